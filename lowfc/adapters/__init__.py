@@ -1,0 +1,1 @@
+"""Everything that touches the outside: bus, clock, files, scheduling."""

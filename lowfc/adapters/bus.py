@@ -1,0 +1,124 @@
+"""What the processes ask of a message bus: publish, subscribe, answer, ask.
+
+`ZenohBus` carries the messages between processes; `MemoryBus` does the same within one, for tests. Handlers run on the
+bus's own thread and must be short: put into a mailbox, append to a queue.
+"""
+
+import sys
+import threading
+import traceback
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Protocol
+
+from lowfc.adapters.envelope import Envelope
+from lowfc.contract.messages import Topic
+
+ALL = "*"
+"""In place of a name: every mirror, or every process."""
+
+
+@dataclass(slots=True)
+class Sample:
+    """One message as it arrived.
+
+    Attributes:
+        key: where it was published.
+        payload: protobuf bytes.
+        sequence: see `Envelope`.
+        publish_time_ns: when the publisher sent it, host clock.
+        receive_time_ns: when the bus's thread had it here, host clock.
+    """
+
+    key: str
+    payload: bytes
+    sequence: int
+    publish_time_ns: int
+    receive_time_ns: int
+
+
+@dataclass(slots=True)
+class Query:
+    """A question that waits for its answer; `reply` may be called later and from any thread, once.
+
+    Attributes:
+        key: what was asked.
+        name: last part of the key, such as "gain" of "lowfc/request/gain".
+        payload: protobuf bytes; may be empty.
+        reply: sends the answer.
+    """
+
+    key: str
+    payload: bytes
+    reply: Callable[[bytes], None]
+
+    @property
+    def name(self) -> str:
+        """Last part of the key."""
+        return self.key.rpartition("/")[2]
+
+
+class Publisher(Protocol):
+    """Publishes one topic under one key."""
+
+    topic: Topic
+    key: str
+    published: int
+    last: tuple[bytes, Envelope] | None
+
+    def put(self, payload: bytes, publish_time_ns: int | None = None) -> Envelope:
+        """Send `payload`; the time defaults to now and the sequence is the next one. Never waits for a reader."""
+        ...
+
+
+class Bus(Protocol):
+    """A connection of one process to all others of its run."""
+
+    faults: "Faults"
+
+    def publisher(self, topic: Topic, name: str = "") -> Publisher:
+        """Publisher of a topic; the last message of a queryable topic is what `get` on its key returns."""
+        ...
+
+    def subscribe(self, topic: Topic, handler: Callable[[Sample], None], name: str = ALL) -> None:
+        """Call `handler` with every message of a topic, of one mirror or process or of all."""
+        ...
+
+    def queryable(self, key_expression: str, handler: Callable[[Query], None]) -> None:
+        """Call `handler` with every question asked under a key expression such as "lowfc/request/*"."""
+        ...
+
+    def get(self, key: str, payload: bytes = b"", timeout_s: float = 1.0) -> list[Sample]:
+        """Ask, and wait for the answers; nobody there is an empty list."""
+        ...
+
+    def peers(self) -> int:
+        """How many other processes this one is connected to."""
+        ...
+
+    def close(self) -> None:
+        """Leave the run."""
+        ...
+
+
+class Faults:
+    """Exceptions of handlers: the first of each place goes to standard error, all are counted."""
+
+    def __init__(self) -> None:
+        self.counts: dict[str, int] = {}
+        self._lock = threading.Lock()
+
+    def add(self, where: str, fault: Exception) -> None:
+        """Count a fault at `where`, and print it when it is the first there."""
+        with self._lock:
+            seen = self.counts.get(where, 0)
+            self.counts[where] = seen + 1
+        if not seen:
+            text = "".join(traceback.format_exception(fault))
+            sys.stderr.write(f"{where}: {text}(further ones here are only counted)\n")
+
+
+def name_in(topic: Topic, key: str) -> str:
+    """Name of the mirror or process in a key of this topic; empty for a topic without one."""
+    before, placeholder, after = topic.key.partition("{name}")
+    return key[len(before) : len(key) - len(after)] if placeholder else ""

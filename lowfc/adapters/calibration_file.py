@@ -1,0 +1,100 @@
+"""Calibrations as FITS: one named extension for each array, units in the headers."""
+
+import io
+import tempfile
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+from astropy.io import fits
+
+from lowfc.contract.codec import identified
+from lowfc.contract.errors import DataFileError
+from lowfc.control.calibration import Calibration
+
+KIND = "lowfc calibration 1"
+
+# Extension, attribute of Calibration, unit.
+_EXTENSIONS = (
+    ("REFERENCE", "reference", "", "reference image I0, fraction of the flux"),
+    ("RESPONSE", "response", "nm-1", "response matrix H, fraction of the flux per nm rms of wavefront"),
+    ("RECONSTRUCTOR", "reconstructor", "nm", "reconstructor R, nm rms of wavefront per fraction of the flux"),
+    ("MASK", "good", "", "1 where a pixel is used"),
+    ("DARK", "dark", "adu", "frame without light"),
+    ("MODES2ACT", "modes_to_actuators", "", "nm of surface per nm rms of wavefront"),
+)
+
+
+def to_bytes(calibration: Calibration) -> bytes:
+    """Calibration as a FITS file."""
+    primary = fits.PrimaryHDU()
+    header = primary.header
+    header["KIND"] = (KIND, "what this file is")
+    header["CALID"] = (calibration.id, "SHA-256 of the calibration")
+    header["OPERATOR"] = (calibration.operator_hash, "SHA-256 of the optical model")
+    header["ESTIMATE"] = (calibration.estimator, "how R was made")
+    header["NOLL"] = (" ".join(map(str, calibration.noll)), "Noll index of each mode")
+    header["WAVELEN"] = (calibration.wavelength_nm, "[nm] wavelength")
+    header["ROWS"] = (calibration.shape[0], "rows of the frame")
+    header["COLUMNS"] = (calibration.shape[1], "columns of the frame")
+    header["MIRROWS"] = (calibration.grid[0], "rows of the mirror")
+    header["MIRCOLS"] = (calibration.grid[1], "columns of the mirror")
+    header["FLUX"] = (calibration.flux_dn, "[adu] expected sum of the good pixels")
+    header["SATURATE"] = (calibration.saturation_dn, "[adu] highest value of a pixel")
+    units = [primary]
+    for name, attribute, unit, sentence in _EXTENSIONS:
+        extension = fits.ImageHDU(getattr(calibration, attribute), name=name)
+        extension.header["BUNIT"] = (unit, sentence[:47])
+        units.append(extension)
+    stream = io.BytesIO()
+    fits.HDUList(units).writeto(stream, checksum=True)
+    return stream.getvalue()
+
+
+def save(calibration: Calibration, path: Path) -> None:
+    """Write a FITS file; another program never sees half of it."""
+    with tempfile.NamedTemporaryFile(dir=path.parent, prefix=path.stem, suffix=".part", delete=False) as stream:
+        stream.write(to_bytes(calibration))
+    Path(stream.name).replace(path)
+
+
+def load(path: Path) -> Calibration:
+    """Read a FITS file and check that it is whole.
+
+    Raises:
+        DataFileError: the file is missing, damaged or holds something else.
+    """
+    if not path.is_file():
+        raise DataFileError(f"{path}: there is no such calibration file")
+    try:
+        with fits.open(path, mode="readonly", memmap=False) as units:
+            calibration = _read(units)
+    except (OSError, KeyError, TypeError, ValueError) as error:
+        raise DataFileError(f"{path}: not a whole calibration file: {error}") from None
+    found = identified(calibration).id
+    if found != calibration.id:
+        raise DataFileError(f"{path}: damaged: its content has identity {found[:12]}, it says {calibration.id[:12]}")
+    return calibration
+
+
+def _read(units: fits.HDUList) -> Calibration:
+    header = units[0].header
+    if header.get("KIND") != KIND:
+        raise ValueError(f"its header should say KIND = {KIND!r}, got {header.get('KIND')!r}")
+
+    def array(name: str) -> npt.NDArray[np.float32]:
+        return np.ascontiguousarray(units[name].data, dtype=np.float32)
+
+    arrays = {attribute: array(name) for name, attribute, _, _ in _EXTENSIONS}
+    return Calibration(
+        noll=tuple(int(index) for index in str(header["NOLL"]).split()),
+        shape=(int(header["ROWS"]), int(header["COLUMNS"])),
+        grid=(int(header["MIRROWS"]), int(header["MIRCOLS"])),
+        flux_dn=float(header["FLUX"]),
+        saturation_dn=float(header["SATURATE"]),
+        estimator=str(header["ESTIMATE"]),
+        wavelength_nm=float(header["WAVELEN"]),
+        operator_hash=str(header["OPERATOR"]),
+        id=str(header["CALID"]),
+        **arrays,
+    )

@@ -1,0 +1,56 @@
+"""The 16 bytes that travel beside every payload: which message of its publisher it is, and when it was sent."""
+
+import struct
+from dataclasses import dataclass
+
+from lowfc.contract.errors import BusError
+
+_LAYOUT = struct.Struct("<QQ")
+_COUNT_BITS = 32
+_COUNT_MASK = (1 << _COUNT_BITS) - 1
+
+
+@dataclass(frozen=True, slots=True)
+class Envelope:
+    """Identity and time of one message.
+
+    Attributes:
+        sequence: the publisher's start in unix seconds << 32 | its count on this topic, from 0.
+        publish_time_ns: just before the put, nanoseconds since the epoch on the host's clock.
+    """
+
+    sequence: int
+    publish_time_ns: int
+
+    def encode(self) -> bytes:
+        """Two little-endian unsigned 64-bit numbers: sequence, publish_time_ns."""
+        return _LAYOUT.pack(self.sequence, self.publish_time_ns)
+
+    @classmethod
+    def decode(cls, data: bytes) -> "Envelope":
+        """Envelope of 16 bytes.
+
+        Raises:
+            BusError: `data` has another length.
+        """
+        if len(data) != _LAYOUT.size:
+            raise BusError(
+                f"an envelope is {_LAYOUT.size} bytes (sequence and publish_time_ns, little-endian uint64), "
+                f"got {len(data)}; attach one to every put"
+            )
+        return cls(*_LAYOUT.unpack(data))
+
+
+def sequence_of(start_s: int, count: int) -> int:
+    """Sequence of message number `count` of a publisher that started at `start_s` (unix seconds)."""
+    return start_s << _COUNT_BITS | count
+
+
+def start_of(sequence: int) -> int:
+    """Start of the publisher, unix seconds; a larger one means that it was restarted."""
+    return sequence >> _COUNT_BITS
+
+
+def count_of(sequence: int) -> int:
+    """Number of the message among those of its publisher on this topic, from 0."""
+    return sequence & _COUNT_MASK

@@ -1,0 +1,153 @@
+"""The simulated instrument that a configuration describes: optics, star, detector, mirror, calibration.
+
+The camera, the mirror and the launcher build the same parts from the same keys; nothing else interprets them.
+"""
+
+from collections.abc import Callable
+
+import numpy as np
+import numpy.typing as npt
+
+from lowfc.adapters.masks import sensor_from
+from lowfc.adapters.twin_store import load_or_build
+from lowfc.contract.codec import identified
+from lowfc.contract.configuration import Configuration
+from lowfc.contract.errors import CalibrationError, ConfigurationError
+from lowfc.control.calibration import Calibration, normalise_flux, reconstructor
+from lowfc.control.safety import Limits, LoopMode
+from lowfc.control.state import Settings
+from lowfc.optics.band import Band, gauss_legendre, monochromatic
+from lowfc.optics.detector import Detector, saturation_dn
+from lowfc.optics.mirror import Mirror, modes_to_actuators
+from lowfc.optics.photometry import Photometry, electrons
+from lowfc.optics.sensor import Sensor
+from lowfc.optics.twin import Twin, TwinSpec, node_radii, reference, response
+from lowfc.optics.zernike import zernikes
+
+Single = npt.NDArray[np.float32]
+Progress = Callable[[int, int], None]
+
+# What goes with each number of pupil nodes: the order of the interpolation, and the sensor's prolate functions.
+_TWIN_DETAILS = {32: (4, 28), 64: (6, 30)}
+
+
+def sensor(config: Configuration, warn: Callable[[str], None]) -> Sensor:
+    """The wavefront sensor's optics."""
+    return sensor_from(config.sensor.sam, config.sensor.focal_mask, config.star.wavelength_nm, warn)
+
+
+def band(config: Configuration) -> Band:
+    """The wavelengths that stand for the star's band."""
+    if config.sensor.wavelengths == 1:
+        return monochromatic(config.star.wavelength_nm)
+    return gauss_legendre(config.star.wavelength_nm, config.star.bandwidth, config.sensor.wavelengths)
+
+
+def twin(config: Configuration, progress: Progress | None, warn: Callable[[str], None]) -> Twin:
+    """The real-time twin of the sensor, from the cache or built."""
+    order, functions = _TWIN_DETAILS[config.sensor.nodes]
+    spec = TwinSpec(config.sensor.nodes, order, config.sensor.rank, functions)
+    return load_or_build(sensor(config, warn), spec, band(config), progress, notice=warn)
+
+
+def electrons_per_exposure(config: Configuration) -> float:
+    """Electrons in one exposure of all the light through the open circle; an image times this is in electrons."""
+    star = config.star
+    photometry = Photometry(
+        star.magnitude,
+        star.diameter_m,
+        star.wavelength_nm * star.bandwidth,
+        star.throughput,
+        config.camera.quantum_efficiency,
+    )
+    return electrons(photometry, config.exposure_ns * 1e-9)
+
+
+def detector(config: Configuration) -> Detector:
+    """The camera's detector."""
+    camera = config.camera
+    try:
+        return Detector(
+            camera.gain_e_per_dn,
+            camera.read_noise_e,
+            camera.bias_dn,
+            camera.full_well_e,
+            camera.bit_depth,
+            camera.em_gain,
+            camera.clock_induced_charge_e,
+        )
+    except ValueError as error:
+        raise ConfigurationError(f"camera: {error}") from None
+
+
+def mirror(config: Configuration) -> Mirror:
+    """The mirror's geometry."""
+    section = config.mirror
+    return Mirror(section.rows, section.columns, section.pitches_per_pupil, section.coupling)
+
+
+def mirror_limits(config: Configuration) -> Limits:
+    """What the mirror itself allows."""
+    return Limits(config.mirror.stroke_nm / 2, config.mirror.slew_nm, config.mirror.neighbour_nm)
+
+
+def settings(config: Configuration) -> Settings:
+    """What of the controller does not change during a run."""
+    control, safety = config.control, config.safety
+    return Settings(
+        limits=Limits(safety.stroke_nm, safety.slew_nm, safety.neighbour_nm),
+        delay_frames=config.camera.delay_frames,
+        start_mode=LoopMode[control.start_mode.upper()],
+        late_ns=round(control.late_ms * 1e6),
+        hold_ns=round(control.hold_ms * 1e6),
+        silence=control.silence,
+        least_flux=control.least_flux,
+        most_saturated=control.most_saturated,
+        gain=(control.tilt_gain, control.gain),
+        leak=(control.tilt_leak, control.leak),
+        limit_nm=(control.tilt_limit_nm, control.limit_nm),
+    )
+
+
+def analytic_calibration(config: Configuration, optics: Twin) -> Calibration:
+    """I0 and H from the camera's own operator, eqs. (6) to (12), R from them, the mirror's modes fitted.
+
+    Raises:
+        CalibrationError: this sensor cannot tell the modes apart.
+    """
+    camera = detector(config)
+    nolls = config.noll
+    radii = node_radii(optics)
+    I0, H = reference(optics), response(optics, zernikes(nolls, *radii))
+    shape = I0.shape
+    good = np.ones(I0.size)
+    flux_e = electrons_per_exposure(config) * float(I0.sum()) * camera.em_gain
+    I0, H = normalise_flux(I0.reshape(-1), H, good)
+    try:
+        R = reconstructor(I0, H, good, flux_e, camera.read_noise_e, config.control.estimator)
+    except ValueError as error:
+        raise CalibrationError(f"sensor.sam = {config.sensor.sam!r}, {len(nolls)} modes: {error}") from None
+
+    def single(array: npt.NDArray[np.float64]) -> Single:
+        return np.ascontiguousarray(array, dtype=np.float32)
+
+    grid = (config.mirror.rows, config.mirror.columns)
+    return identified(
+        Calibration(
+            noll=nolls,
+            reference=single(I0),
+            response=single(H),
+            reconstructor=single(R),
+            good=single(good),
+            dark=np.full(I0.size, camera.bias_dn, np.float32),
+            modes_to_actuators=single(modes_to_actuators(mirror(config), nolls)),
+            shape=(shape[0], shape[1]),
+            grid=grid,
+            flux_dn=flux_e / camera.gain_e_per_dn,
+            saturation_dn=float(saturation_dn(camera)),
+            estimator=config.control.estimator,
+            wavelength_nm=config.star.wavelength_nm,
+            operator_hash=optics.operator_hash,
+            id="",
+        )
+    )

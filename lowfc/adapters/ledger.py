@@ -1,0 +1,78 @@
+"""The account of a recording: which messages there were, and which of them are missing."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+from google.protobuf.message import DecodeError
+
+from lowfc.adapters.bus import Sample
+from lowfc.adapters.envelope import count_of, start_of
+from lowfc.contract.messages import EVENT, Log, Topic, wire
+
+
+@dataclass(slots=True)
+class _Tally:
+    """Messages of one topic of one start of one publisher; counts as in their envelopes."""
+
+    first: int
+    next: int
+    published: int = 0
+    recorded: int = 0
+    reported: int = 0
+
+    @property
+    def lost(self) -> int:
+        return max(self.next, self.published) - self.first - self.recorded
+
+
+class Ledger:
+    """Which messages there were: by the counts of those that arrived, and by what their publishers say they sent."""
+
+    def __init__(self) -> None:
+        self._tallies: dict[tuple[str, str, int], _Tally] = {}
+
+    def enter(self, topic: Topic, sample: Sample, *, recorded: bool) -> None:
+        """Account for a message; the first one of a publisher's start is its beginning."""
+        count = count_of(sample.sequence)
+        line = (sample.key, _author(topic, sample), start_of(sample.sequence))
+        tally = self._tallies.setdefault(line, _Tally(count, count))
+        if count >= tally.next:
+            tally.next = count + 1
+            tally.recorded += recorded
+
+    def believe(self, sample: Sample, health: wire.Health) -> None:
+        """Take over what a publisher says it sent; what it sent before it was first heard does not count as lost."""
+        for topic in health.topics:
+            if topic.published:
+                line = (topic.topic, health.process if topic.topic == EVENT.key else "", start_of(sample.sequence))
+                tally = self._tallies.setdefault(line, _Tally(topic.published, topic.published))
+                if health.state == "stopped":
+                    tally.published = topic.published
+
+    def lost(self) -> dict[str, int]:
+        """Messages lost so far, by key; only keys that lost some."""
+        return self._sum(lambda tally: tally.lost)
+
+    def news(self) -> dict[str, int]:
+        """Messages lost since this was asked last, by key."""
+        found = self._sum(lambda tally: tally.lost - tally.reported)
+        for tally in self._tallies.values():
+            tally.reported = tally.lost
+        return found
+
+    def _sum(self, number: Callable[[_Tally], int]) -> dict[str, int]:
+        sums: dict[str, int] = {}
+        for (key, _, _), tally in self._tallies.items():
+            if number(tally):
+                sums[key] = sums.get(key, 0) + number(tally)
+        return sums
+
+
+def _author(topic: Topic, sample: Sample) -> str:
+    """Who published on a topic that all share, where equal starts do not tell; elsewhere nothing."""
+    if topic is not EVENT:
+        return ""
+    try:
+        return Log.FromString(sample.payload).name
+    except DecodeError:
+        return "?"

@@ -1,0 +1,150 @@
+"""The bus within one process: a put calls the handlers before it returns. For unit and fault tests."""
+
+import contextlib
+import threading
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+
+from lowfc.adapters.bus import ALL, Faults, Query, Sample
+from lowfc.adapters.clock import Clock
+from lowfc.adapters.envelope import Envelope, sequence_of
+from lowfc.contract.errors import BusError
+from lowfc.contract.messages import Topic
+
+
+@dataclass(slots=True)
+class MemoryHub:
+    """What the buses of one test have in common.
+
+    Attributes:
+        lose: whether to lose this message on its way to that role; a test may set it.
+    """
+
+    buses: "list[MemoryBus]" = field(default_factory=list)
+    starts: dict[str, int] = field(default_factory=dict)
+    lose: Callable[[str, str, Envelope], bool] = lambda role, key, envelope: False
+
+
+class MemoryPublisher:
+    """Publishes one topic to all buses of the hub."""
+
+    def __init__(self, bus: "MemoryBus", topic: Topic, key: str) -> None:
+        self.topic = topic
+        self.key = key
+        self.published = 0
+        self.last: tuple[bytes, Envelope] | None = None
+        self._bus = bus
+
+    def put(self, payload: bytes, publish_time_ns: int | None = None) -> Envelope:
+        """Deliver `payload` to every handler before returning."""
+        if self._bus.closed:
+            raise BusError(f"{self.key}: the bus is closed")
+        clock = self._bus.clock
+        sequence = sequence_of(self._bus.start_s, self.published)
+        envelope = Envelope(sequence, clock.host_ns() if publish_time_ns is None else publish_time_ns)
+        self.published += 1
+        if self.topic.queryable:
+            self.last = (payload, envelope)
+        for bus in list(self._bus.hub.buses):
+            bus.deliver(self.key, payload, envelope)
+        return envelope
+
+
+class MemoryBus:
+    """One process's connection to a `MemoryHub`."""
+
+    def __init__(self, hub: MemoryHub, role: str, clock: Clock) -> None:
+        self.hub = hub
+        self.role = role
+        self.clock = clock
+        self.closed = False
+        self.faults = Faults()
+        self.start_s = max(clock.start_s, hub.starts.get(role, -1) + 1)
+        hub.starts[role] = self.start_s
+        self._publishers: list[MemoryPublisher] = []
+        self._subscriptions: list[tuple[Topic, str, Callable[[Sample], None]]] = []
+        self._queryables: list[tuple[str, Callable[[Query], None]]] = []
+        hub.buses.append(self)
+
+    def publisher(self, topic: Topic, name: str = "") -> MemoryPublisher:
+        """See `Bus.publisher`."""
+        publisher = MemoryPublisher(self, topic, topic.at(name))
+        self._publishers.append(publisher)
+        return publisher
+
+    def subscribe(self, topic: Topic, handler: Callable[[Sample], None], name: str = ALL) -> None:
+        """See `Bus.subscribe`."""
+        self._subscriptions.append((topic, topic.at(name), handler))
+
+    def queryable(self, key_expression: str, handler: Callable[[Query], None]) -> None:
+        """See `Bus.queryable`."""
+        self._queryables.append((key_expression, handler))
+
+    def get(self, key: str, payload: bytes = b"", timeout_s: float = 1.0) -> list[Sample]:
+        """See `Bus.get`; returns once every handler asked has replied, or after `timeout_s`."""
+        answers: list[Sample] = []
+        asked = threading.Semaphore(0)
+        handlers = 0
+        for bus in list(self.hub.buses):
+            for at, body, envelope in bus.kept(key):
+                answers.append(Sample(at, body, envelope.sequence, envelope.publish_time_ns, self.clock.host_ns()))
+            for handler in bus.handlers_of(key):
+                handlers += 1
+                bus.ask(handler, Query(key, payload, self._collector(bus, key, answers, asked)))
+        for _ in range(handlers):
+            if not asked.acquire(timeout=timeout_s):
+                break
+        return answers
+
+    def peers(self) -> int:
+        """See `Bus.peers`."""
+        return sum(bus is not self for bus in self.hub.buses)
+
+    def close(self) -> None:
+        """Leave the hub."""
+        self.closed = True
+        with contextlib.suppress(ValueError):
+            self.hub.buses.remove(self)
+
+    def deliver(self, key: str, payload: bytes, envelope: Envelope) -> None:
+        """Call the handlers for a message that somebody put."""
+        if self.hub.lose(self.role, key, envelope):
+            return
+        for topic, wanted, handler in list(self._subscriptions):
+            if key == wanted or (wanted == topic.at(ALL) and topic.matches(key)):
+                sample = Sample(key, payload, envelope.sequence, envelope.publish_time_ns, self.clock.host_ns())
+                try:
+                    handler(sample)
+                except Exception as fault:  # a handler's fault is its own process's, never the publisher's
+                    self.faults.add(f"{self.role}: handler of {key}", fault)
+
+    def kept(self, key: str) -> Iterator[tuple[str, bytes, Envelope]]:
+        """Last messages of the queryable topics that a key expression asks for."""
+        for publisher in self._publishers:
+            if publisher.last and (publisher.key == key or key == publisher.topic.at(ALL)):
+                yield publisher.key, *publisher.last
+
+    def handlers_of(self, key: str) -> list[Callable[[Query], None]]:
+        """Handlers declared for a key."""
+        return [handler for wanted, handler in self._queryables if _covers(wanted, key)]
+
+    def ask(self, handler: Callable[[Query], None], query: Query) -> None:
+        """Hand a question to a handler."""
+        try:
+            handler(query)
+        except Exception as fault:
+            self.faults.add(f"{self.role}: queryable of {query.key}", fault)
+
+    def _collector(
+        self, bus: "MemoryBus", key: str, answers: list[Sample], asked: threading.Semaphore
+    ) -> Callable[[bytes], None]:
+        def reply(body: bytes) -> None:
+            now_ns = self.clock.host_ns()
+            answers.append(Sample(key, body, sequence_of(bus.start_s, 0), now_ns, now_ns))
+            asked.release()
+
+        return reply
+
+
+def _covers(expression: str, key: str) -> bool:
+    return expression == key or (expression.endswith("/*") and key.rpartition("/")[0] == expression[:-2])

@@ -1,0 +1,137 @@
+"""Real-time set-up of a process, in one place; call it before the first zenoh session.
+
+A session's threads keep the scheduling class and the processors they are born with.
+"""
+
+import ctypes
+import gc
+import os
+import resource
+import sys
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+from threadpoolctl import threadpool_limits
+
+from lowfc.adapters.clock import sharpen_sleep
+
+_SWITCH_INTERVAL_S = 5e-4
+_MCL_CURRENT, _MCL_FUTURE, _MCL_ONFAULT = 1, 2, 4
+_CAP_IPC_LOCK = 1 << 14
+
+
+@dataclass(frozen=True, slots=True)
+class Granted:
+    """What the host allowed.
+
+    Attributes:
+        granted: measures in force.
+        refused: measures that are not, each with what that costs.
+    """
+
+    granted: tuple[str, ...]
+    refused: tuple[tuple[str, str], ...]
+
+
+NOTHING = Granted((), ())
+
+
+class _RefusedError(Exception):
+    """The host does not allow a measure."""
+
+
+def set_up(priority: int | None, cpus: set[int] | None, lock_memory: bool) -> Granted:
+    """Prepare this process for the loop.
+
+    Args:
+        priority: of SCHED_FIFO, 1 to 99; None leaves the normal class.
+        cpus: processors to stay on; None leaves all.
+        lock_memory: keep every page in memory.
+
+    Returns:
+        What was granted; a refusal is no error, for the loop runs without, only less evenly.
+    """
+    granted = list(_quiet_interpreter())
+    refused: list[tuple[str, str]] = []
+    for measure, cost in _asked(priority, cpus, lock_memory):
+        try:
+            granted.append(measure())
+        except (_RefusedError, OSError, ValueError) as fault:
+            what, price = cost
+            refused.append((f"{what} ({getattr(fault, 'strerror', None) or fault})", price))
+    return Granted(tuple(granted), tuple(refused))
+
+
+def step_back(niceness: int = 5) -> Granted:
+    """Prepare a process that must never get in the loop's way, such as the recorder: lower priority, no more."""
+    os.nice(niceness)
+    return Granted((f"niceness {niceness}",), ())
+
+
+def _asked(
+    priority: int | None, cpus: set[int] | None, lock_memory: bool
+) -> Iterator[tuple[Callable[[], str], tuple[str, str]]]:
+    if cpus is not None:
+        yield (
+            lambda: _stay_on(cpus),
+            (f"processors {sorted(cpus)}", "the kernel moves the loop between processors; expect a longer tail"),
+        )
+    if lock_memory:
+        yield (
+            _lock_memory,
+            ("locked memory", "a page that was swapped out stalls the loop for milliseconds"),
+        )
+    if priority is not None:
+        yield (
+            lambda: _run_first(priority),
+            (
+                f"SCHED_FIFO priority {priority}",
+                "other programs may run first, and one frame in a thousand comes milliseconds late on a busy host; "
+                "allow it with LimitRTPRIO= or CAP_SYS_NICE",
+            ),
+        )
+
+
+def _quiet_interpreter() -> tuple[str, ...]:
+    """One BLAS thread, no garbage collection, quick hand-over between threads, sharp sleeps."""
+    threadpool_limits(limits=1)
+    gc.collect()
+    gc.freeze()
+    gc.disable()
+    sys.setswitchinterval(_SWITCH_INTERVAL_S)
+    sharpen_sleep()
+    return "one BLAS thread", "garbage collector off", "timer slack 1 ns"
+
+
+def _run_first(priority: int) -> str:
+    os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(priority))
+    return f"SCHED_FIFO priority {priority}"
+
+
+def _stay_on(cpus: set[int]) -> str:
+    os.sched_setaffinity(0, cpus)
+    return f"processors {sorted(cpus)}"
+
+
+def _lock_memory() -> str:
+    """Lock what is there, and every later page once it is touched.
+
+    Under a limit, later allocations would fail instead of being slow, so nothing is locked then.
+    """
+    limit = resource.getrlimit(resource.RLIMIT_MEMLOCK)[1]
+    if limit != resource.RLIM_INFINITY and not _capabilities() & _CAP_IPC_LOCK:
+        raise _RefusedError(f"the limit is {limit // 1024} kB; set LimitMEMLOCK=infinity")
+    libc = ctypes.CDLL(None, use_errno=True)
+    for flags in (_MCL_CURRENT, _MCL_FUTURE | _MCL_ONFAULT):
+        if libc.mlockall(flags) != 0:
+            raise _RefusedError(os.strerror(ctypes.get_errno()))
+    return "locked memory"
+
+
+def _capabilities() -> int:
+    """Effective capabilities of this process, as the kernel's bit mask."""
+    for line in Path("/proc/self/status").read_text().splitlines():
+        if line.startswith("CapEff:"):
+            return int(line.split()[1], 16)
+    return 0

@@ -1,0 +1,218 @@
+"""What every process of a run does alike: stop when told, say how it is, report events, hear the others."""
+
+import os
+import signal
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterable
+from types import FrameType
+
+from lowfc import __version__
+from lowfc.adapters.bus import ALL, Bus, Publisher, Sample, name_in
+from lowfc.adapters.clock import Clock
+from lowfc.adapters.mailbox import Mailbox
+from lowfc.adapters.realtime import NOTHING, Granted
+from lowfc.contract.events import EVENTS, Level
+from lowfc.contract.messages import EVENT, HEALTH, Log, Topic, timestamp, wire
+
+HEALTH_PERIOD_NS = 500_000_000
+STATES = ("starting", "ready", "running", "stopping", "stopped")
+
+_MET_PERIOD_S = 0.02
+_PAGE_BYTES = os.sysconf("SC_PAGE_SIZE")
+
+
+class Service:
+    """One process of a run.
+
+    Attributes:
+        name: of the process, such as "camera" or "mirror-dm".
+        running: until SIGTERM, SIGINT or `stop`.
+        work: units of work done (frames, commands, messages); `rate_hz` in Health is its rate.
+        heard: last Health of each process heard, this one's too.
+    """
+
+    def __init__(
+        self,
+        name: str,
+        run_id: str,
+        clock: Clock,
+        bus: Bus,
+        *,
+        granted: Granted = NOTHING,
+        fill: Callable[[wire.Health], None] | None = None,
+    ) -> None:
+        """Join the run; `fill` adds the role's own fields to each Health."""
+        self.name = name
+        self.clock = clock
+        self.bus = bus
+        self.running = True
+        self.why = "finished"
+        self.work = 0
+        self.heard: dict[str, wire.Health] = {}
+        self.publishers: list[Publisher] = []
+        self.mailboxes: list[Mailbox] = []
+        self._run_id = run_id
+        self._granted = granted
+        self.fill = fill
+        self._state = "starting"
+        self._wakers: list[Callable[[], None]] = []
+        self._event_lock = threading.Lock()
+        self._started_ns = self._beaten_ns = clock.host_ns()
+        self._worked = 0
+        self._due_ns = 0
+        self._events = self.publisher(EVENT)
+        self._health = self.publisher(HEALTH, name)
+        bus.subscribe(HEALTH, self._hear)
+        self.event("STARTED", process=name, version=__version__)
+        for measure, cost in granted.refused:
+            self.event("REALTIME_REFUSED", measure=measure, cost=cost)
+
+    def publisher(self, topic: Topic, name: str = "") -> Publisher:
+        """Publisher of a topic, counted in Health."""
+        publisher = self.bus.publisher(topic, name)
+        self.publishers.append(publisher)
+        return publisher
+
+    def mailbox(self, topic: Topic, name: str = "") -> Mailbox:
+        """Mailbox that gets a topic, counted in Health and woken at a stop."""
+        mailbox = Mailbox(topic.at(name))
+        self.mailboxes.append(mailbox)
+        self.on_stop(mailbox.wake)
+        self.bus.subscribe(topic, mailbox.put, name or ALL)
+        return mailbox
+
+    def catch_signals(self) -> None:
+        """Stop at SIGTERM and SIGINT; a second SIGINT ends the process at once. For the main thread."""
+        signal.signal(signal.SIGTERM, self._caught)
+        signal.signal(signal.SIGINT, self._caught)
+
+    def on_stop(self, waker: Callable[[], None]) -> None:
+        """Call `waker` when the process is told to stop, so that a waiting loop notices."""
+        self._wakers.append(waker)
+
+    def stop(self, why: str) -> None:
+        """End the loop: `running` is False from here."""
+        if self.running:
+            self.why = why
+            self.running = False
+        for waker in self._wakers:
+            waker()
+
+    @property
+    def state(self) -> str:
+        """One of `STATES`; setting it sends Health at once."""
+        return self._state
+
+    @state.setter
+    def state(self, state: str) -> None:
+        if state not in STATES:
+            raise ValueError(f"a process's state is one of {', '.join(STATES)}; got {state!r}")
+        self._state = state
+        self._send_health(self.clock.host_ns())
+
+    def beat(self) -> None:
+        """Send Health when it is due, twice a second; call it in every turn of the loop."""
+        now_ns = self.clock.host_ns()
+        if now_ns >= self._due_ns:
+            self._send_health(now_ns)
+
+    def finish(self) -> None:
+        """Send the last Health, with all counts: nothing may be published after it."""
+        self.event("STOPPED", process=self.name, why=self.why)
+        self.state = "stopped"
+
+    def event(self, event: str, **details: object) -> None:
+        """Publish an event of the table; warnings and worse go to standard error too. Callable from any thread."""
+        kind = EVENTS[event]
+        log = Log(
+            timestamp=timestamp(self.clock.now_ns()),
+            level=kind.level.value,  # type: ignore[arg-type]  # the schema's enum is a plain int at run time
+            message=f"{kind.name} {kind.sentence.format(**details)}",
+            name=self.name,
+        )
+        with self._event_lock:
+            self._events.put(log.SerializeToString())
+        if kind.level >= Level.WARNING:
+            sys.stderr.write(f"{self.name}: {log.message}\n")
+
+    def wait_for(self, names: Iterable[str], timeout_s: float) -> tuple[str, ...]:
+        """Wait until these processes are ready and have heard this one, so that they get its first message.
+
+        Returns:
+            Names of those that did not answer in time; empty when all did, or the process was told to stop.
+        """
+        wanted = tuple(names)
+        deadline_s = time.monotonic() + timeout_s
+        while missing := tuple(name for name in wanted if not self._meets(name)):
+            if not self.running or time.monotonic() >= deadline_s:
+                return missing
+            self.beat()
+            time.sleep(_MET_PERIOD_S)
+        return ()
+
+    def health(self) -> wire.Health:
+        """How the process is."""
+        now_ns = self.clock.host_ns()
+        span_s = max(now_ns - self._beaten_ns, 1) * 1e-9
+        message = wire.Health(
+            timestamp=timestamp(now_ns),
+            process=self.name,
+            state=self._state,
+            run_id=self._run_id,
+            pid=os.getpid(),
+            version=__version__,
+            memory_bytes=resident_bytes(),
+            rate_hz=(self.work - self._worked) / span_s,
+            heard=sorted(self.heard),
+            granted=self._granted.granted,
+            refused=[f"{measure}: {cost}" for measure, cost in self._granted.refused],
+            clock_offset_ns=self.clock.offset_ns,
+            uptime_ns=now_ns - self._started_ns,
+            topics=[*(self._sent(one) for one in self.publishers), *map(_got, self.mailboxes)],
+        )
+        if self.fill:
+            self.fill(message)
+        return message
+
+    def _sent(self, publisher: Publisher) -> wire.TopicCount:
+        own = publisher is self._health  # the message that carries the count is one of them
+        return wire.TopicCount(topic=publisher.key, published=publisher.published + own)
+
+    def _send_health(self, now_ns: int) -> None:
+        self._due_ns = now_ns + HEALTH_PERIOD_NS
+        message = self.health()
+        self._beaten_ns, self._worked = now_ns, self.work
+        self._health.put(message.SerializeToString())
+
+    def _hear(self, sample: Sample) -> None:
+        name = name_in(HEALTH, sample.key)
+        if name not in self.heard:
+            self._due_ns = 0  # answer a newcomer at the next beat, so that it need not wait for us
+        self.heard[name] = wire.Health.FromString(sample.payload)
+
+    def _meets(self, name: str) -> bool:
+        health = self.heard.get(name)
+        return health is not None and health.state in ("ready", "running") and self.name in health.heard
+
+    def _caught(self, number: int, frame: FrameType | None) -> None:
+        if number == signal.SIGINT and not self.running:
+            os._exit(128 + number)
+        self.stop(signal.Signals(number).name)
+
+
+def resident_bytes() -> int:
+    """Resident memory of this process."""
+    with open("/proc/self/statm", "rb") as file:  # noqa: PTH123  # the loop calls it; Path costs more than the read
+        return int(file.read().split()[1]) * _PAGE_BYTES
+
+
+def _got(mailbox: Mailbox) -> wire.TopicCount:
+    return wire.TopicCount(
+        topic=mailbox.key,
+        received=mailbox.received,
+        skipped=mailbox.skipped,
+        missing=mailbox.missing,
+        last_sequence=mailbox.last_sequence,
+    )

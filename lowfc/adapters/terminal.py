@@ -1,0 +1,48 @@
+"""Command lines: how a user's mistake looks, and the options that every process of a run has."""
+
+import sys
+from pathlib import Path
+from typing import Annotated, Any, NoReturn
+
+import typer
+
+from lowfc.contract.configuration import Configuration, load
+from lowfc.contract.errors import LowfcError
+
+MISTAKE = 2
+"""Exit status for anything the user can put right."""
+
+RunId = Annotated[str, typer.Option("--run", help="Name of the run; processes of one run find each other by it.")]
+ConfigFile = Annotated[Path | None, typer.Option("--config", help="Configuration file (TOML).", show_default=False)]
+
+DEFAULT_RUN = "default"
+
+
+def new_app(help_text: str) -> typer.Typer:
+    """A command line with plain errors."""
+    return typer.Typer(
+        help=help_text,
+        add_completion=False,
+        pretty_exceptions_enable=False,
+        rich_markup_mode=None,
+        context_settings={"help_option_names": ["-h", "--help"]},
+    )
+
+
+def run_app(app: typer.Typer) -> NoReturn:
+    """Run a command line; a user's mistake is one clear message and exit status 2, never a traceback."""
+    try:
+        app()
+    except LowfcError as error:
+        sys.stderr.write(f"error: {error}\n")
+        sys.exit(MISTAKE)
+    except KeyboardInterrupt:
+        sys.stderr.write("interrupted\n")
+        sys.exit(130)
+    sys.exit(0)
+
+
+def configuration(file: Path | None, overrides: dict[str, Any] | None = None) -> Configuration:
+    """Configuration of a file with the options given on the command line (those that are not None) over it."""
+    given = {key: value for key, value in (overrides or {}).items() if value is not None}
+    return load(file, given)

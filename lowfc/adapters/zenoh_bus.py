@@ -1,0 +1,210 @@
+"""The bus between processes: zenoh peers over loopback TCP, each connected to all others of its run.
+
+Why each setting is what it is stands in `session_config`; all of them were measured.
+"""
+
+import contextlib
+import json
+import threading
+from collections.abc import Callable
+from typing import Any
+
+import zenoh
+from zenoh.handlers import Callback
+
+from lowfc.adapters.bus import ALL, Faults, Query, Sample
+from lowfc.adapters.clock import Clock
+from lowfc.adapters.envelope import Envelope, sequence_of
+from lowfc.adapters.run import Links
+from lowfc.contract.errors import BusError
+from lowfc.contract.messages import Topic
+
+_HOST = "tcp/127.0.0.1"
+_PRIORITIES = ("real_time", "interactive_high", "interactive_low", "data_high", "data", "data_low", "background")
+
+
+def session_config(links: Links, role: str) -> dict[str, Any]:
+    """Return zenoh's configuration for a role of a run; a role without a port of its own only connects."""
+    own = links.ports.get(role)
+    return {
+        "mode": "peer",
+        # Peers do not forward, so everybody connects to everybody; with a timeout of -1 any start order works.
+        "listen": {"endpoints": [f"{_HOST}:{own}"] if own else [], "exit_on_failure": True, "timeout_ms": 0},
+        "connect": {
+            "endpoints": [f"{_HOST}:{port}" for name, port in sorted(links.ports.items()) if name != role],
+            "timeout_ms": -1,
+            "exit_on_failure": False,
+            "retry": {"period_init_ms": 50, "period_max_ms": 200, "period_increase_factor": 2},
+        },
+        "scouting": {"multicast": {"enabled": False}, "gossip": {"enabled": False}},
+        "transport": {
+            "auth": {
+                "usrpwd": {
+                    "user": links.user,
+                    "password": links.secret,
+                    "dictionary_file": str(links.secret_file),
+                }
+            },
+            "link": {
+                "tx": {
+                    # A full queue delays a put by at most 1 ms, then the message is dropped; at 0 bursts are lost.
+                    "queue": {
+                        "size": dict.fromkeys(_PRIORITIES, 16),
+                        "congestion_control": {"drop": {"wait_before_drop": 1000}},
+                    }
+                }
+            },
+            # Gains nothing at these sizes, and a receiver descheduled for 100 ms loses messages silently.
+            "shared_memory": {"enabled": False},
+        },
+    }
+
+
+class ZenohPublisher:
+    """Publishes one topic; see `Publisher`."""
+
+    def __init__(self, session: zenoh.Session, topic: Topic, key: str, clock: Clock, start_s: int) -> None:
+        self.topic = topic
+        self.key = key
+        self.published = 0
+        self.last: tuple[bytes, Envelope] | None = None
+        self._keeps = topic.queryable
+        self._clock = clock
+        self._start_s = start_s
+        self._publisher = session.declare_publisher(
+            key,
+            encoding=f"application/protobuf;{topic.message.DESCRIPTOR.full_name}",
+            congestion_control=zenoh.CongestionControl.DROP,
+            priority=zenoh.Priority.REAL_TIME if topic.in_loop else zenoh.Priority.DATA,
+            express=topic.in_loop,
+        )
+        if self._keeps:
+            session.declare_queryable(key, Callback(self._answer, indirect=False))
+
+    def put(self, payload: bytes, publish_time_ns: int | None = None) -> Envelope:
+        """Send `payload`; waits at most 1 ms for a reader that does not keep up, then loses the message to it."""
+        envelope = Envelope(
+            sequence_of(self._start_s, self.published),
+            self._clock.host_ns() if publish_time_ns is None else publish_time_ns,
+        )
+        self.published += 1
+        if self._keeps:
+            self.last = (payload, envelope)
+        self._publisher.put(payload, attachment=envelope.encode())
+        return envelope
+
+    def _answer(self, query: zenoh.Query) -> None:
+        if self.last is not None:
+            payload, envelope = self.last
+            _reply(query, self.key, payload, envelope)
+        query.drop()  # type: ignore[no-untyped-call]
+
+
+class ZenohBus:
+    """One process's zenoh session; see `Bus`."""
+
+    def __init__(self, links: Links, role: str, clock: Clock) -> None:
+        """Join a run.
+
+        Raises:
+            BusError: the role's port is taken, or zenoh refuses the configuration.
+        """
+        self.role = role
+        self.clock = clock
+        self.faults = Faults()
+        self.start_s = links.claim_start(role, clock.start_s)
+        config = zenoh.Config.from_json5(json.dumps(session_config(links, role)))
+        try:
+            self._session = zenoh.open(config)
+        except zenoh.ZError as fault:
+            port = links.ports.get(role)
+            raise BusError(
+                f"{role} of run {links.run_id!r} cannot listen on 127.0.0.1:{port}; is one running already? "
+                f"stop it, or start another run (zenoh says: {str(fault).splitlines()[0][:200]})"
+            ) from fault
+
+    def publisher(self, topic: Topic, name: str = "") -> ZenohPublisher:
+        """See `Bus.publisher`."""
+        return ZenohPublisher(self._session, topic, topic.at(name), self.clock, self.start_s)
+
+    def subscribe(self, topic: Topic, handler: Callable[[Sample], None], name: str = ALL) -> None:
+        """See `Bus.subscribe`; `handler` runs on zenoh's receiving thread."""
+        key, host_ns, faults = topic.at(name), self.clock.host_ns, self.faults
+
+        def received(sample: zenoh.Sample) -> None:
+            now_ns = host_ns()
+            try:
+                handler(_sample(sample, now_ns))
+            except Exception as fault:  # zenoh would print it and go on; it is counted here
+                faults.add(f"{self.role}: handler of {key}", fault)
+
+        self._session.declare_subscriber(key, Callback(received, indirect=False))
+
+    def queryable(self, key_expression: str, handler: Callable[[Query], None]) -> None:
+        """See `Bus.queryable`."""
+
+        def asked(query: zenoh.Query) -> None:
+            key = str(query.key_expr)
+            try:
+                handler(
+                    Query(key, b"" if query.payload is None else query.payload.to_bytes(), self._replier(query, key))
+                )
+            except Exception as fault:
+                query.drop()  # type: ignore[no-untyped-call]
+                self.faults.add(f"{self.role}: queryable of {key}", fault)
+
+        self._session.declare_queryable(key_expression, Callback(asked, indirect=False))
+
+    def get(self, key: str, payload: bytes = b"", timeout_s: float = 1.0) -> list[Sample]:
+        """See `Bus.get`."""
+        answers: list[Sample] = []
+        done = threading.Event()
+
+        def answered(reply: zenoh.Reply) -> None:
+            if reply.ok is None:  # a timeout
+                return
+            try:
+                answers.append(_sample(reply.ok, self.clock.host_ns()))
+            except Exception as fault:
+                self.faults.add(f"{self.role}: answer to {key}", fault)
+
+        self._session.get(
+            key,
+            Callback(answered, done.set, indirect=False),
+            payload=payload,
+            timeout=timeout_s,
+            target=zenoh.QueryTarget.ALL,
+            consolidation=zenoh.ConsolidationMode.NONE,
+            congestion_control=zenoh.CongestionControl.DROP,
+        )
+        done.wait(timeout_s + 1.0)
+        return list(answers)
+
+    def peers(self) -> int:
+        """See `Bus.peers`."""
+        return len(self._session.info.peers_zid())
+
+    def close(self) -> None:
+        """Leave the run."""
+        with contextlib.suppress(zenoh.ZError):
+            self._session.close()  # type: ignore[no-untyped-call]
+
+    def _replier(self, query: zenoh.Query, key: str) -> Callable[[bytes], None]:
+        def reply(body: bytes) -> None:
+            _reply(query, key, body, Envelope(sequence_of(self.start_s, 0), self.clock.host_ns()))
+            query.drop()  # type: ignore[no-untyped-call]  # only now does the asker know that there is no further answer
+
+        return reply
+
+
+def _sample(sample: zenoh.Sample, receive_time_ns: int) -> Sample:
+    attachment = sample.attachment
+    envelope = Envelope.decode(b"" if attachment is None else attachment.to_bytes())
+    return Sample(
+        str(sample.key_expr), sample.payload.to_bytes(), envelope.sequence, envelope.publish_time_ns, receive_time_ns
+    )
+
+
+def _reply(query: zenoh.Query, key: str, payload: bytes, envelope: Envelope) -> None:
+    # BLOCK, the default of a reply, would let a frozen asker hold the loop for seconds.
+    query.reply(key, payload, attachment=envelope.encode(), congestion_control=zenoh.CongestionControl.DROP)

@@ -1,0 +1,35 @@
+"""The exceptions a user may see.
+
+    LowfcError              anything the user can put right; one line, exit status 2
+    ├── ConfigurationError  a key, a value or a combination of values
+    ├── DataFileError       a file that is missing, damaged or of another kind
+    ├── CalibrationError    a calibration that does not fit the instrument
+    ├── BusError            a port, a socket, or a peer that does not answer
+    └── RequestRefusedError    the controller answered no, and says why
+
+The numerics raise ValueError; the adapters above them name the file or the key and re-raise one of these.
+"""
+
+
+class LowfcError(Exception):
+    """Base of the errors that a user can put right; the text says what was wrong, expected, got and to do."""
+
+
+class ConfigurationError(LowfcError):
+    """A configuration key or value is unknown, malformed or out of range."""
+
+
+class DataFileError(LowfcError):
+    """A file is missing, damaged or holds something else."""
+
+
+class CalibrationError(LowfcError):
+    """A calibration does not fit the camera, the mirror or the sensor."""
+
+
+class BusError(LowfcError):
+    """The message bus cannot be opened, or nobody answers on it."""
+
+
+class RequestRefusedError(LowfcError):
+    """The controller refused an operator's request."""

@@ -1,0 +1,67 @@
+"""Every event, once: name, level and the sentence an operator reads. They travel as Foxglove log lines."""
+
+from dataclasses import dataclass
+from enum import IntEnum
+
+from lowfc.contract.messages import Log, timestamp
+
+
+class Level(IntEnum):
+    """Severity, numbered as in Foxglove's schema."""
+
+    DEBUG = 1
+    INFO = 2
+    WARNING = 3
+    ERROR = 4
+    FATAL = 5
+
+
+@dataclass(frozen=True, slots=True)
+class Event:
+    """One kind of event; `sentence` is a format string for its details."""
+
+    name: str
+    level: Level
+    sentence: str
+
+    def log(self, process: str, time_ns: int, **details: object) -> Log:
+        """Message of one occurrence: "NAME sentence", from `process`, at `time_ns` (nanoseconds since the epoch)."""
+        return Log(
+            timestamp=timestamp(time_ns),
+            level=self.level.value,  # type: ignore[arg-type]  # the schema's enum is a plain int at run time
+            message=f"{self.name} {self.sentence.format(**details)}",
+            name=process,
+        )
+
+
+EVENTS: dict[str, Event] = {
+    event.name: event
+    for event in (
+        Event("STARTED", Level.INFO, "{process} {version} started"),
+        Event("STOPPED", Level.INFO, "{process} stopped: {why}"),
+        Event("REALTIME_REFUSED", Level.WARNING, "the host refused {measure}: {cost}"),
+        Event("CALIBRATION_LOADED", Level.INFO, "calibration {id}: {modes} modes, {estimator}, from {source}"),
+        Event("CALIBRATION_REFUSED", Level.ERROR, "calibration refused: {why}"),
+        Event("CAMERA_CHANGED", Level.WARNING, "the camera no longer fits the calibration ({what}); loop opened"),
+        Event("MODE_CHANGED", Level.INFO, "loop {before} -> {after}: {why}"),
+        Event("SAFED", Level.ERROR, "safed: {why}; `lowfc ctl clear` when it is safe"),
+        Event("FRAMES_REFUSED", Level.WARNING, "frames refused: {reason}"),
+        Event("FRAMES_ACCEPTED", Level.INFO, "frames accepted again after {refused} refused: {reason}"),
+        Event("NO_FRAMES", Level.WARNING, "no frame for {silent_ms:.0f} ms; {action}"),
+        Event("FRAMES_BACK", Level.INFO, "frames are back after {silent_ms:.0f} ms"),
+        Event("FRAMES_MISSING", Level.WARNING, "{count} frames missing before frame {sequence}"),
+        Event("CAMERA_RESTARTED", Level.WARNING, "the camera restarted"),
+        Event("MIRROR_ADOPTED", Level.INFO, "starting from the mirror's command, {rms_nm:.1f} nm rms of wavefront"),
+        Event("MIRROR_SILENT", Level.WARNING, "no mirror state within {patience_s:g} s; taking the mirror for flat"),
+        Event("MIRROR_REFUSED", Level.WARNING, "the mirror's shape is not adopted: {why}"),
+        Event("LIMIT_HIT", Level.WARNING, "mirror limit reached: {reason}"),
+        Event("LIMIT_CLEARED", Level.INFO, "mirror limit no longer reached: {reason}"),
+        Event("COMMAND_EXPIRED", Level.WARNING, "the last command expired after {valid_ms:.0f} ms; {action}"),
+        Event("COMMAND_BACK", Level.INFO, "commands are back"),
+        Event("COMMAND_REFUSED", Level.WARNING, "command refused: {reason}"),
+        Event("RECORDING", Level.INFO, "recording to {file}"),
+        Event("MESSAGES_LOST", Level.ERROR, "{count} messages lost on {topic}"),
+        Event("RECORDING_FAILED", Level.ERROR, "recording stopped: {why}"),
+        Event("BAD_MESSAGE", Level.WARNING, "a message on {topic} could not be read: {why}"),
+    )
+}

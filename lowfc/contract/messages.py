@@ -1,0 +1,230 @@
+"""The one table of topics; bus, recorder, health, documentation and access control derive from it.
+
+A topic's key on the bus is its topic in a log without the leading slash. Payloads are protobuf: the project's own
+package `lowfc.v1` (declared in `proto/lowfc/v1/lowfc.proto`) and Foxglove's schemas for images and log lines.
+"""
+
+from dataclasses import dataclass
+from enum import StrEnum
+
+import numpy as np
+import numpy.typing as npt
+from foxglove_schemas_protobuf.Log_pb2 import Log
+from foxglove_schemas_protobuf.RawImage_pb2 import RawImage
+from google.protobuf.message import Message
+from google.protobuf.timestamp_pb2 import Timestamp
+
+from lowfc.contract.wire import lowfc_pb2 as wire
+
+__all__ = ["TOPICS", "Log", "Message", "RawImage", "Role", "Timestamp", "Topic", "from_timestamp", "timestamp", "wire"]
+
+
+class Role(StrEnum):
+    """The processes of a run, by the part they play; a mirror's process is `mirror-<name>`."""
+
+    CAMERA = "camera"
+    MIRROR = "mirror"
+    CONTROLLER = "controller"
+    RECORDER = "recorder"
+    LAUNCHER = "launcher"
+    VIEWER = "viewer"
+    OPERATOR = "operator"
+
+
+class Rate(StrEnum):
+    """How often a topic is published, where it is not a number of hertz."""
+
+    LOOP = "every frame"
+    EVENT = "on event"
+
+
+@dataclass(frozen=True, slots=True)
+class Topic:
+    """One line of the table.
+
+    Attributes:
+        key: zenoh key; `{name}` stands for a mirror's or a process's name.
+        message: class of the payload.
+        rate: loop, on event, or the number of hertz.
+        publisher: who may put it.
+        subscribers: who gets it.
+        simulated_only: there is no such topic on a bench with real devices.
+        timeless: in lockstep two runs with the same seed write the same payload bytes.
+        queryable: a late joiner may ask the publisher for the last one.
+        sentence: what it is.
+    """
+
+    key: str
+    message: type[Message]
+    rate: Rate | float
+    publisher: frozenset[Role]
+    subscribers: frozenset[Role]
+    sentence: str
+    simulated_only: bool = False
+    timeless: bool = True
+    queryable: bool = False
+
+    def at(self, name: str) -> str:
+        """Key of this topic for the mirror or process `name`."""
+        return self.key.format(name=name)
+
+    @property
+    def in_loop(self) -> bool:
+        """Whether a late message costs the loop a frame: sent at once, ahead of everything else."""
+        return self.rate is Rate.LOOP and Role.CONTROLLER in self.publisher | self.subscribers
+
+    def matches(self, key: str) -> bool:
+        """Whether `key` is this topic, for any name."""
+        before, name, after = self.key.partition("{name}")
+        if not name:
+            return key == before
+        return key.startswith(before) and key.endswith(after) and len(key) > len(before) + len(after)
+
+
+EVERYBODY = frozenset(Role)
+_WATCHERS = frozenset({Role.RECORDER, Role.VIEWER})
+_CAMERA, _MIRROR, _CONTROLLER = frozenset({Role.CAMERA}), frozenset({Role.MIRROR}), frozenset({Role.CONTROLLER})
+
+FRAME = Topic(
+    "lowfc/camera/frame",
+    RawImage,
+    Rate.LOOP,
+    _CAMERA,
+    _CONTROLLER | _WATCHERS,
+    "Sensor image, mono16, DN; its time is the end of the exposure.",
+)
+CAMERA_STATE = Topic(
+    "lowfc/camera/state", wire.CameraState, 2.0, _CAMERA, EVERYBODY, "The camera's settings.", queryable=True
+)
+STEP = Topic("lowfc/control/step", wire.ControlStep, Rate.LOOP, _CONTROLLER, _WATCHERS, "One step of the control law.")
+TIMING = Topic(
+    "lowfc/control/timing",
+    wire.ControlTiming,
+    10.0,
+    _CONTROLLER,
+    _WATCHERS,
+    "How long each stage of each step took.",
+    timeless=False,
+)
+CONTROLLER_STATE = Topic(
+    "lowfc/control/state",
+    wire.ControllerState,
+    1.0,
+    _CONTROLLER,
+    _WATCHERS,
+    "Everything the next command depends on, besides the calibration.",
+    queryable=True,
+)
+REQUEST = Topic(
+    "lowfc/control/request",
+    wire.Request,
+    Rate.EVENT,
+    _CONTROLLER,
+    _WATCHERS,
+    "What an operator asked, and the answer.",
+)
+COMMAND = Topic(
+    "lowfc/mirror/{name}/command",
+    wire.MirrorCommand,
+    Rate.LOOP,
+    _CONTROLLER,
+    _MIRROR | {Role.RECORDER},
+    "Where the mirror shall be.",
+)
+MIRROR_STATE = Topic(
+    "lowfc/mirror/{name}/state",
+    wire.MirrorState,
+    Rate.LOOP,
+    _MIRROR,
+    _CONTROLLER | _CAMERA | _WATCHERS,
+    "Where the mirror is.",
+)
+SURFACE = Topic(
+    "lowfc/mirror/{name}/surface",
+    RawImage,
+    30.0,
+    _MIRROR,
+    _WATCHERS,
+    "The mirror's surface over the pupil, 32FC1, nm: for eyes.",
+)
+TRUTH = Topic(
+    "lowfc/sim/truth",
+    wire.Truth,
+    Rate.LOOP,
+    _CAMERA,
+    _WATCHERS,
+    "What the simulation knows and no sensor does.",
+    simulated_only=True,
+)
+CALIBRATION = Topic(
+    "lowfc/calibration",
+    wire.Calibration,
+    Rate.EVENT,
+    _CONTROLLER,
+    _WATCHERS,
+    "What turns a frame into a command.",
+    queryable=True,
+)
+EVENT = Topic("lowfc/event", Log, Rate.EVENT, EVERYBODY, EVERYBODY, "A named event, from the table of events.")
+HEALTH = Topic(
+    "lowfc/health/{name}", wire.Health, 2.0, EVERYBODY, EVERYBODY, "How a process is.", timeless=False, queryable=True
+)
+
+TOPICS: tuple[Topic, ...] = (
+    FRAME,
+    CAMERA_STATE,
+    STEP,
+    TIMING,
+    CONTROLLER_STATE,
+    REQUEST,
+    COMMAND,
+    MIRROR_STATE,
+    SURFACE,
+    TRUTH,
+    CALIBRATION,
+    EVENT,
+    HEALTH,
+)
+
+REQUEST_KEY = "lowfc/request/{name}"
+"""Key of the queryable for one kind of request; the query's payload is a `lowfc.v1.Request`."""
+
+MONO16 = "mono16"
+FLOAT32 = "32FC1"
+
+
+def topic_of(key: str) -> Topic:
+    """Return the line of the table for a key on the bus.
+
+    Raises:
+        KeyError: there is no such topic.
+    """
+    for topic in TOPICS:
+        if topic.matches(key):
+            return topic
+    raise KeyError(key)
+
+
+def timestamp(time_ns: int) -> Timestamp:
+    """Message form of nanoseconds since the epoch."""
+    seconds, nanos = divmod(time_ns, 1_000_000_000)
+    return Timestamp(seconds=seconds, nanos=nanos)
+
+
+def from_timestamp(stamp: Timestamp) -> int:
+    """Nanoseconds since the epoch of a message's time."""
+    return stamp.seconds * 1_000_000_000 + stamp.nanos
+
+
+def image(array: npt.NDArray[np.uint16] | npt.NDArray[np.float32], time_ns: int, frame_id: str) -> RawImage:
+    """Message of an image (rows, columns): uint16 becomes mono16, float32 becomes 32FC1, both little-endian."""
+    rows, columns = array.shape
+    return RawImage(
+        timestamp=timestamp(time_ns),
+        frame_id=frame_id,
+        width=columns,
+        height=rows,
+        encoding=MONO16 if array.dtype == np.uint16 else FLOAT32,
+        step=columns * array.itemsize,
+        data=array.tobytes(),
+    )

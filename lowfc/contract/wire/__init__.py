@@ -1,0 +1,1 @@
+"""Code that protoc generated from `lowfc/contract/proto`; `make proto` rewrites it."""

@@ -1,0 +1,400 @@
+import datetime
+
+from google.protobuf import timestamp_pb2 as _timestamp_pb2
+from google.protobuf.internal import containers as _containers
+from google.protobuf.internal import enum_type_wrapper as _enum_type_wrapper
+from google.protobuf import descriptor as _descriptor
+from google.protobuf import message as _message
+from collections.abc import Iterable as _Iterable, Mapping as _Mapping
+from typing import ClassVar as _ClassVar, Optional as _Optional, Union as _Union
+
+DESCRIPTOR: _descriptor.FileDescriptor
+
+class LoopMode(int, metaclass=_enum_type_wrapper.EnumTypeWrapper):
+    __slots__ = ()
+    LOOP_MODE_UNSPECIFIED: _ClassVar[LoopMode]
+    LOOP_MODE_IDLE: _ClassVar[LoopMode]
+    LOOP_MODE_OPEN: _ClassVar[LoopMode]
+    LOOP_MODE_CLOSED: _ClassVar[LoopMode]
+    LOOP_MODE_SAFED: _ClassVar[LoopMode]
+
+class Reason(int, metaclass=_enum_type_wrapper.EnumTypeWrapper):
+    __slots__ = ()
+    REASON_UNSPECIFIED: _ClassVar[Reason]
+    REASON_NO_CALIBRATION: _ClassVar[Reason]
+    REASON_WRONG_SIZE: _ClassVar[Reason]
+    REASON_OUT_OF_ORDER: _ClassVar[Reason]
+    REASON_REPEATED: _ClassVar[Reason]
+    REASON_LATE: _ClassVar[Reason]
+    REASON_SATURATED: _ClassVar[Reason]
+    REASON_DARK: _ClassVar[Reason]
+    REASON_NO_FRAME: _ClassVar[Reason]
+    REASON_MODAL_LIMIT: _ClassVar[Reason]
+    REASON_STROKE: _ClassVar[Reason]
+    REASON_SLEW: _ClassVar[Reason]
+    REASON_NEIGHBOUR: _ClassVar[Reason]
+    REASON_NOT_FINITE: _ClassVar[Reason]
+    REASON_WRONG_GRID: _ClassVar[Reason]
+
+class MirrorStatus(int, metaclass=_enum_type_wrapper.EnumTypeWrapper):
+    __slots__ = ()
+    MIRROR_STATUS_UNSPECIFIED: _ClassVar[MirrorStatus]
+    MIRROR_STATUS_WAITING: _ClassVar[MirrorStatus]
+    MIRROR_STATUS_FOLLOWING: _ClassVar[MirrorStatus]
+    MIRROR_STATUS_EXPIRED: _ClassVar[MirrorStatus]
+LOOP_MODE_UNSPECIFIED: LoopMode
+LOOP_MODE_IDLE: LoopMode
+LOOP_MODE_OPEN: LoopMode
+LOOP_MODE_CLOSED: LoopMode
+LOOP_MODE_SAFED: LoopMode
+REASON_UNSPECIFIED: Reason
+REASON_NO_CALIBRATION: Reason
+REASON_WRONG_SIZE: Reason
+REASON_OUT_OF_ORDER: Reason
+REASON_REPEATED: Reason
+REASON_LATE: Reason
+REASON_SATURATED: Reason
+REASON_DARK: Reason
+REASON_NO_FRAME: Reason
+REASON_MODAL_LIMIT: Reason
+REASON_STROKE: Reason
+REASON_SLEW: Reason
+REASON_NEIGHBOUR: Reason
+REASON_NOT_FINITE: Reason
+REASON_WRONG_GRID: Reason
+MIRROR_STATUS_UNSPECIFIED: MirrorStatus
+MIRROR_STATUS_WAITING: MirrorStatus
+MIRROR_STATUS_FOLLOWING: MirrorStatus
+MIRROR_STATUS_EXPIRED: MirrorStatus
+
+class CameraState(_message.Message):
+    __slots__ = ("timestamp", "exposure_ns", "period_ns", "gain_e_per_dn", "bias_dn", "read_noise_e", "saturation_dn", "region_row", "region_column", "rows", "columns", "bit_depth", "em_gain")
+    TIMESTAMP_FIELD_NUMBER: _ClassVar[int]
+    EXPOSURE_NS_FIELD_NUMBER: _ClassVar[int]
+    PERIOD_NS_FIELD_NUMBER: _ClassVar[int]
+    GAIN_E_PER_DN_FIELD_NUMBER: _ClassVar[int]
+    BIAS_DN_FIELD_NUMBER: _ClassVar[int]
+    READ_NOISE_E_FIELD_NUMBER: _ClassVar[int]
+    SATURATION_DN_FIELD_NUMBER: _ClassVar[int]
+    REGION_ROW_FIELD_NUMBER: _ClassVar[int]
+    REGION_COLUMN_FIELD_NUMBER: _ClassVar[int]
+    ROWS_FIELD_NUMBER: _ClassVar[int]
+    COLUMNS_FIELD_NUMBER: _ClassVar[int]
+    BIT_DEPTH_FIELD_NUMBER: _ClassVar[int]
+    EM_GAIN_FIELD_NUMBER: _ClassVar[int]
+    timestamp: _timestamp_pb2.Timestamp
+    exposure_ns: int
+    period_ns: int
+    gain_e_per_dn: float
+    bias_dn: float
+    read_noise_e: float
+    saturation_dn: float
+    region_row: int
+    region_column: int
+    rows: int
+    columns: int
+    bit_depth: int
+    em_gain: float
+    def __init__(self, timestamp: _Optional[_Union[datetime.datetime, _timestamp_pb2.Timestamp, _Mapping]] = ..., exposure_ns: _Optional[int] = ..., period_ns: _Optional[int] = ..., gain_e_per_dn: _Optional[float] = ..., bias_dn: _Optional[float] = ..., read_noise_e: _Optional[float] = ..., saturation_dn: _Optional[float] = ..., region_row: _Optional[int] = ..., region_column: _Optional[int] = ..., rows: _Optional[int] = ..., columns: _Optional[int] = ..., bit_depth: _Optional[int] = ..., em_gain: _Optional[float] = ...) -> None: ...
+
+class ControlStep(_message.Message):
+    __slots__ = ("timestamp", "frame_sequence", "mode", "error_nm", "pol_nm", "command_nm", "reasons", "flux_dn", "saturated_pixels")
+    TIMESTAMP_FIELD_NUMBER: _ClassVar[int]
+    FRAME_SEQUENCE_FIELD_NUMBER: _ClassVar[int]
+    MODE_FIELD_NUMBER: _ClassVar[int]
+    ERROR_NM_FIELD_NUMBER: _ClassVar[int]
+    POL_NM_FIELD_NUMBER: _ClassVar[int]
+    COMMAND_NM_FIELD_NUMBER: _ClassVar[int]
+    REASONS_FIELD_NUMBER: _ClassVar[int]
+    FLUX_DN_FIELD_NUMBER: _ClassVar[int]
+    SATURATED_PIXELS_FIELD_NUMBER: _ClassVar[int]
+    timestamp: _timestamp_pb2.Timestamp
+    frame_sequence: int
+    mode: LoopMode
+    error_nm: _containers.RepeatedScalarFieldContainer[float]
+    pol_nm: _containers.RepeatedScalarFieldContainer[float]
+    command_nm: _containers.RepeatedScalarFieldContainer[float]
+    reasons: _containers.RepeatedScalarFieldContainer[Reason]
+    flux_dn: float
+    saturated_pixels: int
+    def __init__(self, timestamp: _Optional[_Union[datetime.datetime, _timestamp_pb2.Timestamp, _Mapping]] = ..., frame_sequence: _Optional[int] = ..., mode: _Optional[_Union[LoopMode, str]] = ..., error_nm: _Optional[_Iterable[float]] = ..., pol_nm: _Optional[_Iterable[float]] = ..., command_nm: _Optional[_Iterable[float]] = ..., reasons: _Optional[_Iterable[_Union[Reason, str]]] = ..., flux_dn: _Optional[float] = ..., saturated_pixels: _Optional[int] = ...) -> None: ...
+
+class ControlTiming(_message.Message):
+    __slots__ = ("timestamp", "frame_sequence", "transport_ns", "wakeup_ns", "compute_ns", "publish_ns", "frame_to_command_ns")
+    TIMESTAMP_FIELD_NUMBER: _ClassVar[int]
+    FRAME_SEQUENCE_FIELD_NUMBER: _ClassVar[int]
+    TRANSPORT_NS_FIELD_NUMBER: _ClassVar[int]
+    WAKEUP_NS_FIELD_NUMBER: _ClassVar[int]
+    COMPUTE_NS_FIELD_NUMBER: _ClassVar[int]
+    PUBLISH_NS_FIELD_NUMBER: _ClassVar[int]
+    FRAME_TO_COMMAND_NS_FIELD_NUMBER: _ClassVar[int]
+    timestamp: _timestamp_pb2.Timestamp
+    frame_sequence: _containers.RepeatedScalarFieldContainer[int]
+    transport_ns: _containers.RepeatedScalarFieldContainer[int]
+    wakeup_ns: _containers.RepeatedScalarFieldContainer[int]
+    compute_ns: _containers.RepeatedScalarFieldContainer[int]
+    publish_ns: _containers.RepeatedScalarFieldContainer[int]
+    frame_to_command_ns: _containers.RepeatedScalarFieldContainer[int]
+    def __init__(self, timestamp: _Optional[_Union[datetime.datetime, _timestamp_pb2.Timestamp, _Mapping]] = ..., frame_sequence: _Optional[_Iterable[int]] = ..., transport_ns: _Optional[_Iterable[int]] = ..., wakeup_ns: _Optional[_Iterable[int]] = ..., compute_ns: _Optional[_Iterable[int]] = ..., publish_ns: _Optional[_Iterable[int]] = ..., frame_to_command_ns: _Optional[_Iterable[int]] = ...) -> None: ...
+
+class ReasonCount(_message.Message):
+    __slots__ = ("reason", "count")
+    REASON_FIELD_NUMBER: _ClassVar[int]
+    COUNT_FIELD_NUMBER: _ClassVar[int]
+    reason: Reason
+    count: int
+    def __init__(self, reason: _Optional[_Union[Reason, str]] = ..., count: _Optional[int] = ...) -> None: ...
+
+class ControllerState(_message.Message):
+    __slots__ = ("timestamp", "frame_sequence", "mode", "calibration_id", "gain", "leak", "limit_nm", "delay_frames", "command_history_nm", "actuators", "offset", "counts", "frames_used")
+    TIMESTAMP_FIELD_NUMBER: _ClassVar[int]
+    FRAME_SEQUENCE_FIELD_NUMBER: _ClassVar[int]
+    MODE_FIELD_NUMBER: _ClassVar[int]
+    CALIBRATION_ID_FIELD_NUMBER: _ClassVar[int]
+    GAIN_FIELD_NUMBER: _ClassVar[int]
+    LEAK_FIELD_NUMBER: _ClassVar[int]
+    LIMIT_NM_FIELD_NUMBER: _ClassVar[int]
+    DELAY_FRAMES_FIELD_NUMBER: _ClassVar[int]
+    COMMAND_HISTORY_NM_FIELD_NUMBER: _ClassVar[int]
+    ACTUATORS_FIELD_NUMBER: _ClassVar[int]
+    OFFSET_FIELD_NUMBER: _ClassVar[int]
+    COUNTS_FIELD_NUMBER: _ClassVar[int]
+    FRAMES_USED_FIELD_NUMBER: _ClassVar[int]
+    timestamp: _timestamp_pb2.Timestamp
+    frame_sequence: int
+    mode: LoopMode
+    calibration_id: str
+    gain: _containers.RepeatedScalarFieldContainer[float]
+    leak: _containers.RepeatedScalarFieldContainer[float]
+    limit_nm: _containers.RepeatedScalarFieldContainer[float]
+    delay_frames: float
+    command_history_nm: _containers.RepeatedScalarFieldContainer[float]
+    actuators: bytes
+    offset: bytes
+    counts: _containers.RepeatedCompositeFieldContainer[ReasonCount]
+    frames_used: int
+    def __init__(self, timestamp: _Optional[_Union[datetime.datetime, _timestamp_pb2.Timestamp, _Mapping]] = ..., frame_sequence: _Optional[int] = ..., mode: _Optional[_Union[LoopMode, str]] = ..., calibration_id: _Optional[str] = ..., gain: _Optional[_Iterable[float]] = ..., leak: _Optional[_Iterable[float]] = ..., limit_nm: _Optional[_Iterable[float]] = ..., delay_frames: _Optional[float] = ..., command_history_nm: _Optional[_Iterable[float]] = ..., actuators: _Optional[bytes] = ..., offset: _Optional[bytes] = ..., counts: _Optional[_Iterable[_Union[ReasonCount, _Mapping]]] = ..., frames_used: _Optional[int] = ...) -> None: ...
+
+class Request(_message.Message):
+    __slots__ = ("timestamp", "name", "modes", "values", "text", "accepted", "reply", "frame_sequence", "state")
+    TIMESTAMP_FIELD_NUMBER: _ClassVar[int]
+    NAME_FIELD_NUMBER: _ClassVar[int]
+    MODES_FIELD_NUMBER: _ClassVar[int]
+    VALUES_FIELD_NUMBER: _ClassVar[int]
+    TEXT_FIELD_NUMBER: _ClassVar[int]
+    ACCEPTED_FIELD_NUMBER: _ClassVar[int]
+    REPLY_FIELD_NUMBER: _ClassVar[int]
+    FRAME_SEQUENCE_FIELD_NUMBER: _ClassVar[int]
+    STATE_FIELD_NUMBER: _ClassVar[int]
+    timestamp: _timestamp_pb2.Timestamp
+    name: str
+    modes: _containers.RepeatedScalarFieldContainer[int]
+    values: _containers.RepeatedScalarFieldContainer[float]
+    text: str
+    accepted: bool
+    reply: str
+    frame_sequence: int
+    state: ControllerState
+    def __init__(self, timestamp: _Optional[_Union[datetime.datetime, _timestamp_pb2.Timestamp, _Mapping]] = ..., name: _Optional[str] = ..., modes: _Optional[_Iterable[int]] = ..., values: _Optional[_Iterable[float]] = ..., text: _Optional[str] = ..., accepted: _Optional[bool] = ..., reply: _Optional[str] = ..., frame_sequence: _Optional[int] = ..., state: _Optional[_Union[ControllerState, _Mapping]] = ...) -> None: ...
+
+class MirrorCommand(_message.Message):
+    __slots__ = ("timestamp", "frame_sequence", "channel", "valid_for_ns", "rows", "columns", "actuators", "command_nm")
+    TIMESTAMP_FIELD_NUMBER: _ClassVar[int]
+    FRAME_SEQUENCE_FIELD_NUMBER: _ClassVar[int]
+    CHANNEL_FIELD_NUMBER: _ClassVar[int]
+    VALID_FOR_NS_FIELD_NUMBER: _ClassVar[int]
+    ROWS_FIELD_NUMBER: _ClassVar[int]
+    COLUMNS_FIELD_NUMBER: _ClassVar[int]
+    ACTUATORS_FIELD_NUMBER: _ClassVar[int]
+    COMMAND_NM_FIELD_NUMBER: _ClassVar[int]
+    timestamp: _timestamp_pb2.Timestamp
+    frame_sequence: int
+    channel: str
+    valid_for_ns: int
+    rows: int
+    columns: int
+    actuators: bytes
+    command_nm: _containers.RepeatedScalarFieldContainer[float]
+    def __init__(self, timestamp: _Optional[_Union[datetime.datetime, _timestamp_pb2.Timestamp, _Mapping]] = ..., frame_sequence: _Optional[int] = ..., channel: _Optional[str] = ..., valid_for_ns: _Optional[int] = ..., rows: _Optional[int] = ..., columns: _Optional[int] = ..., actuators: _Optional[bytes] = ..., command_nm: _Optional[_Iterable[float]] = ...) -> None: ...
+
+class MirrorState(_message.Message):
+    __slots__ = ("timestamp", "frame_sequence", "status", "rows", "columns", "actuators", "command_nm", "limits_hit", "channels")
+    TIMESTAMP_FIELD_NUMBER: _ClassVar[int]
+    FRAME_SEQUENCE_FIELD_NUMBER: _ClassVar[int]
+    STATUS_FIELD_NUMBER: _ClassVar[int]
+    ROWS_FIELD_NUMBER: _ClassVar[int]
+    COLUMNS_FIELD_NUMBER: _ClassVar[int]
+    ACTUATORS_FIELD_NUMBER: _ClassVar[int]
+    COMMAND_NM_FIELD_NUMBER: _ClassVar[int]
+    LIMITS_HIT_FIELD_NUMBER: _ClassVar[int]
+    CHANNELS_FIELD_NUMBER: _ClassVar[int]
+    timestamp: _timestamp_pb2.Timestamp
+    frame_sequence: int
+    status: MirrorStatus
+    rows: int
+    columns: int
+    actuators: bytes
+    command_nm: _containers.RepeatedScalarFieldContainer[float]
+    limits_hit: _containers.RepeatedScalarFieldContainer[Reason]
+    channels: _containers.RepeatedScalarFieldContainer[str]
+    def __init__(self, timestamp: _Optional[_Union[datetime.datetime, _timestamp_pb2.Timestamp, _Mapping]] = ..., frame_sequence: _Optional[int] = ..., status: _Optional[_Union[MirrorStatus, str]] = ..., rows: _Optional[int] = ..., columns: _Optional[int] = ..., actuators: _Optional[bytes] = ..., command_nm: _Optional[_Iterable[float]] = ..., limits_hit: _Optional[_Iterable[_Union[Reason, str]]] = ..., channels: _Optional[_Iterable[str]] = ...) -> None: ...
+
+class Truth(_message.Message):
+    __slots__ = ("timestamp", "frame_sequence", "disturbance_nm", "residual_nm", "disturbance_rms_nm", "residual_rms_nm")
+    TIMESTAMP_FIELD_NUMBER: _ClassVar[int]
+    FRAME_SEQUENCE_FIELD_NUMBER: _ClassVar[int]
+    DISTURBANCE_NM_FIELD_NUMBER: _ClassVar[int]
+    RESIDUAL_NM_FIELD_NUMBER: _ClassVar[int]
+    DISTURBANCE_RMS_NM_FIELD_NUMBER: _ClassVar[int]
+    RESIDUAL_RMS_NM_FIELD_NUMBER: _ClassVar[int]
+    timestamp: _timestamp_pb2.Timestamp
+    frame_sequence: int
+    disturbance_nm: _containers.RepeatedScalarFieldContainer[float]
+    residual_nm: _containers.RepeatedScalarFieldContainer[float]
+    disturbance_rms_nm: float
+    residual_rms_nm: float
+    def __init__(self, timestamp: _Optional[_Union[datetime.datetime, _timestamp_pb2.Timestamp, _Mapping]] = ..., frame_sequence: _Optional[int] = ..., disturbance_nm: _Optional[_Iterable[float]] = ..., residual_nm: _Optional[_Iterable[float]] = ..., disturbance_rms_nm: _Optional[float] = ..., residual_rms_nm: _Optional[float] = ...) -> None: ...
+
+class Calibration(_message.Message):
+    __slots__ = ("timestamp", "id", "operator_hash", "estimator", "noll", "mode_names", "wavelength_nm", "rows", "columns", "reference", "response", "reconstructor", "mask", "dark", "flux_dn", "saturation_dn", "mirror_rows", "mirror_columns", "modes_to_actuators")
+    TIMESTAMP_FIELD_NUMBER: _ClassVar[int]
+    ID_FIELD_NUMBER: _ClassVar[int]
+    OPERATOR_HASH_FIELD_NUMBER: _ClassVar[int]
+    ESTIMATOR_FIELD_NUMBER: _ClassVar[int]
+    NOLL_FIELD_NUMBER: _ClassVar[int]
+    MODE_NAMES_FIELD_NUMBER: _ClassVar[int]
+    WAVELENGTH_NM_FIELD_NUMBER: _ClassVar[int]
+    ROWS_FIELD_NUMBER: _ClassVar[int]
+    COLUMNS_FIELD_NUMBER: _ClassVar[int]
+    REFERENCE_FIELD_NUMBER: _ClassVar[int]
+    RESPONSE_FIELD_NUMBER: _ClassVar[int]
+    RECONSTRUCTOR_FIELD_NUMBER: _ClassVar[int]
+    MASK_FIELD_NUMBER: _ClassVar[int]
+    DARK_FIELD_NUMBER: _ClassVar[int]
+    FLUX_DN_FIELD_NUMBER: _ClassVar[int]
+    SATURATION_DN_FIELD_NUMBER: _ClassVar[int]
+    MIRROR_ROWS_FIELD_NUMBER: _ClassVar[int]
+    MIRROR_COLUMNS_FIELD_NUMBER: _ClassVar[int]
+    MODES_TO_ACTUATORS_FIELD_NUMBER: _ClassVar[int]
+    timestamp: _timestamp_pb2.Timestamp
+    id: str
+    operator_hash: str
+    estimator: str
+    noll: _containers.RepeatedScalarFieldContainer[int]
+    mode_names: _containers.RepeatedScalarFieldContainer[str]
+    wavelength_nm: float
+    rows: int
+    columns: int
+    reference: bytes
+    response: bytes
+    reconstructor: bytes
+    mask: bytes
+    dark: bytes
+    flux_dn: float
+    saturation_dn: float
+    mirror_rows: int
+    mirror_columns: int
+    modes_to_actuators: bytes
+    def __init__(self, timestamp: _Optional[_Union[datetime.datetime, _timestamp_pb2.Timestamp, _Mapping]] = ..., id: _Optional[str] = ..., operator_hash: _Optional[str] = ..., estimator: _Optional[str] = ..., noll: _Optional[_Iterable[int]] = ..., mode_names: _Optional[_Iterable[str]] = ..., wavelength_nm: _Optional[float] = ..., rows: _Optional[int] = ..., columns: _Optional[int] = ..., reference: _Optional[bytes] = ..., response: _Optional[bytes] = ..., reconstructor: _Optional[bytes] = ..., mask: _Optional[bytes] = ..., dark: _Optional[bytes] = ..., flux_dn: _Optional[float] = ..., saturation_dn: _Optional[float] = ..., mirror_rows: _Optional[int] = ..., mirror_columns: _Optional[int] = ..., modes_to_actuators: _Optional[bytes] = ...) -> None: ...
+
+class TopicCount(_message.Message):
+    __slots__ = ("topic", "published", "received", "skipped", "missing", "last_sequence")
+    TOPIC_FIELD_NUMBER: _ClassVar[int]
+    PUBLISHED_FIELD_NUMBER: _ClassVar[int]
+    RECEIVED_FIELD_NUMBER: _ClassVar[int]
+    SKIPPED_FIELD_NUMBER: _ClassVar[int]
+    MISSING_FIELD_NUMBER: _ClassVar[int]
+    LAST_SEQUENCE_FIELD_NUMBER: _ClassVar[int]
+    topic: str
+    published: int
+    received: int
+    skipped: int
+    missing: int
+    last_sequence: int
+    def __init__(self, topic: _Optional[str] = ..., published: _Optional[int] = ..., received: _Optional[int] = ..., skipped: _Optional[int] = ..., missing: _Optional[int] = ..., last_sequence: _Optional[int] = ...) -> None: ...
+
+class Latency(_message.Message):
+    __slots__ = ("count", "p50_ns", "p99_ns", "p99_9_ns", "max_ns")
+    COUNT_FIELD_NUMBER: _ClassVar[int]
+    P50_NS_FIELD_NUMBER: _ClassVar[int]
+    P99_NS_FIELD_NUMBER: _ClassVar[int]
+    P99_9_NS_FIELD_NUMBER: _ClassVar[int]
+    MAX_NS_FIELD_NUMBER: _ClassVar[int]
+    count: int
+    p50_ns: int
+    p99_ns: int
+    p99_9_ns: int
+    max_ns: int
+    def __init__(self, count: _Optional[int] = ..., p50_ns: _Optional[int] = ..., p99_ns: _Optional[int] = ..., p99_9_ns: _Optional[int] = ..., max_ns: _Optional[int] = ...) -> None: ...
+
+class WavefrontFigures(_message.Message):
+    __slots__ = ("disturbance_rms_nm", "residual_rms_nm", "tilt_disturbance_mas", "tilt_residual_mas")
+    DISTURBANCE_RMS_NM_FIELD_NUMBER: _ClassVar[int]
+    RESIDUAL_RMS_NM_FIELD_NUMBER: _ClassVar[int]
+    TILT_DISTURBANCE_MAS_FIELD_NUMBER: _ClassVar[int]
+    TILT_RESIDUAL_MAS_FIELD_NUMBER: _ClassVar[int]
+    disturbance_rms_nm: float
+    residual_rms_nm: float
+    tilt_disturbance_mas: float
+    tilt_residual_mas: float
+    def __init__(self, disturbance_rms_nm: _Optional[float] = ..., residual_rms_nm: _Optional[float] = ..., tilt_disturbance_mas: _Optional[float] = ..., tilt_residual_mas: _Optional[float] = ...) -> None: ...
+
+class Recording(_message.Message):
+    __slots__ = ("file", "messages", "lost", "bytes")
+    FILE_FIELD_NUMBER: _ClassVar[int]
+    MESSAGES_FIELD_NUMBER: _ClassVar[int]
+    LOST_FIELD_NUMBER: _ClassVar[int]
+    BYTES_FIELD_NUMBER: _ClassVar[int]
+    file: str
+    messages: int
+    lost: int
+    bytes: int
+    def __init__(self, file: _Optional[str] = ..., messages: _Optional[int] = ..., lost: _Optional[int] = ..., bytes: _Optional[int] = ...) -> None: ...
+
+class Health(_message.Message):
+    __slots__ = ("timestamp", "process", "state", "run_id", "pid", "version", "memory_bytes", "rate_hz", "heard", "topics", "granted", "refused", "clock_offset_ns", "uptime_ns", "frame_to_command", "frame_to_mirror", "wavefront", "recording", "mode", "counts", "commands_late", "mean_rate_hz")
+    TIMESTAMP_FIELD_NUMBER: _ClassVar[int]
+    PROCESS_FIELD_NUMBER: _ClassVar[int]
+    STATE_FIELD_NUMBER: _ClassVar[int]
+    RUN_ID_FIELD_NUMBER: _ClassVar[int]
+    PID_FIELD_NUMBER: _ClassVar[int]
+    VERSION_FIELD_NUMBER: _ClassVar[int]
+    MEMORY_BYTES_FIELD_NUMBER: _ClassVar[int]
+    RATE_HZ_FIELD_NUMBER: _ClassVar[int]
+    HEARD_FIELD_NUMBER: _ClassVar[int]
+    TOPICS_FIELD_NUMBER: _ClassVar[int]
+    GRANTED_FIELD_NUMBER: _ClassVar[int]
+    REFUSED_FIELD_NUMBER: _ClassVar[int]
+    CLOCK_OFFSET_NS_FIELD_NUMBER: _ClassVar[int]
+    UPTIME_NS_FIELD_NUMBER: _ClassVar[int]
+    FRAME_TO_COMMAND_FIELD_NUMBER: _ClassVar[int]
+    FRAME_TO_MIRROR_FIELD_NUMBER: _ClassVar[int]
+    WAVEFRONT_FIELD_NUMBER: _ClassVar[int]
+    RECORDING_FIELD_NUMBER: _ClassVar[int]
+    MODE_FIELD_NUMBER: _ClassVar[int]
+    COUNTS_FIELD_NUMBER: _ClassVar[int]
+    COMMANDS_LATE_FIELD_NUMBER: _ClassVar[int]
+    MEAN_RATE_HZ_FIELD_NUMBER: _ClassVar[int]
+    timestamp: _timestamp_pb2.Timestamp
+    process: str
+    state: str
+    run_id: str
+    pid: int
+    version: str
+    memory_bytes: int
+    rate_hz: float
+    heard: _containers.RepeatedScalarFieldContainer[str]
+    topics: _containers.RepeatedCompositeFieldContainer[TopicCount]
+    granted: _containers.RepeatedScalarFieldContainer[str]
+    refused: _containers.RepeatedScalarFieldContainer[str]
+    clock_offset_ns: int
+    uptime_ns: int
+    frame_to_command: Latency
+    frame_to_mirror: Latency
+    wavefront: WavefrontFigures
+    recording: Recording
+    mode: LoopMode
+    counts: _containers.RepeatedCompositeFieldContainer[ReasonCount]
+    commands_late: int
+    mean_rate_hz: float
+    def __init__(self, timestamp: _Optional[_Union[datetime.datetime, _timestamp_pb2.Timestamp, _Mapping]] = ..., process: _Optional[str] = ..., state: _Optional[str] = ..., run_id: _Optional[str] = ..., pid: _Optional[int] = ..., version: _Optional[str] = ..., memory_bytes: _Optional[int] = ..., rate_hz: _Optional[float] = ..., heard: _Optional[_Iterable[str]] = ..., topics: _Optional[_Iterable[_Union[TopicCount, _Mapping]]] = ..., granted: _Optional[_Iterable[str]] = ..., refused: _Optional[_Iterable[str]] = ..., clock_offset_ns: _Optional[int] = ..., uptime_ns: _Optional[int] = ..., frame_to_command: _Optional[_Union[Latency, _Mapping]] = ..., frame_to_mirror: _Optional[_Union[Latency, _Mapping]] = ..., wavefront: _Optional[_Union[WavefrontFigures, _Mapping]] = ..., recording: _Optional[_Union[Recording, _Mapping]] = ..., mode: _Optional[_Union[LoopMode, str]] = ..., counts: _Optional[_Iterable[_Union[ReasonCount, _Mapping]]] = ..., commands_late: _Optional[int] = ..., mean_rate_hz: _Optional[float] = ...) -> None: ...

@@ -1,0 +1,1 @@
+"""Estimation, control law, safety and stability: pure functions of arrays."""

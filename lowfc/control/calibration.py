@@ -1,0 +1,127 @@
+"""From reference image and response matrix to the reconstructor: flux normalisation, weights, condition."""
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+Array = npt.NDArray[np.float64]
+Single = npt.NDArray[np.float32]
+
+ESTIMATORS = ("weighted", "pinv")
+
+
+@dataclass(frozen=True, slots=True)
+class Calibration:
+    """What turns a frame into modes and modes into actuators; single precision, as the loop uses it.
+
+    Attributes:
+        noll: Noll index of each mode.
+        reference: (pixels,) I0 in flux fractions; sums to 1 over the good pixels.
+        response: (pixels, modes) H in flux fractions per nm of wavefront rms.
+        reconstructor: (modes, pixels) R in nm per flux fraction; zero at bad pixels.
+        good: (pixels,) 1 where a pixel is used, 0 where not.
+        dark: (pixels,) DN.
+        modes_to_actuators: (actuators, modes) nm of surface per nm of wavefront rms; it contains the 1/2.
+        shape: rows and columns of the frame.
+        grid: rows and columns of the mirror.
+        flux_dn: expected sum of the good pixels, dark subtracted.
+        saturation_dn: highest value a pixel can have.
+        estimator: how R was made: weighted or pinv.
+        wavelength_nm: at which H was made.
+        operator_hash: of the optical model behind it; empty for a measured calibration.
+        id: identity of the whole.
+    """
+
+    noll: tuple[int, ...]
+    reference: Single
+    response: Single
+    reconstructor: Single
+    good: Single
+    dark: Single
+    modes_to_actuators: Single
+    shape: tuple[int, int]
+    grid: tuple[int, int]
+    flux_dn: float
+    saturation_dn: float
+    estimator: str
+    wavelength_nm: float
+    operator_hash: str
+    id: str
+
+    def __post_init__(self) -> None:
+        pixels, modes, actuators = self.shape[0] * self.shape[1], len(self.noll), self.grid[0] * self.grid[1]
+        for name, shape in {
+            "reference": (pixels,),
+            "response": (pixels, modes),
+            "reconstructor": (modes, pixels),
+            "good": (pixels,),
+            "dark": (pixels,),
+            "modes_to_actuators": (actuators, modes),
+        }.items():
+            array = getattr(self, name)
+            if array.shape != shape:
+                raise ValueError(f"{name} must have shape {shape}, got {array.shape}")
+            if not np.isfinite(array).all():
+                raise ValueError(f"{name} holds values that are not finite")
+        if not self.flux_dn > 0:
+            raise ValueError(f"flux_dn must be above 0, got {self.flux_dn}")
+
+
+def normalise_flux(reference: Array, response: Array, good: Array) -> tuple[Array, Array]:
+    """Pass I0 (pixels,) and H (pixels, modes) through the normalisation that frames get: divided by their own flux.
+
+    Returns I0 in flux fractions and the derivative of I/sum(I) with respect to each mode, in flux fractions per nm.
+    """
+    flux = float(reference @ good)
+    if not flux > 0:
+        raise ValueError(f"the reference image has no light on the good pixels (sum {flux})")
+    fraction = reference / flux
+    change = good @ response / flux
+    return fraction, response / flux - np.outer(fraction, change)
+
+
+def reconstructor(
+    reference: Array, response: Array, good: Array, flux_e: float, read_noise_e: float, estimator: str = "weighted"
+) -> Array:
+    """R (modes, pixels) from normalised I0 and H: error = R (I - I0), the least-squares solution of eq. (11).
+
+    `weighted` is (H' W H)^-1 H' W with W = 1 / (I0 + read_noise^2) in electrons, the least noise that an unbiased
+    linear estimate can have; `pinv` weighs all pixels alike. Bad pixels get zero.
+
+    Raises:
+        ValueError: unknown estimator, or modes that this sensor cannot tell apart.
+    """
+    if estimator == "weighted":
+        variance_e = np.maximum(reference, 0) * flux_e + read_noise_e**2
+        weights = good / np.maximum(variance_e, 1e-12 * variance_e.max())
+    elif estimator == "pinv":
+        weights = good
+    else:
+        raise ValueError(f"estimator must be one of {', '.join(ESTIMATORS)}, got {estimator!r}")
+    root = np.sqrt(weights)[:, None]
+    scaled = root * response
+    if not condition_number(scaled) < 1e8:
+        raise ValueError(
+            "the sensor cannot tell the modes apart (condition number above 1e8): "
+            "an even-symmetric aperture mask cannot sense even modes; use another mask or fewer modes"
+        )
+    inverse: Array = np.linalg.pinv(scaled) * root.T
+    return inverse
+
+
+def condition_number(response: Array) -> float:
+    """Largest over smallest singular value of H (pixels, modes); infinite where a mode has no signal."""
+    singular = np.linalg.svd(response, compute_uv=False)
+    return float(singular[0] / singular[-1]) if singular[-1] > 0 else float("inf")
+
+
+def noise_nm(matrix: Array, reference: Array, flux_e: float, read_noise_e: float) -> Array:
+    """Standard deviation of each mode of one frame, in nm: photon and read noise through R (modes, pixels).
+
+    The normalisation divides by the frame's own noisy flux, so that each pixel's noise n acts as n - I0 sum(n).
+    """
+    good = (np.abs(matrix).sum(axis=0) > 0).astype(float)
+    variance = (np.maximum(reference, 0) * flux_e + read_noise_e**2) / flux_e**2
+    effective = matrix - np.outer(matrix @ reference, good)
+    return np.asarray(np.sqrt(effective**2 @ (variance * good)))

@@ -1,0 +1,123 @@
+"""What the controller takes in and gives out: values, with the time each was taken."""
+
+from dataclasses import dataclass, field
+
+import numpy as np
+import numpy.typing as npt
+
+from lowfc.control.calibration import Calibration
+from lowfc.control.safety import LoopMode, Reason
+
+Single = npt.NDArray[np.float32]
+
+
+@dataclass(frozen=True, slots=True)
+class Frame:
+    """A sensor image that arrived: `pixels` (rows, columns) uint16, DN, or None where the message made no image."""
+
+    sequence: int
+    time_ns: int
+    age_ns: int
+    pixels: npt.NDArray[np.uint16] | None
+
+
+@dataclass(frozen=True, slots=True)
+class Request:
+    """What an operator asks: `modes` are Noll indices, empty for all; one value for all modes or one for each."""
+
+    time_ns: int
+    name: str
+    modes: tuple[int, ...] = ()
+    values: tuple[float, ...] = ()
+
+
+@dataclass(frozen=True, slots=True)
+class MirrorShape:
+    """Where the mirror is: actuators (rows, columns) nm of surface, and the modal command behind them."""
+
+    time_ns: int
+    actuators_nm: Single
+    command_nm: Single
+
+
+@dataclass(frozen=True, slots=True)
+class CameraSettings:
+    """What of the camera must fit the calibration."""
+
+    time_ns: int
+    shape: tuple[int, int]
+    bias_dn: float
+    saturation_dn: float
+
+
+@dataclass(frozen=True, slots=True)
+class Load:
+    """A calibration to use from now on, and where it came from."""
+
+    time_ns: int
+    calibration: Calibration
+    source: str
+
+
+@dataclass(frozen=True, slots=True)
+class Tick:
+    """No frame came; `silent_ns` is how long it has been (a clock's verdict)."""
+
+    time_ns: int
+    silent_ns: int
+
+
+Input = Frame | Request | MirrorShape | CameraSettings | Load | Tick
+
+
+@dataclass(frozen=True, slots=True)
+class Step:
+    """One step of the control law, for every frame that arrived; arrays (modes,) float32, nm of wavefront rms."""
+
+    frame_sequence: int
+    time_ns: int
+    mode: LoopMode
+    command_nm: Single
+    reasons: tuple[Reason, ...]
+    error_nm: Single | None = None
+    pol_nm: Single | None = None
+    flux_dn: float = 0.0
+    saturated_pixels: int = 0
+
+
+@dataclass(frozen=True, slots=True)
+class Command:
+    """Where the mirror shall be: (rows, columns) float32, nm of surface."""
+
+    frame_sequence: int
+    time_ns: int
+    actuators_nm: Single
+    command_nm: Single
+
+
+@dataclass(frozen=True, slots=True)
+class Raised:
+    """An event of the table in `lowfc.contract.events`, with its details."""
+
+    name: str
+    details: dict[str, object]
+
+
+@dataclass(frozen=True, slots=True)
+class Reply:
+    """The answer to a request, and the first frame for which it is in force."""
+
+    accepted: bool
+    text: str
+    frame_sequence: int
+
+
+@dataclass(frozen=True, slots=True)
+class Outputs:
+    """What one input gave rise to; `changed` says that more of the state changed than the next frame will show."""
+
+    step: Step | None = None
+    command: Command | None = None
+    reply: Reply | None = None
+    events: list[Raised] = field(default_factory=list)
+    changed: bool = False

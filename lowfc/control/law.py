@@ -1,0 +1,43 @@
+"""The integrator: gain, leak and limit of each mode."""
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+Single = npt.NDArray[np.float32]
+
+
+@dataclass(frozen=True, slots=True)
+class Law:
+    """Gain, leak and limit of each mode, each (modes,) float32; the limit is nm of wavefront rms."""
+
+    gain: Single
+    leak: Single
+    limit_nm: Single
+
+    def __post_init__(self) -> None:
+        if not self.gain.shape == self.leak.shape == self.limit_nm.shape:
+            raise ValueError(
+                f"gain, leak and limit must be as long as each other, got {self.gain.shape}, {self.leak.shape} "
+                f"and {self.limit_nm.shape}"
+            )
+        for name, array, low, high in (
+            ("gain", self.gain, 0, 2),
+            ("leak", self.leak, 0, 1),
+            ("limit_nm", self.limit_nm, 0, np.inf),
+        ):
+            if not (np.isfinite(array).all() and (array >= low).all() and (array <= high).all()):
+                raise ValueError(f"every {name} must be between {low} and {high}, got {array.tolist()}")
+
+
+def integrate(law: Law, command_nm: Single, error_nm: Single) -> tuple[Single, bool]:
+    """command[k+1] = (1 - leak) command[k] - gain error[k], cut to the limit of each mode; and whether any was cut.
+
+    All (modes,) float32, nm of wavefront rms.
+    """
+    wanted = (1 - law.leak) * command_nm - law.gain * error_nm
+    cut = np.abs(wanted) > law.limit_nm
+    if cut.any():
+        return np.clip(wanted, -law.limit_nm, law.limit_nm), True
+    return wanted, False

@@ -1,0 +1,294 @@
+"""The controller: one pure function, `advance(settings, state, input)`, of which every run is a fold.
+
+The live loop, replay and the tests call it with frames, requests, mirror shapes, camera settings, calibrations and
+ticks, in the order in which they were taken. Nothing here reads a clock: each input brings its time, and every verdict
+that needs one (how late a frame is, how long it has been silent) comes with the input.
+"""
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+import numpy.typing as npt
+
+from lowfc.control.estimator import estimate, saturated_pixels
+from lowfc.control.inputs import (
+    CameraSettings,
+    Command,
+    Frame,
+    Input,
+    Load,
+    MirrorShape,
+    Outputs,
+    Raised,
+    Reply,
+    Request,
+    Step,
+    Tick,
+)
+from lowfc.control.law import integrate
+from lowfc.control.requests import answer
+from lowfc.control.safety import LoopMode, Reason, limit
+from lowfc.control.stability import delay_weights
+from lowfc.control.state import Drive, Settings, State
+
+Single = npt.NDArray[np.float32]
+
+COUNT_BITS = 32
+"""A frame's sequence is its publisher's start in seconds, shifted by this, and its count."""
+
+
+def advance(settings: Settings, state: State, taken: Input) -> tuple[State, Outputs]:
+    """Take one input; return the state after it and what shall be sent."""
+    return _HANDLERS[type(taken)](settings, state, taken)
+
+
+def _frame(settings: Settings, state: State, frame: Frame) -> tuple[State, Outputs]:
+    events: list[Raised] = []
+    state, stale = _count_frames(state, frame, events)
+    if stale is not None:
+        return _refuse(settings, state, frame, stale, events)
+    drive = state.drive
+    if drive is None:
+        return _refuse(settings, state, frame, Reason.NO_CALIBRATION, events)
+    calibration = drive.calibration
+    if frame.pixels is None or frame.pixels.shape != calibration.shape:
+        return _refuse(settings, state, frame, Reason.WRONG_SIZE, events)
+    if frame.age_ns > settings.late_ns:
+        return _refuse(settings, state, frame, Reason.LATE, events)
+    pixels = frame.pixels.reshape(-1)
+    saturated = saturated_pixels(calibration, pixels)
+    if saturated > settings.most_saturated:
+        return _refuse(settings, state, frame, Reason.SATURATED, events)
+    measured = estimate(calibration, pixels, settings.least_flux * calibration.flux_dn, drive.scratch)
+    if measured is None:
+        return _refuse(settings, state, frame, Reason.DARK, events)
+
+    pol_nm = measured.error_nm - drive.seen_nm()
+    drive, reasons = _follow(settings, state.mode, drive, measured.error_nm)
+    if state.refused is not None:
+        details: dict[str, object] = {"refused": state.refused_count, "reason": state.refused.name}
+        events.append(Raised("FRAMES_ACCEPTED", details))
+    _limit_events(state.limits_hit, reasons, events)
+    state = replace(
+        state,
+        drive=drive,
+        frames_used=state.frames_used + 1,
+        refused=None,
+        refused_count=0,
+        limits_hit=reasons,
+        counts=_counted(state.counts, reasons),
+    )
+    step = Step(
+        frame.sequence,
+        frame.time_ns,
+        state.mode,
+        drive.history_nm[0],
+        reasons,
+        measured.error_nm,
+        pol_nm,
+        measured.flux_dn,
+        saturated,
+    )
+    return _send(state, step, events)
+
+
+def _count_frames(state: State, frame: Frame, events: list[Raised]) -> tuple[State, Reason | None]:
+    """Account for frames that never came, and find those that are not newer than the last."""
+    if frame.sequence <= state.frame_sequence:
+        return state, Reason.REPEATED if frame.sequence == state.frame_sequence else Reason.OUT_OF_ORDER
+    if state.silent:
+        events.append(Raised("FRAMES_BACK", {"silent_ms": (frame.time_ns - state.frame_time_ns) / 1e6}))
+    drive = state.drive
+    if frame.sequence >> COUNT_BITS == state.frame_sequence >> COUNT_BITS:
+        missing = frame.sequence - state.frame_sequence - 1
+        if missing:
+            events.append(Raised("FRAMES_MISSING", {"count": missing, "sequence": frame.sequence}))
+            drive = drive.stayed(missing) if drive is not None else None
+    elif state.frame_sequence:
+        events.append(Raised("CAMERA_RESTARTED", {}))
+    state = replace(state, drive=drive, silent=False, frame_sequence=frame.sequence, frame_time_ns=frame.time_ns)
+    return state, None
+
+
+def _follow(settings: Settings, mode: LoopMode, drive: Drive, error_nm: Single) -> tuple[Drive, tuple[Reason, ...]]:
+    """The command after a measured error (modes,), and the limits that acted."""
+    if mode is LoopMode.SAFED:
+        return _relax(settings, drive), ()
+    if mode is not LoopMode.CLOSED:
+        return drive.stayed(1), ()
+    command_nm, cut = integrate(drive.law, drive.history_nm[0], error_nm)
+    wanted_nm = (drive.calibration.modes_to_actuators @ command_nm).reshape(drive.calibration.grid)
+    limited = limit(settings.limits, drive.actuators_nm, wanted_nm)
+    if limited.reasons:  # the modal command becomes what was kept: for pseudo-open-loop, and against wind-up
+        command_nm = drive.inverse @ limited.actuators_nm.reshape(-1)
+    reasons = (Reason.MODAL_LIMIT, *limited.reasons) if cut else limited.reasons
+    return drive.pushed(command_nm, limited.actuators_nm), reasons
+
+
+def _relax(settings: Settings, drive: Drive) -> Drive:
+    """One frame towards flat, within the slew limit."""
+    flat = limit(settings.limits, drive.actuators_nm, np.zeros_like(drive.actuators_nm)).actuators_nm
+    return drive.pushed(drive.inverse @ flat.reshape(-1), flat)
+
+
+def _refuse(
+    settings: Settings, state: State, frame: Frame, reason: Reason, events: list[Raised]
+) -> tuple[State, Outputs]:
+    """Hold the command: a frame that cannot be used still yields a step and a command."""
+    if reason is not state.refused:
+        events.append(Raised("FRAMES_REFUSED", {"reason": reason.name}))
+    drive = state.drive
+    held = np.zeros(0, np.float32)
+    if drive is not None:
+        if state.mode is LoopMode.SAFED:
+            drive = _relax(settings, drive)
+        elif reason not in (Reason.REPEATED, Reason.OUT_OF_ORDER):
+            drive = drive.stayed(1)
+        held = drive.history_nm[0]
+    state = replace(
+        state,
+        drive=drive,
+        refused=reason,
+        refused_count=state.refused_count + 1,
+        counts=_counted(state.counts, (reason,)),
+    )
+    return _send(state, Step(frame.sequence, frame.time_ns, state.mode, held, (reason,)), events)
+
+
+def _send(state: State, step: Step, events: list[Raised]) -> tuple[State, Outputs]:
+    if state.drive is None:
+        return state, Outputs(step=step, events=events)
+    command = Command(step.frame_sequence, step.time_ns, state.drive.actuators_nm, step.command_nm)
+    return replace(state, commanded=True), Outputs(step=step, command=command, events=events)
+
+
+def _tick(settings: Settings, state: State, tick: Tick) -> tuple[State, Outputs]:
+    """Without frames: repeat the held command, so that only a dead controller lets it expire."""
+    drive = state.drive
+    if drive is None or not state.commanded:
+        return state, Outputs()
+    events = []
+    silent = tick.silent_ns > settings.hold_ns
+    flatten = silent and settings.silence == "flat"
+    counts = state.counts
+    if silent and not state.silent:
+        action = "relaxing the mirror to flat" if flatten else "holding the command"
+        events.append(Raised("NO_FRAMES", {"silent_ms": tick.silent_ns / 1e6, "action": action}))
+        counts = _counted(counts, (Reason.NO_FRAME,))
+    if flatten or state.mode is LoopMode.SAFED:
+        drive = _relax(settings, drive)
+    command = Command(state.frame_sequence, state.frame_time_ns, drive.actuators_nm, drive.history_nm[0])
+    state = replace(state, drive=drive, silent=silent, counts=counts)
+    return state, Outputs(command=command, events=events)
+
+
+def _load(settings: Settings, state: State, load: Load) -> tuple[State, Outputs]:
+    calibration = load.calibration
+    modes = len(calibration.noll)
+    drive = Drive(
+        calibration,
+        settings.law(calibration.noll),
+        np.linalg.pinv(calibration.modes_to_actuators.astype(np.float64)).astype(np.float32),
+        delay_weights(settings.delay_frames).astype(np.float32),
+        (np.zeros(modes, np.float32),) * len(delay_weights(settings.delay_frames)),
+        np.zeros(calibration.grid, np.float32),
+        np.empty(calibration.shape[0] * calibration.shape[1], np.float32),
+    )
+    before = state.drive
+    if before is not None and before.actuators_nm.shape == calibration.grid:
+        command_nm = drive.inverse @ before.actuators_nm.reshape(-1)
+        drive = replace(drive, actuators_nm=before.actuators_nm, history_nm=(command_nm,) * len(drive.weights))
+    mode = settings.start_mode if state.mode is LoopMode.IDLE else state.mode
+    details: dict[str, object] = {
+        "id": calibration.id[:12],
+        "modes": modes,
+        "estimator": calibration.estimator,
+        "source": load.source,
+    }
+    events = [Raised("CALIBRATION_LOADED", details)]
+    if mode is not state.mode:
+        events.append(_mode_event(state.mode, mode, "a calibration was loaded"))
+    return replace(state, mode=mode, drive=drive), Outputs(events=events, changed=True)
+
+
+def _mirror(settings: Settings, state: State, shape: MirrorShape) -> tuple[State, Outputs]:
+    """Start from where the mirror is, so that it does not jump; later shapes change nothing."""
+    drive = state.drive
+    if drive is None or state.commanded:
+        return state, Outputs()
+    if shape.actuators_nm.shape != drive.calibration.grid or not np.isfinite(shape.actuators_nm).all():
+        why = f"the mirror has a grid of {shape.actuators_nm.shape}, the calibration {drive.calibration.grid}"
+        return state, Outputs(events=[Raised("MIRROR_REFUSED", {"why": why})])
+    same_modes = shape.command_nm.shape == (len(drive.calibration.noll),) and np.isfinite(shape.command_nm).all()
+    command_nm = shape.command_nm if same_modes else drive.inverse @ shape.actuators_nm.reshape(-1)
+    drive = replace(drive, actuators_nm=shape.actuators_nm, history_nm=(command_nm,) * len(drive.weights))
+    events = []
+    if command_nm.any():
+        events.append(Raised("MIRROR_ADOPTED", {"rms_nm": float(np.sqrt(command_nm @ command_nm))}))
+    return replace(state, drive=drive), Outputs(events=events, changed=True)
+
+
+def _camera(settings: Settings, state: State, camera: CameraSettings) -> tuple[State, Outputs]:
+    """Open the loop where the camera is no longer the one that was calibrated."""
+    if state.drive is None or state.mode is not LoopMode.CLOSED:
+        return state, Outputs()
+    calibration = state.drive.calibration
+    wrong = [
+        f"{name} is {got}, calibrated {want}"
+        for name, got, want in (
+            ("frame", camera.shape, calibration.shape),
+            ("saturation_dn", camera.saturation_dn, calibration.saturation_dn),
+            ("bias_dn", camera.bias_dn, float(np.median(calibration.dark))),
+        )
+        if not np.allclose(got, want, rtol=0, atol=1)
+    ]
+    if not wrong:
+        return state, Outputs()
+    events = [
+        Raised("CAMERA_CHANGED", {"what": "; ".join(wrong)}),
+        _mode_event(state.mode, LoopMode.OPEN, "the camera changed"),
+    ]
+    return replace(state, mode=LoopMode.OPEN), Outputs(events=events, changed=True)
+
+
+def _request(settings: Settings, state: State, request: Request) -> tuple[State, Outputs]:
+    drive = state.drive
+    law, noll = (drive.law, drive.calibration.noll) if drive is not None else (None, ())
+    answered = answer(state.mode, law, noll, settings.delay_frames, request)
+    events = []
+    if answered.mode is not state.mode:
+        why = f"operator asked to {request.name}"
+        events.append(_mode_event(state.mode, answered.mode, why))
+        if answered.mode is LoopMode.SAFED:
+            events.append(Raised("SAFED", {"why": why}))
+    changed = answered.mode is not state.mode or answered.law is not law
+    if drive is not None and answered.law is not None:
+        drive = replace(drive, law=answered.law)
+    reply = Reply(answered.accepted, answered.text, state.frame_sequence + 1)
+    return replace(state, mode=answered.mode, drive=drive), Outputs(reply=reply, events=events, changed=changed)
+
+
+def _mode_event(before: LoopMode, after: LoopMode, why: str) -> Raised:
+    return Raised("MODE_CHANGED", {"before": before.name.lower(), "after": after.name.lower(), "why": why})
+
+
+def _limit_events(before: tuple[Reason, ...], now: tuple[Reason, ...], events: list[Raised]) -> None:
+    events.extend(Raised("LIMIT_HIT", {"reason": reason.name}) for reason in now if reason not in before)
+    events.extend(Raised("LIMIT_CLEARED", {"reason": reason.name}) for reason in before if reason not in now)
+
+
+def _counted(counts: dict[Reason, int], reasons: tuple[Reason, ...]) -> dict[Reason, int]:
+    if not reasons:
+        return counts
+    return counts | {reason: counts.get(reason, 0) + 1 for reason in reasons}
+
+
+_HANDLERS: dict[type, Callable[..., tuple[State, Outputs]]] = {
+    Frame: _frame,
+    Request: _request,
+    MirrorShape: _mirror,
+    CameraSettings: _camera,
+    Load: _load,
+    Tick: _tick,
+}

@@ -1,0 +1,153 @@
+"""Limits of the mirror, the loop-mode machine and the dead-man: no control law, no estimate, no trust.
+
+Used by the controller on what it sends and again by the mirror on what it gets. `docs/safety.md` lists the hazards.
+"""
+
+from dataclasses import dataclass
+from enum import IntEnum
+
+import numpy as np
+import numpy.typing as npt
+
+Actuators = npt.NDArray[np.float32]
+
+MARGIN_NM = 1e-3
+"""Kept clear of every limit, so that float32 rounding (6e-5 nm at 750 nm) cannot cross it."""
+
+
+class LoopMode(IntEnum):
+    """What the controller does with the mirror; numbered as on the wire."""
+
+    IDLE = 1
+    OPEN = 2
+    CLOSED = 3
+    SAFED = 4
+
+
+class Reason(IntEnum):
+    """Why a frame or a command was not used as it came; numbered as on the wire."""
+
+    NO_CALIBRATION = 1
+    WRONG_SIZE = 2
+    OUT_OF_ORDER = 3
+    REPEATED = 4
+    LATE = 5
+    SATURATED = 6
+    DARK = 7
+    NO_FRAME = 8
+    MODAL_LIMIT = 20
+    STROKE = 21
+    SLEW = 22
+    NEIGHBOUR = 23
+    NOT_FINITE = 24
+    WRONG_GRID = 25
+
+
+@dataclass(frozen=True, slots=True)
+class Limits:
+    """What the mirror may do, in nm of surface.
+
+    Attributes:
+        stroke_nm: largest deviation of an actuator from flat, either way.
+        slew_nm: largest change of an actuator from one command to the next.
+        neighbour_nm: largest difference between actuators side by side.
+    """
+
+    stroke_nm: float
+    slew_nm: float
+    neighbour_nm: float
+
+    def __post_init__(self) -> None:
+        for name in ("stroke_nm", "slew_nm", "neighbour_nm"):
+            value = getattr(self, name)
+            if not value > 2 * MARGIN_NM or not np.isfinite(value):
+                raise ValueError(f"{name} must be a finite number above {2 * MARGIN_NM} nm, got {value}")
+
+
+@dataclass(frozen=True, slots=True)
+class Limited:
+    """A command that may be sent: (rows, columns) float32, nm of surface, and the limits that changed it."""
+
+    actuators_nm: Actuators
+    reasons: tuple[Reason, ...]
+
+
+def limit(limits: Limits, previous_nm: Actuators, wanted_nm: Actuators) -> Limited:
+    """Return the command nearest to `wanted_nm` that may follow `previous_nm`.
+
+    Both are (rows, columns) float32, nm of surface. Stroke, then slew, cut each actuator by itself; the neighbour limit
+    shortens the whole move. Whatever is wanted, the result is finite, no actuator moves further than the slew limit,
+    and if `previous_nm` keeps the stroke and neighbour limits, so does the result; if it does not, it comes back to
+    them at the slew limit.
+    """
+    if wanted_nm.shape != previous_nm.shape:
+        return Limited(previous_nm, (Reason.WRONG_GRID,))
+    if not np.isfinite(wanted_nm).all():
+        return Limited(previous_nm, (Reason.NOT_FINITE,))
+    reasons: list[Reason] = []
+    stroke, slew = np.float32(limits.stroke_nm - MARGIN_NM), np.float32(limits.slew_nm - MARGIN_NM)
+    kept = wanted_nm
+    if np.abs(kept).max(initial=0) > stroke:
+        reasons.append(Reason.STROKE)
+        kept = np.clip(kept, -stroke, stroke)
+    move = kept - previous_nm
+    if np.abs(move).max(initial=0) > slew:
+        reasons.append(Reason.SLEW)
+        move = np.clip(move, -slew, slew)
+        kept = previous_nm + move
+    if neighbour_difference_nm(kept) > limits.neighbour_nm - MARGIN_NM:
+        reasons.append(Reason.NEIGHBOUR)
+        kept = _shorten(limits, previous_nm, kept)
+    return Limited(kept.astype(np.float32, copy=False), tuple(reasons))
+
+
+def _shorten(limits: Limits, previous_nm: Actuators, kept_nm: Actuators) -> Actuators:
+    """Go from `previous_nm` towards `kept_nm` as far as neighbours allow, or towards flat if they are apart already."""
+    neighbour_nm = limits.neighbour_nm - MARGIN_NM
+    if neighbour_difference_nm(previous_nm) > neighbour_nm:
+        largest_nm = float(np.abs(previous_nm).max())
+        return previous_nm * np.float32(max(0.0, 1.0 - (limits.slew_nm - MARGIN_NM) / largest_nm))
+    fraction = 1.0
+    for axis in (0, 1):
+        before = np.diff(previous_nm.astype(np.float64), axis=axis)
+        after = np.diff(kept_nm.astype(np.float64), axis=axis)
+        over = np.abs(after) > neighbour_nm
+        if over.any():
+            room = neighbour_nm - np.sign(after[over]) * before[over]
+            fraction = min(fraction, float((room / np.abs(after[over] - before[over])).min()))
+    return previous_nm + np.float32(fraction) * (kept_nm - previous_nm)
+
+
+def neighbour_difference_nm(actuators_nm: Actuators) -> float:
+    """Largest difference between actuators (rows, columns) side by side, in nm."""
+    rows = np.abs(actuators_nm[1:] - actuators_nm[:-1]).max(initial=0)
+    columns = np.abs(actuators_nm[:, 1:] - actuators_nm[:, :-1]).max(initial=0)
+    return float(max(rows, columns))
+
+
+def expired(age_ns: int, valid_for_ns: int) -> bool:
+    """Whether a command that came `age_ns` ago may no longer be held: the dead-man."""
+    return age_ns > valid_for_ns
+
+
+def request_mode(mode: LoopMode, request: str, calibrated: bool) -> tuple[LoopMode, str]:
+    """Mode after an operator's request, and why it was refused (empty where it was not).
+
+    `safe` is always granted and latched; only `clear` leaves it, and never straight to closed.
+    """
+    match request:
+        case "safe":
+            return LoopMode.SAFED, ""
+        case "clear" if mode is LoopMode.SAFED:
+            return (LoopMode.OPEN if calibrated else LoopMode.IDLE), ""
+        case "clear":
+            return mode, f"the loop is {mode.name.lower()}, not safed: there is nothing to clear"
+        case "open" | "close" if mode is LoopMode.SAFED:
+            return mode, "the loop is safed: `lowfc ctl clear` first, when it is safe"
+        case "open" | "close" if not calibrated:
+            return mode, "no calibration is loaded"
+        case "open":
+            return LoopMode.OPEN, ""
+        case "close":
+            return LoopMode.CLOSED, ""
+    raise ValueError(f"{request!r} is not a request for a loop mode: open, close, safe or clear")

@@ -1,0 +1,76 @@
+"""Transfer functions of the loop: stability limit, rejection, noise, predicted residual.
+
+The loop of `lowfc.control.law`: command[k+1] = (1 - leak) command[k] - gain error[k], and
+error[k] = disturbance[k] + sum_j w_j command[k - j] + noise[k], with w from the delay in frames.
+"""
+
+import numpy as np
+import numpy.typing as npt
+from scipy.optimize import brentq
+
+Array = npt.NDArray[np.float64]
+
+
+def delay_weights(delay_frames: float) -> Array:
+    """Return w: how much of command[k - j], j = 0, 1, ..., is seen in exposure k; sums to 1.
+
+    A delay of d frames (d >= 1) goes from the frame a command was made from to the first exposed wholly under it;
+    a fraction f of a frame sees (1 - f) of the newer and f of the older command.
+
+    Raises:
+        ValueError: the delay is below 1 frame or not finite.
+    """
+    if not (np.isfinite(delay_frames) and delay_frames >= 1):
+        raise ValueError(f"a delay is at least 1 frame, got {delay_frames}")
+    whole = int(np.floor(delay_frames))
+    fraction = delay_frames - whole
+    weights = np.zeros(whole + (fraction > 0))
+    weights[whole - 1] = 1 - fraction
+    if fraction > 0:
+        weights[whole] = fraction
+    return weights
+
+
+def open_loop(omega: Array | float, gain: float, leak: float, delay_frames: float) -> npt.NDArray[np.complex128]:
+    """Loop transfer function L at angular frequencies omega (rad per frame)."""
+    z = np.exp(1j * np.asarray(omega, dtype=float))
+    weights = delay_weights(delay_frames)
+    seen = np.polynomial.polynomial.polyval(1 / z, weights)
+    return np.asarray(gain * seen / (z - (1 - leak)))
+
+
+def rejection(frequency_hz: Array, rate_hz: float, gain: float, leak: float, delay_frames: float) -> Array:
+    """|S| at each frequency: true residual over disturbance."""
+    loop = open_loop(2 * np.pi * frequency_hz / rate_hz, gain, leak, delay_frames)
+    return np.abs(1 / (1 + loop))
+
+
+def noise_transfer(frequency_hz: Array, rate_hz: float, gain: float, leak: float, delay_frames: float) -> Array:
+    """|T| at each frequency: true residual over measurement noise."""
+    loop = open_loop(2 * np.pi * frequency_hz / rate_hz, gain, leak, delay_frames)
+    return np.abs(loop / (1 + loop))
+
+
+def noise_gain(gain: float, leak: float, delay_frames: float) -> float:
+    """Variance of the residual per variance of white measurement noise: the mean of |T|^2 over frequency."""
+    omega = (np.arange(1 << 14) + 0.5) * np.pi / (1 << 14)
+    loop = open_loop(omega, gain, leak, delay_frames)
+    return float(np.mean(np.abs(loop / (1 + loop)) ** 2))
+
+
+def limiting_gain(delay_frames: float, leak: float = 0.0) -> float:
+    """Gain at which the loop starts to oscillate; 2 sin(pi / (2 (2d - 1))) for a whole delay d without leak."""
+    grid = np.linspace(1e-6, np.pi, 4096)
+
+    def phase_beyond(omega: float) -> float:
+        return float(np.imag(open_loop(omega, 1.0, leak, delay_frames)))
+
+    values = np.imag(open_loop(grid, 1.0, leak, delay_frames))
+    crossings = [
+        brentq(phase_beyond, low, high)
+        for low, high, before, after in zip(grid[:-1], grid[1:], values[:-1], values[1:], strict=True)
+        if before < 0 <= after
+    ]
+    crossings.append(np.pi)
+    real = [float(np.real(open_loop(omega, 1.0, leak, delay_frames))) for omega in crossings]
+    return min(-1 / value for value in real if value < 0)

@@ -1,0 +1,52 @@
+"""Wavelengths and weights that stand for a passband (flat in photons per nm)."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+
+@dataclass(frozen=True)
+class Band:
+    """Quadrature over a passband: an image is the sum of weight times image at each wavelength.
+
+    Attributes:
+        wavelengths_nm: The wavelengths.
+        weights: One for each, positive, of sum 1.
+    """
+
+    wavelengths_nm: tuple[float, ...]
+    weights: tuple[float, ...]
+
+    def __post_init__(self) -> None:
+        if not self.wavelengths_nm or len(self.wavelengths_nm) != len(self.weights):
+            raise ValueError(
+                f"a band needs one weight per wavelength, got {len(self.wavelengths_nm)} wavelengths and "
+                f"{len(self.weights)} weights"
+            )
+        if min(self.wavelengths_nm) <= 0 or min(self.weights) <= 0 or abs(sum(self.weights) - 1.0) > 1e-9:
+            raise ValueError(
+                f"wavelengths and weights must be positive and the weights must sum to 1, got {self.wavelengths_nm} "
+                f"nm with {self.weights}"
+            )
+
+
+def monochromatic(wavelength_nm: float) -> Band:
+    """One wavelength."""
+    return Band((float(wavelength_nm),), (1.0,))
+
+
+def gauss_legendre(centre_nm: float, fraction: float = 0.2, count: int = 3) -> Band:
+    """Gauss-Legendre quadrature of a band of relative width `fraction`; three points are right to
+    4e-4 of the image over 20 %, 2e-3 with the mask `sam27d07_bal14`."""
+    points, weights = np.polynomial.legendre.leggauss(count)
+    return _band(centre_nm * (1.0 + 0.5 * fraction * points), weights / weights.sum())
+
+
+def uniform(centre_nm: float, fraction: float = 0.2, count: int = 5) -> Band:
+    """Evenly spaced wavelengths with both ends, equally weighted, as in Sect. 3.3: 50 times less accurate."""
+    wavelengths = centre_nm * (1.0 + 0.5 * fraction * np.linspace(-1.0, 1.0, count))
+    return _band(wavelengths, np.full(count, 1.0 / count))
+
+
+def _band(wavelengths_nm: np.ndarray, weights: np.ndarray) -> Band:
+    return Band(tuple(map(float, wavelengths_nm)), tuple(map(float, weights)))

@@ -1,0 +1,165 @@
+"""The whole optical chain of the paper, with full diffraction: star to binned sensor image (Sect. 2, Table 1)."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lowfc.optics.band import Band, monochromatic
+from lowfc.optics.fourier import Field, to_image, to_pupil
+from lowfc.optics.grid import OPEN_AREA, pupil_axis
+
+
+@dataclass(frozen=True, eq=False)
+class Sensor:
+    """The hardware of a sparse-aperture wavefront sensor.
+
+    Attributes:
+        pupil: (n, n) amplitude transmission of the shaped pupil.
+        focal_mask: (k, k) the part of the focal plane that goes to the sensor, k even, centred.
+        relay_mask: (n, n) the sparse aperture mask.
+        wavelength_nm: The central wavelength, lambda0.
+        samples_per: Samples per lambda0 / D in both focal planes.
+        binning: Samples per pixel, in each direction.
+        pixels: Pixels across the square image.
+    """
+
+    pupil: NDArray[np.float64]
+    focal_mask: NDArray[np.float64]
+    relay_mask: NDArray[np.float64]
+    wavelength_nm: float = 550.0
+    samples_per: int = 8
+    binning: int = 2
+    pixels: int = 80
+
+    def __post_init__(self) -> None:
+        if self.pupil.ndim != 2 or self.pupil.shape[0] != self.pupil.shape[1]:
+            raise ValueError(f"the pupil must be square, got shape {self.pupil.shape}")
+        if self.relay_mask.shape != self.pupil.shape:
+            raise ValueError(
+                f"the relay mask must be sampled like the pupil, {self.pupil.shape}, got {self.relay_mask.shape}"
+            )
+        if self.focal_mask.ndim != 2 or self.focal_mask.shape[0] != self.focal_mask.shape[1]:
+            raise ValueError(f"the focal-plane mask must be square, got shape {self.focal_mask.shape}")
+        if not self.wavelength_nm > 0:
+            raise ValueError(f"the wavelength must be positive, got {self.wavelength_nm} nm")
+
+
+@dataclass(frozen=True)
+class LightBudget:
+    """Where the light goes: each a fraction of what reached the element before it, but `total` and `peak`.
+
+    Attributes:
+        pupil: Of the open circle's light, what the shaped pupil lets through.
+        focal_mask: Of that, what the focal-plane mask sends to the sensor.
+        relay_mask: Of that, what passes the sparse aperture mask.
+        sensor: Of the light on the relay mask, what falls on the pixels.
+        total: Of the open circle's light, what falls on the pixels.
+        peak: Of the light on the pixels, what falls on the brightest.
+    """
+
+    pupil: float
+    focal_mask: float
+    relay_mask: float
+    sensor: float
+    total: float
+    peak: float
+
+
+def pupil_radii(sensor: Sensor) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Coordinates x (1, n) and y (n, 1) of the pupil samples in pupil radii, for Zernike polynomials."""
+    u = 2.0 * pupil_axis(sensor.pupil.shape[0])
+    return u[None, :], u[:, None]
+
+
+def propagate(sensor: Sensor, pupil_field: NDArray[np.inexact], wavelength_nm: float) -> Field:
+    """Field at the sensor's samples, eqs. (4) to (6), of a field (n, n) that has passed the shaped pupil."""
+    scale = sensor.wavelength_nm / wavelength_nm
+    focal = to_image(np.asarray(pupil_field, np.complex128), sensor.focal_mask.shape[0], sensor.samples_per, scale)
+    relay = to_pupil(focal * sensor.focal_mask, sensor.pupil.shape[0], sensor.samples_per, scale)
+    return to_image(relay * sensor.relay_mask, sensor.pixels * sensor.binning, sensor.samples_per, scale)
+
+
+def field(sensor: Sensor, opd_nm: NDArray[np.floating], wavelength_nm: float | None = None) -> Field:
+    """Field at the sensor's samples for a wavefront (n, n) in nm, with exp(i phi) and not its expansion.
+
+    Args:
+        sensor: The optics.
+        opd_nm: Optical path difference.
+        wavelength_nm: The central wavelength when None.
+
+    Raises:
+        ValueError: The wavefront is not sampled like the pupil.
+    """
+    if opd_nm.shape != sensor.pupil.shape:
+        raise ValueError(f"a wavefront must be sampled like the pupil, {sensor.pupil.shape}, got {opd_nm.shape}")
+    wavelength_nm = sensor.wavelength_nm if wavelength_nm is None else wavelength_nm
+    return propagate(sensor, sensor.pupil * np.exp((2j * np.pi / wavelength_nm) * opd_nm), wavelength_nm)
+
+
+def image(sensor: Sensor, opd_nm: NDArray[np.floating], band: Band | None = None) -> NDArray[np.float64]:
+    """Image (pixels, pixels), fraction per pixel of the light entering the open circular pupil.
+
+    Args:
+        sensor: The optics.
+        opd_nm: Wavefront (n, n).
+        band: The central wavelength alone when None.
+    """
+    band = monochromatic(sensor.wavelength_nm) if band is None else band
+    total = np.zeros((sensor.pixels, sensor.pixels))
+    for wavelength_nm, weight in zip(band.wavelengths_nm, band.weights, strict=True):
+        at_sensor = field(sensor, opd_nm, wavelength_nm)
+        total += weight * _pixel_sums(sensor, at_sensor.real**2 + at_sensor.imag**2)
+    return total
+
+
+def reference(sensor: Sensor, band: Band | None = None) -> NDArray[np.float64]:
+    """I0 (pixels, pixels): the image of a flat wavefront, eq. (6), in the units of `image`."""
+    return image(sensor, np.zeros(sensor.pupil.shape), band)
+
+
+def response(sensor: Sensor, basis: NDArray[np.floating], band: Band | None = None) -> NDArray[np.float64]:
+    """H = dI/da (pixels squared, modes), in the units of `image` per nm of each mode.
+
+    H = 2 (2 pi / lambda) Re{E0 conj(i E_k)}: eq. (12) with the 2 of eq. (9), so that I - I0 = H a.
+
+    Args:
+        sensor: The optics.
+        basis: Modes (modes, n, n), unit rms where a is to be nm rms.
+        band: The central wavelength alone when None.
+    """
+    band = monochromatic(sensor.wavelength_nm) if band is None else band
+    H = np.zeros((sensor.pixels**2, len(basis)))
+    for wavelength_nm, weight in zip(band.wavelengths_nm, band.weights, strict=True):
+        E0 = propagate(sensor, sensor.pupil, wavelength_nm)
+        for k, mode in enumerate(basis):
+            Ek = propagate(sensor, sensor.pupil * mode, wavelength_nm)
+            slope = (4.0 * np.pi / wavelength_nm) * (E0 * np.conj(1j * Ek)).real
+            H[:, k] += weight * _pixel_sums(sensor, slope).ravel()
+    return H
+
+
+def light_budget(sensor: Sensor) -> LightBudget:
+    """The throughput of each element at the central wavelength, flat wavefront."""
+    samples, area = sensor.pupil.shape[0], 1.0 / sensor.samples_per**2
+    focal = to_image(sensor.pupil.astype(np.complex128), sensor.focal_mask.shape[0], sensor.samples_per, 1.0)
+    focal = focal * sensor.focal_mask
+    relay = to_pupil(focal, samples, sensor.samples_per, 1.0)
+    after_pupil = np.sum(sensor.pupil**2) / samples**2
+    after_focal = np.sum(np.abs(focal) ** 2) * area
+    after_relay = np.sum(np.abs(relay * sensor.relay_mask) ** 2) / samples**2
+    I0 = reference(sensor)
+    return LightBudget(
+        pupil=float(after_pupil / OPEN_AREA),
+        focal_mask=float(after_focal / after_pupil),
+        relay_mask=float(after_relay / after_focal),
+        sensor=float(I0.sum() * OPEN_AREA / after_focal),
+        total=float(I0.sum()),
+        peak=float(I0.max() / I0.sum()),
+    )
+
+
+def _pixel_sums(sensor: Sensor, intensity: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Bin samples to pixels and normalise to the light that enters the open circle."""
+    shape = (sensor.pixels, sensor.binning, sensor.pixels, sensor.binning)
+    return np.asarray(intensity.reshape(shape).sum(axis=(1, 3))) / (sensor.samples_per**2 * OPEN_AREA)

@@ -1,0 +1,203 @@
+"""The real-time twin: the optics compressed to a few small matrices, and their evaluation.
+
+At each wavelength the field at the sensor is linear in exp(i phi) at the pupil nodes, and both ends are band-limited:
+
+    exp(i phi) --to_modes--> modes --to_coefficients--> coefficients of prolate functions --basis--> field at points
+
+The intensity is band-limited to twice the field's band, so it is evaluated at few points of each axis, and the pixels
+are two small products: image = to_pixels |E|^2 to_pixels'. `twin_build` makes the matrices from a `Sensor`.
+"""
+
+from dataclasses import dataclass
+from math import sqrt
+
+import numpy as np
+from numpy.typing import NDArray
+
+Float = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class TwinSpec:
+    """How far the optics are compressed; the default is right to 1e-4 of the image.
+
+    Attributes:
+        nodes: Pupil nodes across the diameter.
+        order: Points of the interpolation from the nodes, even.
+        rank: Modes of the operator that are kept for a focal-plane mask as large as the disk of 4 lambda0 / D; for
+            others the number kept is in proportion to the area, which is what their light's freedom goes by.
+        functions: Prolate functions along each axis of the sensor, at the central wavelength.
+    """
+
+    nodes: int = 32
+    order: int = 6
+    rank: int = 60
+    functions: int = 28
+
+
+FAST = TwinSpec()
+ACCURATE = TwinSpec(nodes=64, order=6, rank=80, functions=30)
+
+
+@dataclass(frozen=True, eq=False)
+class Operator:
+    """The optics at one wavelength.
+
+    Attributes:
+        wavelength_nm: The wavelength.
+        weight: Of this wavelength's image in the band's.
+        to_modes: (rank, used) real; amplitudes of the modes from exp(i phi) at the used nodes. The units of the image
+            are in it.
+        to_coefficients: (functions squared, rank) real.
+        basis: (points, functions) complex: prolate functions at the points, the odd ones times -i.
+    """
+
+    wavelength_nm: float
+    weight: float
+    to_modes: Float
+    to_coefficients: Float
+    basis: NDArray[np.complex128]
+
+
+@dataclass(frozen=True, eq=False)
+class Twin:
+    """A compressed sensor.
+
+    Attributes:
+        axis: Coordinates of the nodes along one axis, with guards, in pupil diameters.
+        used: Indices of the nodes that matter in the flattened square grid of the axis (rows = y, columns = x).
+        area_weights: (used,) weights of sum 1 for means over the open pupil (transmission above 0.5, unweighted).
+        operators: One for each wavelength.
+        to_pixels: (pixels, points) from intensities at the points of an axis to pixels.
+        operator_hash: Hexadecimal digest of everything the twin was made from.
+    """
+
+    axis: Float
+    used: NDArray[np.intp]
+    area_weights: Float
+    operators: tuple[Operator, ...]
+    to_pixels: Float
+    operator_hash: str
+
+
+def node_radii(twin: Twin) -> tuple[Float, Float]:
+    """Coordinates x, y (used,) of the used nodes in pupil radii, for Zernike polynomials and screens."""
+    rows, columns = np.divmod(twin.used, twin.axis.size)
+    return 2.0 * twin.axis[columns], 2.0 * twin.axis[rows]
+
+
+def wavefront_rms_nm(twin: Twin, opd_nm: NDArray[np.floating]) -> float:
+    """Rms of a wavefront (used,) over the open pupil, piston removed."""
+    mean = twin.area_weights @ opd_nm
+    variance = float(twin.area_weights @ (opd_nm - mean) ** 2)
+    return sqrt(max(variance, 0.0))  # a few weights are negative: those of the interpolation's guard nodes
+
+
+def reference(twin: Twin) -> Float:
+    """I0 (pixels, pixels) in float64: fraction per pixel of the light entering the open circle."""
+    flat = np.ones(twin.used.size)
+    intensity = np.sum([each.weight * np.abs(_field(each, flat)) ** 2 for each in twin.operators], axis=0)
+    return np.asarray(twin.to_pixels @ intensity @ twin.to_pixels.T)
+
+
+def response(twin: Twin, basis: NDArray[np.floating]) -> Float:
+    """H = dI/da (pixels squared, modes) in float64, per nm: 2 (2 pi / lambda) Re{E0 conj(i E_k)}, eq. (12) times 2.
+
+    Args:
+        twin: The twin.
+        basis: Modes (modes, used) at the used nodes, of unit rms where a is to be nm rms.
+
+    Raises:
+        ValueError: The modes are not at the used nodes.
+    """
+    if basis.ndim != 2 or basis.shape[1] != twin.used.size:
+        raise ValueError(f"modes must be (modes, {twin.used.size}) values at the used nodes, got {basis.shape}")
+    H = np.zeros((twin.to_pixels.shape[0] ** 2, len(basis)))
+    for operator in twin.operators:
+        E0 = _field(operator, np.ones(twin.used.size))
+        for k, mode in enumerate(basis):
+            slope = (
+                operator.weight
+                * (4.0 * np.pi / operator.wavelength_nm)
+                * (E0 * np.conj(1j * _field(operator, mode))).real
+            )
+            H[:, k] += (twin.to_pixels @ slope @ twin.to_pixels.T).ravel()
+    return H
+
+
+def _field(operator: Operator, nodes: Float) -> NDArray[np.complex128]:
+    """Field (points, points) of real values (used,) at the nodes."""
+    functions = operator.basis.shape[1]
+    coefficients = (operator.to_coefficients @ (operator.to_modes @ nodes)).reshape(functions, functions)
+    return np.asarray(operator.basis @ coefficients @ operator.basis.T)
+
+
+class Evaluator:
+    """Makes images with a twin in float32, in buffers of its own: use one for each thread.
+
+    Rounding leaves values down to about -1e-7 of the brightest pixel where there is no light.
+    """
+
+    def __init__(self, twin: Twin) -> None:
+        self._used = twin.used.size
+        self._stages = [_Stage(operator) for operator in twin.operators]
+        pixels, points = twin.to_pixels.shape
+        self._to_pixels = twin.to_pixels.astype(np.float32)
+        self._to_pixels_transposed = np.ascontiguousarray(self._to_pixels.T)
+        self._phase = np.empty(self._used, np.float32)
+        self._phasor = np.empty((self._used, 2), np.float32)
+        self._intensity = np.empty((points, points), np.float32)
+        self._half = np.empty((pixels, points), np.float32)
+        self._image = np.empty((pixels, pixels), np.float32)
+
+    def image(self, opd_nm: NDArray[np.float32]) -> NDArray[np.float32]:
+        """Image (pixels, pixels) of a wavefront (used,) in nm, fraction per pixel of the open circle's light.
+
+        The array is overwritten by the next call.
+
+        Raises:
+            ValueError: The wavefront does not have one value per used node.
+        """
+        if opd_nm.shape != (self._used,):
+            raise ValueError(f"a wavefront must have one value for each of {self._used} nodes, got {opd_nm.shape}")
+        self._intensity.fill(0.0)
+        for stage in self._stages:
+            np.multiply(opd_nm, stage.wavenumber, out=self._phase)
+            # The flat wavefront's field is added later, from float64: less is lost in the sums over the nodes.
+            np.cos(self._phase, out=self._phasor[:, 0])
+            np.subtract(self._phasor[:, 0], 1.0, out=self._phasor[:, 0])
+            np.sin(self._phase, out=self._phasor[:, 1])
+            stage.add_intensity(self._phasor, self._intensity)
+        np.matmul(self._to_pixels, self._intensity, out=self._half)
+        return np.matmul(self._half, self._to_pixels_transposed, out=self._image)
+
+
+class _Stage:
+    """One wavelength's matrices and buffers in single precision."""
+
+    def __init__(self, operator: Operator) -> None:
+        points, functions = operator.basis.shape
+        self.wavenumber = np.float32(2.0 * np.pi / operator.wavelength_nm)
+        to_modes = np.sqrt(operator.weight) * operator.to_modes
+        self._to_modes = to_modes.astype(np.float32)
+        self._flat_modes = to_modes.sum(axis=1).astype(np.float32)
+        self._to_coefficients = np.ascontiguousarray(operator.to_coefficients, np.float32)
+        self._basis = operator.basis.astype(np.complex64)
+        self._basis_transposed = np.ascontiguousarray(self._basis.T)
+        self._modes = np.empty((len(self._to_modes), 2), np.float32)
+        self._pairs = np.empty((functions**2, 2), np.float32)
+        self._coefficients = self._pairs.view(np.complex64).reshape(functions, functions)
+        self._half = np.empty((points, functions), np.complex64)
+        self._field = np.empty((points, points), np.complex64)
+        self._squares = np.empty((points, points), np.float32)
+
+    def add_intensity(self, phasor: NDArray[np.float32], intensity: NDArray[np.float32]) -> None:
+        """Add |E|^2 at the points, for real and imaginary parts (used, 2) of exp(i phi) - 1."""
+        np.matmul(self._to_modes, phasor, out=self._modes)
+        self._modes[:, 0] += self._flat_modes
+        np.matmul(self._to_coefficients, self._modes, out=self._pairs)
+        np.matmul(self._basis, self._coefficients, out=self._half)
+        np.matmul(self._half, self._basis_transposed, out=self._field)
+        for part in (self._field.real, self._field.imag):
+            np.multiply(part, part, out=self._squares)
+            np.add(intensity, self._squares, out=intensity)

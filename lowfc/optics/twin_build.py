@@ -1,0 +1,103 @@
+"""Compression of a sensor's optics to a twin: all in float64, as products of matrices."""
+
+import itertools
+from collections.abc import Callable
+
+import numpy as np
+import scipy.linalg
+from numpy.typing import NDArray
+
+from lowfc.optics.band import Band, monochromatic
+from lowfc.optics.field_operator import field_operator, prolates
+from lowfc.optics.nodes import interpolation, node_axis
+from lowfc.optics.sensor import Sensor
+from lowfc.optics.twin import Operator, Twin, TwinSpec
+
+Float = NDArray[np.float64]
+
+_DISK_AREA = np.pi * 4.0**2  # of the focal-plane mask that `TwinSpec.rank` is given for
+
+
+def build(
+    sensor: Sensor,
+    spec: TwinSpec,
+    band: Band | None = None,
+    operator_hash: str = "",
+    progress: Callable[[int, int], None] | None = None,
+) -> Twin:
+    """Compress a sensor.
+
+    Args:
+        sensor: The optics; the focal-plane mask must be symmetric about both axes.
+        spec: How far.
+        band: The central wavelength alone when None.
+        operator_hash: Digest of the three above, see `twin_store`.
+        progress: Called with the steps done and the steps in all.
+
+    Raises:
+        ValueError: The mask is not symmetric, or the specification cannot be met.
+    """
+    mask = sensor.focal_mask
+    if mask.shape[0] % 2 or not (np.array_equal(mask, mask[::-1]) and np.array_equal(mask, mask[:, ::-1])):
+        raise ValueError("the twin needs a focal-plane mask with even samples and symmetric about both axes")
+    band = monochromatic(sensor.wavelength_nm) if band is None else band
+    scales = [sensor.wavelength_nm / wavelength_nm for wavelength_nm in band.wavelengths_nm]
+    axis = node_axis(spec.nodes, spec.order)
+    to_samples = interpolation(sensor.pupil.shape[0], spec.nodes, spec.order)
+    used = np.flatnonzero(_adjoint(np.abs(to_samples), sensor.pupil != 0))
+    area_weights = _adjoint(to_samples, sensor.pupil > 0.5).ravel()[used]
+    points, to_pixels = _intensity_sampling(sensor, spec, max(scales))
+    area = np.sum(mask) / sensor.samples_per**2
+    rank = round(spec.rank * float(area / _DISK_AREA))
+    steps = len(scales) * mask.shape[0] // 2
+    done = itertools.count(1)
+
+    def advance() -> None:
+        if progress is not None:
+            progress(next(done), steps)
+
+    operators = []
+    for scale, weight in zip(scales, band.weights, strict=True):
+        functions = prolates(sensor, scale / 2.0, int(np.ceil(spec.functions * scale)))
+        matrix = field_operator(sensor, scale, functions, to_samples, to_samples, used, advance)
+        kept = _leading_modes(matrix, rank)
+        operators.append(
+            Operator(
+                wavelength_nm=sensor.wavelength_nm / scale,
+                weight=weight,
+                to_modes=kept.T @ matrix,
+                to_coefficients=kept,
+                basis=np.asarray(functions[points] * np.resize([1.0, -1j], functions.shape[1]), np.complex128),
+            )
+        )
+    return Twin(axis, used, area_weights / area_weights.sum(), tuple(operators), to_pixels, operator_hash)
+
+
+def _adjoint(to_samples: Float, weights: NDArray[np.bool_]) -> Float:
+    """Weights on the square grid of nodes that do what weights on the pupil's samples do to interpolated values."""
+    return np.asarray(to_samples.T @ weights.astype(np.float64) @ to_samples)
+
+
+def _intensity_sampling(sensor: Sensor, spec: TwinSpec, scale: float) -> tuple[NDArray[np.intp], Float]:
+    """Choose the sensor samples at which intensities are evaluated, and the matrix from them to pixels.
+
+    Intensities fill twice the field's band; the samples are picked by pivoted QR of that band's prolate functions.
+    """
+    samples = sensor.pixels * sensor.binning
+    functions = prolates(sensor, scale, min(2 * int(np.ceil(spec.functions * scale)), samples))
+    _, _, pivots = scipy.linalg.qr(functions.T, mode="economic", pivoting=True)
+    points = np.sort(pivots[: functions.shape[1]]).astype(np.intp)
+    pixels = functions.reshape(sensor.pixels, sensor.binning, -1).sum(axis=1)
+    return points, np.asarray(np.linalg.solve(functions[points].T, pixels.T).T)
+
+
+def _leading_modes(matrix: Float, rank: int) -> Float:
+    """Orthonormal (rows, rank): the left singular vectors of the largest singular values.
+
+    They come from the matrix times its transpose: squaring costs precision only below 1e-8 of the largest value.
+    """
+    if not 0 < rank <= min(matrix.shape):
+        raise ValueError(f"the rank must lie between 1 and {min(matrix.shape)}, got {rank}")
+    size = len(matrix)
+    _, vectors = scipy.linalg.eigh(matrix @ matrix.T, subset_by_index=(size - rank, size - 1))
+    return np.asarray(vectors[:, ::-1])

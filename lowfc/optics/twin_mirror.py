@@ -1,0 +1,87 @@
+"""A deformable mirror on the twin's nodes: its wavefront in microseconds.
+
+Nodes are too coarse for the print-through of the actuators, which the shaped pupil's fine structure mixes back into the
+low orders. The surface is therefore sampled without it, and a small correction makes the field at the sensor, to first
+order, the one that the full surface gives.
+"""
+
+from dataclasses import dataclass
+from math import isqrt
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lowfc.optics.field_operator import field_operator, prolates
+from lowfc.optics.grid import pupil_axis
+from lowfc.optics.mirror import Mirror, influence_factors
+from lowfc.optics.sensor import Sensor
+from lowfc.optics.twin import Twin
+
+_LOWPASS_CYCLES = 12.0
+_SMALLEST_SINGULAR_VALUE = 0.01  # of the largest; the correction's error stops falling there
+
+Single = NDArray[np.float32]
+
+
+@dataclass(frozen=True, eq=False)
+class TwinMirror:
+    """Matrices from actuators to the used nodes of a twin.
+
+    Attributes:
+        used: The twin's used nodes.
+        y_factors: (axis, rows) influence functions along y, without what the nodes cannot carry.
+        x_factors: (axis, columns) along x.
+        reduce: (few, rows times columns) what that leaves out, seen through the sensor.
+        expand: (used, few) the smooth surface that gives the same.
+    """
+
+    used: NDArray[np.intp]
+    y_factors: Single
+    x_factors: Single
+    reduce: Single
+    expand: Single
+
+
+def twin_mirror(sensor: Sensor, twin: Twin, mirror: Mirror) -> TwinMirror:
+    """Fit a mirror to a twin; the correction is exact at the wavelength in the middle of the band.
+
+    Args:
+        sensor: The optics that the twin was built from.
+        twin: The twin.
+        mirror: The mirror.
+    """
+    operator = twin.operators[len(twin.operators) // 2]
+    scale = sensor.wavelength_nm / operator.wavelength_nm
+    u = pupil_axis(sensor.pupil.shape[0])
+    actuators = np.arange(mirror.rows * mirror.columns)
+    functions = prolates(sensor, scale / 2.0, isqrt(len(operator.to_coefficients)))
+    y_full = influence_factors(mirror, u, mirror.rows)
+    x_full = influence_factors(mirror, u, mirror.columns)
+    to_field = operator.to_coefficients.T @ field_operator(sensor, scale, functions, y_full, x_full, actuators)
+    y_factors = influence_factors(mirror, twin.axis, mirror.rows, _LOWPASS_CYCLES)
+    x_factors = influence_factors(mirror, twin.axis, mirror.columns, _LOWPASS_CYCLES)
+    rows, columns = np.divmod(twin.used, twin.axis.size)
+    sampled = (y_factors[rows][:, :, None] * x_factors[columns][:, None, :]).reshape(twin.used.size, -1)
+    left, values, right = np.linalg.svd(operator.to_modes, full_matrices=False)
+    kept = values > _SMALLEST_SINGULAR_VALUE * values[0]
+    missing = left[:, kept].T @ (to_field - operator.to_modes @ sampled) / values[kept, None]
+    return TwinMirror(
+        used=twin.used,
+        y_factors=y_factors.astype(np.float32),
+        x_factors=x_factors.astype(np.float32),
+        reduce=missing.astype(np.float32),
+        expand=np.ascontiguousarray(right[kept].T, np.float32),
+    )
+
+
+def wavefront_nm(mirror: TwinMirror, actuators_nm: NDArray[np.floating]) -> Single:
+    """Wavefront (used,) at the twin's nodes: twice the surface.
+
+    Args:
+        mirror: From `twin_mirror`.
+        actuators_nm: (rows, columns) nm of surface.
+    """
+    twice = 2.0 * np.asarray(actuators_nm, np.float32)
+    wavefront = (mirror.y_factors @ twice @ mirror.x_factors.T).ravel()[mirror.used]
+    wavefront += mirror.expand @ (mirror.reduce @ twice.ravel())
+    return np.asarray(wavefront)

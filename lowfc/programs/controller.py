@@ -1,0 +1,196 @@
+"""The controller's process: `advance` folded over what the bus brings; the command first, then all the rest."""
+
+from collections import deque
+
+from lowfc.adapters.bus import ALL, Query, Sample
+from lowfc.adapters.clock import SimulatedClock
+from lowfc.adapters.instrument import settings
+from lowfc.adapters.service import Service
+from lowfc.contract import codec
+from lowfc.contract.configuration import Configuration
+from lowfc.contract.messages import (
+    CALIBRATION,
+    CAMERA_STATE,
+    COMMAND,
+    CONTROLLER_STATE,
+    FRAME,
+    MIRROR_STATE,
+    REQUEST,
+    REQUEST_KEY,
+    STEP,
+    TIMING,
+    timestamp,
+    wire,
+)
+from lowfc.control.calibration import Calibration
+from lowfc.control.durations import Durations
+from lowfc.control.inputs import Input, Load, Outputs, Reply, Request, Tick
+from lowfc.control.loop import advance
+from lowfc.control.state import State
+
+TICK_S = 0.01
+"""Without frames the held command is repeated this often."""
+MIRROR_PATIENCE_S = 1.0
+"""How long the start waits to learn where the mirror is."""
+STATE_PERIOD_NS = 1_000_000_000
+TIMING_PERIOD_NS = 100_000_000
+CHANNEL = "lowfc"
+
+
+class Controller:
+    """Receives frames, sends commands, answers operators, until told to stop."""
+
+    def __init__(self, config: Configuration, service: Service, calibration: Calibration, source: str) -> None:
+        """Declare everything on the bus and load the calibration."""
+        name = config.mirror.name
+        self._service = service
+        self._settings = settings(config)
+        self._valid_ns = round(config.control.valid_ms * 1e6)
+        self._state = State()
+        self._frames = service.mailbox(FRAME)
+        self._mirror = service.mailbox(MIRROR_STATE, name)
+        self._camera = service.mailbox(CAMERA_STATE)
+        self._commands = service.publisher(COMMAND, name)
+        self._steps = service.publisher(STEP)
+        self._states = service.publisher(CONTROLLER_STATE)
+        self._requests = service.publisher(REQUEST)
+        self._timings = service.publisher(TIMING)
+        self._queries: deque[Query] = deque()
+        service.bus.queryable(REQUEST_KEY.format(name=ALL), self._ask)
+        self._frame_to_command = Durations()
+        self._timing = wire.ControlTiming()
+        self._timing_due_ns = self._state_due_ns = 0
+        self._last_frame_ns = service.clock.host_ns()
+        self._tell(self._advance(Load(service.clock.now_ns(), calibration, source)))
+        service.publisher(CALIBRATION).put(codec.encode_calibration(calibration, service.clock.now_ns()))
+        service.state = "ready"
+
+    def run(self) -> None:
+        """Take a frame, advance, send the command; between frames, everything else."""
+        self._adopt_mirror()
+        self._service.state = "running"
+        while self._service.running:
+            sample = self._frames.take(TICK_S)
+            if self._queries or self._camera.received:
+                self._between_frames()
+            if sample is not None:
+                self._frame(sample)
+            elif not self._service.clock.lockstep:
+                self._tick()
+            self._service.beat()
+        self._publish_timing()
+        self._service.finish()
+
+    def fill(self, health: wire.Health) -> None:
+        """Add mode, counts and latency to a Health."""
+        health.mode = self._state.mode.value  # type: ignore[assignment]  # numbered alike
+        health.counts.extend(codec.reason_counts(self._state))
+        if self._frame_to_command.count:
+            health.frame_to_command.CopyFrom(codec.latency(self._frame_to_command))
+
+    def _frame(self, sample: Sample) -> None:
+        """One step: the command goes out before anything else is encoded."""
+        clock = self._service.clock
+        taken_ns = clock.host_ns()
+        age_ns = 0 if clock.lockstep else taken_ns - sample.publish_time_ns
+        frame = codec.decode_frame(sample.payload, sample.sequence, age_ns)
+        if isinstance(clock, SimulatedClock):
+            clock.set_ns(frame.time_ns)
+        outputs = self._advance(frame)
+        ready_ns = clock.host_ns()
+        self._send(outputs)
+        sent_ns = clock.host_ns()
+        self._tell(outputs)
+        self._last_frame_ns = taken_ns
+        self._service.work += 1
+        self._frame_to_command.add(sent_ns - sample.publish_time_ns)
+        timing = self._timing
+        timing.frame_sequence.append(sample.sequence)
+        timing.transport_ns.append(max(0, sample.receive_time_ns - sample.publish_time_ns))
+        timing.wakeup_ns.append(max(0, taken_ns - sample.receive_time_ns))
+        timing.compute_ns.append(ready_ns - taken_ns)
+        timing.publish_ns.append(sent_ns - ready_ns)
+        timing.frame_to_command_ns.append(max(0, sent_ns - sample.publish_time_ns))
+        if sent_ns >= self._timing_due_ns:
+            self._publish_timing()
+        if frame.time_ns >= self._state_due_ns:
+            self._publish_state(frame.time_ns)
+
+    def _tick(self) -> None:
+        host_ns = self._service.clock.host_ns()
+        outputs = self._advance(Tick(self._service.clock.now_ns(), host_ns - self._last_frame_ns))
+        self._send(outputs)
+        self._tell(outputs)
+
+    def _between_frames(self) -> None:
+        """Apply what operators asked, in the order they asked, and what the camera says of itself."""
+        camera = self._camera.take(0) if self._camera.received else None
+        if camera is not None:
+            settings_now = codec.decode_camera(camera.payload)
+            if settings_now is not None:
+                self._tell(self._advance(settings_now))
+        while self._queries:
+            self._answer(self._queries.popleft())
+
+    def _answer(self, query: Query) -> None:
+        now_ns = self._service.clock.now_ns()
+        request = codec.decode_request(query.payload, query.name, now_ns)
+        if request is None:
+            request = Request(now_ns, query.name)
+            outputs = Outputs(reply=Reply(False, "the request could not be read", self._state.frame_sequence + 1))
+        else:
+            outputs = self._advance(request)
+        assert outputs.reply is not None  # noqa: S101  # every request has an answer
+        state = None
+        if request.name == "status":
+            state = codec.controller_state(self._state, self._settings.delay_frames, now_ns)
+        answer = codec.encode_request(request, outputs.reply, state)
+        query.reply(answer)
+        self._requests.put(answer)
+        self._tell(outputs)
+
+    def _adopt_mirror(self) -> None:
+        """Learn where the mirror is before the first command, so that it does not jump."""
+        if self._service.clock.lockstep:  # every lockstep run starts from flat
+            return
+        sample = self._mirror.take(MIRROR_PATIENCE_S)
+        shape = codec.decode_mirror(sample.payload) if sample is not None else None
+        if shape is not None:
+            self._tell(self._advance(shape))
+        elif self._service.running:
+            self._service.event("MIRROR_SILENT", patience_s=MIRROR_PATIENCE_S)
+
+    def _advance(self, taken: Input) -> Outputs:
+        self._state, outputs = advance(self._settings, self._state, taken)
+        return outputs
+
+    def _send(self, outputs: Outputs) -> None:
+        if outputs.command is not None:
+            self._commands.put(codec.encode_command(outputs.command, self._valid_ns, CHANNEL))
+
+    def _tell(self, outputs: Outputs) -> None:
+        """Publish the step and the events, and the state where more of it changed than the next frame shows."""
+        if outputs.step is not None:
+            self._steps.put(codec.encode_step(outputs.step))
+        for event in outputs.events:
+            self._service.event(event.name, **event.details)
+        if outputs.changed:
+            self._publish_state(self._service.clock.now_ns())
+
+    def _publish_state(self, time_ns: int) -> None:
+        message = codec.controller_state(self._state, self._settings.delay_frames, time_ns)
+        self._states.put(message.SerializeToString())
+        self._state_due_ns = time_ns + STATE_PERIOD_NS
+
+    def _publish_timing(self) -> None:
+        now_ns = self._service.clock.host_ns()
+        self._timing_due_ns = now_ns + TIMING_PERIOD_NS
+        if self._timing.frame_sequence:
+            self._timing.timestamp.CopyFrom(timestamp(now_ns))
+            self._timings.put(self._timing.SerializeToString())
+            self._timing = wire.ControlTiming()
+
+    def _ask(self, query: Query) -> None:
+        """On the bus's thread: leave the request for the loop, and wake it."""
+        self._queries.append(query)
+        self._frames.wake()

@@ -1,0 +1,175 @@
+"""The launcher of the simulated loop: starts camera, mirror, controller and recorder, watches them, sums up."""
+
+import contextlib
+import math
+import signal
+import sys
+import time
+from collections.abc import Callable, Iterator
+from types import FrameType
+from typing import Any
+
+from rich.console import Console
+from rich.live import Live
+from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
+
+from lowfc.adapters import calibration_file, instrument
+from lowfc.adapters.clock import HostClock
+from lowfc.adapters.join import mirror_role
+from lowfc.adapters.run import Run, new_run_id, open_run
+from lowfc.adapters.zenoh_bus import ZenohBus
+from lowfc.contract.configuration import Configuration
+from lowfc.contract.errors import LowfcError
+from lowfc.contract.messages import EVENT, HEALTH, Role
+from lowfc.programs.processes import Child, start_all, stop_all
+from lowfc.programs.status import screen, status_line
+from lowfc.programs.watch import Watch, summary
+
+POLL_S = 0.1
+SETTLE_S = 0.05
+"""After the last frame, before the controller is stopped: the last command is on its way."""
+LINE_PERIOD_S = 5.0
+
+
+class ProcessDiedError(LowfcError):
+    """A process of the loop ended by itself."""
+
+
+def sim_loop(config: Configuration, duration_s: float | None, record: bool) -> dict[str, Any]:
+    """Run the simulated loop for a time (None: until Ctrl-C); return the summary that `--json` prints.
+
+    Raises:
+        ProcessDiedError: a process ended by itself; the text names it and has its last words.
+    """
+    console = Console(stderr=True)
+    run = open_run(new_run_id(), (config.mirror.name,))
+    try:
+        _prepare(config, run, console)
+        children = _children(config, run, duration_s, record)
+        watch = Watch({}, [])
+        start_all(children)
+        bus = ZenohBus(run.links, Role.LAUNCHER, HostClock())
+        try:
+            bus.subscribe(HEALTH, watch.hear)
+            bus.subscribe(EVENT, watch.note)
+            _supervise(config, children, watch, console, duration_s)
+        finally:
+            bus.close()
+            stop_all(children)
+        return summary(config, watch, record)
+    finally:
+        run.remove()
+
+
+def _prepare(config: Configuration, run: Run, console: Console) -> None:
+    """Build what the processes share: the twin in the cache, calibration and configuration in the run's directory."""
+
+    def warn(text: str) -> None:
+        console.print(f"warning: {text}", style="yellow", highlight=False)
+
+    with _progress("building the optical model", console) as advance:
+        optics = instrument.twin(config, advance, warn)
+    calibration_file.save(instrument.analytic_calibration(config, optics), run.path / "calibration.fits")
+    (run.path / "config.toml").write_text(config.to_toml(), encoding="utf-8")
+
+
+def _children(config: Configuration, run: Run, duration_s: float | None, record: bool) -> list[Child]:
+    """The processes, in the order in which they are stopped: from the source of the data to its end."""
+    shared = ["--run", run.run_id, "--config", str(run.path / "config.toml")]
+    calibration = ["--calibration", str(run.path / "calibration.fits")]
+    mirror = mirror_role(config.mirror.name)
+    awaited = [Role.CONTROLLER, mirror, *([Role.RECORDER] if record else [])]
+    camera = ["-m", "sim_camera", *shared, *(word for name in awaited for word in ("--wait-for", str(name)))]
+    if duration_s is not None:
+        camera += ["--frames", str(max(1, math.ceil(duration_s * config.camera.rate_hz)))]
+    commands = {
+        str(Role.CAMERA): camera,
+        str(Role.CONTROLLER): ["-m", "lowfc", "controller", *shared, *calibration],
+        mirror: ["-m", "sim_dm", *shared],
+    }
+    if record:
+        commands[str(Role.RECORDER)] = ["-m", "lowfc", "record", *shared, *calibration]
+    return [Child(name, arguments, run.path / f"{name}.stderr") for name, arguments in commands.items()]
+
+
+def _supervise(
+    config: Configuration,
+    children: list[Child],
+    watch: Watch,
+    console: Console,
+    duration_s: float | None,
+) -> None:
+    """Until the camera has exposed its frames, Ctrl-C, or the death of a process."""
+    camera = children[0]
+    with _interrupted() as interrupted, _display(console) as show:
+        begun_s = time.monotonic()
+        while camera.status is None and not interrupted():
+            _check(children[1:])
+            show(watch, config, duration_s, time.monotonic() - begun_s)
+            time.sleep(POLL_S)
+        if not interrupted():
+            _check(children)
+        camera.stop(patience_s=5.0)
+        time.sleep(SETTLE_S)
+        stop_all(children)
+        time.sleep(POLL_S)  # the last Health is on its way
+    for child in children:
+        if child.status != 0:
+            raise ProcessDiedError(f"{child.how_it_ended()}\n{child.last_words()}")
+
+
+def _check(children: list[Child]) -> None:
+    """Raise where a process ended by itself; the camera may end when it is done."""
+    for child in children:
+        if child.status is not None and not (child.name == Role.CAMERA and child.status == 0):
+            raise ProcessDiedError(f"{child.how_it_ended()}; its last words:\n{child.last_words()}")
+
+
+@contextlib.contextmanager
+def _progress(what: str, console: Console) -> Iterator[Callable[[int, int], None]]:
+    """A progress bar that appears with the first step."""
+    columns = (TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn())
+    with Progress(*columns, console=console, transient=True) as bar:
+        tasks: list[Any] = []
+
+        def advance(done: int, total: int) -> None:
+            if not tasks:
+                tasks.append(bar.add_task(what, total=total))
+            bar.update(tasks[0], completed=done, total=total)
+
+        yield advance
+
+
+@contextlib.contextmanager
+def _interrupted() -> Iterator[Callable[[], bool]]:
+    """Whether Ctrl-C or SIGTERM has come; a second Ctrl-C ends at once."""
+    caught: list[int] = []
+
+    def catch(number: int, frame: FrameType | None) -> None:
+        if caught:
+            raise KeyboardInterrupt
+        caught.append(number)
+
+    before = {number: signal.signal(number, catch) for number in (signal.SIGINT, signal.SIGTERM)}
+    try:
+        yield lambda: bool(caught)
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+
+@contextlib.contextmanager
+def _display(console: Console) -> Iterator[Callable[..., None]]:
+    """A live screen on a terminal, a line every few seconds elsewhere."""
+    if console.is_terminal:
+        with Live(console=console, refresh_per_second=4, transient=True) as live:
+            yield lambda *what: live.update(screen(*what))
+    else:
+        due_s = [LINE_PERIOD_S]
+
+        def line(watch: Watch, config: Configuration, duration_s: float | None, elapsed_s: float) -> None:
+            if elapsed_s >= due_s[0]:
+                due_s[0] += LINE_PERIOD_S
+                sys.stderr.write(status_line(watch, elapsed_s) + "\n")
+
+        yield line

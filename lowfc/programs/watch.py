@@ -1,0 +1,83 @@
+"""What a launcher hears of a run, and the figures that it sums up from the last Health of each process."""
+
+from dataclasses import dataclass
+from typing import Any
+
+from lowfc.adapters.bus import Sample, name_in
+from lowfc.adapters.join import mirror_role
+from lowfc.contract.configuration import Configuration
+from lowfc.contract.messages import COMMAND, FRAME, HEALTH, Log, Role, wire
+
+
+@dataclass(slots=True)
+class Watch:
+    """What the launcher hears: the last Health of each process and the last events."""
+
+    health: dict[str, wire.Health]
+    events: list[Log]
+
+    def of(self, name: str) -> wire.Health:
+        """Last Health of a process; an empty one before the first."""
+        return self.health.get(name, wire.Health())
+
+    def hear(self, sample: Sample) -> None:
+        """Keep a Health."""
+        self.health[name_in(HEALTH, sample.key)] = wire.Health.FromString(sample.payload)
+
+    def note(self, sample: Sample) -> None:
+        """Keep an event."""
+        self.events.append(Log.FromString(sample.payload))
+        del self.events[:-100]
+
+
+def summary(config: Configuration, watch: Watch, record: bool) -> dict[str, Any]:
+    """Figures of a run, from the last Health of each process."""
+    camera, controller = watch.of(Role.CAMERA), watch.of(Role.CONTROLLER)
+    mirror = watch.of(mirror_role(config.mirror.name))
+    frames = topic_count(controller, FRAME.key)
+    commands = topic_count(mirror, COMMAND.at(config.mirror.name))
+    wavefront = camera.wavefront
+    figures: dict[str, Any] = {
+        "rate_hz": round(camera.mean_rate_hz, 2),
+        "frames_published": topic_count(camera, FRAME.key).published,
+        "frames_processed": frames.received - frames.skipped,
+        "frames_skipped": frames.skipped,
+        "frames_missing": frames.missing,
+        "commands_applied": commands.received - commands.skipped,
+        "commands_late": camera.commands_late,
+        "messages_recorded": None,
+        "messages_lost": None,
+        "disturbance_rms_nm": round(wavefront.disturbance_rms_nm, 4),
+        "residual_rms_nm": round(wavefront.residual_rms_nm, 4),
+        "tilt_disturbance_mas": round(wavefront.tilt_disturbance_mas, 4),
+        "tilt_residual_mas": round(wavefront.tilt_residual_mas, 4),
+        "latency_us": {
+            "frame_to_command": _microseconds(controller.frame_to_command),
+            "frame_to_mirror": _microseconds(camera.frame_to_mirror),
+        },
+        "realtime_granted": list(controller.granted),
+        "realtime_refused": list(controller.refused),
+        "log": None,
+    }
+    if record:
+        recording = watch.of(Role.RECORDER).recording
+        figures |= {
+            "messages_recorded": recording.messages,
+            "messages_lost": recording.lost,
+            "log": recording.file,
+        }
+    return figures
+
+
+def topic_count(health: wire.Health, key: str) -> wire.TopicCount:
+    """What a process counted of a topic; zeros where it says nothing."""
+    return next((topic for topic in health.topics if topic.topic == key), wire.TopicCount())
+
+
+def _microseconds(latency: wire.Latency) -> dict[str, float]:
+    return {
+        "p50": latency.p50_ns / 1e3,
+        "p99": latency.p99_ns / 1e3,
+        "p99_9": latency.p99_9_ns / 1e3,
+        "max": latency.max_ns / 1e3,
+    }

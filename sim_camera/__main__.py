@@ -1,0 +1,41 @@
+"""Command line of the simulated camera."""
+
+from typing import Annotated
+
+import typer
+
+from lowfc.adapters.join import join
+from lowfc.adapters.terminal import DEFAULT_RUN, ConfigFile, RunId, configuration, new_app, run_app
+from lowfc.contract.messages import Role
+from sim_camera.process import CameraProcess, bench
+
+app = new_app("The simulated sensor camera.\n\nExample: sim-camera --run bench --config lowfc.toml")
+
+
+@app.command()
+def camera(
+    run: RunId = DEFAULT_RUN,
+    config: ConfigFile = None,
+    frames: Annotated[int | None, typer.Option(min=1, help="Stop after so many frames; default: when told to.")] = None,
+    wait_for: Annotated[list[str] | None, typer.Option(help="Process that the first frame waits for; repeat.")] = None,
+) -> None:
+    """Expose frames of a run: the mirror's surface from the bus, a disturbance from the seed, full diffraction.
+
+    Example: sim-camera --run bench --wait-for controller --wait-for mirror-dm
+    """
+    settings = configuration(config)
+    optics = bench(settings)
+    service = join(settings, run, Role.CAMERA, settings.realtime.camera_cpus)
+    process = CameraProcess(settings, service, optics, frames)
+    service.fill = process.fill
+    service.catch_signals()
+    process.run(tuple(wait_for or ()))
+
+
+def main() -> None:
+    """Entry point."""
+    run_app(app)
+
+
+if __name__ == "__main__":
+    main()

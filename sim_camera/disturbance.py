@@ -1,0 +1,162 @@
+"""What shakes the wavefront: a pure function of the seed and the frame index.
+
+Every preset is a sum of sine waves with seeded phases (a spectral model of drift, jitter and lines), a square wave or
+a static screen, so that any frame can be computed by itself and its spectrum is known exactly.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+Array = npt.NDArray[np.float64]
+
+BLOCK = 32
+"""Frames computed at once: cheap, and short enough not to delay a frame."""
+
+# The reaction wheel: rms of each line per axis, mas. Falling with frequency as a telescope's structure damps it;
+# with the drift they add up to 14 mas.
+LINES_HZ = (6.0, 18.0, 37.0, 71.0, 117.0)
+_LINES_MAS = (9.0, 8.3, 5.0, 3.0, 2.0)
+_DRIFT_MAS = 3.0
+_JITTER_HZ = (0.7, 1.9, 4.3, 9.1)
+_JITTER_MAS = 1.5
+_STEP_MAS = 5.0
+_STEP_PERIOD_S = 4.0
+_SCREEN_WAVES = 0.05
+_THERMAL_NM = {1: 4.0, 2: 5.0, 3: 2.5, 4: 1.5}
+_THERMAL_HZ = (0.003, 0.5)
+_DRIFT_HZ = (0.02, 5.0)
+_WAVES_PER_BAND = 24
+
+
+@dataclass(frozen=True, eq=False)
+class Disturbance:
+    """A disturbance of the modes and a static screen.
+
+    Attributes:
+        noll: Noll index of each mode.
+        frequency_hz: (waves,) of each sine wave.
+        amplitude_nm: (waves, modes) complex: amplitude and phase, nm of wavefront rms.
+        step_nm: (modes,) half of the height of a square wave.
+        static_nm: (modes,) constant.
+        screen_nm: rms of a static Kolmogorov screen, 0 for none.
+    """
+
+    noll: tuple[int, ...]
+    frequency_hz: Array
+    amplitude_nm: npt.NDArray[np.complex128]
+    step_nm: Array
+    static_nm: Array
+    screen_nm: float
+
+
+def disturbance(
+    preset: str,
+    noll: tuple[int, ...],
+    seed: int,
+    nm_per_mas: float,
+    wavelength_nm: float,
+    scale: float = 1.0,
+    static_nm: dict[int, float] | None = None,
+) -> Disturbance:
+    """The disturbance of a preset for these modes.
+
+    Raises:
+        ValueError: unknown preset, or a static mode that is not among the modes.
+    """
+    modes = len(noll)
+    static = np.zeros(modes)
+    for index, amplitude in (static_nm or {}).items():
+        if index not in noll:
+            raise ValueError(f"the static mode Z{index} is not one of Z{noll[0]} to Z{noll[-1]}")
+        static[noll.index(index)] = amplitude
+    rng = np.random.default_rng([seed, 1])
+    tilt = np.array([index in (2, 3) for index in noll])
+    tilt_nm = scale * nm_per_mas * tilt
+    step, screen = np.zeros(modes), 0.0
+    waves: list[tuple[Array, npt.NDArray[np.complex128]]] = []
+    match preset:
+        case "quiet":
+            pass
+        case "thermal":
+            waves = [_drift(rng, scale * _thermal_nm(noll), _THERMAL_HZ)]
+        case "bench":
+            waves = [
+                _drift(rng, scale * _thermal_nm(noll), _THERMAL_HZ),
+                _lines(rng, np.full(len(_JITTER_HZ), _JITTER_MAS / 2), _JITTER_HZ, tilt_nm),
+            ]
+        case "reaction-wheel":
+            waves = [
+                _drift(rng, scale * _thermal_nm(noll) * ~tilt, _THERMAL_HZ),
+                _drift(rng, _DRIFT_MAS * tilt_nm, _DRIFT_HZ),
+                _lines(rng, np.array(_LINES_MAS), LINES_HZ, tilt_nm),
+            ]
+        case "step":
+            step = _STEP_MAS * tilt_nm
+        case "kolmogorov":
+            screen = scale * _SCREEN_WAVES * wavelength_nm
+        case _:
+            raise ValueError(f"unknown disturbance {preset!r}")
+    frequencies = np.concatenate([np.zeros(0), *(frequency for frequency, _ in waves)])
+    amplitudes = np.concatenate([np.zeros((0, modes), complex), *(amplitude for _, amplitude in waves)])
+    return Disturbance(noll, frequencies, amplitudes, step, static, screen)
+
+
+def modes_nm(shaken: Disturbance, first: int, count: int, rate_hz: float) -> Array:
+    """Modes (count, modes) of the frames from `first` on, nm of wavefront rms."""
+    index = first + np.arange(count)
+    waves = np.exp(2j * np.pi * np.outer(np.arange(count) / rate_hz, shaken.frequency_hz))
+    start = shaken.amplitude_nm * np.exp(2j * np.pi * shaken.frequency_hz * (first / rate_hz))[:, None]
+    square = np.where(np.mod(index / rate_hz, _STEP_PERIOD_S) < _STEP_PERIOD_S / 2, -1.0, 1.0)
+    return np.asarray((waves @ start).real + square[:, None] * shaken.step_nm + shaken.static_nm)
+
+
+def screen(seed: int, samples: int, spacing: float) -> Array:
+    """Kolmogorov screen (samples, samples), of power law -11/3, at a spacing in pupil diameters; of any scale.
+
+    It is made on a square of four pupil diameters and holds nothing finer than 12 cycles per diameter, which is far
+    beyond what the sensor's focal-plane mask passes, so that coarse nodes do not fold fine structure back.
+    """
+    rng = np.random.default_rng([seed, 2])
+    side, finest = 4.0, 12.0
+    count = int(2 * finest * side)
+    frequency = np.arange(-count // 2, count // 2 + 1) / side
+    fx, fy = np.meshgrid(frequency, frequency)
+    radius = np.hypot(fx, fy)
+    amplitude = np.where((radius > 0) & (radius <= finest), np.maximum(radius, 1 / side) ** (-11 / 6), 0.0)
+    spectrum = amplitude * (rng.standard_normal(radius.shape) + 1j * rng.standard_normal(radius.shape))
+    position = (np.arange(samples) - (samples - 1) / 2) * spacing
+    waves = np.exp(2j * np.pi * np.outer(position, frequency))
+    return np.asarray((waves @ spectrum @ waves.T).real)
+
+
+def _thermal_nm(noll: tuple[int, ...]) -> Array:
+    """Rms of the slow drift of each mode, by radial degree."""
+    return np.array([_THERMAL_NM.get(_radial_degree(index), 1.0) for index in noll])
+
+
+def _radial_degree(noll: int) -> int:
+    return int((np.sqrt(8 * noll - 7) - 1) / 2)
+
+
+def _drift(
+    rng: np.random.Generator, rms_nm: Array, band_hz: tuple[float, float]
+) -> tuple[Array, npt.NDArray[np.complex128]]:
+    """Sine waves, evenly spread in the logarithm of frequency, with a power that falls as 1/f^2 per hertz."""
+    frequencies = np.geomspace(*band_hz, _WAVES_PER_BAND) * rng.uniform(0.95, 1.05, _WAVES_PER_BAND)
+    weights = frequencies**-0.5
+    weights *= np.sqrt(2 / np.sum(weights**2))
+    return frequencies, weights[:, None] * _phases(rng, (_WAVES_PER_BAND, len(rms_nm))) * rms_nm
+
+
+def _lines(
+    rng: np.random.Generator, rms: Array, frequencies_hz: tuple[float, ...], unit_nm: Array
+) -> tuple[Array, npt.NDArray[np.complex128]]:
+    """Sine waves at fixed frequencies; `rms` of each in units of `unit_nm` (modes,)."""
+    amplitude = np.sqrt(2) * rms[:, None] * unit_nm
+    return np.array(frequencies_hz), amplitude * _phases(rng, amplitude.shape)
+
+
+def _phases(rng: np.random.Generator, shape: tuple[int, int]) -> npt.NDArray[np.complex128]:
+    return np.asarray(np.exp(2j * np.pi * rng.random(shape)))

@@ -1,0 +1,57 @@
+"""The true wavefront's figures over the second half of a run of unknown length."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from sim_camera.bench import Truth
+
+BLOCK = 500
+"""Frames summed together: the second half is right to this many frames."""
+
+
+@dataclass(frozen=True, slots=True)
+class Wavefront:
+    """Root mean squares over the second half: nm over the open pupil, mas per axis."""
+
+    disturbance_rms_nm: float
+    residual_rms_nm: float
+    tilt_disturbance_mas: float
+    tilt_residual_mas: float
+
+
+class Figures:
+    """Sums of squares, block by block."""
+
+    def __init__(self, noll: tuple[int, ...], nm_per_mas: float) -> None:
+        """The modes of the truths to come, and what a milliarcsecond of tilt is on the wavefront."""
+        self._tilts = [noll.index(index) for index in (2, 3) if index in noll]
+        self._nm_per_mas = nm_per_mas
+        self._blocks: list[list[float]] = []
+        self._sums = [0.0, 0.0, 0.0, 0.0]
+        self._count = 0
+
+    def add(self, truth: Truth) -> None:
+        """Count the truth of one frame."""
+        tilt, left = truth.disturbance_nm[self._tilts], truth.residual_nm[self._tilts]
+        sums = self._sums
+        sums[0] += truth.disturbance_rms_nm**2
+        sums[1] += truth.residual_rms_nm**2
+        sums[2] += float(tilt @ tilt)
+        sums[3] += float(left @ left)
+        self._count += 1
+        if self._count == BLOCK:
+            self._blocks.append(sums)
+            self._sums, self._count = [0.0, 0.0, 0.0, 0.0], 0
+
+    def wavefront(self) -> Wavefront | None:
+        """Figures over the second half of the whole blocks, or of what there is; None before the first frame."""
+        if self._blocks:
+            half = self._blocks[len(self._blocks) // 2 :]
+            mean = np.sum(half, axis=0) / (BLOCK * len(half))
+        elif self._count:
+            mean = np.array(self._sums) / self._count
+        else:
+            return None
+        mean[2:] /= 2 * self._nm_per_mas**2
+        return Wavefront(*(float(value) for value in np.sqrt(mean)))

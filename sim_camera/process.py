@@ -1,0 +1,225 @@
+"""The simulated camera's process: mirror states from the bus, frames and truth to it."""
+
+import threading
+from collections import deque
+from itertools import count
+
+import numpy as np
+import numpy.typing as npt
+
+from lowfc.adapters import instrument
+from lowfc.adapters.bus import Sample
+from lowfc.adapters.service import Service
+from lowfc.contract.codec import actuators, latency
+from lowfc.contract.configuration import Configuration
+from lowfc.contract.errors import BusError, ConfigurationError
+from lowfc.contract.messages import CAMERA_STATE, FRAME, MIRROR_STATE, TRUTH, image, timestamp, wire
+from lowfc.control.durations import Durations
+from lowfc.control.stability import delay_weights
+from lowfc.optics.detector import saturation_dn
+from lowfc.optics.photometry import tilt_nm_per_mas
+from sim_camera.bench import Bench, Truth
+from sim_camera.disturbance import disturbance
+from sim_camera.figures import Figures
+
+Single = npt.NDArray[np.float32]
+
+PATIENCE_S = 5.0
+"""In lockstep, real time without progress after which the run is ended."""
+WAIT_S = 30.0
+"""How long the first frame waits for those who must not miss it."""
+_REMEMBERED = 256
+
+
+def bench(config: Configuration) -> Bench:
+    """The bench of a configuration; its twin comes from the cache."""
+    section = config.disturbance
+    try:
+        shaken = disturbance(
+            section.preset,
+            config.noll,
+            config.seed,
+            tilt_nm_per_mas(config.star.diameter_m),
+            config.star.wavelength_nm,
+            section.scale,
+            {int(index): amplitude for index, amplitude in section.static_nm.items()},
+        )
+    except ValueError as error:
+        raise ConfigurationError(f"disturbance: {error}") from None
+    return Bench(
+        instrument.twin(config, None, lambda _: None),
+        instrument.mirror(config),
+        instrument.detector(config),
+        instrument.electrons_per_exposure(config),
+        shaken,
+        config.camera.rate_hz,
+        config.seed,
+        config.camera.noise,
+    )
+
+
+class CameraProcess:
+    """Exposes frame after frame until told to stop, or for a number of frames."""
+
+    def __init__(self, config: Configuration, service: Service, optics: Bench, frames: int | None) -> None:
+        """Declare everything on the bus."""
+        self._config = config
+        self._service = service
+        self._bench = optics
+        self._limit = frames
+        self._frames = service.publisher(FRAME)
+        self._truths = service.publisher(TRUTH)
+        self._settings = service.publisher(CAMERA_STATE)
+        self._weights = delay_weights(config.camera.delay_frames).astype(np.float32)
+        flat = np.zeros((config.mirror.rows, config.mirror.columns), np.float32)
+        self._shapes = deque([flat] * len(self._weights), maxlen=len(self._weights))
+        self._states: deque[Sample] = deque(maxlen=_REMEMBERED)
+        self._arrived = threading.Event()
+        service.bus.subscribe(MIRROR_STATE, self._hear, config.mirror.name)
+        service.on_stop(self._arrived.set)
+        self._latched = flat
+        self._newest_state = 0
+        self._put_ns = [(0, 0)] * _REMEMBERED
+        self._last_frame = 0
+        self._first_put_ns = 0
+        self._late = 0
+        self._frame_to_mirror = Durations()
+        self._figures = Figures(config.noll, tilt_nm_per_mas(config.star.diameter_m))
+        service.state = "ready"
+
+    def run(self, wait_for: tuple[str, ...]) -> None:
+        """Expose, publish, wait; the first frame waits for those named.
+
+        Raises:
+            BusError: somebody did not come, or in lockstep did not answer.
+        """
+        missing = self._service.wait_for(wait_for, WAIT_S)
+        if missing and self._service.running:
+            raise BusError(f"no sign of {', '.join(missing)} after {WAIT_S:g} s; the camera will not start without")
+        self._service.state = "running"
+        clock, period_ns, exposure_ns = self._service.clock, self._config.period_ns, self._config.exposure_ns
+        origin_ns = clock.now_ns() if clock.lockstep else clock.now_ns() + 10 * period_ns
+        settings_every = max(1, round(self._config.camera.rate_hz / float(CAMERA_STATE.rate)))
+        for index in count() if self._limit is None else range(self._limit):
+            start_ns = origin_ns + index * period_ns
+            clock.sleep_until_ns(start_ns)
+            behind_ns = clock.now_ns() - start_ns
+            if behind_ns > period_ns:  # the host stood still: go on from here rather than catch up in a burst
+                origin_ns += behind_ns
+                start_ns += behind_ns
+            if not self._service.running:
+                break
+            end_ns = start_ns + exposure_ns
+            if index % settings_every == 0:
+                self._publish_settings(end_ns)
+            truth = self._expose(index, end_ns)
+            self._figures.add(truth)
+            self._service.work += 1
+            if clock.lockstep:
+                self._wait_for_mirror()
+            self._service.beat()
+        self._drain()
+        self._service.finish()
+
+    def fill(self, health: wire.Health) -> None:
+        """Add latency and wavefront to a Health."""
+        health.commands_late = self._late
+        if self._frames.published > 1:
+            elapsed_ns = self._put_ns[self._last_frame % _REMEMBERED][1] - self._first_put_ns
+            health.mean_rate_hz = (self._frames.published - 1) * 1e9 / elapsed_ns
+        if self._frame_to_mirror.count:
+            health.frame_to_mirror.CopyFrom(latency(self._frame_to_mirror))
+        wavefront = self._figures.wavefront()
+        if wavefront is not None:
+            health.wavefront.CopyFrom(
+                wire.WavefrontFigures(
+                    disturbance_rms_nm=wavefront.disturbance_rms_nm,
+                    residual_rms_nm=wavefront.residual_rms_nm,
+                    tilt_disturbance_mas=wavefront.tilt_disturbance_mas,
+                    tilt_residual_mas=wavefront.tilt_residual_mas,
+                )
+            )
+
+    def _expose(self, index: int, end_ns: int) -> Truth:
+        """Latch the mirror, make the frame during the exposure, publish it at its end and the truth after it."""
+        clock = self._service.clock
+        self._drain()
+        self._shapes.appendleft(self._latched)
+        seen = self._weights[0] * self._shapes[0]
+        for weight, shape in zip(list(self._weights)[1:], list(self._shapes)[1:], strict=True):
+            seen = seen + weight * shape
+        frame, truth = self._bench.expose(index, seen)
+        payload = image(frame, end_ns, "lowfc_camera").SerializeToString()
+        clock.sleep_until_ns(end_ns)
+        envelope = self._frames.put(payload)
+        self._put_ns[envelope.sequence % _REMEMBERED] = (envelope.sequence, envelope.publish_time_ns)
+        self._last_frame = envelope.sequence
+        self._first_put_ns = self._first_put_ns or envelope.publish_time_ns
+        message = wire.Truth(
+            timestamp=timestamp(end_ns),
+            frame_sequence=envelope.sequence,
+            disturbance_nm=truth.disturbance_nm.tolist(),
+            residual_nm=truth.residual_nm.tolist(),
+            disturbance_rms_nm=truth.disturbance_rms_nm,
+            residual_rms_nm=truth.residual_rms_nm,
+        )
+        self._truths.put(message.SerializeToString())
+        return truth
+
+    def _hear(self, sample: Sample) -> None:
+        self._states.append(sample)
+        self._arrived.set()
+
+    def _drain(self) -> None:
+        """Take the mirror's states that have come: the newest is the shape of the next exposure."""
+        while self._states:
+            sample = self._states.popleft()
+            state = wire.MirrorState.FromString(sample.payload)
+            shape = actuators(state)
+            if shape is None or shape.shape != self._latched.shape:
+                self._service.event("BAD_MESSAGE", topic=sample.key, why="its grid is not the configured mirror's")
+                continue
+            self._latched = shape
+            if state.frame_sequence > self._newest_state:
+                self._newest_state = state.frame_sequence
+                self._late += state.frame_sequence < self._last_frame
+                sequence, put_ns = self._put_ns[state.frame_sequence % _REMEMBERED]
+                if sequence == state.frame_sequence:
+                    self._frame_to_mirror.add(sample.publish_time_ns - put_ns)
+
+    def _wait_for_mirror(self) -> None:
+        """In lockstep: until the mirror has applied the command made from the last frame."""
+        while self._newest_state < self._last_frame and self._service.running:
+            self._arrived.clear()
+            if not self._states and not self._arrived.wait(PATIENCE_S):
+                raise BusError(self._silent_ones())
+            self._drain()
+
+    def _silent_ones(self) -> str:
+        now_ns = self._service.clock.host_ns()
+        silent = [
+            name
+            for name, health in sorted(self._service.heard.items())
+            if name != self._service.name and now_ns - health.timestamp.ToNanoseconds() > PATIENCE_S * 0.4e9
+        ]
+        who = f"nothing was heard of {', '.join(silent)}" if silent else "all processes are alive"
+        return (
+            f"the mirror did not apply a command for frame {self._frames.published - 1} within {PATIENCE_S:g} s: {who}"
+        )
+
+    def _publish_settings(self, time_ns: int) -> None:
+        camera, detector = self._config.camera, instrument.detector(self._config)
+        state = wire.CameraState(
+            timestamp=timestamp(time_ns),
+            exposure_ns=self._config.exposure_ns,
+            period_ns=self._config.period_ns,
+            gain_e_per_dn=camera.gain_e_per_dn,
+            bias_dn=camera.bias_dn,
+            read_noise_e=camera.read_noise_e,
+            saturation_dn=saturation_dn(detector),
+            rows=self._bench.shape[0],
+            columns=self._bench.shape[1],
+            bit_depth=camera.bit_depth,
+            em_gain=camera.em_gain,
+        )
+        self._settings.put(state.SerializeToString())

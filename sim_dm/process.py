@@ -1,0 +1,142 @@
+"""The simulated mirror's process: commands from the bus, state and picture to it."""
+
+import numpy as np
+import numpy.typing as npt
+from google.protobuf.message import DecodeError
+
+from lowfc.adapters.bus import Sample
+from lowfc.adapters.clock import SimulatedClock
+from lowfc.adapters.instrument import mirror, mirror_limits
+from lowfc.adapters.service import Service
+from lowfc.contract.codec import actuators
+from lowfc.contract.configuration import Configuration
+from lowfc.contract.messages import COMMAND, MIRROR_STATE, SURFACE, from_timestamp, image, timestamp, wire
+from lowfc.control.safety import Reason
+from lowfc.optics.grid import pupil_axis
+from lowfc.optics.mirror import influence_factors
+from sim_dm.device import Device, Told, initial, obey, tick
+
+Single = npt.NDArray[np.float32]
+
+TICK_S = 0.01
+IDLE_STATE_NS = 100_000_000
+"""Without commands the state is published this often, so that a restarted controller learns it."""
+PICTURE_PIXELS = 64
+
+
+def device(config: Configuration) -> Device:
+    """The mirror of a configuration."""
+    section = config.mirror
+    fixed_nm = np.full((section.rows, section.columns), np.nan, np.float32)
+    fixed_nm.flat[section.dead] = 0
+    for index, height_nm in section.stuck_nm.items():
+        fixed_nm.flat[int(index)] = height_nm
+    return Device(
+        fixed_nm.shape,
+        mirror_limits(config),
+        section.stroke_nm / 2**section.driver_bits,
+        section.settling_us * 1e3,
+        fixed_nm,
+        section.expired == "flat",
+    )
+
+
+class MirrorProcess:
+    """Follows commands until told to stop."""
+
+    def __init__(self, config: Configuration, service: Service) -> None:
+        """Declare everything on the bus."""
+        name = config.mirror.name
+        self._service = service
+        self._device = device(config)
+        self._status = initial(self._device)
+        self._commands = service.mailbox(COMMAND, name)
+        self._states = service.publisher(MIRROR_STATE, name)
+        self._surfaces = service.publisher(SURFACE, name)
+        geometry, axis = mirror(config), pupil_axis(PICTURE_PIXELS)
+        self._y_factors: Single = influence_factors(geometry, axis, geometry.rows).astype(np.float32)
+        self._x_factors: Single = influence_factors(geometry, axis, geometry.columns).astype(np.float32)
+        self._picture_due_ns = 0
+        self._state_due_ns = 0
+        self._refused: Reason | None = None
+        service.state = "ready"
+
+    def run(self) -> None:
+        """Commands first; without one, the dead-man."""
+        while self._service.running:
+            sample = self._commands.take(TICK_S)
+            if sample is not None:
+                self._follow(sample)
+            elif not self._service.clock.lockstep:
+                self._wait()
+            self._service.beat()
+        self._service.finish()
+
+    def _follow(self, sample: Sample) -> None:
+        clock = self._service.clock
+        try:
+            told = _told(sample.payload)
+        except DecodeError as error:
+            self._service.event("BAD_MESSAGE", topic=sample.key, why=error)
+            return
+        if isinstance(clock, SimulatedClock):
+            clock.set_ns(told.time_ns)
+        before = self._status
+        self._status, refused = obey(self._device, before, told, clock.now_ns())
+        self._publish(told.time_ns)
+        self._service.work += 1
+        if refused is not None and refused is not self._refused:
+            self._service.event("COMMAND_REFUSED", reason=refused.name)
+        self._refused = refused
+        if not before.following and before.frame_sequence and refused is None:
+            self._service.event("COMMAND_BACK")
+        for reason in self._status.limits_hit:
+            if reason not in before.limits_hit:
+                self._service.event("LIMIT_HIT", reason=reason.name)
+
+    def _wait(self) -> None:
+        now_ns = self._service.clock.now_ns()
+        before = self._status
+        self._status = tick(self._device, before, now_ns)
+        if before.following and not self._status.following:
+            action = "relaxing to flat" if self._device.flatten else "holding the shape"
+            self._service.event("COMMAND_EXPIRED", valid_ms=before.valid_for_ns / 1e6, action=action)
+        moved = (
+            self._status.surface_nm is not before.surface_nm and (self._status.surface_nm != before.surface_nm).any()
+        )
+        if moved or now_ns >= self._state_due_ns:
+            self._publish(now_ns)
+
+    def _publish(self, time_ns: int) -> None:
+        """Publish the state, then, when it is due, a picture of the surface."""
+        status = self._status
+        following = wire.MIRROR_STATUS_FOLLOWING if status.following else wire.MIRROR_STATUS_EXPIRED
+        state = wire.MirrorState(
+            timestamp=timestamp(time_ns),
+            frame_sequence=status.frame_sequence,
+            status=following if status.frame_sequence else wire.MIRROR_STATUS_WAITING,
+            rows=self._device.grid[0],
+            columns=self._device.grid[1],
+            actuators=status.surface_nm.tobytes(),
+            command_nm=status.command_nm.tolist(),
+            limits_hit=[reason.value for reason in status.limits_hit],  # type: ignore[misc]  # numbered alike
+            channels=sorted(status.channels),
+        )
+        self._states.put(state.SerializeToString())
+        self._state_due_ns = self._service.clock.now_ns() + IDLE_STATE_NS
+        if time_ns >= self._picture_due_ns:
+            picture = np.asarray(self._y_factors @ status.surface_nm @ self._x_factors.T, np.float32)
+            self._surfaces.put(image(picture, time_ns, "mirror").SerializeToString())
+            self._picture_due_ns = time_ns + int(1e9 / float(SURFACE.rate))
+
+
+def _told(payload: bytes) -> Told:
+    message = wire.MirrorCommand.FromString(payload)
+    return Told(
+        message.channel,
+        message.frame_sequence,
+        from_timestamp(message.timestamp),
+        message.valid_for_ns,
+        actuators(message),
+        np.array(message.command_nm, dtype=np.float32),
+    )

@@ -1,0 +1,68 @@
+"""The optics under test, built once: the real masks at the paper's sampling."""
+
+import importlib
+import warnings
+
+import numpy as np
+import pytest
+
+from lowfc.adapters.masks import sensor_from
+from lowfc.adapters.twin_store import load_or_build
+from lowfc.optics.band import gauss_legendre
+from lowfc.optics.sensor import pupil_radii
+from lowfc.optics.twin import ACCURATE, FAST
+from lowfc.optics.zernike import NOLLS_20, zernikes
+
+
+@pytest.fixture(scope="session")
+def sensor():
+    return sensor_from()
+
+
+@pytest.fixture(scope="session")
+def modes(sensor):
+    """The 20 modes (20, 512, 512) at the pupil's samples."""
+    return zernikes(NOLLS_20, *pupil_radii(sensor))
+
+
+@pytest.fixture(scope="session")
+def coefficients_nm():
+    """20 wavefronts (20, 20): the paper's literal bounds, 0.04 waves rms for n = 1, 2 and 0.016 above."""
+    bounds_nm = 550.0 * np.where(np.array(NOLLS_20) <= 6, 0.04, 0.016)
+    return np.random.default_rng(20).uniform(-1, 1, (20, 20)) * bounds_nm
+
+
+@pytest.fixture(scope="session")
+def cache_dir(tmp_path_factory):
+    return tmp_path_factory.mktemp("twins")
+
+
+@pytest.fixture(scope="session")
+def fast(sensor, cache_dir):
+    return load_or_build(sensor, FAST, cache_dir=cache_dir)
+
+
+@pytest.fixture(scope="session")
+def accurate(sensor, cache_dir):
+    return load_or_build(sensor, ACCURATE, cache_dir=cache_dir)
+
+
+@pytest.fixture(scope="session")
+def broadband(sensor, cache_dir):
+    return load_or_build(sensor, FAST, gauss_legendre(550.0), cache_dir=cache_dir)
+
+
+@pytest.fixture(scope="session")
+def hcipy():
+    """An independent model; its import warns of things that are not ours."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        return importlib.import_module("hcipy")
+
+
+@pytest.fixture(scope="session")
+def prysm():
+    """Another independent model: prysm.propagation."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        return importlib.import_module("prysm.propagation")
