@@ -6,15 +6,12 @@ import numpy as np
 import numpy.typing as npt
 
 from lowfc.optics.detector import Detector, expose, saturation_dn
-from lowfc.optics.mirror import Mirror, influence_factors
 from lowfc.optics.twin import Evaluator, Twin, node_radii, wavefront_rms_nm
+from lowfc.optics.twin_mirror import TwinMirror, wavefront_nm
 from lowfc.optics.zernike import zernikes
 from sim_camera.disturbance import BLOCK, Disturbance, modes_nm, screen
 
 Single = npt.NDArray[np.float32]
-
-LOWPASS_CYCLES = 12.0
-"""Finest structure of the mirror that the pupil nodes may see, cycles per diameter: beyond it they would fold it."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -33,7 +30,7 @@ class Bench:
     def __init__(
         self,
         optics: Twin,
-        mirror: Mirror,
+        mirror: TwinMirror,
         detector: Detector,
         electrons: float,
         shaken: Disturbance,
@@ -43,6 +40,7 @@ class Bench:
     ) -> None:
         """Prepare everything that does not change from frame to frame."""
         self._optics = optics
+        self._mirror = mirror
         self._evaluator = Evaluator(optics)
         self._detector = detector
         self._electrons = np.float32(electrons)
@@ -50,16 +48,14 @@ class Bench:
         self._rate_hz = rate_hz
         self._rng = np.random.Generator(np.random.SFC64(np.random.SeedSequence([seed, 3])))
         self._noise = noise
-        self._y_factors: Single = influence_factors(mirror, optics.axis, mirror.rows, LOWPASS_CYCLES).astype(np.float32)
-        self._x_factors: Single = influence_factors(mirror, optics.axis, mirror.columns, LOWPASS_CYCLES).astype(
-            np.float32
-        )
+        self._normal = np.empty(self.shape, np.float32)
         self._basis = zernikes(shaken.noll, *node_radii(optics)).astype(np.float32)
         self._screen = self._static_screen(seed)
         self._screen_modes = np.asarray(self._project(self._screen), dtype=np.float32)
-        self._mirror_to_modes = self._mirror_projection(mirror)
+        self._mirror_to_modes = self._mirror_projection()
         self._block = np.zeros((0, len(shaken.noll)), np.float32)
         self._block_start = 0
+        self.prepare()
 
     @property
     def shape(self) -> tuple[int, int]:
@@ -68,29 +64,35 @@ class Bench:
         return pixels, pixels
 
     def expose(self, index: int, actuators_nm: Single) -> tuple[npt.NDArray[np.uint16], Truth]:
-        """Frame (rows, columns) of index `index` with the mirror's actuators (rows, columns), and its truth."""
+        """Frame (rows, columns) with the mirror's actuators (rows, columns), and its truth; after `prepare`."""
         modes = self._modes(index)
         disturbance_nm: Single = modes @ self._basis
         disturbance_nm += self._screen
-        surface_nm = np.asarray(self._y_factors @ actuators_nm @ self._x_factors.T, np.float32)
-        wavefront_nm: Single = disturbance_nm + np.float32(2) * surface_nm.reshape(-1)[self._optics.used]
-        electrons = self._evaluator.image(wavefront_nm) * self._electrons
-        frame = expose(self._detector, electrons, self._rng) if self._noise else self._noiseless(electrons)
+        residual_nm = disturbance_nm + wavefront_nm(self._mirror, actuators_nm)
+        electrons = self._evaluator.image(residual_nm) * self._electrons
+        frame = (
+            expose(self._detector, electrons, self._rng, self._normal) if self._noise else self._noiseless(electrons)
+        )
         true_modes = modes + self._screen_modes
         truth = Truth(
             true_modes,
             true_modes + self._mirror_to_modes @ actuators_nm.reshape(-1),
             wavefront_rms_nm(self._optics, disturbance_nm),
-            wavefront_rms_nm(self._optics, wavefront_nm),
+            wavefront_rms_nm(self._optics, residual_nm),
         )
         return frame, truth
+
+    def prepare(self) -> None:
+        """Draw what the next frame's noise needs and does not depend on its light: call it when there is time."""
+        if self._noise:
+            self._rng.standard_normal(dtype=np.float32, out=self._normal)
 
     def _modes(self, index: int) -> Single:
         """Disturbance (modes,) of a frame, from a block computed every `BLOCK` frames."""
         offset = index - self._block_start
         if not 0 <= offset < len(self._block):
-            self._block_start, offset = index, 0
-            self._block = modes_nm(self._shaken, index, BLOCK, self._rate_hz).astype(np.float32)
+            self._block_start, offset = index - index % BLOCK, index % BLOCK  # a frame is the same in whatever order
+            self._block = modes_nm(self._shaken, self._block_start, BLOCK, self._rate_hz).astype(np.float32)
         row: Single = self._block[offset]
         return row
 
@@ -114,9 +116,9 @@ class Bench:
         basis = np.vstack([np.ones(inside.sum()), self._basis[:, inside]]).astype(np.float64)
         return np.asarray(np.linalg.lstsq(basis.T, opd_nm[inside].astype(np.float64), rcond=None)[0][1:])
 
-    def _mirror_projection(self, mirror: Mirror) -> Single:
+    def _mirror_projection(self) -> Single:
         """(modes, actuators): modes of the wavefront, twice the surface, per nm of each actuator."""
-        nodes = self._optics.used
-        rows, columns = nodes // self._optics.axis.size, nodes % self._optics.axis.size
-        influence = self._y_factors[rows][:, :, None] * self._x_factors[columns][:, None, :]
-        return (2 * self._project(influence.reshape(len(nodes), -1))).astype(np.float32)
+        mirror = self._mirror
+        actuators = mirror.y_factors.shape[1] * mirror.x_factors.shape[1]
+        pokes = np.eye(actuators, dtype=np.float32).reshape(actuators, mirror.y_factors.shape[1], -1)
+        return self._project(np.stack([wavefront_nm(mirror, poke) for poke in pokes], axis=1)).astype(np.float32)

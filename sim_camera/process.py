@@ -46,9 +46,10 @@ def bench(config: Configuration) -> Bench:
         )
     except ValueError as error:
         raise ConfigurationError(f"disturbance: {error}") from None
+    optics = instrument.twin(config, None, _ignore)
     return Bench(
-        instrument.twin(config, None, lambda _: None),
-        instrument.mirror(config),
+        optics,
+        instrument.mirror_on_twin(config, optics, _ignore),
         instrument.detector(config),
         instrument.electrons_per_exposure(config),
         shaken,
@@ -56,6 +57,10 @@ def bench(config: Configuration) -> Bench:
         config.seed,
         config.camera.noise,
     )
+
+
+def _ignore(warning: str) -> None:
+    """The launcher has told the user."""
 
 
 class CameraProcess:
@@ -115,6 +120,7 @@ class CameraProcess:
             truth = self._expose(index, end_ns)
             self._figures.add(truth)
             self._service.work += 1
+            self._bench.prepare()
             if clock.lockstep:
                 self._wait_for_mirror()
             self._service.beat()

@@ -3,7 +3,11 @@
 It trusts nobody: its own limits, its own dead-man, its own check of what it is told.
 """
 
-from dataclasses import dataclass, field, replace
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from types import MappingProxyType
+from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -12,11 +16,13 @@ from lowfc.control.safety import Limits, Reason, expired, limit
 
 Single = npt.NDArray[np.float32]
 
+_NONE: Single = np.zeros(0, np.float32)
+
 LONGEST_VALID_NS = 2_000_000_000
 """However long a command says that it is valid, the mirror does not hold it longer."""
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True)
 class Device:
     """What the mirror is.
 
@@ -36,6 +42,12 @@ class Device:
     fixed_nm: Single
     flatten: bool
 
+    @cached_property
+    def tighter(self) -> Limits:
+        """Limits before the driver rounds, one step tighter, so that rounding cannot cross those that count."""
+        limits, step = self.limits, self.step_nm
+        return Limits(limits.stroke_nm - step, limits.slew_nm - step, limits.neighbour_nm - step)
+
 
 @dataclass(frozen=True, slots=True)
 class Told:
@@ -49,12 +61,11 @@ class Told:
     command_nm: Single
 
 
-@dataclass(frozen=True, slots=True)
-class Status:
+class Status(NamedTuple):
     """Where the mirror is.
 
     Attributes:
-        driven_nm: (rows, columns) what the driver puts out: always within the limits.
+        driven_nm: (rows, columns) what the driver is given, before it rounds: always within the limits.
         surface_nm: (rows, columns) where the actuators are.
         channels: last actuators of each channel; the mirror follows their sum.
         command_nm: the modal command behind it; empty where the mirror's own limits changed it.
@@ -67,8 +78,8 @@ class Status:
 
     driven_nm: Single
     surface_nm: Single
-    channels: dict[str, Single] = field(default_factory=dict)
-    command_nm: Single = field(default_factory=lambda: np.zeros(0, np.float32))
+    channels: Mapping[str, Single] = MappingProxyType({})
+    command_nm: Single = _NONE
     limits_hit: tuple[Reason, ...] = ()
     frame_sequence: int = 0
     time_ns: int = 0
@@ -89,15 +100,17 @@ def obey(device: Device, status: Status, told: Told, now_ns: int) -> tuple[Statu
     if reason is not None:
         return status, reason
     assert told.actuators_nm is not None  # noqa: S101  # _refusal
-    channels = status.channels | {told.channel: told.actuators_nm}
-    wanted = told.actuators_nm if len(channels) == 1 else sum(channels.values(), np.zeros(device.grid, np.float32))
-    driven_nm, limits_hit = _drive(device, status.driven_nm, wanted)
-    status = replace(
-        status,
-        driven_nm=driven_nm,
+    channels = {**status.channels, told.channel: told.actuators_nm}
+    wanted = told.actuators_nm
+    if len(channels) > 1:
+        with np.errstate(over="ignore", invalid="ignore"):  # a sum that is not finite is refused by `limit`
+            wanted = sum(channels.values(), np.zeros(device.grid, np.float32))
+    limited = limit(device.tighter, status.driven_nm, wanted)
+    status = status._replace(
+        driven_nm=limited.actuators_nm,
         channels=channels,
-        command_nm=told.command_nm if not limits_hit else np.zeros(0, np.float32),
-        limits_hit=limits_hit,
+        command_nm=told.command_nm if not limited.reasons else _NONE,
+        limits_hit=limited.reasons,
         frame_sequence=told.frame_sequence,
         received_ns=now_ns,
         valid_for_ns=min(told.valid_for_ns, LONGEST_VALID_NS),
@@ -109,42 +122,34 @@ def obey(device: Device, status: Status, told: Told, now_ns: int) -> tuple[Statu
 def tick(device: Device, status: Status, now_ns: int) -> Status:
     """Without a command: settle, and act on one that has expired."""
     if status.following and expired(now_ns - status.received_ns, status.valid_for_ns):
-        status = replace(status, following=False)
+        status = status._replace(following=False)
     if not status.following and device.flatten and status.driven_nm.any():
-        driven_nm, limits_hit = _drive(device, status.driven_nm, np.zeros(device.grid, np.float32))
-        empty = np.zeros(0, np.float32)
-        status = replace(status, driven_nm=driven_nm, limits_hit=limits_hit, command_nm=empty, channels={})
+        flat = limit(device.tighter, status.driven_nm, np.zeros(device.grid, np.float32)).actuators_nm
+        status = status._replace(driven_nm=flat, limits_hit=(), command_nm=_NONE, channels={})
     return _settle(device, status, max(now_ns, status.time_ns))
 
 
 def _refusal(device: Device, status: Status, told: Told) -> Reason | None:
     if told.actuators_nm is None or told.actuators_nm.shape != device.grid:
         return Reason.WRONG_GRID
-    if not np.isfinite(told.actuators_nm).all():
+    if not (np.isfinite(told.actuators_nm).all() and np.isfinite(told.command_nm).all()):
         return Reason.NOT_FINITE
     if told.frame_sequence < status.frame_sequence:
         return Reason.OUT_OF_ORDER
     return None
 
 
-def _drive(device: Device, previous_nm: Single, wanted_nm: Single) -> tuple[Single, tuple[Reason, ...]]:
-    """Limit, then round to the driver's steps; the limits are one step tighter, so that rounding cannot cross them."""
-    step, limits = device.step_nm, device.limits
-    tighter = Limits(limits.stroke_nm - step, limits.slew_nm - step, limits.neighbour_nm - step)
-    limited = limit(tighter, previous_nm, wanted_nm)
-    steps = np.round(limited.actuators_nm / np.float32(step))
-    return (steps * np.float32(step)).astype(np.float32), limited.reasons
-
-
 def _settle(device: Device, status: Status, time_ns: int) -> Status:
-    """First-order response of the actuators up to `time_ns`."""
+    """Round to the driver's steps; first-order response of the actuators up to `time_ns`."""
+    step = np.float32(device.step_nm)
+    driver_nm = np.round(status.driven_nm / step) * step
     elapsed_ns = time_ns - status.time_ns if status.time_ns else np.inf
     if device.settling_ns <= 0 or elapsed_ns > 20 * device.settling_ns:
-        surface = status.driven_nm
+        surface = driver_nm
     else:
         fraction = np.float32(-np.expm1(-max(elapsed_ns, 0) / device.settling_ns))
-        surface = status.surface_nm + fraction * (status.driven_nm - status.surface_nm)
-    return replace(status, surface_nm=_at_rest(device, surface), time_ns=time_ns)
+        surface = status.surface_nm + fraction * (driver_nm - status.surface_nm)
+    return status._replace(surface_nm=_at_rest(device, surface), time_ns=time_ns)
 
 
 def _at_rest(device: Device, surface_nm: Single) -> Single:

@@ -7,7 +7,7 @@ from google.protobuf.message import DecodeError
 
 from lowfc.adapters.bus import Sample
 from lowfc.adapters.envelope import count_of, start_of
-from lowfc.contract.messages import EVENT, Log, Topic, wire
+from lowfc.contract.messages import EVENT, Log, Topic, topic_of, wire
 
 
 @dataclass(slots=True)
@@ -42,12 +42,13 @@ class Ledger:
 
     def believe(self, sample: Sample, health: wire.Health) -> None:
         """Take over what a publisher says it sent; what it sent before it was first heard does not count as lost."""
-        for topic in health.topics:
-            if topic.published:
-                line = (topic.topic, health.process if topic.topic == EVENT.key else "", start_of(sample.sequence))
-                tally = self._tallies.setdefault(line, _Tally(topic.published, topic.published))
+        for count in health.topics:
+            if _publishes(health.process, count.topic):
+                author = health.process if count.topic == EVENT.key else ""
+                line = (count.topic, author, start_of(sample.sequence))
+                tally = self._tallies.setdefault(line, _Tally(count.published, count.published))
                 if health.state == "stopped":
-                    tally.published = topic.published
+                    tally.published = count.published
 
     def lost(self) -> dict[str, int]:
         """Messages lost so far, by key; only keys that lost some."""
@@ -66,6 +67,14 @@ class Ledger:
             if number(tally):
                 sums[key] = sums.get(key, 0) + number(tally)
         return sums
+
+
+def _publishes(process: str, key: str) -> bool:
+    """Whether a process's count is of a topic that it publishes, and not of one that it receives."""
+    try:
+        return process.partition("-")[0] in topic_of(key).publisher
+    except KeyError:
+        return False
 
 
 def _author(topic: Topic, sample: Sample) -> str:

@@ -30,7 +30,7 @@ class Service:
         name: of the process, such as "camera" or "mirror-dm".
         running: until SIGTERM, SIGINT or `stop`.
         work: units of work done (frames, commands, messages); `rate_hz` in Health is its rate.
-        heard: last Health of each process heard, this one's too.
+        heard: last Health of every other process heard.
     """
 
     def __init__(
@@ -188,9 +188,13 @@ class Service:
 
     def _hear(self, sample: Sample) -> None:
         name = name_in(HEALTH, sample.key)
-        if name not in self.heard:
+        if name == self.name:
+            return
+        health = wire.Health.FromString(sample.payload)
+        known = self.heard.get(name)
+        self.heard[name] = health
+        if known is None or known.pid != health.pid:
             self._due_ns = 0  # answer a newcomer at the next beat, so that it need not wait for us
-        self.heard[name] = wire.Health.FromString(sample.payload)
 
     def _meets(self, name: str) -> bool:
         health = self.heard.get(name)

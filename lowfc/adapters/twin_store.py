@@ -58,7 +58,7 @@ def load_or_build(
     key = operator_hash(sensor, spec, band)
     path = (default_cache_dir() if cache_dir is None else cache_dir) / f"twin-{key[:32]}.npz"
     try:
-        return _unpack(path.read_bytes(), key)
+        return _unpack(path.read_bytes(), key, spec)
     except FileNotFoundError:
         pass
     except Exception as error:  # a damaged file fails in zipfile, zlib, numpy or the checks below: always rebuild
@@ -100,7 +100,7 @@ def _pack(twin: Twin) -> bytes:
     return stream.getvalue()
 
 
-def _unpack(content: bytes, key: str) -> Twin:
+def _unpack(content: bytes, key: str, spec: TwinSpec) -> Twin:
     with np.load(io.BytesIO(content), allow_pickle=False) as stored:
         arrays = {name: stored[name] for name in stored.files}
     if str(arrays.pop("checksum")) != _digest(arrays):
@@ -111,7 +111,7 @@ def _unpack(content: bytes, key: str) -> Twin:
         Operator(nm, weight, arrays[f"to_modes_{i}"], arrays[f"to_coefficients_{i}"], arrays[f"basis_{i}"])
         for i, (nm, weight) in enumerate(arrays["band"].tolist())
     )
-    return Twin(arrays["axis"], arrays["used"], arrays["area_weights"], operators, arrays["to_pixels"], key)
+    return Twin(spec, arrays["axis"], arrays["used"], arrays["area_weights"], operators, arrays["to_pixels"], key)
 
 
 def _write(path: Path, content: bytes) -> None:

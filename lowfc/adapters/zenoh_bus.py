@@ -6,7 +6,7 @@ Why each setting is what it is stands in `session_config`; all of them were meas
 import contextlib
 import json
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from typing import Any
 
 import zenoh
@@ -36,7 +36,8 @@ def session_config(links: Links, role: str) -> dict[str, Any]:
             "exit_on_failure": False,
             "retry": {"period_init_ms": 50, "period_max_ms": 200, "period_increase_factor": 2},
         },
-        "scouting": {"multicast": {"enabled": False}, "gossip": {"enabled": False}},
+        # Opening waits `delay` ms for the links that are not there yet; whoever is up is connected within a few.
+        "scouting": {"delay": 100, "multicast": {"enabled": False}, "gossip": {"enabled": False}},
         "transport": {
             "auth": {
                 "usrpwd": {
@@ -63,14 +64,15 @@ def session_config(links: Links, role: str) -> dict[str, Any]:
 class ZenohPublisher:
     """Publishes one topic; see `Publisher`."""
 
-    def __init__(self, session: zenoh.Session, topic: Topic, key: str, clock: Clock, start_s: int) -> None:
+    def __init__(self, bus: "ZenohBus", session: zenoh.Session, topic: Topic, key: str) -> None:
         self.topic = topic
         self.key = key
         self.published = 0
         self.last: tuple[bytes, Envelope] | None = None
         self._keeps = topic.queryable
-        self._clock = clock
-        self._start_s = start_s
+        self._host_ns = bus.clock.host_ns
+        self._start_s = bus.start_s
+        self._replying = bus.replying
         self._publisher = session.declare_publisher(
             key,
             encoding=f"application/protobuf;{topic.message.DESCRIPTOR.full_name}",
@@ -85,7 +87,7 @@ class ZenohPublisher:
         """Send `payload`; waits at most 1 ms for a reader that does not keep up, then loses the message to it."""
         envelope = Envelope(
             sequence_of(self._start_s, self.published),
-            self._clock.host_ns() if publish_time_ns is None else publish_time_ns,
+            self._host_ns() if publish_time_ns is None else publish_time_ns,
         )
         self.published += 1
         if self._keeps:
@@ -94,10 +96,10 @@ class ZenohPublisher:
         return envelope
 
     def _answer(self, query: zenoh.Query) -> None:
-        if self.last is not None:
-            payload, envelope = self.last
-            _reply(query, self.key, payload, envelope)
-        query.drop()  # type: ignore[no-untyped-call]
+        with self._replying(query):
+            if self.last is not None:
+                payload, envelope = self.last
+                query.reply(self.key, payload, attachment=envelope.encode())
 
 
 class ZenohBus:
@@ -118,14 +120,15 @@ class ZenohBus:
             self._session = zenoh.open(config)
         except zenoh.ZError as fault:
             port = links.ports.get(role)
+            where = f"cannot listen on 127.0.0.1:{port}; is one running already?" if port else "cannot join."
             raise BusError(
-                f"{role} of run {links.run_id!r} cannot listen on 127.0.0.1:{port}; is one running already? "
-                f"stop it, or start another run (zenoh says: {str(fault).splitlines()[0][:200]})"
+                f"{role} of run {links.run_id!r} {where} Stop what is in the way, or start another run "
+                f"(zenoh says: {str(fault).splitlines()[0][:200]})"
             ) from fault
 
     def publisher(self, topic: Topic, name: str = "") -> ZenohPublisher:
         """See `Bus.publisher`."""
-        return ZenohPublisher(self._session, topic, topic.at(name), self.clock, self.start_s)
+        return ZenohPublisher(self, self._session, topic, topic.at(name))
 
     def subscribe(self, topic: Topic, handler: Callable[[Sample], None], name: str = ALL) -> None:
         """See `Bus.subscribe`; `handler` runs on zenoh's receiving thread."""
@@ -175,7 +178,7 @@ class ZenohBus:
             timeout=timeout_s,
             target=zenoh.QueryTarget.ALL,
             consolidation=zenoh.ConsolidationMode.NONE,
-            congestion_control=zenoh.CongestionControl.DROP,
+            congestion_control=zenoh.CongestionControl.DROP,  # of the answers too: nobody blocks for a frozen asker
         )
         done.wait(timeout_s + 1.0)
         return list(answers)
@@ -189,10 +192,21 @@ class ZenohBus:
         with contextlib.suppress(zenoh.ZError):
             self._session.close()  # type: ignore[no-untyped-call]
 
+    @contextlib.contextmanager
+    def replying(self, query: zenoh.Query) -> Iterator[None]:
+        """End a question, answered or not, so that its asker does not wait; a fault harms nobody here."""
+        try:
+            yield
+        except Exception as fault:
+            self.faults.add(f"{self.role}: queryable of {query.key_expr}", fault)
+        finally:
+            query.drop()  # type: ignore[no-untyped-call]
+
     def _replier(self, query: zenoh.Query, key: str) -> Callable[[bytes], None]:
         def reply(body: bytes) -> None:
-            _reply(query, key, body, Envelope(sequence_of(self.start_s, 0), self.clock.host_ns()))
-            query.drop()  # type: ignore[no-untyped-call]  # only now does the asker know that there is no further answer
+            with self.replying(query):
+                envelope = Envelope(sequence_of(self.start_s, 0), self.clock.host_ns())
+                query.reply(key, body, attachment=envelope.encode())
 
         return reply
 
@@ -203,8 +217,3 @@ def _sample(sample: zenoh.Sample, receive_time_ns: int) -> Sample:
     return Sample(
         str(sample.key_expr), sample.payload.to_bytes(), envelope.sequence, envelope.publish_time_ns, receive_time_ns
     )
-
-
-def _reply(query: zenoh.Query, key: str, payload: bytes, envelope: Envelope) -> None:
-    # BLOCK, the default of a reply, would let a frozen asker hold the loop for seconds.
-    query.reply(key, payload, attachment=envelope.encode(), congestion_control=zenoh.CongestionControl.DROP)

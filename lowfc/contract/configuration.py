@@ -145,9 +145,9 @@ class Control(Section):
     """Loop mode once a calibration is loaded."""
     estimator: Literal["weighted", "pinv"] = "weighted"
     """Noise-weighted or plain pseudo-inverse of H."""
-    tilt_gain: float = Field(0.5, ge=0, le=2)
+    tilt_gain: float = Field(0.5, ge=0, le=4)
     """Integrator gain of tip and tilt."""
-    gain: float = Field(0.05, ge=0, le=2)
+    gain: float = Field(0.05, ge=0, le=4)
     """Integrator gain of the other modes."""
     tilt_leak: float = Field(0.0, ge=0, le=1)
     """Integrator leak of tip and tilt."""
@@ -230,6 +230,13 @@ class Configuration(Section):
                 f"safety.stroke_nm is {self.safety.stroke_nm:g} nm either way, but mirror.stroke_nm gives only "
                 f"{self.mirror.stroke_nm / 2:g} nm either way"
             )
+        step_nm = self.mirror.stroke_nm / 2**self.mirror.driver_bits
+        for name in ("slew_nm", "neighbour_nm"):
+            if getattr(self.mirror, name) < step_nm + 0.01:
+                raise ValueError(
+                    f"mirror.{name} is {getattr(self.mirror, name):g} nm, but one step of a driver of "
+                    f"{self.mirror.driver_bits} bits is {step_nm:g} nm already"
+                )
         actuators = self.mirror.rows * self.mirror.columns
         for key in map(str, (*self.mirror.dead, *self.mirror.stuck_nm)):
             if not key.isdecimal() or int(key) >= actuators:

@@ -23,7 +23,7 @@ class Law:
                 f"and {self.limit_nm.shape}"
             )
         for name, array, low, high in (
-            ("gain", self.gain, 0, 2),
+            ("gain", self.gain, 0, 4),
             ("leak", self.leak, 0, 1),
             ("limit_nm", self.limit_nm, 0, np.inf),
         ):

@@ -5,8 +5,7 @@ ticks, in the order in which they were taken. Nothing here reads a clock: each i
 that needs one (how late a frame is, how long it has been silent) comes with the input.
 """
 
-from collections.abc import Callable
-from dataclasses import replace
+from collections.abc import Callable, Mapping
 
 import numpy as np
 import numpy.typing as npt
@@ -70,8 +69,7 @@ def _frame(settings: Settings, state: State, frame: Frame) -> tuple[State, Outpu
         details: dict[str, object] = {"refused": state.refused_count, "reason": state.refused.name}
         events.append(Raised("FRAMES_ACCEPTED", details))
     _limit_events(state.limits_hit, reasons, events)
-    state = replace(
-        state,
+    state = state._replace(
         drive=drive,
         frames_used=state.frames_used + 1,
         refused=None,
@@ -107,7 +105,7 @@ def _count_frames(state: State, frame: Frame, events: list[Raised]) -> tuple[Sta
             drive = drive.stayed(missing) if drive is not None else None
     elif state.frame_sequence:
         events.append(Raised("CAMERA_RESTARTED", {}))
-    state = replace(state, drive=drive, silent=False, frame_sequence=frame.sequence, frame_time_ns=frame.time_ns)
+    state = state._replace(drive=drive, silent=False, frame_sequence=frame.sequence, frame_time_ns=frame.time_ns)
     return state, None
 
 
@@ -141,13 +139,14 @@ def _refuse(
     drive = state.drive
     held = np.zeros(0, np.float32)
     if drive is not None:
-        if state.mode is LoopMode.SAFED:
+        if reason in (Reason.REPEATED, Reason.OUT_OF_ORDER):  # no exposure, and the mirror takes no older command
+            pass
+        elif state.mode is LoopMode.SAFED:
             drive = _relax(settings, drive)
-        elif reason not in (Reason.REPEATED, Reason.OUT_OF_ORDER):
+        else:
             drive = drive.stayed(1)
         held = drive.history_nm[0]
-    state = replace(
-        state,
+    state = state._replace(
         drive=drive,
         refused=reason,
         refused_count=state.refused_count + 1,
@@ -160,26 +159,27 @@ def _send(state: State, step: Step, events: list[Raised]) -> tuple[State, Output
     if state.drive is None:
         return state, Outputs(step=step, events=events)
     command = Command(step.frame_sequence, step.time_ns, state.drive.actuators_nm, step.command_nm)
-    return replace(state, commanded=True), Outputs(step=step, command=command, events=events)
+    return state._replace(commanded=True), Outputs(step=step, command=command, events=events)
 
 
 def _tick(settings: Settings, state: State, tick: Tick) -> tuple[State, Outputs]:
     """Without frames: repeat the held command, so that only a dead controller lets it expire."""
     drive = state.drive
-    if drive is None or not state.commanded:
+    safed = state.mode is LoopMode.SAFED
+    if drive is None or not (state.commanded or safed):
         return state, Outputs()
     events = []
-    silent = tick.silent_ns > settings.hold_ns
+    silent = state.silent or tick.silent_ns > settings.hold_ns  # until a newer frame comes, whatever else comes
     flatten = silent and settings.silence == "flat"
     counts = state.counts
     if silent and not state.silent:
         action = "relaxing the mirror to flat" if flatten else "holding the command"
         events.append(Raised("NO_FRAMES", {"silent_ms": tick.silent_ns / 1e6, "action": action}))
         counts = _counted(counts, (Reason.NO_FRAME,))
-    if flatten or state.mode is LoopMode.SAFED:
+    if flatten or safed:
         drive = _relax(settings, drive)
     command = Command(state.frame_sequence, state.frame_time_ns, drive.actuators_nm, drive.history_nm[0])
-    state = replace(state, drive=drive, silent=silent, counts=counts)
+    state = state._replace(drive=drive, silent=silent, commanded=True, counts=counts)
     return state, Outputs(command=command, events=events)
 
 
@@ -198,7 +198,7 @@ def _load(settings: Settings, state: State, load: Load) -> tuple[State, Outputs]
     before = state.drive
     if before is not None and before.actuators_nm.shape == calibration.grid:
         command_nm = drive.inverse @ before.actuators_nm.reshape(-1)
-        drive = replace(drive, actuators_nm=before.actuators_nm, history_nm=(command_nm,) * len(drive.weights))
+        drive = drive._replace(actuators_nm=before.actuators_nm, history_nm=(command_nm,) * len(drive.weights))
     mode = settings.start_mode if state.mode is LoopMode.IDLE else state.mode
     details: dict[str, object] = {
         "id": calibration.id[:12],
@@ -209,7 +209,7 @@ def _load(settings: Settings, state: State, load: Load) -> tuple[State, Outputs]
     events = [Raised("CALIBRATION_LOADED", details)]
     if mode is not state.mode:
         events.append(_mode_event(state.mode, mode, "a calibration was loaded"))
-    return replace(state, mode=mode, drive=drive), Outputs(events=events, changed=True)
+    return state._replace(mode=mode, drive=drive), Outputs(events=events, changed=True)
 
 
 def _mirror(settings: Settings, state: State, shape: MirrorShape) -> tuple[State, Outputs]:
@@ -222,11 +222,11 @@ def _mirror(settings: Settings, state: State, shape: MirrorShape) -> tuple[State
         return state, Outputs(events=[Raised("MIRROR_REFUSED", {"why": why})])
     same_modes = shape.command_nm.shape == (len(drive.calibration.noll),) and np.isfinite(shape.command_nm).all()
     command_nm = shape.command_nm if same_modes else drive.inverse @ shape.actuators_nm.reshape(-1)
-    drive = replace(drive, actuators_nm=shape.actuators_nm, history_nm=(command_nm,) * len(drive.weights))
+    drive = drive._replace(actuators_nm=shape.actuators_nm, history_nm=(command_nm,) * len(drive.weights))
     events = []
     if command_nm.any():
         events.append(Raised("MIRROR_ADOPTED", {"rms_nm": float(np.sqrt(command_nm @ command_nm))}))
-    return replace(state, drive=drive), Outputs(events=events, changed=True)
+    return state._replace(drive=drive), Outputs(events=events, changed=True)
 
 
 def _camera(settings: Settings, state: State, camera: CameraSettings) -> tuple[State, Outputs]:
@@ -237,11 +237,12 @@ def _camera(settings: Settings, state: State, camera: CameraSettings) -> tuple[S
     wrong = [
         f"{name} is {got}, calibrated {want}"
         for name, got, want in (
-            ("frame", camera.shape, calibration.shape),
+            ("rows", camera.shape[0], calibration.shape[0]),
+            ("columns", camera.shape[1], calibration.shape[1]),
             ("saturation_dn", camera.saturation_dn, calibration.saturation_dn),
             ("bias_dn", camera.bias_dn, float(np.median(calibration.dark))),
         )
-        if not np.allclose(got, want, rtol=0, atol=1)
+        if not abs(got - want) < 1
     ]
     if not wrong:
         return state, Outputs()
@@ -249,7 +250,7 @@ def _camera(settings: Settings, state: State, camera: CameraSettings) -> tuple[S
         Raised("CAMERA_CHANGED", {"what": "; ".join(wrong)}),
         _mode_event(state.mode, LoopMode.OPEN, "the camera changed"),
     ]
-    return replace(state, mode=LoopMode.OPEN), Outputs(events=events, changed=True)
+    return state._replace(mode=LoopMode.OPEN), Outputs(events=events, changed=True)
 
 
 def _request(settings: Settings, state: State, request: Request) -> tuple[State, Outputs]:
@@ -264,9 +265,9 @@ def _request(settings: Settings, state: State, request: Request) -> tuple[State,
             events.append(Raised("SAFED", {"why": why}))
     changed = answered.mode is not state.mode or answered.law is not law
     if drive is not None and answered.law is not None:
-        drive = replace(drive, law=answered.law)
+        drive = drive._replace(law=answered.law)
     reply = Reply(answered.accepted, answered.text, state.frame_sequence + 1)
-    return replace(state, mode=answered.mode, drive=drive), Outputs(reply=reply, events=events, changed=changed)
+    return state._replace(mode=answered.mode, drive=drive), Outputs(reply=reply, events=events, changed=changed)
 
 
 def _mode_event(before: LoopMode, after: LoopMode, why: str) -> Raised:
@@ -278,10 +279,10 @@ def _limit_events(before: tuple[Reason, ...], now: tuple[Reason, ...], events: l
     events.extend(Raised("LIMIT_CLEARED", {"reason": reason.name}) for reason in before if reason not in now)
 
 
-def _counted(counts: dict[Reason, int], reasons: tuple[Reason, ...]) -> dict[Reason, int]:
+def _counted(counts: Mapping[Reason, int], reasons: tuple[Reason, ...]) -> Mapping[Reason, int]:
     if not reasons:
         return counts
-    return counts | {reason: counts.get(reason, 0) + 1 for reason in reasons}
+    return {**counts, **{reason: counts.get(reason, 0) + 1 for reason in reasons}}
 
 
 _HANDLERS: dict[type, Callable[..., tuple[State, Outputs]]] = {

@@ -5,6 +5,7 @@ Used by the controller on what it sends and again by the mirror on what it gets.
 
 from dataclasses import dataclass
 from enum import IntEnum
+from math import frexp, ldexp
 
 import numpy as np
 import numpy.typing as npt
@@ -12,7 +13,7 @@ import numpy.typing as npt
 Actuators = npt.NDArray[np.float32]
 
 MARGIN_NM = 1e-3
-"""Kept clear of every limit, so that float32 rounding (6e-5 nm at 750 nm) cannot cross it."""
+"""Kept clear of every limit, at least, so that float32 rounding (6e-5 nm at 750 nm) cannot cross it."""
 
 
 class LoopMode(IntEnum):
@@ -60,8 +61,13 @@ class Limits:
     def __post_init__(self) -> None:
         for name in ("stroke_nm", "slew_nm", "neighbour_nm"):
             value = getattr(self, name)
-            if not value > 2 * MARGIN_NM or not np.isfinite(value):
-                raise ValueError(f"{name} must be a finite number above {2 * MARGIN_NM} nm, got {value}")
+            if not 2 * self.margin_nm < value < np.inf:
+                raise ValueError(f"{name} must be a finite number above {2 * self.margin_nm:g} nm, got {value}")
+
+    @property
+    def margin_nm(self) -> float:
+        """What is kept clear of each limit: 1e-3 nm, or sixteen roundings of float32 where the stroke is so long."""
+        return max(MARGIN_NM, ldexp(1.0, frexp(self.stroke_nm)[1] - 20))
 
 
 @dataclass(frozen=True, slots=True)
@@ -85,7 +91,8 @@ def limit(limits: Limits, previous_nm: Actuators, wanted_nm: Actuators) -> Limit
     if not np.isfinite(wanted_nm).all():
         return Limited(previous_nm, (Reason.NOT_FINITE,))
     reasons: list[Reason] = []
-    stroke, slew = np.float32(limits.stroke_nm - MARGIN_NM), np.float32(limits.slew_nm - MARGIN_NM)
+    margin_nm = limits.margin_nm
+    stroke, slew = np.float32(limits.stroke_nm - margin_nm), np.float32(limits.slew_nm - margin_nm)
     kept = wanted_nm
     if np.abs(kept).max(initial=0) > stroke:
         reasons.append(Reason.STROKE)
@@ -95,18 +102,25 @@ def limit(limits: Limits, previous_nm: Actuators, wanted_nm: Actuators) -> Limit
         reasons.append(Reason.SLEW)
         move = np.clip(move, -slew, slew)
         kept = previous_nm + move
-    if neighbour_difference_nm(kept) > limits.neighbour_nm - MARGIN_NM:
+    if neighbour_difference_nm(kept) > limits.neighbour_nm - margin_nm / 2:
         reasons.append(Reason.NEIGHBOUR)
         kept = _shorten(limits, previous_nm, kept)
     return Limited(kept.astype(np.float32, copy=False), tuple(reasons))
 
 
 def _shorten(limits: Limits, previous_nm: Actuators, kept_nm: Actuators) -> Actuators:
-    """Go from `previous_nm` towards `kept_nm` as far as neighbours allow, or towards flat if they are apart already."""
-    neighbour_nm = limits.neighbour_nm - MARGIN_NM
-    if neighbour_difference_nm(previous_nm) > neighbour_nm:
-        largest_nm = float(np.abs(previous_nm).max())
-        return previous_nm * np.float32(max(0.0, 1.0 - (limits.slew_nm - MARGIN_NM) / largest_nm))
+    """Go from `previous_nm` towards `kept_nm` as far as neighbours allow; if they are apart already, shrink the shape.
+
+    It goes half a margin further inside than `limit` asks, so that rounding does not hold the mirror there.
+    """
+    margin_nm = limits.margin_nm
+    neighbour_nm = limits.neighbour_nm - margin_nm
+    apart_nm, largest_nm = neighbour_difference_nm(previous_nm), float(np.abs(previous_nm).max())
+    if apart_nm > neighbour_nm or largest_nm > limits.stroke_nm:
+        stroke_nm = limits.stroke_nm - margin_nm
+        enough = min(neighbour_nm / max(apart_nm, neighbour_nm), stroke_nm / max(largest_nm, stroke_nm))
+        slowest = 1.0 - (limits.slew_nm - margin_nm) / largest_nm
+        return previous_nm * np.float32(max(enough, slowest))
     fraction = 1.0
     for axis in (0, 1):
         before = np.diff(previous_nm.astype(np.float64), axis=axis)
@@ -120,14 +134,14 @@ def _shorten(limits: Limits, previous_nm: Actuators, kept_nm: Actuators) -> Actu
 
 def neighbour_difference_nm(actuators_nm: Actuators) -> float:
     """Largest difference between actuators (rows, columns) side by side, in nm."""
-    rows = np.abs(actuators_nm[1:] - actuators_nm[:-1]).max(initial=0)
-    columns = np.abs(actuators_nm[:, 1:] - actuators_nm[:, :-1]).max(initial=0)
-    return float(max(rows, columns))
+    rows = np.subtract(actuators_nm[1:], actuators_nm[:-1], dtype=np.float64)
+    columns = np.subtract(actuators_nm[:, 1:], actuators_nm[:, :-1], dtype=np.float64)
+    return float(max(np.abs(rows).max(initial=0), np.abs(columns).max(initial=0)))
 
 
 def expired(age_ns: int, valid_for_ns: int) -> bool:
-    """Whether a command that came `age_ns` ago may no longer be held: the dead-man."""
-    return age_ns > valid_for_ns
+    """Whether a command that came `age_ns` ago may no longer be held: the dead-man; a clock gone back is no excuse."""
+    return not 0 <= age_ns <= valid_for_ns
 
 
 def request_mode(mode: LoopMode, request: str, calibrated: bool) -> tuple[LoopMode, str]:

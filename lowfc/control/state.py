@@ -1,6 +1,9 @@
 """What the controller knows: settings that stay, the state that changes."""
 
-from dataclasses import dataclass, field, replace
+from collections.abc import Mapping
+from dataclasses import dataclass
+from types import MappingProxyType
+from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -49,8 +52,7 @@ class Settings:
         return Law(per_mode(self.gain), per_mode(self.leak), per_mode(self.limit_nm))
 
 
-@dataclass(frozen=True, slots=True)
-class Drive:
+class Drive(NamedTuple):
     """What there is once a calibration is loaded.
 
     Attributes:
@@ -78,16 +80,15 @@ class Drive:
 
     def pushed(self, command_nm: Single, actuators_nm: Single) -> "Drive":
         """One frame later, under this command."""
-        return replace(self, history_nm=(command_nm, *self.history_nm[:-1]), actuators_nm=actuators_nm)
+        return self._replace(history_nm=(command_nm, *self.history_nm[:-1]), actuators_nm=actuators_nm)
 
     def stayed(self, frames: int) -> "Drive":
         """Some frames later, the command held under each of them."""
         held = min(frames, len(self.history_nm))
-        return replace(self, history_nm=(self.history_nm[:1] * held + self.history_nm)[: len(self.history_nm)])
+        return self._replace(history_nm=(self.history_nm[:1] * held + self.history_nm)[: len(self.history_nm)])
 
 
-@dataclass(frozen=True, slots=True)
-class State:
+class State(NamedTuple):
     """Everything the next command depends on.
 
     Attributes:
@@ -108,4 +109,4 @@ class State:
     limits_hit: tuple[Reason, ...] = ()
     silent: bool = False
     commanded: bool = False
-    counts: dict[Reason, int] = field(default_factory=dict)
+    counts: Mapping[Reason, int] = MappingProxyType({})

@@ -51,7 +51,12 @@ def saturation_dn(detector: Detector) -> int:
     return int(min(np.rint(full_well_dn), 2**detector.bit_depth - 1))
 
 
-def expose(detector: Detector, electrons: NDArray[np.floating], rng: np.random.Generator) -> NDArray[np.uint16]:
+def expose(
+    detector: Detector,
+    electrons: NDArray[np.floating],
+    rng: np.random.Generator,
+    normal: NDArray[np.float32] | None = None,
+) -> NDArray[np.uint16]:
     """One frame (rows, columns) in DN.
 
     Electrons are drawn from the exact Poisson law. Multiplication draws from the gamma law of a long register, whose
@@ -61,6 +66,8 @@ def expose(detector: Detector, electrons: NDArray[np.floating], rng: np.random.G
         detector: The camera.
         electrons: (rows, columns) mean photo-electrons in the exposure; rounding below zero counts as none.
         rng: Source of all randomness.
+        normal: (rows, columns) of the standard normal law for the read noise, drawn before a loop has no time for it;
+            overwritten. Drawn here when None.
 
     Raises:
         ValueError: An expected number of electrons is not a finite number.
@@ -74,7 +81,7 @@ def expose(detector: Detector, electrons: NDArray[np.floating], rng: np.random.G
         charge *= np.float32(detector.em_gain)
     else:
         charge = counted.astype(np.float32)
-    values = rng.standard_normal(charge.shape, dtype=np.float32)
+    values = rng.standard_normal(charge.shape, dtype=np.float32) if normal is None else normal
     values *= np.float32(detector.read_noise_e)
     np.minimum(charge, np.float32(detector.full_well_e), out=charge)
     values += charge

@@ -34,8 +34,8 @@ def prolates(sensor: Sensor, half_band: float, count: int) -> Float:
     _, vectors = scipy.linalg.eigh_tridiagonal(
         diagonal, off_diagonal, select="i", select_range=(samples - count, samples - 1)
     )
-    vectors = vectors[:, ::-1]
-    return np.asarray(vectors * np.sign(vectors[samples // 2]))  # so that the same functions come from any LAPACK
+    signs = np.sign(vectors[samples // 2])  # LAPACK leaves the sign open; the same functions must come from each
+    return np.ascontiguousarray((vectors * signs)[:, ::-1])
 
 
 def field_operator(

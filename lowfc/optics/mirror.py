@@ -47,12 +47,14 @@ def actuator_axis(mirror: Mirror, actuators: int) -> Float:
 def influence_factors(mirror: Mirror, coordinates: Float, actuators: int, lowpass_cycles: float | None = None) -> Float:
     """One axis of the influence functions, (points, actuators); surface = y_factors actuators x_factors'.
 
+    Points must be closer than half a pitch, or the print-through of the actuators folds to low frequencies unless it
+    is removed; on the nodes of a twin `twin_mirror` is several times closer to the truth than a low-pass.
+
     Args:
         mirror: The mirror.
         coordinates: (points,) in pupil diameters.
         actuators: The mirror's rows for y, columns for x.
-        lowpass_cycles: Remove what is finer than this many cycles per pupil diameter, so that coarse points do not
-            fold the print-through of the actuators to low frequencies; nothing is removed when None.
+        lowpass_cycles: Remove what is finer than this many cycles per pupil diameter; nothing when None.
     """
     distance = coordinates[:, None] - actuator_axis(mirror, actuators)
     width = 1.0 / (mirror.pitches_per_pupil * np.sqrt(-np.log(mirror.coupling)))

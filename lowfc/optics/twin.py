@@ -64,6 +64,7 @@ class Twin:
     """A compressed sensor.
 
     Attributes:
+        spec: How far.
         axis: Coordinates of the nodes along one axis, with guards, in pupil diameters.
         used: Indices of the nodes that matter in the flattened square grid of the axis (rows = y, columns = x).
         area_weights: (used,) weights of sum 1 for means over the open pupil (transmission above 0.5, unweighted).
@@ -72,6 +73,7 @@ class Twin:
         operator_hash: Hexadecimal digest of everything the twin was made from.
     """
 
+    spec: TwinSpec
     axis: Float
     used: NDArray[np.intp]
     area_weights: Float

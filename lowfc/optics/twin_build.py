@@ -70,7 +70,7 @@ def build(
                 basis=np.asarray(functions[points] * np.resize([1.0, -1j], functions.shape[1]), np.complex128),
             )
         )
-    return Twin(axis, used, area_weights / area_weights.sum(), tuple(operators), to_pixels, operator_hash)
+    return Twin(spec, axis, used, area_weights / area_weights.sum(), tuple(operators), to_pixels, operator_hash)
 
 
 def _adjoint(to_samples: Float, weights: NDArray[np.bool_]) -> Float:
@@ -88,7 +88,7 @@ def _intensity_sampling(sensor: Sensor, spec: TwinSpec, scale: float) -> tuple[N
     _, _, pivots = scipy.linalg.qr(functions.T, mode="economic", pivoting=True)
     points = np.sort(pivots[: functions.shape[1]]).astype(np.intp)
     pixels = functions.reshape(sensor.pixels, sensor.binning, -1).sum(axis=1)
-    return points, np.asarray(np.linalg.solve(functions[points].T, pixels.T).T)
+    return points, np.ascontiguousarray(np.linalg.solve(functions[points].T, pixels.T).T)
 
 
 def _leading_modes(matrix: Float, rank: int) -> Float:
@@ -100,4 +100,4 @@ def _leading_modes(matrix: Float, rank: int) -> Float:
         raise ValueError(f"the rank must lie between 1 and {min(matrix.shape)}, got {rank}")
     size = len(matrix)
     _, vectors = scipy.linalg.eigh(matrix @ matrix.T, subset_by_index=(size - rank, size - 1))
-    return np.asarray(vectors[:, ::-1])
+    return np.ascontiguousarray(vectors[:, ::-1])

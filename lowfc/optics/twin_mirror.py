@@ -1,8 +1,8 @@
 """A deformable mirror on the twin's nodes: its wavefront in microseconds.
 
-Nodes are too coarse for the print-through of the actuators, which the shaped pupil's fine structure mixes back into the
-low orders. The surface is therefore sampled without it, and a small correction makes the field at the sensor, to first
-order, the one that the full surface gives.
+Nodes are too coarse for the print-through of the actuators: sampled there, it would fold to low orders, and in truth
+the shaped pupil's fine structure mixes some of it back into them. The nodes therefore carry the surface's least-squares
+fit, and a small correction makes the field at the sensor, to first order, the one that the full surface gives.
 """
 
 from dataclasses import dataclass
@@ -14,10 +14,11 @@ from numpy.typing import NDArray
 from lowfc.optics.field_operator import field_operator, prolates
 from lowfc.optics.grid import pupil_axis
 from lowfc.optics.mirror import Mirror, influence_factors
+from lowfc.optics.nodes import interpolation
 from lowfc.optics.sensor import Sensor
 from lowfc.optics.twin import Twin
 
-_LOWPASS_CYCLES = 12.0
+_LEAST_WEIGHT = 0.01  # of the largest; leaves alone the guard nodes that hardly any of the pupil depends on
 _SMALLEST_SINGULAR_VALUE = 0.01  # of the largest; the correction's error stops falling there
 
 Single = NDArray[np.float32]
@@ -29,7 +30,7 @@ class TwinMirror:
 
     Attributes:
         used: The twin's used nodes.
-        y_factors: (axis, rows) influence functions along y, without what the nodes cannot carry.
+        y_factors: (axis, rows) influence functions along y, fitted by values at the nodes.
         x_factors: (axis, columns) along x.
         reduce: (few, rows times columns) what that leaves out, seen through the sensor.
         expand: (used, few) the smooth surface that gives the same.
@@ -58,8 +59,8 @@ def twin_mirror(sensor: Sensor, twin: Twin, mirror: Mirror) -> TwinMirror:
     y_full = influence_factors(mirror, u, mirror.rows)
     x_full = influence_factors(mirror, u, mirror.columns)
     to_field = operator.to_coefficients.T @ field_operator(sensor, scale, functions, y_full, x_full, actuators)
-    y_factors = influence_factors(mirror, twin.axis, mirror.rows, _LOWPASS_CYCLES)
-    x_factors = influence_factors(mirror, twin.axis, mirror.columns, _LOWPASS_CYCLES)
+    fit = np.linalg.pinv(interpolation(u.size, twin.spec.nodes, twin.spec.order), _LEAST_WEIGHT)
+    y_factors, x_factors = fit @ y_full, fit @ x_full
     rows, columns = np.divmod(twin.used, twin.axis.size)
     sampled = (y_factors[rows][:, :, None] * x_factors[columns][:, None, :]).reshape(twin.used.size, -1)
     left, values, right = np.linalg.svd(operator.to_modes, full_matrices=False)

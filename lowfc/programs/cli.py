@@ -2,8 +2,9 @@
 
 import json
 import sys
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -11,10 +12,20 @@ from lowfc import __version__
 from lowfc.adapters.terminal import DEFAULT_RUN, ConfigFile, RunId, configuration, new_app, run_app
 from lowfc.contract.configuration import Preset
 
+if TYPE_CHECKING:
+    from lowfc.contract.messages import wire
+
 app = new_app("Low-order wavefront control for coronagraphs.\n\nExample: lowfc sim-loop --duration 20")
 bench_app = new_app("Measure the parts.\n\nExample: lowfc bench twin")
+ctl_app = new_app("Ask a running controller.\n\nExample: lowfc ctl status")
+config_app = new_app("Show and check the configuration.\n\nExample: lowfc config show")
+app.add_typer(ctl_app, name="ctl")
+app.add_typer(config_app, name="config")
 app.add_typer(bench_app, name="bench")
 
+AnyRun = Annotated[str | None, typer.Option("--run", help="Name of the run; default: the only one.")]
+Values = Annotated[list[float], typer.Argument(help="One value for all modes, or one for each.")]
+Modes = Annotated[list[int] | None, typer.Option("--mode", help="Noll index of a mode; repeat. Default: all.")]
 Json = Annotated[bool, typer.Option("--json", help="Print one JSON object on standard output.")]
 
 
@@ -115,6 +126,111 @@ def record(
         raise typer.Exit(1)
 
 
+@ctl_app.command()
+def status(run: AnyRun = None, as_json: Json = False) -> None:
+    """Say what the controller is doing.
+
+    Example: lowfc ctl status --json
+    """
+    from google.protobuf.json_format import MessageToDict
+
+    answer = _ask(run, "status")
+    state = MessageToDict(answer.state, preserving_proto_field_name=True)
+    state.pop("actuators", None)
+    if as_json:
+        _print(json.dumps(state))
+    else:
+        _print("\n".join(f"{key:20} {value}" for key, value in state.items()))
+
+
+@ctl_app.command("open")
+def open_(run: AnyRun = None) -> None:
+    """Stop driving the mirror; it holds its shape.
+
+    Example: lowfc ctl open
+    """
+    _say(_ask(run, "open"))
+
+
+@ctl_app.command()
+def close(run: AnyRun = None) -> None:
+    """Let the integrator drive the mirror.
+
+    Example: lowfc ctl close
+    """
+    _say(_ask(run, "close"))
+
+
+@ctl_app.command()
+def safe(run: AnyRun = None) -> None:
+    """Relax the mirror to flat and latch it there.
+
+    Example: lowfc ctl safe
+    """
+    _say(_ask(run, "safe"))
+
+
+@ctl_app.command()
+def clear(run: AnyRun = None) -> None:
+    """Leave the latched safe state; the loop is open afterwards.
+
+    Example: lowfc ctl clear
+    """
+    _say(_ask(run, "clear"))
+
+
+@ctl_app.command()
+def gain(values: Values, mode: Modes = None, run: AnyRun = None) -> None:
+    """Set integrator gains.
+
+    Example: lowfc ctl gain 0.4 --mode 2 --mode 3
+    """
+    _say(_ask(run, "gain", mode, values))
+
+
+@ctl_app.command()
+def leak(values: Values, mode: Modes = None, run: AnyRun = None) -> None:
+    """Set integrator leaks.
+
+    Example: lowfc ctl leak 0.01
+    """
+    _say(_ask(run, "leak", mode, values))
+
+
+@config_app.command("show")
+def config_show(config: ConfigFile = None) -> None:
+    """Print every key with its value and its sentence, as TOML that can be used.
+
+    Example: lowfc config show > lowfc.toml
+    """
+    from lowfc.programs.config import commented
+
+    _print(commented(configuration(config)))
+
+
+@config_app.command("check")
+def config_check(config: Annotated[Path, typer.Argument(help="Configuration file (TOML).")]) -> None:
+    """Check a configuration file; exit status 2 and one line per mistake where it is wrong.
+
+    Example: lowfc config check lowfc.toml
+    """
+    configuration(config)
+    _print(f"{config}: fine")
+
+
+@config_app.command("zenoh")
+def config_zenoh(
+    role: Annotated[str, typer.Option(help="Role of your program, such as camera.")], run: RunId = DEFAULT_RUN
+) -> None:
+    """Print the zenoh configuration for a program of your own that plays a role in a run.
+
+    Example: lowfc config zenoh --role camera --run bench
+    """
+    from lowfc.programs.config import zenoh_session
+
+    _print(zenoh_session(run, role))
+
+
 @bench_app.command("twin")
 def bench_twin(as_json: Json = False) -> None:
     """Time the real-time twin against the full optical chain, both on one thread, in the same run.
@@ -131,6 +247,17 @@ def bench_twin(as_json: Json = False) -> None:
 def main() -> None:
     """Entry point."""
     run_app(app)
+
+
+def _ask(run: str | None, name: str, modes: list[int] | None = None, values: Sequence[float] = ()) -> "wire.Request":
+    from lowfc.programs.ctl import ask, the_run
+
+    return ask(the_run(run), name, tuple(modes or ()), tuple(values))
+
+
+def _say(answer: "wire.Request") -> None:
+    count = answer.frame_sequence & 0xFFFFFFFF
+    _print(f"{answer.reply}, from frame {count} on")
 
 
 def _print(text: str, *, error: bool = False) -> None:

@@ -106,11 +106,11 @@ class Controller:
         self._frame_to_command.add(sent_ns - sample.publish_time_ns)
         timing = self._timing
         timing.frame_sequence.append(sample.sequence)
-        timing.transport_ns.append(max(0, sample.receive_time_ns - sample.publish_time_ns))
-        timing.wakeup_ns.append(max(0, taken_ns - sample.receive_time_ns))
-        timing.compute_ns.append(ready_ns - taken_ns)
-        timing.publish_ns.append(sent_ns - ready_ns)
-        timing.frame_to_command_ns.append(max(0, sent_ns - sample.publish_time_ns))
+        timing.transport_ns.append(_column(sample.receive_time_ns - sample.publish_time_ns))
+        timing.wakeup_ns.append(_column(taken_ns - sample.receive_time_ns))
+        timing.compute_ns.append(_column(ready_ns - taken_ns))
+        timing.publish_ns.append(_column(sent_ns - ready_ns))
+        timing.frame_to_command_ns.append(_column(sent_ns - sample.publish_time_ns))
         if sent_ns >= self._timing_due_ns:
             self._publish_timing()
         if frame.time_ns >= self._state_due_ns:
@@ -194,3 +194,8 @@ class Controller:
         """On the bus's thread: leave the request for the loop, and wake it."""
         self._queries.append(query)
         self._frames.wake()
+
+
+def _column(duration_ns: int) -> int:
+    """Fit a duration into the 32 bits of its column: a camera's clock may be wrong, and a process may be stopped."""
+    return min(max(0, duration_ns), 0xFFFF_FFFF)

@@ -138,8 +138,7 @@ class Recorder:
             self.service.beat()
             time.sleep(_TURN_S)
             age_s = time.monotonic() - begun_s
-            heard = sum(name != self.service.name for name in list(self.service.heard))
-            if age_s >= longest_s or (age_s >= shortest_s and heard >= self._bus.peers()):
+            if age_s >= longest_s or (age_s >= shortest_s and len(self.service.heard) >= self._bus.peers()):
                 return
 
     def _ask(self) -> None:

@@ -69,7 +69,8 @@ def _prepare(config: Configuration, run: Run, console: Console) -> None:
 
     with _progress("building the optical model", console) as advance:
         optics = instrument.twin(config, advance, warn)
-    calibration_file.save(instrument.analytic_calibration(config, optics), run.path / "calibration.fits")
+    mirror = instrument.mirror_on_twin(config, optics, lambda _: None)
+    calibration_file.save(instrument.analytic_calibration(config, optics, mirror), run.path / "calibration.fits")
     (run.path / "config.toml").write_text(config.to_toml(), encoding="utf-8")
 
 

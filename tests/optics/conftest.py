@@ -1,7 +1,10 @@
 """The optics under test, built once: the real masks at the paper's sampling."""
 
 import importlib
+import importlib.metadata
+import sys
 import warnings
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -62,7 +65,9 @@ def hcipy():
 
 @pytest.fixture(scope="session")
 def prysm():
-    """Another independent model: prysm.propagation."""
-    with warnings.catch_warnings():
+    """Another independent model; prysm 0.21 asks pkg_resources, which setuptools no longer has, for its version."""
+    with pytest.MonkeyPatch.context() as patch, warnings.catch_warnings():
         warnings.simplefilter("ignore")
+        stand_in = SimpleNamespace(get_distribution=importlib.metadata.distribution)
+        patch.setitem(sys.modules, "pkg_resources", stand_in)
         return importlib.import_module("prysm.propagation")

@@ -32,9 +32,9 @@ def test_a_tilt_along_x_moves_the_star_along_columns_by_its_cycles():
 @pytest.mark.parametrize("scale", [1.0, 0.9, 1.1])
 def test_the_relay_pupil_is_upright_and_energy_is_kept(scale):
     pupil = blob(128, 0.2, -0.1)
-    focal = to_image(pupil, 240, 8, scale)
-    np.testing.assert_allclose(to_pupil(focal, 128, 8, scale), pupil, atol=1e-10)
-    assert np.sum(np.abs(focal) ** 2) / 8**2 == pytest.approx(np.sum(np.abs(pupil) ** 2) / 128**2, rel=1e-10)
+    focal = to_image(pupil, 360, 8, scale)
+    np.testing.assert_allclose(to_pupil(focal, 128, 8, scale), pupil, atol=1e-6)
+    assert np.sum(np.abs(focal) ** 2) / 8**2 == pytest.approx(np.sum(np.abs(pupil) ** 2) / 128**2, rel=1e-9)
 
 
 def test_longer_waves_make_a_larger_image():

@@ -48,9 +48,7 @@ def test_the_chain_agrees_with_prysm(prysm, sensor, opd_nm):
     step_um = wavelength_um * focal_mm / pupil_mm / 8
     optics = {"prop_dist": focal_mm, "wavelength": wavelength_um}
     start = sensor.pupil * np.exp(2j * np.pi / 550.0 * opd_nm)
-    focal = prysm.focus_fixed_sampling(
-        start * ramp, pupil_mm / 512, output_dx=step_um, output_samples=64, **optics
-    )
+    focal = prysm.focus_fixed_sampling(start * ramp, pupil_mm / 512, output_dx=step_um, output_samples=64, **optics)
     relay = prysm.unfocus_fixed_sampling(
         focal * sensor.focal_mask, step_um, output_dx=pupil_mm / 512, output_samples=512, **optics
     )
@@ -82,8 +80,10 @@ def test_broadband_images_and_responses_are_weighted_sums(sensor, modes, opd_nm)
 
 def test_three_gauss_legendre_wavelengths_beat_the_papers_five(sensor):
     truth = reference(sensor, gauss_legendre(550.0, count=9))
-    assert relative_l2(reference(sensor, gauss_legendre(550.0)), truth) < 1e-3
-    assert relative_l2(reference(sensor, uniform(550.0)), truth) > 1e-2
+    three = relative_l2(reference(sensor, gauss_legendre(550.0)), truth)
+    five = relative_l2(reference(sensor, uniform(550.0)), truth)
+    assert three < 2.5e-3
+    assert five > 20 * three
 
 
 def test_bands_have_the_wavelengths_of_section_3_3():

@@ -1,0 +1,60 @@
+# One command runs the loop, one passes the tests: `make sim-loop`, `make test`. `make help` lists the rest.
+PYTHON ?= $(shell for p in python3.13 python3.12 python3.11 python3 python; do \
+	$$p -c 'import sys; sys.exit(sys.version_info < (3, 11))' 2>/dev/null && { echo $$p; break; }; done)
+VENV := .venv
+BIN := $(VENV)/bin
+INSTALL := $(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt
+
+.PHONY: help sim-loop test test-all lint types format proto node clean
+
+help:  ## list the targets
+	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:[^#]*## /\t/' | expand -t 12
+
+$(BIN)/python:
+	@test -n "$(PYTHON)" || { echo "lowfc needs Python 3.11 or newer; none was found. Debian: apt install python3" >&2; exit 1; }
+	@$(PYTHON) -c 'import venv, ensurepip' 2>/dev/null || { v=$$($(PYTHON) -c 'import sys; print("%d.%d" % sys.version_info[:2])'); \
+		echo "$(PYTHON) has no venv module. Debian: apt install python$$v-venv" >&2; exit 1; }
+	$(PYTHON) -m venv $(VENV)
+
+$(VENV)/.installed: pyproject.toml constraints.txt | $(BIN)/python
+	$(INSTALL) --editable .
+	@touch $@
+
+$(VENV)/.tests: $(VENV)/.installed
+	$(INSTALL) --editable '.[test]'
+	@touch $@
+
+sim-loop: $(VENV)/.installed  ## install, then run the simulated loop for 20 s
+	$(BIN)/lowfc sim-loop --duration 20
+
+test: $(VENV)/.tests lint types  ## install, then lint, types and tests
+	$(BIN)/python -m pytest -m 'not slow'
+
+test-all: $(VENV)/.tests node lint types  ## everything, the slow tests and those that need node and a graphics driver too
+	@ls /usr/share/vulkan/icd.d/*.json >/dev/null 2>&1 || { test "$$(id -u)" = 0 && apt-get install --yes mesa-vulkan-drivers libvulkan1; } || \
+		echo "no Vulkan driver: the viewer tests will skip. Debian: apt install mesa-vulkan-drivers libvulkan1" >&2
+	$(BIN)/python -m pytest
+
+lint: $(VENV)/.tests  ## ruff
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+
+types: $(VENV)/.tests  ## mypy, strict
+	$(BIN)/mypy
+
+format: $(VENV)/.tests  ## rewrite the sources as ruff likes them
+	$(BIN)/ruff check --fix .
+	$(BIN)/ruff format .
+
+proto: $(VENV)/.tests  ## compile the messages' declaration (development only)
+	$(INSTALL) --editable '.[proto]'
+	$(BIN)/python -m lowfc.contract.compile_proto
+
+node: tests/node/node_modules  ## the independent MCAP reader
+
+tests/node/node_modules: tests/node/package.json
+	npm install --prefix tests/node --no-audit --no-fund --no-package-lock
+	@touch $@
+
+clean:  ## remove what was installed and built
+	rm -rf $(VENV) tests/node/node_modules *.egg-info .pytest_cache .mypy_cache .ruff_cache .hypothesis

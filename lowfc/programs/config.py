@@ -1,0 +1,35 @@
+"""What a configuration says: every key with its sentence, or the bus session of a role."""
+
+import json
+
+from lowfc.adapters.run import open_run
+from lowfc.adapters.zenoh_bus import session_config
+from lowfc.contract.configuration import Configuration, keys
+from lowfc.contract.errors import BusError
+
+
+def commented(config: Configuration) -> str:
+    """TOML of a configuration, each key with its sentence above it."""
+    sentences = {name: info.description for name, info in keys().items()}
+    lines, section = [], ""
+    for line in config.to_toml().splitlines():
+        if line.startswith("["):
+            section = line.strip("[]") + "."
+        key = section + line.split(" = ")[0]
+        if " = " in line and key in sentences:
+            lines.append(f"# {sentences[key]}")
+        lines.append(line)
+    return "\n".join(lines)
+
+
+def zenoh_session(run_id: str, role: str) -> str:
+    """Zenoh's configuration file for a program that plays a role in a run.
+
+    Raises:
+        BusError: the run has no such role.
+    """
+    run = open_run(run_id)
+    known = sorted({*run.links.ports, "operator", "launcher"})
+    if role not in known:
+        raise BusError(f"run {run_id!r} has no role {role!r}; there are {', '.join(known)}")
+    return json.dumps(session_config(run.links, role), indent=2)

@@ -1,0 +1,70 @@
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from lowfc.adapters.clock import SIMULATED_START_NS, FakeClock, HostClock, SimulatedClock, boot_offset_ns
+from lowfc.adapters.run import write_once
+from lowfc.contract.errors import DataFileError
+
+
+def test_all_processes_of_a_boot_have_one_offset(tmp_path: Path) -> None:
+    ask = f"from lowfc.adapters.clock import *; import pathlib; print(boot_offset_ns(pathlib.Path({str(tmp_path)!r})))"
+    asked = [subprocess.Popen([sys.executable, "-c", ask], stdout=subprocess.PIPE, text=True) for _ in range(4)]
+    answers = {process.communicate()[0] for process in asked}
+    assert answers == {f"{boot_offset_ns(tmp_path)}\n"}
+    (file,) = tmp_path.iterdir()
+    assert file.stat().st_mode & 0o777 == 0o600
+
+
+def test_the_clock_is_the_hosts_and_does_not_step_with_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    clock = HostClock(tmp_path)
+    before = clock.now_ns()
+    monkeypatch.setattr(time, "time_ns", lambda: 0)  # somebody sets the wall clock back to 1970
+    assert HostClock(tmp_path).now_ns() >= before
+    assert clock.host_ns() >= before
+    assert clock.start_s == before // 1_000_000_000 or clock.start_s + 1 == before // 1_000_000_000
+    assert clock.now_ns() - time.monotonic_ns() <= clock.offset_ns
+
+
+def test_sleep_ends_after_its_deadline_and_not_before(tmp_path: Path) -> None:
+    clock = HostClock(tmp_path)
+    deadline = clock.now_ns() + 3_000_000
+    clock.sleep_until_ns(deadline)
+    assert clock.now_ns() >= deadline
+    clock.sleep_until_ns(deadline)  # passed: no wait, no error
+
+
+def test_a_damaged_offset_is_an_error(tmp_path: Path) -> None:
+    boot_offset_ns(tmp_path)
+    (file,) = tmp_path.iterdir()
+    file.write_text("noon")
+    with pytest.raises(DataFileError, match="offset in ns, got 'noon'"):
+        boot_offset_ns(tmp_path)
+
+
+def test_what_is_written_once_stays(tmp_path: Path) -> None:
+    assert [write_once(tmp_path / "file", text) for text in ("first", "second")] == ["first", "first"]
+    assert [path.name for path in tmp_path.iterdir()] == ["file"]
+
+
+def test_simulated_time_moves_by_hand_and_host_time_by_itself(tmp_path: Path) -> None:
+    host = HostClock(tmp_path)
+    clock = SimulatedClock(host=host)
+    assert (clock.now_ns(), clock.start_s, clock.lockstep) == (SIMULATED_START_NS, SIMULATED_START_NS // 10**9, True)
+    clock.set_ns(SIMULATED_START_NS + 7)
+    clock.sleep_until_ns(SIMULATED_START_NS + 9)
+    clock.sleep_until_ns(SIMULATED_START_NS + 8)
+    assert clock.now_ns() == SIMULATED_START_NS + 9
+    assert host.now_ns() <= clock.host_ns() <= host.now_ns()
+
+
+def test_the_fake_clock_stands_still() -> None:
+    clock = FakeClock(5)
+    clock.advance(2)
+    clock.sleep_until_ns(6)
+    assert (clock.now_ns(), clock.host_ns()) == (7, 7)
+    clock.sleep_until_ns(10)
+    assert clock.now_ns() == 10

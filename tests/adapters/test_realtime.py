@@ -1,0 +1,87 @@
+"""Each set-up runs in a process of its own: it cannot be undone."""
+
+import json
+import os
+import resource
+import subprocess
+import sys
+
+import pytest
+
+REPORT = """
+import gc, json, os, sys
+import numpy
+from threadpoolctl import threadpool_info
+{limits}
+from lowfc.adapters.realtime import set_up, step_back
+granted = {call}
+print(json.dumps({{
+    "granted": granted.granted, "refused": granted.refused,
+    "policy": os.sched_getscheduler(0), "priority": os.sched_getparam(0).sched_priority,
+    "cpus": sorted(os.sched_getaffinity(0)), "collects": gc.isenabled(), "frozen": gc.get_freeze_count(),
+    "nice": os.nice(0), "blas": [pool["num_threads"] for pool in threadpool_info() if pool["user_api"] == "blas"],
+    "locked_kb": [int(line.split()[1]) for line in open("/proc/self/status") if line.startswith("VmLck")][0],
+    "slack_ns": int(open("/proc/self/timerslack_ns").read()) if os.path.exists("/proc/self/timerslack_ns") else 1,
+}}))
+"""
+
+# What a host without privileges refuses; the process gives its own up first.
+UNPRIVILEGED = """
+import ctypes, resource
+resource.setrlimit(resource.RLIMIT_RTPRIO, (0, 0))
+resource.setrlimit(resource.RLIMIT_MEMLOCK, (65536, 65536))
+version_3, no_capabilities = (ctypes.c_uint32 * 2)(0x20080522, 0), (ctypes.c_uint32 * 6)()
+assert ctypes.CDLL(None).capset(version_3, no_capabilities) == 0
+"""
+
+
+def report(call: str, limits: str = "") -> dict[str, object]:
+    done = subprocess.run(
+        [sys.executable, "-c", REPORT.format(call=call, limits=limits)], capture_output=True, text=True, check=True
+    )
+    return json.loads(done.stdout)
+
+
+def test_the_interpreter_is_quiet_and_nothing_unasked_is_changed() -> None:
+    found = report("set_up(None, None, False)")
+    assert found["granted"] == ["one BLAS thread", "garbage collector off", "timer slack 1 ns"]
+    assert found["refused"] == []
+    assert (found["policy"], found["cpus"]) == (os.SCHED_OTHER, sorted(os.sched_getaffinity(0)))
+    assert (found["collects"], found["slack_ns"], found["locked_kb"]) == (False, 1, 0)
+    assert found["frozen"] > 0
+    assert set(found["blas"]) == {1}
+
+
+def test_what_the_host_refuses_is_named_with_its_cost() -> None:
+    found = report("set_up(50, {4096}, True)", UNPRIVILEGED)
+    measures = [measure for measure, _ in found["refused"]]
+    assert [measure.split(" (")[0] for measure in measures] == [
+        "processors [4096]",
+        "locked memory",
+        "SCHED_FIFO priority 50",
+    ]
+    assert "64 kB" in measures[1]
+    assert all(len(cost) > 30 for _, cost in found["refused"])
+    assert (found["policy"], found["locked_kb"]) == (os.SCHED_OTHER, 0)
+    assert found["granted"] == ["one BLAS thread", "garbage collector off", "timer slack 1 ns"]
+
+
+def may_be_real_time() -> bool:
+    limit = resource.getrlimit(resource.RLIMIT_RTPRIO)[1]
+    return os.geteuid() == 0 or limit == resource.RLIM_INFINITY or limit >= 10
+
+
+@pytest.mark.skipif(not may_be_real_time(), reason="this user may not have SCHED_FIFO")
+def test_a_host_that_allows_it_grants_real_time() -> None:
+    cpu = min(os.sched_getaffinity(0))
+    found = report(f"set_up(10, {{{cpu}}}, False)")
+    if found["refused"]:  # a container's root may not have CAP_SYS_NICE
+        pytest.skip(str(found["refused"]))
+    assert (found["policy"], found["priority"], found["cpus"]) == (os.SCHED_FIFO, 10, [cpu])
+    assert found["granted"][-2:] == [f"processors [{cpu}]", "SCHED_FIFO priority 10"]
+
+
+def test_the_recorder_steps_back() -> None:
+    before = os.nice(0)
+    found = report("step_back(3)")
+    assert (found["nice"], found["policy"]) == (min(before + 3, 19), os.SCHED_OTHER)

@@ -1,0 +1,134 @@
+import os
+import socket
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from lowfc.adapters.run import Run, free_ports, mirror_role, new_run_id, open_run, own_directory, runtime_base
+from lowfc.contract.errors import BusError, DataFileError
+
+
+@pytest.fixture(autouse=True)
+def runtime(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
+
+
+def test_a_run_has_ports_a_secret_and_closed_doors() -> None:
+    run = open_run("night", mirrors=("dm", "tip"))
+    assert set(run.links.ports) == {"camera", "controller", "mirror-dm", "mirror-tip", "recorder", "viewer"}
+    assert len(set(run.links.ports.values())) == 6
+    assert len(run.links.secret) == 64
+    assert run.path.stat().st_mode & 0o777 == 0o700
+    assert {path.stat().st_mode & 0o777 for path in run.path.iterdir()} == {0o600}
+    assert run.links.secret_file.read_text() == f"lowfc:{run.links.secret}\n"
+    assert run.links.secret not in repr(run)
+    run.remove()
+    assert not run.path.exists()
+
+
+def test_all_who_open_a_run_at_once_get_the_same(tmp_path: Path) -> None:
+    ask = "import lowfc.adapters.run as r; l = r.open_run('one').links; print(sorted(l.ports.items()), l.secret)"
+    asked = [subprocess.Popen([sys.executable, "-c", ask], stdout=subprocess.PIPE, text=True) for _ in range(5)]
+    assert len({process.communicate()[0] for process in asked}) == 1
+    assert [path.name for path in (tmp_path / "lowfc").iterdir()] == ["one"]
+
+
+def test_two_runs_share_nothing() -> None:
+    one, other = (open_run(new_run_id()) for _ in range(2))
+    assert one.path != other.path
+    assert one.links.secret != other.links.secret
+    assert not set(one.links.ports.values()) & set(other.links.ports.values())
+
+
+@pytest.mark.parametrize("name", ["", "../up", "a/b", ".hidden", "Night", "x" * 49, "a b"])
+def test_a_name_that_is_no_name_is_refused(name: str) -> None:
+    with pytest.raises(BusError, match="a run's name"):
+        open_run(name)
+
+
+def test_a_mirror_that_the_run_does_not_have_is_refused() -> None:
+    open_run("night")
+    with pytest.raises(BusError, match="no 'mirror-tip'"):
+        open_run("night", mirrors=("dm", "tip"))
+    assert mirror_role("tip") == "mirror-tip"
+
+
+def damaged(run: Run, name: str, text: str | None) -> None:
+    if text is None:
+        (run.path / name).unlink()
+    else:
+        (run.path / name).write_text(text)
+
+
+@pytest.mark.parametrize("text", [None, "", "{}", "[]", '{"run_id": "night", "user": "lowfc", "ports": {"camera": 0}}'])
+def test_damaged_links_are_an_error(text: str | None) -> None:
+    run = open_run("night")
+    damaged(run, "links.json", text)
+    with pytest.raises(DataFileError, match=r"links\.json should hold"):
+        open_run("night")
+
+
+@pytest.mark.parametrize("text", [None, "", "lowfc", "somebody:else"])
+def test_damaged_credentials_are_an_error(text: str | None) -> None:
+    run = open_run("night")
+    damaged(run, "credentials", text)
+    with pytest.raises(DataFileError, match="credentials"):
+        _ = run.links.secret
+
+
+def test_links_of_another_run_are_refused(tmp_path: Path) -> None:
+    open_run("one").path.rename(tmp_path / "lowfc" / "two")
+    with pytest.raises(DataFileError, match="another run's"):
+        open_run("two")
+
+
+def test_directories_of_others_open_ones_and_links_are_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    base = tmp_path / "lowfc"
+    base.mkdir(mode=0o755)
+    with pytest.raises(DataFileError, match="mode 700"):
+        runtime_base()
+    base.chmod(0o700)
+    assert runtime_base() == base
+    monkeypatch.setattr(os, "geteuid", lambda: base.stat().st_uid + 1)
+    with pytest.raises(DataFileError, match="mode 700"):
+        own_directory(base)
+    monkeypatch.undo()
+    (tmp_path / "real").mkdir(mode=0o700)
+    (tmp_path / "link").symlink_to(tmp_path / "real")
+    with pytest.raises(DataFileError, match="mode 700"):
+        own_directory(tmp_path / "link")
+
+
+def test_a_runtime_directory_that_is_none_is_an_error(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "lowfc").write_text("")
+    with pytest.raises(DataFileError, match="should be a directory"):
+        runtime_base()
+    monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path / "gone"))
+    with pytest.raises(DataFileError, match="XDG_RUNTIME_DIR"):
+        runtime_base()
+    monkeypatch.delenv("XDG_RUNTIME_DIR")
+    monkeypatch.setattr(os, "geteuid", lambda: 4_000_000_000)  # nobody's: the directory is made, and is not theirs
+    shared = Path("/tmp/lowfc-4000000000")  # noqa: S108  # the place it is about
+    try:
+        with pytest.raises(DataFileError, match="of user 4000000000"):
+            runtime_base()
+    finally:
+        shared.rmdir()
+
+
+def test_ports_are_free_and_outside_the_range_of_outgoing_connections() -> None:
+    ports = free_ports(8)
+    lowest_outgoing = int(Path("/proc/sys/net/ipv4/ip_local_port_range").read_text().split()[0])
+    assert len(set(ports)) == 8
+    assert all(port < lowest_outgoing for port in ports)
+    for port in ports:
+        with socket.socket() as probe:
+            probe.bind(("127.0.0.1", port))
+
+
+def test_a_start_is_claimed_once() -> None:
+    links = open_run("night").links
+    assert [links.claim_start("camera", start_s) for start_s in (100, 100, 50, 200)] == [100, 101, 102, 200]
+    assert links.claim_start("controller", 100) == 100

@@ -1,0 +1,212 @@
+import os
+import signal
+import subprocess
+import sys
+import threading
+
+import pytest
+
+from lowfc.adapters.clock import FakeClock
+from lowfc.adapters.memory_bus import MemoryBus, MemoryHub
+from lowfc.adapters.realtime import Granted
+from lowfc.adapters.service import HEALTH_PERIOD_NS, Service
+from lowfc.contract.messages import EVENT, FRAME, HEALTH, Log, from_timestamp, wire
+
+PATIENCE_S = 30.0
+
+
+class Ear:
+    """Hears what a run says about itself."""
+
+    def __init__(self, hub: MemoryHub, clock: FakeClock) -> None:
+        self.health: list[wire.Health] = []
+        self.events: list[Log] = []
+        bus = MemoryBus(hub, "operator", clock)
+        bus.subscribe(HEALTH, lambda sample: self.health.append(wire.Health.FromString(sample.payload)))
+        bus.subscribe(EVENT, lambda sample: self.events.append(Log.FromString(sample.payload)))
+
+
+@pytest.fixture
+def hub() -> MemoryHub:
+    return MemoryHub()
+
+
+@pytest.fixture
+def clock() -> FakeClock:
+    return FakeClock()
+
+
+def service(hub: MemoryHub, clock: FakeClock, name: str, **more: object) -> Service:
+    return Service(name, "night", clock, MemoryBus(hub, name, clock), **more)
+
+
+def test_health_is_sent_when_due_and_tells_everything(hub: MemoryHub, clock: FakeClock) -> None:
+    ear = Ear(hub, clock)
+
+    def fill(health: wire.Health) -> None:
+        health.commands_late = 3
+
+    camera = service(hub, clock, "camera", granted=Granted(("one BLAS thread",), ()), fill=fill)
+    frames = camera.publisher(FRAME)
+    camera.beat()
+    camera.beat()
+    assert len(ear.health) == 1
+    for _ in range(5):
+        frames.put(b"")
+        camera.work += 1
+    clock.advance(HEALTH_PERIOD_NS)
+    camera.beat()
+    first, second = ear.health
+    assert (first.state, first.rate_hz, second.rate_hz) == ("starting", 0.0, 10.0)
+    assert (second.process, second.run_id, second.pid, second.version) == ("camera", "night", os.getpid(), "0.1.0")
+    assert (second.commands_late, second.uptime_ns, second.granted) == (3, HEALTH_PERIOD_NS, ["one BLAS thread"])
+    assert from_timestamp(second.timestamp) == clock.now_ns()
+    assert 1 << 20 < second.memory_bytes < 1 << 36
+    assert {count.topic: count.published for count in second.topics} == {
+        "lowfc/event": 1,
+        "lowfc/health/camera": 2,
+        "lowfc/camera/frame": 5,
+    }
+
+
+def test_what_a_mailbox_got_is_in_health(hub: MemoryHub, clock: FakeClock) -> None:
+    camera, controller = service(hub, clock, "camera"), service(hub, clock, "controller")
+    box = controller.mailbox(FRAME)
+    frames = camera.publisher(FRAME)
+    hub.lose = lambda role, key, envelope: key == FRAME.key and envelope.sequence & 0xFFFFFFFF == 1
+    for _ in range(4):
+        last = frames.put(b"").sequence
+    box.take(0.0)
+    (count,) = (count for count in controller.health().topics if count.topic == FRAME.key)
+    assert (count.received, count.skipped, count.missing, count.last_sequence) == (3, 2, 1, last)
+
+
+def test_events_are_published_and_warnings_shown(
+    hub: MemoryHub, clock: FakeClock, capsys: pytest.CaptureFixture[str]
+) -> None:
+    ear = Ear(hub, clock)
+    controller = service(hub, clock, "controller", granted=Granted((), (("SCHED_FIFO", "a longer tail"),)))
+    controller.event("FRAMES_BACK", silent_ms=12.4)
+    assert [(log.name, log.message.split()[0], log.level) for log in ear.events] == [
+        ("controller", "STARTED", 2),
+        ("controller", "REALTIME_REFUSED", 3),
+        ("controller", "FRAMES_BACK", 2),
+    ]
+    assert ear.events[-1].message == "FRAMES_BACK frames are back after 12 ms"
+    assert from_timestamp(ear.events[-1].timestamp) == clock.now_ns()
+    shown = capsys.readouterr().err
+    assert shown == "controller: REALTIME_REFUSED the host refused SCHED_FIFO: a longer tail\n"
+
+
+def test_processes_meet_when_each_has_heard_the_other(hub: MemoryHub, clock: FakeClock) -> None:
+    camera, controller = service(hub, clock, "camera"), service(hub, clock, "controller")
+    assert camera.wait_for(["controller", "mirror-dm"], 0.0) == ("controller", "mirror-dm")
+    camera.state = controller.state = "ready"  # controller heard camera's Health before it sent its own
+    assert camera.wait_for(["controller"], 0.0) == ()
+    assert controller.wait_for(["camera"], 0.0) == ("camera",)  # camera's Health was sent before it heard controller
+    camera.beat()
+    assert controller.wait_for(["camera"], 0.0) == ()
+    mirror = service(hub, clock, "mirror-dm")
+    mirror.beat()  # there, and not ready
+    assert camera.wait_for(["mirror-dm"], 0.0) == ("mirror-dm",)
+    assert camera.heard["mirror-dm"].state == "starting"
+
+
+def test_a_newcomer_is_answered_before_the_next_health_is_due(hub: MemoryHub, clock: FakeClock) -> None:
+    camera = service(hub, clock, "camera")
+    camera.beat()
+    ear = Ear(hub, clock)
+    camera.beat()
+    assert ear.health == []
+    service(hub, clock, "controller").beat()
+    camera.beat()
+    assert list(ear.health[-1].heard) == ["controller"]
+    again = service(hub, clock, "controller")
+    camera.beat()
+    assert len(ear.health) == 2  # one of each process
+    again.beat()  # the same name and the same process: no news
+    camera.beat()
+    assert [health.process for health in ear.health] == ["controller", "camera", "controller"]
+
+
+def test_the_last_health_has_the_final_counts(hub: MemoryHub, clock: FakeClock) -> None:
+    ear = Ear(hub, clock)
+    camera = service(hub, clock, "camera")
+    camera.stop("enough")
+    camera.finish()
+    assert not camera.running
+    assert ear.events[-1].message == "STOPPED camera stopped: enough"
+    assert ear.health[-1].state == "stopped"
+    assert {count.topic: count.published for count in ear.health[-1].topics} == {
+        "lowfc/event": len(ear.events),
+        "lowfc/health/camera": len(ear.health),
+    }
+
+
+def test_only_known_states_and_events(hub: MemoryHub, clock: FakeClock) -> None:
+    camera = service(hub, clock, "camera")
+    with pytest.raises(ValueError, match="starting, ready, running, stopping, stopped; got 'happy'"):
+        camera.state = "happy"
+    with pytest.raises(KeyError):
+        camera.event("NOTHING_OF_THE_KIND")
+
+
+def test_a_broken_health_of_another_is_counted(
+    hub: MemoryHub, clock: FakeClock, capsys: pytest.CaptureFixture[str]
+) -> None:
+    camera = service(hub, clock, "camera")
+    MemoryBus(hub, "operator", clock).publisher(HEALTH, "stranger").put(b"\xff")
+    assert sum(camera.bus.faults.counts.values()) == 1
+    assert "DecodeError" in capsys.readouterr().err
+
+
+def test_a_stop_wakes_the_loop(hub: MemoryHub, clock: FakeClock) -> None:
+    camera = service(hub, clock, "camera")
+    box = camera.mailbox(FRAME)
+    teller = threading.Timer(0.01, camera.stop, ["told"])
+    teller.start()
+    assert box.take(PATIENCE_S) is None
+    teller.join()
+    assert (camera.running, camera.why) == (False, "told")
+
+
+LOOP = """
+from lowfc.adapters.clock import FakeClock
+from lowfc.adapters.memory_bus import MemoryBus, MemoryHub
+from lowfc.adapters.service import Service
+from lowfc.contract.messages import FRAME
+
+clock = FakeClock()
+service = Service("camera", "night", clock, MemoryBus(MemoryHub(), "camera", clock))
+box = service.mailbox(FRAME)
+service.catch_signals()
+print("up", flush=True)
+while service.running:
+    box.take(60.0)
+print(service.why, flush=True)
+if {stuck}:
+    while True:
+        box.take(60.0)
+"""
+
+
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
+def test_a_signal_ends_the_loop(number: signal.Signals) -> None:
+    with subprocess.Popen(
+        [sys.executable, "-c", LOOP.format(stuck=False)], stdout=subprocess.PIPE, text=True
+    ) as process:
+        assert process.stdout.readline() == "up\n"
+        process.send_signal(number)
+        assert process.communicate(timeout=PATIENCE_S)[0] == number.name + "\n"
+    assert process.returncode == 0
+
+
+def test_a_second_interrupt_ends_the_process() -> None:
+    with subprocess.Popen(
+        [sys.executable, "-c", LOOP.format(stuck=True)], stdout=subprocess.PIPE, text=True
+    ) as process:
+        assert process.stdout.readline() == "up\n"
+        process.send_signal(signal.SIGINT)
+        assert process.stdout.readline() == "SIGINT\n"
+        process.send_signal(signal.SIGINT)
+        assert process.wait(PATIENCE_S) == 128 + signal.SIGINT

@@ -1,0 +1,29 @@
+"""What all tests share: runs that leave nothing behind, and no silent skips where none are allowed."""
+
+import os
+from pathlib import Path
+
+import pytest
+
+NO_SKIPS = os.environ.get("LOWFC_NO_SKIPS") == "1"
+
+
+@pytest.fixture(scope="session", autouse=True)
+def _private_runtime(tmp_path_factory: pytest.TempPathFactory) -> None:
+    """Give all runs of the tests a runtime directory of their own, so that they meet no loop of the user's."""
+    path = tmp_path_factory.mktemp("runtime")
+    path.chmod(0o700)
+    os.environ["XDG_RUNTIME_DIR"] = str(path)
+
+
+def pytest_runtest_logreport(report: pytest.TestReport) -> None:
+    if NO_SKIPS and report.skipped and not hasattr(report, "wasxfail"):
+        report.outcome = "failed"
+
+
+@pytest.fixture(scope="session")
+def artefacts() -> Path:
+    """Where tests leave pictures for people to look at."""
+    path = Path(__file__).parent / "artefacts"
+    path.mkdir(exist_ok=True)
+    return path

@@ -1,0 +1,168 @@
+"""From I0 and H to R: normalisation, unbiasedness, the least noise, and sensors that cannot."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from toy import TOY, calibration
+
+from lowfc.control.calibration import ESTIMATORS, condition_number, noise_nm, normalise_flux, reconstructor
+from lowfc.control.estimator import estimate, saturated_pixels
+
+PIXELS = TOY.reference.size
+RESPONSE = TOY.response + 0.001 * np.outer(TOY.reference, [1, -2, 3])  # modes that also change the flux
+GOOD = np.ones(PIXELS)
+SOME_BAD = GOOD.copy()
+SOME_BAD[[3, 17, 30]] = 0
+
+
+@pytest.mark.parametrize("good", [GOOD, SOME_BAD])
+def test_the_normalised_response_is_the_derivative_of_the_normalised_image(good: np.ndarray) -> None:
+    I0, H = normalise_flux(TOY.reference, RESPONSE, good)
+    assert I0 @ good == pytest.approx(1, abs=1e-12)
+
+    def normalised(modes_nm: np.ndarray) -> np.ndarray:
+        image = TOY.reference + RESPONSE @ modes_nm
+        return image / (image @ good)
+
+    for mode in range(RESPONSE.shape[1]):
+        poke = 1e-4 * np.eye(RESPONSE.shape[1])[mode]
+        numerical = (normalised(poke) - normalised(-poke)) / 2e-4
+        assert np.abs(numerical - H[:, mode]).max() < 1e-9 * np.abs(H).max()
+
+
+def test_an_image_without_light_cannot_be_normalised() -> None:
+    with pytest.raises(ValueError, match="no light"):
+        normalise_flux(np.zeros(PIXELS), RESPONSE, GOOD)
+
+
+@pytest.mark.parametrize("estimator", ESTIMATORS)
+@pytest.mark.parametrize("good", [GOOD, SOME_BAD])
+def test_modes_are_recovered_exactly_without_noise(estimator: str, good: np.ndarray) -> None:
+    I0, H = normalise_flux(TOY.reference, RESPONSE, good)
+    R = reconstructor(I0, H, good, 1e5, 2.0, estimator)
+    assert np.abs(R @ H - np.eye(3)).max() < 1e-10
+    assert not R[:, good == 0].any()
+
+
+def test_plain_is_numpys_pseudo_inverse_and_weighted_is_not() -> None:
+    I0, H = normalise_flux(TOY.reference, RESPONSE, GOOD)
+    assert np.allclose(reconstructor(I0, H, GOOD, 1e5, 2.0, "pinv"), np.linalg.pinv(H), rtol=1e-9)
+    assert not np.allclose(reconstructor(I0, H, GOOD, 1e5, 2.0), np.linalg.pinv(H), rtol=1e-3)
+
+
+def cramer_rao(flux_e: float, read_noise_e: float) -> np.ndarray:
+    """Covariance bound (modes, modes) for modes and an unknown flux together, Gaussian noise of known variance."""
+    image_e = flux_e * TOY.reference / TOY.reference.sum()
+    design = np.column_stack([flux_e * RESPONSE / TOY.reference.sum(), image_e])
+    information = design.T @ (design / (image_e + read_noise_e**2)[:, None])
+    bound: np.ndarray = np.linalg.inv(information)[:3, :3]
+    return bound
+
+
+def covariance(estimator: str, flux_e: float, read_noise_e: float) -> np.ndarray:
+    """Covariance (modes, modes) of R on frames that are divided by their own noisy flux."""
+    I0, H = normalise_flux(TOY.reference, RESPONSE, GOOD)
+    R = reconstructor(I0, H, GOOD, flux_e, read_noise_e, estimator)
+    each = R - np.outer(R @ I0, GOOD)
+    result: np.ndarray = each @ np.diag((I0 * flux_e + read_noise_e**2) / flux_e**2) @ each.T
+    return result
+
+
+def test_the_weighted_estimator_reaches_the_cramer_rao_bound_of_photon_noise() -> None:
+    assert np.allclose(covariance("weighted", 1e5, 0.0), cramer_rao(1e5, 0.0), rtol=1e-9)
+
+
+def test_with_read_noise_it_stays_at_the_bound_within_a_percent() -> None:
+    ratio = np.diag(covariance("weighted", 1e4, 5.0)) / np.diag(cramer_rao(1e4, 5.0))
+    assert (ratio >= 1 - 1e-9).all()
+    assert (ratio < 1.01).all()
+
+
+def test_the_plain_estimator_is_noisier() -> None:
+    plain = np.diag(covariance("pinv", 1e5, 0.0)) / np.diag(cramer_rao(1e5, 0.0))
+    assert (plain > 1.01).all()
+
+
+@pytest.mark.parametrize("estimator", ESTIMATORS)
+def test_the_predicted_noise_is_that_of_a_monte_carlo(estimator: str) -> None:
+    flux_e, read_noise_e, trials = 50_000.0, 3.0, 4000
+    I0, H = normalise_flux(TOY.reference, RESPONSE, SOME_BAD)
+    R = reconstructor(I0, H, SOME_BAD, flux_e, read_noise_e, estimator)
+    rng = np.random.default_rng(5)
+    frames = rng.poisson(flux_e * I0, (trials, PIXELS)) + read_noise_e * rng.standard_normal((trials, PIXELS))
+    errors = (frames / (frames @ SOME_BAD)[:, None] - I0) @ R.T
+    predicted = noise_nm(R, I0, flux_e, read_noise_e)
+    # The standard deviation of a standard deviation is 1 / sqrt(2 trials): four of them are 4.5 %.
+    assert np.abs(errors.std(axis=0) / predicted - 1).max() < 4 / np.sqrt(2 * trials)
+
+
+@pytest.mark.parametrize(
+    "response",
+    [
+        np.column_stack([RESPONSE[:, 0], RESPONSE[:, 0]]),
+        np.column_stack([RESPONSE[:, 0], np.zeros(PIXELS)]),
+        np.column_stack([RESPONSE[:, 0], RESPONSE[:, 0] * (1 + 1e-10)]),
+    ],
+)
+@pytest.mark.parametrize("estimator", ESTIMATORS)
+def test_a_sensor_that_cannot_tell_modes_apart_is_refused(response: np.ndarray, estimator: str) -> None:
+    I0, H = normalise_flux(TOY.reference, response, GOOD)
+    with pytest.raises(ValueError, match="cannot tell the modes apart"):
+        reconstructor(I0, H, GOOD, 1e5, 1.0, estimator)
+
+
+def test_an_unknown_estimator_is_refused() -> None:
+    with pytest.raises(ValueError, match="'best'"):
+        reconstructor(TOY.reference, RESPONSE, GOOD, 1e5, 1.0, "best")
+
+
+def test_condition_number_of_a_missing_mode_is_infinite() -> None:
+    assert condition_number(np.eye(4)[:, :2]) == pytest.approx(1)
+    assert condition_number(np.column_stack([np.ones(4), np.zeros(4)])) == np.inf
+
+
+def test_an_estimate_is_right_at_any_flux_and_overwrites_only_its_scratch() -> None:
+    known, scratch = calibration(), np.empty(PIXELS, np.float32)
+    for flux_dn in (100_000.0, 200_000.0, 400_000.0):
+        pixels = TOY.pixels((3, -4, 5), flux_dn).reshape(-1)
+        before = pixels.copy()
+        found = estimate(known, pixels, 1000.0, scratch)
+        assert found is not None
+        assert np.abs(found.error_nm - (3, -4, 5)).max() < 0.1
+        assert found.error_nm.dtype == np.float32
+        assert found.flux_dn == pytest.approx(flux_dn, rel=1e-4)
+        assert np.array_equal(pixels, before)
+
+
+def test_a_frame_at_or_below_the_least_flux_is_dark() -> None:
+    known, scratch = calibration(), np.empty(PIXELS, np.float32)
+    pixels = np.full(PIXELS, 101, np.uint16)  # one DN above the dark in every pixel
+    assert estimate(known, pixels, float(PIXELS), scratch) is None
+    assert estimate(known, pixels, PIXELS - 1.0, scratch) is not None
+    assert estimate(known, np.zeros(PIXELS, np.uint16), 0.0, scratch) is None
+
+
+def test_only_good_pixels_count_as_saturated() -> None:
+    known = replace(calibration(), good=SOME_BAD.astype(np.float32))
+    pixels = np.full(PIXELS, 1000, np.uint16)
+    assert saturated_pixels(known, pixels) == 0
+    pixels[[3, 4]] = 60_000
+    assert saturated_pixels(known, pixels) == 1
+    pixels[5] = 65_535
+    assert saturated_pixels(known, pixels) == 2
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"reference": np.zeros(3, np.float32)}, "reference must have shape"),
+        ({"modes_to_actuators": np.zeros((20, 2), np.float32)}, "modes_to_actuators must have shape"),
+        ({"dark": np.full(PIXELS, np.nan, np.float32)}, "dark holds values that are not finite"),
+        ({"flux_dn": 0.0}, "flux_dn"),
+        ({"flux_dn": np.nan}, "flux_dn"),
+    ],
+)
+def test_a_calibration_that_does_not_fit_together_is_refused(change: dict[str, object], message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        replace(calibration(), **change)

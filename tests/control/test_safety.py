@@ -1,0 +1,289 @@
+"""The limits of the mirror hold for any wanted shape, exactly, in float64 and without tolerance."""
+
+import numpy as np
+import numpy.typing as npt
+import pytest
+from hypothesis import assume, example, given, settings
+from hypothesis import strategies as st
+from hypothesis.extra import numpy as hnp
+
+from lowfc.control.safety import (
+    Limits,
+    LoopMode,
+    Reason,
+    expired,
+    limit,
+    neighbour_difference_nm,
+    request_mode,
+)
+from safety_checks import CASES, LIMITS, Case, check_kept, violations
+
+Array = npt.NDArray[np.float32]
+
+GRID = (4, 5)
+
+
+def boundary_values(bounds: tuple[float, ...]) -> list[float]:
+    """Dense around each limit: at it, and one and two roundings to either side, with both signs."""
+    found = [0.0, 1e-40, -1e-45, 1e-3]
+    for bound in bounds:
+        for value in (np.float32(bound), np.float32(bound - 1e-3), np.float32(bound / 2)):
+            below = np.nextafter(value, np.float32(0))
+            above = np.nextafter(value, np.float32(np.inf))
+            found += [float(v) for v in (value, below, above, np.nextafter(above, np.float32(np.inf)))]
+    return found + [-value for value in found]
+
+
+EDGES = boundary_values((LIMITS.stroke_nm, LIMITS.slew_nm, LIMITS.neighbour_nm))
+finite = st.one_of(st.sampled_from(EDGES), st.floats(-2000, 2000, width=32))
+anything = st.one_of(finite, st.floats(width=32), st.sampled_from([np.inf, -np.inf, np.nan, 1e38, -3.4e38]))
+
+
+def within(limits: Limits, actuators_nm: Array) -> bool:
+    stroke = np.abs(actuators_nm.astype(np.float64)).max() <= limits.stroke_nm
+    return bool(stroke) and neighbour_difference_nm(actuators_nm) <= limits.neighbour_nm
+
+
+def allowed_shapes(limits: Limits = LIMITS) -> st.SearchStrategy[Array]:
+    """Shapes within the limits, many of them exactly at one."""
+
+    def bring_in(shape: Array) -> Array:
+        shape = np.clip(shape, -np.float32(limits.stroke_nm), np.float32(limits.stroke_nm))
+        apart = neighbour_difference_nm(shape)
+        while apart > limits.neighbour_nm:
+            shape = (shape * np.float32(limits.neighbour_nm / apart * (1 - 1e-7))).astype(np.float32)
+            apart = neighbour_difference_nm(shape)
+        return shape
+
+    return hnp.arrays(np.float32, GRID, elements=finite.map(np.float32)).map(bring_in)
+
+
+@settings(max_examples=400, deadline=None)
+@given(previous=allowed_shapes(), wanted=hnp.arrays(np.float32, GRID, elements=anything.map(np.float32)))
+def test_whatever_is_wanted_the_limits_hold(previous: Array, wanted: Array) -> None:
+    assert within(LIMITS, previous)
+    limited = limit(LIMITS, previous, wanted)
+    assert violations(LIMITS, previous, limited.actuators_nm) == []
+    assert limited.actuators_nm.dtype == np.float32
+    if not np.isfinite(wanted).all():
+        assert limited.reasons == (Reason.NOT_FINITE,)
+        assert np.array_equal(limited.actuators_nm, previous)
+
+
+@settings(max_examples=150, deadline=None)
+@given(
+    stroke=st.floats(5, 2e5),
+    slew=st.floats(0.05, 1),
+    neighbour=st.floats(0.05, 1),
+    seed=st.integers(0, 2**32 - 1),
+)
+@example(stroke=2e5, slew=0.05, neighbour=0.05, seed=1)
+def test_the_limits_hold_for_any_limits(stroke: float, slew: float, neighbour: float, seed: int) -> None:
+    """Also for strokes so long that float32 rounds coarser than the usual margin, over many steps."""
+    limits = Limits(stroke, slew * stroke, neighbour * stroke)
+    rng = np.random.default_rng(seed)
+    shape = np.zeros(GRID, np.float32)
+    for _ in range(20):
+        wanted = (rng.choice([0.01, 1, 3]) * stroke * rng.standard_normal(GRID)).astype(np.float32)
+        after = limit(limits, shape, wanted).actuators_nm
+        assert violations(limits, shape, after) == []
+        shape = after
+
+
+@pytest.mark.parametrize("case", CASES, ids=lambda case: case.name)
+def test_cases_by_hand(case: Case) -> None:
+    check_kept(limit, case)
+
+
+@settings(max_examples=200, deadline=None)
+@given(previous=allowed_shapes(), fraction=st.floats(0, 1))
+def test_what_is_allowed_goes_through_unchanged(previous: Array, fraction: float) -> None:
+    """A move well within every limit is carried out as it was wanted, and nothing is said about it."""
+    wanted = (previous * np.float32(fraction)).astype(np.float32)
+    assume(np.abs(wanted.astype(np.float64) - previous).max() < LIMITS.slew_nm - 0.01)
+    assume(np.abs(wanted).max() < LIMITS.stroke_nm - 0.01)
+    assume(neighbour_difference_nm(wanted) < LIMITS.neighbour_nm - 0.01)
+    limited = limit(LIMITS, previous, wanted)
+    assert limited.reasons == ()
+    assert np.array_equal(limited.actuators_nm, wanted)
+
+
+@pytest.mark.parametrize(
+    ("value_nm", "reasons"),
+    [
+        (LIMITS.slew_nm - 0.01, ()),
+        (LIMITS.slew_nm + 0.01, (Reason.SLEW,)),
+    ],
+)
+def test_slew_both_sides_of_the_limit(value_nm: float, reasons: tuple[Reason, ...]) -> None:
+    previous = np.full(GRID, 3.0, np.float32)
+    assert limit(LIMITS, previous, previous + np.float32(value_nm)).reasons == reasons
+
+
+@pytest.mark.parametrize(
+    ("value_nm", "reasons"),
+    [
+        (LIMITS.stroke_nm - 0.01, ()),
+        (LIMITS.stroke_nm + 0.01, (Reason.STROKE,)),
+    ],
+)
+@pytest.mark.parametrize("sign", [1, -1])
+def test_stroke_both_sides_of_the_limit(value_nm: float, reasons: tuple[Reason, ...], sign: int) -> None:
+    previous = np.full(GRID, sign * (LIMITS.stroke_nm - 50), np.float32)
+    assert limit(LIMITS, previous, np.full(GRID, sign * value_nm, np.float32)).reasons == reasons
+
+
+@pytest.mark.parametrize(
+    ("apart_nm", "reasons"),
+    [
+        (LIMITS.neighbour_nm - 0.01, ()),
+        (LIMITS.neighbour_nm + 0.01, (Reason.NEIGHBOUR,)),
+    ],
+)
+@pytest.mark.parametrize("axis", [0, 1])
+def test_neighbours_both_sides_of_the_limit(apart_nm: float, reasons: tuple[Reason, ...], axis: int) -> None:
+    def step(height_nm: float) -> Array:
+        shape = np.zeros(GRID, np.float32)
+        np.moveaxis(shape, axis, 0)[2:] = height_nm
+        return shape - np.float32(height_nm / 2)
+
+    limited = limit(LIMITS, step(LIMITS.neighbour_nm - 60), step(apart_nm))
+    assert limited.reasons == reasons
+    assert abs(neighbour_difference_nm(limited.actuators_nm) - min(apart_nm, LIMITS.neighbour_nm)) < 0.02
+
+
+def test_diagonal_actuators_are_not_neighbours() -> None:
+    shape = np.zeros((2, 2), np.float32)
+    shape[0, 0], shape[1, 1] = 1, -1
+    assert neighbour_difference_nm(shape) == 1
+
+
+@pytest.mark.parametrize("shape", [(5, 4), (4, 4), (20,), (0, 0), (1, 4, 5)])
+def test_another_grid_is_refused(shape: tuple[int, ...]) -> None:
+    previous = np.full(GRID, 7, np.float32)
+    limited = limit(LIMITS, previous, np.zeros(shape, np.float32))
+    assert limited.reasons == (Reason.WRONG_GRID,)
+    assert np.array_equal(limited.actuators_nm, previous)
+
+
+def test_wide_numbers_are_limited_too() -> None:
+    limited = limit(LIMITS, np.zeros(GRID, np.float32), np.full(GRID, 1e300))
+    assert violations(LIMITS, np.zeros(GRID, np.float32), limited.actuators_nm) == []
+    assert limited.actuators_nm.dtype == np.float32
+
+
+def test_nothing_given_is_changed() -> None:
+    rng = np.random.default_rng(4)
+    previous = (200 * rng.standard_normal(GRID)).astype(np.float32)
+    wanted = (900 * rng.standard_normal(GRID)).astype(np.float32)
+    copies = previous.copy(), wanted.copy()
+    limit(LIMITS, previous, wanted)
+    assert np.array_equal(previous, copies[0])
+    assert np.array_equal(wanted, copies[1])
+
+
+@settings(max_examples=100, deadline=None)
+@given(
+    previous=hnp.arrays(np.float32, GRID, elements=st.floats(-3000, 3000, width=32)),
+    wanted=hnp.arrays(np.float32, GRID, elements=finite.map(np.float32)),
+)
+def test_a_shape_outside_the_limits_comes_back(previous: Array, wanted: Array) -> None:
+    """What is outside never goes further out, comes in at no more than the slew limit, and gets there."""
+    shape, steps = previous, 0
+    while not within(LIMITS, shape):
+        after = limit(LIMITS, shape, wanted).actuators_nm
+        assert np.isfinite(after).all()
+        largest, apart = np.abs(shape).max(), neighbour_difference_nm(shape)
+        assert np.abs(after.astype(np.float64) - shape).max() <= LIMITS.slew_nm
+        assert np.abs(after).max() <= max(largest, LIMITS.stroke_nm)
+        if largest > LIMITS.stroke_nm:
+            assert np.abs(after).max() < largest
+        if largest <= LIMITS.stroke_nm and apart > LIMITS.neighbour_nm:
+            assert neighbour_difference_nm(after) < apart
+        shape, steps = after, steps + 1
+        assert steps < 200
+    assert violations(LIMITS, shape, limit(LIMITS, shape, wanted).actuators_nm) == []
+
+
+@settings(max_examples=200, deadline=None)
+@given(previous=st.one_of(allowed_shapes(), hnp.arrays(np.float32, GRID, elements=st.floats(-3000, 3000, width=32))))
+def test_relaxing_reaches_flat(previous: Array) -> None:
+    shape, steps = previous, 0
+    while shape.any():
+        after = limit(LIMITS, shape, np.zeros(GRID, np.float32)).actuators_nm
+        assert np.abs(after.astype(np.float64) - shape).max() <= LIMITS.slew_nm
+        assert np.abs(after).max() < np.abs(shape).max()
+        shape, steps = after, steps + 1
+        assert steps <= 2 * np.ceil(np.abs(previous).max() / (LIMITS.slew_nm - 1e-3)) + 2
+
+
+@settings(max_examples=100, deadline=None)
+@given(shape=allowed_shapes(), seed=st.integers(0, 2**32 - 1))
+def test_a_mirror_pressed_against_the_neighbour_limit_stays_there(shape: Array, seed: int) -> None:
+    """It does not fall back towards flat and it does not shake: repeated wishes for too much change nothing much."""
+    rng = np.random.default_rng(seed)
+    wanted = (5000 * rng.standard_normal(GRID)).astype(np.float32)
+    for _ in range(30):
+        shape = limit(LIMITS, shape, wanted).actuators_nm
+    settled = shape
+    for _ in range(10):
+        shape = limit(LIMITS, shape, wanted).actuators_nm
+        assert np.abs(shape - settled).max() < 0.1
+
+
+@pytest.mark.parametrize("name", ["stroke_nm", "slew_nm", "neighbour_nm"])
+@pytest.mark.parametrize("value", [0, -1, 1e-3, np.nan, np.inf])
+def test_limits_that_limit_nothing_are_refused(name: str, value: float) -> None:
+    good = {"stroke_nm": 700.0, "slew_nm": 100.0, "neighbour_nm": 400.0}
+    with pytest.raises(ValueError, match=name):
+        Limits(**(good | {name: value}))
+
+
+@pytest.mark.parametrize(
+    ("age_ns", "valid_for_ns", "answer"),
+    [
+        (0, 0, False),
+        (1, 0, True),
+        (200, 200, False),
+        (201, 200, True),
+        (-1, 200, True),
+    ],
+)
+def test_the_dead_man_expires_just_after_what_was_promised(age_ns: int, valid_for_ns: int, answer: bool) -> None:
+    assert expired(age_ns, valid_for_ns) is answer
+
+
+@pytest.mark.parametrize("mode", list(LoopMode))
+@pytest.mark.parametrize("calibrated", [True, False])
+def test_safe_is_granted_in_every_mode_and_latched(mode: LoopMode, calibrated: bool) -> None:
+    assert request_mode(mode, "safe", calibrated) == (LoopMode.SAFED, "")
+    for request in ("open", "close"):
+        after, refusal = request_mode(LoopMode.SAFED, request, calibrated)
+        assert after is LoopMode.SAFED
+        assert "clear" in refusal
+
+
+@pytest.mark.parametrize("mode", list(LoopMode))
+@pytest.mark.parametrize("calibrated", [True, False])
+def test_clear_leaves_only_safed_and_never_for_closed(mode: LoopMode, calibrated: bool) -> None:
+    after, refusal = request_mode(mode, "clear", calibrated)
+    if mode is LoopMode.SAFED:
+        assert after is (LoopMode.OPEN if calibrated else LoopMode.IDLE)
+        assert refusal == ""
+    else:
+        assert after is mode
+        assert "nothing to clear" in refusal
+
+
+@pytest.mark.parametrize("mode", [LoopMode.IDLE, LoopMode.OPEN, LoopMode.CLOSED])
+def test_open_and_close_need_a_calibration(mode: LoopMode) -> None:
+    for request, target in (("open", LoopMode.OPEN), ("close", LoopMode.CLOSED)):
+        assert request_mode(mode, request, calibrated=True) == (target, "")
+        after, refusal = request_mode(mode, request, calibrated=False)
+        assert after is mode
+        assert "calibration" in refusal
+
+
+def test_an_unknown_request_is_an_error_of_the_program() -> None:
+    with pytest.raises(ValueError, match="'dance'"):
+        request_mode(LoopMode.OPEN, "dance", calibrated=True)

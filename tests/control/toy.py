@@ -1,0 +1,109 @@
+"""A small sensor and mirror with exact algebra, in place of diffraction: for tests of the control law alone."""
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from lowfc.control.calibration import Calibration, normalise_flux, reconstructor
+from lowfc.control.inputs import Frame, Load
+from lowfc.control.loop import advance
+from lowfc.control.safety import Limits, LoopMode
+from lowfc.control.state import Settings, State
+
+Array = npt.NDArray[np.float64]
+
+SHAPE, GRID, NOLL = (6, 7), (4, 5), (2, 3, 4)
+FLUX_DN, DARK_DN, SATURATION_DN = 200_000.0, 100.0, 60_000.0
+START = 1_700_000_000
+PERIOD_NS = 1_000_000
+
+
+def frame_sequence(count: int, start: int = START) -> int:
+    return start << 32 | count
+
+
+@dataclass(frozen=True)
+class Toy:
+    """I0 (pixels,) and H (pixels, modes) before normalisation, and the modes' shapes on the mirror."""
+
+    reference: Array
+    response: Array
+    modes_to_actuators: Array
+
+    def pixels(self, modes_nm: npt.ArrayLike, flux_dn: float = FLUX_DN) -> npt.NDArray[np.uint16]:
+        """Frame (rows, columns) of a wavefront, exactly linear up to the rounding to DN."""
+        image = self.reference + self.response @ np.asarray(modes_nm, float)
+        return np.rint(DARK_DN + flux_dn * image.reshape(SHAPE) / self.reference.sum()).astype(np.uint16)
+
+
+def toy() -> Toy:
+    rng = np.random.default_rng(11)
+    count = SHAPE[0] * SHAPE[1]
+    reference = rng.uniform(0.5, 1.5, count)
+    response = 0.002 * rng.standard_normal((count, len(NOLL)))
+    response -= response.mean(axis=0)  # the flux stays the same, so that the sensor is linear
+    y, x = np.meshgrid(np.linspace(-1, 1, GRID[0]), np.linspace(-1, 1, GRID[1]), indexing="ij")
+    shapes = np.stack([x, y, x**2 + y**2 - 1]).reshape(len(NOLL), -1).T
+    return Toy(reference, response, shapes / 2)
+
+
+TOY = toy()
+
+
+def calibration(noll: tuple[int, ...] = NOLL, scale: float = 1.0) -> Calibration:
+    """The toy's calibration, of some of its modes; `scale` makes a different one."""
+    good = np.ones(SHAPE[0] * SHAPE[1])
+    chosen = [NOLL.index(index) for index in noll]
+    I0, H = normalise_flux(TOY.reference, TOY.response[:, chosen] * scale, good)
+    R = reconstructor(I0, H, good, FLUX_DN, 1.0)
+    return Calibration(
+        noll=noll,
+        reference=I0.astype(np.float32),
+        response=H.astype(np.float32),
+        reconstructor=R.astype(np.float32),
+        good=good.astype(np.float32),
+        dark=np.full(good.size, DARK_DN, np.float32),
+        modes_to_actuators=TOY.modes_to_actuators[:, chosen].astype(np.float32),
+        shape=SHAPE,
+        grid=GRID,
+        flux_dn=FLUX_DN,
+        saturation_dn=SATURATION_DN,
+        estimator="weighted",
+        wavelength_nm=550.0,
+        operator_hash="",
+        id="toy",
+    )
+
+
+def settings(**changes: object) -> Settings:
+    usual: dict[str, object] = {
+        "limits": Limits(700.0, 100.0, 400.0),
+        "delay_frames": 1.0,
+        "start_mode": LoopMode.CLOSED,
+        "late_ns": 20_000_000,
+        "hold_ns": 50_000_000,
+        "silence": "hold",
+        "least_flux": 0.2,
+        "most_saturated": 8,
+        "gain": (0.5, 0.3),
+        "leak": (0.0, 0.0),
+        "limit_nm": (150.0, 50.0),
+    }
+    return Settings(**(usual | changes))  # type: ignore[arg-type]
+
+
+def loaded(what: Settings) -> State:
+    """State with the toy's calibration loaded."""
+    return advance(what, State(), Load(0, calibration(), "test"))[0]
+
+
+def frame(count: int, modes_nm: npt.ArrayLike = (0, 0, 0), **changes: object) -> Frame:
+    """Frame number `count` of a wavefront."""
+    usual: dict[str, object] = {
+        "sequence": frame_sequence(count),
+        "time_ns": START * 10**9 + count * PERIOD_NS,
+        "age_ns": 100_000,
+        "pixels": TOY.pixels(modes_nm),
+    }
+    return Frame(**(usual | changes))  # type: ignore[arg-type]

@@ -1,0 +1,134 @@
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from lowfc.adapters.masks import layout_names, layout_warnings, load_layout, load_pupil, sensor_from
+from lowfc.contract.errors import ConfigurationError, DataFileError
+from lowfc.optics.sam import Layout, check, is_even_symmetric, transmission
+
+TWO = {"purpose": "two holes", "hole_diameter": 0.1, "holes": [[0.1, 0.2], [-0.3, 0.0]]}
+
+
+def written(tmp_path, content, name="mask.json"):
+    path = tmp_path / name
+    path.write_text(content if isinstance(content, str) else json.dumps(content))
+    return path
+
+
+@pytest.mark.parametrize(
+    ("name", "diameter"), [("sam27d07_bal14", 0.07), ("sam27d10_bal14", 0.1), ("sam27_crb20", 0.07)]
+)
+def test_shipped_layouts_are_sound(name, diameter):
+    assert name in layout_names()
+    layout = load_layout(name)
+    assert len(layout.holes) == 27
+    assert layout.hole_diameter == diameter
+    assert layout_warnings(layout) == []
+    open_area = transmission(layout, 512).mean()
+    assert open_area == pytest.approx(27 * np.pi / 4 * diameter**2, rel=0.01)
+
+
+def test_holes_are_where_x_and_y_say():
+    mask = transmission(Layout("one", "", 0.1, ((0.3, -0.2),)), 100)
+    rows, columns = np.nonzero(mask)
+    assert (rows.mean() + 0.5) / 100 - 0.5 == pytest.approx(-0.2)
+    assert (columns.mean() + 0.5) / 100 - 0.5 == pytest.approx(0.3)
+
+
+@pytest.mark.parametrize(
+    ("layout", "message"),
+    [
+        (Layout("a", "", 0.1, ((0.0, 0.0), (0.09, 0.0))), r"holes 0 at \(0.0, 0.0\) and 1 at \(0.09, 0.0\) overlap"),
+        (Layout("a", "", 0.1, ((0.0, 0.0), (0.0, 0.46))), "hole 1 at .* reaches 0.5100 D"),
+        (Layout("a", "", 0.1, ()), "at least one hole"),
+        (Layout("a", "", 0.0, ((0.0, 0.0),)), "hole diameter"),
+        (Layout("a", "", 0.1, ((float("nan"), 0.0),)), "finite"),
+    ],
+)
+def test_impossible_layouts_are_refused(layout, message):
+    with pytest.raises(ValueError, match=message):
+        check(layout)
+
+
+def test_holes_may_touch():
+    check(Layout("touching", "", 0.1, ((0.0, 0.0), (0.1, 0.0), (0.45, 0.0))))
+
+
+def test_even_symmetry_is_warned_about(tmp_path):
+    even = Layout("even", "", 0.1, ((0.2, 0.1), (-0.2, -0.1), (0.0, 0.0)))
+    assert is_even_symmetric(even)
+    assert not is_even_symmetric(replace(even, holes=(*even.holes, (0.3, 0.2))))
+    path = written(tmp_path, {"hole_diameter": 0.1, "holes": even.holes})
+    said = []
+    sensor_from(str(path), warn=said.append)
+    assert len(said) == 1
+    assert "cannot sense even modes" in said[0]
+    said.clear()
+    sensor_from(warn=said.append)
+    assert said == []
+
+
+def test_layouts_from_files(tmp_path):
+    alone = load_layout(str(written(tmp_path, TWO)))
+    assert alone == Layout("mask", "two holes", 0.1, ((0.1, 0.2), (-0.3, 0.0)))
+    one = written(tmp_path, {"layouts": {"x": TWO}}, "one.json")
+    assert load_layout(str(one)) == load_layout(f"{one}:x")
+    several = written(tmp_path, {"layouts": {"x": TWO, "y": TWO}}, "several.json")
+    assert load_layout(f"{several}:y").name == "y"
+    with pytest.raises(ConfigurationError, match=r"several layouts.* x, y"):
+        load_layout(str(several))
+    with pytest.raises(ConfigurationError, match="'z'"):
+        load_layout(f"{several}:z")
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        ("{not json", "not a readable JSON"),
+        ("[]", "holds no layouts"),
+        ({"layouts": {}}, "holds no layouts"),
+        ({"layouts": {"x": {"holes": [[0, 0]]}}}, "hole_diameter"),
+        ({"layouts": {"x": {**TWO, "holes": [[0, 0, 0]]}}}, "pairs"),
+        ({"layouts": {"x": {**TWO, "holes": [[0, 0], [0.05, 0]]}}}, "overlap"),
+        ({"layouts": {"x": {**TWO, "holes": [[0.49, 0]]}}}, "outside"),
+        ({"layouts": {"x": 3}}, "layout x"),
+    ],
+)
+def test_damaged_layout_files_are_named(tmp_path, content, message):
+    path = written(tmp_path, content)
+    with pytest.raises(DataFileError, match=message) as caught:
+        load_layout(str(path))
+    assert str(path) in str(caught.value)
+
+
+def test_missing_files_and_misspelt_names():
+    with pytest.raises(DataFileError, match=r"no layout file nowhere\.json"):
+        load_layout("nowhere.json")
+    with pytest.raises(ConfigurationError, match="did you mean 'sam27d07_bal14'"):
+        load_layout("sam27d07_ball4")
+    with pytest.raises(ConfigurationError, match="did you mean 'bowtie'"):
+        sensor_from(focal_mask="bowtei")
+    with pytest.raises(ConfigurationError, match="wavelength"):
+        sensor_from(wavelength_nm=-1.0)
+
+
+def test_damaged_pupil_files_are_named(tmp_path):
+    path = tmp_path / "pupil.npz"
+    with pytest.raises(DataFileError, match="no pupil file"):
+        load_pupil(file=path)
+    np.savez(path, quarter=np.ones((4, 4)))
+    path.write_bytes(path.read_bytes()[:100])
+    with pytest.raises(DataFileError, match="damaged"):
+        load_pupil(file=path)
+    np.savez(path, other=np.ones((4, 4)))
+    with pytest.raises(DataFileError, match="quarter"):
+        load_pupil(file=path)
+    np.savez(path, quarter=np.full((4, 4), 2.0))
+    with pytest.raises(DataFileError, match="between 0 and 1"):
+        load_pupil(file=path)
+    np.savez(path, quarter=np.ones((4, 4)))
+    assert load_pupil(16, path).shape == (16, 16)
+    with pytest.raises(ConfigurationError, match="multiple of 8"):
+        load_pupil(12, path)

@@ -1,0 +1,83 @@
+import numpy as np
+import pytest
+
+from lowfc.optics.grid import pupil_axis
+from lowfc.optics.mirror import (
+    Mirror,
+    active_actuators,
+    actuator_axis,
+    influence_factors,
+    modes_to_actuators,
+    surface_nm,
+)
+from lowfc.optics.zernike import NOLLS_20, zernikes
+
+MIRROR = Mirror()
+
+
+def test_one_poke_is_one_nm_there_and_the_coupling_next_door():
+    axis = actuator_axis(MIRROR, 34)
+    assert axis[1] - axis[0] == pytest.approx(1 / 31)
+    poke = np.zeros((34, 34))
+    poke[10, 20] = 1.0
+    factors = influence_factors(MIRROR, axis, 34)
+    surface = surface_nm(factors, poke, factors)
+    assert surface[10, 20] == pytest.approx(1.0)
+    assert surface[11, 20] == pytest.approx(0.15)
+    assert surface[10, 19] == pytest.approx(0.15)
+    assert surface[11, 21] == pytest.approx(0.15**2)
+    assert np.unravel_index(surface.argmax(), surface.shape) == (10, 20)
+
+
+def test_rows_and_columns_may_differ():
+    mirror = Mirror(rows=3, columns=5, pitches_per_pupil=4)
+    u = pupil_axis(16)
+    commands = modes_to_actuators(mirror, [2, 3])
+    assert commands.shape == (15, 2)
+    surface = surface_nm(influence_factors(mirror, u, 3), commands[:, 0].reshape(3, 5), influence_factors(mirror, u, 5))
+    assert surface.shape == (16, 16)
+    assert np.corrcoef(surface[8], u)[0, 1] > 0.9  # a tilt along x
+
+
+def test_the_driven_actuators_are_the_pupil_and_one_ring():
+    active = active_actuators(MIRROR)
+    assert active.sum() == 912
+    np.testing.assert_array_equal(active, active.T)
+    np.testing.assert_array_equal(active, active[::-1])
+
+
+def test_commands_make_the_modes_with_half_the_surface():
+    commands = modes_to_actuators(MIRROR, NOLLS_20)
+    assert commands.shape == (34 * 34, 20)
+    assert not commands[~active_actuators(MIRROR).ravel()].any()
+    u = pupil_axis(256)
+    inside = np.hypot(u[:, None], u) <= 0.5
+    factors = influence_factors(MIRROR, u, 34)
+    targets = zernikes(NOLLS_20, 2 * u, 2 * u[:, None])
+    for k in range(20):
+        wavefront = 2.0 * surface_nm(factors, commands[:, k].reshape(34, 34), factors)
+        assert (wavefront - targets[k])[inside].std() < 0.016  # print-through: 1.1 %, 1.5 % for the worst mode
+        assert np.sum((wavefront * targets[k])[inside]) / np.sum(targets[k][inside] ** 2) == pytest.approx(
+            1.0, abs=2e-3
+        )
+
+
+def test_low_pass_removes_the_print_through_and_nothing_else():
+    tilt = modes_to_actuators(MIRROR, [2])[:, 0].reshape(34, 34)
+    u = pupil_axis(512)
+    plain = influence_factors(MIRROR, u, 34)
+    smooth = influence_factors(MIRROR, u, 34, lowpass_cycles=12)
+
+    def cycles(factors, frequency):
+        surface = surface_nm(factors, tilt, factors)
+        row = (surface - surface[:, ::-1])[256] * np.hanning(512)
+        return abs(np.exp(-2j * np.pi * frequency * u) @ row) / 512
+
+    assert cycles(plain, 31) > 20 * cycles(smooth, 31)
+    assert cycles(smooth, 2) == pytest.approx(cycles(plain, 2), rel=0.01)
+
+
+@pytest.mark.parametrize("bad", [{"rows": 0}, {"pitches_per_pupil": 0.0}, {"coupling": 0.0}, {"coupling": 1.0}])
+def test_impossible_mirrors_are_refused(bad):
+    with pytest.raises(ValueError, match="got"):
+        Mirror(**bad)

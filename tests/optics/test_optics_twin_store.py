@@ -1,0 +1,124 @@
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from lowfc.adapters.twin_store import default_cache_dir, load_or_build, operator_hash
+from lowfc.optics.band import gauss_legendre, monochromatic
+from lowfc.optics.twin import FAST, Evaluator, TwinSpec, reference
+
+SMALL = TwinSpec(nodes=16, order=4, rank=40, functions=24)  # the real optics, coarser, for tests of the file
+
+
+@pytest.fixture
+def stored(sensor, tmp_path):
+    twin = load_or_build(sensor, SMALL, cache_dir=tmp_path)
+    (path,) = tmp_path.iterdir()
+    return twin, path
+
+
+def same(first, second):
+    wavefront = np.linspace(-20, 20, first.used.size, dtype=np.float32)
+    np.testing.assert_array_equal(Evaluator(first).image(wavefront), Evaluator(second).image(wavefront))
+    np.testing.assert_array_equal(first.area_weights, second.area_weights)
+    assert first.operator_hash == second.operator_hash
+
+
+def forbidden(*_):
+    raise AssertionError("built again")
+
+
+def test_a_second_call_reads_the_file(sensor, stored, tmp_path):
+    again = load_or_build(sensor, SMALL, cache_dir=tmp_path, progress=forbidden, notice=forbidden)
+    same(stored[0], again)
+    assert again.operator_hash == operator_hash(sensor, SMALL, monochromatic(550.0))
+
+
+def test_broadband_twins_survive_the_file(sensor, broadband, cache_dir):
+    again = load_or_build(sensor, FAST, gauss_legendre(550.0), cache_dir=cache_dir, progress=forbidden)
+    same(broadband, again)
+    assert [each.weight for each in again.operators] == list(gauss_legendre(550.0).weights)
+
+
+def test_the_hash_depends_on_everything(sensor):
+    band = monochromatic(550.0)
+    changed_pupil = sensor.pupil.copy()
+    changed_pupil[256, 256] += 1e-6
+    variants = [
+        (sensor, SMALL, band),
+        (replace(sensor, pupil=changed_pupil), SMALL, band),
+        (replace(sensor, relay_mask=sensor.relay_mask.T), SMALL, band),
+        (replace(sensor, focal_mask=sensor.focal_mask[1:-1, 1:-1]), SMALL, band),
+        (replace(sensor, wavelength_nm=551.0), SMALL, band),
+        (replace(sensor, pixels=78), SMALL, band),
+        (sensor, replace(SMALL, nodes=18), band),
+        (sensor, replace(SMALL, order=6), band),
+        (sensor, replace(SMALL, rank=41), band),
+        (sensor, replace(SMALL, functions=25), band),
+        (sensor, SMALL, gauss_legendre(550.0)),
+        (sensor, SMALL, monochromatic(550.1)),
+    ]
+    hashes = [operator_hash(*variant) for variant in variants]
+    assert len(set(hashes)) == len(variants)
+    assert operator_hash(replace(sensor), SMALL, band) == hashes[0]
+
+
+@pytest.mark.parametrize("damage", ["truncated", "empty", "one bit", "other content", "another twin"])
+def test_a_damaged_file_is_noticed_and_built_again(damage, sensor, stored, tmp_path):
+    twin, path = stored
+    content = bytearray(path.read_bytes())
+    if damage == "truncated":
+        path.write_bytes(content[: len(content) // 2])
+    elif damage == "empty":
+        path.write_bytes(b"")
+    elif damage == "one bit":
+        content[len(content) // 3] ^= 1
+        path.write_bytes(content)
+    elif damage == "other content":
+        with np.load(path) as arrays:
+            changed = {name: arrays[name] for name in arrays.files}
+        changed["to_modes_0"] = changed["to_modes_0"] * 1.001
+        np.savez(path, **changed)
+    else:
+        load_or_build(sensor, replace(SMALL, rank=41), cache_dir=tmp_path / "other")
+        path.write_bytes(next((tmp_path / "other").iterdir()).read_bytes())
+    said, steps = [], []
+    again = load_or_build(
+        sensor, SMALL, cache_dir=tmp_path, notice=said.append, progress=lambda done, total: steps.append(done)
+    )
+    assert len(said) == 1
+    assert str(path) in said[0]
+    assert steps[-1] == 32
+    same(twin, again)
+    same(twin, load_or_build(sensor, SMALL, cache_dir=tmp_path, progress=forbidden, notice=forbidden))
+
+
+def test_a_directory_that_cannot_be_written_is_not_fatal(sensor, stored, tmp_path):
+    in_the_way = tmp_path / "file"
+    in_the_way.write_text("not a directory")
+    said = []
+    twin = load_or_build(sensor, SMALL, cache_dir=in_the_way / "cache", notice=said.append)
+    same(stored[0], twin)
+    assert any("not cached" in text for text in said)
+
+
+def test_two_builders_at_once_do_no_harm(sensor, tmp_path):
+    with ThreadPoolExecutor(2) as pool:
+        twins = list(pool.map(lambda _: load_or_build(sensor, SMALL, cache_dir=tmp_path), range(2)))
+    same(*twins)
+    assert [path.suffix for path in tmp_path.iterdir()] == [".npz"]
+    same(twins[0], load_or_build(sensor, SMALL, cache_dir=tmp_path, progress=forbidden, notice=forbidden))
+
+
+def test_the_cache_follows_xdg(monkeypatch, tmp_path):
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    assert default_cache_dir() == tmp_path / "lowfc"
+    monkeypatch.delenv("XDG_CACHE_HOME")
+    monkeypatch.setenv("HOME", str(tmp_path))
+    assert default_cache_dir() == tmp_path / ".cache" / "lowfc"
+
+
+def test_a_cached_twin_makes_the_same_reference(fast, sensor, cache_dir):
+    again = load_or_build(sensor, FAST, cache_dir=cache_dir, progress=forbidden)
+    np.testing.assert_array_equal(reference(again), reference(fast))

@@ -1,0 +1,284 @@
+"""The simulated mirror trusts nobody: its limits, its dead-man and its checks hold whatever it is told."""
+
+from dataclasses import replace
+
+import numpy as np
+import numpy.typing as npt
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from hypothesis.extra import numpy as hnp
+
+from lowfc.control.safety import Limits, Reason, neighbour_difference_nm
+from sim_dm.device import LONGEST_VALID_NS, Device, Status, Told, initial, obey, tick
+
+Array = npt.NDArray[np.float32]
+
+GRID = (4, 5)
+LIMITS = Limits(750.0, 150.0, 500.0)
+STEP_NM = 1500 / 2**16
+START_NS = 1_700_000_000_000_000_000
+MS = 1_000_000
+
+
+def mirror(**changes: object) -> Device:
+    free = np.full(GRID, np.nan, np.float32)
+    return replace(Device(GRID, LIMITS, STEP_NM, 0.0, free, flatten=True), **changes)
+
+
+def told(actuators_nm: Array | None, index: int = 1, **changes: object) -> Told:
+    usual = Told("lowfc", index, START_NS + index * MS, 200 * MS, actuators_nm, np.array([1, 2], np.float32))
+    return replace(usual, **changes)
+
+
+def even(height_nm: float) -> Array:
+    return np.full(GRID, height_nm, np.float32)
+
+
+def follow(device: Device, status: Status, *heights_nm: float) -> Status:
+    for height_nm in heights_nm:
+        index = status.frame_sequence + 1
+        status, refused = obey(device, status, told(even(height_nm), index), START_NS + index * MS)
+        assert refused is None
+    return status
+
+
+def broken(before: Array, after: Array) -> list[str]:
+    """Limits that the driver's output breaks, by float64 and without tolerance."""
+    now, then = after.astype(np.float64), before.astype(np.float64)
+    figures = (
+        ("finite", 0 if np.isfinite(now).all() else 1, 0),
+        ("stroke", np.abs(now).max(), LIMITS.stroke_nm),
+        ("slew", np.abs(now - then).max(), LIMITS.slew_nm),
+        ("neighbours", neighbour_difference_nm(after), LIMITS.neighbour_nm),
+    )
+    return [name for name, value, bound in figures if not value <= bound]
+
+
+values = st.one_of(
+    st.floats(-1000, 1000, width=32),
+    st.sampled_from([750.0, -750.0, 749.98, 150.0, 149.98, 250.0, -250.0, 3e38, -3e38, np.nan, np.inf, 1e-40]),
+)
+commands = st.lists(
+    st.one_of(
+        hnp.arrays(np.float32, GRID, elements=values.map(np.float32)),
+        hnp.arrays(np.float32, st.sampled_from([(5, 4), (1, 1), (20,)]), elements=values.map(np.float32)),
+        st.none(),
+        st.integers(1, 3_000).map(lambda ms: ms * MS),  # silence
+    ),
+    max_size=12,
+)
+
+
+@settings(max_examples=200, deadline=None)
+@given(script=commands, bits=st.sampled_from([8, 10, 16, 24]))
+def test_whatever_it_is_told_the_surface_keeps_the_limits(script: list[object], bits: int) -> None:
+    """After rounding to the driver's steps, and when it relaxes by itself."""
+    device = mirror(step_nm=1500 / 2**bits)
+    status, now_ns = initial(device), START_NS
+    for index, what in enumerate(script):
+        now_ns += MS
+        if isinstance(what, int):
+            now_ns += what
+            after = tick(device, status, now_ns)
+        else:
+            after, _ = obey(device, status, told(what, index + 1), now_ns)  # type: ignore[arg-type]
+        assert broken(status.surface_nm, after.surface_nm) == []
+        status = after
+
+
+@pytest.mark.parametrize("bits", [8, 16])
+def test_a_command_is_rounded_to_the_drivers_steps(bits: int) -> None:
+    device = mirror(step_nm=1500 / 2**bits)
+    wanted = np.linspace(-100, 100, 20, dtype=np.float32).reshape(GRID)
+    status, _ = obey(device, initial(device), told(wanted), START_NS)
+    steps = status.surface_nm / device.step_nm
+    assert np.abs(steps - np.round(steps)).max() < 1e-3
+    assert np.abs(status.surface_nm - wanted).max() <= device.step_nm * 0.501
+    assert len(np.unique(status.surface_nm)) > 10
+
+
+def test_a_mirror_pressed_against_its_neighbour_limit_stays_there() -> None:
+    """Rounding must not make it think that it is beyond the limit and fall back towards flat."""
+    device = mirror(step_nm=1500 / 2**8)
+    wanted = even(0)
+    wanted[:2] = 740
+    wanted[2:] = -740
+    status = initial(device)
+    for index in range(1, 60):
+        status, _ = obey(device, status, told(wanted, index), START_NS + index * MS)
+        if index == 30:
+            settled = status.surface_nm
+    assert neighbour_difference_nm(status.surface_nm) > LIMITS.neighbour_nm - 3 * device.step_nm
+    assert np.array_equal(status.surface_nm, settled)
+
+
+def test_its_own_limits_are_named_and_the_modal_command_is_forgotten() -> None:
+    device = mirror()
+    status, _ = obey(device, initial(device), told(even(100)), START_NS)
+    assert status.limits_hit == ()
+    assert status.command_nm.tolist() == [1, 2]
+    status, _ = obey(device, status, told(even(900), 2), START_NS + MS)
+    assert status.limits_hit == (Reason.STROKE, Reason.SLEW)
+    assert status.command_nm.size == 0
+    status, _ = obey(device, status, told(even(300), 3), START_NS + 2 * MS)
+    assert status.limits_hit == ()
+
+
+@pytest.mark.parametrize(
+    ("what", "reason"),
+    [
+        (told(None, 6), Reason.WRONG_GRID),
+        (told(np.zeros((5, 4), np.float32), 6), Reason.WRONG_GRID),
+        (told(even(np.nan), 6), Reason.NOT_FINITE),
+        (told(even(-np.inf), 6), Reason.NOT_FINITE),
+        (told(even(5), 6, command_nm=np.array([np.nan], np.float32)), Reason.NOT_FINITE),
+        (told(even(5), 4), Reason.OUT_OF_ORDER),
+    ],
+)
+def test_a_bad_command_changes_nothing_and_does_not_feed_the_dead_man(what: Told, reason: Reason) -> None:
+    device = mirror()
+    before = follow(device, initial(device), 10, 20, 30, 40, 50)
+    after, refused = obey(device, before, what, START_NS + 100 * MS)
+    assert refused is reason
+    assert after is before
+
+
+def test_a_repeated_command_is_taken_so_that_a_held_one_can_be_renewed() -> None:
+    device = mirror()
+    status = follow(device, initial(device), 10)
+    after, refused = obey(device, status, told(even(10), 1), START_NS + 150 * MS)
+    assert refused is None
+    assert after.received_ns == START_NS + 150 * MS
+    assert np.array_equal(after.surface_nm, status.surface_nm)
+
+
+def test_the_dead_man_acts_just_after_what_the_command_promised() -> None:
+    device = mirror()
+    status, _ = obey(device, initial(device), told(even(50)), START_NS)
+    held = tick(device, status, START_NS + 200 * MS)
+    assert held.following
+    assert np.array_equal(held.surface_nm, status.surface_nm)
+    expired = tick(device, held, START_NS + 200 * MS + 1)
+    assert not expired.following
+    assert not expired.surface_nm.any()
+
+
+def test_no_command_is_held_longer_than_the_mirror_allows() -> None:
+    device = mirror()
+    status, _ = obey(device, initial(device), told(even(50), valid_for_ns=2**64 - 1), START_NS)
+    assert tick(device, status, START_NS + LONGEST_VALID_NS).following
+    assert not tick(device, status, START_NS + LONGEST_VALID_NS + 1).following
+
+
+def test_a_command_that_promises_nothing_is_not_held() -> None:
+    device = mirror()
+    status, _ = obey(device, initial(device), told(even(50), valid_for_ns=0), START_NS)
+    assert not tick(device, status, START_NS + 1).following
+
+
+def test_a_clock_that_goes_back_does_not_keep_a_command_alive() -> None:
+    device = mirror()
+    status, _ = obey(device, initial(device), told(even(50)), START_NS)
+    gone_back = tick(device, status, START_NS - 1)
+    assert not gone_back.following
+    assert gone_back.time_ns >= status.time_ns
+
+
+def test_once_expired_it_relaxes_to_flat_within_the_slew_limit_and_follows_again() -> None:
+    device = mirror()
+    status = follow(device, initial(device), 100, 200, 300, 400, 500)
+    now_ns = START_NS + 1_000 * MS
+    heights = []
+    for _ in range(6):
+        status = tick(device, status, now_ns)
+        now_ns += 10 * MS
+        heights.append(float(status.surface_nm.max()))
+    assert heights[0] == pytest.approx(350, abs=0.1)
+    assert heights[3:] == [0, 0, 0]
+    assert status.channels == {}
+    status, refused = obey(device, status, told(even(100), 700), now_ns)
+    assert refused is None
+    assert status.following
+    assert status.surface_nm.max() == pytest.approx(100, abs=STEP_NM)
+
+
+def test_once_expired_it_holds_its_shape_where_that_is_configured() -> None:
+    device = mirror(flatten=False)
+    status = follow(device, initial(device), 50)
+    expired = tick(device, status, START_NS + 1_000 * MS)
+    assert not expired.following
+    assert np.array_equal(expired.surface_nm, status.surface_nm)
+
+
+def test_before_the_first_command_it_is_flat_and_waits() -> None:
+    device = mirror()
+    status = tick(device, initial(device), START_NS)
+    assert not status.following
+    assert not status.surface_nm.any()
+
+
+def test_channels_are_summed_and_the_sum_is_limited() -> None:
+    device = mirror()
+    status = initial(device)
+    for index, (channel, height_nm) in enumerate((("lowfc", 60), ("offset", -20), ("lowfc", 80)), start=1):
+        status, _ = obey(device, status, told(even(height_nm), index, channel=channel), START_NS + index * MS)
+    assert status.surface_nm.max() == pytest.approx(60, abs=STEP_NM)
+    assert sorted(status.channels) == ["lowfc", "offset"]
+    status, _ = obey(device, status, told(even(3e38), 4, channel="lowfc"), START_NS + 4 * MS)
+    status, _ = obey(device, status, told(even(3e38), 5, channel="offset"), START_NS + 5 * MS)
+    assert status.limits_hit == (Reason.NOT_FINITE,)
+    assert np.abs(status.surface_nm).max() <= LIMITS.stroke_nm
+
+
+def test_dead_and_stuck_actuators_stay_where_they_are() -> None:
+    fixed = np.full(GRID, np.nan, np.float32)
+    fixed[0, 0], fixed[1, 1] = 0, 123
+    device = mirror(fixed_nm=fixed)
+    status = initial(device)
+    assert status.surface_nm[1, 1] == 123
+    status = follow(device, status, 100)
+    assert status.surface_nm[0, 0] == 0
+    assert status.surface_nm[1, 1] == 123
+    assert status.surface_nm[2, 2] == pytest.approx(100, abs=STEP_NM)
+    for _ in range(5):
+        status = tick(device, status, START_NS + 1_000 * MS)
+    assert np.count_nonzero(status.surface_nm) == 1
+    assert status.surface_nm[1, 1] == 123
+
+
+def test_settling_is_a_first_order_response() -> None:
+    """A third command, one time constant after the second: the surface is 1 - 1/e of the way."""
+    device = mirror(settling_ns=1e6)
+    status, _ = obey(device, initial(device), told(even(0), 1), START_NS)
+    status, _ = obey(device, status, told(even(100), 2), START_NS)
+    assert status.surface_nm.max() == pytest.approx(100 * (1 - np.exp(-1)), abs=STEP_NM)
+    status = tick(device, status, status.time_ns + 2 * MS)
+    assert status.surface_nm.max() == pytest.approx(100 * (1 - np.exp(-3)), abs=STEP_NM)
+    status = tick(device, status, status.time_ns + 21 * MS)
+    assert status.surface_nm.max() == pytest.approx(100, abs=STEP_NM)
+
+
+def test_an_older_time_does_not_move_the_surface_back() -> None:
+    device = mirror(settling_ns=1e6)
+    status = follow(device, initial(device), 0, 100)
+    again, _ = obey(device, status, told(even(100), 2, time_ns=0), START_NS)
+    assert np.array_equal(again.surface_nm, status.surface_nm)
+
+
+def test_obeying_changes_nothing_that_it_was_given() -> None:
+    device = mirror()
+    status = follow(device, initial(device), 10)
+    driven, surface, channels = status.driven_nm.copy(), status.surface_nm.copy(), dict(status.channels)
+    what = told(even(700), 2, channel="other")
+    obey(device, status, what, START_NS)
+    tick(device, status, START_NS + 10_000 * MS)
+    assert np.array_equal(status.driven_nm, driven)
+    assert np.array_equal(status.surface_nm, surface)
+    assert status.channels == channels
+    assert np.array_equal(what.actuators_nm, even(700))
+
+
+def test_a_driver_too_coarse_for_the_limits_is_refused() -> None:
+    with pytest.raises(ValueError, match="slew_nm"):
+        _ = mirror(limits=Limits(750.0, 5.0, 500.0), step_nm=1500 / 2**8).tighter
