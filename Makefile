@@ -47,7 +47,6 @@ format: $(VENV)/.tests  ## rewrite the sources as ruff likes them
 	$(BIN)/ruff format .
 
 proto: $(VENV)/.tests  ## compile the messages' declaration (development only)
-	$(INSTALL) --editable '.[proto]'
 	$(BIN)/python -m lowfc.contract.compile_proto
 
 node: tests/node/node_modules  ## the independent MCAP reader

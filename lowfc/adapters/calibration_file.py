@@ -2,11 +2,13 @@
 
 import io
 import tempfile
+import warnings
 from pathlib import Path
 
 import numpy as np
 import numpy.typing as npt
 from astropy.io import fits
+from astropy.utils.exceptions import AstropyWarning
 
 from lowfc.contract.codec import identified
 from lowfc.contract.errors import DataFileError
@@ -30,8 +32,8 @@ def to_bytes(calibration: Calibration) -> bytes:
     primary = fits.PrimaryHDU()
     header = primary.header
     header["KIND"] = (KIND, "what this file is")
-    header["CALID"] = (calibration.id, "SHA-256 of the calibration")
-    header["OPERATOR"] = (calibration.operator_hash, "SHA-256 of the optical model")
+    header["CALID"] = calibration.id
+    header["OPERATOR"] = calibration.operator_hash
     header["ESTIMATE"] = (calibration.estimator, "how R was made")
     header["NOLL"] = (" ".join(map(str, calibration.noll)), "Noll index of each mode")
     header["WAVELEN"] = (calibration.wavelength_nm, "[nm] wavelength")
@@ -44,7 +46,8 @@ def to_bytes(calibration: Calibration) -> bytes:
     units = [primary]
     for name, attribute, unit, sentence in _EXTENSIONS:
         extension = fits.ImageHDU(getattr(calibration, attribute), name=name)
-        extension.header["BUNIT"] = (unit, sentence[:47])
+        extension.header["BUNIT"] = unit
+        extension.header["CONTENT"] = sentence
         units.append(extension)
     stream = io.BytesIO()
     fits.HDUList(units).writeto(stream, checksum=True)
@@ -67,9 +70,11 @@ def load(path: Path) -> Calibration:
     if not path.is_file():
         raise DataFileError(f"{path}: there is no such calibration file")
     try:
-        with fits.open(path, mode="readonly", memmap=False) as units:
-            calibration = _read(units)
-    except (OSError, KeyError, TypeError, ValueError) as error:
+        with warnings.catch_warnings():
+            warnings.simplefilter("error", AstropyWarning)  # a shortened file is no more than a warning to astropy
+            with fits.open(path, mode="readonly", memmap=False) as units:
+                calibration = _read(units)
+    except (OSError, KeyError, TypeError, ValueError, AstropyWarning) as error:
         raise DataFileError(f"{path}: not a whole calibration file: {error}") from None
     found = identified(calibration).id
     if found != calibration.id:

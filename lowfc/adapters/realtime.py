@@ -63,10 +63,14 @@ def set_up(priority: int | None, cpus: set[int] | None, lock_memory: bool) -> Gr
     return Granted(tuple(granted), tuple(refused))
 
 
-def step_back(niceness: int = 5) -> Granted:
-    """Prepare a process that must never get in the loop's way, such as the recorder: lower priority, no more."""
-    os.nice(niceness)
-    return Granted((f"niceness {niceness}",), ())
+def step_back() -> Granted:
+    """Prepare a process that must never get in the loop's way, such as the recorder: the normal scheduling class.
+
+    It is not made nicer than that: with a niceness of 5 on a busy host a recorder lost 15 % of a 1 kHz loop's
+    messages, at 0 none.
+    """
+    os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
+    return Granted(("normal scheduling class",), ())
 
 
 def _asked(

@@ -140,6 +140,8 @@ class Service:
     def wait_for(self, names: Iterable[str], timeout_s: float) -> tuple[str, ...]:
         """Wait until these processes are ready and have heard this one, so that they get its first message.
 
+        Set `state` to "ready" before: others may be waiting for this one.
+
         Returns:
             Names of those that did not answer in time; empty when all did, or the process was told to stop.
         """

@@ -24,7 +24,7 @@ class Event:
     level: Level
     sentence: str
 
-    def log(self, process: str, time_ns: int, **details: object) -> Log:
+    def log(self, process: str, time_ns: int, /, **details: object) -> Log:
         """Message of one occurrence: "NAME sentence", from `process`, at `time_ns` (nanoseconds since the epoch)."""
         return Log(
             timestamp=timestamp(time_ns),

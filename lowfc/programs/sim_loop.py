@@ -56,7 +56,7 @@ def sim_loop(config: Configuration, duration_s: float | None, record: bool) -> d
         finally:
             bus.close()
             stop_all(children)
-        return summary(config, watch, record)
+        return summary(watch, record)
     finally:
         run.remove()
 
@@ -115,7 +115,7 @@ def _supervise(
         stop_all(children)
         time.sleep(POLL_S)  # the last Health is on its way
     for child in children:
-        if child.status != 0:
+        if child.status not in (0, -signal.SIGTERM):  # told to end before it was ready is no failure
             raise ProcessDiedError(f"{child.how_it_ended()}\n{child.last_words()}")
 
 

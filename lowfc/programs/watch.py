@@ -4,9 +4,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from lowfc.adapters.bus import Sample, name_in
-from lowfc.adapters.join import mirror_role
-from lowfc.contract.configuration import Configuration
-from lowfc.contract.messages import COMMAND, FRAME, HEALTH, Log, Role, wire
+from lowfc.contract.messages import FRAME, HEALTH, Log, Role, wire
 
 
 @dataclass(slots=True)
@@ -30,12 +28,10 @@ class Watch:
         del self.events[:-100]
 
 
-def summary(config: Configuration, watch: Watch, record: bool) -> dict[str, Any]:
+def summary(watch: Watch, record: bool) -> dict[str, Any]:
     """Figures of a run, from the last Health of each process."""
     camera, controller = watch.of(Role.CAMERA), watch.of(Role.CONTROLLER)
-    mirror = watch.of(mirror_role(config.mirror.name))
     frames = topic_count(controller, FRAME.key)
-    commands = topic_count(mirror, COMMAND.at(config.mirror.name))
     wavefront = camera.wavefront
     figures: dict[str, Any] = {
         "rate_hz": round(camera.mean_rate_hz, 2),
@@ -43,7 +39,7 @@ def summary(config: Configuration, watch: Watch, record: bool) -> dict[str, Any]
         "frames_processed": frames.received - frames.skipped,
         "frames_skipped": frames.skipped,
         "frames_missing": frames.missing,
-        "commands_applied": commands.received - commands.skipped,
+        "commands_applied": camera.frame_to_mirror.count,
         "commands_late": camera.commands_late,
         "messages_recorded": None,
         "messages_lost": None,

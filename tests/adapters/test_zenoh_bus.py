@@ -357,3 +357,17 @@ def test_sequences_count_from_zero_and_never_repeat(run: Run, join: Callable[[Ru
         starts += [start_of(sequences[0])]
         bus.close()
     assert starts == sorted(set(starts))
+
+
+def test_everybody_listens_on_its_own_port_and_connects_to_all_others(run: Run) -> None:
+    endpoints = {role: f"tcp/127.0.0.1:{port}" for role, port in run.links.ports.items()}
+    for role, own in endpoints.items():
+        config = session_config(run.links, role)
+        assert config["listen"]["endpoints"] == [own]
+        assert set(config["connect"]["endpoints"]) == set(endpoints.values()) - {own}
+        assert not config["scouting"]["multicast"]["enabled"]
+        assert not config["scouting"]["gossip"]["enabled"]
+        assert not config["transport"]["shared_memory"]["enabled"]
+    operator = session_config(run.links, "operator")
+    assert operator["listen"]["endpoints"] == []
+    assert set(operator["connect"]["endpoints"]) == set(endpoints.values())

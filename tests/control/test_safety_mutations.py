@@ -28,7 +28,10 @@ MUTATIONS = {
     "slew the wrong way": ("kept = previous_nm + move", "kept = previous_nm - move"),
     "slew without a margin": ("np.float32(limits.slew_nm - margin_nm)", "np.float32(limits.slew_nm + margin_nm)"),
     "stroke limit for slew": ("np.float32(limits.slew_nm - margin_nm)", "np.float32(limits.stroke_nm - margin_nm)"),
-    "neighbours never looked at": ("if neighbour_difference_nm(kept) >", "if False and neighbour_difference_nm(kept) >"),
+    "neighbours never looked at": (
+        "if neighbour_difference_nm(kept) >",
+        "if False and neighbour_difference_nm(kept) >",
+    ),
     "neighbours without a margin": ("> limits.neighbour_nm - margin_nm / 2:", "> limits.neighbour_nm + margin_nm:"),
     "neighbours in a column only": (
         "max(np.abs(rows).max(initial=0), np.abs(columns).max(initial=0))",

@@ -1,0 +1,73 @@
+"""Runs of the real processes, and what their logs hold."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+from collections import defaultdict
+from pathlib import Path
+from typing import Any
+
+from mcap.reader import make_reader
+
+LOWFC = [sys.executable, "-m", "lowfc"]
+
+
+def run(folder: Path, *arguments: str, config: str = "", timeout_s: float = 120) -> "subprocess.CompletedProcess[str]":
+    """`lowfc` with these arguments, in a folder of its own."""
+    words = [*LOWFC, *arguments]
+    if config:
+        (folder / "test.toml").write_text(config)
+        words += ["--config", "test.toml"]
+    return subprocess.run(words, cwd=folder, capture_output=True, text=True, timeout=timeout_s, check=False)
+
+
+def loop(folder: Path, *arguments: str, config: str = "", timeout_s: float = 120) -> dict[str, Any]:
+    """Figures of a `sim-loop` that must succeed; `log` becomes an absolute path."""
+    done = run(folder, "sim-loop", "--json", *arguments, config=config, timeout_s=timeout_s)
+    assert done.returncode == 0, done.stderr
+    lines = done.stdout.splitlines()
+    assert len(lines) == 1, done.stdout
+    figures: dict[str, Any] = json.loads(lines[0])
+    if figures["log"]:
+        figures["log"] = folder / figures["log"]
+    return figures
+
+
+def payloads(log: Path) -> dict[str, list[bytes]]:
+    """Payloads of every topic of a log, in order; CRCs are checked."""
+    found: dict[str, list[bytes]] = defaultdict(list)
+    with log.open("rb") as stream:
+        for _, channel, message in make_reader(stream, validate_crcs=True).iter_messages():
+            found[channel.topic].append(message.data)
+    return dict(found)
+
+
+def children(launcher: int) -> dict[str, int]:
+    """Process ids of a launcher's processes, by a word of their command line."""
+    found = {}
+    listed = Path(f"/proc/{launcher}/task/{launcher}/children").read_text().split()
+    for pid in map(int, listed):
+        words = Path(f"/proc/{pid}/cmdline").read_text().split("\0")
+        module = words[words.index("-m") + 1]
+        found[module if module != "lowfc" else words[words.index("-m") + 2]] = pid
+    return found
+
+
+def start(folder: Path, *arguments: str) -> "subprocess.Popen[str]":
+    """A `lowfc` that goes on while the test does something."""
+    return subprocess.Popen(
+        [*LOWFC, *arguments],
+        cwd=folder,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        env=os.environ | {"PYTHONUNBUFFERED": "1"},
+    )
+
+
+def interrupt(process: "subprocess.Popen[str]", timeout_s: float = 20) -> tuple[str, str]:
+    """Ctrl-C, and everything it said."""
+    process.send_signal(signal.SIGINT)
+    return process.communicate(timeout=timeout_s)

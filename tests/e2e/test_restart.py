@@ -1,0 +1,153 @@
+"""Camera, mirror and controller started by hand: any order, and kill -9 of each."""
+
+import itertools
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from lowfc.adapters import calibration_file, instrument
+from lowfc.adapters.bus import Sample
+from lowfc.adapters.clock import HostClock
+from lowfc.adapters.run import new_run_id, open_run
+from lowfc.adapters.zenoh_bus import ZenohBus
+from lowfc.contract.configuration import load
+from lowfc.contract.messages import MIRROR_STATE, STEP, wire
+
+TOML = """
+[star]
+magnitude = -1.0
+[camera]
+rate_hz = 100
+[disturbance]
+preset = "quiet"
+static_nm = {2 = 8.0, 4 = 5.0}
+[mirror]
+expired = "hold"
+[control]
+start_mode = "closed"
+gain = 0.3
+"""
+
+
+class Bench:
+    """Processes of one run, and what is heard of them."""
+
+    def __init__(self, folder: Path) -> None:
+        self.run_id = new_run_id()
+        self.run = open_run(self.run_id)
+        self.running: dict[str, subprocess.Popen[bytes]] = {}
+        self.steps = 0
+        self.closed = 0
+        self.shapes: list[np.ndarray] = []
+        shared = ["--run", self.run_id, "--config", str(folder / "test.toml")]
+        self.commands = {
+            "camera": ["-m", "sim_camera", *shared],
+            "mirror": ["-m", "sim_dm", *shared],
+            "controller": ["-m", "lowfc", "controller", *shared, "--calibration", str(folder / "calibration.fits")],
+        }
+        self.bus = ZenohBus(self.run.links, "operator", HostClock())
+        self.bus.subscribe(STEP, self._step)
+        self.bus.subscribe(MIRROR_STATE, self._shape)
+
+    def _step(self, sample: Sample) -> None:
+        step = wire.ControlStep.FromString(sample.payload)
+        self.steps += 1
+        good = step.mode == wire.LOOP_MODE_CLOSED and not step.reasons
+        self.closed = self.closed + 1 if good and np.abs(step.error_nm).max() < 3 else 0
+
+    def _shape(self, sample: Sample) -> None:
+        self.shapes.append(np.frombuffer(wire.MirrorState.FromString(sample.payload).actuators, "<f4"))
+
+    def start(self, name: str) -> None:
+        self.running[name] = subprocess.Popen([sys.executable, *self.commands[name]], stderr=subprocess.DEVNULL)
+
+    def kill(self, name: str) -> None:
+        os.kill(self.running[name].pid, signal.SIGKILL)
+        self.running.pop(name).wait()
+
+    def wait(self, condition: Callable[[], bool], what: str, timeout_s: float = 40) -> None:
+        deadline_s = time.monotonic() + timeout_s
+        while not condition():
+            assert time.monotonic() < deadline_s, f"waited in vain for {what}"
+            time.sleep(0.02)
+
+    def settled(self) -> None:
+        """Twenty good frames in a row, from now on, with the loop closed and the disturbance held."""
+        self.closed = 0
+        self.wait(lambda: self.closed > 20, "a closed loop")
+
+    def stop(self) -> None:
+        for process in self.running.values():
+            process.terminate()
+        for process in self.running.values():
+            process.wait(10)
+        self.bus.close()
+        self.run.remove()
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("by-hand")
+    (path / "test.toml").write_text(TOML)
+    config = load(path / "test.toml")
+    optics = instrument.twin(config, None, print)
+    calibration = instrument.analytic_calibration(config, optics, instrument.mirror_on_twin(config, optics, print))
+    calibration_file.save(calibration, path / "calibration.fits")
+    return path
+
+
+@pytest.fixture
+def bench(folder: Path) -> Iterator[Bench]:
+    made = Bench(folder)
+    yield made
+    made.stop()
+
+
+ORDERS = list(itertools.permutations(["camera", "mirror", "controller"]))
+
+
+@pytest.mark.parametrize(
+    "order",
+    [
+        pytest.param(order, marks=() if order[0] != "mirror" else pytest.mark.slow, id="-".join(order))
+        for order in ORDERS
+    ],
+)
+def test_any_start_order(bench: Bench, order: tuple[str, ...]) -> None:
+    """Each is up before the next is started, so that every one of them is first and last once."""
+    for name in order:
+        bench.start(name)
+        heard = [*bench.running]
+        bench.wait(lambda: all(_alive(bench, process) for process in heard), f"{name}'s health", 20)  # noqa: B023
+    bench.settled()
+
+
+def test_kill_and_restart_of_each(bench: Bench) -> None:
+    for name in ("mirror", "controller", "camera"):
+        bench.start(name)
+    bench.settled()
+    for name in ("camera", "controller", "mirror"):
+        before = bench.shapes[-1]
+        bench.kill(name)
+        bench.shapes.clear()
+        bench.start(name)
+        bench.wait(lambda: len(bench.shapes) > 20, "the mirror's states")
+        bench.settled()
+        shapes = np.array(bench.shapes.copy())
+        moves = np.abs(np.diff(shapes, axis=0)).max()
+        assert moves < 100, "no jump beyond the controller's slew limit"
+        np.testing.assert_allclose(shapes[-1], before, atol=5)
+        if name == "controller":  # it starts from where the mirror is: nothing moves but noise
+            assert np.abs(shapes - before).max() < 12
+
+
+def _alive(bench: Bench, name: str) -> bool:
+    process = {"mirror": "mirror-dm"}.get(name, name)
+    return bool(bench.bus.get(f"lowfc/health/{process}", timeout_s=0.5))

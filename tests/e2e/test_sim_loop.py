@@ -1,0 +1,165 @@
+"""The simulated loop as a user runs it: real processes, a real bus, a real log."""
+
+import os
+import shutil
+import signal
+import subprocess
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from loops import children, interrupt, loop, payloads, run, start
+
+from lowfc.contract.messages import RawImage, from_timestamp, topic_of, wire
+
+FRAMES = 3000
+
+
+@pytest.fixture(scope="module")
+def live(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
+    """One run in real time, on which several tests look."""
+    folder = tmp_path_factory.mktemp("live")
+    return loop(folder, "--duration", "6", "--rate", "500", "--disturbance", "reaction-wheel", "--seed", "3")
+
+
+@pytest.fixture(scope="module")
+def topics(live: dict[str, Any]) -> dict[str, list[bytes]]:
+    return payloads(live["log"])
+
+
+def test_the_loop_holds_the_wavefront_and_accounts_for_every_frame(live: dict[str, Any]) -> None:
+    assert live["frames_published"] == FRAMES
+    assert live["frames_processed"] + live["frames_skipped"] + live["frames_missing"] == FRAMES
+    assert live["frames_processed"] > 0.9 * FRAMES
+    assert 0 < live["commands_applied"] <= live["frames_processed"]
+    assert 10 < live["tilt_disturbance_mas"] < 18
+    assert live["tilt_residual_mas"] < 0.7 * live["tilt_disturbance_mas"]
+    assert live["residual_rms_nm"] < 0.7 * live["disturbance_rms_nm"]
+    for stage in ("frame_to_command", "frame_to_mirror"):
+        values = live["latency_us"][stage]
+        assert 0 < values["p50"] <= values["p99"] <= values["p99_9"] <= values["max"]
+
+
+def test_the_log_holds_every_topic_and_says_what_it_lost(live: dict[str, Any], topics: dict[str, list[bytes]]) -> None:
+    recorded = sum(map(len, topics.values()))
+    assert recorded == live["messages_recorded"]
+    assert {topic_of(topic[1:]).key for topic in topics} >= {
+        "lowfc/camera/frame",
+        "lowfc/camera/state",
+        "lowfc/control/step",
+        "lowfc/control/timing",
+        "lowfc/control/state",
+        "lowfc/mirror/{name}/command",
+        "lowfc/mirror/{name}/state",
+        "lowfc/mirror/{name}/surface",
+        "lowfc/sim/truth",
+        "lowfc/calibration",
+        "lowfc/event",
+        "lowfc/health/{name}",
+    }
+    assert len(topics["/lowfc/camera/frame"]) <= FRAMES
+    assert len(topics["/lowfc/calibration"]) == 1
+    missing = FRAMES - len(topics["/lowfc/camera/frame"]) + FRAMES - len(topics["/lowfc/sim/truth"])
+    assert live["messages_lost"] >= missing
+
+
+def test_frame_step_command_and_state_join(topics: dict[str, list[bytes]]) -> None:
+    """Each carries the frame's time and sequence, so that the road of one frame can be followed."""
+    frames = {from_timestamp(RawImage.FromString(payload).timestamp) for payload in topics["/lowfc/camera/frame"]}
+    steps = [wire.ControlStep.FromString(payload) for payload in topics["/lowfc/control/step"]]
+    commands = {
+        message.frame_sequence: message
+        for message in map(wire.MirrorCommand.FromString, topics["/lowfc/mirror/dm/command"])
+    }
+    states = {
+        message.frame_sequence: message
+        for message in map(wire.MirrorState.FromString, topics["/lowfc/mirror/dm/state"])
+        if message.status == wire.MIRROR_STATUS_FOLLOWING
+    }
+    joined = 0
+    for step in steps:
+        command, state = commands.get(step.frame_sequence), states.get(step.frame_sequence)
+        if command is None or state is None or from_timestamp(step.timestamp) not in frames:
+            continue
+        joined += 1
+        assert step.timestamp == command.timestamp
+        assert list(step.command_nm) == list(command.command_nm)
+        wanted, driven = (np.frombuffer(message.actuators, "<f4") for message in (command, state))
+        np.testing.assert_allclose(driven, wanted, atol=0.02)  # the driver's steps
+    assert joined > 0.8 * len(steps)
+
+
+def test_an_independent_reader_agrees(live: dict[str, Any], topics: dict[str, list[bytes]]) -> None:
+    """npm's @mcap/core: same counts, CRCs right, attachments there."""
+    import json
+
+    node = Path(__file__).parent.parent / "node"
+    if shutil.which("node") is None or not (node / "node_modules").is_dir():
+        pytest.skip("node or its packages are missing: make node")
+    done = subprocess.run(
+        ["node", "count.mjs", str(live["log"])], cwd=node, capture_output=True, text=True, timeout=60, check=False
+    )
+    assert done.returncode == 0, done.stderr
+    found = json.loads(done.stdout)
+    assert found["messages"] == found["counted"] == live["messages_recorded"]
+    assert found["counts"] == {topic: len(values) for topic, values in topics.items()}
+    assert set(found["attachments"]) == {"config.toml", "calibration.fits"}
+    assert "lowfc" in found["metadata"]
+
+
+def test_ctrl_c_ends_with_a_summary(tmp_path: Path) -> None:
+    process = start(tmp_path, "sim-loop", "--rate", "200", "--disturbance", "quiet")
+    _until(lambda: _recorded(tmp_path) > 4e6)
+    said, complaints = interrupt(process)
+    assert process.returncode == 0, complaints
+    assert "frame to command" in said
+    logs = list((tmp_path / "logs").glob("*.mcap"))
+    assert len(logs) == 1
+    assert payloads(logs[0])["/lowfc/camera/frame"]
+
+
+def test_a_process_that_dies_is_named(tmp_path: Path) -> None:
+    process = start(tmp_path, "sim-loop", "--rate", "200", "--duration", "60")
+    _until(lambda: _recorded(tmp_path) > 4e6)
+    os.kill(children(process.pid)["sim_dm"], signal.SIGKILL)
+    said, complaints = process.communicate(timeout=30)
+    assert process.returncode == 2
+    assert not said
+    assert "mirror-dm was killed by SIGKILL" in complaints
+    assert "Traceback" not in complaints
+    assert list((tmp_path / "logs").glob("*.mcap")), "the log is finished all the same"
+
+
+def test_two_loops_on_one_host_do_not_mix(tmp_path: Path) -> None:
+    first, second = (tmp_path / name for name in ("first", "second"))
+    for folder in (first, second):
+        folder.mkdir()
+    other = start(
+        first, "sim-loop", "--rate", "100", "--duration", "4", "--seed", "1", "--json", "--disturbance", "quiet"
+    )
+    figures = loop(second, "--rate", "100", "--duration", "4", "--seed", "2", "--disturbance", "quiet")
+    said, complaints = other.communicate(timeout=60)
+    assert other.returncode == 0, complaints
+    assert figures["frames_published"] == 400
+    assert len(payloads(figures["log"])["/lowfc/camera/frame"]) <= 400
+    assert '"frames_published": 400' in said
+
+
+def _recorded(folder: Path) -> int:
+    return sum(path.stat().st_size for path in (folder / "logs").glob("*.part"))
+
+
+def _until(condition: Any, timeout_s: float = 30.0) -> None:
+    deadline_s = time.monotonic() + timeout_s
+    while not condition():
+        assert time.monotonic() < deadline_s, "waited in vain"
+        time.sleep(0.05)
+
+
+def test_help_has_examples(tmp_path: Path) -> None:
+    for command in (["sim-loop"], ["controller"], ["record"], ["ctl", "gain"], ["config", "zenoh"], ["bench", "twin"]):
+        done = run(tmp_path, *command, "--help")
+        assert done.returncode == 0
+        assert "Example: lowfc" in done.stdout

@@ -1,0 +1,155 @@
+"""The simulated bench: its truth is what was put in, and its frames are what the calibration expects."""
+
+import numpy as np
+import pytest
+
+from lowfc.adapters.instrument import analytic_calibration, mirror_on_twin, twin
+from lowfc.contract.configuration import Configuration, load
+from lowfc.control.calibration import Calibration
+from lowfc.control.estimator import estimate
+from sim_camera.bench import Bench, Truth
+from sim_camera.disturbance import BLOCK
+from sim_camera.figures import BLOCK as FIGURES_BLOCK
+from sim_camera.figures import Figures
+from sim_camera.process import bench
+
+FLAT = np.zeros((34, 34), np.float32)
+
+
+def configured(**overrides: object) -> Configuration:
+    quiet = {"disturbance.preset": "quiet"}
+    return load(None, quiet | {key.replace("__", "."): value for key, value in overrides.items()})
+
+
+@pytest.fixture(scope="module")
+def calibration() -> Calibration:
+    config = configured()
+    optics = twin(config, None, print)
+    return analytic_calibration(config, optics, mirror_on_twin(config, optics, print))
+
+
+@pytest.fixture(scope="module")
+def still() -> Bench:
+    return bench(configured(camera__noise=False))
+
+
+def shape_of(calibration: Calibration, modes_nm: np.ndarray) -> np.ndarray:
+    return (calibration.modes_to_actuators @ modes_nm.astype(np.float32)).reshape(34, 34)
+
+
+def test_the_truth_of_static_modes_is_those_modes(still: Bench) -> None:
+    asked = {"2": 5.0, "4": -12.0, "11": 3.0}
+    _, truth = bench(configured(camera__noise=False, disturbance__static_nm=asked)).expose(0, FLAT)
+    expected = np.zeros(14)
+    expected[[0, 2, 9]] = 5, -12, 3
+    assert truth.disturbance_nm == pytest.approx(expected, abs=1e-4)
+    assert truth.residual_nm == pytest.approx(expected, abs=1e-3)
+    assert truth.residual_rms_nm == truth.disturbance_rms_nm > 3
+    _, nothing = still.expose(0, FLAT)
+    assert nothing.residual_rms_nm == pytest.approx(0, abs=1e-4)
+
+
+@pytest.mark.parametrize("mode", range(14))
+def test_a_modal_command_adds_its_wavefront_to_the_disturbance(
+    still: Bench, calibration: Calibration, mode: int
+) -> None:
+    """The residual is disturbance + command within 2 % of the command: wavefront = disturbance + 2 surface."""
+    command = 20.0 * np.eye(14)[mode]
+    _, truth = still.expose(0, shape_of(calibration, command))
+    assert np.abs(truth.residual_nm - command).max() < 0.02 * 20
+    assert not truth.disturbance_nm.any()
+
+
+def test_the_opposite_command_flattens_a_disturbance(calibration: Calibration) -> None:
+    asked = {str(noll): (-1.0) ** noll * 30 / noll for noll in range(2, 16)}
+    scene = bench(configured(camera__noise=False, disturbance__static_nm=asked))
+    _, before = scene.expose(0, FLAT)
+    _, after = scene.expose(0, shape_of(calibration, -np.array(list(asked.values()))))
+    assert after.residual_rms_nm < 0.03 * before.residual_rms_nm
+    assert after.disturbance_rms_nm == before.disturbance_rms_nm
+
+
+@pytest.mark.parametrize("mode", range(14))
+def test_a_small_mode_is_measured_with_the_right_size_and_sign(
+    still: Bench, calibration: Calibration, mode: int
+) -> None:
+    """Push and pull by the mirror, without noise: R of the frames is the mode, within 3 % and a rounding of DN."""
+    scratch, measured = np.empty(calibration.reference.size, np.float32), []
+    for sign in (1, -1):
+        frame, _ = still.expose(0, shape_of(calibration, sign * 5.0 * np.eye(14)[mode]))
+        found = estimate(calibration, frame.reshape(-1), 0.0, scratch)
+        assert found is not None
+        measured.append(found.error_nm)
+    half = (measured[0] - measured[1]) / 2
+    assert np.abs(half - 5.0 * np.eye(14)[mode]).max() < 0.15
+
+
+def test_the_light_is_what_the_calibration_expects(calibration: Calibration) -> None:
+    scene = bench(configured())
+    flux = []
+    for index in range(20):
+        scene.prepare()
+        frame, _ = scene.expose(index, FLAT)
+        flux.append(frame.sum() - calibration.dark.sum())
+    error = np.sqrt(calibration.flux_dn + frame.size) / np.sqrt(20)
+    assert np.mean(flux) == pytest.approx(calibration.flux_dn, abs=4 * error)
+    assert frame.dtype == np.uint16
+    assert frame.shape == scene.shape == calibration.shape
+
+
+def test_noise_comes_from_the_seed_and_differs_from_frame_to_frame() -> None:
+    def frames(seed: int) -> list[bytes]:
+        scene = bench(configured(seed=seed))
+        taken = []
+        for index in range(3):
+            taken.append(scene.expose(index, FLAT)[0].tobytes())
+            scene.prepare()
+        return taken
+
+    first = frames(1)
+    assert frames(1) == first
+    assert frames(2) != first
+    assert len(set(first)) == 3
+
+
+def test_a_frame_is_the_same_in_whatever_order_it_is_asked_for() -> None:
+    indices = [0, 1, BLOCK - 1, BLOCK, BLOCK + 1, 3 * BLOCK + 7]
+    scene = bench(configured(camera__noise=False, disturbance__preset="reaction-wheel"))
+    forward = [scene.expose(index, FLAT)[0].tobytes() for index in indices]
+    backward = [scene.expose(index, FLAT)[0].tobytes() for index in reversed(indices)]
+    assert forward == backward[::-1]
+    assert len(set(forward)) == len(indices)
+
+
+def test_a_kolmogorov_screen_has_its_rms_over_the_open_pupil() -> None:
+    scene = bench(configured(camera__noise=False, disturbance__preset="kolmogorov"))
+    _, truth = scene.expose(0, FLAT)
+    assert truth.disturbance_rms_nm == pytest.approx(0.05 * 550, rel=1e-3)
+    assert np.abs(truth.disturbance_nm).max() > 5  # its low orders are among the true modes
+
+
+def truth(tilt_x_nm: float, residual_x_nm: float, rms_nm: float, residual_rms_nm: float) -> Truth:
+    modes = np.array([tilt_x_nm, 0, 99], np.float32)
+    left = np.array([residual_x_nm, residual_x_nm, 99], np.float32)
+    return Truth(modes, left, rms_nm, residual_rms_nm)
+
+
+def test_figures_are_of_the_second_half() -> None:
+    figures = Figures((2, 3, 4), nm_per_mas=2.0)
+    assert figures.wavefront() is None
+    figures.add(truth(8.0, 4.0, 10.0, 5.0))
+    first = figures.wavefront()
+    assert first is not None
+    assert first.tilt_disturbance_mas == pytest.approx(8 / 2 / np.sqrt(2))
+    assert first.tilt_residual_mas == pytest.approx(2.0)
+    assert (first.disturbance_rms_nm, first.residual_rms_nm) == pytest.approx((10, 5))
+    for _ in range(2 * FIGURES_BLOCK - 1):
+        figures.add(truth(1000.0, 1000.0, 1000.0, 1000.0))
+    for index in range(2 * FIGURES_BLOCK):
+        figures.add(truth(6.0, 2.0, (3.0, 4.0)[index % 2], 1.0))
+    second = figures.wavefront()
+    assert second is not None
+    assert second.disturbance_rms_nm == pytest.approx(np.sqrt(12.5))
+    assert second.residual_rms_nm == pytest.approx(1)
+    assert second.tilt_disturbance_mas == pytest.approx(6 / 2 / np.sqrt(2))
+    assert second.tilt_residual_mas == pytest.approx(1)

@@ -1,0 +1,132 @@
+"""The disturbance is a pure function of seed and frame index, and each preset is what it promises."""
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from lowfc.contract.configuration import PRESETS
+from sim_camera.disturbance import LINES_HZ, Disturbance, disturbance, modes_nm, screen
+
+NOLL = tuple(range(2, 16))
+NM_PER_MAS = 2.424
+RATE_HZ = 1000.0
+
+
+def preset(name: str, seed: int = 1, **more: object) -> Disturbance:
+    return disturbance(name, NOLL, seed, NM_PER_MAS, 550.0, **more)  # type: ignore[arg-type]
+
+
+def rms_nm(shaken: Disturbance) -> np.ndarray:
+    """Rms of each mode over all time, from its exact spectrum."""
+    result: np.ndarray = np.sqrt(np.sum(np.abs(shaken.amplitude_nm) ** 2, axis=0) / 2)
+    return result
+
+
+@pytest.mark.parametrize("name", PRESETS)
+@settings(max_examples=15, deadline=None)
+@given(first=st.integers(0, 10**9), count=st.integers(1, 80), cut=st.integers(0, 80))
+def test_a_frame_is_the_same_in_any_order_and_any_block(name: str, first: int, count: int, cut: int) -> None:
+    shaken = preset(name, static_nm={4: 3.0})
+    whole = modes_nm(shaken, first, count, RATE_HZ)
+    cut = min(cut, count - 1)
+    assert whole.shape == (count, len(NOLL))
+    assert np.abs(modes_nm(shaken, first + cut, count - cut, RATE_HZ) - whole[cut:]).max() < 1e-5
+    assert np.abs(modes_nm(shaken, first + cut, 1, RATE_HZ)[0] - whole[cut]).max() < 1e-5
+    assert np.array_equal(modes_nm(preset(name, static_nm={4: 3.0}), first, count, RATE_HZ), whole)
+
+
+@pytest.mark.parametrize("name", ["bench", "thermal", "reaction-wheel"])
+def test_another_seed_is_another_disturbance_of_the_same_rms(name: str) -> None:
+    one, other = preset(name, 1), preset(name, 2)
+    assert np.abs(modes_nm(one, 0, 50, RATE_HZ) - modes_nm(other, 0, 50, RATE_HZ)).max() > 0.5
+    assert rms_nm(one) == pytest.approx(rms_nm(other), rel=1e-9)
+
+
+@pytest.mark.parametrize("name", PRESETS)
+def test_the_scale_multiplies_it(name: str) -> None:
+    one, thrice = preset(name), preset(name, scale=3.0)
+    assert np.allclose(modes_nm(thrice, 5, 7, RATE_HZ), 3 * modes_nm(one, 5, 7, RATE_HZ))
+    assert thrice.screen_nm == pytest.approx(3 * one.screen_nm)
+
+
+def test_the_reaction_wheel_is_14_mas_per_axis_with_its_five_lines() -> None:
+    shaken = preset("reaction-wheel")
+    per_axis_mas = rms_nm(shaken)[:2] / NM_PER_MAS
+    assert np.abs(per_axis_mas / 14 - 1).max() < 0.05
+    assert LINES_HZ == (6.0, 18.0, 37.0, 71.0, 117.0)
+    for axis in (0, 1):
+        power = np.abs(shaken.amplitude_nm[:, axis]) ** 2
+        lines = np.isin(shaken.frequency_hz, LINES_HZ)
+        assert lines.sum() == 5
+        assert power[lines].sum() > 0.9 * power.sum()
+        assert shaken.frequency_hz[~lines].max() < 6
+        assert (np.diff(power[lines]) < 0).all()
+
+
+def test_its_lines_are_in_the_frames_too() -> None:
+    """A spectrum of frames, independent of the table of waves: ten seconds, so that lines fall on whole bins."""
+    tilt_mas = modes_nm(preset("reaction-wheel"), 12_345, 10_000, RATE_HZ)[:, 0] / NM_PER_MAS
+    amplitude = np.abs(np.fft.rfft(tilt_mas - tilt_mas.mean())) / 5000
+    frequency = np.fft.rfftfreq(10_000, 1 / RATE_HZ)
+    strong = frequency[(amplitude > 1.5) & (frequency > 5.5)]
+    assert strong == pytest.approx(LINES_HZ)
+
+
+def test_the_lines_phases_of_the_two_axes_differ() -> None:
+    shaken = preset("reaction-wheel")
+    tilts = shaken.amplitude_nm[np.isin(shaken.frequency_hz, LINES_HZ), :2]
+    assert np.abs(np.angle(tilts[:, 0] / tilts[:, 1])).max() > 0.5
+
+
+def test_the_bench_drifts_and_jitters_a_little() -> None:
+    shaken = preset("bench")
+    jitter = np.isin(shaken.frequency_hz, (0.7, 1.9, 4.3, 9.1))
+    assert jitter.sum() == 4
+    assert np.sqrt(np.sum(np.abs(shaken.amplitude_nm[jitter]) ** 2, axis=0) / 2)[:2] == pytest.approx(1.5 * NM_PER_MAS)
+    assert not shaken.amplitude_nm[jitter, 2:].any()
+    assert shaken.frequency_hz[~jitter].max() <= 0.53
+
+
+def test_the_thermal_drift_is_slow_and_falls_with_radial_degree() -> None:
+    shaken = preset("thermal")
+    assert shaken.frequency_hz.max() <= 0.53
+    assert rms_nm(shaken) == pytest.approx([4, 4, 5, 5, 5, 2.5, 2.5, 2.5, 2.5, 1.5, 1.5, 1.5, 1.5, 1.5])
+
+
+def test_the_step_is_a_square_wave_of_5_mas() -> None:
+    tilt = modes_nm(preset("step"), 0, 8000, RATE_HZ)
+    assert set(np.unique(tilt[:, 0] / NM_PER_MAS).round(9)) == {-5.0, 5.0}
+    assert np.flatnonzero(np.diff(tilt[:, 0])).tolist() == [1999, 3999, 5999]
+    assert not tilt[:, 2:].any()
+
+
+def test_quiet_is_nothing_but_what_is_asked() -> None:
+    still = modes_nm(preset("quiet", static_nm={2: 4.0, 11: -7.0}), 10**6, 3, RATE_HZ)
+    assert (still == still[0]).all()
+    assert still[0][[0, 9]].tolist() == [4, -7]
+    assert np.count_nonzero(still[0]) == 2
+
+
+def test_kolmogorov_is_a_screen_of_a_twentieth_of_a_wave() -> None:
+    assert preset("kolmogorov").screen_nm == pytest.approx(0.05 * 550)
+
+
+def test_the_screen_has_kolmogorovs_spectrum_and_comes_from_the_seed() -> None:
+    """Power summed over many seeds falls as the -11/3 power of frequency, between 1 and 12 cycles per diameter."""
+    power = np.zeros((64, 64))
+    for seed in range(30):
+        power += np.abs(np.fft.fft2(screen(seed, 64, 4 / 64))) ** 2  # the whole periodic square
+    radius = np.hypot(*np.meshgrid(np.fft.fftfreq(64, 4 / 64), np.fft.fftfreq(64, 4 / 64)))
+    bands = [(radius > low) & (radius <= 1.3 * low) for low in (1.0, 2.0, 4.0)]
+    slope = np.polyfit(np.log([radius[b].mean() for b in bands]), np.log([power[b].mean() for b in bands]), 1)[0]
+    assert slope == pytest.approx(-11 / 3, abs=0.25)
+    assert np.array_equal(screen(3, 20, 0.05), screen(3, 20, 0.05))
+    assert not np.allclose(screen(3, 20, 0.05), screen(4, 20, 0.05))
+
+
+def test_mistakes_are_named() -> None:
+    with pytest.raises(ValueError, match="'earthquake'"):
+        preset("earthquake")
+    with pytest.raises(ValueError, match="Z40"):
+        preset("quiet", static_nm={40: 1.0})

@@ -1,0 +1,199 @@
+"""Imports point downward, the numerics are pure, and no file outgrows its noun."""
+
+import ast
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parent.parent
+PACKAGES = ("lowfc", "sim_camera", "sim_dm")
+FILES = {
+    ".".join(path.relative_to(ROOT).with_suffix("").parts).removesuffix(".__init__"): path
+    for package in PACKAGES
+    for path in sorted((ROOT / package).rglob("*.py"))
+}
+GENERATED = "lowfc.contract.wire"
+
+# What each layer may import of the project, besides itself.
+BELOW = {
+    "lowfc.optics": (),
+    "lowfc.control": (),
+    "lowfc.contract": ("lowfc.optics", "lowfc.control"),
+    "lowfc.adapters": ("lowfc.optics", "lowfc.control", "lowfc.contract"),
+    "lowfc.programs": ("lowfc.optics", "lowfc.control", "lowfc.contract", "lowfc.adapters"),
+    "sim_camera": ("lowfc.optics", "lowfc.control", "lowfc.contract", "lowfc.adapters"),
+    "sim_dm": ("lowfc.optics", "lowfc.control", "lowfc.contract", "lowfc.adapters"),
+}
+LAYERS = tuple(BELOW)
+
+PURE_LAYERS = ("lowfc.optics", "lowfc.control")
+PURE_MODULES = ("sim_dm.device", "sim_camera.disturbance", "sim_camera.bench", "sim_camera.figures")
+PURE_IMPORTS = (
+    *("numpy", "scipy", "abc", "collections", "dataclasses", "enum", "functools", "itertools", "math", "operator"),
+    *("types", "typing"),
+)
+# A generator made from a seed is a value; everything else in numpy.random is state that all share.
+FROM_A_SEED = ("Generator", "default_rng", "SeedSequence", "SFC64", "PCG64")
+NUMPY_FILES = ("load", "loadtxt", "save", "savez", "savez_compressed", "savetxt", "fromfile", "memmap", "genfromtxt")
+FORBIDDEN_CALLS = ("open", "print", "input", "exec", "eval", "__import__", "breakpoint", "globals")
+LONGEST = 400
+
+
+def imports_of(tree: ast.AST) -> Iterator[str]:
+    """Every module imported anywhere in a file, and what is taken from it: `a.b` and `a.b.c` for `from a.b import c`."""
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Import):
+            yield from (alias.name for alias in node.names)
+        elif isinstance(node, ast.ImportFrom):
+            yield "." * node.level + (node.module or "")
+            yield from ("." * node.level + f"{node.module or ''}.{alias.name}" for alias in node.names)
+
+
+def inside(name: str, package: str) -> bool:
+    return name == package or name.startswith(package + ".")
+
+
+def layer_of(module: str) -> str:
+    if module == "lowfc.__main__":  # `python -m lowfc` is the command line
+        return "lowfc.programs"
+    return next((layer for layer in LAYERS if inside(module, layer)), "")
+
+
+def is_pure(module: str) -> bool:
+    return layer_of(module) in PURE_LAYERS or module in PURE_MODULES
+
+
+def layer_faults(module: str, source: str) -> list[str]:
+    """Imports that point upward or sideways."""
+    own, faults = layer_of(module), []
+    for name in imports_of(ast.parse(source)):
+        if name.startswith("."):
+            faults.append(f"{module} imports {name}: relative")
+        target = layer_of(name)
+        if target and own and target != own and target not in BELOW[own]:
+            faults.append(f"{module} imports {name}")
+    return faults
+
+
+def purity_faults(module: str, source: str) -> list[str]:
+    """Imports and calls by which a module of the numerics would depend on more than its arguments."""
+    tree, faults = ast.parse(source), []
+    for name in imports_of(tree):
+        if layer_of(name) or name == "lowfc":
+            if layer_of(name) and not is_pure(name) and not any(inside(name, pure) for pure in PURE_MODULES):
+                faults.append(f"imports {name}")
+        elif not any(inside(name, allowed) for allowed in PURE_IMPORTS):
+            faults.append(f"imports {name}")
+        if inside(name, "numpy.random") and name.rpartition(".")[2] not in ("random", *FROM_A_SEED):
+            faults.append(f"imports {name}")
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Call) and isinstance(node.func, ast.Name) and node.func.id in FORBIDDEN_CALLS:
+            faults.append(f"calls {node.func.id}")
+        if isinstance(node, ast.Global):
+            faults.append("changes a global")
+        if isinstance(node, ast.Attribute):
+            text = ast.unparse(node)
+            kind, _, attribute = text.rpartition(".")
+            if kind in ("np.random", "numpy.random") and attribute not in FROM_A_SEED:
+                faults.append(f"uses {text}")
+            if kind in ("np", "numpy") and attribute in NUMPY_FILES:
+                faults.append(f"uses {text}")
+        unseeded = isinstance(node, ast.Call) and ast.unparse(node.func).rpartition(".")[2] in FROM_A_SEED[1:]
+        if unseeded and not (node.args or node.keywords):  # type: ignore[attr-defined]
+            faults.append(f"calls {ast.unparse(node)} without a seed")
+    return [f"{module} {fault}" for fault in faults]
+
+
+@pytest.mark.parametrize("module", FILES)
+def test_imports_point_downward(module: str) -> None:
+    assert layer_faults(module, FILES[module].read_text(encoding="utf-8")) == []
+
+
+@pytest.mark.parametrize("module", [module for module in FILES if is_pure(module)])
+def test_the_numerics_are_pure(module: str) -> None:
+    assert purity_faults(module, FILES[module].read_text(encoding="utf-8")) == []
+
+
+def test_every_module_is_in_a_layer() -> None:
+    outside = [module for module in FILES if not layer_of(module) and module != "lowfc"]
+    assert outside == []
+    assert sum(map(is_pure, FILES)) > 25  # the list above still finds the numerics
+
+
+def test_no_file_outgrows_its_noun() -> None:
+    long = {module: len(path.read_text(encoding="utf-8").splitlines()) for module, path in FILES.items()}
+    assert {module: lines for module, lines in long.items() if lines > LONGEST and not inside(module, GENERATED)} == {}
+    vague = {"utils", "util", "helpers", "common", "misc"}
+    assert [module for module in FILES if vague & set(module.split("."))] == []
+
+
+@pytest.mark.parametrize(
+    ("module", "source"),
+    [
+        ("lowfc.control.law", "from lowfc.contract import codec"),
+        ("lowfc.control.law", "from lowfc.optics.twin import Twin"),
+        ("lowfc.optics.twin", "import lowfc.control.law"),
+        ("lowfc.contract.codec", "def later():\n    from lowfc.adapters.clock import HostClock"),
+        ("lowfc.adapters.bus", "from lowfc.programs import controller"),
+        ("lowfc.adapters.bus", "import sim_dm.device"),
+        ("lowfc.programs.sim_loop", "from sim_camera.bench import Bench"),
+        ("sim_camera.process", "import lowfc.programs.controller"),
+        ("sim_dm.process", "from sim_camera import bench"),
+        ("lowfc.adapters.bus", "from . import clock"),
+    ],
+)
+def test_an_import_upward_is_found(module: str, source: str) -> None:
+    assert layer_faults(module, source) != []
+
+
+@pytest.mark.parametrize(
+    ("module", "source"),
+    [
+        ("lowfc.contract.codec", "from lowfc.control.law import Law\nfrom lowfc.optics import zernike"),
+        ("lowfc.programs.controller", "import lowfc.adapters.bus\nfrom lowfc import __version__"),
+        ("sim_dm.process", "from lowfc.adapters.service import Service\nimport time"),
+    ],
+)
+def test_an_import_downward_is_fine(module: str, source: str) -> None:
+    assert layer_faults(module, source) == []
+
+
+@pytest.mark.parametrize(
+    "source",
+    [
+        "import time",
+        "import os",
+        "from pathlib import Path",
+        "from datetime import datetime",
+        "import random",
+        "import pydantic",
+        "def later():\n    import time",
+        "from lowfc.contract.errors import LowfcError",
+        "import numpy as np\nnp.random.seed(1)",
+        "import numpy as np\nx = np.random.standard_normal(3)",
+        "import numpy\nx = numpy.random.rand(3)",
+        "from numpy.random import rand",
+        "from numpy import random\nrandom.default_rng()",
+        "import numpy as np\nrng = np.random.default_rng()",
+        "import numpy as np\nseeds = np.random.SeedSequence()",
+        "import numpy as np\nx = np.load('file')",
+        "x = open('file')",
+        "def f():\n    global x\n    x = 1",
+        "print('x')",
+    ],
+)
+def test_an_impurity_is_found(source: str) -> None:
+    assert purity_faults("lowfc.control.law", source) != []
+
+
+@pytest.mark.parametrize(
+    "source",
+    [
+        "import numpy as np\nimport numpy.typing as npt\nfrom scipy.optimize import brentq",
+        "import numpy as np\nrng = np.random.default_rng([1, 2])\ndef f(rng: np.random.Generator): ...",
+        "from lowfc.control.safety import limit\nfrom dataclasses import dataclass",
+    ],
+)
+def test_pure_source_is_fine(source: str) -> None:
+    assert purity_faults("lowfc.control.law", source) == []
