@@ -1,0 +1,329 @@
+"""Controller and mirror as they run, on a bus within one process, with a camera that exposes when it is told."""
+
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+import numpy as np
+import numpy.typing as npt
+import pytest
+
+from lowfc.adapters import instrument
+from lowfc.adapters.clock import HostClock, SimulatedClock
+from lowfc.adapters.memory_bus import MemoryBus, MemoryHub
+from lowfc.adapters.service import Service
+from lowfc.contract.codec import actuators
+from lowfc.contract.configuration import Configuration, load
+from lowfc.contract.messages import (
+    CALIBRATION,
+    CAMERA_STATE,
+    COMMAND,
+    CONTROLLER_STATE,
+    EVENT,
+    FRAME,
+    MIRROR_STATE,
+    REQUEST,
+    STEP,
+    TIMING,
+    Log,
+    Message,
+    image,
+    timestamp,
+    wire,
+)
+from lowfc.control.calibration import Calibration, noise_nm
+from lowfc.programs.controller import Controller
+from sim_camera.bench import Bench, Truth
+from sim_camera.process import bench
+from sim_dm.process import MirrorProcess
+
+Single = npt.NDArray[np.float32]
+
+PATIENCE_S = 20.0
+START_NS = 1_767_225_600_000_000_000
+
+
+def configured(**overrides: object) -> Configuration:
+    bright = {"disturbance.preset": "quiet", "star.magnitude": -2.0, "lockstep": True, "mirror.settling_us": 0.0}
+    return load(None, bright | {key.replace("__", "."): value for key, value in overrides.items()})
+
+
+CONFIG = configured()
+
+
+class Rig:
+    """A run in one process: two roles on threads of their own, and everything that was said."""
+
+    def __init__(self, config: Configuration, calibration: Calibration, scene: Bench) -> None:
+        self.config, self.calibration, self.scene, self.hub = config, calibration, scene, MemoryHub()
+        self.said: dict[str, list[Message]] = {}
+        self.offset_nm = np.zeros((34, 34), np.float32)
+        self._index = 0
+        self._newest = threading.Condition()
+        self.operator = self.bus("operator")
+        for topic in (STEP, COMMAND, MIRROR_STATE, EVENT, REQUEST, TIMING):
+            self.operator.subscribe(topic, self._hear(topic.message, topic.key))
+        camera = self.bus("camera")
+        self.frames, self.settings = camera.publisher(FRAME), camera.publisher(CAMERA_STATE)
+        self.services = [Service(role, "test", self.clock(), self.bus(role)) for role in ("controller", "mirror-dm")]
+        self.mirror = MirrorProcess(config, self.services[1])
+        self.controller = Controller(config, self.services[0], calibration, "a test")
+        self.threads = [threading.Thread(target=one.run) for one in (self.mirror, self.controller)]
+        for thread in self.threads:
+            thread.start()
+
+    def clock(self) -> HostClock | SimulatedClock:
+        return SimulatedClock(START_NS) if self.config.lockstep else HostClock()
+
+    def bus(self, role: str) -> MemoryBus:
+        return MemoryBus(self.hub, role, self.clock())
+
+    def _hear(self, kind: type[Message], key: str):  # type: ignore[no-untyped-def]
+        def heard(sample: object) -> None:
+            with self._newest:
+                self.said.setdefault(key, []).append(kind.FromString(sample.payload))  # type: ignore[attr-defined]
+                self._newest.notify_all()
+
+        return heard
+
+    def until(self, what: str, met: "object") -> None:
+        with self._newest:
+            assert self._newest.wait_for(met, PATIENCE_S), f"{what} did not happen"  # type: ignore[arg-type]
+
+    def put(self, pixels: npt.NDArray[np.uint16], publish_time_ns: int | None = None) -> int:
+        """Publish a frame, and wait until the mirror has answered the command made from it."""
+        time_ns = START_NS + (self._index + 1) * self.config.period_ns
+        self._index += 1
+        payload = image(pixels, time_ns, "camera").SerializeToString()
+        sequence = self.frames.put(payload, publish_time_ns).sequence
+        key = MIRROR_STATE.key
+        self.until("the mirror's answer", lambda: key in self.said and self.said[key][-1].frame_sequence == sequence)  # type: ignore[attr-defined]
+        return sequence
+
+    def expose(self, count: int) -> list[Truth]:
+        """Frames of the scene through the mirror as it is, plus the offset."""
+        truths = []
+        for _ in range(count):
+            states = self.said.get(MIRROR_STATE.key)
+            shape = actuators(states[-1]) if states else None  # type: ignore[arg-type]
+            seen = self.offset_nm if shape is None else shape + self.offset_nm
+            self.scene.prepare()
+            pixels, truth = self.scene.expose(self._index, seen)
+            self.put(pixels)
+            truths.append(truth)
+        return truths
+
+    def inject(self, modes_nm: npt.ArrayLike) -> None:
+        """Add modes to the wavefront, by a second mirror in the same place."""
+        shape = self.calibration.modes_to_actuators @ np.asarray(modes_nm, np.float32)
+        self.offset_nm = shape.reshape(34, 34)
+
+    def ask(self, name: str, *values: float, modes: tuple[int, ...] = ()) -> wire.Request:
+        payload = wire.Request(modes=modes, values=values).SerializeToString()
+        (answer,) = self.operator.get(f"lowfc/request/{name}", payload, PATIENCE_S)
+        return wire.Request.FromString(answer.payload)
+
+    def steps(self, count: int) -> list[wire.ControlStep]:
+        self.until("the step", lambda: len(self.said[STEP.key]) >= self._index)
+        return self.said[STEP.key][-count:]  # type: ignore[return-value]
+
+    def events(self) -> list[str]:
+        return [log.message.split()[0] for log in self.said.get(EVENT.key, []) if isinstance(log, Log)]
+
+    def stop(self) -> None:
+        for service in self.services:
+            service.stop("the test is over")
+        for thread in self.threads:
+            thread.join(PATIENCE_S)
+        assert not any(thread.is_alive() for thread in self.threads)
+        assert not any(bus.faults.counts for bus in self.hub.buses)
+
+
+@pytest.fixture(scope="module")
+def calibration() -> Calibration:
+    optics = instrument.twin(CONFIG, None, print)
+    return instrument.analytic_calibration(CONFIG, optics, instrument.mirror_on_twin(CONFIG, optics, print))
+
+
+@pytest.fixture(scope="module")
+def scene() -> Bench:
+    return bench(CONFIG)
+
+
+@contextmanager
+def running(config: Configuration, calibration: Calibration, scene: Bench) -> Iterator[Rig]:
+    rig = Rig(config, calibration, scene)
+    try:
+        yield rig
+    finally:
+        rig.stop()
+
+
+@pytest.fixture
+def rig(calibration: Calibration, scene: Bench) -> Iterator[Rig]:
+    with running(CONFIG, calibration, scene) as one:
+        yield one
+
+
+def errors_of(steps: list[wire.ControlStep]) -> npt.NDArray[np.float64]:
+    return np.array([step.error_nm for step in steps], float)
+
+
+def test_a_quiet_open_loop_measures_nothing_with_the_noise_that_is_predicted(rig: Rig) -> None:
+    rig.expose(400)
+    errors = errors_of(rig.steps(400))
+    known = rig.calibration
+    camera = rig.config.camera
+    predicted = noise_nm(
+        known.reconstructor.astype(float),
+        known.reference.astype(float),
+        known.flux_dn * camera.gain_e_per_dn,
+        float(np.hypot(camera.read_noise_e, camera.gain_e_per_dn / np.sqrt(12))),  # and the rounding to DN
+    )
+    assert (np.abs(errors.mean(axis=0)) < 4 * errors.std(axis=0) / np.sqrt(400)).all()
+    # The standard deviation of a standard deviation is 1 / sqrt(2 * 400): four of them are 14 %.
+    assert np.abs(errors.std(axis=0) / predicted - 1).max() < 0.15
+
+
+def test_every_mode_is_measured_with_its_size_and_sign(rig: Rig) -> None:
+    pairs = 40
+    for mode in range(14):
+        taken = []
+        for sign in (1, -1):
+            rig.inject(sign * 5.0 * np.eye(14)[mode])
+            rig.expose(pairs)
+            taken.append(errors_of(rig.steps(pairs)))
+        half = (taken[0] - taken[1]) / 2
+        allowed = np.maximum(4 * half.std(axis=0) / np.sqrt(pairs), 0.05)
+        assert (np.abs(half.mean(axis=0) - 5.0 * np.eye(14)[mode]) < allowed).all(), f"mode {mode}"
+        assert half.mean(axis=0)[mode] > 4.5
+
+
+def test_closing_the_loop_corrects_every_mode(rig: Rig) -> None:
+    injected = 12.0 * np.array([1, -1] * 7)
+    rig.inject(injected)
+    rig.expose(3)
+    assert rig.ask("gain", 0.25).accepted
+    assert rig.ask("close").accepted
+    rig.expose(60)
+    last = rig.steps(20)
+    assert all(step.mode == wire.LOOP_MODE_CLOSED for step in last)
+    command = np.array([step.command_nm for step in last], float)
+    error = errors_of(last)
+    # Noise through an integrator of gain 0.25 is correlated over some 7 frames.
+    allowed = 4 * error.std(axis=0) / np.sqrt(20) * 2 + 0.03 * 12
+    assert (np.abs(command.mean(axis=0) + injected) < allowed).all()
+    assert (np.abs(error.mean(axis=0)) < allowed).all()
+    pol = np.array([step.pol_nm for step in last], float).mean(axis=0)
+    assert (np.abs(pol - injected) < allowed).all()
+
+
+def test_the_true_wavefront_gets_flat_too(rig: Rig) -> None:
+    rig.inject(10.0 * np.array([1, -1] * 7))
+    before = rig.expose(1)[0].residual_rms_nm
+    rig.ask("gain", 0.25)
+    rig.ask("close")
+    after = rig.expose(60)[-1].residual_rms_nm
+    assert after < 0.2 * before
+
+
+def test_requests_are_answered_with_the_frame_they_are_in_force_for(rig: Rig) -> None:
+    rig.expose(5)
+    newest = rig.steps(1)[0].frame_sequence
+    answer = rig.ask("close")
+    assert (answer.accepted, answer.reply, answer.frame_sequence) == (True, "loop closed", newest + 1)
+    rig.expose(1)
+    step = rig.steps(1)[0]
+    assert (step.frame_sequence, step.mode) == (answer.frame_sequence, wire.LOOP_MODE_CLOSED)
+    refused = rig.ask("gain", 9.0)
+    assert not refused.accepted
+    assert "unstable" in refused.reply
+    status = rig.ask("status")
+    assert status.state.mode == wire.LOOP_MODE_CLOSED
+    assert status.state.frame_sequence == newest + 1
+    assert not rig.ask("dance").accepted
+    (bad,) = rig.operator.get("lowfc/request/gain", b"\xff\xff", PATIENCE_S)
+    assert "could not be read" in wire.Request.FromString(bad.payload).reply
+    rig.until("five published requests", lambda: len(rig.said.get(REQUEST.key, [])) == 5)
+    published = [(one.name, one.accepted) for one in rig.said[REQUEST.key]]  # type: ignore[attr-defined]
+    assert published == [("close", True), ("gain", False), ("status", True), ("dance", False), ("gain", False)]
+
+
+def test_safe_flattens_the_mirror_and_stays(rig: Rig) -> None:
+    rig.inject(10.0 * np.ones(14))
+    rig.ask("close")
+    rig.expose(10)
+    assert actuators(rig.said[MIRROR_STATE.key][-1]).any()  # type: ignore[arg-type, union-attr]
+    assert rig.ask("safe").accepted
+    assert not rig.ask("close").accepted
+    rig.expose(5)
+    assert not actuators(rig.said[MIRROR_STATE.key][-1]).any()  # type: ignore[arg-type, union-attr]
+    assert rig.steps(1)[0].mode == wire.LOOP_MODE_SAFED
+    assert rig.ask("clear").accepted
+    rig.expose(1)
+    assert rig.steps(1)[0].mode == wire.LOOP_MODE_OPEN
+    assert {"SAFED", "MODE_CHANGED"} <= set(rig.events())
+
+
+def test_a_late_joiner_gets_calibration_and_state(rig: Rig) -> None:
+    rig.expose(2)
+    late = rig.bus("viewer")
+    (answer,) = late.get(CALIBRATION.key)
+    assert wire.Calibration.FromString(answer.payload).id == rig.calibration.id
+    (answer,) = late.get(CONTROLLER_STATE.key)
+    state = wire.ControllerState.FromString(answer.payload)
+    assert state.calibration_id == rig.calibration.id
+    assert len(state.gain) == len(state.leak) == len(state.limit_nm) == 14
+
+
+def test_every_frame_yields_one_step_and_one_command(rig: Rig) -> None:
+    sequences = []
+    size = rig.scene.shape[0]
+    dark, odd = np.full((size, size), 100, np.uint16), np.zeros((3, 3), np.uint16)
+    full = np.full((size, size), 65535, np.uint16)
+    good = rig.scene.expose(0, rig.offset_nm)[0]
+    for pixels in (good, odd, good, dark, full, good):
+        sequences.append(rig.put(pixels))
+    steps = rig.steps(6)
+    assert [step.frame_sequence for step in steps] == sequences
+    assert [one.frame_sequence for one in rig.said[COMMAND.key]] == sequences  # type: ignore[attr-defined]
+    assert [list(step.reasons) for step in steps] == [
+        [],
+        [wire.REASON_WRONG_SIZE],
+        [],
+        [wire.REASON_DARK],
+        [wire.REASON_SATURATED],
+        [],
+    ]
+    for step, command in zip(steps, rig.said[COMMAND.key], strict=True):
+        assert step.timestamp == command.timestamp  # type: ignore[attr-defined]
+        assert step.command_nm == command.command_nm  # type: ignore[attr-defined]
+
+
+def test_a_camera_that_changes_opens_the_loop(rig: Rig) -> None:
+    rig.expose(1)
+    rig.ask("close")
+    changed = wire.CameraState(timestamp=timestamp(START_NS), rows=5, columns=5, bias_dn=100, saturation_dn=65535)
+    rig.settings.put(changed.SerializeToString())
+    rig.until("CAMERA_CHANGED", lambda: "CAMERA_CHANGED" in rig.events())
+    rig.expose(1)
+    assert rig.steps(1)[0].mode == wire.LOOP_MODE_OPEN
+
+
+def test_a_camera_with_a_wrong_clock_is_late_and_does_not_stop_the_controller(
+    calibration: Calibration, scene: Bench
+) -> None:
+    """Durations of years do not fit the columns of the timing; and without frames the command is repeated."""
+    with running(configured(lockstep=False), calibration, scene) as rig:
+        pixels = scene.expose(0, rig.offset_nm)[0]
+        rig.until("a mirror that waits", lambda: MIRROR_STATE.key in rig.said)
+        rig.put(pixels, publish_time_ns=1)
+        rig.put(pixels, publish_time_ns=2**62)
+        rig.put(pixels)
+        reasons = [list(step.reasons) for step in rig.steps(3)]
+        assert reasons[0] == [wire.REASON_LATE]
+        assert reasons[1] == []
+        sent = len(rig.said[COMMAND.key])
+        rig.until("a repeated command", lambda: len(rig.said[COMMAND.key]) > sent + 3)
+        rig.until("NO_FRAMES", lambda: "NO_FRAMES" in rig.events())
+    assert max(rig.said[TIMING.key][0].transport_ns) == 2**32 - 1  # type: ignore[attr-defined]
