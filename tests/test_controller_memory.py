@@ -1,14 +1,16 @@
 """Controller and mirror as they run, on a bus within one process, with a camera that exposes when it is told."""
 
 import threading
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 import pytest
 
 from lowfc.adapters import instrument
+from lowfc.adapters.bus import Sample
 from lowfc.adapters.clock import HostClock, SimulatedClock
 from lowfc.adapters.memory_bus import MemoryBus, MemoryHub
 from lowfc.adapters.service import Service
@@ -56,7 +58,7 @@ class Rig:
 
     def __init__(self, config: Configuration, calibration: Calibration, scene: Bench) -> None:
         self.config, self.calibration, self.scene, self.hub = config, calibration, scene, MemoryHub()
-        self.said: dict[str, list[Message]] = {}
+        self.said: dict[str, list[Any]] = {}
         self.offset_nm = np.zeros((34, 34), np.float32)
         self._index = 0
         self._newest = threading.Condition()
@@ -78,17 +80,17 @@ class Rig:
     def bus(self, role: str) -> MemoryBus:
         return MemoryBus(self.hub, role, self.clock())
 
-    def _hear(self, kind: type[Message], key: str):  # type: ignore[no-untyped-def]
-        def heard(sample: object) -> None:
+    def _hear(self, kind: type[Message], key: str) -> Callable[[Sample], None]:
+        def heard(sample: Sample) -> None:
             with self._newest:
-                self.said.setdefault(key, []).append(kind.FromString(sample.payload))  # type: ignore[attr-defined]
+                self.said.setdefault(key, []).append(kind.FromString(sample.payload))
                 self._newest.notify_all()
 
         return heard
 
-    def until(self, what: str, met: "object") -> None:
+    def until(self, what: str, met: Callable[[], bool]) -> None:
         with self._newest:
-            assert self._newest.wait_for(met, PATIENCE_S), f"{what} did not happen"  # type: ignore[arg-type]
+            assert self._newest.wait_for(met, PATIENCE_S), f"{what} did not happen"
 
     def put(self, pixels: npt.NDArray[np.uint16], publish_time_ns: int | None = None) -> int:
         """Publish a frame, and wait until the mirror has answered the command made from it."""
@@ -97,7 +99,7 @@ class Rig:
         payload = image(pixels, time_ns, "camera").SerializeToString()
         sequence = self.frames.put(payload, publish_time_ns).sequence
         key = MIRROR_STATE.key
-        self.until("the mirror's answer", lambda: key in self.said and self.said[key][-1].frame_sequence == sequence)  # type: ignore[attr-defined]
+        self.until("the mirror's answer", lambda: key in self.said and self.said[key][-1].frame_sequence == sequence)
         return sequence
 
     def expose(self, count: int) -> list[Truth]:
@@ -105,7 +107,7 @@ class Rig:
         truths = []
         for _ in range(count):
             states = self.said.get(MIRROR_STATE.key)
-            shape = actuators(states[-1]) if states else None  # type: ignore[arg-type]
+            shape = actuators(states[-1]) if states else None
             seen = self.offset_nm if shape is None else shape + self.offset_nm
             self.scene.prepare()
             pixels, truth = self.scene.expose(self._index, seen)
@@ -125,7 +127,7 @@ class Rig:
 
     def steps(self, count: int) -> list[wire.ControlStep]:
         self.until("the step", lambda: len(self.said[STEP.key]) >= self._index)
-        return self.said[STEP.key][-count:]  # type: ignore[return-value]
+        return self.said[STEP.key][-count:]
 
     def events(self) -> list[str]:
         return [log.message.split()[0] for log in self.said.get(EVENT.key, []) if isinstance(log, Log)]
@@ -245,7 +247,7 @@ def test_requests_are_answered_with_the_frame_they_are_in_force_for(rig: Rig) ->
     (bad,) = rig.operator.get("lowfc/request/gain", b"\xff\xff", PATIENCE_S)
     assert "could not be read" in wire.Request.FromString(bad.payload).reply
     rig.until("five published requests", lambda: len(rig.said.get(REQUEST.key, [])) == 5)
-    published = [(one.name, one.accepted) for one in rig.said[REQUEST.key]]  # type: ignore[attr-defined]
+    published = [(one.name, one.accepted) for one in rig.said[REQUEST.key]]
     assert published == [("close", True), ("gain", False), ("status", True), ("dance", False), ("gain", False)]
 
 
@@ -253,11 +255,11 @@ def test_safe_flattens_the_mirror_and_stays(rig: Rig) -> None:
     rig.inject(10.0 * np.ones(14))
     rig.ask("close")
     rig.expose(10)
-    assert actuators(rig.said[MIRROR_STATE.key][-1]).any()  # type: ignore[arg-type, union-attr]
+    assert actuators(rig.said[MIRROR_STATE.key][-1]).any()
     assert rig.ask("safe").accepted
     assert not rig.ask("close").accepted
     rig.expose(5)
-    assert not actuators(rig.said[MIRROR_STATE.key][-1]).any()  # type: ignore[arg-type, union-attr]
+    assert not actuators(rig.said[MIRROR_STATE.key][-1]).any()
     assert rig.steps(1)[0].mode == wire.LOOP_MODE_SAFED
     assert rig.ask("clear").accepted
     rig.expose(1)
@@ -277,16 +279,14 @@ def test_a_late_joiner_gets_calibration_and_state(rig: Rig) -> None:
 
 
 def test_every_frame_yields_one_step_and_one_command(rig: Rig) -> None:
-    sequences = []
     size = rig.scene.shape[0]
     dark, odd = np.full((size, size), 100, np.uint16), np.zeros((3, 3), np.uint16)
     full = np.full((size, size), 65535, np.uint16)
     good = rig.scene.expose(0, rig.offset_nm)[0]
-    for pixels in (good, odd, good, dark, full, good):
-        sequences.append(rig.put(pixels))
+    sequences = [rig.put(pixels) for pixels in (good, odd, good, dark, full, good)]
     steps = rig.steps(6)
     assert [step.frame_sequence for step in steps] == sequences
-    assert [one.frame_sequence for one in rig.said[COMMAND.key]] == sequences  # type: ignore[attr-defined]
+    assert [one.frame_sequence for one in rig.said[COMMAND.key]] == sequences
     assert [list(step.reasons) for step in steps] == [
         [],
         [wire.REASON_WRONG_SIZE],
@@ -296,8 +296,8 @@ def test_every_frame_yields_one_step_and_one_command(rig: Rig) -> None:
         [],
     ]
     for step, command in zip(steps, rig.said[COMMAND.key], strict=True):
-        assert step.timestamp == command.timestamp  # type: ignore[attr-defined]
-        assert step.command_nm == command.command_nm  # type: ignore[attr-defined]
+        assert step.timestamp == command.timestamp
+        assert step.command_nm == command.command_nm
 
 
 def test_a_camera_that_changes_opens_the_loop(rig: Rig) -> None:
@@ -326,4 +326,4 @@ def test_a_camera_with_a_wrong_clock_is_late_and_does_not_stop_the_controller(
         sent = len(rig.said[COMMAND.key])
         rig.until("a repeated command", lambda: len(rig.said[COMMAND.key]) > sent + 3)
         rig.until("NO_FRAMES", lambda: "NO_FRAMES" in rig.events())
-    assert max(rig.said[TIMING.key][0].transport_ns) == 2**32 - 1  # type: ignore[attr-defined]
+    assert max(rig.said[TIMING.key][0].transport_ns) == 2**32 - 1

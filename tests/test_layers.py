@@ -41,7 +41,7 @@ LONGEST = 400
 
 
 def imports_of(tree: ast.AST) -> Iterator[str]:
-    """Every module imported anywhere in a file, and what is taken from it: `a.b` and `a.b.c` for `from a.b import c`."""
+    """Every module imported anywhere in a file; `a.b` and `a.b.c` for `from a.b import c`."""
     for node in ast.walk(tree):
         if isinstance(node, ast.Import):
             yield from (alias.name for alias in node.names)
@@ -100,7 +100,7 @@ def purity_faults(module: str, source: str) -> list[str]:
             if kind in ("np", "numpy") and attribute in NUMPY_FILES:
                 faults.append(f"uses {text}")
         unseeded = isinstance(node, ast.Call) and ast.unparse(node.func).rpartition(".")[2] in FROM_A_SEED[1:]
-        if unseeded and not (node.args or node.keywords):  # type: ignore[attr-defined]
+        if unseeded and not (node.args or node.keywords):
             faults.append(f"calls {ast.unparse(node)} without a seed")
     return [f"{module} {fault}" for fault in faults]
 

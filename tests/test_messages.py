@@ -24,6 +24,7 @@ from lowfc.contract.messages import (
     Log,
     RawImage,
     Role,
+    Topic,
     from_timestamp,
     image,
     timestamp,
@@ -186,14 +187,14 @@ def test_another_key_is_no_topic(key: str) -> None:
 
 
 @pytest.mark.parametrize("topic", TOPICS, ids=lambda topic: topic.key)
-def test_every_topic_has_a_publisher_a_reader_and_a_sentence(topic: "object") -> None:
-    assert topic.publisher <= EVERYBODY  # type: ignore[attr-defined]
-    assert topic.publisher  # type: ignore[attr-defined]
-    assert Role.RECORDER in topic.subscribers  # type: ignore[attr-defined]
-    assert topic.sentence.endswith(".")  # type: ignore[attr-defined]
-    package = topic.message.DESCRIPTOR.file.package  # type: ignore[attr-defined]
+def test_every_topic_has_a_publisher_a_reader_and_a_sentence(topic: Topic) -> None:
+    assert topic.publisher <= EVERYBODY
+    assert topic.publisher
+    assert Role.RECORDER in topic.subscribers
+    assert topic.sentence.endswith(".")
+    package = topic.message.DESCRIPTOR.file.package
     assert package in ("lowfc.v1", "foxglove")
-    assert "timestamp" in topic.message.DESCRIPTOR.fields_by_name  # type: ignore[attr-defined]
+    assert "timestamp" in topic.message.DESCRIPTOR.fields_by_name
 
 
 def test_only_what_the_loop_waits_for_is_in_the_loop() -> None:

@@ -80,8 +80,8 @@ class Bus(Protocol):
         """Publisher of a topic; the last message of a queryable topic is what `get` on its key returns."""
         ...
 
-    def subscribe(self, topic: Topic, handler: Callable[[Sample], None], name: str = ALL) -> None:
-        """Call `handler` with every message of a topic, of one mirror or process or of all."""
+    def subscribe(self, topic: Topic, handler: Callable[[Sample], None], name: str = ALL) -> Callable[[], None]:
+        """Call `handler` with every message of a topic, of one mirror or process or of all; return what ends it."""
         ...
 
     def queryable(self, key_expression: str, handler: Callable[[Query], None]) -> None:

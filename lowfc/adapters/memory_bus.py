@@ -72,9 +72,11 @@ class MemoryBus:
         self._publishers.append(publisher)
         return publisher
 
-    def subscribe(self, topic: Topic, handler: Callable[[Sample], None], name: str = ALL) -> None:
+    def subscribe(self, topic: Topic, handler: Callable[[Sample], None], name: str = ALL) -> Callable[[], None]:
         """See `Bus.subscribe`."""
-        self._subscriptions.append((topic, topic.at(name), handler))
+        subscription = (topic, topic.at(name), handler)
+        self._subscriptions.append(subscription)
+        return lambda: self._subscriptions.remove(subscription)
 
     def queryable(self, key_expression: str, handler: Callable[[Query], None]) -> None:
         """See `Bus.queryable`."""

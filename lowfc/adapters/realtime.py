@@ -18,6 +18,7 @@ from lowfc.adapters.clock import sharpen_sleep
 
 _SWITCH_INTERVAL_S = 5e-4
 _MCL_CURRENT, _MCL_FUTURE, _MCL_ONFAULT = 1, 2, 4
+_M_TRIM_THRESHOLD, _M_TOP_PAD, _M_MMAP_THRESHOLD = -1, -2, -3
 _CAP_IPC_LOCK = 1 << 14
 
 
@@ -63,14 +64,20 @@ def set_up(priority: int | None, cpus: set[int] | None, lock_memory: bool) -> Gr
     return Granted(tuple(granted), tuple(refused))
 
 
-def step_back() -> Granted:
-    """Prepare a process that must never get in the loop's way, such as the recorder: the normal scheduling class.
+def step_back(priority: int | None) -> Granted:
+    """Prepare a process that must keep up but never get in the loop's way, such as the recorder.
 
-    It is not made nicer than that: with a niceness of 5 on a busy host a recorder lost 15 % of a 1 kHz loop's
-    messages, at 0 none.
+    Its SCHED_FIFO priority, where it may have one, is below the loop's and above all else on the host: in the normal
+    class, beside other work, a recorder loses messages of a 1 kHz loop.
     """
-    os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
-    return Granted(("normal scheduling class",), ())
+    refused: tuple[tuple[str, str], ...] = ()
+    granted = [_keep_memory()]
+    if priority is not None:
+        try:
+            granted.append(_run_first(priority))
+        except OSError as fault:
+            refused = ((f"SCHED_FIFO ({fault.strerror})", "on a busy host the recorder loses messages"),)
+    return Granted(tuple(granted), refused)
 
 
 def _asked(
@@ -105,7 +112,15 @@ def _quiet_interpreter() -> tuple[str, ...]:
     gc.disable()
     sys.setswitchinterval(_SWITCH_INTERVAL_S)
     sharpen_sleep()
-    return "one BLAS thread", "garbage collector off", "timer slack 1 ns"
+    return _keep_memory(), "one BLAS thread", "garbage collector off", "timer slack 1 ns"
+
+
+def _keep_memory() -> str:
+    """Never give freed memory back to the kernel: fetching it again costs a page fault in the middle of a frame."""
+    libc = ctypes.CDLL(None)
+    for option, value in ((_M_MMAP_THRESHOLD, 32 << 20), (_M_TRIM_THRESHOLD, 1 << 30), (_M_TOP_PAD, 4 << 20)):
+        libc.mallopt(option, value)
+    return "memory kept"
 
 
 def _run_first(priority: int) -> str:

@@ -14,7 +14,7 @@ from lowfc.adapters.clock import Clock
 from lowfc.adapters.mailbox import Mailbox
 from lowfc.adapters.realtime import NOTHING, Granted
 from lowfc.contract.events import EVENTS, Level
-from lowfc.contract.messages import EVENT, HEALTH, Log, Topic, timestamp, wire
+from lowfc.contract.messages import EVENT, HEALTH, Topic, timestamp, wire
 
 HEALTH_PERIOD_NS = 500_000_000
 STATES = ("starting", "ready", "running", "stopping", "stopped")
@@ -119,19 +119,15 @@ class Service:
             self._send_health(now_ns)
 
     def finish(self) -> None:
-        """Send the last Health, with all counts: nothing may be published after it."""
+        """Send the last Health, with all counts, and leave the run."""
         self.event("STOPPED", process=self.name, why=self.why)
         self.state = "stopped"
+        self.bus.close()
 
     def event(self, event: str, **details: object) -> None:
         """Publish an event of the table; warnings and worse go to standard error too. Callable from any thread."""
         kind = EVENTS[event]
-        log = Log(
-            timestamp=timestamp(self.clock.now_ns()),
-            level=kind.level.value,  # type: ignore[arg-type]  # the schema's enum is a plain int at run time
-            message=f"{kind.name} {kind.sentence.format(**details)}",
-            name=self.name,
-        )
+        log = kind.log(self.name, self.clock.now_ns(), **details)
         with self._event_lock:
             self._events.put(log.SerializeToString())
         if kind.level >= Level.WARNING:

@@ -196,6 +196,8 @@ class Realtime(Section):
 
     priority: int = Field(50, ge=0, le=98)
     """SCHED_FIFO priority of camera, controller and mirror; 0 for normal scheduling."""
+    recorder_priority: int = Field(10, ge=0, le=98)
+    """SCHED_FIFO priority of the recorder, below the loop's; 0, or a loop without, for normal scheduling."""
     lock_memory: bool = True
     """Keep the processes' memory from being paged out."""
     camera_cpus: list[int] = Field(default_factory=list)
@@ -237,6 +239,11 @@ class Configuration(Section):
                     f"mirror.{name} is {getattr(self.mirror, name):g} nm, but one step of a driver of "
                     f"{self.mirror.driver_bits} bits is {step_nm:g} nm already"
                 )
+        if 0 < self.realtime.priority <= self.realtime.recorder_priority:
+            raise ValueError(
+                f"realtime.recorder_priority, {self.realtime.recorder_priority}, must be below the loop's "
+                f"realtime.priority, {self.realtime.priority}"
+            )
         actuators = self.mirror.rows * self.mirror.columns
         for key in map(str, (*self.mirror.dead, *self.mirror.stuck_nm)):
             if not key.isdecimal() or int(key) >= actuators:

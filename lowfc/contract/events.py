@@ -59,7 +59,7 @@ EVENTS: dict[str, Event] = {
         Event("COMMAND_EXPIRED", Level.WARNING, "the last command expired after {valid_ms:.0f} ms; {action}"),
         Event("COMMAND_BACK", Level.INFO, "commands are back"),
         Event("COMMAND_REFUSED", Level.WARNING, "command refused: {reason}"),
-        Event("RECORDING", Level.INFO, "recording to {file}"),
+        Event("RECORDING", Level.INFO, "recording"),
         Event("MESSAGES_LOST", Level.ERROR, "{count} messages lost on {topic}"),
         Event("RECORDING_FAILED", Level.ERROR, "recording stopped: {why}"),
         Event("BAD_MESSAGE", Level.WARNING, "a message on {topic} could not be read: {why}"),

@@ -1,27 +1,33 @@
 """Percentiles of durations, gathered one by one without keeping them."""
 
+from math import log
+
 import numpy as np
+
+_SMALLEST_NS = 1_000
+_RATIO = 1.01
+_BINS = 2_000
 
 
 class Durations:
-    """Counts durations in bins of 1 us up to 0.1 s; the largest is kept exactly."""
-
-    BIN_NS = 1_000
-    BINS = 100_000
+    """Counts durations in bins of 1 % of their value, from 1 us to 400 s; the largest is kept exactly."""
 
     def __init__(self) -> None:
-        self._counts = [0] * (self.BINS + 1)
+        self._counts = [0] * _BINS
         self.count = 0
         self.max_ns = 0
 
     def add(self, duration_ns: int) -> None:
         """Count one duration."""
-        self._counts[min(max(duration_ns, 0) // self.BIN_NS, self.BINS)] += 1
+        place = int(log(duration_ns / _SMALLEST_NS) * _PER_RATIO) + 1 if duration_ns > _SMALLEST_NS else 0
+        self._counts[min(place, _BINS - 1)] += 1
         self.count += 1
         self.max_ns = max(self.max_ns, duration_ns)
 
     def percentiles_ns(self, *fractions: float) -> list[int]:
         """Durations that these fractions do not exceed, to the upper edge of a bin; 0 where nothing was counted."""
-        cumulated = np.cumsum(self._counts)
-        found = np.searchsorted(cumulated, np.ceil(np.array(fractions) * self.count))
-        return [min(int(index + 1) * self.BIN_NS, self.max_ns) for index in found]
+        places = np.searchsorted(np.cumsum(self._counts), np.ceil(np.array(fractions) * self.count))
+        return [min(round(_SMALLEST_NS * _RATIO ** int(place)), self.max_ns) for place in places]
+
+
+_PER_RATIO = 1 / log(_RATIO)

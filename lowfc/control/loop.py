@@ -220,8 +220,9 @@ def _mirror(settings: Settings, state: State, shape: MirrorShape) -> tuple[State
     if shape.actuators_nm.shape != drive.calibration.grid or not np.isfinite(shape.actuators_nm).all():
         why = f"the mirror has a grid of {shape.actuators_nm.shape}, the calibration {drive.calibration.grid}"
         return state, Outputs(events=[Raised("MIRROR_REFUSED", {"why": why})])
-    same_modes = shape.command_nm.shape == (len(drive.calibration.noll),) and np.isfinite(shape.command_nm).all()
-    command_nm = shape.command_nm if same_modes else drive.inverse @ shape.actuators_nm.reshape(-1)
+    limit_nm = drive.law.limit_nm
+    believed = shape.command_nm.shape == limit_nm.shape and (np.abs(shape.command_nm) <= limit_nm).all()
+    command_nm = shape.command_nm if believed else drive.inverse @ shape.actuators_nm.reshape(-1)
     drive = drive._replace(actuators_nm=shape.actuators_nm, history_nm=(command_nm,) * len(drive.weights))
     events = []
     if command_nm.any():

@@ -115,7 +115,7 @@ def _shorten(limits: Limits, previous_nm: Actuators, kept_nm: Actuators) -> Actu
     """
     margin_nm = limits.margin_nm
     neighbour_nm = limits.neighbour_nm - margin_nm
-    apart_nm, largest_nm = neighbour_difference_nm(previous_nm), float(np.abs(previous_nm).max())
+    apart_nm, largest_nm = neighbour_difference_nm(previous_nm.astype(np.float64)), float(np.abs(previous_nm).max())
     if apart_nm > neighbour_nm or largest_nm > limits.stroke_nm:
         stroke_nm = limits.stroke_nm - margin_nm
         enough = min(neighbour_nm / max(apart_nm, neighbour_nm), stroke_nm / max(largest_nm, stroke_nm))
@@ -132,11 +132,11 @@ def _shorten(limits: Limits, previous_nm: Actuators, kept_nm: Actuators) -> Actu
     return previous_nm + np.float32(fraction) * (kept_nm - previous_nm)
 
 
-def neighbour_difference_nm(actuators_nm: Actuators) -> float:
-    """Largest difference between actuators (rows, columns) side by side, in nm."""
-    rows = np.subtract(actuators_nm[1:], actuators_nm[:-1], dtype=np.float64)
-    columns = np.subtract(actuators_nm[:, 1:], actuators_nm[:, :-1], dtype=np.float64)
-    return float(max(np.abs(rows).max(initial=0), np.abs(columns).max(initial=0)))
+def neighbour_difference_nm(actuators_nm: npt.NDArray[np.floating]) -> float:
+    """Largest difference between actuators (rows, columns) side by side, in nm; rounded as the actuators are."""
+    rows = np.abs(actuators_nm[1:] - actuators_nm[:-1]).max(initial=0)
+    columns = np.abs(actuators_nm[:, 1:] - actuators_nm[:, :-1]).max(initial=0)
+    return float(max(rows, columns))
 
 
 def expired(age_ns: int, valid_for_ns: int) -> bool:

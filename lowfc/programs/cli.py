@@ -113,13 +113,22 @@ def record(
 
     Example: lowfc record --run bench --folder logs
     """
+    from lowfc.adapters.join import clock_of
     from lowfc.adapters.run import open_run
     from lowfc.programs.recorder import record as run_recorder
 
     settings = configuration(config)
     joined = open_run(run, (settings.mirror.name,))
     target = folder if folder is not None else Path(settings.recorder.folder)
-    done = run_recorder(joined, target, configuration=config, calibration=calibration, seed=settings.seed)
+    done = run_recorder(
+        joined,
+        target,
+        configuration=config,
+        calibration=calibration,
+        seed=settings.seed,
+        clock=clock_of(settings),
+        priority=(settings.realtime.priority and settings.realtime.recorder_priority) or None,
+    )
     lost = sum(done.lost.values())
     _print(f"{done.messages} messages in {', '.join(map(str, done.files))}; {lost} lost", error=True)
     if done.failure:

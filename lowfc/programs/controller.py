@@ -5,6 +5,7 @@ from collections import deque
 from lowfc.adapters.bus import ALL, Query, Sample
 from lowfc.adapters.clock import SimulatedClock
 from lowfc.adapters.instrument import settings
+from lowfc.adapters.mailbox import Mailbox
 from lowfc.adapters.service import Service
 from lowfc.contract import codec
 from lowfc.contract.configuration import Configuration
@@ -48,7 +49,8 @@ class Controller:
         self._valid_ns = round(config.control.valid_ms * 1e6)
         self._state = State()
         self._frames = service.mailbox(FRAME)
-        self._mirror = service.mailbox(MIRROR_STATE, name)
+        self._mirror = Mailbox(MIRROR_STATE.at(name))
+        self._leave_mirror = service.bus.subscribe(MIRROR_STATE, self._mirror.put, name)
         self._camera = service.mailbox(CAMERA_STATE)
         self._commands = service.publisher(COMMAND, name)
         self._steps = service.publisher(STEP)
@@ -152,8 +154,10 @@ class Controller:
     def _adopt_mirror(self) -> None:
         """Learn where the mirror is before the first command, so that it does not jump."""
         if self._service.clock.lockstep:  # every lockstep run starts from flat
+            self._leave_mirror()
             return
         sample = self._mirror.take(MIRROR_PATIENCE_S)
+        self._leave_mirror()  # from here its states would only cost time
         shape = codec.decode_mirror(sample.payload) if sample is not None else None
         if shape is not None:
             self._tell(self._advance(shape))

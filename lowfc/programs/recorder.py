@@ -161,7 +161,7 @@ class Recorder:
         self._files.append(self._log.path)
         for sample in self._kept.values():
             self._write(sample)
-        self.service.event("RECORDING", file=self._log.path)
+        self.service.event("RECORDING")
 
     def _turn(self) -> None:
         """Write what has arrived; now and then flush, report and rotate."""
@@ -274,6 +274,8 @@ def record(
     calibration: Path | None = None,
     seed: int | None = None,
     rotation: Rotation = Rotation(),
+    clock: Clock | None = None,
+    priority: int | None = None,
 ) -> Summary:
     """Record a run into `folder` until SIGTERM or SIGINT; the process of `lowfc record`.
 
@@ -284,6 +286,8 @@ def record(
         calibration: FITS file to put into the log.
         seed: of a simulated run.
         rotation: when a log is finished and the next begun.
+        clock: the run's; the host's when None.
+        priority: of SCHED_FIFO, below the loop's; None leaves the normal class.
 
     Raises:
         BusError: another recorder has this run.
@@ -294,8 +298,8 @@ def record(
         for path, media_type in ((configuration, "application/toml"), (calibration, "application/fits"))
         if path is not None
     ]
-    granted = step_back()
-    clock = HostClock()
+    granted = step_back(priority)
+    clock = HostClock() if clock is None else clock
     bus = ZenohBus(run.links, Role.RECORDER, clock)
     try:
         recorder = Recorder(

@@ -61,6 +61,9 @@ CASES = (
     Case("neighbours crossing over", rows(60, -60, 0), rows(-45, 45, 0), ("SLEW",), rows(-40, 40, 0)),
     Case("all neighbours together", rows(500, 500, 500), rows(550, 550, 550), (), rows(550, 550, 550)),
     Case("pressed against neighbours", rows(0, 0, 0), rows(600, -600, -600), ("STROKE",), rows(200, -200, -200), 40),
+    Case(
+        "in the margin of neighbours", rows(200, -199.9996, 0), rows(250, -250, 0), ("NEIGHBOUR",), rows(200, -200, 0)
+    ),
     Case("apart, to flat", rows(600, 0, 0), rows(0, 0, 0), (), rows(0, 0, 0), 20),
     Case("apart, wanting more", rows(600, 0, 0), rows(680, 0, 0), ("NEIGHBOUR",), rows(500, 0, 0)),
     Case("far out, to flat", rows(5000, 5000, 5000), rows(0, 0, 0), (), rows(0, 0, 0), 60),

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import HealthCheck, given
+from hypothesis import HealthCheck, Phase, given
 from hypothesis import settings as hypothesis_settings
 from hypothesis import strategies as st
 from safety_checks import violations
@@ -276,7 +276,7 @@ def test_a_frame_that_the_mirror_would_not_take_does_not_move_the_command() -> N
 
 
 def test_clear_opens_the_loop_and_close_closes_it() -> None:
-    state, every = feed(USUAL, running(), ask("safe"), ask("clear"))
+    state, _ = feed(USUAL, running(), ask("safe"), ask("clear"))
     assert state.mode is LoopMode.OPEN
     state, (outputs,) = feed(USUAL, state, ask("close"))
     assert state.mode is LoopMode.CLOSED
@@ -419,6 +419,14 @@ def test_a_restarted_controller_goes_on_from_the_mirrors_shape(with_modes: bool)
     assert outputs.step.pol_nm == pytest.approx(-before.history_nm[0], abs=0.02)
     later, (outputs,) = feed(USUAL, state, MirrorShape(0, np.zeros(GRID, np.float32), np.zeros(3, np.float32)))
     assert later is state
+
+
+@pytest.mark.parametrize("told_nm", [np.nan, np.inf, 1e30, -200.0])
+def test_a_modal_command_that_cannot_be_is_not_believed(told_nm: float) -> None:
+    before = drive_of(running())
+    shape = MirrorShape(0, before.actuators_nm, np.full(3, told_nm, np.float32))
+    state, _ = feed(USUAL, loaded(USUAL), shape)
+    assert drive_of(state).history_nm[0] == pytest.approx(before.history_nm[0], abs=1e-3)
 
 
 @pytest.mark.parametrize("shape", [np.zeros((5, 4), np.float32), np.full(GRID, np.nan, np.float32)])
@@ -576,7 +584,13 @@ inputs = st.one_of(
 )
 
 
-@hypothesis_settings(max_examples=25, deadline=None, suppress_health_check=list(HealthCheck))
+@hypothesis_settings(
+    max_examples=25,
+    deadline=None,
+    derandomize=True,
+    suppress_health_check=list(HealthCheck),
+    phases=[Phase.explicit, Phase.generate],
+)
 @given(
     script=st.lists(inputs, min_size=200, max_size=200),
     delay=st.sampled_from([1.0, 1.5, 3.0]),

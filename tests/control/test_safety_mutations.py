@@ -34,14 +34,17 @@ MUTATIONS = {
     ),
     "neighbours without a margin": ("> limits.neighbour_nm - margin_nm / 2:", "> limits.neighbour_nm + margin_nm:"),
     "neighbours in a column only": (
-        "max(np.abs(rows).max(initial=0), np.abs(columns).max(initial=0))",
-        "np.abs(rows).max(initial=0)",
+        "float(max(rows, columns))",
+        "float(rows)",
     ),
     "neighbours in a row only": (
-        "max(np.abs(rows).max(initial=0), np.abs(columns).max(initial=0))",
-        "np.abs(columns).max(initial=0)",
+        "float(max(rows, columns))",
+        "float(columns)",
     ),
-    "neighbours without a sign": ("np.abs(rows).max(initial=0)", "rows.max(initial=0)"),
+    "neighbours without a sign": (
+        "np.abs(actuators_nm[1:] - actuators_nm[:-1])",
+        "(actuators_nm[1:] - actuators_nm[:-1])",
+    ),
     "shortened along one axis": ("for axis in (0, 1):", "for axis in (0,):"),
     "shortened along the other axis": ("for axis in (0, 1):", "for axis in (1,):"),
     "shortened too little": ("fraction = min(fraction, float(", "fraction = max(fraction, float("),

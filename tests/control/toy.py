@@ -90,7 +90,7 @@ def settings(**changes: object) -> Settings:
         "leak": (0.0, 0.0),
         "limit_nm": (150.0, 50.0),
     }
-    return Settings(**(usual | changes))  # type: ignore[arg-type]
+    return Settings(**(usual | changes))
 
 
 def loaded(what: Settings) -> State:
@@ -106,4 +106,4 @@ def frame(count: int, modes_nm: npt.ArrayLike = (0, 0, 0), **changes: object) ->
         "age_ns": 100_000,
         "pixels": TOY.pixels(modes_nm),
     }
-    return Frame(**(usual | changes))  # type: ignore[arg-type]
+    return Frame(**(usual | changes))

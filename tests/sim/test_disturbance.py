@@ -14,7 +14,7 @@ RATE_HZ = 1000.0
 
 
 def preset(name: str, seed: int = 1, **more: object) -> Disturbance:
-    return disturbance(name, NOLL, seed, NM_PER_MAS, 550.0, **more)  # type: ignore[arg-type]
+    return disturbance(name, NOLL, seed, NM_PER_MAS, 550.0, **more)
 
 
 def rms_nm(shaken: Disturbance) -> np.ndarray:
@@ -24,7 +24,7 @@ def rms_nm(shaken: Disturbance) -> np.ndarray:
 
 
 @pytest.mark.parametrize("name", PRESETS)
-@settings(max_examples=15, deadline=None)
+@settings(max_examples=15, deadline=None, derandomize=True)
 @given(first=st.integers(0, 10**9), count=st.integers(1, 80), cut=st.integers(0, 80))
 def test_a_frame_is_the_same_in_any_order_and_any_block(name: str, first: int, count: int, cut: int) -> None:
     shaken = preset(name, static_nm={4: 3.0})

@@ -1,0 +1,32 @@
+"""Percentiles without keeping what was counted."""
+
+import numpy as np
+import pytest
+
+from lowfc.control.durations import Durations
+
+
+def test_percentiles_are_numpys_to_a_bin() -> None:
+    rng = np.random.default_rng(6)
+    values_ns = (rng.gamma(2.0, 100_000, 5000)).astype(int)
+    durations = Durations()
+    for value_ns in values_ns:
+        durations.add(int(value_ns))
+    fractions = (0.5, 0.99, 0.999, 1.0)
+    exact = np.quantile(values_ns, fractions, method="inverted_cdf")
+    found = durations.percentiles_ns(*fractions)
+    assert all(0 <= one - other <= Durations.BIN_NS for one, other in zip(found, exact, strict=True))
+    assert (durations.count, durations.max_ns) == (5000, values_ns.max())
+
+
+@pytest.mark.parametrize(("duration_ns", "expected_ns"), [(-5, 0), (0, 0), (10**12, 10**12)])
+def test_what_is_outside_the_bins_is_counted_at_their_ends(duration_ns: int, expected_ns: int) -> None:
+    durations = Durations()
+    durations.add(duration_ns)
+    assert durations.count == 1
+    assert durations.max_ns == expected_ns
+    assert durations.percentiles_ns(0.5)[0] <= max(expected_ns, Durations.BIN_NS)
+
+
+def test_nothing_counted_is_zero() -> None:
+    assert Durations().percentiles_ns(0.5, 0.99) == [0, 0]
