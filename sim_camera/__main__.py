@@ -1,5 +1,6 @@
 """Command line of the simulated camera."""
 
+from contextlib import closing
 from typing import Annotated
 
 import typer
@@ -29,7 +30,8 @@ def camera(
     process = CameraProcess(settings, service, optics, frames)
     service.fill = process.fill
     service.catch_signals()
-    process.run(tuple(wait_for or ()))
+    with closing(service.bus):  # a callback on zenoh's threads must not outlive the interpreter
+        process.run(tuple(wait_for or ()))
 
 
 def main() -> None:

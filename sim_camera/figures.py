@@ -25,7 +25,7 @@ class Figures:
 
     def __init__(self, noll: tuple[int, ...], nm_per_mas: float) -> None:
         """The modes of the truths to come, and what a milliarcsecond of tilt is on the wavefront."""
-        self._tilts = [noll.index(index) for index in (2, 3) if index in noll]
+        self._tilts = slice(0, sum(index in (2, 3) for index in noll))  # they come first
         self._nm_per_mas = nm_per_mas
         self._blocks: list[list[float]] = []
         self._sums = [0.0, 0.0, 0.0, 0.0]

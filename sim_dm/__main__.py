@@ -1,5 +1,7 @@
 """Command line of the simulated mirror."""
 
+from contextlib import closing
+
 from lowfc.adapters.join import join, mirror_role
 from lowfc.adapters.terminal import DEFAULT_RUN, ConfigFile, RunId, configuration, new_app, run_app
 from sim_dm.process import MirrorProcess
@@ -17,7 +19,8 @@ def mirror(run: RunId = DEFAULT_RUN, config: ConfigFile = None) -> None:
     service = join(settings, run, mirror_role(settings.mirror.name), settings.realtime.mirror_cpus)
     process = MirrorProcess(settings, service)
     service.catch_signals()
-    process.run()
+    with closing(service.bus):  # a callback on zenoh's threads must not outlive the interpreter
+        process.run()
 
 
 def main() -> None:

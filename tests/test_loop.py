@@ -9,6 +9,7 @@ from lowfc.control.stability import limiting_gain
 from lowfc.optics.photometry import tilt_nm_per_mas
 
 QUIET = {
+    "camera.rate_hz": 1000,
     "disturbance.preset": "quiet",
     "control.start_mode": "closed",
     "mirror.settling_us": 0,

@@ -33,12 +33,18 @@ class Envelope:
         Raises:
             BusError: `data` has another length.
         """
+        return cls(*cls.unpack(data))
+
+    @staticmethod
+    def unpack(data: bytes) -> tuple[int, int]:
+        """Sequence and publish time of an encoded envelope; errors as for `decode`."""
         if len(data) != _LAYOUT.size:
             raise BusError(
                 f"an envelope is {_LAYOUT.size} bytes (sequence and publish_time_ns, little-endian uint64), "
                 f"got {len(data)}; attach one to every put"
             )
-        return cls(*_LAYOUT.unpack(data))
+        sequence, publish_time_ns = _LAYOUT.unpack(data)
+        return sequence, publish_time_ns
 
 
 def sequence_of(start_s: int, count: int) -> int:

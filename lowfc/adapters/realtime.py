@@ -16,7 +16,7 @@ from threadpoolctl import threadpool_limits
 
 from lowfc.adapters.clock import sharpen_sleep
 
-_SWITCH_INTERVAL_S = 5e-4
+_SWITCH_INTERVAL_S = 5e-3
 _MCL_CURRENT, _MCL_FUTURE, _MCL_ONFAULT = 1, 2, 4
 _M_TRIM_THRESHOLD, _M_TOP_PAD, _M_MMAP_THRESHOLD = -1, -2, -3
 _CAP_IPC_LOCK = 1 << 14
@@ -70,14 +70,15 @@ def step_back(priority: int | None) -> Granted:
     Its SCHED_FIFO priority, where it may have one, is below the loop's and above all else on the host: in the normal
     class, beside other work, a recorder loses messages of a 1 kHz loop.
     """
-    refused: tuple[tuple[str, str], ...] = ()
+    os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))  # not the class of a parent that is in the loop
     granted = [_keep_memory()]
-    if priority is not None:
-        try:
-            granted.append(_run_first(priority))
-        except OSError as fault:
-            refused = ((f"SCHED_FIFO ({fault.strerror})", "on a busy host the recorder loses messages"),)
-    return Granted(tuple(granted), refused)
+    if priority is None:
+        return Granted((*granted, "normal scheduling class"), ())
+    try:
+        return Granted((*granted, _run_first(priority)), ())
+    except OSError as fault:
+        refused = (f"SCHED_FIFO ({fault.strerror})", "on a busy host the recorder loses messages")
+        return Granted(tuple(granted), (refused,))
 
 
 def _asked(

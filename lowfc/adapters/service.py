@@ -119,10 +119,9 @@ class Service:
             self._send_health(now_ns)
 
     def finish(self) -> None:
-        """Send the last Health, with all counts, and leave the run."""
+        """Send the last Health, with all counts: nothing may be published after it."""
         self.event("STOPPED", process=self.name, why=self.why)
         self.state = "stopped"
-        self.bus.close()
 
     def event(self, event: str, **details: object) -> None:
         """Publish an event of the table; warnings and worse go to standard error too. Callable from any thread."""

@@ -35,7 +35,7 @@ def session_config(links: Links, role: str) -> dict[str, Any]:
             "endpoints": [f"{_HOST}:{port}" for name, port in sorted(links.ports.items()) if name != role],
             "timeout_ms": -1,
             "exit_on_failure": False,
-            "retry": {"period_init_ms": 50, "period_max_ms": 200, "period_increase_factor": 2},
+            "retry": {"period_init_ms": 50, "period_max_ms": 1000, "period_increase_factor": 2},
         },
         # Opening waits `delay` ms for the links that are not there yet; whoever is up is connected within a few.
         "scouting": {"delay": 100, "multicast": {"enabled": False}, "gossip": {"enabled": False}},
@@ -136,12 +136,13 @@ class ZenohBus:
     def subscribe(self, topic: Topic, handler: Callable[[Sample], None], name: str = ALL) -> Callable[[], None]:
         """See `Bus.subscribe`; `handler` runs on zenoh's receiving thread."""
         key, host_ns, faults = topic.at(name), self.clock.host_ns, self.faults
+        known_key = None if ALL in key else key
 
         def received(sample: zenoh.Sample) -> None:
             now_ns = host_ns()
             _stay_python()
             try:
-                handler(_sample(sample, now_ns))
+                handler(_sample(sample, now_ns, known_key))
             except Exception as fault:  # zenoh would print it and go on; it is counted here
                 faults.add(f"{self.role}: handler of {key}", fault)
 
@@ -230,9 +231,13 @@ def _stay_python() -> None:
         _known.thread = True
 
 
-def _sample(sample: zenoh.Sample, receive_time_ns: int) -> Sample:
+def _sample(sample: zenoh.Sample, receive_time_ns: int, key: str | None = None) -> Sample:
     attachment = sample.attachment
-    envelope = Envelope.decode(b"" if attachment is None else attachment.to_bytes())
+    sequence, publish_time_ns = Envelope.unpack(b"" if attachment is None else attachment.to_bytes())
     return Sample(
-        str(sample.key_expr), sample.payload.to_bytes(), envelope.sequence, envelope.publish_time_ns, receive_time_ns
+        str(sample.key_expr) if key is None else key,
+        sample.payload.to_bytes(),
+        sequence,
+        publish_time_ns,
+        receive_time_ns,
     )

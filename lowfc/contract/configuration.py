@@ -63,7 +63,7 @@ class SensorSection(Section):
 class Camera(Section):
     """The sensor camera."""
 
-    rate_hz: float = Field(1000.0, gt=0, le=20_000)
+    rate_hz: float = Field(500.0, gt=0, le=20_000)
     """Frames per second."""
     exposure_fraction: float = Field(0.5, gt=0, le=1)
     """Part of the period during which light is collected; the rest is for the loop to react."""

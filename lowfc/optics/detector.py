@@ -75,19 +75,18 @@ def expose(
     mean = np.maximum(electrons, 0.0)
     if detector.clock_induced_charge_e:
         mean = mean + detector.clock_induced_charge_e
-    counted = rng.poisson(mean)
-    if detector.em_gain > 1.0:
-        charge = rng.standard_gamma(counted.astype(np.float32), dtype=np.float32)
-        charge *= np.float32(detector.em_gain)
-    else:
-        charge = counted.astype(np.float32)
+    charge = rng.poisson(mean)
     values = rng.standard_normal(charge.shape, dtype=np.float32) if normal is None else normal
     values *= np.float32(detector.read_noise_e)
-    np.minimum(charge, np.float32(detector.full_well_e), out=charge)
-    values += charge
-    values *= np.float32(1.0 / detector.gain_e_per_dn)
+    if detector.em_gain > 1.0:
+        charge = rng.standard_gamma(charge.astype(np.float32), dtype=np.float32)
+        charge *= np.float32(detector.em_gain)
+    if charge.max() > detector.full_well_e:
+        charge = np.minimum(charge, np.float32(detector.full_well_e))
+    np.add(values, charge, out=values, casting="same_kind")
+    if detector.gain_e_per_dn != 1.0:
+        values *= np.float32(1.0 / detector.gain_e_per_dn)
     values += np.float32(detector.bias_dn)
     np.rint(values, out=values)
-    np.maximum(values, np.float32(0.0), out=values)
-    np.minimum(values, np.float32(saturation_dn(detector)), out=values)
-    return np.asarray(values, dtype=np.uint16)
+    np.clip(values, np.float32(0.0), np.float32(saturation_dn(detector)), out=values)
+    return values.astype(np.uint16)

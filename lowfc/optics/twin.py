@@ -90,8 +90,8 @@ def node_radii(twin: Twin) -> tuple[Float, Float]:
 
 def wavefront_rms_nm(twin: Twin, opd_nm: NDArray[np.floating]) -> float:
     """Rms of a wavefront (used,) over the open pupil, piston removed."""
-    mean = twin.area_weights @ opd_nm
-    variance = float(twin.area_weights @ (opd_nm - mean) ** 2)
+    mean = float(twin.area_weights @ opd_nm)
+    variance = float(twin.area_weights @ (opd_nm * opd_nm)) - mean**2
     return sqrt(max(variance, 0.0))  # a few weights are negative: those of the interpolation's guard nodes
 
 

@@ -3,6 +3,7 @@
 import json
 import sys
 from collections.abc import Sequence
+from contextlib import closing
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -99,7 +100,8 @@ def controller(
     process = Controller(settings, service, found, calibration.name)
     service.fill = process.fill
     service.catch_signals()
-    process.run()
+    with closing(service.bus):  # a callback on zenoh's threads must not outlive the interpreter
+        process.run()
 
 
 @app.command()

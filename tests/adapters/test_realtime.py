@@ -83,5 +83,5 @@ def test_a_host_that_allows_it_grants_real_time() -> None:
 
 def test_the_recorder_steps_back_out_of_its_parents_class() -> None:
     limits = "os.sched_setscheduler(0, os.SCHED_RR, os.sched_param(1))" if may_be_real_time() else ""
-    found = report("step_back()", limits)
-    assert (found["policy"], found["granted"]) == (os.SCHED_OTHER, ["normal scheduling class"])
+    found = report("step_back(None)", limits)
+    assert (found["policy"], found["granted"]) == (os.SCHED_OTHER, ["memory kept", "normal scheduling class"])

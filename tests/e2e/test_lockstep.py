@@ -16,6 +16,8 @@ from lowfc.optics.photometry import tilt_nm_per_mas
 from sim_camera.disturbance import disturbance
 
 GENTLE = """
+[camera]
+rate_hz = 1000
 [disturbance]
 preset = "reaction-wheel"
 scale = 0.3571428
@@ -30,7 +32,7 @@ def test_two_runs_with_one_seed_write_the_same_bytes(tmp_path: Path) -> None:
         folder = tmp_path / name
         folder.mkdir()
         seed = "8" if name == "other" else "7"
-        figures = loop(folder, "--lockstep", "--duration", "0.5", "--seed", seed, "--disturbance", "bench")
+        figures = loop(folder, "--lockstep", "--rate", "1000", "--duration", "0.5", "--seed", seed, "--disturbance", "bench")
         assert figures["frames_published"] == figures["commands_applied"] == 500
         assert figures["messages_lost"] == 0
         logs.append(payloads(figures["log"]))
