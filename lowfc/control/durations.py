@@ -5,7 +5,7 @@ from math import log
 import numpy as np
 
 _SMALLEST_NS = 1_000
-_RATIO = 1.01
+RATIO = 1.01
 _BINS = 2_000
 
 
@@ -27,7 +27,8 @@ class Durations:
     def percentiles_ns(self, *fractions: float) -> list[int]:
         """Durations that these fractions do not exceed, to the upper edge of a bin; 0 where nothing was counted."""
         places = np.searchsorted(np.cumsum(self._counts), np.ceil(np.array(fractions) * self.count))
-        return [min(round(_SMALLEST_NS * _RATIO ** int(place)), self.max_ns) for place in places]
+        edges_ns = [round(_SMALLEST_NS * RATIO ** int(place)) if place < _BINS - 1 else self.max_ns for place in places]
+        return [min(edge_ns, self.max_ns) for edge_ns in edges_ns]
 
 
-_PER_RATIO = 1 / log(_RATIO)
+_PER_RATIO = 1 / log(RATIO)
