@@ -81,23 +81,28 @@ def sim_loop(
 
 @app.command()
 def controller(
-    calibration: Annotated[Path, typer.Option(help="Calibration file (FITS).")],
     run: RunId = DEFAULT_RUN,
     config: ConfigFile = None,
+    calibration: Annotated[
+        Path | None, typer.Option(help="Calibration file (FITS); default: computed from the configuration.")
+    ] = None,
 ) -> None:
     """Run the controller: frames from the bus, commands to it.
 
     Example: lowfc controller --run bench --calibration calibration.fits
     """
+    from rich.console import Console
+
     from lowfc.adapters.calibration_file import load
     from lowfc.adapters.join import join
     from lowfc.contract.messages import Role
+    from lowfc.programs.analytic import analytic
     from lowfc.programs.controller import Controller
 
     settings = configuration(config)
-    found = load(calibration)
+    found = load(calibration) if calibration is not None else analytic(settings, Console(stderr=True))
     service = join(settings, run, Role.CONTROLLER, settings.realtime.controller_cpus)
-    process = Controller(settings, service, found, calibration.name)
+    process = Controller(settings, service, found, calibration.name if calibration is not None else "the configuration")
     service.fill = process.fill
     service.catch_signals()
     with closing(service.bus):  # a callback on zenoh's threads must not outlive the interpreter

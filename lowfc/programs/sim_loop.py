@@ -11,9 +11,8 @@ from typing import Any
 
 from rich.console import Console
 from rich.live import Live
-from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
-from lowfc.adapters import calibration_file, instrument
+from lowfc.adapters import calibration_file
 from lowfc.adapters.clock import HostClock
 from lowfc.adapters.join import mirror_role
 from lowfc.adapters.run import Run, new_run_id, open_run
@@ -21,6 +20,7 @@ from lowfc.adapters.zenoh_bus import ZenohBus
 from lowfc.contract.configuration import Configuration
 from lowfc.contract.errors import LowfcError
 from lowfc.contract.messages import EVENT, HEALTH, Role
+from lowfc.programs.analytic import analytic
 from lowfc.programs.processes import Child, start_all, stop_all
 from lowfc.programs.status import screen, status_line
 from lowfc.programs.watch import Watch, summary
@@ -62,15 +62,8 @@ def sim_loop(config: Configuration, duration_s: float | None, record: bool) -> d
 
 
 def _prepare(config: Configuration, run: Run, console: Console) -> None:
-    """Build what the processes share: the twin in the cache, calibration and configuration in the run's directory."""
-
-    def warn(text: str) -> None:
-        console.print(f"warning: {text}", style="yellow", highlight=False)
-
-    with _progress("building the optical model", console) as advance:
-        optics = instrument.twin(config, advance, warn)
-    mirror = instrument.mirror_on_twin(config, optics, lambda _: None)
-    calibration_file.save(instrument.analytic_calibration(config, optics, mirror), run.path / "calibration.fits")
+    """Put what the processes share into the run's directory: calibration and configuration."""
+    calibration_file.save(analytic(config, console), run.path / "calibration.fits")
     (run.path / "config.toml").write_text(config.to_toml(), encoding="utf-8")
 
 
@@ -124,21 +117,6 @@ def _check(children: list[Child]) -> None:
     for child in children:
         if child.status is not None and not (child.name == Role.CAMERA and child.status == 0):
             raise ProcessDiedError(f"{child.how_it_ended()}; its last words:\n{child.last_words()}")
-
-
-@contextlib.contextmanager
-def _progress(what: str, console: Console) -> Iterator[Callable[[int, int], None]]:
-    """A progress bar that appears with the first step."""
-    columns = (TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn())
-    with Progress(*columns, console=console, transient=True) as bar:
-        tasks: list[Any] = []
-
-        def advance(done: int, total: int) -> None:
-            if not tasks:
-                tasks.append(bar.add_task(what, total=total))
-            bar.update(tasks[0], completed=done, total=total)
-
-        yield advance
 
 
 @contextlib.contextmanager

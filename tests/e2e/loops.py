@@ -5,7 +5,9 @@ import os
 import signal
 import subprocess
 import sys
+import time
 from collections import defaultdict
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -50,6 +52,8 @@ def children(launcher: int) -> dict[str, int]:
     listed = Path(f"/proc/{launcher}/task/{launcher}/children").read_text().split()
     for pid in map(int, listed):
         words = Path(f"/proc/{pid}/cmdline").read_text().split("\0")
+        if "-m" not in words:  # between fork and exec
+            continue
         module = words[words.index("-m") + 1]
         found[module if module != "lowfc" else words[words.index("-m") + 2]] = pid
     return found
@@ -71,3 +75,16 @@ def interrupt(process: "subprocess.Popen[str]", timeout_s: float = 20) -> tuple[
     """Ctrl-C, and everything it said."""
     process.send_signal(signal.SIGINT)
     return process.communicate(timeout=timeout_s)
+
+
+def until(condition: Callable[[], object], timeout_s: float = 30.0) -> None:
+    """Wait for something to be true."""
+    deadline_s = time.monotonic() + timeout_s
+    while not condition():
+        assert time.monotonic() < deadline_s, "waited in vain"
+        time.sleep(0.05)
+
+
+def recorded_bytes(folder: Path) -> int:
+    """Size of the log that is being written in a folder; 4 MB are more than calibration and configuration."""
+    return sum(path.stat().st_size for path in (folder / "logs").glob("*.part"))

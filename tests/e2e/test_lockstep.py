@@ -1,11 +1,13 @@
 """Lockstep over the real bus: the same seed gives the same bytes, and the residual is the predicted one."""
 
+import os
+import signal
 from collections import Counter
 from pathlib import Path
 
 import numpy as np
 import pytest
-from loops import loop, payloads
+from loops import children, loop, payloads, recorded_bytes, start, until
 
 from lowfc.adapters import instrument
 from lowfc.contract.configuration import load
@@ -32,7 +34,9 @@ def test_two_runs_with_one_seed_write_the_same_bytes(tmp_path: Path) -> None:
         folder = tmp_path / name
         folder.mkdir()
         seed = "8" if name == "other" else "7"
-        figures = loop(folder, "--lockstep", "--rate", "1000", "--duration", "0.5", "--seed", seed, "--disturbance", "bench")
+        figures = loop(
+            folder, "--lockstep", "--rate", "1000", "--duration", "0.5", "--seed", seed, "--disturbance", "bench"
+        )
         assert figures["frames_published"] == figures["commands_applied"] == 500
         assert figures["messages_lost"] == 0
         logs.append(payloads(figures["log"]))
@@ -67,3 +71,14 @@ def test_the_residual_is_the_predicted_one(tmp_path: Path) -> None:
     noise = noise_nm(matrix, reference, flux_e, config.camera.read_noise_e)[:2] ** 2 * noise_gain(1.0, 0.0, 1.0)
     predicted_mas = np.sqrt(np.mean(lines + noise)) / nm_per_mas
     assert figures["tilt_residual_mas"] == pytest.approx(predicted_mas, rel=0.1)
+
+
+def test_a_process_that_stands_still_is_named(tmp_path: Path) -> None:
+    """Five seconds of real time without progress end a lockstep run."""
+    process = start(tmp_path, "sim-loop", "--lockstep", "--duration", "600")
+    until(lambda: recorded_bytes(tmp_path) > 4e6)
+    os.kill(children(process.pid)["controller"], signal.SIGSTOP)
+    _, complaints = process.communicate(timeout=40)
+    assert process.returncode == 2
+    assert "nothing was heard of controller" in complaints
+    assert "Traceback" not in complaints

@@ -4,13 +4,12 @@ import os
 import shutil
 import signal
 import subprocess
-import time
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-from loops import children, interrupt, loop, payloads, run, start
+from loops import children, interrupt, loop, payloads, recorded_bytes, run, start, until
 
 from lowfc.contract.messages import RawImage, from_timestamp, topic_of, wire
 
@@ -111,7 +110,7 @@ def test_an_independent_reader_agrees(live: dict[str, Any], topics: dict[str, li
 
 def test_ctrl_c_ends_with_a_summary(tmp_path: Path) -> None:
     process = start(tmp_path, "sim-loop", "--rate", "200", "--disturbance", "quiet")
-    _until(lambda: _recorded(tmp_path) > 4e6)
+    until(lambda: recorded_bytes(tmp_path) > 4e6)
     said, complaints = interrupt(process)
     assert process.returncode == 0, complaints
     assert "frame to command" in said
@@ -122,7 +121,7 @@ def test_ctrl_c_ends_with_a_summary(tmp_path: Path) -> None:
 
 def test_a_process_that_dies_is_named(tmp_path: Path) -> None:
     process = start(tmp_path, "sim-loop", "--rate", "200", "--duration", "60")
-    _until(lambda: _recorded(tmp_path) > 4e6)
+    until(lambda: recorded_bytes(tmp_path) > 4e6)
     os.kill(children(process.pid)["sim_dm"], signal.SIGKILL)
     said, complaints = process.communicate(timeout=30)
     assert process.returncode == 2
@@ -145,17 +144,6 @@ def test_two_loops_on_one_host_do_not_mix(tmp_path: Path) -> None:
     assert figures["frames_published"] == 400
     assert len(payloads(figures["log"])["/lowfc/camera/frame"]) <= 400
     assert '"frames_published": 400' in said
-
-
-def _recorded(folder: Path) -> int:
-    return sum(path.stat().st_size for path in (folder / "logs").glob("*.part"))
-
-
-def _until(condition: Any, timeout_s: float = 30.0) -> None:
-    deadline_s = time.monotonic() + timeout_s
-    while not condition():
-        assert time.monotonic() < deadline_s, "waited in vain"
-        time.sleep(0.05)
 
 
 def test_help_has_examples(tmp_path: Path) -> None:

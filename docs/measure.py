@@ -1,0 +1,105 @@
+"""Measure the simulated loop on this host and put the table into the README.
+
+Example:
+    python docs/measure.py            # runs the loops, writes docs/measured.json and the README's table
+    python docs/measure.py --render   # the README's table again from docs/measured.json
+"""
+
+import argparse
+import json
+import os
+import platform
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+from typing import Any
+
+ROOT = Path(__file__).parents[1]
+MEASURED = ROOT / "docs" / "measured.json"
+README = ROOT / "README.md"
+BEGIN, END = "<!-- measured: begin -->\n", "<!-- measured: end -->"
+
+NORMAL = "[realtime]\npriority = 0\nlock_memory = false\n"
+COMMON = ["--disturbance", "reaction-wheel", "--star-magnitude", "2", "--sensor", "sam27d10_bal14", "--duration", "20"]
+RUNS: tuple[tuple[str, list[str], str], ...] = (
+    ("500 Hz, SCHED_FIFO", ["--rate", "500"], ""),
+    ("500 Hz, normal scheduling", ["--rate", "500"], NORMAL),
+    ("1000 Hz, SCHED_FIFO", ["--rate", "1000"], ""),
+    ("1000 Hz, normal scheduling", ["--rate", "1000"], NORMAL),
+    ("1000 Hz in lockstep", ["--rate", "1000", "--lockstep"], ""),
+)
+
+
+def host() -> dict[str, Any]:
+    """What the figures depend on."""
+    lines = Path("/proc/cpuinfo").read_text().splitlines()
+    names = [line.partition(":")[2].strip() for line in lines if line.startswith("model name")]
+    return {
+        "processor": names[0] if names else platform.machine(),
+        "processors": os.cpu_count(),
+        "kernel": platform.release(),
+        "python": platform.python_version(),
+        "date": time.strftime("%Y-%m-%d", time.gmtime()),
+        "load_before": round(os.getloadavg()[0], 2),
+    }
+
+
+def measure() -> dict[str, Any]:
+    """Run every loop once and keep what `--json` prints."""
+    found: dict[str, Any] = {"host": host(), "command": ["lowfc", "sim-loop", *COMMON], "runs": {}}
+    for name, arguments, toml in RUNS:
+        with tempfile.TemporaryDirectory() as folder:
+            (Path(folder) / "run.toml").write_text(toml)
+            words = [sys.executable, "-m", "lowfc", "sim-loop", "--config", "run.toml", *COMMON, *arguments, "--json"]
+            done = subprocess.run(words, cwd=folder, stdout=subprocess.PIPE, text=True, check=True)  # noqa: S603
+            found["runs"][name] = json.loads(done.stdout) | {"log": None}
+    return found
+
+
+def render(measured: dict[str, Any]) -> str:
+    """The table in Markdown, with the host it was measured on."""
+    rows = [
+        "| loop | rate | tilt per axis, mas rms | frame to command, us | frame to mirror, us "
+        "| frames skipped or missing | messages lost |",
+        "|---|---|---|---|---|---|---|",
+    ]
+    for name, run in measured["runs"].items():
+        command, mirror = (
+            " / ".join(f"{run['latency_us'][stage][p]:.0f}" for p in ("p50", "p99", "p99_9"))
+            for stage in ("frame_to_command", "frame_to_mirror")
+        )
+        dropped = run["frames_skipped"] + run["frames_missing"]
+        rows.append(
+            f"| {name} | {run['rate_hz']:.1f} Hz | {run['tilt_residual_mas']:.2f} of {run['tilt_disturbance_mas']:.1f} "
+            f"| {command} | {mirror} | {dropped} of {run['frames_published']} "
+            f"| {run['messages_lost']} of {run['messages_lost'] + run['messages_recorded']} |"
+        )
+    about = measured["host"]
+    where = (
+        f"Latencies are p50 / p99 / p99.9. Measured {about['date']} on {about['processors']} cores of "
+        f"{about['processor']} (a virtual machine, Linux {about['kernel']}, Python {about['python']}, load "
+        f"{about['load_before']} before) by `python docs/measure.py`, which runs `{' '.join(measured['command'])}`."
+    )
+    return "\n".join([*rows, "", where, ""])
+
+
+def put(table: str) -> None:
+    """Replace what is between the README's marks."""
+    before, _, rest = README.read_text().partition(BEGIN)
+    _, _, after = rest.partition(END)
+    README.write_text(f"{before}{BEGIN}{table}{END}{after}")
+
+
+def main() -> None:
+    """Command line."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--render", action="store_true", help="use docs/measured.json as it is")
+    if not parser.parse_args().render:
+        MEASURED.write_text(json.dumps(measure(), indent=1) + "\n")
+    put(render(json.loads(MEASURED.read_text())))
+
+
+if __name__ == "__main__":
+    main()

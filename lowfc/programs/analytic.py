@@ -1,0 +1,42 @@
+"""The analytic calibration of a configured instrument, with a progress bar where the optical model must be built."""
+
+import contextlib
+from collections.abc import Callable, Iterator
+
+from rich.console import Console
+from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeElapsedColumn
+
+from lowfc.adapters import instrument
+from lowfc.contract.configuration import Configuration
+from lowfc.control.calibration import Calibration
+
+
+def analytic(config: Configuration, console: Console) -> Calibration:
+    """I0, H and R from the paper's equations; the optical model goes into the cache, from where the camera takes it.
+
+    Raises:
+        CalibrationError: this sensor cannot tell the modes apart.
+        DataFileError: a layout is missing or damaged.
+    """
+
+    def warn(text: str) -> None:
+        console.print(f"warning: {text}", style="yellow", highlight=False, soft_wrap=True)
+
+    with _progress("building the optical model", console) as advance:
+        optics = instrument.twin(config, advance, warn)
+    return instrument.analytic_calibration(config, optics, instrument.mirror_on_twin(config, optics, lambda _: None))
+
+
+@contextlib.contextmanager
+def _progress(what: str, console: Console) -> Iterator[Callable[[int, int], None]]:
+    """A progress bar that appears with the first step."""
+    columns = (TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn())
+    with Progress(*columns, console=console, transient=True) as bar:
+        tasks: list[TaskID] = []
+
+        def advance(done: int, total: int) -> None:
+            if not tasks:
+                tasks.append(bar.add_task(what, total=total))
+            bar.update(tasks[0], completed=done, total=total)
+
+        yield advance

@@ -1,0 +1,130 @@
+"""Documents that cannot rot: every command in them is run, every figure comes from a file."""
+
+import json
+import re
+import shlex
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+from loops import children, interrupt, recorded_bytes, start, until
+
+ROOT = Path(__file__).parents[1]
+README = ROOT / "README.md"
+sys.path.insert(0, str(ROOT / "docs"))
+
+# Run by CI itself, which runs this test; and by the test of the viewer.
+ELSEWHERE = {"make sim-loop": ".ci/run", "make test": ".ci/run", "rerun logs/*.mcap": "tests/e2e/test_viewer.py"}
+PROGRAMS = ("lowfc", "sim-camera", "sim-dm", "make", "rerun", "python")
+
+
+def commands(document: Path) -> list[str]:
+    """Command lines of a document: indented by four, without the comment behind them."""
+    lines = re.findall(r"^    (\S.*)$", document.read_text(), flags=re.MULTILINE)
+    bare = [line.split("  #")[0].strip() for line in lines]
+    return [line for line in bare if line.split()[0] in PROGRAMS]
+
+
+def run(folder: Path, command: str) -> str:
+    """Run a documented command as it stands, only shorter."""
+    words = shlex.split(command.replace("--duration 20", "--duration 2"), comments=True)
+    output = None
+    if ">" in words:
+        output = folder / words[words.index(">") + 1]
+        words = words[: words.index(">")]
+    program = Path(sys.executable).parent / words[0]
+    done = subprocess.run([program, *words[1:]], cwd=folder, capture_output=True, text=True, timeout=120, check=False)
+    assert done.returncode == 0, f"{command}: {done.stderr}"
+    if output is not None:
+        output.write_text(done.stdout)
+    return done.stdout
+
+
+def test_every_command_of_the_documents_is_known() -> None:
+    found = [
+        line for document in (README, *ROOT.glob("docs/*.md"), *ROOT.glob("deploy/*.md")) for line in commands(document)
+    ]
+    assert len(found) > 15
+    tested = {*ELSEWHERE, *LOOPS, *REQUESTS, *FILES, *BY_HAND, *SESSION, *BENCH}
+    assert set(found) == tested
+    for command, where in ELSEWHERE.items():
+        assert command.split()[0] in (ROOT / where).read_text()
+
+
+LOOPS = (
+    "lowfc sim-loop --rate 1000 --duration 20 --disturbance reaction-wheel --star-magnitude 2",
+    "lowfc sim-loop --lockstep --duration 2 --seed 7",
+)
+REQUESTS = (
+    "lowfc ctl status",
+    "lowfc ctl gain 0.3 --mode 2 --mode 3",
+    "lowfc ctl open",
+    "lowfc ctl close",
+    "lowfc ctl safe",
+    "lowfc ctl clear",
+)
+FILES = (
+    "lowfc config show > lowfc.toml",
+    "lowfc config check lowfc.toml",
+    "lowfc sim-loop --config lowfc.toml --duration 2",
+)
+BY_HAND = ("sim-camera --run bench", "sim-dm --run bench", "lowfc controller --run bench", "lowfc record --run bench")
+SESSION = ("lowfc config zenoh --run bench --role camera",)
+BENCH = ("lowfc bench twin",)
+
+
+@pytest.mark.parametrize("command", LOOPS)
+def test_the_loops(tmp_path: Path, command: str) -> None:
+    assert "frame to command" in run(tmp_path, command)
+    assert len(list((tmp_path / "logs").glob("*.mcap"))) == 1
+
+
+def test_the_configuration(tmp_path: Path) -> None:
+    for command in FILES:
+        run(tmp_path, command)
+
+
+def test_the_requests(tmp_path: Path) -> None:
+    loop = start(tmp_path, "sim-loop", "--rate", "100", "--no-record")
+    try:
+        until(lambda: "controller" in children(loop.pid))
+        time.sleep(3)
+        said = [run(tmp_path, command) for command in REQUESTS]
+    finally:
+        out, complaints = interrupt(loop)
+    assert loop.returncode == 0, complaints
+    assert "LOOP_MODE_CLOSED" in said[0]
+    assert "gain is now 0.3 0.3 0.05" in said[1]
+    assert [text.split(",")[0] for text in said[2:]] == ["loop open", "loop closed", "loop safed", "loop open"]
+    assert "frame to command" in out
+
+
+def test_the_processes_by_hand(tmp_path: Path) -> None:
+    program = Path(sys.executable).parent
+    started = [
+        subprocess.Popen([program / words[0], *words[1:]], cwd=tmp_path, stderr=subprocess.PIPE, text=True)
+        for words in map(str.split, BY_HAND)
+    ]
+    try:
+        until(lambda: recorded_bytes(tmp_path) > 4e6)
+        session = json.loads(run(tmp_path, SESSION[0]))
+        assert session["listen"]["endpoints"][0].startswith("tcp/127.0.0.1:")
+    finally:
+        for process in started:
+            process.terminate()
+        complaints = [process.communicate(timeout=20)[1] for process in started]
+    assert [process.returncode for process in started] == [0] * 4, complaints
+    assert len(list((tmp_path / "logs").glob("*.mcap"))) == 1
+
+
+def test_the_bench(tmp_path: Path) -> None:
+    assert "rank" in run(tmp_path, BENCH[0])
+
+
+def test_the_readmes_figures_are_the_measured_ones() -> None:
+    import measure
+
+    table = README.read_text().partition(measure.BEGIN)[2].partition(measure.END)[0]
+    assert table == measure.render(json.loads(measure.MEASURED.read_text()))
