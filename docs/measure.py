@@ -16,6 +16,9 @@ import time
 from pathlib import Path
 from typing import Any
 
+from lowfc.contract.configuration import load
+from sim_camera.prediction import tilt_residual_mas
+
 ROOT = Path(__file__).parents[1]
 MEASURED = ROOT / "docs" / "measured.json"
 README = ROOT / "README.md"
@@ -55,15 +58,28 @@ def measure() -> dict[str, Any]:
             words = [sys.executable, "-m", "lowfc", "sim-loop", "--config", "run.toml", *COMMON, *arguments, "--json"]
             done = subprocess.run(words, cwd=folder, stdout=subprocess.PIPE, text=True, check=True)  # noqa: S603
             found["runs"][name] = json.loads(done.stdout) | {"log": None}
+            found["runs"][name]["tilt_predicted_mas"] = round(predicted_mas(arguments, found["runs"][name]), 4)
     return found
+
+
+def predicted_mas(arguments: list[str], run: dict[str, Any]) -> float:
+    """The tilt residual that theory gives for the delay as measured: one frame, two where commands were late."""
+    rate_hz = float(arguments[arguments.index("--rate") + 1])
+    overrides = {
+        "camera.rate_hz": rate_hz,
+        "disturbance.preset": "reaction-wheel",
+        "star.magnitude": 2.0,
+        "sensor.sam": "sam27d10_bal14",
+    }
+    return tilt_residual_mas(load(None, overrides), 1 + run["commands_late"] / run["frames_published"])
 
 
 def render(measured: dict[str, Any]) -> str:
     """The table in Markdown, with the host it was measured on."""
     rows = [
-        "| loop | rate | tilt per axis, mas rms | frame to command, us | frame to mirror, us "
+        "| loop | rate | tilt per axis, mas rms | predicted | frame to command, us | frame to mirror, us "
         "| frames skipped or missing | messages lost |",
-        "|---|---|---|---|---|---|---|",
+        "|---|---|---|---|---|---|---|---|",
     ]
     for name, run in measured["runs"].items():
         command, mirror = (
@@ -73,12 +89,14 @@ def render(measured: dict[str, Any]) -> str:
         dropped = run["frames_skipped"] + run["frames_missing"]
         rows.append(
             f"| {name} | {run['rate_hz']:.1f} Hz | {run['tilt_residual_mas']:.2f} of {run['tilt_disturbance_mas']:.1f} "
+            f"| {run['tilt_predicted_mas']:.2f} "
             f"| {command} | {mirror} | {dropped} of {run['frames_published']} "
             f"| {run['messages_lost']} of {run['messages_lost'] + run['messages_recorded']} |"
         )
     about = measured["host"]
     where = (
-        f"Latencies are p50 / p99 / p99.9. Measured {about['date']} on {about['processors']} cores of "
+        f"Latencies are p50 / p99 / p99.9; predicted is for the delay as measured, without the frames that were lost. "
+        f"Measured {about['date']} on {about['processors']} cores of "
         f"{about['processor']} (a virtual machine, Linux {about['kernel']}, Python {about['python']}, load "
         f"{about['load_before']} before) by `python docs/measure.py`, which runs `{' '.join(measured['command'])}`."
     )

@@ -124,10 +124,10 @@ class Bench:
 
     def _mirror_projection(self) -> Single:
         """(modes, actuators): modes of the wavefront, twice the surface, per nm of each actuator."""
-        mirror = self._mirror
-        actuators = mirror.y_factors.shape[1] * mirror.x_factors.shape[1]
-        pokes = np.eye(actuators, dtype=np.float32).reshape(actuators, mirror.y_factors.shape[1], -1)
-        return self._project(np.stack([wavefront_nm(mirror, poke) for poke in pokes], axis=1)).astype(np.float32)
+        rows, columns = np.divmod(self._mirror.used, self._optics.axis.size)
+        factors = self._mirror.y_factors[rows][:, :, None] * self._mirror.x_factors[columns][:, None, :]
+        surface = factors.reshape(rows.size, -1) + self._mirror.expand @ self._mirror.reduce
+        return self._project(2 * surface).astype(np.float32)
 
 
 def _standard_normal(rng: np.random.Generator, count: int) -> Single:

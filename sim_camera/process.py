@@ -19,7 +19,7 @@ from lowfc.control.stability import delay_weights
 from lowfc.optics.detector import saturation_dn
 from lowfc.optics.photometry import tilt_nm_per_mas
 from sim_camera.bench import Bench, Truth
-from sim_camera.disturbance import disturbance
+from sim_camera.disturbance import Disturbance, disturbance
 from sim_camera.figures import Figures
 
 Single = npt.NDArray[np.float32]
@@ -31,11 +31,11 @@ WAIT_S = 30.0
 _REMEMBERED = 256
 
 
-def bench(config: Configuration) -> Bench:
-    """The bench of a configuration; its twin comes from the cache."""
+def disturbance_of(config: Configuration) -> Disturbance:
+    """The disturbance of a configuration."""
     section = config.disturbance
     try:
-        shaken = disturbance(
+        return disturbance(
             section.preset,
             config.noll,
             config.seed,
@@ -46,13 +46,17 @@ def bench(config: Configuration) -> Bench:
         )
     except ValueError as error:
         raise ConfigurationError(f"disturbance: {error}") from None
+
+
+def bench(config: Configuration) -> Bench:
+    """The bench of a configuration; its twin comes from the cache."""
     optics = instrument.twin(config, None, _ignore)
     return Bench(
         optics,
         instrument.mirror_on_twin(config, optics, _ignore),
         instrument.detector(config),
         instrument.electrons_per_exposure(config),
-        shaken,
+        disturbance_of(config),
         config.camera.rate_hz,
         config.seed,
         config.camera.noise,

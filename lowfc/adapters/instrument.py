@@ -10,7 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from lowfc.adapters.masks import sensor_from
-from lowfc.adapters.twin_store import load_or_build
+from lowfc.adapters.twin_store import load_or_build, load_or_fit_mirror
 from lowfc.contract.codec import identified
 from lowfc.contract.configuration import Configuration
 from lowfc.contract.errors import CalibrationError, ConfigurationError
@@ -23,7 +23,7 @@ from lowfc.optics.mirror import Mirror, modes_to_actuators
 from lowfc.optics.photometry import Photometry, electrons
 from lowfc.optics.sensor import Sensor
 from lowfc.optics.twin import ACCURATE, FAST, Twin, node_radii, reference, response
-from lowfc.optics.twin_mirror import TwinMirror, twin_mirror, wavefront_nm
+from lowfc.optics.twin_mirror import TwinMirror, wavefront_nm
 from lowfc.optics.zernike import zernikes
 
 Single = npt.NDArray[np.float32]
@@ -87,8 +87,8 @@ def mirror(config: Configuration) -> Mirror:
 
 
 def mirror_on_twin(config: Configuration, optics: Twin, warn: Callable[[str], None]) -> TwinMirror:
-    """The mirror's wavefront at the twin's nodes."""
-    return twin_mirror(sensor(config, warn), optics, mirror(config))
+    """The mirror's wavefront at the twin's nodes, from the cache or fitted."""
+    return load_or_fit_mirror(sensor(config, warn), optics, mirror(config), notice=warn)
 
 
 def mirror_limits(config: Configuration) -> Limits:

@@ -1,4 +1,4 @@
-"""The twin's cache: built once, then read from a file named by a hash of everything it depends on."""
+"""The twin's cache: twin and mirror are built once, then read from files named by a hash of all they depend on."""
 
 import hashlib
 import io
@@ -6,20 +6,24 @@ import logging
 import os
 import tempfile
 from collections.abc import Callable
-from dataclasses import astuple
+from dataclasses import astuple, fields
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from lowfc.optics.band import Band, monochromatic
+from lowfc.optics.mirror import Mirror
 from lowfc.optics.sensor import Sensor
 from lowfc.optics.twin import Operator, Twin, TwinSpec
 from lowfc.optics.twin_build import build
+from lowfc.optics.twin_mirror import TwinMirror, twin_mirror
 
 FORMAT = 1
 """Raised whenever the construction or the file changes: files of another format are not looked at."""
+
+_Kept = TypeVar("_Kept", Twin, TwinMirror)
 
 _log = logging.getLogger(__name__)
 
@@ -57,18 +61,54 @@ def load_or_build(
     band = monochromatic(sensor.wavelength_nm) if band is None else band
     key = operator_hash(sensor, spec, band)
     path = (default_cache_dir() if cache_dir is None else cache_dir) / f"twin-{key[:32]}.npz"
+    return _cached(
+        path,
+        lambda content: _unpack(content, key, spec),
+        lambda: build(sensor, spec, band, key, progress),
+        _pack,
+        notice,
+    )
+
+
+def load_or_fit_mirror(
+    sensor: Sensor,
+    twin: Twin,
+    mirror: Mirror,
+    cache_dir: Path | None = None,
+    notice: Callable[[str], None] = _log.warning,
+) -> TwinMirror:
+    """A mirror on the twin's nodes from the cache, or fitted and put there; arguments as for `load_or_build`."""
+    key = _digest({}, repr((FORMAT, twin.operator_hash, astuple(mirror))))
+    path = (default_cache_dir() if cache_dir is None else cache_dir) / f"mirror-{key[:32]}.npz"
+    return _cached(
+        path,
+        lambda content: TwinMirror(**_arrays(content)),
+        lambda: twin_mirror(sensor, twin, mirror),
+        lambda fitted: _packed({part.name: getattr(fitted, part.name) for part in fields(fitted)}),
+        notice,
+    )
+
+
+def _cached(
+    path: Path,
+    unpack: Callable[[bytes], _Kept],
+    make: Callable[[], _Kept],
+    pack: Callable[[_Kept], bytes],
+    notice: Callable[[str], None],
+) -> _Kept:
+    """What the file holds; made and written there where the file is missing or damaged."""
     try:
-        return _unpack(path.read_bytes(), key, spec)
+        return unpack(path.read_bytes())
     except FileNotFoundError:
         pass
     except Exception as error:  # a damaged file fails in zipfile, zlib, numpy or the checks below: always rebuild
-        notice(f"the cached twin {path} cannot be used and is built again: {type(error).__name__}: {error}")
-    twin = build(sensor, spec, band, key, progress)
+        notice(f"the cached {path} cannot be used and is built again: {type(error).__name__}: {error}")
+    made = make()
     try:
-        _write(path, _pack(twin))
+        _write(path, pack(made))
     except OSError as error:
-        notice(f"the twin is not cached and will be built again next time: {error}")
-    return twin
+        notice(f"{path} cannot be written, so that it will be built again next time: {error}")
+    return made
 
 
 def _digest(arrays: dict[str, NDArray[Any]], extra: str = "") -> str:
@@ -95,16 +135,25 @@ def _pack(twin: Twin) -> bytes:
             f"to_coefficients_{i}": operator.to_coefficients,
             f"basis_{i}": operator.basis,
         }
+    return _packed(arrays)
+
+
+def _packed(arrays: dict[str, NDArray[Any]]) -> bytes:
     stream = io.BytesIO()
     np.savez(stream, allow_pickle=False, checksum=np.array(_digest(arrays)), **arrays)
     return stream.getvalue()
 
 
-def _unpack(content: bytes, key: str, spec: TwinSpec) -> Twin:
+def _arrays(content: bytes) -> dict[str, NDArray[Any]]:
     with np.load(io.BytesIO(content), allow_pickle=False) as stored:
         arrays = {name: stored[name] for name in stored.files}
     if str(arrays.pop("checksum")) != _digest(arrays):
         raise ValueError("the checksum does not match the content")
+    return arrays
+
+
+def _unpack(content: bytes, key: str, spec: TwinSpec) -> Twin:
+    arrays = _arrays(content)
     if str(arrays["operator_hash"]) != key:
         raise ValueError("it was made from other optics")
     operators = tuple(

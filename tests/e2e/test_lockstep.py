@@ -5,17 +5,12 @@ import signal
 from collections import Counter
 from pathlib import Path
 
-import numpy as np
 import pytest
 from loops import children, loop, payloads, recorded_bytes, start, until
 
-from lowfc.adapters import instrument
 from lowfc.contract.configuration import load
 from lowfc.contract.messages import topic_of
-from lowfc.control.calibration import noise_nm
-from lowfc.control.stability import noise_gain, rejection
-from lowfc.optics.photometry import tilt_nm_per_mas
-from sim_camera.disturbance import disturbance
+from sim_camera.prediction import tilt_residual_mas
 
 GENTLE = """
 [camera]
@@ -59,17 +54,7 @@ def test_the_residual_is_the_predicted_one(tmp_path: Path) -> None:
     figures = loop(tmp_path, "--lockstep", "--duration", "20", "--no-record", config=GENTLE, timeout_s=200)
     assert figures["frames_published"] == figures["commands_applied"] == 20_000
     assert figures["tilt_disturbance_mas"] == pytest.approx(5, rel=0.15)
-    config = load(tmp_path / "test.toml")
-    nm_per_mas = tilt_nm_per_mas(config.star.diameter_m)
-    shaken = disturbance("reaction-wheel", config.noll, config.seed, nm_per_mas, 550.0, config.disturbance.scale)
-    rejected = rejection(shaken.frequency_hz, config.camera.rate_hz, 1.0, 0.0, 1.0)
-    lines = np.sum(np.abs(shaken.amplitude_nm[:, :2]) ** 2 / 2 * rejected[:, None] ** 2, axis=0)
-    optics = instrument.twin(config, None, print)
-    calibration = instrument.analytic_calibration(config, optics, instrument.mirror_on_twin(config, optics, print))
-    flux_e = calibration.flux_dn * config.camera.gain_e_per_dn
-    reference, matrix = calibration.reference.astype(float), calibration.reconstructor.astype(float)
-    noise = noise_nm(matrix, reference, flux_e, config.camera.read_noise_e)[:2] ** 2 * noise_gain(1.0, 0.0, 1.0)
-    predicted_mas = np.sqrt(np.mean(lines + noise)) / nm_per_mas
+    predicted_mas = tilt_residual_mas(load(tmp_path / "test.toml"), delay_frames=1.0)
     assert figures["tilt_residual_mas"] == pytest.approx(predicted_mas, rel=0.1)
 
 

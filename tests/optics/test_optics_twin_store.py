@@ -4,8 +4,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from lowfc.adapters.twin_store import default_cache_dir, load_or_build, operator_hash
+from lowfc.adapters.twin_store import default_cache_dir, load_or_build, load_or_fit_mirror, operator_hash
 from lowfc.optics.band import gauss_legendre, monochromatic
+from lowfc.optics.mirror import Mirror
 from lowfc.optics.twin import FAST, Evaluator, TwinSpec, reference
 
 SMALL = TwinSpec(nodes=16, order=4, rank=40, functions=24)  # the real optics, coarser, for tests of the file
@@ -100,7 +101,7 @@ def test_a_directory_that_cannot_be_written_is_not_fatal(sensor, stored, tmp_pat
     said = []
     twin = load_or_build(sensor, SMALL, cache_dir=in_the_way / "cache", notice=said.append)
     same(stored[0], twin)
-    assert any("not cached" in text for text in said)
+    assert any("cannot be written" in text for text in said)
 
 
 def test_two_builders_at_once_do_no_harm(sensor, tmp_path):
@@ -122,3 +123,19 @@ def test_the_cache_follows_xdg(monkeypatch, tmp_path):
 def test_a_cached_twin_makes_the_same_reference(fast, sensor, cache_dir):
     again = load_or_build(sensor, FAST, cache_dir=cache_dir, progress=forbidden)
     np.testing.assert_array_equal(reference(again), reference(fast))
+
+
+def test_a_mirror_is_kept_too_and_a_damaged_one_is_fitted_again(stored, sensor, tmp_path):
+    twin, mirror, said = stored[0], Mirror(rows=6, columns=5, pitches_per_pupil=4.0), []
+    first = load_or_fit_mirror(sensor, twin, mirror, tmp_path, said.append)
+    file = next(tmp_path.glob("mirror-*.npz"))
+    written = file.stat().st_mtime_ns
+    again = load_or_fit_mirror(sensor, twin, mirror, tmp_path, said.append)
+    assert file.stat().st_mtime_ns == written
+    assert not said
+    file.write_bytes(file.read_bytes()[:-100])
+    rebuilt = load_or_fit_mirror(sensor, twin, mirror, tmp_path, said.append)
+    assert "cannot be used" in said[0]
+    for other in (again, rebuilt):
+        for part in ("used", "y_factors", "x_factors", "reduce", "expand"):
+            np.testing.assert_array_equal(getattr(first, part), getattr(other, part))
