@@ -34,6 +34,7 @@ LOOP = ["sim-loop", "--open", "--duration", "7", "--rate", "300", "--seed", "1"]
 LOOP += ["--sensor", "sam27d10_bal14", "--disturbance", "reaction-wheel"]
 OPEN_FOR_BYTES = 4_000_000  # of the log; with the time that `lowfc ctl` takes to start, some two seconds
 WINDOW = (1600, 1000)
+MOST_BYTES = 400_000
 MENU_BAR = 37  # pixels at the top that say nothing about the log
 TIMELINE = "message_log_time"
 FRAME, SURFACE, EVENT = "/lowfc/camera/frame", "/lowfc/mirror/dm/surface", "/lowfc/event"
@@ -56,19 +57,21 @@ def main() -> None:
         folder = Path(name)
         log = run_loop(folder)
         closed_ns = when_closed(log)
+        drawn = layout(log, closed_ns)
         with viewer(folder) as url:
             recording = rr.RecordingStream("lowfc")
             recording.connect_grpc(url)
-            recording.send_blueprint(layout(log, closed_ns))
+            recording.send_blueprint(drawn)
             recording.log_file_from_path(log)
             recording.flush()
-            screenshot = look(ViewerClient.connect(url), closed_ns + 300_000_000)
+            screenshot = look(ViewerClient.connect(url), closed_ns + 200_000_000)
             recording.disconnect()
     picture = Image.open(io.BytesIO(screenshot)).convert("RGB")
     picture = picture.crop((0, MENU_BAR, picture.width, picture.height))
     PICTURE.parent.mkdir(exist_ok=True)
     picture.quantize(256, dither=Image.Dither.NONE).save(PICTURE, optimize=True)
-    print(f"{PICTURE}: {picture.width} x {picture.height}, {PICTURE.stat().st_size / 1000:.0f} kB")
+    if PICTURE.stat().st_size > MOST_BYTES:
+        raise SystemExit(f"{PICTURE} is larger than {MOST_BYTES} bytes")
 
 
 def run_loop(folder: Path) -> Path:
@@ -108,24 +111,24 @@ def layout(log: Path, closed_ns: int) -> rrb.Blueprint:
     calibration = wire.Calibration.FromString(next(messages(log, "/lowfc/calibration"))[1])
     names = [f"Z{noll} {name}" for noll, name in zip(calibration.noll, calibration.mode_names, strict=True)]
     truth_ns = [time_ns for time_ns, _ in messages(log, TRUTH)]
-    whole, around = (truth_ns[0], truth_ns[-1]), (closed_ns - 400_000_000, closed_ns + 700_000_000)
+    whole, around = (truth_ns[0], truth_ns[-1]), (closed_ns - 250_000_000, closed_ns + 450_000_000)
     brightest = max(np.frombuffer(RawImage.FromString(data).data, "<u2").max() for _, data in messages(log, FRAME))
     images = [
-        image("Sensor frame, DN", FRAME, "inferno", (90.0, 0.4 * float(brightest))),
-        image("Mirror surface, ±60 nm", SURFACE, "spectral", (-60.0, 60.0)),
+        image("Sensor frame, DN", log, FRAME, "inferno", (90.0, 0.4 * float(brightest))),
+        image("Mirror surface, ±60 nm", log, SURFACE, "spectral", (-60.0, 60.0)),
     ]
     columns = rrb.TextLogColumns(text_log_columns=["loglevel", "body"])
     events = rrb.TextLogView(origin=EVENT, name="Events", columns=columns)
     wavefront = {".disturbance_rms_nm": ("disturbance", GREY), ".residual_rms_nm": ("residual", BLUE)}
-    rms = plot("Wavefront over the pupil, nm rms", TRUTH, wire.Truth, wavefront, whole)
+    rms = plot("Wavefront over the pupil, nm rms", TRUTH, wire.Truth, wavefront, whole, (0, 70))
 
     def modes(field: str, colours: dict[int, int]) -> dict[str, tuple[str, int]]:
         return {f".{field}[{mode}]": (names[mode], colour) for mode, colour in colours.items()}
 
     tilt, higher = {0: ORANGE, 1: BLUE}, {2: GREEN, 3: PINK, 4: VIOLET, 5: YELLOW, 6: BLUE}
-    errors = plot("Tilt measured, nm rms", STEP, wire.ControlStep, modes("error_nm", tilt), around)
-    commands = plot("Tilt commanded, nm rms", STEP, wire.ControlStep, modes("command_nm", tilt), around)
-    slow = plot("Z4 to Z8 commanded, nm rms", STEP, wire.ControlStep, modes("command_nm", higher), whole)
+    errors = plot("Tilt measured, nm rms", STEP, wire.ControlStep, modes("error_nm", tilt), around, (-75, 75))
+    commands = plot("Tilt commanded, nm rms", STEP, wire.ControlStep, modes("command_nm", tilt), around, (-75, 75))
+    slow = plot("Z4 to Z8 commanded, nm rms", STEP, wire.ControlStep, modes("command_nm", higher), whole, (-10, 30))
     return rrb.Blueprint(
         rrb.Vertical(
             rrb.Horizontal(*images, events, column_shares=[1.0, 1.0, 2.2]),
@@ -140,11 +143,19 @@ def layout(log: Path, closed_ns: int) -> rrb.Blueprint:
     )
 
 
-def image(title: str, topic: str, colormap: str, limits: tuple[float, float]) -> rrb.Spatial2DView:
+def image(
+    title: str, log: Path, topic: str, colormap: rr.components.ColormapLike, limits: tuple[float, float]
+) -> rrb.Spatial2DView:
     """View of an image of the log in false colours, between limits."""
     shown = rr.DepthImage.from_fields(colormap=colormap, depth_range=limits, magnification_filter="nearest")
     mappings = [source(f"DepthImage:{part}", f"Image:{part}") for part in ("buffer", "format")]
-    return rrb.Spatial2DView(origin=topic, name=title, overrides={topic: shown.visualizer(mappings=mappings)})
+    first = RawImage.FromString(next(messages(log, topic))[1])
+    return rrb.Spatial2DView(
+        origin=topic,
+        name=title,
+        overrides={topic: shown.visualizer(mappings=mappings)},
+        visual_bounds=rrb.VisualBounds2D(x_range=(-1, first.width + 1), y_range=(-1, first.height + 1)),
+    )
 
 
 def plot(
@@ -153,6 +164,7 @@ def plot(
     message: type[Message],
     fields: dict[str, tuple[str, int]],
     span: tuple[int, int],
+    limits: tuple[float, float],
 ) -> rrb.TimeSeriesView:
     """View of fields of the project's own messages, each with a name and a colour, over a span of log time."""
     component = f"{message.DESCRIPTOR.full_name}:message"
@@ -168,6 +180,7 @@ def plot(
         name=title,
         overrides={topic: lines},
         axis_x=rrb.TimeAxis(view_range=rrb.TimeRange(start=first, end=last)),
+        axis_y=rrb.ScalarAxis(range=limits),
         plot_legend=rrb.PlotLegend(rrb.Corner2D.LeftTop),
     )
 
@@ -215,9 +228,9 @@ def look(client: ViewerClient, time_ns: int) -> bytes:
     client.set_time(TIMELINE, timestamp=np.datetime64(time_ns, "ns"), play_state="paused")
     time.sleep(8)
     client.set_time(TIMELINE, timestamp=np.datetime64(time_ns, "ns"), play_state="paused")
-    for view in client.get_state().views:
-        for report in view.reports:
-            print(f"{view.name}: {report.summary}", file=sys.stderr)
+    failed = [f"{view.name}: {report.summary}" for view in client.get_state().views for report in view.reports]
+    if failed:
+        raise SystemExit("\n".join(failed))
     return client.take_screenshot()
 
 

@@ -16,7 +16,7 @@ import time
 from pathlib import Path
 from typing import Any
 
-from lowfc.contract.configuration import load
+from lowfc.contract.configuration import Configuration, load
 from sim_camera.prediction import tilt_residual_mas
 
 ROOT = Path(__file__).parents[1]
@@ -28,6 +28,7 @@ NORMAL = "[realtime]\npriority = 0\nlock_memory = false\n"
 COMMON = ["--disturbance", "reaction-wheel", "--star-magnitude", "2", "--sensor", "sam27d10_bal14", "--duration", "20"]
 RUNS: tuple[tuple[str, list[str], str], ...] = (
     ("500 Hz, SCHED_FIFO", ["--rate", "500"], ""),
+    ("500 Hz, SCHED_FIFO, exposed for 30 % of the period", ["--rate", "500"], "[camera]\nexposure_fraction = 0.3\n"),
     ("500 Hz, normal scheduling", ["--rate", "500"], NORMAL),
     ("1000 Hz, SCHED_FIFO", ["--rate", "1000"], ""),
     ("1000 Hz, normal scheduling", ["--rate", "1000"], NORMAL),
@@ -54,24 +55,29 @@ def measure() -> dict[str, Any]:
     found: dict[str, Any] = {"host": host(), "command": ["lowfc", "sim-loop", *COMMON], "runs": {}}
     for name, arguments, toml in RUNS:
         with tempfile.TemporaryDirectory() as folder:
-            (Path(folder) / "run.toml").write_text(toml)
+            file = Path(folder) / "run.toml"
+            file.write_text(toml)
             words = [sys.executable, "-m", "lowfc", "sim-loop", "--config", "run.toml", *COMMON, *arguments, "--json"]
-            done = subprocess.run(words, cwd=folder, stdout=subprocess.PIPE, text=True, check=True)  # noqa: S603
-            found["runs"][name] = json.loads(done.stdout) | {"log": None}
-            found["runs"][name]["tilt_predicted_mas"] = round(predicted_mas(arguments, found["runs"][name]), 4)
+            done = subprocess.run(words, cwd=folder, stdout=subprocess.PIPE, text=True, check=True)
+            run = json.loads(done.stdout) | {"log": None}
+            run["tilt_predicted_mas"] = round(predicted_mas(load(file, overrides(arguments)), run), 4)
+            found["runs"][name] = run
     return found
 
 
-def predicted_mas(arguments: list[str], run: dict[str, Any]) -> float:
-    """The tilt residual that theory gives for the delay as measured: one frame, two where commands were late."""
-    rate_hz = float(arguments[arguments.index("--rate") + 1])
-    overrides = {
-        "camera.rate_hz": rate_hz,
+def overrides(arguments: list[str]) -> dict[str, Any]:
+    """The configuration keys behind the command line."""
+    return {
+        "camera.rate_hz": float(arguments[arguments.index("--rate") + 1]),
         "disturbance.preset": "reaction-wheel",
         "star.magnitude": 2.0,
         "sensor.sam": "sam27d10_bal14",
     }
-    return tilt_residual_mas(load(None, overrides), 1 + run["commands_late"] / run["frames_published"])
+
+
+def predicted_mas(config: Configuration, run: dict[str, Any]) -> float:
+    """The tilt residual that theory gives for the delay as measured: one frame, two where commands were late."""
+    return tilt_residual_mas(config, 1 + run["commands_late"] / run["frames_published"])
 
 
 def render(measured: dict[str, Any]) -> str:
