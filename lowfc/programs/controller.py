@@ -20,6 +20,7 @@ from lowfc.contract.messages import (
     REQUEST_KEY,
     STEP,
     TIMING,
+    Role,
     timestamp,
     wire,
 )
@@ -119,8 +120,11 @@ class Controller:
             self._publish_state(frame.time_ns)
 
     def _tick(self) -> None:
-        host_ns = self._service.clock.host_ns()
-        outputs = self._advance(Tick(self._service.clock.now_ns(), host_ns - self._last_frame_ns))
+        """No frame: hold the command; a camera that said it stopped is no silence."""
+        camera = self._service.heard.get(Role.CAMERA)
+        stopped = camera is not None and camera.state == "stopped"
+        silent_ns = 0 if stopped else self._service.clock.host_ns() - self._last_frame_ns
+        outputs = self._advance(Tick(self._service.clock.now_ns(), silent_ns))
         self._send(outputs)
         self._tell(outputs)
 

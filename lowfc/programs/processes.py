@@ -34,7 +34,7 @@ class Child:
         """Start it in a session of its own, so that Ctrl-C reaches only the launcher; it dies with the launcher."""
         self._stream = self.said.open("wb")
         self.process = subprocess.Popen(  # noqa: S603  # our own programs
-            [sys.executable, *self.arguments],
+            [sys.executable, "-P", *self.arguments],  # -P: a folder called lowfc where the user stands is not ours
             stdin=subprocess.DEVNULL,
             stdout=subprocess.DEVNULL,
             stderr=self._stream,
