@@ -20,7 +20,7 @@ FRAMES = 3000
 def live(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
     """One run in real time, on which several tests look."""
     folder = tmp_path_factory.mktemp("live")
-    return loop(folder, "--duration", "6", "--rate", "500", "--disturbance", "reaction-wheel", "--seed", "3")
+    return loop(folder, "--duration", "6", "--rate", "500", "--star-magnitude", "0", "--seed", "3")
 
 
 @pytest.fixture(scope="module")
@@ -33,9 +33,8 @@ def test_the_loop_holds_the_wavefront_and_accounts_for_every_frame(live: dict[st
     assert live["frames_processed"] + live["frames_skipped"] + live["frames_missing"] == FRAMES
     assert live["frames_processed"] > 0.9 * FRAMES
     assert 0 < live["commands_applied"] <= live["frames_processed"]
-    assert 10 < live["tilt_disturbance_mas"] < 18
-    assert live["tilt_residual_mas"] < 0.7 * live["tilt_disturbance_mas"]
-    assert live["residual_rms_nm"] < 0.7 * live["disturbance_rms_nm"]
+    assert live["tilt_residual_mas"] < 0.5 * live["tilt_disturbance_mas"]
+    assert live["residual_rms_nm"] < 0.5 * live["disturbance_rms_nm"]
     for stage in ("frame_to_command", "frame_to_mirror"):
         values = live["latency_us"][stage]
         assert 0 < values["p50"] <= values["p99"] <= values["p99_9"] <= values["max"]
