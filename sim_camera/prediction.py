@@ -4,7 +4,6 @@ import numpy as np
 
 from lowfc.adapters import instrument
 from lowfc.contract.configuration import Configuration
-from lowfc.control.calibration import noise_nm
 from lowfc.control.stability import noise_gain, rejection
 from lowfc.optics.photometry import tilt_nm_per_mas
 from sim_camera.process import disturbance_of
@@ -21,9 +20,7 @@ def tilt_residual_mas(config: Configuration, delay_frames: float) -> float:
     waves = np.sum(np.abs(shaken.amplitude_nm[:, :2]) ** 2 / 2 * rejected[:, None] ** 2, axis=0)
     optics = instrument.twin(config, None, _quiet)
     calibration = instrument.analytic_calibration(config, optics, instrument.mirror_on_twin(config, optics, _quiet))
-    reference, R = calibration.reference.astype(float), calibration.reconstructor.astype(float)
-    flux_e = calibration.flux_dn * config.camera.gain_e_per_dn
-    noise = noise_nm(R, reference, flux_e, config.camera.read_noise_e)[:2] ** 2
+    noise = instrument.frame_noise_nm(config, calibration)[:2] ** 2
     through = noise_gain(control.tilt_gain, control.tilt_leak, delay_frames)
     return float(np.sqrt(np.mean(waves + noise * through)) / tilt_nm_per_mas(config.star.diameter_m))
 

@@ -29,6 +29,7 @@ PATIENCE_S = 5.0
 WAIT_S = 30.0
 """How long the first frame waits for those who must not miss it."""
 _REMEMBERED = 256
+_HABIT = 500
 
 
 def disturbance_of(config: Configuration) -> Disturbance:
@@ -192,10 +193,17 @@ class CameraProcess:
             self._latched = shape
             if state.frame_sequence > self._newest_state:
                 self._newest_state = state.frame_sequence
-                self._late += state.frame_sequence < self._last_frame
+                self._count_late(state.frame_sequence < self._last_frame)
                 sequence, put_ns = self._put_ns[state.frame_sequence % _REMEMBERED]
                 if sequence == state.frame_sequence:
                     self._frame_to_mirror.add(sample.publish_time_ns - put_ns)
+
+    def _count_late(self, late: bool) -> None:
+        """Tell once where commands are habitually late."""
+        self._late += late
+        count = self._frame_to_mirror.count
+        if count == _HABIT and self._late > _HABIT / 4:
+            self._service.event("COMMANDS_LATE", percent=100 * self._late / count)
 
     def _wait_for_mirror(self) -> None:
         """In lockstep: until the mirror has applied the command made from the last frame."""

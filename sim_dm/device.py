@@ -71,6 +71,7 @@ class Status(NamedTuple):
         command_nm: the modal command behind it; empty where the mirror's own limits changed it.
         limits_hit: the mirror's own limits that acted on the last command.
         frame_sequence: of the frame behind the last command; its time is `time_ns`.
+        commanded_ns: `time_ns` at the last command; between commands `time_ns` goes on by the mirror's clock.
         received_ns: when the last command came, by the mirror's clock.
         valid_for_ns: how long it may be held.
         following: whether there is a command in force.
@@ -83,6 +84,7 @@ class Status(NamedTuple):
     limits_hit: tuple[Reason, ...] = ()
     frame_sequence: int = 0
     time_ns: int = 0
+    commanded_ns: int = 0
     received_ns: int = 0
     valid_for_ns: int = 0
     following: bool = False
@@ -116,7 +118,9 @@ def obey(device: Device, status: Status, told: Told, now_ns: int) -> tuple[Statu
         valid_for_ns=min(told.valid_for_ns, LONGEST_VALID_NS),
         following=True,
     )
-    return _settle(device, status, told.time_ns), None
+    # From frame to frame, not from the last tick: ticks go by the mirror's own clock, which is ahead of a frame's time.
+    elapsed_ns = told.time_ns - status.commanded_ns if status.commanded_ns else np.inf
+    return _settle(device, status._replace(commanded_ns=told.time_ns), elapsed_ns, told.time_ns), None
 
 
 def tick(device: Device, status: Status, now_ns: int) -> Status:
@@ -126,7 +130,8 @@ def tick(device: Device, status: Status, now_ns: int) -> Status:
     if not status.following and device.flatten and status.driven_nm.any():
         flat = limit(device.tighter, status.driven_nm, np.zeros(device.grid, np.float32)).actuators_nm
         status = status._replace(driven_nm=flat, limits_hit=(), command_nm=_NONE, channels={})
-    return _settle(device, status, max(now_ns, status.time_ns))
+    time_ns = max(now_ns, status.time_ns)
+    return _settle(device, status, time_ns - status.time_ns if status.time_ns else np.inf, time_ns)
 
 
 def _refusal(device: Device, status: Status, told: Told) -> Reason | None:
@@ -139,11 +144,10 @@ def _refusal(device: Device, status: Status, told: Told) -> Reason | None:
     return None
 
 
-def _settle(device: Device, status: Status, time_ns: int) -> Status:
-    """Round to the driver's steps; first-order response of the actuators up to `time_ns`."""
+def _settle(device: Device, status: Status, elapsed_ns: float, time_ns: int) -> Status:
+    """Round to the driver's steps; first-order response of the actuators after `elapsed_ns`, at `time_ns`."""
     step = np.float32(device.step_nm)
     driver_nm = np.round(status.driven_nm / step) * step
-    elapsed_ns = time_ns - status.time_ns if status.time_ns else np.inf
     if device.settling_ns <= 0 or elapsed_ns > 20 * device.settling_ns:
         surface = driver_nm
     else:

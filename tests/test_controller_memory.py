@@ -1,8 +1,10 @@
 """Controller and mirror as they run, on a bus within one process, with a camera that exposes when it is told."""
 
+import tempfile
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -16,6 +18,7 @@ from lowfc.adapters.memory_bus import MemoryBus, MemoryHub
 from lowfc.adapters.service import Service
 from lowfc.contract.codec import actuators
 from lowfc.contract.configuration import Configuration, load
+from lowfc.contract.errors import CalibrationError
 from lowfc.contract.messages import (
     CALIBRATION,
     CAMERA_STATE,
@@ -34,6 +37,7 @@ from lowfc.contract.messages import (
     wire,
 )
 from lowfc.control.calibration import Calibration, noise_nm
+from lowfc.control.safety import LoopMode
 from lowfc.programs.controller import Controller
 from sim_camera.bench import Bench, Truth
 from sim_camera.process import bench
@@ -69,7 +73,8 @@ class Rig:
         self.frames, self.settings = camera.publisher(FRAME), camera.publisher(CAMERA_STATE)
         self.services = [Service(role, "test", self.clock(), self.bus(role)) for role in ("controller", "mirror-dm")]
         self.mirror = MirrorProcess(config, self.services[1])
-        self.controller = Controller(config, self.services[0], calibration, "a test")
+        self.latch = Path(tempfile.mkdtemp()) / "safed"
+        self.controller = Controller(config, self.services[0], calibration, "a test", self.latch)
         self.threads = [threading.Thread(target=one.run) for one in (self.mirror, self.controller)]
         for thread in self.threads:
             thread.start()
@@ -261,8 +266,10 @@ def test_safe_flattens_the_mirror_and_stays(rig: Rig) -> None:
     rig.expose(5)
     assert not actuators(rig.said[MIRROR_STATE.key][-1]).any()
     assert rig.steps(1)[0].mode == wire.LOOP_MODE_SAFED
+    assert rig.latch.exists()
     assert rig.ask("clear").accepted
     rig.expose(1)
+    assert not rig.latch.exists()
     assert rig.steps(1)[0].mode == wire.LOOP_MODE_OPEN
     assert {"SAFED", "MODE_CHANGED"} <= set(rig.events())
 
@@ -327,3 +334,32 @@ def test_a_camera_with_a_wrong_clock_is_late_and_does_not_stop_the_controller(
         rig.until("a repeated command", lambda: len(rig.said[COMMAND.key]) > sent + 3)
         rig.until("NO_FRAMES", lambda: "NO_FRAMES" in rig.events())
     assert max(rig.said[TIMING.key][0].transport_ns) == 2**32 - 1
+
+
+def test_safed_outlives_the_controller(rig: Rig, tmp_path: Path) -> None:
+    """The latch is a file of the run: only an operator's clear removes it."""
+    latch = tmp_path / "safed"
+    closed = configured(control__start_mode="closed")
+
+    def mode() -> LoopMode:
+        service = Service("controller", "test", rig.clock(), MemoryBus(MemoryHub(), "controller", rig.clock()))
+        health = wire.Health()
+        Controller(closed, service, rig.calibration, "a test", latch).fill(health)
+        return LoopMode(health.mode)
+
+    assert mode() is LoopMode.CLOSED
+    latch.touch()
+    assert mode() is LoopMode.SAFED
+    latch.unlink()
+    assert mode() is LoopMode.CLOSED
+
+
+def test_another_mirror_than_the_calibrations_is_refused(rig: Rig, tmp_path: Path) -> None:
+    live = configured(lockstep=False)
+    hub = MemoryHub()
+    service = Service("controller", "test", HostClock(), MemoryBus(hub, "controller", HostClock()))
+    controller = Controller(live, service, rig.calibration, "a test", tmp_path / "safed")
+    small = wire.MirrorState(rows=20, columns=20, actuators=np.zeros(400, np.float32).tobytes())
+    MemoryBus(hub, "mirror-dm", HostClock()).publisher(MIRROR_STATE, "dm").put(small.SerializeToString())
+    with pytest.raises(CalibrationError, match="20, 20"):
+        controller.run()

@@ -14,10 +14,10 @@ from lowfc.adapters.twin_store import load_or_build, load_or_fit_mirror
 from lowfc.contract.codec import identified
 from lowfc.contract.configuration import Configuration
 from lowfc.contract.errors import CalibrationError, ConfigurationError
-from lowfc.control.calibration import Calibration, normalise_flux, reconstructor
+from lowfc.control.calibration import Calibration, noise_nm, normalise_flux, reconstructor
 from lowfc.control.safety import Limits, LoopMode
 from lowfc.control.state import Settings
-from lowfc.optics.band import Band, gauss_legendre, monochromatic
+from lowfc.optics.band import Band, gauss_legendre, monochromatic, uniform
 from lowfc.optics.detector import Detector, saturation_dn
 from lowfc.optics.mirror import Mirror, modes_to_actuators
 from lowfc.optics.photometry import Photometry, electrons
@@ -41,7 +41,8 @@ def band(config: Configuration) -> Band:
     """The wavelengths that stand for the star's band."""
     if config.sensor.wavelengths == 1:
         return monochromatic(config.star.wavelength_nm)
-    return gauss_legendre(config.star.wavelength_nm, config.star.bandwidth, config.sensor.wavelengths)
+    quadrature = gauss_legendre if config.sensor.quadrature == "gauss-legendre" else uniform
+    return quadrature(config.star.wavelength_nm, config.star.bandwidth, config.sensor.wavelengths)
 
 
 def twin(config: Configuration, progress: Progress | None, warn: Callable[[str], None]) -> Twin:
@@ -101,7 +102,7 @@ def settings(config: Configuration) -> Settings:
     control, safety = config.control, config.safety
     return Settings(
         limits=Limits(safety.stroke_nm, safety.slew_nm, safety.neighbour_nm),
-        delay_frames=config.camera.delay_frames,
+        delay_frames=control.delay_frames or config.camera.delay_frames,
         start_mode=LoopMode[control.start_mode.upper()],
         late_ns=round(control.late_ms * 1e6),
         hold_ns=round(control.hold_ms * 1e6),
@@ -129,11 +130,11 @@ def analytic_calibration(config: Configuration, optics: Twin, on_nodes: TwinMirr
     I0, H = reference(optics), response(optics, zernikes(nolls, *radii))
     shape = I0.shape
     good = np.ones(I0.size)
-    flux_e = electrons_per_exposure(config) * float(I0.sum()) * camera.em_gain
+    flux_e = electrons_per_exposure(config) * float(I0.sum())
     light = I0.reshape(-1)
     I0, H = normalise_flux(light, H, good)
     try:
-        R = reconstructor(I0, H, good, flux_e, camera.read_noise_e, config.control.estimator)
+        R = reconstructor(I0, H, good, flux_e, _equivalent_read_noise_e(camera), config.control.estimator)
     except ValueError as error:
         raise CalibrationError(f"sensor.sam = {config.sensor.sam!r}, {len(nolls)} modes: {error}") from None
 
@@ -141,6 +142,8 @@ def analytic_calibration(config: Configuration, optics: Twin, on_nodes: TwinMirr
     pokes = commands.T.reshape(len(nolls), config.mirror.rows, config.mirror.columns)
     seen = response(optics, np.array([wavefront_nm(on_nodes, poke) for poke in pokes], dtype=np.float64))
     commands = commands @ np.linalg.inv(R @ normalise_flux(light, seen, good)[1])
+
+    dark_dn = camera.bias_dn + camera.clock_induced_charge_e * camera.em_gain / camera.gain_e_per_dn
 
     def single(array: npt.NDArray[np.float64]) -> Single:
         return np.ascontiguousarray(array, dtype=np.float32)
@@ -153,11 +156,11 @@ def analytic_calibration(config: Configuration, optics: Twin, on_nodes: TwinMirr
             response=single(H),
             reconstructor=single(R),
             good=single(good),
-            dark=np.full(I0.size, camera.bias_dn, np.float32),
+            dark=np.full(I0.size, dark_dn, np.float32),
             modes_to_actuators=single(commands),
             shape=(shape[0], shape[1]),
             grid=grid,
-            flux_dn=flux_e / camera.gain_e_per_dn,
+            flux_dn=flux_e * camera.em_gain / camera.gain_e_per_dn,
             saturation_dn=float(saturation_dn(camera)),
             estimator=config.control.estimator,
             wavelength_nm=config.star.wavelength_nm,
@@ -165,3 +168,23 @@ def analytic_calibration(config: Configuration, optics: Twin, on_nodes: TwinMirr
             id="",
         )
     )
+
+
+def frame_noise_nm(config: Configuration, calibration: Calibration) -> npt.NDArray[np.float64]:
+    """Standard deviation of each mode of one frame, nm of wavefront rms: photon and read noise through R."""
+    camera = detector(config)
+    flux_e = calibration.flux_dn * camera.gain_e_per_dn / camera.em_gain
+    reference, matrix = calibration.reference.astype(float), calibration.reconstructor.astype(float)
+    excess = np.sqrt(2) if camera.em_gain > 1 else 1.0
+    return excess * noise_nm(matrix, reference, flux_e, _equivalent_read_noise_e(camera))
+
+
+def _equivalent_read_noise_e(camera: Detector) -> float:
+    """Read noise beside photon noise as the weights see it, in electrons before multiplication.
+
+    The register doubles the photons' variance, to 2 (I0 + read_noise^2 / (2 gain^2)); spurious charge counts as light.
+    """
+    read_noise_e = camera.read_noise_e
+    if camera.em_gain > 1:
+        read_noise_e /= camera.em_gain * np.sqrt(2)
+    return float(np.hypot(read_noise_e, np.sqrt(camera.clock_induced_charge_e)))

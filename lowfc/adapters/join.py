@@ -1,14 +1,11 @@
 """How a process of the loop joins a run: real-time set-up first, then clock, bus and service."""
 
-from collections.abc import Callable
-
 from lowfc.adapters.clock import Clock, HostClock, SimulatedClock
 from lowfc.adapters.realtime import set_up
 from lowfc.adapters.run import mirror_role, open_run
 from lowfc.adapters.service import Service
 from lowfc.adapters.zenoh_bus import ZenohBus
 from lowfc.contract.configuration import Configuration
-from lowfc.contract.messages import wire
 
 
 def clock_of(config: Configuration) -> Clock:
@@ -21,9 +18,8 @@ def join(
     run_id: str,
     role: str,
     cpus: list[int],
-    fill: Callable[[wire.Health], None] | None = None,
 ) -> Service:
-    """Set this process up for the loop and join a run; `fill` adds the role's own fields to its Health.
+    """Set this process up for the loop and join a run.
 
     A session's threads keep the scheduling class they are born with, so that comes before the session.
     """
@@ -31,7 +27,7 @@ def join(
     granted = set_up(realtime.priority or None, set(cpus) or None, realtime.lock_memory)
     run = open_run(run_id, (config.mirror.name,))
     clock = clock_of(config)
-    return Service(role, run_id, clock, ZenohBus(run.links, role, clock), granted=granted, fill=fill)
+    return Service(role, run_id, clock, ZenohBus(run.links, role, clock), granted=granted)
 
 
 __all__ = ["clock_of", "join", "mirror_role"]

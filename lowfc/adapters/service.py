@@ -53,7 +53,7 @@ class Service:
         self.heard: dict[str, wire.Health] = {}
         self.publishers: list[Publisher] = []
         self.mailboxes: list[Mailbox] = []
-        self._run_id = run_id
+        self.run_id = run_id
         self._granted = granted
         self.fill = fill
         self._state = "starting"
@@ -157,7 +157,7 @@ class Service:
             timestamp=timestamp(now_ns),
             process=self.name,
             state=self._state,
-            run_id=self._run_id,
+            run_id=self.run_id,
             pid=os.getpid(),
             version=__version__,
             memory_bytes=resident_bytes(),

@@ -6,16 +6,14 @@ from typing import Annotated, Any, NoReturn
 
 import typer
 
+from lowfc.adapters.run import DEFAULT_RUN
 from lowfc.contract.configuration import Configuration, load
 from lowfc.contract.errors import LowfcError
 
-MISTAKE = 2
-"""Exit status for anything the user can put right."""
+__all__ = ["DEFAULT_RUN", "ConfigFile", "RunId", "configuration", "new_app", "run_app"]
 
 RunId = Annotated[str, typer.Option("--run", help="Name of the run; processes of one run find each other by it.")]
 ConfigFile = Annotated[Path | None, typer.Option("--config", help="Configuration file (TOML).", show_default=False)]
-
-DEFAULT_RUN = "default"
 
 
 def new_app(help_text: str) -> typer.Typer:
@@ -35,14 +33,16 @@ def run_app(app: typer.Typer) -> NoReturn:
         app()
     except LowfcError as error:
         sys.stderr.write(f"error: {error}\n")
-        sys.exit(MISTAKE)
+        sys.exit(error.exit_status)
     except KeyboardInterrupt:
         sys.stderr.write("interrupted\n")
         sys.exit(130)
     sys.exit(0)
 
 
-def configuration(file: Path | None, overrides: dict[str, Any] | None = None) -> Configuration:
-    """Configuration of a file with the options given on the command line (those that are not None) over it."""
+def configuration(
+    file: Path | None, overrides: dict[str, Any] | None = None, defaults: dict[str, Any] | None = None
+) -> Configuration:
+    """Configuration of a file, options given on the command line (not None) over it, a command's defaults under it."""
     given = {key: value for key, value in (overrides or {}).items() if value is not None}
-    return load(file, given)
+    return load(file, given, defaults)

@@ -53,7 +53,9 @@ class SensorSection(Section):
     modes: int = Field(14, ge=1, le=35)
     """Zernike modes after piston, from Noll 2 on."""
     wavelengths: int = Field(1, ge=1, le=9)
-    """Gauss-Legendre wavelengths of the simulated band; 1 is monochromatic."""
+    """Wavelengths of the simulated band; 1 is monochromatic."""
+    quadrature: Literal["gauss-legendre", "uniform"] = "gauss-legendre"
+    """How the wavelengths are chosen: uniform is the paper's, both ends included, and far less accurate."""
     nodes: Literal[32, 64] = 32
     """Pupil nodes across the diameter in the real-time twin."""
     rank: int = Field(60, ge=20, le=200)
@@ -63,7 +65,7 @@ class SensorSection(Section):
 class Camera(Section):
     """The sensor camera."""
 
-    rate_hz: float = Field(500.0, gt=0, le=20_000)
+    rate_hz: float = Field(250.0, gt=0, le=20_000)
     """Frames per second."""
     exposure_fraction: float = Field(0.5, gt=0, le=1)
     """Part of the period during which light is collected; the rest is for the loop to react."""
@@ -142,7 +144,10 @@ class Control(Section):
     """The control law."""
 
     start_mode: Literal["open", "closed"] = "open"
-    """Loop mode once a calibration is loaded."""
+    """Loop mode once a calibration is loaded; sim-loop takes closed where the file says nothing."""
+    delay_frames: float = Field(0.0, ge=0, le=10)
+    """Frames from the one a command is made from to the first exposed wholly under it, as measured; 0 takes the
+    camera's. Twice the delay halves the highest stable gain."""
     estimator: Literal["weighted", "pinv"] = "weighted"
     """Noise-weighted or plain pseudo-inverse of H."""
     tilt_gain: float = Field(0.5, ge=0, le=4)
@@ -187,8 +192,6 @@ class Recorder(Section):
 
     folder: str = "logs"
     """Where log files are written."""
-    queue: int = Field(20_000, ge=100)
-    """Messages that may wait to be written."""
 
 
 class Realtime(Section):
@@ -239,6 +242,10 @@ class Configuration(Section):
                     f"mirror.{name} is {getattr(self.mirror, name):g} nm, but one step of a driver of "
                     f"{self.mirror.driver_bits} bits is {step_nm:g} nm already"
                 )
+        if 0 < self.control.delay_frames < 1:
+            raise ValueError(
+                f"control.delay_frames is at least 1, or 0 for the camera's; got {self.control.delay_frames}"
+            )
         if 0 < self.realtime.priority <= self.realtime.recorder_priority:
             raise ValueError(
                 f"realtime.recorder_priority, {self.realtime.recorder_priority}, must be below the loop's "
@@ -270,8 +277,10 @@ class Configuration(Section):
         return tomli_w.dumps(self.model_dump())
 
 
-def load(path: Path | None, overrides: dict[str, Any] | None = None) -> Configuration:
-    """Read a TOML file (None: all defaults) and lay `overrides` over it, a dict of dotted keys to values.
+def load(
+    path: Path | None, overrides: dict[str, Any] | None = None, defaults: dict[str, Any] | None = None
+) -> Configuration:
+    """Read a TOML file (None: all defaults), lay `overrides` over it and `defaults` under it: dotted keys to values.
 
     Raises:
         ConfigurationError: the file is missing or no TOML, or a key or value is wrong.
@@ -284,20 +293,27 @@ def load(path: Path | None, overrides: dict[str, Any] | None = None) -> Configur
             raise ConfigurationError(f"{path}: there is no such configuration file") from None
         except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
             raise ConfigurationError(f"{path}: not a readable TOML file: {error}") from None
+    for key, value in (defaults or {}).items():
+        _put(path, data, key, value, replace=False)
     for key, value in (overrides or {}).items():
-        *sections, last = key.split(".")
-        target = data
-        for section in sections:
-            target = target.setdefault(section, {})
-            if not isinstance(target, dict):
-                raise ConfigurationError(f"{path}: {section} must be a section, [{section}]")
-        target[last] = value
+        _put(path, data, key, value, replace=True)
     try:
         return Configuration.model_validate(data)
     except ValidationError as error:
         lines = [_explain(detail) for detail in error.errors()]
         where = f"{path}: " if path is not None else ""
         raise ConfigurationError("\n".join(f"{where}{line}" for line in lines)) from None
+
+
+def _put(path: Path | None, data: dict[str, Any], key: str, value: object, *, replace: bool) -> None:
+    *sections, last = key.split(".")
+    target = data
+    for section in sections:
+        target = target.setdefault(section, {})
+        if not isinstance(target, dict):
+            raise ConfigurationError(f"{path}: {section} must be a section, [{section}]")
+    if replace or last not in target:
+        target[last] = value
 
 
 def keys(section: type[BaseModel] = Configuration, prefix: str = "") -> dict[str, FieldInfo]:

@@ -14,6 +14,8 @@ The numerics raise ValueError; the adapters above them name the file or the key 
 class LowfcError(Exception):
     """Base of the errors that a user can put right; the text says what was wrong, expected, got and to do."""
 
+    exit_status = 2
+
 
 class ConfigurationError(LowfcError):
     """A configuration key or value is unknown, malformed or out of range."""

@@ -41,7 +41,6 @@ EVENTS: dict[str, Event] = {
         Event("STOPPED", Level.INFO, "{process} stopped: {why}"),
         Event("REALTIME_REFUSED", Level.WARNING, "the host refused {measure}: {cost}"),
         Event("CALIBRATION_LOADED", Level.INFO, "calibration {id}: {modes} modes, {estimator}, from {source}"),
-        Event("CALIBRATION_REFUSED", Level.ERROR, "calibration refused: {why}"),
         Event("CAMERA_CHANGED", Level.WARNING, "the camera no longer fits the calibration ({what}); loop opened"),
         Event("MODE_CHANGED", Level.INFO, "loop {before} -> {after}: {why}"),
         Event("SAFED", Level.ERROR, "safed: {why}; `lowfc ctl clear` when it is safe"),
@@ -59,6 +58,12 @@ EVENTS: dict[str, Event] = {
         Event("COMMAND_EXPIRED", Level.WARNING, "the last command expired after {valid_ms:.0f} ms; {action}"),
         Event("COMMAND_BACK", Level.INFO, "commands are back"),
         Event("COMMAND_REFUSED", Level.WARNING, "command refused: {reason}"),
+        Event(
+            "COMMANDS_LATE",
+            Level.WARNING,
+            "{percent:.0f} % of the commands came after the next exposure had begun: the delay is a frame longer than "
+            "control.delay_frames says, and the highest stable gain lower; reduce the rate or set it",
+        ),
         Event("RECORDING", Level.INFO, "recording"),
         Event("MESSAGES_LOST", Level.ERROR, "{count} messages lost on {topic}"),
         Event("RECORDING_FAILED", Level.ERROR, "recording stopped: {why}"),

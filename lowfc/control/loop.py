@@ -139,11 +139,9 @@ def _refuse(
     drive = state.drive
     held = np.zeros(0, np.float32)
     if drive is not None:
-        if reason in (Reason.REPEATED, Reason.OUT_OF_ORDER):  # no exposure, and the mirror takes no older command
-            pass
-        elif state.mode is LoopMode.SAFED:
+        if state.mode is LoopMode.SAFED:
             drive = _relax(settings, drive)
-        else:
+        elif reason not in (Reason.REPEATED, Reason.OUT_OF_ORDER):  # those are no new exposure
             drive = drive.stayed(1)
         held = drive.history_nm[0]
     state = state._replace(
@@ -158,7 +156,8 @@ def _refuse(
 def _send(state: State, step: Step, events: list[Raised]) -> tuple[State, Outputs]:
     if state.drive is None:
         return state, Outputs(step=step, events=events)
-    command = Command(step.frame_sequence, step.time_ns, state.drive.actuators_nm, step.command_nm)
+    # Under the newest frame's sequence even where an older frame came: the mirror refuses older commands.
+    command = Command(state.frame_sequence, state.frame_time_ns, state.drive.actuators_nm, step.command_nm)
     return state._replace(commanded=True), Outputs(step=step, command=command, events=events)
 
 

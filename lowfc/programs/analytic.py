@@ -3,6 +3,7 @@
 import contextlib
 from collections.abc import Callable, Iterator
 
+import numpy as np
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeElapsedColumn
 
@@ -24,7 +25,16 @@ def analytic(config: Configuration, console: Console) -> Calibration:
 
     with _progress("building the optical model", console) as advance:
         optics = instrument.twin(config, advance, warn)
-    return instrument.analytic_calibration(config, optics, instrument.mirror_on_twin(config, optics, lambda _: None))
+    made = instrument.analytic_calibration(config, optics, instrument.mirror_on_twin(config, optics, lambda _: None))
+    noise = instrument.frame_noise_nm(config, made)
+    worst = int(np.argmax(noise))
+    if noise[worst] > config.control.limit_nm:
+        warn(
+            f"Z{made.noll[worst]} is measured with {noise[worst]:.0f} nm rms of noise in each frame, more than the "
+            f"{config.control.limit_nm:g} nm that its command is limited to: "
+            "the star is too faint, or the mask cannot tell so many modes apart"
+        )
+    return made
 
 
 @contextlib.contextmanager

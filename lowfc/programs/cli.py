@@ -44,7 +44,7 @@ def root(
 @app.command("sim-loop")
 def sim_loop(
     config: ConfigFile = None,
-    duration: Annotated[float | None, typer.Option(min=0.01, help="Seconds; default: until Ctrl-C.")] = None,
+    duration: Annotated[float | None, typer.Option(min=0.01, max=1e7, help="Seconds; default: until Ctrl-C.")] = None,
     rate: Annotated[float | None, typer.Option(help="Frames per second.")] = None,
     disturbance: Annotated[Preset | None, typer.Option(help="What shakes the wavefront.")] = None,
     seed: Annotated[int | None, typer.Option(help="Seed of every random number.")] = None,
@@ -73,9 +73,10 @@ def sim_loop(
         "sensor.sam": sensor,
         "star.magnitude": star_magnitude,
         "lockstep": lockstep or None,
-        "control.start_mode": "open" if open_loop else "closed",
+        "control.start_mode": "open" if open_loop else None,
     }
-    figures = run(configuration(config, overrides), duration, record=not no_record)
+    settings = configuration(config, overrides, {"control.start_mode": "closed"})
+    figures = run(settings, duration, record=not no_record)
     _print(json.dumps(figures) if as_json else report(figures))
 
 
@@ -95,6 +96,7 @@ def controller(
 
     from lowfc.adapters.calibration_file import load
     from lowfc.adapters.join import join
+    from lowfc.adapters.run import open_run
     from lowfc.contract.messages import Role
     from lowfc.programs.analytic import analytic
     from lowfc.programs.controller import Controller
@@ -102,7 +104,8 @@ def controller(
     settings = configuration(config)
     found = load(calibration) if calibration is not None else analytic(settings, Console(stderr=True))
     service = join(settings, run, Role.CONTROLLER, settings.realtime.controller_cpus)
-    process = Controller(settings, service, found, calibration.name if calibration is not None else "the configuration")
+    source = calibration.name if calibration is not None else "the configuration"
+    process = Controller(settings, service, found, source, open_run(run, (settings.mirror.name,)).path / "safed")
     service.fill = process.fill
     service.catch_signals()
     with closing(service.bus):  # a callback on zenoh's threads must not outlive the interpreter

@@ -1,6 +1,8 @@
 """The controller's process: `advance` folded over what the bus brings; the command first, then all the rest."""
 
 from collections import deque
+from dataclasses import replace
+from pathlib import Path
 
 from lowfc.adapters.bus import ALL, Query, Sample
 from lowfc.adapters.clock import SimulatedClock
@@ -9,6 +11,7 @@ from lowfc.adapters.mailbox import Mailbox
 from lowfc.adapters.service import Service
 from lowfc.contract import codec
 from lowfc.contract.configuration import Configuration
+from lowfc.contract.errors import CalibrationError
 from lowfc.contract.messages import (
     CALIBRATION,
     CAMERA_STATE,
@@ -20,7 +23,6 @@ from lowfc.contract.messages import (
     REQUEST_KEY,
     STEP,
     TIMING,
-    Role,
     timestamp,
     wire,
 )
@@ -28,6 +30,7 @@ from lowfc.control.calibration import Calibration
 from lowfc.control.durations import Durations
 from lowfc.control.inputs import Input, Load, Outputs, Reply, Request, Tick
 from lowfc.control.loop import advance
+from lowfc.control.safety import LoopMode
 from lowfc.control.state import State
 
 TICK_S = 0.01
@@ -42,11 +45,16 @@ CHANNEL = "lowfc"
 class Controller:
     """Receives frames, sends commands, answers operators, until told to stop."""
 
-    def __init__(self, config: Configuration, service: Service, calibration: Calibration, source: str) -> None:
-        """Declare everything on the bus and load the calibration."""
+    def __init__(
+        self, config: Configuration, service: Service, calibration: Calibration, source: str, latch: Path
+    ) -> None:
+        """Declare everything on the bus and load the calibration; the file `latch` is there while the loop is safed."""
         name = config.mirror.name
         self._service = service
+        self._latch = latch
         self._settings = settings(config)
+        if latch.exists():  # safed stays safed when the controller dies
+            self._settings = replace(self._settings, start_mode=LoopMode.SAFED)
         self._valid_ns = round(config.control.valid_ms * 1e6)
         self._state = State()
         self._frames = service.mailbox(FRAME)
@@ -104,7 +112,8 @@ class Controller:
         self._send(outputs)
         sent_ns = clock.host_ns()
         self._tell(outputs)
-        self._last_frame_ns = taken_ns
+        if sample.sequence == self._state.frame_sequence:  # an older one is no sign of a live camera
+            self._last_frame_ns = taken_ns
         self._service.work += 1
         self._frame_to_command.add(sent_ns - sample.publish_time_ns)
         timing = self._timing
@@ -120,10 +129,8 @@ class Controller:
             self._publish_state(frame.time_ns)
 
     def _tick(self) -> None:
-        """No frame: hold the command; a camera that said it stopped is no silence."""
-        camera = self._service.heard.get(Role.CAMERA)
-        stopped = camera is not None and camera.state == "stopped"
-        silent_ns = 0 if stopped else self._service.clock.host_ns() - self._last_frame_ns
+        """No frame: hold the command."""
+        silent_ns = self._service.clock.host_ns() - self._last_frame_ns
         outputs = self._advance(Tick(self._service.clock.now_ns(), silent_ns))
         self._send(outputs)
         self._tell(outputs)
@@ -164,6 +171,12 @@ class Controller:
         self._leave_mirror()  # from here its states would only cost time
         shape = codec.decode_mirror(sample.payload) if sample is not None else None
         if shape is not None:
+            grid = self._state.drive.calibration.grid if self._state.drive is not None else shape.actuators_nm.shape
+            if shape.actuators_nm.shape != grid:
+                raise CalibrationError(
+                    f"the mirror has {shape.actuators_nm.shape} actuators, the calibration is for {grid}; use the "
+                    "mirror's own calibration"
+                )
             self._tell(self._advance(shape))
         elif self._service.running:
             self._service.event("MIRROR_SILENT", patience_s=MIRROR_PATIENCE_S)
@@ -184,6 +197,10 @@ class Controller:
             self._service.event(event.name, **event.details)
         if outputs.changed:
             self._publish_state(self._service.clock.now_ns())
+            if self._state.mode is LoopMode.SAFED:
+                self._latch.touch()
+            else:
+                self._latch.unlink(missing_ok=True)
 
     def _publish_state(self, time_ns: int) -> None:
         message = codec.controller_state(self._state, self._settings.delay_frames, time_ns)

@@ -39,8 +39,9 @@ def the_run(name: str | None) -> str:
     if name in runs and name is not None:
         return name
     there = f"there are {', '.join(runs)}" if runs else "no loop is running on this host"
-    wanted = f"there is no run {name!r}" if name is not None else "say which run with --run"
-    raise BusError(f"{wanted}: {there}" if runs else there)
+    if name is not None:
+        raise BusError(f"there is no run {name!r}: {there}")
+    raise BusError(f"say which run with --run: {there}" if runs else there)
 
 
 def ask(run_id: str, name: str, modes: tuple[int, ...] = (), values: tuple[float, ...] = ()) -> wire.Request:

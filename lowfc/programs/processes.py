@@ -5,7 +5,6 @@ import ctypes
 import signal
 import subprocess
 import sys
-import time
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import IO
@@ -88,14 +87,6 @@ def stop_all(children: list[Child], patience_s: float = 5.0) -> None:
     """Stop them one after the other, in the order of the list."""
     for child in children:
         child.stop(patience_s)
-
-
-def wait_for_end(child: Child, timeout_s: float) -> bool:
-    """Whether a process ended by itself within the time."""
-    deadline_s = time.monotonic() + timeout_s
-    while child.status is None and time.monotonic() < deadline_s:
-        time.sleep(0.01)
-    return child.status is not None
 
 
 _libc = ctypes.CDLL(None)

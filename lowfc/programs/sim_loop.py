@@ -25,14 +25,17 @@ from lowfc.programs.processes import Child, start_all, stop_all
 from lowfc.programs.status import screen, status_line
 from lowfc.programs.watch import Watch, summary
 
-POLL_S = 0.1
-SETTLE_S = 0.05
+POLL_S = 0.02
+SETTLE_S = 0.02
 """After the last frame, before the controller is stopped: the last command is on its way."""
 LINE_PERIOD_S = 5.0
+SHOW_S = 0.1
 
 
 class ProcessDiedError(LowfcError):
     """A process of the loop ended by itself."""
+
+    exit_status = 1
 
 
 def sim_loop(config: Configuration, duration_s: float | None, record: bool) -> dict[str, Any]:
@@ -97,16 +100,21 @@ def _supervise(
     camera = children[0]
     with _interrupted() as interrupted, _display(console) as show:
         begun_s = time.monotonic()
-        while camera.status is None and not interrupted():
+        shown_s = 0.0
+        while camera.status is None and watch.of(Role.CAMERA).state != "stopped" and not interrupted():
             _check(children[1:])
-            show(watch, config, duration_s, time.monotonic() - begun_s)
+            elapsed_s = time.monotonic() - begun_s
+            if elapsed_s > shown_s + SHOW_S:
+                shown_s = elapsed_s
+                show(watch, config, duration_s, elapsed_s)
             time.sleep(POLL_S)
         if not interrupted():
             _check(children)
-        camera.stop(patience_s=5.0)
+        if interrupted():
+            camera.stop(patience_s=5.0)
         time.sleep(SETTLE_S)
-        stop_all(children)
-        time.sleep(POLL_S)  # the last Health is on its way
+        stop_all([*children[1:], camera])
+        time.sleep(SHOW_S)  # the last Health is on its way
     for child in children:
         if child.status not in (0, -signal.SIGTERM):  # told to end before it was ready is no failure
             raise ProcessDiedError(f"{child.how_it_ended()}\n{child.last_words()}")

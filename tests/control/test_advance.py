@@ -269,10 +269,16 @@ def test_safed_relaxes_the_mirror_frame_by_frame_within_the_limits() -> None:
     assert not drive_of(state).actuators_nm.any()
 
 
-def test_a_frame_that_the_mirror_would_not_take_does_not_move_the_command() -> None:
+@pytest.mark.parametrize("reason", [Reason.OUT_OF_ORDER, Reason.REPEATED])
+def test_safe_flattens_the_mirror_under_a_stuck_camera(reason: Reason) -> None:
+    """Its frames are refused, the commands go out under the newest sequence, so that the mirror takes them."""
     state, _ = feed(USUAL, running(), ask("safe"))
-    after, _ = feed(USUAL, state, BAD[Reason.OUT_OF_ORDER](6))
-    assert drive_of(after) is drive_of(state)
+    newest = state.frame_sequence
+    for _ in range(200):
+        state, (outputs,) = feed(USUAL, state, BAD[reason](6))
+        assert outputs.command is not None
+        assert outputs.command.frame_sequence == newest
+    assert not drive_of(state).actuators_nm.any()
 
 
 def test_clear_opens_the_loop_and_close_closes_it() -> None:
