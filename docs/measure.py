@@ -101,8 +101,8 @@ def render(measured: dict[str, Any]) -> str:
         )
     about = measured["host"]
     where = (
-        f"Latencies are p50 / p99 / p99.9; predicted is for the delay as measured, without the frames that were lost; the rate "
-        f"is that of the host's clock. "
+        "Latencies are p50 / p99 / p99.9; predicted is for the delay as measured, without the frames that were lost; "
+        "the rate is that of the host's clock. "
         f"Measured {about['date']} on {about['processors']} cores of "
         f"{about['processor']} (a virtual machine, Linux {about['kernel']}, Python {about['python']}, load "
         f"{about['load_before']} before) by `python docs/measure.py`, which runs `{' '.join(measured['command'])}`."

@@ -8,7 +8,7 @@ import gc
 import os
 import resource
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -62,6 +62,19 @@ def set_up(priority: int | None, cpus: set[int] | None, lock_memory: bool) -> Gr
             what, price = cost
             refused.append((f"{what} ({getattr(fault, 'strerror', None) or fault})", price))
     return Granted(tuple(granted), tuple(refused))
+
+
+def spread(cpus: Iterable[int]) -> dict[str, list[int]]:
+    """Configuration keys that keep the loop's processes apart on these processors; none where there is only one.
+
+    The simulated camera has the most to do, so that of two processors it has one to itself: a processor whose real-time
+    share is used up stands still for 50 ms.
+    """
+    first, *others = sorted(cpus)
+    if not others:
+        return {}
+    keys = {"camera": first, "controller": others[0], "mirror": others[1] if len(others) > 2 else others[0]}
+    return {f"realtime.{role}_cpus": [cpu] for role, cpu in keys.items()}
 
 
 def step_back(priority: int | None) -> Granted:

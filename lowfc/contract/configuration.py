@@ -204,7 +204,7 @@ class Realtime(Section):
     lock_memory: bool = True
     """Keep the processes' memory from being paged out."""
     camera_cpus: list[int] = Field(default_factory=list)
-    """Processors of the camera; empty for all."""
+    """Processors of the camera; empty for all. sim-loop keeps the three apart where the file says nothing."""
     controller_cpus: list[int] = Field(default_factory=list)
     """Processors of the controller; empty for all."""
     mirror_cpus: list[int] = Field(default_factory=list)

@@ -1,6 +1,7 @@
 """The command `lowfc`: arguments only; every command is a function elsewhere."""
 
 import json
+import os
 import sys
 from collections.abc import Sequence
 from contextlib import closing
@@ -63,6 +64,7 @@ def sim_loop(
 
     Example: lowfc sim-loop --rate 1000 --duration 20 --disturbance reaction-wheel --star-magnitude 2
     """
+    from lowfc.adapters.realtime import spread
     from lowfc.programs.sim_loop import sim_loop as run
     from lowfc.programs.status import report
 
@@ -75,7 +77,7 @@ def sim_loop(
         "lockstep": lockstep or None,
         "control.start_mode": "open" if open_loop else None,
     }
-    settings = configuration(config, overrides, {"control.start_mode": "closed"})
+    settings = configuration(config, overrides, {"control.start_mode": "closed", **spread(os.sched_getaffinity(0))})
     figures = run(settings, duration, record=not no_record)
     _print(json.dumps(figures) if as_json else report(figures))
 

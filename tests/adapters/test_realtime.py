@@ -13,7 +13,7 @@ import gc, json, os, sys
 import numpy
 from threadpoolctl import threadpool_info
 {limits}
-from lowfc.adapters.realtime import set_up, step_back
+from lowfc.adapters.realtime import set_up, spread, step_back
 granted = {call}
 print(json.dumps({{
     "granted": granted.granted, "refused": granted.refused,
@@ -85,3 +85,13 @@ def test_the_recorder_steps_back_out_of_its_parents_class() -> None:
     limits = "os.sched_setscheduler(0, os.SCHED_RR, os.sched_param(1))" if may_be_real_time() else ""
     found = report("step_back(None)", limits)
     assert (found["policy"], found["granted"]) == (os.SCHED_OTHER, ["memory kept", "normal scheduling class"])
+
+
+def test_processes_are_kept_apart_as_far_as_there_are_processors() -> None:
+    def of(*cpus: int) -> list[int]:
+        return [cpu for (cpu,) in spread(cpus).values()]
+
+    assert of(3) == []
+    assert of(5, 1) == [1, 5, 5]
+    assert of(0, 1, 2) == [0, 1, 1]
+    assert of(0, 1, 2, 3) == [0, 1, 2]
