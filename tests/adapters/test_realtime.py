@@ -8,12 +8,14 @@ import sys
 
 import pytest
 
+from lowfc.adapters.realtime import spread
+
 REPORT = """
 import gc, json, os, sys
 import numpy
 from threadpoolctl import threadpool_info
 {limits}
-from lowfc.adapters.realtime import set_up, spread, step_back
+from lowfc.adapters.realtime import set_up, step_back
 granted = {call}
 print(json.dumps({{
     "granted": granted.granted, "refused": granted.refused,
