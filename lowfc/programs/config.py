@@ -10,7 +10,7 @@ from lowfc.contract.errors import BusError
 
 def commented(config: Configuration) -> str:
     """TOML of a configuration, each key with its sentence above it."""
-    sentences = {name: info.description for name, info in keys().items()}
+    sentences = {name: " ".join((info.description or "").split()) for name, info in keys().items()}
     lines, section = [], ""
     for line in config.to_toml().splitlines():
         if line.startswith("["):
