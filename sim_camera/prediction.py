@@ -6,7 +6,7 @@ from lowfc.adapters import instrument
 from lowfc.contract.configuration import Configuration
 from lowfc.control.stability import noise_gain, rejection
 from lowfc.optics.photometry import tilt_nm_per_mas
-from sim_camera.process import disturbance_of
+from sim_camera.process import disturbance_of, ignore
 
 
 def tilt_residual_mas(config: Configuration, delay_frames: float) -> float:
@@ -18,12 +18,8 @@ def tilt_residual_mas(config: Configuration, delay_frames: float) -> float:
     shaken = disturbance_of(config)
     rejected = rejection(shaken.frequency_hz, rate_hz, control.tilt_gain, control.tilt_leak, delay_frames)
     waves = np.sum(np.abs(shaken.amplitude_nm[:, :2]) ** 2 / 2 * rejected[:, None] ** 2, axis=0)
-    optics = instrument.twin(config, None, _quiet)
-    calibration = instrument.analytic_calibration(config, optics, instrument.mirror_on_twin(config, optics, _quiet))
+    optics = instrument.twin(config, None, ignore)
+    calibration = instrument.analytic_calibration(config, optics, instrument.mirror_on_twin(config, optics, ignore))
     noise = instrument.frame_noise_nm(config, calibration)[:2] ** 2
     through = noise_gain(control.tilt_gain, control.tilt_leak, delay_frames)
     return float(np.sqrt(np.mean(waves + noise * through)) / tilt_nm_per_mas(config.star.diameter_m))
-
-
-def _quiet(warning: str) -> None:
-    """Whoever ran the loop has seen it."""

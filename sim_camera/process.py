@@ -51,10 +51,10 @@ def disturbance_of(config: Configuration) -> Disturbance:
 
 def bench(config: Configuration) -> Bench:
     """The bench of a configuration; its twin comes from the cache."""
-    optics = instrument.twin(config, None, _ignore)
+    optics = instrument.twin(config, None, ignore)
     return Bench(
         optics,
-        instrument.mirror_on_twin(config, optics, _ignore),
+        instrument.mirror_on_twin(config, optics, ignore),
         instrument.detector(config),
         instrument.electrons_per_exposure(config),
         disturbance_of(config),
@@ -64,7 +64,7 @@ def bench(config: Configuration) -> Bench:
     )
 
 
-def _ignore(warning: str) -> None:
+def ignore(warning: str) -> None:
     """The launcher has told the user."""
 
 

@@ -2,7 +2,8 @@
 
 from contextlib import closing
 
-from lowfc.adapters.join import join, mirror_role
+from lowfc.adapters.join import join
+from lowfc.adapters.run import mirror_role
 from lowfc.adapters.terminal import DEFAULT_RUN, ConfigFile, RunId, configuration, new_app, run_app
 from sim_dm.process import MirrorProcess
 

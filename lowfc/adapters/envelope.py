@@ -4,10 +4,10 @@ import struct
 from dataclasses import dataclass
 
 from lowfc.contract.errors import BusError
+from lowfc.control.loop import COUNT_BITS
 
 _LAYOUT = struct.Struct("<QQ")
-_COUNT_BITS = 32
-_COUNT_MASK = (1 << _COUNT_BITS) - 1
+_COUNT_MASK = (1 << COUNT_BITS) - 1
 
 
 @dataclass(frozen=True, slots=True)
@@ -49,12 +49,12 @@ class Envelope:
 
 def sequence_of(start_s: int, count: int) -> int:
     """Sequence of message number `count` of a publisher that started at `start_s` (unix seconds)."""
-    return start_s << _COUNT_BITS | count
+    return start_s << COUNT_BITS | count
 
 
 def start_of(sequence: int) -> int:
     """Start of the publisher, unix seconds; a larger one means that it was restarted."""
-    return sequence >> _COUNT_BITS
+    return sequence >> COUNT_BITS
 
 
 def count_of(sequence: int) -> int:

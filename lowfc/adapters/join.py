@@ -2,7 +2,7 @@
 
 from lowfc.adapters.clock import Clock, HostClock, SimulatedClock
 from lowfc.adapters.realtime import set_up
-from lowfc.adapters.run import mirror_role, open_run
+from lowfc.adapters.run import open_run
 from lowfc.adapters.service import Service
 from lowfc.adapters.zenoh_bus import ZenohBus
 from lowfc.contract.configuration import Configuration
@@ -28,6 +28,3 @@ def join(
     run = open_run(run_id, (config.mirror.name,))
     clock = clock_of(config)
     return Service(role, run_id, clock, ZenohBus(run.links, role, clock), granted=granted)
-
-
-__all__ = ["clock_of", "join", "mirror_role"]

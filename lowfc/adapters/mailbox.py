@@ -39,6 +39,11 @@ class Mailbox:
         """Messages that arrived and were replaced by a newer one before they were taken."""
         return self.received - self._taken - len(self._slot)
 
+    @property
+    def waiting(self) -> bool:
+        """Whether there is a message to take."""
+        return bool(self._slot)
+
     def put(self, sample: Sample) -> None:
         """Leave a message; called on the bus's thread."""
         sequence, last = sample.sequence, self.last_sequence

@@ -35,7 +35,7 @@ def session_config(links: Links, role: str) -> dict[str, Any]:
             "endpoints": [f"{_HOST}:{port}" for name, port in sorted(links.ports.items()) if name != role],
             "timeout_ms": -1,
             "exit_on_failure": False,
-            "retry": {"period_init_ms": 50, "period_max_ms": 1000, "period_increase_factor": 2},
+            "retry": {"period_init_ms": 50, "period_max_ms": 200, "period_increase_factor": 2},
         },
         # Opening waits `delay` ms for the links that are not there yet; whoever is up is connected within a few.
         "scouting": {"delay": 100, "multicast": {"enabled": False}, "gossip": {"enabled": False}},

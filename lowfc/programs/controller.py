@@ -82,7 +82,7 @@ class Controller:
         self._service.state = "running"
         while self._service.running:
             sample = self._frames.take(TICK_S)
-            if self._queries or self._camera.received:
+            if self._queries or self._camera.waiting:
                 self._between_frames()
             if sample is not None:
                 self._frame(sample)
@@ -137,7 +137,7 @@ class Controller:
 
     def _between_frames(self) -> None:
         """Apply what operators asked, in the order they asked, and what the camera says of itself."""
-        camera = self._camera.take(0) if self._camera.received else None
+        camera = self._camera.take(0) if self._camera.waiting else None
         if camera is not None:
             settings_now = codec.decode_camera(camera.payload)
             if settings_now is not None:

@@ -14,8 +14,7 @@ from rich.live import Live
 
 from lowfc.adapters import calibration_file
 from lowfc.adapters.clock import HostClock
-from lowfc.adapters.join import mirror_role
-from lowfc.adapters.run import Run, new_run_id, open_run
+from lowfc.adapters.run import Run, mirror_role, new_run_id, open_run
 from lowfc.adapters.zenoh_bus import ZenohBus
 from lowfc.contract.configuration import Configuration
 from lowfc.contract.errors import LowfcError

@@ -7,7 +7,7 @@ from rich.panel import Panel
 from rich.table import Table
 from rich.text import Text
 
-from lowfc.adapters.join import mirror_role
+from lowfc.adapters.run import mirror_role
 from lowfc.contract.configuration import Configuration
 from lowfc.contract.events import Level
 from lowfc.contract.messages import COMMAND, FRAME, Role, wire
