@@ -19,15 +19,16 @@ GENERATED = "lowfc.contract.wire"
 BELOW = {
     "lowfc.optics": (),
     "lowfc.control": (),
+    "lowfc.design": ("lowfc.optics", "lowfc.control"),
     "lowfc.contract": ("lowfc.optics", "lowfc.control"),
     "lowfc.adapters": ("lowfc.optics", "lowfc.control", "lowfc.contract"),
-    "lowfc.programs": ("lowfc.optics", "lowfc.control", "lowfc.contract", "lowfc.adapters"),
+    "lowfc.programs": ("lowfc.optics", "lowfc.control", "lowfc.design", "lowfc.contract", "lowfc.adapters"),
     "sim_camera": ("lowfc.optics", "lowfc.control", "lowfc.contract", "lowfc.adapters"),
     "sim_dm": ("lowfc.optics", "lowfc.control", "lowfc.contract", "lowfc.adapters"),
 }
 LAYERS = tuple(BELOW)
 
-PURE_LAYERS = ("lowfc.optics", "lowfc.control")
+PURE_LAYERS = ("lowfc.optics", "lowfc.control", "lowfc.design")
 PURE_MODULES = ("sim_dm.device", "sim_camera.disturbance", "sim_camera.bench", "sim_camera.figures")
 PURE_IMPORTS = (
     *("numpy", "scipy", "abc", "collections", "dataclasses", "enum", "functools", "itertools", "math", "operator"),

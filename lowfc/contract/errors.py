@@ -10,6 +10,9 @@
 The numerics raise ValueError; the adapters above them name the file or the key and re-raise one of these.
 """
 
+from collections.abc import Iterable
+from difflib import get_close_matches
+
 
 class LowfcError(Exception):
     """Base of the errors that a user can put right; the text says what was wrong, expected, got and to do."""
@@ -35,3 +38,9 @@ class BusError(LowfcError):
 
 class RequestRefusedError(LowfcError):
     """The controller refused an operator's request."""
+
+
+def nearest(wanted: str, known: Iterable[str]) -> str:
+    """What to add to "no such name": the name that was probably meant, or nothing."""
+    close = get_close_matches(wanted, list(known), n=1)
+    return f" (did you mean {close[0]!r}?)" if close else ""

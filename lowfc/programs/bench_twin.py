@@ -12,7 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
-from lowfc.adapters.masks import DEFAULT_SAM, sensor_from
+from lowfc.adapters.layouts import DEFAULT_SAM
+from lowfc.adapters.masks import sensor_from
 from lowfc.adapters.twin_store import load_or_build
 from lowfc.optics.band import Band, gauss_legendre, monochromatic
 from lowfc.optics.sensor import image, pupil_radii

@@ -4,9 +4,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from lowfc.adapters.masks import layout_names, layout_warnings, load_layout, load_pupil, sensor_from
+from lowfc.adapters.layouts import layout_names, layout_warnings, load_layout
+from lowfc.adapters.masks import load_pupil, sensor_from
 from lowfc.contract.errors import ConfigurationError, DataFileError
-from lowfc.optics.sam import Layout, check, is_even_symmetric, transmission
+from lowfc.optics.sam import Layout, check, equal_holes, is_even_symmetric, transmission
 
 TWO = {"purpose": "two holes", "hole_diameter": 0.1, "holes": [[0.1, 0.2], [-0.3, 0.0]]}
 
@@ -24,43 +25,45 @@ def test_shipped_layouts_are_sound(name, diameter):
     assert name in layout_names()
     layout = load_layout(name)
     assert len(layout.holes) == 27
-    assert layout.hole_diameter == diameter
+    assert {hole[2] for hole in layout.holes} == {diameter}
     assert layout_warnings(layout) == []
     open_area = transmission(layout, 512).mean()
     assert open_area == pytest.approx(27 * np.pi / 4 * diameter**2, rel=0.01)
 
 
 def test_holes_are_where_x_and_y_say():
-    mask = transmission(Layout("one", "", 0.1, ((0.3, -0.2),)), 100)
+    mask = transmission(Layout("one", "", ((0.3, -0.2, 0.1),)), 100)
     rows, columns = np.nonzero(mask)
     assert (rows.mean() + 0.5) / 100 - 0.5 == pytest.approx(-0.2)
     assert (columns.mean() + 0.5) / 100 - 0.5 == pytest.approx(0.3)
 
 
 @pytest.mark.parametrize(
-    ("layout", "message"),
+    ("holes", "message"),
     [
-        (Layout("a", "", 0.1, ((0.0, 0.0), (0.09, 0.0))), r"holes 0 at \(0.0, 0.0\) and 1 at \(0.09, 0.0\) overlap"),
-        (Layout("a", "", 0.1, ((0.0, 0.0), (0.0, 0.46))), "hole 1 at .* reaches 0.5100 D"),
-        (Layout("a", "", 0.1, ()), "at least one hole"),
-        (Layout("a", "", 0.0, ((0.0, 0.0),)), "hole diameter"),
-        (Layout("a", "", 0.1, ((float("nan"), 0.0),)), "finite"),
+        (equal_holes(((0.0, 0.0), (0.09, 0.0)), 0.1), r"holes 0 at \(0.0, 0.0\) and 1 at \(0.09, 0.0\) overlap"),
+        (((0.0, 0.0, 0.1), (0.1, 0.0, 0.2)), "overlap by 0.0500 D"),
+        (equal_holes(((0.0, 0.0), (0.0, 0.46)), 0.1), "hole 1 at .* reaches 0.5100 D"),
+        ((), "at least one hole"),
+        (((0.0, 0.0, 0.0),), "hole diameters"),
+        (((float("nan"), 0.0, 0.1),), "finite"),
     ],
 )
-def test_impossible_layouts_are_refused(layout, message):
+def test_impossible_layouts_are_refused(holes, message):
     with pytest.raises(ValueError, match=message):
-        check(layout)
+        check(Layout("a", "", holes))
 
 
 def test_holes_may_touch():
-    check(Layout("touching", "", 0.1, ((0.0, 0.0), (0.1, 0.0), (0.45, 0.0))))
+    check(Layout("touching", "", ((0.0, 0.0, 0.1), (0.1, 0.0, 0.1), (0.45, 0.0, 0.1))))
 
 
 def test_even_symmetry_is_warned_about(tmp_path):
-    even = Layout("even", "", 0.1, ((0.2, 0.1), (-0.2, -0.1), (0.0, 0.0)))
+    even = Layout("even", "", equal_holes(((0.2, 0.1), (-0.2, -0.1), (0.0, 0.0)), 0.1))
     assert is_even_symmetric(even)
-    assert not is_even_symmetric(replace(even, holes=(*even.holes, (0.3, 0.2))))
-    path = written(tmp_path, {"hole_diameter": 0.1, "holes": even.holes})
+    assert not is_even_symmetric(replace(even, holes=(*even.holes, (0.3, 0.2, 0.1))))
+    assert not is_even_symmetric(replace(even, holes=((0.2, 0.1, 0.05), *even.holes[1:])))
+    path = written(tmp_path, {"holes": even.holes})
     said = []
     sensor_from(str(path), warn=said.append)
     assert len(said) == 1
@@ -72,7 +75,7 @@ def test_even_symmetry_is_warned_about(tmp_path):
 
 def test_layouts_from_files(tmp_path):
     alone = load_layout(str(written(tmp_path, TWO)))
-    assert alone == Layout("mask", "two holes", 0.1, ((0.1, 0.2), (-0.3, 0.0)))
+    assert alone == Layout("mask", "two holes", ((0.1, 0.2, 0.1), (-0.3, 0.0, 0.1)))
     one = written(tmp_path, {"layouts": {"x": TWO}}, "one.json")
     assert load_layout(str(one)) == load_layout(f"{one}:x")
     several = written(tmp_path, {"layouts": {"x": TWO, "y": TWO}}, "several.json")
@@ -90,7 +93,7 @@ def test_layouts_from_files(tmp_path):
         ("[]", "holds no layouts"),
         ({"layouts": {}}, "holds no layouts"),
         ({"layouts": {"x": {"holes": [[0, 0]]}}}, "hole_diameter"),
-        ({"layouts": {"x": {**TWO, "holes": [[0, 0, 0]]}}}, "pairs"),
+        ({"layouts": {"x": {**TWO, "holes": [[0, 0, 0, 0]]}}}, "pairs"),
         ({"layouts": {"x": {**TWO, "holes": [[0, 0], [0.05, 0]]}}}, "overlap"),
         ({"layouts": {"x": {**TWO, "holes": [[0.49, 0]]}}}, "outside"),
         ({"layouts": {"x": 3}}, "layout x"),

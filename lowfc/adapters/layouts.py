@@ -1,0 +1,91 @@
+"""Sparse-aperture layouts: the shipped ones, and those of a user's own files."""
+
+import json
+from importlib import resources
+from importlib.resources.abc import Traversable
+from pathlib import Path
+from typing import Any
+
+from lowfc.contract.errors import ConfigurationError, DataFileError, nearest
+from lowfc.optics import sam as sams
+
+DEFAULT_SAM = "sam27d07_bal14"
+
+SHIPPED = resources.files("lowfc") / "data" / "sam_layouts.json"
+
+
+def layout_names() -> list[str]:
+    """Names of the layouts that are shipped."""
+    return sorted(_read_layouts(SHIPPED))
+
+
+def load_layout(name: str) -> sams.Layout:
+    """A layout by name, checked.
+
+    Args:
+        name: A shipped layout, `file.json` with one layout, or `file.json:name` with several. A file has the shape of
+            the shipped one: {"layouts": {name: {"purpose", "hole_diameter", "holes": [[x, y], ...]}}} in pupil
+            diameters; a hole [x, y, diameter] has its own size. A single layout may stand alone, without "layouts".
+
+    Raises:
+        ConfigurationError: No layout has that name.
+        DataFileError: The file is missing, damaged, or its holes overlap or leave the pupil.
+    """
+    path, suffix, inner = name.partition(".json")
+    file: Traversable = Path(path + suffix) if suffix else SHIPPED
+    layouts = _read_layouts(file)
+    wanted = inner.removeprefix(":") if suffix else name
+    if not wanted and len(layouts) == 1:
+        wanted = next(iter(layouts))
+    if wanted not in layouts:
+        known = ", ".join(sorted(layouts))
+        if not wanted:
+            raise ConfigurationError(f"{file} holds several layouts; say which as {file}:name, of {known}")
+        raise ConfigurationError(f"no sparse-aperture layout is called {wanted!r}{nearest(wanted, layouts)}; {known}")
+    return _parse(file, wanted, layouts[wanted])
+
+
+def layout_warnings(layout: sams.Layout) -> list[str]:
+    """What a user should know about a layout that is legal but of little use."""
+    if sams.is_even_symmetric(layout):
+        return [
+            f"{layout.name} is symmetric about the pupil's centre: it cannot sense even modes such as focus and "
+            "astigmatism; move at least one hole"
+        ]
+    return []
+
+
+def _read_layouts(file: Traversable) -> dict[str, Any]:
+    try:
+        content = json.loads(file.read_text(encoding="utf-8"))
+    except FileNotFoundError:
+        raise DataFileError(f"there is no layout file {file}") from None
+    except (OSError, ValueError) as error:
+        raise DataFileError(f"{file} is not a readable JSON file: {error}") from error
+    if isinstance(content, dict) and "holes" in content:
+        return {str(content.get("name", Path(file.name).stem)): content}
+    layouts = content.get("layouts") if isinstance(content, dict) else None
+    if not isinstance(layouts, dict) or not layouts:
+        raise DataFileError(f'{file} holds no layouts: expected {{"layouts": {{name: ...}}}} or one with "holes"')
+    return layouts
+
+
+def _parse(file: Traversable, name: str, entry: Any) -> sams.Layout:
+    try:
+        holes = tuple(_hole(hole, entry) for hole in entry["holes"])
+        layout = sams.Layout(name, str(entry.get("purpose", "")), holes)
+    except (AttributeError, KeyError, TypeError, ValueError) as error:
+        raise DataFileError(
+            f'{file}: layout {name} must have "hole_diameter" and "holes" as pairs [x, y], or as [x, y, diameter], in '
+            f"pupil diameters ({type(error).__name__}: {error})"
+        ) from error
+    try:
+        sams.check(layout)
+    except ValueError as error:
+        raise DataFileError(f"{file}: {error}") from error
+    return layout
+
+
+def _hole(hole: Any, entry: Any) -> tuple[float, float, float]:
+    x, y, diameter = hole if len(hole) == 3 else (*hole, entry["hole_diameter"])
+    return float(x), float(y), float(diameter)
