@@ -34,7 +34,7 @@ _TWINS = {spec.nodes: spec for spec in (FAST, ACCURATE)}
 
 def sensor(config: Configuration, warn: Callable[[str], None]) -> Sensor:
     """The wavefront sensor's optics."""
-    return sensor_from(config.sensor.sam, config.sensor.focal_mask, config.star.wavelength_nm, warn)
+    return sensor_from(config.sensor, config.star.wavelength_nm, warn)
 
 
 def band(config: Configuration) -> Band:
@@ -136,7 +136,7 @@ def analytic_calibration(config: Configuration, optics: Twin, on_nodes: TwinMirr
     try:
         R = reconstructor(I0, H, good, flux_e, _equivalent_read_noise_e(camera), config.control.estimator)
     except ValueError as error:
-        raise CalibrationError(f"sensor.sam = {config.sensor.sam!r}, {len(nolls)} modes: {error}") from None
+        raise CalibrationError(f"sensor.kind = {config.sensor.kind!r}, {len(nolls)} modes: {error}") from None
 
     commands = modes_to_actuators(mirror(config), nolls)
     pokes = commands.T.reshape(len(nolls), config.mirror.rows, config.mirror.columns)

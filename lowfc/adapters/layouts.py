@@ -9,8 +9,6 @@ from typing import Any
 from lowfc.contract.errors import ConfigurationError, DataFileError, nearest
 from lowfc.optics import sam as sams
 
-DEFAULT_SAM = "sam27d07_bal14"
-
 SHIPPED = resources.files("lowfc") / "data" / "sam_layouts.json"
 
 

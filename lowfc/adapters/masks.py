@@ -4,22 +4,28 @@ import logging
 from collections.abc import Callable
 from importlib import resources
 from importlib.resources.abc import Traversable
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
-from lowfc.adapters.layouts import DEFAULT_SAM, layout_warnings, load_layout
+from lowfc.adapters.layouts import layout_warnings, load_layout
+from lowfc.contract.configuration import SensorSection, sensor_keys
 from lowfc.contract.errors import ConfigurationError, DataFileError, nearest
-from lowfc.optics import focal_mask as focal_masks
 from lowfc.optics import sam as sams
-from lowfc.optics.pupil import from_quarter
+from lowfc.optics.focal_mask import bowtie, disk, phase_spot
+from lowfc.optics.pupil import circle, from_quarter, prolate, with_bar
+from lowfc.optics.relay import ApertureMask, Defocus, PupilImage, Relay, fresnel_distance
 from lowfc.optics.sensor import Sensor
 
 _DATA = resources.files("lowfc") / "data"
 _log = logging.getLogger(__name__)
 
+SAMPLES = 512
+"""Across a pupil, Table 1."""
 
-def load_pupil(samples: int = 512, file: Traversable = _DATA / "spc_quarter128.npz") -> NDArray[np.float64]:
+
+def load_pupil(samples: int = SAMPLES, file: Traversable = _DATA / "spc_quarter128.npz") -> NDArray[np.float64]:
     """The shaped pupil (samples, samples): 1e-9 between 4 and 20 lambda/D within 42.5 degrees of the x axis.
 
     Args:
@@ -48,33 +54,72 @@ def load_pupil(samples: int = 512, file: Traversable = _DATA / "spc_quarter128.n
 
 
 def sensor_from(
-    sam: str = DEFAULT_SAM,
-    focal_mask: str = "disk",
+    section: SensorSection | None = None,
     wavelength_nm: float = 550.0,
     warn: Callable[[str], None] = _log.warning,
 ) -> Sensor:
-    """The paper's sensor (Table 1) with the shipped shaped pupil.
+    """The optics that [sensor] describes, at the sampling of Table 1.
 
     Args:
-        sam: See `load_layout`.
-        focal_mask: "disk" of 4 lambda/D, or "bowtie" (Fig. 3).
+        section: All defaults when None.
         wavelength_nm: The central wavelength.
         warn: Called with each of `layout_warnings`.
 
     Raises:
-        ConfigurationError: A name is not known, or the wavelength is not positive.
+        ConfigurationError: A name is not known, or values do not go together.
         DataFileError: A file is missing or damaged, or a layout is impossible.
     """
-    makers = {"disk": focal_masks.disk, "bowtie": focal_masks.bowtie}
-    if focal_mask not in makers:
-        raise ConfigurationError(
-            f"no focal-plane mask is called {focal_mask!r}{nearest(focal_mask, makers)}; {', '.join(makers)}"
-        )
-    layout = load_layout(sam)
-    for text in layout_warnings(layout):
-        warn(text)
-    pupil = load_pupil()
+    section = SensorSection() if section is None else section
+    pupil = _pupil(section)
     try:
-        return Sensor(pupil, makers[focal_mask](), sams.transmission(layout, len(pupil)), wavelength_nm)
+        focal_mask = _focal_mask(section)
+        match section.kind:
+            case "clowfs":
+                relay: Relay = Defocus(fresnel_distance(section.defocus_mm, section.focal_ratio, wavelength_nm))
+            case "zwfs":
+                return Sensor(pupil, focal_mask, PupilImage(), wavelength_nm, pixels=40)
+            case "bar":
+                relay = ApertureMask(with_bar(len(pupil), section.bar_width, section.bar_angle_deg))
+            case "open":
+                relay = ApertureMask(circle(len(pupil)))
+            case "sam":
+                layout = load_layout(section.sam)
+                for text in layout_warnings(layout):
+                    warn(text)
+                relay = ApertureMask(sams.transmission(layout, len(pupil)))
+        return Sensor(pupil, focal_mask, relay, wavelength_nm)
     except ValueError as error:
         raise ConfigurationError(f"sensor: {error}") from error
+
+
+def sensor_named(name: str) -> Sensor:
+    """One of `SENSORS`, or the sparse aperture mask with that layout."""
+    return sensor_from(SensorSection.model_validate(sensor_keys(name)))
+
+
+def _pupil(section: SensorSection) -> NDArray[np.float64]:
+    match section.pupil:
+        case "shaped":
+            return load_pupil()
+        case "circle":
+            return circle(SAMPLES)
+        case "prolate":
+            return prolate(SAMPLES, section.focal_radius)
+    if section.pupil.endswith(".npz"):
+        return load_pupil(file=Path(section.pupil))
+    known = ("shaped", "circle", "prolate", "FILE.npz")
+    raise ConfigurationError(f"sensor.pupil = {section.pupil!r}: no such pupil{nearest(section.pupil, known)}; {known}")
+
+
+def _focal_mask(section: SensorSection) -> NDArray[np.inexact]:
+    if section.kind == "zwfs":
+        return phase_spot(radius=section.focal_radius, spot_diameter=section.spot_diameter)
+    if section.focal_mask == "bowtie":
+        return bowtie(radius=section.focal_radius)
+    if section.kind == "clowfs":
+        if not section.inner_radius < section.focal_radius:
+            raise ValueError(
+                f"inner_radius, {section.inner_radius} lambda/D, must be below focal_radius, {section.focal_radius}"
+            )
+        return disk(radius=section.focal_radius, inner_radius=section.inner_radius)
+    return disk(radius=section.focal_radius)

@@ -15,12 +15,13 @@ from numpy.typing import NDArray
 
 from lowfc.optics.band import Band, monochromatic
 from lowfc.optics.mirror import Mirror
+from lowfc.optics.relay import ApertureMask
 from lowfc.optics.sensor import Sensor
 from lowfc.optics.twin import Operator, Twin, TwinSpec
 from lowfc.optics.twin_build import build
 from lowfc.optics.twin_mirror import TwinMirror, twin_mirror
 
-FORMAT = 1
+FORMAT = 2
 """Raised whenever the construction or the file changes: files of another format are not looked at."""
 
 _Kept = TypeVar("_Kept", Twin, TwinMirror)
@@ -31,8 +32,13 @@ _log = logging.getLogger(__name__)
 def operator_hash(sensor: Sensor, spec: TwinSpec, band: Band) -> str:
     """SHA-256, hexadecimal, of every array and number that the twin depends on."""
     numbers = (FORMAT, sensor.wavelength_nm, sensor.samples_per, sensor.binning, sensor.pixels)
-    arrays = {"pupil": sensor.pupil, "focal_mask": sensor.focal_mask, "relay_mask": sensor.relay_mask}
-    return _digest(arrays, repr((numbers, astuple(spec), astuple(band))))
+    arrays: dict[str, NDArray[Any]] = {"pupil": sensor.pupil, "focal_mask": sensor.focal_mask}
+    relay: tuple[object, ...] = (type(sensor.relay).__name__,)
+    if isinstance(sensor.relay, ApertureMask):
+        arrays["relay_mask"] = sensor.relay.transmission
+    else:
+        relay += astuple(sensor.relay)
+    return _digest(arrays, repr((numbers, relay, astuple(spec), astuple(band))))
 
 
 def default_cache_dir() -> Path:
@@ -131,6 +137,7 @@ def _pack(twin: Twin) -> bytes:
     }
     for i, operator in enumerate(twin.operators):
         arrays |= {
+            f"modes_{i}": operator.modes,
             f"to_modes_{i}": operator.to_modes,
             f"to_coefficients_{i}": operator.to_coefficients,
             f"basis_{i}": operator.basis,
@@ -157,7 +164,14 @@ def _unpack(content: bytes, key: str, spec: TwinSpec) -> Twin:
     if str(arrays["operator_hash"]) != key:
         raise ValueError("it was made from other optics")
     operators = tuple(
-        Operator(nm, weight, arrays[f"to_modes_{i}"], arrays[f"to_coefficients_{i}"], arrays[f"basis_{i}"])
+        Operator(
+            nm,
+            weight,
+            arrays[f"modes_{i}"],
+            arrays[f"to_modes_{i}"],
+            arrays[f"to_coefficients_{i}"],
+            arrays[f"basis_{i}"],
+        )
         for i, (nm, weight) in enumerate(arrays["band"].tolist())
     )
     return Twin(spec, arrays["axis"], arrays["used"], arrays["area_weights"], operators, arrays["to_pixels"], key)

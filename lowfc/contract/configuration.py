@@ -44,12 +44,30 @@ class Star(Section):
 
 
 class SensorSection(Section):
-    """The wavefront sensor's optics."""
+    """The wavefront sensor's optics, and of the coronagraph what it lives on."""
 
-    sam: str = "sam27d07_bal14"
-    """Sparse aperture mask: a shipped layout, or FILE.json, or FILE.json:NAME."""
+    kind: Literal["sam", "clowfs", "zwfs", "bar", "open"] = "sam"
+    """Sparse aperture mask, coronagraphic low-order sensor, Zernike sensor, pupil with a bar, or open relay pupil."""
+    pupil: str = "shaped"
+    """Coronagraph: the shaped pupil; circle for a classical Lyot, prolate for an apodised one; or FILE.npz."""
     focal_mask: Literal["disk", "bowtie"] = "disk"
-    """Reflective focal-plane mask: the disk of 4 lambda/D, or the bowtie of Fig. 3."""
+    """Reflective focal-plane mask: a disk, or the bowtie of Fig. 3."""
+    focal_radius: float = Field(4.0, ge=1, le=10)
+    """Radius of its disk, lambda/D."""
+    sam: str = "sam27d07_bal14"
+    """Of a sam: a shipped layout, or FILE.json, or FILE.json:NAME."""
+    defocus_mm: float = Field(6.0, ge=1, le=50)
+    """Of a clowfs: the detector's distance from focus."""
+    focal_ratio: float = Field(20.0, ge=1, le=200)
+    """Of a clowfs: focal length over pupil diameter at the focal-plane mask."""
+    inner_radius: float = Field(0.0, ge=0, lt=10)
+    """Of a clowfs: radius of the hole in the reflecting disk, lambda/D."""
+    spot_diameter: float = Field(1.06, gt=0, le=8)
+    """Of a zwfs: the phase spot's diameter, lambda/D."""
+    bar_width: float = Field(0.1, gt=0, lt=1)
+    """Of a bar: its width, pupil diameters."""
+    bar_angle_deg: float = Field(20.0, ge=0, lt=360)
+    """Of a bar: its direction from the x axis towards y."""
     modes: int = Field(14, ge=1, le=35)
     """Zernike modes after piston, from Noll 2 on."""
     wavelengths: int = Field(1, ge=1, le=9)
@@ -60,6 +78,24 @@ class SensorSection(Section):
     """Pupil nodes across the diameter in the real-time twin."""
     rank: int = Field(60, ge=20, le=200)
     """Modes kept of the optical operator in the real-time twin."""
+
+
+SENSORS: dict[str, dict[str, Any]] = {
+    "sam": {"kind": "sam"},
+    "bowtie": {"kind": "sam", "focal_mask": "bowtie"},
+    "clowfs": {"kind": "clowfs"},
+    "zwfs": {"kind": "zwfs"},
+    "bar": {"kind": "bar"},
+    "open": {"kind": "open"},
+    "lyot": {"kind": "sam", "pupil": "circle"},
+    "aplc": {"kind": "sam", "pupil": "prolate", "focal_radius": 2.5},
+}
+"""The sensors that have a name on the command line, as keys of [sensor]."""
+
+
+def sensor_keys(name: str) -> dict[str, Any]:
+    """Keys of [sensor] for one of `SENSORS`; any other name is that of a sparse aperture mask's layout."""
+    return SENSORS.get(name, {"kind": "sam", "sam": name})
 
 
 class Camera(Section):

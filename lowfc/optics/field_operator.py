@@ -1,8 +1,10 @@
-"""The optics at one wavelength as a real matrix, from products of functions on the pupil to coefficients on the sensor.
+"""The optics at one wavelength as a real matrix, from products of functions on the pupil to where modes are chosen.
 
-The focal-plane mask is symmetric about both axes, so that focal samples may be paired into cosines and sines and the
-operator from pupil to relay pupil is real. On the sensor the prolate functions of either parity turn the last kernel
-into a real matrix times 1 (even) or -i (odd), so that the whole operator is a real matrix with known phases.
+The focal-plane mask is symmetric about both axes, so that focal samples may be paired into cosines and sines. With an
+aperture mask in the relay pupil, the operator from pupil to relay pupil is then real; on the sensor the prolate
+functions of either parity turn the last kernel into a real matrix times 1 (even) or -i (odd), so that the whole
+operator is a real matrix with known phases. Without one, the relay loses nothing and is a product of two axes: the real
+operator ends at the focal plane, and what is left of the way is applied to the few modes that are kept.
 """
 
 from collections.abc import Callable
@@ -12,22 +14,25 @@ import scipy.linalg
 from numpy.typing import NDArray
 
 from lowfc.optics.grid import OPEN_AREA, image_axis, pupil_axis
+from lowfc.optics.relay import ApertureMask, direct_kernel, half_band
 from lowfc.optics.sensor import Sensor
 
 Float = NDArray[np.float64]
+Matrix = NDArray[np.float64] | NDArray[np.complex128]
+
+_WIDEST = 0.49  # cycles per sample: the samples hold no more than half
 
 
-def prolates(sensor: Sensor, half_band: float, count: int) -> Float:
-    """Discrete prolate sequences (samples, count) on the sensor's axis, even and odd in turn, orthonormal.
+def prolates(samples: int, half_band: float, count: int) -> Float:
+    """Discrete prolate sequences (samples, count), even and odd in turn, orthonormal.
 
     Args:
-        sensor: The optics.
-        half_band: Half of the band, in cycles per lambda0 / D.
+        samples: Of the axis.
+        half_band: Half of the band, in cycles per sample.
         count: How many, the best concentrated first.
     """
-    samples = sensor.pixels * sensor.binning
     index = np.arange(samples)
-    diagonal = ((samples - 1) / 2.0 - index) ** 2 * np.cos(2.0 * np.pi * half_band / sensor.samples_per)
+    diagonal = ((samples - 1) / 2.0 - index) ** 2 * np.cos(2.0 * np.pi * half_band)
     off_diagonal = index[1:] * (samples - index[1:]) / 2.0
     if count > samples:
         raise ValueError(f"{count} prolate functions were asked for, the sensor has {samples} samples")
@@ -36,6 +41,31 @@ def prolates(sensor: Sensor, half_band: float, count: int) -> Float:
     )
     signs = np.sign(vectors[samples // 2])  # LAPACK leaves the sign open; the same functions must come from each
     return np.ascontiguousarray((vectors * signs)[:, ::-1])
+
+
+def sensor_functions(sensor: Sensor, scale: float, guards: int) -> Float:
+    """Prolate functions (sensor samples, functions) that hold the field at a wavelength.
+
+    Args:
+        sensor: The optics.
+        scale: lambda0 / lambda.
+        guards: Functions beyond the number that the field's band and the sensor's width call for.
+    """
+    band = _half_band(sensor, scale)
+    return prolates(sensor.samples, band, min(int(np.ceil(2.0 * band * sensor.samples)) + guards, sensor.samples))
+
+
+def intensity_functions(sensor: Sensor, scale: float, guards: int) -> Float:
+    """Prolate functions (sensor samples, functions) that hold the intensity, whose band is twice the field's."""
+    band = min(2.0 * _half_band(sensor, scale), _WIDEST)
+    count = 2 * (int(np.ceil(band * sensor.samples)) + guards)
+    return prolates(sensor.samples, band, min(count, sensor.samples))
+
+
+def phases(sensor: Sensor, count: int) -> NDArray[np.complex128]:
+    """By what each of the functions must be multiplied on the sensor: an aperture mask makes the odd ones -i."""
+    odd = -1j if isinstance(sensor.relay, ApertureMask) else 1.0
+    return np.resize(np.array([1.0, odd], dtype=np.complex128), count)
 
 
 def field_operator(
@@ -47,47 +77,95 @@ def field_operator(
     wanted: NDArray[np.intp],
     advance: Callable[[], None] = lambda: None,
 ) -> Float:
-    """Real matrix (functions squared, wanted) from amplitudes of separable functions in the pupil to the sensor.
+    """Real matrix (rows, wanted) from amplitudes of separable functions in the pupil.
 
-    A sum over rows of the focal plane. Each row c is a cosine or a sine along y, each column d one along x; with the
-    relay mask M and the pupil A the contribution is (to_sensor_c M to_sensor_d') mask[c, d] (to_focal_c A to_focal_d').
+    Its rows are coefficients of the functions on the sensor where there is an aperture mask, and samples of the focal
+    plane within its mask, in cosines and sines, where there is none; `on_sensor` takes either to the sensor.
 
     Args:
         sensor: The optics.
         scale: lambda0 / lambda.
-        functions: (sensor samples, functions) from `prolates`.
+        functions: (sensor samples, functions) from `sensor_functions`.
         y_factors: (n, p) the functions' factors along y at the pupil's samples.
         x_factors: (n, q) along x.
         wanted: Indices of the wanted products in the flattened (p, q).
         advance: Called after each of the k / 2 steps, k the samples across the focal-plane mask.
-
-    Returns:
-        The field at the sensor is F Y F', F the functions with the odd ones times -i and Y this matrix times the
-        amplitudes, in the units of an image's square root.
     """
-    samples = sensor.pupil.shape[0]
-    u = pupil_axis(samples)
+    samples, relay = sensor.pupil.shape[0], sensor.relay
+    half = sensor.focal_mask.shape[0] // 2
+    quarter = sensor.focal_mask[half:, half:].real
+    waves = _waves(sensor, scale)
+    entering = (x_factors.T[:, None, None] * waves).transpose(3, 1, 2, 0).reshape(samples, -1)
+    count, p, q = functions.shape[1], y_factors.shape[1], x_factors.shape[1]
+    if isinstance(relay, ApertureMask):
+        kernels = _kernels(sensor, scale, functions)
+        relayed = (kernels[:, None, None] * waves).transpose(3, 1, 2, 0).reshape(samples, -1)  # columns (parity, d, k)
+    total = np.zeros((count**2, wanted.size))
+    rows = []
+    for c in range(half):
+        columns = np.flatnonzero(sensor.focal_mask[half + c, half:])
+        for wave in waves[:, c]:
+            right = ((y_factors.T * wave) @ sensor.pupil @ entering).reshape(p, 2, half, q)
+            inner = right[:, :, columns].transpose(1, 2, 0, 3).reshape(2 * columns.size, p * q)[:, wanted]
+            if isinstance(relay, ApertureMask):
+                left = ((kernels * wave) @ relay.transmission @ relayed).reshape(count, 2, half, count)
+                outer = left[:, :, columns].transpose(0, 3, 1, 2) * quarter[c, columns]
+                total += outer.reshape(count**2, -1) @ inner
+            else:
+                rows.append(inner)
+        advance()
+    unit = scale * sensor.pitch / (samples**2 * np.sqrt(OPEN_AREA))
+    return np.asarray(unit * (np.vstack(rows) if rows else total))
+
+
+def on_sensor(sensor: Sensor, scale: float, functions: Float, modes: Float) -> Matrix:
+    """Coefficients (functions squared, modes) on the sensor of modes (rows, modes), rows as `field_operator` has them.
+
+    The field at the sensor is F Y F', F the functions times `phases` and Y these coefficients, in the units of an
+    image's square root.
+    """
+    if isinstance(sensor.relay, ApertureMask):
+        return modes
     half = sensor.focal_mask.shape[0] // 2
     quarter = sensor.focal_mask[half:, half:]
-    # Both parities of every sample on the positive half axis; 2 stands for the pair of samples that each replaces.
-    angles = 2.0 * np.pi * scale * np.outer(image_axis(2 * half, sensor.samples_per)[half:], u)
-    waves = np.sqrt(2.0) * np.stack([np.cos(angles), np.sin(angles)])  # (parity, half, samples)
-    count = functions.shape[1]
-    sensor_angles = 2.0 * np.pi * scale * np.outer(image_axis(len(functions), sensor.samples_per), u)
-    kernels = functions.T @ np.cos(sensor_angles)
-    kernels[1::2] = (functions.T @ np.sin(sensor_angles))[1::2]
-    relayed = (kernels[:, None, None] * waves).transpose(3, 1, 2, 0).reshape(samples, -1)  # columns (parity, d, k)
-    entering = (x_factors.T[:, None, None] * waves).transpose(3, 1, 2, 0).reshape(samples, -1)
-    total = np.zeros((count**2, wanted.size))
-    p, q = y_factors.shape[1], x_factors.shape[1]
+    matrix = direct_kernel(sensor.relay, sensor.samples, 2 * half, sensor.samples_per, scale)
+    both = functions.T @ matrix
+    right, left = both[:, half:], both[:, :half][:, ::-1]
+    pairs = np.stack([right + left, -1j * (right - left)]) / np.sqrt(2.0)  # (parity, functions, half)
+    coefficients = np.zeros((functions.shape[1] ** 2, modes.shape[1]), np.complex128)
+    row = 0
     for c in range(half):
         columns = np.flatnonzero(quarter[c])
-        for wave in waves[:, c]:
-            left = ((kernels * wave) @ sensor.relay_mask @ relayed).reshape(count, 2, half, count)
-            right = ((y_factors.T * wave) @ sensor.pupil @ entering).reshape(p, 2, half, q)
-            outer = left[:, :, columns].transpose(0, 3, 1, 2) * quarter[c, columns]
-            inner = right[:, :, columns].transpose(1, 2, 0, 3).reshape(2 * columns.size, p * q)[:, wanted]
-            total += outer.reshape(count**2, -1) @ inner
-        advance()
-    unit = scale**3 / (samples**4 * sensor.samples_per**3 * np.sqrt(OPEN_AREA))
-    return np.asarray(total * unit)
+        for parity in (0, 1):
+            few = modes[row : row + 2 * columns.size].reshape(2, columns.size, -1) * quarter[c, columns, None]
+            along_x = np.einsum("pfd,pdm->fm", pairs[:, :, columns], few)
+            coefficients += (pairs[parity, :, c, None, None] * along_x).reshape(len(coefficients), -1)
+            row += 2 * columns.size
+    return coefficients
+
+
+def _waves(sensor: Sensor, scale: float) -> Float:
+    """Cosines and sines (parity, k / 2, n) of the focal samples on the positive half axis.
+
+    The root of 2 makes each stand for the pair of samples that it replaces.
+    """
+    half = sensor.focal_mask.shape[0] // 2
+    x = image_axis(2 * half, sensor.samples_per)[half:]
+    angles = 2.0 * np.pi * scale * np.outer(x, pupil_axis(sensor.pupil.shape[0]))
+    return np.asarray(np.sqrt(2.0) * np.stack([np.cos(angles), np.sin(angles)]))
+
+
+def _kernels(sensor: Sensor, scale: float, functions: Float) -> Float:
+    """From the relay pupil to the functions on the sensor (functions, n), with half of both transforms' factors."""
+    samples = sensor.pupil.shape[0]
+    angles = 2.0 * np.pi * scale * np.outer(image_axis(sensor.samples, sensor.samples_per), pupil_axis(samples))
+    kernels = functions.T @ np.cos(angles)
+    kernels[1::2] = (functions.T @ np.sin(angles))[1::2]
+    return np.asarray(kernels * (scale / (samples * sensor.samples_per)))
+
+
+def _half_band(sensor: Sensor, scale: float) -> float:
+    """Half of the band of the field, in cycles per sample of the sensor."""
+    radius = sensor.focal_mask.shape[0] / (2.0 * sensor.samples_per)
+    band = half_band(sensor.relay, sensor.samples * sensor.pitch, radius, scale)
+    return min(band * sensor.pitch, _WIDEST)

@@ -1,4 +1,4 @@
-"""The whole optical chain of the paper, with full diffraction: star to binned sensor image (Sect. 2, Table 1)."""
+"""The whole optical chain of a sensor, with full diffraction: star to binned sensor image (Sect. 2, Table 1)."""
 
 from dataclasses import dataclass
 
@@ -7,26 +7,28 @@ from numpy.typing import NDArray
 
 from lowfc.optics.band import Band, monochromatic
 from lowfc.optics.fourier import Field, to_image, to_pupil
-from lowfc.optics.grid import OPEN_AREA, pupil_axis
+from lowfc.optics.grid import OPEN_AREA, image_axis, pupil_axis
+from lowfc.optics.relay import ApertureMask, Relay, direct_kernel, pitch
 
 
 @dataclass(frozen=True, eq=False)
 class Sensor:
-    """The hardware of a sparse-aperture wavefront sensor.
+    """The hardware of a wavefront sensor that lives on the light a coronagraph's focal-plane mask rejects.
 
     Attributes:
-        pupil: (n, n) amplitude transmission of the shaped pupil.
-        focal_mask: (k, k) the part of the focal plane that goes to the sensor, k even, centred.
-        relay_mask: (n, n) the sparse aperture mask.
+        pupil: (n, n) amplitude transmission of the coronagraph's pupil.
+        focal_mask: (k, k) the part of the focal plane that goes to the sensor, k even, centred; complex where it
+            delays light, as the spot of a Zernike sensor does.
+        relay: What lies between the focal-plane mask and the detector.
         wavelength_nm: The central wavelength, lambda0.
-        samples_per: Samples per lambda0 / D in both focal planes.
+        samples_per: Samples per lambda0 / D in the focal planes.
         binning: Samples per pixel, in each direction.
         pixels: Pixels across the square image.
     """
 
     pupil: NDArray[np.float64]
-    focal_mask: NDArray[np.float64]
-    relay_mask: NDArray[np.float64]
+    focal_mask: NDArray[np.inexact]
+    relay: Relay
     wavelength_nm: float = 550.0
     samples_per: int = 8
     binning: int = 2
@@ -35,14 +37,25 @@ class Sensor:
     def __post_init__(self) -> None:
         if self.pupil.ndim != 2 or self.pupil.shape[0] != self.pupil.shape[1]:
             raise ValueError(f"the pupil must be square, got shape {self.pupil.shape}")
-        if self.relay_mask.shape != self.pupil.shape:
+        if isinstance(self.relay, ApertureMask) and self.relay.transmission.shape != self.pupil.shape:
             raise ValueError(
-                f"the relay mask must be sampled like the pupil, {self.pupil.shape}, got {self.relay_mask.shape}"
+                f"the relay mask must be sampled like the pupil, {self.pupil.shape}, got "
+                f"{self.relay.transmission.shape}"
             )
         if self.focal_mask.ndim != 2 or self.focal_mask.shape[0] != self.focal_mask.shape[1]:
             raise ValueError(f"the focal-plane mask must be square, got shape {self.focal_mask.shape}")
         if not self.wavelength_nm > 0:
             raise ValueError(f"the wavelength must be positive, got {self.wavelength_nm} nm")
+
+    @property
+    def samples(self) -> int:
+        """Samples across the detector."""
+        return self.pixels * self.binning
+
+    @property
+    def pitch(self) -> float:
+        """Distance between them, in lambda0 / D; in D where the detector sees the pupil."""
+        return pitch(self.relay, self.samples, self.samples_per)
 
 
 @dataclass(frozen=True)
@@ -52,7 +65,7 @@ class LightBudget:
     Attributes:
         pupil: Of the open circle's light, what the shaped pupil lets through.
         focal_mask: Of that, what the focal-plane mask sends to the sensor.
-        relay_mask: Of that, what passes the sparse aperture mask.
+        relay_mask: Of that, what passes a mask in the relay pupil.
         sensor: Of the light on the relay mask, what falls on the pixels.
         total: Of the open circle's light, what falls on the pixels.
         peak: Of the light on the pixels, what falls on the brightest.
@@ -72,12 +85,29 @@ def pupil_radii(sensor: Sensor) -> tuple[NDArray[np.float64], NDArray[np.float64
     return u[None, :], u[:, None]
 
 
-def propagate(sensor: Sensor, pupil_field: NDArray[np.inexact], wavelength_nm: float) -> Field:
-    """Field at the sensor's samples, eqs. (4) to (6), of a field (n, n) that has passed the shaped pupil."""
+def propagate(
+    sensor: Sensor,
+    pupil_field: NDArray[np.inexact],
+    wavelength_nm: float,
+    focal_mask: NDArray[np.inexact] | None = None,
+) -> Field:
+    """Field at the sensor's samples, eqs. (4) to (6) or (13), of a field (n, n) that has passed the pupil's mask.
+
+    Args:
+        sensor: The optics.
+        pupil_field: The field.
+        wavelength_nm: Its wavelength.
+        focal_mask: Instead of the sensor's own.
+    """
     scale = sensor.wavelength_nm / wavelength_nm
-    focal = to_image(np.asarray(pupil_field, np.complex128), sensor.focal_mask.shape[0], sensor.samples_per, scale)
-    relay = to_pupil(focal * sensor.focal_mask, sensor.pupil.shape[0], sensor.samples_per, scale)
-    return to_image(relay * sensor.relay_mask, sensor.pixels * sensor.binning, sensor.samples_per, scale)
+    mask = sensor.focal_mask if focal_mask is None else focal_mask
+    size, relay = mask.shape[0], sensor.relay
+    focal = to_image(np.asarray(pupil_field, np.complex128), size, sensor.samples_per, scale) * mask
+    if isinstance(relay, ApertureMask):
+        in_relay = to_pupil(focal, sensor.pupil.shape[0], sensor.samples_per, scale)
+        return to_image(in_relay * relay.transmission, sensor.samples, sensor.samples_per, scale)
+    matrix = direct_kernel(relay, sensor.samples, size, sensor.samples_per, scale)
+    return np.asarray(matrix @ focal @ matrix.T)
 
 
 def field(sensor: Sensor, opd_nm: NDArray[np.floating], wavelength_nm: float | None = None) -> Field:
@@ -139,15 +169,39 @@ def response(sensor: Sensor, basis: NDArray[np.floating], band: Band | None = No
     return H
 
 
+def shear_response(sensor: Sensor, band: Band | None = None) -> NDArray[np.float64]:
+    """dI/ds (pixels squared, 2), in the units of `image` per pupil diameter of shear of the beam along x and y.
+
+    A shift of the beam in the pupil is a ramp of phase on the focal plane, where -2 pi i x of the field is its slope.
+    It is a nuisance: the beam wanders on the relay mask, which looks like a wavefront and is none.
+
+    Args:
+        sensor: The optics.
+        band: The central wavelength alone when None.
+    """
+    band = monochromatic(sensor.wavelength_nm) if band is None else band
+    x = image_axis(sensor.focal_mask.shape[0], sensor.samples_per)
+    slopes = np.zeros((sensor.pixels**2, 2))
+    for wavelength_nm, weight in zip(band.wavelengths_nm, band.weights, strict=True):
+        ramp = (-2j * np.pi * sensor.wavelength_nm / wavelength_nm) * x
+        E0 = propagate(sensor, sensor.pupil, wavelength_nm)
+        for k, along in enumerate((ramp[None, :], ramp[:, None])):
+            E1 = propagate(sensor, sensor.pupil, wavelength_nm, sensor.focal_mask * along)
+            slopes[:, k] += weight * _pixel_sums(sensor, 2.0 * (E0 * np.conj(E1)).real).ravel()
+    return slopes
+
+
 def light_budget(sensor: Sensor) -> LightBudget:
     """The throughput of each element at the central wavelength, flat wavefront."""
     samples, area = sensor.pupil.shape[0], 1.0 / sensor.samples_per**2
     focal = to_image(sensor.pupil.astype(np.complex128), sensor.focal_mask.shape[0], sensor.samples_per, 1.0)
     focal = focal * sensor.focal_mask
-    relay = to_pupil(focal, samples, sensor.samples_per, 1.0)
     after_pupil = np.sum(sensor.pupil**2) / samples**2
     after_focal = np.sum(np.abs(focal) ** 2) * area
-    after_relay = np.sum(np.abs(relay * sensor.relay_mask) ** 2) / samples**2
+    after_relay = after_focal
+    if isinstance(sensor.relay, ApertureMask):
+        in_relay = to_pupil(focal, samples, sensor.samples_per, 1.0)
+        after_relay = np.sum(np.abs(in_relay * sensor.relay.transmission) ** 2) / samples**2
     I0 = reference(sensor)
     return LightBudget(
         pupil=float(after_pupil / OPEN_AREA),
@@ -162,4 +216,4 @@ def light_budget(sensor: Sensor) -> LightBudget:
 def _pixel_sums(sensor: Sensor, intensity: NDArray[np.float64]) -> NDArray[np.float64]:
     """Bin samples to pixels and normalise to the light that enters the open circle."""
     shape = (sensor.pixels, sensor.binning, sensor.pixels, sensor.binning)
-    return np.asarray(intensity.reshape(shape).sum(axis=(1, 3))) / (sensor.samples_per**2 * OPEN_AREA)
+    return np.asarray(intensity.reshape(shape).sum(axis=(1, 3))) * (sensor.pitch**2 / OPEN_AREA)

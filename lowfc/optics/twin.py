@@ -24,19 +24,19 @@ class TwinSpec:
     Attributes:
         nodes: Pupil nodes across the diameter.
         order: Points of the interpolation from the nodes, even.
-        rank: Modes of the operator that are kept for a focal-plane mask as large as the disk of 4 lambda0 / D; for
-            others the number kept is in proportion to the area, which is what their light's freedom goes by.
-        functions: Prolate functions along each axis of the sensor, at the central wavelength.
+        rank: Modes of the operator that are kept for a focal-plane mask as large as the disk of 4 lambda0 / D and an
+            aperture mask behind it; it grows with another mask's area, and is a third more without an aperture mask.
+        guards: Prolate functions along each axis of the sensor beyond what its width and the field's band call for.
     """
 
     nodes: int = 32
     order: int = 6
     rank: int = 60
-    functions: int = 28
+    guards: int = 8
 
 
 FAST = TwinSpec()
-ACCURATE = TwinSpec(nodes=64, order=6, rank=80, functions=30)
+ACCURATE = TwinSpec(nodes=64, order=6, rank=80, guards=10)
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,16 +46,18 @@ class Operator:
     Attributes:
         wavelength_nm: The wavelength.
         weight: Of this wavelength's image in the band's.
+        modes: (rows, rank) orthonormal; what `field_operator` ends at, from which the modes were chosen.
         to_modes: (rank, used) real; amplitudes of the modes from exp(i phi) at the used nodes. The units of the image
             are in it.
-        to_coefficients: (functions squared, rank) real.
-        basis: (points, functions) complex: prolate functions at the points, the odd ones times -i.
+        to_coefficients: (functions squared, rank) real with an aperture mask, else complex.
+        basis: (points, functions) complex: prolate functions at the points, with their phases.
     """
 
     wavelength_nm: float
     weight: float
+    modes: Float
     to_modes: Float
-    to_coefficients: Float
+    to_coefficients: Float | NDArray[np.complex128]
     basis: NDArray[np.complex128]
 
 
@@ -183,7 +185,9 @@ class _Stage:
         to_modes = np.sqrt(operator.weight) * operator.to_modes
         self._to_modes = to_modes.astype(np.float32)
         self._flat_modes = to_modes.sum(axis=1).astype(np.float32)
-        self._to_coefficients = np.ascontiguousarray(operator.to_coefficients, np.float32)
+        # A real matrix takes the two columns of real and imaginary parts, a complex one the numbers that they make.
+        self._unit = np.dtype(np.complex64 if np.iscomplexobj(operator.to_coefficients) else np.float32)
+        self._to_coefficients = np.ascontiguousarray(operator.to_coefficients, self._unit)
         self._basis = operator.basis.astype(np.complex64)
         self._basis_transposed = np.ascontiguousarray(self._basis.T)
         self._modes = np.empty((len(self._to_modes), 2), np.float32)
@@ -197,7 +201,7 @@ class _Stage:
         """Add |E|^2 at the points, for real and imaginary parts (used, 2) of exp(i phi) - 1."""
         np.matmul(self._to_modes, phasor, out=self._modes)
         self._modes[:, 0] += self._flat_modes
-        np.matmul(self._to_coefficients, self._modes, out=self._pairs)
+        np.matmul(self._to_coefficients, self._modes.view(self._unit), out=self._pairs.view(self._unit))
         np.matmul(self._basis, self._coefficients, out=self._half)
         np.matmul(self._half, self._basis_transposed, out=self._field)
         for part in (self._field.real, self._field.imag):

@@ -8,8 +8,9 @@ import scipy.linalg
 from numpy.typing import NDArray
 
 from lowfc.optics.band import Band, monochromatic
-from lowfc.optics.field_operator import field_operator, prolates
+from lowfc.optics.field_operator import field_operator, intensity_functions, on_sensor, phases, sensor_functions
 from lowfc.optics.nodes import interpolation, node_axis
+from lowfc.optics.relay import ApertureMask
 from lowfc.optics.sensor import Sensor
 from lowfc.optics.twin import Operator, Twin, TwinSpec
 
@@ -47,8 +48,11 @@ def build(
     used = np.flatnonzero(_adjoint(np.abs(to_samples), sensor.pupil != 0))
     area_weights = _adjoint(to_samples, sensor.pupil > 0.5).ravel()[used]
     points, to_pixels = _intensity_sampling(sensor, spec, max(scales))
-    area = np.sum(mask) / sensor.samples_per**2
-    rank = round(spec.rank * float(area / _DISK_AREA))
+    area = np.count_nonzero(mask) / sensor.samples_per**2
+    # Two thirds of the modes are the light's freedom, which goes by the mask's area; the others are for its edge.
+    # An aperture mask blurs what the faintest modes add; without one it takes a third more of them.
+    needed = spec.rank if isinstance(sensor.relay, ApertureMask) else 4 * spec.rank / 3
+    rank = round(needed * (2.0 * float(area / _DISK_AREA) + 1.0) / 3.0)
     steps = len(scales) * mask.shape[0] // 2
     done = itertools.count(1)
 
@@ -58,16 +62,17 @@ def build(
 
     operators = []
     for scale, weight in zip(scales, band.weights, strict=True):
-        functions = prolates(sensor, scale / 2.0, int(np.ceil(spec.functions * scale)))
+        functions = sensor_functions(sensor, scale, spec.guards)
         matrix = field_operator(sensor, scale, functions, to_samples, to_samples, used, advance)
         kept = _leading_modes(matrix, rank)
         operators.append(
             Operator(
                 wavelength_nm=sensor.wavelength_nm / scale,
                 weight=weight,
+                modes=kept,
                 to_modes=kept.T @ matrix,
-                to_coefficients=kept,
-                basis=np.asarray(functions[points] * np.resize([1.0, -1j], functions.shape[1]), np.complex128),
+                to_coefficients=on_sensor(sensor, scale, functions, kept),
+                basis=functions[points] * phases(sensor, functions.shape[1]),
             )
         )
     return Twin(spec, axis, used, area_weights / area_weights.sum(), tuple(operators), to_pixels, operator_hash)
@@ -83,8 +88,7 @@ def _intensity_sampling(sensor: Sensor, spec: TwinSpec, scale: float) -> tuple[N
 
     Intensities fill twice the field's band; the samples are picked by pivoted QR of that band's prolate functions.
     """
-    samples = sensor.pixels * sensor.binning
-    functions = prolates(sensor, scale, min(2 * int(np.ceil(spec.functions * scale)), samples))
+    functions = intensity_functions(sensor, scale, spec.guards)
     _, _, pivots = scipy.linalg.qr(functions.T, mode="economic", pivoting=True)
     points = np.sort(pivots[: functions.shape[1]]).astype(np.intp)
     pixels = functions.reshape(sensor.pixels, sensor.binning, -1).sum(axis=1)
@@ -94,10 +98,14 @@ def _intensity_sampling(sensor: Sensor, spec: TwinSpec, scale: float) -> tuple[N
 def _leading_modes(matrix: Float, rank: int) -> Float:
     """Orthonormal (rows, rank): the left singular vectors of the largest singular values.
 
-    They come from the matrix times its transpose: squaring costs precision only below 1e-8 of the largest value.
+    They come from the smaller of the matrix's two squares, which costs precision only below 1e-8 of the largest value.
     """
-    if not 0 < rank <= min(matrix.shape):
-        raise ValueError(f"the rank must lie between 1 and {min(matrix.shape)}, got {rank}")
-    size = len(matrix)
-    _, vectors = scipy.linalg.eigh(matrix @ matrix.T, subset_by_index=(size - rank, size - 1))
-    return np.ascontiguousarray(vectors[:, ::-1])
+    size = min(matrix.shape)
+    if not 0 < rank <= size:
+        raise ValueError(f"the rank must lie between 1 and {size}, got {rank}")
+    subset = (size - rank, size - 1)
+    if len(matrix) == size:
+        _, vectors = scipy.linalg.eigh(matrix @ matrix.T, subset_by_index=subset)
+        return np.ascontiguousarray(vectors[:, ::-1])
+    _, vectors = scipy.linalg.eigh(matrix.T @ matrix, subset_by_index=subset)
+    return np.ascontiguousarray(np.linalg.qr(matrix @ vectors[:, ::-1])[0])

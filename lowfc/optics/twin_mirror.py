@@ -6,12 +6,11 @@ fit, and a small correction makes the field at the sensor, to first order, the o
 """
 
 from dataclasses import dataclass
-from math import isqrt
 
 import numpy as np
 from numpy.typing import NDArray
 
-from lowfc.optics.field_operator import field_operator, prolates
+from lowfc.optics.field_operator import field_operator, sensor_functions
 from lowfc.optics.grid import pupil_axis
 from lowfc.optics.mirror import Mirror, influence_factors
 from lowfc.optics.nodes import interpolation
@@ -55,10 +54,10 @@ def twin_mirror(sensor: Sensor, twin: Twin, mirror: Mirror) -> TwinMirror:
     scale = sensor.wavelength_nm / operator.wavelength_nm
     u = pupil_axis(sensor.pupil.shape[0])
     actuators = np.arange(mirror.rows * mirror.columns)
-    functions = prolates(sensor, scale / 2.0, isqrt(len(operator.to_coefficients)))
+    functions = sensor_functions(sensor, scale, twin.spec.guards)
     y_full = influence_factors(mirror, u, mirror.rows)
     x_full = influence_factors(mirror, u, mirror.columns)
-    to_field = operator.to_coefficients.T @ field_operator(sensor, scale, functions, y_full, x_full, actuators)
+    to_field = operator.modes.T @ field_operator(sensor, scale, functions, y_full, x_full, actuators)
     fit = np.linalg.pinv(interpolation(u.size, twin.spec.nodes, twin.spec.order), _LEAST_WEIGHT)
     y_factors, x_factors = fit @ y_full, fit @ x_full
     rows, columns = np.divmod(twin.used, twin.axis.size)

@@ -12,8 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
-from lowfc.adapters.layouts import DEFAULT_SAM
-from lowfc.adapters.masks import sensor_from
+from lowfc.adapters.masks import sensor_named
 from lowfc.adapters.twin_store import load_or_build
 from lowfc.optics.band import Band, gauss_legendre, monochromatic
 from lowfc.optics.sensor import image, pupil_radii
@@ -33,8 +32,7 @@ class Case:
 
 
 def bench_twin(
-    sam: str = DEFAULT_SAM,
-    focal_mask: str = "disk",
+    sensor: str = "sam",
     seconds: float = 1.0,
     progress: Callable[[str], None] = lambda name: None,
     cache_dir: Path | None = None,
@@ -45,37 +43,36 @@ def bench_twin(
     worst of 20 random wavefronts: radial degrees 1 to 5 within the literal bounds of Sect. 3.1.
 
     Args:
-        sam: Layout of the sparse aperture mask.
-        focal_mask: "disk" or "bowtie".
+        sensor: Its name, or that of a layout.
         seconds: For how long each model is timed.
         progress: Called with the name of each case.
         cache_dir: Of the twins; the usual one when None.
     """
-    sensor = sensor_from(sam, focal_mask)
-    nm = sensor.wavelength_nm
+    optics = sensor_named(sensor)
+    nm = optics.wavelength_nm
     cases = (
         Case("monochromatic, rank 60", FAST, monochromatic(nm)),
         Case("monochromatic, rank 80", ACCURATE, monochromatic(nm)),
         Case("20 % band in 3 wavelengths, rank 60", FAST, gauss_legendre(nm)),
     )
     coefficients_nm = nm * random_coefficients_waves(np.random.default_rng(1), WAVEFRONTS)
-    opds_nm = np.tensordot(coefficients_nm, zernikes(NOLLS_20, *pupil_radii(sensor)), 1)
+    opds_nm = np.tensordot(coefficients_nm, zernikes(NOLLS_20, *pupil_radii(optics)), 1)
     results = []
     with threadpool_limits(1):
         for case in cases:
             progress(case.name)
             begin = time.perf_counter()
-            twin = load_or_build(sensor, case.spec, case.band, cache_dir=cache_dir)
+            twin = load_or_build(optics, case.spec, case.band, cache_dir=cache_dir)
             load_s = time.perf_counter() - begin
             evaluator = Evaluator(twin)
             at_nodes = (coefficients_nm @ zernikes(NOLLS_20, *node_radii(twin))).astype(np.float32)
             errors = []
             for opd_nm, nodes_nm in zip(opds_nm, at_nodes, strict=True):
-                truth = image(sensor, opd_nm, case.band)
+                truth = image(optics, opd_nm, case.band)
                 errors.append(float(np.linalg.norm(evaluator.image(nodes_nm) - truth) / np.linalg.norm(truth)))
 
             def full(i: int, band: Band = case.band) -> object:
-                return image(sensor, opds_nm[i], band)
+                return image(optics, opds_nm[i], band)
 
             def fast(i: int, evaluator: Evaluator = evaluator, nodes: NDArray[np.float32] = at_nodes) -> object:
                 return evaluator.image(nodes[i])
@@ -96,7 +93,7 @@ def bench_twin(
             )
     top = {key: results[0][key] for key in ("twin_us", "full_us", "ratio", "relative_l2", "rank")}
     host = {"machine": platform.machine(), "python": platform.python_version(), "numpy": np.__version__}
-    return {**top, "sam": sam, "focal_mask": focal_mask, "wavefronts": WAVEFRONTS, "cases": results, "host": host}
+    return {**top, "sensor": sensor, "wavefronts": WAVEFRONTS, "cases": results, "host": host}
 
 
 def random_coefficients_waves(rng: np.random.Generator, count: int) -> NDArray[np.float64]:
@@ -114,7 +111,7 @@ def render(result: dict[str, Any]) -> str:
         for case in result["cases"]
     ]
     lines.append(
-        f"one thread, medians; {result['sam']} with the {result['focal_mask']}; relative L2 is the worst of "
+        f"one thread, medians; sensor {result['sensor']}; relative L2 is the worst of "
         f"{result['wavefronts']} random wavefronts"
     )
     return "\n".join(lines)

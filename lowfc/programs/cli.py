@@ -50,7 +50,8 @@ def sim_loop(
     disturbance: Annotated[Preset | None, typer.Option(help="What shakes the wavefront.")] = None,
     seed: Annotated[int | None, typer.Option(help="Seed of every random number.")] = None,
     sensor: Annotated[
-        str | None, typer.Option(help="Sparse aperture mask: a name, FILE.json or FILE.json:NAME.")
+        str | None,
+        typer.Option(help="sam, bowtie, clowfs, zwfs, bar, lyot, aplc; or a layout, FILE.json or FILE.json:NAME."),
     ] = None,
     star_magnitude: Annotated[float | None, typer.Option(help="V magnitude of the star.")] = None,
     lockstep: Annotated[
@@ -65,6 +66,7 @@ def sim_loop(
     Example: lowfc sim-loop --rate 1000 --duration 20 --disturbance reaction-wheel --star-magnitude 2
     """
     from lowfc.adapters.realtime import spread
+    from lowfc.contract.configuration import sensor_keys
     from lowfc.programs.sim_loop import sim_loop as run
     from lowfc.programs.status import report
 
@@ -72,7 +74,7 @@ def sim_loop(
         "camera.rate_hz": rate,
         "disturbance.preset": disturbance,
         "seed": seed,
-        "sensor.sam": sensor,
+        **({f"sensor.{key}": value for key, value in sensor_keys(sensor).items()} if sensor else {}),
         "star.magnitude": star_magnitude,
         "lockstep": lockstep or None,
         "control.start_mode": "open" if open_loop else None,

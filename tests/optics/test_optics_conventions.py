@@ -6,6 +6,7 @@ import pytest
 from lowfc.optics.fourier import to_image, to_pupil
 from lowfc.optics.grid import OPEN_AREA, image_axis, pupil_axis
 from lowfc.optics.pupil import circle, from_quarter
+from lowfc.optics.relay import ApertureMask
 from lowfc.optics.sensor import Sensor, image
 
 
@@ -46,10 +47,10 @@ def test_longer_waves_make_a_larger_image():
 
 
 def test_an_image_is_the_fraction_of_the_light_in_the_open_circle():
-    open_circle = Sensor(circle(512), np.ones((480, 480)), np.ones((512, 512)))
+    open_circle = Sensor(circle(512), np.ones((480, 480)), ApertureMask(np.ones((512, 512))))
     total = image(open_circle, np.zeros((512, 512))).sum()
     assert 0.97 < total < 1.0  # what diffraction throws beyond the pixels is missing
-    half = Sensor(0.5 * circle(512), np.ones((480, 480)), np.ones((512, 512)))
+    half = Sensor(0.5 * circle(512), np.ones((480, 480)), ApertureMask(np.ones((512, 512))))
     assert image(half, np.zeros((512, 512))).sum() == pytest.approx(0.25 * total)
     assert circle(512).mean() == pytest.approx(OPEN_AREA, rel=1e-3)
 

@@ -6,6 +6,7 @@ import pytest
 
 from lowfc.adapters.layouts import layout_names, layout_warnings, load_layout
 from lowfc.adapters.masks import load_pupil, sensor_from
+from lowfc.contract.configuration import SensorSection
 from lowfc.contract.errors import ConfigurationError, DataFileError
 from lowfc.optics.sam import Layout, check, equal_holes, is_even_symmetric, transmission
 
@@ -65,7 +66,7 @@ def test_even_symmetry_is_warned_about(tmp_path):
     assert not is_even_symmetric(replace(even, holes=((0.2, 0.1, 0.05), *even.holes[1:])))
     path = written(tmp_path, {"holes": even.holes})
     said = []
-    sensor_from(str(path), warn=said.append)
+    sensor_from(SensorSection(sam=str(path)), warn=said.append)
     assert len(said) == 1
     assert "cannot sense even modes" in said[0]
     said.clear()
@@ -111,8 +112,10 @@ def test_missing_files_and_misspelt_names():
         load_layout("nowhere.json")
     with pytest.raises(ConfigurationError, match="did you mean 'sam27d07_bal14'"):
         load_layout("sam27d07_ball4")
-    with pytest.raises(ConfigurationError, match="did you mean 'bowtie'"):
-        sensor_from(focal_mask="bowtei")
+    with pytest.raises(ConfigurationError, match="did you mean 'prolate'"):
+        sensor_from(SensorSection(pupil="prolat"))
+    with pytest.raises(ConfigurationError, match=r"inner_radius, 4\.0 lambda/D, must be below"):
+        sensor_from(SensorSection(kind="clowfs", inner_radius=4.0))
     with pytest.raises(ConfigurationError, match="wavelength"):
         sensor_from(wavelength_nm=-1.0)
 

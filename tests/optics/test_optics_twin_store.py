@@ -7,9 +7,10 @@ import pytest
 from lowfc.adapters.twin_store import default_cache_dir, load_or_build, load_or_fit_mirror, operator_hash
 from lowfc.optics.band import gauss_legendre, monochromatic
 from lowfc.optics.mirror import Mirror
+from lowfc.optics.relay import ApertureMask
 from lowfc.optics.twin import FAST, Evaluator, TwinSpec, reference
 
-SMALL = TwinSpec(nodes=16, order=4, rank=40, functions=24)  # the real optics, coarser, for tests of the file
+SMALL = TwinSpec(nodes=16, order=4, rank=40, guards=4)  # the real optics, coarser, for tests of the file
 
 
 @pytest.fixture
@@ -49,14 +50,14 @@ def test_the_hash_depends_on_everything(sensor):
     variants = [
         (sensor, SMALL, band),
         (replace(sensor, pupil=changed_pupil), SMALL, band),
-        (replace(sensor, relay_mask=sensor.relay_mask.T), SMALL, band),
+        (replace(sensor, relay=ApertureMask(sensor.relay.transmission.T)), SMALL, band),
         (replace(sensor, focal_mask=sensor.focal_mask[1:-1, 1:-1]), SMALL, band),
         (replace(sensor, wavelength_nm=551.0), SMALL, band),
         (replace(sensor, pixels=78), SMALL, band),
         (sensor, replace(SMALL, nodes=18), band),
         (sensor, replace(SMALL, order=6), band),
         (sensor, replace(SMALL, rank=41), band),
-        (sensor, replace(SMALL, functions=25), band),
+        (sensor, replace(SMALL, guards=5), band),
         (sensor, SMALL, gauss_legendre(550.0)),
         (sensor, SMALL, monochromatic(550.1)),
     ]
