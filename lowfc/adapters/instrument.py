@@ -21,12 +21,13 @@ from lowfc.optics.band import Band, gauss_legendre, monochromatic, uniform
 from lowfc.optics.detector import Detector, saturation_dn
 from lowfc.optics.mirror import Mirror, modes_to_actuators
 from lowfc.optics.photometry import Photometry, electrons
-from lowfc.optics.sensor import Sensor
+from lowfc.optics.sensor import Sensor, shear_response
 from lowfc.optics.twin import ACCURATE, FAST, Twin, node_radii, reference, response
 from lowfc.optics.twin_mirror import TwinMirror, wavefront_nm
 from lowfc.optics.zernike import zernikes
 
 Single = npt.NDArray[np.float32]
+Double = npt.NDArray[np.float64]
 Progress = Callable[[int, int], None]
 
 _TWINS = {spec.nodes: spec for spec in (FAST, ACCURATE)}
@@ -46,9 +47,16 @@ def band(config: Configuration) -> Band:
 
 
 def twin(config: Configuration, progress: Progress | None, warn: Callable[[str], None]) -> Twin:
-    """The real-time twin of the sensor, from the cache or built."""
+    """The real-time twin of the sensor, from the cache or built.
+
+    Raises:
+        ConfigurationError: the optics do not have as many modes as they ask for.
+    """
     spec = replace(_TWINS[config.sensor.nodes], rank=config.sensor.rank)
-    return load_or_build(sensor(config, warn), spec, band(config), progress, notice=warn)
+    try:
+        return load_or_build(sensor(config, warn), spec, band(config), progress, notice=warn)
+    except ValueError as error:
+        raise ConfigurationError(f"sensor: {error}") from None
 
 
 def electrons_per_exposure(config: Configuration) -> float:
@@ -122,7 +130,7 @@ def analytic_calibration(config: Configuration, optics: Twin, on_nodes: TwinMirr
     measures of it: through the shaped pupil some of the mirror's print-through looks like low orders, by 2 to 6 %.
 
     Raises:
-        CalibrationError: this sensor cannot tell the modes apart.
+        CalibrationError: this sensor cannot tell the modes apart, or the star saturates it.
     """
     camera = detector(config)
     nolls = config.noll
@@ -133,19 +141,19 @@ def analytic_calibration(config: Configuration, optics: Twin, on_nodes: TwinMirr
     flux_e = electrons_per_exposure(config) * float(I0.sum())
     light = I0.reshape(-1)
     I0, H = normalise_flux(light, H, good)
+    nuisance = _nuisance(config, light, good)
     try:
-        R = reconstructor(I0, H, good, flux_e, _equivalent_read_noise_e(camera), config.control.estimator)
+        R = reconstructor(I0, H, good, flux_e, _equivalent_read_noise_e(camera), config.control.estimator, nuisance)
     except ValueError as error:
         raise CalibrationError(f"sensor.kind = {config.sensor.kind!r}, {len(nolls)} modes: {error}") from None
+    _check_exposure(config, light)
 
     commands = modes_to_actuators(mirror(config), nolls)
     pokes = commands.T.reshape(len(nolls), config.mirror.rows, config.mirror.columns)
     seen = response(optics, np.array([wavefront_nm(on_nodes, poke) for poke in pokes], dtype=np.float64))
     commands = commands @ np.linalg.inv(R @ normalise_flux(light, seen, good)[1])
 
-    dark_dn = camera.bias_dn + camera.clock_induced_charge_e * camera.em_gain / camera.gain_e_per_dn
-
-    def single(array: npt.NDArray[np.float64]) -> Single:
+    def single(array: Double) -> Single:
         return np.ascontiguousarray(array, dtype=np.float32)
 
     grid = (config.mirror.rows, config.mirror.columns)
@@ -156,13 +164,13 @@ def analytic_calibration(config: Configuration, optics: Twin, on_nodes: TwinMirr
             response=single(H),
             reconstructor=single(R),
             good=single(good),
-            dark=np.full(I0.size, dark_dn, np.float32),
+            dark=np.full(I0.size, _dark_dn(camera), np.float32),
             modes_to_actuators=single(commands),
             shape=(shape[0], shape[1]),
             grid=grid,
             flux_dn=flux_e * camera.em_gain / camera.gain_e_per_dn,
             saturation_dn=float(saturation_dn(camera)),
-            estimator=config.control.estimator,
+            estimator="+".join((config.control.estimator, *config.control.nuisance)),
             wavelength_nm=config.star.wavelength_nm,
             operator_hash=optics.operator_hash,
             id="",
@@ -170,13 +178,41 @@ def analytic_calibration(config: Configuration, optics: Twin, on_nodes: TwinMirr
     )
 
 
-def frame_noise_nm(config: Configuration, calibration: Calibration) -> npt.NDArray[np.float64]:
+def frame_noise_nm(config: Configuration, calibration: Calibration) -> Double:
     """Standard deviation of each mode of one frame, nm of wavefront rms: photon and read noise through R."""
     camera = detector(config)
     flux_e = calibration.flux_dn * camera.gain_e_per_dn / camera.em_gain
     reference, matrix = calibration.reference.astype(float), calibration.reconstructor.astype(float)
     excess = np.sqrt(2) if camera.em_gain > 1 else 1.0
     return excess * noise_nm(matrix, reference, flux_e, _equivalent_read_noise_e(camera))
+
+
+def _check_exposure(config: Configuration, light: Double) -> None:
+    """Raise where a pixel is at full well under a flat wavefront: what it then says is no longer linear."""
+    camera = detector(config)
+    charge_e = float(light.max()) * electrons_per_exposure(config) * camera.em_gain
+    full_dn = float(saturation_dn(camera))
+    if _dark_dn(camera) + charge_e / camera.gain_e_per_dn >= full_dn:
+        raise CalibrationError(
+            f"the star saturates the sensor: {charge_e:.0f} e- in the brightest pixel of a flat wavefront, which holds "
+            f"{(full_dn - _dark_dn(camera)) * camera.gain_e_per_dn:.0f} e-; shorten camera.exposure_fraction or raise "
+            "camera.rate_hz"
+        )
+
+
+def _nuisance(config: Configuration, light: Double, good: Double) -> Double | None:
+    """Slopes (pixels, any) of the normalised image along what is fitted beside the modes; None without any."""
+    columns = []
+    for name in config.control.nuisance:
+        if name == "background":
+            columns.append(np.ones((light.size, 1)))
+        else:
+            columns.append(shear_response(sensor(config, lambda _: None), band(config)))
+    return normalise_flux(light, np.hstack(columns), good)[1] if columns else None
+
+
+def _dark_dn(camera: Detector) -> float:
+    return camera.bias_dn + camera.clock_induced_charge_e * camera.em_gain / camera.gain_e_per_dn
 
 
 def _equivalent_read_noise_e(camera: Detector) -> float:

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lowfc.adapters.layouts import layout_warnings, load_layout
-from lowfc.contract.configuration import SensorSection, sensor_keys
+from lowfc.contract.configuration import SENSORS, SensorSection, sensor_keys
 from lowfc.contract.errors import ConfigurationError, DataFileError, nearest
 from lowfc.optics import sam as sams
 from lowfc.optics.focal_mask import bowtie, disk, phase_spot
@@ -83,7 +83,7 @@ def sensor_from(
             case "open":
                 relay = ApertureMask(circle(len(pupil)))
             case "sam":
-                layout = load_layout(section.sam)
+                layout = _layout(section.sam)
                 for text in layout_warnings(layout):
                     warn(text)
                 relay = ApertureMask(sams.transmission(layout, len(pupil)))
@@ -95,6 +95,14 @@ def sensor_from(
 def sensor_named(name: str) -> Sensor:
     """One of `SENSORS`, or the sparse aperture mask with that layout."""
     return sensor_from(SensorSection.model_validate(sensor_keys(name)))
+
+
+def _layout(name: str) -> sams.Layout:
+    try:
+        return load_layout(name)
+    except ConfigurationError as error:  # on the command line sensors and layouts share an option
+        slip = nearest(name, SENSORS)
+        raise ConfigurationError(f"{error}; nor is it a sensor{slip}" if slip else str(error)) from None
 
 
 def _pupil(section: SensorSection) -> NDArray[np.float64]:
@@ -112,10 +120,12 @@ def _pupil(section: SensorSection) -> NDArray[np.float64]:
 
 
 def _focal_mask(section: SensorSection) -> NDArray[np.inexact]:
+    if section.focal_mask == "bowtie":
+        if section.kind == "zwfs" or section.inner_radius:
+            raise ValueError("a bowtie has neither a phase spot nor an inner radius; take focal_mask = 'disk'")
+        return bowtie(radius=section.focal_radius)
     if section.kind == "zwfs":
         return phase_spot(radius=section.focal_radius, spot_diameter=section.spot_diameter)
-    if section.focal_mask == "bowtie":
-        return bowtie(radius=section.focal_radius)
     if section.kind == "clowfs":
         if not section.inner_radius < section.focal_radius:
             raise ValueError(

@@ -186,6 +186,8 @@ class Control(Section):
     camera's. Twice the delay halves the highest stable gain."""
     estimator: Literal["weighted", "pinv"] = "weighted"
     """Noise-weighted or plain pseudo-inverse of H."""
+    nuisance: list[Literal["background", "shear"]] = Field(default_factory=list)
+    """What is fitted along with the modes so that it does not pass for them: uniform light, shear of the beam."""
     tilt_gain: float = Field(0.5, ge=0, le=4)
     """Integrator gain of tip and tilt."""
     gain: float = Field(0.05, ge=0, le=4)

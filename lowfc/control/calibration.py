@@ -27,7 +27,7 @@ class Calibration:
         grid: rows and columns of the mirror.
         flux_dn: expected sum of the good pixels, dark subtracted.
         saturation_dn: highest value a pixel can have.
-        estimator: how R was made: weighted or pinv.
+        estimator: how R was made: weighted or pinv, and what was fitted along, as in weighted+shear.
         wavelength_nm: at which H was made.
         operator_hash: of the optical model behind it; empty for a measured calibration.
         id: identity of the whole.
@@ -82,12 +82,28 @@ def normalise_flux(reference: Array, response: Array, good: Array) -> tuple[Arra
 
 
 def reconstructor(
-    reference: Array, response: Array, good: Array, flux_e: float, read_noise_e: float, estimator: str = "weighted"
+    reference: Array,
+    response: Array,
+    good: Array,
+    flux_e: float,
+    read_noise_e: float,
+    estimator: str = "weighted",
+    nuisance: Array | None = None,
 ) -> Array:
     """R (modes, pixels) from normalised I0 and H: error = R (I - I0), the least-squares solution of eq. (11).
 
     `weighted` is (H' W H)^-1 H' W with W = 1 / (I0 + read_noise^2) in electrons, the least noise that an unbiased
     linear estimate can have; `pinv` weighs all pixels alike. Bad pixels get zero.
+
+    Args:
+        reference: (pixels,) I0, normalised.
+        response: (pixels, modes) H, normalised.
+        good: (pixels,) 1 where a pixel is used, else 0.
+        flux_e: Electrons on the good pixels.
+        read_noise_e: Of a pixel.
+        estimator: One of `ESTIMATORS`.
+        nuisance: (pixels, any) what else changes an image, normalised like H, in any unit: fitted along, so that it
+            does not pass for modes, and not returned. Flux is none: nothing of it is left by the normalisation.
 
     Raises:
         ValueError: unknown estimator, or modes that this sensor cannot tell apart.
@@ -106,8 +122,14 @@ def reconstructor(
             "the sensor cannot tell the modes apart (condition number above 1e8): "
             "an even-symmetric aperture mask cannot sense even modes; use another mask or fewer modes"
         )
-    inverse: Array = np.linalg.pinv(scaled) * root.T
-    return inverse
+    if nuisance is None:
+        return np.asarray(np.linalg.pinv(scaled) * root.T)
+    both = np.hstack([scaled, root * nuisance])
+    sizes = np.linalg.norm(both, axis=0)  # pinv leaves out singular values that are small beside the largest
+    if not (sizes.all() and condition_number(both / sizes) < 1e8):
+        raise ValueError("the sensor cannot tell the nuisance modes from the others: fit fewer of either")
+    inverse = np.linalg.pinv(both / sizes) / sizes[:, None]
+    return np.asarray((inverse * root.T)[: response.shape[1]])
 
 
 def condition_number(response: Array) -> float:

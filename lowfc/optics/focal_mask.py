@@ -31,10 +31,12 @@ def phase_spot(samples_per: int = 8, radius: float = 4.0, spot_diameter: float =
         radius: Of the disk, in lambda0 / D.
         spot_diameter: In lambda0 / D.
     """
-    fine, _ = _polar(samples_per * _FINE, radius)
-    size = len(fine) // _FINE
-    covered = (fine <= spot_diameter / 2.0).reshape(size, _FINE, size, _FINE).mean(axis=(1, 3))
-    return np.asarray(disk(samples_per, radius) * (1.0 + (1j - 1.0) * covered))
+    mask = disk(samples_per, radius)
+    size = len(mask)
+    x = image_axis(size * _FINE, samples_per * _FINE)
+    inside = np.hypot(x[:, None], x) <= spot_diameter / 2.0
+    covered = inside.reshape(size, _FINE, size, _FINE).mean(axis=(1, 3))
+    return np.asarray(mask * (1.0 + (1j - 1.0) * covered))
 
 
 def bowtie(

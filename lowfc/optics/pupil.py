@@ -51,7 +51,8 @@ def prolate(samples: int, mask_radius: float) -> NDArray[np.float64]:
     r = np.hypot(u[:, None], u)
     inside = r <= 0.5
     amplitude = np.zeros((samples, samples))
-    amplitude[inside] = _within(r[inside], rho, mask_radius) @ values
+    radii, where = np.unique(r[inside], return_inverse=True)
+    amplitude[inside] = (_within(radii, rho, mask_radius) @ values)[where]
     centre = float((_within(np.zeros(1), rho, mask_radius) @ values)[0])
     return np.clip(amplitude / centre, 0.0, 1.0)
 

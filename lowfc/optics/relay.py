@@ -58,6 +58,19 @@ def fresnel_distance(defocus_mm: float, focal_ratio: float, wavelength_nm: float
     return defocus_mm * 1e6 / (wavelength_nm * focal_ratio**2)
 
 
+def least_distance(reach: float, samples_per: int) -> float:
+    """Shortest distance of a `Defocus` whose chirp the samples resolve, in (lambda0/D)^2.
+
+    The sum over the focal plane repeats itself where chirp and field together turn by a wave from sample to sample.
+
+    Args:
+        reach: From the edge of the detector to the far edge of the focal-plane mask, in lambda0 / D.
+        samples_per: Samples per lambda0 / D.
+    """
+    spare = 2.0  # half a cycle for the pupil's light, the rest for the short end of a wide band
+    return reach / (samples_per - spare)
+
+
 def pitch(relay: Relay, samples: int, samples_per: int) -> float:
     """Distance between the samples on the detector, in lambda0 / D; in D where it sees the pupil."""
     return relay.width / samples if isinstance(relay, PupilImage) else 1.0 / samples_per

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from lowfc.optics.band import Band, monochromatic
 from lowfc.optics.fourier import Field, to_image, to_pupil
 from lowfc.optics.grid import OPEN_AREA, image_axis, pupil_axis
-from lowfc.optics.relay import ApertureMask, Relay, direct_kernel, pitch
+from lowfc.optics.relay import ApertureMask, Defocus, Relay, direct_kernel, least_distance, pitch
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,6 +44,14 @@ class Sensor:
             )
         if self.focal_mask.ndim != 2 or self.focal_mask.shape[0] != self.focal_mask.shape[1]:
             raise ValueError(f"the focal-plane mask must be square, got shape {self.focal_mask.shape}")
+        if isinstance(self.relay, Defocus):
+            reach = (self.pixels * self.binning + self.focal_mask.shape[0]) / (2.0 * self.samples_per)
+            least = least_distance(reach, self.samples_per)
+            if self.relay.distance < least:
+                raise ValueError(
+                    f"{self.samples_per} samples per lambda/D resolve a defocus of at least {least:.3g} (lambda/D)^2, "
+                    f"got {self.relay.distance:.3g}; take a longer distance or a smaller focal ratio"
+                )
         if not self.wavelength_nm > 0:
             raise ValueError(f"the wavelength must be positive, got {self.wavelength_nm} nm")
 

@@ -41,6 +41,8 @@ def build(
     mask = sensor.focal_mask
     if mask.shape[0] % 2 or not (np.array_equal(mask, mask[::-1]) and np.array_equal(mask, mask[:, ::-1])):
         raise ValueError("the twin needs a focal-plane mask with even samples and symmetric about both axes")
+    if isinstance(sensor.relay, ApertureMask) and np.iscomplexobj(mask):
+        raise ValueError("the twin of an aperture mask needs a real focal-plane mask, got a complex one")
     band = monochromatic(sensor.wavelength_nm) if band is None else band
     scales = [sensor.wavelength_nm / wavelength_nm for wavelength_nm in band.wavelengths_nm]
     axis = node_axis(spec.nodes, spec.order)
@@ -51,7 +53,10 @@ def build(
     area = np.count_nonzero(mask) / sensor.samples_per**2
     # Two thirds of the modes are the light's freedom, which goes by the mask's area; the others are for its edge.
     # An aperture mask blurs what the faintest modes add; without one it takes a third more of them.
+    # A pupil that is bright up to its edge fills the faintest of them, a tenth more.
     needed = spec.rank if isinstance(sensor.relay, ApertureMask) else 4 * spec.rank / 3
+    if sensor.pupil.mean() > 0.5:
+        needed *= 1.1
     rank = round(needed * (2.0 * float(area / _DISK_AREA) + 1.0) / 3.0)
     steps = len(scales) * mask.shape[0] // 2
     done = itertools.count(1)

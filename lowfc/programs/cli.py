@@ -13,6 +13,8 @@ import typer
 from lowfc import __version__
 from lowfc.adapters.terminal import DEFAULT_RUN, ConfigFile, RunId, configuration, new_app, run_app
 from lowfc.contract.configuration import Preset
+from lowfc.programs.design_commands import design_app
+from lowfc.programs.validate.commands import validate
 
 if TYPE_CHECKING:
     from lowfc.contract.messages import wire
@@ -24,6 +26,8 @@ config_app = new_app("Show and check the configuration.\n\nExample: lowfc config
 app.add_typer(ctl_app, name="ctl")
 app.add_typer(config_app, name="config")
 app.add_typer(bench_app, name="bench")
+app.add_typer(design_app, name="design")
+app.command()(validate)
 
 AnyRun = Annotated[str | None, typer.Option("--run", help="Name of the run; default: the only one.")]
 Values = Annotated[list[float], typer.Argument(help="One value for all modes, or one for each.")]

@@ -112,6 +112,36 @@ def test_a_sensor_that_cannot_tell_modes_apart_is_refused(response: np.ndarray, 
         reconstructor(I0, H, GOOD, 1e5, 1.0, estimator)
 
 
+@pytest.mark.parametrize("estimator", ESTIMATORS)
+@pytest.mark.parametrize("unit", [1.0, 1e-9, 1e12])
+def test_a_nuisance_mode_is_not_seen_whatever_its_unit(estimator: str, unit: float) -> None:
+    ramp = np.linspace(-1, 1, PIXELS)
+    background = np.column_stack([np.ones(PIXELS), TOY.reference * ramp])
+    I0, H = normalise_flux(TOY.reference, RESPONSE, GOOD)
+    beside = normalise_flux(TOY.reference, background, GOOD)[1]
+    R = reconstructor(I0, H, GOOD, 1e5, 2.0, estimator, unit * beside)
+    assert R.shape == (3, PIXELS)
+    assert np.abs(R @ H - np.eye(3)).max() < 1e-9
+    assert np.abs(R @ beside).max() < 1e-9 * np.abs(R).max()
+    plain = reconstructor(I0, H, GOOD, 1e5, 2.0, estimator)
+    assert np.abs(plain @ beside).max() > 1e-3 * np.abs(plain).max()
+    if estimator == "weighted":  # of the estimates that do not see it, this one costs the least noise, but some
+        assert (noise_nm(R, I0, 1e5, 2.0) > noise_nm(plain, I0, 1e5, 2.0)).all()
+
+
+@pytest.mark.parametrize("nuisance", [RESPONSE[:, :1], np.zeros((PIXELS, 1))])
+def test_a_nuisance_that_is_a_mode_or_nothing_is_refused(nuisance: np.ndarray) -> None:
+    I0, H = normalise_flux(TOY.reference, RESPONSE, GOOD)
+    beside = normalise_flux(TOY.reference, nuisance, GOOD)[1]
+    with pytest.raises(ValueError, match="nuisance modes"):
+        reconstructor(I0, H, GOOD, 1e5, 1.0, nuisance=beside)
+
+
+def test_nothing_of_the_flux_is_left_by_the_normalisation() -> None:
+    left = normalise_flux(TOY.reference, TOY.reference[:, None], GOOD)[1]
+    assert np.abs(left).max() < 1e-15
+
+
 def test_an_unknown_estimator_is_refused() -> None:
     with pytest.raises(ValueError, match="'best'"):
         reconstructor(TOY.reference, RESPONSE, GOOD, 1e5, 1.0, "best")

@@ -104,8 +104,8 @@ def test_bands_have_the_wavelengths_of_section_3_3():
 def test_shipped_masks_pass_the_light_they_were_designed_for(sam, sensor_fraction, peak, condition, modes):
     sensor = sensor_named(sam)
     budget = light_budget(sensor)
-    assert budget.pupil == pytest.approx(0.258, abs=1e-3)
-    assert budget.focal_mask == pytest.approx(0.633, abs=1e-3)
+    assert budget.pupil == pytest.approx(0.2625, abs=1e-3)
+    assert budget.focal_mask == pytest.approx(0.635, abs=1e-3)
     assert budget.sensor == pytest.approx(sensor_fraction, rel=0.02)
     assert budget.peak == pytest.approx(peak, rel=0.02)
     assert budget.total == pytest.approx(budget.pupil * budget.focal_mask * budget.sensor)

@@ -5,13 +5,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from lowfc.adapters.masks import sensor_named
+from lowfc.adapters.masks import sensor_from, sensor_named
+from lowfc.contract.configuration import SensorSection
 from lowfc.optics.band import gauss_legendre
 from lowfc.optics.grid import pupil_axis
 from lowfc.optics.mirror import Mirror, influence_factors, modes_to_actuators, surface_nm
 from lowfc.optics.nodes import interpolation, node_axis
 from lowfc.optics.sensor import image, response
-from lowfc.optics.twin import FAST, Evaluator, TwinSpec, node_radii, wavefront_rms_nm
+from lowfc.optics.twin import ACCURATE, FAST, Evaluator, TwinSpec, node_radii, wavefront_rms_nm
 from lowfc.optics.twin import reference as twin_reference
 from lowfc.optics.twin import response as twin_response
 from lowfc.optics.twin_build import build
@@ -62,10 +63,52 @@ def test_other_masks_are_right_to_1e_4(sam, modes, coefficients_nm):
 def test_the_bowtie_keeps_as_many_modes_as_its_area_needs(modes, coefficients_nm):
     sensor = sensor_named("bowtie")
     twin = build(sensor, FAST)
-    assert len(twin.operators[0].to_modes) == 170
+    assert len(twin.operators[0].to_modes) == 171
     few = coefficients_nm[:3]
     full = [image(sensor, np.tensordot(each, modes, 1)) for each in few]
     assert max(map(relative_l2, twin_images(twin, few), full)) < 1e-4
+
+
+@pytest.mark.parametrize(
+    ("name", "limit"),
+    [("clowfs", 1e-5), ("zwfs", 1e-4), ("bar", 1e-4), ("open", 1e-4), ("lyot", 1e-4), ("aplc", 3e-5)],
+)
+def test_the_twin_of_every_sensor_is_right_to_1e_4(name, limit, modes, coefficients_nm):
+    sensor = sensor_named(name)
+    few = coefficients_nm[:3]
+    full = [image(sensor, np.tensordot(each, modes, 1)) for each in few]
+    assert max(map(relative_l2, twin_images(build(sensor, FAST), few), full)) < limit
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("name", "limit"),
+    [("clowfs", 1e-6), ("zwfs", 2e-6), ("bar", 1e-6), ("lyot", 2e-6), ("aplc", 2e-6), ("bowtie", 1e-6)],
+)
+def test_the_accurate_twin_of_every_sensor(name, limit, modes, coefficients_nm):
+    sensor = sensor_named(name)
+    few = coefficients_nm[:3]
+    full = [image(sensor, np.tensordot(each, modes, 1)) for each in few]
+    assert max(map(relative_l2, twin_images(build(sensor, ACCURATE), few), full)) < limit
+
+
+@pytest.mark.parametrize(("defocus_mm", "limit"), [(1.5, 2e-4), (3.0, 5e-5), (12.0, 5e-5)])
+def test_the_defocused_twin_is_right_at_any_distance(defocus_mm, limit, modes, coefficients_nm):
+    sensor = sensor_from(SensorSection(kind="clowfs", defocus_mm=defocus_mm))
+    full = image(sensor, np.tensordot(coefficients_nm[0], modes, 1))
+    assert relative_l2(twin_images(build(sensor, FAST), coefficients_nm[:1])[0], full) < limit
+
+
+@pytest.mark.parametrize("name", ["clowfs", "zwfs"])
+def test_without_a_relay_mask_the_mirrors_tilt_is_right_to_1e_4(name):
+    sensor, mirror = sensor_named(name), Mirror()
+    twin = build(sensor, FAST)
+    on_nodes = twin_mirror(sensor, twin, mirror)
+    factors = influence_factors(mirror, pupil_axis(512), 34)
+    for tilt in modes_to_actuators(mirror, [2, 3]).T:
+        actuators_nm = 34.0 * tilt.reshape(34, 34)
+        full = image(sensor, 2.0 * surface_nm(factors, actuators_nm, factors))
+        assert relative_l2(Evaluator(twin).image(wavefront_nm(on_nodes, actuators_nm)), full) < 1e-4
 
 
 @pytest.mark.parametrize(("name", "limit"), [("fast", 3e-4), ("accurate", 1e-5)])
@@ -108,7 +151,7 @@ def test_the_mirror_on_the_nodes_makes_the_commanded_wavefront(sensor, fast):
     commands = modes_to_actuators(Mirror(), NOLLS_20)
     for command, wanted in zip(commands.T, zernikes(NOLLS_20, *node_radii(fast)), strict=True):
         error = wavefront_nm(on_nodes, 10.0 * command.reshape(34, 34)) - 10.0 * wanted
-        assert wavefront_rms_nm(fast, error) < 0.25  # the full surface's own fit errors reach 0.15 nm
+        assert wavefront_rms_nm(fast, error) < 0.35  # the full surface's own fit errors reach 0.15 nm
 
 
 def test_rms_is_taken_over_the_open_pupil_without_piston(sensor, modes, fast):
@@ -140,6 +183,8 @@ def test_what_cannot_be_compressed_is_refused(sensor):
     lopsided[:, :20] = 0
     with pytest.raises(ValueError, match="symmetric about both axes"):
         build(replace(sensor, focal_mask=lopsided), FAST)
+    with pytest.raises(ValueError, match="needs a real focal-plane mask"):
+        build(replace(sensor, focal_mask=sensor.focal_mask * 1j), FAST)
     with pytest.raises(ValueError, match="rank must lie between 1 and"):
         build(sensor, TwinSpec(rank=5000, nodes=16))
     with pytest.raises(ValueError, match="must be even"):

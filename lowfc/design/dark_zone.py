@@ -1,0 +1,62 @@
+"""The dark zone of a shaped pupil's image: one quadrant of it, for the rest are mirror images; all in lambda / D."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+Float = NDArray[np.float64]
+
+FINE_STEP = 0.1
+"""Between the points where a mask must keep its promise."""
+
+
+@dataclass(frozen=True)
+class DarkZone:
+    """Part of a ring.
+
+    Attributes:
+        inner: Where it begins.
+        outer: Where it ends.
+        half_angle_deg: It lies within this angle of the x axis.
+    """
+
+    inner: float
+    outer: float
+    half_angle_deg: float
+
+
+def fine_grid(zone: DarkZone) -> tuple[Float, NDArray[np.bool_]]:
+    """Coordinates (n,) from the star outward, and where (n, n), [row = y, column = x], they are in the zone."""
+    axis = _axis(FINE_STEP, zone.outer)
+    return axis, _inside(zone, axis)
+
+
+def first_points(zone: DarkZone, step: float) -> Float:
+    """Points (n, 2), x and y, of a square grid in the zone and along its edges, where the field is worst."""
+    axis = _axis(step, zone.outer)
+    y, x = np.nonzero(_inside(zone, axis))
+    found = np.concatenate([np.column_stack([axis[x], axis[y]]), edge_points(zone, step)])
+    return np.unique(np.round(found, 9), axis=0)
+
+
+def edge_points(zone: DarkZone, step: float) -> Float:
+    """Points (n, 2), x and y, along the zone's edges: the inner arc, the ray, and the outer arc back."""
+    reach = float(np.deg2rad(zone.half_angle_deg))
+    upward = np.linspace(0.0, reach, int(np.ceil(zone.inner * reach / step)) + 1)
+    ray = np.linspace(zone.inner, zone.outer, int(np.ceil((zone.outer - zone.inner) / step)) + 1)
+    downward = np.linspace(reach, 0.0, int(np.ceil(zone.outer * reach / step)) + 1)
+    radii = np.concatenate([np.full(upward.size, zone.inner), ray, np.full(downward.size, zone.outer)])
+    angles = np.concatenate([upward, np.full(ray.size, reach), downward])
+    return np.column_stack([radii * np.cos(angles), radii * np.sin(angles)])
+
+
+def _axis(step: float, outer: float) -> Float:
+    return np.arange(int(np.floor(outer / step + 1e-9)) + 1, dtype=np.float64) * step
+
+
+def _inside(zone: DarkZone, axis: Float) -> NDArray[np.bool_]:
+    x, y, rounding = axis, axis[:, None], 1e-9
+    radius, angle_deg = np.hypot(x, y), np.rad2deg(np.arctan2(y, x))
+    within = (radius >= zone.inner - rounding) & (radius <= zone.outer + rounding)
+    return np.asarray(within & (angle_deg <= zone.half_angle_deg + rounding))

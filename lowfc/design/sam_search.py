@@ -1,0 +1,238 @@
+"""Simulated annealing of the holes of a sparse aperture mask, in blocks that can be stopped, stored and continued.
+
+Positions and diameters are whole thousandths of the pupil's diameter, so that a layout is written without loss. Under
+a mirror symmetry a chain moves orbits: a hole on the axis, or one hole that stands for itself and its mirror image.
+"""
+
+from dataclasses import dataclass, replace
+from math import exp, hypot, inf, log
+
+import numpy as np
+
+from lowfc.design.sam_goal import Goal, merit
+from lowfc.design.sam_merit import Optics, Single, hole_fields
+
+Orbit = tuple[int, int, int]
+"""Centre x, y and diameter of a hole, in thousandths of the pupil's diameter."""
+
+UNIT = 1000
+SYMMETRIES = ("none", "x", "y")
+BLOCK = 200
+"""Steps between two states of a chain that can be stored."""
+
+_ATTEMPTS = 60
+_PACKINGS = 200
+_WARM, _COLD = 0.01, 0.0003
+_FAR, _NEAR = 80.0, 1.5
+
+
+@dataclass(frozen=True)
+class Bounds:
+    """What every layout of a search keeps to; lengths in thousandths of the pupil's diameter.
+
+    Attributes:
+        count: Fewest and most holes.
+        diameter: Smallest and largest.
+        gap: Least distance between the rims of two holes.
+        edge: Least distance from a hole's rim to the pupil's.
+        symmetry: "none", or the axis, "x" or "y", about which the mask is its own mirror image.
+    """
+
+    count: tuple[int, int] = (27, 27)
+    diameter: tuple[int, int] = (70, 70)
+    gap: int = 10
+    edge: int = 0
+    symmetry: str = "none"
+
+    def __post_init__(self) -> None:
+        if not 1 <= self.count[0] <= self.count[1]:
+            raise ValueError(f"the number of holes must be at least 1 and in order, got {self.count}")
+        if not 2 <= self.diameter[0] <= self.diameter[1] <= UNIT - 2 * self.edge:
+            raise ValueError(
+                "hole diameters must be in order and lie between 0.002 and 1 pupil diameter less the edge, got "
+                f"{self.diameter[0] / UNIT} to {self.diameter[1] / UNIT}"
+            )
+        if self.gap < 0 or self.edge < 0:
+            raise ValueError(f"gaps must not be negative, got {self.gap / UNIT} and {self.edge / UNIT}")
+        if self.symmetry not in SYMMETRIES:
+            raise ValueError(f"symmetry must be one of {', '.join(SYMMETRIES)}, got {self.symmetry!r}")
+
+
+@dataclass(frozen=True)
+class Chain:
+    """One search between two blocks.
+
+    Attributes:
+        seed: Of the whole search.
+        index: Of this chain.
+        steps: How many it makes in all.
+        step: How many it has made.
+        orbits: Where it stands.
+        best: The best it has seen.
+        best_merit: Merit of that.
+    """
+
+    seed: int
+    index: int
+    steps: int
+    step: int
+    orbits: tuple[Orbit, ...]
+    best: tuple[Orbit, ...]
+    best_merit: float = inf
+
+
+def start(bounds: Bounds, seed: int, index: int, steps: int) -> Chain:
+    """A chain at a random layout.
+
+    Raises:
+        ValueError: So many holes cannot be placed.
+    """
+    rng = np.random.default_rng([seed, index])
+    for _ in range(_PACKINGS):
+        orbits = _packed(rng, bounds)
+        if orbits is not None:
+            return Chain(seed, index, steps, 0, orbits, orbits)
+    raise ValueError(
+        f"{bounds.count[0]} holes of at least {bounds.diameter[0] / UNIT} pupil diameters with gaps of "
+        f"{bounds.gap / UNIT} could not be placed in {_PACKINGS} attempts; ask for fewer, smaller or closer holes"
+    )
+
+
+def advance(optics: Optics, goal: Goal, bounds: Bounds, chain: Chain) -> Chain:
+    """Make the next block of steps, if any is left; the result depends on nothing but the arguments."""
+    if chain.step >= chain.steps:
+        return chain
+    rng = np.random.default_rng([chain.seed, chain.index, 1 + chain.step])
+    orbits, best, best_merit = list(chain.orbits), chain.best, chain.best_merit
+    fields = [orbit_fields(optics, orbit, bounds.symmetry) for orbit in orbits]
+    total = np.sum(fields, axis=0)
+    current = merit(optics, goal, total)
+    if current < best_merit:
+        best, best_merit = tuple(orbits), current
+    end = min(chain.step + BLOCK, chain.steps)
+    for step in range(chain.step, end):
+        done = step / chain.steps
+        temperature = _WARM * (_COLD / _WARM) ** done
+        move = _move(rng, bounds, orbits, done)
+        if move is None:
+            continue
+        at, orbit = move
+        field = None if orbit is None else orbit_fields(optics, orbit, bounds.symmetry)
+        changed = total if at is None else total - fields[at]
+        changed = changed if field is None else changed + field
+        value = merit(optics, goal, changed)
+        # a layout that is 1 % worse is as likely at any level of the merit
+        accepted = value < current or (value < inf and rng.random() < exp(-log(value / current) / temperature))
+        if not accepted:
+            continue
+        if at is not None:
+            del orbits[at], fields[at]
+        if orbit is not None and field is not None:
+            orbits.append(orbit)
+            fields.append(field)
+        total, current = changed, value
+        if current < best_merit:
+            best, best_merit = tuple(orbits), current
+    return replace(chain, step=end, orbits=tuple(orbits), best=best, best_merit=best_merit)
+
+
+def holes(orbits: tuple[Orbit, ...], symmetry: str) -> tuple[tuple[float, float, float], ...]:
+    """The holes (x, y, diameter) in pupil diameters that orbits stand for, in a fixed order."""
+    expanded = sorted(hole for orbit in orbits for hole in images(orbit, symmetry))
+    return tuple((x / UNIT, y / UNIT, diameter / UNIT) for x, y, diameter in expanded)
+
+
+def images(orbit: Orbit, symmetry: str) -> tuple[Orbit, ...]:
+    """The orbit's one or two holes."""
+    x, y, diameter = orbit
+    mirrored = {"none": orbit, "x": (x, -y, diameter), "y": (-x, y, diameter)}[symmetry]
+    return (orbit,) if mirrored == orbit else (orbit, mirrored)
+
+
+def orbit_fields(optics: Optics, orbit: Orbit, symmetry: str) -> Single:
+    """What the orbit's holes add to the fields at the sensor."""
+    return np.asarray(np.sum([hole_fields(optics, hole) for hole in holes((orbit,), symmetry)], axis=0))
+
+
+def _packed(rng: np.random.Generator, bounds: Bounds) -> tuple[Orbit, ...] | None:
+    """A random layout of the fewest holes and smallest diameters, or None when it got stuck."""
+    orbits: list[Orbit] = []
+    missing = bounds.count[0]
+    while missing:
+        paired = bounds.symmetry != "none" and missing >= 2
+        orbit = _placed(rng, bounds, orbits, paired, bounds.diameter[0])
+        if orbit is None:
+            return None
+        orbits.append(orbit)
+        missing -= 1 + paired
+    return tuple(orbits)
+
+
+def _move(
+    rng: np.random.Generator, bounds: Bounds, orbits: list[Orbit], done: float
+) -> tuple[int | None, Orbit | None] | None:
+    """A random change that keeps to the bounds: which orbit goes and which one comes; None when none was found."""
+    at = int(rng.integers(len(orbits)))
+    if bounds.count[0] < bounds.count[1] and rng.random() < 0.1:
+        count = sum(len(images(orbit, bounds.symmetry)) for orbit in orbits)
+        if rng.random() < 0.5:
+            left = count - len(images(orbits[at], bounds.symmetry))
+            return (at, None) if left >= bounds.count[0] else None
+        paired = bounds.symmetry != "none" and rng.random() < 0.8
+        diameter = int(rng.integers(bounds.diameter[0], bounds.diameter[1] + 1))
+        added = _placed(rng, bounds, orbits, paired, diameter) if count + 1 + paired <= bounds.count[1] else None
+        return (None, added) if added is not None else None
+    others = orbits[:at] + orbits[at + 1 :]
+    paired = len(images(orbits[at], bounds.symmetry)) == 2
+    jumps = rng.random() < 0.25 * (1.0 - done)
+    resizes = bounds.diameter[0] < bounds.diameter[1] and rng.random() < 0.4
+    reach = _FAR * (_NEAR / _FAR) ** done
+    for _ in range(_ATTEMPTS):
+        x, y, diameter = orbits[at]
+        if resizes:
+            diameter = int(np.clip(diameter + round(rng.normal(0.0, 0.3 * reach + 1.0)), *bounds.diameter))
+        if jumps:
+            orbit = _anywhere(rng, bounds, paired, diameter)
+        else:
+            x, y = x + round(rng.normal(0.0, reach)), y + round(rng.normal(0.0, reach))
+            orbit = _on_axis(bounds, (x, y, diameter), paired)
+        if orbit != orbits[at] and _fits(bounds, orbit, others, paired):
+            return at, orbit
+    return None
+
+
+def _placed(rng: np.random.Generator, bounds: Bounds, others: list[Orbit], paired: bool, diameter: int) -> Orbit | None:
+    """A random orbit that fits beside others, or None when none was found."""
+    for _ in range(_ATTEMPTS):
+        orbit = _anywhere(rng, bounds, paired, diameter)
+        if _fits(bounds, orbit, others, paired):
+            return orbit
+    return None
+
+
+def _anywhere(rng: np.random.Generator, bounds: Bounds, paired: bool, diameter: int) -> Orbit:
+    x, y = (int(value) for value in rng.integers(-UNIT // 2, UNIT // 2 + 1, 2))
+    return _on_axis(bounds, (x, y, diameter), paired)
+
+
+def _on_axis(bounds: Bounds, orbit: Orbit, paired: bool) -> Orbit:
+    """The orbit itself, or moved onto the axis of the symmetry unless it is to be a pair."""
+    x, y, diameter = orbit
+    if bounds.symmetry == "none" or paired:
+        return orbit
+    return (x, 0, diameter) if bounds.symmetry == "x" else (0, y, diameter)
+
+
+def _fits(bounds: Bounds, orbit: Orbit, others: list[Orbit], paired: bool) -> bool:
+    """Whether an orbit is one hole or a pair as wanted, inside the pupil, apart from its own image and from others."""
+    own = images(orbit, bounds.symmetry)
+    x, y, diameter = orbit
+    if len(own) != 1 + paired or 2 * hypot(x, y) + diameter > UNIT - 2 * bounds.edge:
+        return False
+    if paired and hypot(own[0][0] - own[1][0], own[0][1] - own[1][1]) < diameter + bounds.gap:
+        return False
+    return all(
+        2 * hypot(x - a, y - b) >= diameter + d + 2 * bounds.gap
+        for other in others
+        for a, b, d in images(other, bounds.symmetry)
+    )

@@ -1,0 +1,318 @@
+"""The shaped pupil by linear programming: the most open mask whose image has a dark zone.
+
+The transmissions of the cells of one quadrant are the variables. A mask that is symmetric about both axes has a real
+field, so that |E| <= sqrt(contrast) E(0) is two linear inequalities at every point. Less symmetry would gain nothing:
+the mean of any mask and its mirror images is as open, and as dark in a zone that has both mirror symmetries itself.
+
+Between the points of a grid the light is tens of times brighter. Exchange: the maxima of the solution on a fine
+grid become points of the next program, until none is above what was promised.
+"""
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.ndimage import maximum_filter
+
+from lowfc.design.dark_zone import FINE_STEP, DarkZone, edge_points, fine_grid, first_points
+from lowfc.design.linear_program import maximise
+from lowfc.optics.focal_mask import disk
+from lowfc.optics.fourier import to_image
+from lowfc.optics.grid import OPEN_AREA, pupil_axis
+from lowfc.optics.pupil import circle, from_quarter
+
+Float = NDArray[np.float64]
+
+SAMPLES = 512
+"""Samples across the pupil as the sensor uses it; each cell is a square of them."""
+
+FOCAL_MASK_RADIUS = 4.0
+"""Of the disk whose share of the light is reported, in lambda / D (Sect. 2.1)."""
+
+LEAST_OPEN = 0.01
+"""A program whose best mask is less open than this part of the circle is called infeasible: a closed one is dark."""
+
+SYMMETRIES = ("quarter", "octant")
+
+COARSEST_CELLS = 32
+"""In half the diameter, of the first programs: they find most of the points, and are soon solved."""
+
+
+@dataclass(frozen=True)
+class Request:
+    """What is asked of a shaped pupil; angles from the star in lambda / D.
+
+    Attributes:
+        inner: Where the dark zone begins.
+        outer: Where it ends.
+        half_angle_deg: The zone lies within this angle of the x axis, on both sides; 90 is the full annulus.
+        contrast: The largest intensity in the zone over the one at the star, every `FINE_STEP` and on the edges.
+        limit: The programs' contrast over the promised one; below 1 the exchange ends sooner.
+        cells: Across half the diameter, a divisor of 256.
+        step: Of the first grid of points.
+        symmetry: "quarter" about both axes, "octant" about both diagonals too (the zone then has them as well).
+        rounds: Programs to be solved at most with each number of cells.
+    """
+
+    inner: float = 4.0
+    outer: float = 20.0
+    half_angle_deg: float = 42.5
+    contrast: float = 1e-9
+    limit: float = 0.95
+    cells: int = 128
+    step: float = 0.5
+    symmetry: str = "quarter"
+    rounds: int = 20
+
+    def __post_init__(self) -> None:
+        if self.cells < 8 or SAMPLES // 2 % self.cells:
+            raise ValueError(f"cells must be 8, 16, 32, 64, 128 or 256 in half the diameter, got {self.cells}")
+        if not 0 < self.inner < self.outer <= self.cells:
+            raise ValueError(
+                "the dark zone must begin above 0 and end above that, by the number of cells in half the diameter "
+                f"({self.cells} lambda/D) at most; got {self.inner:g} to {self.outer:g} lambda/D"
+            )
+        if not 0 < self.half_angle_deg <= 90:
+            raise ValueError(f"the half-angle must be above 0 and at most 90 degrees, got {self.half_angle_deg:g}")
+        if not 0 < self.contrast < 1 or not 0 < self.limit <= 1:
+            raise ValueError(
+                "contrast must lie between 0 and 1 and the limit above 0 and at most 1, got "
+                f"{self.contrast:g} and {self.limit:g}"
+            )
+        if not FINE_STEP <= self.step <= 2:
+            raise ValueError(f"the grid's step must lie between {FINE_STEP} and 2 lambda/D, got {self.step:g}")
+        if self.symmetry not in SYMMETRIES:
+            raise ValueError(f"the symmetry must be one of {', '.join(SYMMETRIES)}, got {self.symmetry!r}")
+        if self.rounds < 1:
+            raise ValueError(f"at least one round is needed, got {self.rounds}")
+
+    @property
+    def zone(self) -> DarkZone:
+        """The part of the dark zone that has no mirror image in itself."""
+        most_deg = 45.0 if self.symmetry == "octant" else 90.0
+        return DarkZone(self.inner, self.outer, min(self.half_angle_deg, most_deg))
+
+
+@dataclass(frozen=True, eq=False)
+class Round:
+    """A solved program.
+
+    Attributes:
+        number: Counted from 1 with each number of cells.
+        points: Of the program, each with one sign of the field.
+        quarter: (cells, cells) the mask, [0, 0] next to the pupil's centre.
+        open_area: Fraction of the circle.
+        bound: On `open_area`, from the dual: no mask that is dark in these points is more open.
+        contrast: The largest in the zone on the fine grid; infinite for a closed mask.
+    """
+
+    number: int
+    points: int
+    quarter: Float
+    open_area: float
+    bound: float
+    contrast: float
+
+
+@dataclass(frozen=True)
+class Figures:
+    """Of a mask: all are fractions; contrasts every `FINE_STEP` of the dark zone.
+
+    Attributes:
+        open_area: Sum of the transmission, of the open circle.
+        energy: Of the open circle's light, what passes.
+        focal_mask: Of that, what falls within `FOCAL_MASK_RADIUS`.
+        max_contrast: The largest, also on the zone's edges.
+        mean_contrast: The mean.
+        grey: Of the circle's cells, those neither open nor closed to a thousandth.
+    """
+
+    open_area: float
+    energy: float
+    focal_mask: float
+    max_contrast: float
+    mean_contrast: float
+    grey: float
+
+
+def exchange(request: Request) -> Iterator[Round]:
+    """Solve program after program, first with few cells; the last one keeps the promise unless the rounds ran out.
+
+    Each program begins at the multipliers of the one before, and the points are those that few cells have found.
+    Where nothing but a closed mask is dark the last round's contrast is infinite.
+
+    Raises:
+        ValueError: The solver gave up.
+    """
+    points = first_points(request.zone, request.step)
+    points, signs = np.concatenate([points, points]), np.repeat([1.0, -1.0], len(points))
+    multipliers = np.zeros(len(points))
+    level = np.sqrt(request.limit * request.contrast)
+    for cells in _levels(request):
+        y, x, weights = _variables(cells, request.symmetry)
+        for number in range(1, request.rounds + 1):
+            rows = _rows(points, signs, cells, request.symmetry) - level * weights
+            values, multipliers, bound = maximise(rows, weights, multipliers)
+            quarter = np.zeros((cells, cells))
+            quarter[y, x] = values
+            if request.symmetry == "octant":
+                quarter[x, y] = values
+            is_open = _open_area(quarter) >= LEAST_OPEN
+            contrast = largest_contrast(quarter, request) if is_open else np.inf
+            bound_area = bound / (cells**2 * OPEN_AREA)
+            yield Round(number, len(points), quarter, _open_area(quarter), bound_area, contrast)
+            if not is_open or contrast <= request.contrast:
+                break
+            found, found_signs = _maxima(quarter, request, level * (1 + 1e-6))
+            points, signs = np.concatenate([points, found]), np.concatenate([signs, found_signs])
+            multipliers = np.concatenate([multipliers, np.zeros(len(found))])
+        if is_open:  # the other sign of the field hardly ever matters in the same place with more cells
+            kept = (signs * _field_at(quarter, points) > 0) | (multipliers > 0)
+            points, signs, multipliers = points[kept], signs[kept], multipliers[kept]
+
+
+def relative_field(quarter: Float, axis: Float) -> Float:
+    """Field E / E(0) of a mask at all pairs of coordinates, [row = y, column = x].
+
+    Args:
+        quarter: (cells, cells) of the mask.
+        axis: (n,) coordinates in lambda / D.
+    """
+    waves = _waves(axis, len(quarter))
+    return np.asarray(waves @ quarter @ waves.T / quarter.sum())
+
+
+def largest_contrast(quarter: Float, request: Request) -> float:
+    """Of a mask, on the fine grid of the dark zone and on its edges."""
+    axis, zone = fine_grid(request.zone)
+    on_grid = relative_field(quarter, axis)[zone]
+    on_edge = _field_at(quarter, edge_points(request.zone, FINE_STEP))
+    return float(max(np.abs(on_grid).max(), np.abs(on_edge).max()) ** 2)
+
+
+def figures(quarter: Float, request: Request) -> Figures:
+    """What a mask does in the dark zone of a request."""
+    axis, zone = fine_grid(request.zone)
+    contrast = relative_field(quarter, axis)[zone] ** 2
+    pupil = from_quarter(quarter, SAMPLES)
+    samples_per = 8
+    mask = disk(samples_per, FOCAL_MASK_RADIUS)
+    image = np.abs(to_image(pupil.astype(np.complex128), len(mask), samples_per, 1.0)) ** 2
+    cells = quarter[_circle_quarter(len(quarter))]
+    return Figures(
+        open_area=_open_area(quarter),
+        energy=float((pupil**2).mean() / OPEN_AREA),
+        focal_mask=float((image * mask).sum() / samples_per**2 / (pupil**2).mean()),
+        max_contrast=largest_contrast(quarter, request),
+        mean_contrast=float(contrast.mean()),
+        grey=float(((cells > 1e-3) & (cells < 1 - 1e-3)).mean()),
+    )
+
+
+def stored(quarter: Float, request: Request) -> NDArray[np.floating]:
+    """The mask in the shortest floating-point type in which it keeps the promise."""
+    for kind in (np.float16, np.float32):
+        short: NDArray[np.floating] = quarter.astype(kind)
+        if largest_contrast(short.astype(np.float64), request) <= request.contrast:
+            return short
+    return quarter
+
+
+def nearest_feasible(request: Request) -> tuple[float | None, float | None]:
+    """For an infeasible request, what would do: the next inner angle in steps of 0.1, and contrast in steps of 26 %.
+
+    Found with the fewest cells that resolve the zone.
+
+    Returns:
+        Inner angle (at most twice as large), and contrast (at most 1e5 times as large) with all else kept; None where
+        even the largest is infeasible.
+    """
+    coarse = replace(request, cells=_levels(request)[0])
+    inners = [round(v, 6) for v in request.inner + 0.1 * np.arange(1, round(10 * request.inner) + 1)]
+    contrasts = [float(f"{request.contrast * 10 ** (k / 10):.1e}") for k in range(1, 51)]
+    return (
+        _first([v for v in inners if v < request.outer], lambda v: is_feasible(replace(coarse, inner=v))),
+        _first([v for v in contrasts if v < 1], lambda v: is_feasible(replace(coarse, contrast=v))),
+    )
+
+
+def is_feasible(request: Request) -> bool:
+    """Whether a mask that is not closed keeps the promise."""
+    return [found.contrast <= request.contrast for found in exchange(request)][-1]
+
+
+def _first(candidates: Sequence[float], feasible: Callable[[float], bool]) -> float | None:
+    """The first feasible one of candidates that grow easier, by bisection."""
+    low, high = 0, len(candidates)
+    while low < high:
+        middle = (low + high) // 2
+        if feasible(candidates[middle]):
+            high = middle
+        else:
+            low = middle + 1
+    return candidates[low] if low < len(candidates) else None
+
+
+def _levels(request: Request) -> list[int]:
+    """Numbers of cells, up to what is wanted."""
+    finest = request.cells
+    coarser = [cells for cells in (COARSEST_CELLS, 64, 128) if request.outer <= cells < finest]
+    return [*coarser, finest]
+
+
+def _variables(cells: int, symmetry: str) -> tuple[NDArray[np.intp], NDArray[np.intp], Float]:
+    """Indices y and x (n,) of the cells that stand for themselves and their mirror images, and how many those are."""
+    y, x = np.nonzero(_circle_quarter(cells))
+    if symmetry == "quarter":
+        return y, x, np.ones(y.size)
+    below = y <= x
+    y, x = y[below], x[below]
+    return y, x, np.where(y == x, 1.0, 2.0)
+
+
+def _rows(points: Float, signs: Float, cells: int, symmetry: str) -> Float:
+    """Field (points, n) at points, with a sign, of each variable; a cell adds 1 to E(0)."""
+    y, x, weights = _variables(cells, symmetry)
+    along_x, along_y = (_waves(points[:, k], cells) for k in (0, 1))
+    rows = along_y[:, y] * along_x[:, x]
+    if symmetry == "octant":
+        rows = 0.5 * weights * (rows + along_y[:, x] * along_x[:, y])
+    return np.asarray(signs[:, None] * rows)
+
+
+def _waves(axis: Float, cells: int) -> Float:
+    """Kernel (n, cells) from a half-axis of cells, mirrored, to the image: the mean over each cell's samples."""
+    u = pupil_axis(SAMPLES)[SAMPLES // 2 :]
+    return np.asarray(np.cos(2.0 * np.pi * np.outer(axis, u)).reshape(axis.size, cells, -1).mean(axis=2))
+
+
+def _field_at(quarter: Float, points: Float) -> Float:
+    """Field E / E(0) of a mask (n,) at points (n, 2)."""
+    along_x, along_y = (_waves(points[:, k], len(quarter)) for k in (0, 1))
+    return np.asarray(((along_y @ quarter) * along_x).sum(axis=1) / quarter.sum())
+
+
+def _maxima(quarter: Float, request: Request, level: float) -> tuple[Float, Float]:
+    """Where the field's absolute value has maxima above a level, points (n, 2), and its signs (n,) there."""
+    axis, zone = fine_grid(request.zone)
+    field = np.where(zone, relative_field(quarter, axis), 0.0)
+    edge = edge_points(request.zone, FINE_STEP)
+    on_edge = _field_at(quarter, edge)
+    y, x = np.nonzero(_peaks(field, level))
+    peaks = _peaks(on_edge, level)
+    points = np.concatenate([np.column_stack([axis[x], axis[y]]), edge[peaks]])
+    return points, np.sign(np.concatenate([field[y, x], on_edge[peaks]]))
+
+
+def _peaks(field: Float, level: float) -> NDArray[np.bool_]:
+    size = np.abs(field)
+    return np.asarray((size > level) & (size >= maximum_filter(size, 3)))
+
+
+def _circle_quarter(cells: int) -> NDArray[np.bool_]:
+    return circle(2 * cells)[cells:, cells:] > 0
+
+
+def _open_area(quarter: Float) -> float:
+    return float(quarter.mean() / OPEN_AREA)

@@ -1,0 +1,76 @@
+"""Random wavefronts and noisy images (Sect. 3.1), and what is left of a wavefront after its estimate is taken off."""
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from lowfc.optics.zernike import noll_to_nm
+
+Array = NDArray[np.float64]
+
+LITERAL_WAVES = (0.04, 0.016)
+"""Bounds of Sect. 3.1 for radial degrees 1 and 2, and above; read as uniform between minus and plus these."""
+
+_BLOCK = 100  # wavefronts whose samples are in memory at once
+
+
+def bounds_waves(nolls: Sequence[int], low: float, high: float) -> Array:
+    """Bound (modes,) of each coefficient in waves rms: `low` for radial degrees 1 and 2, `high` above."""
+    return np.array([low if noll_to_nm(noll)[0] <= 2 else high for noll in nolls])
+
+
+def random_wavefronts(rng: np.random.Generator, count: int, nolls: Sequence[int], low: float, high: float) -> Array:
+    """Coefficients (count, modes) in waves rms, uniform between minus and plus `bounds_waves` (Sect. 3.1).
+
+    They are stratified: of `count` equal parts of its range each coefficient takes every one once, in random order, so
+    that the input's mean square, on which the second-order errors depend, hardly changes from seed to seed.
+    """
+    strata = rng.permuted(np.tile(np.arange(count), (len(nolls), 1)), axis=1).T
+    unit = 2.0 * (strata + rng.uniform(size=strata.shape)) / count - 1.0
+    return np.asarray(unit * bounds_waves(nolls, low, high))
+
+
+def noisy_e(rng: np.random.Generator, mean_e: ArrayLike, read_noise_e: float) -> Array:
+    """An exposure in electrons: photon noise, read noise, and whole numbers at one electron per digital number."""
+    mean_e = np.maximum(mean_e, 0.0)  # a twin's rounding leaves values below zero where there is no light
+    return np.asarray(np.rint(rng.poisson(mean_e) + read_noise_e * rng.standard_normal(mean_e.shape)))
+
+
+def gram(basis: Array) -> Array:
+    """Mean products (modes, modes) of modes (modes, samples) over the open pupil, piston removed."""
+    centred = basis - basis.mean(axis=1, keepdims=True)
+    return np.asarray(centred @ centred.T / basis.shape[1])
+
+
+def input_rms(gram: Array, bounds: Array) -> float:
+    """Root mean square over the open pupil of coefficients uniform between minus and plus bounds (modes,)."""
+    return float(np.sqrt(np.sum(np.diag(gram) * bounds**2) / 3.0))
+
+
+def expected_rms(gram: Array, covariance: Array) -> float:
+    """Root mean square over the open pupil of residuals with this covariance (modes, modes)."""
+    return float(np.sqrt(np.sum(gram * covariance)))
+
+
+def residual_rms(gram: Array, residuals: Array) -> Array:
+    """Rms (n,) over the open pupil of residual coefficients (n, modes), in their unit."""
+    return np.asarray(np.sqrt(np.maximum(np.einsum("nj,jk,nk->n", residuals, gram, residuals), 0.0)))
+
+
+def residual_pv(basis: Array, residuals: Array) -> Array:
+    """Peak to valley (n,) over the open pupil of residual coefficients (n, modes), in their unit.
+
+    Args:
+        basis: Modes (modes, samples) at the open samples.
+        residuals: Truth minus estimate.
+    """
+    blocks = (residuals[i : i + _BLOCK] @ basis for i in range(0, len(residuals), _BLOCK))
+    return np.concatenate([np.ptp(block, axis=1) for block in blocks])
+
+
+def r_squared(estimates: Array, truth: Array) -> Array:
+    """Coefficient of determination (modes,) of estimates (n, modes), eq. (15) as the text below it reads."""
+    residual = np.sum((estimates - truth) ** 2, axis=0)
+    total = np.sum((estimates - estimates.mean(axis=0)) ** 2, axis=0)
+    return np.asarray(1.0 - residual / total)

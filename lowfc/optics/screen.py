@@ -1,0 +1,34 @@
+"""Phase screens with the power spectrum of Kolmogorov's turbulence (Sect. 3.2)."""
+
+import numpy as np
+import scipy.fft
+from numpy.typing import NDArray
+
+_SPECTRUM = 0.0229  # of the phase, rad^2 per (cycle per D)^2 at one cycle per D, where Fried's length is D
+
+
+def kolmogorov(rng: np.random.Generator, samples: int, width: int = 4) -> NDArray[np.float64]:
+    """Screen (samples, samples) of power law -11/3, at the samples of a pupil, in radians for a Fried length of D.
+
+    It is cut out of a periodic one that is wider than the pupil: without the waves that are longer than the pupil,
+    which a periodic screen cannot hold, too little of the wavefront would be of low order.
+
+    Args:
+        rng: Source of all randomness.
+        samples: Points across the pupil.
+        width: Of the periodic screen, in pupil diameters.
+
+    Raises:
+        ValueError: The periodic screen would be narrower than the pupil.
+    """
+    if width < 1:
+        raise ValueError(f"the periodic screen must be at least as wide as the pupil, got {width} pupil diameters")
+    count = width * samples
+    fx, fy = scipy.fft.rfftfreq(count, 1.0 / samples), scipy.fft.fftfreq(count, 1.0 / samples)
+    f2 = fy[:, None] ** 2 + fx**2
+    f2[0, 0] = np.inf  # no piston
+    amplitude = np.sqrt(_SPECTRUM) * f2 ** (-11.0 / 12.0)
+    spectrum = scipy.fft.rfft2(rng.standard_normal((count, count))) * amplitude
+    # White noise has a power of count^2 at each frequency; the inverse transform divides by it once more.
+    whole = (count / width) * scipy.fft.irfft2(spectrum, (count, count))
+    return np.ascontiguousarray(whole[:samples, :samples])

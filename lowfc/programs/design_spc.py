@@ -1,0 +1,228 @@
+"""The design of a shaped pupil: progress, file, picture and text around `lowfc.design.shaped_pupil`."""
+
+import io
+import json
+from collections.abc import Callable
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from queue import SimpleQueue
+from threading import Thread
+from typing import Any, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+from rich.console import Console
+from threadpoolctl import threadpool_limits
+
+from lowfc.contract.errors import ConfigurationError, DataFileError
+from lowfc.design.dark_zone import FINE_STEP, fine_grid
+from lowfc.design.shaped_pupil import (
+    FOCAL_MASK_RADIUS,
+    LEAST_OPEN,
+    Request,
+    Round,
+    exchange,
+    figures,
+    nearest_feasible,
+    relative_field,
+    stored,
+)
+from lowfc.optics.pupil import from_quarter
+from lowfc.programs.design_sam_files import figure_class, write_whole
+
+Result = TypeVar("Result")
+
+OPTIONS = {"half_angle_deg": "half-angle"}
+"""Options that are not called as in the request."""
+
+
+def request(**options: Any) -> Request:
+    """What the options ask for.
+
+    Raises:
+        ConfigurationError: A value is out of range.
+    """
+    try:
+        return Request(**options)
+    except ValueError as error:
+        raise ConfigurationError(str(error)) from error
+
+
+def command_of(wanted: Request) -> str:
+    """The command that makes this mask."""
+    given = ((OPTIONS.get(key, key), value) for key, value in asdict(wanted).items())
+    return " ".join(["lowfc design spc", *(f"--{key} {value}" for key, value in given)])
+
+
+def design_spc(wanted: Request, out: Path, plot: Path | None, console: Console) -> dict[str, Any]:
+    """Design a mask and write it.
+
+    Args:
+        wanted: The mask.
+        out: An npz file with `quarter`, which `load_pupil` reads, and `made_by`, the request as JSON.
+        plot: Picture to be drawn, or None.
+        console: Where progress goes.
+
+    Raises:
+        ConfigurationError: No mask does that, and which nearest request is feasible; or the rounds did not suffice,
+            or there is no matplotlib.
+        DataFileError: A file cannot be written.
+    """
+    if plot is not None:
+        figure_class()
+    for file in (out, plot):  # what is missing is said before the work, not after it
+        if file is not None and not file.parent.is_dir():
+            raise DataFileError(f"{file} cannot be written: there is no directory {file.parent}")
+    with console.status("solving linear programs"):
+        rounds = _interruptibly(lambda: _rounds(wanted, console))
+    last = rounds[-1]
+    if last.open_area < LEAST_OPEN:
+        with console.status("infeasible; looking for the nearest feasible request"):
+            raise ConfigurationError(_infeasible(wanted, *_interruptibly(lambda: nearest_feasible(wanted))))
+    if last.contrast > wanted.contrast:
+        raise ConfigurationError(
+            f"after {last.number} programs with {wanted.cells} cells the contrast is {last.contrast:.2e}, not "
+            f"{wanted.contrast:g}: allow more --rounds, or a lower --limit than {wanted.limit:g}"
+        )
+    quarter = stored(last.quarter, wanted)
+    made_by = np.array(json.dumps(asdict(wanted)))
+    content = io.BytesIO()
+    np.savez_compressed(content, allow_pickle=False, quarter=quarter, made_by=made_by)
+    write_whole(out, content.getvalue())
+    found = figures(quarter.astype(np.float64), wanted)
+    if plot is not None:
+        write_whole(plot, _picture(quarter.astype(np.float64), wanted))
+    return {
+        "file": str(out),
+        "dtype": str(quarter.dtype),
+        "command": command_of(wanted),
+        "open_area_fraction": found.open_area,
+        "energy_fraction": found.energy,
+        "focal_mask_fraction": found.focal_mask,
+        "focal_mask_radius_lambda_d": FOCAL_MASK_RADIUS,
+        "max_contrast": found.max_contrast,
+        "mean_contrast": found.mean_contrast,
+        "contrast_step_lambda_d": FINE_STEP,
+        "grey_cells_fraction": found.grey,
+        "above_optimum_fraction": last.bound - last.open_area,
+        "rounds": len(rounds),
+        "points": last.points,
+    }
+
+
+def render(result: dict[str, Any]) -> str:
+    """The result of `design_spc` as text."""
+    lines = (
+        ("open area", f"{result['open_area_fraction']:.2%} of the circle"),
+        ("energy", f"{result['energy_fraction']:.2%} of the circle's light"),
+        (
+            "in the focal-plane mask",
+            f"{result['focal_mask_fraction']:.2%} of that (disk, {result['focal_mask_radius_lambda_d']:g} lambda/D)",
+        ),
+        (
+            "contrast",
+            f"max {result['max_contrast']:.2e}, mean {result['mean_contrast']:.2e} "
+            f"(every {result['contrast_step_lambda_d']:g} lambda/D)",
+        ),
+        ("grey cells", f"{result['grey_cells_fraction']:.2%}"),
+        ("solved", f"{result['rounds']} programs, the last with {result['points']} points"),
+        ("written", f"{result['file']} ({result['dtype']})"),
+        ("again", result["command"]),
+    )
+    return "\n".join(f"{name:<24} {value}" for name, value in lines)
+
+
+def _rounds(wanted: Request, console: Console) -> list[Round]:
+    """All programs, each with a line of progress."""
+    rounds: list[Round] = []
+    for found in exchange(wanted):
+        rounds.append(found)
+        console.print(
+            f"{len(found.quarter):>4} cells, program {found.number:>2}: {found.points:>5} points, open area "
+            f"{found.open_area:7.3%}, contrast {found.contrast:.2e}",
+            highlight=False,
+        )
+    return rounds
+
+
+def _infeasible(wanted: Request, inner: float | None, contrast: float | None) -> str:
+    ways = []
+    if inner is not None:
+        ways.append(f"inner angle is {inner:g} (contrast kept)")
+    if contrast is not None:
+        ways.append(f"contrast is {contrast:g} (angle kept)")
+    nearest = f"the nearest feasible {', or '.join(ways)}" if ways else "nothing near it is feasible"
+    return (
+        f"inner angle {wanted.inner:g} lambda/D at {wanted.contrast:g} is infeasible (no mask is more open than "
+        f"{LEAST_OPEN:.0%}); {nearest}"
+    )
+
+
+@dataclass
+class _Outcome:
+    value: Any = None
+    error: BaseException | None = None
+
+
+def _interruptibly(work: Callable[[], Result]) -> Result:
+    """Do work in a thread, for Ctrl-C waits for the end of a program where the main thread solves it.
+
+    Raises:
+        ConfigurationError: The work cannot be done.
+    """
+    outcomes: SimpleQueue[_Outcome] = SimpleQueue()
+
+    def run() -> None:
+        try:
+            with threadpool_limits(1):
+                outcomes.put(_Outcome(work()))
+        except BaseException as error:
+            outcomes.put(_Outcome(error=error))
+
+    Thread(target=run, daemon=True).start()
+    outcome = outcomes.get()
+    if isinstance(outcome.error, ValueError):
+        raise ConfigurationError(str(outcome.error)) from outcome.error
+    if outcome.error is not None:
+        raise outcome.error
+    value: Result = outcome.value
+    return value
+
+
+def _picture(quarter: NDArray[np.float64], wanted: Request) -> bytes:
+    """Mask, image on a log scale with the dark zone outlined, and contrast against angle (PNG)."""
+    figure = figure_class()(figsize=(15, 4.6), layout="constrained")
+    mask, image, curve = figure.subplots(1, 3)
+    mask.imshow(from_quarter(quarter, 2 * len(quarter)), cmap="gray", extent=(-0.5, 0.5, -0.5, 0.5))
+    mask.set(title="shaped pupil", xlabel="x (D)", ylabel="y (D)")
+
+    edge = min(wanted.outer + 4.0, float(wanted.cells))
+    axis = np.arange(-edge, edge + FINE_STEP / 2, FINE_STEP)
+    decades = np.log10(np.maximum(relative_field(quarter, axis) ** 2, 1e-30))
+    floor = np.log10(wanted.contrast) - 2.0
+    drawn = image.imshow(
+        decades, vmin=floor, vmax=0.0, cmap="inferno", origin="lower", extent=(-edge, edge, -edge, edge)
+    )
+    angles = np.deg2rad(np.linspace(-wanted.half_angle_deg, wanted.half_angle_deg, 91))
+    radii = np.concatenate([np.full(91, wanted.inner), np.full(91, wanted.outer), [wanted.inner]])
+    outline = np.concatenate([angles, angles[::-1], angles[:1]])
+    for side in (-1.0, 1.0):
+        image.plot(side * radii * np.cos(outline), radii * np.sin(outline), "c-", linewidth=0.8)
+    image.set(title="image, log10 of contrast", xlabel="x (lambda/D)", ylabel="y (lambda/D)")
+    figure.colorbar(drawn, ax=image)
+
+    axis, zone = fine_grid(wanted.zone)
+    contrast = relative_field(quarter, axis) ** 2
+    ring = np.round(np.hypot(axis, axis[:, None])[zone] / 0.5).astype(int)
+    values = contrast[zone]
+    rings = np.unique(ring)
+    for name, reduce in (("max", np.max), ("mean", np.mean)):
+        curve.semilogy(0.5 * rings, [reduce(values[ring == k]) for k in rings], label=f"{name} in the dark zone")
+    along_x = axis[axis <= wanted.outer]
+    curve.semilogy(along_x, contrast[0, : along_x.size], color="0.6", linewidth=0.8, label="on the x axis")
+    curve.axhline(wanted.contrast, color="k", linestyle=":", label="promised")
+    curve.set(title="contrast", xlabel="angle (lambda/D)", ylim=(10.0**floor, 1.0), xlim=(0.0, wanted.outer))
+    curve.legend()
+    content = io.BytesIO()
+    figure.savefig(content, format="png", dpi=120)
+    return content.getvalue()

@@ -1,0 +1,53 @@
+"""The bright exposure in which the figures measure one wavefront (Sect. 3.1), and all ways to estimate it."""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lowfc.design.estimators import Fit, estimate, refine
+from lowfc.design.fisher import cramer_rao, variance_e
+from lowfc.design.trials import noisy_e
+from lowfc.optics.zernike import NOLLS_14
+from lowfc.programs.validate.cases import Prepared
+from lowfc.programs.validate.reconstruction import PEAK_E, READ_NOISE_E, scale_e
+
+Array = NDArray[np.float64]
+
+MODES = len(NOLLS_14)
+ITERATIONS = (0, 1, 2)
+BRIGHT = (
+    f"{PEAK_E:,.0f} e- in the brightest pixel of the flat image, {READ_NOISE_E:.0f} e- read noise, whole electrons, "
+    "monochromatic."
+)
+FULL_CHAIN = "Images by the full optical chain; iterations with the twin, right to 1e-6."
+
+
+def label(kind: str, iterations: int) -> str:
+    """An estimator's name, as Table 3 has it."""
+    return kind if iterations == 0 else f"{kind} + {iterations} iteration{'s' * (iterations > 1)}"
+
+
+ESTIMATORS = tuple(label(kind, iterations) for kind in ("pinv", "weighted") for iterations in ITERATIONS)
+PINV = label("pinv", 0)
+WEIGHTED, WEIGHTED_1, WEIGHTED_2 = (label("weighted", iterations) for iterations in ITERATIONS)
+
+
+def exposed_e(ready: Prepared, image: Array, rng: np.random.Generator) -> Array:
+    """A noisy image (pixels,) in electrons of one in fractions of the open circle's light."""
+    return noisy_e(rng, scale_e(ready) * image, READ_NOISE_E)
+
+
+def estimates_nm(ready: Prepared, linear: dict[str, Fit], image_e: Array) -> dict[str, Array]:
+    """What each of `ESTIMATORS` makes (modes,) of an image (pixels,) in electrons; of the kinds in `linear` alone."""
+    found: dict[str, Array] = {}
+    for kind, fit in linear.items():
+        modes_nm = estimate(fit, image_e)
+        for iterations in ITERATIONS:
+            modes_nm = refine(fit, image_e, modes_nm, ready.model, min(iterations, 1))
+            found[label(kind, iterations)] = modes_nm
+    return found
+
+
+def bound_nm2(ready: Prepared) -> Array:
+    """Cramer-Rao bound (modes, modes) of the exposure."""
+    light_e = scale_e(ready)
+    return cramer_rao(light_e * ready.H[:, :MODES], variance_e(light_e * ready.I0, READ_NOISE_E))

@@ -1,0 +1,174 @@
+"""Estimators against closed forms, their covariance against the Cramer-Rao bound, and both against noise itself."""
+
+from itertools import pairwise
+
+import numpy as np
+import pytest
+
+from lowfc.design.estimators import KINDS, estimate, fit, refine
+from lowfc.design.fisher import covariance, cramer_rao, variance_e
+from lowfc.design.trials import (
+    bounds_waves,
+    expected_rms,
+    gram,
+    input_rms,
+    noisy_e,
+    r_squared,
+    random_wavefronts,
+    residual_pv,
+    residual_rms,
+)
+from lowfc.optics.grid import pupil_axis
+from lowfc.optics.zernike import NOLLS_14, NOLLS_20, zernikes
+
+SCALE_E, READ_NOISE_E = 2e5, 3.0
+NOLLS = (2, 3, 4)
+
+
+@pytest.fixture(scope="module")
+def optics():
+    """I0 (60,) and H (60, 3) of no sensor in particular."""
+    rng = np.random.default_rng(1)
+    I0 = rng.exponential(size=60) / 60
+    return I0, I0[:, None] ** 0.5 * rng.normal(size=(60, 3)) * 1e-3
+
+
+@pytest.fixture(scope="module")
+def fits(optics):
+    return {kind: fit(NOLLS, *optics, SCALE_E, READ_NOISE_E, kind) for kind in KINDS}
+
+
+def test_the_bound_of_one_mode_in_two_pixels():
+    H, variance = np.array([[3.0], [4.0]]), np.array([9.0, 4.0])
+    np.testing.assert_allclose(cramer_rao(H, variance), [[1.0 / (9 / 9 + 16 / 4)]])
+
+
+def test_a_pixel_without_noise_or_light_tells_nothing():
+    H, variance = np.array([[3.0], [0.0]]), np.array([9.0, 0.0])
+    np.testing.assert_allclose(cramer_rao(H, variance), [[1.0]])
+
+
+def test_modes_that_look_alike_have_no_bound_and_no_estimate():
+    H = np.ones((5, 2))
+    with pytest.raises(ValueError, match="cannot tell the modes apart"):
+        cramer_rao(H, np.ones(5))
+    with pytest.raises(ValueError, match="cannot tell the modes apart"):
+        fit(NOLLS[:2], np.ones(5), H, SCALE_E, READ_NOISE_E, "pinv")
+
+
+def test_weighting_attains_the_bound_and_the_plain_inverse_does_not(fits):
+    variance = variance_e(fits["pinv"].reference_e, READ_NOISE_E)
+    bound = cramer_rao(fits["pinv"].response_e, variance)
+    np.testing.assert_allclose(covariance(fits["weighted"].R, variance), bound, rtol=1e-9)
+    assert (np.diag(covariance(fits["pinv"].R, variance)) > 1.05 * np.diag(bound)).all()
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_linear_image_is_estimated_exactly(fits, optics, kind):
+    I0, H = optics
+    modes_nm = np.array([[1.0, -2.0, 3.0], [0.5, 0.0, -4.0]])
+    images_e = SCALE_E * (I0 + modes_nm @ H.T)
+    np.testing.assert_allclose(estimate(fits[kind], images_e), modes_nm, atol=1e-9)
+    np.testing.assert_allclose(estimate(fits[kind], images_e[1]), modes_nm[1], atol=1e-9)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_what_is_fitted_along_does_not_pass_for_a_mode(fits, optics, kind):
+    I0, H = optics
+    nuisance = np.column_stack([I0, H[:, 0] * 1e6 + np.gradient(I0)])  # flux, and a shear that looks like the tilt
+    image_e = SCALE_E * (I0 + H @ [1.0, -2.0, 3.0] + nuisance @ [0.01, 2e-6])
+    careful = fit(NOLLS, I0, H, SCALE_E, READ_NOISE_E, kind, nuisance)
+    np.testing.assert_allclose(estimate(careful, image_e), [1.0, -2.0, 3.0], atol=1e-8)
+    assert abs(estimate(fits[kind], image_e)[0] - 1.0) > 0.5
+    assert careful.R.shape == (3, 60)
+
+
+def test_iterations_with_the_full_model_remove_the_second_order(fits, optics):
+    I0, H = optics
+
+    def model(modes_nm):
+        return I0 + H @ modes_nm + 0.02 * np.abs(H) @ modes_nm**2
+
+    truth_nm = np.array([3.0, -2.0, 4.0])
+    image_e = SCALE_E * model(truth_nm)
+    start_nm = estimate(fits["weighted"], image_e)
+    errors = [np.abs(refine(fits["weighted"], image_e, start_nm, model, n) - truth_nm).max() for n in range(4)]
+    assert errors[0] > 0.1
+    assert all(after < 0.5 * before for before, after in pairwise(errors))
+    assert np.abs(refine(fits["weighted"], image_e, start_nm, model, 60) - truth_nm).max() < 1e-9
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_the_scatter_under_noise_is_the_predicted_one(fits, kind):
+    rng, linear, count = np.random.default_rng(5), fits[kind], 20_000
+    images_e = noisy_e(rng, np.tile(linear.reference_e, (count, 1)), READ_NOISE_E)
+    predicted = np.sqrt(np.diag(covariance(linear.R, variance_e(linear.reference_e, READ_NOISE_E) + 1 / 12)))
+    measured = estimate(linear, images_e).std(axis=0, ddof=1)
+    np.testing.assert_allclose(measured, predicted, rtol=4 / np.sqrt(2 * count))
+
+
+def test_an_unknown_kind_is_refused(optics):
+    with pytest.raises(ValueError, match="estimator must be one of"):
+        fit(NOLLS, *optics, SCALE_E, READ_NOISE_E, "best")
+
+
+def test_noise_is_photons_read_noise_and_whole_numbers():
+    mean_e = np.repeat([0.0, 7.0, 400.0], 40_000)
+    image_e = noisy_e(np.random.default_rng(3), mean_e, READ_NOISE_E)
+    assert (image_e == np.rint(image_e)).all()
+    for mean, part in zip((0.0, 7.0, 400.0), image_e.reshape(3, -1), strict=True):
+        variance = mean + READ_NOISE_E**2 + 1 / 12
+        assert part.mean() == pytest.approx(mean, abs=4 * np.sqrt(variance / 40_000))
+        assert part.var() == pytest.approx(variance, rel=0.04)
+
+
+def test_no_light_is_no_error():
+    assert noisy_e(np.random.default_rng(3), np.array([-1e-9]), 0.0).tolist() == [0.0]
+
+
+def test_wavefronts_fill_their_bounds_evenly_and_come_from_the_seed():
+    drawn = random_wavefronts(np.random.default_rng(4), 50, NOLLS_20, 0.04, 0.016)
+    bounds = bounds_waves(NOLLS_20, 0.04, 0.016)
+    assert bounds.tolist() == [0.04] * 5 + [0.016] * 15
+    strata = np.sort(np.floor((drawn / bounds + 1.0) * 25), axis=0)
+    np.testing.assert_array_equal(strata, np.tile(np.arange(50.0)[:, None], (1, 20)))
+    np.testing.assert_array_equal(drawn, random_wavefronts(np.random.default_rng(4), 50, NOLLS_20, 0.04, 0.016))
+    assert np.abs(np.corrcoef(drawn.T) - np.eye(20)).max() < 0.5
+
+
+@pytest.fixture(scope="module")
+def circle_modes():
+    u = 2.0 * pupil_axis(256)
+    inside = u[:, None] ** 2 + u**2 <= 1.0
+    return zernikes(NOLLS_14, u, u[:, None])[:, inside]
+
+
+def test_residuals_over_the_circle_are_those_of_zernike_polynomials(circle_modes):
+    residuals = np.zeros((2, 14))
+    residuals[0, 0], residuals[1, :3] = 0.5, (3.0, 0.0, 4.0)
+    products = gram(circle_modes)
+    np.testing.assert_allclose(products, np.eye(14), atol=5e-3)
+    np.testing.assert_allclose(residual_rms(products, residuals), [0.5, 5.0], rtol=5e-3)
+    pv = residual_pv(circle_modes, residuals)
+    assert pv[0] == pytest.approx(0.5 * 4.0, rel=0.01)  # a tilt's peak to valley is four times its rms
+    assert pv[1] == pytest.approx(np.ptp(residuals[1] @ circle_modes))
+
+
+def test_a_piston_is_no_residual():
+    basis = np.array([[1.0, 1.0, 1.0], [3.0, 4.0, 5.0]])
+    np.testing.assert_allclose(residual_rms(gram(basis), np.array([[7.0, 1.0]])), [np.sqrt(2 / 3)])
+
+
+def test_the_expected_rms_is_that_of_many_draws(circle_modes):
+    products, bounds = gram(circle_modes), bounds_waves(NOLLS_14, 0.04, 0.016)
+    drawn = random_wavefronts(np.random.default_rng(6), 5000, NOLLS_14, 0.04, 0.016)
+    measured = np.sqrt(np.mean(residual_rms(products, drawn) ** 2))
+    assert input_rms(products, bounds) == pytest.approx(measured, rel=0.01)
+    assert expected_rms(products, np.diag(bounds**2 / 3)) == pytest.approx(input_rms(products, bounds))
+
+
+def test_the_coefficient_of_determination():
+    truth = np.array([[0.0, 1.0], [2.0, 1.0], [4.0, 4.0]])
+    estimates = truth + np.array([[0.0, 1.0], [0.0, 0.0], [0.0, -1.0]])
+    # The second mode: errors 1, 0, -1; estimates 2, 1, 3 about their mean 2.
+    np.testing.assert_allclose(r_squared(estimates, truth), [1.0, 1.0 - 2.0 / 2.0])

@@ -1,0 +1,221 @@
+import json
+import re
+import signal
+import subprocess
+import sys
+from dataclasses import replace
+from importlib import resources
+
+import numpy as np
+import pytest
+from scipy.optimize import linprog
+from scipy.special import j0, j1
+from typer.testing import CliRunner
+
+from lowfc.adapters.masks import load_pupil
+from lowfc.contract.errors import ConfigurationError, DataFileError
+from lowfc.design.shaped_pupil import (
+    SAMPLES,
+    Request,
+    exchange,
+    figures,
+    is_feasible,
+    relative_field,
+    stored,
+)
+from lowfc.optics.fourier import to_image
+from lowfc.optics.grid import OPEN_AREA, image_axis, pupil_axis
+from lowfc.optics.pupil import circle, from_quarter
+from lowfc.programs.design_commands import design_app
+
+SMALL = Request(outer=8.0, cells=16)
+SHIPPED = resources.files("lowfc") / "data" / "spc_quarter128.npz"
+
+
+def last(request):
+    return list(exchange(request))[-1]
+
+
+def image_of(quarter, samples_per, extent):
+    """Contrast by the sensor's own transform, at half-integer offsets: never on a point of the fine grid."""
+    pupil = from_quarter(quarter, SAMPLES)
+    axis = image_axis(2 * extent * samples_per, samples_per)
+    return axis, to_image(pupil.astype(complex), axis.size, samples_per, 1.0) / pupil.mean()
+
+
+def in_zone(request, axis, margin=0.0):
+    radius, angle = np.hypot(axis[:, None], axis), np.rad2deg(np.arctan2(np.abs(axis)[:, None], np.abs(axis)))
+    return (
+        (radius >= request.inner + margin)
+        & (radius <= request.outer - margin)
+        & (angle <= request.half_angle_deg - np.rad2deg(margin / request.inner))
+    )
+
+
+def test_the_field_is_the_sensors():
+    quarter = np.random.default_rng(1).random((16, 16))
+    axis, field = image_of(quarter, 7, 9)
+    np.testing.assert_allclose(relative_field(quarter, axis), field, atol=1e-12)
+
+
+def test_figures_of_the_open_circle():
+    found = figures(circle(512)[256:, 256:], Request())
+    assert found.open_area == pytest.approx(1.0, abs=1e-3)
+    assert found.energy == found.open_area
+    encircled = 1.0 - j0(4 * np.pi) ** 2 - j1(4 * np.pi) ** 2
+    assert found.focal_mask == pytest.approx(encircled, abs=2e-3)  # the disk's rim is a staircase
+    assert found.grey == 0.0
+
+
+def test_the_first_program_has_the_optimum_that_another_formulation_and_solver_find():
+    """The whole pupil without symmetry, its field as a plain sum, the whole wedge, an interior-point method."""
+    request = replace(SMALL, limit=1.0)
+    first = next(exchange(request))
+    assert first.bound == pytest.approx(first.open_area, abs=1e-9)
+    axis, reach = np.arange(17) / 2, np.deg2rad(request.half_angle_deg)
+    row, column = np.nonzero(in_zone(request, axis, -1e-9))
+    polar = [(4.0, a) for a in np.linspace(0, reach, 7)] + [(8.0, a) for a in np.linspace(0, reach, 13)]
+    polar += [(r, reach) for r in np.linspace(4, 8, 9)]
+    x = np.concatenate([axis[column], [r * np.cos(a) for r, a in polar]])
+    y = np.concatenate([axis[row], [r * np.sin(a) for r, a in polar]])
+    u, samples = pupil_axis(32), np.arange(-7.5, 8.0) / SAMPLES
+    v, h = (position[circle(32) > 0] for position in np.meshgrid(u, u, indexing="ij"))
+    square = np.cos(2 * np.pi * np.outer(x, samples)).mean(1) * np.cos(2 * np.pi * np.outer(y, samples)).mean(1)
+    fields = [np.cos(2 * np.pi * (np.outer(x, h) + np.outer(side * y, v))) * square[:, None] for side in (-1, 1)]
+    field, level = np.vstack(fields), np.sqrt(request.contrast)
+    other = linprog(
+        -np.ones(v.size),
+        A_ub=np.vstack([field - level, -field - level]),
+        b_ub=np.zeros(4 * x.size),
+        bounds=(0, 1),
+        method="highs-ipm",
+    )
+    assert -other.fun / 32**2 / OPEN_AREA == pytest.approx(first.open_area, abs=1e-6)
+
+
+def test_the_command_writes_a_mask_that_keeps_its_promise_between_the_points(tmp_path):
+    path, picture = tmp_path / "spc.npz", tmp_path / "spc.png"
+    pytest.importorskip("matplotlib")
+    arguments = ["spc", "--outer", "8", "--cells", "64", "--out", str(path), "--plot", str(picture), "--json"]
+    answer = CliRunner().invoke(design_app, arguments)
+    assert answer.exit_code == 0, answer.output
+    result = json.loads(answer.stdout)
+    assert result["open_area_fraction"] == pytest.approx(0.5317, abs=5e-4)
+    assert abs(result["above_optimum_fraction"]) < 1e-6
+    assert picture.read_bytes().startswith(b"\x89PNG")
+    pupil = load_pupil(file=path)
+    assert pupil.mean() / OPEN_AREA == pytest.approx(result["open_area_fraction"], abs=1e-12)
+    assert (pupil <= circle(SAMPLES // 4).repeat(4, 0).repeat(4, 1)).all()  # no cell outside the circle is open
+    with np.load(path) as file:
+        request = Request(**json.loads(str(file["made_by"])))
+        quarter = file["quarter"].astype(float)
+    assert request == Request(outer=8.0, cells=64)
+    assert figures(quarter, request).max_contrast == result["max_contrast"] <= request.contrast
+    axis, field = image_of(quarter, 30, 8)
+    zone = in_zone(request, axis)
+    assert (np.abs(field[zone]) ** 2).max() < 1.1 * request.contrast
+    assert (np.abs(field[zone]) ** 2).mean() == pytest.approx(result["mean_contrast"], rel=0.05)
+
+
+def test_the_same_request_gives_the_same_mask():
+    first, again = last(SMALL), last(SMALL)
+    assert first.contrast <= SMALL.contrast
+    np.testing.assert_array_equal(first.quarter, again.quarter)
+
+
+def test_less_symmetry_gains_nothing():
+    request = replace(SMALL, half_angle_deg=90.0, limit=0.98)
+    octant = last(replace(request, symmetry="octant"))
+    np.testing.assert_array_equal(octant.quarter, octant.quarter.T)
+    assert octant.contrast <= request.contrast
+    assert octant.open_area == pytest.approx(last(request).open_area, abs=1e-4)
+
+
+def test_the_shortest_type_that_keeps_the_promise():
+    found = last(SMALL)
+    kinds = {stored(found.quarter, replace(SMALL, contrast=contrast)).dtype for contrast in (1e-9, 1e-7)}
+    assert kinds == {np.dtype(np.float32), np.dtype(np.float16)}
+
+
+def test_an_infeasible_request_names_the_nearest_that_is_feasible(tmp_path):
+    path = tmp_path / "spc.npz"
+    arguments = ["spc", "--inner", "2.5", "--outer", "8", "--cells", "16", "--out", str(path)]
+    error = CliRunner().invoke(design_app, arguments).exception
+    assert isinstance(error, ConfigurationError)
+    assert "inner angle 2.5 lambda/D at 1e-09 is infeasible" in str(error)
+    nearest = r"nearest feasible inner angle is (\S+) \(contrast kept\), or contrast is (\S+) \(angle kept\)"
+    inner, contrast = map(float, re.search(nearest, str(error)).groups())
+    request = replace(SMALL, inner=2.5)
+    assert is_feasible(replace(request, inner=inner))
+    assert not is_feasible(replace(request, inner=inner - 0.1))
+    assert is_feasible(replace(request, contrast=contrast))
+    assert not is_feasible(replace(request, contrast=contrast / 10**0.1))
+    assert not path.exists()
+
+
+@pytest.mark.parametrize(
+    ("values", "message"),
+    [
+        ({"cells": 100}, "cells must be 8, 16"),
+        ({"outer": 20.0, "cells": 16}, "16 lambda/D"),
+        ({"inner": 20.0}, "20 to 20"),
+        ({"half_angle_deg": 95.0}, "half-angle"),
+        ({"contrast": 0.0}, "contrast must"),
+        ({"limit": 1.1}, "limit"),
+        ({"step": 0.0}, "step"),
+        ({"symmetry": "half"}, "one of quarter, octant, got 'half'"),
+        ({"rounds": 0}, "one round"),
+    ],
+)
+def test_impossible_requests_are_refused(values, message):
+    with pytest.raises(ValueError, match=message):
+        Request(**values)
+
+
+def test_too_few_rounds_say_what_to_do(tmp_path):
+    arguments = ["spc", "--outer", "8", "--cells", "16", "--rounds", "1", "--out", str(tmp_path / "spc.npz")]
+    error = CliRunner().invoke(design_app, arguments).exception
+    assert isinstance(error, ConfigurationError)
+    assert "after 1 programs with 16 cells the contrast is" in str(error)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_file_that_cannot_be_written_is_said_first(tmp_path):
+    error = CliRunner().invoke(design_app, ["spc", "--out", str(tmp_path / "nowhere" / "spc.npz")]).exception
+    assert isinstance(error, DataFileError)
+    assert "there is no directory" in str(error)
+
+
+def test_ctrl_c_stops_within_a_program_and_leaves_no_file(tmp_path):
+    source = "from lowfc.adapters.terminal import run_app; from lowfc.programs.design_commands import design_app"
+    command = [sys.executable, "-c", f"{source}; run_app(design_app)", "spc", "--outer", "12"]
+    command += ["--out", str(tmp_path / "spc.npz")]
+    with subprocess.Popen(command, stderr=subprocess.PIPE, text=True) as process:
+        assert "cells, program  1" in process.stderr.readline()
+        process.send_signal(signal.SIGINT)
+        process.communicate()
+    assert process.returncode == 130
+    assert list(tmp_path.iterdir()) == []
+
+
+def recorded():
+    with SHIPPED.open("rb") as stream, np.load(stream) as file:
+        return file["quarter"].astype(float), Request(**json.loads(str(file["made_by"])))
+
+
+def test_the_shipped_mask_keeps_what_its_record_promises():
+    quarter, request = recorded()
+    assert request == Request()
+    found = figures(quarter, request)
+    assert found.max_contrast <= request.contrast == 1e-9
+    assert found.open_area > 0.26
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(3600)
+def test_the_recorded_command_makes_the_shipped_mask_again():
+    quarter, request = recorded()
+    again = last(request)
+    assert again.contrast <= request.contrast
+    assert again.open_area == pytest.approx(quarter.mean() / OPEN_AREA, abs=1e-4)
+    assert (np.abs(again.quarter - quarter) > 0.5).mean() < 1e-3

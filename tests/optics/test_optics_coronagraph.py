@@ -1,0 +1,106 @@
+import numpy as np
+import pytest
+from scipy.special import j0, j1
+
+from lowfc.adapters.masks import load_pupil
+from lowfc.optics.coronagraph import DARK_ZONE, Wedge, contrast, contrast_curve, mean_contrast, wedge_samples
+from lowfc.optics.grid import image_axis, pupil_axis
+from lowfc.optics.pupil import circle
+from lowfc.optics.screen import kolmogorov
+from lowfc.optics.zernike import zernikes
+
+NM = 550.0
+
+
+@pytest.fixture(scope="module")
+def shaped():
+    return load_pupil()
+
+
+@pytest.fixture(scope="module")
+def flat(shaped):
+    return np.zeros(shaped.shape)
+
+
+def test_the_open_circle_makes_an_airy_pattern():
+    x = image_axis(64, 8)
+    r = np.pi * np.hypot(x[:, None], x)
+    found = contrast(circle(512), np.zeros((512, 512)), NM, 64, samples_per=8)
+    np.testing.assert_allclose(found, (2 * j1(r) / r) ** 2, atol=2e-4)  # the circle has a staircase for an edge
+
+
+def test_the_flat_shaped_pupil_is_dark_everywhere_in_its_zone(shaped, flat):
+    dark = wedge_samples(DARK_ZONE, 160, 160)
+    image = contrast(shaped, flat, NM, 160)
+    assert image[dark].max() < 1e-9
+    assert image[~dark].max() > 0.9
+    rows_only = contrast(shaped, flat, NM, 160, 108)
+    np.testing.assert_allclose(rows_only, image[26:134], rtol=1e-9, atol=1e-16)  # a smaller image is a part of it
+
+
+def test_a_tilt_moves_the_star(shaped):
+    ramp = NM * (3.0 * pupil_axis(512) + 0.5 * pupil_axis(512)[:, None])  # 3 and 1/2 waves across the pupil
+    image = contrast(shaped, ramp, NM, 64)
+    x = image_axis(64, 4)
+    flat = contrast(shaped, np.zeros((512, 512)), NM, 64)
+    np.testing.assert_allclose(image[2:, 12:], flat[:-2, :-12], atol=1e-12)
+    row, column = np.unravel_index(image.argmax(), image.shape)
+    assert abs(x[column] - 3.0) <= 0.125
+    assert abs(x[row] - 0.5) <= 0.125
+
+
+def test_means_and_curves_take_their_samples_from_the_whole_image(shaped, flat):
+    ring = Wedge(4.5, 5.5)
+    radii = 2 * pupil_axis(512)
+    opd_nm = NM / 30 * zernikes((4, 7), radii, radii[:, None]).sum(axis=0)
+    image = contrast(shaped, opd_nm, NM, 160)
+    mean = mean_contrast(shaped, opd_nm, NM, ring)
+    assert mean == pytest.approx(image[wedge_samples(ring, 160, 160)].mean(), rel=1e-9)
+    edges = np.array([3.5, 4.5, 5.5, 6.5])
+    curve = contrast_curve(shaped, opd_nm, NM, edges)
+    assert curve[1] == pytest.approx(mean, rel=1e-9)
+    assert mean > 30 * mean_contrast(shaped, flat, NM, ring)
+    assert mean_contrast(shaped, opd_nm, NM, ring, samples_per=2) == pytest.approx(mean, rel=0.05)
+
+
+def test_a_wedge_is_as_large_as_its_formula():
+    wedge = Wedge(4, 20, 42.5)
+    inside = wedge_samples(wedge, 200, 200, 4)
+    assert inside.sum() / 16 == pytest.approx((20**2 - 4**2) * np.deg2rad(2 * 42.5), rel=5e-3)
+    np.testing.assert_array_equal(inside, inside[::-1, ::-1])
+    for wrong in ({"inner": 5.0, "outer": 4.0}, {"half_opening_deg": 91.0}, {"inner": -1.0}):
+        with pytest.raises(ValueError, match="a wedge needs"):
+            Wedge(**wrong)
+
+
+def test_a_wavefront_of_another_sampling_is_refused(shaped):
+    with pytest.raises(ValueError, match=r"\(512, 512\), got \(64, 64\)"):
+        contrast(shaped, np.zeros((64, 64)), NM, 8)
+
+
+def test_screens_have_the_structure_function_of_kolmogorov():
+    samples, width, separations = 128, 4, np.array([2, 4, 8, 16])
+    found = np.zeros(separations.size)
+    for i in range(24):
+        screen = kolmogorov(np.random.default_rng([1, i]), samples, width)
+        for k, shift in enumerate(separations):
+            steps = [screen[shift:] - screen[:-shift], screen[:, shift:] - screen[:, :-shift]]
+            found[k] += np.mean([np.mean(step**2) for step in steps]) / 24
+    r = separations / samples
+    # What is expected without the waves longer than the periodic screen: its zero frequency holds a disk this large.
+    f = np.geomspace(1.0 / (width * np.sqrt(np.pi)), samples / 2, 4000)
+    density = 0.0229 * f ** (-11 / 3) * 2 * np.pi * f
+    expected = 2 * np.trapezoid(density * (1 - j0(2 * np.pi * r[:, None] * f)), f, axis=1)
+    np.testing.assert_allclose(found, expected, rtol=0.08)
+    assert np.all(expected < 6.88 * r ** (5 / 3))
+    slope = np.polyfit(np.log(r), np.log(found), 1)[0]
+    assert slope == pytest.approx(5 / 3, abs=0.1)
+
+
+def test_screens_come_from_their_generator_alone():
+    first, again, other = (kolmogorov(np.random.default_rng(seed), 32) for seed in (1, 1, 2))
+    np.testing.assert_array_equal(first, again)
+    assert first.shape == (32, 32)
+    assert np.std(first - other) > 0.1
+    with pytest.raises(ValueError, match="at least as wide"):
+        kolmogorov(np.random.default_rng(1), 32, 0)

@@ -1,0 +1,128 @@
+"""Pupils and focal-plane masks against their closed forms."""
+
+import numpy as np
+import pytest
+
+from lowfc.adapters.masks import SAMPLES, load_pupil, sensor_from, sensor_named
+from lowfc.contract.configuration import SensorSection
+from lowfc.contract.errors import ConfigurationError, DataFileError
+from lowfc.optics.focal_mask import disk, phase_spot
+from lowfc.optics.fourier import to_image, to_pupil
+from lowfc.optics.grid import image_axis, pupil_axis
+from lowfc.optics.pupil import circle, prolate, with_bar
+
+
+@pytest.mark.parametrize("angle_deg", [0.0, 20.0, 135.0, 300.0])
+def test_the_bar_goes_from_the_centre_to_the_edge_on_one_side(angle_deg):
+    barred, angle = with_bar(512, 0.1, angle_deg), np.deg2rad(angle_deg)
+
+    def at(radius, across):
+        x = radius * np.cos(angle) - across * np.sin(angle)
+        y = radius * np.sin(angle) + across * np.cos(angle)
+        return barred[int((y + 0.5) * 512), int((x + 0.5) * 512)]
+
+    for radius in (0.02, 0.25, 0.48):
+        assert at(radius, 0.0) == at(radius, 0.045) == at(radius, -0.045) == 0
+        assert at(-radius, 0.0) == 1
+    assert at(0.25, 0.055) == at(0.25, -0.055) == 1
+    # The bar's area: a rectangle and the segment of the circle at its end.
+    half = np.arcsin(0.1)
+    rectangle, segment = 0.1 * 0.5 * np.cos(half), 0.25 * (half - np.sin(half) * np.cos(half))
+    assert (circle(512) - barred).mean() == pytest.approx(rectangle + segment, rel=0.02)
+
+
+@pytest.fixture(scope="module")
+def apodised():
+    return prolate(256, 2.5)
+
+
+def encircled(pupil, radius):
+    """Share of a pupil's light within a radius of its image, by a sum over fine samples."""
+    samples_per = 32
+    x = image_axis(2 * int(np.ceil(radius * samples_per)), samples_per)
+    image = to_image(pupil.astype(complex), x.size, samples_per, 1.0) * (np.hypot(x[:, None], x) <= radius)
+    return np.sum(np.abs(image) ** 2) / samples_per**2 / (np.sum(pupil**2) / pupil.size), image
+
+
+def test_the_prolate_pupil_is_the_one_with_most_light_on_the_mask(apodised):
+    most, _ = encircled(apodised, 2.5)
+    assert 0.9999 < most < 1
+    r = np.hypot(pupil_axis(256), pupil_axis(256)[:, None])
+    others = [prolate(256, 2.2), prolate(256, 2.8), circle(256)]
+    others += [apodised * (1 + 0.03 * np.cos(2 * np.pi * cycles * r)) for cycles in (1, 2, 4)]
+    for other in others:
+        assert encircled(other, 2.5)[0] < most
+
+
+def test_through_the_mask_and_back_it_is_itself(apodised):
+    """The circular prolate function is an eigenfunction, and its eigenvalue is the share on the mask."""
+    share, image = encircled(apodised, 2.5)
+    back = to_pupil(image, 256, 32, 1.0)
+    inside = circle(256) > 0
+    assert np.abs(back[inside] - share * apodised[inside]).max() < 1e-3
+
+
+def test_its_throughput_and_its_shape(apodised):
+    assert apodised.max() <= 1
+    assert apodised[127:129, 127:129] == pytest.approx(1, abs=1e-3)
+    assert not apodised[circle(256) == 0].any()
+    np.testing.assert_allclose(apodised, apodised.T, atol=1e-12)
+    np.testing.assert_allclose(apodised, apodised[::-1], atol=1e-12)
+    # For a large c, pi times the mask's radius, it is exp(-c r^2 / 2) with r in pupil radii: throughput 1 / c.
+    assert np.sum(apodised**2) / np.sum(circle(256)) == pytest.approx(1 / (np.pi * 2.5), rel=0.1)
+    with pytest.raises(ValueError, match="must have a radius"):
+        prolate(256, 0.0)
+
+
+@pytest.mark.parametrize(("radius", "spot"), [(4.0, 1.06), (2.53, 2.0)])
+def test_the_phase_spot_has_the_area_of_its_circle_and_a_soft_edge(radius, spot):
+    mask, whole = phase_spot(8, radius, spot), disk(8, radius)
+    np.testing.assert_array_equal(mask == 0, whole == 0)
+    assert mask.imag.sum() / 64 == pytest.approx(np.pi * spot**2 / 4, rel=1e-3)
+    r = np.hypot(image_axis(len(mask), 8)[:, None], image_axis(len(mask), 8))
+    half_sample = np.sqrt(0.5) / 8
+    np.testing.assert_array_equal(mask[r < spot / 2 - half_sample], 1j)
+    np.testing.assert_array_equal(mask[(whole > 0) & (r > spot / 2 + half_sample)], 1)
+    np.testing.assert_array_equal(mask, mask[::-1])
+    np.testing.assert_array_equal(mask, mask.T)
+
+
+def test_an_annulus_lacks_its_middle():
+    annulus = disk(32, 4.0, 1.5)
+    assert annulus.sum() / 32**2 == pytest.approx(np.pi * (16 - 2.25), rel=2e-3)
+    assert not annulus[112:144, 112:144].any()
+
+
+def test_a_pupil_of_ones_own_comes_from_its_file(tmp_path):
+    quarter = np.linspace(1.0, 0.5, 64 * 64).reshape(64, 64)
+    np.savez(tmp_path / "mine.npz", quarter=quarter)
+    pupil = sensor_from(SensorSection(pupil=str(tmp_path / "mine.npz"))).pupil
+    assert pupil.shape == (SAMPLES, SAMPLES)
+    np.testing.assert_array_equal(pupil[256::4, 256::4], quarter)
+    np.testing.assert_array_equal(pupil, pupil[::-1, ::-1])
+    assert not np.array_equal(pupil, load_pupil())
+    with pytest.raises(DataFileError, match="no pupil file"):
+        sensor_from(SensorSection(pupil="missing.npz"))
+    with pytest.raises(ConfigurationError, match="did you mean"):
+        sensor_from(SensorSection(pupil="prolat"))
+
+
+def test_a_slip_in_the_name_of_a_sensor_is_named():
+    with pytest.raises(ConfigurationError, match=r"layout is called 'clofws'.* nor is it a sensor.* mean 'clowfs'"):
+        sensor_named("clofws")
+    with pytest.raises(ConfigurationError, match=r"layout is called 'mask'; [^;]*$"):
+        sensor_named("mask")
+
+
+@pytest.mark.parametrize(
+    ("keys", "complaint"),
+    [
+        ({"kind": "clowfs", "inner_radius": 5.0}, "inner_radius, 5.0"),
+        ({"kind": "clowfs", "defocus_mm": 1.0, "focal_ratio": 100.0}, "take a longer distance"),
+        ({"kind": "clowfs", "inner_radius": 1.0, "focal_mask": "bowtie"}, "bowtie has neither"),
+        ({"kind": "zwfs", "focal_mask": "bowtie"}, "bowtie has neither"),
+    ],
+)
+def test_keys_that_do_not_go_together_are_refused(keys, complaint):
+    with pytest.raises(ConfigurationError, match=complaint):
+        sensor_from(SensorSection.model_validate(keys))

@@ -1,0 +1,271 @@
+"""Every sensor against closed forms, independent propagators and finite differences."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from lowfc.adapters import instrument
+from lowfc.adapters.masks import sensor_from, sensor_named
+from lowfc.contract.configuration import SENSORS, SensorSection, load
+from lowfc.contract.errors import CalibrationError
+from lowfc.optics.band import gauss_legendre, monochromatic
+from lowfc.optics.fourier import to_image
+from lowfc.optics.grid import image_axis
+from lowfc.optics.relay import ApertureMask, Defocus, PupilImage, direct_kernel, fresnel_distance
+from lowfc.optics.sensor import field, image, light_budget, reference, response, shear_response
+
+
+def relative_l2(ours, truth):
+    return np.linalg.norm(ours - truth) / np.linalg.norm(truth)
+
+
+@pytest.fixture(scope="module")
+def opd_nm(modes, coefficients_nm):
+    return np.tensordot(coefficients_nm[0], modes, 1)
+
+
+def at_the_mask(optics, opd_nm, wavelength_nm):
+    """Field behind the focal-plane mask."""
+    start = optics.pupil * np.exp(2j * np.pi / wavelength_nm * opd_nm)
+    return to_image(start, len(optics.focal_mask), 8, 550.0 / wavelength_nm) * optics.focal_mask
+
+
+def test_six_millimetres_are_three_and_a_half_waves_of_defocus():
+    assert fresnel_distance(6.0, 20.0, 550.0) == pytest.approx(27.27, abs=0.01)
+    assert fresnel_distance(6.0, 20.0, 550.0) / 8 == pytest.approx(3.41, abs=0.01)  # z / (8 lambda F^2), peak to valley
+
+
+@pytest.mark.parametrize("wavelength_nm", [550.0, 500.0])
+def test_the_defocused_image_agrees_with_hcipy(hcipy, opd_nm, wavelength_nm):
+    """Its window is periodic, which costs a scale factor of 1e-3; lengths in lambda0/D, the wavelength paraxial."""
+    optics = sensor_named("clowfs")
+    samples, paraxial = 512, 1e-3
+    grid = hcipy.make_uniform_grid([samples] * 2, [samples / 8] * 2)
+    start = np.zeros((samples, samples), complex)
+    start[224:288, 224:288] = at_the_mask(optics, opd_nm, wavelength_nm)
+    free_space = hcipy.FresnelPropagator(grid, optics.relay.distance / paraxial)
+    wave = hcipy.Wavefront(hcipy.Field(start.ravel(), grid), paraxial * wavelength_nm / 550.0)
+    there = np.asarray(free_space.forward(wave).electric_field).reshape(samples, samples)[176:336, 176:336]
+    theirs, ours = np.abs(there) ** 2, np.abs(field(optics, opd_nm, wavelength_nm)) ** 2
+    scale = np.vdot(theirs, ours) / np.vdot(theirs, theirs)
+    assert scale == pytest.approx(1, abs=1e-3)
+    assert relative_l2(ours, scale * theirs) < 1e-3
+
+
+@pytest.mark.parametrize("defocus_mm", [1.5, 6.0])
+def test_the_defocused_image_is_that_of_a_quadratic_phase_in_the_relay_pupil(opd_nm, defocus_mm):
+    """Fresnel's integral by way of the angular spectrum, over all frequencies that the samples hold."""
+    optics = sensor_from(SensorSection(kind="clowfs", defocus_mm=defocus_mm))
+    x, u = image_axis(64, 8), image_axis(4096, 512)  # 8 D of relay pupil
+    window = np.cos(np.clip((np.abs(u) - 3.0) * np.pi / 2, 0, np.pi / 2)) ** 2  # its rim sends nothing to the detector
+    transfer = window * np.exp(-1j * np.pi * optics.relay.distance * u**2)
+    there = np.exp(2j * np.pi * np.outer(image_axis(160, 8), u)) * transfer @ np.exp(-2j * np.pi * np.outer(u, x))
+    there /= 8 * 512
+    theirs = there @ at_the_mask(optics, opd_nm, 550.0) @ there.T
+    assert relative_l2(field(optics, opd_nm, 550.0), theirs) < 1e-3
+
+
+@pytest.mark.parametrize("wavelength_nm", [550.0, 500.0])
+def test_the_image_of_the_pupil_agrees_with_hcipy(hcipy, opd_nm, wavelength_nm):
+    optics = sensor_named("zwfs")
+    focal_grid = hcipy.CartesianGrid(hcipy.RegularCoords([1 / 8] * 2, [64] * 2, [-63 / 16] * 2))
+    pitch = 1.1 / 80
+    detector = hcipy.CartesianGrid(hcipy.RegularCoords([pitch] * 2, [80] * 2, [-79 / 2 * pitch] * 2))
+    pupil_grid = hcipy.make_pupil_grid(512, 1.0)
+    phase = 2 * np.pi / wavelength_nm * opd_nm
+    start = hcipy.Field((optics.pupil * np.exp(1j * phase)).ravel(), pupil_grid)
+    focal = hcipy.FraunhoferPropagator(pupil_grid, focal_grid).forward(hcipy.Wavefront(start, wavelength_nm / 550.0))
+    focal.electric_field *= optics.focal_mask.ravel()
+    there = np.asarray(hcipy.FraunhoferPropagator(detector, focal_grid).backward(focal).electric_field)
+    theirs = np.abs(there.reshape(80, 80)) ** 2 * optics.pitch**2 / (np.pi / 4)
+    ours = image(optics, opd_nm, monochromatic(wavelength_nm))
+    assert relative_l2(ours, theirs.reshape(40, 2, 40, 2).sum(axis=(1, 3))) < 1e-12
+
+
+def test_a_phase_error_brightens_the_zernike_sensors_pupil():
+    """dI/dphi of |P (1 + i phi) + (i - 1) b|^2 is 2 P b, b the wave that the spot makes of a flat one.
+
+    It holds for phases of frequencies above the spot's and below the disk's: 3 cycles per diameter.
+    """
+    optics = replace(sensor_named("zwfs"), pupil=sensor_named("lyot").pupil)
+    u = (np.arange(512) + 0.5) / 512 - 0.5
+    wave = np.cos(2 * np.pi * 3 * u) * np.ones((512, 1))
+    slope = response(optics, wave[None])[:, 0].reshape(40, 40)[14:26, 14:26]
+    pixels = 1.1 * ((np.arange(40) + 0.5) / 40 - 0.5)[14:26]
+    expected = np.cos(2 * np.pi * 3 * pixels) * np.ones((12, 1))
+    gain = np.vdot(slope, expected) / np.vdot(expected, expected)
+    spot = optics.focal_mask.imag  # the reference wave at the pupil's centre
+    b = (to_image(optics.pupil.astype(complex), 64, 8, 1.0) * spot).sum().real / 64
+    pixel = (1.1 / 40) ** 2 / (np.pi / 4)
+    assert np.corrcoef(slope.ravel(), expected.ravel())[0, 1] > 0.98
+    assert gain == pytest.approx(2 * b * (2 * np.pi / 550.0) * pixel, rel=0.1)
+
+
+def test_the_kernels_conserve_energy():
+    """Over the whole period of the sampled focal plane the columns of each are orthonormal."""
+    distance = 27.25  # of which the period, 8 distances, is a whole number of samples
+    matrix = direct_kernel(Defocus(distance), 1744, 64, 8, 1.0)
+    np.testing.assert_allclose(matrix.conj().T @ matrix, np.eye(64), atol=1e-12)
+    for scale in (1.0, 1.1):
+        matrix = direct_kernel(PupilImage(8.0 / scale), 512, 64, 8, scale)
+        unitary = matrix.conj().T @ matrix * (8.0 / scale / 512) * 8  # to the density of the focal plane's samples
+        np.testing.assert_allclose(unitary, np.eye(64), atol=1e-12)
+
+
+@pytest.mark.parametrize("name", ["clowfs", "zwfs"])
+def test_without_a_relay_mask_only_the_detectors_edge_loses_light(name):
+    optics = sensor_named(name)
+    budget = light_budget(optics)
+    assert budget.relay_mask == 1
+    relay = PupilImage(4.4) if name == "zwfs" else optics.relay
+    wide = light_budget(replace(optics, pixels=160, relay=relay))
+    assert max(budget.sensor, 0.985) < wide.sensor < 1
+
+
+@pytest.mark.parametrize("name", SENSORS)
+def test_the_response_of_every_sensor_is_the_slope_of_its_image(name, modes):
+    optics, step_nm = sensor_named(name), 0.02
+    chosen = modes[[0, 5]] if name == "open" else modes[[0, 2, 9]]  # it has no slope along even modes
+    H = response(optics, chosen)
+    for k, mode in enumerate(chosen):
+        slope = (image(optics, step_nm * mode) - image(optics, -step_nm * mode)) / (2 * step_nm)
+        assert relative_l2(H[:, k], slope.ravel()) < 1e-6
+
+
+EIGHTH_ORDER = {1: 4 / 5, 2: -1 / 5, 3: 4 / 105, 4: -1 / 280}
+
+
+def slope_along(shifted, step):
+    """Central difference of eighth order of what a function gives for 1 to 4 steps either way."""
+    return sum(weight * (shifted(k) - shifted(-k)) for k, weight in EIGHTH_ORDER.items()) / step
+
+
+@pytest.mark.parametrize("axis", [0, 1])
+def test_a_sheared_beam_is_a_relay_mask_moved_the_other_way(axis, sensor):
+    def moved(samples):
+        transmission = np.roll(sensor.relay.transmission, -samples, axis=1 - axis)
+        return reference(replace(sensor, relay=ApertureMask(transmission))).ravel()
+
+    assert relative_l2(shear_response(sensor)[:, axis], slope_along(moved, 1 / 512)) < 1e-4
+
+
+@pytest.mark.parametrize("axis", [0, 1])
+@pytest.mark.parametrize("name", ["clowfs", "zwfs"])
+def test_a_sheared_beam_moves_the_image(name, axis):
+    """By as much where the detector sees the pupil; behind a focus, where left and right are swapped, by -z shear."""
+    fine = replace(sensor_named(name), pixels=160 if name == "clowfs" else 640, binning=1)
+    moves_by = -fine.relay.distance if name == "clowfs" else 1.0
+    still = reference(fine)
+    slope = slope_along(lambda samples: np.roll(still, samples, axis=1 - axis), fine.pitch / moves_by)
+    inner = np.s_[8:-8, 8:-8]
+    ours = shear_response(fine)[:, axis].reshape(still.shape)
+    assert relative_l2(ours[inner], slope[inner]) < 1e-4
+
+
+@pytest.mark.parametrize("name", ["sam", "clowfs", "zwfs"])
+def test_broadband_shear_is_a_weighted_sum(name):
+    optics, band = sensor_named(name), gauss_legendre(550.0, count=2)
+    each = [shear_response(optics, monochromatic(nm)) for nm in band.wavelengths_nm]
+    np.testing.assert_allclose(shear_response(optics, band), np.tensordot(band.weights, each, 1), atol=1e-15)
+
+
+@pytest.mark.parametrize("name", ["clowfs", "zwfs", "bar"])
+def test_at_another_wavelength_it_is_the_sensor_with_its_hardware_scaled(name):
+    """At 1.25 lambda0 a sample of lambda0/8D is one of lambda/10D, and the same millimetres are less defocus."""
+    optics, longer_nm = sensor_named(name), 687.5
+    ours = reference(optics, monochromatic(longer_nm))
+    relay = optics.relay
+    if isinstance(relay, Defocus):
+        relay = Defocus(relay.distance / 1.25)
+    scaled = replace(optics, relay=relay, wavelength_nm=longer_nm, samples_per=10)
+    np.testing.assert_allclose(ours, reference(scaled), rtol=1e-9, atol=1e-15)
+
+
+def test_the_open_circle_cannot_sense_even_modes(modes):
+    condition = {name: np.linalg.cond(response(sensor_named(name), modes[:14])) for name in ("open", "bar", "zwfs")}
+    assert condition["open"] > 1e12
+    assert condition["bar"] < 1000
+    assert condition["zwfs"] == pytest.approx(21, abs=1)
+
+
+def test_the_papers_defocus_tells_the_modes_apart_best(modes):
+    def condition(defocus_mm):
+        optics = sensor_from(SensorSection(kind="clowfs", defocus_mm=defocus_mm))
+        return np.linalg.cond(response(optics, modes[:14]))
+
+    assert condition(6.0) < 0.7 * min(condition(2.0), condition(12.0))
+
+
+def test_an_annulus_takes_light_from_the_clowfs():
+    whole, annulus = (
+        light_budget(sensor_from(SensorSection(kind="clowfs", inner_radius=radius))) for radius in (0.0, 0.7)
+    )
+    assert 0.2 * whole.total < annulus.total < 0.7 * whole.total
+
+
+def test_a_defocus_that_the_samples_do_not_resolve_is_refused():
+    optics = sensor_named("clowfs")
+    with pytest.raises(ValueError, match=r"of at least 2.33 \(lambda/D\)\^2, got 2.3"):
+        replace(optics, relay=Defocus(2.3))
+    shortest = replace(optics, relay=Defocus(14 / 6))
+    assert light_budget(shortest).sensor == pytest.approx(1, abs=0.01)  # no repeated image on the detector
+    with pytest.raises(ValueError, match="behind the focal-plane mask"):
+        Defocus(0.0)
+    with pytest.raises(ValueError, match="must have a width"):
+        PupilImage(0.0)
+
+
+@pytest.mark.parametrize("name", ["sam", "bar", "lyot"])
+def test_behind_an_aperture_mask_shear_flux_and_background_do_not_look_like_a_wavefront(name, modes):
+    """With symmetric real masks before it, phases change the image by odd functions, amplitudes by even ones."""
+    optics = sensor_named(name)
+    H, slopes = response(optics, modes[:14]), shear_response(optics)
+    # The last pixel is the first one's mirror image through the centre.
+    assert np.abs(H + H[::-1]).max() < 1e-9 * np.abs(H).max()
+    assert np.abs(slopes - slopes[::-1]).max() < 1e-9 * np.abs(slopes).max()
+    I0 = reference(optics).ravel()
+    assert np.abs(I0 - I0[::-1]).max() < 1e-9 * I0.max()
+
+
+@pytest.fixture
+def calibrated(tmp_path, monkeypatch):
+    """Makes calibrations and their noise from keys of the configuration, with a small mirror and a cache of its own."""
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+
+    def make(**changed):
+        keys = {"mirror.rows": 12, "mirror.columns": 12, "mirror.pitches_per_pupil": 11.0}
+        config = load(None, keys | {key.replace("__", "."): value for key, value in changed.items()})
+        optics = instrument.twin(config, None, pytest.fail)
+        made = instrument.analytic_calibration(config, optics, instrument.mirror_on_twin(config, optics, pytest.fail))
+        return made, instrument.frame_noise_nm(config, made)
+
+    return make
+
+
+@pytest.mark.parametrize(("name", "price"), [("clowfs", (3, 8)), ("zwfs", (1.2, 2))])
+def test_shear_and_background_fitted_along_do_not_pass_for_modes(name, price, calibrated):
+    """A beam sheared by 0.002 D on 10 % of uniform light; the price is the noise of tip, the mode most like a shear."""
+    optics = sensor_named(name)
+    ramp = np.exp(-2j * np.pi * 0.002 * image_axis(64, 8))
+    sheared = reference(replace(optics, focal_mask=optics.focal_mask * ramp)).ravel()
+    veiled = sheared + 0.1 * sheared.mean()
+
+    def bias_nm(calibration, light):
+        return np.linalg.norm(calibration.reconstructor @ (light / light.sum() - calibration.reference))
+
+    plain, noise_nm = calibrated(sensor__kind=name)
+    shear, shear_noise_nm = calibrated(sensor__kind=name, control__nuisance=["shear"])
+    both, _ = calibrated(sensor__kind=name, control__nuisance=["background", "shear"])
+    assert (plain.estimator, both.estimator) == ("weighted", "weighted+background+shear")
+    assert bias_nm(plain, sheared) > 4.0
+    assert bias_nm(shear, sheared) < 0.15
+    assert bias_nm(shear, veiled) > 20 * bias_nm(both, veiled)
+    assert bias_nm(both, veiled) < 0.15
+    print(f"{name}: tip {noise_nm[0]:.2f} nm of noise, {shear_noise_nm[0]:.2f} with shear")
+    assert price[0] < shear_noise_nm[0] / noise_nm[0] < price[1]
+
+
+def test_a_star_that_fills_the_pixels_is_refused(calibrated):
+    with pytest.raises(CalibrationError, match=r"the star saturates the sensor: \d+ e- in the brightest pixel"):
+        calibrated(sensor__kind="zwfs", star__magnitude=-1.0)
