@@ -47,7 +47,7 @@ def test_every_command_of_the_documents_is_known() -> None:
         line for document in (README, *ROOT.glob("docs/*.md"), *ROOT.glob("deploy/*.md")) for line in commands(document)
     ]
     assert len(found) > 15
-    tested = {*ELSEWHERE, *LOOPS, *REQUESTS, *FILES, *BY_HAND, *SESSION, *BENCH}
+    tested = {*ELSEWHERE, *LOOPS, *REQUESTS, *FILES, *BY_HAND, *SESSION, *BENCH, *VALIDATE, *DESIGN}
     assert set(found) == tested
     for command, where in ELSEWHERE.items():
         assert command.split()[0] in (ROOT / where).read_text()
@@ -56,6 +56,12 @@ def test_every_command_of_the_documents_is_known() -> None:
 LOOPS = (
     "lowfc sim-loop --rate 1000 --duration 20 --disturbance reaction-wheel --star-magnitude 2",
     "lowfc sim-loop --lockstep --duration 2 --seed 7",
+    "lowfc sim-loop --sensor clowfs --duration 2",
+)
+VALIDATE = ("lowfc validate table4 photometry --trials 20",)
+DESIGN = (
+    "lowfc design spc --cells 32 --outer 8 --out pupil.npz",
+    "lowfc design sam --steps 200 --out mask.json",
 )
 REQUESTS = (
     "lowfc ctl status",
@@ -121,6 +127,19 @@ def test_the_processes_by_hand(tmp_path: Path) -> None:
 
 def test_the_bench(tmp_path: Path) -> None:
     assert "rank" in run(tmp_path, BENCH[0])
+
+
+def test_the_validation(tmp_path: Path) -> None:
+    said = run(tmp_path, VALIDATE[0])
+    assert "tilt" in said
+    assert "peak" in said
+
+
+def test_the_designs_are_taken_by_the_loop(tmp_path: Path) -> None:
+    for command in DESIGN:
+        run(tmp_path, command)
+    (tmp_path / "own.toml").write_text('[sensor]\npupil = "pupil.npz"\nsam = "mask.json"\n')
+    run(tmp_path, "lowfc sim-loop --config own.toml --lockstep --duration 0.2")
 
 
 def test_the_readmes_figures_are_the_measured_ones() -> None:

@@ -115,8 +115,10 @@ def _pupil(section: SensorSection) -> NDArray[np.float64]:
             return prolate(SAMPLES, section.focal_radius)
     if section.pupil.endswith(".npz"):
         return load_pupil(file=Path(section.pupil))
-    known = ("shaped", "circle", "prolate", "FILE.npz")
-    raise ConfigurationError(f"sensor.pupil = {section.pupil!r}: no such pupil{nearest(section.pupil, known)}; {known}")
+    slip = nearest(section.pupil, ("shaped", "circle", "prolate"))
+    raise ConfigurationError(
+        f"sensor.pupil = {section.pupil!r}: no such pupil{slip}; shaped, circle, prolate, or FILE.npz"
+    )
 
 
 def _focal_mask(section: SensorSection) -> NDArray[np.inexact]:

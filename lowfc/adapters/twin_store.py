@@ -21,7 +21,7 @@ from lowfc.optics.twin import Operator, Twin, TwinSpec
 from lowfc.optics.twin_build import build
 from lowfc.optics.twin_mirror import TwinMirror, twin_mirror
 
-FORMAT = 2
+FORMAT = 3
 """Raised whenever the construction or the file changes: files of another format are not looked at."""
 
 _Kept = TypeVar("_Kept", Twin, TwinMirror)

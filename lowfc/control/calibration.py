@@ -103,7 +103,7 @@ def reconstructor(
         read_noise_e: Of a pixel.
         estimator: One of `ESTIMATORS`.
         nuisance: (pixels, any) what else changes an image, normalised like H, in any unit: fitted along, so that it
-            does not pass for modes, and not returned. Flux is none: nothing of it is left by the normalisation.
+            does not pass for modes, and not returned. Of the flux itself, normalisation leaves nothing to fit.
 
     Raises:
         ValueError: unknown estimator, or modes that this sensor cannot tell apart.
