@@ -54,7 +54,7 @@ class SensorSection(Section):
     """Reflective focal-plane mask: a disk, or the bowtie of Fig. 3."""
     focal_radius: float = Field(4.0, ge=1, le=10)
     """Radius of its disk, lambda/D."""
-    sam: str = "sam27d07_bal14"
+    sam: str = "sam27d07"
     """Of a sam: a shipped layout, or FILE.json, or FILE.json:NAME."""
     defocus_mm: float = Field(6.0, ge=1, le=50)
     """Of a clowfs: the detector's distance from focus."""
@@ -82,7 +82,7 @@ class SensorSection(Section):
 
 SENSORS: dict[str, dict[str, Any]] = {
     "sam": {"kind": "sam"},
-    "bowtie": {"kind": "sam", "focal_mask": "bowtie"},
+    "bowtie": {"kind": "sam", "focal_mask": "bowtie", "sam": "sam27d07_bowtie"},
     "clowfs": {"kind": "clowfs"},
     "zwfs": {"kind": "zwfs"},
     "bar": {"kind": "bar"},

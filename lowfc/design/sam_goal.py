@@ -20,6 +20,7 @@ from lowfc.design.sam_merit import (
 )
 
 MERITS = ("paper", "table3", "table4", "condition", "throughput", "pareto")
+_WEIGHTED = ("paper", "pareto")
 
 PAPER_TABLE3_WAVES = {"disk": {14: 5.1e-4, 20: 8.0e-4}, "bowtie": {14: 4.6e-4, 20: 6.8e-4}}
 """Mean residual rms of the paper's two sparse-aperture rows, by focal-plane mask and modes."""
@@ -35,10 +36,12 @@ class Goal:
 
     Attributes:
         merit: Of `MERITS`; "paper" is the largest ratio of a predicted figure to the paper's, over its rows of Table 3
-            and Table 4; "pareto" is table3^(1 - weight) table4^weight.
+            and Table 4, those of Table 3 to the power of 2 weight, that of Table 4 to 2 (1 - weight); "pareto" is
+            table3^(1 - weight) table4^weight.
         estimator: "pinv", or "weighted" for the Cramer-Rao bound.
         modes: Number of modes in Table 3 and in the condition number.
-        weight: Of Table 4 in "pareto", 0 to 1; None where each chain of a search has its own.
+        weight: Of Table 4 in "pareto" and "paper", 0 to 1; None for 1/2 in "paper", and for a weight of its own for
+            each chain in a "pareto" search.
     """
 
     merit: str = "paper"
@@ -53,8 +56,11 @@ class Goal:
             raise ValueError(f"modes must be 14 or 20 (radial degrees up to 4 or 5), got {self.modes}")
         if self.estimator not in ESTIMATORS:
             raise ValueError(f"estimator must be one of {', '.join(ESTIMATORS)}, got {self.estimator!r}")
-        if self.weight is not None and not (self.merit == "pareto" and 0.0 <= self.weight <= 1.0):
-            raise ValueError(f"a weight, 0 to 1, belongs to the merit 'pareto'; got {self.weight} with {self.merit!r}")
+        if self.weight is not None and not (self.merit in _WEIGHTED and 0.0 <= self.weight <= 1.0):
+            raise ValueError(
+                f"a weight, 0 to 1, belongs to the merits {' and '.join(_WEIGHTED)}; got {self.weight} with "
+                f"{self.merit!r}"
+            )
 
 
 def merit(optics: Optics, goal: Goal, fields: Single) -> float:
@@ -80,7 +86,10 @@ def paper_ratios(optics: Optics, fields: Single, estimator: str = "pinv") -> dic
 
 def _merit(optics: Optics, goal: Goal, fields: Single) -> float:
     if goal.merit == "paper":
-        return max(paper_ratios(optics, fields, goal.estimator).values())
+        weight = 0.5 if goal.weight is None else goal.weight
+        ratios = paper_ratios(optics, fields, goal.estimator)
+        tilt = ratios.pop("table4")
+        return float(max(max(ratios.values()) ** (2.0 * weight), tilt ** (2.0 * (1.0 - weight))))
     if goal.merit == "table4":
         return _tilt_mas(optics, fields, goal.estimator)
     seen = signal(optics, fields, optics.focal_masks[0])

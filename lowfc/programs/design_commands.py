@@ -68,7 +68,7 @@ def sam(
     ] = None,
     modes: Annotated[int, typer.Option(help="Modes in Table 3: 14 or 20.")] = 14,
     weight: Annotated[
-        float | None, typer.Option(help="Of Table 4 in pareto, 0 to 1. Default: a front, each chain with its own.")
+        float | None, typer.Option(help="Of Table 4 in paper and pareto, 0 to 1. Default: 0.5; in pareto, a front.")
     ] = None,
     focal_mask: Annotated[
         str | None, typer.Option(help="disk, bowtie or both. Default: disk; both for the merit paper.")

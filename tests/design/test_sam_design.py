@@ -374,7 +374,7 @@ def test_the_command_records_itself_and_finds_the_same_again(tmp_path, monkeypat
         (("--merit", "beauty"), "merit must be one of paper, table3"),
         (("--estimator", "best"), "estimator must be one of"),
         (("--modes", "15"), "modes must be 14 or 20"),
-        (("--weight", "0.5"), "belongs to the merit 'pareto'"),
+        (("--merit", "table3", "--weight", "0.5"), "belongs to the merits paper and pareto"),
         (("--merit", "pareto", "--weight", "2"), "a weight, 0 to 1"),
         (("--merit", "pareto", "--chains", "1"), "at least 2 chains"),
         (("--merit", "table3", "--focal-mask", "both"), "only 'paper' takes both"),

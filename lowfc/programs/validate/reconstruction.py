@@ -24,6 +24,11 @@ PEAK_E = 40_000.0
 READ_NOISE_E = 3.0
 ESTIMATORS = ("pinv", "weighted", "weighted + 1 iteration", "weighted + 2 iterations")
 WITH_NUISANCES = "weighted, flux and shear fitted along"
+EVEN = (
+    "Where pupil and masks are real and the pupil is symmetric, flux and shear change the image evenly and every mode "
+    "oddly: fitting them along costs a sparse aperture mask nothing. CLOWFS and the Zernike sensor mistake a shear for "
+    "a tilt."
+)
 
 INPUT_RMS_WAVES = {14: 0.015, 20: 0.018}
 INPUT_PV_WAVES = {14: 0.097, 20: 0.11}
@@ -201,7 +206,7 @@ def _residual_rows(sensor: Prepared, modes: int, wavefronts: Input, found: Ensem
                 limit=None if limit_nm is None else limit_nm / sensor.sensor.wavelength_nm,
                 modes=modes,
                 estimator=estimator,
-                assumption=f"{wavefronts.assumption}\n{NOISE}",
+                assumption="\n".join((wavefronts.assumption, NOISE, *((EVEN,) if estimator == WITH_NUISANCES else ()))),
             )
 
 
