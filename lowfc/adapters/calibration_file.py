@@ -1,7 +1,6 @@
 """Calibrations as FITS: one named extension for each array, units in the headers."""
 
 import io
-import tempfile
 import warnings
 from pathlib import Path
 
@@ -10,6 +9,7 @@ import numpy.typing as npt
 from astropy.io import fits
 from astropy.utils.exceptions import AstropyWarning
 
+from lowfc.adapters.whole_file import write_whole
 from lowfc.contract.codec import identified
 from lowfc.contract.errors import DataFileError
 from lowfc.control.calibration import Calibration
@@ -55,10 +55,12 @@ def to_bytes(calibration: Calibration) -> bytes:
 
 
 def save(calibration: Calibration, path: Path) -> None:
-    """Write a FITS file; another program never sees half of it."""
-    with tempfile.NamedTemporaryFile(dir=path.parent, prefix=path.stem, suffix=".part", delete=False) as stream:
-        stream.write(to_bytes(calibration))
-    Path(stream.name).replace(path)
+    """Write a FITS file.
+
+    Raises:
+        DataFileError: the file cannot be written.
+    """
+    write_whole(path, to_bytes(calibration))
 
 
 def load(path: Path) -> Calibration:

@@ -4,7 +4,6 @@ import hashlib
 import io
 import logging
 import os
-import tempfile
 from collections.abc import Callable
 from dataclasses import astuple, fields
 from pathlib import Path
@@ -13,6 +12,8 @@ from typing import Any, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
+from lowfc.adapters.whole_file import write_whole
+from lowfc.contract.errors import DataFileError
 from lowfc.optics.band import Band, monochromatic
 from lowfc.optics.mirror import Mirror
 from lowfc.optics.relay import ApertureMask
@@ -111,9 +112,10 @@ def _cached(
         notice(f"the cached {path} cannot be used and is built again: {type(error).__name__}: {error}")
     made = make()
     try:
-        _write(path, pack(made))
-    except OSError as error:
-        notice(f"{path} cannot be written, so that it will be built again next time: {error}")
+        path.parent.mkdir(parents=True, exist_ok=True)
+        write_whole(path, pack(made))
+    except (OSError, DataFileError) as error:
+        notice(f"{error}, so that it will be built again next time")
     return made
 
 
@@ -175,17 +177,3 @@ def _unpack(content: bytes, key: str, spec: TwinSpec) -> Twin:
         for i, (nm, weight) in enumerate(arrays["band"].tolist())
     )
     return Twin(spec, arrays["axis"], arrays["used"], arrays["area_weights"], operators, arrays["to_pixels"], key)
-
-
-def _write(path: Path, content: bytes) -> None:
-    """Write beside, then rename: a reader or a second writer never sees half a file."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    with tempfile.NamedTemporaryFile(dir=path.parent, prefix=path.stem, suffix=".part", delete=False) as stream:
-        part = Path(stream.name)
-        try:
-            stream.write(content)
-            stream.close()
-            part.replace(path)
-        except BaseException:
-            part.unlink()
-            raise

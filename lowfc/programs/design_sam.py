@@ -18,6 +18,7 @@ from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 from threadpoolctl import threadpool_limits
 
+from lowfc.adapters.drawing import figure_class
 from lowfc.adapters.masks import load_pupil
 from lowfc.contract.errors import ConfigurationError
 from lowfc.design.sam_goal import FITTED_IN_TABLE4, figures
@@ -26,7 +27,6 @@ from lowfc.design.sam_search import Chain, advance, holes, start
 from lowfc.optics.sam import Layout
 from lowfc.programs.design_sam_files import (
     Point,
-    figure_class,
     front,
     read_state,
     write_front,

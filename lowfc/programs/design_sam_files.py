@@ -3,14 +3,15 @@
 import csv
 import io
 import json
-import tempfile
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
+from lowfc.adapters.drawing import figure_class, png
 from lowfc.adapters.layouts import load_layout
-from lowfc.contract.errors import ConfigurationError, DataFileError
+from lowfc.adapters.whole_file import write_whole
+from lowfc.contract.errors import DataFileError
 from lowfc.design.sam_goal import PAPER_TABLE3_WAVES, PAPER_TABLE4_MAS, Goal
 from lowfc.design.sam_search import Bounds, Chain
 from lowfc.optics.sam import Layout
@@ -101,22 +102,7 @@ def write_plot(path: Path, points: Sequence[Point], search: Search) -> None:
     axes.set(xscale="log", yscale="log", xlabel="Table 3: residual (waves rms)", ylabel="Table 4: tilt (mas)")
     axes.set_title(f"{search.goal.modes} modes, {search.focal_masks[0]}, {search.goal.estimator}")
     axes.legend()
-    content = io.BytesIO()
-    figure.savefig(content, format="png", dpi=150)
-    write_whole(path, content.getvalue())
-
-
-def figure_class() -> Any:
-    """What draws.
-
-    Raises:
-        ConfigurationError: matplotlib is not installed.
-    """
-    try:
-        from matplotlib.figure import Figure
-    except ImportError:
-        raise ConfigurationError("--plot needs matplotlib: pip install 'lowfc[plots]'") from None
-    return Figure
+    write_whole(path, png(figure, 150))
 
 
 def front(points: Sequence[Point]) -> list[Point]:
@@ -131,27 +117,6 @@ def front(points: Sequence[Point]) -> list[Point]:
             for other in points
         )
     ]
-
-
-def write_whole(path: Path, content: bytes) -> None:
-    """Write beside, then rename: never half a file.
-
-    Raises:
-        DataFileError: The file cannot be written.
-    """
-    try:
-        with tempfile.NamedTemporaryFile(dir=path.parent, prefix=f".{path.name}.", delete=False) as stream:
-            part = Path(stream.name)
-            try:
-                stream.write(content)
-                stream.flush()
-                part.chmod(0o644)
-                part.replace(path)
-            except BaseException:
-                part.unlink(missing_ok=True)
-                raise
-    except OSError as error:
-        raise DataFileError(f"{path} cannot be written: {error.strerror}") from error
 
 
 def _as_tuple(value: Any) -> Any:

@@ -14,6 +14,8 @@ from numpy.typing import NDArray
 from rich.console import Console
 from threadpoolctl import threadpool_limits
 
+from lowfc.adapters.drawing import figure_class, png
+from lowfc.adapters.whole_file import write_whole
 from lowfc.contract.errors import ConfigurationError, DataFileError
 from lowfc.design.dark_zone import FINE_STEP, fine_grid
 from lowfc.design.shaped_pupil import (
@@ -28,7 +30,6 @@ from lowfc.design.shaped_pupil import (
     stored,
 )
 from lowfc.optics.pupil import from_quarter
-from lowfc.programs.design_sam_files import figure_class, write_whole
 
 Result = TypeVar("Result")
 
@@ -223,6 +224,4 @@ def _picture(quarter: NDArray[np.float64], wanted: Request) -> bytes:
     curve.axhline(wanted.contrast, color="k", linestyle=":", label="promised")
     curve.set(title="contrast", xlabel="angle (lambda/D)", ylim=(10.0**floor, 1.0), xlim=(0.0, wanted.outer))
     curve.legend()
-    content = io.BytesIO()
-    figure.savefig(content, format="png", dpi=120)
-    return content.getvalue()
+    return png(figure)

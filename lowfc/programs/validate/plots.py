@@ -11,7 +11,8 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from lowfc.contract.errors import LowfcError
+from lowfc.adapters.drawing import figure_class, png
+from lowfc.adapters.whole_file import write_whole
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -124,23 +125,17 @@ def draw(path: Path, panels: Sequence[Panel], caption: str, columns: int = 3, wi
         wide: Whether a panel is half again as wide.
 
     Raises:
-        LowfcError: matplotlib is not installed.
-        OSError: The file cannot be written.
+        ConfigurationError: matplotlib is not installed.
+        DataFileError: The file cannot be written.
     """
-    try:
-        figures, canvases = import_module("matplotlib.figure"), import_module("matplotlib.backends.backend_agg")
-    except ImportError as error:
-        raise LowfcError(
-            f"plots need matplotlib, which is not there ({error}); install it with: pip install 'lowfc[plots]'"
-        ) from error
+    figure_type = figure_class()
     columns = min(columns, len(panels))
     rows = ceil(len(panels) / columns)
     width = columns * _PANEL_IN[0] * (1.5 if wide else 1.0)
     text = fill(caption, int(width * 16))
     height = rows * _PANEL_IN[1]
     below = 0.2 * (text.count("\n") + 1) + 0.1
-    figure = figures.Figure(figsize=(width, height + below), dpi=_DPI, layout="constrained")
-    canvases.FigureCanvasAgg(figure)
+    figure = figure_type(figsize=(width, height + below), dpi=_DPI, layout="constrained")
     figure.get_layout_engine().set(w_pad=0.1, rect=(0, below / (height + below), 1, height / (height + below)))
     for i, panel in enumerate(panels):
         axes = figure.add_subplot(rows, columns, i + 1)
@@ -154,7 +149,7 @@ def draw(path: Path, panels: Sequence[Panel], caption: str, columns: int = 3, wi
             case Bars():
                 _bars(axes, panel)
     figure.text(0.01, 0.005, text, fontsize=8, va="bottom")
-    figure.savefig(path, format="png", metadata={"Software": None})  # no version: the same figure is the same file
+    write_whole(path, png(figure, _DPI))
 
 
 def _picture(figure: "Figure", axes: "Axes", panel: Picture) -> None:

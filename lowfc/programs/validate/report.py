@@ -1,7 +1,7 @@
 """Run tables and figures; say what they found as text, as JSON, and as the document docs/paper.md."""
 
 import json
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -10,6 +10,7 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 from threadpoolctl import threadpool_limits
 
+from lowfc.adapters.whole_file import write_whole
 from lowfc.contract.errors import DataFileError
 from lowfc.programs.validate.cases import Case, Context
 from lowfc.programs.validate.figures import FIGURES
@@ -95,7 +96,7 @@ def run(
             drawn = None
             if plots is not None and case.plot is not None:
                 drawn = f"{name}.png"
-                _draw(case.plot, context, plots / drawn)
+                case.plot(context, plots / drawn)
             tables.append(
                 {
                     "table": name,
@@ -147,11 +148,8 @@ def write_document(folder: Path, tables: Sequence[Table]) -> None:
     Raises:
         DataFileError: The folder cannot be written.
     """
-    try:
-        _write(folder / RESULTS, _one_row_to_a_line(tables))
-        _write(folder / DOCUMENT, to_markdown(tables))
-    except OSError as error:
-        raise DataFileError(f"the document cannot be written: {error}") from error
+    write_whole(folder / RESULTS, _one_row_to_a_line(tables).encode())
+    write_whole(folder / DOCUMENT, to_markdown(tables).encode())
 
 
 def _glance(tables: Sequence[Table]) -> list[dict[str, Any]]:
@@ -176,23 +174,6 @@ def _one_row_to_a_line(tables: Sequence[Table]) -> str:
         head = json.dumps({key: value for key, value in table.items() if key != "rows"})
         parts.append(f'{head[:-1]}, "rows": [\n{rows}\n]}}')
     return '{"tables": [\n' + ",\n".join(parts) + "\n]}\n"
-
-
-def _write(path: Path, text: str) -> None:
-    part = path.with_name(path.name + ".part")
-    part.write_text(text, encoding="utf-8")
-    part.replace(path)
-
-
-def _draw(plot: Callable[[Context, Path], None], context: Context, path: Path) -> None:
-    part = path.with_name(f"{path.stem}.part.png")
-    try:
-        plot(context, part)
-        part.replace(path)
-    except OSError as error:
-        raise DataFileError(f"{path} cannot be written: {error}") from error
-    finally:
-        part.unlink(missing_ok=True)
 
 
 def _trials(table: Table) -> str:

@@ -1,0 +1,27 @@
+"""Files that are whole or not there."""
+
+import tempfile
+from pathlib import Path
+
+from lowfc.contract.errors import DataFileError
+
+
+def write_whole(path: Path, content: bytes) -> None:
+    """Write beside, then rename: neither a reader nor a second writer ever sees half a file.
+
+    Raises:
+        DataFileError: The file cannot be written.
+    """
+    try:
+        with tempfile.NamedTemporaryFile(dir=path.parent, prefix=f".{path.name}.", delete=False) as stream:
+            part = Path(stream.name)
+            try:
+                stream.write(content)
+                stream.close()
+                part.chmod(0o644)
+                part.replace(path)
+            except BaseException:
+                part.unlink(missing_ok=True)
+                raise
+    except OSError as error:
+        raise DataFileError(f"{path} cannot be written: {error.strerror or error}") from error
