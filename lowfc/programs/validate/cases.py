@@ -26,6 +26,7 @@ from lowfc.optics.zernike import NOLLS_20, zernikes
 from lowfc.programs.validate.rows import Row
 
 Array = NDArray[np.float64]
+DEFAULT_SAM = SensorSection().sam
 Item = TypeVar("Item")
 Result = TypeVar("Result")
 
@@ -134,20 +135,22 @@ def modes_at(samples: int) -> Array:
 
 
 def sparse_apertures() -> tuple[str, ...]:
-    """Names of the default sensor and of one with each layout that is shipped."""
-    return "sam", *layout_names()
+    """Names of the default sensor and of one with each of the other layouts that are shipped."""
+    return "sam", *(name for name in layout_names() if name != DEFAULT_SAM)
 
 
 @lru_cache(maxsize=64)
 def prepared(name: str) -> Prepared:
-    """A sensor by the name of `lowfc.adapters.masks.sensor_named`, or clowfs:MM with the defocus in mm."""
-    kind, _, defocus_mm = name.partition(":")
-    if kind == "clowfs" and defocus_mm:
+    """A sensor by the name of `lowfc.adapters.masks.sensor_named`; clowfs:MM, its defocus; or bowtie:LAYOUT."""
+    kind, _, detail = name.partition(":")
+    if kind == "clowfs" and detail:
         try:
-            section = SensorSection(kind="clowfs", defocus_mm=float(defocus_mm))
+            section = SensorSection(kind="clowfs", defocus_mm=float(detail))
         except ValueError:
             raise ConfigurationError(f"{name}: after the colon comes the defocus in mm, 1 to 50") from None
         return Prepared(name, sensor_from(section))
+    if kind == "bowtie" and detail:
+        return Prepared(name, sensor_from(SensorSection(focal_mask="bowtie", sam=detail)))
     return Prepared(name, sensor_named(name))
 
 

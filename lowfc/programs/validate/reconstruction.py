@@ -10,12 +10,12 @@ from lowfc.design import trials as random
 from lowfc.design.estimators import Fit, estimate, fit, refine
 from lowfc.design.fisher import cramer_rao, variance_e
 from lowfc.optics.zernike import NOLLS_20
-from lowfc.programs.validate.cases import Context, Prepared, sparse_apertures
+from lowfc.programs.validate.cases import DEFAULT_SAM, Context, Prepared, sparse_apertures
 from lowfc.programs.validate.rows import Row
 
 Array = NDArray[np.float64]
 
-OTHERS = ("bowtie", "clowfs", "zwfs", "bar", "lyot", "aplc")
+OTHERS = ("bowtie", f"bowtie:{DEFAULT_SAM}", "clowfs", "zwfs", "bar", "lyot", "aplc")
 """Sensors besides the shipped sparse apertures."""
 MODES = (14, 20)
 """Radial degrees 1 to 4 and 1 to 5."""
@@ -33,9 +33,11 @@ EVEN = (
 INPUT_RMS_WAVES = {14: 0.015, 20: 0.018}
 INPUT_PV_WAVES = {14: 0.097, 20: 0.11}
 CIRCULAR = {14: (5.1e-4, 8.9e-3), 20: (8.0e-4, 0.021)}
+BOWTIE = {14: (4.6e-4, 8.0e-3), 20: (6.8e-4, 0.017)}
 PAPER_WAVES = {
     "sam": CIRCULAR,
-    "bowtie": {14: (4.6e-4, 8.0e-3), 20: (6.8e-4, 0.017)},
+    "bowtie": BOWTIE,
+    f"bowtie:{DEFAULT_SAM}": BOWTIE,
     "clowfs": {14: (1.3e-3, 0.022), 20: (2.3e-3, 0.066)},
 }
 """RMS and P-V residuals of the paper's three sensors."""
