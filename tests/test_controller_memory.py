@@ -193,7 +193,7 @@ def test_a_quiet_open_loop_measures_nothing_with_the_noise_that_is_predicted(rig
 
 
 def test_every_mode_is_measured_with_its_size_and_sign(rig: Rig) -> None:
-    pairs = 40
+    pairs = 100
     for mode in range(14):
         taken = []
         for sign in (1, -1):

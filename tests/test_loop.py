@@ -15,8 +15,8 @@ QUIET = {
     "mirror.settling_us": 0,
     "mirror.driver_bits": 24,
     "camera.noise": False,
-    "camera.gain_e_per_dn": 0.0004,  # fine steps, so that rounding moves a mode by less than a picometre
-    "camera.full_well_e": 26.0,
+    "camera.gain_e_per_dn": 0.0008,  # fine steps, so that rounding moves a mode by less than a picometre
+    "camera.full_well_e": 52.0,
 }
 
 

@@ -9,7 +9,7 @@ from typer.testing import CliRunner
 
 from lowfc.contract.errors import ConfigurationError, DataFileError
 from lowfc.programs.validate import commands
-from lowfc.programs.validate.cases import DEFAULT_SAM, Case, Context
+from lowfc.programs.validate.cases import DEFAULT_SAM, Context
 from lowfc.programs.validate.figures import FIGURES
 from lowfc.programs.validate.reconstruction import ESTIMATORS, WITH_NUISANCES
 from lowfc.programs.validate.report import (
@@ -222,17 +222,6 @@ def test_a_folder_that_cannot_be_written_is_a_users_mistake(tmp_path):
         run(["table1"], Context(), tmp_path / "file" / "plots")
     with pytest.raises(DataFileError, match="cannot be written"):
         write_document(tmp_path / "nowhere", [])
-
-
-def test_a_drawing_that_fails_leaves_nothing_behind(tmp_path, monkeypatch):
-    def half(context, path):
-        path.write_bytes(b"half")
-        raise OSError("disk full")
-
-    monkeypatch.setitem(CASES, "table1", Case("", lambda context: [], half))
-    with pytest.raises(DataFileError, match="disk full"):
-        run(["table1"], Context(), tmp_path)
-    assert list(tmp_path.iterdir()) == []
 
 
 def test_rows_become_cells():

@@ -115,7 +115,7 @@ def _cached(
         path.parent.mkdir(parents=True, exist_ok=True)
         write_whole(path, pack(made))
     except (OSError, DataFileError) as error:
-        notice(f"{error}, so that it will be built again next time")
+        notice(f"{path} cannot be written, so that it will be built again next time: {error}")
     return made
 
 

@@ -99,7 +99,12 @@ def test_bands_have_the_wavelengths_of_section_3_3():
 
 @pytest.mark.parametrize(
     ("sam", "sensor_fraction", "peak", "condition"),
-    [("sam27d07_bal14", 0.028, 0.0039, 19), ("sam27d10_bal14", 0.098, 0.0068, 36), ("sam27_crb20", 0.153, 0.0044, 58)],
+    [
+        ("sam27d07_bal14", 0.0288, 0.0039, 19),
+        ("sam27d07", 0.0574, 0.0038, 26.5),
+        ("sam27d10_bal14", 0.0994, 0.0069, 35.3),
+        ("sam27_crb20", 0.152, 0.00446, 57.2),
+    ],
 )
 def test_shipped_masks_pass_the_light_they_were_designed_for(sam, sensor_fraction, peak, condition, modes):
     sensor = sensor_named(sam)
