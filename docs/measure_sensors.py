@@ -33,7 +33,8 @@ MEASURED = ROOT / "docs" / "sensors.json"
 DOCUMENT = ROOT / "docs" / "sensors.md"
 BEGIN, END = "<!-- measured: begin -->\n", "<!-- measured: end -->"
 
-NAMES = (*(name for name in SENSORS if name != "open"), "sam27d10_bal14", "sam27_crb20", "open")
+LAYOUTS = ("sam18_sized", "sam27d07_bal14", "sam27d10_bal14", "sam27_crb20")
+NAMES = (*(name for name in SENSORS if name != "open"), *LAYOUTS, "open")
 RATE_HZ = 1000
 COMMON = ["--rate", str(RATE_HZ), "--duration", "2", "--lockstep", "--no-record", "--json"]
 PRESETS = ("bench", "reaction-wheel")

@@ -6,8 +6,8 @@ from typing import Any
 import numpy as np
 
 from lowfc.control.calibration import ESTIMATORS
+from lowfc.design.paper import MODES, TABLE3_WAVES, TABLE4_MAS, TABLE4_MODES
 from lowfc.design.sam_merit import (
-    MODES,
     Optics,
     Single,
     band_signal,
@@ -21,13 +21,6 @@ from lowfc.design.sam_merit import (
 
 MERITS = ("paper", "table3", "table4", "condition", "throughput", "pareto")
 _WEIGHTED = ("paper", "pareto")
-
-PAPER_TABLE3_WAVES = {"disk": {14: 5.1e-4, 20: 8.0e-4}, "bowtie": {14: 4.6e-4, 20: 6.8e-4}}
-"""Mean residual rms of the paper's two sparse-aperture rows, by focal-plane mask and modes."""
-PAPER_TABLE4_MAS = 0.36
-"""Standard deviation of the paper's tilt estimate at 1 mas; at 10 mas it is 0.37."""
-FITTED_IN_TABLE4 = 2
-"""Tip and tilt: with more modes the paper's figure is out of reach of any of its sensors."""
 
 
 @dataclass(frozen=True)
@@ -79,8 +72,8 @@ def paper_ratios(optics: Optics, fields: Single, estimator: str = "pinv") -> dic
         seen = signal(optics, fields, name)
         for modes in MODES:
             noise = table3_waves(optics, seen, modes, estimator)
-            ratios[f"table3 {name} {modes} modes"] = noise / PAPER_TABLE3_WAVES[name][modes]
-    ratios["table4"] = _tilt_mas(optics, fields, estimator) / PAPER_TABLE4_MAS
+            ratios[f"table3 {name} {modes} modes"] = noise / TABLE3_WAVES[name][modes][0]
+    ratios["table4"] = _tilt_mas(optics, fields, estimator) / TABLE4_MAS["sam"][1]
     return ratios
 
 
@@ -107,7 +100,7 @@ def _merit(optics: Optics, goal: Goal, fields: Single) -> float:
 
 
 def _tilt_mas(optics: Optics, fields: Single, estimator: str) -> float:
-    return max(table4_mas(band_signal(optics, fields), FITTED_IN_TABLE4, estimator))
+    return max(table4_mas(band_signal(optics, fields), TABLE4_MODES, estimator))
 
 
 def figures(optics: Optics, fields: Single) -> dict[str, Any]:
@@ -118,7 +111,7 @@ def figures(optics: Optics, fields: Single) -> dict[str, Any]:
     seen, in_band = signal(optics, fields, optics.focal_masks[0]), band_signal(optics, fields)
     table3 = {name: {str(m): table3_waves(optics, seen, m, name) for m in MODES} for name in ESTIMATORS}
     table3["bound"] = {str(m): table3_noise_waves(optics, seen, m, "weighted") for m in MODES}
-    fitted = (FITTED_IN_TABLE4, optics.band_modes)
+    fitted = (TABLE4_MODES, optics.band_modes)
     return {
         "throughput": throughput(seen),
         "condition": {str(m): condition(seen, m) for m in MODES},

@@ -14,11 +14,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lowfc.control.calibration import ESTIMATORS, condition_number
+from lowfc.design.paper import (
+    PEAK_E,
+    STAR,
+    TABLE3_READ_NOISE_E,
+    TABLE4_EXPOSURE_S,
+    TABLE4_READ_NOISE_E,
+)
 from lowfc.optics.band import Band, uniform
 from lowfc.optics.focal_mask import bowtie, disk
 from lowfc.optics.fourier import Field, kernel, to_image, to_pupil
 from lowfc.optics.grid import OPEN_AREA, pupil_axis
-from lowfc.optics.photometry import Photometry, electrons, tilt_nm_per_mas
+from lowfc.optics.photometry import electrons, tilt_nm_per_mas
 from lowfc.optics.zernike import NOLLS_20, zernikes
 
 Array = NDArray[np.float64]
@@ -26,8 +33,6 @@ Single = NDArray[np.complex64]
 Hole = tuple[float, float, float]
 
 FOCAL_MASKS: dict[str, Callable[[int], Array]] = {"disk": disk, "bowtie": bowtie}
-MODES = (14, 20)
-"""Numbers of modes of the two columns of Table 3: radial degrees up to 4 and up to 5."""
 
 WAVELENGTH_NM = 550.0
 IMAGE_WIDTH = 20
@@ -38,17 +43,10 @@ FOCAL_SAMPLES_PER = 8
 _PIXEL = 1.0 / (PIXELS_PER**2 * OPEN_AREA)
 """Fraction of the open circle's light in a pixel where the field is 1."""
 
-PEAK_E = 40_000.0
-"""Electrons in the brightest pixel of the flat wavefront's image (Sect. 3.1)."""
-TABLE3_READ_NOISE_E = 3.0
 TABLE3_NONLINEARITY_WAVES = {14: 2.1e-4, 20: 3.1e-4}
 """Residual without noise of the plain pseudo-inverse: the second order of wavefronts matched to the paper's 0.015 waves
 rms, as it adds to the noise in quadrature. The shipped layouts are within 10 % of it, so that a search need not
 compute it."""
-
-TABLE4_READ_NOISE_E = 1.0
-TABLE4_EXPOSURE_S = 0.05
-STAR = Photometry()
 
 RELAY_SAMPLES = 128
 SAMPLES_PER = 2

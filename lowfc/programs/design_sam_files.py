@@ -12,7 +12,8 @@ from lowfc.adapters.drawing import figure_class, png
 from lowfc.adapters.layouts import load_layout
 from lowfc.adapters.whole_file import write_whole
 from lowfc.contract.errors import DataFileError
-from lowfc.design.sam_goal import PAPER_TABLE3_WAVES, PAPER_TABLE4_MAS, Goal
+from lowfc.design.paper import TABLE3_WAVES, TABLE4_MAS
+from lowfc.design.sam_goal import Goal
 from lowfc.design.sam_search import Bounds, Chain
 from lowfc.optics.sam import Layout
 from lowfc.programs.design_sam_request import Search
@@ -97,8 +98,8 @@ def write_plot(path: Path, points: Sequence[Point], search: Search) -> None:
     on_front = sorted(front(points), key=lambda point: point.table3_waves)
     axes.plot([p.table3_waves for p in points], [p.table4_mas for p in points], ".", color="0.6", label="searched")
     axes.plot([p.table3_waves for p in on_front], [p.table4_mas for p in on_front], "o-", label="front")
-    paper = PAPER_TABLE3_WAVES[search.focal_masks[0]][search.goal.modes]
-    axes.plot([paper], [PAPER_TABLE4_MAS], "k*", markersize=12, label="paper")
+    paper = TABLE3_WAVES[search.focal_masks[0]][search.goal.modes][0]
+    axes.plot([paper], [TABLE4_MAS["sam"][1]], "k*", markersize=12, label="paper")
     axes.set(xscale="log", yscale="log", xlabel="Table 3: residual (waves rms)", ylabel="Table 4: tilt (mas)")
     axes.set_title(f"{search.goal.modes} modes, {search.focal_masks[0]}, {search.goal.estimator}")
     axes.legend()

@@ -9,12 +9,13 @@ from lowfc.adapters.masks import sensor_from
 from lowfc.contract.configuration import SensorSection
 from lowfc.control.calibration import condition_number
 from lowfc.design.fisher import cramer_rao, variance_e
+from lowfc.design.paper import STAR, TABLE4_EXPOSURE_S, TABLE4_READ_NOISE_E
 from lowfc.optics import sam as sams
 from lowfc.optics.photometry import electrons
 from lowfc.optics.relay import ApertureMask
 from lowfc.optics.sensor import Sensor
 from lowfc.programs.validate.cases import Context, Prepared, sparse_apertures
-from lowfc.programs.validate.pointing import EXPOSURE_S, NM_PER_MAS, READ_NOISE_E, STAR
+from lowfc.programs.validate.pointing import NM_PER_MAS
 from lowfc.programs.validate.rows import Row
 
 OTHERS = ("clowfs", "zwfs")
@@ -25,7 +26,7 @@ HOLES = (0.09, 0.08, 0.07, 0.06, 0.05, 0.04, 0.03)
 
 MONOCHROMATIC = "H at the central wavelength, in nm rms of each mode over the circle."
 FIXED_STAR = (
-    f"Cramer-Rao bound at the central wavelength: V = {STAR.magnitude}, {STAR.diameter_m:g} m, {EXPOSURE_S} s, "
+    f"Cramer-Rao bound at the central wavelength: V = {STAR.magnitude}, {STAR.diameter_m:g} m, {TABLE4_EXPOSURE_S} s, "
     "our own masks. Smaller holes are better conditioned and yet worse: the condition number does not know the light."
 )
 CLAIMS = {
@@ -84,8 +85,8 @@ def _rows(kind: str, mask: Prepared) -> Iterator[Row]:
             assumption=f"{MONOCHROMATIC}\n{CLAIMS[kind]}",
         )
     yield Row(mask.name, "open circle's light that falls on the sensor", "", float(mask.I0.sum()))
-    scale_e = electrons(STAR, EXPOSURE_S)
-    variance = variance_e(mask.I0 * scale_e, READ_NOISE_E)
+    scale_e = electrons(STAR, TABLE4_EXPOSURE_S)
+    variance = variance_e(mask.I0 * scale_e, TABLE4_READ_NOISE_E)
     for modes in (2, 14):
         try:
             tilt = float(np.sqrt(cramer_rao(mask.H[:, :modes] * scale_e, variance)[0, 0]) / NM_PER_MAS)

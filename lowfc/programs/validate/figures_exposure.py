@@ -5,18 +5,19 @@ from numpy.typing import NDArray
 
 from lowfc.design.estimators import Fit, estimate, refine
 from lowfc.design.fisher import cramer_rao, variance_e
+from lowfc.design.paper import PEAK_E, TABLE3_READ_NOISE_E
 from lowfc.design.trials import noisy_e
 from lowfc.optics.zernike import NOLLS_14
 from lowfc.programs.validate.cases import Prepared
-from lowfc.programs.validate.reconstruction import PEAK_E, READ_NOISE_E, scale_e
+from lowfc.programs.validate.reconstruction import scale_e
 
 Array = NDArray[np.float64]
 
 MODES = len(NOLLS_14)
 ITERATIONS = (0, 1, 2)
 BRIGHT = (
-    f"{PEAK_E:,.0f} e- in the brightest pixel of the flat image, {READ_NOISE_E:.0f} e- read noise, whole electrons, "
-    "monochromatic."
+    f"{PEAK_E:,.0f} e- in the brightest pixel of the flat image, {TABLE3_READ_NOISE_E:.0f} e- read noise, whole "
+    "electrons, monochromatic."
 )
 FULL_CHAIN = "Images by the full optical chain; iterations with the twin, right to 1e-6."
 
@@ -33,7 +34,7 @@ WEIGHTED, WEIGHTED_1, WEIGHTED_2 = (label("weighted", iterations) for iterations
 
 def exposed_e(ready: Prepared, image: Array, rng: np.random.Generator) -> Array:
     """A noisy image (pixels,) in electrons of one in fractions of the open circle's light."""
-    return noisy_e(rng, scale_e(ready) * image, READ_NOISE_E)
+    return noisy_e(rng, scale_e(ready) * image, TABLE3_READ_NOISE_E)
 
 
 def estimates_nm(ready: Prepared, linear: dict[str, Fit], image_e: Array) -> dict[str, Array]:
@@ -50,4 +51,4 @@ def estimates_nm(ready: Prepared, linear: dict[str, Fit], image_e: Array) -> dic
 def bound_nm2(ready: Prepared) -> Array:
     """Cramer-Rao bound (modes, modes) of the exposure."""
     light_e = scale_e(ready)
-    return cramer_rao(light_e * ready.H[:, :MODES], variance_e(light_e * ready.I0, READ_NOISE_E))
+    return cramer_rao(light_e * ready.H[:, :MODES], variance_e(light_e * ready.I0, TABLE3_READ_NOISE_E))

@@ -7,6 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lowfc.design.fisher import variance_e
+from lowfc.design.paper import STAR, TABLE4_EXPOSURE_S, TABLE4_READ_NOISE_E
 from lowfc.design.trials import noisy_e
 from lowfc.optics.fourier import to_image, to_pupil
 from lowfc.optics.photometry import electrons
@@ -16,13 +17,10 @@ from lowfc.programs.validate import plots
 from lowfc.programs.validate.cases import Case, Context, Prepared
 from lowfc.programs.validate.photometry import PAPER_PEAK, PAPER_SIGNAL
 from lowfc.programs.validate.pointing import (
-    EXPOSURE_S,
     NM_PER_MAS,
     PAPER_FOCAL_MASK,
     PAPER_PUPIL,
     PAPER_RELAY_MASK,
-    READ_NOISE_E,
-    STAR,
 )
 from lowfc.programs.validate.rows import Row, assuming
 from lowfc.programs.validate.tables import PAPER_TABLE2
@@ -158,7 +156,7 @@ class _Tilted:
 
 
 def _tilted(ready: Prepared, axis: int) -> _Tilted:
-    light_e, modes_nm = electrons(STAR, EXPOSURE_S), np.zeros(2)
+    light_e, modes_nm = electrons(STAR, TABLE4_EXPOSURE_S), np.zeros(2)
     modes_nm[axis] = NM_PER_MAS
     flat_e = light_e * ready.band_I0
     return _Tilted(flat_e, light_e * ready.image(modes_nm, ready.band) - flat_e)
@@ -172,7 +170,7 @@ def fig10(context: Context) -> list[Row]:
         for axis in (0, 1):
             what, tilted = f"{name}, tilt {'xy'[axis]}", _tilted(ready, axis)
             signal_e = float(np.ptp(tilted.change_e))
-            noise_e = np.sqrt(variance_e(tilted.flat_e + tilted.change_e, READ_NOISE_E))
+            noise_e = np.sqrt(variance_e(tilted.flat_e + tilted.change_e, TABLE4_READ_NOISE_E))
             ratio = np.abs(tilted.change_e) / noise_e
             rows += [
                 Row(what, "P-V change over peak", "", signal_e / float(tilted.flat_e.max()), PAPER_SIGNAL.get(name)),
@@ -182,8 +180,8 @@ def fig10(context: Context) -> list[Row]:
             ]
     return assuming(
         rows,
-        f"1 mas, {EXPOSURE_S} s, V = {STAR.magnitude}, 20 % band in five wavelengths with both ends, 1 e- read noise, "
-        "our own photometry and masks, full optical chain. The ratio of the image is that of the best filter for it.",
+        f"1 mas, {TABLE4_EXPOSURE_S} s, V = {STAR.magnitude}, 20 % band in five wavelengths with both ends, "
+        "1 e- read noise, our own photometry and masks, full optical chain. The ratio of the image is that of the best filter for it.",
     )
 
 
@@ -193,14 +191,14 @@ def plot_fig10(context: Context, path: Path) -> None:
     for name in context.sensors or ("sam", "clowfs"):
         ready = context.prepared(name)
         tilted = _tilted(ready, 0)
-        image_e = noisy_e(context.rng("fig10", name), tilted.flat_e + tilted.change_e, READ_NOISE_E)
+        image_e = noisy_e(context.rng("fig10", name), tilted.flat_e + tilted.change_e, TABLE4_READ_NOISE_E)
         for values, title in ((image_e - tilted.flat_e, name), (tilted.change_e, f"{name}, without noise")):
             bound = float(np.percentile(np.abs(values), 99.8))
             panels.append(_on_sensor(ready, values, title, (-bound, bound), "e-", "signed"))
     plots.draw(
         path,
         panels,
-        f"Fig. 10. One exposure minus the mean of the flat wavefront's: 1 mas in x, {EXPOSURE_S} s, "
+        f"Fig. 10. One exposure minus the mean of the flat wavefront's: 1 mas in x, {TABLE4_EXPOSURE_S} s, "
         f"V = {STAR.magnitude}, 20 % band, 1 e- read noise, our own photometry.",
         columns=2,
     )

@@ -9,6 +9,7 @@ from scipy.optimize import brentq
 
 from lowfc.contract.configuration import SensorSection
 from lowfc.design.fisher import covariance, variance_e
+from lowfc.design.paper import STAR, TABLE3_READ_NOISE_E, TABLE3_WAVES, TABLE4_EXPOSURE_S, TABLE4_MAS
 from lowfc.design.trials import bounds_waves, expected_rms
 from lowfc.optics.photometry import electrons
 from lowfc.optics.relay import Defocus, fresnel_distance
@@ -16,13 +17,10 @@ from lowfc.optics.sensor import reference
 from lowfc.programs.validate import reconstruction
 from lowfc.programs.validate.cases import Context, Prepared
 from lowfc.programs.validate.pointing import (
-    EXPOSURE_S,
     NM_PER_MAS,
     PAPER_FOCAL_MASK,
-    PAPER_MAS,
     PAPER_PUPIL,
     PAPER_RELAY_MASK,
-    STAR,
     exposures,
     fits,
     paper_count_e,
@@ -57,15 +55,15 @@ def _throughputs(sam: Prepared, clowfs: Prepared) -> Iterator[Row]:
     yield Row("sparse aperture mask", "throughput", "", budget.relay_mask, PAPER_RELAY_MASK)
     yield Row("sam", "relay mask's light that falls on the sensor", "", budget.sensor, PAPER_RELAY_MASK)
     for sensor in (sam, clowfs):
-        own_e = electrons(STAR, EXPOSURE_S) * float(sensor.band_I0.sum())
+        own_e = electrons(STAR, TABLE4_EXPOSURE_S) * float(sensor.band_I0.sum())
         yield Row(
             sensor.name,
             "electrons on the sensor",
             "e-",
             own_e,
             paper_count_e(sensor),
-            assumption=f"V = {STAR.magnitude}, {STAR.diameter_m:g} m, {EXPOSURE_S} s, {STAR.bandwidth_nm:g} nm; paper: "
-            "the same light through the paper's throughputs.",
+            assumption=f"V = {STAR.magnitude}, {STAR.diameter_m:g} m, {TABLE4_EXPOSURE_S} s, {STAR.bandwidth_nm:g} nm; "
+            "paper: the same light through the paper's throughputs.",
         )
 
 
@@ -120,7 +118,7 @@ def _ratios(sam: Prepared, clowfs: Prepared) -> Iterator[Row]:
             PAPER_SCATTER_RATIO,
             modes=2,
             estimator="pinv",
-            assumption=f"Predicted; the paper's own Table 4 has {PAPER_MAS['sam'][1] / PAPER_MAS['clowfs'][1]:.1f}.",
+            assumption=f"Predicted; the paper's own Table 4 has {TABLE4_MAS['sam'][1] / TABLE4_MAS['clowfs'][1]:.1f}.",
         )
 
 
@@ -195,7 +193,7 @@ def _defocus_contradiction(clowfs: Prepared) -> Iterator[Row]:
 def _r2_contradiction(sam: Prepared) -> Iterator[Row]:
     """A mean R2 of 0.97 and a residual 30 times below the input do not go together."""
     name = "inconsistency 3: R2 of 0.97 against a residual 30 times below the input"
-    paper_in, paper_out = reconstruction.INPUT_RMS_WAVES[14], reconstruction.CIRCULAR[14][0]
+    paper_in, paper_out = reconstruction.INPUT_RMS_WAVES[14], TABLE3_WAVES["disk"][14][0]
     yield Row(
         name,
         "R2 if every mode's error were as far below its input as the wavefront's",
@@ -207,7 +205,7 @@ def _r2_contradiction(sam: Prepared) -> Iterator[Row]:
     gram, wavelength_nm = sam.gram[:14, :14], sam.sensor.wavelength_nm
     wavefronts = next(reconstruction.inputs(sam, 14, literal=False))
     linear = reconstruction.fits(sam, 14)["pinv"]
-    spread = covariance(linear.R, variance_e(linear.reference_e, reconstruction.READ_NOISE_E)) / wavelength_nm**2
+    spread = covariance(linear.R, variance_e(linear.reference_e, TABLE3_READ_NOISE_E)) / wavelength_nm**2
     spread *= (paper_out / expected_rms(gram, spread)) ** 2
     inputs = bounds_waves(linear.nolls, wavefronts.low, wavefronts.high) ** 2 / 3.0
     yield Row(

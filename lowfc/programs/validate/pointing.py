@@ -9,8 +9,9 @@ from numpy.typing import NDArray
 
 from lowfc.design.estimators import KINDS, Fit, estimate, fit
 from lowfc.design.fisher import covariance, cramer_rao, variance_e
+from lowfc.design.paper import STAR, TABLE4_EXPOSURE_S, TABLE4_MAS, TABLE4_READ_NOISE_E
 from lowfc.design.trials import noisy_e
-from lowfc.optics.photometry import Photometry, electrons, tilt_nm_per_mas
+from lowfc.optics.photometry import electrons, tilt_nm_per_mas
 from lowfc.optics.relay import ApertureMask
 from lowfc.optics.zernike import NOLLS_20
 from lowfc.programs.validate.cases import Context, Prepared, sparse_apertures
@@ -20,15 +21,11 @@ Array = NDArray[np.float64]
 
 OTHERS = ("clowfs", "clowfs:1", "zwfs")
 """Sensors besides the shipped sparse apertures."""
-STAR = Photometry()
-EXPOSURE_S = 0.05
-READ_NOISE_E = 1.0
 FITTED = {1: (2, 14, 20), 10: (2, 14)}
 """Numbers of modes, tip and tilt first, by the tilt in mas."""
 NM_PER_MAS = tilt_nm_per_mas(STAR.diameter_m)
 
 PAPER_PUPIL, PAPER_FOCAL_MASK, PAPER_RELAY_MASK = 0.147, 0.567, 0.091
-PAPER_MAS = {"sam": {1: 0.36, 10: 0.37}, "clowfs": {1: 0.080, 10: 0.082}}
 
 ASSUMPTION = (
     "Band in five wavelengths with both ends, H averaged over it, 1 e- read noise, whole electrons, total known. The "
@@ -60,27 +57,27 @@ class Exposure:
 def paper_count_e(sensor: Prepared) -> float:
     """Electrons on the sensor by the paper's own throughputs: 6.2e4 behind a sparse aperture mask, 6.8e5 without."""
     relay = PAPER_RELAY_MASK if isinstance(sensor.sensor.relay, ApertureMask) else 1.0
-    return electrons(STAR, EXPOSURE_S) * PAPER_PUPIL * PAPER_FOCAL_MASK * relay
+    return electrons(STAR, TABLE4_EXPOSURE_S) * PAPER_PUPIL * PAPER_FOCAL_MASK * relay
 
 
 def exposures(sensor: Prepared) -> tuple[Exposure, Exposure]:
     """The paper's electron count, and our own."""
-    on_sensor, own = float(sensor.band_I0.sum()), electrons(STAR, EXPOSURE_S)
+    on_sensor, own = float(sensor.band_I0.sum()), electrons(STAR, TABLE4_EXPOSURE_S)
     count = paper_count_e(sensor)
     return (
         Exposure("paper's electrons", count / on_sensor, f"{count:.3g} e- on the sensor, by the paper's throughputs."),
         Exposure(
             "own photometry",
             own,
-            f"{own * on_sensor:.3g} e- on the sensor: V = {STAR.magnitude}, {STAR.diameter_m:g} m, {EXPOSURE_S} s, "
-            f"{STAR.bandwidth_nm:g} nm and our own masks.",
+            f"{own * on_sensor:.3g} e- on the sensor: V = {STAR.magnitude}, {STAR.diameter_m:g} m, "
+            f"{TABLE4_EXPOSURE_S} s, {STAR.bandwidth_nm:g} nm and our own masks.",
         ),
     )
 
 
 def dimmed(sensor: Prepared) -> Exposure:
     """Our own photometry, if our pupil let through no more than the paper's."""
-    own = electrons(STAR, EXPOSURE_S) * PAPER_PUPIL / sensor.budget.pupil
+    own = electrons(STAR, TABLE4_EXPOSURE_S) * PAPER_PUPIL / sensor.budget.pupil
     return Exposure(
         f"own photometry, pupil dimmed to {100 * PAPER_PUPIL:g} %",
         own,
@@ -93,7 +90,7 @@ def fits(sensor: Prepared, exposure: Exposure, mas: int) -> dict[tuple[int, str]
     """Estimators by number of modes and kind."""
     return {
         (modes, kind): fit(
-            NOLLS_20[:modes], sensor.band_I0, sensor.band_H[:, :modes], exposure.scale_e, READ_NOISE_E, kind
+            NOLLS_20[:modes], sensor.band_I0, sensor.band_H[:, :modes], exposure.scale_e, TABLE4_READ_NOISE_E, kind
         )
         for modes, kind in product(FITTED[mas], KINDS)
     }
@@ -101,13 +98,13 @@ def fits(sensor: Prepared, exposure: Exposure, mas: int) -> dict[tuple[int, str]
 
 def bound_mas(linear: Fit) -> Array:
     """Cramer-Rao bounds (2,) of the tilts in x and y near the flat wavefront."""
-    bound = cramer_rao(linear.response_e, variance_e(linear.reference_e, READ_NOISE_E))
+    bound = cramer_rao(linear.response_e, variance_e(linear.reference_e, TABLE4_READ_NOISE_E))
     return np.asarray(np.sqrt(np.diag(bound)[:2]) / NM_PER_MAS)
 
 
 def predicted_mas(linear: Fit, mean_e: Array) -> Array:
     """Standard deviations (2,) of the tilts in x and y that an image of this mean (pixels,) gives."""
-    spread = covariance(linear.R[:2], variance_e(mean_e, READ_NOISE_E))
+    spread = covariance(linear.R[:2], variance_e(mean_e, TABLE4_READ_NOISE_E))
     return np.asarray(np.sqrt(np.diag(spread)) / NM_PER_MAS)
 
 
@@ -144,7 +141,7 @@ def _realisations(
     """Tilts (trials, 2) in mas that each estimator finds in noisy images."""
 
     def trial(i: int) -> list[Array]:
-        image_e = noisy_e(context.rng("table4", sensor.name, exposure.name, mas, i), mean_e, READ_NOISE_E)
+        image_e = noisy_e(context.rng("table4", sensor.name, exposure.name, mas, i), mean_e, TABLE4_READ_NOISE_E)
         return [estimate(each, image_e)[:2] / NM_PER_MAS for each in linear.values()]
 
     found = context.map(f"table4 {sensor.name}, {mas} mas, {exposure.name}", trial, range(context.trials))
@@ -153,7 +150,7 @@ def _realisations(
 
 def _paper_mas(name: str, modes: int, mas: int) -> float | None:
     kind = "sam" if name.startswith("sam") else name.partition(":")[0]
-    return PAPER_MAS.get(kind, {}).get(mas) if modes == 2 else None
+    return TABLE4_MAS.get(kind, {}).get(mas) if modes == 2 else None
 
 
 def _rows(

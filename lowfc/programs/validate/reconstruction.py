@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 from lowfc.design import trials as random
 from lowfc.design.estimators import Fit, estimate, fit, refine
 from lowfc.design.fisher import cramer_rao, variance_e
+from lowfc.design.paper import MODES, PEAK_E, TABLE3_READ_NOISE_E, TABLE3_WAVES
 from lowfc.optics.zernike import NOLLS_20
 from lowfc.programs.validate.cases import DEFAULT_SAM, Context, Prepared, sparse_apertures
 from lowfc.programs.validate.rows import Row
@@ -17,11 +18,6 @@ Array = NDArray[np.float64]
 
 OTHERS = ("bowtie", f"bowtie:{DEFAULT_SAM}", "clowfs", "zwfs", "bar", "lyot", "aplc")
 """Sensors besides the shipped sparse apertures."""
-MODES = (14, 20)
-"""Radial degrees 1 to 4 and 1 to 5."""
-PEAK_E = 40_000.0
-"""In the brightest pixel of the flat wavefront's image (Sect. 3.1)."""
-READ_NOISE_E = 3.0
 ESTIMATORS = ("pinv", "weighted", "weighted + 1 iteration", "weighted + 2 iterations")
 WITH_NUISANCES = "weighted, flux and shear fitted along"
 EVEN = (
@@ -32,15 +28,12 @@ EVEN = (
 
 INPUT_RMS_WAVES = {14: 0.015, 20: 0.018}
 INPUT_PV_WAVES = {14: 0.097, 20: 0.11}
-CIRCULAR = {14: (5.1e-4, 8.9e-3), 20: (8.0e-4, 0.021)}
-BOWTIE = {14: (4.6e-4, 8.0e-3), 20: (6.8e-4, 0.017)}
 PAPER_WAVES = {
-    "sam": CIRCULAR,
-    "bowtie": BOWTIE,
-    f"bowtie:{DEFAULT_SAM}": BOWTIE,
-    "clowfs": {14: (1.3e-3, 0.022), 20: (2.3e-3, 0.066)},
+    "sam": TABLE3_WAVES["disk"],
+    "bowtie": TABLE3_WAVES["bowtie"],
+    f"bowtie:{DEFAULT_SAM}": TABLE3_WAVES["bowtie"],
+    "clowfs": TABLE3_WAVES["clowfs"],
 }
-"""RMS and P-V residuals of the paper's three sensors."""
 
 NOISE = (
     "40,000 e- in the brightest pixel of the sensor's own flat image (which rewards a mask that wastes light: read it "
@@ -112,7 +105,7 @@ def scale_e(sensor: Prepared) -> float:
 
 def fits(sensor: Prepared, modes: int, nuisances: bool = False) -> dict[str, Fit]:
     """The linear estimators of Table 3."""
-    arguments = (NOLLS_20[:modes], sensor.I0, sensor.H[:, :modes], scale_e(sensor), READ_NOISE_E)
+    arguments = (NOLLS_20[:modes], sensor.I0, sensor.H[:, :modes], scale_e(sensor), TABLE3_READ_NOISE_E)
     made = {kind: fit(*arguments, kind) for kind in ("pinv", "weighted")}
     if nuisances:
         made[WITH_NUISANCES] = fit(*arguments, "weighted", sensor.nuisance)
@@ -138,14 +131,14 @@ def ensemble(context: Context, name: str, modes: int, wavefronts: Input, nuisanc
 
     def trial(i: int) -> dict[str, Array]:
         noise = context.rng("table3", name, modes, wavefronts.name, i)
-        image_e = random.noisy_e(noise, light_e * sensor.image(truth_nm[i]), READ_NOISE_E)
+        image_e = random.noisy_e(noise, light_e * sensor.image(truth_nm[i]), TABLE3_READ_NOISE_E)
         found = {key: estimate(each, image_e) for key, each in linear.items()}
         found[ESTIMATORS[2]] = refine(linear["weighted"], image_e, found["weighted"], sensor.model, 1)
         found[ESTIMATORS[3]] = refine(linear["weighted"], image_e, found[ESTIMATORS[2]], sensor.model, 1)
         return found
 
     results = context.map(f"table3 {name}, {modes} modes, {wavefronts.name}", trial, range(context.trials))
-    H_e, variance = linear["weighted"].response_e, variance_e(linear["weighted"].reference_e, READ_NOISE_E)
+    H_e, variance = linear["weighted"].response_e, variance_e(linear["weighted"].reference_e, TABLE3_READ_NOISE_E)
     bound_nm = random.expected_rms(sensor.gram[:modes, :modes], cramer_rao(H_e, variance))
     return Ensemble(truth_nm, {key: np.stack([each[key] for each in results]) for key in results[0]}, bound_nm)
 
@@ -191,7 +184,9 @@ def _input_rows(sensor: Prepared, modes: int, wavefronts: Input, found: Ensemble
 
 
 def _residual_rows(sensor: Prepared, modes: int, wavefronts: Input, found: Ensemble) -> Iterator[Row]:
-    paper = PAPER_WAVES.get(sensor.name, CIRCULAR if sensor.name.startswith("sam") else {}).get(modes, (None, None))
+    paper = PAPER_WAVES.get(sensor.name, TABLE3_WAVES["disk"] if sensor.name.startswith("sam") else {}).get(
+        modes, (None, None)
+    )
     for estimator, estimates_nm in found.estimates_nm.items():
         residuals_nm = found.truth_nm - estimates_nm
         for figure, value, limit_nm, (mean, error) in (
