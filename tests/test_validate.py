@@ -1,6 +1,7 @@
 """`lowfc validate`: its rows against the committed ones, the paper's claims, and what the command prints."""
 
 import json
+import sys
 from pathlib import Path
 
 import pytest
@@ -8,16 +9,20 @@ import typer
 from typer.testing import CliRunner
 
 from lowfc.contract.errors import ConfigurationError, DataFileError
-from lowfc.programs.validate import commands
-from lowfc.programs.validate.cases import DEFAULT_SAM, Context
+from lowfc.programs.validate import commands, report
+from lowfc.programs.validate.cases import DEFAULT_SAM, Case, Context
 from lowfc.programs.validate.figures import FIGURES
+from lowfc.programs.validate.figures_aberration import REALISATIONS
+from lowfc.programs.validate.figures_screens import SCREENS
 from lowfc.programs.validate.reconstruction import ESTIMATORS, WITH_NUISANCES
 from lowfc.programs.validate.report import (
     CASES,
     DOCUMENT,
     GLANCE,
+    PICTURES,
     RESULTS,
     run,
+    run_into,
     to_json,
     to_markdown,
     to_text,
@@ -60,7 +65,8 @@ def agree(measured, reference):
             # The committed standard error is of many trials: that of few ones follows from it.
             allowed = 5.0 * reference["error"] * (1.0 + reference["trials"] / measured["trials"]) ** 0.5
         elif isinstance(wanted, (int, float)):
-            allowed = 0.01 * abs(wanted) + 1e-5
+            size = 1.0 - wanted if "R^2" in reference["quantity"] else abs(wanted)  # of an R^2 what is left to 1 counts
+            allowed = 0.01 * size + (1e-5 if reference["unit"] else 0.0)  # contrasts are small, and not zero
             if wanted > 1e12:  # rounding errors: singular
                 allowed = float("inf") if found > 1e12 else 0.0
         else:
@@ -201,6 +207,11 @@ def test_the_command_prints_a_table(lowfc):
         (("tabel3",), "did you mean 'table3'"),
         (("table2", "--sensor", "sam27d07_bal15"), "did you mean"),
         (("table2", "--sensor", "clowfs:far"), "after the colon comes the defocus"),
+        (("photometry", "--sensor", "nonsense"), "called 'nonsense'"),
+        (("table3", "--sensor", "open", "--trials", "2"), "table3: sensor open, 14 modes: the sensor cannot tell"),
+        (("table4", "--sensor", "open", "--trials", "2"), "table4: sensor open, 14 modes: the sensor cannot tell"),
+        (("fig5", "--sensor", "open", "--trials", "2"), "fig5: sensor open, 14 modes: the sensor cannot tell"),
+        (("fig6", "--sensor", "open", "--trials", "2"), "fig6: sensor open, 14 modes: the sensor cannot tell"),
         (("table1", "--docs", "."), "use it with all"),
         (("all", "--docs", ".", "--sensor", "sam"), "use it with all"),
     ],
@@ -210,6 +221,51 @@ def test_mistakes_are_one_line(lowfc, words, said):
     assert isinstance(error, ConfigurationError)
     assert said in str(error)
     assert "\n" not in str(error)
+
+
+def test_a_fault_of_ours_is_not_called_a_users_mistake(monkeypatch):
+    def broken(context):
+        raise ValueError("a fault")
+
+    monkeypatch.setitem(report.CASES, "table1", Case("broken", broken))
+    with pytest.raises(ValueError, match="a fault"):
+        run(["table1"], Context())
+
+
+def test_who_names_a_sensor_is_told_where_it_changes_nothing(lowfc):
+    told = "of the paper's own sensors, --sensor changes nothing there"
+    assert lowfc("table1", "--sensor", SAM).stderr.startswith(f"table1: {told}\n")
+    assert told not in lowfc("table1").stderr
+    assert told not in lowfc("fig3", "--sensor", SAM).stderr
+
+
+def test_without_matplotlib_nothing_is_worked_out_in_vain(monkeypatch, tmp_path):
+    monkeypatch.setitem(sys.modules, "matplotlib.figure", None)
+    monkeypatch.setitem(report.CASES, "table1", Case("never run", pytest.fail))
+    with pytest.raises(ConfigurationError, match="matplotlib"):
+        run(["table1"], Context(), tmp_path / "plots")
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_document_is_written_whole_or_not_at_all(monkeypatch, tmp_path):
+    def drawn(context, path):
+        path.write_bytes(b"new")
+
+    def interrupted(context):
+        raise KeyboardInterrupt
+
+    old = tmp_path / PICTURES / "fig1.png"
+    old.parent.mkdir(parents=True)
+    old.write_bytes(b"old")
+    monkeypatch.setitem(report.CASES, "fig1", Case("drawn", lambda context: [], drawn))
+    monkeypatch.setitem(report.CASES, "table1", Case("interrupted", interrupted))
+    with pytest.raises(KeyboardInterrupt):
+        run_into(tmp_path, ["fig1", "table1"], Context())
+    assert [path for path in tmp_path.rglob("*") if path.is_file()] == [old]
+    assert old.read_bytes() == b"old"
+    run_into(tmp_path, ["fig1"], Context())
+    assert old.read_bytes() == b"new"
+    assert {path.name for path in tmp_path.iterdir()} == {DOCUMENT, RESULTS, PICTURES.partition("/")[0]}
 
 
 def test_every_table_has_its_name_on_the_command_line():
@@ -246,9 +302,40 @@ def test_every_table_is_as_committed(committed):
 
 
 @pytest.mark.slow
-def test_every_figure_has_the_committed_rows(committed):
-    for table in run(tuple(FIGURES), Context(2, jobs=2)):
-        assert list(map(key, table["rows"])) == list(map(key, committed[table["table"]]["rows"]))
+def test_every_figure_is_as_committed(committed):
+    for table in run(tuple(FIGURES), Context(10, jobs=2)):
+        name, wanted = table["table"], committed[table["table"]]
+        for row, reference in zip(table["rows"], wanted["rows"], strict=True):
+            assert key(row) == key(reference), name
+            by_chance = CHANCE.get((name, row["quantity"]))
+            if by_chance is not None:
+                assert abs(row["measured"] - reference["measured"]) < by_chance(reference["measured"]), (name, row)
+                row, reference = row | {"measured": None}, reference | {"measured": None}
+            if name == "fig9" and row["limit"] is not None:  # the best fit, a mean over the screens as well
+                assert row["limit"] == pytest.approx(reference["limit"], rel=0.2), row
+                row, reference = row | {"limit": None}, reference | {"limit": None}
+            agree(row | {"trials": 10}, reference | {"trials": FIGURE_DRAWS.get(name, wanted["trials"])})
+
+
+FIGURE_DRAWS = {"fig1": REALISATIONS, "fig7": REALISATIONS, "fig9": SCREENS}
+"""Where fewer than the trials are behind the committed standard errors."""
+
+
+def _unexplained(coefficient):
+    """Five times what an R^2 or a correlation leaves to 1: of ten wavefronts that scatters by half of itself."""
+    return 5.0 * (1.0 - coefficient)
+
+
+def _a_fifth(value):
+    return 0.2 * value
+
+
+CHANCE = {
+    ("fig5", "correlation"): _unexplained,
+    **{("fig6", quantity): _unexplained for quantity in ("R^2", "least R^2", "mean R^2")},
+    **{("fig9", quantity): _a_fifth for quantity in ("least residual rms", "largest residual rms")},
+}
+"""Figures that depend on the draw and have no standard error: how far ten trials may be from the committed ones."""
 
 
 @pytest.mark.slow

@@ -7,11 +7,15 @@ import pytest
 from matplotlib.image import imread
 
 from lowfc.contract.errors import LowfcError
+from lowfc.design.fisher import cramer_rao, variance_e
+from lowfc.design.paper import STAR, TABLE4_EXPOSURE_S
 from lowfc.optics.grid import pupil_axis
+from lowfc.optics.photometry import electrons
 from lowfc.programs.validate.cases import Context
 from lowfc.programs.validate.figures import FIGURES
 from lowfc.programs.validate.figures_exposure import ESTIMATORS
 from lowfc.programs.validate.figures_modes import AMPLITUDES, deviations, linear_range
+from lowfc.programs.validate.pointing import NM_PER_MAS
 
 FEW = Context(trials=4, seed=1, sensors=("sam",))
 
@@ -82,6 +86,7 @@ def test_estimates_follow_the_truth(tables):
     assert values(tables["fig5"], "slope", "pinv") == pytest.approx([1.0] * 4, abs=0.1)
     assert min(values(tables["fig5"], "correlation", "pinv")) > 0.95
     rows = tables["fig6"]
+    assert all(row.limit < 1.0 for row in rows)
     assert len(values(rows, "R^2", "pinv")) == 14
     assert values(rows, "mean R^2", "pinv")[0] > 0.97
     assert values(rows, "least R^2", "pinv")[0] > 0.8  # of four wavefronts; of a hundred below
@@ -112,6 +117,7 @@ def test_screens_lose_what_fourteen_modes_can_take(tables):
         assert 0.01 < best < 0.03
         together = np.hypot(best, values(rows, "reconstructed rms", "best possible fit", name)[0])
         assert together == pytest.approx(0.05, rel=0.03)  # squares add for each screen, these are means of them
+        assert all((row.limit is None) == (row.quantity != "residual rms") for row in rows)
         for estimator in ("pinv", "weighted", "weighted + 2 iterations"):
             assert best < values(rows, "residual rms", estimator, name)[0] < 2.5 * best
 
@@ -124,8 +130,20 @@ def test_a_milliarcsecond_is_as_large_as_the_slope_of_the_image(tables):
     np.testing.assert_allclose(ready.opd_nm(np.array([2.4241, 0.0])), tilt_nm, atol=1e-3)
     slope = ready.band_H[:, 0] * 2.4241 / ready.band_I0.max()
     assert values(rows, "P-V change over peak", name="sam, tilt x")[0] == pytest.approx(np.ptp(slope), rel=0.02)
-    change_e = values(rows, "P-V change", name="sam, tilt x")[0]
-    assert values(rows, "largest signal over noise of a pixel", name="sam, tilt x")[0] < change_e
+
+
+def test_the_signal_over_noise_of_an_image_is_what_the_bound_of_its_tilt_says(tables):
+    rows, ready = tables["fig10"], FEW.prepared("sam")
+    light_e = electrons(STAR, TABLE4_EXPOSURE_S)
+    slope_e, noise_e2 = light_e * NM_PER_MAS * ready.band_H[:, 1:2], variance_e(light_e * ready.band_I0, 1.0)
+    least_mas = np.sqrt(cramer_rao(slope_e, noise_e2)[0, 0])
+    ratio = values(rows, "signal over noise of the image", name="sam, tilt y")[0]
+    assert ratio == pytest.approx(1.0 / least_mas, rel=0.03)
+    brightest = np.max(np.abs(slope_e[:, 0]) / np.sqrt(noise_e2))
+    assert values(rows, "largest signal over noise of a pixel", name="sam, tilt y")[0] == pytest.approx(
+        brightest, rel=0.03
+    )
+    assert brightest < ratio
 
 
 def test_rows_depend_on_the_seed_and_not_on_the_threads():

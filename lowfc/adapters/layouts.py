@@ -1,6 +1,7 @@
 """Sparse-aperture layouts: the shipped ones, and those of a user's own files."""
 
 import json
+import re
 from importlib import resources
 from importlib.resources.abc import Traversable
 from pathlib import Path
@@ -29,10 +30,10 @@ def load_layout(name: str) -> sams.Layout:
         ConfigurationError: No layout has that name.
         DataFileError: The file is missing, damaged, or its holes overlap or leave the pupil.
     """
-    path, suffix, inner = name.partition(".json")
-    file: Traversable = Path(path + suffix) if suffix else SHIPPED
+    in_file = re.fullmatch(r"(.*\.json)(?::(.*))?", name)
+    file: Traversable = Path(in_file[1]) if in_file else SHIPPED
     layouts = _read_layouts(file)
-    wanted = inner.removeprefix(":") if suffix else name
+    wanted = (in_file[2] or "") if in_file else name
     if not wanted and len(layouts) == 1:
         wanted = next(iter(layouts))
     if wanted not in layouts:
@@ -40,7 +41,33 @@ def load_layout(name: str) -> sams.Layout:
         if not wanted:
             raise ConfigurationError(f"{file} holds several layouts; say which as {file}:name, of {known}")
         raise ConfigurationError(f"no sparse-aperture layout is called {wanted!r}{nearest(wanted, layouts)}; {known}")
-    return _parse(file, wanted, layouts[wanted])
+    return parse_layout(file, wanted, layouts[wanted])
+
+
+def parse_layout(file: Traversable, name: str, entry: Any) -> sams.Layout:
+    """A layout from what a JSON file holds under its name, checked.
+
+    Args:
+        file: Named in errors.
+        name: Of the layout.
+        entry: "hole_diameter", "holes" and perhaps "purpose", as in `load_layout`.
+
+    Raises:
+        DataFileError: It is malformed, or its holes overlap or leave the pupil.
+    """
+    try:
+        holes = tuple(_hole(hole, entry) for hole in entry["holes"])
+        layout = sams.Layout(name, str(entry.get("purpose", "")), holes)
+    except (AttributeError, KeyError, TypeError, ValueError) as error:
+        raise DataFileError(
+            f'{file}: layout {name} must have "hole_diameter" and "holes" as pairs [x, y], or as [x, y, diameter], in '
+            f"pupil diameters ({type(error).__name__}: {error})"
+        ) from error
+    try:
+        sams.check(layout)
+    except ValueError as error:
+        raise DataFileError(f"{file}: {error}") from error
+    return layout
 
 
 def layout_warnings(layout: sams.Layout) -> list[str]:
@@ -66,22 +93,6 @@ def _read_layouts(file: Traversable) -> dict[str, Any]:
     if not isinstance(layouts, dict) or not layouts:
         raise DataFileError(f'{file} holds no layouts: expected {{"layouts": {{name: ...}}}} or one with "holes"')
     return layouts
-
-
-def _parse(file: Traversable, name: str, entry: Any) -> sams.Layout:
-    try:
-        holes = tuple(_hole(hole, entry) for hole in entry["holes"])
-        layout = sams.Layout(name, str(entry.get("purpose", "")), holes)
-    except (AttributeError, KeyError, TypeError, ValueError) as error:
-        raise DataFileError(
-            f'{file}: layout {name} must have "hole_diameter" and "holes" as pairs [x, y], or as [x, y, diameter], in '
-            f"pupil diameters ({type(error).__name__}: {error})"
-        ) from error
-    try:
-        sams.check(layout)
-    except ValueError as error:
-        raise DataFileError(f"{file}: {error}") from error
-    return layout
 
 
 def _hole(hole: Any, entry: Any) -> tuple[float, float, float]:

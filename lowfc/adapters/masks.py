@@ -38,13 +38,13 @@ def load_pupil(samples: int = SAMPLES, file: Traversable = _DATA / "spc_quarter1
     """
     try:
         with file.open("rb") as stream, np.load(stream, allow_pickle=False) as arrays:
-            quarter = np.asarray(arrays["quarter"], dtype=np.float64)
+            quarter = np.asarray(arrays["quarter"])
     except FileNotFoundError:
         raise DataFileError(f"there is no pupil file {file}") from None
     except Exception as error:  # zipfile, zlib and numpy each raise their own on a damaged file
         raise DataFileError(f"{file} is damaged, or not a pupil file with an array `quarter`: {error}") from error
     try:
-        from_quarter(quarter, 2 * len(quarter))
+        from_quarter(quarter, 2 * max(len(np.atleast_1d(quarter)), 1))
     except ValueError as error:
         raise DataFileError(f"{file}: {error}") from error
     try:

@@ -1,5 +1,6 @@
 """Command lines: how a user's mistake looks, and the options that every process of a run has."""
 
+import signal
 import sys
 from pathlib import Path
 from typing import Annotated, Any, NoReturn
@@ -9,6 +10,9 @@ import typer
 from lowfc.adapters.run import DEFAULT_RUN
 from lowfc.contract.configuration import Configuration, load
 from lowfc.contract.errors import LowfcError
+
+INTERRUPTED = 130
+"""Exit status after Ctrl-C."""
 
 __all__ = ["DEFAULT_RUN", "ConfigFile", "RunId", "configuration", "new_app", "run_app"]
 
@@ -28,15 +32,20 @@ def new_app(help_text: str) -> typer.Typer:
 
 
 def run_app(app: typer.Typer) -> NoReturn:
-    """Run a command line; a user's mistake is one clear message and exit status 2, never a traceback."""
+    """Run a command line; a user's mistake is one clear message and exit status 2, never a traceback.
+
+    Being told to stop ends a command as Ctrl-C does; the processes of a loop catch both themselves.
+    """
+    signal.signal(signal.SIGTERM, signal.default_int_handler)
     try:
         app()
     except LowfcError as error:
         sys.stderr.write(f"error: {error}\n")
         sys.exit(error.exit_status)
-    except KeyboardInterrupt:
-        sys.stderr.write("interrupted\n")
-        sys.exit(130)
+    except SystemExit as end:
+        if end.code == INTERRUPTED:
+            sys.stderr.write("interrupted\n")
+        raise
     sys.exit(0)
 
 

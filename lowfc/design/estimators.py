@@ -6,13 +6,14 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from lowfc.control.calibration import reconstructor
+from lowfc.control.calibration import ESTIMATORS, reconstructor
 
 Array = NDArray[np.float64]
 Model = Callable[[Array], Array]
 """Image (pixels,), fractions of the open circle's light, of modes in nm: with exp(i phi) and not its expansion."""
 
-KINDS = ("pinv", "weighted")
+KINDS = ESTIMATORS[::-1]
+"""The plain one first, as in the paper."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -7,6 +7,10 @@ from scipy.optimize import linprog
 Float = NDArray[np.float64]
 
 
+class NotSolvedError(ValueError):
+    """The solver gave up."""
+
+
 def maximise(rows: Float, weights: Float, multipliers: Float) -> tuple[Float, Float, float]:
     """The x in [0, 1] of the largest weights @ x with rows @ x <= 0, by HiGHS' dual simplex.
 
@@ -23,7 +27,7 @@ def maximise(rows: Float, weights: Float, multipliers: Float) -> tuple[Float, Fl
         x (n,), the multipliers (m,), and the dual bound on the objective, which proves the optimum.
 
     Raises:
-        ValueError: HiGHS gave up.
+        NotSolvedError: HiGHS gave up.
     """
     tight = multipliers > 0
     count = int(np.count_nonzero(tight))
@@ -38,7 +42,7 @@ def maximise(rows: Float, weights: Float, multipliers: Float) -> tuple[Float, Fl
         options={"presolve": False},
     )
     if result.status or result.x is None:
-        raise ValueError(f"the linear program was not solved: {result.message}")
+        raise NotSolvedError(f"the linear program was not solved: {result.message}")
     found = multipliers.copy()
     found[tight] -= result.eqlin.marginals
     found[~tight] -= result.ineqlin.marginals

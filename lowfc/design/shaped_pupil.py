@@ -103,7 +103,8 @@ class Round:
         points: Of the program, each with one sign of the field.
         quarter: (cells, cells) the mask, [0, 0] next to the pupil's centre.
         open_area: Fraction of the circle.
-        bound: On `open_area`, from the dual: no mask that is dark in these points is more open.
+        bound: On `open_area`, from the dual: no mask that keeps to `limit` times the contrast in these points is more
+            open. One that keeps to the contrast alone, as promised, may be.
         contrast: The largest in the zone on the fine grid; infinite for a closed mask.
     """
 
@@ -143,7 +144,7 @@ def exchange(request: Request) -> Iterator[Round]:
     Where nothing but a closed mask is dark the last round's contrast is infinite.
 
     Raises:
-        ValueError: The solver gave up.
+        NotSolvedError: The solver gave up.
     """
     points = first_points(request.zone, request.step)
     points, signs = np.concatenate([points, points]), np.repeat([1.0, -1.0], len(points))

@@ -69,6 +69,16 @@ def residual_pv(basis: Array, residuals: Array) -> Array:
     return np.concatenate([np.ptp(block, axis=1) for block in blocks])
 
 
+def expected_r_squared(variances: Array, bounds: Array) -> Array:
+    """What `r_squared` tends to (modes,) with many estimates, if their errors do not depend on the truth.
+
+    Args:
+        variances: (modes,) of the errors.
+        bounds: (modes,) of the coefficients, uniform between minus and plus these.
+    """
+    return np.asarray(1.0 - variances / (bounds**2 / 3.0 + variances))
+
+
 def r_squared(estimates: Array, truth: Array) -> Array:
     """Coefficient of determination (modes,) of estimates (n, modes), eq. (15) as the text below it reads."""
     residual = np.sum((estimates - truth) ** 2, axis=0)

@@ -75,13 +75,19 @@ def from_quarter(quarter: ArrayLike, samples: int) -> NDArray[np.float64]:
         samples: Points across the diameter, a multiple of twice the number of cells.
 
     Raises:
-        ValueError: The quadrant is not square, is outside 0..1, or does not divide `samples`.
+        ValueError: The quadrant is not real and square, is outside 0..1, lets nothing through, or does not divide
+            `samples`.
     """
-    quarter = np.asarray(quarter, dtype=np.float64)
-    if quarter.ndim != 2 or quarter.shape[0] != quarter.shape[1]:
+    given = np.asarray(quarter)
+    if given.dtype.kind not in "buif":
+        raise ValueError(f"a quadrant must be of real numbers, got {given.dtype}")
+    quarter = given.astype(np.float64)
+    if quarter.ndim != 2 or quarter.shape[0] != quarter.shape[1] or not quarter.size:
         raise ValueError(f"a quadrant must be square, got shape {quarter.shape}")
     if not (np.isfinite(quarter).all() and quarter.min() >= 0 and quarter.max() <= 1):
         raise ValueError("a quadrant's transmission must lie between 0 and 1")
+    if not quarter.any():
+        raise ValueError("a quadrant must let some light through")
     repeat, remainder = divmod(samples, 2 * quarter.shape[0])
     if remainder or not repeat:
         raise ValueError(f"samples must be a multiple of {2 * quarter.shape[0]}, got {samples}")

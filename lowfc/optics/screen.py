@@ -10,8 +10,9 @@ _SPECTRUM = 0.0229  # of the phase, rad^2 per (cycle per D)^2 at one cycle per D
 def kolmogorov(rng: np.random.Generator, samples: int, width: int = 4) -> NDArray[np.float64]:
     """Screen (samples, samples) of power law -11/3, at the samples of a pupil, in radians for a Fried length of D.
 
-    It is cut out of a periodic one that is wider than the pupil: without the waves that are longer than the pupil,
-    which a periodic screen cannot hold, too little of the wavefront would be of low order.
+    It is cut out of a periodic one, which holds no wave longer than itself. What it lacks is tilt: over a circle that
+    has 0.90 rad^2 of the 1.03 rad^2 of an endless screen (Noll 1976), but about 0.3 rad^2 here at a width of 4 and 0.04
+    at a width of 1. The orders above tilt are nearly whole at a width of 4.
 
     Args:
         rng: Source of all randomness.

@@ -19,7 +19,9 @@ Float = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class TwinSpec:
-    """How far the optics are compressed; the default is right to 1e-4 of the image.
+    """How far the optics are compressed; the default is right to 1e-4 of the image for every sensor that has a name.
+
+    Other combinations of pupil, focal-plane mask and relay have been seen at up to 5e-4.
 
     Attributes:
         nodes: Pupil nodes across the diameter.

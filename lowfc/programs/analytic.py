@@ -41,7 +41,7 @@ def analytic(config: Configuration, console: Console) -> Calibration:
 def _progress(what: str, console: Console) -> Iterator[Callable[[int, int], None]]:
     """A progress bar that appears with the first step."""
     columns = (TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn())
-    with Progress(*columns, console=console, transient=True) as bar:
+    with Progress(*columns, console=console, transient=True, disable=not console.is_terminal) as bar:
         tasks: list[TaskID] = []
 
         def advance(done: int, total: int) -> None:

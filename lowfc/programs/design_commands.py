@@ -84,7 +84,7 @@ def sam(
     name: Annotated[str, typer.Option(help="Of the layout.")] = "sam",
     jobs: Annotated[int | None, typer.Option(min=1, help="Processes. Default: one for each core.")] = None,
     scheduler: Annotated[str | None, typer.Option(help="Address of a Dask scheduler, to use its workers.")] = None,
-    out: Annotated[Path | None, typer.Option(help="Layout file. Default: the layout's name and .json.")] = None,
+    out: Annotated[Path | None, typer.Option(help="Layout file (.json). Default: the layout's name.")] = None,
     resume: Annotated[
         Path | None, typer.Option(help="State file of an interrupted search, which it goes on with.")
     ] = None,
@@ -96,7 +96,9 @@ def sam(
 
     Example: lowfc design sam --diameter 0.05:0.2 --holes 8:30 --chains 4 --out mask.json
     """
-    from lowfc.programs.design_sam import begin, design_sam, open_executor, render, resumed
+    from lowfc.programs.design_sam import begin, design_sam, render, resumed
+    from lowfc.programs.design_sam_executors import open_executor
+    from lowfc.programs.design_sam_files import check_files
     from lowfc.programs.design_sam_request import SEARCH_OPTIONS, request
 
     values = context.params
@@ -110,7 +112,7 @@ def sam(
         search = request(**{key: values[key] for key in SEARCH_OPTIONS})
         found = begin(search)
     out = out if out is not None else Path(f"{search.name}.json")
-    state = resume if resume is not None else out.with_suffix(".state.json")
+    state = check_files(out, resume, front, plot)
     processes = min(jobs or len(os.sched_getaffinity(0)), search.chains)
     with open_executor(processes, scheduler) as executor:
         result = design_sam(search, found, out, state, executor, front, plot)

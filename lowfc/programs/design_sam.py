@@ -1,15 +1,12 @@
 """The search for a sparse aperture mask: chains on all cores or on a Dask cluster, kept safe from interruption."""
 
 import hashlib
-import multiprocessing
 import shlex
-import signal
 import time
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import FIRST_COMPLETED, Executor, Future, ProcessPoolExecutor, wait
+from concurrent.futures import FIRST_COMPLETED, Executor, Future, wait
 from contextlib import contextmanager
-from functools import lru_cache
-from importlib import import_module
+from functools import cache, lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -20,12 +17,13 @@ from threadpoolctl import threadpool_limits
 
 from lowfc.adapters.drawing import figure_class
 from lowfc.adapters.masks import load_pupil
-from lowfc.contract.errors import ConfigurationError
+from lowfc.contract.errors import ConfigurationError, LowfcError
 from lowfc.design.paper import TABLE4_MODES
 from lowfc.design.sam_goal import figures
 from lowfc.design.sam_merit import FOCAL_MASKS, Hole, Optics, Single, build_optics, hole_fields
-from lowfc.design.sam_search import Chain, advance, holes, start
+from lowfc.design.sam_search import BLOCK, Chain, advance, holes, start
 from lowfc.optics.sam import Layout
+from lowfc.programs.design_sam_executors import is_lost
 from lowfc.programs.design_sam_files import (
     Point,
     front,
@@ -38,7 +36,6 @@ from lowfc.programs.design_sam_files import (
 from lowfc.programs.design_sam_request import Search, command_of, goal_of
 
 STATE_PERIOD_S = 10.0
-DASK_TIMEOUT_S = 10.0
 
 
 def begin(search: Search) -> list[Chain]:
@@ -82,8 +79,12 @@ def design_sam(
 
     Raises:
         DataFileError: A file cannot be written.
-        ConfigurationError: A package for the plot is missing.
+        ConfigurationError: A package for the plot is missing, or a worker has another shaped pupil.
+        LowfcError: The workers are lost; the state file stays if any chain had finished a block.
+        KeyboardInterrupt: Ctrl-C, before any chain had finished a block.
     """
+    console = Console(stderr=True) if console is None else console
+    _one_thread()
     if plot_file is not None:
         figure_class()  # missing, it must be found before the work, not after
     pupil = pupil_digest()
@@ -102,14 +103,19 @@ def design_sam(
         try:
             run_chains(search, chains, executor, on_block)
         except KeyboardInterrupt:
-            if not any(chain.step for chain in chains):
-                state.unlink()
-                raise
             interrupted = True
-            write_state(state, search, pupil, chains)
+            if not _keep(state, search, pupil, chains):
+                console.print(_NOTHING, highlight=False)
+                raise
+        except Exception as error:
+            kept = _keep(state, search, pupil, chains)
+            if not is_lost(error):
+                raise
+            go_on = f"go on with --resume {state}" if kept else _NOTHING
+            raise LowfcError(f"the workers were lost ({error!r}); {go_on}") from error
     points = [point_of(search, chain) for chain in chains if chain.step]
-    kept = front(points) if search.sweeps else [min(points, key=lambda point: point.merit)]
-    write_layouts(out, kept, search, command_of(search))
+    best = front(points) if search.sweeps else [min(points, key=lambda point: point.merit)]
+    write_layouts(out, best, search, command_of(search))
     if front_file is not None:
         write_front(front_file, points)
     if plot_file is not None:
@@ -125,8 +131,20 @@ def design_sam(
         "interrupted": interrupted,
         "resume": str(state) if interrupted else None,
         "merits": [chain.best_merit for chain in chains if chain.step],
-        "layouts": [summary(point) for point in kept],
+        "layouts": [summary(point) for point in best],
     }
+
+
+def _keep(state: Path, search: Search, pupil: str, chains: list[Chain]) -> bool:
+    """Write the state if any chain has come forward, else remove it; say which."""
+    if not any(chain.step for chain in chains):
+        state.unlink()
+        return False
+    write_state(state, search, pupil, chains)
+    return True
+
+
+_NOTHING = f"no chain had finished its first {BLOCK} steps: nothing was found, nothing is written"
 
 
 def run_chains(search: Search, chains: list[Chain], executor: Executor, on_block: Callable[[], None]) -> None:
@@ -139,65 +157,39 @@ def run_chains(search: Search, chains: list[Chain], executor: Executor, on_block
         on_block: Called after each.
     """
     running: dict[Future[Chain], int] = {}
+    pupil = pupil_digest()
     try:
         for i, chain in enumerate(chains):
             if chain.step < chain.steps:
-                running[executor.submit(advance_block, search, chain)] = i
+                running[executor.submit(advance_block, search, chain, pupil)] = i
         while running:
             done, _ = wait(running, return_when=FIRST_COMPLETED)
             for future in done:
                 i = running.pop(future)
                 chains[i] = future.result()
                 if chains[i].step < chains[i].steps:
-                    running[executor.submit(advance_block, search, chains[i])] = i
+                    running[executor.submit(advance_block, search, chains[i], pupil)] = i
             on_block()
     finally:
         for future in running:
             future.cancel()
 
 
-def advance_block(search: Search, chain: Chain) -> Chain:
-    """One block of one chain, on whatever machine this runs; on one thread, so that every run adds up alike."""
-    with threadpool_limits(1):
-        return advance(_optics(search.focal_masks), goal_of(search, chain.index), search.bounds, chain)
-
-
-class Here(Executor):
-    """Runs what is submitted at once, in this process."""
-
-    def submit(self, fn: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future[Any]:
-        """Run it; an interrupt is the caller's."""
-        future: Future[Any] = Future()
-        try:
-            future.set_result(fn(*args, **kwargs))
-        except Exception as error:
-            future.set_exception(error)
-        return future
-
-
-@contextmanager
-def open_executor(jobs: int, scheduler: str | None) -> Iterator[Executor]:
-    """Where the chains run.
+def advance_block(search: Search, chain: Chain, pupil: str) -> Chain:
+    """One block of one chain, on whatever machine this runs.
 
     Args:
-        jobs: Processes of this machine; 1 is this one.
-        scheduler: Address of a Dask scheduler, to use its workers.
+        search: What to look for.
+        chain: Where it stands.
+        pupil: Digest of the shaped pupil that the search is for.
 
     Raises:
-        ConfigurationError: The scheduler does not answer, or the package for it is missing.
+        ConfigurationError: This machine has another shaped pupil.
     """
-    if scheduler is not None:
-        with _dask(scheduler) as executor:
-            yield executor
-    elif jobs == 1:
-        yield Here()
-    else:
-        context = multiprocessing.get_context("spawn")
-        pool = ProcessPoolExecutor(jobs, context, signal.signal, (signal.SIGINT, signal.SIG_IGN))
-        try:
-            yield pool
-        finally:
-            pool.shutdown(wait=True, cancel_futures=True)
+    if pupil != pupil_digest():
+        raise ConfigurationError("a worker has another shaped pupil: install the same lowfc on all machines")
+    _one_thread()
+    return advance(_optics(search.focal_masks), goal_of(search, chain.index), search.bounds, chain)
 
 
 def point_of(search: Search, chain: Chain) -> Point:
@@ -257,6 +249,12 @@ def render(result: dict[str, Any]) -> str:
     return "\n".join(lines)
 
 
+@cache
+def _one_thread() -> None:
+    """From now on one thread in this process, so that every run adds up alike; others may be at work, so for good."""
+    threadpool_limits(1)
+
+
 @lru_cache(maxsize=1)
 def pupil_digest() -> str:
     """Identity of the shaped pupil, on which every result depends."""
@@ -286,25 +284,10 @@ def _described(found: Sequence[Hole]) -> str:
 
 
 @contextmanager
-def _dask(address: str) -> Iterator[Executor]:
-    try:
-        client: Any = import_module("distributed").Client(address, timeout=DASK_TIMEOUT_S)
-    except ImportError:
-        raise ConfigurationError("--scheduler needs Dask: pip install 'lowfc[cluster]'") from None
-    except (OSError, ValueError) as error:
-        raise ConfigurationError(f"no Dask scheduler answers at {address!r}: {error}") from error
-    try:
-        yield client.get_executor(pure=False)
-    finally:
-        client.close()
-
-
-@contextmanager
-def _progress(search: Search, chains: list[Chain], console: Console | None) -> Iterator[Callable[[], None]]:
+def _progress(search: Search, chains: list[Chain], console: Console) -> Iterator[Callable[[], None]]:
     """A progress bar with the best merit so far."""
-    console = Console(stderr=True) if console is None else console
     columns = (TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn(), TimeRemainingColumn())
-    with Progress(*columns, console=console, transient=True) as bar:
+    with Progress(*columns, console=console, transient=True, disable=not console.is_terminal) as bar:
         task = bar.add_task(search.goal.merit, total=search.chains * search.steps)
 
         def show() -> None:

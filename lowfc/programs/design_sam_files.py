@@ -9,9 +9,9 @@ from pathlib import Path
 from typing import Any
 
 from lowfc.adapters.drawing import figure_class, png
-from lowfc.adapters.layouts import load_layout
+from lowfc.adapters.layouts import parse_layout
 from lowfc.adapters.whole_file import write_whole
-from lowfc.contract.errors import DataFileError
+from lowfc.contract.errors import ConfigurationError, DataFileError
 from lowfc.design.paper import TABLE3_WAVES, TABLE4_MAS
 from lowfc.design.sam_goal import Goal
 from lowfc.design.sam_search import Bounds, Chain
@@ -30,6 +30,36 @@ class Point:
     table3_waves: float
     table4_mas: float
     throughput: float
+
+
+def check_files(out: Path, resume: Path | None, *others: Path | None) -> Path:
+    """Say before the search what would go wrong after it.
+
+    Args:
+        out: Layout file.
+        resume: State file to go on from.
+        others: More files to be written.
+
+    Returns:
+        The state file.
+
+    Raises:
+        ConfigurationError: The layout file is not called .json, two files are the same one, or an interrupted search
+            would be overwritten.
+        DataFileError: A directory is missing.
+    """
+    if out.suffix != ".json":
+        raise ConfigurationError(f"--out must end in .json, as only that is read as a layout file; got {out}")
+    state = resume if resume is not None else out.with_name(f"{out.name}.state.json")
+    files = [file for file in (out, state, *others) if file is not None]
+    for file in files:
+        if not file.parent.is_dir():
+            raise DataFileError(f"{file} cannot be written: there is no directory {file.parent}")
+    if len({file.resolve() for file in files}) < len(files):
+        raise ConfigurationError(f"these must be different files: {', '.join(map(str, files))}")
+    if resume is None and state.exists():
+        raise ConfigurationError(f"{state} holds an interrupted search: go on with --resume {state}, or delete it")
+    return state
 
 
 def write_state(path: Path, search: Search, pupil: str, chains: Sequence[Chain]) -> None:
@@ -72,11 +102,16 @@ def read_state(path: Path, pupil: str) -> tuple[Search, list[Chain]]:
 
 
 def write_layouts(path: Path, points: Sequence[Point], search: Search, command: str) -> None:
-    """Write layouts as the loop reads them, each with how it was found."""
+    """Write layouts as the loop reads them, each with how it was found.
+
+    Raises:
+        DataFileError: The file cannot be written, or the loop would refuse it.
+    """
     entries = {point.layout.name: _entry(point, search, command) for point in points}
-    write_whole(path, (json.dumps({"units": UNITS, "layouts": entries}, indent=1) + "\n").encode())
-    for name in entries:
-        load_layout(f"{path}:{name}")
+    content = json.dumps({"units": UNITS, "layouts": entries}, indent=1) + "\n"
+    for name, entry in json.loads(content)["layouts"].items():
+        parse_layout(path, name, entry)
+    write_whole(path, content.encode())
 
 
 def write_front(path: Path, points: Sequence[Point]) -> None:

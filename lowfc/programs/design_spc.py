@@ -18,6 +18,7 @@ from lowfc.adapters.drawing import figure_class, png
 from lowfc.adapters.whole_file import write_whole
 from lowfc.contract.errors import ConfigurationError, DataFileError
 from lowfc.design.dark_zone import FINE_STEP, fine_grid
+from lowfc.design.linear_program import NotSolvedError
 from lowfc.design.shaped_pupil import (
     FOCAL_MASK_RADIUS,
     LEAST_OPEN,
@@ -64,6 +65,10 @@ def design_spc(wanted: Request, out: Path, plot: Path | None, console: Console) 
         plot: Picture to be drawn, or None.
         console: Where progress goes.
 
+    Returns:
+        What was found. "below_optimum_at_limit_fraction" is how much more of the circle a mask could leave open that
+        keeps to `limit` times the contrast; with the contrast promised it may be more.
+
     Raises:
         ConfigurationError: No mask does that, and which nearest request is feasible; or the rounds did not suffice,
             or there is no matplotlib.
@@ -105,7 +110,7 @@ def design_spc(wanted: Request, out: Path, plot: Path | None, console: Console) 
         "mean_contrast": found.mean_contrast,
         "contrast_step_lambda_d": FINE_STEP,
         "grey_cells_fraction": found.grey,
-        "above_optimum_fraction": last.bound - last.open_area,
+        "below_optimum_at_limit_fraction": last.bound - last.open_area,
         "rounds": len(rounds),
         "points": last.points,
     }
@@ -169,7 +174,7 @@ def _interruptibly(work: Callable[[], Result]) -> Result:
     """Do work in a thread, for Ctrl-C waits for the end of a program where the main thread solves it.
 
     Raises:
-        ConfigurationError: The work cannot be done.
+        ConfigurationError: The solver gave up.
     """
     outcomes: SimpleQueue[_Outcome] = SimpleQueue()
 
@@ -182,7 +187,7 @@ def _interruptibly(work: Callable[[], Result]) -> Result:
 
     Thread(target=run, daemon=True).start()
     outcome = outcomes.get()
-    if isinstance(outcome.error, ValueError):
+    if isinstance(outcome.error, NotSolvedError):
         raise ConfigurationError(str(outcome.error)) from outcome.error
     if outcome.error is not None:
         raise outcome.error

@@ -15,6 +15,7 @@ from rich.live import Live
 from lowfc.adapters import calibration_file
 from lowfc.adapters.clock import HostClock
 from lowfc.adapters.run import Run, mirror_role, new_run_id, open_run
+from lowfc.adapters.terminal import INTERRUPTED
 from lowfc.adapters.zenoh_bus import ZenohBus
 from lowfc.contract.configuration import Configuration
 from lowfc.contract.errors import LowfcError
@@ -115,7 +116,7 @@ def _supervise(
         stop_all([*children[1:], camera])
         time.sleep(SHOW_S)  # the last Health is on its way
     for child in children:
-        if child.status not in (0, -signal.SIGTERM):  # told to end before it was ready is no failure
+        if child.status not in (0, -signal.SIGTERM, INTERRUPTED):  # told to end before it was ready is no failure
             raise ProcessDiedError(f"{child.how_it_ended()}\n{child.last_words()}")
 
 

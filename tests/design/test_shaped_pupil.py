@@ -14,6 +14,8 @@ from typer.testing import CliRunner
 
 from lowfc.adapters.masks import load_pupil
 from lowfc.contract.errors import ConfigurationError, DataFileError
+from lowfc.design import shaped_pupil
+from lowfc.design.linear_program import NotSolvedError
 from lowfc.design.shaped_pupil import (
     SAMPLES,
     Request,
@@ -101,7 +103,7 @@ def test_the_command_writes_a_mask_that_keeps_its_promise_between_the_points(tmp
     assert answer.exit_code == 0, answer.output
     result = json.loads(answer.stdout)
     assert result["open_area_fraction"] == pytest.approx(0.5317, abs=5e-4)
-    assert abs(result["above_optimum_fraction"]) < 1e-6
+    assert abs(result["below_optimum_at_limit_fraction"]) < 1e-6
     assert picture.read_bytes().startswith(b"\x89PNG")
     pupil = load_pupil(file=path)
     assert pupil.mean() / OPEN_AREA == pytest.approx(result["open_area_fraction"], abs=1e-12)
@@ -178,6 +180,19 @@ def test_too_few_rounds_say_what_to_do(tmp_path):
     assert isinstance(error, ConfigurationError)
     assert "after 1 programs with 16 cells the contrast is" in str(error)
     assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize(
+    ("failure", "seen"), [(NotSolvedError("the solver gave up"), ConfigurationError), (ValueError("a bug"), ValueError)]
+)
+def test_only_the_solver_that_gives_up_is_the_users_affair(tmp_path, monkeypatch, failure, seen):
+    def fail(*_):
+        raise failure
+
+    monkeypatch.setattr(shaped_pupil, "maximise", fail)
+    error = CliRunner().invoke(design_app, ["spc", "--out", str(tmp_path / "spc.npz")]).exception
+    assert type(error) is seen
+    assert str(error) == str(failure)
 
 
 def test_a_file_that_cannot_be_written_is_said_first(tmp_path):

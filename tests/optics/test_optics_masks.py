@@ -139,9 +139,16 @@ def test_damaged_pupil_files_are_named(tmp_path):
     np.savez(path, other=np.ones((4, 4)))
     with pytest.raises(DataFileError, match="quarter"):
         load_pupil(file=path)
-    np.savez(path, quarter=np.full((4, 4), 2.0))
-    with pytest.raises(DataFileError, match="between 0 and 1"):
-        load_pupil(file=path)
+    for quarter, message in (
+        (np.full((4, 4), 2.0), "between 0 and 1"),
+        (np.zeros((4, 4)), "some light"),
+        (np.ones((4, 4)) + 0j, "real numbers"),
+        (np.float64(1.0), "square"),
+        (np.ones((0, 0)), "square"),
+    ):
+        np.savez(path, quarter=quarter)
+        with pytest.raises(DataFileError, match=message):
+            load_pupil(file=path)
     np.savez(path, quarter=np.ones((4, 4)))
     assert load_pupil(16, path).shape == (16, 16)
     with pytest.raises(ConfigurationError, match="multiple of 8"):

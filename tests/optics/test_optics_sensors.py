@@ -262,7 +262,6 @@ def test_shear_and_background_fitted_along_do_not_pass_for_modes(name, price, ca
     assert bias_nm(shear, sheared) < 0.15
     assert bias_nm(shear, veiled) > 20 * bias_nm(both, veiled)
     assert bias_nm(both, veiled) < 0.15
-    print(f"{name}: tip {noise_nm[0]:.2f} nm of noise, {shear_noise_nm[0]:.2f} with shear")
     assert price[0] < shear_noise_nm[0] / noise_nm[0] < price[1]
 
 

@@ -17,6 +17,7 @@ from lowfc.adapters.masks import sensor_from, sensor_named
 from lowfc.adapters.twin_store import load_or_build
 from lowfc.contract.configuration import SensorSection
 from lowfc.contract.errors import ConfigurationError
+from lowfc.design.estimators import Fit, fit
 from lowfc.design.trials import gram
 from lowfc.optics.band import Band, uniform
 from lowfc.optics.grid import pupil_axis
@@ -104,7 +105,7 @@ class Prepared:
 
     @cached_property
     def twin(self) -> Twin:
-        """The real-time twin that the full-model iterations run on: right to 1e-6 of the image."""
+        """The real-time twin that the full-model iterations run on: right to about 1e-5 of the image."""
         return load_or_build(self.sensor, ACCURATE)
 
     def opd_nm(self, modes_nm: Array) -> Array:
@@ -114,6 +115,26 @@ class Prepared:
     def image(self, modes_nm: Array, band: Band | None = None) -> Array:
         """Image (pixels,) of the first modes (up to 20,) in nm by the full optical chain, the truth of every trial."""
         return image(self.sensor, self.opd_nm(modes_nm), band).ravel()
+
+    def fit(
+        self,
+        modes: int,
+        scale_e: float,
+        read_noise_e: float,
+        kind: str,
+        in_band: bool = False,
+        nuisance: Array | None = None,
+    ) -> Fit:
+        """A linear estimator of the first modes, at the central wavelength or over the band.
+
+        Raises:
+            ConfigurationError: This sensor cannot tell the modes apart.
+        """
+        I0, H = (self.band_I0, self.band_H) if in_band else (self.I0, self.H)
+        try:
+            return fit(NOLLS_20[:modes], I0, H[:, :modes], scale_e, read_noise_e, kind, nuisance)
+        except ValueError as error:
+            raise ConfigurationError(f"sensor {self.name}, {modes} modes: {error}") from error
 
     @cached_property
     def _node_modes(self) -> Array:

@@ -15,6 +15,9 @@ TABLES = (
     *("conditioning", "photometry"),
 )
 
+OF_THE_PAPER = ("table1", "photometry")
+"""What compares the paper's own sensors and takes no others."""
+
 
 def validate(
     tables: Annotated[
@@ -27,8 +30,9 @@ def validate(
     sensor: Annotated[
         list[str] | None,
         typer.Option(
-            help="Only this sensor in table2, table3, table4 and conditioning: sam, bowtie, clowfs, clowfs:MM (its "
-            "defocus), zwfs, bar, lyot, aplc; or a layout, FILE.json or FILE.json:NAME. Repeat.",
+            help=f"Only this sensor, in all tables and figures but {' and '.join(OF_THE_PAPER)}: sam, bowtie, "
+            "bowtie:LAYOUT, clowfs, clowfs:MM (its defocus), zwfs, bar, open, lyot, aplc; or a layout, FILE.json or "
+            "FILE.json:NAME. Repeat.",
             show_default=False,
         ),
     ] = None,
@@ -54,10 +58,11 @@ def validate(
         raise ConfigurationError("--docs writes the whole document: use it with all, without --sensor and --plots")
 
     from lowfc.programs.validate.cases import Context
-    from lowfc.programs.validate.report import PICTURES, run, to_json, to_text, write_document
+    from lowfc.programs.validate.report import run, run_into, to_json, to_text
 
     context = Context(trials, seed, jobs or len(os.sched_getaffinity(0)), tuple(sensor) if sensor else None)
-    found = run(wanted, context, docs / PICTURES if docs is not None else plots)
-    if docs is not None:
-        write_document(docs, found)
+    fixed = [name for name in wanted if name in OF_THE_PAPER]
+    if sensor and fixed:
+        typer.echo(f"{', '.join(fixed)}: of the paper's own sensors, --sensor changes nothing there", err=True)
+    found = run(wanted, context, plots) if docs is None else run_into(docs, wanted, context)
     sys.stdout.write((to_json(found) if as_json else "\n\n".join(map(to_text, found))) + "\n")

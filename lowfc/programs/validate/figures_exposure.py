@@ -3,31 +3,25 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from lowfc.design.estimators import Fit, estimate, refine
+from lowfc.design.estimators import KINDS, Fit, estimate, refine
 from lowfc.design.fisher import cramer_rao, variance_e
 from lowfc.design.paper import PEAK_E, TABLE3_READ_NOISE_E
 from lowfc.design.trials import noisy_e
 from lowfc.optics.zernike import NOLLS_14
 from lowfc.programs.validate.cases import Prepared
-from lowfc.programs.validate.reconstruction import scale_e
+from lowfc.programs.validate.reconstruction import ITERATIONS, label, scale_e
 
 Array = NDArray[np.float64]
 
 MODES = len(NOLLS_14)
-ITERATIONS = (0, 1, 2)
 BRIGHT = (
     f"{PEAK_E:,.0f} e- in the brightest pixel of the flat image, {TABLE3_READ_NOISE_E:.0f} e- read noise, whole "
     "electrons, monochromatic."
 )
-FULL_CHAIN = "Images by the full optical chain; iterations with the twin, right to 1e-6."
+FULL_CHAIN = "Images by the full optical chain; iterations with the twin, right to about 1e-5."
 
 
-def label(kind: str, iterations: int) -> str:
-    """An estimator's name, as Table 3 has it."""
-    return kind if iterations == 0 else f"{kind} + {iterations} iteration{'s' * (iterations > 1)}"
-
-
-ESTIMATORS = tuple(label(kind, iterations) for kind in ("pinv", "weighted") for iterations in ITERATIONS)
+ESTIMATORS = tuple(label(kind, iterations) for kind in KINDS for iterations in ITERATIONS)
 PINV = label("pinv", 0)
 WEIGHTED, WEIGHTED_1, WEIGHTED_2 = (label("weighted", iterations) for iterations in ITERATIONS)
 

@@ -181,7 +181,8 @@ def fig10(context: Context) -> list[Row]:
     return assuming(
         rows,
         f"1 mas, {TABLE4_EXPOSURE_S} s, V = {STAR.magnitude}, 20 % band in five wavelengths with both ends, "
-        "1 e- read noise, our own photometry and masks, full optical chain. The ratio of the image is that of the best filter for it.",
+        "1 e- read noise, our own photometry and masks, full optical chain. "
+        "The ratio of the image is that of the best filter for it.",
     )
 
 

@@ -9,23 +9,21 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lowfc.design.estimators import estimate, refine
-from lowfc.design.trials import LITERAL_WAVES, bounds_waves, r_squared, random_wavefronts
+from lowfc.design.trials import LITERAL_WAVES, bounds_waves, expected_r_squared, r_squared, random_wavefronts
 from lowfc.optics.zernike import NOLLS_14, noll_to_nm
 from lowfc.programs.validate import plots
 from lowfc.programs.validate.cases import Case, Context, Prepared
 from lowfc.programs.validate.figures_exposure import (
     BRIGHT,
     FULL_CHAIN,
-    ITERATIONS,
     MODES,
     PINV,
     WEIGHTED_2,
     bound_nm2,
     estimates_nm,
     exposed_e,
-    label,
 )
-from lowfc.programs.validate.reconstruction import Ensemble, Input, ensemble, fits, inputs
+from lowfc.programs.validate.reconstruction import ITERATIONS, Ensemble, Input, ensemble, fits, inputs, label
 from lowfc.programs.validate.rows import Row, assuming
 
 Array = NDArray[np.float64]
@@ -110,8 +108,8 @@ def fig6(context: Context) -> list[Row]:
         ]
     return assuming(
         rows,
-        "The wavefronts of Table 3, n = 1 to 4, input matched to its rms; limit: 1 - variance at the Cramer-Rao bound "
-        f"over that of the coefficients. {BRIGHT} Images by the full optical chain.",
+        "The wavefronts of Table 3, n = 1 to 4, input matched to its rms; limit: R^2 of "
+        f"estimates whose errors are at the Cramer-Rao bound. {BRIGHT} Images by the full optical chain.",
     )
 
 
@@ -140,7 +138,7 @@ def _r_squared(context: Context) -> dict[str, Array]:
 def _r_squared_limit(ready: Prepared) -> Array:
     wavefronts = _matched(ready)
     bounds_nm = bounds_waves(NOLLS_14, wavefronts.low, wavefronts.high) * ready.sensor.wavelength_nm
-    return np.asarray(1.0 - np.diag(bound_nm2(ready)) / (bounds_nm**2 / 3.0))
+    return expected_r_squared(np.diag(bound_nm2(ready)), bounds_nm)
 
 
 @lru_cache(maxsize=8)
@@ -225,7 +223,7 @@ def fig8(context: Context) -> list[Row]:
 def _range_rows(context: Context, name: str) -> Iterator[Row]:
     assumption = (
         "Pure modes of one sign from 0.005 to 0.15 waves rms, fitted with 14 modes, no noise, images by the twin "
-        "right to 1e-6; deviation: part by which a mode's own estimate differs from its amplitude."
+        "right to about 1e-5; deviation: part by which a mode's own estimate differs from its amplitude."
     )
     at = {"lambda/20": int(np.argmin(np.abs(AMPLITUDES - 0.05))), "lambda/10": int(np.argmin(np.abs(AMPLITUDES - 0.1)))}
     linear = dict(zip(at, _PAPER_LINEAR.get(name, (None, None)), strict=True))

@@ -10,7 +10,7 @@ from scipy.optimize import brentq
 from lowfc.contract.configuration import SensorSection
 from lowfc.design.fisher import covariance, variance_e
 from lowfc.design.paper import STAR, TABLE3_READ_NOISE_E, TABLE3_WAVES, TABLE4_EXPOSURE_S, TABLE4_MAS
-from lowfc.design.trials import bounds_waves, expected_rms
+from lowfc.design.trials import bounds_waves, expected_r_squared, expected_rms
 from lowfc.optics.photometry import electrons
 from lowfc.optics.relay import Defocus, fresnel_distance
 from lowfc.optics.sensor import reference
@@ -161,6 +161,11 @@ def _tilt_contradiction(sam: Prepared) -> Iterator[Row]:
     )
 
 
+def defocus_waves(section: SensorSection, wavelength_nm: float) -> float:
+    """Peak to valley of a sensor's defocus in waves."""
+    return fresnel_distance(section.defocus_mm, section.focal_ratio, wavelength_nm) / 8.0
+
+
 def _defocus_contradiction(clowfs: Prepared) -> Iterator[Row]:
     section = SensorSection(kind="clowfs")
 
@@ -169,19 +174,20 @@ def _defocus_contradiction(clowfs: Prepared) -> Iterator[Row]:
         I0 = reference(replace(clowfs.sensor, relay=relay))
         return float(I0.max() / I0.sum())
 
-    name, wanted = "inconsistency 2: CLOWFS at 6 mm against 1.10 % in its brightest pixel", PAPER_PEAK["clowfs"]
+    wanted, own = PAPER_PEAK["clowfs"], f"{section.defocus_mm:g} mm"
+    name = f"inconsistency 2: CLOWFS at {own} against {100 * wanted:.2f} % in its brightest pixel"
     yield Row(
         name,
-        "brightest pixel / image at 6 mm",
+        f"brightest pixel / image at {own}",
         "",
         peak(section.defocus_mm),
         wanted,
-        assumption=f"6 mm are {section.defocus_mm * 1e6 / (8 * section.focal_ratio**2 * 550):.2f} waves of defocus.",
+        assumption=f"{own} are {defocus_waves(section, clowfs.sensor.wavelength_nm):.2f} waves of defocus.",
     )
     found = brentq(lambda mm: peak(mm) - wanted, 1.0, section.defocus_mm, xtol=1e-3)
     yield Row(
         name,
-        "defocus at which the brightest pixel has 1.10 %",
+        f"defocus at which the brightest pixel has {100 * wanted:.2f} %",
         "mm",
         float(found),
         section.defocus_mm,
@@ -207,12 +213,12 @@ def _r2_contradiction(sam: Prepared) -> Iterator[Row]:
     linear = reconstruction.fits(sam, 14)["pinv"]
     spread = covariance(linear.R, variance_e(linear.reference_e, TABLE3_READ_NOISE_E)) / wavelength_nm**2
     spread *= (paper_out / expected_rms(gram, spread)) ** 2
-    inputs = bounds_waves(linear.nolls, wavefronts.low, wavefronts.high) ** 2 / 3.0
+    bounds = bounds_waves(linear.nolls, wavefronts.low, wavefronts.high)
     yield Row(
         name,
         "mean R2 of our sensor, noise scaled to the paper's residual of 5.1e-4 waves",
         "",
-        float(1.0 - np.mean(np.diag(spread) / (inputs + np.diag(spread)))),
+        float(expected_r_squared(np.diag(spread), bounds).mean()),
         PAPER_R2,
         assumption="Modes that look alike through the shaped pupil can err together and leave little; even so.",
     )

@@ -7,13 +7,12 @@ from itertools import product
 import numpy as np
 from numpy.typing import NDArray
 
-from lowfc.design.estimators import KINDS, Fit, estimate, fit
+from lowfc.design.estimators import KINDS, Fit, estimate
 from lowfc.design.fisher import covariance, cramer_rao, variance_e
 from lowfc.design.paper import STAR, TABLE4_EXPOSURE_S, TABLE4_MAS, TABLE4_READ_NOISE_E
 from lowfc.design.trials import noisy_e
 from lowfc.optics.photometry import electrons, tilt_nm_per_mas
 from lowfc.optics.relay import ApertureMask
-from lowfc.optics.zernike import NOLLS_20
 from lowfc.programs.validate.cases import Context, Prepared, sparse_apertures
 from lowfc.programs.validate.rows import Row
 
@@ -55,7 +54,7 @@ class Exposure:
 
 
 def paper_count_e(sensor: Prepared) -> float:
-    """Electrons on the sensor by the paper's own throughputs: 6.2e4 behind a sparse aperture mask, 6.8e5 without."""
+    """Electrons on the sensor by the paper's own throughputs."""
     relay = PAPER_RELAY_MASK if isinstance(sensor.sensor.relay, ApertureMask) else 1.0
     return electrons(STAR, TABLE4_EXPOSURE_S) * PAPER_PUPIL * PAPER_FOCAL_MASK * relay
 
@@ -89,9 +88,7 @@ def dimmed(sensor: Prepared) -> Exposure:
 def fits(sensor: Prepared, exposure: Exposure, mas: int) -> dict[tuple[int, str], Fit]:
     """Estimators by number of modes and kind."""
     return {
-        (modes, kind): fit(
-            NOLLS_20[:modes], sensor.band_I0, sensor.band_H[:, :modes], exposure.scale_e, TABLE4_READ_NOISE_E, kind
-        )
+        (modes, kind): sensor.fit(modes, exposure.scale_e, TABLE4_READ_NOISE_E, kind, in_band=True)
         for modes, kind in product(FITTED[mas], KINDS)
     }
 

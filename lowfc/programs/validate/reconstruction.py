@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lowfc.design import trials as random
-from lowfc.design.estimators import Fit, estimate, fit, refine
+from lowfc.design.estimators import KINDS, Fit, estimate, refine
 from lowfc.design.fisher import cramer_rao, variance_e
 from lowfc.design.paper import MODES, PEAK_E, TABLE3_READ_NOISE_E, TABLE3_WAVES
 from lowfc.optics.zernike import NOLLS_20
@@ -18,7 +18,7 @@ Array = NDArray[np.float64]
 
 OTHERS = ("bowtie", f"bowtie:{DEFAULT_SAM}", "clowfs", "zwfs", "bar", "lyot", "aplc")
 """Sensors besides the shipped sparse apertures."""
-ESTIMATORS = ("pinv", "weighted", "weighted + 1 iteration", "weighted + 2 iterations")
+ITERATIONS = (0, 1, 2)
 WITH_NUISANCES = "weighted, flux and shear fitted along"
 EVEN = (
     "Where pupil and masks are real and the pupil is symmetric, flux and shear change the image evenly and every mode "
@@ -40,6 +40,14 @@ NOISE = (
     "with Table 4), 3 e- read noise, whole electrons, total known, monochromatic; open area: transmission above 0.5, "
     "piston removed. limit: root mean square of the residual at the Cramer-Rao bound."
 )
+
+
+def label(kind: str, iterations: int) -> str:
+    """An estimator's name: its kind, and how many iterations with the full model follow."""
+    return kind if iterations == 0 else f"{kind} + {iterations} iteration{'s' * (iterations > 1)}"
+
+
+ESTIMATORS = ("pinv", *(label("weighted", iterations) for iterations in ITERATIONS))
 
 
 @dataclass(frozen=True)
@@ -105,10 +113,10 @@ def scale_e(sensor: Prepared) -> float:
 
 def fits(sensor: Prepared, modes: int, nuisances: bool = False) -> dict[str, Fit]:
     """The linear estimators of Table 3."""
-    arguments = (NOLLS_20[:modes], sensor.I0, sensor.H[:, :modes], scale_e(sensor), TABLE3_READ_NOISE_E)
-    made = {kind: fit(*arguments, kind) for kind in ("pinv", "weighted")}
+    exposure = (modes, scale_e(sensor), TABLE3_READ_NOISE_E)
+    made = {kind: sensor.fit(*exposure, kind) for kind in KINDS}
     if nuisances:
-        made[WITH_NUISANCES] = fit(*arguments, "weighted", sensor.nuisance)
+        made[WITH_NUISANCES] = sensor.fit(*exposure, "weighted", nuisance=sensor.nuisance)
     return made
 
 

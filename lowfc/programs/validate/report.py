@@ -4,14 +4,16 @@ import json
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 from threadpoolctl import threadpool_limits
 
+from lowfc.adapters.drawing import figure_class
 from lowfc.adapters.whole_file import write_whole
-from lowfc.contract.errors import DataFileError
+from lowfc.contract.errors import ConfigurationError, DataFileError
 from lowfc.programs.validate.cases import Case, Context
 from lowfc.programs.validate.figures import FIGURES
 from lowfc.programs.validate.rows import plain
@@ -73,15 +75,16 @@ def run(
 
     Raises:
         DataFileError: The folder cannot be written.
-        ConfigurationError: A sensor or a layout is not known, or matplotlib is missing.
+        ConfigurationError: A sensor or a layout is not known, a sensor cannot tell the modes of a table apart, or
+            matplotlib is missing.
     """
     columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
     tables = []
+    for name in context.sensors or ():
+        context.prepared(name)  # a mistake is said before the work, not after it
     if plots is not None:
-        try:
-            plots.mkdir(parents=True, exist_ok=True)
-        except OSError as error:
-            raise DataFileError(f"the folder for plots cannot be made: {error}") from error
+        figure_class()
+        _make_folder(plots)
     with Progress(*columns, console=console or Console(stderr=True), transient=True) as shown, threadpool_limits(1):
         all_of_them, this = shown.add_task("tables", total=len(names)), shown.add_task("")
 
@@ -92,11 +95,14 @@ def run(
         for name in names:
             progress(name, 0, 1)
             case = CASES[name]
-            rows = [plain(row) for row in case.run(context)]
             drawn = None
-            if plots is not None and case.plot is not None:
-                drawn = f"{name}.png"
-                case.plot(context, plots / drawn)
+            try:
+                rows = [plain(row) for row in case.run(context)]
+                if plots is not None and case.plot is not None:
+                    drawn = f"{name}.png"
+                    case.plot(context, plots / drawn)
+            except ConfigurationError as error:
+                raise ConfigurationError(f"{name}: {error}") from error
             tables.append(
                 {
                     "table": name,
@@ -109,6 +115,40 @@ def run(
             )
             shown.advance(all_of_them)
     return tables
+
+
+def run_into(folder: Path, names: Sequence[str], context: Context) -> list[Table]:
+    """The same, written as the document with its drawings: all of it at the end, or nothing.
+
+    Args:
+        folder: Of the document.
+        names: Keys of `CASES`.
+        context: Trials, seed, threads.
+
+    Raises:
+        DataFileError: The folder cannot be written.
+        ConfigurationError: As `run`.
+    """
+    pictures = folder / PICTURES
+    _make_folder(pictures)
+    try:
+        beside = TemporaryDirectory(dir=folder, prefix=".drawings.")
+    except OSError as error:
+        raise DataFileError(f"{folder} cannot be written: {error.strerror or error}") from error
+    with beside as drawn:
+        tables = run(names, context, Path(drawn))
+        for table in tables:
+            if table["plot"]:
+                write_whole(pictures / table["plot"], (Path(drawn) / table["plot"]).read_bytes())
+    write_document(folder, tables)
+    return tables
+
+
+def _make_folder(folder: Path) -> None:
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise DataFileError(f"the folder {folder} cannot be made: {error}") from error
 
 
 def to_json(tables: Sequence[Table]) -> str:

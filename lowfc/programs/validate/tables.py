@@ -9,7 +9,7 @@ from lowfc.contract.configuration import SensorSection
 from lowfc.optics.zernike import NOLLS_14, mode_name
 from lowfc.programs.validate.cases import Case, Context
 from lowfc.programs.validate.conditioning import conditioning
-from lowfc.programs.validate.photometry import photometry
+from lowfc.programs.validate.photometry import defocus_waves, photometry
 from lowfc.programs.validate.pointing import table4
 from lowfc.programs.validate.reconstruction import table3
 from lowfc.programs.validate.rows import Row
@@ -35,7 +35,7 @@ def table1(context: Context) -> list[Row]:
     diameters = sorted({hole[2] for hole in layout.holes})
     scaled = "The model knows focal lengths and diameters only by their ratio."
     ripple = "The paper's ripple pupil is not published: ours is made by linear programming for the same mask."
-    waves = clowfs.defocus_mm * 1e6 / (8 * clowfs.focal_ratio**2 * sensor.wavelength_nm)
+    waves = defocus_waves(clowfs, sensor.wavelength_nm)
     return [
         Row("pupil", "focal ratio, 200 mm over 10 mm", "", clowfs.focal_ratio, 20.0, assumption=scaled),
         Row("pupil", "samples across the diameter", "", len(sensor.pupil), 512),

@@ -1,0 +1,77 @@
+"""Where the chains of a search run: this process, others of this machine, or the workers of a Dask cluster."""
+
+import logging
+import multiprocessing
+import signal
+from collections.abc import Callable, Iterator
+from concurrent.futures import BrokenExecutor, CancelledError, Executor, Future, ProcessPoolExecutor
+from contextlib import contextmanager
+from importlib import import_module
+from typing import Any
+
+from lowfc.contract.errors import ConfigurationError
+
+DASK_TIMEOUT_S = 10.0
+
+
+class Here(Executor):
+    """Runs what is submitted at once, in this process."""
+
+    def submit(self, fn: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future[Any]:
+        """Run it; an interrupt is the caller's."""
+        future: Future[Any] = Future()
+        try:
+            future.set_result(fn(*args, **kwargs))
+        except Exception as error:
+            future.set_exception(error)
+        return future
+
+
+@contextmanager
+def open_executor(jobs: int, scheduler: str | None) -> Iterator[Executor]:
+    """Where the chains run.
+
+    Args:
+        jobs: Processes of this machine; 1 is this one.
+        scheduler: Address of a Dask scheduler, to use its workers.
+
+    Raises:
+        ConfigurationError: The scheduler does not answer, or the package for it is missing.
+    """
+    if scheduler is not None:
+        with _dask(scheduler) as executor:
+            yield executor
+    elif jobs == 1:
+        yield Here()
+    else:
+        context = multiprocessing.get_context("spawn")
+        pool = ProcessPoolExecutor(jobs, context, signal.signal, (signal.SIGINT, signal.SIG_IGN))
+        try:
+            yield pool
+        finally:
+            pool.shutdown(wait=True, cancel_futures=True)
+
+
+def is_lost(error: BaseException) -> bool:
+    """Whether it says that the workers are gone, not that their work is wrong."""
+    from_dask = type(error).__module__.partition(".")[0] == "distributed"
+    return from_dask or isinstance(error, (BrokenExecutor, CancelledError, OSError))
+
+
+@contextmanager
+def _dask(address: str) -> Iterator[Executor]:
+    try:
+        client: Any = import_module("distributed").Client(address, timeout=DASK_TIMEOUT_S)
+    except ImportError:
+        raise ConfigurationError("--scheduler needs Dask: pip install 'lowfc[cluster]'") from None
+    except (OSError, ValueError) as error:
+        raise ConfigurationError(f"no Dask scheduler answers at {address!r}: {error}") from error
+    for name in (
+        "distributed",
+        "distributed.client",
+    ):  # a lost scheduler is our error to tell, not a traceback of theirs
+        logging.getLogger(name).setLevel(logging.CRITICAL)
+    try:
+        yield client.get_executor(pure=False)
+    finally:
+        client.close()

@@ -1,0 +1,295 @@
+import io
+import json
+import os
+import shlex
+import sys
+from collections.abc import Iterator
+from concurrent.futures import Executor, Future
+from concurrent.futures.process import BrokenProcessPool
+from itertools import pairwise
+
+import pytest
+from rich.console import Console
+from typer.testing import CliRunner
+
+from lowfc.adapters.layouts import SHIPPED, load_layout
+from lowfc.adapters.terminal import new_app
+from lowfc.contract.errors import ConfigurationError, DataFileError, LowfcError
+from lowfc.design.sam_search import BLOCK
+from lowfc.optics.sam import Layout
+from lowfc.programs import design_sam as program
+from lowfc.programs import design_sam_executors as executors
+from lowfc.programs.design_commands import design_app
+from lowfc.programs.design_sam_executors import Here, open_executor
+from lowfc.programs.design_sam_files import front, read_state
+from lowfc.programs.design_sam_request import Search, command_of, request
+
+RECORDED = {
+    name: entry["command"] for name, entry in json.loads(SHIPPED.read_text())["layouts"].items() if "command" in entry
+}
+SMALL = {"merit": "table4", "holes": "4", "diameter": "0.1:0.2", "steps": BLOCK + 50, "chains": 2, "seed": 7}
+
+
+class Interrupted(Executor):
+    """The user's Ctrl-C after a number of blocks."""
+
+    def __init__(self, blocks: int) -> None:
+        self.blocks, self.inside = blocks, Here()
+
+    def submit(self, fn, /, *args, **kwargs):
+        if not self.blocks:
+            raise KeyboardInterrupt
+        self.blocks -= 1
+        return self.inside.submit(fn, *args, **kwargs)
+
+
+def searched(**options) -> Search:
+    defaults = {"estimator": None, "modes": 14, "weight": None, "focal_mask": None, "gap": 0.01, "edge": 0.0}
+    return request(**{**defaults, "symmetry": "none", "name": "small", **SMALL, **options})
+
+
+def run(search, folder, executor, chains=None, console=None, **files):
+    out = folder / "mask.json"
+    chains = program.begin(search) if chains is None else chains
+    console = Console(quiet=True) if console is None else console
+    return program.design_sam(search, chains, out, folder / "state.json", executor, **files, console=console), out
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory):
+    """An uninterrupted search in this process: its result and what it wrote."""
+    folder = tmp_path_factory.mktemp("whole")
+    result, out = run(searched(), folder, Here())
+    assert [path.name for path in folder.iterdir()] == ["mask.json"]
+    return result, out.read_text()
+
+
+def test_the_result_does_not_depend_on_where_the_chains_run(whole, tmp_path):
+    with open_executor(2, None) as executor:
+        result, out = run(searched(), tmp_path, executor)
+    assert out.read_text() == whole[1]
+    assert result["merits"] == whole[0]["merits"]
+    assert len(set(result["merits"])) == 2
+
+
+@pytest.fixture
+def scheduler() -> Iterator[str]:
+    """Address of a Dask scheduler with one worker, in threads of this process."""
+    from distributed import LocalCluster
+
+    with LocalCluster(n_workers=1, threads_per_worker=1, processes=False, dashboard_address=None) as cluster:
+        yield cluster.scheduler_address
+
+
+def test_a_dask_cluster_finds_the_same(scheduler, whole, tmp_path):
+    with open_executor(1, scheduler) as executor:
+        _, out = run(searched(), tmp_path, executor)
+    assert out.read_text() == whole[1]
+
+
+@pytest.mark.parametrize("blocks", [2, 3])
+def test_an_interrupted_search_keeps_its_best_and_goes_on(whole, tmp_path, blocks):
+    result, out = run(searched(), tmp_path, Interrupted(blocks))
+    assert result["interrupted"]
+    assert result["steps"] < 2 * SMALL["steps"]
+    load_layout(str(out))
+    text = program.render(result)
+    assert f"--resume {result['resume']}" in text
+    search, chains = program.resumed(tmp_path / "state.json")
+    assert search == searched()
+    again, out = run(search, tmp_path, Here(), chains)
+    assert (out.read_text(), again["merits"], again["interrupted"]) == (whole[1], whole[0]["merits"], False)
+    assert not (tmp_path / "state.json").exists()
+
+
+def test_an_interrupt_before_the_first_block_says_that_nothing_was_found(tmp_path):
+    said = io.StringIO()
+    with pytest.raises(KeyboardInterrupt):
+        run(searched(), tmp_path, Interrupted(0), console=Console(file=said, width=200))
+    assert "nothing was found, nothing is written" in said.getvalue()
+    assert list(tmp_path.iterdir()) == []
+
+
+class Broken(Interrupted):
+    """Workers that die after a number of blocks."""
+
+    def submit(self, fn, /, *args, **kwargs):
+        if self.blocks:
+            return super().submit(fn, *args, **kwargs)
+        future = Future()
+        future.set_exception(BrokenProcessPool("a process was terminated abruptly"))
+        return future
+
+
+def test_lost_workers_are_one_clear_error_and_the_search_goes_on(whole, tmp_path):
+    with pytest.raises(
+        LowfcError, match=r"workers were lost .*abruptly.*\); no chain had finished .* nothing is written"
+    ):
+        run(searched(), tmp_path, Broken(0))
+    assert list(tmp_path.iterdir()) == []
+    with pytest.raises(LowfcError, match=r"workers were lost .*abruptly.*\); go on with --resume .*state\.json"):
+        run(searched(), tmp_path, Broken(2))
+    search, chains = program.resumed(tmp_path / "state.json")
+    _, out = run(search, tmp_path, Here(), chains)
+    assert out.read_text() == whole[1]
+
+
+def test_processes_that_die_and_a_mistake_in_the_search_are_told_apart(tmp_path, monkeypatch):
+    with open_executor(2, None) as executor:
+        future = executor.submit(os._exit, 1)
+        assert executors.is_lost(future.exception())
+    monkeypatch.setattr(program, "advance", lambda *_: 1 / 0)
+    with pytest.raises(ZeroDivisionError):
+        run(searched(), tmp_path, Here())
+
+
+def test_a_worker_with_another_pupil_is_refused(tmp_path):
+    search = searched()
+    with pytest.raises(ConfigurationError, match="another shaped pupil: install the same lowfc"):
+        program.advance_block(search, program.begin(search)[0], "another")
+
+
+def test_the_command_does_not_overwrite_an_interrupted_search(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    state = tmp_path / "mask.json.state.json"
+    program.write_state(state, searched(), program.pupil_digest(), program.begin(searched()))
+    before = state.read_bytes()
+    ran = cli("--out", "mask.json")
+    assert isinstance(ran.exception, ConfigurationError)
+    assert f"go on with --resume {state.name}, or delete it" in str(ran.exception)
+    assert {path: path.read_bytes() for path in tmp_path.iterdir()} == {state: before}
+    assert isinstance(cli("--resume", state.name, "--out", state.name).exception, ConfigurationError)
+    assert state.read_bytes() == before
+    ran = cli("--resume", state.name, "--out", "mask.json", "--jobs", 1)
+    assert ran.exit_code == 0, ran.output
+    assert [path.name for path in tmp_path.iterdir()] == ["mask.json"]
+
+
+def test_a_folder_may_be_called_like_a_layout_file(tmp_path):
+    folder = tmp_path / "a.json.d"
+    folder.mkdir()
+    run(searched(steps=20), folder, Here())
+    assert load_layout(f"{folder}/mask.json") == load_layout(f"{folder}/mask.json:small")
+    with pytest.raises(ConfigurationError, match="no sparse-aperture layout is called"):
+        load_layout(f"{folder}/mask")
+
+
+def test_states_are_read_back_or_refused(tmp_path):
+    search = searched()
+    state = tmp_path / "state.json"
+    with pytest.raises(DataFileError, match="no search to resume"):
+        read_state(state, "pupil")
+    state.write_text('{"search": {}}')
+    with pytest.raises(DataFileError, match="not the state of a search"):
+        read_state(state, "pupil")
+    program.write_state(state, search, "pupil", program.begin(search))
+    assert read_state(state, "pupil") == (search, program.begin(search))
+    with pytest.raises(DataFileError, match="another shaped pupil"):
+        read_state(state, "another")
+
+
+def test_a_front_is_written_and_drawn(tmp_path):
+    search = searched(merit="pareto", chains=3, steps=60, name="edge", estimator="pinv")
+    table, picture = tmp_path / "front.csv", tmp_path / "front.png"
+    result, out = run(search, tmp_path, Here(), front_file=table, plot_file=picture)
+    head, *rows = [line.split(",") for line in table.read_text().splitlines()]
+    assert head[:4] == ["layout", "holes", "table3_waves", "table4_mas"]
+    assert [row[1] for row in rows] == ["4"] * 3
+    on_front = [(float(row[2]), float(row[3])) for row in rows if row[-1] == "1"]
+    assert all(b[0] > a[0] and b[1] < a[1] for a, b in pairwise(on_front))
+    assert {shown["name"] for shown in result["layouts"]} == {row[0] for row in rows if row[-1] == "1"}
+    assert picture.read_bytes().startswith(b"\x89PNG")
+    for shown in result["layouts"]:
+        assert len(load_layout(f"{out}:{shown['name']}").holes) == 4
+
+
+def test_a_front_is_what_nothing_beats():
+    at = [(1.0, 3.0), (2.0, 2.0), (2.0, 3.0), (3.0, 1.0), (3.0, 2.5), (1.0, 3.0)]
+    points = [program.Point(Layout(str(i), "", ()), 0.0, *xy, 0.0) for i, xy in enumerate(at)]
+    assert [point.layout.name for point in front(points)] == ["0", "1", "3", "5"]
+
+
+def cli(*words):
+    app = new_app("As the program has it.")
+    app.add_typer(design_app, name="design")
+    return CliRunner().invoke(app, ["design", "sam", *map(str, words)])
+
+
+def test_the_command_records_itself_and_finds_the_same_again(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    ran = cli("--merit", "condition", "--holes", 5, "--steps", 30, "--symmetry", "x", "--jobs", 1, "--json")
+    assert ran.exit_code == 0, ran.output
+    result = json.loads(ran.stdout)
+    assert list(result["layouts"][0]["focal_masks"]) == ["disk", "bowtie"]
+    first = json.loads((tmp_path / "sam.json").read_text())["layouts"]["sam"]
+    assert (first["merit"], first["seed"], first["command"]) == ("condition", 1, result["command"])
+    words = shlex.split(first["command"])
+    assert words[:3] == ["lowfc", "design", "sam"]
+    again = cli(*words[3:], "--jobs", 1, "--out", "again.json")
+    assert again.exit_code == 0, again.output
+    assert json.loads((tmp_path / "again.json").read_text())["layouts"]["sam"] == first
+    assert command_of(searched()) in program.render({**result, "command": command_of(searched())})
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (("--merit", "beauty"), "merit must be one of paper, table3"),
+        (("--estimator", "best"), "estimator must be one of"),
+        (("--modes", "15"), "modes must be 14 or 20"),
+        (("--merit", "table3", "--weight", "0.5"), "belongs to the merits paper and pareto"),
+        (("--merit", "pareto", "--weight", "2"), "a weight, 0 to 1"),
+        (("--merit", "pareto", "--chains", "1"), "at least 2 chains"),
+        (("--merit", "table3", "--focal-mask", "both"), "only 'paper' takes both"),
+        (("--focal-mask", "square"), "--focal-mask must be"),
+        (("--holes", "many"), "--holes must be a number"),
+        (("--holes", "9:4"), "number of holes"),
+        (("--holes", "2.5"), "--holes must be in steps of 1,"),
+        (("--diameter", "0.0705"), "--diameter must be in steps of 0.001"),
+        (("--diameter", "2"), "hole diameters"),
+        (("--diameter", "nan"), "--diameter must be a number"),
+        (("--gap", "-0.1"), "gaps must not be negative"),
+        (("--symmetry", "z"), "symmetry must be one of"),
+        (("--seed", "-1"), "seed must not be negative"),
+        (("--chains", "0"), "chains must be at least 1"),
+        (("--steps", "0"), "steps must be at least 1"),
+        (("--name", "a b"), "--name must be"),
+        (("--holes", "40", "--diameter", "0.2"), "40 holes .* could not be placed"),
+        (("--scheduler", "nowhere:1"), "no Dask scheduler answers at 'nowhere:1'"),
+        (("--resume", "nowhere.json"), "no search to resume in nowhere.json"),
+        (("--resume", "nowhere.json", "--focal-mask", "disk"), "leave out --focal-mask"),
+        (("--out", "nowhere/mask.json"), "nowhere/mask.json cannot be written: there is no directory nowhere"),
+        (("--front", "nowhere/front.csv"), "nowhere/front.csv cannot be written: there is no directory nowhere"),
+        (("--plot", "nowhere/front.png"), "nowhere/front.png cannot be written: there is no directory nowhere"),
+        (("--out", "mask.txt"), "--out must end in .json, .* got mask.txt"),
+        (("--out", "mask.json", "--front", "./mask.json"), "must be different files"),
+    ],
+)
+def test_mistakes_are_one_clear_error(tmp_path, monkeypatch, words, message):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(executors, "DASK_TIMEOUT_S", 0.2)
+    ran = cli(*words)
+    assert isinstance(ran.exception, (ConfigurationError, DataFileError)), ran.output
+    ran_text = str(ran.exception)
+    assert "\n" not in ran_text
+    with pytest.raises(type(ran.exception), match=message):
+        raise ran.exception
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_missing_extras_are_named_before_the_work(tmp_path, monkeypatch):
+    monkeypatch.setitem(sys.modules, "distributed", None)
+    monkeypatch.setitem(sys.modules, "matplotlib.figure", None)
+    with pytest.raises(ConfigurationError, match=r"pip install 'lowfc\[cluster\]'"), open_executor(1, "x:1"):
+        pass
+    with pytest.raises(ConfigurationError, match=r"pip install 'lowfc\[plots\]'"):
+        run(searched(), tmp_path, Interrupted(0), plot_file=tmp_path / "front.png")
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(1800)
+@pytest.mark.parametrize("name", RECORDED)
+def test_the_recorded_command_finds_the_shipped_layout_again(tmp_path, name):
+    ran = cli(*shlex.split(RECORDED[name])[3:], "--jobs", 1, "--out", tmp_path / "mask.json")
+    assert ran.exit_code == 0, ran.output
+    assert load_layout(f"{tmp_path / 'mask.json'}:{name}").holes == load_layout(name).holes

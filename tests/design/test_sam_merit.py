@@ -1,0 +1,155 @@
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from lowfc.adapters.layouts import load_layout
+from lowfc.adapters.masks import load_pupil
+from lowfc.contract.configuration import SensorSection
+from lowfc.design.sam_goal import MERITS, Goal, figures, merit, paper_ratios
+from lowfc.design.sam_merit import (
+    TABLE3_NONLINEARITY_WAVES,
+    build_optics,
+    covariance_nm2,
+    hole_fields,
+    signal,
+    table3_waves,
+)
+from lowfc.optics.band import monochromatic, uniform
+from lowfc.optics.focal_mask import disk
+from lowfc.optics.fourier import to_image, to_pupil
+from lowfc.optics.grid import OPEN_AREA, pupil_axis
+from lowfc.optics.photometry import Photometry, electrons, tilt_nm_per_mas
+from lowfc.optics.sam import Layout, transmission
+from lowfc.optics.zernike import NOLLS_20, zernikes
+
+RECORDED_TABLES = Path(__file__).parents[2] / "docs" / "paper.json"
+
+
+@pytest.fixture(scope="module")
+def pupil():
+    return load_pupil()
+
+
+@pytest.fixture(scope="module")
+def layout():
+    return load_layout("sam27d07_bal14")
+
+
+@pytest.fixture(scope="module")
+def modes():
+    u = 2.0 * pupil_axis(512)
+    return zernikes(NOLLS_20, u, u[:, None])
+
+
+@pytest.fixture(scope="module")
+def fields(optics, layout):
+    return np.sum([hole_fields(optics, hole) for hole in layout.holes], axis=0)
+
+
+def relay_of(amplitude, scale=1.0):
+    mask = disk()
+    return to_pupil(to_image(amplitude.astype(complex), len(mask), 8, scale) * mask, 512, 8, scale)
+
+
+def at_pixels(values):
+    """Sums over 2 x 2 samples, as fractions of the open circle's light."""
+    return values.reshape(80, 2, 80, 2).sum(axis=(1, 3)).ravel() / (64 * OPEN_AREA)
+
+
+def by_the_chain(pupil, modes, mask, wavelength_nm):
+    """I0 (pixels,) and H (pixels, modes) per nm, by the full chain of Table 1."""
+    scale = 550.0 / wavelength_nm
+    E0, *Ek = (to_image(relay_of(a, scale) * mask, 160, 8, scale) for a in (pupil, *(pupil * modes)))
+    slopes = [at_pixels(4 * np.pi / wavelength_nm * (E0 * np.conj(1j * E)).real) for E in Ek]
+    return at_pixels(np.abs(E0) ** 2), np.stack(slopes, axis=1)
+
+
+def noise_nm2(I0, H, light_e, read_noise_e, estimator):
+    """Covariance of the modes, by propagating the noise of each pixel through the reconstructor."""
+    variance = (I0 * light_e + read_noise_e**2) / light_e**2
+    root = np.ones(len(I0)) if estimator == "pinv" else variance**-0.5
+    R = np.linalg.pinv(H * root[:, None]) * root
+    return (R * variance) @ R.T
+
+
+def test_the_holes_add_up_to_the_field_of_the_full_chain(pupil, modes):
+    fine = build_optics(pupil, band=monochromatic(550.0), relay_samples=512, samples_per=8)
+    some = Layout("three", "", ((0.2, -0.3, 0.07), (-0.414, 0.102, 0.12), (0.0, 0.05, 0.2)))
+    found = np.sum([hole_fields(fine, hole) for hole in some.holes], axis=0)
+    u = pupil_axis(512)
+    covered = [np.clip((d / 2 - np.hypot(u[:, None] - y, u - x)) * 512 + 0.5, 0, 1) for x, y, d in some.holes]
+    for mask, allowed in ((sum(covered), 1e-6), (transmission(some, 512), 5e-3)):
+        for k, amplitude in {0: pupil, 1: pupil * modes[0], 13: pupil * modes[12]}.items():
+            truth = to_image(relay_of(amplitude) * mask, 160, 8, 1.0)
+            assert np.linalg.norm(found[k] - truth) < allowed * np.linalg.norm(truth)
+
+
+def test_the_predictions_are_those_of_the_full_chain(pupil, modes, layout, fields, optics):
+    shown = figures(optics, fields)
+    mask = transmission(layout, 512)
+    I0, H = by_the_chain(pupil, modes, mask, 550.0)
+    open_ = modes[:, pupil > 0.5]
+    for estimator in ("pinv", "weighted"):
+        for count in (14, 20):
+            C = noise_nm2(I0, H[:, :count], 40_000 / I0.max(), 3.0, estimator)
+            drawn = np.linalg.cholesky(C) @ np.random.default_rng(1).standard_normal((count, 20 * count))
+            rms = np.sqrt(np.mean(np.var(drawn.T @ open_[:count], axis=1))) / 550.0
+            expected = np.hypot(rms, TABLE3_NONLINEARITY_WAVES[count])
+            assert shown["table3_waves"][estimator][str(count)] == pytest.approx(expected, rel=0.05)
+    assert shown["throughput"] == pytest.approx(I0.sum(), rel=0.02)
+    for count in (14, 20):
+        assert shown["condition"][str(count)] == pytest.approx(np.linalg.cond(H[:, :count]), rel=0.02)
+    band = uniform(550.0)
+    at = [by_the_chain(pupil, modes[:2], mask, nm) for nm in band.wavelengths_nm]
+    I0, H = np.mean([image for image, _ in at], axis=0), np.mean([response for _, response in at], axis=0)
+    for estimator in ("pinv", "weighted"):
+        C = noise_nm2(I0, H, electrons(Photometry(), 0.05), 1.0, estimator)
+        expected = np.sqrt(np.diag(C)) / tilt_nm_per_mas(2.0)
+        assert shown["table4_mas"][estimator]["2"] == pytest.approx(expected, rel=0.02)
+
+
+def test_merits_are_what_their_names_say(optics, fields):
+    shown = figures(optics, fields)
+    tilt = max(shown["table4_mas"]["pinv"]["2"])
+    expected = {
+        "paper": max(paper_ratios(optics, fields).values()),
+        "table3": shown["table3_waves"]["pinv"]["20"],
+        "table4": tilt,
+        "condition": shown["condition"]["20"],
+        "throughput": 1 / shown["throughput"],
+        "pareto": shown["table3_waves"]["pinv"]["20"] ** 0.75 * tilt**0.25,
+    }
+    assert set(expected) == set(MERITS)
+    for name, value in expected.items():
+        weight = 0.25 if name == "pareto" else None
+        assert merit(optics, Goal(name, "pinv", 20, weight), fields) == pytest.approx(value, rel=1e-6)
+    ratios = paper_ratios(optics, fields)
+    assert ratios["table3 disk 14 modes"] == pytest.approx(shown["table3_waves"]["pinv"]["14"] / 5.1e-4)
+    assert ratios["table4"] == pytest.approx(tilt / 0.36)
+    dark = np.zeros_like(fields)
+    assert merit(optics, Goal("table4"), dark) == np.inf
+
+
+def test_the_weighted_estimator_is_never_worse(optics, fields):
+    seen = signal(optics, fields, "disk")
+    for count in (2, 14, 20):
+        plain, weighted = (covariance_nm2(seen, 1e6, 3.0, count, name) for name in ("pinv", "weighted"))
+        assert np.linalg.eigvalsh(plain - weighted).min() > -1e-9 * np.trace(plain)
+    with pytest.raises(ValueError, match="estimator must be one of"):
+        covariance_nm2(seen, 1e6, 3.0, 2, "best")
+
+
+@pytest.mark.parametrize("modes", [14, 20])
+def test_table_3_is_predicted_as_it_was_measured(optics, modes):
+    (measured,) = (
+        row["measured"]
+        for table in json.loads(RECORDED_TABLES.read_text())["tables"]
+        for row in table["rows"]
+        if (table["table"], row["name"], row["modes"], row["estimator"], row["quantity"])
+        == ("table3", "sam", modes, "pinv", "RMS residual, matched input")
+    )
+    default = load_layout(SensorSection().sam)
+    seen = signal(optics, np.sum([hole_fields(optics, hole) for hole in default.holes], axis=0), "disk")
+    assert table3_waves(optics, seen, modes, "pinv") == pytest.approx(measured, rel=0.1)
