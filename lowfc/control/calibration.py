@@ -10,6 +10,9 @@ Single = npt.NDArray[np.float32]
 
 ESTIMATORS = ("weighted", "pinv")
 
+SINGULAR = 1e8
+"""Condition number above which modes count as the same."""
+
 
 @dataclass(frozen=True, slots=True)
 class Calibration:
@@ -117,16 +120,16 @@ def reconstructor(
         raise ValueError(f"estimator must be one of {', '.join(ESTIMATORS)}, got {estimator!r}")
     root = np.sqrt(weights)[:, None]
     scaled = root * response
-    if not condition_number(scaled) < 1e8:
+    if not condition_number(scaled) < SINGULAR:
         raise ValueError(
-            "the sensor cannot tell the modes apart (condition number above 1e8): "
+            f"the sensor cannot tell the modes apart (condition number above {SINGULAR:.0e}): "
             "an even-symmetric aperture mask cannot sense even modes; use another mask or fewer modes"
         )
     if nuisance is None:
         return np.asarray(np.linalg.pinv(scaled) * root.T)
     both = np.hstack([scaled, root * nuisance])
     sizes = np.linalg.norm(both, axis=0)  # pinv leaves out singular values that are small beside the largest
-    if not (sizes.all() and condition_number(both / sizes) < 1e8):
+    if not (sizes.all() and condition_number(both / sizes) < SINGULAR):
         raise ValueError("the sensor cannot tell the nuisance modes from the others: fit fewer of either")
     inverse = np.linalg.pinv(both / sizes) / sizes[:, None]
     return np.asarray((inverse * root.T)[: response.shape[1]])

@@ -3,13 +3,9 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from lowfc.control.calibration import condition_number
+from lowfc.control.calibration import SINGULAR, condition_number
 
 Array = NDArray[np.float64]
-
-
-SINGULAR = 1e8
-"""Condition number above which modes count as the same; that of `lowfc.control.calibration.reconstructor`."""
 
 
 def variance_e(reference_e: Array, read_noise_e: float) -> Array:

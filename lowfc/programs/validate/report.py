@@ -32,17 +32,30 @@ _LIGHT = ("paper's electrons", "own photometry")
 GLANCE = (
     *(
         ("table3", name, modes, estimator, _RESIDUAL)
-        for name in ("sam", "bowtie", "clowfs")
+        for name in ("sam", "sam18_sized", "bowtie", "clowfs", "zwfs")
         for modes in (14, 20)
-        for estimator in ("pinv", "weighted", "weighted + 2 iterations")
+        for estimator in ("pinv", "weighted + 2 iterations")
     ),
     *(
         ("table4", name, modes, estimator, _SCATTER.format(light))
-        for name in ("sam", "clowfs")
+        for name in ("sam", "sam18_sized", "clowfs", "zwfs")
         for light in _LIGHT
         for modes in (2, 14)
         for estimator in ("pinv", "weighted")
     ),
+    *(("fig6", name, 14, "pinv", f"{which} R^2") for name in ("sam", "clowfs", "zwfs") for which in ("least", "mean")),
+    *(("fig7", f"sam, coma {coma}", 14, "weighted + 1 iteration", "P-V residual") for coma in ("Z7", "Z8")),
+    *(("fig1", f"sam, coma {coma}", 14, "weighted + 1 iteration", "corrected over flat") for coma in ("Z7", "Z8")),
+    *(
+        ("fig8", name, 14, "pinv", f"{which} deviation at lambda/20")
+        for name in ("sam", "clowfs", "zwfs")
+        for which in ("mean", "largest")
+    ),
+    *(
+        ("fig9", "sam, cut from four pupil diameters", 14, estimator, "residual rms")
+        for estimator in ("pinv", "best possible fit")
+    ),
+    *(("conditioning", name, 14, None, "condition number") for name in ("open", "sam")),
 )
 """Table and key of the rows that the document begins with."""
 
@@ -59,6 +72,12 @@ a sparse aperture mask", J. Astron. Telesc. Instrum. Syst. 1(3), 039001 (2015), 
 gives for it; *limit* is the Cramer-Rao bound unless the assumption says otherwise. The paper's shaped pupil and sparse
 aperture mask are not published, so that agreement to a few per cent is not to be expected: the assumptions, numbered
 below each table, say what was chosen where the paper is silent or contradicts itself.
+
+Three things to know before the tables. Table 3 gives every sensor 40,000 e- in its brightest pixel, which rewards a
+mask that wastes light; Table 4 gives every sensor the same star, and there the Zernike sensor, which uses all of the
+light, beats every sparse aperture. In Table 3 the sparse aperture wins by its linearity, until the estimate is iterated
+on the full model: then CLOWFS does. And a scatter over 100 realisations is known to 7 %: where a figure is near the
+paper's, *predicted* decides.
 """
 
 
