@@ -8,8 +8,11 @@ import numpy as np
 import pytest
 from loops import loop, payloads, run
 
+from lowfc.adapters.layouts import layout_names
+from lowfc.adapters.masks import sensor_named
 from lowfc.contract.configuration import SENSORS
 from lowfc.contract.messages import wire
+from lowfc.optics.sensor import light_budget
 
 DOCS = Path(__file__).parents[2] / "docs"
 sys.path.insert(0, str(DOCS))
@@ -60,3 +63,14 @@ def test_the_documents_table_is_the_measured_one() -> None:
     assert set(SENSORS) < set(measured["sensors"])
     for name in SENSORS:
         assert f"\n| `{name}` |" in document  # what it is
+    for name in layout_names():
+        assert f"`{name}`" in document
+
+
+def test_the_documents_table_is_of_the_sensors_as_they_are() -> None:
+    import measure_sensors
+
+    for name, measured in json.loads(measure_sensors.MEASURED.read_text())["sensors"].items():
+        budget = light_budget(sensor_named(name))
+        assert budget.total == pytest.approx(measured["light"], rel=1e-6), name
+        assert budget.peak == pytest.approx(measured["peak"], rel=1e-6), name
