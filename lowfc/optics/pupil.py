@@ -86,10 +86,10 @@ def from_quarter(quarter: ArrayLike, samples: int) -> NDArray[np.float64]:
         raise ValueError(f"a quadrant must be square, got shape {quarter.shape}")
     if not (np.isfinite(quarter).all() and quarter.min() >= 0 and quarter.max() <= 1):
         raise ValueError("a quadrant's transmission must lie between 0 and 1")
-    if not quarter.any():
-        raise ValueError("a quadrant must let some light through")
     repeat, remainder = divmod(samples, 2 * quarter.shape[0])
     if remainder or not repeat:
         raise ValueError(f"samples must be a multiple of {2 * quarter.shape[0]}, got {samples}")
+    if not quarter.any():
+        raise ValueError("a quadrant must let some light through")
     right = np.vstack([quarter[::-1], quarter])
     return np.kron(np.hstack([right[:, ::-1], right]), np.ones((repeat, repeat)))
