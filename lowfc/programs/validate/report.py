@@ -104,7 +104,9 @@ def run(
     if plots is not None:
         figure_class()
         _make_folder(plots)
-    with Progress(*columns, console=console or Console(stderr=True), transient=True) as shown, threadpool_limits(1):
+    console = console or Console(stderr=True)
+    bar = Progress(*columns, console=console, transient=True, disable=not console.is_terminal)
+    with bar as shown, threadpool_limits(1):
         all_of_them, this = shown.add_task("tables", total=len(names)), shown.add_task("")
 
         def progress(what: str, done: int, total: int) -> None:
