@@ -13,6 +13,7 @@ import subprocess
 import sys
 import tempfile
 import time
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -110,21 +111,27 @@ def render(measured: dict[str, Any]) -> str:
     return "\n".join([*rows, "", where, ""])
 
 
-def put(table: str) -> None:
-    """Replace what is between the README's marks."""
-    before, _, rest = README.read_text().partition(BEGIN)
+def put(document: Path, table: str) -> None:
+    """Replace what is between a document's marks."""
+    before, _, rest = document.read_text().partition(BEGIN)
     _, _, after = rest.partition(END)
-    README.write_text(f"{before}{BEGIN}{table}{END}{after}")
+    document.write_text(f"{before}{BEGIN}{table}{END}{after}")
 
 
-def main() -> None:
-    """Command line."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--render", action="store_true", help="use docs/measured.json as it is")
+def command_line(
+    about: str | None,
+    measured: Path,
+    document: Path,
+    measure: Callable[[], dict[str, Any]],
+    render: Callable[[dict[str, Any]], str],
+) -> None:
+    """Measure into a JSON file unless told to take it as it is, and put its table into a document."""
+    parser = argparse.ArgumentParser(description=about, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--render", action="store_true", help=f"use {measured.relative_to(ROOT)} as it is")
     if not parser.parse_args().render:
-        MEASURED.write_text(json.dumps(measure(), indent=1) + "\n")
-    put(render(json.loads(MEASURED.read_text())))
+        measured.write_text(json.dumps(measure(), indent=1) + "\n")
+    put(document, render(json.loads(measured.read_text())))
 
 
 if __name__ == "__main__":
-    main()
+    command_line(__doc__, MEASURED, README, measure, render)

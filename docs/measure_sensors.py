@@ -5,18 +5,16 @@ Example:
     python docs/measure_sensors.py --render   # the table again from docs/sensors.json
 """
 
-import argparse
 import json
 import statistics
 import subprocess
 import sys
 import tempfile
 import time
-from pathlib import Path
 from typing import Any
 
 import numpy as np
-from measure import host
+from measure import ROOT, command_line, host
 from rich.progress import track
 from threadpoolctl import threadpool_limits
 
@@ -28,10 +26,8 @@ from lowfc.optics.sensor import light_budget, pupil_radii, reference, response, 
 from lowfc.optics.twin import Evaluator
 from lowfc.optics.zernike import zernikes
 
-ROOT = Path(__file__).parents[1]
 MEASURED = ROOT / "docs" / "sensors.json"
 DOCUMENT = ROOT / "docs" / "sensors.md"
-BEGIN, END = "<!-- measured: begin -->\n", "<!-- measured: end -->"
 
 LAYOUTS = ("sam18_sized", "sam27d07_bal14", "sam27d10_bal14", "sam27_crb20")
 NAMES = (*(name for name in SENSORS if name != "open"), *LAYOUTS, "open")
@@ -150,21 +146,5 @@ def render(measured: dict[str, Any]) -> str:
     return "\n".join([*rows, "", where, ""])
 
 
-def put(table: str) -> None:
-    """Replace what is between the document's marks."""
-    before, _, rest = DOCUMENT.read_text().partition(BEGIN)
-    _, _, after = rest.partition(END)
-    DOCUMENT.write_text(f"{before}{BEGIN}{table}{END}{after}")
-
-
-def main() -> None:
-    """Command line."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--render", action="store_true", help="use docs/sensors.json as it is")
-    if not parser.parse_args().render:
-        MEASURED.write_text(json.dumps(measure(), indent=1) + "\n")
-    put(render(json.loads(MEASURED.read_text())))
-
-
 if __name__ == "__main__":
-    main()
+    command_line(__doc__, MEASURED, DOCUMENT, measure, render)

@@ -25,3 +25,14 @@ def write_whole(path: Path, content: bytes) -> None:
                 raise
     except OSError as error:
         raise DataFileError(f"{path} cannot be written: {error.strerror or error}") from error
+
+
+def require_folder(*files: Path | None) -> None:
+    """Say before the work that a file could not be written after it; None is no file.
+
+    Raises:
+        DataFileError: A file's folder is not there.
+    """
+    for file in files:
+        if file is not None and not file.parent.is_dir():
+            raise DataFileError(f"{file} cannot be written: there is no directory {file.parent}")

@@ -84,3 +84,11 @@ def refine(fit: Fit, image_e: Array, start_nm: Array, model: Model, iterations: 
     for _ in range(iterations):
         modes_nm = modes_nm + fit.R @ (image_e - fit.scale_e * model(modes_nm))
     return modes_nm
+
+
+def iterated(fit: Fit, image_e: Array, model: Model, iterations: int) -> list[Array]:
+    """Estimates (modes,) in nm of an image after none, one, ... `iterations` with the full model."""
+    found = [estimate(fit, image_e)]
+    for _ in range(iterations):
+        found.append(refine(fit, image_e, found[-1], model, 1))
+    return found

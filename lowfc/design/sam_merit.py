@@ -21,6 +21,7 @@ from lowfc.design.paper import (
     TABLE4_EXPOSURE_S,
     TABLE4_READ_NOISE_E,
 )
+from lowfc.design.trials import expected_rms, gram
 from lowfc.optics.band import Band, uniform
 from lowfc.optics.focal_mask import bowtie, disk
 from lowfc.optics.fourier import Field, kernel, to_image, to_pupil
@@ -130,8 +131,6 @@ def build_optics(
     others = [nm for nm in band.wavelengths_nm if nm != WAVELENGTH_NM]
     groups = [group(1.0, focal_masks, 1 + len(modes))]
     groups += [group(WAVELENGTH_NM / nm, focal_masks[:1], 1 + band_modes) for nm in others]
-    inside = modes[:, pupil > 0.5]
-    inside = inside - inside.mean(axis=1, keepdims=True)
     at_samples = kernel(samples, samples_per, relay_samples, 1.0)
     wanted = kernel(IMAGE_WIDTH * PIXELS_PER, PIXELS_PER, relay_samples, 1.0)
     return Optics(
@@ -139,7 +138,7 @@ def build_optics(
         band,
         tuple(groups),
         band_modes,
-        inside @ inside.T / inside.shape[1],
+        gram(modes[:, pupil > 0.5]),
         samples_per,
         (wanted @ np.linalg.pinv(at_samples, rcond=1e-3)).astype(np.complex64),
     )
@@ -235,7 +234,7 @@ def covariance_nm2(seen: Signal, electrons_e: float, read_noise_e: float, modes:
 def table3_noise_waves(optics: Optics, seen: Signal, modes: int, estimator: str) -> float:
     """Residual rms over the open pupil that noise alone leaves in Table 3, in waves."""
     covariance = covariance_nm2(seen, PEAK_E / seen.peak, TABLE3_READ_NOISE_E, modes, estimator)
-    return float(np.sqrt(np.sum(covariance * optics.gram[:modes, :modes]))) / WAVELENGTH_NM
+    return expected_rms(optics.gram[:modes, :modes], covariance) / WAVELENGTH_NM
 
 
 def table3_waves(optics: Optics, seen: Signal, modes: int, estimator: str) -> float:

@@ -5,9 +5,10 @@ from collections.abc import Callable, Iterator
 
 import numpy as np
 from rich.console import Console
-from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeElapsedColumn
+from rich.progress import BarColumn, TaskID, TextColumn, TimeElapsedColumn
 
 from lowfc.adapters import instrument
+from lowfc.adapters.progress import passing_bar
 from lowfc.contract.configuration import Configuration
 from lowfc.control.calibration import Calibration
 
@@ -41,7 +42,7 @@ def analytic(config: Configuration, console: Console) -> Calibration:
 def _progress(what: str, console: Console) -> Iterator[Callable[[int, int], None]]:
     """A progress bar that appears with the first step."""
     columns = (TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn())
-    with Progress(*columns, console=console, transient=True, disable=not console.is_terminal) as bar:
+    with passing_bar(console, *columns) as bar:
         tasks: list[TaskID] = []
 
         def advance(done: int, total: int) -> None:

@@ -8,7 +8,7 @@ from typing import Annotated
 
 import typer
 
-from lowfc.adapters.terminal import new_app
+from lowfc.adapters.terminal import INTERRUPTED, new_app
 from lowfc.contract.errors import ConfigurationError
 
 design_app = new_app("Design masks.\n\nExample: lowfc design spc --help")
@@ -118,4 +118,4 @@ def sam(
         result = design_sam(search, found, out, state, executor, front, plot)
     sys.stdout.write((json.dumps(result) if as_json else render(result)) + "\n")
     if result["interrupted"]:
-        raise typer.Exit(130)
+        raise typer.Exit(INTERRUPTED)

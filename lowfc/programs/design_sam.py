@@ -12,11 +12,12 @@ from typing import Any
 
 import numpy as np
 from rich.console import Console
-from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+from rich.progress import BarColumn, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 from threadpoolctl import threadpool_limits
 
 from lowfc.adapters.drawing import figure_class
 from lowfc.adapters.masks import load_pupil
+from lowfc.adapters.progress import passing_bar
 from lowfc.contract.errors import ConfigurationError, LowfcError
 from lowfc.design.paper import TABLE4_MODES
 from lowfc.design.sam_goal import figures
@@ -200,7 +201,7 @@ def point_of(search: Search, chain: Chain) -> Point:
     weight = "" if goal.weight is None else f" with weight {goal.weight:g}"
     masks = " and ".join(search.focal_masks)
     purpose = f"{_described(found)}: merit {goal.merit}{weight}, focal-plane mask {masks}"
-    shown = layout_figures(Layout(name, purpose, found))[search.focal_masks[0]]
+    shown = _figures(search.focal_masks[0], found)
     return Point(
         Layout(name, purpose, found),
         chain.best_merit,
@@ -287,7 +288,7 @@ def _described(found: Sequence[Hole]) -> str:
 def _progress(search: Search, chains: list[Chain], console: Console) -> Iterator[Callable[[], None]]:
     """A progress bar with the best merit so far."""
     columns = (TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn(), TimeRemainingColumn())
-    with Progress(*columns, console=console, transient=True, disable=not console.is_terminal) as bar:
+    with passing_bar(console, *columns) as bar:
         task = bar.add_task(search.goal.merit, total=search.chains * search.steps)
 
         def show() -> None:

@@ -66,10 +66,7 @@ def _dask(address: str) -> Iterator[Executor]:
         raise ConfigurationError("--scheduler needs Dask: pip install 'lowfc[cluster]'") from None
     except (OSError, ValueError) as error:
         raise ConfigurationError(f"no Dask scheduler answers at {address!r}: {error}") from error
-    for name in (
-        "distributed",
-        "distributed.client",
-    ):  # a lost scheduler is our error to tell, not a traceback of theirs
+    for name in ("distributed", "distributed.client"):  # a lost scheduler is ours to tell, without their traceback
         logging.getLogger(name).setLevel(logging.CRITICAL)
     try:
         yield client.get_executor(pure=False)

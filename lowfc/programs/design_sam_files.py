@@ -10,7 +10,7 @@ from typing import Any
 
 from lowfc.adapters.drawing import figure_class, png
 from lowfc.adapters.layouts import parse_layout
-from lowfc.adapters.whole_file import write_whole
+from lowfc.adapters.whole_file import require_folder, write_whole
 from lowfc.contract.errors import ConfigurationError, DataFileError
 from lowfc.design.paper import TABLE3_WAVES, TABLE4_MAS
 from lowfc.design.sam_goal import Goal
@@ -52,9 +52,7 @@ def check_files(out: Path, resume: Path | None, *others: Path | None) -> Path:
         raise ConfigurationError(f"--out must end in .json, as only that is read as a layout file; got {out}")
     state = resume if resume is not None else out.with_name(f"{out.name}.state.json")
     files = [file for file in (out, state, *others) if file is not None]
-    for file in files:
-        if not file.parent.is_dir():
-            raise DataFileError(f"{file} cannot be written: there is no directory {file.parent}")
+    require_folder(*files)
     if len({file.resolve() for file in files}) < len(files):
         raise ConfigurationError(f"these must be different files: {', '.join(map(str, files))}")
     if resume is None and state.exists():

@@ -15,8 +15,8 @@ from rich.console import Console
 from threadpoolctl import threadpool_limits
 
 from lowfc.adapters.drawing import figure_class, png
-from lowfc.adapters.whole_file import write_whole
-from lowfc.contract.errors import ConfigurationError, DataFileError
+from lowfc.adapters.whole_file import require_folder, write_whole
+from lowfc.contract.errors import ConfigurationError
 from lowfc.design.dark_zone import FINE_STEP, fine_grid
 from lowfc.design.linear_program import NotSolvedError
 from lowfc.design.shaped_pupil import (
@@ -76,9 +76,7 @@ def design_spc(wanted: Request, out: Path, plot: Path | None, console: Console) 
     """
     if plot is not None:
         figure_class()
-    for file in (out, plot):  # what is missing is said before the work, not after it
-        if file is not None and not file.parent.is_dir():
-            raise DataFileError(f"{file} cannot be written: there is no directory {file.parent}")
+    require_folder(out, plot)
     with console.status("solving linear programs"):
         rounds = _interruptibly(lambda: _rounds(wanted, console))
     last = rounds[-1]

@@ -54,10 +54,11 @@ def test_a_sensor_that_cannot_tell_the_modes_apart_says_so(tmp_path: Path) -> No
 
 
 def test_the_documents_table_is_the_measured_one() -> None:
+    import measure
     import measure_sensors
 
     document = measure_sensors.DOCUMENT.read_text()
-    table = document.partition(measure_sensors.BEGIN)[2].partition(measure_sensors.END)[0]
+    table = document.partition(measure.BEGIN)[2].partition(measure.END)[0]
     measured = json.loads(measure_sensors.MEASURED.read_text())
     assert table == measure_sensors.render(measured)
     assert set(SENSORS) < set(measured["sensors"])

@@ -3,7 +3,7 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from lowfc.design.estimators import KINDS, Fit, estimate, refine
+from lowfc.design.estimators import KINDS, Fit, iterated
 from lowfc.design.fisher import cramer_rao, variance_e
 from lowfc.design.paper import PEAK_E, TABLE3_READ_NOISE_E
 from lowfc.design.trials import noisy_e
@@ -35,10 +35,8 @@ def estimates_nm(ready: Prepared, linear: dict[str, Fit], image_e: Array) -> dic
     """What each of `ESTIMATORS` makes (modes,) of an image (pixels,) in electrons; of the kinds in `linear` alone."""
     found: dict[str, Array] = {}
     for kind, fit in linear.items():
-        modes_nm = estimate(fit, image_e)
-        for iterations in ITERATIONS:
-            modes_nm = refine(fit, image_e, modes_nm, ready.model, min(iterations, 1))
-            found[label(kind, iterations)] = modes_nm
+        steps_nm = iterated(fit, image_e, ready.model, ITERATIONS[-1])
+        found |= {label(kind, iterations): steps_nm[iterations] for iterations in ITERATIONS}
     return found
 
 

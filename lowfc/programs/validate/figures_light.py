@@ -12,12 +12,11 @@ from lowfc.design.trials import noisy_e
 from lowfc.optics.fourier import to_image, to_pupil
 from lowfc.optics.photometry import electrons
 from lowfc.optics.relay import ApertureMask, PupilImage
-from lowfc.optics.zernike import NOLLS_14, mode_name
+from lowfc.optics.zernike import mode_name
 from lowfc.programs.validate import plots
 from lowfc.programs.validate.cases import Case, Context, Prepared
-from lowfc.programs.validate.photometry import PAPER_PEAK, PAPER_SIGNAL
+from lowfc.programs.validate.photometry import PAPER_PEAK, PAPER_SIGNAL, differential, tilt_signal
 from lowfc.programs.validate.pointing import (
-    NM_PER_MAS,
     PAPER_FOCAL_MASK,
     PAPER_PUPIL,
     PAPER_RELAY_MASK,
@@ -115,7 +114,7 @@ def fig4(context: Context) -> list[Row]:
                 f"{name}, Z{noll} {mode_name(noll)}",
                 "peak of |I - I0| over peak of I0",
                 "",
-                float(np.abs(_difference(ready, noll)).max()),
+                float(np.abs(differential(ready, noll)).max()),
                 PAPER_TABLE2[noll] if name.startswith("sam") else None,
             )
             for noll in _CHANGED
@@ -132,19 +131,12 @@ def plot_fig4(context: Context, path: Path) -> None:
     ready = context.prepared((context.sensors or ("sam",))[0])
     panels: list[plots.Panel] = []
     for noll in _DRAWN:
-        change = _difference(ready, noll)
+        change = differential(ready, noll)
         bound = float(np.abs(change).max())
         panels.append(
             _on_sensor(ready, change, f"Z{noll}, {mode_name(noll)}", (-bound, bound), "$(I - I_0)$ / peak", "signed")
         )
     plots.draw(path, panels, rf"Fig. 4. {ready.name}: differential images of $\lambda$/30 rms, without noise.")
-
-
-def _difference(ready: Prepared, noll: int) -> Array:
-    """(I - I0) / max(I0), (pixels,), for a thirtieth of a wave."""
-    modes_nm = np.zeros(len(NOLLS_14))
-    modes_nm[NOLLS_14.index(noll)] = ready.sensor.wavelength_nm / 30.0
-    return np.asarray((ready.image(modes_nm) - ready.I0) / ready.I0.max())
 
 
 @dataclass(frozen=True, eq=False)
@@ -156,10 +148,8 @@ class _Tilted:
 
 
 def _tilted(ready: Prepared, axis: int) -> _Tilted:
-    light_e, modes_nm = electrons(STAR, TABLE4_EXPOSURE_S), np.zeros(2)
-    modes_nm[axis] = NM_PER_MAS
-    flat_e = light_e * ready.band_I0
-    return _Tilted(flat_e, light_e * ready.image(modes_nm, ready.band) - flat_e)
+    light_e = electrons(STAR, TABLE4_EXPOSURE_S)
+    return _Tilted(light_e * ready.band_I0, light_e * tilt_signal(ready, axis))
 
 
 def fig10(context: Context) -> list[Row]:

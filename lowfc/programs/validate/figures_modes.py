@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from lowfc.design.estimators import estimate, refine
+from lowfc.design.estimators import iterated
 from lowfc.design.trials import LITERAL_WAVES, bounds_waves, expected_r_squared, r_squared, random_wavefronts
 from lowfc.optics.zernike import NOLLS_14, noll_to_nm
 from lowfc.programs.validate import plots
@@ -154,10 +154,8 @@ def _pure_modes(context: Context, name: str) -> Array:
             truth_nm = np.zeros(MODES)
             truth_nm[k] = amplitude * wavelength_nm
             image_e = linear.scale_e * ready.model(truth_nm)
-            modes_nm = estimate(linear, image_e)
-            for i, iterations in enumerate(ITERATIONS):
-                modes_nm = refine(linear, image_e, modes_nm, ready.model, min(iterations, 1))
-                found[i, j] = modes_nm[k] / wavelength_nm
+            steps_nm = iterated(linear, image_e, ready.model, ITERATIONS[-1])
+            found[:, j] = [steps_nm[iterations][k] / wavelength_nm for iterations in ITERATIONS]
         return found
 
     return np.stack(context.map(f"{name}, pure modes", one, range(MODES)), axis=1)

@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lowfc.design import trials as random
-from lowfc.design.estimators import KINDS, Fit, estimate, refine
+from lowfc.design.estimators import KINDS, Fit, estimate, iterated
 from lowfc.design.fisher import cramer_rao, variance_e
 from lowfc.design.paper import MODES, PEAK_E, TABLE3_READ_NOISE_E, TABLE3_WAVES
 from lowfc.optics.zernike import NOLLS_20
@@ -141,9 +141,8 @@ def ensemble(context: Context, name: str, modes: int, wavefronts: Input, nuisanc
         noise = context.rng("table3", name, modes, wavefronts.name, i)
         image_e = random.noisy_e(noise, light_e * sensor.image(truth_nm[i]), TABLE3_READ_NOISE_E)
         found = {key: estimate(each, image_e) for key, each in linear.items()}
-        found[ESTIMATORS[2]] = refine(linear["weighted"], image_e, found["weighted"], sensor.model, 1)
-        found[ESTIMATORS[3]] = refine(linear["weighted"], image_e, found[ESTIMATORS[2]], sensor.model, 1)
-        return found
+        steps_nm = iterated(linear["weighted"], image_e, sensor.model, ITERATIONS[-1])
+        return found | {label("weighted", iterations): steps_nm[iterations] for iterations in ITERATIONS}
 
     results = context.map(f"table3 {name}, {modes} modes, {wavefronts.name}", trial, range(context.trials))
     H_e, variance = linear["weighted"].response_e, variance_e(linear["weighted"].reference_e, TABLE3_READ_NOISE_E)

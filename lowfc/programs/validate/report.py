@@ -8,10 +8,11 @@ from tempfile import TemporaryDirectory
 from typing import Any
 
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
+from rich.progress import BarColumn, MofNCompleteColumn, TextColumn, TimeElapsedColumn
 from threadpoolctl import threadpool_limits
 
 from lowfc.adapters.drawing import figure_class
+from lowfc.adapters.progress import passing_bar
 from lowfc.adapters.whole_file import write_whole
 from lowfc.contract.errors import ConfigurationError, DataFileError
 from lowfc.programs.validate.cases import Case, Context
@@ -104,9 +105,7 @@ def run(
     if plots is not None:
         figure_class()
         _make_folder(plots)
-    console = console or Console(stderr=True)
-    bar = Progress(*columns, console=console, transient=True, disable=not console.is_terminal)
-    with bar as shown, threadpool_limits(1):
+    with passing_bar(console or Console(stderr=True), *columns) as shown, threadpool_limits(1):
         all_of_them, this = shown.add_task("tables", total=len(names)), shown.add_task("")
 
         def progress(what: str, done: int, total: int) -> None:

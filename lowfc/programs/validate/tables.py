@@ -9,7 +9,7 @@ from lowfc.contract.configuration import SensorSection
 from lowfc.optics.zernike import NOLLS_14, mode_name
 from lowfc.programs.validate.cases import Case, Context
 from lowfc.programs.validate.conditioning import conditioning
-from lowfc.programs.validate.photometry import defocus_waves, photometry
+from lowfc.programs.validate.photometry import defocus_waves, differential, photometry
 from lowfc.programs.validate.pointing import table4
 from lowfc.programs.validate.reconstruction import table3
 from lowfc.programs.validate.rows import Row
@@ -63,14 +63,11 @@ def table2(context: Context) -> list[Row]:
 
 def _peaks(context: Context, name: str) -> Iterator[Row]:
     sensor = context.prepared(name)
-    amplitude_nm = sensor.sensor.wavelength_nm / 30.0
 
-    def peak(index: int) -> float:
-        modes_nm = np.zeros(len(NOLLS_14))
-        modes_nm[index] = amplitude_nm
-        return float(np.abs(sensor.image(modes_nm) - sensor.I0).max() / sensor.I0.max())
+    def peak(noll: int) -> float:
+        return float(np.abs(differential(sensor, noll)).max())
 
-    found = context.map(f"table2 {name}", peak, range(len(NOLLS_14)))
+    found = context.map(f"table2 {name}", peak, NOLLS_14)
     for noll, value in zip(NOLLS_14, found, strict=True):
         yield Row(
             name,

@@ -1,0 +1,9 @@
+"""Progress bars that leave nothing behind."""
+
+from rich.console import Console
+from rich.progress import Progress, ProgressColumn
+
+
+def passing_bar(console: Console, *columns: ProgressColumn) -> Progress:
+    """A bar that vanishes at its end, and is not there at all where nobody looks: it would leave an empty line."""
+    return Progress(*columns, console=console, transient=True, disable=not console.is_terminal)
