@@ -14,15 +14,13 @@ from lowfc.contract.configuration import SENSORS, SensorSection, sensor_keys
 from lowfc.contract.errors import ConfigurationError, DataFileError, nearest
 from lowfc.optics import sam as sams
 from lowfc.optics.focal_mask import bowtie, disk, phase_spot
+from lowfc.optics.grid import SAMPLES
 from lowfc.optics.pupil import circle, from_quarter, prolate, with_bar
 from lowfc.optics.relay import ApertureMask, Defocus, PupilImage, Relay, fresnel_distance
 from lowfc.optics.sensor import Sensor
 
 _DATA = resources.files("lowfc") / "data"
 _log = logging.getLogger(__name__)
-
-SAMPLES = 512
-"""Across a pupil, Table 1."""
 
 
 def load_pupil(samples: int = SAMPLES, file: Traversable = _DATA / "spc_quarter128.npz") -> NDArray[np.float64]:

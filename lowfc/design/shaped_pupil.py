@@ -19,13 +19,10 @@ from lowfc.design.dark_zone import FINE_STEP, DarkZone, edge_points, fine_grid, 
 from lowfc.design.linear_program import maximise
 from lowfc.optics.focal_mask import disk
 from lowfc.optics.fourier import to_image
-from lowfc.optics.grid import OPEN_AREA, pupil_axis
+from lowfc.optics.grid import OPEN_AREA, SAMPLES, pupil_axis
 from lowfc.optics.pupil import circle, from_quarter
 
 Float = NDArray[np.float64]
-
-SAMPLES = 512
-"""Samples across the pupil as the sensor uses it; each cell is a square of them."""
 
 FOCAL_MASK_RADIUS = 4.0
 """Of the disk whose share of the light is reported, in lambda / D (Sect. 2.1)."""

@@ -7,7 +7,7 @@ operator is a real matrix with known phases. Without one, the relay loses nothin
 operator ends at the focal plane, and what is left of the way is applied to the few modes that are kept.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 
 import numpy as np
 import scipy.linalg
@@ -91,31 +91,48 @@ def field_operator(
         wanted: Indices of the wanted products in the flattened (p, q).
         advance: Called after each of the k / 2 steps, k the samples across the focal-plane mask.
     """
-    samples, relay = sensor.pupil.shape[0], sensor.relay
-    half = sensor.focal_mask.shape[0] // 2
-    quarter = sensor.focal_mask[half:, half:].real
+    samples = sensor.pupil.shape[0]
+    unit = scale * sensor.pitch / (samples**2 * np.sqrt(OPEN_AREA))
     waves = _waves(sensor, scale)
-    entering = (x_factors.T[:, None, None] * waves).transpose(3, 1, 2, 0).reshape(samples, -1)
-    count, p, q = functions.shape[1], y_factors.shape[1], x_factors.shape[1]
-    if isinstance(relay, ApertureMask):
-        kernels = _kernels(sensor, scale, functions)
-        relayed = (kernels[:, None, None] * waves).transpose(3, 1, 2, 0).reshape(samples, -1)  # columns (parity, d, k)
+    rows = _focal_rows(sensor, waves, y_factors, x_factors, wanted, advance)
+    if not isinstance(sensor.relay, ApertureMask):
+        return np.asarray(unit * np.vstack([amplitudes for *_, amplitudes in rows]))
+    half, count = waves.shape[1], functions.shape[1]
+    quarter = sensor.focal_mask[half:, half:].real
+    kernels = _kernels(sensor, scale, functions)
+    relayed = (kernels[:, None, None] * waves).transpose(3, 1, 2, 0).reshape(samples, -1)  # columns (parity, d, k)
     total = np.zeros((count**2, wanted.size))
-    rows = []
+    for parity, c, columns, amplitudes in rows:
+        left = ((kernels * waves[parity, c]) @ sensor.relay.transmission @ relayed).reshape(count, 2, half, count)
+        outer = left[:, :, columns].transpose(0, 3, 1, 2) * quarter[c, columns]
+        total += outer.reshape(count**2, -1) @ amplitudes
+    return np.asarray(unit * total)
+
+
+def _focal_rows(
+    sensor: Sensor,
+    waves: Float,
+    y_factors: Float,
+    x_factors: Float,
+    wanted: NDArray[np.intp],
+    advance: Callable[[], None],
+) -> Iterator[tuple[int, int, NDArray[np.intp], Float]]:
+    """Amplitudes on the focal plane row by row, from amplitudes in the pupil; arguments as for `field_operator`.
+
+    Yields:
+        Parity and index of the row, the columns within the mask, and the amplitudes (2 columns, wanted) there, of
+        either parity along x.
+    """
+    samples, half = sensor.pupil.shape[0], waves.shape[1]
+    entering = (x_factors.T[:, None, None] * waves).transpose(3, 1, 2, 0).reshape(samples, -1)
+    p, q = y_factors.shape[1], x_factors.shape[1]
     for c in range(half):
         columns = np.flatnonzero(sensor.focal_mask[half + c, half:])
-        for wave in waves[:, c]:
-            right = ((y_factors.T * wave) @ sensor.pupil @ entering).reshape(p, 2, half, q)
-            inner = right[:, :, columns].transpose(1, 2, 0, 3).reshape(2 * columns.size, p * q)[:, wanted]
-            if isinstance(relay, ApertureMask):
-                left = ((kernels * wave) @ relay.transmission @ relayed).reshape(count, 2, half, count)
-                outer = left[:, :, columns].transpose(0, 3, 1, 2) * quarter[c, columns]
-                total += outer.reshape(count**2, -1) @ inner
-            else:
-                rows.append(inner)
+        for parity in (0, 1):
+            right = ((y_factors.T * waves[parity, c]) @ sensor.pupil @ entering).reshape(p, 2, half, q)
+            amplitudes = right[:, :, columns].transpose(1, 2, 0, 3).reshape(2 * columns.size, p * q)[:, wanted]
+            yield parity, c, columns, amplitudes
         advance()
-    unit = scale * sensor.pitch / (samples**2 * np.sqrt(OPEN_AREA))
-    return np.asarray(unit * (np.vstack(rows) if rows else total))
 
 
 def on_sensor(sensor: Sensor, scale: float, functions: Float, modes: Float) -> Matrix:

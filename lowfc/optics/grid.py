@@ -15,6 +15,9 @@ pixels are hardware: their size in lambda0 / D does not change with the waveleng
 import numpy as np
 from numpy.typing import NDArray
 
+SAMPLES = 512
+"""Across a pupil, Table 1."""
+
 OPEN_AREA = np.pi / 4.0
 """Area of the open circular pupil, in squared pupil diameters."""
 

@@ -17,7 +17,6 @@ from lowfc.contract.errors import ConfigurationError, DataFileError
 from lowfc.design import shaped_pupil
 from lowfc.design.linear_program import NotSolvedError
 from lowfc.design.shaped_pupil import (
-    SAMPLES,
     Request,
     exchange,
     figures,
@@ -26,7 +25,7 @@ from lowfc.design.shaped_pupil import (
     stored,
 )
 from lowfc.optics.fourier import to_image
-from lowfc.optics.grid import OPEN_AREA, image_axis, pupil_axis
+from lowfc.optics.grid import OPEN_AREA, SAMPLES, image_axis, pupil_axis
 from lowfc.optics.pupil import circle, from_quarter
 from lowfc.programs.design_commands import design_app
 

@@ -3,12 +3,12 @@
 import numpy as np
 import pytest
 
-from lowfc.adapters.masks import SAMPLES, load_pupil, sensor_from, sensor_named
+from lowfc.adapters.masks import load_pupil, sensor_from, sensor_named
 from lowfc.contract.configuration import SensorSection
 from lowfc.contract.errors import ConfigurationError, DataFileError
 from lowfc.optics.focal_mask import disk, phase_spot
 from lowfc.optics.fourier import to_image, to_pupil
-from lowfc.optics.grid import image_axis, pupil_axis
+from lowfc.optics.grid import SAMPLES, image_axis, pupil_axis
 from lowfc.optics.pupil import circle, prolate, with_bar
 
 
