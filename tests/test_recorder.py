@@ -17,7 +17,8 @@ from lowfc.adapters.bus import Publisher, Sample
 from lowfc.adapters.clock import HostClock
 from lowfc.adapters.envelope import Envelope, count_of, sequence_of
 from lowfc.adapters.ledger import Ledger
-from lowfc.adapters.mcap_log import UNFINISHED, Logged, LogReader
+from lowfc.adapters.log_reader import Logged, LogReader
+from lowfc.adapters.log_writer import UNFINISHED
 from lowfc.adapters.memory_bus import MemoryBus, MemoryHub
 from lowfc.adapters.run import Run, new_run_id, open_run
 from lowfc.adapters.service import Service

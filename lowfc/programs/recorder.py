@@ -23,7 +23,7 @@ from lowfc.adapters.bus import ALL, Bus, Sample, name_in
 from lowfc.adapters.clock import Clock, HostClock
 from lowfc.adapters.envelope import start_of
 from lowfc.adapters.ledger import Ledger
-from lowfc.adapters.mcap_log import Attachment, LogWriter, log_path
+from lowfc.adapters.log_writer import Attachment, LogWriter, log_path
 from lowfc.adapters.realtime import NOTHING, Granted, step_back
 from lowfc.adapters.run import Run
 from lowfc.adapters.service import Service

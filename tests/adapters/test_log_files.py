@@ -14,7 +14,8 @@ from mcap_protobuf.decoder import DecoderFactory
 
 from lowfc.adapters.bus import Sample
 from lowfc.adapters.envelope import sequence_of
-from lowfc.adapters.mcap_log import UNFINISHED, Attachment, LogReader, LogWriter, log_path
+from lowfc.adapters.log_reader import LogReader
+from lowfc.adapters.log_writer import UNFINISHED, Attachment, LogWriter, log_path
 from lowfc.contract.errors import DataFileError
 from lowfc.contract.messages import COMMAND, EVENT, FRAME, STEP, TOPICS, image, timestamp, wire
 
@@ -130,7 +131,7 @@ def test_what_was_flushed_survives_a_kill(tmp_path: Path) -> None:
 import os, sys
 sys.path[:0] = {[str(Path(__file__).parent)]!r}
 from pathlib import Path
-from test_mcap_log import *
+from test_log_files import *
 log = LogWriter(Path({str(tmp_path / "a.mcap")!r}), START_NS, METADATA, ATTACHMENTS)
 for number, sample in enumerate(samples(50)):
     log.write(sample)
