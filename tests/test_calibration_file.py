@@ -9,7 +9,7 @@ import pytest
 from astropy.io import fits
 
 from lowfc.adapters.calibration_file import load, save, to_bytes
-from lowfc.contract import codec
+from lowfc.contract import calibration_codec
 from lowfc.contract.errors import DataFileError
 from lowfc.contract.messages import wire
 from lowfc.control.calibration import Calibration
@@ -21,7 +21,7 @@ def calibration() -> Calibration:
     def single(*shape: int) -> np.ndarray:
         return rng.standard_normal(shape).astype(np.float32)
 
-    return codec.identified(
+    return calibration_codec.identified(
         Calibration(
             noll=(2, 3, 4),
             reference=single(30),
@@ -115,14 +115,14 @@ def test_a_fits_file_of_something_else_is_refused(tmp_path: Path) -> None:
 )
 def test_the_identity_is_of_everything(change: dict[str, object]) -> None:
     one = calibration()
-    assert codec.identified(one).id == one.id
+    assert calibration_codec.identified(one).id == one.id
     assert len(one.id) == 64
-    assert codec.identified(replace(one, **change)).id != one.id
+    assert calibration_codec.identified(replace(one, **change)).id != one.id
 
 
 def test_the_message_carries_the_same(tmp_path: Path) -> None:
     one = calibration()
-    message = wire.Calibration.FromString(codec.encode_calibration(one, 5_000_000_001))
+    message = wire.Calibration.FromString(calibration_codec.encode_calibration(one, 5_000_000_001))
     assert message.timestamp.ToNanoseconds() == 5_000_000_001
     assert (message.id, message.operator_hash, message.estimator) == (one.id, one.operator_hash, one.estimator)
     assert tuple(message.noll) == one.noll

@@ -41,7 +41,22 @@ UNITS = ("_nm", "_ns", "_hz", "_e", "_dn", "_mas", "_bytes", "_e_per_dn", "_fram
 # Numbers that are counts, indices, identities, ratios or free values: they have no unit to say.
 WITHOUT_UNIT = {
     *("frame_sequence", "last_sequence", "count", "published", "received", "skipped", "missing", "messages", "lost"),
-    *("frames_used", "commands_late", "saturated_pixels", "pid", "noll", "modes", "values", "gain", "leak", "em_gain"),
+    *(
+        "frames_used",
+        "taken",
+        "refused_count",
+        "most_saturated",
+        "least_flux",
+        "commands_late",
+        "saturated_pixels",
+        "pid",
+        "noll",
+        "modes",
+        "values",
+        "gain",
+        "leak",
+        "em_gain",
+    ),
     *("rows", "columns", "region_row", "region_column", "mirror_rows", "mirror_columns", "bit_depth", "bytes"),
 }
 
@@ -298,16 +313,17 @@ def test_what_is_no_frame_has_no_pixels(payload: bytes) -> None:
 def test_a_step_a_command_and_a_request_survive() -> None:
     modes, shape = np.array([1.5, -2.25], np.float32), np.arange(6, dtype=np.float32).reshape(2, 3)
     step = Step(9, 77, LoopMode.CLOSED, modes, (Reason.SLEW, Reason.NEIGHBOUR), modes + 1, modes + 2, 12.5, 3)
-    sent = wire.ControlStep.FromString(codec.encode_step(step))
+    sent = wire.ControlStep.FromString(codec.encode_step(step, 4))
     assert (sent.frame_sequence, from_timestamp(sent.timestamp), sent.mode) == (9, 77, wire.LOOP_MODE_CLOSED)
+    assert sent.taken == 4
     assert list(sent.reasons) == [wire.REASON_SLEW, wire.REASON_NEIGHBOUR]
     assert list(sent.command_nm) == modes.tolist()
     assert list(sent.error_nm) == (modes + 1).tolist()
     assert list(sent.pol_nm) == (modes + 2).tolist()
     assert (sent.flux_dn, sent.saturated_pixels) == (12.5, 3)
 
-    told = wire.MirrorCommand.FromString(codec.encode_command(Command(9, 77, shape, modes), 5, "lowfc"))
-    assert (told.frame_sequence, told.valid_for_ns, told.channel) == (9, 5, "lowfc")
+    told = wire.MirrorCommand.FromString(codec.encode_command(Command(9, 77, shape, modes), 5, "lowfc", 4))
+    assert (told.frame_sequence, told.valid_for_ns, told.channel, told.taken) == (9, 5, "lowfc", 4)
     assert np.array_equal(codec.actuators(told), shape)
     told.actuators += b"\0"
     assert codec.actuators(told) is None
@@ -315,10 +331,10 @@ def test_a_step_a_command_and_a_request_survive() -> None:
     assert codec.actuators(told) is None
 
     asked = Request(77, "gain", (2, 3), (0.5, 0.25))
-    answered = codec.encode_request(asked, Reply(True, "done", 10), None)
+    answered = codec.encode_request(asked, Reply(True, "done", 10), 4, None)
     assert codec.decode_request(answered, "gain", 77) == asked
     reply = wire.Request.FromString(answered)
-    assert (reply.accepted, reply.reply, reply.frame_sequence) == (True, "done", 10)
+    assert (reply.accepted, reply.reply, reply.frame_sequence, reply.taken) == (True, "done", 10, 4)
     assert codec.decode_request(b"\xff", "gain", 77) is None
 
 

@@ -10,7 +10,7 @@ from astropy.io import fits
 from astropy.utils.exceptions import AstropyWarning
 
 from lowfc.adapters.whole_file import write_whole
-from lowfc.contract.codec import identified
+from lowfc.contract.calibration_codec import identified
 from lowfc.contract.errors import DataFileError
 from lowfc.control.calibration import Calibration
 

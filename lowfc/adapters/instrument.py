@@ -11,7 +11,7 @@ import numpy.typing as npt
 
 from lowfc.adapters.masks import sensor_from
 from lowfc.adapters.twin_store import load_or_build, load_or_fit_mirror
-from lowfc.contract.codec import identified
+from lowfc.contract.calibration_codec import identified
 from lowfc.contract.configuration import Configuration
 from lowfc.contract.errors import CalibrationError, ConfigurationError
 from lowfc.control.calibration import Calibration, noise_nm, normalise_flux, reconstructor

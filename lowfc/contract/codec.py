@@ -1,7 +1,6 @@
 """Between the values of the numerics and the messages of the bus, both ways."""
 
-import hashlib
-from dataclasses import fields, replace
+from collections.abc import Mapping
 
 import numpy as np
 import numpy.typing as npt
@@ -10,10 +9,8 @@ from google.protobuf.message import DecodeError
 from lowfc.contract.messages import MONO16, RawImage, from_timestamp, timestamp, wire
 from lowfc.control.calibration import Calibration
 from lowfc.control.durations import Durations
-from lowfc.control.inputs import CameraSettings, Command, Frame, MirrorShape, Reply, Request, Step
+from lowfc.control.inputs import CameraSettings, Command, Frame, Input, Load, MirrorShape, Reply, Request, Step, Tick
 from lowfc.control.safety import LoopMode, Reason
-from lowfc.control.state import State
-from lowfc.optics.zernike import mode_name
 
 Single = npt.NDArray[np.float32]
 
@@ -31,24 +28,25 @@ def decode_frame(payload: bytes, sequence: int, age_ns: int) -> Frame:
     return Frame(sequence, from_timestamp(image.timestamp), age_ns, pixels)
 
 
-def encode_step(step: Step) -> bytes:
-    """ControlStep of a step."""
+def encode_step(step: Step, taken: int) -> bytes:
+    """ControlStep of a step, made from input number `taken`."""
     message = wire.ControlStep(
         timestamp=timestamp(step.time_ns),
         frame_sequence=step.frame_sequence,
-        mode=_mode(step.mode),
+        mode=wire_mode(step.mode),
         error_nm=[] if step.error_nm is None else step.error_nm.tolist(),
         pol_nm=[] if step.pol_nm is None else step.pol_nm.tolist(),
         command_nm=step.command_nm.tolist(),
-        reasons=_reasons(step.reasons),
+        reasons=wire_reasons(step.reasons),
         flux_dn=step.flux_dn,
         saturated_pixels=step.saturated_pixels,
+        taken=taken,
     )
     return message.SerializeToString()
 
 
-def encode_command(command: Command, valid_for_ns: int, channel: str) -> bytes:
-    """MirrorCommand of a command."""
+def encode_command(command: Command, valid_for_ns: int, channel: str, taken: int) -> bytes:
+    """MirrorCommand of a command, made from input number `taken`."""
     rows, columns = command.actuators_nm.shape
     message = wire.MirrorCommand(
         timestamp=timestamp(command.time_ns),
@@ -59,6 +57,7 @@ def encode_command(command: Command, valid_for_ns: int, channel: str) -> bytes:
         columns=columns,
         actuators=command.actuators_nm.tobytes(),
         command_nm=command.command_nm.tolist(),
+        taken=taken,
     )
     return message.SerializeToString()
 
@@ -73,37 +72,89 @@ def actuators(message: wire.MirrorCommand | wire.MirrorState) -> Single | None:
 def decode_mirror(payload: bytes) -> MirrorShape | None:
     """Shape of a MirrorState; None where it is none."""
     try:
-        state = wire.MirrorState.FromString(payload)
+        return _mirror_shape(wire.MirrorState.FromString(payload))
     except DecodeError:
         return None
+
+
+def decode_camera(payload: bytes) -> CameraSettings | None:
+    """What of a CameraState must fit the calibration; None where the message cannot be read."""
+    try:
+        return _camera_settings(wire.CameraState.FromString(payload))
+    except DecodeError:
+        return None
+
+
+def encode_input(taken: MirrorShape | CameraSettings | Load | Tick, number: int) -> bytes:
+    """ControlInput of what the controller took in as its input `number`."""
+    time = timestamp(taken.time_ns)
+    message = wire.ControlInput(timestamp=time, taken=number)
+    match taken:
+        case MirrorShape():
+            rows, columns = taken.actuators_nm.shape
+            mirror = wire.MirrorState(timestamp=time, rows=rows, columns=columns, command_nm=taken.command_nm.tolist())
+            mirror.actuators = taken.actuators_nm.tobytes()
+            message.mirror.CopyFrom(mirror)
+        case CameraSettings():
+            rows, columns = taken.shape
+            camera = wire.CameraState(timestamp=time, rows=rows, columns=columns)
+            camera.bias_dn, camera.saturation_dn = taken.bias_dn, taken.saturation_dn
+            message.camera.CopyFrom(camera)
+        case Load():
+            message.load.CopyFrom(wire.Load(timestamp=time, calibration_id=taken.calibration.id, source=taken.source))
+        case Tick():
+            message.tick.CopyFrom(wire.Tick(timestamp=time, silent_ns=max(0, taken.silent_ns)))
+    return message.SerializeToString()
+
+
+def decode_input(message: wire.ControlInput, calibrations: Mapping[str, Calibration]) -> Input:
+    """What the controller took in.
+
+    Raises:
+        ValueError: it is an input that this version does not know, or its calibration is not among these (by id).
+    """
+    match message.WhichOneof("input"):
+        case "mirror":
+            shape = _mirror_shape(message.mirror)
+            if shape is not None:
+                return shape
+        case "camera":
+            return _camera_settings(message.camera)
+        case "tick":
+            return Tick(from_timestamp(message.timestamp), message.tick.silent_ns)
+        case "load" if message.load.calibration_id in calibrations:
+            calibration = calibrations[message.load.calibration_id]
+            return Load(from_timestamp(message.timestamp), calibration, message.load.source)
+    raise ValueError(f"input {message.taken} of the controller cannot be read")
+
+
+def _mirror_shape(state: wire.MirrorState) -> MirrorShape | None:
     surface = actuators(state)
     if surface is None:
         return None
     return MirrorShape(from_timestamp(state.timestamp), surface, np.array(state.command_nm, dtype=np.float32))
 
 
-def decode_camera(payload: bytes) -> CameraSettings | None:
-    """What of a CameraState must fit the calibration; None where the message cannot be read."""
-    try:
-        state = wire.CameraState.FromString(payload)
-    except DecodeError:
-        return None
-    return CameraSettings(
-        from_timestamp(state.timestamp), (state.rows, state.columns), state.bias_dn, state.saturation_dn
-    )
+def _camera_settings(state: wire.CameraState) -> CameraSettings:
+    shape = (state.rows, state.columns)
+    return CameraSettings(from_timestamp(state.timestamp), shape, state.bias_dn, state.saturation_dn)
 
 
 def decode_request(payload: bytes, name: str, time_ns: int) -> Request | None:
     """Request under a key's name; None where the payload cannot be read."""
     try:
-        message = wire.Request.FromString(payload)
+        return request(wire.Request.FromString(payload), name, time_ns)
     except DecodeError:
         return None
+
+
+def request(message: wire.Request, name: str, time_ns: int) -> Request:
+    """Request of a message."""
     return Request(time_ns, name, tuple(message.modes), tuple(message.values))
 
 
-def encode_request(request: Request, reply: Reply, state: wire.ControllerState | None) -> bytes:
-    """Request with its answer."""
+def encode_request(request: Request, reply: Reply, taken: int, state: wire.ControllerState | None) -> bytes:
+    """Request with its answer; it was input number `taken`, or 0 where it could not be read."""
     message = wire.Request(
         timestamp=timestamp(request.time_ns),
         name=request.name,
@@ -113,78 +164,18 @@ def encode_request(request: Request, reply: Reply, state: wire.ControllerState |
         reply=reply.text,
         frame_sequence=reply.frame_sequence,
         state=state,
+        taken=taken,
     )
     return message.SerializeToString()
 
 
-def controller_state(state: State, delay_frames: float, time_ns: int) -> wire.ControllerState:
-    """Everything the next command depends on, as a message."""
-    message = wire.ControllerState(
-        timestamp=timestamp(time_ns),
-        frame_sequence=state.frame_sequence,
-        mode=_mode(state.mode),
-        delay_frames=delay_frames,
-        counts=reason_counts(state),
-        frames_used=state.frames_used,
-    )
-    if state.drive is not None:
-        message.calibration_id = state.drive.calibration.id
-        message.gain.extend(state.drive.law.gain.tolist())
-        message.leak.extend(state.drive.law.leak.tolist())
-        message.limit_nm.extend(state.drive.law.limit_nm.tolist())
-        message.command_history_nm.extend(np.concatenate(state.drive.history_nm).tolist())
-        message.actuators = state.drive.actuators_nm.tobytes()
-    return message
-
-
-def reason_counts(state: State) -> list[wire.ReasonCount]:
-    """How often each reason was given."""
-    pairs = zip(_reasons(tuple(state.counts)), state.counts.values(), strict=True)
-    return [wire.ReasonCount(reason=reason, count=count) for reason, count in pairs]
-
-
-def encode_calibration(calibration: Calibration, time_ns: int) -> bytes:
-    """Calibration as a message."""
-    message = wire.Calibration(
-        timestamp=timestamp(time_ns),
-        id=calibration.id,
-        operator_hash=calibration.operator_hash,
-        estimator=calibration.estimator,
-        noll=calibration.noll,
-        mode_names=[mode_name(index) for index in calibration.noll],
-        wavelength_nm=calibration.wavelength_nm,
-        rows=calibration.shape[0],
-        columns=calibration.shape[1],
-        reference=calibration.reference.tobytes(),
-        response=calibration.response.tobytes(),
-        reconstructor=calibration.reconstructor.tobytes(),
-        mask=calibration.good.astype(np.uint8).tobytes(),
-        dark=calibration.dark.tobytes(),
-        flux_dn=calibration.flux_dn,
-        saturation_dn=calibration.saturation_dn,
-        mirror_rows=calibration.grid[0],
-        mirror_columns=calibration.grid[1],
-        modes_to_actuators=calibration.modes_to_actuators.tobytes(),
-    )
-    return message.SerializeToString()
-
-
-def identified(calibration: Calibration) -> Calibration:
-    """The same calibration with its identity: SHA-256 of everything else in it."""
-    digest = hashlib.sha256()
-    for part in fields(calibration):
-        if part.name != "id":
-            value = getattr(calibration, part.name)
-            digest.update(part.name.encode())
-            digest.update(value.tobytes() if isinstance(value, np.ndarray) else repr(value).encode())
-    return replace(calibration, id=digest.hexdigest())
-
-
-def _mode(mode: LoopMode) -> wire.LoopMode:
+def wire_mode(mode: LoopMode) -> wire.LoopMode:
+    """A loop mode as on the wire."""
     return mode.value  # type: ignore[return-value]  # numbered alike, which a test holds
 
 
-def _reasons(reasons: tuple[Reason, ...]) -> list[wire.Reason]:
+def wire_reasons(reasons: tuple[Reason, ...]) -> list[wire.Reason]:
+    """Reasons as on the wire."""
     return [reason.value for reason in reasons]  # type: ignore[misc]  # numbered alike, which a test holds
 
 

@@ -97,6 +97,14 @@ CAMERA_STATE = Topic(
     "lowfc/camera/state", wire.CameraState, 2.0, _CAMERA, EVERYBODY, "The camera's settings.", queryable=True
 )
 STEP = Topic("lowfc/control/step", wire.ControlStep, Rate.LOOP, _CONTROLLER, _WATCHERS, "One step of the control law.")
+CONTROL_INPUT = Topic(
+    "lowfc/control/input",
+    wire.ControlInput,
+    Rate.EVENT,
+    _CONTROLLER,
+    _WATCHERS,
+    "What the controller took in other than frames and requests, with the verdicts of its clock.",
+)
 TIMING = Topic(
     "lowfc/control/timing",
     wire.ControlTiming,
@@ -174,6 +182,7 @@ TOPICS: tuple[Topic, ...] = (
     FRAME,
     CAMERA_STATE,
     STEP,
+    CONTROL_INPUT,
     TIMING,
     CONTROLLER_STATE,
     REQUEST,

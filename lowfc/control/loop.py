@@ -28,7 +28,6 @@ from lowfc.control.inputs import (
 from lowfc.control.law import integrate
 from lowfc.control.requests import answer
 from lowfc.control.safety import LoopMode, Reason, limit
-from lowfc.control.stability import delay_weights
 from lowfc.control.state import Drive, Settings, State
 
 Single = npt.NDArray[np.float32]
@@ -38,8 +37,14 @@ COUNT_BITS = 32
 
 
 def advance(settings: Settings, state: State, taken: Input) -> tuple[State, Outputs]:
-    """Take one input; return the state after it and what shall be sent."""
-    return _HANDLERS[type(taken)](settings, state, taken)
+    """Take one input; return the state after it and what shall be sent.
+
+    An input that changes nothing and gives rise to nothing leaves the very same state, and is not counted in it.
+    """
+    after, outputs = _HANDLERS[type(taken)](settings, state, taken)
+    if after is not state or outputs.events:
+        after = after._replace(taken=state.taken + 1)
+    return after, outputs
 
 
 def _frame(settings: Settings, state: State, frame: Frame) -> tuple[State, Outputs]:
@@ -184,16 +189,7 @@ def _tick(settings: Settings, state: State, tick: Tick) -> tuple[State, Outputs]
 
 def _load(settings: Settings, state: State, load: Load) -> tuple[State, Outputs]:
     calibration = load.calibration
-    modes = len(calibration.noll)
-    drive = Drive(
-        calibration,
-        settings.law(calibration.noll),
-        np.linalg.pinv(calibration.modes_to_actuators.astype(np.float64)).astype(np.float32),
-        delay_weights(settings.delay_frames).astype(np.float32),
-        (np.zeros(modes, np.float32),) * len(delay_weights(settings.delay_frames)),
-        np.zeros(calibration.grid, np.float32),
-        np.empty(calibration.shape[0] * calibration.shape[1], np.float32),
-    )
+    drive = Drive.at_rest(settings, calibration)
     before = state.drive
     if before is not None and before.actuators_nm.shape == calibration.grid:
         command_nm = drive.inverse @ before.actuators_nm.reshape(-1)
@@ -201,7 +197,7 @@ def _load(settings: Settings, state: State, load: Load) -> tuple[State, Outputs]
     mode = settings.start_mode if state.mode is LoopMode.IDLE else state.mode
     details: dict[str, object] = {
         "id": calibration.id[:12],
-        "modes": modes,
+        "modes": len(calibration.noll),
         "estimator": calibration.estimator,
         "source": load.source,
     }

@@ -11,6 +11,7 @@ import numpy.typing as npt
 from lowfc.control.calibration import Calibration
 from lowfc.control.law import Law
 from lowfc.control.safety import Limits, LoopMode, Reason
+from lowfc.control.stability import delay_weights
 
 Single = npt.NDArray[np.float32]
 
@@ -71,6 +72,21 @@ class Drive(NamedTuple):
     actuators_nm: Single
     scratch: Single
 
+    @classmethod
+    def at_rest(cls, settings: Settings, calibration: Calibration) -> "Drive":
+        """A drive with nothing commanded yet, under the law that the settings begin with."""
+        modes = len(calibration.noll)
+        weights = delay_weights(settings.delay_frames).astype(np.float32)
+        return cls(
+            calibration,
+            settings.law(calibration.noll),
+            np.linalg.pinv(calibration.modes_to_actuators.astype(np.float64)).astype(np.float32),
+            weights,
+            (np.zeros(modes, np.float32),) * len(weights),
+            np.zeros(calibration.grid, np.float32),
+            np.empty(calibration.shape[0] * calibration.shape[1], np.float32),
+        )
+
     def seen_nm(self) -> Single:
         """The modal command (modes,) that the last exposure saw."""
         seen: Single = self.weights[0] * self.history_nm[0]
@@ -97,6 +113,7 @@ class State(NamedTuple):
         limits_hit: limits that acted on the last command.
         silent: whether the silence has been announced.
         commanded: whether a command has been sent, so that the mirror is no longer adopted.
+        taken: inputs that changed something or gave rise to something; the order of what is replayed.
     """
 
     mode: LoopMode = LoopMode.IDLE
@@ -110,3 +127,4 @@ class State(NamedTuple):
     silent: bool = False
     commanded: bool = False
     counts: Mapping[Reason, int] = MappingProxyType({})
+    taken: int = 0

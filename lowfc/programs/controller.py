@@ -10,12 +10,14 @@ from lowfc.adapters.instrument import settings
 from lowfc.adapters.mailbox import Mailbox
 from lowfc.adapters.service import Service
 from lowfc.contract import codec
+from lowfc.contract.calibration_codec import encode_calibration
 from lowfc.contract.configuration import Configuration
 from lowfc.contract.errors import CalibrationError
 from lowfc.contract.messages import (
     CALIBRATION,
     CAMERA_STATE,
     COMMAND,
+    CONTROL_INPUT,
     CONTROLLER_STATE,
     FRAME,
     MIRROR_STATE,
@@ -26,9 +28,10 @@ from lowfc.contract.messages import (
     timestamp,
     wire,
 )
+from lowfc.contract.state_codec import controller_state, reason_counts
 from lowfc.control.calibration import Calibration
 from lowfc.control.durations import Durations
-from lowfc.control.inputs import Input, Load, Outputs, Reply, Request, Tick
+from lowfc.control.inputs import CameraSettings, Input, Load, MirrorShape, Outputs, Reply, Request, Tick
 from lowfc.control.loop import advance
 from lowfc.control.safety import LoopMode
 from lowfc.control.state import State
@@ -63,6 +66,7 @@ class Controller:
         self._camera = service.mailbox(CAMERA_STATE)
         self._commands = service.publisher(COMMAND, name)
         self._steps = service.publisher(STEP)
+        self._inputs = service.publisher(CONTROL_INPUT)
         self._states = service.publisher(CONTROLLER_STATE)
         self._requests = service.publisher(REQUEST)
         self._timings = service.publisher(TIMING)
@@ -72,8 +76,9 @@ class Controller:
         self._timing = wire.ControlTiming()
         self._timing_due_ns = self._state_due_ns = 0
         self._last_frame_ns = service.clock.host_ns()
-        self._tell(self._advance(Load(service.clock.now_ns(), calibration, source)))
-        service.publisher(CALIBRATION).put(codec.encode_calibration(calibration, service.clock.now_ns()))
+        now_ns = service.clock.now_ns()
+        service.publisher(CALIBRATION).put(encode_calibration(calibration, now_ns))
+        self._take(Load(now_ns, calibration, source))
         service.state = "ready"
 
     def run(self) -> None:
@@ -95,7 +100,7 @@ class Controller:
     def fill(self, health: wire.Health) -> None:
         """Add mode, counts and latency to a Health."""
         health.mode = self._state.mode.value  # type: ignore[assignment]  # numbered alike
-        health.counts.extend(codec.reason_counts(self._state))
+        health.counts.extend(reason_counts(self._state))
         if self._frame_to_command.count:
             health.frame_to_command.CopyFrom(codec.latency(self._frame_to_command))
 
@@ -131,9 +136,7 @@ class Controller:
     def _tick(self) -> None:
         """No frame: hold the command."""
         silent_ns = self._service.clock.host_ns() - self._last_frame_ns
-        outputs = self._advance(Tick(self._service.clock.now_ns(), silent_ns))
-        self._send(outputs)
-        self._tell(outputs)
+        self._take(Tick(self._service.clock.now_ns(), silent_ns))
 
     def _between_frames(self) -> None:
         """Apply what operators asked, in the order they asked, and what the camera says of itself."""
@@ -141,7 +144,7 @@ class Controller:
         if camera is not None:
             settings_now = codec.decode_camera(camera.payload)
             if settings_now is not None:
-                self._tell(self._advance(settings_now))
+                self._take(settings_now)
         while self._queries:
             self._answer(self._queries.popleft())
 
@@ -151,13 +154,15 @@ class Controller:
         if request is None:
             request = Request(now_ns, query.name)
             outputs = Outputs(reply=Reply(False, "the request could not be read", self._state.frame_sequence + 1))
+            taken = 0
         else:
             outputs = self._advance(request)
+            taken = self._state.taken
         assert outputs.reply is not None  # noqa: S101  # every request has an answer
         state = None
         if request.name == "status":
-            state = codec.controller_state(self._state, self._settings.delay_frames, now_ns)
-        answer = codec.encode_request(request, outputs.reply, state)
+            state = controller_state(self._state, self._settings, now_ns)
+        answer = codec.encode_request(request, outputs.reply, taken, state)
         query.reply(answer)
         self._requests.put(answer)
         self._tell(outputs)
@@ -177,7 +182,7 @@ class Controller:
                     f"the mirror has {shape.actuators_nm.shape} actuators, the calibration is for {grid}; use the "
                     "mirror's own calibration"
                 )
-            self._tell(self._advance(shape))
+            self._take(shape)
         elif self._service.running:
             self._service.event("MIRROR_SILENT", patience_s=MIRROR_PATIENCE_S)
 
@@ -185,14 +190,23 @@ class Controller:
         self._state, outputs = advance(self._settings, self._state, taken)
         return outputs
 
+    def _take(self, taken: MirrorShape | CameraSettings | Load | Tick) -> None:
+        """Advance by what is neither a frame nor a request, and log it where it made a difference."""
+        before = self._state
+        outputs = self._advance(taken)
+        self._send(outputs)
+        if self._state is not before:
+            self._inputs.put(codec.encode_input(taken, self._state.taken))
+        self._tell(outputs)
+
     def _send(self, outputs: Outputs) -> None:
         if outputs.command is not None:
-            self._commands.put(codec.encode_command(outputs.command, self._valid_ns, CHANNEL))
+            self._commands.put(codec.encode_command(outputs.command, self._valid_ns, CHANNEL, self._state.taken))
 
     def _tell(self, outputs: Outputs) -> None:
         """Publish the step and the events, and the state where more of it changed than the next frame shows."""
         if outputs.step is not None:
-            self._steps.put(codec.encode_step(outputs.step))
+            self._steps.put(codec.encode_step(outputs.step, self._state.taken))
         for event in outputs.events:
             self._service.event(event.name, **event.details)
         if outputs.changed:
@@ -203,7 +217,7 @@ class Controller:
                 self._latch.unlink(missing_ok=True)
 
     def _publish_state(self, time_ns: int) -> None:
-        message = codec.controller_state(self._state, self._settings.delay_frames, time_ns)
+        message = controller_state(self._state, self._settings, time_ns)
         self._states.put(message.SerializeToString())
         self._state_due_ns = time_ns + STATE_PERIOD_NS
 

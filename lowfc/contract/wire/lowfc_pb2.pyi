@@ -98,7 +98,7 @@ class CameraState(_message.Message):
     def __init__(self, timestamp: _Optional[_Union[datetime.datetime, _timestamp_pb2.Timestamp, _Mapping]] = ..., exposure_ns: _Optional[int] = ..., period_ns: _Optional[int] = ..., gain_e_per_dn: _Optional[float] = ..., bias_dn: _Optional[float] = ..., read_noise_e: _Optional[float] = ..., saturation_dn: _Optional[float] = ..., region_row: _Optional[int] = ..., region_column: _Optional[int] = ..., rows: _Optional[int] = ..., columns: _Optional[int] = ..., bit_depth: _Optional[int] = ..., em_gain: _Optional[float] = ...) -> None: ...
 
 class ControlStep(_message.Message):
-    __slots__ = ("timestamp", "frame_sequence", "mode", "error_nm", "pol_nm", "command_nm", "reasons", "flux_dn", "saturated_pixels")
+    __slots__ = ("timestamp", "frame_sequence", "mode", "error_nm", "pol_nm", "command_nm", "reasons", "flux_dn", "saturated_pixels", "taken")
     TIMESTAMP_FIELD_NUMBER: _ClassVar[int]
     FRAME_SEQUENCE_FIELD_NUMBER: _ClassVar[int]
     MODE_FIELD_NUMBER: _ClassVar[int]
@@ -108,6 +108,7 @@ class ControlStep(_message.Message):
     REASONS_FIELD_NUMBER: _ClassVar[int]
     FLUX_DN_FIELD_NUMBER: _ClassVar[int]
     SATURATED_PIXELS_FIELD_NUMBER: _ClassVar[int]
+    TAKEN_FIELD_NUMBER: _ClassVar[int]
     timestamp: _timestamp_pb2.Timestamp
     frame_sequence: int
     mode: LoopMode
@@ -117,7 +118,42 @@ class ControlStep(_message.Message):
     reasons: _containers.RepeatedScalarFieldContainer[Reason]
     flux_dn: float
     saturated_pixels: int
-    def __init__(self, timestamp: _Optional[_Union[datetime.datetime, _timestamp_pb2.Timestamp, _Mapping]] = ..., frame_sequence: _Optional[int] = ..., mode: _Optional[_Union[LoopMode, str]] = ..., error_nm: _Optional[_Iterable[float]] = ..., pol_nm: _Optional[_Iterable[float]] = ..., command_nm: _Optional[_Iterable[float]] = ..., reasons: _Optional[_Iterable[_Union[Reason, str]]] = ..., flux_dn: _Optional[float] = ..., saturated_pixels: _Optional[int] = ...) -> None: ...
+    taken: int
+    def __init__(self, timestamp: _Optional[_Union[datetime.datetime, _timestamp_pb2.Timestamp, _Mapping]] = ..., frame_sequence: _Optional[int] = ..., mode: _Optional[_Union[LoopMode, str]] = ..., error_nm: _Optional[_Iterable[float]] = ..., pol_nm: _Optional[_Iterable[float]] = ..., command_nm: _Optional[_Iterable[float]] = ..., reasons: _Optional[_Iterable[_Union[Reason, str]]] = ..., flux_dn: _Optional[float] = ..., saturated_pixels: _Optional[int] = ..., taken: _Optional[int] = ...) -> None: ...
+
+class Tick(_message.Message):
+    __slots__ = ("timestamp", "silent_ns")
+    TIMESTAMP_FIELD_NUMBER: _ClassVar[int]
+    SILENT_NS_FIELD_NUMBER: _ClassVar[int]
+    timestamp: _timestamp_pb2.Timestamp
+    silent_ns: int
+    def __init__(self, timestamp: _Optional[_Union[datetime.datetime, _timestamp_pb2.Timestamp, _Mapping]] = ..., silent_ns: _Optional[int] = ...) -> None: ...
+
+class Load(_message.Message):
+    __slots__ = ("timestamp", "calibration_id", "source")
+    TIMESTAMP_FIELD_NUMBER: _ClassVar[int]
+    CALIBRATION_ID_FIELD_NUMBER: _ClassVar[int]
+    SOURCE_FIELD_NUMBER: _ClassVar[int]
+    timestamp: _timestamp_pb2.Timestamp
+    calibration_id: str
+    source: str
+    def __init__(self, timestamp: _Optional[_Union[datetime.datetime, _timestamp_pb2.Timestamp, _Mapping]] = ..., calibration_id: _Optional[str] = ..., source: _Optional[str] = ...) -> None: ...
+
+class ControlInput(_message.Message):
+    __slots__ = ("timestamp", "taken", "load", "mirror", "camera", "tick")
+    TIMESTAMP_FIELD_NUMBER: _ClassVar[int]
+    TAKEN_FIELD_NUMBER: _ClassVar[int]
+    LOAD_FIELD_NUMBER: _ClassVar[int]
+    MIRROR_FIELD_NUMBER: _ClassVar[int]
+    CAMERA_FIELD_NUMBER: _ClassVar[int]
+    TICK_FIELD_NUMBER: _ClassVar[int]
+    timestamp: _timestamp_pb2.Timestamp
+    taken: int
+    load: Load
+    mirror: MirrorState
+    camera: CameraState
+    tick: Tick
+    def __init__(self, timestamp: _Optional[_Union[datetime.datetime, _timestamp_pb2.Timestamp, _Mapping]] = ..., taken: _Optional[int] = ..., load: _Optional[_Union[Load, _Mapping]] = ..., mirror: _Optional[_Union[MirrorState, _Mapping]] = ..., camera: _Optional[_Union[CameraState, _Mapping]] = ..., tick: _Optional[_Union[Tick, _Mapping]] = ...) -> None: ...
 
 class ControlTiming(_message.Message):
     __slots__ = ("timestamp", "frame_sequence", "transport_ns", "wakeup_ns", "compute_ns", "publish_ns", "frame_to_command_ns")
@@ -145,8 +181,38 @@ class ReasonCount(_message.Message):
     count: int
     def __init__(self, reason: _Optional[_Union[Reason, str]] = ..., count: _Optional[int] = ...) -> None: ...
 
+class ControllerSettings(_message.Message):
+    __slots__ = ("stroke_nm", "slew_nm", "neighbour_nm", "delay_frames", "start_mode", "late_ns", "hold_ns", "silence", "least_flux", "most_saturated", "gain", "leak", "limit_nm")
+    STROKE_NM_FIELD_NUMBER: _ClassVar[int]
+    SLEW_NM_FIELD_NUMBER: _ClassVar[int]
+    NEIGHBOUR_NM_FIELD_NUMBER: _ClassVar[int]
+    DELAY_FRAMES_FIELD_NUMBER: _ClassVar[int]
+    START_MODE_FIELD_NUMBER: _ClassVar[int]
+    LATE_NS_FIELD_NUMBER: _ClassVar[int]
+    HOLD_NS_FIELD_NUMBER: _ClassVar[int]
+    SILENCE_FIELD_NUMBER: _ClassVar[int]
+    LEAST_FLUX_FIELD_NUMBER: _ClassVar[int]
+    MOST_SATURATED_FIELD_NUMBER: _ClassVar[int]
+    GAIN_FIELD_NUMBER: _ClassVar[int]
+    LEAK_FIELD_NUMBER: _ClassVar[int]
+    LIMIT_NM_FIELD_NUMBER: _ClassVar[int]
+    stroke_nm: float
+    slew_nm: float
+    neighbour_nm: float
+    delay_frames: float
+    start_mode: LoopMode
+    late_ns: int
+    hold_ns: int
+    silence: str
+    least_flux: float
+    most_saturated: int
+    gain: _containers.RepeatedScalarFieldContainer[float]
+    leak: _containers.RepeatedScalarFieldContainer[float]
+    limit_nm: _containers.RepeatedScalarFieldContainer[float]
+    def __init__(self, stroke_nm: _Optional[float] = ..., slew_nm: _Optional[float] = ..., neighbour_nm: _Optional[float] = ..., delay_frames: _Optional[float] = ..., start_mode: _Optional[_Union[LoopMode, str]] = ..., late_ns: _Optional[int] = ..., hold_ns: _Optional[int] = ..., silence: _Optional[str] = ..., least_flux: _Optional[float] = ..., most_saturated: _Optional[int] = ..., gain: _Optional[_Iterable[float]] = ..., leak: _Optional[_Iterable[float]] = ..., limit_nm: _Optional[_Iterable[float]] = ...) -> None: ...
+
 class ControllerState(_message.Message):
-    __slots__ = ("timestamp", "frame_sequence", "mode", "calibration_id", "gain", "leak", "limit_nm", "delay_frames", "command_history_nm", "actuators", "offset", "counts", "frames_used")
+    __slots__ = ("timestamp", "frame_sequence", "mode", "calibration_id", "gain", "leak", "limit_nm", "delay_frames", "command_history_nm", "actuators", "offset", "counts", "frames_used", "frame_timestamp", "refused", "refused_count", "limits_hit", "silent", "commanded", "taken", "settings")
     TIMESTAMP_FIELD_NUMBER: _ClassVar[int]
     FRAME_SEQUENCE_FIELD_NUMBER: _ClassVar[int]
     MODE_FIELD_NUMBER: _ClassVar[int]
@@ -160,6 +226,14 @@ class ControllerState(_message.Message):
     OFFSET_FIELD_NUMBER: _ClassVar[int]
     COUNTS_FIELD_NUMBER: _ClassVar[int]
     FRAMES_USED_FIELD_NUMBER: _ClassVar[int]
+    FRAME_TIMESTAMP_FIELD_NUMBER: _ClassVar[int]
+    REFUSED_FIELD_NUMBER: _ClassVar[int]
+    REFUSED_COUNT_FIELD_NUMBER: _ClassVar[int]
+    LIMITS_HIT_FIELD_NUMBER: _ClassVar[int]
+    SILENT_FIELD_NUMBER: _ClassVar[int]
+    COMMANDED_FIELD_NUMBER: _ClassVar[int]
+    TAKEN_FIELD_NUMBER: _ClassVar[int]
+    SETTINGS_FIELD_NUMBER: _ClassVar[int]
     timestamp: _timestamp_pb2.Timestamp
     frame_sequence: int
     mode: LoopMode
@@ -173,10 +247,18 @@ class ControllerState(_message.Message):
     offset: bytes
     counts: _containers.RepeatedCompositeFieldContainer[ReasonCount]
     frames_used: int
-    def __init__(self, timestamp: _Optional[_Union[datetime.datetime, _timestamp_pb2.Timestamp, _Mapping]] = ..., frame_sequence: _Optional[int] = ..., mode: _Optional[_Union[LoopMode, str]] = ..., calibration_id: _Optional[str] = ..., gain: _Optional[_Iterable[float]] = ..., leak: _Optional[_Iterable[float]] = ..., limit_nm: _Optional[_Iterable[float]] = ..., delay_frames: _Optional[float] = ..., command_history_nm: _Optional[_Iterable[float]] = ..., actuators: _Optional[bytes] = ..., offset: _Optional[bytes] = ..., counts: _Optional[_Iterable[_Union[ReasonCount, _Mapping]]] = ..., frames_used: _Optional[int] = ...) -> None: ...
+    frame_timestamp: _timestamp_pb2.Timestamp
+    refused: Reason
+    refused_count: int
+    limits_hit: _containers.RepeatedScalarFieldContainer[Reason]
+    silent: bool
+    commanded: bool
+    taken: int
+    settings: ControllerSettings
+    def __init__(self, timestamp: _Optional[_Union[datetime.datetime, _timestamp_pb2.Timestamp, _Mapping]] = ..., frame_sequence: _Optional[int] = ..., mode: _Optional[_Union[LoopMode, str]] = ..., calibration_id: _Optional[str] = ..., gain: _Optional[_Iterable[float]] = ..., leak: _Optional[_Iterable[float]] = ..., limit_nm: _Optional[_Iterable[float]] = ..., delay_frames: _Optional[float] = ..., command_history_nm: _Optional[_Iterable[float]] = ..., actuators: _Optional[bytes] = ..., offset: _Optional[bytes] = ..., counts: _Optional[_Iterable[_Union[ReasonCount, _Mapping]]] = ..., frames_used: _Optional[int] = ..., frame_timestamp: _Optional[_Union[datetime.datetime, _timestamp_pb2.Timestamp, _Mapping]] = ..., refused: _Optional[_Union[Reason, str]] = ..., refused_count: _Optional[int] = ..., limits_hit: _Optional[_Iterable[_Union[Reason, str]]] = ..., silent: _Optional[bool] = ..., commanded: _Optional[bool] = ..., taken: _Optional[int] = ..., settings: _Optional[_Union[ControllerSettings, _Mapping]] = ...) -> None: ...
 
 class Request(_message.Message):
-    __slots__ = ("timestamp", "name", "modes", "values", "text", "accepted", "reply", "frame_sequence", "state")
+    __slots__ = ("timestamp", "name", "modes", "values", "text", "accepted", "reply", "frame_sequence", "state", "taken")
     TIMESTAMP_FIELD_NUMBER: _ClassVar[int]
     NAME_FIELD_NUMBER: _ClassVar[int]
     MODES_FIELD_NUMBER: _ClassVar[int]
@@ -186,6 +268,7 @@ class Request(_message.Message):
     REPLY_FIELD_NUMBER: _ClassVar[int]
     FRAME_SEQUENCE_FIELD_NUMBER: _ClassVar[int]
     STATE_FIELD_NUMBER: _ClassVar[int]
+    TAKEN_FIELD_NUMBER: _ClassVar[int]
     timestamp: _timestamp_pb2.Timestamp
     name: str
     modes: _containers.RepeatedScalarFieldContainer[int]
@@ -195,10 +278,11 @@ class Request(_message.Message):
     reply: str
     frame_sequence: int
     state: ControllerState
-    def __init__(self, timestamp: _Optional[_Union[datetime.datetime, _timestamp_pb2.Timestamp, _Mapping]] = ..., name: _Optional[str] = ..., modes: _Optional[_Iterable[int]] = ..., values: _Optional[_Iterable[float]] = ..., text: _Optional[str] = ..., accepted: _Optional[bool] = ..., reply: _Optional[str] = ..., frame_sequence: _Optional[int] = ..., state: _Optional[_Union[ControllerState, _Mapping]] = ...) -> None: ...
+    taken: int
+    def __init__(self, timestamp: _Optional[_Union[datetime.datetime, _timestamp_pb2.Timestamp, _Mapping]] = ..., name: _Optional[str] = ..., modes: _Optional[_Iterable[int]] = ..., values: _Optional[_Iterable[float]] = ..., text: _Optional[str] = ..., accepted: _Optional[bool] = ..., reply: _Optional[str] = ..., frame_sequence: _Optional[int] = ..., state: _Optional[_Union[ControllerState, _Mapping]] = ..., taken: _Optional[int] = ...) -> None: ...
 
 class MirrorCommand(_message.Message):
-    __slots__ = ("timestamp", "frame_sequence", "channel", "valid_for_ns", "rows", "columns", "actuators", "command_nm")
+    __slots__ = ("timestamp", "frame_sequence", "channel", "valid_for_ns", "rows", "columns", "actuators", "command_nm", "taken")
     TIMESTAMP_FIELD_NUMBER: _ClassVar[int]
     FRAME_SEQUENCE_FIELD_NUMBER: _ClassVar[int]
     CHANNEL_FIELD_NUMBER: _ClassVar[int]
@@ -207,6 +291,7 @@ class MirrorCommand(_message.Message):
     COLUMNS_FIELD_NUMBER: _ClassVar[int]
     ACTUATORS_FIELD_NUMBER: _ClassVar[int]
     COMMAND_NM_FIELD_NUMBER: _ClassVar[int]
+    TAKEN_FIELD_NUMBER: _ClassVar[int]
     timestamp: _timestamp_pb2.Timestamp
     frame_sequence: int
     channel: str
@@ -215,7 +300,8 @@ class MirrorCommand(_message.Message):
     columns: int
     actuators: bytes
     command_nm: _containers.RepeatedScalarFieldContainer[float]
-    def __init__(self, timestamp: _Optional[_Union[datetime.datetime, _timestamp_pb2.Timestamp, _Mapping]] = ..., frame_sequence: _Optional[int] = ..., channel: _Optional[str] = ..., valid_for_ns: _Optional[int] = ..., rows: _Optional[int] = ..., columns: _Optional[int] = ..., actuators: _Optional[bytes] = ..., command_nm: _Optional[_Iterable[float]] = ...) -> None: ...
+    taken: int
+    def __init__(self, timestamp: _Optional[_Union[datetime.datetime, _timestamp_pb2.Timestamp, _Mapping]] = ..., frame_sequence: _Optional[int] = ..., channel: _Optional[str] = ..., valid_for_ns: _Optional[int] = ..., rows: _Optional[int] = ..., columns: _Optional[int] = ..., actuators: _Optional[bytes] = ..., command_nm: _Optional[_Iterable[float]] = ..., taken: _Optional[int] = ...) -> None: ...
 
 class MirrorState(_message.Message):
     __slots__ = ("timestamp", "frame_sequence", "status", "rows", "columns", "actuators", "command_nm", "limits_hit", "channels")

@@ -1,0 +1,81 @@
+"""Calibrations as messages, both ways, and their identity."""
+
+import hashlib
+from dataclasses import fields, replace
+
+import numpy as np
+import numpy.typing as npt
+
+from lowfc.contract.messages import timestamp, wire
+from lowfc.control.calibration import Calibration
+from lowfc.optics.zernike import mode_name
+
+
+def encode_calibration(calibration: Calibration, time_ns: int) -> bytes:
+    """Calibration as a message."""
+    message = wire.Calibration(
+        timestamp=timestamp(time_ns),
+        id=calibration.id,
+        operator_hash=calibration.operator_hash,
+        estimator=calibration.estimator,
+        noll=calibration.noll,
+        mode_names=[mode_name(index) for index in calibration.noll],
+        wavelength_nm=calibration.wavelength_nm,
+        rows=calibration.shape[0],
+        columns=calibration.shape[1],
+        reference=calibration.reference.tobytes(),
+        response=calibration.response.tobytes(),
+        reconstructor=calibration.reconstructor.tobytes(),
+        mask=calibration.good.astype(np.uint8).tobytes(),
+        dark=calibration.dark.tobytes(),
+        flux_dn=calibration.flux_dn,
+        saturation_dn=calibration.saturation_dn,
+        mirror_rows=calibration.grid[0],
+        mirror_columns=calibration.grid[1],
+        modes_to_actuators=calibration.modes_to_actuators.tobytes(),
+    )
+    return message.SerializeToString()
+
+
+def identified(calibration: Calibration) -> Calibration:
+    """The same calibration with its identity: SHA-256 of everything else in it."""
+    digest = hashlib.sha256()
+    for part in fields(calibration):
+        if part.name != "id":
+            value = getattr(calibration, part.name)
+            digest.update(part.name.encode())
+            digest.update(value.tobytes() if isinstance(value, np.ndarray) else repr(value).encode())
+    return replace(calibration, id=digest.hexdigest())
+
+
+def decode_calibration(message: wire.Calibration) -> Calibration:
+    """Calibration of a message.
+
+    Raises:
+        ValueError: it is not whole, or not the one that its identity says.
+    """
+    pixels, modes = message.rows * message.columns, len(message.noll)
+
+    def single(data: bytes, *shape: int) -> npt.NDArray[np.float32]:
+        return np.frombuffer(data, dtype="<f4").reshape(shape)
+
+    calibration = Calibration(
+        noll=tuple(message.noll),
+        reference=single(message.reference, pixels),
+        response=single(message.response, pixels, modes),
+        reconstructor=single(message.reconstructor, modes, pixels),
+        good=np.frombuffer(message.mask, dtype=np.uint8).astype(np.float32),
+        dark=single(message.dark, pixels),
+        modes_to_actuators=single(message.modes_to_actuators, message.mirror_rows * message.mirror_columns, modes),
+        shape=(message.rows, message.columns),
+        grid=(message.mirror_rows, message.mirror_columns),
+        flux_dn=message.flux_dn,
+        saturation_dn=message.saturation_dn,
+        estimator=message.estimator,
+        wavelength_nm=message.wavelength_nm,
+        operator_hash=message.operator_hash,
+        id=message.id,
+    )
+    if identified(calibration).id != message.id:
+        raise ValueError(f"calibration {message.id[:12]} is not whole: its content has another identity")
+    return calibration

@@ -1,0 +1,120 @@
+"""The controller's state and settings as a message, both ways: whoever reads it goes on with the same next command."""
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from lowfc.contract.codec import wire_mode, wire_reasons
+from lowfc.contract.messages import from_timestamp, timestamp, wire
+from lowfc.control.calibration import Calibration
+from lowfc.control.law import Law
+from lowfc.control.safety import Limits, LoopMode, Reason
+from lowfc.control.state import Drive, Settings, State
+
+
+def controller_state(state: State, settings: Settings, time_ns: int) -> wire.ControllerState:
+    """Everything the next command depends on, besides the calibration."""
+    message = wire.ControllerState(
+        timestamp=timestamp(time_ns),
+        frame_sequence=state.frame_sequence,
+        frame_timestamp=timestamp(state.frame_time_ns),
+        mode=wire_mode(state.mode),
+        delay_frames=settings.delay_frames,
+        counts=reason_counts(state),
+        frames_used=state.frames_used,
+        refused=wire_reasons((state.refused,))[0] if state.refused is not None else wire.REASON_UNSPECIFIED,
+        refused_count=state.refused_count,
+        limits_hit=wire_reasons(state.limits_hit),
+        silent=state.silent,
+        commanded=state.commanded,
+        taken=state.taken,
+        settings=_encode_settings(settings),
+    )
+    if state.drive is not None:
+        message.calibration_id = state.drive.calibration.id
+        message.gain.extend(state.drive.law.gain.tolist())
+        message.leak.extend(state.drive.law.leak.tolist())
+        message.limit_nm.extend(state.drive.law.limit_nm.tolist())
+        message.command_history_nm.extend(np.concatenate(state.drive.history_nm).tolist())
+        message.actuators = state.drive.actuators_nm.tobytes()
+    return message
+
+
+def decode_state(message: wire.ControllerState, calibration: Calibration | None) -> tuple[Settings, State]:
+    """Settings and state of a message; `calibration` is the one that it names.
+
+    Raises:
+        ValueError: the message is not whole, or the calibration is another one.
+    """
+    settings = _decode_settings(message.settings)
+    drive = None
+    if message.calibration_id:
+        if calibration is None or calibration.id != message.calibration_id:
+            raise ValueError(f"calibration {message.calibration_id[:12]} of the controller's state is not there")
+        drive = Drive.at_rest(settings, calibration)
+        law = Law(*(np.array(values, np.float32) for values in (message.gain, message.leak, message.limit_nm)))
+        history = np.array(message.command_history_nm, np.float32).reshape(len(drive.weights), -1)
+        actuators = np.frombuffer(message.actuators, "<f4").reshape(calibration.grid)
+        if law.gain.shape != drive.law.gain.shape or history.shape[1] != len(calibration.noll):
+            raise ValueError(f"the controller's state is not of {len(calibration.noll)} modes")
+        drive = drive._replace(law=law, history_nm=tuple(history), actuators_nm=actuators)
+    state = State(
+        mode=LoopMode(message.mode),
+        drive=drive,
+        frame_sequence=message.frame_sequence,
+        frame_time_ns=from_timestamp(message.frame_timestamp),
+        frames_used=message.frames_used,
+        refused=Reason(message.refused) if message.refused else None,
+        refused_count=message.refused_count,
+        limits_hit=tuple(Reason(reason) for reason in message.limits_hit),
+        silent=message.silent,
+        commanded=message.commanded,
+        counts={Reason(line.reason): line.count for line in message.counts},
+        taken=message.taken,
+    )
+    return settings, state
+
+
+def reason_counts(state: State) -> list[wire.ReasonCount]:
+    """How often each reason was given."""
+    pairs = zip(wire_reasons(tuple(state.counts)), state.counts.values(), strict=True)
+    return [wire.ReasonCount(reason=reason, count=count) for reason, count in pairs]
+
+
+def _encode_settings(settings: Settings) -> wire.ControllerSettings:
+    return wire.ControllerSettings(
+        stroke_nm=settings.limits.stroke_nm,
+        slew_nm=settings.limits.slew_nm,
+        neighbour_nm=settings.limits.neighbour_nm,
+        delay_frames=settings.delay_frames,
+        start_mode=wire_mode(settings.start_mode),
+        late_ns=settings.late_ns,
+        hold_ns=settings.hold_ns,
+        silence=settings.silence,
+        least_flux=settings.least_flux,
+        most_saturated=settings.most_saturated,
+        gain=settings.gain,
+        leak=settings.leak,
+        limit_nm=settings.limit_nm,
+    )
+
+
+def _decode_settings(message: wire.ControllerSettings) -> Settings:
+    return Settings(
+        limits=Limits(message.stroke_nm, message.slew_nm, message.neighbour_nm),
+        delay_frames=message.delay_frames,
+        start_mode=LoopMode(message.start_mode),
+        late_ns=message.late_ns,
+        hold_ns=message.hold_ns,
+        silence=message.silence,
+        least_flux=message.least_flux,
+        most_saturated=message.most_saturated,
+        gain=_pair(message.gain),
+        leak=_pair(message.leak),
+        limit_nm=_pair(message.limit_nm),
+    )
+
+
+def _pair(values: Sequence[float]) -> tuple[float, float]:
+    tilt, others = values
+    return tilt, others
