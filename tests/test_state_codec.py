@@ -4,55 +4,19 @@ from dataclasses import fields, replace
 
 import numpy as np
 import pytest
+from happenings import CALIBRATION, TIGHT, inputs
 from hypothesis import given
 from hypothesis import settings as effort
 from hypothesis import strategies as st
-from toy import NOLL, calibration, frame, loaded, settings
+from toy import frame, loaded, settings
 
 from lowfc.contract import codec
-from lowfc.contract.calibration_codec import decode_calibration, encode_calibration, identified
+from lowfc.contract.calibration_codec import decode_calibration, encode_calibration
 from lowfc.contract.messages import wire
 from lowfc.contract.state_codec import controller_state, decode_state
 from lowfc.control.inputs import CameraSettings, Frame, Input, Load, MirrorShape, Outputs, Request, Tick
 from lowfc.control.loop import advance
 from lowfc.control.state import Settings, State
-
-CALIBRATION = identified(calibration())
-TIGHT = {"limit_nm": (15.0, 8.0), "most_saturated": 0}
-MS = 1_000_000
-
-
-@st.composite
-def inputs(draw: st.DrawFn) -> list[Input]:
-    """What may come to a controller, in any order: good and bad frames, gaps, silence, operators, devices."""
-    taken: list[Input] = []
-    count = 0
-    for kind in draw(st.lists(st.sampled_from("fffffbltrmcs"), min_size=1, max_size=40)):
-        seed = draw(st.integers(0, 1 << 16))
-        rng = np.random.default_rng(seed)
-        match kind:
-            case "f":
-                count += 1 + (seed % 7 == 0) * 3
-                taken.append(frame(count, rng.normal(0, 20, len(NOLL))))
-            case "b":
-                bad: dict[str, object] = {"pixels": None} if seed % 2 else {"sequence": 5}
-                taken.append(frame(count, **bad))
-            case "l":
-                count += 1
-                taken.append(frame(count, age_ns=10**9))
-            case "t":
-                taken.append(Tick(seed, seed * 2_000))
-            case "r":
-                name = ("gain", "leak", "status", "open", "safe", "clear", "nonsense")[seed % 7]
-                taken.append(Request(seed, name, (), (float(np.float32(rng.uniform(0, 1))),)))
-            case "m":
-                shape = rng.normal(0, 30, CALIBRATION.grid).astype(np.float32)
-                taken.append(MirrorShape(seed, shape, rng.normal(0, 5, 3).astype(np.float32)))
-            case "c":
-                taken.append(CameraSettings(seed, CALIBRATION.shape, 7.0, CALIBRATION.saturation_dn))
-            case "s":
-                taken += [Request(seed, "clear"), Request(seed, "close")]
-    return taken
 
 
 def said(outputs: Outputs, taken: int) -> tuple[object, ...]:

@@ -1,0 +1,87 @@
+"""What two messages of one kind say differently, field by field."""
+
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+from google.protobuf.descriptor import FieldDescriptor
+from google.protobuf.message import Message
+
+_FLOAT32_FIELDS = ("actuators", "offset")
+"""Bytes that hold little-endian float32, nm."""
+_SHOWN = 4
+
+
+@dataclass(slots=True)
+class Difference:
+    """The log's message and the replayed one.
+
+    Attributes:
+        what: kind of the message, such as ControlStep.
+        taken: which input of the controller it belongs to.
+        frame_sequence: of the newest frame then.
+        fields: sentences, one for each field that differs.
+        largest_nm: largest difference of a number in nm.
+        otherwise: something else than numbers in nm differs.
+    """
+
+    what: str
+    taken: int
+    frame_sequence: int
+    fields: list[str] = field(default_factory=list)
+    largest_nm: float = 0.0
+    otherwise: bool = False
+
+
+def difference(taken: int, frame_sequence: int, logged: Message, replayed: Message | None) -> Difference:
+    """Compare a message of the log with the replayed one, which is None where the replay sent nothing."""
+    found = Difference(logged.DESCRIPTOR.name, taken, frame_sequence)
+    if replayed is None:
+        found.fields.append("the replay sends none")
+        found.otherwise = True
+    else:
+        _compare(found, "", logged, replayed)
+    return found
+
+
+def _compare(found: Difference, prefix: str, logged: Message, replayed: Message) -> None:
+    for descriptor in logged.DESCRIPTOR.fields:
+        name = descriptor.name
+        was, now = getattr(logged, name), getattr(replayed, name)
+        if was == now:
+            continue
+        if descriptor.type == FieldDescriptor.TYPE_MESSAGE and not descriptor.is_repeated:
+            _compare(found, f"{prefix}{name}.", was, now)
+            continue
+        before, after = _numbers(descriptor, was), _numbers(descriptor, now)
+        if before is None or after is None or before.shape != after.shape or not name.endswith(("_nm", "actuators")):
+            found.fields.append(f"{prefix}{name}: log {_short(was)}, replay {_short(now)}")
+            found.otherwise = True
+        else:
+            _numbers_differ(found, prefix + name, before, after)
+
+
+def _numbers_differ(
+    found: Difference, name: str, before: npt.NDArray[np.float64], after: npt.NDArray[np.float64]
+) -> None:
+    apart = np.abs(after - before)
+    places = np.flatnonzero(apart)
+    shown = ", ".join(f"[{place}] log {before[place]:.9g}, replay {after[place]:.9g}" for place in places[:_SHOWN])
+    more = f" and {len(places) - _SHOWN} more" if len(places) > _SHOWN else ""
+    found.fields.append(f"{name}: {shown}{more}; at most {apart.max():.3g} nm apart")
+    found.largest_nm = max(found.largest_nm, float(apart.max()))
+
+
+def _numbers(descriptor: Any, value: Any) -> npt.NDArray[np.float64] | None:
+    """Numbers of a field as an array; None where it holds none."""
+    if descriptor.name in _FLOAT32_FIELDS:
+        return np.frombuffer(value, "<f4").astype(float) if len(value) % 4 == 0 else None
+    if descriptor.type in (FieldDescriptor.TYPE_FLOAT, FieldDescriptor.TYPE_DOUBLE):
+        return np.atleast_1d(np.array(value, float))
+    return None
+
+
+def _short(value: object) -> str:
+    text = " ".join(str(value).split()) or "nothing"
+    return text if len(text) <= 80 else text[:77] + "..."
