@@ -1,6 +1,7 @@
 """Replay finds what is the same, says what is not, and counts what it cannot know."""
 
 from dataclasses import replace as changed
+from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -35,7 +36,7 @@ from lowfc.contract.state_codec import controller_state
 from lowfc.control.inputs import Frame, Input, Load, Request
 from lowfc.control.loop import advance
 from lowfc.control.state import Settings, State
-from lowfc.programs.replay import PATIENCE_NS, Account, replay
+from lowfc.programs.replay import PATIENCE_NS, Account, Share, replay
 
 START_S = 1_767_225_600
 STATE_EVERY = 12
@@ -172,6 +173,27 @@ def test_the_order_between_publishers_does_not_matter(taken: list[Input], random
     account = replay(shuffled)
     assert account.identical
     assert account.frames == made.steps()
+
+
+@effort(deadline=None)
+@given(inputs(), inputs(), st.randoms(use_true_random=False), st.integers(1, 4), st.booleans())
+def test_shares_are_together_what_the_whole_is(
+    before: list[Input], after: list[Input], random: st.DataObject, shares: int, lossy: bool
+) -> None:
+    made = night([*before, *frames(40, 9000)])
+    made.restart()
+    for one in of_another_camera([*after, *frames(40, 9000)]):
+        made.take(one)
+    messages = list(made.messages)
+    if lossy:
+        messages.pop(random.randrange(len(messages)))  # type: ignore[attr-defined]
+    first_ns, last_ns = messages[0].log_time_ns, messages[-1].log_time_ns
+    edges = sorted(random.randrange(first_ns, last_ns) for _ in range(shares))  # type: ignore[attr-defined]
+    whole = replay(messages)
+    parts = [replay(messages, share=Share(begin, end)) for begin, end in pairwise([0, *edges, 1 << 63])]
+    for count in ("frames", "commands", "requests", "different"):
+        assert sum(getattr(part, count) for part in parts) == getattr(whole, count), count
+    assert sum(sum(part.unchecked.values()) for part in parts) == sum(whole.unchecked.values())
 
 
 def test_a_log_that_begins_in_the_middle_is_replayed_from_its_first_state() -> None:

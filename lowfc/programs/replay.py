@@ -129,33 +129,56 @@ class Frames:
         return next((frame for frame in found if frame.time_ns == time_ns), None)
 
 
-class Lane:
-    """One start of a controller: its inputs in the order it took them, folded again."""
+@dataclass(frozen=True, slots=True)
+class Share:
+    """The part of a log that one worker replays: from the first state at `from_ns` to the first one at `until_ns`.
 
-    def __init__(self, frames: Frames, calibrations: dict[str, Calibration], account: Account, tolerance_nm: float):
+    Log times; a worker is given the messages around its share too.
+    """
+
+    from_ns: int = 0
+    until_ns: int = 1 << 63
+
+
+class Lane:
+    """One start of a controller: its inputs in the order it took them, folded again.
+
+    Attributes:
+        done: the state where the next share begins has been reached.
+    """
+
+    def __init__(
+        self, frames: Frames, calibrations: dict[str, Calibration], account: Account, tolerance_nm: float, share: Share
+    ) -> None:
+        self.done = False
         self._frames = frames
         self._calibrations = calibrations
         self._account = account
         self._tolerance_nm = tolerance_nm
+        self._share = share
+        self._last: int | None = None
         self._entries: dict[int, _Entry] = {}
         self._states: dict[int, wire.ControllerState] = {}
         self._settings: Settings | None = None
         self._state: State | None = None
         self._past: deque[State] = deque(maxlen=_STATES_KEPT)
-        self._why = _BEFORE
+        self._why = _BEFORE if not share.from_ns else ""
 
     def take(self, message: Logged, kind: type[Message]) -> None:
         """Take one of the controller's messages; the fold goes on as far as it can."""
+        if self.done:
+            return
         body = kind.FromString(message.payload)
         if isinstance(body, wire.ControllerState):
-            self._take_state(body)
+            self._take_state(body, message.log_time_ns)
         else:
             number: int = body.taken  # type: ignore[attr-defined]  # all others of the controller have it
             if not number:
                 self._unnumbered(kind)
                 return
             if self._state is not None and number <= self._state.taken:  # recorded after the state that it led to
-                self._account.leave_out(_BEFORE, int(kind is wire.ControlStep))
+                if not self._share.from_ns:
+                    self._account.leave_out(_BEFORE, int(kind is wire.ControlStep))
                 return
             entry = self._entries.get(number)
             if entry is None:
@@ -176,7 +199,7 @@ class Lane:
 
     def go_on(self, now_ns: int, *, ended: bool = False) -> None:
         """Take every input that is complete, or too old to become so; all that is left when the log has `ended`."""
-        while self._entries or self._states:
+        while (self._entries or self._states) and not self.done:
             if self._state is None and not self._adopt():
                 if ended:
                     self._leave_out(len(self._entries))
@@ -202,7 +225,11 @@ class Lane:
             else:
                 return
 
-    def _take_state(self, message: wire.ControllerState) -> None:
+    def _take_state(self, message: wire.ControllerState, log_time_ns: int) -> None:
+        if log_time_ns < self._share.from_ns:
+            return
+        if log_time_ns >= self._share.until_ns:
+            self._last = message.taken if self._last is None else min(self._last, message.taken)
         past = next((state for state in self._past if state.taken == message.taken), None)
         if past is not None:
             self._compare_state(past, message)
@@ -222,14 +249,16 @@ class Lane:
             self._settings, self._state = settings, state
             self._past.append(state)
             self._leave_out(number)
-            return True
+            self.done = number == self._last
+            return not self.done
         return False
 
     def _leave_out(self, upto: int) -> None:
         """Forget the inputs up to a number, and count their steps as unchecked."""
         gone = [number for number in self._entries if number <= upto or not self._state]
         steps = sum(isinstance(self._entries.pop(number).taken, wire.ControlStep) for number in gone)
-        self._account.leave_out(self._why, steps)
+        if self._why:  # else they are another share's
+            self._account.leave_out(self._why, steps)
 
     def _lose(self, why: str) -> None:
         self._why = why
@@ -285,11 +314,12 @@ class Lane:
     def _compare_state(self, state: State, logged: wire.ControllerState) -> None:
         assert self._settings is not None  # noqa: S101
         self._account.states += 1
+        self.done = state.taken == self._last
         replayed = controller_state(state, self._settings, from_timestamp(logged.timestamp))
         if replayed == logged:
             return
         self._account.enter(difference(state.taken, state.frame_sequence, logged, replayed), self._tolerance_nm)
-        if self._state is state:  # so that what differs here does not differ for the rest of the log
+        if self._state is state and not self.done:  # or what differs here would differ for the rest of the log
             self._states[state.taken] = logged
             self._lose("")
             self._adopt()
@@ -306,10 +336,11 @@ class Lane:
 class Replay:
     """Takes the messages of a log, or of several that follow each other, and keeps the account."""
 
-    def __init__(self, tolerance_nm: float = 0.0) -> None:
+    def __init__(self, tolerance_nm: float = 0.0, share: Share = Share()) -> None:
         """Differences up to `tolerance_nm` are none: for a log of another kind of processor."""
         self.account = Account()
         self._tolerance_nm = tolerance_nm
+        self._share = share
         self._frames = Frames()
         self._calibrations: dict[str, Calibration] = {}
         self._lanes: dict[int, Lane] = {}
@@ -332,8 +363,14 @@ class Replay:
             with contextlib.suppress(DecodeError):  # its number is missing then, which the fold will find
                 self._lane(start_of(message.sequence)).take(message, topic.message)
 
+    @property
+    def done(self) -> bool:
+        """Whether the share has been replayed: no controller has anything more to say about it."""
+        beyond_ns = self._last_ns - self._share.until_ns
+        return beyond_ns > PATIENCE_NS and (beyond_ns > 5 * PATIENCE_NS or all(x.done for x in self._lanes.values()))
+
     def finish(self) -> Account:
-        """The log has ended."""
+        """The log, or the share, has ended."""
         for lane in self._lanes.values():
             lane.go_on(self._last_ns, ended=True)
         return self.account
@@ -341,7 +378,7 @@ class Replay:
     def _lane(self, start_s: int) -> Lane:
         lane = self._lanes.get(start_s)
         if lane is None:
-            lane = Lane(self._frames, self._calibrations, self.account, self._tolerance_nm)
+            lane = Lane(self._frames, self._calibrations, self.account, self._tolerance_nm, self._share)
             self._lanes[start_s] = lane
         return lane
 
@@ -353,13 +390,15 @@ class Replay:
         self._calibrations[calibration.id] = calibration
 
 
-def replay(messages: Iterable[Logged], tolerance_nm: float = 0.0) -> Account:
-    """Replay a log's messages from beginning to end.
+def replay(messages: Iterable[Logged], tolerance_nm: float = 0.0, share: Share = Share()) -> Account:
+    """Replay a log's messages from beginning to end, or a share of them.
 
     Raises:
         DataFileError: see `Replay.take`.
     """
-    run = Replay(tolerance_nm)
+    run = Replay(tolerance_nm, share)
     for message in messages:
         run.take(message)
+        if run.done:
+            break
     return run.finish()
