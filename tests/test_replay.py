@@ -36,7 +36,8 @@ from lowfc.contract.state_codec import controller_state
 from lowfc.control.inputs import Frame, Input, Load, Request
 from lowfc.control.loop import advance
 from lowfc.control.state import Settings, State
-from lowfc.programs.replay import PATIENCE_NS, Account, Share, replay
+from lowfc.programs.replay import PATIENCE_NS, Share, replay
+from lowfc.programs.replay_account import Account
 
 START_S = 1_767_225_600
 STATE_EVERY = 12
@@ -176,19 +177,19 @@ def test_the_order_between_publishers_does_not_matter(taken: list[Input], random
 
 
 @effort(deadline=None)
-@given(inputs(), inputs(), st.randoms(use_true_random=False), st.integers(1, 4), st.booleans())
+@given(inputs(), inputs(), st.lists(st.floats(0, 1), max_size=4), st.floats(0, 1) | st.none())
 def test_shares_are_together_what_the_whole_is(
-    before: list[Input], after: list[Input], random: st.DataObject, shares: int, lossy: bool
+    before: list[Input], after: list[Input], cuts: list[float], lost: float | None
 ) -> None:
     made = night([*before, *frames(40, 9000)])
     made.restart()
     for one in of_another_camera([*after, *frames(40, 9000)]):
         made.take(one)
     messages = list(made.messages)
-    if lossy:
-        messages.pop(random.randrange(len(messages)))  # type: ignore[attr-defined]
+    if lost is not None:
+        messages.pop(int(lost * (len(messages) - 1)))
     first_ns, last_ns = messages[0].log_time_ns, messages[-1].log_time_ns
-    edges = sorted(random.randrange(first_ns, last_ns) for _ in range(shares))  # type: ignore[attr-defined]
+    edges = sorted({first_ns + int(cut * (last_ns - first_ns)) for cut in cuts})
     whole = replay(messages)
     parts = [replay(messages, share=Share(begin, end)) for begin, end in pairwise([0, *edges, 1 << 63])]
     for count in ("frames", "commands", "requests", "different"):

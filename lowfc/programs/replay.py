@@ -8,7 +8,7 @@ state and counts the steps that it could not check.
 import contextlib
 from collections import deque
 from collections.abc import Iterable
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 from google.protobuf.message import DecodeError, Message
 
@@ -35,7 +35,8 @@ from lowfc.control.calibration import Calibration
 from lowfc.control.inputs import Frame, Input, Outputs
 from lowfc.control.loop import advance
 from lowfc.control.state import Settings, State
-from lowfc.programs.replay_difference import Difference, difference
+from lowfc.programs.replay_account import Account
+from lowfc.programs.replay_difference import difference
 
 TOPICS = (FRAME, STEP, COMMAND, CONTROL_INPUT, CONTROLLER_STATE, REQUEST, CALIBRATION)
 """What a replay reads of a log."""
@@ -45,45 +46,6 @@ PATIENCE_NS = 2_000_000_000
 FRAMES_BYTES = 64 << 20
 _STATES_KEPT = 256
 _BEFORE = "before the first complete state"
-
-
-@dataclass(slots=True)
-class Account:
-    """What a replay has found.
-
-    Attributes:
-        frames: steps that were checked; `commands`, `states` and `requests` likewise.
-        unchecked: steps of the log that could not be checked, by why.
-        different: messages that differ by more than the tolerance.
-        first: the first of them.
-        largest_nm: largest difference of any number in nm.
-    """
-
-    frames: int = 0
-    commands: int = 0
-    states: int = 0
-    requests: int = 0
-    unchecked: dict[str, int] = field(default_factory=dict)
-    different: int = 0
-    first: Difference | None = None
-    largest_nm: float = 0.0
-
-    @property
-    def identical(self) -> bool:
-        """Whether something was checked, and nothing differed."""
-        return self.frames > 0 and not self.different
-
-    def leave_out(self, why: str, steps: int) -> None:
-        """Count steps that cannot be checked."""
-        if steps:
-            self.unchecked[why] = self.unchecked.get(why, 0) + steps
-
-    def enter(self, found: Difference, tolerance_nm: float) -> None:
-        """Account for two messages that are not the same bytes."""
-        self.largest_nm = max(self.largest_nm, found.largest_nm)
-        if found.otherwise or found.largest_nm > tolerance_nm:
-            self.different += 1
-            self.first = self.first or found
 
 
 @dataclass(slots=True)
@@ -201,8 +163,8 @@ class Lane:
         """Take every input that is complete, or too old to become so; all that is left when the log has `ended`."""
         while (self._entries or self._states) and not self.done:
             if self._state is None and not self._adopt():
-                if ended:
-                    self._leave_out(len(self._entries))
+                if ended and not self.done:
+                    self._leave_out(max(self._entries, default=0))
                 return
             assert self._state is not None  # noqa: S101  # adopted
             number = self._state.taken + 1
@@ -243,7 +205,7 @@ class Lane:
             try:
                 settings, state = decode_state(message, self._calibrations.get(message.calibration_id))
             except ValueError as error:
-                self._why = f"as {error}"
+                self._why = self._why and f"as {error}"
                 continue
             self._states = {later: state for later, state in self._states.items() if later > number}
             self._settings, self._state = settings, state
@@ -255,7 +217,7 @@ class Lane:
 
     def _leave_out(self, upto: int) -> None:
         """Forget the inputs up to a number, and count their steps as unchecked."""
-        gone = [number for number in self._entries if number <= upto or not self._state]
+        gone = [number for number in self._entries if number <= upto]
         steps = sum(isinstance(self._entries.pop(number).taken, wire.ControlStep) for number in gone)
         if self._why:  # else they are another share's
             self._account.leave_out(self._why, steps)
@@ -341,6 +303,7 @@ class Replay:
         self.account = Account()
         self._tolerance_nm = tolerance_nm
         self._share = share
+        self._from_ns = share.from_ns - PATIENCE_NS
         self._frames = Frames()
         self._calibrations: dict[str, Calibration] = {}
         self._lanes: dict[int, Lane] = {}
@@ -354,6 +317,8 @@ class Replay:
             DataFileError: the log is from before the inputs of the controller were numbered.
         """
         self._last_ns = message.log_time_ns
+        if message.log_time_ns < self._from_ns and message.key != CALIBRATION.key:
+            return
         topic = self._topics.get(message.key) or self._topics.setdefault(message.key, topic_of(message.key))
         if topic is FRAME:
             self._frames.add(message.sequence, message.payload)

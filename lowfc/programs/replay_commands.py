@@ -1,10 +1,8 @@
 """The command `lowfc replay`."""
 
-import gc
 import json
 import sys
 import time
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -12,45 +10,36 @@ import typer
 from rich.console import Console
 
 from lowfc.adapters.envelope import count_of
-from lowfc.adapters.log_reader import Logged, LogReader
 from lowfc.adapters.progress import passing_bar
 from lowfc.adapters.provenance import provenance
-from lowfc.programs.replay import TOPICS, Account, replay
+from lowfc.programs.replay_account import Account
 
 _HOST = ("lowfc", "git", "python", "numpy", "scipy", "blas", "processor", "cpu_features")
 """What the same bytes may depend on."""
 
 
-def verify(logs: list[Path], tolerance_nm: float, console: Console) -> dict[str, Any]:
+def verify(logs: list[Path], tolerance_nm: float, jobs: int, console: Console) -> dict[str, Any]:
     """Replay logs that follow each other; return the figures that `--json` prints.
 
     Raises:
         DataFileError: a log cannot be read, or cannot be replayed.
     """
-    from threadpoolctl import threadpool_limits
+    from lowfc.programs.replay_workers import replay_files
 
-    readers = [LogReader(path, topics=TOPICS, skip_damaged=True) for path in logs]
     total = sum(path.stat().st_size for path in logs if path.exists())
-    span = _Span()
     begun_s = time.monotonic()
-    with threadpool_limits(1), passing_bar(console) as bar:  # as the live loop: more threads sum in another order
+    with passing_bar(console) as bar:
         task = bar.add_task("replaying", total=total)
-        gc.disable()
-        try:
-            account = replay(
-                span.over(readers, lambda done: bar.update(task, completed=min(done, total))), tolerance_nm
-            )
-        finally:
-            gc.enable()
+        outcome = replay_files(logs, tolerance_nm, jobs, lambda done: bar.update(task, completed=done))
     elapsed_s = time.monotonic() - begun_s
     return {
-        **_figures(account),
+        **_figures(outcome.account),
         "tolerance_nm": tolerance_nm,
-        "log_s": round(span.duration_s, 3),
-        "speed": round(span.duration_s / elapsed_s, 2),
-        "complete": all(reader.complete for reader in readers),
-        "damaged": [f"{reader.path}: byte {one.position}, {one.why}" for reader in readers for one in reader.damage],
-        "host_differs": _host_differs(readers[0]),
+        "log_s": round(outcome.log_s, 3),
+        "speed": round(outcome.log_s / elapsed_s, 2),
+        "complete": outcome.complete,
+        "damaged": outcome.damage,
+        "host_differs": _host_differs(outcome.recorded_on),
     }
 
 
@@ -87,30 +76,6 @@ def render(figures: dict[str, Any]) -> str:
     return "\n".join(lines)
 
 
-class _Span:
-    """From which log time to which the messages are."""
-
-    def __init__(self) -> None:
-        self._first_ns = self._last_ns = 0
-
-    @property
-    def duration_s(self) -> float:
-        return (self._last_ns - self._first_ns) * 1e-9
-
-    def over(self, readers: list[LogReader], progress: Any) -> Iterator[Logged]:
-        """The messages of one log after the other."""
-        done = number = 0
-        for reader in readers:
-            for message in reader:
-                self._first_ns = self._first_ns or message.log_time_ns
-                self._last_ns = message.log_time_ns
-                number += 1
-                if number % 5000 == 0:
-                    progress(done + reader.position)
-                yield message
-            done += reader.size
-
-
 def _figures(account: Account) -> dict[str, Any]:
     first = account.first
     return {
@@ -133,9 +98,9 @@ def _figures(account: Account) -> dict[str, Any]:
     }
 
 
-def _host_differs(reader: LogReader) -> dict[str, tuple[str, str]]:
+def _host_differs(there: dict[str, str]) -> dict[str, tuple[str, str]]:
     """What of versions and processor is not as it was when the log was recorded: the log's, and here."""
-    there, here = reader.metadata.get("lowfc", {}), provenance()
+    here = provenance()
     return {key: (there[key], here.get(key, "none")) for key in _HOST if key in there and there[key] != here.get(key)}
 
 
@@ -146,6 +111,7 @@ def replay_log(
     tolerance: Annotated[
         float, typer.Option(min=0, help="Largest difference that is none, nm: for a log of another processor.")
     ] = 0.0,
+    jobs: Annotated[int, typer.Option(min=0, help="Processes, at most; 0 for one on every processor.")] = 0,
     as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object on standard output.")] = False,
 ) -> None:
     """Run the loop again on what it took in, and compare every step and command with the log, to the bit.
@@ -154,7 +120,7 @@ def replay_log(
 
     Example: lowfc replay logs/20261122T020834Z.mcap
     """
-    figures = verify(logs, tolerance, Console(stderr=True))
+    figures = verify(logs, tolerance, jobs, Console(stderr=True))
     sys.stdout.write((json.dumps(figures) if as_json else render(figures)) + "\n")
     if not figures["identical"]:
         raise typer.Exit(1)

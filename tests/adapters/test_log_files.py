@@ -1,19 +1,30 @@
+import dataclasses
 import resource
 import subprocess
 import sys
+import tracemalloc
+import zlib
 from collections.abc import Iterator
+from itertools import pairwise
 from pathlib import Path
+from typing import Any
 
+import lz4.frame
 import numpy as np
 import pytest
+from mcap.data_stream import RecordBuilder
+from mcap.opcode import Opcode
 from mcap.reader import make_reader
 from mcap.records import Attachment as AttachmentRecord
-from mcap.records import Channel, Chunk, Metadata
+from mcap.records import Channel, Chunk, McapRecord, Message, Metadata, Schema
 from mcap.stream_reader import StreamReader
+from mcap.writer import MCAP0_MAGIC as MAGIC
+from mcap.writer import CompressionType, Writer
 from mcap_protobuf.decoder import DecoderFactory
+from mutated_logs import boundaries
 
 from lowfc.adapters.bus import Sample
-from lowfc.adapters.envelope import sequence_of
+from lowfc.adapters.envelope import count_of, sequence_of
 from lowfc.adapters.log_reader import LogReader
 from lowfc.adapters.log_writer import UNFINISHED, Attachment, LogWriter, log_path
 from lowfc.contract.errors import DataFileError
@@ -116,11 +127,11 @@ def test_what_describes_a_log_stands_at_its_start_and_chunks_are_small(tmp_path:
 def test_a_log_cut_anywhere_yields_its_whole_chunks(tmp_path: Path) -> None:
     data = written(tmp_path / "whole.mcap", samples(60)).read_bytes()
     cut, found = tmp_path / "cut.mcap", []
-    for size in [*range(40), *range(40, len(data), 3001), *range(len(data) - 40, len(data))]:
+    for size in [*range(40), *range(40, len(data), 3001), *range(len(data) - 40, len(data) + 1)]:
         cut.write_bytes(data[:size])
         reader = LogReader(cut)
         found.append(len(list(reader)))
-        assert not reader.complete or size >= len(data) - 8  # without its last magic it lacks nothing
+        assert reader.complete == (size == len(data))
     assert found == sorted(found)
     assert (found[0], found[-1]) == (0, 120)
     assert len(set(found)) > 3
@@ -129,7 +140,7 @@ def test_a_log_cut_anywhere_yields_its_whole_chunks(tmp_path: Path) -> None:
 def test_what_was_flushed_survives_a_kill(tmp_path: Path) -> None:
     program = f"""
 import os, sys
-sys.path[:0] = {[str(Path(__file__).parent)]!r}
+sys.path[:0] = {[str(Path(__file__).parent), str(Path(__file__).parents[1])]!r}
 from pathlib import Path
 from test_log_files import *
 log = LogWriter(Path({str(tmp_path / "a.mcap")!r}), START_NS, METADATA, ATTACHMENTS)
@@ -145,30 +156,321 @@ os.kill(os.getpid(), 9)
     assert (reader.complete, reader.metadata, len(reader.attachments)) == (False, METADATA, 2)
 
 
+def chunks_of(path: Path) -> list[tuple[int, int]]:
+    """Where the chunks of a log begin and end."""
+    starts = boundaries(data := path.read_bytes())
+    return [(a, b) for a, b in pairwise(starts) if data[a] == Opcode.CHUNK]
+
+
+def changed(path: Path, at: int, new: bytes) -> Path:
+    data = bytearray(path.read_bytes())
+    assert data[at : at + len(new)] != new
+    data[at : at + len(new)] = new
+    path.write_bytes(data)
+    return path
+
+
+def flipped(path: Path, at: int, bit: int = 0) -> Path:
+    return changed(path, at, bytes([path.read_bytes()[at] ^ 1 << bit]))
+
+
+def crafted(path: Path, *records: McapRecord) -> Path:
+    """An unfinished file of these records."""
+    builder = RecordBuilder()
+    for record in records:
+        record.write(builder)
+    path.write_bytes(MAGIC + builder.end())
+    return path
+
+
+def chunk(*records: McapRecord, **changes: Any) -> Chunk:
+    builder = RecordBuilder()
+    for record in records:
+        record.write(builder)
+    return packed(builder.end(), **changes)
+
+
+def packed(content: bytes, **changes: Any) -> Chunk:
+    sound = Chunk("lz4", lz4.frame.compress(content), 0, 0, zlib.crc32(content), len(content))
+    return dataclasses.replace(sound, **changes)
+
+
+STEPS = Schema(id=1, data=b"", encoding="protobuf", name="lowfc.v1.ControlStep")
+CHANNEL = Channel(1, "/lowfc/control/step", "protobuf", {"start_s": "7"}, 1)
+
+
+def message(number: int, channel: int = 1) -> Message:
+    return Message(channel, START_NS, b"x", START_NS, number)
+
+
 def test_damage_is_found_and_can_be_left_out(tmp_path: Path) -> None:
     path = written(tmp_path / "a.mcap", samples(60))
-    data = bytearray(path.read_bytes())
-    data[len(data) // 2] ^= 0x10
-    path.write_bytes(data)
-    with pytest.raises(DataFileError, match=r"is damaged \(crc"):
+    begin, end = chunks_of(path)[1]
+    flipped(path, (begin + end) // 2, 4)
+    said = rf"is damaged at byte {begin} \((the checksum of a chunk is wrong|a chunk cannot be decompressed)\)"
+    with pytest.raises(DataFileError, match=said):
         list(LogReader(path))
     reader = LogReader(path, skip_damaged=True)
-    assert 60 < len(list(reader)) < 120
-    assert (reader.damaged_chunks, reader.unreadable) == (1, 0)
+    read = list(reader)
+    assert 60 < len(read) < 120
+    assert (len(reader.damage), reader.unreadable, reader.complete) == (1, 0, True)
+    damage = reader.damage[0]
+    assert (damage.position, damage.length) == (begin, end - begin)
+    assert damage.after_ns is not None
+    assert damage.before_ns is not None
+    times = [m.log_time_ns for m in read]
+    assert (damage.after_ns, damage.before_ns) in pairwise(times)
+    assert damage.before_ns - damage.after_ns == max(b - a for a, b in pairwise(times))
 
 
-def test_messages_of_an_undeclared_channel_are_counted(tmp_path: Path) -> None:
+def test_a_summary_says_what_a_damaged_chunk_declared(tmp_path: Path) -> None:
     path = written(tmp_path / "a.mcap", samples(60))
-    data = bytearray(path.read_bytes())
-    with path.open("rb") as file:
-        stream = StreamReader(file, emit_chunks=True)
-        first = next(record for record in stream.records if isinstance(record, Chunk))
-    data[data.index(first.data) + len(first.data) // 2] ^= 0x10  # the first chunk declares both channels
-    path.write_bytes(data)
+    (begin, end), *_ = chunks_of(path)
+    flipped(path, (begin + end) // 2)  # the first chunk declares both channels
+    reader = LogReader(path, skip_damaged=True)
+    assert 60 < len(list(reader)) < 120
+    assert (len(reader.damage), reader.unreadable) == (1, 0)
+    path.write_bytes(path.read_bytes()[: chunks_of(path)[-1][1]])
     reader = LogReader(path, skip_damaged=True)
     assert list(reader) == []
-    assert reader.damaged_chunks == 1
-    assert 0 < reader.unreadable < 120
+    assert len(reader.damage) == 1
+    assert 60 < reader.unreadable < 120
+
+
+@pytest.mark.parametrize(
+    ("at", "new"),
+    [
+        (0, b"\x07"),  # taken for an index of messages
+        (0, b"\x86"),  # for a record of somebody else's
+        (0, b"\x03"),  # for a declaration that no checksum covers
+        (1, b"\x00"),
+        (4, b"\x01"),  # 16 MB longer
+        (6, b"\xff"),
+        (8, b"\xff"),
+        (25, bytes(12)),  # size and checksum: a chunk that says that it is empty
+        (32, b"\xff"),  # size: more than memory has
+        (33, bytes(4)),  # "no checksum"
+        (41, b"zzz"),
+        (44, b"\x00\x01"),
+    ],
+)
+@pytest.mark.parametrize("finished", [True, False])
+def test_whatever_a_chunk_says_of_itself_only_that_chunk_is_lost(
+    tmp_path: Path, at: int, new: bytes, finished: bool
+) -> None:
+    path = written(tmp_path / "a.mcap", samples(60))
+    whole = list(LogReader(path))
+    chunks = chunks_of(path)
+    if not finished:
+        path.write_bytes(path.read_bytes()[: chunks[-1][1]])
+    cut = tmp_path / "cut.mcap"
+    before, after = (cut.write_bytes(path.read_bytes()[:end]) and len(list(LogReader(cut))) for end in chunks[1])
+    changed(path, chunks[1][0] + at, new)
+    with pytest.raises(DataFileError, match=rf"is damaged at byte {chunks[1][0]} "):
+        list(LogReader(path))
+    reader = LogReader(path, skip_damaged=True)
+    read = list(reader)
+    assert reader.damage[0].position == chunks[1][0]
+    assert read == whole[:before] + whole[after:]
+    assert before < after < len(whole)
+
+
+def test_a_damaged_attachment_is_left_out(tmp_path: Path) -> None:
+    path = written(tmp_path / "a.mcap", samples(4))
+    data = path.read_bytes()
+    flipped(path, data.index(b"[loop]"))
+    path.write_bytes(path.read_bytes()[: chunks_of(path)[-1][1]])  # nothing but its own checksum can tell
+    with pytest.raises(DataFileError, match="the checksum of an attachment is wrong"):
+        list(LogReader(path))
+    reader = LogReader(path, skip_damaged=True)
+    assert len(list(reader)) == 8
+    assert (list(reader.attachments), len(reader.damage)) == (["h.fits"], 1)
+
+
+def test_what_no_checksum_of_its_own_covers_is_under_that_of_the_whole(tmp_path: Path) -> None:
+    path = written(tmp_path / "a.mcap", samples(4))
+    flipped(path, path.read_bytes().index(b"night"))
+    with pytest.raises(DataFileError, match="its parts are whole, but"):
+        list(LogReader(path))
+
+
+def test_the_end_of_the_data_in_the_wrong_place_ends_nothing(tmp_path: Path) -> None:
+    path = written(tmp_path / "a.mcap", samples(60))
+    data = path.read_bytes()
+    starts = boundaries(data)
+    (end,) = (at for at in starts[:-1] if data[at] == Opcode.DATA_END)
+    early = chunks_of(path)[1][0]
+    path.write_bytes(data[:early] + data[end : end + 13] + data[early:end] + data[end + 13 :])
+    reader = LogReader(path, skip_damaged=True)
+    assert len(list(reader)) == 120
+    assert reader.damage
+
+
+def test_a_declaration_is_not_changed_by_a_later_one(tmp_path: Path) -> None:
+    other = dataclasses.replace(CHANNEL, topic="/lowfc/camera/frame")
+    newer = dataclasses.replace(CHANNEL, metadata={"start_s": "8"})
+    renamed = dataclasses.replace(STEPS, name="lowfc.v1.Truth")
+    path = crafted(
+        tmp_path / "a",
+        chunk(STEPS, CHANNEL, message(0)),
+        chunk(other, message(1)),
+        chunk(newer, message(2)),
+        chunk(renamed, message(3)),
+        chunk(STEPS, CHANNEL, message(4)),
+    )
+    with pytest.raises(DataFileError, match="channel 1 is declared a second time, and not as before"):
+        list(LogReader(path))
+    reader = LogReader(path, skip_damaged=True)
+    assert [(m.key, m.schema, m.sequence) for m in reader] == [
+        ("lowfc/control/step", "lowfc.v1.ControlStep", sequence_of(7, count)) for count in (0, 4)
+    ]
+    assert len(reader.damage) == 3
+
+
+@pytest.mark.parametrize("start", ["", "-1", "7.0", "seven", "\u0667", "9" * 30, "9" * 10])
+def test_a_start_that_is_no_time_is_damage(tmp_path: Path, start: str) -> None:
+    path = crafted(tmp_path / "a", chunk(STEPS, dataclasses.replace(CHANNEL, metadata={"start_s": start}), message(0)))
+    with pytest.raises(DataFileError, match="channel 1 has start_s"):
+        list(LogReader(path))
+    assert list(LogReader(path, skip_damaged=True)) == []
+
+
+def test_a_summary_that_declares_nonsense_is_damage(tmp_path: Path) -> None:
+    path = tmp_path / "a.mcap"
+    with path.open("wb") as file:
+        writer = Writer(file, compression=CompressionType.LZ4, enable_data_crcs=True)
+        writer.start()
+        schema = writer.register_schema(STEPS.name, STEPS.encoding, b"")
+        writer.register_channel(CHANNEL.topic, "protobuf", schema, {"start_s": "seven"})
+        writer.add_message(1, START_NS, b"x", START_NS)
+        writer.finish()
+    with pytest.raises(DataFileError, match="channel 1 has start_s 'seven'"):
+        list(LogReader(path))
+    assert list(LogReader(path, skip_damaged=True)) == []
+
+
+def test_a_message_that_no_checksum_vouches_for_is_not_delivered(tmp_path: Path) -> None:
+    path = crafted(tmp_path / "a", chunk(STEPS, CHANNEL, message(0)), message(1), chunk(message(2)))
+    with pytest.raises(DataFileError, match="outside of the chunks"):
+        list(LogReader(path))
+    reader = LogReader(path, skip_damaged=True)
+    assert [count_of(m.sequence) for m in reader] == [0, 2]
+    assert len(reader.damage) == 1
+
+
+def test_a_message_without_its_declaration_is_an_error(tmp_path: Path) -> None:
+    path = crafted(tmp_path / "a", chunk(STEPS, CHANNEL, message(0), message(1, channel=2)))
+    with pytest.raises(DataFileError, match="what declares its messages is not there"):
+        list(LogReader(path))
+    reader = LogReader(path, skip_damaged=True)
+    assert (len(list(reader)), reader.unreadable) == (1, 1)
+
+
+@pytest.mark.parametrize(
+    "content",
+    [
+        b"\x05",
+        b"\x05" + b"\xff" * 8,
+        b"\x05" + bytes(20),
+        b"\x05" + (23).to_bytes(8, "little") + b"\x01" + bytes(21),
+        b"\x04\x01" + bytes(8),
+        b"\x03" + b"\x7f" * 20,
+    ],
+)
+def test_records_that_do_not_fit_into_their_chunk_are_damage(tmp_path: Path, content: bytes) -> None:
+    path = crafted(tmp_path / "a", chunk(STEPS, CHANNEL, message(0)), packed(content), chunk(message(2)))
+    with pytest.raises(DataFileError, match="is damaged"):
+        list(LogReader(path))
+    assert [count_of(m.sequence) for m in LogReader(path, skip_damaged=True)] == [0, 2]
+
+
+def test_a_chunk_that_would_fill_the_memory_does_not(tmp_path: Path) -> None:
+    zeros = bytes(200_000_000)
+    bomb = dataclasses.replace(packed(zeros), uncompressed_size=1000)
+    boast = chunk(STEPS, uncompressed_size=1 << 40)
+    path = crafted(tmp_path / "a", chunk(STEPS, CHANNEL, message(0)), bomb, boast)
+    del zeros
+    tracemalloc.start()
+    try:
+        reader = LogReader(path, skip_damaged=True)
+        assert len(list(reader)) == 1
+        assert len(reader.damage) == 2
+        assert tracemalloc.get_traced_memory()[1] < 20_000_000
+    finally:
+        tracemalloc.stop()
+
+
+def test_a_length_that_would_fill_the_memory_does_not(tmp_path: Path) -> None:
+    path = crafted(tmp_path / "a", chunk(STEPS, CHANNEL, message(0)))
+    with path.open("ab") as file:
+        file.write(b"\x06" + (300_000_000).to_bytes(8, "little"))
+        file.truncate(path.stat().st_size + 300_000_100)
+    tracemalloc.start()
+    try:
+        assert len(list(LogReader(path, skip_damaged=True))) == 1
+        assert tracemalloc.get_traced_memory()[1] < 20_000_000
+    finally:
+        tracemalloc.stop()
+
+
+@pytest.mark.parametrize("finished", [True, False])
+def test_a_stretch_of_zeros_is_one_damage(tmp_path: Path, finished: bool) -> None:
+    path = written(tmp_path / "a.mcap", samples(60))
+    chunks = chunks_of(path)
+    if not finished:
+        path.write_bytes(path.read_bytes()[: chunks[-1][1]])
+    changed(path, chunks[1][0] - 30, bytes(100_000))
+    reader = LogReader(path, skip_damaged=True)
+    assert 60 < len(list(reader)) < 120
+    assert len(reader.damage) == 1
+    assert reader.complete == finished
+
+
+def test_a_finished_log_does_not_break_off(tmp_path: Path) -> None:
+    path = written(tmp_path / "a.mcap", samples(60))
+    last = chunks_of(path)[-1][0]
+    flipped(flipped(path, last + 6), len(path.read_bytes()) - 60)  # its length, and the summary
+    with pytest.raises(DataFileError, match=rf"is damaged at byte {last} "):
+        list(LogReader(path))
+
+
+def test_memory_does_not_grow_with_the_log(tmp_path: Path) -> None:
+    peaks = []
+    for number, count in enumerate((100, 100, 1000)):
+        path = written(tmp_path / f"{number}.mcap", samples(count))
+        tracemalloc.start()
+        assert sum(1 for _ in LogReader(path)) == 2 * count
+        peaks.append(tracemalloc.get_traced_memory()[1])
+        tracemalloc.stop()
+    assert peaks[2] < 1.1 * peaks[1]
+
+
+def test_only_the_topics_asked_for_are_delivered(tmp_path: Path) -> None:
+    path = written(tmp_path / "a.mcap", samples(60))
+    everything = list(LogReader(path))
+    reader = LogReader(path, topics=(STEP, COMMAND))
+    assert list(reader) == [m for m in everything if m.key == STEP.key]
+    assert reader.complete
+    assert list(LogReader(path, topics=())) == []
+    flipped(path, (sum(chunks_of(path)[1]) // 2))
+    with pytest.raises(DataFileError, match="is damaged"):
+        list(LogReader(path, topics=()))
+
+
+def test_a_log_that_grows_is_read_up_to_where_it_ended(tmp_path: Path) -> None:
+    log = LogWriter(tmp_path / "a.mcap", START_NS, METADATA, ATTACHMENTS)
+    messages = samples(40)
+    for sample in messages[:20]:
+        log.write(sample)
+    log.flush()
+    reading = iter(reader := LogReader(tmp_path / f"a.mcap{UNFINISHED}"))
+    read = [next(reading)]
+    for sample in messages[20:]:
+        log.write(sample)
+    log.finish({})
+    read += reading
+    assert [m.payload for m in read] == [s.payload for s in messages[:20]]
+    assert (reader.complete, reader.finished, reader.damage) == (False, False, [])
 
 
 def test_a_full_disk_is_one_error_and_leaves_a_readable_log(tmp_path: Path, small_disk: int) -> None:

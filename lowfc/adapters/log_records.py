@@ -1,0 +1,281 @@
+"""The records of a log file as they lie on the disk: what is whole, what is damaged, where the file breaks off.
+
+Nothing passes that its checksum does not vouch for. Of a finished log every byte is under one: the chunks and the
+attachments have their own, DataEnd has that of all before it, the footer that of the summary.
+"""
+
+import io
+import re
+import struct
+import zlib
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import BinaryIO, NamedTuple, TypeVar
+
+import lz4.frame  # type: ignore[import-untyped]
+from mcap.data_stream import ReadDataStream
+from mcap.exceptions import McapError
+from mcap.opcode import Opcode
+from mcap.records import Attachment, Channel, Metadata, Schema
+from mcap.writer import MCAP0_MAGIC as MAGIC
+
+from lowfc.contract.errors import DataFileError
+
+HEAD = struct.Struct("<BQ")
+"""What every record begins with: opcode, and length of what follows."""
+
+_CHUNK_HEAD = struct.Struct("<QQQII3sQ")  # times of first and last message, size, CRC, "lz4", compressed size
+_LARGEST_BYTES = 1 << 28  # of a record, compressed or not; a damaged length must not take all memory
+_LZ4_RATIO = 255  # the format allows no more
+_FOOTER_BYTES = HEAD.size + 20 + len(MAGIC)
+_BLOCK_BYTES = 1 << 20
+_EXPECTED = {Opcode.CHUNK, Opcode.MESSAGE_INDEX, Opcode.ATTACHMENT, Opcode.METADATA, Opcode.DATA_END}
+_CHANGED = "its parts are whole, but not all are there, or not in order, or what lies between them has changed"
+_CHUNK_HERE = re.compile(rb"\x06.{36}\x03\x00\x00\x00lz4", re.DOTALL)
+
+
+@dataclass(slots=True)
+class Damage:
+    """A stretch of a log that is not as it was written, and is left out.
+
+    Attributes:
+        position: its first byte.
+        length: its bytes.
+        why: what is wrong with it.
+        after_ns: log time of the last message delivered before it; None before the first.
+        before_ns: log time of the next one delivered; None after the last.
+    """
+
+    position: int
+    length: int
+    why: str
+    after_ns: int | None = None
+    before_ns: int | None = None
+
+
+class Chunk(NamedTuple):
+    """Messages and their declarations, decompressed, as a checksum says they were written.
+
+    Attributes:
+        position: of the chunk in the file.
+        length: its bytes there.
+        crc: of `content`.
+        content: records, one after the other.
+    """
+
+    position: int
+    length: int
+    crc: int
+    content: bytes
+
+
+class UnsoundError(Exception):
+    """What stands here is not what was written; the text says why."""
+
+
+class LogFile:
+    """A log file that is open for reading, up to where it ends now; a context.
+
+    Attributes:
+        path: of the file.
+        size: bytes of it when it was opened.
+        finished: it ends as a log that was finished ends.
+        complete: finished, and read up to a sound summary; known when all `parts` have been taken.
+    """
+
+    def __init__(self, path: Path) -> None:
+        """Open the log at `path`.
+
+        Raises:
+            DataFileError: it cannot be read.
+        """
+        self.path = path
+        self.complete = False
+        try:
+            self._file: BinaryIO = path.open("rb")
+            self.size = self._file.seek(0, io.SEEK_END)
+        except OSError as fault:
+            raise DataFileError(f"{path} cannot be read: {fault.strerror}") from fault
+        self.finished = self._read(max(0, self.size - len(MAGIC)), len(MAGIC)) == MAGIC
+        self._summary = self._sound_summary()
+
+    def __enter__(self) -> "LogFile":
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._file.close()
+
+    def declarations(self) -> Chunk | None:
+        """What the summary declares, schemas and channels, like a chunk; None unless the summary is sound."""
+        if self._summary is None:
+            return None
+        end = self._summary
+        while end + HEAD.size <= self.size:
+            opcode, length = HEAD.unpack(self._read(end, HEAD.size))
+            if opcode not in (Opcode.SCHEMA, Opcode.CHANNEL):
+                break
+            end += HEAD.size + length
+        length = min(end, self.size) - self._summary
+        content = self._read(self._summary, length)
+        return Chunk(self._summary, length, zlib.crc32(content), content)
+
+    def span_ns(self) -> tuple[int, int]:
+        """Log times of the first and the last message, by the heads of the chunks, unchecked; (0, 0) for none."""
+        times_ns: list[int] = []
+        at = len(MAGIC)
+        while len(head := self._read(at, HEAD.size + 16)) == HEAD.size + 16:
+            opcode, length, *chunk_ns = struct.unpack("<BQQQ", head)
+            if opcode == Opcode.CHUNK:
+                times_ns += chunk_ns
+            at += HEAD.size + length
+        return min(times_ns, default=0), max(times_ns, default=0)
+
+    def parts(self) -> Iterator[Chunk | Metadata | Attachment | Damage]:
+        """What the file holds, in its order.
+
+        Raises:
+            DataFileError: the disk refuses.
+        """
+        magic = self._read(0, len(MAGIC))
+        at, crc, intact = len(MAGIC), zlib.crc32(magic), MAGIC.startswith(magic)
+        if not intact:
+            yield Damage(0, len(magic), "it does not begin as an MCAP file")
+        while at < self.size:
+            head = self._read(at, HEAD.size)
+            opcode, length = HEAD.unpack(head) if len(head) == HEAD.size else (0, self.size)
+            end = at + HEAD.size + length
+            try:
+                if end > self.size or length > _LARGEST_BYTES:
+                    raise UnsoundError("a record is longer than it can be")
+                body = self._read(at + HEAD.size, length)
+                if opcode == Opcode.DATA_END and length == 4 and self._summary in (None, end):
+                    if intact and int.from_bytes(body, "little") not in (0, crc):
+                        yield Damage(at, 0, _CHANGED)
+                    if self.finished and self._summary is None:
+                        yield Damage(end, self.size - end, "the summary is damaged")
+                    self.complete = self._summary is not None
+                    return
+                crc = zlib.crc32(body, zlib.crc32(head, crc))
+                part = _part(opcode, body, at)
+            except UnsoundError as fault:
+                resumed = self._resume(at, end)
+                if resumed == self.size < end and not self.finished:
+                    return  # the last record was not written to its end
+                intact = False
+                yield Damage(at, resumed - at, str(fault))
+                at = resumed
+            else:
+                if part is not None:
+                    yield part
+                at = end
+
+    def _sound_summary(self) -> int | None:
+        """Where the summary begins; None unless its checksum is right."""
+        footer_at = self.size - _FOOTER_BYTES
+        footer = self._read(footer_at, _FOOTER_BYTES) if self.finished and footer_at > 0 else b""
+        if not footer or HEAD.unpack_from(footer) != (Opcode.FOOTER, 20):
+            return None
+        start, _, stored = struct.unpack_from("<QQI", footer, HEAD.size)
+        if not len(MAGIC) <= start < footer_at:
+            return None
+        crc = 0
+        for at in range(start, footer_at, _BLOCK_BYTES):
+            crc = zlib.crc32(self._read(at, min(_BLOCK_BYTES, footer_at - at)), crc)
+        return start if zlib.crc32(footer[: HEAD.size + 16], crc) == stored else None
+
+    def _resume(self, at: int, end: int) -> int:
+        """Where to read on after an unsound record: behind it if a record begins there, else at the next whole one."""
+        if end == self.size:
+            return end
+        if end < self.size:
+            head = self._read(end, HEAD.size)
+            if len(head) == HEAD.size:
+                opcode, length = HEAD.unpack(head)
+                if opcode in _EXPECTED and end + HEAD.size + length <= self.size:
+                    return end
+        for start in range(at + 1, self.size, _BLOCK_BYTES):
+            for match in _CHUNK_HERE.finditer(self._read(start, _BLOCK_BYTES + 64)):
+                if self._chunk_at(start + match.start()):
+                    return start + match.start()
+        data_end = 0 if self._summary is None else self._summary - HEAD.size - 4
+        return data_end if data_end > at else self.size
+
+    def _chunk_at(self, at: int) -> bool:
+        """Whether a whole chunk begins at `at`."""
+        _, length = HEAD.unpack(self._read(at, HEAD.size))
+        if at + HEAD.size + length > self.size or length > _LARGEST_BYTES:
+            return False
+        try:
+            _chunk(self._read(at + HEAD.size, length), at)
+        except UnsoundError:
+            return False
+        return True
+
+    def _read(self, at: int, length: int) -> bytes:
+        try:
+            self._file.seek(at)
+            return self._file.read(length)
+        except OSError as fault:
+            raise DataFileError(f"{self.path} cannot be read: {fault.strerror}") from fault
+
+
+def _part(opcode: int, body: bytes, at: int) -> Chunk | Metadata | Attachment | None:
+    """A record of the data section, checked; None for one that only helps to find others.
+
+    Raises:
+        UnsoundError: it is damaged, or has no place in a log.
+    """
+    match opcode:
+        case Opcode.CHUNK:
+            return _chunk(body, at)
+        case Opcode.ATTACHMENT:
+            if zlib.crc32(body[:-4]).to_bytes(4, "little") != body[-4:]:
+                raise UnsoundError("the checksum of an attachment is wrong")
+            return parsed(Attachment, body)
+        case Opcode.METADATA:
+            return parsed(Metadata, body)
+        case Opcode.MESSAGE_INDEX:
+            if len(body) < 6 or int.from_bytes(body[2:6], "little") != len(body) - 6:
+                raise UnsoundError("an index of messages is damaged")
+        case Opcode.HEADER if at == len(MAGIC):
+            pass
+        case Opcode.MESSAGE | Opcode.SCHEMA | Opcode.CHANNEL:
+            raise UnsoundError("a record stands outside of the chunks, where no checksum vouches for it")
+        case _:
+            raise UnsoundError("no record begins here")
+    return None
+
+
+def _chunk(body: bytes, at: int) -> Chunk:
+    if len(body) < _CHUNK_HEAD.size:
+        raise UnsoundError("a chunk is too short")
+    _, _, size, crc, _, compression, compressed = _CHUNK_HEAD.unpack_from(body)
+    if compression != b"lz4" or compressed != len(body) - _CHUNK_HEAD.size:
+        raise UnsoundError("the head of a chunk is damaged")
+    if not 0 < size <= min(_LARGEST_BYTES, _LZ4_RATIO * compressed):
+        raise UnsoundError("a chunk says that it has a size that it cannot have")
+    try:
+        content = lz4.frame.LZ4FrameDecompressor().decompress(memoryview(body)[_CHUNK_HEAD.size :], max_length=size)
+    except (RuntimeError, EOFError) as fault:
+        raise UnsoundError("a chunk cannot be decompressed") from fault
+    if zlib.crc32(content) != crc:
+        raise UnsoundError("the checksum of a chunk is wrong")
+    return Chunk(at, HEAD.size + len(body), crc, content)
+
+
+_Record = TypeVar("_Record", Attachment, Metadata, Schema, Channel)
+
+
+def parsed(kind: type[_Record], body: bytes) -> _Record:
+    """A record of this kind.
+
+    Raises:
+        UnsoundError: it is not one.
+    """
+    stream = ReadDataStream(io.BytesIO(body))
+    try:
+        record: _Record = kind.read(stream)
+    except (McapError, UnicodeDecodeError, struct.error) as fault:
+        raise UnsoundError(f"a record ({kind.__name__.lower()}) cannot be read") from fault
+    return record
