@@ -66,8 +66,11 @@ class Publisher(Protocol):
     published: int
     last: tuple[bytes, Envelope] | None
 
-    def put(self, payload: bytes, publish_time_ns: int | None = None) -> Envelope:
-        """Send `payload`; the time defaults to now and the sequence is the next one. Never waits for a reader."""
+    def put(self, payload: bytes, publish_time_ns: int | None = None, sequence: int | None = None) -> Envelope:
+        """Send `payload`, by default now and with the next sequence; never waits for a reader.
+
+        Whoever gives sequences (a replay, those of the log) gives them with every put.
+        """
         ...
 
 

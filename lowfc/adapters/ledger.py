@@ -12,12 +12,17 @@ from lowfc.contract.messages import EVENT, Log, Topic, topic_of, wire
 
 @dataclass(slots=True)
 class _Tally:
-    """Messages of one topic of one start of one publisher; counts as in their envelopes."""
+    """Messages of one topic of one start of one publisher; counts as in their envelopes.
+
+    Attributes:
+        safe: recorded, and flushed since.
+    """
 
     first: int
     next: int
     published: int = 0
     recorded: int = 0
+    safe: int = 0
     reported: int = 0
 
     @property
@@ -35,7 +40,9 @@ class Ledger:
         """Account for a message; the first one of a publisher's start is its beginning."""
         count = count_of(sample.sequence)
         line = (sample.key, _author(topic, sample), start_of(sample.sequence))
-        tally = self._tallies.setdefault(line, _Tally(count, count))
+        tally = self._tallies.get(line)
+        if tally is None:
+            tally = self._tallies[line] = _Tally(count, count)
         if count >= tally.next:
             tally.next = count + 1
             tally.recorded += recorded
@@ -49,6 +56,23 @@ class Ledger:
                 tally = self._tallies.setdefault(line, _Tally(count.published, count.published))
                 if health.state == "stopped":
                     tally.published = count.published
+
+    def settle(self) -> None:
+        """What was recorded so far has been flushed."""
+        for tally in self._tallies.values():
+            tally.safe = tally.recorded
+
+    def revert(self) -> None:
+        """What was recorded since `settle` did not reach the disk."""
+        for tally in self._tallies.values():
+            tally.recorded = tally.safe
+
+    def recorded(self) -> dict[str, int]:
+        """Messages recorded so far, by key; keys that lost all of theirs too."""
+        sums: dict[str, int] = {}
+        for (key, _, _), tally in self._tallies.items():
+            sums[key] = sums.get(key, 0) + tally.recorded
+        return sums
 
     def lost(self) -> dict[str, int]:
         """Messages lost so far, by key; only keys that lost some."""

@@ -3,16 +3,20 @@
 A log is written as `<name>.mcap.part` and renamed when it is finished. What describes it (metadata, attachments)
 stands at its start. A channel is one topic of one start of its publisher: MCAP's sequence has 32 bits and takes the
 count, the channel's metadata the start.
+
+What was flushed survives the death of the process, at any moment and in any way. It does not survive a loss of power:
+only a finished log, when it has its name, is known to be on the disk itself.
 """
 
 import contextlib
 import itertools
+import os
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from io import BufferedWriter, FileIO
 from pathlib import Path
-from typing import cast
+from typing import TYPE_CHECKING, cast
 
 from google.protobuf.descriptor import FileDescriptor
 from google.protobuf.descriptor_pb2 import FileDescriptorSet
@@ -24,6 +28,9 @@ from lowfc.adapters.bus import Sample
 from lowfc.adapters.envelope import count_of, start_of
 from lowfc.contract.errors import DataFileError
 from lowfc.contract.messages import Topic, topic_of
+
+if TYPE_CHECKING:
+    from _typeshed import ReadableBuffer
 
 UNFINISHED = ".part"
 """Appended to the name of a log that is being written, or was when its recorder died."""
@@ -42,12 +49,34 @@ class Attachment:
     data: bytes
 
 
+class _File(FileIO):
+    """A log's file: it knows its size without asking the system, and how long one write took at most."""
+
+    def __init__(self, path: Path) -> None:
+        super().__init__(path, "x")
+        self.size = 0
+        self.longest_write_ns = 0
+
+    def write(self, data: "ReadableBuffer", /) -> int:
+        begun_ns = time.monotonic_ns()
+        written = super().write(data)
+        self.longest_write_ns = max(self.longest_write_ns, time.monotonic_ns() - begun_ns)
+        self.size += written
+        return written
+
+    def tell(self) -> int:
+        return self.size
+
+
 class LogWriter:
     """Writes one log.
 
     Attributes:
         path: what the log will be called when it is finished.
+        part: what it is called until then.
         messages: messages written.
+        messages_written: messages written up to the last flush.
+        bytes_written: size of the file up to the last flush.
     """
 
     def __init__(
@@ -63,18 +92,17 @@ class LogWriter:
             DataFileError: there is a log of that name, or the disk refuses.
         """
         self.path = path
-        self.messages = 0
-        self._part = path.with_name(path.name + UNFINISHED)
-        self._good_bytes = 0
+        self.part = path.with_name(path.name + UNFINISHED)
+        self.messages = self.messages_written = self.bytes_written = 0
         self._channels: dict[tuple[str, int], int] = {}
         self._schemas: dict[str, int] = {}
-        if path.exists() or self._part.exists():
+        if path.exists() or self.part.exists():
             raise DataFileError(f"{path} exists already; a log is never overwritten")
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
-            self._raw = FileIO(self._part, "x")
+            self._raw = _File(self.part)
         except OSError as fault:
-            raise DataFileError(f"{self._part} cannot be made: {fault.strerror}") from fault
+            raise DataFileError(f"{self.part} cannot be made: {fault.strerror}") from fault
         self._file = BufferedWriter(self._raw)
         self._writer = Writer(
             self._file,
@@ -83,10 +111,9 @@ class LogWriter:
             enable_crcs=True,
             enable_data_crcs=True,
         )
-        with self._disk():
+        try:
             self._writer.start(profile="", library=f"lowfc {__version__}")
-            for name, entries in metadata.items():
-                self._writer.add_metadata(name, dict(entries))
+            self._describe(metadata)
             for attachment in attachments:
                 self._writer.add_attachment(
                     create_time=time_ns,
@@ -96,11 +123,13 @@ class LogWriter:
                     data=attachment.data,
                 )
             self._flush()
+        except OSError as fault:
+            raise self._refused(fault) from fault
 
     @property
-    def bytes_written(self) -> int:
-        """Size of the file up to the last flush."""
-        return self._good_bytes
+    def longest_write_ns(self) -> int:
+        """How long one write of this log took at most."""
+        return self._raw.longest_write_ns
 
     def write(self, sample: Sample) -> None:
         """Add one message, its payload verbatim.
@@ -109,7 +138,7 @@ class LogWriter:
             DataFileError: the disk refuses; the log keeps what was flushed and takes no more.
             KeyError: there is no such topic.
         """
-        with self._disk():
+        try:
             self._writer.add_message(
                 channel_id=self._channel(sample),
                 log_time=sample.receive_time_ns,
@@ -117,41 +146,66 @@ class LogWriter:
                 sequence=count_of(sample.sequence),
                 data=sample.payload,
             )
-            self.messages += 1
+        except OSError as fault:
+            raise self._refused(fault) from fault
+        self.messages += 1
 
     def flush(self) -> None:
         """Hand everything to the operating system: what was flushed survives a kill -9 of this process.
 
         Raises:
-            DataFileError: as for `write`.
+            DataFileError: as for `write`, or the file is no longer there.
         """
-        with self._disk():
+        try:
             self._flush()
+        except OSError as fault:
+            raise self._refused(fault) from fault
 
     def finish(self, metadata: Mapping[str, Mapping[str, str]]) -> Path:
-        """Close the log, with what became known at its end, and give it its name.
+        """Close the log, with what became known at its end, and give it its name once the disk has it.
 
         Raises:
             DataFileError: as for `write`.
         """
-        with self._disk():
-            for name, entries in metadata.items():
-                self._writer.add_metadata(name, dict(entries))
+        try:
+            self._flush()
+            self._describe(metadata)
             self._writer.finish()  # type: ignore[no-untyped-call]
+            self._file.flush()
+            os.fsync(self._raw.fileno())
             self._file.close()
-            self._part.rename(self.path)
+            self.part.rename(self.path)
+        except OSError as fault:
+            raise self._refused(fault) from fault
+        with contextlib.suppress(OSError):  # not every file system has this for folders
+            _sync_folder(self.path.parent)
         return self.path
 
     def abandon(self) -> None:
         """Close the log unfinished, cut back to its last flush."""
         if not self._raw.closed:
             with contextlib.suppress(OSError):
-                self._raw.truncate(self._good_bytes)
+                self._raw.truncate(self.bytes_written)
             self._raw.close()
+
+    def _describe(self, metadata: Mapping[str, Mapping[str, str]]) -> None:
+        for name, entries in metadata.items():
+            self._writer.add_metadata(name, dict(entries))
 
     def _flush(self) -> None:
         self._writer.flush()  # type: ignore[no-untyped-call]
-        self._good_bytes = self._raw.tell()
+        self.part.stat()  # a file that was removed takes data as if nothing had happened
+        self.bytes_written = self._raw.size
+        self.messages_written = self.messages
+
+    def _refused(self, fault: OSError) -> DataFileError:
+        """Turn a fault of the disk into one error, and cut the file back to whole records."""
+        self.abandon()
+        rest = "what is there is readable" if self.part.exists() else "somebody removed it"
+        return DataFileError(
+            f"{self.part} cannot be written ({fault.strerror}) after {self.bytes_written} bytes; "
+            f"make room or record elsewhere; {rest}"
+        )
 
     def _channel(self, sample: Sample) -> int:
         start_s = start_of(sample.sequence)
@@ -178,18 +232,6 @@ class LogWriter:
             )
         return self._schemas[name]
 
-    @contextlib.contextmanager
-    def _disk(self) -> Iterator[None]:
-        """Turn a fault of the disk into one error, and cut the file back to whole records."""
-        try:
-            yield
-        except OSError as fault:
-            self.abandon()
-            raise DataFileError(
-                f"{self._part} cannot be written ({fault.strerror}) after {self._good_bytes} bytes; "
-                "make room or record elsewhere; what is there is readable"
-            ) from fault
-
 
 def log_path(folder: Path, time_ns: int) -> Path:
     """Name for a log begun at `time_ns`, UTC, that no log in the folder has, finished or not."""
@@ -215,3 +257,11 @@ def declaration(message: type[ProtobufMessage]) -> FileDescriptorSet:
 
     add(cast("FileDescriptor", message.DESCRIPTOR.file))
     return declared
+
+
+def _sync_folder(folder: Path) -> None:
+    descriptor = os.open(folder, os.O_RDONLY)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)

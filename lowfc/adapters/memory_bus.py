@@ -35,12 +35,13 @@ class MemoryPublisher:
         self.last: tuple[bytes, Envelope] | None = None
         self._bus = bus
 
-    def put(self, payload: bytes, publish_time_ns: int | None = None) -> Envelope:
+    def put(self, payload: bytes, publish_time_ns: int | None = None, sequence: int | None = None) -> Envelope:
         """Deliver `payload` to every handler before returning."""
         if self._bus.closed:
             raise BusError(f"{self.key}: the bus is closed")
         clock = self._bus.clock
-        sequence = sequence_of(self._bus.start_s, self.published)
+        if sequence is None:
+            sequence = sequence_of(self._bus.start_s, self.published)
         envelope = Envelope(sequence, clock.host_ns() if publish_time_ns is None else publish_time_ns)
         self.published += 1
         if self.topic.queryable:

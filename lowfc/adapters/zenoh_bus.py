@@ -86,10 +86,10 @@ class ZenohPublisher:
         if self._keeps:
             session.declare_queryable(key, Callback(self._answer, indirect=False))
 
-    def put(self, payload: bytes, publish_time_ns: int | None = None) -> Envelope:
+    def put(self, payload: bytes, publish_time_ns: int | None = None, sequence: int | None = None) -> Envelope:
         """Send `payload`; waits at most 1 ms for a reader that does not keep up, then loses the message to it."""
         envelope = Envelope(
-            sequence_of(self._start_s, self.published),
+            sequence_of(self._start_s, self.published) if sequence is None else sequence,
             self._host_ns() if publish_time_ns is None else publish_time_ns,
         )
         self.published += 1

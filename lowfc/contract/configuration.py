@@ -230,6 +230,12 @@ class Recorder(Section):
 
     folder: str = "logs"
     """Where log files are written."""
+    largest_mb: float = Field(4000.0, ge=1, le=1_000_000)
+    """Size at which a log is finished and the next one begun; each can be read by itself."""
+    longest_s: float = Field(3600.0, ge=1, le=1_000_000)
+    """Age at which a log is finished and the next one begun."""
+    min_free_mb: float = Field(500.0, ge=0, le=1_000_000_000)
+    """Free space on the disk below which recording is refused, or ends with a complete log while the loop goes on."""
 
 
 class Realtime(Section):

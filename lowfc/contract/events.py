@@ -67,6 +67,7 @@ EVENTS: dict[str, Event] = {
         Event("RECORDING", Level.INFO, "recording"),
         Event("MESSAGES_LOST", Level.ERROR, "{count} messages lost on {topic}"),
         Event("RECORDING_FAILED", Level.ERROR, "recording stopped: {why}"),
+        Event("DISK_SLOW", Level.WARNING, "the disk took {stall_s:.1f} s for one write; {waiting} messages waited"),
         Event("BAD_MESSAGE", Level.WARNING, "a message on {topic} could not be read: {why}"),
     )
 }

@@ -29,6 +29,7 @@ class Role(StrEnum):
     LAUNCHER = "launcher"
     VIEWER = "viewer"
     OPERATOR = "operator"
+    REPLAY = "replay"
 
 
 class Rate(StrEnum):

@@ -13,7 +13,11 @@ import typer
 from lowfc import __version__
 from lowfc.adapters.terminal import DEFAULT_RUN, ConfigFile, RunId, configuration, new_app, run_app
 from lowfc.contract.configuration import Preset
+from lowfc.programs.bench_record import bench_record
 from lowfc.programs.design_commands import design_app
+from lowfc.programs.log_info import info
+from lowfc.programs.recover import recover
+from lowfc.programs.replay_commands import replay_log
 from lowfc.programs.validate.commands import validate
 
 if TYPE_CHECKING:
@@ -27,6 +31,10 @@ app.add_typer(ctl_app, name="ctl")
 app.add_typer(config_app, name="config")
 app.add_typer(bench_app, name="bench")
 app.add_typer(design_app, name="design")
+app.command("replay")(replay_log)
+bench_app.command("record")(bench_record)
+app.command()(info)
+app.command()(recover)
 app.command()(validate)
 
 AnyRun = Annotated[str | None, typer.Option("--run", help="Name of the run; default: the only one.")]
@@ -86,6 +94,8 @@ def sim_loop(
     settings = configuration(config, overrides, {"control.start_mode": "closed", **spread(os.sched_getaffinity(0))})
     figures = run(settings, duration, record=not no_record)
     _print(json.dumps(figures) if as_json else report(figures))
+    if figures["recording_failure"]:
+        raise typer.Exit(1)
 
 
 @app.command()
@@ -125,30 +135,46 @@ def record(
     run: RunId = DEFAULT_RUN,
     config: ConfigFile = None,
     calibration: Annotated[Path | None, typer.Option(help="Calibration file to put into the log.")] = None,
-    folder: Annotated[Path | None, typer.Option(help="Where logs are written; default: recorder.folder.")] = None,
+    folder: Annotated[str | None, typer.Option(help="Where logs are written; default: recorder.folder.")] = None,
+    largest_mb: Annotated[float | None, typer.Option(help="Size at which the next log is begun.")] = None,
+    longest_s: Annotated[float | None, typer.Option(help="Age at which the next log is begun.")] = None,
+    min_free_mb: Annotated[
+        float | None, typer.Option(help="Free space on the disk below which nothing is recorded.")
+    ] = None,
+    as_json: Json = False,
 ) -> None:
     """Record a run's messages into MCAP logs until told to stop.
 
-    Example: lowfc record --run bench --folder logs
+    Example: lowfc record --run bench --folder logs --longest-s 600 --min-free-mb 2000
     """
     from lowfc.adapters.join import clock_of
+    from lowfc.adapters.log_series import Limits
     from lowfc.adapters.run import open_run
     from lowfc.programs.recorder import record as run_recorder
+    from lowfc.programs.recording_summary import figures, report
 
-    settings = configuration(config)
-    joined = open_run(run, (settings.mirror.name,))
-    target = folder if folder is not None else Path(settings.recorder.folder)
+    overrides = {
+        "recorder.folder": folder,
+        "recorder.largest_mb": largest_mb,
+        "recorder.longest_s": longest_s,
+        "recorder.min_free_mb": min_free_mb,
+    }
+    settings = configuration(config, overrides)
+    log = settings.recorder
     done = run_recorder(
-        joined,
-        target,
+        open_run(run, (settings.mirror.name,)),
+        Path(log.folder),
         configuration=config,
         calibration=calibration,
         seed=settings.seed,
+        limits=Limits(round(log.largest_mb * 1e6), log.longest_s, round(log.min_free_mb * 1e6)),
         clock=clock_of(settings),
         priority=(settings.realtime.priority and settings.realtime.recorder_priority) or None,
     )
-    lost = sum(done.lost.values())
-    _print(f"{done.messages} messages in {', '.join(map(str, done.files))}; {lost} lost", error=True)
+    if as_json:
+        _print(json.dumps(figures(done)))
+    else:
+        _print(report(done), error=True)
     if done.failure:
         raise typer.Exit(1)
 

@@ -1,69 +1,45 @@
 """The recorder: every message of a run into one log, and an account of those that it did not get.
 
 The bus's threads only append to a bounded queue; the loop here empties it, so that a slow disk costs messages, which
-are counted, and never time in the loop.
+are counted, and never time in the loop. A disk that refuses ends the recording and nothing else.
 """
 
-import importlib.metadata
-import os
-import platform
-import shutil
-import subprocess
+import signal
 import time
-from collections import deque
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from concurrent.futures import Future, ThreadPoolExecutor
 from functools import partial
 from pathlib import Path
+from types import FrameType
 
 from google.protobuf.message import DecodeError
 
-from lowfc import __version__
+from lowfc.adapters.backlog import Backlog
 from lowfc.adapters.bus import ALL, Bus, Sample, name_in
 from lowfc.adapters.clock import Clock, HostClock
 from lowfc.adapters.envelope import start_of
 from lowfc.adapters.ledger import Ledger
-from lowfc.adapters.log_writer import Attachment, LogWriter, log_path
+from lowfc.adapters.log_series import STANDARD, Limits, LogSeries, shortage
+from lowfc.adapters.log_writer import Attachment
+from lowfc.adapters.provenance import provenance
 from lowfc.adapters.realtime import NOTHING, Granted, step_back
 from lowfc.adapters.run import Run
 from lowfc.adapters.service import Service
 from lowfc.adapters.zenoh_bus import ZenohBus
 from lowfc.contract.errors import DataFileError
 from lowfc.contract.messages import HEALTH, TOPICS, Role, Topic, wire
+from lowfc.programs.recording_summary import Summary
 
 QUEUE_MESSAGES = 20_000
 """Messages that may wait for the disk: about 4 s of a 1 kHz loop, 90 MB."""
+QUEUE_BYTES = 256_000_000
+"""Payloads that may wait for the disk, whatever their size."""
 
 _TURN_S = 0.02
 _FLUSH_NS = 250_000_000
 _SETTLE_S = (0.3, 1.5)
 _DRAIN_S = 1.0
-_LIBRARIES = ("numpy", "scipy", "eclipse-zenoh", "mcap", "protobuf", "foxglove-schemas-protobuf", "lz4")
-
-
-@dataclass(frozen=True, slots=True)
-class Rotation:
-    """When a log is finished and the next one begun."""
-
-    largest_bytes: int = 4 << 30
-    longest_s: float = 3600.0
-
-
-@dataclass(frozen=True, slots=True)
-class Summary:
-    """What a recorder has done.
-
-    Attributes:
-        files: logs, in order.
-        messages: recorded, in all of them.
-        lost: messages published and not recorded, by topic; only topics that lost some.
-        failure: why recording stopped early; empty when it did not.
-    """
-
-    files: tuple[Path, ...]
-    messages: int
-    lost: dict[str, int]
-    failure: str
+_SLOW_NS = 1_000_000_000
 
 
 class Recorder:
@@ -78,33 +54,39 @@ class Recorder:
         *,
         metadata: Mapping[str, Mapping[str, str]],
         attachments: Sequence[Attachment] = (),
-        rotation: Rotation = Rotation(),
+        limits: Limits = STANDARD,
         granted: Granted = NOTHING,
     ) -> None:
         """Subscribe to everything; recording starts with `run`."""
         self._bus = bus
         self._clock = clock
-        self._folder = folder
-        self._metadata = metadata
-        self._attachments = attachments
-        self._rotation = rotation
-        self._queue: deque[tuple[Topic, Sample]] = deque()
+        self._backlog = Backlog(QUEUE_MESSAGES, QUEUE_BYTES)
         self._ledger = Ledger()
+        self._series = LogSeries(folder, clock, metadata, attachments, limits)
         self._kept: dict[str, Sample] = {}
         self._asked: set[tuple[str, int]] = set()
+        self._asker = ThreadPoolExecutor(1, "ask")
+        self._answers: Future[list[Sample]] | None = None
         self._states: dict[tuple[str, int], str] = {}
         self._newcomers = False
-        self._log: LogWriter | None = None
-        self._files: list[Path] = []
-        self._messages = 0
-        self._bytes = 0
+        self._hurried = False
         self._failure = ""
-        self._opened_s = 0.0
         self._flush_due_ns = 0
+        self._begun_ns = self._oldest_ns = 0
+        self._longest_wait_ns = self._longest_unflushed_ns = self._slowest_ns = 0
         # Before the service, which subscribes to Health: who has heard of that has heard of all others.
         for topic in TOPICS:
-            bus.subscribe(topic, partial(self._arrived, topic))
+            bus.subscribe(topic, partial(self._backlog.put, topic))
         self.service = Service(Role.RECORDER, run_id, clock, bus, granted=granted, fill=self._fill)
+
+    def catch_signals(self) -> None:
+        """Finish the log at SIGTERM, Ctrl-C or a lost terminal; a second one does not wait for the others' last words.
+
+        For the main thread.
+        """
+        for number in (signal.SIGTERM, signal.SIGINT, signal.SIGHUP):
+            if number != signal.SIGHUP or signal.getsignal(number) is not signal.SIG_IGN:  # as nohup leaves it
+                signal.signal(number, self._told)
 
     def run(self) -> Summary:
         """Record until told to stop.
@@ -113,8 +95,9 @@ class Recorder:
             DataFileError: the first log cannot be opened.
         """
         self._settle()
-        self._ask()
-        self._open()
+        self._keep(self._ask())
+        self._begin()
+        self._begun_ns = self._clock.host_ns()
         self.service.state = "ready"
         while self.service.running:
             self._turn()
@@ -125,10 +108,9 @@ class Recorder:
         self.service.finish()
         return summary
 
-    def _arrived(self, topic: Topic, sample: Sample) -> None:
-        """Take a message from the bus's thread; when too many wait it is left out, and the ledger will tell."""
-        if len(self._queue) < QUEUE_MESSAGES:
-            self._queue.append((topic, sample))
+    def _told(self, number: int, frame: FrameType | None) -> None:
+        self._hurried = not self.service.running
+        self.service.stop(signal.Signals(number).name)
 
     def _settle(self) -> None:
         """Wait until those who are there already have been heard, so that they can be asked."""
@@ -141,47 +123,65 @@ class Recorder:
             if age_s >= longest_s or (age_s >= shortest_s and len(self.service.heard) >= self._bus.peers()):
                 return
 
-    def _ask(self) -> None:
-        """Get what was published before this process came: calibration and states."""
-        self._newcomers = False
-        for topic in TOPICS:
-            if topic.queryable and topic is not HEALTH:
-                for sample in self._bus.get(topic.at(ALL)):
-                    kept = self._kept.get(sample.key)
-                    if kept is None or kept.sequence < sample.sequence:
-                        self._kept[sample.key] = sample
-                        self._asked.add((sample.key, sample.sequence))
-                        self._write(sample)
+    def _ask(self) -> list[Sample]:
+        """Get what this process did not hear: calibration and states from before its start, or lost on their way."""
+        topics = [topic for topic in TOPICS if topic.queryable and topic is not HEALTH]
+        return [sample for topic in topics for sample in self._bus.get(topic.at(ALL))]
 
-    def _open(self) -> None:
+    def _ask_meanwhile(self) -> None:
+        """Ask when somebody is new, on a thread of its own: one who is frozen answers late, and the rest goes on."""
+        if self._newcomers and self._answers is None and self.service.running:
+            self._answers = self._asker.submit(self._ask)
+            self._newcomers = False
+        if self._answers is not None and self._answers.done():
+            answers, self._answers = self._answers, None
+            self._keep(answers.result())
+
+    def _keep(self, answers: list[Sample]) -> None:
+        for sample in answers:
+            kept = self._kept.get(sample.key)
+            if kept is None or kept.sequence < sample.sequence:
+                self._kept[sample.key] = sample
+                self._asked.add((sample.key, sample.sequence))
+                self._write(sample)
+
+    def _begin(self) -> None:
         """Begin a log, with what the messages in it depend on."""
-        now_ns = self._clock.host_ns()
-        self._log = LogWriter(log_path(self._folder, now_ns), now_ns, self._metadata, self._attachments)
-        self._opened_s = time.monotonic()
-        self._files.append(self._log.path)
-        for sample in self._kept.values():
-            self._write(sample)
+        self._series.begin(self._kept.values())
         self.service.event("RECORDING")
 
     def _turn(self) -> None:
         """Write what has arrived; now and then flush, report and rotate."""
-        for _ in range(len(self._queue)):
-            self._take(*self._queue.popleft())
-        if self._newcomers and self.service.running:
-            self._ask()
-        now_ns = self._clock.host_ns()
-        if now_ns >= self._flush_due_ns:
-            self._flush_due_ns = now_ns + _FLUSH_NS
-            self._flush()
-            for topic, count in self._ledger.news().items():
-                self.service.event("MESSAGES_LOST", topic=topic, count=count)
+        for _ in range(len(self._backlog)):
+            topic, sample = self._backlog.take()
+            self._take(topic, sample)
+            now_ns = self._clock.host_ns()
+            self._longest_wait_ns = max(self._longest_wait_ns, now_ns - self._arrival_ns(sample))
+            if now_ns >= self._flush_due_ns:
+                self._look_after()
+        self._ask_meanwhile()
+        if self._clock.host_ns() >= self._flush_due_ns:
+            self._look_after()
+        self.service.beat()
+
+    def _look_after(self) -> None:
+        """Flush, begin the next log when it is time, say what was lost, be heard."""
+        self._flush()
+        self._flush_due_ns = self._clock.host_ns() + _FLUSH_NS
+        self._say_losses()
+        if self._series.longest_write_ns > max(_SLOW_NS, self._slowest_ns):
+            self._slowest_ns = self._series.longest_write_ns
+            self.service.event("DISK_SLOW", stall_s=self._slowest_ns * 1e-9, waiting=len(self._backlog))
         self.service.beat()
 
     def _take(self, topic: Topic, sample: Sample) -> None:
         """Record one message, unless it was recorded when it was asked for."""
         there = (sample.key, sample.sequence)
-        recorded = there in self._asked or self._write(sample)
-        self._asked.discard(there)
+        if there in self._asked:
+            self._asked.discard(there)
+            recorded = not self._failure
+        else:
+            recorded = self._write(sample)
         self._ledger.enter(topic, sample, recorded=recorded)
         if topic is HEALTH:
             self._hear(sample)
@@ -199,41 +199,59 @@ class Recorder:
         self._states[process] = health.state
 
     def _write(self, sample: Sample) -> bool:
-        if self._log is None:
-            return False
         try:
-            self._log.write(sample)
+            written = self._series.write(sample)
         except DataFileError as fault:
             self._fail(fault)
             return False
-        self._messages += 1
-        self.service.work += 1
-        return True
+        if written:
+            self.service.work += 1
+            self._oldest_ns = self._oldest_ns or self._arrival_ns(sample)
+        return written
+
+    def _arrival_ns(self, sample: Sample) -> int:
+        return max(sample.receive_time_ns, self._begun_ns)
 
     def _flush(self) -> None:
-        if self._log is None:
-            return
+        """Make what was written safe; end the log where it is full, and the recording where the disk nearly is."""
         try:
-            self._log.flush()
-            full = self._log.bytes_written >= self._rotation.largest_bytes
-            if full or time.monotonic() - self._opened_s >= self._rotation.longest_s:
-                self._finish_log()
-                self._open()
+            self._series.flush()
+            self._flushed()
+            if self._failure:
+                return
+            if short := self._series.shortage():
+                self._failure = short
+                self._series.end(self._figures() | {"stopped": short})
+                self.service.event("RECORDING_FAILED", why=f"{short}; the log is complete")
+            elif self._series.full:
+                self._series.end(self._figures(), wait=False)
+                self._begin()
+                self._newcomers = True  # a calibration or a state may have been lost on its way: ask for them again
         except DataFileError as fault:
             self._fail(fault)
+
+    def _flushed(self) -> None:
+        self._ledger.settle()
+        if self._oldest_ns:
+            age_ns = self._clock.host_ns() - self._oldest_ns
+            self._longest_unflushed_ns = max(self._longest_unflushed_ns, age_ns)
+            self._oldest_ns = 0
 
     def _fail(self, fault: DataFileError) -> None:
         """Give up recording, and nothing else: the process lives, and counts what is lost from here."""
-        if self._log is not None:
-            self._bytes += self._log.bytes_written
-        self._log = None
+        self._series.give_up()
+        self._ledger.revert()
         self._failure = str(fault)
         self.service.event("RECORDING_FAILED", why=fault)
+
+    def _say_losses(self) -> None:
+        for topic, count in self._ledger.news().items():
+            self.service.event("MESSAGES_LOST", topic=topic, count=count)
 
     def _drain(self) -> None:
         """Wait a while for the last Health of the others, which counts what they sent."""
         deadline_s = time.monotonic() + _DRAIN_S
-        while True:
+        while not self._hurried:
             self._turn()
             latest = {name: state for (name, _), state in sorted(self._states.items()) if name != self.service.name}
             if all(state == "stopped" for state in latest.values()) or time.monotonic() >= deadline_s:
@@ -241,29 +259,43 @@ class Recorder:
             time.sleep(_TURN_S)
 
     def _close(self) -> Summary:
-        for topic, count in self._ledger.news().items():
-            self.service.event("MESSAGES_LOST", topic=topic, count=count)
+        self._say_losses()
         self._turn()
+        self._flush()
         try:
-            self._finish_log()
+            self._series.end(self._figures())
         except DataFileError as fault:
             self._fail(fault)
-        return Summary(tuple(self._files), self._messages, self._ledger.lost(), self._failure)
+        return Summary(
+            tuple(self._series.files),
+            self._series.messages,
+            self._ledger.lost(),
+            self._failure,
+            self._longest_wait_ns,
+            self._longest_unflushed_ns,
+            self._series.longest_write_ns,
+        )
 
-    def _finish_log(self) -> None:
-        if self._log is None:
-            return
-        lost = {f"lost {key}": str(count) for key, count in self._ledger.lost().items()}
-        figures = {"messages": str(self._messages), "messages_lost": str(sum(self._ledger.lost().values())), **lost}
-        self._log.finish({"recording": figures})
-        self._bytes += self._log.path.stat().st_size
-        self._log = None
+    def _figures(self) -> dict[str, str]:
+        """What a log says of its recording at its end: of all logs so far."""
+        lost = self._ledger.lost()
+        return {
+            "messages": str(self._series.messages),
+            "messages_lost": str(sum(lost.values())),
+            **{f"lost {key}": str(count) for key, count in lost.items()},
+        }
 
     def _fill(self, health: wire.Health) -> None:
-        health.recording.file = str(self._files[-1]) if self._files else ""
-        health.recording.messages = self._messages
-        health.recording.lost = sum(self._ledger.lost().values())
-        health.recording.bytes = self._bytes + (self._log.bytes_written if self._log else 0)
+        lost = self._ledger.lost()
+        health.recording.file = str(self._series.files[-1]) if self._series.files else ""
+        health.recording.messages = self._series.messages
+        health.recording.lost = sum(lost.values())
+        health.recording.failure = self._failure
+        health.recording.bytes = self._series.bytes_written
+        counts = {count.topic: count for count in health.topics}  # of its own, those that it sent
+        for key, recorded in self._ledger.recorded().items():
+            count = counts[key] if key in counts else health.topics.add(topic=key)
+            count.received, count.missing = recorded, lost.get(key, 0)
 
 
 def record(
@@ -273,7 +305,7 @@ def record(
     configuration: Path | None = None,
     calibration: Path | None = None,
     seed: int | None = None,
-    rotation: Rotation = Rotation(),
+    limits: Limits = STANDARD,
     clock: Clock | None = None,
     priority: int | None = None,
 ) -> Summary:
@@ -285,7 +317,7 @@ def record(
         configuration: TOML file to put into the log.
         calibration: FITS file to put into the log.
         seed: of a simulated run.
-        rotation: when a log is finished and the next begun.
+        limits: when a log is finished and the next begun, and when there is no room for one.
         clock: the run's; the host's when None.
         priority: of SCHED_FIFO, below the loop's; None leaves the normal class.
 
@@ -293,6 +325,8 @@ def record(
         BusError: another recorder has this run.
         DataFileError: a file cannot be read, or no log can be written in `folder`.
     """
+    if short := shortage(folder, limits.min_free_bytes):
+        raise DataFileError(short)
     attachments = [
         _attached(path, media_type)
         for path, media_type in ((configuration, "application/toml"), (calibration, "application/fits"))
@@ -309,32 +343,13 @@ def record(
             folder,
             metadata={"lowfc": provenance(run.run_id, seed)},
             attachments=attachments,
-            rotation=rotation,
+            limits=limits,
             granted=granted,
         )
-        recorder.service.catch_signals()
+        recorder.catch_signals()
         return recorder.run()
     finally:
         bus.close()
-
-
-def provenance(run_id: str, seed: int | None) -> dict[str, str]:
-    """Versions, host and run, as a log keeps them."""
-    found = {
-        "lowfc": __version__,
-        "python": platform.python_version(),
-        "host": platform.node(),
-        "kernel": platform.release(),
-        "processor": _processor(),
-        "processors": str(os.cpu_count()),
-        "run": run_id,
-        **{library: importlib.metadata.version(library) for library in _LIBRARIES},
-    }
-    if seed is not None:
-        found["seed"] = str(seed)
-    if commit := _commit():
-        found["git"] = commit
-    return found
 
 
 def _attached(path: Path, media_type: str) -> Attachment:
@@ -342,25 +357,3 @@ def _attached(path: Path, media_type: str) -> Attachment:
         return Attachment(path.name, media_type, path.read_bytes())
     except OSError as fault:
         raise DataFileError(f"{path} cannot be read for the log: {fault.strerror}") from fault
-
-
-def _processor() -> str:
-    with Path("/proc/cpuinfo").open() as lines:
-        names = (line.partition(":")[2].strip() for line in lines if line.startswith(("model name", "Model")))
-        return next(names, platform.machine())
-
-
-def _commit() -> str:
-    """Commit of the checkout that runs, where it is one and git is there."""
-    checkout = Path(__file__).parents[2]
-    git = shutil.which("git")
-    if git is None or not (checkout / ".git").exists():
-        return ""
-    done = subprocess.run(  # noqa: S603  # a fixed command
-        [git, "-C", str(checkout), "describe", "--always", "--dirty", "--tags"],
-        capture_output=True,
-        text=True,
-        timeout=5,
-        check=False,
-    )
-    return done.stdout.strip()

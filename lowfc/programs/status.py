@@ -102,4 +102,7 @@ def report(figures: dict[str, Any]) -> str:
             f"log                {figures['log']}: {figures['messages_recorded']} messages, "
             f"{figures['messages_lost']} lost"
         )
+    lines += [f"lost               {count} of {topic}" for topic, count in figures["lost"].items()]
+    if figures["recording_failure"]:
+        lines.append(f"recording stopped  {figures['recording_failure']}")
     return "\n".join(lines)

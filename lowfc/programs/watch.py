@@ -43,6 +43,8 @@ def summary(watch: Watch, record: bool) -> dict[str, Any]:
         "commands_late": camera.commands_late,
         "messages_recorded": None,
         "messages_lost": None,
+        "lost": {},
+        "recording_failure": None,
         "disturbance_rms_nm": round(wavefront.disturbance_rms_nm, 4),
         "residual_rms_nm": round(wavefront.residual_rms_nm, 4),
         "tilt_disturbance_mas": round(wavefront.tilt_disturbance_mas, 4),
@@ -60,6 +62,8 @@ def summary(watch: Watch, record: bool) -> dict[str, Any]:
         figures |= {
             "messages_recorded": recording.messages,
             "messages_lost": recording.lost,
+            "lost": {topic.topic: topic.missing for topic in watch.of(Role.RECORDER).topics if topic.missing},
+            "recording_failure": recording.failure or None,
             "log": recording.file,
         }
     return figures

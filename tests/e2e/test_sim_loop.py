@@ -1,6 +1,8 @@
 """The simulated loop as a user runs it: real processes, a real bus, a real log."""
 
+import json
 import os
+import resource
 import shutil
 import signal
 import subprocess
@@ -9,7 +11,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from loops import children, interrupt, loop, payloads, recorded_bytes, run, start, until
+from loops import LOWFC, children, interrupt, loop, payloads, recorded_bytes, run, start, until
 
 from lowfc.contract.messages import RawImage, from_timestamp, topic_of, wire
 
@@ -150,3 +152,23 @@ def test_help_has_examples(tmp_path: Path) -> None:
         done = run(tmp_path, *command, "--help")
         assert done.returncode == 0
         assert "Example: lowfc" in done.stdout
+
+
+def test_a_disk_that_refuses_ends_the_recording_and_nothing_else(tmp_path: Path) -> None:
+    words = [*LOWFC, "sim-loop", "--rate", "200", "--duration", "2", "--json"]
+    small = (4_000_000, 4_000_000)
+    done = subprocess.run(
+        words,
+        cwd=tmp_path,
+        capture_output=True,
+        text=True,
+        timeout=60,
+        check=False,
+        preexec_fn=lambda: resource.setrlimit(resource.RLIMIT_FSIZE, small),
+    )
+    figures = json.loads(done.stdout)
+    assert done.returncode == 1, done.stderr
+    assert "File too large" in figures["recording_failure"]
+    assert figures["frames_published"] == 400
+    assert figures["frames_processed"] + figures["frames_skipped"] == 400
+    assert sum(figures["lost"].values()) == figures["messages_lost"] > 100

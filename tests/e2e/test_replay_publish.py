@@ -1,0 +1,228 @@
+"""A recorded night back on the real bus: what a tool, a late joiner and a controller under test get of it."""
+
+import json
+import signal
+import socket
+import subprocess
+import sys
+from collections import defaultdict
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+from loops import LOWFC, loop, until
+
+from lowfc.adapters.bus import Sample
+from lowfc.adapters.clock import HostClock
+from lowfc.adapters.log_reader import Logged, LogReader
+from lowfc.adapters.run import Run, new_run_id, open_run
+from lowfc.adapters.zenoh_bus import ZenohBus
+from lowfc.contract.errors import BusError, ConfigurationError
+from lowfc.contract.messages import (
+    CALIBRATION,
+    CAMERA_STATE,
+    COMMAND,
+    EVENT,
+    FRAME,
+    HEALTH,
+    MIRROR_STATE,
+    STEP,
+    Topic,
+    wire,
+)
+from lowfc.programs.replay_publish import publish, render
+
+PLAY = """
+import json, sys
+from pathlib import Path
+from lowfc.programs.replay_publish import publish
+logs, run, options = json.loads(sys.argv[1])
+print(json.dumps(publish([Path(log) for log in logs], run, **options)))
+"""
+
+
+@pytest.fixture(scope="module")
+def log(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path: Path = loop(tmp_path_factory.mktemp("night"), "--rate", "100", "--duration", "1")["log"]
+    return path
+
+
+@pytest.fixture(scope="module")
+def logged(log: Path) -> dict[str, list[Logged]]:
+    """Messages of the log by key."""
+    found = defaultdict(list)
+    for message in LogReader(log):
+        found[message.key].append(message)
+    assert len(found[FRAME.key]) > 80
+    return found
+
+
+@pytest.fixture
+def run() -> Iterator[Run]:
+    made = open_run(new_run_id())
+    yield made
+    made.remove()
+
+
+class Tool:
+    """A user's own program: it is a role without a port, and has no health."""
+
+    def __init__(self, run: Run, *topics: Topic) -> None:
+        self.heard: dict[str, list[Sample]] = defaultdict(list)
+        self.bus = ZenohBus(run.links, "operator", HostClock())
+        for topic in topics:
+            self.bus.subscribe(topic, lambda sample: self.heard[sample.key].append(sample))
+
+
+@pytest.fixture
+def tool(run: Run) -> Iterator[Tool]:
+    made = Tool(run, FRAME, STEP, MIRROR_STATE, COMMAND, EVENT, HEALTH)
+    yield made
+    made.bus.close()
+
+
+def start(log: Path, run: Run, **options: object) -> "subprocess.Popen[str]":
+    words = [sys.executable, "-c", PLAY, json.dumps([[str(log)], run.run_id, options])]
+    return subprocess.Popen(words, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+
+
+def figures_of(process: "subprocess.Popen[str]") -> dict[str, Any]:
+    output, complaints = process.communicate(timeout=60)
+    assert process.returncode == 0, complaints
+    figures: dict[str, Any] = json.loads(output)
+    assert render(figures)
+    return figures
+
+
+def test_a_tool_sees_the_night_again(log: Path, logged: dict[str, list[Logged]], run: Run, tool: Tool) -> None:
+    begun_ns = tool.bus.clock.host_ns()
+    playing = start(log, run, speed=2.0)
+    until(lambda: tool.heard[FRAME.key] or playing.poll() is not None)
+    (calibration,) = tool.bus.get(CALIBRATION.key)
+    (camera,) = tool.bus.get(CAMERA_STATE.key)
+    figures = figures_of(playing)
+
+    assert calibration.payload == logged[CALIBRATION.key][-1].payload
+    assert camera.sequence in [message.sequence for message in logged[CAMERA_STATE.key]]
+    for key in (FRAME.key, STEP.key, MIRROR_STATE.at("dm"), HEALTH.at("camera")):
+        heard, sent = tool.heard[key], logged[key]
+        assert [sample.payload for sample in heard] == [message.payload for message in sent], key
+        assert [sample.sequence for sample in heard] == [message.sequence for message in sent], key
+        times = [sample.publish_time_ns for sample in heard]
+        assert times == sorted(times)
+        assert times[0] > begun_ns, "the time of publication is that of today"
+        span_ns = sent[-1].log_time_ns - sent[0].log_time_ns
+        assert times[-1] - times[0] > 0.9 * span_ns / 2, "played in its own time, twice as fast"
+    frames = {sample.sequence for sample in tool.heard[FRAME.key]}
+    joined = {wire.ControlStep.FromString(sample.payload).frame_sequence for sample in tool.heard[STEP.key]}
+    assert joined
+    assert joined <= frames
+
+    command = COMMAND.at("dm")
+    assert logged[command]
+    assert command not in tool.heard
+    assert "allow-commands" in figures["left_out"][command]
+    assert HEALTH.at("recorder") not in tool.heard
+    assert HEALTH.at("replay") in tool.heard
+    assert figures["published"][FRAME.key] == len(logged[FRAME.key])
+    assert figures["finished"]
+    assert not figures["interrupted"]
+    assert figures["timing_error_us"]["max"] >= figures["timing_error_us"]["p50"] > 0
+
+
+def test_a_truncated_log_faster_with_commands(log: Path, run: Run, tool: Tool, tmp_path: Path) -> None:
+    cut = tmp_path / "cut.mcap.part"
+    content = log.read_bytes()
+    cut.write_bytes(content[: len(content) * 2 // 3])
+    there = [message for message in LogReader(cut) if message.key == COMMAND.at("dm")]
+    assert len(there) > 20
+    figures = figures_of(start(cut, run, speed=4.0, topics=["/lowfc/mirror/*"], allow_commands=True))
+    heard = tool.heard[COMMAND.at("dm")]
+    assert [sample.payload for sample in heard] == [message.payload for message in there]
+    assert {key for key in tool.heard if tool.heard[key]} - {HEALTH.at("replay"), EVENT.key} == {
+        COMMAND.at("dm"),
+        MIRROR_STATE.at("dm"),
+    }
+    assert not figures["finished"]
+    assert figures["took_s"] < figures["span_s"] * 0.9 or figures["messages_behind"]
+
+
+def test_a_controller_under_test(log: Path, logged: dict[str, list[Logged]], run: Run, tool: Tool, tmp_path: Path):
+    reader = LogReader(log)
+    next(iter(reader))
+    for name, content in reader.attachments.items():
+        (tmp_path / name).write_bytes(content)
+    files = ["--config", str(tmp_path / "config.toml"), "--calibration", str(tmp_path / "calibration.fits")]
+    playing = start(log, run, speed=2.0, wait_for=["controller"])
+    controller = subprocess.Popen([*LOWFC, "controller", "--run", run.run_id, *files], stderr=subprocess.DEVNULL)
+    try:
+        figures = figures_of(playing)
+    finally:
+        controller.terminate()
+        controller.wait(10)
+    assert figures["left_out"][STEP.key] == "controller is live"
+
+    errors = {}
+    for message in logged[STEP.key]:
+        step = wire.ControlStep.FromString(message.payload)
+        errors[step.frame_sequence] = list(step.error_nm)
+    steps = [wire.ControlStep.FromString(sample.payload) for sample in tool.heard[STEP.key]]
+    assert {step.frame_sequence for step in steps} <= {message.sequence for message in logged[FRAME.key]}
+    measured = [step for step in steps if step.error_nm and errors.get(step.frame_sequence)]
+    assert len(measured) > len(errors) / 2
+    for step in measured:  # the same frame through the same calibration, by another process on another day
+        assert list(step.error_nm) == errors[step.frame_sequence]
+    assert len(tool.heard[COMMAND.at("dm")]) >= len(steps)
+
+
+def test_ctrl_c_ends_with_the_summary(log: Path, logged: dict[str, list[Logged]], run: Run, tool: Tool) -> None:
+    playing = start(log, run, speed=0.05, topics=["lowfc/camera/frame"])
+    until(lambda: tool.heard[FRAME.key] or playing.poll() is not None)
+    playing.send_signal(signal.SIGINT)
+    figures = figures_of(playing)
+    assert figures["interrupted"]
+    assert 0 < figures["published"][FRAME.key] < len(logged[FRAME.key])
+    assert "interrupted" in render(figures)
+
+
+def test_nothing_to_play(log: Path, run: Run) -> None:
+    playing = start(log, run, topics=["lowfc/control/request"])
+    _, complaints = playing.communicate(timeout=60)
+    assert playing.returncode
+    assert "no message of the topics to play" in complaints
+
+
+@pytest.mark.parametrize(
+    ("options", "expected"),
+    [
+        ({"topics": ["lowfc/camera/fram"]}, "did you mean 'lowfc/camera/frame'"),
+        ({"topics": ["lowfc/nothing/*"]}, "no topic fits"),
+        ({"topics": ["lowfc/mirror/dm/command"]}, "--allow-commands"),
+        ({"topics": ["lowfc/mirror/*/command"]}, "--allow-commands"),
+        ({"wait_for": ["controler"]}, "did you mean 'controller'"),
+        ({"speed": 0.0}, "above 0"),
+    ],
+)
+def test_a_mistake(log: Path, run: Run, options: dict[str, Any], expected: str) -> None:
+    with pytest.raises(ConfigurationError, match=expected):
+        publish([log], run.run_id, **options)
+
+
+@pytest.mark.parametrize(
+    ("live", "options"),
+    [
+        ("camera", {}),
+        ("camera", {"topics": ["lowfc/camera/*"]}),
+        ("mirror-dm", {}),
+        ("mirror-dm", {"topics": ["lowfc/camera/frame"]}),
+        ("controller", {"topics": ["lowfc/control/step"]}),
+        ("controller", {"topics": ["lowfc/mirror/dm/command"], "allow_commands": True}),
+    ],
+)
+def test_a_live_process_is_not_mixed_with_a_log(log: Path, run: Run, live: str, options: dict[str, Any]) -> None:
+    with socket.socket() as taken:
+        taken.bind(("127.0.0.1", run.links.ports[live]))
+        taken.listen()
+        with pytest.raises(BusError, match=f"{live} of run '{run.run_id}' is live"):
+            publish([log], run.run_id, **options)
