@@ -91,7 +91,7 @@ class _Columns:
 
     def taken(self, name: str, width: int | None = None) -> npt.NDArray[Any]:
         column = np.array(self._columns[name])
-        return column if width is None else column.reshape(-1, width)
+        return column if width is None else column.reshape(len(self._columns["sequence"]), width)
 
 
 class _Gathered:

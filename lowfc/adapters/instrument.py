@@ -143,7 +143,7 @@ def analytic_calibration(config: Configuration, optics: Twin, on_nodes: TwinMirr
     I0, H = normalise_flux(light, H, good)
     nuisance = _nuisance(config, light, good)
     try:
-        R = reconstructor(I0, H, good, flux_e, _equivalent_read_noise_e(camera), config.control.estimator, nuisance)
+        R = reconstructor(I0, H, good, flux_e, equivalent_read_noise_e(camera), config.control.estimator, nuisance)
     except ValueError as error:
         raise CalibrationError(f"sensor.kind = {config.sensor.kind!r}, {len(nolls)} modes: {error}") from None
     _check_exposure(config, light)
@@ -184,7 +184,7 @@ def frame_noise_nm(config: Configuration, calibration: Calibration) -> Double:
     flux_e = calibration.flux_dn * camera.gain_e_per_dn / camera.em_gain
     reference, matrix = calibration.reference.astype(float), calibration.reconstructor.astype(float)
     excess = np.sqrt(2) if camera.em_gain > 1 else 1.0
-    return excess * noise_nm(matrix, reference, flux_e, _equivalent_read_noise_e(camera))
+    return excess * noise_nm(matrix, reference, flux_e, equivalent_read_noise_e(camera))
 
 
 def _check_exposure(config: Configuration, light: Double) -> None:
@@ -215,7 +215,7 @@ def _dark_dn(camera: Detector) -> float:
     return camera.bias_dn + camera.clock_induced_charge_e * camera.em_gain / camera.gain_e_per_dn
 
 
-def _equivalent_read_noise_e(camera: Detector) -> float:
+def equivalent_read_noise_e(camera: Detector) -> float:
     """Read noise beside photon noise as the weights see it, in electrons before multiplication.
 
     The register doubles the photons' variance, to 2 (I0 + read_noise^2 / (2 gain^2)); spurious charge counts as light.

@@ -15,13 +15,12 @@ from lowfc import __version__
 from lowfc.adapters.envelope import count_of, start_of
 from lowfc.adapters.log_reader import LogReader
 from lowfc.adapters.log_records import Damage
-from lowfc.adapters.log_writer import UNFINISHED
+from lowfc.adapters.log_writer import CHUNK_BYTES, UNFINISHED
 from lowfc.contract.errors import DataFileError
 
 RECOVERY = "recovery"
 """Name of the metadata that says what a recovered log was made from."""
 
-_CHUNK_BYTES = 240 * 1024
 _STRIDE = 1000  # messages between two words about the progress
 
 
@@ -77,7 +76,7 @@ def recover(source: Path, out: Path, progress: Callable[[int, int], None] = lamb
     reader = LogReader(source, skip_damaged=True)
     with _new_file(out) as file:
         writer = Writer(
-            file, chunk_size=_CHUNK_BYTES, compression=CompressionType.LZ4, enable_crcs=True, enable_data_crcs=True
+            file, chunk_size=CHUNK_BYTES, compression=CompressionType.LZ4, enable_crcs=True, enable_data_crcs=True
         )
         writer.start(profile="", library=f"lowfc {__version__}")
         messages = _copy(reader, writer, progress)

@@ -35,7 +35,7 @@ if TYPE_CHECKING:
 UNFINISHED = ".part"
 """Appended to the name of a log that is being written, or was when its recorder died."""
 
-_CHUNK_BYTES = 240 * 1024  # a chunk is closed by the message that passes this; with a frame it stays below 256 KiB
+CHUNK_BYTES = 240 * 1024  # a chunk is closed by the message that passes this; with a frame it stays below 256 KiB
 START_KEY = "start_s"
 """Of a channel's metadata: the upper half of the sequences in it."""
 
@@ -106,7 +106,7 @@ class LogWriter:
         self._file = BufferedWriter(self._raw)
         self._writer = Writer(
             self._file,
-            chunk_size=_CHUNK_BYTES,
+            chunk_size=CHUNK_BYTES,
             compression=CompressionType.LZ4,
             enable_crcs=True,
             enable_data_crcs=True,

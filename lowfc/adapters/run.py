@@ -30,6 +30,7 @@ _CREDENTIALS = "credentials"
 _USER = "lowfc"
 _RUN_ID = re.compile(r"[a-z0-9][a-z0-9._-]{0,47}")
 _LOWEST_PORT = 15000
+_CONNECT_S = 1.0
 _PORT_RANGE = Path("/proc/sys/net/ipv4/ip_local_port_range")
 
 
@@ -64,6 +65,10 @@ class Links:
             raise DataFileError(f"{self.secret_file} should hold one line '{self.user}:password'; {_ADVICE}")
         return secret
 
+    def live(self) -> set[str]:
+        """Roles whose processes listen now; a run that was killed leaves its directory behind."""
+        return {role for role, port in self.ports.items() if _listens(port)}
+
     def claim_start(self, role: str, start_s: int) -> int:
         """Start of a role's process for its sequences: `start_s`, or more where this run has had that one already.
 
@@ -95,6 +100,12 @@ class Run:
 
 
 _ADVICE = "stop the processes of this run, remove its directory and start again"
+
+
+def _listens(port: int) -> bool:
+    with socket.socket() as probe:
+        probe.settimeout(_CONNECT_S)
+        return probe.connect_ex(("127.0.0.1", port)) == 0
 
 
 def new_run_id() -> str:

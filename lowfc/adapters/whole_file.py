@@ -1,9 +1,31 @@
 """Files that are whole or not there."""
 
+import contextlib
 import tempfile
+from collections.abc import Iterator
 from pathlib import Path
 
 from lowfc.contract.errors import DataFileError
+
+
+@contextlib.contextmanager
+def being_written(path: Path) -> Iterator[Path]:
+    """A file to write that gets the name `path` when all went well, and is gone when not.
+
+    Raises:
+        DataFileError: it cannot be written.
+    """
+    try:
+        with tempfile.NamedTemporaryFile(dir=path.parent, prefix=f".{path.name}.", delete=False) as stream:
+            part = Path(stream.name)
+        try:
+            yield part
+            part.chmod(0o644)
+            part.replace(path)
+        finally:
+            part.unlink(missing_ok=True)
+    except OSError as error:
+        raise DataFileError(f"{path} cannot be written: {error.strerror or error}") from error
 
 
 def write_whole(path: Path, content: bytes) -> None:
@@ -12,19 +34,8 @@ def write_whole(path: Path, content: bytes) -> None:
     Raises:
         DataFileError: The file cannot be written.
     """
-    try:
-        with tempfile.NamedTemporaryFile(dir=path.parent, prefix=f".{path.name}.", delete=False) as stream:
-            part = Path(stream.name)
-            try:
-                stream.write(content)
-                stream.close()
-                part.chmod(0o644)
-                part.replace(path)
-            except BaseException:
-                part.unlink(missing_ok=True)
-                raise
-    except OSError as error:
-        raise DataFileError(f"{path} cannot be written: {error.strerror or error}") from error
+    with being_written(path) as part:
+        part.write_bytes(content)
 
 
 def require_folder(*files: Path | None) -> None:

@@ -15,6 +15,7 @@ from lowfc.adapters.terminal import DEFAULT_RUN, ConfigFile, RunId, configuratio
 from lowfc.contract.configuration import Preset
 from lowfc.programs.bench_record import bench_record
 from lowfc.programs.design_commands import design_app
+from lowfc.programs.export import export
 from lowfc.programs.log_info import info
 from lowfc.programs.recover import recover
 from lowfc.programs.replay_commands import replay_log
@@ -35,6 +36,7 @@ app.command("replay")(replay_log)
 bench_app.command("record")(bench_record)
 app.command()(info)
 app.command()(recover)
+app.command()(export)
 app.command()(validate)
 
 AnyRun = Annotated[str | None, typer.Option("--run", help="Name of the run; default: the only one.")]

@@ -1,6 +1,5 @@
 """The operator's hand: requests to a running controller."""
 
-import socket
 import time
 from pathlib import Path
 
@@ -18,13 +17,7 @@ def running(base: Path | None = None) -> list[str]:
     """Names of the runs on this host whose controller listens; a run that was killed leaves its directory behind."""
     folder = runtime_base() if base is None else base
     found = (path.parent.name for path in folder.glob("*/links.json"))
-    return sorted(name for name in found if _listens(open_run(name, ()).links.ports[Role.CONTROLLER]))
-
-
-def _listens(port: int) -> bool:
-    with socket.socket() as probe:
-        probe.settimeout(CONNECT_S)
-        return probe.connect_ex(("127.0.0.1", port)) == 0
+    return sorted(name for name in found if Role.CONTROLLER in open_run(name, ()).links.live())
 
 
 def the_run(name: str | None) -> str:

@@ -71,7 +71,7 @@ def export_log(
     from lowfc.adapters.history_reader import read_history
     from lowfc.adapters.log_reader import LogReader
     from lowfc.adapters.progress import passing_bar
-    from lowfc.programs.export_rows import being_written
+    from lowfc.adapters.whole_file import being_written
 
     if frames and to is Format.CSV:
         raise ConfigurationError("a CSV file has no place for frames: use --to npz, fits or aot, or leave out --frames")

@@ -1,9 +1,7 @@
 """Big arrays, row by row from a log into a file: frames and actuator commands are never in memory all at once."""
 
-import contextlib
 import itertools
 import math
-import tempfile
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -133,23 +131,3 @@ def _frames(path: Path, count: int, progress: Progress) -> Iterator[tuple[int, i
             )
         yield frame.sequence, frame.time_ns, frame.pixels
         progress(log)
-
-
-@contextlib.contextmanager
-def being_written(path: Path) -> Iterator[Path]:
-    """A file to write that gets the name `path` when all went well, and is gone when not.
-
-    Raises:
-        DataFileError: it cannot be written.
-    """
-    try:
-        with tempfile.NamedTemporaryFile(dir=path.parent, prefix=f".{path.name}.", delete=False) as stream:
-            part = Path(stream.name)
-        try:
-            yield part
-            part.chmod(0o644)
-            part.replace(path)
-        finally:
-            part.unlink(missing_ok=True)
-    except OSError as error:
-        raise DataFileError(f"{path} cannot be written: {error.strerror or error}") from error

@@ -3,6 +3,7 @@
 import json
 import sys
 import time
+from collections.abc import Callable
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -10,8 +11,11 @@ import typer
 from rich.console import Console
 
 from lowfc.adapters.envelope import count_of
+from lowfc.adapters.log_reader import LogReader
 from lowfc.adapters.progress import passing_bar
 from lowfc.adapters.provenance import provenance
+from lowfc.adapters.terminal import DEFAULT_RUN, INTERRUPTED
+from lowfc.contract.errors import ConfigurationError
 from lowfc.programs.replay_account import Account
 
 _HOST = ("lowfc", "git", "python", "numpy", "scipy", "blas", "processor", "cpu_features")
@@ -105,22 +109,82 @@ def _host_differs(there: dict[str, str]) -> dict[str, tuple[str, str]]:
 
 
 def replay_log(
-    logs: Annotated[
-        list[Path], typer.Argument(help="Log (MCAP); or several that follow each other.", metavar="LOG...")
-    ],
+    logs: Annotated[list[Path], typer.Argument(help="A log, or several that follow each other.", metavar="LOG...")],
     tolerance: Annotated[
-        float, typer.Option(min=0, help="Largest difference that is none, nm: for a log of another processor.")
-    ] = 0.0,
-    jobs: Annotated[int, typer.Option(min=0, help="Processes, at most; 0 for one on every processor.")] = 0,
+        float | None, typer.Option(min=0, help="Largest difference that is none, nm: for a log of another processor.")
+    ] = None,
+    jobs: Annotated[
+        int | None, typer.Option(min=1, help="Processes, at most; default: one on every processor.")
+    ] = None,
+    what_if: Annotated[
+        str | None,
+        typer.Option("--what-if", metavar="KEY=VALUE,...", help="Other gains: gain, leak, limit_nm, tilt_gain, ..."),
+    ] = None,
+    config: Annotated[Path | None, typer.Option(help="What if: the [control] section of this file.")] = None,
+    calibration: Annotated[Path | None, typer.Option(help="What if: another calibration (FITS).")] = None,
+    controller: Annotated[
+        str | None,
+        typer.Option(metavar="FILE.py:NAME", help="What if: your step(state, error_nm) -> (state, command_nm)."),
+    ] = None,
+    publish: Annotated[bool, typer.Option("--publish", help="Put the recorded traffic on the bus again.")] = False,
+    run: Annotated[str | None, typer.Option("--run", help="Publish: name of the run.")] = None,
+    speed: Annotated[float | None, typer.Option(help="Publish: times as fast as it was.")] = None,
+    topics: Annotated[list[str] | None, typer.Option(help="Publish: only these keys or patterns; repeat.")] = None,
+    allow_commands: Annotated[
+        bool, typer.Option("--allow-commands", help="Publish: commands too, which a live mirror obeys.")
+    ] = False,
+    wait_for: Annotated[list[str] | None, typer.Option(help="Publish: begin when this role is there; repeat.")] = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object on standard output.")] = False,
 ) -> None:
     """Run the loop again on what it took in, and compare every step and command with the log, to the bit.
 
-    Exit status 0 only if they are identical. Logs may be complete, rotated, truncated or damaged.
+    Exit status 0 only if they are identical. Logs may be complete, rotated, truncated or damaged. With --what-if (or
+    --config, --calibration, --controller): what another controller would have made of the same night. With --publish:
+    the night on the bus again, for a viewer or a controller under test.
 
-    Example: lowfc replay logs/20261122T020834Z.mcap
+    Example: lowfc replay logs/*.mcap
     """
-    figures = verify(logs, tolerance, jobs, Console(stderr=True))
-    sys.stdout.write((json.dumps(figures) if as_json else render(figures)) + "\n")
-    if not figures["identical"]:
-        raise typer.Exit(1)
+    console = Console(stderr=True)
+    another = any(option is not None for option in (what_if, config, calibration, controller))
+    _only_with("--publish", publish, run, speed, topics, allow_commands, wait_for)
+    if (publish or another) and (tolerance is not None or jobs is not None or publish is another):
+        raise ConfigurationError(
+            "--publish, --what-if and the comparison (--tolerance, --jobs) are three different things"
+        )
+    if publish:
+        from lowfc.programs import replay_publish as publishing
+
+        figures = publishing.publish(
+            logs,
+            run or DEFAULT_RUN,
+            speed=1.0 if speed is None else speed,
+            topics=topics or (),
+            allow_commands=allow_commands,
+            wait_for=wait_for or (),
+            console=console,
+        )
+        _show(figures, publishing.render, as_json)
+        if figures["interrupted"]:
+            raise typer.Exit(INTERRUPTED)
+    elif another:
+        from lowfc.programs import what_if as counterfactual
+
+        if len(logs) != 1:
+            raise ConfigurationError("--what-if reads one log")
+        wanted = counterfactual.wanted(what_if, config, calibration, controller)
+        reader = LogReader(logs[0], skip_damaged=True)
+        _show(counterfactual.what_if(reader, wanted), counterfactual.render, as_json)
+    else:
+        figures = verify(logs, tolerance or 0.0, jobs or 0, console)
+        _show(figures, render, as_json)
+        if not figures["identical"]:
+            raise typer.Exit(1)
+
+
+def _only_with(name: str, given: bool, *options: object) -> None:
+    if not given and any(options):
+        raise ConfigurationError(f"--run, --speed, --topics, --allow-commands and --wait-for belong to {name}")
+
+
+def _show(figures: dict[str, Any], text: Callable[[dict[str, Any]], str], as_json: bool) -> None:
+    sys.stdout.write((json.dumps(figures) if as_json else text(figures)) + "\n")

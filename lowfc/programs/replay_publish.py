@@ -25,7 +25,7 @@ from lowfc.adapters.zenoh_bus import ZenohBus
 from lowfc.contract.errors import ConfigurationError, DataFileError, nearest
 from lowfc.contract.messages import COMMAND, HEALTH, MIRROR_STATE, Role, topic_of
 from lowfc.control.durations import Durations
-from lowfc.programs.replay_selection import Selection, live_roles, role_of
+from lowfc.programs.replay_selection import Selection, role_of
 
 BEHIND_NS = 1_000_000
 """A message that is sent later than this after its time is counted as behind."""
@@ -77,7 +77,7 @@ def publish(
                 f"run {run_id!r} has no role {role!r} to wait for{nearest(role, run.links.ports)}; "
                 f"it has {', '.join(sorted(run.links.ports))}"
             )
-    selection = Selection(run.links, topics, live_roles(run.links) | set(wait_for), allow_commands=allow_commands)
+    selection = Selection(run.links, topics, run.links.live() | set(wait_for), allow_commands=allow_commands)
     granted = set_up(None, None, lock_memory=False)
     with _joined(run, selection, granted) as (service, buses):
         shown.print(f"playing into run {run_id!r} as {', '.join(buses)}", highlight=False)

@@ -4,7 +4,6 @@ Every topic of a log was published by a role of the loop. A replay takes the pla
 that a role is played either by the log or by a live process and never by both.
 """
 
-import socket
 from collections.abc import Collection, Iterator, Sequence
 from fnmatch import fnmatchcase
 
@@ -13,7 +12,6 @@ from lowfc.adapters.run import Links, mirror_role
 from lowfc.contract.errors import BusError, ConfigurationError, nearest
 from lowfc.contract.messages import COMMAND, FRAME, HEALTH, TOPICS, Role, Topic, topic_of
 
-_CONNECT_S = 1.0
 _MIRROR = f"{Role.MIRROR}-"
 
 
@@ -110,19 +108,8 @@ def role_of(key: str) -> str:
     return mirror_role(name) if role is Role.MIRROR else role
 
 
-def live_roles(links: Links) -> set[str]:
-    """Roles of a run whose processes listen now."""
-    return {role for role, port in links.ports.items() if _listens(port)}
-
-
 def _in_loop(role: str) -> bool:
     return role in (Role.CAMERA, Role.CONTROLLER) or role.startswith(_MIRROR)
-
-
-def _listens(port: int) -> bool:
-    with socket.socket() as probe:
-        probe.settimeout(_CONNECT_S)
-        return probe.connect_ex(("127.0.0.1", port)) == 0
 
 
 def _keys(links: Links) -> Iterator[str]:

@@ -1,0 +1,153 @@
+"""The logged run as a what-if needs it: exposures, the delay as measured, what each of them saw of the commands."""
+
+from collections.abc import Callable
+from dataclasses import fields
+
+import numpy as np
+import numpy.typing as npt
+
+from lowfc.adapters.history import History, Steps, rows_of
+from lowfc.adapters.instrument import settings
+from lowfc.adapters.log_reader import LogReader
+from lowfc.contract.codec import decode_frame
+from lowfc.contract.errors import DataFileError
+from lowfc.contract.messages import FRAME
+from lowfc.control.calibration import Calibration
+from lowfc.control.estimator import estimate
+from lowfc.control.law import Law
+from lowfc.control.safety import LoopMode
+from lowfc.control.stability import delay_weights
+from lowfc.control.what_if import (
+    delay_from_times,
+    delay_from_truth,
+    exposed,
+    frames_since,
+    missing_before,
+    seen_nm,
+    settling_frames,
+)
+
+Single = npt.NDArray[np.float32]
+Double = npt.NDArray[np.float64]
+Rows = npt.NDArray[np.bool_]
+
+DELAY_DIFFERS = 0.05
+"""Frames by which a measured delay must differ from the controller's, or a whole number, to be another one."""
+_TORN_NM = 0.01
+_PROGRESS_FRAMES = 1000
+
+
+class LoggedRun:
+    """Steps of a log that are exposures of their own, from the first that was used.
+
+    Attributes:
+        steps: those steps; `missing` exposures (steps,) without one before each.
+        calibration: of the log.
+        used: (steps,) whether the frame was used.
+        law: the one that the run ended with.
+        controller_delay: frames that the controller reckoned with; `measured_delay` is None where it cannot be
+            measured, `measured_from` says from what; `delay_frames` is the one to go by, and `weights` are its.
+        seen_nm: (steps, modes) commands that the exposures saw; NaN where a frame was not used and the delay is the
+            controller's.
+        torn: (steps,) where the command before is not the one that the log has: something was not recorded.
+    """
+
+    def __init__(self, history: History) -> None:
+        """Take the run out of a history.
+
+        Raises:
+            DataFileError: no frame was used, or gains and delay are not known.
+        """
+        self.history = history
+        rows = exposed(history.steps.sequence)
+        used = rows & np.isfinite(history.steps.error_nm).all(axis=1)
+        if history.calibration is None or not used.any() or not history.rate_hz:
+            raise DataFileError(f"{history.log.path}: too few frames that a calibrated controller used are in it")
+        rows[: int(np.argmax(used))] = False  # of the disturbance before nothing is known
+        self.calibration = history.calibration
+        self.steps = Steps(*(getattr(history.steps, part.name)[rows] for part in fields(Steps)))
+        self.used: Rows = used[rows]
+        self.missing = missing_before(self.steps.sequence)
+        self.law, self.controller_delay = _law_and_delay(history, self.calibration)
+
+        weights = delay_weights(self.controller_delay).astype(np.float32)
+        believed_nm = self.steps.error_nm - self.steps.pol_nm
+        reckoned_nm = seen_nm(weights, self.steps.command_nm, self.missing, believed_nm[0])
+        self.torn: Rows = np.abs(reckoned_nm - believed_nm).max(axis=1) > _TORN_NM
+
+        self.measured_delay, self.measured_from = self._measured_delay()
+        self.delay_frames, self.weights, self.seen_nm = self.controller_delay, weights, believed_nm
+        if self.measured_delay is not None and abs(self.measured_delay - self.controller_delay) > DELAY_DIFFERS:
+            whole = round(self.measured_delay)
+            near = abs(self.measured_delay - whole) <= DELAY_DIFFERS
+            self.delay_frames = float(whole) if near else self.measured_delay
+            self.weights = delay_weights(self.delay_frames).astype(np.float32)
+            self.seen_nm = seen_nm(self.weights, self.steps.command_nm, self.missing, believed_nm[0])
+
+    def true_nm(self, of_truths: Single) -> Single:
+        """Rows of the truths (truths, modes) at each step; NaN where there is none."""
+        rows = rows_of(self.steps.sequence, self.history.truths.sequence)
+        return np.where((rows >= 0)[:, None], of_truths[rows], np.float32(np.nan))
+
+    def rows_to_compare(self, laws: list[Law], usable: Rows) -> tuple[Rows, int, str]:
+        """Which of the usable steps to compare runs at, the frames in which these laws settle, and in words.
+
+        Raises:
+            DataFileError: none are left.
+        """
+        steps, missing = self.steps, self.missing
+        closed, over = steps.mode == LoopMode.CLOSED, "closed loop"
+        if not (closed & usable).any():
+            closed, over = np.ones_like(closed), "the loop was never closed"
+        since = frames_since(self.torn, closed, missing)
+        settling = max(settling_frames(law, self.history.rate_hz) for law in laws)
+        settling = min(settling, int(since.max()) // 2)
+        rows = usable & (since >= settling) & (steps.saturated_pixels == 0)
+        if not rows.any():
+            raise DataFileError(
+                f"{self.history.log.path}: no frame is left to compare: of {len(rows)}, {np.count_nonzero(~usable)} "
+                f"were refused and {np.count_nonzero(steps.saturated_pixels)} have saturated pixels"
+            )
+        return rows, settling, over
+
+    def measured_again(self, calibration: Calibration, progress: Callable[[int], None] | None) -> Single:
+        """Errors (steps, modes) that another calibration measures in the frames that were used: a second pass."""
+        steps = self.steps
+        error_nm = np.full_like(steps.error_nm, np.nan)
+        scratch = np.empty(calibration.shape[0] * calibration.shape[1], np.float32)
+        rows = {sequence: row for row, sequence in enumerate(steps.sequence.tolist()) if self.used[row]}
+        for number, message in enumerate(LogReader(self.history.log.path, topics=[FRAME]), 1):
+            if progress is not None and number % _PROGRESS_FRAMES == 0:
+                progress(number)
+            row = rows.get(message.sequence)
+            pixels = decode_frame(message.payload, message.sequence, 0).pixels if row is not None else None
+            if pixels is not None and pixels.shape == calibration.shape:
+                found = estimate(calibration, pixels.reshape(-1), 0.0, scratch)
+                if found is not None:
+                    error_nm[row] = found.error_nm
+        return error_nm
+
+    def _measured_delay(self) -> tuple[float | None, str]:
+        history, steps, truths = self.history, self.steps, self.history.truths
+        if len(truths.sequence):
+            moved_nm = self.true_nm(truths.residual_nm - truths.disturbance_nm)
+            return delay_from_truth(moved_nm, steps.command_nm, self.missing), "the true wavefront"
+        if history.camera is None:
+            return None, ""
+        starts_ns = steps.time_ns - int(history.camera.exposure_ns)
+        mirror = history.mirror
+        delay = delay_from_times(steps.sequence, starts_ns, mirror.sequence, mirror.publish_time_ns)
+        return delay, "the times of frames and mirror"
+
+
+def _law_and_delay(history: History, calibration: Calibration) -> tuple[Law, float]:
+    state = history.controller
+    if state is not None and len(state.gain) == len(calibration.noll):
+        law = Law(*(np.array(values, np.float32) for values in (state.gain, state.leak, state.limit_nm)))
+        return law, state.delay_frames
+    if history.configuration is None:
+        raise DataFileError(
+            f"{history.log.path}: its gains and delay are not known: no state of the controller is there"
+        )
+    known = settings(history.configuration)
+    return known.law(calibration.noll), known.delay_frames

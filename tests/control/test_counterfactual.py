@@ -1,0 +1,215 @@
+"""What-ifs against the live loop's own `advance`, and against figures that can be checked by hand."""
+
+import numpy as np
+import pytest
+from toy import TOY, frame, frame_sequence, loaded, settings
+
+from lowfc.control.inputs import Step
+from lowfc.control.law import Law
+from lowfc.control.loop import advance
+from lowfc.control.safety import Limits
+from lowfc.control.stability import delay_weights
+from lowfc.control.state import Settings
+from lowfc.control.what_if import (
+    counterfactual,
+    delay_from_times,
+    delay_from_truth,
+    exposed,
+    frames_since,
+    integrator,
+    missing_before,
+    rms,
+    seen_nm,
+    settling_frames,
+)
+
+WIDE = {"limits": Limits(7000.0, 7000.0, 7000.0), "limit_nm": (5000.0, 5000.0)}
+DELAYS = [1.0, 1.4, 2.0, 3.0]
+NOTHING_MISSING = np.zeros(12, np.int64)
+
+
+def law(gain: float = 0.5, leak: float = 0.0, limit_nm: float = 1000.0, modes: int = 1) -> Law:
+    return Law(*(np.full(modes, value, np.float32) for value in (gain, leak, limit_nm)))
+
+
+def single(*values: float) -> np.ndarray:
+    """One mode at several steps."""
+    return np.array(values, np.float32)[:, None]
+
+
+def weights(delay_frames: float) -> np.ndarray:
+    return delay_weights(delay_frames).astype(np.float32)
+
+
+def live(what: Settings, disturbance_nm: np.ndarray, counts: list[int], dark: tuple[int, ...] = ()) -> list[Step]:
+    """Steps of the live loop that gets only the frames of `counts`, some of them dark."""
+    state, steps = loaded(what), []
+    shares = delay_weights(what.delay_frames)
+    given = [np.zeros(3)] * len(shares)  # by exposure, of which each sees those before
+    for count, wave_nm in enumerate(disturbance_nm):
+        seen = sum(share * command for share, command in zip(shares, given[::-1], strict=False))
+        if count in counts:
+            light = {"pixels": TOY.pixels((0, 0, 0), flux_dn=0)} if count in dark else {}
+            state, outputs = advance(what, state, frame(count + 1, wave_nm + seen, **light))
+            assert outputs.step is not None
+            steps.append(outputs.step)
+            given.append(outputs.step.command_nm.astype(float))
+        else:
+            given.append(given[-1])
+    return steps
+
+
+def columns(steps: list[Step]) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Errors, pseudo-open-loop and commands (steps, modes), and exposures missing."""
+    nothing = np.full(3, np.nan, np.float32)
+    error = np.array([nothing if step.error_nm is None else step.error_nm for step in steps])
+    pol = np.array([nothing if step.pol_nm is None else step.pol_nm for step in steps])
+    sequence = np.array([step.frame_sequence for step in steps], np.uint64)
+    return error, pol, np.array([step.command_nm for step in steps]), missing_before(sequence)
+
+
+def walk(frames: int) -> np.ndarray:
+    return np.array([15.0, -9.0, 6.0]) + np.cumsum(np.random.default_rng(4).normal(size=(frames, 3)), axis=0)
+
+
+HOLED = [count for count in range(160) if count not in (30, 31, 32, 33, 34, 35, 60, 90, 91)]
+DARK = (45, 46, 100, 101, 102, 103)
+
+
+@pytest.mark.parametrize("delay", DELAYS)
+def test_with_the_gains_that_were_used_it_is_the_logged_run(delay: float) -> None:
+    """To the rounding of float32 in pol = error - seen, with missing and refused frames and modal limits that act."""
+    what = settings(delay_frames=delay, gain=(0.3, 0.2), leak=(0.01, 0.0), limit_nm=(12.0, 50.0))
+    error, pol, command, missing = columns(live(what, walk(160), HOLED, DARK))
+    assert missing.sum() == 9
+    assert np.isnan(error).any(axis=1).sum() == len(DARK)
+    assert (np.abs(command[:, 0]) == 12.0).any()
+    again_error, again_command = counterfactual(integrator(what.law((2, 3, 4))), weights(delay), pol, missing)
+    np.testing.assert_allclose(again_error, error, atol=2e-5, rtol=0)
+    np.testing.assert_allclose(again_command, command, atol=2e-5, rtol=0)
+
+
+@pytest.mark.parametrize("delay", DELAYS)
+def test_with_other_gains_it_is_the_run_with_those(delay: float) -> None:
+    """On a sensor that is linear up to the rounding to DN, a hundredth of a nanometre here."""
+    before = settings(delay_frames=delay, gain=(0.3, 0.1), **WIDE)
+    after = settings(delay_frames=delay, gain=(0.1, 0.25), leak=(0.02, 0.01), **WIDE)
+    disturbance = walk(160)
+    _, pol, _, missing = columns(live(before, disturbance, HOLED, DARK))
+    error, _, command, _ = columns(live(after, disturbance, HOLED, DARK))
+    other_error, other_command = counterfactual(integrator(after.law((2, 3, 4))), weights(delay), pol, missing)
+    np.testing.assert_allclose(other_error, error, atol=0.05)
+    np.testing.assert_allclose(other_command, command, atol=0.05)
+    assert np.nanmax(np.abs(other_error - pol)) > 5
+
+
+@pytest.mark.parametrize(
+    ("delay", "errors"),
+    [
+        (1.0, [8, 4, 2, 1]),
+        (2.0, [8, 8, 4, 0]),
+        (3.0, [8, 8, 8, 4]),
+        (1.5, [8, 6, 2.5, 0.375]),
+    ],
+)
+def test_an_integrator_of_half_on_a_step_by_hand(delay: float, errors: list[float]) -> None:
+    pol = single(8, 8, 8, 8)
+    error, command = counterfactual(integrator(law()), weights(delay), pol, NOTHING_MISSING[:4])
+    assert error[:, 0].tolist() == errors
+    assert command[:, 0].tolist() == np.cumsum([-0.5 * value for value in errors]).tolist()
+
+
+def test_under_refused_and_missing_frames_the_command_is_held() -> None:
+    pol, missing = single(8, np.nan, 8, 8), np.array([0, 0, 0, 2])
+    error, command = counterfactual(integrator(law()), weights(2.0), pol, missing)
+    # frame 0 commands -4; 1 is refused, so that 2 sees -4; it commands -6; after two missing frames 5 sees -6
+    np.testing.assert_array_equal(error[:, 0], [8, np.nan, 4, 2])
+    assert command[:, 0].tolist() == [-4, -4, -6, -7]
+
+
+def test_modal_limits_act() -> None:
+    error, command = counterfactual(integrator(law(limit_nm=5.0)), weights(1.0), single(8, 8, 8), NOTHING_MISSING[:3])
+    assert command[:, 0].tolist() == [-4, -5, -5]
+    assert error[:, 0].tolist() == [8, 4, 3]
+
+
+def test_any_function_of_state_and_error_is_a_controller() -> None:
+    def every_other(state: int | None, error_nm: np.ndarray) -> tuple[int, np.ndarray]:
+        count = state or 0
+        return count + 1, -error_nm if count % 2 else np.zeros_like(error_nm)
+
+    _, command = counterfactual(every_other, weights(1.0), single(8, 8, np.nan, 8, 8), NOTHING_MISSING[:5])
+    assert command[:, 0].tolist() == [0, -8, -8, 0, -8]
+
+
+def test_what_is_seen_of_commands_by_hand() -> None:
+    command, first, missing = single(1, 2, 4, 8), np.array([-1], np.float32), np.array([0, 0, 3, 0])
+    assert seen_nm(weights(1.0), command, missing, first)[:, 0].tolist() == [-1, 1, 2, 4]
+    assert seen_nm(weights(2.0), command, missing, first)[:, 0].tolist() == [-1, -1, 2, 2]
+    assert seen_nm(weights(1.5), command, missing, first)[:, 0].tolist() == [-1, 0, 2, 3]
+
+
+def test_frames_that_came_again_or_late_are_no_exposures() -> None:
+    counts = [5, 6, 6, 4, 9, 8]
+    sequence = np.array([*map(frame_sequence, counts), frame_sequence(1, 1_800_000_000)], np.uint64)
+    rows = exposed(sequence)
+    assert rows.tolist() == [True, True, False, False, True, False, True]
+    assert missing_before(sequence[rows]).tolist() == [0, 0, 2, 0]
+
+
+def test_nothing_is_no_exposure() -> None:
+    assert exposed(np.zeros(0, np.uint64)).tolist() == []
+    assert missing_before(np.zeros(0, np.uint64)).tolist() == []
+
+
+@pytest.mark.parametrize("delay", [1.0, 1.4, 2.0, 2.7, 3.0])
+def test_the_delay_is_found_from_what_the_mirror_truly_did(delay: float) -> None:
+    rng = np.random.default_rng(3)
+    command = np.cumsum(rng.normal(size=(400, 3)), axis=0).astype(np.float32)
+    missing = (rng.random(400) < 0.02).astype(np.int64)
+    true = seen_nm(weights(delay), command, missing, command[0]) * np.float32(1.03)  # not quite what was commanded
+    true[50:60] = np.nan
+    assert delay_from_truth(true, command, missing) == pytest.approx(delay, abs=0.05)
+
+
+def test_a_mirror_that_stands_still_says_nothing_of_the_delay() -> None:
+    still = np.full((400, 3), 7, np.float32)
+    assert delay_from_truth(still, still, np.zeros(400, np.int64)) is None
+
+
+def test_the_delay_is_found_from_the_times_of_messages() -> None:
+    """40 exposures from 1000 ns on, every 1000 ns; every fourth command comes 100 ns after a start, and is late."""
+    sequence = np.array([frame_sequence(count) for count in range(40)], np.uint64)
+    start_ns = 1000 + 1000 * np.arange(40)
+    applied_ns = start_ns + 900
+    applied_ns[::4] += 200
+    again = slice(0, 40, 3)  # the mirror says some of them again, much later
+    told, times = np.append(sequence, sequence[again]), np.append(applied_ns, applied_ns[again] + 3000)
+    assert delay_from_times(sequence, start_ns, told, times) == pytest.approx(1.25, abs=0.02)
+    assert delay_from_times(sequence, start_ns, told[:5], times[:5]) is None
+
+
+def test_times_beside_a_missing_frame_do_not_count() -> None:
+    counts = [count for count in range(90) if count % 3 != 2]
+    sequence = np.array([frame_sequence(count) for count in counts], np.uint64)
+    start_ns = 1000 * np.array(counts)
+    assert delay_from_times(sequence, start_ns, sequence, start_ns + 900) == 1.0
+
+
+def test_settling_takes_five_time_constants_and_at_least_a_second() -> None:
+    assert settling_frames(law(gain=0.5), 250.0) == 250
+    slow = Law(*(np.array(values, np.float32) for values in ([0.5, 0.001, 0], [0, 0.001, 0], [9, 9, 9])))
+    assert settling_frames(slow, 250.0) == 2500
+    assert settling_frames(law(gain=0.0), 250.0) == 250
+
+
+def test_frames_are_counted_from_where_the_loop_begins_to_run() -> None:
+    running = np.array([0, 1, 1, 1, 0, 1, 1, 1], bool)
+    begins = np.array([0, 0, 0, 0, 0, 0, 1, 0], bool)
+    missing = np.array([0, 0, 3, 0, 0, 0, 0, 0])
+    assert frames_since(begins, running, missing).tolist() == [-1, 0, 4, 5, -1, 0, 0, 1]
+
+
+def test_rms_is_about_zero_and_over_the_rows_asked_for() -> None:
+    values = np.array([[3, 1], [4, 1], [np.nan, 9]], np.float32)
+    assert rms(values, np.array([True, True, False])).tolist() == pytest.approx([np.sqrt(12.5), 1.0])
