@@ -30,9 +30,11 @@ sim-loop: $(VENV)/.installed  ## install, then run the simulated loop for 20 s
 test: $(VENV)/.tests lint types  ## install, then lint, types and tests
 	$(BIN)/python -m pytest -m 'not slow'
 
-test-all: $(VENV)/.tests node lint types  ## everything, the slow tests and those that need node and a graphics driver too
+test-all: $(VENV)/.tests node lint types  ## everything, the slow tests and those that need node, chromium and a graphics driver too
 	@ls /usr/share/vulkan/icd.d/*.json >/dev/null 2>&1 || { test "$$(id -u)" = 0 && apt-get install --yes mesa-vulkan-drivers libvulkan1; } || \
 		echo "no Vulkan driver: the viewer tests will skip. Debian: apt install mesa-vulkan-drivers libvulkan1" >&2
+	@command -v chromium >/dev/null || { test "$$(id -u)" = 0 && apt-get install --yes chromium; } || \
+		echo "no chromium: the browser tests will skip. Debian: apt install chromium" >&2
 	$(BIN)/python -m pytest
 
 lint: $(VENV)/.tests  ## ruff

@@ -19,6 +19,7 @@ from lowfc.programs.export import export
 from lowfc.programs.log_info import info
 from lowfc.programs.recover import recover
 from lowfc.programs.replay_commands import replay_log
+from lowfc.programs.report.command import report
 from lowfc.programs.validate.commands import validate
 
 if TYPE_CHECKING:
@@ -36,6 +37,7 @@ app.command("replay")(replay_log)
 bench_app.command("record")(bench_record)
 app.command()(info)
 app.command()(recover)
+app.command()(report)
 app.command()(export)
 app.command()(validate)
 
@@ -82,7 +84,7 @@ def sim_loop(
     from lowfc.adapters.realtime import spread
     from lowfc.contract.configuration import sensor_keys
     from lowfc.programs.sim_loop import sim_loop as run
-    from lowfc.programs.status import report
+    from lowfc.programs.status import summary_text
 
     overrides: dict[str, Any] = {
         "camera.rate_hz": rate,
@@ -95,7 +97,7 @@ def sim_loop(
     }
     settings = configuration(config, overrides, {"control.start_mode": "closed", **spread(os.sched_getaffinity(0))})
     figures = run(settings, duration, record=not no_record)
-    _print(json.dumps(figures) if as_json else report(figures))
+    _print(json.dumps(figures) if as_json else summary_text(figures))
     if figures["recording_failure"]:
         raise typer.Exit(1)
 

@@ -78,7 +78,7 @@ def recording(recorder: wire.Health) -> str:
     return f"{done.messages} messages, {done.bytes / 1e6:.1f} MB, {done.lost} lost"
 
 
-def report(figures: dict[str, Any]) -> str:
+def summary_text(figures: dict[str, Any]) -> str:
     """The summary of a run for a person."""
     command, mirror = (figures["latency_us"][name] for name in ("frame_to_command", "frame_to_mirror"))
 

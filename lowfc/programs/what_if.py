@@ -8,7 +8,7 @@ import numpy as np
 import numpy.typing as npt
 
 from lowfc.adapters.history_reader import read_history
-from lowfc.adapters.instrument import equivalent_read_noise_e, detector
+from lowfc.adapters.instrument import detector, equivalent_read_noise_e
 from lowfc.adapters.log_reader import LogReader
 from lowfc.contract.calibration_codec import identified
 from lowfc.contract.configuration import Configuration, load

@@ -1,0 +1,1 @@
+"""The report of a run: figures from its log, and the page that shows them."""

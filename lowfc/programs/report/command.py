@@ -1,0 +1,62 @@
+"""The command `lowfc report`: arguments only; the work is elsewhere."""
+
+import json
+import sys
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from lowfc.contract.errors import DataFileError
+
+_LOGS = (".mcap", ".part")
+
+
+def report(
+    log: Annotated[Path, typer.Argument(help="A log, finished or not.", show_default=False)],
+    out: Annotated[
+        Path | None, typer.Option(help="The page (HTML). Default: beside the log, under its name.", show_default=False)
+    ] = None,
+    as_json: Annotated[
+        bool, typer.Option("--json", help="Print the figures as one JSON object; the page only with --out.")
+    ] = False,
+) -> None:
+    """Say how a run was, from its log: one HTML page that opens anywhere, and the same figures as JSON.
+
+    Example: lowfc report logs/20260412T021500Z.mcap
+    """
+    if out is not None and out.suffix in _LOGS:
+        raise DataFileError(f"{out} would be a log, which a report never overwrites; give --out FILE.html")
+    from rich.console import Console
+    from rich.progress import BarColumn, TextColumn, TimeElapsedColumn
+
+    from lowfc.adapters.progress import passing_bar
+    from lowfc.adapters.whole_file import require_folder, write_whole
+    from lowfc.programs.report.figures import report_of
+    from lowfc.programs.report.page import page
+    from lowfc.programs.report.source import read_run
+
+    target = out if out is not None or as_json else beside(log)
+    require_folder(target)
+    with passing_bar(Console(stderr=True), TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn()) as bar:
+        task = bar.add_task(f"reading {log.name}", total=1.0)
+        run = read_run(log, lambda part: bar.update(task, completed=part))
+        bar.update(task, description="figures", completed=1.0)
+        found = report_of(run)
+        if target is not None:
+            made = page(found, lambda name: bar.update(task, description=f"drawing {name}"))
+            write_whole(target, made.encode())
+    if as_json:
+        sys.stdout.write(json.dumps(found.figures, allow_nan=False) + "\n")
+    else:
+        verdict = found.figures["verdict"]
+        because = f": {verdict['because']}" if verdict["because"] else ""
+        sys.stdout.write(f"{verdict['heading']}{because}\n{target}\n")
+
+
+def beside(log: Path) -> Path:
+    """Where a log's page is written: its folder, its name without what says that it is a log."""
+    name = log.name
+    for suffix in reversed(_LOGS):
+        name = name.removesuffix(suffix)
+    return log.with_name(f"{name}.html")

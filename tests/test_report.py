@@ -1,0 +1,374 @@
+"""The report of a run: its figures against a log whose content is known, and a page for every kind of log."""
+
+import json
+import re
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import typer.testing
+from report_log import READ_NOISE_E, Night
+
+from lowfc.adapters.terminal import new_app
+from lowfc.contract.errors import DataFileError
+from lowfc.contract.messages import CONTROLLER_STATE, FRAME, wire
+from lowfc.control.error_budget import sensor_noise
+from lowfc.control.stability import noise_gain, rejection
+from lowfc.optics.photometry import tilt_nm_per_mas
+from lowfc.programs.report import closed_loop
+from lowfc.programs.report.command import beside, report
+from lowfc.programs.report.figures import report_of
+from lowfc.programs.report.page import NOT_HERE, fixed, number, page
+from lowfc.programs.report.source import read_run
+
+RATE_HZ = 1000.0
+
+
+def figures(log: Path) -> dict[str, Any]:
+    found = report_of(read_run(log)).figures
+    json.dumps(found, allow_nan=False)
+    return found
+
+
+def command(*words: str) -> typer.testing.Result:
+    app = new_app("Reports.")
+    app.command()(report)
+    return typer.testing.CliRunner().invoke(app, list(words))
+
+
+@pytest.fixture(scope="module")
+def eventful(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
+    """Opened, closed, frames lost and dark, gains changed, controller and camera restarted."""
+    night = Night()
+    night.request("open")
+    night.frames(300)
+    night.request("close")
+    night.frames(1500, lost={200, 201, 202, 203, 204, 700}, dark={800})
+    night.request("gain", (0.2,))
+    night.frames(200)
+    night.request("gain", (9.0,))
+    night.frames(100)
+    night.start_controller()
+    night.frames(50)
+    night.start_camera()
+    night.frames(100)
+    counts = [wire.TopicCount(topic=FRAME.key, received=2244, skipped=4, missing=2)]
+    night.health("controller", topics=counts, state="stopped")
+    night.health("camera", commands_late=3, state="stopped")
+    return figures(night.write(tmp_path_factory.mktemp("eventful") / "night.mcap"))
+
+
+def test_the_loop_s_course_is_told(eventful: dict[str, Any]) -> None:
+    assert eventful["mode_steps"] == {"open": 300, "closed": 1944}
+    assert [span["mode"] for span in eventful["mode_spans"]] == ["open", "closed"]
+    assert eventful["mode_spans"][1]["from_s"] == pytest.approx(0.3)
+    assert [(one["from_s"], one["gain"]) for one in eventful["laws"]] == [
+        (0.0, [0.4, 0.4, 0.2]),
+        (pytest.approx(1.8), [0.2, 0.2, 0.2]),
+        (pytest.approx(2.1), [0.4, 0.4, 0.2]),
+    ]
+    assert [(one["name"], one["accepted"]) for one in eventful["requests"]] == [
+        ("open", True),
+        ("close", True),
+        ("gain", True),
+        ("gain", False),
+    ]
+    assert [one["time_s"] for one in eventful["requests"]] == pytest.approx([0, 0.3, 1.8, 2.0], abs=1e-3)
+    assert eventful["run"]["steps"] == 2244
+    assert eventful["run"]["host"] == "bench"
+    assert eventful["run"]["versions"] == {"lowfc": "0.1.0", "numpy": "2.0"}
+
+
+def test_frames_are_accounted_for(eventful: dict[str, Any]) -> None:
+    assert eventful["timing"]["frames"] == {
+        "recorded": 2250,
+        "without_command": 6,
+        "skipped_by_controller": 4,
+        "missing_at_controller": 2,
+        "commands_late": 3,
+        "camera_starts": 2,
+    }
+    assert eventful["light"]["refused"] == {"dark": 1}
+    assert eventful["timing"]["rate_hz"] == RATE_HZ
+
+
+def test_latencies_are_those_of_the_messages(eventful: dict[str, Any]) -> None:
+    latency = eventful["timing"]["latency_us"]
+    assert latency["transport"] == {"count": 2244, **dict.fromkeys(("p50", "p90", "p99", "p99_9", "max"), 90.0)}
+    assert latency["frame_to_command"]["max"] == 349
+    assert 320 < latency["frame_to_command"]["p50"] < 330
+    assert latency["frame_to_mirror"]["max"] == 549
+    assert latency["frame_to_mirror"]["count"] == 2244
+    assert eventful["timing"]["interval_us"]["frames"]["max"] == 1000
+    assert eventful["timing"]["interval_us"]["commands"]["max"] == pytest.approx(6006)  # five frames lost in a row
+
+
+def test_the_longest_stretch_under_one_law_is_taken(eventful: dict[str, Any]) -> None:
+    stretch = eventful["closed_stretch"]
+    assert stretch["gain"] == [0.4, 0.4, 0.2]
+    assert stretch["steps_settling"] == 25
+    assert stretch["from_s"] == pytest.approx(0.325)
+    assert stretch["to_s"] == pytest.approx(1.799)
+    assert (stretch["pieces"], stretch["frames_bridged"]) == (2, 2)  # one lost, one dark; five lost are too many
+    assert stretch["frames"] == 1475 - 5
+
+
+def test_the_budget_is_what_the_toy_is_made_of(eventful: dict[str, Any]) -> None:
+    made = Night().calibration
+    noise = sensor_noise(
+        made.reconstructor.astype(float), made.reference.astype(float), made.flux_dn, np.hypot(READ_NOISE_E, 12**-0.5)
+    )
+    terms = {term["name"]: term for term in eventful["error_budget"]["terms"]}
+    through = np.sqrt([noise_gain(gain, 0.0, 1.0) for gain in (0.4, 0.4, 0.2)])
+    groups = ("tilt x", "tilt y", "other modes")
+    for name, expected in (("photon noise", noise.photon_nm), ("read noise", noise.read_nm)):
+        found = [terms[name]["rms_nm"][group] for group in groups]
+        assert found == pytest.approx((expected * through).tolist(), rel=0.01)
+    expected_nm = 12 / np.sqrt(2) * rejection(np.array([7.0]), RATE_HZ, 0.4, 0.0, 1.0)[0]
+    assert terms["lag"]["rms_nm"]["tilt x"] == pytest.approx(expected_nm, rel=0.1)
+    assert terms["lag"]["rms_nm"]["tilt y"] < 0.01
+    assert "all modes" in terms["nonlinearity"]["upper_limit"]
+    for group in (*groups, "all modes"):
+        assert eventful["error_budget"]["sum_over_true"][group] == pytest.approx(1, abs=0.1)
+    assert eventful["error_budget"]["sum_lacks"] == []
+
+
+def test_the_residual_is_before_and_after(eventful: dict[str, Any]) -> None:
+    tip = eventful["residual"]["modes"][0]
+    assert tip["name"] == "tilt x"
+    assert tip["disturbance_rms_nm"] == pytest.approx(12 / np.sqrt(2), rel=0.05)
+    assert tip["residual_rms_nm"] < 0.15 * tip["disturbance_rms_nm"]
+    assert tip["pseudo_open_loop_rms_nm"] == pytest.approx(tip["disturbance_rms_nm"], rel=0.05)
+    assert tip["open_residual_rms_nm"] == pytest.approx(12 / np.sqrt(2), rel=0.15)
+    x_mas = tip["residual_rms_nm"] / tilt_nm_per_mas(2.0)
+    tilt = eventful["residual"]["tilt_mas"]["residual"]
+    assert tilt["x"] == pytest.approx(x_mas)
+    assert tilt["per_axis"] == pytest.approx(np.sqrt((tilt["x"] ** 2 + tilt["y"] ** 2) / 2))
+
+
+def test_spectra_are_held_against_theory(eventful: dict[str, Any]) -> None:
+    tip = eventful["spectra"]["groups"][0]
+    assert tip["measured_over_theory"]["median"] == pytest.approx(1, abs=0.02)
+    assert tip["true_over_theory"]["median"] == pytest.approx(1, abs=0.15)
+    assert sum(band["disturbance_rms_nm"] ** 2 for band in tip["bands"]) == pytest.approx(72, rel=0.1)
+    loudest = int(np.argmax(tip["power_nm2_hz"]["disturbance"]))
+    assert tip["frequency_hz"][loudest] == pytest.approx(7, abs=eventful["spectra"]["resolution_hz"])
+
+
+def test_the_verdict_names_what_was_wrong(eventful: dict[str, Any]) -> None:
+    verdict = eventful["verdict"]
+    levels = {check["name"]: check["level"] for check in verdict["checks"]}
+    assert verdict["level"] == "look"
+    assert levels == {
+        "log": "good",
+        "loop": "good",
+        "residual": "good",
+        "commands": "look",
+        "delay": "good",
+        "light": "look",
+        "mirror": "good",
+        "events": "look",
+    }
+    assert verdict["because"] == "6 of 2250 frames (0.27%) got no command"
+
+
+def quiet(night: Night, number: int = 700) -> Night:
+    """A run in which nothing went wrong."""
+    night.frames(number)
+    night.health("camera", state="stopped")
+    return night
+
+
+def test_a_run_without_a_fault_is_good(tmp_path: Path) -> None:
+    verdict = figures(quiet(Night()).write(tmp_path / "x.mcap"))["verdict"]
+    assert verdict["level"] == "good", verdict
+    assert verdict["because"] == ""
+
+
+def test_an_error_or_a_safed_loop_is_not_good(tmp_path: Path) -> None:
+    night = quiet(Night())
+    night.request("safe")
+    night.frames(50)
+    found = figures(night.write(tmp_path / "x.mcap"))
+    assert found["verdict"]["level"] == "bad"
+    assert {check["name"] for check in found["verdict"]["checks"] if check["level"] == "bad"} == {"loop", "events"}
+    assert [event["name"] for event in found["events"] if event["level"] == "error"] == ["SAFED"]
+
+
+def test_without_truth_its_terms_are_missing_and_not_zero(tmp_path: Path) -> None:
+    found = figures(quiet(Night(truth=False), 1500).write(tmp_path / "x.mcap"))
+    terms = {term["name"]: term for term in found["error_budget"]["terms"]}
+    for name in ("cross-talk and aliasing", "nonlinearity"):
+        assert terms[name]["missing"]
+        assert set(terms[name]["rms_nm"].values()) == {None}
+        assert "true wavefront" in terms[name]["how"]
+    expected_nm = 12 / np.sqrt(2) * rejection(np.array([7.0]), RATE_HZ, 0.4, 0.0, 1.0)[0]
+    assert terms["lag"]["rms_nm"]["tilt x"] == pytest.approx(expected_nm, rel=0.25)
+    assert "noise floor" in terms["lag"]["how"]
+    assert found["error_budget"]["sum_lacks"] == ["cross-talk and aliasing", "nonlinearity"]
+    assert set(found["error_budget"]["true_residual"]["rms_nm"].values()) == {None}
+    assert found["residual"]["total_rms_nm"]["residual"] is None
+    assert "true_over_theory" not in found["spectra"]["groups"][0]
+    assert found["run"]["simulated"] is False
+
+
+def test_a_log_of_an_open_loop_has_neither_spectra_nor_budget(tmp_path: Path) -> None:
+    night = Night()
+    night.request("open")
+    found = figures(quiet(night, 300).write(tmp_path / "x.mcap"))
+    assert found["closed_stretch"] is None
+    assert found["spectra"] == found["error_budget"] == {"why_not": "the loop was not closed in this log"}
+    assert found["residual"]["total_rms_nm"]["open_error"] > 5
+    assert found["residual"]["total_rms_nm"]["error"] is None
+    assert found["verdict"]["level"] == "unknown"
+
+
+def test_a_loop_closed_under_an_unknown_law_is_not_called_open(tmp_path: Path) -> None:
+    night = Night()
+    night.frames(300)
+    night.samples = [sample for sample in night.samples if sample.key != CONTROLLER_STATE.key]
+    found = figures(night.write(tmp_path / "x.mcap"))
+    assert found["mode_steps"] == {"closed": 300}
+    why = "this log does not tell under which law the loop was closed"
+    assert found["spectra"] == found["error_budget"] == {"why_not": why}
+    assert found["verdict"]["checks"][2]["text"] == why
+
+
+def test_a_closed_loop_without_a_good_frame_has_neither(tmp_path: Path) -> None:
+    night = Night()
+    night.frames(200, dark=range(200))
+    found = figures(night.write(tmp_path / "x.mcap"))
+    assert found["closed_stretch"]["frames"] == 0
+    assert "has 0 frames" in found["spectra"]["why_not"]
+    assert {term["missing"] for term in found["error_budget"]["terms"]} == {True}
+    assert found["light"]["refused"] == {"dark": 200}
+    assert found["verdict"]["checks"][2]["level"] == "look"  # truly the wavefront is as it was
+
+
+def test_of_a_very_long_stretch_the_end_is_taken(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(closed_loop, "MOST_STEPS", 400)
+    stretch = figures(quiet(Night(), 700).write(tmp_path / "x.mcap"))["closed_stretch"]
+    assert stretch["frames"] == 400
+    assert stretch["steps_settling"] + stretch["steps_earlier"] == 300
+    assert stretch["to_s"] == pytest.approx(0.699)
+
+
+def test_a_few_steps_are_too_short_for_spectra(tmp_path: Path) -> None:
+    found = figures(quiet(Night(), 3).write(tmp_path / "x.mcap"))
+    assert found["run"]["steps"] == 3
+    assert "has 3 frames" in found["spectra"]["why_not"]
+    terms = {term["name"]: term["missing"] for term in found["error_budget"]["terms"]}
+    assert terms == {
+        "photon noise": False,
+        "read noise": False,
+        "lag": True,
+        "cross-talk and aliasing": True,
+        "nonlinearity": True,
+    }
+
+
+@pytest.mark.parametrize("empty", [True, False])
+def test_a_log_without_a_step_still_has_a_page(tmp_path: Path, empty: bool) -> None:
+    night = Night()
+    if empty:
+        night.samples.clear()
+    made = report_of(read_run(night.write(tmp_path / "x.mcap", config=not empty)))
+    assert made.figures["verdict"]["level"] == "bad"
+    assert made.figures["verdict"]["because"] == "no step of the control law is in this log"
+    assert "No step of the control law is in this log" in page(made)
+
+
+def test_a_log_that_was_cut_off_is_reported_as_far_as_it_goes(tmp_path: Path) -> None:
+    log = quiet(Night(), 500).write(tmp_path / "x.mcap", finish=False)
+    assert log.name == "x.mcap.part"
+    content = log.read_bytes()
+    log.write_bytes(content[: int(0.7 * len(content))])
+    found = figures(log)
+    assert found["log"]["complete"] is False
+    assert 100 < found["run"]["steps"] < 500
+    check = found["verdict"]["checks"][0]
+    assert (check["name"], check["level"]) == ("log", "look")
+    assert "did not finish" in check["text"]
+
+
+def test_a_damaged_part_is_left_out_and_told(tmp_path: Path) -> None:
+    log = quiet(Night(), 1500).write(tmp_path / "x.mcap")
+    content = bytearray(log.read_bytes())
+    content[len(content) // 2] ^= 0xFF
+    log.write_bytes(content)
+    found = figures(log)
+    assert len(found["log"]["damage"]) == 1
+    assert "1 damaged part left out" in found["verdict"]["checks"][0]["text"]
+    assert 0 < found["run"]["steps"] < 1500
+
+
+def test_no_log_is_an_error(tmp_path: Path) -> None:
+    text = tmp_path / "notes.txt"
+    text.write_text("no log")
+    with pytest.raises(DataFileError, match="not an MCAP file"):
+        read_run(text)
+
+
+def test_the_command_prints_one_object_or_writes_one_page(tmp_path: Path) -> None:
+    log = quiet(Night(), 3).write(tmp_path / "night.mcap")
+    printed = command(str(log), "--json")
+    assert printed.exit_code == 0, printed.output
+    assert json.loads(printed.stdout)["run"]["steps"] == 3
+    assert not beside(log).exists()
+
+    out = tmp_path / "told.html"
+    written = command(str(log), "--out", str(out))
+    assert written.exit_code == 0, written.output
+    assert written.stdout.splitlines() == ["A good run", str(out)]
+    text = out.read_text()
+    assert text.lstrip().startswith("<!DOCTYPE html>")
+    assert "No spectra: the longest gap-free stretch has 3 frames" in text
+    assert f'<td class="none">{NOT_HERE}</td>' in text
+    assert not re.search(r"""(src|href)=["'](?!#|data:)""", text)
+    assert not re.search(r"url\((?!#)|@import|<script|<link|<iframe", text)
+    identifiers = re.findall(r'\bid="([^"]+)"', text)
+    assert len(identifiers) == len(set(identifiers))
+    for target in re.findall(r'href="#([^"]+)"', text):
+        assert target in identifiers
+
+
+@pytest.mark.parametrize("name", ["night.mcap", "other.mcap.part"])
+def test_a_report_never_overwrites_a_log(tmp_path: Path, name: str) -> None:
+    log = quiet(Night(), 3).write(tmp_path / "night.mcap")
+    before = log.read_bytes()
+    done = command(str(log), "--out", str(tmp_path / name))
+    assert isinstance(done.exception, DataFileError)
+    assert log.read_bytes() == before
+    assert not (tmp_path / "other.mcap.part").exists()
+
+
+@pytest.mark.parametrize(
+    ("log", "expected"),
+    [("a/n.mcap", "a/n.html"), ("n.mcap.part", "n.html"), ("n.recovered.mcap", "n.recovered.html"), ("n", "n.html")],
+)
+def test_the_page_is_beside_the_log(log: str, expected: str) -> None:
+    assert beside(Path(log)) == Path(expected)
+
+
+def test_figures_are_written_for_people() -> None:
+    assert [number(value) for value in (None, "x", 3, 0.0, 1234.5, 12.345, 0.05)] == [
+        *(NOT_HERE, "x", "3", "0", "1234", "12.3", "0.05"),
+    ]
+    assert [fixed(value) for value in (3, 0.0, 12.3456, 0.0006, 0.0004, -0.25)] == [
+        *("3", "0.000", "12.346", "0.001", "< 0.001", "-0.250"),
+    ]
+
+
+def test_the_figures_take_neither_matplotlib_nor_jinja2(tmp_path: Path) -> None:
+    log = quiet(Night(), 3).write(tmp_path / "x.mcap")
+    code = (
+        "import sys, pathlib; from lowfc.programs.report.command import report; "
+        f"report(pathlib.Path({str(log)!r}), None, True); "
+        "sys.exit(bool({'matplotlib', 'jinja2'} & set(sys.modules)))"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60, check=False)
+    assert done.returncode == 0, done.stderr
+    assert json.loads(done.stdout)["log"]["file"] == "x.mcap"
