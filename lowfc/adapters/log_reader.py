@@ -59,13 +59,23 @@ class LogReader:
         complete: the end was reached, and the summary there is sound; False while reading.
     """
 
-    def __init__(self, path: Path, *, topics: Collection[Topic] | None = None, skip_damaged: bool = False) -> None:
+    def __init__(
+        self,
+        path: Path,
+        *,
+        topics: Collection[Topic] | None = None,
+        skip_damaged: bool = False,
+        from_ns: int = 0,
+        always: Collection[Topic] = (),
+    ) -> None:
         """Read the log at `path`.
 
         Args:
             path: of a log, whatever its name.
             topics: deliver only messages of these; all when None.
             skip_damaged: leave out what is damaged instead of raising an error.
+            from_ns: of a finished log, leave out what was recorded before this log time, up to a chunk more or less.
+            always: topics of which nothing is left out for that.
         """
         self.path = path
         self.size = 0
@@ -79,6 +89,8 @@ class LogReader:
         self.complete = False
         self._topics = topics
         self._skip_damaged = skip_damaged
+        self._from_ns = from_ns
+        self._always = always
         self._declared: dict[int, Channel] = {}
         self._wanted: dict[int, tuple[str, str, int] | None] = {}
         self._chunks: set[int] = set()
@@ -118,6 +130,11 @@ class LogReader:
             self.complete = file.complete
         if self.damage and not (self.damage[0].position or self.described or self._chunks):
             raise DataFileError(f"{self.path} is not an MCAP file")
+
+    def _channels_of(self, topics: Collection[Topic]) -> set[int]:
+        return {
+            channel.id for (key, _), channel in self.channels.items() if any(topic.matches(key) for topic in topics)
+        }
 
     def _chunk(self, chunk: Chunk) -> list[Logged]:
         """Messages of a chunk, unless it is not in its place."""

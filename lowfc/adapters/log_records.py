@@ -8,7 +8,7 @@ import io
 import re
 import struct
 import zlib
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import BinaryIO, NamedTuple, TypeVar
@@ -17,7 +17,7 @@ import lz4.frame
 from mcap.data_stream import ReadDataStream
 from mcap.exceptions import McapError
 from mcap.opcode import Opcode
-from mcap.records import Attachment, Channel, Metadata, Schema
+from mcap.records import Attachment, Channel, ChunkIndex, Metadata, Schema
 from mcap.writer import MCAP0_MAGIC as MAGIC
 
 from lowfc.contract.errors import DataFileError
@@ -120,6 +120,20 @@ class LogFile:
         content = self._read(self._summary, length)
         return Chunk(self._summary, length, zlib.crc32(content), content)
 
+    def chunks_with(self, channels: Collection[int]) -> set[int] | None:
+        """Where the chunks begin that have messages of these channels; None unless the summary is sound."""
+        if self._summary is None:
+            return None
+        found, at = set(), self._summary
+        while at < self.size - _FOOTER_BYTES:
+            opcode, length = HEAD.unpack(self._read(at, HEAD.size))
+            if opcode == Opcode.CHUNK_INDEX:
+                index = parsed(ChunkIndex, self._read(at + HEAD.size, length))
+                if not index.message_index_offsets.keys().isdisjoint(channels):
+                    found.add(index.chunk_start_offset)
+            at += HEAD.size + length
+        return found
+
     def span_ns(self) -> tuple[int, int]:
         """Log times of the first and the last message, by the heads of the chunks, unchecked; (0, 0) for none."""
         times_ns: list[int] = []
@@ -131,8 +145,10 @@ class LogFile:
             at += HEAD.size + length
         return min(times_ns, default=0), max(times_ns, default=0)
 
-    def parts(self) -> Iterator[Chunk | Metadata | Attachment | Damage]:
+    def parts(self, from_ns: int = 0, always: Collection[int] = ()) -> Iterator[Chunk | Metadata | Attachment | Damage]:
         """What the file holds, in its order.
+
+        Chunks that end before the log time `from_ns` are passed over unread, but for those that begin at `always`.
 
         Raises:
             DataFileError: the disk refuses.
@@ -145,6 +161,11 @@ class LogFile:
             head = self._read(at, HEAD.size)
             opcode, length = HEAD.unpack(head) if len(head) == HEAD.size else (0, self.size)
             end = at + HEAD.size + length
+            if from_ns and opcode == Opcode.CHUNK and end <= self.size and at not in always:
+                intact = False  # no checksum of the whole without all of it
+                if int.from_bytes(self._read(at + HEAD.size + 8, 8), "little") < from_ns:
+                    at = end
+                    continue
             try:
                 if end > self.size or length > _LARGEST_BYTES:
                     raise UnsoundError("a record is longer than it can be")
@@ -264,7 +285,7 @@ def _chunk(body: bytes, at: int) -> Chunk:
     return Chunk(at, HEAD.size + len(body), crc, content)
 
 
-_Record = TypeVar("_Record", Attachment, Metadata, Schema, Channel)
+_Record = TypeVar("_Record", Attachment, ChunkIndex, Metadata, Schema, Channel)
 
 
 def parsed(kind: type[_Record], body: bytes) -> _Record:

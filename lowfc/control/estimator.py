@@ -1,6 +1,6 @@
 """From a frame to modal errors: dark, flux normalisation, reference, reconstructor."""
 
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -10,8 +10,7 @@ from lowfc.control.calibration import Calibration
 Single = npt.NDArray[np.float32]
 
 
-@dataclass(frozen=True, slots=True)
-class Estimate:
+class Estimate(NamedTuple):
     """Modal errors of a frame (modes,), nm of wavefront rms, and what was seen of its light."""
 
     error_nm: Single

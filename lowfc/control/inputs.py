@@ -1,6 +1,8 @@
 """What the controller takes in and gives out: values, with the time each was taken."""
 
-from dataclasses import dataclass, field
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -70,8 +72,7 @@ class Tick:
 Input = Frame | Request | MirrorShape | CameraSettings | Load | Tick
 
 
-@dataclass(frozen=True, slots=True)
-class Step:
+class Step(NamedTuple):
     """One step of the control law, for every frame that arrived; arrays (modes,) float32, nm of wavefront rms."""
 
     frame_sequence: int
@@ -85,8 +86,7 @@ class Step:
     saturated_pixels: int = 0
 
 
-@dataclass(frozen=True, slots=True)
-class Command:
+class Command(NamedTuple):
     """Where the mirror shall be: (rows, columns) float32, nm of surface."""
 
     frame_sequence: int
@@ -95,16 +95,14 @@ class Command:
     command_nm: Single
 
 
-@dataclass(frozen=True, slots=True)
-class Raised:
+class Raised(NamedTuple):
     """An event of the table in `lowfc.contract.events`, with its details."""
 
     name: str
     details: dict[str, object]
 
 
-@dataclass(frozen=True, slots=True)
-class Reply:
+class Reply(NamedTuple):
     """The answer to a request, and the first frame for which it is in force."""
 
     accepted: bool
@@ -112,12 +110,11 @@ class Reply:
     frame_sequence: int
 
 
-@dataclass(frozen=True, slots=True)
-class Outputs:
+class Outputs(NamedTuple):
     """What one input gave rise to; `changed` says that more of the state changed than the next frame will show."""
 
     step: Step | None = None
     command: Command | None = None
     reply: Reply | None = None
-    events: list[Raised] = field(default_factory=list)
+    events: Sequence[Raised] = ()
     changed: bool = False

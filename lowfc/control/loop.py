@@ -73,7 +73,8 @@ def _frame(settings: Settings, state: State, frame: Frame) -> tuple[State, Outpu
     if state.refused is not None:
         details: dict[str, object] = {"refused": state.refused_count, "reason": state.refused.name}
         events.append(Raised("FRAMES_ACCEPTED", details))
-    _limit_events(state.limits_hit, reasons, events)
+    if reasons != state.limits_hit:
+        _limit_events(state.limits_hit, reasons, events)
     state = state._replace(
         drive=drive,
         frames_used=state.frames_used + 1,
@@ -163,7 +164,9 @@ def _send(state: State, step: Step, events: list[Raised]) -> tuple[State, Output
         return state, Outputs(step=step, events=events)
     # Under the newest frame's sequence even where an older frame came: the mirror refuses older commands.
     command = Command(state.frame_sequence, state.frame_time_ns, state.drive.actuators_nm, step.command_nm)
-    return state._replace(commanded=True), Outputs(step=step, command=command, events=events)
+    if not state.commanded:
+        state = state._replace(commanded=True)
+    return state, Outputs(step=step, command=command, events=events)
 
 
 def _tick(settings: Settings, state: State, tick: Tick) -> tuple[State, Outputs]:

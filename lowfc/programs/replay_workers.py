@@ -14,7 +14,8 @@ from threadpoolctl import threadpool_limits
 
 from lowfc.adapters.log_reader import LogReader
 from lowfc.adapters.log_records import LogFile
-from lowfc.programs.replay import TOPICS, Replay, Share
+from lowfc.contract.messages import CALIBRATION
+from lowfc.programs.replay import PATIENCE_NS, TOPICS, Replay, Share
 from lowfc.programs.replay_account import Account
 
 _WORTH_BYTES = 50_000_000
@@ -55,7 +56,8 @@ def replay_files(paths: Sequence[Path], tolerance_nm: float, jobs: int, progress
     Raises:
         DataFileError: a log cannot be read, or cannot be replayed.
     """
-    first_ns, last_ns = _span_ns(paths)
+    spans_ns = [_span_ns(path) for path in paths]
+    first_ns, last_ns = min(first for first, _ in spans_ns), max(last for _, last in spans_ns)
     worth = sum(path.stat().st_size for path in paths) // _WORTH_BYTES
     count = max(1, min(jobs or len(os.sched_getaffinity(0)), worth))
     edges = [0, *(first_ns + (last_ns - first_ns) * share // count for share in range(1, count)), Share().until_ns]
@@ -70,16 +72,13 @@ def replay_files(paths: Sequence[Path], tolerance_nm: float, jobs: int, progress
     for outcome in outcomes[1:]:
         account.add(outcome.account)
     whole.account = account
-    whole.log_s = (last_ns - first_ns) * 1e-9
+    whole.log_s = sum(last - first for first, last in spans_ns) * 1e-9
     return whole
 
 
-def _span_ns(paths: Sequence[Path]) -> tuple[int, int]:
-    spans_ns = []
-    for path in paths:
-        with LogFile(path) as file:
-            spans_ns.append(file.span_ns())
-    return min(first for first, _ in spans_ns), max(last for _, last in spans_ns)
+def _span_ns(path: Path) -> tuple[int, int]:
+    with LogFile(path) as file:
+        return file.span_ns()
 
 
 def _replay_share(paths: Sequence[Path], tolerance_nm: float, share: Share, progress: Progress) -> Outcome:
@@ -91,7 +90,13 @@ def _replay_share(paths: Sequence[Path], tolerance_nm: float, share: Share, prog
     try:
         with threadpool_limits(1):
             for path in paths:
-                reader = LogReader(path, topics=TOPICS, skip_damaged=True)
+                reader = LogReader(
+                    path,
+                    topics=TOPICS,
+                    skip_damaged=True,
+                    from_ns=max(0, share.from_ns - PATIENCE_NS),
+                    always=(CALIBRATION,),
+                )
                 for message in reader:
                     run.take(message)
                     number += 1
