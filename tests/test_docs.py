@@ -29,11 +29,13 @@ def commands(document: Path) -> list[str]:
 
 def run(folder: Path, command: str) -> str:
     """Run a documented command as it stands, only shorter."""
-    words = shlex.split(command.replace("--duration 20", "--duration 2"), comments=True)
+    shorter = command.replace("--duration 20", "--duration 2").replace("--seconds 2", "--seconds 0.5")
+    words = shlex.split(shorter, comments=True)
     output = None
     if ">" in words:
         output = folder / words[words.index(">") + 1]
         words = words[: words.index(">")]
+    words = [found for word in words for found in (sorted(folder.glob(word)) if "*" in word else [word])]
     program = Path(sys.executable).parent / words[0]
     done = subprocess.run([program, *words[1:]], cwd=folder, capture_output=True, text=True, timeout=120, check=False)
     assert done.returncode == 0, f"{command}: {done.stderr}"
@@ -47,7 +49,7 @@ def test_every_command_of_the_documents_is_known() -> None:
         line for document in (README, *ROOT.glob("docs/*.md"), *ROOT.glob("deploy/*.md")) for line in commands(document)
     ]
     assert len(found) > 15
-    tested = {*ELSEWHERE, *LOOPS, *REQUESTS, *FILES, *BY_HAND, *SESSION, *BENCH, *VALIDATE, *DESIGN}
+    tested = {*ELSEWHERE, *LOOPS, *LOGS, *REQUESTS, *FILES, *BY_HAND, *SESSION, *BENCH, *VALIDATE, *DESIGN}
     assert set(found) == tested
     for command, where in ELSEWHERE.items():
         assert command.split()[0] in (ROOT / where).read_text()
@@ -78,7 +80,16 @@ FILES = (
 )
 BY_HAND = ("sim-camera --run bench", "sim-dm --run bench", "lowfc controller --run bench", "lowfc record --run bench")
 SESSION = ("lowfc config zenoh --run bench --role camera",)
-BENCH = ("lowfc bench twin",)
+BENCH = ("lowfc bench twin", "lowfc bench record --seconds 2")
+LOGS = (
+    "lowfc info logs/*.mcap",
+    "lowfc replay logs/*.mcap",
+    "lowfc replay logs/*.mcap --what-if gain=0.3,leak=0.01",
+    "lowfc replay logs/*.mcap --publish --speed 2",
+    "lowfc recover logs/*.mcap",
+    "lowfc report logs/*.mcap",
+    "lowfc export logs/*.mcap --to fits",
+)
 
 
 @pytest.mark.parametrize("command", LOOPS)
@@ -127,6 +138,18 @@ def test_the_processes_by_hand(tmp_path: Path) -> None:
 
 def test_the_bench(tmp_path: Path) -> None:
     assert "rank" in run(tmp_path, BENCH[0])
+    assert "longest wait" in run(tmp_path, BENCH[1])
+
+
+def test_the_logs(tmp_path: Path) -> None:
+    run(tmp_path, "lowfc sim-loop --lockstep --rate 200 --duration 3 --json")
+    said = [run(tmp_path, command) for command in LOGS]
+    assert "lowfc/camera/frame" in said[0]
+    assert "600 frames, commands identical, largest difference 0 nm" in said[1]
+    assert "what if" in said[2]
+    assert "published" in said[3]
+    assert "is whole" in said[4]
+    assert {path.suffix for path in (tmp_path / "logs").iterdir()} == {".mcap", ".html", ".fits"}
 
 
 def test_the_validation(tmp_path: Path) -> None:
@@ -142,8 +165,10 @@ def test_the_designs_are_taken_by_the_loop(tmp_path: Path) -> None:
     run(tmp_path, "lowfc sim-loop --config own.toml --lockstep --duration 0.2")
 
 
-def test_the_readmes_figures_are_the_measured_ones() -> None:
+def test_the_measured_tables_are_those_of_their_files() -> None:
     import measure
+    import measure_logs
 
-    table = README.read_text().partition(measure.BEGIN)[2].partition(measure.END)[0]
-    assert table == measure.render(json.loads(measure.MEASURED.read_text()))
+    for document, measured in ((README, measure), (measure_logs.DOCUMENT, measure_logs)):
+        table = document.read_text().partition(measure.BEGIN)[2].partition(measure.END)[0]
+        assert table == measured.render(json.loads(measured.MEASURED.read_text()))

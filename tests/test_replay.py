@@ -36,7 +36,8 @@ from lowfc.contract.state_codec import controller_state
 from lowfc.control.inputs import Frame, Input, Load, Request
 from lowfc.control.loop import advance
 from lowfc.control.state import Settings, State
-from lowfc.programs.replay import PATIENCE_NS, Share, replay
+from lowfc.programs import replay as replay_module
+from lowfc.programs.replay import PATIENCE_NS, Frames, Share, replay
 from lowfc.programs.replay_account import Account
 
 START_S = 1_767_225_600
@@ -302,3 +303,17 @@ def test_nothing_to_check_is_not_identical() -> None:
     assert not replay([]).identical
     made = night(frames(5))
     assert not replay([message for message in made.messages if message.key != CALIBRATION_TOPIC.key]).identical
+
+
+def test_frames_are_kept_within_a_budget(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(replay_module, "FRAMES_BYTES", 1000)
+    kept = Frames()
+    pixels = np.arange(100, dtype=np.uint16).reshape(10, 10)
+    for sequence in range(50):
+        kept.add(sequence, image(pixels + sequence, sequence, "sensor").SerializeToString())
+    found = [kept.frame(sequence, sequence, 0) for sequence in range(50)]
+    assert found[49] is not None
+    assert found[49].pixels is not None
+    assert np.array_equal(found[49].pixels, pixels + 49)
+    assert [one is not None for one in found].count(True) == 4
+    assert kept.frame(49, 48, 0) is None

@@ -19,7 +19,7 @@ from lowfc.contract.errors import ConfigurationError
 from lowfc.programs.replay_account import Account
 
 _HOST = ("lowfc", "git", "python", "numpy", "scipy", "blas", "processor", "cpu_features")
-"""What the same bytes may depend on."""
+"""What the same bytes may depend on; of the processor's features, those that only one of the two has."""
 
 
 def verify(logs: list[Path], tolerance_nm: float, jobs: int, console: Console) -> dict[str, Any]:
@@ -75,7 +75,7 @@ def render(figures: dict[str, Any]) -> str:
         )
         lines += [f"                   {line}" for line in first["fields"]]
     for key, (there, here) in figures["host_differs"].items():
-        lines.append(f"{key:18} {there} in the log, {here} here")
+        lines.append(f"{key:18} {there or 'none'} in the log, {here or 'none'} here")
     lines.append(f"speed              {figures['log_s']:.1f} s of log, {figures['speed']:.1f} times as fast as it was")
     return "\n".join(lines)
 
@@ -105,7 +105,11 @@ def _figures(account: Account) -> dict[str, Any]:
 def _host_differs(there: dict[str, str]) -> dict[str, tuple[str, str]]:
     """What of versions and processor is not as it was when the log was recorded: the log's, and here."""
     here = provenance()
-    return {key: (there[key], here.get(key, "none")) for key in _HOST if key in there and there[key] != here.get(key)}
+    found = {key: (there[key], here.get(key, "")) for key in _HOST if key in there and there[key] != here.get(key, "")}
+    if "cpu_features" in found:
+        before, now = (set(features.split()) for features in found["cpu_features"])
+        found["cpu_features"] = " ".join(sorted(before - now)), " ".join(sorted(now - before))
+    return found
 
 
 def replay_log(

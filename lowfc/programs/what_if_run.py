@@ -116,7 +116,7 @@ class LoggedRun:
         error_nm = np.full_like(steps.error_nm, np.nan)
         scratch = np.empty(calibration.shape[0] * calibration.shape[1], np.float32)
         rows = {sequence: row for row, sequence in enumerate(steps.sequence.tolist()) if self.used[row]}
-        for number, message in enumerate(LogReader(self.history.log.path, topics=[FRAME]), 1):
+        for number, message in enumerate(LogReader(self.history.log.path, topics=[FRAME], skip_damaged=True), 1):
             if progress is not None and number % _PROGRESS_FRAMES == 0:
                 progress(number)
             row = rows.get(message.sequence)

@@ -9,11 +9,14 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 from loops import LOWFC, loop, run, until
 
+from lowfc.adapters.bus import Sample
 from lowfc.adapters.clock import HostClock
 from lowfc.adapters.log_reader import LogReader
+from lowfc.adapters.log_writer import LogWriter
 from lowfc.adapters.run import Run, new_run_id, open_run
 from lowfc.adapters.zenoh_bus import ZenohBus
 from lowfc.contract.messages import CONTROLLER_STATE, STEP, wire
@@ -42,7 +45,26 @@ main()
 """
 
 
-def replayed(folder: Path, *logs: Path, status: int = 0) -> dict[str, Any]:
+def forged(log: Path, path: Path) -> None:
+    """The same log of another host, with one actuator of one command a trifle off."""
+    reader = LogReader(log)
+    messages = list(reader)
+    metadata = {name: dict(entries) for name, entries in reader.metadata.items()}
+    metadata["lowfc"] |= {"numpy": "1.0", "cpu_features": metadata["lowfc"]["cpu_features"] + " abacus"}
+    writer = LogWriter(path, messages[0].log_time_ns, metadata)
+    for message in messages:
+        payload = message.payload
+        if message.key == "lowfc/mirror/dm/command" and message.sequence & 0xFFFF == 700:
+            command = wire.MirrorCommand.FromString(payload)
+            surface = np.frombuffer(command.actuators, np.float32).copy()
+            surface[600] = np.nextafter(surface[600], np.float32(np.inf))
+            command.actuators = surface.tobytes()
+            payload = command.SerializeToString()
+        writer.write(Sample(message.key, payload, message.sequence, message.publish_time_ns, message.log_time_ns))
+    writer.finish({})
+
+
+def replayed(folder: Path, *logs: Path | str, status: int = 0) -> dict[str, Any]:
     """Figures of `lowfc replay`."""
     done = run(folder, "replay", "--json", *map(str, logs))
     assert done.returncode == status, done.stdout + done.stderr
@@ -197,6 +219,15 @@ def test_a_log_cut_short_and_a_log_with_a_hole(tmp_path: Path) -> None:
     said = run(tmp_path, "replay", "hole.mcap").stdout
     assert "not checked" in said
     assert "damaged" in said
+    forged(made, tmp_path / "forged.mcap")
+    done = run(tmp_path, "replay", "forged.mcap")
+    assert done.returncode == 1
+    assert "1200 frames, 1 messages differ" in done.stdout
+    assert "first difference   MirrorCommand of frame 700 " in done.stdout
+    assert "actuators: [600] log" in done.stdout
+    assert "numpy              1.0 in the log" in done.stdout
+    assert "cpu_features       abacus in the log, none here" in done.stdout
+    assert replayed(tmp_path, tmp_path / "forged.mcap", "--tolerance", "0.001")["identical"]
 
 
 def test_what_cannot_be_replayed_is_said_in_one_line(tmp_path: Path) -> None:
