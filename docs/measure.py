@@ -60,7 +60,7 @@ def measure() -> dict[str, Any]:
             file.write_text(toml)
             words = [sys.executable, "-m", "lowfc", "sim-loop", "--config", "run.toml", *COMMON, *arguments, "--json"]
             done = subprocess.run(words, cwd=folder, stdout=subprocess.PIPE, text=True, check=True)
-            run = json.loads(done.stdout) | {"log": None}
+            run = json.loads(done.stdout) | {"log": None, "logs": []}
             run["tilt_predicted_mas"] = round(predicted_mas(load(file, overrides(arguments)), run), 4)
             found["runs"][name] = run
     return found

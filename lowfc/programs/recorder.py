@@ -287,7 +287,8 @@ class Recorder:
 
     def _fill(self, health: wire.Health) -> None:
         lost = self._ledger.lost()
-        health.recording.file = str(self._series.files[-1]) if self._series.files else ""
+        health.recording.files.extend(map(str, self._series.files))
+        health.recording.file = health.recording.files[-1] if health.recording.files else ""
         health.recording.messages = self._series.messages
         health.recording.lost = sum(lost.values())
         health.recording.failure = self._failure

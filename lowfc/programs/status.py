@@ -99,7 +99,7 @@ def summary_text(figures: dict[str, Any]) -> str:
     ]
     if figures["log"]:
         lines.append(
-            f"log                {figures['log']}: {figures['messages_recorded']} messages, "
+            f"log                {' '.join(figures['logs'])}: {figures['messages_recorded']} messages, "
             f"{figures['messages_lost']} lost"
         )
     lines += [f"lost               {count} of {topic}" for topic, count in figures["lost"].items()]

@@ -56,6 +56,7 @@ def summary(watch: Watch, record: bool) -> dict[str, Any]:
         "realtime_granted": list(controller.granted),
         "realtime_refused": list(controller.refused),
         "log": None,
+        "logs": [],
     }
     if record:
         recording = watch.of(Role.RECORDER).recording
@@ -65,6 +66,7 @@ def summary(watch: Watch, record: bool) -> dict[str, Any]:
             "lost": {topic.topic: topic.missing for topic in watch.of(Role.RECORDER).topics if topic.missing},
             "recording_failure": recording.failure or None,
             "log": recording.file,
+            "logs": list(recording.files),
         }
     return figures
 

@@ -426,18 +426,20 @@ class WavefrontFigures(_message.Message):
     def __init__(self, disturbance_rms_nm: _Optional[float] = ..., residual_rms_nm: _Optional[float] = ..., tilt_disturbance_mas: _Optional[float] = ..., tilt_residual_mas: _Optional[float] = ...) -> None: ...
 
 class Recording(_message.Message):
-    __slots__ = ("file", "messages", "lost", "bytes", "failure")
+    __slots__ = ("file", "messages", "lost", "bytes", "failure", "files")
     FILE_FIELD_NUMBER: _ClassVar[int]
     MESSAGES_FIELD_NUMBER: _ClassVar[int]
     LOST_FIELD_NUMBER: _ClassVar[int]
     BYTES_FIELD_NUMBER: _ClassVar[int]
     FAILURE_FIELD_NUMBER: _ClassVar[int]
+    FILES_FIELD_NUMBER: _ClassVar[int]
     file: str
     messages: int
     lost: int
     bytes: int
     failure: str
-    def __init__(self, file: _Optional[str] = ..., messages: _Optional[int] = ..., lost: _Optional[int] = ..., bytes: _Optional[int] = ..., failure: _Optional[str] = ...) -> None: ...
+    files: _containers.RepeatedScalarFieldContainer[str]
+    def __init__(self, file: _Optional[str] = ..., messages: _Optional[int] = ..., lost: _Optional[int] = ..., bytes: _Optional[int] = ..., failure: _Optional[str] = ..., files: _Optional[_Iterable[str]] = ...) -> None: ...
 
 class Health(_message.Message):
     __slots__ = ("timestamp", "process", "state", "run_id", "pid", "version", "memory_bytes", "rate_hz", "heard", "topics", "granted", "refused", "clock_offset_ns", "uptime_ns", "frame_to_command", "frame_to_mirror", "wavefront", "recording", "mode", "counts", "commands_late", "mean_rate_hz")
