@@ -11,11 +11,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from other_readers import foxglove, rerun
 from test_recorder import PATIENCE_S, bodies_of, until
 
 from lowfc.adapters.clock import HostClock
 from lowfc.adapters.envelope import count_of
 from lowfc.adapters.log_reader import LogReader
+from lowfc.adapters.log_recovery import recover
 from lowfc.adapters.log_writer import UNFINISHED
 from lowfc.adapters.provenance import provenance
 from lowfc.adapters.run import new_run_id, open_run
@@ -102,6 +104,7 @@ def benches(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[list[Ben
         bench.close()
 
 
+@pytest.mark.node
 @pytest.mark.parametrize("benches", [10], indirect=True)
 @pytest.mark.parametrize("seed", [1, 2])
 def test_a_recorder_killed_at_any_moment_leaves_all_but_the_last_moment(
@@ -120,6 +123,7 @@ def test_a_recorder_killed_at_any_moment_leaves_all_but_the_last_moment(
         due_s += 0.005
         time.sleep(max(0.0, due_s - time.monotonic()))
     assert [int(line.split()[1]) for line in parent.communicate(timeout=PATIENCE_S)[0].splitlines()] == [9] * 10
+    made: dict[Path, int] = {}
     for bench in benches:
         reader = bench.read()
         messages = list(reader)
@@ -133,6 +137,14 @@ def test_a_recorder_killed_at_any_moment_leaves_all_but_the_last_moment(
             assert [int.from_bytes(message.payload[:8]) for message in found] == counts
             assert found[-1].publish_time_ns >= bench.killed_ns - SAFE_NS
         bench.put()  # the loop goes on
+        recovered = bench.folder / "recovered.mcap"
+        recover(reader.path, recovered)
+        made[recovered] = len(messages)
+    assert [one["counted"] for one in foxglove(made)] == list(made.values())
+    for path, count in made.items():
+        reader = LogReader(path)
+        assert (len(list(reader)), reader.complete, list(reader.attachments)) == (count, True, ["lowfc.toml"])
+        assert all(topic.key in rerun("check", path) for topic in (FRAME, STEP))
 
 
 SIGNALS = (

@@ -1,9 +1,6 @@
 """`lowfc recover`: what is whole of a damaged log is a log again, for every reader there is."""
 
 import json
-import os
-import shutil
-import subprocess
 from collections import Counter
 from collections.abc import Callable
 from pathlib import Path
@@ -14,6 +11,7 @@ from click.testing import Result
 from mcap.reader import make_reader
 from mcap.records import Attachment, Channel, Metadata, Schema
 from mutated_logs import ATTACHMENTS, METADATA, identity, mutations, small_log, small_samples
+from other_readers import foxglove, rerun
 from typer.testing import CliRunner
 
 import lowfc.adapters.log_recovery as recovery
@@ -24,7 +22,6 @@ from lowfc.contract.errors import DataFileError
 from lowfc.programs.recover import recover as command
 
 RECOVERED = 120  # of the mutations
-NODE = Path(__file__).parent / "node"
 
 
 @pytest.fixture
@@ -89,29 +86,15 @@ def test_recovered_logs_are_whole(recovered: dict[Path, Counter[str]]) -> None:
 
 @pytest.mark.node
 def test_recovered_logs_are_whole_for_the_reader_of_foxglove(recovered: dict[Path, Counter[str]]) -> None:
-    if shutil.which("node") is None or not (NODE / "node_modules").is_dir():
-        pytest.skip("node or its packages are missing: make node")
-    words = ["node", "count.mjs", *map(str, recovered)]
-    done = subprocess.run(words, cwd=NODE, capture_output=True, text=True, timeout=60, check=False)
-    assert done.returncode == 0, done.stderr
-    found = [json.loads(line) for line in done.stdout.splitlines()]
+    found = foxglove(recovered)
     assert [(one["counts"], one["counted"]) for one in found] == [(c, c.total()) for c in recovered.values()]
     assert all("recovery" in one["metadata"] for one in found)
 
 
-def test_recovered_logs_are_whole_for_rerun(recovered: dict[Path, Counter[str]], tmp_path: Path) -> None:
-    import rerun_cli
-
-    binary = str(Path(rerun_cli.__file__).parent / "rerun")
-    home = os.environ | {"HOME": str(tmp_path), "XDG_CONFIG_HOME": str(tmp_path), "XDG_DATA_HOME": str(tmp_path)}
+def test_recovered_logs_are_whole_for_rerun(recovered: dict[Path, Counter[str]]) -> None:
     for path, counts in [one for one in recovered.items() if one[1]][::4]:
-        said = {}
-        for word in ("info", "check"):
-            words = [binary, "mcap", word, str(path)]
-            done = subprocess.run(words, env=home, capture_output=True, text=True, timeout=20, check=False)
-            assert done.returncode == 0, f"{path.name}: {done.stderr}"
-            said[word] = done.stdout
-        lines = [line.split() for line in said["info"].splitlines()]
+        checked = rerun("check", path)
+        lines = [line.split() for line in rerun("info", path).splitlines()]
         assert ["Messages", str(counts.total())] in lines
         assert ["Summary", "embedded"] in lines
         seen: Counter[str] = Counter()
@@ -119,7 +102,7 @@ def test_recovered_logs_are_whole_for_rerun(recovered: dict[Path, Counter[str]],
             if len(words) > 2 and words[1].startswith("/"):
                 seen[words[1]] += int(words[2])
         assert seen == counts
-        assert all(topic in said["check"] for topic in counts)
+        assert all(topic in checked for topic in counts)
 
 
 def test_an_unfinished_log_is_finished(tmp_path: Path, lowfc: Callable[..., Result]) -> None:

@@ -119,6 +119,7 @@ class Lane:
         self._tolerance_nm = tolerance_nm
         self._share = share
         self._last: int | None = None
+        self._lost_at: int | None = None
         self._entries: dict[int, _Entry] = {}
         self._states: dict[int, wire.ControllerState] = {}
         self._settings: Settings | None = None
@@ -210,20 +211,25 @@ class Lane:
             self._states = {later: state for later, state in self._states.items() if later > number}
             self._settings, self._state = settings, state
             self._past.append(state)
-            self._leave_out(number)
+            known = self._leave_out(number)
+            if self._lost_at is not None:
+                self._account.missing += number - self._lost_at - known
+                self._lost_at = None
             self.done = number == self._last
             return not self.done
         return False
 
-    def _leave_out(self, upto: int) -> None:
-        """Forget the inputs up to a number, and count their steps as unchecked."""
+    def _leave_out(self, upto: int) -> int:
+        """Forget the inputs up to a number, and count their steps as unchecked; return how many there were."""
         gone = [number for number in self._entries if number <= upto]
-        steps = sum(isinstance(self._entries.pop(number).taken, wire.ControlStep) for number in gone)
+        taken = [self._entries.pop(number).taken for number in gone]
         if self._why:  # else they are another share's
-            self._account.leave_out(self._why, steps)
+            self._account.leave_out(self._why, sum(isinstance(one, wire.ControlStep) for one in taken))
+        return sum(one is not None for one in taken)
 
     def _lose(self, why: str) -> None:
         self._why = why
+        self._lost_at = self._state.taken if self._state is not None and why else None
         self._state = None
         self._past.clear()
 

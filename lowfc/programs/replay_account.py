@@ -12,6 +12,7 @@ class Account:
     Attributes:
         frames: steps that were checked; `commands`, `states` and `requests` likewise.
         unchecked: steps of the log that could not be checked, by why.
+        missing: inputs of the controller that the log does not have, as far as a later state tells.
         different: messages that differ by more than the tolerance.
         first: the first of them.
         largest_nm: largest difference of any number in nm.
@@ -22,6 +23,7 @@ class Account:
     states: int = 0
     requests: int = 0
     unchecked: dict[str, int] = field(default_factory=dict)
+    missing: int = 0
     different: int = 0
     first: Difference | None = None
     largest_nm: float = 0.0
@@ -33,7 +35,7 @@ class Account:
 
     def add(self, other: "Account") -> None:
         """Add what was found in the next share."""
-        for count in ("frames", "commands", "states", "requests", "different"):
+        for count in ("frames", "commands", "states", "requests", "missing", "different"):
             setattr(self, count, getattr(self, count) + getattr(other, count))
         for why, steps in other.unchecked.items():
             self.leave_out(why, steps)

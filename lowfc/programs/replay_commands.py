@@ -64,6 +64,8 @@ def render(figures: dict[str, Any]) -> str:
     ]
     for why, count in figures["unchecked_because"].items():
         lines.append(f"not checked        {count} steps {why}")
+    if figures["inputs_missing"]:
+        lines.append(f"not in the log     {figures['inputs_missing']} inputs of the controller")
     lines += [f"damaged            {damage}" for damage in figures["damaged"]]
     if not figures["complete"]:
         lines.append("truncated          the log has no end: its recorder was killed, or is still writing")
@@ -99,6 +101,7 @@ def _figures(account: Account) -> dict[str, Any]:
         "states": account.states,
         "requests": account.requests,
         "unchecked_because": account.unchecked,
+        "inputs_missing": account.missing,
     }
 
 

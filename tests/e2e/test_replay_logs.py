@@ -20,6 +20,7 @@ from lowfc.adapters.log_writer import LogWriter
 from lowfc.adapters.run import Run, new_run_id, open_run
 from lowfc.adapters.zenoh_bus import ZenohBus
 from lowfc.contract.messages import CONTROLLER_STATE, STEP, wire
+from lowfc.programs.replay_workers import replay_files
 
 # A camera that loses one frame in a hundred on the way, as a bad cable does.
 LOSSY_CAMERA = """
@@ -204,18 +205,20 @@ def test_a_log_cut_short_and_a_log_with_a_hole(tmp_path: Path) -> None:
     data = made.read_bytes()
     cut = tmp_path / "cut.mcap"
     cut.write_bytes(data[: len(data) * 2 // 3])
-    short = replayed(tmp_path, cut)
-    assert (short["identical"], short["complete"]) == (True, False)
-    assert 500 < short["frames"] < 1200
+    short = replay_files([cut], 0.0, 1, lambda done: None)
+    assert (short.account.identical, short.complete) == (True, False)
+    assert 500 < short.account.frames < 1200
     hole = bytearray(data)
     middle = len(data) // 2
     hole[middle] ^= 0x40
     (tmp_path / "hole.mcap").write_bytes(hole)
-    holed = replayed(tmp_path, tmp_path / "hole.mcap")
-    assert holed["identical"]
-    assert len(holed["damaged"]) == 1
-    assert 600 < holed["frames"] < 1200
-    assert holed["unchecked"] > 0
+    holed = replay_files([tmp_path / "hole.mcap"], 0.0, 1, lambda done: None)
+    assert holed.account.identical
+    assert len(holed.damage) == 1
+    assert 600 < holed.account.frames < 1200
+    there = len(list(LogReader(tmp_path / "hole.mcap", topics=[STEP], skip_damaged=True)))
+    assert holed.account.frames + sum(holed.account.unchecked.values()) == there < 1200
+    assert holed.account.missing == 1200 - there
     said = run(tmp_path, "replay", "hole.mcap").stdout
     assert "not checked" in said
     assert "damaged" in said

@@ -4,7 +4,6 @@ import json
 import signal
 import socket
 import subprocess
-import sys
 from collections import defaultdict
 from collections.abc import Iterator
 from pathlib import Path
@@ -17,6 +16,7 @@ from lowfc.adapters.bus import Sample
 from lowfc.adapters.clock import HostClock
 from lowfc.adapters.log_reader import Logged, LogReader
 from lowfc.adapters.run import Run, new_run_id, open_run
+from lowfc.adapters.terminal import INTERRUPTED
 from lowfc.adapters.zenoh_bus import ZenohBus
 from lowfc.contract.errors import BusError, ConfigurationError
 from lowfc.contract.messages import (
@@ -32,14 +32,6 @@ from lowfc.contract.messages import (
     wire,
 )
 from lowfc.programs.replay_publish import publish, render
-
-PLAY = """
-import json, sys
-from pathlib import Path
-from lowfc.programs.replay_publish import publish
-logs, run, options = json.loads(sys.argv[1])
-print(json.dumps(publish([Path(log) for log in logs], run, **options)))
-"""
 
 
 @pytest.fixture(scope="module")
@@ -82,14 +74,14 @@ def tool(run: Run) -> Iterator[Tool]:
     made.bus.close()
 
 
-def start(log: Path, run: Run, **options: object) -> "subprocess.Popen[str]":
-    words = [sys.executable, "-c", PLAY, json.dumps([[str(log)], run.run_id, options])]
+def start(log: Path, run: Run, *options: str) -> "subprocess.Popen[str]":
+    words = [*LOWFC, "replay", str(log), "--publish", "--run", run.run_id, "--json", *options]
     return subprocess.Popen(words, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
 
 
-def figures_of(process: "subprocess.Popen[str]") -> dict[str, Any]:
+def figures_of(process: "subprocess.Popen[str]", status: int = 0) -> dict[str, Any]:
     output, complaints = process.communicate(timeout=60)
-    assert process.returncode == 0, complaints
+    assert process.returncode == status, complaints
     figures: dict[str, Any] = json.loads(output)
     assert render(figures)
     return figures
@@ -97,7 +89,7 @@ def figures_of(process: "subprocess.Popen[str]") -> dict[str, Any]:
 
 def test_a_tool_sees_the_night_again(log: Path, logged: dict[str, list[Logged]], run: Run, tool: Tool) -> None:
     begun_ns = tool.bus.clock.host_ns()
-    playing = start(log, run, speed=2.0)
+    playing = start(log, run, "--speed", "2")
     until(lambda: tool.heard[FRAME.key] or playing.poll() is not None)
     (calibration,) = tool.bus.get(CALIBRATION.key)
     (camera,) = tool.bus.get(CAMERA_STATE.key)
@@ -154,7 +146,7 @@ def test_a_controller_under_test(log: Path, logged: dict[str, list[Logged]], run
     for name, content in reader.attachments.items():
         (tmp_path / name).write_bytes(content)
     files = ["--config", str(tmp_path / "config.toml"), "--calibration", str(tmp_path / "calibration.fits")]
-    playing = start(log, run, speed=2.0, wait_for=["controller"])
+    playing = start(log, run, "--speed", "2", "--wait-for", "controller")
     controller = subprocess.Popen([*LOWFC, "controller", "--run", run.run_id, *files], stderr=subprocess.DEVNULL)
     try:
         figures = figures_of(playing)
@@ -177,17 +169,17 @@ def test_a_controller_under_test(log: Path, logged: dict[str, list[Logged]], run
 
 
 def test_ctrl_c_ends_with_the_summary(log: Path, logged: dict[str, list[Logged]], run: Run, tool: Tool) -> None:
-    playing = start(log, run, speed=0.05, topics=["lowfc/camera/frame"])
+    playing = start(log, run, "--speed", "0.05", "--topics", "lowfc/camera/frame")
     until(lambda: tool.heard[FRAME.key] or playing.poll() is not None)
     playing.send_signal(signal.SIGINT)
-    figures = figures_of(playing)
+    figures = figures_of(playing, INTERRUPTED)
     assert figures["interrupted"]
     assert 0 < figures["published"][FRAME.key] < len(logged[FRAME.key])
     assert "interrupted" in render(figures)
 
 
 def test_nothing_to_play(log: Path, run: Run) -> None:
-    playing = start(log, run, topics=["lowfc/control/request"])
+    playing = start(log, run, "--topics", "lowfc/control/request")
     _, complaints = playing.communicate(timeout=60)
     assert playing.returncode
     assert "no message of the topics to play" in complaints

