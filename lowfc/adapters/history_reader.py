@@ -38,6 +38,9 @@ from lowfc.contract.messages import (
 
 Single = npt.NDArray[np.float32]
 
+_BITS = 63  # of a column of whole numbers, but for the sign
+_LAST_NS = (1 << _BITS) - 1
+
 
 def read_history(log: LogReader, progress: Callable[[int], None] | None = None) -> History:
     """Read a log to its end.
@@ -81,13 +84,18 @@ class _Columns:
     def __init__(self, **kinds: str) -> None:
         self._columns = {name: array(kind) for name, kind in kinds.items()}
 
-    def add(self, **values: object) -> None:
-        for name, value in values.items():
-            column = self._columns[name]
-            if isinstance(value, int | float):
-                column.append(value)  # type: ignore[arg-type]  # of the column's kind
-            else:
-                column.extend(value)  # type: ignore[arg-type]  # a vector
+    def add(self, **values: int | float | Iterable[int | float]) -> None:
+        """Add to every column, or to none.
+
+        Raises:
+            OverflowError: a value is beyond what its column can hold.
+        """
+        added = {
+            name: array(self._columns[name].typecode, (value,) if isinstance(value, int | float) else value)
+            for name, value in values.items()
+        }
+        for name, more in added.items():
+            self._columns[name].extend(more)
 
     def taken(self, name: str, width: int | None = None) -> npt.NDArray[Any]:
         column = np.array(self._columns[name])
@@ -117,6 +125,9 @@ class _Gathered:
 
     def take(self, message: Logged) -> None:
         """Take one message of the log."""
+        if max(message.log_time_ns, message.publish_time_ns) > _LAST_NS:
+            self.left_out += 1
+            return
         first_ns, _ = self.span_ns
         self.span_ns = (first_ns or message.log_time_ns, message.log_time_ns)
         self.counts[message.key] += 1
@@ -127,23 +138,26 @@ class _Gathered:
                 handle(self, message)
         except (KeyError, DecodeError):
             return  # a message that nobody of the loop could read either
+        except OverflowError:
+            self.left_out += 1  # protobuf allows it, and nobody of the loop sends it
 
     def frame(self, message: Logged) -> None:
         self.frames.add(sequence=message.sequence, publish_ns=message.publish_time_ns)
 
     def step(self, message: Logged) -> None:
         step = wire.ControlStep.FromString(message.payload)
-        if len(step.command_nm) != self.modes:
+        nothing, modes = self._nothing, self.modes
+        error_nm, pol_nm = step.error_nm or nothing, step.pol_nm or nothing
+        if not len(step.command_nm) == len(error_nm) == len(pol_nm) == modes:
             self.left_out += 1
             return
-        nothing = self._nothing
         self.steps.add(
             sequence=step.frame_sequence,
             time_ns=from_timestamp(step.timestamp),
             mode=step.mode,
             reasons=_bits(step.reasons),
-            error_nm=step.error_nm or nothing,
-            pol_nm=step.pol_nm or nothing,
+            error_nm=error_nm,
+            pol_nm=pol_nm,
             command_nm=step.command_nm,
             flux_dn=step.flux_dn,
             saturated_pixels=step.saturated_pixels,
@@ -162,7 +176,9 @@ class _Gathered:
 
     def timing(self, message: Logged) -> None:
         timing = wire.ControlTiming.FromString(message.payload)
-        self.timings.add(sequence=timing.frame_sequence, **{one: getattr(timing, f"{one}_ns") for one in STAGES})
+        stages = {one: getattr(timing, f"{one}_ns") for one in STAGES}
+        if all(len(stage) == len(timing.frame_sequence) for stage in stages.values()):
+            self.timings.add(sequence=timing.frame_sequence, **stages)
 
     def mirror_state(self, message: Logged) -> None:
         state = wire.MirrorState.FromString(message.payload)
@@ -274,7 +290,17 @@ class _Gathered:
 
 
 def _bits(reasons: Iterable[int]) -> int:
-    return sum(1 << reason for reason in reasons)
+    """Bit `1 << reason` for each.
+
+    Raises:
+        OverflowError: there is no such bit.
+    """
+    bits = 0
+    for reason in reasons:
+        if not 0 <= reason < _BITS:
+            raise OverflowError(f"a reason is a bit below {_BITS}; got {reason}")
+        bits |= 1 << reason
+    return bits
 
 
 _TAKE: dict[str, Callable[[_Gathered, Logged], None]] = {

@@ -74,7 +74,7 @@ class LogReader:
             path: of a log, whatever its name.
             topics: deliver only messages of these; all when None.
             skip_damaged: leave out what is damaged instead of raising an error.
-            from_ns: of a finished log, leave out what was recorded before this log time, up to a chunk more or less.
+            from_ns: leave out the chunks that end before this log time.
             always: topics of which nothing is left out for that.
         """
         self.path = path
@@ -117,7 +117,7 @@ class LogReader:
             self.size, self.finished = file.size, file.finished
             if (declarations := file.declarations()) is not None:
                 self._chunk(declarations)
-            for part in file.parts():
+            for part in file.parts(self._from_ns, self._kept(file)):
                 match part:
                     case Chunk():
                         self.position = part.position + part.length
@@ -131,10 +131,12 @@ class LogReader:
         if self.damage and not (self.damage[0].position or self.described or self._chunks):
             raise DataFileError(f"{self.path} is not an MCAP file")
 
-    def _channels_of(self, topics: Collection[Topic]) -> set[int]:
-        return {
-            channel.id for (key, _), channel in self.channels.items() if any(topic.matches(key) for topic in topics)
-        }
+    def _kept(self, file: LogFile) -> set[int]:
+        """Where the chunks are of which nothing is left out."""
+        held = self.channels.items()
+        wanted = {one.id for (key, _), one in held if any(topic.matches(key) for topic in self._always)}
+        index = file.index() if self._from_ns else []
+        return {one.chunk_start_offset for one in index if not wanted.isdisjoint(one.message_index_offsets)}
 
     def _chunk(self, chunk: Chunk) -> list[Logged]:
         """Messages of a chunk, unless it is not in its place."""

@@ -120,30 +120,15 @@ class LogFile:
         content = self._read(self._summary, length)
         return Chunk(self._summary, length, zlib.crc32(content), content)
 
-    def chunks_with(self, channels: Collection[int]) -> set[int] | None:
-        """Where the chunks begin that have messages of these channels; None unless the summary is sound."""
-        if self._summary is None:
-            return None
-        found, at = set(), self._summary
+    def index(self) -> list[ChunkIndex]:
+        """What the summary says of each chunk, in the order of the file; nothing unless it is sound."""
+        found, at = [], self.size if self._summary is None else self._summary
         while at < self.size - _FOOTER_BYTES:
             opcode, length = HEAD.unpack(self._read(at, HEAD.size))
             if opcode == Opcode.CHUNK_INDEX:
-                index = parsed(ChunkIndex, self._read(at + HEAD.size, length))
-                if not index.message_index_offsets.keys().isdisjoint(channels):
-                    found.add(index.chunk_start_offset)
+                found.append(parsed(ChunkIndex, self._read(at + HEAD.size, length)))
             at += HEAD.size + length
-        return found
-
-    def span_ns(self) -> tuple[int, int]:
-        """Log times of the first and the last message, by the heads of the chunks, unchecked; (0, 0) for none."""
-        times_ns: list[int] = []
-        at = len(MAGIC)
-        while len(head := self._read(at, HEAD.size + 16)) == HEAD.size + 16:
-            opcode, length, *chunk_ns = struct.unpack("<BQQQ", head)
-            if opcode == Opcode.CHUNK:
-                times_ns += chunk_ns
-            at += HEAD.size + length
-        return min(times_ns, default=0), max(times_ns, default=0)
+        return sorted(found, key=lambda chunk: chunk.chunk_start_offset)
 
     def parts(self, from_ns: int = 0, always: Collection[int] = ()) -> Iterator[Chunk | Metadata | Attachment | Damage]:
         """What the file holds, in its order.

@@ -238,7 +238,8 @@ def log_path(folder: Path, time_ns: int) -> Path:
     stamp = time.strftime("%Y%m%dT%H%M%S", time.gmtime(time_ns // 1_000_000_000))
     for number in itertools.count(1):
         path = folder / (f"{stamp}Z.mcap" if number == 1 else f"{stamp}Z-{number}.mcap")
-        if not path.exists() and not path.with_name(path.name + UNFINISHED).exists():
+        # In this order: a log that is finished in between, by another thread, must not pass unseen.
+        if not path.with_name(path.name + UNFINISHED).exists() and not path.exists():
             return path
     raise AssertionError("unreachable")
 

@@ -56,6 +56,8 @@ def render(figures: dict[str, Any]) -> str:
         verdict = f"{frames} frames, commands identical within {figures['tolerance_nm']:g} nm"
     elif figures["identical"]:
         verdict = f"{frames} frames, commands identical"
+    elif not figures["different"]:
+        verdict = f"{frames} frames, steps identical, but no command is in the log"
     else:
         verdict = f"{frames} frames, {figures['different']} messages differ"
     lines = [
@@ -64,8 +66,9 @@ def render(figures: dict[str, Any]) -> str:
     ]
     for why, count in figures["unchecked_because"].items():
         lines.append(f"not checked        {count} steps {why}")
-    if figures["inputs_missing"]:
-        lines.append(f"not in the log     {figures['inputs_missing']} inputs of the controller")
+    for name, what in (("inputs_missing", "inputs of the controller"), ("commands_missing", "commands that it sent")):
+        if figures[name]:
+            lines.append(f"not in the log     {figures[name]} {what}")
     lines += [f"damaged            {damage}" for damage in figures["damaged"]]
     if not figures["complete"]:
         lines.append("truncated          the log has no end: its recorder was killed, or is still writing")
@@ -102,6 +105,7 @@ def _figures(account: Account) -> dict[str, Any]:
         "requests": account.requests,
         "unchecked_because": account.unchecked,
         "inputs_missing": account.missing,
+        "commands_missing": account.commands_missing,
     }
 
 

@@ -42,6 +42,8 @@ def difference(taken: int, frame_sequence: int, logged: Message, replayed: Messa
         found.otherwise = True
     else:
         _compare(found, "", logged, replayed)
+        if not found.fields:
+            found.fields.append("bytes that no value explains: a sign of zero, or a field that this version lacks")
     return found
 
 
@@ -55,11 +57,20 @@ def _compare(found: Difference, prefix: str, logged: Message, replayed: Message)
             _compare(found, f"{prefix}{name}.", was, now)
             continue
         before, after = _numbers(descriptor, was), _numbers(descriptor, now)
-        if before is None or after is None or before.shape != after.shape or not name.endswith(("_nm", "actuators")):
+        if not _alike(before, after) or not name.endswith(("_nm", "actuators")):
             found.fields.append(f"{prefix}{name}: log {_short(was)}, replay {_short(now)}")
             found.otherwise = True
         else:
+            assert before is not None  # noqa: S101  # for the type checker
+            assert after is not None  # noqa: S101
             _numbers_differ(found, prefix + name, before, after)
+
+
+def _alike(before: npt.NDArray[np.float64] | None, after: npt.NDArray[np.float64] | None) -> bool:
+    """Whether these are numbers that can be subtracted from each other."""
+    if before is None or after is None or before.shape != after.shape:
+        return False
+    return bool(np.isfinite(before).all() and np.isfinite(after).all())
 
 
 def _numbers_differ(

@@ -19,7 +19,8 @@ class Selection:
     """Decides for every key of a log whether it is played.
 
     Attributes:
-        roles: whose places the replay takes, in the order of the topics.
+        roles: whose places the replay takes, in the order of the topics; those of all mirrors with frames, unless a
+            live mirror may be moved.
         live: roles that others play.
     """
 
@@ -49,7 +50,9 @@ class Selection:
             if self.asked(key):
                 self._check_live(key)
         self._check_mirrors()
-        wanted = (role_of(key) for key in keys if self.asked(key) and not self.why_not(key))
+        wanted = [role_of(key) for key in keys if self.asked(key) and not self.why_not(key)]
+        if self.asked(FRAME.key) and not allow_commands:  # a mirror that came up later would follow the frames
+            wanted += filter(_is_mirror, links.ports)
         self.roles = tuple(role for role in dict.fromkeys(wanted) if role)
 
     def asked(self, key: str) -> bool:
@@ -88,7 +91,7 @@ class Selection:
             )
 
     def _check_mirrors(self) -> None:
-        mirrors = sorted(role for role in self.live if role.startswith(_MIRROR))
+        mirrors = sorted(filter(_is_mirror, self.live))
         if mirrors and self.asked(FRAME.key) and not self._allow_commands:
             raise BusError(
                 f"{mirrors[0]} of run {self._run_id!r} is live, and a controller that gets the frames of a log would "
@@ -108,8 +111,12 @@ def role_of(key: str) -> str:
     return mirror_role(name) if role is Role.MIRROR else role
 
 
+def _is_mirror(role: str) -> bool:
+    return role.startswith(_MIRROR)
+
+
 def _in_loop(role: str) -> bool:
-    return role in (Role.CAMERA, Role.CONTROLLER) or role.startswith(_MIRROR)
+    return role in (Role.CAMERA, Role.CONTROLLER) or _is_mirror(role)
 
 
 def _keys(links: Links) -> Iterator[str]:
@@ -124,7 +131,7 @@ def _names(topic: Topic, links: Links) -> list[str]:
         return sorted(filter(_in_loop, links.ports))
     if topic.at("") == topic.key:
         return [""]
-    return sorted(role.removeprefix(_MIRROR) for role in links.ports if role.startswith(_MIRROR))
+    return sorted(role.removeprefix(_MIRROR) for role in links.ports if _is_mirror(role))
 
 
 def _fits(pattern: str, key: str) -> bool:

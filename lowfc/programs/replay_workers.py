@@ -15,8 +15,9 @@ from threadpoolctl import threadpool_limits
 from lowfc.adapters.log_reader import LogReader
 from lowfc.adapters.log_records import LogFile
 from lowfc.contract.messages import CALIBRATION
-from lowfc.programs.replay import PATIENCE_NS, TOPICS, Replay, Share
+from lowfc.programs.replay import TOPICS, Replay
 from lowfc.programs.replay_account import Account
+from lowfc.programs.replay_lane import PATIENCE_NS, Share
 
 _WORTH_BYTES = 50_000_000
 """Of log, for another process: below that it costs more time than it saves."""
@@ -34,7 +35,7 @@ class Outcome:
         complete: every log has its end.
         damage: what was left out of the logs, a sentence each.
         recorded_on: versions and host, as the first log has them.
-        log_s: how long the logs are.
+        log_s: from the first frame to the last.
     """
 
     account: Account
@@ -56,29 +57,30 @@ def replay_files(paths: Sequence[Path], tolerance_nm: float, jobs: int, progress
     Raises:
         DataFileError: a log cannot be read, or cannot be replayed.
     """
-    spans_ns = [_span_ns(path) for path in paths]
-    first_ns, last_ns = min(first for first, _ in spans_ns), max(last for _, last in spans_ns)
-    worth = sum(path.stat().st_size for path in paths) // _WORTH_BYTES
+    ends_ns = [one for path in paths for one in _chunk_ends_ns(path)]
+    worth = sum(path.stat().st_size for path in paths) // _WORTH_BYTES if ends_ns else 1
     count = max(1, min(jobs or len(os.sched_getaffinity(0)), worth))
-    edges = [0, *(first_ns + (last_ns - first_ns) * share // count for share in range(1, count)), Share().until_ns]
+    edges = [0, *(ends_ns[len(ends_ns) * share // count] for share in range(1, count)), Share().until_ns]
     shares = [Share(from_ns, until_ns) for from_ns, until_ns in pairwise(edges)]
     if count == 1:
         outcomes = [_replay_share(paths, tolerance_nm, shares[0], progress)]
     else:
         outcomes = _in_processes(paths, tolerance_nm, shares, progress)
-    whole = outcomes[-1]  # its worker has read the logs to their end
-    whole.damage = sorted({line for outcome in outcomes for line in outcome.damage})
-    account = outcomes[0].account
+    whole = outcomes[0]
     for outcome in outcomes[1:]:
-        account.add(outcome.account)
-    whole.account = account
-    whole.log_s = sum(last - first for first, last in spans_ns) * 1e-9
+        whole.account.add(outcome.account)
+        whole.log_s += outcome.log_s
+        whole.damage = sorted({*whole.damage, *outcome.damage})
+    whole.complete = outcomes[-1].complete  # its worker has read the logs to their end
+    unaccounted = whole.account.steps - whole.account.frames - sum(whole.account.unchecked.values())
+    whole.account.leave_out("that no state came before", max(0, unaccounted))
     return whole
 
 
-def _span_ns(path: Path) -> tuple[int, int]:
+def _chunk_ends_ns(path: Path) -> list[int]:
+    """Log times at which the chunks of a log end, as its summary says; none for one that is not finished."""
     with LogFile(path) as file:
-        return file.span_ns()
+        return [chunk.message_end_time for chunk in file.index()]
 
 
 def _replay_share(paths: Sequence[Path], tolerance_nm: float, share: Share, progress: Progress) -> Outcome:
@@ -113,6 +115,7 @@ def _replay_share(paths: Sequence[Path], tolerance_nm: float, share: Share, prog
             run.finish()
     finally:
         gc.enable()
+    outcome.log_s = run.duration_s
     return outcome
 
 

@@ -508,6 +508,20 @@ def test_a_log_is_never_overwritten(tmp_path: Path) -> None:
             LogWriter(tmp_path / name, START_NS, {})
 
 
+def test_a_log_that_is_finished_meanwhile_keeps_its_name(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    log = LogWriter(log_path(tmp_path, START_NS), START_NS, {})
+    exists = Path.exists
+
+    def then_finished(path: Path) -> bool:
+        there = exists(path)
+        if not exists(log.path):
+            log.finish({})
+        return there
+
+    monkeypatch.setattr(Path, "exists", then_finished)
+    assert log_path(tmp_path, START_NS).name == "20260101T000000Z-2.mcap"
+
+
 def test_files_that_cannot_be_used_are_errors(tmp_path: Path) -> None:
     (tmp_path / "text").write_text("this is not an MCAP file, by far")
     with pytest.raises(DataFileError, match="is not an MCAP file"):

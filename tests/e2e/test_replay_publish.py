@@ -32,6 +32,7 @@ from lowfc.contract.messages import (
     wire,
 )
 from lowfc.programs.replay_publish import publish, render
+from lowfc.programs.replay_selection import Selection
 
 
 @pytest.fixture(scope="module")
@@ -129,7 +130,7 @@ def test_a_truncated_log_faster_with_commands(log: Path, run: Run, tool: Tool, t
     cut.write_bytes(content[: len(content) * 2 // 3])
     there = [message for message in LogReader(cut) if message.key == COMMAND.at("dm")]
     assert len(there) > 20
-    figures = figures_of(start(cut, run, speed=4.0, topics=["/lowfc/mirror/*"], allow_commands=True))
+    figures = figures_of(start(cut, run, "--speed", "4", "--topics", "/lowfc/mirror/*", "--allow-commands"))
     heard = tool.heard[COMMAND.at("dm")]
     assert [sample.payload for sample in heard] == [message.payload for message in there]
     assert {key for key in tool.heard if tool.heard[key]} - {HEALTH.at("replay"), EVENT.key} == {
@@ -176,6 +177,23 @@ def test_ctrl_c_ends_with_the_summary(log: Path, logged: dict[str, list[Logged]]
     assert figures["interrupted"]
     assert 0 < figures["published"][FRAME.key] < len(logged[FRAME.key])
     assert "interrupted" in render(figures)
+
+
+def test_no_mirror_can_come_up_while_frames_are_played(log: Path, run: Run, tool: Tool) -> None:
+    playing = start(log, run, "--speed", "0.05", "--topics", FRAME.key)
+    until(lambda: tool.heard[FRAME.key] or playing.poll() is not None)
+    with pytest.raises(BusError, match="mirror-dm"):
+        ZenohBus(run.links, "mirror-dm", HostClock())
+    playing.send_signal(signal.SIGINT)
+    assert set(figures_of(playing, INTERRUPTED)["published"]) == {FRAME.key}
+
+
+def test_whose_places_are_taken(run: Run) -> None:
+    frames, steps = [FRAME.key], [STEP.key]
+    assert Selection(run.links, frames, ()).roles == ("camera", "mirror-dm")
+    assert Selection(run.links, frames, (), allow_commands=True).roles == ("camera",)
+    assert Selection(run.links, steps, ()).roles == ("controller",)
+    assert set(Selection(run.links, (), ()).roles) == {"camera", "controller", "mirror-dm"}
 
 
 def test_nothing_to_play(log: Path, run: Run) -> None:

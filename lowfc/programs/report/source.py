@@ -85,7 +85,8 @@ class _Tapped(LogReader):
     def __iter__(self) -> Iterator[Logged]:
         for message in super().__iter__():
             if COMMAND.matches(message.key):
-                self.command_publish_ns.append(message.publish_time_ns)
+                with contextlib.suppress(OverflowError):
+                    self.command_publish_ns.append(message.publish_time_ns)
             elif message.key == CONTROLLER_STATE.key:
                 with contextlib.suppress(DecodeError):  # the history leaves it out, too
                     self.states.append(wire.ControllerState.FromString(message.payload))
