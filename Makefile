@@ -4,6 +4,9 @@ PYTHON ?= $(shell for p in python3.13 python3.12 python3.11 python3 python; do \
 VENV := .venv
 BIN := $(VENV)/bin
 INSTALL := $(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt
+# Tests that only compute run side by side; those with processes and a clock in them run alone, after them.
+COMPUTING := tests/control tests/design tests/optics tests/sim tests/test_loop.py tests/test_validate.py \
+	tests/test_validate_figures.py
 
 .PHONY: help sim-loop test test-all lint types format proto node clean
 
@@ -28,7 +31,8 @@ sim-loop: $(VENV)/.installed  ## install, then run the simulated loop for 20 s
 	$(BIN)/lowfc sim-loop --duration 20
 
 test: $(VENV)/.tests lint types  ## install, then lint, types and tests
-	$(BIN)/python -m pytest -m 'not slow'
+	OPENBLAS_NUM_THREADS=1 $(BIN)/python -m pytest -m 'not slow' -n auto --dist loadfile $(COMPUTING)
+	$(BIN)/python -m pytest -m 'not slow' $(COMPUTING:%=--ignore=%)
 
 test-all: $(VENV)/.tests node lint types  ## everything, the slow tests and those that need node, chromium and a graphics driver too
 	@ls /usr/share/vulkan/icd.d/*.json >/dev/null 2>&1 || { test "$$(id -u)" = 0 && apt-get install --yes mesa-vulkan-drivers libvulkan1; } || \

@@ -9,12 +9,13 @@ from typing import Any
 
 import numpy as np
 import pytest
+import report_log
 import typer.testing
 from report_log import READ_NOISE_E, Night
 
 from lowfc.adapters.terminal import new_app
 from lowfc.contract.errors import DataFileError
-from lowfc.contract.messages import CONTROLLER_STATE, FRAME, wire
+from lowfc.contract.messages import CONTROLLER_STATE, EVENT, FRAME, REQUEST, Log, wire
 from lowfc.control.error_budget import sensor_noise
 from lowfc.control.stability import noise_gain, rejection
 from lowfc.optics.photometry import tilt_nm_per_mas
@@ -333,6 +334,37 @@ def test_the_command_prints_one_object_or_writes_one_page(tmp_path: Path) -> Non
     assert len(identifiers) == len(set(identifiers))
     for target in re.findall(r'href="#([^"]+)"', text):
         assert target in identifiers
+
+
+MARKUP = '<script>alert("x")</script>'
+
+
+def test_text_of_a_log_is_no_markup(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    night = quiet(Night(), 30)
+    for name in (f"1 {MARKUP}", r"2 $\foo{$", "3 $x^2$"):
+        night.put(REQUEST, wire.Request(name=name, reply=f"4 {MARKUP}", accepted=False))
+    night.put(EVENT, Log(name=f"5 {MARKUP}", message=f"6{MARKUP} 7 {MARKUP}", level=3))
+    night.health("camera", refused=[f"8 {MARKUP}"])
+    about = {name: f"{name} {MARKUP}" for name in (f"9 {MARKUP}", "host", "kernel", "processor", "git", "lowfc")}
+    recording = {"messages_lost": MARKUP, f"lost {MARKUP}": MARKUP}
+    monkeypatch.setattr(report_log, "METADATA", {"lowfc": about, "recording": recording})
+    text = page(report_of(read_run(night.write(tmp_path / "x.mcap", finish=False))))
+    assert "<script" not in text
+    for number in "123456789":
+        assert re.search(rf"{number}( ?&lt;script&gt;| \$)", text), number
+    for name in ("host", "kernel", "processor", "lowfc"):
+        assert f"{name} &lt;script&gt;" in text
+    assert text.count("3 $x^2$") == 2, "in the drawing and in the table"
+
+
+def test_a_figure_that_is_no_number_is_none(tmp_path: Path) -> None:
+    night = quiet(Night(), 30)
+    night.put(REQUEST, wire.Request(name="gain", values=[np.nan, np.inf, 0.5]))
+    log = night.write(tmp_path / "x.mcap")
+    printed = command(str(log), "--json", "--out", str(tmp_path / "x.html"))
+    assert printed.exit_code == 0, printed.output
+    assert json.loads(printed.stdout)["requests"][-1]["values"] == [None, None, 0.5]
+    assert "gain nan inf" in (tmp_path / "x.html").read_text()
 
 
 @pytest.mark.parametrize("name", ["night.mcap", "other.mcap.part"])

@@ -32,7 +32,9 @@ _FOOTER_BYTES = HEAD.size + 20 + len(MAGIC)
 _BLOCK_BYTES = 1 << 20
 _EXPECTED = {Opcode.CHUNK, Opcode.MESSAGE_INDEX, Opcode.ATTACHMENT, Opcode.METADATA, Opcode.DATA_END}
 _CHANGED = "its parts are whole, but not all are there, or not in order, or what lies between them has changed"
-_CHUNK_HERE = re.compile(rb"\x06.{36}\x03\x00\x00\x00lz4", re.DOTALL)
+_CHUNK_HERE = re.compile(rb"\x06.{36}\x03\x00\x00\x00lz4.{8}\x04\x22\x4d\x18", re.DOTALL)  # up to LZ4's own magic
+_FIRST_BLOCK_BYTES = 1 << 12
+_TRIES = 4  # times a file's size: what is read in search of chunks before the rest of a file made to mislead is given up
 
 
 @dataclass(slots=True)
@@ -99,6 +101,7 @@ class LogFile:
             raise DataFileError(f"{path} cannot be read: {fault.strerror}") from fault
         self.finished = self._read(max(0, self.size - len(MAGIC)), len(MAGIC)) == MAGIC
         self._summary = self._sound_summary()
+        self._bytes_to_try = _TRIES * self.size
 
     def __enter__(self) -> "LogFile":
         return self
@@ -200,20 +203,26 @@ class LogFile:
                 opcode, length = HEAD.unpack(head)
                 if opcode in _EXPECTED and end + HEAD.size + length <= self.size:
                     return end
-        for start in range(at + 1, self.size, _BLOCK_BYTES):
-            for match in _CHUNK_HERE.finditer(self._read(start, _BLOCK_BYTES + 64)):
+            self._bytes_to_try -= min(end - at, _LARGEST_BYTES)  # read once, and now searched
+        start, block = at + 1, _FIRST_BLOCK_BYTES
+        while start < self.size and self._bytes_to_try > 0:
+            for match in _CHUNK_HERE.finditer(self._read(start, block + 64)):
                 if self._chunk_at(start + match.start()):
                     return start + match.start()
+            start, block = start + block, min(2 * block, _BLOCK_BYTES)
         data_end = 0 if self._summary is None else self._summary - HEAD.size - 4
         return data_end if data_end > at else self.size
 
     def _chunk_at(self, at: int) -> bool:
         """Whether a whole chunk begins at `at`."""
         _, length = HEAD.unpack(self._read(at, HEAD.size))
-        if at + HEAD.size + length > self.size or length > _LARGEST_BYTES:
+        at += HEAD.size
+        if at + length > self.size or not _CHUNK_HEAD.size <= length <= min(_LARGEST_BYTES, self._bytes_to_try):
             return False
         try:
-            _chunk(self._read(at + HEAD.size, length), at)
+            _size_and_crc(self._read(at, _CHUNK_HEAD.size), length)
+            self._bytes_to_try -= length
+            _chunk(self._read(at, length), at)
         except UnsoundError:
             return False
         return True
@@ -254,13 +263,7 @@ def _part(opcode: int, body: bytes, at: int) -> Chunk | Metadata | Attachment | 
 
 
 def _chunk(body: bytes, at: int) -> Chunk:
-    if len(body) < _CHUNK_HEAD.size:
-        raise UnsoundError("a chunk is too short")
-    _, _, size, crc, _, compression, compressed = _CHUNK_HEAD.unpack_from(body)
-    if compression != b"lz4" or compressed != len(body) - _CHUNK_HEAD.size:
-        raise UnsoundError("the head of a chunk is damaged")
-    if not 0 < size <= min(_LARGEST_BYTES, _LZ4_RATIO * compressed):
-        raise UnsoundError("a chunk says that it has a size that it cannot have")
+    size, crc = _size_and_crc(body, len(body))
     try:
         content = lz4.frame.LZ4FrameDecompressor().decompress(memoryview(body)[_CHUNK_HEAD.size :], max_length=size)
     except (RuntimeError, EOFError) as fault:
@@ -268,6 +271,22 @@ def _chunk(body: bytes, at: int) -> Chunk:
     if zlib.crc32(content) != crc:
         raise UnsoundError("the checksum of a chunk is wrong")
     return Chunk(at, HEAD.size + len(body), crc, content)
+
+
+def _size_and_crc(head: bytes, length: int) -> tuple[int, int]:
+    """Of the content of a chunk with this head and so many bytes.
+
+    Raises:
+        UnsoundError: it cannot be one.
+    """
+    if length < _CHUNK_HEAD.size:
+        raise UnsoundError("a chunk is too short")
+    _, _, size, crc, _, compression, compressed = _CHUNK_HEAD.unpack_from(head)
+    if compression != b"lz4" or compressed != length - _CHUNK_HEAD.size:
+        raise UnsoundError("the head of a chunk is damaged")
+    if not 0 < size <= min(_LARGEST_BYTES, _LZ4_RATIO * compressed):
+        raise UnsoundError("a chunk says that it has a size that it cannot have")
+    return size, crc
 
 
 _Record = TypeVar("_Record", Attachment, ChunkIndex, Metadata, Schema, Channel)

@@ -1,9 +1,10 @@
 """The command `lowfc report`: arguments only; the work is elsewhere."""
 
 import json
+import math
 import sys
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
@@ -47,11 +48,23 @@ def report(
             made = page(found, lambda name: bar.update(task, description=f"drawing {name}"))
             write_whole(target, made.encode())
     if as_json:
-        sys.stdout.write(json.dumps(found.figures, allow_nan=False) + "\n")
+        sys.stdout.write(json.dumps(_finite(found.figures), allow_nan=False) + "\n")
     else:
         verdict = found.figures["verdict"]
         because = f": {verdict['because']}" if verdict["because"] else ""
         sys.stdout.write(f"{verdict['heading']}{because}\n{target}\n")
+
+
+def _finite(figures: Any) -> Any:
+    """The figures with None for what JSON has no number for: a log may hold any value."""
+    match figures:
+        case dict():
+            return {key: _finite(value) for key, value in figures.items()}
+        case list() | tuple():
+            return [_finite(value) for value in figures]
+        case float() if not math.isfinite(figures):
+            return None
+    return figures
 
 
 def beside(log: Path) -> Path:

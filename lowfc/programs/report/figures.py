@@ -1,5 +1,6 @@
 """All figures of a report: one object, of what JSON has."""
 
+import re
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from typing import Any
@@ -66,7 +67,7 @@ def report_of(run: Run) -> Report:
 def _log(run: Run) -> Figures:
     log = run.history.log
     account = log.metadata.get("recording", {})
-    lost = {name.removeprefix("lost "): int(count) for name, count in account.items() if name.startswith("lost ")}
+    lost = {name.removeprefix("lost "): _count(text) for name, text in account.items() if name.startswith("lost ")}
     return {
         "file": log.path.name,
         "bytes": log.size,
@@ -74,11 +75,15 @@ def _log(run: Run) -> Figures:
         "damage": [{"byte": damage.position, "bytes": damage.length, "why": damage.why} for damage in log.damage],
         "messages": sum(run.history.counts.values()),
         "messages_by_topic": dict(sorted(run.history.counts.items())),
-        "messages_lost": int(account["messages_lost"]) if "messages_lost" in account else None,
-        "lost_by_topic": lost,
+        "messages_lost": _count(account.get("messages_lost", "")),
+        "lost_by_topic": {name: count for name, count in lost.items() if count is not None},
         "messages_unreadable": log.unreadable,
         "steps_left_out": run.history.left_out,
     }
+
+
+def _count(text: str) -> int | None:
+    return int(text) if re.fullmatch("[0-9]{1,20}", text) else None  # whatever stands there, it is the log's text
 
 
 def _run(run: Run) -> Figures:
