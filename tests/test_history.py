@@ -62,7 +62,7 @@ def test_an_impossible_step_is_left_out_whole(tmp_path: Path, name: str, value: 
     assert len(steps.sequence) == STEPS - 1
     assert {len(getattr(steps, column)) for column in steps.__slots__} == {STEPS - 1}
     assert np.isfinite(steps.error_nm).all()
-    assert len(history.truths.sequence) == len(history.mirror.sequence) - 1 == STEPS
+    assert len(history.truths.sequence) == len(history.mirror.sequence) == STEPS
 
 
 def test_a_reason_given_twice_is_one_bit(tmp_path: Path) -> None:

@@ -350,8 +350,8 @@ def test_text_of_a_log_is_no_markup(tmp_path: Path, monkeypatch: pytest.MonkeyPa
     monkeypatch.setattr(report_log, "METADATA", {"lowfc": about, "recording": recording})
     text = page(report_of(read_run(night.write(tmp_path / "x.mcap", finish=False))))
     assert "<script" not in text
-    for number in "123456789":
-        assert re.search(rf"{number}( ?&lt;script&gt;| \$)", text), number
+    for digit in "123456789":
+        assert re.search(rf"{digit}( ?&lt;script&gt;| \$)", text), digit
     for name in ("host", "kernel", "processor", "lowfc"):
         assert f"{name} &lt;script&gt;" in text
     assert text.count("3 $x^2$") == 2, "in the drawing and in the table"

@@ -20,6 +20,7 @@ from mcap.opcode import Opcode
 from mcap.records import Attachment, Channel, ChunkIndex, Metadata, Schema
 from mcap.writer import MCAP0_MAGIC as MAGIC
 
+from lowfc.adapters.log_writer import UNFINISHED
 from lowfc.contract.errors import DataFileError
 
 HEAD = struct.Struct("<BQ")
@@ -34,7 +35,9 @@ _EXPECTED = {Opcode.CHUNK, Opcode.MESSAGE_INDEX, Opcode.ATTACHMENT, Opcode.METAD
 _CHANGED = "its parts are whole, but not all are there, or not in order, or what lies between them has changed"
 _CHUNK_HERE = re.compile(rb"\x06.{36}\x03\x00\x00\x00lz4.{8}\x04\x22\x4d\x18", re.DOTALL)  # up to LZ4's own magic
 _FIRST_BLOCK_BYTES = 1 << 12
-_TRIES = 4  # times a file's size: what is read in search of chunks before the rest of a file made to mislead is given up
+_TRIES = (
+    4  # times a file's size: what is read in search of chunks before the rest of a file made to mislead is given up
+)
 
 
 @dataclass(slots=True)
@@ -94,11 +97,18 @@ class LogFile:
         """
         self.path = path
         self.complete = False
+        if path.exists() and not path.is_file():
+            raise DataFileError(f"{path} is no file")
         try:
             self._file: BinaryIO = path.open("rb")
             self.size = self._file.seek(0, io.SEEK_END)
         except OSError as fault:
-            raise DataFileError(f"{path} cannot be read: {fault.strerror}") from fault
+            finished = path.with_name(path.name.removesuffix(UNFINISHED))
+            hint = f"; it is finished now: {finished}" if finished != path and finished.exists() else ""
+            raise DataFileError(f"{path} cannot be read: {fault.strerror}{hint}") from fault
+        if not self.size:
+            self._file.close()
+            raise DataFileError(f"{path} is empty: nothing was recorded")
         self.finished = self._read(max(0, self.size - len(MAGIC)), len(MAGIC)) == MAGIC
         self._summary = self._sound_summary()
         self._bytes_to_try = _TRIES * self.size

@@ -80,6 +80,8 @@ def recover(source: Path, out: Path, progress: Callable[[int, int], None] = lamb
         )
         writer.start(profile="", library=f"lowfc {__version__}")
         messages = _copy(reader, writer, progress)
+        if not messages and not reader.described:
+            raise DataFileError(f"{source}: nothing in it is whole, so there is nothing to recover")
         writer.add_metadata(RECOVERY, _account(reader, messages))
         writer.finish()  # type: ignore[no-untyped-call]
     return Recovery(source, reader.size, out, messages, reader.finished, reader.damage, reader.unreadable)

@@ -193,5 +193,5 @@ def shortage(folder: Path, min_free_bytes: int) -> str:
         return ""
     return (
         f"the disk of {folder} has {free_bytes / 1e6:.0f} MB free, and recorder.min_free_mb is "
-        f"{min_free_bytes / 1e6:.0f}; make room, record elsewhere (--folder) or lower it (--min-free-mb)"
+        f"{min_free_bytes / 1e6:.0f}; make room, record elsewhere (recorder.folder) or lower it"
     )

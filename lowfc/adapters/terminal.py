@@ -1,5 +1,7 @@
 """Command lines: how a user's mistake looks, and the options that every process of a run has."""
 
+import errno
+import os
 import signal
 import sys
 from pathlib import Path
@@ -37,8 +39,16 @@ def run_app(app: typer.Typer) -> NoReturn:
     Being told to stop ends a command as Ctrl-C does; the processes of a loop catch both themselves.
     """
     signal.signal(signal.SIGTERM, signal.default_int_handler)
+    signal.signal(signal.SIGINT, signal.default_int_handler)
     try:
         app()
+        sys.stdout.flush()
+    except OSError as fault:
+        if fault.filename is not None or fault.errno not in (errno.ENOSPC, errno.EIO, errno.EPIPE):
+            raise
+        sys.stderr.write(f"error: standard output cannot be written: {fault.strerror}\n")
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # what is left of it cannot go anywhere
+        sys.exit(2)
     except LowfcError as error:
         sys.stderr.write(f"error: {error}\n")
         sys.exit(error.exit_status)

@@ -48,7 +48,7 @@ EVENTS: dict[str, Event] = {
         Event("FRAMES_ACCEPTED", Level.INFO, "frames accepted again after {refused} refused: {reason}"),
         Event("NO_FRAMES", Level.WARNING, "no frame for {silent_ms:.0f} ms; {action}"),
         Event("FRAMES_BACK", Level.INFO, "frames are back after {silent_ms:.0f} ms"),
-        Event("FRAMES_MISSING", Level.WARNING, "{count} frames missing before frame {sequence}"),
+        Event("FRAMES_MISSING", Level.WARNING, "{count} frames missing or skipped before frame {number}"),
         Event("CAMERA_RESTARTED", Level.WARNING, "the camera restarted"),
         Event("MIRROR_ADOPTED", Level.INFO, "starting from the mirror's command, {rms_nm:.1f} nm rms of wavefront"),
         Event("MIRROR_SILENT", Level.WARNING, "no mirror state within {patience_s:g} s; taking the mirror for flat"),

@@ -107,7 +107,8 @@ def _count_frames(state: State, frame: Frame, events: list[Raised]) -> tuple[Sta
     if frame.sequence >> COUNT_BITS == state.frame_sequence >> COUNT_BITS:
         missing = frame.sequence - state.frame_sequence - 1
         if missing:
-            events.append(Raised("FRAMES_MISSING", {"count": missing, "sequence": frame.sequence}))
+            number = frame.sequence & ((1 << COUNT_BITS) - 1)
+            events.append(Raised("FRAMES_MISSING", {"count": missing, "number": number}))
             drive = drive.stayed(missing) if drive is not None else None
     elif state.frame_sequence:
         events.append(Raised("CAMERA_RESTARTED", {}))

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from lowfc.contract.errors import BusError
+from lowfc.contract.errors import BusError, DataFileError
 
 if TYPE_CHECKING:
     from lowfc.adapters.run import Run
@@ -50,7 +50,11 @@ def bench_record(
 
     Example: lowfc bench record --seconds 5 --json
     """
-    figures = measure(tuple(rate or RATES_HZ), seconds, folder)
+    try:
+        figures = measure(tuple(rate or RATES_HZ), seconds, folder)
+    except OSError as fault:
+        where = folder or tempfile.gettempdir()
+        raise DataFileError(f"{where} cannot be written: {fault.strerror or fault}") from fault
     sys.stdout.write((json.dumps(figures) if as_json else render(figures)) + "\n")
 
 

@@ -154,6 +154,7 @@ def record(
     from lowfc.adapters.join import clock_of
     from lowfc.adapters.log_series import Limits
     from lowfc.adapters.run import open_run
+    from lowfc.adapters.whole_file import write_whole
     from lowfc.programs.recorder import record as run_recorder
     from lowfc.programs.recording_summary import figures, report
 
@@ -165,8 +166,12 @@ def record(
     }
     settings = configuration(config, overrides)
     log = settings.recorder
+    joined = open_run(run, (settings.mirror.name,))
+    if config is None:
+        config = joined.path / "config.toml"
+        write_whole(config, settings.to_toml().encode())
     done = run_recorder(
-        open_run(run, (settings.mirror.name,)),
+        joined,
         Path(log.folder),
         configuration=config,
         calibration=calibration,

@@ -130,7 +130,7 @@ class Controller:
         timing.frame_to_command_ns.append(_column(sent_ns - sample.publish_time_ns))
         if sent_ns >= self._timing_due_ns:
             self._publish_timing()
-        if frame.time_ns >= self._state_due_ns:
+        if clock.now_ns() >= self._state_due_ns:  # not by the frame's time: a camera's clock may be another
             self._publish_state(frame.time_ns)
 
     def _tick(self) -> None:
@@ -219,7 +219,7 @@ class Controller:
     def _publish_state(self, time_ns: int) -> None:
         message = controller_state(self._state, self._settings, time_ns)
         self._states.put(message.SerializeToString())
-        self._state_due_ns = time_ns + STATE_PERIOD_NS
+        self._state_due_ns = self._service.clock.now_ns() + STATE_PERIOD_NS
 
     def _publish_timing(self) -> None:
         now_ns = self._service.clock.host_ns()

@@ -8,12 +8,19 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from lowfc.contract.errors import ConfigurationError
+
 if TYPE_CHECKING:
     from lowfc.adapters.log_recovery import Recovery
 
 
 def recover(
-    log: Annotated[Path, typer.Argument(help="Log (MCAP), truncated, unfinished or damaged; it is not changed.")],
+    logs: Annotated[
+        list[Path],
+        typer.Argument(
+            help="Logs, truncated, unfinished or damaged; they are not changed.", metavar="LOG...", readable=False
+        ),
+    ],
     out: Annotated[
         Path | None, typer.Option(help="The new log; default: NAME-recovered.mcap beside it.", show_default=False)
     ] = None,
@@ -30,15 +37,18 @@ def recover(
     from lowfc.adapters.log_recovery import recovered_path
     from lowfc.adapters.progress import passing_bar
 
+    if len(logs) > 1 and (as_json or out is not None):
+        raise ConfigurationError("--json and --out are for one log: name one")
     columns = (TextColumn("{task.description}"), BarColumn(), DownloadColumn(), TimeRemainingColumn())
-    with passing_bar(Console(stderr=True), *columns) as bar:
-        task = bar.add_task("recovering", total=None)
-        done = run(
-            log,
-            recovered_path(log) if out is None else out,
-            lambda position, size: bar.update(task, completed=position, total=size),
-        )
-    sys.stdout.write((json.dumps(figures(done)) if as_json else report(done)) + "\n")
+    for log in logs:
+        with passing_bar(Console(stderr=True), *columns) as bar:
+            task = bar.add_task(f"recovering {log.name}", total=None)
+            done = run(
+                log,
+                recovered_path(log) if out is None else out,
+                lambda position, size: bar.update(task, completed=position, total=size),  # noqa: B023  # not kept
+            )
+        sys.stdout.write((json.dumps(figures(done)) if as_json else report(done)) + "\n")
 
 
 def figures(done: "Recovery") -> dict[str, Any]:

@@ -43,6 +43,8 @@ def verify(logs: list[Path], tolerance_nm: float, jobs: int, console: Console) -
         "speed": round(outcome.log_s / elapsed_s, 2),
         "complete": outcome.complete,
         "damaged": outcome.damage,
+        "runs": outcome.runs,
+        "stopped": outcome.stopped,
         "host_differs": _host_differs(outcome.recorded_on),
     }
 
@@ -72,6 +74,9 @@ def render(figures: dict[str, Any]) -> str:
     lines += [f"damaged            {damage}" for damage in figures["damaged"]]
     if not figures["complete"]:
         lines.append("truncated          the log has no end: its recorder was killed, or is still writing")
+    lines += [f"recording stopped  {why}" for why in figures["stopped"]]
+    if len(figures["runs"]) > 1:
+        lines.append(f"of several runs    {', '.join(figures['runs'])}")
     first = figures["first_difference"]
     if first:
         lines.append(
@@ -120,7 +125,9 @@ def _host_differs(there: dict[str, str]) -> dict[str, tuple[str, str]]:
 
 
 def replay_log(
-    logs: Annotated[list[Path], typer.Argument(help="A log, or several that follow each other.", metavar="LOG...")],
+    logs: Annotated[
+        list[Path], typer.Argument(help="A log, or several that follow each other.", metavar="LOG...", readable=False)
+    ],
     tolerance: Annotated[
         float | None, typer.Option(min=0, help="Largest difference that is none, nm: for a log of another processor.")
     ] = None,

@@ -14,6 +14,7 @@ from threadpoolctl import threadpool_limits
 
 from lowfc.adapters.log_reader import LogReader
 from lowfc.adapters.log_records import LogFile
+from lowfc.contract.errors import ConfigurationError
 from lowfc.contract.messages import CALIBRATION
 from lowfc.programs.replay import TOPICS, Replay
 from lowfc.programs.replay_account import Account
@@ -35,6 +36,8 @@ class Outcome:
         complete: every log has its end.
         damage: what was left out of the logs, a sentence each.
         recorded_on: versions and host, as the first log has them.
+        runs: names of the runs that are in the logs.
+        stopped: why a recording ended early, a sentence each.
         log_s: from the first frame to the last.
     """
 
@@ -43,6 +46,8 @@ class Outcome:
     damage: list[str] = field(default_factory=list)
     recorded_on: dict[str, str] = field(default_factory=dict)
     log_s: float = 0.0
+    runs: list[str] = field(default_factory=list)
+    stopped: list[str] = field(default_factory=list)
 
 
 def replay_files(paths: Sequence[Path], tolerance_nm: float, jobs: int, progress: Progress) -> Outcome:
@@ -55,8 +60,11 @@ def replay_files(paths: Sequence[Path], tolerance_nm: float, jobs: int, progress
         progress: called with the bytes replayed so far.
 
     Raises:
+        ConfigurationError: a log is named twice.
         DataFileError: a log cannot be read, or cannot be replayed.
     """
+    if len({path.resolve() for path in paths}) < len(paths):
+        raise ConfigurationError("a log is named twice; name each once, in the order they were recorded")
     ends_ns = [one for path in paths for one in _chunk_ends_ns(path)]
     worth = sum(path.stat().st_size for path in paths) // _WORTH_BYTES if ends_ns else 1
     count = max(1, min(jobs or len(os.sched_getaffinity(0)), worth))
@@ -71,7 +79,8 @@ def replay_files(paths: Sequence[Path], tolerance_nm: float, jobs: int, progress
         whole.account.add(outcome.account)
         whole.log_s += outcome.log_s
         whole.damage = sorted({*whole.damage, *outcome.damage})
-    whole.complete = outcomes[-1].complete  # its worker has read the logs to their end
+    last = outcomes[-1]  # its worker has read the logs to their end
+    whole.complete, whole.runs, whole.stopped = last.complete, sorted(set(last.runs)), last.stopped
     unaccounted = whole.account.steps - whole.account.frames - sum(whole.account.unchecked.values())
     whole.account.leave_out("that no state came before", max(0, unaccounted))
     return whole
@@ -109,7 +118,11 @@ def _replay_share(paths: Sequence[Path], tolerance_nm: float, share: Share, prog
                 done += reader.size
                 outcome.complete &= reader.complete
                 outcome.damage += [f"{path.name}, byte {one.position}: {one.why}" for one in reader.damage]
-                outcome.recorded_on = outcome.recorded_on or reader.metadata.get("lowfc", {})
+                metadata = reader.metadata
+                outcome.recorded_on = outcome.recorded_on or metadata.get("lowfc", {})
+                outcome.runs.append(metadata.get("lowfc", {}).get("run", "?"))
+                if why := metadata.get("recording", {}).get("stopped"):
+                    outcome.stopped.append(f"{path.name}: {why}")
                 if run.done:
                     break
             run.finish()

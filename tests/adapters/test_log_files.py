@@ -127,7 +127,7 @@ def test_what_describes_a_log_stands_at_its_start_and_chunks_are_small(tmp_path:
 def test_a_log_cut_anywhere_yields_its_whole_chunks(tmp_path: Path) -> None:
     data = written(tmp_path / "whole.mcap", samples(60)).read_bytes()
     cut, found = tmp_path / "cut.mcap", []
-    for size in [*range(40), *range(40, len(data), 3001), *range(len(data) - 40, len(data) + 1)]:
+    for size in [*range(1, 40), *range(40, len(data), 3001), *range(len(data) - 40, len(data) + 1)]:
         cut.write_bytes(data[:size])
         reader = LogReader(cut)
         found.append(len(list(reader)))

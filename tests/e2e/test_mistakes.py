@@ -1,13 +1,18 @@
 """A user's mistakes: one clear message, exit status 2, nothing half done."""
 
 import json
+import os
+import signal
 import socket
+import subprocess
+import time
 from pathlib import Path
 
 import pytest
-from loops import run
+from loops import LOWFC, run
 
 from lowfc.adapters import calibration_file, instrument
+from lowfc.adapters.log_writer import LogWriter
 from lowfc.adapters.run import open_run
 from lowfc.contract.configuration import load
 
@@ -103,3 +108,47 @@ def _refused(folder: Path, *arguments: str, expected: str, config: str = "") -> 
     assert not done.stdout
     assert not (folder / "logs").exists()
     return done.stderr
+
+
+def test_a_full_disk_on_standard_output_is_one_line(tmp_path: Path) -> None:
+    with Path("/dev/full").open("w") as full:
+        done = subprocess.run(
+            [*LOWFC, "config", "show"], cwd=tmp_path, stdout=full, stderr=subprocess.PIPE, text=True, check=False
+        )
+    assert done.returncode == 2
+    assert done.stderr == "error: standard output cannot be written: No space left on device\n"
+
+
+def test_ctrl_c_while_it_loads_is_quiet(tmp_path: Path) -> None:
+    process = subprocess.Popen([*LOWFC, "config", "show"], cwd=tmp_path, stderr=subprocess.PIPE, text=True)
+    time.sleep(0.15)
+    process.send_signal(signal.SIGINT)
+    _, complaints = process.communicate(timeout=20)
+    assert "Traceback" not in complaints
+
+
+@pytest.mark.parametrize(
+    ("words", "expected"),
+    [
+        (("info", "empty.mcap"), "empty.mcap is empty: nothing was recorded"),
+        (("recover", "header.mcap"), "nothing in it is whole, so there is nothing to recover"),
+        (("replay", "night.mcap.part"), "it is finished now: night.mcap"),
+        (("replay", "night.mcap", "night.mcap"), "a log is named twice"),
+        (("replay", "pipe"), "pipe is no file"),
+        (("replay", "night.mcap", "--speed", "2"), "belong to --publish"),
+        (("replay", "night.mcap", "--publish", "--what-if", "gain=1"), "three different things"),
+        (("recover", "night.mcap", "header.mcap", "--json"), "name one"),
+        (("bench", "record", "--folder", "nowhere"), "nowhere cannot be written"),
+    ],
+)
+def test_logs(tmp_path: Path, words: tuple[str, ...], expected: str) -> None:
+    (tmp_path / "empty.mcap").touch()
+    (tmp_path / "header.mcap").write_bytes(b"\x89MCAP0\r\n" + bytes(12))
+    LogWriter(tmp_path / "night.mcap", 1, {}).finish({})
+    os.mkfifo(tmp_path / "pipe")
+    before = sorted(path.name for path in tmp_path.iterdir())
+    done = run(tmp_path, *words)
+    assert done.returncode == 2, done.stdout
+    assert expected in done.stderr
+    assert len(done.stderr.splitlines()) == 1
+    assert sorted(path.name for path in tmp_path.iterdir()) == before

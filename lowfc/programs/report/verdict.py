@@ -42,7 +42,9 @@ def _record(figures: Figures) -> Figures:
     if log["messages_lost"]:
         faults.append(f"{plural(log['messages_lost'], 'message')} lost")
     if log["steps_left_out"]:
-        faults.append(f"{plural(log['steps_left_out'], 'step')} of another calibration's modes, or with impossible values, left out")
+        faults.append(
+            f"{plural(log['steps_left_out'], 'step')} of another calibration's modes, or with impossible values, left out"
+        )
     if faults:
         return _check("log", LOOK, "; ".join(faults))
     if log["messages_lost"] is None:
