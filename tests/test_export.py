@@ -345,6 +345,37 @@ def test_nothing_is_replaced_unless_forced(log: Path, tmp_path: Path) -> None:
     assert out.read_text().startswith("sequence,")
 
 
+@pytest.mark.parametrize("name", ["night.mcap", "other.mcap", "torn.mcap", "linked.csv"])
+def test_a_log_is_not_replaced_even_if_forced(tmp_path: Path, name: str) -> None:
+    source = write(tmp_path / "night.mcap")
+    (tmp_path / "other.mcap").write_bytes(source.read_bytes())
+    (tmp_path / "linked.csv").symlink_to(source)
+    torn = tmp_path / "torn.mcap"
+    torn.write_bytes(b"?" + source.read_bytes()[1:])
+    before = (tmp_path / name).read_bytes()
+    with pytest.raises(DataFileError, match="never overwritten"):
+        export_log(torn if name == torn.name else source, Format.CSV, tmp_path / name, force=True, console=QUIET)
+    assert (tmp_path / name).read_bytes() == before
+
+
+def test_frames_do_not_replace_a_log(log: Path, tmp_path: Path) -> None:
+    frames = tmp_path / "out.frames.npy"
+    frames.write_bytes(log.read_bytes())
+    with pytest.raises(DataFileError, match="never overwritten"):
+        export_log(log, Format.NPZ, tmp_path / "out.npz", frames=True, force=True, console=QUIET)
+    assert frames.read_bytes() == log.read_bytes()
+
+
+def test_several_logs_are_exported_in_turn(tmp_path: Path) -> None:
+    logs = [str(write(tmp_path / f"{name}.mcap")) for name in "ab"]
+    app = new_app("Test.")
+    app.command()(export)
+    for words in (["--json"], ["--out", str(tmp_path / "c.csv")]):
+        assert isinstance(CliRunner().invoke(app, [*logs, "--to", "csv", *words]).exception, ConfigurationError)
+    assert CliRunner().invoke(app, [*logs, "--to", "csv"]).exit_code == 0
+    assert {path.name for path in tmp_path.glob("*.csv")} == {"a.csv", "b.csv"}
+
+
 @pytest.mark.parametrize("to", [Format.NPZ, Format.FITS])  # with aot they are copied as with fits
 def test_frames_are_not_held_in_memory(tmp_path: Path, to: Format) -> None:
     frames, shape = 60, (200, 200)

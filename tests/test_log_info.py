@@ -10,9 +10,10 @@ from typer.testing import CliRunner
 
 from lowfc.adapters.bus import Sample
 from lowfc.adapters.envelope import sequence_of
+from lowfc.adapters.log_recovery import recover
 from lowfc.adapters.log_writer import Attachment, LogWriter
 from lowfc.adapters.terminal import new_app
-from lowfc.contract.errors import DataFileError
+from lowfc.contract.errors import ConfigurationError, DataFileError
 from lowfc.contract.events import EVENTS
 from lowfc.contract.messages import CALIBRATION, CONTROLLER_STATE, EVENT, FRAME, HEALTH, STEP, Message, wire
 from lowfc.programs.log_info import info
@@ -141,10 +142,31 @@ def test_an_unfinished_and_a_damaged_log_say_so(log: Path, lowfc: Callable[..., 
     data[data.index(b"[loop]")] ^= 1
     log.write_bytes(data)
     said = lowfc(log)
+    assert said.exit_code == 0
     assert "damaged; `lowfc recover` saves what is whole" in said.stdout
     assert "the checksum of an attachment is wrong" in said.stdout
     found = json.loads(lowfc(log, "--json").stdout)
     assert (found["state"], len(found["damage"]), found["attachments"]) == ("damaged", 1, {})
+
+
+def test_a_recording_that_stopped_early_says_so(tmp_path: Path, lowfc: Callable[..., Result]) -> None:
+    log = LogWriter(tmp_path / "a.mcap", START_NS, {}).finish({"recording": {"stopped": "the disk is full"}})
+    assert "recording stopped: the disk is full" in lowfc(log).stdout
+
+
+def test_a_recovered_log_says_so(log: Path, lowfc: Callable[..., Result]) -> None:
+    log.write_bytes(log.read_bytes()[:-500])
+    recovered = log.with_name("recovered.mcap")
+    recover(log, recovered)
+    said = lowfc(recovered).stdout
+    assert "recovered from night.mcap, which had not been finished; left out: damaged parts 0" in said
+
+
+def test_several_logs_are_told_in_turn(log: Path, lowfc: Callable[..., Result]) -> None:
+    assert lowfc(log, log).stdout == f"{lowfc(log).stdout}\n{lowfc(log).stdout}"
+    done = lowfc(log, log, "--json")
+    assert isinstance(done.exception, ConfigurationError)
+    assert str(done.exception) == "--json prints one object: name one log"
 
 
 def test_an_empty_log_is_a_log(tmp_path: Path, lowfc: Callable[..., Result]) -> None:

@@ -13,8 +13,10 @@ import report_log
 import typer.testing
 from report_log import READ_NOISE_E, Night
 
+from lowfc.adapters.log_recovery import recover
+from lowfc.adapters.log_writer import LogWriter
 from lowfc.adapters.terminal import new_app
-from lowfc.contract.errors import DataFileError
+from lowfc.contract.errors import ConfigurationError, DataFileError
 from lowfc.contract.messages import CONTROLLER_STATE, EVENT, FRAME, REQUEST, Log, wire
 from lowfc.control.error_budget import sensor_noise
 from lowfc.control.stability import noise_gain, rejection
@@ -87,6 +89,7 @@ def test_frames_are_accounted_for(eventful: dict[str, Any]) -> None:
     assert eventful["timing"]["frames"] == {
         "recorded": 2250,
         "without_command": 6,
+        "at_the_end": 0,
         "skipped_by_controller": 4,
         "missing_at_controller": 2,
         "commands_late": 3,
@@ -302,8 +305,58 @@ def test_a_damaged_part_is_left_out_and_told(tmp_path: Path) -> None:
     log.write_bytes(content)
     found = figures(log)
     assert len(found["log"]["damage"]) == 1
-    assert "1 damaged part left out" in found["verdict"]["checks"][0]["text"]
+    assert found["verdict"]["checks"][0]["text"] == "1 damaged part left out"
+    assert found["log"]["finished"] is True
     assert 0 < found["run"]["steps"] < 1500
+
+
+def test_a_recording_that_stopped_early_is_not_good(tmp_path: Path) -> None:
+    writer = LogWriter(tmp_path / "x.mcap", report_log.START * 10**9, report_log.METADATA)
+    for sample in quiet(Night()).samples:
+        writer.write(sample)
+    log = writer.finish({"recording": {"messages_lost": "0", "stopped": "the disk is full"}})
+    made = report_of(read_run(log))
+    assert made.figures["verdict"]["because"] == "recording stopped: the disk is full"
+    assert made.figures["verdict"]["level"] == "bad"
+    assert '<td class="text">the disk is full</td>' in page(made)
+
+
+def test_a_recovered_log_says_so(tmp_path: Path) -> None:
+    part = quiet(Night()).write(tmp_path / "x.mcap", finish=False)
+    recover(part, tmp_path / "y.mcap")
+    check = figures(tmp_path / "y.mcap")["verdict"]["checks"][0]
+    assert (check["name"], check["level"]) == ("log", "look")
+    assert check["text"].startswith(
+        "recovered from x.mcap.part, which had not been finished; left out: damaged parts 0"
+    )
+
+
+@pytest.mark.parametrize(("lost", "without", "at_the_end"), [(1, 0, 1), (50, 0, 50), (80, 30, 50)])
+def test_the_last_frames_may_have_their_command_after_the_log(
+    tmp_path: Path, lost: int, without: int, at_the_end: int
+) -> None:
+    night = Night()
+    night.frames(200, lost=range(200 - lost, 200))
+    found = figures(night.write(tmp_path / "x.mcap"))["timing"]["frames"]
+    assert (found["without_command"], found["at_the_end"]) == (without, at_the_end)
+
+
+def test_the_verdict_says_over_what_its_figures_are(tmp_path: Path) -> None:
+    for truth, words in ((True, "nm after over the open pupil;"), (False, "nm after in all modes over the circle;")):
+        found = figures(quiet(Night(truth=truth)).write(tmp_path / f"{truth}.mcap"))
+        assert words in found["verdict"]["checks"][2]["text"]
+        if truth:
+            before_nm = found["residual"]["open_pupil"]["disturbance_open_pupil_rms_nm"]
+            assert found["verdict"]["checks"][2]["text"].startswith(f"{before_nm:.3g} nm before")
+
+
+def test_several_logs_are_reported_in_turn(tmp_path: Path) -> None:
+    logs = [str(quiet(Night(), 3).write(tmp_path / f"{name}.mcap")) for name in "ab"]
+    done = command(*logs)
+    assert done.exit_code == 0, done.output
+    assert done.stdout.splitlines()[1::2] == [str(tmp_path / "a.html"), str(tmp_path / "b.html")]
+    for words in (["--json"], ["--out", str(tmp_path / "c.html")]):
+        assert isinstance(command(*logs, *words).exception, ConfigurationError)
 
 
 def test_no_log_is_an_error(tmp_path: Path) -> None:
@@ -367,10 +420,11 @@ def test_a_figure_that_is_no_number_is_none(tmp_path: Path) -> None:
     assert "gain nan inf" in (tmp_path / "x.html").read_text()
 
 
-@pytest.mark.parametrize("name", ["night.mcap", "other.mcap.part"])
+@pytest.mark.parametrize("name", ["night.mcap", "other.mcap.part", "link.html"])
 def test_a_report_never_overwrites_a_log(tmp_path: Path, name: str) -> None:
     log = quiet(Night(), 3).write(tmp_path / "night.mcap")
     before = log.read_bytes()
+    (tmp_path / "link.html").hardlink_to(log)
     done = command(str(log), "--out", str(tmp_path / name))
     assert isinstance(done.exception, DataFileError)
     assert log.read_bytes() == before
@@ -398,7 +452,7 @@ def test_the_figures_take_neither_matplotlib_nor_jinja2(tmp_path: Path) -> None:
     log = quiet(Night(), 3).write(tmp_path / "x.mcap")
     code = (
         "import sys, pathlib; from lowfc.programs.report.command import report; "
-        f"report(pathlib.Path({str(log)!r}), None, True); "
+        f"report([pathlib.Path({str(log)!r})], None, True); "
         "sys.exit(bool({'matplotlib', 'jinja2'} & set(sys.modules)))"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60, check=False)

@@ -17,6 +17,7 @@ from lowfc.adapters import calibration_file, instrument
 from lowfc.adapters.history import History, MirrorStates, Steps, Truths
 from lowfc.adapters.history_reader import read_history
 from lowfc.adapters.log_reader import LogReader
+from lowfc.adapters.log_records import Damage
 from lowfc.contract.calibration_codec import identified
 from lowfc.contract.configuration import Configuration, load
 from lowfc.contract.errors import CalibrationError, ConfigurationError, DataFileError, LowfcError
@@ -308,6 +309,8 @@ def test_a_controller_of_ones_own_is_folded_like_the_integrator(
         ("def stop(state, error_nm):\n    pass\n", r"has no function 'step' \(did you mean 'stop'\?\)"),
         ("def step(:\n", "cannot be run: SyntaxError"),
         ("import no_such_module_at_all\n", "cannot be run: ModuleNotFoundError"),
+        ("raise SystemExit(0)\n", "cannot be run: SystemExit: 0"),
+        ("def step(state, error_nm):\n    exit(3)\n", "call 1: SystemExit: 3"),
     ],
 )
 def test_a_controllers_mistakes_are_made_plain(controller: Callable[[str], str], body: str, message: str) -> None:
@@ -316,6 +319,14 @@ def test_a_controllers_mistakes_are_made_plain(controller: Callable[[str], str],
 
     with pytest.raises(ConfigurationError, match=message):
         call()
+
+
+def test_what_a_controller_prints_is_not_among_the_figures(
+    controller: Callable[[str], str], capsys: pytest.CaptureFixture[str]
+) -> None:
+    where = controller("print('loaded')\ndef step(state, error_nm):\n    print('called')\n    return state, error_nm\n")
+    user_controller(where)(None, np.ones(3, np.float32))
+    assert capsys.readouterr() == ("", "loaded\ncalled\n")
 
 
 @pytest.mark.parametrize(
@@ -334,7 +345,8 @@ def test_where_a_controller_is_must_be_said(where: str, message: str) -> None:
 def test_the_words_of_the_command_line() -> None:
     asked = wanted(" gain=0.6, leak=0.01,tilt_limit_nm=80,estimator=pinv", controller=None)
     assert asked == WhatIf({"gain": 0.6, "leak": 0.01, "tilt_limit_nm": 80.0}, "pinv")
-    assert wanted("") == wanted() == WhatIf()
+    assert wanted() == WhatIf()
+    assert wanted("", controller="mine.py:step") == WhatIf(controller="mine.py:step")
 
 
 @pytest.mark.parametrize(
@@ -346,6 +358,7 @@ def test_the_words_of_the_command_line() -> None:
         ("gain=", "gain needs a value"),
         ("gain=high", "gain must be a number, got 'high'"),
         ("gain=1,gain=2", "gain is there twice"),
+        ("", "--what-if asks for nothing; give KEY=VALUE"),
         ("estimator=best", "estimator must be weighted or pinv, got 'best'"),
     ],
 )
@@ -389,8 +402,10 @@ def history(frames: int = 40, **columns: Any) -> History:
     }
     none, nothing = np.zeros(0, np.int64), np.zeros((0, 3), np.float32)
     ends = wire.ControllerState(gain=[0.5] * 3, leak=[0] * 3, limit_nm=[100] * 3, delay_frames=1)
+    log = LogReader(Path("toy.mcap"))
+    log.finished = True
     return History(
-        log=LogReader(Path("toy.mcap")),
+        log=log,
         configuration=None,
         calibration=toy.calibration(),
         controller=ends,
@@ -462,6 +477,21 @@ def test_a_log_that_is_none_is_said(tmp_path: Path) -> None:
     path.write_bytes(b"nothing")
     with pytest.raises(LowfcError):
         what_if(LogReader(path), WhatIf())
+
+
+def test_the_table_of_another_controller_has_no_gains() -> None:
+    own = compared(LoggedRun(history()), WhatIf(controller="mine.py:step"), None, lambda state, error: (state, error))
+    assert "gain" not in render(own)
+    assert "0.5" not in render(own).split("tilt x")[1].splitlines()[0]
+
+
+def test_what_is_not_in_the_log_is_said() -> None:
+    torn = history()
+    torn.log.finished = False
+    torn.log.damage.append(Damage(77, 5, "the checksum of a chunk is wrong"))
+    warnings = compared(LoggedRun(torn), WhatIf(), None, None)["warnings"]
+    assert any("left out: byte 77, the checksum of a chunk is wrong" in warning for warning in warnings)
+    assert any("the log has no end" in warning for warning in warnings)
 
 
 def test_doubts_are_said() -> None:

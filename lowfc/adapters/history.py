@@ -87,7 +87,7 @@ class History:
         log: the reader, read to its end: metadata, attachments, whether the log is complete.
         frame_sequence, frame_publish_ns: of every frame in the log.
         stages_ns: (timed steps,) each of `STAGES`, for the frames of `timed_sequence`.
-        left_out: steps of another number of modes than the last calibration's.
+        left_out: steps of another number of modes than the last calibration's, or with impossible values.
         requests: what operators asked, with the answers.
         events: (log time ns, message).
         health: the last of each process.

@@ -90,7 +90,7 @@ class _Columns:
         Raises:
             OverflowError: a value is beyond what its column can hold.
         """
-        added = {
+        added: dict[str, array[Any]] = {
             name: array(self._columns[name].typecode, (value,) if isinstance(value, int | float) else value)
             for name, value in values.items()
         }

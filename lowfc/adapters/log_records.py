@@ -35,9 +35,7 @@ _EXPECTED = {Opcode.CHUNK, Opcode.MESSAGE_INDEX, Opcode.ATTACHMENT, Opcode.METAD
 _CHANGED = "its parts are whole, but not all are there, or not in order, or what lies between them has changed"
 _CHUNK_HERE = re.compile(rb"\x06.{36}\x03\x00\x00\x00lz4.{8}\x04\x22\x4d\x18", re.DOTALL)  # up to LZ4's own magic
 _FIRST_BLOCK_BYTES = 1 << 12
-_TRIES = (
-    4  # times a file's size: what is read in search of chunks before the rest of a file made to mislead is given up
-)
+_TRIES = 4  # times the file's size is read in search of chunks; then the rest is given up, of a file made to mislead
 
 
 @dataclass(slots=True)

@@ -96,7 +96,7 @@ class LogWriter:
         self.messages = self.messages_written = self.bytes_written = 0
         self._channels: dict[tuple[str, int], int] = {}
         self._schemas: dict[str, int] = {}
-        if path.exists() or self.part.exists():
+        if self.part.exists() or path.exists():
             raise DataFileError(f"{path} exists already; a log is never overwritten")
         try:
             path.parent.mkdir(parents=True, exist_ok=True)

@@ -32,7 +32,7 @@ _ENDINGS = {Format.CSV: ".csv", Format.NPZ: ".npz", Format.FITS: ".fits", Format
 
 
 def export(
-    log: Annotated[Path, typer.Argument(help="Log (MCAP), finished or not.")],
+    logs: Annotated[list[Path], typer.Argument(help="Logs (MCAP), finished or not.", metavar="LOG...", readable=False)],
     to: Annotated[Format, typer.Option("--to", help="csv, npz, fits, or aot: Adaptive Optics Telemetry.")],
     out: Annotated[Path | None, typer.Option(help="File to write; default: the log's name beside the log.")] = None,
     frames: Annotated[bool, typer.Option("--frames", help="The frames too; with npz as OUT.frames.npy.")] = False,
@@ -45,8 +45,13 @@ def export(
     """
     from rich.console import Console
 
-    figures = export_log(log, to, out, frames=frames, force=force, console=Console(stderr=True))
-    sys.stdout.write((json.dumps(figures) if as_json else render(figures)) + "\n")
+    if len(logs) > 1 and as_json:
+        raise ConfigurationError("--json prints one object: name one log")
+    if len(logs) > 1 and out is not None:
+        raise ConfigurationError("--out is one file: name one log")
+    for log in logs:
+        figures = export_log(log, to, out, frames=frames, force=force, console=Console(stderr=True))
+        sys.stdout.write((json.dumps(figures) if as_json else render(figures)) + "\n")
 
 
 def export_log(
@@ -59,7 +64,7 @@ def export_log(
         to: what it becomes.
         out: file to write; the log's name with another ending, beside it, when None.
         frames: export the frames too.
-        force: replace a file that is there.
+        force: replace a file that is there, unless it is a log.
         console: for the progress.
 
     Raises:
@@ -72,13 +77,16 @@ def export_log(
     from lowfc.adapters.log_reader import LogReader
     from lowfc.adapters.progress import passing_bar
     from lowfc.adapters.whole_file import being_written
+    from lowfc.programs.log_guard import refuse_log
 
     if frames and to is Format.CSV:
         raise ConfigurationError("a CSV file has no place for frames: use --to npz, fits or aot, or leave out --frames")
     write = _writer(to)
-    out = out if out is not None else log.with_name(log.name.removesuffix(".part").removesuffix(".mcap") + _ENDINGS[to])
+    stem = log.name.removesuffix(".part").removesuffix(".mcap")
+    out = out if out is not None else log.parent / (stem + _ENDINGS[to])
     files = [out] + ([out.with_suffix(".frames.npy")] if frames and to is Format.NPZ else [])
     for file in files:
+        refuse_log(file, log)
         if file.exists() and not force:
             raise DataFileError(f"{file} exists already; choose another name (--out), or --force replaces it")
     columns = (TextColumn("{task.description}"), BarColumn(), DownloadColumn(), TimeRemainingColumn())

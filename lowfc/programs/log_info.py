@@ -8,6 +8,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from lowfc.contract.errors import ConfigurationError
+
 if TYPE_CHECKING:
     from rich.console import Console
 
@@ -20,7 +22,7 @@ _STATES = {
 
 
 def info(
-    log: Annotated[Path, typer.Argument(help="Log (MCAP), finished or not.")],
+    logs: Annotated[list[Path], typer.Argument(help="Logs (MCAP), finished or not.", metavar="LOG...", readable=False)],
     as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object on standard output.")] = False,
 ) -> None:
     """Say what ran, when, what was recorded of each topic, and what is missing or damaged.
@@ -33,14 +35,18 @@ def info(
     from lowfc.adapters.progress import passing_bar
     from lowfc.programs.log_survey import survey
 
+    if as_json and len(logs) > 1:
+        raise ConfigurationError("--json prints one object: name one log")
     columns = (TextColumn("{task.description}"), BarColumn(), DownloadColumn(), TimeRemainingColumn())
-    with passing_bar(Console(stderr=True), *columns) as bar:
-        task = bar.add_task("reading", total=None)
-        found = survey(log, lambda position, size: bar.update(task, completed=position, total=size))
-    if as_json:
-        sys.stdout.write(json.dumps(found) + "\n")
-    else:
-        report(found, Console(width=None if sys.stdout.isatty() else _WIDTH, highlight=False))
+    for number, log in enumerate(logs):
+        with passing_bar(Console(stderr=True), *columns) as bar:
+            task = bar.add_task(f"reading {log.name}", total=None)
+            found = survey(log, lambda position, size: bar.update(task, completed=position, total=size))  # noqa: B023  # not kept
+        if as_json:
+            sys.stdout.write(json.dumps(found) + "\n")
+        else:
+            sys.stdout.write("\n" if number else "")
+            report(found, Console(width=None if sys.stdout.isatty() else _WIDTH, highlight=False))
 
 
 def report(found: Mapping[str, Any], console: "Console") -> None:
@@ -68,6 +74,8 @@ def report(found: Mapping[str, Any], console: "Console") -> None:
 
 def _summary(found: Mapping[str, Any]) -> dict[str, str]:
     """All but the topics, a line each."""
+    from lowfc.programs.log_survey import recovery_in_words
+
     metadata, recording = found["metadata"], found["metadata"].get("recording", {})
     damage = [f"byte {one['position']}, {one['length']} bytes: {one['why']}" for one in found["damage"]]
     lost = [f"{found['messages_missing']} missing by their counts"]
@@ -79,6 +87,8 @@ def _summary(found: Mapping[str, Any]) -> dict[str, str]:
     lines = {
         "log": f"{found['log']}, {found['bytes'] / 1e6:.1f} MB",
         "state": _STATES[found["state"]],
+        "stopped": f"recording stopped: {recording['stopped']}" if recording.get("stopped") else "",
+        "recovery": recovery_in_words(metadata),
         "damage": "\n".join(damage),
         "start": "" if found["start"] is None else f"{found['start']}, {found['duration_s']:.3f} s",
         "messages": f"{found['messages']}; {', '.join(lost)}",
@@ -88,7 +98,7 @@ def _summary(found: Mapping[str, Any]) -> dict[str, str]:
         **{
             name: ", ".join(f"{key} {value}" for key, value in entries.items())
             for name, entries in metadata.items()
-            if name != "recording"
+            if name not in ("recording", "recovery")
         },
     }
     return {name: value for name, value in lines.items() if value}

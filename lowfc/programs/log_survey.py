@@ -2,7 +2,7 @@
 
 import dataclasses
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from functools import cache
@@ -15,6 +15,7 @@ from lowfc.adapters.bus import Sample
 from lowfc.adapters.envelope import start_of
 from lowfc.adapters.ledger import Ledger
 from lowfc.adapters.log_reader import Logged, LogReader
+from lowfc.adapters.log_recovery import RECOVERY
 from lowfc.contract.events import Level
 from lowfc.contract.messages import CONTROLLER_STATE, EVENT, HEALTH, Log, Topic, topic_of, wire
 from lowfc.control.safety import LoopMode
@@ -136,6 +137,19 @@ def survey(log: Path, progress: Callable[[int, int], None] = lambda done, size: 
         "metadata": reader.metadata,
         "attachments": {name: len(data) for name, data in reader.attachments.items()},
     }
+
+
+def recovery_in_words(metadata: Mapping[str, Mapping[str, str]]) -> str:
+    """What a recovered log was made from, and what was left out; nothing for another log."""
+    account = metadata.get(RECOVERY)
+    if account is None:
+        return ""
+    unfinished = ", which had not been finished" if account.get("source_finished") == "false" else ""
+    parts, unreadable = account.get("left_out", "?"), account.get("unreadable", "?")
+    return (
+        f"recovered from {account.get('source', '?')}{unfinished}; "
+        f"left out: damaged parts {parts}, unreadable messages {unreadable}"
+    )
 
 
 @cache

@@ -134,18 +134,21 @@ def compared(
 def render(figures: dict[str, Any]) -> str:
     """The figures of `what_if` as a table."""
     columns = [name for name in _TITLES if f"{name}_nm" in figures]
+    gains = all("gain" in mode for mode in figures["modes"])  # a controller of one's own has none
     lines = [
         f"{figures['frames_compared']} of {figures['frames']} frames compared: {figures['compared']}, after "
         f"{figures['settling_s']:.2g} s to settle; {figures['frames_refused']} were refused, "
         f"{figures['frames_saturated']} saturated, {figures['frames_missing']} missing",
         f"delay {figures['delay_frames']:.2f} frames, {figures['estimator']} reconstructor, {figures['controller']}",
         "",
-        f"{'residual, nm rms':<28}" + "".join(f"{_TITLES[name]:>16}" for name in columns) + f"{'gain':>16}",
+        f"{'residual, nm rms':<28}"
+        + "".join(f"{_TITLES[name]:>16}" for name in columns)
+        + (f"{'gain':>16}" if gains else ""),
     ]
     for mode in figures["modes"]:
-        gain = f"{mode['gain_was']:.3g}" + (f" -> {mode['gain']:.3g}" if "gain" in mode else "")
+        gain = f"{mode['gain_was']:.3g} -> {mode['gain']:.3g}" if gains else ""
         values = "".join(f"{mode[f'{name}_nm']:>16.2f}" for name in columns)
-        lines.append(f"{mode['noll']:>3} {mode['name']:<24}{values}{gain:>16}")
+        lines.append(f"{mode['noll']:>3} {mode['name']:<24}{values}" + (f"{gain:>16}" if gains else ""))
     lines.append(f"{'all modes':<28}" + "".join(f"{figures[f'{name}_nm']:>16.2f}" for name in columns))
     if "tilt_was_mas" in figures:
         values = "".join(f"{figures[f'tilt_{name}_mas']:>16.2f}" for name in columns)
@@ -221,7 +224,14 @@ def _tilt_mas(run: LoggedRun, columns: dict[str, Double]) -> dict[str, float]:
 
 def _doubts_of_log(run: LoggedRun) -> list[str]:
     """What of the log makes the figures less sure."""
-    found = []
+    found, log = [], run.history.log
+    if log.damage:
+        parts = ", ".join(f"byte {one.position}, {one.why}" for one in log.damage)
+        found.append(f"the log is damaged, and these parts are left out: {parts}")
+    if not log.finished:
+        found.append("the log has no end: its recorder was killed, or is still writing")
+    if log.metadata.get("recording", {}).get("stopped"):
+        found.append(f"recording stopped: {log.metadata['recording']['stopped']}")
     if run.measured_delay is None:
         found.append(f"the delay could not be measured in this log; {run.delay_frames:g} frames is the controller's")
     elif run.delay_frames != run.controller_delay:

@@ -1,5 +1,6 @@
 """What a what-if changes: the words of the command line, the law they make, a user's own controller."""
 
+import contextlib
 import sys
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -54,7 +55,7 @@ def wanted(
     """What the options of the command line ask for; `text` is like "gain=0.6,leak=0.01".
 
     Raises:
-        ConfigurationError: an unknown key, or a value that is none.
+        ConfigurationError: an unknown key, a value that is none, or a text that asks for nothing.
     """
     values: dict[str, str] = {}
     for part in filter(None, (part.strip() for part in (text or "").split(","))):
@@ -66,6 +67,10 @@ def wanted(
         if key in values:
             raise ConfigurationError(f"--what-if: {key} is there twice")
         values[key] = value
+    if text is not None and not values and all(one is None for one in (config, calibration, controller)):
+        raise ConfigurationError(
+            f"--what-if asks for nothing; give KEY=VALUE, such as gain=0.3; known are {', '.join(KEYS)}"
+        )
     estimator = values.pop("estimator", None)
     if estimator not in (None, *ESTIMATORS):
         raise ConfigurationError(f"--what-if: estimator must be {' or '.join(ESTIMATORS)}, got {estimator!r}")
@@ -110,8 +115,9 @@ def user_controller(where: str) -> Controller:
         raise ConfigurationError(f"--controller: there is no file {file}")
     module = sys.modules[spec.name] = module_from_spec(spec)  # where its dataclasses look for it
     try:
-        spec.loader.exec_module(module)
-    except Exception as error:
+        with contextlib.redirect_stdout(sys.stderr):
+            spec.loader.exec_module(module)
+    except (Exception, SystemExit) as error:
         raise ConfigurationError(f"--controller: {file} cannot be run: {type(error).__name__}: {error}") from None
     function = getattr(module, name, None)
     if not callable(function):
@@ -123,9 +129,10 @@ def user_controller(where: str) -> Controller:
         nonlocal calls
         calls += 1
         try:
-            state, command = function(state, error_nm.copy())
+            with contextlib.redirect_stdout(sys.stderr):  # standard output is for the figures
+                state, command = function(state, error_nm.copy())
             command_nm = np.array(command, np.float32)
-        except Exception as error:
+        except (Exception, SystemExit) as error:
             raise ConfigurationError(
                 f"--controller: {where}, call {calls}: {type(error).__name__}: {error}; "
                 "step(state, error_nm) must return (state, command_nm)"

@@ -8,13 +8,15 @@ from typing import Annotated, Any
 
 import typer
 
-from lowfc.contract.errors import DataFileError
+from lowfc.contract.errors import ConfigurationError, DataFileError
 
 _LOGS = (".mcap", ".part")
 
 
 def report(
-    log: Annotated[Path, typer.Argument(help="A log, finished or not.", show_default=False)],
+    logs: Annotated[
+        list[Path], typer.Argument(help="Logs, finished or not.", metavar="LOG...", readable=False, show_default=False)
+    ],
     out: Annotated[
         Path | None, typer.Option(help="The page (HTML). Default: beside the log, under its name.", show_default=False)
     ] = None,
@@ -26,19 +28,32 @@ def report(
 
     Example: lowfc report logs/20260412T021500Z.mcap
     """
+    if len(logs) > 1 and as_json:
+        raise ConfigurationError("--json prints one object: name one log")
+    if len(logs) > 1 and out is not None:
+        raise ConfigurationError("--out is one page: name one log")
     if out is not None and out.suffix in _LOGS:
         raise DataFileError(f"{out} would be a log, which a report never overwrites; give --out FILE.html")
+    for log in logs:
+        _report(log, out, as_json)
+
+
+def _report(log: Path, out: Path | None, as_json: bool) -> None:
+    """Report one log."""
     from rich.console import Console
     from rich.progress import BarColumn, TextColumn, TimeElapsedColumn
 
     from lowfc.adapters.progress import passing_bar
     from lowfc.adapters.whole_file import require_folder, write_whole
+    from lowfc.programs.log_guard import refuse_log
     from lowfc.programs.report.figures import report_of
     from lowfc.programs.report.page import page
     from lowfc.programs.report.source import read_run
 
     target = out if out is not None or as_json else beside(log)
     require_folder(target)
+    if target is not None:
+        refuse_log(target, log)
     with passing_bar(Console(stderr=True), TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn()) as bar:
         task = bar.add_task(f"reading {log.name}", total=1.0)
         run = read_run(log, lambda part: bar.update(task, completed=part))
@@ -72,4 +87,4 @@ def beside(log: Path) -> Path:
     name = log.name
     for suffix in reversed(_LOGS):
         name = name.removesuffix(suffix)
-    return log.with_name(f"{name}.html")
+    return log.parent / f"{name}.html"

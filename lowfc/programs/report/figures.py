@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from lowfc.programs.log_survey import recovery_in_words
 from lowfc.programs.report import course
 from lowfc.programs.report.budget import budget_figures
 from lowfc.programs.report.closed_loop import (
@@ -71,7 +72,10 @@ def _log(run: Run) -> Figures:
     return {
         "file": log.path.name,
         "bytes": log.size,
+        "finished": log.finished,
         "complete": log.complete and not log.damage,
+        "stopped": account.get("stopped") or None,
+        "recovery": recovery_in_words(log.metadata) or None,
         "damage": [{"byte": damage.position, "bytes": damage.length, "why": damage.why} for damage in log.damage],
         "messages": sum(run.history.counts.values()),
         "messages_by_topic": dict(sorted(run.history.counts.items())),

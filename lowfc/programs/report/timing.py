@@ -13,6 +13,9 @@ from lowfc.programs.report.source import Run
 Whole = npt.NDArray[np.int64]
 Figures = dict[str, Any]
 
+_END_NS = 50_000_000
+"""Before the last frame, in which a command may still be on its way when the log ends."""
+
 PERCENTILES = {"p50": 50.0, "p90": 90.0, "p99": 99.0, "p99_9": 99.9}
 FRAME_TO_MIRROR = "frame_to_mirror"
 
@@ -61,11 +64,16 @@ def frame_counts(history: History) -> Figures:
     """Frames in the log, those without a command, and what camera and controller counted themselves.
 
     A step is made of every frame that reaches the controller, and a command of every step once there is a calibration;
-    what the controller skipped (a newer one came before it was used) or missed (it never came) has neither. Their own
-    counts go from the start of a process, which may be before the log's.
+    what the controller skipped (a newer one came before it was used) or missed (it never came) has neither. Of the last
+    frames the command may be after the end of the log: they are counted apart. The processes' own counts go from the
+    start of a process, which may be before the log's.
     """
-    frames = np.unique(history.frame_sequence)
+    frames, rows = np.unique(history.frame_sequence, return_index=True)
     without = rows_of(frames, history.steps.sequence) < 0
+    at_the_end = np.zeros_like(without)
+    if not without.all():
+        published_ns = history.frame_publish_ns[rows]
+        at_the_end = (frames > history.steps.sequence.max()) & (published_ns > published_ns[-1] - _END_NS)
     counted: dict[str, int | None] = {"skipped": None, "missing": None}
     controller = history.health.get(Role.CONTROLLER)
     if controller is not None:
@@ -75,7 +83,8 @@ def frame_counts(history: History) -> Figures:
     camera = history.health.get(Role.CAMERA)
     return {
         "recorded": int(frames.size),
-        "without_command": int(without.sum()),
+        "without_command": int((without & ~at_the_end).sum()),
+        "at_the_end": int(at_the_end.sum()),
         "skipped_by_controller": counted["skipped"],
         "missing_at_controller": counted["missing"],
         "commands_late": camera.commands_late if camera is not None else None,

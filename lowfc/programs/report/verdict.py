@@ -34,19 +34,20 @@ def _check(name: str, level: str, text: str) -> Figures:
 
 def _record(figures: Figures) -> Figures:
     log = figures["log"]
-    faults = []
+    faults = [f"recording stopped: {log['stopped']}"] if log["stopped"] else []
     if log["damage"]:
         faults.append(f"{plural(len(log['damage']), 'damaged part')} left out")
-    if not log["complete"]:
+    if not log["finished"]:
         faults.append("its end is missing: the recorder did not finish it")
+    if log["recovery"]:
+        faults.append(log["recovery"])
     if log["messages_lost"]:
         faults.append(f"{plural(log['messages_lost'], 'message')} lost")
     if log["steps_left_out"]:
-        faults.append(
-            f"{plural(log['steps_left_out'], 'step')} of another calibration's modes, or with impossible values, left out"
-        )
+        what = "of another calibration's modes, or with impossible values"
+        faults.append(f"{plural(log['steps_left_out'], 'step')} {what}, left out")
     if faults:
-        return _check("log", LOOK, "; ".join(faults))
+        return _check("log", BAD if log["stopped"] else LOOK, "; ".join(faults))
     if log["messages_lost"] is None:
         return _check("log", UNKNOWN, "complete; lost messages were not counted")
     return _check("log", GOOD, "complete, no message lost")
@@ -64,23 +65,30 @@ def _modes(figures: Figures) -> Figures:
 
 
 def _residual(figures: Figures) -> Figures:
-    """Before and after: true where the log has truth, else as measured."""
+    """Before and after: true over the open pupil where the log has truth, else the modes as measured."""
     totals, tilts = figures["residual"]["total_rms_nm"], figures["residual"]["tilt_mas"]
     true = totals["residual"] is not None
     before, after = ("disturbance", "residual") if true else ("pseudo_open_loop", "error")
-    if totals[before] is None or totals[after] is None:
+    before_nm, after_nm = totals[before], totals[after]
+    over = "in all modes over the circle"
+    open_pupil = figures["residual"]["open_pupil"]
+    pupil_nm = [open_pupil[f"{name}_open_pupil_rms_nm"] for name in ("disturbance", "residual")]
+    if true and all(pupil_nm):
+        before_nm, after_nm = pupil_nm
+        over = "over the open pupil"
+    if before_nm is None or after_nm is None:
         why = figures["error_budget"].get("why_not", "no good frame with the loop closed is in this log")
         return _check("residual", UNKNOWN, why)
-    text = f"{totals[before]:.3g} nm before, {totals[after]:.3g} nm after"
+    text = f"{before_nm:.3g} nm before, {after_nm:.3g} nm after {over}"
     if tilts[before] and tilts[after]:
         text += f"; tip and tilt {tilts[before]['per_axis']:.3g} mas to {tilts[after]['per_axis']:.3g} mas per axis"
     text += " (true)" if true else " (as measured, with the sensor's noise in both)"
-    return _check("residual", GOOD if totals[after] < totals[before] else LOOK, text)
+    return _check("residual", GOOD if after_nm < before_nm else LOOK, text)
 
 
 def _commands(figures: Figures) -> Figures:
     frames = figures["timing"]["frames"]
-    without, recorded = frames["without_command"], frames["recorded"]
+    without, recorded = frames["without_command"], frames["recorded"] - frames["at_the_end"]
     if not recorded:
         return _check("commands", UNKNOWN, "no frame is in this log")
     if not without:
