@@ -142,7 +142,7 @@ def test_two_loops_on_one_host_do_not_mix(tmp_path: Path) -> None:
     figures = loop(second, "--rate", "100", "--duration", "4", "--seed", "2", "--disturbance", "quiet")
     said, complaints = other.communicate(timeout=60)
     assert other.returncode == 0, complaints
-    assert figures["frames_published"] == 200
+    assert figures["frames_published"] == 400
     assert len(payloads(figures["log"])["/lowfc/camera/frame"]) <= 400
     assert '"frames_published": 400' in said
 
