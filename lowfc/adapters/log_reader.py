@@ -135,7 +135,7 @@ class LogReader:
         """Where the chunks are of which nothing is left out."""
         held = self.channels.items()
         wanted = {one.id for (key, _), one in held if any(topic.matches(key) for topic in self._always)}
-        index = file.index() if self._from_ns else []
+        index = file.index() if self._from_ns else ()
         return {one.chunk_start_offset for one in index if not wanted.isdisjoint(one.message_index_offsets)}
 
     def _chunk(self, chunk: Chunk) -> list[Logged]:

@@ -131,15 +131,14 @@ class LogFile:
         content = self._read(self._summary, length)
         return Chunk(self._summary, length, zlib.crc32(content), content)
 
-    def index(self) -> list[ChunkIndex]:
+    def index(self) -> Iterator[ChunkIndex]:
         """What the summary says of each chunk, in the order of the file; nothing unless it is sound."""
-        found, at = [], self.size if self._summary is None else self._summary
+        at = self.size if self._summary is None else self._summary
         while at < self.size - _FOOTER_BYTES:
             opcode, length = HEAD.unpack(self._read(at, HEAD.size))
             if opcode == Opcode.CHUNK_INDEX:
-                found.append(parsed(ChunkIndex, self._read(at + HEAD.size, length)))
+                yield parsed(ChunkIndex, self._read(at + HEAD.size, length))
             at += HEAD.size + length
-        return sorted(found, key=lambda chunk: chunk.chunk_start_offset)
 
     def parts(self, from_ns: int = 0, always: Collection[int] = ()) -> Iterator[Chunk | Metadata | Attachment | Damage]:
         """What the file holds, in its order.
