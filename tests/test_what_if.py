@@ -408,10 +408,11 @@ def history(frames: int = 40, **columns: Any) -> History:
         log=log,
         configuration=None,
         calibration=toy.calibration(),
-        controller=ends,
+        controllers=[ends],
         camera=wire.CameraState(period_ns=toy.PERIOD_NS * 200, exposure_ns=toy.PERIOD_NS),
         frame_sequence=usual["sequence"],
         frame_publish_ns=none,
+        command_publish_ns=none,
         steps=Steps(**(usual | columns)),
         truths=Truths(none.astype(np.uint64), nothing, nothing, none, none),
         mirror=MirrorStates(none.astype(np.uint64), none, none, none, nothing, nothing),
@@ -469,7 +470,7 @@ def test_too_little_to_compare_is_said() -> None:
         with pytest.raises(DataFileError, match="too few frames that a calibrated controller used"):
             LoggedRun(short)
     with pytest.raises(DataFileError, match="gains and delay are not known"):
-        LoggedRun(replace(history(), controller=None))
+        LoggedRun(replace(history(), controllers=[]))
 
 
 def test_a_log_that_is_none_is_said(tmp_path: Path) -> None:

@@ -85,7 +85,9 @@ class History:
 
     Attributes:
         log: the reader, read to its end: metadata, attachments, whether the log is complete.
+        controllers: states of the controllers, in order.
         frame_sequence, frame_publish_ns: of every frame in the log.
+        command_publish_ns: of every mirror command in the log.
         stages_ns: (timed steps,) each of `STAGES`, for the frames of `timed_sequence`.
         left_out: steps of another number of modes than the last calibration's, or with impossible values.
         requests: what operators asked, with the answers.
@@ -98,10 +100,11 @@ class History:
     log: LogReader
     configuration: Configuration | None
     calibration: Calibration | None
-    controller: wire.ControllerState | None
+    controllers: list[wire.ControllerState]
     camera: wire.CameraState | None
     frame_sequence: Sequences
     frame_publish_ns: Whole
+    command_publish_ns: Whole
     steps: Steps
     truths: Truths
     mirror: MirrorStates
@@ -113,6 +116,11 @@ class History:
     health: dict[str, wire.Health]
     counts: Counter[str]
     span_ns: tuple[int, int]
+
+    @property
+    def controller(self) -> wire.ControllerState | None:
+        """The controller's last state; None without one."""
+        return self.controllers[-1] if self.controllers else None
 
     @property
     def rate_hz(self) -> float:

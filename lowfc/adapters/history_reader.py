@@ -21,6 +21,7 @@ from lowfc.contract.errors import DataFileError
 from lowfc.contract.messages import (
     CALIBRATION,
     CAMERA_STATE,
+    COMMAND,
     CONTROLLER_STATE,
     EVENT,
     FRAME,
@@ -107,7 +108,7 @@ class _Gathered:
 
     def __init__(self) -> None:
         self.calibration: wire.Calibration | None = None
-        self.controller: wire.ControllerState | None = None
+        self.controllers: list[wire.ControllerState] = []
         self.camera: wire.CameraState | None = None
         self.requests: list[wire.Request] = []
         self.events: list[tuple[int, Log]] = []
@@ -117,6 +118,7 @@ class _Gathered:
         self.modes = 0
         self.left_out = 0
         self.frames = _Columns(sequence="Q", publish_ns="q")
+        self.commands = _Columns(publish_ns="q")
         self.timings = _Columns(sequence="Q", **dict.fromkeys(STAGES, "q"))
         self.mirror = _Columns(sequence="Q", publish_ns="q", stroke_nm="f", limits="q")
         self.highest_nm: Single | None = None
@@ -143,6 +145,9 @@ class _Gathered:
 
     def frame(self, message: Logged) -> None:
         self.frames.add(sequence=message.sequence, publish_ns=message.publish_time_ns)
+
+    def command(self, message: Logged) -> None:
+        self.commands.add(publish_ns=message.publish_time_ns)
 
     def step(self, message: Logged) -> None:
         step = wire.ControlStep.FromString(message.payload)
@@ -205,7 +210,7 @@ class _Gathered:
             self._forget_steps()
 
     def state(self, message: Logged) -> None:
-        self.controller = wire.ControllerState.FromString(message.payload)
+        self.controllers.append(wire.ControllerState.FromString(message.payload))
 
     def camera_state(self, message: Logged) -> None:
         self.camera = wire.CameraState.FromString(message.payload)
@@ -231,10 +236,11 @@ class _Gathered:
             log=log,
             configuration=attached_configuration(log),
             calibration=calibration,
-            controller=self.controller,
+            controllers=self.controllers,
             camera=self.camera,
             frame_sequence=self.frames.taken("sequence"),
             frame_publish_ns=self.frames.taken("publish_ns"),
+            command_publish_ns=self.commands.taken("publish_ns"),
             steps=Steps(
                 sequence=steps.taken("sequence"),
                 time_ns=steps.taken("time_ns"),
@@ -306,6 +312,7 @@ def _bits(reasons: Iterable[int]) -> int:
 _TAKE: dict[str, Callable[[_Gathered, Logged], None]] = {
     FRAME.key: _Gathered.frame,
     STEP.key: _Gathered.step,
+    COMMAND.key: _Gathered.command,
     TIMING.key: _Gathered.timing,
     TRUTH.key: _Gathered.truth,
     MIRROR_STATE.key: _Gathered.mirror_state,

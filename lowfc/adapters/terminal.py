@@ -4,6 +4,7 @@ import errno
 import os
 import signal
 import sys
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, Any, NoReturn
 
@@ -11,7 +12,7 @@ import typer
 
 from lowfc.adapters.run import DEFAULT_RUN
 from lowfc.contract.configuration import Configuration, load
-from lowfc.contract.errors import LowfcError
+from lowfc.contract.errors import ConfigurationError, LowfcError
 
 INTERRUPTED = 130
 """Exit status after Ctrl-C."""
@@ -57,6 +58,18 @@ def run_app(app: typer.Typer) -> NoReturn:
             sys.stderr.write("interrupted\n")
         raise
     sys.exit(0)
+
+
+def one_log(logs: Sequence[Path], out: Path | None, *, as_json: bool) -> None:
+    """Refuse several logs where there is one place for what is made of them.
+
+    Raises:
+        ConfigurationError: there are several.
+    """
+    if len(logs) > 1 and as_json:
+        raise ConfigurationError("--json prints one object: name one log")
+    if len(logs) > 1 and out is not None:
+        raise ConfigurationError("--out is one file: name one log")
 
 
 def configuration(

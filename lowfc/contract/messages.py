@@ -6,6 +6,7 @@ package `lowfc.v1` (declared in `proto/lowfc/v1/lowfc.proto`) and Foxglove's sch
 
 from dataclasses import dataclass
 from enum import StrEnum
+from functools import lru_cache
 
 import numpy as np
 import numpy.typing as npt
@@ -203,6 +204,7 @@ MONO16 = "mono16"
 FLOAT32 = "32FC1"
 
 
+@lru_cache(maxsize=256)
 def topic_of(key: str) -> Topic:
     """Return the line of the table for a key on the bus.
 

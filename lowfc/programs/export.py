@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from lowfc.adapters.terminal import one_log
 from lowfc.contract.errors import ConfigurationError, DataFileError
 
 if TYPE_CHECKING:
@@ -45,10 +46,7 @@ def export(
     """
     from rich.console import Console
 
-    if len(logs) > 1 and as_json:
-        raise ConfigurationError("--json prints one object: name one log")
-    if len(logs) > 1 and out is not None:
-        raise ConfigurationError("--out is one file: name one log")
+    one_log(logs, out, as_json=as_json)
     for log in logs:
         figures = export_log(log, to, out, frames=frames, force=force, console=Console(stderr=True))
         sys.stdout.write((json.dumps(figures) if as_json else render(figures)) + "\n")

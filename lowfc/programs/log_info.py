@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from lowfc.contract.errors import ConfigurationError
+from lowfc.adapters.terminal import one_log
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -35,8 +35,7 @@ def info(
     from lowfc.adapters.progress import passing_bar
     from lowfc.programs.log_survey import survey
 
-    if as_json and len(logs) > 1:
-        raise ConfigurationError("--json prints one object: name one log")
+    one_log(logs, None, as_json=as_json)
     columns = (TextColumn("{task.description}"), BarColumn(), DownloadColumn(), TimeRemainingColumn())
     for number, log in enumerate(logs):
         with passing_bar(Console(stderr=True), *columns) as bar:

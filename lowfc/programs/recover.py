@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from lowfc.contract.errors import ConfigurationError
+from lowfc.adapters.terminal import one_log
 
 if TYPE_CHECKING:
     from lowfc.adapters.log_recovery import Recovery
@@ -37,8 +37,7 @@ def recover(
     from lowfc.adapters.log_recovery import recovered_path
     from lowfc.adapters.progress import passing_bar
 
-    if len(logs) > 1 and (as_json or out is not None):
-        raise ConfigurationError("--json and --out are for one log: name one")
+    one_log(logs, out, as_json=as_json)
     columns = (TextColumn("{task.description}"), BarColumn(), DownloadColumn(), TimeRemainingColumn())
     for log in logs:
         with passing_bar(Console(stderr=True), *columns) as bar:

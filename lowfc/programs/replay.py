@@ -21,7 +21,6 @@ from lowfc.contract.messages import (
     FRAME,
     REQUEST,
     STEP,
-    Topic,
     topic_of,
     wire,
 )
@@ -45,7 +44,6 @@ class Replay:
         self._frames = Frames()
         self._calibrations: dict[str, Calibration] = {}
         self._lanes: dict[int, Lane] = {}
-        self._topics: dict[str, Topic] = {}
         self._last_ns = self._begun_ns = self._ended_ns = 0
 
     @property
@@ -62,7 +60,7 @@ class Replay:
         self._last_ns = message.log_time_ns
         if message.log_time_ns < self._from_ns and message.key != CALIBRATION.key:
             return
-        topic = self._topics.get(message.key) or self._topics.setdefault(message.key, topic_of(message.key))
+        topic = topic_of(message.key)
         if topic is FRAME:
             self._frames.add(message.sequence, message.payload)
             if self._share.from_ns <= message.log_time_ns < self._share.until_ns:

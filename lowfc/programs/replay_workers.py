@@ -18,7 +18,7 @@ from lowfc.contract.errors import ConfigurationError
 from lowfc.contract.messages import CALIBRATION
 from lowfc.programs.replay import TOPICS, Replay
 from lowfc.programs.replay_account import Account
-from lowfc.programs.replay_lane import PATIENCE_NS, Share
+from lowfc.programs.replay_lane import PATIENCE_NS, WHOLE, Share
 
 _WORTH_BYTES = 50_000_000
 """Of log, for another process: below that it costs more time than it saves."""
@@ -68,7 +68,7 @@ def replay_files(paths: Sequence[Path], tolerance_nm: float, jobs: int, progress
     ends_ns = [one for path in paths for one in _chunk_ends_ns(path)]
     worth = sum(path.stat().st_size for path in paths) // _WORTH_BYTES if ends_ns else 1
     count = max(1, min(jobs or len(os.sched_getaffinity(0)), worth))
-    edges = [0, *(ends_ns[len(ends_ns) * share // count] for share in range(1, count)), Share().until_ns]
+    edges = [0, *(ends_ns[len(ends_ns) * share // count] for share in range(1, count)), WHOLE.until_ns]
     shares = [Share(from_ns, until_ns) for from_ns, until_ns in pairwise(edges)]
     if count == 1:
         outcomes = [_replay_share(paths, tolerance_nm, shares[0], progress)]

@@ -8,7 +8,8 @@ from typing import Annotated, Any
 
 import typer
 
-from lowfc.contract.errors import ConfigurationError, DataFileError
+from lowfc.adapters.terminal import one_log
+from lowfc.contract.errors import DataFileError
 
 _LOGS = (".mcap", ".part")
 
@@ -28,10 +29,7 @@ def report(
 
     Example: lowfc report logs/20260412T021500Z.mcap
     """
-    if len(logs) > 1 and as_json:
-        raise ConfigurationError("--json prints one object: name one log")
-    if len(logs) > 1 and out is not None:
-        raise ConfigurationError("--out is one page: name one log")
+    one_log(logs, out, as_json=as_json)
     if out is not None and out.suffix in _LOGS:
         raise DataFileError(f"{out} would be a log, which a report never overwrites; give --out FILE.html")
     for log in logs:

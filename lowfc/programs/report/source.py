@@ -1,19 +1,16 @@
 """What a report is made from: the history of a run, and the law that was in force at each of its steps."""
 
-import contextlib
-from array import array
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
 import numpy.typing as npt
-from google.protobuf.message import DecodeError
 
 from lowfc.adapters.history import History, rows_of
 from lowfc.adapters.history_reader import read_history
-from lowfc.adapters.log_reader import Logged, LogReader
-from lowfc.contract.messages import COMMAND, CONTROLLER_STATE, from_timestamp, wire
+from lowfc.adapters.log_reader import LogReader
+from lowfc.contract.messages import from_timestamp
 
 Whole = npt.NDArray[np.int64]
 Double = npt.NDArray[np.float64]
@@ -35,12 +32,10 @@ class Run:
 
     Attributes:
         laws: in order; the steps before the first one are under a law that the log does not tell.
-        command_publish_ns: of every mirror command in the log.
     """
 
     history: History
     laws: tuple[InForce, ...]
-    command_publish_ns: Whole
 
     def law_rows(self) -> Whole:
         """Index of the law of each step; -1 where it is not known."""
@@ -74,25 +69,6 @@ class Run:
         return np.asarray((self.history.steps.time_ns - self.begun_ns) * 1e-9)
 
 
-class _Tapped(LogReader):
-    """A reader that keeps, as they pass, the controller's states and when commands were sent."""
-
-    def __init__(self, path: Path) -> None:
-        super().__init__(path, skip_damaged=True)
-        self.states: list[wire.ControllerState] = []
-        self.command_publish_ns = array("q")
-
-    def __iter__(self) -> Iterator[Logged]:
-        for message in super().__iter__():
-            if COMMAND.matches(message.key):
-                with contextlib.suppress(OverflowError):
-                    self.command_publish_ns.append(message.publish_time_ns)
-            elif message.key == CONTROLLER_STATE.key:
-                with contextlib.suppress(DecodeError):  # the history leaves it out, too
-                    self.states.append(wire.ControllerState.FromString(message.payload))
-            yield message
-
-
 def read_run(path: Path, progress: Callable[[float], None] | None = None) -> Run:
     """Read a log, whole or not, to its end; what is damaged is left out and told by the history's reader.
 
@@ -104,21 +80,21 @@ def read_run(path: Path, progress: Callable[[float], None] | None = None) -> Run
         DataFileError: this is no log, or it has a calibration that cannot be read.
         ConfigurationError: it has a configuration that this version cannot read.
     """
-    log = _Tapped(path)
+    log = LogReader(path, skip_damaged=True)
 
     def passed(_: int) -> None:
         if progress is not None and log.size:
             progress(log.position / log.size)
 
     history = read_history(log, passed)
-    return Run(history, _laws(history, log.states), np.array(log.command_publish_ns, dtype=np.int64))
+    return Run(history, _laws(history))
 
 
-def _laws(history: History, states: list[wire.ControllerState]) -> tuple[InForce, ...]:
+def _laws(history: History) -> tuple[InForce, ...]:
     """The laws of a run, from the states that its controllers published at every change."""
     steps = history.steps
     found: list[InForce] = []
-    for state in states:
+    for state in history.controllers:
         if len(state.gain) != steps.command_nm.shape[1] or not steps.sequence.size:
             continue
         if state.frame_sequence:

@@ -37,7 +37,7 @@ def intervals_ns(run: Run) -> dict[str, Whole]:
     published = history.frame_publish_ns
     starts = history.frame_sequence >> np.uint64(32)
     frames = np.diff(published)[np.diff(starts) == 0] if published.size else published
-    return {"frames": frames, "commands": np.diff(run.command_publish_ns)}
+    return {"frames": frames, "commands": np.diff(run.history.command_publish_ns)}
 
 
 def latencies_ns(history: History) -> dict[str, Whole]:
