@@ -53,6 +53,7 @@ class Truths:
     """What the simulation knew, one row per frame; empty for a log of real devices."""
 
     sequence: Sequences
+    time_ns: Whole
     disturbance_nm: Single
     residual_nm: Single
     disturbance_rms_nm: Single

@@ -1,19 +1,18 @@
 """Reading a log into a history."""
 
 import tempfile
-from array import array
 from collections import Counter
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 from google.protobuf.message import DecodeError
 
 from lowfc.adapters.bus import name_in
-from lowfc.adapters.history import STAGES, History, MirrorStates, Steps, Truths
+from lowfc.adapters.history import History, MirrorStates
 from lowfc.adapters.log_reader import Logged, LogReader
+from lowfc.adapters.rows import Columns, StepRows, TimingRows, TruthRows, bits_of
 from lowfc.contract.calibration_codec import decode_calibration
 from lowfc.contract.codec import actuators
 from lowfc.contract.configuration import Configuration, load
@@ -32,15 +31,13 @@ from lowfc.contract.messages import (
     TIMING,
     TRUTH,
     Log,
-    from_timestamp,
     topic_of,
     wire,
 )
 
 Single = npt.NDArray[np.float32]
 
-_BITS = 63  # of a column of whole numbers, but for the sign
-_LAST_NS = (1 << _BITS) - 1
+_LAST_NS = (1 << 63) - 1
 
 
 def read_history(log: LogReader, progress: Callable[[int], None] | None = None) -> History:
@@ -79,30 +76,6 @@ def attached_configuration(log: LogReader) -> Configuration | None:
         return load(path)
 
 
-class _Columns:
-    """Columns that grow by rows: whole numbers, and vectors of one length."""
-
-    def __init__(self, **kinds: str) -> None:
-        self._columns = {name: array(kind) for name, kind in kinds.items()}
-
-    def add(self, **values: int | float | Iterable[int | float]) -> None:
-        """Add to every column, or to none.
-
-        Raises:
-            OverflowError: a value is beyond what its column can hold.
-        """
-        added: dict[str, array[Any]] = {
-            name: array(self._columns[name].typecode, (value,) if isinstance(value, int | float) else value)
-            for name, value in values.items()
-        }
-        for name, more in added.items():
-            self._columns[name].extend(more)
-
-    def taken(self, name: str, width: int | None = None) -> npt.NDArray[Any]:
-        column = np.array(self._columns[name])
-        return column if width is None else column.reshape(len(self._columns["sequence"]), width)
-
-
 class _Gathered:
     """What has been read so far."""
 
@@ -117,10 +90,10 @@ class _Gathered:
         self.span_ns = (0, 0)
         self.modes = 0
         self.left_out = 0
-        self.frames = _Columns(sequence="Q", publish_ns="q")
-        self.commands = _Columns(publish_ns="q")
-        self.timings = _Columns(sequence="Q", **dict.fromkeys(STAGES, "q"))
-        self.mirror = _Columns(sequence="Q", publish_ns="q", stroke_nm="f", limits="q")
+        self.frames = Columns(sequence="Q", publish_ns="q")
+        self.commands = Columns(publish_ns="q")
+        self.timings = TimingRows()
+        self.mirror = Columns(sequence="Q", publish_ns="q", stroke_nm="f", limits="q")
         self.highest_nm: Single | None = None
         self.lowest_nm: Single | None = None
         self._forget_steps()
@@ -150,40 +123,13 @@ class _Gathered:
         self.commands.add(publish_ns=message.publish_time_ns)
 
     def step(self, message: Logged) -> None:
-        step = wire.ControlStep.FromString(message.payload)
-        nothing, modes = self._nothing, self.modes
-        error_nm, pol_nm = step.error_nm or nothing, step.pol_nm or nothing
-        if not len(step.command_nm) == len(error_nm) == len(pol_nm) == modes:
-            self.left_out += 1
-            return
-        self.steps.add(
-            sequence=step.frame_sequence,
-            time_ns=from_timestamp(step.timestamp),
-            mode=step.mode,
-            reasons=_bits(step.reasons),
-            error_nm=error_nm,
-            pol_nm=pol_nm,
-            command_nm=step.command_nm,
-            flux_dn=step.flux_dn,
-            saturated_pixels=step.saturated_pixels,
-        )
+        self.left_out += not self.steps.add(wire.ControlStep.FromString(message.payload))
 
     def truth(self, message: Logged) -> None:
-        truth = wire.Truth.FromString(message.payload)
-        if len(truth.residual_nm) == len(truth.disturbance_nm) == self.modes:
-            self.truths.add(
-                sequence=truth.frame_sequence,
-                disturbance_nm=truth.disturbance_nm,
-                residual_nm=truth.residual_nm,
-                disturbance_rms_nm=truth.disturbance_rms_nm,
-                residual_rms_nm=truth.residual_rms_nm,
-            )
+        self.truths.add(wire.Truth.FromString(message.payload))
 
     def timing(self, message: Logged) -> None:
-        timing = wire.ControlTiming.FromString(message.payload)
-        stages = {one: getattr(timing, f"{one}_ns") for one in STAGES}
-        if all(len(stage) == len(timing.frame_sequence) for stage in stages.values()):
-            self.timings.add(sequence=timing.frame_sequence, **stages)
+        self.timings.add(wire.ControlTiming.FromString(message.payload))
 
     def mirror_state(self, message: Logged) -> None:
         state = wire.MirrorState.FromString(message.payload)
@@ -194,7 +140,7 @@ class _Gathered:
             sequence=state.frame_sequence,
             publish_ns=message.publish_time_ns,
             stroke_nm=float(np.abs(surface).max()),
-            limits=_bits(state.limits_hit),
+            limits=bits_of(state.limits_hit),
         )
         if self.highest_nm is None or self.lowest_nm is None or self.highest_nm.shape != surface.shape:
             self.highest_nm, self.lowest_nm = surface.copy(), surface.copy()
@@ -205,7 +151,7 @@ class _Gathered:
         self.calibration = wire.Calibration.FromString(message.payload)
         modes = len(self.calibration.noll)
         if modes != self.modes:
-            self.left_out += len(self.steps.taken("sequence"))
+            self.left_out += len(self.steps)
             self.modes = modes
             self._forget_steps()
 
@@ -226,8 +172,9 @@ class _Gathered:
 
     def history(self, log: LogReader) -> History:
         """Everything as arrays."""
-        modes, steps, truths, mirror = self.modes, self.steps, self.truths, self.mirror
+        mirror = self.mirror
         empty = np.zeros((0, 0), np.float32)
+        timed_sequence, stages_ns = self.timings.taken()
         try:
             calibration = decode_calibration(self.calibration) if self.calibration is not None else None
         except ValueError as error:
@@ -241,24 +188,8 @@ class _Gathered:
             frame_sequence=self.frames.taken("sequence"),
             frame_publish_ns=self.frames.taken("publish_ns"),
             command_publish_ns=self.commands.taken("publish_ns"),
-            steps=Steps(
-                sequence=steps.taken("sequence"),
-                time_ns=steps.taken("time_ns"),
-                mode=steps.taken("mode"),
-                reasons=steps.taken("reasons"),
-                error_nm=steps.taken("error_nm", modes),
-                pol_nm=steps.taken("pol_nm", modes),
-                command_nm=steps.taken("command_nm", modes),
-                flux_dn=steps.taken("flux_dn"),
-                saturated_pixels=steps.taken("saturated_pixels"),
-            ),
-            truths=Truths(
-                sequence=truths.taken("sequence"),
-                disturbance_nm=truths.taken("disturbance_nm", modes),
-                residual_nm=truths.taken("residual_nm", modes),
-                disturbance_rms_nm=truths.taken("disturbance_rms_nm"),
-                residual_rms_nm=truths.taken("residual_rms_nm"),
-            ),
+            steps=self.steps.taken(),
+            truths=self.truths.taken(),
             mirror=MirrorStates(
                 sequence=mirror.taken("sequence"),
                 publish_time_ns=mirror.taken("publish_ns"),
@@ -267,8 +198,8 @@ class _Gathered:
                 highest_nm=self.highest_nm if self.highest_nm is not None else empty,
                 lowest_nm=self.lowest_nm if self.lowest_nm is not None else empty,
             ),
-            timed_sequence=self.timings.taken("sequence"),
-            stages_ns={stage: self.timings.taken(stage) for stage in STAGES},
+            timed_sequence=timed_sequence,
+            stages_ns=stages_ns,
             left_out=self.left_out,
             requests=self.requests,
             events=self.events,
@@ -278,35 +209,8 @@ class _Gathered:
         )
 
     def _forget_steps(self) -> None:
-        self._nothing = [np.nan] * self.modes
-        self.steps = _Columns(
-            sequence="Q",
-            time_ns="q",
-            mode="B",
-            reasons="q",
-            error_nm="f",
-            pol_nm="f",
-            command_nm="f",
-            flux_dn="f",
-            saturated_pixels="q",
-        )
-        self.truths = _Columns(
-            sequence="Q", disturbance_nm="f", residual_nm="f", disturbance_rms_nm="f", residual_rms_nm="f"
-        )
-
-
-def _bits(reasons: Iterable[int]) -> int:
-    """Bit `1 << reason` for each.
-
-    Raises:
-        OverflowError: there is no such bit.
-    """
-    bits = 0
-    for reason in reasons:
-        if not 0 <= reason < _BITS:
-            raise OverflowError(f"a reason is a bit below {_BITS}; got {reason}")
-        bits |= 1 << reason
-    return bits
+        self.steps = StepRows(self.modes)
+        self.truths = TruthRows(self.modes)
 
 
 _TAKE: dict[str, Callable[[_Gathered, Logged], None]] = {
