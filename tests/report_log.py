@@ -30,6 +30,7 @@ from lowfc.contract.messages import (
     Message,
     Topic,
     image,
+    timestamp,
     wire,
 )
 from lowfc.contract.state_codec import controller_state
@@ -88,6 +89,7 @@ class Night:
             if self.truth:
                 rms = [float(np.linalg.norm(one)) for one in (wave_nm, residual_nm)]
                 truth = wire.Truth(
+                    timestamp=timestamp(self.now_ns),
                     frame_sequence=sequence,
                     disturbance_nm=wave_nm,
                     residual_nm=residual_nm,

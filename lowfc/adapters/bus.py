@@ -104,6 +104,11 @@ class Bus(Protocol):
         ...
 
 
+def last_of(bus: Bus, topic: Topic) -> list[Sample]:
+    """The last message of a queryable topic from everybody who publishes it, for who was not there to hear it."""
+    return bus.get(topic.at(ALL))
+
+
 class Faults:
     """Exceptions of handlers: the first of each place goes to standard error, all are counted."""
 

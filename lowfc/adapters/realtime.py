@@ -20,6 +20,7 @@ _SWITCH_INTERVAL_S = 5e-3
 _MCL_CURRENT, _MCL_FUTURE, _MCL_ONFAULT = 1, 2, 4
 _M_TRIM_THRESHOLD, _M_TOP_PAD, _M_MMAP_THRESHOLD = -1, -2, -3
 _CAP_IPC_LOCK = 1 << 14
+_LOOKING_ON = 5  # of nice's 19
 
 
 @dataclass(frozen=True, slots=True)
@@ -92,6 +93,13 @@ def step_back(priority: int | None) -> Granted:
     except OSError as fault:
         refused = (f"SCHED_FIFO ({fault.strerror})", "on a busy host the recorder loses messages")
         return Granted(tuple(granted), (refused,))
+
+
+def give_way() -> None:
+    """Let the loop and its recorder run first: for a process that only looks on. It may be late, and loses nothing."""
+    os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))  # not the class of a parent that is in the loop
+    os.nice(_LOOKING_ON)
+    threadpool_limits(limits=1)
 
 
 def _asked(

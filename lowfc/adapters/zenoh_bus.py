@@ -7,7 +7,7 @@ import contextlib
 import ctypes
 import json
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from typing import Any
 
 import zenoh
@@ -24,9 +24,16 @@ _HOST = "tcp/127.0.0.1"
 _PRIORITIES = ("real_time", "interactive_high", "interactive_low", "data_high", "data", "data_low", "background")
 
 
-def session_config(links: Links, role: str) -> dict[str, Any]:
-    """Return zenoh's configuration for a role of a run; a role without a port of its own only connects."""
+def session_config(links: Links, role: str, at_most_hz: Mapping[Topic, float] | None = None) -> dict[str, Any]:
+    """Return zenoh's configuration for a role of a run; a role without a port of its own only connects.
+
+    Args:
+        links: of the run.
+        role: whose.
+        at_most_hz: topics of which this role takes only so many a second; the others cost it next to nothing.
+    """
     own = links.ports.get(role)
+    thinned = [{"key_expr": topic.at(ALL), "freq": rate_hz} for topic, rate_hz in (at_most_hz or {}).items()]
     return {
         "mode": "peer",
         # Peers do not forward, so everybody connects to everybody; with a timeout of -1 any start order works.
@@ -59,6 +66,9 @@ def session_config(links: Links, role: str) -> dict[str, Any]:
             # Gains nothing at these sizes, and a receiver descheduled for 100 ms loses messages silently.
             "shared_memory": {"enabled": False},
         },
+        "downsampling": [{"id": "thinned", "flows": ["ingress"], "messages": ["put"], "rules": thinned}]
+        if thinned
+        else [],
     }
 
 
@@ -108,8 +118,14 @@ class ZenohPublisher:
 class ZenohBus:
     """One process's zenoh session; see `Bus`."""
 
-    def __init__(self, links: Links, role: str, clock: Clock) -> None:
+    def __init__(self, links: Links, role: str, clock: Clock, at_most_hz: Mapping[Topic, float] | None = None) -> None:
         """Join a run.
+
+        Args:
+            links: of the run.
+            role: this process's.
+            clock: the run's.
+            at_most_hz: topics of which this process takes only so many a second.
 
         Raises:
             BusError: the role's port is taken, or zenoh refuses the configuration.
@@ -118,7 +134,7 @@ class ZenohBus:
         self.clock = clock
         self.faults = Faults()
         self.start_s = links.claim_start(role, clock.start_s)
-        config = zenoh.Config.from_json5(json.dumps(session_config(links, role)))
+        config = zenoh.Config.from_json5(json.dumps(session_config(links, role, at_most_hz)))
         try:
             self._session = zenoh.open(config)
         except zenoh.ZError as fault:

@@ -68,6 +68,8 @@ EVENTS: dict[str, Event] = {
         Event("MESSAGES_LOST", Level.ERROR, "{count} messages lost on {topic}"),
         Event("RECORDING_FAILED", Level.ERROR, "recording stopped: {why}"),
         Event("DISK_SLOW", Level.WARNING, "the disk took {stall_s:.1f} s for one write; {waiting} messages waited"),
+        Event("VIEW_STUCK", Level.WARNING, "the viewer took nothing for {stuck_s:.0f} s; close its window if it hangs"),
+        Event("VIEW_RENEWED", Level.WARNING, "the view began anew: {why}"),
         Event("BAD_MESSAGE", Level.WARNING, "a message on {topic} could not be read: {why}"),
     )
 }

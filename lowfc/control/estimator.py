@@ -24,6 +24,24 @@ def saturated_pixels(calibration: Calibration, pixels: npt.NDArray[np.uint16]) -
     return int(np.count_nonzero((pixels >= calibration.saturation_dn) & (calibration.good > 0)))
 
 
+def difference(
+    calibration: Calibration, pixels: npt.NDArray[np.uint16], least_flux_dn: float, out: Single
+) -> float | None:
+    """Put (I - dark) / flux - I0 of a frame (pixels,) into `out` (pixels,), float32.
+
+    Returns:
+        The flux: the sum of the good pixels, dark subtracted, DN. None where it is at most `least_flux_dn`; `out` then
+        holds I - dark.
+    """
+    np.subtract(pixels, calibration.dark, out=out)
+    flux_dn = float(out @ calibration.good)
+    if not flux_dn > least_flux_dn:
+        return None
+    out *= np.float32(1 / flux_dn)
+    out -= calibration.reference
+    return flux_dn
+
+
 def estimate(
     calibration: Calibration, pixels: npt.NDArray[np.uint16], least_flux_dn: float, scratch: Single
 ) -> Estimate | None:
@@ -31,10 +49,5 @@ def estimate(
 
     `scratch` (pixels,) float32 is overwritten, so that nothing the size of a frame is allocated.
     """
-    np.subtract(pixels, calibration.dark, out=scratch)
-    flux_dn = float(scratch @ calibration.good)
-    if not flux_dn > least_flux_dn:
-        return None
-    scratch *= np.float32(1 / flux_dn)
-    scratch -= calibration.reference
-    return Estimate(calibration.reconstructor @ scratch, flux_dn)
+    flux_dn = difference(calibration, pixels, least_flux_dn, scratch)
+    return None if flux_dn is None else Estimate(calibration.reconstructor @ scratch, flux_dn)

@@ -13,6 +13,7 @@ import typer
 from lowfc import __version__
 from lowfc.adapters.terminal import DEFAULT_RUN, ConfigFile, RunId, configuration, new_app, run_app
 from lowfc.contract.configuration import Preset
+from lowfc.contract.errors import ConfigurationError
 from lowfc.programs.bench_record import bench_record
 from lowfc.programs.design_commands import design_app
 from lowfc.programs.export import export
@@ -21,6 +22,7 @@ from lowfc.programs.recover import recover
 from lowfc.programs.replay_commands import replay_log
 from lowfc.programs.report.command import report
 from lowfc.programs.validate.commands import validate
+from lowfc.programs.view.command import view
 
 if TYPE_CHECKING:
     from lowfc.contract.messages import wire
@@ -40,6 +42,7 @@ app.command()(recover)
 app.command()(report)
 app.command()(export)
 app.command()(validate)
+app.command()(view)
 
 AnyRun = Annotated[str | None, typer.Option("--run", help="Name of the run; default: the only one.")]
 Values = Annotated[list[float], typer.Argument(help="One value for all modes, or one for each.")]
@@ -75,6 +78,8 @@ def sim_loop(
     ] = False,
     no_record: Annotated[bool, typer.Option("--no-record", help="Write no log.")] = False,
     open_loop: Annotated[bool, typer.Option("--open", help="Start with the loop open.")] = False,
+    view_: Annotated[bool, typer.Option("--view", help="Look at it in a window.")] = False,
+    web: Annotated[bool, typer.Option("--web", help="Look at it in a browser.")] = False,
     as_json: Json = False,
 ) -> None:
     """Start the simulated loop: camera, mirror, controller and recorder; show its status, end with a summary.
@@ -82,6 +87,7 @@ def sim_loop(
     Example: lowfc sim-loop --rate 1000 --duration 20 --disturbance reaction-wheel --star-magnitude 2
     """
     from lowfc.adapters.realtime import spread
+    from lowfc.adapters.rerun_viewer import Show, has_screen
     from lowfc.contract.configuration import sensor_keys
     from lowfc.programs.sim_loop import sim_loop as run
     from lowfc.programs.status import summary_text
@@ -96,7 +102,12 @@ def sim_loop(
         "control.start_mode": "open" if open_loop else None,
     }
     settings = configuration(config, overrides, {"control.start_mode": "closed", **spread(os.sched_getaffinity(0))})
-    figures = run(settings, duration, record=not no_record)
+    if view_ and web:
+        raise ConfigurationError("a view is in one place: choose --view or --web")
+    if has_screen() and not (view_ or web):
+        _print("to look at it: lowfc view", error=True)
+    show = Show.NATIVE if view_ else Show.WEB if web else None
+    figures = run(settings, duration, not no_record, show)
     _print(json.dumps(figures) if as_json else summary_text(figures))
     if figures["recording_failure"]:
         raise typer.Exit(1)

@@ -1,4 +1,4 @@
-"""The launcher of the simulated loop: starts camera, mirror, controller and recorder, watches them, sums up."""
+"""The launcher of the simulated loop: starts camera, mirror, controller, recorder and view, watches them, sums up."""
 
 import contextlib
 import math
@@ -13,15 +13,17 @@ from rich.console import Console
 from rich.live import Live
 
 from lowfc.adapters import calibration_file
+from lowfc.adapters.child import Child
 from lowfc.adapters.clock import HostClock
-from lowfc.adapters.run import Run, mirror_role, new_run_id, open_run
+from lowfc.adapters.rerun_viewer import Show, require_screen, stream_url, web_address
+from lowfc.adapters.run import Run, free_ports, mirror_role, new_run_id, open_run
 from lowfc.adapters.terminal import INTERRUPTED
 from lowfc.adapters.zenoh_bus import ZenohBus
 from lowfc.contract.configuration import Configuration
 from lowfc.contract.errors import LowfcError
 from lowfc.contract.messages import EVENT, HEALTH, Role
 from lowfc.programs.analytic import analytic
-from lowfc.programs.processes import Child, start_all, stop_all
+from lowfc.programs.processes import program, start_all, stop_all
 from lowfc.programs.status import screen, status_line
 from lowfc.programs.watch import Watch, summary
 
@@ -30,6 +32,8 @@ SETTLE_S = 0.02
 """After the last frame, before the controller is stopped: the last command is on its way."""
 LINE_PERIOD_S = 5.0
 SHOW_S = 0.1
+_BEFORE_RECORDER = 3
+"""Place of the view among the processes: the recorder ends last, and waits for the last words of all others."""
 
 
 class ProcessDiedError(LowfcError):
@@ -38,17 +42,29 @@ class ProcessDiedError(LowfcError):
     exit_status = 1
 
 
-def sim_loop(config: Configuration, duration_s: float | None, record: bool) -> dict[str, Any]:
-    """Run the simulated loop for a time (None: until Ctrl-C); return the summary that `--json` prints.
+def sim_loop(
+    config: Configuration, duration_s: float | None, record: bool, show: Show | None = None
+) -> dict[str, Any]:
+    """Run the simulated loop for a time; return the summary that `--json` prints.
+
+    Args:
+        config: of the run.
+        duration_s: for so long; None until Ctrl-C.
+        record: write a log.
+        show: look at it, in a window or a browser; the loop goes on where the view ends.
 
     Raises:
+        ViewerError: there is no screen for the window.
         ProcessDiedError: a process ended by itself; the text names it and has its last words.
     """
     console = Console(stderr=True)
+    require_screen(show)
     run = open_run(new_run_id(), (config.mirror.name,))
     try:
         _prepare(config, run, console)
         children = _children(config, run, duration_s, record)
+        if show is not None:
+            children.insert(_BEFORE_RECORDER, _view(run, show, console))
         watch = Watch({}, [])
         start_all(children)
         bus = ZenohBus(run.links, Role.LAUNCHER, HostClock())
@@ -86,7 +102,16 @@ def _children(config: Configuration, run: Run, duration_s: float | None, record:
     }
     if record:
         commands[str(Role.RECORDER)] = ["-m", "lowfc", "record", *shared, *calibration]
-    return [Child(name, arguments, run.path / f"{name}.stderr") for name, arguments in commands.items()]
+    return [program(name, arguments, run.path / f"{name}.stderr") for name, arguments in commands.items()]
+
+
+def _view(run: Run, show: Show, console: Console) -> Child:
+    """The view's process; where it is to be seen is said now."""
+    port, web_port = free_ports(2)
+    if show is Show.WEB:
+        console.print(f"look at {web_address(stream_url(port), web_port)}", soft_wrap=True, highlight=False)
+    words = ["-m", "lowfc", "view", "--run", run.run_id, f"--{show}", "--port", str(port), "--web-port", str(web_port)]
+    return program(str(Role.VIEWER), words, run.path / f"{Role.VIEWER}.stderr")
 
 
 def _supervise(
@@ -98,11 +123,13 @@ def _supervise(
 ) -> None:
     """Until the camera has exposed its frames, Ctrl-C, or the death of a process."""
     camera = children[0]
+    viewless = False
     with _interrupted() as interrupted, _display(console) as show:
         begun_s = time.monotonic()
         shown_s = 0.0
         while camera.status is None and watch.of(Role.CAMERA).state != "stopped" and not interrupted():
             _check(children[1:])
+            viewless = viewless or _say_view_ended(children, console)
             elapsed_s = time.monotonic() - begun_s
             if elapsed_s > shown_s + SHOW_S:
                 shown_s = elapsed_s
@@ -116,6 +143,8 @@ def _supervise(
         stop_all([*children[1:], camera])
         time.sleep(SHOW_S)  # the last Health is on its way
     for child in children:
+        if child.name == Role.VIEWER:
+            continue
         if child.name == Role.RECORDER and watch.of(Role.RECORDER).recording.failure:
             continue  # the loop ran to its end without it; the summary says why
         if child.status not in (0, -signal.SIGTERM, INTERRUPTED):  # told to end before it was ready is no failure
@@ -123,10 +152,21 @@ def _supervise(
 
 
 def _check(children: list[Child]) -> None:
-    """Raise where a process ended by itself; the camera may end when it is done."""
+    """Raise where a process ended by itself; the camera may end when it is done, and the view whenever it likes."""
     for child in children:
-        if child.status is not None and not (child.name == Role.CAMERA and child.status == 0):
+        done = child.name == Role.VIEWER or (child.name == Role.CAMERA and child.status == 0)
+        if child.status is not None and not done:
             raise ProcessDiedError(f"{child.how_it_ended()}; its last words:\n{child.last_words()}")
+
+
+def _say_view_ended(children: list[Child], console: Console) -> bool:
+    """Whether the view has ended by itself; what it said last is shown, unless its window was just closed."""
+    for child in children:
+        if child.name == Role.VIEWER and child.status is not None:
+            if child.status != 0:
+                console.print(f"the loop goes on without its view: {child.last_words()}", markup=False)
+            return True
+    return False
 
 
 @contextlib.contextmanager

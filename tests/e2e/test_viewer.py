@@ -20,23 +20,18 @@ import numpy.typing as npt
 import pytest
 from loops import loop
 from mcap.reader import make_reader
+from viewers import needs_vulkan
 
+from lowfc.adapters.rerun_viewer import vulkan_drivers
 from lowfc.contract.messages import FLOAT32, MONO16, RawImage, wire
 
-DRIVERS = sorted(path for folder in ("/usr/share", "/etc") for path in Path(folder, "vulkan/icd.d").glob("*.json"))
 FRAME, SURFACE = "/lowfc/camera/frame", "/lowfc/mirror/dm/surface"
 SAME = 0.99  # of 1; a view without an image, or with another one, stays below OTHER
 OTHER = 0.8
 
 Picture = npt.NDArray[np.floating[Any]]
 
-pytestmark = [
-    pytest.mark.viewer,
-    pytest.mark.skipif(
-        not DRIVERS and "VK_ICD_FILENAMES" not in os.environ,
-        reason="no Vulkan driver is installed: apt install mesa-vulkan-drivers libvulkan1",
-    ),
-]
+pytestmark = [pytest.mark.viewer, needs_vulkan]
 
 
 @pytest.fixture(scope="module")
@@ -143,7 +138,7 @@ def _viewer(log: Path, home: Path) -> Iterator[Any]:
 
     binary = str(Path(rerun_cli.__file__).parent / "rerun")
     environment = os.environ | {"HOME": str(home), "XDG_CONFIG_HOME": str(home), "XDG_DATA_HOME": str(home)}
-    software = [str(path) for path in DRIVERS if path.name.startswith("lvp")]
+    software = [str(path) for path in vulkan_drivers() if path.name.startswith("lvp")]
     if software:  # the same everywhere, and there where no graphics card is
         environment.setdefault("VK_ICD_FILENAMES", software[0])
     subprocess.run([binary, "analytics", "disable"], env=environment, capture_output=True, timeout=20, check=True)

@@ -1,4 +1,4 @@
-"""What is new on the bus or in a log since the last look: messages become columns, pictures and the last of each state."""
+"""What is new on the bus or in a log since the last look: columns, pictures, and the last of each state."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -123,13 +123,21 @@ class Gatherer:
         except (DecodeError, OverflowError, ValueError):
             self.unreadable += 1
 
-    def moment(self, host_ns: int) -> Moment:
-        """What is new at this time of the host's clock; the next moment begins here."""
+    def moment(self, host_ns: int, *, rows: bool = True) -> Moment:
+        """What is new at this time of the host's clock; the next moment begins here.
+
+        Args:
+            host_ns: now.
+            rows: take the rows too; otherwise they wait for a later moment, in which more of them come at once.
+        """
         frame, frame_ns = self._frame()
         if frame is not None:
             self._date(frame_ns, self._heard_ns[FRAME.key])
-        steps, truths, timings = self._steps, self._truths, self._timings
-        self._steps, self._truths, self._timings = StepRows(steps.modes), TruthRows(truths.modes), TimingRows()
+        steps, truths, timings = StepRows(self._steps.modes), TruthRows(self._truths.modes), TimingRows()
+        if rows:
+            steps, self._steps = self._steps, steps
+            truths, self._truths = self._truths, truths
+            timings, self._timings = self._timings, timings
         events, self._events = self._events, []
         mirror, surface = self._mirror(), self._surface()
         self._newest.clear()

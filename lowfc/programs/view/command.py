@@ -1,0 +1,78 @@
+"""The command `lowfc view`."""
+
+import json
+import sys
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from lowfc.adapters.terminal import ConfigFile, configuration
+from lowfc.contract.errors import ConfigurationError
+from lowfc.programs.view.tabs import Tab
+
+
+def view(
+    logs: Annotated[
+        list[Path] | None,
+        typer.Argument(help="Logs (MCAP) that follow each other; none: the running loop.", metavar="[LOG...]"),
+    ] = None,
+    native: Annotated[bool, typer.Option("--native", help="In a window of its own.")] = False,
+    web: Annotated[bool, typer.Option("--web", help="In a browser, at an address of this host.")] = False,
+    save: Annotated[Path | None, typer.Option(help="Into a file (RRD) that rerun opens.")] = None,
+    headless_screenshot: Annotated[Path | None, typer.Option(help="As a picture (PNG), without a screen.")] = None,
+    foxglove: Annotated[bool, typer.Option("--foxglove", help="For Foxglove, by its WebSocket protocol.")] = False,
+    tab: Annotated[Tab, typer.Option(help="Tab that is opened.")] = Tab.OPERATOR,
+    seconds: Annotated[
+        float | None, typer.Option(min=0.1, help="Look at a running loop for so long; for a picture: 8 s.")
+    ] = None,
+    run: Annotated[str | None, typer.Option("--run", help="Name of the run; default: the only one.")] = None,
+    config: ConfigFile = None,
+    memory_mb: Annotated[float, typer.Option(min=16, help="What the viewer keeps of the past.")] = 512.0,
+    port: Annotated[
+        int | None, typer.Option(help="TCP port of the stream, or of Foxglove; default: a free one.")
+    ] = None,
+    web_port: Annotated[int | None, typer.Option(help="TCP port of the page; default: a free one.")] = None,
+    as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object at the end.")] = False,
+) -> None:
+    """Look at a running loop, or at logs: in a window, a browser, a picture or a file.
+
+    Without an option it is a window, or a page for the browser where there is no screen.
+
+    Example: lowfc view --web
+    """
+    if foxglove:
+        if logs or native or web or save or headless_screenshot:
+            raise ConfigurationError("--foxglove serves a running loop, and nothing else beside it")
+        _serve_foxglove(run, port)
+        return
+    from lowfc.programs.ctl import the_run
+    from lowfc.programs.view.look import look_at_logs, look_at_run
+    from lowfc.programs.view.place import place
+
+    where = place(
+        native=native,
+        web=web,
+        save=save,
+        picture=headless_screenshot,
+        tab=tab,
+        memory_mb=memory_mb,
+        port=port,
+        web_port=web_port,
+    )
+    settings = None if config is None else configuration(config)
+    figures = (
+        look_at_logs(logs, settings, where) if logs else look_at_run(run or the_run(None), settings, where, seconds)
+    )
+    if as_json:
+        sys.stdout.write(json.dumps(figures) + "\n")
+
+
+def _serve_foxglove(run: str | None, port: int | None) -> None:
+    from lowfc.adapters.clock import HostClock
+    from lowfc.adapters.run import open_run
+    from lowfc.programs.ctl import the_run
+    from lowfc.programs.view.foxglove_bridge import DEFAULT_PORT, serve_foxglove
+
+    summary = serve_foxglove(open_run(run or the_run(None), ()), HostClock(), port or DEFAULT_PORT)
+    sys.stderr.write(f"{summary}\n")

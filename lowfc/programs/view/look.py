@@ -1,0 +1,128 @@
+"""Looking at a run or at logs, in one place, from the beginning to the end."""
+
+import contextlib
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+from rich.console import Console
+
+from lowfc.adapters.join import clock_of
+from lowfc.adapters.progress import passing_bar
+from lowfc.adapters.realtime import give_way
+from lowfc.adapters.rerun_viewer import RerunViewer, Show
+from lowfc.adapters.run import open_run
+from lowfc.adapters.whole_file import being_written, require_folder
+from lowfc.adapters.zenoh_bus import ZenohBus
+from lowfc.contract.configuration import Configuration, load
+from lowfc.contract.messages import Role
+from lowfc.programs.view.bridge import AT_MOST_HZ, Bridge
+from lowfc.programs.view.layout import LIVE_WINDOW_S
+from lowfc.programs.view.painter import Painter
+from lowfc.programs.view.place import Place
+from lowfc.programs.view.recorded import draw_logs
+
+PICTURE_AFTER_S = 8.0
+"""Of a running loop: its plots have something to show by then."""
+_POLL_S = 0.1
+
+
+def look_at_run(run_id: str, config: Configuration | None, where: Place, seconds: float | None) -> dict[str, Any]:
+    """Show a running loop until told to stop, until the window is closed, or for some seconds.
+
+    Raises:
+        ViewerError, ViewError: there is no viewer, or it fails again and again.
+        DataFileError: a file cannot be written.
+    """
+    require_folder(where.save, where.picture)
+    give_way()
+    run = open_run(run_id, ())
+    own = run.path / "config.toml"
+    config = config or load(own if own.exists() else None)
+    clock = clock_of(config)
+    with contextlib.ExitStack() as stack:
+        part = stack.enter_context(being_written(where.save)) if where.save is not None else None
+        bus = ZenohBus(run.links, Role.VIEWER, clock, AT_MOST_HZ)
+        stack.callback(bus.close)
+        bridge = Bridge(
+            config,
+            run_id,
+            clock,
+            bus,
+            where.viewer if where.show is not None else None,
+            lambda viewer: where.stream(viewer, part, LIVE_WINDOW_S),
+            round(where.memory_mb * 1e6),
+        )
+        stack.callback(bridge.close)
+        bridge.service.catch_signals()
+        until_s = seconds if seconds is not None or where.picture is None else PICTURE_AFTER_S
+        summary = bridge.run(until_s, lambda: _say_where(where, bridge.viewer))
+        if where.picture is not None and bridge.viewer is not None:
+            bridge.viewer.screenshot(where.picture)
+    _say_written(where)
+    return {
+        "run": run_id,
+        "moments": summary.moments,
+        "renewals": summary.renewals,
+        "memory_mb": round(summary.most_bytes / 1e6, 1),
+        "file": str(where.save or where.picture or "") or None,
+    }
+
+
+def look_at_logs(logs: list[Path], config: Configuration | None, where: Place) -> dict[str, Any]:
+    """Show logs that follow each other; a window or page stays until it is closed or Ctrl-C.
+
+    Raises:
+        ViewerError: there is no viewer, or it ended while it was drawn on.
+        DataFileError: a file cannot be read or written.
+    """
+    require_folder(where.save, where.picture)
+    console = Console(stderr=True)
+    with contextlib.ExitStack() as stack:
+        part = stack.enter_context(being_written(where.save)) if where.save is not None else None
+        viewer = where.viewer() if where.show is not None else None
+        stream = where.stream(viewer, part, None)
+        stack.callback(stream.disconnect)
+        if viewer is not None:
+            stack.callback(viewer.stop)  # before the stream, which would wait for one that hangs
+        _say_where(where, viewer)
+        total = sum(log.stat().st_size for log in logs if log.exists())
+        with passing_bar(console) as bar:
+            task = bar.add_task("drawing", total=total)
+            drawn = draw_logs(
+                logs, config, lambda own: Painter(own, stream), lambda done: bar.update(task, completed=done)
+            )
+        stream.flush()
+        for remark in drawn.remarks:
+            sys.stderr.write(f"{remark}\n")
+        if viewer is not None and where.picture is not None:
+            viewer.screenshot(where.picture)
+        elif viewer is not None:
+            _stay(viewer)
+    _say_written(where)
+    return {
+        "logs": [str(log) for log in logs],
+        "moments": drawn.moments,
+        "log_s": round(drawn.log_s, 3),
+        "remarks": drawn.remarks,
+        "file": str(where.save or where.picture or "") or None,
+    }
+
+
+def _stay(viewer: RerunViewer) -> None:
+    """Until the window is closed, or Ctrl-C."""
+    with contextlib.suppress(KeyboardInterrupt):
+        while viewer.alive:
+            time.sleep(_POLL_S)
+
+
+def _say_where(where: Place, viewer: RerunViewer | None) -> None:
+    if viewer is not None and where.show is Show.WEB:
+        sys.stderr.write(f"look at {viewer.web_address}\nCtrl-C ends the view; the loop goes on\n")
+
+
+def _say_written(where: Place) -> None:
+    for file in (where.save, where.picture):
+        if file is not None:
+            sys.stderr.write(f"{file} written\n")

@@ -1,0 +1,60 @@
+"""Marks on a rerun stream, all on one timeline: curves in columns, pictures, captions."""
+
+from collections.abc import Sequence
+
+import numpy as np
+import numpy.typing as npt
+import rerun as rr
+from rerun.components import AggregationPolicy
+
+from lowfc.programs.view.colours import WHITE, Colour, Rgb
+
+TIMELINE = "time"
+
+
+def at(stream: rr.RecordingStream, time_ns: int) -> None:
+    """What is logged next belongs to this time."""
+    stream.set_time(TIMELINE, timestamp=np.datetime64(time_ns, "ns"))
+
+
+def name_curves(
+    stream: rr.RecordingStream, path: str, names: Sequence[str], colours: Sequence[Colour], width: float = 1.2
+) -> None:
+    """Names and colours of the curves at `path`, for all times."""
+    style = rr.SeriesLines(
+        names=list(names),
+        colors=list(colours),
+        widths=[width] * len(names),
+        aggregation_policy=AggregationPolicy.MinMax,  # where a pixel holds many rows: peaks stay
+    )
+    stream.log(path, style, static=True)
+
+
+def curves(
+    stream: rr.RecordingStream, path: str, times_ns: npt.NDArray[np.int64], values: npt.NDArray[np.floating]
+) -> None:
+    """Add (rows,) or (rows, curves) values in one message; rows that are not finite are left out."""
+    if not len(times_ns):
+        return
+    columns = values.reshape(len(times_ns), -1)
+    whole = np.isfinite(columns).all(axis=1)
+    if not whole.any():
+        return
+    times, columns = times_ns[whole], columns[whole]
+    scalars = rr.Scalars.columns(scalars=columns.astype(np.float64).ravel())
+    stream.send_columns(
+        path,
+        indexes=[rr.TimeColumn(TIMELINE, timestamp=times.view("datetime64[ns]"))],
+        columns=scalars.partition([columns.shape[1]] * len(times)),
+    )
+
+
+def picture(stream: rr.RecordingStream, path: str, time_ns: int, colours: Rgb) -> None:
+    """Show colours (rows, columns, 3)."""
+    at(stream, time_ns)
+    stream.log(path, rr.Image(colours))
+
+
+def caption(stream: rr.RecordingStream, path: str, text: str, place: tuple[float, float]) -> None:
+    """Write a line into a picture, centred on a place in its pixels (x, y)."""
+    stream.log(path, rr.Points2D([place], radii=[0.0], colors=[WHITE], labels=[text], show_labels=True))

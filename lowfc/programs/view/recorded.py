@@ -1,0 +1,95 @@
+"""A log drawn as the live view would have drawn it."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from lowfc.adapters.history_reader import attached_configuration
+from lowfc.adapters.log_reader import Logged, LogReader
+from lowfc.contract.configuration import Configuration
+from lowfc.contract.errors import ConfigurationError, DataFileError
+from lowfc.contract.messages import topic_of
+from lowfc.programs.view.brush import PICTURES_HZ, PICTURES_PER_ROWS
+from lowfc.programs.view.moment import SHOWN, Gatherer
+from lowfc.programs.view.painter import Painter
+
+_PERIOD_NS = round(1e9 / PICTURES_HZ)
+_STRIDE = 500  # messages between two words about the progress
+
+
+@dataclass(slots=True)
+class Drawn:
+    """What was drawn of some logs.
+
+    Attributes:
+        moments: drawn.
+        log_s: from the first message to the last.
+        remarks: what a person should know: what is damaged, truncated, unreadable.
+    """
+
+    moments: int = 0
+    log_s: float = 0.0
+    remarks: list[str] = field(default_factory=list)
+
+
+def draw_logs(
+    logs: Sequence[Path],
+    config: Configuration | None,
+    make_painter: Callable[[Configuration], Painter],
+    progress: Callable[[int], None] = lambda done: None,
+) -> Drawn:
+    """Draw logs that follow each other.
+
+    Args:
+        logs: finished or not, damaged or whole.
+        config: of the run; None takes the first log's own.
+        make_painter: makes the painter, once the configuration is known.
+        progress: is told how many bytes are done.
+
+    Raises:
+        DataFileError: one is no log, or there is nothing to see in any of them.
+    """
+    drawn, gatherer = Drawn(), Gatherer()
+    painter: Painter | None = None
+    due_ns = first_ns = last_ns = behind = 0
+    for log in logs:
+        reader = LogReader(log, topics=SHOWN, skip_damaged=True)
+        for number, message in enumerate(reader):
+            if painter is None:
+                painter = make_painter(config or _own(reader, drawn))
+                first_ns = message.log_time_ns
+            last_ns = message.log_time_ns
+            _take(gatherer, message)
+            if last_ns >= due_ns:
+                painter.draw(gatherer.moment(last_ns, rows=drawn.moments % PICTURES_PER_ROWS == 0))
+                drawn.moments += 1
+                due_ns = last_ns + _PERIOD_NS
+            if number % _STRIDE == 0:
+                progress(behind + reader.position)
+        behind += reader.size
+        drawn.remarks += [f"{log.name}: {damage}" for damage in reader.damage]
+        if not reader.complete and not reader.damage:
+            drawn.remarks.append(f"{log.name} has no end: its recorder was killed, or is still writing")
+    if painter is None:
+        raise DataFileError(f"there is nothing to see in {', '.join(map(str, logs))}: no message that a view shows")
+    painter.draw(gatherer.moment(last_ns))
+    if gatherer.unreadable:
+        drawn.remarks.append(f"{gatherer.unreadable} messages could not be read")
+    drawn.log_s = (last_ns - first_ns) * 1e-9
+    return drawn
+
+
+def _take(gatherer: Gatherer, message: Logged) -> None:
+    gatherer.take(topic_of(message.key), message.key, message.payload, message.publish_time_ns)
+
+
+def _own(reader: LogReader, drawn: Drawn) -> Configuration:
+    """The log's own configuration; the default one, with a remark, where it has none that can be read."""
+    try:
+        found = attached_configuration(reader)
+    except ConfigurationError as error:
+        drawn.remarks.append(f"the log's configuration cannot be read ({error}); the default one is taken")
+        return Configuration()
+    if found is None:
+        drawn.remarks.append("the log has no configuration; the default one is taken for pupil and telescope")
+    return found or Configuration()

@@ -1,0 +1,103 @@
+"""The sensor's pictures: the frame, what it differs by from the reference, and the reference itself."""
+
+import numpy as np
+import numpy.typing as npt
+import rerun as rr
+import rerun.blueprint as rrb
+
+from lowfc.control.calibration import Calibration
+from lowfc.control.estimator import difference
+from lowfc.programs.view.colours import Rgb, diverging, sequential
+from lowfc.programs.view.marks import caption, picture
+from lowfc.programs.view.moment import Moment
+from lowfc.programs.view.panel import Panel
+from lowfc.programs.view.scale import Scale
+
+FRAME, DIFFERENCE, REFERENCE, RAW = "sensor/frame", "sensor/difference", "sensor/reference", "sensor/raw"
+_CAPTION = "caption"
+_RAW_PERIOD_NS = 500_000_000
+_LEAST_DN = 10.0
+
+Single = npt.NDArray[np.float32]
+
+
+class Sensor(Panel):
+    """Frame and difference as they come; the reference when there is another."""
+
+    def __init__(self) -> None:
+        self._calibration: Calibration | None = None
+        self._difference = np.zeros(0, np.float32)
+        self._brightest = Scale(_LEAST_DN)
+        self._largest = Scale(_LEAST_DN / 10)
+        self._raw_due_ns = 0
+
+    def draw(self, stream: rr.RecordingStream, moment: Moment) -> None:
+        """Show the newest frame."""
+        if moment.calibration is not None and moment.calibration is not self._calibration:
+            self._calibrate(stream, moment.calibration, moment.time_ns)
+        if moment.frame is None:
+            return
+        calibration = self._calibration
+        dark = 0.0
+        if calibration is not None and calibration.dark.size == moment.frame.size:
+            dark = float(np.median(calibration.dark))
+            self._show_difference(stream, calibration, moment.frame, moment.frame_ns)
+        light = moment.frame - np.float32(dark)
+        changed = self._brightest.fit(light, moment.frame_ns)
+        picture(stream, FRAME, moment.frame_ns, _log_stretched(light, self._brightest.limit))
+        if changed:
+            _caption_below(stream, FRAME, moment.frame.shape, f"0 to {self._brightest.limit:g} DN, logarithmic")
+        if moment.frame_ns >= self._raw_due_ns:
+            self._raw_due_ns = moment.frame_ns + _RAW_PERIOD_NS
+            stream.log(RAW, rr.Image(moment.frame, color_model="L"))
+
+    def _calibrate(self, stream: rr.RecordingStream, calibration: Calibration, time_ns: int) -> None:
+        self._calibration = calibration
+        self._difference = np.empty(calibration.dark.size, np.float32)
+        reference_dn = (calibration.reference * calibration.flux_dn).reshape(calibration.shape)
+        limit_dn = float(reference_dn.max())
+        picture(stream, REFERENCE, time_ns, _log_stretched(reference_dn, limit_dn))
+        _caption_below(stream, REFERENCE, calibration.shape, f"0 to {limit_dn:.0f} DN expected, logarithmic")
+
+    def _show_difference(
+        self, stream: rr.RecordingStream, calibration: Calibration, frame: npt.NDArray[np.uint16], time_ns: int
+    ) -> None:
+        flux_dn = difference(calibration, frame.ravel(), 0.0, self._difference)
+        if flux_dn is None:
+            return
+        change_dn = (self._difference * flux_dn * calibration.good).reshape(frame.shape)
+        changed = self._largest.fit(change_dn, time_ns)
+        picture(stream, DIFFERENCE, time_ns, diverging(change_dn / self._largest.limit))
+        if changed:
+            text = f"blue -{self._largest.limit:g}, orange +{self._largest.limit:g} DN"
+            _caption_below(stream, DIFFERENCE, frame.shape, text)
+
+
+def frame_view() -> rrb.View:
+    """The frame."""
+    return rrb.Spatial2DView(origin=FRAME, name="Sensor frame, DN")
+
+
+def difference_view() -> rrb.View:
+    """What differs from the reference."""
+    return rrb.Spatial2DView(origin=DIFFERENCE, name="I - I0, DN")
+
+
+def reference_view() -> rrb.View:
+    """The reference."""
+    return rrb.Spatial2DView(origin=REFERENCE, name="Reference I0, DN")
+
+
+def raw_view() -> rrb.View:
+    """The frame's own values, to be read with the pointer."""
+    return rrb.Spatial2DView(origin=RAW, name="Frame as it came, DN")
+
+
+def _log_stretched(light_dn: Single, limit_dn: float) -> Rgb:
+    """Two decades below the limit, in colours; less light is nearly black."""
+    knee_dn = np.float32(limit_dn * 1e-2)
+    return sequential(np.log1p(np.maximum(light_dn, 0) / knee_dn) / np.log1p(limit_dn / knee_dn))
+
+
+def _caption_below(stream: rr.RecordingStream, path: str, shape: tuple[int, ...], text: str) -> None:
+    caption(stream, f"{path}/{_CAPTION}", text, (shape[1] / 2, shape[0] * 0.93))

@@ -1,0 +1,226 @@
+"""The viewer as a child process: what is drawn is on the screen, nobody else can reach it, and none is left behind."""
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from viewers import CHROMIUM, browser_screenshot, needs_chromium, needs_vulkan, pixels, share_of
+
+from lowfc.adapters.rerun_viewer import RerunViewer, Show, ViewerError
+
+ORANGE, BLUE = (214, 110, 20), (20, 90, 214)
+SHARE = 0.05  # of the viewer's pixels that an image of two colours gives each of them, at least
+
+
+@pytest.fixture(scope="module")
+def headless() -> Iterator[RerunViewer]:
+    with RerunViewer(Show.HEADLESS, size_px=(640, 400)) as viewer:
+        yield viewer
+
+
+@pytest.fixture
+def web() -> Iterator[RerunViewer]:
+    with RerunViewer(Show.WEB) as viewer:
+        yield viewer
+
+
+@pytest.mark.viewer
+@needs_vulkan
+def test_an_image_that_was_logged_is_on_the_screen(headless: RerunViewer, tmp_path: Path) -> None:
+    stream = _two_colours(headless)
+    path = tmp_path / "screen.png"
+    picture = headless.screenshot(path)
+    assert path.read_bytes() == picture
+    shown = pixels(picture)
+    assert shown.shape == (400, 640, 3)
+    assert _both(shown)
+    assert _mean_row(shown, ORANGE) < _mean_row(shown, BLUE), "it is upside down"
+    assert [view.origin for view in headless.state().views] == ["/image"]
+    assert headless.complaints() == []
+    _end(stream)
+
+
+@pytest.mark.viewer
+@needs_vulkan
+def test_a_view_that_cannot_draw_is_complained_of() -> None:
+    import rerun as rr
+
+    with RerunViewer(Show.HEADLESS, size_px=(640, 400)) as viewer:
+        stream = _two_colours(viewer)
+        stream.log("image", rr.Image(bytes=b"too short", width=80, height=80, color_model="RGB", datatype="U8"))
+        stream.flush(timeout_sec=10)
+        viewer.screenshot()
+        assert [line for line in viewer.complaints() if "image" in line]
+        _end(stream)
+
+
+@pytest.mark.viewer
+@needs_vulkan
+def test_a_headless_viewer_is_reached_from_this_host_only(headless: RerunViewer) -> None:
+    assert _listening(headless.pid) == {("127.0.0.1", headless.port)}
+
+
+def test_a_page_is_reached_from_this_host_only(web: RerunViewer) -> None:
+    theirs = _listening(web.pid)
+    assert {host for host, _ in theirs} == {"127.0.0.1"}
+    assert web.port in {port for _, port in theirs}
+    assert ("127.0.0.1", web.web_port) in _listening(os.getpid())
+
+
+def test_a_viewer_that_hangs_or_dies_is_noticed(web: RerunViewer) -> None:
+    assert web.alive
+    assert web.answers()
+    assert web.resident_bytes() > 1 << 20
+    os.kill(web.pid, signal.SIGSTOP)
+    _until_stopped(web.pid)
+    assert web.alive
+    assert not web.answers(0.3)
+    os.kill(web.pid, signal.SIGCONT)
+    assert web.answers(5.0)
+    os.kill(web.pid, signal.SIGKILL)
+    os.waitid(os.P_PID, web.pid, os.WEXITED | os.WNOWAIT)
+    assert not web.alive
+    assert not web.answers()
+    assert web.resident_bytes() == 0
+    assert f"the viewer on port {web.port} was killed by SIGKILL" in web.how_it_ended()
+
+
+def test_a_new_viewer_on_the_same_port_takes_a_new_stream(web: RerunViewer) -> None:
+    before = _two_colours(web)
+    os.kill(web.pid, signal.SIGKILL)
+    os.waitid(os.P_PID, web.pid, os.WEXITED | os.WNOWAIT)
+    web.stop()
+    with RerunViewer(Show.WEB, port=web.port, web_port=web.web_port) as again:
+        assert (again.url, again.web_address) == (web.url, web.web_address)
+        _end(_two_colours(again))
+    _end(before)
+
+
+def test_none_is_left_when_it_is_stopped_hanging() -> None:
+    viewer = RerunViewer(Show.WEB)
+    os.kill(viewer.pid, signal.SIGSTOP)
+    viewer.stop()
+    viewer.stop()
+    assert not viewer.alive
+    assert not Path(f"/proc/{viewer.pid}").exists()
+
+
+@pytest.mark.parametrize("hangs", [False, True])
+def test_it_dies_with_its_parent(hangs: bool) -> None:
+    program = (
+        "import os, signal\nfrom lowfc.adapters.rerun_viewer import RerunViewer, Show\n"
+        "viewer = RerunViewer(Show.WEB)\nprint(viewer.pid, flush=True)\n"
+        f"if {hangs}:\n    os.kill(viewer.pid, signal.SIGSTOP)\nos.kill(os.getpid(), signal.SIGKILL)"
+    )
+    parent = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=60, check=False)
+    assert parent.returncode == -signal.SIGKILL, parent.stderr
+    _until(lambda: not _runs(int(parent.stdout)), "the viewer outlives its parent")
+
+
+def test_without_a_screen_one_line_says_what_to_do(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delenv("DISPLAY", raising=False)
+    monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
+    with pytest.raises(ViewerError, match=r"no screen.*use --web") as caught:
+        RerunViewer(Show.NATIVE)
+    assert "\n" not in str(caught.value)
+
+
+def test_a_screen_that_is_not_there_is_one_line(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
+    monkeypatch.setenv("DISPLAY", ":9999")
+    with pytest.raises(ViewerError, match=r"exit status 1 .*X server.*use --web") as caught:
+        RerunViewer(Show.NATIVE)
+    assert "\n" not in str(caught.value)
+
+
+def test_without_a_driver_one_line_names_the_packages(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("VK_ICD_FILENAMES", "/nowhere.json")
+    with pytest.raises(ViewerError, match=r"mesa-vulkan-drivers") as caught:
+        RerunViewer(Show.HEADLESS)
+    assert "\n" not in str(caught.value)
+
+
+def test_a_port_that_is_taken_is_one_line(web: RerunViewer) -> None:
+    with pytest.raises(ViewerError) as caught:
+        RerunViewer(Show.WEB, port=web.port)
+    assert str(web.port) in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.browser
+@needs_chromium
+def test_an_image_that_was_logged_is_on_the_page(web: RerunViewer, tmp_path: Path) -> None:
+    assert CHROMIUM is not None
+    assert web.web_address is not None
+    stream = _two_colours(web)
+    path = tmp_path / "page.png"
+    page = browser_screenshot(web.web_address, path, 90.0, _both, size_px=(800, 500))
+    assert _both(pixels(path.read_bytes())), page.complaints
+    assert any("ReadMessages" in address and str(web.port) in address for address in page.fetched.values())
+    refused = [line for line in page.complaints if "Content Security Policy" in line]
+    assert any("tel.rerun.io" in line for line in refused), "it no longer wants to call home; the page could go"
+    for address in page.fetched.values():
+        assert address.startswith(("http://127.0.0.1:", "data:", "blob:")), address
+    _end(stream)
+
+
+def _two_colours(viewer: RerunViewer) -> Any:
+    """A stream that has sent an image, orange above blue."""
+    import rerun as rr
+
+    stream = rr.RecordingStream("lowfc-test", recording_id="test")
+    stream.connect_grpc(viewer.url)
+    image = np.empty((80, 80, 3), np.uint8)
+    image[:40], image[40:] = ORANGE, BLUE
+    stream.set_time("time", timestamp=1.0)
+    stream.log("image", rr.Image(image))
+    stream.flush(timeout_sec=10)
+    return stream
+
+
+def _end(stream: Any) -> None:
+    """Let the stream go while its viewer is there, or it says so on our standard error."""
+    stream.disconnect()
+
+
+def _both(shown: Any) -> bool:
+    return share_of(shown, ORANGE) > SHARE and share_of(shown, BLUE) > SHARE
+
+
+def _mean_row(shown: Any, colour: tuple[int, int, int]) -> float:
+    return float(np.nonzero(np.all(np.abs(shown.astype(int) - colour) <= 12, axis=2))[0].mean())
+
+
+def _listening(pid: int) -> set[tuple[str, int]]:
+    """Address and port of every socket on which a process listens, of IPv4 and IPv6."""
+    import psutil
+
+    return {
+        (one.laddr.ip, one.laddr.port) for one in psutil.Process(pid).net_connections("inet") if one.status == "LISTEN"
+    }
+
+
+def _state(pid: int) -> str:
+    return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0]
+
+
+def _runs(pid: int) -> bool:
+    return Path(f"/proc/{pid}").exists() and _state(pid) != "Z"
+
+
+def _until_stopped(pid: int) -> None:
+    _until(lambda: _state(pid) == "T", "it does not stop")
+
+
+def _until(true: Any, what: str) -> None:
+    deadline_s = time.monotonic() + 10
+    while not true():
+        assert time.monotonic() < deadline_s, what
+        time.sleep(0.02)
