@@ -69,7 +69,8 @@ class Brush(threading.Thread):
             for _ in range(len(self._backlog)):
                 topic, sample = self._backlog.take()
                 gatherer.take(topic, sample.key, sample.payload, sample.publish_time_ns)
-            painter.draw(gatherer.moment(self._clock.host_ns(), rows=self.moments % PICTURES_PER_ROWS == 0))
+            rows, behind_s = self.moments % PICTURES_PER_ROWS == 0, time.monotonic() - due_s
+            painter.draw(gatherer.moment(self._clock.host_ns(), rows=rows, behind_s=behind_s))
             self.moments += 1
             self.painted_s = time.monotonic()
             due_s = max(due_s + 1 / PICTURES_HZ, self.painted_s)

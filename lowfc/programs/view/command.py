@@ -74,5 +74,5 @@ def _serve_foxglove(run: str | None, port: int | None) -> None:
     from lowfc.programs.ctl import the_run
     from lowfc.programs.view.foxglove_bridge import DEFAULT_PORT, serve_foxglove
 
-    summary = serve_foxglove(open_run(run or the_run(None), ()), HostClock(), port or DEFAULT_PORT)
+    summary = serve_foxglove(open_run(run or the_run(None), ()), HostClock(), DEFAULT_PORT if port is None else port)
     sys.stderr.write(f"{summary}\n")

@@ -2,7 +2,7 @@
 
 import rerun.blueprint as rrb
 
-from lowfc.programs.view import loop, mirror, pointing, sensor, wavefront
+from lowfc.programs.view import loop, mirror, pointing, sensor, tiles, wavefront
 from lowfc.programs.view.marks import TIMELINE
 from lowfc.programs.view.tabs import Tab
 
@@ -16,9 +16,7 @@ def layout(active: Tab = Tab.OPERATOR, window_s: float | None = LIVE_WINDOW_S) -
     tabs = {Tab.OPERATOR: _operator(window_s), Tab.OPTICS: _optics(), Tab.ENGINEERING: _engineering(window_s)}
     return rrb.Blueprint(
         rrb.Tabs(*tabs.values(), active_tab=list(tabs).index(active)),
-        rrb.TimePanel(
-            state="collapsed", timeline=TIMELINE, play_state="following" if window_s is not None else "paused"
-        ),
+        rrb.TimePanel(state="collapsed", timeline=TIMELINE, play_state="following"),  # of a log, its end
         rrb.TopPanel(state="collapsed"),
         rrb.BlueprintPanel(state="hidden"),
         rrb.SelectionPanel(state="hidden"),
@@ -33,7 +31,7 @@ def _operator(window_s: float | None) -> rrb.Container:
     )
     courses = rrb.Horizontal(wavefront.rms_view(), wavefront.tilt_view())
     below = rrb.Horizontal(loop.mode_view(), loop.log_view())
-    rows = rrb.Vertical(pictures, courses, below, row_shares=[3, 3, 2], name="operator")
+    rows = rrb.Vertical(tiles.tiles_view(), pictures, courses, below, row_shares=[5, 7, 6, 4], name="operator")
     return _timed(rows, window_s)
 
 

@@ -51,7 +51,7 @@ def look_at_run(run_id: str, config: Configuration | None, where: Place, seconds
             clock,
             bus,
             where.viewer if where.show is not None else None,
-            lambda viewer: where.stream(viewer, part, LIVE_WINDOW_S),
+            lambda viewer: where.stream(viewer, part, run_id, LIVE_WINDOW_S),
             round(where.memory_mb * 1e6),
         )
         stack.callback(bridge.close)
@@ -82,7 +82,7 @@ def look_at_logs(logs: list[Path], config: Configuration | None, where: Place) -
     with contextlib.ExitStack() as stack:
         part = stack.enter_context(being_written(where.save)) if where.save is not None else None
         viewer = where.viewer() if where.show is not None else None
-        stream = where.stream(viewer, part, None)
+        stream = where.stream(viewer, part, logs[0].stem, None)
         stack.callback(stream.disconnect)
         if viewer is not None:
             stack.callback(viewer.stop)  # before the stream, which would wait for one that hangs

@@ -75,6 +75,7 @@ class Moment:
         calibration, camera, controller: the last of each; None before the first.
         health: of every process heard so far, by name.
         heard_ns: when the last message of each topic was sent, by the topic's key in the table.
+        behind_s: how late this moment is.
     """
 
     time_ns: int
@@ -92,6 +93,7 @@ class Moment:
     controller: wire.ControllerState | None
     health: Mapping[str, Heard]
     heard_ns: Mapping[str, int]
+    behind_s: float = 0.0
 
 
 class Gatherer:
@@ -123,12 +125,13 @@ class Gatherer:
         except (DecodeError, OverflowError, ValueError):
             self.unreadable += 1
 
-    def moment(self, host_ns: int, *, rows: bool = True) -> Moment:
+    def moment(self, host_ns: int, *, rows: bool = True, behind_s: float = 0.0) -> Moment:
         """What is new at this time of the host's clock; the next moment begins here.
 
         Args:
             host_ns: now.
             rows: take the rows too; otherwise they wait for a later moment, in which more of them come at once.
+            behind_s: how late it is.
         """
         frame, frame_ns = self._frame()
         if frame is not None:
@@ -157,6 +160,7 @@ class Gatherer:
             controller=self._controller,
             health=self._health,
             heard_ns=self._heard_ns,
+            behind_s=behind_s,
         )
 
     def _read(self, topic: Topic, key: str, payload: bytes, publish_time_ns: int) -> None:

@@ -3,6 +3,7 @@
 import rerun as rr
 
 from lowfc.contract.configuration import Configuration
+from lowfc.optics.photometry import tilt_nm_per_mas
 from lowfc.programs.view.loop import LOG, Loop
 from lowfc.programs.view.marks import at
 from lowfc.programs.view.mirror import Mirror
@@ -10,6 +11,7 @@ from lowfc.programs.view.moment import Moment
 from lowfc.programs.view.panel import Panel
 from lowfc.programs.view.pointing import Pointing
 from lowfc.programs.view.sensor import Sensor
+from lowfc.programs.view.tiles import Tiles
 from lowfc.programs.view.wavefront import Wavefront
 
 
@@ -23,6 +25,7 @@ class Painter:
     def __init__(self, config: Configuration, stream: rr.RecordingStream) -> None:
         self._stream = stream
         self.panels: list[Panel] = [
+            Tiles(tilt_nm_per_mas(config.star.diameter_m)),
             Sensor(),
             Mirror(),
             Wavefront(config.star.diameter_m),

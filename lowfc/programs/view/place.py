@@ -43,13 +43,15 @@ class Place:
         memory = f"{self.memory_mb:.0f}MB"
         return RerunViewer(self.show, memory_limit=memory, port=self.port, web_port=self.web_port)
 
-    def stream(self, viewer: RerunViewer | None, part: Path | None, window_s: float | None) -> rr.RecordingStream:
+    def stream(
+        self, viewer: RerunViewer | None, part: Path | None, recording: str, window_s: float | None
+    ) -> rr.RecordingStream:
         """Stream to the viewer, or into a file; plots show the last `window_s` seconds, or everything."""
         blueprint = layout(self.tab, window_s)
         if viewer is not None:
-            return to_viewer(viewer.url, blueprint)
+            return to_viewer(viewer.url, recording, blueprint)
         assert part is not None  # noqa: S101  # there is a viewer or a file
-        return to_file(part, blueprint)
+        return to_file(part, recording, blueprint)
 
 
 def place(

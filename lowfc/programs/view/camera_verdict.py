@@ -1,0 +1,118 @@
+"""Judgement on what comes from the camera: do frames arrive, are they used, is there light on them."""
+
+from lowfc.contract.messages import FRAME
+from lowfc.control.safety import Reason
+from lowfc.programs.view.tile import Level, Tile, ago
+from lowfc.programs.view.watcher import GRACE_S, RECENT_S, SILENT_S, Life, Watcher
+
+SLOW = 0.9
+"""Frames at less than this share of the camera's own rate are a camera or host that does not keep up."""
+MANY_LOST = 0.1
+"""Where a tenth of the frames is lost, the loop is no longer the one that was tuned."""
+DARK, DIM, BRIGHT = 0.2, 0.5, 2.0
+"""A fifth of the light is what a controller refuses as dark unless told otherwise; half the light is 1.4 times the
+noise; twice the light is not the star that was calibrated."""
+
+_REFUSED: dict[Reason, tuple[str, str]] = {
+    Reason.DARK: ("too dark", "the star is gone; look at pointing, shutter and clouds"),
+    Reason.SATURATED: ("detector saturated", "there is too much light; shorten the exposure or dim the star"),
+    Reason.WRONG_SIZE: ("wrong size", "they are not what was calibrated; set the camera back or calibrate again"),
+    Reason.LATE: ("too late", "host or link is too slow; look at the latency, lower the rate"),
+    Reason.NO_CALIBRATION: ("no calibration", "load a calibration"),
+    Reason.REPEATED: ("repeated", "the camera sends a frame twice; restart it"),
+    Reason.OUT_OF_ORDER: ("out of order", "there may be a second camera on the bus; stop one"),
+}
+
+
+def frames(watcher: Watcher) -> Tile:
+    """Whether frames come, at their rate, and are used."""
+    title, camera, silent_s = "FRAMES", watcher.camera(), watcher.silent_s(FRAME)
+    if camera.life is Life.NEVER:
+        if watcher.running_s > GRACE_S:
+            return Tile(title, "NO CAMERA", "not heard of", Level.WARNING, "There is no camera. Start it for this run.")
+        return Tile(title, "WAITING", "for the camera", Level.NEUTRAL)
+    if camera.life in (Life.STOPPED, Life.STARTING):
+        return Tile(title, camera.life.name, "the camera, as told", Level.NEUTRAL)
+    if silent_s is not None:
+        alive = camera.life is not Life.SILENT and silent_s > 2 * SILENT_S
+        who = "the camera lives, but sends none" if alive else "camera silent"
+        advice = f"No frame for {ago(silent_s)}, {who}: the loop holds. See the camera's last words, restart it."
+        return Tile(title, "NO FRAMES", f"for {ago(silent_s)}: {who}", Level.BAD, advice)
+    return max((_rate(watcher), _lost(watcher), _refused(watcher)), key=lambda tile: tile.level)
+
+
+def _refused(watcher: Watcher) -> Tile:
+    title, every = "FRAMES", all_refused(watcher)
+    counts = {reason: watcher.now(reason) if every else watcher.recent(reason) for reason in _REFUSED}
+    word, what = _REFUSED[max(counts, key=lambda one: counts[one])]
+    if every:
+        advice = f"Every frame is refused, {word}: {what}. The mirror holds."
+        return Tile(title, "REFUSED", f"all: {word}", Level.BAD, advice)
+    count = sum(counts.values())
+    advice = f"{count} frames refused in the last {RECENT_S:g} s, {word}: {what}."
+    return Tile(
+        title,
+        f"{count} REFUSED",
+        f"{word}, in the last {RECENT_S:g} s",
+        Level.WARNING if count else Level.NEUTRAL,
+        advice,
+    )
+
+
+def _lost(watcher: Watcher) -> Tile:
+    skipped, missing = watcher.recent("skipped"), watcher.recent("missing")
+    lost = skipped + missing
+    due = RECENT_S * 1e9 / watcher.period_ns if watcher.period_ns else 0.0
+    share = lost / max(watcher.recent("steps") + lost, due, 1)
+    said = [f"{skipped} skipped (controller busy)"] * bool(skipped) + [f"{missing} never arrived"] * bool(missing)
+    advice = (
+        f"{lost} frames lost in the last {RECENT_S:g} s, {100 * share:.2g} %: {', '.join(said)}. "
+        "Free the host's processors or lower the rate."
+    )
+    level = Level.NEUTRAL if not lost else Level.BAD if share > MANY_LOST else Level.WARNING
+    return Tile("FRAMES", f"{lost} LOST", f"{', '.join(said)}, in the last {RECENT_S:g} s", level, advice)
+
+
+def _rate(watcher: Watcher) -> Tile:
+    title, rate_hz = "FRAMES", watcher.rate_hz()
+    if rate_hz is None:
+        return Tile(title, "UNUSED", "frames come, nobody takes them", Level.NEUTRAL)
+    clock = ", simulated time" if watcher.simulated else ""
+    value = f"{rate_hz:.0f} Hz" if rate_hz >= 10 else f"{rate_hz:.2g} Hz"
+    nominal_hz = 1e9 / watcher.period_ns if watcher.period_ns else 0.0
+    if rate_hz < SLOW * nominal_hz:
+        advice = f"The camera makes {rate_hz:.0f} frames a second, not {nominal_hz:.0f}: the host does not keep up."
+        return Tile(title, value, f"slow: {nominal_hz:.0f} Hz wanted", Level.WARNING, advice)
+    return Tile(title, value, f"none lost, none refused{clock}", Level.GOOD)
+
+
+def star(watcher: Watcher) -> Tile:
+    """How much light there is, of what the calibration expects."""
+    title, flux = "STAR", watcher.flux
+    if flux is None or watcher.silent_s(FRAME) is not None:
+        return Tile(title, "?", "light not known now", Level.NEUTRAL)
+    percent = 100 * flux
+    value = f"{percent:.0f} %" if percent >= 1 else "< 1 %"
+    detail = "of the expected light"
+    full = f"{watcher.saturated} pixels at full well"
+    steps = watcher.now("steps")
+    if watcher.now(Reason.SATURATED) > steps / 2 and watcher.saturated:
+        advice = f"The detector is saturated, {full}: shorten the exposure or dim the star."
+        return Tile(title, "SATURATED", f"{full}; {value} {detail}", Level.BAD, advice)
+    if (watcher.now(Reason.DARK) > steps / 2 and flux < DIM) or (not steps and flux < DARK):
+        advice = f"The star is gone, {value} of its light: look at pointing, shutter and clouds. The mirror holds."
+        return Tile(title, "GONE", f"{value} {detail}", Level.BAD, advice)
+    if watcher.saturated:
+        advice = f"Near saturation, {full}: shorten the exposure."
+        return Tile(title, value, f"{full}; {detail}", Level.WARNING, advice)
+    if not DIM <= flux <= BRIGHT:
+        word, what = ("dim", "look for clouds") if flux < DIM else ("bright", "is it the one that was calibrated?")
+        advice = f"The star is {word}, {value} of the expected light: {what}."
+        return Tile(title, value, f"{word}: {detail}", Level.WARNING, advice)
+    return Tile(title, value, f"{detail}, no pixel saturated", Level.GOOD)
+
+
+def all_refused(watcher: Watcher) -> bool:
+    """Whether no frame of the last second was used."""
+    steps = watcher.now("steps")
+    return steps > 0 and sum(watcher.now(reason) for reason in _REFUSED) >= steps

@@ -1,0 +1,200 @@
+"""The bus as a Foxglove WebSocket server, for those who look with Foxglove or Lichtblick.
+
+Payloads go out as they came: the schemas are those of the log. A channel hands its message to the server's own threads
+and returns at once, and a client that does not read loses its oldest messages (1024 wait for it at most), so that the
+bus's threads log directly.
+"""
+
+import logging
+import sys
+import threading
+import time
+from dataclasses import dataclass
+from functools import partial
+from typing import TYPE_CHECKING, Any
+
+from lowfc.adapters.bus import ALL, Bus, Sample
+from lowfc.adapters.clock import Clock
+from lowfc.adapters.log_writer import declaration
+from lowfc.adapters.run import Run
+from lowfc.adapters.service import Service
+from lowfc.adapters.zenoh_bus import ZenohBus
+from lowfc.contract.errors import BusError, ConfigurationError
+from lowfc.contract.messages import HEALTH, TOPICS, RawImage, Role, Topic
+
+if TYPE_CHECKING:
+    from foxglove import Channel
+    from foxglove.websocket import ChannelView, Client
+
+HOST = "127.0.0.1"
+DEFAULT_PORT = 8765
+"""Where Foxglove and Lichtblick look first."""
+SHOWN = tuple(topic for topic in TOPICS if Role.VIEWER in topic.subscribers)
+"""What a viewer subscribes to."""
+IMAGES_HZ = 30.0
+"""How many images a second of each topic are served at most."""
+
+_TURN_S = 0.05
+_PATIENCE_S = 0.2
+
+
+@dataclass(frozen=True, slots=True)
+class Summary:
+    """What a bridge did.
+
+    Attributes:
+        clients: those that looked at something.
+        messages: logged, whether anybody looked or not.
+    """
+
+    clients: int
+    messages: int
+
+    def __str__(self) -> str:
+        """The line for a person."""
+        return f"clients: {self.clients}, messages: {self.messages}"
+
+
+class FoxgloveBridge:
+    """Passes on what is on a bus to whoever connects.
+
+    Attributes:
+        service: this process as the others of the run see it.
+        port: where apps connect, on loopback.
+        looking: client and topic of every subscription that there is now.
+        kept: the states in force, by key.
+    """
+
+    def __init__(self, bus: Bus, clock: Clock, run_id: str, port: int = DEFAULT_PORT) -> None:
+        """Serve at `port`, or at a free one where it is 0, and subscribe.
+
+        Raises:
+            BusError: the port is taken.
+            ConfigurationError: foxglove-sdk is not installed.
+        """
+        self._foxglove = _foxglove()
+        self._context = self._foxglove.Context()
+        self._bus = bus
+        self._channels: dict[str, Channel] = {}
+        self._channels_lock = threading.Lock()
+        self._seen: set[int] = set()
+        self.kept: dict[str, Sample] = {}
+        self.looking: set[tuple[int, str]] = set()
+        self._messages = 0
+        for topic in SHOWN:
+            if topic.key == topic.at(ALL):  # the names in the others' keys are yet to be heard
+                self._channel(topic, topic.key)
+        try:
+            self._server = self._foxglove.start_server(
+                name=f"lowfc {run_id}", host=HOST, port=port, server_listener=self, context=self._context
+            )
+        except RuntimeError as fault:
+            raise BusError(
+                f"cannot listen on {HOST}:{port} ({fault}); stop what is there, or choose another with --port"
+            ) from None
+        self.port: int = self._server.port
+        # Before the service, which subscribes to Health: who has heard of that has heard of all others.
+        for topic in SHOWN:
+            bus.subscribe(topic, partial(self._take, topic))
+        self.service = Service(Role.VIEWER, run_id, clock, bus)
+
+    def run(self) -> Summary:
+        """Serve until told to stop."""
+        self.service.state = "running"
+        heard = 0
+        while self.service.running:
+            if len(self.service.heard) > heard:
+                heard = len(self.service.heard)
+                self._ask()
+            self.service.work = self._messages
+            self.service.beat()
+            time.sleep(_TURN_S)
+        self.service.finish()
+        self._server.stop()
+        return Summary(len(self._seen), self._messages)
+
+    def on_subscribe(self, client: "Client", channel: "ChannelView") -> None:
+        """Give a client the state that is in force; called by the server."""
+        self._seen.add(client.id)
+        self.looking.add((client.id, channel.topic))
+        kept = self.kept.get(channel.topic.removeprefix("/"))
+        if kept is not None:
+            self._channels[kept.key].log(kept.payload, log_time=kept.publish_time_ns)
+
+    def on_unsubscribe(self, client: "Client", channel: "ChannelView") -> None:
+        """A client has seen enough of a topic; called by the server."""
+        self.looking.discard((client.id, channel.topic))
+
+    def _ask(self) -> None:
+        """Get the states that a process published before it was linked to this one."""
+        for topic in SHOWN:
+            if topic.queryable and topic is not HEALTH:
+                for sample in self._bus.get(topic.at(ALL), timeout_s=_PATIENCE_S):
+                    kept = self.kept.get(sample.key)
+                    if kept is None or kept.sequence < sample.sequence:
+                        self._take(topic, sample)
+
+    def _take(self, topic: Topic, sample: Sample) -> None:
+        """Pass a message on; on the bus's threads."""
+        if topic.queryable:
+            self.kept[sample.key] = sample
+        self._messages += 1
+        self._channel(topic, sample.key).log(sample.payload, log_time=sample.publish_time_ns)
+
+    def _channel(self, topic: Topic, key: str) -> "Channel":
+        channel = self._channels.get(key)
+        if channel is None:
+            with self._channels_lock:  # two processes may be the first with an event
+                channel = self._channels.get(key) or self._new_channel(topic, key)
+                self._channels[key] = channel
+        return channel
+
+    def _new_channel(self, topic: Topic, key: str) -> "Channel":
+        schema = self._foxglove.Schema(
+            name=topic.message.DESCRIPTOR.full_name,
+            encoding="protobuf",
+            data=declaration(topic.message).SerializeToString(),
+        )
+        channel: Channel = self._foxglove.Channel(
+            "/" + key,
+            schema=schema,
+            message_encoding="protobuf",
+            context=self._context,
+            metadata={"description": topic.sentence},
+        )
+        return channel
+
+
+def serve_foxglove(run: Run, clock: Clock, port: int = DEFAULT_PORT) -> Summary:
+    """Serve a run to Foxglove and Lichtblick until SIGTERM or SIGINT; the process of `lowfc view --foxglove`.
+
+    Args:
+        run: the run to join.
+        clock: the run's.
+        port: on loopback, for the apps; 0 for a free one.
+
+    Raises:
+        BusError: another viewer has this run, or the port is taken.
+        ConfigurationError: foxglove-sdk is not installed.
+    """
+    images = {topic: IMAGES_HZ for topic in SHOWN if topic.message is RawImage}
+    bus = ZenohBus(run.links, Role.VIEWER, clock, images)
+    try:
+        bridge = FoxgloveBridge(bus, clock, run.run_id, port)
+        bridge.service.catch_signals()
+        sys.stderr.write(f"serving run {run.run_id!r} at ws://{HOST}:{bridge.port}; Ctrl-C ends it\n")
+        return bridge.run()
+    finally:
+        bus.close()
+
+
+def _foxglove() -> Any:
+    try:
+        import foxglove
+    except ImportError as error:
+        raise ConfigurationError(
+            f"--foxglove needs foxglove-sdk, which is not there ({error}); install it with: "
+            "pip install 'lowfc[foxglove]'"
+        ) from None
+    logging.getLogger("foxglove").setLevel(logging.CRITICAL)  # an app that is closed while it is sent to is no error
+    return foxglove

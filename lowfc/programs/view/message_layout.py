@@ -1,0 +1,102 @@
+"""A layout for a log as rerun opens it by itself: the project's own messages plotted, with nothing converted.
+
+Rerun decodes every message into one struct; a mapping takes a field out of it. A viewer applies a layout to whatever
+has its application id, and that of a log is the name of its file, so that a layout is for one log.
+"""
+
+from collections.abc import Mapping, Sequence
+
+import rerun as rr
+import rerun.blueprint as rrb
+from rerun.blueprint.components import VisualizerComponentMapping
+from rerun.blueprint.encodings import ComponentSourceKind
+
+from lowfc.contract.messages import EVENT, FRAME, STEP, SURFACE, TIMING, TRUTH, Topic, wire
+from lowfc.optics.zernike import NOLLS_14, mode_name
+from lowfc.programs.view.colours import BLUE, GREEN, GREY, RED, distinct
+
+TIMELINE = "message_publish_time"
+"""Of the timelines that rerun gives to a log, the one by which messages were sent."""
+
+_MIRROR = "dm"
+_MODE_NAMES = tuple(map(mode_name, NOLLS_14))
+_MODE_COLOURS = {
+    wire.LOOP_MODE_IDLE: GREY,
+    wire.LOOP_MODE_OPEN: BLUE,
+    wire.LOOP_MODE_CLOSED: GREEN,
+    wire.LOOP_MODE_SAFED: RED,
+}
+_STATES = rr.StateConfiguration(
+    values=list(map(wire.LoopMode.Name, _MODE_COLOURS)),
+    labels=[wire.LoopMode.Name(mode).removeprefix("LOOP_MODE_").lower() for mode in _MODE_COLOURS],
+    colors=[(*colour, 255) for colour in _MODE_COLOURS.values()],
+)
+_STAGES = ("transport", "wakeup", "compute", "publish", "frame_to_command")
+
+
+def message_layout() -> rrb.Blueprint:
+    """Views of a log's images, events and messages, with the names of the default's modes and mirror."""
+    frame = rrb.Spatial2DView(origin=f"/{FRAME.key}", name="frame, DN")
+    surface = rrb.Spatial2DView(origin=f"/{SURFACE.at(_MIRROR)}", name="mirror surface, nm")
+    events = rrb.TextLogView(
+        origin=f"/{EVENT.key}",
+        name="events",
+        columns=rrb.TextLogColumns(timeline_columns=[TIMELINE], text_log_columns=["loglevel", "body"]),
+    )
+    loop_mode = rrb.StateTimelineView(
+        origin=f"/{STEP.key}",
+        name="loop mode",
+        overrides={f"/{STEP.key}": _STATES.visualizer(mappings=[_field(STEP, "StateChange:state", "mode.name")])},
+    )
+    rms = _plot(
+        TRUTH, "true wavefront rms, nm", {"disturbance_rms_nm": ["disturbance"], "residual_rms_nm": ["residual"]}
+    )
+    flux = _plot(STEP, "flux, DN", {"flux_dn": ["flux"]})
+    stages = {f"{stage}_ns[0]": [stage.replace("_", " ")] for stage in _STAGES}
+    timing = _plot(TIMING, "stages of one frame in each batch, ns", stages)
+    modes = [
+        _plot(topic, f"{name}, nm", {f"{field}[]": _MODE_NAMES}, legend=field == "error_nm")
+        for topic, field, name in (
+            (STEP, "error_nm", "measured error"),
+            (STEP, "command_nm", "command"),
+            (STEP, "pol_nm", "pseudo-open-loop"),
+            (TRUTH, "residual_nm", "true residual"),
+        )
+    ]
+    return rrb.Blueprint(
+        rrb.Horizontal(
+            rrb.Vertical(frame, surface, events),
+            rrb.Vertical(loop_mode, rms, flux, timing, row_shares=[1, 2, 2, 2]),
+            rrb.Vertical(*modes, row_shares=[3, 2, 2, 2]),
+            column_shares=[2, 3, 3],
+        ),
+        rrb.TimePanel(timeline=TIMELINE, state="collapsed"),
+        collapse_panels=True,
+    )
+
+
+def _plot(topic: Topic, name: str, series: Mapping[str, Sequence[str]], *, legend: bool = True) -> rrb.TimeSeriesView:
+    """Plot of fields of a topic's messages, each with the names of its lines."""
+    colours = iter(distinct(sum(map(len, series.values()))))
+    lines = [
+        rr.SeriesLines(names=list(names), colors=[next(colours) for _ in names]).visualizer(
+            mappings=[_field(topic, "Scalars:scalars", selector)]
+        )
+        for selector, names in series.items()
+    ]
+    return rrb.TimeSeriesView(
+        origin=f"/{topic.key}",
+        name=name,
+        overrides={f"/{topic.key}": lines},
+        plot_legend=rrb.PlotLegend(corner=rrb.Corner2D.RightTop, visible=legend),
+    )
+
+
+def _field(topic: Topic, target: str, selector: str) -> VisualizerComponentMapping:
+    """What a view takes from a message."""
+    return VisualizerComponentMapping(
+        target,
+        ComponentSourceKind.SourceComponent,
+        source_component=f"{topic.message.DESCRIPTOR.full_name}:message",
+        selector=f".{selector}",
+    )

@@ -1,0 +1,44 @@
+"""A tile of the annunciator, before it is drawn, and how figures are told on it."""
+
+from dataclasses import dataclass
+from enum import IntEnum
+
+
+class Level(IntEnum):
+    """How a tile is; from `WARNING` on somebody should look."""
+
+    NEUTRAL = 0
+    GOOD = 1
+    WARNING = 2
+    BAD = 3
+
+
+@dataclass(frozen=True, slots=True)
+class Tile:
+    """One tile of the annunciator.
+
+    Attributes:
+        title: what it is about.
+        value: the one word or figure.
+        detail: what it means.
+        level: of the tile.
+        advice: for the headline: what is the matter, and what to do.
+    """
+
+    title: str
+    value: str
+    detail: str
+    level: Level
+    advice: str = ""
+
+
+def figure(value: float) -> str:
+    """In two or three digits: nobody reads more at a glance."""
+    if value >= 100:
+        return f"{value:.0f}"
+    return f"{value:.1f}" if value >= 1 else f"{value:.2f}"
+
+
+def ago(seconds: float) -> str:
+    """A span of time in words."""
+    return f"{seconds:.0f} s" if seconds < 120 else f"{seconds / 60:.0f} min"

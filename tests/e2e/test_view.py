@@ -1,0 +1,173 @@
+"""The live view of a real loop: real processes, the real viewer and a real browser, judged by their pixels."""
+
+import json
+import os
+import re
+import signal
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+import rerun.blueprint as rrb
+from loops import LOWFC, children, interrupt, loop, run, start, until
+from viewers import browser_screenshot, needs_chromium, needs_vulkan, pixels, share_of
+
+from lowfc.adapters.join import clock_of
+from lowfc.adapters.rerun_viewer import RerunViewer, Show
+from lowfc.adapters.run import open_run
+from lowfc.adapters.zenoh_bus import ZenohBus
+from lowfc.contract.configuration import load
+from lowfc.contract.messages import Role
+from lowfc.programs.ctl import running
+from lowfc.programs.view.bridge import AT_MOST_HZ, Bridge
+from lowfc.programs.view.layout import layout
+from lowfc.programs.view.stream import to_viewer
+from lowfc.programs.view.tabs import Tab
+from lowfc.programs.view.tile import Level
+from lowfc.programs.view.tiles import FILL
+
+LEAST_SHADES = 8  # of a panel with something in it; an empty one has its ground and the letters of its title
+TITLE_ROWS = 30
+
+
+@pytest.fixture(scope="module")
+def live(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
+    """Name of a run whose loop is closed."""
+    process = start(tmp_path_factory.mktemp("loop"), "sim-loop", "--rate", "250", "--no-record")
+    try:
+        until(lambda: running() or process.poll() is not None)
+        yield running()[0]
+    finally:
+        interrupt(process)
+    assert process.returncode == 130 or process.returncode == 0
+
+
+@pytest.mark.viewer
+@needs_vulkan
+def test_every_panel_of_every_tab_shows_the_live_loop(live: str, artefacts: Path) -> None:
+    joined = open_run(live)
+    config = load(joined.path / "config.toml")
+    clock = clock_of(config)
+    bus = ZenohBus(joined.links, Role.VIEWER, clock, AT_MOST_HZ)
+    bridge = Bridge(
+        config,
+        live,
+        clock,
+        bus,
+        lambda: RerunViewer(Show.HEADLESS, size_px=(1600, 1000)),
+        lambda viewer: to_viewer(viewer.url, live, layout()) if viewer is not None else None,  # type: ignore[arg-type,return-value]
+        10**9,
+    )
+    try:
+        summary = bridge.run(5.0)
+        viewer = bridge.viewer
+        assert viewer is not None
+        assert summary.renewals == 0
+        for number, tab in enumerate(Tab):
+            blueprint = layout(tab)
+            stream = to_viewer(viewer.url, live, blueprint)
+            stream.disconnect()
+            picture = viewer.screenshot(artefacts / f"live-{tab}.png", patience_s=6)
+            assert pixels(picture).shape == (1000, 1600, 3)
+            shown = {view.name: _shades(viewer, view.id) for view in _views(blueprint.root_container.contents[number])}
+            assert len(shown) > 4
+            assert {name: shades for name, shades in shown.items() if shades < LEAST_SHADES} == {}, tab
+        assert viewer.complaints() == []
+    finally:
+        bridge.close()
+        bus.close()
+
+
+@pytest.mark.browser
+@needs_chromium
+def test_the_page_shows_the_live_loop_and_nobody_else_can_see_it(live: str, artefacts: Path) -> None:
+    view = subprocess.Popen([*LOWFC, "view", "--web", "--run", live], stderr=subprocess.PIPE, text=True)
+    try:
+        assert view.stderr is not None
+        address = re.search(r"http://127\.0\.0\.1:\S+", view.stderr.readline())
+        assert address is not None
+        picture = artefacts / "live-browser.png"
+        good = FILL[Level.GOOD]
+        page = browser_screenshot(address.group(), picture, 60, lambda shown: share_of(shown, good) > 0.01, (1000, 625))
+        assert share_of(pixels(picture.read_bytes()), good) > 0.01, "no tile says that something is well"
+        assert all(url.startswith(("http://127.0.0.1", "data:", "blob:")) for url in page.fetched.values())
+    finally:
+        view.send_signal(signal.SIGINT)
+        _, rest = view.communicate(timeout=20)
+        assert view.returncode == 0, rest
+
+
+def test_the_loop_goes_on_whatever_happens_to_its_view(tmp_path: Path) -> None:
+    process = start(tmp_path, "sim-loop", "--web", "--rate", "200", "--duration", "6", "--json")
+    until(lambda: "view" in children(process.pid))
+    view = children(process.pid)["view"]
+    until(lambda: _grandchildren(view))
+    os.kill(view, signal.SIGKILL)
+    out, err = process.communicate(timeout=60)
+    assert process.returncode == 0, err
+    assert "the loop goes on without its view" in err
+    figures = json.loads(out)
+    assert figures["frames_processed"] >= 0.98 * figures["frames_published"] > 1000
+    assert figures["messages_lost"] == 0
+
+
+@pytest.mark.viewer
+@needs_vulkan
+def test_a_log_without_an_end_is_a_picture_and_a_file(tmp_path: Path) -> None:
+    log: Path = loop(tmp_path, "--rate", "100", "--duration", "2")["log"]
+    cut = tmp_path / "cut.mcap"
+    cut.write_bytes(log.read_bytes()[: int(log.stat().st_size * 0.7)])
+    done = run(tmp_path, "view", "cut.mcap", "--headless-screenshot", "cut.png", "--tab", "optics", "--json")
+    assert done.returncode == 0, done.stderr
+    assert "no end" in done.stderr
+    assert json.loads(done.stdout)["moments"] > 20
+    assert len(np.unique(pixels((tmp_path / "cut.png").read_bytes()).reshape(-1, 3), axis=0)) > 1000
+    done = run(tmp_path, "view", "cut.mcap", "--save", "cut.rrd")
+    assert done.returncode == 0, done.stderr
+    checked = subprocess.run(
+        [str(Path(sys.executable).parent / "rerun"), "rrd", "verify", "cut.rrd"],
+        cwd=tmp_path,
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert checked.returncode == 0, checked.stderr
+
+
+@pytest.mark.parametrize(
+    ("words", "complaint"),
+    [
+        (["--web", "--native"], "choose one"),
+        (["--foxglove", "--web"], "--foxglove"),
+        (["--run", "NO SUCH"], "a run's name"),
+        (["nothing.mcap", "--save", "x.rrd"], "nothing.mcap"),
+        (["--save", "nowhere/x.rrd", "nothing.mcap"], "nowhere"),
+    ],
+)
+def test_mistakes_are_one_line(tmp_path: Path, words: list[str], complaint: str) -> None:
+    done = run(tmp_path, "view", *words)
+    assert done.returncode == 2
+    (line,) = done.stderr.strip().splitlines()
+    assert complaint in line
+    assert not list(tmp_path.iterdir())
+
+
+def _shades(viewer: RerunViewer, view_id: object) -> int:
+    """Different colours in a panel, below its title."""
+    from rerun.experimental import ViewerClient
+
+    shown = pixels(ViewerClient.connect(viewer.url).take_screenshot(view_id))[TITLE_ROWS:]  # type: ignore[arg-type]
+    return len(np.unique(shown.reshape(-1, 3), axis=0))
+
+
+def _views(part: rrb.Container | rrb.View) -> list[rrb.View]:
+    if isinstance(part, rrb.View):
+        return [part]
+    return [view for one in part.contents for view in _views(one)]
+
+
+def _grandchildren(pid: int) -> list[str]:
+    return Path(f"/proc/{pid}/task/{pid}/children").read_text().split()
