@@ -74,6 +74,14 @@ class Publisher(Protocol):
         ...
 
 
+class Ring(Protocol):
+    """Messages of one topic that wait to be looked at."""
+
+    def drain(self) -> list[Sample]:
+        """Those that arrived since the last call, in their order; `receive_time_ns` is that of this call."""
+        ...
+
+
 class Bus(Protocol):
     """A connection of one process to all others of its run."""
 
@@ -85,6 +93,10 @@ class Bus(Protocol):
 
     def subscribe(self, topic: Topic, handler: Callable[[Sample], None], name: str = ALL) -> Callable[[], None]:
         """Call `handler` with every message of a topic, of one mirror or process or of all; return what ends it."""
+        ...
+
+    def ring(self, topic: Topic, capacity: int) -> "Ring":
+        """Keep the newest `capacity` messages of a topic for who looks now and then, at no cost in between."""
         ...
 
     def queryable(self, key_expression: str, handler: Callable[[Query], None]) -> None:

@@ -20,6 +20,7 @@ from lowfc.optics.relay import ApertureMask, Defocus, PupilImage, Relay, fresnel
 from lowfc.optics.sensor import Sensor
 
 _DATA = resources.files("lowfc") / "data"
+_WITH_LYOT_STOP = ("circle", "prolate")
 _log = logging.getLogger(__name__)
 
 
@@ -93,6 +94,16 @@ def sensor_from(
 def sensor_named(name: str) -> Sensor:
     """One of `SENSORS`, or the sparse aperture mask with that layout."""
     return sensor_from(SensorSection.model_validate(sensor_keys(name)))
+
+
+def science_pupil(section: SensorSection) -> NDArray[np.float64] | None:
+    """The shaped pupil (samples, samples) in front of the science camera; None where a Lyot stop makes its image.
+
+    Raises:
+        ConfigurationError: There is no such pupil.
+        DataFileError: Its file is missing or damaged.
+    """
+    return None if section.pupil in _WITH_LYOT_STOP else _pupil(section)
 
 
 def _layout(name: str) -> sams.Layout:

@@ -2,6 +2,7 @@
 
 import contextlib
 import threading
+from collections import deque
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 
@@ -51,6 +52,17 @@ class MemoryPublisher:
         return envelope
 
 
+class MemoryRing:
+    """See `Ring`."""
+
+    def __init__(self, capacity: int) -> None:
+        self.waiting: deque[Sample] = deque(maxlen=capacity)
+
+    def drain(self) -> list[Sample]:
+        """See `Ring.drain`."""
+        return [self.waiting.popleft() for _ in range(len(self.waiting))]
+
+
 class MemoryBus:
     """One process's connection to a `MemoryHub`."""
 
@@ -78,6 +90,12 @@ class MemoryBus:
         subscription = (topic, topic.at(name), handler)
         self._subscriptions.append(subscription)
         return lambda: self._subscriptions.remove(subscription)
+
+    def ring(self, topic: Topic, capacity: int) -> "MemoryRing":
+        """See `Bus.ring`."""
+        ring = MemoryRing(capacity)
+        self.subscribe(topic, ring.waiting.append)
+        return ring
 
     def queryable(self, key_expression: str, handler: Callable[[Query], None]) -> None:
         """See `Bus.queryable`."""

@@ -17,7 +17,8 @@ class Columns:
     """Columns that grow by rows: whole numbers, and vectors of one length."""
 
     def __init__(self, **kinds: str) -> None:
-        self._columns = {name: array(kind) for name, kind in kinds.items()}
+        self._columns: dict[str, array[Any]] = {name: array(kind) for name, kind in kinds.items()}
+        self._ends = [0] * len(kinds)
 
     def __len__(self) -> int:
         return len(next(iter(self._columns.values())))
@@ -28,12 +29,18 @@ class Columns:
         Raises:
             OverflowError: a value is beyond what its column can hold.
         """
-        added: dict[str, array[Any]] = {
-            name: array(self._columns[name].typecode, (value,) if isinstance(value, int | float) else value)
-            for name, value in values.items()
-        }
-        for name, more in added.items():
-            self._columns[name].extend(more)
+        columns = self._columns
+        try:
+            for name, value in values.items():
+                if type(value) is int or type(value) is float:
+                    columns[name].append(value)
+                else:
+                    columns[name].extend(value)  # type: ignore[arg-type]  # the numbers are above
+        except OverflowError:
+            for column, end in zip(columns.values(), self._ends, strict=True):
+                del column[end:]
+            raise
+        self._ends = list(map(len, columns.values()))
 
     def taken(self, name: str, width: int | None = None) -> npt.NDArray[Any]:
         """One column, (rows,) or (rows, width)."""

@@ -11,7 +11,7 @@ from collections.abc import Callable, Iterator, Mapping
 from typing import Any
 
 import zenoh
-from zenoh.handlers import Callback
+from zenoh.handlers import Callback, Handler, RingChannel
 
 from lowfc.adapters.bus import ALL, Faults, Query, Sample
 from lowfc.adapters.clock import Clock
@@ -115,6 +115,25 @@ class ZenohPublisher:
                 query.reply(self.key, payload, attachment=envelope.encode())
 
 
+class ZenohRing:
+    """See `Ring`."""
+
+    def __init__(self, bus: "ZenohBus", subscriber: "zenoh.Subscriber[Handler[zenoh.Sample]]") -> None:
+        self._bus = bus
+        self._subscriber = subscriber
+
+    def drain(self) -> list[Sample]:
+        """See `Ring.drain`."""
+        found: list[Sample] = []
+        now_ns = self._bus.clock.host_ns()
+        while (sample := self._subscriber.try_recv()) is not None:
+            try:
+                found.append(_sample(sample, now_ns))
+            except Exception as fault:
+                self._bus.faults.add(f"{self._bus.role}: ring of {sample.key_expr}", fault)
+        return found
+
+
 class ZenohBus:
     """One process's zenoh session; see `Bus`."""
 
@@ -164,6 +183,13 @@ class ZenohBus:
 
         subscriber = self._session.declare_subscriber(key, Callback(received, indirect=False))
         return subscriber.undeclare
+
+    def ring(self, topic: Topic, capacity: int) -> "ZenohRing":
+        """See `Bus.ring`; zenoh's own threads keep the messages, and Python is not woken for any of them.
+
+        Each may hold the whole buffer that it came in, 64 kB.
+        """
+        return ZenohRing(self, self._session.declare_subscriber(topic.at(ALL), RingChannel(capacity)))
 
     def queryable(self, key_expression: str, handler: Callable[[Query], None]) -> None:
         """See `Bus.queryable`."""

@@ -131,10 +131,10 @@ def _one_rate(rate_hz: float, seconds: float, folder: Path) -> dict[str, Any]:
                     raise BusError(f"the recorder did not get ready: {_said(folder)}")
             traffic.run(_WARM_UP_S)
             begun_s, frames = time.monotonic(), traffic.frames
-            own_s, others_s = time.process_time(), _processor_s(process.pid)
+            own_s, others_s = time.process_time(), processor_s(process.pid)
             traffic.run(seconds)
             elapsed_s = time.monotonic() - begun_s
-            own_s, others_s = time.process_time() - own_s, _processor_s(process.pid) - others_s
+            own_s, others_s = time.process_time() - own_s, processor_s(process.pid) - others_s
             traffic.finish()
             process.send_signal(signal.SIGTERM)
             out, _ = process.communicate()
@@ -186,7 +186,7 @@ def _said(folder: Path) -> str:
     return (folder / _STDERR).read_text(errors="replace").strip()[-500:]
 
 
-def _processor_s(pid: int) -> float:
+def processor_s(pid: int) -> float:
     """Processor time that a process has used, all its threads, seconds."""
     fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
     return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")

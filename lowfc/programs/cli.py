@@ -15,6 +15,7 @@ from lowfc.adapters.terminal import DEFAULT_RUN, ConfigFile, RunId, configuratio
 from lowfc.contract.configuration import Preset
 from lowfc.contract.errors import ConfigurationError
 from lowfc.programs.bench_record import bench_record
+from lowfc.programs.bench_view import bench_view
 from lowfc.programs.design_commands import design_app
 from lowfc.programs.export import export
 from lowfc.programs.log_info import info
@@ -37,6 +38,7 @@ app.add_typer(bench_app, name="bench")
 app.add_typer(design_app, name="design")
 app.command("replay")(replay_log)
 bench_app.command("record")(bench_record)
+bench_app.command("view")(bench_view)
 app.command()(info)
 app.command()(recover)
 app.command()(report)

@@ -42,9 +42,7 @@ class ProcessDiedError(LowfcError):
     exit_status = 1
 
 
-def sim_loop(
-    config: Configuration, duration_s: float | None, record: bool, show: Show | None = None
-) -> dict[str, Any]:
+def sim_loop(config: Configuration, duration_s: float | None, record: bool, show: Show | None = None) -> dict[str, Any]:
     """Run the simulated loop for a time; return the summary that `--json` prints.
 
     Args:
@@ -61,8 +59,8 @@ def sim_loop(
     require_screen(show)
     run = open_run(new_run_id(), (config.mirror.name,))
     try:
-        _prepare(config, run, console)
-        children = _children(config, run, duration_s, record)
+        prepare(config, run, console)
+        children = children_of(config, run, duration_s, record)
         if show is not None:
             children.insert(_BEFORE_RECORDER, _view(run, show, console))
         watch = Watch({}, [])
@@ -80,13 +78,13 @@ def sim_loop(
         run.remove()
 
 
-def _prepare(config: Configuration, run: Run, console: Console) -> None:
+def prepare(config: Configuration, run: Run, console: Console) -> None:
     """Put what the processes share into the run's directory: calibration and configuration."""
     calibration_file.save(analytic(config, console), run.path / "calibration.fits")
     (run.path / "config.toml").write_text(config.to_toml(), encoding="utf-8")
 
 
-def _children(config: Configuration, run: Run, duration_s: float | None, record: bool) -> list[Child]:
+def children_of(config: Configuration, run: Run, duration_s: float | None, record: bool) -> list[Child]:
     """The processes, in the order in which they are stopped: from the source of the data to its end."""
     shared = ["--run", run.run_id, "--config", str(run.path / "config.toml")]
     calibration = ["--calibration", str(run.path / "calibration.fits")]
@@ -128,7 +126,7 @@ def _supervise(
         begun_s = time.monotonic()
         shown_s = 0.0
         while camera.status is None and watch.of(Role.CAMERA).state != "stopped" and not interrupted():
-            _check(children[1:])
+            check(children[1:])
             viewless = viewless or _say_view_ended(children, console)
             elapsed_s = time.monotonic() - begun_s
             if elapsed_s > shown_s + SHOW_S:
@@ -136,7 +134,7 @@ def _supervise(
                 show(watch, config, duration_s, elapsed_s)
             time.sleep(POLL_S)
         if not interrupted():
-            _check(children)
+            check(children)
         if interrupted():
             camera.stop(patience_s=5.0)
         time.sleep(SETTLE_S)
@@ -151,7 +149,7 @@ def _supervise(
             raise ProcessDiedError(f"{child.how_it_ended()}\n{child.last_words()}")
 
 
-def _check(children: list[Child]) -> None:
+def check(children: list[Child]) -> None:
     """Raise where a process ended by itself; the camera may end when it is done, and the view whenever it likes."""
     for child in children:
         done = child.name == Role.VIEWER or (child.name == Role.CAMERA and child.status == 0)

@@ -22,7 +22,7 @@ from lowfc.adapters.zenoh_bus import ZenohBus
 from lowfc.contract.configuration import load
 from lowfc.contract.messages import Role
 from lowfc.programs.ctl import running
-from lowfc.programs.view.bridge import AT_MOST_HZ, Bridge
+from lowfc.programs.view.bridge import Bridge
 from lowfc.programs.view.layout import layout
 from lowfc.programs.view.stream import to_viewer
 from lowfc.programs.view.tabs import Tab
@@ -51,7 +51,7 @@ def test_every_panel_of_every_tab_shows_the_live_loop(live: str, artefacts: Path
     joined = open_run(live)
     config = load(joined.path / "config.toml")
     clock = clock_of(config)
-    bus = ZenohBus(joined.links, Role.VIEWER, clock, AT_MOST_HZ)
+    bus = ZenohBus(joined.links, Role.VIEWER, clock)
     bridge = Bridge(
         config,
         live,

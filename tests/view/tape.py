@@ -5,7 +5,6 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
-import rerun as rr
 
 
 class Tape:
@@ -57,8 +56,12 @@ class Tape:
         return self.logged[path][-1][1][0]
 
 
-def pixels(image: rr.Image) -> npt.NDArray[np.uint8]:
-    """Colours (rows, columns, 3) of an image."""
-    shape = image.format.as_arrow_array().to_pylist()[0]
-    flat = np.array(image.buffer.as_arrow_array().to_pylist()[0], np.uint8)
-    return flat.reshape(shape["height"], shape["width"], -1)
+def pixels(tape: Tape, path: str) -> npt.NDArray[np.uint8]:
+    """Colours (rows, columns, 3) of the last picture at a path; its format may have come before it."""
+
+    def last(component: str) -> Any:
+        found = [getattr(archetypes[0], component) for _, archetypes in tape.logged[path]]
+        return [one for one in found if one is not None][-1].as_arrow_array().to_pylist()[0]
+
+    shape = last("format")
+    return np.array(last("buffer"), np.uint8).reshape(shape["height"], shape["width"], -1)

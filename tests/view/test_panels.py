@@ -95,11 +95,11 @@ def test_the_pictures_are_those_of_the_newest_messages() -> None:
     tape = painted(moment)
     assert moment.frame is not None
     assert moment.calibration is not None
-    brightness = pixels(tape.last(sensor.FRAME)).sum(axis=2).astype(float)
+    brightness = pixels(tape, sensor.FRAME).sum(axis=2).astype(float)
     order = np.argsort(moment.frame.ravel(), kind="stable")
     assert np.all(np.diff(brightness.ravel()[order]) >= 0), "more light is never darker"
     change = (moment.frame.ravel() - moment.calibration.dark) / FLUX_DN - moment.calibration.reference
-    shown = pixels(tape.last(sensor.DIFFERENCE)).reshape(-1, 3).astype(int)
+    shown = pixels(tape, sensor.DIFFERENCE).reshape(-1, 3).astype(int)
     strong = np.abs(change) > 0.5 * np.abs(change).max()
     assert strong.sum() > 2
     assert np.all((shown[strong, 0] > shown[strong, 2]) == (change[strong] > 0)), "orange above zero, blue below"
@@ -134,7 +134,7 @@ def test_the_mode_is_a_band_and_events_have_their_level() -> None:
     states = [archetype.state.as_arrow_array().to_pylist() for _, (archetype,) in tape.logged["loop/mode"][1:]]
     assert states == [["CLOSED"], ["OPEN"]]
     lines = [found for path, lines in tape.logged.items() if path.startswith("log/") for _, (found,) in lines]
-    levels = {text(line.text).split()[0]: text(line.level) for line in lines}
+    levels = {text(line.text).split()[1]: text(line.level) for line in lines}
     assert levels["RECORDING_FAILED"] == "ERROR"
 
 
@@ -174,18 +174,18 @@ def test_a_panel_that_fails_is_left_out_and_said_so() -> None:
 def test_a_log_is_drawn_moment_by_moment_and_every_view_of_the_layout_has_something(tmp_path: Path) -> None:
     made = night()
     made.put(SURFACE, image(np.eye(8, dtype=np.float32), made.now_ns, "dm"))
-    made.frames(400)
+    made.frames(1400)
     log = made.write(tmp_path / "night.mcap")
     tape = Tape()
     drawn = draw_logs([log], Configuration(), lambda config: Painter(config, tape))  # type: ignore[arg-type]
     assert drawn.remarks == []
     assert drawn.moments > 5
     times_ns, _ = tape.column(wavefront.ERROR)
-    assert len(times_ns) == FRAMES + 400
+    assert len(times_ns) == FRAMES + 1400
     assert np.all(np.diff(times_ns) > 0)
     origins = {str(view.origin) for view in views(layout())}
     empty = [origin for origin in origins if not any(path.startswith(origin) for path in tape.paths)]
-    assert empty == []
+    assert not empty
 
 
 def test_a_log_without_an_end_is_drawn_as_far_as_it_goes(tmp_path: Path) -> None:
@@ -223,11 +223,11 @@ def test_a_scale_grows_at_once_and_shrinks_after_a_while() -> None:
     assert scale.limit == 50.0
     assert not scale.fit(np.array([3.0]), 1_000_000_000)
     assert scale.fit(np.array([3.0]), 3_000_000_000)
-    assert scale.limit == 5.0
+    assert scale.limit == 3.0
 
 
 @pytest.mark.parametrize(
-    ("value", "limit"), [(1.0, 1.0), (1.1, 2.0), (2.0, 2.0), (0.03, 0.05), (999.0, 1000.0), (0.2, 0.2)]
+    ("value", "limit"), [(1.0, 1.0), (1.1, 1.5), (2.0, 2.0), (0.021, 0.03), (999.0, 1000.0), (0.2, 0.2)]
 )
 def test_scales_are_round(value: float, limit: float) -> None:
     assert round_up(value) == pytest.approx(limit)

@@ -1,29 +1,27 @@
 """The bridge from a run to a viewer: it may start, hang, die and start again, and the loop never notices.
 
-The bus's threads append to a bounded backlog, a brush draws from it, and the main thread watches all three: the brush,
-the viewer's process, and the memory of both. What goes wrong is mended by beginning anew, with an event that says why.
+What arrives waits in rings that keep the newest, a brush draws from them, and the main thread watches the brush, the
+viewer's process and the memory of both. What goes wrong is mended by beginning anew, with an event that says why.
 """
 
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import partial
 
 import rerun as rr
 
-from lowfc.adapters.backlog import Backlog
 from lowfc.adapters.bus import Bus, Sample, last_of
 from lowfc.adapters.clock import Clock
 from lowfc.adapters.rerun_viewer import RerunViewer, Show
 from lowfc.adapters.service import Service, resident_bytes
 from lowfc.contract.configuration import Configuration
 from lowfc.contract.errors import LowfcError
-from lowfc.contract.messages import FRAME, HEALTH, MIRROR_STATE, Role, Topic
-from lowfc.programs.view.brush import PICTURES_HZ, Brush
-from lowfc.programs.view.moment import SHOWN
+from lowfc.contract.messages import HEALTH, STEP, TRUTH, Role, Topic
+from lowfc.programs.view.brush import Brush
+from lowfc.programs.view.moment import NEWEST_ONLY, SHOWN
 
-AT_MOST_HZ = {FRAME: PICTURES_HZ, MIRROR_STATE: PICTURES_HZ}
-"""Of the topics that come with every frame only so many are looked at; the rest never reaches Python."""
+WAITING = dict.fromkeys(SHOWN, 200) | dict.fromkeys(NEWEST_ONLY, 1) | {STEP: 2000, TRUTH: 2000}
+"""Messages that wait, by topic: of pictures the newest, of rows those of two seconds at 1 kHz. Each may hold 64 kB."""
 OWN_BYTES = 512_000_000
 """Memory of this process above which the view begins anew; what a hung viewer holds up stays below it."""
 VIEWER_SPARE_BYTES = 1_500_000_000
@@ -31,7 +29,6 @@ VIEWER_SPARE_BYTES = 1_500_000_000
 STUCK_S = 10.0
 """Without a moment drawn, the viewer is taken for hung."""
 
-_BACKLOG = (20_000, 64_000_000)
 _TURN_S = 0.1
 _LOOK_S = 1.0
 _MOST_RENEWALS = 5
@@ -83,15 +80,13 @@ class Bridge:
         self._open_viewer = open_viewer
         self._make_stream = make_stream
         self._viewer_bytes = viewer_bytes
-        self._backlog = Backlog(*_BACKLOG)
         self._viewer: RerunViewer | None = None
         self._brush: Brush | None = None
         self._drawn = self._renewals = self._most_bytes = 0
         self._renewed_s: list[float] = []
         self._stuck = False
         self._asked: set[tuple[str, int]] = set()
-        for topic in SHOWN:
-            bus.subscribe(topic, partial(self._backlog.put, topic))
+        self._rings = {topic: bus.ring(topic, WAITING[topic]) for topic in SHOWN}
         self.service = Service(Role.VIEWER, run_id, clock, bus)
 
     @property
@@ -142,7 +137,8 @@ class Bridge:
     def _begin(self) -> None:
         self._viewer = self._open_viewer() if self._open_viewer is not None else None
         viewer = self._viewer
-        self._brush = Brush(self._config, self._clock, self._backlog, self._ask(), lambda: self._make_stream(viewer))
+        self._brush = Brush(self._config, self._clock, self._rings, lambda: self._make_stream(viewer))
+        self._brush.tell(self._ask())
         self._brush.start()
         self._stuck = False
 
@@ -162,10 +158,9 @@ class Bridge:
     def _look(self, now_s: float) -> None:
         """Is everything well?"""
         there = {(name, health.pid) for name, health in list(self.service.heard.items())}
-        if there - self._asked:
+        if there - self._asked and self._brush is not None:
             self._asked |= there
-            for topic, sample in self._ask():
-                self._backlog.put(topic, sample)
+            self._brush.tell(self._ask())
         own_bytes = resident_bytes()
         self._most_bytes = max(self._most_bytes, own_bytes)
         if self._viewer is not None and not self._viewer.alive:

@@ -2,7 +2,7 @@
 
 import rerun.blueprint as rrb
 
-from lowfc.programs.view import loop, mirror, pointing, sensor, tiles, wavefront
+from lowfc.programs.view import latency, loop, mirror, pointing, science, sensor, spectra, tiles, wavefront
 from lowfc.programs.view.marks import TIMELINE
 from lowfc.programs.view.tabs import Tab
 
@@ -27,27 +27,38 @@ def layout(active: Tab = Tab.OPERATOR, window_s: float | None = LIVE_WINDOW_S) -
 
 def _operator(window_s: float | None) -> rrb.Container:
     pictures = rrb.Horizontal(
-        sensor.frame_view(), sensor.difference_view(), mirror.command_view(), pointing.pointing_view()
+        sensor.frame_view(),
+        sensor.difference_view(),
+        mirror.command_view(),
+        pointing.pointing_view(),
+        science.image_view(),
+        column_shares=[1, 1, 1, 1, 2],
     )
-    courses = rrb.Horizontal(wavefront.rms_view(), wavefront.tilt_view())
-    below = rrb.Horizontal(loop.mode_view(), loop.log_view())
-    rows = rrb.Vertical(tiles.tiles_view(), pictures, courses, below, row_shares=[5, 7, 6, 4], name="operator")
+    courses = rrb.Horizontal(wavefront.rms_view(), wavefront.tilt_view(), science.contrast_view())
+    below = rrb.Horizontal(loop.mode_view(), latency.percentiles_view(), loop.log_view(), column_shares=[2, 3, 4])
+    rows = rrb.Vertical(tiles.tiles_view(), pictures, courses, below, row_shares=[8, 10, 9, 7], name=Tab.OPERATOR)
     return _timed(rows, window_s)
 
 
 def _optics() -> rrb.Container:
     return rrb.Vertical(
         rrb.Horizontal(sensor.frame_view(), sensor.difference_view(), sensor.reference_view(), sensor.raw_view()),
-        rrb.Horizontal(mirror.command_view(), mirror.surface_view()),
-        name="optics",
+        rrb.Horizontal(mirror.command_view(), mirror.surface_view(), science.image_view(), column_shares=[1, 1, 2]),
+        name=Tab.OPTICS,
     )
 
 
 def _engineering(window_s: float | None) -> rrb.Container:
     columns = rrb.Horizontal(
         rrb.Vertical(*wavefront.mode_views()),
-        rrb.Vertical(wavefront.groups_view(), mirror.stroke_view(), loop.light_view(), loop.saturated_view()),
-        name="engineering",
+        rrb.Vertical(wavefront.groups_view(), *spectra.spectra_views(), mirror.stroke_view(), row_shares=[2, 4, 4, 2]),
+        rrb.Vertical(
+            latency.histogram_view(),
+            latency.stages_view(),
+            latency.counts_view(),
+            rrb.Horizontal(loop.light_view(), loop.saturated_view()),
+        ),
+        name=Tab.ENGINEERING,
     )
     return _timed(columns, window_s)
 

@@ -17,7 +17,7 @@ from lowfc.adapters.whole_file import being_written, require_folder
 from lowfc.adapters.zenoh_bus import ZenohBus
 from lowfc.contract.configuration import Configuration, load
 from lowfc.contract.messages import Role
-from lowfc.programs.view.bridge import AT_MOST_HZ, Bridge
+from lowfc.programs.view.bridge import Bridge
 from lowfc.programs.view.layout import LIVE_WINDOW_S
 from lowfc.programs.view.painter import Painter
 from lowfc.programs.view.place import Place
@@ -43,7 +43,7 @@ def look_at_run(run_id: str, config: Configuration | None, where: Place, seconds
     clock = clock_of(config)
     with contextlib.ExitStack() as stack:
         part = stack.enter_context(being_written(where.save)) if where.save is not None else None
-        bus = ZenohBus(run.links, Role.VIEWER, clock, AT_MOST_HZ)
+        bus = ZenohBus(run.links, Role.VIEWER, clock)
         stack.callback(bus.close)
         bridge = Bridge(
             config,
@@ -93,7 +93,7 @@ def look_at_logs(logs: list[Path], config: Configuration | None, where: Place) -
             drawn = draw_logs(
                 logs, config, lambda own: Painter(own, stream), lambda done: bar.update(task, completed=done)
             )
-        stream.flush()
+        stream.disconnect()  # the viewer keeps what it has
         for remark in drawn.remarks:
             sys.stderr.write(f"{remark}\n")
         if viewer is not None and where.picture is not None:

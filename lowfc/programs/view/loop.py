@@ -59,7 +59,7 @@ class Loop(Panel):
         for event in moment.events:
             at(stream, from_timestamp(event.timestamp))
             level = _LEVELS.get(event.level, rr.TextLogLevel.INFO)
-            stream.log(f"{LOG}/{event.name}", rr.TextLog(event.message, level=level))
+            stream.log(f"{LOG}/{event.name}", rr.TextLog(f"{event.name}: {event.message}", level=level))
 
 
 def mode_view() -> rrb.View:
@@ -82,5 +82,5 @@ def log_view() -> rrb.View:
     return rrb.TextLogView(
         origin=LOG,
         name="Events",
-        columns=rrb.TextLogColumns(timeline_columns=["time"], text_log_columns=["loglevel", "entitypath", "body"]),
+        columns=rrb.TextLogColumns(timeline_columns=["time"], text_log_columns=["loglevel", "body"]),
     )

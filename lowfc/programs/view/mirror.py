@@ -6,9 +6,8 @@ import rerun as rr
 import rerun.blueprint as rrb
 
 from lowfc.contract.codec import actuators
-from lowfc.contract.messages import wire
 from lowfc.programs.view.colours import YELLOW, diverging
-from lowfc.programs.view.marks import at, caption, curves, name_curves, picture
+from lowfc.programs.view.marks import Pictures, at, caption, curves, name_curves
 from lowfc.programs.view.moment import Moment
 from lowfc.programs.view.panel import Panel
 from lowfc.programs.view.scale import Scale
@@ -23,8 +22,11 @@ _NEAR = 0.995
 class Mirror(Panel):
     """The newest state, as a picture."""
 
+    pictures = True
+
     def __init__(self) -> None:
-        self._scales = {COMMAND: Scale(_LEAST_NM), SURFACE: Scale(_LEAST_NM)}
+        self._scales = {path: Scale(_LEAST_NM) for path in (COMMAND, SURFACE)}
+        self._pictures = {path: Pictures(path) for path in (COMMAND, SURFACE)}
         self._limited = False
 
     def begin(self, stream: rr.RecordingStream) -> None:
@@ -37,38 +39,34 @@ class Mirror(Panel):
             surface_nm = actuators(moment.mirror)
             if surface_nm is not None:
                 self._show(stream, COMMAND, moment.time_ns, surface_nm)
-                self._mark(stream, moment.time_ns, surface_nm, moment.controller)
+                self._mark(stream, moment, surface_nm)
         if moment.surface is not None:
             self._show(stream, SURFACE, moment.time_ns, moment.surface)
 
     def _show(self, stream: rr.RecordingStream, path: str, time_ns: int, values_nm: npt.NDArray[np.float32]) -> None:
         scale = self._scales[path]
         changed = scale.fit(values_nm, time_ns)
-        picture(stream, path, time_ns, diverging(values_nm / scale.limit))
+        self._pictures[path].show(stream, time_ns, diverging(values_nm / scale.limit))
         if changed:
             rows, columns = values_nm.shape
             text = f"blue -{scale.limit:g}, orange +{scale.limit:g} nm"
             caption(stream, f"{path}/{_CAPTION}", text, (columns / 2, rows * 0.93))
 
-    def _mark(
-        self,
-        stream: rr.RecordingStream,
-        time_ns: int,
-        surface_nm: npt.NDArray[np.float32],
-        controller: wire.ControllerState | None,
-    ) -> None:
+    def _mark(self, stream: rr.RecordingStream, moment: Moment, surface_nm: npt.NDArray[np.float32]) -> None:
         """A ring round each actuator at its stroke."""
-        stroke_nm = controller.settings.stroke_nm if controller is not None else 0.0
+        stroke_nm = moment.controller.settings.stroke_nm if moment.controller is not None else 0.0
         if not stroke_nm:
             return
-        used = np.abs(surface_nm) / stroke_nm
-        rows, columns = np.nonzero(used >= _NEAR)
-        if len(rows) or self._limited:
-            at(stream, time_ns)
+        largest = max(float(surface_nm.max()), -float(surface_nm.min())) / stroke_nm
+        limited = largest >= _NEAR
+        if limited or self._limited:
+            rows, columns = np.nonzero(np.abs(surface_nm) >= _NEAR * stroke_nm)
             places = np.stack([columns + 0.5, rows + 0.5], axis=1)
+            at(stream, moment.time_ns)
             stream.log(f"{COMMAND}/{_LIMITED}", rr.Points2D(places, radii=0.3, colors=[YELLOW]))
-        self._limited = len(rows) > 0
-        curves(stream, STROKE, np.array([time_ns]), np.array([100 * float(used.max())]))
+        self._limited = limited
+        if moment.whole:
+            curves(stream, STROKE, np.array([moment.time_ns]), np.array([100 * largest]))
 
 
 def command_view() -> rrb.View:

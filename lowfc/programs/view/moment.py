@@ -52,6 +52,8 @@ SHOWN: tuple[Topic, ...] = (
 NEWEST_ONLY: tuple[Topic, ...] = (FRAME, MIRROR_STATE, SURFACE)
 """Topics of which only the newest message is looked at."""
 
+_NEWEST_ONLY = {topic.key for topic in NEWEST_ONLY}
+
 
 class Heard(NamedTuple):
     """A process's last Health, and when it was sent (host clock)."""
@@ -75,6 +77,7 @@ class Moment:
         calibration, camera, controller: the last of each; None before the first.
         health: of every process heard so far, by name.
         heard_ns: when the last message of each topic was sent, by the topic's key in the table.
+        whole: everything is in it; otherwise only what is newest, and rows and events wait for a later moment.
         behind_s: how late this moment is.
     """
 
@@ -93,6 +96,7 @@ class Moment:
     controller: wire.ControllerState | None
     health: Mapping[str, Heard]
     heard_ns: Mapping[str, int]
+    whole: bool = True
     behind_s: float = 0.0
 
 
@@ -117,7 +121,7 @@ class Gatherer:
     def take(self, topic: Topic, key: str, payload: bytes, publish_time_ns: int) -> None:
         """Take one message of one of `SHOWN`."""
         self._heard_ns[topic.key] = publish_time_ns
-        if topic in NEWEST_ONLY:
+        if topic.key in _NEWEST_ONLY:
             self._newest[topic.key] = payload
             return
         try:
@@ -125,23 +129,24 @@ class Gatherer:
         except (DecodeError, OverflowError, ValueError):
             self.unreadable += 1
 
-    def moment(self, host_ns: int, *, rows: bool = True, behind_s: float = 0.0) -> Moment:
+    def moment(self, host_ns: int, *, whole: bool = True, behind_s: float = 0.0) -> Moment:
         """What is new at this time of the host's clock; the next moment begins here.
 
         Args:
             host_ns: now.
-            rows: take the rows too; otherwise they wait for a later moment, in which more of them come at once.
+            whole: take rows and events too; otherwise they wait for a later moment, in which more come at once.
             behind_s: how late it is.
         """
         frame, frame_ns = self._frame()
         if frame is not None:
             self._date(frame_ns, self._heard_ns[FRAME.key])
         steps, truths, timings = StepRows(self._steps.modes), TruthRows(self._truths.modes), TimingRows()
-        if rows:
+        events: list[Log] = []
+        if whole:
+            events, self._events = self._events, events
             steps, self._steps = self._steps, steps
             truths, self._truths = self._truths, truths
             timings, self._timings = self._timings, timings
-        events, self._events = self._events, []
         mirror, surface = self._mirror(), self._surface()
         self._newest.clear()
         return Moment(
@@ -160,6 +165,7 @@ class Gatherer:
             controller=self._controller,
             health=self._health,
             heard_ns=self._heard_ns,
+            whole=whole,
             behind_s=behind_s,
         )
 

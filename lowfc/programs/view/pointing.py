@@ -7,7 +7,6 @@ import numpy.typing as npt
 import rerun as rr
 import rerun.blueprint as rrb
 
-from lowfc.optics.photometry import tilt_nm_per_mas
 from lowfc.programs.view.colours import BLUE, GREY, WHITE, YELLOW
 from lowfc.programs.view.marks import at
 from lowfc.programs.view.moment import Moment
@@ -28,8 +27,8 @@ Points = npt.NDArray[np.floating]
 class Pointing(Panel):
     """The trail of the last two seconds; the outer ring follows it."""
 
-    def __init__(self, diameter_m: float) -> None:
-        self._nm_per_mas = tilt_nm_per_mas(diameter_m)
+    def __init__(self, nm_per_mas: float) -> None:
+        self._nm_per_mas = nm_per_mas
         self._scale = Scale(_LEAST_MAS)
         self._pieces: deque[tuple[npt.NDArray[np.int64], Points]] = deque()
 

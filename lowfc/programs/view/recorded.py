@@ -9,7 +9,7 @@ from lowfc.adapters.log_reader import Logged, LogReader
 from lowfc.contract.configuration import Configuration
 from lowfc.contract.errors import ConfigurationError, DataFileError
 from lowfc.contract.messages import topic_of
-from lowfc.programs.view.brush import PICTURES_HZ, PICTURES_PER_ROWS
+from lowfc.programs.view.brush import PICTURES_HZ, PICTURES_PER_WHOLE
 from lowfc.programs.view.moment import SHOWN, Gatherer
 from lowfc.programs.view.painter import Painter
 
@@ -61,7 +61,7 @@ def draw_logs(
             last_ns = message.log_time_ns
             _take(gatherer, message)
             if last_ns >= due_ns:
-                painter.draw(gatherer.moment(last_ns, rows=drawn.moments % PICTURES_PER_ROWS == 0))
+                painter.draw(gatherer.moment(last_ns, whole=drawn.moments % PICTURES_PER_WHOLE == 0))
                 drawn.moments += 1
                 due_ns = last_ns + _PERIOD_NS
             if number % _STRIDE == 0:

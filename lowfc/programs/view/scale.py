@@ -5,12 +5,15 @@ from math import floor, log10
 import numpy as np
 import numpy.typing as npt
 
-_STEPS = (1.0, 2.0, 5.0, 10.0)
+_STEPS = (1.0, 1.5, 2.0, 3.0, 5.0, 7.0, 10.0)
 _SHRINK_NS = 2_000_000_000
 
 
 class Scale:
-    """The largest magnitude shown: 1, 2 or 5 times a power of ten; larger at once, smaller after two seconds."""
+    """The largest magnitude shown, a round number.
+
+    It grows at once, and shrinks after two seconds.
+    """
 
     def __init__(self, least: float) -> None:
         self.least = least
@@ -19,7 +22,7 @@ class Scale:
 
     def fit(self, values: npt.NDArray[np.floating], time_ns: int) -> bool:
         """Take values into account; True where the limit is another one now."""
-        wanted = round_up(max(float(np.abs(values).max(initial=0.0)), self.least))
+        wanted = round_up(max(float(values.max(initial=0.0)), -float(values.min(initial=0.0)), self.least))
         if wanted >= self.limit:
             self._needed_ns = time_ns
         if wanted > self.limit or (wanted < self.limit and time_ns - self._needed_ns > _SHRINK_NS):
@@ -29,6 +32,6 @@ class Scale:
 
 
 def round_up(value: float) -> float:
-    """The next of 1, 2, 5, 10, ... at or above a positive value."""
+    """The next round number at or above a positive value."""
     decade = 10.0 ** floor(log10(value))
     return next(step * decade for step in _STEPS if value <= step * decade * (1 + 1e-9))

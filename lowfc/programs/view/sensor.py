@@ -8,7 +8,7 @@ import rerun.blueprint as rrb
 from lowfc.control.calibration import Calibration
 from lowfc.control.estimator import difference
 from lowfc.programs.view.colours import Rgb, diverging, sequential
-from lowfc.programs.view.marks import caption, picture
+from lowfc.programs.view.marks import Pictures, caption
 from lowfc.programs.view.moment import Moment
 from lowfc.programs.view.panel import Panel
 from lowfc.programs.view.scale import Scale
@@ -24,10 +24,14 @@ Single = npt.NDArray[np.float32]
 class Sensor(Panel):
     """Frame and difference as they come; the reference when there is another."""
 
+    pictures = True
+
     def __init__(self) -> None:
         self._calibration: Calibration | None = None
         self._difference = np.zeros(0, np.float32)
+        self._frames, self._differences, self._references = Pictures(FRAME), Pictures(DIFFERENCE), Pictures(REFERENCE)
         self._brightest = Scale(_LEAST_DN)
+        self._stretch = np.zeros((1, 3), np.uint8)
         self._largest = Scale(_LEAST_DN / 10)
         self._raw_due_ns = 0
 
@@ -37,26 +41,34 @@ class Sensor(Panel):
             self._calibrate(stream, moment.calibration, moment.time_ns)
         if moment.frame is None:
             return
-        calibration = self._calibration
-        dark = 0.0
+        calibration, dark_dn = self._calibration, 0
         if calibration is not None and calibration.dark.size == moment.frame.size:
-            dark = float(np.median(calibration.dark))
+            dark_dn = round(float(calibration.dark[0]))
             self._show_difference(stream, calibration, moment.frame, moment.frame_ns)
-        light = moment.frame - np.float32(dark)
-        changed = self._brightest.fit(light, moment.frame_ns)
-        picture(stream, FRAME, moment.frame_ns, _log_stretched(light, self._brightest.limit))
-        if changed:
-            _caption_below(stream, FRAME, moment.frame.shape, f"0 to {self._brightest.limit:g} DN, logarithmic")
+        self._show_frame(stream, moment.frame, dark_dn, moment.frame_ns)
         if moment.frame_ns >= self._raw_due_ns:
             self._raw_due_ns = moment.frame_ns + _RAW_PERIOD_NS
             stream.log(RAW, rr.Image(moment.frame, color_model="L"))
+
+    def _show_frame(
+        self, stream: rr.RecordingStream, frame: npt.NDArray[np.uint16], dark_dn: int, time_ns: int
+    ) -> None:
+        brightest = np.array([max(0, int(frame.max()) - dark_dn)])
+        changed = self._brightest.fit(brightest, time_ns)
+        limit = round(self._brightest.limit)
+        if changed:  # a colour for each DN: looking up is cheaper than a logarithm of every pixel
+            self._stretch = _log_stretched(np.arange(limit + 1, dtype=np.float32), limit)
+        light = np.clip(frame, dark_dn, dark_dn + limit) - np.uint16(dark_dn)
+        self._frames.show(stream, time_ns, np.take(self._stretch, light, axis=0))
+        if changed:
+            _caption_below(stream, FRAME, frame.shape, f"0 to {limit} DN, logarithmic")
 
     def _calibrate(self, stream: rr.RecordingStream, calibration: Calibration, time_ns: int) -> None:
         self._calibration = calibration
         self._difference = np.empty(calibration.dark.size, np.float32)
         reference_dn = (calibration.reference * calibration.flux_dn).reshape(calibration.shape)
         limit_dn = float(reference_dn.max())
-        picture(stream, REFERENCE, time_ns, _log_stretched(reference_dn, limit_dn))
+        self._references.show(stream, time_ns, _log_stretched(reference_dn, limit_dn))
         _caption_below(stream, REFERENCE, calibration.shape, f"0 to {limit_dn:.0f} DN expected, logarithmic")
 
     def _show_difference(
@@ -67,7 +79,7 @@ class Sensor(Panel):
             return
         change_dn = (self._difference * flux_dn * calibration.good).reshape(frame.shape)
         changed = self._largest.fit(change_dn, time_ns)
-        picture(stream, DIFFERENCE, time_ns, diverging(change_dn / self._largest.limit))
+        self._differences.show(stream, time_ns, diverging(change_dn / self._largest.limit))
         if changed:
             text = f"blue -{self._largest.limit:g}, orange +{self._largest.limit:g} DN"
             _caption_below(stream, DIFFERENCE, frame.shape, text)

@@ -5,7 +5,6 @@ import numpy.typing as npt
 import rerun as rr
 import rerun.blueprint as rrb
 
-from lowfc.optics.photometry import tilt_nm_per_mas
 from lowfc.optics.zernike import mode_name, noll_to_nm
 from lowfc.programs.view.colours import BLUE, GREEN, GREY, ORANGE, PINK, RED, YELLOW, distinct
 from lowfc.programs.view.marks import curves, name_curves
@@ -25,8 +24,8 @@ Values = npt.NDArray[np.floating]
 class Wavefront(Panel):
     """Every step and, in a simulation, every truth."""
 
-    def __init__(self, diameter_m: float) -> None:
-        self._nm_per_mas = tilt_nm_per_mas(diameter_m)
+    def __init__(self, nm_per_mas: float) -> None:
+        self._nm_per_mas = nm_per_mas
         self._named: tuple[tuple[int, ...], bool] | None = None
         self._groups: list[npt.NDArray[np.intp]] = []
         self._tilts: list[int] = []

@@ -1,0 +1,165 @@
+"""What the science camera sees: the dark zone's contrast with the wavefront as it is, and as it would be open."""
+
+from collections import deque
+from collections.abc import Sequence
+
+import numpy as np
+import numpy.typing as npt
+import rerun as rr
+import rerun.blueprint as rrb
+
+from lowfc.optics.coronagraph import DARK_ZONE, Wedge
+from lowfc.optics.science_camera import ScienceCamera
+from lowfc.programs.view.colours import BLUE, GREEN, GREY, WHITE, Rgb, sequential
+from lowfc.programs.view.marks import Pictures, curves, name_curves
+from lowfc.programs.view.moment import Moment
+from lowfc.programs.view.panel import Panel
+
+IMAGE, CONTRAST = "science/image", "science/contrast"
+PERIOD_NS = 1_000_000_000
+WEDGE = Wedge(4.0, 6.0)
+"""Where contrast is averaged."""
+
+_LOOKS = 5
+"""Wavefronts, each the newest of a moment, that one image is the mean of."""
+_DARKEST, _BRIGHTEST = -10, -4
+"""Decades of contrast that the colours span."""
+_HALF_WIDTH, _SAMPLES_PER = 12, 4
+_SAMPLES = 2 * _HALF_WIDTH * _SAMPLES_PER
+_GAP, _BAR = 6, 5  # samples between the pictures, and of the colour scale
+_SECOND = _SAMPLES + _GAP  # where the second picture begins, and the colour scale
+_SCALE = 2 * _SECOND
+_WIDTH = _SCALE + _BAR
+_LABEL = 5  # samples by which the viewer sets a label below its place
+_NAMES = {
+    "true": ("now, true wavefront", "loop open, true wavefront"),
+    "measured": ("now, measured error", "loop open, pseudo-open-loop"),
+}
+"""What the wavefronts are, those of a simulation first: they are taken where there are any."""
+
+Single = npt.NDArray[np.float32]
+
+
+class Science(Panel):
+    """Two images side by side and the mean contrast, once a second."""
+
+    def __init__(self, pupil: npt.NDArray[np.float64], wavelength_nm: float) -> None:
+        self._pupil = pupil
+        self._wavelength_nm = wavelength_nm
+        self._noll: tuple[int, ...] = ()
+        self._camera: ScienceCamera | None = None
+        self._flat = np.nan
+        self._looks: dict[str, deque[tuple[Single, Single]]] = {source: deque(maxlen=_LOOKS) for source in _NAMES}
+        self._pictures = Pictures(f"{IMAGE}/contrast")
+        self._named = ""
+        self._drawn_ns = 0
+
+    def begin(self, stream: rr.RecordingStream) -> None:
+        """Draw what stays: where the mask ends and contrast is averaged, and the scale of the colours."""
+        lines = [line + np.array([start, 0]) for start in (0, _SECOND) for line in _outlines()]
+        outlines = rr.LineStrips2D(lines, colors=[GREY], radii=rr.Radius.ui_points(0.7))
+        stream.log(f"{IMAGE}/outlines", outlines, static=True)
+        decades = range(_DARKEST, _BRIGHTEST + 1)
+        places = [(_WIDTH + 12, _SAMPLES * (1 - float(_share(decade))) - _LABEL) for decade in decades]
+        stream.log(f"{IMAGE}/scale", _texts(places, [f"1e{decade}" for decade in decades]), static=True)
+
+    def draw(self, stream: rr.RecordingStream, moment: Moment) -> None:
+        """Look at the newest wavefront; now and then, draw."""
+        if moment.calibration is None:
+            return
+        camera = self._prepared(moment.calibration.noll)
+        truths, steps = moment.truths, moment.steps
+        self._look("true", truths.residual_nm, truths.disturbance_nm)
+        self._look("measured", steps.error_nm, steps.pol_nm)
+        if 0 <= moment.time_ns - self._drawn_ns < PERIOD_NS:
+            return
+        source = next((name for name, looks in self._looks.items() if looks), None)
+        if source is None:
+            return
+        self._drawn_ns = moment.time_ns
+        self._show(stream, moment.time_ns, camera, source)
+        for looks in self._looks.values():
+            looks.clear()
+
+    def _prepared(self, noll: tuple[int, ...]) -> ScienceCamera:
+        """The camera for these modes; wavefronts of others are forgotten."""
+        if self._camera is None or noll != self._noll:
+            self._noll = noll
+            self._camera = ScienceCamera(self._pupil, noll, self._wavelength_nm, _HALF_WIDTH, _SAMPLES_PER)
+            self._flat = self._camera.mean_contrast(self._camera.image(np.zeros(len(noll))), WEDGE)
+            for looks in self._looks.values():
+                looks.clear()
+        return self._camera
+
+    def _look(self, source: str, now_nm: Single, open_nm: Single) -> None:
+        """Keep the newest row; a refused frame has none."""
+        if now_nm.shape[1] != len(self._noll):
+            return
+        whole = np.flatnonzero(np.isfinite(now_nm).all(axis=1) & np.isfinite(open_nm).all(axis=1))
+        if whole.size:
+            self._looks[source].append((now_nm[whole[-1]], open_nm[whole[-1]]))
+
+    def _show(self, stream: rr.RecordingStream, time_ns: int, camera: ScienceCamera, source: str) -> None:
+        looks = self._looks[source]
+        images = [np.mean([camera.image(look[which]) for look in looks], axis=0) for which in (0, 1)]
+        means = [camera.mean_contrast(image, WEDGE) for image in images]
+        if source != self._named:
+            self._named = source
+            name_curves(stream, CONTRAST, ["flat wavefront", *_NAMES[source]], [BLUE, GREEN, GREY], 1.6)
+        self._pictures.show(stream, time_ns, _side_by_side(*images))
+        captions = [f"{title}: {mean:.1e}" for title, mean in zip(("now", "loop open"), means, strict=True)]
+        places = [(start + _SAMPLES / 2, -_LABEL - _GAP) for start in (0, _SECOND)]
+        stream.log(f"{IMAGE}/captions", _texts(places, captions))
+        curves(stream, CONTRAST, np.array([time_ns]), np.log10([[self._flat, *means]]))
+
+
+def image_view() -> rrb.View:
+    """Both images."""
+    return rrb.Spatial2DView(
+        origin=IMAGE,
+        name="Science camera: contrast, mean in the wedge from 4 to 6 λ/D",
+        visual_bounds=rrb.VisualBounds2D(x_range=[-4, _WIDTH + 24], y_range=[-2 * _GAP - _LABEL, _SAMPLES + 4]),
+    )
+
+
+def contrast_view() -> rrb.View:
+    """Mean contrast."""
+    return rrb.TimeSeriesView(
+        origin=CONTRAST,
+        name="Mean contrast from 4 to 6 λ/D, log10",
+        plot_legend=rrb.Corner2D.LeftTop,
+        axis_y=rrb.ScalarAxis(range=(_DARKEST, _BRIGHTEST - 1)),
+    )
+
+
+def _texts(places: Sequence[tuple[float, float]], texts: Sequence[str]) -> rr.Points2D:
+    """Words centred below places."""
+    return rr.Points2D(places, radii=0.0, colors=[WHITE], labels=texts, show_labels=True)
+
+
+def _share(decade: npt.NDArray[np.floating] | float) -> npt.NDArray[np.floating]:
+    """Place of a logarithm of contrast among the colours, from 0 to 1."""
+    return np.clip((np.asarray(decade) - _DARKEST) / (_BRIGHTEST - _DARKEST), 0, 1)
+
+
+def _side_by_side(now: Single, as_open: Single) -> Rgb:
+    """Colours of both images and of the scale beside them, on black."""
+    shares = np.zeros((_SAMPLES, _WIDTH))
+    tiny = 10.0 ** (_DARKEST - 1)  # a logarithm has no value at zero
+    shares[:, :_SAMPLES] = _share(np.log10(now + tiny))
+    shares[:, _SECOND : _SECOND + _SAMPLES] = _share(np.log10(as_open + tiny))
+    shares[:, _SCALE:] = np.linspace(1, 0, _SAMPLES)[:, None]
+    return sequential(shares)
+
+
+def _outlines() -> list[npt.NDArray[np.float64]]:
+    """Lines (points, 2) in pixels of one image: the mask's edge, and the wedge on either side of the star."""
+    turn = np.linspace(0, 2 * np.pi, 97)
+    opening = np.deg2rad(WEDGE.half_opening_deg) * np.linspace(-1, 1, 33)
+    arcs = [radius * _directions(opening) for radius in (WEDGE.inner, WEDGE.outer)]
+    right = np.concatenate([arcs[0], arcs[1][::-1], arcs[0][:1]])
+    return [_SAMPLES / 2 + _SAMPLES_PER * line for line in (DARK_ZONE.inner * _directions(turn), right, -right)]
+
+
+def _directions(angle: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
+    return np.stack([np.cos(angle), np.sin(angle)], axis=1)
