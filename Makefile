@@ -5,7 +5,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 INSTALL := $(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt
 # Tests that only compute run side by side; those with processes and a clock in them run alone, after them.
-COMPUTING := tests/control tests/design tests/optics tests/sim tests/test_loop.py tests/test_validate.py \
+COMPUTING := tests/control tests/design tests/optics tests/sim tests/view tests/test_loop.py tests/test_validate.py \
 	tests/test_validate_figures.py
 
 .PHONY: help sim-loop test test-all lint types format proto node clean

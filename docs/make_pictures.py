@@ -23,7 +23,7 @@ LOOK_S = 10.0
 MENU_BAR = 37  # pixels at the top that say nothing about the loop
 SHADES = 192
 CLOSED = '[control]\nstart_mode = "closed"\n'
-LOUD = CLOSED + '[disturbance]\npreset = "reaction-wheel"\n[sensor]\nsam = "sam27d10_bal14"\n'
+BRIGHT = CLOSED + '[sensor]\nsam = "sam27d10_bal14"\n'
 SMALL_WELL = CLOSED + "[camera]\nfull_well_e = 1500\n"
 
 Process = subprocess.Popen[bytes]
@@ -105,7 +105,7 @@ def night(config: str) -> Iterator[Night]:
 
 def main() -> None:
     """Every state, and every tab."""
-    with night(LOUD) as run:
+    with night(BRIGHT) as run:
         for tab in ("operator", "optics", "engineering"):
             run.picture(tab, tab)
         run.picture("open", "operator", lambda: run.ask("open"))
@@ -113,9 +113,8 @@ def main() -> None:
         time.sleep(5)
         run.picture("frames-lost", "operator", run.stumble)
         time.sleep(5)
-        run.picture("star-gone", "operator", lambda: run.restart("camera", LOUD + "[star]\nmagnitude = 9\n"))
-        run.restart("camera", LOUD)
-        time.sleep(6)
+        run.picture("star-gone", "operator", lambda: run.restart("camera", BRIGHT + "[star]\nmagnitude = 9\n"))
+    with night(BRIGHT) as run:
         run.picture("controller-dead", "operator", run.processes["controller"].kill)
     with night(SMALL_WELL) as run:
         run.picture("saturated", "operator", lambda: run.restart("camera", SMALL_WELL + "[star]\nmagnitude = -2\n"))

@@ -111,11 +111,11 @@ def render(measured: dict[str, Any]) -> str:
     return "\n".join([*rows, "", where, ""])
 
 
-def put(document: Path, table: str) -> None:
+def put(document: Path, table: str, begin: str = BEGIN, end: str = END) -> None:
     """Replace what is between a document's marks."""
-    before, _, rest = document.read_text().partition(BEGIN)
-    _, _, after = rest.partition(END)
-    document.write_text(f"{before}{BEGIN}{table}{END}{after}")
+    before, _, rest = document.read_text().partition(begin)
+    _, _, after = rest.partition(end)
+    document.write_text(f"{before}{begin}{table}{end}{after}")
 
 
 def command_line(

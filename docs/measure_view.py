@@ -8,10 +8,9 @@ Example:
 import json
 import subprocess
 import sys
-from pathlib import Path
 from typing import Any
 
-from measure import ROOT, host
+from measure import ROOT, host, put
 
 MEASURED = ROOT / "docs" / "view.json"
 DOCUMENT = ROOT / "docs" / "performance.md"
@@ -87,14 +86,7 @@ def course(found: dict[str, Any]) -> str:
     )
 
 
-def put(document: Path, table: str) -> None:
-    """Replace what is between the document's marks for the view."""
-    before, _, rest = document.read_text().partition(BEGIN)
-    _, _, after = rest.partition(END)
-    document.write_text(f"{before}{BEGIN}{table}{END}{after}")
-
-
 if __name__ == "__main__":
     if "--render" not in sys.argv:
         MEASURED.write_text(json.dumps(measure(), indent=1) + "\n")
-    put(DOCUMENT, render(json.loads(MEASURED.read_text())))
+    put(DOCUMENT, render(json.loads(MEASURED.read_text())), BEGIN, END)

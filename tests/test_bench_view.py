@@ -35,6 +35,7 @@ def figures() -> dict[str, object]:
     return json.loads(done.stdout)
 
 
+@pytest.mark.slow
 def test_every_phase_is_measured_in_one_run(figures: dict[str, object]) -> None:
     assert list(figures["phases"]) == PHASES
     for phase in figures["phases"].values():
@@ -47,6 +48,7 @@ def test_every_phase_is_measured_in_one_run(figures: dict[str, object]) -> None:
     assert run["realtime_granted"]
 
 
+@pytest.mark.slow
 def test_the_view_that_works_is_a_real_one(figures: dict[str, object]) -> None:
     view = figures["view"]
     assert view["bridge_cpu_percent"] > 0
@@ -55,6 +57,7 @@ def test_the_view_that_works_is_a_real_one(figures: dict[str, object]) -> None:
     assert view["viewer_mb"] > 10
 
 
+@pytest.mark.slow
 def test_a_person_reads_one_line_for_each_phase(figures: dict[str, object]) -> None:
     title, *lines = render(figures).splitlines()
     assert "p99" in title

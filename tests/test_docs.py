@@ -10,13 +10,20 @@ from pathlib import Path
 
 import pytest
 from loops import children, interrupt, recorded_bytes, start, until
+from viewers import needs_vulkan
 
 ROOT = Path(__file__).parents[1]
 README = ROOT / "README.md"
 sys.path.insert(0, str(ROOT / "docs"))
 
 # Run by CI itself, which runs this test; and by the test of the viewer.
-ELSEWHERE = {"make sim-loop": ".ci/run", "make test": ".ci/run", "rerun logs/*.mcap": "tests/e2e/test_viewer.py"}
+ROUTE = "rerun rrd route --application-id $(basename $log .mcap) deploy/layouts/log.rbl | rerun $log -"
+ELSEWHERE = {
+    "make sim-loop": ".ci/run",
+    "make test": ".ci/run",
+    "rerun logs/*.mcap": "tests/e2e/test_viewer.py",
+    ROUTE: "tests/test_layout_files.py",
+}
 PROGRAMS = ("lowfc", "sim-camera", "sim-dm", "make", "rerun", "python")
 
 
@@ -49,7 +56,8 @@ def test_every_command_of_the_documents_is_known() -> None:
         line for document in (README, *ROOT.glob("docs/*.md"), *ROOT.glob("deploy/*.md")) for line in commands(document)
     ]
     assert len(found) > 15
-    tested = {*ELSEWHERE, *LOOPS, *LOGS, *REQUESTS, *FILES, *BY_HAND, *SESSION, *BENCH, *VALIDATE, *DESIGN}
+    tested = {*ELSEWHERE, *LOOPS, *LOGS, *REQUESTS, *FILES, *BY_HAND, *SESSION, *BENCH, *VALIDATE, *DESIGN, *LOOKING}
+    tested |= {*STAYING}
     assert set(found) == tested
     for command, where in ELSEWHERE.items():
         assert command.split()[0] in (ROOT / where).read_text()
@@ -81,6 +89,19 @@ FILES = (
 BY_HAND = ("sim-camera --run bench", "sim-dm --run bench", "lowfc controller --run bench", "lowfc record --run bench")
 SESSION = ("lowfc config zenoh --run bench --role camera",)
 BENCH = ("lowfc bench twin", "lowfc bench record --rate 1000 --seconds 2")
+STAYING = (
+    "lowfc sim-loop --web",
+    "lowfc view",
+    "lowfc view --web",
+    "lowfc view --foxglove",
+    "lowfc view logs/*.mcap",
+)
+"""They go on until Ctrl-C."""
+LOOKING = (
+    "lowfc view --headless-screenshot now.png",
+    "lowfc view --save night.rrd --seconds 60",
+    "lowfc view logs/*.mcap --headless-screenshot log.png --tab optics",
+)
 LOGS = (
     "lowfc info logs/*.mcap",
     "lowfc replay logs/*.mcap",
@@ -152,6 +173,36 @@ def test_the_logs(tmp_path: Path) -> None:
     assert {path.suffix for path in (tmp_path / "logs").iterdir()} == {".mcap", ".html", ".fits"}
 
 
+@pytest.mark.viewer
+@needs_vulkan
+def test_the_views(tmp_path: Path) -> None:
+    loop = start(tmp_path, *STAYING[0].split()[1:], "--rate", "100")
+    try:
+        until(lambda: recorded_bytes(tmp_path) > 4e6)
+        for command in STAYING[1:4]:
+            look(tmp_path, command)
+        for command in LOOKING[:2]:
+            run(tmp_path, command.replace("--seconds 60", "--seconds 1").replace("now.png", "now.png --seconds 2"))
+    finally:
+        _, complaints = interrupt(loop)
+    assert loop.returncode == 0, complaints
+    assert "http://127.0.0.1:" in complaints
+    look(tmp_path, STAYING[4])
+    run(tmp_path, LOOKING[2])
+    assert {path.name for path in tmp_path.iterdir()} >= {"now.png", "night.rrd", "log.png"}
+
+
+def look(folder: Path, command: str) -> None:
+    """Run a view until it says where it is to be seen, then Ctrl-C."""
+    words = [str(found) for word in command.split()[1:] for found in (folder.glob(word) if "*" in word else [word])]
+    process = start(folder, *words)
+    assert process.stderr is not None
+    said = process.stderr.readline()
+    assert "127.0.0.1" in said
+    _, complaints = interrupt(process)
+    assert process.returncode == 0, complaints
+
+
 def test_the_validation(tmp_path: Path) -> None:
     said = run(tmp_path, VALIDATE[0])
     assert "tilt" in said
@@ -168,7 +219,10 @@ def test_the_designs_are_taken_by_the_loop(tmp_path: Path) -> None:
 def test_the_measured_tables_are_those_of_their_files() -> None:
     import measure
     import measure_logs
+    import measure_view
 
-    for document, measured in ((README, measure), (measure_logs.DOCUMENT, measure_logs)):
-        table = document.read_text().partition(measure.BEGIN)[2].partition(measure.END)[0]
+    measured_by = {README: measure, measure_logs.DOCUMENT: measure_logs, measure_view.DOCUMENT: measure_view}
+    for document, measured in measured_by.items():
+        begin, end = getattr(measured, "BEGIN", measure.BEGIN), getattr(measured, "END", measure.END)
+        table = document.read_text().partition(begin)[2].partition(end)[0]
         assert table == measured.render(json.loads(measured.MEASURED.read_text()))

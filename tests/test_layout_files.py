@@ -26,6 +26,7 @@ from lowfc.adapters.rerun_viewer import vulkan_drivers
 from lowfc.adapters.run import free_ports
 from lowfc.contract.messages import EVENT, TRUTH, RawImage, Role, topic_of, wire
 from lowfc.optics.zernike import NOLLS_14, mode_name
+from lowfc.programs.view.layout import APPLICATION, layout
 from lowfc.programs.view.message_layout import message_layout
 
 LAYOUTS = Path(__file__).parents[1] / "deploy" / "layouts"
@@ -194,9 +195,11 @@ def of_rerun(path: Path) -> tuple[str, Counter[str], set[tuple[str, str]]]:
 
 
 def test_the_layout_for_rerun_is_the_one_that_the_code_makes(tmp_path: Path) -> None:
-    message_layout().save("lowfc", tmp_path / "made.rbl")
+    message_layout().save(APPLICATION, tmp_path / "log.rbl")
+    layout().save(APPLICATION, tmp_path / "lowfc.rbl")
+    assert of_rerun(LAYOUTS / "lowfc.rbl") == of_rerun(tmp_path / "lowfc.rbl"), "python docs/make_layouts.py"
     shipped = of_rerun(LAYOUTS / "log.rbl")
-    assert shipped == of_rerun(tmp_path / "made.rbl")
+    assert shipped == of_rerun(tmp_path / "log.rbl"), "python docs/make_layouts.py"
     assert shipped[1][f"ViewBlueprint:space_origin /{TRUTH.key}"] == 2
     assert len(shipped[2]) == 13
     for component, selector in shipped[2]:
@@ -218,6 +221,7 @@ def shaded(picture: Pixels) -> bool:
     return float(levels.max() / levels.sum()) < 0.8
 
 
+@pytest.mark.slow
 @pytest.mark.viewer
 @needs_vulkan
 def test_the_plain_viewer_plots_a_log(tmp_path: Path, artefacts: Path) -> None:

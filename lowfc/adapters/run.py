@@ -40,7 +40,7 @@ class Links:
 
     Attributes:
         run_id: the run they belong to.
-        ports: loopback TCP port of each role that listens: "camera", "controller", "mirror-dm", "recorder", "viewer".
+        ports: loopback TCP port of each role that listens: "camera", "controller", "mirror-dm", "recorder".
         user: name for zenoh's user/password authentication.
         secret_file: zenoh's dictionary, one line "user:password".
     """
@@ -197,7 +197,8 @@ def _draft(path: Path, text: str) -> Path:
 
 def _make(path: Path, mirrors: tuple[str, ...]) -> None:
     """Make the directory under another name and rename it; whoever is second leaves the first one's in place."""
-    roles = [Role.CAMERA, Role.CONTROLLER, *map(mirror_role, mirrors), Role.RECORDER, Role.VIEWER]
+    # Who only looks on connects and does not listen: there may be several, and nobody keeps looking for one.
+    roles = [Role.CAMERA, Role.CONTROLLER, *map(mirror_role, mirrors), Role.RECORDER]
     draft = Path(tempfile.mkdtemp(prefix=f".{path.name}-", dir=path.parent))  # mode 0700
     links = {
         "run_id": path.name,

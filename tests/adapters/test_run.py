@@ -17,8 +17,8 @@ def runtime(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 
 def test_a_run_has_ports_a_secret_and_closed_doors() -> None:
     run = open_run("night", mirrors=("dm", "tip"))
-    assert set(run.links.ports) == {"camera", "controller", "mirror-dm", "mirror-tip", "recorder", "viewer"}
-    assert len(set(run.links.ports.values())) == 6
+    assert set(run.links.ports) == {"camera", "controller", "mirror-dm", "mirror-tip", "recorder"}
+    assert len(set(run.links.ports.values())) == 5
     assert len(run.links.secret) == 64
     assert run.path.stat().st_mode & 0o777 == 0o700
     assert {path.stat().st_mode & 0o777 for path in run.path.iterdir()} == {0o600}

@@ -154,6 +154,7 @@ def test_a_port_that_is_taken_is_one_line(web: RerunViewer) -> None:
     assert "\n" not in str(caught.value)
 
 
+@pytest.mark.slow  # the live loop's page is looked at anyway
 @pytest.mark.browser
 @needs_chromium
 def test_an_image_that_was_logged_is_on_the_page(web: RerunViewer, tmp_path: Path) -> None:

@@ -6,6 +6,7 @@ import time
 from pathlib import Path
 from typing import Any
 
+import rerun as rr
 from rich.console import Console
 
 from lowfc.adapters.join import clock_of
@@ -21,7 +22,7 @@ from lowfc.programs.view.bridge import Bridge
 from lowfc.programs.view.layout import LIVE_WINDOW_S
 from lowfc.programs.view.painter import Painter
 from lowfc.programs.view.place import Place
-from lowfc.programs.view.recorded import draw_logs
+from lowfc.programs.view.recorded import Drawn, draw_logs
 
 PICTURE_AFTER_S = 8.0
 """Of a running loop: its plots have something to show by then."""
@@ -78,28 +79,25 @@ def look_at_logs(logs: list[Path], config: Configuration | None, where: Place) -
         DataFileError: a file cannot be read or written.
     """
     require_folder(where.save, where.picture)
-    console = Console(stderr=True)
     with contextlib.ExitStack() as stack:
         part = stack.enter_context(being_written(where.save)) if where.save is not None else None
         viewer = where.viewer() if where.show is not None else None
-        stream = where.stream(viewer, part, logs[0].stem, None)
-        stack.callback(stream.disconnect)
         if viewer is not None:
-            stack.callback(viewer.stop)  # before the stream, which would wait for one that hangs
+            stack.callback(viewer.stop)
+        stream = where.stream(viewer, part, logs[0].stem, None)
+        stack.callback(_end, stream, viewer)
         _say_where(where, viewer)
-        total = sum(log.stat().st_size for log in logs if log.exists())
-        with passing_bar(console) as bar:
-            task = bar.add_task("drawing", total=total)
-            drawn = draw_logs(
-                logs, config, lambda own: Painter(own, stream), lambda done: bar.update(task, completed=done)
-            )
-        stream.disconnect()  # the viewer keeps what it has
-        for remark in drawn.remarks:
-            sys.stderr.write(f"{remark}\n")
-        if viewer is not None and where.picture is not None:
-            viewer.screenshot(where.picture)
-        elif viewer is not None:
-            _stay(viewer)
+        if viewer is None or where.picture is not None:
+            drawn = _draw(logs, config, stream)
+            stream.disconnect()  # a viewer keeps what it has
+            if viewer is not None:
+                viewer.screenshot(where.picture)
+        else:
+            drawn = Drawn()
+            with contextlib.suppress(KeyboardInterrupt):  # the way to end it, whether everything is drawn yet or not
+                drawn = _draw(logs, config, stream)
+                while viewer.alive:
+                    time.sleep(_POLL_S)
     _say_written(where)
     return {
         "logs": [str(log) for log in logs],
@@ -110,16 +108,26 @@ def look_at_logs(logs: list[Path], config: Configuration | None, where: Place) -
     }
 
 
-def _stay(viewer: RerunViewer) -> None:
-    """Until the window is closed, or Ctrl-C."""
-    with contextlib.suppress(KeyboardInterrupt):
-        while viewer.alive:
-            time.sleep(_POLL_S)
+def _draw(logs: list[Path], config: Configuration | None, stream: rr.RecordingStream) -> Drawn:
+    total = sum(log.stat().st_size for log in logs if log.exists())
+    with passing_bar(Console(stderr=True)) as bar:
+        task = bar.add_task("drawing", total=total)
+        drawn = draw_logs(logs, config, lambda own: Painter(own, stream), lambda done: bar.update(task, completed=done))
+    for remark in drawn.remarks:
+        sys.stderr.write(f"{remark}\n")
+    return drawn
+
+
+def _end(stream: rr.RecordingStream, viewer: RerunViewer | None) -> None:
+    """End a stream; one into a viewer that hangs would wait for it, so that goes first."""
+    if viewer is not None and not viewer.answers():
+        viewer.stop()
+    stream.disconnect()
 
 
 def _say_where(where: Place, viewer: RerunViewer | None) -> None:
     if viewer is not None and where.show is Show.WEB:
-        sys.stderr.write(f"look at {viewer.web_address}\nCtrl-C ends the view; the loop goes on\n")
+        sys.stderr.write(f"look at {viewer.web_address}\nCtrl-C ends the view\n")
 
 
 def _say_written(where: Place) -> None:
