@@ -63,7 +63,7 @@ def render(measured: dict[str, Any]) -> str:
             f"| {memory['growth_mb_per_hour']:.1f} MB per hour |"
         )
     where = (
-        f'Shares and memory are of the phase "on"; '
+        f'Shares and memory are of the phase "on", in which {view["moments_hz"]:.0f} moments a second were drawn; '
         f"the view began anew {view['renewals']} times. The hour is "
         f"{hour['traffic_s']:.0f} s of traffic, {hour['messages']} messages, drawn in {hour['took_s']:.0f} s; the "
         "view's memory has in it the log that is played. The viewer is told to keep "

@@ -70,7 +70,7 @@ def test_a_person_reads_one_line_for_each_phase(figures: dict[str, object]) -> N
 def reading(phase: Phase, p50_us: float, **losses: int) -> Reading:
     """200 frames, of which the slowest four took twice as long."""
     frames_us = np.where(np.arange(200) < 196, p50_us, 2 * p50_us)
-    beside = Cost(0.1 * p50_us / 100, 0.01, 200_000_000, 50_000_000) if phase is Phase.ON else None
+    beside = Cost(0.1 * p50_us / 100, 0.01, 200_000_000, 50_000_000, 30.0) if phase is Phase.ON else None
     return Reading(
         phase, (frames_us * 1000).astype(np.int64), Losses(**{"skipped": 0, "missing": 0, "lost": 0, **losses}), beside
     )
@@ -104,6 +104,7 @@ def test_a_difference_stands_beside_the_spread() -> None:
         "viewer_cpu_percent": pytest.approx(1.0),
         "bridge_mb": 200.0,
         "viewer_mb": 50.0,
+        "moments_hz": 30.0,
     }
 
 

@@ -3,6 +3,7 @@
 import contextlib
 import ctypes
 import functools
+import os
 import signal
 import subprocess
 from collections.abc import Mapping
@@ -47,7 +48,7 @@ class Child:
             stderr=self._stream,
             env=self.environment,
             start_new_session=True,
-            preexec_fn=functools.partial(_signal_at_parents_death, self.when_we_die),
+            preexec_fn=functools.partial(_signal_at_parents_death, self.when_we_die, os.getpid()),
         )
 
     @property
@@ -85,5 +86,7 @@ class Child:
 _libc = ctypes.CDLL(None)
 
 
-def _signal_at_parents_death(number: signal.Signals) -> None:
+def _signal_at_parents_death(number: signal.Signals, parent: int) -> None:
     _libc.prctl(_PR_SET_PDEATHSIG, number)
+    if os.getppid() != parent:  # it died between fork and here
+        os._exit(1)

@@ -149,7 +149,8 @@ def cost(readings: Iterable["Reading"]) -> dict[str, Any]:
 
     Returns:
         bridge_cpu_percent and viewer_cpu_percent (of one processor, all threads; median over the repeats) and
-        bridge_mb and viewer_mb (resident; the most): of the view's process and of the viewer's server.
+        bridge_mb and viewer_mb (resident; the most): of the view's process and of the viewer's server;
+        moments_hz drawn, median: a view that gets no processor time is cheap.
     """
     costs = [reading.cost for reading in readings if reading.cost is not None]
     return {
@@ -157,6 +158,7 @@ def cost(readings: Iterable["Reading"]) -> dict[str, Any]:
         "viewer_cpu_percent": 100 * statistics.median(one.viewer_share for one in costs),
         "bridge_mb": max(one.bridge_bytes for one in costs) / 1e6,
         "viewer_mb": max(one.viewer_bytes for one in costs) / 1e6,
+        "moments_hz": statistics.median(one.moments_hz for one in costs),
     }
 
 
@@ -179,7 +181,8 @@ def render(figures: dict[str, Any]) -> str:
         f"frame to command, medians of {figures['repeats']} times {figures['seconds']:g} s at {figures['rate_hz']:g} "
         f"Hz; run-to-run spread, the range without a view: {', '.join(spreads)}",
         f"the view takes {view['bridge_cpu_percent']:.1f} % of a processor and {view['bridge_mb']:.0f} MB, its viewer "
-        f"{view['viewer_cpu_percent']:.1f} % and {view['viewer_mb']:.0f} MB; it began anew {view['renewals']} times",
+        f"{view['viewer_cpu_percent']:.1f} % and {view['viewer_mb']:.0f} MB; it drew {view['moments_hz']:.0f} moments "
+        f"a second and began anew {view['renewals']} times",
     ]
     return "\n".join(lines)
 

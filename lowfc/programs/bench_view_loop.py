@@ -78,12 +78,14 @@ class Cost:
     Attributes:
         bridge_share, viewer_share: of one processor, all threads.
         bridge_bytes, viewer_bytes: resident memory at the end.
+        moments_hz: drawn at the end; a view that gets no processor time is cheap.
     """
 
     bridge_share: float
     viewer_share: float
     bridge_bytes: int
     viewer_bytes: int
+    moments_hz: float
 
 
 @dataclass(frozen=True, slots=True)
@@ -270,7 +272,7 @@ class LoopBesideView:
             (processor_s(pid) - then_s) / elapsed_s for pid, then_s in zip(pids, used_s, strict=True)
         )
         bridge_bytes, viewer_bytes = map(resident_bytes_of, pids)
-        return Cost(bridge_share, viewer_share, bridge_bytes, viewer_bytes)
+        return Cost(bridge_share, viewer_share, bridge_bytes, viewer_bytes, self._watch.of(Role.VIEWER).rate_hz)
 
 
 def resident_bytes_of(pid: int) -> int:

@@ -37,6 +37,21 @@ def the_run(name: str | None) -> str:
     raise BusError(f"say which run with --run: {there}" if runs else there)
 
 
+def the_known_run(name: str | None) -> str:
+    """The run of that name, whether its controller is there or not, or the only one there is.
+
+    Raises:
+        BusError: there is no such run, none at all, or more than one to choose from.
+    """
+    if name is None:
+        return the_run(None)
+    if not (runtime_base() / name).is_dir():
+        raise BusError(
+            f"there is no run {name!r}: start its processes first; running are {', '.join(running()) or 'none'}"
+        )
+    return name
+
+
 def ask(run_id: str, name: str, modes: tuple[int, ...] = (), values: tuple[float, ...] = ()) -> wire.Request:
     """Send one request and return it with its answer.
 

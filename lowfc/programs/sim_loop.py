@@ -32,8 +32,6 @@ SETTLE_S = 0.02
 """After the last frame, before the controller is stopped: the last command is on its way."""
 LINE_PERIOD_S = 5.0
 SHOW_S = 0.1
-_BEFORE_RECORDER = 3
-"""Place of the view among the processes: the recorder ends last, and waits for the last words of all others."""
 
 
 class ProcessDiedError(LowfcError):
@@ -62,7 +60,7 @@ def sim_loop(config: Configuration, duration_s: float | None, record: bool, show
         prepare(config, run, console)
         children = children_of(config, run, duration_s, record)
         if show is not None:
-            children.insert(_BEFORE_RECORDER, _view(run, show, console))
+            children.insert(len(children) - record, _view(run, show, console))  # the recorder ends last
         watch = Watch({}, [])
         start_all(children)
         bus = ZenohBus(run.links, Role.LAUNCHER, HostClock())
@@ -162,7 +160,13 @@ def _say_view_ended(children: list[Child], console: Console) -> bool:
     for child in children:
         if child.name == Role.VIEWER and child.status is not None:
             if child.status != 0:
-                console.print(f"the loop goes on without its view: {child.last_words()}", markup=False)
+                why = child.last_words().splitlines()[-1:] if child.status > 0 else []
+                told = "; ".join([child.how_it_ended(), *why])
+                console.print(
+                    f"the loop goes on without its view ({told}); `lowfc view` starts another",
+                    markup=False,
+                    soft_wrap=True,
+                )
             return True
     return False
 

@@ -135,10 +135,13 @@ def test_a_log_without_an_end_is_a_file_for_rerun(tmp_path: Path) -> None:
     [
         ({"web": True, "native": True}, "choose one"),
         ({"foxglove": True, "web": True}, "--foxglove"),
-        ({"run": "NO SUCH", "web": True}, "a run's name"),
+        ({"run": "nosuch", "web": True}, "there is no run"),
         ({"logs": [Path("nothing.mcap")], "save": Path("x.rrd")}, "nothing.mcap"),
         ({"logs": [Path("nothing.mcap")], "save": Path("nowhere/x.rrd")}, "nowhere"),
         ({"native": True}, "no screen"),
+        ({"headless_screenshot": Path("x.jpg")}, "ends in .png"),
+        ({"web": True, "port": 15999, "web_port": 15999}, "must differ"),
+        ({"logs": [Path("nothing.mcap")], "seconds": 3.0}, "--seconds"),
     ],
 )
 def test_mistakes_are_one_line(
@@ -147,9 +150,9 @@ def test_mistakes_are_one_line(
     monkeypatch.chdir(tmp_path)
     for screen in ("DISPLAY", "WAYLAND_DISPLAY"):
         monkeypatch.delenv(screen, raising=False)
-    monkeypatch.setattr("lowfc.programs.view.look.give_way", lambda: None)
+    monkeypatch.setattr("lowfc.adapters.realtime.give_way", lambda: None)
     if "run" not in given and "logs" not in given:
-        given = given | {"run": "mistaken"}
+        given = given | {"run": open_run("mistaken").run_id}
     with pytest.raises(LowfcError, match=complaint) as raised:
         view(**given)  # type: ignore[arg-type]
     assert len(str(raised.value).splitlines()) == 1

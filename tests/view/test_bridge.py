@@ -36,6 +36,9 @@ class Screen:
     def resident_bytes(self) -> int:
         return self.held_bytes
 
+    def answers(self) -> bool:
+        return not self.stopped.is_set()
+
     def how_it_ended(self) -> str:
         return "the viewer was killed"
 

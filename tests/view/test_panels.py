@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+import report_log
 import rerun.blueprint as rrb
 from report_log import Night
 from tape import Tape, pixels
@@ -14,13 +15,26 @@ from toy import FLUX_DN, NOLL
 from lowfc.adapters.log_reader import LogReader
 from lowfc.contract.codec import actuators
 from lowfc.contract.configuration import Configuration
-from lowfc.contract.messages import EVENT, FRAME, MIRROR_STATE, STEP, SURFACE, TRUTH, Log, image, topic_of, wire
+from lowfc.contract.errors import DataFileError
+from lowfc.contract.messages import (
+    CONTROLLER_STATE,
+    EVENT,
+    FRAME,
+    MIRROR_STATE,
+    STEP,
+    SURFACE,
+    TRUTH,
+    Log,
+    image,
+    topic_of,
+    wire,
+)
 from lowfc.optics.photometry import tilt_nm_per_mas
 from lowfc.optics.zernike import mode_name
-from lowfc.programs.view import mirror, sensor, wavefront
+from lowfc.programs.view import marks, mirror, sensor, wavefront
 from lowfc.programs.view.layout import layout
 from lowfc.programs.view.moment import Gatherer, Moment
-from lowfc.programs.view.painter import Painter
+from lowfc.programs.view.painter import RETRY_NS, Painter
 from lowfc.programs.view.recorded import draw_logs
 from lowfc.programs.view.scale import Scale, round_up
 
@@ -67,7 +81,7 @@ def test_every_step_and_truth_is_drawn_under_its_name() -> None:
     np.testing.assert_allclose(
         tape.column(wavefront.RMS)[1], [[one.residual_rms_nm, one.disturbance_rms_nm] for one in truths], rtol=1e-6
     )
-    assert tape.names(wavefront.RMS) == ["now, true", "as it would be open, true"]
+    assert tape.names(wavefront.RMS) == ["residual, true", "with a flat mirror, true"]
     mas = np.array([one.residual_nm[:2] for one in truths]) / tilt_nm_per_mas(Configuration().star.diameter_m)
     np.testing.assert_allclose(tape.column(wavefront.TILT)[1], mas, rtol=1e-6)
 
@@ -78,7 +92,7 @@ def test_without_truth_it_is_measured_and_says_so() -> None:
     steps = [wire.ControlStep.FromString(one.payload) for one in made.samples if one.key == STEP.key]
     rms_nm = [[np.hypot.reduce(step.error_nm), np.hypot.reduce(step.pol_nm)] for step in steps]
     np.testing.assert_allclose(tape.column(wavefront.RMS)[1], rms_nm, rtol=1e-5)
-    assert tape.names(wavefront.RMS) == ["now, measured", "as it would be open, pseudo-open-loop"]
+    assert tape.names(wavefront.RMS) == ["residual, measured", "with a flat mirror, pseudo-open-loop"]
     assert wavefront.TRUTH not in tape.rows
 
 
@@ -134,7 +148,7 @@ def test_the_mode_is_a_band_and_events_have_their_level() -> None:
     states = [archetype.state.as_arrow_array().to_pylist() for _, (archetype,) in tape.logged["loop/mode"][1:]]
     assert states == [["CLOSED"], ["OPEN"]]
     lines = [found for path, lines in tape.logged.items() if path.startswith("log/") for _, (found,) in lines]
-    levels = {text(line.text).split()[1]: text(line.level) for line in lines}
+    levels = {text(line.text).split()[2]: text(line.level) for line in lines}
     assert levels["RECORDING_FAILED"] == "ERROR"
 
 
@@ -159,7 +173,7 @@ def test_what_nobody_foresaw_costs_one_message_not_the_view() -> None:
     assert wavefront.ERROR in tape.rows
 
 
-def test_a_panel_that_fails_is_left_out_and_said_so() -> None:
+def test_a_panel_that_fails_is_left_out_for_a_while_and_said_so() -> None:
     moment = whole(night())
     broken = dataclasses.replace(moment, frame=np.zeros((2, 3, 4), np.uint16))
     tape = Tape()
@@ -169,6 +183,56 @@ def test_a_panel_that_fails_is_left_out_and_said_so() -> None:
     assert len(painter.panels) == before - 1
     assert "Sensor is left out" in text(tape.last("log/view").text)
     assert wavefront.ERROR in tape.rows
+    painter.draw(dataclasses.replace(moment, time_ns=moment.time_ns + RETRY_NS - 1))
+    assert len(painter.panels) == before - 1
+    painter.draw(dataclasses.replace(moment, time_ns=moment.time_ns + RETRY_NS))
+    assert len(painter.panels) == before
+    assert sensor.DIFFERENCE in tape.logged
+
+
+def test_an_older_state_does_not_replace_a_newer_one() -> None:
+    made = night()
+    gatherer = Gatherer()
+    states = [one for one in made.samples if one.key == CONTROLLER_STATE.key]
+    old, new = states[0], dataclasses.replace(states[0], sequence=states[0].sequence + 1, payload=b"")
+    for sample in (new, old):
+        gatherer.take(CONTROLLER_STATE, sample.key, sample.payload, sample.publish_time_ns, sample.sequence)
+    assert gatherer.moment(0).controller == wire.ControllerState()
+
+
+def test_an_odd_step_costs_itself_alone() -> None:
+    gatherer, payloads = Gatherer(), [one.payload for one in night().samples if one.key == STEP.key]
+    odd = wire.ControlStep.FromString(payloads[0])
+    del odd.error_nm[1:]
+    for payload in (*payloads, odd.SerializeToString()):
+        gatherer.take(STEP, STEP.key, payload, 1)
+    assert len(gatherer.moment(2).steps.sequence) == FRAMES
+    assert gatherer.unreadable == 1
+
+
+def test_before_the_first_frame_of_a_run_in_lockstep_its_own_time_holds() -> None:
+    moment = Gatherer(simulated_ns=5).moment(host_ns=10**18)
+    assert moment.time_ns == 5
+    assert Gatherer().moment(host_ns=10**18).time_ns == 10**18
+
+
+def test_refused_frames_are_a_gap() -> None:
+    tape = Tape()
+    marks.curves(tape, "x", np.arange(6), np.array([1.0, np.nan, np.nan, 2.0, np.inf, 3.0]))  # type: ignore[arg-type]
+    times, values = tape.column("x")
+    assert times.tolist() == [0, 1, 3, 4, 5]
+    assert np.isfinite(values[:, 0]).tolist() == [True, False, True, False, True]
+
+
+def test_logs_of_two_runs_are_not_laid_over_each_other(tmp_path: Path) -> None:
+    logs = [night().write(tmp_path / f"{name}.mcap") for name in "ab"]
+    paint = lambda config: Painter(config, Tape())  # type: ignore[arg-type]  # noqa: E731
+    assert draw_logs(logs, Configuration(), paint).moments > 0
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setitem(report_log.METADATA["lowfc"], "run", "another")
+        night().write(logs[1].with_name("c.mcap"))
+    with pytest.raises(DataFileError, match="one at a time"):
+        draw_logs([logs[0], logs[1].with_name("c.mcap")], Configuration(), paint)
 
 
 def test_a_log_is_drawn_moment_by_moment_and_every_view_of_the_layout_has_something(tmp_path: Path) -> None:

@@ -142,6 +142,7 @@ def test_an_open_run_is_grey_and_says_how_to_close_it(tmp_path: Path) -> None:
     assert verdict.level is tile(verdict, "LOOP").level is Level.NEUTRAL
     assert "lowfc ctl close" in verdict.headline
     assert "not corrected" in tile(verdict, "WAVEFRONT").detail
+    assert "mirror holds its last shape" in tile(verdict, "LOOP").detail
 
 
 def test_a_saturated_detector_is_told_from_a_star_that_is_gone(tmp_path: Path) -> None:
@@ -190,7 +191,7 @@ class Stage:
         self.flux, self.full = 1.0, 0
         self.stroke_nm, self.latency_us = 100.0, 500
         self.status = wire.MIRROR_STATUS_FOLLOWING
-        self.frames = 0
+        self.frames, self.start_s = 0, START
         self.behind_s = 0.0
         self.calibrated = True
 
@@ -229,7 +230,7 @@ class Stage:
 
     def _frame(self) -> None:
         self.frames += 1
-        sequence, stamp = sequence_of(START, self.frames), timestamp(self.data_ns)
+        sequence, stamp = sequence_of(self.start_s, self.frames), timestamp(self.data_ns)
         residual_nm, open_nm = ([size, 0.0, 0.0] for size in (self.residual_nm, self.open_nm))
         if self._talks("camera"):
             pixels = TOY.pixels([0.0] * len(NOLL), self.flux * FLUX_DN)
@@ -322,6 +323,13 @@ STATES: dict[str, tuple[Callable[[Stage], object], str, str, Level, str]] = {
     # name: what changes; the tile that tells it, its value and level; words of the headline
     "healthy": (lambda stage: None, "LOOP", "CLOSED", Level.GOOD, "nothing is wrong"),
     "open": (setting(mode=LoopMode.OPEN), "LOOP", "OPEN", Level.NEUTRAL, "lowfc ctl close"),
+    "open, worse than flat": (
+        setting(mode=LoopMode.OPEN, residual_nm=60.0),
+        "LOOP",
+        "OPEN",
+        Level.NEUTRAL,
+        "worse than a flat mirror: `lowfc ctl safe` flattens it",
+    ),
     "camera changed": (opened_by_itself, "LOOP", "OPEN", Level.WARNING, "opened by itself"),
     "safed": (setting(mode=LoopMode.SAFED), "LOOP", "SAFED", Level.BAD, "lowfc ctl clear"),
     "no calibration": (
@@ -358,7 +366,7 @@ STATES: dict[str, tuple[Callable[[Stage], object], str, str, Level, str]] = {
     "little stroke left": (setting(stroke_nm=650.0), "MIRROR", "93 %", Level.WARNING, "little is left"),
     "expired": (setting(status=wire.MIRROR_STATUS_EXPIRED), "MIRROR", "EXPIRED", Level.BAD, "gets no commands"),
     "harmful": (setting(residual_nm=60.0), "WAVEFRONT", "60.0 nm rms", Level.WARNING, "The loop does harm"),
-    "diverging": (setting(residual_nm=400.0), "WAVEFRONT", "400 nm rms", Level.BAD, "400 nm rms, 40.0 nm without"),
+    "diverging": (setting(residual_nm=400.0), "WAVEFRONT", "400 nm rms", Level.BAD, "40.0 nm with a flat mirror"),
     "late commands": (saying("camera", commands_late=80), "LATENCY", "80 LATE", Level.WARNING, "80 commands, "),
     "slow": (setting(latency_us=30_000), "LATENCY", "30000 us", Level.WARNING, "longer than a frame"),
     "recorder failed": (
@@ -403,6 +411,75 @@ def test_what_a_dead_controller_leaves_is_not_called_good(verdicts: dict[str, Ve
     assert tile(verdicts["camera dead"], "LOOP").value == tile(verdicts["star gone"], "LOOP").value == "HOLDING"
 
 
+@pytest.mark.parametrize(
+    ("name", "compared"),
+    [
+        ("open", "not corrected; 40.0 nm with a flat mirror"),
+        ("safed", "not corrected; 40.0 nm with a flat mirror"),
+        ("controller dead", "not corrected; 40.0 nm with a flat mirror"),
+        ("star gone", "of 40.0 nm with a flat mirror"),
+        ("ended", "of 40.0 nm with a flat mirror"),
+    ],
+)
+def test_only_where_nothing_corrects_it_is_said(verdicts: dict[str, Verdict], name: str, compared: str) -> None:
+    found = tile(verdicts[name], "WAVEFRONT")
+    assert (found.detail.startswith(compared), found.level) == (True, Level.NEUTRAL), found
+
+
+@pytest.mark.parametrize("after_s", [0.5, 20.0])
+def test_what_is_left_of_an_ended_run_is_called_the_last_of_it_and_is_grey(after_s: float) -> None:
+    verdict = staged(stop(*EVERYBODY), after_s=after_s)
+    last = [tile(verdict, title).value for title in ("WAVEFRONT", "STAR", "LATENCY")]
+    assert last == ["last: 5.0 nm", "last: 100 %", "last: 500 us"]
+    assert set(levels(verdict).values()) == {Level.NEUTRAL}
+
+
+def test_a_few_lost_frames_are_told_and_are_no_alarm() -> None:
+    stage = Stage()
+    stage.begin()
+    stage.run(3)
+    counting(skipped=1)(stage)
+    verdict = stage.run(1)
+    frames = tile(verdict, "FRAMES")
+    assert (frames.value, frames.level, verdict.level) == ("50 Hz", Level.GOOD, Level.GOOD)
+    assert frames.detail == "1 frame skipped in the last 5 s"
+    counting(skipped=2)(stage)  # 2 of 250 are more than 0.5 %
+    verdict = stage.run(1)
+    assert (tile(verdict, "FRAMES").value, verdict.level) == ("2 LOST", Level.WARNING)
+    assert verdict.headline.startswith("2 frames lost in the last 5 s")
+
+
+def test_a_refused_frame_is_told_and_is_no_alarm() -> None:
+    stage = Stage()
+    stage.begin()
+    stage.run(3)
+    stage.reasons = (Reason.LATE,)
+    stage.run(0.02)
+    stage.reasons = ()
+    frames = tile(stage.run(0.98), "FRAMES")
+    assert (frames.level, frames.detail) == (Level.GOOD, "1 frame refused in the last 5 s")
+
+
+def test_a_camera_that_restarts_is_never_called_unused() -> None:
+    stage = Stage()
+    stage.begin()
+    stage.run(3)
+    stage.start_s += 100
+    values = [tile(stage.run(0.1), "FRAMES").value for _ in range(15)]
+    assert set(values) == {"50 Hz"}
+
+
+def test_a_dead_mirror_is_not_hidden_by_one_that_was_stopped_or_runs() -> None:
+    stage = Stage()
+    stage.begin()
+    stage.states |= {"mirror-dm": "running", "mirror-tt": "running", "mirror-old": "stopped"}
+    stage.run(1)
+    stage.silent = {"mirror-old"}
+    assert tile(stage.run(3), "MIRROR").level is Level.GOOD
+    stage.silent.add("mirror-tt")
+    assert (tile(stage.run(3), "MIRROR").value, tile(stage.run(3), "LOOP").level) == ("DEAD", Level.WARNING)
+
+
 def test_losses_stay_for_five_seconds_and_then_go() -> None:
     stage = Stage()
     stage.begin()
@@ -418,7 +495,10 @@ def test_without_truth_the_measured_wavefront_is_told_as_such() -> None:
     stage.begin()
     found = tile(stage.run(3), "WAVEFRONT")
     tilt = f"tilt {5 / np.sqrt(2) / MAS:.1f} of {40 / np.sqrt(2) / MAS:.1f} mas per axis"
-    assert (found.value, found.detail) == ("5.0 nm rms", f"8.0 x better than 40.0 nm; {tilt}; measured, with noise")
+    assert (found.value, found.detail) == (
+        "5.0 nm rms",
+        f"8.0 x better than 40.0 nm with a flat mirror; {tilt}; measured, with noise",
+    )
 
 
 def test_simulated_time_is_neither_silence_nor_latency() -> None:
@@ -465,8 +545,11 @@ def test_a_view_that_is_behind_does_not_take_the_run_for_dead() -> None:
 # The picture.
 
 
-def pixels(verdict: Verdict) -> npt.NDArray[np.uint8]:
-    with Image.open(io.BytesIO(png(picture(verdict)))) as shown:
+NOON_NS = 43_200 * 10**9
+
+
+def pixels(verdict: Verdict, time_ns: int = NOON_NS) -> npt.NDArray[np.uint8]:
+    with Image.open(io.BytesIO(png(picture(verdict, time_ns)))) as shown:
         return np.asarray(shown.convert("RGB"))
 
 
@@ -496,10 +579,20 @@ def test_longer_words_are_smaller_words_not_fewer() -> None:
     assert (pixels(whole[0]) != pixels(whole[1])).any()
 
 
+def test_the_time_of_day_is_at_the_right_end_of_the_headline_and_nowhere_else() -> None:
+    verdict = Verdict(LONG, Level.GOOD, (Tile("A", "B", LONG, Level.GOOD),) * 7)
+    noon, next_second, next_day = (pixels(verdict, NOON_NS + 10**9 * later) for later in (0, 1, 86_400))
+    differs = np.argwhere((noon != next_second).any(axis=2))
+    (top, left), (bottom, right) = differs.min(axis=0), differs.max(axis=0)
+    assert 0 < top < bottom < places(7)[0][3]
+    assert WIDTH - 190 < left < right < WIDTH
+    assert (noon == next_day).all()
+
+
 def test_levels_differ_in_lightness_too() -> None:
     light = sorted(float(np.dot(FILL[level], (0.2126, 0.7152, 0.0722))) for level in Level)
     assert min(np.diff(light)) > 8
-    assert len({picture(Verdict("", level, ())).tobytes() for level in Level}) == len(Level)
+    assert len({picture(Verdict("", level, ()), NOON_NS).tobytes() for level in Level}) == len(Level)
 
 
 class Noting(rr.RecordingStream):
@@ -511,7 +604,7 @@ class Noting(rr.RecordingStream):
         self.logged.append((path, what))
 
 
-def test_the_panel_speaks_when_something_changes_and_not_otherwise() -> None:
+def test_the_panel_draws_the_clock_each_second_and_speaks_when_something_changes() -> None:
     stream = Noting("test")
     logged = stream.logged = []
     panel, stage = Tiles(MAS), Stage()
@@ -529,7 +622,8 @@ def test_the_panel_speaks_when_something_changes_and_not_otherwise() -> None:
     assert 1 <= said.count(HEADLINE) <= said.count(TILES)
     logged.clear()
     stage.run(3)
-    assert logged == []
+    assert [path for path, _ in logged] == [TILES] * 3
+    logged.clear()
     stage.mode = LoopMode.SAFED
     stage.run(0.5)
     assert [path for path, _ in logged][:2] == [TILES, HEADLINE]

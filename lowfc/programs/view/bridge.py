@@ -4,6 +4,7 @@ What arrives waits in rings that keep the newest, a brush draws from them, and t
 viewer's process and the memory of both. What goes wrong is mended by beginning anew, with an event that says why.
 """
 
+import threading
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -12,7 +13,7 @@ import rerun as rr
 
 from lowfc.adapters.bus import Bus, Sample, last_of
 from lowfc.adapters.clock import Clock
-from lowfc.adapters.rerun_viewer import RerunViewer, Show
+from lowfc.adapters.rerun_viewer import RerunViewer, Show, ViewerError
 from lowfc.adapters.service import Service, resident_bytes
 from lowfc.contract.configuration import Configuration
 from lowfc.contract.errors import LowfcError
@@ -20,10 +21,10 @@ from lowfc.contract.messages import HEALTH, STEP, TRUTH, Role, Topic
 from lowfc.programs.view.brush import Brush
 from lowfc.programs.view.moment import NEWEST_ONLY, SHOWN
 
-WAITING = dict.fromkeys(SHOWN, 200) | dict.fromkeys(NEWEST_ONLY, 1) | {STEP: 2000, TRUTH: 2000}
-"""Messages that wait, by topic: of pictures the newest, of rows those of two seconds at 1 kHz. Each may hold 64 kB."""
+WAITING = dict.fromkeys(SHOWN, 50) | dict.fromkeys(NEWEST_ONLY, 1) | {STEP: 500, TRUTH: 500}
+"""Messages that wait, by topic: of pictures the newest, of rows half a second at 1 kHz; each may hold 64 kB."""
 OWN_BYTES = 512_000_000
-"""Memory of this process above which the view begins anew; what a hung viewer holds up stays below it."""
+"""Memory of this process above which the view begins anew: 160 MB, 100 MB of rings and 150 MB unsent stay below it."""
 VIEWER_SPARE_BYTES = 1_500_000_000
 """Memory of a viewer beyond what it may keep of the stream: its textures, plots and window are not in that limit."""
 STUCK_S = 10.0
@@ -31,6 +32,7 @@ STUCK_S = 10.0
 
 _TURN_S = 0.1
 _LOOK_S = 1.0
+_FROZEN_S = 3.0
 _MOST_RENEWALS = 5
 _RENEWALS_S = 60.0
 
@@ -85,6 +87,7 @@ class Bridge:
         self._drawn = self._renewals = self._most_bytes = 0
         self._renewed_s: list[float] = []
         self._stuck = False
+        self._awake_s = time.monotonic()
         self._asked: set[tuple[str, int]] = set()
         self._rings = {topic: bus.ring(topic, WAITING[topic]) for topic in SHOWN}
         self.service = Service(Role.VIEWER, run_id, clock, bus)
@@ -112,10 +115,13 @@ class Bridge:
             self.service.state = "ready"
             began_s = looked_s = time.monotonic()
             while self.service.running:
+                self.service.work = self._moments
                 self.service.beat()
                 time.sleep(_TURN_S)
                 now_s = time.monotonic()
                 if now_s - looked_s >= _LOOK_S:
+                    if now_s - looked_s > _FROZEN_S:
+                        self._awake_s = now_s  # this process stood still, and so did the brush
                     looked_s = now_s
                     self._look(now_s)
                 if until_s is not None and now_s - began_s >= until_s:
@@ -123,6 +129,8 @@ class Bridge:
             return Summary(self._moments, self._renewals, self._most_bytes)
         finally:
             self.service.finish()
+            if self._viewer is not None and not self._viewer.answers():
+                self._viewer.stop()  # or the brush would wait for it
             self._lay_down()
 
     def close(self) -> None:
@@ -158,9 +166,10 @@ class Bridge:
     def _look(self, now_s: float) -> None:
         """Is everything well?"""
         there = {(name, health.pid) for name, health in list(self.service.heard.items())}
-        if there - self._asked and self._brush is not None:
+        if there - self._asked and (brush := self._brush) is not None:
             self._asked |= there
-            self._brush.tell(self._ask())
+            # One who is frozen answers late; the rest goes on meanwhile.
+            threading.Thread(target=lambda: brush.tell(self._ask()), name="ask", daemon=True).start()
         own_bytes = resident_bytes()
         self._most_bytes = max(self._most_bytes, own_bytes)
         if self._viewer is not None and not self._viewer.alive:
@@ -170,16 +179,19 @@ class Bridge:
                 self._renew(self._viewer.how_it_ended())
         elif self._brush is not None and self._brush.fault is not None:
             self._renew(f"drawing failed: {self._brush.fault!r}")
+        elif self._brush is not None and self._stuck_s(now_s) > STUCK_S:
+            self._unstick(self._stuck_s(now_s))
         elif own_bytes > OWN_BYTES:
             self._renew(f"the bridge holds {own_bytes / 1e6:.0f} MB, more than {OWN_BYTES / 1e6:.0f} MB")
             if resident_bytes() > OWN_BYTES:
                 raise ViewError(f"the view holds more than {OWN_BYTES / 1e6:.0f} MB even when new; start it again")
         elif self._viewer is not None and self._viewer.resident_bytes() > self._viewer_bytes + VIEWER_SPARE_BYTES:
             self._renew(f"the viewer holds {self._viewer.resident_bytes() / 1e6:.0f} MB")
-        elif self._brush is not None and now_s - self._brush.painted_s > STUCK_S:
-            self._unstick(now_s - self._brush.painted_s)
         else:
             self._stuck = False
+
+    def _stuck_s(self, now_s: float) -> float:
+        return now_s - max(self._brush.painted_s, self._awake_s) if self._brush is not None else 0.0
 
     def _unstick(self, stuck_s: float) -> None:
         """A window belongs to whoever looks at it: it is waited for. A server is started again."""
@@ -191,16 +203,23 @@ class Bridge:
             self._renew(f"the viewer took nothing for {stuck_s:.0f} s")
 
     def _renew(self, why: str) -> None:
-        """Begin anew, with a new viewer on the same ports."""
-        now_s = time.monotonic()
-        self._renewed_s = [at_s for at_s in self._renewed_s if now_s - at_s < _RENEWALS_S] + [now_s]
-        if len(self._renewed_s) > _MOST_RENEWALS:
-            raise ViewError(
-                f"the view began anew {_MOST_RENEWALS} times within {_RENEWALS_S:g} s; the last time: {why}"
-            )
-        self.service.event("VIEW_RENEWED", why=why)
-        self._renewals += 1
-        if self._viewer is not None:
-            self._viewer.stop()
-        self._lay_down()
-        self._begin()
+        """Begin anew, with a new viewer on the same ports; a file cannot be begun anew, and is kept as far as it is."""
+        if self._open_viewer is None:
+            raise ViewError(f"the view into a file ended: {why}")
+        while True:
+            now_s = time.monotonic()
+            self._renewed_s = [at_s for at_s in self._renewed_s if now_s - at_s < _RENEWALS_S] + [now_s]
+            if len(self._renewed_s) > _MOST_RENEWALS:
+                raise ViewError(
+                    f"the view began anew {_MOST_RENEWALS} times in {_RENEWALS_S:g} s; the last time: {why}"
+                )
+            self.service.event("VIEW_RENEWED", why=why)
+            self._renewals += 1
+            if self._viewer is not None:
+                self._viewer.stop()
+            self._lay_down()
+            try:
+                self._begin()
+                return
+            except ViewerError as error:
+                why = str(error)

@@ -64,11 +64,14 @@ class Brush(threading.Thread):
 
     def _draw(self) -> None:
         stream = self._make_stream()
-        painter, gatherer = Painter(self._config, stream), Gatherer()
-        due_s = time.monotonic()
+        painter = Painter(self._config, stream)
+        gatherer = Gatherer(self._clock.now_ns() if self._clock.lockstep else None)
+        due_s = began_s = time.monotonic()
         while not self._abandoned:
+            now_s = time.monotonic()
+            behind_s, began_s = max(0.0, now_s - began_s - 1 / PICTURES_HZ), now_s  # what arrived may be that old
             self._gather(gatherer)
-            whole, behind_s = self.moments % PICTURES_PER_WHOLE == 0, time.monotonic() - due_s
+            whole = self.moments % PICTURES_PER_WHOLE == 0
             painter.draw(gatherer.moment(self._clock.host_ns(), whole=whole, behind_s=behind_s))
             self.moments += 1
             self.painted_s = time.monotonic()
@@ -79,7 +82,7 @@ class Brush(threading.Thread):
     def _gather(self, gatherer: Gatherer) -> None:
         while self._told:
             topic, sample = self._told.popleft()
-            gatherer.take(topic, sample.key, sample.payload, sample.publish_time_ns)
+            gatherer.take(topic, sample.key, sample.payload, sample.publish_time_ns, sample.sequence)
         for topic, ring in self._rings.items():
             for sample in ring.drain():
-                gatherer.take(topic, sample.key, sample.payload, sample.publish_time_ns)
+                gatherer.take(topic, sample.key, sample.payload, sample.publish_time_ns, sample.sequence)

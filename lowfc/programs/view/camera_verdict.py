@@ -2,11 +2,13 @@
 
 from lowfc.contract.messages import FRAME
 from lowfc.control.safety import Reason
-from lowfc.programs.view.tile import Level, Tile, ago
+from lowfc.programs.view.tile import Level, Tile, ago, counted
 from lowfc.programs.view.watcher import GRACE_S, RECENT_S, SILENT_S, Life, Watcher
 
 SLOW = 0.9
 """Frames at less than this share of the camera's own rate are a camera or host that does not keep up."""
+FEW = 0.005
+"""Fewer frames than this share, lost or refused, do no harm that anybody could measure: they are told, no more."""
 MANY_LOST = 0.1
 """Where a tenth of the frames is lost, the loop is no longer the one that was tuned."""
 DARK, DIM, BRIGHT = 0.2, 0.5, 2.0
@@ -49,52 +51,68 @@ def _refused(watcher: Watcher) -> Tile:
         advice = f"Every frame is refused, {word}: {what}. The mirror holds."
         return Tile(title, "REFUSED", f"all: {word}", Level.BAD, advice)
     count = sum(counts.values())
-    advice = f"{count} frames refused in the last {RECENT_S:g} s, {word}: {what}."
-    return Tile(
-        title,
-        f"{count} REFUSED",
-        f"{word}, in the last {RECENT_S:g} s",
-        Level.WARNING if count else Level.NEUTRAL,
-        advice,
-    )
+    advice = f"{counted(count, 'frame')} refused in the last {RECENT_S:g} s, {word}: {what}."
+    level = Level.WARNING if count >= FEW * _due(watcher) else Level.NEUTRAL
+    return Tile(title, f"{count} REFUSED", f"{word}, in the last {RECENT_S:g} s", level, advice)
 
 
 def _lost(watcher: Watcher) -> Tile:
     skipped, missing = watcher.recent("skipped"), watcher.recent("missing")
     lost = skipped + missing
-    due = RECENT_S * 1e9 / watcher.period_ns if watcher.period_ns else 0.0
-    share = lost / max(watcher.recent("steps") + lost, due, 1)
+    share = lost / _due(watcher)
     said = [f"{skipped} skipped (controller busy)"] * bool(skipped) + [f"{missing} never arrived"] * bool(missing)
     advice = (
-        f"{lost} frames lost in the last {RECENT_S:g} s, {100 * share:.2g} %: {', '.join(said)}. "
+        f"{counted(lost, 'frame')} lost in the last {RECENT_S:g} s, {100 * share:.2g} %: {', '.join(said)}. "
         "Free the host's processors or lower the rate."
     )
-    level = Level.NEUTRAL if not lost else Level.BAD if share > MANY_LOST else Level.WARNING
+    level = Level.BAD if share > MANY_LOST else Level.WARNING if share >= FEW else Level.NEUTRAL
     return Tile("FRAMES", f"{lost} LOST", f"{', '.join(said)}, in the last {RECENT_S:g} s", level, advice)
+
+
+def _due(watcher: Watcher) -> float:
+    """Frames that there should have been lately, at least 1."""
+    nominal = RECENT_S * 1e9 / watcher.period_ns if watcher.period_ns else 0.0
+    return max(watcher.recent("steps") + watcher.recent("skipped") + watcher.recent("missing"), nominal, 1)
+
+
+def _few(watcher: Watcher) -> str:
+    """Lost and refused frames, as they are told where they are few."""
+    counts = {
+        "skipped": watcher.recent("skipped"),
+        "never arrived": watcher.recent("missing"),
+        "refused": sum(watcher.recent(reason) for reason in _REFUSED),
+    }
+    said = [f"{counted(count, 'frame')} {what}" for what, count in counts.items() if count]
+    return f"{', '.join(said)} in the last {RECENT_S:g} s" if said else "none lost, none refused"
 
 
 def _rate(watcher: Watcher) -> Tile:
     title, rate_hz = "FRAMES", watcher.rate_hz()
+    if rate_hz is None and watcher.now("steps"):
+        return Tile(title, "STARTING", "too few for a rate", Level.NEUTRAL)
     if rate_hz is None:
         return Tile(title, "UNUSED", "frames come, nobody takes them", Level.NEUTRAL)
     clock = ", simulated time" if watcher.simulated else ""
     value = f"{rate_hz:.0f} Hz" if rate_hz >= 10 else f"{rate_hz:.2g} Hz"
     nominal_hz = 1e9 / watcher.period_ns if watcher.period_ns else 0.0
     if rate_hz < SLOW * nominal_hz:
-        advice = f"The camera makes {rate_hz:.0f} frames a second, not {nominal_hz:.0f}: the host does not keep up."
-        return Tile(title, value, f"slow: {nominal_hz:.0f} Hz wanted", Level.WARNING, advice)
-    return Tile(title, value, f"none lost, none refused{clock}", Level.GOOD)
+        advice = f"The camera runs at {rate_hz:.3g} Hz, not at {nominal_hz:.3g} Hz: the host does not keep up."
+        return Tile(title, value, f"slow: {nominal_hz:.3g} Hz wanted", Level.WARNING, advice)
+    return Tile(title, value, f"{_few(watcher)}{clock}", Level.GOOD)
 
 
 def star(watcher: Watcher) -> Tile:
     """How much light there is, of what the calibration expects."""
     title, flux = "STAR", watcher.flux
-    if flux is None or watcher.silent_s(FRAME) is not None:
+    stopped = watcher.camera().life is Life.STOPPED
+    if flux is None or (watcher.silent_s(FRAME) is not None and not stopped):
         return Tile(title, "?", "light not known now", Level.NEUTRAL)
     percent = 100 * flux
     value = f"{percent:.0f} %" if percent >= 1 else "< 1 %"
     detail = "of the expected light"
-    full = f"{watcher.saturated} pixels at full well"
+    if stopped:
+        return Tile(title, f"last: {value}", detail, Level.NEUTRAL)
+    full = f"{counted(watcher.saturated, 'pixel')} at full well"
     steps = watcher.now("steps")
     if watcher.now(Reason.SATURATED) > steps / 2 and watcher.saturated:
         advice = f"The detector is saturated, {full}: shorten the exposure or dim the star."

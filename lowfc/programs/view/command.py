@@ -29,10 +29,8 @@ def view(
     run: Annotated[str | None, typer.Option("--run", help="Name of the run; default: the only one.")] = None,
     config: ConfigFile = None,
     memory_mb: Annotated[float, typer.Option(min=16, help="What the viewer keeps of the past.")] = 512.0,
-    port: Annotated[
-        int | None, typer.Option(help="TCP port of the stream, or of Foxglove; default: a free one.")
-    ] = None,
-    web_port: Annotated[int | None, typer.Option(help="TCP port of the page; default: a free one.")] = None,
+    port: Annotated[int | None, typer.Option(min=0, max=65535, help="TCP port of the stream, or of Foxglove.")] = None,
+    web_port: Annotated[int | None, typer.Option(min=1, max=65535, help="TCP port of the page.")] = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object at the end.")] = False,
 ) -> None:
     """Look at a running loop, or at logs: in a window, a browser, a picture or a file.
@@ -41,12 +39,17 @@ def view(
 
     Example: lowfc view --web
     """
+    from lowfc.adapters.realtime import give_way
+
+    give_way()
     if foxglove:
-        if logs or native or web or save or headless_screenshot:
-            raise ConfigurationError("--foxglove serves a running loop, and nothing else beside it")
+        if logs or native or web or save or headless_screenshot or seconds or config or as_json:
+            raise ConfigurationError("--foxglove serves a running loop until Ctrl-C, with --run and --port alone")
         _serve_foxglove(run, port)
         return
-    from lowfc.programs.ctl import the_run
+    if logs and (seconds or run):
+        raise ConfigurationError("--seconds and --run are for a running loop, not for logs")
+    from lowfc.programs.ctl import the_known_run
     from lowfc.programs.view.look import look_at_logs, look_at_run
     from lowfc.programs.view.place import place
 
@@ -61,9 +64,7 @@ def view(
         web_port=web_port,
     )
     settings = None if config is None else configuration(config)
-    figures = (
-        look_at_logs(logs, settings, where) if logs else look_at_run(run or the_run(None), settings, where, seconds)
-    )
+    figures = look_at_logs(logs, settings, where) if logs else look_at_run(the_known_run(run), settings, where, seconds)
     if as_json:
         sys.stdout.write(json.dumps(figures) + "\n")
 
@@ -71,8 +72,8 @@ def view(
 def _serve_foxglove(run: str | None, port: int | None) -> None:
     from lowfc.adapters.clock import HostClock
     from lowfc.adapters.run import open_run
-    from lowfc.programs.ctl import the_run
+    from lowfc.programs.ctl import the_known_run
     from lowfc.programs.view.foxglove_bridge import DEFAULT_PORT, serve_foxglove
 
-    summary = serve_foxglove(open_run(run or the_run(None), ()), HostClock(), DEFAULT_PORT if port is None else port)
+    summary = serve_foxglove(open_run(the_known_run(run), ()), HostClock(), DEFAULT_PORT if port is None else port)
     sys.stderr.write(f"{summary}\n")

@@ -101,10 +101,11 @@ class FoxgloveBridge:
     def run(self) -> Summary:
         """Serve until told to stop."""
         self.service.state = "running"
-        heard = 0
+        asked: set[tuple[str, int]] = set()
         while self.service.running:
-            if len(self.service.heard) > heard:
-                heard = len(self.service.heard)
+            there = {(name, health.pid) for name, health in list(self.service.heard.items())}
+            if there - asked:
+                asked |= there
                 self._ask()
             self.service.work = self._messages
             self.service.beat()
@@ -174,7 +175,7 @@ def serve_foxglove(run: Run, clock: Clock, port: int = DEFAULT_PORT) -> Summary:
         port: on loopback, for the apps; 0 for a free one.
 
     Raises:
-        BusError: another viewer has this run, or the port is taken.
+        BusError: the port is taken.
         ConfigurationError: foxglove-sdk is not installed.
     """
     images = {topic: IMAGES_HZ for topic in SHOWN if topic.message is RawImage}

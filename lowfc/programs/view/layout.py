@@ -50,7 +50,7 @@ def _optics() -> rrb.Container:
 
 def _engineering(window_s: float | None) -> rrb.Container:
     columns = rrb.Horizontal(
-        rrb.Vertical(*wavefront.mode_views()),
+        rrb.Vertical(*wavefront.mode_views(), row_shares=[5, 2, 2, 2]),  # room for the names of the modes
         rrb.Vertical(wavefront.groups_view(), *spectra.spectra_views(), mirror.stroke_view(), row_shares=[2, 4, 4, 2]),
         rrb.Vertical(
             latency.histogram_view(),

@@ -11,14 +11,13 @@ from rich.console import Console
 
 from lowfc.adapters.join import clock_of
 from lowfc.adapters.progress import passing_bar
-from lowfc.adapters.realtime import give_way
 from lowfc.adapters.rerun_viewer import RerunViewer, Show
 from lowfc.adapters.run import open_run
 from lowfc.adapters.whole_file import being_written, require_folder
 from lowfc.adapters.zenoh_bus import ZenohBus
 from lowfc.contract.configuration import Configuration, load
 from lowfc.contract.messages import Role
-from lowfc.programs.view.bridge import Bridge
+from lowfc.programs.view.bridge import Bridge, ViewError
 from lowfc.programs.view.layout import LIVE_WINDOW_S
 from lowfc.programs.view.painter import Painter
 from lowfc.programs.view.place import Place
@@ -37,7 +36,6 @@ def look_at_run(run_id: str, config: Configuration | None, where: Place, seconds
         DataFileError: a file cannot be written.
     """
     require_folder(where.save, where.picture)
-    give_way()
     run = open_run(run_id, ())
     own = run.path / "config.toml"
     config = config or load(own if own.exists() else None)
@@ -58,7 +56,16 @@ def look_at_run(run_id: str, config: Configuration | None, where: Place, seconds
         stack.callback(bridge.close)
         bridge.service.catch_signals()
         until_s = seconds if seconds is not None or where.picture is None else PICTURE_AFTER_S
-        summary = bridge.run(until_s, lambda: _say_where(where, bridge.viewer))
+        try:
+            summary = bridge.run(until_s, lambda: _say_where(where, bridge.viewer))
+        except ViewError as error:
+            if part is None:
+                raise
+            rest = Path(f"{where.save}.part")
+            part.replace(rest)
+            raise ViewError(f"{error}; what there is of it is in {rest}") from error
+        if not bridge.service.heard and where.show in (None, Show.HEADLESS):
+            raise ViewError(f"nothing was heard of run {run_id!r}: nothing is written")
         if where.picture is not None and bridge.viewer is not None:
             bridge.viewer.screenshot(where.picture)
     _say_written(where)

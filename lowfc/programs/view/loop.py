@@ -1,5 +1,7 @@
 """How the loop runs: its mode as a band, the light, saturated pixels, and what every process said."""
 
+from datetime import UTC, datetime
+
 import numpy as np
 import rerun as rr
 import rerun.blueprint as rrb
@@ -57,9 +59,11 @@ class Loop(Panel):
             curves(stream, FLUX, steps.time_ns, 100 * steps.flux_dn / moment.calibration.flux_dn)
             curves(stream, SATURATED, steps.time_ns, steps.saturated_pixels.astype(float))
         for event in moment.events:
-            at(stream, from_timestamp(event.timestamp))
+            time_ns = from_timestamp(event.timestamp)
+            clock = datetime.fromtimestamp(time_ns * 1e-9, UTC).strftime("%H:%M:%S")  # rerun's own column is cut
+            at(stream, time_ns)
             level = _LEVELS.get(event.level, rr.TextLogLevel.INFO)
-            stream.log(f"{LOG}/{event.name}", rr.TextLog(f"{event.name}: {event.message}", level=level))
+            stream.log(f"{LOG}/{event.name}", rr.TextLog(f"{clock}  {event.name}: {event.message}", level=level))
 
 
 def mode_view() -> rrb.View:
@@ -69,7 +73,7 @@ def mode_view() -> rrb.View:
 
 def light_view() -> rrb.View:
     """Light."""
-    return rrb.TimeSeriesView(origin=FLUX, name="Light on the sensor, % of expected")
+    return rrb.TimeSeriesView(origin=FLUX, name="Light, % of expected")
 
 
 def saturated_view() -> rrb.View:
@@ -82,5 +86,5 @@ def log_view() -> rrb.View:
     return rrb.TextLogView(
         origin=LOG,
         name="Events",
-        columns=rrb.TextLogColumns(timeline_columns=["time"], text_log_columns=["loglevel", "body"]),
+        columns=rrb.TextLogColumns(text_log_columns=["loglevel", "body"]),
     )

@@ -33,14 +33,13 @@ def name_curves(
 def curves(
     stream: rr.RecordingStream, path: str, times_ns: npt.NDArray[np.int64], values: npt.NDArray[np.floating]
 ) -> None:
-    """Add (rows,) or (rows, curves) values in one message; rows that are not finite are left out."""
+    """Add (rows,) or (rows, curves) values in one message; of rows that are not finite one is left, as a gap."""
     if not len(times_ns):
         return
     columns = values.reshape(len(times_ns), -1)
     whole = np.isfinite(columns).all(axis=1)
-    if not whole.any():
-        return
-    times, columns = times_ns[whole], columns[whole]
+    kept = whole | np.concatenate([[True], whole[:-1]])
+    times, columns = times_ns[kept], columns[kept]
     scalars = rr.Scalars.columns(scalars=columns.astype(np.float64).ravel())
     stream.send_columns(
         path,

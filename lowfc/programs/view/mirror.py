@@ -50,7 +50,7 @@ class Mirror(Panel):
         if changed:
             rows, columns = values_nm.shape
             text = f"blue -{scale.limit:g}, orange +{scale.limit:g} nm"
-            caption(stream, f"{path}/{_CAPTION}", text, (columns / 2, rows * 0.93))
+            caption(stream, f"{path}/{_CAPTION}", text, (columns / 2, rows * 0.86))
 
     def _mark(self, stream: rr.RecordingStream, moment: Moment, surface_nm: npt.NDArray[np.float32]) -> None:
         """A ring round each actuator at its stroke."""

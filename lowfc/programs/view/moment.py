@@ -103,7 +103,9 @@ class Moment:
 class Gatherer:
     """Takes messages and makes moments of them; what cannot be read is left out and counted in `unreadable`."""
 
-    def __init__(self) -> None:
+    def __init__(self, simulated_ns: int | None = None) -> None:
+        """With the time at which a run in lockstep begins: its data's clock is not the host's."""
+        self._simulated_ns = simulated_ns
         self.unreadable = 0
         self._steps = StepRows(0)
         self._truths = TruthRows(0)
@@ -115,12 +117,17 @@ class Gatherer:
         self._controller: wire.ControllerState | None = None
         self._health: dict[str, Heard] = {}
         self._heard_ns: dict[str, int] = {}
+        self._sequences: dict[str, int] = {}
         self._data_ns = 0
         self._data_host_ns = 0
 
-    def take(self, topic: Topic, key: str, payload: bytes, publish_time_ns: int) -> None:
-        """Take one message of one of `SHOWN`."""
-        self._heard_ns[topic.key] = publish_time_ns
+    def take(self, topic: Topic, key: str, payload: bytes, publish_time_ns: int, sequence: int = 0) -> None:
+        """Take one message of one of `SHOWN`; a state that is older than one taken before is none."""
+        if topic.queryable:
+            if sequence < self._sequences.get(key, 0):
+                return
+            self._sequences[key] = sequence
+        self._heard_ns[topic.key] = max(publish_time_ns, self._heard_ns.get(topic.key, 0))
         if topic.key in _NEWEST_ONLY:
             self._newest[topic.key] = payload
             return
@@ -150,7 +157,7 @@ class Gatherer:
         mirror, surface = self._mirror(), self._surface()
         self._newest.clear()
         return Moment(
-            time_ns=self._data_ns + max(0, host_ns - self._data_host_ns) if self._data_ns else host_ns,
+            time_ns=self._time_ns(host_ns),
             host_ns=host_ns,
             steps=steps.taken(),
             truths=truths.taken(),
@@ -169,20 +176,29 @@ class Gatherer:
             behind_s=behind_s,
         )
 
+    def _time_ns(self, host_ns: int) -> int:
+        if self._simulated_ns is not None:
+            return self._data_ns or self._simulated_ns
+        return self._data_ns + max(0, host_ns - self._data_host_ns) if self._data_ns else host_ns
+
     def _read(self, topic: Topic, key: str, payload: bytes, publish_time_ns: int) -> None:
         if topic is STEP:
             step = wire.ControlStep.FromString(payload)
             if not self._steps.add(step):
-                self._steps = StepRows(len(step.command_nm))
-                self._steps.add(step)
+                rows = StepRows(len(step.command_nm))
+                if not rows.add(step):
+                    raise ValueError("a step whose modes differ in number")
+                self._steps = rows
             self._date(from_timestamp(step.timestamp), publish_time_ns)
         elif topic is TRUTH:
             truth = wire.Truth.FromString(payload)
             if not self._truths.add(truth):
-                self._truths = TruthRows(len(truth.residual_nm))
-                self._truths.add(truth)
+                others = TruthRows(len(truth.residual_nm))
+                if not others.add(truth):
+                    raise ValueError("a truth whose modes differ in number")
+                self._truths = others
         elif topic is TIMING:
-            self._timings.add(wire.ControlTiming.FromString(payload))
+            self.unreadable += not self._timings.add(wire.ControlTiming.FromString(payload))
         elif topic is HEALTH:
             self._health[name_in(HEALTH, key)] = Heard(publish_time_ns, wire.Health.FromString(payload))
         elif topic is EVENT:

@@ -1,5 +1,8 @@
 """Everything that is shown, drawn onto a stream moment by moment."""
 
+from collections.abc import Callable
+from dataclasses import dataclass
+
 import rerun as rr
 
 from lowfc.adapters.masks import science_pupil
@@ -19,46 +22,74 @@ from lowfc.programs.view.spectra import Spectra
 from lowfc.programs.view.tiles import Tiles
 from lowfc.programs.view.wavefront import Wavefront
 
+RETRY_NS = 5_000_000_000
+"""After which a panel that failed is made again."""
+
+
+@dataclass(slots=True)
+class _Place:
+    """Where a panel belongs: how to make it, it or None while it is left out, and when to try again."""
+
+    make: Callable[[], Panel]
+    panel: Panel | None = None
+    again_ns: int = 0
+
 
 class Painter:
     """All panels of a view.
 
-    Attributes:
-        panels: those that are drawn; one that fails is left out from then on, with a line in the view's log.
+    A message that nobody foresaw must not take more from the operator than the panel that it breaks, nor that for ever:
+    it is left out, with a line in the view's log, and made again a little later.
     """
 
     def __init__(self, config: Configuration, stream: rr.RecordingStream) -> None:
         self._stream = stream
         self._remarks: list[str] = []
         nm_per_mas = tilt_nm_per_mas(config.star.diameter_m)
-        self.panels: list[Panel] = [
-            Tiles(nm_per_mas),
-            Sensor(),
-            Mirror(),
-            Wavefront(nm_per_mas),
-            Pointing(nm_per_mas),
-            Loop(),
-            Latency(),
-            Spectra(),
+        made: list[Callable[[], Panel]] = [
+            lambda: Tiles(nm_per_mas),
+            Sensor,
+            Mirror,
+            lambda: Wavefront(nm_per_mas),
+            lambda: Pointing(nm_per_mas),
+            Loop,
+            Latency,
+            Spectra,
             *self._science(config),
         ]
-        for panel in self.panels:
-            panel.begin(stream)
+        self._places = [_Place(make) for make in made]
+        for place in self._places:
+            self._make(place)
+
+    @property
+    def panels(self) -> list[Panel]:
+        """Those that are drawn."""
+        return [place.panel for place in self._places if place.panel is not None]
 
     def draw(self, moment: Moment) -> None:
         """Draw what is new."""
-        for panel in [panel for panel in self.panels if moment.whole or panel.pictures]:
-            try:
-                panel.draw(self._stream, moment)
-            except Exception as fault:  # a message that nobody foresaw must not take the other panels from the operator
-                self.panels.remove(panel)
-                self._remarks.append(f"{type(panel).__name__} is left out of the view: {fault!r}")
+        for place in self._places:
+            if place.panel is None and moment.time_ns >= place.again_ns:
+                self._make(place)
+            if place.panel is not None and (moment.whole or place.panel.pictures):
+                self._draw(place, place.panel, moment)
         for remark in self._remarks:
             at(self._stream, moment.time_ns)
             self._stream.log(f"{LOG}/view", rr.TextLog(remark, level=rr.TextLogLevel.ERROR))
         self._remarks.clear()
 
-    def _science(self, config: Configuration) -> list[Panel]:
+    def _make(self, place: _Place) -> None:
+        place.panel = place.make()
+        place.panel.begin(self._stream)
+
+    def _draw(self, place: _Place, panel: Panel, moment: Moment) -> None:
+        try:
+            panel.draw(self._stream, moment)
+        except Exception as fault:
+            place.panel, place.again_ns = None, moment.time_ns + RETRY_NS
+            self._remarks.append(f"{type(panel).__name__} is left out of the view for a while: {fault!r}")
+
+    def _science(self, config: Configuration) -> list[Callable[[], Panel]]:
         """The science camera, where its image can be computed."""
         try:
             pupil = science_pupil(config.sensor)
@@ -68,4 +99,4 @@ class Painter:
         if pupil is None:
             self._remarks.append("no science camera: behind a Lyot stop its image is not modelled")
             return []
-        return [Science(pupil, config.star.wavelength_nm)]
+        return [lambda: Science(pupil, config.star.wavelength_nm)]

@@ -6,6 +6,7 @@ from pathlib import Path
 import rerun as rr
 
 from lowfc.adapters.rerun_viewer import RerunViewer, Show, has_screen
+from lowfc.adapters.run import free_ports
 from lowfc.contract.errors import ConfigurationError
 from lowfc.programs.view.layout import layout
 from lowfc.programs.view.stream import to_file, to_viewer
@@ -22,7 +23,7 @@ class Place:
         picture: file (PNG) of a headless viewer, or None.
         tab: that is opened.
         memory_mb: what a viewer keeps of the past.
-        port, web_port: of the viewer; None for free ones.
+        port, web_port: of the viewer, each time it is started.
     """
 
     show: Show | None
@@ -30,8 +31,8 @@ class Place:
     picture: Path | None
     tab: Tab
     memory_mb: float
-    port: int | None
-    web_port: int | None
+    port: int
+    web_port: int
 
     def viewer(self) -> RerunViewer:
         """Start the viewer.
@@ -74,10 +75,16 @@ def place(
     chosen = [name for name, wanted in given.items() if wanted]
     if len(chosen) > 1:
         raise ConfigurationError(f"a view is in one place; got {' and '.join(chosen)}: choose one")
+    for option, file, suffix in (("--save", save, ".rrd"), ("--headless-screenshot", picture, ".png")):
+        if file is not None and file.suffix != suffix:
+            raise ConfigurationError(f"{option} writes a file that ends in {suffix}; got {file}")
+    if port is not None and port == web_port:
+        raise ConfigurationError(f"--port and --web-port must differ; both are {port}")
     if save is not None:
         show = None
     elif picture is not None:
         show = Show.HEADLESS
     else:
         show = Show.WEB if web or not (native or has_screen()) else Show.NATIVE
-    return Place(show, save, picture, tab, memory_mb, port, web_port)
+    free = free_ports(2)  # now, so that a viewer that is started again is where it was
+    return Place(show, save, picture, tab, memory_mb, port or free[0], web_port or free[1])

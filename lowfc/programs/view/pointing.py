@@ -79,7 +79,7 @@ def pointing_view() -> rrb.View:
     """The trail."""
     return rrb.Spatial2DView(
         origin=TRAIL,
-        name="Pointing left, mas",
+        name="Residual pointing, mas",
         visual_bounds=rrb.VisualBounds2D(x_range=[-1.15, 1.15], y_range=[-1.15, 1.15]),
     )
 

@@ -4,6 +4,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
+from lowfc.adapters.clock import SimulatedClock
 from lowfc.adapters.history_reader import attached_configuration
 from lowfc.adapters.log_reader import Logged, LogReader
 from lowfc.contract.configuration import Configuration
@@ -47,17 +48,21 @@ def draw_logs(
         progress: is told how many bytes are done.
 
     Raises:
-        DataFileError: one is no log, or there is nothing to see in any of them.
+        DataFileError: one is no log, they are of several runs, or there is nothing to see in any of them.
     """
-    drawn, gatherer = Drawn(), Gatherer()
+    drawn, gatherer, run = Drawn(), Gatherer(), ""
     painter: Painter | None = None
     due_ns = first_ns = last_ns = behind = 0
     for log in logs:
         reader = LogReader(log, topics=SHOWN, skip_damaged=True)
         for number, message in enumerate(reader):
             if painter is None:
-                painter = make_painter(config or _own(reader, drawn))
+                own = config or _own(reader, drawn)
+                painter = make_painter(own)
+                gatherer = Gatherer(SimulatedClock().now_ns() if own.lockstep else None)
                 first_ns = message.log_time_ns
+            if number == 0:
+                run = _same_run(run, reader)
             last_ns = message.log_time_ns
             _take(gatherer, message)
             if last_ns >= due_ns:
@@ -80,7 +85,16 @@ def draw_logs(
 
 
 def _take(gatherer: Gatherer, message: Logged) -> None:
-    gatherer.take(topic_of(message.key), message.key, message.payload, message.publish_time_ns)
+    gatherer.take(topic_of(message.key), message.key, message.payload, message.publish_time_ns, message.sequence)
+
+
+def _same_run(before: str, reader: LogReader) -> str:
+    run = reader.metadata.get("lowfc", {}).get("run", "")
+    if before and run and run != before:
+        raise DataFileError(
+            f"{reader.path} is of run {run!r}, and the log before it of {before!r}: look at one at a time"
+        )
+    return run or before
 
 
 def _own(reader: LogReader, drawn: Drawn) -> Configuration:

@@ -1,6 +1,6 @@
 """The scale of a picture's colours: it follows what is shown, but slowly, so that colours can be compared."""
 
-from math import floor, log10
+from math import floor, isfinite, log10
 
 import numpy as np
 import numpy.typing as npt
@@ -22,7 +22,10 @@ class Scale:
 
     def fit(self, values: npt.NDArray[np.floating], time_ns: int) -> bool:
         """Take values into account; True where the limit is another one now."""
-        wanted = round_up(max(float(values.max(initial=0.0)), -float(values.min(initial=0.0)), self.least))
+        largest = max(float(values.max(initial=0.0)), -float(values.min(initial=0.0)))
+        if not isfinite(largest):
+            return self.fit(np.nan_to_num(values, nan=0.0, posinf=0.0, neginf=0.0), time_ns)
+        wanted = round_up(max(largest, self.least))
         if wanted >= self.limit:
             self._needed_ns = time_ns
         if wanted > self.limit or (wanted < self.limit and time_ns - self._needed_ns > _SHRINK_NS):

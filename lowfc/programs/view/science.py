@@ -32,8 +32,8 @@ _SCALE = 2 * _SECOND
 _WIDTH = _SCALE + _BAR
 _LABEL = 5  # samples by which the viewer sets a label below its place
 _NAMES = {
-    "true": ("now, true wavefront", "loop open, true wavefront"),
-    "measured": ("now, measured error", "loop open, pseudo-open-loop"),
+    "true": ("now, true wavefront", "with a flat mirror, true wavefront"),
+    "measured": ("now, measured error", "with a flat mirror, pseudo-open-loop"),
 }
 """What the wavefronts are, those of a simulation first: they are taken where there are any."""
 
@@ -107,7 +107,7 @@ class Science(Panel):
             self._named = source
             name_curves(stream, CONTRAST, ["flat wavefront", *_NAMES[source]], [BLUE, GREEN, GREY], 1.6)
         self._pictures.show(stream, time_ns, _side_by_side(*images))
-        captions = [f"{title}: {mean:.1e}" for title, mean in zip(("now", "loop open"), means, strict=True)]
+        captions = [f"{title}: {mean:.1e}" for title, mean in zip(("now", "flat mirror"), means, strict=True)]
         places = [(start + _SAMPLES / 2, -_LABEL - _GAP) for start in (0, _SECOND)]
         stream.log(f"{IMAGE}/captions", _texts(places, captions))
         curves(stream, CONTRAST, np.array([time_ns]), np.log10([[self._flat, *means]]))
@@ -118,7 +118,7 @@ def image_view() -> rrb.View:
     return rrb.Spatial2DView(
         origin=IMAGE,
         name="Science camera: contrast, mean in the wedge from 4 to 6 λ/D",
-        visual_bounds=rrb.VisualBounds2D(x_range=[-4, _WIDTH + 24], y_range=[-2 * _GAP - _LABEL, _SAMPLES + 4]),
+        visual_bounds=rrb.VisualBounds2D(x_range=[-4, _WIDTH + 24], y_range=[-2 * _GAP - _LABEL, _SAMPLES + 14]),
     )
 
 

@@ -42,7 +42,7 @@ class Sensor(Panel):
         if moment.frame is None:
             return
         calibration, dark_dn = self._calibration, 0
-        if calibration is not None and calibration.dark.size == moment.frame.size:
+        if calibration is not None and calibration.shape == moment.frame.shape:
             dark_dn = round(float(calibration.dark[0]))
             self._show_difference(stream, calibration, moment.frame, moment.frame_ns)
         self._show_frame(stream, moment.frame, dark_dn, moment.frame_ns)
@@ -75,8 +75,9 @@ class Sensor(Panel):
         self, stream: rr.RecordingStream, calibration: Calibration, frame: npt.NDArray[np.uint16], time_ns: int
     ) -> None:
         flux_dn = difference(calibration, frame.ravel(), 0.0, self._difference)
-        if flux_dn is None:
-            return
+        if flux_dn is None:  # no light: nothing differs
+            self._difference.fill(0.0)
+            flux_dn = 0.0
         change_dn = (self._difference * flux_dn * calibration.good).reshape(frame.shape)
         changed = self._largest.fit(change_dn, time_ns)
         self._differences.show(stream, time_ns, diverging(change_dn / self._largest.limit))
@@ -112,4 +113,4 @@ def _log_stretched(light_dn: Single, limit_dn: float) -> Rgb:
 
 
 def _caption_below(stream: rr.RecordingStream, path: str, shape: tuple[int, ...], text: str) -> None:
-    caption(stream, f"{path}/{_CAPTION}", text, (shape[1] / 2, shape[0] * 0.93))
+    caption(stream, f"{path}/{_CAPTION}", text, (shape[1] / 2, shape[0] * 0.86))

@@ -11,7 +11,7 @@ import rerun.blueprint as rrb
 
 from lowfc.control.error_budget import LinearLoop
 from lowfc.control.safety import LoopMode
-from lowfc.control.spectra import SHORTEST, Spectrum, in_bins, pieces, spectrum
+from lowfc.control.spectra import Spectrum, in_bins, pieces, spectrum
 from lowfc.programs.report.closed_loop import SETTLING
 from lowfc.programs.view.colours import GREEN, GREY, WHITE, YELLOW, Colour
 from lowfc.programs.view.marks import at
@@ -132,7 +132,7 @@ class Spectra(Panel):
         for axes, modes in zip(self._axes.values(), (index <= _HIGHEST_TILT, index > _HIGHEST_TILT), strict=True):
             columns = [] if found is None or not modes.any() else self._columns(found, modes, rate_hz)
             if not columns:
-                said = f"loop {mode}: {run.frames} frames, a spectrum takes {SHORTEST} without a gap"
+                said = f"loop {mode}: too few frames yet"
             else:
                 said = f"loop {mode}, last {run.frames / rate_hz:.1f} s"
             _draw_curves(stream, axes, found, columns, rate_hz)

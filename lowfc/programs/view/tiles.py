@@ -1,6 +1,7 @@
 """The annunciator: the verdict as a picture, a headline above large coloured tiles with words on them."""
 
 import io
+from datetime import UTC, datetime
 from functools import lru_cache
 from math import ceil
 
@@ -40,9 +41,10 @@ WORD: dict[Level, str] = {Level.NEUTRAL: "", Level.GOOD: "ok", Level.WARNING: "C
 SHORTEST_NS = 250_000_000
 """Between pictures with another word or colour."""
 FIGURES_NS = 1_000_000_000
-"""Between pictures where only figures differ: nobody reads them faster, and each stays in the viewer's memory."""
+"""Between pictures where only figures differ: nobody reads them faster, and each stays in the viewer's memory. The
+clock is drawn as often where nothing else is new: when it stands, the view does."""
 
-_GAP, _INSET, _BAND = 6, 9, 46
+_GAP, _INSET, _BAND, _CLOCK = 6, 9, 46, 190
 _SMALLEST = 8
 _SHADES = 16
 _PITCH = 1.16
@@ -59,25 +61,27 @@ class Tiles(Panel):
         self._nm_per_mas = nm_per_mas
         self._watcher = Watcher()
         self._drawn: Verdict | None = None
-        self._drawn_ns = self._judged_ns = 0
+        self._drawn_ns = self._judged_ns = self._clock_ns = 0
 
     def draw(self, stream: rr.RecordingStream, moment: Moment) -> None:
-        """Judge, and show the verdict if it changed."""
+        """Judge, and show the verdict if it changed, or the clock did."""
         self._watcher.feed(moment)
         if 0 <= moment.host_ns - self._judged_ns < SHORTEST_NS:
             return
         self._judged_ns = moment.host_ns
         verdict = judge(self._watcher, self._nm_per_mas)
-        if self._drawn is not None and (
-            verdict == self._drawn
-            or (_gist(verdict) == _gist(self._drawn) and 0 <= moment.host_ns - self._drawn_ns < FIGURES_NS)
+        if (
+            self._drawn is not None
+            and _gist(verdict) == _gist(self._drawn)
+            and moment.time_ns // FIGURES_NS == self._clock_ns // FIGURES_NS
+            and 0 <= moment.host_ns - self._drawn_ns < FIGURES_NS
         ):
             return
         at(stream, moment.time_ns)
-        stream.log(TILES, rr.EncodedImage(contents=png(picture(verdict)), media_type="image/png"))
+        stream.log(TILES, rr.EncodedImage(contents=png(picture(verdict, moment.time_ns)), media_type="image/png"))
         if self._drawn is None or verdict.headline != self._drawn.headline:
             stream.log(HEADLINE, rr.TextDocument(verdict.headline))
-        self._drawn, self._drawn_ns = verdict, moment.host_ns
+        self._drawn, self._drawn_ns, self._clock_ns = verdict, moment.host_ns, moment.time_ns
 
 
 def tiles_view() -> rrb.View:
@@ -85,11 +89,12 @@ def tiles_view() -> rrb.View:
     return rrb.Spatial2DView(origin=TILES, name="Status")
 
 
-def picture(verdict: Verdict) -> Image.Image:
-    """The verdict as a picture with a palette: of each level, shades from its fill to its ink."""
+def picture(verdict: Verdict, time_ns: int) -> Image.Image:
+    """The verdict and its time as a picture with a palette: of each level, shades from its fill to its ink."""
     headline, *boxes = places(len(verdict.tiles))
     colours = np.full((HEIGHT, WIDTH), _SHADES * len(Level), np.uint8)
     _put(colours, headline, verdict.level, _headline(WORD[verdict.level].upper(), verdict.headline))
+    _put(colours, (WIDTH - _CLOCK, 0, WIDTH, _BAND), verdict.level, _clock(time_ns // 10**9))
     for box, tile in zip(boxes, verdict.tiles, strict=True):
         _put(colours, box, tile.level, _tile(tile, box[2] - box[0], box[3] - box[1]))
     image = Image.fromarray(colours).convert("P")
@@ -127,11 +132,19 @@ def _put(colours: Shades, box: Box, level: Level, shades: Shades) -> None:
 
 @lru_cache(maxsize=8)
 def _headline(word: str, sentence: str) -> Shades:
-    """Words of the headline."""
+    """Words of the headline, left of the clock."""
     page = _Page(WIDTH, _BAND)
-    right, bottom = WIDTH - _INSET, _BAND - _INSET // 2
+    right, bottom = WIDTH - _CLOCK - _INSET, _BAND - _INSET // 2
     left = _INSET + page.line((_INSET, _INSET // 2, _INSET + 130, bottom), word, 30)
     page.write((left + (_INSET if word else 0), _INSET // 2, right, bottom), sentence, 27)
+    return page.shades()
+
+
+def _clock(seconds: int) -> Shades:
+    """Time of day."""
+    page = _Page(_CLOCK, _BAND)
+    time = f"{datetime.fromtimestamp(seconds, UTC):%H:%M:%S} UTC"
+    page.line((_INSET, _INSET // 2, _CLOCK - _INSET, _BAND - _INSET // 2), time, 27)
     return page.shades()
 
 

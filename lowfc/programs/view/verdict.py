@@ -9,7 +9,7 @@ from lowfc.contract.codec import actuators
 from lowfc.contract.messages import FRAME, STEP, Role, wire
 from lowfc.control.safety import LoopMode, Reason
 from lowfc.programs.view.camera_verdict import all_refused, frames, star
-from lowfc.programs.view.tile import Level, Tile, ago, figure
+from lowfc.programs.view.tile import Level, Tile, ago, counted, figure
 from lowfc.programs.view.watcher import GRACE_S, RECENT_S, Life, Rms, Watcher
 
 WORSE = 1.1
@@ -26,6 +26,8 @@ MANY_LATE = 0.05
 """One late command in twenty is the host's; more of them are another delay than the one that was tuned for."""
 BEHIND_S, FAR_BEHIND_S = 1.0, 5.0
 """A view is a glance old at best; a second shows, and after five it is history."""
+UNCORRECTED = ("OPEN", "SAFED", "DEAD")
+"""The loop as it is where nothing corrects; where it waits or has ended, that would say something else."""
 _LONGEST = 110
 """Letters of a text of somebody else's that a tile has room for."""
 
@@ -57,7 +59,7 @@ def judge(watcher: Watcher, nm_per_mas: float | None = None) -> Verdict:
         nm_per_mas: wavefront rms of a tilt of 1 mas (`lowfc.optics.photometry`); without it tilt is not told.
     """
     loop = _loop(watcher)
-    wavefront = _wavefront(watcher, nm_per_mas, correcting=loop.level is Level.GOOD)
+    wavefront = _wavefront(watcher, nm_per_mas, loop)
     tiles = [
         loop,
         wavefront,
@@ -111,14 +113,8 @@ def _loop(watcher: Watcher) -> Tile:
         case LoopMode.IDLE:
             advice = "The controller has no calibration: it refuses every frame. Give it one."
             return Tile(title, "IDLE", "no calibration", Level.WARNING, advice)
-        case LoopMode.OPEN if "camera" in watcher.why:
-            advice = (
-                "The loop opened by itself, the camera changed: set it back or calibrate again, then `lowfc ctl close`."
-            )
-            return Tile(title, "OPEN", watcher.why, Level.WARNING, advice)
         case LoopMode.OPEN:
-            advice = "The loop is open: nothing is corrected. `lowfc ctl close` closes it."
-            return Tile(title, "OPEN", watcher.why or "measuring only", Level.NEUTRAL, advice)
+            return _open(watcher)
     if Life.STARTING in (sign.life, watcher.camera().life) or watcher.camera().life is Life.NEVER:
         return Tile(title, "WAITING", "closed, no frame yet", Level.NEUTRAL, "Waiting for the first frame.")
     if watcher.mirrors().life is Life.SILENT:
@@ -136,28 +132,45 @@ def _loop(watcher: Watcher) -> Tile:
     return Tile(title, "CLOSED", "correcting", Level.GOOD, "Loop closed, nothing is wrong.")
 
 
-def _wavefront(watcher: Watcher, nm_per_mas: float | None, *, correcting: bool) -> Tile:
-    title = "WAVEFRONT"
-    found, true = watcher.wavefront()
+def _open(watcher: Watcher) -> Tile:
+    shape = "mirror holds its last shape"
+    found, _ = watcher.wavefront()
+    if found is not None and found.residual_nm > WORSE * found.open_nm:
+        shape += ", worse than a flat mirror: `lowfc ctl safe` flattens it"
+    detail = f"{watcher.why or 'measuring only'}; {shape}"
+    if "camera" in watcher.why:
+        advice = (
+            "The loop opened by itself, the camera changed: set it back or calibrate again, then `lowfc ctl close`. "
+            f"The {shape}."
+        )
+        return Tile("LOOP", "OPEN", detail, Level.WARNING, advice)
+    advice = f"The loop is open: nothing is corrected, `lowfc ctl close` closes it. The {shape}."
+    return Tile("LOOP", "OPEN", detail, Level.NEUTRAL, advice)
+
+
+def _wavefront(watcher: Watcher, nm_per_mas: float | None, loop: Tile) -> Tile:
+    title, ended = "WAVEFRONT", loop.value == "ENDED"
+    found, true = watcher.wavefront(ended=ended)
     if found is None:
         return Tile(title, "?", "not measured now", Level.NEUTRAL)
     value = f"{figure(found.residual_nm)} nm rms"
-    source = "true" if true else "measured, with noise"
-    if not correcting:
-        return Tile(title, value, f"not corrected; {_tilt(found, nm_per_mas)}{source}", Level.NEUTRAL)
+    flat = f"{figure(found.open_nm)} nm with a flat mirror"
+    more = f"{_tilt(found, nm_per_mas)}{'true' if true else 'measured, with noise'}"
+    if ended:
+        return Tile(title, f"last: {figure(found.residual_nm)} nm", f"of {flat}; {more}", Level.NEUTRAL)
+    if loop.level is not Level.GOOD:
+        compared = f"not corrected; {flat}" if loop.value in UNCORRECTED else f"of {flat}"
+        return Tile(title, value, f"{compared}; {more}", Level.NEUTRAL)
     factor = found.open_nm / found.residual_nm if found.residual_nm else 1.0
     compared = f"{factor:.1f} x better than" if factor >= 1 else "of"
-    detail = f"{compared} {figure(found.open_nm)} nm; {_tilt(found, nm_per_mas)}{source}"
-    good = f"{figure(found.residual_nm)} nm rms of wavefront are left of {figure(found.open_nm)} nm."
+    detail = f"{compared} {flat}; {more}"
+    good = f"{figure(found.residual_nm)} nm rms of wavefront are left of {flat}."
     latest, _ = watcher.wavefront(LATEST_S)
     if factor >= 1 / WORSE or latest is None or latest.residual_nm <= WORSE * latest.open_nm:
         return Tile(title, value, detail, Level.GOOD, good)
     level = Level.BAD if factor < 1 / DIVERGING else Level.WARNING
-    detail = f"worse than {figure(found.open_nm)} nm without; {_tilt(found, nm_per_mas)}{source}"
-    advice = (
-        f"The loop does harm: {figure(found.residual_nm)} nm rms, {figure(found.open_nm)} nm without it. "
-        "Lower the gain or open the loop."
-    )
+    detail = f"worse than {flat}; {more}"
+    advice = f"The loop does harm: {figure(found.residual_nm)} nm rms, {flat}. Lower the gain or open the loop."
     return Tile(title, value, detail, level, advice)
 
 
@@ -200,10 +213,10 @@ def _stroke(watcher: Watcher, state: wire.MirrorState) -> Tile:
         often = now > LIMITED * max(1, watcher.now("steps"))
         count = max(acting.values())
         advice = (
-            f"The mirror is at a limit ({', '.join(words)}), {count} times in the last {RECENT_S:g} s: the disturbance "
-            "is larger than it can correct. Offload it, or raise the limit if that is safe."
+            f"The mirror is at a limit ({', '.join(words)}), {counted(count, 'time')} in the last {RECENT_S:g} s: "
+            "the disturbance is larger than it can correct. Offload it, or raise the limit if that is safe."
         )
-        detail = f"{', '.join(words)}: {count} times in {RECENT_S:g} s; {value} {of}"
+        detail = f"{', '.join(words)}: {counted(count, 'time')} in {RECENT_S:g} s; {value} {of}"
         return Tile(title, "AT LIMIT", detail, Level.BAD if often else Level.WARNING, advice)
     if stroke_nm and used_nm > NEAR_STROKE * stroke_nm:
         advice = f"The mirror has used {value} of its stroke: little is left. Offload the slow part of it."
@@ -212,20 +225,29 @@ def _stroke(watcher: Watcher, state: wire.MirrorState) -> Tile:
 
 
 def _latency(watcher: Watcher) -> Tile:
-    title, durations = "LATENCY", watcher.durations_us()
+    title, stopped = "LATENCY", watcher.controller().life is Life.STOPPED
+    durations = watcher.durations_us(ended=stopped)
     if durations is None:
         return Tile(title, "?", "not measured now", Level.NEUTRAL)
     middle_us, long_us = durations
     value, detail = f"{figure(middle_us)} us", f"frame to command; 1 in 100 over {figure(long_us)} us"
     late, steps = watcher.recent("late"), watcher.recent("steps")
+    if stopped:
+        return Tile(title, f"last: {value}", detail, Level.NEUTRAL)
     if watcher.simulated:
         return Tile(title, value, f"{detail}; of no effect in simulated time", Level.NEUTRAL)
     if late > MANY_LATE * max(1, steps):
         advice = (
-            f"{late} commands, {100 * late / max(1, steps):.2g} %, came after the next exposure had begun: there is "
-            "more delay than the loop is tuned for. Free the host's processors or lower the rate."
+            f"{counted(late, 'command')}, {100 * late / max(1, steps):.2g} %, came after the next exposure had begun: "
+            "there is more delay than the loop is tuned for. Free the host's processors or lower the rate."
         )
-        return Tile(title, f"{late} LATE", f"commands in {RECENT_S:g} s; {value}, {detail}", Level.WARNING, advice)
+        return Tile(
+            title,
+            f"{late} LATE",
+            f"{'command' if late == 1 else 'commands'} in {RECENT_S:g} s; {value}, {detail}",
+            Level.WARNING,
+            advice,
+        )
     if watcher.period_ns and long_us * 1e3 > watcher.period_ns:
         advice = (
             f"1 command in 100 takes over {figure(long_us)} us, longer than a frame. Free the host or lower the rate."
@@ -252,11 +274,12 @@ def _recorder(watcher: Watcher) -> Tile:
     if sign.life is Life.STOPPED:
         return Tile(title, "STOPPED", f"{_short(PurePath(done.file).stem)} is complete", Level.NEUTRAL)
     if lost := watcher.recent("lost"):
-        advice = f"The recorder lost {lost} messages in the last {RECENT_S:g} s: disk or processor is too slow for it."
-        return Tile(title, "LOSING", f"{lost} messages in {RECENT_S:g} s, {done.lost} in all", Level.BAD, advice)
+        messages = counted(lost, "message")
+        advice = f"The recorder lost {messages} in the last {RECENT_S:g} s: disk or processor is too slow for it."
+        return Tile(title, "LOSING", f"{messages} in {RECENT_S:g} s, {done.lost} in all", Level.BAD, advice)
     if not done.file:
         return Tile(title, "WAITING", "no log yet", Level.NEUTRAL)
-    losses = f"{done.lost} messages lost" if done.lost else "nothing lost"
+    losses = f"{counted(done.lost, 'message')} lost" if done.lost else "nothing lost"
     return Tile(title, "RECORDING", f"{_short(PurePath(done.file).stem)}, {losses}", Level.GOOD)
 
 

@@ -9,6 +9,7 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
+from lowfc.adapters.envelope import start_of
 from lowfc.adapters.history import Single, Whole
 from lowfc.adapters.run import mirror_role
 from lowfc.contract.messages import CONTROLLER_STATE, FRAME, MIRROR_STATE, STEP, Role, Topic, wire
@@ -99,6 +100,7 @@ class Watcher:
         self._totals: dict[float, Counter[Reason | str]] = {}
         self._counted: dict[str, tuple[int, int]] = {}
         self._told: dict[str, object] = {}
+        self._worked: list[_Glance] = []
 
     @property
     def behind_s(self) -> float:
@@ -137,6 +139,8 @@ class Watcher:
         )
         while self._glances[0].host_ns < moment.host_ns - RECENT_S * 1e9 - PERIODS * self.period_ns:
             self._glances.popleft()
+        if moment.steps.mode.size:
+            self._worked = list(self._last(NOW_S))
 
     @property
     def period_ns(self) -> int:
@@ -162,9 +166,9 @@ class Watcher:
         """The same for the last second."""
         return self._total(NOW_S)[what]
 
-    def wavefront(self, span_s: float = NOW_S) -> tuple[Rms | None, bool]:
-        """Of the last second, and whether it is the truth; None without any."""
-        glances = list(self._last(span_s))
+    def wavefront(self, span_s: float = NOW_S, *, ended: bool = False) -> tuple[Rms | None, bool]:
+        """Of the last second, or the last with a step in it, and whether it is the truth; None without any."""
+        glances = self._worked if ended else list(self._last(span_s))
         for sums, true in (([one.truth for one in glances], True), ([one.measured for one in glances], False)):
             total = np.sum(sums, axis=0) if sums else np.zeros(5)
             if total[0]:
@@ -172,17 +176,17 @@ class Watcher:
         return None, False
 
     def rate_hz(self) -> float | None:
-        """Rate of the frames behind the steps, by their own times; None with less than two."""
+        """Rate of the frames behind the steps, by their own times; None with less than two since it started."""
         spans = [glance.span for glance in self._last(NOW_S) if glance.span is not None]
+        spans = [span for span in spans if start_of(span[0]) == start_of(spans[-1][2])]
         if not spans:
             return None
         frames, elapsed_ns = spans[-1][2] - spans[0][0], spans[-1][3] - spans[0][1]
-        restarted = frames >= 1 << 32
-        return frames * 1e9 / elapsed_ns if elapsed_ns > 0 and frames > 0 and not restarted else None
+        return frames * 1e9 / elapsed_ns if elapsed_ns > 0 and frames > 0 else None
 
-    def durations_us(self) -> tuple[float, float] | None:
-        """p50 and p99 of frame to command in the last second; None without any."""
-        durations = [glance.durations_ns for glance in self._last(NOW_S)]
+    def durations_us(self, *, ended: bool = False) -> tuple[float, float] | None:
+        """p50 and p99 of frame to command in the last second, or the last with a step in it; None without any."""
+        durations = [glance.durations_ns for glance in (self._worked if ended else self._last(NOW_S))]
         every = np.concatenate(durations) if durations else np.zeros(0)
         return None if not every.size else (float(np.median(every)) / 1e3, float(np.percentile(every, 99)) / 1e3)
 
@@ -199,10 +203,13 @@ class Watcher:
         return self._sign((Role.RECORDER,))
 
     def mirrors(self) -> Sign:
-        """Of the mirror; of the one silent longest where there are several."""
+        """Of the mirror; where there are several, of the one silent longest, and of a stopped one only if all are."""
         names = [name for name in self.moment.health if name.startswith(mirror_role(""))] if self.moment else []
         if len(names) > 1:
-            return max((self._sign((name,)) for name in names), key=lambda sign: sign.silent_s)
+            return max(
+                (self._sign((name,)) for name in names),
+                key=lambda sign: (sign.life is Life.SILENT, sign.life is not Life.STOPPED, sign.silent_s),
+            )
         return self._sign(names, MIRROR_STATE)
 
     def silent_s(self, topic: Topic) -> float | None:

@@ -69,7 +69,7 @@ class Wavefront(Panel):
         for path in (ERROR, POL, COMMAND, TRUTH):
             name_curves(stream, path, names, colours)
         what = "true" if true else "measured"
-        with_loop = [f"now, {what}", f"as it would be open, {what if true else 'pseudo-open-loop'}"]
+        with_loop = [f"residual, {what}", f"with a flat mirror, {what if true else 'pseudo-open-loop'}"]
         name_curves(stream, RMS, with_loop, [GREEN, GREY], 1.6)
         degrees = np.array([noll_to_nm(index)[0] for index in noll])
         found = sorted(set(degrees.tolist()))
@@ -83,17 +83,19 @@ class Wavefront(Panel):
 
 def rms_view() -> rrb.View:
     """Rms, with the loop and without."""
-    return rrb.TimeSeriesView(origin=RMS, name="Wavefront left, nm rms", plot_legend=rrb.Corner2D.LeftTop)
+    return rrb.TimeSeriesView(origin=RMS, name="Residual wavefront, nm rms", plot_legend=rrb.Corner2D.LeftTop)
 
 
 def groups_view() -> rrb.View:
     """Rms by group."""
-    return rrb.TimeSeriesView(origin=GROUPS, name="Left by group of modes, nm rms", plot_legend=rrb.Corner2D.LeftTop)
+    return rrb.TimeSeriesView(
+        origin=GROUPS, name="Residual by group of modes, nm rms", plot_legend=rrb.Corner2D.LeftTop
+    )
 
 
 def tilt_view() -> rrb.View:
     """Tip and tilt."""
-    return rrb.TimeSeriesView(origin=TILT, name="Tip and tilt left, mas", plot_legend=rrb.Corner2D.LeftTop)
+    return rrb.TimeSeriesView(origin=TILT, name="Residual tip and tilt, mas", plot_legend=rrb.Corner2D.LeftTop)
 
 
 def mode_views() -> list[rrb.View]:
