@@ -221,6 +221,8 @@ def test_the_measured_tables_are_those_of_their_files() -> None:
     import measure_logs
     import measure_view
 
+    made_by = {name: " ".join(["lowfc", *words]) for name, words in measure_view.COMMANDS.items()}
+    assert json.loads(measure_view.MEASURED.read_text())["commands"] == made_by
     measured_by = {README: measure, measure_logs.DOCUMENT: measure_logs, measure_view.DOCUMENT: measure_view}
     for document, measured in measured_by.items():
         begin, end = getattr(measured, "BEGIN", measure.BEGIN), getattr(measured, "END", measure.END)

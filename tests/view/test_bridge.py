@@ -127,6 +127,7 @@ class Scene:
 def _quickly(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(bridges, "_LOOK_S", 0.05)
     monkeypatch.setattr(bridges, "_TURN_S", 0.02)
+    monkeypatch.setattr(bridges, "resident_bytes", lambda: 0)  # that of all tests in this process is no view's
 
 
 @pytest.fixture

@@ -1,4 +1,4 @@
-"""What the science camera sees: the dark zone's contrast with the wavefront as it is, and as it would be open."""
+"""What the science camera sees: the dark zone's contrast with the wavefront as it is, and with a flat mirror."""
 
 from collections import deque
 from collections.abc import Sequence
