@@ -173,6 +173,7 @@ def test_the_logs(tmp_path: Path) -> None:
     assert {path.suffix for path in (tmp_path / "logs").iterdir()} == {".mcap", ".html", ".fits"}
 
 
+@pytest.mark.slow
 @pytest.mark.viewer
 @needs_vulkan
 def test_the_views(tmp_path: Path) -> None:
