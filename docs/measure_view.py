@@ -15,7 +15,7 @@ from measure import ROOT, host, put
 MEASURED = ROOT / "docs" / "view.json"
 DOCUMENT = ROOT / "docs" / "performance.md"
 BEGIN, END = "<!-- view: begin -->\n", "<!-- view: end -->"
-COMMANDS = {"beside": ["bench", "view", "--json"], "hour": ["bench", "view", "--hour", "--json"]}
+COMMANDS = {"beside": ["bench", "view", "--seconds", "4", "--json"], "hour": ["bench", "view", "--hour", "--json"]}
 
 
 def measure() -> dict[str, Any]:

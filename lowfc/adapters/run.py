@@ -113,8 +113,17 @@ def new_run_id() -> str:
     return f"{time.strftime('%Y%m%d-%H%M%S', time.gmtime())}-{secrets.token_hex(3)}"
 
 
-def open_run(run_id: str, mirrors: tuple[str, ...] = ("dm",), base: Path | None = None) -> Run:
+def open_run(
+    run_id: str, mirrors: tuple[str, ...] = ("dm",), base: Path | None = None, listeners: tuple[str, ...] = ()
+) -> Run:
     """Run of that name; the first to open it makes its directory, chooses its ports and its secret.
+
+    Args:
+        run_id: its name.
+        mirrors: that it has.
+        base: directory of its directory; the user's runtime directory when None.
+        listeners: roles that get a port of their own beside the usual ones, where this makes the run: a launcher hears
+            a view, which only connects, if it listens.
 
     Raises:
         BusError: the name is not usable, or the run was made without one of `mirrors`.
@@ -126,7 +135,7 @@ def open_run(run_id: str, mirrors: tuple[str, ...] = ("dm",), base: Path | None 
         )
     path = (runtime_base() if base is None else base) / run_id
     if not path.is_dir():
-        _make(path, mirrors)
+        _make(path, mirrors, listeners)
     own_directory(path)
     links = _read(path)
     for role in map(mirror_role, mirrors):
@@ -195,10 +204,10 @@ def _draft(path: Path, text: str) -> Path:
     return Path(name)
 
 
-def _make(path: Path, mirrors: tuple[str, ...]) -> None:
+def _make(path: Path, mirrors: tuple[str, ...], listeners: tuple[str, ...]) -> None:
     """Make the directory under another name and rename it; whoever is second leaves the first one's in place."""
     # Who only looks on connects and does not listen: there may be several, and nobody keeps looking for one.
-    roles = [Role.CAMERA, Role.CONTROLLER, *map(mirror_role, mirrors), Role.RECORDER]
+    roles = [Role.CAMERA, Role.CONTROLLER, *map(mirror_role, mirrors), Role.RECORDER, *listeners]
     draft = Path(tempfile.mkdtemp(prefix=f".{path.name}-", dir=path.parent))  # mode 0700
     links = {
         "run_id": path.name,

@@ -120,7 +120,7 @@ class LoopBesideView:
         self._clock = HostClock()
         self._watch = Watch({}, [])
         self._timings: list[tuple[int, list[int]]] = []
-        self._run = open_run(new_run_id(), (config.mirror.name,))
+        self._run = open_run(new_run_id(), (config.mirror.name,), listeners=(Role.LAUNCHER,))
         self._children: list[Child] = []
         self._view: Child | None = None
         self._rendering = False

@@ -55,7 +55,7 @@ def sim_loop(config: Configuration, duration_s: float | None, record: bool, show
     """
     console = Console(stderr=True)
     require_screen(show)
-    run = open_run(new_run_id(), (config.mirror.name,))
+    run = open_run(new_run_id(), (config.mirror.name,), listeners=(Role.LAUNCHER,))
     try:
         prepare(config, run, console)
         children = children_of(config, run, duration_s, record)
