@@ -7,12 +7,12 @@ bus's own thread and must be short: put into a mailbox, append to a queue.
 import sys
 import threading
 import traceback
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from typing import Protocol
 
 from lowfc.adapters.envelope import Envelope
-from lowfc.contract.messages import Topic
+from lowfc.contract.messages import HEALTH, Topic
 
 ALL = "*"
 """In place of a name: every mirror, or every process."""
@@ -116,9 +116,15 @@ class Bus(Protocol):
         ...
 
 
-def last_of(bus: Bus, topic: Topic) -> list[Sample]:
-    """The last message of a queryable topic from everybody who publishes it, for who was not there to hear it."""
-    return bus.get(topic.at(ALL))
+def states(bus: Bus, topics: Iterable[Topic], timeout_s: float = 1.0) -> Iterator[tuple[Topic, Sample]]:
+    """Ask for the states among `topics`, each from everybody who publishes it, for who was not there to hear them.
+
+    Health is none of them: it comes twice a second.
+    """
+    for topic in topics:
+        if topic.queryable and topic is not HEALTH:
+            for sample in bus.get(topic.at(ALL), timeout_s=timeout_s):
+                yield topic, sample
 
 
 class Faults:

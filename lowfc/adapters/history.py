@@ -125,11 +125,17 @@ class History:
 
     @property
     def rate_hz(self) -> float:
-        """Frame rate: the camera's period where it is known, the median interval of the steps otherwise; 0 for none."""
-        if self.camera is not None and self.camera.period_ns:
-            return 1e9 / self.camera.period_ns
-        intervals_ns = np.diff(self.steps.time_ns)
-        return 1e9 / float(np.median(intervals_ns)) if intervals_ns.size else 0.0
+        """See `frame_rate_hz`."""
+        return frame_rate_hz(self.camera, self.steps)
+
+
+def frame_rate_hz(camera: wire.CameraState | None, steps: Steps) -> float:
+    """Frame rate: the camera's period where it is known, the median interval of the steps otherwise; 0 for none."""
+    if camera is not None and camera.period_ns:
+        return 1e9 / camera.period_ns
+    intervals_ns = np.diff(steps.time_ns)
+    median_ns = float(np.median(intervals_ns)) if intervals_ns.size else 0.0
+    return 1e9 / median_ns if median_ns > 0 else 0.0
 
 
 def rows_of(sequence: Sequences, among: Sequences) -> Whole:

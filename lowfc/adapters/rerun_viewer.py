@@ -34,6 +34,7 @@ from urllib.parse import quote
 
 from lowfc.adapters.child import Child
 from lowfc.adapters.run import free_ports
+from lowfc.adapters.usage import resident_bytes
 from lowfc.adapters.viewer_page import ViewerPage
 from lowfc.adapters.whole_file import being_written
 from lowfc.contract.errors import LowfcError
@@ -155,10 +156,9 @@ class RerunViewer:
     def resident_bytes(self) -> int:
         """Memory of its process; 0 when it is gone."""
         try:
-            pages = int(Path(f"/proc/{self.pid}/statm").read_text().split()[1])
+            return resident_bytes(self.pid)
         except (OSError, IndexError):
             return 0
-        return pages * os.sysconf("SC_PAGE_SIZE")
 
     def how_it_ended(self) -> str:
         """One line about a viewer that is no longer alive."""

@@ -13,6 +13,7 @@ from lowfc.adapters.bus import ALL, Bus, Publisher, Sample, name_in
 from lowfc.adapters.clock import Clock
 from lowfc.adapters.mailbox import Mailbox
 from lowfc.adapters.realtime import NOTHING, Granted
+from lowfc.adapters.usage import resident_bytes
 from lowfc.contract.events import EVENTS, Level
 from lowfc.contract.messages import EVENT, HEALTH, Topic, timestamp, wire
 
@@ -20,7 +21,6 @@ HEALTH_PERIOD_NS = 500_000_000
 STATES = ("starting", "ready", "running", "stopping", "stopped")
 
 _MET_PERIOD_S = 0.02
-_PAGE_BYTES = os.sysconf("SC_PAGE_SIZE")
 
 
 class Service:
@@ -57,6 +57,7 @@ class Service:
         self._granted = granted
         self.fill = fill
         self._state = "starting"
+        self._known: set[tuple[str, int]] = set()
         self._wakers: list[Callable[[], None]] = []
         self._event_lock = threading.Lock()
         self._started_ns = self._beaten_ns = clock.host_ns()
@@ -82,6 +83,13 @@ class Service:
         self.on_stop(mailbox.wake)
         self.bus.subscribe(topic, mailbox.put, name or ALL)
         return mailbox
+
+    def newcomers(self) -> bool:
+        """Whether somebody is heard whom the last call did not know: who answers what is asked, or answers anew."""
+        there = {(name, health.pid) for name, health in list(self.heard.items())}
+        new = not there <= self._known
+        self._known |= there
+        return new
 
     def catch_signals(self) -> None:
         """Stop at SIGTERM and SIGINT; a second SIGINT ends the process at once. For the main thread."""
@@ -201,12 +209,6 @@ class Service:
         if number == signal.SIGINT and not self.running:
             os._exit(128 + number)
         self.stop(signal.Signals(number).name)
-
-
-def resident_bytes() -> int:
-    """Resident memory of this process."""
-    with open("/proc/self/statm", "rb") as file:  # noqa: PTH123  # the loop calls it; Path costs more than the read
-        return int(file.read().split()[1]) * _PAGE_BYTES
 
 
 def _got(mailbox: Mailbox) -> wire.TopicCount:

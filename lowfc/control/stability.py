@@ -9,8 +9,17 @@ import numpy.typing as npt
 
 Array = npt.NDArray[np.float64]
 
+SETTLING = 5.0
+"""Time constants of the slowest mode after which a loop counts as settled."""
+
 _BISECTIONS = 50
 """Of a 4096th of pi: to the rounding of a double. scipy.optimize would cost every command 0.3 s at its start."""
+
+
+def settling_frames(gain: Array, leak: Array) -> int:
+    """Frames until the slowest mode, of gain and leak (modes,), has settled after the loop was closed."""
+    slowest = float((gain + leak)[gain > 0].min(initial=1.0))
+    return round(SETTLING / slowest)
 
 
 def delay_weights(delay_frames: float) -> Array:

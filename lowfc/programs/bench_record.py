@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from lowfc.adapters.usage import processor_s
 from lowfc.contract.errors import BusError, DataFileError
 
 if TYPE_CHECKING:
@@ -184,12 +185,6 @@ def _recorder(run: "Run", folder: Path) -> Iterator["subprocess.Popen[str]"]:
 def _said(folder: Path) -> str:
     """The end of what the recorder said on standard error."""
     return (folder / _STDERR).read_text(errors="replace").strip()[-500:]
-
-
-def processor_s(pid: int) -> float:
-    """Processor time that a process has used, all its threads, seconds."""
-    fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
-    return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
 
 
 def _copying(folder: Path) -> tuple[float, float]:

@@ -12,14 +12,13 @@ from rich.console import Console
 
 from lowfc.adapters.log_reader import Logged, LogReader
 from lowfc.adapters.progress import passing_bar
-from lowfc.adapters.service import resident_bytes
+from lowfc.adapters.usage import resident_bytes
 from lowfc.contract.configuration import Configuration
 from lowfc.contract.messages import TRUTH, Message, Topic, from_timestamp, timestamp, topic_of, wire
 from lowfc.programs.bench_view_loop import LoopBesideView, loop_configuration
 from lowfc.programs.view.bridge import OWN_BYTES, VIEWER_SPARE_BYTES
-from lowfc.programs.view.brush import PICTURES_HZ, PICTURES_PER_WHOLE
 from lowfc.programs.view.layout import LIVE_WINDOW_S
-from lowfc.programs.view.moment import NEWEST_ONLY, SHOWN, Gatherer
+from lowfc.programs.view.moment import NEWEST_ONLY, PICTURES_HZ, PICTURES_PER_WHOLE, SHOWN, Gatherer
 from lowfc.programs.view.painter import Painter
 from lowfc.programs.view.place import place
 from lowfc.programs.view.tabs import Tab
@@ -103,7 +102,7 @@ def _thinned(log: Iterable[Logged]) -> Iterator[tuple[Topic, Logged]]:
         if topic in NEWEST_ONLY:
             if logged.log_time_ns < due_ns.get(logged.key, 0):
                 continue
-            due_ns[logged.key] = logged.log_time_ns + round(1e9 / PICTURES_HZ)
+            due_ns[logged.key] = logged.log_time_ns + _PERIOD_NS
         yield topic, logged
 
 

@@ -19,11 +19,11 @@ from lowfc.adapters.child import Child
 from lowfc.adapters.clock import HostClock
 from lowfc.adapters.realtime import spread
 from lowfc.adapters.run import new_run_id, open_run
+from lowfc.adapters.usage import processor_s, resident_bytes
 from lowfc.adapters.zenoh_bus import ZenohBus
 from lowfc.contract.configuration import Configuration, load
 from lowfc.contract.errors import BusError
 from lowfc.contract.messages import EVENT, FRAME, HEALTH, TIMING, Log, Role, from_timestamp, wire
-from lowfc.programs.bench_record import processor_s
 from lowfc.programs.processes import program, start_all, stop_all
 from lowfc.programs.sim_loop import check, children_of, prepare
 from lowfc.programs.watch import Watch, summary, topic_count
@@ -271,13 +271,8 @@ class LoopBesideView:
         bridge_share, viewer_share = (
             (processor_s(pid) - then_s) / elapsed_s for pid, then_s in zip(pids, used_s, strict=True)
         )
-        bridge_bytes, viewer_bytes = map(resident_bytes_of, pids)
+        bridge_bytes, viewer_bytes = map(resident_bytes, pids)
         return Cost(bridge_share, viewer_share, bridge_bytes, viewer_bytes, self._watch.of(Role.VIEWER).rate_hz)
-
-
-def resident_bytes_of(pid: int) -> int:
-    """Resident memory of a process."""
-    return int(Path(f"/proc/{pid}/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE")
 
 
 def _check_view(view: Child) -> None:

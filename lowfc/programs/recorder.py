@@ -15,7 +15,7 @@ from types import FrameType
 from google.protobuf.message import DecodeError
 
 from lowfc.adapters.backlog import Backlog
-from lowfc.adapters.bus import Bus, Sample, last_of, name_in
+from lowfc.adapters.bus import Bus, Sample, name_in, states
 from lowfc.adapters.clock import Clock, HostClock
 from lowfc.adapters.envelope import start_of
 from lowfc.adapters.ledger import Ledger
@@ -125,8 +125,7 @@ class Recorder:
 
     def _ask(self) -> list[Sample]:
         """Get what this process did not hear: calibration and states from before its start, or lost on their way."""
-        topics = [topic for topic in TOPICS if topic.queryable and topic is not HEALTH]
-        return [sample for topic in topics for sample in last_of(self._bus, topic)]
+        return [sample for _, sample in states(self._bus, TOPICS)]
 
     def _ask_meanwhile(self) -> None:
         """Ask when somebody is new, on a thread of its own: one who is frozen answers late, and the rest goes on."""

@@ -15,13 +15,12 @@ from lowfc.control.error_budget import (
 )
 from lowfc.control.safety import LoopMode
 from lowfc.control.spectra import SHORTEST, Pieces, Spectrum, in_bins, pieces, spectrum
+from lowfc.control.stability import settling_frames
 from lowfc.programs.report.source import Run
 
 Double = npt.NDArray[np.float64]
 Figures = dict[str, Any]
 
-SETTLING = 5.0
-"""Time constants of the slowest mode that are left out after the loop was closed; at most a tenth of the stretch."""
 MOST_STEPS = 200_000
 """Of a longer stretch only the last ones are looked at: memory does not grow with the night."""
 BANDS_HZ = (1.0, 10.0, 100.0, 1000.0)
@@ -68,8 +67,7 @@ def longest_stretch(run: Run) -> Stretch | None:
     first, last = max(spans, key=lambda span: int(np.isfinite(steps.error_nm[span[0] : span[1], :1]).sum()))
     law = run.laws[laws[first]]
     gain, leak = np.array(law.gain, float), np.array(law.leak, float)
-    slowest = float((gain + leak)[gain > 0].min(initial=1.0))
-    settling = min(round(SETTLING / slowest), (last - first) // 10)
+    settling = min(settling_frames(gain, leak), (last - first) // 10)
     rows = slice(max(first + settling, last - MOST_STEPS), last)
     earlier = rows.start - first - settling
     signals = [steps.error_nm[rows], steps.pol_nm[rows]]

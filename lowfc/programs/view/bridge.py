@@ -11,13 +11,14 @@ from dataclasses import dataclass
 
 import rerun as rr
 
-from lowfc.adapters.bus import Bus, Sample, last_of
+from lowfc.adapters.bus import Bus, Sample, states
 from lowfc.adapters.clock import Clock
 from lowfc.adapters.rerun_viewer import RerunViewer, Show, ViewerError
-from lowfc.adapters.service import Service, resident_bytes
+from lowfc.adapters.service import Service
+from lowfc.adapters.usage import resident_bytes
 from lowfc.contract.configuration import Configuration
 from lowfc.contract.errors import LowfcError
-from lowfc.contract.messages import HEALTH, STEP, TRUTH, Role, Topic
+from lowfc.contract.messages import STEP, TRUTH, Role, Topic
 from lowfc.programs.view.brush import Brush
 from lowfc.programs.view.moment import NEWEST_ONLY, SHOWN
 
@@ -88,7 +89,6 @@ class Bridge:
         self._renewed_s: list[float] = []
         self._stuck = False
         self._awake_s = time.monotonic()
-        self._asked: set[tuple[str, int]] = set()
         self._rings = {topic: bus.ring(topic, WAITING[topic]) for topic in SHOWN}
         self.service = Service(Role.VIEWER, run_id, clock, bus)
 
@@ -160,14 +160,11 @@ class Bridge:
 
     def _ask(self) -> list[tuple[Topic, Sample]]:
         """States from before our start."""
-        topics = [topic for topic in SHOWN if topic.queryable and topic is not HEALTH]
-        return [(topic, sample) for topic in topics for sample in last_of(self._bus, topic)]
+        return list(states(self._bus, SHOWN))
 
     def _look(self, now_s: float) -> None:
         """Is everything well?"""
-        there = {(name, health.pid) for name, health in list(self.service.heard.items())}
-        if there - self._asked and (brush := self._brush) is not None:
-            self._asked |= there
+        if (brush := self._brush) is not None and self.service.newcomers():
             # One who is frozen answers late; the rest goes on meanwhile.
             threading.Thread(target=lambda: brush.tell(self._ask()), name="ask", daemon=True).start()
         own_bytes = resident_bytes()

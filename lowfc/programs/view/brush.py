@@ -4,6 +4,7 @@ import threading
 import time
 from collections import deque
 from collections.abc import Callable, Iterable, Mapping
+from itertools import chain
 
 import rerun as rr
 
@@ -11,12 +12,8 @@ from lowfc.adapters.bus import Ring, Sample
 from lowfc.adapters.clock import Clock
 from lowfc.contract.configuration import Configuration
 from lowfc.contract.messages import Topic
-from lowfc.programs.view.moment import Gatherer
+from lowfc.programs.view.moment import PICTURES_HZ, PICTURES_PER_WHOLE, Gatherer
 from lowfc.programs.view.painter import Painter
-
-PICTURES_HZ = 30.0
-PICTURES_PER_WHOLE = 6
-"""Curves grow five times a second: many rows in one message cost hardly more than one."""
 
 
 class Brush(threading.Thread):
@@ -80,9 +77,7 @@ class Brush(threading.Thread):
         stream.disconnect()
 
     def _gather(self, gatherer: Gatherer) -> None:
-        while self._told:
-            topic, sample = self._told.popleft()
+        told = [self._told.popleft() for _ in range(len(self._told))]
+        arrived = ((topic, sample) for topic, ring in self._rings.items() for sample in ring.drain())
+        for topic, sample in chain(told, arrived):
             gatherer.take(topic, sample.key, sample.payload, sample.publish_time_ns, sample.sequence)
-        for topic, ring in self._rings.items():
-            for sample in ring.drain():
-                gatherer.take(topic, sample.key, sample.payload, sample.publish_time_ns, sample.sequence)

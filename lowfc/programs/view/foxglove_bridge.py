@@ -13,14 +13,15 @@ from dataclasses import dataclass
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
-from lowfc.adapters.bus import ALL, Bus, Sample
+from lowfc.adapters.bus import ALL, Bus, Sample, states
 from lowfc.adapters.clock import Clock
 from lowfc.adapters.log_writer import declaration
 from lowfc.adapters.run import Run
 from lowfc.adapters.service import Service
 from lowfc.adapters.zenoh_bus import ZenohBus
 from lowfc.contract.errors import BusError, ConfigurationError
-from lowfc.contract.messages import HEALTH, TOPICS, RawImage, Role, Topic
+from lowfc.contract.messages import TOPICS, RawImage, Role, Topic
+from lowfc.programs.view.moment import PICTURES_HZ
 
 if TYPE_CHECKING:
     from foxglove import Channel
@@ -31,8 +32,6 @@ DEFAULT_PORT = 8765
 """Where Foxglove and Lichtblick look first."""
 SHOWN = tuple(topic for topic in TOPICS if Role.VIEWER in topic.subscribers)
 """What a viewer subscribes to."""
-IMAGES_HZ = 30.0
-"""How many images a second of each topic are served at most."""
 
 _TURN_S = 0.05
 _PATIENCE_S = 0.2
@@ -101,11 +100,8 @@ class FoxgloveBridge:
     def run(self) -> Summary:
         """Serve until told to stop."""
         self.service.state = "running"
-        asked: set[tuple[str, int]] = set()
         while self.service.running:
-            there = {(name, health.pid) for name, health in list(self.service.heard.items())}
-            if there - asked:
-                asked |= there
+            if self.service.newcomers():
                 self._ask()
             self.service.work = self._messages
             self.service.beat()
@@ -128,12 +124,10 @@ class FoxgloveBridge:
 
     def _ask(self) -> None:
         """Get the states that a process published before it was linked to this one."""
-        for topic in SHOWN:
-            if topic.queryable and topic is not HEALTH:
-                for sample in self._bus.get(topic.at(ALL), timeout_s=_PATIENCE_S):
-                    kept = self.kept.get(sample.key)
-                    if kept is None or kept.sequence < sample.sequence:
-                        self._take(topic, sample)
+        for topic, sample in states(self._bus, SHOWN, _PATIENCE_S):
+            kept = self.kept.get(sample.key)
+            if kept is None or kept.sequence < sample.sequence:
+                self._take(topic, sample)
 
     def _take(self, topic: Topic, sample: Sample) -> None:
         """Pass a message on; on the bus's threads."""
@@ -178,7 +172,7 @@ def serve_foxglove(run: Run, clock: Clock, port: int = DEFAULT_PORT) -> Summary:
         BusError: the port is taken.
         ConfigurationError: foxglove-sdk is not installed.
     """
-    images = {topic: IMAGES_HZ for topic in SHOWN if topic.message is RawImage}
+    images = {topic: PICTURES_HZ for topic in SHOWN if topic.message is RawImage}
     bus = ZenohBus(run.links, Role.VIEWER, clock, images)
     try:
         bridge = FoxgloveBridge(bus, clock, run.run_id, port)

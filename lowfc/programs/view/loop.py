@@ -15,7 +15,7 @@ from lowfc.programs.view.moment import Moment
 from lowfc.programs.view.panel import Panel
 
 MODE, FLUX, SATURATED, LOG = "loop/mode", "loop/flux", "loop/saturated", "log"
-_COLOURS: dict[LoopMode, Colour] = {
+MODE_COLOURS: dict[LoopMode, Colour] = {
     LoopMode.IDLE: GREY,
     LoopMode.OPEN: BLUE,
     LoopMode.CLOSED: GREEN,
@@ -40,9 +40,9 @@ class Loop(Panel):
     def begin(self, stream: rr.RecordingStream) -> None:
         """Name what is drawn."""
         style = rr.StateConfiguration(
-            values=[mode.name for mode in _COLOURS],
-            labels=[mode.name.lower() for mode in _COLOURS],
-            colors=[(*colour, 255) for colour in _COLOURS.values()],
+            values=[mode.name for mode in MODE_COLOURS],
+            labels=[mode.name.lower() for mode in MODE_COLOURS],
+            colors=[(*colour, 255) for colour in MODE_COLOURS.values()],
         )
         stream.log(MODE, style, static=True)
         name_curves(stream, FLUX, ["light on the sensor, % of expected"], [ORANGE])

@@ -66,6 +66,12 @@ class Pictures:
         stream.log(self.path, rr.Image.from_fields(buffer=colours.tobytes()))
 
 
-def caption(stream: rr.RecordingStream, path: str, text: str, place: tuple[float, float]) -> None:
-    """Write a line into a picture, centred on a place in its pixels (x, y)."""
-    stream.log(path, rr.Points2D([place], radii=[0.0], colors=[WHITE], labels=[text], show_labels=True))
+def words(places: npt.ArrayLike, texts: Sequence[str], colours: Sequence[Colour] = (WHITE,)) -> rr.Points2D:
+    """Words at places (words, 2), by which the viewer sets them a little below."""
+    return rr.Points2D(places, radii=0.0, colors=colours, labels=texts, show_labels=True)
+
+
+def caption(stream: rr.RecordingStream, path: str, text: str, shape: tuple[int, ...]) -> None:
+    """Write a line into the lower edge of the picture (rows, columns) at `path`."""
+    rows, columns = shape
+    stream.log(f"{path}/caption", words([(columns / 2, rows * 0.86)], [text]))

@@ -11,27 +11,23 @@ import rerun.blueprint as rrb
 from rerun.blueprint.components import VisualizerComponentMapping
 from rerun.blueprint.encodings import ComponentSourceKind
 
+from lowfc.adapters.history import STAGES
+from lowfc.contract.codec import wire_mode
 from lowfc.contract.messages import EVENT, FRAME, STEP, SURFACE, TIMING, TRUTH, Topic, wire
 from lowfc.optics.zernike import NOLLS_14, mode_name
-from lowfc.programs.view.colours import BLUE, GREEN, GREY, RED, distinct
+from lowfc.programs.view.colours import distinct
+from lowfc.programs.view.loop import MODE_COLOURS
 
 TIMELINE = "message_publish_time"
 """Of the timelines that rerun gives to a log, the one by which messages were sent."""
 
 _MIRROR = "dm"
 _MODE_NAMES = tuple(map(mode_name, NOLLS_14))
-_MODE_COLOURS = {
-    wire.LOOP_MODE_IDLE: GREY,
-    wire.LOOP_MODE_OPEN: BLUE,
-    wire.LOOP_MODE_CLOSED: GREEN,
-    wire.LOOP_MODE_SAFED: RED,
-}
 _STATES = rr.StateConfiguration(
-    values=list(map(wire.LoopMode.Name, _MODE_COLOURS)),
-    labels=[wire.LoopMode.Name(mode).removeprefix("LOOP_MODE_").lower() for mode in _MODE_COLOURS],
-    colors=[(*colour, 255) for colour in _MODE_COLOURS.values()],
+    values=[wire.LoopMode.Name(wire_mode(mode)) for mode in MODE_COLOURS],
+    labels=[mode.name.lower() for mode in MODE_COLOURS],
+    colors=[(*colour, 255) for colour in MODE_COLOURS.values()],
 )
-_STAGES = ("transport", "wakeup", "compute", "publish", "frame_to_command")
 
 
 def message_layout() -> rrb.Blueprint:
@@ -52,7 +48,7 @@ def message_layout() -> rrb.Blueprint:
         TRUTH, "true wavefront rms, nm", {"disturbance_rms_nm": ["disturbance"], "residual_rms_nm": ["residual"]}
     )
     flux = _plot(STEP, "flux, DN", {"flux_dn": ["flux"]})
-    stages = {f"{stage}_ns[0]": [stage.replace("_", " ")] for stage in _STAGES}
+    stages = {f"{stage}_ns[0]": [stage.replace("_", " ")] for stage in STAGES}
     timing = _plot(TIMING, "stages of one frame in each batch, ns", stages)
     modes = [
         _plot(topic, f"{name}, nm", {f"{field}[]": _MODE_NAMES}, legend=field == "error_nm")

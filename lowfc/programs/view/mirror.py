@@ -13,7 +13,7 @@ from lowfc.programs.view.panel import Panel
 from lowfc.programs.view.scale import Scale
 
 COMMAND, SURFACE, STROKE = "mirror/command", "mirror/surface", "mirror/stroke"
-_LIMITED, _CAPTION = "at_limit", "caption"
+_LIMITED = "at_limit"
 _LEAST_NM = 1.0
 _NEAR = 0.995
 """Share of the stroke from which on an actuator counts as at its limit: the driver's step and margins lie above."""
@@ -48,9 +48,8 @@ class Mirror(Panel):
         changed = scale.fit(values_nm, time_ns)
         self._pictures[path].show(stream, time_ns, diverging(values_nm / scale.limit))
         if changed:
-            rows, columns = values_nm.shape
             text = f"blue -{scale.limit:g}, orange +{scale.limit:g} nm"
-            caption(stream, f"{path}/{_CAPTION}", text, (columns / 2, rows * 0.86))
+            caption(stream, path, text, values_nm.shape)
 
     def _mark(self, stream: rr.RecordingStream, moment: Moment, surface_nm: npt.NDArray[np.float32]) -> None:
         """A ring round each actuator at its stroke."""

@@ -52,6 +52,10 @@ SHOWN: tuple[Topic, ...] = (
 NEWEST_ONLY: tuple[Topic, ...] = (FRAME, MIRROR_STATE, SURFACE)
 """Topics of which only the newest message is looked at."""
 
+PICTURES_HZ = 30.0
+PICTURES_PER_WHOLE = 6
+"""Moments for each that is whole: curves grow five times a second, for many rows cost hardly more than one."""
+
 _NEWEST_ONLY = {topic.key for topic in NEWEST_ONLY}
 
 

@@ -27,7 +27,7 @@ RETRY_NS = 5_000_000_000
 
 
 @dataclass(slots=True)
-class _Place:
+class _Slot:
     """Where a panel belongs: how to make it, it or None while it is left out, and when to try again."""
 
     make: Callable[[], Panel]
@@ -57,36 +57,36 @@ class Painter:
             Spectra,
             *self._science(config),
         ]
-        self._places = [_Place(make) for make in made]
-        for place in self._places:
-            self._make(place)
+        self._slots = [_Slot(make) for make in made]
+        for slot in self._slots:
+            self._make(slot)
 
     @property
     def panels(self) -> list[Panel]:
         """Those that are drawn."""
-        return [place.panel for place in self._places if place.panel is not None]
+        return [slot.panel for slot in self._slots if slot.panel is not None]
 
     def draw(self, moment: Moment) -> None:
         """Draw what is new."""
-        for place in self._places:
-            if place.panel is None and moment.time_ns >= place.again_ns:
-                self._make(place)
-            if place.panel is not None and (moment.whole or place.panel.pictures):
-                self._draw(place, place.panel, moment)
+        for slot in self._slots:
+            if slot.panel is None and moment.time_ns >= slot.again_ns:
+                self._make(slot)
+            if slot.panel is not None and (moment.whole or slot.panel.pictures):
+                self._draw(slot, slot.panel, moment)
         for remark in self._remarks:
             at(self._stream, moment.time_ns)
             self._stream.log(f"{LOG}/view", rr.TextLog(remark, level=rr.TextLogLevel.ERROR))
         self._remarks.clear()
 
-    def _make(self, place: _Place) -> None:
-        place.panel = place.make()
-        place.panel.begin(self._stream)
+    def _make(self, slot: _Slot) -> None:
+        slot.panel = slot.make()
+        slot.panel.begin(self._stream)
 
-    def _draw(self, place: _Place, panel: Panel, moment: Moment) -> None:
+    def _draw(self, slot: _Slot, panel: Panel, moment: Moment) -> None:
         try:
             panel.draw(self._stream, moment)
         except Exception as fault:
-            place.panel, place.again_ns = None, moment.time_ns + RETRY_NS
+            slot.panel, slot.again_ns = None, moment.time_ns + RETRY_NS
             self._remarks.append(f"{type(panel).__name__} is left out of the view for a while: {fault!r}")
 
     def _science(self, config: Configuration) -> list[Callable[[], Panel]]:

@@ -7,8 +7,8 @@ import numpy.typing as npt
 import rerun as rr
 import rerun.blueprint as rrb
 
-from lowfc.programs.view.colours import BLUE, GREY, WHITE, YELLOW
-from lowfc.programs.view.marks import at
+from lowfc.programs.view.colours import BLUE, GREY, YELLOW
+from lowfc.programs.view.marks import at, words
 from lowfc.programs.view.moment import Moment
 from lowfc.programs.view.panel import Panel
 from lowfc.programs.view.scale import Scale
@@ -72,7 +72,7 @@ class Pointing(Panel):
         stream.log(f"{TRAIL}/rings", rr.LineStrips2D(lines, colors=[GREY], radii=0.003))
         labels = [f"{ring * self._scale.limit:g} mas" for ring in _RINGS]
         places = _screen(np.array([[0.0, ring] for ring in _RINGS]))
-        stream.log(f"{TRAIL}/labels", rr.Points2D(places, radii=0.0, labels=labels, colors=[WHITE], show_labels=True))
+        stream.log(f"{TRAIL}/labels", words(places, labels))
 
 
 def pointing_view() -> rrb.View:

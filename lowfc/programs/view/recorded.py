@@ -10,8 +10,7 @@ from lowfc.adapters.log_reader import Logged, LogReader
 from lowfc.contract.configuration import Configuration
 from lowfc.contract.errors import ConfigurationError, DataFileError
 from lowfc.contract.messages import topic_of
-from lowfc.programs.view.brush import PICTURES_HZ, PICTURES_PER_WHOLE
-from lowfc.programs.view.moment import SHOWN, Gatherer
+from lowfc.programs.view.moment import PICTURES_HZ, PICTURES_PER_WHOLE, SHOWN, Gatherer
 from lowfc.programs.view.painter import Painter
 
 _PERIOD_NS = round(1e9 / PICTURES_HZ)

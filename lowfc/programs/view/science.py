@@ -1,7 +1,6 @@
 """What the science camera sees: the dark zone's contrast with the wavefront as it is, and with a flat mirror."""
 
 from collections import deque
-from collections.abc import Sequence
 
 import numpy as np
 import numpy.typing as npt
@@ -10,8 +9,8 @@ import rerun.blueprint as rrb
 
 from lowfc.optics.coronagraph import DARK_ZONE, Wedge
 from lowfc.optics.science_camera import ScienceCamera
-from lowfc.programs.view.colours import BLUE, GREEN, GREY, WHITE, Rgb, sequential
-from lowfc.programs.view.marks import Pictures, curves, name_curves
+from lowfc.programs.view.colours import BLUE, GREEN, GREY, Rgb, sequential
+from lowfc.programs.view.marks import Pictures, curves, name_curves, words
 from lowfc.programs.view.moment import Moment
 from lowfc.programs.view.panel import Panel
 
@@ -61,7 +60,7 @@ class Science(Panel):
         stream.log(f"{IMAGE}/outlines", outlines, static=True)
         decades = range(_DARKEST, _BRIGHTEST + 1)
         places = [(_WIDTH + 12, _SAMPLES * (1 - float(_share(decade))) - _LABEL) for decade in decades]
-        stream.log(f"{IMAGE}/scale", _texts(places, [f"1e{decade}" for decade in decades]), static=True)
+        stream.log(f"{IMAGE}/scale", words(places, [f"1e{decade}" for decade in decades]), static=True)
 
     def draw(self, stream: rr.RecordingStream, moment: Moment) -> None:
         """Look at the newest wavefront; now and then, draw."""
@@ -109,7 +108,7 @@ class Science(Panel):
         self._pictures.show(stream, time_ns, _side_by_side(*images))
         captions = [f"{title}: {mean:.1e}" for title, mean in zip(("now", "flat mirror"), means, strict=True)]
         places = [(start + _SAMPLES / 2, -_LABEL - _GAP) for start in (0, _SECOND)]
-        stream.log(f"{IMAGE}/captions", _texts(places, captions))
+        stream.log(f"{IMAGE}/captions", words(places, captions))
         curves(stream, CONTRAST, np.array([time_ns]), np.log10([[self._flat, *means]]))
 
 
@@ -130,11 +129,6 @@ def contrast_view() -> rrb.View:
         plot_legend=rrb.Corner2D.LeftTop,
         axis_y=rrb.ScalarAxis(range=(_DARKEST, _BRIGHTEST - 1)),
     )
-
-
-def _texts(places: Sequence[tuple[float, float]], texts: Sequence[str]) -> rr.Points2D:
-    """Words centred below places."""
-    return rr.Points2D(places, radii=0.0, colors=[WHITE], labels=texts, show_labels=True)
 
 
 def _share(decade: npt.NDArray[np.floating] | float) -> npt.NDArray[np.floating]:

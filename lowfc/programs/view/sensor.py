@@ -14,7 +14,6 @@ from lowfc.programs.view.panel import Panel
 from lowfc.programs.view.scale import Scale
 
 FRAME, DIFFERENCE, REFERENCE, RAW = "sensor/frame", "sensor/difference", "sensor/reference", "sensor/raw"
-_CAPTION = "caption"
 _RAW_PERIOD_NS = 500_000_000
 _LEAST_DN = 10.0
 
@@ -61,7 +60,7 @@ class Sensor(Panel):
         light = np.clip(frame, dark_dn, dark_dn + limit) - np.uint16(dark_dn)
         self._frames.show(stream, time_ns, np.take(self._stretch, light, axis=0))
         if changed:
-            _caption_below(stream, FRAME, frame.shape, f"0 to {limit} DN, logarithmic")
+            caption(stream, FRAME, f"0 to {limit} DN, logarithmic", frame.shape)
 
     def _calibrate(self, stream: rr.RecordingStream, calibration: Calibration, time_ns: int) -> None:
         self._calibration = calibration
@@ -69,7 +68,7 @@ class Sensor(Panel):
         reference_dn = (calibration.reference * calibration.flux_dn).reshape(calibration.shape)
         limit_dn = float(reference_dn.max())
         self._references.show(stream, time_ns, _log_stretched(reference_dn, limit_dn))
-        _caption_below(stream, REFERENCE, calibration.shape, f"0 to {limit_dn:.0f} DN expected, logarithmic")
+        caption(stream, REFERENCE, f"0 to {limit_dn:.0f} DN expected, logarithmic", calibration.shape)
 
     def _show_difference(
         self, stream: rr.RecordingStream, calibration: Calibration, frame: npt.NDArray[np.uint16], time_ns: int
@@ -83,7 +82,7 @@ class Sensor(Panel):
         self._differences.show(stream, time_ns, diverging(change_dn / self._largest.limit))
         if changed:
             text = f"blue -{self._largest.limit:g}, orange +{self._largest.limit:g} DN"
-            _caption_below(stream, DIFFERENCE, frame.shape, text)
+            caption(stream, DIFFERENCE, text, frame.shape)
 
 
 def frame_view() -> rrb.View:
@@ -110,7 +109,3 @@ def _log_stretched(light_dn: Single, limit_dn: float) -> Rgb:
     """Two decades below the limit, in colours; less light is nearly black."""
     knee_dn = np.float32(limit_dn * 1e-2)
     return sequential(np.log1p(np.maximum(light_dn, 0) / knee_dn) / np.log1p(limit_dn / knee_dn))
-
-
-def _caption_below(stream: rr.RecordingStream, path: str, shape: tuple[int, ...], text: str) -> None:
-    caption(stream, f"{path}/{_CAPTION}", text, (shape[1] / 2, shape[0] * 0.86))

@@ -1,7 +1,6 @@
 """Power spectra of the wavefront: open against closed, and what the law should leave of it."""
 
 from collections import deque
-from collections.abc import Sequence
 from math import ceil, floor, log10
 
 import numpy as np
@@ -9,12 +8,13 @@ import numpy.typing as npt
 import rerun as rr
 import rerun.blueprint as rrb
 
+from lowfc.adapters.history import frame_rate_hz
 from lowfc.control.error_budget import LinearLoop
 from lowfc.control.safety import LoopMode
 from lowfc.control.spectra import Spectrum, in_bins, pieces, spectrum
-from lowfc.programs.report.closed_loop import SETTLING
-from lowfc.programs.view.colours import GREEN, GREY, WHITE, YELLOW, Colour
-from lowfc.programs.view.marks import at
+from lowfc.control.stability import settling_frames
+from lowfc.programs.view.colours import GREEN, GREY, YELLOW
+from lowfc.programs.view.marks import at, words
 from lowfc.programs.view.moment import Moment
 from lowfc.programs.view.panel import Panel
 
@@ -88,7 +88,7 @@ class Axes:
         stream.log(f"{self.path}/grid", grid)
         places = [(at_x, HEIGHT + 1) for at_x in x] + [(-11.0, at_y - _LABEL) for at_y in y]
         labels = [f"{10.0**decade:g} Hz" for decade in decades_x] + [f"1e{decade}" for decade in decades_y]
-        stream.log(f"{self.path}/ticks", _texts(places, labels))
+        stream.log(f"{self.path}/ticks", words(places, labels))
 
 
 class Spectra(Panel):
@@ -110,7 +110,7 @@ class Spectra(Panel):
         for path in self._axes:
             legend = rr.LineStrips2D(lines, colors=colours, radii=rr.Radius.ui_points(widths))
             stream.log(f"{path}/legend/lines", legend, static=True)
-            texts = _texts([(at_x, _LEGEND_Y - _LABEL - 6) for at_x in _LEGEND_X], names, colours)
+            texts = words([(at_x, _LEGEND_Y - _LABEL - 6) for at_x in _LEGEND_X], names, colours)
             stream.log(f"{path}/legend/names", texts, static=True)
 
     def draw(self, stream: rr.RecordingStream, moment: Moment) -> None:
@@ -122,7 +122,7 @@ class Spectra(Panel):
         if 0 <= moment.time_ns - self._drawn_ns < PERIOD_NS:
             return
         self._drawn_ns = moment.time_ns
-        rate_hz = _rate_hz(moment)
+        rate_hz = frame_rate_hz(moment.camera, steps)
         sequence, signals = (np.concatenate(column) for column in zip(*self._recent, strict=True))
         run = pieces(sequence, signals)
         found = spectrum(run, rate_hz) if rate_hz else None
@@ -136,7 +136,7 @@ class Spectra(Panel):
             else:
                 said = f"loop {mode}, last {run.frames / rate_hz:.1f} s"
             _draw_curves(stream, axes, found, columns, rate_hz)
-            stream.log(f"{axes.path}/state", _texts([_STATE], [said]))
+            stream.log(f"{axes.path}/state", words([_STATE], [said]))
 
     def _keep(self, moment: Moment, modes: int) -> None:
         """Add new rows; what was before a change of mode or law is forgotten, and what has yet to settle left out."""
@@ -146,7 +146,10 @@ class Spectra(Panel):
         if changes.size or law != self._law:
             self._recent.clear()
             self._mode, self._law = int(steps.mode[-1]), law
-            self._settling = _settling_frames(law) if law is not None and self._mode == LoopMode.CLOSED else 0
+            self._settling = 0
+            if law is not None and self._mode == LoopMode.CLOSED:
+                gain, leak, _ = law
+                self._settling = min(settling_frames(np.array(gain), np.array(leak)), FRAMES)
         signals = np.concatenate([steps.error_nm, steps.pol_nm], axis=1)
         left_out = min(self._settling, len(signals) - first)
         self._settling -= left_out
@@ -193,30 +196,9 @@ def _draw_curves(
     stream.log(f"{axes.path}/curves", rr.LineStrips2D(strips, colors=colours, radii=widths))
 
 
-def _texts(
-    places: Sequence[tuple[float, float]], texts: Sequence[str], colours: Sequence[Colour] = (WHITE,)
-) -> rr.Points2D:
-    """Words centred below places."""
-    return rr.Points2D(places, radii=0.0, colors=colours, labels=texts, show_labels=True)
-
-
-def _rate_hz(moment: Moment) -> float:
-    """The camera's, or that of the new steps; 0 where neither tells."""
-    if moment.camera is not None and moment.camera.period_ns:
-        return 1e9 / moment.camera.period_ns
-    intervals_ns = np.diff(moment.steps.time_ns)
-    return 1e9 / float(np.median(intervals_ns)) if intervals_ns.size and np.median(intervals_ns) > 0 else 0.0
-
-
 def _law_of(moment: Moment, modes: int) -> Law | None:
     """The controller's; None where it does not tell, or is for other modes."""
     state = moment.controller
     if state is None or not len(state.gain) == len(state.leak) == modes or not state.delay_frames >= 1:
         return None
     return tuple(state.gain), tuple(state.leak), state.delay_frames
-
-
-def _settling_frames(law: Law) -> int:
-    """Frames until the slowest mode has settled after the loop was closed; at most as many as are kept."""
-    rates = [gain + leak for gain, leak in zip(law[0], law[1], strict=True) if gain > 0]
-    return min(round(SETTLING / min(rates, default=1.0)), FRAMES)
