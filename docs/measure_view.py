@@ -31,7 +31,7 @@ def measure() -> dict[str, Any]:
 def render(measured: dict[str, Any]) -> str:
     """The tables in Markdown, with the host they were measured on."""
     beside, hour, about = measured["beside"], measured["hour"], measured["host"]
-    view, run = beside["view"], beside["run"]
+    view, alone, run = beside["view"], beside["view_alone"], beside["run"]
     rows = [
         "| the view is | p50, us | of off | difference, us | less than the spread | p99, us | of off | difference, us "
         "| less than the spread | frames | skipped or missing | messages lost |",
@@ -52,19 +52,22 @@ def render(measured: dict[str, Any]) -> str:
         f"{run['frames_skipped'] + run['frames_missing']} of {run['frames_published']} frames were skipped or missing, "
         f"and {run['messages_lost']} of {run['messages_lost'] + run['messages_recorded']} messages lost.",
         "",
-        "| process | share of one processor | memory | most in the hour | bound | growth over its second half |",
-        "|---|---|---|---|---|---|",
+        "| process | share of one processor, alone | beside the loop | memory | most in the hour | bound "
+        "| growth over its second half |",
+        "|---" * 7 + "|",
     ]
     for name, title in (("bridge", "the view"), ("viewer", "its viewer, serving")):
         memory = hour[name]
         rows.append(
-            f"| {title} | {view[f'{name}_cpu_percent']:.1f} % | {view[f'{name}_mb']:.0f} MB "
+            f"| {title} | {alone[f'{name}_cpu_percent']:.1f} % | {view[f'{name}_cpu_percent']:.1f} % "
+            f"| {view[f'{name}_mb']:.0f} MB "
             f"| {memory['most_mb']:.0f} MB | {memory['bound_mb']:.0f} MB "
             f"| {memory['growth_mb_per_hour']:.1f} MB per hour |"
         )
     where = (
-        f'Shares and memory are of the phase "on", in which {view["moments_hz"]:.0f} moments a second were drawn; '
-        f"the view began anew {view['renewals']} times. The hour is "
+        f"Alone: the log of this loop is published at its own rate, and {alone['moments_hz']:.0f} moments a second are "
+        f'drawn. Beside the loop: in the phase "on", in which loop and recorder leave it so much of the processors that '
+        f"{view['moments_hz']:.0f} are; it began anew {view['renewals']} times. The hour is "
         f"{hour['traffic_s']:.0f} s of traffic, {hour['messages']} messages, drawn in {hour['took_s']:.0f} s; the "
         "view's memory has in it the log that is played. The viewer is told to keep "
         f"{hour['viewer_limit_mb']:.0f} MB, as it counts. Granted by the host: "

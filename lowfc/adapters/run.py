@@ -31,6 +31,7 @@ _USER = "lowfc"
 _RUN_ID = re.compile(r"[a-z0-9][a-z0-9._-]{0,47}")
 _LOWEST_PORT = 15000
 _CONNECT_S = 1.0
+_LONGEST_SOCKET = 107  # bytes of a Unix socket's address
 _PORT_RANGE = Path("/proc/sys/net/ipv4/ip_local_port_range")
 
 
@@ -64,6 +65,11 @@ class Links:
         if user != self.user or not secret:
             raise DataFileError(f"{self.secret_file} should hold one line '{self.user}:password'; {_ADVICE}")
         return secret
+
+    def socket(self, role: str) -> Path | None:
+        """Unix socket of a role, beside its port; None where the directory's name is too long for one."""
+        path = self.secret_file.parent / f"{role}.sock"
+        return path if role in self.ports and len(os.fsencode(path)) <= _LONGEST_SOCKET else None
 
     def live(self) -> set[str]:
         """Roles whose processes listen now; a run that was killed leaves its directory behind."""

@@ -6,8 +6,9 @@ Why each setting is what it is stands in `session_config`; all of them were meas
 import contextlib
 import ctypes
 import json
+import os
 import threading
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 from typing import Any
 
 import zenoh
@@ -18,28 +19,38 @@ from lowfc.adapters.clock import Clock
 from lowfc.adapters.envelope import Envelope, sequence_of
 from lowfc.adapters.run import Links
 from lowfc.contract.errors import BusError
-from lowfc.contract.messages import Topic
+from lowfc.contract.messages import TOPICS, Topic
 
-_HOST = "tcp/127.0.0.1"
+_SOCKET = "unixsock-stream"
+_GLANCES_HZ = 40.0  # a view draws 30 pictures a second; each finds a new one
+_BATCH_BYTES = 65535  # zenoh's own
+_SMALL_BATCH_BYTES = 16384  # of a reader that keeps messages: each holds the buffer that it came in
+_SPARE_BUFFERS = 1024  # without them it makes and clears one for every message
+_ONE_THREAD = "(rx: (handover: net))"
 _PRIORITIES = ("real_time", "interactive_high", "interactive_low", "data_high", "data", "data_low", "background")
 
 
-def session_config(links: Links, role: str, at_most_hz: Mapping[Topic, float] | None = None) -> dict[str, Any]:
+def session_config(links: Links, role: str, *, looks_on: bool = False) -> dict[str, Any]:
     """Return zenoh's configuration for a role of a run; a role without a port of its own only connects.
 
     Args:
         links: of the run.
         role: whose.
-        at_most_hz: topics of which this role takes only so many a second; the others cost it next to nothing.
+        looks_on: it takes no part in the loop, see `ZenohBus`.
     """
-    own = links.ports.get(role)
-    thinned = [{"key_expr": topic.at(ALL), "freq": rate_hz} for topic, rate_hz in (at_most_hz or {}).items()]
+    listening = [_address(links, role), _socket(links, role)] if role in links.ports else []
+    batch_bytes = _SMALL_BATCH_BYTES if looks_on else _BATCH_BYTES
+    glanced_at = [{"key_expr": topic.at(ALL), "freq": _GLANCES_HZ} for topic in TOPICS if topic.newest_only]
     return {
         "mode": "peer",
         # Peers do not forward, so everybody connects to everybody; with a timeout of -1 any start order works.
-        "listen": {"endpoints": [f"{_HOST}:{own}"] if own else [], "exit_on_failure": True, "timeout_ms": 0},
+        "listen": {"endpoints": [one for one in listening if one], "exit_on_failure": True, "timeout_ms": 0},
         "connect": {
-            "endpoints": [f"{_HOST}:{port}" for name, port in sorted(links.ports.items()) if name != role],
+            "endpoints": [
+                (_socket(links, name) if looks_on else None) or _address(links, name)
+                for name in sorted(links.ports)
+                if name != role
+            ],
             "timeout_ms": -1,
             "exit_on_failure": False,
             "retry": {"period_init_ms": 50, "period_max_ms": 200, "period_increase_factor": 2},
@@ -56,20 +67,38 @@ def session_config(links: Links, role: str, at_most_hz: Mapping[Topic, float] | 
             },
             "link": {
                 "tx": {
+                    "batch_size": batch_bytes,  # of both directions: the smaller one of both ends holds
                     # A full queue delays a put by at most 1 ms, then the message is dropped; at 0 bursts are lost.
                     "queue": {
                         "size": dict.fromkeys(_PRIORITIES, 16),
                         "congestion_control": {"drop": {"wait_before_drop": 1000}},
-                    }
-                }
+                    },
+                },
+                "rx": {"buffer_size": _SPARE_BUFFERS * batch_bytes if looks_on else batch_bytes},
             },
             # Gains nothing at these sizes, and a receiver descheduled for 100 ms loses messages silently.
             "shared_memory": {"enabled": False},
         },
-        "downsampling": [{"id": "thinned", "flows": ["ingress"], "messages": ["put"], "rules": thinned}]
-        if thinned
-        else [],
+        # Who looks on comes by socket, and is sent no more pictures than it draws: writing them costs the loop, too.
+        "downsampling": [
+            {
+                "id": "glances",
+                "flows": ["egress"],
+                "messages": ["put"],
+                "link_protocols": [_SOCKET],
+                "rules": glanced_at,
+            }
+        ],
     }
+
+
+def _address(links: Links, role: str) -> str:
+    return f"tcp/127.0.0.1:{links.ports[role]}"
+
+
+def _socket(links: Links, role: str) -> str | None:
+    path = links.socket(role)
+    return None if path is None else f"{_SOCKET}/{path}"
 
 
 class ZenohPublisher:
@@ -121,6 +150,7 @@ class ZenohRing:
     def __init__(self, bus: "ZenohBus", subscriber: "zenoh.Subscriber[Handler[zenoh.Sample]]") -> None:
         self._bus = bus
         self._subscriber = subscriber
+        self._key = _known_key(str(subscriber.key_expr))
 
     def drain(self) -> list[Sample]:
         """See `Ring.drain`."""
@@ -128,7 +158,7 @@ class ZenohRing:
         now_ns = self._bus.clock.host_ns()
         while (sample := self._subscriber.try_recv()) is not None:
             try:
-                found.append(_sample(sample, now_ns))
+                found.append(_sample(sample, now_ns, self._key))
             except Exception as fault:
                 self._bus.faults.add(f"{self._bus.role}: ring of {sample.key_expr}", fault)
         return found
@@ -137,14 +167,16 @@ class ZenohRing:
 class ZenohBus:
     """One process's zenoh session; see `Bus`."""
 
-    def __init__(self, links: Links, role: str, clock: Clock, at_most_hz: Mapping[Topic, float] | None = None) -> None:
+    def __init__(self, links: Links, role: str, clock: Clock, *, looks_on: bool = False) -> None:
         """Join a run.
 
         Args:
             links: of the run.
             role: this process's.
             clock: the run's.
-            at_most_hz: topics of which this process takes only so many a second.
+            looks_on: this process takes no part in the loop: it looks at what it kept in a `Ring` now and then. It is
+                sent the topics of which only the newest matters no faster than it looks, receives into spare buffers,
+                and in one thread: half the cost. To be set in a process's first bus.
 
         Raises:
             BusError: the role's port is taken, or zenoh refuses the configuration.
@@ -153,7 +185,9 @@ class ZenohBus:
         self.clock = clock
         self.faults = Faults()
         self.start_s = links.claim_start(role, clock.start_s)
-        config = zenoh.Config.from_json5(json.dumps(session_config(links, role, at_most_hz)))
+        if looks_on:
+            os.environ.setdefault("ZENOH_RUNTIME", _ONE_THREAD)
+        config = zenoh.Config.from_json5(json.dumps(session_config(links, role, looks_on=looks_on)))
         try:
             self._session = zenoh.open(config)
         except zenoh.ZError as fault:
@@ -171,7 +205,7 @@ class ZenohBus:
     def subscribe(self, topic: Topic, handler: Callable[[Sample], None], name: str = ALL) -> Callable[[], None]:
         """See `Bus.subscribe`; `handler` runs on zenoh's receiving thread."""
         key, host_ns, faults = topic.at(name), self.clock.host_ns, self.faults
-        known_key = None if ALL in key else key
+        known_key = _known_key(key)
 
         def received(sample: zenoh.Sample) -> None:
             now_ns = host_ns()
@@ -185,10 +219,7 @@ class ZenohBus:
         return subscriber.undeclare
 
     def ring(self, topic: Topic, capacity: int) -> "ZenohRing":
-        """See `Bus.ring`; zenoh's own threads keep the messages, and Python is not woken for any of them.
-
-        Each may hold the whole buffer that it came in, 64 kB.
-        """
+        """See `Bus.ring`; zenoh's own threads keep the messages, and Python is not woken for any of them."""
         return ZenohRing(self, self._session.declare_subscriber(topic.at(ALL), RingChannel(capacity)))
 
     def queryable(self, key_expression: str, handler: Callable[[Query], None]) -> None:
@@ -271,6 +302,11 @@ def _stay_python() -> None:
     if not hasattr(_known, "thread"):
         ctypes.pythonapi.PyGILState_Ensure()
         _known.thread = True
+
+
+def _known_key(expression: str) -> str | None:
+    """The key of every message, where there is but one."""
+    return None if ALL in expression else expression
 
 
 def _sample(sample: zenoh.Sample, receive_time_ns: int, key: str | None = None) -> Sample:

@@ -53,6 +53,7 @@ class Topic:
         simulated_only: there is no such topic on a bench with real devices.
         timeless: in lockstep two runs with the same seed write the same payload bytes.
         queryable: a late joiner may ask the publisher for the last one.
+        newest_only: who looks at a run wants the newest only, and gets no more than eyes can follow.
         sentence: what it is.
     """
 
@@ -65,6 +66,7 @@ class Topic:
     simulated_only: bool = False
     timeless: bool = True
     queryable: bool = False
+    newest_only: bool = False
 
     def at(self, name: str) -> str:
         """Key of this topic for the mirror or process `name`."""
@@ -94,6 +96,7 @@ FRAME = Topic(
     _CAMERA,
     _CONTROLLER | _WATCHERS,
     "Sensor image, mono16, DN; its time is the end of the exposure.",
+    newest_only=True,
 )
 CAMERA_STATE = Topic(
     "lowfc/camera/state", wire.CameraState, 2.0, _CAMERA, EVERYBODY, "The camera's settings.", queryable=True
@@ -148,6 +151,7 @@ MIRROR_STATE = Topic(
     _MIRROR,
     _CONTROLLER | _CAMERA | _WATCHERS,
     "Where the mirror is.",
+    newest_only=True,
 )
 SURFACE = Topic(
     "lowfc/mirror/{name}/surface",
@@ -156,6 +160,7 @@ SURFACE = Topic(
     _MIRROR,
     _WATCHERS,
     "The mirror's surface over the pupil, 32FC1, nm: for eyes.",
+    newest_only=True,
 )
 TRUTH = Topic(
     "lowfc/sim/truth",

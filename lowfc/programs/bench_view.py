@@ -3,19 +3,21 @@
 import json
 import statistics
 import sys
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 if TYPE_CHECKING:
-    from lowfc.programs.bench_view_loop import Reading
+    from lowfc.programs.bench_view_loop import Cost, Reading
 
 PERCENTILES = (50, 99)
 LOG_MB = 250.0
 """Size of the recorder's logs; finished ones are deleted between two phases."""
 HOUR_S = 3600.0
+LOGGED_S = 8.0
+"""Of the loop's log that is published afterwards, beside the seconds that are measured."""
 
 
 def bench_view(
@@ -55,7 +57,9 @@ def measure(rate_hz: float, seconds: float, repeats: int, *, rendered: bool = Fa
 
     Returns:
         rate_hz, seconds and repeats as asked; phases and spread_us, see `isolation`; view, see `cost`, with renewals,
-        how often it began anew; run, figures of the whole run, the changes between phases included.
+        how often it began anew; view_alone, the same beside nothing but one process that publishes the loop's log, at
+        its own rate: without a loop on the same processors; run, figures of the whole run, the changes between phases
+        included.
 
     Raises:
         BusError, ProcessDiedError: the loop or the view did not come up, or ended.
@@ -71,7 +75,8 @@ def measure(rate_hz: float, seconds: float, repeats: int, *, rendered: bool = Fa
     readings: list[Reading] = []
     with tempfile.TemporaryDirectory(prefix="lowfc-bench-") as name:
         folder = Path(name)
-        loop = LoopBesideView(loop_configuration(rate_hz, folder, LOG_MB), folder)
+        configuration = loop_configuration(rate_hz, folder, LOG_MB)
+        loop = LoopBesideView(configuration, folder)
         with passing_bar(Console(stderr=True)) as bar, loop:
             task = bar.add_task("starting", total=repeats * len(phases))
             for repeat in range(repeats):
@@ -82,14 +87,20 @@ def measure(rate_hz: float, seconds: float, repeats: int, *, rendered: bool = Fa
                     for log in folder.glob("*.mcap"):
                         log.unlink()
                     bar.advance(task)
+            loop.wait(LOGGED_S + seconds)
         run = loop.figures()
+        with passing_bar(Console(stderr=True)) as bar:
+            bar.add_task("view of its log", total=None)
+            with LoopBesideView(configuration, folder, sorted(folder.glob("*.mcap"))) as player:
+                alone = player.cost(seconds)
     kept = ("rate_hz", "frames_published", "frames_skipped", "frames_missing", "messages_recorded", "messages_lost")
     return {
         "rate_hz": rate_hz,
         "seconds": seconds,
         "repeats": repeats,
         **isolation(readings),
-        "view": {**cost(readings), "renewals": loop.renewals},
+        "view": {**cost([one.cost for one in readings if one.cost is not None]), "renewals": loop.renewals},
+        "view_alone": cost([alone]),
         "run": {key: run[key] for key in (*kept, "realtime_granted", "realtime_refused")},
     }
 
@@ -144,7 +155,7 @@ def isolation(readings: Sequence["Reading"]) -> dict[str, Any]:
     }
 
 
-def cost(readings: Iterable["Reading"]) -> dict[str, Any]:
+def cost(costs: Sequence["Cost"]) -> dict[str, Any]:
     """What the view itself took while it worked.
 
     Returns:
@@ -152,7 +163,6 @@ def cost(readings: Iterable["Reading"]) -> dict[str, Any]:
         bridge_mb and viewer_mb (resident; the most): of the view's process and of the viewer's server;
         moments_hz drawn, median: a view that gets no processor time is cheap.
     """
-    costs = [reading.cost for reading in readings if reading.cost is not None]
     return {
         "bridge_cpu_percent": 100 * statistics.median(one.bridge_share for one in costs),
         "viewer_cpu_percent": 100 * statistics.median(one.viewer_share for one in costs),
@@ -180,9 +190,13 @@ def render(figures: dict[str, Any]) -> str:
     lines += [
         f"frame to command, medians of {figures['repeats']} times {figures['seconds']:g} s at {figures['rate_hz']:g} "
         f"Hz; run-to-run spread, the range without a view: {', '.join(spreads)}",
-        f"the view takes {view['bridge_cpu_percent']:.1f} % of a processor and {view['bridge_mb']:.0f} MB, its viewer "
-        f"{view['viewer_cpu_percent']:.1f} % and {view['viewer_mb']:.0f} MB; it drew {view['moments_hz']:.0f} moments "
-        f"a second and began anew {view['renewals']} times",
+        *(
+            f"{where}, the view takes {found['bridge_cpu_percent']:.1f} % of a processor and {found['bridge_mb']:.0f} "
+            f"MB, its viewer {found['viewer_cpu_percent']:.1f} % and {found['viewer_mb']:.0f} MB; it drew "
+            f"{found['moments_hz']:.0f} moments a second"
+            for where, found in (("beside the loop", view), ("beside its log, published", figures["view_alone"]))
+        ),
+        f"the view began anew {view['renewals']} times",
     ]
     return "\n".join(lines)
 

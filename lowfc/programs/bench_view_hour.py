@@ -18,7 +18,7 @@ from lowfc.contract.messages import TRUTH, Message, Topic, from_timestamp, times
 from lowfc.programs.bench_view_loop import LoopBesideView, loop_configuration
 from lowfc.programs.view.bridge import OWN_BYTES, VIEWER_SPARE_BYTES
 from lowfc.programs.view.layout import LIVE_WINDOW_S
-from lowfc.programs.view.moment import NEWEST_ONLY, PICTURES_HZ, PICTURES_PER_WHOLE, SHOWN, Gatherer
+from lowfc.programs.view.moment import PICTURES_HZ, PICTURES_PER_WHOLE, SHOWN, Gatherer
 from lowfc.programs.view.painter import Painter
 from lowfc.programs.view.place import place
 from lowfc.programs.view.tabs import Tab
@@ -99,7 +99,7 @@ def _thinned(log: Iterable[Logged]) -> Iterator[tuple[Topic, Logged]]:
     due_ns: dict[str, int] = {}
     for logged in log:
         topic = topic_of(logged.key)
-        if topic in NEWEST_ONLY:
+        if topic.newest_only:
             if logged.log_time_ns < due_ns.get(logged.key, 0):
                 continue
             due_ns[logged.key] = logged.log_time_ns + _PERIOD_NS

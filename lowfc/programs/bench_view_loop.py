@@ -4,7 +4,7 @@ import contextlib
 import os
 import signal
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from enum import StrEnum
 from pathlib import Path
@@ -112,9 +112,16 @@ class LoopBesideView:
         renewals: how often a view began anew.
     """
 
-    def __init__(self, config: Configuration, folder: Path) -> None:
-        """Prepare it; what the view leaves behind when it is killed is left in `folder`."""
+    def __init__(self, config: Configuration, folder: Path, played: Sequence[Path] = ()) -> None:
+        """Prepare it.
+
+        Args:
+            config: of the loop.
+            folder: what the view leaves behind when it is killed is left there.
+            played: instead of the loop, its logs are published, at their own rate, by one process.
+        """
         self.renewals = 0
+        self._played = played
         self._config = config
         self._folder = folder
         self._clock = HostClock()
@@ -130,7 +137,11 @@ class LoopBesideView:
         with contextlib.ExitStack() as stack:
             stack.callback(self._run.remove)
             prepare(self._config, self._run, Console(stderr=True))
-            self._children = children_of(self._config, self._run, None, record=True)
+            if self._played:
+                words = ["-m", "lowfc", "replay", *map(str, self._played), "--publish", "--run", self._run.run_id]
+                self._children = [program("player", [*words, "--json"], self._run.path / "player.stderr")]
+            else:
+                self._children = children_of(self._config, self._run, None, record=True)
             bus = ZenohBus(self._run.links, Role.LAUNCHER, self._clock)
             stack.callback(bus.close)
             bus.subscribe(HEALTH, self._watch.hear)
@@ -175,12 +186,12 @@ class LoopBesideView:
             self._want_view(rendering=phase is Phase.RENDERED)
         self.wait(SETTLE_S)
         pids, losses = self._pids(), self._losses()
-        used_s = [processor_s(pid) for pid in pids]
         begun_ns = self._clock.host_ns()
         with self._disturbed(phase, pids):
-            self.wait(seconds)
+            cost = self._cost(pids, seconds) if phase is Phase.ON else None
+            if cost is None:
+                self.wait(seconds)
         end_ns = self._clock.host_ns()
-        cost = self._cost(pids, used_s, (end_ns - begun_ns) * 1e-9) if phase is Phase.ON else None
         self.wait(HEALTH_S)
         if phase is Phase.KILLED:
             self._stop_view()
@@ -192,6 +203,17 @@ class LoopBesideView:
             raise BusError(f"the controller said nothing of its timing within {seconds:g} s; make the phases longer")
         lost = (now - then for now, then in zip(self._losses(), losses, strict=True))
         return Reading(phase, np.array(durations_ns), Losses(*lost), cost)
+
+    def cost(self, seconds: float) -> Cost:
+        """What a view takes for so long.
+
+        Raises:
+            ProcessDiedError: a process of the loop ended by itself.
+            BusError: the view did not get ready, or ended.
+        """
+        self._want_view(rendering=False)
+        self.wait(SETTLE_S)
+        return self._cost(self._pids(), seconds)
 
     @contextlib.contextmanager
     def _disturbed(self, phase: Phase, pids: tuple[int, ...]) -> Iterator[None]:
@@ -267,7 +289,11 @@ class LoopBesideView:
         frames = topic_count(self._watch.of(Role.CONTROLLER), FRAME.key)
         return Losses(frames.skipped, frames.missing, self._watch.of(Role.RECORDER).recording.lost)
 
-    def _cost(self, pids: tuple[int, ...], used_s: list[float], elapsed_s: float) -> Cost:
+    def _cost(self, pids: tuple[int, ...], seconds: float) -> Cost:
+        """Let time pass, and tell what the view took of it."""
+        used_s, begun_s = [processor_s(pid) for pid in pids], time.monotonic()
+        self.wait(seconds)
+        elapsed_s = time.monotonic() - begun_s
         bridge_share, viewer_share = (
             (processor_s(pid) - then_s) / elapsed_s for pid, then_s in zip(pids, used_s, strict=True)
         )

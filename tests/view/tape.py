@@ -60,8 +60,10 @@ def pixels(tape: Tape, path: str) -> npt.NDArray[np.uint8]:
     """Colours (rows, columns, 3) of the last picture at a path; its format may have come before it."""
 
     def last(component: str) -> Any:
-        found = [getattr(archetypes[0], component) for _, archetypes in tape.logged[path]]
-        return [one for one in found if one is not None][-1].as_arrow_array().to_pylist()[0]
+        logged = [batches for _, (batches, *_) in tape.logged[path]]
+        parts = [part for one in logged for part in (one if isinstance(one, list) else one.as_component_batches())]
+        named = [part for part in parts if part.component_descriptor().component == f"Image:{component}"]
+        return named[-1].as_arrow_array().to_pylist()[0]
 
     shape = last("format")
     return np.array(last("buffer"), np.uint8).reshape(shape["height"], shape["width"], -1)

@@ -20,12 +20,12 @@ from lowfc.contract.configuration import Configuration
 from lowfc.contract.errors import LowfcError
 from lowfc.contract.messages import STEP, TRUTH, Role, Topic
 from lowfc.programs.view.brush import Brush
-from lowfc.programs.view.moment import NEWEST_ONLY, SHOWN
+from lowfc.programs.view.moment import SHOWN
 
-WAITING = dict.fromkeys(SHOWN, 50) | dict.fromkeys(NEWEST_ONLY, 1) | {STEP: 500, TRUTH: 500}
-"""Messages that wait, by topic: of pictures the newest, of rows half a second at 1 kHz; each may hold 64 kB."""
+WAITING = {topic: 1 if topic.newest_only else 100 for topic in SHOWN} | {STEP: 2000, TRUTH: 2000}
+"""Messages that wait, by topic: of pictures the newest, of rows two seconds at 1 kHz; each may hold 16 kB."""
 OWN_BYTES = 512_000_000
-"""Memory of this process above which the view begins anew: 160 MB, 100 MB of rings and 150 MB unsent stay below it."""
+"""Memory of this process above which the view begins anew: 160 MB, 80 MB of rings and 150 MB unsent stay below it."""
 VIEWER_SPARE_BYTES = 1_500_000_000
 """Memory of a viewer beyond what it may keep of the stream: its textures, plots and window are not in that limit."""
 STUCK_S = 10.0

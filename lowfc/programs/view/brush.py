@@ -67,8 +67,8 @@ class Brush(threading.Thread):
         while not self._abandoned:
             now_s = time.monotonic()
             behind_s, began_s = max(0.0, now_s - began_s - 1 / PICTURES_HZ), now_s  # what arrived may be that old
-            self._gather(gatherer)
             whole = self.moments % PICTURES_PER_WHOLE == 0
+            self._gather(gatherer, whole=whole)
             painter.draw(gatherer.moment(self._clock.host_ns(), whole=whole, behind_s=behind_s))
             self.moments += 1
             self.painted_s = time.monotonic()
@@ -76,8 +76,10 @@ class Brush(threading.Thread):
             time.sleep(due_s - self.painted_s)
         stream.disconnect()
 
-    def _gather(self, gatherer: Gatherer) -> None:
+    def _gather(self, gatherer: Gatherer, *, whole: bool) -> None:
+        """Take what arrived: everything, or what is drawn at once; many messages in a row cost less each."""
         told = [self._told.popleft() for _ in range(len(self._told))]
-        arrived = ((topic, sample) for topic, ring in self._rings.items() for sample in ring.drain())
+        rings = [(topic, ring) for topic, ring in self._rings.items() if whole or topic.newest_only]
+        arrived = ((topic, sample) for topic, ring in rings for sample in ring.drain())
         for topic, sample in chain(told, arrived):
             gatherer.take(topic, sample.key, sample.payload, sample.publish_time_ns, sample.sequence)

@@ -20,8 +20,7 @@ from lowfc.adapters.run import Run
 from lowfc.adapters.service import Service
 from lowfc.adapters.zenoh_bus import ZenohBus
 from lowfc.contract.errors import BusError, ConfigurationError
-from lowfc.contract.messages import TOPICS, RawImage, Role, Topic
-from lowfc.programs.view.moment import PICTURES_HZ
+from lowfc.contract.messages import TOPICS, Role, Topic
 
 if TYPE_CHECKING:
     from foxglove import Channel
@@ -172,8 +171,7 @@ def serve_foxglove(run: Run, clock: Clock, port: int = DEFAULT_PORT) -> Summary:
         BusError: the port is taken.
         ConfigurationError: foxglove-sdk is not installed.
     """
-    images = {topic: PICTURES_HZ for topic in SHOWN if topic.message is RawImage}
-    bus = ZenohBus(run.links, Role.VIEWER, clock, images)
+    bus = ZenohBus(run.links, Role.VIEWER, clock, looks_on=True)
     try:
         bridge = FoxgloveBridge(bus, clock, run.run_id, port)
         bridge.service.catch_signals()

@@ -42,8 +42,7 @@ class Latency(Panel):
     def begin(self, stream: rr.RecordingStream) -> None:
         """Name what is drawn."""
         name_curves(stream, WHOLE, list(FIGURES), [BLUE, ORANGE, RED])
-        for figure in FIGURES:
-            name_curves(stream, f"{PARTS}/{figure}", STAGES[:-1], distinct(len(STAGES) - 1))
+        name_curves(stream, PARTS, STAGES[:-1], distinct(len(STAGES) - 1))
         name_curves(stream, COUNTS, ["skipped: a newer one was there", "missing: never arrived"], [ORANGE, RED])
         name_curves(stream, LOST, ["messages lost by the recorder"], [GREY])
 
@@ -62,8 +61,7 @@ class Latency(Panel):
         if len(us):
             figures = np.concatenate([np.percentile(us, [50, 99], axis=0), us.max(axis=0)[None]])
             curves(stream, WHOLE, now, figures[None, :, -1])
-            for figure, of_stages in zip(FIGURES, figures[:, :-1], strict=True):
-                curves(stream, f"{PARTS}/{figure}", now, of_stages[None])
+            curves(stream, PARTS, now, figures[None, FIGURES.index("p99"), :-1])
         self._draw_histogram(stream, moment.time_ns, us[:, -1])
         if (controller := moment.health.get(Role.CONTROLLER)) is not None:
             frames = topic_count(controller.health, FRAME.key)
@@ -92,7 +90,7 @@ def percentiles_view() -> rrb.View:
 def stages_view() -> rrb.View:
     """Every stage of it."""
     return rrb.TimeSeriesView(
-        origin=f"{PARTS}/p99", name="Stages of it, p99 of the last second, us", plot_legend=rrb.Corner2D.LeftTop
+        origin=PARTS, name="Stages of it, p99 of the last second, us", plot_legend=rrb.Corner2D.LeftTop
     )
 
 

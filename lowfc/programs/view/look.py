@@ -42,7 +42,7 @@ def look_at_run(run_id: str, config: Configuration | None, where: Place, seconds
     clock = clock_of(config)
     with contextlib.ExitStack() as stack:
         part = stack.enter_context(being_written(where.save)) if where.save is not None else None
-        bus = ZenohBus(run.links, Role.VIEWER, clock)
+        bus = ZenohBus(run.links, Role.VIEWER, clock, looks_on=True)
         stack.callback(bus.close)
         bridge = Bridge(
             config,

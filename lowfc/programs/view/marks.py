@@ -5,7 +5,7 @@ from collections.abc import Sequence
 import numpy as np
 import numpy.typing as npt
 import rerun as rr
-from rerun.components import AggregationPolicy, ImageFormat
+from rerun.components import AggregationPolicy, ImageBufferBatch, ImageFormat
 
 from lowfc.programs.view.colours import WHITE, Colour, Rgb
 
@@ -63,7 +63,8 @@ class Pictures:
             rows, columns, _ = colours.shape
             image_format = ImageFormat(width=columns, height=rows, color_model="RGB", channel_datatype="U8")
             stream.log(self.path, rr.Image.from_fields(format=image_format))
-        stream.log(self.path, rr.Image.from_fields(buffer=colours.tobytes()))
+        buffer = rr.DescribedComponentBatch(ImageBufferBatch(colours.tobytes()), rr.Image.descriptor_buffer())
+        stream.log(self.path, [buffer])  # the same as Image.from_fields() makes, for two thirds of its time
 
 
 def words(places: npt.ArrayLike, texts: Sequence[str], colours: Sequence[Colour] = (WHITE,)) -> rr.Points2D:

@@ -49,14 +49,11 @@ SHOWN: tuple[Topic, ...] = (
 )
 """Topics that a view shows."""
 
-NEWEST_ONLY: tuple[Topic, ...] = (FRAME, MIRROR_STATE, SURFACE)
-"""Topics of which only the newest message is looked at."""
-
 PICTURES_HZ = 30.0
-PICTURES_PER_WHOLE = 6
-"""Moments for each that is whole: curves grow five times a second, for many rows cost hardly more than one."""
+PICTURES_PER_WHOLE = 8
+"""Moments for each that is whole: curves grow four times a second, for many rows cost hardly more than one."""
 
-_NEWEST_ONLY = {topic.key for topic in NEWEST_ONLY}
+_NO_STEPS, _NO_TRUTHS, _NO_TIMINGS = StepRows(0).taken(), TruthRows(0).taken(), TimingRows().taken()[1]
 
 
 class Heard(NamedTuple):
@@ -132,7 +129,7 @@ class Gatherer:
                 return
             self._sequences[key] = sequence
         self._heard_ns[topic.key] = max(publish_time_ns, self._heard_ns.get(topic.key, 0))
-        if topic.key in _NEWEST_ONLY:
+        if topic.newest_only:
             self._newest[topic.key] = payload
             return
         try:
@@ -151,21 +148,20 @@ class Gatherer:
         frame, frame_ns = self._frame()
         if frame is not None:
             self._date(frame_ns, self._heard_ns[FRAME.key])
-        steps, truths, timings = StepRows(self._steps.modes), TruthRows(self._truths.modes), TimingRows()
-        events: list[Log] = []
+        steps, truths, timings, events = _NO_STEPS, _NO_TRUTHS, _NO_TIMINGS, list[Log]()
         if whole:
+            steps, truths, timings = self._steps.taken(), self._truths.taken(), self._timings.taken()[1]
+            self._steps, self._truths = StepRows(self._steps.modes), TruthRows(self._truths.modes)
+            self._timings = TimingRows()
             events, self._events = self._events, events
-            steps, self._steps = self._steps, steps
-            truths, self._truths = self._truths, truths
-            timings, self._timings = self._timings, timings
         mirror, surface = self._mirror(), self._surface()
         self._newest.clear()
         return Moment(
             time_ns=self._time_ns(host_ns),
             host_ns=host_ns,
-            steps=steps.taken(),
-            truths=truths.taken(),
-            timings=timings.taken()[1],
+            steps=steps,
+            truths=truths,
+            timings=timings,
             frame=frame,
             frame_ns=frame_ns,
             mirror=mirror,
