@@ -66,8 +66,8 @@ def render(measured: dict[str, Any]) -> str:
         )
     where = (
         f"Alone: the log of this loop is published at its own rate, and {alone['moments_hz']:.0f} moments a second are "
-        f'drawn. Beside the loop: in the phase "on", in which loop and recorder leave it so much of the processors that '
-        f"{view['moments_hz']:.0f} are; it began anew {view['renewals']} times. The hour is "
+        f'drawn. Beside the loop: in the phase "on", in which loop and recorder leave it processor time for '
+        f"{view['moments_hz']:.0f} a second; it began anew {view['renewals']} times. The hour is "
         f"{hour['traffic_s']:.0f} s of traffic, {hour['messages']} messages, drawn in {hour['took_s']:.0f} s; the "
         "view's memory has in it the log that is played. The viewer is told to keep "
         f"{hour['viewer_limit_mb']:.0f} MB, as it counts. Granted by the host: "

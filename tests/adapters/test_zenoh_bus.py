@@ -5,6 +5,7 @@ import json
 import signal
 import subprocess
 import sys
+import tempfile
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -21,7 +22,7 @@ from lowfc.adapters.mailbox import Mailbox
 from lowfc.adapters.run import Run, new_run_id, open_run
 from lowfc.adapters.zenoh_bus import ZenohBus, session_config
 from lowfc.contract.errors import BusError
-from lowfc.contract.messages import CALIBRATION, COMMAND, FRAME, HEALTH, REQUEST_KEY
+from lowfc.contract.messages import CALIBRATION, COMMAND, FRAME, HEALTH, REQUEST_KEY, TRUTH, Topic
 
 ROLES = ("camera", "controller", "mirror-dm")
 PATIENCE_S = 30.0
@@ -96,8 +97,10 @@ def until(condition: Callable[[], bool]) -> None:
 
 
 @pytest.fixture(autouse=True)
-def runtime(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
+def runtime(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    with tempfile.TemporaryDirectory(prefix="bus-") as path:  # short enough for the sockets in it
+        monkeypatch.setenv("XDG_RUNTIME_DIR", path)
+        yield
 
 
 @pytest.fixture
@@ -122,8 +125,8 @@ def start() -> Iterator[Callable[[], Toy]]:
 def join() -> Iterator[Callable[[Run, str], ZenohBus]]:
     buses: list[ZenohBus] = []
 
-    def begin(run: Run, role: str) -> ZenohBus:
-        buses.append(ZenohBus(run.links, role, HostClock()))
+    def begin(run: Run, role: str, **how: bool) -> ZenohBus:
+        buses.append(ZenohBus(run.links, role, HostClock(), **how))
         return buses[-1]
 
     yield begin
@@ -359,11 +362,12 @@ def test_sequences_count_from_zero_and_never_repeat(run: Run, join: Callable[[Ru
     assert starts == sorted(set(starts))
 
 
-def test_everybody_listens_on_its_own_port_and_connects_to_all_others(run: Run) -> None:
+def test_everybody_listens_on_its_own_port_and_socket_and_connects_to_all_others(run: Run) -> None:
     endpoints = {role: f"tcp/127.0.0.1:{port}" for role, port in run.links.ports.items()}
+    sockets = {role: f"unixsock-stream/{run.path}/{role}.sock" for role in endpoints}
     for role, own in endpoints.items():
         config = session_config(run.links, role)
-        assert config["listen"]["endpoints"] == [own]
+        assert config["listen"]["endpoints"] == [own, sockets[role]]
         assert set(config["connect"]["endpoints"]) == set(endpoints.values()) - {own}
         assert not config["scouting"]["multicast"]["enabled"]
         assert not config["scouting"]["gossip"]["enabled"]
@@ -371,3 +375,51 @@ def test_everybody_listens_on_its_own_port_and_connects_to_all_others(run: Run) 
     operator = session_config(run.links, "operator")
     assert operator["listen"]["endpoints"] == []
     assert set(operator["connect"]["endpoints"]) == set(endpoints.values())
+    viewer = session_config(run.links, "viewer", looks_on=True)
+    assert viewer["listen"]["endpoints"] == []
+    assert set(viewer["connect"]["endpoints"]) == set(sockets.values())
+
+
+def test_where_a_socket_has_too_long_a_name_a_port_serves_those_who_look_on(tmp_path: Path) -> None:
+    base = tmp_path / ("long" * 25)
+    base.mkdir(mode=0o700)
+    links = open_run(new_run_id(), base=base).links
+    endpoints = {f"tcp/127.0.0.1:{port}" for port in links.ports.values()}
+    assert len(session_config(links, "camera")["listen"]["endpoints"]) == 1
+    assert set(session_config(links, "viewer", looks_on=True)["connect"]["endpoints"]) == endpoints
+
+
+def test_who_looks_on_gets_every_row_and_no_more_pictures_than_it_draws(
+    run: Run, join: Callable[..., ZenohBus]
+) -> None:
+    camera, viewer, recorder = join(run, "camera"), join(run, "viewer", looks_on=True), join(run, "recorder")
+    frames, truths = camera.publisher(FRAME), camera.publisher(TRUTH)
+    kept, rows, recorded = viewer.ring(FRAME, 5000), viewer.ring(TRUTH, 5000), Mailbox()
+    recorder.subscribe(FRAME, recorded.put)
+    seen: dict[Topic, list[Sample]] = {FRAME: [], TRUTH: []}
+
+    def look() -> None:
+        seen[FRAME] += kept.drain()
+        seen[TRUTH] += rows.drain()
+
+    def met() -> bool:
+        frames.put(b"picture")
+        truths.put(b"row")
+        look()
+        return bool(seen[FRAME] and seen[TRUTH] and recorded.received)
+
+    until(met)
+    first = {topic: len(samples) for topic, samples in seen.items()}
+    heard = recorded.received
+    for _ in range(500):
+        frames.put(b"picture")
+        last = truths.put(b"row")
+        time.sleep(0.002)
+
+    def got_the_last() -> bool:
+        look()
+        return seen[TRUTH][-1].sequence == last.sequence and recorded.received >= heard + 500
+
+    until(got_the_last)
+    assert len(seen[TRUTH]) - first[TRUTH] >= 500
+    assert 5 < len(seen[FRAME]) - first[FRAME] < 250
