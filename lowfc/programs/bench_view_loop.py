@@ -150,7 +150,8 @@ class LoopBesideView:
             stack.callback(time.sleep, _LAST_WORDS_S)
             stack.callback(stop_all, self._children)
             start_all(self._children)
-            self._until(lambda: self._watch.of(Role.CAMERA).state == "running", "the camera")
+            if not self._played:
+                self._until(lambda: self._watch.of(Role.CAMERA).state == "running", "the camera")
             stack.callback(self._stop_view)
             self._stack = stack.pop_all()
         return self
