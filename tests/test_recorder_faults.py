@@ -190,7 +190,7 @@ def test_a_frozen_process_that_is_asked_does_not_hold_up_the_recorder(
     bench.start()
     asked, thawed = threading.Event(), threading.Event()
 
-    def get(key: str) -> list[Sample]:
+    def get(key: str, *, timeout_s: float) -> list[Sample]:
         asked.set()
         thawed.wait(PATIENCE_S)
         return []
