@@ -9,6 +9,7 @@ import numpy.typing as npt
 
 from lowfc.adapters import instrument
 from lowfc.adapters.bus import Sample
+from lowfc.adapters.realtime import let_send
 from lowfc.adapters.service import Service
 from lowfc.contract.codec import actuators, latency
 from lowfc.contract.configuration import Configuration
@@ -163,6 +164,7 @@ class CameraProcess:
         payload = image(frame, end_ns, "lowfc_camera").SerializeToString()
         clock.sleep_until_ns(end_ns)
         envelope = self._frames.put(payload)
+        let_send()
         self._put_ns[envelope.sequence % _REMEMBERED] = (envelope.sequence, envelope.publish_time_ns)
         self._last_frame = envelope.sequence
         self._first_put_ns = self._first_put_ns or envelope.publish_time_ns

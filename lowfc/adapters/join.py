@@ -4,8 +4,9 @@ from lowfc.adapters.clock import Clock, HostClock, SimulatedClock
 from lowfc.adapters.realtime import set_up
 from lowfc.adapters.run import open_run
 from lowfc.adapters.service import Service
-from lowfc.adapters.zenoh_bus import ZenohBus
+from lowfc.adapters.zenoh_bus import ZenohBus, receive_in_one_thread
 from lowfc.contract.configuration import Configuration
+from lowfc.contract.messages import Role
 
 
 def clock_of(config: Configuration) -> Clock:
@@ -21,10 +22,15 @@ def join(
 ) -> Service:
     """Set this process up for the loop and join a run.
 
-    A session's threads keep the scheduling class they are born with, so that comes before the session.
+    A session's threads keep the scheduling class they are born with, so that comes before the session. The mirror runs
+    ahead of the others: where it shares a processor with the controller, a command is applied before the controller
+    tells of it.
     """
     realtime = config.realtime
-    granted = set_up(realtime.priority or None, set(cpus) or None, realtime.lock_memory)
+    priority = realtime.priority + (realtime.priority > 0 and role.startswith(Role.MIRROR))
+    granted = set_up(priority or None, set(cpus) or None, realtime.lock_memory)
+    if role != Role.CAMERA:  # which computes while the mirror's states come
+        receive_in_one_thread()
     run = open_run(run_id, (config.mirror.name,))
     clock = clock_of(config)
     return Service(role, run_id, clock, ZenohBus(run.links, role, clock), granted=granted)

@@ -117,7 +117,7 @@ class RerunViewer:
         )
         try:
             self._child.environment = _environment(show)
-            self._child.command = [str(_binary()), "--bind", HOST, "--port", str(self.port)]
+            self._child.command = [str(viewer_binary()), "--bind", HOST, "--port", str(self.port)]
             self._child.command += _words(show, memory_limit, size_px, self._source_port)
             self._start()
             if self.web_port:
@@ -354,7 +354,7 @@ def vulkan_drivers() -> list[Path]:
     return sorted(found, key=lambda path: not path.name.startswith("lvp"))
 
 
-def _binary() -> Path:
+def viewer_binary() -> Path:
     package = importlib.util.find_spec("rerun_cli")
     if package is None or package.origin is None:
         raise ViewerError(f"the package rerun-sdk has no viewer here; {_REINSTALL}")

@@ -26,8 +26,15 @@ _GLANCES_HZ = 40.0  # a view draws 30 pictures a second; each finds a new one
 _BATCH_BYTES = 65535  # zenoh's own
 _SMALL_BATCH_BYTES = 16384  # of a reader that keeps messages: each holds the buffer that it came in
 _SPARE_BUFFERS = 1024  # without them it makes and clears one for every message
-_ONE_THREAD = "(rx: (handover: net))"
 _PRIORITIES = ("real_time", "interactive_high", "interactive_low", "data_high", "data", "data_low", "background")
+
+
+def receive_in_one_thread() -> None:
+    """Let zenoh's thread that waits for messages read them too, instead of waking another; before the first session.
+
+    Right for a process that waits for what it receives; one that computes meanwhile would hold it up.
+    """
+    os.environ.setdefault("ZENOH_RUNTIME", "(rx: (handover: net))")
 
 
 def session_config(links: Links, role: str, *, looks_on: bool = False) -> dict[str, Any]:
@@ -186,7 +193,7 @@ class ZenohBus:
         self.faults = Faults()
         self.start_s = links.claim_start(role, clock.start_s)
         if looks_on:
-            os.environ.setdefault("ZENOH_RUNTIME", _ONE_THREAD)
+            receive_in_one_thread()
         config = zenoh.Config.from_json5(json.dumps(session_config(links, role, looks_on=looks_on)))
         try:
             self._session = zenoh.open(config)

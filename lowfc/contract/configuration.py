@@ -242,7 +242,7 @@ class Realtime(Section):
     """What is asked of the host, in every process, before its first bus session."""
 
     priority: int = Field(50, ge=0, le=98)
-    """SCHED_FIFO priority of camera, controller and mirror; 0 for normal scheduling."""
+    """SCHED_FIFO priority of camera and controller, the mirror's is one more; 0 for normal scheduling."""
     recorder_priority: int = Field(10, ge=0, le=98)
     """SCHED_FIFO priority of the recorder, below the loop's; 0, or a loop without, for normal scheduling."""
     lock_memory: bool = True

@@ -8,6 +8,7 @@ from lowfc.adapters.bus import ALL, Query, Sample
 from lowfc.adapters.clock import SimulatedClock
 from lowfc.adapters.instrument import settings
 from lowfc.adapters.mailbox import Mailbox
+from lowfc.adapters.realtime import let_send
 from lowfc.adapters.service import Service
 from lowfc.contract import codec
 from lowfc.contract.calibration_codec import encode_calibration
@@ -116,6 +117,7 @@ class Controller:
         ready_ns = clock.host_ns()
         self._send(outputs)
         sent_ns = clock.host_ns()
+        let_send()
         self._tell(outputs)
         if sample.sequence == self._state.frame_sequence:  # an older one is no sign of a live camera
             self._last_frame_ns = taken_ns

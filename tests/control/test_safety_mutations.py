@@ -15,24 +15,40 @@ from lowfc.control import safety
 SOURCE = Path(safety.__file__).read_text(encoding="utf-8")
 
 MUTATIONS = {
-    "stroke never looked at": ("if np.abs(kept).max(initial=0) > stroke:", "if False:"),
+    "stroke never looked at": ("if max(highest_nm, -lowest_nm) > stroke:", "if False:"),
     "stroke cut on one side": ("np.clip(kept, -stroke, stroke)", "np.clip(kept, None, stroke)"),
     "stroke cut on the other side": ("np.clip(kept, -stroke, stroke)", "np.clip(kept, -stroke, None)"),
-    "stroke without a sign": ("if np.abs(kept).max(initial=0) > stroke:", "if kept.max(initial=0) > stroke:"),
-    "stroke without a margin": ("np.float32(limits.stroke_nm - margin_nm)", "np.float32(limits.stroke_nm + margin_nm)"),
-    "slew never looked at": ("if np.abs(move).max(initial=0) > slew:", "if False:"),
-    "slew without a sign": ("if np.abs(move).max(initial=0) > slew:", "if move.max(initial=0) > slew:"),
+    "stroke without a sign": ("if max(highest_nm, -lowest_nm) > stroke:", "if highest_nm > stroke:"),
+    "stroke without a margin": (
+        "stroke, slew = limits.stroke_nm - margin_nm, limits.slew_nm - margin_nm",
+        "stroke, slew = limits.stroke_nm + margin_nm, limits.slew_nm - margin_nm",
+    ),
+    "slew never looked at": ("if max(highest_move, -lowest_move) > slew:", "if False:"),
+    "slew without a sign": ("if max(highest_move, -lowest_move) > slew:", "if highest_move > slew:"),
     "slew cut on one side": ("np.clip(move, -slew, slew)", "np.clip(move, None, slew)"),
     "slew cut on the other side": ("np.clip(move, -slew, slew)", "np.clip(move, -slew, None)"),
     "slew from flat": ("kept = previous_nm + move", "kept = move"),
     "slew the wrong way": ("kept = previous_nm + move", "kept = previous_nm - move"),
-    "slew without a margin": ("np.float32(limits.slew_nm - margin_nm)", "np.float32(limits.slew_nm + margin_nm)"),
-    "stroke limit for slew": ("np.float32(limits.slew_nm - margin_nm)", "np.float32(limits.stroke_nm - margin_nm)"),
-    "neighbours never looked at": (
-        "if neighbour_difference_nm(kept) >",
-        "if False and neighbour_difference_nm(kept) >",
+    "slew without a margin": (
+        "stroke, slew = limits.stroke_nm - margin_nm, limits.slew_nm - margin_nm",
+        "stroke, slew = limits.stroke_nm - margin_nm, limits.slew_nm + margin_nm",
     ),
-    "neighbours without a margin": ("> limits.neighbour_nm - margin_nm / 2:", "> limits.neighbour_nm + margin_nm:"),
+    "stroke limit for slew": (
+        "stroke, slew = limits.stroke_nm - margin_nm, limits.slew_nm - margin_nm",
+        "stroke = slew = limits.stroke_nm - margin_nm",
+    ),
+    "neighbours never looked at": (
+        "if highest_nm - lowest_nm > apart_nm and",
+        "if False and",
+    ),
+    "neighbours looked at where twice as far apart": (
+        "if highest_nm - lowest_nm > apart_nm and",
+        "if highest_nm - lowest_nm > 2 * apart_nm and",
+    ),
+    "neighbours without a margin": (
+        "apart_nm = limits.neighbour_nm - margin_nm / 2",
+        "apart_nm = limits.neighbour_nm + margin_nm",
+    ),
     "neighbours in a column only": (
         "float(max(rows, columns))",
         "float(rows)",
@@ -53,8 +69,11 @@ MUTATIONS = {
     "apart, shrunk at once": ("max(enough, slowest)", "enough"),
     "apart, never shrunk": ("max(enough, slowest)", "1"),
     "apart, not noticed": ("if apart_nm > neighbour_nm or largest_nm > limits.stroke_nm:", "if False:"),
-    "not finite let through": ("if not np.isfinite(wanted_nm).all():", "if False:"),
-    "only one value finite": ("if not np.isfinite(wanted_nm).all():", "if not np.isfinite(wanted_nm).any():"),
+    "not finite let through": ("if not (isfinite(lowest_nm) and isfinite(highest_nm)):", "if False:"),
+    "only one value finite": (
+        "if not (isfinite(lowest_nm) and isfinite(highest_nm)):",
+        "if not (isfinite(lowest_nm) or isfinite(highest_nm)):",
+    ),
     "not finite becomes flat": (
         "Limited(previous_nm, (Reason.NOT_FINITE,))",
         "Limited(0 * previous_nm, (Reason.NOT_FINITE,))",
