@@ -21,6 +21,7 @@ ROUTE = "rerun rrd route --application-id $(basename $log .mcap) deploy/layouts/
 ELSEWHERE = {
     "make sim-loop": ".ci/run",
     "make test": ".ci/run",
+    "lowfc doctor": "tests/test_doctor.py",
     "rerun logs/*.mcap": "tests/e2e/test_viewer.py",
     ROUTE: "tests/test_layout_files.py",
 }

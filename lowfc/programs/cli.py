@@ -17,6 +17,7 @@ from lowfc.contract.errors import ConfigurationError
 from lowfc.programs.bench_record import bench_record
 from lowfc.programs.bench_view import bench_view
 from lowfc.programs.design_commands import design_app
+from lowfc.programs.doctor import doctor
 from lowfc.programs.export import export
 from lowfc.programs.log_info import info
 from lowfc.programs.recover import recover
@@ -43,6 +44,7 @@ app.command()(info)
 app.command()(recover)
 app.command()(report)
 app.command()(export)
+app.command()(doctor)
 app.command()(validate)
 app.command()(view)
 
