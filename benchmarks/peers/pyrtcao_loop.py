@@ -1,0 +1,191 @@
+"""The same loop in pyrtcao, each component a process: python -m benchmarks.peers.pyrtcao_loop ROLE FOLDER.
+
+Stock, as its users build it: a `WavefrontSensor`, a component of one's own that makes a signal of the pixels,
+`Loop.standard_integrator`, a `WavefrontCorrector`. Fused: one component of one's own between sensor and corrector does
+all of it in one compiled function, which is the best that pyrtcao can do. It runs in an interpreter that has pyrtcao,
+and needs nothing of lowfc's. Where pyrtcao may, it sets nice -20 in the normal class by itself.
+
+The corrector makes actuators of modes only when the command is out: in stock, their 144 are no part of the time to it.
+"""
+
+import os
+import sys
+import threading
+import time
+from pathlib import Path
+
+import numpy as np
+from numba import jit
+from pyrtc.component import Component
+from pyrtc.loop import Loop
+from pyrtc.streams import clear_shms, create_stream, open_stream
+from pyrtc.utils import set_affinity_and_priority
+from pyrtc.wavefront_corrector import WavefrontCorrector
+from pyrtc.wavefront_sensor import WavefrontSensor
+
+from benchmarks.peers.problem import ACTUATORS, DIFFERENT, GAIN, LEAK, LIMIT_NM, MODES, SHAPE, Problem
+from benchmarks.peers.process import Part
+
+_STREAMS = ("wfs_raw", "wfs", "signal", "wfc")
+_PIXELS = SHAPE[0] * SHAPE[1]
+
+
+class Sensor(WavefrontSensor):
+    """Exposes the frames when they are due."""
+
+    part: Part
+
+    def run(self) -> None:
+        """All frames of a run; ends the process."""
+        frames, published = Problem().frames, self.part.marks("published")
+        for number in self.part.frames():
+            self.data = frames[number % DIFFERENT]
+            published[number] = time.monotonic_ns()
+            self.expose()  # it numbers them from 1, too
+        clear(self.part)
+        os._exit(0)
+
+
+class PixelSignal(Component):
+    """The signal is the pixels without those of the reference image."""
+
+    def __init__(self, conf: dict) -> None:
+        super().__init__(conf)
+        self._reference = Problem().I0.reshape(SHAPE)
+        self._image = np.empty(SHAPE, np.int32)
+        self._signal = np.empty(SHAPE, np.float32)
+        self.register_input_stream("wfs", open_stream(self.input_stream_name("wfs")))
+        self.register_output_stream("signal", create_stream(self.output_stream_name("signal"), (_PIXELS,), np.float32))
+
+    def compute_signal(self) -> None:
+        """One frame."""
+        image = self.read_stream("wfs", out=self._image)
+        np.subtract(image, self._reference, out=self._signal, dtype=np.float32, casting="unsafe")
+        self.write_stream("signal", self._signal.reshape(-1))
+
+
+class StockLoop(Loop):
+    """Its own loop, with the moment noted when a command is out."""
+
+    commanded: memoryview
+
+    def send_to_wfc(self, correction: np.ndarray, slopes: np.ndarray | None = None) -> None:
+        """Its own, then the time."""
+        super().send_to_wfc(correction, slopes=slopes)
+        self.commanded[self.frame_id] = time.monotonic_ns()
+
+
+class FusedLoop(Component):
+    """Everything between frame and actuators."""
+
+    commanded: memoryview
+
+    def __init__(self, conf: dict) -> None:
+        super().__init__(conf)
+        problem = Problem()
+        self._arrays = (problem.I0, problem.R, problem.to_actuators)
+        self._image = np.empty(SHAPE, np.int32)
+        self._difference = np.empty(_PIXELS, np.float32)
+        self._command = np.zeros(MODES, np.float32)
+        self.register_input_stream("wfs", open_stream(self.input_stream_name("wfs")))
+        self.register_output_stream("wfc", open_stream(self.output_stream_name("wfc")))
+        _fused(np.zeros(_PIXELS, np.int32), *self._arrays, self._difference, self._command.copy())  # compiled here
+
+    def step(self) -> None:
+        """One frame."""
+        image = self.read_stream("wfs", out=self._image).reshape(-1)
+        self.write_stream("wfc", _fused(image, *self._arrays, self._difference, self._command))
+        self.commanded[self.frame_id] = time.monotonic_ns()
+
+
+@jit(nopython=True, nogil=True, fastmath=True)
+def _fused(image, I0, R, to_actuators, difference, command):
+    for pixel in range(difference.size):
+        difference[pixel] = np.float32(image[pixel]) - I0[pixel]
+    error = np.dot(R, difference)
+    for mode in range(command.size):
+        wanted = np.float32(1 - LEAK) * command[mode] - np.float32(GAIN) * error[mode]
+        command[mode] = min(max(wanted, np.float32(-LIMIT_NM)), np.float32(LIMIT_NM))
+    return np.dot(to_actuators, command)
+
+
+class Corrector(WavefrontCorrector):
+    """Its own corrector without hardware, with the moment noted when the actuators are there."""
+
+    received: memoryview
+
+    def send_to_hardware(self) -> None:
+        """Its own, then the time."""
+        super().send_to_hardware()
+        self.received[self.frame_id] = time.monotonic_ns()
+
+
+def clear(part: Part) -> None:
+    """Remove what a run has in shared memory."""
+    clear_shms([_name(part, stream) for stream in _STREAMS])
+
+
+def _name(part: Part, stream: str) -> str:
+    return f"{part.folder.name}_{stream}"
+
+
+def _configuration(part: Part, function: str) -> dict:
+    streams = {stream: _name(part, stream) for stream in _STREAMS}
+    return {
+        "affinity": part.cpu,
+        "realtime_priority": part.priority,
+        "functions": [function],
+        "input_streams": streams,
+        "output_streams": streams,
+    }
+
+
+def _source(part: Part) -> Component:
+    sensor = Sensor(_configuration(part, "run") | {"name": "wfs", "width": SHAPE[1], "height": SHAPE[0]})
+    sensor.part = part
+    return sensor
+
+
+def _mirror(part: Part) -> Component:
+    fused = part.plan.options["fused"]
+    modes = ACTUATORS if fused else MODES  # of the command: fused, its actuators are made already
+    matrix = part.folder / "m2c.npy"
+    np.save(matrix, np.eye(ACTUATORS, dtype=np.float32) if fused else Problem().to_actuators)
+    of_its_own = {"name": "wfc", "num_actuators": ACTUATORS, "num_modes": modes, "m2c_file": str(matrix)}
+    corrector = Corrector(_configuration(part, "send_to_hardware") | of_its_own)
+    corrector.received = part.marks("received")
+    return corrector
+
+
+def _signal(part: Part) -> Component:
+    return PixelSignal(_configuration(part, "compute_signal"))
+
+
+def _controller(part: Part) -> Component:
+    if part.plan.options["fused"]:
+        fused = FusedLoop(_configuration(part, "step"))
+        fused.commanded = part.marks("commanded")
+        return fused
+    loop = StockLoop(_configuration(part, "standard_integrator"))
+    loop.cm = Problem().R.copy()
+    loop.gain = GAIN
+    loop.commanded = part.marks("commanded")
+    return loop
+
+
+_ROLES = {"source": _source, "mirror": _mirror, "signal": _signal, "controller": _controller}
+
+
+if __name__ == "__main__":
+    role, folder = sys.argv[1:]
+    own = Part(role, Path(folder))
+    if role == "clear":  # after a run that failed
+        clear(own)
+        sys.exit()
+    set_affinity_and_priority(role, own.cpu, own.priority)  # as its launcher does
+    own.quiet()
+    component = _ROLES[role](own)
+    component.start()
+    if role != "source":  # which is ready when it is about to wait for the start
+        own.ready()
+    threading.Event().wait()
