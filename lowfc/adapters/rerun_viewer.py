@@ -355,6 +355,11 @@ def vulkan_drivers() -> list[Path]:
 
 
 def viewer_binary() -> Path:
+    """The viewer's program, as rerun-sdk installs it.
+
+    Raises:
+        ViewerError: it is not there.
+    """
     package = importlib.util.find_spec("rerun_cli")
     if package is None or package.origin is None:
         raise ViewerError(f"the package rerun-sdk has no viewer here; {_REINSTALL}")

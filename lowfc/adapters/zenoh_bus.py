@@ -216,7 +216,7 @@ class ZenohBus:
 
         def received(sample: zenoh.Sample) -> None:
             now_ns = host_ns()
-            _stay_python()
+            stay_python()
             try:
                 handler(_sample(sample, now_ns, known_key))
             except Exception as fault:  # zenoh would print it and go on; it is counted here
@@ -300,7 +300,7 @@ class ZenohBus:
 _known = threading.local()
 
 
-def _stay_python() -> None:
+def stay_python() -> None:
     """Keep Python's state of this native thread from one callback to the next.
 
     Otherwise it is made and destroyed for every message: a map, a page fault and an unmap that interrupts the other

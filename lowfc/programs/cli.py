@@ -19,6 +19,7 @@ from lowfc.programs.bench_view import bench_view
 from lowfc.programs.design_commands import design_app
 from lowfc.programs.doctor import doctor
 from lowfc.programs.export import export
+from lowfc.programs.latency import latency
 from lowfc.programs.log_info import info
 from lowfc.programs.recover import recover
 from lowfc.programs.replay_commands import replay_log
@@ -45,6 +46,7 @@ app.command()(recover)
 app.command()(report)
 app.command()(export)
 app.command()(doctor)
+app.command()(latency)
 app.command()(validate)
 app.command()(view)
 

@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 from threadpoolctl import threadpool_info, threadpool_limits
 
-from lowfc.adapters.rerun_viewer import ViewerError, viewer_binary, has_screen, vulkan_drivers
+from lowfc.adapters.rerun_viewer import ViewerError, has_screen, viewer_binary, vulkan_drivers
 from lowfc.programs.doctor_facts import Facts, Finding, note, ok, warning
 
 _STALL_S = 0.1
