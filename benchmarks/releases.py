@@ -9,6 +9,7 @@ them, so that a ratio to it can be compared where microseconds cannot.
 
 import argparse
 import json
+import re
 import sys
 import time
 from collections.abc import Iterator, Mapping
@@ -114,7 +115,7 @@ def compare(today: Mapping[str, Any], before: Mapping[str, Any] | None, echo: st
             lines.append(
                 {"figure": path, "today": value, "to_echo": to_echo[path], "before_to_echo": old, "change": change}
             )
-        elif any(word in path for word in PLAIN):
+        elif any(part.startswith(word) or part.endswith(word) for part in re.split(r"[._]", path) for word in PLAIN):
             lines.append({"figure": path, "today": value, "before": then.get(path)})
     return lines
 

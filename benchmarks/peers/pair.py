@@ -13,6 +13,7 @@ from benchmarks.peers.problem import DIFFERENT, NumpyStep, Problem
 from benchmarks.peers.process import Part
 from benchmarks.peers.transports import TRANSPORTS, Link, Message, watch
 from lowfc.adapters import realtime
+from lowfc.adapters.zenoh_bus import receive_in_one_thread
 
 _STEPS = {"numpy": NumpyStep, "lowfc": LowfcStep}
 _GROWTH_BYTES = 64  # numbers in a protobuf message grow longer
@@ -85,6 +86,8 @@ def _step(part: Part) -> NumpyStep | LowfcStep:
 
 
 def _settle(part: Part) -> None:
+    if part.role != "source":  # as a process of lowfc's that waits for what it receives
+        receive_in_one_thread()
     if part.plan.options.get("transport") == "lowfc":  # as its processes are set up, whatever that is
         realtime.set_up(part.priority or None, {part.cpu}, lock_memory=True)
     else:

@@ -18,6 +18,7 @@ from benchmarks.peers.ring import Ring
 from lowfc.adapters.bus import Sample
 from lowfc.adapters.clock import HostClock
 from lowfc.adapters.mailbox import Mailbox
+from lowfc.adapters.realtime import let_send
 from lowfc.adapters.run import Links
 from lowfc.adapters.zenoh_bus import ZenohBus, session_config
 from lowfc.contract.messages import COMMAND, FRAME, Role
@@ -114,7 +115,10 @@ def lowfc_bus(part: Part, _frame_bytes: int, _command_bytes: int, take: Message)
     def put(number: int, time_ns: int, payload: bytes) -> None:
         publisher.put(payload, time_ns + clock.offset_ns, number)
 
-    return Link(put, kept=bus)
+    def afterwards(_number: int, _time_ns: int, _payload: bytes) -> None:
+        let_send()
+
+    return Link(put, afterwards, bus)
 
 
 def watch(part: Part) -> Iterator[int]:

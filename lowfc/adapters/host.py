@@ -225,14 +225,15 @@ class Host:
         """Processes that ran or waited to run, mean of a minute."""
         return float(self._text("proc/loadavg").split()[0])
 
-    def used_s(self) -> dict[tuple[int, str], float]:
-        """Processor time of every process, seconds, by its number and name."""
+    def used_s(self) -> dict[tuple[int, int], tuple[str, float]]:
+        """Name and processor time, seconds, of every process, by its number and when it was started."""
         found = {}
         for folder in (self.root / "proc").glob("[0-9]*"):
             text = self._text_or_nothing(f"proc/{folder.name}/stat")
             if text:  # it may have ended
                 name, rest = text[text.index("(") + 1 : text.rindex(")")], text[text.rindex(")") + 1 :].split()
-                found[int(folder.name), name] = (int(rest[11]) + int(rest[12])) / os.sysconf("SC_CLK_TCK")
+                used_s = (int(rest[11]) + int(rest[12])) / os.sysconf("SC_CLK_TCK")
+                found[int(folder.name), int(rest[19])] = name, used_s
         return found
 
     def disk(self, folder: Path) -> Disk:

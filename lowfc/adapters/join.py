@@ -1,7 +1,7 @@
 """How a process of the loop joins a run: real-time set-up first, then clock, bus and service."""
 
 from lowfc.adapters.clock import Clock, HostClock, SimulatedClock
-from lowfc.adapters.realtime import set_up
+from lowfc.adapters.realtime import Granted, set_up
 from lowfc.adapters.run import open_run
 from lowfc.adapters.service import Service
 from lowfc.adapters.zenoh_bus import ZenohBus, receive_in_one_thread
@@ -14,23 +14,28 @@ def clock_of(config: Configuration) -> Clock:
     return SimulatedClock() if config.lockstep else HostClock()
 
 
+def prepare(config: Configuration, role: str, cpus: list[int]) -> Granted:
+    """Set this process up for a role in the loop, before its first session, whose threads keep what they are born with.
+
+    The mirror runs ahead of the others: where it shares a processor with the controller, a command is applied before
+    the controller tells of it.
+    """
+    realtime = config.realtime
+    priority = realtime.priority if role.startswith(Role.MIRROR) else realtime.lowest_priority
+    granted = set_up(priority or None, set(cpus) or None, realtime.lock_memory)
+    if role != Role.CAMERA:  # which computes while the mirror's states come
+        receive_in_one_thread()
+    return granted
+
+
 def join(
     config: Configuration,
     run_id: str,
     role: str,
     cpus: list[int],
 ) -> Service:
-    """Set this process up for the loop and join a run.
-
-    A session's threads keep the scheduling class they are born with, so that comes before the session. The mirror runs
-    ahead of the others: where it shares a processor with the controller, a command is applied before the controller
-    tells of it.
-    """
-    realtime = config.realtime
-    priority = realtime.priority + (realtime.priority > 0 and role.startswith(Role.MIRROR))
-    granted = set_up(priority or None, set(cpus) or None, realtime.lock_memory)
-    if role != Role.CAMERA:  # which computes while the mirror's states come
-        receive_in_one_thread()
+    """Set this process up for the loop and join a run."""
+    granted = prepare(config, role, cpus)
     run = open_run(run_id, (config.mirror.name,))
     clock = clock_of(config)
     return Service(role, run_id, clock, ZenohBus(run.links, role, clock), granted=granted)

@@ -98,9 +98,11 @@ def step_back(priority: int | None) -> Granted:
 def let_send() -> None:
     """Let the bus's thread send what was just put before this one goes on.
 
-    Of equal SCHED_FIFO priority and on the same processor, it would wait until this one rests.
+    Of equal SCHED_FIFO priority and on the same processor, it would wait until this one rests. In the normal class the
+    kernel sees to that, and yielding would give way to everybody.
     """
-    os.sched_yield()
+    if os.sched_getscheduler(0) == os.SCHED_FIFO:
+        os.sched_yield()
 
 
 def give_way() -> None:

@@ -1,5 +1,7 @@
 """The bus between processes: zenoh peers over loopback TCP, each connected to all others of its run.
 
+Who only looks on comes by Unix socket instead, and is sent fewer pictures.
+
 Why each setting is what it is stands in `session_config`; all of them were measured.
 """
 
@@ -32,7 +34,8 @@ _PRIORITIES = ("real_time", "interactive_high", "interactive_low", "data_high", 
 def receive_in_one_thread() -> None:
     """Let zenoh's thread that waits for messages read them too, instead of waking another; before the first session.
 
-    Right for a process that waits for what it receives; one that computes meanwhile would hold it up.
+    Right for a process that waits for what it receives; one that computes meanwhile would hold it up. Its children
+    inherit it.
     """
     os.environ.setdefault("ZENOH_RUNTIME", "(rx: (handover: net))")
 

@@ -81,10 +81,10 @@ class Limited:
 def limit(limits: Limits, previous_nm: Actuators, wanted_nm: Actuators) -> Limited:
     """Return the command nearest to `wanted_nm` that may follow `previous_nm`.
 
-    Both are (rows, columns) float32, nm of surface. Stroke, then slew, cut each actuator by itself; the neighbour limit
-    shortens the whole move. Whatever is wanted, the result is finite, no actuator moves further than the slew limit,
-    and if `previous_nm` keeps the stroke and neighbour limits, so does the result; if it does not, it comes back to
-    them at the slew limit.
+    Both are (rows, columns) float32, nm of surface; the previous one is finite, for it was made here. Stroke, then
+    slew, cut each actuator by itself; the neighbour limit shortens the whole move. Whatever is wanted, the result is
+    finite, no actuator moves further than the slew limit, and if `previous_nm` keeps the stroke and neighbour limits,
+    so does the result; if it does not, it comes back to them at the slew limit.
     """
     if wanted_nm.shape != previous_nm.shape:
         return Limited(previous_nm, (Reason.WRONG_GRID,))
@@ -93,7 +93,7 @@ def limit(limits: Limits, previous_nm: Actuators, wanted_nm: Actuators) -> Limit
         return Limited(previous_nm, (Reason.NOT_FINITE,))
     reasons: list[Reason] = []
     margin_nm = limits.margin_nm
-    stroke, slew = limits.stroke_nm - margin_nm, limits.slew_nm - margin_nm
+    stroke, slew = (float(np.float32(one - margin_nm)) for one in (limits.stroke_nm, limits.slew_nm))
     kept = wanted_nm
     if max(highest_nm, -lowest_nm) > stroke:
         reasons.append(Reason.STROKE)

@@ -59,7 +59,7 @@ def gather(host: "Host", config: "Configuration", seconds: float) -> "Facts":
     from lowfc.adapters.trial import Trial, try_out
     from lowfc.programs.doctor_facts import Facts, named_cpus
 
-    before_s, begun_s = host.used_s(), time.monotonic()
+    before, begun_s = host.used_s(), time.monotonic()
     trial: Trial | OSError
     try:
         trial = try_out(config.realtime, named_cpus(config), seconds)
@@ -67,9 +67,9 @@ def gather(host: "Host", config: "Configuration", seconds: float) -> "Facts":
         trial = fault
     elapsed_s = time.monotonic() - begun_s
     shares = [
-        (f"{name} ({pid})", (used_s - before_s.get((pid, name), 0.0)) / elapsed_s)
-        for (pid, name), used_s in host.used_s().items()
-        if pid != os.getpid()
+        (f"{name} ({one[0]})", (used_s - before.get(one, ("", 0.0))[1]) / elapsed_s)
+        for one, (name, used_s) in host.used_s().items()
+        if one[0] != os.getpid()
     ]
     return Facts(host, config, trial, tuple(sorted(shares, key=lambda one: -one[1])))
 

@@ -20,12 +20,12 @@ from zenoh.handlers import Callback
 
 from lowfc.adapters.clock import HostClock
 from lowfc.adapters.envelope import Envelope
-from lowfc.adapters.realtime import set_up
+from lowfc.adapters.join import prepare
+from lowfc.adapters.realtime import let_send
 from lowfc.adapters.run import Run, open_run
 from lowfc.adapters.terminal import DEFAULT_RUN, ConfigFile, RunId, configuration, new_app, run_app
 from lowfc.adapters.whole_file import being_written
-from lowfc.adapters.zenoh_bus import session_config
-from lowfc.adapters.zenoh_bus import stay_python as stay_python
+from lowfc.adapters.zenoh_bus import session_config, stay_python
 from lowfc.contract.configuration import Configuration
 from lowfc.contract.errors import BusError
 from lowfc.contract.messages import COMMAND, FRAME, Role, Topic
@@ -58,7 +58,7 @@ def ask(
     Example: python -m lowfc.programs.echo ask --run bench --seconds 5
     """
     settings = configuration(config)
-    joined = _joined(settings, run, settings.realtime.camera_cpus)
+    joined = _joined(settings, run, Role.CAMERA, settings.realtime.camera_cpus)
     payloads = Payloads(np.load(joined.path / FRAMES_FILE))
     with closing(Asker(settings, joined)) as asker:
         asker.meet()
@@ -81,14 +81,13 @@ def answer(
 
     settings = configuration(config)
     calibration = calibration_file.load(open_run(run, (settings.mirror.name,)).path / "calibration.fits")
-    joined = _joined(settings, run, settings.realtime.controller_cpus)
+    joined = _joined(settings, run, Role.CONTROLLER, settings.realtime.controller_cpus)
     payloads = Payloads(np.load(joined.path / FRAMES_FILE))
     clock = HostClock()
     step = ControlStep(settings, calibration, clock.host_ns())
     _answer(settings, joined, step(payloads.at(0, clock.host_ns())))
-    period_ns = None if free_running else settings.period_ns
-    alone = time_alone(step, payloads, clock, seconds, period_ns)
     hot = time_alone(step, payloads, clock, _HOT_S, None)
+    alone = hot if free_running else time_alone(step, payloads, clock, seconds, settings.period_ns)
     with being_written(joined.path / ALONE_FILE) as part, part.open("wb") as file:
         np.savez(file, timer_ns=alone.timer_ns, step_ns=alone.step_ns, hot_step_ns=hot.step_ns)
 
@@ -134,6 +133,7 @@ class Asker:
             put_ns = clock.host_ns()
             self._put_ns.append(put_ns)
             self._publisher.put(payload, attachment=Envelope(len(self._put_ns) - 1, put_ns).encode())
+            let_send()
             if free_running:
                 self._answered.wait(ANSWER_S)
                 due_ns = clock.host_ns()
@@ -180,10 +180,9 @@ def _answer(config: Configuration, run: Run, command: bytes) -> None:
     session.close()  # type: ignore[no-untyped-call]
 
 
-def _joined(config: Configuration, run_id: str, cpus: list[int]) -> Run:
-    """The run, its links only those of the two; real-time set-up comes before the session."""
-    realtime = config.realtime
-    set_up(realtime.priority or None, set(cpus) or None, realtime.lock_memory)
+def _joined(config: Configuration, run_id: str, role: str, cpus: list[int]) -> Run:
+    """The run, its links only those of the two, for a process that is set up as the role's in the loop."""
+    prepare(config, role, cpus)
     run = open_run(run_id, (config.mirror.name,))
     ports = {str(role): run.links.ports[role] for role in (Role.CAMERA, Role.CONTROLLER)}
     return dataclasses.replace(run, links=dataclasses.replace(run.links, ports=ports))

@@ -17,6 +17,7 @@ import typer
 from lowfc.adapters import instrument
 from lowfc.adapters.join import join
 from lowfc.adapters.mailbox import Mailbox
+from lowfc.adapters.realtime import let_send
 from lowfc.adapters.run import open_run
 from lowfc.adapters.service import Service
 from lowfc.adapters.terminal import DEFAULT_RUN, ConfigFile, RunId, configuration, new_app, run_app
@@ -169,6 +170,7 @@ class Source:
 
     def _put(self, payload: bytes) -> int:
         envelope = self._frames.put(payload)
+        let_send()
         self._sequence.append(envelope.sequence)
         self._put_ns.append(envelope.publish_time_ns)
         self._service.work += 1

@@ -100,6 +100,8 @@ def until(condition: Callable[[], bool]) -> None:
 def runtime(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     with tempfile.TemporaryDirectory(prefix="bus-") as path:  # short enough for the sockets in it
         monkeypatch.setenv("XDG_RUNTIME_DIR", path)
+        monkeypatch.setenv("ZENOH_RUNTIME", "")  # what a bus puts there is gone after the test
+        monkeypatch.delenv("ZENOH_RUNTIME")
         yield
 
 

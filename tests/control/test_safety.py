@@ -175,6 +175,16 @@ def test_wide_numbers_are_limited_too() -> None:
     assert limited.actuators_nm.dtype == np.float32
 
 
+@pytest.mark.parametrize("stroke_nm", [100.0, 333.3, 700.0, 750.0])
+def test_what_was_kept_is_wanted_again_without_a_reason(stroke_nm: float) -> None:
+    limits = Limits(stroke_nm, stroke_nm, 3 * stroke_nm)
+    flat = np.zeros(GRID, np.float32)
+    kept = limit(limits, flat, np.full(GRID, 2 * stroke_nm, np.float32))
+    assert kept.reasons
+    assert limit(limits, flat, kept.actuators_nm).reasons == ()
+    assert limit(limits, kept.actuators_nm, kept.actuators_nm).reasons == ()
+
+
 def test_nothing_given_is_changed() -> None:
     rng = np.random.default_rng(4)
     previous = (200 * rng.standard_normal(GRID)).astype(np.float32)

@@ -20,8 +20,8 @@ MUTATIONS = {
     "stroke cut on the other side": ("np.clip(kept, -stroke, stroke)", "np.clip(kept, -stroke, None)"),
     "stroke without a sign": ("if max(highest_nm, -lowest_nm) > stroke:", "if highest_nm > stroke:"),
     "stroke without a margin": (
-        "stroke, slew = limits.stroke_nm - margin_nm, limits.slew_nm - margin_nm",
-        "stroke, slew = limits.stroke_nm + margin_nm, limits.slew_nm - margin_nm",
+        "for one in (limits.stroke_nm, limits.slew_nm))",
+        "for one in (limits.stroke_nm + 2 * margin_nm, limits.slew_nm))",
     ),
     "slew never looked at": ("if max(highest_move, -lowest_move) > slew:", "if False:"),
     "slew without a sign": ("if max(highest_move, -lowest_move) > slew:", "if highest_move > slew:"),
@@ -30,12 +30,12 @@ MUTATIONS = {
     "slew from flat": ("kept = previous_nm + move", "kept = move"),
     "slew the wrong way": ("kept = previous_nm + move", "kept = previous_nm - move"),
     "slew without a margin": (
-        "stroke, slew = limits.stroke_nm - margin_nm, limits.slew_nm - margin_nm",
-        "stroke, slew = limits.stroke_nm - margin_nm, limits.slew_nm + margin_nm",
+        "for one in (limits.stroke_nm, limits.slew_nm))",
+        "for one in (limits.stroke_nm, limits.slew_nm + 2 * margin_nm))",
     ),
     "stroke limit for slew": (
-        "stroke, slew = limits.stroke_nm - margin_nm, limits.slew_nm - margin_nm",
-        "stroke = slew = limits.stroke_nm - margin_nm",
+        "for one in (limits.stroke_nm, limits.slew_nm))",
+        "for one in (limits.stroke_nm, limits.stroke_nm))",
     ),
     "neighbours never looked at": (
         "if highest_nm - lowest_nm > apart_nm and",

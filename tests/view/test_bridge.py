@@ -18,8 +18,11 @@ from lowfc.adapters.rerun_viewer import Show
 from lowfc.contract.configuration import Configuration
 from lowfc.contract.messages import CALIBRATION, EVENT, FRAME, STEP, Log, topic_of
 from lowfc.programs.view import bridge as bridges
+from lowfc.programs.view import brush as brushes
 from lowfc.programs.view import wavefront
 from lowfc.programs.view.bridge import Bridge, Summary, ViewError
+from lowfc.programs.view.brush import Brush
+from lowfc.programs.view.moment import Moment
 
 PATIENCE_S = 10.0
 
@@ -232,3 +235,32 @@ def test_a_viewer_that_is_stuck_costs_bounded_memory_and_no_publisher() -> None:
     assert all(count <= bridges.WAITING[topic] for topic, count in waiting.items())
     scene.screens[0].stopped.set()
     scene.end()
+
+
+@pytest.mark.parametrize(("pause_s", "every_one"), [(0.3, True), (0.0, False)])
+def test_rows_are_taken_by_time_however_slow_the_drawing_is(
+    monkeypatch: pytest.MonkeyPatch, pause_s: float, every_one: bool
+) -> None:
+    whole: list[bool] = []
+
+    class Drawn:
+        def __init__(self, *_: object) -> None:
+            pass
+
+        def draw(self, moment: Moment) -> None:
+            whole.append(moment.whole)
+            time.sleep(pause_s)
+
+    class Stream(Tape):
+        def disconnect(self) -> None:
+            pass
+
+    monkeypatch.setattr(brushes, "Painter", Drawn)
+    brush = Brush(Configuration(), HostClock(), {}, Stream)
+    brush.start()
+    until(lambda: len(whole) >= 4)
+    brush.abandon()
+    brush.join()
+    assert brush.fault is None
+    assert all(whole) == every_one
+    assert whole[0]

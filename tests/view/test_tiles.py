@@ -106,9 +106,11 @@ def spoken(config: Configuration, camera: Configuration, latch: Path, frames: in
 
 
 def judged(heard: list[Sample]) -> Verdict:
-    """The verdict on a run when its last frame has been used, ten moments a second."""
+    """The verdict on a run at its last step before a process said that it ends, ten moments a second."""
     gatherer, watcher, due_ns = Gatherer(), Watcher(), 0
-    last = max(place for place, sample in enumerate(heard) if topic_of(sample.key) is STEP)
+    ends = (topic_of(one.key) is HEALTH and wire.Health.FromString(one.payload).state == "stopped" for one in heard)
+    end = next((place for place, ended in enumerate(ends) if ended), len(heard))
+    last = max(place for place, sample in enumerate(heard[:end]) if topic_of(sample.key) is STEP)
     for sample in heard[: last + 1]:
         gatherer.take(topic_of(sample.key), sample.key, sample.payload, sample.publish_time_ns)
         if sample.publish_time_ns >= due_ns:

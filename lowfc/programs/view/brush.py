@@ -63,11 +63,13 @@ class Brush(threading.Thread):
         stream = self._make_stream()
         painter = Painter(self._config, stream)
         gatherer = Gatherer(self._clock.now_ns() if self._clock.lockstep else None)
-        due_s = began_s = time.monotonic()
+        due_s = began_s = whole_due_s = time.monotonic()
         while not self._abandoned:
             now_s = time.monotonic()
             behind_s, began_s = max(0.0, now_s - began_s - 1 / PICTURES_HZ), now_s  # what arrived may be that old
-            whole = self.moments % PICTURES_PER_WHOLE == 0
+            whole = now_s >= whole_due_s
+            if whole:
+                whole_due_s = now_s + (PICTURES_PER_WHOLE - 0.5) / PICTURES_HZ  # by time: rings wait no longer
             self._gather(gatherer, whole=whole)
             painter.draw(gatherer.moment(self._clock.host_ns(), whole=whole, behind_s=behind_s))
             self.moments += 1
