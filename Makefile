@@ -8,7 +8,7 @@ INSTALL := $(BIN)/python -m pip install --quiet --disable-pip-version-check --co
 COMPUTING := tests/control tests/design tests/optics tests/sim tests/view tests/test_loop.py tests/test_validate.py \
 	tests/test_validate_figures.py
 
-.PHONY: help sim-loop test test-all lint types format proto node clean
+.PHONY: help sim-loop test test-all bench lint types format proto node clean
 
 help:  ## list the targets
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:[^#]*## /\t/' | expand -t 12
@@ -40,6 +40,9 @@ test-all: $(VENV)/.tests node lint types  ## everything, the slow tests and thos
 	@command -v chromium >/dev/null || { test "$$(id -u)" = 0 && apt-get install --yes chromium; } || \
 		echo "no chromium: the browser tests will skip. Debian: apt install chromium" >&2
 	$(BIN)/python -m pytest
+
+bench: $(VENV)/.installed  ## time the loop beside the last release's figures; STORE=--store keeps them
+	@figures=$$($(BIN)/lowfc latency --json) && printf '%s' "$$figures" | $(BIN)/python -m benchmarks.releases $(STORE)
 
 lint: $(VENV)/.tests  ## ruff
 	$(BIN)/ruff check .
