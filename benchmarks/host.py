@@ -1,21 +1,22 @@
 """What figures of time depend on."""
 
-import os
-import platform
-from pathlib import Path
 from typing import Any
 
-_CLOCK_SOURCE = Path("/sys/devices/system/clocksource/clocksource0/current_clocksource")
+from lowfc.adapters.host import Host
+from lowfc.adapters.provenance import provenance
 
 
 def host() -> dict[str, Any]:
     """Processor, how many there are, kernel, clock source, Python."""
-    lines = Path("/proc/cpuinfo").read_text().splitlines()
-    names = [line.partition(":")[2].strip() for line in lines if line.startswith("model name")]
+    known = provenance()
+    try:
+        clock_source = Host().clock_source()
+    except OSError:
+        clock_source = "not known"
     return {
-        "processor": names[0] if names else platform.machine(),
-        "processors": os.cpu_count(),
-        "kernel": platform.release(),
-        "clock_source": _CLOCK_SOURCE.read_text().strip() if _CLOCK_SOURCE.exists() else "not known",
-        "python": platform.python_version(),
+        "processor": known["processor"],
+        "processors": int(known["processors"]),
+        "kernel": known["kernel"],
+        "clock_source": clock_source,
+        "python": known["python"],
     }

@@ -8,7 +8,6 @@ Example:
 import argparse
 import json
 import os
-import platform
 import subprocess
 import sys
 import tempfile
@@ -17,6 +16,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+from lowfc.adapters.provenance import provenance
 from lowfc.contract.configuration import Configuration, load
 from sim_camera.prediction import tilt_residual_mas
 
@@ -39,13 +39,12 @@ RUNS: tuple[tuple[str, list[str], str], ...] = (
 
 def host() -> dict[str, Any]:
     """What the figures depend on."""
-    lines = Path("/proc/cpuinfo").read_text().splitlines()
-    names = [line.partition(":")[2].strip() for line in lines if line.startswith("model name")]
+    known = provenance()
     return {
-        "processor": names[0] if names else platform.machine(),
-        "processors": os.cpu_count(),
-        "kernel": platform.release(),
-        "python": platform.python_version(),
+        "processor": known["processor"],
+        "processors": int(known["processors"]),
+        "kernel": known["kernel"],
+        "python": known["python"],
         "date": time.strftime("%Y-%m-%d", time.gmtime()),
         "load_before": round(os.getloadavg()[0], 2),
     }

@@ -17,7 +17,6 @@ from lowfc.contract.errors import BusError, ConfigurationError
 from lowfc.contract.messages import CAMERA_STATE, FRAME, MIRROR_STATE, TRUTH, image, timestamp, wire
 from lowfc.control.durations import Durations
 from lowfc.control.stability import delay_weights
-from lowfc.optics.detector import saturation_dn
 from lowfc.optics.photometry import tilt_nm_per_mas
 from sim_camera.bench import Bench, Truth
 from sim_camera.disturbance import Disturbance, disturbance
@@ -228,18 +227,5 @@ class CameraProcess:
         )
 
     def _publish_settings(self, time_ns: int) -> None:
-        camera, detector = self._config.camera, instrument.detector(self._config)
-        state = wire.CameraState(
-            timestamp=timestamp(time_ns),
-            exposure_ns=self._config.exposure_ns,
-            period_ns=self._config.period_ns,
-            gain_e_per_dn=camera.gain_e_per_dn,
-            bias_dn=camera.bias_dn,
-            read_noise_e=camera.read_noise_e,
-            saturation_dn=saturation_dn(detector),
-            rows=self._bench.shape[0],
-            columns=self._bench.shape[1],
-            bit_depth=camera.bit_depth,
-            em_gain=camera.em_gain,
-        )
+        state = instrument.camera_state(self._config, self._bench.shape, time_ns)
         self._settings.put(state.SerializeToString())

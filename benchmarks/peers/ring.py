@@ -7,9 +7,8 @@ from collections.abc import Callable
 from pathlib import Path
 
 _SLOTS = 8
-_HEAD_BYTES = 64  # the newest number, in a line of its own
 _SLOT_HEAD_BYTES = 32  # number, time, length
-_SEMAPHORE_OFFSET = 64
+_SEMAPHORE_OFFSET = 64  # before it the newest number, in a line of its own
 _BODY_OFFSET = 128
 
 WAKES = ("semaphore", "pipe")

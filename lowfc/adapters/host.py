@@ -12,6 +12,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
 
+from lowfc.adapters.usage import used
+
 _CPUS = "sys/devices/system/cpu"
 _CPUIDLE = f"{_CPUS}/cpuidle"
 _CLOCKSOURCE = "sys/devices/system/clocksource/clocksource0/current_clocksource"
@@ -231,9 +233,8 @@ class Host:
         for folder in (self.root / "proc").glob("[0-9]*"):
             text = self._text_or_nothing(f"proc/{folder.name}/stat")
             if text:  # it may have ended
-                name, rest = text[text.index("(") + 1 : text.rindex(")")], text[text.rindex(")") + 1 :].split()
-                used_s = (int(rest[11]) + int(rest[12])) / os.sysconf("SC_CLK_TCK")
-                found[int(folder.name), int(rest[19])] = name, used_s
+                process = used(text)
+                found[int(folder.name), process.started] = process.name, process.processor_s
         return found
 
     def disk(self, folder: Path) -> Disk:

@@ -14,6 +14,7 @@ from lowfc.adapters.twin_store import load_or_build, load_or_fit_mirror
 from lowfc.contract.calibration_codec import identified
 from lowfc.contract.configuration import Configuration
 from lowfc.contract.errors import CalibrationError, ConfigurationError
+from lowfc.contract.messages import timestamp, wire
 from lowfc.control.calibration import Calibration, noise_nm, normalise_flux, reconstructor
 from lowfc.control.safety import Limits, LoopMode
 from lowfc.control.state import Settings
@@ -87,6 +88,24 @@ def detector(config: Configuration) -> Detector:
         )
     except ValueError as error:
         raise ConfigurationError(f"camera: {error}") from None
+
+
+def camera_state(config: Configuration, shape: tuple[int, int], time_ns: int) -> wire.CameraState:
+    """What the camera says of itself; `shape` are the rows and columns of its frames."""
+    camera = config.camera
+    return wire.CameraState(
+        timestamp=timestamp(time_ns),
+        exposure_ns=config.exposure_ns,
+        period_ns=config.period_ns,
+        gain_e_per_dn=camera.gain_e_per_dn,
+        bias_dn=camera.bias_dn,
+        read_noise_e=camera.read_noise_e,
+        saturation_dn=saturation_dn(detector(config)),
+        rows=shape[0],
+        columns=shape[1],
+        bit_depth=camera.bit_depth,
+        em_gain=camera.em_gain,
+    )
 
 
 def mirror(config: Configuration) -> Mirror:

@@ -111,6 +111,19 @@ def _socket(links: Links, role: str) -> str | None:
     return None if path is None else f"{_SOCKET}/{path}"
 
 
+def declare_publisher(session: zenoh.Session, topic: Topic, key: str) -> zenoh.Publisher:
+    """Return zenoh's own publisher of a topic, with the settings of the loop."""
+    return session.declare_publisher(
+        key,
+        encoding=f"application/protobuf;{topic.message.DESCRIPTOR.full_name}",
+        congestion_control=zenoh.CongestionControl.DROP,
+        priority=zenoh.Priority.REAL_TIME if topic.in_loop else zenoh.Priority.DATA,
+        # Express gives every message a batch of its own, so that a burst of 16 fills the queue and the rest is lost;
+        # without it the latency is the same, for messages are batched under back-pressure only.
+        express=False,
+    )
+
+
 class ZenohPublisher:
     """Publishes one topic; see `Publisher`."""
 
@@ -123,15 +136,7 @@ class ZenohPublisher:
         self._host_ns = bus.clock.host_ns
         self._start_s = bus.start_s
         self._replying = bus.replying
-        self._publisher = session.declare_publisher(
-            key,
-            encoding=f"application/protobuf;{topic.message.DESCRIPTOR.full_name}",
-            congestion_control=zenoh.CongestionControl.DROP,
-            priority=zenoh.Priority.REAL_TIME if topic.in_loop else zenoh.Priority.DATA,
-            # Express gives every message a batch of its own, so that a burst of 16 fills the queue and the rest is
-            # lost; without it the latency is the same, for messages are batched under back-pressure only.
-            express=False,
-        )
+        self._publisher = declare_publisher(session, topic, key)
         if self._keeps:
             session.declare_queryable(key, Callback(self._answer, indirect=False))
 

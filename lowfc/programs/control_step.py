@@ -13,11 +13,10 @@ from lowfc.control.calibration import Calibration
 from lowfc.control.inputs import Load
 from lowfc.control.loop import advance
 from lowfc.control.state import State
+from lowfc.programs.controller import CHANNEL
 from lowfc.programs.frame_source import Payloads
 
 Whole = npt.NDArray[np.int64]
-
-CHANNEL = "lowfc"
 
 
 class ControlStep:

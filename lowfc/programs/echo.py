@@ -25,10 +25,10 @@ from lowfc.adapters.realtime import let_send
 from lowfc.adapters.run import Run, open_run
 from lowfc.adapters.terminal import DEFAULT_RUN, ConfigFile, RunId, configuration, new_app, run_app
 from lowfc.adapters.whole_file import being_written
-from lowfc.adapters.zenoh_bus import session_config, stay_python
+from lowfc.adapters.zenoh_bus import declare_publisher, session_config, stay_python
 from lowfc.contract.configuration import Configuration
 from lowfc.contract.errors import BusError
-from lowfc.contract.messages import COMMAND, FRAME, Role, Topic
+from lowfc.contract.messages import COMMAND, FRAME, Role
 from lowfc.programs.frame_source import ANSWER_S, FRAMES_FILE, Payloads
 from lowfc.programs.latency_figures import WARM_UP_S
 
@@ -103,7 +103,7 @@ class Asker:
         self._round_trip_ns: list[int] = []
         self._answered = threading.Event()
         self._session = _session(run, Role.CAMERA)
-        self._publisher = _publisher(self._session, FRAME, FRAME.key)
+        self._publisher = declare_publisher(self._session, FRAME, FRAME.key)
         key = COMMAND.at(config.mirror.name)
         self._subscriber = self._session.declare_subscriber(key, Callback(self._hear, indirect=False))
 
@@ -165,7 +165,7 @@ def _answer(config: Configuration, run: Run, command: bytes) -> None:
     """Answer every frame with these bytes until an empty one comes."""
     done = threading.Event()
     session = _session(run, Role.CONTROLLER)
-    publisher = _publisher(session, COMMAND, COMMAND.at(config.mirror.name))
+    publisher = declare_publisher(session, COMMAND, COMMAND.at(config.mirror.name))
 
     def received(sample: zenoh.Sample) -> None:
         stay_python()
@@ -190,17 +190,6 @@ def _joined(config: Configuration, run_id: str, role: str, cpus: list[int]) -> R
 
 def _session(run: Run, role: Role) -> zenoh.Session:
     return zenoh.open(zenoh.Config.from_json5(json.dumps(session_config(run.links, role))))
-
-
-def _publisher(session: zenoh.Session, topic: Topic, key: str) -> zenoh.Publisher:
-    """A publisher with the settings of a topic of the loop."""
-    return session.declare_publisher(
-        key,
-        encoding=f"application/protobuf;{topic.message.DESCRIPTOR.full_name}",
-        congestion_control=zenoh.CongestionControl.DROP,
-        priority=zenoh.Priority.REAL_TIME,
-        express=False,
-    )
 
 
 def main() -> None:

@@ -69,11 +69,9 @@ def export_log(
         ConfigurationError: this format has no place for frames, or needs a library that is not there.
         DataFileError: the log cannot be read or has no steps, or the file is there already or cannot be written.
     """
-    from rich.progress import BarColumn, DownloadColumn, TextColumn, TimeRemainingColumn
-
     from lowfc.adapters.history_reader import read_history
     from lowfc.adapters.log_reader import LogReader
-    from lowfc.adapters.progress import passing_bar
+    from lowfc.adapters.progress import reading_bar
     from lowfc.adapters.whole_file import being_written
     from lowfc.programs.log_guard import refuse_log
 
@@ -87,9 +85,8 @@ def export_log(
         refuse_log(file, log)
         if file.exists() and not force:
             raise DataFileError(f"{file} exists already; choose another name (--out), or --force replaces it")
-    columns = (TextColumn("{task.description}"), BarColumn(), DownloadColumn(), TimeRemainingColumn())
     with contextlib.ExitStack() as held:
-        bar = held.enter_context(passing_bar(console, *columns))
+        bar = held.enter_context(reading_bar(console))
         task = bar.add_task("reading", total=None)
 
         def progress(reader: LogReader) -> None:

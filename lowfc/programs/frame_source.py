@@ -25,7 +25,7 @@ from lowfc.adapters.whole_file import being_written
 from lowfc.contract.configuration import Configuration
 from lowfc.contract.errors import BusError
 from lowfc.contract.messages import CAMERA_STATE, COMMAND, FRAME, RawImage, Role, image, timestamp, wire
-from lowfc.optics.detector import expose, saturation_dn
+from lowfc.optics.detector import expose
 from lowfc.optics.twin import Evaluator, node_radii
 from lowfc.optics.zernike import zernikes
 
@@ -178,21 +178,7 @@ class Source:
         return envelope.sequence
 
     def _publish_settings(self) -> None:
-        config = self._config
-        rows, columns = self._payloads.shape
-        state = wire.CameraState(
-            timestamp=timestamp(self._service.clock.now_ns()),
-            exposure_ns=config.exposure_ns,
-            period_ns=config.period_ns,
-            gain_e_per_dn=config.camera.gain_e_per_dn,
-            bias_dn=config.camera.bias_dn,
-            read_noise_e=config.camera.read_noise_e,
-            saturation_dn=saturation_dn(instrument.detector(config)),
-            rows=rows,
-            columns=columns,
-            bit_depth=config.camera.bit_depth,
-            em_gain=config.camera.em_gain,
-        )
+        state = instrument.camera_state(self._config, self._payloads.shape, self._service.clock.now_ns())
         self._settings.put(state.SerializeToString())
 
 

@@ -20,7 +20,6 @@ if TYPE_CHECKING:
 
 _RATE_HZ = 1000.0
 _LEAK = 0.01
-_CLOCK_SOURCE = Path("/sys/devices/system/clocksource/clocksource0/current_clocksource")
 
 
 class Camera(StrEnum):
@@ -146,7 +145,7 @@ def _measure(
         "command": shlex.join(["lowfc", *sys.argv[1:]]),
         "host": provenance()
         | {
-            "clock_source": _CLOCK_SOURCE.read_text().strip() if _CLOCK_SOURCE.exists() else "",
+            "clock_source": _clock_source(),
             "load": load,
             "granted": done[-1]["granted"],
             "refused": done[-1]["refused"],
@@ -154,17 +153,24 @@ def _measure(
     }
 
 
+def _clock_source() -> str:
+    from lowfc.adapters.host import Host
+
+    try:
+        return Host().clock_source()
+    except OSError:
+        return ""
+
+
 def _of_log(path: Path) -> dict[str, Any]:
     """The same figures of a log."""
     from rich.console import Console
-    from rich.progress import BarColumn, DownloadColumn, TextColumn, TimeRemainingColumn
 
-    from lowfc.adapters.progress import passing_bar
+    from lowfc.adapters.progress import reading_bar
     from lowfc.programs.latency_log import log_figures
     from lowfc.programs.latency_summary import together
 
-    columns = (TextColumn("{task.description}"), BarColumn(), DownloadColumn(), TimeRemainingColumn())
-    with passing_bar(Console(stderr=True), *columns) as bar:
+    with reading_bar(Console(stderr=True)) as bar:
         task = bar.add_task(f"reading {path.name}", total=None)
         figures, host = log_figures(path, lambda position, size: bar.update(task, completed=position, total=size))
     return together([figures]) | {"settings": {"log": str(path)}, "host": host}

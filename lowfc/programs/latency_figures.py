@@ -21,8 +21,6 @@ UNKNOWN = -1
 WARM_UP_S = 0.5
 """Frames put so soon after the first one are left out."""
 LOOP_SPANS = ("frame_to_receive", "receive_to_command", "frame_to_command", "command_to_mirror", "frame_to_mirror")
-DUE_SPANS = ("due_to_frame", "due_to_command", "due_to_mirror")
-"""The same from the moment at which the frame was due: what a late source would hide."""
 PERCENTILES = {"p50": 500, "p90": 900, "p99": 990, "p99_9": 999, "max": 1000}
 """Each in thousandths, so that its place among the values is exact."""
 

@@ -30,15 +30,13 @@ def info(
     Example: lowfc info logs/20270101T220000Z.mcap
     """
     from rich.console import Console
-    from rich.progress import BarColumn, DownloadColumn, TextColumn, TimeRemainingColumn
 
-    from lowfc.adapters.progress import passing_bar
+    from lowfc.adapters.progress import reading_bar
     from lowfc.programs.log_survey import survey
 
     one_log(logs, None, as_json=as_json)
-    columns = (TextColumn("{task.description}"), BarColumn(), DownloadColumn(), TimeRemainingColumn())
     for number, log in enumerate(logs):
-        with passing_bar(Console(stderr=True), *columns) as bar:
+        with reading_bar(Console(stderr=True)) as bar:
             task = bar.add_task(f"reading {log.name}", total=None)
             found = survey(log, lambda position, size: bar.update(task, completed=position, total=size))  # noqa: B023  # not kept
         if as_json:

@@ -31,16 +31,14 @@ def recover(
     Example: lowfc recover logs/20270101T220000Z.mcap.part
     """
     from rich.console import Console
-    from rich.progress import BarColumn, DownloadColumn, TextColumn, TimeRemainingColumn
 
     from lowfc.adapters.log_recovery import recover as run
     from lowfc.adapters.log_recovery import recovered_path
-    from lowfc.adapters.progress import passing_bar
+    from lowfc.adapters.progress import reading_bar
 
     one_log(logs, out, as_json=as_json)
-    columns = (TextColumn("{task.description}"), BarColumn(), DownloadColumn(), TimeRemainingColumn())
     for log in logs:
-        with passing_bar(Console(stderr=True), *columns) as bar:
+        with reading_bar(Console(stderr=True)) as bar:
             task = bar.add_task(f"recovering {log.name}", total=None)
             done = run(
                 log,

@@ -59,9 +59,9 @@ class Latency(Panel):
         now = np.array([moment.time_ns])
         us = np.concatenate([stages_us for _, stages_us in self._recent] or [np.zeros((0, len(STAGES)))])
         if len(us):
-            figures = np.concatenate([np.percentile(us, [50, 99], axis=0), us.max(axis=0)[None]])
-            curves(stream, WHOLE, now, figures[None, :, -1])
-            curves(stream, PARTS, now, figures[None, FIGURES.index("p99"), :-1])
+            whole_us = us[:, -1]
+            curves(stream, WHOLE, now, np.array([[*np.percentile(whole_us, [50, 99]), whole_us.max()]]))
+            curves(stream, PARTS, now, np.percentile(us[:, :-1], 99, axis=0)[None])
         self._draw_histogram(stream, moment.time_ns, us[:, -1])
         if (controller := moment.health.get(Role.CONTROLLER)) is not None:
             frames = topic_count(controller.health, FRAME.key)
