@@ -25,7 +25,7 @@ MEASURED = ROOT / "docs" / "measured.json"
 README = ROOT / "README.md"
 BEGIN, END = "<!-- measured: begin -->\n", "<!-- measured: end -->"
 
-NORMAL = "[realtime]\npriority = 0\nlock_memory = false\n"
+NORMAL = "[realtime]\npriority = 0\nlock_memory = false\nstay_awake = false\n"
 COMMON = ["--disturbance", "reaction-wheel", "--star-magnitude", "2", "--sensor", "sam27d10_bal14", "--duration", "20"]
 RUNS: tuple[tuple[str, list[str], str], ...] = (
     ("250 Hz, SCHED_FIFO", ["--rate", "250"], ""),

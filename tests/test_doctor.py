@@ -88,7 +88,7 @@ def tree(root: Path, changes: dict[str, str | None]) -> Host:
 
 
 def facts(root: Path, changes: dict[str, str | None] | None = None, **others: object) -> Facts:
-    config = others.pop("config", load(None, {"recorder.folder": "/logs", **NAMED}))
+    config = others.pop("config", load(None, {"recorder.folder": "/logs", "realtime.stay_awake": False, **NAMED}))
     return Facts(**{"host": tree(root, changes or {}), "config": config, "trial": GRANTED, "busy": (), **others})
 
 
@@ -246,6 +246,17 @@ def test_what_is_refused_is_said_with_its_cost(tmp_path: Path) -> None:
     late = found["wake-up"]
     assert (late.status, "SCHED_FIFO" in late.detail) == ("warning", False)
     assert "a frame period is 4000 us" in late.detail
+
+
+def test_processors_that_the_loop_keeps_awake_may_have_deep_states(tmp_path: Path) -> None:
+    deep = {f"{CPUS}/cpu0/cpuidle/state2/disable": "0\n"}
+    config = load(None, NAMED)
+    kept = examine(facts(tmp_path, deep, config=config))["idle states"]
+    assert (kept.status, "133 us" in kept.detail, "kept awake" in kept.detail) == ("ok", True, True)
+    refused = {"stay_awake": ("processors awake (no)", "it wakes late")}
+    found = examine(facts(tmp_path, deep, config=config, trial=Trial(refused, set(range(8)), [1000], [1000])))
+    assert (found["idle states"].status, found["idle states"].cost) == ("warning", "it wakes late")
+    assert "cpu_dma_latency" in found["idle states"].advice
 
 
 def test_what_is_not_asked_for_is_not_missed(tmp_path: Path) -> None:

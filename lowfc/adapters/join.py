@@ -22,7 +22,12 @@ def prepare(config: Configuration, role: str, cpus: list[int]) -> Granted:
     """
     realtime = config.realtime
     priority = realtime.priority if role.startswith(Role.MIRROR) else realtime.lowest_priority
-    granted = set_up(priority or None, set(cpus) or None, realtime.lock_memory)
+    granted = set_up(
+        priority or None,
+        set(cpus) or None,
+        lock_memory=realtime.lock_memory,
+        stay_awake=realtime.stay_awake,
+    )
     if role != Role.CAMERA:  # which computes while the mirror's states come
         receive_in_one_thread()
     return granted

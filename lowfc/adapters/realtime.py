@@ -7,6 +7,7 @@ import ctypes
 import gc
 import os
 import resource
+import struct
 import sys
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
@@ -21,6 +22,9 @@ _MCL_CURRENT, _MCL_FUTURE, _MCL_ONFAULT = 1, 2, 4
 _M_TRIM_THRESHOLD, _M_TOP_PAD, _M_MMAP_THRESHOLD = -1, -2, -3
 _CAP_IPC_LOCK = 1 << 14
 _LOOKING_ON = 5  # of nice's 19
+_LATENCY_DEVICE = "/dev/cpu_dma_latency"
+
+_held: list[int] = []
 
 
 @dataclass(frozen=True, slots=True)
@@ -43,20 +47,21 @@ class _RefusedError(Exception):
     """The host does not allow a measure."""
 
 
-def set_up(priority: int | None, cpus: set[int] | None, lock_memory: bool) -> Granted:
+def set_up(priority: int | None, cpus: set[int] | None, *, lock_memory: bool, stay_awake: bool) -> Granted:
     """Prepare this process for the loop.
 
     Args:
         priority: of SCHED_FIFO, 1 to 99; None leaves the normal class.
         cpus: processors to stay on; None leaves all.
         lock_memory: keep every page in memory.
+        stay_awake: keep the host's idle processors awake as long as this process lives.
 
     Returns:
         What was granted; a refusal is no error, for the loop runs without, only less evenly.
     """
     granted = list(_quiet_interpreter())
     refused: list[tuple[str, str]] = []
-    for measure, cost in _asked(priority, cpus, lock_memory):
+    for measure, cost in _asked(priority, cpus, lock_memory, stay_awake):
         try:
             granted.append(measure())
         except (_RefusedError, OSError, ValueError) as fault:
@@ -68,31 +73,39 @@ def set_up(priority: int | None, cpus: set[int] | None, lock_memory: bool) -> Gr
 def spread(cpus: Iterable[int]) -> dict[str, list[int]]:
     """Configuration keys that keep the loop's processes apart on these processors; none where there is only one.
 
-    The simulated camera has the most to do, so that of two processors it has one to itself: a processor whose real-time
-    share is used up stands still for 50 ms.
+    The simulated camera has the most to do, so that of two processors the others share one: a processor whose real-time
+    share is used up stands still for 50 ms. The recorder is sent each frame together with the controller, and would run
+    first on its processor.
     """
-    first, *others = sorted(cpus)
+    first, *others = cpus = sorted(cpus)
     if not others:
         return {}
     keys = {"camera": first, "controller": others[0], "mirror": others[1] if len(others) > 2 else others[0]}
-    return {f"realtime.{role}_cpus": [cpu] for role, cpu in keys.items()}
+    apart = {f"realtime.{role}_cpus": [cpu] for role, cpu in keys.items()}
+    return apart | {"realtime.recorder_cpus": [cpu for cpu in cpus if cpu != keys["controller"]]}
 
 
-def step_back(priority: int | None) -> Granted:
+def step_back(priority: int | None, cpus: set[int] | None = None) -> Granted:
     """Prepare a process that must keep up but never get in the loop's way, such as the recorder.
 
     Its SCHED_FIFO priority, where it may have one, is below the loop's and above all else on the host: in the normal
     class, beside other work, a recorder loses messages of a 1 kHz loop.
     """
     os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))  # not the class of a parent that is in the loop
-    granted = [_keep_memory()]
+    granted, refused = [_keep_memory()], []
+    if cpus is not None:
+        try:
+            granted.append(_stay_on(cpus))
+        except OSError as fault:
+            refused.append((f"processors {sorted(cpus)} ({fault.strerror})", "the recorder may get in the loop's way"))
     if priority is None:
-        return Granted((*granted, "normal scheduling class"), ())
-    try:
-        return Granted((*granted, _run_first(priority)), ())
-    except OSError as fault:
-        refused = (f"SCHED_FIFO ({fault.strerror})", "on a busy host the recorder loses messages")
-        return Granted(tuple(granted), (refused,))
+        granted.append("normal scheduling class")
+    else:
+        try:
+            granted.append(_run_first(priority))
+        except OSError as fault:
+            refused.append((f"SCHED_FIFO ({fault.strerror})", "on a busy host the recorder loses messages"))
+    return Granted(tuple(granted), tuple(refused))
 
 
 def let_send() -> None:
@@ -113,7 +126,7 @@ def give_way() -> None:
 
 
 def _asked(
-    priority: int | None, cpus: set[int] | None, lock_memory: bool
+    priority: int | None, cpus: set[int] | None, lock_memory: bool, stay_awake: bool
 ) -> Iterator[tuple[Callable[[], str], tuple[str, str]]]:
     if cpus is not None:
         yield (
@@ -124,6 +137,15 @@ def _asked(
         yield (
             _lock_memory,
             ("locked memory", "a page that was swapped out stalls the loop for milliseconds"),
+        )
+    if stay_awake:
+        yield (
+            _stay_awake,
+            (
+                "processors awake",
+                "a processor that sleeps between frames takes tens of microseconds longer to wake, several times a "
+                f"frame; let this user write to {_LATENCY_DEVICE}",
+            ),
         )
     if priority is not None:
         yield (
@@ -163,6 +185,19 @@ def _run_first(priority: int) -> str:
 def _stay_on(cpus: set[int]) -> str:
     os.sched_setaffinity(0, cpus)
     return f"processors {sorted(cpus)}"
+
+
+def _stay_awake() -> str:
+    """Ask the kernel for processors that wake at once; it holds as long as the device is open."""
+    if not _held:
+        device = os.open(_LATENCY_DEVICE, os.O_WRONLY)
+        try:
+            os.write(device, struct.pack("=i", 0))
+        except OSError:
+            os.close(device)
+            raise
+        _held.append(device)
+    return "processors awake"
 
 
 def _lock_memory() -> str:

@@ -24,7 +24,7 @@ class Trial:
     """What came of it.
 
     Attributes:
-        refused: of `priority` and `lock_memory` what the host refused, each with what that costs.
+        refused: of `priority`, `lock_memory` and `stay_awake` what the host refused, each with what that costs.
         cpus: processors that the process could choose from.
         normal_ns: how late each wake-up was in the normal class, ns.
         first_ns: the same under SCHED_FIFO; empty where that is not asked for, or refused.
@@ -47,7 +47,8 @@ def try_out(asked: Realtime, cpus: set[int], seconds: float) -> Trial:
     Raises:
         OSError: the process that tries cannot be started, or fails.
     """
-    words = [str(asked.priority), str(int(asked.lock_memory)), ",".join(map(str, sorted(cpus))), str(seconds)]
+    wishes = (asked.priority, int(asked.lock_memory), int(asked.stay_awake), ",".join(map(str, sorted(cpus))), seconds)
+    words = [str(wish) for wish in wishes]
     try:
         done = subprocess.run(  # noqa: S603  # this module
             [sys.executable, "-P", "-m", "lowfc.adapters.trial", *words],
@@ -81,16 +82,19 @@ def lateness_ns(wake_ups: int, period_ns: int = 1_000_000_000 // RATE_HZ) -> lis
     return late_ns
 
 
-def _main(priority: int, lock_memory: bool, cpus: set[int], seconds: float) -> None:
+def _main(priority: int, lock_memory: bool, stay_awake: bool, cpus: set[int], seconds: float) -> None:
     os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))  # not the class of a parent that has another
     wake_ups = max(1, round(seconds * RATE_HZ))
     inherited = os.sched_getaffinity(0)
     os.sched_setaffinity(0, range(_CPUS))
     reachable = os.sched_getaffinity(0)
     os.sched_setaffinity(0, (cpus & reachable) or inherited)
-    refused = {"lock_memory": _refused(set_up(None, None, lock_memory))}
+    refused = {
+        "lock_memory": _refused(set_up(None, None, lock_memory=lock_memory, stay_awake=False)),
+        "stay_awake": _refused(set_up(None, None, lock_memory=False, stay_awake=stay_awake)),
+    }
     normal_ns = lateness_ns(wake_ups)
-    refused["priority"] = _refused(set_up(priority or None, None, False))
+    refused["priority"] = _refused(set_up(priority or None, None, lock_memory=False, stay_awake=False))
     first_ns = lateness_ns(wake_ups) if priority and not refused["priority"] else []
     found = {
         "refused": {name: what for name, what in refused.items() if what},
@@ -106,5 +110,5 @@ def _refused(granted: Granted) -> tuple[str, str] | None:
 
 
 if __name__ == "__main__":
-    _priority, _lock, _cpus, _seconds = sys.argv[1:]
-    _main(int(_priority), _lock == "1", {int(cpu) for cpu in _cpus.split(",") if cpu}, float(_seconds))
+    _priority, _lock, _awake, _cpus, _seconds = sys.argv[1:]
+    _main(int(_priority), _lock == "1", _awake == "1", {int(cpu) for cpu in _cpus.split(",") if cpu}, float(_seconds))

@@ -247,12 +247,16 @@ class Realtime(Section):
     """SCHED_FIFO priority of the recorder, below the loop's; 0, or a loop without, for normal scheduling."""
     lock_memory: bool = True
     """Keep the processes' memory from being paged out."""
+    stay_awake: bool = True
+    """Keep idle processors awake while the loop runs: waking one takes longer than a hand-off; it costs power."""
     camera_cpus: list[int] = Field(default_factory=list)
     """Processors of the camera; empty for all. sim-loop keeps the three apart where the file says nothing."""
     controller_cpus: list[int] = Field(default_factory=list)
     """Processors of the controller; empty for all."""
     mirror_cpus: list[int] = Field(default_factory=list)
     """Processors of the mirror; empty for all."""
+    recorder_cpus: list[int] = Field(default_factory=list)
+    """Processors of the recorder; empty for all. sim-loop keeps it off the controller's."""
 
     @property
     def lowest_priority(self) -> int:

@@ -196,6 +196,7 @@ def record(
         limits=Limits(round(log.largest_mb * 1e6), log.longest_s, round(log.min_free_mb * 1e6)),
         clock=clock_of(settings),
         priority=(settings.realtime.priority and settings.realtime.recorder_priority) or None,
+        cpus=set(settings.realtime.recorder_cpus) or None,
     )
     if as_json:
         _print(json.dumps(figures(done)))

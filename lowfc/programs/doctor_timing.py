@@ -140,7 +140,7 @@ def frequency(facts: Facts) -> Finding:
 def idle_states(facts: Facts) -> Finding:
     """How deeply an idle processor sleeps: the driver and the longest waking of the states in use.
 
-    Waking takes more than 50 us.
+    The loop is not allowed to keep processors awake, or is not asked to and waking one takes more than 50 us.
     """
     driver = facts.host.idle_driver()
     used = [state for state in facts.host.idle_states() if state.enabled]
@@ -148,6 +148,15 @@ def idle_states(facts: Facts) -> Finding:
         return note(f"driver {driver}, no states shown; in a virtual machine the hypervisor decides")
     deepest = max(used, key=lambda state: state.exit_us)
     detail = f"driver {driver}, deepest state {deepest.name} with {deepest.exit_us} us to wake"
+    if facts.config.realtime.stay_awake:
+        if refused := facts.tried.refused.get("stay_awake"):
+            what, cost = refused
+            return warning(
+                f"{detail}; not granted: {what}",
+                'a udev rule: KERNEL=="cpu_dma_latency", GROUP="realtime", MODE="0660"; this user in that group',
+                cost,
+            )
+        return ok(f"{detail}; kept awake while the loop runs")
     if deepest.exit_us <= _SLOW_EXIT_US:
         return ok(detail)
     return warning(

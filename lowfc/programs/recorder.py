@@ -308,6 +308,7 @@ def record(
     limits: Limits = STANDARD,
     clock: Clock | None = None,
     priority: int | None = None,
+    cpus: set[int] | None = None,
 ) -> Summary:
     """Record a run into `folder` until SIGTERM or SIGINT; the process of `lowfc record`.
 
@@ -320,6 +321,7 @@ def record(
         limits: when a log is finished and the next begun, and when there is no room for one.
         clock: the run's; the host's when None.
         priority: of SCHED_FIFO, below the loop's; None leaves the normal class.
+        cpus: processors to stay on; None leaves all.
 
     Raises:
         BusError: another recorder has this run.
@@ -332,7 +334,7 @@ def record(
         for path, media_type in ((configuration, "application/toml"), (calibration, "application/fits"))
         if path is not None
     ]
-    granted = step_back(priority)
+    granted = step_back(priority, cpus)
     clock = HostClock() if clock is None else clock
     bus = ZenohBus(run.links, Role.RECORDER, clock)
     try:

@@ -78,7 +78,7 @@ def publish(
                 f"it has {', '.join(sorted(run.links.ports))}"
             )
     selection = Selection(run.links, topics, run.links.live() | set(wait_for), allow_commands=allow_commands)
-    granted = set_up(None, None, lock_memory=False)
+    granted = set_up(None, None, lock_memory=False, stay_awake=False)
     with _joined(run, selection, granted) as (service, buses):
         shown.print(f"playing into run {run_id!r} as {', '.join(buses)}", highlight=False)
         player = Player(service, buses, selection, speed)
