@@ -9,6 +9,7 @@ from lowfc.adapters import instrument
 from lowfc.contract.configuration import Configuration
 from lowfc.control.inputs import Frame, Load
 from lowfc.control.loop import advance
+from lowfc.control.stability import delay_weights
 from lowfc.control.state import State
 from sim_camera.process import bench
 from sim_dm.device import Told, initial, obey
@@ -40,13 +41,12 @@ def fold(config: Configuration, frames: int) -> Fold:
     assert state.drive is not None
     scene, mirror = bench(config), device(config)
     status = initial(mirror)
-    weights = state.drive.weights
+    weights = delay_weights(settings.delay_frames).astype(np.float32)
     shapes = [status.surface_nm] * len(weights)
     rows: list[list[npt.ArrayLike]] = [[] for _ in fields(Fold)]
     for index in range(frames):
         shapes = [status.surface_nm, *shapes[:-1]]
         seen = np.sum([weight * shape for weight, shape in zip(weights, shapes, strict=True)], axis=0, dtype=np.float32)
-        scene.prepare()
         pixels, truth = scene.expose(index, seen)
         time_ns = 10**18 + index * config.period_ns
         state, outputs = advance(settings, state, Frame((1 << 32) + index, time_ns, 0, pixels))

@@ -26,6 +26,7 @@ from lowfc.programs.frame_source import Payloads, prepared_frames
 from lowfc.programs.latency import latency
 from lowfc.programs.latency_figures import (
     LOOP_SPANS,
+    STAGES,
     UNKNOWN,
     WARM_UP_S,
     Frames,
@@ -57,6 +58,7 @@ def frames(count: int = 1000, period_ns: int = MS, **changes: Any) -> Frames:
         "commanded": np.ones(count, bool),
         "transport_ns": np.full(count, 40_000),
         "command_ns": np.full(count, 100_000),
+        "stages_ns": dict.fromkeys(STAGES, np.full(count, 20_000)),
         "mirror_ns": put_ns + 150_000,
     }
     return Frames(**columns | changes)
@@ -72,13 +74,15 @@ def test_percentiles_are_values_that_were_measured() -> None:
 def test_what_was_heard_is_put_beside_what_was_sent() -> None:
     sequence = START + np.arange(4, dtype=np.uint64)
     timed = sequence[[0, 1, 3]]  # the third frame was skipped
-    stages = {"transport": np.array([10, 11, 13]), "frame_to_command": np.array([100, 101, 103])}
+    columns = {"transport": 10, "wakeup": 20, "compute": 30, "publish": 40, "frame_to_command": 100}
+    stages = {stage: np.array([0, 1, 3]) + value for stage, value in columns.items()}
     states = sequence[[0, 0, 3]], np.array([1200, 9999, 4200])  # the first one was said twice, the second one lost
     put_ns = np.array([1000, 2000, 3000, 4000])
     found = join(sequence, put_ns, put_ns - 5, (timed, stages), states)
     assert found.commanded.tolist() == [True, True, False, True]
     assert found.transport_ns.tolist() == [10, 11, UNKNOWN, 13]
     assert found.command_ns.tolist() == [100, 101, UNKNOWN, 103]
+    assert found.stages_ns["compute"].tolist() == [30, 31, UNKNOWN, 33]
     assert found.mirror_ns.tolist() == [1200, UNKNOWN, UNKNOWN, 4200]
     commands = join(sequence, put_ns, None, (timed, stages), states, sequence[:3])
     assert commands.commanded.tolist() == [True, True, True, False]

@@ -9,7 +9,7 @@ import threading
 import traceback
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
-from typing import Protocol
+from typing import NamedTuple, Protocol
 
 from lowfc.adapters.envelope import Envelope
 from lowfc.contract.messages import HEALTH, Topic
@@ -18,8 +18,7 @@ ALL = "*"
 """In place of a name: every mirror, or every process."""
 
 
-@dataclass(slots=True)
-class Sample:
+class Sample(NamedTuple):
     """One message as it arrived.
 
     Attributes:

@@ -1,7 +1,7 @@
 """The 16 bytes that travel beside every payload: which message of its publisher it is, and when it was sent."""
 
 import struct
-from dataclasses import dataclass
+from typing import NamedTuple
 
 from lowfc.contract.errors import BusError
 from lowfc.control.loop import COUNT_BITS
@@ -10,8 +10,7 @@ _LAYOUT = struct.Struct("<QQ")
 _COUNT_MASK = (1 << COUNT_BITS) - 1
 
 
-@dataclass(frozen=True, slots=True)
-class Envelope:
+class Envelope(NamedTuple):
     """Identity and time of one message.
 
     Attributes:

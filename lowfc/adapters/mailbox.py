@@ -4,30 +4,19 @@ import threading
 import time
 from collections import deque
 
+from lowfc.adapters.arrivals import Arrivals
 from lowfc.adapters.bus import Sample
-from lowfc.adapters.envelope import start_of
 
 
-class Mailbox:
+class Mailbox(Arrivals):
     """Holds the newest message of one publisher; a newer one replaces it.
 
     One thread puts and one takes. A bare lock is the signal: releasing it is the cheapest way for CPython to wake a
     thread that waits with a timeout.
-
-    Attributes:
-        key: what it gets, where it was made for one topic.
-        received: messages put.
-        missing: messages that never arrived, by gaps in the sequence of one start of the publisher.
-        restarts: how often the publisher began anew.
-        last_sequence: of the newest message.
     """
 
     def __init__(self, key: str = "") -> None:
-        self.key = key
-        self.received = 0
-        self.missing = 0
-        self.restarts = 0
-        self.last_sequence = 0
+        super().__init__(key)
         self._taken = 0
         self._woken = False
         self._slot: deque[Sample] = deque(maxlen=1)
@@ -46,16 +35,7 @@ class Mailbox:
 
     def put(self, sample: Sample) -> None:
         """Leave a message; called on the bus's thread."""
-        sequence, last = sample.sequence, self.last_sequence
-        if not self.received:
-            self.last_sequence = sequence
-        elif sequence > last:
-            if start_of(sequence) == start_of(last):
-                self.missing += sequence - last - 1
-            else:
-                self.restarts += 1
-            self.last_sequence = sequence
-        self.received += 1
+        self.count(sample)
         self._slot.append(sample)
         self._raise_signal()
 

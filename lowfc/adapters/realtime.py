@@ -73,16 +73,19 @@ def set_up(priority: int | None, cpus: set[int] | None, *, lock_memory: bool, st
 def spread(cpus: Iterable[int]) -> dict[str, list[int]]:
     """Configuration keys that keep the loop's processes apart on these processors; none where there is only one.
 
-    The simulated camera has the most to do, so that of two processors the others share one: a processor whose real-time
-    share is used up stands still for 50 ms. The recorder is sent each frame together with the controller, and would run
-    first on its processor.
+    The controller has one to itself: whatever else runs there pushes its code and data out of the caches. The recorder,
+    which is sent each frame together with it, would run first there.
     """
-    first, *others = cpus = sorted(cpus)
+    camera, *others = cpus = sorted(cpus)
     if not others:
         return {}
-    keys = {"camera": first, "controller": others[0], "mirror": others[1] if len(others) > 2 else others[0]}
-    apart = {f"realtime.{role}_cpus": [cpu] for role, cpu in keys.items()}
-    return apart | {"realtime.recorder_cpus": [cpu for cpu in cpus if cpu != keys["controller"]]}
+    controller, mirror, *_ = *others, camera
+    return {
+        "realtime.camera_cpus": [camera],
+        "realtime.controller_cpus": [controller],
+        "realtime.mirror_cpus": [mirror],
+        "realtime.recorder_cpus": [cpu for cpu in cpus if cpu != controller],
+    }
 
 
 def step_back(priority: int | None, cpus: set[int] | None = None) -> Granted:

@@ -9,8 +9,10 @@ from collections.abc import Callable, Iterable
 from types import FrameType
 
 from lowfc import __version__
+from lowfc.adapters.arrivals import Arrivals
 from lowfc.adapters.bus import ALL, Bus, Publisher, Sample, name_in
 from lowfc.adapters.clock import Clock
+from lowfc.adapters.handover import Handover
 from lowfc.adapters.mailbox import Mailbox
 from lowfc.adapters.realtime import NOTHING, Granted
 from lowfc.adapters.usage import resident_bytes
@@ -52,7 +54,7 @@ class Service:
         self.work = 0
         self.heard: dict[str, wire.Health] = {}
         self.publishers: list[Publisher] = []
-        self.mailboxes: list[Mailbox] = []
+        self.arrivals: list[Arrivals] = []
         self.run_id = run_id
         self._granted = granted
         self.fill = fill
@@ -79,10 +81,16 @@ class Service:
     def mailbox(self, topic: Topic, name: str = "") -> Mailbox:
         """Mailbox that gets a topic, counted in Health and woken at a stop."""
         mailbox = Mailbox(topic.at(name))
-        self.mailboxes.append(mailbox)
+        self.arrivals.append(mailbox)
         self.on_stop(mailbox.wake)
         self.bus.subscribe(topic, mailbox.put, name or ALL)
         return mailbox
+
+    def handover(self, topic: Topic, handler: Callable[[Sample], None]) -> Callable[[], None]:
+        """Handle a topic's messages on the bus's thread, counted in Health; call what is returned to leave off."""
+        handover = Handover(topic.key, handler, self.clock.host_ns)
+        self.arrivals.append(handover)
+        return self.bus.subscribe(topic, handover.put)
 
     def newcomers(self) -> bool:
         """Whether somebody is heard whom the last call did not know: who answers what is asked, or answers anew."""
@@ -175,7 +183,7 @@ class Service:
             refused=[f"{measure}: {cost}" for measure, cost in self._granted.refused],
             clock_offset_ns=self.clock.offset_ns,
             uptime_ns=now_ns - self._started_ns,
-            topics=[*(self._sent(one) for one in self.publishers), *map(_got, self.mailboxes)],
+            topics=[*(self._sent(one) for one in self.publishers), *map(_got, self.arrivals)],
         )
         if self.fill:
             self.fill(message)
@@ -211,11 +219,11 @@ class Service:
         self.stop(signal.Signals(number).name)
 
 
-def _got(mailbox: Mailbox) -> wire.TopicCount:
+def _got(arrivals: Arrivals) -> wire.TopicCount:
     return wire.TopicCount(
-        topic=mailbox.key,
-        received=mailbox.received,
-        skipped=mailbox.skipped,
-        missing=mailbox.missing,
-        last_sequence=mailbox.last_sequence,
+        topic=arrivals.key,
+        received=arrivals.received,
+        skipped=arrivals.skipped,
+        missing=arrivals.missing,
+        last_sequence=arrivals.last_sequence,
     )

@@ -21,10 +21,10 @@ def decode_frame(payload: bytes, sequence: int, age_ns: int) -> Frame:
         image = RawImage.FromString(payload)
     except DecodeError:
         return Frame(sequence, 0, age_ns, None)
-    pixels = None
-    whole = image.step == 2 * image.width and len(image.data) == image.step * image.height > 0
-    if image.encoding == MONO16 and whole:
-        pixels = np.frombuffer(image.data, dtype="<u2").reshape(image.height, image.width)
+    pixels, data = None, image.data  # each look at it makes a copy
+    rows, columns, step = image.height, image.width, image.step
+    if image.encoding == MONO16 and step == 2 * columns and len(data) == step * rows > 0:
+        pixels = np.frombuffer(data, dtype="<u2").reshape(rows, columns)
     return Frame(sequence, from_timestamp(image.timestamp), age_ns, pixels)
 
 

@@ -249,8 +249,10 @@ class Realtime(Section):
     """Keep the processes' memory from being paged out."""
     stay_awake: bool = True
     """Keep idle processors awake while the loop runs: waking one takes longer than a hand-off; it costs power."""
+    rehearse: bool = True
+    """Do each control step a second time for nothing, so that the next frame finds the caches warm; not above 2 kHz."""
     camera_cpus: list[int] = Field(default_factory=list)
-    """Processors of the camera; empty for all. sim-loop keeps the three apart where the file says nothing."""
+    """Processors of the camera; empty for all. Where the file says nothing, sim-loop gives the controller its own."""
     controller_cpus: list[int] = Field(default_factory=list)
     """Processors of the controller; empty for all."""
     mirror_cpus: list[int] = Field(default_factory=list)

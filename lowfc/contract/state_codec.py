@@ -53,7 +53,7 @@ def decode_state(message: wire.ControllerState, calibration: Calibration | None)
             raise ValueError(f"calibration {message.calibration_id[:12]} of the controller's state is not there")
         drive = Drive.at_rest(settings, calibration)
         law = Law(*(np.array(values, np.float32) for values in (message.gain, message.leak, message.limit_nm)))
-        history = np.array(message.command_history_nm, np.float32).reshape(len(drive.weights), -1)
+        history = np.array(message.command_history_nm, np.float32).reshape(len(drive.history_nm), -1)
         actuators = np.frombuffer(message.actuators, "<f4").reshape(calibration.grid)
         if law.gain.shape != drive.law.gain.shape or history.shape[1] != len(calibration.noll):
             raise ValueError(f"the controller's state is not of {len(calibration.noll)} modes")

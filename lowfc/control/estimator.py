@@ -11,17 +11,46 @@ Single = npt.NDArray[np.float32]
 
 
 class Estimate(NamedTuple):
-    """Modal errors of a frame (modes,), nm of wavefront rms, and what was seen of its light."""
+    """Modal errors of a frame (modes,), nm of wavefront rms, and the sum of its good pixels, dark subtracted, DN."""
 
     error_nm: Single
     flux_dn: float
 
 
-def saturated_pixels(calibration: Calibration, pixels: npt.NDArray[np.uint16]) -> int:
-    """How many good pixels of a frame (pixels,) are at full well."""
-    if pixels.max() < calibration.saturation_dn:
-        return 0
-    return int(np.count_nonzero((pixels >= calibration.saturation_dn) & (calibration.good > 0)))
+class Estimator(NamedTuple):
+    """R times the `difference` of a frame, in the order in which it is quickest: R (I - dark) and the flux at once.
+
+    Rounding adds some 1e-5 nm to a mode of the paper's sensor.
+
+    Attributes:
+        rows: (modes + 1, pixels) R, and below it the good pixels.
+        reference_nm: (modes,) R I0.
+        dark: (pixels,) DN.
+        scratch: (pixels,) overwritten by every frame, so that nothing the size of a frame is allocated; it carries
+            nothing from one call to the next.
+    """
+
+    rows: Single
+    reference_nm: Single
+    dark: Single
+    scratch: Single
+
+    @classmethod
+    def of(cls, calibration: Calibration) -> "Estimator":
+        """The estimator of a calibration."""
+        R, I0 = calibration.reconstructor, calibration.reference
+        reference_nm = (R.astype(np.float64) @ I0).astype(np.float32)
+        return cls(np.vstack([R, calibration.good]), reference_nm, calibration.dark, np.empty_like(calibration.dark))
+
+    def estimate(self, pixels: npt.NDArray[np.uint16], least_flux_dn: float) -> Estimate | None:
+        """Modal error of a frame (pixels,); None where its flux is at most `least_flux_dn`."""
+        np.copyto(self.scratch, pixels)  # by itself, for it is quicker than a subtraction of two types
+        np.subtract(self.scratch, self.dark, out=self.scratch)
+        sums = self.rows @ self.scratch
+        flux_dn = float(sums[-1])
+        if not flux_dn > least_flux_dn:
+            return None
+        return Estimate(sums[:-1] * np.float32(1 / flux_dn) - self.reference_nm, flux_dn)
 
 
 def difference(
@@ -42,12 +71,8 @@ def difference(
     return flux_dn
 
 
-def estimate(
-    calibration: Calibration, pixels: npt.NDArray[np.uint16], least_flux_dn: float, scratch: Single
-) -> Estimate | None:
-    """Modal error R ((I - dark) / flux - I0) of a frame (pixels,); None where the flux is at most `least_flux_dn`.
-
-    `scratch` (pixels,) float32 is overwritten, so that nothing the size of a frame is allocated.
-    """
-    flux_dn = difference(calibration, pixels, least_flux_dn, scratch)
-    return None if flux_dn is None else Estimate(calibration.reconstructor @ scratch, flux_dn)
+def saturated_pixels(calibration: Calibration, pixels: npt.NDArray[np.uint16]) -> int:
+    """How many good pixels of a frame (pixels,) are at full well."""
+    if np.maximum.reduce(pixels) < calibration.saturation_dn:
+        return 0
+    return int(np.count_nonzero((pixels >= calibration.saturation_dn) & (calibration.good > 0)))

@@ -13,8 +13,7 @@ from lowfc.control.safety import LoopMode, Reason
 Single = npt.NDArray[np.float32]
 
 
-@dataclass(frozen=True, slots=True)
-class Frame:
+class Frame(NamedTuple):
     """A sensor image that arrived: `pixels` (rows, columns) uint16, DN, or None where the message made no image."""
 
     sequence: int

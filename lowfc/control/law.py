@@ -1,6 +1,6 @@
 """The integrator: gain, leak and limit of each mode."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 import numpy.typing as npt
@@ -10,11 +10,16 @@ Single = npt.NDArray[np.float32]
 
 @dataclass(frozen=True, slots=True)
 class Law:
-    """Gain, leak and limit of each mode, each (modes,) float32; the limit is nm of wavefront rms."""
+    """Gain, leak and limit of each mode, each (modes,) float32; the limit is nm of wavefront rms.
+
+    Attributes:
+        kept: (modes,) 1 - leak.
+    """
 
     gain: Single
     leak: Single
     limit_nm: Single
+    kept: Single = field(init=False)
 
     def __post_init__(self) -> None:
         if not self.gain.shape == self.leak.shape == self.limit_nm.shape:
@@ -29,6 +34,7 @@ class Law:
         ):
             if not (np.isfinite(array).all() and (array >= low).all() and (array <= high).all()):
                 raise ValueError(f"every {name} must be between {low} and {high}, got {array.tolist()}")
+        object.__setattr__(self, "kept", 1 - self.leak)
 
 
 def integrate(law: Law, command_nm: Single, error_nm: Single) -> tuple[Single, bool]:
@@ -36,8 +42,7 @@ def integrate(law: Law, command_nm: Single, error_nm: Single) -> tuple[Single, b
 
     All (modes,) float32, nm of wavefront rms.
     """
-    wanted = (1 - law.leak) * command_nm - law.gain * error_nm
-    cut = np.abs(wanted) > law.limit_nm
-    if cut.any():
+    wanted = law.kept * command_nm - law.gain * error_nm
+    if np.count_nonzero(np.abs(wanted) > law.limit_nm):
         return np.clip(wanted, -law.limit_nm, law.limit_nm), True
     return wanted, False

@@ -10,7 +10,7 @@ from collections.abc import Callable, Mapping
 import numpy as np
 import numpy.typing as npt
 
-from lowfc.control.estimator import estimate, saturated_pixels
+from lowfc.control.estimator import Estimate, saturated_pixels
 from lowfc.control.inputs import (
     CameraSettings,
     Command,
@@ -41,6 +41,8 @@ def advance(settings: Settings, state: State, taken: Input) -> tuple[State, Outp
 
     An input that changes nothing and gives rise to nothing leaves the very same state, and is not counted in it.
     """
+    if isinstance(taken, Frame):
+        return _frame(settings, state, taken)
     after, outputs = _HANDLERS[type(taken)](settings, state, taken)
     if after is not state or outputs.events:
         after = after._replace(taken=state.taken + 1)
@@ -49,58 +51,51 @@ def advance(settings: Settings, state: State, taken: Input) -> tuple[State, Outp
 
 def _frame(settings: Settings, state: State, frame: Frame) -> tuple[State, Outputs]:
     events: list[Raised] = []
-    state, stale = _count_frames(state, frame, events)
-    if stale is not None:
+    if frame.sequence <= state.frame_sequence:
+        stale = Reason.REPEATED if frame.sequence == state.frame_sequence else Reason.OUT_OF_ORDER
         return _refuse(settings, state, frame, stale, events)
-    drive = state.drive
+    drive = _arrive(state, frame, events)
     if drive is None:
-        return _refuse(settings, state, frame, Reason.NO_CALIBRATION, events)
-    calibration = drive.calibration
-    if frame.pixels is None or frame.pixels.shape != calibration.shape:
-        return _refuse(settings, state, frame, Reason.WRONG_SIZE, events)
-    if frame.age_ns > settings.late_ns:
-        return _refuse(settings, state, frame, Reason.LATE, events)
-    pixels = frame.pixels.reshape(-1)
-    saturated = saturated_pixels(calibration, pixels)
-    if saturated > settings.most_saturated:
-        return _refuse(settings, state, frame, Reason.SATURATED, events)
-    measured = estimate(calibration, pixels, settings.least_flux * calibration.flux_dn, drive.scratch)
-    if measured is None:
-        return _refuse(settings, state, frame, Reason.DARK, events)
-
-    pol_nm = measured.error_nm - drive.seen_nm()
-    drive, reasons = _follow(settings, state.mode, drive, measured.error_nm)
+        return _refuse(settings, _newest(state, drive, frame), frame, Reason.NO_CALIBRATION, events)
+    measured = _measure(settings, drive, frame)
+    if isinstance(measured, Reason):
+        return _refuse(settings, _newest(state, drive, frame), frame, measured, events)
+    estimate, saturated = measured
+    pol_nm = estimate.error_nm - drive.seen_nm()
+    drive, reasons = _follow(settings, state.mode, drive, estimate.error_nm)
     if state.refused is not None:
         details: dict[str, object] = {"refused": state.refused_count, "reason": state.refused.name}
         events.append(Raised("FRAMES_ACCEPTED", details))
     if reasons != state.limits_hit:
         _limit_events(state.limits_hit, reasons, events)
-    state = state._replace(
-        drive=drive,
-        frames_used=state.frames_used + 1,
-        refused=None,
-        refused_count=0,
+    mode, command_nm = state.mode, drive.history_nm[0]
+    state = State(  # made anew: `_replace` takes four times as long
+        mode,
+        drive,
+        frame.sequence,
+        frame.time_ns,
+        state.frames_used + 1,
         limits_hit=reasons,
+        commanded=True,
         counts=_counted(state.counts, reasons),
+        taken=state.taken + 1,
     )
     step = Step(
         frame.sequence,
         frame.time_ns,
-        state.mode,
-        drive.history_nm[0],
+        mode,
+        command_nm,
         reasons,
-        measured.error_nm,
+        estimate.error_nm,
         pol_nm,
-        measured.flux_dn,
+        estimate.flux_dn,
         saturated,
     )
-    return _send(state, step, events)
+    return state, Outputs(step, Command(frame.sequence, frame.time_ns, drive.actuators_nm, command_nm), None, events)
 
 
-def _count_frames(state: State, frame: Frame, events: list[Raised]) -> tuple[State, Reason | None]:
-    """Account for frames that never came, and find those that are not newer than the last."""
-    if frame.sequence <= state.frame_sequence:
-        return state, Reason.REPEATED if frame.sequence == state.frame_sequence else Reason.OUT_OF_ORDER
+def _arrive(state: State, frame: Frame, events: list[Raised]) -> Drive | None:
+    """The drive after the frames that never came before this one."""
     if state.silent:
         events.append(Raised("FRAMES_BACK", {"silent_ms": (frame.time_ns - state.frame_time_ns) / 1e6}))
     drive = state.drive
@@ -112,8 +107,26 @@ def _count_frames(state: State, frame: Frame, events: list[Raised]) -> tuple[Sta
             drive = drive.stayed(missing) if drive is not None else None
     elif state.frame_sequence:
         events.append(Raised("CAMERA_RESTARTED", {}))
-    state = state._replace(drive=drive, silent=False, frame_sequence=frame.sequence, frame_time_ns=frame.time_ns)
-    return state, None
+    return drive
+
+
+def _newest(state: State, drive: Drive | None, frame: Frame) -> State:
+    return state._replace(drive=drive, silent=False, frame_sequence=frame.sequence, frame_time_ns=frame.time_ns)
+
+
+def _measure(settings: Settings, drive: Drive, frame: Frame) -> tuple[Estimate, int] | Reason:
+    """Modal errors of a frame and its saturated pixels, or why it cannot be used."""
+    calibration = drive.calibration
+    if frame.pixels is None or frame.pixels.shape != calibration.shape:
+        return Reason.WRONG_SIZE
+    if frame.age_ns > settings.late_ns:
+        return Reason.LATE
+    pixels = frame.pixels.ravel()
+    saturated = saturated_pixels(calibration, pixels)
+    if saturated > settings.most_saturated:
+        return Reason.SATURATED
+    estimate = drive.estimator.estimate(pixels, settings.least_flux * calibration.flux_dn)
+    return Reason.DARK if estimate is None else (estimate, saturated)
 
 
 def _follow(settings: Settings, mode: LoopMode, drive: Drive, error_nm: Single) -> tuple[Drive, tuple[Reason, ...]]:
@@ -123,7 +136,7 @@ def _follow(settings: Settings, mode: LoopMode, drive: Drive, error_nm: Single) 
     if mode is not LoopMode.CLOSED:
         return drive.stayed(1), ()
     command_nm, cut = integrate(drive.law, drive.history_nm[0], error_nm)
-    wanted_nm = (drive.calibration.modes_to_actuators @ command_nm).reshape(drive.calibration.grid)
+    wanted_nm = (drive.to_actuators @ command_nm).reshape(drive.calibration.grid)
     limited = limit(settings.limits, drive.actuators_nm, wanted_nm)
     if limited.reasons:  # the modal command becomes what was kept: for pseudo-open-loop, and against wind-up
         command_nm = drive.inverse @ limited.actuators_nm.reshape(-1)
@@ -155,18 +168,15 @@ def _refuse(
         drive=drive,
         refused=reason,
         refused_count=state.refused_count + 1,
+        commanded=state.commanded or drive is not None,
         counts=_counted(state.counts, (reason,)),
+        taken=state.taken + 1,
     )
-    return _send(state, Step(frame.sequence, frame.time_ns, state.mode, held, (reason,)), events)
-
-
-def _send(state: State, step: Step, events: list[Raised]) -> tuple[State, Outputs]:
-    if state.drive is None:
+    step = Step(frame.sequence, frame.time_ns, state.mode, held, (reason,))
+    if drive is None:
         return state, Outputs(step=step, events=events)
     # Under the newest frame's sequence even where an older frame came: the mirror refuses older commands.
-    command = Command(state.frame_sequence, state.frame_time_ns, state.drive.actuators_nm, step.command_nm)
-    if not state.commanded:
-        state = state._replace(commanded=True)
+    command = Command(state.frame_sequence, state.frame_time_ns, drive.actuators_nm, held)
     return state, Outputs(step=step, command=command, events=events)
 
 
@@ -197,7 +207,7 @@ def _load(settings: Settings, state: State, load: Load) -> tuple[State, Outputs]
     before = state.drive
     if before is not None and before.actuators_nm.shape == calibration.grid:
         command_nm = drive.inverse @ before.actuators_nm.reshape(-1)
-        drive = drive._replace(actuators_nm=before.actuators_nm, history_nm=(command_nm,) * len(drive.weights))
+        drive = drive._replace(actuators_nm=before.actuators_nm, history_nm=(command_nm,) * len(drive.history_nm))
     mode = settings.start_mode if state.mode is LoopMode.IDLE else state.mode
     details: dict[str, object] = {
         "id": calibration.id[:12],
@@ -222,7 +232,7 @@ def _mirror(settings: Settings, state: State, shape: MirrorShape) -> tuple[State
     limit_nm = drive.law.limit_nm
     believed = shape.command_nm.shape == limit_nm.shape and (np.abs(shape.command_nm) <= limit_nm).all()
     command_nm = shape.command_nm if believed else drive.inverse @ shape.actuators_nm.reshape(-1)
-    drive = drive._replace(actuators_nm=shape.actuators_nm, history_nm=(command_nm,) * len(drive.weights))
+    drive = drive._replace(actuators_nm=shape.actuators_nm, history_nm=(command_nm,) * len(drive.history_nm))
     events = []
     if command_nm.any():
         events.append(Raised("MIRROR_ADOPTED", {"rms_nm": float(np.sqrt(command_nm @ command_nm))}))
@@ -286,7 +296,6 @@ def _counted(counts: Mapping[Reason, int], reasons: tuple[Reason, ...]) -> Mappi
 
 
 _HANDLERS: dict[type, Callable[..., tuple[State, Outputs]]] = {
-    Frame: _frame,
     Request: _request,
     MirrorShape: _mirror,
     CameraSettings: _camera,

@@ -3,9 +3,10 @@
 Used by the controller on what it sends and again by the mirror on what it gets. `docs/safety.md` lists the hazards.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from enum import IntEnum
 from math import frexp, isfinite, ldexp
+from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -52,26 +53,30 @@ class Limits:
         stroke_nm: largest deviation of an actuator from flat, either way.
         slew_nm: largest change of an actuator from one command to the next.
         neighbour_nm: largest difference between actuators side by side.
+        margin_nm: kept clear of each limit: 1e-3 nm, or sixteen roundings of float32 where the stroke is so long.
+        kept_stroke_nm: stroke without the margin, a float32, so that what was cut to it is not cut again.
+        kept_slew_nm: the same of the slew.
     """
 
     stroke_nm: float
     slew_nm: float
     neighbour_nm: float
+    margin_nm: float = field(init=False)
+    kept_stroke_nm: float = field(init=False)
+    kept_slew_nm: float = field(init=False)
 
     def __post_init__(self) -> None:
+        margin_nm = max(MARGIN_NM, ldexp(1.0, frexp(self.stroke_nm)[1] - 20))
+        object.__setattr__(self, "margin_nm", margin_nm)
+        object.__setattr__(self, "kept_stroke_nm", float(np.float32(self.stroke_nm - margin_nm)))
+        object.__setattr__(self, "kept_slew_nm", float(np.float32(self.slew_nm - margin_nm)))
         for name in ("stroke_nm", "slew_nm", "neighbour_nm"):
             value = getattr(self, name)
             if not 2 * self.margin_nm < value < np.inf:
                 raise ValueError(f"{name} must be a finite number above {2 * self.margin_nm:g} nm, got {value}")
 
-    @property
-    def margin_nm(self) -> float:
-        """What is kept clear of each limit: 1e-3 nm, or sixteen roundings of float32 where the stroke is so long."""
-        return max(MARGIN_NM, ldexp(1.0, frexp(self.stroke_nm)[1] - 20))
 
-
-@dataclass(frozen=True, slots=True)
-class Limited:
+class Limited(NamedTuple):
     """A command that may be sent: (rows, columns) float32, nm of surface, and the limits that changed it."""
 
     actuators_nm: Actuators
@@ -92,8 +97,7 @@ def limit(limits: Limits, previous_nm: Actuators, wanted_nm: Actuators) -> Limit
     if not (isfinite(lowest_nm) and isfinite(highest_nm)):
         return Limited(previous_nm, (Reason.NOT_FINITE,))
     reasons: list[Reason] = []
-    margin_nm = limits.margin_nm
-    stroke, slew = (float(np.float32(one - margin_nm)) for one in (limits.stroke_nm, limits.slew_nm))
+    stroke, slew = limits.kept_stroke_nm, limits.kept_slew_nm
     kept = wanted_nm
     if max(highest_nm, -lowest_nm) > stroke:
         reasons.append(Reason.STROKE)
@@ -105,7 +109,7 @@ def limit(limits: Limits, previous_nm: Actuators, wanted_nm: Actuators) -> Limit
         move = np.clip(move, -slew, slew)
         kept = previous_nm + move
         lowest_nm, highest_nm = _range_nm(kept)
-    apart_nm = limits.neighbour_nm - margin_nm / 2
+    apart_nm = limits.neighbour_nm - limits.margin_nm / 2
     # Where no two actuators at all are that far apart, no neighbours are; it costs a fraction of looking at each pair.
     if highest_nm - lowest_nm > apart_nm and neighbour_difference_nm(kept) > apart_nm:
         reasons.append(Reason.NEIGHBOUR)
@@ -139,7 +143,8 @@ def _shorten(limits: Limits, previous_nm: Actuators, kept_nm: Actuators) -> Actu
 
 def _range_nm(actuators_nm: Actuators) -> tuple[float, float]:
     """Lowest and highest; not finite where any is not."""
-    return float(actuators_nm.min(initial=0)), float(actuators_nm.max(initial=0))
+    flat = actuators_nm.ravel()
+    return float(np.minimum.reduce(flat, initial=0)), float(np.maximum.reduce(flat, initial=0))
 
 
 def neighbour_difference_nm(actuators_nm: npt.NDArray[np.floating]) -> float:

@@ -1,5 +1,6 @@
 """The controller's process: `advance` folded over what the bus brings; the command first, then all the rest."""
 
+import threading
 from collections import deque
 from dataclasses import replace
 from pathlib import Path
@@ -37,8 +38,10 @@ from lowfc.control.loop import advance
 from lowfc.control.safety import LoopMode
 from lowfc.control.state import State
 
-TICK_S = 0.01
+TICK_NS = 10_000_000
 """Without frames the held command is repeated this often."""
+REHEARSED_NS = 500_000
+"""Frames that come faster leave no time to rehearse, and the caches no time to cool."""
 MIRROR_PATIENCE_S = 1.0
 """How long the start waits to learn where the mirror is."""
 STATE_PERIOD_NS = 1_000_000_000
@@ -59,9 +62,14 @@ class Controller:
         self._settings = settings(config)
         if latch.exists():  # safed stays safed when the controller dies
             self._settings = replace(self._settings, start_mode=LoopMode.SAFED)
+        self._rehearses = config.realtime.rehearse and not config.lockstep
         self._valid_ns = round(config.control.valid_ms * 1e6)
         self._state = State()
-        self._frames = service.mailbox(FRAME)
+        self._turn = threading.Lock()
+        self._adopted = False
+        self._early: Sample | None = None
+        self._fault: Exception | None = None
+        self._leave_camera = service.handover(FRAME, self._arrived)
         self._mirror = Mailbox(MIRROR_STATE.at(name))
         self._leave_mirror = service.bus.subscribe(MIRROR_STATE, self._mirror.put, name)
         self._camera = service.mailbox(CAMERA_STATE)
@@ -83,19 +91,23 @@ class Controller:
         service.state = "ready"
 
     def run(self) -> None:
-        """Take a frame, advance, send the command; between frames, everything else."""
+        """Do all but the frames: those are dealt with where they arrive, one turn each."""
         self._adopt_mirror()
         self._service.state = "running"
+        with self._turn:
+            self._adopted = True
+            if self._early is not None:
+                self._frame(self._early)
         while self._service.running:
-            sample = self._frames.take(TICK_S)
-            if self._queries or self._camera.waiting:
-                self._between_frames()
-            if sample is not None:
-                self._frame(sample)
-            elif not self._service.clock.lockstep:
-                self._tick()
+            camera = self._camera.take(TICK_NS * 1e-9)
+            with self._turn:
+                self._between_frames(camera)
             self._service.beat()
-        self._publish_timing()
+        if self._fault is not None:
+            raise self._fault
+        self._leave_camera()
+        with self._turn:
+            self._publish_timing()
         self._service.finish()
 
     def fill(self, health: wire.Health) -> None:
@@ -104,6 +116,18 @@ class Controller:
         health.counts.extend(reason_counts(self._state))
         if self._frame_to_command.count:
             health.frame_to_command.CopyFrom(codec.latency(self._frame_to_command))
+
+    def _arrived(self, sample: Sample) -> None:
+        """On the bus's thread: a frame; the newest one waits until it is known where the mirror is."""
+        try:
+            with self._turn:
+                if self._adopted:
+                    self._frame(sample)
+                else:
+                    self._early = sample
+        except Exception as fault:  # the bus would count it and go on: it shall end the process
+            self._fault = fault
+            self._service.stop("a frame could not be dealt with")
 
     def _frame(self, sample: Sample) -> None:
         """One step: the command goes out before anything else is encoded."""
@@ -119,6 +143,7 @@ class Controller:
         sent_ns = clock.host_ns()
         let_send()
         self._tell(outputs)
+        before_ns = self._last_frame_ns
         if sample.sequence == self._state.frame_sequence:  # an older one is no sign of a live camera
             self._last_frame_ns = taken_ns
         self._service.work += 1
@@ -134,21 +159,30 @@ class Controller:
             self._publish_timing()
         if clock.now_ns() >= self._state_due_ns:  # not by the frame's time: a camera's clock may be another
             self._publish_state(frame.time_ns)
+        if self._rehearses and taken_ns - before_ns > REHEARSED_NS:
+            self._rehearse(sample)
 
-    def _tick(self) -> None:
-        """No frame: hold the command."""
-        silent_ns = self._service.clock.host_ns() - self._last_frame_ns
-        self._take(Tick(self._service.clock.now_ns(), silent_ns))
+    def _rehearse(self, sample: Sample) -> None:
+        """Do the step once more, and forget what came of it: code and data are in the caches when the next frame comes.
 
-    def _between_frames(self) -> None:
-        """Apply what operators asked, in the order they asked, and what the camera says of itself."""
-        camera = self._camera.take(0) if self._camera.waiting else None
+        What happens between two frames pushes them out, and a step takes two thirds longer from memory.
+        """
+        frame = codec.decode_frame(sample.payload, self._state.frame_sequence + 1, 0)
+        _, outputs = advance(self._settings, self._state, frame)
+        if outputs.command is not None:
+            codec.encode_command(outputs.command, self._valid_ns, CHANNEL, self._state.taken)
+
+    def _between_frames(self, camera: Sample | None) -> None:
+        """Apply what the camera says of itself and what operators asked, in their order; without frames, hold."""
         if camera is not None:
             settings_now = codec.decode_camera(camera.payload)
             if settings_now is not None:
                 self._take(settings_now)
         while self._queries:
             self._answer(self._queries.popleft())
+        silent_ns = self._service.clock.host_ns() - self._last_frame_ns
+        if silent_ns >= TICK_NS and not self._service.clock.lockstep:
+            self._take(Tick(self._service.clock.now_ns(), silent_ns))
 
     def _answer(self, query: Query) -> None:
         now_ns = self._service.clock.now_ns()
@@ -234,7 +268,7 @@ class Controller:
     def _ask(self, query: Query) -> None:
         """On the bus's thread: leave the request for the loop, and wake it."""
         self._queries.append(query)
-        self._frames.wake()
+        self._camera.wake()
 
 
 def _column(duration_ns: int) -> int:

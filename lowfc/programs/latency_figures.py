@@ -20,6 +20,8 @@ Flags = npt.NDArray[np.bool_]
 UNKNOWN = -1
 WARM_UP_S = 0.5
 """Frames put so soon after the first one are left out."""
+STAGES = ("wakeup", "compute", "publish")
+"""What receive to command is made of, as in ControlTiming."""
 LOOP_SPANS = ("frame_to_receive", "receive_to_command", "frame_to_command", "command_to_mirror", "frame_to_mirror")
 PERCENTILES = {"p50": 500, "p90": 900, "p99": 990, "p99_9": 999, "max": 1000}
 """Each in thousandths, so that its place among the values is exact."""
@@ -40,6 +42,7 @@ class Frames:
         commanded: whether there is a command made from it.
         transport_ns: from the put to its reception by the controller; `UNKNOWN` where nothing says.
         command_ns: from the put to just after the command's put; `UNKNOWN` where nothing says.
+        stages_ns: of `STAGES`, each (frames,); `UNKNOWN` where nothing says.
         mirror_ns: when the mirror said that it had applied the command; `UNKNOWN` where it did not.
     """
 
@@ -48,6 +51,7 @@ class Frames:
     commanded: Flags
     transport_ns: Whole
     command_ns: Whole
+    stages_ns: Mapping[str, Whole]
     mirror_ns: Whole
 
     def only(self, wanted: Flags) -> "Frames":
@@ -58,6 +62,7 @@ class Frames:
             self.commanded[wanted],
             self.transport_ns[wanted],
             self.command_ns[wanted],
+            {stage: column[wanted] for stage, column in self.stages_ns.items()},
             self.mirror_ns[wanted],
         )
 
@@ -88,6 +93,7 @@ def join(
         (row >= 0) | (mirror_row >= 0) if commanded is None else rows_of(sequence, commanded) >= 0,
         _taken(stages_ns["transport"], row),
         _taken(stages_ns["frame_to_command"], row),
+        {stage: _taken(stages_ns[stage], row) for stage in STAGES},
         _taken(mirror[1], mirror_row),
     )
 
@@ -106,6 +112,7 @@ def spans_us(frames: Frames) -> dict[str, Double]:
     spans = {
         "frame_to_receive": transport,
         "receive_to_command": command - transport,
+        **{stage: _microseconds(column) for stage, column in frames.stages_ns.items()},
         "frame_to_command": command,
         "command_to_mirror": mirror - command,
         "frame_to_mirror": mirror,

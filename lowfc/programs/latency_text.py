@@ -11,6 +11,9 @@ from lowfc.programs.latency_summary import OVER
 _WORDS = {
     "frame_to_receive": "frame to receive",
     "receive_to_command": "receive to command",
+    "wakeup": "  waking",
+    "compute": "  computing",
+    "publish": "  publishing",
     "frame_to_command": "frame to command",
     "command_to_mirror": "command to mirror",
     "frame_to_mirror": "frame to mirror",

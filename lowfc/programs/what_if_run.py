@@ -13,7 +13,7 @@ from lowfc.contract.codec import decode_frame
 from lowfc.contract.errors import DataFileError
 from lowfc.contract.messages import FRAME
 from lowfc.control.calibration import Calibration
-from lowfc.control.estimator import estimate
+from lowfc.control.estimator import Estimator
 from lowfc.control.law import Law
 from lowfc.control.safety import LoopMode
 from lowfc.control.stability import delay_weights
@@ -114,7 +114,7 @@ class LoggedRun:
         """Errors (steps, modes) that another calibration measures in the frames that were used: a second pass."""
         steps = self.steps
         error_nm = np.full_like(steps.error_nm, np.nan)
-        scratch = np.empty(calibration.shape[0] * calibration.shape[1], np.float32)
+        estimator = Estimator.of(calibration)
         rows = {sequence: row for row, sequence in enumerate(steps.sequence.tolist()) if self.used[row]}
         for number, message in enumerate(LogReader(self.history.log.path, topics=[FRAME], skip_damaged=True), 1):
             if progress is not None and number % _PROGRESS_FRAMES == 0:
@@ -122,7 +122,7 @@ class LoggedRun:
             row = rows.get(message.sequence)
             pixels = decode_frame(message.payload, message.sequence, 0).pixels if row is not None else None
             if pixels is not None and pixels.shape == calibration.shape:
-                found = estimate(calibration, pixels.reshape(-1), 0.0, scratch)
+                found = estimator.estimate(pixels.reshape(-1), 0.0)
                 if found is not None:
                     error_nm[row] = found.error_nm
         return error_nm

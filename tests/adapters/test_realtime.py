@@ -114,6 +114,6 @@ def test_processes_are_kept_apart_as_far_as_there_are_processors() -> None:
         return list(spread(cpus).values())
 
     assert of(3) == []
-    assert of(5, 1) == [[1], [5], [5], [1]]
-    assert of(0, 1, 2) == [[0], [1], [1], [0, 2]]
+    assert of(5, 1) == [[1], [5], [1], [1]]
+    assert of(0, 1, 2) == [[0], [1], [2], [0, 2]]
     assert of(0, 1, 2, 3) == [[0], [1], [2], [0, 2, 3]]

@@ -534,7 +534,7 @@ def frozen(value: Any) -> Any:
     if hasattr(value, "_fields"):
         return type(value)(*(frozen(getattr(value, name)) for name in value._fields))
     if is_dataclass(value) and not isinstance(value, type):
-        return replace(value, **{part.name: frozen(getattr(value, part.name)) for part in fields(value)})
+        return replace(value, **{part.name: frozen(getattr(value, part.name)) for part in fields(value) if part.init})
     if isinstance(value, (list, tuple)):
         return type(value)(map(frozen, value))
     return dict(value) if hasattr(value, "items") else value

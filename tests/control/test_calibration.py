@@ -7,7 +7,7 @@ import pytest
 from toy import TOY, calibration
 
 from lowfc.control.calibration import ESTIMATORS, condition_number, noise_nm, normalise_flux, reconstructor
-from lowfc.control.estimator import estimate, saturated_pixels
+from lowfc.control.estimator import Estimator, difference, saturated_pixels
 
 PIXELS = TOY.reference.size
 RESPONSE = TOY.response + 0.001 * np.outer(TOY.reference, [1, -2, 3])  # modes that also change the flux
@@ -153,11 +153,11 @@ def test_condition_number_of_a_missing_mode_is_infinite() -> None:
 
 
 def test_an_estimate_is_right_at_any_flux_and_overwrites_only_its_scratch() -> None:
-    known, scratch = calibration(), np.empty(PIXELS, np.float32)
+    estimator = Estimator.of(calibration())
     for flux_dn in (100_000.0, 200_000.0, 400_000.0):
         pixels = TOY.pixels((3, -4, 5), flux_dn).reshape(-1)
         before = pixels.copy()
-        found = estimate(known, pixels, 1000.0, scratch)
+        found = estimator.estimate(pixels, 1000.0)
         assert found is not None
         assert np.abs(found.error_nm - (3, -4, 5)).max() < 0.1
         assert found.error_nm.dtype == np.float32
@@ -165,12 +165,28 @@ def test_an_estimate_is_right_at_any_flux_and_overwrites_only_its_scratch() -> N
         assert np.array_equal(pixels, before)
 
 
+def test_an_estimate_is_the_reconstructor_times_the_difference_from_the_reference() -> None:
+    rng = np.random.default_rng(3)
+    shifted = rng.uniform(0.5, 1.5, PIXELS) * calibration().reference  # so that R I0 is not zero
+    known = replace(calibration(), reference=(shifted / shifted.sum()).astype(np.float32))
+    out = np.empty(PIXELS, np.float32)
+    for flux_dn in (30_000.0, 300_000.0):
+        pixels = rng.poisson(TOY.pixels((3, -4, 5), flux_dn).reshape(-1)).astype(np.uint16)
+        found = Estimator.of(known).estimate(pixels, 0.0)
+        assert found is not None
+        assert found.flux_dn == pytest.approx(difference(known, pixels, 0.0, out), rel=1e-6)
+        expected_nm = known.reconstructor.astype(np.float64) @ out
+        assert np.abs(expected_nm).max() > 1
+        assert found.error_nm == pytest.approx(expected_nm, rel=1e-4, abs=1e-4)
+
+
 def test_a_frame_at_or_below_the_least_flux_is_dark() -> None:
-    known, scratch = calibration(), np.empty(PIXELS, np.float32)
+    known = calibration()
+    estimator = Estimator.of(known)
     pixels = np.full(PIXELS, 101, np.uint16)  # one DN above the dark in every pixel
-    assert estimate(known, pixels, float(PIXELS), scratch) is None
-    assert estimate(known, pixels, PIXELS - 1.0, scratch) is not None
-    assert estimate(known, np.zeros(PIXELS, np.uint16), 0.0, scratch) is None
+    assert estimator.estimate(pixels, float(PIXELS)) is None
+    assert estimator.estimate(pixels, PIXELS - 1.0) is not None
+    assert estimator.estimate(np.zeros(PIXELS, np.uint16), 0.0) is None
 
 
 def test_only_good_pixels_count_as_saturated() -> None:

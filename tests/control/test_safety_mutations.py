@@ -20,8 +20,8 @@ MUTATIONS = {
     "stroke cut on the other side": ("np.clip(kept, -stroke, stroke)", "np.clip(kept, -stroke, None)"),
     "stroke without a sign": ("if max(highest_nm, -lowest_nm) > stroke:", "if highest_nm > stroke:"),
     "stroke without a margin": (
-        "for one in (limits.stroke_nm, limits.slew_nm))",
-        "for one in (limits.stroke_nm + 2 * margin_nm, limits.slew_nm))",
+        "np.float32(self.stroke_nm - margin_nm)",
+        "np.float32(self.stroke_nm + margin_nm)",
     ),
     "slew never looked at": ("if max(highest_move, -lowest_move) > slew:", "if False:"),
     "slew without a sign": ("if max(highest_move, -lowest_move) > slew:", "if highest_move > slew:"),
@@ -30,12 +30,12 @@ MUTATIONS = {
     "slew from flat": ("kept = previous_nm + move", "kept = move"),
     "slew the wrong way": ("kept = previous_nm + move", "kept = previous_nm - move"),
     "slew without a margin": (
-        "for one in (limits.stroke_nm, limits.slew_nm))",
-        "for one in (limits.stroke_nm, limits.slew_nm + 2 * margin_nm))",
+        "np.float32(self.slew_nm - margin_nm)",
+        "np.float32(self.slew_nm + margin_nm)",
     ),
     "stroke limit for slew": (
-        "for one in (limits.stroke_nm, limits.slew_nm))",
-        "for one in (limits.stroke_nm, limits.stroke_nm))",
+        "np.float32(self.slew_nm - margin_nm)",
+        "np.float32(self.stroke_nm - margin_nm)",
     ),
     "neighbours never looked at": (
         "if highest_nm - lowest_nm > apart_nm and",
@@ -46,8 +46,8 @@ MUTATIONS = {
         "if highest_nm - lowest_nm > 2 * apart_nm and",
     ),
     "neighbours without a margin": (
-        "apart_nm = limits.neighbour_nm - margin_nm / 2",
-        "apart_nm = limits.neighbour_nm + margin_nm",
+        "apart_nm = limits.neighbour_nm - limits.margin_nm / 2",
+        "apart_nm = limits.neighbour_nm + limits.margin_nm",
     ),
     "neighbours in a column only": (
         "float(max(rows, columns))",
@@ -130,7 +130,8 @@ def check(module: Any) -> None:
 def _check_random_walks(module: Any) -> None:
     """Towards random shapes at the edge of what is allowed, step after step; far strokes need a wider margin."""
     rng = np.random.default_rng(7)
-    for bounds in ((LIMITS.stroke_nm, LIMITS.slew_nm, LIMITS.neighbour_nm), (2e5, 1.5e5, 1.5e5)):
+    usual, far, free = (LIMITS.stroke_nm, LIMITS.slew_nm, LIMITS.neighbour_nm), (2e5, 1.5e5, 1.5e5), (700.0, 500.0, 2e3)
+    for bounds in (usual, far, free):  # in the last, neighbours may be anywhere
         limits, shape = module.Limits(*bounds), np.zeros((3, 4), np.float32)
         for _ in range(60):
             wanted = (rng.choice([0.3, 1, 3]) * limits.stroke_nm * rng.standard_normal((3, 4))).astype(np.float32)

@@ -1,0 +1,98 @@
+"""Sizes of a loop, and random calibrations and frames of any size."""
+
+import os
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from lowfc.adapters import instrument
+from lowfc.adapters.realtime import spread
+from lowfc.contract.calibration_codec import identified
+from lowfc.contract.configuration import Configuration, load
+from lowfc.control.calibration import Calibration
+from lowfc.optics.detector import saturation_dn
+
+Single = npt.NDArray[np.float32]
+Frames = npt.NDArray[np.uint16]
+
+FRAMES = 8
+"""Made of each size."""
+
+_LIGHT_DN = 1000.0  # of a pixel
+_LEAK = 0.01  # nothing answers to the mirror: without it, noise would add up
+
+
+@dataclass(frozen=True, slots=True)
+class Size:
+    """One point of a curve.
+
+    Attributes:
+        side: pixels across the frame.
+        modes: how many.
+        mirror_side: actuators across the mirror.
+    """
+
+    side: int = 80
+    modes: int = 20
+    mirror_side: int = 34
+
+    @property
+    def pixels(self) -> int:
+        """Of a frame."""
+        return self.side**2
+
+    @property
+    def actuators(self) -> int:
+        """Of the mirror."""
+        return self.mirror_side**2
+
+    @property
+    def bytes(self) -> int:
+        """What a step must touch: the frame; in float32 R, the reference, the dark, the mask and the modes' shapes."""
+        return 4 * self.pixels * (self.modes + 3) + 2 * self.pixels + 4 * self.modes * self.actuators
+
+
+def configuration(size: Size, rate_hz: float) -> Configuration:
+    """Of a loop with a mirror of that size."""
+    overrides = {
+        "camera.rate_hz": rate_hz,
+        "mirror.rows": size.mirror_side,
+        "mirror.columns": size.mirror_side,
+        "mirror.pitches_per_pupil": size.mirror_side - 3,
+        "control.start_mode": "closed",
+        "control.tilt_leak": _LEAK,
+        "control.leak": _LEAK,
+    }
+    return load(None, overrides, spread(os.sched_getaffinity(0)))
+
+
+def made_up(size: Size, config: Configuration) -> tuple[Calibration, Frames]:
+    """A random calibration, and frames (frames, rows, columns) whose noise it takes for 1 nm rms in every mode."""
+    rng = np.random.default_rng(size.bytes)
+    light_dn = _LIGHT_DN * rng.uniform(0.5, 1.5, size.pixels)
+    flux_dn = float(light_dn.sum())
+    dark_dn = config.camera.bias_dn
+    frames = rng.poisson(light_dn, (FRAMES, size.pixels)) + round(dark_dn)
+    calibration = Calibration(
+        noll=tuple(range(2, 2 + size.modes)),
+        reference=(light_dn / flux_dn).astype(np.float32),
+        response=_random(rng, (size.pixels, size.modes), 1 / size.pixels),
+        reconstructor=_random(rng, (size.modes, size.pixels), flux_dn**0.5),
+        good=np.ones(size.pixels, np.float32),
+        dark=np.full(size.pixels, dark_dn, np.float32),
+        modes_to_actuators=_random(rng, (size.actuators, size.modes), 1 / size.modes**0.5),
+        shape=(size.side, size.side),
+        grid=(size.mirror_side, size.mirror_side),
+        flux_dn=flux_dn,
+        saturation_dn=float(saturation_dn(instrument.detector(config))),
+        estimator="weighted",
+        wavelength_nm=config.star.wavelength_nm,
+        operator_hash="",
+        id="",
+    )
+    return identified(calibration), frames.astype(np.uint16).reshape(FRAMES, size.side, size.side)
+
+
+def _random(rng: np.random.Generator, shape: tuple[int, int], scale: float) -> Single:
+    return rng.standard_normal(shape, np.float32) * np.float32(scale)

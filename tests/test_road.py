@@ -1,0 +1,298 @@
+"""The road down: every patch finds what it replaces, turns and ratios are right, the load loads, documents hold."""
+
+import json
+import os
+import platform
+import subprocess
+import sys
+import time
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import pytest
+import zenoh
+
+ROOT = Path(__file__).parents[1]
+sys.path[:0] = [str(ROOT), str(ROOT / "docs")]
+
+import measure_road  # noqa: E402
+
+from benchmarks.road import loaded, measure, patches, table, trip  # noqa: E402
+from benchmarks.road.__main__ import settings  # noqa: E402
+from benchmarks.road.changes import CHANGES, Change  # noqa: E402
+from benchmarks.road.load import background  # noqa: E402
+from lowfc.adapters import realtime, zenoh_bus  # noqa: E402
+from lowfc.adapters.run import open_run  # noqa: E402
+from lowfc.contract.configuration import keys  # noqa: E402
+from lowfc.programs import controller, latency_run  # noqa: E402
+
+BY_NAME = {change.name: change for change in CHANGES}
+
+
+def figures(p50: float, without: int = 0, **stages_us: float) -> dict[str, Any]:
+    high = dict.fromkeys(("p99", "p99_9", "max", "due_p99_9", "mirror_p50"), 2 * p50)
+    counts = {"frames": 1000, "frames_without_command": without, "granted": ["all"], "stages_us": stages_us}
+    return {"p50": p50, **high, **counts}
+
+
+@pytest.mark.parametrize("name", patches.PATCHES)
+def test_every_patch_finds_what_it_replaces_and_belongs_to_a_change(name: str) -> None:
+    assert BY_NAME[name].variables["LOWFC_ROAD"] == name
+    with patches.applied(name) as replaced:
+        changed = [(owner, attribute, vars(owner)[attribute]) for owner, attribute, _ in replaced]
+        assert changed
+        assert all(new is not old for (*_, new), (*_, old) in zip(changed, replaced, strict=True))
+    assert all(vars(owner)[attribute] is not new for owner, attribute, new in changed)
+
+
+def test_every_change_switches_something() -> None:
+    assert len(BY_NAME) == len(CHANGES)
+    for change in CHANGES:
+        assert change.keys or change.variables, change.name
+        assert set(change.keys) <= set(keys()), change.name
+        if change.keys:
+            before = settings().model_dump()["realtime"]
+            words = [
+                f"realtime.{key}" for key, value in before.items() if change.keys.get(f"realtime.{key}", value) != value
+            ]
+            assert words or len(os.sched_getaffinity(0)) == 1, f"{change.name} changes nothing"
+
+
+def test_a_patch_without_a_target_is_an_error(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delattr(realtime, "let_send")
+    with pytest.raises(patches.PatchError, match="has no let_send to replace"), patches.applied("let-send"):
+        pass
+    with pytest.raises(patches.PatchError, match="no patch 'nonsense'"):
+        patches.apply("nonsense")
+
+
+EDITS = ("socket", "low-latency", "qos", "batching", "queues", "shared-memory", "password")
+
+
+@pytest.mark.parametrize("name", EDITS)
+def test_zenoh_takes_the_changed_settings(tmp_path: Path, name: str) -> None:
+    links = open_run("road", base=tmp_path).links
+    before = zenoh_bus.session_config(links, "controller")
+    with patches.applied(name):
+        after = zenoh_bus.session_config(links, "controller")
+    assert after != before
+    zenoh.Config.from_json5(json.dumps(after))
+    if name == "socket":
+        assert all(one.startswith("unixsock-stream/") for one in after["connect"]["endpoints"])
+
+
+def test_the_mirror_is_no_longer_ahead() -> None:
+    assert settings().realtime.lowest_priority < settings().realtime.priority
+    with patches.applied("mirror-ahead"):
+        assert settings().realtime.lowest_priority == settings().realtime.priority
+
+
+def test_telemetry_goes_before_the_command(monkeypatch: pytest.MonkeyPatch) -> None:
+    said: list[str] = []
+    monkeypatch.setattr(controller.Controller, "_send", lambda self, outputs: said.append(f"send {outputs}"))
+    monkeypatch.setattr(controller.Controller, "_tell", lambda self, outputs: said.append(f"tell {outputs}"))
+    with patches.applied("telemetry"):
+        one: Any = object.__new__(controller.Controller)
+        first, second = "first", "second"
+        one._send(first)
+        one._tell(first)
+        one._tell(second)
+    assert said == ["tell first", "send first", "tell second"]
+
+
+SEEN = """
+import gc, sys
+import numpy as np
+from lowfc.adapters import realtime
+granted = realtime._quiet_interpreter()
+print(gc.isenabled(), f"{sys.getswitchinterval():g}", "memory kept" in granted, np.float32(2e-38) / np.float32(4) > 0)
+"""
+
+
+def seen(name: str) -> "subprocess.CompletedProcess[str]":
+    path = os.pathsep.join([str(trip.SITE), str(ROOT)])
+    environment = {**os.environ, "PYTHONPATH": path, "LOWFC_ROAD": name}
+    words = [sys.executable, "-P", "-c", SEEN]
+    return subprocess.run(words, env=environment, capture_output=True, text=True, check=False)
+
+
+@pytest.mark.parametrize(
+    ("name", "found"),
+    [
+        ("", "False 0.005 True True\n"),
+        ("collector", "True 0.005 True True\n"),
+        ("switch-interval", "False 0.0001 True True\n"),
+        ("memory-kept", "False 0.005 False True\n"),
+        pytest.param(
+            "denormals",
+            "False 0.005 True False\n",
+            marks=pytest.mark.skipif(platform.machine() != "x86_64", reason="of x86-64"),
+        ),
+    ],
+)
+def test_a_patch_is_in_force_in_a_process(name: str, found: str) -> None:
+    done = seen(name)
+    assert done.stdout == found, done.stderr
+
+
+def test_a_process_that_cannot_be_changed_does_not_run() -> None:
+    done = seen("nonsense")
+    assert (done.returncode, done.stdout) == (1, "")
+    assert "there is no patch 'nonsense'" in done.stderr
+
+
+KEPT = Change("kept", "a thing kept", kept=True, often=True)
+LEFT = Change("left", "a thing left", kept=False, why="it is odd")
+BROKEN = Change("broken", "a thing refused", kept=False, often=True)
+BESIDE = Change("beside", "a thing beside", kept=True, often=True, record=True)
+
+
+def test_every_change_runs_between_two_of_the_loop_as_it_is() -> None:
+    order: list[str] = []
+
+    def travel(change: Change | None, record: bool) -> Mapping[str, Any]:
+        order.append(("" if change is None else change.name) + "+" * record)
+        return {"refused": "no"} if change is BROKEN else figures(100.0)
+
+    tried = measure.in_turns([KEPT, LEFT, BROKEN, BESIDE], measure.SELDOM + 1, travel)
+    turn = ["", "kept", "", "left", "", "+", "beside+", "+"]
+    assert order == [
+        "",
+        "kept",
+        "",
+        "left",
+        "",
+        "broken",
+        "",
+        "+",
+        "beside+",
+        "+",
+        *turn[:],
+        *turn[:],
+        *turn[:3],
+        *turn[5:],
+    ]
+    assert [len(one.runs) for one in tried] == [4, 3, 0, 4]
+    assert tried[2].refused == "no"
+    with pytest.raises(trip.TripError, match="as it is does not run: dead"):
+        measure.in_turns([KEPT], 1, lambda *_: {"refused": "dead"})
+
+
+def test_before_is_without_a_change_and_after_with_it() -> None:
+    runs = [figures(200.0, 7, wakeup=80.0), figures(300.0, 0, wakeup=90.0)]
+    neighbours = [(figures(90.0, wakeup=20.0), figures(110.0, wakeup=22.0)), (figures(150.0, wakeup=24.0),) * 2]
+    kept = measure.figures(measure.Tried(KEPT, runs, neighbours))
+    left = measure.figures(measure.Tried(LEFT, runs, neighbours))
+    assert kept["ratio"]["p50"] == {"median": 0.5, "lowest": 0.5, "highest": 0.5}
+    assert left["ratio"]["p99"] == {"median": 2.0, "lowest": 2.0, "highest": 2.0}
+    assert kept["before"] == left["after"]
+    assert kept["before"]["p50"] == {"median": 250.0, "lowest": 200.0, "highest": 300.0}
+    assert kept["after"]["p99"] == {"median": 260.0, "lowest": 180.0, "highest": 300.0}
+    assert kept["frames_without_command"] == {"before": 7, "after": 0}
+    assert kept["frames"] == {"before": 2000, "after": 4000}
+    assert kept["stages_us"] == {"before": {"wakeup": 85.0}, "after": {"wakeup": 23.0}}
+    refused = measure.figures(measure.Tried(BROKEN, refused="zenoh says no"))
+    lines = table.road({"changes": [kept, left, refused]})
+    assert lines[0][1:3] == ("250 (200 to 300)", "130 (90 to 150)")
+    assert lines[0][5:] == ("0.50 (0.50 to 0.50)",) * 3 + ("7 of 2000 / 0 of 4000", "wakeup -62 us", "yes", "")
+    assert lines[1][-1] == "it is odd; worse p50, worse p99, worse p50 to the mirror"
+    assert lines[2][-2:] == ("no", "it does not run: zenoh says no")
+    assert {len(line) for line in lines} == {len(table.HEADINGS)}
+    assert table.markdown(table.HEADINGS, lines).count("\n") == 4
+    assert "zenoh says no" in table.text(table.HEADINGS, lines)
+
+
+def test_how_many_times_the_set_up_lowers_what() -> None:
+    runs: dict[tuple[bool, bool], list[dict[str, Any]]] = {
+        (load, plain): [
+            figures(p50 * (1 + 3 * plain)) | ({"load_share": 0.5} if load else {}) for p50 in (100.0, 200.0)
+        ]
+        for load, plain in loaded.KINDS
+    }
+    found = loaded.figures(runs)
+    assert found["lowered"]["loaded"]["p99_9"] == {"median": 4.0, "lowest": 4.0, "highest": 4.0}
+    lines = table.loaded(found)
+    assert [line[:3] for line in lines[:2]] == [
+        ("yes", "with", "150 (100 to 200)"),
+        ("yes", "without", "600 (400 to 800)"),
+    ]
+    assert {len(line) for line in lines} == {len(table.LOADED_HEADINGS)}
+    assert "loaded: p50 4.00 (4.00 to 4.00)" in table.ratios(found)
+    about = {"settings": {"seconds": 1, "repeats": 2, "rate_hz": 1000.0}, "date": "2026-01-01", "command": "it"}
+    host = {
+        "host": dict.fromkeys(("processor", "processors", "kernel", "clock_source", "python", "load_before"), "this")
+    }
+    assert "it took 50 % of the processors" in measure_road.loaded(found | about | host)
+    assert "Granted by the host: all." in measure_road.road({"changes": [], "granted": ["all"]} | about | host)
+
+
+def test_the_load_loads() -> None:
+    with background(1) as load:
+        folder = load._children[0].said.parent
+        written, begun_s, deadline_s = folder / "written-0", load.used_s(), time.monotonic() + 20
+        missing = {"processor time", "file"}
+        while missing and time.monotonic() < deadline_s:
+            time.sleep(0.01)
+            if load.used_s() - begun_s > 0.2:
+                missing.discard("processor time")
+            if written.exists() and written.stat().st_size == 4 << 20:
+                missing.discard("file")
+        assert not missing
+        processes = [child.process for child in load._children]
+    assert all(process is not None and process.poll() is not None for process in processes)
+    assert not folder.exists()
+
+
+def test_a_load_that_ends_is_noticed() -> None:
+    with background(1) as load:
+        process = load._children[0].process
+        assert process is not None
+        process.kill()
+        process.wait()
+        with pytest.raises(RuntimeError, match="memory 0 was killed by SIGKILL"):
+            load.used_s()
+
+
+def test_the_document_is_that_of_its_file() -> None:
+    document = measure_road.DOCUMENT.read_text()
+    measured = json.loads(measure_road.MEASURED.read_text()) if measure_road.MEASURED.exists() else None
+    rendered = dict.fromkeys(measure_road.MODULES, "") if measured is None else measure_road.render(measured)
+    for name, wanted in rendered.items():
+        begin, end = measure_road.marks(name)
+        assert document.count(begin) == document.count(end) == 1
+        assert document.partition(begin)[2].partition(end)[0] == wanted
+    if measured is not None:
+        assert [one["name"] for one in measured["road"]["changes"]] == list(BY_NAME)
+        assert {name: measured[name]["command"] for name in rendered} == {
+            name: f"python -m {module} --json" for name, module in measure_road.MODULES.items()
+        }
+
+
+def test_without_the_set_up_nothing_of_it_is_left() -> None:
+    assert callable(latency_run._loop)
+    plain = settings(plain=True).realtime
+    left = [plain.priority, plain.lock_memory, plain.stay_awake, plain.controller_cpus, plain.mirror_cpus]
+    assert not any(left)
+
+
+@pytest.mark.slow
+def test_the_road_for_real() -> None:
+    words = [
+        sys.executable,
+        "-m",
+        "benchmarks.road",
+        "--seconds",
+        "0.5",
+        "--repeats",
+        "1",
+        "--only",
+        "fifo",
+        "memoryview",
+    ]
+    done = subprocess.run([*words, "--json"], cwd=ROOT, capture_output=True, text=True, timeout=120, check=False)
+    assert done.returncode == 0, done.stderr
+    fifo, view = json.loads(done.stdout)["changes"]
+    assert fifo["frames"]["before"] >= 400
+    assert fifo["before"]["p50"]["median"] > 0
+    assert "memoryview" in view["refused"]
