@@ -64,7 +64,7 @@ def configuration(size: Size, rate_hz: float) -> Configuration:
         "control.tilt_leak": _LEAK,
         "control.leak": _LEAK,
     }
-    return load(None, overrides, spread(os.sched_getaffinity(0)))
+    return load(None, overrides, spread(os.sched_getaffinity(0), simulated=False))
 
 
 def made_up(size: Size, config: Configuration) -> tuple[Calibration, Frames]:

@@ -125,7 +125,6 @@ class CameraProcess:
             truth = self._expose(index, end_ns)
             self._figures.add(truth)
             self._service.work += 1
-            self._bench.prepare()
             if clock.lockstep:
                 self._wait_for_mirror()
             self._service.beat()
@@ -156,9 +155,9 @@ class CameraProcess:
         clock = self._service.clock
         self._drain()
         self._shapes.appendleft(self._latched)
-        seen = self._weights[0] * self._shapes[0]
-        for weight, shape in zip(list(self._weights)[1:], list(self._shapes)[1:], strict=True):
-            seen = seen + weight * shape
+        seen = self._latched
+        if len(self._weights) > 1:
+            seen = np.tensordot(self._weights, np.array(self._shapes), 1)
         frame, truth = self._bench.expose(index, seen)
         payload = image(frame, end_ns, "lowfc_camera").SerializeToString()
         clock.sleep_until_ns(end_ns)

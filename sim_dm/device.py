@@ -6,6 +6,7 @@ It trusts nobody: its own limits, its own dead-man, its own check of what it is 
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
+from math import expm1
 from types import MappingProxyType
 from typing import NamedTuple
 
@@ -47,6 +48,12 @@ class Device:
         """Limits before the driver rounds, one step tighter, so that rounding cannot cross those that count."""
         limits, step = self.limits, self.step_nm
         return Limits(limits.stroke_nm - step, limits.slew_nm - step, limits.neighbour_nm - step)
+
+    @cached_property
+    def fixed(self) -> npt.NDArray[np.intp] | None:
+        """Which of the flattened actuators are dead or stuck; None where all move."""
+        found = np.flatnonzero(np.isfinite(self.fixed_nm))
+        return found if found.size else None
 
 
 @dataclass(frozen=True, slots=True)
@@ -108,19 +115,22 @@ def obey(device: Device, status: Status, told: Told, now_ns: int) -> tuple[Statu
         with np.errstate(over="ignore", invalid="ignore"):  # a sum that is not finite is refused by `limit`
             wanted = sum(channels.values(), np.zeros(device.grid, np.float32))
     limited = limit(device.tighter, status.driven_nm, wanted)
-    status = status._replace(
+    # From frame to frame, not from the last tick: ticks go by the mirror's own clock, which is ahead of a frame's time.
+    elapsed_ns = told.time_ns - status.commanded_ns if status.commanded_ns else np.inf
+    followed = Status(
         driven_nm=limited.actuators_nm,
+        surface_nm=_settled(device, limited.actuators_nm, status.surface_nm, elapsed_ns),
         channels=channels,
         command_nm=told.command_nm if not limited.reasons else _NONE,
         limits_hit=limited.reasons,
         frame_sequence=told.frame_sequence,
+        time_ns=told.time_ns,
+        commanded_ns=told.time_ns,
         received_ns=now_ns,
         valid_for_ns=min(told.valid_for_ns, LONGEST_VALID_NS),
         following=True,
     )
-    # From frame to frame, not from the last tick: ticks go by the mirror's own clock, which is ahead of a frame's time.
-    elapsed_ns = told.time_ns - status.commanded_ns if status.commanded_ns else np.inf
-    return _settle(device, status._replace(commanded_ns=told.time_ns), elapsed_ns, told.time_ns), None
+    return followed, None
 
 
 def tick(device: Device, status: Status, now_ns: int) -> Status:
@@ -131,7 +141,9 @@ def tick(device: Device, status: Status, now_ns: int) -> Status:
         flat = limit(device.tighter, status.driven_nm, np.zeros(device.grid, np.float32)).actuators_nm
         status = status._replace(driven_nm=flat, limits_hit=(), command_nm=_NONE, channels={})
     time_ns = max(now_ns, status.time_ns)
-    return _settle(device, status, time_ns - status.time_ns if status.time_ns else np.inf, time_ns)
+    elapsed_ns = time_ns - status.time_ns if status.time_ns else np.inf
+    surface_nm = _settled(device, status.driven_nm, status.surface_nm, elapsed_ns)
+    return status._replace(surface_nm=surface_nm, time_ns=time_ns)
 
 
 def _refusal(device: Device, status: Status, told: Told) -> Reason | None:
@@ -144,18 +156,23 @@ def _refusal(device: Device, status: Status, told: Told) -> Reason | None:
     return None
 
 
-def _settle(device: Device, status: Status, elapsed_ns: float, time_ns: int) -> Status:
-    """Round to the driver's steps; first-order response of the actuators after `elapsed_ns`, at `time_ns`."""
+def _settled(device: Device, driven_nm: Single, surface_nm: Single, elapsed_ns: float) -> Single:
+    """Round to the driver's steps; first-order response of the actuators from a surface of `elapsed_ns` ago."""
     step = np.float32(device.step_nm)
-    driver_nm = np.round(status.driven_nm / step) * step
-    if device.settling_ns <= 0 or elapsed_ns > 20 * device.settling_ns:
-        surface = driver_nm
-    else:
-        fraction = np.float32(-np.expm1(-max(elapsed_ns, 0) / device.settling_ns))
-        surface = status.surface_nm + fraction * (driver_nm - status.surface_nm)
-    return status._replace(surface_nm=_at_rest(device, surface), time_ns=time_ns)
+    settled = driven_nm / step
+    np.rint(settled, out=settled)
+    settled *= step
+    if device.settling_ns > 0 and elapsed_ns <= 20 * device.settling_ns:
+        settled -= surface_nm
+        settled *= np.float32(-expm1(-max(elapsed_ns, 0) / device.settling_ns))
+        settled += surface_nm
+    return _at_rest(device, settled)
 
 
 def _at_rest(device: Device, surface_nm: Single) -> Single:
     """Dead and stuck actuators stay where they are."""
-    return np.where(np.isnan(device.fixed_nm), surface_nm, device.fixed_nm)
+    if device.fixed is None:
+        return surface_nm
+    kept = surface_nm.copy()
+    kept.flat[device.fixed] = device.fixed_nm.flat[device.fixed]
+    return kept

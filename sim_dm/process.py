@@ -138,5 +138,5 @@ def _told(payload: bytes) -> Told:
         from_timestamp(message.timestamp),
         message.valid_for_ns,
         actuators(message),
-        np.array(message.command_nm, dtype=np.float32),
+        np.fromiter(message.command_nm, np.float32, len(message.command_nm)),
     )

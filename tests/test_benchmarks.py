@@ -9,18 +9,17 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-ROOT = Path(__file__).parents[1]
-sys.path.insert(0, str(ROOT))
+from benchmarks import releases
+from benchmarks.host import host
+from benchmarks.peers import contest, table
+from benchmarks.peers.contestants import BARE, CONTESTANTS, TIMER
+from benchmarks.peers.lowfc_step import LowfcStep
+from benchmarks.peers.problem import ACTUATORS, NumpyStep, Problem
+from benchmarks.peers.process import MARKS, Plan
+from benchmarks.peers.ring import WAKES, Ring
+from lowfc.contract.messages import wire
 
-from benchmarks import releases  # noqa: E402
-from benchmarks.host import host  # noqa: E402
-from benchmarks.peers import contest, table  # noqa: E402
-from benchmarks.peers.contestants import BARE, CONTESTANTS, TIMER  # noqa: E402
-from benchmarks.peers.lowfc_step import LowfcStep  # noqa: E402
-from benchmarks.peers.problem import ACTUATORS, NumpyStep, Problem  # noqa: E402
-from benchmarks.peers.process import MARKS, Plan  # noqa: E402
-from benchmarks.peers.ring import WAKES, Ring  # noqa: E402
-from lowfc.contract.messages import wire  # noqa: E402
+ROOT = Path(__file__).parents[1]
 
 SECONDS = 0.3
 RATE_HZ = 500.0

@@ -114,7 +114,6 @@ class Rig:
             states = self.said.get(MIRROR_STATE.key)
             shape = actuators(states[-1]) if states else None
             seen = self.offset_nm if shape is None else shape + self.offset_nm
-            self.scene.prepare()
             pixels, truth = self.scene.expose(self._index, seen)
             self.put(pixels)
             truths.append(truth)

@@ -14,8 +14,6 @@ from viewers import needs_vulkan
 
 ROOT = Path(__file__).parents[1]
 README = ROOT / "README.md"
-sys.path.insert(0, str(ROOT / "docs"))
-
 # Run by CI itself, which runs this test; and by the test of the viewer.
 ROUTE = "rerun rrd route --application-id $(basename $log .mcap) deploy/layouts/log.rbl | rerun $log -"
 ELSEWHERE = {

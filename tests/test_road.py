@@ -10,23 +10,20 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+import measure_road
 import pytest
 import zenoh
 
+from benchmarks.road import loaded, measure, patches, table, trip
+from benchmarks.road.__main__ import settings
+from benchmarks.road.changes import CHANGES, Change
+from benchmarks.road.load import background
+from lowfc.adapters import realtime, zenoh_bus
+from lowfc.adapters.run import open_run
+from lowfc.contract.configuration import keys
+from lowfc.programs import controller, latency_run
+
 ROOT = Path(__file__).parents[1]
-sys.path[:0] = [str(ROOT), str(ROOT / "docs")]
-
-import measure_road  # noqa: E402
-
-from benchmarks.road import loaded, measure, patches, table, trip  # noqa: E402
-from benchmarks.road.__main__ import settings  # noqa: E402
-from benchmarks.road.changes import CHANGES, Change  # noqa: E402
-from benchmarks.road.load import background  # noqa: E402
-from lowfc.adapters import realtime, zenoh_bus  # noqa: E402
-from lowfc.adapters.run import open_run  # noqa: E402
-from lowfc.contract.configuration import keys  # noqa: E402
-from lowfc.programs import controller, latency_run  # noqa: E402
-
 BY_NAME = {change.name: change for change in CHANGES}
 
 

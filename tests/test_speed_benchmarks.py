@@ -8,18 +8,16 @@ import time
 from pathlib import Path
 from typing import Any
 
+import measure_speed
 import numpy as np
 import pytest
 
+from benchmarks import cells, curves, load, throughput
+from benchmarks.sizes import Size
+from lowfc.contract.configuration import Camera
+from lowfc.contract.messages import FRAME, wire
+
 ROOT = Path(__file__).parents[1]
-sys.path[:0] = [str(ROOT), str(ROOT / "docs")]
-
-import measure_speed  # noqa: E402
-
-from benchmarks import cells, curves, load, throughput  # noqa: E402
-from benchmarks.sizes import Size  # noqa: E402
-from lowfc.contract.configuration import Camera  # noqa: E402
-from lowfc.contract.messages import FRAME, wire  # noqa: E402
 
 SMALL = Size(side=32, modes=5, mirror_side=10)
 HOST = {"processors": 2, "processor": "P", "kernel": "6.1", "clock_source": "tsc", "python": "3.11"}

@@ -85,6 +85,7 @@ def detector(config: Configuration) -> Detector:
             camera.bit_depth,
             camera.em_gain,
             camera.clock_induced_charge_e,
+            camera.photon_noise == "exact",
         )
     except ValueError as error:
         raise ConfigurationError(f"camera: {error}") from None

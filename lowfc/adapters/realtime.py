@@ -70,21 +70,28 @@ def set_up(priority: int | None, cpus: set[int] | None, *, lock_memory: bool, st
     return Granted(tuple(granted), tuple(refused))
 
 
-def spread(cpus: Iterable[int]) -> dict[str, list[int]]:
+def spread(cpus: Iterable[int], *, simulated: bool = True) -> dict[str, list[int]]:
     """Configuration keys that keep the loop's processes apart on these processors; none where there is only one.
 
-    The controller has one to itself: whatever else runs there pushes its code and data out of the caches. The recorder,
-    which is sent each frame together with it, would run first there.
+    The controller has one to itself where it can: whatever else runs there pushes its code and data out of the caches,
+    and the recorder, which is sent each frame together with it, would run first. Of two processors, though, a simulated
+    camera needs one, and the recorder whatever is left of either: a processor whose real-time share is used up stands
+    still for 50 ms.
+
+    Args:
+        cpus: to spread them on.
+        simulated: the camera computes its frames.
     """
     camera, *others = cpus = sorted(cpus)
     if not others:
         return {}
-    controller, mirror, *_ = *others, camera
+    controller, *others = others
+    few = simulated and not others
     return {
         "realtime.camera_cpus": [camera],
         "realtime.controller_cpus": [controller],
-        "realtime.mirror_cpus": [mirror],
-        "realtime.recorder_cpus": [cpu for cpu in cpus if cpu != controller],
+        "realtime.mirror_cpus": [controller if few else (others or cpus)[0]],
+        "realtime.recorder_cpus": [] if few else [cpu for cpu in cpus if cpu != controller],
     }
 
 

@@ -125,6 +125,8 @@ class Camera(Section):
     """Frames from the one a command is made from to the first exposed wholly under it; 1 is the least."""
     noise: bool = True
     """Photon and read noise; off only for tests of the control law."""
+    photon_noise: Literal["fast", "exact"] = "fast"
+    """Faint pixels from a table of their law (its variance is 6e-5 e-^2 too large at most), or every electron drawn."""
 
 
 class Disturbance(Section):

@@ -73,6 +73,6 @@ def difference(
 
 def saturated_pixels(calibration: Calibration, pixels: npt.NDArray[np.uint16]) -> int:
     """How many good pixels of a frame (pixels,) are at full well."""
-    if np.maximum.reduce(pixels) < calibration.saturation_dn:
+    if pixels.item(pixels.argmax()) < calibration.saturation_dn:
         return 0
     return int(np.count_nonzero((pixels >= calibration.saturation_dn) & (calibration.good > 0)))

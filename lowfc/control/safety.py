@@ -114,7 +114,7 @@ def limit(limits: Limits, previous_nm: Actuators, wanted_nm: Actuators) -> Limit
     if highest_nm - lowest_nm > apart_nm and neighbour_difference_nm(kept) > apart_nm:
         reasons.append(Reason.NEIGHBOUR)
         kept = _shorten(limits, previous_nm, kept)
-    return Limited(kept.astype(np.float32, copy=False), tuple(reasons))
+    return Limited(kept if kept.dtype == np.float32 else kept.astype(np.float32), tuple(reasons))
 
 
 def _shorten(limits: Limits, previous_nm: Actuators, kept_nm: Actuators) -> Actuators:
@@ -143,8 +143,8 @@ def _shorten(limits: Limits, previous_nm: Actuators, kept_nm: Actuators) -> Actu
 
 def _range_nm(actuators_nm: Actuators) -> tuple[float, float]:
     """Lowest and highest; not finite where any is not."""
-    flat = actuators_nm.ravel()
-    return float(np.minimum.reduce(flat, initial=0)), float(np.maximum.reduce(flat, initial=0))
+    flat = actuators_nm.ravel()  # where there is a NaN, both functions find it
+    return flat.item(flat.argmin()), flat.item(flat.argmax())
 
 
 def neighbour_difference_nm(actuators_nm: npt.NDArray[np.floating]) -> float:

@@ -52,7 +52,7 @@ class Operator:
         to_modes: (rank, used) real; amplitudes of the modes from exp(i phi) at the used nodes. The units of the image
             are in it.
         to_coefficients: (functions squared, rank) real with an aperture mask, else complex.
-        basis: (points, functions) complex: prolate functions at the points, with their phases.
+        basis: (points, functions) complex: prolate functions at the points, each with its phase, a power of i.
     """
 
     wavelength_nm: float
@@ -190,22 +190,39 @@ class _Stage:
         # A real matrix takes the two columns of real and imaginary parts, a complex one the numbers that they make.
         self._unit = np.dtype(np.complex64 if np.iscomplexobj(operator.to_coefficients) else np.float32)
         self._to_coefficients = np.ascontiguousarray(operator.to_coefficients, self._unit)
-        self._basis = operator.basis.astype(np.complex64)
-        self._basis_transposed = np.ascontiguousarray(self._basis.T)
         self._modes = np.empty((len(self._to_modes), 2), np.float32)
         self._pairs = np.empty((functions**2, 2), np.float32)
-        self._coefficients = self._pairs.view(np.complex64).reshape(functions, functions)
-        self._half = np.empty((points, functions), np.complex64)
-        self._field = np.empty((points, points), np.complex64)
-        self._squares = np.empty((points, points), np.float32)
+        basis, phases = _real_basis(operator.basis)
+        turned = np.outer(phases, phases).ravel()
+        # Times a power of i, the parts of a coefficient change places, signs or both.
+        places = np.arange(2 * functions**2).reshape(-1, 2)
+        self._places = np.where(np.abs(turned.imag) > 0.5, places.T[::-1], places.T)
+        signs = np.where(np.abs(turned.imag) > 0.5, (-turned.imag, turned.imag), turned.real)
+        self._signs = signs.astype(np.float32)
+        self._coefficients = np.empty(self._signs.shape, np.float32)
+        self._basis = basis.astype(np.float32)
+        self._basis_transposed = np.ascontiguousarray(self._basis.T)
+        self._half = np.empty((2 * functions, points), np.float32)
+        self._field = np.empty((2, points, points), np.float32)
 
     def add_intensity(self, phasor: NDArray[np.float32], intensity: NDArray[np.float32]) -> None:
         """Add |E|^2 at the points, for real and imaginary parts (used, 2) of exp(i phi) - 1."""
         np.matmul(self._to_modes, phasor, out=self._modes)
         self._modes[:, 0] += self._flat_modes
         np.matmul(self._to_coefficients, self._modes.view(self._unit), out=self._pairs.view(self._unit))
-        np.matmul(self._basis, self._coefficients, out=self._half)
-        np.matmul(self._half, self._basis_transposed, out=self._field)
-        for part in (self._field.real, self._field.imag):
-            np.multiply(part, part, out=self._squares)
-            np.add(intensity, self._squares, out=intensity)
+        np.take(self._pairs, self._places, out=self._coefficients, mode="clip")
+        self._coefficients *= self._signs
+        # Real and imaginary parts side by side: the functions are real.
+        functions, points = self._basis_transposed.shape
+        np.matmul(self._coefficients.reshape(-1, functions), self._basis_transposed, out=self._half)
+        np.matmul(self._basis, self._half.reshape(2, functions, points), out=self._field)
+        np.multiply(self._field, self._field, out=self._field)
+        for part in self._field:
+            np.add(intensity, part, out=intensity)
+
+
+def _real_basis(basis: NDArray[np.complex128]) -> tuple[Float, NDArray[np.complex128]]:
+    """A basis (points, functions) without its phases, and these (functions,): powers of i."""
+    largest = basis[np.abs(basis).argmax(axis=0), np.arange(basis.shape[1])]
+    phases = np.where(np.abs(largest.imag) > np.abs(largest.real), 1j, 1.0 + 0j)
+    return np.asarray((basis / phases).real), phases

@@ -70,7 +70,7 @@ def twin_mirror(sensor: Sensor, twin: Twin, mirror: Mirror) -> TwinMirror:
         y_factors=y_factors.astype(np.float32),
         x_factors=x_factors.astype(np.float32),
         reduce=missing.astype(np.float32),
-        expand=np.ascontiguousarray(right[kept].T, np.float32),
+        expand=right[kept].astype(np.float32).T,  # so ordered, its product takes half the time
     )
 
 
@@ -81,7 +81,7 @@ def wavefront_nm(mirror: TwinMirror, actuators_nm: NDArray[np.floating]) -> Sing
         mirror: From `twin_mirror`.
         actuators_nm: (rows, columns) nm of surface.
     """
-    twice = 2.0 * np.asarray(actuators_nm, np.float32)
-    wavefront = (mirror.y_factors @ twice @ mirror.x_factors.T).ravel()[mirror.used]
+    twice = np.multiply(actuators_nm, np.float32(2.0), dtype=np.float32)
+    wavefront = (mirror.y_factors @ twice @ mirror.x_factors.T).take(mirror.used)
     wavefront += mirror.expand @ (mirror.reduce @ twice.ravel())
     return np.asarray(wavefront)

@@ -97,8 +97,9 @@ def _configuration(file: Path | None, rate: float | None, camera: Camera, *, pla
         overrides |= {"control.tilt_leak": _LEAK, "control.leak": _LEAK}
     if plain:
         overrides |= {"realtime.priority": 0, "realtime.lock_memory": False, "realtime.stay_awake": False}
-        overrides |= {f"realtime.{role}_cpus": [] for role in ("camera", "controller", "mirror")}
-    defaults = {"control.start_mode": "closed", "camera.rate_hz": _RATE_HZ, **spread(os.sched_getaffinity(0))}
+        overrides |= {f"realtime.{role}_cpus": [] for role in ("camera", "controller", "mirror", "recorder")}
+    apart = spread(os.sched_getaffinity(0), simulated=camera is Camera.SIMULATED)
+    defaults = {"control.start_mode": "closed", "camera.rate_hz": _RATE_HZ, **apart}
     return configuration(file, overrides, defaults)
 
 

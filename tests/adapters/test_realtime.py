@@ -110,10 +110,11 @@ def test_the_recorder_steps_back_out_of_its_parents_class() -> None:
 
 
 def test_processes_are_kept_apart_as_far_as_there_are_processors() -> None:
-    def of(*cpus: int) -> list[list[int]]:
-        return list(spread(cpus).values())
+    def of(*cpus: int, simulated: bool = True) -> list[list[int]]:
+        return list(spread(cpus, simulated=simulated).values())
 
     assert of(3) == []
-    assert of(5, 1) == [[1], [5], [1], [1]]
+    assert of(5, 1) == [[1], [5], [5], []]
+    assert of(5, 1, simulated=False) == [[1], [5], [1], [1]]
     assert of(0, 1, 2) == [[0], [1], [2], [0, 2]]
     assert of(0, 1, 2, 3) == [[0], [1], [2], [0, 2, 3]]

@@ -1,7 +1,6 @@
 """The sensors in the live loop: each closes it, with every mode's sign right; the table in docs/sensors.md."""
 
 import json
-import sys
 from pathlib import Path
 
 import numpy as np
@@ -15,7 +14,6 @@ from lowfc.contract.messages import wire
 from lowfc.optics.sensor import light_budget
 
 DOCS = Path(__file__).parents[2] / "docs"
-sys.path.insert(0, str(DOCS))
 
 STATIC_NM = dict(zip(range(2, 16), (12, -9, 8, -7, 6, 5, -5, 4, -4, 3, -3, 3, -3, 3), strict=True))
 STILL = f"""

@@ -1,8 +1,10 @@
 import numpy as np
 import pytest
+from scipy import stats
 
-from lowfc.optics.detector import Detector, expose, saturation_dn
+from lowfc.optics.detector import Detector, expose, laws_of, saturation_dn
 from lowfc.optics.photometry import Photometry, electrons, tilt_nm_per_mas
+from lowfc.optics.pixel_laws import FAINT_E, STEP_E
 
 QUIET = Detector(read_noise_e=0.0, bias_dn=0.0)
 
@@ -22,6 +24,61 @@ def test_electrons_follow_the_poisson_law(mean_e):
     assert frame.mean() == pytest.approx(mean_e, abs=5 * spread)
     assert frame.var() == pytest.approx(mean_e, rel=0.03)
     assert np.mean(frame == 0) == pytest.approx(np.exp(-mean_e), abs=5e-3)
+
+
+def law_of(camera, mean_e, numbers):
+    """Probability of each digital number, from the laws' definitions."""
+    electrons_e = np.arange(400)
+    edges = (np.append(numbers, numbers[-1] + 1) - 0.5 - camera.bias_dn) * camera.gain_e_per_dn
+    read = np.diff(stats.norm.cdf((edges - electrons_e[:, None]) / camera.read_noise_e), axis=1)
+    return stats.poisson.pmf(electrons_e, mean_e) @ read
+
+
+CAMERAS = [Detector(), Detector(gain_e_per_dn=0.7, read_noise_e=0.4, bias_dn=90.3)]
+
+
+@pytest.mark.parametrize("camera", CAMERAS)
+def test_the_table_has_the_law_of_every_level(camera):
+    """Places and what is left over of them add up to Poisson, read noise and rounding."""
+    laws = laws_of(camera)
+    numbers = np.arange(laws.first_dn, laws.first_dn + laws.rest.shape[1])
+    for level in (0, 1, 2, 17, 64, 500, len(laws.places) - 1):
+        places = laws.places[level].astype(int)
+        apart = (places > numbers[-1]).sum()
+        found = np.bincount(places[places <= numbers[-1]] - numbers[0], minlength=len(numbers)).astype(float)
+        found += apart * np.diff(laws.rest[level].astype(float), prepend=0.0)
+        assert 0.5 * np.abs(found / len(places) - law_of(camera, level * STEP_E, numbers)).sum() < 1e-7
+
+
+@pytest.mark.parametrize("camera", CAMERAS)
+@pytest.mark.parametrize("mean_e", [0.0, 0.5 * STEP_E, 0.05, 1.3, 5.03, 13.0, FAINT_E - 0.01, FAINT_E, 60.0])
+def test_a_million_pixels_pass_the_chi_square_test(camera, mean_e):
+    """Between two levels, on them, and above, where every electron is drawn."""
+    count, least = 1_000_000, 10
+    frame = expose(camera, flat(mean_e, 1000), rng())
+    numbers = np.arange(400)
+    expected = count * law_of(camera, float(np.float32(mean_e)), numbers)
+    found = np.bincount(frame.ravel(), minlength=400)
+    often = expected > least
+    expected = np.append(expected[often], max(count - expected[often].sum(), least))
+    found = np.append(found[often], found[~often].sum())
+    assert stats.chi2.sf(np.sum((found - expected)[:-1] ** 2 / expected[:-1]), often.sum() - 1) > 1e-3
+    assert found[-1] < 10 * least
+
+
+def test_an_exact_camera_has_no_table_and_the_same_mean_and_variance():
+    camera = Detector(exact=True)
+    assert laws_of(camera) is None
+    exact, drawn = (expose(one, flat(2.3), rng()).astype(float) for one in (camera, Detector()))
+    assert exact.mean() == pytest.approx(drawn.mean(), abs=0.03)
+    assert exact.var() == pytest.approx(drawn.var(), rel=0.03)
+
+
+def test_faint_and_bright_pixels_of_one_frame_keep_their_places():
+    mean_e = np.tile(np.array([0.0, 5.0, 23.0, 25.0, 900.0], np.float32), (10_000, 1))
+    frame = expose(Detector(), mean_e, rng()).astype(float)
+    assert frame.mean(axis=0) - 100 == pytest.approx(mean_e[0], abs=1.5)
+    assert np.abs(np.corrcoef(frame.T) - np.eye(5)).max() < 0.05
 
 
 def test_gain_bias_and_read_noise():
@@ -75,7 +132,7 @@ def test_the_same_seed_gives_the_same_frame_and_the_input_is_kept():
 
 def test_rounding_below_zero_is_no_light_but_nan_is_an_error():
     assert expose(QUIET, flat(-1e-9, 4), rng()).max() == 0
-    with pytest.raises(ValueError, match="lam"):
+    with pytest.raises(ValueError, match="finite number, got nan"):
         expose(QUIET, flat(np.nan, 4), rng())
 
 

@@ -6,7 +6,7 @@ import pytest
 from lowfc.adapters.instrument import analytic_calibration, mirror_on_twin, twin
 from lowfc.contract.configuration import Configuration, load
 from lowfc.control.calibration import Calibration
-from lowfc.control.estimator import estimate
+from lowfc.control.estimator import Estimator
 from sim_camera.bench import Bench, Truth
 from sim_camera.disturbance import BLOCK
 from sim_camera.figures import BLOCK as FIGURES_BLOCK
@@ -80,10 +80,10 @@ def test_a_small_mode_is_measured_with_the_right_size_and_sign(
     still: Bench, calibration: Calibration, mode: int
 ) -> None:
     """Push and pull by the mirror, without noise: R of the frames is the mode, within 2 %."""
-    scratch, measured = np.empty(calibration.reference.size, np.float32), []
+    estimator, measured = Estimator.of(calibration), []
     for sign in (1, -1):
         frame, _ = still.expose(0, shape_of(calibration, sign * 5.0 * np.eye(14)[mode]))
-        found = estimate(calibration, frame.reshape(-1), 0.0, scratch)
+        found = estimator.estimate(frame.reshape(-1), 0.0)
         assert found is not None
         measured.append(found.error_nm)
     half = (measured[0] - measured[1]) / 2
@@ -91,11 +91,7 @@ def test_a_small_mode_is_measured_with_the_right_size_and_sign(
 
 
 def noisy_frames(scene: Bench, count: int) -> list[np.ndarray]:
-    frames = []
-    for index in range(count):
-        frames.append(scene.expose(index, FLAT)[0])
-        scene.prepare()
-    return frames
+    return [scene.expose(index, FLAT)[0] for index in range(count)]
 
 
 def test_noise_comes_from_the_seed_and_the_light_is_what_the_calibration_expects(

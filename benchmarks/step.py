@@ -1,0 +1,204 @@
+"""Where the control step's time goes: each stage, beside one matrix-vector product of the same size in the same run.
+
+The step is the loop's own, from a frame's bytes to a command's, of a made-up calibration of the usual size. It is timed
+back to back and as in the loop, after a rest as long as a frame's period; it takes turns with the product R x alone.
+After that it is timed stage by stage, which takes a little longer.
+
+Example:
+    python -m benchmarks.step --seconds 5 --markdown
+"""
+
+import argparse
+import json
+import sys
+import time
+import tracemalloc
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from functools import partial
+from itertools import count
+from typing import Any
+
+import numpy as np
+
+from benchmarks import cells
+from benchmarks.host import host
+from benchmarks.sizes import Size, configuration, made_up
+from lowfc.adapters.realtime import set_up
+from lowfc.contract import codec
+from lowfc.control import loop
+from lowfc.control.estimator import Estimator
+from lowfc.control.safety import LoopMode
+from lowfc.control.state import Drive
+from lowfc.programs.control_step import ControlStep
+from lowfc.programs.frame_source import Payloads
+from lowfc.programs.latency_figures import percentiles
+
+RATE_HZ = 1000.0
+STAGES: dict[str, tuple[Any, str]] = {
+    "decode": (codec, "decode_frame"),
+    "full well": (loop, "saturated_pixels"),
+    "estimate": (Estimator, "estimate"),
+    "seen": (Drive, "seen_nm"),
+    "law": (loop, "integrate"),
+    "limits": (loop, "limit"),
+    "encode": (codec, "encode_command"),
+}
+REST, STEP, PRODUCT = "modes to actuators, state, step", "the whole step", "one product R x"
+_WARM_UP = 200
+_TRACED = 1000
+
+Durations = dict[str, list[int]]
+
+
+def main() -> int:
+    """The command line; returns its exit status."""
+    parser = argparse.ArgumentParser("python -m benchmarks.step", description=__doc__.splitlines()[0])
+    parser.add_argument("--seconds", type=float, default=5.0, help="of each of both (%(default)s)")
+    shown = parser.add_mutually_exclusive_group()
+    shown.add_argument("--json", action="store_true", help="print one JSON object")
+    shown.add_argument("--markdown", action="store_true", help="print a table for a document")
+    asked = parser.parse_args()
+    found = measure(asked.seconds)
+    if asked.json:
+        sys.stdout.write(json.dumps(found) + "\n")
+    else:
+        lines = table(found)
+        sys.stdout.write(f"{cells.markdown(lines) if asked.markdown else cells.text(lines)}\n\n{remarks(found)}\n")
+    return 0
+
+
+def measure(seconds: float) -> dict[str, Any]:
+    """Time the stages.
+
+    Returns:
+        hot_us and paced_us (percentiles by stage), over_product (the whole step over the product, p50, of both), memory
+        (see `allocated`), rate_hz, granted and host.
+    """
+    size = Size()
+    config = configuration(size, RATE_HZ)
+    calibration, frames = made_up(size, config)
+    payloads = Payloads(frames)
+    granted = set_up(config.realtime.lowest_priority or None, None, lock_memory=True, stay_awake=True)
+    step = ControlStep(config, calibration, 0)
+    memory = allocated(step, payloads)
+    x = np.random.default_rng(1).standard_normal(size.pixels, np.float32)
+    found: dict[str, Any] = {}
+    for name, period_s in (("hot_us", None), ("paced_us", 1 / RATE_HZ)):
+        durations = _timed(step, payloads, lambda: calibration.reconstructor @ x, seconds, period_s)
+        found[name] = {stage: percentiles(np.array(each) / 1e3) for stage, each in durations.items()}
+    if step.state.mode is not LoopMode.CLOSED or step.state.counts:
+        raise ValueError(f"frames were refused or limits acted: {dict(step.state.counts)}; this is not the usual step")
+    found["over_product"] = {name: found[name][STEP]["p50"] / found[name][PRODUCT]["p50"] for name in found}
+    return found | {"memory": memory, "rate_hz": RATE_HZ, "granted": list(granted.granted), "host": host()}
+
+
+def allocated(step: ControlStep, payloads: Payloads) -> dict[str, float]:
+    """What a step takes of memory after the first few.
+
+    Returns:
+        peak_bytes of a step over what is there before it, kept_bytes a step on average, and frame_bytes: of one frame
+        in float32, for comparison.
+    """
+    for number in range(_WARM_UP):
+        step(payloads.at(number, number))
+    tracemalloc.start()
+    try:
+        for number in range(_WARM_UP):
+            step(payloads.at(number, number))
+        begun, highest = tracemalloc.get_traced_memory()[0], 0
+        for number in range(_TRACED):
+            payload = payloads.at(number, number)
+            tracemalloc.reset_peak()
+            before = tracemalloc.get_traced_memory()[0]
+            step(payload)
+            highest = max(highest, tracemalloc.get_traced_memory()[1] - before)
+        del payload
+        kept = (tracemalloc.get_traced_memory()[0] - begun) / _TRACED
+    finally:
+        tracemalloc.stop()
+    rows, columns = payloads.shape
+    return {"peak_bytes": float(highest), "kept_bytes": kept, "frame_bytes": 4.0 * rows * columns}
+
+
+def table(found: dict[str, Any]) -> list[list[str]]:
+    """One line a stage."""
+    columns = [(name, at) for name in ("hot_us", "paced_us") for at in ("p50", "p99")]
+    head = ["us", "back to back p50", "p99", f"at {found['rate_hz']:g} Hz p50", "p99"]
+    stages = (*STAGES, REST, STEP, PRODUCT)
+    return [head, *([stage, *(f"{found[name][stage][at]:.1f}" for name, at in columns)] for stage in stages)]
+
+
+def remarks(found: dict[str, Any]) -> str:
+    """What the table does not say."""
+    over, memory, size = found["over_product"], found["memory"], Size()
+    return (
+        f"The step takes {over['hot_us']:.1f} times as long as one product back to back, "
+        f"{over['paced_us']:.1f} times at {found['rate_hz']:g} Hz. {size.pixels} pixels, {size.modes} modes, "
+        f"{size.actuators} actuators. A step's allocations reach {memory['peak_bytes'] / 1e3:.1f} kB at most "
+        f"(a frame in float32 is {memory['frame_bytes'] / 1e3:.1f} kB), and {memory['kept_bytes']:.1f} bytes of each "
+        "stay."
+    )
+
+
+def _timed(
+    step: ControlStep, payloads: Payloads, product: Callable[[], object], seconds: float, period_s: float | None
+) -> Durations:
+    durations: Durations = {stage: [] for stage in (*STAGES, REST, STEP, PRODUCT)}
+    for payload in _turns(payloads, 2 * seconds / 3, period_s):
+        if len(durations[STEP]) > len(durations[PRODUCT]):
+            durations[PRODUCT].append(_taken_ns(product))
+        else:
+            durations[STEP].append(_taken_ns(partial(step, payload)))
+    with _clocked(durations):
+        for payload in _turns(payloads, seconds / 3, period_s):
+            whole_ns = _taken_ns(partial(step, payload))
+            durations[REST].append(whole_ns - sum(durations[stage][-1] for stage in STAGES))
+    return durations
+
+
+def _turns(payloads: Payloads, seconds: float, period_s: float | None) -> Iterator[bytes]:
+    """A frame for each turn, at its moment."""
+    due_s = time.monotonic()
+    end_s = due_s + seconds
+    for number in count():
+        due_s = time.monotonic() if period_s is None else due_s + period_s
+        if due_s > end_s:
+            return
+        payload = payloads.at(number, time.monotonic_ns())
+        if period_s is not None:
+            time.sleep(max(0.0, due_s - time.monotonic()))
+        yield payload
+
+
+def _taken_ns(what: Callable[[], object]) -> int:
+    begun_ns = time.perf_counter_ns()
+    what()
+    return time.perf_counter_ns() - begun_ns
+
+
+@contextmanager
+def _clocked(durations: Durations) -> Iterator[None]:
+    """Each stage's function timed where the step calls it."""
+    originals = [(owner, name, getattr(owner, name)) for owner, name in STAGES.values()]
+    for stage, (owner, name, original) in zip(STAGES, originals, strict=True):
+        setattr(owner, name, _clock(original, durations[stage]))
+    try:
+        yield
+    finally:
+        for owner, name, original in originals:
+            setattr(owner, name, original)
+
+
+def _clock(original: Callable[..., Any], durations: list[int]) -> Callable[..., Any]:
+    def clocked(*arguments: Any) -> Any:
+        begun_ns = time.perf_counter_ns()
+        found = original(*arguments)
+        durations.append(time.perf_counter_ns() - begun_ns)
+        return found
+
+    return clocked
+
+
+if __name__ == "__main__":
+    sys.exit(main())
