@@ -63,7 +63,9 @@ def session_config(links: Links, role: str, *, looks_on: bool = False) -> dict[s
             ],
             "timeout_ms": -1,
             "exit_on_failure": False,
-            "retry": {"period_init_ms": 50, "period_max_ms": 200, "period_increase_factor": 2},
+            # A newcomer connects to all others itself. Who asks five times a second for somebody who is not there (a
+            # recorder, say) delays a frame each time.
+            "retry": {"period_init_ms": 50, "period_max_ms": 4000, "period_increase_factor": 2},
         },
         # Opening waits `delay` ms for the links that are not there yet; whoever is up is connected within a few.
         "scouting": {"delay": 100, "multicast": {"enabled": False}, "gossip": {"enabled": False}},

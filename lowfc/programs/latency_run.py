@@ -35,7 +35,7 @@ from lowfc.programs.watch import Watch
 
 Whole = npt.NDArray[np.int64]
 
-_TURN_S = 0.05
+_TURN_S = 0.25
 _RING = 1 << 14
 _SETTLE_S = 0.15
 _LAST_WORDS_S = 0.1
