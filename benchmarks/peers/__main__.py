@@ -60,7 +60,10 @@ def measure(asked: argparse.Namespace) -> dict[str, Any]:
         "rules": {name: getattr(asked, name) for name in ("repeats", "seconds", "warm_up", "rate_hz")},
         "sizes": _SIZES,
         "definitions": DEFINITIONS,
-        "scheduling": {name: f"SCHED_FIFO {level}" if level else "SCHED_OTHER" for name, level in SCHEDULING.items()},
+        "scheduling": {
+            name: f"SCHED_FIFO {level}, idle processors kept awake" if level else "SCHED_OTHER"
+            for name, level in SCHEDULING.items()
+        },
         "notes": notes,
         "host": {**host(), "load_before": round(load_before, 2)},
         "pinned_to": list(processors()),

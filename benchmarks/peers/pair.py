@@ -89,7 +89,7 @@ def _settle(part: Part) -> None:
     if part.role != "source":  # as a process of lowfc's that waits for what it receives
         receive_in_one_thread()
     if part.plan.options.get("transport") == "lowfc":  # as its processes are set up, whatever that is
-        realtime.set_up(part.priority or None, {part.cpu}, lock_memory=True, stay_awake=True)
+        realtime.set_up(part.priority or None, {part.cpu}, lock_memory=True, stay_awake=False)
     else:
         part.settle()
 

@@ -17,7 +17,7 @@ from benchmarks.peers.process import Part
 from benchmarks.peers.ring import Ring
 from lowfc.adapters.bus import Sample
 from lowfc.adapters.clock import HostClock
-from lowfc.adapters.mailbox import Mailbox
+from lowfc.adapters.handover import Handover
 from lowfc.adapters.realtime import let_send
 from lowfc.adapters.run import Links
 from lowfc.adapters.zenoh_bus import ZenohBus, session_config
@@ -26,7 +26,6 @@ from lowfc.contract.messages import COMMAND, FRAME, Role
 _ENVELOPE = struct.Struct("<QQ")  # number and time, as long as what lowfc sends with every message
 _MIRROR = "dm"
 _ROLES = {"source": Role.CAMERA, "controller": Role.CONTROLLER, "onlooker": Role.VIEWER}
-_TICK_S = 0.01  # lowfc's controller waits as long
 _LOOK_S = 0.02
 _KEPT = 4096
 
@@ -90,7 +89,7 @@ def both(part: Part, frame_bytes: int, command_bytes: int, take: Message) -> Lin
 
 
 def lowfc_bus(part: Part, _frame_bytes: int, _command_bytes: int, take: Message) -> Link:
-    """By lowfc's bus, and at the controller by its mailbox to a thread of its own, as its loop is built."""
+    """By lowfc's bus, frames handed over on its own thread, as its loop is built."""
     clock = HostClock()
     bus = ZenohBus(_links(part), _ROLES[part.role], clock)
 
@@ -101,16 +100,8 @@ def lowfc_bus(part: Part, _frame_bytes: int, _command_bytes: int, take: Message)
         bus.subscribe(COMMAND, pass_on, _MIRROR)
         publisher = bus.publisher(FRAME)
     else:
-        mailbox = Mailbox()
-        bus.subscribe(FRAME, mailbox.put)
+        bus.subscribe(FRAME, Handover(FRAME.key, pass_on, clock.host_ns).put)
         publisher = bus.publisher(COMMAND, _MIRROR)
-
-        def run() -> None:
-            while True:
-                if (sample := mailbox.take(_TICK_S)) is not None:
-                    pass_on(sample)
-
-        threading.Thread(target=run, daemon=True).start()
 
     def put(number: int, time_ns: int, payload: bytes) -> None:
         publisher.put(payload, time_ns + clock.offset_ns, number)
