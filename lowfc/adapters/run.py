@@ -71,6 +71,11 @@ class Links:
         path = self.secret_file.parent / f"{role}.sock"
         return path if role in self.ports and len(os.fsencode(path)) <= _LONGEST_SOCKET else None
 
+    def shortcut(self, role: str) -> Path | None:
+        """Socket at which a role gets what it waits for; None where the directory's name is too long for one."""
+        path = self.secret_file.parent / f"{role}.in"
+        return path if len(os.fsencode(path)) <= _LONGEST_SOCKET else None
+
     def live(self) -> set[str]:
         """Roles whose processes listen now; a run that was killed leaves its directory behind."""
         return {role for role, port in self.ports.items() if _listens(port)}

@@ -11,6 +11,7 @@ import json
 import os
 import threading
 from collections.abc import Callable, Iterator
+from pathlib import Path
 from typing import Any
 
 import zenoh
@@ -19,9 +20,10 @@ from zenoh.handlers import Callback, Handler, RingChannel
 from lowfc.adapters.bus import ALL, Faults, Query, Sample
 from lowfc.adapters.clock import Clock
 from lowfc.adapters.envelope import Envelope, sequence_of
-from lowfc.adapters.run import Links
+from lowfc.adapters.run import Links, mirror_role
+from lowfc.adapters.shortcut import ShortcutReader, ShortcutWriter
 from lowfc.contract.errors import BusError
-from lowfc.contract.messages import TOPICS, Topic
+from lowfc.contract.messages import TOPICS, Role, Topic
 
 _SOCKET = "unixsock-stream"
 _GLANCES_HZ = 40.0  # a view draws 30 pictures a second; each finds a new one
@@ -129,7 +131,7 @@ def declare_publisher(session: zenoh.Session, topic: Topic, key: str) -> zenoh.P
 class ZenohPublisher:
     """Publishes one topic; see `Publisher`."""
 
-    def __init__(self, bus: "ZenohBus", session: zenoh.Session, topic: Topic, key: str) -> None:
+    def __init__(self, bus: "ZenohBus", session: zenoh.Session, topic: Topic, key: str, shortcut: Path | None) -> None:
         self.topic = topic
         self.key = key
         self.published = 0
@@ -139,6 +141,7 @@ class ZenohPublisher:
         self._start_s = bus.start_s
         self._replying = bus.replying
         self._publisher = declare_publisher(session, topic, key)
+        self._shortcut = None if shortcut is None else ShortcutWriter(shortcut)
         if self._keeps:
             session.declare_queryable(key, Callback(self._answer, indirect=False))
 
@@ -151,8 +154,16 @@ class ZenohPublisher:
         self.published += 1
         if self._keeps:
             self.last = (payload, envelope)
-        self._publisher.put(payload, attachment=envelope.encode())
+        attachment = envelope.encode()
+        if self._shortcut is not None:
+            self._shortcut.send(attachment, payload)
+        self._publisher.put(payload, attachment=attachment)
         return envelope
+
+    def close(self) -> None:
+        """Let go of what is not zenoh's."""
+        if self._shortcut is not None:
+            self._shortcut.close()
 
     def _answer(self, query: zenoh.Query) -> None:
         with self._replying(query):
@@ -199,6 +210,8 @@ class ZenohBus:
             BusError: the role's port is taken, or zenoh refuses the configuration.
         """
         self.role = role
+        self._links = links
+        self._closers: list[Callable[[], None]] = []
         self.clock = clock
         self.faults = Faults()
         self.start_s = links.claim_start(role, clock.start_s)
@@ -217,10 +230,27 @@ class ZenohBus:
 
     def publisher(self, topic: Topic, name: str = "") -> ZenohPublisher:
         """See `Bus.publisher`."""
-        return ZenohPublisher(self, self._session, topic, topic.at(name))
+        publisher = ZenohPublisher(self, self._session, topic, topic.at(name), self._shortcut(topic, name))
+        self._closers.append(publisher.close)
+        return publisher
 
     def subscribe(self, topic: Topic, handler: Callable[[Sample], None], name: str = ALL) -> Callable[[], None]:
-        """See `Bus.subscribe`; `handler` runs on zenoh's receiving thread."""
+        """See `Bus.subscribe`; `handler` runs on a thread that receives, on one at a time."""
+        if self._reader(topic, name) != self.role or (path := self._shortcut(topic, name)) is None:
+            return self._subscribe(topic, handler, name)
+        key = topic.at(name)
+        reader = ShortcutReader(
+            path,
+            key,
+            handler,
+            lambda by_bus: self._subscribe(topic, by_bus, name),
+            self.clock.host_ns,
+            lambda fault: self.faults.add(f"{self.role}: handler of {key}", fault),
+        )
+        self._closers.append(reader.close)
+        return reader.close
+
+    def _subscribe(self, topic: Topic, handler: Callable[[Sample], None], name: str) -> Callable[[], None]:
         key, host_ns, faults = topic.at(name), self.clock.host_ns, self.faults
         known_key = _known_key(key)
 
@@ -285,8 +315,18 @@ class ZenohBus:
 
     def close(self) -> None:
         """Leave the run."""
+        for close in self._closers:
+            close()
         with contextlib.suppress(zenoh.ZError):
             self._session.close()  # type: ignore[no-untyped-call]
+
+    def _reader(self, topic: Topic, name: str) -> str | None:
+        """Role of the process that waits for this topic."""
+        return mirror_role(name) if topic.reader is Role.MIRROR else topic.reader
+
+    def _shortcut(self, topic: Topic, name: str) -> Path | None:
+        reader = self._reader(topic, name)
+        return None if reader is None else self._links.shortcut(reader)
 
     @contextlib.contextmanager
     def replying(self, query: zenoh.Query) -> Iterator[None]:

@@ -54,6 +54,7 @@ class Topic:
         timeless: in lockstep two runs with the same seed write the same payload bytes.
         queryable: a late joiner may ask the publisher for the last one.
         newest_only: who looks at a run wants the newest only, and gets no more than eyes can follow.
+        reader: who waits for it, and gets it first by a way of its own where that is on the same host.
         sentence: what it is.
     """
 
@@ -67,6 +68,7 @@ class Topic:
     timeless: bool = True
     queryable: bool = False
     newest_only: bool = False
+    reader: Role | None = None
 
     def at(self, name: str) -> str:
         """Key of this topic for the mirror or process `name`."""
@@ -97,6 +99,7 @@ FRAME = Topic(
     _CONTROLLER | _WATCHERS,
     "Sensor image, mono16, DN; its time is the end of the exposure.",
     newest_only=True,
+    reader=Role.CONTROLLER,
 )
 CAMERA_STATE = Topic(
     "lowfc/camera/state", wire.CameraState, 2.0, _CAMERA, EVERYBODY, "The camera's settings.", queryable=True
@@ -143,6 +146,7 @@ COMMAND = Topic(
     _CONTROLLER,
     _MIRROR | {Role.RECORDER},
     "Where the mirror shall be.",
+    reader=Role.MIRROR,
 )
 MIRROR_STATE = Topic(
     "lowfc/mirror/{name}/state",

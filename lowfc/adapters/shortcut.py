@@ -1,0 +1,168 @@
+"""The short way between two processes of one host that wait for each other: a Unix socket, beside the bus.
+
+The bus still carries every message to everybody. The one reader that a topic names (`Topic.reader`) gets it first by a
+socket in the run's directory: no thread of the bus is between the put and the reader. Whoever publishes from another
+host, or without this library, is heard by the bus as ever.
+"""
+
+import contextlib
+import os
+import socket
+import threading
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+from lowfc.adapters.bus import Sample
+from lowfc.adapters.envelope import Envelope
+
+Handler = Callable[[Sample], None]
+
+_BUFFER_BYTES = 4 << 20  # some hundred frames, where the host allows it
+_RETRY_S = 0.1
+_ENVELOPE_BYTES = len(Envelope(0, 0).encode())
+
+
+class ShortcutWriter:
+    """Sends to the reader, if there is one; never waits."""
+
+    def __init__(self, path: Path) -> None:
+        """Send to whoever listens at `path`, now or later."""
+        self._path = os.fspath(path)
+        self._socket: socket.socket | None = None
+        self._again_s = 0.0
+
+    def send(self, envelope: bytes, payload: bytes) -> None:
+        """Send a message; a reader that is too far behind loses it, as it would on the bus."""
+        if self._socket is None:
+            self._connect()
+            if self._socket is None:
+                return
+        try:
+            self._socket.sendmsg((envelope, payload))
+        except BlockingIOError:
+            return
+        except OSError:  # the reader has gone, or this is more than a socket takes on this host
+            self.close()
+
+    def close(self) -> None:
+        """Leave the reader to the bus."""
+        if self._socket is not None:
+            self._socket.close()
+            self._socket = None
+
+    def _connect(self) -> None:
+        now_s = time.monotonic()
+        if now_s < self._again_s:
+            return
+        self._again_s = now_s + _RETRY_S
+        made = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET | socket.SOCK_NONBLOCK)
+        try:
+            made.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, _BUFFER_BYTES)  # the kernel gives what it allows
+            made.connect(self._path)
+        except OSError:  # nobody is there, or not yet
+            made.close()
+        else:
+            self._socket = made
+
+
+class ShortcutReader:
+    """Hands on every message once: by the socket while a writer has it, by the bus otherwise."""
+
+    def __init__(
+        self,
+        path: Path,
+        key: str,
+        handler: Handler,
+        subscribe: Callable[[Handler], Callable[[], None]],
+        now_ns: Callable[[], int],
+        failed: Callable[[Exception], None],
+    ) -> None:
+        """Listen, at once.
+
+        Args:
+            path: where the writer sends to.
+            key: of the topic.
+            handler: gets each message, one at a time, on the bus's thread or on one of this reader's own.
+            subscribe: to the same topic on the bus; returns what ends that.
+            now_ns: the host's clock.
+            failed: told of what the handler raises.
+        """
+        self._handler = handler
+        self._subscribe = subscribe
+        self._now_ns = now_ns
+        self._failed = failed
+        self._turn = threading.Lock()
+        self._key = key
+        self._newest = self._newest_by_bus = -1
+        self._connected = self._closed = False
+        self._both = False
+        self._leave_bus: Callable[[], None] | None = subscribe(self._by_bus)
+        path.unlink(missing_ok=True)  # of a process that was killed: there is one of each role
+        self._listener = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+        self._listener.bind(os.fspath(path))
+        self._listener.listen(1)
+        self._connection: socket.socket | None = None
+        threading.Thread(target=self._run, name="shortcut", daemon=True).start()
+
+    def close(self) -> None:
+        """Hand on nothing more."""
+        if self._closed:
+            return
+        self._closed = True
+        for one in (self._listener, self._connection):
+            if one is not None:
+                with contextlib.suppress(OSError):
+                    one.shutdown(socket.SHUT_RDWR)  # which ends the wait of the thread
+        if self._leave_bus is not None:
+            self._leave_bus()
+
+    def _by_bus(self, sample: Sample) -> None:
+        with self._turn:
+            if self._connected and sample.sequence <= self._newest:
+                self._both = True  # whatever the bus had before the writer came has been handed on
+            elif not self._closed:
+                self._newest_by_bus = sample.sequence
+                self._handler(sample)
+
+    def _run(self) -> None:
+        with self._listener:
+            while not self._closed:
+                try:
+                    self._connection, _ = self._listener.accept()
+                except OSError:
+                    return
+                with self._connection:
+                    self._serve(self._connection)
+                self._connected = False
+                if self._leave_bus is None and not self._closed:
+                    self._leave_bus = self._subscribe(self._by_bus)
+
+    def _serve(self, connection: socket.socket) -> None:
+        connection.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, _BUFFER_BYTES)
+        buffer = memoryview(bytearray(_BUFFER_BYTES))
+        while not self._closed:
+            try:
+                size = connection.recv_into(buffer)
+            except OSError:
+                return
+            if not size:
+                return
+            now_ns = self._now_ns()
+            try:
+                envelope = bytes(buffer[: min(size, _ENVELOPE_BYTES)])
+                payload = bytes(buffer[_ENVELOPE_BYTES:size])
+                self._by_socket(Sample(self._key, payload, *Envelope.unpack(envelope), now_ns))
+            except Exception as fault:
+                self._failed(fault)
+            if self._both and self._leave_bus is not None:
+                self._leave_bus()
+                self._leave_bus, self._both = None, False
+
+    def _by_socket(self, sample: Sample) -> None:
+        with self._turn:
+            self._connected = True
+            if self._leave_bus is not None and sample.sequence <= self._newest_by_bus:
+                return  # the bus was quicker
+            self._newest = sample.sequence
+            self._handler(sample)

@@ -1,0 +1,186 @@
+"""The short way beside the real bus: every message once and in order, whoever comes, goes, stalls or is too large."""
+
+import socket
+import threading
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import pytest
+
+from lowfc.adapters import shortcut
+from lowfc.adapters.bus import Sample
+from lowfc.adapters.clock import HostClock
+from lowfc.adapters.envelope import Envelope, count_of
+from lowfc.adapters.run import Run, open_run
+from lowfc.adapters.zenoh_bus import ZenohBus, ZenohPublisher
+from lowfc.contract.messages import COMMAND, FRAME
+
+PATIENCE_S = 30.0
+
+
+def until(what: str, met: Callable[[], object]) -> None:
+    deadline_s = time.monotonic() + PATIENCE_S
+    while not met():
+        assert time.monotonic() < deadline_s, f"{what} did not happen"
+        time.sleep(0.002)
+
+
+class Ends:
+    """A run with a camera and a controller that notes what it gets, from which thread."""
+
+    def __init__(self, base: Path) -> None:
+        self.run: Run = open_run("shortcut", base=base)
+        self.clock = HostClock(base)
+        self.buses: list[ZenohBus] = []
+        self.got: list[int] = []
+        self.threads: list[str] = []
+        self.sizes: list[int] = []
+
+    def bus(self, role: str) -> ZenohBus:
+        self.buses.append(ZenohBus(self.run.links, role, self.clock))
+        return self.buses[-1]
+
+    def hear(self, sample: Sample) -> None:
+        assert sample.key == FRAME.key
+        assert sample.publish_time_ns <= sample.receive_time_ns
+        self.got.append(count_of(sample.sequence))
+        self.threads.append(threading.current_thread().name)
+        self.sizes.append(len(sample.payload))
+
+    def publish(self, publisher: ZenohPublisher, messages: int, pause_s: float = 0.001) -> None:
+        for _ in range(messages):
+            publisher.put(bytes(1000))
+            time.sleep(pause_s)
+
+    def meet(self, publisher: ZenohPublisher) -> None:
+        """Publish until the short way is the only one."""
+
+        def only() -> bool:
+            publisher.put(b"")
+            return self.threads[-5:] == ["shortcut"] * 5 and len(self.threads) > 20
+
+        until("the short way", only)
+        del self.got[:-1], self.threads[:], self.sizes[:]
+
+    def close(self) -> None:
+        for bus in self.buses:
+            bus.close()
+
+
+@pytest.fixture
+def ends(tmp_path: Path) -> Iterator[Ends]:
+    made = Ends(tmp_path)
+    yield made
+    made.close()
+
+
+def test_the_reader_gets_everything_by_the_short_way_and_others_by_the_bus(ends: Ends) -> None:
+    controller, recorder, camera = ends.bus("controller"), ends.bus("recorder"), ends.bus("camera")
+    controller.subscribe(FRAME, ends.hear)
+    recorded: list[int] = []
+    recorder.subscribe(FRAME, lambda sample: recorded.append(count_of(sample.sequence)))
+    frames = camera.publisher(FRAME)
+    ends.meet(frames)
+    ends.publish(frames, 300)
+    until("the last frame", lambda: recorded[-1:] == [frames.published - 1] == ends.got[-1:])
+    assert ends.got == list(range(ends.got[0], frames.published))
+    assert set(ends.threads) == {"shortcut"}
+    assert recorded[-300:] == ends.got[-300:]
+
+
+def test_the_switch_loses_and_repeats_nothing(ends: Ends) -> None:
+    camera = ends.bus("camera")
+    frames = camera.publisher(FRAME)
+    controller = ends.bus("controller")
+    controller.subscribe(FRAME, ends.hear)
+    until("a link", lambda: controller.peers() and camera.peers())
+    ends.publish(frames, 400)
+    until("the last frame", lambda: ends.got[-1:] == [frames.published - 1])
+    assert ends.got == sorted(set(ends.got))
+    assert ends.got == list(range(ends.got[0], frames.published))
+    assert "shortcut" in ends.threads
+
+
+def test_a_restarted_reader_and_a_restarted_writer_find_each_other_again(ends: Ends) -> None:
+    controller, camera = ends.bus("controller"), ends.bus("camera")
+    controller.subscribe(FRAME, ends.hear)
+    frames = camera.publisher(FRAME)
+    ends.meet(frames)
+    controller.close()
+    ends.publish(frames, 5)
+    controller = ends.bus("controller")
+    controller.subscribe(FRAME, ends.hear)
+    ends.meet(frames)
+    camera.close()
+    ends.buses.remove(camera)
+    camera = ends.bus("camera")
+    ends.meet(camera.publisher(FRAME))
+
+
+def test_without_its_writer_the_reader_hears_the_bus(ends: Ends, monkeypatch: pytest.MonkeyPatch) -> None:
+    controller, camera = ends.bus("controller"), ends.bus("camera")
+    controller.subscribe(FRAME, ends.hear)
+    ends.meet(camera.publisher(FRAME))
+    camera.close()
+    ends.buses.remove(camera)
+    monkeypatch.setattr(shortcut.ShortcutWriter, "send", lambda *_: None)  # as one in another language
+    frames = ends.bus("camera").publisher(FRAME)
+
+    def heard() -> bool:
+        frames.put(b"")
+        return bool(ends.threads) and ends.threads[-1] != "shortcut"
+
+    until("a frame by the bus", heard)
+
+
+def test_a_message_that_a_socket_does_not_take_comes_by_the_bus(ends: Ends) -> None:
+    controller, camera = ends.bus("controller"), ends.bus("camera")
+    controller.subscribe(FRAME, ends.hear)
+    frames = camera.publisher(FRAME)
+    large = 9 << 20
+
+    def heard() -> bool:
+        frames.put(bytes(large))
+        time.sleep(0.05)
+        return ends.sizes[-1:] == [large]
+
+    until("a large frame", heard)
+    assert ends.threads[-1] != "shortcut"
+
+
+def test_a_reader_that_stalls_never_holds_the_writer(tmp_path: Path) -> None:
+    listener = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+    listener.bind(str(tmp_path / "stalled.in"))
+    listener.listen(1)
+    writer = shortcut.ShortcutWriter(tmp_path / "stalled.in")
+    for _ in range(2000):  # far more than a socket holds: a send that waited would wait for ever
+        writer.send(Envelope(1, 2).encode(), bytes(12800))
+    taken, _ = listener.accept()
+    taken.settimeout(PATIENCE_S)
+    assert Envelope.decode(taken.recv(20000)[:16]) == Envelope(1, 2)
+    taken.close()
+    writer.send(b"", b"")
+    writer.close()
+    listener.close()
+
+
+def test_a_message_that_makes_no_sense_is_counted_and_the_next_is_heard(ends: Ends) -> None:
+    controller = ends.bus("controller")
+    controller.subscribe(FRAME, ends.hear)
+    path = ends.run.links.shortcut("controller")
+    assert path is not None
+    writer = shortcut.ShortcutWriter(path)
+    writer.send(b"short", b"")
+    writer.send(Envelope(7, 0).encode(), b"fine")
+    until("the second message", lambda: ends.got == [7])
+    assert list(controller.faults.counts.values()) == [1]
+    writer.close()
+
+
+def test_only_who_waits_for_a_topic_has_a_short_way(ends: Ends) -> None:
+    ends.bus("recorder").subscribe(FRAME, ends.hear)
+    ends.bus("mirror-dm").subscribe(COMMAND, lambda _: None, "dm")
+    ends.bus("mirror-other").subscribe(COMMAND, lambda _: None, "other")
+    there = {path.name for path in ends.run.path.glob("*.in")}
+    assert there == {"mirror-dm.in", "mirror-other.in"}
