@@ -1,15 +1,17 @@
-"""Measure the cost curves and the highest rates on this host into docs/performance.md; forty minutes.
+"""Measure latency, the control step, peers, cost curves and the highest rates into docs/performance.md; an hour.
 
 Example:
     python docs/measure_speed.py                    # measures, writes docs/speed.json, the picture and the sections
-    python docs/measure_speed.py --only throughput  # one of the two anew, the other as it was
+    python docs/measure_speed.py --only throughput  # one of them anew, the others as they were
     python docs/measure_speed.py --render           # the picture and the sections again from docs/speed.json
 """
 
 import argparse
 import json
+import shlex
 import subprocess
 import sys
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -17,13 +19,58 @@ from measure import ROOT, put
 
 sys.path.insert(0, str(ROOT))
 
-from benchmarks import curves, throughput
+from benchmarks import cells, curves, step, throughput
+from benchmarks.peers import table as peers
+from lowfc.programs import latency_text
 
 MEASURED = ROOT / "docs" / "speed.json"
 DOCUMENT = ROOT / "docs" / "performance.md"
 PICTURE = ROOT / "docs" / "pictures" / "cost_curves.png"
-BENCHES = {"curves": curves, "throughput": throughput}
+LATENCY = ("lowfc", "latency", "--duration", "10", "--repeats", "5")
+WATCHED = ("lowfc", "latency", "--duration", "60", "--record", "--view")
+
+
+def _as_text(words: Sequence[str]) -> Callable[[dict[str, Any]], str]:
+    return lambda result: f"```\n$ {shlex.join(words)}\n{latency_text.table(result)}\n```"
+
+
+BENCHES: dict[str, tuple[Sequence[str], Callable[[dict[str, Any]], str]]] = {
+    "latency": (LATENCY, _as_text(LATENCY)),
+    "watched": (WATCHED, _as_text(WATCHED)),
+    "step": (("benchmarks.step",), lambda result: f"{cells.markdown(step.table(result))}\n\n{step.remarks(result)}"),
+    "peers": (("benchmarks.peers", "--seconds", "4"), peers.markdown),
+    "curves": (("benchmarks.curves",), curves.markdown),
+    "throughput": (("benchmarks.throughput",), throughput.markdown),
+}
+"""What is run, as `python -m`, and how its `--json` becomes a part of the document."""
 SECTIONS = {
+    "latency": """
+## From a frame to its command
+
+The controller and the mirror as they run, frames made beforehand, at 1 kHz; [latency](latency.md) tells what each
+line is.
+
+""",
+    "watched": """
+The same for a minute, with the recorder and a view beside:
+
+""",
+    "step": """
+## The control step
+
+`python -m benchmarks.step`: decode, checks, law, limits and encode, from a frame's bytes to a command's, in one
+process. The stages are timed one by one in steps of their own, which takes a little longer; the product R x is NumPy's,
+in float32.
+
+""",
+    "peers": """
+## Beside its peers
+
+`python -m benchmarks.peers` drives all of them at the same sizes with the same frames, in turns, once in the normal
+scheduling class and once under SCHED_FIFO with the processors kept awake for everybody; it needs an interpreter that
+has `pyrtcao` (`--pyrtcao PYTHON`).
+
+""",
     "curves": """
 ## What a frame costs
 
@@ -56,9 +103,9 @@ def marks(name: str) -> tuple[str, str]:
     return f"<!-- {name}: begin -->\n", f"<!-- {name}: end -->"
 
 
-def measure(name: str) -> dict[str, Any]:
-    """Run one of the two; what its `--json` prints."""
-    words = ["-m", BENCHES[name].__name__, "--json"]
+def measure(name: str, extra: Sequence[str]) -> dict[str, Any]:
+    """Run one of them; what its `--json` prints."""
+    words = ["-m", *BENCHES[name][0], *extra, "--json"]
     done = subprocess.run([sys.executable, *words], cwd=ROOT, stdout=subprocess.PIPE, text=True, check=False)
     if not done.stdout:
         sys.exit(f"python {' '.join(words)} failed")
@@ -67,8 +114,8 @@ def measure(name: str) -> dict[str, Any]:
 
 
 def render(name: str, result: dict[str, Any]) -> str:
-    """The tables of one of the two in Markdown."""
-    return BENCHES[name].markdown(result) + "\n"
+    """The tables of one of them in Markdown."""
+    return BENCHES[name][1](result) + "\n"
 
 
 def place(document: Path, name: str, result: dict[str, Any]) -> None:
@@ -84,12 +131,13 @@ def main() -> None:
     """The command line."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--render", action="store_true", help=f"use {MEASURED.relative_to(ROOT)} as it is")
-    parser.add_argument("--only", choices=BENCHES, help="measure one of the two")
+    parser.add_argument("--only", choices=BENCHES, help="measure one of them")
+    parser.add_argument("--pyrtcao", default=sys.executable, metavar="PYTHON", help="an interpreter that has pyrtcao")
     asked = parser.parse_args()
     found = json.loads(MEASURED.read_text()) if MEASURED.exists() else {}
     if not asked.render:
         for name in [asked.only] if asked.only else BENCHES:
-            found[name] = measure(name)
+            found[name] = measure(name, ["--pyrtcao", asked.pyrtcao] if name == "peers" else [])
             MEASURED.write_text(json.dumps(found, indent=1) + "\n")
     for name in BENCHES:
         if name in found:

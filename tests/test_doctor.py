@@ -48,8 +48,8 @@ METAL = {
     "proc/17/stat": "17 (kworker/0:1 (x)) S 2 0 0 0 -1 0 0 0 0 0 150 50 0 0 20 0 1 0 10 0 0\n",
     "proc/sys/net/core/rmem_default": "212992\n",
     "proc/sys/net/core/wmem_default": "212992\n",
-    "proc/sys/net/core/rmem_max": "425984\n",
-    "proc/sys/net/core/wmem_max": "212992\n",
+    "proc/sys/net/core/rmem_max": "8388608\n",
+    "proc/sys/net/core/wmem_max": "4194304\n",
     "proc/sys/net/ipv4/tcp_rmem": "4096\t131072\t6291456\n",
     "proc/sys/net/ipv4/tcp_wmem": "4096\t16384\t4194304\n",
     f"{CPUS}/online": "0-7\n",
@@ -112,7 +112,7 @@ def test_a_fit_host_has_no_warning(tmp_path: Path) -> None:
     assert "turbo off" in found["frequency"].detail
     assert "C1 with 2 us" in found["idle states"].detail
     assert "4194 kB" in found["socket buffers"].detail
-    assert "213 kB, at most 213 kB" in found["socket buffers"].detail
+    assert "213 kB, at most 4194 kB" in found["socket buffers"].detail
     assert "p99 20 us, max 60 us" in found["wake-up"].detail
 
 
@@ -200,6 +200,7 @@ def test_a_fit_host_has_no_warning(tmp_path: Path) -> None:
             {"sys/kernel/mm/transparent_hugepage/enabled": "[always] madvise never\n"},
         ),
         ("socket buffers", "warning", "550 kB", {"proc/sys/net/ipv4/tcp_rmem": "4096 131072 550000\n"}),
+        ("socket buffers", "warning", "at most 213 kB, 38 ms", {"proc/sys/net/core/wmem_max": "212992\n"}),
         ("socket buffers", "ok", "560 kB", {"proc/sys/net/ipv4/tcp_rmem": "4096 131072 560000\n"}),
         ("shared memory", "warning", "there is no /dev/shm", {"dev/shm/is_there": None}),
         ("open files", "warning", "64", {"proc/self/limits": "Max open files            64    64    files\n"}),

@@ -165,7 +165,7 @@ class Controller:
     def _rehearse(self, sample: Sample) -> None:
         """Do the step once more, and forget what came of it: code and data are in the caches when the next frame comes.
 
-        What happens between two frames pushes them out, and a step takes two thirds longer from memory.
+        What happens between two frames pushes them out.
         """
         frame = codec.decode_frame(sample.payload, self._state.frame_sequence + 1, 0)
         _, outputs = advance(self._settings, self._state, frame)

@@ -83,9 +83,9 @@ class Facts:
 
 
 def named_cpus(config: Configuration) -> set[int]:
-    """Processors that a configuration names for camera, controller and mirror."""
+    """Processors that a configuration names for camera, controller, mirror and recorder."""
     realtime = config.realtime
-    return {*realtime.camera_cpus, *realtime.controller_cpus, *realtime.mirror_cpus}
+    return {*realtime.camera_cpus, *realtime.controller_cpus, *realtime.mirror_cpus, *realtime.recorder_cpus}
 
 
 def ok(detail: str) -> Finding:
