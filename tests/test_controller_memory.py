@@ -362,3 +362,50 @@ def test_another_mirror_than_the_calibrations_is_refused(rig: Rig, tmp_path: Pat
     MemoryBus(hub, "mirror-dm", HostClock()).publisher(MIRROR_STATE, "dm").put(small.SerializeToString())
     with pytest.raises(CalibrationError, match="20, 20"):
         controller.run()
+
+
+def test_a_rehearsal_changes_nothing_and_says_nothing(
+    calibration: Calibration, scene: Bench, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    rehearsed: list[bool] = []
+    original = Controller._rehearse
+
+    with running(configured(lockstep=False), calibration, scene) as rig:
+
+        def said() -> list[int]:
+            return [len(rig.said.get(topic.key, ())) for topic in (STEP, COMMAND, TIMING)]
+
+        def watched(self: Controller, sample: Sample) -> None:
+            before, said_before = self._state, said()
+            original(self, sample)
+            rehearsed.append(self._state is before and said() == said_before)
+
+        monkeypatch.setattr(Controller, "_rehearse", watched)
+        rig.until("a mirror that waits", lambda: MIRROR_STATE.key in rig.said)
+        for index in range(5):
+            pixels = scene.expose(index, rig.offset_nm)[0]
+            rig.put(pixels)
+        assert [list(step.reasons) for step in rig.steps(5)] == [[]] * 5
+    assert len(rehearsed) >= 3
+    assert all(rehearsed)
+
+
+def test_a_frame_that_cannot_be_dealt_with_ends_the_controller(
+    rig: Rig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """On the bus's thread it would be counted, and the loop would stand still."""
+    monkeypatch.setattr("lowfc.programs.controller.MIRROR_PATIENCE_S", 0.01)
+    hub = MemoryHub()
+    service = Service("controller", "test", HostClock(), MemoryBus(hub, "controller", HostClock()))
+    controller = Controller(configured(lockstep=False), service, rig.calibration, "a test", tmp_path / "safed")
+
+    def broken(_: Sample) -> None:
+        raise ArithmeticError("one and one is three")
+
+    monkeypatch.setattr(controller, "_frame", broken)
+    frames = MemoryBus(hub, "camera", HostClock()).publisher(FRAME)
+    late = threading.Timer(0.2, frames.put, [b""])
+    late.start()
+    with pytest.raises(ArithmeticError, match="three"):
+        controller.run()
+    late.join()
