@@ -44,7 +44,7 @@ def road(found: Mapping[str, Any]) -> str:
     elsewhere = min(how["repeats"], SELDOM)
     where = (
         f"Frame to command at {how['rate_hz']:g} Hz, runs of {how['seconds']:g} s. Each run of a change stands between "
-        f"two of the loop as it is, {how['repeats']} times where most was to be expected, {elsewhere} "
+        f"two of its loop as that is, {how['repeats']} times where most was to be expected, {elsewhere} "
         "times elsewhere: medians over the runs, in brackets the lowest and the highest. A ratio is of a run "
         "to its two neighbours; where its range includes 1, nothing is shown. "
         f"{_host(found)}"

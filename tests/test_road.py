@@ -5,8 +5,10 @@ import os
 import platform
 import subprocess
 import sys
+import threading
 import time
 from collections.abc import Mapping
+from contextlib import closing
 from pathlib import Path
 from typing import Any
 
@@ -16,11 +18,14 @@ import zenoh
 
 from benchmarks.road import loaded, measure, patches, table, trip
 from benchmarks.road.__main__ import settings
-from benchmarks.road.changes import CHANGES, Change
+from benchmarks.road.changes import CHANGES, Change, Loop
 from benchmarks.road.load import background
 from lowfc.adapters import realtime, zenoh_bus
+from lowfc.adapters.clock import HostClock
 from lowfc.adapters.run import open_run
+from lowfc.adapters.zenoh_bus import ZenohBus
 from lowfc.contract.configuration import keys
+from lowfc.contract.messages import FRAME
 from lowfc.programs import controller, latency_run
 
 ROOT = Path(__file__).parents[1]
@@ -35,7 +40,7 @@ def figures(p50: float, without: int = 0, **stages_us: float) -> dict[str, Any]:
 
 @pytest.mark.parametrize("name", patches.PATCHES)
 def test_every_patch_finds_what_it_replaces_and_belongs_to_a_change(name: str) -> None:
-    assert BY_NAME[name].variables["LOWFC_ROAD"] == name
+    assert BY_NAME[name].variables["LOWFC_ROAD"].split(",")[-1] == name
     with patches.applied(name) as replaced:
         changed = [(owner, attribute, vars(owner)[attribute]) for owner, attribute, _ in replaced]
         assert changed
@@ -46,7 +51,7 @@ def test_every_patch_finds_what_it_replaces_and_belongs_to_a_change(name: str) -
 def test_every_change_switches_something() -> None:
     assert len(BY_NAME) == len(CHANGES)
     for change in CHANGES:
-        assert change.keys or change.variables, change.name
+        assert change.keys or change.variables != change.loop.variables, change.name
         assert set(change.keys) <= set(keys()), change.name
         if change.keys:
             before = settings().model_dump()["realtime"]
@@ -60,11 +65,32 @@ def test_a_patch_without_a_target_is_an_error(monkeypatch: pytest.MonkeyPatch) -
     monkeypatch.delattr(realtime, "let_send")
     with pytest.raises(patches.PatchError, match="has no let_send to replace"), patches.applied("let-send"):
         pass
-    with pytest.raises(patches.PatchError, match="no patch 'nonsense'"):
-        patches.apply("nonsense")
+    with pytest.raises(patches.PatchError, match="no patch 'nonsense'"), patches.applied("shortcut,nonsense"):
+        pass
 
 
-EDITS = ("socket", "low-latency", "qos", "batching", "queues", "shared-memory", "password")
+@pytest.mark.parametrize(("names", "thread"), [("shortcut", "Dummy-"), ("shortcut,channel", "Thread-")])
+def test_without_the_short_way_frames_come_by_the_bus(tmp_path: Path, names: str, thread: str) -> None:
+    links, clock = open_run("road", base=tmp_path).links, HostClock(tmp_path)
+    heard: list[str] = []
+    with (
+        patches.applied(names),
+        closing(ZenohBus(links, "controller", clock)) as reader,
+        closing(ZenohBus(links, "camera", clock)) as writer,
+    ):
+        reader.subscribe(FRAME, lambda _: heard.append(threading.current_thread().name))
+        frames, deadline_s = writer.publisher(FRAME), time.monotonic() + 20
+        while len(heard) < 3 and time.monotonic() < deadline_s:
+            frames.put(b"frame")
+            time.sleep(0.01)
+    assert len(heard) >= 3
+    assert all(name.startswith(thread) for name in heard), heard
+    way = links.shortcut("controller")
+    assert way is not None
+    assert not way.exists()
+
+
+EDITS = ("retry", "socket", "low-latency", "qos", "batching", "queues", "shared-memory", "password")
 
 
 @pytest.mark.parametrize("name", EDITS)
@@ -120,6 +146,7 @@ def seen(name: str) -> "subprocess.CompletedProcess[str]":
         ("", "False 0.005 True True\n"),
         ("collector", "True 0.005 True True\n"),
         ("switch-interval", "False 0.0001 True True\n"),
+        ("shortcut,collector", "True 0.005 True True\n"),
         ("memory-kept", "False 0.005 False True\n"),
         pytest.param(
             "denormals",
@@ -142,18 +169,18 @@ def test_a_process_that_cannot_be_changed_does_not_run() -> None:
 KEPT = Change("kept", "a thing kept", kept=True, often=True)
 LEFT = Change("left", "a thing left", kept=False, why="it is odd")
 BROKEN = Change("broken", "a thing refused", kept=False, often=True)
-BESIDE = Change("beside", "a thing beside", kept=True, often=True, record=True)
+BY_BUS = Change("by-bus", "a thing of the bus", kept=True, often=True, loop=Loop.BY_BUS)
 
 
-def test_every_change_runs_between_two_of_the_loop_as_it_is() -> None:
+def test_every_change_runs_between_two_of_its_loop_as_that_is() -> None:
     order: list[str] = []
 
-    def travel(change: Change | None, record: bool) -> Mapping[str, Any]:
-        order.append(("" if change is None else change.name) + "+" * record)
+    def travel(change: Change | None, loop: Loop) -> Mapping[str, Any]:
+        order.append(("" if change is None else change.name) + "+" * (loop is Loop.BY_BUS))
         return {"refused": "no"} if change is BROKEN else figures(100.0)
 
-    tried = measure.in_turns([KEPT, LEFT, BROKEN, BESIDE], measure.SELDOM + 1, travel)
-    turn = ["", "kept", "", "left", "", "+", "beside+", "+"]
+    tried = measure.in_turns([KEPT, LEFT, BROKEN, BY_BUS], measure.SELDOM + 1, travel)
+    turn = ["", "kept", "", "left", "", "+", "by-bus+", "+"]
     assert order == [
         "",
         "kept",
@@ -163,7 +190,7 @@ def test_every_change_runs_between_two_of_the_loop_as_it_is() -> None:
         "broken",
         "",
         "+",
-        "beside+",
+        "by-bus+",
         "+",
         *turn[:],
         *turn[:],
@@ -177,8 +204,11 @@ def test_every_change_runs_between_two_of_the_loop_as_it_is() -> None:
 
 
 def test_before_is_without_a_change_and_after_with_it() -> None:
-    runs = [figures(200.0, 7, wakeup=80.0), figures(300.0, 0, wakeup=90.0)]
-    neighbours = [(figures(90.0, wakeup=20.0), figures(110.0, wakeup=22.0)), (figures(150.0, wakeup=24.0),) * 2]
+    runs: list[Mapping[str, Any]] = [figures(200.0, 7, wakeup=80.0), figures(300.0, 0, wakeup=90.0)]
+    neighbours: list[tuple[Mapping[str, Any], Mapping[str, Any]]] = [
+        (figures(90.0, wakeup=20.0), figures(110.0, wakeup=22.0)),
+        (figures(150.0, wakeup=24.0),) * 2,
+    ]
     kept = measure.figures(measure.Tried(KEPT, runs, neighbours))
     left = measure.figures(measure.Tried(LEFT, runs, neighbours))
     assert kept["ratio"]["p50"] == {"median": 0.5, "lowest": 0.5, "highest": 0.5}
@@ -198,6 +228,11 @@ def test_before_is_without_a_change_and_after_with_it() -> None:
     assert {len(line) for line in lines} == {len(table.HEADINGS)}
     assert table.markdown(table.HEADINGS, lines).count("\n") == 4
     assert "zenoh says no" in table.text(table.HEADINGS, lines)
+    by_bus = measure.figures(measure.Tried(BY_BUS, runs, neighbours))
+    assert [line[0] for line in table.road({"changes": [kept, by_bus]})] == [
+        "a thing kept",
+        "a thing of the bus (by the bus alone)",
+    ]
 
 
 def test_how_many_times_the_set_up_lowers_what() -> None:

@@ -12,9 +12,9 @@ from typing import Any
 
 from benchmarks.host import host
 from benchmarks.road import table
-from benchmarks.road.changes import CHANGES, Change
+from benchmarks.road.changes import CHANGES, Change, Loop
 from benchmarks.road.measure import figures, in_turns
-from benchmarks.road.patches import PATCHES, applied
+from benchmarks.road.patches import applied
 from benchmarks.road.trip import prepared, trip
 from lowfc.adapters.clock import sharpen_sleep
 from lowfc.adapters.terminal import INTERRUPTED
@@ -24,7 +24,7 @@ from lowfc.programs.latency import Camera, _configuration
 
 def main() -> int:
     """The command line; returns its exit status."""
-    asked = parser("python -m benchmarks.road", __doc__, seconds=2.0)
+    asked = parser("python -m benchmarks.road", __doc__, seconds=1.5)
     asked.add_argument("--only", nargs="+", metavar="NAME", choices=[one.name for one in CHANGES], help="these changes")
     chosen = asked.parse_args()
     say(measure(chosen), table.HEADINGS, table.road, chosen)
@@ -35,18 +35,17 @@ def measure(asked: argparse.Namespace) -> dict[str, Any]:
     """Try the changes that the command line asks for; the object that --json prints."""
     changes = [one for one in CHANGES if not asked.only or one.name in asked.only]
     for change in changes:
-        if change.name in PATCHES:
-            with applied(change.name):  # before the work, where there is nothing to replace
+        if change.patches:
+            with applied(change.patches):  # before the work, where there is nothing to replace
                 pass
     result = about(asked, "python -m benchmarks.road")
     sharpen_sleep()
     with prepared(settings()) as run:
 
-        def travel(change: Change | None, record: bool) -> Mapping[str, Any]:
-            tell(change.name if change is not None else "as it is")
-            if change is None:
-                return trip(run, asked.seconds, record=record)
-            return trip(run, asked.seconds, change.keys, change.variables, record=record)
+        def travel(change: Change | None, loop: Loop) -> Mapping[str, Any]:
+            tell(f"{change.name}, {loop}" if change is not None else loop)
+            keys, variables = ({}, loop.variables) if change is None else (change.keys, change.variables)
+            return trip(run, asked.seconds, keys, variables, record=loop is Loop.RECORDING)
 
         tried = in_turns(changes, asked.repeats, travel)
     granted: list[str] = next((pair[0]["granted"] for one in tried for pair in one.neighbours), [])

@@ -3,10 +3,30 @@
 import os
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from enum import StrEnum
 from typing import Any
 
 from benchmarks.road.patches import PATCHES
 from lowfc.adapters.realtime import spread
+
+
+class Loop(StrEnum):
+    """The loops to which changes are made."""
+
+    AS_IT_IS = "as it is"
+    BY_BUS = "by the bus alone"
+    """Without the short way: frames and commands go through zenoh."""
+    RECORDING = "recording"
+
+    @property
+    def patches(self) -> str:
+        """What makes it of the loop as it is."""
+        return "shortcut" if self is Loop.BY_BUS else ""
+
+    @property
+    def variables(self) -> dict[str, str]:
+        """Environment of its processes."""
+        return _switch(self.patches)
 
 
 @dataclass(frozen=True)
@@ -20,7 +40,7 @@ class Change:
         why: not, where speed alone would not tell.
         keys: of the configuration.
         environment: variables of every process.
-        record: the recorder runs beside, in the loop it is compared with too.
+        loop: in which it is switched, and to which that is compared.
         often: measured in every repeat; others in the first three only.
     """
 
@@ -30,20 +50,29 @@ class Change:
     why: str = ""
     keys: Mapping[str, Any] = field(default_factory=dict)
     environment: Mapping[str, str] = field(default_factory=dict)
-    record: bool = False
+    loop: Loop = Loop.AS_IT_IS
     often: bool = False
+
+    @property
+    def patches(self) -> str:
+        """Its loop's patch and its own, with a comma between."""
+        return ",".join(filter(None, [self.loop.patches, self.name if self.name in PATCHES else ""]))
 
     @property
     def variables(self) -> dict[str, str]:
         """Environment of the processes in which the change is switched."""
-        return {**self.environment, **({"LOWFC_ROAD": self.name} if self.name in PATCHES else {})}
+        return {**self.environment, **_switch(self.patches)}
+
+
+def _switch(patches: str) -> dict[str, str]:
+    return {"LOWFC_ROAD": patches} if patches else {}
 
 
 _ALL = "(handover: net)"
 _APART = spread(os.sched_getaffinity(0))
 _LOOP = ("camera", "controller", "mirror")
 
-CHANGES: tuple[Change, ...] = (
+_AS_IT_IS = (
     Change("awake", "idle processors kept awake", kept=True, often=True, keys={"realtime.stay_awake": False}),
     Change("fifo", "SCHED_FIFO", kept=True, often=True, keys={"realtime.priority": 0}),
     Change(
@@ -60,30 +89,20 @@ CHANGES: tuple[Change, ...] = (
         often=True,
         keys={"realtime.mirror_cpus": _APART.get("realtime.controller_cpus", [])},
     ),
-    Change("locked", "memory locked", kept=True, often=True, keys={"realtime.lock_memory": False}),
-    Change("memory-kept", "freed memory kept (mallopt)", kept=True, often=True),
-    Change("collector", "garbage collector frozen and off", kept=True, often=True),
-    Change("blas", "one BLAS thread", kept=True, often=True),
-    Change("switch-interval", "interpreter's switch interval 0.1 ms, not 5 ms", kept=False),
-    Change("stay-python", "Python's state kept in zenoh's threads", kept=True, often=True),
-    Change("timer-slack", "timer slack 1 ns", kept=True),
-    Change("let-send", "sched_yield after a put", kept=True, often=True),
-    Change("mirror-ahead", "mirror one priority ahead of the controller", kept=True, often=True),
-    Change("bus-first", "zenoh's threads one priority ahead of Python's main thread", kept=False),
+    Change("mirror-ahead", "mirror one priority ahead of camera and controller", kept=True),
     Change(
-        "one-receiver",
-        "zenoh receives in the thread that waits (ZENOH_RUNTIME)",
+        "shortcut",
+        "a socket beside the bus for who waits: frames to the controller, commands to the mirror",
         kept=True,
         often=True,
-        environment={"ZENOH_RUNTIME": "()"},
     ),
+    Change("retry", "nobody asks five times a second for who is not there", kept=True, often=True),
     Change(
-        "one-thread",
-        "all of zenoh in one thread (ZENOH_RUNTIME)",
-        kept=False,
-        environment={"ZENOH_RUNTIME": f"(app: {_ALL}, acc: {_ALL}, tx: {_ALL}, rx: {_ALL})"},
+        "own-thread",
+        "frames dealt with in the thread that receives them, not in one that it wakes",
+        kept=True,
+        often=True,
     ),
-    Change("own-thread", "frames dealt with in zenoh's thread, not in one that it wakes", kept=True, often=True),
     Change(
         "rehearse",
         "each step done a second time, to keep the caches warm",
@@ -91,30 +110,13 @@ CHANGES: tuple[Change, ...] = (
         often=True,
         keys={"realtime.rehearse": False},
     ),
-    Change("telemetry", "command before telemetry", kept=True, often=True),
-    Change("channel", "ring channel and a receiving thread, not a callback", kept=False, often=True),
-    Change(
-        "socket",
-        "Unix sockets, not TCP",
-        kept=False,
-        why="a reader that stalls loses frames",
-        often=True,
-    ),
-    Change("low-latency", "low-latency transport, without QoS", kept=False, why="it has no priorities", often=True),
-    Change("qos", "QoS off", kept=False, why="pictures and telemetry may go before frames"),
-    Change("batching", "batching off", kept=False),
-    Change("express", "express publishers", kept=False, why="a burst of 16 messages fills the queue, the rest is lost"),
-    Change(
-        "shared-memory",
-        "zenoh's shared memory",
-        kept=False,
-        why="a receiver that stalls for 100 ms loses messages silently",
-        often=True,
-    ),
-    Change("queues", "link queues of 2 messages, not 16", kept=False, why="bursts are lost"),
-    Change("password", "no user and password", kept=False, why="anybody on the host could send commands"),
-    Change("memoryview", "payloads as memoryview", kept=False),
-    Change("bytearray", "payloads as bytearray", kept=False),
+    Change("telemetry", "command before telemetry", kept=True),
+    Change("locked", "memory locked", kept=True, keys={"realtime.lock_memory": False}),
+    Change("memory-kept", "freed memory kept (mallopt)", kept=True),
+    Change("collector", "garbage collector frozen and off", kept=True),
+    Change("blas", "one BLAS thread", kept=True),
+    Change("timer-slack", "timer slack 1 ns", kept=True),
+    Change("switch-interval", "interpreter's switch interval 0.1 ms, not 5 ms", kept=False),
     Change("denormals", "denormals flushed to zero", kept=False),
     Change(
         "huge-pages",
@@ -122,12 +124,69 @@ CHANGES: tuple[Change, ...] = (
         kept=False,
         environment={"PYTHONMALLOC": "malloc", "GLIBC_TUNABLES": "glibc.malloc.hugetlb=1"},
     ),
+)
+_BY_BUS = (
+    Change(
+        "one-receiver",
+        "zenoh receives in the thread that waits (ZENOH_RUNTIME)",
+        kept=True,
+        environment={"ZENOH_RUNTIME": "()"},
+        loop=Loop.BY_BUS,
+    ),
+    Change(
+        "one-thread",
+        "all of zenoh in one thread (ZENOH_RUNTIME)",
+        kept=False,
+        environment={"ZENOH_RUNTIME": f"(app: {_ALL}, acc: {_ALL}, tx: {_ALL}, rx: {_ALL})"},
+        loop=Loop.BY_BUS,
+    ),
+    Change("stay-python", "Python's state kept in zenoh's threads", kept=True, loop=Loop.BY_BUS),
+    Change("let-send", "sched_yield after a put", kept=True, loop=Loop.BY_BUS),
+    Change("bus-first", "zenoh's threads one priority ahead of Python's main thread", kept=False, loop=Loop.BY_BUS),
+    Change("channel", "ring channel and a receiving thread, not a callback", kept=False, loop=Loop.BY_BUS),
+    Change("socket", "Unix sockets, not TCP", kept=False, why="a reader that stalls loses frames", loop=Loop.BY_BUS),
+    Change(
+        "low-latency",
+        "low-latency transport, without QoS",
+        kept=False,
+        why="it has no priorities",
+        loop=Loop.BY_BUS,
+    ),
+    Change("qos", "QoS off", kept=False, why="pictures and telemetry may go before frames", loop=Loop.BY_BUS),
+    Change("batching", "batching off", kept=False, loop=Loop.BY_BUS),
+    Change(
+        "express",
+        "express publishers",
+        kept=False,
+        why="a burst of 16 messages fills the queue, the rest is lost",
+        loop=Loop.BY_BUS,
+    ),
+    Change(
+        "shared-memory",
+        "zenoh's shared memory",
+        kept=False,
+        why="a receiver that stalls for 100 ms loses messages silently",
+        loop=Loop.BY_BUS,
+    ),
+    Change("queues", "link queues of 2 messages, not 16", kept=False, why="bursts are lost", loop=Loop.BY_BUS),
+    Change(
+        "password",
+        "no user and password",
+        kept=False,
+        why="anybody on the host could send commands",
+        loop=Loop.BY_BUS,
+    ),
+    Change("memoryview", "payloads as memoryview", kept=False, loop=Loop.BY_BUS),
+    Change("bytearray", "payloads as bytearray", kept=False, loop=Loop.BY_BUS),
+)
+_RECORDING = (
     Change(
         "recorder-apart",
-        "recorder off the controller's processor, recording",
+        "recorder off the controller's processor",
         kept=True,
-        often=True,
         keys={"realtime.recorder_cpus": []},
-        record=True,
+        loop=Loop.RECORDING,
     ),
 )
+
+CHANGES: tuple[Change, ...] = (*_AS_IT_IS, *_BY_BUS, *_RECORDING)

@@ -1,4 +1,4 @@
-"""The loop as it is and each change in turns, so that every change has neighbours of its own; figures of both."""
+"""A loop as it is and each change to it in turns, so that every change has neighbours of its own; figures of both."""
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks.road.changes import Change
+from benchmarks.road.changes import Change, Loop
 from benchmarks.road.trip import MIRROR, TripError
 
 SELDOM = 3
@@ -15,12 +15,12 @@ SELDOM = 3
 AT = ("p50", "p99", MIRROR)
 
 Figures = Mapping[str, Any]
-Travel = Callable[[Change | None, bool], Figures]
+Travel = Callable[[Change | None, Loop], Figures]
 
 
 @dataclass
 class Tried:
-    """What was measured of one change: its runs, and the two of the loop as it is beside each."""
+    """What was measured of one change: its runs, and the two of its loop as that is beside each."""
 
     change: Change
     runs: list[Figures] = field(default_factory=list)
@@ -32,21 +32,21 @@ def in_turns(changes: Sequence[Change], repeats: int, travel: Travel) -> list[Tr
     """Run everything.
 
     Args:
-        changes: to be tried; those with the recorder together.
+        changes: to be tried; neighbours in the same loop share runs.
         repeats: of those that are measured often.
-        travel: runs the loop once, with a change or as it is, with the recorder or without.
+        travel: runs a loop once, with a change or as it is.
 
     Raises:
-        TripError: the loop as it is does not run.
+        TripError: a loop does not run as it is.
     """
     tried = [Tried(change) for change in changes]
     for number in range(repeats):
         due = [one for one in tried if one.refused is None and (one.change.often or number < SELDOM)]
-        for record, group in groupby(due, key=lambda one: one.change.record):
-            before = _as_it_is(travel, record)
+        for loop, group in groupby(due, key=lambda one: one.change.loop):
+            before = _as_it_is(travel, loop)
             for one in group:
-                found = travel(one.change, record)
-                after = _as_it_is(travel, record)
+                found = travel(one.change, loop)
+                after = _as_it_is(travel, loop)
                 if "refused" in found:
                     one.refused = found["refused"]
                 else:
@@ -56,10 +56,10 @@ def in_turns(changes: Sequence[Change], repeats: int, travel: Travel) -> list[Tr
     return tried
 
 
-def _as_it_is(travel: Travel, record: bool) -> Figures:
-    found = travel(None, record)
+def _as_it_is(travel: Travel, loop: Loop) -> Figures:
+    found = travel(None, loop)
     if "refused" in found:
-        raise TripError(f"the loop as it is does not run: {found['refused']}")
+        raise TripError(f"the loop {loop} does not run: {found['refused']}")
     return found
 
 
@@ -67,14 +67,15 @@ def figures(tried: Tried) -> dict[str, Any]:
     """What a change brought; before and after are without it and with it, whether it was kept or not.
 
     Returns:
-        name, what, kept, why, refused; where it runs, runs, before and after (p50 and p99 of frame to command, p50 of
-        frame to mirror, us, each median, lowest and highest), ratio (after over before, run by run), frames and
-        frames_without_command of each, and stages_us (p50 of each stage, before and after).
+        name, what, loop, kept, why, refused; where it runs, runs, before and after (p50 and p99 of frame to command,
+        p50 of frame to mirror, us, each median, lowest and highest), ratio (after over before, run by run), frames
+        and frames_without_command of each, and stages_us (p50 of each stage, before and after).
     """
     change = tried.change
     found: dict[str, Any] = {
         "name": change.name,
         "what": change.what,
+        "loop": str(change.loop),
         "kept": change.kept,
         "why": change.why,
         "refused": tried.refused,

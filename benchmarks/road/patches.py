@@ -17,7 +17,7 @@ import zenoh
 from zenoh.handlers import RingChannel
 
 from lowfc.adapters import realtime, zenoh_bus
-from lowfc.adapters.bus import ALL, Sample
+from lowfc.adapters.bus import Sample
 from lowfc.adapters.clock import Clock
 from lowfc.adapters.envelope import Envelope
 from lowfc.adapters.run import Links
@@ -30,6 +30,7 @@ Config = dict[str, Any]
 
 _OFTEN_S = 1e-4
 _PATIENCE_S = 0.1
+_RETRY_MS = 200
 _QUEUE = 2
 _RING = 64
 _ENVIRONMENT_BYTES, _MXCSR = 32, 28  # of fenv_t on x86-64
@@ -42,23 +43,24 @@ class PatchError(Exception):
     """What a patch should replace is not there."""
 
 
-def apply(name: str) -> None:
-    """Replace what the change of this name replaces.
+def apply(names: str) -> None:
+    """Replace what the changes of these names, with commas between, replace.
 
     Raises:
         PatchError: there is no such patch, or nothing to replace.
     """
-    if name not in PATCHES:
-        raise PatchError(f"there is no patch {name!r}; there are {', '.join(PATCHES)}")
-    PATCHES[name]()
+    for name in names.split(","):
+        if name not in PATCHES:
+            raise PatchError(f"there is no patch {name!r}; there are {', '.join(PATCHES)}")
+        PATCHES[name]()
 
 
 @contextlib.contextmanager
-def applied(name: str) -> Iterator[list[tuple[object, str, object]]]:
+def applied(names: str) -> Iterator[list[tuple[object, str, object]]]:
     """The same for a while; owner, name and original of each attribute that is another now."""
     begun = len(_replaced)
     try:
-        apply(name)
+        apply(names)
         yield _replaced[begun:]
     finally:
         while len(_replaced) > begun:
@@ -136,6 +138,10 @@ def _edit(edit: Callable[[Config, Links], None]) -> Callable[[], None]:
     return replace
 
 
+def _asks_often(config: Config, _: Links) -> None:
+    config["connect"]["retry"]["period_max_ms"] = _RETRY_MS
+
+
 def _by_socket(config: Config, links: Links) -> None:
     addresses = {
         f"tcp/127.0.0.1:{port}": f"unixsock-stream/{path}"
@@ -197,7 +203,7 @@ def _channel() -> None:
     convert = _original(zenoh_bus, "_sample")
 
     def subscribe(
-        self: zenoh_bus.ZenohBus, topic: Topic, handler: Callable[[Sample], None], name: str = ALL
+        self: zenoh_bus.ZenohBus, topic: Topic, handler: Callable[[Sample], None], name: str
     ) -> Callable[[], None]:
         subscriber = self._session.declare_subscriber(topic.at(name), RingChannel(_RING))
         left = threading.Event()
@@ -212,7 +218,7 @@ def _channel() -> None:
         threading.Thread(target=receive, daemon=True).start()
         return left.set
 
-    _put(zenoh_bus.ZenohBus, "subscribe", subscribe)
+    _put(zenoh_bus.ZenohBus, "_subscribe", subscribe)
 
 
 def _own_thread() -> None:
@@ -276,6 +282,8 @@ PATCHES: dict[str, Callable[[], None]] = {
     "stay-python": lambda: _put(zenoh_bus, "stay_python", _nothing),
     "let-send": lambda: _put(realtime, "let_send", _nothing),
     "mirror-ahead": lambda: _put(configuration.Realtime, "lowest_priority", property(lambda self: self.priority)),
+    "shortcut": lambda: _put(zenoh_bus.ZenohBus, "_shortcut", _nothing),
+    "retry": _edit(_asks_often),
     "bus-first": _bus_first,
     "socket": _edit(_by_socket),
     "low-latency": _edit(_low_latency),

@@ -3,6 +3,8 @@
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+from benchmarks.road.changes import Loop
+
 HEADINGS = (
     "change",
     "p50 before, us",
@@ -75,7 +77,8 @@ def text(headings: Cells, lines: Sequence[Cells]) -> str:
 
 
 def _line(change: Mapping[str, Any]) -> Cells:
-    name, kept, why = change["what"], "yes" if change["kept"] else "no", change["why"]
+    name = change["what"] if change["loop"] == Loop.AS_IT_IS else f"{change['what']} ({change['loop']})"
+    kept, why = "yes" if change["kept"] else "no", change["why"]
     if "ratio" not in change:
         return (name, *[""] * (len(HEADINGS) - 3), kept, f"it does not run: {change['refused']}")
     before, after = change["before"], change["after"]

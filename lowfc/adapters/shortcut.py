@@ -102,18 +102,16 @@ class ShortcutReader:
         self._listener = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET)
         self._listener.bind(os.fspath(path))
         self._listener.listen(1)
-        self._connection: socket.socket | None = None
-        threading.Thread(target=self._run, name="shortcut", daemon=True).start()
+        self._accepting = threading.Thread(target=self._accept, name="shortcut-accept", daemon=True)
+        self._accepting.start()
 
     def close(self) -> None:
         """Hand on nothing more."""
         if self._closed:
             return
         self._closed = True
-        for one in (self._listener, self._connection):
-            if one is not None:
-                with contextlib.suppress(OSError):
-                    one.shutdown(socket.SHUT_RDWR)  # which ends the wait of the thread
+        _end(self._listener)
+        self._accepting.join()
         if self._leave_bus is not None:
             self._leave_bus()
 
@@ -125,20 +123,33 @@ class ShortcutReader:
                 self._newest_by_bus = sample.sequence
                 self._handler(sample)
 
-    def _run(self) -> None:
+    def _accept(self) -> None:
+        """Serve one writer after the other: who comes anew takes the place of the last."""
+        served: threading.Thread | None = None
+        connection: socket.socket | None = None
         with self._listener:
-            while not self._closed:
+            while True:
                 try:
-                    self._connection, _ = self._listener.accept()
-                except OSError:
+                    coming, _ = self._listener.accept()
+                except OSError:  # closed
+                    coming = None
+                if served is not None and connection is not None:
+                    _end(connection)
+                    served.join()
+                if coming is None:
                     return
-                with self._connection:
-                    self._serve(self._connection)
-                self._connected = False
-                if self._leave_bus is None and not self._closed:
-                    self._leave_bus = self._subscribe(self._by_bus)
+                connection = coming
+                served = threading.Thread(target=self._serve, args=(connection,), name="shortcut", daemon=True)
+                served.start()
 
     def _serve(self, connection: socket.socket) -> None:
+        with connection:
+            self._receive(connection)
+        self._connected = False
+        if self._leave_bus is None and not self._closed:
+            self._leave_bus = self._subscribe(self._by_bus)
+
+    def _receive(self, connection: socket.socket) -> None:
         connection.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, _BUFFER_BYTES)
         buffer = memoryview(bytearray(_BUFFER_BYTES))
         while not self._closed:
@@ -166,3 +177,9 @@ class ShortcutReader:
                 return  # the bus was quicker
             self._newest = sample.sequence
             self._handler(sample)
+
+
+def _end(one: socket.socket) -> None:
+    """End the wait of whoever accepts or receives there."""
+    with contextlib.suppress(OSError):
+        one.shutdown(socket.SHUT_RDWR)
