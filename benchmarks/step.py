@@ -79,7 +79,7 @@ def measure(seconds: float) -> dict[str, Any]:
     config = configuration(size, RATE_HZ)
     calibration, frames = made_up(size, config)
     payloads = Payloads(frames)
-    granted = set_up(config.realtime.lowest_priority or None, None, lock_memory=True, stay_awake=True)
+    granted = set_up(config.realtime.priority or None, None, lock_memory=True, stay_awake=True)
     step = ControlStep(config, calibration, 0)
     memory = allocated(step, payloads)
     x = np.random.default_rng(1).standard_normal(size.pixels, np.float32)

@@ -1,5 +1,7 @@
 """The simulated mirror's process: commands from the bus, state and picture to it."""
 
+import threading
+
 import numpy as np
 import numpy.typing as npt
 from google.protobuf.message import DecodeError
@@ -18,7 +20,7 @@ from sim_dm.device import Device, Told, initial, obey, tick
 
 Single = npt.NDArray[np.float32]
 
-TICK_S = 0.01
+TICK_NS = 10_000_000
 IDLE_STATE_NS = 100_000_000
 """Without commands the state is published this often, so that a restarted controller learns it."""
 PICTURE_PIXELS = 64
@@ -50,7 +52,10 @@ class MirrorProcess:
         self._service = service
         self._device = device(config)
         self._status = initial(self._device)
-        self._commands = service.mailbox(COMMAND, name)
+        self._turn = threading.Lock()
+        self._stopped = threading.Event()
+        service.on_stop(self._stopped.set)
+        self._last_ns = 0
         self._states = service.publisher(MIRROR_STATE, name)
         self._surfaces = service.publisher(SURFACE, name)
         geometry, axis = mirror(config), pupil_axis(PICTURE_PIXELS)
@@ -59,18 +64,26 @@ class MirrorProcess:
         self._picture_due_ns = 0
         self._state_due_ns = 0
         self._refused: Reason | None = None
+        self._leave = service.handover(COMMAND, self._arrived, name)
         service.state = "ready"
 
     def run(self) -> None:
-        """Commands first; without one, the dead-man."""
-        while self._service.running:
-            sample = self._commands.take(TICK_S)
-            if sample is not None:
-                self._follow(sample)
-            elif not self._service.clock.lockstep:
-                self._wait()
-            self._service.beat()
-        self._service.finish()
+        """Do all but the commands, which are obeyed where they arrive: without one, the dead-man."""
+        service = self._service
+        while service.running:
+            self._stopped.wait(TICK_NS * 1e-9)
+            with self._turn:
+                if not service.clock.lockstep and service.clock.host_ns() - self._last_ns >= TICK_NS:
+                    self._wait()
+            service.beat()
+        self._leave()
+        service.finish()
+
+    def _arrived(self, sample: Sample) -> None:
+        """On the thread that receives: a command."""
+        with self._turn:
+            self._follow(sample)
+            self._last_ns = self._service.clock.host_ns()
 
     def _follow(self, sample: Sample) -> None:
         clock = self._service.clock

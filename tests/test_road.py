@@ -20,7 +20,7 @@ from benchmarks.road import loaded, measure, patches, table, trip
 from benchmarks.road.__main__ import settings
 from benchmarks.road.changes import CHANGES, Change, Loop
 from benchmarks.road.load import background
-from lowfc.adapters import realtime, zenoh_bus
+from lowfc.adapters import join, realtime, zenoh_bus
 from lowfc.adapters.clock import HostClock
 from lowfc.adapters.run import open_run
 from lowfc.adapters.zenoh_bus import ZenohBus
@@ -105,10 +105,14 @@ def test_zenoh_takes_the_changed_settings(tmp_path: Path, name: str) -> None:
         assert all(one.startswith("unixsock-stream/") for one in after["connect"]["endpoints"])
 
 
-def test_the_mirror_is_no_longer_ahead() -> None:
-    assert settings().realtime.lowest_priority < settings().realtime.priority
+def test_the_mirror_is_ahead(monkeypatch: pytest.MonkeyPatch) -> None:
+    asked: list[object] = []
+    monkeypatch.setattr(join, "set_up", lambda priority, *_, **__: asked.append(priority))
+    monkeypatch.setattr(join, "receive_in_one_thread", lambda: None)
     with patches.applied("mirror-ahead"):
-        assert settings().realtime.lowest_priority == settings().realtime.priority
+        for role in ("mirror-dm", "controller"):
+            join.prepare(settings(), role, [])
+    assert asked == [settings().realtime.priority + 1, settings().realtime.priority]
 
 
 def test_telemetry_goes_before_the_command(monkeypatch: pytest.MonkeyPatch) -> None:

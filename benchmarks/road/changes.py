@@ -89,7 +89,12 @@ _AS_IT_IS = (
         often=True,
         keys={"realtime.mirror_cpus": _APART.get("realtime.controller_cpus", [])},
     ),
-    Change("mirror-ahead", "mirror one priority ahead of camera and controller", kept=True),
+    Change(
+        "mirror-ahead",
+        "mirror one priority ahead of camera and controller",
+        kept=False,
+        why="where they share a processor, the mirror works while the controller's put waits",
+    ),
     Change(
         "shortcut",
         "a socket beside the bus for who waits: frames to the controller, commands to the mirror",

@@ -16,14 +16,14 @@ from typing import Any
 import zenoh
 from zenoh.handlers import RingChannel
 
-from lowfc.adapters import realtime, zenoh_bus
+from lowfc.adapters import join, realtime, zenoh_bus
 from lowfc.adapters.bus import Sample
 from lowfc.adapters.clock import Clock
 from lowfc.adapters.envelope import Envelope
 from lowfc.adapters.run import Links
 from lowfc.adapters.service import Service
-from lowfc.contract import configuration
-from lowfc.contract.messages import Topic
+from lowfc.contract.configuration import Configuration
+from lowfc.contract.messages import Role, Topic
 from lowfc.control.inputs import Outputs
 
 Config = dict[str, Any]
@@ -253,6 +253,20 @@ def _payload(kind: Callable[[bytes], Any]) -> Callable[[], None]:
     return replace
 
 
+def _mirror_ahead() -> None:
+    original = _original(join, "prepare")
+
+    @functools.wraps(original)
+    def prepare(config: Configuration, role: str, cpus: list[int]) -> realtime.Granted:
+        if role.startswith(Role.MIRROR) and config.realtime.priority:
+            ahead = {"priority": config.realtime.priority + 1}
+            config = config.model_copy(update={"realtime": config.realtime.model_copy(update=ahead)})
+        granted: realtime.Granted = original(config, role, cpus)
+        return granted
+
+    _put(join, "prepare", prepare)
+
+
 def _telemetry_first() -> None:
     from lowfc.programs.controller import Controller
 
@@ -281,7 +295,7 @@ PATCHES: dict[str, Callable[[], None]] = {
     "denormals": _denormals_flushed,
     "stay-python": lambda: _put(zenoh_bus, "stay_python", _nothing),
     "let-send": lambda: _put(realtime, "let_send", _nothing),
-    "mirror-ahead": lambda: _put(configuration.Realtime, "lowest_priority", property(lambda self: self.priority)),
+    "mirror-ahead": _mirror_ahead,
     "shortcut": lambda: _put(zenoh_bus.ZenohBus, "_shortcut", _nothing),
     "retry": _edit(_asks_often),
     "bus-first": _bus_first,

@@ -17,13 +17,12 @@ def clock_of(config: Configuration) -> Clock:
 def prepare(config: Configuration, role: str, cpus: list[int]) -> Granted:
     """Set this process up for a role in the loop, before its first session, whose threads keep what they are born with.
 
-    The mirror runs ahead of the others: where it shares a processor with the controller, a command is applied before
-    the controller tells of it.
+    All have the same priority: where the mirror shares a processor with the controller, which yields after its put, a
+    command is applied before the controller tells of it.
     """
     realtime = config.realtime
-    priority = realtime.priority if role.startswith(Role.MIRROR) else realtime.lowest_priority
     granted = set_up(
-        priority or None,
+        realtime.priority or None,
         set(cpus) or None,
         lock_memory=realtime.lock_memory,
         stay_awake=realtime.stay_awake,

@@ -121,10 +121,12 @@ def step_back(priority: int | None, cpus: set[int] | None = None) -> Granted:
 def let_send() -> None:
     """Let the bus's thread send what was just put before this one goes on.
 
-    Of equal SCHED_FIFO priority and on the same processor, it would wait until this one rests. In the normal class the
-    kernel sees to that, and yielding would give way to everybody.
+    Of equal SCHED_FIFO priority and on the same processor, it would wait until this one rests; so would the mirror that
+    got a command, and the bus's thread of the mirror, which is woken only then. In the normal class the kernel sees to
+    that, and yielding would give way to everybody.
     """
     if os.sched_getscheduler(0) == os.SCHED_FIFO:
+        os.sched_yield()
         os.sched_yield()
 
 

@@ -59,6 +59,7 @@ class Service:
         self._granted = granted
         self.fill = fill
         self._state = "starting"
+        self._fault: Exception | None = None
         self._known: set[tuple[str, int]] = set()
         self._wakers: list[Callable[[], None]] = []
         self._event_lock = threading.Lock()
@@ -86,11 +87,22 @@ class Service:
         self.bus.subscribe(topic, mailbox.put, name or ALL)
         return mailbox
 
-    def handover(self, topic: Topic, handler: Callable[[Sample], None]) -> Callable[[], None]:
-        """Handle a topic's messages on the bus's thread, counted in Health; call what is returned to leave off."""
-        handover = Handover(topic.key, handler, self.clock.host_ns)
+    def handover(self, topic: Topic, handler: Callable[[Sample], None], name: str = "") -> Callable[[], None]:
+        """Handle a topic's messages on the thread that receives them, counted in Health; what is returned ends it.
+
+        What the handler raises ends the process: `finish` raises it again. The bus would count it and go on.
+        """
+
+        def handle(sample: Sample) -> None:
+            try:
+                handler(sample)
+            except Exception as fault:
+                self._fault = fault
+                self.stop("a message could not be dealt with")
+
+        handover = Handover(topic.at(name), handle, self.clock.host_ns)
         self.arrivals.append(handover)
-        return self.bus.subscribe(topic, handover.put)
+        return self.bus.subscribe(topic, handover.put, name or ALL)
 
     def newcomers(self) -> bool:
         """Whether somebody is heard whom the last call did not know: who answers what is asked, or answers anew."""
@@ -135,7 +147,13 @@ class Service:
             self._send_health(now_ns)
 
     def finish(self) -> None:
-        """Send the last Health, with all counts: nothing may be published after it."""
+        """Send the last Health, with all counts: nothing may be published after it.
+
+        Raises:
+            Exception: what ended the process, where a handler failed.
+        """
+        if self._fault is not None:
+            raise self._fault
         self.event("STOPPED", process=self.name, why=self.why)
         self.state = "stopped"
 

@@ -244,7 +244,7 @@ class Realtime(Section):
     """What is asked of the host, in every process, before its first bus session."""
 
     priority: int = Field(50, ge=0, le=98)
-    """SCHED_FIFO priority of the mirror; camera and controller are one below it; 0 for normal scheduling."""
+    """SCHED_FIFO priority of camera, controller and mirror; 0 for normal scheduling."""
     recorder_priority: int = Field(10, ge=0, le=98)
     """SCHED_FIFO priority of the recorder, below the loop's; 0, or a loop without, for normal scheduling."""
     lock_memory: bool = True
@@ -261,11 +261,6 @@ class Realtime(Section):
     """Processors of the mirror; empty for all."""
     recorder_cpus: list[int] = Field(default_factory=list)
     """Processors of the recorder; empty for all. sim-loop keeps it off the controller's."""
-
-    @property
-    def lowest_priority(self) -> int:
-        """SCHED_FIFO priority of camera and controller; 0 for normal scheduling."""
-        return max(1, self.priority - 1) if self.priority else 0
 
 
 class Configuration(Section):
@@ -303,11 +298,10 @@ class Configuration(Section):
             raise ValueError(
                 f"control.delay_frames is at least 1, or 0 for the camera's; got {self.control.delay_frames}"
             )
-        lowest = self.realtime.lowest_priority
-        if lowest and lowest <= self.realtime.recorder_priority:
+        if 0 < self.realtime.priority <= self.realtime.recorder_priority:
             raise ValueError(
-                f"realtime.recorder_priority, {self.realtime.recorder_priority}, must be below the loop's lowest, "
-                f"{lowest}: realtime.priority is {self.realtime.priority}, and camera and controller are one below it"
+                f"realtime.recorder_priority, {self.realtime.recorder_priority}, must be below the loop's "
+                f"realtime.priority, {self.realtime.priority}"
             )
         actuators = self.mirror.rows * self.mirror.columns
         for key in map(str, (*self.mirror.dead, *self.mirror.stuck_nm)):

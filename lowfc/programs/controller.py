@@ -68,7 +68,6 @@ class Controller:
         self._turn = threading.Lock()
         self._adopted = False
         self._early: Sample | None = None
-        self._fault: Exception | None = None
         self._leave_camera = service.handover(FRAME, self._arrived)
         self._mirror = Mailbox(MIRROR_STATE.at(name))
         self._leave_mirror = service.bus.subscribe(MIRROR_STATE, self._mirror.put, name)
@@ -103,8 +102,6 @@ class Controller:
             with self._turn:
                 self._between_frames(camera)
             self._service.beat()
-        if self._fault is not None:
-            raise self._fault
         self._leave_camera()
         with self._turn:
             self._publish_timing()
@@ -118,16 +115,12 @@ class Controller:
             health.frame_to_command.CopyFrom(codec.latency(self._frame_to_command))
 
     def _arrived(self, sample: Sample) -> None:
-        """On the bus's thread: a frame; the newest one waits until it is known where the mirror is."""
-        try:
-            with self._turn:
-                if self._adopted:
-                    self._frame(sample)
-                else:
-                    self._early = sample
-        except Exception as fault:  # the bus would count it and go on: it shall end the process
-            self._fault = fault
-            self._service.stop("a frame could not be dealt with")
+        """On the thread that receives: a frame; the newest one waits until it is known where the mirror is."""
+        with self._turn:
+            if self._adopted:
+                self._frame(sample)
+            else:
+                self._early = sample
 
     def _frame(self, sample: Sample) -> None:
         """One step: the command goes out before anything else is encoded."""

@@ -194,7 +194,7 @@ def test_an_older_state_does_not_replace_a_newer_one() -> None:
     made = night()
     gatherer = Gatherer()
     states = [one for one in made.samples if one.key == CONTROLLER_STATE.key]
-    old, new = states[0], dataclasses.replace(states[0], sequence=states[0].sequence + 1, payload=b"")
+    old, new = states[0], states[0]._replace(sequence=states[0].sequence + 1, payload=b"")
     for sample in (new, old):
         gatherer.take(CONTROLLER_STATE, sample.key, sample.payload, sample.publish_time_ns, sample.sequence)
     assert gatherer.moment(0).controller == wire.ControllerState()
