@@ -103,12 +103,7 @@ def render(measured: dict[str, Any]) -> str:
     where = (
         "Latencies are p50 / p99 / p99.9; predicted is for the delay as measured, without the frames that were lost; "
         "the rate is that of the host's clock. "
-        + (
-            "On two cores the mirror applies a command within the controller's put. "
-            if about["processors"] == 2
-            else ""
-        )
-        + f"Measured {about['date']} on {about['processors']} cores of "
+        f"Measured {about['date']} on {about['processors']} cores of "
         f"{about['processor']} (a virtual machine, Linux {about['kernel']}, Python {about['python']}, load "
         f"{about['load_before']} before) by `python docs/measure.py`, which runs `{' '.join(measured['command'])}`."
     )
