@@ -9,6 +9,7 @@ from google.protobuf.message import DecodeError
 from lowfc.adapters.bus import Sample
 from lowfc.adapters.clock import SimulatedClock
 from lowfc.adapters.instrument import mirror, mirror_limits
+from lowfc.adapters.mailbox import Mailbox
 from lowfc.adapters.service import Service
 from lowfc.contract.codec import actuators
 from lowfc.contract.configuration import Configuration
@@ -53,9 +54,9 @@ class MirrorProcess:
         self._device = device(config)
         self._status = initial(self._device)
         self._turn = threading.Lock()
-        self._stopped = threading.Event()
-        service.on_stop(self._stopped.set)
-        self._last_ns = 0
+        self._pause = Mailbox()  # nothing comes there: a signal can end its wait, wherever it strikes
+        service.on_stop(self._pause.wake)
+        self._obeyed_ns = 0
         self._states = service.publisher(MIRROR_STATE, name)
         self._surfaces = service.publisher(SURFACE, name)
         geometry, axis = mirror(config), pupil_axis(PICTURE_PIXELS)
@@ -64,26 +65,26 @@ class MirrorProcess:
         self._picture_due_ns = 0
         self._state_due_ns = 0
         self._refused: Reason | None = None
-        self._leave = service.handover(COMMAND, self._arrived, name)
+        self._leave = service.handover(COMMAND, self._arrived, name, period_ns=config.period_ns)
         service.state = "ready"
 
     def run(self) -> None:
         """Do all but the commands, which are obeyed where they arrive: without one, the dead-man."""
         service = self._service
         while service.running:
-            self._stopped.wait(TICK_NS * 1e-9)
+            self._pause.take(TICK_NS * 1e-9)
             with self._turn:
-                if not service.clock.lockstep and service.clock.host_ns() - self._last_ns >= TICK_NS:
+                if not service.clock.lockstep and service.clock.host_ns() - self._obeyed_ns >= TICK_NS:
                     self._wait()
             service.beat()
         self._leave()
         service.finish()
 
     def _arrived(self, sample: Sample) -> None:
-        """On the thread that receives: a command."""
+        """On the thread that receives: a command. Those that waited while this process stood still are skipped."""
         with self._turn:
-            self._follow(sample)
-            self._last_ns = self._service.clock.host_ns()
+            if self._service.running:
+                self._follow(sample)
 
     def _follow(self, sample: Sample) -> None:
         clock = self._service.clock
@@ -101,6 +102,8 @@ class MirrorProcess:
         if refused is not None and refused is not self._refused:
             self._service.event("COMMAND_REFUSED", reason=refused.name)
         self._refused = refused
+        if refused is None:
+            self._obeyed_ns = clock.host_ns()
         if not before.following and before.frame_sequence and refused is None:
             self._service.event("COMMAND_BACK")
         for reason in self._status.limits_hit:

@@ -2,6 +2,7 @@
 
 import tempfile
 import threading
+import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -399,7 +400,7 @@ def test_a_frame_that_cannot_be_dealt_with_ends_the_controller(
     service = Service("controller", "test", HostClock(), MemoryBus(hub, "controller", HostClock()))
     controller = Controller(configured(lockstep=False), service, rig.calibration, "a test", tmp_path / "safed")
 
-    def broken(_: Sample) -> None:
+    def broken(*_: object) -> None:
         raise ArithmeticError("one and one is three")
 
     monkeypatch.setattr(controller, "_frame", broken)
@@ -409,3 +410,52 @@ def test_a_frame_that_cannot_be_dealt_with_ends_the_controller(
     with pytest.raises(ArithmeticError, match="three"):
         controller.run()
     late.join()
+
+
+def test_frames_that_waited_are_not_all_integrated(calibration: Calibration, scene: Bench) -> None:
+    """They saw one and the same mirror: together they may move the command by one gain, not by ten."""
+    config = configured(lockstep=False, control__start_mode="closed")
+    with running(config, calibration, scene) as rig:
+        rig.inject(2.0 * np.eye(14)[3])
+        pixels = scene.expose(0, rig.offset_nm)[0]
+        rig.until("a mirror that waits", lambda: MIRROR_STATE.key in rig.said)
+        payload = image(pixels, 1, "camera").SerializeToString()
+        handover = next(one for one in rig.services[0].arrivals if one.key == FRAME.key)
+        deadline_s = time.monotonic() + PATIENCE_S
+        while not rig.controller._adopted:
+            assert time.monotonic() < deadline_s
+            time.sleep(0.01)
+        now_ns = HostClock().now_ns()
+        for age in range(9, -1, -1):  # periods; they arrive one upon the other, after the controller stood still
+            handover.put(Sample(FRAME.key, payload, (9 << 32) - age, now_ns - age * config.period_ns, now_ns))
+        steps = rig.said[STEP.key][-10:]
+    used = [step for step in steps if not step.reasons]
+    assert len(steps) == 10
+    assert used == steps[-1:]
+    assert all(list(step.reasons) == [wire.REASON_LATE] for step in steps[:-1])
+    assert abs(used[0].error_nm[3]) > 1
+    assert used[0].command_nm[3] == pytest.approx(-config.control.gain * used[0].error_nm[3], rel=1e-3)
+
+
+NOT_FINITE = np.full((34, 34), np.nan, np.float32).tobytes()
+
+
+@pytest.mark.parametrize("actuators", [b"", NOT_FINITE])
+def test_what_the_mirror_refuses_does_not_feed_its_dead_man(
+    calibration: Calibration, scene: Bench, actuators: bytes
+) -> None:
+    """However much of it comes."""
+    with running(configured(lockstep=False, control__valid_ms=50.0), calibration, scene) as rig:
+        rig.until("a mirror that waits", lambda: MIRROR_STATE.key in rig.said)
+        rig.put(scene.expose(0, rig.offset_nm)[0])
+        rig.services[0].stop("the controller has died")
+        rig.threads[1].join(PATIENCE_S)
+        other = rig.bus("other").publisher(COMMAND, "dm")
+        nonsense = wire.MirrorCommand(
+            rows=34, columns=34, actuators=actuators, frame_sequence=2**63, valid_for_ns=10**9
+        )
+        deadline_s = time.monotonic() + PATIENCE_S
+        while "COMMAND_EXPIRED" not in rig.events():
+            other.put(nonsense.SerializeToString())
+            time.sleep(0.001)
+            assert time.monotonic() < deadline_s

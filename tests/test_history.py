@@ -1,7 +1,6 @@
 """A history of a log whose values protobuf allows, and nobody of the loop would send."""
 
 from collections.abc import Callable
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -23,7 +22,7 @@ def changed(night: Night, topic: Topic, change: Callable[[Any], object]) -> None
     sample = night.samples[number]
     message: Message = topic.message.FromString(sample.payload)
     change(message)
-    night.samples[number] = replace(sample, payload=message.SerializeToString())
+    night.samples[number] = sample._replace(payload=message.SerializeToString())
 
 
 def history_of(night: Night, path: Path) -> History:

@@ -118,7 +118,7 @@ def night(taken: list[Input], **changes: object) -> Night:
 def of_another_camera(taken: list[Input]) -> list[Input]:
     """The same after a restart of the camera, so that no two frames share sequence and time."""
     return [
-        changed(one, sequence=one.sequence + (1 << 32), time_ns=one.time_ns + 10**9) if isinstance(one, Frame) else one
+        one._replace(sequence=one.sequence + (1 << 32), time_ns=one.time_ns + 10**9) if isinstance(one, Frame) else one
         for one in taken
     ]
 

@@ -1,6 +1,6 @@
 """Whoever reads a controller's state from the wire goes on as the controller does, to the bit."""
 
-from dataclasses import fields, replace
+from dataclasses import fields
 
 import numpy as np
 import pytest
@@ -110,6 +110,6 @@ def test_only_what_makes_a_difference_is_counted() -> None:
     idle = [Tick(1, 1), CameraSettings(1, CALIBRATION.shape, 100.0, CALIBRATION.saturation_dn)]
     state, _ = fold(what, state, idle)
     assert state.taken == 1
-    different: list[Input] = [frame(1), Tick(1, 1), Request(1, "open"), replace(frame(2), pixels=None)]
+    different: list[Input] = [frame(1), Tick(1, 1), Request(1, "open"), frame(2)._replace(pixels=None)]
     assert fold(what, state, different)[0].taken == 5
     assert isinstance(different[0], Frame)

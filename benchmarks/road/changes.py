@@ -97,7 +97,7 @@ _AS_IT_IS = (
     ),
     Change(
         "shortcut",
-        "a socket beside the bus for who waits: frames to the controller, commands to the mirror",
+        "a socket beside the bus for frames to the controller",
         kept=True,
         often=True,
     ),

@@ -1,7 +1,7 @@
 """What the processes ask of a message bus: publish, subscribe, answer, ask.
 
-`ZenohBus` carries the messages between processes; `MemoryBus` does the same within one, for tests. Handlers run on the
-bus's own thread and must be short: put into a mailbox, append to a queue.
+`ZenohBus` carries the messages between processes; `MemoryBus` does the same within one, for tests. Handlers run on
+the thread that receives, one message after the other: what they take, the next one waits for.
 """
 
 import sys

@@ -1,4 +1,4 @@
-"""A message handed on where it arrives, on the bus's own thread: nobody has to be woken for it."""
+"""A message handed on where it arrives, on the thread that receives: nobody has to be woken for it."""
 
 from collections.abc import Callable
 
@@ -6,41 +6,67 @@ from lowfc.adapters.arrivals import Arrivals
 from lowfc.adapters.bus import Sample
 
 MOST_IN_A_ROW = 16
-"""Messages that may wait behind each other before some are skipped."""
+"""Messages that are handed on one upon the other before some are skipped."""
 REST_NS = 50_000
 """Without a message for so long, there is none that waits."""
+LONG_AGO_NS = 5_000_000
+"""Age at which a message is old, whatever came before it, and at three periods where these are longer."""
 
 
 class Handover(Arrivals):
-    """Hands each message to a handler in the order in which they come, and falls behind by a few at most.
+    """Hands each message to a handler in the order in which they come, and says which were overtaken.
 
-    What comes in a burst is handled message by message, so that nothing is lost to a short stall. When a handler does
-    not keep up, messages wait ahead of the bus's thread, where nobody sees them; that they come one upon the other is
-    the sign of it. After `MOST_IN_A_ROW` of them, all that wait are skipped.
+    What comes while its reader stands still waits. One that is a period old when it is handed on, right behind another,
+    has been overtaken by a newer one; so has one that is older than `LONG_AGO_NS`. A handler that does not keep up
+    would fall behind for good: after `MOST_IN_A_ROW` messages one upon the other, all that still wait are skipped.
     """
 
-    def __init__(self, key: str, handler: Callable[[Sample], None], now_ns: Callable[[], int]) -> None:
-        """Hand messages of this key to `handler`; `now_ns` is the clock of their `receive_time_ns`."""
+    def __init__(
+        self,
+        key: str,
+        handler: Callable[[Sample], None],
+        now_ns: Callable[[], int],
+        period_ns: int | None = None,
+        overtaken: Callable[[Sample], None] | None = None,
+    ) -> None:
+        """Hand messages on.
+
+        Args:
+            key: of the messages.
+            handler: gets them.
+            now_ns: the clock of their `receive_time_ns`.
+            period_ns: of the messages; None where each waits for the answer to the last one: none is ever overtaken.
+            overtaken: gets those that were overtaken, instead of `handler`; they are skipped when None.
+        """
         super().__init__(key)
-        self._skipped = 0
         self._handler = handler
         self._now_ns = now_ns
+        self._period_ns = period_ns
+        self._old_ns = max(LONG_AGO_NS, 3 * (period_ns or 0))
+        self._overtaken = overtaken
+        self._skipped = 0
         self._in_a_row = 0
         self._done_ns = 0
 
     @property
     def skipped(self) -> int:
-        """Messages that waited behind too many others."""
+        """Messages that were overtaken, or waited behind too many others."""
         return self._skipped
 
     def put(self, sample: Sample) -> None:
-        """Hand a message on, or skip it; called on the bus's thread."""
-        self.count(sample)
-        if sample.receive_time_ns - self._done_ns > REST_NS:
-            self._in_a_row = 0
-        self._in_a_row += 1
-        if self._in_a_row > MOST_IN_A_ROW:
+        """Hand a message on, or skip it; called on the thread that receives, one message at a time."""
+        handler: Callable[[Sample], None] | None = self._handler
+        if self._period_ns is not None:
+            crowded = sample.receive_time_ns - self._done_ns <= REST_NS
+            self._in_a_row = self._in_a_row + 1 if crowded else 1
+            age_ns = sample.receive_time_ns - sample.publish_time_ns
+            if self._in_a_row > MOST_IN_A_ROW:
+                handler = None
+            elif age_ns >= (self._period_ns if crowded else self._old_ns):
+                handler = self._overtaken
+        if handler is None:
             self._skipped += 1
         else:
-            self._handler(sample)
+            handler(sample)
+        self.count(sample)
         self._done_ns = self._now_ns()

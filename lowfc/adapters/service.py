@@ -87,20 +87,38 @@ class Service:
         self.bus.subscribe(topic, mailbox.put, name or ALL)
         return mailbox
 
-    def handover(self, topic: Topic, handler: Callable[[Sample], None], name: str = "") -> Callable[[], None]:
+    def handover(
+        self,
+        topic: Topic,
+        handler: Callable[[Sample], None],
+        name: str = "",
+        *,
+        period_ns: int,
+        overtaken: Callable[[Sample], None] | None = None,
+    ) -> Callable[[], None]:
         """Handle a topic's messages on the thread that receives them, counted in Health; what is returned ends it.
 
-        What the handler raises ends the process: `finish` raises it again. The bus would count it and go on.
+        What a handler raises ends the process: `finish` raises it again. The bus would count it and go on. Periods and
+        `overtaken` are as for `Handover`; in lockstep none is overtaken.
         """
 
-        def handle(sample: Sample) -> None:
-            try:
-                handler(sample)
-            except Exception as fault:
-                self._fault = fault
-                self.stop("a message could not be dealt with")
+        def guarded(handle: Callable[[Sample], None]) -> Callable[[Sample], None]:
+            def guard(sample: Sample) -> None:
+                try:
+                    handle(sample)
+                except Exception as fault:
+                    self._fault = fault
+                    self.stop("a message could not be dealt with")
 
-        handover = Handover(topic.at(name), handle, self.clock.host_ns)
+            return guard
+
+        handover = Handover(
+            topic.at(name),
+            guarded(handler),
+            self.clock.host_ns,
+            None if self.clock.lockstep else period_ns,
+            None if overtaken is None else guarded(overtaken),
+        )
         self.arrivals.append(handover)
         return self.bus.subscribe(topic, handover.put, name or ALL)
 

@@ -6,6 +6,8 @@ host, or without this library, is heard by the bus as ever.
 """
 
 import contextlib
+import errno
+import math
 import os
 import socket
 import threading
@@ -18,7 +20,7 @@ from lowfc.adapters.envelope import Envelope
 
 Handler = Callable[[Sample], None]
 
-_BUFFER_BYTES = 4 << 20  # some hundred frames, where the host allows it
+_BUFFER_BYTES = 4 << 20  # some hundred frames, where the host allows it; the kernel allows twice as much
 _RETRY_S = 0.1
 _ENVELOPE_BYTES = len(Envelope(0, 0).encode())
 
@@ -42,8 +44,10 @@ class ShortcutWriter:
             self._socket.sendmsg((envelope, payload))
         except BlockingIOError:
             return
-        except OSError:  # the reader has gone, or this is more than a socket takes on this host
-            self.close()
+        except OSError as fault:
+            self.close()  # the reader has gone
+            if fault.errno == errno.EMSGSIZE:  # more than a socket takes on this host: it will be so with the next
+                self._again_s = math.inf
 
     def close(self) -> None:
         """Leave the reader to the bus."""
@@ -67,7 +71,10 @@ class ShortcutWriter:
 
 
 class ShortcutReader:
-    """Hands on every message once: by the socket while a writer has it, by the bus otherwise."""
+    """Hands on each message once: by the socket while a writer has it, by the bus otherwise.
+
+    A message that is still on the bus when a newer one has come by the socket is too late, and left out.
+    """
 
     def __init__(
         self,
@@ -94,7 +101,7 @@ class ShortcutReader:
         self._failed = failed
         self._turn = threading.Lock()
         self._key = key
-        self._newest = self._newest_by_bus = -1
+        self._first = self._newest = self._newest_by_bus = -1
         self._connected = self._closed = False
         self._both = False
         self._leave_bus: Callable[[], None] | None = subscribe(self._by_bus)
@@ -106,10 +113,11 @@ class ShortcutReader:
         self._accepting.start()
 
     def close(self) -> None:
-        """Hand on nothing more."""
-        if self._closed:
-            return
-        self._closed = True
+        """Hand on nothing more; for any thread but those that hand on."""
+        with self._turn:
+            if self._closed:
+                return
+            self._closed = True
         _end(self._listener)
         self._accepting.join()
         if self._leave_bus is not None:
@@ -118,7 +126,7 @@ class ShortcutReader:
     def _by_bus(self, sample: Sample) -> None:
         with self._turn:
             if self._connected and sample.sequence <= self._newest:
-                self._both = True  # whatever the bus had before the writer came has been handed on
+                self._both = self._both or sample.sequence >= self._first  # it has come by both: the bus can be left
             elif not self._closed:
                 self._newest_by_bus = sample.sequence
                 self._handler(sample)
@@ -129,10 +137,12 @@ class ShortcutReader:
         connection: socket.socket | None = None
         with self._listener:
             while True:
-                try:
+                coming = None
+                with contextlib.suppress(OSError):
                     coming, _ = self._listener.accept()
-                except OSError:  # closed
-                    coming = None
+                if coming is None and not self._closed:  # out of descriptors, say
+                    time.sleep(_RETRY_S)
+                    continue
                 if served is not None and connection is not None:
                     _end(connection)
                     served.join()
@@ -145,13 +155,14 @@ class ShortcutReader:
     def _serve(self, connection: socket.socket) -> None:
         with connection:
             self._receive(connection)
-        self._connected = False
+        with self._turn:
+            self._connected = self._both = False
+            self._first = -1
         if self._leave_bus is None and not self._closed:
             self._leave_bus = self._subscribe(self._by_bus)
 
     def _receive(self, connection: socket.socket) -> None:
-        connection.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, _BUFFER_BYTES)
-        buffer = memoryview(bytearray(_BUFFER_BYTES))
+        buffer = memoryview(bytearray(2 * _BUFFER_BYTES))
         while not self._closed:
             try:
                 size = connection.recv_into(buffer)
@@ -172,7 +183,11 @@ class ShortcutReader:
 
     def _by_socket(self, sample: Sample) -> None:
         with self._turn:
+            if self._closed:
+                return
             self._connected = True
+            if self._first < 0:
+                self._first = sample.sequence
             if self._leave_bus is not None and sample.sequence <= self._newest_by_bus:
                 return  # the bus was quicker
             self._newest = sample.sequence

@@ -20,10 +20,10 @@ from zenoh.handlers import Callback, Handler, RingChannel
 from lowfc.adapters.bus import ALL, Faults, Query, Sample
 from lowfc.adapters.clock import Clock
 from lowfc.adapters.envelope import Envelope, sequence_of
-from lowfc.adapters.run import Links, mirror_role
+from lowfc.adapters.run import Links
 from lowfc.adapters.shortcut import ShortcutReader, ShortcutWriter
 from lowfc.contract.errors import BusError
-from lowfc.contract.messages import TOPICS, Role, Topic
+from lowfc.contract.messages import TOPICS, Topic
 
 _SOCKET = "unixsock-stream"
 _GLANCES_HZ = 40.0  # a view draws 30 pictures a second; each finds a new one
@@ -230,13 +230,13 @@ class ZenohBus:
 
     def publisher(self, topic: Topic, name: str = "") -> ZenohPublisher:
         """See `Bus.publisher`."""
-        publisher = ZenohPublisher(self, self._session, topic, topic.at(name), self._shortcut(topic, name))
+        publisher = ZenohPublisher(self, self._session, topic, topic.at(name), self._shortcut(topic))
         self._closers.append(publisher.close)
         return publisher
 
     def subscribe(self, topic: Topic, handler: Callable[[Sample], None], name: str = ALL) -> Callable[[], None]:
         """See `Bus.subscribe`; `handler` runs on a thread that receives, on one at a time."""
-        if self._reader(topic, name) != self.role or (path := self._shortcut(topic, name)) is None:
+        if topic.reader != self.role or (path := self._shortcut(topic)) is None:
             return self._subscribe(topic, handler, name)
         key = topic.at(name)
         reader = ShortcutReader(
@@ -320,13 +320,8 @@ class ZenohBus:
         with contextlib.suppress(zenoh.ZError):
             self._session.close()  # type: ignore[no-untyped-call]
 
-    def _reader(self, topic: Topic, name: str) -> str | None:
-        """Role of the process that waits for this topic."""
-        return mirror_role(name) if topic.reader is Role.MIRROR else topic.reader
-
-    def _shortcut(self, topic: Topic, name: str) -> Path | None:
-        reader = self._reader(topic, name)
-        return None if reader is None else self._links.shortcut(reader)
+    def _shortcut(self, topic: Topic) -> Path | None:
+        return None if topic.reader is None else self._links.shortcut(topic.reader)
 
     @contextlib.contextmanager
     def replying(self, query: zenoh.Query) -> Iterator[None]:

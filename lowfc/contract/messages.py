@@ -54,7 +54,7 @@ class Topic:
         timeless: in lockstep two runs with the same seed write the same payload bytes.
         queryable: a late joiner may ask the publisher for the last one.
         newest_only: who looks at a run wants the newest only, and gets no more than eyes can follow.
-        reader: who waits for it, and gets it first by a way of its own where that is on the same host.
+        reader: who waits for it, and gets it by a way of its own from a publisher on the same host; of one publisher.
         sentence: what it is.
     """
 
@@ -146,7 +146,6 @@ COMMAND = Topic(
     _CONTROLLER,
     _MIRROR | {Role.RECORDER},
     "Where the mirror shall be.",
-    reader=Role.MIRROR,
 )
 MIRROR_STATE = Topic(
     "lowfc/mirror/{name}/state",

@@ -3,6 +3,7 @@
 import threading
 from collections import deque
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 from lowfc.adapters.bus import ALL, Query, Sample
@@ -68,7 +69,9 @@ class Controller:
         self._turn = threading.Lock()
         self._adopted = False
         self._early: Sample | None = None
-        self._leave_camera = service.handover(FRAME, self._arrived)
+        self._leave_camera = service.handover(
+            FRAME, self._arrived, period_ns=config.period_ns, overtaken=partial(self._arrived, overtaken=True)
+        )
         self._mirror = Mailbox(MIRROR_STATE.at(name))
         self._leave_mirror = service.bus.subscribe(MIRROR_STATE, self._mirror.put, name)
         self._camera = service.mailbox(CAMERA_STATE)
@@ -114,19 +117,25 @@ class Controller:
         if self._frame_to_command.count:
             health.frame_to_command.CopyFrom(codec.latency(self._frame_to_command))
 
-    def _arrived(self, sample: Sample) -> None:
+    def _arrived(self, sample: Sample, *, overtaken: bool = False) -> None:
         """On the thread that receives: a frame; the newest one waits until it is known where the mirror is."""
         with self._turn:
-            if self._adopted:
-                self._frame(sample)
-            else:
+            if not self._adopted:
                 self._early = sample
+            elif self._service.running:
+                self._frame(sample, overtaken)
 
-    def _frame(self, sample: Sample) -> None:
-        """One step: the command goes out before anything else is encoded."""
+    def _frame(self, sample: Sample, overtaken: bool = False) -> None:
+        """One step: the command goes out before anything else is encoded.
+
+        A frame that was overtaken is late, whatever its age, and the command is held: frames exposed under one mirror
+        shape must not all be integrated.
+        """
         clock = self._service.clock
         taken_ns = clock.host_ns()
         age_ns = 0 if clock.lockstep else taken_ns - sample.publish_time_ns
+        if overtaken:
+            age_ns = max(age_ns, self._settings.late_ns + 1)
         frame = codec.decode_frame(sample.payload, sample.sequence, age_ns)
         if isinstance(clock, SimulatedClock):
             clock.set_ns(frame.time_ns)

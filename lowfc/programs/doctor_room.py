@@ -89,24 +89,20 @@ def blas(facts: Facts) -> Finding:
 def socket_buffers(facts: Facts) -> Finding:
     """Bytes that sockets hold for a slow reader: `net.core.{r,w}mem_{default,max}` and `net.ipv4.tcp_{r,w}mem`.
 
-    TCP, by which the processes talk, or a Unix socket, by which frames go to the controller, holds less than 100 ms of
-    the loop's frames, commands and mirror states.
+    TCP, by which the processes talk, holds less than 100 ms of the loop's frames, commands and mirror states.
     """
     default_bytes, largest_bytes, tcp_bytes = facts.host.socket_buffers()
-    tcp_s, other_s = tcp_bytes / facts.bytes_per_s, largest_bytes / facts.bytes_per_s
+    held_s = tcp_bytes / facts.bytes_per_s
     detail = (
-        f"TCP up to {tcp_bytes / 1e3:.0f} kB, {tcp_s * 1e3:.0f} ms of the loop's traffic; other sockets "
-        f"{default_bytes / 1e3:.0f} kB, at most {largest_bytes / 1e3:.0f} kB, {other_s * 1e3:.0f} ms"
+        f"TCP up to {tcp_bytes / 1e3:.0f} kB, {held_s * 1e3:.0f} ms of the loop's traffic; other sockets "
+        f"{default_bytes / 1e3:.0f} kB, at most {largest_bytes / 1e3:.0f} kB"
     )
-    held_s, need = min(tcp_s, other_s), round(facts.bytes_per_s * _STALL_S)
     if held_s >= _STALL_S:
         return ok(detail)
-    raised = f"set sysctl net.core.wmem_max to {need} or more"
-    if tcp_s < _STALL_S:
-        raised = f"raise the third value of sysctl net.ipv4.tcp_rmem and net.ipv4.tcp_wmem to {need} or more"
+    need = round(facts.bytes_per_s * _STALL_S)
     return warning(
         detail,
-        raised,
+        f"raise the third value of sysctl net.ipv4.tcp_rmem and net.ipv4.tcp_wmem to {need} or more",
         f"a reader that stands still for more than {held_s * 1e3:.0f} ms loses messages, where it need not",
     )
 

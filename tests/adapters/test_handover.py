@@ -1,12 +1,13 @@
 """Messages handled where they arrive: all of a burst, and not all where the handler does not keep up."""
 
 import time
+from collections.abc import Callable
 from pathlib import Path
 
 from lowfc.adapters.bus import Sample
 from lowfc.adapters.clock import HostClock
 from lowfc.adapters.envelope import count_of, sequence_of
-from lowfc.adapters.handover import MOST_IN_A_ROW, REST_NS, Handover
+from lowfc.adapters.handover import LONG_AGO_NS, Handover
 from lowfc.adapters.run import open_run
 from lowfc.adapters.zenoh_bus import ZenohBus
 from lowfc.contract.messages import FRAME
@@ -14,60 +15,92 @@ from lowfc.contract.messages import FRAME
 PATIENCE_S = 30.0
 
 
+PERIOD_NS = 1_000_000
+
+
 class Bench:
     """A handover whose handler takes a given time, and messages that come as soon as they are due."""
 
-    def __init__(self) -> None:
-        self.now_ns, self.handled, self.work_ns = 10**9, list[int](), 100_000
-        self.handover = Handover(FRAME.key, self._handle, lambda: self.now_ns)
+    def __init__(self, period_ns: int | None = PERIOD_NS, *, told: bool = False) -> None:
+        self.now_ns, self.work_ns = 10**9, 100_000
+        self.handled: list[int] = []
+        self.overtaken: list[int] = []
+        overtaken = self._hear(self.overtaken) if told else None
+        self.handover = Handover(FRAME.key, self._hear(self.handled), lambda: self.now_ns, period_ns, overtaken)
 
-    def _handle(self, sample: Sample) -> None:
-        self.handled.append(count_of(sample.sequence))
-        self.now_ns += self.work_ns
+    def _hear(self, where: list[int]) -> Callable[[Sample], None]:
+        def hear(sample: Sample) -> None:
+            where.append(count_of(sample.sequence))
+            self.now_ns += self.work_ns
 
-    def come(self, count: int, due_ns: int = 0) -> None:
-        self.now_ns = max(self.now_ns + 10_000, due_ns)  # it takes the bus a moment to hand over the next one
-        self.handover.put(Sample(FRAME.key, b"", sequence_of(7, count), due_ns, self.now_ns))
+        return hear
+
+    def come(self, count: int, put_ns: int) -> None:
+        self.now_ns = max(self.now_ns + 10_000, put_ns)  # it takes the bus a moment to hand over the next one
+        self.handover.put(Sample(FRAME.key, b"", sequence_of(7, count), put_ns, self.now_ns))
 
 
-def test_a_burst_is_handled_message_by_message() -> None:
+def test_of_what_waited_only_the_newest_is_as_good_as_ever() -> None:
+    """The reader stood still for ten periods, while ten messages came."""
+    bench = Bench(told=True)
+    bench.work_ns = 20_000
+    begun_ns = bench.now_ns + 10**8
+    bench.come(0, begun_ns)
+    bench.now_ns = begun_ns + 10 * PERIOD_NS + 1000
+    for count in range(1, 11):
+        bench.come(count, begun_ns + count * PERIOD_NS)
+    assert (bench.handled, bench.overtaken) == ([0, 10], list(range(1, 10)))
+    assert (bench.handover.received, bench.handover.skipped, bench.handover.missing) == (11, 0, 0)
+
+
+def test_who_does_not_want_what_was_overtaken_skips_it() -> None:
     bench = Bench()
-    for count in range(MOST_IN_A_ROW):
-        bench.come(count)
-    assert bench.handled == list(range(MOST_IN_A_ROW))
-    assert (bench.handover.received, bench.handover.skipped, bench.handover.missing) == (MOST_IN_A_ROW, 0, 0)
+    begun_ns = bench.now_ns + 10**8
+    bench.now_ns = begun_ns + 9 * PERIOD_NS + PERIOD_NS // 2
+    for count in range(10):
+        bench.come(count, begun_ns + count * PERIOD_NS)
+    assert len(bench.handled) + bench.handover.skipped == 10
+    assert bench.handled == [9]
 
 
-def test_what_waits_behind_too_many_is_skipped_until_there_is_a_rest() -> None:
+def test_an_old_message_alone_was_overtaken_too() -> None:
     bench = Bench()
-    for count in range(MOST_IN_A_ROW + 5):
-        bench.come(count)
-    assert bench.handled == list(range(MOST_IN_A_ROW))
-    assert bench.handover.skipped == 5
-    bench.come(99, bench.now_ns + REST_NS + 1)
-    assert bench.handled[-1] == 99
-    assert bench.handover.missing == 99 - (MOST_IN_A_ROW + 5)
+    bench.come(0, bench.now_ns + 10**8)
+    bench.now_ns += 10**9
+    bench.come(1, bench.now_ns - LONG_AGO_NS)
+    bench.now_ns += 10**9
+    bench.come(2, bench.now_ns - PERIOD_NS)  # late by a period, and nothing suggests that there is a newer one
+    assert bench.handled == [0, 2]
+
+
+def test_where_each_waits_for_the_last_nothing_is_overtaken() -> None:
+    bench = Bench(None)
+    for count in range(50):
+        bench.come(count, 0)
+    assert bench.handled == list(range(50))
+    assert bench.handover.skipped == 0
 
 
 def test_a_slow_handler_is_never_far_behind() -> None:
-    bench, period_ns = Bench(), 1_000_000
-    bench.work_ns = 3 * period_ns
-    behind = []
+    bench = Bench(told=True)
+    bench.work_ns = 3 * PERIOD_NS
+    begun_ns, behind = bench.now_ns + 10**8, []
     for count in range(500):
-        due_ns = 2 * 10**9 + count * period_ns
-        bench.come(count, due_ns)
-        if bench.handled[-1] == count:
-            behind.append((bench.now_ns - bench.work_ns - due_ns) / period_ns)
-    assert max(behind) < 3 * MOST_IN_A_ROW
-    assert 100 < len(bench.handled) < 200
-    assert len(bench.handled) + bench.handover.skipped == bench.handover.received == 500
+        put_ns = begun_ns + count * PERIOD_NS
+        before = len(bench.handled)
+        bench.come(count, put_ns)
+        if len(bench.handled) > before:
+            behind.append((bench.now_ns - bench.work_ns - put_ns) / PERIOD_NS)
+    assert max(behind) < 5
+    assert len(bench.handled) > 5
+    assert len(bench.handled) + len(bench.overtaken) + bench.handover.skipped == bench.handover.received == 500
 
 
 def test_frames_faster_than_their_handler_are_skipped_on_the_real_bus(tmp_path: Path) -> None:
     links = open_run("handover", base=tmp_path).links
     camera, controller = (ZenohBus(links, role, HostClock(tmp_path)) for role in ("camera", "controller"))
     number = 300
-    handover = Handover(FRAME.key, lambda _: time.sleep(2e-3), controller.clock.host_ns)
+    handover = Handover(FRAME.key, lambda _: time.sleep(2e-3), controller.clock.host_ns, 500_000)
     controller.subscribe(FRAME, handover.put)
     publisher = camera.publisher(FRAME)
     until_s = time.monotonic() + PATIENCE_S

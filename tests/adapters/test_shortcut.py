@@ -138,7 +138,7 @@ def test_a_message_that_a_socket_does_not_take_comes_by_the_bus(ends: Ends) -> N
     controller, camera = ends.bus("controller"), ends.bus("camera")
     controller.subscribe(FRAME, ends.hear)
     frames = camera.publisher(FRAME)
-    large = 9 << 20
+    large = 17 << 20
 
     def heard() -> bool:
         frames.put(bytes(large))
@@ -181,6 +181,6 @@ def test_a_message_that_makes_no_sense_is_counted_and_the_next_is_heard(ends: En
 def test_only_who_waits_for_a_topic_has_a_short_way(ends: Ends) -> None:
     ends.bus("recorder").subscribe(FRAME, ends.hear)
     ends.bus("mirror-dm").subscribe(COMMAND, lambda _: None, "dm")
-    ends.bus("mirror-other").subscribe(COMMAND, lambda _: None, "other")
-    there = {path.name for path in ends.run.path.glob("*.in")}
-    assert there == {"mirror-dm.in", "mirror-other.in"}
+    assert not list(ends.run.path.glob("*.in"))
+    ends.bus("controller").subscribe(FRAME, ends.hear)
+    assert [path.name for path in ends.run.path.glob("*.in")] == ["controller.in"]

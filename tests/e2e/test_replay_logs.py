@@ -29,18 +29,29 @@ from lowfc.adapters.zenoh_bus import ZenohPublisher
 from lowfc.contract.messages import FRAME
 from sim_camera.__main__ import main
 
+def lost(attachment):
+    return int.from_bytes(attachment[:4], "little") % 100 == 57
+
 class Lossy:
     def __init__(self, publisher):
         self.publisher = publisher
     def put(self, payload, attachment):
-        if int.from_bytes(attachment[:4], "little") % 100 != 57:
+        if not lost(attachment):
             self.publisher.put(payload, attachment=attachment)
 
+class LossyShortcut:
+    def __init__(self, shortcut):
+        self.shortcut, self.close = shortcut, shortcut.close
+    def send(self, attachment, payload):
+        if not lost(attachment):
+            self.shortcut.send(attachment, payload)
+
 made = ZenohPublisher.__init__
-def lossy(self, bus, session, topic, key):
-    made(self, bus, session, topic, key)
+def lossy(self, bus, session, topic, key, shortcut):
+    made(self, bus, session, topic, key, shortcut)
     if topic is FRAME:
-        self._publisher = Lossy(self._publisher)
+        self._publisher, self._shortcut = Lossy(self._publisher), LossyShortcut(self._shortcut)
+
 ZenohPublisher.__init__ = lossy
 main()
 """
