@@ -6,7 +6,9 @@ BIN := $(VENV)/bin
 INSTALL := $(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt
 # Tests that only compute run side by side; those with processes and a clock in them run alone, after them.
 COMPUTING := tests/control tests/design tests/optics tests/sim tests/view tests/test_loop.py tests/test_validate.py \
-	tests/test_validate_figures.py
+	tests/test_validate_figures.py tests/test_calibration_file.py tests/test_configuration.py tests/test_export.py \
+	tests/test_history.py tests/test_log_info.py tests/test_messages.py tests/test_recover.py tests/test_replay.py \
+	tests/test_report.py tests/test_state_codec.py tests/test_step.py tests/test_what_if.py
 
 .PHONY: help sim-loop test test-all bench lint types format proto node clean
 
