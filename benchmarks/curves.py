@@ -31,6 +31,7 @@ from astropy.io.fits.verify import VerifyWarning
 from rich.console import Console
 
 from benchmarks import cells
+from benchmarks.command import run_main
 from benchmarks.host import host
 from benchmarks.load import Watched
 from benchmarks.sizes import FRAMES, Size, configuration, made_up
@@ -39,7 +40,6 @@ from lowfc.adapters.clock import HostClock
 from lowfc.adapters.progress import passing_bar
 from lowfc.adapters.realtime import set_up
 from lowfc.adapters.run import Run, new_run_id, open_run
-from lowfc.adapters.terminal import INTERRUPTED
 from lowfc.adapters.whole_file import require_folder, write_whole
 from lowfc.contract.configuration import Configuration
 from lowfc.contract.errors import LowfcError
@@ -385,9 +385,4 @@ def _parser() -> argparse.ArgumentParser:
 
 
 if __name__ == "__main__":
-    try:
-        sys.exit(main())
-    except KeyboardInterrupt:
-        sys.exit(INTERRUPTED)
-    except LowfcError as error:
-        sys.exit(f"error: {error}")
+    run_main(main)

@@ -22,6 +22,7 @@ from typing import Any
 import numpy as np
 
 from benchmarks import cells
+from benchmarks.command import run_main
 from benchmarks.host import host
 from benchmarks.sizes import Size, configuration, made_up
 from lowfc.adapters.realtime import set_up
@@ -201,4 +202,4 @@ def _clock(original: Callable[..., Any], durations: list[int]) -> Callable[..., 
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    run_main(main)

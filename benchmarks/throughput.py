@@ -28,13 +28,13 @@ from typing import Any, NamedTuple
 from rich.console import Console
 
 from benchmarks import cells
+from benchmarks.command import run_main
 from benchmarks.host import host
 from benchmarks.load import Watched
 from lowfc.adapters.bus import Sample
 from lowfc.adapters.clock import HostClock
 from lowfc.adapters.progress import passing_bar
 from lowfc.adapters.run import open_run
-from lowfc.adapters.terminal import INTERRUPTED
 from lowfc.adapters.zenoh_bus import ZenohBus
 from lowfc.contract.messages import FRAME, HEALTH, Role, wire
 from lowfc.programs.latency_figures import WARM_UP_S
@@ -368,7 +368,4 @@ def _parser() -> argparse.ArgumentParser:
 
 
 if __name__ == "__main__":
-    try:
-        sys.exit(main())
-    except KeyboardInterrupt:
-        sys.exit(INTERRUPTED)
+    run_main(main)

@@ -1,4 +1,4 @@
-"""Measure latency, the control step, peers, cost curves and the highest rates into docs/performance.md; an hour.
+"""Measure what docs/performance.md says of speed, each bench in turn; an hour and a half.
 
 Example:
     python docs/measure_speed.py                    # measures, writes docs/speed.json, the picture and the sections
@@ -21,12 +21,14 @@ sys.path.insert(0, str(ROOT))
 
 from benchmarks import cells, curves, step, throughput
 from benchmarks.peers import table as peers
+from benchmarks.road import report
 from lowfc.programs import latency_text
 
 MEASURED = ROOT / "docs" / "speed.json"
 DOCUMENT = ROOT / "docs" / "performance.md"
 PICTURE = ROOT / "docs" / "pictures" / "cost_curves.png"
 LATENCY = ("lowfc", "latency", "--duration", "10", "--repeats", "5")
+NEXT = "## What a view costs\n"
 WATCHED = ("lowfc", "latency", "--duration", "60", "--record", "--view")
 
 
@@ -41,6 +43,8 @@ BENCHES: dict[str, tuple[Sequence[str], Callable[[dict[str, Any]], str]]] = {
     "peers": (("benchmarks.peers", "--seconds", "4"), peers.markdown),
     "curves": (("benchmarks.curves",), curves.markdown),
     "throughput": (("benchmarks.throughput",), throughput.markdown),
+    "road": (("benchmarks.road",), report.road_markdown),
+    "loaded": (("benchmarks.road.loaded",), report.loaded_markdown),
 }
 """What is run, as `python -m`, and how its `--json` becomes a part of the document."""
 SECTIONS = {
@@ -95,6 +99,29 @@ processors says what stands in the way: the camera's own arithmetic, controller 
 neither, where it is frames that come in a burst.
 
 """,
+    "road": """
+## The road down
+
+What each change to the loop bought, and what did not help. `python -m benchmarks.road` runs the loop of `lowfc latency`
+(the real controller and mirror, frames made beforehand) as it is and, in turns with that, once for each change: without
+it where it was kept, with it where it was not. Before and after are without and with the change in either case, so that
+a ratio below 1 is a gain. `--only` takes names of changes. Kept changes are not independent: each is measured beside
+all others. A change may move work from behind the command's put into it; frame to mirror, whose ratio is beside, then
+stays as it was. Compiled code of our own in the loop is not in the table: it is out by design, so there is no patch for
+it.
+
+Frames go from the camera to the controller by a socket beside zenoh; commands go by zenoh. A change that is marked "by
+the bus alone" is tried in a loop in which frames go through zenoh, too, as they do where there is no such socket, and
+compared with that loop. "Recording" is with the recorder beside, compared likewise.
+
+""",
+    "loaded": """
+## On a loaded host
+
+`python -m benchmarks.road.loaded` runs the same loop with its real-time set-up and without (`--plain-scheduling`),
+beside a background load and alone, in turns.
+
+""",
 }
 
 
@@ -119,11 +146,11 @@ def render(name: str, result: dict[str, Any]) -> str:
 
 
 def place(document: Path, name: str, result: dict[str, Any]) -> None:
-    """Put the tables into their section, which is added at the document's end where there is none yet."""
+    """Put the tables into their section, which is added before `NEXT`, or at the end, where there is none yet."""
     begin, end = marks(name)
     if begin not in document.read_text():
-        with document.open("a") as file:
-            file.write(f"{SECTIONS[name]}{begin}{end}\n")
+        before, heading, after = document.read_text().partition(NEXT)
+        document.write_text(f"{before.rstrip()}\n{SECTIONS[name]}{begin}{end}\n{heading}{after}")
     put(document, render(name, result), begin, end)
 
 

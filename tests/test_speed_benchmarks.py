@@ -273,9 +273,9 @@ def test_a_command_that_fails_says_why() -> None:
 
 
 def test_both_tables_of_cells_have_every_cell() -> None:
-    lines = [["a", "bb"], ["ccc", "d"]]
-    assert cells.text(lines) == "a    bb\nccc   d"
-    assert cells.markdown(lines) == "| a | bb |\n|---|---|\n| ccc | d |"
+    lines = [["a", "bb", "ff"], ["ccc", "1", "d|e"]]
+    assert cells.text(lines) == "a    bb  ff\nccc   1  d|e"
+    assert cells.markdown(lines) == "| a | bb | ff |\n|---|---|---|\n| ccc | 1 | d/e |"
 
 
 def test_a_section_is_added_once_and_its_tables_replaced(tmp_path: Path) -> None:
@@ -292,12 +292,22 @@ def test_a_section_is_added_once_and_its_tables_replaced(tmp_path: Path) -> None
     assert "2026-01-01" not in said
 
 
+def test_a_section_is_added_before_what_a_view_costs(tmp_path: Path) -> None:
+    document = tmp_path / "performance.md"
+    document.write_text(f"# Performance\n\n{measure_speed.NEXT}\nIts table.\n")
+    measure_speed.place(document, "curves", curves_result())
+    first, _, after = document.read_text().partition(measure_speed.NEXT)
+    assert first.startswith("# Performance\n\n## What a frame costs\n")
+    assert first.endswith(f"{measure_speed.marks('curves')[1]}\n")
+    assert after == "\nIts table.\n"
+
+
 def test_the_document_has_what_was_measured() -> None:
     measured = json.loads(measure_speed.MEASURED.read_text()) if measure_speed.MEASURED.exists() else {}
     document = measure_speed.DOCUMENT.read_text()
     for name in measure_speed.BENCHES:
         begin, end = measure_speed.marks(name)
-        assert (begin in document) == (name in measured)
+        assert document.count(begin) == document.count(end) == (name in measured)
         if name in measured:
             assert document.partition(begin)[2].partition(end)[0] == measure_speed.render(name, measured[name])
     assert measure_speed.PICTURE.exists() == ("curves" in measured)

@@ -13,13 +13,13 @@ from typing import Any
 
 from rich.console import Console
 
+from benchmarks.command import run_main
 from benchmarks.host import host
 from benchmarks.peers.contest import PRIORITY, SCHEDULING, Rules, hold, may_run_first, processors
 from benchmarks.peers.contestants import CONTESTANTS
 from benchmarks.peers.problem import ACTUATORS, MODES, SHAPE
 from benchmarks.peers.table import DEFINITIONS, markdown, summary, text
 from lowfc.adapters.progress import passing_bar
-from lowfc.adapters.terminal import INTERRUPTED
 
 _SIZES = f"{SHAPE[0]} x {SHAPE[1]} uint16 pixels, {MODES} modes, {ACTUATORS} actuators"
 
@@ -99,7 +99,4 @@ def _parser() -> argparse.ArgumentParser:
 
 
 if __name__ == "__main__":
-    try:
-        sys.exit(main())
-    except KeyboardInterrupt:
-        sys.exit(INTERRUPTED)
+    run_main(main)

@@ -4,6 +4,7 @@ from collections.abc import Iterable, Sequence
 from statistics import median
 from typing import Any
 
+from benchmarks import cells
 from benchmarks.peers.contestants import BARE, TIMER
 
 PERCENTILES = {"p50_us": "p50", "p99_us": "p99", "p99_9_us": "p99.9", "max_us": "max"}
@@ -57,23 +58,13 @@ def summary(row: dict[str, Any]) -> dict[str, Any]:
 
 def text(result: dict[str, Any]) -> str:
     """The whole result for a terminal."""
-    lines = [HEADINGS, *table(result["rows"])]
-    widths = [max(map(len, column)) for column in zip(*lines, strict=True)]
-    printed = [
-        "  ".join(
-            cell.ljust(width) if column < 2 else cell.rjust(width)
-            for column, (cell, width) in enumerate(zip(line, widths, strict=True))
-        ).rstrip()
-        for line in lines
-    ]
-    return "\n".join([*printed, "", *_about(result)])
+    return "\n".join([cells.text([HEADINGS, *table(result["rows"])]), "", *_about(result)])
 
 
 def markdown(result: dict[str, Any]) -> str:
     """The whole result for a document."""
-    first, *others = (f"| {' | '.join(cells)} |" for cells in (HEADINGS, *table(result["rows"])))
-    rows = [first, "|---" * len(HEADINGS) + "|", *others]
-    return "\n".join([*rows, "", *(f"- {line}" for line in _about(result)), ""])
+    about = (f"- {line}" for line in _about(result))
+    return "\n".join([cells.markdown([HEADINGS, *table(result["rows"])]), "", *about, ""])
 
 
 def _cells(row: dict[str, Any], bare: dict[str, Any] | None) -> list[str]:

@@ -4,12 +4,13 @@ import argparse
 import json
 import os
 import shlex
-import signal
 import sys
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from typing import Any
 
+from benchmarks import cells
+from benchmarks.command import run_main
 from benchmarks.host import host
 from benchmarks.road import table
 from benchmarks.road.changes import CHANGES, Change, Loop
@@ -17,7 +18,6 @@ from benchmarks.road.measure import figures, in_turns
 from benchmarks.road.patches import applied
 from benchmarks.road.trip import prepared, trip
 from lowfc.adapters.clock import sharpen_sleep
-from lowfc.adapters.terminal import INTERRUPTED
 from lowfc.contract.configuration import Configuration
 from lowfc.programs.latency import Camera, _configuration
 
@@ -27,7 +27,8 @@ def main() -> int:
     asked = parser("python -m benchmarks.road", __doc__, seconds=1.5)
     asked.add_argument("--only", nargs="+", metavar="NAME", choices=[one.name for one in CHANGES], help="these changes")
     chosen = asked.parse_args()
-    say(measure(chosen), table.HEADINGS, table.road, chosen)
+    result = measure(chosen)
+    say(result, table.road(result), chosen)
     return 0
 
 
@@ -81,27 +82,15 @@ def about(asked: argparse.Namespace, program: str) -> dict[str, Any]:
     }
 
 
-def say(result: Mapping[str, Any], headings: table.Cells, lines: Any, asked: argparse.Namespace) -> None:
-    """Print what was measured."""
-    if asked.json:
-        printed = json.dumps(result)
-    else:
-        printed = (table.markdown if asked.markdown else table.text)(headings, lines(result))
-    sys.stdout.write(printed + "\n")
+def say(result: Mapping[str, Any], lines: cells.Lines, asked: argparse.Namespace) -> None:
+    """Print what was measured, its table being `lines`."""
+    table_of = cells.markdown if asked.markdown else cells.text
+    sys.stdout.write((json.dumps(result) if asked.json else table_of(lines)) + "\n")
 
 
 def tell(what: str) -> None:
     """Say what runs now; a bar would be a thread, and the next run's process is forked."""
     sys.stderr.write(f"{time.strftime('%H:%M:%S')} {what}\n")
-
-
-def run_main(main: Callable[[], int]) -> None:
-    """End with its status; told to end, stop what runs first."""
-    signal.signal(signal.SIGTERM, signal.default_int_handler)
-    try:
-        sys.exit(main())
-    except KeyboardInterrupt:
-        sys.exit(INTERRUPTED)
 
 
 if __name__ == "__main__":

@@ -9,8 +9,9 @@ import time
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+from benchmarks.command import run_main
 from benchmarks.road import table
-from benchmarks.road.__main__ import about, parser, run_main, say, settings, tell
+from benchmarks.road.__main__ import about, parser, say, settings, tell
 from benchmarks.road.load import WHAT, background
 from benchmarks.road.measure import course
 from benchmarks.road.trip import DUE, PERCENTILES, TripError, prepared, trip
@@ -25,7 +26,7 @@ def main() -> int:
     """The command line; returns its exit status."""
     asked = parser("python -m benchmarks.road.loaded", __doc__, seconds=5.0).parse_args()
     result = measure(asked)
-    say(result, table.LOADED_HEADINGS, table.loaded, asked)
+    say(result, table.loaded(result), asked)
     if not asked.json:
         sys.stdout.write(f"\n{table.ratios(result)}\n")
     return 0

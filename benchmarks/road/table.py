@@ -1,6 +1,6 @@
-"""The tables of the road and of the loaded host, as Markdown and aligned for a terminal."""
+"""The tables of the road and of the loaded host: their headings, then their lines."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import Any
 
 from benchmarks.road.changes import Loop
@@ -37,13 +37,13 @@ Cells = tuple[str, ...]
 
 
 def road(result: Mapping[str, Any]) -> list[Cells]:
-    """A line for each change."""
-    return [_line(change) for change in result["changes"]]
+    """`HEADINGS`, and a line for each change."""
+    return [HEADINGS, *map(_line, result["changes"])]
 
 
 def loaded(result: Mapping[str, Any]) -> list[Cells]:
-    """A line for each kind of run."""
-    return [
+    """`LOADED_HEADINGS`, and a line for each kind of run."""
+    lines = (
         (
             "yes" if kind["load"] else "no",
             "without" if kind["plain"] else "with",
@@ -51,7 +51,8 @@ def loaded(result: Mapping[str, Any]) -> list[Cells]:
             f"{kind['frames_without_command']} of {kind['frames']}",
         )
         for kind in result["kinds"]
-    ]
+    )
+    return [LOADED_HEADINGS, *lines]
 
 
 def ratios(result: Mapping[str, Any]) -> str:
@@ -61,19 +62,6 @@ def ratios(result: Mapping[str, Any]) -> str:
         each = ", ".join(f"{words} {_course(found[at], '.2f')}" for at, words in _AT.items())
         parts.append(f"{state}: {each}")
     return f"The real-time set-up lowers frame to command by these times, {'; '.join(parts)}."
-
-
-def markdown(headings: Cells, lines: Sequence[Cells]) -> str:
-    """As a table of Markdown."""
-    rows = [headings, ("---",) * len(headings), *lines]
-    return "\n".join(f"| {' | '.join(cell.replace('|', '/') for cell in row)} |" for row in rows)
-
-
-def text(headings: Cells, lines: Sequence[Cells]) -> str:
-    """In columns."""
-    rows = [headings, *lines]
-    widths = [max(len(row[column]) for row in rows) for column in range(len(headings))]
-    return "\n".join("  ".join(map(str.ljust, row, widths)).rstrip() for row in rows)
 
 
 def _line(change: Mapping[str, Any]) -> Cells:

@@ -26,7 +26,7 @@ class Sample(NamedTuple):
         payload: protobuf bytes.
         sequence: see `Envelope`.
         publish_time_ns: when the publisher sent it, host clock.
-        receive_time_ns: when the bus's thread had it here, host clock.
+        receive_time_ns: when the thread that received it had it here, host clock.
     """
 
     key: str

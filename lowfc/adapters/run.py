@@ -68,12 +68,14 @@ class Links:
 
     def socket(self, role: str) -> Path | None:
         """Unix socket of a role, beside its port; None where the directory's name is too long for one."""
-        path = self.secret_file.parent / f"{role}.sock"
-        return path if role in self.ports and len(os.fsencode(path)) <= _LONGEST_SOCKET else None
+        return self._beside(f"{role}.sock") if role in self.ports else None
 
     def shortcut(self, role: str) -> Path | None:
         """Socket at which a role gets what it waits for; None where the directory's name is too long for one."""
-        path = self.secret_file.parent / f"{role}.in"
+        return self._beside(f"{role}.in")
+
+    def _beside(self, name: str) -> Path | None:
+        path = self.secret_file.parent / name
         return path if len(os.fsencode(path)) <= _LONGEST_SOCKET else None
 
     def live(self) -> set[str]:

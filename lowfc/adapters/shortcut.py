@@ -102,8 +102,7 @@ class ShortcutReader:
         self._turn = threading.Lock()
         self._key = key
         self._first = self._newest = self._newest_by_bus = -1
-        self._connected = self._closed = False
-        self._both = False
+        self._both = self._closed = False
         self._leave_bus: Callable[[], None] | None = subscribe(self._by_bus)
         path.unlink(missing_ok=True)  # of a process that was killed: there is one of each role
         self._listener = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET)
@@ -125,7 +124,7 @@ class ShortcutReader:
 
     def _by_bus(self, sample: Sample) -> None:
         with self._turn:
-            if self._connected and sample.sequence <= self._newest:
+            if self._first >= 0 and sample.sequence <= self._newest:
                 self._both = self._both or sample.sequence >= self._first  # it has come by both: the bus can be left
             elif not self._closed:
                 self._newest_by_bus = sample.sequence
@@ -156,8 +155,7 @@ class ShortcutReader:
         with connection:
             self._receive(connection)
         with self._turn:
-            self._connected = self._both = False
-            self._first = -1
+            self._both, self._first = False, -1
         if self._leave_bus is None and not self._closed:
             self._leave_bus = self._subscribe(self._by_bus)
 
@@ -185,7 +183,6 @@ class ShortcutReader:
         with self._turn:
             if self._closed:
                 return
-            self._connected = True
             if self._first < 0:
                 self._first = sample.sequence
             if self._leave_bus is not None and sample.sequence <= self._newest_by_bus:

@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from lowfc.adapters.history import STAGES as TIMED
 from lowfc.adapters.history import rows_of
 from lowfc.contract.messages import FRAME, wire
 from lowfc.control.safety import Reason
@@ -20,7 +21,7 @@ Flags = npt.NDArray[np.bool_]
 UNKNOWN = -1
 WARM_UP_S = 0.5
 """Frames put so soon after the first one are left out."""
-STAGES = ("wakeup", "compute", "publish")
+STAGES = TIMED[1:-1]
 """What receive to command is made of, as in ControlTiming."""
 LOOP_SPANS = ("frame_to_receive", "receive_to_command", "frame_to_command", "command_to_mirror", "frame_to_mirror")
 PERCENTILES = {"p50": 500, "p90": 900, "p99": 990, "p99_9": 999, "max": 1000}

@@ -35,6 +35,7 @@ class Screen:
     alive: bool = True
     held_bytes: int = 0
     stopped: threading.Event = field(default_factory=threading.Event)
+    holds_up: threading.Event = field(default_factory=threading.Event)
 
     def resident_bytes(self) -> int:
         return self.held_bytes
@@ -59,6 +60,7 @@ class Stuck(Tape):
 
     def log(self, path: str, *archetypes: Any, static: bool = False) -> None:
         if not static:
+            self.screen.holds_up.set()
             self.screen.stopped.wait(PATIENCE_S)
         super().log(path, *archetypes, static=static)
 
@@ -227,6 +229,7 @@ def test_a_view_that_fails_again_and_again_ends(monkeypatch: pytest.MonkeyPatch)
 
 def test_a_viewer_that_is_stuck_costs_bounded_memory_and_no_publisher() -> None:
     scene = Scene(Show.NATIVE, stuck=1)
+    until(lambda: scene.screens and scene.screens[0].holds_up.is_set())
     for _ in range(100):
         scene.say()
     waiting = {topic: len(ring.waiting) for topic, ring in scene.bridge._rings.items()}  # type: ignore[attr-defined]
