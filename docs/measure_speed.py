@@ -1,4 +1,4 @@
-"""Measure what docs/performance.md says of speed, each bench in turn; an hour and a half.
+"""Measure what docs/performance.md says of speed, each bench in turn; over an hour.
 
 Example:
     python docs/measure_speed.py                    # measures, writes docs/speed.json, the picture and the sections

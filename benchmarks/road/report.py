@@ -41,5 +41,5 @@ def _where(result: Mapping[str, Any], granted: Sequence[str]) -> str:
     return (
         f"Granted by the host: {', '.join(granted)}. Measured {result['date']} on {host['processors']} processors of "
         f"{host['processor']}, Linux {host['kernel']}, clock source {host['clock_source']}, Python {host['python']}, "
-        f"load {host['load_before']:g} before, by `{result['command']}`."
+        f"load {host['load_before']} before, by `{result['command']}`."
     )
