@@ -43,6 +43,13 @@ WITHOUT_UNIT = {
     *("frame_sequence", "last_sequence", "count", "published", "received", "skipped", "missing", "messages", "lost"),
     *(
         "frames_used",
+        "first_sequence",
+        "columns",
+        "states",
+        "law_state",
+        "law_frames",
+        "steps_left",
+        "frames",
         "taken",
         "refused_count",
         "most_saturated",
@@ -335,7 +342,8 @@ def test_a_step_a_command_and_a_request_survive() -> None:
     assert codec.decode_request(answered, "gain", 77) == asked
     reply = wire.Request.FromString(answered)
     assert (reply.accepted, reply.reply, reply.frame_sequence, reply.taken) == (True, "done", 10, 4)
-    assert codec.decode_request(b"\xff", "gain", 77) is None
+    with pytest.raises(ValueError, match="could not be read"):
+        codec.decode_request(b"\xff", "gain", 77)
 
 
 def test_a_mirrors_state_survives() -> None:

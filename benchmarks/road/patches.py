@@ -222,8 +222,10 @@ def _channel() -> None:
 
 
 def _own_thread() -> None:
-    def handover(self: Service, topic: Topic, handler: Callable[[Sample], None]) -> Callable[[], None]:
-        mailbox = self.mailbox(topic)
+    def handover(
+        self: Service, topic: Topic, handler: Callable[[Sample], None], name: str = "", **_: object
+    ) -> Callable[[], None]:
+        mailbox = self.mailbox(topic, name)
 
         def work() -> None:
             while self.running:

@@ -24,7 +24,9 @@ _EXTENSIONS = (
     ("MASK", "good", "", "1 where a pixel is used"),
     ("DARK", "dark", "adu", "frame without light"),
     ("MODES2ACT", "modes_to_actuators", "", "nm of surface per nm rms of wavefront"),
+    ("ACT2MODES", "actuators_to_modes", "", "nm rms of wavefront that R makes of a nm of surface"),
 )
+_MAY_LACK = "ACT2MODES"
 
 
 def to_bytes(calibration: Calibration) -> bytes:
@@ -45,7 +47,10 @@ def to_bytes(calibration: Calibration) -> bytes:
     header["SATURATE"] = (calibration.saturation_dn, "[adu] highest value of a pixel")
     units = [primary]
     for name, attribute, unit, sentence in _EXTENSIONS:
-        extension = fits.ImageHDU(getattr(calibration, attribute), name=name)
+        array = getattr(calibration, attribute)
+        if name == _MAY_LACK and not array.size:
+            continue
+        extension = fits.ImageHDU(array, name=name)
         extension.header["BUNIT"] = unit
         extension.header["CONTENT"] = sentence
         units.append(extension)
@@ -92,7 +97,7 @@ def _read(units: fits.HDUList) -> Calibration:
     def array(name: str) -> npt.NDArray[np.float32]:
         return np.ascontiguousarray(units[name].data, dtype=np.float32)
 
-    arrays = {attribute: array(name) for name, attribute, _, _ in _EXTENSIONS}
+    arrays = {attribute: array(name) for name, attribute, _, _ in _EXTENSIONS if name != _MAY_LACK or name in units}
     return Calibration(
         noll=tuple(int(index) for index in str(header["NOLL"]).split()),
         shape=(int(header["ROWS"]), int(header["COLUMNS"])),

@@ -15,6 +15,7 @@ from lowfc.contract.calibration_codec import identified
 from lowfc.contract.configuration import Configuration
 from lowfc.contract.errors import CalibrationError, ConfigurationError
 from lowfc.contract.messages import timestamp, wire
+from lowfc.control.actuator_response import actuators_to_modes
 from lowfc.control.calibration import Calibration, noise_nm, normalise_flux, reconstructor
 from lowfc.control.safety import Limits, LoopMode
 from lowfc.control.state import Settings
@@ -169,9 +170,11 @@ def analytic_calibration(config: Configuration, optics: Twin, on_nodes: TwinMirr
     _check_exposure(config, light)
 
     commands = modes_to_actuators(mirror(config), nolls)
-    pokes = commands.T.reshape(len(nolls), config.mirror.rows, config.mirror.columns)
-    seen = response(optics, np.array([wavefront_nm(on_nodes, poke) for poke in pokes], dtype=np.float64))
-    commands = commands @ np.linalg.inv(R @ normalise_flux(light, seen, good)[1])
+    actuators = config.mirror.rows * config.mirror.columns
+    pokes = np.eye(actuators, dtype=np.float32).reshape(actuators, config.mirror.rows, config.mirror.columns)
+    wavefronts = np.array([wavefront_nm(on_nodes, poke) for poke in pokes])
+    seen = actuators_to_modes(R, light, good, lambda shapes: response(optics, shapes), wavefronts)
+    commands = commands @ np.linalg.inv(seen @ commands)
 
     def single(array: Double) -> Single:
         return np.ascontiguousarray(array, dtype=np.float32)
@@ -194,6 +197,7 @@ def analytic_calibration(config: Configuration, optics: Twin, on_nodes: TwinMirr
             wavelength_nm=config.star.wavelength_nm,
             operator_hash=optics.operator_hash,
             id="",
+            actuators_to_modes=single(seen),
         )
     )
 

@@ -33,6 +33,7 @@ def encode_calibration(calibration: Calibration, time_ns: int) -> bytes:
         mirror_rows=calibration.grid[0],
         mirror_columns=calibration.grid[1],
         modes_to_actuators=calibration.modes_to_actuators.tobytes(),
+        actuators_to_modes=calibration.actuators_to_modes.tobytes(),
     )
     return message.SerializeToString()
 
@@ -41,8 +42,8 @@ def identified(calibration: Calibration) -> Calibration:
     """The same calibration with its identity: SHA-256 of everything else in it."""
     digest = hashlib.sha256()
     for part in fields(calibration):
-        if part.name != "id":
-            value = getattr(calibration, part.name)
+        value = getattr(calibration, part.name)
+        if part.name != "id" and not (isinstance(value, np.ndarray) and not value.size):
             digest.update(part.name.encode())
             digest.update(value.tobytes() if isinstance(value, np.ndarray) else repr(value).encode())
     return replace(calibration, id=digest.hexdigest())
@@ -55,6 +56,7 @@ def decode_calibration(message: wire.Calibration) -> Calibration:
         ValueError: it is not whole, or not the one that its identity says.
     """
     pixels, modes = message.rows * message.columns, len(message.noll)
+    actuators, seen = message.mirror_rows * message.mirror_columns, bool(message.actuators_to_modes)
 
     def single(data: bytes, *shape: int) -> npt.NDArray[np.float32]:
         return np.frombuffer(data, dtype="<f4").reshape(shape)
@@ -66,7 +68,7 @@ def decode_calibration(message: wire.Calibration) -> Calibration:
         reconstructor=single(message.reconstructor, modes, pixels),
         good=np.frombuffer(message.mask, dtype=np.uint8).astype(np.float32),
         dark=single(message.dark, pixels),
-        modes_to_actuators=single(message.modes_to_actuators, message.mirror_rows * message.mirror_columns, modes),
+        modes_to_actuators=single(message.modes_to_actuators, actuators, modes),
         shape=(message.rows, message.columns),
         grid=(message.mirror_rows, message.mirror_columns),
         flux_dn=message.flux_dn,
@@ -75,6 +77,7 @@ def decode_calibration(message: wire.Calibration) -> Calibration:
         wavelength_nm=message.wavelength_nm,
         operator_hash=message.operator_hash,
         id=message.id,
+        actuators_to_modes=single(message.actuators_to_modes, *((modes, actuators) if seen else (0, 0))),
     )
     if identified(calibration).id != message.id:
         raise ValueError(f"calibration {message.id[:12]} is not whole: its content has another identity")

@@ -1,11 +1,14 @@
 """Between the values of the numerics and the messages of the bus, both ways."""
 
 from collections.abc import Mapping
+from types import MappingProxyType
 
 import numpy as np
 import numpy.typing as npt
 from google.protobuf.message import DecodeError
 
+from lowfc.contract.calibration_codec import decode_calibration
+from lowfc.contract.law_codec import floats, law_of, wire_law
 from lowfc.contract.messages import MONO16, RawImage, from_timestamp, timestamp, wire
 from lowfc.control.calibration import Calibration
 from lowfc.control.durations import Durations
@@ -140,17 +143,42 @@ def _camera_settings(state: wire.CameraState) -> CameraSettings:
     return CameraSettings(from_timestamp(state.timestamp), shape, state.bias_dn, state.saturation_dn)
 
 
-def decode_request(payload: bytes, name: str, time_ns: int) -> Request | None:
-    """Request under a key's name; None where the payload cannot be read."""
+def decode_request(payload: bytes, name: str, time_ns: int) -> Request:
+    """Request under a key's name.
+
+    Raises:
+        ValueError: the payload cannot be read, or what it holds is not whole.
+    """
     try:
-        return request(wire.Request.FromString(payload), name, time_ns)
+        message = wire.Request.FromString(payload)
     except DecodeError:
-        return None
+        raise ValueError("the request could not be read") from None
+    return request(message, name, time_ns)
 
 
-def request(message: wire.Request, name: str, time_ns: int) -> Request:
-    """Request of a message."""
-    return Request(time_ns, name, tuple(message.modes), tuple(message.values))
+def request(
+    message: wire.Request, name: str, time_ns: int, calibrations: Mapping[str, Calibration] = MappingProxyType({})
+) -> Request:
+    """Request of a message; of a logged one, whose calibration is no more than an identity, it is one of those.
+
+    Raises:
+        ValueError: what it holds is not whole.
+    """
+    calibration = None
+    if message.HasField("calibration"):
+        known = calibrations.get(message.calibration.id)
+        calibration = decode_calibration(message.calibration) if known is None else known
+    return Request(
+        time_ns,
+        name,
+        tuple(message.modes),
+        tuple(message.values),
+        message.text,
+        floats(message.actuators, -1),
+        floats(message.table, -1, message.columns or 1),
+        law_of(message.law) if message.HasField("law") else None,
+        calibration,
+    )
 
 
 def encode_request(request: Request, reply: Reply, taken: int, state: wire.ControllerState | None) -> bytes:
@@ -165,6 +193,24 @@ def encode_request(request: Request, reply: Reply, taken: int, state: wire.Contr
         frame_sequence=reply.frame_sequence,
         state=state,
         taken=taken,
+        text=request.text,
+        actuators=request.actuators_nm.tobytes(),
+        table=request.table.tobytes(),
+        columns=request.table.shape[1] if request.table.size else 0,
+        law=None if request.law is None else wire_law(request.law),
+        calibration=None if request.calibration is None else wire.Calibration(id=request.calibration.id),
+    )
+    return message.SerializeToString()
+
+
+def encode_offload(step: Step, noll: tuple[int, ...], mean_nm: npt.NDArray[np.float64], frames: int) -> bytes:
+    """ModalOffload of the mean modal command (modes,) over some frames, of which the last one made `step`."""
+    message = wire.ModalOffload(
+        timestamp=timestamp(step.time_ns),
+        frame_sequence=step.frame_sequence,
+        noll=noll,
+        command_nm=mean_nm.tolist(),
+        frames=frames,
     )
     return message.SerializeToString()
 

@@ -51,6 +51,15 @@ EVENTS: dict[str, Event] = {
         Event("FRAMES_MISSING", Level.WARNING, "{count} frames missing or skipped before frame {number}"),
         Event("CAMERA_RESTARTED", Level.WARNING, "the camera restarted"),
         Event("MIRROR_ADOPTED", Level.INFO, "starting from the mirror's command, {rms_nm:.1f} nm rms of wavefront"),
+        Event(
+            "SHAPE_ADOPTED",
+            Level.WARNING,
+            "the mirror had {rms_nm:.1f} nm rms of surface beside the modes: kept as the channel 'adopted'; "
+            "`lowfc ctl channel adopted --zero` takes it away",
+        ),
+        Event("NOTE", Level.INFO, "{text}"),
+        Event("PLAY_ENDED", Level.WARNING, "what was being played ended: {why}"),
+        Event("LOOP_STEPPED", Level.INFO, "the loop opened after its last step"),
         Event("MIRROR_SILENT", Level.WARNING, "no mirror state within {patience_s:g} s; taking the mirror for flat"),
         Event("MIRROR_REFUSED", Level.WARNING, "the mirror's shape is not adopted: {why}"),
         Event("LIMIT_HIT", Level.WARNING, "mirror limit reached: {reason}"),
@@ -65,6 +74,7 @@ EVENTS: dict[str, Event] = {
             "control.delay_frames says, and the highest stable gain lower; reduce the rate or set it",
         ),
         Event("RECORDING", Level.INFO, "recording"),
+        Event("RECORDING_STOPPED", Level.INFO, "recording stopped: {why}"),
         Event("MESSAGES_LOST", Level.ERROR, "{count} messages lost on {topic}"),
         Event("RECORDING_FAILED", Level.ERROR, "recording stopped: {why}"),
         Event("DISK_SLOW", Level.WARNING, "the disk took {stall_s:.1f} s for one write; {waiting} messages waited"),

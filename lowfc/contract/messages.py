@@ -174,6 +174,14 @@ TRUTH = Topic(
     "What the simulation knows and no sensor does.",
     simulated_only=True,
 )
+OFFLOAD = Topic(
+    "lowfc/control/offload",
+    wire.ModalOffload,
+    1.0,
+    _CONTROLLER,
+    _WATCHERS,
+    "Mean modal command, for another adaptive-optics system to take over.",
+)
 CALIBRATION = Topic(
     "lowfc/calibration",
     wire.Calibration,
@@ -196,6 +204,7 @@ TOPICS: tuple[Topic, ...] = (
     TIMING,
     CONTROLLER_STATE,
     REQUEST,
+    OFFLOAD,
     COMMAND,
     MIRROR_STATE,
     SURFACE,
@@ -207,6 +216,9 @@ TOPICS: tuple[Topic, ...] = (
 
 REQUEST_KEY = "lowfc/request/{name}"
 """Key of the queryable for one kind of request; the query's payload is a `lowfc.v1.Request`."""
+
+RECORD_KEY = "lowfc/record/{name}"
+"""Key of the recorder's queryable: start and stop."""
 
 MONO16 = "mono16"
 FLOAT32 = "32FC1"

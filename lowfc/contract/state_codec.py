@@ -5,11 +5,13 @@ from collections.abc import Sequence
 import numpy as np
 
 from lowfc.contract.codec import wire_mode, wire_reasons
+from lowfc.contract.law_codec import additions_of, law_of, put_additions, wire_law
 from lowfc.contract.messages import from_timestamp, timestamp, wire
+from lowfc.control import linear_law
 from lowfc.control.calibration import Calibration
 from lowfc.control.law import Law
 from lowfc.control.safety import Limits, LoopMode, Reason
-from lowfc.control.state import Drive, Settings, State
+from lowfc.control.state import Drive, Following, Settings, State
 
 
 def controller_state(state: State, settings: Settings, time_ns: int) -> wire.ControllerState:
@@ -29,8 +31,17 @@ def controller_state(state: State, settings: Settings, time_ns: int) -> wire.Con
         commanded=state.commanded,
         taken=state.taken,
         settings=_encode_settings(settings),
+        steps_left=state.steps_left,
+        homing=state.homing,
     )
     if state.drive is not None:
+        if state.drive.additions is not None:
+            put_additions(message, state.drive.additions)
+        following = state.drive.following
+        if following is not None:
+            message.law.CopyFrom(wire_law(following.law))
+            message.law_state.extend(following.x.tolist())
+            message.law_frames = following.frames
         message.calibration_id = state.drive.calibration.id
         message.gain.extend(state.drive.law.gain.tolist())
         message.leak.extend(state.drive.law.leak.tolist())
@@ -57,7 +68,19 @@ def decode_state(message: wire.ControllerState, calibration: Calibration | None)
         actuators = np.frombuffer(message.actuators, "<f4").reshape(calibration.grid)
         if law.gain.shape != drive.law.gain.shape or history.shape[1] != len(calibration.noll):
             raise ValueError(f"the controller's state is not of {len(calibration.noll)} modes")
-        drive = drive._replace(law=law, history_nm=tuple(history), actuators_nm=actuators)
+        following = None
+        if message.HasField("law"):
+            x = np.array(message.law_state, np.float32)
+            following = Following(law_of(message.law), x, message.law_frames)
+            if x.shape != linear_law.at_rest(following.law).shape or following.law.noll != calibration.noll:
+                raise ValueError("the law of the controller's state does not fit")
+        drive = drive._replace(
+            law=law,
+            following=following,
+            additions=additions_of(message, drive.added(), drive.to_modes),
+            history_nm=tuple(history),
+            actuators_nm=actuators,
+        )
     state = State(
         mode=LoopMode(message.mode),
         drive=drive,
@@ -70,6 +93,8 @@ def decode_state(message: wire.ControllerState, calibration: Calibration | None)
         silent=message.silent,
         commanded=message.commanded,
         counts={Reason(line.reason): line.count for line in message.counts},
+        steps_left=message.steps_left,
+        homing=message.homing,
         taken=message.taken,
     )
     return settings, state

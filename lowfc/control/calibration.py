@@ -1,6 +1,6 @@
 """From reference image and response matrix to the reconstructor: flux normalisation, weights, condition."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 import numpy.typing as npt
@@ -26,6 +26,8 @@ class Calibration:
         good: (pixels,) 1 where a pixel is used, 0 where not.
         dark: (pixels,) DN.
         modes_to_actuators: (actuators, modes) nm of surface per nm of wavefront rms; it contains the 1/2.
+        actuators_to_modes: (modes, actuators) nm of wavefront rms that R makes of a nm of surface; empty where it is
+            not known.
         shape: rows and columns of the frame.
         grid: rows and columns of the mirror.
         flux_dn: expected sum of the good pixels, dark subtracted.
@@ -51,6 +53,7 @@ class Calibration:
     wavelength_nm: float
     operator_hash: str
     id: str
+    actuators_to_modes: Single = field(default_factory=lambda: np.zeros((0, 0), np.float32))
 
     def __post_init__(self) -> None:
         pixels, modes, actuators = self.shape[0] * self.shape[1], len(self.noll), self.grid[0] * self.grid[1]
@@ -61,6 +64,7 @@ class Calibration:
             "good": (pixels,),
             "dark": (pixels,),
             "modes_to_actuators": (actuators, modes),
+            **({"actuators_to_modes": (modes, actuators)} if self.actuators_to_modes.size else {}),
         }.items():
             array = getattr(self, name)
             if array.shape != shape:

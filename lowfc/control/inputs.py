@@ -1,13 +1,14 @@
 """What the controller takes in and gives out: values, with the time each was taken."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 
 from lowfc.control.calibration import Calibration
+from lowfc.control.linear_law import LinearLaw
 from lowfc.control.safety import LoopMode, Reason
 
 Single = npt.NDArray[np.float32]
@@ -24,12 +25,27 @@ class Frame(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class Request:
-    """What an operator asks: `modes` are Noll indices, empty for all; one value for all modes or one for each."""
+    """What an operator asks.
+
+    Attributes:
+        modes: Noll indices that the values are for; empty for all.
+        values: one for all modes, or one for each.
+        text: name of a channel, target of a play, a note.
+        actuators_nm: one or more shapes of the mirror, one after the other, nm of surface.
+        table: of a play, (frames, columns).
+        law: that shall drive the mirror; None for the integrator.
+        calibration: that shall be used.
+    """
 
     time_ns: int
     name: str
     modes: tuple[int, ...] = ()
     values: tuple[float, ...] = ()
+    text: str = ""
+    actuators_nm: Single = field(default_factory=lambda: np.zeros(0, np.float32), compare=False)
+    table: Single = field(default_factory=lambda: np.zeros((0, 1), np.float32), compare=False)
+    law: LinearLaw | None = None
+    calibration: Calibration | None = field(default=None, compare=False)
 
 
 @dataclass(frozen=True, slots=True)

@@ -10,6 +10,8 @@ from collections.abc import Callable, Mapping
 import numpy as np
 import numpy.typing as npt
 
+from lowfc.control import linear_law
+from lowfc.control.additions import ADOPTED, Channel
 from lowfc.control.estimator import Estimate, saturated_pixels
 from lowfc.control.inputs import (
     CameraSettings,
@@ -26,12 +28,15 @@ from lowfc.control.inputs import (
     Tick,
 )
 from lowfc.control.law import integrate
+from lowfc.control.loading import loaded, mode_event
 from lowfc.control.requests import answer
 from lowfc.control.safety import LoopMode, Reason, limit
 from lowfc.control.state import Drive, Settings, State
 
 Single = npt.NDArray[np.float32]
 
+ADOPTED_NM = 1.0
+"""Of an actuator beyond the modal command, above which a mirror's shape is adopted as a channel."""
 COUNT_BITS = 32
 """A frame's sequence is its publisher's start in seconds, shifted by this, and its count."""
 
@@ -61,16 +66,21 @@ def _frame(settings: Settings, state: State, frame: Frame) -> tuple[State, Outpu
     if isinstance(measured, Reason):
         return _refuse(settings, _newest(state, drive, frame), frame, measured, events)
     estimate, saturated = measured
-    pol_nm = estimate.error_nm - drive.seen_nm()
-    drive, reasons = _follow(settings, state.mode, drive, estimate.error_nm)
+    error_nm, pol_nm, drive = _aim(drive, estimate.error_nm, frame.sequence)
+    drive, reasons, homing = _follow(settings, state, drive, error_nm, frame.sequence)
+    if reasons and drive.additions is not None:
+        drive = _cut_short(drive, frame.sequence, reasons, events)
     if state.refused is not None:
         details: dict[str, object] = {"refused": state.refused_count, "reason": state.refused.name}
         events.append(Raised("FRAMES_ACCEPTED", details))
     if reasons != state.limits_hit:
         _limit_events(state.limits_hit, reasons, events)
     mode, command_nm = state.mode, drive.history_nm[0]
+    steps_left = max(state.steps_left - 1, 0)
+    if state.steps_left == 1:
+        events += [Raised("LOOP_STEPPED", {}), mode_event(mode, LoopMode.OPEN, "its last step is done")]
     state = State(  # made anew: `_replace` takes four times as long
-        mode,
+        LoopMode.OPEN if state.steps_left == 1 else mode,
         drive,
         frame.sequence,
         frame.time_ns,
@@ -78,6 +88,8 @@ def _frame(settings: Settings, state: State, frame: Frame) -> tuple[State, Outpu
         limits_hit=reasons,
         commanded=True,
         counts=_counted(state.counts, reasons),
+        steps_left=steps_left,
+        homing=homing,
         taken=state.taken + 1,
     )
     step = Step(
@@ -86,12 +98,13 @@ def _frame(settings: Settings, state: State, frame: Frame) -> tuple[State, Outpu
         mode,
         command_nm,
         reasons,
-        estimate.error_nm,
+        error_nm,
         pol_nm,
         estimate.flux_dn,
         saturated,
     )
-    return state, Outputs(step, Command(frame.sequence, frame.time_ns, drive.actuators_nm, command_nm), None, events)
+    command = Command(frame.sequence, frame.time_ns, drive.actuators_nm, command_nm)
+    return state, Outputs(step, command, None, events, changed=state.mode is not mode)
 
 
 def _arrive(state: State, frame: Frame, events: list[Raised]) -> Drive | None:
@@ -104,9 +117,12 @@ def _arrive(state: State, frame: Frame, events: list[Raised]) -> Drive | None:
         if missing:
             number = frame.sequence & ((1 << COUNT_BITS) - 1)
             events.append(Raised("FRAMES_MISSING", {"count": missing, "number": number}))
-            drive = drive.stayed(missing) if drive is not None else None
+            drive = drive.missed(missing) if drive is not None else None
     elif state.frame_sequence:
         events.append(Raised("CAMERA_RESTARTED", {}))
+        if drive is not None and drive.additions is not None and drive.additions.play is not None:
+            drive = drive._replace(additions=drive.additions.stopped(0))  # its frames were the former camera's
+            events.append(Raised("PLAY_ENDED", {"why": "the camera restarted"}))
     return drive
 
 
@@ -129,24 +145,82 @@ def _measure(settings: Settings, drive: Drive, frame: Frame) -> tuple[Estimate, 
     return Reason.DARK if estimate is None else (estimate, saturated)
 
 
-def _follow(settings: Settings, mode: LoopMode, drive: Drive, error_nm: Single) -> tuple[Drive, tuple[Reason, ...]]:
-    """The command after a measured error (modes,), and the limits that acted."""
-    if mode is LoopMode.SAFED:
-        return _relax(settings, drive), ()
-    if mode is not LoopMode.CLOSED:
-        return drive.stayed(1), ()
-    command_nm, cut = integrate(drive.law, drive.history_nm[0], error_nm)
+def _aim(drive: Drive, measured_nm: Single, sequence: int) -> tuple[Single, Single, Drive]:
+    """Error and pseudo-open-loop modes (modes,) of what the sensor measured, and the drive whose law has seen them.
+
+    Channels are taken out of both, as far as the exposure saw them; what the loop is to aim at is taken out of the
+    error.
+    """
+    added, error_nm = drive.additions, measured_nm
+    if added is not None:
+        error_nm = measured_nm - added.seen_nm(drive.weights)
+    pol_nm = error_nm - drive.seen_nm()
+    if added is not None:
+        error_nm = error_nm - added.target_nm(sequence)
+    if drive.following is not None:
+        drive = drive._replace(following=drive.following.followed(error_nm, pol_nm, drive.history_nm[0]))
+    return error_nm, pol_nm, drive
+
+
+def _follow(
+    settings: Settings, state: State, drive: Drive, error_nm: Single, sequence: int
+) -> tuple[Drive, tuple[Reason, ...], bool]:
+    """The command after an error (modes,), the limits that acted, and whether it is still on its way to zero."""
+    if state.mode is LoopMode.SAFED:
+        return _relax(settings, drive), (), False
+    added, homing = drive.additions, state.homing
+    if state.mode is not LoopMode.CLOSED and not homing and (added is None or not added.moving):
+        return drive.stayed(1), (), False
+    command_nm, cut = drive.history_nm[0], False
+    if homing:
+        command_nm = np.zeros_like(command_nm)
+    elif state.mode is LoopMode.CLOSED:
+        command_nm, cut = _respond(drive, error_nm)
     wanted_nm = (drive.to_actuators @ command_nm).reshape(drive.calibration.grid)
+    extra_nm: Single | None = None
+    if added is not None:
+        added = added.moved(sequence, settings.limits.kept_slew_nm / 2, drive.to_modes)
+        drive = drive._replace(additions=added)
+        played_nm = added.played_nm(sequence)
+        extra_nm = added.sum_nm if played_nm is None else added.sum_nm + played_nm
+        wanted_nm += extra_nm
     limited = limit(settings.limits, drive.actuators_nm, wanted_nm)
     if limited.reasons:  # the modal command becomes what was kept: for pseudo-open-loop, and against wind-up
-        command_nm = drive.inverse @ limited.actuators_nm.reshape(-1)
+        kept_nm = limited.actuators_nm if extra_nm is None else limited.actuators_nm - extra_nm
+        command_nm = drive.inverse @ kept_nm.reshape(-1)
     reasons = (Reason.MODAL_LIMIT, *limited.reasons) if cut else limited.reasons
-    return drive.pushed(command_nm, limited.actuators_nm), reasons
+    return drive.pushed(command_nm, limited.actuators_nm), reasons, homing and bool(limited.reasons)
+
+
+def _respond(drive: Drive, error_nm: Single) -> tuple[Single, bool]:
+    """The law's modal command (modes,) in its limits, and whether one was cut."""
+    following, held_nm = drive.following, drive.history_nm[0]
+    weight = following.weight if following is not None else np.float32(0)
+    if following is None or weight < 1:
+        integrated_nm, cut = integrate(drive.law, held_nm, error_nm)
+        if following is None or not weight:
+            return integrated_nm, cut
+    wanted_nm = linear_law.respond(following.law, following.x)
+    if weight < 1:
+        wanted_nm = wanted_nm * weight + integrated_nm * (1 - weight)
+    kept_nm = np.clip(wanted_nm, -drive.law.limit_nm, drive.law.limit_nm)
+    return kept_nm, not np.array_equal(kept_nm, wanted_nm)
+
+
+def _cut_short(drive: Drive, sequence: int, reasons: tuple[Reason, ...], events: list[Raised]) -> Drive:
+    """What is played is no longer what was asked for once a limit acts: it ends."""
+    added = drive.additions
+    if added is None or added.play is None or added.play.over(sequence):
+        return drive
+    events.append(Raised("PLAY_ENDED", {"why": f"a limit acted: {', '.join(reason.name for reason in reasons)}"}))
+    return drive._replace(additions=added.stopped(sequence))
 
 
 def _relax(settings: Settings, drive: Drive) -> Drive:
     """One frame towards flat, within the slew limit."""
     flat = limit(settings.limits, drive.actuators_nm, np.zeros_like(drive.actuators_nm)).actuators_nm
+    if drive.additions is not None:
+        drive = drive._replace(additions=drive.additions.lowered(drive.to_modes))
     return drive.pushed(drive.inverse @ flat.reshape(-1), flat)
 
 
@@ -162,7 +236,7 @@ def _refuse(
         if state.mode is LoopMode.SAFED:
             drive = _relax(settings, drive)
         elif reason not in (Reason.REPEATED, Reason.OUT_OF_ORDER):  # those are no new exposure
-            drive = drive.stayed(1)
+            drive = drive.missed(1)
         held = drive.history_nm[0]
     state = state._replace(
         drive=drive,
@@ -202,23 +276,8 @@ def _tick(settings: Settings, state: State, tick: Tick) -> tuple[State, Outputs]
 
 
 def _load(settings: Settings, state: State, load: Load) -> tuple[State, Outputs]:
-    calibration = load.calibration
-    drive = Drive.at_rest(settings, calibration)
-    before = state.drive
-    if before is not None and before.actuators_nm.shape == calibration.grid:
-        command_nm = drive.inverse @ before.actuators_nm.reshape(-1)
-        drive = drive._replace(actuators_nm=before.actuators_nm, history_nm=(command_nm,) * len(drive.history_nm))
-    mode = settings.start_mode if state.mode is LoopMode.IDLE else state.mode
-    details: dict[str, object] = {
-        "id": calibration.id[:12],
-        "modes": len(calibration.noll),
-        "estimator": calibration.estimator,
-        "source": load.source,
-    }
-    events = [Raised("CALIBRATION_LOADED", details)]
-    if mode is not state.mode:
-        events.append(_mode_event(state.mode, mode, "a calibration was loaded"))
-    return state._replace(mode=mode, drive=drive), Outputs(events=events, changed=True)
+    state, events = loaded(settings, state, load.calibration, load.source)
+    return state, Outputs(events=events, changed=True)
 
 
 def _mirror(settings: Settings, state: State, shape: MirrorShape) -> tuple[State, Outputs]:
@@ -232,10 +291,16 @@ def _mirror(settings: Settings, state: State, shape: MirrorShape) -> tuple[State
     limit_nm = drive.law.limit_nm
     believed = shape.command_nm.shape == limit_nm.shape and (np.abs(shape.command_nm) <= limit_nm).all()
     command_nm = shape.command_nm if believed else drive.inverse @ shape.actuators_nm.reshape(-1)
+    rest_nm = shape.actuators_nm.copy()
+    rest_nm -= (drive.to_actuators @ command_nm).reshape(rest_nm.shape)
     drive = drive._replace(actuators_nm=shape.actuators_nm, history_nm=(command_nm,) * len(drive.history_nm))
     events = []
     if command_nm.any():
         events.append(Raised("MIRROR_ADOPTED", {"rms_nm": float(np.sqrt(command_nm @ command_nm))}))
+    if np.abs(rest_nm).max() > ADOPTED_NM:  # beyond the driver's rounding: somebody's channel
+        added = drive.added().at((Channel(ADOPTED, rest_nm, rest_nm),), drive.to_modes)
+        drive = drive._replace(additions=added.passed(len(added.shifts_nm)))
+        events.append(Raised("SHAPE_ADOPTED", {"rms_nm": float(np.sqrt(np.mean(np.square(rest_nm))))}))
     return state._replace(drive=drive), Outputs(events=events, changed=True)
 
 
@@ -258,30 +323,18 @@ def _camera(settings: Settings, state: State, camera: CameraSettings) -> tuple[S
         return state, Outputs()
     events = [
         Raised("CAMERA_CHANGED", {"what": "; ".join(wrong)}),
-        _mode_event(state.mode, LoopMode.OPEN, "the camera changed"),
+        mode_event(state.mode, LoopMode.OPEN, "the camera changed"),
     ]
-    return state._replace(mode=LoopMode.OPEN), Outputs(events=events, changed=True)
+    return state._replace(mode=LoopMode.OPEN, steps_left=0), Outputs(events=events, changed=True)
 
 
 def _request(settings: Settings, state: State, request: Request) -> tuple[State, Outputs]:
-    drive = state.drive
-    law, noll = (drive.law, drive.calibration.noll) if drive is not None else (None, ())
-    answered = answer(state.mode, law, noll, settings.delay_frames, request)
-    events = []
-    if answered.mode is not state.mode:
-        why = f"operator asked to {request.name}"
-        events.append(_mode_event(state.mode, answered.mode, why))
-        if answered.mode is LoopMode.SAFED:
-            events.append(Raised("SAFED", {"why": why}))
-    changed = answered.mode is not state.mode or answered.law is not law
-    if drive is not None and answered.law is not None:
-        drive = drive._replace(law=answered.law)
+    answered = answer(settings, state, request)
     reply = Reply(answered.accepted, answered.text, state.frame_sequence + 1)
-    return state._replace(mode=answered.mode, drive=drive), Outputs(reply=reply, events=events, changed=changed)
-
-
-def _mode_event(before: LoopMode, after: LoopMode, why: str) -> Raised:
-    return Raised("MODE_CHANGED", {"before": before.name.lower(), "after": after.name.lower(), "why": why})
+    changed = answered.state is not state
+    # Every request is counted, for its answer is in the log.
+    after = answered.state if changed else state._replace()
+    return after, Outputs(reply=reply, events=answered.events, changed=changed)
 
 
 def _limit_events(before: tuple[Reason, ...], now: tuple[Reason, ...], events: list[Raised]) -> None:

@@ -1,49 +1,235 @@
-"""Operators' requests: what each does to the mode and the law, and the sentence it is answered with."""
+"""Operators' requests: what each does to the state, and the sentence it is answered with.
 
-from dataclasses import dataclass, replace
+Each is applied whole, between two frames, or refused with a sentence and nothing changed.
+"""
+
+from collections.abc import Callable
+from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
+import numpy.typing as npt
 
-from lowfc.control.inputs import Request
+from lowfc.control.additions import FLAT, MIRROR, Additions, play
+from lowfc.control.inputs import Raised, Request
 from lowfc.control.law import Law
-from lowfc.control.safety import LoopMode, request_mode
+from lowfc.control.loading import loaded, mode_event
+from lowfc.control.margins import check_stable
+from lowfc.control.safety import Limits, LoopMode, neighbour_difference_nm, request_mode
 from lowfc.control.stability import limiting_gain
+from lowfc.control.state import Drive, Following, Settings, State
 
-REQUESTS = ("status", "open", "close", "safe", "clear", "gain", "leak")
+Single = npt.NDArray[np.float32]
+
+MOST_STEPS = 1 << 32
+MOST_TEXT = 10_000
+"""Characters of a note."""
 
 
-@dataclass(frozen=True, slots=True)
-class Answer:
-    """Mode and law after a request, whether it was accepted, and the sentence about it."""
+class Answer(NamedTuple):
+    """State after a request, whether it was accepted, the sentence about it, and the events it gave rise to."""
 
-    mode: LoopMode
-    law: Law | None
+    state: State
     accepted: bool
     text: str
+    events: tuple[Raised, ...] = ()
 
 
-def answer(mode: LoopMode, law: Law | None, noll: tuple[int, ...], delay_frames: float, request: Request) -> Answer:
-    """What a request does to the mode and to the law of the modes `noll`."""
-    match request.name:
-        case "status":
-            return Answer(mode, law, True, mode.name.lower())
-        case "open" | "close" | "safe" | "clear":
-            after, refusal = request_mode(mode, request.name, calibrated=law is not None)
-            return Answer(after, law, not refusal, refusal or f"loop {after.name.lower()}")
-        case "gain" | "leak":
-            if law is None:
-                return Answer(mode, law, False, "no calibration is loaded, so there are no modes yet")
-            try:
-                changed = _change(law, noll, delay_frames, request)
-            except ValueError as error:
-                return Answer(mode, law, False, str(error))
-            values = getattr(changed, request.name).tolist()
-            return Answer(mode, changed, True, f"{request.name} is now {' '.join(f'{value:g}' for value in values)}")
-    return Answer(mode, law, False, f"unknown request {request.name!r}; there are {', '.join(REQUESTS)}")
+def answer(settings: Settings, state: State, request: Request) -> Answer:
+    """What a request does; a refused one changes nothing."""
+    handler = _HANDLERS.get(request.name)
+    if handler is None:
+        return Answer(state, False, f"unknown request {request.name!r}; there are {', '.join(REQUESTS)}")
+    try:
+        after, text, *events = handler(settings, state, request)
+    except ValueError as error:
+        return Answer(state, False, str(error))
+    if after.mode is not state.mode:
+        why = f"operator asked to {request.name}"
+        events.append(mode_event(state.mode, after.mode, why))
+        if after.mode is LoopMode.SAFED:
+            events.append(Raised("SAFED", {"why": why}))
+    return Answer(after, True, text, tuple(events))
 
 
-def _change(law: Law, noll: tuple[int, ...], delay_frames: float, request: Request) -> Law:
-    """The law with new gains or leaks; ValueError says what is wrong with the request."""
+Handled = tuple[State, str] | tuple[State, str, Raised]
+Handler = Callable[[Settings, State, Request], Handled]
+
+
+def _status(settings: Settings, state: State, request: Request) -> Handled:
+    return state, state.mode.name.lower()
+
+
+def _mode(settings: Settings, state: State, request: Request) -> Handled:
+    """open, close, safe, clear; to pause is to open: the command is held until the loop is closed again."""
+    asked = "open" if request.name == "pause" else request.name
+    after, refusal = request_mode(state.mode, asked, calibrated=state.drive is not None)
+    if refusal:
+        raise ValueError(refusal)
+    return _in_mode(state, after), f"loop {after.name.lower()}"
+
+
+def _step(settings: Settings, state: State, request: Request) -> Handled:
+    frames = request.values[0] if len(request.values) == 1 else 0.0
+    if not (1 <= frames <= MOST_STEPS and frames == int(frames)):
+        raise ValueError(f"step takes one whole number of frames, 1 or more; got {list(request.values)}")
+    after, refusal = request_mode(state.mode, "close", calibrated=state.drive is not None)
+    if refusal:
+        raise ValueError(refusal)
+    state = _in_mode(state, after)
+    return state._replace(steps_left=int(frames)), f"loop closed for {frames:g} frames"
+
+
+def _reset(settings: Settings, state: State, request: Request) -> Handled:
+    drive = _drive(state)
+    if state.mode is LoopMode.SAFED:
+        raise ValueError("the loop is safed: the mirror is on its way to flat, or there")
+    if drive.following is not None:
+        drive = drive._replace(following=Following.at_rest(drive.following.law))
+    return state._replace(drive=drive, homing=True), "the modal command goes to zero"
+
+
+def _law_of_modes(settings: Settings, state: State, request: Request) -> Handled:
+    """gain, leak and limit of the integrator."""
+    drive = _drive(state)
+    if drive.following is not None and request.name != "limit":
+        raise ValueError(
+            f"the law {drive.following.law.name!r} drives the mirror, and has no {request.name}: "
+            "`lowfc ctl law integrator` goes back to the one that has"
+        )
+    law = _changed(drive.law, drive.calibration.noll, settings.delay_frames, request)
+    attribute = _ATTRIBUTES[request.name]
+    values = " ".join(f"{value:g}" for value in getattr(law, attribute).tolist())
+    return state._replace(drive=drive._replace(law=law)), f"{request.name} is now {values}"
+
+
+def _offset(settings: Settings, state: State, request: Request) -> Handled:
+    drive = _drive(state)
+    added = drive.added()
+    values = _per_mode(drive.calibration.noll, request, added.offset_nm) if request.values else added.offset_nm * 0
+    if (np.abs(values) > drive.law.limit_nm).any():
+        raise ValueError(f"an offset may be as large as the mode's limit, {drive.law.limit_nm.tolist()} nm")
+    text = " ".join(f"{value:g}" for value in values.tolist())
+    return _with(state, drive, added._replace(offset_nm=values)), f"offset is now {text} nm"
+
+
+def _channel(settings: Settings, state: State, request: Request) -> Handled:
+    drive = _drive(state)
+    if state.mode is LoopMode.SAFED and request.text != FLAT:
+        raise ValueError("the loop is safed: `lowfc ctl clear` first, when it is safe")
+    grid = drive.calibration.grid
+    wanted_nm = np.zeros(grid, np.float32)
+    if request.actuators_nm.size:
+        if request.actuators_nm.size != wanted_nm.size:
+            raise ValueError(f"a channel has {grid[0]} x {grid[1]} actuators, got {request.actuators_nm.size}")
+        wanted_nm = request.actuators_nm.reshape(grid)
+    _check_shape(settings.limits, wanted_nm)
+    added = drive.added().with_channel(request.text, wanted_nm, drive.to_modes)
+    rms_nm = float(np.sqrt(np.mean(np.square(wanted_nm, dtype=np.float64))))
+    return _with(state, drive, added), f"channel {request.text}: {rms_nm:.3g} nm rms of surface"
+
+
+def _play(settings: Settings, state: State, request: Request) -> Handled:
+    drive = _drive(state)
+    if state.mode not in (LoopMode.OPEN, LoopMode.CLOSED):
+        raise ValueError(f"nothing can be played while the loop is {state.mode.name.lower()}")
+    added = drive.added()
+    if added.play is not None:
+        raise ValueError("something is being played already: `lowfc ctl stop` ends it")
+    grid = drive.calibration.grid
+    actuators = grid[0] * grid[1]
+    if request.actuators_nm.size % actuators:
+        raise ValueError(
+            f"the shapes of a play have {actuators} actuators each, got {request.actuators_nm.size} in all"
+        )
+    basis = request.actuators_nm.reshape(-1, actuators)
+    first = state.frame_sequence + 1
+    made = play(request.text, first, request.table, basis, len(drive.calibration.noll), grid)
+    if made.target == MIRROR and float(np.abs(made.table).max() * np.abs(basis).max()) > settings.limits.stroke_nm:
+        raise ValueError(f"a shape of the play goes beyond the stroke of {settings.limits.stroke_nm:g} nm")
+    return _with(state, drive, added._replace(play=made)), f"playing {len(made.table)} frames on the {made.target}"
+
+
+def _stop(settings: Settings, state: State, request: Request) -> Handled:
+    drive = state.drive
+    if drive is None or drive.additions is None or drive.additions.play is None:
+        return state, "nothing is being played"
+    return _with(state, drive, drive.additions.stopped(state.frame_sequence)), "stopped"
+
+
+def _law(settings: Settings, state: State, request: Request) -> Handled:
+    drive = _drive(state)
+    if request.law is None:
+        return state._replace(drive=drive._replace(following=None)), "the integrator drives the mirror"
+    law = request.law
+    if law.noll != drive.calibration.noll:
+        raise ValueError(f"the law is of the modes {list(law.noll)}, the loop of {list(drive.calibration.noll)}")
+    check_stable(law, settings.delay_frames)
+    drive = drive._replace(following=Following.at_rest(law))
+    return state._replace(drive=drive), f"the law {law.name!r} takes over from the integrator"
+
+
+def _load(settings: Settings, state: State, request: Request) -> Handled:
+    if request.calibration is None:
+        raise ValueError("there is no calibration in the request")
+    if state.mode is LoopMode.CLOSED:
+        raise ValueError("the loop is closed: open it before another calibration is loaded")
+    before = state.drive
+    if before is not None and before.calibration.grid != request.calibration.grid:
+        raise ValueError(
+            f"the calibration is for a mirror of {request.calibration.grid} actuators, this one has "
+            f"{before.calibration.grid}"
+        )
+    after, events = loaded(settings, state, request.calibration, "operator")
+    return after, f"calibration {request.calibration.id[:12]}", events[0]
+
+
+def _note(settings: Settings, state: State, request: Request) -> Handled:
+    if not 0 < len(request.text.strip()) <= MOST_TEXT:
+        raise ValueError(f"a note has 1 to {MOST_TEXT} characters, got {len(request.text)}")
+    return state, "noted", Raised("NOTE", {"text": request.text.strip()})
+
+
+def _drive(state: State) -> Drive:
+    if state.drive is None:
+        raise ValueError("no calibration is loaded, so there are no modes yet")
+    return state.drive
+
+
+def _in_mode(state: State, mode: LoopMode) -> State:
+    """Nothing of the last mode goes on in the next one."""
+    drive = state.drive
+    if drive is not None and mode is not state.mode:
+        if drive.additions is not None:
+            safed = mode is LoopMode.SAFED
+            added = drive.additions.stopped(state.frame_sequence)
+            drive = drive._replace(additions=added.lowered(drive.to_modes, only_flat=True) if safed else added)
+        if drive.following is not None and mode is LoopMode.CLOSED:
+            drive = drive._replace(following=drive.following.taking_over())
+    return state._replace(mode=mode, drive=drive, steps_left=0, homing=state.homing and mode is state.mode)
+
+
+def _with(state: State, drive: Drive, additions: Additions) -> State:
+    return state._replace(drive=drive._replace(additions=additions))
+
+
+def _check_shape(limits: Limits, wanted_nm: Single) -> None:
+    """A channel that the mirror could not take by itself is refused here, where it can still be said."""
+    if not np.isfinite(wanted_nm).all():
+        raise ValueError("every actuator of a channel must be finite")
+    largest, apart = float(np.abs(wanted_nm).max()), neighbour_difference_nm(wanted_nm)
+    if largest > limits.kept_stroke_nm:
+        raise ValueError(f"an actuator is {largest:.4g} nm from flat, the limit is {limits.stroke_nm:g} nm")
+    if apart > limits.neighbour_nm - limits.margin_nm:
+        raise ValueError(f"neighbours differ by {apart:.4g} nm, the limit is {limits.neighbour_nm:g} nm")
+
+
+def _per_mode(noll: tuple[int, ...], request: Request, before: Single) -> Single:
+    """The values of all modes (modes,) with those of the request in their places.
+
+    Raises:
+        ValueError: what is wrong with the request.
+    """
     modes = request.modes or noll
     unknown = sorted(set(modes) - set(noll))
     if unknown:
@@ -52,15 +238,53 @@ def _change(law: Law, noll: tuple[int, ...], delay_frames: float, request: Reque
         raise ValueError(f"give one value, or one for each of the {len(modes)} modes; got {len(request.values)}")
     if not np.isfinite(request.values).all():
         raise ValueError(f"{request.name} must be finite, got {list(request.values)}")
+    array = before.copy()
+    array[[noll.index(mode) for mode in modes]] = np.asarray(request.values, dtype=np.float32)
+    return array
+
+
+def _changed(law: Law, noll: tuple[int, ...], delay_frames: float, request: Request) -> Law:
+    """The law with new gains, leaks or limits; ValueError says what is wrong with the request."""
+    attribute = _ATTRIBUTES[request.name]
+    values = _per_mode(noll, request, getattr(law, attribute))
+    lowest, highest = min(request.values), max(request.values)
     if request.name == "gain":
-        highest = limiting_gain(delay_frames)
-        if not (min(request.values) >= 0 and max(request.values) < highest):
+        limiting = limiting_gain(delay_frames)
+        if not (lowest >= 0 and highest < limiting):
             raise ValueError(
-                f"gain must be at least 0 and below {highest:.3g}, where a loop with a delay of {delay_frames:g} "
+                f"gain must be at least 0 and below {limiting:.3g}, where a loop with a delay of {delay_frames:g} "
                 f"frames becomes unstable; got {max(request.values, key=abs):g}"
             )
-    elif not (min(request.values) >= 0 and max(request.values) <= 1):
+    elif request.name == "leak" and not (lowest >= 0 and highest <= 1):
         raise ValueError(f"leak must be between 0 and 1, got {max(request.values, key=abs):g}")
-    array = getattr(law, request.name).copy()
-    array[[noll.index(mode) for mode in modes]] = np.asarray(request.values, dtype=np.float32)
-    return replace(law, **{request.name: array})
+    elif lowest < 0:
+        raise ValueError(f"limit must be at least 0 nm, got {lowest:g}")
+    return replace(law, **{attribute: values})
+
+
+_ATTRIBUTES = {"gain": "gain", "leak": "leak", "limit": "limit_nm"}
+
+_HANDLERS: dict[str, Handler] = {
+    "status": _status,
+    "open": _mode,
+    "close": _mode,
+    "pause": _mode,
+    "step": _step,
+    "safe": _mode,
+    "clear": _mode,
+    "reset": _reset,
+    "gain": _law_of_modes,
+    "leak": _law_of_modes,
+    "limit": _law_of_modes,
+    "offset": _offset,
+    "channel": _channel,
+    "play": _play,
+    "stop": _stop,
+    "law": _law,
+    "load": _load,
+    "note": _note,
+}
+
+CONFIGURATION = "configuration"
+"""The one request that the process answers, which knows its configuration."""
+REQUESTS = (*_HANDLERS, CONFIGURATION)

@@ -8,13 +8,23 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
+from lowfc.control import linear_law
+from lowfc.control.additions import Additions
 from lowfc.control.calibration import Calibration
 from lowfc.control.estimator import Estimator
 from lowfc.control.law import Law
+from lowfc.control.linear_law import LinearLaw
 from lowfc.control.safety import Limits, LoopMode, Reason
 from lowfc.control.stability import delay_weights
 
 Single = npt.NDArray[np.float32]
+
+SETTLING_FRAMES = 100
+"""For which a new law only follows."""
+FADING_FRAMES = 100
+"""In which a law takes over."""
+MOST_COASTED = 100
+"""Frames missing in a row after which a law begins anew."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -54,13 +64,54 @@ class Settings:
         return Law(per_mode(self.gain), per_mode(self.leak), per_mode(self.limit_nm))
 
 
+class Following(NamedTuple):
+    """A linear law that follows the measurements: its x (states,), and the frames for which it has done so.
+
+    It drives the mirror once it has followed for `SETTLING_FRAMES`; over the next `FADING_FRAMES` it takes over from
+    the integrator, so that the mirror does not jump.
+    """
+
+    law: LinearLaw
+    x: Single
+    frames: int = 0
+
+    @classmethod
+    def at_rest(cls, law: LinearLaw) -> "Following":
+        """A law that has seen nothing yet."""
+        return cls(law, linear_law.at_rest(law))
+
+    def followed(self, error_nm: Single, pol_nm: Single, kept_nm: Single) -> "Following":
+        """One frame later; all (modes,), the last one is the command that was kept of the last frame."""
+        signal = error_nm if self.law.signal == "error" else pol_nm
+        return Following(self.law, linear_law.follow(self.law, self.x, signal, kept_nm), self.frames + 1)
+
+    def coasted(self, frames: int, kept_nm: Single) -> "Following":
+        """Some frames later, which were missing or of no use."""
+        x = self.x
+        for _ in range(min(frames, MOST_COASTED)):
+            x = linear_law.coast(self.law, x, kept_nm)
+        return Following(self.law, x, self.frames if frames <= MOST_COASTED else 0)
+
+    @property
+    def weight(self) -> np.float32:
+        """Its part of the command; the integrator's is the rest."""
+        return np.float32(min(max(self.frames - SETTLING_FRAMES, 0) / FADING_FRAMES, 1))
+
+    def taking_over(self) -> "Following":
+        """The same where the loop was just closed: it fades in."""
+        return self._replace(frames=min(self.frames, SETTLING_FRAMES))
+
+
 class Drive(NamedTuple):
     """What there is once a calibration is loaded.
 
     Attributes:
         to_actuators: (actuators, modes) as in the calibration, laid out for the quicker product.
         inverse: (modes, actuators) modal command of a mirror shape.
+        to_modes: (modes, actuators) what the sensor sees of a mirror shape.
         weights: which commands of the history are seen in an exposure, and how much of each.
+        following: a law in place of the integrator's.
+        additions: to what the law commands; None for nothing at all.
         history_nm: modal commands, newest first.
         actuators_nm: (rows, columns), the last command.
     """
@@ -70,7 +121,10 @@ class Drive(NamedTuple):
     law: Law
     to_actuators: Single
     inverse: Single
+    to_modes: Single
     weights: tuple[tuple[int, np.float32], ...]
+    following: Following | None
+    additions: Additions | None
     history_nm: tuple[Single, ...]
     actuators_nm: Single
 
@@ -79,13 +133,17 @@ class Drive(NamedTuple):
         """A drive with nothing commanded yet, under the law that the settings begin with."""
         modes = len(calibration.noll)
         weights = delay_weights(settings.delay_frames).astype(np.float32)
+        inverse = np.linalg.pinv(calibration.modes_to_actuators.astype(np.float64)).astype(np.float32)
         return cls(
             calibration,
             Estimator.of(calibration),
             settings.law(calibration.noll),
             np.asfortranarray(calibration.modes_to_actuators),
-            np.linalg.pinv(calibration.modes_to_actuators.astype(np.float64)).astype(np.float32),
+            inverse,
+            calibration.actuators_to_modes if calibration.actuators_to_modes.size else inverse,
             tuple((lag, weight) for lag, weight in enumerate(weights) if weight),
+            None,
+            None,
             (np.zeros(modes, np.float32),) * len(weights),
             np.zeros(calibration.grid, np.float32),
         )
@@ -98,15 +156,32 @@ class Drive(NamedTuple):
             seen = seen + weight * self.history_nm[lag]
         return seen
 
+    def added(self) -> Additions:
+        """What is added, though it be nothing."""
+        if self.additions is not None:
+            return self.additions
+        return Additions.none(self.calibration.grid, len(self.calibration.noll), len(self.history_nm))
+
     def pushed(self, command_nm: Single, actuators_nm: Single) -> "Drive":
         """One frame later, under this command."""
-        fixed = self[:-2]  # `_replace` takes four times as long
-        return Drive(*fixed, (command_nm, *self.history_nm[:-1]), actuators_nm)
+        fixed = self[:-3]  # `_replace` takes four times as long
+        additions = None if self.additions is None else self.additions.passed()
+        return Drive(*fixed, additions, (command_nm, *self.history_nm[:-1]), actuators_nm)
 
     def stayed(self, frames: int) -> "Drive":
         """Some frames later, the command held under each of them."""
         held = min(frames, len(self.history_nm))
-        return self._replace(history_nm=(self.history_nm[:1] * held + self.history_nm)[: len(self.history_nm)])
+        history_nm = (self.history_nm[:1] * held + self.history_nm)[: len(self.history_nm)]
+        if self.additions is None:
+            return self._replace(history_nm=history_nm)
+        return self._replace(history_nm=history_nm, additions=self.additions.passed(frames))
+
+    def missed(self, frames: int) -> "Drive":
+        """Some frames later, of which nothing was measured."""
+        stayed = self.stayed(frames)
+        if self.following is None:
+            return stayed
+        return stayed._replace(following=self.following.coasted(frames, self.history_nm[0]))
 
 
 class State(NamedTuple):
@@ -118,6 +193,8 @@ class State(NamedTuple):
         limits_hit: limits that acted on the last command.
         silent: whether the silence has been announced.
         commanded: whether a command has been sent, so that the mirror is no longer adopted.
+        steps_left: frames until the loop opens by itself; 0 for never.
+        homing: the modal command is on its way to zero.
         taken: inputs that changed something or gave rise to something; the order of what is replayed.
     """
 
@@ -132,4 +209,6 @@ class State(NamedTuple):
     silent: bool = False
     commanded: bool = False
     counts: Mapping[Reason, int] = MappingProxyType({})
+    steps_left: int = 0
+    homing: bool = False
     taken: int = 0

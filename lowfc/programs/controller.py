@@ -6,6 +6,8 @@ from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
+import numpy as np
+
 from lowfc.adapters.bus import ALL, Query, Sample
 from lowfc.adapters.clock import SimulatedClock
 from lowfc.adapters.instrument import settings
@@ -24,6 +26,7 @@ from lowfc.contract.messages import (
     CONTROLLER_STATE,
     FRAME,
     MIRROR_STATE,
+    OFFLOAD,
     REQUEST,
     REQUEST_KEY,
     STEP,
@@ -34,8 +37,9 @@ from lowfc.contract.messages import (
 from lowfc.contract.state_codec import controller_state, reason_counts
 from lowfc.control.calibration import Calibration
 from lowfc.control.durations import Durations
-from lowfc.control.inputs import CameraSettings, Input, Load, MirrorShape, Outputs, Reply, Request, Tick
+from lowfc.control.inputs import CameraSettings, Input, Load, MirrorShape, Outputs, Reply, Request, Step, Tick
 from lowfc.control.loop import advance
+from lowfc.control.requests import CONFIGURATION
 from lowfc.control.safety import LoopMode
 from lowfc.control.state import State
 
@@ -61,6 +65,7 @@ class Controller:
         self._service = service
         self._latch = latch
         self._settings = settings(config)
+        self._configuration = config.to_toml()
         if latch.exists():  # safed stays safed when the controller dies
             self._settings = replace(self._settings, start_mode=LoopMode.SAFED)
         self._rehearses = config.realtime.rehearse and not config.lockstep
@@ -81,6 +86,9 @@ class Controller:
         self._states = service.publisher(CONTROLLER_STATE)
         self._requests = service.publisher(REQUEST)
         self._timings = service.publisher(TIMING)
+        self._offloads = service.publisher(OFFLOAD)
+        self._offload_frames = max(1, round(1e9 / float(OFFLOAD.rate) / config.period_ns))
+        self._offloaded_nm, self._offloaded = np.zeros(0), 0
         self._queries: deque[Query] = deque()
         service.bus.queryable(REQUEST_KEY.format(name=ALL), self._ask)
         self._frame_to_command = Durations()
@@ -88,7 +96,8 @@ class Controller:
         self._timing_due_ns = self._state_due_ns = 0
         self._last_frame_ns = service.clock.host_ns()
         now_ns = service.clock.now_ns()
-        service.publisher(CALIBRATION).put(encode_calibration(calibration, now_ns))
+        self._calibrations = service.publisher(CALIBRATION)
+        self._calibrations.put(encode_calibration(calibration, now_ns))
         self._take(Load(now_ns, calibration, source))
         service.state = "ready"
 
@@ -188,14 +197,7 @@ class Controller:
 
     def _answer(self, query: Query) -> None:
         now_ns = self._service.clock.now_ns()
-        request = codec.decode_request(query.payload, query.name, now_ns)
-        if request is None:
-            request = Request(now_ns, query.name)
-            outputs = Outputs(reply=Reply(False, "the request could not be read", self._state.frame_sequence + 1))
-            taken = 0
-        else:
-            outputs = self._advance(request)
-            taken = self._state.taken
+        request, outputs, taken = self._asked(query, now_ns)
         assert outputs.reply is not None  # noqa: S101  # every request has an answer
         state = None
         if request.name == "status":
@@ -204,6 +206,20 @@ class Controller:
         query.reply(answer)
         self._requests.put(answer)
         self._tell(outputs)
+
+    def _asked(self, query: Query, now_ns: int) -> tuple[Request, Outputs, int]:
+        """The request, what it gave rise to, and its number; 0 for one that is no input of the control law."""
+        next_frame = self._state.frame_sequence + 1
+        try:
+            request = codec.decode_request(query.payload, query.name, now_ns)
+        except ValueError as error:
+            return Request(now_ns, query.name), Outputs(reply=Reply(False, str(error), next_frame)), 0
+        if request.name == CONFIGURATION:
+            return request, Outputs(reply=Reply(True, self._configuration, next_frame)), 0
+        if request.calibration is not None:
+            self._calibrations.put(encode_calibration(request.calibration, now_ns))
+        outputs = self._advance(request)
+        return request, outputs, self._state.taken
 
     def _adopt_mirror(self) -> None:
         """Learn where the mirror is before the first command, so that it does not jump."""
@@ -245,6 +261,7 @@ class Controller:
         """Publish the step and the events, and the state where more of it changed than the next frame shows."""
         if outputs.step is not None:
             self._steps.put(codec.encode_step(outputs.step, self._state.taken))
+            self._offload(outputs.step)
         for event in outputs.events:
             self._service.event(event.name, **event.details)
         if outputs.changed:
@@ -253,6 +270,17 @@ class Controller:
                 self._latch.touch()
             else:
                 self._latch.unlink(missing_ok=True)
+
+    def _offload(self, step: Step) -> None:
+        """Once a second, the mean modal command, for whoever can take it over; by counting, as lockstep needs it."""
+        if self._offloaded_nm.shape != step.command_nm.shape:
+            self._offloaded_nm, self._offloaded = np.zeros(step.command_nm.shape), 0
+        self._offloaded_nm += step.command_nm
+        self._offloaded += 1
+        if self._offloaded >= self._offload_frames and self._state.drive is not None:
+            mean_nm, noll = self._offloaded_nm / self._offloaded, self._state.drive.calibration.noll
+            self._offloads.put(codec.encode_offload(step, noll, mean_nm, self._offloaded))
+            self._offloaded_nm[:] = self._offloaded = 0
 
     def _publish_state(self, time_ns: int) -> None:
         message = controller_state(self._state, self._settings, time_ns)

@@ -260,7 +260,9 @@ class Lane:
                 # With no other left, a frame of another time: then the step is wrong, which the comparison finds.
                 return self._frames.frame(step.frame_sequence, from_timestamp(step.timestamp), age_ns, last=late)
             case wire.Request() as request:
-                return codec.request(request, request.name, from_timestamp(request.timestamp))
+                with contextlib.suppress(ValueError):
+                    time_ns = from_timestamp(request.timestamp)
+                    return codec.request(request, request.name, time_ns, self._calibrations)
             case wire.ControlInput() as other:
                 with contextlib.suppress(ValueError):
                     return codec.decode_input(other, self._calibrations)
@@ -298,7 +300,7 @@ class Lane:
             return None
         time_ns = from_timestamp(request.timestamp)
         shown = controller_state(state, self._settings, time_ns) if request.HasField("state") else None
-        asked = codec.request(request, request.name, time_ns)
+        asked = codec.request(request, request.name, time_ns, self._calibrations)
         return codec.encode_request(asked, outputs.reply, state.taken, shown)
 
     def _compare_state(self, state: State, logged: wire.ControllerState) -> None:

@@ -211,8 +211,60 @@ class ControllerSettings(_message.Message):
     limit_nm: _containers.RepeatedScalarFieldContainer[float]
     def __init__(self, stroke_nm: _Optional[float] = ..., slew_nm: _Optional[float] = ..., neighbour_nm: _Optional[float] = ..., delay_frames: _Optional[float] = ..., start_mode: _Optional[_Union[LoopMode, str]] = ..., late_ns: _Optional[int] = ..., hold_ns: _Optional[int] = ..., silence: _Optional[str] = ..., least_flux: _Optional[float] = ..., most_saturated: _Optional[int] = ..., gain: _Optional[_Iterable[float]] = ..., leak: _Optional[_Iterable[float]] = ..., limit_nm: _Optional[_Iterable[float]] = ...) -> None: ...
 
+class Channel(_message.Message):
+    __slots__ = ("name", "actuators", "shifts", "reached")
+    NAME_FIELD_NUMBER: _ClassVar[int]
+    ACTUATORS_FIELD_NUMBER: _ClassVar[int]
+    SHIFTS_FIELD_NUMBER: _ClassVar[int]
+    REACHED_FIELD_NUMBER: _ClassVar[int]
+    name: str
+    actuators: bytes
+    shifts: bool
+    reached: bytes
+    def __init__(self, name: _Optional[str] = ..., actuators: _Optional[bytes] = ..., shifts: _Optional[bool] = ..., reached: _Optional[bytes] = ...) -> None: ...
+
+class Play(_message.Message):
+    __slots__ = ("target", "first_sequence", "columns", "table", "basis")
+    TARGET_FIELD_NUMBER: _ClassVar[int]
+    FIRST_SEQUENCE_FIELD_NUMBER: _ClassVar[int]
+    COLUMNS_FIELD_NUMBER: _ClassVar[int]
+    TABLE_FIELD_NUMBER: _ClassVar[int]
+    BASIS_FIELD_NUMBER: _ClassVar[int]
+    target: str
+    first_sequence: int
+    columns: int
+    table: bytes
+    basis: bytes
+    def __init__(self, target: _Optional[str] = ..., first_sequence: _Optional[int] = ..., columns: _Optional[int] = ..., table: _Optional[bytes] = ..., basis: _Optional[bytes] = ...) -> None: ...
+
+class LinearLaw(_message.Message):
+    __slots__ = ("name", "signal", "noll", "delay_frames", "rate_hz", "states", "follow", "gain", "kept", "coast", "output")
+    NAME_FIELD_NUMBER: _ClassVar[int]
+    SIGNAL_FIELD_NUMBER: _ClassVar[int]
+    NOLL_FIELD_NUMBER: _ClassVar[int]
+    DELAY_FRAMES_FIELD_NUMBER: _ClassVar[int]
+    RATE_HZ_FIELD_NUMBER: _ClassVar[int]
+    STATES_FIELD_NUMBER: _ClassVar[int]
+    FOLLOW_FIELD_NUMBER: _ClassVar[int]
+    GAIN_FIELD_NUMBER: _ClassVar[int]
+    KEPT_FIELD_NUMBER: _ClassVar[int]
+    COAST_FIELD_NUMBER: _ClassVar[int]
+    OUTPUT_FIELD_NUMBER: _ClassVar[int]
+    name: str
+    signal: str
+    noll: _containers.RepeatedScalarFieldContainer[int]
+    delay_frames: float
+    rate_hz: float
+    states: int
+    follow: bytes
+    gain: bytes
+    kept: bytes
+    coast: bytes
+    output: bytes
+    def __init__(self, name: _Optional[str] = ..., signal: _Optional[str] = ..., noll: _Optional[_Iterable[int]] = ..., delay_frames: _Optional[float] = ..., rate_hz: _Optional[float] = ..., states: _Optional[int] = ..., follow: _Optional[bytes] = ..., gain: _Optional[bytes] = ..., kept: _Optional[bytes] = ..., coast: _Optional[bytes] = ..., output: _Optional[bytes] = ...) -> None: ...
+
 class ControllerState(_message.Message):
-    __slots__ = ("timestamp", "frame_sequence", "mode", "calibration_id", "gain", "leak", "limit_nm", "delay_frames", "command_history_nm", "actuators", "offset", "counts", "frames_used", "frame_timestamp", "refused", "refused_count", "limits_hit", "silent", "commanded", "taken", "settings")
+    __slots__ = ("timestamp", "frame_sequence", "mode", "calibration_id", "gain", "leak", "limit_nm", "delay_frames", "command_history_nm", "actuators", "offset", "counts", "frames_used", "frame_timestamp", "refused", "refused_count", "limits_hit", "silent", "commanded", "taken", "settings", "offset_nm", "channels", "shift_history_nm", "law", "law_state", "law_frames", "play", "steps_left", "homing")
     TIMESTAMP_FIELD_NUMBER: _ClassVar[int]
     FRAME_SEQUENCE_FIELD_NUMBER: _ClassVar[int]
     MODE_FIELD_NUMBER: _ClassVar[int]
@@ -234,6 +286,15 @@ class ControllerState(_message.Message):
     COMMANDED_FIELD_NUMBER: _ClassVar[int]
     TAKEN_FIELD_NUMBER: _ClassVar[int]
     SETTINGS_FIELD_NUMBER: _ClassVar[int]
+    OFFSET_NM_FIELD_NUMBER: _ClassVar[int]
+    CHANNELS_FIELD_NUMBER: _ClassVar[int]
+    SHIFT_HISTORY_NM_FIELD_NUMBER: _ClassVar[int]
+    LAW_FIELD_NUMBER: _ClassVar[int]
+    LAW_STATE_FIELD_NUMBER: _ClassVar[int]
+    LAW_FRAMES_FIELD_NUMBER: _ClassVar[int]
+    PLAY_FIELD_NUMBER: _ClassVar[int]
+    STEPS_LEFT_FIELD_NUMBER: _ClassVar[int]
+    HOMING_FIELD_NUMBER: _ClassVar[int]
     timestamp: _timestamp_pb2.Timestamp
     frame_sequence: int
     mode: LoopMode
@@ -255,10 +316,19 @@ class ControllerState(_message.Message):
     commanded: bool
     taken: int
     settings: ControllerSettings
-    def __init__(self, timestamp: _Optional[_Union[datetime.datetime, _timestamp_pb2.Timestamp, _Mapping]] = ..., frame_sequence: _Optional[int] = ..., mode: _Optional[_Union[LoopMode, str]] = ..., calibration_id: _Optional[str] = ..., gain: _Optional[_Iterable[float]] = ..., leak: _Optional[_Iterable[float]] = ..., limit_nm: _Optional[_Iterable[float]] = ..., delay_frames: _Optional[float] = ..., command_history_nm: _Optional[_Iterable[float]] = ..., actuators: _Optional[bytes] = ..., offset: _Optional[bytes] = ..., counts: _Optional[_Iterable[_Union[ReasonCount, _Mapping]]] = ..., frames_used: _Optional[int] = ..., frame_timestamp: _Optional[_Union[datetime.datetime, _timestamp_pb2.Timestamp, _Mapping]] = ..., refused: _Optional[_Union[Reason, str]] = ..., refused_count: _Optional[int] = ..., limits_hit: _Optional[_Iterable[_Union[Reason, str]]] = ..., silent: _Optional[bool] = ..., commanded: _Optional[bool] = ..., taken: _Optional[int] = ..., settings: _Optional[_Union[ControllerSettings, _Mapping]] = ...) -> None: ...
+    offset_nm: _containers.RepeatedScalarFieldContainer[float]
+    channels: _containers.RepeatedCompositeFieldContainer[Channel]
+    shift_history_nm: _containers.RepeatedScalarFieldContainer[float]
+    law: LinearLaw
+    law_state: _containers.RepeatedScalarFieldContainer[float]
+    law_frames: int
+    play: Play
+    steps_left: int
+    homing: bool
+    def __init__(self, timestamp: _Optional[_Union[datetime.datetime, _timestamp_pb2.Timestamp, _Mapping]] = ..., frame_sequence: _Optional[int] = ..., mode: _Optional[_Union[LoopMode, str]] = ..., calibration_id: _Optional[str] = ..., gain: _Optional[_Iterable[float]] = ..., leak: _Optional[_Iterable[float]] = ..., limit_nm: _Optional[_Iterable[float]] = ..., delay_frames: _Optional[float] = ..., command_history_nm: _Optional[_Iterable[float]] = ..., actuators: _Optional[bytes] = ..., offset: _Optional[bytes] = ..., counts: _Optional[_Iterable[_Union[ReasonCount, _Mapping]]] = ..., frames_used: _Optional[int] = ..., frame_timestamp: _Optional[_Union[datetime.datetime, _timestamp_pb2.Timestamp, _Mapping]] = ..., refused: _Optional[_Union[Reason, str]] = ..., refused_count: _Optional[int] = ..., limits_hit: _Optional[_Iterable[_Union[Reason, str]]] = ..., silent: _Optional[bool] = ..., commanded: _Optional[bool] = ..., taken: _Optional[int] = ..., settings: _Optional[_Union[ControllerSettings, _Mapping]] = ..., offset_nm: _Optional[_Iterable[float]] = ..., channels: _Optional[_Iterable[_Union[Channel, _Mapping]]] = ..., shift_history_nm: _Optional[_Iterable[float]] = ..., law: _Optional[_Union[LinearLaw, _Mapping]] = ..., law_state: _Optional[_Iterable[float]] = ..., law_frames: _Optional[int] = ..., play: _Optional[_Union[Play, _Mapping]] = ..., steps_left: _Optional[int] = ..., homing: _Optional[bool] = ...) -> None: ...
 
 class Request(_message.Message):
-    __slots__ = ("timestamp", "name", "modes", "values", "text", "accepted", "reply", "frame_sequence", "state", "taken")
+    __slots__ = ("timestamp", "name", "modes", "values", "text", "accepted", "reply", "frame_sequence", "state", "taken", "actuators", "table", "columns", "law", "calibration")
     TIMESTAMP_FIELD_NUMBER: _ClassVar[int]
     NAME_FIELD_NUMBER: _ClassVar[int]
     MODES_FIELD_NUMBER: _ClassVar[int]
@@ -269,6 +339,11 @@ class Request(_message.Message):
     FRAME_SEQUENCE_FIELD_NUMBER: _ClassVar[int]
     STATE_FIELD_NUMBER: _ClassVar[int]
     TAKEN_FIELD_NUMBER: _ClassVar[int]
+    ACTUATORS_FIELD_NUMBER: _ClassVar[int]
+    TABLE_FIELD_NUMBER: _ClassVar[int]
+    COLUMNS_FIELD_NUMBER: _ClassVar[int]
+    LAW_FIELD_NUMBER: _ClassVar[int]
+    CALIBRATION_FIELD_NUMBER: _ClassVar[int]
     timestamp: _timestamp_pb2.Timestamp
     name: str
     modes: _containers.RepeatedScalarFieldContainer[int]
@@ -279,7 +354,12 @@ class Request(_message.Message):
     frame_sequence: int
     state: ControllerState
     taken: int
-    def __init__(self, timestamp: _Optional[_Union[datetime.datetime, _timestamp_pb2.Timestamp, _Mapping]] = ..., name: _Optional[str] = ..., modes: _Optional[_Iterable[int]] = ..., values: _Optional[_Iterable[float]] = ..., text: _Optional[str] = ..., accepted: _Optional[bool] = ..., reply: _Optional[str] = ..., frame_sequence: _Optional[int] = ..., state: _Optional[_Union[ControllerState, _Mapping]] = ..., taken: _Optional[int] = ...) -> None: ...
+    actuators: bytes
+    table: bytes
+    columns: int
+    law: LinearLaw
+    calibration: Calibration
+    def __init__(self, timestamp: _Optional[_Union[datetime.datetime, _timestamp_pb2.Timestamp, _Mapping]] = ..., name: _Optional[str] = ..., modes: _Optional[_Iterable[int]] = ..., values: _Optional[_Iterable[float]] = ..., text: _Optional[str] = ..., accepted: _Optional[bool] = ..., reply: _Optional[str] = ..., frame_sequence: _Optional[int] = ..., state: _Optional[_Union[ControllerState, _Mapping]] = ..., taken: _Optional[int] = ..., actuators: _Optional[bytes] = ..., table: _Optional[bytes] = ..., columns: _Optional[int] = ..., law: _Optional[_Union[LinearLaw, _Mapping]] = ..., calibration: _Optional[_Union[Calibration, _Mapping]] = ...) -> None: ...
 
 class MirrorCommand(_message.Message):
     __slots__ = ("timestamp", "frame_sequence", "channel", "valid_for_ns", "rows", "columns", "actuators", "command_nm", "taken")
@@ -342,7 +422,7 @@ class Truth(_message.Message):
     def __init__(self, timestamp: _Optional[_Union[datetime.datetime, _timestamp_pb2.Timestamp, _Mapping]] = ..., frame_sequence: _Optional[int] = ..., disturbance_nm: _Optional[_Iterable[float]] = ..., residual_nm: _Optional[_Iterable[float]] = ..., disturbance_rms_nm: _Optional[float] = ..., residual_rms_nm: _Optional[float] = ...) -> None: ...
 
 class Calibration(_message.Message):
-    __slots__ = ("timestamp", "id", "operator_hash", "estimator", "noll", "mode_names", "wavelength_nm", "rows", "columns", "reference", "response", "reconstructor", "mask", "dark", "flux_dn", "saturation_dn", "mirror_rows", "mirror_columns", "modes_to_actuators")
+    __slots__ = ("timestamp", "id", "operator_hash", "estimator", "noll", "mode_names", "wavelength_nm", "rows", "columns", "reference", "response", "reconstructor", "mask", "dark", "flux_dn", "saturation_dn", "mirror_rows", "mirror_columns", "modes_to_actuators", "actuators_to_modes")
     TIMESTAMP_FIELD_NUMBER: _ClassVar[int]
     ID_FIELD_NUMBER: _ClassVar[int]
     OPERATOR_HASH_FIELD_NUMBER: _ClassVar[int]
@@ -362,6 +442,7 @@ class Calibration(_message.Message):
     MIRROR_ROWS_FIELD_NUMBER: _ClassVar[int]
     MIRROR_COLUMNS_FIELD_NUMBER: _ClassVar[int]
     MODES_TO_ACTUATORS_FIELD_NUMBER: _ClassVar[int]
+    ACTUATORS_TO_MODES_FIELD_NUMBER: _ClassVar[int]
     timestamp: _timestamp_pb2.Timestamp
     id: str
     operator_hash: str
@@ -381,7 +462,22 @@ class Calibration(_message.Message):
     mirror_rows: int
     mirror_columns: int
     modes_to_actuators: bytes
-    def __init__(self, timestamp: _Optional[_Union[datetime.datetime, _timestamp_pb2.Timestamp, _Mapping]] = ..., id: _Optional[str] = ..., operator_hash: _Optional[str] = ..., estimator: _Optional[str] = ..., noll: _Optional[_Iterable[int]] = ..., mode_names: _Optional[_Iterable[str]] = ..., wavelength_nm: _Optional[float] = ..., rows: _Optional[int] = ..., columns: _Optional[int] = ..., reference: _Optional[bytes] = ..., response: _Optional[bytes] = ..., reconstructor: _Optional[bytes] = ..., mask: _Optional[bytes] = ..., dark: _Optional[bytes] = ..., flux_dn: _Optional[float] = ..., saturation_dn: _Optional[float] = ..., mirror_rows: _Optional[int] = ..., mirror_columns: _Optional[int] = ..., modes_to_actuators: _Optional[bytes] = ...) -> None: ...
+    actuators_to_modes: bytes
+    def __init__(self, timestamp: _Optional[_Union[datetime.datetime, _timestamp_pb2.Timestamp, _Mapping]] = ..., id: _Optional[str] = ..., operator_hash: _Optional[str] = ..., estimator: _Optional[str] = ..., noll: _Optional[_Iterable[int]] = ..., mode_names: _Optional[_Iterable[str]] = ..., wavelength_nm: _Optional[float] = ..., rows: _Optional[int] = ..., columns: _Optional[int] = ..., reference: _Optional[bytes] = ..., response: _Optional[bytes] = ..., reconstructor: _Optional[bytes] = ..., mask: _Optional[bytes] = ..., dark: _Optional[bytes] = ..., flux_dn: _Optional[float] = ..., saturation_dn: _Optional[float] = ..., mirror_rows: _Optional[int] = ..., mirror_columns: _Optional[int] = ..., modes_to_actuators: _Optional[bytes] = ..., actuators_to_modes: _Optional[bytes] = ...) -> None: ...
+
+class ModalOffload(_message.Message):
+    __slots__ = ("timestamp", "frame_sequence", "noll", "command_nm", "frames")
+    TIMESTAMP_FIELD_NUMBER: _ClassVar[int]
+    FRAME_SEQUENCE_FIELD_NUMBER: _ClassVar[int]
+    NOLL_FIELD_NUMBER: _ClassVar[int]
+    COMMAND_NM_FIELD_NUMBER: _ClassVar[int]
+    FRAMES_FIELD_NUMBER: _ClassVar[int]
+    timestamp: _timestamp_pb2.Timestamp
+    frame_sequence: int
+    noll: _containers.RepeatedScalarFieldContainer[int]
+    command_nm: _containers.RepeatedScalarFieldContainer[float]
+    frames: int
+    def __init__(self, timestamp: _Optional[_Union[datetime.datetime, _timestamp_pb2.Timestamp, _Mapping]] = ..., frame_sequence: _Optional[int] = ..., noll: _Optional[_Iterable[int]] = ..., command_nm: _Optional[_Iterable[float]] = ..., frames: _Optional[int] = ...) -> None: ...
 
 class TopicCount(_message.Message):
     __slots__ = ("topic", "published", "received", "skipped", "missing", "last_sequence")
