@@ -7,7 +7,7 @@ from google.protobuf.message import DecodeError
 
 from lowfc.adapters.bus import Sample
 from lowfc.adapters.envelope import count_of, start_of
-from lowfc.contract.messages import EVENT, Log, Topic, topic_of, wire
+from lowfc.contract.messages import EVENT, HEALTH, Log, Topic, topic_of, wire
 
 
 @dataclass(slots=True)
@@ -96,7 +96,8 @@ class Ledger:
 def _publishes(process: str, key: str) -> bool:
     """Whether a process's count is of a topic that it publishes, and not of one that it receives."""
     try:
-        return process.partition("-")[0] in topic_of(key).publisher
+        topic = topic_of(key)
+        return key == HEALTH.at(process) if topic is HEALTH else process.partition("-")[0] in topic.publisher
     except KeyError:
         return False
 

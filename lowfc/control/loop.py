@@ -186,7 +186,9 @@ def _follow(
         wanted_nm += extra_nm
     limited = limit(settings.limits, drive.actuators_nm, wanted_nm)
     if limited.reasons:  # the modal command becomes what was kept: for pseudo-open-loop, and against wind-up
-        kept_nm = limited.actuators_nm if extra_nm is None else limited.actuators_nm - extra_nm
+        kept_nm = limited.actuators_nm
+        if extra_nm is not None:
+            kept_nm = np.subtract(kept_nm, extra_nm)
         command_nm = drive.inverse @ kept_nm.reshape(-1)
     reasons = (Reason.MODAL_LIMIT, *limited.reasons) if cut else limited.reasons
     return drive.pushed(command_nm, limited.actuators_nm), reasons, homing and bool(limited.reasons)

@@ -10,7 +10,7 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from lowfc.control.additions import FLAT, MIRROR, Additions, play
+from lowfc.control.additions import FLAT, MIRROR, OFFSET, Additions, play
 from lowfc.control.inputs import Raised, Request
 from lowfc.control.law import Law
 from lowfc.control.loading import loaded, mode_event
@@ -145,8 +145,11 @@ def _play(settings: Settings, state: State, request: Request) -> Handled:
     basis = request.actuators_nm.reshape(-1, actuators)
     first = state.frame_sequence + 1
     made = play(request.text, first, request.table, basis, len(drive.calibration.noll), grid)
-    if made.target == MIRROR and float(np.abs(made.table).max() * np.abs(basis).max()) > settings.limits.stroke_nm:
-        raise ValueError(f"a shape of the play goes beyond the stroke of {settings.limits.stroke_nm:g} nm")
+    largest = np.abs(made.table).max(axis=0).astype(np.float64)
+    if made.target == MIRROR and largest @ np.abs(basis).max(axis=1) > settings.limits.stroke_nm:
+        raise ValueError(f"the shapes of the play may go beyond the stroke of {settings.limits.stroke_nm:g} nm")
+    if made.target == OFFSET and (largest > drive.law.limit_nm).any():
+        raise ValueError(f"an offset may be as large as the mode's limit, {drive.law.limit_nm.tolist()} nm")
     return _with(state, drive, added._replace(play=made)), f"playing {len(made.table)} frames on the {made.target}"
 
 

@@ -42,6 +42,7 @@ from lowfc.control.loop import advance
 from lowfc.control.requests import CONFIGURATION
 from lowfc.control.safety import LoopMode
 from lowfc.control.state import State
+from lowfc.programs.start_up import StartUp
 
 TICK_NS = 10_000_000
 """Without frames the held command is repeated this often."""
@@ -66,6 +67,7 @@ class Controller:
         self._latch = latch
         self._settings = settings(config)
         self._configuration = config.to_toml()
+        self._start_up = StartUp(config)
         if latch.exists():  # safed stays safed when the controller dies
             self._settings = replace(self._settings, start_mode=LoopMode.SAFED)
         self._rehearses = config.realtime.rehearse and not config.lockstep
@@ -106,6 +108,7 @@ class Controller:
         self._adopt_mirror()
         self._service.state = "running"
         with self._turn:
+            self._begin()
             self._adopted = True
             if self._early is not None:
                 self._frame(self._early)
@@ -202,9 +205,9 @@ class Controller:
         state = None
         if request.name == "status":
             state = controller_state(self._state, self._settings, now_ns)
-        answer = codec.encode_request(request, outputs.reply, taken, state)
-        query.reply(answer)
-        self._requests.put(answer)
+        short = Request(request.time_ns, request.name, request.modes, request.values, request.text)
+        query.reply(codec.encode_request(short, outputs.reply, taken, state))  # who asked has the arrays
+        self._requests.put(codec.encode_request(request, outputs.reply, taken, state))
         self._tell(outputs)
 
     def _asked(self, query: Query, now_ns: int) -> tuple[Request, Outputs, int]:
@@ -239,6 +242,17 @@ class Controller:
             self._take(shape)
         elif self._service.running:
             self._service.event("MIRROR_SILENT", patience_s=MIRROR_PATIENCE_S)
+
+    def _begin(self) -> None:
+        """Ask for what the configuration puts on the mirror, and for its law, as an operator would."""
+        for request in self._start_up.requests(self._state, self._service.clock.now_ns()):
+            outputs = self._advance(request)
+            assert outputs.reply is not None  # noqa: S101  # every request has an answer
+            self._requests.put(codec.encode_request(request, outputs.reply, self._state.taken, None))
+            self._tell(outputs)
+            if not outputs.reply.accepted:
+                self._start_up.refused(request, outputs.reply.text)
+                break
 
     def _advance(self, taken: Input) -> Outputs:
         self._state, outputs = advance(self._settings, self._state, taken)

@@ -29,6 +29,7 @@ from lowfc.adapters.zenoh_bus import ZenohBus
 from lowfc.contract.errors import DataFileError
 from lowfc.contract.messages import HEALTH, TOPICS, Role, Topic, wire
 from lowfc.programs.recording_summary import Summary
+from lowfc.programs.recording_switch import RecordingSwitch
 
 QUEUE_MESSAGES = 20_000
 """Messages that may wait for the disk: about 4 s of a 1 kHz loop, 90 MB."""
@@ -69,6 +70,7 @@ class Recorder:
         self._answers: Future[list[Sample]] | None = None
         self._states: dict[tuple[str, int], str] = {}
         self._newcomers = False
+        self._paused = False
         self._hurried = False
         self._failure = ""
         self._flush_due_ns = 0
@@ -78,6 +80,7 @@ class Recorder:
         for topic in TOPICS:
             bus.subscribe(topic, partial(self._backlog.put, topic))
         self.service = Service(Role.RECORDER, run_id, clock, bus, granted=granted, fill=self._fill)
+        self._switch = RecordingSwitch(bus, clock, {"start": self._resume, "stop": self._pause})
 
     def catch_signals(self) -> None:
         """Finish the log at SIGTERM, Ctrl-C or a lost terminal; a second one does not wait for the others' last words.
@@ -150,7 +153,15 @@ class Recorder:
         self.service.event("RECORDING")
 
     def _turn(self) -> None:
-        """Write what has arrived; now and then flush, report and rotate."""
+        """Write what has arrived; now and then flush, report and rotate; do what an operator asks."""
+        self._write_waiting()
+        self._ask_meanwhile()
+        if self._clock.host_ns() >= self._flush_due_ns:
+            self._look_after()
+        self._switch.serve(self._series.files)
+        self.service.beat()
+
+    def _write_waiting(self) -> None:
         for _ in range(len(self._backlog)):
             topic, sample = self._backlog.take()
             self._take(topic, sample)
@@ -158,10 +169,38 @@ class Recorder:
             self._longest_wait_ns = max(self._longest_wait_ns, now_ns - self._arrival_ns(sample))
             if now_ns >= self._flush_due_ns:
                 self._look_after()
-        self._ask_meanwhile()
-        if self._clock.host_ns() >= self._flush_due_ns:
-            self._look_after()
-        self.service.beat()
+
+    def _pause(self) -> str:
+        """Finish the log with all that has arrived; return why not, if so."""
+        if self._failure or self._paused:
+            return self._failure or "nothing is being recorded"
+        self.service.event("RECORDING_STOPPED", why="operator asked")
+        self._say_losses()
+        self._write_waiting()
+        self._flush()
+        try:
+            self._series.end(self._figures())
+        except DataFileError as fault:
+            self._fail(fault)
+        self._paused = not self._failure
+        return self._failure
+
+    def _resume(self) -> str:
+        """Begin the next log; return why not, if so."""
+        if self._failure:
+            return f"{self._failure}; start another recorder"
+        if not self._paused or not self.service.running:
+            return "it is being recorded already" if self.service.running else "the recorder is ending"
+        try:
+            if short := self._series.shortage():
+                return short
+            self._begin()
+        except DataFileError as fault:
+            self._series.give_up()
+            return str(fault)
+        self._paused = False
+        self._newcomers = True  # what was lost on its way meanwhile is asked for again
+        return ""
 
     def _look_after(self) -> None:
         """Flush, begin the next log when it is time, say what was lost, be heard."""
@@ -180,7 +219,7 @@ class Recorder:
             self._asked.discard(there)
             recorded = not self._failure
         else:
-            recorded = self._write(sample)
+            recorded = self._write(sample) or self._paused  # what nobody wants recorded is not lost
         self._ledger.enter(topic, sample, recorded=recorded)
         if topic is HEALTH:
             self._hear(sample)
@@ -216,7 +255,7 @@ class Recorder:
         try:
             self._series.flush()
             self._flushed()
-            if self._failure:
+            if self._failure or self._paused:
                 return
             if short := self._series.shortage():
                 self._failure = short

@@ -1,0 +1,14 @@
+"""A running loop in Python: what an operator asks of it, and the frames and steps that it makes.
+
+with Client() as loop:
+    loop.gain(0.4, modes=[2, 3])
+    since = loop.offset(5.0, modes=[4]).frame_sequence
+    errors_nm = [step.error_nm for step in loop.steps(200) if step.frame_sequence >= since]
+"""
+
+from lowfc.client.client import Answer, Client
+from lowfc.client.runs import running, the_run
+from lowfc.client.stream import Frame, Stream
+from lowfc.control.inputs import Step
+
+__all__ = ["Answer", "Client", "Frame", "Step", "Stream", "running", "the_run"]

@@ -1,0 +1,304 @@
+"""What an operator asks of a running loop, from Python."""
+
+import time
+from collections.abc import Callable, Sequence
+from types import TracebackType
+from typing import NamedTuple, TypeVar
+
+import numpy as np
+import numpy.typing as npt
+
+from lowfc.adapters.bus import Bus, Sample
+from lowfc.adapters.clock import HostClock
+from lowfc.adapters.run import DEFAULT_RUN, open_run
+from lowfc.adapters.zenoh_bus import ZenohBus
+from lowfc.client.runs import the_run
+from lowfc.client.stream import SILENT_S, WAITING, Frame, Stream, frame_of, step_of
+from lowfc.contract.calibration_codec import decode_calibration, encode_calibration
+from lowfc.contract.errors import BusError, RequestRefusedError
+from lowfc.contract.law_codec import wire_law
+from lowfc.contract.messages import CALIBRATION, FRAME, RECORD_KEY, REQUEST_KEY, STEP, Role, Topic, wire
+from lowfc.control.additions import MIRROR, OFFSET
+from lowfc.control.calibration import Calibration
+from lowfc.control.inputs import Step
+from lowfc.control.linear_law import LinearLaw
+
+Single = npt.NDArray[np.float32]
+T = TypeVar("T")
+
+CONNECT_S = 1.0
+ANSWER_S = 2.0
+SLOW_ANSWER_S = 30.0
+"""To load a calibration, to take a long play, to finish a log."""
+LARGE_BYTES = 100_000
+"""Of a request; a larger one takes its time."""
+MOST_BYTES = 16_000_000
+"""Of a request; the bus loses one that is far larger."""
+
+
+class Answer(NamedTuple):
+    """What was answered to a request that was carried out; one that was refused raises RequestRefusedError.
+
+    Attributes:
+        accepted: always true.
+        reply: the sentence.
+        frame_sequence: of the first frame for which the request is in force.
+        text: path of the log, of `record`.
+        state: the controller's, of `status`.
+    """
+
+    accepted: bool
+    reply: str
+    frame_sequence: int
+    text: str = ""
+    state: wire.ControllerState | None = None
+
+
+class Client:
+    """A connection to a running loop, for one thread; it stays until `close`.
+
+    Every request is carried out between two frames or refused, and answered with the first frame for which it is in
+    force. What is refused raises RequestRefusedError, what is not answered BusError.
+    """
+
+    def __init__(self, run: str | None = None, *, bus: Bus | None = None) -> None:
+        """Join a run.
+
+        Args:
+            run: its name; the only one on this host when None.
+            bus: of a process that has joined it already; `close` leaves that alone.
+
+        Raises:
+            BusError: there is no such run, none at all, or more than one to choose from.
+        """
+        self.run_id = the_run(run) if bus is None else run or DEFAULT_RUN
+        self._own = None
+        if bus is None:
+            bus = self._own = ZenohBus(open_run(self.run_id, ()).links, Role.OPERATOR, HostClock())
+            deadline_s = time.monotonic() + CONNECT_S
+            while not bus.peers() and time.monotonic() < deadline_s:
+                time.sleep(0.01)
+        self._bus = bus
+        self._grid: tuple[int, int] | None = None
+
+    def __enter__(self) -> "Client":
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, fault: BaseException | None, at: TracebackType | None) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Leave the run; the loop goes on as it is. To close the loop is `close_loop`."""
+        if self._own is not None:
+            self._own.close()
+
+    def status(self) -> Answer:
+        """What the controller is doing, in `state`."""
+        return self.ask("status")
+
+    def open(self) -> Answer:
+        """Stop driving the mirror; it holds its shape."""
+        return self.ask("open")
+
+    def close_loop(self) -> Answer:
+        """Let the control law drive the mirror."""
+        return self.ask("close")
+
+    def pause(self) -> Answer:
+        """Hold the command; `close_loop` goes on from it."""
+        return self.ask("pause")
+
+    def step(self, frames: int) -> Answer:
+        """Close the loop for some frames; then it opens by itself."""
+        return self.ask("step", values=frames)
+
+    def safe(self) -> Answer:
+        """Relax the mirror to flat and latch it there."""
+        return self.ask("safe")
+
+    def clear(self) -> Answer:
+        """Leave the latched safe state; the loop is open afterwards."""
+        return self.ask("clear")
+
+    def reset(self) -> Answer:
+        """Take the modal command to zero within the slew limit, and clear the law's memory."""
+        return self.ask("reset")
+
+    def gain(self, values: npt.ArrayLike, modes: Sequence[int] = ()) -> Answer:
+        """Set integrator gains: one value, or one for each of `modes` (Noll indices, all when empty)."""
+        return self.ask("gain", modes, values)
+
+    def leak(self, values: npt.ArrayLike, modes: Sequence[int] = ()) -> Answer:
+        """Set integrator leaks, as `gain`."""
+        return self.ask("leak", modes, values)
+
+    def limit(self, values: npt.ArrayLike, modes: Sequence[int] = ()) -> Answer:
+        """Set the largest modal commands, nm rms of wavefront, as `gain`."""
+        return self.ask("limit", modes, values)
+
+    def offset(self, values: npt.ArrayLike = (), modes: Sequence[int] = ()) -> Answer:
+        """Set the loop's target, nm rms of wavefront, as `gain`; zero without values."""
+        return self.ask("offset", modes, values)
+
+    def channel(self, name: str, actuators_nm: npt.ArrayLike | None = None) -> Answer:
+        """Add a shape to the mirror: (rows, columns) nm of surface, in place of the one of that name; None removes it.
+
+        The sensor's zero point is shifted along, so that the loop does not undo it; not by the channel "flat".
+        """
+        shape = np.zeros(0, np.float32) if actuators_nm is None else np.asarray(actuators_nm, np.float32)
+        if shape.size and shape.shape != self._mirror_grid():
+            raise RequestRefusedError(
+                f"channel refused: the mirror has actuators of shape {self._mirror_grid()}, got an array of shape "
+                f"{shape.shape}"
+            )
+        return self.ask("channel", text=name, actuators_nm=shape)
+
+    def play(self, basis_nm: npt.ArrayLike, table: npt.ArrayLike) -> Answer:
+        """Add shapes to the mirror frame by frame, without the loop being told; it ends by itself.
+
+        Args:
+            basis_nm: (shapes, actuators) or (shapes, rows, columns), nm of surface.
+            table: (frames, shapes), a row of factors for each frame from the answered one on.
+        """
+        basis = np.asarray(basis_nm, np.float32)
+        basis = basis.reshape(len(basis), -1) if basis.ndim == 3 else basis
+        factors = np.asarray(table, np.float32)
+        if basis.ndim != 2 or factors.ndim != 2 or factors.shape[1] != len(basis):
+            raise RequestRefusedError(
+                "play refused: it takes shapes (shapes, actuators) and a table (frames, shapes), got arrays of shape "
+                f"{basis.shape} and {factors.shape}"
+            )
+        return self.ask("play", text=MIRROR, actuators_nm=basis, table=factors)
+
+    def play_offset(self, table_nm: npt.ArrayLike) -> Answer:
+        """Add to the loop's target frame by frame: (frames, modes), nm rms of wavefront; it ends by itself."""
+        table = np.asarray(table_nm, np.float32)
+        if table.ndim != 2:
+            raise RequestRefusedError(f"play refused: it takes a table (frames, modes), got an array of {table.shape}")
+        return self.ask("play", text=OFFSET, table=table)
+
+    def stop(self) -> Answer:
+        """End what is being played."""
+        return self.ask("stop")
+
+    def load(self, calibration: Calibration) -> Answer:
+        """Use another calibration; the loop must be open."""
+        return self.ask("load", calibration=calibration)
+
+    def law(self, law: LinearLaw | None = None) -> Answer:
+        """Let a linear law drive the mirror; None for the integrator."""
+        return self.ask("law", law=law)
+
+    def note(self, text: str) -> Answer:
+        """Leave a note in the log."""
+        return self.ask("note", text=text)
+
+    def record(self, on: bool) -> Answer:
+        """Begin the next log, or finish this one: its path is the answer's text, and the file is whole."""
+        key = RECORD_KEY.format(name="start" if on else "stop")
+        return _answer("record", self._get(key, b"", SLOW_ANSWER_S, Role.RECORDER))
+
+    def configuration(self) -> str:
+        """The configuration that the controller was started with, as TOML."""
+        return self.ask("configuration").reply
+
+    def calibration(self) -> Calibration:
+        """The calibration in use.
+
+        Raises:
+            BusError: nobody has one.
+        """
+        sample = self._get(CALIBRATION.key, b"", ANSWER_S)
+        return decode_calibration(wire.Calibration.FromString(sample.payload))
+
+    def frames(self, count: int | None = None, patience_s: float = SILENT_S) -> Stream[Frame]:
+        """Sensor images from now on, `count` of them or without end.
+
+        Raises:
+            BusError: none came.
+        """
+        return self._stream(FRAME, frame_of, "frame", count, patience_s)
+
+    def steps(self, count: int | None = None, patience_s: float = SILENT_S) -> Stream[Step]:
+        """Steps of the control law from now on, `count` of them or without end; see `frames`."""
+        return self._stream(STEP, step_of, "step", count, patience_s)
+
+    def ask(
+        self,
+        name: str,
+        modes: Sequence[int] = (),
+        values: npt.ArrayLike = (),
+        *,
+        text: str = "",
+        actuators_nm: Single | None = None,
+        table: Single | None = None,
+        law: LinearLaw | None = None,
+        calibration: Calibration | None = None,
+    ) -> Answer:
+        """Ask the controller anything; the fields are those of `lowfc.v1.Request`.
+
+        Raises:
+            BusError: no controller is there, or it is too slow.
+            RequestRefusedError: the controller refused, and says why.
+        """
+        try:
+            message = wire.Request(
+                name=name,
+                modes=[int(mode) for mode in modes],
+                values=np.atleast_1d(np.asarray(values, np.float64)).tolist(),
+                text=text,
+                actuators=b"" if actuators_nm is None else actuators_nm.tobytes(),
+                table=b"" if table is None else table.tobytes(),
+                columns=0 if table is None else table.shape[1],
+                law=None if law is None else wire_law(law),
+            )
+        except (ValueError, TypeError) as fault:
+            raise RequestRefusedError(f"{name} refused: {fault}") from None
+        if calibration is not None:
+            message.calibration.MergeFromString(encode_calibration(calibration, 0))
+        payload = message.SerializeToString()
+        if len(payload) > MOST_BYTES:
+            raise RequestRefusedError(
+                f"a request holds at most {MOST_BYTES / 1e6:g} MB, this one {len(payload) / 1e6:.1f} MB: ask in parts"
+            )
+        patience_s = SLOW_ANSWER_S if len(payload) > LARGE_BYTES else ANSWER_S
+        return _answer(name, self._get(REQUEST_KEY.format(name=name), payload, patience_s))
+
+    def _get(self, key: str, payload: bytes, answer_s: float, who: Role = Role.CONTROLLER) -> Sample:
+        """Ask one process; a link that is just being made answers at once that nobody is there."""
+        deadline_s = time.monotonic() + CONNECT_S
+        while True:
+            begun_s = time.monotonic()
+            answers = self._bus.get(key, payload, answer_s)
+            if answers:
+                return answers[0]
+            now_s = time.monotonic()
+            if now_s - begun_s >= answer_s * 0.9:
+                raise BusError(
+                    f"the {who} of run {self.run_id!r} did not answer within {answer_s:g} s: it hangs or is too slow; "
+                    "whether it did what was asked, the log and `lowfc ctl status` say"
+                )
+            if now_s >= deadline_s:
+                raise BusError(f"no {who} is there in run {self.run_id!r}: start one with `lowfc {_COMMANDS[who]}`")
+            time.sleep(0.05)
+
+    def _stream(
+        self, topic: Topic, decode: Callable[[Sample], T | None], what: str, count: int | None, patience_s: float
+    ) -> Stream[T]:
+        return Stream(self._bus.ring(topic, WAITING), decode, what, count, patience_s)
+
+    def _mirror_grid(self) -> tuple[int, int]:
+        if self._grid is None:  # it does not change: another mirror is another run
+            self._grid = self.calibration().grid
+        return self._grid
+
+
+_COMMANDS = {Role.CONTROLLER: "controller", Role.RECORDER: "record"}
+
+
+def _answer(name: str, sample: Sample) -> Answer:
+    message = wire.Request.FromString(sample.payload)
+    if not message.accepted:
+        raise RequestRefusedError(f"{name} refused: {message.reply}")
+    state = message.state if message.HasField("state") else None
+    return Answer(True, message.reply, message.frame_sequence, message.text, state)

@@ -1,0 +1,129 @@
+"""Frames and steps of a running loop, for who looks at them one after the other; what did not get here is counted."""
+
+import time
+from collections import deque
+from collections.abc import Callable
+from typing import Generic, NamedTuple, TypeVar
+
+import numpy as np
+import numpy.typing as npt
+from google.protobuf.message import DecodeError
+
+from lowfc.adapters.bus import Ring, Sample
+from lowfc.adapters.envelope import start_of
+from lowfc.contract import codec
+from lowfc.contract.errors import BusError
+from lowfc.contract.messages import from_timestamp, wire
+from lowfc.control.inputs import Step
+from lowfc.control.safety import LoopMode, Reason
+
+T = TypeVar("T")
+
+WAITING = 1024
+"""Messages of a stream that wait for their reader: a second of a 1 kHz loop."""
+SILENT_S = 5.0
+_POLL_S = 0.002
+
+
+class Frame(NamedTuple):
+    """A sensor image: `pixels` (rows, columns) uint16, DN; its time is the end of the exposure."""
+
+    sequence: int
+    time_ns: int
+    pixels: npt.NDArray[np.uint16]
+
+
+class Stream(Generic[T]):
+    """Messages of one topic in their order, from the moment it is made; it is there once the first one has come.
+
+    Attributes:
+        lost: messages that were sent and did not get here, because their reader was too slow, or that were none.
+    """
+
+    def __init__(
+        self, ring: Ring, decode: Callable[[Sample], T | None], what: str, count: int | None, patience_s: float
+    ) -> None:
+        """Begin with what the ring gets; it is read now and then, and keeps the newest.
+
+        Args:
+            ring: that gets the messages.
+            decode: a message; None where it is none.
+            what: they are, for people.
+            count: messages after which it ends; None for never.
+            patience_s: silence after which it is given up.
+
+        Raises:
+            BusError: none came.
+        """
+        self.lost = 0
+        self._ring: Ring | None = ring
+        self._decode = decode
+        self._what = what
+        self._left = count
+        self._patience_s = patience_s
+        self._last = 0
+        self._waiting: deque[Sample] = deque()
+        self._fill(ring)
+
+    def __iter__(self) -> "Stream[T]":
+        return self
+
+    def __next__(self) -> T:
+        """The next message.
+
+        Raises:
+            BusError: none came for too long.
+        """
+        while self._ring is not None and self._left != 0:
+            if not self._waiting:
+                self._fill(self._ring)
+            sample = self._waiting.popleft()
+            if start_of(sample.sequence) == start_of(self._last):
+                self.lost += max(0, sample.sequence - self._last - 1)
+            self._last = sample.sequence
+            found = self._decode(sample)
+            if found is not None:
+                self._left = None if self._left is None else self._left - 1
+                return found
+            self.lost += 1
+        self.close()
+        raise StopIteration
+
+    def close(self) -> None:
+        """Get no more."""
+        self._ring = None  # which ends its subscription
+        self._waiting.clear()
+
+    def _fill(self, ring: Ring) -> None:
+        deadline_s = time.monotonic() + self._patience_s
+        while not self._waiting:
+            self._waiting.extend(ring.drain())
+            if not self._waiting:
+                if time.monotonic() >= deadline_s:
+                    raise BusError(f"no {self._what} came within {self._patience_s:g} s: `lowfc ctl status` says why")
+                time.sleep(_POLL_S)
+
+
+def frame_of(sample: Sample) -> Frame | None:
+    """Frame of a message; None where it holds no whole image."""
+    frame = codec.decode_frame(sample.payload, sample.sequence, 0)
+    return None if frame.pixels is None else Frame(frame.sequence, frame.time_ns, frame.pixels)
+
+
+def step_of(sample: Sample) -> Step | None:
+    """Step of a message; None where it is none."""
+    try:
+        message = wire.ControlStep.FromString(sample.payload)
+        return Step(
+            message.frame_sequence,
+            from_timestamp(message.timestamp),
+            LoopMode(message.mode),
+            np.array(message.command_nm, np.float32),
+            tuple(Reason(reason) for reason in message.reasons),
+            np.array(message.error_nm, np.float32) if message.error_nm else None,
+            np.array(message.pol_nm, np.float32) if message.pol_nm else None,
+            message.flux_dn,
+            message.saturated_pixels,
+        )
+    except (DecodeError, ValueError):
+        return None

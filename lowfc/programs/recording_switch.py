@@ -1,0 +1,39 @@
+"""Recording, as an operator begins and ends it: questions to the recorder, answered with the file that is meant."""
+
+from collections import deque
+from collections.abc import Callable, Mapping
+from pathlib import Path
+
+from lowfc.adapters.bus import ALL, Bus, Query
+from lowfc.adapters.clock import Clock
+from lowfc.contract.messages import RECORD_KEY, timestamp, wire
+
+
+class RecordingSwitch:
+    """Questions that wait for the recorder's loop, and their answers."""
+
+    def __init__(self, bus: Bus, clock: Clock, handlers: Mapping[str, Callable[[], str]]) -> None:
+        """Declare it on the bus; each handler does what its name says, and returns why not where it did not."""
+        self._clock = clock
+        self._handlers = handlers
+        self._queries: deque[Query] = deque()
+        bus.queryable(RECORD_KEY.format(name=ALL), self._queries.append)
+
+    def serve(self, files: list[Path]) -> None:
+        """Do what was asked since the last call; `files` are the logs so far, and change with it."""
+        while self._queries:
+            query = self._queries.popleft()
+            handler = self._handlers.get(query.name)
+            if handler is None:
+                refusal = f"a recorder is told to {' or to '.join(self._handlers)}, not to {query.name}"
+            else:
+                refusal = handler()
+            path = str(files[-1].absolute()) if files else ""
+            message = wire.Request(
+                timestamp=timestamp(self._clock.now_ns()),
+                name=query.name,
+                text=path,
+                accepted=not refusal,
+                reply=refusal or f"{query.name}: {path}",
+            )
+            query.reply(message.SerializeToString())

@@ -1,0 +1,228 @@
+"""A night with the loop: every command of docs/operating.md, and its programs, against real processes."""
+
+import contextlib
+import io
+import itertools
+import json
+import re
+import shlex
+import subprocess
+import sys
+from collections import Counter
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+import pytest
+from loops import LOWFC, children, interrupt, payloads, run, start, until
+from safety_checks import violations
+from typer.testing import CliRunner
+
+from lowfc.adapters import calibration_file, law_file
+from lowfc.client import Client, running
+from lowfc.contract.errors import RequestRefusedError
+from lowfc.contract.messages import COMMAND, EVENT, REQUEST, Log, wire
+from lowfc.control.linear_law import integrator_block, of_blocks
+from lowfc.control.requests import REQUESTS
+from lowfc.control.safety import Limits
+from lowfc.programs.ctl_commands import ctl_app
+from lowfc.programs.ctl_requests import ASKED
+
+DOCUMENT = Path(__file__).parents[2] / "docs" / "operating.md"
+COMMANDS = re.findall(r"^    (lowfc ctl .*)$", DOCUMENT.read_text(), flags=re.MULTILINE)
+PROGRAMS = re.findall(r"^```python\n(.*?)^```$", DOCUMENT.read_text(), flags=re.MULTILINE | re.DOTALL)
+
+
+@dataclass
+class Night:
+    """A running loop, what was asked of it, and what it came to."""
+
+    folder: Path
+    process: "subprocess.Popen[str]"
+    name: str = ""
+    said: dict[str, str] = field(default_factory=dict)
+    figures: dict[str, object] = field(default_factory=dict)
+    logs: list[Path] = field(default_factory=list)
+
+    def ctl(self, command: str) -> str:
+        """A command line, in this process: what it says."""
+        words = [str(self.folder / word) if (self.folder / word).is_file() else word for word in shlex.split(command)]
+        done = CliRunner().invoke(ctl_app, [*words[2:], "--run", self.name], catch_exceptions=False)
+        assert done.exit_code == 0, done.output
+        self.said[command] = done.stdout
+        return done.stdout
+
+    def end(self) -> None:
+        out, complaints = interrupt(self.process)
+        assert self.process.returncode == 0, complaints
+        self.figures = json.loads(out)
+        self.logs = [self.folder / name for name in self.figures["logs"]]  # type: ignore[attr-defined]
+
+
+@pytest.fixture(scope="module")
+def night(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Night]:
+    """All of it is done once; the tests look at what it said and left."""
+    folder = tmp_path_factory.mktemp("night")
+    before = set(running())
+    process = start(folder, "sim-loop", "--rate", "200", "--json", "--disturbance", "bench", "--seed", "4")
+    made = Night(folder, process)
+    try:
+        until(lambda: "controller" in children(process.pid) and set(running()) - before)
+        (made.name,) = set(running()) - before
+        _ready(made)
+        for command in COMMANDS:
+            made.ctl(command)
+        for number, program in enumerate(PROGRAMS):
+            made.said[f"program {number}"] = _program(made, program)
+        _the_rest(made)
+        made.end()
+        yield made
+    finally:
+        if process.poll() is None:
+            process.kill()
+            process.communicate()
+
+
+def _ready(night: Night) -> None:
+    """Wait for frames, and leave the files that the document's commands read."""
+    with Client(night.name) as loop:
+        until(lambda: loop.status().state.frames_used)  # type: ignore[union-attr]
+        loop.steps(1, patience_s=20)
+        calibration, status = loop.calibration(), loop.status().state
+    assert status is not None
+    calibration_file.save(calibration, night.folder / "calibration.fits")
+    delay = status.settings.delay_frames
+    blocks = [integrator_block(0.2, 0.001, "pol", delay)] * len(calibration.noll)
+    law_file.save(of_blocks(blocks, "pol", "leaky", calibration.noll, delay, 200.0), night.folder / "law.fits")
+    rows, columns = np.indices(calibration.grid)
+    np.save(night.folder / "shape.npy", 3.0 * np.sin(rows / 3) * np.cos(columns / 4))
+
+
+def _program(night: Night, program: str) -> str:
+    """A program of the document, in this process; only the run has another name."""
+    said = io.StringIO()
+    words = program.replace('"bench"', repr(night.name)).replace("Client()", f"Client({night.name!r})")
+    words = words.replace('"lowfc", "config"', f"{sys.executable!r}, '-m', 'lowfc', 'config'")
+    with contextlib.redirect_stdout(said):
+        exec(compile(words, DOCUMENT.name, "exec"), {"__name__": "example"})  # noqa: S102  # our own document's
+    return said.getvalue()
+
+
+def _the_rest(night: Night) -> None:
+    """What the document has no command for: plays, refusals, JSON, and a process of its own."""
+    with Client(night.name) as loop:
+        grid = loop.calibration().grid
+        loop.open()
+        shapes = np.zeros((2, *grid))
+        shapes[0, 10:20, 10:20], shapes[1, 5:9, 20:30] = 2.0, -3.0
+        steps = loop.steps(60)
+        first = loop.play(shapes, np.ones((20, 2))).frame_sequence
+        night.said["played"] = json.dumps([len(list(steps)), steps.lost])
+        until(lambda: not loop.status().state.HasField("play"))  # type: ignore[union-attr]
+        loop.step(5)
+        until(lambda: loop.status().reply == "open")
+        loop.close_loop()
+        assert loop.play_offset(np.ones((5000, 14))).frame_sequence > first
+        loop.stop()
+        for ask, why in (
+            (lambda: loop.gain(9.0), "becomes unstable"),
+            (lambda: loop.offset(np.nan), "finite"),
+            (lambda: loop.channel("Dark Hole", np.zeros(grid)), "letter first"),
+            (lambda: loop.load(loop.calibration()), "the loop is closed"),
+            (lambda: loop.note(" "), "1 to"),
+            (lambda: loop.ask("dance"), "unknown request 'dance'"),
+            (lambda: loop.record(True), "recorded already"),
+        ):
+            with pytest.raises(RequestRefusedError, match=why):
+                ask()
+    for command in ("lowfc ctl status --json", "lowfc ctl note once --json", "lowfc ctl configuration --json"):
+        night.ctl(command)
+    words = [*LOWFC, "ctl", "gain", "-0.1", "--modes", "2", "--run", night.name]
+    refused = subprocess.run(words, capture_output=True, text=True, timeout=20, check=False)
+    night.said["refused"] = f"{refused.returncode} {refused.stdout}{refused.stderr}"
+
+
+def test_every_request_is_made_by_a_command_of_the_document() -> None:
+    names = {command.split()[2] for command in COMMANDS}
+    assert names == {asked.example.split()[0] for asked in ASKED if asked.example}
+
+
+def test_the_commands_say_what_they_did(night: Night) -> None:
+    said = night.said
+    assert "loop           closed" in said["lowfc ctl status"]
+    assert 'preset = "bench"' in said["lowfc ctl configuration"]
+    assert "loop closed for 50 frames, from frame" in said["lowfc ctl step 50"]
+    assert "gain is now 0.4 0.4 0.05" in said["lowfc ctl gain 0.4 --modes 2,3"]
+    assert "leak is now 0 0 0.001 0.001" in said["lowfc ctl leak 0.001 --modes 4-11"]
+    assert "offset is now 0 0 5 0" in said["lowfc ctl offset 5 -3 --modes 4,11"]
+    assert "channel dark-hole: 1.47 nm rms of surface" in said["lowfc ctl channel dark-hole shape.npy"]
+    assert "'leaky' takes over" in said["lowfc ctl law law.fits"]
+    assert [said[f"lowfc ctl {name}"].split(",")[0] for name in ("safe", "clear", "pause", "close")] == [
+        "loop safed",
+        "loop open",
+        "loop open",
+        "loop closed",
+    ]
+    status = json.loads(said["lowfc ctl status --json"])
+    assert (status["mode"], status["law"]["name"], status["offset_rms_nm"]) == ("closed", "integrator", 0.0)
+    assert status["channels"] == []
+    assert json.loads(said["lowfc ctl note once --json"])["reply"] == "noted"
+    assert json.loads(said["lowfc ctl configuration --json"])["camera"]["rate_hz"] == 200.0
+    assert re.match(r"2 error: gain refused: gain must be at least 0", said["refused"])
+
+
+def test_the_programs_of_the_document_run(night: Night) -> None:
+    assert "frames lost on their way: 0" in night.said["program 0"]
+    assert "mean image (" in night.said["program 0"]
+    assert night.said["program 1"].startswith("True gain is now 0.3 0.3")
+    assert json.loads(night.said["played"]) == [60, 0]
+
+
+def test_the_log_has_every_request_and_nothing_was_lost(night: Night) -> None:
+    assert night.figures["messages_lost"] == 0
+    assert night.figures["recording_failure"] is None
+    assert len(night.logs) == 2, "the recording was stopped and started once"
+    messages = [payloads(log) for log in night.logs]
+    requests = [wire.Request.FromString(body) for found in messages for body in found.get(f"/{REQUEST.key}", [])]
+    counts = Counter((request.name, request.accepted) for request in requests)
+    assert {name for name, accepted in counts if accepted} == set(REQUESTS)
+    assert {name for name, accepted in counts if not accepted} == {"gain", "offset", "channel", "load", "note", "dance"}
+    commanded = Counter(command.split()[2] for command in COMMANDS)
+    for name, count in commanded.items():
+        assert name == "record" or sum(counts[name, good] for good in (True, False)) >= count
+    taken = [request.taken for request in requests if request.taken]
+    assert taken == sorted(taken)
+    events = [Log.FromString(body).message for found in messages for body in found[f"/{EVENT.key}"]]
+    for wanted in (
+        "RECORDING_STOPPED recording stopped: operator asked",
+        "NOTE HD 209458, seeing 0.8 arcsec",
+        "LOOP_STEPPED the loop opened after its last step",
+    ):
+        assert wanted in events
+
+
+def test_the_mirror_never_jumped(night: Night) -> None:
+    limits = Limits(700.0, 100.0, 400.0)
+    shapes = []
+    for found in map(payloads, night.logs):
+        commands = [wire.MirrorCommand.FromString(body) for body in found[f"/{COMMAND.at('dm')}"]]
+        shapes.append([np.frombuffer(one.actuators, "<f4").reshape(one.rows, one.columns) for one in commands])
+    assert sum(map(len, shapes)) > 500
+    for log in shapes:
+        for before, now in itertools.pairwise(log):
+            assert violations(limits, before, now) == []
+
+
+def test_the_night_is_replayed_to_the_bit(night: Night) -> None:
+    commands = 0
+    for log in night.logs:
+        done = run(night.folder, "replay", "--json", str(log))
+        assert done.returncode == 0, done.stdout + done.stderr
+        found = json.loads(done.stdout)
+        assert found["identical"]
+        assert found["largest_difference_nm"] == 0
+        commands += found["commands"]
+    frames = night.figures["frames_processed"]
+    assert isinstance(frames, int)
+    assert commands > 0.6 * frames, "all but those before the second log's first state"
