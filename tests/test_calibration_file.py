@@ -132,3 +132,18 @@ def test_the_message_carries_the_same(tmp_path: Path) -> None:
         assert getattr(message, name) == getattr(one, name).tobytes()
     assert list(message.mask) == one.good.astype(int).tolist()
     assert (message.flux_dn, message.saturation_dn) == (one.flux_dn, one.saturation_dn)
+
+
+def test_what_r_makes_of_each_actuator_is_kept_and_may_be_missing(tmp_path: Path) -> None:
+    one, path = calibration(), tmp_path / "night.fits"
+    seen = np.arange(36, dtype=np.float32).reshape(3, 12)
+    whole = calibration_codec.identified(replace(one, actuators_to_modes=seen))
+    save(whole, path)
+    assert np.array_equal(load(path).actuators_to_modes, seen)
+    assert whole.id != one.id
+    with fits.open(path) as units:
+        assert "ACT2MODES" in units
+    save(one, path)
+    assert load(path).actuators_to_modes.size == 0
+    with fits.open(path) as units:
+        assert "ACT2MODES" not in units

@@ -1,0 +1,73 @@
+"""A calibration with another dark, mask or reference image: everything that hangs on them made anew."""
+
+from dataclasses import replace
+
+import numpy as np
+import numpy.typing as npt
+
+from lowfc.control.calibration import Calibration, normalise_flux
+from lowfc.control.regularised import reconstruct
+
+Array = npt.NDArray[np.float64]
+Single = npt.NDArray[np.float32]
+
+
+def with_dark(calibration: Calibration, dark_dn: Array, good: Array, read_noise_e: float, gain_e: float) -> Calibration:
+    """The calibration with another dark (pixels,), DN, and only the pixels (pixels,) that are 1 in `good`.
+
+    I0 and H pass through the flux normalisation of the pixels that are left, and R is made anew from them.
+
+    Args:
+        calibration: The one so far; pixels that were bad stay bad.
+        dark_dn: Mean of frames without light.
+        good: 1 where a pixel is used, else 0.
+        read_noise_e: Of a pixel.
+        gain_e: Electrons per DN.
+
+    Raises:
+        ValueError: too little is left to tell the modes apart.
+    """
+    kept = good * calibration.good
+    I0, H = calibration.reference.astype(np.float64), calibration.response.astype(np.float64)
+    share = float(I0 @ kept)
+    I0, H = normalise_flux(I0, H, kept)
+    changed = replace(
+        calibration,
+        reference=_single(I0),
+        response=_single(H),
+        good=_single(kept),
+        dark=_single(dark_dn),
+        flux_dn=calibration.flux_dn * share,
+    )
+    return _reconstructed(changed, read_noise_e, gain_e)
+
+
+def with_reference(
+    calibration: Calibration, reference: Array, flux_dn: float, read_noise_e: float, gain_e: float
+) -> Calibration:
+    """The calibration with another zero point (pixels,), in flux fractions, and mean flux; H stays.
+
+    Raises:
+        ValueError: there is no light on the good pixels.
+    """
+    I0, _ = normalise_flux(reference, calibration.response.astype(np.float64), calibration.good.astype(np.float64))
+    return _reconstructed(replace(calibration, reference=_single(I0), flux_dn=flux_dn), read_noise_e, gain_e)
+
+
+def _reconstructed(calibration: Calibration, read_noise_e: float, gain_e: float) -> Calibration:
+    """R anew from I0 and H, by the weights that its name says."""
+    estimator = calibration.estimator.partition("+")[0]
+    made = reconstruct(
+        calibration.reference.astype(np.float64),
+        calibration.response.astype(np.float64),
+        None,
+        calibration.good.astype(np.float64),
+        calibration.flux_dn * gain_e,
+        read_noise_e,
+        estimator,
+    )
+    return replace(calibration, reconstructor=_single(made.matrix), operator_hash="", id="")
+
+
+def _single(array: Array) -> Single:
+    return np.ascontiguousarray(array, dtype=np.float32)

@@ -1,0 +1,73 @@
+"""`lowfc calibrate` on the real processes: pokes through the bus, Ctrl-C in the middle, and going on after it."""
+
+import json
+import signal
+import time
+from pathlib import Path
+
+import numpy as np
+from loops import interrupt, run, start, until
+
+from lowfc.adapters import calibration_file
+from lowfc.client import Client, running
+from lowfc.control.response_fit import cross_talk
+
+CONFIG = """
+[sensor]
+sam = "sam27d10_bal14"
+modes = 6
+[star]
+magnitude = 0.0
+[camera]
+rate_hz = 500.0
+delay_frames = 1.5
+[disturbance]
+preset = "quiet"
+[realtime]
+priority = 0
+stay_awake = false
+"""
+
+
+def test_a_running_loop_is_calibrated_interrupted_and_gone_on_with(tmp_path: Path) -> None:
+    (tmp_path / "test.toml").write_text(CONFIG)
+    loop = start(tmp_path, "sim-loop", "--config", "test.toml", "--no-record", "--open")
+    try:
+        until(running)
+        calibrating = start(tmp_path, "calibrate", "--cycles", "400", "--out", "night.fits")
+        until((tmp_path / "night.fits.part.npz").exists)
+        calibrating.send_signal(signal.SIGINT)
+        assert calibrating.wait(20) == 130
+        with Client() as client:
+            until(lambda: flat(client))
+        done = run(
+            tmp_path, "calibrate", "--cycles", "5", "--resume", "--no-linear-range", "--out", "night.fits", "--json"
+        )
+        assert done.returncode == 0, done.stderr
+        assert "going on after" in done.stderr
+        found = json.loads(done.stdout)
+        assert {"method", "modes", "condition_number", "delay_frames", "noise_gain_nm", "file"} <= found.keys()
+        assert abs(found["delay_frames"] - 1.5) < 0.05
+        assert found["cross_talk"] < 0.02 + 4 * found["cross_talk_error"]
+        assert not (tmp_path / "night.fits.part.npz").exists()
+        made = calibration_file.load(tmp_path / "night.fits")
+        with Client() as client:
+            assert flat(client)
+            talk = cross_talk(made.reconstructor, client.calibration().response)
+            assert np.abs(talk).max() == np.float64(found["cross_talk"])
+            client.load(made)
+            assert client.calibration().id == made.id
+            client.close_loop()
+            time.sleep(0.5)
+            state = client.status().state
+            assert state is not None
+            assert np.abs(np.array(state.command_history_nm)).max() < 5
+    finally:
+        interrupt(loop)
+
+
+def flat(client: Client) -> bool:
+    """Whether nothing is played, nor anything commanded."""
+    state = client.status().state
+    assert state is not None
+    return not np.frombuffer(state.actuators, np.float32).any()

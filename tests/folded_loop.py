@@ -1,0 +1,174 @@
+"""A loop in one process behind the client's interface: frames are exposed when somebody asks for the next one."""
+
+import tomllib
+from collections import deque
+from collections.abc import Callable, Iterator
+from functools import lru_cache
+from typing import Any, NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from lowfc.adapters import instrument
+from lowfc.client import Frame as Image
+from lowfc.contract.configuration import Configuration
+from lowfc.contract.errors import RequestRefusedError
+from lowfc.contract.messages import wire
+from lowfc.contract.state_codec import controller_state
+from lowfc.control.additions import MIRROR
+from lowfc.control.calibration import Calibration
+from lowfc.control.inputs import Frame, Load, Request, Step
+from lowfc.control.loop import advance
+from lowfc.control.stability import delay_weights
+from lowfc.control.state import State
+from sim_camera.process import bench
+from sim_dm.device import Told, initial, obey
+from sim_dm.process import device
+
+FIRST = 1 << 32
+
+
+@lru_cache(maxsize=4)
+def computed(toml: str) -> Calibration:
+    """The computed calibration of a configuration."""
+    config = Configuration.model_validate(tomllib.loads(toml))
+    optics = instrument.twin(config, None, print)
+    return instrument.analytic_calibration(config, optics, instrument.mirror_on_twin(config, optics, print))
+
+
+class Given(NamedTuple):
+    """An answer."""
+
+    frame_sequence: int
+    state: wire.ControllerState | None
+
+
+class FoldedLoop:
+    """Camera, controller and mirror, one frame after the other.
+
+    Attributes:
+        surfaces_nm: shape of the mirror in each exposure.
+        residual_nm: true modes in each exposure.
+    """
+
+    def __init__(
+        self,
+        config: Configuration,
+        calibration: Calibration | None = None,
+        world: Configuration | None = None,
+        lose: Callable[[int], bool] = lambda index: False,
+    ) -> None:
+        """A loop under `config` in a world that may be another one; frames that `lose` names do not arrive."""
+        world = config if world is None else world
+        self.config = config
+        if calibration is None:
+            calibration = computed(config.to_toml())
+        self._settings = instrument.settings(config)
+        self._state, _ = advance(self._settings, State(), Load(0, calibration, "test"))
+        self._scene, self._mirror = bench(world), device(world)
+        self._status = initial(self._mirror)
+        self._weights = delay_weights(world.camera.delay_frames).astype(np.float32)
+        self._shapes = [self._status.surface_nm] * len(self._weights)
+        self._index = 0
+        self._lose = lose
+        self._listeners: list[tuple[str, deque[Any]]] = []
+        self.surfaces_nm: list[npt.NDArray[np.float32]] = []
+        self.residual_nm: list[npt.NDArray[np.float32]] = []
+        self.stops = 0
+
+    def expose(self) -> None:
+        """One frame."""
+        self._shapes = [self._status.surface_nm, *self._shapes[:-1]]
+        seen = np.tensordot(self._weights, np.array(self._shapes), 1)
+        pixels, truth = self._scene.expose(self._index, seen)
+        self.surfaces_nm.append(seen)
+        self.residual_nm.append(truth.residual_nm)
+        sequence, time_ns = FIRST + self._index, 10**18 + self._index * self.config.period_ns
+        self._index += 1
+        if self._lose(self._index - 1):
+            return
+        self._state, outputs = advance(self._settings, self._state, Frame(sequence, time_ns, 0, pixels))
+        step, command = outputs.step, outputs.command
+        assert step is not None
+        assert command is not None
+        told = Told("lowfc", sequence, time_ns, 10**9, command.actuators_nm, command.command_nm)
+        self._status, refused = obey(self._mirror, self._status, told, time_ns)
+        assert refused is None
+        for kind, waiting in self._listeners:
+            waiting.append(Image(sequence, time_ns, pixels) if kind == "frames" else step)
+
+    def run(self, frames: int) -> None:
+        """Some frames that nobody looks at."""
+        for _ in range(frames):
+            self.expose()
+
+    def ask(self, name: str, **fields: Any) -> Given:
+        """A request, carried out before the next frame."""
+        self._state, outputs = advance(self._settings, self._state, Request(0, name, **fields))
+        assert outputs.reply is not None
+        if not outputs.reply.accepted:
+            raise RequestRefusedError(f"{name} refused: {outputs.reply.text}")
+        state = controller_state(self._state, self._settings, 0) if name == "status" else None
+        return Given(outputs.reply.frame_sequence, state)
+
+    def play(self, basis_nm: npt.ArrayLike, table: npt.ArrayLike) -> Given:
+        """See `Client.play`."""
+        self.expose()  # time goes on while somebody asks
+        basis = np.asarray(basis_nm, np.float32)
+        return self.ask("play", text=MIRROR, actuators_nm=basis.reshape(-1), table=np.asarray(table, np.float32))
+
+    def status(self) -> Given:
+        """See `Client.status`."""
+        return self.ask("status")
+
+    def open(self) -> Given:
+        """See `Client.open`."""
+        return self.ask("open")
+
+    def close_loop(self) -> Given:
+        """See `Client.close_loop`."""
+        return self.ask("close")
+
+    def stop(self) -> Given:
+        """See `Client.stop`."""
+        self.stops += 1
+        return self.ask("stop")
+
+    def load(self, calibration: Calibration) -> Given:
+        """See `Client.load`."""
+        return self.ask("load", calibration=calibration)
+
+    def calibration(self) -> Calibration:
+        """See `Client.calibration`."""
+        assert self._state.drive is not None
+        return self._state.drive.calibration
+
+    def configuration(self) -> str:
+        """See `Client.configuration`."""
+        return self.config.to_toml()
+
+    def frames(self, count: int | None = None) -> Iterator[Image]:
+        """See `Client.frames`."""
+        return self._listen("frames", count)
+
+    def steps(self, count: int | None = None) -> Iterator[Step]:
+        """See `Client.steps`."""
+        return self._listen("steps", count)
+
+    def _listen(self, kind: str, count: int | None) -> Iterator[Any]:
+        waiting: deque[Any] = deque()
+        listener = (kind, waiting)
+        self._listeners.append(listener)
+
+        def each() -> Iterator[Any]:
+            left = count
+            try:
+                while left is None or left > 0:
+                    while not waiting:
+                        self.expose()
+                    left = None if left is None else left - 1
+                    yield waiting.popleft()
+            finally:
+                self._listeners = [one for one in self._listeners if one is not listener]
+
+        return each()

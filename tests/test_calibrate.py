@@ -1,0 +1,236 @@
+"""Calibration of a whole loop in one process: the controller's own functions, the simulated optics, photon noise."""
+
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+import pytest
+from folded_loop import FoldedLoop, Given
+
+from lowfc.contract.configuration import Configuration, load
+from lowfc.contract.errors import CalibrationError, DataFileError
+from lowfc.contract.messages import wire
+from lowfc.control.calibration import Calibration
+from lowfc.control.response_fit import cross_talk, cross_talk_error
+from lowfc.programs import calibrate_run
+from lowfc.programs.calibrate_partial import go_on, partial_of
+from lowfc.programs.calibrate_result import measured_calibration
+from lowfc.programs.calibrate_run import Calibrator, Taken, Wanted
+
+OUT = Path("night.fits")
+BRIGHT = {
+    "sensor.sam": "sam27d10_bal14",
+    "star.magnitude": 0.0,
+    "disturbance.preset": "quiet",
+}
+
+
+def configured(**changes: object) -> Configuration:
+    return load(None, BRIGHT | {key.replace("__", "."): value for key, value in changes.items()})
+
+
+FEW = {"sensor.modes": 6}
+"""Modes, for what does not hang on their number: a cycle is half as long."""
+
+
+@pytest.fixture(autouse=True)
+def _folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+
+
+def ignore(*told: object) -> None:
+    pass
+
+
+def of(
+    loop: FoldedLoop,
+    method: str,
+    cycles: int,
+    *,
+    out: Path = OUT,
+    amplitude_nm: float | None = None,
+    resume: bool = False,
+) -> Calibrator:
+    wanted = Wanted(method, amplitude_nm, 100.0, cycles, out, resume)
+    return Calibrator(loop, wanted, ignore, ignore)
+
+
+def taken_of(
+    loop: FoldedLoop, method: str, cycles: int, *, out: Path = OUT, resume: bool = False
+) -> tuple[Calibrator, Taken]:
+    calibrator = of(loop, method, cycles, out=out, resume=resume)
+    with calibrator.holding():
+        return calibrator, calibrator.run()
+
+
+def mode_of(loop: FoldedLoop) -> int:
+    state = loop.status().state
+    assert state is not None
+    return state.mode
+
+
+def calibrated(loop: FoldedLoop, method: str, cycles: int) -> tuple[Calibration, Taken]:
+    calibrator, taken = taken_of(loop, method, cycles)
+    made, _ = measured_calibration(loop.config, calibrator.before, taken.measured, method, 0.0, 0.0)
+    return made, taken
+
+
+@pytest.mark.parametrize(
+    ("method", "delay", "modes", "cycles"), [("hadamard", 1.0, 14, 4), ("poke", 1.5, 6, 6), ("in-loop", 2.0, 6, 4)]
+)
+def test_what_is_measured_reads_the_true_modes(method: str, delay: float, modes: int, cycles: int) -> None:
+    config = configured(camera__delay_frames=delay, sensor__modes=modes)
+    loop = FoldedLoop(config)
+    if method == "in-loop":
+        loop.close_loop()
+        loop.run(30)
+    before = loop.calibration()
+    made, taken = calibrated(loop, method, cycles)
+    assert abs(taken.delay.delay_frames - delay) < 0.05
+    assert taken.measured.error is not None
+    R, H = made.reconstructor.astype(float), before.response.astype(float)
+    error = cross_talk_error(R, taken.measured.error)
+    assert error.max() < 0.02
+    assert (np.abs(cross_talk(R, H)) - 4 * error).max() < 0.02
+    assert np.allclose(made.actuators_to_modes @ made.modes_to_actuators, np.eye(len(made.noll)), atol=1e-4)
+    close = made.actuators_to_modes - before.actuators_to_modes
+    assert np.linalg.norm(close) < 0.1 * np.linalg.norm(before.actuators_to_modes)
+    assert made.id != before.id
+    assert made.estimator == f"weighted+{method}"
+
+
+def closed(config: Configuration, calibration: Calibration, frames: int, world: Configuration) -> np.ndarray:
+    """True residual (frames, modes) of the second half of a closed loop."""
+    loop = FoldedLoop(config, calibration, world)
+    loop.close_loop()
+    loop.run(frames)
+    return np.array(loop.residual_nm[frames // 2 :], dtype=np.float64)
+
+
+def test_a_loop_on_the_measured_calibration_is_as_good_as_on_the_computed_one() -> None:
+    loop = FoldedLoop(configured(**FEW))
+    made, _ = calibrated(loop, "hadamard", 4)
+    shaken = configured(**FEW, disturbance__preset="bench")
+    of_computed, of_measured = (closed(shaken, each, 600, shaken) for each in (loop.calibration(), made))
+    one, other = (np.sqrt((each**2).sum(axis=1).mean()) for each in (of_computed, of_measured))
+    assert abs(other / one - 1) < 0.05
+
+
+def test_a_mirror_with_dead_actuators_and_another_scale_calibrates_and_closes() -> None:
+    dead = [300, 417, 595, 700, 812]
+    active = np.ones(34 * 34)
+    active[dead] = 0
+    np.save("active.npy", active.reshape(34, 34))
+    config = configured(**FEW, mirror__active="active.npy")
+    true = {"mirror__dead": dead, "mirror__magnification": 1.01}
+    loop = FoldedLoop(config, world=configured(**FEW, **true))
+    made, taken = calibrated(loop, "hadamard", 4)
+    assert of(loop, "hadamard", 4).amplitude_nm <= 3
+    assert not made.modes_to_actuators[dead].any()
+    assert not made.actuators_to_modes[:, dead].any()
+    wrong = cross_talk(loop.calibration().reconstructor, taken.measured.response)
+    assert np.abs(wrong).max() > 0.02  # the computed calibration does not know of it
+    shaken = configured(**FEW, **true, disturbance__static_nm={"2": 10.0, "5": 8.0, "7": -6.0})
+    settled = closed(config, made, 400, shaken).mean(axis=0)
+    assert np.abs(settled).max() < 0.5
+
+
+def test_a_reference_that_is_not_flat_is_held() -> None:
+    state = {"4": 15.0, "7": -10.0}
+    config = configured(**FEW)
+    loop = FoldedLoop(config, world=configured(**FEW, disturbance__static_nm=state))
+    made, _ = calibrated(loop, "hadamard", 4)
+    zero = loop.residual_nm[0]
+    moved = configured(**FEW, disturbance__static_nm=state | {"4": 35.0, "6": 20.0})
+    off = closed(config, made, 600, moved).mean(axis=0) - zero
+    assert np.abs(off).max() < 0.02 * 20.0
+
+
+class Interrupting(FoldedLoop):
+    """Ctrl-C during the second play."""
+
+    plays = 0
+
+    def play(self, basis_nm: npt.ArrayLike, table: npt.ArrayLike) -> Given:
+        given = super().play(basis_nm, table)
+        self.plays += 1
+        if self.plays == 3:
+            self.run(100)
+            raise KeyboardInterrupt
+        return given
+
+
+def test_after_ctrl_c_the_mirror_is_where_it_was_and_the_cycles_done_are_kept() -> None:
+    loop = Interrupting(configured(**FEW, disturbance__static_nm={"4": 5.0}))
+    loop.close_loop()
+    loop.run(50)
+    loop.open()
+    loop.run(5)
+    held = loop.surfaces_nm[-1]
+    assert np.abs(held).max() > 1
+    with pytest.raises(KeyboardInterrupt):
+        taken_of(loop, "hadamard", 4)
+    assert np.abs(loop.surfaces_nm[-1] - held).max() > 1
+    loop.run(5)
+    assert np.array_equal(loop.surfaces_nm[-1], held)
+    assert loop.stops == 1
+    kept = go_on(partial_of(OUT), {"method": "hadamard"})
+    assert kept.cycles == 1
+    _, taken = taken_of(loop, "hadamard", 4, resume=True)
+    assert taken.measured.cycles == 4
+    assert np.array_equal(loop.surfaces_nm[-1], held)
+    with pytest.raises(DataFileError, match="its method is hadamard, now it is poke"):
+        taken_of(loop, "poke", 4, resume=True)
+    with pytest.raises(DataFileError, match="nothing to go on from"):
+        taken_of(loop, "poke", 4, out=Path("other.fits"), resume=True)
+
+
+def test_a_closed_loop_is_opened_for_pokes_and_closed_again() -> None:
+    loop = FoldedLoop(configured(**FEW))
+    with pytest.raises(CalibrationError, match="the loop is open: `lowfc ctl close` first"):
+        taken_of(loop, "in-loop", 4)
+    loop.close_loop()
+    calibrator = of(loop, "poke", 4)
+    modes = []
+    with calibrator.holding():
+        modes.append(mode_of(loop))
+    assert [*modes, mode_of(loop)] == [wire.LOOP_MODE_OPEN, wire.LOOP_MODE_CLOSED]
+    loop.ask("safe")
+    with pytest.raises(CalibrationError, match="must be open or closed"), calibrator.holding():
+        pass
+
+
+def test_lost_frames_cost_only_themselves() -> None:
+    config = configured(**FEW, camera__delay_frames=1.5)
+    loop = FoldedLoop(config, lose=lambda index: index > 700 and index % 41 == 0)
+    before = loop.calibration()
+    made, taken = calibrated(loop, "hadamard", 4)
+    assert taken.measured.error is not None
+    error = cross_talk_error(made.reconstructor.astype(float), taken.measured.error)
+    assert (np.abs(cross_talk(made.reconstructor, before.response)) - 4 * error).max() < 0.02
+
+
+def test_what_cannot_be_calibrated_is_said(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(calibrate_run, "MOST_FAILURES", 2)
+    blind = FoldedLoop(configured(**FEW), world=configured(**FEW, mirror__dead=list(range(34 * 34))))
+    with pytest.raises(CalibrationError, match="pokes are not seen"):
+        taken_of(blind, "hadamard", 4)
+    loop = FoldedLoop(configured(**FEW))
+    with pytest.raises(CalibrationError, match="at most 3 nm of each"):
+        of(loop, "hadamard", 4, amplitude_nm=5.0)
+    with pytest.raises(CalibrationError, match="slew limit; at most"):
+        of(loop, "poke", 4, amplitude_nm=500.0)
+    lossy = FoldedLoop(configured(**FEW), lose=lambda index: index % 50 == 49)
+    with pytest.raises(CalibrationError, match="in 2 attempts there was no run of 600 frames"):
+        taken_of(lossy, "hadamard", 4)
+
+
+def test_the_linear_range_is_measured() -> None:
+    loop = FoldedLoop(configured(**FEW))
+    calibrator = of(loop, "hadamard", 4)
+    with calibrator.holding():
+        delay = calibrator.delay()
+        found = calibrator.linear_range(loop.calibration(), delay)
+    assert found.range_nm.shape == (6,)
+    assert (found.range_nm > 15).all()  # Sect. 3.2: linear to about a twentieth of a wave, 27 nm
+    assert np.abs(found.gain[0] - 1).max() < 0.1

@@ -1,0 +1,179 @@
+"""`lowfc calibrate` and what stands beside it: files, figures and mistakes; the loop is in this process."""
+
+import json
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from astropy.io import fits
+from folded_loop import FoldedLoop
+from typer.testing import CliRunner
+
+from lowfc.adapters import calibration_file
+from lowfc.contract.calibration_codec import identified
+from lowfc.contract.configuration import Configuration, load
+from lowfc.contract.errors import CalibrationError, DataFileError
+from lowfc.control.alignment import Geometry, onto
+from lowfc.control.response_fit import cross_talk
+from lowfc.programs import calibrate_align, calibrate_commands
+from lowfc.programs.calibrate import calibrate_app
+from lowfc.programs.calibrate_commands import compared
+
+CONFIG = {
+    "sensor.sam": "sam27d10_bal14",
+    "sensor.modes": 6,
+    "star.magnitude": 0.0,
+    "disturbance.preset": "quiet",
+}
+
+
+class Connected(FoldedLoop):
+    """A loop that commands connect to."""
+
+    def __enter__(self) -> "Connected":
+        return self
+
+    def __exit__(self, *what: object) -> None:
+        pass
+
+
+@pytest.fixture
+def loop(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Connected:
+    monkeypatch.chdir(tmp_path)
+    made = Connected(load(None, CONFIG), world=load(None, CONFIG | {"disturbance.static_nm": {"4": 6.0}}))
+    connect(made, monkeypatch)
+    return made
+
+
+def connect(loop: Connected, monkeypatch: pytest.MonkeyPatch) -> None:
+    for module in (calibrate_commands, calibrate_align):
+        monkeypatch.setattr(module, "Client", lambda run: loop)
+
+
+def told(*words: str) -> dict[str, Any]:
+    """The JSON of a command that must succeed."""
+    done = CliRunner().invoke(calibrate_app, [*words, "--json"], catch_exceptions=False)
+    assert done.exit_code == 0, done.output
+    found: dict[str, Any] = json.loads(done.stdout)
+    return found
+
+
+def toml(config: Configuration) -> str:
+    Path("test.toml").write_text(config.to_toml())
+    return "test.toml"
+
+
+def test_a_calibration_is_written_and_used_and_its_figures_are_told(loop: Connected) -> None:
+    before = loop.calibration()
+    found = told("--method", "hadamard", "--cycles", "4", "--out", "night.fits", "--load", "--no-linear-range")
+    made = calibration_file.load(Path("night.fits"))
+    assert found["method"] == "hadamard"
+    assert found["modes"] == 6
+    assert found["file"] == "night.fits"
+    assert found["condition_number"] > 1
+    assert abs(found["delay_frames"] - 1) < 0.05
+    assert found["frame_to_effect_ms"] == pytest.approx(4.0, rel=0.05)
+    assert len(found["noise_gain_nm"]) == len(found["singular_values"]) == 6
+    # H was measured 6 nm from flat, where the computed one is a little off
+    assert found["cross_talk"] < 0.1 + 4 * found["cross_talk_error"]
+    assert loop.calibration().id == made.id != before.id
+    assert list(Path().glob("*.part.npz")) == []
+    same = told("--compare", "night.fits", "night.fits")
+    assert same["cross_talk"] < 0.1  # R leaves out the noise of H, which is in both here
+    assert same["same_commands"]
+    assert same["reference_shift_nm"] == [0.0] * 6
+    done = CliRunner().invoke(calibrate_app, ["--compare", "night.fits", "night.fits"])
+    assert "largest cross-talk" in done.stdout
+
+
+def test_the_reference_is_the_present_state(loop: Connected) -> None:
+    found = told("reference", "--frames", "200", "--out", "there.fits")
+    shift = dict(zip(found["noll"], found["reference_shift_nm"], strict=True))
+    assert shift[4] == pytest.approx(6.0, abs=0.6)
+    made = calibration_file.load(Path("there.fits"))
+    assert np.abs(cross_talk(made.reconstructor, made.response)).max() < 1e-3
+    assert np.array_equal(made.response, loop.calibration().response)
+
+
+def test_a_dark_finds_bad_pixels_and_is_not_taken_in_light(loop: Connected, monkeypatch: pytest.MonkeyPatch) -> None:
+    with pytest.raises(CalibrationError, match=r"not dark: .*; block the star|not dark"):
+        told("dark", "--dark-taken", "--frames", "50")
+    rng = np.random.default_rng(5)
+    cube = np.rint(100 + 1.5 * rng.standard_normal((64, 80, 80)))
+    cube[:, 40, 41] += 500
+    fits.PrimaryHDU(cube.astype(np.int16)).writeto("dark.fits")
+    found = told("dark", "--file", "dark.fits", "--out", "masked.fits")
+    assert (found["hot"], found["noisy"], found["dead"]) == (1, 0, 0)
+    made = calibration_file.load(Path("masked.fits"))
+    assert made.good.reshape(80, 80)[40, 41] == 0
+    assert not made.reconstructor[:, 40 * 80 + 41].any()
+    fits.PrimaryHDU(cube[:, :20].astype(np.int16)).writeto("small.fits")
+    with pytest.raises(DataFileError, match=r"frames of \(20, 80\), the calibration has \(80, 80\)"):
+        told("dark", "--file", "small.fits")
+    with pytest.raises(DataFileError, match="cannot be read"):
+        told("dark", "--file", "none.fits")
+    dark = Connected(load(None, CONFIG), world=load(None, CONFIG | {"star.magnitude": 20.0}))
+    connect(dark, monkeypatch)
+    found = told("dark", "--dark-taken", "--frames", "50", "--out", "night.fits")
+    assert found["dark_dn"] == pytest.approx(100, abs=0.5)
+    assert found["hot"] < 5
+
+
+def test_a_sensor_that_lies_otherwise_gets_the_computed_calibration_on_its_pixels(loop: Connected) -> None:
+    before = loop.calibration()
+    geometry = Geometry(1.08, 44.0, 47.5, 12.0, -1)
+    light = 3e5 * onto(before.reference.astype(float).reshape(80, 80), geometry, (90, 96)) + 3
+    fits.PrimaryHDU(np.random.default_rng(2).poisson(np.maximum(light, 0)).astype(np.int32)).writeto("real.fits")
+    found = told("align", "--file", "real.fits", "--config", toml(loop.config), "--out", "aligned.fits")
+    assert found["pixels_per_lambda_d"] == pytest.approx(4 * 1.08, rel=0.003)
+    assert (found["row"], found["column"]) == pytest.approx((44.0, 47.5), abs=0.1)
+    assert found["rotation_deg"] == pytest.approx(12.0, abs=0.3)
+    assert found["parity"] == -1
+    made = calibration_file.load(Path("aligned.fits"))
+    assert made.shape == (90, 96)
+    H = onto(before.response.astype(float).reshape(80, 80, -1), geometry, (90, 96)).reshape(90 * 96, -1)
+    assert np.abs(cross_talk(made.reconstructor, H)).max() < 0.03
+    told("align", "--file", "real.fits", "--config", "test.toml", "--out", "turned.fits", "--half-turn")
+    turned = calibration_file.load(Path("turned.fits"))
+    assert np.diag(turned.reconstructor.astype(float) @ H).max() < -0.9
+
+
+def test_pokes_tell_the_half_turn(loop: Connected) -> None:
+    found = told("align", "--out", "aligned.fits", "--frames", "200")
+    assert found["half_turn_known"]
+    made = calibration_file.load(Path("aligned.fits"))
+    assert np.abs(cross_talk(made.reconstructor, loop.calibration().response)).max() < 0.05
+
+
+def test_a_computed_calibration_may_leave_combinations_out(loop: Connected) -> None:
+    config = toml(loop.config)
+    found = told("--method", "analytic", "--config", config, "--out", "all.fits")
+    assert found["kept"] == [1.0] * 6
+    smallest = found["singular_values"][-1] / found["singular_values"][0]
+    cut = told("--method", "analytic", "--config", config, "--out", "few.fits", "--truncate", str(1.01 * smallest))
+    assert np.count_nonzero(cut["kept"]) == 5
+    one, other = (calibration_file.load(Path(name)) for name in ("all.fits", "few.fits"))
+    assert np.linalg.matrix_rank(one.reconstructor) == 6
+    assert np.linalg.matrix_rank(other.reconstructor) == 5
+    done = CliRunner().invoke(calibrate_app, ["--method", "analytic", "--config", config, "--out", "all.fits"])
+    assert "no regularisation needed" in done.stdout
+
+
+def test_calibrations_of_different_sensors_are_not_compared(loop: Connected) -> None:
+    one = loop.calibration()
+    calibration_file.save(one, Path("one.fits"))
+    other = replace(
+        one,
+        noll=one.noll[:5],
+        response=one.response[:, :5],
+        reconstructor=one.reconstructor[:5],
+        modes_to_actuators=one.modes_to_actuators[:, :5],
+        actuators_to_modes=one.actuators_to_modes[:5],
+    )
+    calibration_file.save(identified(other), Path("other.fits"))
+    with pytest.raises(CalibrationError, match="cannot be compared"):
+        compared(Path("one.fits"), Path("other.fits"))
+    with pytest.raises(DataFileError, match="there is no directory"):
+        told("--method", "hadamard", "--out", "nowhere/night.fits")
