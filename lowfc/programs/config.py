@@ -2,6 +2,7 @@
 
 import json
 
+from lowfc.adapters.clock import HostClock
 from lowfc.adapters.run import open_run
 from lowfc.adapters.zenoh_bus import session_config
 from lowfc.contract.configuration import Configuration, keys
@@ -32,4 +33,5 @@ def zenoh_session(run_id: str, role: str) -> str:
     known = sorted({*run.links.ports, "operator", "launcher"})
     if role not in known:
         raise BusError(f"run {run_id!r} has no role {role!r}; there are {', '.join(known)}")
+    HostClock()  # its file says what time the messages of this host go by
     return json.dumps(session_config(run.links, role), indent=2)

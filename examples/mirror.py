@@ -1,0 +1,80 @@
+"""A mirror of your own: what `apply` is given goes to its driver. Replace it, the grid and the limits by your mirror's.
+
+Example: python examples/mirror.py --run bench
+"""
+
+from contextlib import closing
+from functools import partial
+
+import numpy as np
+import typer
+from google.protobuf.message import DecodeError
+
+from lowfc.adapters.join import join
+from lowfc.adapters.run import mirror_role
+from lowfc.adapters.terminal import DEFAULT_RUN, ConfigFile, RunId, configuration, run_app
+from lowfc.contract.codec import Single, actuators
+from lowfc.contract.messages import COMMAND, MIRROR_STATE, wire
+from lowfc.control.safety import Limits, limit
+
+GRID, STEP_NM = (34, 34), 1500 / 2**16
+LIMITS = Limits(750 - STEP_NM, 150 - STEP_NM, 500 - STEP_NM)  # stroke, slew, neighbours: a step inside the hardware's
+LONGEST_VALID_NS, IDLE_STATE_NS = 2_000_000_000, 100_000_000
+
+
+def apply(actuators_nm: Single) -> Single:
+    """Move the mirror to these (rows, columns) nm of surface from flat; return where it is."""
+    return np.rint(actuators_nm / STEP_NM).astype(np.float32) * np.float32(STEP_NM)
+
+
+def good(payload: bytes, last_sequence: int) -> wire.MirrorCommand | None:
+    """The command in `payload`; None for one that must not be followed."""
+    try:
+        told = wire.MirrorCommand.FromString(payload)
+    except DecodeError:
+        return None
+    wanted_nm = actuators(told)  # None where the bytes are not rows x columns float32
+    fits = wanted_nm is not None and wanted_nm.shape == GRID and np.isfinite(wanted_nm).all()
+    return told if fits and told.frame_sequence >= last_sequence else None
+
+
+def main(run: RunId = DEFAULT_RUN, config: ConfigFile = None) -> None:
+    """Follow commands until told to stop."""
+    settings = configuration(config)
+    name = settings.mirror.name
+    service = join(settings, run, mirror_role(name), settings.realtime.mirror_cpus)  # real-time set-up, clock and bus
+    service.catch_signals()
+    commands, states = service.mailbox(COMMAND, name), service.publisher(MIRROR_STATE, name)
+    where_nm = apply(np.zeros(GRID, np.float32))
+    state = wire.MirrorState(rows=GRID[0], columns=GRID[1], status=wire.MIRROR_STATUS_WAITING)
+    obeyed_ns = valid_ns = due_ns = 0
+    service.state = "running"
+    with closing(service.bus):
+        while service.running:
+            sample, now_ns = commands.take(0.01), service.clock.now_ns()
+            told = good(sample.payload, state.frame_sequence) if sample is not None else None
+            if told is not None:
+                kept_nm, hit = limit(LIMITS, where_nm, actuators(told))
+                where_nm, obeyed_ns, valid_ns = apply(kept_nm), now_ns, min(told.valid_for_ns, LONGEST_VALID_NS)
+                state.frame_sequence, state.status = told.frame_sequence, wire.MIRROR_STATUS_FOLLOWING
+                state.command_nm[:], state.limits_hit[:] = [] if hit else told.command_nm, [one.value for one in hit]
+                service.work += 1
+            elif sample is not None:
+                service.event("COMMAND_REFUSED", reason="out of order, not finite, or for another grid")
+            if state.status == wire.MIRROR_STATUS_FOLLOWING and now_ns - obeyed_ns > valid_ns:  # the dead-man
+                state.status = wire.MIRROR_STATUS_EXPIRED
+                service.event("COMMAND_EXPIRED", valid_ms=valid_ns / 1e6, action="relaxing to flat")
+            relaxing = state.status == wire.MIRROR_STATUS_EXPIRED and where_nm.any()
+            if relaxing:
+                where_nm = apply(limit(LIMITS, where_nm, np.zeros_like(where_nm)).actuators_nm)
+            if told is not None or relaxing or now_ns >= due_ns:  # without commands ten times a second
+                state.timestamp.FromNanoseconds(told.timestamp.ToNanoseconds() if told is not None else now_ns)
+                state.actuators = where_nm.tobytes()
+                states.put(state.SerializeToString())
+                due_ns = now_ns + IDLE_STATE_NS
+            service.beat()  # Health, twice a second
+        service.finish()
+
+
+if __name__ == "__main__":
+    run_app(partial(typer.run, main))  # a mistake is one line, not a traceback

@@ -1,0 +1,76 @@
+"""A camera without this library: zenoh, protobuf and the contract only, as it would be written in another language.
+
+It plays a stack of frames, a numpy file of (frames, rows, columns) uint16, over and over.
+
+Example: python examples/plain_camera.py camera.json5 frames.npy
+"""
+
+import json
+import struct
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import zenoh
+from foxglove_schemas_protobuf.RawImage_pb2 import RawImage
+
+from lowfc.contract.wire.lowfc_pb2 import CameraState, Health  # what protoc makes of lowfc/contract/proto
+
+PERIOD_NS, EXPOSURE_NS, SETTINGS_PERIOD_NS = 4_000_000, 2_000_000, 500_000_000
+
+SESSION, FRAMES = Path(sys.argv[1]), np.load(sys.argv[2])
+# The host's time never steps: CLOCK_MONOTONIC and an offset in a file that all processes of this boot share.
+base = Path(json.loads(SESSION.read_text())["transport"]["auth"]["usrpwd"]["dictionary_file"]).parents[1]
+boot = Path("/proc/sys/kernel/random/boot_id").read_text().strip()
+OFFSET_NS = int((base / f"clock-{boot}").read_text())
+
+
+def now_ns() -> int:
+    """Nanoseconds since the epoch."""
+    return time.monotonic_ns() + OFFSET_NS
+
+
+START_S = now_ns() // 1_000_000_000
+
+
+class Publisher:
+    """Puts messages with their envelope: 16 bytes, start << 32 | count and the time of the put, little-endian."""
+
+    def __init__(self, session: zenoh.Session, key: str, *, answers: bool = False) -> None:
+        """Publish on a key, and answer who asks for the last message."""
+        self.key, self.count, self.last = key, 0, (b"", b"")
+        self._publisher = session.declare_publisher(key, congestion_control=zenoh.CongestionControl.DROP)
+        if answers:
+            session.declare_queryable(key, lambda query: query.reply(key, self.last[0], attachment=self.last[1]))
+
+    def put(self, payload: bytes) -> None:
+        """Send a message."""
+        self.last = (payload, struct.pack("<QQ", START_S << 32 | self.count, now_ns()))
+        self._publisher.put(payload, attachment=self.last[1])
+        self.count += 1
+
+
+session = zenoh.open(zenoh.Config.from_file(str(SESSION)))
+frames, states = Publisher(session, "lowfc/camera/frame"), Publisher(session, "lowfc/camera/state", answers=True)
+health = Publisher(session, "lowfc/health/camera", answers=True)
+_, rows, columns = FRAMES.shape
+picture = RawImage(encoding="mono16", height=rows, width=columns, step=2 * columns, frame_id="my_camera")
+settings = CameraState(rows=rows, columns=columns, exposure_ns=EXPOSURE_NS, period_ns=PERIOD_NS, bit_depth=16)
+settings.gain_e_per_dn, settings.bias_dn, settings.saturation_dn, settings.em_gain = 1.0, 100.0, 40_100.0, 1.0
+how = Health(process="camera", state="running")
+end_ns, due_ns = now_ns(), 0
+while True:
+    end_ns = max(end_ns + PERIOD_NS, now_ns())
+    time.sleep(max(0, end_ns - now_ns()) * 1e-9)
+    picture.timestamp.FromNanoseconds(end_ns)
+    picture.data = FRAMES[frames.count % len(FRAMES)].astype("<u2").tobytes()
+    frames.put(picture.SerializeToString())
+    if end_ns >= due_ns:
+        settings.timestamp.FromNanoseconds(end_ns)
+        states.put(settings.SerializeToString())
+        how.timestamp.FromNanoseconds(now_ns())
+        del how.topics[:]
+        how.topics.add(topic=frames.key, published=frames.count)
+        health.put(how.SerializeToString())
+        due_ns = end_ns + SETTINGS_PERIOD_NS

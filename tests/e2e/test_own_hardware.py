@@ -1,0 +1,161 @@
+"""The examples of docs/hardware.md, as real processes: a camera and a mirror that are not of this library."""
+
+import json
+import shlex
+import subprocess
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import numpy as np
+import pytest
+from loops import until
+
+from lowfc.adapters.bus import Sample
+from lowfc.adapters.clock import HostClock
+from lowfc.adapters.run import open_run
+from lowfc.adapters.zenoh_bus import ZenohBus
+from lowfc.contract.messages import FRAME, MIRROR_STATE, STEP, Role, wire
+
+ROOT = Path(__file__).parents[2]
+BENCH = """
+[camera]
+rate_hz = 100
+
+[disturbance]
+preset = "quiet"
+static_nm = { "2" = 15, "4" = 8 }
+
+[control]
+gain = 0.2
+"""
+DEVICES = (
+    "python examples/mirror.py --run bench --config bench.toml",
+    "python examples/camera.py --run bench --config bench.toml",
+)
+CONFORMANCE = (
+    "lowfc conformance camera --run bench",
+    "lowfc conformance mirror --run bench --config bench.toml",
+)
+LOOP = ("lowfc controller --run bench --config bench.toml", "lowfc ctl close --run bench")
+PLAIN = (
+    "lowfc config zenoh --run bench --role camera > camera.json5",
+    "python examples/plain_camera.py camera.json5 frames.npy",
+)
+DOCUMENTED = (*DEVICES, *CONFORMANCE, *LOOP, *PLAIN)
+"""Commands of docs/hardware.md; all are run here."""
+
+SIMULATED = ("sim-camera --run bench --config bench.toml", "sim-dm --run bench --config bench.toml")
+
+
+@pytest.fixture
+def bench(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A folder with the examples, and runs of its own."""
+    runtime = tmp_path / "run"
+    runtime.mkdir(mode=0o700)
+    monkeypatch.setenv("XDG_RUNTIME_DIR", str(runtime))
+    (tmp_path / "examples").symlink_to(ROOT / "examples")
+    (tmp_path / "bench.toml").write_text(BENCH)
+    return tmp_path
+
+
+def started(folder: Path, command: str) -> "subprocess.Popen[str]":
+    """A documented command, as it stands."""
+    program, *rest = shlex.split(command)
+    return subprocess.Popen(
+        [Path(sys.executable).parent / program, *rest],
+        cwd=folder,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+
+
+def said(folder: Path, command: str) -> str:
+    """What a documented command prints; where it is told to, into a file, too."""
+    words, _, output = command.partition(" > ")
+    process = started(folder, words)
+    out, complaints = process.communicate(timeout=60)
+    assert process.returncode == 0, f"{command}: {out} {complaints}"
+    if output:
+        (folder / output).write_text(out)
+    return out
+
+
+@contextmanager
+def running(folder: Path, *commands: str) -> Iterator[list["subprocess.Popen[str]"]]:
+    """Commands that go on until told to stop; they must end cleanly then."""
+    processes = [started(folder, command) for command in commands]
+    try:
+        yield processes
+    finally:
+        for process in processes:
+            process.terminate()
+        complaints = [process.communicate(timeout=20)[1] for process in processes]
+    assert all(process.returncode in (0, -15) for process in processes), complaints
+
+
+@contextmanager
+def listening() -> Iterator[ZenohBus]:
+    bus = ZenohBus(open_run("bench").links, Role.OPERATOR, HostClock())
+    try:
+        yield bus
+    finally:
+        bus.close()
+
+
+def heard(bus: ZenohBus) -> None:
+    """Wait until camera and mirror are there."""
+    there: set[str] = set()
+    for topic in (FRAME, MIRROR_STATE):
+        bus.subscribe(topic, lambda sample: there.add(sample.key))
+    until(lambda: len(there) == 2)
+
+
+def conformance(folder: Path, *commands: str) -> None:
+    """Nothing is wrong with the devices; all are looked at at once."""
+    checking = [started(folder, f"{command} --json --duration 0.6") for command in commands]
+    for command, process in zip(commands, checking, strict=True):
+        out, complaints = process.communicate(timeout=60)
+        assert process.returncode == 0, f"{command}: {out} {complaints}"
+        figures = json.loads(out)
+        assert f"--run {figures['run']}" in command
+        assert figures["device"] in command or figures["device"] == "mirror-dm"
+        assert figures["counts"]["wrong"] == 0
+        assert figures["counts"]["ok"] >= len(figures["checks"]) - 5  # of a busy host: warnings
+
+
+def test_the_loop_closes_on_a_camera_and_a_mirror_of_ones_own(bench: Path) -> None:
+    with running(bench, *DEVICES), listening() as bus:
+        heard(bus)
+        conformance(bench, *CONFORMANCE)
+        errors_nm: list[list[float]] = []
+
+        def note(sample: Sample) -> None:
+            errors_nm.append(list(wire.ControlStep.FromString(sample.payload).error_nm))
+
+        def rms_nm() -> float:
+            """Of the mean of the last steps: what the loop has left, without the noise."""
+            measured = [error for error in errors_nm[-100:] if error]
+            return float(np.linalg.norm(np.mean(measured, axis=0))) if len(measured) == 100 else np.nan
+
+        bus.subscribe(STEP, note)
+        with running(bench, LOOP[0]):
+            until(lambda: np.isfinite(rms_nm()))
+            before_nm = rms_nm()
+            assert "loop closed" in said(bench, LOOP[1])
+            until(lambda: rms_nm() < 0.1 * before_nm)
+    assert before_nm == pytest.approx(17, rel=0.15)
+
+
+def test_the_simulated_devices_and_a_camera_in_plain_zenoh_keep_the_contract(bench: Path) -> None:
+    y, x = np.mgrid[:80, :80]
+    spot = 100 + 2000 * np.exp(-((y - 40) ** 2 + (x - 30) ** 2) / 50)
+    np.save(bench / "frames.npy", np.random.default_rng(1).poisson(spot, (50, 80, 80)).astype(np.uint16))
+    HostClock()  # this boot's clock, for a program that does not make it
+    said(bench, PLAIN[0].replace("bench", "plain"))
+    with running(bench, *SIMULATED, PLAIN[1]):
+        with listening() as bus:
+            heard(bus)
+        conformance(bench, *CONFORMANCE, CONFORMANCE[0].replace("bench", "plain"))
