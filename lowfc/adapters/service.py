@@ -15,6 +15,7 @@ from lowfc.adapters.clock import Clock
 from lowfc.adapters.handover import Handover
 from lowfc.adapters.mailbox import Mailbox
 from lowfc.adapters.realtime import NOTHING, Granted
+from lowfc.adapters.supervision import Supervisor
 from lowfc.adapters.usage import resident_bytes
 from lowfc.contract.events import EVENTS, Level
 from lowfc.contract.messages import EVENT, HEALTH, Topic, timestamp, wire
@@ -63,6 +64,7 @@ class Service:
         self._known: set[tuple[str, int]] = set()
         self._wakers: list[Callable[[], None]] = []
         self._event_lock = threading.Lock()
+        self._supervisor = Supervisor()
         self._started_ns = self._beaten_ns = clock.host_ns()
         self._worked = 0
         self._due_ns = 0
@@ -143,6 +145,7 @@ class Service:
         if self.running:
             self.why = why
             self.running = False
+            self._supervisor.stopping()
         for waker in self._wakers:
             waker()
 
@@ -157,10 +160,18 @@ class Service:
             raise ValueError(f"a process's state is one of {', '.join(STATES)}; got {state!r}")
         self._state = state
         self._send_health(self.clock.host_ns())
+        if state in ("ready", "running"):
+            self._supervisor.ready()
+        elif state in ("stopping", "stopped"):
+            self._supervisor.stopping()
 
     def beat(self) -> None:
-        """Send Health when it is due, twice a second; call it in every turn of the loop."""
+        """Send Health when it is due, twice a second, and a sign of life to the service manager.
+
+        Call it in every turn of the loop that does the work, and nowhere else.
+        """
         now_ns = self.clock.host_ns()
+        self._supervisor.alive(now_ns)
         if now_ns >= self._due_ns:
             self._send_health(now_ns)
 
@@ -221,6 +232,8 @@ class Service:
             uptime_ns=now_ns - self._started_ns,
             topics=[*(self._sent(one) for one in self.publishers), *map(_got, self.arrivals)],
         )
+        if self.bus.offset is not None and (exchange := self.bus.offset.best) is not None:
+            message.router_offset_ns, message.router_round_trip_ns = exchange
         if self.fill:
             self.fill(message)
         return message
@@ -234,6 +247,7 @@ class Service:
         message = self.health()
         self._beaten_ns, self._worked = now_ns, self.work
         self._health.put(message.SerializeToString())
+        self._supervisor.tell(message)
 
     def _hear(self, sample: Sample) -> None:
         name = name_in(HEALTH, sample.key)
