@@ -154,11 +154,12 @@ def _aim(drive: Drive, measured_nm: Single, sequence: int) -> tuple[Single, Sing
     added, error_nm = drive.additions, measured_nm
     if added is not None:
         error_nm = measured_nm - added.seen_nm(drive.weights)
-    pol_nm = error_nm - drive.seen_nm()
+    pol_nm = to_undo_nm = error_nm - drive.seen_nm()
     if added is not None:
-        error_nm = error_nm - added.target_nm(sequence)
+        target_nm = added.target_nm(sequence)
+        error_nm, to_undo_nm = error_nm - target_nm, pol_nm - target_nm
     if drive.following is not None:
-        drive = drive._replace(following=drive.following.followed(error_nm, pol_nm, drive.history_nm[0]))
+        drive = drive._replace(following=drive.following.followed(error_nm, to_undo_nm, drive.history_nm[0]))
     return error_nm, pol_nm, drive
 
 

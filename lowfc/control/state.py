@@ -81,7 +81,7 @@ class Following(NamedTuple):
         return cls(law, linear_law.at_rest(law))
 
     def followed(self, error_nm: Single, pol_nm: Single, kept_nm: Single) -> "Following":
-        """One frame later; all (modes,), the last one is the command that was kept of the last frame."""
+        """One frame later; all (modes,): both without the loop's target, and the command kept of the last frame."""
         signal = error_nm if self.law.signal == "error" else pol_nm
         return Following(self.law, linear_law.follow(self.law, self.x, signal, kept_nm), self.frames + 1)
 

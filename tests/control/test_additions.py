@@ -13,7 +13,7 @@ from lowfc.contract.state_codec import controller_state, decode_state
 from lowfc.control.additions import ADOPTED, FLAT, MIRROR, MOST_CHANNELS, OFFSET
 from lowfc.control.inputs import Frame, Input, Load, MirrorShape, Outputs, Reply, Request
 from lowfc.control.law import Law
-from lowfc.control.linear_law import integrator
+from lowfc.control.linear_law import LinearLaw, Signal, integrator
 from lowfc.control.loop import advance
 from lowfc.control.safety import Limits, LoopMode, Reason
 from lowfc.control.state import FADING_FRAMES, SETTLING_FRAMES, Settings, State
@@ -340,6 +340,21 @@ def test_a_law_takes_over_and_gives_back_without_a_jump() -> None:
     assert night.ask("law").accepted
     night.run(5)
     assert np.allclose(night.surfaces[-1], plain.surfaces[-1], atol=0.05)
+
+
+@pytest.mark.parametrize("signal", ["error", "pol"])
+def test_a_law_goes_to_the_offset_whatever_it_is_fed_with(signal: Signal) -> None:
+    night, unit = Night(), np.eye(3, dtype=np.float32)
+    if signal == "error":
+        linear = integrator(Law(*(np.full(3, each, np.float32) for each in (0.4, 0.0, 50.0))), NOLL, 1.0, 1000.0)
+    else:  # the disturbance, smoothed, undone
+        linear = LinearLaw("pol", 0.6 * unit, 0.4 * unit, 0 * unit, unit, -unit, "smooth", NOLL, 1.0, 1000.0)
+    assert night.ask("law", law=linear).accepted
+    night.run(SETTLING_FRAMES + FADING_FRAMES + 50)
+    assert np.abs(night.wavefronts[-1]).max() < 0.1
+    night.ask("offset", values=(4.0, 0.0, -2.0))
+    night.run(60)
+    assert np.allclose(night.wavefronts[-1], (4, 0, -2), atol=0.1)
 
 
 def test_an_unstable_or_foreign_law_is_refused() -> None:
