@@ -22,9 +22,10 @@ LIMITS = Limits(750 - STEP_NM, 150 - STEP_NM, 500 - STEP_NM)  # stroke, slew, ne
 LONGEST_VALID_NS, IDLE_STATE_NS = 2_000_000_000, 100_000_000
 
 
-def apply(actuators_nm: Single) -> Single:
+def apply(actuators_nm: Single, nm_per_unit: float) -> Single:
     """Move the mirror to these (rows, columns) nm of surface from flat; return where it is."""
-    return np.rint(actuators_nm / STEP_NM).astype(np.float32) * np.float32(STEP_NM)
+    units = np.round(actuators_nm / nm_per_unit, 2)  # what your driver takes, and its least step
+    return (units * nm_per_unit).astype(np.float32)
 
 
 def good(payload: bytes, last_sequence: int) -> wire.MirrorCommand | None:
@@ -45,7 +46,8 @@ def main(run: RunId = DEFAULT_RUN, config: ConfigFile = None) -> None:
     service = join(settings, run, mirror_role(name), settings.realtime.mirror_cpus)  # real-time set-up, clock and bus
     service.catch_signals()
     commands, states = service.mailbox(COMMAND, name), service.publisher(MIRROR_STATE, name)
-    where_nm = apply(np.zeros(GRID, np.float32))
+    moved = partial(apply, nm_per_unit=settings.mirror.nm_per_unit)
+    where_nm = moved(np.zeros(GRID, np.float32))
     state = wire.MirrorState(rows=GRID[0], columns=GRID[1], status=wire.MIRROR_STATUS_WAITING)
     obeyed_ns = valid_ns = due_ns = 0
     service.state = "running"
@@ -55,7 +57,7 @@ def main(run: RunId = DEFAULT_RUN, config: ConfigFile = None) -> None:
             told = good(sample.payload, state.frame_sequence) if sample is not None else None
             if told is not None:
                 kept_nm, hit = limit(LIMITS, where_nm, actuators(told))
-                where_nm, obeyed_ns, valid_ns = apply(kept_nm), now_ns, min(told.valid_for_ns, LONGEST_VALID_NS)
+                where_nm, obeyed_ns, valid_ns = moved(kept_nm), now_ns, min(told.valid_for_ns, LONGEST_VALID_NS)
                 state.frame_sequence, state.status = told.frame_sequence, wire.MIRROR_STATUS_FOLLOWING
                 state.command_nm[:], state.limits_hit[:] = [] if hit else told.command_nm, [one.value for one in hit]
                 service.work += 1
@@ -66,7 +68,7 @@ def main(run: RunId = DEFAULT_RUN, config: ConfigFile = None) -> None:
                 service.event("COMMAND_EXPIRED", valid_ms=valid_ns / 1e6, action="relaxing to flat")
             relaxing = state.status == wire.MIRROR_STATUS_EXPIRED and where_nm.any()
             if relaxing:
-                where_nm = apply(limit(LIMITS, where_nm, np.zeros_like(where_nm)).actuators_nm)
+                where_nm = moved(limit(LIMITS, where_nm, np.zeros_like(where_nm)).actuators_nm)
             if told is not None or relaxing or now_ns >= due_ns:  # without commands ten times a second
                 state.timestamp.FromNanoseconds(told.timestamp.ToNanoseconds() if told is not None else now_ns)
                 state.actuators = where_nm.tobytes()

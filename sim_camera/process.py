@@ -6,6 +6,7 @@ from itertools import count
 
 import numpy as np
 import numpy.typing as npt
+from google.protobuf.message import DecodeError
 
 from lowfc.adapters import instrument
 from lowfc.adapters.bus import Sample
@@ -17,9 +18,12 @@ from lowfc.contract.errors import BusError, ConfigurationError
 from lowfc.contract.messages import CAMERA_STATE, FRAME, MIRROR_STATE, TRUTH, image, timestamp, wire
 from lowfc.control.durations import Durations
 from lowfc.control.stability import delay_weights
+from lowfc.optics.detector import saturation_dn
 from lowfc.optics.photometry import tilt_nm_per_mas
 from sim_camera.bench import Bench, Truth
 from sim_camera.disturbance import Disturbance, disturbance
+from sim_camera.faults import Fault
+from sim_camera.faulty import FaultyFrames
 from sim_camera.figures import Figures
 
 Single = npt.NDArray[np.float32]
@@ -54,7 +58,7 @@ def bench(config: Configuration) -> Bench:
     optics = instrument.twin(config, None, ignore)
     return Bench(
         optics,
-        instrument.mirror_on_twin(config, optics, ignore),
+        instrument.true_mirror_on_twin(config, optics, ignore),
         instrument.detector(config),
         instrument.electrons_per_exposure(config),
         disturbance_of(config),
@@ -71,13 +75,22 @@ def ignore(warning: str) -> None:
 class CameraProcess:
     """Exposes frame after frame until told to stop, or for a number of frames."""
 
-    def __init__(self, config: Configuration, service: Service, optics: Bench, frames: int | None) -> None:
-        """Declare everything on the bus."""
+    def __init__(
+        self,
+        config: Configuration,
+        service: Service,
+        optics: Bench,
+        frames: int | None,
+        faults: tuple[Fault, ...] = (),
+    ) -> None:
+        """Declare everything on the bus; `faults` befall the frames."""
         self._config = config
         self._service = service
         self._bench = optics
         self._limit = frames
         self._frames = service.publisher(FRAME)
+        highest = saturation_dn(instrument.detector(config))
+        self._faulty = FaultyFrames(faults, self._frames, config.camera.bias_dn, highest) if faults else None
         self._truths = service.publisher(TRUTH)
         self._settings = service.publisher(CAMERA_STATE)
         self._weights = delay_weights(config.camera.delay_frames).astype(np.float32)
@@ -159,9 +172,15 @@ class CameraProcess:
         if len(self._weights) > 1:
             seen = np.tensordot(self._weights, np.array(self._shapes), 1)
         frame, truth = self._bench.expose(index, seen)
-        payload = image(frame, end_ns, "lowfc_camera").SerializeToString()
+        if self._faulty is None:
+            payload = image(frame, end_ns, "lowfc_camera").SerializeToString()
+        else:
+            payload = self._faulty.message(index, frame, end_ns)
         clock.sleep_until_ns(end_ns)
-        envelope = self._frames.put(payload)
+        if self._faulty is None:
+            envelope = self._frames.put(payload)
+        else:
+            envelope = self._faulty.put(index, payload, clock.host_ns())
         let_send()
         self._put_ns[envelope.sequence % _REMEMBERED] = (envelope.sequence, envelope.publish_time_ns)
         self._last_frame = envelope.sequence
@@ -185,10 +204,15 @@ class CameraProcess:
         """Take the mirror's states that have come: the newest is the shape of the next exposure."""
         while self._states:
             sample = self._states.popleft()
-            state = wire.MirrorState.FromString(sample.payload)
+            try:
+                state = wire.MirrorState.FromString(sample.payload)
+            except DecodeError as error:
+                self._service.event("BAD_MESSAGE", topic=sample.key, why=error)
+                continue
             shape = actuators(state)
-            if shape is None or shape.shape != self._latched.shape:
-                self._service.event("BAD_MESSAGE", topic=sample.key, why="its grid is not the configured mirror's")
+            if shape is None or shape.shape != self._latched.shape or not np.isfinite(shape).all():
+                why = "it is not finite, or its grid not the configured mirror's"
+                self._service.event("BAD_MESSAGE", topic=sample.key, why=why)
                 continue
             self._latched = shape
             if state.frame_sequence > self._newest_state:

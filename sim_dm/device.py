@@ -117,6 +117,8 @@ def obey(device: Device, status: Status, told: Told, now_ns: int) -> tuple[Statu
     limited = limit(device.tighter, status.driven_nm, wanted)
     # From frame to frame, not from the last tick: ticks go by the mirror's own clock, which is ahead of a frame's time.
     elapsed_ns = told.time_ns - status.commanded_ns if status.commanded_ns else np.inf
+    if elapsed_ns <= 0:  # the same frame again, while the camera is silent: only the mirror's own clock goes on
+        elapsed_ns = now_ns - status.received_ns
     followed = Status(
         driven_nm=limited.actuators_nm,
         surface_nm=_settled(device, limited.actuators_nm, status.surface_nm, elapsed_ns),

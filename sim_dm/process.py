@@ -8,7 +8,7 @@ from google.protobuf.message import DecodeError
 
 from lowfc.adapters.bus import Sample
 from lowfc.adapters.clock import SimulatedClock
-from lowfc.adapters.instrument import mirror, mirror_limits
+from lowfc.adapters.instrument import mirror_limits, true_mirror
 from lowfc.adapters.mailbox import Mailbox
 from lowfc.adapters.service import Service
 from lowfc.contract.codec import actuators
@@ -59,7 +59,7 @@ class MirrorProcess:
         self._obeyed_ns = 0
         self._states = service.publisher(MIRROR_STATE, name)
         self._surfaces = service.publisher(SURFACE, name)
-        geometry, axis = mirror(config), pupil_axis(PICTURE_PIXELS)
+        geometry, axis = true_mirror(config), pupil_axis(PICTURE_PIXELS)
         self._y_factors: Single = influence_factors(geometry, axis, geometry.rows).astype(np.float32)
         self._x_factors: Single = influence_factors(geometry, axis, geometry.columns).astype(np.float32)
         self._picture_due_ns = 0

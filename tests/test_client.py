@@ -15,6 +15,7 @@ from lowfc.adapters.clock import HostClock
 from lowfc.adapters.envelope import sequence_of
 from lowfc.adapters.log_reader import LogReader
 from lowfc.adapters.memory_bus import MemoryBus, MemoryHub
+from lowfc.adapters.mirror_maps import read_shape
 from lowfc.client import Client, Stream, client
 from lowfc.client.stream import WAITING, frame_of, step_of
 from lowfc.contract import codec
@@ -26,7 +27,6 @@ from lowfc.control.linear_law import LinearLaw, integrator_block, of_blocks
 from lowfc.control.requests import REQUESTS
 from lowfc.control.safety import LoopMode, Reason
 from lowfc.programs.ctl_commands import SIMPLE, _noll, ctl_app
-from lowfc.programs.ctl_files import read_shape
 from lowfc.programs.ctl_requests import ASKED, table
 from lowfc.programs.ctl_status import figures, text
 

@@ -10,6 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from lowfc.adapters.masks import sensor_from
+from lowfc.adapters.mirror_maps import active_actuators
 from lowfc.adapters.twin_store import load_or_build, load_or_fit_mirror
 from lowfc.contract.calibration_codec import identified
 from lowfc.contract.configuration import Configuration
@@ -111,14 +112,26 @@ def camera_state(config: Configuration, shape: tuple[int, int], time_ns: int) ->
 
 
 def mirror(config: Configuration) -> Mirror:
-    """The mirror's geometry."""
+    """The mirror's geometry, as it is believed to be."""
     section = config.mirror
     return Mirror(section.rows, section.columns, section.pitches_per_pupil, section.coupling)
 
 
+def true_mirror(config: Configuration) -> Mirror:
+    """The simulated mirror's geometry, with its errors of registration."""
+    section = config.mirror
+    pitches_per_pupil = section.pitches_per_pupil / section.magnification
+    return replace(mirror(config), pitches_per_pupil=pitches_per_pupil, shift_pitches=section.shift_pitches)
+
+
 def mirror_on_twin(config: Configuration, optics: Twin, warn: Callable[[str], None]) -> TwinMirror:
-    """The mirror's wavefront at the twin's nodes, from the cache or fitted."""
+    """The mirror's wavefront at the twin's nodes as it is believed to be, from the cache or fitted."""
     return load_or_fit_mirror(sensor(config, warn), optics, mirror(config), notice=warn)
+
+
+def true_mirror_on_twin(config: Configuration, optics: Twin, warn: Callable[[str], None]) -> TwinMirror:
+    """The simulated mirror's wavefront at the twin's nodes, with its errors of registration."""
+    return load_or_fit_mirror(sensor(config, warn), optics, true_mirror(config), notice=warn)
 
 
 def mirror_limits(config: Configuration) -> Limits:
@@ -150,8 +163,11 @@ def analytic_calibration(config: Configuration, optics: Twin, on_nodes: TwinMirr
     The modes are fitted to the influence functions, then mixed a little so that a modal command is what the sensor
     measures of it: through the shaped pupil some of the mirror's print-through looks like low orders, by 2 to 6 %.
 
+    Actuators that are not active stay out of the modes, and the sensor sees nothing of them.
+
     Raises:
         CalibrationError: this sensor cannot tell the modes apart, or the star saturates it.
+        ConfigurationError: the map of active actuators cannot be used.
     """
     camera = detector(config)
     nolls = config.noll
@@ -169,11 +185,17 @@ def analytic_calibration(config: Configuration, optics: Twin, on_nodes: TwinMirr
         raise CalibrationError(f"sensor.kind = {config.sensor.kind!r}, {len(nolls)} modes: {error}") from None
     _check_exposure(config, light)
 
-    commands = modes_to_actuators(mirror(config), nolls)
+    active = active_actuators(config)
+    try:
+        commands = modes_to_actuators(mirror(config), nolls, active)
+    except ValueError as error:
+        raise ConfigurationError(f"mirror: {error}") from None
     actuators = config.mirror.rows * config.mirror.columns
     pokes = np.eye(actuators, dtype=np.float32).reshape(actuators, config.mirror.rows, config.mirror.columns)
     wavefronts = np.array([wavefront_nm(on_nodes, poke) for poke in pokes])
     seen = actuators_to_modes(R, light, good, lambda shapes: response(optics, shapes), wavefronts)
+    if active is not None:
+        seen[:, ~active.reshape(-1)] = 0
     commands = commands @ np.linalg.inv(seen @ commands)
 
     def single(array: Double) -> Single:

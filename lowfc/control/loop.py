@@ -300,6 +300,8 @@ def _mirror(settings: Settings, state: State, shape: MirrorShape) -> tuple[State
     events = []
     if command_nm.any():
         events.append(Raised("MIRROR_ADOPTED", {"rms_nm": float(np.sqrt(command_nm @ command_nm))}))
+    if state.mode is LoopMode.SAFED:
+        rest_nm[:] = 0  # it is on its way to flat, and shall stay there
     if np.abs(rest_nm).max() > ADOPTED_NM:  # beyond the driver's rounding: somebody's channel
         added = drive.added().at((Channel(ADOPTED, rest_nm, rest_nm),), drive.to_modes)
         drive = drive._replace(additions=added.passed(len(added.shifts_nm)))

@@ -27,12 +27,14 @@ class Mirror:
         columns: Actuators along x.
         pitches_per_pupil: Actuator pitches across the pupil's diameter.
         coupling: Surface at the next actuator over that at the poked one.
+        shift_pitches: How far the actuators lie off the centre along x, and as far along y.
     """
 
     rows: int = 34
     columns: int = 34
     pitches_per_pupil: float = 31.0
     coupling: float = 0.15
+    shift_pitches: float = 0.0
 
     def __post_init__(self) -> None:
         if self.rows < 1 or self.columns < 1 or not self.pitches_per_pupil > 0:
@@ -46,7 +48,7 @@ class Mirror:
 
 def actuator_axis(mirror: Mirror, actuators: int) -> Float:
     """Positions (actuators,) along one axis in pupil diameters; `actuators` is the mirror's rows or columns."""
-    return np.asarray((np.arange(actuators) - (actuators - 1) / 2.0) / mirror.pitches_per_pupil)
+    return np.asarray((np.arange(actuators) - (actuators - 1) / 2.0 + mirror.shift_pitches) / mirror.pitches_per_pupil)
 
 
 def influence_factors(mirror: Mirror, coordinates: Float, actuators: int, lowpass_cycles: float | None = None) -> Float:
@@ -85,7 +87,7 @@ def active_actuators(mirror: Mirror) -> NDArray[np.bool_]:
     return np.asarray(np.hypot(y[:, None], x) <= 0.5 + 1.5 / mirror.pitches_per_pupil)
 
 
-def modes_to_actuators(mirror: Mirror, nolls: Sequence[int]) -> Float:
+def modes_to_actuators(mirror: Mirror, nolls: Sequence[int], usable: NDArray[np.bool_] | None = None) -> Float:
     """Commands that make Zernike wavefronts: nm of surface at the actuators per nm rms of wavefront.
 
     A regularised least-squares fit over the circle. It contains the 1/2 of reflection: the wavefront is twice
@@ -94,9 +96,14 @@ def modes_to_actuators(mirror: Mirror, nolls: Sequence[int]) -> Float:
     Args:
         mirror: The mirror.
         nolls: Noll indices.
+        usable: (rows, columns) actuators that may be commanded; all when None. The others stay at zero, and their
+            neighbours make up for them as far as they can.
 
     Returns:
         (rows times columns, modes); inactive actuators are exactly zero.
+
+    Raises:
+        ValueError: too few actuators are left for so many modes.
     """
     u = pupil_axis(int(np.ceil(4.0 * mirror.pitches_per_pupil)))
     inside = (np.hypot(u[:, None], u) <= 0.5).astype(np.float64)
@@ -109,7 +116,10 @@ def modes_to_actuators(mirror: Mirror, nolls: Sequence[int]) -> Float:
     normal = sums.transpose(0, 2, 1, 3).reshape(actuators, actuators)
     wanted = 0.5 * inside * zernikes(nolls, 2.0 * u, 2.0 * u[:, None])
     projected = (y_factors.T @ wanted @ x_factors).reshape(len(nolls), actuators)
-    active = np.flatnonzero(active_actuators(mirror))
+    driven = active_actuators(mirror) if usable is None else active_actuators(mirror) & usable
+    active = np.flatnonzero(driven)
+    if active.size < len(nolls):
+        raise ValueError(f"{active.size} active actuators in the pupil cannot make {len(nolls)} modes")
     normal = normal[np.ix_(active, active)]
     normal.flat[:: active.size + 1] += _TIKHONOV * np.trace(normal) / active.size
     commands = np.zeros((actuators, len(nolls)))

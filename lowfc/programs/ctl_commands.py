@@ -132,7 +132,7 @@ def channel(
 
     Example: lowfc ctl channel dark-hole shape.fits
     """
-    from lowfc.programs.ctl_files import read_shape
+    from lowfc.adapters.mirror_maps import read_shape
 
     if zero == (file is not None):
         raise ConfigurationError(f"channel takes a file, or {ZERO}")

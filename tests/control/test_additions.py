@@ -342,6 +342,18 @@ def test_a_law_takes_over_and_gives_back_without_a_jump() -> None:
     assert np.allclose(night.surfaces[-1], plain.surfaces[-1], atol=0.05)
 
 
+def test_a_mirror_that_is_safed_keeps_nobodys_shape() -> None:
+    night = Night(mode=LoopMode.SAFED)
+    there = dark_hole(30.0)
+    night.take(MirrorShape(0, there, np.zeros(0, np.float32)))
+    night.surfaces = [there]
+    night.run(10, np.zeros(3))
+    assert not night.surfaces[-1].any()
+    assert night.ask("clear").accepted
+    night.run(10, np.zeros(3))
+    assert not night.surfaces[-1].any()
+
+
 @pytest.mark.parametrize("signal", ["error", "pol"])
 def test_a_law_goes_to_the_offset_whatever_it_is_fed_with(signal: Signal) -> None:
     night, unit = Night(), np.eye(3, dtype=np.float32)

@@ -62,6 +62,35 @@ def test_commands_make_the_modes_with_half_the_surface():
         )
 
 
+def test_neighbours_make_up_for_actuators_that_may_not_be_used():
+    """The modes are better than those of a mirror that does not know which of its actuators are dead."""
+    usable = np.ones((34, 34), bool)
+    usable[10, 12] = usable[16, 17] = usable[17, 17] = usable[22, 9] = usable[25, 24] = False
+    commands = modes_to_actuators(MIRROR, NOLLS_20, usable)
+    assert not commands[~usable.ravel()].any()
+    ignorant = modes_to_actuators(MIRROR, NOLLS_20) * usable.ravel()[:, None]
+    u = pupil_axis(256)
+    inside = np.hypot(u[:, None], u) <= 0.5
+    factors = influence_factors(MIRROR, u, 34)
+    targets = zernikes(NOLLS_20, 2 * u, 2 * u[:, None])
+
+    def faults(of):
+        made = [2.0 * surface_nm(factors, of[:, k].reshape(34, 34), factors) for k in range(20)]
+        return np.array([(one - target)[inside].std() for one, target in zip(made, targets, strict=True)])
+
+    assert (faults(commands) < 0.95 * faults(ignorant)).all()
+    assert np.median(faults(commands) / faults(ignorant)) < 0.8
+    few = np.zeros((34, 34), bool)
+    few[16:18, 16:18] = True
+    with pytest.raises(ValueError, match="4 active actuators in the pupil cannot make 20 modes"):
+        modes_to_actuators(MIRROR, NOLLS_20, few)
+
+
+def test_a_mirror_may_lie_beside_the_pupil():
+    moved = actuator_axis(Mirror(shift_pitches=0.5), 34) - actuator_axis(MIRROR, 34)
+    np.testing.assert_allclose(moved, 0.5 / 31)
+
+
 def test_low_pass_removes_the_print_through_and_nothing_else():
     tilt = modes_to_actuators(MIRROR, [2])[:, 0].reshape(34, 34)
     u = pupil_axis(512)

@@ -268,6 +268,18 @@ def test_an_older_time_does_not_move_the_surface_back() -> None:
     assert np.array_equal(again.surface_nm, status.surface_nm)
 
 
+def test_commands_of_the_same_frame_move_the_surface_within_the_slew() -> None:
+    """A silent camera: the controller relaxes the mirror, and no frame's time goes on."""
+    device = mirror(settling_ns=1e6)
+    status = follow(device, initial(device), 100, 200, 300)
+    for number, height_nm in enumerate((200, 100, 0), start=1):
+        before = status.surface_nm
+        now_ns = status.received_ns + 10 * MS
+        status, _ = obey(device, status, told(even(height_nm), 3, time_ns=status.commanded_ns), now_ns)
+        assert status.surface_nm.max() == pytest.approx(height_nm, abs=1), number
+        assert np.abs(status.surface_nm - before).max() <= LIMITS.slew_nm
+
+
 def test_obeying_changes_nothing_that_it_was_given() -> None:
     device = mirror()
     status = follow(device, initial(device), 10)

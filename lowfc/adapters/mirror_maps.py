@@ -1,0 +1,95 @@
+"""Maps of the mirror in files, FITS or numpy's: its shapes, and the actuators that may be commanded."""
+
+import io
+import warnings
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+from astropy.io import fits
+from astropy.utils.exceptions import AstropyWarning
+
+from lowfc.contract.configuration import Configuration
+from lowfc.contract.errors import ConfigurationError, DataFileError
+
+Single = npt.NDArray[np.float32]
+
+
+def read_shape(path: Path) -> Single:
+    """Shape of a mirror (rows, columns), nm of surface: the first image of a FITS file, or the array of a .npy file.
+
+    Raises:
+        DataFileError: the file is missing, damaged or holds something else.
+    """
+    if not path.is_file():
+        raise DataFileError(f"{path}: there is no such file")
+    try:
+        shape = _npy(path) if path.suffix == ".npy" else _fits(path)
+    except (OSError, TypeError, ValueError, EOFError, AstropyWarning) as error:
+        why = " ".join(str(error).split())
+        raise DataFileError(f"{path}: neither a FITS image nor a numpy array (.npy): {why}") from None
+    if shape.ndim != 2 or shape.dtype.kind not in "biuf":
+        raise DataFileError(
+            f"{path}: a mirror's shape is an array (rows, columns) of numbers, got {shape.shape} of {shape.dtype}"
+        )
+    return np.ascontiguousarray(shape, dtype=np.float32)
+
+
+def active_actuators(config: Configuration) -> npt.NDArray[np.bool_] | None:
+    """Actuators (rows, columns) that may be commanded, of `mirror.active`; None where all may.
+
+    Raises:
+        ConfigurationError: the file is missing, damaged or does not fit the mirror.
+    """
+    if not config.mirror.active:
+        return None
+    found = _map(config, "mirror.active", config.mirror.active)
+    if not np.isin(found, (0, 1)).all():
+        raise ConfigurationError(f"mirror.active = {config.mirror.active!r}: every value must be 0 or 1")
+    if not found.any():
+        raise ConfigurationError(f"mirror.active = {config.mirror.active!r}: no actuator is active")
+    return np.asarray(found, dtype=np.bool_)
+
+
+def flat_nm(config: Configuration) -> Single | None:
+    """The flat map (rows, columns) of `mirror.flat`, nm of surface, zero at inactive actuators; None without one.
+
+    Raises:
+        ConfigurationError: the file is missing, damaged or does not fit the mirror.
+    """
+    if not config.mirror.flat:
+        return None
+    found = _map(config, "mirror.flat", config.mirror.flat)
+    if not np.isfinite(found).all():
+        raise ConfigurationError(f"mirror.flat = {config.mirror.flat!r}: every value must be finite")
+    active = active_actuators(config)
+    return found if active is None else np.where(active, found, np.float32(0))
+
+
+def _map(config: Configuration, key: str, file: str) -> Single:
+    try:
+        found = read_shape(Path(file).expanduser())
+    except DataFileError as fault:
+        raise ConfigurationError(f"{key}: {fault}") from None
+    grid = (config.mirror.rows, config.mirror.columns)
+    if found.shape != grid:
+        raise ConfigurationError(
+            f"{key} = {file!r}: {found.shape[0]} x {found.shape[1]} values, the mirror has {grid[0]} x {grid[1]} "
+            "actuators"
+        )
+    return found
+
+
+def _npy(path: Path) -> npt.NDArray[np.generic]:
+    found: npt.NDArray[np.generic] = np.load(path, allow_pickle=False)
+    return found
+
+
+def _fits(path: Path) -> npt.NDArray[np.generic]:
+    with warnings.catch_warnings():
+        warnings.simplefilter("error", AstropyWarning)  # a shortened file is no more than a warning to astropy
+        with fits.open(io.BytesIO(path.read_bytes())) as units:
+            images = [unit.data for unit in units if unit.is_image and unit.data is not None]
+            if not images:
+                raise ValueError("there is no image in it")
+            return np.asarray(images[0])

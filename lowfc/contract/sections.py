@@ -1,0 +1,177 @@
+"""The sections of the configuration that say what the instrument is: star, sensor, camera, disturbance, mirror."""
+
+from typing import Annotated, Any, Literal, get_args
+
+from pydantic import BaseModel, ConfigDict, Field, model_validator
+
+Preset = Literal["quiet", "bench", "thermal", "reaction-wheel", "step", "kolmogorov"]
+PRESETS: tuple[str, ...] = get_args(Preset)
+
+Positive = Annotated[float, Field(gt=0)]
+NotNegative = Annotated[float, Field(ge=0)]
+
+
+class Section(BaseModel):
+    """A section: unknown keys are errors, values do not change."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True, use_attribute_docstrings=True, allow_inf_nan=False)
+
+
+class Star(Section):
+    """The star and the telescope: Sect. 3.3."""
+
+    magnitude: float = Field(2.0, ge=-2, le=20)
+    """Apparent V magnitude."""
+    diameter_m: float = Field(2.0, gt=0, le=100)
+    """Diameter of the open circular aperture."""
+    wavelength_nm: float = Field(550.0, ge=100, le=30_000)
+    """Central wavelength."""
+    bandwidth: float = Field(0.2, gt=0, lt=1)
+    """Width of the band as a fraction of the central wavelength."""
+    throughput: float = Field(0.5, gt=0, le=1)
+    """Light that is left after all reflections upstream of the coronagraph."""
+
+
+class SensorSection(Section):
+    """The wavefront sensor's optics, and of the coronagraph what it lives on."""
+
+    kind: Literal["sam", "clowfs", "zwfs", "bar", "open"] = "sam"
+    """Sparse aperture mask, coronagraphic low-order sensor, Zernike sensor, pupil with a bar, or open relay pupil."""
+    pupil: str = "shaped"
+    """Coronagraph: the shaped pupil; circle for a classical Lyot, prolate for an apodised one; or FILE.npz."""
+    focal_mask: Literal["disk", "bowtie"] = "disk"
+    """Reflective focal-plane mask: a disk, or the bowtie of Fig. 3."""
+    focal_radius: float = Field(4.0, ge=1, le=10)
+    """Radius of its disk, lambda/D."""
+    sam: str = "sam27d07"
+    """Of a sam: a shipped layout, or FILE.json, or FILE.json:NAME."""
+    defocus_mm: float = Field(6.0, ge=1, le=50)
+    """Of a clowfs: the detector's distance from focus."""
+    focal_ratio: float = Field(20.0, ge=1, le=200)
+    """Of a clowfs: focal length over pupil diameter at the focal-plane mask."""
+    inner_radius: float = Field(0.0, ge=0, lt=10)
+    """Of a clowfs: radius of the hole in the reflecting disk, lambda/D."""
+    spot_diameter: float = Field(1.06, gt=0, le=8)
+    """Of a zwfs: the phase spot's diameter, lambda/D."""
+    bar_width: float = Field(0.1, gt=0, lt=1)
+    """Of a bar: its width, pupil diameters."""
+    bar_angle_deg: float = Field(20.0, ge=0, lt=360)
+    """Of a bar: its direction from the x axis towards y."""
+    modes: int = Field(14, ge=1, le=35)
+    """Zernike modes after piston, from Noll 2 on."""
+    wavelengths: int = Field(1, ge=1, le=9)
+    """Wavelengths of the simulated band; 1 is monochromatic."""
+    quadrature: Literal["gauss-legendre", "uniform"] = "gauss-legendre"
+    """How the wavelengths are chosen: uniform is the paper's, both ends included, and far less accurate."""
+    nodes: Literal[32, 64] = 32
+    """Pupil nodes across the diameter in the real-time twin."""
+    rank: int = Field(60, ge=20, le=200)
+    """Modes kept of the optical operator in the real-time twin."""
+
+
+SENSORS: dict[str, dict[str, Any]] = {
+    "sam": {"kind": "sam"},
+    "bowtie": {"kind": "sam", "focal_mask": "bowtie", "sam": "sam27d07_bowtie"},
+    "clowfs": {"kind": "clowfs"},
+    "zwfs": {"kind": "zwfs"},
+    "bar": {"kind": "bar"},
+    "open": {"kind": "open"},
+    "lyot": {"kind": "sam", "pupil": "circle"},
+    "aplc": {"kind": "sam", "pupil": "prolate", "focal_radius": 2.5},
+}
+"""The sensors that have a name on the command line, as keys of [sensor]."""
+
+
+def sensor_keys(name: str) -> dict[str, Any]:
+    """Keys of [sensor] for one of `SENSORS`; any other name is that of a sparse aperture mask's layout."""
+    return SENSORS.get(name, {"kind": "sam", "sam": name})
+
+
+class Camera(Section):
+    """The sensor camera."""
+
+    rate_hz: float = Field(250.0, gt=0, le=20_000)
+    """Frames per second."""
+    exposure_fraction: float = Field(0.5, gt=0, le=1)
+    """Part of the period during which light is collected; the rest is for the loop to react."""
+    quantum_efficiency: float = Field(0.8, gt=0, le=1)
+    """Electrons per photon."""
+    read_noise_e: NotNegative = 1.0
+    """Read noise of one pixel."""
+    gain_e_per_dn: Positive = 1.0
+    """Electrons per digital number."""
+    bias_dn: float = Field(100.0, ge=0, le=60_000)
+    """Level without light."""
+    full_well_e: Positive = 40_000.0
+    """Electrons that a pixel can hold."""
+    bit_depth: int = Field(16, ge=8, le=16)
+    """Bits of the converter."""
+    em_gain: float = Field(1.0, ge=1, le=5000)
+    """Electron-multiplying gain; 1 is a plain detector."""
+    clock_induced_charge_e: NotNegative = 0.0
+    """Spurious electrons per pixel and frame before multiplication."""
+    delay_frames: float = Field(1.0, ge=1, le=3)
+    """Frames from the one a command is made from to the first exposed wholly under it; 1 is the least."""
+    noise: bool = True
+    """Photon and read noise; off only for tests of the control law."""
+    photon_noise: Literal["fast", "exact"] = "fast"
+    """Faint pixels from a table of their law (its variance is 6e-5 e-^2 too large at most), or every electron drawn."""
+
+
+class Disturbance(Section):
+    """What shakes the wavefront: a function of the seed and the frame index."""
+
+    preset: Preset = "bench"
+    """quiet, bench, thermal, reaction-wheel, step or kolmogorov."""
+    scale: NotNegative = 1.0
+    """Multiplies the preset's amplitude."""
+    static_nm: dict[str, float] = Field(default_factory=dict)
+    """Constant wavefront added to it: Noll index = nm rms."""
+
+    @model_validator(mode="after")
+    def _noll_indices(self) -> "Disturbance":
+        for key in self.static_nm:
+            if not key.isdecimal() or int(key) < 2:
+                raise ValueError(f"static_nm: {key!r} is not a Noll index of 2 or more")
+        return self
+
+
+class Mirror(Section):
+    """The deformable mirror."""
+
+    name: str = Field("dm", pattern=r"^[a-z][a-z0-9_]*$")
+    """Its name in the topics."""
+    rows: int = Field(34, ge=2, le=128)
+    """Rows of actuators."""
+    columns: int = Field(34, ge=2, le=128)
+    """Columns of actuators."""
+    pitches_per_pupil: float = Field(31.0, gt=1, le=128)
+    """Actuator pitches across the pupil."""
+    coupling: float = Field(0.15, gt=0, lt=1)
+    """Height of an influence function at the neighbouring actuator."""
+    stroke_nm: float = Field(1500.0, gt=0)
+    """Whole range of an actuator, surface."""
+    driver_bits: int = Field(16, ge=8, le=24)
+    """Bits of the driver over the whole range."""
+    settling_us: NotNegative = 50.0
+    """Time constant of an actuator's first-order response."""
+    dead: list[int] = Field(default_factory=list)
+    """Actuators that stay flat: row * columns + column."""
+    stuck_nm: dict[str, float] = Field(default_factory=dict)
+    """Actuators stuck at a height: row * columns + column = nm."""
+    slew_nm: float = Field(150.0, gt=0.01)
+    """Largest change of an actuator per command that the mirror accepts."""
+    neighbour_nm: float = Field(500.0, gt=0.01)
+    """Largest difference between neighbouring actuators that the mirror accepts."""
+    expired: Literal["hold", "flat"] = "flat"
+    """When the last command has expired: hold the shape, or relax to flat within the slew limit."""
+    flat: str = ""
+    """File (FITS or .npy) of the flat map, nm of surface, which is on the mirror from the start; empty for none."""
+    active: str = ""
+    """File (FITS or .npy) of the active actuators, 0 or 1: modes and flat map leave the others out; empty for all."""
+    nm_per_unit: Positive = 1.0
+    """For the mirror's driver: nm of surface that one unit of what it writes to the hardware makes."""
+    shift_pitches: float = Field(0.0, ge=-2, le=2)
+    """Of the simulated mirror: how far its actuators lie from where they are believed, along x and along y."""
+    magnification: float = Field(1.0, ge=0.9, le=1.1)
+    """Of the simulated mirror: its size in the pupil, of the one that is believed."""

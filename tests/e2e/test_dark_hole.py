@@ -1,0 +1,95 @@
+"""A dark hole is dug while the loop runs: the loop does not undo it, and nothing of it is lost on replay."""
+
+import json
+
+import numpy as np
+import numpy.typing as npt
+import pytest
+from loops import payloads, run
+from measure_zero_point import PLAIN, SHIFTED, STEPS, Night, dark_hole
+
+from lowfc.contract.calibration_codec import decode_calibration
+from lowfc.contract.messages import CALIBRATION, COMMAND, OFFLOAD, STEP, wire
+
+GRID = (34, 34)
+DEAD = (352, 561, 595, 757)
+EACH_NM = 2.0
+
+
+def flat_nm() -> npt.NDArray[np.float64]:
+    """Small, for the simulated mirror is flat without it."""
+    rows, columns = np.indices(GRID)
+    return np.asarray(np.sin(rows / 2) * np.cos(columns / 3))
+
+
+@pytest.fixture(scope="module")
+def night(tmp_path_factory: pytest.TempPathFactory) -> Night:
+    """Twenty steps with the zero point taken along, then without; on a mirror with a flat map and dead actuators."""
+    folder = tmp_path_factory.mktemp("dark_hole")
+    active = np.ones(GRID)
+    active.flat[list(DEAD)] = 0
+    np.save(folder / "flat.npy", flat_nm())
+    np.save(folder / "active.npy", active)
+    toml = f'[mirror]\nflat = "flat.npy"\nactive = "active.npy"\ndead = {list(DEAD)}\n'
+    return dark_hole(folder, EACH_NM, toml, flat_nm() * active)
+
+
+@pytest.fixture(scope="module")
+def said(night: Night) -> dict[str, list[bytes]]:
+    return payloads(night.log)
+
+
+def test_the_loop_does_not_undo_the_steps(night: Night) -> None:
+    channel = night.channels[SHIFTED]
+    assert len(channel.seen_nm) == STEPS + 1
+    assert np.linalg.norm(channel.seen_nm[-1]) > 15, "nm of wavefront that a loop without the shift would take away"
+    undone, error = channel.undone()
+    assert abs(undone) < 0.01
+    assert error < 0.005
+
+
+def test_without_the_shift_it_does_undo_them(night: Night) -> None:
+    undone, _ = night.channels[PLAIN].undone()
+    assert undone == pytest.approx(1, abs=0.1)
+
+
+def test_the_residual_is_as_small_as_before(night: Night) -> None:
+    before_nm, after_nm = night.channels[SHIFTED].left_nm
+    assert before_nm < 3
+    assert after_nm < 1.2 * before_nm
+
+
+def test_the_flat_map_is_there_from_the_start_and_dead_actuators_are_left_alone(said: dict[str, list[bytes]]) -> None:
+    calibration = decode_calibration(wire.Calibration.FromString(said[f"/{CALIBRATION.key}"][0]))
+    wanted = flat_nm().reshape(-1)
+    wanted[list(DEAD)] = 0
+    messages = [wire.MirrorCommand.FromString(body) for body in said[f"/{COMMAND.at('dm')}"][:300]]
+    for message in messages:
+        beside = np.frombuffer(message.actuators, "<f4") - calibration.modes_to_actuators @ message.command_nm
+        assert not np.frombuffer(message.actuators, "<f4")[list(DEAD)].any()
+        np.testing.assert_allclose(beside, wanted, atol=1e-3)
+
+
+def test_the_mean_command_is_published_once_a_second(said: dict[str, list[bytes]]) -> None:
+    """By counting frames, at 1000 Hz: for another adaptive-optics system to take over."""
+    steps = [wire.ControlStep.FromString(body) for body in said[f"/{STEP.key}"]]
+    offloads = [wire.ModalOffload.FromString(body) for body in said[f"/{OFFLOAD.key}"]]
+    assert len(offloads) == len(steps) // 1000 > 2
+    commands = {step.frame_sequence: step.command_nm for step in steps}
+    for offload in offloads:
+        assert offload.frames == 1000
+        assert list(offload.noll) == list(range(2, 16))
+        last = offload.frame_sequence
+        wanted = np.mean([commands[sequence] for sequence in range(last - 999, last + 1)], axis=0)
+        np.testing.assert_allclose(offload.command_nm, wanted, atol=1e-4)
+    times_ns = [offload.timestamp.ToNanoseconds() for offload in offloads]
+    assert np.diff(times_ns) == pytest.approx(1e9)
+
+
+def test_the_night_is_replayed_to_the_bit(night: Night) -> None:
+    done = run(night.log.parent, "replay", "--json", str(night.log))
+    assert done.returncode == 0, done.stdout + done.stderr
+    found = json.loads(done.stdout)
+    assert found["identical"]
+    assert found["largest_difference_nm"] == 0
+    assert found["requests"] > STEPS
