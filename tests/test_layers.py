@@ -22,7 +22,10 @@ BELOW = {
     "lowfc.design": ("lowfc.optics", "lowfc.control"),
     "lowfc.contract": ("lowfc.optics", "lowfc.control"),
     "lowfc.adapters": ("lowfc.optics", "lowfc.control", "lowfc.contract"),
-    "lowfc.programs": ("lowfc.optics", "lowfc.control", "lowfc.design", "lowfc.contract", "lowfc.adapters"),
+    "lowfc.client": ("lowfc.control", "lowfc.contract", "lowfc.adapters"),
+    "lowfc.programs": (
+        *("lowfc.optics", "lowfc.control", "lowfc.design", "lowfc.contract", "lowfc.adapters", "lowfc.client"),
+    ),
     "sim_camera": ("lowfc.optics", "lowfc.control", "lowfc.contract", "lowfc.adapters"),
     "sim_dm": ("lowfc.optics", "lowfc.control", "lowfc.contract", "lowfc.adapters"),
 }
@@ -139,6 +142,8 @@ def test_no_file_outgrows_its_noun() -> None:
         ("lowfc.adapters.bus", "from lowfc.programs import controller"),
         ("lowfc.adapters.bus", "import sim_dm.device"),
         ("lowfc.programs.sim_loop", "from sim_camera.bench import Bench"),
+        ("lowfc.client.client", "from lowfc.programs import ctl"),
+        ("lowfc.adapters.bus", "from lowfc.client import Client"),
         ("sim_camera.process", "import lowfc.programs.controller"),
         ("sim_dm.process", "from sim_camera import bench"),
         ("lowfc.adapters.bus", "from . import clock"),

@@ -11,6 +11,7 @@ from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from typing import NamedTuple, Protocol
 
+from lowfc.adapters.clock_offset import ClockOffset
 from lowfc.adapters.envelope import Envelope
 from lowfc.contract.messages import HEALTH, Topic
 
@@ -82,9 +83,15 @@ class Ring(Protocol):
 
 
 class Bus(Protocol):
-    """A connection of one process to all others of its run."""
+    """A connection of one process to all others of its run.
+
+    Attributes:
+        faults: of handlers.
+        offset: of the router's clock, where the run is on several hosts.
+    """
 
     faults: "Faults"
+    offset: ClockOffset | None
 
     def publisher(self, topic: Topic, name: str = "") -> Publisher:
         """Publisher of a topic; the last message of a queryable topic is what `get` on its key returns."""

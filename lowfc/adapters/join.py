@@ -40,6 +40,6 @@ def join(
 ) -> Service:
     """Set this process up for the loop and join a run."""
     granted = prepare(config, role, cpus)
-    run = open_run(run_id, (config.mirror.name,))
+    run = open_run(run_id, (config.mirror.name,), network=config.network)
     clock = clock_of(config)
     return Service(role, run_id, clock, ZenohBus(run.links, role, clock), granted=granted)

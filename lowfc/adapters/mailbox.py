@@ -7,6 +7,9 @@ from collections import deque
 from lowfc.adapters.arrivals import Arrivals
 from lowfc.adapters.bus import Sample
 
+LONGEST_WAIT_S = 0.5
+"""A signal that strikes after Python has looked for one and before it waits is handled only when the wait is over."""
+
 
 class Mailbox(Arrivals):
     """Holds the newest message of one publisher; a newer one replaces it.
@@ -50,7 +53,7 @@ class Mailbox(Arrivals):
                 if self._woken or left_s <= 0:
                     self._woken = False
                     return None
-                self._signal.acquire(timeout=left_s)
+                self._signal.acquire(timeout=min(left_s, LONGEST_WAIT_S))
             else:
                 self._taken += 1
                 return sample

@@ -8,6 +8,7 @@ from dataclasses import dataclass, field
 
 from lowfc.adapters.bus import ALL, Faults, Query, Sample
 from lowfc.adapters.clock import Clock
+from lowfc.adapters.clock_offset import ClockOffset
 from lowfc.adapters.envelope import Envelope, sequence_of
 from lowfc.contract.errors import BusError
 from lowfc.contract.messages import Topic
@@ -72,6 +73,7 @@ class MemoryBus:
         self.clock = clock
         self.closed = False
         self.faults = Faults()
+        self.offset: ClockOffset | None = None
         self.start_s = max(clock.start_s, hub.starts.get(role, -1) + 1)
         hub.starts[role] = self.start_s
         self._publishers: list[MemoryPublisher] = []

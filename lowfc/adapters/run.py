@@ -16,9 +16,10 @@ import socket
 import stat
 import tempfile
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
+from lowfc.contract.configuration import Network
 from lowfc.contract.errors import BusError, DataFileError
 from lowfc.contract.messages import Role
 
@@ -44,12 +45,14 @@ class Links:
         ports: loopback TCP port of each role that listens: "camera", "controller", "mirror-dm", "recorder".
         user: name for zenoh's user/password authentication.
         secret_file: zenoh's dictionary, one line "user:password".
+        network: the way by a router, where the run is on several hosts; ports and secret are then not used.
     """
 
     run_id: str
     ports: dict[str, int]
     user: str
     secret_file: Path
+    network: Network = field(default_factory=Network)
 
     @property
     def secret(self) -> str:
@@ -79,8 +82,18 @@ class Links:
         return path if len(os.fsencode(path)) <= _LONGEST_SOCKET else None
 
     def live(self) -> set[str]:
-        """Roles whose processes listen now; a run that was killed leaves its directory behind."""
-        return {role for role, port in self.ports.items() if _listens(port)}
+        """Roles whose processes listen now; a run that was killed leaves its directory behind.
+
+        By a router, nobody else listens: while it does, any may be there.
+        """
+        if self.network.router:
+            return set(self.ports) if _listens(*self.network.address) else set()
+        return {role for role, port in self.ports.items() if _listens("127.0.0.1", port)}
+
+    @property
+    def mirrors(self) -> tuple[str, ...]:
+        """Roles of the mirrors."""
+        return tuple(role for role in self.ports if role.partition("-")[0] == Role.MIRROR)
 
     def claim_start(self, role: str, start_s: int) -> int:
         """Start of a role's process for its sequences: `start_s`, or more where this run has had that one already.
@@ -115,10 +128,12 @@ class Run:
 _ADVICE = "stop the processes of this run, remove its directory and start again"
 
 
-def _listens(port: int) -> bool:
-    with socket.socket() as probe:
-        probe.settimeout(_CONNECT_S)
-        return probe.connect_ex(("127.0.0.1", port)) == 0
+def _listens(host: str, port: int) -> bool:
+    try:
+        socket.create_connection((host, port), _CONNECT_S).close()
+    except OSError:
+        return False
+    return True
 
 
 def new_run_id() -> str:
@@ -127,7 +142,11 @@ def new_run_id() -> str:
 
 
 def open_run(
-    run_id: str, mirrors: tuple[str, ...] = ("dm",), base: Path | None = None, listeners: tuple[str, ...] = ()
+    run_id: str,
+    mirrors: tuple[str, ...] = ("dm",),
+    base: Path | None = None,
+    listeners: tuple[str, ...] = (),
+    network: Network | None = None,
 ) -> Run:
     """Run of that name; the first to open it makes its directory, chooses its ports and its secret.
 
@@ -137,9 +156,11 @@ def open_run(
         base: directory of its directory; the user's runtime directory when None.
         listeners: roles that get a port of their own beside the usual ones, where this makes the run: a launcher hears
             a view, which only connects, if it listens.
+        network: the way to other hosts, where this makes the run; who gives none, or one without a router, takes the
+            run's. A launcher's run stays on its host.
 
     Raises:
-        BusError: the name is not usable, or the run was made without one of `mirrors`.
+        BusError: the name is not usable, or the run was made without one of `mirrors`, or goes another way.
         DataFileError: the run's directory is damaged.
     """
     if not _RUN_ID.fullmatch(run_id):
@@ -148,9 +169,20 @@ def open_run(
         )
     path = (runtime_base() if base is None else base) / run_id
     if not path.is_dir():
-        _make(path, mirrors, listeners)
+        _make(path, mirrors, listeners, _absolute(network or Network()))
     own_directory(path)
     links = _read(path)
+    if (
+        network is not None
+        and network.router
+        and _absolute(network) != links.network
+        and Role.LAUNCHER not in links.ports
+    ):
+        there = f"by {links.network.router}" if links.network.router else "on this host alone"
+        raise BusError(
+            f"run {run_id!r} is {there} with certificates {links.network.certificates!r}, and the configuration has "
+            f"{network.router} with {_absolute(network).certificates!r}; {_ADVICE} ({path}), or start another run"
+        )
     for role in map(mirror_role, mirrors):
         if role not in links.ports:
             raise BusError(
@@ -217,7 +249,14 @@ def _draft(path: Path, text: str) -> Path:
     return Path(name)
 
 
-def _make(path: Path, mirrors: tuple[str, ...], listeners: tuple[str, ...]) -> None:
+def _absolute(network: Network) -> Network:
+    """The same from wherever a process is started."""
+    if not network.router:
+        return Network()
+    return network.model_copy(update={"certificates": str(Path(network.certificates).expanduser().absolute())})
+
+
+def _make(path: Path, mirrors: tuple[str, ...], listeners: tuple[str, ...], network: Network) -> None:
     """Make the directory under another name and rename it; whoever is second leaves the first one's in place."""
     # Who only looks on connects and does not listen: there may be several, and nobody keeps looking for one.
     roles = [Role.CAMERA, Role.CONTROLLER, *map(mirror_role, mirrors), Role.RECORDER, *listeners]
@@ -226,6 +265,7 @@ def _make(path: Path, mirrors: tuple[str, ...], listeners: tuple[str, ...]) -> N
         "run_id": path.name,
         "user": _USER,
         "ports": dict(zip(map(str, roles), free_ports(len(roles)), strict=True)),
+        **({"network": network.model_dump()} if network.router else {}),
     }
     for name, text in ((_LINKS, json.dumps(links, indent=2)), (_CREDENTIALS, f"{_USER}:{secrets.token_hex(32)}\n")):
         _draft(draft / name, text).rename(draft / name)
@@ -244,7 +284,8 @@ def _read(path: Path) -> Links:
         ports = {str(role): int(port) for role, port in found["ports"].items()}
         if found["run_id"] != path.name or not all(0 < port < 1 << 16 for port in ports.values()):
             raise ValueError("another run's, or a port that is none")
-        return Links(path.name, ports, str(found["user"]), path / _CREDENTIALS)
+        network = Network.model_validate(found.get("network", {}))
+        return Links(path.name, ports, str(found["user"]), path / _CREDENTIALS, network)
     except (OSError, ValueError, KeyError, TypeError, AttributeError) as fault:
         raise DataFileError(
             f"{file} should hold run_id, user and ports as JSON, and could not be read ({fault}); {_ADVICE}: {path}"

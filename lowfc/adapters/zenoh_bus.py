@@ -2,7 +2,7 @@
 
 Who only looks on comes by Unix socket instead, and is sent fewer pictures.
 
-Why each setting is what it is stands in `session_config`; all of them were measured.
+Why each setting is what it is stands in `zenoh_session`; all of them were measured.
 """
 
 import contextlib
@@ -11,26 +11,35 @@ import json
 import os
 import threading
 from collections.abc import Callable, Iterator
+from functools import partial
 from pathlib import Path
-from typing import Any
 
 import zenoh
 from zenoh.handlers import Callback, Handler, RingChannel
 
+from lowfc.adapters.access import CLOCK_KEY, ROUTER
 from lowfc.adapters.bus import ALL, Faults, Query, Sample
 from lowfc.adapters.clock import Clock
+from lowfc.adapters.clock_offset import ClockAsker, ClockOffset
 from lowfc.adapters.envelope import Envelope, sequence_of
+from lowfc.adapters.routed import open_by_router, require_certificate
 from lowfc.adapters.run import Links
 from lowfc.adapters.shortcut import ShortcutReader, ShortcutWriter
+from lowfc.adapters.zenoh_session import session_config
 from lowfc.contract.errors import BusError
-from lowfc.contract.messages import TOPICS, Topic
+from lowfc.contract.messages import HEALTH, Topic
 
-_SOCKET = "unixsock-stream"
-_GLANCES_HZ = 40.0  # a view draws 30 pictures a second; each finds a new one
-_BATCH_BYTES = 65535  # zenoh's own
-_SMALL_BATCH_BYTES = 16384  # of a reader that keeps messages: each holds the buffer that it came in
-_SPARE_BUFFERS = 1024  # without them it makes and clears one for every message
-_PRIORITIES = ("real_time", "interactive_high", "interactive_low", "data_high", "data", "data_low", "background")
+__all__ = [
+    "ZenohBus",
+    "ZenohPublisher",
+    "declare_publisher",
+    "receive_in_one_thread",
+    "session_config",
+    "stay_python",
+]
+
+TAKEN_S = 0.5
+"""How long the router, or who has one's place already, may take to answer."""
 
 
 def receive_in_one_thread() -> None:
@@ -40,79 +49,6 @@ def receive_in_one_thread() -> None:
     inherit it.
     """
     os.environ.setdefault("ZENOH_RUNTIME", "(rx: (handover: net))")
-
-
-def session_config(links: Links, role: str, *, looks_on: bool = False) -> dict[str, Any]:
-    """Return zenoh's configuration for a role of a run; a role without a port of its own only connects.
-
-    Args:
-        links: of the run.
-        role: whose.
-        looks_on: it takes no part in the loop, see `ZenohBus`.
-    """
-    listening = [_address(links, role), _socket(links, role)] if role in links.ports else []
-    batch_bytes = _SMALL_BATCH_BYTES if looks_on else _BATCH_BYTES
-    glanced_at = [{"key_expr": topic.at(ALL), "freq": _GLANCES_HZ} for topic in TOPICS if topic.newest_only]
-    return {
-        "mode": "peer",
-        # Peers do not forward, so everybody connects to everybody; with a timeout of -1 any start order works.
-        "listen": {"endpoints": [one for one in listening if one], "exit_on_failure": True, "timeout_ms": 0},
-        "connect": {
-            "endpoints": [
-                (_socket(links, name) if looks_on else None) or _address(links, name)
-                for name in sorted(links.ports)
-                if name != role
-            ],
-            "timeout_ms": -1,
-            "exit_on_failure": False,
-            # A newcomer connects to all others itself. Who asks five times a second for somebody who is not there (a
-            # recorder, say) delays a frame each time.
-            "retry": {"period_init_ms": 50, "period_max_ms": 4000, "period_increase_factor": 2},
-        },
-        # Opening waits `delay` ms for the links that are not there yet; whoever is up is connected within a few.
-        "scouting": {"delay": 100, "multicast": {"enabled": False}, "gossip": {"enabled": False}},
-        "transport": {
-            "auth": {
-                "usrpwd": {
-                    "user": links.user,
-                    "password": links.secret,
-                    "dictionary_file": str(links.secret_file),
-                }
-            },
-            "link": {
-                "tx": {
-                    "batch_size": batch_bytes,  # of both directions: the smaller one of both ends holds
-                    # A full queue delays a put by at most 1 ms, then the message is dropped; at 0 bursts are lost.
-                    "queue": {
-                        "size": dict.fromkeys(_PRIORITIES, 16),
-                        "congestion_control": {"drop": {"wait_before_drop": 1000}},
-                    },
-                },
-                "rx": {"buffer_size": _SPARE_BUFFERS * batch_bytes if looks_on else batch_bytes},
-            },
-            # Gains nothing at these sizes, and a receiver descheduled for 100 ms loses messages silently.
-            "shared_memory": {"enabled": False},
-        },
-        # Who looks on comes by socket, and is sent no more pictures than it draws: writing them costs the loop, too.
-        "downsampling": [
-            {
-                "id": "glances",
-                "flows": ["egress"],
-                "messages": ["put"],
-                "link_protocols": [_SOCKET],
-                "rules": glanced_at,
-            }
-        ],
-    }
-
-
-def _address(links: Links, role: str) -> str:
-    return f"tcp/127.0.0.1:{links.ports[role]}"
-
-
-def _socket(links: Links, role: str) -> str | None:
-    path = links.socket(role)
-    return None if path is None else f"{_SOCKET}/{path}"
 
 
 def declare_publisher(session: zenoh.Session, topic: Topic, key: str) -> zenoh.Publisher:
@@ -139,6 +75,7 @@ class ZenohPublisher:
         self._keeps = topic.queryable
         self._host_ns = bus.clock.host_ns
         self._start_s = bus.start_s
+        self._offset = bus.offset
         self._replying = bus.replying
         self._publisher = declare_publisher(session, topic, key)
         self._shortcut = None if shortcut is None else ShortcutWriter(shortcut)
@@ -154,10 +91,9 @@ class ZenohPublisher:
         self.published += 1
         if self._keeps:
             self.last = (payload, envelope)
-        attachment = envelope.encode()
         if self._shortcut is not None:
-            self._shortcut.send(attachment, payload)
-        self._publisher.put(payload, attachment=attachment)
+            self._shortcut.send(envelope.encode(), payload)
+        self._publisher.put(payload, attachment=self._sent(envelope))
         return envelope
 
     def close(self) -> None:
@@ -169,7 +105,13 @@ class ZenohPublisher:
         with self._replying(query):
             if self.last is not None:
                 payload, envelope = self.last
-                query.reply(self.key, payload, attachment=envelope.encode())
+                query.reply(self.key, payload, attachment=self._sent(envelope))
+
+    def _sent(self, envelope: Envelope) -> bytes:
+        """What goes out: across hosts, by the router's clock."""
+        if self._offset is None:
+            return envelope.encode()
+        return Envelope(envelope.sequence, envelope.publish_time_ns + self._offset.offset_ns).encode()
 
 
 class ZenohRing:
@@ -186,14 +128,20 @@ class ZenohRing:
         now_ns = self._bus.clock.host_ns()
         while (sample := self._subscriber.try_recv()) is not None:
             try:
-                found.append(_sample(sample, now_ns, self._key))
+                found.append(self._bus.read(sample, now_ns, self._key))
             except Exception as fault:
                 self._bus.faults.add(f"{self._bus.role}: ring of {sample.key_expr}", fault)
         return found
 
 
 class ZenohBus:
-    """One process's zenoh session; see `Bus`."""
+    """One process's zenoh session; see `Bus`.
+
+    Attributes:
+        offset: of the router's clock, where the run is on several hosts. Envelopes go by that clock; what is sent and
+            received here is by this host's.
+        read: what a message of zenoh's says.
+    """
 
     def __init__(self, links: Links, role: str, clock: Clock, *, looks_on: bool = False) -> None:
         """Join a run.
@@ -207,26 +155,54 @@ class ZenohBus:
                 and in one thread: half the cost. To be set in a process's first bus.
 
         Raises:
-            BusError: the role's port is taken, or zenoh refuses the configuration.
+            BusError: the role's port is taken, or the role itself on another host; zenoh refuses the configuration, or
+                the router the certificate.
+            DataFileError: the role has no certificate, across hosts.
         """
         self.role = role
         self._links = links
         self._closers: list[Callable[[], None]] = []
         self.clock = clock
         self.faults = Faults()
+        self.offset: ClockOffset | None = None
+        self.read = _sample
         self.start_s = links.claim_start(role, clock.start_s)
         if looks_on:
             receive_in_one_thread()
+        if links.network.router:
+            require_certificate(links.network, role)
         config = zenoh.Config.from_json5(json.dumps(session_config(links, role, looks_on=looks_on)))
+        if links.network.router and role != ROUTER:
+            self._session = open_by_router(config, links.network, role)
+            self._join_hosts()
+            return
         try:
             self._session = zenoh.open(config)
         except zenoh.ZError as fault:
-            port = links.ports.get(role)
-            where = f"cannot listen on 127.0.0.1:{port}; is one running already?" if port else "cannot join."
+            address = links.network.listen or links.network.router or f"127.0.0.1:{links.ports.get(role)}"
+            listens = role in {*links.ports, ROUTER}
+            where = f"cannot listen on {address}; is one running already?" if listens else "cannot join."
             raise BusError(
-                f"{role} of run {links.run_id!r} {where} Stop what is in the way, or start another run "
-                f"(zenoh says: {str(fault).splitlines()[0][:200]})"
+                f"{role} of run {links.run_id!r} {where} Stop what is in the way, or start "
+                f"another run (zenoh says: {str(fault).splitlines()[0][:200]})"
             ) from fault
+        if role == ROUTER:
+            self.queryable(CLOCK_KEY, lambda query: query.reply(b""))
+
+    def _join_hosts(self) -> None:
+        """Take no place that is taken, which ports prevent on one host; and set envelopes by the router's clock."""
+        if self.role in self._links.ports and self.get(HEALTH.at(self.role), timeout_s=TAKEN_S):
+            self._session.close()  # type: ignore[no-untyped-call]
+            raise BusError(
+                f"run {self._links.run_id!r} has a {self.role} already, on this host or another; stop it first"
+            )
+        self.offset = ClockOffset()
+        self.read = partial(_sample_from_afar, self.offset)
+        self._closers.append(ClockAsker(self.offset, self._ask_the_time, self.clock.host_ns).close)
+
+    def _ask_the_time(self) -> list[tuple[int, int]]:
+        answers = self.get(CLOCK_KEY, timeout_s=TAKEN_S)
+        return [(answer.publish_time_ns, answer.receive_time_ns) for answer in answers]
 
     def publisher(self, topic: Topic, name: str = "") -> ZenohPublisher:
         """See `Bus.publisher`."""
@@ -251,14 +227,14 @@ class ZenohBus:
         return reader.close
 
     def _subscribe(self, topic: Topic, handler: Callable[[Sample], None], name: str) -> Callable[[], None]:
-        key, host_ns, faults = topic.at(name), self.clock.host_ns, self.faults
+        key, host_ns, faults, read = topic.at(name), self.clock.host_ns, self.faults, self.read
         known_key = _known_key(key)
 
         def received(sample: zenoh.Sample) -> None:
             now_ns = host_ns()
             stay_python()
             try:
-                handler(_sample(sample, now_ns, known_key))
+                handler(read(sample, now_ns, known_key))
             except Exception as fault:  # zenoh would print it and go on; it is counted here
                 faults.add(f"{self.role}: handler of {key}", fault)
 
@@ -293,7 +269,7 @@ class ZenohBus:
             if reply.ok is None:  # a timeout
                 return
             try:
-                answers.append(_sample(reply.ok, self.clock.host_ns()))
+                answers.append(self.read(reply.ok, self.clock.host_ns()))
             except Exception as fault:
                 self.faults.add(f"{self.role}: answer to {key}", fault)
 
@@ -304,14 +280,15 @@ class ZenohBus:
             timeout=timeout_s,
             target=zenoh.QueryTarget.ALL,
             consolidation=zenoh.ConsolidationMode.NONE,
-            congestion_control=zenoh.CongestionControl.DROP,  # of the answers too: nobody blocks for a frozen asker
+            # An operator's question waits for room, or a large one is lost; those of late joiners are empty.
+            congestion_control=zenoh.CongestionControl.BLOCK if payload else zenoh.CongestionControl.DROP,
         )
         done.wait(timeout_s + 1.0)
         return list(answers)
 
     def peers(self) -> int:
-        """See `Bus.peers`."""
-        return len(self._session.info.peers_zid())
+        """See `Bus.peers`; across hosts, the router alone."""
+        return len(self._session.info.peers_zid()) + len(self._session.info.routers_zid())
 
     def close(self) -> None:
         """Leave the run."""
@@ -336,7 +313,8 @@ class ZenohBus:
     def _replier(self, query: zenoh.Query, key: str) -> Callable[[bytes], None]:
         def reply(body: bytes) -> None:
             with self.replying(query):
-                envelope = Envelope(sequence_of(self.start_s, 0), self.clock.host_ns())
+                shift_ns = 0 if self.offset is None else self.offset.offset_ns
+                envelope = Envelope(sequence_of(self.start_s, 0), self.clock.host_ns() + shift_ns)
                 query.reply(key, body, attachment=envelope.encode())
 
         return reply
@@ -371,3 +349,11 @@ def _sample(sample: zenoh.Sample, receive_time_ns: int, key: str | None = None) 
         publish_time_ns,
         receive_time_ns,
     )
+
+
+def _sample_from_afar(
+    offset: ClockOffset, sample: zenoh.Sample, receive_time_ns: int, key: str | None = None
+) -> Sample:
+    """The same across hosts: when it was sent, by this host's clock."""
+    found = _sample(sample, receive_time_ns, key)
+    return found._replace(publish_time_ns=found.publish_time_ns - offset.offset_ns)

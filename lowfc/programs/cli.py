@@ -3,10 +3,9 @@
 import json
 import os
 import sys
-from collections.abc import Sequence
 from contextlib import closing
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated, Any
 
 import typer
 
@@ -14,28 +13,33 @@ from lowfc import __version__
 from lowfc.adapters.terminal import DEFAULT_RUN, ConfigFile, RunId, configuration, new_app, run_app
 from lowfc.contract.configuration import Preset
 from lowfc.contract.errors import ConfigurationError
+from lowfc.programs.acceptance import acceptance_app
 from lowfc.programs.bench_record import bench_record
 from lowfc.programs.bench_view import bench_view
+from lowfc.programs.calibrate import calibrate_app
+from lowfc.programs.conformance import conformance_app
+from lowfc.programs.ctl_commands import ctl_app
 from lowfc.programs.design_commands import design_app
 from lowfc.programs.doctor import doctor
 from lowfc.programs.export import export
+from lowfc.programs.hosts import certs, hosts, router
 from lowfc.programs.latency import latency
 from lowfc.programs.log_info import info
 from lowfc.programs.recover import recover
 from lowfc.programs.replay_commands import replay_log
 from lowfc.programs.report.command import report
+from lowfc.programs.tune import tune
 from lowfc.programs.validate.commands import validate
 from lowfc.programs.view.command import view
 
-if TYPE_CHECKING:
-    from lowfc.contract.messages import wire
-
 app = new_app("Low-order wavefront control for coronagraphs.\n\nExample: lowfc sim-loop --duration 20")
 bench_app = new_app("Measure the parts.\n\nExample: lowfc bench twin")
-ctl_app = new_app("Ask a running controller.\n\nExample: lowfc ctl status")
 config_app = new_app("Show and check the configuration.\n\nExample: lowfc config show")
 app.add_typer(ctl_app, name="ctl")
 app.add_typer(config_app, name="config")
+app.add_typer(calibrate_app, name="calibrate")
+app.add_typer(acceptance_app, name="acceptance")
+app.add_typer(conformance_app, name="conformance")
 app.add_typer(bench_app, name="bench")
 app.add_typer(design_app, name="design")
 app.command("replay")(replay_log)
@@ -48,11 +52,12 @@ app.command()(export)
 app.command()(doctor)
 app.command()(latency)
 app.command()(validate)
+app.command()(tune)
+app.command()(certs)
+app.command()(router)
+app.command()(hosts)
 app.command()(view)
 
-AnyRun = Annotated[str | None, typer.Option("--run", help="Name of the run; default: the only one.")]
-Values = Annotated[list[float], typer.Argument(help="One value for all modes, or one for each.")]
-Modes = Annotated[list[int] | None, typer.Option("--mode", help="Noll index of a mode; repeat. Default: all.")]
 Json = Annotated[bool, typer.Option("--json", help="Print one JSON object on standard output.")]
 
 
@@ -96,6 +101,7 @@ def sim_loop(
     from lowfc.adapters.rerun_viewer import Show, has_screen
     from lowfc.contract.configuration import sensor_keys
     from lowfc.programs.sim_loop import sim_loop as run
+    from lowfc.programs.start_up import check_files
     from lowfc.programs.status import summary_text
 
     overrides: dict[str, Any] = {
@@ -108,6 +114,7 @@ def sim_loop(
         "control.start_mode": "open" if open_loop else None,
     }
     settings = configuration(config, overrides, {"control.start_mode": "closed", **spread(os.sched_getaffinity(0))})
+    check_files(settings)
     if view_ and web:
         raise ConfigurationError("a view is in one place: choose --view or --web")
     if has_screen() and not (view_ or web):
@@ -183,7 +190,7 @@ def record(
     }
     settings = configuration(config, overrides)
     log = settings.recorder
-    joined = open_run(run, (settings.mirror.name,))
+    joined = open_run(run, (settings.mirror.name,), network=settings.network)
     if config is None:
         config = joined.path / "config.toml"
         write_whole(config, settings.to_toml().encode())
@@ -206,77 +213,6 @@ def record(
         raise typer.Exit(1)
 
 
-@ctl_app.command()
-def status(run: AnyRun = None, as_json: Json = False) -> None:
-    """Say what the controller is doing.
-
-    Example: lowfc ctl status --json
-    """
-    from google.protobuf.json_format import MessageToDict
-
-    answer = _ask(run, "status")
-    state = MessageToDict(answer.state, preserving_proto_field_name=True)
-    state.pop("actuators", None)
-    if as_json:
-        _print(json.dumps(state))
-    else:
-        _print("\n".join(f"{key:20} {value}" for key, value in state.items()))
-
-
-@ctl_app.command("open")
-def open_(run: AnyRun = None) -> None:
-    """Stop driving the mirror; it holds its shape.
-
-    Example: lowfc ctl open
-    """
-    _say(_ask(run, "open"))
-
-
-@ctl_app.command()
-def close(run: AnyRun = None) -> None:
-    """Let the integrator drive the mirror.
-
-    Example: lowfc ctl close
-    """
-    _say(_ask(run, "close"))
-
-
-@ctl_app.command()
-def safe(run: AnyRun = None) -> None:
-    """Relax the mirror to flat and latch it there.
-
-    Example: lowfc ctl safe
-    """
-    _say(_ask(run, "safe"))
-
-
-@ctl_app.command()
-def clear(run: AnyRun = None) -> None:
-    """Leave the latched safe state; the loop is open afterwards.
-
-    Example: lowfc ctl clear
-    """
-    _say(_ask(run, "clear"))
-
-
-@ctl_app.command()
-def gain(values: Values, mode: Modes = None, run: AnyRun = None) -> None:
-    """Set integrator gains.
-
-    Example: lowfc ctl gain 0.4 --mode 2 --mode 3
-    """
-    _say(_ask(run, "gain", mode, values))
-
-
-@ctl_app.command()
-def leak(values: Values, mode: Modes = None, run: AnyRun = None) -> None:
-    """Set integrator leaks.
-
-    Example: lowfc ctl leak 0.01
-    """
-    _say(_ask(run, "leak", mode, values))
-
-
 @config_app.command("show")
 def config_show(config: ConfigFile = None) -> None:
     """Print every key with its value and its sentence, as TOML that can be used.
@@ -290,11 +226,13 @@ def config_show(config: ConfigFile = None) -> None:
 
 @config_app.command("check")
 def config_check(config: Annotated[Path, typer.Argument(help="Configuration file (TOML).")]) -> None:
-    """Check a configuration file; exit status 2 and one line per mistake where it is wrong.
+    """Check a configuration file and the files it names; exit status 2 and one line per mistake where it is wrong.
 
     Example: lowfc config check lowfc.toml
     """
-    configuration(config)
+    from lowfc.programs.start_up import check_files
+
+    check_files(configuration(config))
     _print(f"{config}: fine")
 
 
@@ -327,17 +265,6 @@ def bench_twin(as_json: Json = False) -> None:
 def main() -> None:
     """Entry point."""
     run_app(app)
-
-
-def _ask(run: str | None, name: str, modes: list[int] | None = None, values: Sequence[float] = ()) -> "wire.Request":
-    from lowfc.programs.ctl import ask, the_run
-
-    return ask(the_run(run), name, tuple(modes or ()), tuple(values))
-
-
-def _say(answer: "wire.Request") -> None:
-    count = answer.frame_sequence & 0xFFFFFFFF
-    _print(f"{answer.reply}, from frame {count} on")
 
 
 def _print(text: str, *, error: bool = False) -> None:

@@ -14,6 +14,7 @@ from lowfc.contract.messages import COMMAND, FRAME, HEALTH, MIRROR_STATE, TIMING
 from lowfc.programs.latency_figures import controllers_account, join, repeat_figures
 
 _EVERY = 5000
+_LOOP = frozenset({Role.CAMERA, Role.CONTROLLER, Role.MIRROR})
 
 
 def log_figures(path: Path, progress: Callable[[int, int], None]) -> tuple[dict[str, Any], dict[str, Any]]:
@@ -24,7 +25,8 @@ def log_figures(path: Path, progress: Callable[[int, int], None]) -> tuple[dict[
         progress: told now and then how many bytes of how many are read.
 
     Returns:
-        `repeat_figures` and `controllers_account`; and `provenance`, with what the host granted the controller.
+        `repeat_figures` and `controllers_account`; and `provenance`, with what the host granted the controller and,
+        where the loop was on several hosts, `clock_error_us`: what a span from one to another is wrong by at most.
 
     Raises:
         DataFileError: this is no log, it is damaged, or it has no frame whose timing is known.
@@ -33,6 +35,7 @@ def log_figures(path: Path, progress: Callable[[int, int], None]) -> tuple[dict[
     frames, commands = Columns(sequence="Q", publish_ns="q"), Columns(sequence="Q")
     states, timings = Columns(sequence="Q", publish_ns="q"), TimingRows()
     controller = wire.Health()
+    round_trips_ns: dict[str, int] = {}
     for number, message in enumerate(log):
         try:
             if FRAME.matches(message.key):
@@ -44,8 +47,11 @@ def log_figures(path: Path, progress: Callable[[int, int], None]) -> tuple[dict[
                 states.add(sequence=sequence, publish_ns=message.publish_time_ns)
             elif TIMING.matches(message.key):
                 timings.add(wire.ControlTiming.FromString(message.payload))
-            elif name_in(HEALTH, message.key) == Role.CONTROLLER:
-                controller = wire.Health.FromString(message.payload)
+            elif (name := name_in(HEALTH, message.key)).partition("-")[0] in _LOOP:
+                health = wire.Health.FromString(message.payload)
+                round_trips_ns[name] = max(round_trips_ns.get(name, 0), health.router_round_trip_ns)
+                if name == Role.CONTROLLER:
+                    controller = health
         except (DecodeError, OverflowError):
             continue  # a message that nobody of the loop could read either
         if number % _EVERY == 0:
@@ -60,4 +66,6 @@ def log_figures(path: Path, progress: Callable[[int, int], None]) -> tuple[dict[
         )
     host: dict[str, Any] = dict(log.metadata.get("lowfc", {}))
     host |= {"granted": list(controller.granted), "refused": list(controller.refused)}
+    if any(round_trips_ns.values()):
+        host["clock_error_us"] = sum(sorted(round_trips_ns.values())[-2:]) / 2e3
     return figures | controllers_account(controller), host

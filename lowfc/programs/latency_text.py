@@ -137,6 +137,11 @@ def _remarks(figures: Mapping[str, Any]) -> list[str]:
     lines.append(_what(figures))
     host = figures["host"]
     lines.append(", ".join(f"{name} {host[name]}" for name in _HOST if host.get(name)))
+    if "clock_error_us" in host:
+        lines.append(
+            f"on several hosts, by their clocks' measured offsets: a span from one to another may be wrong by "
+            f"{host['clock_error_us']:.0f} us, however often it was measured"
+        )
     lines += [f"{word}: {', '.join(host[word])}" for word in ("granted", "refused") if host.get(word)]
     return lines
 

@@ -1,0 +1,160 @@
+"""The bus across hosts: zenoh's configuration of the router, and of those who come to it by mutual TLS."""
+
+import socket
+import ssl
+import sys
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Any
+
+import zenoh
+
+from lowfc.adapters.access import ROUTER, access_control
+from lowfc.contract.configuration import Network
+from lowfc.contract.errors import BusError, DataFileError
+
+CA = "ca.pem"
+"""File of a folder of certificates: the authority that signed all of them."""
+
+CONNECT_MS = 1000
+_LEASE_MS = 2000
+_ALERT_S = 0.5
+
+
+def client_session(network: Network, role: str, sending: dict[str, Any]) -> dict[str, Any]:
+    """What a role's session has across hosts in place of its links on one.
+
+    Args:
+        network: where the router is, and the certificates.
+        role: whose.
+        sending: zenoh's `transport/link/tx`, as on one host.
+    """
+    ca, certificate, key = certificate_files(network, role)
+    return {
+        "mode": "client",
+        "listen": {"endpoints": []},
+        "connect": {
+            "endpoints": [network.router],
+            # Opening a session without a router waits so long; a session that has lost it tries again for ever.
+            "timeout_ms": CONNECT_MS,
+            "exit_on_failure": True,
+            "retry": {"period_init_ms": 50, "period_max_ms": 1000, "period_increase_factor": 2},
+        },
+        "transport": _transport(
+            {
+                "root_ca_certificate": str(ca),
+                "enable_mtls": True,
+                "connect_certificate": str(certificate),
+                "connect_private_key": str(key),
+                "verify_name_on_connect": True,
+            },
+            sending,
+        ),
+    }
+
+
+def router_session(network: Network, mirrors: Iterable[str], sending: dict[str, Any]) -> dict[str, Any]:
+    """What the router's session has: it listens by TLS only, and lets nobody do what the table of topics does not.
+
+    Args:
+        network: where it is, and its certificates.
+        mirrors: roles of the mirrors, such as "mirror-dm".
+        sending: zenoh's `transport/link/tx`, as on one host.
+    """
+    ca, certificate, key = certificate_files(network, ROUTER)
+    return {
+        "mode": "router",
+        "listen": {"endpoints": [network.listen or network.router], "exit_on_failure": True, "timeout_ms": 0},
+        "connect": {"endpoints": []},
+        "transport": _transport(
+            {
+                "root_ca_certificate": str(ca),
+                "enable_mtls": True,
+                "listen_certificate": str(certificate),
+                "listen_private_key": str(key),
+            },
+            sending,
+        ),
+        "access_control": access_control(mirrors),
+    }
+
+
+def open_by_router(config: zenoh.Config, network: Network, role: str) -> zenoh.Session:
+    """Session by the router, which is waited for.
+
+    Raises:
+        BusError: the router does not take this certificate, or is not who it should be.
+    """
+    said = False
+    while True:
+        try:
+            return zenoh.open(config)
+        except zenoh.ZError as fault:
+            trouble = router_trouble(network, role)
+            if not said:
+                sys.stderr.write(f"{role}: waiting for the router at {network.router}: {trouble or fault}\n")
+                said = True
+
+
+def router_trouble(network: Network, role: str) -> str:
+    """Why there is no link to the router: it cannot be reached; empty where it can.
+
+    Raises:
+        BusError: it is there, and one of the two does not take the other's certificate.
+    """
+    ca, certificate, key = certificate_files(network, role)
+    host, port = network.address
+    try:
+        context = ssl.create_default_context(cafile=str(ca))
+        context.load_cert_chain(certificate, key)
+        with (
+            socket.create_connection((host, port), CONNECT_MS * 1e-3) as plain,
+            context.wrap_socket(plain, server_hostname=host) as link,
+        ):
+            link.settimeout(_ALERT_S)
+            link.recv(1)  # who is not taken is told so only now
+    except TimeoutError:
+        return ""
+    except ssl.SSLError as fault:
+        raise BusError(
+            f"the router at {network.router} and {certificate} do not take each other ({fault.reason or fault}): both "
+            f"must be signed by {ca}, valid today, and the router's made for the name {host!r}; see lowfc certs"
+        ) from fault
+    except OSError as fault:
+        return fault.strerror or str(fault)
+    return ""
+
+
+def certificate_files(network: Network, role: str) -> tuple[Path, Path, Path]:
+    """Files of the authority, of a role's certificate and of its key."""
+    folder = Path(network.certificates)
+    return folder / CA, folder / f"{role}.pem", folder / f"{role}.key"
+
+
+def require_certificate(network: Network, role: str) -> None:
+    """Say before a session is opened that it would not be let in.
+
+    Raises:
+        DataFileError: a file is missing or cannot be read.
+    """
+    for file in certificate_files(network, role):
+        try:
+            file.open("rb").close()
+        except OSError as fault:
+            raise DataFileError(
+                f"{file} cannot be read ({fault.strerror}): the router takes nobody without it; make it where the "
+                "authority's key is (lowfc certs) and copy it here"
+            ) from fault
+
+
+def _transport(tls: dict[str, object], sending: dict[str, Any]) -> dict[str, Any]:
+    return {
+        "link": {
+            "protocols": ["tls"],  # nothing else is connected to or listened for
+            "tls": tls,
+            # A link that says nothing for so long is down: it is closed, and made anew as soon as that is possible.
+            # What is sent until then waits in it, and arrives stale.
+            "tx": {**sending, "lease": _LEASE_MS, "keep_alive": 4},
+        },
+        "shared_memory": {"enabled": False},
+    }

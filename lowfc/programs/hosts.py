@@ -1,0 +1,158 @@
+"""The commands for a run on several machines: certificates, the router, and who is there by which clock."""
+
+import json
+import re
+import sys
+import time
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from lowfc.adapters.terminal import DEFAULT_RUN, ConfigFile, RunId, configuration
+from lowfc.contract.errors import BusError, ConfigurationError
+
+if TYPE_CHECKING:
+    from lowfc.contract.messages import wire
+
+LISTEN_S = 1.5
+"""Health comes twice a second."""
+
+_TURN_S = 0.1
+
+
+def certs(
+    folder: Annotated[Path, typer.Argument(help="Folder of the authority; made where there is none.")],
+    router: Annotated[
+        list[str] | None, typer.Option(help="Name or IP address by which the others reach the router; repeat.")
+    ] = None,
+    mirror: Annotated[list[str] | None, typer.Option(help="Name of a mirror; repeat. Default: dm.")] = None,
+    days: Annotated[int, typer.Option(min=1, max=3650, help="How long the certificates are valid.")] = 825,
+    renew: Annotated[bool, typer.Option("--renew", help="Make those that are there anew, but the authority.")] = False,
+) -> None:
+    """Make a certificate for each role of a run on several machines, and the authority that signs them.
+
+    Give each machine ca.pem, and ROLE.pem and ROLE.key of its roles; ca.key stays where it is.
+
+    Example: lowfc certs certs --router bench.example.org --router 192.168.7.1
+    """
+    from lowfc.adapters.access import ROUTER, roles
+    from lowfc.adapters.run import mirror_role
+
+    try:
+        from lowfc.adapters.certificates import make_certificates
+    except ImportError as fault:
+        raise ConfigurationError(
+            f"certificates are made with the package cryptography, which is missing here ({fault}): "
+            "pip install 'lowfc[deploy]'"
+        ) from None
+    wanted = (ROUTER, *roles(map(mirror_role, mirror or ["dm"])))
+    made = make_certificates(folder, wanted, router or [], days, renew=renew)
+    for file in made:
+        sys.stdout.write(f"{file}\n")
+    sys.stderr.write(
+        f"{len(made)} made, {len(wanted) - len(made)} there already; keep {folder / 'ca.key'} to yourself\n"
+    )
+
+
+def router(
+    config: ConfigFile = None,
+    run: RunId = DEFAULT_RUN,
+    show: Annotated[
+        bool, typer.Option("--show", help="Print zenoh's configuration of it instead, for a zenohd of your own.")
+    ] = False,
+) -> None:
+    """Run the router of a run on several machines: mutual TLS, and only what the table of messages allows.
+
+    It listens at network.router of the configuration, or at network.listen. A zenohd of your own does as well, but for
+    the clocks: hosts then set envelopes by their own.
+
+    Example: lowfc router --config lowfc.toml --run bench
+    """
+    from contextlib import closing
+
+    from lowfc.adapters.access import ROUTER
+    from lowfc.adapters.join import join
+    from lowfc.adapters.run import open_run
+    from lowfc.adapters.zenoh_session import session_config
+
+    settings = configuration(config)
+    if not settings.network.router:
+        raise ConfigurationError(
+            'there is no router in the configuration: give --config a file with router = "tls/HOST:PORT" and '
+            "certificates in [network]"
+        )
+    if show:
+        links = open_run(run, (settings.mirror.name,), network=settings.network).links
+        sys.stdout.write(_short_lists(json.dumps(session_config(links, ROUTER), indent=2)) + "\n")
+        return
+    service = join(settings, run, ROUTER, [])
+    service.catch_signals()
+    with closing(service.bus):
+        service.state = "running"
+        sys.stderr.write(
+            f"routing run {run!r} at {settings.network.listen or settings.network.router}; Ctrl-C ends it\n"
+        )
+        while service.running:
+            service.beat()
+            time.sleep(_TURN_S)
+        service.finish()
+
+
+def hosts(
+    config: ConfigFile = None,
+    run: RunId = DEFAULT_RUN,
+    as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object on standard output.")] = False,
+) -> None:
+    """Say which processes are in a run, and how far the clocks of their machines are from the router's.
+
+    Example: lowfc hosts --config lowfc.toml --run bench
+    """
+    from contextlib import closing
+
+    from lowfc.adapters.bus import Sample
+    from lowfc.adapters.clock import HostClock
+    from lowfc.adapters.run import open_run
+    from lowfc.adapters.zenoh_bus import ZenohBus
+    from lowfc.contract.messages import HEALTH, Role, wire
+
+    settings = configuration(config)
+    heard: dict[str, wire.Health] = {}
+
+    def hear(sample: Sample) -> None:
+        health = wire.Health.FromString(sample.payload)
+        heard[health.process] = health
+
+    joined = open_run(run, (settings.mirror.name,), network=settings.network)
+    with closing(ZenohBus(joined.links, Role.OPERATOR, HostClock())) as bus:
+        bus.subscribe(HEALTH, hear)
+        time.sleep(LISTEN_S)
+    if not heard:
+        raise BusError(f"nobody is heard in run {run!r} within {LISTEN_S:g} s")
+    rows = [_row(health) for _, health in sorted(heard.items())]
+    sys.stdout.write((json.dumps({"run": run, "processes": rows}) if as_json else _table(rows)) + "\n")
+
+
+def _short_lists(text: str) -> str:
+    """JSON with each list of plain values on one line."""
+    return re.sub(r"\[\s+([^][{}]*?)\s+\]", lambda found: f"[{' '.join(found[1].split())}]", text)
+
+
+def _row(health: "wire.Health") -> dict[str, Any]:
+    measured = health.router_round_trip_ns > 0
+    return {
+        "process": health.process,
+        "state": health.state,
+        "clock_offset_us": health.router_offset_ns / 1e3 if measured else None,
+        "clock_error_us": health.router_round_trip_ns / 2e3 if measured else None,
+    }
+
+
+def _table(rows: list[dict[str, Any]]) -> str:
+    lines = [f"{'process':14} {'state':9} router's clock less its own"]
+    for row in rows:
+        clock = "not measured"
+        if row["clock_offset_us"] is not None:
+            clock = f"{row['clock_offset_us']:+.0f} us, wrong by at most {row['clock_error_us']:.0f} us"
+        lines.append(f"{row['process']:14} {row['state']:9} {clock}")
+    return "\n".join(lines)

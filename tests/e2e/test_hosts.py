@@ -1,0 +1,468 @@
+"""The loop across hosts: camera, controller, mirror and desk in network namespaces of their own, and a router.
+
+What happens when a link is cut, and what somebody gets who should get nothing. See docs/hosts.md.
+"""
+
+import contextlib
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import networks
+import pytest
+from networks import ROUTER_ADDRESS, Host, Lab
+
+from lowfc.adapters import calibration_file, instrument
+from lowfc.adapters.access import ROUTER, roles
+from lowfc.adapters.certificates import make_certificates
+from lowfc.contract.configuration import load
+
+pytestmark = [
+    pytest.mark.slow,
+    pytest.mark.skipif(not networks.possible(), reason="network namespaces cannot be made here"),
+]
+
+RUN = "across"
+PORT = 7447
+TOML = f"""
+[star]
+magnitude = -1.0
+[camera]
+rate_hz = 100
+[disturbance]
+preset = "quiet"
+static_nm = {{2 = 8.0, 4 = 5.0}}
+[control]
+start_mode = "closed"
+gain = 0.3
+[realtime]
+priority = 0
+recorder_priority = 0
+stay_awake = false
+[recorder]
+min_free_mb = 10
+[network]
+router = "tls/{ROUTER_ADDRESS}:{PORT}"
+certificates = "CERTIFICATES"
+"""
+SHIFTS_NS = {"camera": 37_000_000, "controller": -250_000_000, "mirror": 3_000_000_000, "desk": -1_000_000}
+PLACES = {"camera": "camera", "controller": "controller", "mirror-dm": "mirror", "recorder": "desk"}
+"""Process -> host."""
+HERE = Path(__file__).parent
+ROLES = roles(["mirror-dm"])
+
+
+def give(host: Host, authority: Path, *given: str) -> None:
+    """Certificates of some roles, to a host."""
+    folder = host.folder / "certs"
+    folder.mkdir(mode=0o700, exist_ok=True)
+    for name in ("ca.pem", *(f"{role}.{kind}" for role in given for kind in ("pem", "key"))):
+        (folder / name).write_bytes((authority / name).read_bytes())
+
+
+class Bench:
+    """The loop on its hosts, and what an observer beside the router hears of it."""
+
+    def __init__(self, folder: Path) -> None:
+        self.authority = folder / "authority"
+        make_certificates(self.authority, (ROUTER, *ROLES), [ROUTER_ADDRESS])
+        (folder / "lowfc.toml").write_text(TOML)
+        config = load(folder / "lowfc.toml")
+        optics = instrument.twin(config, None, print)
+        calibration = instrument.analytic_calibration(config, optics, instrument.mirror_on_twin(config, optics, print))
+        self.lab = Lab(folder, SHIFTS_NS)
+        for host in self.lab.hosts.values():
+            (host.folder / "lowfc.toml").write_text(TOML.replace("CERTIFICATES", str(host.folder / "certs")))
+        calibration_file.save(calibration, self.lab["controller"].folder / "calibration.fits")
+        give(self.lab.middle, self.authority, ROUTER, "viewer")
+        give(self.lab["desk"], self.authority, "recorder", "operator", "viewer")
+        for name in ("camera", "controller"):
+            give(self.lab[name], self.authority, name)
+        give(self.lab["mirror"], self.authority, "mirror-dm")
+        self.words = {
+            "router": ["-m", "lowfc", "router"],
+            "camera": ["-m", "sim_camera"],
+            "mirror-dm": ["-m", "sim_dm"],
+            "controller": ["-m", "lowfc", "controller", "--calibration", "{folder}/calibration.fits"],
+            "recorder": ["-m", "lowfc", "record", "--folder", "{folder}/logs"],
+        }
+
+    def start(self) -> None:
+        for name, place in PLACES.items():  # before the router: any order will do
+            self.begin(self.lab[place], name)
+        self.begin(self.lab.middle, "router")
+        config = str(self.lab.middle.folder / "lowfc.toml")
+        self.lab.middle.start("observer", str(HERE / "host_observer.py"), RUN, config, "viewer")
+
+    def begin(self, host: Host, name: str) -> None:
+        host.start(name, *self.line(host, name))
+
+    def line(self, host: Host, name: str) -> list[str]:
+        """Arguments of Python for a process on a host."""
+        words = [word.format(folder=host.folder) for word in self.words[name]]
+        return [*words, "--run", RUN, "--config", str(host.folder / "lowfc.toml")]
+
+    def seen(self) -> list[dict[str, Any]]:
+        """Everything the observer said so far."""
+        lines = self.lab.middle.said("observer").splitlines()
+        found = []
+        for line in lines:
+            with contextlib.suppress(json.JSONDecodeError):
+                found.append(json.loads(line))
+        return found
+
+    def newest(self) -> dict[str, Any]:
+        seen = self.seen()
+        return seen[-1] if seen else {"good": 0, "following": 0, "status": "", "events": {}, "health": {}}
+
+    def events(self, name: str) -> int:
+        return int(self.newest()["events"].get(name, 0))
+
+    def wait(self, condition: Callable[[], object], what: str, timeout_s: float = 30) -> None:
+        deadline_s = time.monotonic() + timeout_s
+        while not condition():
+            self.check_alive()
+            assert time.monotonic() < deadline_s, f"waited in vain for {what}: {self.newest()}\n{self.last_words()}"
+            time.sleep(0.05)
+
+    def settled(self, timeout_s: float = 40) -> None:
+        """Twenty good frames in a row and the mirror at them, all heard from now on."""
+        start = len(self.seen())
+
+        def good() -> bool:
+            new = self.seen()[start:]
+            heard = all(sum(one[what] for one in new) > 30 for what in ("steps", "states"))
+            return heard and new[-1]["good"] > 20 and new[-1]["following"] > 20
+
+        self.wait(good, "a closed loop", timeout_s)
+
+    def check_alive(self) -> None:
+        for host in self.lab.hosts.values():
+            for name, child in host.children.items():
+                assert child.status is None, f"{name} on {host.name} ended: {host.said(name)}"
+
+    def last_words(self) -> str:
+        everybody = [(host, name) for host in self.lab.hosts.values() for name in host.children if name != "observer"]
+        return "\n".join(f"{name}: {host.said(name)[-400:]}" for host, name in everybody)
+
+
+@pytest.fixture(scope="module")
+def bench(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Bench]:
+    made = Bench(tmp_path_factory.mktemp("hosts"))
+    try:
+        made.start()
+        made.settled(60)
+        yield made
+    finally:
+        made.lab.close()
+
+
+def test_the_loop_closes_and_clocks_are_known(bench: Bench) -> None:
+    bench.settled()
+    bench.wait(lambda: set(PLACES) <= set(bench.newest()["health"]), "everybody's health")
+    health = bench.newest()["health"]
+    for process, place in PLACES.items():
+        heard = health[process]
+        truth_ns = clock_offset_ns(bench.lab.middle) - clock_offset_ns(bench.lab[place])
+        assert heard["round_trip_ns"] > 0
+        assert abs(heard["offset_ns"] - truth_ns) <= heard["round_trip_ns"] / 2 + 1
+    # the camera's clock is 287 ms ahead of the controller's: by themselves, no latency would be right
+    assert 0 < health["controller"]["frame_to_command_ns"] < 100_000_000
+
+
+def clock_offset_ns(host: Host) -> int:
+    """What a host takes for the difference of the epoch and the one monotonic clock that all have here."""
+    return int(next((host.folder / "runtime" / "lowfc").glob("clock-*")).read_text())
+
+
+def test_the_operators_hand_and_a_view_reach_it_from_the_desk(bench: Bench) -> None:
+    desk = bench.lab["desk"]
+    told = desk.run("-m", "lowfc", "hosts", "--run", RUN, "--json")
+    assert told.returncode == 0, told.stderr
+    rows = {row["process"]: row for row in json.loads(told.stdout)["processes"]}
+    assert {*PLACES, ROUTER} <= set(rows)
+    assert rows["mirror-dm"]["clock_offset_us"] == pytest.approx(-3e6, abs=2e5)
+    done = desk.run("-m", "lowfc", "ctl", "open", "--run", RUN)
+    assert done.returncode == 0, done.stderr
+    bench.wait(lambda: bench.newest()["good"] == 0, "an open loop")
+    assert desk.run("-m", "lowfc", "ctl", "close", "--run", RUN).returncode == 0
+    bench.settled()
+    view = desk.run("-m", "lowfc", "view", "--run", RUN, "--save", "seen.rrd", "--seconds", "2", timeout_s=90)
+    assert view.returncode == 0, view.stderr
+    assert (desk.folder / "seen.rrd").stat().st_size > 10_000
+
+
+def test_a_log_of_several_hosts_says_how_far_its_latencies_can_be_trusted(bench: Bench) -> None:
+    bench.settled()
+    desk = bench.lab["desk"]
+    done = desk.run("-m", "lowfc", "ctl", "record", "stop", "--run", RUN)
+    assert done.returncode == 0, done.stderr
+    log = next(path for path in (desk.folder / "logs").iterdir() if path.suffix == ".mcap")
+    told = desk.run("-m", "lowfc", "latency", str(log), "--json", timeout_s=90)
+    assert told.returncode == 0, told.stderr
+    figures = json.loads(told.stdout)
+    bound_us = figures["host"]["clock_error_us"]
+    assert bound_us > 0
+    # by the hosts' own clocks, frames would come 287 ms before they are sent, and the mirror 3 s after them
+    for span in ("frame_to_command", "frame_to_mirror", "command_to_mirror"):
+        assert -bound_us < figures["latency_us"][span]["p50"] < 100_000
+    text = desk.run("-m", "lowfc", "latency", str(log), timeout_s=90)
+    assert "on several hosts, by their clocks' measured offsets" in text.stdout + text.stderr
+    assert desk.run("-m", "lowfc", "ctl", "record", "start", "--run", RUN).returncode == 0
+
+
+def test_without_the_cameras_link_the_command_is_held_and_repeated(bench: Bench) -> None:
+    bench.settled()
+    before = bench.events("controller NO_FRAMES")
+    with bench.lab.cut("camera"):
+        bench.wait(lambda: bench.events("controller NO_FRAMES") > before, "NO_FRAMES")
+        start = len(bench.seen())
+        bench.wait(lambda: len(bench.seen()) > start + 15, "a second and a half")
+        during = bench.seen()[start + 5 :]
+        # the controller repeats the held command, so that the mirror's dead-man does not act
+        assert all(one["steps"] == 0 for one in during)
+        assert all(one["status"] == "MIRROR_STATUS_FOLLOWING" for one in during)
+        held = {round(one["highest_nm"], 3) for one in during}
+        assert len(held) == 1, held
+    bench.settled()
+    assert bench.events("controller FRAMES_BACK") > 0
+
+
+def test_without_the_mirrors_link_its_dead_man_acts(bench: Bench) -> None:
+    bench.settled()
+    mirror = bench.lab["mirror"]
+    before = mirror.said("mirror-dm").count("COMMAND_EXPIRED")
+    with bench.lab.cut("mirror"):
+        bench.wait(lambda: mirror.said("mirror-dm").count("COMMAND_EXPIRED") > before, "the mirror's dead-man")
+        assert "relaxing to flat" in mirror.said("mirror-dm")
+        start = len(bench.seen())
+        bench.wait(lambda: len(bench.seen()) > start + 10, "a second")
+        assert sum(one["states"] for one in bench.seen()[start + 5 :]) == 0
+    bench.settled()
+
+
+def test_without_the_controllers_link_the_mirror_relaxes_and_the_controller_holds(bench: Bench) -> None:
+    bench.settled()
+    controller = bench.lab["controller"]
+    before = controller.said("controller").count("NO_FRAMES"), bench.events("mirror-dm COMMAND_EXPIRED")
+    with bench.lab.cut("controller"):
+        bench.wait(lambda: bench.events("mirror-dm COMMAND_EXPIRED") > before[1], "the mirror's dead-man")
+        bench.wait(lambda: controller.said("controller").count("NO_FRAMES") > before[0], "NO_FRAMES")
+        bench.wait(lambda: bench.newest()["highest_nm"] < 0.1, "a flat mirror")
+        assert bench.newest()["status"] == "MIRROR_STATUS_EXPIRED"
+    bench.settled()
+
+
+def test_without_the_desks_link_the_loop_goes_on(bench: Bench) -> None:
+    bench.settled()
+    events = ("controller NO_FRAMES", "mirror-dm COMMAND_EXPIRED")
+    before = [bench.events(name) for name in events]
+    start = len(bench.seen())
+    with bench.lab.cut("desk"):
+        bench.wait(lambda: len(bench.seen()) > start + 40, "four seconds")
+        assert [bench.events(name) for name in events] == before
+        during = bench.seen()[start:]
+        assert sum(one["steps"] for one in during) > 0.8 * 4 * 100
+        assert sum("FOLLOWING" in one["status"] for one in during) > 0.9 * len(during)
+    lost = bench.events("recorder MESSAGES_LOST")
+    bench.wait(lambda: bench.events("recorder MESSAGES_LOST") > lost or lost, "the recorder's account of what it lost")
+    bench.settled()
+
+
+def test_the_router_may_die_and_come_back(bench: Bench) -> None:
+    bench.settled()
+    router = bench.lab.middle.children.pop("router")
+    assert router.process is not None
+    router.process.kill()
+    router.stop(5.0)
+    bench.begin(bench.lab.middle, "router")
+    bench.settled()
+
+
+FORGER = """
+import sys, time
+import zenoh
+from lowfc.adapters.envelope import Envelope
+from lowfc.contract.messages import timestamp, wire
+
+try:
+    session = zenoh.open(zenoh.Config.from_json5(open(sys.argv[1]).read()))
+except zenoh.ZError:
+    print("not let in")
+    sys.exit()
+heard, answers = set(), set()
+for key in ("**", "lowfc/**", "lowfc/mirror/dm/command", "lowfc/camera/frame", "lowfc/control/step", "lowfc/event"):
+    session.declare_subscriber(
+        key, lambda sample: heard.add(str(sample.key_expr)), allowed_origin=zenoh.Locality.REMOTE
+    )
+command = wire.MirrorCommand(
+    timestamp=timestamp(time.time_ns()), frame_sequence=2**62, channel="forged", valid_for_ns=10**9, rows=34,
+    columns=34, actuators=b"\\x00\\x00\\xc8\\x42" * 34 * 34,
+)
+for _ in range(100):
+    attachment = Envelope(2**62, time.time_ns()).encode()
+    session.put("lowfc/mirror/dm/command", command.SerializeToString(), attachment=attachment)
+    time.sleep(0.01)
+for key in ("lowfc/request/status", "lowfc/request/safe", "lowfc/record/stop", "@/*/router/**"):
+    answers |= {str(reply.ok.key_expr) for reply in session.get(key, timeout=1.0) if reply.ok is not None}
+print(sorted(heard), sorted(answers))
+session.close()
+"""
+
+
+def forge(host: Host, **changes: Any) -> str:
+    """What a program with a session of its own making says it got; it forges commands meanwhile."""
+    tls = {
+        "root_ca_certificate": str(host.folder / "certs" / "ca.pem"),
+        "enable_mtls": True,
+        **changes.get("tls", {}),
+    }
+    config = {
+        "mode": "client",
+        "connect": {
+            "endpoints": [changes.get("endpoint", f"tls/{ROUTER_ADDRESS}:{PORT}")],
+            "timeout_ms": 3000,
+            "exit_on_failure": True,
+        },
+        "scouting": {"multicast": {"enabled": False}},
+        "transport": {"link": {"tls": tls}},
+    }
+    file = host.folder / "forger.json5"
+    file.write_text(json.dumps(config))
+    done = host.run("-c", FORGER, str(file))
+    assert done.returncode == 0, done.stderr
+    return done.stdout.strip()
+
+
+def pair(folder: Path, role: str) -> dict[str, str]:
+    """Zenoh's settings for the certificate of a role in a folder."""
+    return {"connect_certificate": str(folder / f"{role}.pem"), "connect_private_key": str(folder / f"{role}.key")}
+
+
+def undisturbed(bench: Bench, start: int) -> None:
+    """Since that line of the observer's, nobody but the controller moved the mirror."""
+    seen = bench.seen()[start:]
+    assert len(seen) > 3
+    assert all(one["highest_nm"] < 50 for one in seen)
+    assert seen[-1]["events"].get("mirror-dm COMMAND_REFUSED", 0) == seen[0]["events"].get(
+        "mirror-dm COMMAND_REFUSED", 0
+    )
+    bench.settled()
+
+
+def test_the_controllers_certificate_could_move_the_mirror(bench: Bench) -> None:
+    """So that the tests below can fail: it is the certificate that keeps a forger out, and not its message."""
+    bench.settled()
+    give(bench.lab["desk"], bench.authority, "controller")
+    before = bench.events("mirror-dm COMMAND_REFUSED")
+    forge(bench.lab["desk"], tls=pair(bench.lab["desk"].folder / "certs", "controller"))
+    bench.wait(
+        lambda: (
+            bench.events("mirror-dm COMMAND_REFUSED") > before
+            or any(one["highest_nm"] > 90 for one in bench.seen()[-30:])
+        ),
+        "the forged command at the mirror",
+    )
+    mirror = bench.lab["mirror"]
+    mirror.children.pop("mirror-dm").stop(5.0)  # it waits for frames beyond the forged one
+    bench.begin(mirror, "mirror-dm")
+    bench.settled()
+
+
+def test_a_camera_that_forges_a_command_gets_nothing(bench: Bench) -> None:
+    bench.settled()
+    start = len(bench.seen())
+    camera = bench.lab["camera"]
+    got = forge(camera, tls=pair(camera.folder / "certs", "camera"))
+    assert got in ("[] []", "['lowfc/event'] []")  # events are for all
+    undisturbed(bench, start)
+
+
+def test_without_a_certificate_or_with_a_foreign_one_nobody_is_let_in(bench: Bench, tmp_path: Path) -> None:
+    bench.settled()
+    start = len(bench.seen())
+    desk = bench.lab["desk"]
+    assert forge(desk) == "not let in"
+    make_certificates(tmp_path / "foreign", ROLES, [])
+    assert forge(desk, tls=pair(tmp_path / "foreign", "controller")) == "not let in"
+    undisturbed(bench, start)
+
+
+def test_a_role_that_is_not_of_the_table_gets_nothing(bench: Bench) -> None:
+    bench.settled()
+    start = len(bench.seen())
+    make_certificates(bench.authority, ["stranger"], [])
+    give(bench.lab["desk"], bench.authority, "stranger")
+    assert forge(bench.lab["desk"], tls=pair(bench.lab["desk"].folder / "certs", "stranger")) == "[] []"
+    undisturbed(bench, start)
+
+
+def test_plain_tcp_is_refused(bench: Bench) -> None:
+    bench.settled()
+    start = len(bench.seen())
+    assert forge(bench.lab["desk"], endpoint=f"tcp/{ROUTER_ADDRESS}:{PORT}") == "not let in"
+    listening = bench.lab.middle.run("-c", LISTENING).stdout.split()
+    assert listening == [f"{ROUTER_ADDRESS}:{PORT}"]  # and nobody else listens there
+    undisturbed(bench, start)
+
+
+LISTENING = """
+import socket
+for line in open("/proc/net/tcp").readlines()[1:]:
+    fields = line.split()
+    if fields[3] == "0A":
+        address, port = fields[1].split(":")
+        print(f"{socket.inet_ntoa(bytes.fromhex(address)[::-1])}:{int(port, 16)}")
+"""
+
+
+def test_a_second_controller_is_refused(bench: Bench) -> None:
+    bench.settled()
+    give(bench.lab["desk"], bench.authority, "controller")
+    (bench.lab["desk"].folder / "calibration.fits").write_bytes(
+        (bench.lab["controller"].folder / "calibration.fits").read_bytes()
+    )
+    second = bench.lab["desk"].run(*bench.line(bench.lab["desk"], "controller"))
+    assert second.returncode == 2
+    assert "has a controller already" in second.stderr
+
+
+HELD = """
+import sys, time
+from pathlib import Path
+from networks import Lab
+lab = Lab(Path(sys.argv[1]), {"one": 0, "two": 0})
+sleeper = lab["one"].start("sleeper", "-c", "import time; time.sleep(600)")
+print(*(host.holder.pid for host in lab.hosts.values()), sleeper.process.pid, flush=True)
+time.sleep(600)
+"""
+
+
+@pytest.mark.parametrize("how", [signal.SIGINT, signal.SIGTERM, signal.SIGKILL])
+def test_hosts_are_gone_however_the_test_ends(tmp_path: Path, how: signal.Signals) -> None:
+    environment = os.environ | {"PYTHONPATH": str(HERE)}
+    words = [sys.executable, "-c", HELD, str(tmp_path)]
+    with subprocess.Popen(words, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, env=environment) as holder:
+        assert holder.stdout is not None
+        pids = [int(pid) for pid in holder.stdout.readline().split()]
+        assert len(pids) == 4
+        assert all(Path(f"/proc/{pid}").exists() for pid in pids)
+        holder.send_signal(how)
+        holder.wait(10)
+    deadline_s = time.monotonic() + 10
+    while any(_lives(pid) for pid in pids):
+        assert time.monotonic() < deadline_s
+        time.sleep(0.05)
+
+
+def _lives(pid: int) -> bool:
+    try:
+        return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
+    except OSError:
+        return False
