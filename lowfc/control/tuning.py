@@ -1,0 +1,289 @@
+"""The best law for a log: integrator gains after Gendron and Lena, PI with notches, LQG, each with its margins.
+
+All start from pseudo-open-loop modes, pol = disturbance + white noise. A loop leaves error = S pol, and since a frame's
+noise is not in the command that it sees, the true residual has the variance of the error less the noise's.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+import numpy.typing as npt
+from scipy.optimize import minimize_scalar
+from scipy.signal import periodogram
+
+from lowfc.control import linear_law, margins, stability
+from lowfc.control.kalman import lqg_block
+from lowfc.control.linear_law import Block, LinearLaw, integrator_block, of_blocks
+from lowfc.control.pi_notch import Notch, pi_notch
+from lowfc.control.spectra import Pieces, Spectrum, floor_nm2_hz, spectrum
+from lowfc.control.stability import delay_weights
+from lowfc.control.vibration import FEWEST, Model, identify, resolution_hz
+
+Array = npt.NDArray[np.float64]
+Single = npt.NDArray[np.float32]
+
+LEAST_GAIN_MARGIN = 1.8
+LEAST_PHASE_MARGIN_DEG = 45.0
+LOWEST_GAIN = 0.01
+"""Of a mode whose drift is below the noise of a log: it shall follow nevertheless."""
+
+_NARROWER = (0.1, 0.01, 1e-3)  # what a line's width is tried at, of that fitted, where a log cannot resolve it
+_FASTER = (10.0,)  # and where lines move
+_SETTLING_FRAMES = 5000
+_QUIETER = 2.0 ** np.arange(8)  # by which noise is overestimated, until the margins hold
+
+
+@dataclass(frozen=True, slots=True)
+class Tuned:
+    """A law for each mode, and what it leaves.
+
+    Attributes:
+        law: as it would be loaded.
+        margins: for the delay it was made for.
+        predicted_nm: (modes,) rms of the true residual.
+        kinds: of each mode: integrator, pi-notch or lqg.
+        models: of each mode.
+    """
+
+    law: LinearLaw
+    margins: margins.Margins
+    predicted_nm: Array
+    kinds: tuple[str, ...]
+    models: tuple[Model, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class Gains:
+    """Integrator gains (modes,): the best ones, what they leave (nm rms) and one frame's noise (nm rms)."""
+
+    gain: Array
+    predicted_nm: Array
+    noise_nm: Array
+
+
+def highest_gain(delay_frames: float, leak: float = 0.0) -> float:
+    """The integrator gain at which either margin is the least that is allowed."""
+    omega = np.linspace(1e-4, np.pi, 1 << 14)
+    loop = stability.open_loop(omega, 1.0, leak, delay_frames)
+    late = np.unwrap(np.angle(loop)) < -np.radians(180 - LEAST_PHASE_MARGIN_DEG)
+    by_phase = 1 / np.abs(loop[np.argmax(late)]) if late.any() else np.inf
+    return float(min(stability.limiting_gain(delay_frames, leak) / LEAST_GAIN_MARGIN, by_phase))
+
+
+def best_gains(run: Pieces, rate_hz: float, delay_frames: float, leak: Array) -> Gains:
+    """The gain of each mode at which an integrator leaves least of pseudo-open-loop modes (Gendron and Lena 1994).
+
+    Args:
+        run: (frames, modes) in pieces.
+        rate_hz: Frame rate.
+        delay_frames: The true delay.
+        leak: (modes,) of the integrators.
+
+    Raises:
+        ValueError: there are too few frames in a row.
+    """
+    fine, coarse = _whole_spectrum(run, rate_hz), spectrum(run, rate_hz)
+    if fine is None or coarse is None:
+        longest = max((len(piece) for piece in run.values), default=0)
+        raise ValueError(f"a law is tuned from at least {FEWEST} frames in a row, the longest run has {longest}")
+    noise_nm2 = floor_nm2_hz(coarse) * rate_hz / 2
+    gains, left_nm2 = np.zeros(len(leak)), np.zeros(len(leak))
+    for mode, lost in enumerate(leak.tolist()):
+        power = fine.power_nm2_hz[1:, mode]  # an integrator without leak has no value at 0 Hz
+
+        def error_nm2(gain: float, lost: float = lost, power: Array = power) -> float:
+            passed = stability.rejection(fine.frequency_hz[1:], rate_hz, gain, lost, delay_frames) ** 2
+            return float(passed @ power) * fine.spacing_hz
+
+        bounds = (LOWEST_GAIN, highest_gain(delay_frames, lost))
+        found = minimize_scalar(error_nm2, bounds=bounds, method="bounded", options={"xatol": 1e-3})
+        gains[mode], left_nm2[mode] = found.x, found.fun - noise_nm2[mode]
+    return Gains(gains, np.sqrt(np.maximum(left_nm2, 0.0)), np.sqrt(noise_nm2))
+
+
+def identified(run: Pieces, rate_hz: float) -> list[Model]:
+    """A model of each mode of pseudo-open-loop modes (frames, modes).
+
+    Raises:
+        ValueError: there are too few frames in a row.
+    """
+    found = []
+    for mode in range(run.values[0].shape[1] if run.values else 0):
+        model = identify(run.columns(slice(mode, mode + 1)), rate_hz)
+        if model is None:
+            raise ValueError(f"a model is fitted to at least {FEWEST} frames in a row, there are fewer")
+        found.append(model)
+    return found
+
+
+def tune_integrator(models: Sequence[Model], gains: Gains, noll: tuple[int, ...], leak: Array, delay: float) -> Tuned:
+    """The loop's own integrator with these gains."""
+    blocks = [integrator_block(g, lost, "error", delay) for g, lost in zip(gains.gain, leak, strict=True)]
+    law = of_blocks(blocks, "error", "integrator", noll, delay, models[0].rate_hz)
+    return _tuned(law, delay, predicted_nm(law, models, delay), ("integrator",) * len(noll), models)
+
+
+def tune_lqg(
+    run: Pieces, models: Sequence[Model], gains: Gains, noll: tuple[int, ...], leak: Array, delay: float
+) -> Tuned:
+    """LQG for the modes for which it beats the best integrator on this very run, that integrator for the others.
+
+    The run decides, too, how narrow lines are that are narrower than a spectrum tells, and how fast they move.
+
+    Raises:
+        ValueError: no filter, or an unstable law.
+    """
+    rate_hz, finest_hz = models[0].rate_hz, resolution_hz(run, models[0].rate_hz)
+    tried = [[model] for model in models]
+    for factor in (*_NARROWER, *_FASTER):
+        for candidates, model in zip(tried, models, strict=True):
+            narrow = any(line.width_hz < 3 * finest_hz for line in model.lines)
+            candidates.append(_scaled(model, factor, finest_hz) if narrow else model)
+    best = [(np.inf, model) for model in models]
+    for candidates_now in zip(*tried, strict=True):
+        robust = [_within_margins(model, index, delay) for model, index in zip(candidates_now, noll, strict=True)]
+        law = of_blocks([block for block, _ in robust], "pol", "lqg", noll, delay, rate_hz)
+        for mode, error_nm2 in enumerate(left_of(law, run, delay)):
+            if error_nm2 < best[mode][0]:
+                best[mode] = float(error_nm2), candidates_now[mode]
+    steady = of_blocks(
+        [integrator_block(g, lost, "pol", delay) for g, lost in zip(gains.gain, leak, strict=True)],
+        *("pol", "integrator", noll, delay, rate_hz),
+    )
+    blocks, kinds = [], []
+    for mode, integrator_nm2 in enumerate(left_of(steady, run, delay)):
+        wins = best[mode][0] < integrator_nm2
+        kinds.append("lqg" if wins else "integrator")
+        block = _within_margins(best[mode][1], noll[mode], delay)[0]
+        blocks.append(block if wins else integrator_block(gains.gain[mode], leak[mode], "pol", delay))
+    chosen = tuple(model for _, model in best)
+    law = of_blocks(blocks, "pol", "lqg", noll, delay, rate_hz)
+    return _tuned(law, delay, predicted_nm(law, chosen, delay), tuple(kinds), chosen)
+
+
+def tune_pi_notch(models: Sequence[Model], gains: Gains, noll: tuple[int, ...], leak: Array, delay: float) -> Tuned:
+    """An integrator with a notch for each line that one makes smaller within the margins, the strongest line first."""
+    rate_hz = models[0].rate_hz
+    none = np.zeros(len(noll))
+    chosen: list[tuple[Notch, ...]] = []
+    gain = gains.gain.copy()
+    for mode, model in enumerate(models):
+
+        def made(notches: Sequence[Notch], g: float, mode: int = mode) -> LinearLaw:
+            one = slice(mode, mode + 1)
+            return pi_notch(noll[one], np.array([g]), none[one], leak[one], [notches], delay, rate_hz)
+
+        found: tuple[float, float, tuple[Notch, ...]] | None = None
+        for share in (1.0, 0.7, 0.5, 0.35):  # less gain leaves room for notches
+            g, notches = float(share * gains.gain[mode]), tuple[Notch, ...]()
+            least = predicted_nm(made(notches, g), [model], delay)[0]
+            for line in sorted(model.lines, key=lambda line: -line.variance_nm2):
+                for depth in (30.0, 10.0, 4.0):
+                    width_hz = min(max(4 * line.width_hz, 0.2 * line.frequency_hz), 0.02 * rate_hz)
+                    more = (*notches, Notch(line.frequency_hz, width_hz, depth))
+                    law = made(more, g)
+                    left = predicted_nm(law, [model], delay)[0]
+                    if left < least and _holds(margins.margins(law, delay)):
+                        notches, least = more, left
+                        break
+            if found is None or least < found[0]:
+                found = float(least), g, notches
+        assert found is not None  # noqa: S101  # there was a first share
+        _, gain[mode], notches = found
+        chosen.append(notches)
+    law = pi_notch(noll, gain, none, leak, chosen, delay, rate_hz)
+    kinds = tuple("pi-notch" if notches else "integrator" for notches in chosen)
+    return _tuned(law, delay, predicted_nm(law, models, delay), kinds, tuple(models))
+
+
+def _tuned(law: LinearLaw, delay: float, predicted: Array, kinds: Sequence[str], models: Sequence[Model]) -> Tuned:
+    margins.check_stable(law, delay)
+    return Tuned(law, margins.margins(law, delay), predicted, tuple(kinds), tuple(models))
+
+
+def predicted_nm(law: LinearLaw, models: Sequence[Model], delay_frames: float) -> Array:
+    """Rms (modes,) of the true residual of modes with these models: |S|^2 of the disturbance and |T|^2 of the noise."""
+    found = np.zeros(len(models))
+    for mode, model in enumerate(models):
+        omega = _fine_frequencies(model)
+        hz = omega * model.rate_hz / (2 * np.pi)
+        S = margins.rejection(law, hz, delay_frames)[:, mode] ** 2
+        T = margins.noise_transfer(law, hz, delay_frames)[:, mode] ** 2
+        power = S * model.spectrum_nm2(omega) + T * model.noise_nm2
+        found[mode] = np.trapezoid(power, omega) / np.pi
+    return np.sqrt(found)
+
+
+def left_of(law: LinearLaw, run: Pieces, delay_frames: float) -> Array:
+    """Mean square (modes,) of the measured error that a law would have left of pseudo-open-loop modes (frames, modes).
+
+    Every piece begins with a law at rest and a flat mirror; the frames until it has settled do not count.
+    """
+    weights = [(lag, weight) for lag, weight in enumerate(delay_weights(delay_frames).astype(np.float32)) if weight]
+    squares, frames = np.zeros(len(law.noll)), 0
+    for piece in run.values:
+        skipped = min(_SETTLING_FRAMES, len(piece) // 3)
+        errors = _folded(law, piece.astype(np.float32), weights)[skipped:]
+        squares += np.sum(errors.astype(np.float64) ** 2, axis=0)
+        frames += len(errors)
+    return squares / max(frames, 1)
+
+
+def _folded(law: LinearLaw, pol_nm: Single, weights: list[tuple[int, np.float32]]) -> Single:
+    x = linear_law.at_rest(law)
+    history = [np.zeros(len(law.noll), np.float32)] * (weights[-1][0] + 1)
+    errors = np.empty_like(pol_nm)
+    for row, pol in enumerate(pol_nm):
+        error = pol + sum(weight * history[lag] for lag, weight in weights)
+        x = linear_law.follow(law, x, pol if law.signal == "pol" else error, history[0])
+        history = [linear_law.respond(law, x), *history[:-1]]
+        errors[row] = error
+    return errors
+
+
+def _whole_spectrum(run: Pieces, rate_hz: float) -> Spectrum | None:
+    """The periodogram of the longest piece: coarse segments would lose a slow mode's drift."""
+    longest = max(run.values, key=len, default=None)
+    if longest is None or len(longest) < FEWEST:
+        return None
+    frequency_hz, power = periodogram(longest, rate_hz, "hann", detrend="constant", axis=0)
+    return Spectrum(frequency_hz, power, 1)
+
+
+def _scaled(model: Model, factor: float, finest_hz: float) -> Model:
+    lines = (
+        replace(line, width_hz=factor * line.width_hz) if line.width_hz < 3 * finest_hz else line
+        for line in model.lines
+    )
+    return replace(model, lines=tuple(lines))
+
+
+def _within_margins(model: Model, noll: int, delay_frames: float) -> tuple[Block, float]:
+    """The filter of a model, its noise taken for higher until the margins hold; and by how much."""
+    for factor in _QUIETER.tolist():
+        block = lqg_block(replace(model, noise_nm2=factor * model.noise_nm2), delay_frames)
+        law = of_blocks([block], "pol", "lqg", (noll,), delay_frames, model.rate_hz)
+        if _holds(margins.margins(law, delay_frames)):
+            break
+    return block, factor
+
+
+def _holds(found: margins.Margins) -> bool:
+    return bool(
+        found.stable
+        and found.gain_margin.min() >= LEAST_GAIN_MARGIN
+        and found.gain_reduction.max() <= 1 / LEAST_GAIN_MARGIN
+        and found.phase_margin_deg.min() >= 0.7 * LEAST_PHASE_MARGIN_DEG
+    )
+
+
+def _fine_frequencies(model: Model) -> Array:
+    """Rad per frame from nearly 0 to pi, ascending, densely around each line."""
+    apart = np.geomspace(1e-3, 1e4, 120)
+    grids = [np.linspace(0, np.pi, 2048), np.geomspace(1e-7, np.pi, 512)]
+    for line in model.lines:
+        width, centre = (2 * np.pi * hz / model.rate_hz for hz in (line.width_hz, line.frequency_hz))
+        grids += [centre - width * apart[::-1], np.array([centre]), centre + width * apart]
+    every = np.unique(np.concatenate(grids))
+    return np.asarray(every[(every >= 1e-7) & (every <= np.pi)])

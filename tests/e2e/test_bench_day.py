@@ -1,0 +1,97 @@
+"""A day on the bench: every command of the documents on calibration, tuning and acceptance, on a running loop."""
+
+import shlex
+import subprocess
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import pytest
+from loops import LOWFC, children, interrupt, start, until
+
+from lowfc.client import running
+
+COMPUTED = "lowfc calibrate --method analytic --config lowfc.toml --out computed.fits"
+OPEN_LOOP = (
+    "lowfc calibrate --method hadamard --out night.fits",
+    "lowfc calibrate --compare computed.fits night.fits",
+    "lowfc calibrate reference --frames 5000 --out night.fits",
+    "lowfc calibrate align --out aligned.fits",
+)
+DARK = "lowfc calibrate dark --frames 1000 --out night.fits"
+WITH_IT = "lowfc controller --run bench --calibration night.fits"
+CLOSED_LOOP = (
+    "lowfc tune --live 20 --controller lqg --apply",
+    "lowfc acceptance noise-floor",
+    "lowfc acceptance linearity",
+    "lowfc acceptance capture-range",
+    "lowfc acceptance rejection --plot rejection.png",
+)
+AFTERWARDS = (
+    "lowfc tune logs/*.mcap",
+    "lowfc tune logs/*.mcap --controller lqg --out lqg.fits",
+    "lowfc acceptance rejection logs/*.mcap",
+)
+LAW = "lowfc ctl law lqg.fits"
+COMMANDS = (COMPUTED, *OPEN_LOOP, DARK, WITH_IT, *CLOSED_LOOP, *AFTERWARDS, LAW)
+
+CONFIG = """
+[sensor]
+sam = "sam27d10_bal14"
+modes = 6
+[star]
+magnitude = 0.0
+[disturbance]
+preset = "bench"
+scale = 0.2
+"""
+
+
+def run(folder: Path, command: str) -> str:
+    """Run a documented command; what an acceptance test finds is another matter than whether it runs."""
+    words = shlex.split(command)[1:]
+    words = [found for word in words for found in (map(str, folder.glob(word)) if "*" in word else [word])]
+    done = subprocess.run([*LOWFC, *words], cwd=folder, capture_output=True, text=True, timeout=200, check=False)
+    fine = (0, 1) if words[0] == "acceptance" else (0,)
+    assert done.returncode in fine, f"{command}: {done.stderr}"
+    assert "Traceback" not in done.stderr, done.stderr
+    return done.stdout
+
+
+@contextmanager
+def loop(folder: Path, *arguments: str) -> Iterator[None]:
+    """A running loop."""
+    process = start(folder, "sim-loop", "--config", "lowfc.toml", *arguments)
+    try:
+        until(lambda: "controller" in children(process.pid))
+        until(running)
+        yield
+    finally:
+        _, complaints = interrupt(process)
+    assert process.returncode == 0, complaints
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(900)
+def test_a_day_on_the_bench(tmp_path: Path) -> None:
+    (tmp_path / "lowfc.toml").write_text(CONFIG)
+    run(tmp_path, COMPUTED)
+    with loop(tmp_path, "--open", "--no-record"):
+        for command in OPEN_LOOP:
+            assert run(tmp_path, command)
+    with loop(tmp_path, "--open", "--no-record", "--star-magnitude", "20"):
+        assert run(tmp_path, DARK + " --dark-taken")
+    with loop(tmp_path):
+        for command in CLOSED_LOOP:
+            assert run(tmp_path, command)
+    for command in AFTERWARDS:
+        assert run(tmp_path, command)
+    with loop(tmp_path, "--no-record"):
+        assert run(tmp_path, LAW)
+    controller = start(tmp_path, *shlex.split(WITH_IT)[1:])
+    until(lambda: "bench" in running())
+    interrupt(controller)
+    assert controller.returncode == 0
+    assert {"computed.fits", "night.fits", "aligned.fits", "lqg.fits", "rejection.png"} <= {
+        path.name for path in tmp_path.iterdir()
+    }
