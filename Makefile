@@ -6,7 +6,7 @@ BIN := $(VENV)/bin
 INSTALL := $(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt
 # Tests that only compute run side by side; those with processes and a clock in them run alone, after them.
 COMPUTING := tests/control tests/design tests/fuzz tests/optics tests/sim tests/test_acceptance.py \
-	tests/test_calibrate.py tests/test_calibrate_commands.py tests/test_calibration_file.py \
+	tests/test_calibrate.py tests/test_calibrate_commands.py tests/test_chaos.py tests/test_calibration_file.py \
 	tests/test_certificates.py tests/test_configuration.py tests/test_conformance.py \
 	tests/test_controller_memory.py tests/test_docs_computing.py tests/test_export.py tests/test_history.py \
 	tests/test_layers.py tests/test_layout_files.py tests/test_log_info.py tests/test_loop.py \

@@ -32,7 +32,13 @@ BELOW = {
 LAYERS = tuple(BELOW)
 
 PURE_LAYERS = ("lowfc.optics", "lowfc.control", "lowfc.design")
-PURE_MODULES = ("sim_dm.device", "sim_camera.disturbance", "sim_camera.bench", "sim_camera.figures")
+PURE_MODULES = (
+    "sim_dm.device",
+    "sim_camera.bench",
+    "sim_camera.disturbance",
+    "sim_camera.faults",
+    "sim_camera.figures",
+)
 PURE_IMPORTS = (
     *("numpy", "scipy", "abc", "collections", "dataclasses", "enum", "functools", "itertools", "math", "operator"),
     *("types", "typing"),

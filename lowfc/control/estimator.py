@@ -71,6 +71,19 @@ def difference(
     return flux_dn
 
 
+def filled(calibration: Calibration, pixels: npt.NDArray[np.uint16]) -> npt.NDArray[np.uint16]:
+    """A frame (pixels,) whose pixels at full well are what the reference has there, for the light of all the others.
+
+    A pixel that was hit says nothing of the wavefront, but would weigh as much as its charge.
+    """
+    full = pixels >= calibration.saturation_dn
+    others = calibration.good * ~full
+    light, share = float((pixels - calibration.dark) @ others), float(calibration.reference @ others)
+    flux_dn = light / share if share > 0 else 0.0
+    expected = np.clip(calibration.dark + calibration.reference * np.float32(flux_dn), 0, calibration.saturation_dn)
+    return np.where(full, np.rint(expected), pixels).astype(np.uint16)
+
+
 def saturated_pixels(calibration: Calibration, pixels: npt.NDArray[np.uint16]) -> int:
     """How many good pixels of a frame (pixels,) are at full well."""
     if pixels.item(pixels.argmax()) < calibration.saturation_dn:

@@ -12,7 +12,7 @@ import numpy.typing as npt
 
 from lowfc.control import linear_law
 from lowfc.control.additions import ADOPTED, Channel
-from lowfc.control.estimator import Estimate, saturated_pixels
+from lowfc.control.estimator import Estimate, filled, saturated_pixels
 from lowfc.control.inputs import (
     CameraSettings,
     Command,
@@ -141,6 +141,8 @@ def _measure(settings: Settings, drive: Drive, frame: Frame) -> tuple[Estimate, 
     saturated = saturated_pixels(calibration, pixels)
     if saturated > settings.most_saturated:
         return Reason.SATURATED
+    if saturated:
+        pixels = filled(calibration, pixels)
     estimate = drive.estimator.estimate(pixels, settings.least_flux * calibration.flux_dn)
     return Reason.DARK if estimate is None else (estimate, saturated)
 

@@ -17,6 +17,7 @@ from lowfc.programs.acceptance import acceptance_app
 from lowfc.programs.bench_record import bench_record
 from lowfc.programs.bench_view import bench_view
 from lowfc.programs.calibrate import calibrate_app
+from lowfc.programs.chaos import chaos
 from lowfc.programs.conformance import conformance_app
 from lowfc.programs.ctl_commands import ctl_app
 from lowfc.programs.design_commands import design_app
@@ -28,6 +29,7 @@ from lowfc.programs.log_info import info
 from lowfc.programs.recover import recover
 from lowfc.programs.replay_commands import replay_log
 from lowfc.programs.report.command import report
+from lowfc.programs.soak import soak
 from lowfc.programs.tune import tune
 from lowfc.programs.validate.commands import validate
 from lowfc.programs.view.command import view
@@ -53,6 +55,8 @@ app.command()(doctor)
 app.command()(latency)
 app.command()(validate)
 app.command()(tune)
+app.command()(chaos)
+app.command()(soak)
 app.command()(certs)
 app.command()(router)
 app.command()(hosts)

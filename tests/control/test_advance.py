@@ -12,11 +12,13 @@ from hypothesis import strategies as st
 from safety_checks import violations
 from toy import (
     DARK_DN,
+    FLUX_DN,
     GRID,
     NOLL,
     SATURATION_DN,
     SHAPE,
     START,
+    TOY,
     calibration,
     frame,
     frame_sequence,
@@ -631,3 +633,19 @@ def test_whatever_comes_in_it_is_pure_finite_and_within_the_limits(
             assert taken.name == "clear"
             assert after.mode is not LoopMode.CLOSED
         state = after
+
+
+def test_a_few_pixels_at_full_well_are_left_out_of_the_estimate() -> None:
+    """Of a star that is brighter than expected, too."""
+    plain = TOY.pixels(SOME, 1.3 * FLUX_DN)
+    hit = plain.copy()
+    hit.flat[[3, 17]] = SATURATION_DN
+    errors = []
+    for pixels in (plain, hit):
+        _, (outputs,) = feed(USUAL, loaded(USUAL), frame(1, pixels=pixels))
+        assert outputs.step is not None
+        assert outputs.step.error_nm is not None
+        errors.append(outputs.step.error_nm)
+        assert outputs.step.saturated_pixels == 2 * (pixels is hit)
+    without = np.abs(errors[1] - errors[0]).max()
+    assert 0 < without < np.abs(errors[0]).max() / 2

@@ -80,6 +80,7 @@ def test_a_day_on_the_bench(tmp_path: Path) -> None:
         for command in OPEN_LOOP:
             assert run(tmp_path, command)
     with loop(tmp_path, "--open", "--no-record", "--star-magnitude", "20"):
+        run(tmp_path, "lowfc ctl load night.fits")
         assert run(tmp_path, DARK + " --dark-taken")
     with loop(tmp_path):
         for command in CLOSED_LOOP:

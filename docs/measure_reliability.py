@@ -1,0 +1,193 @@
+"""Run the chaos cases, the soak and the fuzzing, and put the tables into docs/reliability.md.
+
+Example:
+    python docs/measure_reliability.py                    # all of it; takes hours
+    python docs/measure_reliability.py --parts chaos      # chaos, soak, fuzz: what to measure, the rest stays
+    python docs/measure_reliability.py --render           # the tables again from docs/reliability.json
+"""
+
+import argparse
+import json
+import subprocess
+import sys
+import tempfile
+from collections.abc import Callable
+from typing import Any
+
+from measure import ROOT, host, put
+
+MEASURED = ROOT / "docs" / "reliability.json"
+DOCUMENT = ROOT / "docs" / "reliability.md"
+SEEDS = (1, 2, 3, 4, 5)
+HOURS = 0.5
+INPUTS = 1_000_000
+
+
+def chaos(seeds: tuple[int, ...]) -> dict[str, Any]:
+    """Every case once with every seed."""
+    found: dict[str, Any] = {"host": host(), "command": "lowfc chaos --all --seed N", "runs": []}
+    for seed in seeds:
+        found["runs"].append(_json([sys.executable, "-m", "lowfc", "chaos", "--all", "--seed", str(seed), "--json"]))
+    return found
+
+
+def soak(hours: float) -> dict[str, Any]:
+    """The loop for hours."""
+    words = ["soak", "--hours", f"{hours:g}", "--json"]
+    about = host()
+    return {"host": about, "command": f"lowfc {' '.join(words[:-1])}"} | _json([sys.executable, "-m", "lowfc", *words])
+
+
+def fuzz(inputs: int) -> dict[str, Any]:
+    """Damaged inputs for every decoder and reader."""
+    words = ["tests/fuzz/fuzzing.py", "--inputs", str(inputs)]
+    about = host()
+    return {"host": about, "command": f"python {' '.join(words)}"} | _json(
+        [sys.executable, ROOT / words[0], *words[1:]]
+    )
+
+
+def _json(words: list[Any]) -> dict[str, Any]:
+    """What a command prints; a case that failed is a result too."""
+    if "--json" not in words:
+        words = [*words, "--json"]
+    with tempfile.TemporaryDirectory() as folder:
+        done = subprocess.run(words, cwd=folder, stdout=subprocess.PIPE, text=True, check=False)
+    found: dict[str, Any] = json.loads(done.stdout)
+    return found
+
+
+def chaos_tables(measured: dict[str, Any]) -> str:
+    """One line for each case, over all seeds, and the stalls."""
+    runs = measured["runs"]
+    rows = ["| case | what befalls the loop | passed | residual, nm rms: before -> after |", "|---|---|---|---|"]
+    stalls = [
+        "| stands still for 10 s | frame to command, p99 us: before, during, after | during over the mean of both |",
+        "|---|---|---|",
+    ]
+    steps_nm, recovered_s = [], []
+    for cases in zip(*(run["cases"] for run in runs), strict=True):
+        name, sentence = cases[0]["name"], cases[0]["sentence"]
+        passed = sum(case["passed"] and not case["skipped"] for case in cases)
+        skipped = sum(bool(case["skipped"]) for case in cases)
+        why = f", {skipped} skipped ({cases[0]['skipped']})" if skipped else ""
+        found = [case["findings"].get("recovery", {}).get("found", "-") for case in cases]
+        recovered = "; ".join(text.removeprefix("residual ").split(" nm,")[0] for text in found)
+        rows.append(f"| `{name}` | {sentence} | {passed} of {len(cases)}{why} | {recovered} |")
+        for case in cases:
+            if "restart_step_nm" in case["figures"]:
+                steps_nm.append(case["figures"]["restart_step_nm"])
+            if name == "kill-controller" and "recovered_s" in case["figures"]:
+                recovered_s.append(case["figures"]["recovered_s"])
+            if "frame_to_command" in case["figures"]:
+                spans = case["figures"]["frame_to_command"].values()
+                figures = ", ".join(f"{span['p99_us']:.0f}" for span in spans)
+                ratio = case["figures"].get("p99_during_over_calm", "-")
+                stalls.append(f"| {name.removeprefix('stall-')} | {figures} | {ratio} |")
+    total = sum(run["passed"] + run["failed"] for run in runs)
+    passed = sum(run["passed"] for run in runs)
+    failures = [
+        f"- `{case['name']}`, seed {run['seed']}: {rule}: {one['found']}"
+        for run in runs
+        for case in run["cases"]
+        for rule, one in case["findings"].items()
+        if not one["held"]
+    ]
+    text = [f"{passed} of {total} passed, seeds {', '.join(str(run['seed']) for run in runs)}.", "", *rows, ""]
+    if failures:
+        text += ["What failed:", "", *failures, ""]
+    if steps_nm:
+        text += [
+            f"Restarted controllers: {len(steps_nm)}; the first command of one moved an actuator by at most "
+            f"{max(steps_nm):.1f} nm of surface.",
+            "",
+        ]
+    if recovered_s:
+        text += [
+            "Killed in closed loop and started anew, a controller had the residual back at most "
+            f"{max(recovered_s):.2f} s after the first frame that it used ({len(recovered_s)} times).",
+            "",
+        ]
+    if len(stalls) > 2:
+        text += [*stalls, ""]
+    return "\n".join([*text, where(measured), ""])
+
+
+def soak_table(measured: dict[str, Any]) -> str:
+    """A line for each process."""
+    rows = [
+        "| process | memory, MB: first -> last (most) | MB per hour | handles | threads |",
+        "|---|---|---|---|---|",
+    ]
+    for name, one in measured["processes"].items():
+        rows.append(
+            f"| {name} | {one['memory_first_mb']:.1f} -> {one['memory_last_mb']:.1f} ({one['memory_most_mb']:.1f}) "
+            f"| {one['memory_mb_per_hour']:+.2f} +- {one['memory_mb_per_hour_error']:.2f} "
+            f"| {one['handles_first']} -> {one['handles_last']} (most {one['handles_most']}) "
+            f"| {one['threads_first']} -> {one['threads_last']} |"
+        )
+    latency = measured["latency"]
+    verdict = "Nothing grew and nothing was lost." if measured["passed"] else f"Failed: {'; '.join(measured['why'])}."
+    text = (
+        f"{verdict} {measured['hours']:g} h at {measured['rate_hz']:.0f} Hz: {measured['frames_published']} frames, "
+        f"{measured['frames_skipped']} skipped, {measured['frames_missing']} missing; {measured['messages_recorded']} "
+        f"messages in {measured['logs']} logs, {measured['messages_lost']} lost, {measured['gaps']} gaps. "
+        f"Frame to command: p50 {latency['p50_us']:.0f} us, {latency['p50_us_per_hour']:+.1f} +- "
+        f"{latency['p50_us_per_hour_error']:.1f} us per hour; p99 {latency['p99_us']:.0f} us, "
+        f"{latency['p99_us_per_hour']:+.1f} +- {latency['p99_us_per_hour_error']:.1f} us per hour."
+    )
+    return "\n".join([text, "", *rows, "", where(measured), ""])
+
+
+def fuzz_table(measured: dict[str, Any]) -> str:
+    """A line for each decoder and reader."""
+    targets = measured["targets"]
+    rows = ["| what reads | inputs | refused | crashes | hangs | memory grown, MB |", "|---|---|---|---|---|---|"]
+    rows += [
+        f"| {one['name']} | {one['inputs']} | {one['refused']} | {len(one['crashes'])} | {len(one['hangs'])} "
+        f"| {one['grown_bytes'] / 1e6:.0f} |"
+        for one in targets
+    ]
+    totals = [sum(one["inputs"] for one in targets)]
+    totals += [sum(len(one[name]) for one in targets) for name in ("crashes", "hangs")]
+    text = f"{totals[0]} inputs, {totals[1]} crashes, {totals[2]} hangs, in {measured['seconds'] / 60:.0f} minutes."
+    return "\n".join([text, "", *rows, "", where(measured), ""])
+
+
+def where(measured: dict[str, Any]) -> str:
+    """On which host, by which command."""
+    about = measured["host"]
+    return (
+        f"Measured {about['date']} on {about['processors']} cores of {about['processor']} (a virtual machine, Linux "
+        f"{about['kernel']}, Python {about['python']}, load {about['load_before']} before) by `{measured['command']}`."
+    )
+
+
+PARTS: dict[str, Callable[[dict[str, Any]], str]] = {"chaos": chaos_tables, "soak": soak_table, "fuzz": fuzz_table}
+
+
+def main() -> None:
+    """The command line."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--render", action="store_true", help=f"use {MEASURED.relative_to(ROOT)} as it is")
+    parser.add_argument("--parts", nargs="+", choices=[*PARTS], default=[*PARTS])
+    parser.add_argument("--seeds", nargs="+", type=int, default=[*SEEDS])
+    parser.add_argument("--hours", type=float, default=HOURS)
+    parser.add_argument("--inputs", type=int, default=INPUTS)
+    asked = parser.parse_args()
+    measured: dict[str, Any] = json.loads(MEASURED.read_text()) if MEASURED.exists() else {}
+    measure: dict[str, Callable[[], dict[str, Any]]] = {
+        "chaos": lambda: chaos(tuple(asked.seeds)),
+        "soak": lambda: soak(asked.hours),
+        "fuzz": lambda: fuzz(asked.inputs),
+    }
+    for part in () if asked.render else asked.parts:
+        measured[part] = measure[part]()
+        MEASURED.write_text(json.dumps(measured, indent=1) + "\n")
+    for part, render in PARTS.items():
+        table = render(measured[part]) if part in measured else "Not measured yet.\n"
+        put(DOCUMENT, table, f"<!-- {part}: begin -->\n", f"<!-- {part}: end -->")
+
+
+if __name__ == "__main__":
+    main()

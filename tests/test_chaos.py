@@ -1,0 +1,273 @@
+"""The rules of the chaos cases: each passes a run without fault, and notices the one that it is for."""
+
+import json
+import signal
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import typer
+from typer.testing import CliRunner
+
+from lowfc.adapters.envelope import sequence_of
+from lowfc.contract.configuration import load
+from lowfc.contract.errors import ConfigurationError
+from lowfc.contract.events import EVENTS, Level
+from lowfc.contract.messages import FRAME, STEP, wire
+from lowfc.programs.chaos import chaos, configured, render
+from lowfc.programs.chaos_bench import PATIENCE_S, Ended, Left
+from lowfc.programs.chaos_cases import CASES, FIRST, STRUCK, Case, End
+from lowfc.programs.chaos_evidence import FORGED_S, Evidence, Happened, Shape, Stepped, Truths, gaps
+from lowfc.programs.chaos_rules import FLOOR_NM, WITHIN, Finding, judge, recovered_s, restart_step_nm
+from sim_camera.faults import Kind
+
+START_S = 1_800_000_000
+SECOND_NS = 1_000_000_000
+FRAMES = 1000
+CASE = Case("nothing", "frames", "nothing", lambda bench: None)
+
+
+def ns(index: int) -> int:
+    return START_S * SECOND_NS + index * 4_000_000
+
+
+def shape(index: int, height_nm: float = 0.0, start_s: int = START_S) -> Shape:
+    surface = np.full((34, 34), height_nm, np.float32)
+    return Shape(sequence_of(start_s, index), ns(index), index, sequence_of(START_S, index), surface)
+
+
+def step(index: int, *reasons: int, used: bool = True, mode: int = wire.LOOP_MODE_CLOSED) -> Stepped:
+    return Stepped(sequence_of(START_S, index), ns(index), index, sequence_of(START_S, index), mode, reasons, used)
+
+
+@pytest.fixture
+def evidence() -> Evidence:
+    """Four seconds of a loop to which nothing happened."""
+    found = Evidence()
+    found.commands = [shape(index, index % 7) for index in range(FRAMES)]
+    found.states = [shape(index, index % 7) for index in range(FRAMES)]
+    found.steps = [step(index) for index in range(FRAMES)]
+    found.truths = Truths(np.array([ns(index) for index in range(FRAMES)]), np.full(FRAMES, 2.0))
+    found.counts = {(0, key, START_S): set(range(FRAMES)) for key in (FRAME.key, STEP.key)}
+    found.messages = 5 * FRAMES
+    found.last_ns = [(ns(FRAMES), True)]
+    return found
+
+
+@pytest.fixture
+def left(tmp_path: Path) -> Left:
+    found = Left(tmp_path, load(None), marks={"quiet": ns(300), "end": ns(FRAMES)}, mode=wire.LOOP_MODE_CLOSED)
+    found.ended = [Ended("camera", 0, 0.1, True), Ended("controller", 0, 0.1, True)]
+    return found
+
+
+def broken(case: Case, left: Left, evidence: Evidence) -> dict[str, str]:
+    return {one.rule: one.found for one in judge(case, left, evidence) if not one.held}
+
+
+def test_nothing_is_found_where_nothing_happened(left: Left, evidence: Evidence) -> None:
+    assert broken(CASE, left, evidence) == {}
+    assert len(judge(CASE, left, evidence)) == 6
+
+
+def killed_long_after_its_last_flush(evidence: Evidence, left: Left) -> None:
+    left.killed_ns.append(ns(FRAMES))
+    evidence.last_ns.append((ns(500), False))
+
+
+Spoil = Callable[[Evidence, Left], object]
+SPOILT: dict[str, tuple[str, str, Spoil]] = {
+    "a command beyond the stroke": ("limits", "stroke", lambda e, _: e.commands.append(shape(FRAMES, 701))),
+    "a command too far from the last": ("limits", "slew", lambda e, _: e.commands.append(shape(FRAMES, 110))),
+    "a command that is not finite": ("limits", "not finite", lambda e, _: e.commands.append(shape(FRAMES, np.nan))),
+    "a mirror that went too far": ("limits", "mirror: slew", lambda e, _: e.states.append(shape(FRAMES, 160))),
+    "a mirror that jumped at a restart": (
+        "limits",
+        "restarted",
+        lambda e, _: e.commands.append(shape(FRAMES, 120, START_S + 5)),
+    ),
+    "no state of the mirror": ("limits", "0 states", lambda e, _: e.states.clear()),
+    "a command made from a refused frame": (
+        "bad frames",
+        "500, which was refused",
+        lambda e, _: e.steps.__setitem__(500, step(500, wire.REASON_DARK, used=False)),
+    ),
+    "a frame used twice": ("bad frames", "twice", lambda e, _: e.steps.insert(500, step(500))),
+    "a loop that does not come back": (
+        "recovery",
+        "closed",
+        lambda e, _: e.truths.residual_nm.__setitem__(slice(900, None), 2 * (WITHIN * 2 + FLOOR_NM)),
+    ),
+    "a loop that is open": ("recovery", "open", lambda _, rest: setattr(rest, "mode", wire.LOOP_MODE_OPEN)),
+    "a case that waited in vain": ("recovery", "in vain", lambda _, rest: rest.notes.append("waited in vain")),
+    "an error that nobody expects": (
+        "events",
+        "1 unexpected SAFED",
+        lambda e, _: e.events.append(Happened(ns(1), "controller", Level.ERROR, "SAFED why")),
+    ),
+    "messages missing and not counted": (
+        "account",
+        f"2 of {STEP.key} missing, 0 counted",
+        lambda e, _: e.counts[0, STEP.key, START_S].difference_update({7, 8}),
+    ),
+    "messages sent at the end and not counted": (
+        "account",
+        f"5 of {STEP.key} missing",
+        lambda e, _: e.stopped.__setitem__((0, STEP.key, START_S), FRAMES + 5),
+    ),
+    "a log that is damaged": ("account", "damaged", lambda e, _: e.unreadable.append("damaged")),
+    "no log": ("account", "no log", lambda e, _: setattr(e, "messages", 0)),
+    "a recorder that had not flushed": (
+        "account",
+        "flushed",
+        killed_long_after_its_last_flush,
+    ),
+    "a recording that failed without a loss": (
+        "account",
+        "nothing is counted",
+        lambda _, rest: setattr(rest, "failure", "disk"),
+    ),
+    "a process that hangs": (
+        "processes",
+        "did not end",
+        lambda _, rest: rest.ended.append(Ended("mirror-dm", -signal.SIGKILL, PATIENCE_S, True)),
+    ),
+    "a process that died": (
+        "processes",
+        "camera ended with 1, by itself",
+        lambda _, rest: rest.ended.append(Ended("camera", 1, 0.0, False)),
+    ),
+    "a process that ended by itself": (
+        "processes",
+        "by itself",
+        lambda _, rest: rest.ended.append(Ended("camera", 0, 0.0, False)),
+    ),
+    "a process that lives on": ("processes", "lives on", lambda _, rest: rest.alive.append("python (1, Z)")),
+    "a traceback": (
+        "processes",
+        "traceback in camera.stderr",
+        lambda _, rest: (rest.folder / "camera.stderr").write_text("Traceback (most recent call last)"),
+    ),
+}
+
+
+@pytest.mark.parametrize("name", SPOILT)
+def test_each_rule_notices_what_it_is_for(name: str, left: Left, evidence: Evidence) -> None:
+    rule, words, spoil = SPOILT[name]
+    spoil(evidence, left)
+    found = broken(CASE, left, evidence)
+    assert set(found) == {rule}
+    assert words in found[rule]
+
+
+def test_what_is_counted_is_no_fault(left: Left, evidence: Evidence) -> None:
+    evidence.counts[0, STEP.key, START_S] -= {7, 8}
+    evidence.lost = {STEP.key: 2}
+    assert broken(CASE, left, evidence) == {}
+    assert dict(gaps(evidence.counts)) == {STEP.key: 2}
+
+
+def test_lost_commands_allow_as_many_moves(left: Left, evidence: Evidence) -> None:
+    evidence.commands.append(shape(FRAMES + 1, 110))
+    assert broken(CASE, left, evidence) == {}
+
+
+def test_a_held_command_and_a_known_bad_frame_are_no_fault(left: Left, evidence: Evidence) -> None:
+    evidence.steps[500] = step(500, wire.REASON_DARK, used=False)
+    evidence.commands[500] = evidence.commands[500]._replace(actuators_nm=evidence.commands[499].actuators_nm)
+    evidence.states[500] = evidence.states[499]._replace(sequence=evidence.states[500].sequence)
+    assert broken(replace(CASE, bad=lambda number: number == 500), left, evidence) == {}
+    assert (
+        "bad frame 501 was used"
+        in broken(replace(CASE, bad=lambda number: number == 501), left, evidence)["bad frames"]
+    )
+    assert "no bad frame came" in broken(replace(CASE, bad=lambda number: False), left, evidence)["bad frames"]
+
+
+def test_an_expected_event_must_be_there(left: Left, evidence: Evidence) -> None:
+    case = replace(CASE, expected=("FRAMES_REFUSED frames refused: DARK",))
+    assert "no event" in broken(case, left, evidence)["events"]
+    evidence.events.append(Happened(ns(1), "controller", Level.WARNING, "FRAMES_REFUSED frames refused: DARK"))
+    assert broken(case, left, evidence) == {}
+
+
+def test_safed_means_latched_and_flat(left: Left, evidence: Evidence) -> None:
+    case = replace(CASE, end=End.SAFED)
+    assert "closed" in broken(case, left, evidence)["recovery"]
+    left.mode = wire.LOOP_MODE_SAFED
+    assert "mirror at" in broken(case, left, evidence)["recovery"]
+    evidence.states.append(shape(FRAMES))
+    assert broken(case, left, evidence) == {}
+
+
+def test_the_step_at_a_restart_is_measured_from_where_the_mirror_was(evidence: Evidence) -> None:
+    assert restart_step_nm(evidence) is None
+    evidence.commands.append(shape(FRAMES, 40, START_S + 5))
+    at_nm = float(evidence.states[-1].actuators_nm.max())
+    assert restart_step_nm(evidence) == pytest.approx(40 - at_nm)
+
+
+def test_the_time_to_recover_begins_with_the_new_controllers_first_frame(left: Left, evidence: Evidence) -> None:
+    assert recovered_s(left, evidence) is None
+    anew = [step(index)._replace(sequence=sequence_of(START_S + 5, index)) for index in range(600, FRAMES)]
+    evidence.steps[600:] = anew
+    evidence.truths.residual_nm[550:650] = 40.0
+    assert recovered_s(left, evidence) == pytest.approx(50 * 0.004, abs=0.01)
+    evidence.truths.residual_nm[600:] = 40.0
+    assert recovered_s(left, evidence) is None
+
+
+def test_every_case_can_be_run(tmp_path: Path) -> None:
+    names = {event.name for event in EVENTS.values()}
+    for name, case in CASES.items():
+        assert case.name == name
+        assert configured(case, tmp_path).control.start_mode == "closed"
+        assert {text.partition(" ")[0] for text in (*case.expected, *case.allowed)} <= names
+    assert {case.faults for case in CASES.values() if case.faults} == set(Kind)
+    first = next(case for case in CASES.values() if case.bad is not None).bad
+    assert first is not None
+    assert [first(number) for number in (FIRST - 1, FIRST, FIRST + STRUCK - 1, FIRST + STRUCK)] == [
+        *(False, True, True, False)
+    ]
+    assert FORGED_S < START_S
+
+
+def run(*words: str) -> str:
+    app = typer.Typer()
+    app.command("chaos")(chaos)
+    app.command("other")(lambda: None)
+    done = CliRunner().invoke(app, ["chaos", *words], catch_exceptions=False)
+    assert done.exit_code == 0
+    return done.stdout
+
+
+def test_without_a_case_they_are_listed() -> None:
+    listed = run()
+    assert all(name in listed for name in CASES)
+
+
+def test_a_case_that_is_not_there() -> None:
+    with pytest.raises(ConfigurationError, match="frames-dark"):
+        run("--case", "frame-dark")
+
+
+def test_the_table() -> None:
+    rows = [
+        {
+            "name": name,
+            "passed": passed,
+            "skipped": None,
+            "seconds": 8.0,
+            "findings": {"limits": Finding("limits", passed, "slew")._asdict()},
+            "figures": {"restart_step_nm": 2.5} if passed else {},
+        }
+        for name, passed in (("one", True), ("two", False))
+    ]
+    text = render({"seed": 3, "passed": 1, "failed": 1, "cases": rows})
+    assert text.splitlines()[0].split()[:2] == ["one", "passed"]
+    assert "restart_step_nm: 2.5" in text
+    assert "    limits: slew" in text
+    assert text.endswith("1 passed, 1 failed, seed 3\n")
+    assert json.dumps(rows)
