@@ -378,7 +378,7 @@ def test_several_logs_are_exported_in_turn(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("to", [Format.NPZ, Format.FITS])  # with aot they are copied as with fits
 def test_frames_are_not_held_in_memory(tmp_path: Path, to: Format) -> None:
-    frames, shape = 60, (200, 200)
+    frames, shape = 90, (200, 200)
     big = write(tmp_path / "big.mcap", steps=frames, shape=shape)
     size = frames * shape[0] * shape[1] * 2
     export_log(big, to, tmp_path / "warm.out", console=QUIET)  # imports
