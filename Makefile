@@ -15,7 +15,7 @@ COMPUTING := tests/control tests/design tests/fuzz tests/optics tests/sim tests/
 	tests/test_validate_figures.py tests/test_what_if.py tests/test_wheel.py tests/view \
 	tests/adapters/test_access.py tests/adapters/test_log_files.py tests/adapters/test_log_mutations.py \
 	tests/e2e/test_acceptance_loop.py tests/e2e/test_dark_hole.py tests/e2e/test_lockstep.py \
-	tests/e2e/test_mistakes.py
+	tests/e2e/test_mistakes.py tests/e2e/test_report_browser.py tests/e2e/test_sensors.py
 
 .PHONY: help sim-loop test test-all bench lint types format proto node clean
 

@@ -76,7 +76,13 @@ def calibrated(loop: FoldedLoop, method: str, cycles: int) -> tuple[Calibration,
 
 
 @pytest.mark.parametrize(
-    ("method", "delay", "modes", "cycles"), [("hadamard", 1.0, 14, 4), ("poke", 1.5, 6, 6), ("in-loop", 2.0, 6, 4)]
+    ("method", "delay", "modes", "cycles"),
+    [
+        pytest.param("hadamard", 1.0, 14, 4, marks=pytest.mark.slow),
+        ("hadamard", 1.0, 6, 4),
+        ("poke", 1.5, 6, 6),
+        pytest.param("in-loop", 2.0, 6, 4, marks=pytest.mark.slow),
+    ],
 )
 def test_what_is_measured_reads_the_true_modes(method: str, delay: float, modes: int, cycles: int) -> None:
     config = configured(camera__delay_frames=delay, sensor__modes=modes)

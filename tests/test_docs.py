@@ -129,11 +129,6 @@ def test_the_loops(tmp_path: Path, command: str) -> None:
     assert len(list((tmp_path / "logs").glob("*.mcap"))) == 1
 
 
-def test_the_configuration(tmp_path: Path) -> None:
-    for command in FILES:
-        run(tmp_path, command)
-
-
 def test_the_requests(tmp_path: Path) -> None:
     loop = start(tmp_path, "sim-loop", "--rate", "100", "--no-record")
     try:
@@ -170,17 +165,6 @@ def test_the_processes_by_hand(tmp_path: Path) -> None:
 def test_the_bench(tmp_path: Path) -> None:
     assert "rank" in run(tmp_path, BENCH[0])
     assert "longest wait" in run(tmp_path, BENCH[1])
-
-
-def test_the_logs(tmp_path: Path) -> None:
-    run(tmp_path, "lowfc sim-loop --lockstep --rate 200 --duration 2 --json")
-    said = [run(tmp_path, command) for command in LOGS]
-    assert "lowfc/camera/frame" in said[0]
-    assert "400 frames, commands identical, largest difference 0 nm" in said[1]
-    assert "what if" in said[2]
-    assert "played" in said[3]
-    assert "is whole" in said[4]
-    assert {path.suffix for path in (tmp_path / "logs").iterdir()} == {".mcap", ".html", ".fits"}
 
 
 @pytest.mark.slow

@@ -2,7 +2,7 @@
 
 from pathlib import Path
 
-from test_docs import DESIGN, VALIDATE, run
+from test_docs import DESIGN, FILES, LOGS, VALIDATE, run
 
 
 def test_the_validation(tmp_path: Path) -> None:
@@ -16,3 +16,19 @@ def test_the_designs_are_taken_by_the_loop(tmp_path: Path) -> None:
         run(tmp_path, command)
     (tmp_path / "own.toml").write_text('[sensor]\npupil = "pupil.npz"\nsam = "mask.json"\n')
     run(tmp_path, "lowfc sim-loop --config own.toml --lockstep --duration 0.2")
+
+
+def test_the_logs(tmp_path: Path) -> None:
+    run(tmp_path, "lowfc sim-loop --lockstep --rate 200 --duration 2 --json")
+    said = [run(tmp_path, command) for command in LOGS]
+    assert "lowfc/camera/frame" in said[0]
+    assert "400 frames, commands identical, largest difference 0 nm" in said[1]
+    assert "what if" in said[2]
+    assert "played" in said[3]
+    assert "is whole" in said[4]
+    assert {path.suffix for path in (tmp_path / "logs").iterdir()} == {".mcap", ".html", ".fits"}
+
+
+def test_the_configuration(tmp_path: Path) -> None:
+    for command in FILES:
+        run(tmp_path, command)

@@ -14,6 +14,8 @@ Array = npt.NDArray[np.float64]
 Single = npt.NDArray[np.float32]
 Signal = Literal["error", "pol"]
 
+MOST_STATES = 512
+"""Of a law: a step of so many takes as long as a frame at 1 kHz may."""
 SIGNALS: tuple[Signal, ...] = ("error", "pol")
 
 
@@ -65,8 +67,8 @@ class LinearLaw:
             if not np.isfinite(array).all():
                 raise ValueError(f"{name} holds values that are not finite")
             object.__setattr__(self, name, array)
-        if not (states and modes):
-            raise ValueError("a law must have states and modes")
+        if not (states and modes) or states > MOST_STATES:
+            raise ValueError(f"a law must have modes, and 1 to {MOST_STATES} states; got {modes} and {states}")
         delay_weights(self.delay_frames)  # says what is wrong with a delay
         if not (np.isfinite(self.rate_hz) and self.rate_hz > 0):
             raise ValueError(f"rate_hz must be above 0, got {self.rate_hz}")

@@ -1,9 +1,18 @@
-"""A calibration taken into use: the mirror stays where it is, whatever changes."""
+"""A calibration or a mode taken into use: the mirror stays where it is, whatever changes."""
 
+import numpy as np
+import numpy.typing as npt
+
+from lowfc.control.additions import ADOPTED, Channel
 from lowfc.control.calibration import Calibration
 from lowfc.control.inputs import Raised
 from lowfc.control.safety import LoopMode
 from lowfc.control.state import Drive, Settings, State
+
+Single = npt.NDArray[np.float32]
+
+ADOPTED_NM = 1.0
+"""Of an actuator beyond the modal command, above which a mirror's shape is adopted as a channel."""
 
 
 def loaded(settings: Settings, state: State, calibration: Calibration, source: str) -> tuple[State, list[Raised]]:
@@ -13,6 +22,7 @@ def loaded(settings: Settings, state: State, calibration: Calibration, source: s
     modes. Offset, play and a law of other modes are of no meaning any more.
     """
     drive, before = Drive.at_rest(settings, calibration), state.drive
+    events: list[Raised] = []
     if before is not None and before.actuators_nm.shape == calibration.grid:
         shape_nm = before.actuators_nm
         same = before.calibration.noll == calibration.noll
@@ -30,6 +40,8 @@ def loaded(settings: Settings, state: State, calibration: Calibration, source: s
             actuators_nm=before.actuators_nm,
             history_nm=(command_nm,) * len(drive.history_nm),
         )
+        drive, rest = adopted(drive, shape_nm)
+        events += rest
     mode = settings.start_mode if state.mode is LoopMode.IDLE else state.mode
     details: dict[str, object] = {
         "id": calibration.id[:12],
@@ -37,10 +49,39 @@ def loaded(settings: Settings, state: State, calibration: Calibration, source: s
         "estimator": calibration.estimator,
         "source": source,
     }
-    events = [Raised("CALIBRATION_LOADED", details)]
+    events.insert(0, Raised("CALIBRATION_LOADED", details))
     if mode is not state.mode:
         events.append(mode_event(state.mode, mode, "a calibration was loaded"))
     return state._replace(mode=mode, drive=drive), events
+
+
+def adopted(drive: Drive, shape_nm: Single) -> tuple[Drive, list[Raised]]:
+    """What a shape (rows, columns) has beyond the modal command, kept as a channel; the driver's rounding is not."""
+    rest_nm = shape_nm.copy()
+    rest_nm -= (drive.to_actuators @ drive.history_nm[0]).reshape(rest_nm.shape)
+    if not np.abs(rest_nm).max() > ADOPTED_NM:
+        return drive, []
+    added = drive.added()
+    channels = {one.name: one for one in added.channels}
+    before_nm = channels[ADOPTED].wanted_nm if ADOPTED in channels else np.zeros_like(rest_nm)
+    channels[ADOPTED] = Channel(ADOPTED, before_nm + rest_nm, before_nm + rest_nm)
+    added = added.at(tuple(channels[name] for name in sorted(channels)), drive.to_modes)
+    rms_nm = float(np.sqrt(np.mean(np.square(rest_nm))))
+    drive = drive._replace(additions=added.passed(len(added.shifts_nm)))
+    return drive, [Raised("SHAPE_ADOPTED", {"rms_nm": rms_nm})]
+
+
+def in_mode(state: State, mode: LoopMode) -> State:
+    """Nothing of the last mode goes on in the next one."""
+    drive = state.drive
+    if drive is not None and mode is not state.mode:
+        if drive.additions is not None:
+            safed = mode is LoopMode.SAFED
+            added = drive.additions.stopped(state.frame_sequence)
+            drive = drive._replace(additions=added.lowered(drive.to_modes, only_flat=True) if safed else added)
+        if drive.following is not None and mode is LoopMode.CLOSED:
+            drive = drive._replace(following=drive.following.taking_over())
+    return state._replace(mode=mode, drive=drive, steps_left=0, homing=state.homing and mode is state.mode)
 
 
 def mode_event(before: LoopMode, after: LoopMode, why: str) -> Raised:

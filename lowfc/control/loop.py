@@ -11,7 +11,6 @@ import numpy as np
 import numpy.typing as npt
 
 from lowfc.control import linear_law
-from lowfc.control.additions import ADOPTED, Channel
 from lowfc.control.estimator import Estimate, filled, saturated_pixels
 from lowfc.control.inputs import (
     CameraSettings,
@@ -28,15 +27,13 @@ from lowfc.control.inputs import (
     Tick,
 )
 from lowfc.control.law import integrate
-from lowfc.control.loading import loaded, mode_event
+from lowfc.control.loading import adopted, in_mode, loaded, mode_event
 from lowfc.control.requests import answer
 from lowfc.control.safety import LoopMode, Reason, limit
 from lowfc.control.state import Drive, Settings, State
 
 Single = npt.NDArray[np.float32]
 
-ADOPTED_NM = 1.0
-"""Of an actuator beyond the modal command, above which a mirror's shape is adopted as a channel."""
 COUNT_BITS = 32
 """A frame's sequence is its publisher's start in seconds, shifted by this, and its count."""
 
@@ -76,11 +73,11 @@ def _frame(settings: Settings, state: State, frame: Frame) -> tuple[State, Outpu
     if reasons != state.limits_hit:
         _limit_events(state.limits_hit, reasons, events)
     mode, command_nm = state.mode, drive.history_nm[0]
-    steps_left = max(state.steps_left - 1, 0)
-    if state.steps_left == 1:
+    steps_left, ended = max(state.steps_left - 1, 0), state.steps_left == 1
+    if ended:
         events += [Raised("LOOP_STEPPED", {}), mode_event(mode, LoopMode.OPEN, "its last step is done")]
     state = State(  # made anew: `_replace` takes four times as long
-        LoopMode.OPEN if state.steps_left == 1 else mode,
+        mode,
         drive,
         frame.sequence,
         frame.time_ns,
@@ -92,6 +89,8 @@ def _frame(settings: Settings, state: State, frame: Frame) -> tuple[State, Outpu
         homing=homing,
         taken=state.taken + 1,
     )
+    if ended:
+        state = in_mode(state, LoopMode.OPEN)
     step = Step(
         frame.sequence,
         frame.time_ns,
@@ -104,7 +103,7 @@ def _frame(settings: Settings, state: State, frame: Frame) -> tuple[State, Outpu
         saturated,
     )
     command = Command(frame.sequence, frame.time_ns, drive.actuators_nm, command_nm)
-    return state, Outputs(step, command, None, events, changed=state.mode is not mode)
+    return state, Outputs(step, command, None, events, changed=ended)
 
 
 def _arrive(state: State, frame: Frame, events: list[Raised]) -> Drive | None:
@@ -172,12 +171,14 @@ def _follow(
     if state.mode is LoopMode.SAFED:
         return _relax(settings, drive), (), False
     added, homing = drive.additions, state.homing
-    if state.mode is not LoopMode.CLOSED and not homing and (added is None or not added.moving):
+    closed = state.mode is LoopMode.CLOSED
+    # A limit that acted on the last command has kept the mirror from where it was to go.
+    if not closed and not homing and (added is None or not (added.moving or state.limits_hit)):
         return drive.stayed(1), (), False
     command_nm, cut = drive.history_nm[0], False
     if homing:
         command_nm = np.zeros_like(command_nm)
-    elif state.mode is LoopMode.CLOSED:
+    elif closed:
         command_nm, cut = _respond(drive, error_nm)
     wanted_nm = (drive.to_actuators @ command_nm).reshape(drive.calibration.grid)
     extra_nm: Single | None = None
@@ -188,13 +189,14 @@ def _follow(
         extra_nm = added.sum_nm if played_nm is None else added.sum_nm + played_nm
         wanted_nm += extra_nm
     limited = limit(settings.limits, drive.actuators_nm, wanted_nm)
-    if limited.reasons:  # the modal command becomes what was kept: for pseudo-open-loop, and against wind-up
+    if limited.reasons and (closed or homing):  # the modal command becomes what was kept, against wind-up
         kept_nm = limited.actuators_nm
         if extra_nm is not None:
             kept_nm = np.subtract(kept_nm, extra_nm)
         command_nm = drive.inverse @ kept_nm.reshape(-1)
     reasons = (Reason.MODAL_LIMIT, *limited.reasons) if cut else limited.reasons
-    return drive.pushed(command_nm, limited.actuators_nm), reasons, homing and bool(limited.reasons)
+    homing = homing and bool(limited.reasons) and not np.array_equal(limited.actuators_nm, drive.actuators_nm)
+    return drive.pushed(command_nm, limited.actuators_nm), reasons, homing
 
 
 def _respond(drive: Drive, error_nm: Single) -> tuple[Single, bool]:
@@ -296,18 +298,13 @@ def _mirror(settings: Settings, state: State, shape: MirrorShape) -> tuple[State
     limit_nm = drive.law.limit_nm
     believed = shape.command_nm.shape == limit_nm.shape and (np.abs(shape.command_nm) <= limit_nm).all()
     command_nm = shape.command_nm if believed else drive.inverse @ shape.actuators_nm.reshape(-1)
-    rest_nm = shape.actuators_nm.copy()
-    rest_nm -= (drive.to_actuators @ command_nm).reshape(rest_nm.shape)
     drive = drive._replace(actuators_nm=shape.actuators_nm, history_nm=(command_nm,) * len(drive.history_nm))
     events = []
     if command_nm.any():
         events.append(Raised("MIRROR_ADOPTED", {"rms_nm": float(np.sqrt(command_nm @ command_nm))}))
-    if state.mode is LoopMode.SAFED:
-        rest_nm[:] = 0  # it is on its way to flat, and shall stay there
-    if np.abs(rest_nm).max() > ADOPTED_NM:  # beyond the driver's rounding: somebody's channel
-        added = drive.added().at((Channel(ADOPTED, rest_nm, rest_nm),), drive.to_modes)
-        drive = drive._replace(additions=added.passed(len(added.shifts_nm)))
-        events.append(Raised("SHAPE_ADOPTED", {"rms_nm": float(np.sqrt(np.mean(np.square(rest_nm))))}))
+    if state.mode is not LoopMode.SAFED:  # then it is on its way to flat, and shall stay there
+        drive, rest = adopted(drive, shape.actuators_nm)
+        events += rest
     return state._replace(drive=drive), Outputs(events=events, changed=True)
 
 
@@ -332,7 +329,7 @@ def _camera(settings: Settings, state: State, camera: CameraSettings) -> tuple[S
         Raised("CAMERA_CHANGED", {"what": "; ".join(wrong)}),
         mode_event(state.mode, LoopMode.OPEN, "the camera changed"),
     ]
-    return state._replace(mode=LoopMode.OPEN, steps_left=0), Outputs(events=events, changed=True)
+    return in_mode(state, LoopMode.OPEN), Outputs(events=events, changed=True)
 
 
 def _request(settings: Settings, state: State, request: Request) -> tuple[State, Outputs]:

@@ -13,7 +13,7 @@ import numpy.typing as npt
 from lowfc.control.additions import FLAT, MIRROR, OFFSET, Additions, play
 from lowfc.control.inputs import Raised, Request
 from lowfc.control.law import Law
-from lowfc.control.loading import loaded, mode_event
+from lowfc.control.loading import in_mode, loaded, mode_event
 from lowfc.control.margins import check_stable
 from lowfc.control.safety import Limits, LoopMode, neighbour_difference_nm, request_mode
 from lowfc.control.stability import limiting_gain
@@ -66,7 +66,7 @@ def _mode(settings: Settings, state: State, request: Request) -> Handled:
     after, refusal = request_mode(state.mode, asked, calibrated=state.drive is not None)
     if refusal:
         raise ValueError(refusal)
-    return _in_mode(state, after), f"loop {after.name.lower()}"
+    return in_mode(state, after), f"loop {after.name.lower()}"
 
 
 def _step(settings: Settings, state: State, request: Request) -> Handled:
@@ -76,7 +76,7 @@ def _step(settings: Settings, state: State, request: Request) -> Handled:
     after, refusal = request_mode(state.mode, "close", calibrated=state.drive is not None)
     if refusal:
         raise ValueError(refusal)
-    state = _in_mode(state, after)
+    state = in_mode(state, after)
     return state._replace(steps_left=int(frames)), f"loop closed for {frames:g} frames"
 
 
@@ -106,7 +106,8 @@ def _law_of_modes(settings: Settings, state: State, request: Request) -> Handled
 def _offset(settings: Settings, state: State, request: Request) -> Handled:
     drive = _drive(state)
     added = drive.added()
-    values = _per_mode(drive.calibration.noll, request, added.offset_nm) if request.values else added.offset_nm * 0
+    asked = request if request.values else replace(request, values=(0.0,))
+    values = _per_mode(drive.calibration.noll, asked, added.offset_nm)
     if (np.abs(values) > drive.law.limit_nm).any():
         raise ValueError(f"an offset may be as large as the mode's limit, {drive.law.limit_nm.tolist()} nm")
     text = " ".join(f"{value:g}" for value in values.tolist())
@@ -125,6 +126,7 @@ def _channel(settings: Settings, state: State, request: Request) -> Handled:
         wanted_nm = request.actuators_nm.reshape(grid)
     _check_shape(settings.limits, wanted_nm)
     added = drive.added().with_channel(request.text, wanted_nm, drive.to_modes)
+    _check_shape(settings.limits, sum((one.wanted_nm for one in added.channels), np.zeros(grid, np.float32)))
     rms_nm = float(np.sqrt(np.mean(np.square(wanted_nm, dtype=np.float64))))
     return _with(state, drive, added), f"channel {request.text}: {rms_nm:.3g} nm rms of surface"
 
@@ -133,6 +135,8 @@ def _play(settings: Settings, state: State, request: Request) -> Handled:
     drive = _drive(state)
     if state.mode not in (LoopMode.OPEN, LoopMode.CLOSED):
         raise ValueError(f"nothing can be played while the loop is {state.mode.name.lower()}")
+    if not state.frame_sequence:
+        raise ValueError("no frame has come yet, from which to count those of a play")
     added = drive.added()
     if added.play is not None:
         raise ValueError("something is being played already: `lowfc ctl stop` ends it")
@@ -167,6 +171,11 @@ def _law(settings: Settings, state: State, request: Request) -> Handled:
     law = request.law
     if law.noll != drive.calibration.noll:
         raise ValueError(f"the law is of the modes {list(law.noll)}, the loop of {list(drive.calibration.noll)}")
+    if law.signal == "pol" and abs(law.delay_frames - settings.delay_frames) > 1e-3:
+        raise ValueError(
+            f"the law reckons with a delay of {law.delay_frames:g} frames, the loop with {settings.delay_frames:g}: "
+            "set control.delay_frames, or make the law for that"
+        )
     check_stable(law, settings.delay_frames)
     drive = drive._replace(following=Following.at_rest(law))
     return state._replace(drive=drive), f"the law {law.name!r} takes over from the integrator"
@@ -197,19 +206,6 @@ def _drive(state: State) -> Drive:
     if state.drive is None:
         raise ValueError("no calibration is loaded, so there are no modes yet")
     return state.drive
-
-
-def _in_mode(state: State, mode: LoopMode) -> State:
-    """Nothing of the last mode goes on in the next one."""
-    drive = state.drive
-    if drive is not None and mode is not state.mode:
-        if drive.additions is not None:
-            safed = mode is LoopMode.SAFED
-            added = drive.additions.stopped(state.frame_sequence)
-            drive = drive._replace(additions=added.lowered(drive.to_modes, only_flat=True) if safed else added)
-        if drive.following is not None and mode is LoopMode.CLOSED:
-            drive = drive._replace(following=drive.following.taking_over())
-    return state._replace(mode=mode, drive=drive, steps_left=0, homing=state.homing and mode is state.mode)
 
 
 def _with(state: State, drive: Drive, additions: Additions) -> State:

@@ -91,6 +91,7 @@ class Controller:
         self._offloads = service.publisher(OFFLOAD)
         self._offload_frames = max(1, round(1e9 / float(OFFLOAD.rate) / config.period_ns))
         self._offloaded_nm, self._offloaded = np.zeros(0), 0
+        self._offloaded_noll: tuple[int, ...] = ()
         self._queries: deque[Query] = deque()
         service.bus.queryable(REQUEST_KEY.format(name=ALL), self._ask)
         self._frame_to_command = Durations()
@@ -222,6 +223,9 @@ class Controller:
         if request.calibration is not None:
             self._calibrations.put(encode_calibration(request.calibration, now_ns))
         outputs = self._advance(request)
+        drive, reply = self._state.drive, outputs.reply
+        if request.calibration is not None and drive is not None and reply is not None and not reply.accepted:
+            self._calibrations.put(encode_calibration(drive.calibration, now_ns))  # the last one is that in use
         return request, outputs, self._state.taken
 
     def _adopt_mirror(self) -> None:
@@ -287,13 +291,15 @@ class Controller:
 
     def _offload(self, step: Step) -> None:
         """Once a second, the mean modal command, for whoever can take it over; by counting, as lockstep needs it."""
-        if self._offloaded_nm.shape != step.command_nm.shape:
-            self._offloaded_nm, self._offloaded = np.zeros(step.command_nm.shape), 0
+        if self._state.drive is None:
+            return
+        noll = self._state.drive.calibration.noll
+        if self._offloaded_noll != noll:
+            self._offloaded_nm, self._offloaded, self._offloaded_noll = np.zeros(len(noll)), 0, noll
         self._offloaded_nm += step.command_nm
         self._offloaded += 1
-        if self._offloaded >= self._offload_frames and self._state.drive is not None:
-            mean_nm, noll = self._offloaded_nm / self._offloaded, self._state.drive.calibration.noll
-            self._offloads.put(codec.encode_offload(step, noll, mean_nm, self._offloaded))
+        if self._offloaded >= self._offload_frames:
+            self._offloads.put(codec.encode_offload(step, noll, self._offloaded_nm / self._offloaded, self._offloaded))
             self._offloaded_nm[:] = self._offloaded = 0
 
     def _publish_state(self, time_ns: int) -> None:

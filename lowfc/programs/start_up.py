@@ -13,7 +13,7 @@ from lowfc.contract.errors import ConfigurationError, DataFileError, LowfcError
 from lowfc.control.additions import ADOPTED, FLAT
 from lowfc.control.inputs import Request
 from lowfc.control.linear_law import LinearLaw
-from lowfc.control.loop import ADOPTED_NM
+from lowfc.control.loading import ADOPTED_NM
 from lowfc.control.margins import check_stable
 from lowfc.control.safety import Reason, limit
 from lowfc.control.state import State

@@ -125,6 +125,7 @@ def lqg_of(bench: Bench, delay: float) -> LinearLaw:
     return tune_lqg(bench.pol(), identified(bench.pol(), RATE_HZ), gains, bench.noll, none, delay).law
 
 
+@pytest.mark.slow
 def test_lqg_in_images_from_a_closed_loop() -> None:
     """The live loop's own steps: integrator, LQG identified from its closed loop, captured from 14 mas open loop."""
     config = configured()

@@ -22,6 +22,7 @@ lowest_hz = 1.5
 """
 
 
+@pytest.mark.slow
 def test_rejection_of_a_running_loop_and_of_its_log(tmp_path: Path) -> None:
     (tmp_path / "loop.toml").write_text(TOML)
     words = ("--duration", "4", "--lines", "8", "--json", "--plot", "live.png")

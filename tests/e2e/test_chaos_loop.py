@@ -10,7 +10,7 @@ from loops import LOWFC, run
 
 from lowfc.programs.chaos_cases import CASES
 
-QUICK = ("frames-random", "kill-controller")
+QUICK = ("frames-random",)
 STALLS = tuple(name for name in CASES if name.startswith("stall-"))
 WAIT_S = 200
 

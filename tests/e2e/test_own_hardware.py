@@ -149,6 +149,7 @@ def test_the_loop_closes_on_a_camera_and_a_mirror_of_ones_own(bench: Path) -> No
     assert before_nm == pytest.approx(17, rel=0.15)
 
 
+@pytest.mark.slow
 def test_the_simulated_devices_and_a_camera_in_plain_zenoh_keep_the_contract(bench: Path) -> None:
     y, x = np.mgrid[:80, :80]
     spot = 100 + 2000 * np.exp(-((y - 40) ** 2 + (x - 30) ** 2) / 50)

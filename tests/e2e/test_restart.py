@@ -111,7 +111,7 @@ def bench(folder: Path) -> Iterator[Bench]:
 
 
 ORDERS = list(itertools.permutations(["camera", "mirror", "controller"]))
-QUICK = (("camera", "mirror", "controller"), ("controller", "mirror", "camera"), ("mirror", "camera", "controller"))
+QUICK = (("mirror", "camera", "controller"),)
 
 
 @pytest.mark.parametrize(

@@ -132,6 +132,7 @@ def test_a_process_that_dies_is_named(tmp_path: Path) -> None:
     assert list((tmp_path / "logs").glob("*.mcap")), "the log is finished all the same"
 
 
+@pytest.mark.slow
 def test_two_loops_on_one_host_do_not_mix(tmp_path: Path) -> None:
     first, second = (tmp_path / name for name in ("first", "second"))
     for folder in (first, second):

@@ -48,6 +48,7 @@ def live(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
     assert process.returncode == 130 or process.returncode == 0
 
 
+@pytest.mark.slow
 @pytest.mark.viewer
 @needs_vulkan
 def test_every_panel_of_every_tab_shows_the_live_loop(live: str, artefacts: Path) -> None:
