@@ -2,9 +2,11 @@
 
 from pathlib import Path
 
+import pytest
 from test_docs import DESIGN, FILES, LOGS, VALIDATE, run
 
 
+@pytest.mark.slow
 def test_the_validation(tmp_path: Path) -> None:
     said = run(tmp_path, VALIDATE[0])
     assert "tilt" in said

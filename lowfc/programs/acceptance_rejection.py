@@ -42,8 +42,8 @@ class Excitation:
 def play(live: Live, how: Excitation, required: Acceptance) -> Played:
     """Play a multisine to the closed loop.
 
-    It goes to the offset of the loop; to the mirror where the law is one of pseudo-open-loop modes, which know of no
-    offset.
+    It goes to the offset of the loop; to the mirror where the law is one of pseudo-open-loop modes, for how such a law
+    goes to an offset is not how it rejects a disturbance.
 
     Raises:
         AcceptanceError: the duration is too short for the lines, or a mode is not one of the loop's.
