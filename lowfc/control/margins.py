@@ -18,6 +18,9 @@ Array = npt.NDArray[np.float64]
 Complex = npt.NDArray[np.complex128]
 Whole = npt.NDArray[np.intp]
 
+MOST_COUPLED = 100
+"""States that have to do with each other: the poles of so many take 30 ms, within which no frame is answered."""
+
 _GRID = 2048
 _AROUND_POLE = np.concatenate([-np.geomspace(1e-2, 1e2, 33)[::-1], [0.0], np.geomspace(1e-2, 1e2, 33)])
 _LOWEST = 1e-6  # rad per frame: an integrator has no value at 0 Hz
@@ -80,10 +83,16 @@ def check_stable(law: LinearLaw, delay_frames: float) -> None:
     It takes a few milliseconds, for poles are all it needs; `margins` takes a hundred times as long.
 
     Raises:
-        ValueError: it does not settle; the sentence has the pole.
+        ValueError: it does not settle, and the sentence has the pole; or more than `MOST_COUPLED` states have to do
+            with each other.
     """
     weights = delay_weights(delay_frames)
     for part in _parts(law):
+        if len(part.F) > MOST_COUPLED:
+            raise ValueError(
+                f"{len(part.F)} states of the law {law.name!r} have to do with each other; {MOST_COUPLED} are the most "
+                "whose poles can be found between two frames"
+            )
         matrices = (
             ("closed", part.closed(weights)),
             ("open", part.F),

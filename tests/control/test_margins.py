@@ -9,7 +9,16 @@ from test_linear_law import LAWS, NOLL, RATE_HZ, run
 from lowfc.control import stability
 from lowfc.control.law import Law
 from lowfc.control.linear_law import LinearLaw, integrator, integrator_block, of_blocks
-from lowfc.control.margins import as_linear, check_stable, margins, noise_gain, noise_transfer, rejection, sentence
+from lowfc.control.margins import (
+    MOST_COUPLED,
+    as_linear,
+    check_stable,
+    margins,
+    noise_gain,
+    noise_transfer,
+    rejection,
+    sentence,
+)
 from lowfc.control.pi_notch import Notch, pi_notch
 
 FREQUENCY_HZ = np.geomspace(0.1, 499, 200)
@@ -143,3 +152,11 @@ def test_the_integrator_is_turned_into_a_linear_law_and_a_linear_law_is_left() -
     law = LAWS["pi"]
     assert as_linear(law, NOLL, 1.0, RATE_HZ) is law
     assert as_linear(plain(0.5), (4,), 1.0, RATE_HZ).name == "integrator"
+
+
+def test_a_law_that_is_one_large_system_is_refused_at_once() -> None:
+    states, ones = MOST_COUPLED + 1, np.ones((MOST_COUPLED + 1, 1), np.float32)
+    dense = np.full((states, states), 1e-3, np.float32)
+    law = LinearLaw("error", dense, ones, 0 * ones, dense, -ones.T, "dense", (4,), 1.0, RATE_HZ)
+    with pytest.raises(ValueError, match="have to do with each other"):
+        check_stable(law, 1.0)
