@@ -13,10 +13,7 @@ Example:
 
 import argparse
 import contextlib
-import json
 import os
-import shlex
-import sys
 import time
 import warnings
 from collections.abc import Callable, Iterator, Sequence
@@ -31,8 +28,7 @@ from astropy.io.fits.verify import VerifyWarning
 from rich.console import Console
 
 from benchmarks import cells
-from benchmarks.command import run_main
-from benchmarks.host import host
+from benchmarks.command import add_forms, occasion, run_main, say
 from benchmarks.load import Watched
 from benchmarks.sizes import FRAMES, Size, configuration, made_up
 from lowfc.adapters import calibration_file
@@ -47,8 +43,8 @@ from lowfc.contract.messages import Role
 from lowfc.control.safety import LoopMode
 from lowfc.programs.control_step import ControlStep
 from lowfc.programs.frame_source import FRAMES_FILE, Payloads
-from lowfc.programs.latency_figures import WARM_UP_S
-from lowfc.programs.latency_run import Asked, run_repeats
+from lowfc.programs.latency.figures import WARM_UP_S
+from lowfc.programs.latency.run import Asked, run_repeats
 
 Figures = dict[str, Any]
 
@@ -340,7 +336,7 @@ def main() -> int:
     if not any(curves.values()):
         raise SystemExit("nothing to measure: name sizes of --pixels, --modes or --actuators")
     require_folder(asked.plot)
-    load_before, date = os.getloadavg()[0], time.strftime("%Y-%m-%d", time.gmtime())
+    measured = occasion("python -m benchmarks.curves")
     set_up(None, None, lock_memory=False, stay_awake=False)
     with passing_bar(Console(stderr=True)) as bar:
         task = bar.add_task("curves", total=None)
@@ -352,15 +348,11 @@ def main() -> int:
         "seconds": asked.seconds,
         "repeats": asked.repeats,
         "rate_hz": rate_hz,
-        "host": host(),
-        "load_before": round(load_before, 2),
-        "date": date,
-        "command": shlex.join(["python", "-m", "benchmarks.curves", *sys.argv[1:]]),
+        **measured,
     }
     if asked.plot is not None:
         write_whole(asked.plot, picture(result))
-    say = json.dumps if asked.json else markdown if asked.markdown else text
-    sys.stdout.write(say(result) + "\n")
+    say(result, asked, text, markdown)
     return 1 if any(one["failures"] for points in found.values() for one in points) else 0
 
 
@@ -379,8 +371,7 @@ def _parser() -> argparse.ArgumentParser:
     ):
         parser.add_argument(f"--{name}", type=int, nargs="*", default=values, metavar="N", help=f"{what} (%(default)s)")
     parser.add_argument("--plot", type=Path, metavar="FILE.png", help="draw the curves")
-    parser.add_argument("--json", action="store_true", help="print one JSON object")
-    parser.add_argument("--markdown", action="store_true", help="print the tables in Markdown")
+    add_forms(parser, "the tables")
     return parser
 
 

@@ -9,8 +9,6 @@ Example:
 """
 
 import argparse
-import json
-import sys
 import time
 import tracemalloc
 from collections.abc import Callable, Iterator
@@ -22,7 +20,7 @@ from typing import Any
 import numpy as np
 
 from benchmarks import cells
-from benchmarks.command import run_main
+from benchmarks.command import add_forms, run_main, say
 from benchmarks.host import host
 from benchmarks.sizes import Size, configuration, made_up
 from lowfc.adapters.realtime import set_up
@@ -33,7 +31,7 @@ from lowfc.control.safety import LoopMode
 from lowfc.control.state import Drive
 from lowfc.programs.control_step import ControlStep
 from lowfc.programs.frame_source import Payloads
-from lowfc.programs.latency_figures import percentiles
+from lowfc.programs.latency.figures import percentiles
 
 RATE_HZ = 1000.0
 STAGES: dict[str, tuple[Any, str]] = {
@@ -56,16 +54,9 @@ def main() -> int:
     """The command line; returns its exit status."""
     parser = argparse.ArgumentParser("python -m benchmarks.step", description=__doc__.splitlines()[0])
     parser.add_argument("--seconds", type=float, default=5.0, help="of each of both (%(default)s)")
-    shown = parser.add_mutually_exclusive_group()
-    shown.add_argument("--json", action="store_true", help="print one JSON object")
-    shown.add_argument("--markdown", action="store_true", help="print a table for a document")
+    add_forms(parser)
     asked = parser.parse_args()
-    found = measure(asked.seconds)
-    if asked.json:
-        sys.stdout.write(json.dumps(found) + "\n")
-    else:
-        lines = table(found)
-        sys.stdout.write(f"{cells.markdown(lines) if asked.markdown else cells.text(lines)}\n\n{remarks(found)}\n")
+    say(measure(asked.seconds), asked, text, markdown)
     return 0
 
 
@@ -128,6 +119,16 @@ def table(found: dict[str, Any]) -> list[list[str]]:
     head = ["us", "back to back p50", "p99", f"at {found['rate_hz']:g} Hz p50", "p99"]
     stages = (*STAGES, REST, STEP, PRODUCT)
     return [head, *([stage, *(f"{found[name][stage][at]:.1f}" for name, at in columns)] for stage in stages)]
+
+
+def text(found: dict[str, Any]) -> str:
+    """The table and what it does not say for a terminal."""
+    return f"{cells.text(table(found))}\n\n{remarks(found)}"
+
+
+def markdown(found: dict[str, Any]) -> str:
+    """The table and what it does not say for a document."""
+    return f"{cells.markdown(table(found))}\n\n{remarks(found)}"
 
 
 def remarks(found: dict[str, Any]) -> str:

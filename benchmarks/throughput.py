@@ -28,8 +28,7 @@ from typing import Any, NamedTuple
 from rich.console import Console
 
 from benchmarks import cells
-from benchmarks.command import run_main
-from benchmarks.host import host
+from benchmarks.command import add_forms, occasion, run_main, say
 from benchmarks.load import Watched
 from lowfc.adapters.bus import Sample
 from lowfc.adapters.clock import HostClock
@@ -37,12 +36,12 @@ from lowfc.adapters.progress import passing_bar
 from lowfc.adapters.run import open_run
 from lowfc.adapters.zenoh_bus import ZenohBus
 from lowfc.contract.messages import FRAME, HEALTH, Role, wire
-from lowfc.programs.latency_figures import WARM_UP_S
+from lowfc.programs.latency.figures import WARM_UP_S
 from lowfc.programs.watch import topic_count
 
 Figures = dict[str, Any]
 
-SIMULATED, PREPARED, FREE = "sim-loop", "latency", "latency --free-running"
+SIMULATED, PREPARED = "sim-loop", "latency"
 WAYS = {
     "simulated camera, recorder": [SIMULATED],
     "simulated camera": [SIMULATED, "--no-record"],
@@ -326,7 +325,7 @@ def main() -> int:
         raise SystemExit("--lowest must be above 0 and at most --highest, and --step above 1")
     every = WAYS | FREE_RUNNING
     chosen = asked.way or list(every)
-    load_before, date = os.getloadavg()[0], time.strftime("%Y-%m-%d", time.gmtime())
+    measured = occasion("python -m benchmarks.throughput")
     rates = grid(asked.lowest, asked.highest, asked.step)
     ways: Figures = {}
     free: Figures = {}
@@ -343,13 +342,9 @@ def main() -> int:
         "free_running": free,
         "seconds": asked.seconds,
         "rates_hz": rates,
-        "host": host(),
-        "load_before": round(load_before, 2),
-        "date": date,
-        "command": shlex.join(["python", "-m", "benchmarks.throughput", *sys.argv[1:]]),
+        **measured,
     }
-    say = json.dumps if asked.json else markdown if asked.markdown else text
-    sys.stdout.write(say(result) + "\n")
+    say(result, asked, text, markdown)
     return 0
 
 
@@ -362,8 +357,7 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--highest", type=float, default=10_000.0, help="rate of the grid, Hz (%(default)g)")
     parser.add_argument("--step", type=float, default=1.1, help="from one rate to the next (%(default)g times)")
     parser.add_argument("--way", action="append", choices=[*WAYS, *FREE_RUNNING], help="only this one; repeat")
-    parser.add_argument("--json", action="store_true", help="print one JSON object")
-    parser.add_argument("--markdown", action="store_true", help="print the tables in Markdown")
+    add_forms(parser, "the tables")
     return parser
 
 

@@ -1,5 +1,6 @@
-"""The simulated loop without processes, law after law: sensor images, the live loop's own `advance`, true residuals."""
+"""The simulated loop without processes: sensor images, the live loop's own `advance`, the mirror, true residuals."""
 
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -9,17 +10,20 @@ import numpy.typing as npt
 from lowfc.adapters import instrument
 from lowfc.contract.configuration import Configuration, load, sensor_keys
 from lowfc.control.calibration import Calibration
-from lowfc.control.inputs import Frame, Load, Request
+from lowfc.control.inputs import Frame, Load, Request, Step
 from lowfc.control.linear_law import LinearLaw
 from lowfc.control.loop import advance
-from lowfc.control.safety import LoopMode
 from lowfc.control.spectra import Pieces
 from lowfc.control.stability import delay_weights
 from lowfc.control.state import State
+from lowfc.control.tuning import Tuned, best_gains, identified, tune_integrator, tune_lqg, tune_pi_notch
 from lowfc.optics.photometry import tilt_nm_per_mas
 from sim_camera.bench import Bench as Scene
+from sim_camera.bench import Truth
 from sim_camera.disturbance import LINES_HZ, Disturbance
-from sim_camera.process import disturbance_of
+from sim_camera.process import disturbance_of, ignore
+from sim_dm.device import Told, initial, obey
+from sim_dm.process import device
 
 Array = npt.NDArray[np.float64]
 
@@ -37,8 +41,8 @@ def configured(
 
 def calibrated(config: Configuration) -> Calibration:
     """The analytic calibration of a configuration."""
-    optics = instrument.twin(config, None, print)
-    return instrument.analytic_calibration(config, optics, instrument.mirror_on_twin(config, optics, print))
+    optics = instrument.twin(config, None, ignore)
+    return instrument.analytic_calibration(config, optics, instrument.mirror_on_twin(config, optics, ignore))
 
 
 def with_lines_moved(shaken: Disturbance, factor: float) -> Disturbance:
@@ -48,47 +52,47 @@ def with_lines_moved(shaken: Disturbance, factor: float) -> Disturbance:
 
 
 class Bench:
-    """A loop that begins open, its mirror flat; what it did is kept until `forget`.
+    """A loop in one process, its mirror flat to begin with; what it did is kept until `forget`.
 
     Attributes:
-        noll: Noll index of each mode.
+        config: the instrument's.
         nm_per_mas: of tilt.
         refused: frames that the controller did not use.
     """
 
     def __init__(self, config: Configuration, calibration: Calibration, shaken: Disturbance | None = None) -> None:
         """Build the optics; `shaken` is another disturbance than the configuration's."""
-        self._config = config
-        optics = instrument.twin(config, None, print)
+        self.config = config
+        self.nm_per_mas = tilt_nm_per_mas(config.star.diameter_m)
+        self.refused = 0
+        optics = instrument.twin(config, None, ignore)
         self._scene = Scene(
             optics,
-            instrument.mirror_on_twin(config, optics, print),
+            instrument.true_mirror_on_twin(config, optics, ignore),
             instrument.detector(config),
             instrument.electrons_per_exposure(config),
             disturbance_of(config) if shaken is None else shaken,
             config.camera.rate_hz,
             config.seed,
+            config.camera.noise,
         )
-        settings = replace(instrument.settings(config), start_mode=LoopMode.OPEN)
-        self._settings = settings
-        self._state = advance(settings, State(), Load(0, calibration, "bench"))[0]
-        weights = delay_weights(config.camera.delay_frames).astype(np.float32)
-        self._weights = weights
-        self._shapes = [np.zeros(calibration.grid, np.float32)] * len(weights)
+        self._settings = instrument.settings(config)
+        self._state = advance(self._settings, State(), Load(0, calibration, "bench"))[0]
+        self._mirror = device(config)
+        self._status = initial(self._mirror)
+        self._weights = delay_weights(config.camera.delay_frames).astype(np.float32)
+        self._shapes = [self._status.surface_nm] * len(self._weights)
         self._index = 0
-        self.noll = calibration.noll
-        self.nm_per_mas = tilt_nm_per_mas(config.star.diameter_m)
-        self.refused = 0
         self.forget()
 
     def forget(self) -> None:
         """Begin a new record."""
-        self._pol: list[npt.NDArray[np.float32]] = []
-        self._true: list[npt.NDArray[np.float32]] = []
+        self.steps: list[Step] = []
+        self.truths: list[Truth] = []
 
     def ask(self, name: str, **fields: Any) -> None:
         """An operator's request; ValueError where it is refused."""
-        request = Request(self._index * self._config.period_ns, name, **fields)
+        request = Request(self._index * self.config.period_ns, name, **fields)
         self._state, outputs = advance(self._settings, self._state, request)
         if outputs.reply is None or not outputs.reply.accepted:
             raise ValueError(f"{name}: {outputs.reply}")
@@ -100,27 +104,45 @@ class Bench:
     def run(self, frames: int) -> None:
         """Expose, control, move the mirror."""
         for _ in range(frames):
-            seen = np.tensordot(self._weights, np.array(self._shapes), 1)
-            pixels, truth = self._scene.expose(self._index, seen)
-            frame = Frame((1 << 32) + self._index + 1, 10**18 + self._index * self._config.period_ns, 0, pixels)
-            self._state, outputs = advance(self._settings, self._state, frame)
+            pixels, truth = self._scene.expose(self._index, np.tensordot(self._weights, np.array(self._shapes), 1))
+            time_ns = 10**18 + self._index * self.config.period_ns
+            frame = Frame((1 << 32) + self._index, time_ns, 0, pixels)
             self._index += 1
+            self._state, outputs = advance(self._settings, self._state, frame)
             if outputs.step is not None and outputs.step.pol_nm is not None:
-                self._pol.append(outputs.step.pol_nm)
-                self._true.append(truth.residual_nm)
+                self.steps.append(outputs.step)
+                self.truths.append(truth)
             else:
                 self.refused += 1
-            shape = outputs.command.actuators_nm if outputs.command is not None else self._shapes[0]
-            self._shapes = [shape, *self._shapes[:-1]]
+            if outputs.command is not None:
+                command = outputs.command
+                told = Told("lowfc", frame.sequence, time_ns, 10**9, command.actuators_nm, command.command_nm)
+                self._status, refused = obey(self._mirror, self._status, told, time_ns)
+                if refused is not None:
+                    raise ValueError(f"the mirror refused a command: {refused.name}")
+            self._shapes = [self._status.surface_nm, *self._shapes[:-1]]
 
     def pol(self) -> Pieces:
         """Pseudo-open-loop modes (frames, modes) of the record."""
-        return Pieces((np.array(self._pol, np.float64),), 0)
+        return Pieces((np.array([step.pol_nm for step in self.steps], np.float64),), 0)
 
     def residual_nm(self) -> Array:
         """True residual (frames, modes) of the record."""
-        return np.array(self._true, np.float64)
+        return np.array([truth.residual_nm for truth in self.truths], np.float64)
 
     def tilt_mas(self, last: int) -> float:
         """True tilt, rms per axis over the last frames."""
         return float(np.sqrt(np.mean(self.residual_nm()[-last:, :2] ** 2)) / self.nm_per_mas)
+
+
+def tuned(run: Pieces, config: Configuration, kinds: Sequence[str] = ("lqg",)) -> dict[str, Tuned]:
+    """Laws of these kinds for pseudo-open-loop modes (frames, modes), of all modes or the first few."""
+    noll = config.noll[: run.values[0].shape[1]]
+    rate_hz, delay, none = config.camera.rate_hz, config.camera.delay_frames, np.zeros(len(noll))
+    gains, models = best_gains(run, rate_hz, delay, none), identified(run, rate_hz)
+    makers: dict[str, Callable[[], Tuned]] = {
+        "integrator": lambda: tune_integrator(models, gains, noll, none, delay),
+        "pi-notch": lambda: tune_pi_notch(models, gains, noll, none, delay),
+        "lqg": lambda: tune_lqg(run, models, gains, noll, none, delay),
+    }
+    return {kind: makers[kind]() for kind in kinds}

@@ -123,13 +123,15 @@ def command_line(
     document: Path,
     measure: Callable[[], dict[str, Any]],
     render: Callable[[dict[str, Any]], str],
+    begin: str = BEGIN,
+    end: str = END,
 ) -> None:
-    """Measure into a JSON file unless told to take it as it is, and put its table into a document."""
+    """Measure into a JSON file unless told to take it as it is, and put its table between a document's marks."""
     parser = argparse.ArgumentParser(description=about, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--render", action="store_true", help=f"use {measured.relative_to(ROOT)} as it is")
     if not parser.parse_args().render:
         measured.write_text(json.dumps(measure(), indent=1) + "\n")
-    put(document, render(json.loads(measured.read_text())))
+    put(document, render(json.loads(measured.read_text())), begin, end)
 
 
 if __name__ == "__main__":

@@ -8,8 +8,8 @@ Example:
 from typing import Any
 
 import numpy as np
-from law_bench import RATE_HZ, Bench, calibrated, configured, with_lines_moved
-from measure import ROOT, command_line, host
+from law_bench import RATE_HZ, Bench, calibrated, configured, tuned, with_lines_moved
+from measure import BEGIN, END, ROOT, command_line, host
 from rich.progress import track
 from scipy.optimize import minimize
 from threadpoolctl import threadpool_limits
@@ -20,7 +20,7 @@ from lowfc.control.calibration import Calibration
 from lowfc.control.kalman import lqg
 from lowfc.control.linear_law import LinearLaw
 from lowfc.control.margins import noise_gain, rejection
-from lowfc.control.tuning import Tuned, best_gains, identified, tune_integrator, tune_lqg, tune_pi_notch
+from lowfc.control.spectra import Pieces
 from lowfc.control.vibration import Line, Model
 from lowfc.optics.photometry import tilt_nm_per_mas
 from sim_camera.disturbance import LINES_HZ
@@ -29,13 +29,16 @@ from sim_camera.process import disturbance_of
 MEASURED = ROOT / "docs" / "laws.json"
 DOCUMENT = ROOT / "docs" / "tuning.md"
 
-CASES: tuple[tuple[str, str, float, dict[str, Any]], ...] = (
-    ("`sam27d10_bal14`, 14 modes", "sam27d10_bal14", 1.0, {}),
-    ("`sam27d10_bal14`, 14 modes, two frames of delay", "sam27d10_bal14", 2.0, {}),
-    ("`sam27d10_bal14`, 2 modes", "sam27d10_bal14", 1.0, {"sensor.modes": 2}),
-    ("`zwfs`, 14 modes", "zwfs", 1.0, {}),
-)
-IDENTIFY, SETTLE, MEASURE = 16_000, 4_000, 6_000
+CASES: dict[str, dict[str, Any]] = {
+    "`sam27d10_bal14`, 14 modes": {},
+    "`sam27d10_bal14`, 14 modes, two frames of delay": {"delay_frames": 2.0},
+    "`sam27d10_bal14`, 2 modes": {"sensor.modes": 2},
+    "`zwfs`, 14 modes": {"sensor": "zwfs"},
+}
+KINDS = ("integrator", "pi-notch", "lqg")
+SHORTER = (8_000, 16_000)
+"""Frames of the same loop, the last ones, from which an LQG law is made for comparison."""
+IDENTIFY, SETTLE, MEASURE = 48_000, 12_000, 12_000
 """Frames of the closed loop that a law is identified from, until a law has settled, and over which it is measured."""
 _NO_WIDTH_HZ = 1e-8
 _DRIFT_BOUNDS = ((-5.0, 2.0), (-1.0, 2.6))
@@ -46,16 +49,16 @@ def measure() -> dict[str, Any]:
     """Figures of every case."""
     found: dict[str, Any] = {"host": host(), "cases": {}}
     with threadpool_limits(1):
-        for name, sensor, delay, keys in track(CASES, "laws"):
-            found["cases"][name] = case(configured(sensor, delay_frames=delay, **keys), delay)
+        for name in track(CASES, "laws"):
+            found["cases"][name] = case(configured(**CASES[name]))
     return found
 
 
-def case(config: Configuration, delay: float) -> dict[str, Any]:
+def case(config: Configuration) -> dict[str, Any]:
     """What each law leaves of the reaction wheel, mas rms per axis, and the theory of it."""
     calibration = calibrated(config)
     bench = Bench(config, calibration)
-    if delay > 1:
+    if config.camera.delay_frames > 1:
         bench.ask("gain", modes=(2, 3), values=(0.3,))
     bench.ask("close")
     bench.run(SETTLE)
@@ -64,12 +67,17 @@ def case(config: Configuration, delay: float) -> dict[str, Any]:
     figures: dict[str, Any] = {"identified_under_mas": bench.tilt_mas(IDENTIFY), "laws": {}}
     noise_nm = frame_noise_nm(config, calibration)[:2]
     figures["noise_mas"] = float(np.sqrt(np.mean(noise_nm**2)) / bench.nm_per_mas)
-    laws = tuned(bench, delay)
+    run = bench.pol()
+    laws = tuned(run, config, KINDS)
+    figures["theory_by_frames_mas"] = {
+        str(frames): float(np.hypot(*theory_mas(config, calibration, tuned(tilts(run, frames), config)["lqg"].law)))
+        for frames in SHORTER
+    }
     for kind, one in laws.items():
         bench.load(one.law)
         bench.forget()
         bench.run(SETTLE + MEASURE)
-        S, T = theory_mas(config, calibration, one.law, delay)
+        S, T = theory_mas(config, calibration, one.law)
         figures["laws"][kind] = {
             "got_mas": bench.tilt_mas(MEASURE),
             "predicted_mas": float(np.sqrt(np.mean(one.predicted_nm[:2] ** 2)) / bench.nm_per_mas),
@@ -78,24 +86,17 @@ def case(config: Configuration, delay: float) -> dict[str, Any]:
             "gain_margin": float(one.margins.gain_margin[:2].min()),
             "phase_margin_deg": float(one.margins.phase_margin_deg[:2].min()),
         }
-    figures["optimum_mas"] = optimum_mas(config, calibration, delay)
-    figures["moved"] = moved(config, calibration, laws["lqg"].law, delay)
+    figures["optimum_mas"] = optimum_mas(config, calibration)
+    figures["moved"] = moved(config, calibration, laws["lqg"].law)
     return figures
 
 
-def tuned(bench: Bench, delay: float) -> dict[str, Tuned]:
-    """Every law, tuned from what a bench has recorded."""
-    none = np.zeros(len(bench.noll))
-    run = bench.pol()
-    gains, models = best_gains(run, RATE_HZ, delay, none), identified(run, RATE_HZ)
-    return {
-        "integrator": tune_integrator(models, gains, bench.noll, none, delay),
-        "pi-notch": tune_pi_notch(models, gains, bench.noll, none, delay),
-        "lqg": tune_lqg(run, models, gains, bench.noll, none, delay),
-    }
+def tilts(run: Pieces, frames: int) -> Pieces:
+    """The last frames of tip and tilt."""
+    return Pieces((run.values[0][-frames:, :2],), 0)
 
 
-def moved(config: Configuration, calibration: Calibration, law: LinearLaw, delay: float) -> dict[str, float]:
+def moved(config: Configuration, calibration: Calibration, law: LinearLaw) -> dict[str, float]:
     """The lines 2 % higher: under the law of before, and after identifying them again from that closed loop."""
     bench = Bench(config, calibration, with_lines_moved(disturbance_of(config), 1.02))
     bench.load(law)
@@ -104,14 +105,14 @@ def moved(config: Configuration, calibration: Calibration, law: LinearLaw, delay
     bench.forget()
     bench.run(IDENTIFY)
     before = bench.tilt_mas(MEASURE)
-    bench.load(tuned(bench, delay)["lqg"].law)
+    bench.load(tuned(bench.pol(), config)["lqg"].law)
     bench.run(SETTLE + MEASURE)
     return {"before_mas": before, "after_mas": bench.tilt_mas(MEASURE)}
 
 
-def theory_mas(config: Configuration, calibration: Calibration, law: LinearLaw, delay: float) -> tuple[float, float]:
+def theory_mas(config: Configuration, calibration: Calibration, law: LinearLaw) -> tuple[float, float]:
     """What a law leaves of the disturbance's known sine waves, and what it makes of noise; rms of both axes, mas."""
-    shaken = disturbance_of(config)
+    shaken, delay = disturbance_of(config), config.camera.delay_frames
     S = rejection(law, shaken.frequency_hz, delay)[:, :2]
     waves = np.mean(np.sum(np.abs(shaken.amplitude_nm[:, :2]) ** 2 / 2 * S**2, axis=0))
     noise = np.mean(frame_noise_nm(config, calibration)[:2] ** 2 * noise_gain(law, delay)[:2])
@@ -119,15 +120,15 @@ def theory_mas(config: Configuration, calibration: Calibration, law: LinearLaw, 
     return float(np.sqrt(waves) / nm_per_mas), float(np.sqrt(noise) / nm_per_mas)
 
 
-def optimum_mas(config: Configuration, calibration: Calibration, delay: float) -> float:
-    """The least that an LQG law leaves in theory which knows the truth: lines without width, noise, the best drift.
+def optimum_mas(config: Configuration, calibration: Calibration) -> float:
+    """The least that an LQG law leaves in theory which knows the wheel's lines: without width, noise, the best drift.
 
-    Of a sine wave that lasts for ever all can be foreseen, so that no log of finite length leads to this law.
+    The simulated drift is a sum of sine waves, too: a log that is long enough to tell them apart leads below this.
 
     Raises:
         RuntimeError: the search ended at its edge: what it found is no least.
     """
-    shaken = disturbance_of(config)
+    shaken, delay = disturbance_of(config), config.camera.delay_frames
     noise_nm = frame_noise_nm(config, calibration)[:2]
     best = []
     for axis in (0, 1):
@@ -167,7 +168,7 @@ def render(measured: dict[str, Any]) -> str:
             )
         notes.append(
             f"- {name}: one frame's noise is {one['noise_mas']:.2f} mas; identified from a loop that left "
-            f"{one['identified_under_mas']:.2f} mas; LQG left {beside(one)}; "
+            f"{one['identified_under_mas']:.2f} mas; LQG left {beside(one)}; {shorter(one)}; "
             f"with the lines 2 % higher it left {one['moved']['before_mas']:.2f} mas, and "
             f"{one['moved']['after_mas']:.3f} after they were identified again from that very run."
         )
@@ -175,7 +176,8 @@ def render(measured: dict[str, Any]) -> str:
     where = (
         f"Reaction wheel, 14 mas rms per axis, V = 0, {RATE_HZ:g} Hz, sensor images through the live loop's own "
         f"`advance`; laws identified from {IDENTIFY / RATE_HZ:g} s of the closed loop, measured over "
-        f"{MEASURE / RATE_HZ:g} s. Measured {about['date']} by `python docs/measure_laws.py`."
+        f"{MEASURE / RATE_HZ:g} s, {SETTLE / RATE_HZ:g} s after they were loaded. Measured {about['date']} by "
+        "`python docs/measure_laws.py`."
     )
     return "\n".join([*rows, "", *notes, "", where, ""])
 
@@ -186,10 +188,16 @@ def beside(one: dict[str, Any]) -> str:
     theory = float(np.hypot(law["disturbance_mas"], law["noise_mas"]))
     return (
         f"{law['got_mas'] / theory:.2f} times what theory gives for that law ({theory:.3f} mas), and "
-        f"{law['got_mas'] / one['optimum_mas']:.2f} times the least of an LQG law that knows the truth for ever "
-        f"({one['optimum_mas']:.3f} mas)"
+        f"{law['got_mas'] / one['optimum_mas']:.2f} times the least of an LQG law that knows the wheel's lines exactly "
+        f"and takes the drift for a random walk behind a low-pass ({one['optimum_mas']:.3f} mas)"
     )
 
 
+def shorter(one: dict[str, Any]) -> str:
+    """What theory gives for laws from less of the log."""
+    each = (f"{mas:.3f} mas from {int(frames) / RATE_HZ:g} s" for frames, mas in one["theory_by_frames_mas"].items())
+    return f"from less of that run theory gives for LQG {', '.join(each)}"
+
+
 if __name__ == "__main__":
-    command_line(__doc__, MEASURED, DOCUMENT, measure, render)
+    command_line(__doc__, MEASURED, DOCUMENT, measure, render, BEGIN, END)

@@ -19,10 +19,10 @@ from measure import ROOT, put
 
 sys.path.insert(0, str(ROOT))
 
-from benchmarks import cells, curves, step, throughput
+from benchmarks import curves, step, throughput
 from benchmarks.peers import table as peers
 from benchmarks.road import report
-from lowfc.programs import latency_text
+from lowfc.programs.latency import text as latency_text
 
 MEASURED = ROOT / "docs" / "speed.json"
 DOCUMENT = ROOT / "docs" / "performance.md"
@@ -39,10 +39,10 @@ def _as_text(words: Sequence[str]) -> Callable[[dict[str, Any]], str]:
 BENCHES: dict[str, tuple[Sequence[str], Callable[[dict[str, Any]], str]]] = {
     "latency": (LATENCY, _as_text(LATENCY)),
     "watched": (WATCHED, _as_text(WATCHED)),
-    "step": (("benchmarks.step",), lambda result: f"{cells.markdown(step.table(result))}\n\n{step.remarks(result)}"),
+    "step": (("benchmarks.step",), step.markdown),
     "peers": (("benchmarks.peers", "--seconds", "4"), peers.markdown),
-    "curves": (("benchmarks.curves",), curves.markdown),
-    "throughput": (("benchmarks.throughput",), throughput.markdown),
+    "curves": (("benchmarks.curves", "--seconds", "1", "--repeats", "2"), curves.markdown),
+    "throughput": (("benchmarks.throughput", "--seconds", "6"), throughput.markdown),
     "road": (("benchmarks.road",), report.road_markdown),
     "loaded": (("benchmarks.road.loaded",), report.loaded_markdown),
 }

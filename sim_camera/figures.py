@@ -8,6 +8,8 @@ from sim_camera.bench import Truth
 
 BLOCK = 500
 """Frames summed together: the second half is right to this many frames."""
+MOST_BLOCKS = 256
+"""Blocks that are kept; then two become one, so that a long run takes no more memory than a short one."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -30,6 +32,7 @@ class Figures:
         self._blocks: list[list[float]] = []
         self._sums = [0.0, 0.0, 0.0, 0.0]
         self._count = 0
+        self._block = BLOCK
 
     def add(self, truth: Truth) -> None:
         """Count the truth of one frame."""
@@ -40,15 +43,19 @@ class Figures:
         sums[2] += float(tilt @ tilt)
         sums[3] += float(left @ left)
         self._count += 1
-        if self._count == BLOCK:
+        if self._count == self._block:
             self._blocks.append(sums)
             self._sums, self._count = [0.0, 0.0, 0.0, 0.0], 0
+        if len(self._blocks) == MOST_BLOCKS:
+            pairs = zip(self._blocks[::2], self._blocks[1::2], strict=True)
+            self._blocks = [[one + other for one, other in zip(*pair, strict=True)] for pair in pairs]
+            self._block *= 2
 
     def wavefront(self) -> Wavefront | None:
         """Figures over the second half of the whole blocks, or of what there is; None before the first frame."""
         if self._blocks:
             half = self._blocks[len(self._blocks) // 2 :]
-            mean = np.sum(half, axis=0) / (BLOCK * len(half))
+            mean = np.sum(half, axis=0) / (self._block * len(half))
         elif self._count:
             mean = np.array(self._sums) / self._count
         else:

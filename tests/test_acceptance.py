@@ -6,10 +6,12 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 import pytest
+from typer.testing import CliRunner
 
 from lowfc.adapters import instrument
 from lowfc.adapters.drawing import figure_class, png
 from lowfc.contract.configuration import Acceptance, Configuration, load
+from lowfc.contract.errors import ConfigurationError
 from lowfc.contract.messages import wire
 from lowfc.control.calibration import Calibration
 from lowfc.control.excitation import climb, led_in, lines, multisine
@@ -19,9 +21,13 @@ from lowfc.control.loop import advance
 from lowfc.control.safety import LoopMode, Reason
 from lowfc.control.stability import delay_weights
 from lowfc.control.state import State
-from lowfc.programs import acceptance_capture, acceptance_linearity, acceptance_noise, acceptance_rejection
-from lowfc.programs.acceptance import _noll
-from lowfc.programs.acceptance_played import AcceptanceError, Loop, Played, _announced, chosen
+from lowfc.programs.acceptance import capture as acceptance_capture
+from lowfc.programs.acceptance import linearity as acceptance_linearity
+from lowfc.programs.acceptance import noise as acceptance_noise
+from lowfc.programs.acceptance import rejection as acceptance_rejection
+from lowfc.programs.acceptance.command import acceptance_app
+from lowfc.programs.acceptance.played import AcceptanceError, Loop, Played, _announced, chosen
+from lowfc.programs.modes import noll_of
 from sim_camera.bench import Bench
 from sim_camera.process import bench
 
@@ -252,7 +258,14 @@ def test_a_test_is_found_by_its_note() -> None:
 
 
 def test_modes_are_chosen_by_their_noll_indices() -> None:
-    assert _noll("2,4-6, 5") == (2, 4, 5, 6)
+    assert noll_of(["2,4-6, 5"]) == (2, 4, 5, 6)
     assert chosen((), (2, 3)) == (2, 3)
     with pytest.raises(AcceptanceError, match="99"):
         chosen((99,), (2, 3))
+
+
+@pytest.mark.parametrize("test", ["rejection", "linearity", "capture-range"])
+def test_modes_that_are_none_are_refused_and_are_not_all(test: str) -> None:
+    done = CliRunner().invoke(acceptance_app, [test, "--modes", "11-4"])
+    assert isinstance(done.exception, ConfigurationError)
+    assert str(done.exception) == "--modes takes Noll indices, as in 2,3 or 4-11; got '11-4'"

@@ -6,8 +6,8 @@ import pytest
 import typer
 from typer.testing import CliRunner
 
-from lowfc.programs import bench_record as bench_module
-from lowfc.programs.bench_record import bench_record, render
+from lowfc.programs.bench import record as bench_module
+from lowfc.programs.bench.record import bench_record, render
 
 RATES_HZ = (100, 200)
 

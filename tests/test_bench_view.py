@@ -11,10 +11,10 @@ from typer.testing import CliRunner
 
 from lowfc.adapters.log_reader import Logged
 from lowfc.contract.messages import HEALTH, STEP, TIMING, TRUTH, Message, Topic, timestamp, wire
-from lowfc.programs import bench_view_loop
-from lowfc.programs.bench_view import bench_view, cost, isolation, render
-from lowfc.programs.bench_view_hour import Tape, growth, measure_hour, render_hour
-from lowfc.programs.bench_view_loop import Cost, Losses, Phase, Reading
+from lowfc.programs.bench import view_loop as bench_view_loop
+from lowfc.programs.bench.view import bench_view, cost, isolation, render
+from lowfc.programs.bench.view_hour import Tape, growth, measure_hour, render_hour
+from lowfc.programs.bench.view_loop import Cost, Losses, Phase, Reading
 
 RATE_HZ, SECONDS = 200, 0.4
 PHASES = ["off", "starting", "on", "hung", "viewer hung", "killed"]

@@ -1,5 +1,6 @@
 """Calibration of a whole loop in one process: the controller's own functions, the simulated optics, photon noise."""
 
+import io
 from pathlib import Path
 
 import numpy as np
@@ -8,14 +9,14 @@ import pytest
 from folded_loop import FoldedLoop, Given
 
 from lowfc.contract.configuration import Configuration, load
-from lowfc.contract.errors import CalibrationError, DataFileError
+from lowfc.contract.errors import BusError, CalibrationError, DataFileError
 from lowfc.contract.messages import wire
 from lowfc.control.calibration import Calibration
-from lowfc.control.response_fit import cross_talk, cross_talk_error
-from lowfc.programs import calibrate_run
-from lowfc.programs.calibrate_partial import go_on, partial_of
-from lowfc.programs.calibrate_result import measured_calibration
-from lowfc.programs.calibrate_run import Calibrator, Taken, Wanted
+from lowfc.control.response_fit import Sums, cross_talk, cross_talk_error
+from lowfc.programs.calibrate import run as calibrate_run
+from lowfc.programs.calibrate.partial import go_on, keep, partial_of
+from lowfc.programs.calibrate.result import measured_calibration
+from lowfc.programs.calibrate.run import Calibrator, Taken, Wanted
 
 OUT = Path("night.fits")
 BRIGHT = {
@@ -206,6 +207,53 @@ def test_a_closed_loop_is_opened_for_pokes_and_closed_again() -> None:
         pass
 
 
+class Safing(FoldedLoop):
+    """Somebody safes the mirror in the middle of a play, and the play is then not to be stopped any more."""
+
+    def play(self, basis_nm: npt.ArrayLike, table: npt.ArrayLike) -> Given:
+        given = super().play(basis_nm, table)
+        self.run(50)
+        self.ask("safe")
+        return given
+
+    def stop(self) -> Given:
+        super().stop()
+        raise BusError("no answer")
+
+
+def test_what_went_wrong_first_is_told() -> None:
+    loop = Safing(configured(**FEW))
+    loop.close_loop()
+    said: list[str] = []
+    calibrator = Calibrator(loop, Wanted("poke", None, 100.0, 4, OUT, resume=False), said.append, ignore)
+    with pytest.raises(CalibrationError, match="the loop went from open to safed"), calibrator.holding():
+        calibrator.run()
+    assert mode_of(loop) == wire.LOOP_MODE_SAFED
+    assert loop.stops == 1
+    assert said[-1].startswith("warning: the loop is not closed again: close refused")
+
+
+def test_a_loop_is_closed_again_after_a_failure() -> None:
+    loop = FoldedLoop(configured(**FEW))
+    loop.close_loop()
+    with pytest.raises(CalibrationError, match="failed"), of(loop, "poke", 4).holding():
+        raise CalibrationError("failed")
+    assert mode_of(loop) == wire.LOOP_MODE_CLOSED
+
+
+def test_cycles_that_cannot_be_read_are_a_line() -> None:
+    path = partial_of(OUT)
+    keep(path, Sums.none(4, 2), {"method": "poke"})
+    whole = path.read_bytes()
+    one = io.BytesIO()
+    np.save(one, np.zeros(3))
+    for damaged in (b"", whole[: len(whole) // 2], one.getvalue()):
+        path.write_bytes(damaged)
+        with pytest.raises(DataFileError, match="is damaged, or no part of a calibration") as caught:
+            go_on(path, {"method": "poke"})
+        assert "\n" not in str(caught.value)
+
+
 def test_lost_frames_cost_only_themselves() -> None:
     config = configured(**FEW, camera__delay_frames=1.5)
     loop = FoldedLoop(config, lose=lambda index: index > 700 and index % 41 == 0)
@@ -231,12 +279,17 @@ def test_what_cannot_be_calibrated_is_said(monkeypatch: pytest.MonkeyPatch) -> N
         taken_of(lossy, "hadamard", 4)
 
 
-def test_the_linear_range_is_measured() -> None:
-    loop = FoldedLoop(configured(**FEW))
-    calibrator = of(loop, "hadamard", 4)
+def test_the_linear_range_is_measured_again_where_frames_were_lost() -> None:
+    lost = [range(0)]
+    loop = FoldedLoop(configured(**FEW), lose=lambda index: index in lost[-1])
+    said: list[str] = []
+    calibrator = Calibrator(loop, Wanted("hadamard", None, 100.0, 4, OUT, resume=False), said.append, ignore)
     with calibrator.holding():
         delay = calibrator.delay()
+        at = len(loop.surfaces_nm)
+        lost.append(range(at + 10, at + 180))
         found = calibrator.linear_range(loop.calibration(), delay)
+    assert said[-1].startswith("once more: the linear range needs every mode pushed and pulled")
     assert found.range_nm.shape == (6,)
     assert (found.range_nm > 15).all()  # Sect. 3.2: linear to about a twentieth of a wave, 27 nm
     assert np.abs(found.gain[0] - 1).max() < 0.1

@@ -1,5 +1,6 @@
 """`lowfc calibrate` and what stands beside it: files, figures and mistakes; the loop is in this process."""
 
+import inspect
 import json
 from dataclasses import replace
 from pathlib import Path
@@ -14,12 +15,14 @@ from typer.testing import CliRunner
 from lowfc.adapters import calibration_file
 from lowfc.contract.calibration_codec import identified
 from lowfc.contract.configuration import Configuration, load
-from lowfc.contract.errors import CalibrationError, DataFileError
+from lowfc.contract.errors import CalibrationError, ConfigurationError, DataFileError
 from lowfc.control.alignment import Geometry, onto
-from lowfc.control.response_fit import cross_talk
-from lowfc.programs import calibrate_align, calibrate_commands
-from lowfc.programs.calibrate import calibrate_app
-from lowfc.programs.calibrate_commands import compared
+from lowfc.control.response_fit import cross_talk, linear_range
+from lowfc.programs.calibrate import align as calibrate_align
+from lowfc.programs.calibrate import tasks as calibrate_commands
+from lowfc.programs.calibrate.command import calibrate_app
+from lowfc.programs.calibrate.run import AMPLITUDE_NM, Calibrator
+from lowfc.programs.calibrate.tasks import compared
 
 CONFIG = {
     "sensor.sam": "sam27d10_bal14",
@@ -65,11 +68,22 @@ def toml(config: Configuration) -> str:
     return "test.toml"
 
 
-def test_a_calibration_is_written_and_used_and_its_figures_are_told(loop: Connected) -> None:
+def test_a_calibration_is_written_once_it_is_whole_and_used_and_its_figures_are_told(
+    loop: Connected, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def fail(*what: object) -> None:
+        raise CalibrationError("a limit of the mirror acted on the pokes")
+
+    monkeypatch.setattr(Calibrator, "linear_range", fail)
     before = loop.calibration()
-    found = told("--method", "hadamard", "--cycles", "4", "--out", "night.fits", "--load", "--no-linear-range")
+    words = ("--method", "hadamard", "--cycles", "4", "--out", "night.fits", "--load")
+    with pytest.raises(CalibrationError, match="a limit of the mirror"):
+        told(*words)
+    assert not Path("night.fits").exists()
+    assert loop.calibration().id == before.id
+    found = told(*words, "--resume", "--no-linear-range")
     made = calibration_file.load(Path("night.fits"))
-    assert found["method"] == "hadamard"
+    assert (found["method"], found["cycles"]) == ("hadamard", 4)
     assert found["modes"] == 6
     assert found["file"] == "night.fits"
     assert found["condition_number"] > 1
@@ -112,8 +126,22 @@ def test_a_dark_finds_bad_pixels_and_is_not_taken_in_light(loop: Connected, monk
     fits.PrimaryHDU(cube[:, :20].astype(np.int16)).writeto("small.fits")
     with pytest.raises(DataFileError, match=r"frames of \(20, 80\), the calibration has \(80, 80\)"):
         told("dark", "--file", "small.fits")
-    with pytest.raises(DataFileError, match="cannot be read"):
-        told("dark", "--file", "none.fits")
+    np.save("cube.npy", cube)
+    assert told("dark", "--file", "cube.npy")["frames"] == 64
+    whole = Path("dark.fits").read_bytes()
+    Path("cut.fits").write_bytes(whole[: len(whole) // 2])
+    np.savez("cubes.npz", cube)
+    Path("cubes.npz").rename("cubes.npy")
+    for file, why in {
+        "none.fits": "there is no such file",
+        "cut.fits": "neither",
+        "cubes.npy": "neither",
+        "masked.fits": r"\(6400,\)",
+    }.items():
+        for command in ("dark", "align"):
+            with pytest.raises(DataFileError, match=f"^{file}: .*{why}") as caught:
+                told(command, "--file", file)
+            assert "\n" not in str(caught.value)
     dark = Connected(load(None, CONFIG), world=load(None, CONFIG | {"star.magnitude": 20.0}))
     connect(dark, monkeypatch)
     found = told("dark", "--dark-taken", "--frames", "50", "--out", "night.fits")
@@ -159,6 +187,44 @@ def test_a_computed_calibration_may_leave_combinations_out(loop: Connected) -> N
     assert np.linalg.matrix_rank(other.reconstructor) == 5
     done = CliRunner().invoke(calibrate_app, ["--method", "analytic", "--config", config, "--out", "all.fits"])
     assert "no regularisation needed" in done.stdout
+
+
+def test_a_computed_calibration_may_be_of_another_wavefront(loop: Connected) -> None:
+    config = toml(loop.config)
+    told("--method", "analytic", "--config", config, "--out", "flat.fits")
+    told("--method", "analytic", "--config", config, "--out", "there.fits", "--at", "4=15,7=-10")
+    found = told("--compare", "flat.fits", "there.fits")
+    assert found["estimators"] == ["weighted", "weighted+at 4=15,7=-10"]
+    assert found["cross_talk"] > 0.02
+    shift = dict(zip(found["noll"], found["reference_shift_nm"], strict=True))
+    assert (shift[4], shift[7]) == pytest.approx((15, -10), abs=1.5)
+
+
+@pytest.mark.parametrize(
+    ("words", "why"),
+    [
+        ("--out there.fits dark --dark-taken", "--out stands before `dark`, .* after it"),
+        ("--json reference", "--json stands before `reference`"),
+        ("--config test.toml align", "--config stands before `align`"),
+        ("align --config test.toml", "--config goes with --file"),
+        ("align --file real.fits --load", "--load goes with the frames of a running loop"),
+        ("--method poke --config test.toml", "--config goes with --method analytic"),
+        ("--at 4=15", "--at goes with --method analytic"),
+    ],
+)
+def test_an_option_that_would_be_of_no_effect_is_refused(loop: Connected, words: str, why: str) -> None:
+    before = {path.name for path in Path().iterdir()}
+    with pytest.raises(ConfigurationError, match=why):
+        CliRunner().invoke(calibrate_app, words.split(), catch_exceptions=False)
+    assert {path.name for path in Path().iterdir()} == before
+
+
+def test_the_help_says_how_large_pokes_are() -> None:
+    said = " ".join(CliRunner().invoke(calibrate_app, ["--help"]).stdout.split())
+    usual = ", ".join(f"{amplitude_nm:g} {method}" for method, amplitude_nm in AMPLITUDE_NM.items())
+    tolerance = inspect.signature(linear_range).parameters["tolerance"].default
+    assert f"default: {usual}." in said
+    assert f"within {100 * tolerance:g} % of 1" in said
 
 
 def test_calibrations_of_different_sensors_are_not_compared(loop: Connected) -> None:

@@ -1,13 +1,19 @@
 """`lowfc certs`, read by another implementation: the standard library's OpenSSL."""
 
+import contextlib
+import socket
 import ssl
 import stat
+import threading
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
 from typer.testing import CliRunner
 
 from lowfc.adapters.access import ROUTER
+from lowfc.adapters.routed import router_trouble
+from lowfc.contract.configuration import Network
 from lowfc.contract.errors import ConfigurationError, DataFileError
 from lowfc.programs.cli import app
 
@@ -88,9 +94,62 @@ def test_what_is_there_stays_unless_it_is_renewed(tmp_path: Path) -> None:
     assert {name: (tmp_path / name).read_bytes() for name in before} == before
     make(tmp_path, ("camera",), [], renew=True)
     changed = {name for name in before if (tmp_path / name).read_bytes() != before[name]}
-    assert changed == {"camera.pem", "camera.key"}
+    assert changed == {"camera.pem"}  # it is of the key that is there: a machine that has the old key takes the new one
     handshake(tmp_path, tmp_path, "camera")
     handshake(tmp_path, tmp_path, "viewer")
+
+
+@pytest.mark.parametrize("gone", [(), ("camera.key",), ("camera.pem",), ("camera.key", "camera.pem")])
+@pytest.mark.parametrize("file", ["camera.key", "camera.pem", "viewer.pem"])
+def test_wherever_it_is_interrupted_a_pair_is_whole_or_not_there(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, file: str, gone: tuple[str, ...]
+) -> None:
+    roles = (ROUTER, "camera", "viewer")
+    make(tmp_path, roles, ["localhost"])
+    for name in gone:
+        (tmp_path / name).unlink()
+    replace = Path.replace
+
+    def interrupted(draft: Path, target: Path) -> Path:
+        if target.name == file:
+            raise KeyboardInterrupt
+        return replace(draft, target)
+
+    monkeypatch.setattr(Path, "replace", interrupted)
+    with contextlib.suppress(KeyboardInterrupt):
+        make(tmp_path, roles, ["localhost"], renew=True)
+    monkeypatch.undo()
+    for role in roles:
+        if all((tmp_path / f"{role}.{kind}").exists() for kind in ("pem", "key")):
+            handshake(tmp_path, tmp_path, role if role != ROUTER else "viewer")
+    assert not [name for name in tmp_path.iterdir() if name.name.startswith(".")]
+    make(tmp_path, roles, ["localhost"], renew=True)
+    handshake(tmp_path, tmp_path, "camera")
+    assert stat.S_IMODE((tmp_path / "camera.key").stat().st_mode) == 0o600
+
+
+@contextlib.contextmanager
+def answering(answer: Callable[[socket.socket], object]) -> Iterator[int]:
+    """Somebody who takes one connection, on a port of this host."""
+    with socket.create_server(("127.0.0.1", 0)) as server:
+
+        def serve() -> None:
+            connection, _ = server.accept()
+            with connection:
+                answer(connection)
+
+        thread = threading.Thread(target=serve)
+        thread.start()
+        yield server.getsockname()[1]
+        thread.join()
+
+
+def test_who_hangs_up_in_the_handshake_is_not_one_who_refuses_the_certificate(tmp_path: Path) -> None:
+    make(tmp_path, (ROUTER, "camera"), ["127.0.0.1"])
+    with answering(lambda connection: connection.recv(4096)) as port:
+        network = Network(router=f"tls/127.0.0.1:{port}", certificates=str(tmp_path))
+        assert "ends the connection in the midst of the handshake" in router_trouble(network, "camera")
+    assert "refused" in router_trouble(network, "camera")
 
 
 def test_mistakes_are_said(tmp_path: Path) -> None:
@@ -108,6 +167,9 @@ def test_mistakes_are_said(tmp_path: Path) -> None:
     (tmp_path / "one" / "ca.key").write_bytes((tmp_path / "other" / "ca.key").read_bytes())
     with pytest.raises(DataFileError, match="is not the key of"):
         make(tmp_path / "one", ("viewer",), [])
+    (tmp_path / "other" / "camera.key").write_bytes(b"nonsense")
+    with pytest.raises(DataFileError, match=r"camera\.key is not a key that was made here; remove it"):
+        make(tmp_path / "other", ("camera",), [], renew=True)
     (tmp_path / "one" / "ca.key").write_bytes(b"nonsense")
     with pytest.raises(DataFileError, match="are not an authority's key and certificate"):
         make(tmp_path / "one", ("viewer",), [])

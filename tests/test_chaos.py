@@ -12,15 +12,17 @@ import typer
 from typer.testing import CliRunner
 
 from lowfc.adapters.envelope import sequence_of
+from lowfc.adapters.terminal import INTERRUPTED
 from lowfc.contract.configuration import load
-from lowfc.contract.errors import ConfigurationError
+from lowfc.contract.errors import ConfigurationError, LowfcError
 from lowfc.contract.events import EVENTS, Level
 from lowfc.contract.messages import FRAME, STEP, wire
-from lowfc.programs.chaos import chaos, configured, render
-from lowfc.programs.chaos_bench import PATIENCE_S, Ended, Left
-from lowfc.programs.chaos_cases import CASES, FIRST, STRUCK, Case, End
-from lowfc.programs.chaos_evidence import FORGED_S, Evidence, Happened, Shape, Stepped, Truths, gaps
-from lowfc.programs.chaos_rules import FLOOR_NM, WITHIN, Finding, judge, recovered_s, restart_step_nm
+from lowfc.programs.chaos import host as chaos_host
+from lowfc.programs.chaos.bench import PATIENCE_S, Ended, Left
+from lowfc.programs.chaos.cases import CASES, FIRST, STRUCK, Case, End
+from lowfc.programs.chaos.command import chaos, configured, counts, render
+from lowfc.programs.chaos.evidence import FORGED_S, Evidence, Happened, Shape, Stepped, Truths, gaps
+from lowfc.programs.chaos.rules import FLOOR_NM, WITHIN, Finding, judge, recovered_s, restart_step_nm
 from sim_camera.faults import Kind
 
 START_S = 1_800_000_000
@@ -234,13 +236,87 @@ def test_every_case_can_be_run(tmp_path: Path) -> None:
     assert FORGED_S < START_S
 
 
-def run(*words: str) -> str:
+def test_a_stuck_image_may_be_used_no_longer_than_the_loop_lets_it() -> None:
+    bad = CASES["frames-stuck"].bad
+    assert bad is not None
+    assert [bad(number) for number in (FIRST, FIRST + 2, FIRST + 3, FIRST + STRUCK)] == [False, False, True, False]
+
+
+def run(*words: str, status: int = 0) -> str:
     app = typer.Typer()
     app.command("chaos")(chaos)
     app.command("other")(lambda: None)
     done = CliRunner().invoke(app, ["chaos", *words], catch_exceptions=False)
-    assert done.exit_code == 0
+    assert done.exit_code == status
     return done.stdout
+
+
+@pytest.fixture
+def acted(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Cases that act without a loop."""
+
+    def held(case: Case, left: Left, evidence: Evidence) -> list[Finding]:
+        return [Finding("notes", not left.notes, "; ".join(left.notes))]
+
+    def acting(case: Case, folder: Path, rng: object) -> Left:
+        found = Left(folder, load(None))
+        try:
+            case.act(None)  # type: ignore[arg-type]  # they need none
+        except LowfcError as error:
+            found.notes.append(str(error))
+        return found
+
+    def wrong(bench: object) -> None:
+        raise KeyError("odd")
+
+    def stopped(bench: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr("lowfc.programs.chaos.command._run", acting)
+    monkeypatch.setattr("lowfc.programs.chaos.rules.judge", held)
+    acts = {"good": lambda bench: None, "odd": wrong, "stopped": stopped, "last": lambda bench: None}
+    cases = {name: replace(CASE, name=name, act=act) for name, act in acts.items()}
+    cases["lacking"] = replace(CASE, name="lacking", act=wrong, lacks=lambda: "takes a mount of its own (not here)")
+    monkeypatch.setattr("lowfc.programs.chaos.cases.CASES", cases)
+
+
+@pytest.mark.usefixtures("acted")
+def test_what_a_host_cannot_do_is_skipped_and_not_passed() -> None:
+    words = ("--case", "lacking", "--case", "good")
+    table = run(*words)
+    assert table.splitlines()[0].startswith("lacking  skipped: takes a mount of its own (not here) ")
+    assert table.endswith("1 passed, 0 failed, 1 skipped, seed 1\n")
+    figures = json.loads(run(*words, "--json"))
+    assert (figures["passed"], figures["failed"], figures["skipped"]) == (1, 0, 1)
+    assert [(row["passed"], row["skipped"]) for row in figures["cases"]] == [
+        (False, "takes a mount of its own (not here)"),
+        (True, None),
+    ]
+
+
+@pytest.mark.usefixtures("acted")
+def test_an_odd_error_fails_its_case_alone_and_leaves_its_traceback() -> None:
+    table = run("--case", "good", "--case", "odd", "--case", "last", status=1)
+    assert "    error: KeyError: 'odd'\n" in table
+    assert table.endswith("2 passed, 1 failed, seed 1\n")
+    assert 'raise KeyError("odd")' in Path("chaos-logs/odd-1/error.txt").read_text()
+
+
+@pytest.mark.usefixtures("acted")
+def test_interrupted_it_prints_what_it_has() -> None:
+    table = run("--case", "good", "--case", "stopped", "--case", "last", status=INTERRUPTED)
+    assert table.splitlines()[0].split()[:2] == ["good", "passed"]
+    assert table.endswith("1 passed, 0 failed, 2 not run, seed 1\n")
+    assert not Path("chaos-logs").exists()
+
+
+def test_what_cannot_be_tried_is_a_reason() -> None:
+    assert chaos_host.nothing() == ""
+    assert chaos_host._lacking("takes it", "true") == ""
+    assert chaos_host._lacking("takes it", "ls", "/not/there").startswith("takes it (ls: ")
+    assert chaos_host._lacking("takes it", "false") == "takes it (false ended with 1)"
+    assert chaos_host._lacking("takes it", "/not/there") == "takes it (/not/there: No such file or directory)"
 
 
 def test_without_a_case_they_are_listed() -> None:
@@ -265,7 +341,7 @@ def test_the_table() -> None:
         }
         for name, passed in (("one", True), ("two", False))
     ]
-    text = render({"seed": 3, "passed": 1, "failed": 1, "cases": rows})
+    text = render({"seed": 3, "asked": 2, **counts(rows), "cases": rows})
     assert text.splitlines()[0].split()[:2] == ["one", "passed"]
     assert "restart_step_nm: 2.5" in text
     assert "    limits: slew" in text

@@ -1,8 +1,11 @@
 """The client of a running loop, its command line, and the recorder's switch: what is asked, and what comes back."""
 
+import contextlib
+import socket
 from collections.abc import Callable
 from pathlib import Path
 
+import make_limits
 import numpy as np
 import pytest
 import typer
@@ -16,19 +19,22 @@ from lowfc.adapters.envelope import sequence_of
 from lowfc.adapters.log_reader import LogReader
 from lowfc.adapters.memory_bus import MemoryBus, MemoryHub
 from lowfc.adapters.mirror_maps import read_shape
-from lowfc.client import Client, Stream, client
+from lowfc.adapters.run import open_run
+from lowfc.client import Client, Stream, client, configuration_of, running, the_run
 from lowfc.client.stream import WAITING, frame_of, step_of
 from lowfc.contract import codec
 from lowfc.contract.calibration_codec import encode_calibration, identified
+from lowfc.contract.configuration import Configuration
 from lowfc.contract.errors import BusError, ConfigurationError, DataFileError, RequestRefusedError
 from lowfc.contract.messages import CALIBRATION, CAMERA_STATE, EVENT, FRAME, REQUEST_KEY, STEP, Log, image, wire
 from lowfc.control.inputs import Reply, Request, Step
 from lowfc.control.linear_law import LinearLaw, integrator_block, of_blocks
 from lowfc.control.requests import REQUESTS
 from lowfc.control.safety import LoopMode, Reason
-from lowfc.programs.ctl_commands import SIMPLE, _noll, ctl_app
-from lowfc.programs.ctl_requests import ASKED, table
-from lowfc.programs.ctl_status import figures, text
+from lowfc.programs.ctl.command import SIMPLE, ctl_app
+from lowfc.programs.ctl.requests import ASKED, table
+from lowfc.programs.ctl.status import figures, text
+from lowfc.programs.modes import noll_of
 
 DOCUMENT = Path(__file__).parents[1] / "docs" / "operating.md"
 KNOWN = identified(calibration())
@@ -182,6 +188,43 @@ def test_the_calibration_in_use(loop: Client) -> None:
     assert loop.calibration().id == KNOWN.id
 
 
+def test_the_configuration_of_a_loop_and_of_one_of_another_version(controller: FakeController, loop: Client) -> None:
+    for toml, rate_hz in ((Configuration().to_toml(), 250.0), ("[camera]\nrate_hz = 500.0\n", 500.0)):
+        controller.reply = Reply(True, toml, 77)
+        assert configuration_of(loop).camera.rate_hz == rate_hz
+    controller.reply = Reply(True, "[camera]\nspeed = 3\n", 77)
+    with pytest.raises(ConfigurationError, match=r"another version of lowfc: camera\.speed: ") as caught:
+        configuration_of(loop)
+    assert "\n" not in str(caught.value)
+
+
+def listening(name: str, *roles: str) -> list[socket.socket]:
+    """Processes of a run that do nothing else."""
+    ports = open_run(name).links.ports
+    return [socket.create_server(("127.0.0.1", ports[role])) for role in roles]
+
+
+def test_a_run_is_found_by_who_is_there(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
+    with pytest.raises(BusError, match="no loop is running on this host"):
+        the_run(None)
+    open_run("empty")
+    with contextlib.ExitStack() as held:
+        for server in listening("left", "camera", "recorder"):
+            held.enter_context(server)
+        assert the_run(None) == the_run("left") == "left"
+        with pytest.raises(BusError, match=r"there is no run 'empty': there are left$"):
+            the_run("empty")
+        for server in listening("whole", "camera", "controller"):
+            held.enter_context(server)
+        assert running() == ["whole"]
+        assert (the_run(None), the_run("left")) == ("whole", "left"), "the only one with a controller"
+        for server in listening("another", "controller"):
+            held.enter_context(server)
+        with pytest.raises(BusError, match=r"say which run with --run: there are another, left, whole$"):
+            the_run(None)
+
+
 # Streams.
 
 
@@ -220,6 +263,13 @@ def test_what_did_not_get_here_is_counted_and_a_restart_is_no_loss() -> None:
     frames = stream(frame_sample(5), frame_sample(8), broken, frame_sample(10), *again, count=5)
     assert len(list(frames)) == 5
     assert frames.lost == 2 + 1 + 1
+
+
+def test_what_comes_twice_or_out_of_order_is_not_lost() -> None:
+    before = frame_sample(2, 1_699_999_000)
+    frames = stream(*map(frame_sample, (5, 7, 7, 6)), before, *map(frame_sample, (8, 8, 11, 10)), count=9)
+    assert [frame.sequence & 0xFFFF for frame in frames] == [5, 7, 7, 6, 2, 8, 8, 11, 10]
+    assert frames.lost == 1, "9 alone did not come"
 
 
 def test_silence_is_an_error_and_so_is_a_stream_that_never_begins() -> None:
@@ -298,7 +348,14 @@ def test_the_declared_requests_are_those_that_there_are() -> None:
 
 def test_the_table_of_the_document_is_made_of_the_declaration() -> None:
     written = DOCUMENT.read_text().partition("<!-- requests: begin -->\n")[2].partition("<!-- requests: end -->")[0]
-    assert written == table(), "put lowfc.programs.ctl_requests.table() there"
+    assert written == table(), "put lowfc.programs.ctl.requests.table() there"
+
+
+@pytest.mark.parametrize(("name", "table"), make_limits.TABLES)
+def test_the_tables_of_what_the_code_decides_are_made_of_it(name: str, table: str) -> None:
+    begin, end = make_limits.marks(table)
+    written = make_limits.document(name).read_text().partition(begin)[2].partition(end)[0]
+    assert written == make_limits.render(name, table), "run `python docs/make_limits.py`"
 
 
 def test_every_command_has_help_with_an_example() -> None:
@@ -315,16 +372,17 @@ def test_every_command_has_help_with_an_example() -> None:
 
 @pytest.mark.parametrize(
     ("words", "noll"),
-    [(None, ()), (["2,3"], (2, 3)), (["2", "3"], (2, 3)), (["4-7, 11"], (4, 5, 6, 7, 11))],
+    [(None, ()), (["2,3"], (2, 3)), (["2", "3"], (2, 3)), (["4-7, 11"], (4, 5, 6, 7, 11)), (["3,2-4"], (3, 2, 4))],
 )
 def test_modes_are_read_as_people_write_them(words: list[str] | None, noll: tuple[int, ...]) -> None:
-    assert _noll(words) == noll
+    assert noll_of(words) == noll
 
 
-@pytest.mark.parametrize("word", ["x", "2-", "-2", "2.5"])
+@pytest.mark.parametrize("word", ["x", "2-", "-2", "2.5", "11-4", "2,11-4", "", ",", "2-9999999999"])
 def test_modes_that_are_none_are_refused(word: str) -> None:
-    with pytest.raises(ConfigurationError, match="as in 2,3 or 4-11"):
-        _noll([word])
+    with pytest.raises(ConfigurationError, match="as in 2,3 or 4-11") as caught:
+        noll_of([word])
+    assert "\n" not in str(caught.value)
 
 
 def test_shapes_are_read_from_fits_and_numpy(tmp_path: Path) -> None:

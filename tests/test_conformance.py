@@ -41,13 +41,13 @@ from lowfc.contract.messages import (
     wire,
 )
 from lowfc.control.safety import Limits
-from lowfc.programs import conformance
-from lowfc.programs.conformance import conformance_app, figures, report
-from lowfc.programs.conformance_camera import camera_checks, watch
-from lowfc.programs.conformance_checks import Check, Heard
-from lowfc.programs.conformance_dialogue import Dialogue, expected_of
-from lowfc.programs.conformance_line import ZenohLine
-from lowfc.programs.conformance_mirror import mirror_checks
+from lowfc.programs.conformance import command as conformance
+from lowfc.programs.conformance.camera import camera_checks, watch
+from lowfc.programs.conformance.checks import Check, Heard
+from lowfc.programs.conformance.command import conformance_app, figures, report
+from lowfc.programs.conformance.dialogue import Dialogue, expected_of
+from lowfc.programs.conformance.line import ZenohLine
+from lowfc.programs.conformance.mirror import mirror_checks
 from sim_dm.device import Status, Told, initial, obey, tick
 from sim_dm.process import _told, device
 

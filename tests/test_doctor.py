@@ -20,9 +20,9 @@ from lowfc.adapters import trial as trial_module
 from lowfc.adapters.host import Host, Synchronisation
 from lowfc.adapters.trial import Trial, lateness_ns, try_out
 from lowfc.contract.configuration import Configuration, Realtime, load
-from lowfc.programs import doctor as doctor_module
-from lowfc.programs.doctor import checks, doctor, examine, figures, gather
-from lowfc.programs.doctor_facts import Facts, note, ok, ranges
+from lowfc.programs.doctor import command as doctor_module
+from lowfc.programs.doctor.command import checks, doctor, examine, figures, gather
+from lowfc.programs.doctor.facts import Facts, note, ok, ranges
 
 DOCUMENT = Path(__file__).parents[1] / "docs" / "doctor.md"
 NO_RIGHTS = [

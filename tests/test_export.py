@@ -46,7 +46,7 @@ from lowfc.contract.messages import (
     wire,
 )
 from lowfc.control.safety import Reason
-from lowfc.programs.export import Format, export, export_log, render
+from lowfc.programs.export.command import Format, export, export_log, render
 
 STEPS, REFUSED, UNSENT, UNTRUE = 30, 4, 7, 9
 START_S = 1_767_225_600
@@ -326,7 +326,7 @@ def test_mistakes(log: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) ->
     with pytest.raises(DataFileError, match="cannot be written"):
         export_log(log, Format.CSV, tmp_path / "nowhere" / "out.csv", console=QUIET)
     monkeypatch.setitem(sys.modules, "aotpy", None)
-    monkeypatch.delitem(sys.modules, "lowfc.programs.export_aot", raising=False)
+    monkeypatch.delitem(sys.modules, "lowfc.programs.export.aot", raising=False)
     with pytest.raises(ConfigurationError, match=r"pip install 'lowfc\[aot\]'"):
         export_log(log, Format.AOT, console=QUIET)
 

@@ -23,8 +23,8 @@ from lowfc.contract.errors import DataFileError
 from lowfc.contract.messages import RawImage, image
 from lowfc.programs.control_step import ControlStep, time_alone
 from lowfc.programs.frame_source import Payloads, prepared_frames
-from lowfc.programs.latency import latency
-from lowfc.programs.latency_figures import (
+from lowfc.programs.latency.command import latency
+from lowfc.programs.latency.figures import (
     LOOP_SPANS,
     STAGES,
     UNKNOWN,
@@ -41,8 +41,8 @@ from lowfc.programs.latency_figures import (
     spread_of,
     warmed_up,
 )
-from lowfc.programs.latency_summary import compare, together
-from lowfc.programs.latency_text import compared, sparkline, table
+from lowfc.programs.latency.summary import compare, together
+from lowfc.programs.latency.text import compared, sparkline, table
 
 START = 1_700_000_000 << 32
 MS = 1_000_000
@@ -309,7 +309,7 @@ def test_what_is_no_result_and_no_log_is_said(tmp_path: Path) -> None:
     assert "schedule" in str(invoke("--camera", "simulated", "--free-running").exception)
 
 
-STARTED = "from lowfc.adapters.terminal import *; from lowfc.programs.latency import latency; " \
+STARTED = "from lowfc.adapters.terminal import *; from lowfc.programs.latency.command import latency; " \
     "app = new_app(''); app.command()(latency); run_app(app)"  # fmt: skip
 
 

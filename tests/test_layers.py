@@ -148,7 +148,7 @@ def test_no_file_outgrows_its_noun() -> None:
         ("lowfc.adapters.bus", "from lowfc.programs import controller"),
         ("lowfc.adapters.bus", "import sim_dm.device"),
         ("lowfc.programs.sim_loop", "from sim_camera.bench import Bench"),
-        ("lowfc.client.client", "from lowfc.programs import ctl"),
+        ("lowfc.client.client", "from lowfc.programs.ctl import which_run"),
         ("lowfc.adapters.bus", "from lowfc.client import Client"),
         ("sim_camera.process", "import lowfc.programs.controller"),
         ("sim_dm.process", "from sim_camera import bench"),

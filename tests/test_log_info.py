@@ -16,7 +16,7 @@ from lowfc.adapters.terminal import new_app
 from lowfc.contract.errors import ConfigurationError, DataFileError
 from lowfc.contract.events import EVENTS
 from lowfc.contract.messages import CALIBRATION, CONTROLLER_STATE, EVENT, FRAME, HEALTH, STEP, Message, wire
-from lowfc.programs.log_info import info
+from lowfc.programs.log.info import info
 
 START_S = 1_767_225_600  # 2026-01-01T00:00:00Z
 START_NS = START_S * 10**9

@@ -56,6 +56,8 @@ WITHOUT_UNIT = {
         "least_flux",
         "commands_late",
         "saturated_pixels",
+        "most_alike",
+        "alike",
         "pid",
         "noll",
         "modes",

@@ -18,7 +18,7 @@ from lowfc.contract.errors import ConfigurationError, DataFileError
 from lowfc.control.additions import ADOPTED, FLAT
 from lowfc.control.calibration import Calibration
 from lowfc.control.inputs import Frame, Load, MirrorShape, Request
-from lowfc.control.linear_law import LinearLaw, integrator_block, of_blocks
+from lowfc.control.linear_law import LinearLaw, Signal, integrator_block, of_blocks
 from lowfc.control.loop import advance
 from lowfc.control.safety import LoopMode
 from lowfc.control.state import State
@@ -51,10 +51,10 @@ def saved(folder: Path, name: str, array: npt.ArrayLike) -> str:
     return str(path)
 
 
-def law_of(config: Configuration, gain: float = 0.2, rate_hz: float | None = None) -> LinearLaw:
+def law_of(config: Configuration, gain: float = 0.2, signal: Signal = "pol") -> LinearLaw:
     delay_frames = instrument.settings(config).delay_frames
-    blocks = [integrator_block(gain, 0.001, "pol", delay_frames)] * len(config.noll)
-    return of_blocks(blocks, "pol", "leaky", config.noll, delay_frames, rate_hz or config.camera.rate_hz)
+    blocks = [integrator_block(gain, 0.001, signal, delay_frames)] * len(config.noll)
+    return of_blocks(blocks, signal, "leaky", config.noll, delay_frames, config.camera.rate_hz)
 
 
 def complaint(overrides: dict[str, Any]) -> str:
@@ -76,12 +76,20 @@ def test_what_is_no_map_is_named_in_one_line(tmp_path: Path) -> None:
     whole = Path(saved(tmp_path, "whole.fits", wavy())).read_bytes()
     (tmp_path / "short.fits").write_bytes(whole[: len(whole) // 2])
     (tmp_path / "text.npy").write_text("flat")
+    np.savez(tmp_path / "many.npz", wavy())
+    archive = (tmp_path / "many.npz").read_bytes()
+    (tmp_path / "archive.npy").write_bytes(archive)
+    (tmp_path / "half.npy").write_bytes(archive[: len(archive) // 2])
+    saved(tmp_path, "cut.npy", wavy())
+    (tmp_path / "cut.npy").write_bytes((tmp_path / "cut.npy").read_bytes()[:1000])
+    saved(tmp_path, "nothing.npy", np.zeros((0, 34)))
     fits.HDUList([fits.PrimaryHDU()]).writeto(tmp_path / "empty.fits")
     saved(tmp_path, "line.npy", np.zeros(9))
     saved(tmp_path, "words.npy", np.array([["flat"]]))
     np.save(tmp_path / "pickle.npy", np.array([[{}]], dtype=object))
     (tmp_path / "folder.fits").mkdir()
-    for file in ("short.fits", "text.npy", "empty.fits", "line.npy", "words.npy", "pickle.npy", "folder.fits", "none"):
+    of_numpy = ("text.npy", "line.npy", "words.npy", "pickle.npy", "archive.npy", "half.npy", "cut.npy", "nothing.npy")
+    for file in ("short.fits", "empty.fits", "folder.fits", "none", *of_numpy):
         with pytest.raises(DataFileError, match=file) as caught:
             read_shape(tmp_path / file)
         assert "\n" not in str(caught.value)
@@ -111,8 +119,11 @@ def test_every_file_that_cannot_be_used_is_a_line(tmp_path: Path) -> None:
     law_file.save(law_of(config), law)
     check_files(load(None, {"control.law": str(law)}))
     assert "Z2 to Z15" in complaint({"control.law": str(law), "sensor.modes": 9})
-    assert "made for 250 Hz, camera.rate_hz is 500" in complaint({"control.law": str(law), "camera.rate_hz": 500})
-    law_file.save(law_of(config, gain=0.95), law)
+    assert "made for 250 Hz, the frames come at 500 Hz" in complaint({"control.law": str(law), "camera.rate_hz": 500})
+    assert "reckons with a delay of 1 frames, the loop with 3" in complaint(
+        {"control.law": str(law), "control.delay_frames": 3}
+    )
+    law_file.save(law_of(config, gain=0.95, signal="error"), law)
     check_files(load(None, {"control.law": str(law)}))
     assert "unstable with a delay of 3" in complaint({"control.law": str(law), "control.delay_frames": 3})
     several = complaint({"mirror.flat": small, "control.law": small, "sensor.sam": "none.json"}).splitlines()
@@ -184,7 +195,7 @@ def begun(config: Configuration, calibration: Calibration, shape: MirrorShape | 
 def commands(config: Configuration, state: State, frames: int) -> tuple[list[Single], list[str]]:
     """What is commanded over some frames of any light, for which the loop is open, and the channels at their end."""
     assert state.drive is not None
-    settings, shape = replace(instrument.settings(config), least_flux=0.0), state.drive.calibration.shape
+    settings, shape = replace(instrument.settings(config), least_flux=0.0, most_alike=0), state.drive.calibration.shape
     dark = np.rint(state.drive.calibration.dark + 100).reshape(shape).astype(np.uint16)
     sent = []
     for index in range(frames):

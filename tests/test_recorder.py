@@ -37,8 +37,8 @@ from lowfc.contract.messages import (
     Topic,
     wire,
 )
-from lowfc.programs.recorder import Recorder
-from lowfc.programs.recording_summary import Summary
+from lowfc.programs.recording.recorder import Recorder
+from lowfc.programs.recording.summary import Summary
 
 PATIENCE_S = 20.0
 
@@ -173,7 +173,7 @@ def test_a_controller_that_comes_later_is_asked(bench: Bench) -> None:
     late = bench.join("controller-2")
     late.publisher(CALIBRATION).put(b"late")  # before the link to the recorder is up
     late.beat()
-    until(lambda: CALIBRATION.key in bench.recorder._kept)
+    until(lambda: CALIBRATION.key in bench.recorder._others.kept)
     late.finish()
     assert bodies_of(logged(bench.stop()), CALIBRATION) == [b"late"]
 
@@ -209,6 +209,18 @@ def test_every_lost_message_is_counted(bench: Bench) -> None:
         f"lost {FRAME.key}": "4",
         f"lost {STEP.key}": "5",
     }
+
+
+def test_what_comes_twice_or_out_of_order_is_not_lost(bench: Bench) -> None:
+    frames = bench.camera.publisher(FRAME)
+    bench.start()
+    first = frames.put(b"0").sequence
+    for number in (1, 1, 3, 2, 4, 4):
+        frames.put(b"%d" % number, sequence=first + number)
+    summary = bench.stop()
+    assert bodies_of(logged(summary), FRAME) == [b"0", b"1", b"1", b"3", b"2", b"4", b"4"]
+    assert (summary.lost, bench.recorder._ledger.recorded()[FRAME.key]) == ({}, 7)
+    assert not any(event.startswith("MESSAGES_LOST") for event in bench.events)
 
 
 def test_logs_are_rotated_and_each_begins_with_the_calibration(bench: Bench) -> None:
@@ -264,7 +276,7 @@ def entry(topic: Topic, count: int, start_s: int = 100, payload: bytes = b"", ke
 
 def test_the_ledger_knows_beginnings_gaps_and_restarts() -> None:
     ledger = Ledger()
-    for count in (5, 6, 9, 9, 8):  # repeated and late ones fill no gap
+    for count in (5, 6, 9, 9, 4):  # one that came before, or is older than the first, fills no gap
         ledger.enter(*entry(FRAME, count), recorded=True)
     assert ledger.lost() == {FRAME.key: 2}
     for count in (3, 5):
@@ -274,6 +286,33 @@ def test_the_ledger_knows_beginnings_gaps_and_restarts() -> None:
     assert (ledger.news(), ledger.news()) == ({FRAME.key: 4}, {})
     ledger.enter(*entry(FRAME, 8, start_s=101), recorded=True)
     assert ledger.news() == {FRAME.key: 1}
+
+
+def test_the_ledger_takes_a_loss_back_when_the_message_comes_late() -> None:
+    ledger = Ledger()
+    for count in (5, 9, 7):
+        ledger.enter(*entry(FRAME, count), recorded=True)
+    assert (ledger.lost(), ledger.news()) == ({FRAME.key: 2}, {FRAME.key: 2})
+    ledger.enter(*entry(FRAME, 6), recorded=True)
+    ledger.enter(*entry(FRAME, 8), recorded=False)  # the disk did not take it
+    assert (ledger.lost(), ledger.news(), ledger.recorded()) == ({FRAME.key: 1}, {}, {FRAME.key: 4})
+    ledger.enter(*entry(FRAME, 12), recorded=True)
+    assert (ledger.lost(), ledger.news()) == ({FRAME.key: 3}, {FRAME.key: 1}), "two were said already"
+
+
+def test_the_ledger_counts_nothing_as_lost_that_was_sent_twice() -> None:
+    ledger = Ledger()
+    for count in (0, 1, 1, 2, 2, 4, 4):
+        ledger.enter(*entry(FRAME, count), recorded=True)
+    ledger.settle()
+    ledger.enter(*entry(FRAME, 4), recorded=True)
+    ledger.revert()
+    for published, lost in ((7, 1), (8, 1), (9, 2)):
+        message = wire.Health(process="camera", state="stopped")
+        message.topics.add(topic=FRAME.key, published=published)
+        ledger.believe(entry(HEALTH, 0)[1], message)
+        assert ledger.lost() == {FRAME.key: lost}, "3 was not heard, and what the camera sent beyond those seven"
+    assert ledger.recorded() == {FRAME.key: 7}
 
 
 def test_the_ledger_believes_the_last_health_of_each_start() -> None:
@@ -308,7 +347,7 @@ RECORD = """
 import sys
 from pathlib import Path
 from lowfc.adapters.run import open_run
-from lowfc.programs.recorder import record
+from lowfc.programs.recording.recorder import record
 run, logs, toml = sys.argv[1:]
 summary = record(open_run(run), Path(logs), configuration=Path(toml), seed=7)
 print(summary.messages, sum(summary.lost.values()), summary.failure)

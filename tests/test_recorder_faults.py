@@ -23,9 +23,9 @@ from lowfc.adapters.log_series import Limits
 from lowfc.adapters.log_writer import UNFINISHED, Attachment
 from lowfc.adapters.memory_bus import MemoryBus, MemoryHub
 from lowfc.contract.messages import CALIBRATION, EVENT, FRAME, HEALTH, STEP, Topic
-from lowfc.programs import recorder as recorder_module
-from lowfc.programs.recorder import Recorder
-from lowfc.programs.recording_summary import Summary
+from lowfc.programs.recording import recorder as recorder_module
+from lowfc.programs.recording.recorder import Recorder
+from lowfc.programs.recording.summary import Summary
 
 
 @pytest.fixture
@@ -218,8 +218,8 @@ def test_each_log_of_a_run_can_be_read_by_itself(bench: Bench) -> None:
     bench.start(
         limits=Limits(longest_s=0.6, min_free_bytes=0), attachments=[Attachment("a.toml", "application/toml", b"[a]")]
     )
-    recorder = bench.recorder
-    until(lambda: len(recorder._states) == 3 and not recorder._newcomers and recorder._answers is None)
+    others = bench.recorder._others
+    until(lambda: len(others._states) == 3 and not others._newcomers and others._answers is None)
     (second,) = put(calibrations, 1)
     put_until(frames, lambda: len(bench.recorder._series.files) == 3)
     summary = bench.stop()

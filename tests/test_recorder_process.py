@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 from other_readers import foxglove, rerun
 from test_recorder import PATIENCE_S, bodies_of, until
+from typer.testing import CliRunner
 
 from lowfc.adapters.clock import HostClock
 from lowfc.adapters.envelope import count_of
@@ -24,6 +25,7 @@ from lowfc.adapters.run import new_run_id, open_run
 from lowfc.adapters.service import Service
 from lowfc.adapters.zenoh_bus import ZenohBus
 from lowfc.contract.messages import FRAME, STEP
+from lowfc.programs.ctl.command import ctl_app
 
 SAFE_NS = 600_000_000
 """What a kill may cost: the messages published in this time before it."""
@@ -33,7 +35,7 @@ RECORDERS = """
 import os, sys
 from pathlib import Path
 from lowfc.adapters.run import open_run
-from lowfc.programs.recorder import record
+from lowfc.programs.recording.recorder import record
 folder, *runs = sys.argv[1:]
 for run in runs:
     pid = os.fork()
@@ -214,6 +216,27 @@ def test_the_command_rotates_and_says_what_it_did(tmp_path: Path) -> None:
     assert (len(messages), len(bodies_of(messages, FRAME))) == (done["messages_recorded"], published)
     assert readers[-1].metadata["recording"][f"lost {FRAME.key}"] == "3"
     assert done["longest_unflushed_ms"] >= done["longest_wait_ms"] > 0
+
+
+def test_a_recording_is_ended_where_the_controller_has_died(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
+    bench = Bench(tmp_path)
+    process = lowfc("record", "--run", bench.run.run_id, "--folder", tmp_path / "logs")
+    until(lambda: bench.recorder_is("ready"))
+    for _ in range(20):
+        bench.put()
+    stopped = CliRunner().invoke(ctl_app, ["record", "stop", "--json"], catch_exceptions=False)
+    reader = LogReader(Path(json.loads(stopped.stdout)["log"]))
+    assert len(bodies_of(list(reader), FRAME)) == 20
+    assert reader.complete
+    refused = CliRunner().invoke(ctl_app, ["status", "--run", bench.run.run_id])
+    assert f"no controller is there in run '{bench.run.run_id}'" in str(refused.exception)
+    process.send_signal(signal.SIGTERM)
+    until(lambda: bench.recorder_is("stopping"))
+    bench.service.finish()
+    _, wrong = process.communicate(timeout=PATIENCE_S)
+    bench.close()
+    assert process.returncode == 0, wrong
 
 
 @pytest.mark.parametrize(

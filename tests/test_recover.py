@@ -19,7 +19,7 @@ from lowfc.adapters.log_reader import LogReader
 from lowfc.adapters.log_recovery import recover, recovered_path
 from lowfc.adapters.terminal import new_app
 from lowfc.contract.errors import DataFileError
-from lowfc.programs.recover import recover as command
+from lowfc.programs.log.recover import recover as command
 
 RECOVERED = 120  # of the mutations
 

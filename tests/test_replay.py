@@ -36,10 +36,10 @@ from lowfc.contract.state_codec import controller_state
 from lowfc.control.inputs import Frame, Input, Load, Request
 from lowfc.control.loop import advance
 from lowfc.control.state import Settings, State
-from lowfc.programs import replay_lane
-from lowfc.programs.replay import replay
-from lowfc.programs.replay_account import Account
-from lowfc.programs.replay_lane import PATIENCE_NS, Frames, Share
+from lowfc.programs.replay import lane as replay_lane
+from lowfc.programs.replay.account import Account
+from lowfc.programs.replay.fold import replay
+from lowfc.programs.replay.lane import PATIENCE_NS, Frames, Share
 
 START_S = 1_767_225_600
 STATE_EVERY = 12

@@ -27,7 +27,8 @@ from lowfc.adapters.run import open_run
 from lowfc.adapters.zenoh_bus import ZenohBus
 from lowfc.contract.configuration import keys
 from lowfc.contract.messages import FRAME
-from lowfc.programs import controller, latency_run
+from lowfc.programs import controller
+from lowfc.programs.latency import run as latency_run
 
 ROOT = Path(__file__).parents[1]
 BY_NAME = {change.name: change for change in CHANGES}

@@ -1,5 +1,6 @@
 """What a soak makes of its samples: growth is found, noise is not, gaps are counted."""
 
+import json
 from pathlib import Path
 
 import numpy as np
@@ -9,11 +10,20 @@ from lowfc.adapters.bus import Sample
 from lowfc.adapters.envelope import sequence_of
 from lowfc.adapters.log_writer import LogWriter
 from lowfc.contract.messages import STEP, TRUTH
-from lowfc.programs.soak_figures import Usage, grows, of_latency, of_process, render, slope
-from lowfc.programs.soak_run import LogChecker
+from lowfc.programs.soak.figures import Usage, of_latency, of_process, render, slope, too_short
+from lowfc.programs.soak.run import LogChecker
 
 SECONDS = 1800
 START_S = 1_800_000_000
+COUNTS = {
+    "frames_published": 10,
+    "frames_skipped": 1,
+    "frames_missing": 0,
+    "messages_recorded": 50,
+    "messages_lost": 0,
+    "logs": 2,
+    "gaps": 0,
+}
 
 
 def usage(leak_mb_per_hour: float, seed: int = 1, handles_per_hour: float = 0.0) -> list[Usage]:
@@ -45,10 +55,20 @@ def test_handles_that_are_not_given_back_are_found() -> None:
     assert of_process(usage(0.0, handles_per_hour=60))["grows"] == ["handles"]
 
 
-def test_a_slope_of_too_little_is_none() -> None:
-    found = slope([0.0, 1.0, 2.0], [1.0, 2.0, 3.0])
-    assert np.isnan(found.per_hour)
-    assert not grows(found, 1.0)
+def test_what_is_too_short_is_not_judged_and_has_not_passed() -> None:
+    assert slope([0.0, 1.0, 2.0], [1.0, 2.0, 3.0]) is None
+    processes = {"camera": of_process(usage(0.0)), "recorder": of_process(usage(0.0)[:3])}
+    latency = of_latency([])
+    assert (processes["camera"]["too_short"], processes["recorder"]["grows"]) == ([], [])
+    short = too_short(processes, latency)
+    assert short == ["the recorder's memory", "the recorder's handles", "the recorder's threads", "the latency"]
+    figures = {"processes": processes, "latency": latency, **COUNTS, "too_short": short, "why": []}
+    assert json.loads(json.dumps(figures, allow_nan=False)) == figures
+    text = render(figures)
+    assert "nan" not in text
+    assert text.splitlines()[2].split()[-10:-6] == ["too", "short", "to", "judge"]
+    assert "p50 too short to judge; p99 too short to judge" in text
+    assert text.endswith(f"too short to judge: {', '.join(short)}\n")
 
 
 def log(folder: Path, name: str, counts: dict[str, list[int]]) -> None:
@@ -74,15 +94,9 @@ def test_the_table() -> None:
     times = [float(one) for one in range(SECONDS)]
     figures = {
         "processes": {"camera": of_process(usage(0.0))},
-        "latency": of_latency(times, [500 + 8 * one / 3600 for one in times], [900.0] * SECONDS),
-        "frames_published": 10,
-        "frames_skipped": 1,
-        "frames_missing": 0,
-        "messages_recorded": 50,
-        "messages_lost": 0,
-        "logs": 2,
-        "gaps": 0,
-        "passed": False,
+        "latency": of_latency([(one, 500 + 8 * one / 3600, 900.0) for one in times]),
+        **COUNTS,
+        "too_short": [],
         "why": ["the camera's memory grow"],
     }
     text = render(figures)

@@ -11,21 +11,26 @@ from astropy.io import fits
 from report_log import Night
 from rich.console import Console
 from test_linear_law import LAWS
-from toy import PERIOD_NS, calibration, frame_sequence
+from toy import NOLL, PERIOD_NS, calibration, frame_sequence, settings
 
 from lowfc.adapters import law_file
 from lowfc.adapters.log_reader import LogReader
 from lowfc.client import Answer
 from lowfc.contract.configuration import Configuration
-from lowfc.contract.errors import ConfigurationError, DataFileError
+from lowfc.contract.errors import BusError, ConfigurationError, DataFileError, RequestRefusedError
+from lowfc.contract.identity import identity
 from lowfc.contract.messages import wire
+from lowfc.contract.state_codec import controller_state
 from lowfc.control.calibration import Calibration
-from lowfc.control.inputs import Step
+from lowfc.control.inputs import Load, Request, Step
+from lowfc.control.linear_law import LinearLaw
+from lowfc.control.loop import advance
 from lowfc.control.margins import check_stable
 from lowfc.control.safety import LoopMode
-from lowfc.programs.tune import tune, tune_run
-from lowfc.programs.tune_data import of_log, of_run
-from lowfc.programs.tune_figures import figures, render, tuned
+from lowfc.control.state import State
+from lowfc.programs.tune.command import integrate, tune, tune_run
+from lowfc.programs.tune.data import driving, of_log, of_run
+from lowfc.programs.tune.figures import figures, render, tuned
 
 QUIET = Console(quiet=True)
 
@@ -145,6 +150,77 @@ def test_a_running_loop_is_listened_to() -> None:
     assert found["achieved_from"] == "error less noise"
 
 
+class Steered:
+    """What `integrate` asks of a client; requests go to the live controller's `advance`."""
+
+    def __init__(self) -> None:
+        self.settings = settings(gain=(0.4, 0.2))
+        self.state, _ = advance(self.settings, State(), Load(0, calibration(), "test"))
+        self.asked: list[str] = []
+        self.deaf: tuple[int, ...] = ()
+
+    def _ask(self, request: Request) -> Answer:
+        self.asked.append(request.name)
+        if len(self.asked) in self.deaf:
+            raise BusError("the controller did not answer")
+        self.state, outputs = advance(self.settings, self.state, request)
+        assert outputs.reply is not None
+        if not outputs.reply.accepted:
+            raise RequestRefusedError(f"{request.name} refused: {outputs.reply.text}")
+        return Answer(True, outputs.reply.text, frame_sequence(7))
+
+    def status(self) -> Answer:
+        return Answer(True, "", 0, state=controller_state(self.state, self.settings, 0))
+
+    def law(self, law: LinearLaw | None = None) -> Answer:
+        return self._ask(Request(0, "law", law=law))
+
+    def gain(self, values: list[float], modes: tuple[int, ...]) -> Answer:
+        return self._ask(Request(0, "gain", modes, tuple(values)))
+
+    def known(self) -> tuple[str | None, list[float]]:
+        state = self.status().state
+        law = driving(state)
+        assert state is not None
+        return (None if law is None else law.name), [round(gain, 6) for gain in state.gain]
+
+
+def test_gains_are_given_to_whatever_law_drives() -> None:
+    loop = Steered()
+    answer = integrate(loop, [0.3, 0.25, 0.1], NOLL)  # type: ignore[arg-type]
+    assert answer.sentence == "gain is now 0.3 0.25 0.1, from frame 7 on"
+    assert loop.asked == ["gain"]
+    loop.law(LAWS["pi"])
+    integrate(loop, [0.2, 0.2, 0.1], NOLL)  # type: ignore[arg-type]
+    assert loop.known() == (None, [0.2, 0.2, 0.1])
+
+
+def test_the_law_that_drove_goes_on_where_the_gains_are_refused() -> None:
+    loop = Steered()
+    loop.law(LAWS["pi"])
+    before = loop.known()
+    with pytest.raises(RequestRefusedError, match=r"^gain refused: gain must be at least 0 and below"):
+        integrate(loop, [0.3, 0.3, 9.0], NOLL)  # type: ignore[arg-type]
+    assert loop.known() == before == (LAWS["pi"].name, [0.4, 0.4, 0.2])
+    with pytest.raises(RequestRefusedError, match="are not controlled"):
+        integrate(loop, [0.3, 0.3], (2, 9))  # type: ignore[arg-type]
+    assert loop.known() == before
+
+
+def test_the_law_that_drove_goes_on_where_nobody_answers_or_it_is_said_that_it_does_not() -> None:
+    loop = Steered()
+    loop.law(LAWS["pi"])
+    before = loop.known()
+    loop.deaf = (3,)
+    with pytest.raises(BusError, match="did not answer"):
+        integrate(loop, [0.3, 0.3, 0.3], NOLL)  # type: ignore[arg-type]
+    assert loop.known() == before
+    loop.deaf = (6, 7)
+    with pytest.raises(RequestRefusedError, match=f"the integrator drives .* law {before[0]!r} could not be put back"):
+        integrate(loop, [0.3, 0.3, 0.3], NOLL)  # type: ignore[arg-type]
+    assert loop.known() == (None, before[1])
+
+
 def test_a_picture_is_drawn(log: Path, tmp_path: Path) -> None:
     found = tune_run(log, "lqg", plot=tmp_path / "lqg.png", console=QUIET)
     assert (tmp_path / "lqg.png").read_bytes()[:4] == b"\x89PNG"
@@ -175,7 +251,7 @@ def test_a_log_or_a_running_loop_is_named() -> None:
 def test_a_law_comes_back_from_its_file_as_it_was(name: str, tmp_path: Path) -> None:
     law_file.save(LAWS[name], tmp_path / "law.fits")
     again = law_file.load(tmp_path / "law.fits")
-    assert law_file.identity(again) == law_file.identity(LAWS[name])
+    assert identity(again) == identity(LAWS[name])
     assert (again.name, again.noll, again.delay_frames) == (LAWS[name].name, LAWS[name].noll, 1.0)
 
 

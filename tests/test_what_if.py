@@ -2,7 +2,6 @@
 
 import json
 from collections import Counter
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -27,9 +26,8 @@ from lowfc.control.safety import LoopMode, Reason
 from lowfc.control.stability import delay_weights, limiting_gain
 from lowfc.control.what_if import counterfactual, integrator, rms
 from lowfc.optics.photometry import tilt_nm_per_mas
-from lowfc.programs.what_if import LINEAR_WAVES, WhatIf, compared, render, wanted, what_if
-from lowfc.programs.what_if_options import user_controller
-from lowfc.programs.what_if_run import LoggedRun
+from lowfc.programs.what_if.compare import LINEAR_WAVES, WhatIf, compared, render, wanted, what_if
+from lowfc.programs.what_if.run import LoggedRun
 
 RATE_HZ = 250
 Gains = tuple[float, float, float]
@@ -257,18 +255,6 @@ def test_what_is_fitted_along_needs_a_calibration(logs: dict[str, Path], tmp_pat
         figures_of(logs["usual"], wanted(config=path))
 
 
-@pytest.fixture
-def controller(tmp_path: Path) -> Callable[[str], str]:
-    """Writes a file with a controller, and returns where it is."""
-
-    def write(body: str) -> str:
-        path = tmp_path / "mine.py"
-        path.write_text(body)
-        return f"{path}:step"
-
-    return write
-
-
 INTEGRATOR = """
 from __future__ import annotations
 from dataclasses import dataclass
@@ -288,83 +274,14 @@ def step(state: State | None, error_nm: np.ndarray) -> tuple[State, np.ndarray]:
 """
 
 
-def test_a_controller_of_ones_own_is_folded_like_the_integrator(
-    logs: dict[str, Path], controller: Callable[[str], str]
-) -> None:
-    where = controller(INTEGRATOR)
+def test_a_controller_of_ones_own_is_folded_like_the_integrator(logs: dict[str, Path], tmp_path: Path) -> None:
+    (tmp_path / "mine.py").write_text(INTEGRATOR)
+    where = f"{tmp_path / 'mine.py'}:step"
     own, ours = figures_of(logs["usual"], wanted(controller=where)), figures_of(logs["usual"], wanted(OTHER))
     np.testing.assert_allclose(column(own, "what_if"), column(ours, "what_if"), rtol=1e-4)
     assert own["controller"] == where
     assert "gain" not in own["modes"][0]
     assert where in render(own)
-
-
-@pytest.mark.parametrize(
-    ("body", "message"),
-    [
-        ("def step(state, error_nm):\n    return error_nm[0]\n", r"call 1: TypeError: .* must return"),
-        ("def step(state, error_nm):\n    return state, error_nm[:1]\n", r"must be 3 finite numbers, got shape \(1,\)"),
-        ("def step(state, error_nm):\n    return state, error_nm / 0\n", "call 1: .*divide by zero|finite numbers"),
-        ("def step(state, error_nm):\n    return state, ['a'] * 3\n", "call 1: ValueError"),
-        ("def stop(state, error_nm):\n    pass\n", r"has no function 'step' \(did you mean 'stop'\?\)"),
-        ("def step(:\n", "cannot be run: SyntaxError"),
-        ("import no_such_module_at_all\n", "cannot be run: ModuleNotFoundError"),
-        ("raise SystemExit(0)\n", "cannot be run: SystemExit: 0"),
-        ("def step(state, error_nm):\n    exit(3)\n", "call 1: SystemExit: 3"),
-    ],
-)
-def test_a_controllers_mistakes_are_made_plain(controller: Callable[[str], str], body: str, message: str) -> None:
-    def call() -> None:
-        user_controller(controller(body))(None, np.ones(3, np.float32))
-
-    with pytest.raises(ConfigurationError, match=message):
-        call()
-
-
-def test_what_a_controller_prints_is_not_among_the_figures(
-    controller: Callable[[str], str], capsys: pytest.CaptureFixture[str]
-) -> None:
-    where = controller("print('loaded')\ndef step(state, error_nm):\n    print('called')\n    return state, error_nm\n")
-    user_controller(where)(None, np.ones(3, np.float32))
-    assert capsys.readouterr() == ("", "loaded\ncalled\n")
-
-
-@pytest.mark.parametrize(
-    ("where", "message"),
-    [
-        ("mine.py", "must be FILE.py:NAME"),
-        ("mine.txt:step", "must be FILE.py:NAME"),
-        ("nowhere.py:step", "there is no file nowhere.py"),
-    ],
-)
-def test_where_a_controller_is_must_be_said(where: str, message: str) -> None:
-    with pytest.raises(ConfigurationError, match=message):
-        user_controller(where)
-
-
-def test_the_words_of_the_command_line() -> None:
-    asked = wanted(" gain=0.6, leak=0.01,tilt_limit_nm=80,estimator=pinv", controller=None)
-    assert asked == WhatIf({"gain": 0.6, "leak": 0.01, "tilt_limit_nm": 80.0}, "pinv")
-    assert wanted() == WhatIf()
-    assert wanted("", controller="mine.py:step") == WhatIf(controller="mine.py:step")
-
-
-@pytest.mark.parametrize(
-    ("text", "message"),
-    [
-        ("gian=0.6", r"unknown key 'gian' \(did you mean 'gain'\?\); known are gain, leak,"),
-        ("tilt_gains=1", r"did you mean 'tilt_gain'"),
-        ("gain", "gain needs a value"),
-        ("gain=", "gain needs a value"),
-        ("gain=high", "gain must be a number, got 'high'"),
-        ("gain=1,gain=2", "gain is there twice"),
-        ("", "--what-if asks for nothing; give KEY=VALUE"),
-        ("estimator=best", "estimator must be weighted or pinv, got 'best'"),
-    ],
-)
-def test_words_that_make_no_sense_are_refused(text: str, message: str) -> None:
-    with pytest.raises(ConfigurationError, match=message):
-        wanted(text)
 
 
 @pytest.mark.parametrize("text", ["gain=5", "gain=-0.1", "leak=2", "gain=nan", "limit_nm=-1"])

@@ -13,7 +13,7 @@ from typing import Any
 
 from rich.console import Console
 
-from benchmarks.command import run_main
+from benchmarks.command import add_forms, run_main, say
 from benchmarks.host import host
 from benchmarks.peers.contest import PRIORITY, SCHEDULING, Rules, hold, may_run_first, processors
 from benchmarks.peers.contestants import CONTESTANTS
@@ -28,10 +28,7 @@ def main() -> int:
     """The command line; returns its exit status."""
     asked = _parser().parse_args()
     result = json.loads(asked.render.read_text()) if asked.render else measure(asked)
-    if asked.json:
-        sys.stdout.write(json.dumps(result) + "\n")
-    else:
-        sys.stdout.write((markdown(result) if asked.markdown else text(result)) + "\n")
+    say(result, asked, text, markdown)
     return 1 if any(row["failures"] for row in result["rows"]) else 0
 
 
@@ -92,8 +89,7 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--rate", dest="rate_hz", type=float, default=1000.0, help="frames per second (%(default)g)")
     parser.add_argument("--only", action="append", metavar="WORD", help="contestants with this in their name; repeat")
     parser.add_argument("--pyrtcao", default=sys.executable, metavar="PYTHON", help="an interpreter that has pyrtcao")
-    parser.add_argument("--json", action="store_true", help="print one JSON object")
-    parser.add_argument("--markdown", action="store_true", help="print the table in Markdown")
+    add_forms(parser)
     parser.add_argument("--render", type=Path, metavar="JSON", help="measure nothing: print what is in this file")
     return parser
 

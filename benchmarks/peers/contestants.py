@@ -83,7 +83,8 @@ CONTESTANTS = (
     ),
     _plain(
         "lowfc's bus and step",
-        "its bus, handover, step and real-time set-up, without what the controller publishes after a command",
+        "its bus, handover, step, rehearsal and real-time set-up, without what the controller publishes after a "
+        "command",
         "lowfc",
         step="lowfc",
     ),

@@ -7,7 +7,7 @@ from benchmarks.peers.problem import GAIN, GRID, LEAK, LIMIT_NM, MODES, SHAPE, P
 from lowfc.contract import codec
 from lowfc.contract.messages import image
 from lowfc.control.calibration import Calibration
-from lowfc.control.inputs import Load
+from lowfc.control.inputs import Load, Outputs
 from lowfc.control.loop import advance
 from lowfc.control.safety import Limits, LoopMode
 from lowfc.control.state import Settings, State
@@ -33,10 +33,19 @@ class LowfcStep:
         Raises:
             ValueError: the frame was refused: then this is not the step that shall be measured.
         """
-        self._state, outputs = advance(self._settings, self._state, codec.decode_frame(payload, sequence, age_ns))
+        self._state, outputs = self._advanced(payload, sequence, age_ns)
         if outputs.command is None or outputs.step is None or outputs.step.reasons:
             raise ValueError(f"frame {sequence} was not used as it came: {outputs.step}")
         return codec.encode_command(outputs.command, _VALID_NS, "lowfc", self._state.taken)
+
+    def rehearse(self, payload: bytes) -> None:
+        """The answer to a frame, for nothing."""
+        state, outputs = self._advanced(payload, self._state.frame_sequence + 1, 0)
+        if outputs.command is not None:
+            codec.encode_command(outputs.command, _VALID_NS, "lowfc", state.taken)
+
+    def _advanced(self, payload: bytes, sequence: int, age_ns: int) -> tuple[State, Outputs]:
+        return advance(self._settings, self._state, codec.decode_frame(payload, sequence, age_ns))
 
 
 def _settings() -> Settings:

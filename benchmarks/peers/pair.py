@@ -13,9 +13,12 @@ from benchmarks.peers.problem import DIFFERENT, NumpyStep, Problem
 from benchmarks.peers.process import Part
 from benchmarks.peers.transports import TRANSPORTS, Link, Message, watch
 from lowfc.adapters import realtime
+from lowfc.adapters.mailbox import Mailbox
 from lowfc.adapters.zenoh_bus import receive_in_one_thread
+from lowfc.programs.rehearsal import Rehearsal
 
 _STEPS = {"numpy": NumpyStep, "lowfc": LowfcStep}
+_LONGEST_PAUSE_S = 0.1
 _GROWTH_BYTES = 64  # numbers in a protobuf message grow longer
 
 
@@ -41,6 +44,7 @@ def controller(part: Part) -> None:
     """Answer frames until told to stop."""
     commanded, now_ns = part.marks("commanded"), time.monotonic_ns
     step = _step(part)
+    stage = Stage(step, part.plan.rate_hz) if isinstance(step, LowfcStep) and _is_lowfc(part) else None
 
     def answer(number: int, sent_ns: int, payload: bytes) -> None:
         taken_ns = now_ns()
@@ -49,10 +53,49 @@ def controller(part: Part) -> None:
         commanded[number] = now_ns()
         if link.tell is not None:
             link.tell(number, taken_ns, command)
+        if stage is not None:
+            stage.played(payload, taken_ns)
 
-    link = _join(part, answer)
+    link = _join(part, answer if stage is None else stage.alone(answer))
     part.ready()
+    if stage is not None:
+        stage.rehearse()
     threading.Event().wait()
+
+
+class Stage:
+    """Where a step is done, and rehearsed before the next frame, as lowfc's controller does."""
+
+    def __init__(self, step: LowfcStep, rate_hz: float) -> None:
+        self._step = step
+        self._rehearsal = Rehearsal(round(1e9 / rate_hz))
+        self._turn = threading.Lock()
+        self._pause = Mailbox()
+        self._payload = b""
+
+    def alone(self, answer: Message) -> Message:
+        """The same, but never while there is a rehearsal."""
+
+        def answered(number: int, sent_ns: int, payload: bytes) -> None:
+            with self._turn:
+                answer(number, sent_ns, payload)
+
+        return answered
+
+    def played(self, payload: bytes, now_ns: int) -> None:
+        """A frame was answered."""
+        self._payload = payload
+        self._rehearsal.came(now_ns)
+        self._pause.wake()
+
+    def rehearse(self) -> None:
+        """Without end."""
+        while True:
+            rest_ns = self._rehearsal.rest_ns(time.monotonic_ns())
+            self._pause.take(_LONGEST_PAUSE_S if rest_ns is None else rest_ns * 1e-9)
+            with self._turn:
+                if self._rehearsal.begins(time.monotonic_ns()):
+                    self._step.rehearse(self._payload)
 
 
 def onlooker(part: Part) -> None:
@@ -88,10 +131,14 @@ def _step(part: Part) -> NumpyStep | LowfcStep:
 def _settle(part: Part) -> None:
     if part.role != "source":  # as a process of lowfc's that waits for what it receives
         receive_in_one_thread()
-    if part.plan.options.get("transport") == "lowfc":  # as its processes are set up, whatever that is
+    if _is_lowfc(part):  # as its processes are set up, whatever that is
         realtime.set_up(part.priority or None, {part.cpu}, lock_memory=True, stay_awake=False)
     else:
         part.settle()
+
+
+def _is_lowfc(part: Part) -> bool:
+    return part.plan.options.get("transport") == "lowfc"
 
 
 _ROLES = {"source": source, "controller": controller, "onlooker": onlooker, "timer": timer}

@@ -1,17 +1,13 @@
 """What each change on the way down bought: python -m benchmarks.road, from the root of the repository."""
 
 import argparse
-import json
-import os
-import shlex
 import sys
 import time
 from collections.abc import Mapping
 from typing import Any
 
 from benchmarks import cells
-from benchmarks.command import run_main
-from benchmarks.host import host
+from benchmarks.command import add_forms, occasion, run_main, say
 from benchmarks.road import table
 from benchmarks.road.changes import CHANGES, Change, Loop
 from benchmarks.road.measure import figures, in_turns
@@ -19,7 +15,7 @@ from benchmarks.road.patches import applied
 from benchmarks.road.trip import prepared, trip
 from lowfc.adapters.clock import sharpen_sleep
 from lowfc.contract.configuration import Configuration
-from lowfc.programs.latency import Camera, _configuration
+from lowfc.programs.latency.command import Camera, _configuration
 
 
 def main() -> int:
@@ -28,7 +24,7 @@ def main() -> int:
     asked.add_argument("--only", nargs="+", metavar="NAME", choices=[one.name for one in CHANGES], help="these changes")
     chosen = asked.parse_args()
     result = measure(chosen)
-    say(result, table.road(result), chosen)
+    say(result, chosen, lambda found: cells.text(table.road(found)), lambda found: cells.markdown(table.road(found)))
     return 0
 
 
@@ -63,29 +59,16 @@ def parser(program: str, what: str | None, seconds: float) -> argparse.ArgumentP
     found = argparse.ArgumentParser(program, description=what)
     found.add_argument("--seconds", type=float, default=seconds, help="measured of each run (%(default)g)")
     found.add_argument("--repeats", type=int, default=5, help="(%(default)s)")
-    found.add_argument("--json", action="store_true", help="print one JSON object")
-    found.add_argument("--markdown", action="store_true", help="print the table in Markdown")
+    add_forms(found)
     return found
 
 
 def about(asked: argparse.Namespace, program: str) -> dict[str, Any]:
     """Where, when and how something is measured; to be called before."""
-    return {
-        "settings": {
-            "seconds": asked.seconds,
-            "repeats": asked.repeats,
-            "rate_hz": settings().camera.rate_hz,
-        },
-        "host": {**host(), "load_before": round(os.getloadavg()[0], 2)},
-        "date": time.strftime("%Y-%m-%d", time.gmtime()),
-        "command": shlex.join([*program.split(), *sys.argv[1:]]),
-    }
-
-
-def say(result: Mapping[str, Any], lines: cells.Lines, asked: argparse.Namespace) -> None:
-    """Print what was measured, its table being `lines`."""
-    table_of = cells.markdown if asked.markdown else cells.text
-    sys.stdout.write((json.dumps(result) if asked.json else table_of(lines)) + "\n")
+    when = occasion(program)
+    load_before = when.pop("load_before")
+    rules = {"seconds": asked.seconds, "repeats": asked.repeats, "rate_hz": settings().camera.rate_hz}
+    return {"settings": rules, **when, "host": {**when["host"], "load_before": load_before}}
 
 
 def tell(what: str) -> None:

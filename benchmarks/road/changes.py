@@ -115,6 +115,12 @@ _AS_IT_IS = (
         often=True,
         keys={"realtime.rehearse": False},
     ),
+    Change(
+        "rehearse-late",
+        "that shortly before the next frame, not right after the last",
+        kept=True,
+        often=True,
+    ),
     Change("telemetry", "command before telemetry", kept=True),
     Change("locked", "memory locked", kept=True, keys={"realtime.lock_memory": False}),
     Change("memory-kept", "freed memory kept (mallopt)", kept=True),

@@ -4,14 +4,14 @@ import argparse
 import contextlib
 import itertools
 import os
-import sys
 import time
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from benchmarks.command import run_main
+from benchmarks import cells
+from benchmarks.command import run_main, say
 from benchmarks.road import table
-from benchmarks.road.__main__ import about, parser, say, settings, tell
+from benchmarks.road.__main__ import about, parser, settings, tell
 from benchmarks.road.load import WHAT, background
 from benchmarks.road.measure import course
 from benchmarks.road.trip import DUE, PERCENTILES, TripError, prepared, trip
@@ -26,9 +26,12 @@ def main() -> int:
     """The command line; returns its exit status."""
     asked = parser("python -m benchmarks.road.loaded", __doc__, seconds=5.0).parse_args()
     result = measure(asked)
-    say(result, table.loaded(result), asked)
-    if not asked.json:
-        sys.stdout.write(f"\n{table.ratios(result)}\n")
+    say(
+        result,
+        asked,
+        lambda found: f"{cells.text(table.loaded(found))}\n\n{table.ratios(found)}",
+        lambda found: f"{cells.markdown(table.loaded(found))}\n\n{table.ratios(found)}",
+    )
     return 0
 
 

@@ -25,6 +25,7 @@ from lowfc.adapters.service import Service
 from lowfc.contract.configuration import Configuration
 from lowfc.contract.messages import Role, Topic
 from lowfc.control.inputs import Outputs
+from lowfc.programs import rehearsal
 
 Config = dict[str, Any]
 
@@ -298,6 +299,7 @@ PATCHES: dict[str, Callable[[], None]] = {
     "stay-python": lambda: _put(zenoh_bus, "stay_python", _nothing),
     "let-send": lambda: _put(realtime, "let_send", _nothing),
     "mirror-ahead": _mirror_ahead,
+    "rehearse-late": lambda: _put(rehearsal, "LEAD_NS", 10**9),
     "shortcut": lambda: _put(zenoh_bus.ZenohBus, "_shortcut", _nothing),
     "retry": _edit(_asks_often),
     "bus-first": _bus_first,

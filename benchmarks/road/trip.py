@@ -17,8 +17,8 @@ from lowfc.adapters.run import Run, open_run
 from lowfc.contract.configuration import Configuration, load
 from lowfc.contract.errors import LowfcError
 from lowfc.contract.messages import Role
-from lowfc.programs import latency_run
-from lowfc.programs.latency_figures import STAGES
+from lowfc.programs.latency import run as latency_run
+from lowfc.programs.latency.figures import STAGES
 
 ROOT = Path(__file__).parents[2]
 SITE = Path(__file__).parent / "site"

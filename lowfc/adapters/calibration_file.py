@@ -1,17 +1,13 @@
 """Calibrations as FITS: one named extension for each array, units in the headers."""
 
-import io
-import warnings
 from pathlib import Path
 
-import numpy as np
-import numpy.typing as npt
 from astropy.io import fits
-from astropy.utils.exceptions import AstropyWarning
 
+from lowfc.adapters import fits_file
 from lowfc.adapters.whole_file import write_whole
-from lowfc.contract.calibration_codec import identified
 from lowfc.contract.errors import DataFileError
+from lowfc.contract.identity import identity
 from lowfc.control.calibration import Calibration
 
 KIND = "lowfc calibration 1"
@@ -31,9 +27,8 @@ _MAY_LACK = "ACT2MODES"
 
 def to_bytes(calibration: Calibration) -> bytes:
     """Calibration as a FITS file."""
-    primary = fits.PrimaryHDU()
+    primary = fits_file.header_of(KIND)
     header = primary.header
-    header["KIND"] = (KIND, "what this file is")
     header["CALID"] = calibration.id
     header["OPERATOR"] = calibration.operator_hash
     header["ESTIMATE"] = (calibration.estimator, "how R was made")
@@ -45,18 +40,15 @@ def to_bytes(calibration: Calibration) -> bytes:
     header["MIRCOLS"] = (calibration.grid[1], "columns of the mirror")
     header["FLUX"] = (calibration.flux_dn, "[adu] expected sum of the good pixels")
     header["SATURATE"] = (calibration.saturation_dn, "[adu] highest value of a pixel")
-    units = [primary]
-    for name, attribute, unit, sentence in _EXTENSIONS:
-        array = getattr(calibration, attribute)
-        if name == _MAY_LACK and not array.size:
-            continue
-        extension = fits.ImageHDU(array, name=name)
-        extension.header["BUNIT"] = unit
-        extension.header["CONTENT"] = sentence
-        units.append(extension)
-    stream = io.BytesIO()
-    fits.HDUList(units).writeto(stream, checksum=True)
-    return stream.getvalue()
+    arrays = {name: getattr(calibration, attribute) for name, attribute, _, _ in _EXTENSIONS}
+    return fits_file.to_bytes(
+        primary,
+        [
+            fits_file.extension(name, arrays[name], sentence, unit)
+            for name, _, unit, sentence in _EXTENSIONS
+            if name != _MAY_LACK or arrays[name].size
+        ],
+    )
 
 
 def save(calibration: Calibration, path: Path) -> None:
@@ -76,28 +68,18 @@ def load(path: Path) -> Calibration:
     """
     if not path.is_file():
         raise DataFileError(f"{path}: there is no such calibration file")
-    try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("error", AstropyWarning)  # a shortened file is no more than a warning to astropy
-            with fits.open(path, mode="readonly", memmap=False) as units:
-                calibration = _read(units)
-    except (OSError, KeyError, TypeError, ValueError, AstropyWarning) as error:
-        raise DataFileError(f"{path}: not a whole calibration file: {error}") from None
-    found = identified(calibration).id
-    if found != calibration.id:
-        raise DataFileError(f"{path}: damaged: its content has identity {found[:12]}, it says {calibration.id[:12]}")
+    calibration = fits_file.load(path, KIND, "calibration file", _read)
+    fits_file.require_identity(path, identity(calibration), calibration.id)
     return calibration
 
 
 def _read(units: fits.HDUList) -> Calibration:
     header = units[0].header
-    if header.get("KIND") != KIND:
-        raise ValueError(f"its header should say KIND = {KIND!r}, got {header.get('KIND')!r}")
-
-    def array(name: str) -> npt.NDArray[np.float32]:
-        return np.ascontiguousarray(units[name].data, dtype=np.float32)
-
-    arrays = {attribute: array(name) for name, attribute, _, _ in _EXTENSIONS if name != _MAY_LACK or name in units}
+    arrays = {
+        attribute: fits_file.single(units, name)
+        for name, attribute, _, _ in _EXTENSIONS
+        if name != _MAY_LACK or name in units
+    }
     return Calibration(
         noll=tuple(int(index) for index in str(header["NOLL"]).split()),
         shape=(int(header["ROWS"]), int(header["COLUMNS"])),

@@ -4,6 +4,7 @@ The authority's folder has ca.key, which signs: it belongs on no machine of the 
 role that it has ROLE.pem and ROLE.key.
 """
 
+import contextlib
 import datetime
 import ipaddress
 import os
@@ -45,7 +46,7 @@ def make_certificates(
         roles: to make certificates for, the router's among them.
         addresses: names and IP addresses by which the others reach the router.
         days: that the certificates are valid.
-        renew: make those that are there anew, too; not the authority.
+        renew: make those that are there anew, too, of the keys that they have; not the authority.
 
     Returns:
         The certificates that were made.
@@ -62,13 +63,12 @@ def make_certificates(
         folder.mkdir(mode=0o700, parents=True, exist_ok=True)
         key, authority = _authority(folder)
         for role in wanted:
-            own = generate_private_key(SECP256R1())
+            own = _own_key(folder, role)
             usage = ExtendedKeyUsageOID.SERVER_AUTH if role == ROUTER else ExtendedKeyUsageOID.CLIENT_AUTH
             builder = _builder(role, own, days).issuer_name(authority.subject)
             builder = builder.add_extension(x509.ExtendedKeyUsage([usage]), critical=False)
             if role == ROUTER:
                 builder = builder.add_extension(x509.SubjectAlternativeName(names), critical=False)
-            _write_secret(folder / f"{role}.key", _pem(own))
             write_whole(folder / f"{role}.pem", builder.sign(key, SHA256()).public_bytes(Encoding.PEM))
     except OSError as fault:
         raise DataFileError(f"no certificates can be written in {folder}: {fault.strerror or fault}") from fault
@@ -97,6 +97,21 @@ def _authority(folder: Path) -> tuple[EllipticCurvePrivateKey, x509.Certificate]
     if not isinstance(key, EllipticCurvePrivateKey) or key.public_key() != certificate.public_key():
         raise DataFileError(f"{key_file} is not the key of {certificate_file}; make all anew in an empty folder")
     return key, certificate
+
+
+def _own_key(folder: Path, role: str) -> EllipticCurvePrivateKey:
+    """A role's key, which it keeps for good: whatever is interrupted, a certificate that is there is of this key."""
+    file = folder / f"{role}.key"
+    if not file.exists():
+        (folder / f"{role}.pem").unlink(missing_ok=True)  # of a key that is not here
+        own = generate_private_key(SECP256R1())
+        _write_secret(file, _pem(own))
+        return own
+    with contextlib.suppress(ValueError, TypeError):
+        found = load_pem_private_key(file.read_bytes(), password=None)
+        if isinstance(found, EllipticCurvePrivateKey):
+            return found
+    raise DataFileError(f"{file} is not a key that was made here; remove it to have another one made")
 
 
 def _builder(name: str, own: EllipticCurvePrivateKey, days: int, *, authority: bool = False) -> x509.CertificateBuilder:
@@ -149,7 +164,11 @@ def _pem(key: EllipticCurvePrivateKey) -> bytes:
 
 def _write_secret(file: Path, content: bytes) -> None:
     """Write a whole file that nobody else can read, from its first byte on."""
-    descriptor, draft = tempfile.mkstemp(prefix=f".{file.name}-", dir=file.parent)  # mode 0600
-    with os.fdopen(descriptor, "wb") as stream:
-        stream.write(content)
-    Path(draft).replace(file)
+    descriptor, name = tempfile.mkstemp(prefix=f".{file.name}-", dir=file.parent)  # mode 0600
+    draft = Path(name)
+    try:
+        with os.fdopen(descriptor, "wb") as stream:
+            stream.write(content)
+        draft.replace(file)
+    finally:
+        draft.unlink(missing_ok=True)

@@ -154,10 +154,14 @@ def settings(config: Configuration) -> Settings:
         gain=(control.tilt_gain, control.gain),
         leak=(control.tilt_leak, control.leak),
         limit_nm=(control.tilt_limit_nm, control.limit_nm),
+        most_alike=control.most_alike if config.camera.noise else 0,  # without noise images are alike
+        rate_hz=config.camera.rate_hz,
     )
 
 
-def analytic_calibration(config: Configuration, optics: Twin, on_nodes: TwinMirror) -> Calibration:
+def analytic_calibration(
+    config: Configuration, optics: Twin, on_nodes: TwinMirror, opd_nm: Double | None = None
+) -> Calibration:
     """I0 and H from the camera's own operator, eqs. (6) to (12), R from them, and the mirror's modes.
 
     The modes are fitted to the influence functions, then mixed a little so that a modal command is what the sensor
@@ -165,14 +169,25 @@ def analytic_calibration(config: Configuration, optics: Twin, on_nodes: TwinMirr
 
     Actuators that are not active stay out of the modes, and the sensor sees nothing of them.
 
+    Args:
+        config: The instrument's.
+        optics: Its twin.
+        on_nodes: Its mirror.
+        opd_nm: Wavefront at the twin's used nodes at which I0 and H are wanted; flat when None.
+
     Raises:
-        CalibrationError: this sensor cannot tell the modes apart, or the star saturates it.
+        CalibrationError: this sensor cannot tell the modes apart, the star saturates it, or shear is to be fitted
+            along at a wavefront that is not flat.
         ConfigurationError: the map of active actuators cannot be used.
     """
+    if opd_nm is not None and "shear" in config.control.nuisance:
+        raise CalibrationError(
+            "what shear of the beam does is known at a flat wavefront only: leave it out of control.nuisance"
+        )
     camera = detector(config)
     nolls = config.noll
     radii = node_radii(optics)
-    I0, H = reference(optics), response(optics, zernikes(nolls, *radii))
+    I0, H = reference(optics, opd_nm), response(optics, zernikes(nolls, *radii), opd_nm)
     shape = I0.shape
     good = np.ones(I0.size)
     flux_e = electrons_per_exposure(config) * float(I0.sum())
@@ -193,7 +208,7 @@ def analytic_calibration(config: Configuration, optics: Twin, on_nodes: TwinMirr
     actuators = config.mirror.rows * config.mirror.columns
     pokes = np.eye(actuators, dtype=np.float32).reshape(actuators, config.mirror.rows, config.mirror.columns)
     wavefronts = np.array([wavefront_nm(on_nodes, poke) for poke in pokes])
-    seen = actuators_to_modes(R, light, good, lambda shapes: response(optics, shapes), wavefronts)
+    seen = actuators_to_modes(R, light, good, lambda shapes: response(optics, shapes, opd_nm), wavefronts)
     if active is not None:
         seen[:, ~active.reshape(-1)] = 0
     commands = commands @ np.linalg.inv(seen @ commands)
@@ -234,15 +249,15 @@ def frame_noise_nm(config: Configuration, calibration: Calibration) -> Double:
 
 
 def _check_exposure(config: Configuration, light: Double) -> None:
-    """Raise where a pixel is at full well under a flat wavefront: what it then says is no longer linear."""
+    """Raise where a pixel is at full well in the reference image: what it then says is no longer linear."""
     camera = detector(config)
     charge_e = float(light.max()) * electrons_per_exposure(config) * camera.em_gain
     full_dn = float(saturation_dn(camera))
     if _dark_dn(camera) + charge_e / camera.gain_e_per_dn >= full_dn:
         raise CalibrationError(
-            f"the star saturates the sensor: {charge_e:.0f} e- in the brightest pixel of a flat wavefront, which holds "
-            f"{(full_dn - _dark_dn(camera)) * camera.gain_e_per_dn:.0f} e-; shorten camera.exposure_fraction or raise "
-            "camera.rate_hz"
+            f"the star saturates the sensor: {charge_e:.0f} e- in the brightest pixel of the reference image, which "
+            f"holds {(full_dn - _dark_dn(camera)) * camera.gain_e_per_dn:.0f} e-; shorten camera.exposure_fraction or "
+            "raise camera.rate_hz"
         )
 
 

@@ -1,19 +1,15 @@
 """Control laws as FITS: one named extension for each matrix."""
 
-import hashlib
-import io
-import warnings
-from dataclasses import fields
 from pathlib import Path
+from typing import cast
 
-import numpy as np
-import numpy.typing as npt
 from astropy.io import fits
-from astropy.utils.exceptions import AstropyWarning
 
+from lowfc.adapters import fits_file
 from lowfc.adapters.whole_file import write_whole
 from lowfc.contract.errors import DataFileError
-from lowfc.control.linear_law import SIGNALS, LinearLaw
+from lowfc.contract.identity import identity
+from lowfc.control.linear_law import LinearLaw, Signal
 
 KIND = "lowfc law 1"
 
@@ -27,35 +23,20 @@ _EXTENSIONS = (
 )
 
 
-def identity(law: LinearLaw) -> str:
-    """SHA-256 of everything in a law."""
-    digest = hashlib.sha256()
-    for part in fields(law):
-        value = getattr(law, part.name)
-        digest.update(part.name.encode())
-        digest.update(value.tobytes() if isinstance(value, np.ndarray) else repr(value).encode())
-    return digest.hexdigest()
-
-
 def to_bytes(law: LinearLaw) -> bytes:
     """Law as a FITS file."""
-    primary = fits.PrimaryHDU()
+    primary = fits_file.header_of(KIND)
     header = primary.header
-    header["KIND"] = (KIND, "what this file is")
     header["LAWID"] = identity(law)
     header["NAME"] = (law.name, "what kind of law it is")
     header["SIGNAL"] = (law.signal, "y: the error, or pseudo-open-loop modes")
     header["NOLL"] = (" ".join(map(str, law.noll)), "Noll index of each mode")
     header["DELAY"] = (law.delay_frames, "[frames] delay it was made for")
     header["RATE"] = (law.rate_hz, "[Hz] frame rate it was made for")
-    units = [primary]
-    for name, attribute, sentence in _EXTENSIONS:
-        extension = fits.ImageHDU(getattr(law, attribute), name=name)
-        extension.header["CONTENT"] = sentence
-        units.append(extension)
-    stream = io.BytesIO()
-    fits.HDUList(units).writeto(stream, checksum=True)
-    return stream.getvalue()
+    return fits_file.to_bytes(
+        primary,
+        [fits_file.extension(name, getattr(law, attribute), sentence) for name, attribute, sentence in _EXTENSIONS],
+    )
 
 
 def save(law: LinearLaw, path: Path) -> None:
@@ -75,37 +56,19 @@ def load(path: Path) -> LinearLaw:
     """
     if not path.is_file():
         raise DataFileError(f"{path}: there is no such law file: make one with `lowfc tune LOG --out FILE`")
-    try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("error", AstropyWarning)  # a shortened file is no more than a warning to astropy
-            with fits.open(path, mode="readonly", memmap=False) as units:
-                law, stated = _read(units)
-    except (OSError, KeyError, TypeError, ValueError, AstropyWarning) as error:
-        raise DataFileError(f"{path}: not a whole law file: {' '.join(str(error).split())}") from None
-    found = identity(law)
-    if found != stated:
-        raise DataFileError(f"{path}: damaged: its content has identity {found[:12]}, it says {stated[:12]}")
+    law, stated = fits_file.load(path, KIND, "law file", _read)
+    fits_file.require_identity(path, identity(law), stated)
     return law
 
 
 def _read(units: fits.HDUList) -> tuple[LinearLaw, str]:
     header = units[0].header
-    if header.get("KIND") != KIND:
-        raise ValueError(f"its header should say KIND = {KIND!r}, got {header.get('KIND')!r}")
-    signal = next((each for each in SIGNALS if each == header["SIGNAL"]), None)
-    if signal is None:
-        raise ValueError(f"the signal of a law is one of {', '.join(SIGNALS)}, got {header['SIGNAL']!r}")
-
-    def array(name: str) -> npt.NDArray[np.float32]:
-        return np.ascontiguousarray(units[name].data, dtype=np.float32)
-
-    matrices = {attribute: array(name) for name, attribute, _ in _EXTENSIONS}
     law = LinearLaw(
-        signal=signal,
+        signal=cast("Signal", str(header["SIGNAL"])),  # a law refuses any other
         name=str(header["NAME"]),
         noll=tuple(int(index) for index in str(header["NOLL"]).split()),
         delay_frames=float(header["DELAY"]),
         rate_hz=float(header["RATE"]),
-        **matrices,
+        **{attribute: fits_file.single(units, name) for name, attribute, _ in _EXTENSIONS},
     )
     return law, str(header["LAWID"])

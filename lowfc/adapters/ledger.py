@@ -7,6 +7,7 @@ from google.protobuf.message import DecodeError
 
 from lowfc.adapters.bus import Sample
 from lowfc.adapters.envelope import count_of, start_of
+from lowfc.adapters.gaps import Gaps
 from lowfc.contract.messages import EVENT, HEALTH, Log, Topic, topic_of, wire
 
 
@@ -15,19 +16,27 @@ class _Tally:
     """Messages of one topic of one start of one publisher; counts as in their envelopes.
 
     Attributes:
-        safe: recorded, and flushed since.
+        published: by its own last word, in which one that it sent twice is two.
+        twice: of those recorded, messages that had come before.
+        safe: recorded, and twice, flushed since.
     """
 
-    first: int
-    next: int
+    gaps: Gaps
     published: int = 0
     recorded: int = 0
-    safe: int = 0
+    twice: int = 0
+    safe: tuple[int, int] = (0, 0)
     reported: int = 0
 
     @property
     def lost(self) -> int:
-        return max(self.next, self.published) - self.first - self.recorded
+        return max(self.gaps.next + self.twice, self.published) - self.gaps.first - self.recorded
+
+    def enter(self, count: int, *, recorded: bool) -> None:
+        if count >= self.gaps.first:
+            new = self.gaps.came(count)
+            self.recorded += recorded
+            self.twice += recorded and not new
 
 
 class Ledger:
@@ -42,10 +51,8 @@ class Ledger:
         line = (sample.key, _author(topic, sample), start_of(sample.sequence))
         tally = self._tallies.get(line)
         if tally is None:
-            tally = self._tallies[line] = _Tally(count, count)
-        if count >= tally.next:
-            tally.next = count + 1
-            tally.recorded += recorded
+            tally = self._tallies[line] = _Tally(Gaps(count))
+        tally.enter(count, recorded=recorded)
 
     def believe(self, sample: Sample, health: wire.Health) -> None:
         """Take over what a publisher says it sent; what it sent before it was first heard does not count as lost."""
@@ -53,19 +60,19 @@ class Ledger:
             if _publishes(health.process, count.topic):
                 author = health.process if count.topic == EVENT.key else ""
                 line = (count.topic, author, start_of(sample.sequence))
-                tally = self._tallies.setdefault(line, _Tally(count.published, count.published))
+                tally = self._tallies.setdefault(line, _Tally(Gaps(count.published)))
                 if health.state == "stopped":
                     tally.published = count.published
 
     def settle(self) -> None:
         """What was recorded so far has been flushed."""
         for tally in self._tallies.values():
-            tally.safe = tally.recorded
+            tally.safe = tally.recorded, tally.twice
 
     def revert(self) -> None:
         """What was recorded since `settle` did not reach the disk."""
         for tally in self._tallies.values():
-            tally.recorded = tally.safe
+            tally.recorded, tally.twice = tally.safe
 
     def recorded(self) -> dict[str, int]:
         """Messages recorded so far, by key; keys that lost all of theirs too."""
@@ -79,10 +86,10 @@ class Ledger:
         return self._sum(lambda tally: tally.lost)
 
     def news(self) -> dict[str, int]:
-        """Messages lost since this was asked last, by key."""
-        found = self._sum(lambda tally: tally.lost - tally.reported)
+        """Messages lost since this was asked last, by key; one that comes late after all is not taken back."""
+        found = self._sum(lambda tally: max(0, tally.lost - tally.reported))
         for tally in self._tallies.values():
-            tally.reported = tally.lost
+            tally.reported = max(tally.reported, tally.lost)
         return found
 
     def _sum(self, number: Callable[[_Tally], int]) -> dict[str, int]:

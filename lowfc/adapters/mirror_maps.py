@@ -1,14 +1,11 @@
 """Maps of the mirror in files, FITS or numpy's: its shapes, and the actuators that may be commanded."""
 
-import io
-import warnings
 from pathlib import Path
 
 import numpy as np
 import numpy.typing as npt
-from astropy.io import fits
-from astropy.utils.exceptions import AstropyWarning
 
+from lowfc.adapters.array_file import read_array
 from lowfc.contract.configuration import Configuration
 from lowfc.contract.errors import ConfigurationError, DataFileError
 
@@ -21,17 +18,7 @@ def read_shape(path: Path) -> Single:
     Raises:
         DataFileError: the file is missing, damaged or holds something else.
     """
-    if not path.is_file():
-        raise DataFileError(f"{path}: there is no such file")
-    try:
-        shape = _npy(path) if path.suffix == ".npy" else _fits(path)
-    except (OSError, TypeError, ValueError, EOFError, AstropyWarning) as error:
-        why = " ".join(str(error).split())
-        raise DataFileError(f"{path}: neither a FITS image nor a numpy array (.npy): {why}") from None
-    if shape.ndim != 2 or shape.dtype.kind not in "biuf":
-        raise DataFileError(
-            f"{path}: a mirror's shape is an array (rows, columns) of numbers, got {shape.shape} of {shape.dtype}"
-        )
+    shape = read_array(path, "a mirror's shape is an array (rows, columns)", (2,))
     return np.ascontiguousarray(shape, dtype=np.float32)
 
 
@@ -59,11 +46,21 @@ def flat_nm(config: Configuration) -> Single | None:
     """
     if not config.mirror.flat:
         return None
-    found = _map(config, "mirror.flat", config.mirror.flat)
-    if not np.isfinite(found).all():
-        raise ConfigurationError(f"mirror.flat = {config.mirror.flat!r}: every value must be finite")
+    found = shape_of(config, "mirror.flat", config.mirror.flat)
     active = active_actuators(config)
     return found if active is None else np.where(active, found, np.float32(0))
+
+
+def shape_of(config: Configuration, key: str, file: str) -> Single:
+    """A shape (rows, columns) of the configured mirror, nm of surface, from the file that `key` names.
+
+    Raises:
+        ConfigurationError: the file is missing, damaged or does not fit the mirror.
+    """
+    found = _map(config, key, file)
+    if not np.isfinite(found).all():
+        raise ConfigurationError(f"{key} = {file!r}: every value must be finite")
+    return found
 
 
 def _map(config: Configuration, key: str, file: str) -> Single:
@@ -78,18 +75,3 @@ def _map(config: Configuration, key: str, file: str) -> Single:
             "actuators"
         )
     return found
-
-
-def _npy(path: Path) -> npt.NDArray[np.generic]:
-    found: npt.NDArray[np.generic] = np.load(path, allow_pickle=False)
-    return found
-
-
-def _fits(path: Path) -> npt.NDArray[np.generic]:
-    with warnings.catch_warnings():
-        warnings.simplefilter("error", AstropyWarning)  # a shortened file is no more than a warning to astropy
-        with fits.open(io.BytesIO(path.read_bytes())) as units:
-            images = [unit.data for unit in units if unit.is_image and unit.data is not None]
-            if not images:
-                raise ValueError("there is no image in it")
-            return np.asarray(images[0])

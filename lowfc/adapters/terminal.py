@@ -17,9 +17,11 @@ from lowfc.contract.errors import ConfigurationError, LowfcError
 INTERRUPTED = 130
 """Exit status after Ctrl-C."""
 
-__all__ = ["DEFAULT_RUN", "ConfigFile", "RunId", "configuration", "new_app", "run_app"]
+__all__ = ["DEFAULT_RUN", "AnyRun", "ConfigFile", "Json", "RunId", "configuration", "new_app", "run_app"]
 
 RunId = Annotated[str, typer.Option("--run", help="Name of the run; processes of one run find each other by it.")]
+AnyRun = Annotated[str | None, typer.Option("--run", help="Name of the run; default: the only one.")]
+Json = Annotated[bool, typer.Option("--json", help="Print one JSON object on standard output.")]
 ConfigFile = Annotated[Path | None, typer.Option("--config", help="Configuration file (TOML).", show_default=False)]
 
 

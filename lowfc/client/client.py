@@ -10,6 +10,7 @@ import numpy.typing as npt
 
 from lowfc.adapters.bus import Bus, Sample
 from lowfc.adapters.clock import HostClock
+from lowfc.adapters.envelope import count_of
 from lowfc.adapters.run import DEFAULT_RUN, open_run
 from lowfc.adapters.zenoh_bus import ZenohBus
 from lowfc.client.runs import the_run
@@ -53,9 +54,19 @@ class Answer(NamedTuple):
     text: str = ""
     state: wire.ControllerState | None = None
 
+    @property
+    def frame(self) -> int:
+        """Number of that frame among those of its camera."""
+        return count_of(self.frame_sequence)
+
+    @property
+    def sentence(self) -> str:
+        """The answer as people read it."""
+        return f"{self.reply}, from frame {self.frame} on"
+
 
 class Client:
-    """A connection to a running loop, for one thread; it stays until `close`.
+    """A connection to a loop, for one thread; it stays until `close`. Of the run, only who is asked need be there.
 
     Every request is carried out between two frames or refused, and answered with the first frame for which it is in
     force. What is refused raises RequestRefusedError, what is not answered BusError.

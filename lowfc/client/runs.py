@@ -1,31 +1,37 @@
 """Which runs there are on this host."""
 
-from pathlib import Path
-
 from lowfc.adapters.run import open_run, runtime_base
 from lowfc.contract.errors import BusError
 from lowfc.contract.messages import Role
 
 
-def running(base: Path | None = None) -> list[str]:
+def running() -> list[str]:
     """Names of the runs on this host whose controller listens; a run that was killed leaves its directory behind."""
-    folder = runtime_base() if base is None else base
-    found = (path.parent.name for path in folder.glob("*/links.json"))
-    return sorted(name for name in found if Role.CONTROLLER in open_run(name, ()).links.live())
+    return [name for name, roles in _living().items() if Role.CONTROLLER in roles]
 
 
 def the_run(name: str | None) -> str:
-    """The run of that name, or the only one there is.
+    """The run of that name, whoever of it is there, or the only one there is.
+
+    That is the only one with a controller; without any, the only one of which at least somebody is there.
 
     Raises:
         BusError: there is no such run, none at all, or more than one to choose from.
     """
-    runs = running()
+    living = _living()
+    if name is not None and name in living:
+        return name
+    runs = [run for run, roles in living.items() if Role.CONTROLLER in roles] or list(living)
     if name is None and len(runs) == 1:
         return runs[0]
-    if name in runs and name is not None:
-        return name
-    there = f"there are {', '.join(runs)}" if runs else "no loop is running on this host"
+    there = f"there are {', '.join(living)}" if living else "no loop is running on this host"
     if name is not None:
         raise BusError(f"there is no run {name!r}: {there}")
-    raise BusError(f"say which run with --run: {there}" if runs else there)
+    raise BusError(f"say which run with --run: {there}" if living else there)
+
+
+def _living() -> dict[str, set[str]]:
+    """Runs of which somebody listens, and who."""
+    names = sorted(path.parent.name for path in runtime_base().glob("*/links.json"))
+    found = {name: open_run(name, ()).links.live() for name in names}
+    return {name: roles for name, roles in found.items() if roles}

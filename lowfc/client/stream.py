@@ -10,7 +10,8 @@ import numpy.typing as npt
 from google.protobuf.message import DecodeError
 
 from lowfc.adapters.bus import Ring, Sample
-from lowfc.adapters.envelope import start_of
+from lowfc.adapters.envelope import count_of, start_of
+from lowfc.adapters.gaps import Gaps
 from lowfc.contract import codec
 from lowfc.contract.errors import BusError
 from lowfc.contract.messages import from_timestamp, wire
@@ -34,11 +35,7 @@ class Frame(NamedTuple):
 
 
 class Stream(Generic[T]):
-    """Messages of one topic in their order, from the moment it is made; it is there once the first one has come.
-
-    Attributes:
-        lost: messages that were sent and did not get here, because their reader was too slow, or that were none.
-    """
+    """Messages of one topic as they come, from the moment it is made; it is there once the first one has come."""
 
     def __init__(
         self, ring: Ring, decode: Callable[[Sample], T | None], what: str, count: int | None, patience_s: float
@@ -55,15 +52,20 @@ class Stream(Generic[T]):
         Raises:
             BusError: none came.
         """
-        self.lost = 0
         self._ring: Ring | None = ring
         self._decode = decode
         self._what = what
         self._left = count
         self._patience_s = patience_s
-        self._last = 0
+        self._gaps: dict[int, Gaps] = {}
+        self._damaged = 0
         self._waiting: deque[Sample] = deque()
         self._fill(ring)
+
+    @property
+    def lost(self) -> int:
+        """Messages that were sent and did not get here, because their reader was too slow, or that were none."""
+        return self._damaged + sum(gaps.missing for gaps in self._gaps.values())
 
     def __iter__(self) -> "Stream[T]":
         return self
@@ -78,14 +80,13 @@ class Stream(Generic[T]):
             if not self._waiting:
                 self._fill(self._ring)
             sample = self._waiting.popleft()
-            if start_of(sample.sequence) == start_of(self._last):
-                self.lost += max(0, sample.sequence - self._last - 1)
-            self._last = sample.sequence
+            count = count_of(sample.sequence)
+            self._gaps.setdefault(start_of(sample.sequence), Gaps(count)).came(count)
             found = self._decode(sample)
             if found is not None:
                 self._left = None if self._left is None else self._left - 1
                 return found
-            self.lost += 1
+            self._damaged += 1
         self.close()
         raise StopIteration
 

@@ -1,12 +1,11 @@
 """Calibrations as messages, both ways, and their identity."""
 
-import hashlib
-from dataclasses import fields, replace
+from dataclasses import replace
 
 import numpy as np
-import numpy.typing as npt
 
-from lowfc.contract.messages import timestamp, wire
+from lowfc.contract.identity import identity
+from lowfc.contract.messages import floats, timestamp, wire
 from lowfc.control.calibration import Calibration
 from lowfc.optics.zernike import mode_name
 
@@ -40,13 +39,7 @@ def encode_calibration(calibration: Calibration, time_ns: int) -> bytes:
 
 def identified(calibration: Calibration) -> Calibration:
     """The same calibration with its identity: SHA-256 of everything else in it."""
-    digest = hashlib.sha256()
-    for part in fields(calibration):
-        value = getattr(calibration, part.name)
-        if part.name != "id" and not (isinstance(value, np.ndarray) and not value.size):
-            digest.update(part.name.encode())
-            digest.update(value.tobytes() if isinstance(value, np.ndarray) else repr(value).encode())
-    return replace(calibration, id=digest.hexdigest())
+    return replace(calibration, id=identity(calibration))
 
 
 def decode_calibration(message: wire.Calibration) -> Calibration:
@@ -57,18 +50,14 @@ def decode_calibration(message: wire.Calibration) -> Calibration:
     """
     pixels, modes = message.rows * message.columns, len(message.noll)
     actuators, seen = message.mirror_rows * message.mirror_columns, bool(message.actuators_to_modes)
-
-    def single(data: bytes, *shape: int) -> npt.NDArray[np.float32]:
-        return np.frombuffer(data, dtype="<f4").reshape(shape)
-
     calibration = Calibration(
         noll=tuple(message.noll),
-        reference=single(message.reference, pixels),
-        response=single(message.response, pixels, modes),
-        reconstructor=single(message.reconstructor, modes, pixels),
+        reference=floats(message.reference, pixels),
+        response=floats(message.response, pixels, modes),
+        reconstructor=floats(message.reconstructor, modes, pixels),
         good=np.frombuffer(message.mask, dtype=np.uint8).astype(np.float32),
-        dark=single(message.dark, pixels),
-        modes_to_actuators=single(message.modes_to_actuators, actuators, modes),
+        dark=floats(message.dark, pixels),
+        modes_to_actuators=floats(message.modes_to_actuators, actuators, modes),
         shape=(message.rows, message.columns),
         grid=(message.mirror_rows, message.mirror_columns),
         flux_dn=message.flux_dn,
@@ -77,8 +66,8 @@ def decode_calibration(message: wire.Calibration) -> Calibration:
         wavelength_nm=message.wavelength_nm,
         operator_hash=message.operator_hash,
         id=message.id,
-        actuators_to_modes=single(message.actuators_to_modes, *((modes, actuators) if seen else (0, 0))),
+        actuators_to_modes=floats(message.actuators_to_modes, *((modes, actuators) if seen else (0, 0))),
     )
-    if identified(calibration).id != message.id:
+    if identity(calibration) != message.id:
         raise ValueError(f"calibration {message.id[:12]} is not whole: its content has another identity")
     return calibration

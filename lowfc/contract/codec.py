@@ -8,8 +8,8 @@ import numpy.typing as npt
 from google.protobuf.message import DecodeError
 
 from lowfc.contract.calibration_codec import decode_calibration
-from lowfc.contract.law_codec import floats, law_of, wire_law
-from lowfc.contract.messages import MONO16, RawImage, from_timestamp, timestamp, wire
+from lowfc.contract.law_codec import law_of, wire_law
+from lowfc.contract.messages import MONO16, RawImage, floats, from_timestamp, timestamp, wire
 from lowfc.control.calibration import Calibration
 from lowfc.control.durations import Durations
 from lowfc.control.inputs import CameraSettings, Command, Frame, Input, Load, MirrorShape, Reply, Request, Step, Tick
@@ -69,7 +69,7 @@ def actuators(message: wire.MirrorCommand | wire.MirrorState) -> Single | None:
     """Actuators (rows, columns) of a message; None where the bytes are not that many float32."""
     if len(message.actuators) != 4 * message.rows * message.columns or not message.actuators:
         return None
-    return np.frombuffer(message.actuators, dtype="<f4").reshape(message.rows, message.columns)
+    return floats(message.actuators, message.rows, message.columns)
 
 
 def decode_mirror(payload: bytes) -> MirrorShape | None:
@@ -81,11 +81,12 @@ def decode_mirror(payload: bytes) -> MirrorShape | None:
 
 
 def decode_camera(payload: bytes) -> CameraSettings | None:
-    """What of a CameraState must fit the calibration; None where the message cannot be read."""
+    """What of a CameraState must fit the calibration; None where the message cannot be read, or is of no camera."""
     try:
-        return _camera_settings(wire.CameraState.FromString(payload))
+        found = _camera_settings(wire.CameraState.FromString(payload))
     except DecodeError:
         return None
+    return found if all(found.shape) else None
 
 
 def encode_input(taken: MirrorShape | CameraSettings | Load | Tick, number: int) -> bytes:

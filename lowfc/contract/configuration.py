@@ -79,6 +79,8 @@ class Control(Section):
     """Fraction of the expected light below which a frame is dark."""
     most_saturated: int = Field(8, ge=0)
     """Pixels at full well above which a frame is refused."""
+    most_alike: int = Field(3, ge=0)
+    """Frames in a row that may be the very image of the one before, as a stuck camera sends it; 0 for any number."""
     law: str = ""
     """File (FITS) of a law that `lowfc tune` wrote, which takes over from the integrator; empty for the integrator."""
 

@@ -1,11 +1,13 @@
 """Control laws, channels and plays as messages, both ways."""
 
+from typing import cast
+
 import numpy as np
 import numpy.typing as npt
 
-from lowfc.contract.messages import wire
+from lowfc.contract.messages import floats, wire
 from lowfc.control.additions import Additions, Channel, Play
-from lowfc.control.linear_law import SIGNALS, LinearLaw
+from lowfc.control.linear_law import LinearLaw, Signal
 
 Single = npt.NDArray[np.float32]
 
@@ -36,17 +38,13 @@ def law_of(message: wire.LinearLaw) -> LinearLaw:
     states, modes = message.states, len(message.noll)
     follow, coast = (floats(each, states, states) for each in (message.follow, message.coast))
     gain, kept = (floats(each, states, modes) for each in (message.gain, message.kept))
-    signal = next((each for each in SIGNALS if each == message.signal), None)
-    if signal is None:
-        raise ValueError(f"the signal of a law is one of {', '.join(SIGNALS)}, got {message.signal!r}")
-    output = floats(message.output, modes, states)
     return LinearLaw(
-        signal,
+        cast("Signal", message.signal),  # a law refuses any other
         follow,
         gain,
         kept,
         coast,
-        output,
+        floats(message.output, modes, states),
         message.name,
         tuple(message.noll),
         message.delay_frames,
@@ -83,7 +81,7 @@ def additions_of(message: wire.ControllerState, none: Additions, to_modes: Singl
     offset_nm = np.array(message.offset_nm, np.float32).reshape(modes)
     shifts_nm = np.array(message.shift_history_nm, np.float32).reshape(frames, modes)
     channels = tuple(
-        Channel(one.name, floats(one.actuators, rows, columns), floats(one.reached, rows, columns))
+        Channel.of(one.name, floats(one.actuators, rows, columns), floats(one.reached, rows, columns))
         for one in message.channels
     )
     play = None
@@ -92,12 +90,3 @@ def additions_of(message: wire.ControllerState, none: Additions, to_modes: Singl
         basis = floats(one.basis, -1, rows * columns) if one.basis else np.zeros((0, rows * columns), np.float32)
         play = Play(one.target, one.first_sequence, floats(one.table, -1, one.columns), basis)
     return none._replace(offset_nm=offset_nm, shifts_nm=tuple(shifts_nm), play=play).at(channels, to_modes)
-
-
-def floats(data: bytes, *shape: int) -> Single:
-    """Little-endian float32 of a message, in that shape.
-
-    Raises:
-        ValueError: there are more or fewer.
-    """
-    return np.frombuffer(data, dtype="<f4").reshape(shape)

@@ -248,6 +248,15 @@ def from_timestamp(stamp: Timestamp) -> int:
     return stamp.seconds * 1_000_000_000 + stamp.nanos
 
 
+def floats(data: bytes, *shape: int) -> npt.NDArray[np.float32]:
+    """Little-endian float32 of a message, in that shape.
+
+    Raises:
+        ValueError: there are more or fewer.
+    """
+    return np.frombuffer(data, dtype="<f4").reshape(shape)
+
+
 def image(array: npt.NDArray[np.uint16] | npt.NDArray[np.float32], time_ns: int, frame_id: str) -> RawImage:
     """Message of an image (rows, columns): uint16 becomes mono16, float32 becomes 32FC1, both little-endian."""
     rows, columns = array.shape

@@ -6,9 +6,10 @@ import numpy as np
 
 from lowfc.contract.codec import wire_mode, wire_reasons
 from lowfc.contract.law_codec import additions_of, law_of, put_additions, wire_law
-from lowfc.contract.messages import from_timestamp, timestamp, wire
+from lowfc.contract.messages import floats, from_timestamp, timestamp, wire
 from lowfc.control import linear_law
 from lowfc.control.calibration import Calibration
+from lowfc.control.estimator import Estimate
 from lowfc.control.law import Law
 from lowfc.control.safety import Limits, LoopMode, Reason
 from lowfc.control.state import Drive, Following, Settings, State
@@ -33,7 +34,11 @@ def controller_state(state: State, settings: Settings, time_ns: int) -> wire.Con
         settings=_encode_settings(settings),
         steps_left=state.steps_left,
         homing=state.homing,
+        alike=state.alike,
     )
+    if state.estimate is not None:
+        message.measured_nm.extend(state.estimate.error_nm.tolist())
+        message.flux_dn = state.estimate.flux_dn
     if state.drive is not None:
         if state.drive.additions is not None:
             put_additions(message, state.drive.additions)
@@ -65,7 +70,7 @@ def decode_state(message: wire.ControllerState, calibration: Calibration | None)
         drive = Drive.at_rest(settings, calibration)
         law = Law(*(np.array(values, np.float32) for values in (message.gain, message.leak, message.limit_nm)))
         history = np.array(message.command_history_nm, np.float32).reshape(len(drive.history_nm), -1)
-        actuators = np.frombuffer(message.actuators, "<f4").reshape(calibration.grid)
+        actuators = floats(message.actuators, *calibration.grid)
         if law.gain.shape != drive.law.gain.shape or history.shape[1] != len(calibration.noll):
             raise ValueError(f"the controller's state is not of {len(calibration.noll)} modes")
         following = None
@@ -96,6 +101,8 @@ def decode_state(message: wire.ControllerState, calibration: Calibration | None)
         steps_left=message.steps_left,
         homing=message.homing,
         taken=message.taken,
+        estimate=Estimate(np.array(message.measured_nm, np.float32), message.flux_dn) if message.measured_nm else None,
+        alike=message.alike,
     )
     return settings, state
 
@@ -121,6 +128,8 @@ def _encode_settings(settings: Settings) -> wire.ControllerSettings:
         gain=settings.gain,
         leak=settings.leak,
         limit_nm=settings.limit_nm,
+        most_alike=settings.most_alike,
+        rate_hz=settings.rate_hz,
     )
 
 
@@ -137,6 +146,8 @@ def _decode_settings(message: wire.ControllerSettings) -> Settings:
         gain=_pair(message.gain),
         leak=_pair(message.leak),
         limit_nm=_pair(message.limit_nm),
+        most_alike=message.most_alike,
+        rate_hz=message.rate_hz,
     )
 
 

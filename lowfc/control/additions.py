@@ -24,11 +24,19 @@ LONGEST_NAME = 32
 
 
 class Channel(NamedTuple):
-    """A shape added to the command: (rows, columns), nm of surface; what is wanted, and how far the mirror is."""
+    """A shape added to the command: (rows, columns), nm of surface; what is wanted, and how far the mirror is.
+
+    The two are one array where it is there: `of` sees to that.
+    """
 
     name: str
     wanted_nm: Single
     reached_nm: Single
+
+    @classmethod
+    def of(cls, name: str, wanted_nm: Single, reached_nm: Single) -> "Channel":
+        """A channel on its way, or there."""
+        return cls(name, wanted_nm, wanted_nm if np.array_equal(wanted_nm, reached_nm) else reached_nm)
 
     @property
     def shifts(self) -> bool:
@@ -38,7 +46,7 @@ class Channel(NamedTuple):
     @property
     def moving(self) -> bool:
         """Whether the mirror is still on its way."""
-        return not np.array_equal(self.wanted_nm, self.reached_nm)
+        return self.reached_nm is not self.wanted_nm
 
 
 class Play(NamedTuple):
@@ -140,12 +148,20 @@ class Additions(NamedTuple):
         plain = name.isascii() and name == name.lower() and name.replace("-", "").isalnum()
         if not (plain and name[0].isalpha() and len(name) <= LONGEST_NAME):
             raise ValueError(f"a channel's name is up to 32 of a-z, 0-9 and -, a letter first; got {name!r}")
-        before = {one.name: one for one in self.channels}
-        if name not in before and len(before) >= MOST_CHANNELS:
+        before = self.channel(name)
+        if before is None and len(self.channels) >= MOST_CHANNELS:
             raise ValueError(f"there are {MOST_CHANNELS} channels already, which is the most: remove one")
-        reached_nm = before[name].reached_nm if name in before else np.zeros_like(wanted_nm)
-        after = before | {name: Channel(name, wanted_nm, reached_nm)}
-        return self.at(tuple(after[each] for each in sorted(after)), to_modes)
+        reached_nm = np.zeros_like(wanted_nm) if before is None else before.reached_nm
+        return self.having(Channel.of(name, wanted_nm, reached_nm), to_modes)
+
+    def channel(self, name: str) -> Channel | None:
+        """The channel of that name."""
+        return next((one for one in self.channels if one.name == name), None)
+
+    def having(self, channel: Channel, to_modes: Single) -> "Additions":
+        """With this channel in the place of the one of its name, or beside the others."""
+        channels = {one.name: one for one in (*self.channels, channel)}
+        return self.at(tuple(channels[name] for name in sorted(channels)), to_modes)
 
     def stopped(self, sequence: int) -> "Additions":
         """With nothing more to play after this frame; what was played for it goes with the next command."""
@@ -160,10 +176,14 @@ class Additions(NamedTuple):
         newest = (self.shift_nm,) * min(frames, len(self.shifts_nm))
         return self._replace(shifts_nm=(*newest, *self.shifts_nm)[: len(self.shifts_nm)])
 
+    def settled(self) -> "Additions":
+        """As if the channels had always been where they are."""
+        return self.passed(len(self.shifts_nm))
+
     def lowered(self, to_modes: Single, *, only_flat: bool = False) -> "Additions":
         """The mirror goes to zero: no channel has reached anything, and nothing is played."""
         flat = np.zeros_like(self.sum_nm)
-        kept = (one._replace(reached_nm=flat) for one in self.channels if one.name == FLAT or not only_flat)
+        kept = (Channel.of(one.name, one.wanted_nm, flat) for one in self.channels if one.name == FLAT or not only_flat)
         return self._replace(play=None).at(tuple(kept), to_modes)
 
 

@@ -16,6 +16,10 @@ class Estimate(NamedTuple):
     error_nm: Single
     flux_dn: float
 
+    def same(self, other: "Estimate | None") -> bool:
+        """Whether the other is of the same image: photons are never twice the same, a stuck camera's are."""
+        return other is not None and self.flux_dn == other.flux_dn and np.array_equal(self.error_nm, other.error_nm)
+
 
 class Estimator(NamedTuple):
     """R times the `difference` of a frame, in the order in which it is quickest: R (I - dark) and the flux at once.

@@ -9,7 +9,6 @@ from collections.abc import Sequence
 
 import numpy as np
 import numpy.typing as npt
-from scipy.fft import fft, ifft, irfft
 
 from lowfc.control.linear_law import Block, LinearLaw, of_blocks
 from lowfc.control.vibration import Model
@@ -37,7 +36,8 @@ def lqg(models: Sequence[Model], noll: tuple[int, ...], delay_frames: float) -> 
 def lqg_block(model: Model, delay_frames: float) -> Block:
     """The part of the law for one mode; where the delay has a fraction, its last state is the command before."""
     A, _, C = model.states()
-    L, _ = filter_gain(model)
+    covariance = covariance_nm2(model)
+    L = covariance @ C / (C @ covariance @ C + model.noise_nm2)
     whole = int(np.floor(delay_frames))
     fraction = delay_frames - whole
     foreseen = C @ np.linalg.matrix_power(A, whole)
@@ -53,46 +53,14 @@ def lqg_block(model: Model, delay_frames: float) -> Block:
     return Block(larger[0], np.append(L, 0.0), kept, larger[1], -np.append(ahead, before))
 
 
-def filter_gain(model: Model) -> tuple[Array, Array]:
-    """Steady gain L (states,) of the Kalman filter, and the covariance of its states before a frame.
+def covariance_nm2(model: Model) -> Array:
+    """Covariance (states, states) of what the steady filter does not know of the states before a frame.
 
     Raises:
         ValueError: the Riccati equation has no solution.
     """
     A, Q, C = model.states()
-    noise = model.noise_nm2
-    covariance = noise * _riccati(A, Q / noise, C)
-    return np.asarray(covariance @ C / (C @ covariance @ C + noise)), covariance
-
-
-def residual_nm2(model: Model, whole_frames: int) -> float:
-    """Variance that the law leaves in the mean over an exposure, if the model is true, for a delay of whole frames."""
-    A, Q, C = model.states()
-    L, covariance = filter_gain(model)
-    covariance = covariance - np.outer(L, C @ covariance)
-    for _ in range(whole_frames):
-        covariance = A @ covariance @ A.T + Q
-    return float(C @ covariance @ C)
-
-
-def minimum_variance_nm2(spectrum_nm2: Array, noise_nm2: float, whole_frames: int) -> float:
-    """Least variance that any linear law can leave of a disturbance of known spectrum, for a delay of whole frames.
-
-    Kolmogorov's: the spectrum of what is measured is factored into white innovations, of variance
-    exp(mean(log(spectrum + noise))), and a filter 1 + h1/z + ...; those that come after the command was made are lost.
-
-    Args:
-        spectrum_nm2: (frequencies,) of the disturbance at even steps from 0 to pi rad per frame, both included; its
-            mean over a turn is the variance.
-        noise_nm2: Variance of one frame's white noise.
-        whole_frames: The delay.
-    """
-    cepstrum = irfft(np.log(spectrum_nm2 + noise_nm2))
-    innovation = float(np.exp(cepstrum[0]))
-    causal = np.zeros_like(cepstrum)
-    causal[1 : len(causal) // 2] = cepstrum[1 : len(causal) // 2]
-    factor = ifft(np.exp(fft(causal))).real
-    return innovation * float(np.sum(factor[:whole_frames] ** 2)) - noise_nm2
+    return model.noise_nm2 * _riccati(A, Q / model.noise_nm2, C)
 
 
 def _riccati(A: Array, Q: Array, C: Array) -> Array:

@@ -18,11 +18,18 @@ ADOPTED_NM = 1.0
 def loaded(settings: Settings, state: State, calibration: Calibration, source: str) -> tuple[State, list[Raised]]:
     """The state under another calibration, and what there is to say of it.
 
-    Where the mirror has the same grid, its shape stays: the channels as they are, and the rest as a command of the new
-    modes. Offset, play and a law of other modes are of no meaning any more.
+    Where the mirror has the same grid, its shape stays: the channels as they are, the rest as a command of the new
+    modes, and what these cannot make as a channel of its own. Offset, play and a law of other modes are of no meaning
+    any more.
     """
     drive, before = Drive.at_rest(settings, calibration), state.drive
-    events: list[Raised] = []
+    details: dict[str, object] = {
+        "id": calibration.id[:12],
+        "modes": len(calibration.noll),
+        "estimator": calibration.estimator,
+        "source": source,
+    }
+    events = [Raised("CALIBRATION_LOADED", details)]
     if before is not None and before.actuators_nm.shape == calibration.grid:
         shape_nm = before.actuators_nm
         same = before.calibration.noll == calibration.noll
@@ -31,8 +38,7 @@ def loaded(settings: Settings, state: State, calibration: Calibration, source: s
             additions = drive.added().at(before.additions.channels, drive.to_modes)
             if same:
                 additions = additions._replace(offset_nm=before.additions.offset_nm)
-            additions = additions.passed(len(additions.shifts_nm))
-            drive = drive._replace(additions=additions)
+            drive = drive._replace(additions=additions.settled())
         command_nm = drive.inverse @ shape_nm.reshape(-1)
         drive = drive._replace(
             law=before.law if same else drive.law,
@@ -43,13 +49,6 @@ def loaded(settings: Settings, state: State, calibration: Calibration, source: s
         drive, rest = adopted(drive, shape_nm)
         events += rest
     mode = settings.start_mode if state.mode is LoopMode.IDLE else state.mode
-    details: dict[str, object] = {
-        "id": calibration.id[:12],
-        "modes": len(calibration.noll),
-        "estimator": calibration.estimator,
-        "source": source,
-    }
-    events.insert(0, Raised("CALIBRATION_LOADED", details))
     if mode is not state.mode:
         events.append(mode_event(state.mode, mode, "a calibration was loaded"))
     return state._replace(mode=mode, drive=drive), events
@@ -62,12 +61,11 @@ def adopted(drive: Drive, shape_nm: Single) -> tuple[Drive, list[Raised]]:
     if not np.abs(rest_nm).max() > ADOPTED_NM:
         return drive, []
     added = drive.added()
-    channels = {one.name: one for one in added.channels}
-    before_nm = channels[ADOPTED].wanted_nm if ADOPTED in channels else np.zeros_like(rest_nm)
-    channels[ADOPTED] = Channel(ADOPTED, before_nm + rest_nm, before_nm + rest_nm)
-    added = added.at(tuple(channels[name] for name in sorted(channels)), drive.to_modes)
+    before = added.channel(ADOPTED)
+    there_nm = rest_nm if before is None else before.wanted_nm + rest_nm
+    added = added.having(Channel(ADOPTED, there_nm, there_nm), drive.to_modes).settled()
     rms_nm = float(np.sqrt(np.mean(np.square(rest_nm))))
-    drive = drive._replace(additions=added.passed(len(added.shifts_nm)))
+    drive = drive._replace(additions=added)
     return drive, [Raised("SHAPE_ADOPTED", {"rms_nm": rms_nm})]
 
 

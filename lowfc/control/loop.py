@@ -63,9 +63,13 @@ def _frame(settings: Settings, state: State, frame: Frame) -> tuple[State, Outpu
     if isinstance(measured, Reason):
         return _refuse(settings, _newest(state, drive, frame), frame, measured, events)
     estimate, saturated = measured
+    alike = state.alike + 1 if estimate.same(state.estimate) else 0
+    if 0 < settings.most_alike < alike:
+        stuck = _newest(state, drive, frame)._replace(alike=alike)
+        return _refuse(settings, stuck, frame, Reason.STUCK, events)
     error_nm, pol_nm, drive = _aim(drive, estimate.error_nm, frame.sequence)
     drive, reasons, homing = _follow(settings, state, drive, error_nm, frame.sequence)
-    if reasons and drive.additions is not None:
+    if reasons:
         drive = _cut_short(drive, frame.sequence, reasons, events)
     if state.refused is not None:
         details: dict[str, object] = {"refused": state.refused_count, "reason": state.refused.name}
@@ -88,6 +92,8 @@ def _frame(settings: Settings, state: State, frame: Frame) -> tuple[State, Outpu
         steps_left=steps_left,
         homing=homing,
         taken=state.taken + 1,
+        estimate=estimate,
+        alike=alike,
     )
     if ended:
         state = in_mode(state, LoopMode.OPEN)

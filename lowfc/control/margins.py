@@ -10,8 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from lowfc.control.law import Law
-from lowfc.control.linear_law import LinearLaw, integrator
+from lowfc.control.linear_law import LinearLaw
 from lowfc.control.stability import delay_weights
 
 Array = npt.NDArray[np.float64]
@@ -49,11 +48,6 @@ class Margins:
     def stable(self) -> bool:
         """Whether every pole lies within the unit circle."""
         return bool((self.radius < 1).all())
-
-
-def as_linear(law: LinearLaw | Law, noll: tuple[int, ...], delay_frames: float, rate_hz: float) -> LinearLaw:
-    """The law as a linear one: as it is, or the loop's integrator turned into one."""
-    return law if isinstance(law, LinearLaw) else integrator(law, noll, delay_frames, rate_hz)
 
 
 def margins(law: LinearLaw, delay_frames: float) -> Margins:

@@ -24,17 +24,6 @@ class Notch(NamedTuple):
     depth: float
 
 
-def leaky_pi(
-    noll: tuple[int, ...], gain: Array, proportional: Array, leak: Array, delay_frames: float, rate_hz: float
-) -> LinearLaw:
-    """c[k] = (1 - leak) (c[k-1] + proportional e[k-1]) - (gain + proportional) e[k]; each of the three is (modes,).
-
-    Raises:
-        ValueError: arrays of other lengths, or impossible values.
-    """
-    return pi_notch(noll, gain, proportional, leak, [()] * len(noll), delay_frames, rate_hz)
-
-
 def pi_notch(
     noll: tuple[int, ...],
     gain: Array,
@@ -46,8 +35,9 @@ def pi_notch(
 ) -> LinearLaw:
     """A PI law with a resonator for each notch, whose phase makes up for the delay at its own frequency.
 
-    Its states follow the command that was kept, so that a limit does not wind it up and closing starts from the
-    command that is held. Whether it is stable, `lowfc.control.margins` says.
+    Without notches c[k] = (1 - leak) (c[k-1] + proportional e[k-1]) - (gain + proportional) e[k]. Its states follow the
+    command that was kept, so that a limit does not wind it up and closing starts from the command that is held. Whether
+    it is stable, `lowfc.control.margins` says.
 
     Args:
         noll: Noll index of each mode.

@@ -37,6 +37,7 @@ class Reason(IntEnum):
     SATURATED = 6
     DARK = 7
     NO_FRAME = 8
+    STUCK = 9
     MODAL_LIMIT = 20
     STROKE = 21
     SLEW = 22

@@ -11,7 +11,7 @@ import numpy.typing as npt
 from lowfc.control import linear_law
 from lowfc.control.additions import Additions
 from lowfc.control.calibration import Calibration
-from lowfc.control.estimator import Estimator
+from lowfc.control.estimator import Estimate, Estimator
 from lowfc.control.law import Law
 from lowfc.control.linear_law import LinearLaw
 from lowfc.control.safety import Limits, LoopMode, Reason
@@ -40,7 +40,9 @@ class Settings:
         silence: hold the command, or relax the mirror to flat.
         least_flux: fraction of the expected flux below which a frame is dark.
         most_saturated: good pixels at full well above which a frame is refused.
+        most_alike: frames in a row that may be measured exactly as the one before; 0 for any number.
         gain: gain, leak and limit (nm) of tip and tilt, then of the other modes.
+        rate_hz: of the frames; 0 where it is not known.
     """
 
     limits: Limits
@@ -54,6 +56,8 @@ class Settings:
     gain: tuple[float, float]
     leak: tuple[float, float]
     limit_nm: tuple[float, float]
+    most_alike: int = 0
+    rate_hz: float = 0.0
 
     def law(self, noll: tuple[int, ...]) -> Law:
         """The law for these modes: the first figure of each pair for tip and tilt, the second for the rest."""
@@ -195,6 +199,7 @@ class State(NamedTuple):
         commanded: whether a command has been sent, so that the mirror is no longer adopted.
         steps_left: frames until the loop opens by itself; 0 for never.
         homing: the modal command is on its way to zero.
+        estimate: what was last measured, and `alike`, how many in a row were the same as the one before.
         taken: inputs that changed something or gave rise to something; the order of what is replayed.
     """
 
@@ -211,4 +216,6 @@ class State(NamedTuple):
     counts: Mapping[Reason, int] = MappingProxyType({})
     steps_left: int = 0
     homing: bool = False
+    estimate: Estimate | None = None
+    alike: int = 0
     taken: int = 0

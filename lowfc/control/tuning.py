@@ -135,66 +135,56 @@ def tune_lqg(
         ValueError: no filter, or an unstable law.
     """
     rate_hz, finest_hz = models[0].rate_hz, resolution_hz(run, models[0].rate_hz)
-    tried = [[model] for model in models]
-    for factor in (*_NARROWER, *_FASTER):
-        for candidates, model in zip(tried, models, strict=True):
-            narrow = any(line.width_hz < 3 * finest_hz for line in model.lines)
-            candidates.append(_scaled(model, factor, finest_hz) if narrow else model)
-    best = [(np.inf, model) for model in models]
-    for candidates_now in zip(*tried, strict=True):
-        robust = [_within_margins(model, index, delay) for model, index in zip(candidates_now, noll, strict=True)]
-        law = of_blocks([block for block, _ in robust], "pol", "lqg", noll, delay, rate_hz)
-        for mode, error_nm2 in enumerate(left_of(law, run, delay)):
-            if error_nm2 < best[mode][0]:
-                best[mode] = float(error_nm2), candidates_now[mode]
-    steady = of_blocks(
-        [integrator_block(g, lost, "pol", delay) for g, lost in zip(gains.gain, leak, strict=True)],
-        *("pol", "integrator", noll, delay, rate_hz),
-    )
-    blocks, kinds = [], []
-    for mode, integrator_nm2 in enumerate(left_of(steady, run, delay)):
-        wins = best[mode][0] < integrator_nm2
-        kinds.append("lqg" if wins else "integrator")
-        block = _within_margins(best[mode][1], noll[mode], delay)[0]
-        blocks.append(block if wins else integrator_block(gains.gain[mode], leak[mode], "pol", delay))
-    chosen = tuple(model for _, model in best)
-    law = of_blocks(blocks, "pol", "lqg", noll, delay, rate_hz)
-    return _tuned(law, delay, predicted_nm(law, chosen, delay), tuple(kinds), chosen)
+
+    def law_of(blocks: Sequence[Block]) -> LinearLaw:
+        return of_blocks(blocks, "pol", "lqg", noll, delay, rate_hz)
+
+    scaled = ([_scaled(model, factor, finest_hz) for model in models] for factor in (*_NARROWER, *_FASTER))
+    tried = [models, *scaled]
+    robust = [[_within_margins(model, delay) for model in candidates] for candidates in tried]
+    steady = [integrator_block(g, lost, "pol", delay) for g, lost in zip(gains.gain, leak, strict=True)]
+    error_nm2 = np.nan_to_num([left_of(law_of(blocks), run, delay) for blocks in robust], nan=np.inf)
+    best = error_nm2.argmin(axis=0)
+    wins = error_nm2.min(axis=0) < left_of(law_of(steady), run, delay)
+    modes = range(len(noll))
+    chosen = [tried[best[mode]][mode] for mode in modes]
+    law = law_of([robust[best[mode]][mode] if wins[mode] else steady[mode] for mode in modes])
+    kinds = ["lqg" if better else "integrator" for better in wins]
+    return _tuned(law, delay, predicted_nm(law, chosen, delay), kinds, chosen)
 
 
 def tune_pi_notch(models: Sequence[Model], gains: Gains, noll: tuple[int, ...], leak: Array, delay: float) -> Tuned:
     """An integrator with a notch for each line that one makes smaller within the margins, the strongest line first."""
     rate_hz = models[0].rate_hz
-    none = np.zeros(len(noll))
-    chosen: list[tuple[Notch, ...]] = []
-    gain = gains.gain.copy()
-    for mode, model in enumerate(models):
+    found = [_notched(*mode, delay) for mode in zip(models, gains.gain.tolist(), leak.tolist(), strict=True)]
+    gain, notches = np.array([g for g, _ in found]), [of_mode for _, of_mode in found]
+    law = pi_notch(noll, gain, np.zeros(len(noll)), leak, notches, delay, rate_hz)
+    kinds = ["pi-notch" if of_mode else "integrator" for of_mode in notches]
+    return _tuned(law, delay, predicted_nm(law, models, delay), kinds, models)
 
-        def made(notches: Sequence[Notch], g: float, mode: int = mode) -> LinearLaw:
-            one = slice(mode, mode + 1)
-            return pi_notch(noll[one], np.array([g]), none[one], leak[one], [notches], delay, rate_hz)
 
-        found: tuple[float, float, tuple[Notch, ...]] | None = None
-        for share in (1.0, 0.7, 0.5, 0.35):  # less gain leaves room for notches
-            g, notches = float(share * gains.gain[mode]), tuple[Notch, ...]()
-            least = predicted_nm(made(notches, g), [model], delay)[0]
-            for line in sorted(model.lines, key=lambda line: -line.variance_nm2):
-                for depth in (30.0, 10.0, 4.0):
-                    width_hz = min(max(4 * line.width_hz, 0.2 * line.frequency_hz), 0.02 * rate_hz)
-                    more = (*notches, Notch(line.frequency_hz, width_hz, depth))
-                    law = made(more, g)
-                    left = predicted_nm(law, [model], delay)[0]
-                    if left < least and _holds(margins.margins(law, delay)):
-                        notches, least = more, left
-                        break
-            if found is None or least < found[0]:
-                found = float(least), g, notches
-        assert found is not None  # noqa: S101  # there was a first share
-        _, gain[mode], notches = found
-        chosen.append(notches)
-    law = pi_notch(noll, gain, none, leak, chosen, delay, rate_hz)
-    kinds = tuple("pi-notch" if notches else "integrator" for notches in chosen)
-    return _tuned(law, delay, predicted_nm(law, models, delay), kinds, tuple(models))
+def _notched(model: Model, gain: float, leak: float, delay: float) -> tuple[float, tuple[Notch, ...]]:
+    """Gain and notches of one mode."""
+
+    def made(notches: Sequence[Notch], g: float) -> LinearLaw:
+        return pi_notch((2,), np.array([g]), np.zeros(1), np.array([leak]), [notches], delay, model.rate_hz)
+
+    tried: list[tuple[float, float, tuple[Notch, ...]]] = []
+    for share in (1.0, 0.7, 0.5, 0.35):  # less gain leaves room for notches
+        g, notches = share * gain, tuple[Notch, ...]()
+        least = float(predicted_nm(made(notches, g), [model], delay)[0])
+        for line in sorted(model.lines, key=lambda line: -line.variance_nm2):
+            width_hz = min(max(4 * line.width_hz, 0.2 * line.frequency_hz), 0.02 * model.rate_hz)
+            for depth in (30.0, 10.0, 4.0):
+                more = (*notches, Notch(line.frequency_hz, width_hz, depth))
+                law = made(more, g)
+                left = float(predicted_nm(law, [model], delay)[0])
+                if left < least and _holds(margins.margins(law, delay)):
+                    notches, least = more, left
+                    break
+        tried.append((least, g, notches))
+    _, g, notches = min(tried, key=lambda one: one[0])
+    return g, notches
 
 
 def _tuned(law: LinearLaw, delay: float, predicted: Array, kinds: Sequence[str], models: Sequence[Model]) -> Tuned:
@@ -259,14 +249,14 @@ def _scaled(model: Model, factor: float, finest_hz: float) -> Model:
     return replace(model, lines=tuple(lines))
 
 
-def _within_margins(model: Model, noll: int, delay_frames: float) -> tuple[Block, float]:
-    """The filter of a model, its noise taken for higher until the margins hold; and by how much."""
+def _within_margins(model: Model, delay_frames: float) -> Block:
+    """The filter of a model, its noise taken for higher until the margins hold."""
     for factor in _QUIETER.tolist():
         block = lqg_block(replace(model, noise_nm2=factor * model.noise_nm2), delay_frames)
-        law = of_blocks([block], "pol", "lqg", (noll,), delay_frames, model.rate_hz)
+        law = of_blocks([block], "pol", "lqg", (2,), delay_frames, model.rate_hz)  # or any other mode
         if _holds(margins.margins(law, delay_frames)):
             break
-    return block, factor
+    return block
 
 
 def _holds(found: margins.Margins) -> bool:

@@ -29,6 +29,7 @@ _LOBE = 12  # frequencies on either side of a line in which the window leaves so
 _FULL = 40  # frequencies on either side of a line, and from 0 on, that are not averaged
 _PER_DECADE = 48
 _LEAST_DRIFT = 1e-8  # variance of its step per variance of noise: a constant is followed in 10^4 frames
+_LEAST_NOISE = 1e-3  # of the level of the upper frequencies, all of which drift may explain: no filter is made of none
 
 
 @dataclass(frozen=True, slots=True)
@@ -140,6 +141,10 @@ class _Whittle:
         return cls(omega[keep], np.maximum(found[keep] / segments, 1e-300), segments, rate_hz)
 
     @property
+    def frequency_hz(self) -> Array:
+        return np.asarray(self.omega * self.rate_hz / (2 * np.pi))
+
+    @property
     def spacing_hz(self) -> float:
         return float((self.omega[1] - self.omega[0]) * self.rate_hz / (2 * np.pi))
 
@@ -154,7 +159,7 @@ class _Whittle:
         single = places < _FULL
         for line in lines:
             near = max(_FULL * self.spacing_hz, 4 * line.width_hz)
-            single |= np.abs(self.omega * self.rate_hz / (2 * np.pi) - line.frequency_hz) < near
+            single |= np.abs(self.frequency_hz - line.frequency_hz) < near
         fresh = np.diff(group, prepend=-1) != 0
         fresh |= single | np.concatenate([[True], single[:-1]])
         starts = np.flatnonzero(fresh)
@@ -198,17 +203,16 @@ class _Whittle:
             if best is None or found.fun + price < best[0]:
                 best = found.fun + price, of(found.x)
         assert best is not None  # noqa: S101  # there was a first one
-        return best[1]
+        return replace(best[1], noise_nm2=max(best[1].noise_nm2, _LEAST_NOISE * white))
 
     def another_line(self, model: Model) -> Line | None:
         """The line that is missing most; None where none is certain."""
         spectrum = model.spectrum_nm2(self.omega) + model.noise_nm2
         ratio = self.power / spectrum
-        frequency_hz = self.omega * self.rate_hz / (2 * np.pi)
         free = np.ones(ratio.size, bool)
         free[:_LOBE] = False  # there it is drift
         for line in model.lines:
-            free &= np.abs(frequency_hz - line.frequency_hz) > max(_LOBE * self.spacing_hz, 1.5 * line.width_hz)
+            free &= np.abs(self.frequency_hz - line.frequency_hz) > max(_LOBE * self.spacing_hz, 1.5 * line.width_hz)
         found = []
         for scale in _SCALES:
             mean = np.convolve(ratio, np.ones(scale) / scale, "same")
@@ -296,7 +300,7 @@ class _Whittle:
         """A line that is too narrow to be resolved, with the variance that is there: so far only its wings counted."""
         if line.width_hz > self.spacing_hz:
             return line
-        near = np.abs(self.omega * self.rate_hz / (2 * np.pi) - line.frequency_hz) < 3 * self.spacing_hz
+        near = np.abs(self.frequency_hz - line.frequency_hz) < 3 * self.spacing_hz
         others = replace(model, lines=tuple(other for other in model.lines if other is not line))
         floor = others.spectrum_nm2(self.omega[near]) + model.noise_nm2
         variance = float(np.sum(np.maximum(self.power[near] - floor, 0.0))) / self.omega.size

@@ -99,19 +99,26 @@ def wavefront_rms_nm(twin: Twin, opd_nm: NDArray[np.floating]) -> float:
     return sqrt(max(variance, 0.0))  # a few weights are negative: those of the interpolation's guard nodes
 
 
-def reference(twin: Twin) -> Float:
-    """I0 (pixels, pixels) in float64: fraction per pixel of the light entering the open circle."""
-    flat = np.ones(twin.used.size)
-    intensity = np.sum([each.weight * np.abs(_field(each, flat)) ** 2 for each in twin.operators], axis=0)
-    return np.asarray(twin.to_pixels @ intensity @ twin.to_pixels.T)
+def reference(twin: Twin, opd_nm: Float | None = None) -> Float:
+    """I0 (pixels, pixels) in float64: fraction per pixel of the light entering the open circle.
+
+    Args:
+        twin: The twin.
+        opd_nm: The wavefront (used,) that is the zero point; flat when None.
+    """
+    images = [each.weight * np.abs(_field(each, _phasor(twin, each, opd_nm))) ** 2 for each in twin.operators]
+    return np.asarray(twin.to_pixels @ np.sum(images, axis=0) @ twin.to_pixels.T)
 
 
-def response(twin: Twin, basis: NDArray[np.floating]) -> Float:
+def response(twin: Twin, basis: NDArray[np.floating], opd_nm: Float | None = None) -> Float:
     """H = dI/da (pixels squared, modes) in float64, per nm: 2 (2 pi / lambda) Re{E0 conj(i E_k)}, eq. (12) times 2.
+
+    At a wavefront phi that is not flat, both E0 and E_k are fields of exp(i phi) times what they are of at a flat one.
 
     Args:
         twin: The twin.
         basis: Modes (modes, used) at the used nodes, of unit rms where a is to be nm rms.
+        opd_nm: The wavefront (used,) that is the zero point; flat when None.
 
     Raises:
         ValueError: The modes are not at the used nodes.
@@ -120,19 +127,27 @@ def response(twin: Twin, basis: NDArray[np.floating]) -> Float:
         raise ValueError(f"modes must be (modes, {twin.used.size}) values at the used nodes, got {basis.shape}")
     H = np.zeros((twin.to_pixels.shape[0] ** 2, len(basis)))
     for operator in twin.operators:
-        E0 = _field(operator, np.ones(twin.used.size))
+        at = _phasor(twin, operator, opd_nm)
+        E0 = _field(operator, at)
         for k, mode in enumerate(basis):
             slope = (
                 operator.weight
                 * (4.0 * np.pi / operator.wavelength_nm)
-                * (E0 * np.conj(1j * _field(operator, mode))).real
+                * (E0 * np.conj(1j * _field(operator, at * mode))).real
             )
             H[:, k] += (twin.to_pixels @ slope @ twin.to_pixels.T).ravel()
     return H
 
 
-def _field(operator: Operator, nodes: Float) -> NDArray[np.complex128]:
-    """Field (points, points) of real values (used,) at the nodes."""
+def _phasor(twin: Twin, operator: Operator, opd_nm: Float | None) -> Float | NDArray[np.complex128]:
+    """exp(i phi) (used,) of a wavefront in nm; real where that is flat."""
+    if opd_nm is None:
+        return np.ones(twin.used.size)
+    return np.asarray(np.exp((2j * np.pi / operator.wavelength_nm) * opd_nm))
+
+
+def _field(operator: Operator, nodes: Float | NDArray[np.complex128]) -> NDArray[np.complex128]:
+    """Field (points, points) of values (used,) at the nodes."""
     functions = operator.basis.shape[1]
     coefficients = (operator.to_coefficients @ (operator.to_modes @ nodes)).reshape(functions, functions)
     return np.asarray(operator.basis @ coefficients @ operator.basis.T)

@@ -1,20 +1,30 @@
 """The analytic calibration of a configured instrument, with a progress bar where the optical model must be built."""
 
-import contextlib
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 
 import numpy as np
+import numpy.typing as npt
 from rich.console import Console
-from rich.progress import BarColumn, TaskID, TextColumn, TimeElapsedColumn
+from rich.progress import TimeElapsedColumn
 
 from lowfc.adapters import instrument
-from lowfc.adapters.progress import passing_bar
+from lowfc.adapters.progress import counting_bar
 from lowfc.contract.configuration import Configuration
 from lowfc.control.calibration import Calibration
+from lowfc.optics.twin import Twin
+from lowfc.optics.twin_mirror import TwinMirror
+
+Wavefront = Callable[[Twin, TwinMirror], npt.NDArray[np.float64]]
+"""In nm at the used nodes of a twin, with the mirror on these."""
 
 
-def analytic(config: Configuration, console: Console) -> Calibration:
+def analytic(config: Configuration, console: Console, at: Wavefront | None = None) -> Calibration:
     """I0, H and R from the paper's equations; the optical model goes into the cache, from where the camera takes it.
+
+    Args:
+        config: The instrument's.
+        console: For people: a progress bar, warnings.
+        at: The wavefront that is the zero point; flat when None.
 
     Raises:
         CalibrationError: this sensor cannot tell the modes apart.
@@ -24,9 +34,10 @@ def analytic(config: Configuration, console: Console) -> Calibration:
     def warn(text: str) -> None:
         console.print(f"warning: {text}", style="yellow", highlight=False, soft_wrap=True)
 
-    with _progress("building the optical model", console) as advance:
-        optics = instrument.twin(config, advance, warn)
-    made = instrument.analytic_calibration(config, optics, instrument.mirror_on_twin(config, optics, lambda _: None))
+    with counting_bar(console, TimeElapsedColumn()) as count:
+        optics = instrument.twin(config, lambda done, total: count("building the optical model", done, total), warn)
+    on_nodes = instrument.mirror_on_twin(config, optics, lambda _: None)
+    made = instrument.analytic_calibration(config, optics, on_nodes, None if at is None else at(optics, on_nodes))
     noise = instrument.frame_noise_nm(config, made)
     worst = int(np.argmax(noise))
     if noise[worst] > config.control.limit_nm:
@@ -36,18 +47,3 @@ def analytic(config: Configuration, console: Console) -> Calibration:
             "the star is too faint, or the mask cannot tell so many modes apart"
         )
     return made
-
-
-@contextlib.contextmanager
-def _progress(what: str, console: Console) -> Iterator[Callable[[int, int], None]]:
-    """A progress bar that appears with the first step."""
-    columns = (TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn())
-    with passing_bar(console, *columns) as bar:
-        tasks: list[TaskID] = []
-
-        def advance(done: int, total: int) -> None:
-            if not tasks:
-                tasks.append(bar.add_task(what, total=total))
-            bar.update(tasks[0], completed=done, total=total)
-
-        yield advance

@@ -10,27 +10,28 @@ from typing import Annotated, Any
 import typer
 
 from lowfc import __version__
-from lowfc.adapters.terminal import DEFAULT_RUN, ConfigFile, RunId, configuration, new_app, run_app
+from lowfc.adapters.terminal import DEFAULT_RUN, ConfigFile, Json, RunId, configuration, new_app, run_app
 from lowfc.contract.configuration import Preset
 from lowfc.contract.errors import ConfigurationError
-from lowfc.programs.acceptance import acceptance_app
-from lowfc.programs.bench_record import bench_record
-from lowfc.programs.bench_view import bench_view
-from lowfc.programs.calibrate import calibrate_app
-from lowfc.programs.chaos import chaos
-from lowfc.programs.conformance import conformance_app
-from lowfc.programs.ctl_commands import ctl_app
-from lowfc.programs.design_commands import design_app
-from lowfc.programs.doctor import doctor
-from lowfc.programs.export import export
+from lowfc.programs.acceptance.command import acceptance_app
+from lowfc.programs.bench.record import bench_record
+from lowfc.programs.bench.view import bench_view
+from lowfc.programs.calibrate.command import calibrate_app
+from lowfc.programs.chaos.command import chaos
+from lowfc.programs.conformance.command import conformance_app
+from lowfc.programs.ctl.command import ctl_app
+from lowfc.programs.design.command import design_app
+from lowfc.programs.doctor.command import doctor
+from lowfc.programs.export.command import export
 from lowfc.programs.hosts import certs, hosts, router
-from lowfc.programs.latency import latency
-from lowfc.programs.log_info import info
-from lowfc.programs.recover import recover
-from lowfc.programs.replay_commands import replay_log
+from lowfc.programs.latency.command import latency
+from lowfc.programs.log.info import info
+from lowfc.programs.log.recover import recover
+from lowfc.programs.output import put
+from lowfc.programs.replay.command import replay_log
 from lowfc.programs.report.command import report
-from lowfc.programs.soak import soak
-from lowfc.programs.tune import tune
+from lowfc.programs.soak.command import soak
+from lowfc.programs.tune.command import tune
 from lowfc.programs.validate.commands import validate
 from lowfc.programs.view.command import view
 
@@ -61,8 +62,6 @@ app.command()(certs)
 app.command()(router)
 app.command()(hosts)
 app.command()(view)
-
-Json = Annotated[bool, typer.Option("--json", help="Print one JSON object on standard output.")]
 
 
 @app.callback(invoke_without_command=True)
@@ -125,7 +124,7 @@ def sim_loop(
         _print("to look at it: lowfc view", error=True)
     show = Show.NATIVE if view_ else Show.WEB if web else None
     figures = run(settings, duration, not no_record, show)
-    _print(json.dumps(figures) if as_json else summary_text(figures))
+    put(figures, summary_text(figures), as_json=as_json)
     if figures["recording_failure"]:
         raise typer.Exit(1)
 
@@ -183,8 +182,8 @@ def record(
     from lowfc.adapters.log_series import Limits
     from lowfc.adapters.run import open_run
     from lowfc.adapters.whole_file import write_whole
-    from lowfc.programs.recorder import record as run_recorder
-    from lowfc.programs.recording_summary import figures, report
+    from lowfc.programs.recording.recorder import record as run_recorder
+    from lowfc.programs.recording.summary import figures, report
 
     overrides = {
         "recorder.folder": folder,
@@ -242,7 +241,9 @@ def config_check(config: Annotated[Path, typer.Argument(help="Configuration file
 
 @config_app.command("zenoh")
 def config_zenoh(
-    role: Annotated[str, typer.Option(help="Role of your program, such as camera.")], run: RunId = DEFAULT_RUN
+    role: Annotated[str, typer.Option(help="Role of your program, such as camera.")],
+    run: RunId = DEFAULT_RUN,
+    make: Annotated[bool, typer.Option("--make", help="Make the run, if it is not there.")] = False,
 ) -> None:
     """Print the zenoh configuration for a program of your own that plays a role in a run.
 
@@ -250,7 +251,7 @@ def config_zenoh(
     """
     from lowfc.programs.config import zenoh_session
 
-    _print(zenoh_session(run, role))
+    _print(zenoh_session(run, role, make=make))
 
 
 @bench_app.command("twin")
@@ -259,11 +260,11 @@ def bench_twin(as_json: Json = False) -> None:
 
     Example: lowfc bench twin --json
     """
-    from lowfc.programs.bench_twin import bench_twin as measure
-    from lowfc.programs.bench_twin import render
+    from lowfc.programs.bench.twin import bench_twin as measure
+    from lowfc.programs.bench.twin import render
 
     figures = measure()
-    _print(json.dumps(figures) if as_json else render(figures))
+    put(figures, render(figures), as_json=as_json)
 
 
 def main() -> None:

@@ -3,8 +3,9 @@
 import json
 
 from lowfc.adapters.clock import HostClock
-from lowfc.adapters.run import open_run
+from lowfc.adapters.run import open_run, runtime_base
 from lowfc.adapters.zenoh_bus import session_config
+from lowfc.client import running
 from lowfc.contract.configuration import Configuration, keys
 from lowfc.contract.errors import BusError
 
@@ -23,12 +24,17 @@ def commented(config: Configuration) -> str:
     return "\n".join(lines)
 
 
-def zenoh_session(run_id: str, role: str) -> str:
-    """Zenoh's configuration file for a program that plays a role in a run.
+def zenoh_session(run_id: str, role: str, *, make: bool) -> str:
+    """Zenoh's configuration file for a program that plays a role in a run, made where it may be and is not there.
 
     Raises:
-        BusError: the run has no such role.
+        BusError: there is no such run, or it has no such role.
     """
+    if not make and not (runtime_base() / run_id).is_dir():
+        raise BusError(
+            f"there is no run {run_id!r}: start one of its processes first, or make it with --make; running are "
+            f"{', '.join(running()) or 'none'}"
+        )
     run = open_run(run_id)
     known = sorted({*run.links.ports, "operator", "launcher"})
     if role not in known:

@@ -42,12 +42,11 @@ from lowfc.control.loop import advance
 from lowfc.control.requests import CONFIGURATION
 from lowfc.control.safety import LoopMode
 from lowfc.control.state import State
+from lowfc.programs.rehearsal import Rehearsal
 from lowfc.programs.start_up import StartUp
 
 TICK_NS = 10_000_000
 """Without frames the held command is repeated this often."""
-REHEARSED_NS = 500_000
-"""Frames that come faster leave no time to rehearse, and the caches no time to cool."""
 MIRROR_PATIENCE_S = 1.0
 """How long the start waits to learn where the mirror is."""
 STATE_PERIOD_NS = 1_000_000_000
@@ -70,7 +69,9 @@ class Controller:
         self._start_up = StartUp(config)
         if latch.exists():  # safed stays safed when the controller dies
             self._settings = replace(self._settings, start_mode=LoopMode.SAFED)
-        self._rehearses = config.realtime.rehearse and not config.lockstep
+        rehearses = config.realtime.rehearse and not config.lockstep
+        self._rehearsal = Rehearsal(config.period_ns) if rehearses else None
+        self._last: Sample | None = None
         self._valid_ns = round(config.control.valid_ms * 1e6)
         self._state = State()
         self._turn = threading.Lock()
@@ -114,9 +115,14 @@ class Controller:
             if self._early is not None:
                 self._frame(self._early)
         while self._service.running:
-            camera = self._camera.take(TICK_NS * 1e-9)
+            camera = self._camera.take(self._rest_ns() * 1e-9)
+            if self._rehearsal is not None and self._rehearsal.begins(self._service.clock.host_ns()):
+                self._rehearse()
+                continue  # the rest can wait until the frame has come
             with self._turn:
                 self._between_frames(camera)
+            for _ in range(len(self._queries)):
+                self._answer(self._queries.popleft())
             self._service.beat()
         self._leave_camera()
         with self._turn:
@@ -158,7 +164,6 @@ class Controller:
         sent_ns = clock.host_ns()
         let_send()
         self._tell(outputs)
-        before_ns = self._last_frame_ns
         if sample.sequence == self._state.frame_sequence:  # an older one is no sign of a live camera
             self._last_frame_ns = taken_ns
         self._service.work += 1
@@ -174,59 +179,69 @@ class Controller:
             self._publish_timing()
         if clock.now_ns() >= self._state_due_ns:  # not by the frame's time: a camera's clock may be another
             self._publish_state(frame.time_ns)
-        if self._rehearses and taken_ns - before_ns > REHEARSED_NS:
-            self._rehearse(sample)
+        if self._rehearsal is not None:
+            self._last = sample
+            self._rehearsal.came(sample.receive_time_ns)
+            self._camera.wake()  # whoever rehearses does what else is to be done now, and then knows when to
 
-    def _rehearse(self, sample: Sample) -> None:
-        """Do the step once more, and forget what came of it: code and data are in the caches when the next frame comes.
+    def _rest_ns(self) -> int:
+        """How long the main thread may wait."""
+        rest_ns = None if self._rehearsal is None else self._rehearsal.rest_ns(self._service.clock.host_ns())
+        return TICK_NS if rest_ns is None else min(rest_ns, TICK_NS)
+
+    def _rehearse(self) -> None:
+        """Do the last step once more, and forget what came of it: code and data are in the caches for the next frame.
 
         What happens between two frames pushes them out.
         """
-        frame = codec.decode_frame(sample.payload, self._state.frame_sequence + 1, 0)
-        _, outputs = advance(self._settings, self._state, frame)
-        if outputs.command is not None:
-            codec.encode_command(outputs.command, self._valid_ns, CHANNEL, self._state.taken)
+        with self._turn:
+            if self._last is None:
+                return
+            frame = codec.decode_frame(self._last.payload, self._state.frame_sequence + 1, 0)
+            _, outputs = advance(self._settings, self._state, frame)
+            if outputs.command is not None:
+                codec.encode_command(outputs.command, self._valid_ns, CHANNEL, self._state.taken)
 
     def _between_frames(self, camera: Sample | None) -> None:
-        """Apply what the camera says of itself and what operators asked, in their order; without frames, hold."""
+        """Apply what the camera says of itself; without frames, hold."""
         if camera is not None:
             settings_now = codec.decode_camera(camera.payload)
             if settings_now is not None:
                 self._take(settings_now)
-        while self._queries:
-            self._answer(self._queries.popleft())
         silent_ns = self._service.clock.host_ns() - self._last_frame_ns
         if silent_ns >= TICK_NS and not self._service.clock.lockstep:
             self._take(Tick(self._service.clock.now_ns(), silent_ns))
 
     def _answer(self, query: Query) -> None:
+        """Apply what an operator asked between two frames; they do not wait while it is decoded, nor for its answer."""
         now_ns = self._service.clock.now_ns()
-        request, outputs, taken = self._asked(query, now_ns)
-        assert outputs.reply is not None  # noqa: S101  # every request has an answer
-        state = None
-        if request.name == "status":
-            state = controller_state(self._state, self._settings, now_ns)
-        short = Request(request.time_ns, request.name, request.modes, request.values, request.text)
-        query.reply(codec.encode_request(short, outputs.reply, taken, state))  # who asked has the arrays
-        self._requests.put(codec.encode_request(request, outputs.reply, taken, state))
-        self._tell(outputs)
-
-    def _asked(self, query: Query, now_ns: int) -> tuple[Request, Outputs, int]:
-        """The request, what it gave rise to, and its number; 0 for one that is no input of the control law."""
-        next_frame = self._state.frame_sequence + 1
         try:
             request = codec.decode_request(query.payload, query.name, now_ns)
         except ValueError as error:
-            return Request(now_ns, query.name), Outputs(reply=Reply(False, str(error), next_frame)), 0
+            request = Request(now_ns, query.name)
+            reply, state, taken = Reply(False, str(error), self._state.frame_sequence + 1), self._state, 0
+        else:
+            reply, state, taken = self._asked(request)
+        shown = controller_state(state, self._settings, now_ns) if request.name == "status" else None
+        short = Request(request.time_ns, request.name, request.modes, request.values, request.text)
+        query.reply(codec.encode_request(short, reply, taken, shown))  # who asked has the arrays
+        self._requests.put(codec.encode_request(request, reply, taken, shown))
+
+    def _asked(self, request: Request) -> tuple[Reply, State, int]:
+        """The reply, the state that it tells of, and its number; 0 for one that is no input of the control law."""
         if request.name == CONFIGURATION:
-            return request, Outputs(reply=Reply(True, self._configuration, next_frame)), 0
+            return Reply(True, self._configuration, self._state.frame_sequence + 1), self._state, 0
         if request.calibration is not None:
-            self._calibrations.put(encode_calibration(request.calibration, now_ns))
-        outputs = self._advance(request)
-        drive, reply = self._state.drive, outputs.reply
-        if request.calibration is not None and drive is not None and reply is not None and not reply.accepted:
-            self._calibrations.put(encode_calibration(drive.calibration, now_ns))  # the last one is that in use
-        return request, outputs, self._state.taken
+            self._calibrations.put(encode_calibration(request.calibration, request.time_ns))
+        with self._turn:
+            outputs = self._advance(request)
+            state = self._state
+            self._tell(outputs)
+        reply = outputs.reply
+        assert reply is not None  # noqa: S101  # every request has an answer
+        if request.calibration is not None and state.drive is not None and not reply.accepted:
+            self._calibrations.put(encode_calibration(state.drive.calibration, request.time_ns))  # the last is in use
+        return reply, state, state.taken
 
     def _adopt_mirror(self) -> None:
         """Learn where the mirror is before the first command, so that it does not jump."""

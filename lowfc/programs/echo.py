@@ -30,7 +30,7 @@ from lowfc.contract.configuration import Configuration
 from lowfc.contract.errors import BusError
 from lowfc.contract.messages import COMMAND, FRAME, Role
 from lowfc.programs.frame_source import ANSWER_S, FRAMES_FILE, Payloads
-from lowfc.programs.latency_figures import WARM_UP_S
+from lowfc.programs.latency.figures import WARM_UP_S
 
 ECHO_FILE = "echo.npz"
 """In the run's directory: round_trip_ns of every frame after the warm-up, -1 where none came back."""

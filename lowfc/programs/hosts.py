@@ -3,16 +3,22 @@
 import json
 import re
 import sys
+import tempfile
 import time
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from lowfc.adapters.terminal import DEFAULT_RUN, ConfigFile, RunId, configuration
+from lowfc.adapters.terminal import DEFAULT_RUN, ConfigFile, Json, RunId, configuration
 from lowfc.contract.errors import BusError, ConfigurationError
+from lowfc.programs.output import put
 
 if TYPE_CHECKING:
+    from lowfc.adapters.run import Links
+    from lowfc.contract.configuration import Configuration
     from lowfc.contract.messages import wire
 
 LISTEN_S = 1.5
@@ -28,7 +34,9 @@ def certs(
     ] = None,
     mirror: Annotated[list[str] | None, typer.Option(help="Name of a mirror; repeat. Default: dm.")] = None,
     days: Annotated[int, typer.Option(min=1, max=3650, help="How long the certificates are valid.")] = 825,
-    renew: Annotated[bool, typer.Option("--renew", help="Make those that are there anew, but the authority.")] = False,
+    renew: Annotated[
+        bool, typer.Option("--renew", help="Sign those that are there anew; they keep their keys.")
+    ] = False,
 ) -> None:
     """Make a certificate for each role of a run on several machines, and the authority that signs them.
 
@@ -73,7 +81,6 @@ def router(
 
     from lowfc.adapters.access import ROUTER
     from lowfc.adapters.join import join
-    from lowfc.adapters.run import open_run
     from lowfc.adapters.zenoh_session import session_config
 
     settings = configuration(config)
@@ -83,8 +90,8 @@ def router(
             "certificates in [network]"
         )
     if show:
-        links = open_run(run, (settings.mirror.name,), network=settings.network).links
-        sys.stdout.write(_short_lists(json.dumps(session_config(links, ROUTER), indent=2)) + "\n")
+        with joined(settings, run) as links:
+            sys.stdout.write(_short_lists(json.dumps(session_config(links, ROUTER), indent=2)) + "\n")
         return
     service = join(settings, run, ROUTER, [])
     service.catch_signals()
@@ -102,7 +109,7 @@ def router(
 def hosts(
     config: ConfigFile = None,
     run: RunId = DEFAULT_RUN,
-    as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object on standard output.")] = False,
+    as_json: Json = False,
 ) -> None:
     """Say which processes are in a run, and how far the clocks of their machines are from the router's.
 
@@ -123,14 +130,31 @@ def hosts(
         health = wire.Health.FromString(sample.payload)
         heard[health.process] = health
 
-    joined = open_run(run, (settings.mirror.name,), network=settings.network)
-    with closing(ZenohBus(joined.links, Role.OPERATOR, HostClock())) as bus:
+    with joined(settings, run) as links, closing(ZenohBus(links, Role.OPERATOR, HostClock())) as bus:
         bus.subscribe(HEALTH, hear)
         time.sleep(LISTEN_S)
     if not heard:
         raise BusError(f"nobody is heard in run {run!r} within {LISTEN_S:g} s")
+    open_run(run, (settings.mirror.name,), network=settings.network)  # from now on its folder knows the way
     rows = [_row(health) for _, health in sorted(heard.items())]
-    sys.stdout.write((json.dumps({"run": run, "processes": rows}) if as_json else _table(rows)) + "\n")
+    put({"run": run, "processes": rows}, _table(rows), as_json=as_json)
+
+
+@contextmanager
+def joined(settings: "Configuration", run: str) -> Iterator["Links"]:
+    """Links of a run that is there, or by the configuration's router as if it were: nothing is left of having asked.
+
+    Raises:
+        BusError: there is no such run, and no router.
+    """
+    from lowfc.adapters.run import open_run, runtime_base
+    from lowfc.programs.ctl.which_run import the_known_run
+
+    if not settings.network.router:
+        the_known_run(run)
+    with tempfile.TemporaryDirectory(prefix="lowfc-") as elsewhere:
+        base = None if (runtime_base() / run).is_dir() else Path(elsewhere)
+        yield open_run(run, (settings.mirror.name,), base, network=settings.network).links
 
 
 def _short_lists(text: str) -> str:

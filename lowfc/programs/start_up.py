@@ -14,14 +14,12 @@ from lowfc.control.additions import ADOPTED, FLAT
 from lowfc.control.inputs import Request
 from lowfc.control.linear_law import LinearLaw
 from lowfc.control.loading import ADOPTED_NM
-from lowfc.control.margins import check_stable
+from lowfc.control.requests import check_law
 from lowfc.control.safety import Reason, limit
 from lowfc.control.state import State
 
 Single = npt.NDArray[np.float32]
 
-SAME_RATE = 0.01
-"""By which the rate of a law's frames may differ from the camera's."""
 LIKENESS = 0.5
 """Of a mirror's shape to the flat map, from which on it is taken to be there already."""
 
@@ -52,24 +50,19 @@ def law(config: Configuration) -> LinearLaw | None:
     """The law of `control.law`, which suits the loop; None for the integrator.
 
     Raises:
-        ConfigurationError: the file cannot be used, or the law is of another rate, or not stable here.
+        ConfigurationError: the file cannot be used, or the law is of another delay or rate, or not stable here.
     """
     file = config.control.law
     if not file:
         return None
     try:
         found = law_file.load(Path(file).expanduser())
-        check_stable(found, instrument.settings(config).delay_frames)
+        settings = instrument.settings(config)
+        check_law(found, settings.delay_frames, settings.rate_hz)
     except DataFileError as fault:
         raise ConfigurationError(f"control.law: {fault}") from None
     except ValueError as fault:
         raise ConfigurationError(f"control.law = {file!r}: {fault}") from None
-    rate_hz = config.camera.rate_hz
-    if abs(found.rate_hz - rate_hz) > SAME_RATE * rate_hz:
-        raise ConfigurationError(
-            f"control.law = {file!r}: it was made for {found.rate_hz:g} Hz, camera.rate_hz is {rate_hz:g}: make "
-            "another with `lowfc tune` from a log of this rate"
-        )
     return found
 
 

@@ -8,7 +8,7 @@ from lowfc.contract.calibration_codec import identified
 from lowfc.control.inputs import CameraSettings, Input, MirrorShape, Request, Tick
 
 CALIBRATION = identified(calibration())
-TIGHT = {"limit_nm": (15.0, 8.0), "most_saturated": 0}
+TIGHT = {"limit_nm": (15.0, 8.0), "most_saturated": 0, "most_alike": 2}
 """Settings under which limits act."""
 
 

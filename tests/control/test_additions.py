@@ -420,6 +420,9 @@ def test_an_unstable_or_foreign_law_is_refused() -> None:
     reply = late.ask("law", law=linear)
     assert not reply.accepted
     assert not night.ask("law", law=integrator(law, (2, 3, 5), 1.0, 1000.0)).accepted
+    fast = Night(replace(USUAL, rate_hz=500.0))
+    assert "1000 Hz" in fast.ask("law", law=linear).text
+    assert fast.ask("law", law=integrator(law, NOLL, 1.0, 501.0)).accepted
 
 
 def test_another_calibration_moves_nothing() -> None:

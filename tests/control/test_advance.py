@@ -99,6 +99,23 @@ def test_a_bad_frame_is_refused_counted_and_named_and_the_command_holds(reason: 
     assert state.frames_used == before.frames_used + 2
 
 
+def test_a_camera_that_is_stuck_is_refused_until_its_image_changes() -> None:
+    what = settings(most_alike=3)
+    state, every = feed(what, loaded(what), *(frame(count, SOME) for count in range(1, 8)))
+    reasons = [outputs.step.reasons for outputs in every if outputs.step is not None]
+    assert reasons == [()] * 4 + [(Reason.STUCK,)] * 3
+    used = drive_of(feed(what, loaded(what), *(frame(count, SOME) for count in range(1, 5)))[0])
+    assert np.array_equal(drive_of(state).actuators_nm, used.actuators_nm)
+    changed = frame(8, SOME)
+    assert changed.pixels is not None
+    pixels = changed.pixels.copy()
+    pixels.flat[0] += 1
+    state, back = feed(what, state, changed._replace(pixels=pixels), frame(9, SOME))
+    assert names(every + back) == ["FRAMES_REFUSED", "FRAMES_ACCEPTED"]
+    assert state.counts == {Reason.STUCK: 3}
+    assert state.frames_used == 6
+
+
 def test_a_message_without_an_image_is_of_the_wrong_size() -> None:
     _, every = feed(USUAL, running(), frame(6, pixels=None))
     assert every[0].step is not None

@@ -2,11 +2,10 @@
 
 import numpy as np
 import pytest
-from toy import TOY, frame, frame_sequence, loaded, settings
+from toy import frame_sequence, live, settings
 
 from lowfc.control.inputs import Step
 from lowfc.control.law import Law
-from lowfc.control.loop import advance
 from lowfc.control.safety import Limits
 from lowfc.control.stability import delay_weights
 from lowfc.control.state import Settings
@@ -41,22 +40,9 @@ def weights(delay_frames: float) -> np.ndarray:
     return delay_weights(delay_frames).astype(np.float32)
 
 
-def live(what: Settings, disturbance_nm: np.ndarray, counts: list[int], dark: tuple[int, ...] = ()) -> list[Step]:
-    """Steps of the live loop that gets only the frames of `counts`, some of them dark."""
-    state, steps = loaded(what), []
-    shares = delay_weights(what.delay_frames)
-    given = [np.zeros(3)] * len(shares)  # by exposure, of which each sees those before
-    for count, wave_nm in enumerate(disturbance_nm):
-        seen = sum(share * command for share, command in zip(shares, given[::-1], strict=False))
-        if count in counts:
-            light = {"pixels": TOY.pixels((0, 0, 0), flux_dn=0)} if count in dark else {}
-            state, outputs = advance(what, state, frame(count + 1, wave_nm + seen, **light))
-            assert outputs.step is not None
-            steps.append(outputs.step)
-            given.append(outputs.step.command_nm.astype(float))
-        else:
-            given.append(given[-1])
-    return steps
+def used(what: Settings, disturbance_nm: np.ndarray) -> list[Step]:
+    """Steps of the live loop with frames missing, and dark ones."""
+    return live(what, disturbance_nm, missing=MISSING, dark=DARK)[0]
 
 
 def columns(steps: list[Step]) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
@@ -72,7 +58,7 @@ def walk(frames: int) -> np.ndarray:
     return np.array([15.0, -9.0, 6.0]) + np.cumsum(np.random.default_rng(4).normal(size=(frames, 3)), axis=0)
 
 
-HOLED = [count for count in range(160) if count not in (30, 31, 32, 33, 34, 35, 60, 90, 91)]
+MISSING = (30, 31, 32, 33, 34, 35, 60, 90, 91)
 DARK = (45, 46, 100, 101, 102, 103)
 
 
@@ -80,7 +66,7 @@ DARK = (45, 46, 100, 101, 102, 103)
 def test_with_the_gains_that_were_used_it_is_the_logged_run(delay: float) -> None:
     """To the rounding of float32 in pol = error - seen, with missing and refused frames and modal limits that act."""
     what = settings(delay_frames=delay, gain=(0.3, 0.2), leak=(0.01, 0.0), limit_nm=(12.0, 50.0))
-    error, pol, command, missing = columns(live(what, walk(160), HOLED, DARK))
+    error, pol, command, missing = columns(used(what, walk(160)))
     assert missing.sum() == 9
     assert np.isnan(error).any(axis=1).sum() == len(DARK)
     assert (np.abs(command[:, 0]) == 12.0).any()
@@ -95,8 +81,8 @@ def test_with_other_gains_it_is_the_run_with_those(delay: float) -> None:
     before = settings(delay_frames=delay, gain=(0.3, 0.1), **WIDE)
     after = settings(delay_frames=delay, gain=(0.1, 0.25), leak=(0.02, 0.01), **WIDE)
     disturbance = walk(160)
-    _, pol, _, missing = columns(live(before, disturbance, HOLED, DARK))
-    error, _, command, _ = columns(live(after, disturbance, HOLED, DARK))
+    _, pol, _, missing = columns(used(before, disturbance))
+    error, _, command, _ = columns(used(after, disturbance))
     other_error, other_command = counterfactual(integrator(after.law((2, 3, 4))), weights(delay), pol, missing)
     np.testing.assert_allclose(other_error, error, atol=0.05)
     np.testing.assert_allclose(other_command, command, atol=0.05)

@@ -1,5 +1,6 @@
 """Linear laws: what the loop's integrator does, bumpless closing, no wind-up, and shapes that are checked."""
 
+from collections.abc import Iterable
 from dataclasses import replace
 
 import numpy as np
@@ -9,6 +10,7 @@ import pytest
 from lowfc.control.law import Law, integrate
 from lowfc.control.linear_law import (
     LinearLaw,
+    Signal,
     at_rest,
     coast,
     follow,
@@ -17,7 +19,7 @@ from lowfc.control.linear_law import (
     of_blocks,
     respond,
 )
-from lowfc.control.pi_notch import Notch, leaky_pi, pi_notch
+from lowfc.control.pi_notch import Notch, pi_notch
 from lowfc.control.stability import delay_weights
 
 NOLL, RATE_HZ = (2, 3, 4), 1000.0
@@ -29,19 +31,29 @@ def plain(limit_nm: float = 1e9) -> Law:
     return Law(*(np.asarray(values, np.float32) for values in (GAIN, LEAK, np.full(3, limit_nm))))
 
 
-def run(
-    law: LinearLaw, disturbance_nm: Array, delay_frames: float, limit_nm: float = np.inf, closed_from: int = 0
-) -> tuple[Array, Array]:
-    """Errors and commands (frames, modes) of a loop in which nothing else acts."""
+def integrators(modes: Iterable[tuple[float, float]], signal: Signal, delay_frames: float) -> LinearLaw:
+    """Integrators of gain and leak, as a linear law of this signal."""
+    blocks = [integrator_block(gain, leak, signal, delay_frames) for gain, leak in modes]
+    noll = tuple(range(2, 2 + len(blocks)))
+    return of_blocks(blocks, signal, "integrator", noll, delay_frames, RATE_HZ)
+
+
+def pi(gain: Array, proportional: Array, leak: Array) -> LinearLaw:
+    """A PI law without notches."""
+    return pi_notch(NOLL, gain, proportional, leak, [()] * len(NOLL), 1.0, RATE_HZ)
+
+
+def run(law: LinearLaw, disturbance_nm: Array, delay_frames: float, limit_nm: float = np.inf) -> tuple[Array, Array]:
+    """Errors and commands (frames, modes) of a loop in which nothing else acts; its delay may not be the law's."""
     weights = delay_weights(delay_frames).astype(np.float32)
-    history = [np.zeros(disturbance_nm.shape[1], np.float32)] * len(weights)
+    believed = delay_weights(law.delay_frames).astype(np.float32)
+    history = [np.zeros(disturbance_nm.shape[1], np.float32)] * max(len(weights), len(believed))
     x, errors, commands = at_rest(law), [], []
-    for k, disturbance in enumerate(disturbance_nm.astype(np.float32)):
-        seen = sum(weight * past for weight, past in zip(weights, history, strict=True))
-        error = disturbance + seen
-        x = follow(law, x, error if law.signal == "error" else disturbance, history[0])
-        kept = np.clip(respond(law, x), -limit_nm, limit_nm) if k >= closed_from else history[0]
-        history = [kept.astype(np.float32), *history[:-1]]
+    for disturbance in disturbance_nm.astype(np.float32):
+        error = disturbance + sum(weight * past for weight, past in zip(weights, history, strict=False))
+        pol = error - sum(weight * past for weight, past in zip(believed, history, strict=False))
+        x = follow(law, x, error if law.signal == "error" else pol, history[0])
+        history = [np.clip(respond(law, x), -limit_nm, limit_nm, dtype=np.float32), *history[:-1]]
         errors.append(error)
         commands.append(history[0])
     return np.array(errors, float), np.array(commands, float)
@@ -60,19 +72,14 @@ def test_the_integrator_as_a_linear_law_is_the_integrator_to_the_bit() -> None:
 def test_an_integrator_of_pseudo_open_loop_modes_is_the_same_loop(delay_frames: float) -> None:
     disturbance = np.random.default_rng(2).standard_normal((300, 3))
     modes = list(zip(GAIN / 2, LEAK, strict=True))
-    pol = of_blocks(
-        [integrator_block(*mode, "pol", delay_frames) for mode in modes], "pol", "i", NOLL, delay_frames, RATE_HZ
-    )
-    error = of_blocks(
-        [integrator_block(*mode, "error", delay_frames) for mode in modes], "error", "i", NOLL, delay_frames, RATE_HZ
-    )
+    pol, error = integrators(modes, "pol", delay_frames), integrators(modes, "error", delay_frames)
     for one, other in zip(run(pol, disturbance, delay_frames), run(error, disturbance, delay_frames), strict=True):
         np.testing.assert_allclose(one, other, atol=1e-4)
 
 
 def test_a_pi_law_follows_its_difference_equation() -> None:
     proportional = np.array([0.2, 0.1, 0.0])
-    law, rng = leaky_pi(NOLL, GAIN, proportional, LEAK, 1.0, RATE_HZ), np.random.default_rng(3)
+    law, rng = pi(GAIN, proportional, LEAK), np.random.default_rng(3)
     x, kept, before = at_rest(law), np.zeros(3), np.zeros(3)
     for error in rng.standard_normal((50, 3)):
         x = follow(law, x, error.astype(np.float32), kept.astype(np.float32))
@@ -82,7 +89,7 @@ def test_a_pi_law_follows_its_difference_equation() -> None:
 
 
 LAWS = {
-    "pi": leaky_pi(NOLL, GAIN, GAIN / 2, 0 * LEAK, 1.0, RATE_HZ),
+    "pi": pi(GAIN, GAIN / 2, 0 * LEAK),
     "notch": pi_notch(NOLL, GAIN, 0 * GAIN, 0 * LEAK, [(Notch(18, 8, 10), Notch(71, 8, 5))] * 3, 1.0, RATE_HZ),
 }
 
@@ -114,7 +121,7 @@ def test_a_notch_takes_its_line_out(frequency_hz: float) -> None:
     time_s = np.arange(6000) / RATE_HZ
     line = np.repeat(10 * np.sin(2 * np.pi * frequency_hz * time_s)[:, None], 3, axis=1)
     with_notch = run(LAWS["notch"], line, 1.0)[0][3000:]
-    without = run(leaky_pi(NOLL, GAIN, 0 * GAIN, 0 * LEAK, 1.0, RATE_HZ), line, 1.0)[0][3000:]
+    without = run(pi(GAIN, 0 * GAIN, 0 * LEAK), line, 1.0)[0][3000:]
     ratio = with_notch.std(axis=0) / without.std(axis=0)
     np.testing.assert_allclose(ratio, 1 / (10 if frequency_hz == 18 else 5), rtol=0.15)
 
@@ -158,4 +165,4 @@ def test_an_impossible_notch_is_refused(notch: Notch) -> None:
 
 def test_gains_of_another_number_of_modes_are_refused() -> None:
     with pytest.raises(ValueError, match="proportional must be given for each of 3 modes, got 2"):
-        leaky_pi(NOLL, GAIN, GAIN[:2], LEAK, 1.0, RATE_HZ)
+        pi(GAIN, GAIN[:2], LEAK)

@@ -2,10 +2,9 @@
 
 import numpy as np
 import pytest
-from toy import NOLL, frame, loaded, settings
+from toy import live, settings
 
 from lowfc.control.law import Law, integrate
-from lowfc.control.loop import advance
 from lowfc.control.safety import Limits
 from lowfc.control.stability import (
     delay_weights,
@@ -105,20 +104,10 @@ def test_the_limiting_gain_is_where_a_pole_leaves_the_unit_circle(delay: float, 
 
 
 def run(what: Settings, disturbance_nm: np.ndarray, noise_nm: np.ndarray | float = 0.0) -> np.ndarray:
-    """Residual (frames, modes) of the loop closed through `advance`, whose sensor sees modes with `noise_nm` added."""
-    state = loaded(what)
-    assert state.drive is not None
-    weights = delay_weights(what.delay_frames)
-    commands = [np.zeros(len(NOLL))] * len(weights)
-    noise = np.broadcast_to(noise_nm, disturbance_nm.shape)
-    residual = np.empty_like(disturbance_nm)
-    for index, wave_nm in enumerate(disturbance_nm):
-        residual[index] = wave_nm + sum(w * c for w, c in zip(weights, commands, strict=True))
-        state, outputs = advance(what, state, frame(index + 1, residual[index] + noise[index]))
-        assert outputs.step is not None
-        assert outputs.step.reasons == ()
-        commands = [outputs.step.command_nm.astype(float), *commands[:-1]]
-    return residual
+    """Residual (frames, modes) of the loop closed through `advance`, of which nothing but the law makes the command."""
+    steps, residual_nm, _ = live(what, disturbance_nm, noise_nm)
+    assert all(step.reasons == () for step in steps)
+    return residual_nm
 
 
 @pytest.mark.parametrize("delay", [1, 2, 3])
@@ -173,14 +162,9 @@ def test_rejection_and_noise_transfer_add_up_to_one() -> None:
 @pytest.mark.parametrize("delay", [1.0, 1.5, 2.0, 3.0])
 def test_pseudo_open_loop_is_the_disturbance_while_the_loop_settles(delay: float) -> None:
     what = settings(delay_frames=delay, gain=(0.3, 0.2), leak=(0.01, 0.0))
-    state, weights = loaded(what), delay_weights(delay)
     still = np.array([12.0, -7.0, 5.0])
-    commands = [np.zeros(3)] * len(weights)
-    for index in range(60):
-        seen = still + sum(w * c for w, c in zip(weights, commands, strict=True))
-        state, outputs = advance(what, state, frame(index + 1, seen))
-        assert outputs.step is not None
-        assert outputs.step.pol_nm is not None
-        assert np.abs(outputs.step.pol_nm - still).max() < 0.05
-        commands = [outputs.step.command_nm.astype(float), *commands[:-1]]
-    assert np.abs(commands[0] + still * [0.3 / 0.31, 0.3 / 0.31, 1]).max() < 0.05
+    steps, _, _ = live(what, np.tile(still, (60, 1)))
+    for step in steps:
+        assert step.pol_nm is not None
+        assert np.abs(step.pol_nm - still).max() < 0.05
+    assert np.abs(steps[-1].command_nm + still * [0.3 / 0.31, 0.3 / 0.31, 1]).max() < 0.05

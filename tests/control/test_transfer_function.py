@@ -1,12 +1,12 @@
 """The measured rejection of a loop is the theory's; sensor gains and captures are what was put in."""
 
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from dataclasses import replace
 
 import numpy as np
 import numpy.typing as npt
 import pytest
-from toy import NOLL, TOY, calibration, frame, frame_sequence, loaded, settings
+from toy import NOLL, TOY, calibration, frame, frame_sequence, live, loaded, settings
 
 from lowfc.control import margins
 from lowfc.control.error_budget import LinearLoop
@@ -36,35 +36,23 @@ def theory_of(one: Law, delay_frames: float) -> LinearLoop:
     return LinearLoop(one.gain.astype(float), one.leak.astype(float), delay_frames, 1.0)
 
 
-def through(
-    what: Settings, requests: Iterable[Request], frames: int, disturbance_nm: Callable[[int], npt.ArrayLike]
-) -> tuple[Array, Array, State]:
-    """Errors and commands (frames, modes) of the toy's loop, after what was asked; and the state after them."""
-    state, weights = loaded(what), delay_weights(what.delay_frames)
-    inverse = np.linalg.pinv(TOY.modes_to_actuators)
-    state, _ = advance(what, state, frame(1))
+def through(what: Settings, requests: Iterable[Request], frames: int) -> tuple[Array, Array, State]:
+    """Errors and commands (frames, modes) of the toy's loop, after what was asked; and the state after them.
+
+    Beside white noise there is a slow sine that is no line of the multisine.
+    """
+    state, _ = advance(what, loaded(what), frame(1))
     for request in requests:
         state, outputs = advance(what, state, request)
         assert outputs.reply is not None
         assert outputs.reply.accepted, outputs.reply.text
-    history = [np.zeros(len(NOLL))] * len(weights)
-    errors, commands = [], []
-    for count in range(frames):
-        seen = sum((weight * past for weight, past in zip(weights, history, strict=True)), np.zeros(len(NOLL)))
-        state, outputs = advance(what, state, frame(2 + count, seen + np.asarray(disturbance_nm(count))))
-        assert outputs.step is not None
-        assert outputs.step.error_nm is not None
-        assert outputs.command is not None
-        errors.append(outputs.step.error_nm)
-        commands.append(outputs.step.command_nm)
-        history = [inverse @ outputs.command.actuators_nm.reshape(-1), *history[:-1]]
-    return np.array(errors, float), np.array(commands, float), state
-
-
-def noise(sigma_nm: float = 0.3, seed: int = 3) -> Callable[[int], Array]:
-    """White noise, and a slow sine that is no line of the multisine."""
-    rng = np.random.default_rng(seed)
-    return lambda count: sigma_nm * rng.standard_normal(len(NOLL)) + 3 * np.sin(2e-4 * count)
+    slow = 3 * np.sin(2e-4 * np.arange(frames))[:, None]
+    noise = 0.3 * np.random.default_rng(3).standard_normal((frames, len(NOLL)))
+    steps, _, state = live(what, slow + noise, state=state, first=2)
+    error_nm, command_nm = (
+        np.array([getattr(step, name) for step in steps], float) for name in ("error_nm", "command_nm")
+    )
+    return error_nm, command_nm, state
 
 
 @pytest.mark.parametrize("delay_frames", [1.0, 1.5, 2.0])
@@ -77,7 +65,7 @@ def test_the_measured_rejection_is_the_theorys(delay_frames: float, target: str)
     table = led_in(period, lead)
     shapes = np.zeros(0) if target == "offset" else calibration().modes_to_actuators.T.reshape(-1)
     request = Request(0, "play", text=target, table=table, actuators_nm=shapes.astype(np.float32))
-    error_nm, _, _ = through(what, [request], len(table), noise())
+    error_nm, _, _ = through(what, [request], len(table))
     weights = delay_weights(delay_frames)
     added = -period.astype(float) if target == "offset" else seen_of_mirror(period.astype(float), weights)
     found = measured(error_nm[lead:], added)
@@ -110,7 +98,7 @@ def test_a_linear_laws_too() -> None:
     period = multisine(PERIOD, places, 3.0, 2)
     lead = SETTLING_FRAMES + FADING_FRAMES + 200
     requests = [Request(0, "law", law=linear), Request(0, "play", text="offset", table=led_in(period, lead))]
-    error_nm, _, _ = through(what, requests, lead + PERIOD, noise())
+    error_nm, _, _ = through(what, requests, lead + PERIOD)
     found = measured(error_nm[lead:], -period.astype(float))
     theory = margins.rejection(linear, found.frequency, 1.0)[np.arange(found.mode.size), found.mode]
     of = departure(found.rejection, theory, found.error, TOLERANCE_DB)
@@ -214,7 +202,7 @@ def test_a_shape_is_captured_where_the_loop_takes_it_away(gain: tuple[float, flo
     stairs, starts = climb([0.0, 30.0], 40, 20.0)
     table = stairs.astype(np.float32)[:, None]
     request = Request(0, "play", text="mirror", table=table, actuators_nm=shape.reshape(-1))
-    error_nm, command_nm, state = through(what, [request], len(table), noise())
+    error_nm, command_nm, state = through(what, [request], len(table))
     assert state.mode is LoopMode.CLOSED
     before, after = slice(20, 40), slice(int(starts[1]) + 30, int(starts[1]) + 40)
     assert captured(error_nm, command_nm, 1, 30.0, before, after) is expected

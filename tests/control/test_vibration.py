@@ -4,6 +4,8 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
+from lowfc.control.kalman import lqg
+from lowfc.control.margins import check_stable
 from lowfc.control.spectra import Pieces
 from lowfc.control.vibration import FEWEST, Line, Model, identify, resolution_hz
 from lowfc.optics.photometry import tilt_nm_per_mas
@@ -94,3 +96,12 @@ def test_a_slow_mode_is_drift() -> None:
     assert all(line.frequency_hz < 1 for line in model.lines)
     assert model.drift_nm2 > 0
     assert model.noise_nm2 == pytest.approx(0.25, rel=0.05)
+
+
+@pytest.mark.parametrize(("lines", "seed"), [((), 1), (LINES_HZ, 3)])
+def test_where_drift_explains_all_there_is_some_noise_and_a_filter(lines: tuple[float, ...], seed: int) -> None:
+    truth = Model(1.0, 50.0, tuple(Line(hz, 1e-3, 100.0) for hz in lines), 1e-12, RATE_HZ)
+    model = identify(Pieces((realised(truth, 4096, seed),), 0), RATE_HZ)
+    assert model is not None
+    assert model.noise_nm2 > 1e-8
+    check_stable(lqg([model], (2,), 1.0), 1.0)

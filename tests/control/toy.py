@@ -1,14 +1,16 @@
 """A small sensor and mirror with exact algebra, in place of diffraction: for tests of the control law alone."""
 
+from collections.abc import Container
 from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
 
 from lowfc.control.calibration import Calibration, normalise_flux, reconstructor
-from lowfc.control.inputs import Frame, Load
+from lowfc.control.inputs import Frame, Load, Step
 from lowfc.control.loop import advance
 from lowfc.control.safety import Limits, LoopMode
+from lowfc.control.stability import delay_weights
 from lowfc.control.state import Settings, State
 
 Array = npt.NDArray[np.float64]
@@ -107,3 +109,42 @@ def frame(count: int, modes_nm: npt.ArrayLike = (0, 0, 0), **changes: object) ->
         "pixels": TOY.pixels(modes_nm),
     }
     return Frame(**(usual | changes))
+
+
+def live(
+    what: Settings,
+    disturbance_nm: Array,
+    noise_nm: npt.ArrayLike = 0.0,
+    state: State | None = None,
+    first: int = 1,
+    missing: Container[int] = (),
+    dark: Container[int] = (),
+) -> tuple[list[Step], Array, State]:
+    """Steps of the live loop, the residual (frames, modes) in each exposure, and the state at the end.
+
+    Args:
+        what: the controller's.
+        disturbance_nm: (frames, modes), to which the mirror adds.
+        noise_nm: of the sensor, which sees the residual and this.
+        state: to begin with; of `loaded` when None.
+        first: number of the first frame.
+        missing: exposures whose frames do not arrive, counted from 0.
+        dark: those without light.
+    """
+    state = loaded(what) if state is None else state
+    weights, to_modes = delay_weights(what.delay_frames), np.linalg.pinv(TOY.modes_to_actuators)
+    given = [np.zeros(len(NOLL))] * len(weights)
+    noise_nm = np.broadcast_to(noise_nm, disturbance_nm.shape)
+    steps, residual_nm = [], np.empty(disturbance_nm.shape)
+    for count, wave_nm in enumerate(disturbance_nm):
+        residual_nm[count] = wave_nm + sum(weight * past for weight, past in zip(weights, given, strict=True))
+        newest = given[0]
+        if count not in missing:
+            light = {"pixels": TOY.pixels((0, 0, 0), flux_dn=0)} if count in dark else {}
+            state, outputs = advance(what, state, frame(first + count, residual_nm[count] + noise_nm[count], **light))
+            assert outputs.step is not None
+            steps.append(outputs.step)
+            if outputs.command is not None:
+                newest = to_modes @ outputs.command.actuators_nm.reshape(-1)
+        given = [newest, *given[:-1]]
+    return steps, residual_nm, state

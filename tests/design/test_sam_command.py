@@ -17,12 +17,12 @@ from lowfc.adapters.terminal import new_app
 from lowfc.contract.errors import ConfigurationError, DataFileError, LowfcError
 from lowfc.design.sam_search import BLOCK
 from lowfc.optics.sam import Layout
-from lowfc.programs import design_sam as program
-from lowfc.programs import design_sam_executors as executors
-from lowfc.programs.design_commands import design_app
-from lowfc.programs.design_sam_executors import Here, open_executor
-from lowfc.programs.design_sam_files import front, read_state
-from lowfc.programs.design_sam_request import Search, command_of, request
+from lowfc.programs.design import sam as program
+from lowfc.programs.design import sam_executors as executors
+from lowfc.programs.design.command import design_app
+from lowfc.programs.design.sam_executors import Here, open_executor
+from lowfc.programs.design.sam_files import front, read_state
+from lowfc.programs.design.sam_request import Search, command_of, request
 
 RECORDED = {
     name: entry["command"] for name, entry in json.loads(SHIPPED.read_text())["layouts"].items() if "command" in entry

@@ -27,7 +27,7 @@ from lowfc.design.shaped_pupil import (
 from lowfc.optics.fourier import to_image
 from lowfc.optics.grid import OPEN_AREA, SAMPLES, image_axis, pupil_axis
 from lowfc.optics.pupil import circle, from_quarter
-from lowfc.programs.design_commands import design_app
+from lowfc.programs.design.command import design_app
 
 SMALL = Request(outer=8.0, cells=16)
 SHIPPED = resources.files("lowfc") / "data" / "spc_quarter128.npz"
@@ -201,7 +201,7 @@ def test_a_file_that_cannot_be_written_is_said_first(tmp_path):
 
 
 def test_ctrl_c_stops_within_a_program_and_leaves_no_file(tmp_path):
-    source = "from lowfc.adapters.terminal import run_app; from lowfc.programs.design_commands import design_app"
+    source = "from lowfc.adapters.terminal import run_app; from lowfc.programs.design.command import design_app"
     command = [sys.executable, "-c", f"{source}; run_app(design_app)", "spc", "--outer", "12"]
     command += ["--out", str(tmp_path / "spc.npz")]
     with subprocess.Popen(command, stderr=subprocess.PIPE, text=True) as process:

@@ -11,7 +11,10 @@ from loops import LOWFC, children, interrupt, start, until
 
 from lowfc.client import running
 
-COMPUTED = "lowfc calibrate --method analytic --config lowfc.toml --out computed.fits"
+COMPUTED = (
+    "lowfc calibrate --method analytic --config lowfc.toml --out computed.fits",
+    "lowfc calibrate --method analytic --config lowfc.toml --at 4=15,7=-10 --out there.fits",
+)
 OPEN_LOOP = (
     "lowfc calibrate --method hadamard --out night.fits",
     "lowfc calibrate --compare computed.fits night.fits",
@@ -33,7 +36,7 @@ AFTERWARDS = (
     "lowfc acceptance rejection logs/*.mcap",
 )
 LAW = "lowfc ctl law lqg.fits"
-COMMANDS = (COMPUTED, *OPEN_LOOP, DARK, WITH_IT, *CLOSED_LOOP, *AFTERWARDS, LAW)
+COMMANDS = (*COMPUTED, *OPEN_LOOP, DARK, WITH_IT, *CLOSED_LOOP, *AFTERWARDS, LAW)
 
 CONFIG = """
 [sensor]
@@ -75,7 +78,8 @@ def loop(folder: Path, *arguments: str) -> Iterator[None]:
 @pytest.mark.timeout(900)
 def test_a_day_on_the_bench(tmp_path: Path) -> None:
     (tmp_path / "lowfc.toml").write_text(CONFIG)
-    run(tmp_path, COMPUTED)
+    for command in COMPUTED:
+        assert run(tmp_path, command)
     with loop(tmp_path, "--open", "--no-record"):
         for command in OPEN_LOOP:
             assert run(tmp_path, command)
@@ -93,6 +97,6 @@ def test_a_day_on_the_bench(tmp_path: Path) -> None:
     until(lambda: "bench" in running())
     interrupt(controller)
     assert controller.returncode == 0
-    assert {"computed.fits", "night.fits", "aligned.fits", "lqg.fits", "rejection.png"} <= {
+    assert {"computed.fits", "there.fits", "night.fits", "aligned.fits", "lqg.fits", "rejection.png"} <= {
         path.name for path in tmp_path.iterdir()
     }

@@ -26,8 +26,8 @@ from lowfc.contract.messages import COMMAND, EVENT, REQUEST, Log, wire
 from lowfc.control.linear_law import integrator_block, of_blocks
 from lowfc.control.requests import REQUESTS
 from lowfc.control.safety import Limits
-from lowfc.programs.ctl_commands import ctl_app
-from lowfc.programs.ctl_requests import ASKED
+from lowfc.programs.ctl.command import ctl_app
+from lowfc.programs.ctl.requests import ASKED
 
 DOCUMENT = Path(__file__).parents[2] / "docs" / "operating.md"
 COMMANDS = re.findall(r"^    (lowfc ctl .*)$", DOCUMENT.read_text(), flags=re.MULTILINE)

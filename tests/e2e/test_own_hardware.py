@@ -40,7 +40,7 @@ CONFORMANCE = (
 )
 LOOP = ("lowfc controller --run bench --config bench.toml", "lowfc ctl close --run bench")
 PLAIN = (
-    "lowfc config zenoh --run bench --role camera > camera.json5",
+    "lowfc config zenoh --run bench --role camera --make > camera.json5",
     "python examples/plain_camera.py camera.json5 frames.npy",
 )
 DOCUMENTED = (*DEVICES, *CONFORMANCE, *LOOP, *PLAIN)

@@ -20,7 +20,7 @@ from lowfc.adapters.log_writer import LogWriter
 from lowfc.adapters.run import Run, new_run_id, open_run
 from lowfc.adapters.zenoh_bus import ZenohBus
 from lowfc.contract.messages import CONTROLLER_STATE, STEP, wire
-from lowfc.programs.replay_workers import replay_files
+from lowfc.programs.replay.workers import replay_files
 
 # A camera that loses one frame in a hundred on the way, as a bad cable does.
 LOSSY_CAMERA = """

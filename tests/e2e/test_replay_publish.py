@@ -31,8 +31,8 @@ from lowfc.contract.messages import (
     Topic,
     wire,
 )
-from lowfc.programs.replay_publish import publish, render
-from lowfc.programs.replay_selection import Selection
+from lowfc.programs.replay.publish import publish, render
+from lowfc.programs.replay.selection import Selection
 
 
 @pytest.fixture(scope="module")

@@ -23,7 +23,7 @@ from lowfc.adapters.zenoh_bus import ZenohBus
 from lowfc.contract.configuration import load
 from lowfc.contract.errors import LowfcError
 from lowfc.contract.messages import Role
-from lowfc.programs.ctl import running
+from lowfc.programs.ctl.which_run import running
 from lowfc.programs.view.bridge import Bridge
 from lowfc.programs.view.command import view
 from lowfc.programs.view.layout import layout

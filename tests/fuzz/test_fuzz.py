@@ -19,6 +19,16 @@ def test_what_is_whole_is_read(every: list[Target]) -> None:
             target.read(data)
 
 
+@pytest.mark.parametrize(("card", "instead"), [(b"KIND    = '", b"KIND    = &"), (b"XTENSION=", b"XTENSAON=")])
+def test_a_header_that_was_damaged_is_refused(every: list[Target], card: bytes, instead: bytes) -> None:
+    for target in every:
+        for data in target.corpus if target.name in ("calibration file", "law file") else ():
+            damaged = data.replace(card, instead)
+            assert damaged != data
+            with pytest.raises(target.errors, match="not a whole"):
+                target.read(damaged)
+
+
 def test_an_input_is_made_from_its_number_alone(every: list[Target]) -> None:
     for target in every:
         assert target.input(5) == target.input(5)

@@ -29,6 +29,7 @@ class Reason(int, metaclass=_enum_type_wrapper.EnumTypeWrapper):
     REASON_SATURATED: _ClassVar[Reason]
     REASON_DARK: _ClassVar[Reason]
     REASON_NO_FRAME: _ClassVar[Reason]
+    REASON_STUCK: _ClassVar[Reason]
     REASON_MODAL_LIMIT: _ClassVar[Reason]
     REASON_STROKE: _ClassVar[Reason]
     REASON_SLEW: _ClassVar[Reason]
@@ -56,6 +57,7 @@ REASON_LATE: Reason
 REASON_SATURATED: Reason
 REASON_DARK: Reason
 REASON_NO_FRAME: Reason
+REASON_STUCK: Reason
 REASON_MODAL_LIMIT: Reason
 REASON_STROKE: Reason
 REASON_SLEW: Reason
@@ -182,7 +184,7 @@ class ReasonCount(_message.Message):
     def __init__(self, reason: _Optional[_Union[Reason, str]] = ..., count: _Optional[int] = ...) -> None: ...
 
 class ControllerSettings(_message.Message):
-    __slots__ = ("stroke_nm", "slew_nm", "neighbour_nm", "delay_frames", "start_mode", "late_ns", "hold_ns", "silence", "least_flux", "most_saturated", "gain", "leak", "limit_nm")
+    __slots__ = ("stroke_nm", "slew_nm", "neighbour_nm", "delay_frames", "start_mode", "late_ns", "hold_ns", "silence", "least_flux", "most_saturated", "gain", "leak", "limit_nm", "most_alike", "rate_hz")
     STROKE_NM_FIELD_NUMBER: _ClassVar[int]
     SLEW_NM_FIELD_NUMBER: _ClassVar[int]
     NEIGHBOUR_NM_FIELD_NUMBER: _ClassVar[int]
@@ -196,6 +198,8 @@ class ControllerSettings(_message.Message):
     GAIN_FIELD_NUMBER: _ClassVar[int]
     LEAK_FIELD_NUMBER: _ClassVar[int]
     LIMIT_NM_FIELD_NUMBER: _ClassVar[int]
+    MOST_ALIKE_FIELD_NUMBER: _ClassVar[int]
+    RATE_HZ_FIELD_NUMBER: _ClassVar[int]
     stroke_nm: float
     slew_nm: float
     neighbour_nm: float
@@ -209,7 +213,9 @@ class ControllerSettings(_message.Message):
     gain: _containers.RepeatedScalarFieldContainer[float]
     leak: _containers.RepeatedScalarFieldContainer[float]
     limit_nm: _containers.RepeatedScalarFieldContainer[float]
-    def __init__(self, stroke_nm: _Optional[float] = ..., slew_nm: _Optional[float] = ..., neighbour_nm: _Optional[float] = ..., delay_frames: _Optional[float] = ..., start_mode: _Optional[_Union[LoopMode, str]] = ..., late_ns: _Optional[int] = ..., hold_ns: _Optional[int] = ..., silence: _Optional[str] = ..., least_flux: _Optional[float] = ..., most_saturated: _Optional[int] = ..., gain: _Optional[_Iterable[float]] = ..., leak: _Optional[_Iterable[float]] = ..., limit_nm: _Optional[_Iterable[float]] = ...) -> None: ...
+    most_alike: int
+    rate_hz: float
+    def __init__(self, stroke_nm: _Optional[float] = ..., slew_nm: _Optional[float] = ..., neighbour_nm: _Optional[float] = ..., delay_frames: _Optional[float] = ..., start_mode: _Optional[_Union[LoopMode, str]] = ..., late_ns: _Optional[int] = ..., hold_ns: _Optional[int] = ..., silence: _Optional[str] = ..., least_flux: _Optional[float] = ..., most_saturated: _Optional[int] = ..., gain: _Optional[_Iterable[float]] = ..., leak: _Optional[_Iterable[float]] = ..., limit_nm: _Optional[_Iterable[float]] = ..., most_alike: _Optional[int] = ..., rate_hz: _Optional[float] = ...) -> None: ...
 
 class Channel(_message.Message):
     __slots__ = ("name", "actuators", "shifts", "reached")
@@ -264,7 +270,7 @@ class LinearLaw(_message.Message):
     def __init__(self, name: _Optional[str] = ..., signal: _Optional[str] = ..., noll: _Optional[_Iterable[int]] = ..., delay_frames: _Optional[float] = ..., rate_hz: _Optional[float] = ..., states: _Optional[int] = ..., follow: _Optional[bytes] = ..., gain: _Optional[bytes] = ..., kept: _Optional[bytes] = ..., coast: _Optional[bytes] = ..., output: _Optional[bytes] = ...) -> None: ...
 
 class ControllerState(_message.Message):
-    __slots__ = ("timestamp", "frame_sequence", "mode", "calibration_id", "gain", "leak", "limit_nm", "delay_frames", "command_history_nm", "actuators", "offset", "counts", "frames_used", "frame_timestamp", "refused", "refused_count", "limits_hit", "silent", "commanded", "taken", "settings", "offset_nm", "channels", "shift_history_nm", "law", "law_state", "law_frames", "play", "steps_left", "homing")
+    __slots__ = ("timestamp", "frame_sequence", "mode", "calibration_id", "gain", "leak", "limit_nm", "delay_frames", "command_history_nm", "actuators", "offset", "counts", "frames_used", "frame_timestamp", "refused", "refused_count", "limits_hit", "silent", "commanded", "taken", "settings", "offset_nm", "channels", "shift_history_nm", "law", "law_state", "law_frames", "play", "steps_left", "homing", "measured_nm", "flux_dn", "alike")
     TIMESTAMP_FIELD_NUMBER: _ClassVar[int]
     FRAME_SEQUENCE_FIELD_NUMBER: _ClassVar[int]
     MODE_FIELD_NUMBER: _ClassVar[int]
@@ -295,6 +301,9 @@ class ControllerState(_message.Message):
     PLAY_FIELD_NUMBER: _ClassVar[int]
     STEPS_LEFT_FIELD_NUMBER: _ClassVar[int]
     HOMING_FIELD_NUMBER: _ClassVar[int]
+    MEASURED_NM_FIELD_NUMBER: _ClassVar[int]
+    FLUX_DN_FIELD_NUMBER: _ClassVar[int]
+    ALIKE_FIELD_NUMBER: _ClassVar[int]
     timestamp: _timestamp_pb2.Timestamp
     frame_sequence: int
     mode: LoopMode
@@ -325,7 +334,10 @@ class ControllerState(_message.Message):
     play: Play
     steps_left: int
     homing: bool
-    def __init__(self, timestamp: _Optional[_Union[datetime.datetime, _timestamp_pb2.Timestamp, _Mapping]] = ..., frame_sequence: _Optional[int] = ..., mode: _Optional[_Union[LoopMode, str]] = ..., calibration_id: _Optional[str] = ..., gain: _Optional[_Iterable[float]] = ..., leak: _Optional[_Iterable[float]] = ..., limit_nm: _Optional[_Iterable[float]] = ..., delay_frames: _Optional[float] = ..., command_history_nm: _Optional[_Iterable[float]] = ..., actuators: _Optional[bytes] = ..., offset: _Optional[bytes] = ..., counts: _Optional[_Iterable[_Union[ReasonCount, _Mapping]]] = ..., frames_used: _Optional[int] = ..., frame_timestamp: _Optional[_Union[datetime.datetime, _timestamp_pb2.Timestamp, _Mapping]] = ..., refused: _Optional[_Union[Reason, str]] = ..., refused_count: _Optional[int] = ..., limits_hit: _Optional[_Iterable[_Union[Reason, str]]] = ..., silent: _Optional[bool] = ..., commanded: _Optional[bool] = ..., taken: _Optional[int] = ..., settings: _Optional[_Union[ControllerSettings, _Mapping]] = ..., offset_nm: _Optional[_Iterable[float]] = ..., channels: _Optional[_Iterable[_Union[Channel, _Mapping]]] = ..., shift_history_nm: _Optional[_Iterable[float]] = ..., law: _Optional[_Union[LinearLaw, _Mapping]] = ..., law_state: _Optional[_Iterable[float]] = ..., law_frames: _Optional[int] = ..., play: _Optional[_Union[Play, _Mapping]] = ..., steps_left: _Optional[int] = ..., homing: _Optional[bool] = ...) -> None: ...
+    measured_nm: _containers.RepeatedScalarFieldContainer[float]
+    flux_dn: float
+    alike: int
+    def __init__(self, timestamp: _Optional[_Union[datetime.datetime, _timestamp_pb2.Timestamp, _Mapping]] = ..., frame_sequence: _Optional[int] = ..., mode: _Optional[_Union[LoopMode, str]] = ..., calibration_id: _Optional[str] = ..., gain: _Optional[_Iterable[float]] = ..., leak: _Optional[_Iterable[float]] = ..., limit_nm: _Optional[_Iterable[float]] = ..., delay_frames: _Optional[float] = ..., command_history_nm: _Optional[_Iterable[float]] = ..., actuators: _Optional[bytes] = ..., offset: _Optional[bytes] = ..., counts: _Optional[_Iterable[_Union[ReasonCount, _Mapping]]] = ..., frames_used: _Optional[int] = ..., frame_timestamp: _Optional[_Union[datetime.datetime, _timestamp_pb2.Timestamp, _Mapping]] = ..., refused: _Optional[_Union[Reason, str]] = ..., refused_count: _Optional[int] = ..., limits_hit: _Optional[_Iterable[_Union[Reason, str]]] = ..., silent: _Optional[bool] = ..., commanded: _Optional[bool] = ..., taken: _Optional[int] = ..., settings: _Optional[_Union[ControllerSettings, _Mapping]] = ..., offset_nm: _Optional[_Iterable[float]] = ..., channels: _Optional[_Iterable[_Union[Channel, _Mapping]]] = ..., shift_history_nm: _Optional[_Iterable[float]] = ..., law: _Optional[_Union[LinearLaw, _Mapping]] = ..., law_state: _Optional[_Iterable[float]] = ..., law_frames: _Optional[int] = ..., play: _Optional[_Union[Play, _Mapping]] = ..., steps_left: _Optional[int] = ..., homing: _Optional[bool] = ..., measured_nm: _Optional[_Iterable[float]] = ..., flux_dn: _Optional[float] = ..., alike: _Optional[int] = ...) -> None: ...
 
 class Request(_message.Message):
     __slots__ = ("timestamp", "name", "modes", "values", "text", "accepted", "reply", "frame_sequence", "state", "taken", "actuators", "table", "columns", "law", "calibration")

@@ -43,7 +43,7 @@ def _report(log: Path, out: Path | None, as_json: bool) -> None:
 
     from lowfc.adapters.progress import passing_bar
     from lowfc.adapters.whole_file import require_folder, write_whole
-    from lowfc.programs.log_guard import refuse_log
+    from lowfc.programs.log.guard import refuse_log
     from lowfc.programs.report.figures import report_of
     from lowfc.programs.report.page import page
     from lowfc.programs.report.source import read_run

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from lowfc.programs.log_survey import recovery_in_words
+from lowfc.programs.log.survey import recovery_in_words
 from lowfc.programs.report import course
 from lowfc.programs.report.budget import budget_figures
 from lowfc.programs.report.closed_loop import (

@@ -21,6 +21,7 @@ _REFUSED: dict[Reason, tuple[str, str]] = {
     Reason.WRONG_SIZE: ("wrong size", "they are not what was calibrated; set the camera back or calibrate again"),
     Reason.LATE: ("too late", "host or link is too slow; look at the latency, lower the rate"),
     Reason.NO_CALIBRATION: ("no calibration", "load a calibration"),
+    Reason.STUCK: ("stuck", "the camera sends one image again and again; restart it"),
     Reason.REPEATED: ("repeated", "the camera sends a frame twice; restart it"),
     Reason.OUT_OF_ORDER: ("out of order", "there may be a second camera on the bus; stop one"),
 }

@@ -49,7 +49,7 @@ def view(
         return
     if logs and (seconds or run):
         raise ConfigurationError("--seconds and --run are for a running loop, not for logs")
-    from lowfc.programs.ctl import the_known_run
+    from lowfc.programs.ctl.which_run import the_known_run
     from lowfc.programs.view.look import look_at_logs, look_at_run
     from lowfc.programs.view.place import place
 
@@ -72,7 +72,7 @@ def view(
 def _serve_foxglove(run: str | None, port: int | None) -> None:
     from lowfc.adapters.clock import HostClock
     from lowfc.adapters.run import open_run
-    from lowfc.programs.ctl import the_known_run
+    from lowfc.programs.ctl.which_run import the_known_run
     from lowfc.programs.view.foxglove_bridge import DEFAULT_PORT, serve_foxglove
 
     summary = serve_foxglove(open_run(the_known_run(run), ()), HostClock(), DEFAULT_PORT if port is None else port)

@@ -1,0 +1,132 @@
+"""`lowfc acceptance capture-range`: from how large a wavefront the loop closes."""
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from lowfc.contract.configuration import Acceptance
+from lowfc.control.excitation import climb
+from lowfc.control.law import Law
+from lowfc.control.linearity import captured
+from lowfc.control.safety import LoopMode
+from lowfc.optics.zernike import mode_name
+from lowfc.programs.acceptance.live import Live
+from lowfc.programs.acceptance.played import AcceptanceError, Kind, Played, chosen
+
+KIND: Kind = "capture-range"
+SIZES = (0.5, 1.0, 1.5)
+"""Of a shape, beside the one from which the loop must close."""
+_TILTS = (2, 3)
+_HOLD = 2  # settling times for which a shape stays, and as long without it
+
+
+def play(live: Live, modes: Sequence[int], required: Acceptance) -> list[Played]:
+    """Put growing shapes of each mode on the mirror under the closed loop, until it does not take one away.
+
+    A shape comes as quickly as the mirror's slew allows, in a frame or two, and goes again. To the loop that is what it
+    finds when it is closed on it. After one that it did not take away it begins anew from zero.
+
+    Raises:
+        AcceptanceError: the loop was changed meanwhile, or does not close any more on what it was closed on before.
+    """
+    hold = _HOLD * live.loop.settling_frames()
+    found = []
+    for noll in chosen(modes, live.loop.noll):
+        place = live.loop.noll.index(noll)
+        if isinstance(live.loop.law, Law) and not live.loop.law.gain[place]:
+            continue  # nobody asks the loop for it
+        shape = live.calibration.modes_to_actuators[:, place][None]
+        step_nm = live.configuration.safety.slew_nm / 2 / float(np.abs(shape).max())
+        required_nm = _required_nm(required, noll)
+        for level_nm in np.outer(SIZES, (1.0, -1.0)).ravel() * required_nm:
+            stairs, starts = climb([0.0, level_nm], hold, step_nm)
+            begin, there = int(starts[0]), int(starts[1])
+            what = {
+                "noll": noll,
+                "level_nm": float(level_nm),
+                "before": [begin + hold // 2, begin + hold],
+                "after": [there + hold - hold // 4, there + hold],
+            }
+            trial = live.play(KIND, what, LoopMode.CLOSED, stairs.astype(np.float32)[:, None], shape)
+            found.append(trial)
+            if not closed(trial):
+                live.rest()
+                live.into(LoopMode.CLOSED)
+                break
+    return found
+
+
+def closed(trial: Played) -> bool:
+    """Whether the loop took the shape of a trial away.
+
+    Raises:
+        AcceptanceError: somebody opened the loop meanwhile, or frames are missing.
+    """
+    if trial.limits_hit:
+        return False
+    trial.check(LoopMode.CLOSED)
+    place = trial.loop.noll.index(trial.what["noll"])
+    before, after = (slice(*trial.what[name]) for name in ("before", "after"))
+    commands = trial.filled(trial.command_nm)
+    return captured(trial.filled(trial.error_nm), commands, place, trial.what["level_nm"], before, after)
+
+
+def figures(trials: Sequence[Played], required: Acceptance) -> dict[str, Any]:
+    """What `--json` prints.
+
+    Raises:
+        AcceptanceError: as `closed`; or there was no trial, for no mode has a gain.
+    """
+    if not trials:
+        raise AcceptanceError("no mode of the loop has a gain: there is nothing to capture")
+    modes = []
+    for noll in dict.fromkeys(trial.what["noll"] for trial in trials):
+        of = [trial for trial in trials if trial.what["noll"] == noll]
+        done = {trial.what["level_nm"]: closed(trial) for trial in of}
+        sizes = sorted({abs(level_nm) for level_nm in done})
+        lost = [abs(level_nm) for level_nm, good in done.items() if not good]
+        good = [size for size in sizes if {size, -size} <= set(done) and size < min([*lost, np.inf])]
+        required_nm = _required_nm(required, noll)
+        modes.append(
+            {
+                "noll": noll,
+                "name": mode_name(noll),
+                "required_nm": required_nm,
+                "captured_nm": max(good, default=0.0),
+                "lost_nm": min(lost, default=None),
+                "limits": sorted({name for trial in of for name in trial.limits_hit}),
+                "passed": max(good, default=0.0) >= required_nm * (1 - 1e-6),
+            }
+        )
+    return {"test": KIND, "passed": all(mode["passed"] for mode in modes), "trials": len(trials), "modes": modes}
+
+
+def render(found: dict[str, Any]) -> str:
+    """The figures for a person."""
+    lines = [f"{'nm rms of wavefront':<28}{'required':>10}{'closes from':>14}{'not from':>10}"]
+    for mode in found["modes"]:
+        lost = "-" if mode["lost_nm"] is None else f"{mode['lost_nm']:g}"
+        because = f"   ({', '.join(mode['limits'])})" if mode["limits"] else ""
+        lines.append(
+            f"{mode['noll']:>3} {mode['name']:<24}{mode['required_nm']:>10g}{mode['captured_nm']:>14g}{lost:>10}"
+            + because
+            + ("" if mode["passed"] else "   FAILED")
+        )
+    return "\n".join(lines)
+
+
+def draw(found: dict[str, Any], figure: Any) -> None:
+    """Bars of what each mode was captured from, beside what is required."""
+    ax = figure.subplots()
+    x = np.arange(len(found["modes"]))
+    colours = ["C0" if mode["passed"] else "C3" for mode in found["modes"]]
+    ax.bar(x, [mode["captured_nm"] for mode in found["modes"]], color=colours, label="closes from")
+    ax.plot(x, [mode["required_nm"] for mode in found["modes"]], "k_", markersize=14, label="required")
+    ax.set_xticks(x, [f"Z{mode['noll']}" for mode in found["modes"]])
+    ax.set_ylabel("nm rms of wavefront")
+    ax.legend()
+
+
+def _required_nm(required: Acceptance, noll: int) -> float:
+    return required.capture_tilt_nm if noll in _TILTS else required.capture_nm

@@ -1,0 +1,192 @@
+"""`lowfc calibrate align`: the computed calibration on the pixels of a real sensor."""
+
+from dataclasses import asdict, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+from rich.console import Console
+
+from lowfc.adapters import calibration_file, instrument
+from lowfc.adapters.terminal import configuration
+from lowfc.adapters.whole_file import require_folder
+from lowfc.client import Client
+from lowfc.contract.calibration_codec import identified
+from lowfc.contract.configuration import Configuration
+from lowfc.contract.errors import CalibrationError, ConfigurationError
+from lowfc.control import poke_plan
+from lowfc.control.alignment import Alignment, Geometry, align, onto
+from lowfc.control.calibration import Calibration, normalise_flux
+from lowfc.control.delay_fit import measure_delay
+from lowfc.control.regularised import reconstruct
+from lowfc.control.response_fit import normalised
+from lowfc.programs.analytic import analytic
+from lowfc.programs.calibrate.recording import Loop, play, watch
+from lowfc.programs.calibrate.run import AMPLITUDE_NM, DELAY_FRAMES, configuration_of
+from lowfc.programs.calibrate.tasks import Found, images
+
+Array = npt.NDArray[np.float64]
+
+
+def aligned(
+    file: Path | None,
+    out: Path,
+    run: str | None,
+    frames: int,
+    image: Path | None,
+    *,
+    half_turn: bool,
+    load: bool,
+) -> Found:
+    """Fit the geometry, resample the computed calibration, write it.
+
+    Raises:
+        CalibrationError: the image is not like the computed one, or pokes are not seen.
+        ConfigurationError: an option is of no meaning with the others.
+        DataFileError: a file cannot be read or written.
+    """
+    if image is None and file is not None:
+        raise ConfigurationError("--config goes with --file: a running loop is aligned by its own configuration")
+    if image is not None and load:
+        raise ConfigurationError(
+            "--load goes with the frames of a running loop: after --file, load what it wrote with `lowfc ctl load`"
+        )
+    require_folder(out)
+    if image is not None:
+        config = configuration(file)
+        picture, told = images(image).mean(axis=0), False
+        computed = _computed(config)
+        found = _fit(computed, picture, half_turn)
+        made = on_sensor(config, computed, found.geometry, found.flux, picture.shape, None)
+        calibration_file.save(made, out)
+    else:
+        with Client(run) as loop:
+            config, before = configuration_of(loop), loop.calibration()
+            dark = before.dark.reshape(before.shape).astype(np.float64)
+            pixels = watch(loop, frames)
+            computed = _computed(config)
+            found = _fit(computed, pixels.mean(axis=0) - dark, half_turn)
+            made = on_sensor(config, computed, found.geometry, found.flux, before.shape, before)
+            told = True
+            if _reversed(loop, made):
+                found = replace(found, geometry=found.geometry.turned())
+                made = on_sensor(config, computed, found.geometry, found.flux, before.shape, before)
+            calibration_file.save(made, out)
+            if load:
+                loop.load(made)
+    scale = found.geometry.scale * computed_scale(config)
+    return _figures(found, out, scale, told), _text(found, out, scale, told)
+
+
+def on_sensor(
+    config: Configuration,
+    computed: Calibration,
+    geometry: Geometry,
+    flux: float,
+    shape: tuple[int, ...],
+    before: Calibration | None,
+) -> Calibration:
+    """A computed calibration on real pixels (rows, columns); dark and mask are those of `before`.
+
+    Raises:
+        CalibrationError: too little of the image falls on the sensor.
+    """
+    rows, columns = shape
+    own = (*computed.shape, -1)
+    I0 = onto(computed.reference.astype(np.float64).reshape(computed.shape), geometry, (rows, columns)).reshape(-1)
+    H = onto(computed.response.astype(np.float64).reshape(own), geometry, (rows, columns)).reshape(rows * columns, -1)
+    good = np.ones(I0.size) if before is None else before.good.astype(np.float64)
+    dark = np.zeros(I0.size, np.float32) if before is None else before.dark
+    camera = instrument.detector(config)
+    try:
+        I0, H = normalise_flux(np.maximum(I0, 0), H, good)
+        made = reconstruct(
+            I0,
+            H,
+            None,
+            good,
+            flux * camera.gain_e_per_dn / camera.em_gain,
+            instrument.equivalent_read_noise_e(camera),
+            config.control.estimator,
+        )
+    except ValueError as error:
+        raise CalibrationError(f"too little of the image falls on the sensor: {error}") from None
+
+    def single(array: Array) -> npt.NDArray[np.float32]:
+        return np.ascontiguousarray(array, dtype=np.float32)
+
+    return identified(
+        replace(
+            computed,
+            reference=single(I0),
+            response=single(H),
+            reconstructor=single(made.matrix),
+            good=single(good),
+            dark=dark,
+            shape=(rows, columns),
+            flux_dn=flux,
+            estimator=f"{config.control.estimator}+aligned",
+            operator_hash="",
+        )
+    )
+
+
+def computed_scale(config: Configuration) -> float:
+    """Pixels per lambda/D of the computed image; per pupil diameter where the sensor sees the pupil."""
+    optics = instrument.sensor(config, lambda _: None)
+    return 1 / (optics.pitch * optics.binning)
+
+
+def _computed(config: Configuration) -> Calibration:
+    return analytic(config, Console(stderr=True))
+
+
+def _fit(computed: Calibration, image: Array, half_turn: bool) -> Alignment:
+    try:
+        found = align(image, computed.reference.astype(np.float64).reshape(computed.shape))
+    except ValueError as error:
+        raise CalibrationError(str(error)) from None
+    return replace(found, geometry=found.geometry.turned()) if half_turn else found
+
+
+def _reversed(loop: Loop, made: Calibration) -> bool:
+    """Whether a poke is seen with the sign opposite to that of a calibration."""
+    mode = int(np.argmax(np.linalg.norm(made.response, axis=0)))
+    plan = poke_plan.dither(1, AMPLITUDE_NM["poke"], DELAY_FRAMES, 1, 1)
+    recording = play(loop, made.modes_to_actuators.T[mode : mode + 1], plan.table)
+    try:
+        fractions, _ = normalised(recording.pixels, made.dark.astype(np.float64), made.good.astype(np.float64))
+        seen = measure_delay(fractions[:DELAY_FRAMES], made.reference.astype(np.float64), plan.table[:, 0])
+    except ValueError as error:
+        raise CalibrationError(str(error)) from None
+    return bool(seen.picture @ made.response[:, mode] < 0)
+
+
+def _figures(found: Alignment, out: Path, scale: float, told: bool) -> dict[str, Any]:
+    return {
+        **asdict(found.geometry),
+        "pixels_per_lambda_d": scale,
+        "flux_dn": found.flux,
+        "background_dn": found.background,
+        "residual": found.residual,
+        "other_parity_residual": found.other_parity,
+        "half_turn_known": told,
+        "file": str(out),
+    }
+
+
+def _text(found: Alignment, out: Path, scale: float, told: bool) -> str:
+    geometry = found.geometry
+    return (
+        f"{scale:.4f} pixels per lambda/D, centre at row {geometry.row:.2f}, column "
+        f"{geometry.column:.2f}, rotation {geometry.rotation_deg:.2f} degrees, "
+        f"{'reflected' if geometry.parity < 0 else 'not reflected'}; {found.residual:.1%} of the image is left "
+        f"({found.other_parity:.1%} with the other parity)\n"
+        + (
+            "pokes are seen with the right sign"
+            if told
+            else "whether it is half a turn more only a poke can tell: --half-turn is the other one"
+        )
+        + f"\nwritten: {out}"
+    )

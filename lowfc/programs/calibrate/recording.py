@@ -1,0 +1,209 @@
+"""What is played on the mirror of a running loop, and the frames and steps that come of it."""
+
+import contextlib
+from collections.abc import Iterator
+from typing import NamedTuple, Protocol
+
+import numpy as np
+import numpy.typing as npt
+
+from lowfc.contract.errors import BusError, CalibrationError, LowfcError
+from lowfc.control.inputs import Step
+from lowfc.control.poke_plan import Plan, seen, usable
+from lowfc.control.safety import LoopMode, Reason
+from lowfc.control.stability import delay_weights
+
+Array = npt.NDArray[np.float64]
+
+AFTERWARDS = 8
+"""Frames recorded after the last of a play: the longest delay that can be measured is over by then."""
+_LIMITS = frozenset(reason for reason in Reason if reason >= Reason.MODAL_LIMIT)
+
+
+class Answered(Protocol):
+    """An answer to a request."""
+
+    @property
+    def frame_sequence(self) -> int:
+        """Of the first frame for which it is in force."""
+        ...
+
+
+class Image(Protocol):
+    """A sensor image."""
+
+    @property
+    def sequence(self) -> int:
+        """Its number."""
+        ...
+
+    @property
+    def pixels(self) -> npt.NDArray[np.uint16]:
+        """(rows, columns), DN."""
+        ...
+
+
+class Loop(Protocol):
+    """What of `lowfc.client.Client` is needed to play and to look."""
+
+    def play(self, basis_nm: npt.ArrayLike, table: npt.ArrayLike) -> Answered:
+        """Add shapes to the mirror frame by frame."""
+        ...
+
+    def stop(self) -> Answered:
+        """End what is being played."""
+        ...
+
+    def frames(self, count: int | None = None) -> Iterator[Image]:
+        """Sensor images from now on."""
+        ...
+
+    def steps(self, count: int | None = None) -> Iterator[Step]:
+        """Steps of the control law from now on."""
+        ...
+
+
+class Recording(NamedTuple):
+    """Frames of a play, counted from the first whose command had a row.
+
+    Attributes:
+        sequence: (frames,) rising; frames that were lost are not there.
+        pixels: (frames, pixels) uint16, DN.
+        steps: (steps,) sequences of the controller's steps, which may be more.
+        commanded: (steps,) whether the frame was used and a command made of it.
+        command_nm: (steps, modes) the loop's own modal command.
+    """
+
+    sequence: npt.NDArray[np.int64]
+    pixels: npt.NDArray[np.uint16]
+    steps: npt.NDArray[np.int64]
+    commanded: npt.NDArray[np.bool_]
+    command_nm: Array
+
+    def played(self, table: Array, delay_frames: float) -> Array:
+        """(frames, columns): what of a table each exposure saw."""
+        weights = np.concatenate([[0.0], delay_weights(max(delay_frames, 1.0))])
+        return seen(table, weights, self.steps, self.commanded)[self._steps_of_frames]
+
+    def commands(self, delay_frames: float) -> Array:
+        """(frames, modes): what of the loop's own command each exposure saw."""
+        weights = np.concatenate([[0.0], delay_weights(max(delay_frames, 1.0))])
+        places = np.arange(self.steps[-1] + 1)
+        newest = np.searchsorted(self.steps, places, side="right") - 1  # where a step is missing, the one before held
+        return seen(self.command_nm[newest], weights, self.steps, np.ones(len(self.steps), np.bool_))[
+            self._steps_of_frames
+        ]
+
+    def usable(self, plan: Plan, delay_frames: float) -> npt.NDArray[np.bool_]:
+        """(frames,) whether each frame may be used."""
+        return usable(plan, self.steps, self.commanded, int(max(delay_frames, 1.0)))[self._steps_of_frames]
+
+    @property
+    def whole(self) -> bool:
+        """Whether no frame was lost or refused."""
+        return bool(self.commanded.all()) and len(self.sequence) == len(self.steps) == self.steps[-1] + 1
+
+    @property
+    def _steps_of_frames(self) -> npt.NDArray[np.intp]:
+        return np.searchsorted(self.steps, self.sequence)
+
+
+def play(loop: Loop, basis_nm: npt.NDArray[np.floating], table: npt.NDArray[np.floating]) -> Recording:
+    """Play a table on the mirror and record until its last row has been seen.
+
+    Args:
+        loop: A connection to the controller.
+        basis_nm: (shapes, actuators) nm of surface.
+        table: (frames, shapes).
+
+    Raises:
+        CalibrationError: the loop ended the play, or too little of it came through.
+        BusError: frames or steps stopped.
+        RequestRefusedError: the controller would not play it.
+    """
+    with _streams(loop) as (frames, steps):
+        first = loop.play(basis_nm.astype(np.float32), table.astype(np.float32)).frame_sequence
+        end = first + len(table) + AFTERWARDS
+        images: list[Image] = []
+        made: list[Step] = []
+        try:
+            image, step = next(frames), next(steps)
+            mode = None
+            while image.sequence < end or step.frame_sequence < end:
+                if image.sequence <= step.frame_sequence:
+                    if first <= image.sequence:
+                        images.append(image)
+                    image = next(frames)
+                else:
+                    if first <= step.frame_sequence:
+                        mode = _check(step, mode, over=step.frame_sequence >= first + len(table))
+                        made.append(step)
+                    step = next(steps)
+        except StopIteration:
+            raise BusError("the frames came to an end: is the camera still running?") from None
+    return _recording(images, made, first)
+
+
+def watch(loop: Loop, count: int) -> npt.NDArray[np.uint16]:
+    """The next `count` frames (count, rows, columns), DN.
+
+    Raises:
+        BusError: they stopped.
+    """
+    stream = loop.frames(count)
+    taken = [np.asarray(image.pixels) for image in stream]
+    if len(taken) < count:
+        raise BusError(f"the frames came to an end after {len(taken)} of {count}: is the camera still running?")
+    return np.array(taken)
+
+
+@contextlib.contextmanager
+def _streams(loop: Loop) -> Iterator[tuple[Iterator[Image], Iterator[Step]]]:
+    """Frames and steps from now on; where anything goes wrong, nothing is played any more."""
+    frames, steps = loop.frames(), loop.steps()
+    done = False
+    try:
+        yield frames, steps
+        done = True
+    finally:
+        for stream in (frames, steps):
+            close = getattr(stream, "close", None)
+            if close is not None:
+                close()
+        if not done:
+            with contextlib.suppress(LowfcError):  # what went wrong first is what is told
+                loop.stop()
+
+
+def _check(step: Step, before: LoopMode | None, *, over: bool) -> LoopMode:
+    """The mode of a step; raise where the play has been ended."""
+    if not over and before is not None and step.mode is not before:
+        raise CalibrationError(
+            f"the loop went from {before.name.lower()} to {step.mode.name.lower()} while pokes were played, which "
+            "ended them; leave it alone during a calibration"
+        )
+    limits = [reason.name for reason in step.reasons if reason in _LIMITS and reason is not Reason.MODAL_LIMIT]
+    if limits and not over:
+        raise CalibrationError(
+            f"a limit of the mirror acted on the pokes ({', '.join(limits)}), which ended them: take a smaller "
+            "--amplitude, or bring the mirror nearer to flat"
+        )
+    return step.mode
+
+
+def _recording(images: list[Image], made: list[Step], first: int) -> Recording:
+    known = {step.frame_sequence for step in made}
+    images = [image for image in images if image.sequence in known]
+    if not images:
+        raise CalibrationError("no frame of the play was received: is the loop's camera running?")
+    modes = max(step.command_nm.size for step in made)
+    command = np.zeros((len(made), modes))
+    for row, step in enumerate(made):
+        command[row] = step.command_nm if step.command_nm.size == modes else command[max(row - 1, 0)]
+    return Recording(
+        np.array([image.sequence - first for image in images]),
+        np.array([image.pixels for image in images]).reshape(len(images), -1),
+        np.array([step.frame_sequence - first for step in made]),
+        np.array([step.error_nm is not None for step in made]),
+        command,
+    )

@@ -1,0 +1,1 @@
+"""`lowfc ctl`: what operators ask of a running loop."""

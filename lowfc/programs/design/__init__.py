@@ -1,0 +1,1 @@
+"""`lowfc design`: masks for a pupil."""

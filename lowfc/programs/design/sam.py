@@ -1,0 +1,300 @@
+"""The search for a sparse aperture mask: chains on all cores or on a Dask cluster, kept safe from interruption."""
+
+import hashlib
+import shlex
+import time
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import FIRST_COMPLETED, Executor, Future, wait
+from contextlib import contextmanager
+from functools import cache, lru_cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from rich.console import Console
+from rich.progress import BarColumn, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+from threadpoolctl import threadpool_limits
+
+from lowfc.adapters.drawing import figure_class
+from lowfc.adapters.masks import load_pupil
+from lowfc.adapters.progress import passing_bar
+from lowfc.contract.errors import ConfigurationError, LowfcError
+from lowfc.design.paper import TABLE4_MODES
+from lowfc.design.sam_goal import figures
+from lowfc.design.sam_merit import FOCAL_MASKS, Hole, Optics, Single, build_optics, hole_fields
+from lowfc.design.sam_search import BLOCK, Chain, advance, holes, start
+from lowfc.optics.sam import Layout
+from lowfc.programs.design.sam_executors import is_lost
+from lowfc.programs.design.sam_files import (
+    Point,
+    front,
+    read_state,
+    write_front,
+    write_layouts,
+    write_plot,
+    write_state,
+)
+from lowfc.programs.design.sam_request import Search, command_of, goal_of
+
+STATE_PERIOD_S = 10.0
+
+
+def begin(search: Search) -> list[Chain]:
+    """The chains of a new search, at random layouts.
+
+    Raises:
+        ConfigurationError: The holes cannot be placed.
+    """
+    try:
+        return [start(search.bounds, search.seed, i, search.steps) for i in range(search.chains)]
+    except ValueError as error:
+        raise ConfigurationError(str(error)) from error
+
+
+def resumed(state: Path) -> tuple[Search, list[Chain]]:
+    """The search and the chains of a state file."""
+    return read_state(state, pupil_digest())
+
+
+def design_sam(
+    search: Search,
+    chains: list[Chain],
+    out: Path,
+    state: Path,
+    executor: Executor,
+    front_file: Path | None = None,
+    plot_file: Path | None = None,
+    console: Console | None = None,
+) -> dict[str, Any]:
+    """Search, write the best layout or the front, and say what they would show; Ctrl-C writes the best so far.
+
+    Args:
+        search: What to look for.
+        chains: Where each chain stands; brought forward in place.
+        out: Layout file.
+        state: File to resume from, written now and then and removed at the end.
+        executor: Where the chains run.
+        front_file: Table of every chain's best (CSV).
+        plot_file: The same drawn (PNG).
+        console: Where progress is shown.
+
+    Raises:
+        DataFileError: A file cannot be written.
+        ConfigurationError: A package for the plot is missing, or a worker has another shaped pupil.
+        LowfcError: The workers are lost; the state file stays if any chain had finished a block.
+        KeyboardInterrupt: Ctrl-C, before any chain had finished a block.
+    """
+    console = Console(stderr=True) if console is None else console
+    _one_thread()
+    if plot_file is not None:
+        figure_class()  # missing, it must be found before the work, not after
+    pupil = pupil_digest()
+    write_state(state, search, pupil, chains)  # and so must a folder that cannot be written
+    interrupted = False
+    with _progress(search, chains, console) as show:
+        saved_s = time.monotonic()
+
+        def on_block() -> None:
+            nonlocal saved_s
+            show()
+            if time.monotonic() - saved_s > STATE_PERIOD_S:
+                write_state(state, search, pupil, chains)
+                saved_s = time.monotonic()
+
+        try:
+            run_chains(search, chains, executor, on_block)
+        except KeyboardInterrupt:
+            interrupted = True
+            if not _keep(state, search, pupil, chains):
+                console.print(_NOTHING, highlight=False)
+                raise
+        except Exception as error:
+            kept = _keep(state, search, pupil, chains)
+            if not is_lost(error):
+                raise
+            go_on = f"go on with --resume {state}" if kept else _NOTHING
+            raise LowfcError(f"the workers were lost ({error!r}); {go_on}") from error
+    points = [point_of(search, chain) for chain in chains if chain.step]
+    best = front(points) if search.sweeps else [min(points, key=lambda point: point.merit)]
+    write_layouts(out, best, search, command_of(search))
+    if front_file is not None:
+        write_front(front_file, points)
+    if plot_file is not None:
+        write_plot(plot_file, points, search)
+    if not interrupted:
+        state.unlink()
+    return {
+        "command": command_of(search),
+        "file": str(out),
+        "merit": search.goal.merit,
+        "seed": search.seed,
+        "steps": sum(chain.step for chain in chains),
+        "interrupted": interrupted,
+        "resume": str(state) if interrupted else None,
+        "merits": [chain.best_merit for chain in chains if chain.step],
+        "layouts": [summary(point) for point in best],
+    }
+
+
+def _keep(state: Path, search: Search, pupil: str, chains: list[Chain]) -> bool:
+    """Write the state if any chain has come forward, else remove it; say which."""
+    if not any(chain.step for chain in chains):
+        state.unlink()
+        return False
+    write_state(state, search, pupil, chains)
+    return True
+
+
+_NOTHING = f"no chain had finished its first {BLOCK} steps: nothing was found, nothing is written"
+
+
+def run_chains(search: Search, chains: list[Chain], executor: Executor, on_block: Callable[[], None]) -> None:
+    """Bring every chain to its end, in place, block by block.
+
+    Args:
+        search: What to look for.
+        chains: Where each stands.
+        executor: Where the blocks run.
+        on_block: Called after each.
+    """
+    running: dict[Future[Chain], int] = {}
+    pupil = pupil_digest()
+    try:
+        for i, chain in enumerate(chains):
+            if chain.step < chain.steps:
+                running[executor.submit(advance_block, search, chain, pupil)] = i
+        while running:
+            done, _ = wait(running, return_when=FIRST_COMPLETED)
+            for future in done:
+                i = running.pop(future)
+                chains[i] = future.result()
+                if chains[i].step < chains[i].steps:
+                    running[executor.submit(advance_block, search, chains[i], pupil)] = i
+            on_block()
+    finally:
+        for future in running:
+            future.cancel()
+
+
+def advance_block(search: Search, chain: Chain, pupil: str) -> Chain:
+    """One block of one chain, on whatever machine this runs.
+
+    Args:
+        search: What to look for.
+        chain: Where it stands.
+        pupil: Digest of the shaped pupil that the search is for.
+
+    Raises:
+        ConfigurationError: This machine has another shaped pupil.
+    """
+    if pupil != pupil_digest():
+        raise ConfigurationError("a worker has another shaped pupil: install the same lowfc on all machines")
+    _one_thread()
+    return advance(_optics(search.focal_masks), goal_of(search, chain.index), search.bounds, chain)
+
+
+def point_of(search: Search, chain: Chain) -> Point:
+    """The best layout of a chain."""
+    found = holes(chain.best, search.bounds.symmetry)
+    name = f"{search.name}_{chain.index}" if search.sweeps else search.name
+    goal = goal_of(search, chain.index)
+    weight = "" if goal.weight is None else f" with weight {goal.weight:g}"
+    masks = " and ".join(search.focal_masks)
+    purpose = f"{_described(found)}: merit {goal.merit}{weight}, focal-plane mask {masks}"
+    shown = _figures(search.focal_masks[0], found)
+    return Point(
+        Layout(name, purpose, found),
+        chain.best_merit,
+        shown["table3_waves"][goal.estimator][str(goal.modes)],
+        max(shown["table4_mas"][goal.estimator][str(TABLE4_MODES)]),
+        shown["throughput"],
+    )
+
+
+def summary(point: Point) -> dict[str, Any]:
+    """What is said of a layout."""
+    return {
+        "name": point.layout.name,
+        "purpose": point.layout.purpose,
+        "merit": point.merit,
+        "holes": len(point.layout.holes),
+        "focal_masks": layout_figures(point.layout),
+    }
+
+
+def layout_figures(layout: Layout) -> dict[str, Any]:
+    """What Tables 3 and 4 would show of a layout, for each focal-plane mask."""
+    return {name: _figures(name, layout.holes) for name in FOCAL_MASKS}
+
+
+def render(result: dict[str, Any]) -> str:
+    """The result of `design_sam` as text."""
+    lines = []
+    for layout in result["layouts"]:
+        lines.append(f"{layout['name']}: {layout['purpose']}, {result['merit']} {layout['merit']:.4g}")
+        for name, shown in layout["focal_masks"].items():
+            condition = "  ".join(f"{value:.0f} ({modes} modes)" for modes, value in shown["condition"].items())
+            lines.append(f"  {name}: throughput {shown['throughput']:.2%}, condition number {condition}")
+            for estimator, row in shown["table3_waves"].items():
+                lines.append(f"    Table 3  {estimator:<9} n<=4 {row['14']:.2e}  n<=5 {row['20']:.2e} waves rms")
+            for estimator, tilts in shown["table4_mas"].items():
+                fits = "  ".join(f"{modes} modes x {x:.3f} y {y:.3f}" for modes, (x, y) in tilts.items())
+                lines.append(f"    Table 4  {estimator:<9} {fits} mas")
+    lines.append(
+        "predicted; the weighted estimator attains the Cramer-Rao bound of Table 4, 'bound' is that of Table 3"
+    )
+    lines.append(f"written to {result['file']}; found again by: {result['command']}")
+    if result["interrupted"]:
+        go_on = shlex.join(["lowfc", "design", "sam", "--resume", result["resume"], "--out", result["file"]])
+        lines.append(f"interrupted after {result['steps']} steps; go on with: {go_on}")
+    return "\n".join(lines)
+
+
+@cache
+def _one_thread() -> None:
+    """From now on one thread in this process, so that every run adds up alike; others may be at work, so for good."""
+    threadpool_limits(1)
+
+
+@lru_cache(maxsize=1)
+def pupil_digest() -> str:
+    """Identity of the shaped pupil, on which every result depends."""
+    return hashlib.sha256(load_pupil(_PUPIL_SAMPLES).tobytes()).hexdigest()
+
+
+_PUPIL_SAMPLES = 256
+"""One for each cell of the shipped shaped pupil; a mask's figures are those of 512 samples to 1e-3."""
+
+
+@lru_cache(maxsize=4)
+def _optics(focal_masks: tuple[str, ...], band_modes: int = 2) -> Optics:
+    return build_optics(load_pupil(_PUPIL_SAMPLES), focal_masks, band_modes)
+
+
+@lru_cache(maxsize=64)
+def _figures(focal_mask: str, holes_: tuple[Hole, ...]) -> dict[str, Any]:
+    optics = _optics((focal_mask,), band_modes=14)
+    fields: Single = np.sum([hole_fields(optics, hole) for hole in holes_], axis=0)
+    return figures(optics, fields)
+
+
+def _described(found: Sequence[Hole]) -> str:
+    low, high = min(hole[2] for hole in found), max(hole[2] for hole in found)
+    size = f"{low:.1%}" if low == high else f"{low:.1%} to {high:.1%}"
+    return f"{len(found)} holes of {size.replace('.0%', '%')}"
+
+
+@contextmanager
+def _progress(search: Search, chains: list[Chain], console: Console) -> Iterator[Callable[[], None]]:
+    """A progress bar with the best merit so far."""
+    columns = (TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn(), TimeRemainingColumn())
+    with passing_bar(console, *columns) as bar:
+        task = bar.add_task(search.goal.merit, total=search.chains * search.steps)
+
+        def show() -> None:
+            best = min(chain.best_merit for chain in chains)
+            done = sum(chain.step for chain in chains)
+            bar.update(task, completed=done, description=f"{search.goal.merit} {best:.4g}")
+
+        show()
+        yield show

@@ -1,0 +1,172 @@
+"""The files of a search for a sparse aperture mask: layouts, the state to resume from, and the front."""
+
+import csv
+import io
+import json
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+from lowfc.adapters.drawing import figure_class, png
+from lowfc.adapters.layouts import parse_layout
+from lowfc.adapters.whole_file import require_folder, write_whole
+from lowfc.contract.errors import ConfigurationError, DataFileError
+from lowfc.design.paper import TABLE3_WAVES, TABLE4_MAS
+from lowfc.design.sam_goal import Goal
+from lowfc.design.sam_search import Bounds, Chain
+from lowfc.optics.sam import Layout
+from lowfc.programs.design.sam_request import Search
+
+UNITS = "pupil diameters, origin at the pupil centre, x to the right (columns), y up the row index"
+
+
+@dataclass(frozen=True)
+class Point:
+    """A layout and where it lies between Table 3 and Table 4."""
+
+    layout: Layout
+    merit: float
+    table3_waves: float
+    table4_mas: float
+    throughput: float
+
+
+def check_files(out: Path, resume: Path | None, *others: Path | None) -> Path:
+    """Say before the search what would go wrong after it.
+
+    Args:
+        out: Layout file.
+        resume: State file to go on from.
+        others: More files to be written.
+
+    Returns:
+        The state file.
+
+    Raises:
+        ConfigurationError: The layout file is not called .json, two files are the same one, or an interrupted search
+            would be overwritten.
+        DataFileError: A directory is missing.
+    """
+    if out.suffix != ".json":
+        raise ConfigurationError(f"--out must end in .json, as only that is read as a layout file; got {out}")
+    state = resume if resume is not None else out.with_name(f"{out.name}.state.json")
+    files = [file for file in (out, state, *others) if file is not None]
+    require_folder(*files)
+    if len({file.resolve() for file in files}) < len(files):
+        raise ConfigurationError(f"these must be different files: {', '.join(map(str, files))}")
+    if resume is None and state.exists():
+        raise ConfigurationError(f"{state} holds an interrupted search: go on with --resume {state}, or delete it")
+    return state
+
+
+def write_state(path: Path, search: Search, pupil: str, chains: Sequence[Chain]) -> None:
+    """Write all that a search needs to go on.
+
+    Args:
+        path: The file.
+        search: What is searched for.
+        pupil: Digest of the shaped pupil.
+        chains: Where each stands.
+    """
+    state = {"search": asdict(search), "pupil": pupil, "chains": [asdict(chain) for chain in chains]}
+    write_whole(path, json.dumps(state).encode())
+
+
+def read_state(path: Path, pupil: str) -> tuple[Search, list[Chain]]:
+    """The search and its chains that `write_state` wrote.
+
+    Raises:
+        DataFileError: The file is missing, damaged, or of a search with another shaped pupil.
+    """
+    try:
+        state = json.loads(path.read_text(encoding="utf-8"))
+        kept = state["search"]
+        search = Search(
+            goal=Goal(**kept["goal"]),
+            focal_masks=tuple(kept["focal_masks"]),
+            bounds=Bounds(**{key: _as_tuple(value) for key, value in kept["bounds"].items()}),
+            **{key: kept[key] for key in ("seed", "chains", "steps", "name")},
+        )
+        chains = [Chain(**{key: _as_tuple(value) for key, value in chain.items()}) for chain in state["chains"]]
+        made_for = state["pupil"]
+    except FileNotFoundError:
+        raise DataFileError(f"there is no search to resume in {path}") from None
+    except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
+        raise DataFileError(f"{path} is not the state of a search: {type(error).__name__}: {error}") from error
+    if made_for != pupil:
+        raise DataFileError(f"{path} belongs to a search with another shaped pupil; start again without --resume")
+    return search, chains
+
+
+def write_layouts(path: Path, points: Sequence[Point], search: Search, command: str) -> None:
+    """Write layouts as the loop reads them, each with how it was found.
+
+    Raises:
+        DataFileError: The file cannot be written, or the loop would refuse it.
+    """
+    entries = {point.layout.name: _entry(point, search, command) for point in points}
+    content = json.dumps({"units": UNITS, "layouts": entries}, indent=1) + "\n"
+    for name, entry in json.loads(content)["layouts"].items():
+        parse_layout(path, name, entry)
+    write_whole(path, content.encode())
+
+
+def write_front(path: Path, points: Sequence[Point]) -> None:
+    """Write a table of the points (CSV), those that no other beats in both Tables marked."""
+    text = io.StringIO()
+    table = csv.writer(text, lineterminator="\n")
+    table.writerow(["layout", "holes", "table3_waves", "table4_mas", "throughput", "merit", "on_front"])
+    on_front = front(points)
+    for point in sorted(points, key=lambda point: point.table3_waves):
+        values = (point.table3_waves, point.table4_mas, point.throughput, point.merit)
+        table.writerow([point.layout.name, len(point.layout.holes), *values, int(point in on_front)])
+    write_whole(path, text.getvalue().encode())
+
+
+def write_plot(path: Path, points: Sequence[Point], search: Search) -> None:
+    """Draw the points and the paper's (PNG)."""
+    figure = figure_class()(figsize=(6.4, 4.8), layout="constrained")
+    axes = figure.subplots()
+    on_front = sorted(front(points), key=lambda point: point.table3_waves)
+    axes.plot([p.table3_waves for p in points], [p.table4_mas for p in points], ".", color="0.6", label="searched")
+    axes.plot([p.table3_waves for p in on_front], [p.table4_mas for p in on_front], "o-", label="front")
+    paper = TABLE3_WAVES[search.focal_masks[0]][search.goal.modes][0]
+    axes.plot([paper], [TABLE4_MAS["sam"][1]], "k*", markersize=12, label="paper")
+    axes.set(xscale="log", yscale="log", xlabel="Table 3: residual (waves rms)", ylabel="Table 4: tilt (mas)")
+    axes.set_title(f"{search.goal.modes} modes, {search.focal_masks[0]}, {search.goal.estimator}")
+    axes.legend()
+    write_whole(path, png(figure, 150))
+
+
+def front(points: Sequence[Point]) -> list[Point]:
+    """The points that no other one equals or beats in both Tables at once."""
+    return [
+        point
+        for point in points
+        if not any(
+            other.table3_waves <= point.table3_waves
+            and other.table4_mas <= point.table4_mas
+            and (other.table3_waves, other.table4_mas) != (point.table3_waves, point.table4_mas)
+            for other in points
+        )
+    ]
+
+
+def _as_tuple(value: Any) -> Any:
+    """What JSON made a list of, at any depth."""
+    return tuple(map(_as_tuple, value)) if isinstance(value, list) else value
+
+
+def _entry(point: Point, search: Search, command: str) -> dict[str, Any]:
+    layout = point.layout
+    diameters = sorted({hole[2] for hole in layout.holes})
+    entry: dict[str, Any] = {
+        "purpose": layout.purpose,
+        "merit": search.goal.merit,
+        "seed": search.seed,
+        "command": command,
+    }
+    if len(diameters) == 1:
+        return {**entry, "hole_diameter": diameters[0], "holes": [hole[:2] for hole in layout.holes]}
+    return {**entry, "holes": list(layout.holes)}

@@ -1,0 +1,1 @@
+"""`lowfc doctor`: is this host fit for a real-time loop?"""

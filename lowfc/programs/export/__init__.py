@@ -1,0 +1,1 @@
+"""`lowfc export`: a log for the tools of the field."""

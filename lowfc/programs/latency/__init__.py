@@ -1,0 +1,1 @@
+"""`lowfc latency`: how long a frame takes to become a command."""

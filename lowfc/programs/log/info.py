@@ -1,0 +1,101 @@
+"""The command `lowfc info`: what a log holds, whether it is whole, and what is missing from it."""
+
+import json
+import sys
+from collections.abc import Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from lowfc.adapters.terminal import one_log
+
+if TYPE_CHECKING:
+    from rich.console import Console
+
+_WIDTH = 120  # of the report, where there is no terminal
+_STATES = {
+    "complete": "complete",
+    "truncated": "truncated: its recorder died or still writes it; `lowfc recover` makes it complete",
+    "damaged": "damaged; `lowfc recover` saves what is whole",
+}
+
+
+def info(
+    logs: Annotated[list[Path], typer.Argument(help="Logs (MCAP), finished or not.", metavar="LOG...", readable=False)],
+    as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object on standard output.")] = False,
+) -> None:
+    """Say what ran, when, what was recorded of each topic, and what is missing or damaged.
+
+    Example: lowfc info logs/20270101T220000Z.mcap
+    """
+    from rich.console import Console
+
+    from lowfc.adapters.progress import reading_bar
+    from lowfc.programs.log.survey import survey
+
+    one_log(logs, None, as_json=as_json)
+    for number, log in enumerate(logs):
+        with reading_bar(Console(stderr=True)) as bar:
+            task = bar.add_task(f"reading {log.name}", total=None)
+            found = survey(log, lambda position, size: bar.update(task, completed=position, total=size))  # noqa: B023  # not kept
+        if as_json:
+            sys.stdout.write(json.dumps(found) + "\n")
+        else:
+            sys.stdout.write("\n" if number else "")
+            report(found, Console(width=None if sys.stdout.isatty() else _WIDTH, highlight=False))
+
+
+def report(found: Mapping[str, Any], console: "Console") -> None:
+    """Print the figures of a log for a person."""
+    from rich.table import Table
+    from rich.text import Text
+
+    lines = Table.grid(padding=(0, 2))
+    for name, value in _summary(found).items():
+        lines.add_row(Text(name, style="dim"), Text(value))
+    console.print(lines)
+    topics = Table(box=None, padding=(0, 2, 0, 0))
+    topics.add_column("topic", no_wrap=True)
+    for name in ("messages", "Hz", "MB", "restarts", "missing"):
+        topics.add_column(name, justify="right", no_wrap=True)
+    topics.add_column("schema")
+    for key, line in found["topics"].items():
+        rate_hz = "" if line["rate_hz"] is None else f"{line['rate_hz']:.1f}"
+        counts = str(line["messages"]), rate_hz, f"{line['bytes'] / 1e6:.2f}", str(line["restarts"])
+        topics.add_row(Text(key), *counts, str(line["missing"]), Text(line["schema"]))
+    if found["topics"]:
+        console.print()
+        console.print(topics)
+
+
+def _summary(found: Mapping[str, Any]) -> dict[str, str]:
+    """All but the topics, a line each."""
+    from lowfc.programs.log.survey import recovery_in_words
+
+    metadata, recording = found["metadata"], found["metadata"].get("recording", {})
+    damage = [f"byte {one['position']}, {one['length']} bytes: {one['why']}" for one in found["damage"]]
+    lost = [f"{found['messages_missing']} missing by their counts"]
+    if "messages_lost" in recording:
+        lost.append(f"the recorder says that it lost {recording['messages_lost']}")
+    lost += [f"{count} of {key} (all)" for key, count in found["missing_topics"].items()]
+    if found["unreadable"]:
+        lost.append(f"{found['unreadable']} unreadable: what declares them was damaged")
+    lines = {
+        "log": f"{found['log']}, {found['bytes'] / 1e6:.1f} MB",
+        "state": _STATES[found["state"]],
+        "stopped": f"recording stopped: {recording['stopped']}" if recording.get("stopped") else "",
+        "recovery": recovery_in_words(metadata),
+        "damage": "\n".join(damage),
+        "start": "" if found["start"] is None else f"{found['start']}, {found['duration_s']:.3f} s",
+        "messages": f"{found['messages']}; {', '.join(lost)}",
+        "loop": ", ".join(found["loop_modes"]),
+        "events": ", ".join(f"{name} {count}" for name, count in found["events"].items()),
+        "attachments": ", ".join(f"{name} ({size} bytes)" for name, size in found["attachments"].items()),
+        **{
+            name: ", ".join(f"{key} {value}" for key, value in entries.items())
+            for name, entries in metadata.items()
+            if name not in ("recording", "recovery")
+        },
+    }
+    return {name: value for name, value in lines.items() if value}

@@ -1,0 +1,41 @@
+"""Modes as they are named on a command line."""
+
+from collections.abc import Sequence
+from typing import Annotated
+
+import typer
+
+from lowfc.contract.errors import ConfigurationError
+
+Modes = Annotated[
+    list[str] | None,
+    typer.Option("--modes", "--mode", help="Noll indices, as in 2,3 or 4-11. Default: all.", show_default=False),
+]
+
+HIGHEST = 1000
+"""Index, far above any that is controlled."""
+
+
+def noll_of(words: Sequence[str] | None) -> tuple[int, ...]:
+    """Noll indices of words such as "2,3" and "4-11", each once; empty, which is all, where there are no words.
+
+    Raises:
+        ConfigurationError: something else is in them, or nothing.
+    """
+    if not words:
+        return ()
+    found: list[int] = []
+    said = ",".join(words).replace(" ", "")
+    for part in filter(None, said.split(",")):
+        first, dash, last = part.partition("-")
+        last = last if dash else first
+        if not (first.isdecimal() and last.isdecimal() and int(first) <= int(last) <= HIGHEST):
+            raise _none(part)
+        found += range(int(first), int(last) + 1)
+    if not found:
+        raise _none(said)
+    return tuple(dict.fromkeys(found))
+
+
+def _none(word: str) -> ConfigurationError:
+    return ConfigurationError(f"--modes takes Noll indices, as in 2,3 or 4-11; got {word!r}")

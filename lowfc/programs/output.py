@@ -1,0 +1,11 @@
+"""What a command prints."""
+
+import json
+import sys
+from collections.abc import Mapping
+from typing import Any
+
+
+def put(figures: Mapping[str, Any], text: str, *, as_json: bool) -> None:
+    """Print figures as one JSON object, or the text that says the same to a person."""
+    sys.stdout.write((json.dumps(figures) if as_json else text) + "\n")

@@ -1,0 +1,1 @@
+"""`lowfc recorder`: everything that is sent, into a log."""

@@ -1,0 +1,368 @@
+"""The recorder: every message of a run into one log, and an account of those that it did not get.
+
+The bus's threads only append to a bounded queue; the loop here empties it, so that a slow disk costs messages, which
+are counted, and never time in the loop. A disk that refuses ends the recording and nothing else.
+"""
+
+import signal
+import time
+from collections.abc import Mapping, Sequence
+from functools import partial
+from pathlib import Path
+from types import FrameType
+
+from google.protobuf.message import DecodeError
+
+from lowfc.adapters.backlog import Backlog
+from lowfc.adapters.bus import Bus, Sample
+from lowfc.adapters.clock import Clock, HostClock
+from lowfc.adapters.ledger import Ledger
+from lowfc.adapters.log_series import STANDARD, Limits, LogSeries, shortage
+from lowfc.adapters.log_writer import Attachment
+from lowfc.adapters.provenance import provenance
+from lowfc.adapters.realtime import NOTHING, Granted, step_back
+from lowfc.adapters.run import Run
+from lowfc.adapters.service import Service
+from lowfc.adapters.zenoh_bus import ZenohBus
+from lowfc.contract.errors import DataFileError
+from lowfc.contract.messages import HEALTH, TOPICS, Role, Topic, wire
+from lowfc.programs.recording.others import Others
+from lowfc.programs.recording.summary import Summary
+from lowfc.programs.recording.switch import RecordingSwitch
+
+QUEUE_MESSAGES = 20_000
+"""Messages that may wait for the disk: about 4 s of a 1 kHz loop, 90 MB."""
+QUEUE_BYTES = 256_000_000
+"""Payloads that may wait for the disk, whatever their size."""
+
+_TURN_S = 0.02
+_FLUSH_NS = 250_000_000
+_SETTLE_S = (0.3, 1.5)
+_DRAIN_S = 1.0
+_SLOW_NS = 1_000_000_000
+
+
+class Recorder:
+    """Records a run, from its bus to its logs."""
+
+    def __init__(
+        self,
+        bus: Bus,
+        clock: Clock,
+        run_id: str,
+        folder: Path,
+        *,
+        metadata: Mapping[str, Mapping[str, str]],
+        attachments: Sequence[Attachment] = (),
+        limits: Limits = STANDARD,
+        granted: Granted = NOTHING,
+    ) -> None:
+        """Subscribe to everything; recording starts with `run`."""
+        self._bus = bus
+        self._clock = clock
+        self._backlog = Backlog(QUEUE_MESSAGES, QUEUE_BYTES)
+        self._ledger = Ledger()
+        self._series = LogSeries(folder, clock, metadata, attachments, limits)
+        self._others = Others(bus)
+        self._paused = False
+        self._hurried = False
+        self._failure = ""
+        self._flush_due_ns = 0
+        self._begun_ns = self._oldest_ns = 0
+        self._longest_wait_ns = self._longest_unflushed_ns = self._slowest_ns = 0
+        # Before the service, which subscribes to Health: who has heard of that has heard of all others.
+        for topic in TOPICS:
+            bus.subscribe(topic, partial(self._backlog.put, topic))
+        self.service = Service(Role.RECORDER, run_id, clock, bus, granted=granted, fill=self._fill)
+        self._switch = RecordingSwitch(bus, clock, {"start": self._resume, "stop": self._pause})
+
+    def catch_signals(self) -> None:
+        """Finish the log at SIGTERM, Ctrl-C or a lost terminal; a second one does not wait for the others' last words.
+
+        For the main thread.
+        """
+        for number in (signal.SIGTERM, signal.SIGINT, signal.SIGHUP):
+            if number != signal.SIGHUP or signal.getsignal(number) is not signal.SIG_IGN:  # as nohup leaves it
+                signal.signal(number, self._told)
+
+    def run(self) -> Summary:
+        """Record until told to stop.
+
+        Raises:
+            DataFileError: the first log cannot be opened.
+        """
+        self._settle()
+        for sample in self._others.ask():
+            self._write(sample)
+        self._begin()
+        self._begun_ns = self._clock.host_ns()
+        self.service.state = "ready"
+        while self.service.running:
+            self._turn()
+            time.sleep(_TURN_S)
+        self.service.state = "stopping"
+        self._drain()
+        summary = self._close()
+        self.service.finish()
+        return summary
+
+    def _told(self, number: int, frame: FrameType | None) -> None:
+        self._hurried = not self.service.running
+        self.service.stop(signal.Signals(number).name)
+
+    def _settle(self) -> None:
+        """Wait until those who are there already have been heard, so that they can be asked."""
+        begun_s = time.monotonic()
+        shortest_s, longest_s = _SETTLE_S
+        while self.service.running:
+            self.service.beat()
+            time.sleep(_TURN_S)
+            age_s = time.monotonic() - begun_s
+            if age_s >= longest_s or (age_s >= shortest_s and len(self.service.heard) >= self._bus.peers()):
+                return
+
+    def _begin(self) -> None:
+        """Begin a log, with what the messages in it depend on."""
+        self._series.begin(self._others.kept.values())
+        self.service.event("RECORDING")
+
+    def _turn(self) -> None:
+        """Write what has arrived; now and then flush, report and rotate; do what an operator asks."""
+        self._write_waiting()
+        for sample in self._others.ask_meanwhile(more=self.service.running):
+            self._write(sample)
+        if self._clock.host_ns() >= self._flush_due_ns:
+            self._look_after()
+        self._switch.serve(self._series.files)
+        self.service.beat()
+
+    def _write_waiting(self) -> None:
+        for _ in range(len(self._backlog)):
+            topic, sample = self._backlog.take()
+            self._take(topic, sample)
+            now_ns = self._clock.host_ns()
+            self._longest_wait_ns = max(self._longest_wait_ns, now_ns - self._arrival_ns(sample))
+            if now_ns >= self._flush_due_ns:
+                self._look_after()
+
+    def _pause(self) -> str:
+        """Finish the log with all that has arrived; return why not, if so."""
+        if self._failure or self._paused:
+            return self._failure or "nothing is being recorded"
+        self.service.event("RECORDING_STOPPED", why="operator asked")
+        self._say_losses()
+        self._write_waiting()
+        self._flush()
+        try:
+            self._series.end(self._figures())
+        except DataFileError as fault:
+            self._fail(fault)
+        self._paused = not self._failure
+        return self._failure
+
+    def _resume(self) -> str:
+        """Begin the next log; return why not, if so."""
+        if self._failure:
+            return f"{self._failure}; start another recorder"
+        if not self._paused or not self.service.running:
+            return "it is being recorded already" if self.service.running else "the recorder is ending"
+        try:
+            if short := self._series.shortage():
+                return short
+            self._begin()
+        except DataFileError as fault:
+            self._series.give_up()
+            return str(fault)
+        self._paused = False
+        self._others.ask_again()
+        return ""
+
+    def _look_after(self) -> None:
+        """Flush, begin the next log when it is time, say what was lost, be heard."""
+        self._flush()
+        self._flush_due_ns = self._clock.host_ns() + _FLUSH_NS
+        self._say_losses()
+        if self._series.longest_write_ns > max(_SLOW_NS, self._slowest_ns):
+            self._slowest_ns = self._series.longest_write_ns
+            self.service.event("DISK_SLOW", stall_s=self._slowest_ns * 1e-9, waiting=len(self._backlog))
+        self.service.beat()
+
+    def _take(self, topic: Topic, sample: Sample) -> None:
+        """Record one message, unless it was recorded when it was asked for."""
+        asked = self._others.was_asked(sample)
+        recorded = not self._failure if asked else self._write(sample) or self._paused  # unwanted is not lost
+        self._ledger.enter(topic, sample, recorded=recorded)
+        if topic is HEALTH:
+            self._hear(sample)
+        elif topic.queryable:
+            self._others.keep(sample)
+
+    def _hear(self, sample: Sample) -> None:
+        try:
+            health = wire.Health.FromString(sample.payload)
+        except DecodeError:
+            return  # it is in the log as it came; the service counts it
+        self._ledger.believe(sample, health)
+        self._others.hear(sample, health)
+
+    def _write(self, sample: Sample) -> bool:
+        try:
+            written = self._series.write(sample)
+        except DataFileError as fault:
+            self._fail(fault)
+            return False
+        if written:
+            self.service.work += 1
+            self._oldest_ns = self._oldest_ns or self._arrival_ns(sample)
+        return written
+
+    def _arrival_ns(self, sample: Sample) -> int:
+        return max(sample.receive_time_ns, self._begun_ns)
+
+    def _flush(self) -> None:
+        """Make what was written safe; end the log where it is full, and the recording where the disk nearly is."""
+        try:
+            self._series.flush()
+            self._flushed()
+            if self._failure or self._paused:
+                return
+            if short := self._series.shortage():
+                self._failure = short
+                self._series.end(self._figures() | {"stopped": short})
+                self.service.event("RECORDING_FAILED", why=f"{short}; the log is complete")
+            elif self._series.full:
+                self._series.end(self._figures(), wait=False)
+                self._begin()
+                self._others.ask_again()
+        except DataFileError as fault:
+            self._fail(fault)
+
+    def _flushed(self) -> None:
+        self._ledger.settle()
+        if self._oldest_ns:
+            age_ns = self._clock.host_ns() - self._oldest_ns
+            self._longest_unflushed_ns = max(self._longest_unflushed_ns, age_ns)
+            self._oldest_ns = 0
+
+    def _fail(self, fault: DataFileError) -> None:
+        """Give up recording, and nothing else: the process lives, and counts what is lost from here."""
+        self._series.give_up()
+        self._ledger.revert()
+        self._failure = str(fault)
+        self.service.event("RECORDING_FAILED", why=fault)
+
+    def _say_losses(self) -> None:
+        for topic, count in self._ledger.news().items():
+            self.service.event("MESSAGES_LOST", topic=topic, count=count)
+
+    def _drain(self) -> None:
+        """Wait a while for the last Health of the others, which counts what they sent."""
+        deadline_s = time.monotonic() + _DRAIN_S
+        while not self._hurried:
+            self._turn()
+            if self._others.stopped(but=self.service.name) or time.monotonic() >= deadline_s:
+                return
+            time.sleep(_TURN_S)
+
+    def _close(self) -> Summary:
+        self._say_losses()
+        self._turn()
+        self._flush()
+        try:
+            self._series.end(self._figures())
+        except DataFileError as fault:
+            self._fail(fault)
+        return Summary(
+            tuple(self._series.files),
+            self._series.messages,
+            self._ledger.lost(),
+            self._failure,
+            self._longest_wait_ns,
+            self._longest_unflushed_ns,
+            self._series.longest_write_ns,
+        )
+
+    def _figures(self) -> dict[str, str]:
+        """What a log says of its recording at its end: of all logs so far."""
+        lost = self._ledger.lost()
+        return {
+            "messages": str(self._series.messages),
+            "messages_lost": str(sum(lost.values())),
+            **{f"lost {key}": str(count) for key, count in lost.items()},
+        }
+
+    def _fill(self, health: wire.Health) -> None:
+        lost = self._ledger.lost()
+        health.recording.files.extend(map(str, self._series.files))
+        health.recording.file = health.recording.files[-1] if health.recording.files else ""
+        health.recording.messages = self._series.messages
+        health.recording.lost = sum(lost.values())
+        health.recording.failure = self._failure
+        health.recording.bytes = self._series.bytes_written
+        counts = {count.topic: count for count in health.topics}  # of its own, those that it sent
+        for key, recorded in self._ledger.recorded().items():
+            count = counts[key] if key in counts else health.topics.add(topic=key)
+            count.received, count.missing = recorded, lost.get(key, 0)
+
+
+def record(
+    run: Run,
+    folder: Path,
+    *,
+    configuration: Path | None = None,
+    calibration: Path | None = None,
+    seed: int | None = None,
+    limits: Limits = STANDARD,
+    clock: Clock | None = None,
+    priority: int | None = None,
+    cpus: set[int] | None = None,
+) -> Summary:
+    """Record a run into `folder` until SIGTERM or SIGINT; the process of `lowfc record`.
+
+    Args:
+        run: the run to join.
+        folder: where the logs go.
+        configuration: TOML file to put into the log.
+        calibration: FITS file to put into the log.
+        seed: of a simulated run.
+        limits: when a log is finished and the next begun, and when there is no room for one.
+        clock: the run's; the host's when None.
+        priority: of SCHED_FIFO, below the loop's; None leaves the normal class.
+        cpus: processors to stay on; None leaves all.
+
+    Raises:
+        BusError: another recorder has this run.
+        DataFileError: a file cannot be read, or no log can be written in `folder`.
+    """
+    if short := shortage(folder, limits.min_free_bytes):
+        raise DataFileError(short)
+    attachments = [
+        _attached(path, media_type)
+        for path, media_type in ((configuration, "application/toml"), (calibration, "application/fits"))
+        if path is not None
+    ]
+    granted = step_back(priority, cpus)
+    clock = HostClock() if clock is None else clock
+    bus = ZenohBus(run.links, Role.RECORDER, clock)
+    try:
+        recorder = Recorder(
+            bus,
+            clock,
+            run.run_id,
+            folder,
+            metadata={"lowfc": provenance(run.run_id, seed)},
+            attachments=attachments,
+            limits=limits,
+            granted=granted,
+        )
+        recorder.catch_signals()
+        return recorder.run()
+    finally:
+        bus.close()
+
+
+def _attached(path: Path, media_type: str) -> Attachment:
+    try:
+        return Attachment(path.name, media_type, path.read_bytes())
+    except OSError as fault:
+        raise DataFileError(f"{path} cannot be read for the log: {fault.strerror}") from fault

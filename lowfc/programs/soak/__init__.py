@@ -1,0 +1,1 @@
+"""`lowfc soak`: does anything grow, drift or get lost in hours?"""

@@ -1,0 +1,159 @@
+"""The command `lowfc tune`: the best control law for a log, or for a loop that is running."""
+
+from enum import StrEnum
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from lowfc.adapters.terminal import AnyRun, Json
+from lowfc.contract.errors import ConfigurationError, DataFileError, LowfcError, RequestRefusedError
+from lowfc.programs.output import put
+
+if TYPE_CHECKING:
+    from rich.console import Console
+
+    from lowfc.client import Answer, Client
+    from lowfc.control.tuning import Tuned
+    from lowfc.programs.tune.data import Telemetry
+
+
+class ControllerKind(StrEnum):
+    """What can be tuned."""
+
+    INTEGRATOR = "integrator"
+    PI_NOTCH = "pi-notch"
+    LQG = "lqg"
+
+
+def tune(
+    log: Annotated[
+        Path | None, typer.Argument(help="Log (MCAP), finished or not.", metavar="[LOG]", readable=False)
+    ] = None,
+    controller: Annotated[ControllerKind, typer.Option(help="Kind of law.")] = ControllerKind.INTEGRATOR,
+    live: Annotated[float | None, typer.Option(min=1.0, help="Listen to a running loop, for seconds.")] = None,
+    out: Annotated[Path | None, typer.Option(help="Write the law to this file (FITS).")] = None,
+    apply: Annotated[bool, typer.Option("--apply", help="Give the gains, or the law, to the running loop.")] = False,
+    plot: Annotated[Path | None, typer.Option(help="Draw spectra into this file (PNG).")] = None,
+    run: AnyRun = None,
+    as_json: Json = False,
+) -> None:
+    """Find the best gains, notches or Kalman filter for what shakes the wavefront, with margins.
+
+    Example: lowfc tune logs/20270101T220000Z.mcap --controller lqg --out lqg.fits --plot lqg.png
+    """
+    from rich.console import Console
+
+    from lowfc.programs.tune.figures import render
+
+    if (log is None) == (live is None):
+        raise ConfigurationError("name one LOG, or listen to a running loop with --live SECONDS")
+    found = tune_run(log, str(controller), live, out, apply=apply, plot=plot, run=run, console=Console(stderr=True))
+    done = [f"written: {file}" for file in found["files"]] + ([found["applied"]] if found["applied"] else [])
+    put(found, "\n".join([render(found), *done]), as_json=as_json)
+
+
+def tune_run(
+    log: Path | None,
+    controller: str,
+    live: float | None = None,
+    out: Path | None = None,
+    *,
+    apply: bool = False,
+    plot: Path | None = None,
+    run: str | None = None,
+    console: "Console",
+) -> dict[str, Any]:
+    """Tune a law; return the figures that `--json` prints.
+
+    Raises:
+        DataFileError: the log cannot be read or has too little in it, or a file cannot be written.
+        ConfigurationError: no law of this kind is stable, or there is no matplotlib.
+        BusError: there is no such run, or it does not answer.
+        RequestRefusedError: the controller refused what was applied.
+    """
+    from lowfc.adapters.law_file import save
+    from lowfc.adapters.progress import passing_bar
+    from lowfc.adapters.whole_file import require_folder, write_whole
+    from lowfc.programs.log.guard import refuse_log
+    from lowfc.programs.tune.figures import figures, picture, tuned
+
+    require_folder(out, plot)
+    for file in (out, plot):
+        if file is not None and log is not None:
+            refuse_log(file, log)
+    telemetry = _listened(live, run, console) if log is None else _read(log, console)
+    with passing_bar(console) as bar:
+        bar.add_task(f"tuning {controller}", total=None)
+        try:
+            best, gains = tuned(telemetry, controller)
+        except ValueError as error:
+            raise DataFileError(f"{telemetry.source}: {error}") from None
+        found = figures(telemetry, best, gains, controller)
+    found |= {"files": [], "applied": None}
+    if out is not None:
+        save(best.law, out)
+        found["files"].append(str(out))
+    if plot is not None:
+        write_whole(plot, picture(telemetry, best))
+        found["files"].append(str(plot))
+    if apply:
+        found["applied"] = _applied(telemetry, best, gains.gain.tolist(), controller, run)
+    return found
+
+
+def _read(log: Path, console: "Console") -> "Telemetry":
+    from lowfc.adapters.log_reader import LogReader
+    from lowfc.adapters.progress import reading_bar
+    from lowfc.programs.tune.data import of_log
+
+    reader = LogReader(log, skip_damaged=True)
+    with reading_bar(console) as bar:
+        task = bar.add_task("reading", total=None)
+        return of_log(reader, lambda _: bar.update(task, completed=reader.position, total=reader.size))
+
+
+def _listened(seconds: float | None, run: str | None, console: "Console") -> "Telemetry":
+    from lowfc.adapters.progress import passing_bar
+    from lowfc.client import Client
+    from lowfc.programs.tune.data import of_run
+
+    asked_s = seconds or 0.0
+    with Client(run) as loop, passing_bar(console) as bar:
+        task = bar.add_task("listening", total=asked_s)
+        return of_run(loop, asked_s, lambda passed_s: bar.update(task, completed=passed_s))
+
+
+def _applied(telemetry: "Telemetry", best: "Tuned", gains: list[float], controller: str, run: str | None) -> str:
+    from lowfc.client import Client
+
+    with Client(run) as loop:
+        if controller == ControllerKind.INTEGRATOR:
+            return integrate(loop, gains, telemetry.noll).sentence
+        return loop.law(best.law).sentence
+
+
+def integrate(loop: "Client", gains: list[float], noll: tuple[int, ...]) -> "Answer":
+    """Let the integrator drive the mirror with these gains; where they are not taken, the law before it goes on.
+
+    Raises:
+        RequestRefusedError: the gains were refused.
+        BusError: the controller did not answer.
+    """
+    from lowfc.programs.tune.data import driving
+
+    before = driving(loop.status().state)
+    if before is None:
+        return loop.gain(gains, noll)
+    loop.law(None)  # another law has no gains
+    try:
+        return loop.gain(gains, noll)
+    except BaseException as fault:
+        try:
+            loop.law(before)
+        except LowfcError as another:
+            raise RequestRefusedError(
+                f"{fault}; the integrator drives the mirror now, for the law {before.name!r} could not be put back: "
+                f"{another}"
+            ) from None
+        raise
