@@ -49,8 +49,7 @@ def controller(part: Part) -> None:
     def answer(number: int, sent_ns: int, payload: bytes) -> None:
         taken_ns = now_ns()
         command = step.command(payload, number, taken_ns - sent_ns)
-        link.put(number, taken_ns, command)
-        commanded[number] = now_ns()
+        commanded[number] = link.put(number, taken_ns, command) or now_ns()
         if link.tell is not None:
             link.tell(number, taken_ns, command)
         if stage is not None:

@@ -19,7 +19,7 @@ from lowfc.adapters.bus import Sample
 from lowfc.adapters.clock import HostClock
 from lowfc.adapters.handover import Handover
 from lowfc.adapters.realtime import let_send
-from lowfc.adapters.run import Links
+from lowfc.adapters.run import Links, mirror_role
 from lowfc.adapters.zenoh_bus import ZenohBus, session_config
 from lowfc.contract.messages import COMMAND, FRAME, Role
 
@@ -37,10 +37,11 @@ Message = Callable[[int, int, bytes], None]
 class Link:
     """What a transport gives: `put` sends to the other end of the loop, `tell` then to everybody else.
 
-    `kept` must live as long as the link does.
+    `put` returns when the other end could have it (CLOCK_MONOTONIC, ns), or None where that is when it returns. `kept`
+    must live as long as the link does.
     """
 
-    put: Message
+    put: Callable[[int, int, bytes], int | None]
     tell: Message | None = None
     kept: object = None
 
@@ -89,7 +90,7 @@ def both(part: Part, frame_bytes: int, command_bytes: int, take: Message) -> Lin
 
 
 def lowfc_bus(part: Part, _frame_bytes: int, _command_bytes: int, take: Message) -> Link:
-    """By lowfc's bus, frames handed over on its own thread, as its loop is built."""
+    """By lowfc's bus, as its loop is built: frames handed over on its own thread; the source is the mirror as well."""
     clock = HostClock()
     bus = ZenohBus(_links(part), _ROLES[part.role], clock)
 
@@ -97,19 +98,21 @@ def lowfc_bus(part: Part, _frame_bytes: int, _command_bytes: int, take: Message)
         take(sample.sequence, sample.publish_time_ns - clock.offset_ns, sample.payload)
 
     if part.role == "source":
-        bus.subscribe(COMMAND, pass_on, _MIRROR)
-        publisher = bus.publisher(FRAME)
+        mirror = ZenohBus(_links(part), mirror_role(_MIRROR), clock)
+        mirror.subscribe(COMMAND, pass_on, _MIRROR)
+        kept, publisher = (bus, mirror), bus.publisher(FRAME)
     else:
         bus.subscribe(FRAME, Handover(FRAME.key, pass_on, clock.host_ns).put)
-        publisher = bus.publisher(COMMAND, _MIRROR)
+        kept, publisher = (bus,), bus.publisher(COMMAND, _MIRROR)
 
-    def put(number: int, time_ns: int, payload: bytes) -> None:
+    def put(number: int, time_ns: int, payload: bytes) -> int:
         publisher.put(payload, time_ns + clock.offset_ns, number)
+        return publisher.handed_ns - clock.offset_ns
 
     def afterwards(_number: int, _time_ns: int, _payload: bytes) -> None:
         let_send()
 
-    return Link(put, afterwards, bus)
+    return Link(put, afterwards, kept)
 
 
 def watch(part: Part) -> Iterator[int]:

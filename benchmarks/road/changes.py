@@ -97,10 +97,11 @@ _AS_IT_IS = (
     ),
     Change(
         "shortcut",
-        "a socket beside the bus for frames to the controller",
+        "sockets beside the bus, for frames to the controller and commands to the mirror",
         kept=True,
         often=True,
     ),
+    Change("commands-short", "the socket for commands alone", kept=True, often=True),
     Change("retry", "nobody asks five times a second for who is not there", kept=True, often=True),
     Change(
         "own-thread",

@@ -10,6 +10,7 @@ import os
 import platform
 import threading
 from collections.abc import Callable, Iterator
+from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
@@ -23,7 +24,7 @@ from lowfc.adapters.envelope import Envelope
 from lowfc.adapters.run import Links
 from lowfc.adapters.service import Service
 from lowfc.contract.configuration import Configuration
-from lowfc.contract.messages import Role, Topic
+from lowfc.contract.messages import COMMAND, Role, Topic
 from lowfc.control.inputs import Outputs
 from lowfc.programs import rehearsal
 
@@ -174,6 +175,16 @@ def _by_shared_memory(config: Config, _: Links) -> None:
     config["transport"]["shared_memory"]["enabled"] = True
 
 
+def _commands_by_bus() -> None:
+    original = _original(zenoh_bus.ZenohBus, "_shortcut")
+
+    def shortcut(self: zenoh_bus.ZenohBus, topic: Topic, name: str) -> Path | None:
+        path: Path | None = None if topic is COMMAND else original(self, topic, name)
+        return path
+
+    _put(zenoh_bus.ZenohBus, "_shortcut", shortcut)
+
+
 def _without_password(config: Config, _: Links) -> None:
     del config["transport"]["auth"]["usrpwd"]
 
@@ -300,6 +311,7 @@ PATCHES: dict[str, Callable[[], None]] = {
     "let-send": lambda: _put(realtime, "let_send", _nothing),
     "mirror-ahead": _mirror_ahead,
     "rehearse-late": lambda: _put(rehearsal, "LEAD_NS", 10**9),
+    "commands-short": _commands_by_bus,
     "shortcut": lambda: _put(zenoh_bus.ZenohBus, "_shortcut", _nothing),
     "retry": _edit(_asks_often),
     "bus-first": _bus_first,

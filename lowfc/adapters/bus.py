@@ -59,11 +59,19 @@ class Query:
 
 
 class Publisher(Protocol):
-    """Publishes one topic under one key."""
+    """Publishes one topic under one key.
+
+    Attributes:
+        published: messages so far.
+        handed_ns: when the last one had been handed to the reader that waits for it, by the host's clock: by its short
+            way, or else by the bus.
+        last: message and envelope of a topic that can be asked for.
+    """
 
     topic: Topic
     key: str
     published: int
+    handed_ns: int
     last: tuple[bytes, Envelope] | None
 
     def put(self, payload: bytes, publish_time_ns: int | None = None, sequence: int | None = None) -> Envelope:

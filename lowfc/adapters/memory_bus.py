@@ -34,6 +34,7 @@ class MemoryPublisher:
         self.topic = topic
         self.key = key
         self.published = 0
+        self.handed_ns = 0
         self.last: tuple[bytes, Envelope] | None = None
         self._bus = bus
 
@@ -50,6 +51,7 @@ class MemoryPublisher:
             self.last = (payload, envelope)
         for bus in list(self._bus.hub.buses):
             bus.deliver(self.key, payload, envelope)
+        self.handed_ns = clock.host_ns()
         return envelope
 
 

@@ -22,6 +22,7 @@ Handler = Callable[[Sample], None]
 
 _BUFFER_BYTES = 4 << 20  # some hundred frames, where the host allows it; the kernel allows twice as much
 _RETRY_S = 0.1
+_LATELY = 256
 _ENVELOPE_BYTES = len(Envelope(0, 0).encode())
 
 
@@ -34,20 +35,22 @@ class ShortcutWriter:
         self._socket: socket.socket | None = None
         self._again_s = 0.0
 
-    def send(self, envelope: bytes, payload: bytes) -> None:
-        """Send a message; a reader that is too far behind loses it, as it would on the bus."""
+    def send(self, envelope: bytes, payload: bytes) -> bool:
+        """Send a message, and say whether it went; a reader that is too far behind loses it, as it would on the bus."""
         if self._socket is None:
             self._connect()
             if self._socket is None:
-                return
+                return False
         try:
             self._socket.sendmsg((envelope, payload))
         except BlockingIOError:
-            return
+            return False
         except OSError as fault:
             self.close()  # the reader has gone
             if fault.errno == errno.EMSGSIZE:  # more than a socket takes on this host: it will be so with the next
                 self._again_s = math.inf
+            return False
+        return True
 
     def close(self) -> None:
         """Leave the reader to the bus."""
@@ -103,6 +106,7 @@ class ShortcutReader:
         self._key = key
         self._first = self._newest = self._newest_by_bus = -1
         self._both = self._closed = False
+        self._lately: dict[tuple[int, int], None] = {}
         self._leave_bus: Callable[[], None] | None = subscribe(self._by_bus)
         path.unlink(missing_ok=True)  # of a process that was killed: there is one of each role
         self._listener = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET)
@@ -188,6 +192,29 @@ class ShortcutReader:
             if self._leave_bus is not None and sample.sequence <= self._newest_by_bus:
                 return  # the bus was quicker
             self._newest = sample.sequence
+            self._handler(sample)
+
+
+class SharedShortcutReader(ShortcutReader):
+    """The same where others may publish too, by the bus alone: it is never left, and a copy is known by its envelope.
+
+    A copy that comes after `_LATELY` other messages is handed on; it is old by then, and a `Handover` skips it.
+    """
+
+    def _by_bus(self, sample: Sample) -> None:
+        self._once(sample)
+
+    def _by_socket(self, sample: Sample) -> None:
+        self._once(sample)
+
+    def _once(self, sample: Sample) -> None:
+        envelope = sample.sequence, sample.publish_time_ns
+        with self._turn:
+            if self._closed or envelope in self._lately:
+                return
+            self._lately[envelope] = None
+            if len(self._lately) > _LATELY:
+                del self._lately[next(iter(self._lately))]
             self._handler(sample)
 
 

@@ -23,11 +23,11 @@ from lowfc.adapters.clock import Clock
 from lowfc.adapters.clock_offset import ClockAsker, ClockOffset
 from lowfc.adapters.envelope import Envelope, sequence_of
 from lowfc.adapters.routed import open_by_router, require_certificate
-from lowfc.adapters.run import Links
-from lowfc.adapters.shortcut import ShortcutReader, ShortcutWriter
+from lowfc.adapters.run import Links, mirror_role
+from lowfc.adapters.shortcut import SharedShortcutReader, ShortcutReader, ShortcutWriter
 from lowfc.adapters.zenoh_session import session_config
 from lowfc.contract.errors import BusError
-from lowfc.contract.messages import HEALTH, Topic
+from lowfc.contract.messages import HEALTH, Role, Topic
 
 __all__ = [
     "ZenohBus",
@@ -71,6 +71,7 @@ class ZenohPublisher:
         self.topic = topic
         self.key = key
         self.published = 0
+        self.handed_ns = 0
         self.last: tuple[bytes, Envelope] | None = None
         self._keeps = topic.queryable
         self._host_ns = bus.clock.host_ns
@@ -91,9 +92,12 @@ class ZenohPublisher:
         self.published += 1
         if self._keeps:
             self.last = (payload, envelope)
-        if self._shortcut is not None:
-            self._shortcut.send(envelope.encode(), payload)
+        handed = self._shortcut is not None and self._shortcut.send(envelope.encode(), payload)
+        if handed:
+            self.handed_ns = self._host_ns()
         self._publisher.put(payload, attachment=self._sent(envelope))
+        if not handed:
+            self.handed_ns = self._host_ns()
         return envelope
 
     def close(self) -> None:
@@ -206,16 +210,18 @@ class ZenohBus:
 
     def publisher(self, topic: Topic, name: str = "") -> ZenohPublisher:
         """See `Bus.publisher`."""
-        publisher = ZenohPublisher(self, self._session, topic, topic.at(name), self._shortcut(topic))
+        sole = self.role.partition("-")[0] in topic.publisher
+        path = self._shortcut(topic, name) if sole else None
+        publisher = ZenohPublisher(self, self._session, topic, topic.at(name), path)
         self._closers.append(publisher.close)
         return publisher
 
     def subscribe(self, topic: Topic, handler: Callable[[Sample], None], name: str = ALL) -> Callable[[], None]:
         """See `Bus.subscribe`; `handler` runs on a thread that receives, on one at a time."""
-        if topic.reader != self.role or (path := self._shortcut(topic)) is None:
+        if _reader(topic, name) != self.role or (path := self._shortcut(topic, name)) is None:
             return self._subscribe(topic, handler, name)
         key = topic.at(name)
-        reader = ShortcutReader(
+        reader = (SharedShortcutReader if topic.shared else ShortcutReader)(
             path,
             key,
             handler,
@@ -297,8 +303,9 @@ class ZenohBus:
         with contextlib.suppress(zenoh.ZError):
             self._session.close()  # type: ignore[no-untyped-call]
 
-    def _shortcut(self, topic: Topic) -> Path | None:
-        return None if topic.reader is None else self._links.shortcut(topic.reader)
+    def _shortcut(self, topic: Topic, name: str) -> Path | None:
+        reader = _reader(topic, name)
+        return None if reader is None else self._links.shortcut(reader)
 
     @contextlib.contextmanager
     def replying(self, query: zenoh.Query) -> Iterator[None]:
@@ -332,6 +339,11 @@ def stay_python() -> None:
     if not hasattr(_known, "thread"):
         ctypes.pythonapi.PyGILState_Ensure()
         _known.thread = True
+
+
+def _reader(topic: Topic, name: str) -> str | None:
+    """Role of the process that waits for a topic."""
+    return mirror_role(name) if topic.reader is Role.MIRROR else topic.reader
 
 
 def _known_key(expression: str) -> str | None:

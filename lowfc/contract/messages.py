@@ -54,7 +54,8 @@ class Topic:
         timeless: in lockstep two runs with the same seed write the same payload bytes.
         queryable: a late joiner may ask the publisher for the last one.
         newest_only: who looks at a run wants the newest only, and gets no more than eyes can follow.
-        reader: who waits for it, and gets it by a way of its own from a publisher on the same host; of one publisher.
+        reader: who waits for it, and gets it by a way of its own from its publisher on the same host.
+        shared: others than that publisher may put it too, so that its reader hears the bus beside its own way.
         sentence: what it is.
     """
 
@@ -69,6 +70,7 @@ class Topic:
     queryable: bool = False
     newest_only: bool = False
     reader: Role | None = None
+    shared: bool = False
 
     def at(self, name: str) -> str:
         """Key of this topic for the mirror or process `name`."""
@@ -146,6 +148,8 @@ COMMAND = Topic(
     _CONTROLLER,
     _MIRROR | {Role.RECORDER},
     "Where the mirror shall be.",
+    reader=Role.MIRROR,
+    shared=True,
 )
 MIRROR_STATE = Topic(
     "lowfc/mirror/{name}/state",

@@ -161,7 +161,7 @@ class Controller:
         outputs = self._advance(frame)
         ready_ns = clock.host_ns()
         self._send(outputs)
-        sent_ns = clock.host_ns()
+        sent_ns = self._commands.handed_ns if outputs.command is not None else clock.host_ns()
         let_send()
         self._tell(outputs)
         if sample.sequence == self._state.frame_sequence:  # an older one is no sign of a live camera

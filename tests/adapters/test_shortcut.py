@@ -180,7 +180,87 @@ def test_a_message_that_makes_no_sense_is_counted_and_the_next_is_heard(ends: En
 
 def test_only_who_waits_for_a_topic_has_a_short_way(ends: Ends) -> None:
     ends.bus("recorder").subscribe(FRAME, ends.hear)
-    ends.bus("mirror-dm").subscribe(COMMAND, lambda _: None, "dm")
+    ends.bus("mirror-other").subscribe(COMMAND, lambda _: None, "dm")
     assert not list(ends.run.path.glob("*.in"))
     ends.bus("controller").subscribe(FRAME, ends.hear)
-    assert [path.name for path in ends.run.path.glob("*.in")] == ["controller.in"]
+    ends.bus("mirror-dm").subscribe(COMMAND, lambda _: None, "dm")
+    assert sorted(path.name for path in ends.run.path.glob("*.in")) == ["controller.in", "mirror-dm.in"]
+
+
+class Commanded:
+    """A mirror that notes its commands, beside the controller and an operator who both command it."""
+
+    def __init__(self, ends: Ends) -> None:
+        self.ends = ends
+        self.got: list[Sample] = []
+        self.threads: list[str] = []
+        ends.bus("mirror-dm").subscribe(COMMAND, self.hear, "dm")
+        controller, operator = ends.bus("controller"), ends.bus("operator")
+        self.controller, self.operator = controller.publisher(COMMAND, "dm"), operator.publisher(COMMAND, "dm")
+        self.links = controller, operator
+
+    def hear(self, sample: Sample) -> None:
+        self.got.append(sample)
+        self.threads.append(threading.current_thread().name)
+
+    def until_both_ways(self) -> None:
+        def both() -> bool:
+            self.controller.put(b"controller")
+            self.operator.put(b"operator")
+            time.sleep(0.01)
+            return "shortcut" in self.threads and any(one.payload == b"operator" for one in self.got)
+
+        until("both ways", both)
+
+
+def test_a_mirror_gets_each_command_once_and_the_controllers_by_the_short_way(ends: Ends) -> None:
+    mirror = Commanded(ends)
+    mirror.until_both_ways()
+    begun = len(mirror.got)
+    for _ in range(200):
+        mirror.controller.put(b"controller")
+        mirror.operator.put(b"operator")
+        time.sleep(0.001)
+    last = mirror.controller.published - 1, mirror.operator.published - 1
+
+    def all_came() -> bool:
+        return {(one.payload, count_of(one.sequence)) for one in mirror.got[-20:]} >= {
+            (b"controller", last[0]),
+            (b"operator", last[1]),
+        }
+
+    until("the last commands", all_came)
+    time.sleep(0.1)  # in which a copy by the bus would come
+    by_whom = list(zip(mirror.got, mirror.threads, strict=True))[begun:]
+    for payload, last_count in zip((b"controller", b"operator"), last, strict=True):
+        counts = [count_of(one.sequence) for one, _ in by_whom if one.payload == payload]
+        assert counts[-200:] == list(range(last_count - 199, last_count + 1))
+        assert len(counts) == len(set(counts))
+    assert {name for one, name in by_whom if one.payload == b"controller"} == {"shortcut"}
+    assert all(name != "shortcut" for one, name in by_whom if one.payload == b"operator")
+
+
+def test_a_command_with_anothers_sequence_is_no_copy(ends: Ends) -> None:
+    mirror = Commanded(ends)
+    mirror.until_both_ways()
+    newest = mirror.got[[one.payload for one in mirror.got].index(b"controller")]
+    mirror.operator.put(b"a copy", publish_time_ns=newest.publish_time_ns, sequence=newest.sequence)
+    mirror.operator.put(b"another", sequence=newest.sequence)
+    until("the other's", lambda: mirror.got[-1].payload == b"another")
+    assert all(one.payload != b"a copy" for one in mirror.got)
+
+
+def test_handed_is_before_the_bus_where_there_is_a_reader_and_after_it_where_there_is_none(ends: Ends) -> None:
+    mirror = Commanded(ends)
+    mirror.until_both_ways()
+    put_ns: list[int] = []
+
+    class Noting:
+        def put(self, payload: bytes, attachment: bytes) -> None:
+            put_ns.append(ends.clock.host_ns())
+
+    for publisher, is_read in ((mirror.controller, True), (mirror.operator, False)):
+        publisher._publisher = Noting()  # type: ignore[assignment]
+        envelope = publisher.put(b"")
+        assert envelope.publish_time_ns <= publisher.handed_ns
+        assert (publisher.handed_ns <= put_ns[-1]) is is_read

@@ -43,8 +43,7 @@ class LossyShortcut:
     def __init__(self, shortcut):
         self.shortcut, self.close = shortcut, shortcut.close
     def send(self, attachment, payload):
-        if not lost(attachment):
-            self.shortcut.send(attachment, payload)
+        return not lost(attachment) and self.shortcut.send(attachment, payload)
 
 made = ZenohPublisher.__init__
 def lossy(self, bus, session, topic, key, shortcut):
