@@ -162,6 +162,7 @@ def test_the_processes_by_hand(tmp_path: Path) -> None:
     assert len(list((tmp_path / "logs").glob("*.mcap"))) == 1
 
 
+@pytest.mark.slow
 def test_the_bench(tmp_path: Path) -> None:
     assert "rank" in run(tmp_path, BENCH[0])
     assert "longest wait" in run(tmp_path, BENCH[1])

@@ -13,6 +13,7 @@ def test_the_validation(tmp_path: Path) -> None:
     assert "peak" in said
 
 
+@pytest.mark.slow
 def test_the_designs_are_taken_by_the_loop(tmp_path: Path) -> None:
     for command in DESIGN:
         run(tmp_path, command)
@@ -20,6 +21,7 @@ def test_the_designs_are_taken_by_the_loop(tmp_path: Path) -> None:
     run(tmp_path, "lowfc sim-loop --config own.toml --lockstep --duration 0.2")
 
 
+@pytest.mark.slow
 def test_the_logs(tmp_path: Path) -> None:
     run(tmp_path, "lowfc sim-loop --lockstep --rate 200 --duration 2 --json")
     said = [run(tmp_path, command) for command in LOGS]

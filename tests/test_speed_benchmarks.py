@@ -50,6 +50,7 @@ def test_a_step_that_holds_its_command_is_no_measurement(monkeypatch: pytest.Mon
         curves.step_figures(SMALL, 0.01)
 
 
+@pytest.mark.slow
 def test_a_loop_of_sizes_without_an_optical_model_is_run() -> None:
     found = curves.loop_figures(Size(side=32, modes=40, mirror_side=16), 500.0, 0.5)
     assert "failure" not in found
@@ -258,6 +259,7 @@ def test_real_processes_below_this_one_are_watched() -> None:
     assert found["mirror"].processors == found["camera"].processors != ""
 
 
+@pytest.mark.slow
 def test_a_simulated_loop_is_measured_for_real() -> None:
     run = throughput.measure([throughput.SIMULATED], 100.0, 1.5)
     assert "failure" not in run

@@ -61,6 +61,7 @@ def test_the_residual_is_the_predicted_one(tmp_path: Path, frames: int) -> None:
     assert figures["tilt_residual_mas"] == pytest.approx(predicted_mas, rel=0.1)
 
 
+@pytest.mark.slow
 def test_a_process_that_stands_still_is_named(tmp_path: Path) -> None:
     """Five seconds of real time without progress end a lockstep run."""
     process = start(tmp_path, "sim-loop", "--lockstep", "--duration", "600")

@@ -189,6 +189,7 @@ def test_operators_a_restart_and_dropped_frames(night: Night, tmp_path: Path) ->
     assert len(starts) == 2
 
 
+@pytest.mark.slow
 def test_rotated_logs_one_by_one_and_together(night: Night, tmp_path: Path) -> None:
     for name in ("mirror", "controller"):
         night.start(name)

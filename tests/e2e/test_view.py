@@ -104,6 +104,7 @@ def test_the_page_shows_the_live_loop_and_nobody_else_can_see_it(live: str, arte
         assert page_of.returncode == 0, rest
 
 
+@pytest.mark.slow
 def test_the_loop_goes_on_whatever_happens_to_its_view(tmp_path: Path) -> None:
     process = start(tmp_path, "sim-loop", "--web", "--rate", "200", "--duration", "4", "--json")
     until(lambda: "view" in children(process.pid))
