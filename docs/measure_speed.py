@@ -110,9 +110,9 @@ all others. A change may move work from behind the command's put into it; frame 
 stays as it was. Compiled code of our own in the loop is not in the table: it is out by design, so there is no patch for
 it.
 
-Frames go from the camera to the controller by a socket beside zenoh; commands go by zenoh. A change that is marked "by
-the bus alone" is tried in a loop in which frames go through zenoh, too, as they do where there is no such socket, and
-compared with that loop. "Recording" is with the recorder beside, compared likewise.
+Frames go from the camera to the controller, and commands to the mirror, by sockets beside zenoh. A change that is
+marked "by the bus alone" is tried in a loop in which both go through zenoh alone, as they do where there are no such sockets,
+and compared with that loop. "Recording" is with the recorder beside, compared likewise.
 
 """,
     "loaded": """
@@ -150,7 +150,8 @@ def place(document: Path, name: str, result: dict[str, Any]) -> None:
     begin, end = marks(name)
     if begin not in document.read_text():
         before, heading, after = document.read_text().partition(NEXT)
-        document.write_text(f"{before.rstrip()}\n{SECTIONS[name]}{begin}{end}\n{heading}{after}")
+        after = f"\n{heading}{after}" if heading else ""
+        document.write_text(f"{before.rstrip()}\n{SECTIONS[name]}{begin}{end}\n{after}")
     put(document, render(name, result), begin, end)
 
 

@@ -22,7 +22,8 @@ HEADINGS = (
 DEFINITIONS = {
     "t0": "just before the source sends a frame: before the put, the ring's put, or pyrtcao's WavefrontSensor.expose",
     "t1": "just after the controller has sent the frame's command: after the put, the ring's put, or pyrtcao's "
-    "write_stream; for shared memory beside zenoh after the ring's put, before zenoh's",
+    "write_stream; for shared memory beside zenoh after the ring's put, and for lowfc's bus after its socket's send, "
+    "before zenoh's",
     "to the mirror": "from t0 until the command is in the mirror's process: the source's own, on its receiving thread; "
     "for pyrtcao the corrector's process, its actuators made",
     "clock": "CLOCK_MONOTONIC, one host",
