@@ -111,8 +111,8 @@ stays as it was. Compiled code of our own in the loop is not in the table: it is
 it.
 
 Frames go from the camera to the controller, and commands to the mirror, by sockets beside zenoh. A change that is
-marked "by the bus alone" is tried in a loop in which both go through zenoh alone, as they do where there are no such sockets,
-and compared with that loop. "Recording" is with the recorder beside, compared likewise.
+marked "by the bus alone" is tried in a loop in which both go through zenoh alone, as they do where there are no such
+sockets, and compared with that loop. "Recording" is with the recorder beside, compared likewise.
 
 """,
     "loaded": """

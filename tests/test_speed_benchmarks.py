@@ -300,7 +300,7 @@ def test_a_section_is_added_before_what_a_view_costs(tmp_path: Path) -> None:
     measure_speed.place(document, "curves", curves_result())
     first, _, after = document.read_text().partition(measure_speed.NEXT)
     assert first.startswith("# Performance\n\n## What a frame costs\n")
-    assert first.endswith(f"{measure_speed.marks('curves')[1]}\n")
+    assert first.endswith(f"{measure_speed.marks('curves')[1]}\n\n")
     assert after == "\nIts table.\n"
 
 
