@@ -1,7 +1,7 @@
 """`lowfc acceptance capture-range`: from how large a wavefront the loop closes."""
 
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -12,13 +12,20 @@ from lowfc.control.linearity import captured
 from lowfc.control.safety import LoopMode
 from lowfc.optics.zernike import mode_name
 from lowfc.programs.acceptance.live import Live
-from lowfc.programs.acceptance.played import AcceptanceError, Kind, Played, chosen
+from lowfc.programs.acceptance.played import AcceptanceError, Kind, Played, Single, chosen
 
 KIND: Kind = "capture-range"
 SIZES = (0.5, 1.0, 1.5)
 """Of a shape, beside the one from which the loop must close."""
 _TILTS = (2, 3)
-_HOLD = 2  # settling times for which a shape stays, and as long without it
+
+
+class Trial(NamedTuple):
+    """A shape of one mode: what is announced of it, its staircase (frames, 1), its surface (1, actuators)."""
+
+    what: dict[str, Any]
+    table: Single
+    shape: Single
 
 
 def play(live: Live, modes: Sequence[int], required: Acceptance) -> list[Played]:
@@ -30,31 +37,42 @@ def play(live: Live, modes: Sequence[int], required: Acceptance) -> list[Played]
     Raises:
         AcceptanceError: the loop was changed meanwhile, or does not close any more on what it was closed on before.
     """
-    hold = _HOLD * live.loop.settling_frames()
+    plan = [trials for noll in chosen(modes, live.loop.noll) if (trials := _trials(live, noll, required))]
+    live.expect(sum(len(trial.table) for trials in plan for trial in trials))
     found = []
-    for noll in chosen(modes, live.loop.noll):
-        place = live.loop.noll.index(noll)
-        if isinstance(live.loop.law, Law) and not live.loop.law.gain[place]:
-            continue  # nobody asks the loop for it
-        shape = live.calibration.modes_to_actuators[:, place][None]
-        step_nm = live.configuration.safety.slew_nm / 2 / float(np.abs(shape).max())
-        required_nm = _required_nm(required, noll)
-        for level_nm in np.outer(SIZES, (1.0, -1.0)).ravel() * required_nm:
-            stairs, starts = climb([0.0, level_nm], hold, step_nm)
-            begin, there = int(starts[0]), int(starts[1])
-            what = {
-                "noll": noll,
-                "level_nm": float(level_nm),
-                "before": [begin + hold // 2, begin + hold],
-                "after": [there + hold - hold // 4, there + hold],
-            }
-            trial = live.play(KIND, what, LoopMode.CLOSED, stairs.astype(np.float32)[:, None], shape)
-            found.append(trial)
-            if not closed(trial):
+    for trials in plan:
+        for place, trial in enumerate(trials):
+            found.append(live.play(KIND, trial.what, LoopMode.CLOSED, trial.table, trial.shape))
+            if not closed(found[-1]):
+                live.left_out(sum(len(trial.table) for trial in trials[place + 1 :]))
                 live.rest()
                 live.into(LoopMode.CLOSED)
                 break
     return found
+
+
+def _trials(live: Live, noll: int, required: Acceptance) -> list[Trial]:
+    """Every shape of a mode, the smallest first; none where nobody asks the loop for it."""
+    place, law = live.loop.noll.index(noll), live.loop.law
+    if isinstance(law, Law) and not law.gain[place]:
+        return []
+    # A linear law's settling time is that of its slowest pole; an integrator's knows its gain and nothing of the delay.
+    hold = live.loop.settling_frames() * (2 if isinstance(law, Law) else 1)
+    shape = live.calibration.modes_to_actuators[:, place][None]
+    step_nm = live.configuration.safety.slew_nm / 2 / float(np.abs(shape).max())
+    trials = []
+    for level_nm in (np.outer(SIZES, (1.0, -1.0)).ravel() * _required_nm(required, noll)).tolist():
+        stairs, starts = climb([0.0, level_nm], hold, step_nm)
+        begin, there = starts.tolist()
+        what = {
+            "noll": noll,
+            "level_nm": level_nm,
+            "before": [begin + hold // 2, begin + hold],
+            "after": [there + hold - hold // 4, there + hold],
+        }
+        back = len(stairs) - (hold - 1)  # the next one begins with a rest of its own
+        trials.append(Trial(what, stairs[:back].astype(np.float32)[:, None], shape))
+    return trials
 
 
 def closed(trial: Played) -> bool:

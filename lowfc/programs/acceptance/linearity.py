@@ -40,7 +40,7 @@ def play(live: Live, how: Staircase, required: Acceptance) -> list[Played]:
         raise AcceptanceError(
             f"{how.hold_frames} frames at each level are too few: {skipped} pass until the mirror is seen there"
         )
-    found = []
+    plan = []
     for noll in chosen(how.modes, live.loop.noll):
         shape = live.calibration.modes_to_actuators[:, live.loop.noll.index(noll)][None]
         step_nm = live.configuration.safety.slew_nm / 2 / float(np.abs(shape).max())
@@ -52,8 +52,9 @@ def play(live: Live, how: Staircase, required: Acceptance) -> list[Played]:
             "starts": (starts + skipped).tolist(),
             "averaged": how.hold_frames - skipped,
         }
-        found.append(live.play(KIND, what, LoopMode.OPEN, stairs.astype(np.float32)[:, None], shape))
-    return found
+        plan.append((what, stairs.astype(np.float32)[:, None], shape))
+    live.expect(sum(len(table) for _, table, _ in plan))
+    return [live.play(KIND, what, LoopMode.OPEN, table, shape) for what, table, shape in plan]
 
 
 def figures(every: Sequence[Played], required: Acceptance) -> dict[str, Any]:

@@ -27,7 +27,7 @@ class Live:
 
         Args:
             client: that has joined the run.
-            heard: told of frames that have passed, and of all of the play.
+            heard: told of frames that have passed, and of all that are expected.
         """
         self.client = client
         self.calibration = client.calibration()
@@ -39,6 +39,7 @@ class Live:
             )
         self._found = LoopMode(state.mode)
         self._heard = heard
+        self._past = self._expected = 0
         first, *_, last = client.steps(_RATE_STEPS)
         rate_hz = (last.frame_sequence - first.frame_sequence) * 1e9 / (last.time_ns - first.time_ns)
         self.loop = loop_of(state, self.calibration, rate_hz)
@@ -53,6 +54,14 @@ class Live:
             now = LoopMode(self._state().mode)
             if now in (LoopMode.OPEN, LoopMode.CLOSED) and now is not self._found:
                 self.into(self._found)
+
+    def expect(self, frames: int) -> None:
+        """Say how many frames all that is to be played will take; otherwise each play counts by itself."""
+        self._expected = frames
+
+    def left_out(self, frames: int) -> None:
+        """Say that so many of the expected ones will not be played."""
+        self._past += frames
 
     def into(self, mode: LoopMode) -> None:
         """Open or close the loop, where it is not."""
@@ -106,10 +115,12 @@ class Live:
             if step.frame_sequence >= first + frames:
                 break
             kept.append(step)
-            self._heard(step.frame_sequence - first + 1, frames)
+            passed = step.frame_sequence - first + 1
+            self._heard(self._past + passed, max(self._expected, self._past + frames))
             if step.mode is not mode or set(step.reasons) & set(LIMITS):
                 break  # who looks at it says what is wrong
         steps.close()
+        self._past += frames
         after = self._state()
         if [getattr(before, name) for name in _LAW] != [getattr(after, name) for name in _LAW]:
             raise AcceptanceError("gains, or the law, were changed while the loop was measured: measure again")

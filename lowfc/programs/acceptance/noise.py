@@ -24,6 +24,7 @@ _LOOPS = {"open": LoopMode.OPEN, "closed": LoopMode.CLOSED}
 def play(live: Live, duration_s: float) -> list[Played]:
     """Keep what the loop measures with nothing being played: open, then closed, each for so long."""
     frames = max(round(duration_s * live.loop.rate_hz), SHORTEST)
+    live.expect(frames * len(_LOOPS))
     return [live.stretch(KIND, {"loop": name}, mode, frames) for name, mode in _LOOPS.items()]
 
 
