@@ -17,6 +17,8 @@ from lowfc.control.safety import LoopMode, Reason
 
 Single = npt.NDArray[np.float32]
 
+_PIXEL = np.dtype("<u2")  # read from its name, it would cost every frame 0.2 us
+
 
 def decode_frame(payload: bytes, sequence: int, age_ns: int) -> Frame:
     """Frame of a RawImage; its pixels are None where the message holds no whole mono16 image."""
@@ -27,7 +29,7 @@ def decode_frame(payload: bytes, sequence: int, age_ns: int) -> Frame:
     pixels, data = None, image.data  # each look at it makes a copy
     rows, columns, step = image.height, image.width, image.step
     if image.encoding == MONO16 and step == 2 * columns and len(data) == step * rows > 0:
-        pixels = np.frombuffer(data, dtype="<u2").reshape(rows, columns)
+        pixels = np.frombuffer(data, _PIXEL).reshape(rows, columns)
     return Frame(sequence, from_timestamp(image.timestamp), age_ns, pixels)
 
 

@@ -50,7 +50,7 @@ class Estimator(NamedTuple):
         """Modal error of a frame (pixels,); None where its flux is at most `least_flux_dn`."""
         np.copyto(self.scratch, pixels)  # by itself, for it is quicker than a subtraction of two types
         np.subtract(self.scratch, self.dark, out=self.scratch)
-        sums = self.rows @ self.scratch
+        sums = self.rows.dot(self.scratch)  # half a microsecond less than `@`
         flux_dn = float(sums[-1])
         if not flux_dn > least_flux_dn:
             return None

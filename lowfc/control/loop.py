@@ -186,7 +186,7 @@ def _follow(
         command_nm = np.zeros_like(command_nm)
     elif closed:
         command_nm, cut = _respond(drive, error_nm)
-    wanted_nm = (drive.to_actuators @ command_nm).reshape(drive.calibration.grid)
+    wanted_nm = drive.to_actuators.dot(command_nm).reshape(drive.calibration.grid)
     extra_nm: Single | None = None
     if added is not None:
         added = added.moved(sequence, settings.limits.kept_slew_nm / 2, drive.to_modes)

@@ -56,8 +56,9 @@ def _trials(live: Live, noll: int, required: Acceptance) -> list[Trial]:
     place, law = live.loop.noll.index(noll), live.loop.law
     if isinstance(law, Law) and not law.gain[place]:
         return []
-    # A linear law's settling time is that of its slowest pole; an integrator's knows its gain and nothing of the delay.
-    hold = live.loop.settling_frames() * (2 if isinstance(law, Law) else 1)
+    # An integrator's knows its gain and nothing of the delay; a linear law's is five time constants of its slowest
+    # pole, of which three are enough: they leave a twentieth.
+    hold = round(live.loop.settling_frames() * (2 if isinstance(law, Law) else 0.6))
     shape = live.calibration.modes_to_actuators[:, place][None]
     step_nm = live.configuration.safety.slew_nm / 2 / float(np.abs(shape).max())
     trials = []
@@ -67,7 +68,7 @@ def _trials(live: Live, noll: int, required: Acceptance) -> list[Trial]:
         what = {
             "noll": noll,
             "level_nm": level_nm,
-            "before": [begin + hold // 2, begin + hold],
+            "before": [begin + hold - hold // 4, begin + hold],
             "after": [there + hold - hold // 4, there + hold],
         }
         back = len(stairs) - (hold - 1)  # the next one begins with a rest of its own
