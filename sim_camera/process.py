@@ -207,12 +207,12 @@ class CameraProcess:
             try:
                 state = wire.MirrorState.FromString(sample.payload)
             except DecodeError as error:
-                self._service.event("BAD_MESSAGE", topic=sample.key, why=error)
+                self._service.unreadable(sample.key, error)
                 continue
             shape = actuators(state)
             if shape is None or shape.shape != self._latched.shape or not np.isfinite(shape).all():
                 why = "it is not finite, or its grid not the configured mirror's"
-                self._service.event("BAD_MESSAGE", topic=sample.key, why=why)
+                self._service.unreadable(sample.key, why)
                 continue
             self._latched = shape
             if state.frame_sequence > self._newest_state:

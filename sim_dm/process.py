@@ -91,7 +91,7 @@ class MirrorProcess:
         try:
             told = _told(sample.payload)
         except DecodeError as error:
-            self._service.event("BAD_MESSAGE", topic=sample.key, why=error)
+            self._service.unreadable(sample.key, error)
             return
         if isinstance(clock, SimulatedClock):
             clock.set_ns(told.time_ns)

@@ -2,6 +2,7 @@
 
 from collections.abc import Collection
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -56,7 +57,8 @@ class Night:
         self._counts: dict[tuple[str, int], int] = {}
         self._camera_start = START
         self._count = self._frames = 0
-        self._command_nm = np.zeros(len(NOLL), np.float32)
+        self._to_modes = np.linalg.pinv(self.calibration.modes_to_actuators)
+        self._moved_nm = np.zeros(len(NOLL), np.float32)
         self._state = State()
         self.start_controller()
         camera = wire.CameraState(
@@ -82,7 +84,7 @@ class Night:
             self.now_ns += PERIOD_NS
             sequence = sequence_of(self._camera_start, self._count)
             wave_nm = self._disturbance_nm()
-            residual_nm = wave_nm + self._command_nm
+            residual_nm = wave_nm + self._moved_nm
             frame = self._pixels(residual_nm, 0.0 if index in dark else FLUX_DN)
             self._count, self._frames = self._count + 1, self._frames + 1
             self.put(FRAME, image(frame, self.now_ns, "sensor"), sequence)
@@ -101,9 +103,9 @@ class Night:
                 taken = Frame(sequence, self.now_ns, 100_000, frame)
                 self._take(advance(self.settings, self._state, taken), DELAY_NS + 1000 * (self._count % 50))
 
-    def request(self, name: str, values: tuple[float, ...] = (), modes: tuple[int, ...] = ()) -> None:
+    def request(self, name: str, values: tuple[float, ...] = (), modes: tuple[int, ...] = (), **fields: Any) -> None:
         """What an operator asks."""
-        asked = Request(self.now_ns, name, modes, values)
+        asked = Request(self.now_ns, name, modes, values, **fields)
         before = self._state
         after, outputs = advance(self.settings, before, asked)
         assert outputs.reply is not None
@@ -146,7 +148,7 @@ class Night:
             self.event(raised.name, **raised.details)
         if outputs.command is not None:
             command = outputs.command
-            self._command_nm = command.command_nm
+            self._moved_nm = self._to_modes @ command.actuators_nm.ravel()
             self.put(COMMAND, codec.encode_command(command, 10**9, "lowfc", self._state.taken), late_ns=late_ns)
             state = wire.MirrorState(
                 frame_sequence=command.frame_sequence,

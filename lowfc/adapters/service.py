@@ -64,6 +64,7 @@ class Service:
         self._known: set[tuple[str, int]] = set()
         self._wakers: list[Callable[[], None]] = []
         self._event_lock = threading.Lock()
+        self._unreadable: dict[str, tuple[int, object]] = {}
         self._supervisor = Supervisor()
         self._started_ns = self._beaten_ns = clock.host_ns()
         self._worked = 0
@@ -183,6 +184,7 @@ class Service:
         """
         if self._fault is not None:
             raise self._fault
+        self._tell_unreadable()
         self.event("STOPPED", process=self.name, why=self.why)
         self.state = "stopped"
 
@@ -194,6 +196,12 @@ class Service:
             self._events.put(log.SerializeToString())
         if kind.level >= Level.WARNING:
             sys.stderr.write(f"{self.name}: {log.message}\n")
+
+    def unreadable(self, key: str, why: object) -> None:
+        """Count a message that could not be read: a flood is one event with each Health. Callable from any thread."""
+        with self._event_lock:
+            count, _ = self._unreadable.get(key, (0, ""))
+            self._unreadable[key] = count + 1, why
 
     def wait_for(self, names: Iterable[str], timeout_s: float) -> tuple[str, ...]:
         """Wait until these processes are ready and have heard this one, so that they get its first message.
@@ -242,8 +250,15 @@ class Service:
         own = publisher is self._health  # the message that carries the count is one of them
         return wire.TopicCount(topic=publisher.key, published=publisher.published + own)
 
+    def _tell_unreadable(self) -> None:
+        with self._event_lock:
+            unreadable, self._unreadable = self._unreadable, {}
+        for key, (count, why) in unreadable.items():
+            self.event("BAD_MESSAGE", count=count, topic=key, why=why)
+
     def _send_health(self, now_ns: int) -> None:
         self._due_ns = now_ns + HEALTH_PERIOD_NS
+        self._tell_unreadable()
         message = self.health()
         self._beaten_ns, self._worked = now_ns, self.work
         self._health.put(message.SerializeToString())

@@ -80,6 +80,6 @@ EVENTS: dict[str, Event] = {
         Event("DISK_SLOW", Level.WARNING, "the disk took {stall_s:.1f} s for one write; {waiting} messages waited"),
         Event("VIEW_STUCK", Level.WARNING, "the viewer took nothing for {stuck_s:.0f} s; close its window if it hangs"),
         Event("VIEW_RENEWED", Level.WARNING, "the view began anew: {why}"),
-        Event("BAD_MESSAGE", Level.WARNING, "a message on {topic} could not be read: {why}"),
+        Event("BAD_MESSAGE", Level.WARNING, "{count} on {topic} could not be read, the last because: {why}"),
     )
 }

@@ -129,6 +129,25 @@ def test_a_newcomer_is_answered_before_the_next_health_is_due(hub: MemoryHub, cl
     assert [health.process for health in ear.health] == ["controller", "camera", "controller"]
 
 
+def test_a_flood_of_bad_messages_is_one_event_with_each_health(hub: MemoryHub, clock: FakeClock) -> None:
+    ear = Ear(hub, clock)
+    mirror = service(hub, clock, "mirror-dm")
+    for number in range(500):
+        mirror.unreadable("lowfc/mirror/dm/command", f"reason {number}")
+    mirror.beat()
+    mirror.unreadable("lowfc/mirror/dm/command", "too short")
+    mirror.beat()  # no Health is due
+    mirror.stop("enough")
+    mirror.finish()
+    said = [log.message for log in ear.events if "BAD_MESSAGE" in log.message]
+    assert said == [
+        "BAD_MESSAGE 500 on lowfc/mirror/dm/command could not be read, the last because: reason 499",
+        "BAD_MESSAGE 1 on lowfc/mirror/dm/command could not be read, the last because: too short",
+    ]
+    assert "STOPPED" in ear.events[-1].message
+    assert {count.topic: count.published for count in ear.health[-1].topics}["lowfc/event"] == len(ear.events)
+
+
 def test_the_last_health_has_the_final_counts(hub: MemoryHub, clock: FakeClock) -> None:
     ear = Ear(hub, clock)
     camera = service(hub, clock, "camera")

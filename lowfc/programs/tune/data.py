@@ -63,6 +63,8 @@ class Telemetry:
 def of_log(log: LogReader, progress: Callable[[int], None] | None = None) -> Telemetry:
     """The frames of a log that were used while the loop was closed; all of them, where it hardly was.
 
+    What was played, by an acceptance test for one, is nothing that a law shall learn: those frames are left out.
+
     Raises:
         DataFileError: the log cannot be read, or has too few frames in a row.
     """
@@ -72,7 +74,7 @@ def of_log(log: LogReader, progress: Callable[[int], None] | None = None) -> Tel
     rate_hz = history.rate_hz
     same = run.delay_frames == run.controller_delay
     pol_nm = steps.pol_nm if same else steps.error_nm - run.seen_nm
-    usable = run.used & np.isfinite(pol_nm).all(axis=1) & ~run.torn & (steps.saturated_pixels == 0)
+    usable = run.used & np.isfinite(pol_nm).all(axis=1) & ~run.torn & ~run.played & (steps.saturated_pixels == 0)
     true_nm = run.true_nm(history.truths.residual_nm) if len(history.truths.sequence) else None
     state = history.controller
     warnings = []

@@ -1,23 +1,24 @@
 """The logged run as a what-if needs it: exposures, the delay as measured, what each of them saw of the commands."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import fields
 
 import numpy as np
 import numpy.typing as npt
 
-from lowfc.adapters.history import History, Steps, rows_of
+from lowfc.adapters.history import History, Sequences, Steps, rows_of
 from lowfc.adapters.instrument import settings
 from lowfc.adapters.log_reader import LogReader
 from lowfc.contract.codec import decode_frame
 from lowfc.contract.errors import DataFileError
-from lowfc.contract.messages import FRAME
+from lowfc.contract.messages import FRAME, wire
 from lowfc.control.calibration import Calibration
 from lowfc.control.estimator import Estimator
 from lowfc.control.law import Law
 from lowfc.control.safety import LoopMode
 from lowfc.control.stability import delay_weights
 from lowfc.control.what_if import (
+    LONGEST_DELAY,
     delay_from_times,
     delay_from_truth,
     exposed,
@@ -49,6 +50,7 @@ class LoggedRun:
             measured, `measured_from` says from what; `delay_frames` is the one to go by, and `weights` are its.
         seen_nm: (steps, modes) commands that the exposures saw; NaN where a frame was not used and the delay is the
             controller's.
+        played: (steps,) where something was played, which moves the mirror beside the commands.
         torn: (steps,) where the command before is not the one that the log has: something was not recorded.
     """
 
@@ -68,6 +70,7 @@ class LoggedRun:
         self.steps = Steps(*(getattr(history.steps, part.name)[rows] for part in fields(Steps)))
         self.used: Rows = used[rows]
         self.missing = missing_before(self.steps.sequence)
+        self.played = _played(self.steps.sequence, history.requests)
         self.law, self.controller_delay = _law_and_delay(history, self.calibration)
 
         weights = delay_weights(self.controller_delay).astype(np.float32)
@@ -131,6 +134,7 @@ class LoggedRun:
         history, steps, truths = self.history, self.steps, self.history.truths
         if len(truths.sequence):
             moved_nm = self.true_nm(truths.residual_nm - truths.disturbance_nm)
+            moved_nm[self.played] = np.nan
             return delay_from_truth(moved_nm, steps.command_nm, self.missing), "the true wavefront"
         if history.camera is None:
             return None, ""
@@ -138,6 +142,16 @@ class LoggedRun:
         mirror = history.mirror
         delay = delay_from_times(steps.sequence, starts_ns, mirror.sequence, mirror.publish_time_ns)
         return delay, "the times of frames and mirror"
+
+
+def _played(sequence: Sequences, requests: Sequence[wire.Request]) -> Rows:
+    rows = np.zeros(sequence.shape, np.bool_)
+    for request in requests:
+        if request.name == "play" and request.accepted:
+            first = request.frame_sequence
+            last = first + len(request.table) // (4 * max(request.columns, 1)) + LONGEST_DELAY
+            rows |= (sequence >= first) & (sequence < last)
+    return rows
 
 
 def _law_and_delay(history: History, calibration: Calibration) -> tuple[Law, float]:
