@@ -75,6 +75,7 @@ def of_log(log: LogReader, progress: Callable[[int], None] | None = None) -> Tel
     same = run.delay_frames == run.controller_delay
     pol_nm = steps.pol_nm if same else steps.error_nm - run.seen_nm
     usable = run.used & np.isfinite(pol_nm).all(axis=1) & ~run.torn & ~run.played & (steps.saturated_pixels == 0)
+    mode = np.where(run.played, np.uint8(0), steps.mode)  # it settles after a play as after it was closed
     true_nm = run.true_nm(history.truths.residual_nm) if len(history.truths.sequence) else None
     state = history.controller
     warnings = []
@@ -93,7 +94,7 @@ def of_log(log: LogReader, progress: Callable[[int], None] | None = None) -> Tel
         rate_hz,
         run.delay_frames,
         (run.law, driving(state)),
-        (steps.sequence, steps.mode, usable),
+        (steps.sequence, mode, usable),
         (pol_nm, steps.error_nm, true_nm),
         tilt_nm_per_mas(config.star.diameter_m) if config is not None else None,
         warnings,
