@@ -74,8 +74,11 @@ class Links:
         return self._beside(f"{role}.sock") if role in self.ports else None
 
     def shortcut(self, role: str) -> Path | None:
-        """Socket at which a role gets what it waits for; None where the directory's name is too long for one."""
-        return self._beside(f"{role}.in")
+        """Socket at which a role gets what it waits for; None where the directory's name is too long for one.
+
+        None by a router: who may put what is the router's to say, and no process shall get round it.
+        """
+        return None if self.network.router else self._beside(f"{role}.in")
 
     def _beside(self, name: str) -> Path | None:
         path = self.secret_file.parent / name

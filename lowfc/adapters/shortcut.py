@@ -22,7 +22,7 @@ Handler = Callable[[Sample], None]
 
 _BUFFER_BYTES = 4 << 20  # some hundred frames, where the host allows it; the kernel allows twice as much
 _RETRY_S = 0.1
-_LATELY = 256
+_LATELY = 1 << 13  # envelopes: more messages than wait in a socket while its reader stands still
 _ENVELOPE_BYTES = len(Envelope(0, 0).encode())
 
 
@@ -73,10 +73,10 @@ class ShortcutWriter:
             self._socket = made
 
 
-class ShortcutReader:
-    """Hands on each message once: by the socket while a writer has it, by the bus otherwise.
+class _Receiver:
+    """The reader's end of the socket, and its place on the bus; what to make of both is for who inherits.
 
-    A message that is still on the bus when a newer one has come by the socket is too late, and left out.
+    `_by_bus` and `_by_socket` get each message, on the bus's thread and on one of this receiver's own.
     """
 
     def __init__(
@@ -104,9 +104,8 @@ class ShortcutReader:
         self._failed = failed
         self._turn = threading.Lock()
         self._key = key
-        self._first = self._newest = self._newest_by_bus = -1
-        self._both = self._closed = False
-        self._lately: dict[tuple[int, int], None] = {}
+        self._closed = False
+        self._begin()
         self._leave_bus: Callable[[], None] | None = subscribe(self._by_bus)
         path.unlink(missing_ok=True)  # of a process that was killed: there is one of each role
         self._listener = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET)
@@ -126,13 +125,20 @@ class ShortcutReader:
         if self._leave_bus is not None:
             self._leave_bus()
 
+    def _begin(self) -> None:
+        raise NotImplementedError
+
     def _by_bus(self, sample: Sample) -> None:
-        with self._turn:
-            if self._first >= 0 and sample.sequence <= self._newest:
-                self._both = self._both or sample.sequence >= self._first  # it has come by both: the bus can be left
-            elif not self._closed:
-                self._newest_by_bus = sample.sequence
-                self._handler(sample)
+        raise NotImplementedError
+
+    def _by_socket(self, sample: Sample) -> None:
+        raise NotImplementedError
+
+    def _heard(self) -> None:
+        """Called after each message of the socket."""
+
+    def _left(self) -> None:
+        """Called when a writer has gone."""
 
     def _accept(self) -> None:
         """Serve one writer after the other: who comes anew takes the place of the last."""
@@ -158,10 +164,7 @@ class ShortcutReader:
     def _serve(self, connection: socket.socket) -> None:
         with connection:
             self._receive(connection)
-        with self._turn:
-            self._both, self._first = False, -1
-        if self._leave_bus is None and not self._closed:
-            self._leave_bus = self._subscribe(self._by_bus)
+        self._left()
 
     def _receive(self, connection: socket.socket) -> None:
         buffer = memoryview(bytearray(2 * _BUFFER_BYTES))
@@ -179,9 +182,26 @@ class ShortcutReader:
                 self._by_socket(Sample(self._key, payload, *Envelope.unpack(envelope), now_ns))
             except Exception as fault:
                 self._failed(fault)
-            if self._both and self._leave_bus is not None:
-                self._leave_bus()
-                self._leave_bus, self._both = None, False
+            self._heard()
+
+
+class ShortcutReader(_Receiver):
+    """Hands on each message of one publisher once: by the socket while it has a writer, by the bus otherwise.
+
+    A message that is still on the bus when a newer one has come by the socket is too late, and left out.
+    """
+
+    def _begin(self) -> None:
+        self._first = self._newest = self._newest_by_bus = -1
+        self._both = False
+
+    def _by_bus(self, sample: Sample) -> None:
+        with self._turn:
+            if self._first >= 0 and sample.sequence <= self._newest:
+                self._both = self._both or sample.sequence >= self._first  # it has come by both: the bus can be left
+            elif not self._closed:
+                self._newest_by_bus = sample.sequence
+                self._handler(sample)
 
     def _by_socket(self, sample: Sample) -> None:
         with self._turn:
@@ -194,12 +214,27 @@ class ShortcutReader:
             self._newest = sample.sequence
             self._handler(sample)
 
+    def _heard(self) -> None:
+        if self._both and self._leave_bus is not None:
+            self._leave_bus()
+            self._leave_bus, self._both = None, False
 
-class SharedShortcutReader(ShortcutReader):
-    """The same where others may publish too, by the bus alone: it is never left, and a copy is known by its envelope.
+    def _left(self) -> None:
+        with self._turn:
+            self._both, self._first = False, -1
+        if self._leave_bus is None and not self._closed:
+            self._leave_bus = self._subscribe(self._by_bus)
 
-    A copy that comes after `_LATELY` other messages is handed on; it is old by then, and a `Handover` skips it.
+
+class SharedShortcutReader(_Receiver):
+    """Hands on each message once where others may publish too, by the bus alone: it is never left.
+
+    A copy is known by its envelope; numbers alone would not do, for another publisher may have started in the same
+    second. A message that only the bus carried, because the socket was full, may come after a newer one.
     """
+
+    def _begin(self) -> None:
+        self._lately: dict[tuple[int, int], None] = {}
 
     def _by_bus(self, sample: Sample) -> None:
         self._once(sample)

@@ -210,8 +210,8 @@ class ZenohBus:
 
     def publisher(self, topic: Topic, name: str = "") -> ZenohPublisher:
         """See `Bus.publisher`."""
-        sole = self.role.partition("-")[0] in topic.publisher
-        path = self._shortcut(topic, name) if sole else None
+        by_table = self.role.partition("-")[0] in topic.publisher
+        path = self._shortcut(topic, name) if by_table else None
         publisher = ZenohPublisher(self, self._session, topic, topic.at(name), path)
         self._closers.append(publisher.close)
         return publisher

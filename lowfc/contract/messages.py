@@ -48,14 +48,14 @@ class Topic:
         key: zenoh key; `{name}` stands for a mirror's or a process's name.
         message: class of the payload.
         rate: loop, on event, or the number of hertz.
-        publisher: who may put it.
+        publisher: whose it is to put; by a router, nobody else's messages get through.
         subscribers: who gets it.
         simulated_only: there is no such topic on a bench with real devices.
         timeless: in lockstep two runs with the same seed write the same payload bytes.
         queryable: a late joiner may ask the publisher for the last one.
         newest_only: who looks at a run wants the newest only, and gets no more than eyes can follow.
         reader: who waits for it, and gets it by a way of its own from its publisher on the same host.
-        shared: others than that publisher may put it too, so that its reader hears the bus beside its own way.
+        shared: on one host others may put it too, so that its reader hears the bus beside its own way.
         sentence: what it is.
     """
 

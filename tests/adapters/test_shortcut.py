@@ -4,6 +4,7 @@ import socket
 import threading
 import time
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -11,9 +12,10 @@ import pytest
 from lowfc.adapters import shortcut
 from lowfc.adapters.bus import Sample
 from lowfc.adapters.clock import HostClock
-from lowfc.adapters.envelope import Envelope, count_of
+from lowfc.adapters.envelope import Envelope, count_of, sequence_of
 from lowfc.adapters.run import Run, open_run
 from lowfc.adapters.zenoh_bus import ZenohBus, ZenohPublisher
+from lowfc.contract.configuration import Network
 from lowfc.contract.messages import COMMAND, FRAME
 
 PATIENCE_S = 30.0
@@ -265,3 +267,57 @@ def test_handed_is_before_the_bus_where_there_is_a_reader_and_after_it_where_the
         envelope = publisher.put(b"")
         assert envelope.publish_time_ns <= publisher.handed_ns
         assert (publisher.handed_ns <= put_ns[-1]) is is_read
+
+
+class Shared:
+    """A reader on a socket of its own and a bus that is only a function; `got` has each message's number."""
+
+    def __init__(self, folder: Path) -> None:
+        self.got: list[int] = []
+        self.by_bus: Callable[[Sample], None] = lambda _: None
+        path = folder / "mirror-dm.in"
+        self.reader = shortcut.SharedShortcutReader(path, "k", self.hear, self.subscribe, lambda: 0, self.failed)
+        self.writer = shortcut.ShortcutWriter(path)
+
+    def subscribe(self, handler: Callable[[Sample], None]) -> Callable[[], None]:
+        self.by_bus = handler
+        return lambda: None
+
+    def hear(self, sample: Sample) -> None:
+        self.got.append(count_of(sample.sequence))
+
+    def failed(self, fault: Exception) -> None:
+        raise fault
+
+    def bus(self, count: int) -> None:
+        self.by_bus(Sample("k", b"", sequence_of(5, count), count, 0))
+
+    def socket(self, count: int) -> None:
+        while not self.writer.send(Envelope(sequence_of(5, count), count).encode(), b""):
+            time.sleep(0.001)  # the socket is full
+
+
+@pytest.fixture
+def shared(tmp_path: Path) -> Iterator[Shared]:
+    made = Shared(tmp_path)
+    yield made
+    made.writer.close()
+    made.reader.close()
+
+
+def test_after_a_stall_in_which_the_bus_was_quicker_nothing_comes_twice(shared: Shared) -> None:
+    """A few thousand commands are the most that wait in a socket."""
+    number = 5000
+    for count in range(number):
+        shared.bus(count)
+    for count in range(number + 1):
+        shared.socket(count)
+    until("the last one", lambda: shared.got[-1] == number)
+    assert shared.got == list(range(number + 1))
+
+
+def test_by_a_router_there_is_no_short_way_round_its_access_control(ends: Ends) -> None:
+    assert ends.run.links.shortcut("mirror-dm") is not None
+    across = replace(ends.run.links, network=Network(router="tls/localhost:7447", certificates="certs"))
+    assert across.shortcut("mirror-dm") is None
+    assert across.shortcut("controller") is None

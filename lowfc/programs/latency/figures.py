@@ -42,7 +42,8 @@ class Frames:
         due_ns: when it ought to have been put; None where there was no schedule.
         commanded: whether there is a command made from it.
         transport_ns: from the put to its reception by the controller; `UNKNOWN` where nothing says.
-        command_ns: from the put to just after the command's put; `UNKNOWN` where nothing says.
+        command_ns: from the put to when the command was handed to the mirror's socket, or to the bus;
+            `UNKNOWN` where nothing says.
         stages_ns: of `STAGES`, each (frames,); `UNKNOWN` where nothing says.
         mirror_ns: when the mirror said that it had applied the command; `UNKNOWN` where it did not.
     """
