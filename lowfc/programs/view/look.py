@@ -93,8 +93,8 @@ def look_at_logs(logs: list[Path], config: Configuration | None, where: Place) -
             stack.callback(viewer.stop)
         stream = where.stream(viewer, part, logs[0].stem, None)
         stack.callback(_end, stream, viewer)
-        _say_where(where, viewer)
         if viewer is None or where.picture is not None:
+            _say_where(where, viewer)
             drawn = _draw(logs, config, stream)
             stream.disconnect()  # a viewer keeps what it has
             if viewer is not None:
@@ -102,6 +102,7 @@ def look_at_logs(logs: list[Path], config: Configuration | None, where: Place) -
         else:
             drawn = Drawn()
             with contextlib.suppress(KeyboardInterrupt):  # the way to end it, whether everything is drawn yet or not
+                _say_where(where, viewer)
                 drawn = _draw(logs, config, stream)
                 while viewer.alive:
                     time.sleep(_POLL_S)
