@@ -5,6 +5,7 @@ import time
 from pathlib import Path
 
 import numpy as np
+import pytest
 from loops import interrupt, run, start, until
 
 from lowfc.adapters import calibration_file
@@ -28,6 +29,7 @@ stay_awake = false
 """
 
 
+@pytest.mark.slow
 def test_a_running_loop_is_calibrated_interrupted_and_gone_on_with(tmp_path: Path) -> None:
     (tmp_path / "test.toml").write_text(CONFIG)
     loop = start(tmp_path, "sim-loop", "--config", "test.toml", "--no-record", "--open")

@@ -111,13 +111,10 @@ def bench(folder: Path) -> Iterator[Bench]:
 
 
 ORDERS = list(itertools.permutations(["camera", "mirror", "controller"]))
-QUICK = (("mirror", "camera", "controller"),)
 
 
-@pytest.mark.parametrize(
-    "order",
-    [pytest.param(order, marks=() if order in QUICK else pytest.mark.slow, id="-".join(order)) for order in ORDERS],
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("order", ORDERS, ids="-".join)
 def test_any_start_order(bench: Bench, order: tuple[str, ...]) -> None:
     """Each is up before the next is started, so that every one of them is first and last once."""
     for name in order:

@@ -155,6 +155,7 @@ def test_help_has_examples(tmp_path: Path) -> None:
         assert "Example: lowfc" in done.stdout
 
 
+@pytest.mark.slow
 def test_a_disk_that_refuses_ends_the_recording_and_nothing_else(tmp_path: Path) -> None:
     words = [*LOWFC, "sim-loop", "--rate", "200", "--duration", "1", "--json"]
     small = (3_000_000, 3_000_000)
