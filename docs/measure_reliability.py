@@ -3,6 +3,7 @@
 Example:
     python docs/measure_reliability.py                    # all of it; goes on with the seeds that are missing
     python docs/measure_reliability.py --parts chaos      # chaos, soak, fuzz: what to measure, the rest stays
+    python docs/measure_reliability.py --again frames-truncated  # after a change that is of this case alone
     python docs/measure_reliability.py --render           # the tables again from docs/reliability.json
 """
 
@@ -48,6 +49,16 @@ def chaos(seeds: tuple[int, ...], found: dict[str, Any], save: Callable[[dict[st
         found["runs"].append({"seed": seed, **counts(rows), "cases": rows})
         found["runs"].sort(key=lambda run: run["seed"])
         save(found)
+    return found
+
+
+def chaos_again(names: list[str], found: dict[str, Any]) -> dict[str, Any]:
+    """These cases anew with every seed; the figures say which, and of what source."""
+    for run in found["runs"]:
+        anew = {row["name"]: row for row in cases(run["seed"], names)}
+        run["cases"] = [anew.get(row["name"], row) for row in run["cases"]]
+        run |= counts(run["cases"])
+    found["again"] = found.get("again", {}) | dict.fromkeys(names, source_of_the_loop())
     return found
 
 
@@ -150,7 +161,9 @@ def chaos_tables(measured: dict[str, Any]) -> str:
         ]
     if len(stalls) > 2:
         text += [*stalls, ""]
-    return "\n".join([*text, where(measured), ""])
+    again = ", ".join(f"`{name}`" for name in measured.get("again", {}))
+    later = f" Measured again after a change of what the case itself does: {again}." if again else ""
+    return "\n".join([*text, where(measured) + later, ""])
 
 
 def soak_table(measured: dict[str, Any]) -> str:
@@ -215,6 +228,7 @@ def main() -> None:
     parser.add_argument("--render", action="store_true", help=f"use {MEASURED.relative_to(ROOT)} as it is")
     parser.add_argument("--parts", nargs="+", choices=[*PARTS], default=[*PARTS])
     parser.add_argument("--seeds", nargs="+", type=int, default=[*SEEDS])
+    parser.add_argument("--again", nargs="+", choices=[*CASES], help="only these chaos cases, with the seeds there are")
     parser.add_argument("--hours", type=float, default=HOURS)
     parser.add_argument("--inputs", type=int, default=INPUTS)
     asked = parser.parse_args()
@@ -229,7 +243,9 @@ def main() -> None:
         "soak": lambda: soak(asked.hours),
         "fuzz": lambda: fuzz(asked.inputs),
     }
-    for part in () if asked.render else asked.parts:
+    if asked.again:
+        save("chaos", chaos_again(asked.again, measured["chaos"]))
+    for part in () if asked.render or asked.again else asked.parts:
         save(part, measure[part]())
     for part, render in PARTS.items():
         table = render(measured[part]) if part in measured else "Not measured yet.\n"
