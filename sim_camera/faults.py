@@ -6,6 +6,8 @@ from enum import StrEnum
 import numpy as np
 import numpy.typing as npt
 
+from lowfc.contract.messages import RawImage
+
 Frame = npt.NDArray[np.uint16]
 
 MOST_FRAMES_LATE = 50
@@ -134,7 +136,8 @@ def payload(faults: tuple[Fault, ...], index: int, message: bytes) -> bytes:
             rng = fault.random(index)
             match fault.kind:
                 case Kind.TRUNCATED:
-                    message = message[: int(rng.integers(0, len(message)))]
+                    pixels = RawImage.FromString(message).data  # without what follows them the image is whole
+                    message = message[: int(rng.integers(0, message.index(pixels) + len(pixels)))]
                 case Kind.RANDOM:
                     message = rng.bytes(int(rng.integers(1, 2 * len(message))))
     return message

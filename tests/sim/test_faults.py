@@ -13,7 +13,7 @@ from lowfc.adapters.envelope import count_of, start_of
 from lowfc.adapters.memory_bus import MemoryBus, MemoryHub
 from lowfc.contract.codec import decode_frame
 from lowfc.contract.errors import ConfigurationError
-from lowfc.contract.messages import FRAME
+from lowfc.contract.messages import FRAME, image
 from sim_camera.faults import LOST_SHARE, MOST_FRAMES_LATE, TRACK_PIXELS, Fault, Kind, cut, payload, pixels, sent
 from sim_camera.faulty import EARLIER_S, FaultyFrames, read_faults
 
@@ -83,10 +83,11 @@ def test_what_the_detector_gives() -> None:
 
 
 def test_what_is_on_the_wire() -> None:
-    message = bytes(range(200))
+    message = image(IMAGE, 0, "sensor").SerializeToString()
     assert cut(fault(Kind.WRONG_SIZE), FIRST, IMAGE).shape == (19, 19)
-    short = [payload(fault(Kind.TRUNCATED), index, message) for index in range(FIRST, FIRST + 50)]
-    assert all(message.startswith(one) and len(one) < len(message) for one in short)
+    cutting = (Fault(Kind.TRUNCATED, FIRST, 5000, 5),)
+    short = [payload(cutting, index, message) for index in range(FIRST, FIRST + 5000)]
+    assert all(message.startswith(one) and decode_frame(one, 1, 0).pixels is None for one in short)
     assert len({payload(fault(Kind.RANDOM), index, message) for index in range(FIRST, FIRST + 50)}) == 50
 
 
