@@ -6,8 +6,6 @@ from enum import StrEnum
 import numpy as np
 import numpy.typing as npt
 
-from lowfc.contract.messages import RawImage
-
 Frame = npt.NDArray[np.uint16]
 
 MOST_FRAMES_LATE = 50
@@ -129,15 +127,14 @@ def cut(faults: tuple[Fault, ...], index: int, frame: Frame) -> Frame:
     return np.ascontiguousarray(frame[1:, :-1]) if wrong else frame
 
 
-def payload(faults: tuple[Fault, ...], index: int, message: bytes) -> bytes:
-    """The bytes of a frame's message, as they come."""
+def payload(faults: tuple[Fault, ...], index: int, message: bytes, image_end: int) -> bytes:
+    """The bytes of a frame's message, whose image ends at `image_end`, as they come."""
     for fault in faults:
         if fault.strikes(index):
             rng = fault.random(index)
             match fault.kind:
                 case Kind.TRUNCATED:
-                    pixels = RawImage.FromString(message).data  # without what follows them the image is whole
-                    message = message[: int(rng.integers(0, message.index(pixels) + len(pixels)))]
+                    message = message[: int(rng.integers(0, image_end))]
                 case Kind.RANDOM:
                     message = rng.bytes(int(rng.integers(1, 2 * len(message))))
     return message

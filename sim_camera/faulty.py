@@ -45,8 +45,9 @@ class FaultyFrames:
         """Message of a frame (rows, columns)."""
         before = frame if self._before is None else self._before
         self._before = pixels(self._faults, index, frame, before, self._dark, self._highest)
-        message = image(cut(self._faults, index, self._before), time_ns, "lowfc_camera").SerializeToString()
-        return payload(self._faults, index, message)
+        sound = image(cut(self._faults, index, self._before), time_ns, "lowfc_camera")
+        message = sound.SerializeToString()
+        return payload(self._faults, index, message, message.index(sound.data) + len(sound.data))
 
     def put(self, index: int, message: bytes, now_ns: int) -> Envelope:
         """Publish what is due at the end of an exposure; return the envelope that its frame has or should have."""

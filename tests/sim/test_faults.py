@@ -41,7 +41,7 @@ def test_outside_its_time_a_fault_changes_nothing(kind: Kind) -> None:
         assert sent(fault(kind), index) == (index,)
         assert spoilt(kind, index) is IMAGE
         np.testing.assert_array_equal(cut(fault(kind), index, IMAGE), IMAGE)
-        assert payload(fault(kind), index, b"whole") == b"whole"
+        assert payload(fault(kind), index, b"whole", 5) == b"whole"
 
 
 def test_a_tenth_of_the_frames_is_lost_as_the_seed_says() -> None:
@@ -83,12 +83,14 @@ def test_what_the_detector_gives() -> None:
 
 
 def test_what_is_on_the_wire() -> None:
-    message = image(IMAGE, 0, "sensor").SerializeToString()
+    sound = image(IMAGE, 0, "sensor")
+    message = sound.SerializeToString()
+    end = message.index(sound.data) + len(sound.data)
     assert cut(fault(Kind.WRONG_SIZE), FIRST, IMAGE).shape == (19, 19)
     cutting = (Fault(Kind.TRUNCATED, FIRST, 5000, 5),)
-    short = [payload(cutting, index, message) for index in range(FIRST, FIRST + 5000)]
+    short = [payload(cutting, index, message, end) for index in range(FIRST, FIRST + 5000)]
     assert all(message.startswith(one) and decode_frame(one, 1, 0).pixels is None for one in short)
-    assert len({payload(fault(Kind.RANDOM), index, message) for index in range(FIRST, FIRST + 50)}) == 50
+    assert len({payload(fault(Kind.RANDOM), index, message, end) for index in range(FIRST, FIRST + 50)}) == 50
 
 
 @pytest.mark.parametrize("kind", [Kind.DUPLICATED, Kind.REORDERED, Kind.LATE, Kind.OLD_SEQUENCE, Kind.TRUNCATED])
