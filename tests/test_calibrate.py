@@ -279,6 +279,19 @@ def test_what_cannot_be_calibrated_is_said(monkeypatch: pytest.MonkeyPatch) -> N
         taken_of(lossy, "hadamard", 4)
 
 
+def test_a_delay_of_one_frame_that_is_measured_as_a_little_less_gives_the_same_linear_range() -> None:
+    found = []
+    for measured in (0.998, 1.002):
+        loop, said = FoldedLoop(configured(**FEW)), list[str]()
+        calibrator = Calibrator(loop, Wanted("hadamard", None, 100.0, 4, OUT, resume=False), said.append, ignore)
+        with calibrator.holding():
+            delay = calibrator.delay()
+            assert delay.delay_frames == pytest.approx(1, abs=0.05)
+            found.append(calibrator.linear_range(loop.calibration(), delay._replace(delay_frames=measured)))
+        assert not any("once more" in one for one in said)
+    np.testing.assert_allclose(found[0].gain, found[1].gain, rtol=0.01)
+
+
 def test_the_linear_range_is_measured_again_where_frames_were_lost() -> None:
     lost = [range(0)]
     loop = FoldedLoop(configured(**FEW), lose=lambda index: index in lost[-1])

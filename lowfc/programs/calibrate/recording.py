@@ -82,21 +82,22 @@ class Recording(NamedTuple):
 
     def played(self, table: Array, delay_frames: float) -> Array:
         """(frames, columns): what of a table each exposure saw."""
-        weights = np.concatenate([[0.0], delay_weights(max(delay_frames, 1.0))])
-        return seen(table, weights, self.steps, self.commanded)[self._steps_of_frames]
+        return seen(table, _weights(delay_frames), self.steps, self.commanded)[self._steps_of_frames]
 
     def commands(self, delay_frames: float) -> Array:
         """(frames, modes): what of the loop's own command each exposure saw."""
-        weights = np.concatenate([[0.0], delay_weights(max(delay_frames, 1.0))])
         places = np.arange(self.steps[-1] + 1)
         newest = np.searchsorted(self.steps, places, side="right") - 1  # where a step is missing, the one before held
-        return seen(self.command_nm[newest], weights, self.steps, np.ones(len(self.steps), np.bool_))[
-            self._steps_of_frames
-        ]
+        all_of_them = np.ones(len(self.steps), np.bool_)
+        return seen(self.command_nm[newest], _weights(delay_frames), self.steps, all_of_them)[self._steps_of_frames]
 
     def usable(self, plan: Plan, delay_frames: float) -> npt.NDArray[np.bool_]:
         """(frames,) whether each frame may be used."""
-        return usable(plan, self.steps, self.commanded, int(max(delay_frames, 1.0)))[self._steps_of_frames]
+        return usable(plan, self.steps, self.commanded, _lag(delay_frames))[self._steps_of_frames]
+
+    def blocks(self, plan: Plan, delay_frames: float) -> npt.NDArray[np.intp]:
+        """(frames,) the block of a plan that each frame sees."""
+        return plan.block[np.clip(self.sequence - _lag(delay_frames), 0, len(plan) - 1)]
 
     @property
     def whole(self) -> bool:
@@ -106,6 +107,16 @@ class Recording(NamedTuple):
     @property
     def _steps_of_frames(self) -> npt.NDArray[np.intp]:
         return np.searchsorted(self.steps, self.sequence)
+
+
+def _lag(delay_frames: float) -> int:
+    """Whole frames from a row's frame to the first exposure that sees it; one frame is measured as 0.998, too."""
+    return int(max(delay_frames, 1.0))
+
+
+def _weights(delay_frames: float) -> Array:
+    """(lags,) part of the row of so many frames before that an exposure sees."""
+    return np.concatenate([[0.0], delay_weights(max(delay_frames, 1.0))])
 
 
 def play(loop: Loop, basis_nm: npt.NDArray[np.floating], table: npt.NDArray[np.floating]) -> Recording:

@@ -201,10 +201,9 @@ class Calibrator:
             fractions, _ = self._fractions(recording)
             modes_nm = (fractions - made.reference) @ made.reconstructor.T.astype(np.float64)
             use = recording.usable(plan, delay.delay_frames)
-            block = plan.block[np.clip(recording.sequence - int(delay.delay_frames), 0, len(plan) - 1)]
             poked = recording.played(plan.table, delay.delay_frames)
             try:
-                return linear_range(modes_nm[use], poked[use], block[use])
+                return linear_range(modes_nm[use], poked[use], recording.blocks(plan, delay.delay_frames)[use])
             except ValueError as error:
                 self._say(f"once more: {error}")
         raise CalibrationError(
