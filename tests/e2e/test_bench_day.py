@@ -95,6 +95,7 @@ def test_a_day_on_the_bench(tmp_path: Path) -> None:
         assert run(tmp_path, LAW)
     controller = start(tmp_path, *shlex.split(WITH_IT)[1:])
     until(lambda: "bench" in running())
+    until(lambda: subprocess.run([*LOWFC, "ctl", "status"], capture_output=True, check=False).returncode == 0)
     interrupt(controller)
     assert controller.returncode == 0
     assert {"computed.fits", "there.fits", "night.fits", "aligned.fits", "lqg.fits", "rejection.png"} <= {
