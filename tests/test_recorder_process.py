@@ -32,10 +32,11 @@ SAFE_NS = 600_000_000
 
 # One process imports everything, and a copy of it becomes the recorder of each run.
 RECORDERS = """
-import os, sys
+import os, signal, sys
 from pathlib import Path
 from lowfc.adapters.run import open_run
 from lowfc.programs.recording.recorder import record
+signal.signal(signal.SIGHUP, signal.SIG_DFL)  # tests under nohup would leave it ignored
 folder, *runs = sys.argv[1:]
 for run in runs:
     pid = os.fork()
