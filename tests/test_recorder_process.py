@@ -1,5 +1,6 @@
 """The recorder as a process: killed at any moment, told to stop in any way, refused where there is no room."""
 
+import contextlib
 import json
 import os
 import signal
@@ -60,6 +61,7 @@ class Bench:
         self.service = Service("camera", self.run.run_id, self.clock, self.bus)
         self.frames, self.steps = self.service.publisher(FRAME), self.service.publisher(STEP)
         self.pid = 0
+        self.parent: subprocess.Popen[str] | None = None
         self.killed_ns = 0
         self.service.state = "ready"
 
@@ -94,6 +96,8 @@ def started(benches: Sequence[Bench], folder: Path) -> "subprocess.Popen[str]":
     )
     assert parent.stdout is not None
     for bench in benches:
+        bench.parent = parent
+    for bench in benches:
         bench.pid = int(parent.stdout.readline())
     until(lambda: sum(bench.recorder_is("ready") for bench in benches) == len(benches))  # all of them beat
     return parent
@@ -105,6 +109,12 @@ def benches(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[list[Ben
     yield found
     for bench in found:
         bench.close()
+    for parent in {bench.parent for bench in found if bench.parent is not None}:
+        with contextlib.suppress(ProcessLookupError):  # where all went well, none of them is left
+            os.killpg(parent.pid, signal.SIGKILL)
+        parent.wait()
+        if parent.stdout is not None:
+            parent.stdout.close()
 
 
 @pytest.mark.node
