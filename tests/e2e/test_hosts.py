@@ -434,9 +434,10 @@ def test_a_second_controller_is_refused(bench: Bench) -> None:
 
 
 HELD = """
-import sys, time
+import signal, sys, time
 from pathlib import Path
 from networks import Lab
+signal.signal(signal.SIGINT, signal.default_int_handler)  # tests in the background of a shell would leave it ignored
 lab = Lab(Path(sys.argv[1]), {"one": 0, "two": 0})
 sleeper = lab["one"].start("sleeper", "-c", "import time; time.sleep(600)")
 print(*(host.holder.pid for host in lab.hosts.values()), sleeper.process.pid, flush=True)
