@@ -209,6 +209,7 @@ def test_rotated_logs_one_by_one_and_together(night: Night, tmp_path: Path) -> N
     assert together["frames"] == steps_of(*logs)
 
 
+@pytest.mark.slow
 def test_a_log_cut_short_and_a_log_with_a_hole(tmp_path: Path) -> None:
     made = loop(tmp_path, "--lockstep", "--rate", "400", "--duration", "3")["log"]
     whole = replayed(tmp_path, made)

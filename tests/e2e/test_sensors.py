@@ -31,7 +31,7 @@ static_nm = {{ {", ".join(f'"{noll}" = {nm}' for noll, nm in STATIC_NM.items())}
 """
 
 
-@pytest.mark.parametrize("sensor", ["clowfs", "zwfs", "bar"])
+@pytest.mark.parametrize("sensor", ["zwfs", *(pytest.param(one, marks=pytest.mark.slow) for one in ("clowfs", "bar"))])
 def test_every_mode_of_a_static_wavefront_is_removed(tmp_path: Path, sensor: str) -> None:
     figures = loop(tmp_path, "--lockstep", "--duration", "0.6", "--sensor", sensor, config=STILL)
     assert figures["frames_published"] == figures["commands_applied"] == 150
