@@ -123,12 +123,13 @@ LOGS = (
 )
 
 
-@pytest.mark.parametrize("command", LOOPS)
+@pytest.mark.parametrize("command", [LOOPS[0], *(pytest.param(one, marks=pytest.mark.slow) for one in LOOPS[1:])])
 def test_the_loops(tmp_path: Path, command: str) -> None:
     assert "frame to command" in run(tmp_path, command)
     assert len(list((tmp_path / "logs").glob("*.mcap"))) == 1
 
 
+@pytest.mark.slow
 def test_the_requests(tmp_path: Path) -> None:
     loop = start(tmp_path, "sim-loop", "--rate", "100", "--no-record")
     try:

@@ -154,6 +154,7 @@ def night(tmp_path: Path) -> Iterator[Night]:
     made.close()
 
 
+@pytest.mark.slow
 def test_operators_a_restart_and_dropped_frames(night: Night, tmp_path: Path) -> None:
     for name in ("mirror", "controller", "recorder"):
         night.start(name)
