@@ -97,7 +97,6 @@ def started(benches: Sequence[Bench], folder: Path) -> "subprocess.Popen[str]":
     assert parent.stdout is not None
     for bench in benches:
         bench.parent = parent
-    for bench in benches:
         bench.pid = int(parent.stdout.readline())
     until(lambda: sum(bench.recorder_is("ready") for bench in benches) == len(benches))  # all of them beat
     return parent
@@ -110,11 +109,8 @@ def benches(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[list[Ben
     for bench in found:
         bench.close()
     for parent in {bench.parent for bench in found if bench.parent is not None}:
-        with contextlib.suppress(ProcessLookupError):  # where all went well, none of them is left
+        with parent, contextlib.suppress(ProcessLookupError):  # where all went well, none of them is left
             os.killpg(parent.pid, signal.SIGKILL)
-        parent.wait()
-        if parent.stdout is not None:
-            parent.stdout.close()
 
 
 @pytest.mark.node
