@@ -1,0 +1,272 @@
+"""Make the golden files of the version at hand: `python tests/golden/make.py FOLDER`.
+
+A short loop on the bus in memory, whose camera exposes frame by frame and whose clock is moved by hand, so that every
+kind of input of the controller is in its log. What a released version has written is never written again.
+"""
+
+import shutil
+import sys
+import threading
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from lowfc.adapters import calibration_file, instrument, law_file
+from lowfc.adapters.bus import Sample
+from lowfc.adapters.clock import FakeClock
+from lowfc.adapters.log_writer import Attachment
+from lowfc.adapters.memory_bus import MemoryBus, MemoryHub
+from lowfc.adapters.provenance import provenance
+from lowfc.adapters.service import Service
+from lowfc.client import Client
+from lowfc.contract.calibration_codec import identified
+from lowfc.contract.codec import actuators
+from lowfc.contract.configuration import Configuration, load
+from lowfc.contract.errors import RequestRefusedError
+from lowfc.contract.messages import CAMERA_STATE, FRAME, MIRROR_STATE, STEP, TRUTH, image, timestamp, wire
+from lowfc.control.calibration import Calibration
+from lowfc.control.law import Law
+from lowfc.control.linear_law import LinearLaw, integrator_block, of_blocks
+from lowfc.programs.controller import Controller
+from lowfc.programs.recording.recorder import Recorder
+from sim_camera.process import bench
+from sim_dm.process import MirrorProcess
+
+ROOT = Path(__file__).parents[2]
+START_NS = 1_767_225_600_000_000_000
+PATIENCE_S = 20.0
+CONFIGURATION = {
+    "sensor.modes": 2,
+    "mirror.rows": 12,
+    "mirror.columns": 12,
+    "mirror.pitches_per_pupil": 10.0,
+    "mirror.settling_us": 0.0,
+    "star.magnitude": 2.0,
+    "camera.rate_hz": 1000.0,
+    "camera.gain_e_per_dn": 10.0,  # small differences between pixels, so that the log is small
+    "disturbance.preset": "bench",
+    "control.delay_frames": 1.5,
+    "control.hold_ms": 40.0,
+    "control.start_mode": "open",
+    "seed": 7,
+}
+
+
+class Night:
+    """A run in one process: camera by hand, controller, mirror and recorder on threads of their own."""
+
+    def __init__(self, config: Configuration, calibration: Calibration, folder: Path) -> None:
+        self.config, self.calibration = config, calibration
+        self.hub, self.clock = MemoryHub(), FakeClock(START_NS)
+        self.index = 0
+        self.shape_nm = np.zeros((config.mirror.rows, config.mirror.columns), np.float32)
+        self.scene = bench(config)
+        self.answered: dict[str, int] = {}
+        operator = self.bus("operator")
+        operator.subscribe(STEP, self._hear_step)
+        operator.subscribe(MIRROR_STATE, self._hear_mirror)
+        self.client = Client("golden", bus=operator)
+        self.start_camera()
+        (folder / "run").mkdir(parents=True)
+        self.mirror = MirrorProcess(config, self.service("mirror-dm"))
+        attached = [
+            Attachment("config.toml", "application/toml", config.to_toml().encode()),
+            Attachment("calibration.fits", "application/fits", calibration_file.to_bytes(calibration)),
+        ]
+        self.recorder = Recorder(
+            self.bus("recorder"),
+            self.clock,
+            "golden",
+            folder / "logs",
+            metadata={"lowfc": provenance("golden", config.seed) | {"host": "bench"}},
+            attachments=attached,
+        )
+        self.controller = Controller(
+            config, self.service("controller"), calibration, "calibration.fits", folder / "run" / "safed"
+        )
+        self.threads = [threading.Thread(target=one.run) for one in (self.mirror, self.controller, self.recorder)]
+        for thread in self.threads:
+            thread.start()
+        self.until(lambda: self.recorder.service.state == "ready")
+
+    def bus(self, role: str) -> MemoryBus:
+        return MemoryBus(self.hub, role, self.clock)
+
+    def service(self, role: str) -> Service:
+        made = Service(role, "golden", self.clock, self.bus(role))
+        setattr(self, f"{role.partition('-')[0]}_service", made)
+        return made
+
+    def start_camera(self, **changes: float) -> None:
+        """Start the camera, or start it again with other settings."""
+        bus = self.bus("camera")
+        self.frames, self.truths = bus.publisher(FRAME), bus.publisher(TRUTH)
+        self.settings = bus.publisher(CAMERA_STATE)
+        state = instrument.camera_state(self.config, self.scene.shape, self.clock.now_ns())
+        for name, value in changes.items():
+            setattr(state, name, value)
+        self.settings.put(state.SerializeToString())
+
+    def _hear_step(self, sample: Sample) -> None:
+        self.answered["step"] = wire.ControlStep.FromString(sample.payload).frame_sequence
+
+    def _hear_mirror(self, sample: Sample) -> None:
+        found = actuators(wire.MirrorState.FromString(sample.payload))
+        assert found is not None
+        self.shape_nm = found
+
+    def until(self, met: Callable[[], bool]) -> None:
+        deadline_s = time.monotonic() + PATIENCE_S
+        while not met():
+            assert time.monotonic() < deadline_s, "waited in vain"
+            time.sleep(0.002)
+
+    def expose(self, frames: int, change: Callable[[Any], Any] = lambda pixels: pixels, late_ns: int = 0) -> None:
+        """Some frames, each waiting for its step; `change` does something to their pixels."""
+        for _ in range(frames):
+            pixels, truth = self.scene.expose(self.index, self.shape_nm)
+            self.index += 1
+            self.clock.advance(self.config.period_ns)
+            time_ns = self.clock.now_ns()
+            sent = self.frames.put(image(change(pixels), time_ns, "camera").SerializeToString(), time_ns - late_ns)
+            message = wire.Truth(
+                timestamp=timestamp(time_ns),
+                frame_sequence=sent.sequence,
+                disturbance_nm=truth.disturbance_nm.tolist(),
+                residual_nm=truth.residual_nm.tolist(),
+                disturbance_rms_nm=truth.disturbance_rms_nm,
+                residual_rms_nm=truth.residual_rms_nm,
+            )
+            self.truths.put(message.SerializeToString())
+            self.until(lambda: self.answered.get("step") == sent.sequence)  # noqa: B023  # called at once
+
+    def refused(self, ask: Callable[[], object]) -> None:
+        """A request that is refused."""
+        try:
+            ask()
+        except RequestRefusedError:
+            return
+        raise AssertionError("the request was granted")
+
+    def silence(self) -> None:
+        """No frame for a while: the command is repeated, and NO_FRAMES."""
+        for _ in range(3):
+            self.clock.advance(20_000_000)
+            self.until(lambda: self.controller._service.clock.now_ns() == self.clock.now_ns())
+            time.sleep(0.05)
+
+    def finish(self) -> None:
+        for thread, service in (
+            (self.threads[1], self.controller_service),
+            (self.threads[0], self.mirror_service),
+            (self.threads[2], self.recorder.service),
+        ):
+            service.stop("done")
+            thread.join(PATIENCE_S)
+            assert not thread.is_alive()
+
+
+def law(config: Configuration) -> LinearLaw:
+    """An integrator of the pseudo-open-loop modes, which remembers commands."""
+    settings = instrument.settings(config)
+    of_modes: Law = settings.law(config.noll)
+    blocks = [
+        integrator_block(gain, 0.01, "pol", settings.delay_frames) for gain in of_modes.gain.astype(float).tolist()
+    ]
+    return of_blocks(blocks, "pol", "golden integrator", config.noll, settings.delay_frames, config.camera.rate_hz)
+
+
+def main(folder: Path) -> None:
+    """Write all golden files."""
+    folder.mkdir(parents=True)
+    config = load(None, CONFIGURATION)
+    optics = instrument.twin(config, None, print)
+    calibration = instrument.analytic_calibration(config, optics, instrument.mirror_on_twin(config, optics, print))
+    made = law(config)
+    calibration_file.save(calibration, folder / "calibration.fits")
+    law_file.save(made, folder / "law.fits")
+    (folder / "lowfc.toml").write_text(config.to_toml())
+    for path in (ROOT / "deploy/layouts").glob("*.*"):
+        if path.suffix != ".rbl":  # rerun's own form, of one of its versions
+            shutil.copy(path, folder / path.name)
+    shutil.copy(ROOT / "lowfc/contract/wire/lowfc.desc", folder / "lowfc.desc")
+
+    work = folder / "work"
+    night = Night(config, calibration, work)
+    loop = night.client
+    night.expose(2)
+    loop.note("golden files")
+    loop.close_loop()
+    night.expose(5)
+    loop.gain(0.4, (2, 3))
+    loop.leak(0.01)
+    loop.limit([120.0, 110.0], (2, 3))
+    night.refused(lambda: loop.gain(3.0))
+    night.refused(lambda: loop.ask("dance"))
+    night.expose(3)
+    loop.offset([2.0, -1.0], (2, 3))
+    ramp_nm = np.linspace(-40, 40, 144, dtype=np.float32).reshape(12, 12)
+    loop.channel("dark-hole", ramp_nm)
+    loop.channel("flat", ramp_nm.T / 4)
+    night.expose(3)
+    loop.law(made)
+    night.expose(4)
+    loop.play(np.stack([ramp_nm / 20, ramp_nm.T / 20]), [[1.0, 0.0], [0.0, 1.0], [-1.0, 0.5], [0.0, 0.0]])
+    night.expose(2)
+    night.refused(lambda: loop.play_offset(np.ones((2, 2))))
+    night.expose(3)
+    part = next((work / "logs").glob("*.part"))
+    before = part.stat().st_size
+    night.clock.advance(250_000_000)  # so that the recorder flushes
+    night.until(lambda: part.stat().st_size > before)
+    killed = part.read_bytes()
+    (folder / "killed.mcap").write_bytes(killed[: len(killed) - 300])
+    loop.play_offset(np.full((4, 2), 3.0))
+    night.expose(2)
+    loop.stop()
+    loop.channel("dark-hole")
+    loop.offset()
+    night.frames.put(b"", sequence=night.frames.last[1].sequence + 2 if night.frames.last else 1)  # one is missing
+    night.expose(1, lambda pixels: pixels[:3])
+    night.expose(1, lambda pixels: np.full_like(pixels, 100))
+    night.expose(1, lambda pixels: np.full_like(pixels, 65_535))
+    night.expose(1, late_ns=25_000_000)
+    still: list[Any] = []
+    night.expose(6, lambda pixels: (still.append(pixels), still[0])[1])
+    night.silence()
+    night.expose(115)  # the law follows for a hundred frames, and has taken over some of the command by now
+    loop.law()
+    loop.status()
+    loop.pause()
+    loop.step(2)
+    night.expose(3)
+    loop.reset()
+    night.expose(2)
+    other = identified(
+        Calibration(
+            **{name: getattr(calibration, name) for name in calibration.__slots__}
+            | {"reconstructor": calibration.reconstructor * np.float32(0.9)}
+        )
+    )
+    loop.load(other)
+    loop.close_loop()
+    night.expose(2)
+    night.clock.advance(1_000_000_000)
+    night.start_camera(bias_dn=300.0)
+    night.expose(3)
+    loop.safe()
+    night.expose(2)
+    night.refused(loop.close_loop)
+    loop.clear()
+    night.expose(1)
+    night.finish()
+    (log,) = (work / "logs").glob("*.mcap")
+    log.rename(folder / "night.mcap")
+    shutil.rmtree(work)
+
+
+if __name__ == "__main__":
+    main(Path(sys.argv[1]))
