@@ -10,10 +10,14 @@ import numpy as np
 import numpy.typing as npt
 
 from lowfc.adapters import instrument
+from lowfc.adapters.bus import Publisher
+from lowfc.adapters.clock import HostClock
+from lowfc.adapters.memory_bus import MemoryBus, MemoryHub, MemoryRing
 from lowfc.client import Frame as Image
+from lowfc.client import MirrorWatch
 from lowfc.contract.configuration import Configuration
 from lowfc.contract.errors import RequestRefusedError
-from lowfc.contract.messages import wire
+from lowfc.contract.messages import MIRROR_STATE, Topic, wire
 from lowfc.contract.state_codec import controller_state
 from lowfc.control.additions import MIRROR
 from lowfc.control.calibration import Calibration
@@ -43,10 +47,27 @@ class Given(NamedTuple):
     state: wire.ControllerState | None
 
 
+class OperatorBus(MemoryBus):
+    """The connection of an operator's program; a frame is exposed while it subscribes."""
+
+    def __init__(self, loop: "FoldedLoop") -> None:
+        super().__init__(loop.hub, "operator", HostClock())
+        self._loop = loop
+
+    def ring(self, topic: Topic, capacity: int) -> MemoryRing:
+        """See `Bus.ring`."""
+        ring = super().ring(topic, capacity)
+        self._loop.expose()
+        return ring
+
+
 class FoldedLoop:
     """Camera, controller and mirror, one frame after the other.
 
     Attributes:
+        hub: on which the mirror's process reports.
+        mirror_bus: that process's connection; once it is closed, the mirror stays as it is.
+        first: sequence of frame 0.
         surfaces_nm: shape of the mirror in each exposure.
         residual_nm: true modes in each exposure.
     """
@@ -66,7 +87,9 @@ class FoldedLoop:
         self._settings = instrument.settings(config)
         self._state, _ = advance(self._settings, State(), Load(0, calibration, "test"))
         self._scene, self._mirror = bench(world), device(world)
-        self._status = initial(self._mirror)
+        self.hub = MemoryHub()
+        self._operator = OperatorBus(self)
+        self.start_mirror()
         self._weights = delay_weights(world.camera.delay_frames).astype(np.float32)
         self._shapes = [self._status.surface_nm] * len(self._weights)
         self._index = 0
@@ -75,6 +98,13 @@ class FoldedLoop:
         self.surfaces_nm: list[npt.NDArray[np.float32]] = []
         self.residual_nm: list[npt.NDArray[np.float32]] = []
         self.stops = 0
+        self.first = FIRST
+
+    def start_mirror(self) -> None:
+        """The mirror's process, anew and flat."""
+        self._status = initial(self._mirror)
+        self.mirror_bus = MemoryBus(self.hub, "mirror-dm", HostClock())
+        self._states: Publisher = self.mirror_bus.publisher(MIRROR_STATE, "dm")
 
     def expose(self) -> None:
         """One frame."""
@@ -83,7 +113,7 @@ class FoldedLoop:
         pixels, truth = self._scene.expose(self._index, seen)
         self.surfaces_nm.append(seen)
         self.residual_nm.append(truth.residual_nm)
-        sequence, time_ns = FIRST + self._index, 10**18 + self._index * self.config.period_ns
+        sequence, time_ns = self.first + self._index, 10**18 + self._index * self.config.period_ns
         self._index += 1
         if self._lose(self._index - 1):
             return
@@ -92,8 +122,10 @@ class FoldedLoop:
         assert step is not None
         assert command is not None
         told = Told("lowfc", sequence, time_ns, 10**9, command.actuators_nm, command.command_nm)
-        self._status, refused = obey(self._mirror, self._status, told, time_ns)
-        assert refused is None
+        if not self.mirror_bus.closed:
+            self._status, refused = obey(self._mirror, self._status, told, time_ns)
+            assert refused is None
+            self._states.put(wire.MirrorState(frame_sequence=sequence).SerializeToString())
         for kind, waiting in self._listeners:
             waiting.append(Image(sequence, time_ns, pixels) if kind == "frames" else step)
 
@@ -154,6 +186,10 @@ class FoldedLoop:
     def steps(self, count: int | None = None) -> Iterator[Step]:
         """See `Client.steps`."""
         return self._listen("steps", count)
+
+    def mirror_watch(self) -> MirrorWatch:
+        """See `Client.mirror_watch`."""
+        return MirrorWatch(self._operator)
 
     def _listen(self, kind: str, count: int | None) -> Iterator[Any]:
         waiting: deque[Any] = deque()

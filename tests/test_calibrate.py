@@ -1,6 +1,8 @@
 """Calibration of a whole loop in one process: the controller's own functions, the simulated optics, photon noise."""
 
 import io
+import re
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -8,9 +10,11 @@ import numpy.typing as npt
 import pytest
 from folded_loop import FoldedLoop, Given
 
+from lowfc.client import mirror_watch
 from lowfc.contract.configuration import Configuration, load
 from lowfc.contract.errors import BusError, CalibrationError, DataFileError
-from lowfc.contract.messages import wire
+from lowfc.contract.events import EVENTS
+from lowfc.contract.messages import EVENT, wire
 from lowfc.control.calibration import Calibration
 from lowfc.control.response_fit import Sums, cross_talk, cross_talk_error
 from lowfc.programs.calibrate import run as calibrate_run
@@ -277,6 +281,86 @@ def test_what_cannot_be_calibrated_is_said(monkeypatch: pytest.MonkeyPatch) -> N
     lossy = FoldedLoop(configured(**FEW), lose=lambda index: index % 50 == 49)
     with pytest.raises(CalibrationError, match="in 2 attempts there was no run of 600 frames"):
         taken_of(lossy, "hadamard", 4)
+
+
+class Struck(FoldedLoop):
+    """Something happens to a device in the middle of one of the plays, and something else 20 frames later.
+
+    Attributes:
+        begun: frame at which each play began.
+    """
+
+    def __init__(self, play: int, strike: Callable[[FoldedLoop], None], heal: Callable[[FoldedLoop], None]) -> None:
+        self.begun: list[int] = []
+        self.before_the_end: int | None = None
+        self.struck_at = self.healed_at = -1
+        self._play, self._strike, self._heal = play, strike, heal
+        super().__init__(configured(**FEW))
+
+    def play(self, basis_nm: npt.ArrayLike, table: npt.ArrayLike) -> Given:
+        given = super().play(basis_nm, table)
+        self.begun.append(len(self.surfaces_nm))
+        if len(self.begun) == self._play:
+            after = 50 if self.before_the_end is None else len(np.asarray(table)) - self.before_the_end
+            self.struck_at, self.healed_at = self.begun[-1] + after, self.begun[-1] + after + 20
+        return given
+
+    def expose(self) -> None:
+        super().expose()
+        if len(self.surfaces_nm) == self.struck_at:
+            self._strike(self)
+        if len(self.surfaces_nm) == self.healed_at:
+            self._heal(self)
+
+
+def kill_mirror(loop: FoldedLoop) -> None:
+    loop.mirror_bus.close()
+
+
+def expire(loop: FoldedLoop) -> None:
+    event = EVENTS["COMMAND_EXPIRED"].log("mirror-dm", 0, valid_ms=200.0, action="relaxing to flat")
+    loop.mirror_bus.publisher(EVENT).put(event.SerializeToString())
+
+
+def restart_camera(loop: FoldedLoop) -> None:
+    loop.first += 5 << 32
+
+
+@pytest.mark.parametrize(
+    ("strike", "heal", "why"),
+    [
+        (kill_mirror, FoldedLoop.start_mirror, "the mirror 'dm' restarted while pokes were played"),
+        (expire, ignore, r"mirror-dm was .* \(COMMAND_EXPIRED .* relaxing to flat\) while pokes were played"),
+        (restart_camera, ignore, "the camera restarted while pokes were played"),
+    ],
+    ids=["mirror", "command", "camera"],
+)
+@pytest.mark.parametrize("play", [1, 3, 6], ids=["delay", "cycle", "range"])
+def test_what_is_played_while_a_device_restarts_is_given_up_at_once_and_played_again(
+    strike: Callable[[FoldedLoop], None], heal: Callable[[FoldedLoop], None], why: str, play: int
+) -> None:
+    loop, said = Struck(play, strike, heal), list[str]()
+    calibrator = Calibrator(loop, Wanted("hadamard", None, 100.0, 4, OUT, resume=False), said.append, ignore)
+    with calibrator.holding():
+        taken = calibrator.run()
+        calibrator.linear_range(loop.calibration(), taken.delay)
+    (again,) = [one for one in said if re.match("once more|a cycle is repeated", one)]
+    assert re.search(why, again)
+    assert (len(loop.begun), loop.stops) == (1 + 4 + 1 + 1, 1)
+    assert loop.begun[play] < loop.healed_at + 10, "it went on to its end"
+    assert np.abs(cross_talk(loop.calibration().reconstructor, taken.measured.response)).max() < 0.05
+
+
+@pytest.mark.parametrize("before_the_end", [None, 3])
+def test_a_mirror_that_died_ends_the_calibration(monkeypatch: pytest.MonkeyPatch, before_the_end: int | None) -> None:
+    monkeypatch.setattr(mirror_watch, "SILENT_S", 0.0)
+    loop, said = Struck(3, kill_mirror, ignore), list[str]()
+    loop.before_the_end = before_the_end
+    calibrator = Calibrator(loop, Wanted("hadamard", None, 100.0, 4, OUT, resume=False), said.append, ignore)
+    with pytest.raises(BusError, match=r"no mirror state came .* is the mirror's process running"):
+        calibrator.run()
+    assert said[-1].startswith("a cycle is repeated: the mirror has reported no command as followed for 101 frames")
+    assert go_on(partial_of(OUT), {"method": "hadamard"}).cycles == 1
 
 
 def test_a_delay_of_one_frame_that_is_measured_as_a_little_less_gives_the_same_linear_range() -> None:

@@ -63,6 +63,26 @@ def told(*words: str) -> dict[str, Any]:
     return found
 
 
+class OfAnotherVersion(Connected):
+    """Its controller has a key that this version does not know."""
+
+    def configuration(self) -> str:
+        return self.config.to_toml().replace("[camera]", "[camera]\nspeed = 3", 1)
+
+
+@pytest.mark.parametrize("words", [("--out", "night.fits"), ("dark", "--dark-taken"), ("reference",), ("align",)])
+def test_a_controller_of_another_version_is_a_line(
+    words: tuple[str, ...], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    connect(OfAnotherVersion(load(None, CONFIG)), monkeypatch)
+    with pytest.raises(
+        ConfigurationError, match=r"another version of lowfc: camera\.speed: .*; use the lowfc that"
+    ) as it:
+        told(*words)
+    assert "\n" not in str(it.value)
+
+
 def toml(config: Configuration) -> str:
     Path("test.toml").write_text(config.to_toml())
     return "test.toml"

@@ -17,7 +17,7 @@ from lowfc.adapters.bus import Query, Sample
 from lowfc.adapters.clock import HostClock
 from lowfc.adapters.envelope import sequence_of
 from lowfc.adapters.log_reader import LogReader
-from lowfc.adapters.memory_bus import MemoryBus, MemoryHub
+from lowfc.adapters.memory_bus import MemoryBus, MemoryHub, MemoryRing
 from lowfc.adapters.mirror_maps import read_shape
 from lowfc.adapters.run import open_run
 from lowfc.client import Client, Stream, client, configuration_of, running, the_run
@@ -26,7 +26,20 @@ from lowfc.contract import codec
 from lowfc.contract.calibration_codec import encode_calibration, identified
 from lowfc.contract.configuration import Configuration
 from lowfc.contract.errors import BusError, ConfigurationError, DataFileError, RequestRefusedError
-from lowfc.contract.messages import CALIBRATION, CAMERA_STATE, EVENT, FRAME, REQUEST_KEY, STEP, Log, image, wire
+from lowfc.contract.events import EVENTS
+from lowfc.contract.messages import (
+    CALIBRATION,
+    CAMERA_STATE,
+    EVENT,
+    FRAME,
+    MIRROR_STATE,
+    REQUEST_KEY,
+    STEP,
+    Log,
+    Topic,
+    image,
+    wire,
+)
 from lowfc.control.inputs import Reply, Request, Step
 from lowfc.control.linear_law import LinearLaw, integrator_block, of_blocks
 from lowfc.control.requests import REQUESTS
@@ -193,7 +206,7 @@ def test_the_configuration_of_a_loop_and_of_one_of_another_version(controller: F
         controller.reply = Reply(True, toml, 77)
         assert configuration_of(loop).camera.rate_hz == rate_hz
     controller.reply = Reply(True, "[camera]\nspeed = 3\n", 77)
-    with pytest.raises(ConfigurationError, match=r"another version of lowfc: camera\.speed: ") as caught:
+    with pytest.raises(ConfigurationError, match=r"another version of lowfc: camera\.speed: .*; use the ") as caught:
         configuration_of(loop)
     assert "\n" not in str(caught.value)
 
@@ -223,6 +236,49 @@ def test_a_run_is_found_by_who_is_there(tmp_path: Path, monkeypatch: pytest.Monk
             held.enter_context(server)
         with pytest.raises(BusError, match=r"say which run with --run: there are another, left, whole$"):
             the_run(None)
+
+
+# The mirror.
+
+
+def test_a_mirrors_restart_and_its_expired_command_are_seen_and_damaged_messages_are_not() -> None:
+    hub = MemoryHub()
+
+    def process(role: str) -> Callable[[int], object]:
+        states = MemoryBus(hub, role, HostClock()).publisher(MIRROR_STATE, role.removeprefix("mirror-"))
+        return lambda frame: states.put(wire.MirrorState(frame_sequence=frame).SerializeToString())
+
+    slow, quick = process("mirror-slow"), process("mirror-quick")
+    bus = Announced(hub, slow)
+    watch = Client(bus=bus).mirror_watch()
+    assert (watch.frame_sequence, watch.interruption) == (1, "")
+    slow(7)
+    quick(9)
+    for topic, name in ((MIRROR_STATE, "slow"), (EVENT, "")):
+        bus.publisher(topic, name).put(b"\xff")
+    bus.publisher(EVENT).put(EVENTS["COMMAND_BACK"].log("mirror-slow", 0).SerializeToString())
+    watch.read()
+    assert (watch.frame_sequence, watch.interruption) == (7, "")
+    process("mirror-quick")(10)
+    watch.read()
+    assert (watch.frame_sequence, watch.interruption) == (7, "the mirror 'quick' restarted")
+    expired = EVENTS["COMMAND_EXPIRED"].log("mirror-slow", 0, valid_ms=200.0, action="holding the shape")
+    bus.publisher(EVENT).put(expired.SerializeToString())
+    watch.read()
+    assert watch.interruption.startswith("mirror-slow was without commands for too long (COMMAND_EXPIRED ")
+
+
+class Announced(MemoryBus):
+    """A mirror reports as soon as somebody listens."""
+
+    def __init__(self, hub: MemoryHub, report: Callable[[int], object]) -> None:
+        super().__init__(hub, "operator", HostClock())
+        self._report = report
+
+    def ring(self, topic: Topic, capacity: int) -> MemoryRing:
+        ring = super().ring(topic, capacity)
+        self._report(1)
+        return ring
 
 
 # Streams.

@@ -8,8 +8,9 @@ with Client() as loop:
 
 from lowfc.client.client import Answer, Client
 from lowfc.client.configuration import configuration_of
+from lowfc.client.mirror_watch import MirrorWatch
 from lowfc.client.runs import running, the_run
 from lowfc.client.stream import Frame, Stream
 from lowfc.control.inputs import Step
 
-__all__ = ["Answer", "Client", "Frame", "Step", "Stream", "configuration_of", "running", "the_run"]
+__all__ = ["Answer", "Client", "Frame", "MirrorWatch", "Step", "Stream", "configuration_of", "running", "the_run"]

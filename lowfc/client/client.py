@@ -13,6 +13,7 @@ from lowfc.adapters.clock import HostClock
 from lowfc.adapters.envelope import count_of
 from lowfc.adapters.run import DEFAULT_RUN, open_run
 from lowfc.adapters.zenoh_bus import ZenohBus
+from lowfc.client.mirror_watch import MirrorWatch
 from lowfc.client.runs import the_run
 from lowfc.client.stream import SILENT_S, WAITING, Frame, Stream, frame_of, step_of
 from lowfc.contract.calibration_codec import decode_calibration, encode_calibration
@@ -233,6 +234,14 @@ class Client:
     def steps(self, count: int | None = None, patience_s: float = SILENT_S) -> Stream[Step]:
         """Steps of the control law from now on, `count` of them or without end; see `frames`."""
         return self._stream(STEP, step_of, "step", count, patience_s)
+
+    def mirror_watch(self) -> MirrorWatch:
+        """What the mirror reports from now on, read without waiting.
+
+        Raises:
+            BusError: it reported nothing.
+        """
+        return MirrorWatch(self._bus)
 
     def ask(
         self,

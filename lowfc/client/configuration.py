@@ -29,5 +29,6 @@ def configuration_of(loop: Configured) -> Configuration:
         first = fault.errors()[0]
         key = ".".join(map(str, first["loc"]))
         raise ConfigurationError(
-            f"the controller's configuration is one of another version of lowfc: {key}: {first['msg']}"
+            f"the controller's configuration is one of another version of lowfc: {key}: {first['msg']}; use the "
+            "lowfc that the controller was started with"
         ) from None

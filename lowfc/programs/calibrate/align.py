@@ -11,7 +11,7 @@ from rich.console import Console
 from lowfc.adapters import calibration_file, instrument
 from lowfc.adapters.terminal import configuration
 from lowfc.adapters.whole_file import require_folder
-from lowfc.client import Client
+from lowfc.client import Client, configuration_of
 from lowfc.contract.calibration_codec import identified
 from lowfc.contract.configuration import Configuration
 from lowfc.contract.errors import CalibrationError, ConfigurationError
@@ -23,7 +23,7 @@ from lowfc.control.regularised import reconstruct
 from lowfc.control.response_fit import normalised
 from lowfc.programs.analytic import analytic
 from lowfc.programs.calibrate.recording import Loop, play, watch
-from lowfc.programs.calibrate.run import AMPLITUDE_NM, DELAY_FRAMES, configuration_of
+from lowfc.programs.calibrate.run import AMPLITUDE_NM, DELAY_FRAMES
 from lowfc.programs.calibrate.tasks import Found, images
 
 Array = npt.NDArray[np.float64]

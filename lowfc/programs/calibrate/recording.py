@@ -7,6 +7,7 @@ from typing import NamedTuple, Protocol
 import numpy as np
 import numpy.typing as npt
 
+from lowfc.adapters.envelope import start_of
 from lowfc.contract.errors import BusError, CalibrationError, LowfcError
 from lowfc.control.inputs import Step
 from lowfc.control.poke_plan import Plan, seen, usable
@@ -17,7 +18,13 @@ Array = npt.NDArray[np.float64]
 
 AFTERWARDS = 8
 """Frames recorded after the last of a play: the longest delay that can be measured is over by then."""
+MOST_BEHIND = 100
+"""Frames by which the mirror's reports may lag behind the controller's steps; then the mirror is taken for dead."""
 _LIMITS = frozenset(reason for reason in Reason if reason >= Reason.MODAL_LIMIT)
+
+
+class PlayInterruptedError(CalibrationError):
+    """A device restarted or stood still while pokes were played: they are to be played again."""
 
 
 class Answered(Protocol):
@@ -43,6 +50,24 @@ class Image(Protocol):
         ...
 
 
+class Mirror(Protocol):
+    """What the mirror reports; see `lowfc.client.mirror_watch.MirrorWatch`."""
+
+    @property
+    def frame_sequence(self) -> int:
+        """Of the newest command that it follows."""
+        ...
+
+    @property
+    def interruption(self) -> str:
+        """What kept it from following commands; empty where nothing did."""
+        ...
+
+    def read(self) -> None:
+        """Take in what has come."""
+        ...
+
+
 class Loop(Protocol):
     """What of `lowfc.client.Client` is needed to play and to look."""
 
@@ -60,6 +85,10 @@ class Loop(Protocol):
 
     def steps(self, count: int | None = None) -> Iterator[Step]:
         """Steps of the control law from now on."""
+        ...
+
+    def mirror_watch(self) -> Mirror:
+        """What the mirror reports from now on."""
         ...
 
 
@@ -129,27 +158,32 @@ def play(loop: Loop, basis_nm: npt.NDArray[np.floating], table: npt.NDArray[np.f
 
     Raises:
         CalibrationError: the loop ended the play, or too little of it came through.
-        BusError: frames or steps stopped.
+        PlayInterruptedError: the mirror or the camera restarted, or the mirror did not follow commands throughout.
+        BusError: frames or steps stopped, or no mirror is there.
         RequestRefusedError: the controller would not play it.
     """
     with _streams(loop) as (frames, steps):
+        mirror = loop.mirror_watch()
         first = loop.play(basis_nm.astype(np.float32), table.astype(np.float32)).frame_sequence
-        end = first + len(table) + AFTERWARDS
+        last = first + len(table) - 1
+        end = last + 1 + AFTERWARDS
         images: list[Image] = []
         made: list[Step] = []
         try:
             image, step = next(frames), next(steps)
             mode = None
-            while image.sequence < end or step.frame_sequence < end:
+            while image.sequence < end or step.frame_sequence < end or mirror.frame_sequence < last:
                 if image.sequence <= step.frame_sequence:
                     if first <= image.sequence:
                         images.append(image)
                     image = next(frames)
                 else:
                     if first <= step.frame_sequence:
-                        mode = _check(step, mode, over=step.frame_sequence >= first + len(table))
+                        mode = _check(step, mode, over=step.frame_sequence > last)
+                        _check_devices(mirror, step.frame_sequence, first)
                         made.append(step)
                     step = next(steps)
+            _check_devices(mirror, step.frame_sequence, first)
         except StopIteration:
             raise BusError("the frames came to an end: is the camera still running?") from None
     return _recording(images, made, first)
@@ -200,6 +234,20 @@ def _check(step: Step, before: LoopMode | None, *, over: bool) -> LoopMode:
             "--amplitude, or bring the mirror nearer to flat"
         )
     return step.mode
+
+
+def _check_devices(mirror: Mirror, sequence: int, first: int) -> None:
+    """Raise where the pokes up to a frame were not all on the mirror, or the frame is another camera process's."""
+    mirror.read()
+    behind = sequence - max(mirror.frame_sequence, first)
+    if start_of(sequence) != start_of(first):
+        why = "the camera restarted"
+    elif mirror.interruption or behind <= MOST_BEHIND:
+        why = mirror.interruption
+    else:
+        why = f"the mirror has reported no command as followed for {behind} frames"
+    if why:
+        raise PlayInterruptedError(f"{why} while pokes were played")
 
 
 def _recording(images: list[Image], made: list[Step], first: int) -> Recording:

@@ -1,7 +1,6 @@
 """Calibration through the bus: pokes are played by the controller, frames come back, H is fitted to them."""
 
 import contextlib
-import tomllib
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,7 +11,7 @@ import numpy.typing as npt
 
 from lowfc.adapters import instrument
 from lowfc.adapters.progress import Counted
-from lowfc.contract.configuration import Configuration
+from lowfc.client import configuration_of
 from lowfc.contract.errors import CalibrationError, LowfcError
 from lowfc.contract.messages import wire
 from lowfc.control import poke_plan
@@ -29,7 +28,7 @@ from lowfc.control.response_fit import (
     normalised,
 )
 from lowfc.programs.calibrate.partial import go_on, keep, partial_of
-from lowfc.programs.calibrate.recording import Answered, Loop, Recording, play
+from lowfc.programs.calibrate.recording import Answered, Loop, PlayInterruptedError, Recording, play
 
 Array = npt.NDArray[np.float64]
 Say = Callable[[str], None]
@@ -122,11 +121,6 @@ class Taken(NamedTuple):
     delay: Delay
 
 
-def configuration_of(loop: Controller) -> Configuration:
-    """The controller's configuration."""
-    return Configuration.model_validate(tomllib.loads(loop.configuration()))
-
-
 class Calibrator:
     """One calibration of a running loop; the mirror is afterwards where it was."""
 
@@ -197,14 +191,14 @@ class Calibrator:
         plan = poke_plan.ladder(amplitudes, int(np.clip(np.ceil(noise**2 / 2), 2, 200)), SETTLE)
         self._progress("linear range", 0, len(plan))
         for _ in range(MOST_FAILURES):
-            recording = play(self._loop, self._basis, plan.table)
-            fractions, _ = self._fractions(recording)
-            modes_nm = (fractions - made.reference) @ made.reconstructor.T.astype(np.float64)
-            use = recording.usable(plan, delay.delay_frames)
-            poked = recording.played(plan.table, delay.delay_frames)
             try:
+                recording = play(self._loop, self._basis, plan.table)
+                fractions, _ = self._fractions(recording)
+                modes_nm = (fractions - made.reference) @ made.reconstructor.T.astype(np.float64)
+                use = recording.usable(plan, delay.delay_frames)
+                poked = recording.played(plan.table, delay.delay_frames)
                 return linear_range(modes_nm[use], poked[use], recording.blocks(plan, delay.delay_frames)[use])
-            except ValueError as error:
+            except (PlayInterruptedError, ValueError) as error:
                 self._say(f"once more: {error}")
         raise CalibrationError(
             f"in {MOST_FAILURES} attempts the linear range was not measured: `lowfc doctor` looks for why frames are "
@@ -258,7 +252,11 @@ class Calibrator:
         plan = poke_plan.dither(1, amplitude, DELAY_FRAMES, 1, self._wanted.seed)
         self._progress("looking for pokes", 0, DELAY_FRAMES)
         for _ in range(MOST_FAILURES):
-            recording = play(self._loop, self._basis[mode : mode + 1], plan.table)
+            try:
+                recording = play(self._loop, self._basis[mode : mode + 1], plan.table)
+            except PlayInterruptedError as error:
+                self._say(f"once more: {error}")
+                continue
             if recording.whole:
                 break
             self._say("frames were lost or refused while the delay was measured: once more")
@@ -323,7 +321,7 @@ class Calibrator:
             try:
                 sums = sums.plus(self._cycle(sums.cycles, delay))
                 failures = 0
-            except ValueError as error:
+            except (PlayInterruptedError, ValueError) as error:
                 failures += 1
                 if failures >= MOST_FAILURES:
                     raise CalibrationError(f"{failures} cycles in a row were of no use: {error}") from None

@@ -16,7 +16,7 @@ from lowfc.adapters.array_file import read_array
 from lowfc.adapters.progress import counting_bar
 from lowfc.adapters.terminal import configuration
 from lowfc.adapters.whole_file import require_folder
-from lowfc.client import Client
+from lowfc.client import Client, configuration_of
 from lowfc.contract.calibration_codec import identified
 from lowfc.contract.configuration import Configuration
 from lowfc.contract.errors import CalibrationError, DataFileError
@@ -37,7 +37,7 @@ from lowfc.programs.calibrate.result import (
     measured_calibration,
     text_of,
 )
-from lowfc.programs.calibrate.run import Calibrator, Wanted, configuration_of
+from lowfc.programs.calibrate.run import Calibrator, Wanted
 
 Found = tuple[dict[str, Any], str]
 DELAY_APART = 0.1

@@ -1,0 +1,64 @@
+"""The mirrors of a running loop, for a program whose frames are worth nothing unless the mirror follows commands."""
+
+import time
+
+from google.protobuf.message import DecodeError
+
+from lowfc.adapters.bus import Bus, Ring, name_in
+from lowfc.adapters.envelope import start_of
+from lowfc.client.stream import SILENT_S, WAITING
+from lowfc.contract.errors import BusError
+from lowfc.contract.messages import EVENT, MIRROR_STATE, Log, wire
+
+_POLL_S = 0.002
+
+
+class MirrorWatch:
+    """What the mirrors of a run reported since it was made; it is there once a first mirror has reported.
+
+    Attributes:
+        frame_sequence: of the newest command that every mirror heard of follows.
+        interruption: what kept a mirror from following commands meanwhile, a sentence's subject and verb; else empty.
+    """
+
+    def __init__(self, bus: Bus) -> None:
+        """Begin with what the bus gets; `read` takes in what has come.
+
+        Raises:
+            BusError: no mirror reported.
+        """
+        self.interruption = ""
+        self._events: Ring = bus.ring(EVENT, WAITING)
+        self._states: Ring = bus.ring(MIRROR_STATE, WAITING)
+        self._mirrors: dict[str, tuple[int, int]] = {}  # by name: start of its process, frame of its command
+        deadline_s = time.monotonic() + SILENT_S
+        self.read()
+        while not self._mirrors:
+            if time.monotonic() >= deadline_s:
+                raise BusError(f"no mirror state came within {SILENT_S:g} s: is the mirror's process running?")
+            time.sleep(_POLL_S)
+            self.read()
+
+    @property
+    def frame_sequence(self) -> int:
+        """See the class."""
+        return min(sequence for _, sequence in self._mirrors.values())
+
+    def read(self) -> None:
+        """Take in what has come since the last call; waits for nothing."""
+        for sample in self._states.drain():
+            name, start_s = name_in(MIRROR_STATE, sample.key), start_of(sample.sequence)
+            try:
+                state = wire.MirrorState.FromString(sample.payload)
+            except DecodeError:
+                continue
+            if self._mirrors.get(name, (start_s, 0))[0] != start_s:
+                self.interruption = f"the mirror {name!r} restarted"
+            self._mirrors[name] = start_s, state.frame_sequence
+        for sample in self._events.drain():
+            try:
+                event = Log.FromString(sample.payload)
+            except DecodeError:
+                continue
+            if event.message.startswith("COMMAND_EXPIRED "):
+                self.interruption = f"{event.name} was without commands for too long ({event.message})"
