@@ -16,6 +16,13 @@ def _private_runtime(tmp_path_factory: pytest.TempPathFactory) -> None:
     os.environ["XDG_RUNTIME_DIR"] = str(path)
 
 
+@pytest.fixture(scope="session", autouse=True)
+def _private_cache(pytestconfig: pytest.Config) -> None:
+    """Keep optical models apart from the user's, in a folder that all workers and later sessions share."""
+    assert pytestconfig.cache is not None
+    os.environ["XDG_CACHE_HOME"] = str(pytestconfig.cache.mkdir("home"))
+
+
 def pytest_runtest_logreport(report: pytest.TestReport) -> None:
     if NO_SKIPS and report.skipped and not hasattr(report, "wasxfail"):
         report.outcome = "failed"

@@ -1,10 +1,16 @@
-"""The twin's cache: twin and mirror are built once, then read from files named by a hash of all they depend on."""
+"""The twin's cache: twin and mirror are built once, then read from files named by a hash of all they depend on.
 
+That includes the source of the modules that build them, so that no other version's file is ever read.
+"""
+
+import ast
+import functools
 import hashlib
 import io
 import logging
 import os
-from collections.abc import Callable
+import sys
+from collections.abc import Callable, Iterator
 from dataclasses import astuple, fields
 from pathlib import Path
 from typing import Any, TypeVar
@@ -22,8 +28,8 @@ from lowfc.optics.twin import Operator, Twin, TwinSpec
 from lowfc.optics.twin_build import build
 from lowfc.optics.twin_mirror import TwinMirror, twin_mirror
 
-FORMAT = 3
-"""Raised whenever the construction or the file changes: files of another format are not looked at."""
+_HASHED_AS = 3
+"""Part of every operator hash, and so of the identity of every computed calibration: it stays as it is."""
 
 _Kept = TypeVar("_Kept", Twin, TwinMirror)
 
@@ -32,7 +38,7 @@ _log = logging.getLogger(__name__)
 
 def operator_hash(sensor: Sensor, spec: TwinSpec, band: Band) -> str:
     """SHA-256, hexadecimal, of every array and number that the twin depends on."""
-    numbers = (FORMAT, sensor.wavelength_nm, sensor.samples_per, sensor.binning, sensor.pixels)
+    numbers = (_HASHED_AS, sensor.wavelength_nm, sensor.samples_per, sensor.binning, sensor.pixels)
     arrays: dict[str, NDArray[Any]] = {"pupil": sensor.pupil, "focal_mask": sensor.focal_mask}
     relay: tuple[object, ...] = (type(sensor.relay).__name__,)
     if isinstance(sensor.relay, ApertureMask):
@@ -40,6 +46,38 @@ def operator_hash(sensor: Sensor, spec: TwinSpec, band: Band) -> str:
     else:
         relay += astuple(sensor.relay)
     return _digest(arrays, repr((numbers, relay, astuple(spec), astuple(band))))
+
+
+def sources() -> dict[str, Path]:
+    """Modules that determine what is kept, and their files: this one, and all of `lowfc.optics` that it imports."""
+    found: dict[str, Path] = {}
+    pending = [__name__]
+    while pending:
+        name = pending.pop()
+        if name not in found and (path := getattr(sys.modules.get(name), "__file__", None)) is not None:
+            found[name] = Path(path)
+            pending += (one for one in _imports(found[name]) if one.startswith("lowfc.optics."))
+    return found
+
+
+@functools.cache
+def source_hash() -> str:
+    """SHA-256, hexadecimal, of the modules in `sources`."""
+    digest = hashlib.sha256()
+    for name, path in sorted(sources().items()):
+        content = path.read_bytes()
+        digest.update(f"{name} {len(content)}".encode() + content)
+    return digest.hexdigest()
+
+
+def _imports(path: Path) -> Iterator[str]:
+    """Names that may be modules among those that a file imports."""
+    for node in ast.walk(ast.parse(path.read_bytes())):
+        if isinstance(node, ast.Import):
+            yield from (alias.name for alias in node.names)
+        elif isinstance(node, ast.ImportFrom) and node.module:
+            yield node.module
+            yield from (f"{node.module}.{alias.name}" for alias in node.names)
 
 
 def default_cache_dir() -> Path:
@@ -67,9 +105,8 @@ def load_or_build(
     """
     band = monochromatic(sensor.wavelength_nm) if band is None else band
     key = operator_hash(sensor, spec, band)
-    path = (default_cache_dir() if cache_dir is None else cache_dir) / f"twin-{key[:32]}.npz"
     return _cached(
-        path,
+        _file("twin", key, cache_dir),
         lambda content: _unpack(content, key, spec),
         lambda: build(sensor, spec, band, key, progress),
         _pack,
@@ -85,15 +122,19 @@ def load_or_fit_mirror(
     notice: Callable[[str], None] = _log.warning,
 ) -> TwinMirror:
     """A mirror on the twin's nodes from the cache, or fitted and put there; arguments as for `load_or_build`."""
-    key = _digest({}, repr((FORMAT, twin.operator_hash, astuple(mirror))))
-    path = (default_cache_dir() if cache_dir is None else cache_dir) / f"mirror-{key[:32]}.npz"
     return _cached(
-        path,
+        _file("mirror", repr((twin.operator_hash, astuple(mirror))), cache_dir),
         lambda content: TwinMirror(**_arrays(content)),
         lambda: twin_mirror(sensor, twin, mirror),
         lambda fitted: _packed({part.name: getattr(fitted, part.name) for part in fields(fitted)}),
         notice,
     )
+
+
+def _file(kind: str, key: str, cache_dir: Path | None) -> Path:
+    """Where what has this key is kept, if it was built by these sources."""
+    name = f"{kind}-{_digest({}, source_hash() + key)[:32]}.npz"
+    return (default_cache_dir() if cache_dir is None else cache_dir) / name
 
 
 def _cached(

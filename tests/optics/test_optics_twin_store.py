@@ -1,16 +1,32 @@
+import importlib
+import subprocess
+import sys
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 
-from lowfc.adapters.twin_store import default_cache_dir, load_or_build, load_or_fit_mirror, operator_hash
+from lowfc.adapters.twin_store import (
+    default_cache_dir,
+    load_or_build,
+    load_or_fit_mirror,
+    operator_hash,
+    source_hash,
+    sources,
+)
 from lowfc.optics.band import gauss_legendre, monochromatic
 from lowfc.optics.mirror import Mirror
 from lowfc.optics.relay import ApertureMask
 from lowfc.optics.twin import FAST, Evaluator, TwinSpec, reference
 
 SMALL = TwinSpec(nodes=16, order=4, rank=40, guards=4)  # the real optics, coarser, for tests of the file
+HASH_OF_ONES = "a4449a9f81f26403e8a1f5dda2c0cbe7385184dc0b31b34b2b78eb5a92ba3eec"
+IMPORTED_BY_THE_BUILDERS = """
+import sys, lowfc.optics.twin_build, lowfc.optics.twin_mirror
+print(*(name for name in sys.modules if name.startswith("lowfc.optics.")))
+"""
 
 
 @pytest.fixture
@@ -64,6 +80,53 @@ def test_the_hash_depends_on_everything(sensor):
     hashes = [operator_hash(*variant) for variant in variants]
     assert len(set(hashes)) == len(variants)
     assert operator_hash(replace(sensor), SMALL, band) == hashes[0]
+
+
+def test_the_operator_hash_is_that_of_the_first_release(sensor):
+    """It is part of the identity of computed calibrations, which must not change; arrays that round alike anywhere."""
+    plain = replace(
+        sensor,
+        pupil=np.ones_like(sensor.pupil),
+        focal_mask=np.ones_like(sensor.focal_mask),
+        relay=ApertureMask(np.ones_like(sensor.relay.transmission)),
+    )
+    assert operator_hash(plain, SMALL, monochromatic(550.0)) == HASH_OF_ONES
+
+
+def test_the_sources_are_the_modules_that_building_a_twin_imports():
+    imported = subprocess.run(
+        [sys.executable, "-c", IMPORTED_BY_THE_BUILDERS], capture_output=True, text=True, check=True
+    ).stdout.split()
+    assert set(sources()) == {"lowfc.adapters.twin_store", *imported}
+    assert len(imported) > 8
+
+
+@pytest.mark.parametrize(
+    ("module", "again"),
+    [("lowfc.optics.fourier", True), ("lowfc.adapters.twin_store", True), ("lowfc.optics.screen", False)],
+)
+def test_a_changed_source_builds_again(module, again, sensor, stored, tmp_path, monkeypatch):
+    twin, mirror = stored[0], Mirror(rows=6, columns=5, pitches_per_pupil=4.0)
+    load_or_fit_mirror(sensor, twin, mirror, tmp_path)
+    before = set(tmp_path.iterdir())
+    changed = tmp_path / "changed"
+    changed.mkdir()
+    loaded = importlib.import_module(module)
+    source = changed / "source.py"
+    source.write_bytes(Path(loaded.__file__).read_bytes() + b"\nCHANGED = 1\n")
+    monkeypatch.setattr(loaded, "__file__", str(source))
+    source_hash.cache_clear()
+    try:
+        same(twin, load_or_build(sensor, SMALL, cache_dir=tmp_path))
+        load_or_fit_mirror(sensor, twin, mirror, tmp_path)
+    finally:
+        source_hash.cache_clear()
+    new = [path.name.partition("-")[0] for path in set(tmp_path.iterdir()) - before - {changed}]
+    assert sorted(new) == (["mirror", "twin"] if again else [])
+
+
+def test_the_tests_have_a_cache_of_their_own():
+    assert default_cache_dir().is_relative_to(Path(__file__).parents[2] / ".pytest_cache")
 
 
 @pytest.mark.parametrize("damage", ["truncated", "empty", "one bit", "other content", "another twin"])
