@@ -71,6 +71,7 @@ def document(name: str) -> Path:
 
 def render(name: str, table: str) -> str:
     """A table of a document in Markdown."""
+    rows: list[tuple[str, ...]]
     if table == "limits":
         rows = [("what", "value"), *LIMITS[name]]
     else:

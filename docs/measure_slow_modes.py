@@ -46,7 +46,7 @@ def measure() -> dict[str, Any]:
     found: dict[str, Any] = {"host": host(), "cases": {}}
     with threadpool_limits(1):
         for exposed in EXPOSED:
-            found["cases"][f"{exposed:g}"] = case(configured(**KEYS, **{"camera.exposure_fraction": exposed}))
+            found["cases"][f"{exposed:g}"] = case(configured(**KEYS | {"camera.exposure_fraction": exposed}))
     return found
 
 

@@ -28,15 +28,16 @@ def apply(actuators_nm: Single, nm_per_unit: float) -> Single:
     return (units * nm_per_unit).astype(np.float32)
 
 
-def good(payload: bytes, last_sequence: int) -> wire.MirrorCommand | None:
-    """The command in `payload`; None for one that must not be followed."""
+def good(payload: bytes, last_sequence: int) -> tuple[wire.MirrorCommand, Single] | None:
+    """The command in `payload` and its actuators; None for one that must not be followed."""
     try:
         told = wire.MirrorCommand.FromString(payload)
     except DecodeError:
         return None
     wanted_nm = actuators(told)  # None where the bytes are not rows x columns float32
-    fits = wanted_nm is not None and wanted_nm.shape == GRID and np.isfinite(wanted_nm).all()
-    return told if fits and told.frame_sequence >= last_sequence else None
+    if wanted_nm is None or wanted_nm.shape != GRID or not np.isfinite(wanted_nm).all():
+        return None
+    return (told, wanted_nm) if told.frame_sequence >= last_sequence else None
 
 
 def main(run: RunId = DEFAULT_RUN, config: ConfigFile = None) -> None:
@@ -54,12 +55,16 @@ def main(run: RunId = DEFAULT_RUN, config: ConfigFile = None) -> None:
     with closing(service.bus):
         while service.running:
             sample, now_ns = commands.take(0.01), service.clock.now_ns()
-            told = good(sample.payload, state.frame_sequence) if sample is not None else None
-            if told is not None:
-                kept_nm, hit = limit(LIMITS, where_nm, actuators(told))
+            followed = good(sample.payload, state.frame_sequence) if sample is not None else None
+            time_ns = now_ns
+            if followed is not None:
+                told, wanted_nm = followed
+                time_ns = told.timestamp.ToNanoseconds()
+                kept_nm, hit = limit(LIMITS, where_nm, wanted_nm)
                 where_nm, obeyed_ns, valid_ns = moved(kept_nm), now_ns, min(told.valid_for_ns, LONGEST_VALID_NS)
                 state.frame_sequence, state.status = told.frame_sequence, wire.MIRROR_STATUS_FOLLOWING
-                state.command_nm[:], state.limits_hit[:] = [] if hit else told.command_nm, [one.value for one in hit]
+                state.command_nm[:] = [] if hit else told.command_nm
+                state.limits_hit[:] = [one.value for one in hit]  # type: ignore[misc]  # numbered alike
                 service.work += 1
             elif sample is not None:
                 service.event("COMMAND_REFUSED", reason="out of order, not finite, or for another grid")
@@ -69,8 +74,8 @@ def main(run: RunId = DEFAULT_RUN, config: ConfigFile = None) -> None:
             relaxing = state.status == wire.MIRROR_STATUS_EXPIRED and where_nm.any()
             if relaxing:
                 where_nm = moved(limit(LIMITS, where_nm, np.zeros_like(where_nm)).actuators_nm)
-            if told is not None or relaxing or now_ns >= due_ns:  # without commands ten times a second
-                state.timestamp.FromNanoseconds(told.timestamp.ToNanoseconds() if told is not None else now_ns)
+            if followed is not None or relaxing or now_ns >= due_ns:  # without commands ten times a second
+                state.timestamp.FromNanoseconds(time_ns)
                 state.actuators = where_nm.tobytes()
                 states.put(state.SerializeToString())
                 due_ns = now_ns + IDLE_STATE_NS

@@ -1,6 +1,7 @@
 """Imports point downward, the numerics are pure, and no file outgrows its noun."""
 
 import ast
+import tomllib
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -129,6 +130,13 @@ def test_every_module_is_in_a_layer() -> None:
     outside = [module for module in FILES if not layer_of(module) and module != "lowfc"]
     assert outside == []
     assert sum(map(is_pure, FILES)) > 25  # the list above still finds the numerics
+
+
+def test_every_source_but_the_tests_is_type_checked() -> None:
+    mypy = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["tool"]["mypy"]
+    folders = {path.relative_to(ROOT).parts[0] for path in ROOT.glob("[!.]*/**/*.py")}
+    assert set(mypy["files"]) == folders - {"tests", "build"}
+    assert mypy["strict"]
 
 
 def test_no_file_outgrows_its_noun() -> None:

@@ -17,7 +17,7 @@ from lowfc.adapters.mailbox import Mailbox
 from lowfc.adapters.zenoh_bus import receive_in_one_thread
 from lowfc.programs.rehearsal import Rehearsal
 
-_STEPS = {"numpy": NumpyStep, "lowfc": LowfcStep}
+_STEPS: dict[str, type[NumpyStep] | type[LowfcStep]] = {"numpy": NumpyStep, "lowfc": LowfcStep}
 _LONGEST_PAUSE_S = 0.1
 _GROWTH_BYTES = 64  # numbers in a protobuf message grow longer
 

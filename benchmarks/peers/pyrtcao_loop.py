@@ -13,8 +13,10 @@ import sys
 import threading
 import time
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 from numba import jit
 from pyrtc.component import Component
 from pyrtc.loop import Loop
@@ -25,6 +27,8 @@ from pyrtc.wavefront_sensor import WavefrontSensor
 
 from benchmarks.peers.problem import ACTUATORS, DIFFERENT, GAIN, LEAK, LIMIT_NM, MODES, SHAPE, Problem
 from benchmarks.peers.process import Part
+
+Array = npt.NDArray[np.float32]
 
 _STREAMS = ("wfs_raw", "wfs", "signal", "wfc")
 _PIXELS = SHAPE[0] * SHAPE[1]
@@ -49,7 +53,7 @@ class Sensor(WavefrontSensor):
 class PixelSignal(Component):
     """The signal is the pixels without those of the reference image."""
 
-    def __init__(self, conf: dict) -> None:
+    def __init__(self, conf: dict[str, Any]) -> None:
         super().__init__(conf)
         self._reference = Problem().I0.reshape(SHAPE)
         self._image = np.empty(SHAPE, np.int32)
@@ -69,7 +73,7 @@ class StockLoop(Loop):
 
     commanded: memoryview
 
-    def send_to_wfc(self, correction: np.ndarray, slopes: np.ndarray | None = None) -> None:
+    def send_to_wfc(self, correction: Array, slopes: Array | None = None) -> None:
         """Its own, then the time."""
         super().send_to_wfc(correction, slopes=slopes)
         self.commanded[self.frame_id] = time.monotonic_ns()
@@ -80,7 +84,7 @@ class FusedLoop(Component):
 
     commanded: memoryview
 
-    def __init__(self, conf: dict) -> None:
+    def __init__(self, conf: dict[str, Any]) -> None:
         super().__init__(conf)
         problem = Problem()
         self._arrays = (problem.I0, problem.R, problem.to_actuators)
@@ -99,14 +103,17 @@ class FusedLoop(Component):
 
 
 @jit(nopython=True, nogil=True, fastmath=True)
-def _fused(image, I0, R, to_actuators, difference, command):
+def _fused(
+    image: npt.NDArray[np.int32], I0: Array, R: Array, to_actuators: Array, difference: Array, command: Array
+) -> Array:
     for pixel in range(difference.size):
         difference[pixel] = np.float32(image[pixel]) - I0[pixel]
     error = np.dot(R, difference)
     for mode in range(command.size):
         wanted = np.float32(1 - LEAK) * command[mode] - np.float32(GAIN) * error[mode]
         command[mode] = min(max(wanted, np.float32(-LIMIT_NM)), np.float32(LIMIT_NM))
-    return np.dot(to_actuators, command)
+    actuators: Array = np.dot(to_actuators, command)
+    return actuators
 
 
 class Corrector(WavefrontCorrector):
@@ -129,7 +136,7 @@ def _name(part: Part, stream: str) -> str:
     return f"{part.folder.name}_{stream}"
 
 
-def _configuration(part: Part, function: str) -> dict:
+def _configuration(part: Part, function: str) -> dict[str, Any]:
     streams = {stream: _name(part, stream) for stream in _STREAMS}
     return {
         "affinity": part.cpu,

@@ -42,7 +42,7 @@ class Link:
     """
 
     put: Callable[[int, int, bytes], int | None]
-    tell: Message | None = None
+    tell: Callable[[int, int, bytes], object] | None = None
     kept: object = None
 
 
@@ -97,6 +97,7 @@ def lowfc_bus(part: Part, _frame_bytes: int, _command_bytes: int, take: Message)
     def pass_on(sample: Sample) -> None:
         take(sample.sequence, sample.publish_time_ns - clock.offset_ns, sample.payload)
 
+    kept: tuple[ZenohBus, ...]
     if part.role == "source":
         mirror = ZenohBus(_links(part), mirror_role(_MIRROR), clock)
         mirror.subscribe(COMMAND, pass_on, _MIRROR)

@@ -4,7 +4,7 @@ import errno
 import os
 import signal
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Annotated, Any, NoReturn
 
@@ -36,7 +36,7 @@ def new_app(help_text: str) -> typer.Typer:
     )
 
 
-def run_app(app: typer.Typer) -> NoReturn:
+def run_app(app: Callable[[], object]) -> NoReturn:
     """Run a command line; a user's mistake is one clear message and exit status 2, never a traceback.
 
     Being told to stop ends a command as Ctrl-C does; the processes of a loop catch both themselves.
