@@ -10,7 +10,8 @@ from mcap.opcode import Opcode
 from mcap.records import Attachment, Channel, Metadata, Schema
 
 from lowfc.adapters.envelope import sequence_of
-from lowfc.adapters.log_records import HEAD, Chunk, Damage, LogFile, UnsoundError, parsed
+from lowfc.adapters.log_chunk import Chunk, UnsoundError
+from lowfc.adapters.log_records import HEAD, Damage, LogFile, parsed
 from lowfc.adapters.log_writer import START_KEY
 from lowfc.contract.errors import DataFileError
 from lowfc.contract.messages import Topic
@@ -96,6 +97,7 @@ class LogReader:
         self._chunks: set[int] = set()
         self._last_ns: int | None = None
         self._spanned = 0
+        self._has_chunks = False
 
     @property
     def metadata(self) -> dict[str, dict[str, str]]:
@@ -114,12 +116,13 @@ class LogReader:
             DataFileError: this is no log, or a part of it is damaged.
         """
         with LogFile(self.path) as file:
-            self.size, self.finished = file.size, file.finished
+            self.size, self.finished, self._file = file.size, file.finished, file
             if (declarations := file.declarations()) is not None:
                 self._chunk(declarations)
             for part in file.parts(self._from_ns, self._kept(file)):
                 match part:
                     case Chunk():
+                        self._has_chunks = True
                         self.position = part.position + part.length
                         yield from self._chunk(part)
                     case Damage():
@@ -128,6 +131,8 @@ class LogReader:
                         self.described.append(part)
             self.position = self.size
             self.complete = file.complete
+        if file.unread and not self._has_chunks:
+            raise self._error(0, "")
         if self.damage and not (self.damage[0].position or self.described or self._chunks):
             raise DataFileError(f"{self.path} is not an MCAP file")
 
@@ -217,6 +222,11 @@ class LogReader:
         self.damage.append(damage)
 
     def _error(self, position: int, why: str) -> DataFileError:
+        if self._file.unread and not self._has_chunks:
+            return DataFileError(
+                f"{self.path} is compressed with {self._file.unread!r}, which is not read; lz4, zstd and none are: "
+                "compress it again with `mcap compress --compression zstd`"
+            )
         if position == 0:
             return DataFileError(f"{self.path} is not an MCAP file; if it was one, `lowfc recover` saves what is whole")
         return DataFileError(f"{self.path} is damaged at byte {position} ({why}); `lowfc recover` saves what is whole")

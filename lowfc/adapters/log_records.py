@@ -1,39 +1,47 @@
 """The records of a log file as they lie on the disk: what is whole, what is damaged, where the file breaks off.
 
 Nothing passes that its checksum does not vouch for. Of a finished log every byte is under one: the chunks and the
-attachments have their own, DataEnd has that of all before it, the footer that of the summary.
+attachments have their own, DataEnd has that of all before it, the footer that of the summary. A log that another tool
+has rewritten may lack checksums and chunks: what was not computed is not checked.
 """
 
 import io
-import re
 import struct
 import zlib
 from collections.abc import Collection, Iterator
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
-from typing import BinaryIO, NamedTuple, TypeVar
+from typing import TypeVar
 
-import lz4.frame
 from mcap.data_stream import ReadDataStream
 from mcap.exceptions import McapError
 from mcap.opcode import Opcode
-from mcap.records import Attachment, Channel, ChunkIndex, Metadata, Schema
+from mcap.records import Attachment, Channel, ChunkIndex, Header, Metadata, Schema, Statistics
 from mcap.writer import MCAP0_MAGIC as MAGIC
 
+from lowfc.adapters.log_chunk import (
+    CHUNK_HERE,
+    LARGEST_BYTES,
+    LONGEST_HEAD_BYTES,
+    Chunk,
+    CompressionError,
+    UnsoundError,
+    read_chunk,
+    read_head,
+)
 from lowfc.adapters.log_writer import UNFINISHED
+from lowfc.contract import input_file
 from lowfc.contract.errors import DataFileError
 
 HEAD = struct.Struct("<BQ")
 """What every record begins with: opcode, and length of what follows."""
 
-_CHUNK_HEAD = struct.Struct("<QQQII3sQ")  # times of first and last message, size, CRC, "lz4", compressed size
-_LARGEST_BYTES = 1 << 28  # of a record, compressed or not; a damaged length must not take all memory
-_LZ4_RATIO = 255  # the format allows no more
 _FOOTER_BYTES = HEAD.size + 20 + len(MAGIC)
 _BLOCK_BYTES = 1 << 20
 _EXPECTED = {Opcode.CHUNK, Opcode.MESSAGE_INDEX, Opcode.ATTACHMENT, Opcode.METADATA, Opcode.DATA_END}
 _CHANGED = "its parts are whole, but not all are there, or not in order, or what lies between them has changed"
-_CHUNK_HERE = re.compile(rb"\x06.{36}\x03\x00\x00\x00lz4.{8}\x04\x22\x4d\x18", re.DOTALL)  # up to LZ4's own magic
+_OF_CHUNKS = {Opcode.SCHEMA, Opcode.CHANNEL, Opcode.MESSAGE}
 _FIRST_BLOCK_BYTES = 1 << 12
 _TRIES = 4  # times the file's size is read in search of chunks; then the rest is given up, of a file made to mislead
 
@@ -57,26 +65,6 @@ class Damage:
     before_ns: int | None = None
 
 
-class Chunk(NamedTuple):
-    """Messages and their declarations, decompressed, as a checksum says they were written.
-
-    Attributes:
-        position: of the chunk in the file.
-        length: its bytes there.
-        crc: of `content`.
-        content: records, one after the other.
-    """
-
-    position: int
-    length: int
-    crc: int
-    content: bytes
-
-
-class UnsoundError(Exception):
-    """What stands here is not what was written; the text says why."""
-
-
 class LogFile:
     """A log file that is open for reading, up to where it ends now; a context.
 
@@ -85,6 +73,7 @@ class LogFile:
         size: bytes of it when it was opened.
         finished: it ends as a log that was finished ends.
         complete: finished, and read up to a sound summary; known when all `parts` have been taken.
+        unread: compression of a chunk that is not read; empty for none.
     """
 
     def __init__(self, path: Path) -> None:
@@ -95,10 +84,9 @@ class LogFile:
         """
         self.path = path
         self.complete = False
-        if path.exists() and not path.is_file():
-            raise DataFileError(f"{path} is no file")
+        self.unread = ""
         try:
-            self._file: BinaryIO = path.open("rb")
+            self._file = input_file.opened(path, input_file.UNBOUNDED)
             self.size = self._file.seek(0, io.SEEK_END)
         except OSError as fault:
             finished = path.with_name(path.name.removesuffix(UNFINISHED))
@@ -108,6 +96,7 @@ class LogFile:
             self._file.close()
             raise DataFileError(f"{path} is empty: nothing was recorded")
         self.finished = self._read(max(0, self.size - len(MAGIC)), len(MAGIC)) == MAGIC
+        self._ours = self._is_ours()
         self._summary = self._sound_summary()
         self._bytes_to_try = _TRIES * self.size
 
@@ -133,12 +122,8 @@ class LogFile:
 
     def index(self) -> Iterator[ChunkIndex]:
         """What the summary says of each chunk, in the order of the file; nothing unless it is sound."""
-        at = self.size if self._summary is None else self._summary
-        while at < self.size - _FOOTER_BYTES:
-            opcode, length = HEAD.unpack(self._read(at, HEAD.size))
-            if opcode == Opcode.CHUNK_INDEX:
-                yield parsed(ChunkIndex, self._read(at + HEAD.size, length))
-            at += HEAD.size + length
+        for body in self._in_summary(Opcode.CHUNK_INDEX):
+            yield parsed(ChunkIndex, body)
 
     def parts(self, from_ns: int = 0, always: Collection[int] = ()) -> Iterator[Chunk | Metadata | Attachment | Damage]:
         """What the file holds, in its order.
@@ -162,7 +147,11 @@ class LogFile:
                     at = end
                     continue
             try:
-                if end > self.size or length > _LARGEST_BYTES:
+                if opcode in _OF_CHUNKS and self._unchunked and (content := self._loose(at)):
+                    yield Chunk(at, len(content), zlib.crc32(content), content)
+                    crc, at = zlib.crc32(content, crc), at + len(content)
+                    continue
+                if end > self.size or length > LARGEST_BYTES:
                     raise UnsoundError("a record is longer than it can be")
                 body = self._read(at + HEAD.size, length)
                 if opcode == Opcode.DATA_END and length == 4 and self._summary in (None, end):
@@ -173,7 +162,7 @@ class LogFile:
                     self.complete = self._summary is not None
                     return
                 crc = zlib.crc32(body, zlib.crc32(head, crc))
-                part = _part(opcode, body, at)
+                part = self._part(opcode, body, at)
             except UnsoundError as fault:
                 resumed = self._resume(at, end)
                 if resumed == self.size < end and not self.finished:
@@ -193,6 +182,9 @@ class LogFile:
         if not footer or HEAD.unpack_from(footer) != (Opcode.FOOTER, 20):
             return None
         start, _, stored = struct.unpack_from("<QQI", footer, HEAD.size)
+        if not self._ours and not (start and stored):
+            start = start or footer_at  # where there is none, nothing follows the data but the footer
+            return start if len(MAGIC) <= start <= footer_at else None
         if not len(MAGIC) <= start < footer_at:
             return None
         crc = 0
@@ -210,10 +202,10 @@ class LogFile:
                 opcode, length = HEAD.unpack(head)
                 if opcode in _EXPECTED and end + HEAD.size + length <= self.size:
                     return end
-            self._bytes_to_try -= min(end - at, _LARGEST_BYTES)  # read once, and now searched
+            self._bytes_to_try -= min(end - at, LARGEST_BYTES)  # read once, and now searched
         start, block = at + 1, _FIRST_BLOCK_BYTES
         while start < self.size and self._bytes_to_try > 0:
-            for match in _CHUNK_HERE.finditer(self._read(start, block + 64)):
+            for match in CHUNK_HERE.finditer(self._read(start, block + 64)):
                 if self._chunk_at(start + match.start()):
                     return start + match.start()
             start, block = start + block, min(2 * block, _BLOCK_BYTES)
@@ -224,15 +216,83 @@ class LogFile:
         """Whether a whole chunk begins at `at`."""
         _, length = HEAD.unpack(self._read(at, HEAD.size))
         at += HEAD.size
-        if at + length > self.size or not _CHUNK_HEAD.size <= length <= min(_LARGEST_BYTES, self._bytes_to_try):
+        if at + length > self.size or length > min(LARGEST_BYTES, self._bytes_to_try):
             return False
         try:
-            _size_and_crc(self._read(at, _CHUNK_HEAD.size), length)
+            read_head(self._read(at, min(LONGEST_HEAD_BYTES, length)), length)
             self._bytes_to_try -= length
-            _chunk(self._read(at, length), at)
+            read_chunk(self._read(at, length), at, length, may_lack_crc=not self._ours)
         except UnsoundError:
             return False
         return True
+
+    def _part(self, opcode: int, body: bytes, at: int) -> Chunk | Metadata | Attachment | None:
+        """A record of the data section, checked; None for one that only helps to find others.
+
+        Raises:
+            UnsoundError: it is damaged, or has no place in a log.
+        """
+        match opcode:
+            case Opcode.CHUNK:
+                try:
+                    return read_chunk(body, at, HEAD.size + len(body), may_lack_crc=not self._ours)
+                except CompressionError as fault:
+                    self.unread = fault.name
+                    raise
+            case Opcode.ATTACHMENT:
+                crc = int.from_bytes(body[-4:], "little")
+                if crc != zlib.crc32(body[:-4]) and (crc or self._ours):
+                    raise UnsoundError("the checksum of an attachment is wrong")
+                return parsed(Attachment, body)
+            case Opcode.METADATA:
+                return parsed(Metadata, body)
+            case Opcode.MESSAGE_INDEX:
+                if len(body) < 6 or int.from_bytes(body[2:6], "little") != len(body) - 6:
+                    raise UnsoundError("an index of messages is damaged")
+            case Opcode.HEADER if at == len(MAGIC):
+                pass
+            case Opcode.MESSAGE | Opcode.SCHEMA | Opcode.CHANNEL:
+                raise UnsoundError("a record stands outside of the chunks, where no checksum vouches for it")
+            case _:
+                raise UnsoundError("no record begins here")
+        return None
+
+    def _is_ours(self) -> bool:
+        """Whether the recorder wrote this file, with every checksum; another tool says so in the header."""
+        head = self._read(len(MAGIC), HEAD.size)
+        opcode, length = HEAD.unpack(head) if len(head) == HEAD.size else (0, 0)
+        if opcode != Opcode.HEADER or length > _BLOCK_BYTES:
+            return True
+        try:
+            header = parsed(Header, self._read(len(MAGIC) + HEAD.size, length))
+        except UnsoundError:
+            return True
+        return header.library.startswith("lowfc ")
+
+    @cached_property
+    def _unchunked(self) -> bool:
+        """Whether messages may stand outside of chunks."""
+        statistics = (parsed(Statistics, body) for body in self._in_summary(Opcode.STATISTICS))
+        return not self._ours or any(not one.chunk_count for one in statistics)
+
+    def _loose(self, at: int) -> bytes:
+        """Whole records from `at` on of those that usually stand in chunks."""
+        end = at
+        while end - at < _BLOCK_BYTES and len(head := self._read(end, HEAD.size)) == HEAD.size:
+            opcode, length = HEAD.unpack(head)
+            if opcode not in _OF_CHUNKS or length > LARGEST_BYTES or end + HEAD.size + length > self.size:
+                break
+            end += HEAD.size + length
+        return self._read(at, end - at)
+
+    def _in_summary(self, opcode: Opcode) -> Iterator[bytes]:
+        """Records of one kind in the summary; none unless it is sound."""
+        at = self.size if self._summary is None else self._summary
+        while at < self.size - _FOOTER_BYTES:
+            found, length = HEAD.unpack(self._read(at, HEAD.size))
+            if found == opcode:
+                yield self._read(at + HEAD.size, length)
+            at += HEAD.size + length
 
     def _read(self, at: int, length: int) -> bytes:
         try:
@@ -242,61 +302,7 @@ class LogFile:
             raise DataFileError(f"{self.path} cannot be read: {fault.strerror}") from fault
 
 
-def _part(opcode: int, body: bytes, at: int) -> Chunk | Metadata | Attachment | None:
-    """A record of the data section, checked; None for one that only helps to find others.
-
-    Raises:
-        UnsoundError: it is damaged, or has no place in a log.
-    """
-    match opcode:
-        case Opcode.CHUNK:
-            return _chunk(body, at)
-        case Opcode.ATTACHMENT:
-            if zlib.crc32(body[:-4]).to_bytes(4, "little") != body[-4:]:
-                raise UnsoundError("the checksum of an attachment is wrong")
-            return parsed(Attachment, body)
-        case Opcode.METADATA:
-            return parsed(Metadata, body)
-        case Opcode.MESSAGE_INDEX:
-            if len(body) < 6 or int.from_bytes(body[2:6], "little") != len(body) - 6:
-                raise UnsoundError("an index of messages is damaged")
-        case Opcode.HEADER if at == len(MAGIC):
-            pass
-        case Opcode.MESSAGE | Opcode.SCHEMA | Opcode.CHANNEL:
-            raise UnsoundError("a record stands outside of the chunks, where no checksum vouches for it")
-        case _:
-            raise UnsoundError("no record begins here")
-    return None
-
-
-def _chunk(body: bytes, at: int) -> Chunk:
-    size, crc = _size_and_crc(body, len(body))
-    try:
-        content = lz4.frame.LZ4FrameDecompressor().decompress(memoryview(body)[_CHUNK_HEAD.size :], max_length=size)
-    except (RuntimeError, EOFError) as fault:
-        raise UnsoundError("a chunk cannot be decompressed") from fault
-    if zlib.crc32(content) != crc:
-        raise UnsoundError("the checksum of a chunk is wrong")
-    return Chunk(at, HEAD.size + len(body), crc, content)
-
-
-def _size_and_crc(head: bytes, length: int) -> tuple[int, int]:
-    """Of the content of a chunk with this head and so many bytes.
-
-    Raises:
-        UnsoundError: it cannot be one.
-    """
-    if length < _CHUNK_HEAD.size:
-        raise UnsoundError("a chunk is too short")
-    _, _, size, crc, _, compression, compressed = _CHUNK_HEAD.unpack_from(head)
-    if compression != b"lz4" or compressed != length - _CHUNK_HEAD.size:
-        raise UnsoundError("the head of a chunk is damaged")
-    if not 0 < size <= min(_LARGEST_BYTES, _LZ4_RATIO * compressed):
-        raise UnsoundError("a chunk says that it has a size that it cannot have")
-    return size, crc
-
-
-_Record = TypeVar("_Record", Attachment, ChunkIndex, Metadata, Schema, Channel)
+_Record = TypeVar("_Record", Attachment, ChunkIndex, Header, Metadata, Schema, Statistics, Channel)
 
 
 def parsed(kind: type[_Record], body: bytes) -> _Record:

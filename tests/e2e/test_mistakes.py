@@ -134,7 +134,7 @@ def test_ctrl_c_while_it_loads_is_quiet(tmp_path: Path) -> None:
         (("recover", "header.mcap"), "nothing in it is whole, so there is nothing to recover"),
         (("replay", "night.mcap.part"), "it is finished now: night.mcap"),
         (("replay", "night.mcap", "night.mcap"), "a log is named twice"),
-        (("replay", "pipe"), "pipe is no file"),
+        (("replay", "pipe"), "pipe cannot be read: not a regular file"),
         (("replay", "night.mcap", "--speed", "2"), "belong to --publish"),
         (("replay", "night.mcap", "--publish", "--what-if", "gain=1"), "three different things"),
         (("recover", "night.mcap", "header.mcap", "--json"), "name one"),

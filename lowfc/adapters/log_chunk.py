@@ -1,0 +1,137 @@
+"""A chunk of a log: what its head says, and its content, checked, whatever tool compressed it."""
+
+import re
+import struct
+import zlib
+from collections.abc import Callable
+from typing import NamedTuple
+
+import lz4.frame
+import zstandard
+
+LARGEST_BYTES = 1 << 28
+"""Of a record, compressed or not: a damaged length must not take all memory."""
+
+LONGEST_HEAD_BYTES = 64
+"""More than any chunk's head has."""
+
+CHUNK_HERE = re.compile(
+    rb"\x06(?=.{36}(?:\x03\x00{3}lz4.{8}\x04\x22\x4d\x18|\x04\x00{3}zstd.{8}\x28\xb5\x2f\xfd|\x00{4}.{8}[\x03-\x05].{4}\x00{4}))",
+    re.DOTALL,
+)
+"""The opcode of a chunk, before a head with a compression that is read, and what its content begins with."""
+
+_FIXED = struct.Struct("<QQQII")  # times of first and last message, size, CRC, length of the compression's name
+_COMPRESSED = struct.Struct("<Q")
+
+
+class UnsoundError(Exception):
+    """What stands here is not what was written; the text says why."""
+
+
+class CompressionError(UnsoundError):
+    """A chunk is compressed in a way that is not read."""
+
+    def __init__(self, name: str) -> None:
+        super().__init__(f"a chunk is compressed with {name!r}; lz4, zstd and none are read")
+        self.name = name
+
+
+class Chunk(NamedTuple):
+    """Messages and their declarations, decompressed.
+
+    Attributes:
+        position: of the chunk in the file.
+        length: its bytes there.
+        crc: of `content`.
+        content: records, one after the other.
+    """
+
+    position: int
+    length: int
+    crc: int
+    content: bytes
+
+
+class ChunkHead(NamedTuple):
+    """What a chunk's head says of it.
+
+    Attributes:
+        size: bytes of its content.
+        crc: of its content; 0 where none was computed.
+        compression: name of what compressed it; empty for none.
+        begin: bytes before its compressed content.
+    """
+
+    size: int
+    crc: int
+    compression: bytes
+    begin: int
+
+
+def _lz4(data: memoryview, size: int) -> bytes:
+    found: bytes = lz4.frame.LZ4FrameDecompressor().decompress(data, max_length=size)
+    return found
+
+
+def _zstd(data: memoryview, size: int) -> bytes:
+    with zstandard.ZstdDecompressor().stream_reader(data, read_across_frames=True) as stream:
+        return stream.read(size)
+
+
+def _uncompressed(data: memoryview, size: int) -> bytes:
+    return bytes(data[:size])
+
+
+# How each compression is read, and the largest ratio of sizes that its format allows.
+_COMPRESSIONS: dict[bytes, tuple[Callable[[memoryview, int], bytes], int]] = {
+    b"lz4": (_lz4, 255),
+    b"zstd": (_zstd, LARGEST_BYTES),
+    b"": (_uncompressed, 1),
+}
+
+
+def read_head(head: bytes, length: int) -> ChunkHead:
+    """The head of a chunk of `length` bytes.
+
+    Raises:
+        UnsoundError: it cannot be one.
+    """
+    if length < _FIXED.size + _COMPRESSED.size:
+        raise UnsoundError("a chunk is too short")
+    _, _, size, crc, named = _FIXED.unpack_from(head)
+    begin = _FIXED.size + named + _COMPRESSED.size
+    if begin > min(length, LONGEST_HEAD_BYTES):
+        raise UnsoundError("the head of a chunk is damaged")
+    name = head[_FIXED.size : _FIXED.size + named]
+    (compressed,) = _COMPRESSED.unpack_from(head, _FIXED.size + named)
+    if compressed != length - begin:
+        raise UnsoundError("the head of a chunk is damaged")
+    if name not in _COMPRESSIONS:
+        raise CompressionError(name.decode(errors="backslashreplace"))
+    if not 0 < size <= min(LARGEST_BYTES, _COMPRESSIONS[name][1] * compressed):
+        raise UnsoundError("a chunk says that it has a size that it cannot have")
+    return ChunkHead(size, crc, name, begin)
+
+
+def read_chunk(body: bytes, at: int, record_bytes: int, *, may_lack_crc: bool = False) -> Chunk:
+    """The chunk whose record, of `record_bytes` with its own head, has this body and begins at `at`.
+
+    Args:
+        body: of the record.
+        at: position of the record in the file.
+        record_bytes: length of the record there.
+        may_lack_crc: accept one that says that no checksum was computed.
+
+    Raises:
+        UnsoundError: it is not as it was written.
+    """
+    head = read_head(body, len(body))
+    try:
+        content = _COMPRESSIONS[head.compression][0](memoryview(body)[head.begin :], head.size)
+    except (RuntimeError, EOFError, zstandard.ZstdError) as fault:
+        raise UnsoundError("a chunk cannot be decompressed") from fault
+    crc = zlib.crc32(content)
+    if crc != head.crc and not (may_lack_crc and head.crc == 0 and len(content) == head.size):
+        raise UnsoundError("the checksum of a chunk is wrong")
+    return Chunk(at, record_bytes, crc, content)

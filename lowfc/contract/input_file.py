@@ -1,0 +1,50 @@
+"""Files that a user names: regular ones of a bounded size; a device, a pipe or a directory is never read."""
+
+import errno
+import os
+import stat
+from pathlib import Path
+from typing import BinaryIO
+
+UNBOUNDED = (1 << 63) - 1
+"""Size limit of a file that is read piece by piece."""
+
+
+def opened(path: Path, largest_bytes: int) -> BinaryIO:
+    """A regular file, open for reading.
+
+    Args:
+        path: of the file, or of a symbolic link to it.
+        largest_bytes: largest size that is accepted.
+
+    Raises:
+        OSError: it cannot be opened, is not a regular file, or is larger; `strerror` is a sentence for a user.
+    """
+    descriptor = os.open(path, os.O_RDONLY | os.O_CLOEXEC | os.O_NONBLOCK)  # a pipe without a writer would wait
+    try:
+        found = os.fstat(descriptor)
+        if not stat.S_ISREG(found.st_mode):
+            raise OSError(errno.EINVAL, "not a regular file", str(path))
+        if found.st_size > largest_bytes:
+            raise _too_large(path, largest_bytes)
+        return os.fdopen(descriptor, "rb")
+    except BaseException:
+        os.close(descriptor)
+        raise
+
+
+def read_whole(path: Path, largest_bytes: int) -> bytes:
+    """Content of a regular file of at most `largest_bytes`.
+
+    Raises:
+        OSError: as for `opened`.
+    """
+    with opened(path, largest_bytes) as stream:
+        content = stream.read(largest_bytes + 1)
+    if len(content) > largest_bytes:  # its size was not known: a file of /proc, or one that grows
+        raise _too_large(path, largest_bytes)
+    return content
+
+
+def _too_large(path: Path, largest_bytes: int) -> OSError:
+    return OSError(errno.EFBIG, f"larger than the {largest_bytes} bytes that such a file may have", str(path))

@@ -1,0 +1,156 @@
+"""Logs that another MCAP tool has rewritten: other compressions, no chunks, no checksums."""
+
+import dataclasses
+import struct
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import pytest
+from mcap.data_stream import RecordBuilder
+from mcap.opcode import Opcode
+from mcap.reader import make_reader
+from mcap.records import Chunk
+from mcap.stream_reader import StreamReader
+from mcap.writer import MCAP0_MAGIC as MAGIC
+from mcap.writer import CompressionType, Writer
+from mutated_logs import ATTACHMENTS, METADATA, boundaries, identity, small_log, small_samples
+
+from lowfc.adapters.log_reader import LogReader
+from lowfc.adapters.log_recovery import recover
+from lowfc.contract.errors import DataFileError
+from lowfc.programs.log.survey import survey
+
+SENT = sorted(identity(small_samples()))
+
+
+def rewritten(source: Path, out: Path, library: str | None = None, **options: Any) -> Path:
+    """The same log as Python's MCAP library writes it."""
+    with source.open("rb") as given, out.open("wb") as stream:
+        reader = make_reader(given)
+        writer = Writer(stream, chunk_size=8192, **options)
+        writer.start() if library is None else writer.start(library=library)
+        for one in reader.iter_metadata():
+            writer.add_metadata(one.name, one.metadata)
+        for one in reader.iter_attachments():
+            writer.add_attachment(one.create_time, one.log_time, one.name, one.media_type, one.data)
+        schemas: dict[int, int] = {}
+        channels: dict[int, int] = {}
+        for schema, channel, message in reader.iter_messages(log_time_order=False):
+            if schema.id not in schemas:
+                schemas[schema.id] = writer.register_schema(schema.name, schema.encoding, schema.data)
+            if channel.id not in channels:
+                channels[channel.id] = writer.register_channel(
+                    channel.topic, channel.message_encoding, schemas[schema.id], channel.metadata
+                )
+            number = channels[channel.id]
+            writer.add_message(number, message.log_time, message.data, message.publish_time, message.sequence)
+        writer.finish()
+    return out
+
+
+@pytest.fixture
+def source(tmp_path: Path) -> Path:
+    return small_log(tmp_path / "source.mcap")
+
+
+NO_CRCS = {"enable_crcs": False}
+NO_CHUNKS = {"use_chunking": False}
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        *({"compression": one} for one in CompressionType),
+        *({"compression": one} | NO_CRCS for one in CompressionType),
+        {"compression": CompressionType.ZSTD, "use_statistics": False, "use_summary_offsets": False},
+        NO_CHUNKS,
+        NO_CHUNKS | NO_CRCS,
+        NO_CHUNKS | {"enable_data_crcs": True},
+        NO_CHUNKS | {"library": "lowfc 0.1.0"},  # the header copied
+        {"compression": CompressionType.ZSTD, "library": "lowfc 0.1.0"},
+    ],
+    ids=str,
+)
+def test_a_rewritten_log_is_read_as_the_original(tmp_path: Path, source: Path, options: dict[str, Any]) -> None:
+    path = rewritten(source, tmp_path / "rewritten.mcap", **options)
+    reader = LogReader(path)
+    assert sorted(identity(list(reader))) == SENT
+    assert (reader.damage, reader.unreadable, reader.finished, reader.complete) == ([], 0, True, True)
+    assert reader.metadata == METADATA | {"recording": {"messages": str(len(SENT))}}
+    assert reader.attachments == {one.name: one.data for one in ATTACHMENTS}
+    assert survey(path)["state"] == "complete"
+    assert recover(path, tmp_path / "recovered.mcap").recovered is None
+
+
+@pytest.mark.parametrize("compression", CompressionType)
+@pytest.mark.parametrize("at", [1, 4, 8, 60])  # of a chunk: its length twice, and its content
+@pytest.mark.parametrize("finished", [True, False])
+def test_of_a_damaged_one_only_the_damaged_chunk_is_lost(
+    tmp_path: Path, source: Path, compression: CompressionType, at: int, finished: bool
+) -> None:
+    path = rewritten(source, tmp_path / "rewritten.mcap", compression=compression)
+    data = bytearray(path.read_bytes())
+    chunks = [(a, b) for a, b in pairwise(boundaries(data)) if data[a] == Opcode.CHUNK]
+    assert len(chunks) > 10
+    data[chunks[5][0] + at] ^= 0xFF
+    path.write_bytes(data if finished else data[: chunks[-1][1]])
+    reader = LogReader(path, skip_damaged=True)
+    read = identity(list(reader))
+    assert set(SENT).issuperset(read)
+    assert len(SENT) / 2 < len(read) < len(SENT)
+    assert reader.damage[0].position == chunks[5][0]
+    assert sum(one.length for one in reader.damage) < chunks[6][0] - chunks[5][0] + 1
+    done = recover(path, tmp_path / "recovered.mcap")
+    assert done.recovered is not None
+    assert identity(list(LogReader(done.recovered))) == read
+
+
+def test_messages_without_chunks_are_checked_by_the_checksum_of_the_whole(tmp_path: Path, source: Path) -> None:
+    path = rewritten(source, tmp_path / "rewritten.mcap", use_chunking=False, enable_data_crcs=True)
+    data = bytearray(path.read_bytes())
+    data[len(data) // 2] ^= 1
+    path.write_bytes(data)
+    reader = LogReader(path, skip_damaged=True)
+    assert len(list(reader)) == len(SENT)
+    assert [one.why.partition(",")[0] for one in reader.damage] == ["its parts are whole"]
+
+
+def test_a_truncated_one_without_chunks_is_read_up_to_its_end(tmp_path: Path, source: Path) -> None:
+    path = rewritten(source, tmp_path / "rewritten.mcap", use_chunking=False)
+    data = path.read_bytes()
+    path.write_bytes(data[: len(data) // 2])
+    reader = LogReader(path)
+    read = identity(list(reader))
+    assert len(SENT) / 4 < len(read) < len(SENT)
+    assert set(SENT).issuperset(read)
+    assert not reader.complete
+
+
+def test_a_zstd_chunk_that_would_fill_the_memory_is_damage(tmp_path: Path, source: Path) -> None:
+    path = rewritten(source, tmp_path / "rewritten.mcap", compression=CompressionType.ZSTD)
+    data = bytearray(path.read_bytes())
+    begin = next(at for at in boundaries(data) if data[at] == Opcode.CHUNK)
+    struct.pack_into("<Q", data, begin + 9 + 16, 1 << 40)
+    path.write_bytes(data)
+    reader = LogReader(path, skip_damaged=True)
+    assert len(list(reader)) > len(SENT) / 2
+    assert [one.why for one in reader.damage] == ["a chunk says that it has a size that it cannot have"]
+
+
+@pytest.mark.parametrize("skip_damaged", [True, False])
+def test_an_unknown_compression_is_named_and_not_called_damage(
+    tmp_path: Path, source: Path, skip_damaged: bool
+) -> None:
+    path, builder = tmp_path / "rewritten.mcap", RecordBuilder()
+    with rewritten(source, path).open("rb") as stream:
+        for record in StreamReader(stream, emit_chunks=True).records:
+            changed = dataclasses.replace(record, compression="brotli") if isinstance(record, Chunk) else record
+            changed.write(builder)
+    path.write_bytes(MAGIC + builder.end() + MAGIC)
+    with pytest.raises(DataFileError) as caught:
+        list(LogReader(path, skip_damaged=skip_damaged))
+    assert str(caught.value) == (
+        f"{path} is compressed with 'brotli', which is not read; lz4, zstd and none are: "
+        "compress it again with `mcap compress --compression zstd`"
+    )
