@@ -1,12 +1,14 @@
 """An array of numbers in a file: the first image of a FITS file, or a .npy file."""
 
 from pathlib import Path
+from tokenize import TokenError
 
 import numpy as np
 import numpy.typing as npt
 from numpy.lib.format import read_array as read_npy
 
 from lowfc.adapters import fits_file
+from lowfc.contract import input_file
 from lowfc.contract.errors import DataFileError
 
 
@@ -21,10 +23,10 @@ def read_array(path: Path, what: str, dimensions: tuple[int, ...]) -> npt.NDArra
     Raises:
         DataFileError: the file is missing, damaged or holds something else.
     """
-    if not path.is_file():
-        raise DataFileError(f"{path}: there is no such file")
     try:
         array = _npy(path) if path.suffix == ".npy" else _fits(path)
+    except FileNotFoundError:
+        raise DataFileError(f"{path}: there is no such file") from None
     except fits_file.DAMAGED as error:
         why = fits_file.in_a_line(error)
         raise DataFileError(f"{path}: neither a FITS image nor a numpy array (.npy): {why}") from None
@@ -34,8 +36,11 @@ def read_array(path: Path, what: str, dimensions: tuple[int, ...]) -> npt.NDArra
 
 
 def _npy(path: Path) -> npt.NDArray[np.generic]:
-    with path.open("rb") as stream:
-        return np.asarray(read_npy(stream, allow_pickle=False))
+    with input_file.opened(path, fits_file.LARGEST_BYTES) as stream:
+        try:
+            return np.asarray(read_npy(stream, allow_pickle=False))
+        except TokenError as error:
+            raise ValueError(f"its header cannot be read: {error}") from None
 
 
 def _fits(path: Path) -> npt.NDArray[np.generic]:

@@ -6,7 +6,6 @@ from astropy.io import fits
 
 from lowfc.adapters import fits_file
 from lowfc.adapters.whole_file import write_whole
-from lowfc.contract.errors import DataFileError
 from lowfc.contract.identity import identity
 from lowfc.control.calibration import Calibration
 
@@ -66,8 +65,6 @@ def load(path: Path) -> Calibration:
     Raises:
         DataFileError: the file is missing, damaged or holds something else.
     """
-    if not path.is_file():
-        raise DataFileError(f"{path}: there is no such calibration file")
     calibration = fits_file.load(path, KIND, "calibration file", _read)
     fits_file.require_identity(path, identity(calibration), calibration.id)
     return calibration

@@ -12,11 +12,17 @@ import numpy.typing as npt
 from astropy.io import fits
 from astropy.utils.exceptions import AstropyWarning
 
+from lowfc.contract import input_file
 from lowfc.contract.errors import DataFileError
 
 T = TypeVar("T")
 
-DAMAGED = (OSError, KeyError, TypeError, ValueError, EOFError, AstropyWarning, fits.VerifyError)
+LARGEST_BYTES = 1 << 33
+"""Size of a file of arrays, at most."""
+DAMAGED = (
+    *(OSError, KeyError, TypeError, ValueError, EOFError, MemoryError, RecursionError),
+    *(AstropyWarning, fits.VerifyError),
+)
 """What reading a file that is damaged, or something else, may raise."""
 
 
@@ -46,13 +52,16 @@ def to_bytes(primary: fits.PrimaryHDU, extensions: list[fits.ImageHDU]) -> bytes
 @contextlib.contextmanager
 def opened(path: Path) -> Iterator[fits.HDUList]:
     """A file to read; raises some of `DAMAGED` where it is not whole."""
-    with warnings.catch_warnings(), path.open("rb") as stream:  # which astropy leaves open where it raises
+    with (
+        warnings.catch_warnings(),
+        input_file.opened(path, LARGEST_BYTES) as stream,
+    ):  # which astropy leaves open where it raises
         warnings.simplefilter("error", AstropyWarning)  # a shortened file is no more than a warning to astropy
         with fits.open(stream, mode="readonly", memmap=False) as units:
             yield units
 
 
-def load(path: Path, kind: str, what: str, parse: Callable[[fits.HDUList], T]) -> T:
+def load(path: Path, kind: str, what: str, parse: Callable[[fits.HDUList], T], advice: str = "") -> T:
     """What `parse` makes of a file of our own.
 
     Args:
@@ -60,9 +69,10 @@ def load(path: Path, kind: str, what: str, parse: Callable[[fits.HDUList], T]) -
         kind: which it must be.
         what: it is, for people.
         parse: raises some of `DAMAGED` where something is wrong.
+        advice: how such a file is made.
 
     Raises:
-        DataFileError: the file is damaged or holds something else.
+        DataFileError: the file is missing, damaged or holds something else.
     """
     try:
         with opened(path) as units:
@@ -70,6 +80,8 @@ def load(path: Path, kind: str, what: str, parse: Callable[[fits.HDUList], T]) -
             if found != kind:
                 raise ValueError(f"its header should say KIND = {kind!r}, got {found!r}")
             return parse(units)
+    except FileNotFoundError:
+        raise DataFileError(f"{path}: there is no such {what}{advice}") from None
     except DAMAGED as error:
         raise DataFileError(f"{path}: not a whole {what}: {in_a_line(error)}") from None
 
@@ -110,5 +122,6 @@ def require_identity(path: Path, found: str, stated: str) -> None:
 
 
 def in_a_line(error: BaseException) -> str:
-    """What an error says, whose text may have several lines."""
-    return " ".join(str(error).split())
+    """What an error says, whose text may have several lines, or more characters than a user reads."""
+    text = error.strerror if isinstance(error, OSError) and error.strerror else str(error)
+    return " ".join(text.split())[:300]

@@ -7,7 +7,6 @@ from astropy.io import fits
 
 from lowfc.adapters import fits_file
 from lowfc.adapters.whole_file import write_whole
-from lowfc.contract.errors import DataFileError
 from lowfc.contract.identity import identity
 from lowfc.control.linear_law import LinearLaw, Signal
 
@@ -54,9 +53,7 @@ def load(path: Path) -> LinearLaw:
     Raises:
         DataFileError: the file is missing, damaged or holds something else.
     """
-    if not path.is_file():
-        raise DataFileError(f"{path}: there is no such law file: make one with `lowfc tune LOG --out FILE`")
-    law, stated = fits_file.load(path, KIND, "law file", _read)
+    law, stated = fits_file.load(path, KIND, "law file", _read, ": make one with `lowfc tune LOG --out FILE`")
     fits_file.require_identity(path, identity(law), stated)
     return law
 

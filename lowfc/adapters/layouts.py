@@ -7,10 +7,13 @@ from importlib.resources.abc import Traversable
 from pathlib import Path
 from typing import Any
 
-from lowfc.contract.errors import ConfigurationError, DataFileError, nearest
+from lowfc.contract import input_file
+from lowfc.contract.errors import ConfigurationError, DataFileError, brief, nearest
 from lowfc.optics import sam as sams
 
 SHIPPED = resources.files("lowfc") / "data" / "sam_layouts.json"
+
+_LARGEST_BYTES = 1 << 24
 
 
 def layout_names() -> list[str]:
@@ -61,7 +64,7 @@ def parse_layout(file: Traversable, name: str, entry: Any) -> sams.Layout:
     except (AttributeError, KeyError, TypeError, ValueError) as error:
         raise DataFileError(
             f'{file}: layout {name} must have "hole_diameter" and "holes" as pairs [x, y], or as [x, y, diameter], in '
-            f"pupil diameters ({type(error).__name__}: {error})"
+            f"pupil diameters ({type(error).__name__}: {brief(str(error))})"
         ) from error
     try:
         sams.check(layout)
@@ -82,11 +85,16 @@ def layout_warnings(layout: sams.Layout) -> list[str]:
 
 def _read_layouts(file: Traversable) -> dict[str, Any]:
     try:
-        content = json.loads(file.read_text(encoding="utf-8"))
+        content = json.loads(
+            input_file.read_whole(file, _LARGEST_BYTES) if isinstance(file, Path) else file.read_bytes()
+        )
     except FileNotFoundError:
         raise DataFileError(f"there is no layout file {file}") from None
     except (OSError, ValueError) as error:
-        raise DataFileError(f"{file} is not a readable JSON file: {error}") from error
+        why = error.strerror if isinstance(error, OSError) else error
+        raise DataFileError(f"{file} is not a readable JSON file: {why}") from error
+    except RecursionError:
+        raise DataFileError(f"{file} is not a readable JSON file: its lists or objects are nested too deeply") from None
     if isinstance(content, dict) and "holes" in content:
         return {str(content.get("name", Path(file.name).stem)): content}
     layouts = content.get("layouts") if isinstance(content, dict) else None

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lowfc.adapters.layouts import layout_warnings, load_layout
+from lowfc.contract import input_file
 from lowfc.contract.configuration import SENSORS, SensorSection, sensor_keys
 from lowfc.contract.errors import ConfigurationError, DataFileError, nearest
 from lowfc.optics import sam as sams
@@ -20,6 +21,7 @@ from lowfc.optics.relay import ApertureMask, Defocus, PupilImage, Relay, fresnel
 from lowfc.optics.sensor import Sensor
 
 _DATA = resources.files("lowfc") / "data"
+_LARGEST_BYTES = 1 << 30
 _WITH_LYOT_STOP = ("circle", "prolate")
 _log = logging.getLogger(__name__)
 
@@ -36,7 +38,8 @@ def load_pupil(samples: int = SAMPLES, file: Traversable = _DATA / "spc_quarter1
         ConfigurationError: The quadrant does not divide `samples`.
     """
     try:
-        with file.open("rb") as stream, np.load(stream, allow_pickle=False) as arrays:
+        opened = input_file.opened(file, _LARGEST_BYTES) if isinstance(file, Path) else file.open("rb")
+        with opened as stream, np.load(stream, allow_pickle=False) as arrays:
             quarter = np.asarray(arrays["quarter"])
     except FileNotFoundError:
         raise DataFileError(f"there is no pupil file {file}") from None

@@ -5,7 +5,6 @@ the nearest known one. `lowfc config show` prints all keys with their sentences.
 """
 
 import difflib
-import tomllib
 from pathlib import Path
 from typing import Any, Literal
 
@@ -13,7 +12,8 @@ import tomli_w
 from pydantic import BaseModel, Field, ValidationError, model_validator
 from pydantic.fields import FieldInfo
 
-from lowfc.contract.errors import ConfigurationError
+from lowfc.contract import input_file, toml_text
+from lowfc.contract.errors import ConfigurationError, brief
 from lowfc.contract.sections import (
     PRESETS,
     SENSORS,
@@ -41,6 +41,10 @@ __all__ = [
     "load",
     "sensor_keys",
 ]
+
+MOST_FAULTS = 20
+"""Faults that are explained, of a file that may be something else altogether."""
+_LONGEST_KEY = 100  # characters of one that the nearest known key is looked for
 
 
 class Control(Section):
@@ -257,11 +261,12 @@ def load(
     data: dict[str, Any] = {}
     if path is not None:
         try:
-            data = tomllib.loads(path.read_text(encoding="utf-8"))
+            data = toml_text.parsed(input_file.read_whole(path, toml_text.LARGEST_BYTES))
         except FileNotFoundError:
             raise ConfigurationError(f"{path}: there is no such configuration file") from None
-        except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
-            raise ConfigurationError(f"{path}: not a readable TOML file: {error}") from None
+        except (OSError, ValueError) as error:
+            why = error.strerror if isinstance(error, OSError) else error
+            raise ConfigurationError(f"{path}: not a readable TOML file: {why}") from None
     for key, value in (defaults or {}).items():
         _put(path, data, key, value, replace=False)
     for key, value in (overrides or {}).items():
@@ -269,7 +274,10 @@ def load(
     try:
         return Configuration.model_validate(data)
     except ValidationError as error:
-        lines = [_explain(detail) for detail in error.errors()]
+        faults = error.errors()
+        lines = [explain(detail) for detail in faults[:MOST_FAULTS]]
+        if len(faults) > MOST_FAULTS:
+            lines.append(f"and {len(faults) - MOST_FAULTS} more")
         where = f"{path}: " if path is not None else ""
         raise ConfigurationError("\n".join(f"{where}{line}" for line in lines)) from None
 
@@ -296,11 +304,12 @@ def keys(section: type[BaseModel] = Configuration, prefix: str = "") -> dict[str
     return found
 
 
-def _explain(detail: Any) -> str:
+def explain(detail: Any) -> str:
+    """One of pydantic's errors as a line for a user."""
     key = ".".join(str(part) for part in detail["loc"])
     if detail["type"] == "extra_forbidden":
         known = [*keys(), *Configuration.model_fields]
-        near = difflib.get_close_matches(key, known, n=1, cutoff=0.0)
-        return f"unknown key {key!r}; the nearest known one is {near[0]!r}"
+        near = difflib.get_close_matches(key[:_LONGEST_KEY], known, n=1, cutoff=0.0)
+        return f"unknown key {brief(key)}; the nearest known one is {near[0]!r}"
     message = detail["msg"].removeprefix("Value error, ")
-    return f"{key} = {detail['input']!r}: {message}" if key else message
+    return f"{key[:_LONGEST_KEY]} = {brief(detail['input'])}: {message[:300]}" if key else message

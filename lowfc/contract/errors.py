@@ -10,6 +10,7 @@
 The numerics raise ValueError; the adapters above them name the file or the key and re-raise one of these.
 """
 
+import reprlib
 from collections.abc import Iterable
 from difflib import get_close_matches
 
@@ -38,6 +39,18 @@ class BusError(LowfcError):
 
 class RequestRefusedError(LowfcError):
     """The controller refused an operator's request."""
+
+
+_BRIEF = reprlib.Repr()
+_BRIEF.maxstring = _BRIEF.maxother = _BRIEF.maxlong = 100
+
+
+def brief(value: object) -> str:
+    """`repr` of a value from a file, shortened: an error stays one readable line whatever the file holds."""
+    try:
+        return _BRIEF.repr(value)
+    except ValueError:  # an integer of more digits than Python converts
+        return "a number of too many digits"
 
 
 def nearest(wanted: str, known: Iterable[str]) -> str:

@@ -135,6 +135,9 @@ def test_ctrl_c_while_it_loads_is_quiet(tmp_path: Path) -> None:
         (("replay", "night.mcap.part"), "it is finished now: night.mcap"),
         (("replay", "night.mcap", "night.mcap"), "a log is named twice"),
         (("replay", "pipe"), "pipe cannot be read: not a regular file"),
+        (("replay", "circle"), "circle cannot be read: Too many levels of symbolic links"),
+        (("config", "check", "/dev/zero"), "/dev/zero: not a readable TOML file: not a regular file"),
+        (("config", "check", "brackets.toml"), "nested too deeply"),
         (("replay", "night.mcap", "--speed", "2"), "belong to --publish"),
         (("replay", "night.mcap", "--publish", "--what-if", "gain=1"), "three different things"),
         (("recover", "night.mcap", "header.mcap", "--json"), "name one"),
@@ -146,6 +149,8 @@ def test_logs(tmp_path: Path, words: tuple[str, ...], expected: str) -> None:
     (tmp_path / "header.mcap").write_bytes(b"\x89MCAP0\r\n" + bytes(12))
     LogWriter(tmp_path / "night.mcap", 1, {}).finish({})
     os.mkfifo(tmp_path / "pipe")
+    (tmp_path / "circle").symlink_to("circle")
+    (tmp_path / "brackets.toml").write_text("a = " + "[" * 100_000)
     before = sorted(path.name for path in tmp_path.iterdir())
     done = run(tmp_path, *words)
     assert done.returncode == 2, done.stdout

@@ -11,6 +11,7 @@ from typing import Any
 from lowfc.adapters.drawing import figure_class, png
 from lowfc.adapters.layouts import parse_layout
 from lowfc.adapters.whole_file import require_folder, write_whole
+from lowfc.contract import input_file
 from lowfc.contract.errors import ConfigurationError, DataFileError
 from lowfc.design.paper import TABLE3_WAVES, TABLE4_MAS
 from lowfc.design.sam_goal import Goal
@@ -18,6 +19,7 @@ from lowfc.design.sam_search import Bounds, Chain
 from lowfc.optics.sam import Layout
 from lowfc.programs.design.sam_request import Search
 
+_LARGEST_BYTES = 1 << 26
 UNITS = "pupil diameters, origin at the pupil centre, x to the right (columns), y up the row index"
 
 
@@ -80,7 +82,7 @@ def read_state(path: Path, pupil: str) -> tuple[Search, list[Chain]]:
         DataFileError: The file is missing, damaged, or of a search with another shaped pupil.
     """
     try:
-        state = json.loads(path.read_text(encoding="utf-8"))
+        state = json.loads(input_file.read_whole(path, _LARGEST_BYTES))
         kept = state["search"]
         search = Search(
             goal=Goal(**kept["goal"]),
@@ -92,7 +94,7 @@ def read_state(path: Path, pupil: str) -> tuple[Search, list[Chain]]:
         made_for = state["pupil"]
     except FileNotFoundError:
         raise DataFileError(f"there is no search to resume in {path}") from None
-    except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
+    except (OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
         raise DataFileError(f"{path} is not the state of a search: {type(error).__name__}: {error}") from error
     if made_for != pupil:
         raise DataFileError(f"{path} belongs to a search with another shaped pupil; start again without --resume")

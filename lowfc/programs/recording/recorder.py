@@ -24,6 +24,7 @@ from lowfc.adapters.realtime import NOTHING, Granted, step_back
 from lowfc.adapters.run import Run
 from lowfc.adapters.service import Service
 from lowfc.adapters.zenoh_bus import ZenohBus
+from lowfc.contract import input_file
 from lowfc.contract.errors import DataFileError
 from lowfc.contract.messages import HEALTH, TOPICS, Role, Topic, wire
 from lowfc.programs.recording.others import Others
@@ -40,6 +41,7 @@ _FLUSH_NS = 250_000_000
 _SETTLE_S = (0.3, 1.5)
 _DRAIN_S = 1.0
 _SLOW_NS = 1_000_000_000
+_LARGEST_ATTACHMENT_BYTES = 1 << 28
 
 
 class Recorder:
@@ -363,6 +365,6 @@ def record(
 
 def _attached(path: Path, media_type: str) -> Attachment:
     try:
-        return Attachment(path.name, media_type, path.read_bytes())
+        return Attachment(path.name, media_type, input_file.read_whole(path, _LARGEST_ATTACHMENT_BYTES))
     except OSError as fault:
         raise DataFileError(f"{path} cannot be read for the log: {fault.strerror}") from fault

@@ -63,9 +63,9 @@ def replay_files(paths: Sequence[Path], tolerance_nm: float, jobs: int, progress
         ConfigurationError: a log is named twice.
         DataFileError: a log cannot be read, or cannot be replayed.
     """
+    ends_ns = [one for path in paths for one in _chunk_ends_ns(path)]
     if len({path.resolve() for path in paths}) < len(paths):
         raise ConfigurationError("a log is named twice; name each once, in the order they were recorded")
-    ends_ns = [one for path in paths for one in _chunk_ends_ns(path)]
     worth = sum(path.stat().st_size for path in paths) // _WORTH_BYTES if ends_ns else 1
     count = max(1, min(jobs or len(os.sched_getaffinity(0)), worth))
     edges = [0, *(ends_ns[len(ends_ns) * share // count] for share in range(1, count)), WHOLE.until_ns]

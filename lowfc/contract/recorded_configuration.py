@@ -1,0 +1,73 @@
+"""The configuration that a log was recorded with, by this version of lowfc or by another one."""
+
+from typing import Any
+
+from pydantic import BaseModel, ValidationError
+
+from lowfc.contract import toml_text
+from lowfc.contract.configuration import MOST_FAULTS, Configuration, explain
+from lowfc.contract.errors import ConfigurationError
+
+_SECTIONS: dict[str, type[BaseModel]] = {
+    name: info.annotation
+    for name, info in Configuration.model_fields.items()
+    if isinstance(info.annotation, type) and issubclass(info.annotation, BaseModel)
+}
+
+
+def recorded(content: bytes) -> tuple[Configuration, list[str]]:
+    """A recorded configuration, and remarks on what this version would refuse in a file.
+
+    An unknown key is ignored, a value that is refused is replaced by the default. Values that only do not go together
+    stay as they are, since the run had them.
+
+    Raises:
+        ConfigurationError: it is not a readable TOML file.
+    """
+    try:
+        data = toml_text.parsed(content)
+    except ValueError as error:
+        raise ConfigurationError(f"not a readable TOML file: {error}") from None
+    remarks: list[str] = []
+    while faults := _faults(data):
+        of_keys = [detail for detail in faults if _is_of_key(data, detail)]
+        for detail in of_keys or faults:
+            done = _mend(data, detail) if of_keys else "used as recorded"
+            if len(remarks) < MOST_FAULTS:
+                remarks.append(f"{explain(detail)}; {done}")
+        if len(of_keys) > MOST_FAULTS:
+            remarks.append(f"and {len(of_keys) - MOST_FAULTS} more")
+        if not of_keys:
+            return _constructed(data, {str(detail["loc"][0]) for detail in faults if detail["loc"]}), remarks
+    return Configuration.model_validate(data), remarks
+
+
+def _faults(data: dict[str, Any]) -> list[Any]:
+    try:
+        Configuration.model_validate(data)
+    except ValidationError as error:
+        return list(error.errors())
+    return []
+
+
+def _is_of_key(data: dict[str, Any], detail: Any) -> bool:
+    """Whether one key is at fault, rather than several that do not go together."""
+    location = detail["loc"]
+    return len(location) > 1 or (len(location) == 1 and not isinstance(data.get(location[0]), dict))
+
+
+def _mend(data: dict[str, Any], detail: Any) -> str:
+    """Remove the key at fault; return what that means, in words."""
+    section, *path = detail["loc"]
+    (data.get(section, {}) if path else data).pop(path[0] if path else section, None)
+    return "it is ignored" if detail["type"] == "extra_forbidden" else "the default is used"
+
+
+def _constructed(data: dict[str, Any], contradictory: set[str]) -> Configuration:
+    """A configuration whose keys are sound each for itself."""
+    sections = {
+        name: kind.model_construct(**data[name]) if name in contradictory else kind.model_validate(data[name])
+        for name, kind in _SECTIONS.items()
+        if name in data
+    }
+    return Configuration.model_construct(**(data | sections))
