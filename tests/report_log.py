@@ -130,9 +130,10 @@ class Night:
         sent_ns = self.now_ns + late_ns
         self.samples.append(Sample(key, payload, sequence, sent_ns, sent_ns + 50_000))
 
-    def write(self, path: Path, *, finish: bool = True, config: bool = True) -> Path:
+    def write(self, path: Path, *, finish: bool = True, config: bool = True, toml: str | None = None) -> Path:
         """Write the log, finished or as a recorder that died leaves it; return where it is."""
-        attached = [Attachment("config.toml", "application/toml", Configuration().to_toml().encode())] if config else []
+        content = (Configuration().to_toml() if toml is None else toml).encode()
+        attached = [Attachment("config.toml", "application/toml", content)] if config else []
         log = LogWriter(path, START * 10**9, METADATA, attached)
         for sample in self.samples:
             log.write(sample)

@@ -108,6 +108,7 @@ def test_what_was_written_is_said(log: Path, lowfc: Callable[..., Result]) -> No
             "recording": {"messages": "203", "messages_lost": "4"},
         },
         "attachments": {"config.toml": 7},
+        "remarks": [f"{log}: its config.toml: unknown key 'loop'; the nearest known one is 'lockstep'; it is ignored"],
     }
 
 

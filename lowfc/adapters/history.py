@@ -86,6 +86,8 @@ class History:
 
     Attributes:
         log: the reader, read to its end: metadata, attachments, whether the log is complete.
+        configuration: that the log was recorded with; None without one that can be read.
+        remarks: what of that this version cannot use, a sentence each that names the log.
         controllers: states of the controllers, in order.
         frame_sequence, frame_publish_ns: of every frame in the log.
         command_publish_ns: of every mirror command in the log.
@@ -100,6 +102,7 @@ class History:
 
     log: LogReader
     configuration: Configuration | None
+    remarks: list[str]
     calibration: Calibration | None
     controllers: list[wire.ControllerState]
     camera: wire.CameraState | None

@@ -1,9 +1,7 @@
 """Reading a log into a history."""
 
-import tempfile
 from collections import Counter
 from collections.abc import Callable
-from pathlib import Path
 
 import numpy as np
 import numpy.typing as npt
@@ -15,8 +13,8 @@ from lowfc.adapters.log_reader import Logged, LogReader
 from lowfc.adapters.rows import Columns, StepRows, TimingRows, TruthRows, bits_of
 from lowfc.contract.calibration_codec import decode_calibration
 from lowfc.contract.codec import actuators
-from lowfc.contract.configuration import Configuration, load
-from lowfc.contract.errors import DataFileError
+from lowfc.contract.configuration import Configuration
+from lowfc.contract.errors import ConfigurationError, DataFileError
 from lowfc.contract.messages import (
     CALIBRATION,
     CAMERA_STATE,
@@ -34,6 +32,7 @@ from lowfc.contract.messages import (
     topic_of,
     wire,
 )
+from lowfc.contract.recorded_configuration import recorded
 
 Single = npt.NDArray[np.float32]
 
@@ -48,7 +47,7 @@ def read_history(log: LogReader, progress: Callable[[int], None] | None = None) 
         progress: called now and then with the number of messages read so far.
 
     Raises:
-        DataFileError: as `LogReader`, or the log has a calibration or a configuration that cannot be read.
+        DataFileError: as `LogReader`, or the log has a calibration that cannot be read.
     """
     gathered = _Gathered()
     number = 0
@@ -61,19 +60,19 @@ def read_history(log: LogReader, progress: Callable[[int], None] | None = None) 
     return gathered.history(log)
 
 
-def attached_configuration(log: LogReader) -> Configuration | None:
-    """The configuration that a log was recorded with; None where it has none.
+def attached_configuration(log: LogReader) -> tuple[Configuration | None, list[str]]:
+    """The configuration that a log was recorded with, and remarks on what of it this version cannot use.
 
-    Raises:
-        ConfigurationError: this version cannot read it.
+    None where the log has none that can be read: a log is never refused for its configuration.
     """
-    content = next((data for name, data in log.attachments.items() if name.endswith(".toml")), None)
+    name, content = next((one for one in log.attachments.items() if one[0].endswith(".toml")), ("", None))
     if content is None:
-        return None
-    with tempfile.TemporaryDirectory() as folder:
-        path = Path(folder) / "config.toml"
-        path.write_bytes(content)
-        return load(path)
+        return None, []
+    try:
+        found, remarks = recorded(content)
+    except ConfigurationError as error:
+        return None, [f"{log.path}: its {name} cannot be used: {error}"]
+    return found, [f"{log.path}: its {name}: {remark}" for remark in remarks]
 
 
 class _Gathered:
@@ -175,13 +174,15 @@ class _Gathered:
         mirror = self.mirror
         empty = np.zeros((0, 0), np.float32)
         timed_sequence, stages_ns = self.timings.taken()
+        configuration, remarks = attached_configuration(log)
         try:
             calibration = decode_calibration(self.calibration) if self.calibration is not None else None
         except ValueError as error:
             raise DataFileError(f"{log.path}: {error}") from None
         return History(
             log=log,
-            configuration=attached_configuration(log),
+            configuration=configuration,
+            remarks=remarks,
             calibration=calibration,
             controllers=self.controllers,
             camera=self.camera,

@@ -52,8 +52,10 @@ def _faults(data: dict[str, Any]) -> list[Any]:
 
 def _is_of_key(data: dict[str, Any], detail: Any) -> bool:
     """Whether one key is at fault, rather than several that do not go together."""
-    location = detail["loc"]
-    return len(location) > 1 or (len(location) == 1 and not isinstance(data.get(location[0]), dict))
+    if not detail["loc"]:
+        return False
+    section, *path = detail["loc"]
+    return bool(path) or detail["type"] == "extra_forbidden" or not isinstance(data.get(section), dict)
 
 
 def _mend(data: dict[str, Any], detail: Any) -> str:

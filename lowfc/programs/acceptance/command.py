@@ -1,5 +1,6 @@
 """`lowfc acceptance`: arguments only; each test has a module of its own."""
 
+import sys
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
@@ -164,6 +165,8 @@ def _measured(kind: "Kind", where: Where, play: "Callable[[Live, Acceptance], li
         if plot is not None:
             refuse_log(plot, log)
         history = read_history(LogReader(log, skip_damaged=True))
+        for remark in history.remarks:
+            sys.stderr.write(f"warning: {remark}\n")
         every = logged(history, kind)
         known, calibration = history.configuration, history.calibration
         if known is None or calibration is None:

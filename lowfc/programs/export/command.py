@@ -105,6 +105,7 @@ def export_log(
         "steps_left_out": history.left_out,
         "finished": reader.finished,
         "damaged": [f"byte {one.position}, {one.why}" for one in reader.damage],
+        "remarks": history.remarks,
     }
 
 
@@ -117,6 +118,7 @@ def render(figures: dict[str, Any]) -> str:
     if not figures["finished"]:
         lines.append("truncated          the log has no end: its recorder was killed, or is still writing")
     lines += [f"damaged            left out: {part}" for part in figures["damaged"]]
+    lines += [f"configuration      {remark}" for remark in figures["remarks"]]
     return "\n".join(lines)
 
 

@@ -91,6 +91,7 @@ def _summary(found: Mapping[str, Any]) -> dict[str, str]:
         "messages": f"{found['messages']}; {', '.join(lost)}",
         "loop": ", ".join(found["loop_modes"]),
         "events": ", ".join(f"{name} {count}" for name, count in found["events"].items()),
+        "configuration": "\n".join(found["remarks"]),
         "attachments": ", ".join(f"{name} ({size} bytes)" for name, size in found["attachments"].items()),
         **{
             name: ", ".join(f"{key} {value}" for key, value in entries.items())

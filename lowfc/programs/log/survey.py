@@ -13,6 +13,7 @@ from google.protobuf.message import DecodeError
 
 from lowfc.adapters.bus import Sample
 from lowfc.adapters.envelope import start_of
+from lowfc.adapters.history_reader import attached_configuration
 from lowfc.adapters.ledger import Ledger
 from lowfc.adapters.log_reader import Logged, LogReader
 from lowfc.adapters.log_recovery import RECOVERY
@@ -136,6 +137,7 @@ def survey(log: Path, progress: Callable[[int, int], None] = lambda done, size: 
         "damage": [dataclasses.asdict(damage) for damage in reader.damage],
         "metadata": reader.metadata,
         "attachments": {name: len(data) for name, data in reader.attachments.items()},
+        "remarks": attached_configuration(reader)[1],
     }
 
 

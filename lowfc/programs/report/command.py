@@ -60,6 +60,8 @@ def _report(log: Path, out: Path | None, as_json: bool) -> None:
         if target is not None:
             made = page(found, lambda name: bar.update(task, description=f"drawing {name}"))
             write_whole(target, made.encode())
+    for remark in run.history.remarks:
+        sys.stderr.write(f"warning: {remark}\n")
     if as_json:
         sys.stdout.write(json.dumps(_finite(found.figures), allow_nan=False) + "\n")
     else:

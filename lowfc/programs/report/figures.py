@@ -77,6 +77,7 @@ def _log(run: Run) -> Figures:
         "stopped": account.get("stopped") or None,
         "recovery": recovery_in_words(log.metadata) or None,
         "damage": [{"byte": damage.position, "bytes": damage.length, "why": damage.why} for damage in log.damage],
+        "remarks": run.history.remarks,
         "messages": sum(run.history.counts.values()),
         "messages_by_topic": dict(sorted(run.history.counts.items())),
         "messages_lost": _count(account.get("messages_lost", "")),

@@ -78,7 +78,6 @@ def read_run(path: Path, progress: Callable[[float], None] | None = None) -> Run
 
     Raises:
         DataFileError: this is no log, or it has a calibration that cannot be read.
-        ConfigurationError: it has a configuration that this version cannot read.
     """
     log = LogReader(path, skip_damaged=True)
 

@@ -78,7 +78,7 @@ def of_log(log: LogReader, progress: Callable[[int], None] | None = None) -> Tel
     mode = np.where(run.played, np.uint8(0), steps.mode)  # it settles after a play as after it was closed
     true_nm = run.true_nm(history.truths.residual_nm) if len(history.truths.sequence) else None
     state = history.controller
-    warnings = []
+    warnings = list(history.remarks)
     if not same:
         warnings.append(
             f"the controller reckoned with a delay of {run.controller_delay:g} frames, measured from "

@@ -8,7 +8,7 @@ from lowfc.adapters.clock import SimulatedClock
 from lowfc.adapters.history_reader import attached_configuration
 from lowfc.adapters.log_reader import Logged, LogReader
 from lowfc.contract.configuration import Configuration
-from lowfc.contract.errors import ConfigurationError, DataFileError
+from lowfc.contract.errors import DataFileError
 from lowfc.contract.messages import topic_of
 from lowfc.programs.view.moment import PICTURES_HZ, PICTURES_PER_WHOLE, SHOWN, Gatherer
 from lowfc.programs.view.painter import Painter
@@ -98,11 +98,8 @@ def _same_run(before: str, reader: LogReader) -> str:
 
 def _own(reader: LogReader, drawn: Drawn) -> Configuration:
     """The log's own configuration; the default one, with a remark, where it has none that can be read."""
-    try:
-        found = attached_configuration(reader)
-    except ConfigurationError as error:
-        drawn.remarks.append(f"the log's configuration cannot be read ({error}); the default one is taken")
-        return Configuration()
+    found, remarks = attached_configuration(reader)
+    drawn.remarks += remarks
     if found is None:
-        drawn.remarks.append("the log has no configuration; the default one is taken for pupil and telescope")
+        drawn.remarks.append("the default configuration is used for pupil and telescope, as the log has none")
     return found or Configuration()

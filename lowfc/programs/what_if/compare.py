@@ -224,7 +224,7 @@ def _tilt_mas(run: LoggedRun, columns: dict[str, Double]) -> dict[str, float]:
 
 def _doubts_of_log(run: LoggedRun) -> list[str]:
     """What of the log makes the figures less sure."""
-    found, log = [], run.history.log
+    found, log = list(run.history.remarks), run.history.log
     if log.damage:
         parts = ", ".join(f"byte {one.position}, {one.why}" for one in log.damage)
         found.append(f"the log is damaged, and these parts are left out: {parts}")
