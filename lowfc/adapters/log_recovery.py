@@ -74,7 +74,7 @@ def recover(source: Path, out: Path, progress: Callable[[int, int], None] = lamb
     if reader.complete and not reader.damage and not reader.unreadable:
         return Recovery(source, reader.size, None, 0, finished=True, damage=[], unreadable=0)
     reader = LogReader(source, skip_damaged=True)
-    with _new_file(out) as file:
+    with _new_file(out, source) as file:
         writer = Writer(
             file, chunk_size=CHUNK_BYTES, compression=CompressionType.LZ4, enable_crcs=True, enable_data_crcs=True
         )
@@ -148,16 +148,17 @@ def in_words(damage: Damage) -> str:
 
 
 @contextlib.contextmanager
-def _new_file(path: Path) -> Iterator[IO[bytes]]:
-    """A file that has its name when it is whole, and is gone when something fails before."""
+def _new_file(path: Path, source: Path) -> Iterator[IO[bytes]]:
+    """A file with the permissions of `source`: it has its name when it is whole, and is gone when something fails."""
     try:
+        mode = source.stat().st_mode & 0o666
         with tempfile.NamedTemporaryFile(dir=path.parent, prefix=f".{path.name}.", delete=False) as file:
             part = Path(file.name)
             try:
                 yield file
                 file.flush()
                 os.fsync(file.fileno())
-                part.chmod(0o644)
+                part.chmod(mode)
                 if path.exists():
                     raise DataFileError(f"{path} has come into being meanwhile; a log is never overwritten")
                 part.rename(path)

@@ -9,23 +9,25 @@ from pathlib import Path
 
 from lowfc.adapters.bus import Sample
 from lowfc.adapters.clock import Clock
-from lowfc.adapters.log_writer import Attachment, LogWriter, log_path
+from lowfc.adapters.log_writer import FILE_MODE, Attachment, LogWriter, log_path
 from lowfc.contract.errors import DataFileError
 
 
 @dataclass(frozen=True, slots=True)
 class Limits:
-    """When a log is finished and the next one begun, and what is left of the disk for others.
+    """When a log is finished and the next one begun, who may read it, and what is left of the disk for others.
 
     Attributes:
         largest_bytes: size at which the next log is begun.
         longest_s: age at which the next log is begun.
         min_free_bytes: free space below which nothing is recorded.
+        file_mode: permissions of a log.
     """
 
     largest_bytes: int = 4_000_000_000
     longest_s: float = 3600.0
     min_free_bytes: int = 500_000_000
+    file_mode: int = FILE_MODE
 
 
 STANDARD = Limits()
@@ -90,7 +92,9 @@ class LogSeries:
             DataFileError: it cannot be made.
         """
         now_ns = self._clock.host_ns()
-        self._log = LogWriter(log_path(self._folder, now_ns), now_ns, self._metadata, self._attachments)
+        self._log = LogWriter(
+            log_path(self._folder, now_ns), now_ns, self._metadata, self._attachments, self._limits.file_mode
+        )
         self._opened_s = time.monotonic()
         self.files.append(self._log.path)
         for sample in first:

@@ -35,6 +35,9 @@ if TYPE_CHECKING:
 UNFINISHED = ".part"
 """Appended to the name of a log that is being written, or was when its recorder died."""
 
+FILE_MODE = 0o640
+"""Permissions of a log, of which the process's umask may take more away: notes and frames are not for everybody."""
+
 CHUNK_BYTES = 240 * 1024  # a chunk is closed by the message that passes this; with a frame it stays below 256 KiB
 START_KEY = "start_s"
 """Of a channel's metadata: the upper half of the sequences in it."""
@@ -52,8 +55,8 @@ class Attachment:
 class _File(FileIO):
     """A log's file: it knows its size without asking the system, and how long one write took at most."""
 
-    def __init__(self, path: Path) -> None:
-        super().__init__(path, "x")
+    def __init__(self, path: Path, mode: int) -> None:
+        super().__init__(path, "x", opener=lambda name, flags: os.open(name, flags, mode))
         self.size = 0
         self.longest_write_ns = 0
 
@@ -85,8 +88,9 @@ class LogWriter:
         time_ns: int,
         metadata: Mapping[str, Mapping[str, str]],
         attachments: Sequence[Attachment] = (),
+        file_mode: int = FILE_MODE,
     ) -> None:
-        """Open `path` + ".part" and write what describes the log, made at `time_ns`.
+        """Open `path` + ".part", with these permissions, and write what describes the log, made at `time_ns`.
 
         Raises:
             DataFileError: there is a log of that name, or the disk refuses.
@@ -100,7 +104,7 @@ class LogWriter:
             raise DataFileError(f"{path} exists already; a log is never overwritten")
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
-            self._raw = _File(self.part)
+            self._raw = _File(self.part, file_mode)
         except OSError as fault:
             raise DataFileError(f"{self.part} cannot be made: {fault.strerror}") from fault
         self._file = BufferedWriter(self._raw)

@@ -128,6 +128,8 @@ class Recorder(Section):
 
     folder: str = "logs"
     """Where log files are written."""
+    file_mode: str = Field("0640", pattern=r"^06[0246]{2}$")
+    """Permissions of a log file, octal: 0640 lets its group read it, 0600 nobody else; the umask may take more away."""
     largest_mb: float = Field(4000.0, ge=1, le=1_000_000)
     """Size at which a log is finished and the next one begun; each can be read by itself."""
     longest_s: float = Field(3600.0, ge=1, le=1_000_000)

@@ -203,7 +203,7 @@ def record(
         configuration=config,
         calibration=calibration,
         seed=settings.seed,
-        limits=Limits(round(log.largest_mb * 1e6), log.longest_s, round(log.min_free_mb * 1e6)),
+        limits=Limits(round(log.largest_mb * 1e6), log.longest_s, round(log.min_free_mb * 1e6), int(log.file_mode, 8)),
         clock=clock_of(settings),
         priority=(settings.realtime.priority and settings.realtime.recorder_priority) or None,
         cpus=set(settings.realtime.recorder_cpus) or None,
