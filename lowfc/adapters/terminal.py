@@ -13,6 +13,7 @@ import typer
 from lowfc.adapters.run import DEFAULT_RUN
 from lowfc.contract.configuration import Configuration, load
 from lowfc.contract.errors import ConfigurationError, LowfcError
+from lowfc.contract.printable import LINES, printable
 
 INTERRUPTED = 130
 """Exit status after Ctrl-C."""
@@ -53,7 +54,7 @@ def run_app(app: Callable[[], object]) -> NoReturn:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # what is left of it cannot go anywhere
         sys.exit(2)
     except LowfcError as error:
-        sys.stderr.write(f"error: {error}\n")
+        sys.stderr.write(f"error: {printable(str(error), keep=LINES)}\n")
         sys.exit(error.exit_status)
     except SystemExit as end:
         if end.code == INTERRUPTED:

@@ -14,6 +14,7 @@ from pydantic.fields import FieldInfo
 
 from lowfc.contract import input_file, toml_text
 from lowfc.contract.errors import ConfigurationError, brief
+from lowfc.contract.printable import printable
 from lowfc.contract.sections import (
     PRESETS,
     SENSORS,
@@ -314,4 +315,4 @@ def explain(detail: Any) -> str:
         near = difflib.get_close_matches(key[:_LONGEST_KEY], known, n=1, cutoff=0.0)
         return f"unknown key {brief(key)}; the nearest known one is {near[0]!r}"
     message = detail["msg"].removeprefix("Value error, ")
-    return f"{key[:_LONGEST_KEY]} = {brief(detail['input'])}: {message[:300]}" if key else message
+    return printable(f"{key[:_LONGEST_KEY]} = {brief(detail['input'])}: {message[:300]}" if key else message)

@@ -4,6 +4,7 @@ from dataclasses import dataclass
 from enum import IntEnum
 
 from lowfc.contract.messages import Log, timestamp
+from lowfc.contract.printable import printable
 
 
 class Level(IntEnum):
@@ -25,11 +26,14 @@ class Event:
     sentence: str
 
     def log(self, process: str, time_ns: int, /, **details: object) -> Log:
-        """Message of one occurrence: "NAME sentence", from `process`, at `time_ns` (nanoseconds since the epoch)."""
+        """Message of one occurrence: "NAME sentence", from `process`, at `time_ns` (nanoseconds since the epoch).
+
+        Control characters in the details are shown as escapes: the message is one line for a terminal.
+        """
         return Log(
             timestamp=timestamp(time_ns),
             level=self.level.value,  # type: ignore[arg-type]  # the schema's enum is a plain int at run time
-            message=f"{self.name} {self.sentence.format(**details)}",
+            message=printable(f"{self.name} {self.sentence.format(**details)}"),
             name=process,
         )
 

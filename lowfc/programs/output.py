@@ -5,7 +5,9 @@ import sys
 from collections.abc import Mapping
 from typing import Any
 
+from lowfc.contract.printable import LINES, printable
+
 
 def put(figures: Mapping[str, Any], text: str, *, as_json: bool) -> None:
-    """Print figures as one JSON object, or the text that says the same to a person."""
-    sys.stdout.write((json.dumps(figures) if as_json else text) + "\n")
+    """Print figures as one JSON object, or the text that says the same to a person, its control characters escaped."""
+    sys.stdout.write((json.dumps(figures) if as_json else printable(text, keep=LINES)) + "\n")

@@ -11,6 +11,7 @@ from lowfc.adapters.run import mirror_role
 from lowfc.contract.configuration import Configuration
 from lowfc.contract.events import Level
 from lowfc.contract.messages import COMMAND, FRAME, Role, wire
+from lowfc.contract.printable import printable
 from lowfc.control.safety import LoopMode
 from lowfc.programs.watch import Watch, topic_count
 
@@ -39,7 +40,7 @@ def screen(watch: Watch, config: Configuration, duration_s: float | None, elapse
     table.add_row("mirror", f"{mirror.state or 'not there yet'}, {commands.received} commands")
     table.add_row("recorder", recording(recorder))
     for log in watch.events[-_EVENTS_SHOWN:]:
-        table.add_row(log.name, Text(log.message, style=_STYLES.get(Level(log.level), "")))
+        table.add_row(Text(printable(log.name)), Text(printable(log.message), style=_STYLES.get(Level(log.level), "")))
     left = f" of {duration_s:g} s" if duration_s is not None else ", Ctrl-C ends it"
     what = f"{config.disturbance.preset}, V = {config.star.magnitude:g}, {config.sensor.sam}"
     return Panel(Group(table), title="lowfc", subtitle=f"{what}; {elapsed_s:.0f} s{left}", expand=False)

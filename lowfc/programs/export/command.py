@@ -1,8 +1,6 @@
 """The command `lowfc export`: a log for the field's own tools."""
 
 import contextlib
-import json
-import sys
 from collections.abc import Callable
 from enum import StrEnum
 from pathlib import Path
@@ -12,6 +10,7 @@ import typer
 
 from lowfc.adapters.terminal import one_log
 from lowfc.contract.errors import ConfigurationError, DataFileError
+from lowfc.programs.output import put
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -49,7 +48,7 @@ def export(
     one_log(logs, out, as_json=as_json)
     for log in logs:
         figures = export_log(log, to, out, frames=frames, force=force, console=Console(stderr=True))
-        sys.stdout.write((json.dumps(figures) if as_json else render(figures)) + "\n")
+        put(figures, render(figures), as_json=as_json)
 
 
 def export_log(

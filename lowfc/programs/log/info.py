@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from lowfc.adapters.terminal import one_log
+from lowfc.contract.printable import LINES, printable
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -53,7 +54,7 @@ def report(found: Mapping[str, Any], console: "Console") -> None:
 
     lines = Table.grid(padding=(0, 2))
     for name, value in _summary(found).items():
-        lines.add_row(Text(name, style="dim"), Text(value))
+        lines.add_row(Text(printable(name), style="dim"), Text(printable(value, keep=LINES)))
     console.print(lines)
     topics = Table(box=None, padding=(0, 2, 0, 0))
     topics.add_column("topic", no_wrap=True)
@@ -63,7 +64,7 @@ def report(found: Mapping[str, Any], console: "Console") -> None:
     for key, line in found["topics"].items():
         rate_hz = "" if line["rate_hz"] is None else f"{line['rate_hz']:.1f}"
         counts = str(line["messages"]), rate_hz, f"{line['bytes'] / 1e6:.2f}", str(line["restarts"])
-        topics.add_row(Text(key), *counts, str(line["missing"]), Text(line["schema"]))
+        topics.add_row(Text(printable(key)), *counts, str(line["missing"]), Text(printable(line["schema"])))
     if found["topics"]:
         console.print()
         console.print(topics)

@@ -1,14 +1,13 @@
 """The command `lowfc recover`: what is whole of a truncated or damaged log, as a log."""
 
 import dataclasses
-import json
-import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from lowfc.adapters.terminal import one_log
+from lowfc.programs.output import put
 
 if TYPE_CHECKING:
     from lowfc.adapters.log_recovery import Recovery
@@ -45,7 +44,7 @@ def recover(
                 recovered_path(log) if out is None else out,
                 lambda position, size: bar.update(task, completed=position, total=size),  # noqa: B023  # not kept
             )
-        sys.stdout.write((json.dumps(figures(done)) if as_json else report(done)) + "\n")
+        put(figures(done), report(done), as_json=as_json)
 
 
 def figures(done: "Recovery") -> dict[str, Any]:

@@ -1,7 +1,5 @@
 """The command `lowfc replay`."""
 
-import json
-import sys
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -16,6 +14,7 @@ from lowfc.adapters.progress import passing_bar
 from lowfc.adapters.provenance import provenance
 from lowfc.adapters.terminal import DEFAULT_RUN, INTERRUPTED
 from lowfc.contract.errors import ConfigurationError
+from lowfc.programs.output import put
 from lowfc.programs.replay.account import Account
 
 _HOST = ("lowfc", "git", "python", "numpy", "scipy", "blas", "processor", "cpu_features")
@@ -205,4 +204,4 @@ def _only_with(name: str, given: bool, *options: object) -> None:
 
 
 def _show(figures: dict[str, Any], text: Callable[[dict[str, Any]], str], as_json: bool) -> None:
-    sys.stdout.write((json.dumps(figures) if as_json else text(figures)) + "\n")
+    put(figures, text(figures), as_json=as_json)

@@ -10,6 +10,7 @@ import typer
 
 from lowfc.adapters.terminal import one_log
 from lowfc.contract.errors import DataFileError
+from lowfc.contract.printable import LINES, printable
 
 _LOGS = (".mcap", ".part")
 
@@ -67,7 +68,7 @@ def _report(log: Path, out: Path | None, as_json: bool) -> None:
     else:
         verdict = found.figures["verdict"]
         because = f": {verdict['because']}" if verdict["because"] else ""
-        sys.stdout.write(f"{verdict['heading']}{because}\n{target}\n")
+        sys.stdout.write(printable(f"{verdict['heading']}{because}\n{target}\n", keep=LINES))
 
 
 def _finite(figures: Any) -> Any:

@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import numpy.typing as npt
 
+from lowfc.contract.printable import printable
 from lowfc.programs.report.course import actuator_extremes_nm
 from lowfc.programs.report.figures import Report
 from lowfc.programs.report.residual import bin_starts, binned_rms
@@ -282,7 +283,7 @@ def _timeline(figure: "Figure", report: Report) -> bool:
     for number, request in enumerate(requests[:_MOST_MARKS]):
         axes.axvline(request["time_s"], color=FAINT, linewidth=0.8, linestyle=":")
         values = " ".join(f"{value:g}" for value in request["values"][:2])
-        text = f"{request['name']} {values}{'' if request['accepted'] else ' refused'}".strip()
+        text = f"{printable(request['name'])} {values}{'' if request['accepted'] else ' refused'}".strip()
         height = 0.25 * (number % 3 - 1)
         axes.text(request["time_s"], height, f" {text}", va="center", fontsize=8, parse_math=False)
         axes.plot(request["time_s"], 0, "|", color=INK, markersize=9)

@@ -7,6 +7,7 @@ from typing import Any
 import tomli_w
 
 from lowfc.contract.errors import ConfigurationError
+from lowfc.contract.printable import LINES, printable
 from lowfc.programs.report.drawings import drawings
 from lowfc.programs.report.figures import Report
 
@@ -52,6 +53,11 @@ def fixed(value: float | str, decimals: int = 3) -> str:
     return f"< {least:.{decimals}f}" if 0 < value < least / 2 else f"{value:.{decimals}f}"
 
 
+def _finalized(value: Any) -> Any:
+    """What the page shows of a value: text of the log with its control characters escaped."""
+    return printable(value, keep=LINES) if type(value) is str else value  # a drawing is Markup
+
+
 def _environment() -> Any:
     try:
         from jinja2 import Environment, StrictUndefined
@@ -60,6 +66,8 @@ def _environment() -> Any:
             f"a report's page needs jinja2, which is not there ({error}); install it with: pip install 'lowfc[plots]', "
             "or take the figures with --json"
         ) from None
-    environment = Environment(autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True)
+    environment = Environment(
+        autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True, finalize=_finalized
+    )
     environment.filters |= {"n": number, "fixed": fixed}
     return environment

@@ -8,6 +8,7 @@ import rerun.blueprint as rrb
 
 from lowfc.contract.events import Level
 from lowfc.contract.messages import from_timestamp
+from lowfc.contract.printable import printable
 from lowfc.control.safety import LoopMode
 from lowfc.programs.view.colours import BLUE, GREEN, GREY, ORANGE, RED, Colour
 from lowfc.programs.view.marks import at, curves, name_curves
@@ -63,7 +64,8 @@ class Loop(Panel):
             clock = datetime.fromtimestamp(time_ns * 1e-9, UTC).strftime("%H:%M:%S")  # rerun's own column is cut
             at(stream, time_ns)
             level = _LEVELS.get(event.level, rr.TextLogLevel.INFO)
-            stream.log(f"{LOG}/{event.name}", rr.TextLog(f"{clock}  {event.name}: {event.message}", level=level))
+            name, message = printable(event.name), printable(event.message)
+            stream.log(f"{LOG}/{name}", rr.TextLog(f"{clock}  {name}: {message}", level=level))
 
 
 def mode_view() -> rrb.View:

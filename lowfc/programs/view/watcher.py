@@ -13,6 +13,7 @@ from lowfc.adapters.envelope import start_of
 from lowfc.adapters.history import Single, Whole
 from lowfc.adapters.run import mirror_role
 from lowfc.contract.messages import CONTROLLER_STATE, FRAME, MIRROR_STATE, STEP, Role, Topic, wire
+from lowfc.contract.printable import printable
 from lowfc.control.estimator import saturated_pixels
 from lowfc.control.safety import LoopMode, Reason
 from lowfc.programs.view.moment import Moment
@@ -266,7 +267,7 @@ class Watcher:
             self.mode = _MODES.get(int(moment.steps.mode[-1]), self.mode)
         for event in moment.events:
             if event.message.startswith("MODE_CHANGED"):
-                self.why = event.message.partition(": ")[2]
+                self.why = printable(event.message.partition(": ")[2])
 
     def _light(self, frame: npt.NDArray[np.uint16], moment: Moment) -> None:
         calibration = moment.calibration
