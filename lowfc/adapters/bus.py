@@ -11,8 +11,11 @@ from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from typing import NamedTuple, Protocol
 
+from google.protobuf.message import DecodeError
+
 from lowfc.adapters.clock_offset import ClockOffset
 from lowfc.adapters.envelope import Envelope
+from lowfc.contract.errors import BadMessageError
 from lowfc.contract.messages import HEALTH, Topic
 
 ALL = "*"
@@ -94,7 +97,7 @@ class Bus(Protocol):
     """A connection of one process to all others of its run.
 
     Attributes:
-        faults: of handlers.
+        faults: of handlers, and messages that could not be read.
         offset: of the router's clock, where the run is on several hosts.
     """
 
@@ -141,21 +144,50 @@ def states(bus: Bus, topics: Iterable[Topic], timeout_s: float = 1.0) -> Iterato
                 yield topic, sample
 
 
+UNREADABLE = (BadMessageError, DecodeError)
+"""Exceptions that a message raises, and no mistake of this program."""
+
+
 class Faults:
-    """Exceptions of handlers: the first of each place goes to standard error, all are counted."""
+    """Exceptions of handlers, and messages that cannot be read.
+
+    Of exceptions, the first of each place goes to standard error with its traceback. Messages that cannot be read are
+    counted without one, until `take_unreadable`.
+
+    Attributes:
+        counts: of exceptions, by place.
+        unreadable: count and last reason of messages that could not be read, by key.
+    """
 
     def __init__(self) -> None:
         self.counts: dict[str, int] = {}
+        self.unreadable: dict[str, tuple[int, object]] = {}
         self._lock = threading.Lock()
 
-    def add(self, where: str, fault: Exception) -> None:
-        """Count a fault at `where`, and print it when it is the first there."""
+    def add(self, place: str, key: str, fault: Exception) -> None:
+        """Count a fault at a place (such as "camera: handler of") that deals with a key; what a message did is its."""
+        if isinstance(fault, UNREADABLE):
+            self.add_unreadable(key, fault)
+            return
+        where = f"{place} {key}"
         with self._lock:
             seen = self.counts.get(where, 0)
             self.counts[where] = seen + 1
         if not seen:
             text = "".join(traceback.format_exception(fault))
             sys.stderr.write(f"{where}: {text}(further ones here are only counted)\n")
+
+    def add_unreadable(self, key: str, why: object) -> None:
+        """Count a message that could not be read, by its key or its key expression."""
+        with self._lock:
+            count, _ = self.unreadable.get(key, (0, ""))
+            self.unreadable[key] = count + 1, why
+
+    def take_unreadable(self) -> dict[str, tuple[int, object]]:
+        """Messages that could not be read since the last call: count and last reason, by key."""
+        with self._lock:
+            taken, self.unreadable = self.unreadable, {}
+        return taken
 
 
 def name_in(topic: Topic, key: str) -> str:

@@ -3,11 +3,14 @@
 import struct
 from typing import NamedTuple
 
-from lowfc.contract.errors import BusError
+from lowfc.contract.errors import BadMessageError
 from lowfc.control.loop import COUNT_BITS
 
 _LAYOUT = struct.Struct("<QQ")
 _COUNT_MASK = (1 << COUNT_BITS) - 1
+_SEQUENCES = (1 << 64) - (2 << COUNT_BITS)
+"""Below it neither the start nor the count of the next message overflows."""
+_LATEST_NS = 1 << 62
 
 
 class Envelope(NamedTuple):
@@ -30,7 +33,7 @@ class Envelope(NamedTuple):
         """Envelope of 16 bytes.
 
         Raises:
-            BusError: `data` has another length.
+            BadMessageError: `data` has another length, or a number beyond 2^64 - 2^33 (sequence) or 2^62 (time).
         """
         return cls(*cls.unpack(data))
 
@@ -38,17 +41,25 @@ class Envelope(NamedTuple):
     def unpack(data: bytes) -> tuple[int, int]:
         """Sequence and publish time of an encoded envelope; errors as for `decode`."""
         if len(data) != _LAYOUT.size:
-            raise BusError(
+            raise BadMessageError(
                 f"an envelope is {_LAYOUT.size} bytes (sequence and publish_time_ns, little-endian uint64), "
                 f"got {len(data)}; attach one to every put"
             )
         sequence, publish_time_ns = _LAYOUT.unpack(data)
+        if sequence >= _SEQUENCES or publish_time_ns > _LATEST_NS:
+            raise BadMessageError(
+                f"an envelope's sequence is below 2^64 - 2^33 and its time at most 2^62 ns, got {sequence} and "
+                f"{publish_time_ns} ns; the sequence is the publisher's start in unix seconds << 32 | its count"
+            )
         return sequence, publish_time_ns
 
 
 def sequence_of(start_s: int, count: int) -> int:
-    """Sequence of message number `count` of a publisher that started at `start_s` (unix seconds)."""
-    return start_s << COUNT_BITS | count
+    """Sequence of message number `count` of a publisher that started at `start_s` (unix seconds).
+
+    A count of 2^32, after 50 days at 1 kHz, carries into the start: sequences go on growing.
+    """
+    return (start_s << COUNT_BITS) + count
 
 
 def start_of(sequence: int) -> int:

@@ -141,7 +141,7 @@ class MemoryBus:
                 try:
                     handler(sample)
                 except Exception as fault:  # a handler's fault is its own process's, never the publisher's
-                    self.faults.add(f"{self.role}: handler of {key}", fault)
+                    self.faults.add(f"{self.role}: handler of", wanted, fault)
 
     def kept(self, key: str) -> Iterator[tuple[str, bytes, Envelope]]:
         """Last messages of the queryable topics that a key expression asks for."""
@@ -158,7 +158,7 @@ class MemoryBus:
         try:
             handler(query)
         except Exception as fault:
-            self.faults.add(f"{self.role}: queryable of {query.key}", fault)
+            self.faults.add(f"{self.role}: queryable of", query.key, fault)
 
     def _collector(
         self, bus: "MemoryBus", key: str, answers: list[Sample], asked: threading.Semaphore

@@ -10,7 +10,7 @@ from types import FrameType
 
 from lowfc import __version__
 from lowfc.adapters.arrivals import Arrivals
-from lowfc.adapters.bus import ALL, Bus, Publisher, Sample, name_in
+from lowfc.adapters.bus import ALL, UNREADABLE, Bus, Publisher, Sample, name_in
 from lowfc.adapters.clock import Clock
 from lowfc.adapters.handover import Handover
 from lowfc.adapters.mailbox import Mailbox
@@ -64,7 +64,6 @@ class Service:
         self._known: set[tuple[str, int]] = set()
         self._wakers: list[Callable[[], None]] = []
         self._event_lock = threading.Lock()
-        self._unreadable: dict[str, tuple[int, object]] = {}
         self._supervisor = Supervisor()
         self._started_ns = self._beaten_ns = clock.host_ns()
         self._worked = 0
@@ -101,14 +100,16 @@ class Service:
     ) -> Callable[[], None]:
         """Handle a topic's messages on the thread that receives them, counted in Health; what is returned ends it.
 
-        What a handler raises ends the process: `finish` raises it again. The bus would count it and go on. Periods and
-        `overtaken` are as for `Handover`; in lockstep none is overtaken.
+        What a handler raises ends the process, except for a message that cannot be read: `finish` raises it again. The
+        bus would count it and go on. Periods and `overtaken` are as for `Handover`; in lockstep none is overtaken.
         """
 
         def guarded(handle: Callable[[Sample], None]) -> Callable[[Sample], None]:
             def guard(sample: Sample) -> None:
                 try:
                     handle(sample)
+                except UNREADABLE as fault:
+                    self.unreadable(sample.key, fault)
                 except Exception as fault:
                     self._fault = fault
                     self.stop("a message could not be dealt with")
@@ -199,9 +200,7 @@ class Service:
 
     def unreadable(self, key: str, why: object) -> None:
         """Count a message that could not be read: a flood is one event with each Health. Callable from any thread."""
-        with self._event_lock:
-            count, _ = self._unreadable.get(key, (0, ""))
-            self._unreadable[key] = count + 1, why
+        self.bus.faults.add_unreadable(key, why)
 
     def wait_for(self, names: Iterable[str], timeout_s: float) -> tuple[str, ...]:
         """Wait until these processes are ready and have heard this one, so that they get its first message.
@@ -251,9 +250,7 @@ class Service:
         return wire.TopicCount(topic=publisher.key, published=publisher.published + own)
 
     def _tell_unreadable(self) -> None:
-        with self._event_lock:
-            unreadable, self._unreadable = self._unreadable, {}
-        for key, (count, why) in unreadable.items():
+        for key, (count, why) in self.bus.faults.take_unreadable().items():
             self.event("BAD_MESSAGE", count=count, topic=key, why=why)
 
     def _send_health(self, now_ns: int) -> None:

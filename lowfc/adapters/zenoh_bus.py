@@ -124,7 +124,8 @@ class ZenohRing:
     def __init__(self, bus: "ZenohBus", subscriber: "zenoh.Subscriber[Handler[zenoh.Sample]]") -> None:
         self._bus = bus
         self._subscriber = subscriber
-        self._key = _known_key(str(subscriber.key_expr))
+        self._expression = str(subscriber.key_expr)
+        self._key = _known_key(self._expression)
 
     def drain(self) -> list[Sample]:
         """See `Ring.drain`."""
@@ -134,7 +135,7 @@ class ZenohRing:
             try:
                 found.append(self._bus.read(sample, now_ns, self._key))
             except Exception as fault:
-                self._bus.faults.add(f"{self._bus.role}: ring of {sample.key_expr}", fault)
+                self._bus.faults.add(f"{self._bus.role}: ring of", self._expression, fault)
         return found
 
 
@@ -227,7 +228,7 @@ class ZenohBus:
             handler,
             lambda by_bus: self._subscribe(topic, by_bus, name),
             self.clock.host_ns,
-            lambda fault: self.faults.add(f"{self.role}: handler of {key}", fault),
+            lambda fault: self.faults.add(f"{self.role}: handler of", key, fault),
         )
         self._closers.append(reader.close)
         return reader.close
@@ -242,7 +243,7 @@ class ZenohBus:
             try:
                 handler(read(sample, now_ns, known_key))
             except Exception as fault:  # zenoh would print it and go on; it is counted here
-                faults.add(f"{self.role}: handler of {key}", fault)
+                faults.add(f"{self.role}: handler of", key, fault)
 
         subscriber = self._session.declare_subscriber(key, Callback(received, indirect=False))
         return subscriber.undeclare
@@ -262,7 +263,7 @@ class ZenohBus:
                 )
             except Exception as fault:
                 query.drop()  # type: ignore[no-untyped-call]
-                self.faults.add(f"{self.role}: queryable of {key}", fault)
+                self.faults.add(f"{self.role}: queryable of", key, fault)
 
         self._session.declare_queryable(key_expression, Callback(asked, indirect=False))
 
@@ -277,7 +278,7 @@ class ZenohBus:
             try:
                 answers.append(self.read(reply.ok, self.clock.host_ns()))
             except Exception as fault:
-                self.faults.add(f"{self.role}: answer to {key}", fault)
+                self.faults.add(f"{self.role}: answer to", key, fault)
 
         self._session.get(
             key,
@@ -313,7 +314,7 @@ class ZenohBus:
         try:
             yield
         except Exception as fault:
-            self.faults.add(f"{self.role}: queryable of {query.key_expr}", fault)
+            self.faults.add(f"{self.role}: queryable of", str(query.key_expr), fault)
         finally:
             query.drop()  # type: ignore[no-untyped-call]
 

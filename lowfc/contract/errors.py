@@ -5,6 +5,7 @@
     ├── DataFileError       a file that is missing, damaged or of another kind
     ├── CalibrationError    a calibration that does not fit the instrument
     ├── BusError            a port, a socket, or a peer that does not answer
+    │   └── BadMessageError     a message from the bus that breaks the contract
     └── RequestRefusedError    the controller answered no, and says why
 
 The numerics raise ValueError; the adapters above them name the file or the key and re-raise one of these.
@@ -35,6 +36,10 @@ class CalibrationError(LowfcError):
 
 class BusError(LowfcError):
     """The message bus cannot be opened, or nobody answers on it."""
+
+
+class BadMessageError(BusError):
+    """A message from the bus cannot be read; it is counted and left out, and the process goes on."""
 
 
 class RequestRefusedError(LowfcError):

@@ -10,7 +10,7 @@ from lowfc.adapters.clock import FakeClock
 from lowfc.adapters.memory_bus import MemoryBus, MemoryHub
 from lowfc.adapters.realtime import Granted
 from lowfc.adapters.service import HEALTH_PERIOD_NS, Service
-from lowfc.contract.messages import EVENT, FRAME, HEALTH, Log, from_timestamp, wire
+from lowfc.contract.messages import COMMAND, EVENT, FRAME, HEALTH, Log, from_timestamp, wire
 
 PATIENCE_S = 30.0
 
@@ -170,13 +170,37 @@ def test_only_known_states_and_events(hub: MemoryHub, clock: FakeClock) -> None:
         camera.event("NOTHING_OF_THE_KIND")
 
 
-def test_a_broken_health_of_another_is_counted(
+def test_a_broken_health_of_another_is_a_bad_message_without_a_traceback(
     hub: MemoryHub, clock: FakeClock, capsys: pytest.CaptureFixture[str]
 ) -> None:
+    ear = Ear(hub, clock)
     camera = service(hub, clock, "camera")
     MemoryBus(hub, "operator", clock).publisher(HEALTH, "stranger").put(b"\xff")
-    assert sum(camera.bus.faults.counts.values()) == 1
-    assert "DecodeError" in capsys.readouterr().err
+    camera.beat()
+    assert [log.message for log in ear.events if "BAD_MESSAGE" in log.message] == [
+        "BAD_MESSAGE 1 on lowfc/health/* could not be read, the last because: "
+        "Error parsing message with type 'lowfc.v1.Health': Wire format was corrupt"
+    ]
+    assert not camera.bus.faults.counts
+    assert "Traceback" not in capsys.readouterr().err
+
+
+def test_a_message_that_its_handler_cannot_read_does_not_end_the_process(hub: MemoryHub, clock: FakeClock) -> None:
+    ear = Ear(hub, clock)
+    mirror = service(hub, clock, "mirror-dm")
+    read: list[int] = []
+    mirror.handover(
+        COMMAND,
+        lambda sample: read.append(len(wire.MirrorCommand.FromString(sample.payload).actuators)),
+        "dm",
+        period_ns=10**6,
+    )
+    commands = MemoryBus(hub, "controller", clock).publisher(COMMAND, "dm")
+    commands.put(b"\xff")
+    commands.put(wire.MirrorCommand(actuators=b"1234").SerializeToString())
+    mirror.beat()
+    assert (mirror.running, read) == (True, [4])
+    assert any("BAD_MESSAGE 1 on lowfc/mirror/dm/command" in log.message for log in ear.events)
 
 
 def test_a_stop_wakes_the_loop(hub: MemoryHub, clock: FakeClock) -> None:

@@ -167,16 +167,21 @@ def test_a_reader_that_stalls_never_holds_the_writer(tmp_path: Path) -> None:
     listener.close()
 
 
-def test_a_message_that_makes_no_sense_is_counted_and_the_next_is_heard(ends: Ends) -> None:
+def test_a_message_that_makes_no_sense_is_counted_and_the_next_is_heard(
+    ends: Ends, capfd: pytest.CaptureFixture[str]
+) -> None:
     controller = ends.bus("controller")
     controller.subscribe(FRAME, ends.hear)
     path = ends.run.links.shortcut("controller")
     assert path is not None
     writer = shortcut.ShortcutWriter(path)
     writer.send(b"short", b"")
+    writer.send(b"\xff" * 16, b"from the end of time")
     writer.send(Envelope(7, 0).encode(), b"fine")
     until("the second message", lambda: ends.got == [7])
-    assert list(controller.faults.counts.values()) == [1]
+    (found,) = controller.faults.take_unreadable().items()
+    assert (found[0], found[1][0]) == (FRAME.key, 2)
+    assert "Traceback" not in capfd.readouterr().err
     writer.close()
 
 

@@ -293,21 +293,27 @@ def test_faults_of_handlers_are_counted_and_shown_once(
     assert capfd.readouterr().err.count("RuntimeError: handler broke") == 2
 
 
-def test_a_message_without_envelope_is_a_counted_fault(
-    run: Run, join: Callable[[Run, str], ZenohBus], capfd: pytest.CaptureFixture[str]
+@pytest.mark.parametrize("attachment", [None, b"xyz", b"\xff" * 16])
+def test_a_message_without_a_readable_envelope_is_counted_and_no_traceback(
+    run: Run, join: Callable[[Run, str], ZenohBus], capfd: pytest.CaptureFixture[str], attachment: bytes | None
 ) -> None:
     controller = join(run, "controller")
     box = Mailbox()
     controller.subscribe(FRAME, box.put)
+    ring = controller.ring(HEALTH, 10)
     with zenoh.open(zenoh.Config.from_json5(json.dumps(session_config(run.links, "camera")))) as stranger:
 
         def put() -> bool:
-            stranger.put(FRAME.key, b"bare")
-            return bool(controller.faults.counts)
+            stranger.put(FRAME.key, b"bare", attachment=attachment)
+            stranger.put(HEALTH.at("camera"), b"bare", attachment=attachment)
+            assert ring.drain() == []
+            return set(controller.faults.unreadable) == {FRAME.key, HEALTH.at("*")}
 
         until(put)
     assert box.received == 0
-    assert "16 bytes" in capfd.readouterr().err
+    assert all("envelope" in str(why) for _, why in controller.faults.unreadable.values())
+    assert not controller.faults.counts
+    assert "Traceback" not in capfd.readouterr().err
 
 
 def test_a_frozen_subscriber_costs_the_others_nothing(
