@@ -30,28 +30,32 @@ class Envelope(NamedTuple):
 
     @classmethod
     def decode(cls, data: bytes) -> "Envelope":
-        """Envelope of 16 bytes.
+        """Envelope of 16 bytes, whatever its numbers.
 
         Raises:
-            BadMessageError: `data` has another length, or a number beyond 2^64 - 2^33 (sequence) or 2^62 (time).
+            BadMessageError: `data` has another length.
         """
-        return cls(*cls.unpack(data))
-
-    @staticmethod
-    def unpack(data: bytes) -> tuple[int, int]:
-        """Sequence and publish time of an encoded envelope; errors as for `decode`."""
         if len(data) != _LAYOUT.size:
             raise BadMessageError(
                 f"an envelope is {_LAYOUT.size} bytes (sequence and publish_time_ns, little-endian uint64), "
                 f"got {len(data)}; attach one to every put"
             )
-        sequence, publish_time_ns = _LAYOUT.unpack(data)
+        return cls(*_LAYOUT.unpack(data))
+
+    @classmethod
+    def unpack(cls, data: bytes) -> "Envelope":
+        """Envelope of 16 bytes as the bus takes it.
+
+        Raises:
+            BadMessageError: as for `decode`, or the sequence is not below 2^64 - 2^33, or the time above 2^62 ns.
+        """
+        sequence, publish_time_ns = found = cls.decode(data)
         if sequence >= _SEQUENCES or publish_time_ns > _LATEST_NS:
             raise BadMessageError(
                 f"an envelope's sequence is below 2^64 - 2^33 and its time at most 2^62 ns, got {sequence} and "
                 f"{publish_time_ns} ns; the sequence is the publisher's start in unix seconds << 32 | its count"
             )
-        return sequence, publish_time_ns
+        return found
 
 
 def sequence_of(start_s: int, count: int) -> int:
