@@ -17,12 +17,13 @@ from lowfc.adapters import log_writer
 from lowfc.adapters.backlog import Backlog
 from lowfc.adapters.bus import Publisher, Sample
 from lowfc.adapters.clock import FakeClock
-from lowfc.adapters.envelope import Envelope, count_of
+from lowfc.adapters.envelope import Envelope, count_of, sequence_of
 from lowfc.adapters.log_reader import LogReader
 from lowfc.adapters.log_series import Limits
 from lowfc.adapters.log_writer import UNFINISHED, Attachment
 from lowfc.adapters.memory_bus import MemoryBus, MemoryHub
-from lowfc.contract.messages import CALIBRATION, EVENT, FRAME, HEALTH, STEP, Topic
+from lowfc.adapters.names import MOST_NAMES
+from lowfc.contract.messages import CALIBRATION, COMMAND, EVENT, FRAME, HEALTH, STEP, Topic, wire
 from lowfc.programs.recording import recorder as recorder_module
 from lowfc.programs.recording.recorder import Recorder
 from lowfc.programs.recording.summary import Summary
@@ -284,3 +285,24 @@ def test_what_waits_is_bounded_by_number_and_by_size() -> None:
         backlog.take()
     backlog.put(*waiting(FRAME, 1000))
     assert len(backlog) == 1
+
+
+def test_forged_names_and_starts_fill_neither_the_recorder_nor_a_log(
+    bench: Bench, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("lowfc.programs.recording.recorder.MOST_CHANNELS", 100)
+    bench.start()
+    forger = MemoryBus(bench.hub, "operator", bench.clock)
+    for number in range(1000):
+        body = wire.Health(process=f"forged-{number}").SerializeToString()
+        forger.publisher(HEALTH, f"forged-{number}").put(body)
+        forger.publisher(COMMAND, f"forged-{number}").put(b"")
+    until(lambda: told(bench, "BAD_MESSAGE"))
+    first = bench.recorder.service.health().recording.file
+    for start_s in range(1, 200):
+        forger.publisher(FRAME).put(b"", sequence=sequence_of(start_s, 0))
+    until(lambda: bench.recorder.service.health().recording.file != first)
+    summary = bench.stop()
+    keys = {message.key for log in summary.files for message in LogReader(log)}
+    assert sum("forged" in key for key in keys) == 2 * MOST_NAMES
+    assert sum("forged" in key for key in bench.recorder._ledger.recorded()) == 2 * MOST_NAMES

@@ -10,10 +10,11 @@ from types import FrameType
 
 from lowfc import __version__
 from lowfc.adapters.arrivals import Arrivals
-from lowfc.adapters.bus import ALL, UNREADABLE, Bus, Publisher, Sample, name_in
+from lowfc.adapters.bus import ALL, UNREADABLE, Bus, Publisher, Sample
 from lowfc.adapters.clock import Clock
 from lowfc.adapters.handover import Handover
 from lowfc.adapters.mailbox import Mailbox
+from lowfc.adapters.names import Names
 from lowfc.adapters.realtime import NOTHING, Granted
 from lowfc.adapters.supervision import Supervisor
 from lowfc.adapters.usage import resident_bytes
@@ -61,6 +62,7 @@ class Service:
         self.fill = fill
         self._state = "starting"
         self._fault: Exception | None = None
+        self._names = Names()
         self._known: set[tuple[str, int]] = set()
         self._wakers: list[Callable[[], None]] = []
         self._event_lock = threading.Lock()
@@ -130,7 +132,7 @@ class Service:
         """Whether somebody is heard whom the last call did not know: who answers what is asked, or answers anew."""
         there = {(name, health.pid) for name, health in list(self.heard.items())}
         new = not there <= self._known
-        self._known |= there
+        self._known = there
         return new
 
     def catch_signals(self) -> None:
@@ -262,10 +264,9 @@ class Service:
         self._supervisor.tell(message)
 
     def _hear(self, sample: Sample) -> None:
-        name = name_in(HEALTH, sample.key)
+        name, health = self._names.health(sample.key, sample.payload)
         if name == self.name:
             return
-        health = wire.Health.FromString(sample.payload)
         known = self.heard.get(name)
         self.heard[name] = health
         if known is None or known.pid != health.pid:

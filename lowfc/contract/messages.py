@@ -227,6 +227,8 @@ RECORD_KEY = "lowfc/record/{name}"
 MONO16 = "mono16"
 FLOAT32 = "32FC1"
 
+_LONGEST_KEY = 200
+
 
 @lru_cache(maxsize=256)
 def topic_of(key: str) -> Topic:
@@ -235,6 +237,8 @@ def topic_of(key: str) -> Topic:
     Raises:
         KeyError: there is no such topic.
     """
+    if len(key) > _LONGEST_KEY:
+        raise KeyError(key)
     for topic in TOPICS:
         if topic.matches(key):
             return topic

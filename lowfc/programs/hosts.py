@@ -119,16 +119,18 @@ def hosts(
 
     from lowfc.adapters.bus import Sample
     from lowfc.adapters.clock import HostClock
+    from lowfc.adapters.names import Names
     from lowfc.adapters.run import open_run
     from lowfc.adapters.zenoh_bus import ZenohBus
     from lowfc.contract.messages import HEALTH, Role, wire
 
     settings = configuration(config)
     heard: dict[str, wire.Health] = {}
+    names = Names()
 
     def hear(sample: Sample) -> None:
-        health = wire.Health.FromString(sample.payload)
-        heard[health.process] = health
+        name, health = names.health(sample.key, sample.payload)
+        heard[name] = health
 
     with joined(settings, run) as links, closing(ZenohBus(links, Role.OPERATOR, HostClock())) as bus:
         bus.subscribe(HEALTH, hear)

@@ -1,10 +1,11 @@
 """What a launcher hears of a run, and the figures that it sums up from the last Health of each process."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
-from lowfc.adapters.bus import Sample, name_in
-from lowfc.contract.messages import FRAME, HEALTH, Log, Role, wire
+from lowfc.adapters.bus import Sample
+from lowfc.adapters.names import Names
+from lowfc.contract.messages import FRAME, Log, Role, wire
 
 
 @dataclass(slots=True)
@@ -13,6 +14,7 @@ class Watch:
 
     health: dict[str, wire.Health]
     events: list[Log]
+    _names: Names = field(default_factory=Names)
 
     def of(self, name: str) -> wire.Health:
         """Last Health of a process; an empty one before the first."""
@@ -20,7 +22,8 @@ class Watch:
 
     def hear(self, sample: Sample) -> None:
         """Keep a Health."""
-        self.health[name_in(HEALTH, sample.key)] = wire.Health.FromString(sample.payload)
+        name, health = self._names.health(sample.key, sample.payload)
+        self.health[name] = health
 
     def note(self, sample: Sample) -> None:
         """Keep an event."""

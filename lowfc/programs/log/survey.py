@@ -17,6 +17,7 @@ from lowfc.adapters.history_reader import attached_configuration
 from lowfc.adapters.ledger import Ledger
 from lowfc.adapters.log_reader import Logged, LogReader
 from lowfc.adapters.log_recovery import RECOVERY
+from lowfc.contract.errors import BadMessageError
 from lowfc.contract.events import Level
 from lowfc.contract.messages import CONTROLLER_STATE, EVENT, HEALTH, Log, Topic, topic_of, wire
 from lowfc.control.safety import LoopMode
@@ -108,7 +109,7 @@ class _Account:
                 if event.level >= Level.WARNING:
                     self._events[event.message.partition(" ")[0]] += 1
                 return event.name
-        except DecodeError:
+        except (BadMessageError, DecodeError):
             pass  # it is in the log as it came
         return ""
 

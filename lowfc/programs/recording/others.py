@@ -18,22 +18,23 @@ class Others:
         """Nobody has been heard yet."""
         self.kept: dict[str, Sample] = {}
         self._bus = bus
-        self._states: dict[tuple[str, int], str] = {}
+        self._states: dict[str, tuple[int, str]] = {}
         self._newcomers = False
         self._asked: set[tuple[str, int]] = set()
         self._asker = ThreadPoolExecutor(1, "ask")
         self._answers: Future[list[Sample]] | None = None
 
     def hear(self, sample: Sample, health: wire.Health) -> None:
-        """Take note of how a process is."""
-        process = (name_in(HEALTH, sample.key), start_of(sample.sequence))
-        self._newcomers |= process not in self._states
-        self._states[process] = health.state
+        """Take note of how a process is; what an earlier start of it says comes too late."""
+        name, start_s = name_in(HEALTH, sample.key), start_of(sample.sequence)
+        known_s, _ = self._states.get(name, (-1, ""))
+        self._newcomers |= start_s > known_s
+        if start_s >= known_s:
+            self._states[name] = start_s, health.state
 
     def stopped(self, but: str) -> bool:
         """Whether all have said their last words, but for the process of that name."""
-        latest = {name: state for (name, _), state in sorted(self._states.items()) if name != but}
-        return all(state == "stopped" for state in latest.values())
+        return all(state == "stopped" for name, (_, state) in self._states.items() if name != but)
 
     def keep(self, sample: Sample) -> None:
         """Take note of a calibration or state that was heard."""

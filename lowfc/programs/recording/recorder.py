@@ -11,10 +11,8 @@ from functools import partial
 from pathlib import Path
 from types import FrameType
 
-from google.protobuf.message import DecodeError
-
 from lowfc.adapters.backlog import Backlog
-from lowfc.adapters.bus import Bus, Sample
+from lowfc.adapters.bus import UNREADABLE, Bus, Sample
 from lowfc.adapters.clock import Clock, HostClock
 from lowfc.adapters.ledger import Ledger
 from lowfc.adapters.log_series import STANDARD, Limits, LogSeries, shortage
@@ -25,7 +23,7 @@ from lowfc.adapters.run import Run
 from lowfc.adapters.service import Service
 from lowfc.adapters.zenoh_bus import ZenohBus
 from lowfc.contract import input_file
-from lowfc.contract.errors import DataFileError
+from lowfc.contract.errors import BadMessageError, DataFileError
 from lowfc.contract.messages import HEALTH, TOPICS, Role, Topic, wire
 from lowfc.programs.recording.others import Others
 from lowfc.programs.recording.summary import Summary
@@ -35,6 +33,8 @@ QUEUE_MESSAGES = 20_000
 """Messages that may wait for the disk: about 4 s of a 1 kHz loop, 90 MB."""
 QUEUE_BYTES = 256_000_000
 """Payloads that may wait for the disk, whatever their size."""
+MOST_CHANNELS = 4096
+"""Starts of publishers after which the next log is begun: each is a channel of the log, and costs memory."""
 
 _TURN_S = 0.02
 _FLUSH_NS = 250_000_000
@@ -69,7 +69,7 @@ class Recorder:
         self._paused = False
         self._hurried = False
         self._failure = ""
-        self._flush_due_ns = 0
+        self._flush_due_ns = self._most_starts = 0
         self._begun_ns = self._oldest_ns = 0
         self._longest_wait_ns = self._longest_unflushed_ns = self._slowest_ns = 0
         # Before the service, which subscribes to Health: who has heard of that has heard of all others.
@@ -126,6 +126,7 @@ class Recorder:
     def _begin(self) -> None:
         """Begin a log, with what the messages in it depend on."""
         self._series.begin(self._others.kept.values())
+        self._most_starts = self._ledger.starts + MOST_CHANNELS
         self.service.event("RECORDING")
 
     def _turn(self) -> None:
@@ -191,21 +192,29 @@ class Recorder:
 
     def _take(self, topic: Topic, sample: Sample) -> None:
         """Record one message, unless it was recorded when it was asked for."""
+        try:
+            self._ledger.names.admit(topic, sample.key)
+        except BadMessageError as fault:
+            self.service.unreadable(topic.key, fault)
+            return
         asked = self._others.was_asked(sample)
         recorded = not self._failure if asked else self._write(sample) or self._paused  # unwanted is not lost
         self._ledger.enter(topic, sample, recorded=recorded)
         if topic is HEALTH:
-            self._hear(sample)
+            self._hear(topic, sample)
         elif topic.queryable:
             self._others.keep(sample)
 
-    def _hear(self, sample: Sample) -> None:
+    def _hear(self, topic: Topic, sample: Sample) -> None:
         try:
-            health = wire.Health.FromString(sample.payload)
-        except DecodeError:
+            _, health = self._ledger.names.health(sample.key, sample.payload)
+        except UNREADABLE:
             return  # it is in the log as it came; the service counts it
-        self._ledger.believe(sample, health)
         self._others.hear(sample, health)
+        try:
+            self._ledger.believe(sample, health)
+        except BadMessageError as fault:
+            self.service.unreadable(topic.key, fault)
 
     def _write(self, sample: Sample) -> bool:
         try:
@@ -232,7 +241,7 @@ class Recorder:
                 self._failure = short
                 self._series.end(self._figures() | {"stopped": short})
                 self.service.event("RECORDING_FAILED", why=f"{short}; the log is complete")
-            elif self._series.full:
+            elif self._series.full or self._ledger.starts >= self._most_starts:
                 self._series.end(self._figures(), wait=False)
                 self._begin()
                 self._others.ask_again()

@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Any
 from lowfc.adapters.bus import ALL, Bus, Sample, states
 from lowfc.adapters.clock import Clock
 from lowfc.adapters.log_writer import declaration
+from lowfc.adapters.names import Names
 from lowfc.adapters.run import Run
 from lowfc.adapters.service import Service
 from lowfc.adapters.zenoh_bus import ZenohBus
@@ -73,6 +74,7 @@ class FoxgloveBridge:
         self._foxglove = _foxglove()
         self._context = self._foxglove.Context()
         self._bus = bus
+        self._names = Names()
         self._channels: dict[str, Channel] = {}
         self._channels_lock = threading.Lock()
         self._seen: set[int] = set()
@@ -130,6 +132,7 @@ class FoxgloveBridge:
 
     def _take(self, topic: Topic, sample: Sample) -> None:
         """Pass a message on; on the bus's threads."""
+        self._names.admit(topic, sample.key)
         if topic.queryable:
             self.kept[sample.key] = sample
         self._messages += 1

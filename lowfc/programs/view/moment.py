@@ -8,11 +8,12 @@ import numpy as np
 import numpy.typing as npt
 from google.protobuf.message import DecodeError
 
-from lowfc.adapters.bus import name_in
 from lowfc.adapters.history import Steps, Truths
+from lowfc.adapters.names import Names
 from lowfc.adapters.rows import StepRows, TimingRows, TruthRows
 from lowfc.contract.calibration_codec import decode_calibration
 from lowfc.contract.codec import decode_frame
+from lowfc.contract.errors import BadMessageError
 from lowfc.contract.messages import (
     CALIBRATION,
     CAMERA_STATE,
@@ -116,6 +117,7 @@ class Gatherer:
         self._calibration: Calibration | None = None
         self._camera: wire.CameraState | None = None
         self._controller: wire.ControllerState | None = None
+        self._names = Names()
         self._health: dict[str, Heard] = {}
         self._heard_ns: dict[str, int] = {}
         self._sequences: dict[str, int] = {}
@@ -124,6 +126,11 @@ class Gatherer:
 
     def take(self, topic: Topic, key: str, payload: bytes, publish_time_ns: int, sequence: int = 0) -> None:
         """Take one message of one of `SHOWN`; a state that is older than one taken before is none."""
+        try:
+            self._names.admit(topic, key)
+        except BadMessageError:
+            self.unreadable += 1
+            return
         if topic.queryable:
             if sequence < self._sequences.get(key, 0):
                 return
@@ -134,7 +141,7 @@ class Gatherer:
             return
         try:
             self._read(topic, key, payload, publish_time_ns)
-        except (DecodeError, OverflowError, ValueError):
+        except (BadMessageError, DecodeError, OverflowError, ValueError):
             self.unreadable += 1
 
     def moment(self, host_ns: int, *, whole: bool = True, behind_s: float = 0.0) -> Moment:
@@ -200,7 +207,8 @@ class Gatherer:
         elif topic is TIMING:
             self.unreadable += not self._timings.add(wire.ControlTiming.FromString(payload))
         elif topic is HEALTH:
-            self._health[name_in(HEALTH, key)] = Heard(publish_time_ns, wire.Health.FromString(payload))
+            name, health = self._names.health(key, payload)
+            self._health[name] = Heard(publish_time_ns, health)
         elif topic is EVENT:
             self._events.append(Log.FromString(payload))
         elif topic is CALIBRATION:
