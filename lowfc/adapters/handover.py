@@ -1,5 +1,6 @@
 """A message handed on where it arrives, on the thread that receives: nobody has to be woken for it."""
 
+import threading
 from collections.abc import Callable
 
 from lowfc.adapters.arrivals import Arrivals
@@ -44,6 +45,7 @@ class Handover(Arrivals):
         self._period_ns = period_ns
         self._old_ns = max(LONG_AGO_NS, 3 * (period_ns or 0))
         self._overtaken = overtaken
+        self._turn = threading.Lock()
         self._skipped = 0
         self._in_a_row = 0
         self._done_ns = 0
@@ -54,7 +56,11 @@ class Handover(Arrivals):
         return self._skipped
 
     def put(self, sample: Sample) -> None:
-        """Hand a message on, or skip it; called on the thread that receives, one message at a time."""
+        """Hand a message on, or skip it; called on the threads that receive, which take turns."""
+        with self._turn:
+            self._put(sample)
+
+    def _put(self, sample: Sample) -> None:
         handler: Callable[[Sample], None] | None = self._handler
         if self._period_ns is not None:
             crowded = sample.receive_time_ns - self._done_ns <= REST_NS

@@ -32,6 +32,8 @@ _USER = "lowfc"
 _RUN_ID = re.compile(r"[a-z0-9][a-z0-9._-]{0,47}")
 _LOWEST_PORT = 15000
 _CONNECT_S = 1.0
+_LONGEST_START = 20  # characters
+_LATEST_START_S = (1 << 32) - 3  # a sequence has no room for a later one
 _LONGEST_SOCKET = 107  # bytes of a Unix socket's address
 _PORT_RANGE = Path("/proc/sys/net/ipv4/ip_local_port_range")
 
@@ -101,18 +103,23 @@ class Links:
     def claim_start(self, role: str, start_s: int) -> int:
         """Start of a role's process for its sequences: `start_s`, or more where this run has had that one already.
 
-        A process that is killed and restarted within one second must not repeat its sequences.
+        A process that is killed and restarted within one second must not repeat its sequences. Where the run's
+        directory cannot be written it is `start_s`: an operator must be able to ask for `safe` there, too.
         """
         path = self.secret_file.parent / f"start-{role}"
-        with path.open("a+") as file:
+        with contextlib.suppress(OSError, ValueError), path.open("a+") as file:
             fcntl.flock(file, fcntl.LOCK_EX)
             file.seek(0)
-            last = file.read().strip()
-            claimed = max(start_s, int(last) + 1) if last.isdigit() else start_s
+            last = file.read(_LONGEST_START).strip()
+            claimed = max(start_s, int(last) + 1) if last.isdecimal() else start_s
+            if claimed > _LATEST_START_S:
+                claimed = start_s
             file.seek(0)
             file.truncate()
             file.write(str(claimed))
-        return claimed
+            file.flush()
+            return claimed
+        return start_s
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,5 +1,6 @@
 """Messages handled where they arrive: all of a burst, and not all where the handler does not keep up."""
 
+import threading
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -118,3 +119,29 @@ def test_frames_faster_than_their_handler_are_skipped_on_the_real_bus(tmp_path: 
     assert 0 < handover.skipped < handover.received
     for bus in (camera, controller):
         bus.close()
+
+
+def test_two_threads_that_receive_take_turns() -> None:
+    """Each link of the bus has a thread of its own, and so has the direct way beside it."""
+    inside, together, entered = 0, 0, threading.Barrier(2)
+
+    def handle(_: Sample) -> None:
+        nonlocal inside, together
+        inside += 1
+        time.sleep(0)  # gives the other thread every chance
+        together = max(together, inside)
+        inside -= 1
+
+    handover = Handover(FRAME.key, handle, time.monotonic_ns)
+
+    def receive(start_s: int) -> None:
+        entered.wait(PATIENCE_S)
+        for count in range(5000):
+            handover.put(Sample(FRAME.key, b"", sequence_of(start_s, count), 0, 0))
+
+    threads = [threading.Thread(target=receive, args=(start_s,)) for start_s in (1, 2)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join(PATIENCE_S)
+    assert (handover.received, together) == (10_000, 1)

@@ -5,9 +5,15 @@ import sys
 from pathlib import Path
 
 import pytest
+from typer.testing import CliRunner
 
+from lowfc.adapters.bus import ALL, Query
+from lowfc.adapters.clock import HostClock
 from lowfc.adapters.run import Run, free_ports, mirror_role, new_run_id, open_run, own_directory, runtime_base
+from lowfc.adapters.zenoh_bus import ZenohBus
 from lowfc.contract.errors import BusError, DataFileError
+from lowfc.contract.messages import REQUEST_KEY, wire
+from lowfc.programs.cli import app
 
 
 @pytest.fixture(autouse=True)
@@ -132,3 +138,40 @@ def test_a_start_is_claimed_once() -> None:
     links = open_run("night").links
     assert [links.claim_start("camera", start_s) for start_s in (100, 100, 50, 200)] == [100, 101, 102, 200]
     assert links.claim_start("controller", 100) == 100
+
+
+@pytest.mark.parametrize("text", ["", "9" * 5000, str(2**32), "\u00b2", "-7", "later"])
+def test_a_start_that_is_none_is_not_believed(text: str) -> None:
+    links = open_run("night").links
+    (links.secret_file.parent / "start-camera").write_text(text)
+    assert [links.claim_start("camera", 100), links.claim_start("camera", 100)] == [100, 101]
+
+
+def test_a_start_is_given_where_the_directory_cannot_be_written() -> None:
+    links = open_run("night").links
+    (links.secret_file.parent / "start-camera").mkdir()  # which root cannot write either
+    assert links.claim_start("camera", 100) == 100
+
+
+def test_safe_is_asked_for_where_the_directory_cannot_be_written() -> None:
+    run = open_run("night")
+    bus = ZenohBus(run.links, "controller", HostClock())
+    asked: list[str] = []
+
+    def answer(query: Query) -> None:
+        asked.append(query.name)
+        query.reply(
+            wire.Request(name=query.name, accepted=True, reply="the mirror relaxes to flat").SerializeToString()
+        )
+
+    bus.queryable(REQUEST_KEY.format(name=ALL), answer)
+    subprocess.run(["mount", "--bind", run.path, run.path], check=True)
+    subprocess.run(["mount", "-o", "remount,bind,ro", run.path], check=True)
+    try:
+        with pytest.raises(OSError, match="Read-only"):
+            (run.path / "start-operator").write_text("")
+        done = CliRunner().invoke(app, ["ctl", "safe", "--run", "night"])
+    finally:
+        subprocess.run(["umount", "--lazy", run.path], check=True)
+        bus.close()
+    assert (done.exit_code, asked) == (0, ["safe"]), done.output
