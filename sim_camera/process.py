@@ -25,6 +25,7 @@ from sim_camera.disturbance import Disturbance, disturbance
 from sim_camera.faults import Fault
 from sim_camera.faulty import FaultyFrames
 from sim_camera.figures import Figures
+from sim_camera.lateness import Lateness
 
 Single = npt.NDArray[np.float32]
 
@@ -33,7 +34,6 @@ PATIENCE_S = 5.0
 WAIT_S = 30.0
 """How long the first frame waits for those who must not miss it."""
 _REMEMBERED = 256
-_HABIT = 500
 
 
 def disturbance_of(config: Configuration) -> Disturbance:
@@ -105,7 +105,7 @@ class CameraProcess:
         self._put_ns = [(0, 0)] * _REMEMBERED
         self._last_frame = 0
         self._first_put_ns = 0
-        self._late = 0
+        self._lateness = Lateness()
         self._frame_to_mirror = Durations()
         self._figures = Figures(config.noll, tilt_nm_per_mas(config.star.diameter_m))
         service.state = "ready"
@@ -146,7 +146,7 @@ class CameraProcess:
 
     def fill(self, health: wire.Health) -> None:
         """Add latency and wavefront to a Health."""
-        health.commands_late = self._late
+        health.commands_late = self._lateness.total
         if self._frames.published > 1:
             elapsed_ns = self._put_ns[self._last_frame % _REMEMBERED][1] - self._first_put_ns
             health.mean_rate_hz = (self._frames.published - 1) * 1e9 / elapsed_ns
@@ -223,11 +223,10 @@ class CameraProcess:
                     self._frame_to_mirror.add(sample.publish_time_ns - put_ns)
 
     def _count_late(self, late: bool) -> None:
-        """Tell once where commands are habitually late."""
-        self._late += late
-        count = self._frame_to_mirror.count
-        if count == _HABIT and self._late > _HABIT / 4:
-            self._service.event("COMMANDS_LATE", percent=100 * self._late / count)
+        """Report when commands become late habitually, and when they no longer are."""
+        if self._lateness.add(late):
+            event = "COMMANDS_LATE" if self._lateness.habitual else "COMMANDS_IN_TIME"
+            self._service.event(event, percent=self._lateness.percent)
 
     def _wait_for_mirror(self) -> None:
         """In lockstep: until the mirror has applied the command made from the last frame."""

@@ -77,6 +77,7 @@ EVENTS: dict[str, Event] = {
             "{percent:.0f} % of the commands came after the next exposure had begun: the delay is a frame longer than "
             "control.delay_frames says, and the highest stable gain lower; reduce the rate or set it",
         ),
+        Event("COMMANDS_IN_TIME", Level.INFO, "commands are in time again: {percent:.0f} % late"),
         Event("RECORDING", Level.INFO, "recording"),
         Event("RECORDING_STOPPED", Level.INFO, "recording stopped: {why}"),
         Event("MESSAGES_LOST", Level.ERROR, "{count} messages lost on {topic}"),

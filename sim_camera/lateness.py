@@ -1,0 +1,39 @@
+"""Commands that came after the next exposure had begun: whether that is the habit of the last ones."""
+
+from collections import deque
+
+WINDOW = 500
+"""Commands that are looked at: the last ones."""
+_ON = 0.25
+_OFF = 0.125
+
+
+class Lateness:
+    """Counts late commands.
+
+    Attributes:
+        total: late ones since the start.
+        habitual: more than a quarter of a window was late, and since then never less than an eighth.
+    """
+
+    def __init__(self) -> None:
+        self.total = 0
+        self.habitual = False
+        self._last: deque[bool] = deque(maxlen=WINDOW)
+        self._late = 0
+
+    @property
+    def percent(self) -> float:
+        """Late ones among the last."""
+        return 100 * self._late / len(self._last) if self._last else 0.0
+
+    def add(self, late: bool) -> bool:
+        """Count a command; return whether `habitual` has changed."""
+        if len(self._last) == WINDOW:
+            self._late -= self._last[0]
+        self._last.append(late)
+        self._late += late
+        self.total += late
+        before = self.habitual
+        self.habitual = self._late > WINDOW * (_OFF if before else _ON)
+        return self.habitual != before
