@@ -294,6 +294,9 @@ class Queue:
         found, self.samples = self.samples, []
         return found
 
+    def close(self) -> None:
+        pass
+
 
 def frame_sample(count: int, start_s: int = 1_700_000_000) -> Sample:
     pixels = np.full((3, 4), count, np.uint16)
@@ -341,6 +344,20 @@ def test_a_closed_stream_has_ended() -> None:
     frames = stream(*map(frame_sample, range(9)))
     next(frames)
     frames.close()
+    assert list(frames) == []
+
+
+def test_a_stream_that_has_ended_is_sent_nothing_more(
+    controller: FakeController, loop: Client, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    publisher, ring, before = controller.bus.publisher(FRAME), loop._bus.ring, list(loop._bus._subscriptions)
+    monkeypatch.setattr(loop._bus, "ring", lambda topic, capacity: _fed(ring(topic, capacity), publisher.put))
+    assert len(list(loop.frames(2))) == 2
+    assert loop._bus._subscriptions == before
+    frames = loop.frames(patience_s=0.02)
+    with pytest.raises(BusError):
+        list(frames)
+    assert loop._bus._subscriptions == before
     assert list(frames) == []
 
 

@@ -92,6 +92,10 @@ class Ring(Protocol):
         """Those that arrived since the last call, in their order; `receive_time_ns` is that of this call."""
         ...
 
+    def close(self) -> None:
+        """Undeclare the subscription, once or more often."""
+        ...
+
 
 class Bus(Protocol):
     """A connection of one process to all others of its run.

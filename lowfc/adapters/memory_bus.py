@@ -58,12 +58,18 @@ class MemoryPublisher:
 class MemoryRing:
     """See `Ring`."""
 
-    def __init__(self, capacity: int) -> None:
+    def __init__(self, bus: "MemoryBus", topic: Topic, capacity: int) -> None:
         self.waiting: deque[Sample] = deque(maxlen=capacity)
+        self._leave = bus.subscribe(topic, self.waiting.append)
 
     def drain(self) -> list[Sample]:
         """See `Ring.drain`."""
         return [self.waiting.popleft() for _ in range(len(self.waiting))]
+
+    def close(self) -> None:
+        """See `Ring.close`."""
+        with contextlib.suppress(ValueError):
+            self._leave()
 
 
 class MemoryBus:
@@ -97,9 +103,7 @@ class MemoryBus:
 
     def ring(self, topic: Topic, capacity: int) -> "MemoryRing":
         """See `Bus.ring`."""
-        ring = MemoryRing(capacity)
-        self.subscribe(topic, ring.waiting.append)
-        return ring
+        return MemoryRing(self, topic, capacity)
 
     def queryable(self, key_expression: str, handler: Callable[[Query], None]) -> None:
         """See `Bus.queryable`."""

@@ -138,6 +138,11 @@ class ZenohRing:
                 self._bus.faults.add(f"{self._bus.role}: ring of", self._expression, fault)
         return found
 
+    def close(self) -> None:
+        """See `Ring.close`."""
+        with contextlib.suppress(zenoh.ZError):
+            self._subscriber.undeclare()  # type: ignore[no-untyped-call]
+
 
 class ZenohBus:
     """One process's zenoh session; see `Bus`.

@@ -92,7 +92,9 @@ class Stream(Generic[T]):
 
     def close(self) -> None:
         """Get no more."""
-        self._ring = None  # which ends its subscription
+        ring, self._ring = self._ring, None
+        if ring is not None:
+            ring.close()
         self._waiting.clear()
 
     def _fill(self, ring: Ring) -> None:
@@ -101,6 +103,7 @@ class Stream(Generic[T]):
             self._waiting.extend(ring.drain())
             if not self._waiting:
                 if time.monotonic() >= deadline_s:
+                    self.close()
                     raise BusError(f"no {self._what} came within {self._patience_s:g} s: `lowfc ctl status` says why")
                 time.sleep(_POLL_S)
 

@@ -316,6 +316,16 @@ def test_a_message_without_a_readable_envelope_is_counted_and_no_traceback(
     assert "Traceback" not in capfd.readouterr().err
 
 
+def test_a_ring_that_is_closed_has_no_subscriber(run: Run, join: Callable[[Run, str], ZenohBus]) -> None:
+    operator, camera = join(run, "operator"), join(run, "camera")
+    frames = camera.publisher(FRAME)
+    ring = operator.ring(FRAME, 4)
+    until(lambda: frames._publisher.matching_status.matching)
+    ring.close()
+    until(lambda: not frames._publisher.matching_status.matching)
+    ring.close()
+
+
 def test_a_frozen_subscriber_costs_the_others_nothing(
     run: Run, start: Callable[[], Toy], join: Callable[[Run, str], ZenohBus]
 ) -> None:
