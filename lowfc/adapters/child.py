@@ -1,18 +1,26 @@
 """A child process that dies with its parent, and what it said last."""
 
 import contextlib
-import ctypes
-import functools
+import errno
 import os
+import shutil
 import signal
 import subprocess
+import sys
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import IO
 
-_PR_SET_PDEATHSIG = 1
 _LAST_WORDS = 6
+_DIES_WITH = """
+import ctypes, os, sys
+number, parent = map(int, sys.argv[1:3])
+ctypes.CDLL(None).prctl(1, number)  # PR_SET_PDEATHSIG, which exec keeps
+if os.getppid() == parent:  # it lives still
+    os.execvp(sys.argv[3], sys.argv[3:])
+"""
+"""Becomes the program, with the signal set: between fork and exec no code may run where other threads hold locks."""
 
 
 @dataclass(slots=True)
@@ -39,16 +47,21 @@ class Child:
         """Start it in a session of its own, so that Ctrl-C reaches only us.
 
         It dies with us; the kernel takes the end of the thread that starts it for ours.
+
+        Raises:
+            OSError: there is no such program.
         """
+        if shutil.which(self.command[0], path=(self.environment or os.environ).get("PATH")) is None:
+            raise FileNotFoundError(errno.ENOENT, os.strerror(errno.ENOENT), self.command[0])
+        death = [sys.executable, "-I", "-S", "-c", _DIES_WITH, str(self.when_we_die.value), str(os.getpid())]
         self._stream = self.said.open("wb")
         self.process = subprocess.Popen(  # noqa: S603  # our own programs, and the viewer's
-            self.command,
+            [*death, *self.command],
             stdin=subprocess.DEVNULL,
             stdout=subprocess.DEVNULL,
             stderr=self._stream,
             env=self.environment,
             start_new_session=True,
-            preexec_fn=functools.partial(_signal_at_parents_death, self.when_we_die, os.getpid()),
         )
 
     @property
@@ -81,12 +94,3 @@ class Child:
         if status is not None and status < 0:
             return f"{self.name} was killed by {signal.Signals(-status).name}"
         return f"{self.name} ended with exit status {status}"
-
-
-_libc = ctypes.CDLL(None)
-
-
-def _signal_at_parents_death(number: signal.Signals, parent: int) -> None:
-    _libc.prctl(_PR_SET_PDEATHSIG, number)
-    if os.getppid() != parent:  # it died between fork and here
-        os._exit(1)
