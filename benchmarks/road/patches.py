@@ -300,6 +300,23 @@ def _telemetry_first() -> None:
     _put(Controller, "_tell", told_once)
 
 
+def _stay_python() -> None:
+    """Keep Python's state of zenoh's threads from one callback to the next; it is made for each otherwise."""
+    known = threading.local()
+    plain = zenoh_bus.Callback
+
+    def staying(handler: Callable[[Any], None], *drop: Callable[[], None], **how: bool) -> Any:
+        def received(message: Any) -> None:
+            if not hasattr(known, "thread"):
+                ctypes.pythonapi.PyGILState_Ensure()
+                known.thread = True
+            handler(message)
+
+        return plain(received, *drop, **how)
+
+    _put(zenoh_bus, "Callback", staying)
+
+
 PATCHES: dict[str, Callable[[], None]] = {
     "collector": _collector_on,
     "switch-interval": lambda: _put(realtime, "_SWITCH_INTERVAL_S", _OFTEN_S),
@@ -307,7 +324,7 @@ PATCHES: dict[str, Callable[[], None]] = {
     "blas": lambda: _put(realtime, "threadpool_limits", _nothing),
     "timer-slack": lambda: _put(realtime, "sharpen_sleep", _nothing),
     "denormals": _denormals_flushed,
-    "stay-python": lambda: _put(zenoh_bus, "stay_python", _nothing),
+    "stay-python": _stay_python,
     "let-send": lambda: _put(realtime, "let_send", _nothing),
     "mirror-ahead": _mirror_ahead,
     "rehearse-late": lambda: _put(rehearsal, "LEAD_NS", 10**9),

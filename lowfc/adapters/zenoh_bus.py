@@ -6,7 +6,6 @@ Why each setting is what it is stands in `zenoh_session`; all of them were measu
 """
 
 import contextlib
-import ctypes
 import json
 import os
 import threading
@@ -35,7 +34,6 @@ __all__ = [
     "declare_publisher",
     "receive_in_one_thread",
     "session_config",
-    "stay_python",
 ]
 
 TAKEN_S = 0.5
@@ -244,7 +242,6 @@ class ZenohBus:
 
         def received(sample: zenoh.Sample) -> None:
             now_ns = host_ns()
-            stay_python()
             try:
                 handler(read(sample, now_ns, known_key))
             except Exception as fault:  # zenoh would print it and go on; it is counted here
@@ -331,20 +328,6 @@ class ZenohBus:
                 query.reply(key, body, attachment=envelope.encode())
 
         return reply
-
-
-_known = threading.local()
-
-
-def stay_python() -> None:
-    """Keep Python's state of this native thread from one callback to the next.
-
-    Otherwise it is made and destroyed for every message: a map, a page fault and an unmap that interrupts the other
-    processor, together a fifth of the loop's time on a virtual machine.
-    """
-    if not hasattr(_known, "thread"):
-        ctypes.pythonapi.PyGILState_Ensure()
-        _known.thread = True
 
 
 def _reader(topic: Topic, name: str) -> str | None:

@@ -25,7 +25,7 @@ from lowfc.adapters.realtime import let_send
 from lowfc.adapters.run import Run, open_run
 from lowfc.adapters.terminal import DEFAULT_RUN, ConfigFile, RunId, configuration, new_app, run_app
 from lowfc.adapters.whole_file import being_written
-from lowfc.adapters.zenoh_bus import declare_publisher, session_config, stay_python
+from lowfc.adapters.zenoh_bus import declare_publisher, session_config
 from lowfc.contract.configuration import Configuration
 from lowfc.contract.errors import BusError
 from lowfc.contract.messages import COMMAND, FRAME, Role
@@ -153,7 +153,6 @@ class Asker:
 
     def _hear(self, sample: zenoh.Sample) -> None:
         now_ns = self._clock.host_ns()
-        stay_python()
         assert sample.attachment is not None  # noqa: S101  # our own
         index, put_ns = Envelope.unpack(sample.attachment.to_bytes())
         sample.payload.to_bytes()
@@ -168,7 +167,6 @@ def _answer(config: Configuration, run: Run, command: bytes) -> None:
     publisher = declare_publisher(session, COMMAND, COMMAND.at(config.mirror.name))
 
     def received(sample: zenoh.Sample) -> None:
-        stay_python()
         if sample.payload.to_bytes():
             publisher.put(command, attachment=sample.attachment)
         else:

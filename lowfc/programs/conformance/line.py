@@ -12,7 +12,7 @@ from zenoh.handlers import Callback
 from lowfc.adapters.clock import HostClock
 from lowfc.adapters.envelope import Envelope, sequence_of
 from lowfc.adapters.run import Links
-from lowfc.adapters.zenoh_bus import session_config, stay_python
+from lowfc.adapters.zenoh_bus import session_config
 from lowfc.contract.errors import BusError
 from lowfc.contract.messages import Topic
 from lowfc.programs.conformance.checks import Heard
@@ -108,7 +108,6 @@ class ZenohLine:
             self._session.close()  # type: ignore[no-untyped-call]
 
     def _hear(self, sample: zenoh.Sample) -> None:
-        stay_python()
         self._waiting.append(self._taken(sample))
 
     def _taken(self, sample: zenoh.Sample) -> Heard:
