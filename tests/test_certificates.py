@@ -1,6 +1,7 @@
 """`lowfc certs`, read by another implementation: the standard library's OpenSSL."""
 
 import contextlib
+import datetime
 import socket
 import ssl
 import stat
@@ -12,7 +13,8 @@ import pytest
 from typer.testing import CliRunner
 
 from lowfc.adapters.access import ROUTER
-from lowfc.adapters.routed import router_trouble
+from lowfc.adapters.own_certificate import WARN_DAYS, read_certificate
+from lowfc.adapters.routed import ending_certificates, router_trouble
 from lowfc.contract.configuration import Network
 from lowfc.contract.errors import ConfigurationError, DataFileError
 from lowfc.programs.cli import app
@@ -150,6 +152,43 @@ def test_who_hangs_up_in_the_handshake_is_not_one_who_refuses_the_certificate(tm
         network = Network(router=f"tls/127.0.0.1:{port}", certificates=str(tmp_path))
         assert "ends the connection in the midst of the handshake" in router_trouble(network, "camera")
     assert "refused" in router_trouble(network, "camera")
+
+
+def test_a_certificate_is_read_as_its_peers_read_it(tmp_path: Path) -> None:
+    made = datetime.datetime.now(datetime.UTC)
+    make(tmp_path, (ROUTER, "camera"), ["localhost"], 100)
+    for role in (ROUTER, "camera"):
+        files = (tmp_path / "ca.pem", tmp_path / f"{role}.pem", tmp_path / f"{role}.key")
+        found = read_certificate(*files, server=role == ROUTER)
+        assert found.name == role
+        assert abs(found.ends - made - datetime.timedelta(days=100)) < datetime.timedelta(minutes=10)
+        with pytest.raises(DataFileError, match="is not a valid certificate"):
+            read_certificate(*files, server=role != ROUTER)
+    camera = tmp_path / "camera.pem", tmp_path / "camera.key"
+    for wrong in (
+        (tmp_path / "ca.pem", camera[0], tmp_path / "router.key"),
+        (camera[0], *camera),
+        (tmp_path / "none.pem", *camera),
+        (camera[1], *camera),
+    ):
+        with pytest.raises(DataFileError, match=r"camera\.pem is not a valid certificate of .* signed by"):
+            read_certificate(*wrong)
+
+
+def test_certificates_are_warned_about_before_their_end(tmp_path: Path) -> None:
+    now, day = datetime.datetime.now(datetime.UTC), datetime.timedelta(days=1)
+    network = Network(router="tls/localhost:7447", certificates=str(tmp_path))
+    make(tmp_path, (ROUTER, "camera"), ["localhost"], 100)
+    make(tmp_path, ("viewer",), [], 300)
+    assert ending_certificates(network, now + (99 - WARN_DAYS) * day) == []
+    date = now + 100 * day
+    assert ending_certificates(network, now + (100.5 - WARN_DAYS) * day) == [
+        f"the certificate of {role} ends in {WARN_DAYS - 1} days, on {date:%Y-%m-%d}" for role in ("camera", "router")
+    ]
+    assert len(ending_certificates(network, now + (3650 - WARN_DAYS + 1) * day)) == 3, "and the authority's own"
+    (tmp_path / "camera.key").write_bytes((tmp_path / "viewer.key").read_bytes())
+    (said,) = ending_certificates(network, now)
+    assert "camera.pem is not a valid certificate" in said
 
 
 def test_mistakes_are_said(tmp_path: Path) -> None:

@@ -17,7 +17,9 @@ from typer.testing import CliRunner
 
 from lowfc.adapters import host as host_module
 from lowfc.adapters import trial as trial_module
+from lowfc.adapters.clock import boot_file
 from lowfc.adapters.host import Host, Synchronisation
+from lowfc.adapters.run import runtime_base
 from lowfc.adapters.trial import Trial, lateness_ns, try_out
 from lowfc.contract.configuration import Configuration, Realtime, load
 from lowfc.programs.doctor import command as doctor_module
@@ -299,6 +301,35 @@ def test_a_clock_that_nobody_keeps_is_a_warning(
 ) -> None:
     monkeypatch.setattr(host_module, "_adjtimex", lambda: Synchronisation(kept, 12e-6, 0.001))
     assert examine(facts(tmp_path))["synchronisation"].status == status
+
+
+@pytest.mark.parametrize(("behind_ms", "status"), [(50, "ok"), (1000, "warning"), (-1000, "warning")])
+def test_a_boots_clock_that_was_set_wrong_is_a_warning(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, behind_ms: int, status: str
+) -> None:
+    monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
+    assert examine(facts(tmp_path))["boot's clock"] == ok("not set yet: the first process of a run does it")
+    assert not (tmp_path / "lowfc").exists(), "looking changes nothing"
+    file = boot_file(runtime_base())
+    file.write_text(str(time.time_ns() - time.monotonic_ns() - behind_ms * 1_000_000))
+    finding = examine(facts(tmp_path))["boot's clock"]
+    assert finding.status == status
+    assert (status == "warning") == (f"remove {file}" in finding.advice)
+    file.write_text("noon")
+    assert "not known" in examine(facts(tmp_path))["boot's clock"].detail
+
+
+def test_certificates_that_end_are_a_warning(tmp_path: Path) -> None:
+    certificates = pytest.importorskip("lowfc.adapters.certificates")
+    folder = tmp_path / "certs"
+    way = load(None, {"network.router": "tls/bench:7447", "network.certificates": str(folder), **NAMED})
+    certificates.make_certificates(folder, ("camera",), [])
+    assert examine(facts(tmp_path))["certificates"].status == "ok"
+    assert examine(facts(tmp_path, config=way))["certificates"].status == "ok"
+    certificates.make_certificates(folder, ("camera",), [], 59, renew=True)
+    finding = examine(facts(tmp_path, config=way))["certificates"]
+    assert finding.status == "warning"
+    assert "certificate of camera ends in 58 days" in finding.detail
 
 
 def test_the_kernels_account_of_the_clock_is_read_where_it_is() -> None:

@@ -409,6 +409,7 @@ def test_a_recorder_process_loses_nothing_from_the_first_frame_on(
     assert reader.complete
     assert reader.attachments == {"lowfc.toml": b"[loop]\n"}
     described = reader.metadata["lowfc"]
+    assert abs(float(described["clock_ahead_ms"])) < 1000
     assert (described["seed"], described["lowfc"]) == ("7", "0.1.0")
     assert all(described[key] for key in ("host", "kernel", "processor", "python", "numpy", "eclipse-zenoh", "run"))
 

@@ -24,11 +24,10 @@ from cryptography.hazmat.primitives.serialization import (
 from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
 
 from lowfc.adapters.access import ROUTER
-from lowfc.adapters.routed import CA
+from lowfc.adapters.routed import CA, CA_KEY
 from lowfc.adapters.whole_file import write_whole
 from lowfc.contract.errors import ConfigurationError, DataFileError
 
-CA_KEY = "ca.key"
 CA_DAYS = 3650
 DAYS = 825
 """How long a role's certificate is valid, unless it is said."""

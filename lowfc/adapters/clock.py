@@ -11,11 +11,14 @@ import time
 from pathlib import Path
 from typing import Protocol
 
-from lowfc.adapters.run import runtime_base, write_once
+from lowfc.adapters.run import runtime_base, runtime_path, write_once
 from lowfc.contract.errors import DataFileError
 
 SIMULATED_START_NS = 1_767_225_600_000_000_000
 """2026-01-01T00:00:00Z, where every lockstep run starts."""
+
+WALL_TOLERANCE_NS = 100_000_000
+"""Difference from the wall clock above which it is reported: it was wrong when the offset of this boot was fixed."""
 
 _BOOT_ID = Path("/proc/sys/kernel/random/boot_id")
 _PR_SET_TIMERSLACK = 29
@@ -43,6 +46,10 @@ class Clock(Protocol):
         """Time of the host, for envelopes and durations; the same as `now_ns` unless in lockstep."""
         ...
 
+    def ahead_ns(self) -> int:
+        """By how much the host's time is ahead of its wall clock, now."""
+        ...
+
     def sleep_until_ns(self, deadline_ns: int) -> None:
         """Return when `now_ns` has reached the deadline."""
         ...
@@ -63,6 +70,10 @@ class HostClock:
         return time.monotonic_ns() + self.offset_ns
 
     host_ns = now_ns
+
+    def ahead_ns(self) -> int:
+        """By how much it is ahead of the wall clock, now."""
+        return self.now_ns() - time.time_ns()
 
     def sleep_until_ns(self, deadline_ns: int) -> None:
         """Sleep until `deadline_ns`; returns at once when it has passed."""
@@ -89,6 +100,10 @@ class SimulatedClock:
         """The host's time, nanoseconds since the epoch."""
         return self._host.now_ns()
 
+    def ahead_ns(self) -> int:
+        """By how much the host's time is ahead of its wall clock, now."""
+        return self._host.ahead_ns()
+
     def set_ns(self, now_ns: int) -> None:
         """Move the clock."""
         self._now_ns = now_ns
@@ -114,6 +129,10 @@ class FakeClock:
 
     host_ns = now_ns
 
+    def ahead_ns(self) -> int:
+        """It is its own wall clock."""
+        return 0
+
     def advance(self, duration_ns: int) -> None:
         """Let time pass."""
         self.time_ns += duration_ns
@@ -123,13 +142,18 @@ class FakeClock:
         self.time_ns = max(self.time_ns, deadline_ns)
 
 
+def boot_file(base: Path | None = None) -> Path:
+    """File of this boot's offset, in the user's runtime directory where no other is given; it may not be there yet."""
+    return (runtime_path() if base is None else base) / f"clock-{_BOOT_ID.read_text().strip()}"
+
+
 def boot_offset_ns(base: Path) -> int:
     """Offset of CLOCK_MONOTONIC from the epoch, ns; the first to ask since the host was booted fixes it.
 
     Raises:
         DataFileError: the file in `base` that keeps it is damaged.
     """
-    path = base / f"clock-{_BOOT_ID.read_text().strip()}"
+    path = boot_file(base)
     text = write_once(path, str(time.time_ns() - time.monotonic_ns()))
     try:
         return int(text)

@@ -1,6 +1,8 @@
 """The bus across hosts: zenoh's configuration of the router, and of those who come to it by mutual TLS."""
 
 import contextlib
+import datetime
+import errno
 import socket
 import ssl
 import sys
@@ -11,15 +13,24 @@ from typing import Any
 import zenoh
 
 from lowfc.adapters.access import ROUTER, access_control
+from lowfc.adapters.own_certificate import WARN_DAYS, read_certificate
 from lowfc.contract.configuration import Network
 from lowfc.contract.errors import BusError, DataFileError
 
 CA = "ca.pem"
 """File of a folder of certificates: the authority that signed all of them."""
+CA_KEY = "ca.key"
+"""The authority's key, which belongs on no machine of the loop."""
 
 CONNECT_MS = 1000
 _LEASE_MS = 2000
 _ALERT_S = 0.5
+_NOT_THERE = {
+    *(errno.ECONNREFUSED, errno.ECONNRESET, errno.ETIMEDOUT),
+    *(errno.EHOSTUNREACH, errno.EHOSTDOWN, errno.ENETUNREACH, errno.ENETDOWN),
+    socket.EAI_AGAIN,
+}
+"""Faults of a router, or of a network, that is not there yet; with all others waiting is in vain."""
 
 
 def client_session(network: Network, role: str, sending: dict[str, Any]) -> dict[str, Any]:
@@ -81,27 +92,35 @@ def router_session(network: Network, mirrors: Iterable[str], sending: dict[str, 
 
 
 def open_by_router(config: zenoh.Config, network: Network, role: str) -> zenoh.Session:
-    """Session by the router, which is waited for.
+    """Session by the router, which is waited for while nobody listens there.
 
     Raises:
-        BusError: the router does not take this certificate, or is not who it should be.
+        BusError: the router does not take this certificate, or is not who it should be; it cannot be reached for
+            another reason than that it is not there; or zenoh refuses the session though the router is there.
     """
-    said = False
+    said, refused = "", 0
     while True:
         try:
             return zenoh.open(config)
         except zenoh.ZError as fault:
             trouble = router_trouble(network, role)
-            if not said:
-                sys.stderr.write(f"{role}: waiting for the router at {network.router}: {trouble or fault}\n")
-                said = True
+            refused = 0 if trouble else refused + 1  # once it may have come just now
+            if refused > 1:
+                raise BusError(
+                    f"the router at {network.router} takes {role}'s certificate, and zenoh opens no session: "
+                    f"{str(fault).splitlines()[0][:200]}"
+                ) from fault
+            if trouble != said and trouble:
+                sys.stderr.write(f"{role}: waiting for the router at {network.router}: {trouble}\n")
+                said = trouble
 
 
 def router_trouble(network: Network, role: str) -> str:
-    """Why there is no link to the router: it cannot be reached; empty where it can.
+    """Why there is no link to the router: it is not there, or going down; empty where it is there.
 
     Raises:
-        BusError: it is there, and one of the two does not take the other's certificate.
+        BusError: it is there, and one of the two does not take the other's certificate; or it cannot be reached for
+            another reason, such as a name that nobody knows.
     """
     ca, certificate, key = certificate_files(network, role)
     host, port = network.address
@@ -123,8 +142,37 @@ def router_trouble(network: Network, role: str) -> str:
             f"must be signed by {ca}, valid today, and the router's made for the name {host!r}; see lowfc certs"
         ) from fault
     except OSError as fault:
-        return fault.strerror or str(fault)
+        why = fault.strerror or str(fault)
+        if isinstance(fault, TimeoutError) or fault.errno in _NOT_THERE:
+            return why
+        raise BusError(
+            f"the router at {network.router} cannot be reached ({why}): is network.router its name and port, and can "
+            "this host resolve it?"
+        ) from fault
     return ""
+
+
+class RouterWatch:
+    """Says why a process has lost its router, and when it is back."""
+
+    def __init__(self, network: Network, role: str) -> None:
+        self._network = network
+        self._role = role
+        self._said = ""
+
+    def look(self, *, linked: bool) -> None:
+        """Take note of whether there is a link now; to be called now and then."""
+        if linked:
+            why = ""
+        else:
+            try:
+                why = router_trouble(self._network, self._role) or "it is there, and the link is being made anew"
+            except BusError as fault:
+                why = str(fault)
+        if why != self._said:
+            text = f"no link to the router at {self._network.router}: {why}" if why else "the router is back"
+            sys.stderr.write(f"{self._role}: {text}\n")
+            self._said = why
 
 
 def certificate_files(network: Network, role: str) -> tuple[Path, Path, Path]:
@@ -134,12 +182,13 @@ def certificate_files(network: Network, role: str) -> tuple[Path, Path, Path]:
 
 
 def require_certificate(network: Network, role: str) -> None:
-    """Say before a session is opened that it would not be let in.
+    """Say before a session is opened that it would not be let in, or let in and sent nothing.
 
     Raises:
-        DataFileError: a file is missing or cannot be read.
+        DataFileError: a file is missing or cannot be read, or the certificate is not valid, or another role's.
     """
-    for file in certificate_files(network, role):
+    files = certificate_files(network, role)
+    for file in files:
         try:
             file.open("rb").close()
         except OSError as fault:
@@ -147,6 +196,30 @@ def require_certificate(network: Network, role: str) -> None:
                 f"{file} cannot be read ({fault.strerror}): the router takes nobody without it; make it where the "
                 "authority's key is (lowfc certs) and copy it here"
             ) from fault
+    name = read_certificate(*files, server=role == ROUTER).name
+    if name != role:
+        raise DataFileError(
+            f"{files[1]} is the certificate of {name!r}, and this process is {role!r}: the router would let it in and "
+            f"pass on nothing; copy {role}.pem and {role}.key of that role here"
+        )
+
+
+def ending_certificates(network: Network, now: datetime.datetime) -> list[str]:
+    """A sentence for each certificate in this host's folder that is invalid, or ends within `WARN_DAYS`."""
+    said = []
+    for key in sorted(Path(network.certificates).glob("*.key")):
+        role = key.stem
+        if key.name == CA_KEY:
+            continue
+        try:
+            found = read_certificate(*certificate_files(network, role), server=role == ROUTER)
+        except DataFileError as fault:
+            said.append(str(fault))
+            continue
+        left = found.ends - now
+        if left < datetime.timedelta(days=WARN_DAYS):
+            said.append(f"the certificate of {role} ends in {left.days} days, on {found.ends:%Y-%m-%d}")
+    return said
 
 
 def _transport(tls: dict[str, object], sending: dict[str, Any]) -> dict[str, Any]:

@@ -207,14 +207,19 @@ def mirror_role(name: str) -> str:
     return f"{Role.MIRROR}-{name}"
 
 
+def runtime_path() -> Path:
+    """The user's runtime directory for lowfc, whether it is there or not."""
+    given = os.environ.get("XDG_RUNTIME_DIR")
+    return Path(given) / "lowfc" if given else Path("/tmp") / f"lowfc-{os.geteuid()}"  # noqa: S108  # own_directory() checks it
+
+
 def runtime_base() -> Path:
     """The user's runtime directory for lowfc, made if there is none.
 
     Raises:
         DataFileError: it belongs to somebody else, is open to others, or is not a directory.
     """
-    given = os.environ.get("XDG_RUNTIME_DIR")
-    base = Path(given) / "lowfc" if given else Path("/tmp") / f"lowfc-{os.geteuid()}"  # noqa: S108  # own_directory() checks it
+    base = runtime_path()
     try:
         base.mkdir(mode=0o700, exist_ok=True)
     except FileExistsError:

@@ -11,7 +11,7 @@ from types import FrameType
 from lowfc import __version__
 from lowfc.adapters.arrivals import Arrivals
 from lowfc.adapters.bus import ALL, UNREADABLE, Bus, Publisher, Sample
-from lowfc.adapters.clock import Clock
+from lowfc.adapters.clock import WALL_TOLERANCE_NS, Clock
 from lowfc.adapters.handover import Handover
 from lowfc.adapters.mailbox import Mailbox
 from lowfc.adapters.names import Names
@@ -74,6 +74,8 @@ class Service:
         self._health = self.publisher(HEALTH, name)
         bus.subscribe(HEALTH, self._hear)
         self.event("STARTED", process=name, version=__version__)
+        if abs(ahead_ns := clock.ahead_ns()) > WALL_TOLERANCE_NS:
+            self.event("CLOCK_OFF", ahead_ms=ahead_ns / 1e6)
         for measure, cost in granted.refused:
             self.event("REALTIME_REFUSED", measure=measure, cost=cost)
 

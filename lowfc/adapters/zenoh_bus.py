@@ -21,7 +21,7 @@ from lowfc.adapters.bus import ALL, Faults, Query, Sample
 from lowfc.adapters.clock import Clock
 from lowfc.adapters.clock_offset import ClockAsker, ClockOffset
 from lowfc.adapters.envelope import Envelope, sequence_of
-from lowfc.adapters.routed import open_by_router, require_certificate
+from lowfc.adapters.routed import RouterWatch, open_by_router, require_certificate
 from lowfc.adapters.run import Links, mirror_role
 from lowfc.adapters.shortcut import SharedShortcutReader, ShortcutReader, ShortcutWriter
 from lowfc.adapters.zenoh_session import session_config
@@ -206,9 +206,11 @@ class ZenohBus:
             )
         self.offset = ClockOffset()
         self.read = partial(_sample_from_afar, self.offset)
+        self._router = RouterWatch(self._links.network, self.role)
         self._closers.append(ClockAsker(self.offset, self._ask_the_time, self.clock.host_ns).close)
 
     def _ask_the_time(self) -> list[tuple[int, int]]:
+        self._router.look(linked=bool(self._session.info.routers_zid()))
         answers = self.get(CLOCK_KEY, timeout_s=TAKEN_S)
         return [(answer.publish_time_ns, answer.receive_time_ns) for answer in answers]
 

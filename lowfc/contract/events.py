@@ -43,6 +43,11 @@ EVENTS: dict[str, Event] = {
     for event in (
         Event("STARTED", Level.INFO, "{process} {version} started"),
         Event("STOPPED", Level.INFO, "{process} stopped: {why}"),
+        Event(
+            "CLOCK_OFF",
+            Level.WARNING,
+            "this boot's clock is {ahead_ms:+.0f} ms from the wall clock, and so are all times; see `lowfc doctor`",
+        ),
         Event("REALTIME_REFUSED", Level.WARNING, "the host refused {measure}: {cost}"),
         Event("CALIBRATION_LOADED", Level.INFO, "calibration {id}: {modes} modes, {estimator}, from {source}"),
         Event("CAMERA_CHANGED", Level.WARNING, "the camera no longer fits the calibration ({what}); loop opened"),

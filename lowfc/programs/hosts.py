@@ -1,5 +1,6 @@
 """The commands for a run on several machines: certificates, the router, and who is there by which clock."""
 
+import datetime
 import json
 import re
 import sys
@@ -120,6 +121,7 @@ def hosts(
     from lowfc.adapters.bus import Sample
     from lowfc.adapters.clock import HostClock
     from lowfc.adapters.names import Names
+    from lowfc.adapters.routed import ending_certificates
     from lowfc.adapters.run import open_run
     from lowfc.adapters.zenoh_bus import ZenohBus
     from lowfc.contract.messages import HEALTH, Role, wire
@@ -137,7 +139,10 @@ def hosts(
         time.sleep(LISTEN_S)
     if not heard:
         raise BusError(f"nobody is heard in run {run!r} within {LISTEN_S:g} s")
-    open_run(run, (settings.mirror.name,), network=settings.network)  # from now on its folder knows the way
+    known = open_run(run, (settings.mirror.name,), network=settings.network)  # from now on its folder knows the way
+    if known.links.network.router:
+        for said in ending_certificates(known.links.network, datetime.datetime.now(datetime.UTC)):
+            sys.stderr.write(f"warning: {said}; lowfc certs --renew\n")
     rows = [_row(health) for _, health in sorted(heard.items())]
     put({"run": run, "processes": rows}, _table(rows), as_json=as_json)
 

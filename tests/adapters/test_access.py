@@ -1,17 +1,22 @@
 """Who may do what at the router: by the table of topics, and by a real router on loopback."""
 
 import json
+import socket
+import threading
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
+import zenoh
+from typer.testing import CliRunner
 
 from lowfc.adapters.access import CLOCK_KEY, ROUTER, access_control, grant, roles
 from lowfc.adapters.bus import Sample
 from lowfc.adapters.clock import HostClock
 from lowfc.adapters.clock_offset import RECENT, ClockOffset
 from lowfc.adapters.run import free_ports, open_run
+from lowfc.adapters.service import Service
 from lowfc.adapters.zenoh_bus import ZenohBus
 from lowfc.adapters.zenoh_session import session_config
 from lowfc.contract.configuration import Network
@@ -29,6 +34,7 @@ from lowfc.contract.messages import (
     Role,
     Topic,
 )
+from lowfc.programs.cli import app
 
 certificates = pytest.importorskip("lowfc.adapters.certificates", reason="needs the package cryptography")
 ROLES = roles(["mirror-dm"])
@@ -216,6 +222,32 @@ def test_times_are_those_of_the_host_that_receives(hosts: Hosts) -> None:
     assert all(abs(sample.receive_time_ns - sample.publish_time_ns) < second_ns for sample in arrived)
 
 
+def test_hosts_warns_of_a_certificate_that_ends(hosts: Hosts, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("XDG_RUNTIME_DIR", str(hosts.folder))
+    toml = hosts.folder / "lowfc.toml"
+    toml.write_text(f'[network]\nrouter = "{hosts.network().router}"\ncertificates = "{hosts.folder / "certs"}"\n')
+    certificates.make_certificates(hosts.folder / "certs", ("operator",), [], 20, renew=True)
+    Service(ROUTER, "hosts", HostClock(), hosts.join(ROUTER))
+    camera = Service("camera", "hosts", HostClock(), hosts.join("camera"))
+    stop = threading.Event()
+
+    def beat() -> None:
+        while not stop.wait(0.1):
+            camera.beat()
+
+    beating = threading.Thread(target=beat)
+    beating.start()
+    try:
+        done = CliRunner().invoke(app, ["hosts", "--config", str(toml), "--run", "hosts"])
+    finally:
+        stop.set()
+        beating.join()
+    assert done.exit_code == 0, done.output
+    assert "camera" in done.stdout
+    (line,) = (line for line in done.stderr.splitlines() if line.startswith("warning: "))
+    assert line.startswith("warning: the certificate of operator ends in 19 days, on ")
+
+
 def test_there_is_one_of_each_role(hosts: Hosts) -> None:
     hosts.join(ROUTER)
     hosts.join("camera").publisher(HEALTH, "camera").put(b"here")
@@ -228,14 +260,66 @@ def test_there_is_one_of_each_role(hosts: Hosts) -> None:
 def test_a_foreign_certificate_is_told_so(hosts: Hosts) -> None:
     hosts.join(ROUTER)
     certificates.make_certificates(hosts.folder / "foreign", ("camera",), [])
+    others = hosts.folder / "foreign"
     with pytest.raises(BusError, match=r"do not take each other .CERTIFICATE_VERIFY_FAILED"):
         hosts.join("camera", network=hosts.network("foreign"))
-    (hosts.folder / "foreign" / "ca.pem").write_bytes((hosts.folder / "certs" / "ca.pem").read_bytes())
-    with pytest.raises(BusError, match="do not take each other"):
+    (others / "ca.pem").write_bytes((hosts.folder / "certs" / "ca.pem").read_bytes())
+    with pytest.raises(DataFileError, match=r"camera\.pem is not a valid certificate .* signed by .*lowfc certs"):
         hosts.join("camera", network=hosts.network("foreign"))
 
 
-def test_a_role_does_not_pass_for_the_router(hosts: Hosts) -> None:
+def test_a_certificate_of_another_role_is_told_so_before_a_session_is_opened(hosts: Hosts) -> None:
+    for kind in ("pem", "key"):
+        (hosts.folder / "certs" / f"recorder.{kind}").replace(hosts.folder / "certs" / f"camera.{kind}")
+    with pytest.raises(DataFileError, match=r"camera\.pem is the certificate of 'recorder'.*this process is 'camera'"):
+        hosts.join("camera")
+    for kind in ("pem", "key"):
+        (hosts.folder / "certs" / f"camera.{kind}").replace(hosts.folder / "certs" / f"router.{kind}")
+    with pytest.raises(DataFileError, match=r"router\.pem is not a valid certificate"):
+        hosts.join(ROUTER)
+
+
+def test_a_process_that_loses_its_router_says_why(hosts: Hosts, capfd: pytest.CaptureFixture[str]) -> None:
+    said = ""
+
+    def told(text: str) -> Callable[[], bool]:
+        def look() -> bool:
+            nonlocal said
+            said += capfd.readouterr().err
+            return text in said
+
+        return look
+
+    router = hosts.join(ROUTER)
+    hosts.join("camera")
+    router.close()
+    until(told(f"camera: no link to the router at tls/127.0.0.1:{hosts.port}: Connection refused\n"))
+    hosts.join(ROUTER)
+    until(told("camera: the router is back\n"))
+
+
+def test_a_router_that_cannot_be_found_is_not_waited_for(hosts: Hosts, monkeypatch: pytest.MonkeyPatch) -> None:
+    def unknown(*_: object) -> None:
+        raise socket.gaierror(socket.EAI_NONAME, "Name or service not known")
+
+    monkeypatch.setattr("lowfc.adapters.routed.socket.create_connection", unknown)
+    with pytest.raises(BusError, match=r"nowhere\.invalid.*cannot be reached .*resolve it"):
+        hosts.join("camera", network=hosts.network(host="nowhere.invalid"))
+
+
+def test_a_session_that_zenoh_refuses_is_not_waited_for(hosts: Hosts, monkeypatch: pytest.MonkeyPatch) -> None:
+    hosts.join(ROUTER)
+
+    def refuse(config: object) -> None:
+        raise zenoh.ZError("this and that")
+
+    monkeypatch.setattr("lowfc.adapters.routed.zenoh.open", refuse)
+    with pytest.raises(BusError, match="takes camera's certificate, and zenoh opens no session: this and that"):
+        hosts.join("camera")
+
+
+def test_a_role_does_not_pass_for_the_router(hosts: Hosts, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("lowfc.adapters.zenoh_bus.require_certificate", lambda *_: None)  # as in a router of theirs
     folder = hosts.folder / "false"
     folder.mkdir()
     for name, source in (("ca.pem", "ca.pem"), ("router.pem", "camera.pem"), ("router.key", "camera.key")):

@@ -29,6 +29,16 @@ def test_the_clock_is_the_hosts_and_does_not_step_with_it(tmp_path: Path, monkey
     assert clock.now_ns() - time.monotonic_ns() <= clock.offset_ns
 
 
+def test_it_knows_how_far_it_is_from_the_wall_clock(tmp_path: Path) -> None:
+    clock = HostClock(tmp_path)
+    assert abs(clock.ahead_ns()) < 1_000_000_000
+    (file,) = tmp_path.iterdir()
+    file.write_text(str(clock.offset_ns - 3600 * 10**9))  # as fixed before NTP was there
+    late = HostClock(tmp_path)
+    assert abs(late.ahead_ns() + 3600 * 10**9) < 1_000_000_000
+    assert abs(SimulatedClock(host=late).ahead_ns() + 3600 * 10**9) < 1_000_000_000
+
+
 def test_sleep_ends_after_its_deadline_and_not_before(tmp_path: Path) -> None:
     clock = HostClock(tmp_path)
     deadline = clock.now_ns() + 3_000_000

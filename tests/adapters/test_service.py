@@ -69,6 +69,20 @@ def test_health_is_sent_when_due_and_tells_everything(hub: MemoryHub, clock: Fak
     }
 
 
+@pytest.mark.parametrize(("ahead_ms", "said"), [(-99, False), (100, False), (101, True), (-250, True)])
+def test_a_clock_that_is_off_is_reported_at_the_start(
+    hub: MemoryHub, clock: FakeClock, monkeypatch: pytest.MonkeyPatch, ahead_ms: int, said: bool
+) -> None:
+    ear = Ear(hub, clock)
+    monkeypatch.setattr(clock, "ahead_ns", lambda: ahead_ms * 1_000_000)
+    service(hub, clock, "camera")
+    found = [log.message for log in ear.events if log.message.startswith("CLOCK_OFF")]
+    sentence = (
+        f"CLOCK_OFF this boot's clock is {ahead_ms:+d} ms from the wall clock, and so are all times; see `lowfc doctor`"
+    )
+    assert found == [sentence] * said
+
+
 def test_what_a_mailbox_got_is_in_health(hub: MemoryHub, clock: FakeClock) -> None:
     camera, controller = service(hub, clock, "camera"), service(hub, clock, "controller")
     box = controller.mailbox(FRAME)

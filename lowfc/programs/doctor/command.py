@@ -84,13 +84,14 @@ def checks() -> "dict[str, Callable[[Facts], Finding]]":
 
 def examine(facts: "Facts") -> "dict[str, Finding]":
     """What every check found; one that cannot read what it needs finds just that."""
+    from lowfc.contract.errors import LowfcError
     from lowfc.programs.doctor.facts import note
 
     found = {}
     for name, check in checks().items():
         try:
             found[name] = check(facts)
-        except (OSError, ValueError, LookupError) as fault:
+        except (OSError, ValueError, LookupError, LowfcError) as fault:
             found[name] = note(f"not known: {fault}")
     return found
 

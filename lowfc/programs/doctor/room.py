@@ -3,6 +3,7 @@
 Of a check's docstring, the first paragraph is what it looks at, the second when it warns; docs/doctor.md has both.
 """
 
+import datetime
 import platform
 import shutil
 import sys
@@ -11,7 +12,9 @@ from pathlib import Path
 import numpy as np
 from threadpoolctl import threadpool_info, threadpool_limits
 
+from lowfc.adapters.own_certificate import WARN_DAYS
 from lowfc.adapters.rerun_viewer import ViewerError, has_screen, viewer_binary, vulkan_drivers
+from lowfc.adapters.routed import ending_certificates
 from lowfc.programs.doctor.facts import Facts, Finding, note, ok, warning
 
 _STALL_S = 0.1
@@ -160,6 +163,24 @@ def open_files(facts: Facts) -> Finding:
     return warning(detail, "ulimit -n 1024, or LimitNOFILE=1024 of the service", "a process may fail to join the bus")
 
 
+def certificates(facts: Facts) -> Finding:
+    """Certificates in this host's folder, `network.certificates`, where the loop goes by a router.
+
+    One is not valid, or ends within 60 days.
+    """
+    network = facts.config.network
+    if not network.router:
+        return ok("none needed: the configuration names no router")
+    said = ending_certificates(network, datetime.datetime.now(datetime.UTC))
+    if not said:
+        return ok(f"all in {network.certificates} are valid for more than {WARN_DAYS} days")
+    return warning(
+        "; ".join(said),
+        "lowfc certs --renew where the authority's key is, and copy each ROLE.pem here",
+        "a link that is up stays up; a process or a router that starts after the end is not let in",
+    )
+
+
 def python(facts: Facts) -> Finding:
     """The Python that runs the loop.
 
@@ -239,6 +260,7 @@ CHECKS = {
     "shared memory": shared_memory,
     "disk": disk,
     "open files": open_files,
+    "certificates": certificates,
     "python": python,
     "viewer": viewer,
     "graphics driver": graphics_driver,

@@ -7,6 +7,7 @@ import time
 
 import numpy as np
 
+from lowfc.adapters.clock import WALL_TOLERANCE_NS, HostClock, boot_file
 from lowfc.programs.doctor.facts import Facts, Finding, note, ok, ranges, warning
 
 PROCESSES = ("camera", "controller", "mirror", "recorder")
@@ -202,6 +203,26 @@ def synchronisation(facts: Facts) -> Finding:
     )
 
 
+def boot_clock(facts: Facts) -> Finding:
+    """The clock of all runs since the boot, which the first one set by CLOCK_REALTIME, against CLOCK_REALTIME now.
+
+    They differ by more than 100 ms: CLOCK_REALTIME was wrong then, or is now.
+    """
+    del facts
+    file = boot_file()
+    if not file.exists():
+        return ok("not set yet: the first process of a run does it")
+    ahead_ns = HostClock(file.parent).ahead_ns()
+    detail = f"{ahead_ns / 1e6:+.1f} ms from CLOCK_REALTIME"
+    if abs(ahead_ns) <= WALL_TOLERANCE_NS:
+        return ok(detail)
+    return warning(
+        detail,
+        f"once CLOCK_REALTIME is right: stop all lowfc processes, remove {file} and start them again",
+        "the times in logs are off by so much; the loop does not mind",
+    )
+
+
 def kernel(facts: Facts) -> Finding:
     """Preemption model of the kernel.
 
@@ -306,6 +327,7 @@ CHECKS = {
     "virtualisation": virtualisation,
     "clock source": clock_source,
     "synchronisation": synchronisation,
+    "boot's clock": boot_clock,
     "wake-up": wake_up,
     "load": load,
 }

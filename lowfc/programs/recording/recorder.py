@@ -361,7 +361,7 @@ def record(
             clock,
             run.run_id,
             folder,
-            metadata={"lowfc": provenance(run.run_id, seed)},
+            metadata={"lowfc": {**provenance(run.run_id, seed), "clock_ahead_ms": f"{clock.ahead_ns() / 1e6:.3f}"}},
             attachments=attachments,
             limits=limits,
             granted=granted,

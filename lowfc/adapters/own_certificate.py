@@ -1,0 +1,65 @@
+"""A role's certificate as its peers will judge it: by a TLS handshake in memory, before a session is opened."""
+
+import contextlib
+import datetime
+import ssl
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from lowfc.contract.errors import DataFileError
+
+WARN_DAYS = 60
+"""Days before the end of a certificate from which it is warned about."""
+
+_ROUNDS = 4  # of both ends; three are enough
+
+
+class OwnCertificate(NamedTuple):
+    """What a certificate says, its authority having been checked.
+
+    Attributes:
+        name: its common name, the role that it is for.
+        ends: when it, or the authority's own, ceases to be valid.
+    """
+
+    name: str
+    ends: datetime.datetime
+
+
+def read_certificate(authority: Path, certificate: Path, key: Path, *, server: bool = False) -> OwnCertificate:
+    """Read a certificate and check it as a peer does.
+
+    Args:
+        authority: file of the certificate that signed it.
+        certificate: its file.
+        key: file of its private key.
+        server: it is the router's; the others' are checked as those of clients.
+
+    Raises:
+        DataFileError: a file cannot be read, or the three do not fit, or it is not valid now.
+    """
+    try:
+        listening, connecting = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER), ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT)
+        connecting.check_hostname = False
+        connecting.verify_mode = ssl.CERT_NONE
+        judge = connecting if server else listening
+        judge.load_verify_locations(authority)
+        judge.verify_mode = ssl.CERT_REQUIRED
+        for context in (listening, connecting):
+            context.load_cert_chain(certificate, key)
+        to_server, to_client = ssl.MemoryBIO(), ssl.MemoryBIO()
+        ends = listening.wrap_bio(to_server, to_client, server_side=True), connecting.wrap_bio(to_client, to_server)
+        for end in ends * _ROUNDS:
+            with contextlib.suppress(ssl.SSLWantReadError):
+                end.do_handshake()
+        found: dict[str, Any] = {**(ends[server].getpeercert() or {})}
+        name = dict(pair for part in found["subject"] for pair in part)["commonName"]
+        authorities: list[dict[str, Any]] = judge.get_ca_certs()
+        last_s = min(ssl.cert_time_to_seconds(one["notAfter"]) for one in (found, *authorities))
+    except (OSError, KeyError, ValueError) as fault:  # ssl.SSLError is an OSError
+        why = getattr(fault, "verify_message", "") or getattr(fault, "reason", "") or getattr(fault, "strerror", "")
+        raise DataFileError(
+            f"{certificate} is not a valid certificate of {key} signed by {authority} ({why or fault}): make it where "
+            "the authority's key is (lowfc certs --renew) and copy it here; is this host's clock right?"
+        ) from fault
+    return OwnCertificate(name, datetime.datetime.fromtimestamp(last_s, datetime.UTC))
