@@ -23,7 +23,7 @@ from lowfc.adapters.log_series import Limits
 from lowfc.adapters.log_writer import UNFINISHED, Attachment
 from lowfc.adapters.memory_bus import MemoryBus, MemoryHub
 from lowfc.adapters.names import MOST_NAMES
-from lowfc.contract.messages import CALIBRATION, COMMAND, EVENT, FRAME, HEALTH, STEP, Topic, wire
+from lowfc.contract.messages import CALIBRATION, COMMAND, EVENT, FRAME, HEALTH, RECORD_KEY, STEP, Topic, wire
 from lowfc.programs.recording import recorder as recorder_module
 from lowfc.programs.recording.recorder import Recorder
 from lowfc.programs.recording.summary import Summary
@@ -183,6 +183,71 @@ def test_a_disk_that_stalls_costs_messages_and_they_are_counted(bench: Bench, mo
     list(reader)
     assert reader.metadata["recording"][f"lost {FRAME.key}"] == str(summary.lost[FRAME.key])
     assert summary.longest_unflushed_ns > 100_000_000
+
+
+@pytest.mark.parametrize("refused", [False, True])
+def test_the_loop_of_a_recorder_goes_on_while_the_disk_takes_a_stopped_log(
+    bench: Bench, monkeypatch: pytest.MonkeyPatch, refused: bool
+) -> None:
+    reached, release, answers = threading.Event(), threading.Event(), list[Sample]()
+    sync = os.fsync
+
+    def slow(descriptor: int) -> None:
+        reached.set()
+        assert release.wait(PATIENCE_S)
+        if refused:
+            raise OSError(5, "Input/output error")
+        sync(descriptor)
+
+    bench.start()
+    put(bench.camera.publisher(FRAME), 10)
+    monkeypatch.setattr(log_writer.os, "fsync", slow)
+    operator = MemoryBus(bench.hub, "operator", bench.clock)
+    asking = threading.Thread(
+        target=lambda: answers.extend(operator.get(RECORD_KEY.format(name="stop"), timeout_s=PATIENCE_S))
+    )
+    asking.start()
+    assert reached.wait(PATIENCE_S)
+    beats: list[int] = []
+    operator.subscribe(HEALTH, lambda sample: beats.append(sample.sequence), "recorder")
+    until(lambda: len(beats) >= 3)
+    put(bench.camera.publisher(STEP), 5)  # unwanted now, and not lost
+    assert not answers
+    release.set()
+    asking.join(PATIENCE_S)
+    (answer,) = answers
+    request = wire.Request.FromString(answer.payload)
+    assert (request.accepted, "Input/output error" in request.reply) == (not refused, refused)
+    monkeypatch.undo()
+    summary = bench.stop()
+    (log,) = summary.files
+    assert str(log) == request.text
+    assert log.name.endswith(UNFINISHED) == refused
+    assert len(bodies_of(list(LogReader(log)), FRAME)) == 10
+    assert refused or STEP.key not in summary.lost
+
+
+def test_a_recorder_told_to_end_while_a_log_is_being_stopped_ends_with_it(
+    bench: Bench, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    reached, release = threading.Event(), threading.Event()
+    sync = os.fsync
+
+    def slow(descriptor: int) -> None:
+        reached.set()
+        assert release.wait(PATIENCE_S)
+        sync(descriptor)
+
+    bench.start()
+    monkeypatch.setattr(log_writer.os, "fsync", slow)
+    operator = MemoryBus(bench.hub, "operator", bench.clock)
+    operator.get(RECORD_KEY.format(name="stop"), timeout_s=0)
+    assert reached.wait(PATIENCE_S)
+    bench.recorder.service.stop("told")
+    until(lambda: bench.recorder.service.state == "stopping")
+    release.set()
+    (log,) = bench.stop().files
+    assert not log.name.endswith(UNFINISHED)
 
 
 def test_a_frozen_process_that_is_asked_does_not_hold_up_the_recorder(

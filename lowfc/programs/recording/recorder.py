@@ -7,6 +7,7 @@ are counted, and never time in the loop. A disk that refuses ends the recording 
 import signal
 import time
 from collections.abc import Mapping, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
 from functools import partial
 from pathlib import Path
 from types import FrameType
@@ -67,6 +68,8 @@ class Recorder:
         self._series = LogSeries(folder, clock, metadata, attachments, limits)
         self._others = Others(bus)
         self._paused = False
+        self._ender = ThreadPoolExecutor(1, "end-log")
+        self._ending: Future[None] | None = None
         self._hurried = False
         self._failure = ""
         self._flush_due_ns = self._most_starts = 0
@@ -148,16 +151,23 @@ class Recorder:
             if now_ns >= self._flush_due_ns:
                 self._look_after()
 
-    def _pause(self) -> str:
-        """Finish the log with all that has arrived; return why not, if so."""
-        if self._failure or self._paused:
-            return self._failure or "nothing is being recorded"
-        self.service.event("RECORDING_STOPPED", why="operator asked")
-        self._say_losses()
-        self._write_waiting()
-        self._flush()
+    def _pause(self) -> str | None:
+        """Finish the log with all that has arrived; return why not, if so, and None until the disk has it."""
         try:
-            self._series.end(self._figures())
+            if self._ending is None:
+                if self._failure or self._paused:
+                    return self._failure or "nothing is being recorded"
+                self.service.event("RECORDING_STOPPED", why="operator asked")
+                self._say_losses()
+                self._write_waiting()
+                self._flush()
+                self._series.end(self._figures(), wait=False)
+                self._paused = True
+                self._ending = self._ender.submit(self._series.end, {})  # waits for it
+            if not self._ending.done():
+                return None
+            ending, self._ending = self._ending, None
+            ending.result()
         except DataFileError as fault:
             self._fail(fault)
         self._paused = not self._failure
@@ -233,7 +243,8 @@ class Recorder:
     def _flush(self) -> None:
         """Make what was written safe; end the log where it is full, and the recording where the disk nearly is."""
         try:
-            self._series.flush()
+            if self._ending is None:
+                self._series.flush()
             self._flushed()
             if self._failure or self._paused:
                 return
@@ -276,6 +287,9 @@ class Recorder:
             time.sleep(_TURN_S)
 
     def _close(self) -> Summary:
+        while self._ending is not None:
+            self._turn()
+            time.sleep(_TURN_S)
         self._say_losses()
         self._turn()
         self._flush()

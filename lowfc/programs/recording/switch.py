@@ -12,8 +12,11 @@ from lowfc.contract.messages import RECORD_KEY, timestamp, wire
 class RecordingSwitch:
     """Questions that wait for the recorder's loop, and their answers."""
 
-    def __init__(self, bus: Bus, clock: Clock, handlers: Mapping[str, Callable[[], str]]) -> None:
-        """Declare it on the bus; each handler does what its name says, and returns why not where it did not."""
+    def __init__(self, bus: Bus, clock: Clock, handlers: Mapping[str, Callable[[], str | None]]) -> None:
+        """Declare it on the bus; each handler does what its name says.
+
+        A handler returns why not where it did not, and None while it is at it: it is called again then.
+        """
         self._clock = clock
         self._handlers = handlers
         self._queries: deque[Query] = deque()
@@ -22,12 +25,16 @@ class RecordingSwitch:
     def serve(self, files: list[Path]) -> None:
         """Do what was asked since the last call; `files` are the logs so far, and change with it."""
         while self._queries:
-            query = self._queries.popleft()
+            query = self._queries[0]
             handler = self._handlers.get(query.name)
+            refusal: str | None
             if handler is None:
                 refusal = f"a recorder is told to {' or to '.join(self._handlers)}, not to {query.name}"
             else:
                 refusal = handler()
+            if refusal is None:
+                return
+            self._queries.popleft()
             path = str(files[-1].absolute()) if files else ""
             message = wire.Request(
                 timestamp=timestamp(self._clock.now_ns()),
