@@ -390,6 +390,21 @@ def _fed(ring: object, put: Callable[[bytes], object]) -> object:
     return ring
 
 
+def test_an_answer_that_is_none_is_an_error_with_a_sentence() -> None:
+    hub = MemoryHub()
+    controller = MemoryBus(hub, "controller", HostClock())
+    controller.queryable(REQUEST_KEY.format(name="*"), lambda query: query.reply(b"\xff"))
+    loop = Client(bus=MemoryBus(hub, "operator", HostClock()))
+    with pytest.raises(BusError, match=r"safe was answered with what is no lowfc\.v1\.Request"):
+        loop.safe()
+    for payload in (b"\xff", b""):
+        controller.publisher(CALIBRATION).put(payload)
+        with pytest.raises(BusError, match="lowfc/calibration was answered with what is no calibration"):
+            loop.calibration()
+        hub.buses.remove(controller)
+        controller = MemoryBus(hub, "controller", HostClock())
+
+
 def test_a_step_comes_as_it_was_sent() -> None:
     three = np.array([1.5, -2.0, 0.25], np.float32)
     sent = Step(9, 5_000, LoopMode.CLOSED, three, (Reason.SLEW,), three + 1, three + 2, 1234.5, 3)

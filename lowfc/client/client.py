@@ -7,6 +7,7 @@ from typing import NamedTuple, TypeVar
 
 import numpy as np
 import numpy.typing as npt
+from google.protobuf.message import DecodeError
 
 from lowfc.adapters.bus import Bus, Sample
 from lowfc.adapters.clock import HostClock
@@ -218,10 +219,13 @@ class Client:
         """The calibration in use.
 
         Raises:
-            BusError: nobody has one.
+            BusError: nobody has one, or what was answered is none.
         """
         sample = self._get(CALIBRATION.key, b"", ANSWER_S)
-        return decode_calibration(wire.Calibration.FromString(sample.payload))
+        try:
+            return decode_calibration(wire.Calibration.FromString(sample.payload))
+        except (DecodeError, ValueError) as fault:
+            raise BusError(f"{sample.key} was answered with what is no calibration: {fault}") from None
 
     def frames(self, count: int | None = None, patience_s: float = SILENT_S) -> Stream[Frame]:
         """Sensor images from now on, `count` of them or without end.
@@ -317,7 +321,10 @@ _COMMANDS = {Role.CONTROLLER: "controller", Role.RECORDER: "record"}
 
 
 def _answer(name: str, sample: Sample) -> Answer:
-    message = wire.Request.FromString(sample.payload)
+    try:
+        message = wire.Request.FromString(sample.payload)
+    except DecodeError as fault:
+        raise BusError(f"{name} was answered with what is no lowfc.v1.Request: {fault}") from None
     if not message.accepted:
         raise RequestRefusedError(f"{name} refused: {message.reply}")
     state = message.state if message.HasField("state") else None
