@@ -8,7 +8,7 @@ from pathlib import Path
 from make_hardware import marks, sentence
 
 from lowfc.client import stream
-from lowfc.client.client import MOST_BYTES
+from lowfc.contract.codec import MOST_BYTES
 from lowfc.contract.configuration import Acceptance, keys
 from lowfc.control import linearity, transfer_function
 from lowfc.control.state import FADING_FRAMES, SETTLING_FRAMES

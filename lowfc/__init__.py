@@ -1,3 +1,3 @@
 """lowfc: a real-time low-order wavefront control daemon for coronagraphs."""
 
-__version__ = "0.1.0"
+__version__ = "0.2.0.dev0"

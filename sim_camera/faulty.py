@@ -8,7 +8,7 @@ import numpy as np
 import numpy.typing as npt
 
 from lowfc.adapters.bus import Publisher
-from lowfc.adapters.envelope import Envelope, sequence_of, start_of
+from lowfc.contract.envelope import Envelope, sequence_of, start_of
 from lowfc.contract.errors import ConfigurationError
 from lowfc.contract.messages import image
 from sim_camera.faults import MOST_FRAMES_LATE, Fault, Frame, Kind, cut, payload, pixels, sent, starts_before

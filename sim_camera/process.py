@@ -108,6 +108,7 @@ class CameraProcess:
         self._lateness = Lateness()
         self._frame_to_mirror = Durations()
         self._figures = Figures(config.noll, tilt_nm_per_mas(config.star.diameter_m))
+        self._publish_settings(service.clock.now_ns())
         service.state = "ready"
 
     def run(self, wait_for: tuple[str, ...]) -> None:

@@ -13,6 +13,7 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
+from lowfc.control.additions import LONGEST_NAME, MOST_CHANNELS
 from lowfc.control.safety import Limits, Reason, expired, limit
 
 Single = npt.NDArray[np.float32]
@@ -21,6 +22,8 @@ _NONE: Single = np.zeros(0, np.float32)
 
 LONGEST_VALID_NS = 2_000_000_000
 """However long a command says that it is valid, the mirror does not hold it longer."""
+AHEAD_NS = 1_000_000_000
+"""By which a frame's time may be ahead of the mirror's clock and still say when the surface was where it was."""
 
 
 @dataclass(frozen=True)
@@ -58,7 +61,14 @@ class Device:
 
 @dataclass(frozen=True, slots=True)
 class Told:
-    """A command as it came: actuators (rows, columns) float32, nm of surface, or None where the bytes made no grid."""
+    """A command as it came.
+
+    Attributes:
+        actuators_nm: (rows, columns) float32, nm of surface, or None where the bytes made no grid.
+        safe: it was sent in safe mode.
+        clear_id: identity of the operator's last clear; a new one makes the mirror forget the newest sequence.
+        ahead: its sequence starts further ahead of the mirror's clock than allowed (a clock's verdict).
+    """
 
     channel: str
     frame_sequence: int
@@ -66,6 +76,9 @@ class Told:
     valid_for_ns: int
     actuators_nm: Single | None
     command_nm: Single
+    safe: bool = False
+    clear_id: int = 0
+    ahead: bool = False
 
 
 class Status(NamedTuple):
@@ -82,6 +95,8 @@ class Status(NamedTuple):
         received_ns: when the last command came, by the mirror's clock.
         valid_for_ns: how long it may be held.
         following: whether there is a command in force.
+        safe: channels whose last command was sent in safe mode.
+        clear_id: of the newest clear that a command told of.
     """
 
     driven_nm: Single
@@ -95,6 +110,8 @@ class Status(NamedTuple):
     received_ns: int = 0
     valid_for_ns: int = 0
     following: bool = False
+    safe: frozenset[str] = frozenset()
+    clear_id: int = 0
 
 
 def initial(device: Device) -> Status:
@@ -131,6 +148,8 @@ def obey(device: Device, status: Status, told: Told, now_ns: int) -> tuple[Statu
         received_ns=now_ns,
         valid_for_ns=min(told.valid_for_ns, LONGEST_VALID_NS),
         following=True,
+        safe=status.safe | {told.channel} if told.safe else status.safe - {told.channel},
+        clear_id=told.clear_id or status.clear_id,
     )
     return followed, None
 
@@ -138,12 +157,13 @@ def obey(device: Device, status: Status, told: Told, now_ns: int) -> tuple[Statu
 def tick(device: Device, status: Status, now_ns: int) -> Status:
     """Without a command: settle, and act on one that has expired."""
     if status.following and expired(now_ns - status.received_ns, status.valid_for_ns):
-        status = status._replace(following=False)
+        status = status._replace(following=False, channels={})
     if not status.following and device.flatten and status.driven_nm.any():
         flat = limit(device.tighter, status.driven_nm, np.zeros(device.grid, np.float32)).actuators_nm
         status = status._replace(driven_nm=flat, limits_hit=(), command_nm=_NONE, channels={})
-    time_ns = max(now_ns, status.time_ns)
-    elapsed_ns = time_ns - status.time_ns if status.time_ns else np.inf
+    known = status.time_ns and status.time_ns - now_ns < AHEAD_NS
+    time_ns = max(now_ns, status.time_ns) if known else now_ns
+    elapsed_ns = time_ns - status.time_ns if known else np.inf
     surface_nm = _settled(device, status.driven_nm, status.surface_nm, elapsed_ns)
     return status._replace(surface_nm=surface_nm, time_ns=time_ns)
 
@@ -153,8 +173,14 @@ def _refusal(device: Device, status: Status, told: Told) -> Reason | None:
         return Reason.WRONG_GRID
     if not (np.isfinite(told.actuators_nm).all() and np.isfinite(told.command_nm).all()):
         return Reason.NOT_FINITE
-    if told.frame_sequence < status.frame_sequence:
+    if told.ahead:
+        return Reason.AHEAD
+    cleared = told.clear_id and told.clear_id != status.clear_id
+    if told.frame_sequence < status.frame_sequence and not cleared:
         return Reason.OUT_OF_ORDER
+    full = len(status.channels) >= MOST_CHANNELS and told.channel not in status.channels
+    if full or len(told.channel) > LONGEST_NAME:
+        return Reason.CHANNEL
     return None
 
 

@@ -11,9 +11,20 @@ from lowfc.adapters.clock import SimulatedClock
 from lowfc.adapters.instrument import mirror_limits, true_mirror
 from lowfc.adapters.mailbox import Mailbox
 from lowfc.adapters.service import Service
+from lowfc.adapters.start_check import StartCheck
 from lowfc.contract.codec import actuators
 from lowfc.contract.configuration import Configuration
-from lowfc.contract.messages import COMMAND, MIRROR_STATE, SURFACE, from_timestamp, image, timestamp, wire
+from lowfc.contract.errors import BadMessageError
+from lowfc.contract.messages import (
+    COMMAND,
+    MIRROR_STATE,
+    SURFACE,
+    checked_sequence,
+    checked_time_ns,
+    image,
+    timestamp,
+    wire,
+)
 from lowfc.control.safety import Reason
 from lowfc.optics.grid import pupil_axis
 from lowfc.optics.mirror import influence_factors
@@ -65,6 +76,12 @@ class MirrorProcess:
         self._picture_due_ns = 0
         self._state_due_ns = 0
         self._refused: Reason | None = None
+        self._start_check = StartCheck(
+            service.clock,
+            config.control.max_start_ahead_h,
+            lambda start, here: service.event("START_AHEAD", what="commands", start=start, here=here),
+        )
+        service.fill = self._fill
         self._leave = service.handover(COMMAND, self._arrived, name, period_ns=config.period_ns)
         service.state = "ready"
 
@@ -89,19 +106,19 @@ class MirrorProcess:
     def _follow(self, sample: Sample) -> None:
         clock = self._service.clock
         try:
-            told = _told(sample.payload)
-        except DecodeError as error:
+            told = _told(sample.payload, self._start_check)
+        except (DecodeError, BadMessageError) as error:
             self._service.unreadable(sample.key, error)
             return
         if isinstance(clock, SimulatedClock):
             clock.set_ns(told.time_ns)
-        before = self._status
-        self._status, refused = obey(self._device, before, told, clock.now_ns())
-        self._publish(told.time_ns)
+        before, refused_before = self._status, self._refused
+        self._status, self._refused = obey(self._device, before, told, clock.now_ns())
+        refused = self._refused
+        self._publish(self._status.time_ns or clock.now_ns())
         self._service.work += 1
-        if refused is not None and refused is not self._refused:
+        if refused is not None and refused is not refused_before:
             self._service.event("COMMAND_REFUSED", reason=refused.name)
-        self._refused = refused
         if refused is None:
             self._obeyed_ns = clock.host_ns()
         if not before.following and before.frame_sequence and refused is None:
@@ -130,29 +147,42 @@ class MirrorProcess:
         state = wire.MirrorState(
             timestamp=timestamp(time_ns),
             frame_sequence=status.frame_sequence,
-            status=following if status.frame_sequence else wire.MIRROR_STATUS_WAITING,
+            status=following if status.received_ns else wire.MIRROR_STATUS_WAITING,
             rows=self._device.grid[0],
             columns=self._device.grid[1],
             actuators=status.surface_nm.tobytes(),
             command_nm=status.command_nm.tolist(),
             limits_hit=[reason.value for reason in status.limits_hit],  # type: ignore[misc]  # numbered alike
             channels=sorted(status.channels),
+            safe=bool(status.safe),
+            refused=self._refused.value if self._refused is not None else 0,  # type: ignore[arg-type]  # numbered alike
         )
         self._states.put(state.SerializeToString())
         self._state_due_ns = self._service.clock.now_ns() + IDLE_STATE_NS
-        if time_ns >= self._picture_due_ns:
+        now_ns = self._service.clock.now_ns()  # not by a command's time: that may be anything
+        if now_ns >= self._picture_due_ns:
             picture = np.asarray(self._y_factors @ status.surface_nm @ self._x_factors.T, np.float32)
             self._surfaces.put(image(picture, time_ns, "mirror").SerializeToString())
-            self._picture_due_ns = time_ns + int(1e9 / float(SURFACE.rate))
+            self._picture_due_ns = now_ns + int(1e9 / float(SURFACE.rate))
+
+    def _fill(self, health: wire.Health) -> None:
+        """Add to each Health what an operator's `status` says of the mirror."""
+        status = self._status
+        health.command_refused = self._refused.value if self._refused is not None else 0  # type: ignore[assignment]
+        health.command_expired = bool(status.received_ns) and not status.following
+        health.limits_hit.extend(reason.value for reason in status.limits_hit)  # type: ignore[misc]
 
 
-def _told(payload: bytes) -> Told:
+def _told(payload: bytes, start_check: StartCheck | None = None) -> Told:
     message = wire.MirrorCommand.FromString(payload)
     return Told(
         message.channel,
-        message.frame_sequence,
-        from_timestamp(message.timestamp),
+        checked_sequence(message.frame_sequence),
+        checked_time_ns(message.timestamp),
         message.valid_for_ns,
         actuators(message),
         np.fromiter(message.command_nm, np.float32, len(message.command_nm)),
+        message.safe,
+        message.clear_id,
+        start_check is not None and start_check.ahead(message.frame_sequence),
     )

@@ -14,6 +14,7 @@ def _private_runtime(tmp_path_factory: pytest.TempPathFactory) -> None:
     path = tmp_path_factory.mktemp("runtime")
     path.chmod(0o700)
     os.environ["XDG_RUNTIME_DIR"] = str(path)
+    os.environ["XDG_STATE_HOME"] = str(path / "state")  # where latches of safe mode are kept
 
 
 @pytest.fixture(scope="session", autouse=True)

@@ -12,7 +12,6 @@ import numpy.typing as npt
 from lowfc.adapters import instrument
 from lowfc.adapters.bus import Publisher
 from lowfc.adapters.clock import HostClock
-from lowfc.adapters.memory_bus import MemoryBus, MemoryHub, MemoryRing
 from lowfc.client import Frame as Image
 from lowfc.client import MirrorWatch
 from lowfc.contract.configuration import Configuration
@@ -21,10 +20,13 @@ from lowfc.contract.messages import MIRROR_STATE, Topic, wire
 from lowfc.contract.state_codec import controller_state
 from lowfc.control.additions import MIRROR
 from lowfc.control.calibration import Calibration
+from lowfc.control.camera import CameraSettings
 from lowfc.control.inputs import Frame, Load, Request, Step
+from lowfc.control.linear_law import LinearLaw
 from lowfc.control.loop import advance
 from lowfc.control.stability import delay_weights
 from lowfc.control.state import State
+from lowfc.testing.memory_bus import MemoryBus, MemoryHub, MemoryRing
 from sim_camera.process import bench
 from sim_dm.device import Told, initial, obey
 from sim_dm.process import device
@@ -178,6 +180,16 @@ class FoldedLoop:
     def configuration(self) -> str:
         """See `Client.configuration`."""
         return self.config.to_toml()
+
+    def camera(self) -> CameraSettings | None:
+        """See `Client.camera`."""
+        return self._state.conditions.camera
+
+    def laws(self) -> dict[str, LinearLaw]:
+        """See `Client.laws`."""
+        assert self._state.drive is not None
+        following = self._state.drive.following
+        return {} if following is None else {following.law.id: following.law}
 
     def frames(self, count: int | None = None) -> Iterator[Image]:
         """See `Client.frames`."""

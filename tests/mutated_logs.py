@@ -9,9 +9,9 @@ import numpy as np
 from mcap.writer import MCAP0_MAGIC as MAGIC
 
 from lowfc.adapters.bus import Sample
-from lowfc.adapters.envelope import sequence_of
 from lowfc.adapters.log_reader import Logged
 from lowfc.adapters.log_writer import Attachment, LogWriter
+from lowfc.contract.envelope import sequence_of
 from lowfc.contract.messages import EVENT, FRAME, HEALTH, STEP, SURFACE, image, timestamp, wire
 
 START_S = 1_767_225_600

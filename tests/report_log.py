@@ -9,11 +9,11 @@ import numpy.typing as npt
 from toy import FLUX_DN, NOLL, PERIOD_NS, SHAPE, START, TOY, calibration, settings
 
 from lowfc.adapters.bus import Sample
-from lowfc.adapters.envelope import sequence_of
 from lowfc.adapters.log_writer import Attachment, LogWriter
 from lowfc.contract import codec
 from lowfc.contract.calibration_codec import encode_calibration, identified
 from lowfc.contract.configuration import Configuration
+from lowfc.contract.envelope import sequence_of
 from lowfc.contract.events import EVENTS
 from lowfc.contract.messages import (
     CALIBRATION,

@@ -11,9 +11,9 @@ import pytest
 import typer
 from typer.testing import CliRunner
 
-from lowfc.adapters.envelope import sequence_of
 from lowfc.adapters.terminal import INTERRUPTED
 from lowfc.contract.configuration import load
+from lowfc.contract.envelope import sequence_of
 from lowfc.contract.errors import ConfigurationError, LowfcError
 from lowfc.contract.events import EVENTS, Level
 from lowfc.contract.messages import FRAME, STEP, wire

@@ -15,9 +15,7 @@ from toy import NOLL, calibration
 
 from lowfc.adapters.bus import Query, Sample
 from lowfc.adapters.clock import HostClock
-from lowfc.adapters.envelope import sequence_of
 from lowfc.adapters.log_reader import LogReader
-from lowfc.adapters.memory_bus import MemoryBus, MemoryHub, MemoryRing
 from lowfc.adapters.mirror_maps import read_shape
 from lowfc.adapters.run import open_run
 from lowfc.client import Client, Stream, client, configuration_of, running, the_run
@@ -25,6 +23,7 @@ from lowfc.client.stream import WAITING, frame_of, step_of
 from lowfc.contract import codec
 from lowfc.contract.calibration_codec import encode_calibration, identified
 from lowfc.contract.configuration import Configuration
+from lowfc.contract.envelope import sequence_of
 from lowfc.contract.errors import BusError, ConfigurationError, DataFileError, RequestRefusedError
 from lowfc.contract.events import EVENTS
 from lowfc.contract.messages import (
@@ -48,6 +47,7 @@ from lowfc.programs.ctl.command import SIMPLE, ctl_app
 from lowfc.programs.ctl.requests import ASKED, table
 from lowfc.programs.ctl.status import figures, text
 from lowfc.programs.modes import noll_of
+from lowfc.testing.memory_bus import MemoryBus, MemoryHub, MemoryRing
 
 DOCUMENT = Path(__file__).parents[1] / "docs" / "operating.md"
 KNOWN = identified(calibration())
@@ -172,7 +172,7 @@ def test_a_refusal_is_an_error_with_the_controllers_sentence(controller: FakeCon
         (lambda loop: loop.play(np.stack([SHAPE]), [[1, 2]]), r"got arrays of shape \(1, 20\) and \(1, 2\)"),
         (lambda loop: loop.play(SHAPE, [1, 2, 3, 4]), r"\(4, 5\) and \(4,\)"),
         (lambda loop: loop.play_offset([1, 2, 3]), r"takes a table \(frames, modes\)"),
-        (lambda loop: loop.play_offset(np.zeros((3_000_000, 3))), "at most 16 MB, this one 36.0 MB"),
+        (lambda loop: loop.play_offset(np.zeros((3_000_000, 3))), "may have 16,000,000 bytes and has 36,000,0"),
     ],
 )
 def test_what_cannot_be_asked_is_refused_here(
@@ -232,6 +232,10 @@ def test_a_run_is_found_by_who_is_there(tmp_path: Path, monkeypatch: pytest.Monk
             held.enter_context(server)
         assert running() == ["whole"]
         assert (the_run(None), the_run("left")) == ("whole", "left"), "the only one with a controller"
+        (open_run("damaged").path / "links.json").write_text("")
+        assert (the_run(None), the_run("left")) == ("whole", "left"), "a damaged one hides no other"
+        with pytest.raises(DataFileError, match=r"links\.json"):
+            the_run("damaged")
         for server in listening("another", "controller"):
             held.enter_context(server)
         with pytest.raises(BusError, match=r"say which run with --run: there are another, left, whole$"):

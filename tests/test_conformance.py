@@ -21,12 +21,11 @@ from loops import until
 from rich.console import Console
 from typer.testing import CliRunner
 
-from lowfc.adapters.clock import FakeClock
-from lowfc.adapters.envelope import Envelope, sequence_of
 from lowfc.adapters.instrument import camera_state
 from lowfc.adapters.run import open_run
 from lowfc.adapters.zenoh_bus import session_config
 from lowfc.contract.configuration import Configuration, Network, load
+from lowfc.contract.envelope import Envelope, sequence_of
 from lowfc.contract.errors import BusError, ConfigurationError
 from lowfc.contract.messages import (
     CAMERA_STATE,
@@ -48,6 +47,7 @@ from lowfc.programs.conformance.command import conformance_app, figures, report
 from lowfc.programs.conformance.dialogue import Dialogue, expected_of
 from lowfc.programs.conformance.line import ZenohLine
 from lowfc.programs.conformance.mirror import mirror_checks
+from lowfc.testing.clock import FakeClock
 from sim_dm.device import Status, Told, initial, obey, tick
 from sim_dm.process import _told, device
 
@@ -427,7 +427,7 @@ MIRRORS: dict[str, tuple[dict[str, Any], dict[str, str]]] = {
     ),
     "any grid": ({"told": careless("grid")}, {"wrong grid refused": WRONG} | UNTRIED),
     "any length": ({"told": careless("bytes")}, {"short command refused": WRONG} | UNTRIED),
-    "any order": ({"told": careless("order")}, {"old command refused": WRONG} | UNTRIED),
+    "any order": ({"told": careless("order")}, {"old command refused": WRONG, "clear": WARNING} | UNTRIED),
     "no dead-man": (
         {"tick": lambda one: lambda device, status, now_ns: status},
         {"dead-man": WRONG, "longest command": WARNING} | UNTRIED,

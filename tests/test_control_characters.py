@@ -12,8 +12,6 @@ from rich.console import Console
 from tape import Tape
 from typer.testing import CliRunner
 
-from lowfc.adapters.clock import FakeClock
-from lowfc.adapters.memory_bus import MemoryBus, MemoryHub
 from lowfc.adapters.service import Service
 from lowfc.adapters.terminal import new_app, run_app
 from lowfc.contract.configuration import Configuration, load
@@ -28,6 +26,8 @@ from lowfc.programs.view.loop import LOG
 from lowfc.programs.view.painter import Painter
 from lowfc.programs.view.recorded import draw_logs
 from lowfc.programs.watch import Watch
+from lowfc.testing.clock import FakeClock
+from lowfc.testing.memory_bus import MemoryBus, MemoryHub
 
 HOSTILE = "clouds\x1b[2J\x07 \x9b31mred \u202egnorts \u2028 caf\u00e9 5\u2009nm\r\nerror: fine"
 SHOWN = r"clouds\x1b[2J\x07 \x9b31mred \u202egnorts \u2028 café 5" + "\u2009" + r"nm\r\nerror: fine"

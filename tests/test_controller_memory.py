@@ -15,11 +15,12 @@ import pytest
 from lowfc.adapters import instrument
 from lowfc.adapters.bus import Sample
 from lowfc.adapters.clock import HostClock, SimulatedClock
-from lowfc.adapters.memory_bus import MemoryBus, MemoryHub
+from lowfc.adapters.latch import Latch
 from lowfc.adapters.service import Service
 from lowfc.contract.codec import actuators
 from lowfc.contract.configuration import Configuration, load
 from lowfc.contract.errors import CalibrationError
+from lowfc.contract.law_codec import wire_law
 from lowfc.contract.messages import (
     CALIBRATION,
     CAMERA_STATE,
@@ -27,7 +28,9 @@ from lowfc.contract.messages import (
     CONTROLLER_STATE,
     EVENT,
     FRAME,
+    LAW,
     MIRROR_STATE,
+    PLAY,
     REQUEST,
     STEP,
     TIMING,
@@ -37,10 +40,13 @@ from lowfc.contract.messages import (
     timestamp,
     wire,
 )
+from lowfc.contract.published import Published
 from lowfc.control.calibration import Calibration, noise_nm
+from lowfc.control.linear_law import integrator
 from lowfc.control.safety import LoopMode
 from lowfc.programs import rehearsal
 from lowfc.programs.controller import Controller
+from lowfc.testing.memory_bus import MemoryBus, MemoryHub
 from sim_camera.bench import Bench, Truth
 from sim_camera.process import bench
 from sim_dm.process import MirrorProcess
@@ -75,8 +81,10 @@ class Rig:
         self.frames, self.settings = camera.publisher(FRAME), camera.publisher(CAMERA_STATE)
         self.services = [Service(role, "test", self.clock(), self.bus(role)) for role in ("controller", "mirror-dm")]
         self.mirror = MirrorProcess(config, self.services[1])
-        self.latch = Path(tempfile.mkdtemp()) / "safed"
-        self.controller = Controller(config, self.services[0], calibration, "a test", self.latch)
+        state = instrument.camera_state(config, scene.shape, START_NS)
+        self.settings.put(state.SerializeToString())
+        self.latch = Path(tempfile.mkdtemp()) / "safe"
+        self.controller = Controller(config, self.services[0], calibration, "a test", Latch([self.latch]))
         self.threads = [threading.Thread(target=one.run) for one in (self.mirror, self.controller)]
         for thread in self.threads:
             thread.start()
@@ -108,6 +116,12 @@ class Rig:
         key = MIRROR_STATE.key
         self.until("the mirror's answer", lambda: key in self.said and self.said[key][-1].frame_sequence == sequence)
         return sequence
+
+    def until_file(self, path: Path, *, there: bool) -> None:
+        deadline_s = time.monotonic() + PATIENCE_S
+        while path.exists() is not there:
+            assert time.monotonic() < deadline_s, path
+            time.sleep(0.005)
 
     def expose(self, count: int) -> list[Truth]:
         """Frames of the scene through the mirror as it is, plus the offset."""
@@ -267,10 +281,10 @@ def test_safe_flattens_the_mirror_and_stays(rig: Rig) -> None:
     rig.expose(5)
     assert not actuators(rig.said[MIRROR_STATE.key][-1]).any()
     assert rig.steps(1)[0].mode == wire.LOOP_MODE_SAFED
-    assert rig.latch.exists()
+    rig.until_file(rig.latch, there=True)
     assert rig.ask("clear").accepted
     rig.expose(1)
-    assert not rig.latch.exists()
+    rig.until_file(rig.latch, there=False)
     assert rig.steps(1)[0].mode == wire.LOOP_MODE_OPEN
     assert {"SAFED", "MODE_CHANGED"} <= set(rig.events())
 
@@ -337,15 +351,76 @@ def test_a_camera_with_a_wrong_clock_is_late_and_does_not_stop_the_controller(
     assert max(rig.said[TIMING.key][0].transport_ns) == 2**32 - 1
 
 
+def test_a_latch_that_cannot_be_written_starts_open(rig: Rig, tmp_path: Path) -> None:
+    (tmp_path / "file").touch()
+    service = Service("controller", "test", rig.clock(), MemoryBus(MemoryHub(), "controller", rig.clock()))
+    health, said = wire.Health(), []
+    latch = Latch([tmp_path / "file" / "safe"], said.append)
+    Controller(configured(control__start_mode="closed"), service, rig.calibration, "a test", latch).fill(health)
+    assert (LoopMode(health.mode), len(said)) == (LoopMode.OPEN, 1)
+
+
+def test_a_signal_makes_the_loop_safe(rig: Rig) -> None:
+    rig.ask("close")
+    rig.expose(1)
+    rig.controller.safe_by_signal()
+    rig.until("SAFED", lambda: "SAFED" in rig.events())
+    rig.until("the request in the log", lambda: rig.said[REQUEST.key][-1].text == "SIGUSR1")
+    assert (rig.said[REQUEST.key][-1].name, rig.said[REQUEST.key][-1].accepted) == ("safe", True)
+    rig.expose(3)
+    assert not actuators(rig.said[MIRROR_STATE.key][-1]).any()
+    assert rig.said[COMMAND.key][-1].safe
+    assert rig.said[MIRROR_STATE.key][-1].safe
+    rig.until_file(rig.latch, there=True)
+
+
+def test_requests_have_sizes(rig: Rig) -> None:
+    """They are refused before they are decoded, and with a short sentence."""
+    for name in ("step", "gain", "note", "channel", "dance"):
+        values = wire.Request(modes=range(200_000), values=[1.0] * 200_000, text="x" * 100).SerializeToString()
+        (answer,) = rig.operator.get(f"lowfc/request/{name}", values, PATIENCE_S)
+        reply = wire.Request.FromString(answer.payload)
+        assert not reply.accepted
+        assert "holds at most" in reply.reply
+        assert len(answer.payload) < 2000
+    (answer,) = rig.operator.get("lowfc/request/" + "x" * 5000, b"", PATIENCE_S)
+    assert len(wire.Request.FromString(answer.payload).reply) <= 1000
+
+
+def test_states_carry_the_identity_of_a_law_and_of_a_play(rig: Rig) -> None:
+    """Their arrays are published once, by themselves, and can be asked for."""
+    rig.expose(1)
+    settings_of = instrument.settings(rig.config)
+    noll = rig.calibration.noll
+    law = integrator(settings_of.law(noll), noll, settings_of.delay_frames, rig.config.camera.rate_hz)
+    table = np.zeros((50_000, 14), np.float32)
+    play = wire.Request(text="offset", table=table.tobytes(), columns=14)
+    for name, request in (("law", wire.Request(law=wire_law(law))), ("play", play)):
+        (answer,) = rig.operator.get(f"lowfc/request/{name}", request.SerializeToString(), PATIENCE_S)
+        assert wire.Request.FromString(answer.payload).accepted
+    (answer,) = rig.operator.get(CONTROLLER_STATE.key)
+    state = wire.ControllerState.FromString(answer.payload)
+    assert (state.law.id, state.law.follow, state.play.table, state.play.frames) == (law.id, b"", b"", 50_000)
+    assert len(answer.payload) < 20_000
+    logged = rig.said[REQUEST.key][-1]
+    assert (logged.play_id, logged.table) == (state.play.id, b"")
+    published = Published()
+    for topic in (LAW, PLAY):
+        (answer,) = rig.bus("recorder").get(topic.key)
+        published.take(topic, answer.payload)
+    assert list(published.laws) == [law.id]
+    assert published.plays[state.play.id].rows.shape == (50_000, 14)
+
+
 def test_safed_outlives_the_controller(rig: Rig, tmp_path: Path) -> None:
     """The latch is a file of the run: only an operator's clear removes it."""
-    latch = tmp_path / "safed"
+    latch = tmp_path / "safe"
     closed = configured(control__start_mode="closed")
 
     def mode() -> LoopMode:
         service = Service("controller", "test", rig.clock(), MemoryBus(MemoryHub(), "controller", rig.clock()))
         health = wire.Health()
-        Controller(closed, service, rig.calibration, "a test", latch).fill(health)
+        Controller(closed, service, rig.calibration, "a test", Latch([latch])).fill(health)
         return LoopMode(health.mode)
 
     assert mode() is LoopMode.CLOSED
@@ -359,7 +434,7 @@ def test_another_mirror_than_the_calibrations_is_refused(rig: Rig, tmp_path: Pat
     live = configured(lockstep=False)
     hub = MemoryHub()
     service = Service("controller", "test", HostClock(), MemoryBus(hub, "controller", HostClock()))
-    controller = Controller(live, service, rig.calibration, "a test", tmp_path / "safed")
+    controller = Controller(live, service, rig.calibration, "a test", Latch([tmp_path / "safe"]))
     small = wire.MirrorState(rows=20, columns=20, actuators=np.zeros(400, np.float32).tobytes())
     MemoryBus(hub, "mirror-dm", HostClock()).publisher(MIRROR_STATE, "dm").put(small.SerializeToString())
     with pytest.raises(CalibrationError, match="20, 20"):
@@ -401,7 +476,7 @@ def test_a_frame_that_cannot_be_dealt_with_ends_the_controller(
     monkeypatch.setattr("lowfc.programs.controller.MIRROR_PATIENCE_S", 0.01)
     hub = MemoryHub()
     service = Service("controller", "test", HostClock(), MemoryBus(hub, "controller", HostClock()))
-    controller = Controller(configured(lockstep=False), service, rig.calibration, "a test", tmp_path / "safed")
+    controller = Controller(configured(lockstep=False), service, rig.calibration, "a test", Latch([tmp_path / "safe"]))
 
     def broken(*_: object) -> None:
         raise ArithmeticError("one and one is three")
@@ -429,8 +504,10 @@ def test_frames_that_waited_are_not_all_integrated(calibration: Calibration, sce
             assert time.monotonic() < deadline_s
             time.sleep(0.01)
         now_ns = HostClock().now_ns()
+        assert rig.settings.last is not None
+        newest = rig.settings.last[1].sequence + 100
         for age in range(9, -1, -1):  # periods; they arrive one upon the other, after the controller stood still
-            handover.put(Sample(FRAME.key, payload, (9 << 32) - age, now_ns - age * config.period_ns, now_ns))
+            handover.put(Sample(FRAME.key, payload, newest - age, now_ns - age * config.period_ns, now_ns))
         steps = rig.said[STEP.key][-10:]
     used = [step for step in steps if not step.reasons]
     assert len(steps) == 10

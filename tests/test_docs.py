@@ -152,6 +152,8 @@ def test_the_processes_by_hand(tmp_path: Path) -> None:
         for words in map(str.split, BY_HAND)
     ]
     try:
+        status = [sys.executable, "-m", "lowfc", "ctl", "status", "--run", "bench"]
+        until(lambda: subprocess.run(status, cwd=tmp_path, capture_output=True, check=False).returncode == 0, 120)
         until(lambda: recorded_bytes(tmp_path) > 4e6)
         session = json.loads(run(tmp_path, SESSION[0]))
         assert session["listen"]["endpoints"][0].startswith("tcp/127.0.0.1:")

@@ -20,7 +20,6 @@ from rich.console import Console
 from typer.testing import CliRunner
 
 from lowfc.adapters.bus import Sample
-from lowfc.adapters.envelope import count_of, sequence_of
 from lowfc.adapters.history import History
 from lowfc.adapters.history_reader import read_history
 from lowfc.adapters.log_reader import LogReader
@@ -28,6 +27,7 @@ from lowfc.adapters.log_writer import Attachment, LogWriter
 from lowfc.adapters.terminal import new_app
 from lowfc.contract.calibration_codec import encode_calibration, identified
 from lowfc.contract.configuration import Configuration
+from lowfc.contract.envelope import count_of, sequence_of
 from lowfc.contract.errors import ConfigurationError, DataFileError
 from lowfc.contract.messages import (
     CALIBRATION,

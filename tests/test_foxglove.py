@@ -23,8 +23,7 @@ from google.protobuf.json_format import MessageToDict
 from google.protobuf.message_factory import GetMessageClass
 
 from lowfc.adapters.bus import ALL
-from lowfc.adapters.clock import FakeClock, HostClock
-from lowfc.adapters.memory_bus import MemoryBus, MemoryHub
+from lowfc.adapters.clock import HostClock
 from lowfc.adapters.run import new_run_id, open_run
 from lowfc.adapters.zenoh_bus import ZenohBus
 from lowfc.contract.errors import BusError, ConfigurationError
@@ -44,6 +43,8 @@ from lowfc.contract.messages import (
     wire,
 )
 from lowfc.programs.view.foxglove_bridge import FoxgloveBridge
+from lowfc.testing.clock import FakeClock
+from lowfc.testing.memory_bus import MemoryBus, MemoryHub
 
 pytest.importorskip("foxglove")
 client_library = pytest.importorskip("websockets.sync.client")

@@ -23,6 +23,7 @@ BELOW = {
     "lowfc.design": ("lowfc.optics", "lowfc.control"),
     "lowfc.contract": ("lowfc.optics", "lowfc.control"),
     "lowfc.adapters": ("lowfc.optics", "lowfc.control", "lowfc.contract"),
+    "lowfc.testing": ("lowfc.optics", "lowfc.control", "lowfc.contract", "lowfc.adapters"),
     "lowfc.client": ("lowfc.control", "lowfc.contract", "lowfc.adapters"),
     "lowfc.programs": (
         *("lowfc.optics", "lowfc.control", "lowfc.design", "lowfc.contract", "lowfc.adapters", "lowfc.client"),
@@ -41,7 +42,19 @@ PURE_MODULES = (
     "sim_camera.figures",
 )
 PURE_IMPORTS = (
-    *("numpy", "scipy", "abc", "collections", "dataclasses", "enum", "functools", "itertools", "math", "operator"),
+    *(
+        "numpy",
+        "scipy",
+        "abc",
+        "collections",
+        "dataclasses",
+        "enum",
+        "functools",
+        "hashlib",
+        "itertools",
+        "math",
+        "operator",
+    ),
     *("types", "typing"),
 )
 # A generator made from a seed is a value; everything else in numpy.random is state that all share.

@@ -9,10 +9,10 @@ from click.testing import Result
 from typer.testing import CliRunner
 
 from lowfc.adapters.bus import Sample
-from lowfc.adapters.envelope import sequence_of
 from lowfc.adapters.log_recovery import recover
 from lowfc.adapters.log_writer import Attachment, LogWriter
 from lowfc.adapters.terminal import new_app
+from lowfc.contract.envelope import sequence_of
 from lowfc.contract.errors import ConfigurationError, DataFileError
 from lowfc.contract.events import EVENTS
 from lowfc.contract.messages import CALIBRATION, CONTROLLER_STATE, EVENT, FRAME, HEALTH, STEP, Message, wire

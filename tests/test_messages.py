@@ -37,7 +37,7 @@ from lowfc.control.safety import LoopMode, Reason
 ROOT = Path(__file__).parent.parent
 WIRE = ROOT / "lowfc" / "contract" / "wire"
 GOLDEN = Path(__file__).parent / "golden" / "lowfc_v1.txt"
-UNITS = ("_nm", "_ns", "_hz", "_e", "_dn", "_mas", "_bytes", "_e_per_dn", "_frames")
+UNITS = ("_s", "_nm", "_ns", "_hz", "_e", "_dn", "_mas", "_bytes", "_e_per_dn", "_frames")
 # Numbers that are counts, indices, identities, ratios or free values: they have no unit to say.
 WITHOUT_UNIT = {
     *("frame_sequence", "last_sequence", "count", "published", "received", "skipped", "missing", "messages", "lost"),
@@ -49,6 +49,7 @@ WITHOUT_UNIT = {
         "law_state",
         "law_frames",
         "steps_left",
+        "clear_id",
         "frames",
         "taken",
         "refused_count",

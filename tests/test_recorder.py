@@ -13,17 +13,17 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from lowfc import __version__
 from lowfc.adapters.bus import Publisher, Sample
 from lowfc.adapters.clock import HostClock
-from lowfc.adapters.envelope import Envelope, count_of, sequence_of
 from lowfc.adapters.ledger import Ledger
 from lowfc.adapters.log_reader import Logged, LogReader
 from lowfc.adapters.log_series import Limits
 from lowfc.adapters.log_writer import UNFINISHED
-from lowfc.adapters.memory_bus import MemoryBus, MemoryHub
 from lowfc.adapters.run import Run, new_run_id, open_run
 from lowfc.adapters.service import Service
 from lowfc.adapters.zenoh_bus import ZenohBus
+from lowfc.contract.envelope import Envelope, count_of, sequence_of
 from lowfc.contract.errors import DataFileError
 from lowfc.contract.messages import (
     CALIBRATION,
@@ -39,6 +39,7 @@ from lowfc.contract.messages import (
 )
 from lowfc.programs.recording.recorder import Recorder
 from lowfc.programs.recording.summary import Summary
+from lowfc.testing.memory_bus import MemoryBus, MemoryHub
 
 PATIENCE_S = 20.0
 
@@ -410,7 +411,7 @@ def test_a_recorder_process_loses_nothing_from_the_first_frame_on(
     assert reader.attachments == {"lowfc.toml": b"[loop]\n"}
     described = reader.metadata["lowfc"]
     assert abs(float(described["clock_ahead_ms"])) < 1000
-    assert (described["seed"], described["lowfc"]) == ("7", "0.1.0")
+    assert (described["seed"], described["lowfc"]) == ("7", __version__)
     assert all(described[key] for key in ("host", "kernel", "processor", "python", "numpy", "eclipse-zenoh", "run"))
 
 

@@ -16,17 +16,17 @@ from test_recorder import PATIENCE_S, Bench, bodies_of, logged, put, until
 from lowfc.adapters import log_writer
 from lowfc.adapters.backlog import Backlog
 from lowfc.adapters.bus import Publisher, Sample
-from lowfc.adapters.clock import FakeClock
-from lowfc.adapters.envelope import Envelope, count_of, sequence_of
 from lowfc.adapters.log_reader import LogReader
 from lowfc.adapters.log_series import Limits
 from lowfc.adapters.log_writer import UNFINISHED, Attachment
-from lowfc.adapters.memory_bus import MemoryBus, MemoryHub
 from lowfc.adapters.names import MOST_NAMES
+from lowfc.contract.envelope import Envelope, count_of, sequence_of
 from lowfc.contract.messages import CALIBRATION, COMMAND, EVENT, FRAME, HEALTH, RECORD_KEY, STEP, Topic, wire
 from lowfc.programs.recording import recorder as recorder_module
 from lowfc.programs.recording.recorder import Recorder
 from lowfc.programs.recording.summary import Summary
+from lowfc.testing.clock import FakeClock
+from lowfc.testing.memory_bus import MemoryBus, MemoryHub
 
 
 @pytest.fixture

@@ -17,7 +17,6 @@ from test_recorder import PATIENCE_S, bodies_of, until
 from typer.testing import CliRunner
 
 from lowfc.adapters.clock import HostClock
-from lowfc.adapters.envelope import count_of
 from lowfc.adapters.log_reader import LogReader
 from lowfc.adapters.log_recovery import recover
 from lowfc.adapters.log_writer import UNFINISHED
@@ -25,6 +24,7 @@ from lowfc.adapters.provenance import provenance
 from lowfc.adapters.run import new_run_id, open_run
 from lowfc.adapters.service import Service
 from lowfc.adapters.zenoh_bus import ZenohBus
+from lowfc.contract.envelope import count_of
 from lowfc.contract.messages import FRAME, STEP
 from lowfc.programs.ctl.command import ctl_app
 

@@ -11,11 +11,12 @@ from hypothesis import settings as effort
 from hypothesis import strategies as st
 from toy import NOLL, frame, settings
 
-from lowfc.adapters.envelope import sequence_of
 from lowfc.adapters.log_reader import Logged
 from lowfc.contract import codec
 from lowfc.contract.calibration_codec import encode_calibration
+from lowfc.contract.envelope import sequence_of
 from lowfc.contract.errors import DataFileError
+from lowfc.contract.law_codec import wire_law, wire_play
 from lowfc.contract.messages import (
     CALIBRATION as CALIBRATION_TOPIC,
 )
@@ -24,6 +25,8 @@ from lowfc.contract.messages import (
     CONTROL_INPUT,
     CONTROLLER_STATE,
     FRAME,
+    LAW,
+    PLAY,
     REQUEST,
     STEP,
     RawImage,
@@ -35,6 +38,7 @@ from lowfc.contract.messages import (
 from lowfc.contract.state_codec import controller_state
 from lowfc.control.inputs import Frame, Input, Load, Request
 from lowfc.control.loop import advance
+from lowfc.control.requests import prepared
 from lowfc.control.state import Settings, State
 from lowfc.programs.replay import lane as replay_lane
 from lowfc.programs.replay.account import Account
@@ -65,6 +69,12 @@ class Night:
         self.now_ns += 1_000_000
         if isinstance(taken, Frame):
             self._frame(taken)
+        if isinstance(taken, Request):
+            taken = prepared(self.what, taken)
+            if taken.law is not None:
+                self._put(LAW, wire_law(taken.law, taken.time_ns).SerializeToString())
+            if taken.played is not None:
+                self._put(PLAY, wire_play(taken.played, taken.time_ns).SerializeToString())
         self.state, outputs = advance(self.what, self.state, taken)
         number = self.state.taken
         if outputs.command is not None:

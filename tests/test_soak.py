@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from lowfc.adapters.bus import Sample
-from lowfc.adapters.envelope import sequence_of
 from lowfc.adapters.log_writer import LogWriter
+from lowfc.contract.envelope import sequence_of
 from lowfc.contract.messages import STEP, TRUTH
 from lowfc.programs.soak.figures import Usage, of_latency, of_process, render, slope, too_short
 from lowfc.programs.soak.run import LogChecker

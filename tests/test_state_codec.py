@@ -107,9 +107,11 @@ def test_a_calibration_survives() -> None:
 def test_only_what_makes_a_difference_is_counted() -> None:
     what = settings()
     state = loaded(what)
-    idle = [Tick(1, 1), CameraSettings(1, CALIBRATION.shape, 100.0, CALIBRATION.saturation_dn)]
-    state, _ = fold(what, state, idle)
-    assert state.taken == 1
+    camera = CameraSettings(1, CALIBRATION.shape, 100.0, CALIBRATION.saturation_dn)
+    state, _ = fold(what, state, [Tick(1, 1), camera])
+    assert state.taken == 2
+    state, _ = fold(what, state, [Tick(1, 1), camera])
+    assert state.taken == 2
     different: list[Input] = [frame(1), Tick(1, 1), Request(1, "open"), frame(2)._replace(pixels=None)]
-    assert fold(what, state, different)[0].taken == 5
+    assert fold(what, state, different)[0].taken == 6
     assert isinstance(different[0], Frame)

@@ -15,15 +15,15 @@ from types import SimpleNamespace
 from typing import Any
 
 import zenoh
-from zenoh.handlers import RingChannel
+from zenoh.handlers import Callback, RingChannel
 
 from lowfc.adapters import join, realtime, zenoh_bus
 from lowfc.adapters.bus import Sample
 from lowfc.adapters.clock import Clock
-from lowfc.adapters.envelope import Envelope
 from lowfc.adapters.run import Links
 from lowfc.adapters.service import Service
 from lowfc.contract.configuration import Configuration
+from lowfc.contract.envelope import Envelope
 from lowfc.contract.messages import COMMAND, Role, Topic
 from lowfc.control.inputs import Outputs
 from lowfc.programs import rehearsal
@@ -303,7 +303,7 @@ def _telemetry_first() -> None:
 def _stay_python() -> None:
     """Keep Python's state of zenoh's threads from one callback to the next; it is made for each otherwise."""
     known = threading.local()
-    plain = zenoh_bus.Callback
+    plain: Any = Callback
 
     def staying(handler: Callable[[Any], None], *drop: Callable[[], None], **how: bool) -> Any:
         def received(message: Any) -> None:

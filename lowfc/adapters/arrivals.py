@@ -1,7 +1,7 @@
 """What came of one publisher's messages: how many arrived, and how many never did."""
 
 from lowfc.adapters.bus import Sample
-from lowfc.adapters.envelope import start_of
+from lowfc.contract.envelope import start_of
 
 
 class Arrivals:

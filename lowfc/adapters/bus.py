@@ -14,7 +14,7 @@ from typing import NamedTuple, Protocol
 from google.protobuf.message import DecodeError
 
 from lowfc.adapters.clock_offset import ClockOffset
-from lowfc.adapters.envelope import Envelope
+from lowfc.contract.envelope import Envelope
 from lowfc.contract.errors import BadMessageError
 from lowfc.contract.messages import HEALTH, Topic
 

@@ -6,8 +6,8 @@ from astropy.io import fits
 
 from lowfc.adapters import fits_file
 from lowfc.adapters.whole_file import write_whole
-from lowfc.contract.identity import identity
 from lowfc.control.calibration import Calibration
+from lowfc.control.camera import CameraSettings
 
 KIND = "lowfc calibration 1"
 
@@ -39,6 +39,14 @@ def to_bytes(calibration: Calibration) -> bytes:
     header["MIRCOLS"] = (calibration.grid[1], "columns of the mirror")
     header["FLUX"] = (calibration.flux_dn, "[adu] expected sum of the good pixels")
     header["SATURATE"] = (calibration.saturation_dn, "[adu] highest value of a pixel")
+    if (camera := calibration.camera) is not None:
+        header["CAMBIAS"] = (camera.bias_dn, "[adu] bias of the camera when this was made")
+        header["CAMFULL"] = (camera.saturation_dn, "[adu] its highest value of a pixel")
+        header["CAMGAIN"] = (camera.gain_e_per_dn, "[e-/adu] its conversion gain")
+        header["CAMEM"] = (camera.em_gain, "its electron-multiplying gain")
+        header["CAMNOISE"] = (camera.read_noise_e, "[e-] its read noise")
+        header["CAMROW"] = (camera.region[0], "first row read")
+        header["CAMCOL"] = (camera.region[1], "first column read")
     arrays = {name: getattr(calibration, attribute) for name, attribute, _, _ in _EXTENSIONS}
     return fits_file.to_bytes(
         primary,
@@ -66,7 +74,7 @@ def load(path: Path) -> Calibration:
         DataFileError: the file is missing, damaged or holds something else.
     """
     calibration = fits_file.load(path, KIND, "calibration file", _read)
-    fits_file.require_identity(path, identity(calibration), calibration.id)
+    fits_file.require_identity(path, calibration.identity(), calibration.id)
     return calibration
 
 
@@ -87,5 +95,19 @@ def _read(units: fits.HDUList) -> Calibration:
         wavelength_nm=float(header["WAVELEN"]),
         operator_hash=str(header["OPERATOR"]),
         id=str(header["CALID"]),
+        camera=_camera(header) if "CAMBIAS" in header else None,
         **arrays,
+    )
+
+
+def _camera(header: fits.Header) -> CameraSettings:
+    return CameraSettings(
+        0,
+        (int(header["ROWS"]), int(header["COLUMNS"])),
+        float(header["CAMBIAS"]),
+        float(header["CAMFULL"]),
+        float(header["CAMGAIN"]),
+        float(header["CAMEM"]),
+        float(header["CAMNOISE"]),
+        (int(header["CAMROW"]), int(header["CAMCOL"])),
     )

@@ -113,35 +113,6 @@ class SimulatedClock:
         self._now_ns = max(self._now_ns, deadline_ns)
 
 
-class FakeClock:
-    """A clock for tests: host and run have the same time, which moves by hand only."""
-
-    offset_ns = 0
-
-    def __init__(self, start_ns: int = SIMULATED_START_NS, *, lockstep: bool = False) -> None:
-        self.lockstep = lockstep
-        self.time_ns = start_ns
-        self.start_s = start_ns // _NS
-
-    def now_ns(self) -> int:
-        """The time it was given."""
-        return self.time_ns
-
-    host_ns = now_ns
-
-    def ahead_ns(self) -> int:
-        """It is its own wall clock."""
-        return 0
-
-    def advance(self, duration_ns: int) -> None:
-        """Let time pass."""
-        self.time_ns += duration_ns
-
-    def sleep_until_ns(self, deadline_ns: int) -> None:
-        """Let time pass up to the deadline."""
-        self.time_ns = max(self.time_ns, deadline_ns)
-
-
 def boot_file(base: Path | None = None) -> Path:
     """File of this boot's offset, in the user's runtime directory where no other is given; it may not be there yet."""
     return (runtime_path() if base is None else base) / f"clock-{_BOOT_ID.read_text().strip()}"

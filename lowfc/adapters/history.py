@@ -4,7 +4,7 @@ Frames are not in it (read them from the log); everything else that is known of 
 """
 
 from collections import Counter
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 import numpy.typing as npt
@@ -12,6 +12,7 @@ import numpy.typing as npt
 from lowfc.adapters.log_reader import LogReader
 from lowfc.contract.configuration import Configuration
 from lowfc.contract.messages import Log, wire
+from lowfc.contract.published import Published
 from lowfc.control.calibration import Calibration
 
 Single = npt.NDArray[np.float32]
@@ -97,12 +98,12 @@ class History:
         events: (log time ns, message).
         health: the last of each process.
         counts: messages by topic key.
+        published: laws and tables that were played, by identity.
         span_ns: log times of the first and the last message; (0, 0) for none.
     """
 
     log: LogReader
     configuration: Configuration | None
-    remarks: list[str]
     calibration: Calibration | None
     controllers: list[wire.ControllerState]
     camera: wire.CameraState | None
@@ -120,6 +121,8 @@ class History:
     health: dict[str, wire.Health]
     counts: Counter[str]
     span_ns: tuple[int, int]
+    published: Published = field(default_factory=Published)
+    remarks: list[str] = field(default_factory=list)
 
     @property
     def controller(self) -> wire.ControllerState | None:

@@ -23,7 +23,9 @@ from lowfc.contract.messages import (
     EVENT,
     FRAME,
     HEALTH,
+    LAW,
     MIRROR_STATE,
+    PLAY,
     REQUEST,
     STEP,
     TIMING,
@@ -32,6 +34,7 @@ from lowfc.contract.messages import (
     topic_of,
     wire,
 )
+from lowfc.contract.published import Published
 from lowfc.contract.recorded_configuration import recorded
 
 Single = npt.NDArray[np.float32]
@@ -83,6 +86,7 @@ class _Gathered:
         self.controllers: list[wire.ControllerState] = []
         self.camera: wire.CameraState | None = None
         self.requests: list[wire.Request] = []
+        self.published = Published()
         self.events: list[tuple[int, Log]] = []
         self.health: dict[str, wire.Health] = {}
         self.counts: Counter[str] = Counter()
@@ -160,6 +164,12 @@ class _Gathered:
     def camera_state(self, message: Logged) -> None:
         self.camera = wire.CameraState.FromString(message.payload)
 
+    def law(self, message: Logged) -> None:
+        self.published.take(LAW, message.payload)
+
+    def play(self, message: Logged) -> None:
+        self.published.take(PLAY, message.payload)
+
     def request(self, message: Logged) -> None:
         self.requests.append(wire.Request.FromString(message.payload))
 
@@ -206,6 +216,7 @@ class _Gathered:
             events=self.events,
             health=self.health,
             counts=self.counts,
+            published=self.published,
             span_ns=self.span_ns,
         )
 
@@ -225,6 +236,8 @@ _TAKE: dict[str, Callable[[_Gathered, Logged], None]] = {
     CAMERA_STATE.key: _Gathered.camera_state,
     CONTROLLER_STATE.key: _Gathered.state,
     REQUEST.key: _Gathered.request,
+    LAW.key: _Gathered.law,
+    PLAY.key: _Gathered.play,
     EVENT.key: _Gathered.event,
     HEALTH.key: _Gathered.health_of,
 }

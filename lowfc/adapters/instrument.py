@@ -12,7 +12,7 @@ import numpy.typing as npt
 from lowfc.adapters.masks import sensor_from
 from lowfc.adapters.mirror_maps import active_actuators
 from lowfc.adapters.twin_store import load_or_build, load_or_fit_mirror
-from lowfc.contract.calibration_codec import identified
+from lowfc.contract.calibration_codec import camera_settings, identified
 from lowfc.contract.configuration import Configuration
 from lowfc.contract.errors import CalibrationError, ConfigurationError
 from lowfc.contract.messages import timestamp, wire
@@ -235,6 +235,7 @@ def analytic_calibration(
             operator_hash=optics.operator_hash,
             id="",
             actuators_to_modes=single(seen),
+            camera=camera_settings(camera_state(config, (shape[0], shape[1]), 0)),
         )
     )
 

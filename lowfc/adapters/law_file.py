@@ -7,7 +7,6 @@ from astropy.io import fits
 
 from lowfc.adapters import fits_file
 from lowfc.adapters.whole_file import write_whole
-from lowfc.contract.identity import identity
 from lowfc.control.linear_law import LinearLaw, Signal
 
 KIND = "lowfc law 1"
@@ -26,7 +25,7 @@ def to_bytes(law: LinearLaw) -> bytes:
     """Law as a FITS file."""
     primary = fits_file.header_of(KIND)
     header = primary.header
-    header["LAWID"] = identity(law)
+    header["LAWID"] = law.id
     header["NAME"] = (law.name, "what kind of law it is")
     header["SIGNAL"] = (law.signal, "y: the error, or pseudo-open-loop modes")
     header["NOLL"] = (" ".join(map(str, law.noll)), "Noll index of each mode")
@@ -54,7 +53,7 @@ def load(path: Path) -> LinearLaw:
         DataFileError: the file is missing, damaged or holds something else.
     """
     law, stated = fits_file.load(path, KIND, "law file", _read, ": make one with `lowfc tune LOG --out FILE`")
-    fits_file.require_identity(path, identity(law), stated)
+    fits_file.require_identity(path, law.id, stated)
     return law
 
 

@@ -6,9 +6,9 @@ from dataclasses import dataclass
 from google.protobuf.message import DecodeError
 
 from lowfc.adapters.bus import Sample
-from lowfc.adapters.envelope import count_of, start_of
 from lowfc.adapters.gaps import Gaps
 from lowfc.adapters.names import LONGEST_NAME, MOST_NAMES, Names
+from lowfc.contract.envelope import count_of, start_of
 from lowfc.contract.messages import EVENT, HEALTH, Log, Topic, topic_of, wire
 
 MOST_STARTS = 8

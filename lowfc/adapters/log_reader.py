@@ -9,13 +9,12 @@ from typing import NamedTuple
 from mcap.opcode import Opcode
 from mcap.records import Attachment, Channel, Metadata, Schema
 
-from lowfc.adapters.envelope import sequence_of
 from lowfc.adapters.log_chunk import Chunk, UnsoundError
 from lowfc.adapters.log_records import HEAD, Damage, LogFile, parsed
 from lowfc.adapters.log_writer import START_KEY
+from lowfc.contract.envelope import COUNT_BITS, sequence_of
 from lowfc.contract.errors import DataFileError
 from lowfc.contract.messages import Topic
-from lowfc.control.loop import COUNT_BITS
 
 _BEGINNING = 64  # bytes of a chunk, with the first message's times: a night has too many chunks for 32 bits of CRC
 _MESSAGE_HEAD = struct.Struct("<HIQQ")  # channel, count, log time, publish time

@@ -12,10 +12,10 @@ from mcap.records import Attachment, Metadata
 from mcap.writer import CompressionType, Writer
 
 from lowfc import __version__
-from lowfc.adapters.envelope import count_of, start_of
 from lowfc.adapters.log_reader import LogReader
 from lowfc.adapters.log_records import Damage
 from lowfc.adapters.log_writer import CHUNK_BYTES, UNFINISHED
+from lowfc.contract.envelope import count_of, start_of
 from lowfc.contract.errors import DataFileError
 
 RECOVERY = "recovery"

@@ -25,7 +25,7 @@ from mcap.writer import CompressionType, Writer
 
 from lowfc import __version__
 from lowfc.adapters.bus import Sample
-from lowfc.adapters.envelope import count_of, start_of
+from lowfc.contract.envelope import count_of, start_of
 from lowfc.contract.errors import DataFileError
 from lowfc.contract.messages import Topic, topic_of
 

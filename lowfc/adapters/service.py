@@ -1,5 +1,6 @@
 """What every process of a run does alike: stop when told, say how it is, report events, hear the others."""
 
+import contextlib
 import os
 import signal
 import sys
@@ -200,7 +201,8 @@ class Service:
         with self._event_lock:
             self._events.put(log.SerializeToString())
         if kind.level >= Level.WARNING:
-            sys.stderr.write(f"{self.name}: {log.message}\n")
+            with contextlib.suppress(OSError, ValueError):  # a terminal that is gone, or a full disk, ends nobody
+                sys.stderr.write(f"{self.name}: {log.message}\n")
 
     def unreadable(self, key: str, why: object) -> None:
         """Count a message that could not be read: a flood is one event with each Health. Callable from any thread."""

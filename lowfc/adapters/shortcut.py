@@ -16,7 +16,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 from lowfc.adapters.bus import Sample
-from lowfc.adapters.envelope import Envelope
+from lowfc.contract.envelope import Envelope
 
 Handler = Callable[[Sample], None]
 

@@ -20,11 +20,11 @@ from lowfc.adapters.access import CLOCK_KEY, ROUTER
 from lowfc.adapters.bus import ALL, Faults, Query, Sample
 from lowfc.adapters.clock import Clock
 from lowfc.adapters.clock_offset import ClockAsker, ClockOffset
-from lowfc.adapters.envelope import Envelope, sequence_of
 from lowfc.adapters.routed import RouterWatch, open_by_router, require_certificate
 from lowfc.adapters.run import Links, mirror_role
 from lowfc.adapters.shortcut import SharedShortcutReader, ShortcutReader, ShortcutWriter
 from lowfc.adapters.zenoh_session import session_config
+from lowfc.contract.envelope import Envelope, sequence_of
 from lowfc.contract.errors import BusError
 from lowfc.contract.messages import HEALTH, Role, Topic
 

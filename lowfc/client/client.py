@@ -1,7 +1,9 @@
 """What an operator asks of a running loop, from Python."""
 
+import contextlib
 import time
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from types import TracebackType
 from typing import NamedTuple, TypeVar
 
@@ -9,20 +11,23 @@ import numpy as np
 import numpy.typing as npt
 from google.protobuf.message import DecodeError
 
-from lowfc.adapters.bus import Bus, Sample
+from lowfc.adapters.bus import ALL, Bus, Sample, name_in
 from lowfc.adapters.clock import HostClock
-from lowfc.adapters.envelope import count_of
 from lowfc.adapters.run import DEFAULT_RUN, open_run
 from lowfc.adapters.zenoh_bus import ZenohBus
 from lowfc.client.mirror_watch import MirrorWatch
 from lowfc.client.runs import the_run
 from lowfc.client.stream import SILENT_S, WAITING, Frame, Stream, frame_of, step_of
-from lowfc.contract.calibration_codec import decode_calibration, encode_calibration
+from lowfc.contract.calibration_codec import camera_settings, decode_calibration, encode_calibration
+from lowfc.contract.codec import most_bytes
+from lowfc.contract.envelope import count_of
 from lowfc.contract.errors import BusError, RequestRefusedError
 from lowfc.contract.law_codec import wire_law
-from lowfc.contract.messages import CALIBRATION, FRAME, RECORD_KEY, REQUEST_KEY, STEP, Role, Topic, wire
+from lowfc.contract.messages import CALIBRATION, FRAME, HEALTH, LAW, RECORD_KEY, REQUEST_KEY, STEP, Role, Topic, wire
+from lowfc.contract.published import Published
 from lowfc.control.additions import MIRROR, OFFSET
 from lowfc.control.calibration import Calibration
+from lowfc.control.camera import CameraSettings
 from lowfc.control.inputs import Step
 from lowfc.control.linear_law import LinearLaw
 
@@ -35,8 +40,6 @@ SLOW_ANSWER_S = 30.0
 """To load a calibration, to take a long play, to finish a log."""
 LARGE_BYTES = 100_000
 """Of a request; a larger one takes its time."""
-MOST_BYTES = 16_000_000
-"""Of a request; the bus loses one that is far larger."""
 
 
 class Answer(NamedTuple):
@@ -227,6 +230,29 @@ class Client:
         except (DecodeError, ValueError) as fault:
             raise BusError(f"{sample.key} was answered with what is no calibration: {fault}") from None
 
+    def camera(self) -> CameraSettings | None:
+        """Settings of the camera as the controller last received them, to be kept with what is measured with it."""
+        state = self.status().state
+        known = state is not None and state.HasField("camera")
+        return replace(camera_settings(state.camera), start_s=0) if state is not None and known else None
+
+    def mirrors(self) -> dict[str, wire.Health]:
+        """What each mirror of the run says of itself, by its process's name."""
+        found = {}
+        for sample in self._bus.get(HEALTH.at(ALL), timeout_s=ANSWER_S):
+            name = name_in(HEALTH, sample.key)
+            if name.partition("-")[0] == Role.MIRROR:
+                with contextlib.suppress(DecodeError):
+                    found[name] = wire.Health.FromString(sample.payload)
+        return found
+
+    def laws(self) -> dict[str, LinearLaw]:
+        """The law in place of the integrator, by its identity; empty where there has been none."""
+        published = Published()
+        for sample in self._bus.get(LAW.key, timeout_s=ANSWER_S):
+            published.take(LAW, sample.payload)
+        return published.laws
+
     def frames(self, count: int | None = None, patience_s: float = SILENT_S) -> Stream[Frame]:
         """Sensor images from now on, `count` of them or without end.
 
@@ -281,9 +307,9 @@ class Client:
         if calibration is not None:
             message.calibration.MergeFromString(encode_calibration(calibration, 0))
         payload = message.SerializeToString()
-        if len(payload) > MOST_BYTES:
+        if len(payload) > most_bytes(name):
             raise RequestRefusedError(
-                f"a request holds at most {MOST_BYTES / 1e6:g} MB, this one {len(payload) / 1e6:.1f} MB: ask in parts"
+                f"{name} refused: it may have {most_bytes(name):,} bytes and has {len(payload):,}: ask in parts"
             )
         patience_s = SLOW_ANSWER_S if len(payload) > LARGE_BYTES else ANSWER_S
         return _answer(name, self._get(REQUEST_KEY.format(name=name), payload, patience_s))

@@ -5,8 +5,8 @@ import time
 from google.protobuf.message import DecodeError
 
 from lowfc.adapters.bus import Bus, Ring, name_in
-from lowfc.adapters.envelope import start_of
 from lowfc.client.stream import SILENT_S, WAITING
+from lowfc.contract.envelope import start_of
 from lowfc.contract.errors import BusError
 from lowfc.contract.messages import EVENT, MIRROR_STATE, Log, wire
 

@@ -1,7 +1,7 @@
 """Which runs there are on this host."""
 
 from lowfc.adapters.run import open_run, runtime_base
-from lowfc.contract.errors import BusError
+from lowfc.contract.errors import BusError, DataFileError
 from lowfc.contract.messages import Role
 
 
@@ -18,7 +18,7 @@ def the_run(name: str | None) -> str:
     Raises:
         BusError: there is no such run, none at all, or more than one to choose from.
     """
-    living = _living()
+    living = _living(name)
     if name is not None and name in living:
         return name
     runs = [run for run, roles in living.items() if Role.CONTROLLER in roles] or list(living)
@@ -30,8 +30,20 @@ def the_run(name: str | None) -> str:
     raise BusError(f"say which run with --run: {there}" if living else there)
 
 
-def _living() -> dict[str, set[str]]:
-    """Runs of which somebody listens, and who."""
-    names = sorted(path.parent.name for path in runtime_base().glob("*/links.json"))
-    found = {name: open_run(name, ()).links.live() for name in names}
-    return {name: roles for name, roles in found.items() if roles}
+def _living(wanted: str | None = None) -> dict[str, set[str]]:
+    """Runs of which somebody listens, and who; a damaged one is left out, unless it is the one that is wanted.
+
+    Raises:
+        BusError, DataFileError: the wanted one is damaged.
+    """
+    found: dict[str, set[str]] = {}
+    for name in sorted(path.parent.name for path in runtime_base().glob("*/links.json")):
+        try:
+            roles = open_run(name, ()).links.live()
+        except (BusError, DataFileError, OSError):
+            if name == wanted:
+                raise
+            continue
+        if roles:
+            found[name] = roles
+    return found

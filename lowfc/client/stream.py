@@ -10,9 +10,9 @@ import numpy.typing as npt
 from google.protobuf.message import DecodeError
 
 from lowfc.adapters.bus import Ring, Sample
-from lowfc.adapters.envelope import count_of, start_of
 from lowfc.adapters.gaps import Gaps
 from lowfc.contract import codec
+from lowfc.contract.envelope import count_of, start_of
 from lowfc.contract.errors import BusError
 from lowfc.contract.messages import from_timestamp, wire
 from lowfc.control.inputs import Step

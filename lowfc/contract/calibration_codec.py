@@ -1,12 +1,12 @@
-"""Calibrations as messages, both ways, and their identity."""
+"""Calibrations and camera settings as messages, both ways."""
 
 from dataclasses import replace
 
 import numpy as np
 
-from lowfc.contract.identity import identity
-from lowfc.contract.messages import floats, timestamp, wire
+from lowfc.contract.messages import floats, from_timestamp, timestamp, wire
 from lowfc.control.calibration import Calibration
+from lowfc.control.camera import CameraSettings
 from lowfc.optics.zernike import mode_name
 
 
@@ -33,13 +33,14 @@ def encode_calibration(calibration: Calibration, time_ns: int) -> bytes:
         mirror_columns=calibration.grid[1],
         modes_to_actuators=calibration.modes_to_actuators.tobytes(),
         actuators_to_modes=calibration.actuators_to_modes.tobytes(),
+        camera=None if calibration.camera is None else wire_camera(calibration.camera),
     )
     return message.SerializeToString()
 
 
 def identified(calibration: Calibration) -> Calibration:
     """The same calibration with its identity: SHA-256 of everything else in it."""
-    return replace(calibration, id=identity(calibration))
+    return replace(calibration, id=calibration.identity())
 
 
 def decode_calibration(message: wire.Calibration) -> Calibration:
@@ -67,7 +68,40 @@ def decode_calibration(message: wire.Calibration) -> Calibration:
         operator_hash=message.operator_hash,
         id=message.id,
         actuators_to_modes=floats(message.actuators_to_modes, *((modes, actuators) if seen else (0, 0))),
+        camera=camera_settings(message.camera) if message.HasField("camera") else None,
     )
-    if identity(calibration) != message.id:
+    if calibration.identity() != message.id:
         raise ValueError(f"calibration {message.id[:12]} is not whole: its content has another identity")
     return calibration
+
+
+def wire_camera(camera: CameraSettings) -> wire.CameraState:
+    """Camera settings as a message."""
+    return wire.CameraState(
+        timestamp=timestamp(camera.time_ns),
+        gain_e_per_dn=camera.gain_e_per_dn,
+        bias_dn=camera.bias_dn,
+        read_noise_e=camera.read_noise_e,
+        saturation_dn=camera.saturation_dn,
+        region_row=camera.region[0],
+        region_column=camera.region[1],
+        rows=camera.shape[0],
+        columns=camera.shape[1],
+        em_gain=camera.em_gain,
+        start_s=camera.start_s,
+    )
+
+
+def camera_settings(message: wire.CameraState, start_s: int = 0) -> CameraSettings:
+    """Camera settings of a message, published by a camera that started at `start_s`; 0 for the message's own."""
+    return CameraSettings(
+        from_timestamp(message.timestamp),
+        (message.rows, message.columns),
+        message.bias_dn,
+        message.saturation_dn,
+        message.gain_e_per_dn,
+        message.em_gain,
+        message.read_noise_e,
+        (message.region_row, message.region_column),
+        start_s or message.start_s,
+    )

@@ -7,12 +7,26 @@ import numpy as np
 import numpy.typing as npt
 from google.protobuf.message import DecodeError
 
-from lowfc.contract.calibration_codec import decode_calibration
-from lowfc.contract.law_codec import law_of, wire_law
-from lowfc.contract.messages import MONO16, RawImage, floats, from_timestamp, timestamp, wire
+from lowfc.contract.calibration_codec import camera_settings, decode_calibration, wire_camera
+from lowfc.contract.errors import BadMessageError
+from lowfc.contract.law_codec import law_header, law_of, wire_law
+from lowfc.contract.messages import (
+    MONO16,
+    RawImage,
+    checked_sequence,
+    checked_time_ns,
+    floats,
+    from_timestamp,
+    timestamp,
+    wire,
+)
+from lowfc.control.additions import PlayTable
 from lowfc.control.calibration import Calibration
+from lowfc.control.camera import CameraSettings
 from lowfc.control.durations import Durations
-from lowfc.control.inputs import CameraSettings, Command, Frame, Input, Load, MirrorShape, Reply, Request, Step, Tick
+from lowfc.control.inputs import Command, Frame, Input, Load, MirrorShape, Reply, Request, Step, Tick
+from lowfc.control.linear_law import LinearLaw
+from lowfc.control.requests import MOST_TEXT
 from lowfc.control.safety import LoopMode, Reason
 
 Single = npt.NDArray[np.float32]
@@ -20,17 +34,22 @@ Single = npt.NDArray[np.float32]
 _PIXEL = np.dtype("<u2")  # read from its name, it would cost every frame 0.2 us
 
 
-def decode_frame(payload: bytes, sequence: int, age_ns: int) -> Frame:
-    """Frame of a RawImage; its pixels are None where the message holds no whole mono16 image."""
+def decode_frame(payload: bytes, sequence: int, age_ns: int, *, ahead: bool = False) -> Frame:
+    """Frame of a RawImage; its pixels are None where the message holds no whole mono16 image.
+
+    Raises:
+        BadMessageError: its time or its sequence cannot be.
+    """
+    checked_sequence(sequence)
     try:
         image = RawImage.FromString(payload)
     except DecodeError:
-        return Frame(sequence, 0, age_ns, None)
+        return Frame(sequence, 0, age_ns, None, ahead)
     pixels, data = None, image.data  # each look at it makes a copy
     rows, columns, step = image.height, image.width, image.step
     if image.encoding == MONO16 and step == 2 * columns and len(data) == step * rows > 0:
         pixels = np.frombuffer(data, _PIXEL).reshape(rows, columns)
-    return Frame(sequence, from_timestamp(image.timestamp), age_ns, pixels)
+    return Frame(sequence, checked_time_ns(image.timestamp), age_ns, pixels, ahead)
 
 
 def encode_step(step: Step, taken: int) -> bytes:
@@ -63,6 +82,8 @@ def encode_command(command: Command, valid_for_ns: int, channel: str, taken: int
         actuators=command.actuators_nm.tobytes(),
         command_nm=command.command_nm.tolist(),
         taken=taken,
+        safe=command.safe,
+        clear_id=command.clear_id,
     )
     return message.SerializeToString()
 
@@ -75,20 +96,35 @@ def actuators(message: wire.MirrorCommand | wire.MirrorState) -> Single | None:
 
 
 def decode_mirror(payload: bytes) -> MirrorShape | None:
-    """Shape of a MirrorState; None where it is none."""
+    """Shape of a MirrorState; None where it is none.
+
+    Raises:
+        BadMessageError: its time cannot be.
+    """
     try:
-        return _mirror_shape(wire.MirrorState.FromString(payload))
+        state = wire.MirrorState.FromString(payload)
     except DecodeError:
         return None
+    checked_time_ns(state.timestamp)
+    return _mirror_shape(state)
 
 
-def decode_camera(payload: bytes) -> CameraSettings | None:
-    """What of a CameraState must fit the calibration; None where the message cannot be read, or is of no camera."""
+def decode_camera(payload: bytes, start_s: int) -> CameraSettings:
+    """What of a CameraState must fit the calibration; it was published by a camera that started at `start_s`.
+
+    Raises:
+        BadMessageError: the message cannot be read, is of no camera, or a number in it cannot be.
+    """
     try:
-        found = _camera_settings(wire.CameraState.FromString(payload))
-    except DecodeError:
-        return None
-    return found if all(found.shape) else None
+        state = wire.CameraState.FromString(payload)
+    except DecodeError as error:
+        raise BadMessageError(str(error)) from None
+    checked_time_ns(state.timestamp)
+    found = camera_settings(state, start_s)
+    levels = (found.bias_dn, found.saturation_dn, found.gain_e_per_dn, found.em_gain, found.read_noise_e)
+    if not all(found.shape) or not np.isfinite(levels).all():
+        raise BadMessageError("these are the settings of no camera")
+    return found
 
 
 def encode_input(taken: MirrorShape | CameraSettings | Load | Tick, number: int) -> bytes:
@@ -100,12 +136,10 @@ def encode_input(taken: MirrorShape | CameraSettings | Load | Tick, number: int)
             rows, columns = taken.actuators_nm.shape
             mirror = wire.MirrorState(timestamp=time, rows=rows, columns=columns, command_nm=taken.command_nm.tolist())
             mirror.actuators = taken.actuators_nm.tobytes()
+            mirror.safe = taken.safe
             message.mirror.CopyFrom(mirror)
         case CameraSettings():
-            rows, columns = taken.shape
-            camera = wire.CameraState(timestamp=time, rows=rows, columns=columns)
-            camera.bias_dn, camera.saturation_dn = taken.bias_dn, taken.saturation_dn
-            message.camera.CopyFrom(camera)
+            message.camera.CopyFrom(wire_camera(taken))
         case Load():
             message.load.CopyFrom(wire.Load(timestamp=time, calibration_id=taken.calibration.id, source=taken.source))
         case Tick():
@@ -125,7 +159,7 @@ def decode_input(message: wire.ControlInput, calibrations: Mapping[str, Calibrat
             if shape is not None:
                 return shape
         case "camera":
-            return _camera_settings(message.camera)
+            return camera_settings(message.camera)
         case "tick":
             return Tick(from_timestamp(message.timestamp), message.tick.silent_ns)
         case "load" if message.load.calibration_id in calibrations:
@@ -138,20 +172,37 @@ def _mirror_shape(state: wire.MirrorState) -> MirrorShape | None:
     surface = actuators(state)
     if surface is None:
         return None
-    return MirrorShape(from_timestamp(state.timestamp), surface, np.array(state.command_nm, dtype=np.float32))
+    command_nm = np.array(state.command_nm, dtype=np.float32)
+    return MirrorShape(from_timestamp(state.timestamp), surface, command_nm, state.safe)
 
 
-def _camera_settings(state: wire.CameraState) -> CameraSettings:
-    shape = (state.rows, state.columns)
-    return CameraSettings(from_timestamp(state.timestamp), shape, state.bias_dn, state.saturation_dn)
+MOST_BYTES = 16_000_000
+"""Of any request; the bus loses one that is far larger."""
+_SMALL_BYTES = 8_000
+_OF_CHANNEL_BYTES = 4 * 128 * 128 + _SMALL_BYTES
+_NOTE_BYTES = 4 * MOST_TEXT + _SMALL_BYTES
+_MOST_BYTES = {
+    "channel": _OF_CHANNEL_BYTES,
+    "note": _NOTE_BYTES,
+    "play": MOST_BYTES,
+    "law": MOST_BYTES,
+    "load": MOST_BYTES,
+}
+
+
+def most_bytes(name: str) -> int:
+    """Size that a request of this name may have; a larger one is refused before it is decoded."""
+    return _MOST_BYTES.get(name, _SMALL_BYTES)
 
 
 def decode_request(payload: bytes, name: str, time_ns: int) -> Request:
     """Request under a key's name.
 
     Raises:
-        ValueError: the payload cannot be read, or what it holds is not whole.
+        ValueError: the payload is too large or cannot be read, or what it holds is not whole.
     """
+    if len(payload) > most_bytes(name):
+        raise ValueError(f"a request of this name holds at most {most_bytes(name)} bytes, got {len(payload)}")
     try:
         message = wire.Request.FromString(payload)
     except DecodeError:
@@ -160,13 +211,24 @@ def decode_request(payload: bytes, name: str, time_ns: int) -> Request:
 
 
 def request(
-    message: wire.Request, name: str, time_ns: int, calibrations: Mapping[str, Calibration] = MappingProxyType({})
+    message: wire.Request,
+    name: str,
+    time_ns: int,
+    calibrations: Mapping[str, Calibration] = MappingProxyType({}),
+    laws: Mapping[str, LinearLaw] = MappingProxyType({}),
+    plays: Mapping[str, PlayTable] = MappingProxyType({}),
 ) -> Request:
-    """Request of a message; of a logged one, whose calibration is no more than an identity, it is one of those.
+    """Request of a message; of a logged one, calibration, law and table are identities, and are among those.
 
     Raises:
         ValueError: what it holds is not whole.
     """
+    table, basis = floats(message.table, -1, message.columns or 1), floats(message.actuators, -1)
+    if message.play_id:
+        if message.play_id not in plays:
+            raise ValueError(f"the table {message.play_id[:12]} of a play is not there")
+        known_table = plays[message.play_id]
+        table, basis = known_table.rows, known_table.basis.reshape(-1)
     calibration = None
     if message.HasField("calibration"):
         known = calibrations.get(message.calibration.id)
@@ -177,15 +239,19 @@ def request(
         tuple(message.modes),
         tuple(message.values),
         message.text,
-        floats(message.actuators, -1),
-        floats(message.table, -1, message.columns or 1),
-        law_of(message.law) if message.HasField("law") else None,
+        basis,
+        table,
+        law_of(message.law, laws) if message.HasField("law") else None,
         calibration,
     )
 
 
 def encode_request(request: Request, reply: Reply, taken: int, state: wire.ControllerState | None) -> bytes:
-    """Request with its answer; it was input number `taken`, or 0 where it could not be read."""
+    """Request with its answer; it was input number `taken`, or 0 where it could not be read.
+
+    Of the law and the table of a request that was prepared, it has the identity: they are published by themselves.
+    """
+    played = request.played
     message = wire.Request(
         timestamp=timestamp(request.time_ns),
         name=request.name,
@@ -197,10 +263,11 @@ def encode_request(request: Request, reply: Reply, taken: int, state: wire.Contr
         state=state,
         taken=taken,
         text=request.text,
-        actuators=request.actuators_nm.tobytes(),
-        table=request.table.tobytes(),
+        actuators=b"" if played is not None else request.actuators_nm.tobytes(),
+        table=b"" if played is not None else request.table.tobytes(),
         columns=request.table.shape[1] if request.table.size else 0,
-        law=None if request.law is None else wire_law(request.law),
+        law=None if request.law is None else (law_header if request.prepared else wire_law)(request.law),
+        play_id="" if played is None else played.id,
         calibration=None if request.calibration is None else wire.Calibration(id=request.calibration.id),
     )
     return message.SerializeToString()

@@ -80,6 +80,9 @@ class Control(Section):
     """During such a silence: hold the command, or relax the mirror to flat."""
     valid_ms: Positive = 200.0
     """How long the mirror may hold a command without another one."""
+    max_start_ahead_h: float = Field(24.0, ge=0)
+    """Hours by which the start in a camera's or a controller's sequences may lie ahead of this host's clock; 0 for any,
+    as on a host whose clock is not set."""
     least_flux: float = Field(0.2, ge=0, lt=1)
     """Fraction of the expected light below which a frame is dark."""
     most_saturated: int = Field(8, ge=0)

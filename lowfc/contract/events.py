@@ -50,7 +50,7 @@ EVENTS: dict[str, Event] = {
         ),
         Event("REALTIME_REFUSED", Level.WARNING, "the host refused {measure}: {cost}"),
         Event("CALIBRATION_LOADED", Level.INFO, "calibration {id}: {modes} modes, {estimator}, from {source}"),
-        Event("CAMERA_CHANGED", Level.WARNING, "the camera no longer fits the calibration ({what}); loop opened"),
+        Event("CAMERA_CHANGED", Level.WARNING, "the camera does not fit the calibration: {what}"),
         Event("MODE_CHANGED", Level.INFO, "loop {before} -> {after}: {why}"),
         Event("SAFED", Level.ERROR, "safed: {why}; `lowfc ctl clear` when it is safe"),
         Event("FRAMES_REFUSED", Level.WARNING, "frames refused: {reason}"),
@@ -66,6 +66,7 @@ EVENTS: dict[str, Event] = {
             "the mirror had {rms_nm:.1f} nm rms of surface beside the modes: kept as the channel 'adopted'; "
             "`lowfc ctl channel adopted --zero` takes it away",
         ),
+        Event("LAW_NOT_IN_FORCE", Level.WARNING, "the law of the configuration is not in force: {why}"),
         Event("NOTE", Level.INFO, "{text}"),
         Event("PLAY_ENDED", Level.WARNING, "what was being played ended: {why}"),
         Event("LOOP_STEPPED", Level.INFO, "the loop opened after its last step"),
@@ -76,6 +77,17 @@ EVENTS: dict[str, Event] = {
         Event("COMMAND_EXPIRED", Level.WARNING, "the last command expired after {valid_ms:.0f} ms; {action}"),
         Event("COMMAND_BACK", Level.INFO, "commands are back"),
         Event("COMMAND_REFUSED", Level.WARNING, "command refused: {reason}"),
+        Event(
+            "START_AHEAD",
+            Level.ERROR,
+            "{what} refused: their sender started at {start} by its clock, and here it is {here}; set the clocks, or "
+            "control.max_start_ahead_h",
+        ),
+        Event(
+            "LATCH_FAILED",
+            Level.ERROR,
+            "{why}; make it writable: until then safe mode may be lost when the controller restarts",
+        ),
         Event(
             "COMMANDS_LATE",
             Level.WARNING,

@@ -1,12 +1,14 @@
 """Control laws, channels and plays as messages, both ways."""
 
+from collections.abc import Mapping
+from types import MappingProxyType
 from typing import cast
 
 import numpy as np
 import numpy.typing as npt
 
-from lowfc.contract.messages import floats, wire
-from lowfc.control.additions import Additions, Channel, Play
+from lowfc.contract.messages import floats, timestamp, wire
+from lowfc.control.additions import Additions, Channel, Play, PlayTable, play_table
 from lowfc.control.linear_law import LinearLaw, Signal
 
 Single = npt.NDArray[np.float32]
@@ -14,27 +16,38 @@ Single = npt.NDArray[np.float32]
 _MATRICES = ("follow", "gain", "kept", "coast", "output")
 
 
-def wire_law(law: LinearLaw) -> wire.LinearLaw:
-    """A law as a message."""
-    message = wire.LinearLaw(
+def law_header(law: LinearLaw) -> wire.LinearLaw:
+    """A law as a message without its matrices, which are known by its identity."""
+    return wire.LinearLaw(
         name=law.name,
         signal=law.signal,
         noll=law.noll,
         delay_frames=law.delay_frames,
         rate_hz=law.rate_hz,
         states=len(law.follow),
+        id=law.id,
     )
+
+
+def wire_law(law: LinearLaw, time_ns: int = 0) -> wire.LinearLaw:
+    """A law as a message, whole."""
+    message = law_header(law)
+    message.timestamp.CopyFrom(timestamp(time_ns))
     for name in _MATRICES:
         setattr(message, name, getattr(law, name).tobytes())
     return message
 
 
-def law_of(message: wire.LinearLaw) -> LinearLaw:
-    """The law of a message.
+def law_of(message: wire.LinearLaw, known: Mapping[str, LinearLaw] = MappingProxyType({})) -> LinearLaw:
+    """The law of a message; of one without matrices, that of its identity among the `known` ones.
 
     Raises:
-        ValueError: it is not whole.
+        ValueError: it is not whole, or not known.
     """
+    if message.id and not message.follow:
+        if message.id not in known:
+            raise ValueError(f"the law {message.id[:12]} is not there")
+        return known[message.id]
     states, modes = message.states, len(message.noll)
     follow, coast = (floats(each, states, states) for each in (message.follow, message.coast))
     gain, kept = (floats(each, states, modes) for each in (message.gain, message.kept))
@@ -52,6 +65,28 @@ def law_of(message: wire.LinearLaw) -> LinearLaw:
     )
 
 
+def wire_play(table: PlayTable, time_ns: int) -> wire.Play:
+    """A table that can be played as a message, whole."""
+    return wire.Play(
+        target=table.target,
+        columns=table.rows.shape[1],
+        table=table.rows.tobytes(),
+        basis=table.basis.tobytes(),
+        id=table.id,
+        frames=len(table.rows),
+        timestamp=timestamp(time_ns),
+    )
+
+
+def table_of(message: wire.Play) -> PlayTable:
+    """The table of a message.
+
+    Raises:
+        ValueError: it is not whole.
+    """
+    return play_table(message.target, floats(message.table, -1, message.columns or 1), floats(message.basis, -1))
+
+
 def put_additions(message: wire.ControllerState, additions: Additions) -> None:
     """What is added to the law's command, into a state."""
     message.offset_nm.extend(additions.offset_nm.tolist())
@@ -63,13 +98,17 @@ def put_additions(message: wire.ControllerState, additions: Additions) -> None:
     if play is not None:
         message.play.target = play.target
         message.play.first_sequence = play.first_sequence
-        message.play.columns = play.table.shape[1]
-        message.play.table = play.table.tobytes()
-        message.play.basis = play.basis.tobytes()
+        message.play.columns = play.table.rows.shape[1]
+        message.play.frames = play.frames
+        message.play.id = play.table.id
 
 
-def additions_of(message: wire.ControllerState, none: Additions, to_modes: Single) -> Additions | None:
+def additions_of(
+    message: wire.ControllerState, none: Additions, to_modes: Single, plays: Mapping[str, PlayTable]
+) -> Additions | None:
     """What is added, of a state; `none` has its shapes. None where the state has nothing of it.
+
+    A table that is played is among `plays`, by its identity; before 0.2 the state had it, cut to what was played.
 
     Raises:
         ValueError: it does not fit.
@@ -87,6 +126,12 @@ def additions_of(message: wire.ControllerState, none: Additions, to_modes: Singl
     play = None
     if message.HasField("play"):
         one = message.play
-        basis = floats(one.basis, -1, rows * columns) if one.basis else np.zeros((0, rows * columns), np.float32)
-        play = Play(one.target, one.first_sequence, floats(one.table, -1, one.columns), basis)
+        if not one.id:
+            table = floats(one.table, -1, one.columns or 1)
+            cut = PlayTable(one.target, table, floats(one.basis, -1, rows * columns), np.zeros(0), 0.0, "")
+            play = Play(cut, one.first_sequence, len(table))
+        else:
+            if one.id not in plays:
+                raise ValueError(f"the table {one.id[:12]} that is played is not there")
+            play = Play(plays[one.id], one.first_sequence, one.frames)
     return none._replace(offset_nm=offset_nm, shifts_nm=tuple(shifts_nm), play=play).at(channels, to_modes)

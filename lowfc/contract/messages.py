@@ -15,6 +15,7 @@ from foxglove_schemas_protobuf.RawImage_pb2 import RawImage
 from google.protobuf.message import Message
 from google.protobuf.timestamp_pb2 import Timestamp
 
+from lowfc.contract.errors import BadMessageError
 from lowfc.contract.wire import lowfc_pb2 as wire
 
 __all__ = ["TOPICS", "Log", "Message", "RawImage", "Role", "Timestamp", "Topic", "from_timestamp", "timestamp", "wire"]
@@ -186,6 +187,24 @@ OFFLOAD = Topic(
     _WATCHERS,
     "Mean modal command, for another adaptive-optics system to take over.",
 )
+LAW = Topic(
+    "lowfc/control/law",
+    wire.LinearLaw,
+    Rate.EVENT,
+    _CONTROLLER,
+    _WATCHERS,
+    "Control law in place of the integrator, with its matrices; states have its identity.",
+    queryable=True,
+)
+PLAY = Topic(
+    "lowfc/control/play",
+    wire.Play,
+    Rate.EVENT,
+    _CONTROLLER,
+    _WATCHERS,
+    "Table that is being played, frame by frame; states have its identity.",
+    queryable=True,
+)
 CALIBRATION = Topic(
     "lowfc/calibration",
     wire.Calibration,
@@ -208,6 +227,8 @@ TOPICS: tuple[Topic, ...] = (
     TIMING,
     CONTROLLER_STATE,
     REQUEST,
+    LAW,
+    PLAY,
     OFFLOAD,
     COMMAND,
     MIRROR_STATE,
@@ -254,6 +275,35 @@ def timestamp(time_ns: int) -> Timestamp:
 def from_timestamp(stamp: Timestamp) -> int:
     """Nanoseconds since the epoch of a message's time."""
     return stamp.seconds * 1_000_000_000 + stamp.nanos
+
+
+LATEST_NS = 1 << 62
+"""No message is of a later time: the year 2116."""
+SEQUENCES = (1 << 64) - (1 << 33)
+"""Sequences are below this, so that neither start nor count can overflow; starts go up to the year 2106."""
+
+
+def checked_time_ns(stamp: Timestamp) -> int:
+    """Nanoseconds since the epoch of a received message's time.
+
+    Raises:
+        BadMessageError: it cannot be.
+    """
+    time_ns = from_timestamp(stamp)
+    if not 0 <= time_ns <= LATEST_NS:
+        raise BadMessageError(f"its time is {time_ns} ns since the epoch, not 0 to 2^62")
+    return time_ns
+
+
+def checked_sequence(sequence: int) -> int:
+    """A received frame sequence.
+
+    Raises:
+        BadMessageError: it cannot be.
+    """
+    if not 0 <= sequence < SEQUENCES:
+        raise BadMessageError(f"its frame sequence is {sequence}, not below {SEQUENCES}")
+    return sequence
 
 
 def floats(data: bytes, *shape: int) -> npt.NDArray[np.float32]:

@@ -1,18 +1,22 @@
 """The controller's state and settings as a message, both ways: whoever reads it goes on with the same next command."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from types import MappingProxyType
 
 import numpy as np
 
+from lowfc.contract.calibration_codec import camera_settings, wire_camera
 from lowfc.contract.codec import wire_mode, wire_reasons
-from lowfc.contract.law_codec import additions_of, law_of, put_additions, wire_law
+from lowfc.contract.law_codec import additions_of, law_header, law_of, put_additions
 from lowfc.contract.messages import floats, from_timestamp, timestamp, wire
 from lowfc.control import linear_law
+from lowfc.control.additions import PlayTable
 from lowfc.control.calibration import Calibration
 from lowfc.control.estimator import Estimate
 from lowfc.control.law import Law
+from lowfc.control.linear_law import LinearLaw
 from lowfc.control.safety import Limits, LoopMode, Reason
-from lowfc.control.state import Drive, Following, Settings, State
+from lowfc.control.state import Conditions, Drive, Following, Settings, State
 
 
 def controller_state(state: State, settings: Settings, time_ns: int) -> wire.ControllerState:
@@ -36,15 +40,25 @@ def controller_state(state: State, settings: Settings, time_ns: int) -> wire.Con
         homing=state.homing,
         alike=state.alike,
     )
+    conditions = state.conditions
+    message.camera_awaited = conditions.camera_awaited
+    message.clear_id = conditions.clear_id
+    message.mode_cause = conditions.mode_cause
+    if conditions.mode_since_ns:
+        message.mode_timestamp.CopyFrom(timestamp(conditions.mode_since_ns))
+    if conditions.camera is not None:
+        message.camera.CopyFrom(wire_camera(conditions.camera))
     if state.estimate is not None:
         message.measured_nm.extend(state.estimate.error_nm.tolist())
         message.flux_dn = state.estimate.flux_dn
     if state.drive is not None:
         if state.drive.additions is not None:
             put_additions(message, state.drive.additions)
+        if state.drive.camera is not None:
+            message.camera_expected.CopyFrom(wire_camera(state.drive.camera))
         following = state.drive.following
         if following is not None:
-            message.law.CopyFrom(wire_law(following.law))
+            message.law.CopyFrom(law_header(following.law))
             message.law_state.extend(following.x.tolist())
             message.law_frames = following.frames
         message.calibration_id = state.drive.calibration.id
@@ -56,11 +70,16 @@ def controller_state(state: State, settings: Settings, time_ns: int) -> wire.Con
     return message
 
 
-def decode_state(message: wire.ControllerState, calibration: Calibration | None) -> tuple[Settings, State]:
-    """Settings and state of a message; `calibration` is the one that it names.
+def decode_state(
+    message: wire.ControllerState,
+    calibration: Calibration | None,
+    laws: Mapping[str, LinearLaw] = MappingProxyType({}),
+    plays: Mapping[str, PlayTable] = MappingProxyType({}),
+) -> tuple[Settings, State]:
+    """Settings and state of a message; `calibration` is the one that it names, as are one of `laws` and of `plays`.
 
     Raises:
-        ValueError: the message is not whole, or the calibration is another one.
+        ValueError: the message is not whole, the calibration is another one, or its law or table is not there.
     """
     settings = _decode_settings(message.settings)
     drive = None
@@ -76,13 +95,14 @@ def decode_state(message: wire.ControllerState, calibration: Calibration | None)
         following = None
         if message.HasField("law"):
             x = np.array(message.law_state, np.float32)
-            following = Following(law_of(message.law), x, message.law_frames)
+            following = Following(law_of(message.law, laws), x, message.law_frames)
             if x.shape != linear_law.at_rest(following.law).shape or following.law.noll != calibration.noll:
                 raise ValueError("the law of the controller's state does not fit")
         drive = drive._replace(
             law=law,
+            camera=camera_settings(message.camera_expected) if message.HasField("camera_expected") else drive.camera,
             following=following,
-            additions=additions_of(message, drive.added(), drive.to_modes),
+            additions=additions_of(message, drive.added(), drive.to_modes, plays),
             history_nm=tuple(history),
             actuators_nm=actuators,
         )
@@ -103,6 +123,13 @@ def decode_state(message: wire.ControllerState, calibration: Calibration | None)
         taken=message.taken,
         estimate=Estimate(np.array(message.measured_nm, np.float32), message.flux_dn) if message.measured_nm else None,
         alike=message.alike,
+        conditions=Conditions(
+            camera_settings(message.camera) if message.HasField("camera") else None,
+            message.camera_awaited,
+            message.clear_id,
+            from_timestamp(message.mode_timestamp),
+            message.mode_cause,
+        ),
     )
     return settings, state
 

@@ -10,6 +10,8 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
+from lowfc.control.identity import identity
+
 Single = npt.NDArray[np.float32]
 
 FLAT = "flat"
@@ -49,27 +51,45 @@ class Channel(NamedTuple):
         return self.reached_nm is not self.wanted_nm
 
 
-class Play(NamedTuple):
-    """A table (frames, columns), a row for each frame from `first_sequence` on.
+class PlayTable(NamedTuple):
+    """A table (frames, columns) that can be played, a row for each frame.
 
     Attributes:
         target: `MIRROR`, where a row holds the factors of the shapes in `basis` (columns, actuators), nm of surface; or
             `OFFSET`, where it is added to the loop's target, nm of wavefront of each mode.
+        largest: (columns,) largest absolute number of each column.
+        reach_nm: on the mirror, what no actuator can exceed.
+        id: identity of target, rows and basis.
     """
 
     target: str
-    first_sequence: int
-    table: Single
+    rows: Single
     basis: Single
+    largest: npt.NDArray[np.float64]
+    reach_nm: float
+    id: str
+
+
+class Play(NamedTuple):
+    """A table that is being played: its first row for the frame `first_sequence`, and `frames` rows in all."""
+
+    table: PlayTable
+    first_sequence: int
+    frames: int
+
+    @property
+    def target(self) -> str:
+        """`MIRROR` or `OFFSET`."""
+        return self.table.target
 
     def row(self, sequence: int) -> Single | None:
         """The row for a frame; None before the first and after the last."""
         place = sequence - self.first_sequence
-        return self.table[place] if 0 <= place < len(self.table) else None
+        return self.table.rows[place] if 0 <= place < self.frames else None
 
     def over(self, sequence: int) -> bool:
         """Whether nothing of it is left for this frame and those to come."""
-        return sequence - self.first_sequence >= len(self.table)
+        return sequence - self.first_sequence >= self.frames
 
 
 class Additions(NamedTuple):
@@ -119,7 +139,7 @@ class Additions(NamedTuple):
         row = self.play.row(sequence) if self.play is not None and self.play.target == MIRROR else None
         if row is None or self.play is None:
             return None
-        return (row @ self.play.basis).reshape(self.sum_nm.shape)
+        return (row @ self.play.table.basis).reshape(self.sum_nm.shape)
 
     def moved(self, sequence: int, step_nm: float, to_modes: Single) -> "Additions":
         """For the next command: each channel nearer to what is wanted of it, all together by at most `step_nm`."""
@@ -167,9 +187,8 @@ class Additions(NamedTuple):
         """With nothing more to play after this frame; what was played for it goes with the next command."""
         if self.play is None:
             return self
-        return self._replace(
-            play=self.play._replace(table=self.play.table[: max(sequence + 1 - self.play.first_sequence, 0)])
-        )
+        left = min(max(sequence + 1 - self.play.first_sequence, 0), self.play.frames)
+        return self._replace(play=self.play._replace(frames=left))
 
     def passed(self, frames: int = 1) -> "Additions":
         """Some frames later."""
@@ -187,28 +206,33 @@ class Additions(NamedTuple):
         return self._replace(play=None).at(tuple(kept), to_modes)
 
 
-def play(target: str, first_sequence: int, table: Single, basis: Single, modes: int, grid: tuple[int, int]) -> Play:
-    """A play, checked; shapes as in `Play`.
+def play_table(target: str, rows: Single, basis: Single) -> PlayTable:
+    """A table to be played, checked for all that needs no loop; shapes as in `PlayTable`.
 
     Raises:
-        ValueError: its shapes do not fit the loop, it is too long, or a number in it is not finite.
+        ValueError: its parts do not fit together, it is too long, or a number in it is not finite.
     """
     if target not in (MIRROR, OFFSET):
         raise ValueError(f"a play's target is {MIRROR} or {OFFSET}, got {target!r}")
-    actuators = grid[0] * grid[1]
-    columns = len(basis) if target == MIRROR else modes
-    if target == MIRROR and (not len(basis) or basis.shape[1:] != (actuators,)):
-        raise ValueError(f"a play on the mirror needs shapes of {actuators} actuators, got {basis.shape}")
-    if table.ndim != 2 or table.shape[1] != columns or not len(table):
-        raise ValueError(f"a play's table has a row for each frame and {columns} columns, got {table.shape}")
-    if max(table.size, basis.size) > MOST_PLAYED:
+    if rows.ndim != 2 or not rows.size:
+        raise ValueError(f"a play's table has a row for each frame and a column for each shape, got {rows.shape}")
+    columns = rows.shape[1]
+    if target == MIRROR and (not basis.size or basis.size % columns):
+        raise ValueError(
+            f"a play on the mirror needs the actuators of a shape for each of {columns} columns, got {basis.size}"
+        )
+    if max(rows.size, basis.size) > MOST_PLAYED:
         raise ValueError(
             f"a play holds at most {MOST_PLAYED} numbers, {MOST_PLAYED // columns} frames of {columns} columns; "
-            f"got {max(table.size, basis.size)}: play it in parts"
+            f"got {max(rows.size, basis.size)}: play it in parts"
         )
-    if not (np.isfinite(table).all() and np.isfinite(basis).all()):
+    if not (np.isfinite(rows).all() and np.isfinite(basis).all()):
         raise ValueError("every number of a play must be finite")
-    return Play(target, first_sequence, table, basis)
+    basis = basis.reshape(columns, -1) if target == MIRROR else np.zeros((0, 0), np.float32)
+    largest = np.abs(rows).max(axis=0).astype(np.float64)
+    reach_nm = float(largest @ np.abs(basis).max(axis=1)) if basis.size else 0.0
+    made = identity((("target", target), ("table", rows), ("columns", columns), ("basis", basis)))
+    return PlayTable(target, rows, basis, largest, reach_nm, made)
 
 
 def _nearer(channel: Channel, step_nm: np.float32) -> Channel:

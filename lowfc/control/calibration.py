@@ -5,6 +5,9 @@ from dataclasses import dataclass, field
 import numpy as np
 import numpy.typing as npt
 
+from lowfc.control.camera import CameraSettings
+from lowfc.control.identity import identity
+
 Array = npt.NDArray[np.float64]
 Single = npt.NDArray[np.float32]
 
@@ -36,6 +39,7 @@ class Calibration:
         wavelength_nm: at which H was made.
         operator_hash: of the optical model behind it; empty for a measured calibration.
         id: identity of the whole.
+        camera: settings at which it was made; None where they are not known.
     """
 
     noll: tuple[int, ...]
@@ -54,6 +58,7 @@ class Calibration:
     operator_hash: str
     id: str
     actuators_to_modes: Single = field(default_factory=lambda: np.zeros((0, 0), np.float32))
+    camera: CameraSettings | None = None
 
     def __post_init__(self) -> None:
         pixels, modes, actuators = self.shape[0] * self.shape[1], len(self.noll), self.grid[0] * self.grid[1]
@@ -73,6 +78,22 @@ class Calibration:
                 raise ValueError(f"{name} holds values that are not finite")
         if not self.flux_dn > 0:
             raise ValueError(f"flux_dn must be above 0, got {self.flux_dn}")
+
+    def identity(self) -> str:
+        """What `id` must be: a hash of everything else in it."""
+        camera = self.camera
+        settings = camera and (
+            *(camera.shape, camera.region, camera.bias_dn, camera.saturation_dn),
+            *(camera.gain_e_per_dn, camera.em_gain, camera.read_noise_e),
+        )
+        parts = [(name, getattr(self, name)) for name in _IDENTITY]
+        return identity([*parts, ("camera", settings)])
+
+
+_IDENTITY = (
+    *("noll", "reference", "response", "reconstructor", "good", "dark", "modes_to_actuators", "shape", "grid"),
+    *("flux_dn", "saturation_dn", "estimator", "wavelength_nm", "operator_hash", "actuators_to_modes"),
+)
 
 
 def normalise_flux(reference: Array, response: Array, good: Array) -> tuple[Array, Array]:

@@ -7,20 +7,31 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
+from lowfc.control.additions import PlayTable
 from lowfc.control.calibration import Calibration
+from lowfc.control.camera import CameraSettings
 from lowfc.control.linear_law import LinearLaw
 from lowfc.control.safety import LoopMode, Reason
 
 Single = npt.NDArray[np.float32]
 
+COUNT_BITS = 32
+"""A frame's sequence is its publisher's start in seconds, shifted by this, and its count."""
+
 
 class Frame(NamedTuple):
-    """A sensor image that arrived: `pixels` (rows, columns) uint16, DN, or None where the message made no image."""
+    """A sensor image that arrived.
+
+    Attributes:
+        pixels: (rows, columns) uint16, DN, or None where the message made no image.
+        ahead: its sequence starts further ahead of the host's clock than allowed (a clock's verdict, as its age is).
+    """
 
     sequence: int
     time_ns: int
     age_ns: int
     pixels: npt.NDArray[np.uint16] | None
+    ahead: bool = False
 
 
 @dataclass(frozen=True, slots=True)
@@ -35,6 +46,9 @@ class Request:
         table: of a play, (frames, columns).
         law: that shall drive the mirror; None for the integrator.
         calibration: that shall be used.
+        played: what a play's table and shapes make, once they were checked.
+        refusal: why it is refused whatever the state of the loop.
+        prepared: it has been checked for what needs no state; see `lowfc.control.requests.prepared`.
     """
 
     time_ns: int
@@ -46,25 +60,23 @@ class Request:
     table: Single = field(default_factory=lambda: np.zeros((0, 1), np.float32), compare=False)
     law: LinearLaw | None = None
     calibration: Calibration | None = field(default=None, compare=False)
+    played: PlayTable | None = field(default=None, compare=False)
+    refusal: str = ""
+    prepared: bool = field(default=False, compare=False)
 
 
 @dataclass(frozen=True, slots=True)
 class MirrorShape:
-    """Where the mirror is: actuators (rows, columns) nm of surface, and the modal command behind them."""
+    """Where the mirror is: actuators (rows, columns) nm of surface, and the modal command behind them.
+
+    Attributes:
+        safe: its last command was sent in safe mode.
+    """
 
     time_ns: int
     actuators_nm: Single
     command_nm: Single
-
-
-@dataclass(frozen=True, slots=True)
-class CameraSettings:
-    """What of the camera must fit the calibration."""
-
-    time_ns: int
-    shape: tuple[int, int]
-    bias_dn: float
-    saturation_dn: float
+    safe: bool = False
 
 
 @dataclass(frozen=True, slots=True)
@@ -102,12 +114,19 @@ class Step(NamedTuple):
 
 
 class Command(NamedTuple):
-    """Where the mirror shall be: (rows, columns) float32, nm of surface."""
+    """Where the mirror shall be: (rows, columns) float32, nm of surface.
+
+    Attributes:
+        safe: the loop is in safe mode.
+        clear_id: identity of the operator's last clear; 0 without one.
+    """
 
     frame_sequence: int
     time_ns: int
     actuators_nm: Single
     command_nm: Single
+    safe: bool = False
+    clear_id: int = 0
 
 
 class Raised(NamedTuple):

@@ -1,12 +1,13 @@
 """A law of any kind as one linear system for all modes: PI, notches and Kalman filters are values of it."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Literal, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 
+from lowfc.control.identity import identity
 from lowfc.control.law import Law
 from lowfc.control.stability import delay_weights
 
@@ -37,6 +38,7 @@ class LinearLaw:
         noll: Noll index of each mode.
         delay_frames: the delay it was made for, as `lowfc.control.stability.delay_weights`.
         rate_hz: the frame rate it was made for.
+        id: identity of the whole.
     """
 
     signal: Signal
@@ -49,6 +51,7 @@ class LinearLaw:
     noll: tuple[int, ...]
     delay_frames: float
     rate_hz: float
+    id: str = field(init=False)
 
     def __post_init__(self) -> None:
         if self.signal not in SIGNALS:
@@ -72,6 +75,10 @@ class LinearLaw:
         delay_weights(self.delay_frames)  # says what is wrong with a delay
         if not (np.isfinite(self.rate_hz) and self.rate_hz > 0):
             raise ValueError(f"rate_hz must be above 0, got {self.rate_hz}")
+        object.__setattr__(self, "id", identity((name, getattr(self, name)) for name in _IDENTITY))
+
+
+_IDENTITY = ("signal", "follow", "gain", "kept", "coast", "output", "name", "noll", "delay_frames", "rate_hz")
 
 
 def at_rest(law: LinearLaw) -> Single:

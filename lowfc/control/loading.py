@@ -1,13 +1,16 @@
 """A calibration or a mode taken into use: the mirror stays where it is, whatever changes."""
 
+from dataclasses import replace
+
 import numpy as np
 import numpy.typing as npt
 
 from lowfc.control.additions import ADOPTED, Channel
 from lowfc.control.calibration import Calibration
+from lowfc.control.camera import CameraSettings, changes
 from lowfc.control.inputs import Raised
 from lowfc.control.safety import LoopMode
-from lowfc.control.state import Drive, Settings, State
+from lowfc.control.state import Conditions, Drive, Settings, State
 
 Single = npt.NDArray[np.float32]
 
@@ -15,7 +18,9 @@ ADOPTED_NM = 1.0
 """Of an actuator beyond the modal command, above which a mirror's shape is adopted as a channel."""
 
 
-def loaded(settings: Settings, state: State, calibration: Calibration, source: str) -> tuple[State, list[Raised]]:
+def loaded(
+    settings: Settings, state: State, calibration: Calibration, source: str, time_ns: int
+) -> tuple[State, list[Raised]]:
     """The state under another calibration, and what there is to say of it.
 
     Where the mirror has the same grid, its shape stays: the channels as they are, the rest as a command of the new
@@ -48,10 +53,47 @@ def loaded(settings: Settings, state: State, calibration: Calibration, source: s
         )
         drive, rest = adopted(drive, shape_nm)
         events += rest
-    mode = settings.start_mode if state.mode is LoopMode.IDLE else state.mode
-    if mode is not state.mode:
-        events.append(mode_event(state.mode, mode, "a calibration was loaded"))
-    return state._replace(mode=mode, drive=drive), events
+    before_mode, cause = state.mode, "a calibration was loaded"
+    mode = settings.start_mode if before_mode is LoopMode.IDLE else before_mode
+    if mode is LoopMode.SAFED:
+        cause = "it was in safe mode before the controller started"
+    state = state._replace(drive=drive)
+    if mode is LoopMode.CLOSED and (wrong := misfit(state)):
+        mode, cause = LoopMode.OPEN, f"the camera does not fit the calibration: {wrong}"
+    if mode is not before_mode:
+        events.append(mode_event(before_mode, mode, cause))
+        state = state._replace(mode=mode, conditions=_since(state, time_ns, cause))
+    return state, events
+
+
+def misfit(state: State) -> str:
+    """Why the camera, as its settings were last received, does not fit the calibration; empty where it does."""
+    camera, drive = state.conditions.camera, state.drive
+    if camera is None or drive is None:
+        return ""
+    return "; ".join(changes(camera, _expected(drive, camera)))
+
+
+def with_camera(state: State, camera: CameraSettings) -> State:
+    """The state with settings of the camera just received; the very same one where they are nothing new."""
+    drive, known = state.drive, state.conditions
+    if drive is not None and drive.camera is None and not changes(camera, _expected(drive, camera)):
+        state = state._replace(drive=drive._replace(camera=camera))
+    if camera != known.camera or known.camera_awaited:
+        state = state._replace(conditions=known._replace(camera=camera, camera_awaited=False))
+    return state
+
+
+def _expected(drive: Drive, camera: CameraSettings) -> CameraSettings:
+    """Settings of the calibration; where it has none yet, those of the camera as far as the calibration allows."""
+    if drive.camera is not None:
+        return drive.camera
+    calibration = drive.calibration
+    return replace(camera, shape=calibration.shape, saturation_dn=calibration.saturation_dn)
+
+
+def _since(state: State, time_ns: int, cause: str) -> Conditions:
+    return state.conditions._replace(mode_since_ns=time_ns, mode_cause=cause)
 
 
 def adopted(drive: Drive, shape_nm: Single) -> tuple[Drive, list[Raised]]:
@@ -69,7 +111,7 @@ def adopted(drive: Drive, shape_nm: Single) -> tuple[Drive, list[Raised]]:
     return drive, [Raised("SHAPE_ADOPTED", {"rms_nm": rms_nm})]
 
 
-def in_mode(state: State, mode: LoopMode) -> State:
+def in_mode(state: State, mode: LoopMode, time_ns: int, cause: str) -> State:
     """Nothing of the last mode goes on in the next one."""
     drive = state.drive
     if drive is not None and mode is not state.mode:
@@ -79,7 +121,9 @@ def in_mode(state: State, mode: LoopMode) -> State:
             drive = drive._replace(additions=added.lowered(drive.to_modes, only_flat=True) if safed else added)
         if drive.following is not None and mode is LoopMode.CLOSED:
             drive = drive._replace(following=drive.following.taking_over())
-    return state._replace(mode=mode, drive=drive, steps_left=0, homing=state.homing and mode is state.mode)
+    same = mode is state.mode
+    conditions = state.conditions if same else _since(state, time_ns, cause)
+    return state._replace(mode=mode, drive=drive, steps_left=0, homing=state.homing and same, conditions=conditions)
 
 
 def mode_event(before: LoopMode, after: LoopMode, why: str) -> Raised:

@@ -11,9 +11,10 @@ import numpy as np
 import numpy.typing as npt
 
 from lowfc.control import linear_law
+from lowfc.control.camera import CameraSettings
 from lowfc.control.estimator import Estimate, filled, saturated_pixels
 from lowfc.control.inputs import (
-    CameraSettings,
+    COUNT_BITS,
     Command,
     Frame,
     Input,
@@ -27,15 +28,15 @@ from lowfc.control.inputs import (
     Tick,
 )
 from lowfc.control.law import integrate
-from lowfc.control.loading import adopted, in_mode, loaded, mode_event
+from lowfc.control.loading import adopted, in_mode, loaded, misfit, mode_event, with_camera
 from lowfc.control.requests import answer
 from lowfc.control.safety import LoopMode, Reason, limit
 from lowfc.control.state import Drive, Settings, State
 
 Single = npt.NDArray[np.float32]
 
-COUNT_BITS = 32
-"""A frame's sequence is its publisher's start in seconds, shifted by this, and its count."""
+STEPPED = "its last step is done"
+WITNESSED = "the mirror's last command was sent in safe mode"
 
 
 def advance(settings: Settings, state: State, taken: Input) -> tuple[State, Outputs]:
@@ -53,12 +54,16 @@ def advance(settings: Settings, state: State, taken: Input) -> tuple[State, Outp
 
 def _frame(settings: Settings, state: State, frame: Frame) -> tuple[State, Outputs]:
     events: list[Raised] = []
+    if frame.ahead:
+        return _refuse(settings, state, frame, Reason.AHEAD, events)
     if frame.sequence <= state.frame_sequence:
         stale = Reason.REPEATED if frame.sequence == state.frame_sequence else Reason.OUT_OF_ORDER
         return _refuse(settings, state, frame, stale, events)
-    drive = _arrive(state, frame, events)
+    state, drive = _arrive(state, frame, events)
     if drive is None:
         return _refuse(settings, _newest(state, drive, frame), frame, Reason.NO_CALIBRATION, events)
+    if state.conditions.camera_awaited:
+        return _refuse(settings, _newest(state, drive, frame), frame, Reason.CAMERA_UNKNOWN, events)
     measured = _measure(settings, drive, frame)
     if isinstance(measured, Reason):
         return _refuse(settings, _newest(state, drive, frame), frame, measured, events)
@@ -79,7 +84,7 @@ def _frame(settings: Settings, state: State, frame: Frame) -> tuple[State, Outpu
     mode, command_nm = state.mode, drive.history_nm[0]
     steps_left, ended = max(state.steps_left - 1, 0), state.steps_left == 1
     if ended:
-        events += [Raised("LOOP_STEPPED", {}), mode_event(mode, LoopMode.OPEN, "its last step is done")]
+        events += [Raised("LOOP_STEPPED", {}), mode_event(mode, LoopMode.OPEN, STEPPED)]
     state = State(  # made anew: `_replace` takes four times as long
         mode,
         drive,
@@ -94,9 +99,10 @@ def _frame(settings: Settings, state: State, frame: Frame) -> tuple[State, Outpu
         taken=state.taken + 1,
         estimate=estimate,
         alike=alike,
+        conditions=state.conditions,
     )
     if ended:
-        state = in_mode(state, LoopMode.OPEN)
+        state = in_mode(state, LoopMode.OPEN, frame.time_ns, STEPPED)
     step = Step(
         frame.sequence,
         frame.time_ns,
@@ -108,12 +114,19 @@ def _frame(settings: Settings, state: State, frame: Frame) -> tuple[State, Outpu
         estimate.flux_dn,
         saturated,
     )
-    command = Command(frame.sequence, frame.time_ns, drive.actuators_nm, command_nm)
+    command = _command(state, drive, command_nm)
     return state, Outputs(step, command, None, events, changed=ended)
 
 
-def _arrive(state: State, frame: Frame, events: list[Raised]) -> Drive | None:
-    """The drive after the frames that never came before this one."""
+def _command(state: State, drive: Drive, command_nm: Single) -> Command:
+    """The command of the newest frame."""
+    safe = state.mode is LoopMode.SAFED
+    newest = state.frame_sequence, state.frame_time_ns
+    return Command(*newest, drive.actuators_nm, command_nm, safe, state.conditions.clear_id)
+
+
+def _arrive(state: State, frame: Frame, events: list[Raised]) -> tuple[State, Drive | None]:
+    """The state, and the drive after the frames that never came before this one."""
     if state.silent:
         events.append(Raised("FRAMES_BACK", {"silent_ms": (frame.time_ns - state.frame_time_ns) / 1e6}))
     drive = state.drive
@@ -125,10 +138,21 @@ def _arrive(state: State, frame: Frame, events: list[Raised]) -> Drive | None:
             drive = drive.missed(missing) if drive is not None else None
     elif state.frame_sequence:
         events.append(Raised("CAMERA_RESTARTED", {}))
+        state = _awaiting_camera(state, frame)
         if drive is not None and drive.additions is not None and drive.additions.play is not None:
             drive = drive._replace(additions=drive.additions.stopped(0))  # its frames were the former camera's
             events.append(Raised("PLAY_ENDED", {"why": "the camera restarted"}))
-    return drive
+    else:  # after a clear, this may be another start of the camera
+        state = _awaiting_camera(state, frame)
+    return state, drive
+
+
+def _awaiting_camera(state: State, frame: Frame) -> State:
+    """The state, in which settings are awaited unless those that are known may be of the camera's present start."""
+    camera = state.conditions.camera
+    if camera is None or camera.start_s in (0, frame.sequence >> COUNT_BITS):
+        return state
+    return state._replace(conditions=state.conditions._replace(camera_awaited=True))
 
 
 def _newest(state: State, drive: Drive | None, frame: Frame) -> State:
@@ -248,7 +272,7 @@ def _refuse(
     if drive is not None:
         if state.mode is LoopMode.SAFED:
             drive = _relax(settings, drive)
-        elif reason not in (Reason.REPEATED, Reason.OUT_OF_ORDER):  # those are no new exposure
+        elif reason not in (Reason.REPEATED, Reason.OUT_OF_ORDER, Reason.AHEAD):  # those are no new exposure
             drive = drive.missed(1)
         held = drive.history_nm[0]
     state = state._replace(
@@ -263,8 +287,7 @@ def _refuse(
     if drive is None:
         return state, Outputs(step=step, events=events)
     # Under the newest frame's sequence even where an older frame came: the mirror refuses older commands.
-    command = Command(state.frame_sequence, state.frame_time_ns, drive.actuators_nm, held)
-    return state, Outputs(step=step, command=command, events=events)
+    return state, Outputs(step=step, command=_command(state, drive, held), events=events)
 
 
 def _tick(settings: Settings, state: State, tick: Tick) -> tuple[State, Outputs]:
@@ -283,29 +306,34 @@ def _tick(settings: Settings, state: State, tick: Tick) -> tuple[State, Outputs]
         counts = _counted(counts, (Reason.NO_FRAME,))
     if flatten or safed:
         drive = _relax(settings, drive)
-    command = Command(state.frame_sequence, state.frame_time_ns, drive.actuators_nm, drive.history_nm[0])
     state = state._replace(drive=drive, silent=silent, commanded=True, counts=counts)
-    return state, Outputs(command=command, events=events)
+    return state, Outputs(command=_command(state, drive, drive.history_nm[0]), events=events)
 
 
 def _load(settings: Settings, state: State, load: Load) -> tuple[State, Outputs]:
-    state, events = loaded(settings, state, load.calibration, load.source)
+    state, events = loaded(settings, state, load.calibration, load.source, load.time_ns)
     return state, Outputs(events=events, changed=True)
 
 
 def _mirror(settings: Settings, state: State, shape: MirrorShape) -> tuple[State, Outputs]:
     """Start from where the mirror is, so that it does not jump; later shapes change nothing."""
-    drive = state.drive
-    if drive is None or state.commanded:
+    if state.commanded:
         return state, Outputs()
+    witnessed: list[Raised] = []
+    if shape.safe and state.mode is not LoopMode.SAFED:
+        witnessed = [mode_event(state.mode, LoopMode.SAFED, WITNESSED), Raised("SAFED", {"why": WITNESSED})]
+        state = in_mode(state, LoopMode.SAFED, shape.time_ns, WITNESSED)
+    drive = state.drive
+    if drive is None:
+        return state, Outputs(events=witnessed, changed=bool(witnessed))
     if shape.actuators_nm.shape != drive.calibration.grid or not np.isfinite(shape.actuators_nm).all():
         why = f"the mirror has a grid of {shape.actuators_nm.shape}, the calibration {drive.calibration.grid}"
-        return state, Outputs(events=[Raised("MIRROR_REFUSED", {"why": why})])
+        return state, Outputs(events=[*witnessed, Raised("MIRROR_REFUSED", {"why": why})], changed=bool(witnessed))
     limit_nm = drive.law.limit_nm
     believed = shape.command_nm.shape == limit_nm.shape and (np.abs(shape.command_nm) <= limit_nm).all()
     command_nm = shape.command_nm if believed else drive.inverse @ shape.actuators_nm.reshape(-1)
     drive = drive._replace(actuators_nm=shape.actuators_nm, history_nm=(command_nm,) * len(drive.history_nm))
-    events = []
+    events = witnessed
     if command_nm.any():
         events.append(Raised("MIRROR_ADOPTED", {"rms_nm": float(np.sqrt(command_nm @ command_nm))}))
     if state.mode is not LoopMode.SAFED:  # then it is on its way to flat, and shall stay there
@@ -315,27 +343,19 @@ def _mirror(settings: Settings, state: State, shape: MirrorShape) -> tuple[State
 
 
 def _camera(settings: Settings, state: State, camera: CameraSettings) -> tuple[State, Outputs]:
-    """Open the loop where the camera is no longer the one that was calibrated."""
-    if state.drive is None or state.mode is not LoopMode.CLOSED:
+    """Keep the camera's settings; open the loop where it is no longer the camera that was calibrated."""
+    after = with_camera(state, camera)
+    if after is state:
         return state, Outputs()
-    calibration = state.drive.calibration
-    wrong = [
-        f"{name} is {got}, calibrated {want}"
-        for name, got, want in (
-            ("rows", camera.shape[0], calibration.shape[0]),
-            ("columns", camera.shape[1], calibration.shape[1]),
-            ("saturation_dn", camera.saturation_dn, calibration.saturation_dn),
-            ("bias_dn", camera.bias_dn, float(np.median(calibration.dark))),
-        )
-        if not abs(got - want) < 1
-    ]
-    if not wrong:
-        return state, Outputs()
-    events = [
-        Raised("CAMERA_CHANGED", {"what": "; ".join(wrong)}),
-        mode_event(state.mode, LoopMode.OPEN, "the camera changed"),
-    ]
-    return in_mode(state, LoopMode.OPEN), Outputs(events=events, changed=True)
+    wrong = misfit(after)
+    if not wrong or wrong == misfit(state):
+        return after, Outputs(changed=True)
+    events = [Raised("CAMERA_CHANGED", {"what": wrong})]
+    if after.mode is LoopMode.CLOSED:
+        cause = f"the camera does not fit the calibration: {wrong}"
+        events.append(mode_event(after.mode, LoopMode.OPEN, cause))
+        after = in_mode(after, LoopMode.OPEN, camera.time_ns, cause)
+    return after, Outputs(events=events, changed=True)
 
 
 def _request(settings: Settings, state: State, request: Request) -> tuple[State, Outputs]:

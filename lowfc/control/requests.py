@@ -10,11 +10,11 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from lowfc.control.additions import FLAT, MIRROR, OFFSET, Additions, play
+from lowfc.control.additions import FLAT, MIRROR, Additions, Play, play_table
 from lowfc.control.inputs import Raised, Request
 from lowfc.control.law import Law
 from lowfc.control.linear_law import LinearLaw
-from lowfc.control.loading import in_mode, loaded, mode_event
+from lowfc.control.loading import in_mode, loaded, misfit, mode_event
 from lowfc.control.margins import check_stable
 from lowfc.control.safety import Limits, LoopMode, neighbour_difference_nm, request_mode
 from lowfc.control.stability import limiting_gain
@@ -27,6 +27,10 @@ SAME_RATE = 0.01
 """By which the rate of a law's frames may differ from the camera's."""
 MOST_TEXT = 10_000
 """Characters of a note."""
+MOST_REPLY = 1000
+"""Characters of a reply."""
+REFUSED_IN_A_ROW = 3
+"""Frames refused in a row from which on the loop is not closed; fewer may be a hiccup."""
 
 
 class Answer(NamedTuple):
@@ -42,17 +46,45 @@ def answer(settings: Settings, state: State, request: Request) -> Answer:
     """What a request does; a refused one changes nothing."""
     handler = _HANDLERS.get(request.name)
     if handler is None:
-        return Answer(state, False, f"unknown request {request.name!r}; there are {', '.join(REQUESTS)}")
+        return Answer(state, False, _short(f"unknown request {request.name[:40]!r}; there are {', '.join(REQUESTS)}"))
+    request = prepared(settings, request)
+    if request.refusal:
+        return Answer(state, False, _short(request.refusal))
     try:
         after, text, *events = handler(settings, state, request)
     except ValueError as error:
-        return Answer(state, False, str(error))
+        return Answer(state, False, _short(str(error)))
     if after.mode is not state.mode:
-        why = f"operator asked to {request.name}"
+        why = _asked(request)
         events.append(mode_event(state.mode, after.mode, why))
         if after.mode is LoopMode.SAFED:
             events.append(Raised("SAFED", {"why": why}))
     return Answer(after, True, text, tuple(events))
+
+
+def prepared(settings: Settings, request: Request) -> Request:
+    """The request, checked for what needs no state and may take long: for a thread that no frame waits for.
+
+    What is wrong with it is its `refusal`. A request that was prepared is returned as it is.
+    """
+    if request.prepared:
+        return request
+    try:
+        if request.law is not None:
+            check_law(request.law, settings.delay_frames, settings.rate_hz)
+        if request.name == "play":
+            request = replace(request, played=play_table(request.text, request.table, request.actuators_nm.reshape(-1)))
+    except ValueError as error:
+        request = replace(request, refusal=str(error))
+    return replace(request, prepared=True)
+
+
+def _asked(request: Request) -> str:
+    return f"operator asked to {request.name}"
+
+
+def _short(text: str) -> str:
+    return text if len(text) <= MOST_REPLY else f"{text[: MOST_REPLY - 3]}..."
 
 
 Handled = tuple[State, str] | tuple[State, str, Raised]
@@ -69,7 +101,32 @@ def _mode(settings: Settings, state: State, request: Request) -> Handled:
     after, refusal = request_mode(state.mode, asked, calibrated=state.drive is not None)
     if refusal:
         raise ValueError(refusal)
-    return in_mode(state, after), f"loop {after.name.lower()}"
+    if after is LoopMode.CLOSED:
+        _check_closable(state)
+    if request.name == "clear":  # the camera's and the mirror's numbers may begin anew, too
+        conditions = state.conditions._replace(clear_id=request.time_ns)
+        state = state._replace(frame_sequence=0, conditions=conditions)
+    return in_mode(state, after, request.time_ns, _asked(request)), f"loop {after.name.lower()}"
+
+
+def _check_closable(state: State) -> None:
+    """Refuse to close the loop on a camera that is known to be wrong, or none of whose frames can be used."""
+    _check_camera(state)
+    if state.refused is not None and state.refused_count >= REFUSED_IN_A_ROW:
+        raise ValueError(
+            f"the last {state.refused_count} frames were refused as {state.refused.name}: correct this first; if the "
+            "frame sequences are wrong, `lowfc ctl safe` and then `lowfc ctl clear` reset the newest sequence"
+        )
+
+
+def _check_camera(state: State) -> None:
+    wrong = misfit(state)
+    if wrong:
+        raise ValueError(
+            f"the camera does not fit the calibration ({wrong}): set it back, or load a calibration made with it"
+        )
+    if state.conditions.camera_awaited:
+        raise ValueError("the camera restarted, and its settings have not been received yet: try again")
 
 
 def _step(settings: Settings, state: State, request: Request) -> Handled:
@@ -79,7 +136,8 @@ def _step(settings: Settings, state: State, request: Request) -> Handled:
     after, refusal = request_mode(state.mode, "close", calibrated=state.drive is not None)
     if refusal:
         raise ValueError(refusal)
-    state = in_mode(state, after)
+    _check_closable(state)
+    state = in_mode(state, after, request.time_ns, _asked(request))
     return state._replace(steps_left=int(frames)), f"loop closed for {frames:g} frames"
 
 
@@ -143,21 +201,26 @@ def _play(settings: Settings, state: State, request: Request) -> Handled:
     added = drive.added()
     if added.play is not None:
         raise ValueError("something is being played already: `lowfc ctl stop` ends it")
-    grid = drive.calibration.grid
-    actuators = grid[0] * grid[1]
-    if request.actuators_nm.size % actuators:
-        raise ValueError(
-            f"the shapes of a play have {actuators} actuators each, got {request.actuators_nm.size} in all"
-        )
-    basis = request.actuators_nm.reshape(-1, actuators)
-    first = state.frame_sequence + 1
-    made = play(request.text, first, request.table, basis, len(drive.calibration.noll), grid)
-    largest = np.abs(made.table).max(axis=0).astype(np.float64)
-    if made.target == MIRROR and largest @ np.abs(basis).max(axis=1) > settings.limits.stroke_nm:
-        raise ValueError(f"the shapes of the play may go beyond the stroke of {settings.limits.stroke_nm:g} nm")
-    if made.target == OFFSET and (largest > drive.law.limit_nm).any():
-        raise ValueError(f"an offset may be as large as the mode's limit, {drive.law.limit_nm.tolist()} nm")
-    return _with(state, drive, added._replace(play=made)), f"playing {len(made.table)} frames on the {made.target}"
+    table = request.played
+    assert table is not None  # noqa: S101  # prepared
+    if table.target == MIRROR:
+        grid = drive.calibration.grid
+        if table.basis.shape[1] != grid[0] * grid[1]:
+            raise ValueError(
+                f"a play needs a shape of {grid[0]} x {grid[1]} actuators for each of {len(table.largest)} columns, "
+                f"got {table.basis.shape[1]} actuators for each"
+            )
+        if table.reach_nm > settings.limits.stroke_nm:
+            raise ValueError(f"the shapes of the play may go beyond the stroke of {settings.limits.stroke_nm:g} nm")
+    else:
+        modes = len(drive.calibration.noll)
+        if len(table.largest) != modes:
+            raise ValueError(f"a play on the offset has {modes} columns, one for each mode; got {len(table.largest)}")
+        if (table.largest > drive.law.limit_nm).any():
+            raise ValueError(f"an offset may be as large as the mode's limit, {drive.law.limit_nm.tolist()} nm")
+    frames = len(table.rows)
+    made = Play(table, state.frame_sequence + 1, frames)
+    return _with(state, drive, added._replace(play=made)), f"playing {frames} frames on the {table.target}"
 
 
 def _stop(settings: Settings, state: State, request: Request) -> Handled:
@@ -171,10 +234,10 @@ def _law(settings: Settings, state: State, request: Request) -> Handled:
     drive = _drive(state)
     if request.law is None:
         return state._replace(drive=drive._replace(following=None)), "the integrator drives the mirror"
+    _check_camera(state)
     law = request.law
     if law.noll != drive.calibration.noll:
         raise ValueError(f"the law is of the modes {list(law.noll)}, the loop of {list(drive.calibration.noll)}")
-    check_law(law, settings.delay_frames, settings.rate_hz)
     drive = drive._replace(following=Following.at_rest(law))
     return state._replace(drive=drive), f"the law {law.name!r} takes over from the integrator"
 
@@ -209,7 +272,7 @@ def _load(settings: Settings, state: State, request: Request) -> Handled:
             f"the calibration is for a mirror of {request.calibration.grid} actuators, this one has "
             f"{before.calibration.grid}"
         )
-    after, events = loaded(settings, state, request.calibration, "operator")
+    after, events = loaded(settings, state, request.calibration, "operator", request.time_ns)
     return after, f"calibration {request.calibration.id[:12]}", events[0]
 
 

@@ -38,12 +38,15 @@ class Reason(IntEnum):
     DARK = 7
     NO_FRAME = 8
     STUCK = 9
+    AHEAD = 10
+    CAMERA_UNKNOWN = 11
     MODAL_LIMIT = 20
     STROKE = 21
     SLEW = 22
     NEIGHBOUR = 23
     NOT_FINITE = 24
     WRONG_GRID = 25
+    CHANNEL = 26
 
 
 @dataclass(frozen=True, slots=True)

@@ -11,6 +11,7 @@ import numpy.typing as npt
 from lowfc.control import linear_law
 from lowfc.control.additions import Additions
 from lowfc.control.calibration import Calibration
+from lowfc.control.camera import CameraSettings
 from lowfc.control.estimator import Estimate, Estimator
 from lowfc.control.law import Law
 from lowfc.control.linear_law import LinearLaw
@@ -114,6 +115,8 @@ class Drive(NamedTuple):
         inverse: (modes, actuators) modal command of a mirror shape.
         to_modes: (modes, actuators) what the sensor sees of a mirror shape.
         weights: which commands of the history are seen in an exposure, and how much of each.
+        camera: settings that the calibration goes with: its own, or the first received after it was loaded; None until
+            then.
         following: a law in place of the integrator's.
         additions: to what the law commands; None for nothing at all.
         history_nm: modal commands, newest first.
@@ -127,6 +130,7 @@ class Drive(NamedTuple):
     inverse: Single
     to_modes: Single
     weights: tuple[tuple[int, np.float32], ...]
+    camera: CameraSettings | None
     following: Following | None
     additions: Additions | None
     history_nm: tuple[Single, ...]
@@ -146,6 +150,7 @@ class Drive(NamedTuple):
             inverse,
             calibration.actuators_to_modes if calibration.actuators_to_modes.size else inverse,
             tuple((lag, weight) for lag, weight in enumerate(weights) if weight),
+            calibration.camera,
             None,
             None,
             (np.zeros(modes, np.float32),) * len(weights),
@@ -188,6 +193,23 @@ class Drive(NamedTuple):
         return stayed._replace(following=self.following.coasted(frames, self.history_nm[0]))
 
 
+class Conditions(NamedTuple):
+    """What of the state changes rarely.
+
+    Attributes:
+        camera: settings of the camera as last received; None before the first.
+        camera_awaited: the camera restarted, and its settings have not been received since.
+        clear_id: identity of the operator's last clear; 0 without one.
+        mode_since_ns: time of the change to this loop mode, and `mode_cause` its cause.
+    """
+
+    camera: CameraSettings | None = None
+    camera_awaited: bool = False
+    clear_id: int = 0
+    mode_since_ns: int = 0
+    mode_cause: str = ""
+
+
 class State(NamedTuple):
     """Everything the next command depends on.
 
@@ -218,4 +240,5 @@ class State(NamedTuple):
     homing: bool = False
     estimate: Estimate | None = None
     alike: int = 0
+    conditions: Conditions = Conditions()
     taken: int = 0

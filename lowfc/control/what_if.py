@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from lowfc.control.inputs import COUNT_BITS
 from lowfc.control.law import Law, integrate
-from lowfc.control.loop import COUNT_BITS
 from lowfc.control.stability import delay_weights
 
 Single = npt.NDArray[np.float32]

@@ -141,20 +141,31 @@ def controller(
 
     Example: lowfc controller --run bench --calibration calibration.fits
     """
+    import signal
+
     from rich.console import Console
 
     from lowfc.adapters.calibration_file import load
     from lowfc.adapters.join import join
+    from lowfc.adapters.latch import Latch, latch_files
     from lowfc.adapters.run import open_run
     from lowfc.contract.messages import Role
     from lowfc.programs.analytic import analytic
     from lowfc.programs.controller import Controller
 
+    signalled: list[int] = []  # before there is a loop to be made safe
+    signal.signal(signal.SIGUSR1, lambda number, _: signalled.append(number))
     settings = configuration(config)
     found = load(calibration) if calibration is not None else analytic(settings, Console(stderr=True))
     service = join(settings, run, Role.CONTROLLER, settings.realtime.controller_cpus)
     source = calibration.name if calibration is not None else "the configuration"
-    process = Controller(settings, service, found, source, open_run(run, (settings.mirror.name,)).path / "safed")
+    latch = Latch(
+        latch_files(open_run(run, (settings.mirror.name,))), lambda why: service.event("LATCH_FAILED", why=why)
+    )
+    process = Controller(settings, service, found, source, latch)
+    signal.signal(signal.SIGUSR1, lambda number, _: process.safe_by_signal())
+    if signalled:
+        process.safe_by_signal()
     service.fill = process.fill
     service.catch_signals()
     with closing(service.bus):  # a callback on zenoh's threads must not outlive the interpreter

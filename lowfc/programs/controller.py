@@ -1,23 +1,23 @@
 """The controller's process: `advance` folded over what the bus brings; the command first, then all the rest."""
 
 import threading
+import time
 from collections import deque
 from dataclasses import replace
 from functools import partial
-from pathlib import Path
-
-import numpy as np
 
 from lowfc.adapters.bus import ALL, Query, Sample
 from lowfc.adapters.clock import SimulatedClock
 from lowfc.adapters.instrument import settings
+from lowfc.adapters.latch import Latch
 from lowfc.adapters.mailbox import Mailbox
 from lowfc.adapters.realtime import let_send
 from lowfc.adapters.service import Service
+from lowfc.adapters.start_check import StartCheck
 from lowfc.contract import codec
-from lowfc.contract.calibration_codec import encode_calibration
 from lowfc.contract.configuration import Configuration
-from lowfc.contract.errors import CalibrationError
+from lowfc.contract.envelope import start_of
+from lowfc.contract.errors import BadMessageError, CalibrationError
 from lowfc.contract.messages import (
     CALIBRATION,
     CAMERA_STATE,
@@ -25,23 +25,28 @@ from lowfc.contract.messages import (
     CONTROL_INPUT,
     CONTROLLER_STATE,
     FRAME,
+    LAW,
     MIRROR_STATE,
     OFFLOAD,
+    PLAY,
     REQUEST,
     REQUEST_KEY,
+    SEQUENCES,
     STEP,
     TIMING,
-    timestamp,
     wire,
 )
 from lowfc.contract.state_codec import controller_state, reason_counts
 from lowfc.control.calibration import Calibration
+from lowfc.control.camera import CameraSettings
 from lowfc.control.durations import Durations
-from lowfc.control.inputs import CameraSettings, Input, Load, MirrorShape, Outputs, Reply, Request, Step, Tick
+from lowfc.control.inputs import Input, Load, MirrorShape, Outputs, Reply, Request, Tick
+from lowfc.control.loading import misfit
 from lowfc.control.loop import advance
-from lowfc.control.requests import CONFIGURATION
+from lowfc.control.requests import CONFIGURATION, MOST_REPLY, prepared
 from lowfc.control.safety import LoopMode
 from lowfc.control.state import State
+from lowfc.programs.controller_report import Arrays, NotClosed, Offload, StageTiming
 from lowfc.programs.rehearsal import Rehearsal
 from lowfc.programs.start_up import StartUp
 
@@ -49,8 +54,11 @@ TICK_NS = 10_000_000
 """Without frames the held command is repeated this often."""
 MIRROR_PATIENCE_S = 1.0
 """How long the start waits to learn where the mirror is."""
+CAMERA_PATIENCE_NS = 20_000_000_000
+"""How long the start of a lockstep run waits for the camera's settings."""
+CAMERA_PERIOD_NS = 500_000_000
+"""How often a camera that restarted is asked for its settings."""
 STATE_PERIOD_NS = 1_000_000_000
-TIMING_PERIOD_NS = 100_000_000
 CHANNEL = "lowfc"
 
 
@@ -58,17 +66,26 @@ class Controller:
     """Receives frames, sends commands, answers operators, until told to stop."""
 
     def __init__(
-        self, config: Configuration, service: Service, calibration: Calibration, source: str, latch: Path
+        self, config: Configuration, service: Service, calibration: Calibration, source: str, latch: Latch
     ) -> None:
-        """Declare everything on the bus and load the calibration; the file `latch` is there while the loop is safed."""
+        """Declare everything on the bus and load the calibration."""
         name = config.mirror.name
         self._service = service
         self._latch = latch
         self._settings = settings(config)
         self._configuration = config.to_toml()
         self._start_up = StartUp(config)
-        if latch.exists():  # safed stays safed when the controller dies
+        if latch.safe:  # what was made safe stays so when the controller dies
             self._settings = replace(self._settings, start_mode=LoopMode.SAFED)
+        elif not latch.kept:  # safe could not be remembered: nothing is driven until somebody is there
+            self._settings = replace(self._settings, start_mode=LoopMode.OPEN)
+        self._kept_safe = latch.safe
+        self._safe_signalled = False
+        self._start_check = StartCheck(
+            service.clock,
+            config.control.max_start_ahead_h,
+            lambda start, here: service.event("START_AHEAD", what="frames", start=start, here=here),
+        )
         rehearses = config.realtime.rehearse and not config.lockstep
         self._rehearsal = Rehearsal(config.period_ns) if rehearses else None
         self._last: Sample | None = None
@@ -88,25 +105,23 @@ class Controller:
         self._inputs = service.publisher(CONTROL_INPUT)
         self._states = service.publisher(CONTROLLER_STATE)
         self._requests = service.publisher(REQUEST)
-        self._timings = service.publisher(TIMING)
-        self._offloads = service.publisher(OFFLOAD)
-        self._offload_frames = max(1, round(1e9 / float(OFFLOAD.rate) / config.period_ns))
-        self._offloaded_nm, self._offloaded = np.zeros(0), 0
-        self._offloaded_noll: tuple[int, ...] = ()
+        self._timing = StageTiming(service.publisher(TIMING))
+        self._arrays = Arrays(*(service.publisher(topic) for topic in (CALIBRATION, LAW, PLAY)))
+        self._offload = Offload(service.publisher(OFFLOAD), round(1e9 / float(OFFLOAD.rate) / config.period_ns))
+        self._not_closed = NotClosed()
         self._queries: deque[Query] = deque()
         service.bus.queryable(REQUEST_KEY.format(name=ALL), self._ask)
         self._frame_to_command = Durations()
-        self._timing = wire.ControlTiming()
-        self._timing_due_ns = self._state_due_ns = 0
+        self._state_due_ns = self._camera_due_ns = 0
         self._last_frame_ns = service.clock.host_ns()
         now_ns = service.clock.now_ns()
-        self._calibrations = service.publisher(CALIBRATION)
-        self._calibrations.put(encode_calibration(calibration, now_ns))
+        self._arrays.publish(Request(now_ns, "load", calibration=calibration))
         self._take(Load(now_ns, calibration, source))
         service.state = "ready"
 
     def run(self) -> None:
         """Do all but the frames: those are dealt with where they arrive, one turn each."""
+        self._await_camera()
         self._adopt_mirror()
         self._service.state = "running"
         with self._turn:
@@ -121,18 +136,26 @@ class Controller:
                 continue  # the rest can wait until the frame has come
             with self._turn:
                 self._between_frames(camera)
+            if self._safe_signalled:
+                self._obey_signal()
             for _ in range(len(self._queries)):
                 self._answer(self._queries.popleft())
+            self._keep_safe()
+            if self._state.conditions.camera_awaited:
+                self._ask_camera()
             self._service.beat()
         self._leave_camera()
         with self._turn:
-            self._publish_timing()
+            self._timing.publish(self._service.clock.host_ns())
+        self._latch.close()
         self._service.finish()
 
     def fill(self, health: wire.Health) -> None:
         """Add mode, counts and latency to a Health."""
         health.mode = self._state.mode.value  # type: ignore[assignment]  # numbered alike
         health.counts.extend(reason_counts(self._state))
+        now_ns = self._service.clock.now_ns()
+        health.not_closed_ns, health.not_closed_cause = self._not_closed.note(self._state, now_ns)
         if self._frame_to_command.count:
             health.frame_to_command.CopyFrom(codec.latency(self._frame_to_command))
 
@@ -155,7 +178,12 @@ class Controller:
         age_ns = 0 if clock.lockstep else taken_ns - sample.publish_time_ns
         if overtaken:
             age_ns = max(age_ns, self._settings.late_ns + 1)
-        frame = codec.decode_frame(sample.payload, sample.sequence, age_ns)
+        try:
+            ahead = self._start_check.ahead(sample.sequence)
+            frame = codec.decode_frame(sample.payload, sample.sequence, age_ns, ahead=ahead)
+        except BadMessageError as fault:
+            self._service.unreadable(sample.key, fault)
+            return
         if isinstance(clock, SimulatedClock):
             clock.set_ns(frame.time_ns)
         outputs = self._advance(frame)
@@ -168,15 +196,8 @@ class Controller:
             self._last_frame_ns = taken_ns
         self._service.work += 1
         self._frame_to_command.add(sent_ns - sample.publish_time_ns)
-        timing = self._timing
-        timing.frame_sequence.append(sample.sequence)
-        timing.transport_ns.append(_column(sample.receive_time_ns - sample.publish_time_ns))
-        timing.wakeup_ns.append(_column(taken_ns - sample.receive_time_ns))
-        timing.compute_ns.append(_column(ready_ns - taken_ns))
-        timing.publish_ns.append(_column(sent_ns - ready_ns))
-        timing.frame_to_command_ns.append(_column(sent_ns - sample.publish_time_ns))
-        if sent_ns >= self._timing_due_ns:
-            self._publish_timing()
+        moments_ns = sample.receive_time_ns, taken_ns, ready_ns, sent_ns
+        self._timing.add(sample.sequence, sample.publish_time_ns, moments_ns)
         if clock.now_ns() >= self._state_due_ns:  # not by the frame's time: a camera's clock may be another
             self._publish_state(frame.time_ns)
         if self._rehearsal is not None:
@@ -195,7 +216,7 @@ class Controller:
         What happens between two frames pushes them out.
         """
         with self._turn:
-            if self._last is None:
+            if self._last is None or self._state.frame_sequence + 1 >= SEQUENCES:
                 return
             frame = codec.decode_frame(self._last.payload, self._state.frame_sequence + 1, 0)
             _, outputs = advance(self._settings, self._state, frame)
@@ -205,9 +226,7 @@ class Controller:
     def _between_frames(self, camera: Sample | None) -> None:
         """Apply what the camera says of itself; without frames, hold."""
         if camera is not None:
-            settings_now = codec.decode_camera(camera.payload)
-            if settings_now is not None:
-                self._take(settings_now)
+            self._take_camera(camera)
         silent_ns = self._service.clock.host_ns() - self._last_frame_ns
         if silent_ns >= TICK_NS and not self._service.clock.lockstep:
             self._take(Tick(self._service.clock.now_ns(), silent_ns))
@@ -216,10 +235,12 @@ class Controller:
         """Apply what an operator asked between two frames; they do not wait while it is decoded, nor for its answer."""
         now_ns = self._service.clock.now_ns()
         try:
-            request = codec.decode_request(query.payload, query.name, now_ns)
+            if query.name == "safe":  # whatever came along with it
+                query.payload = b""
+            request = prepared(self._settings, codec.decode_request(query.payload, query.name, now_ns))
         except ValueError as error:
             request = Request(now_ns, query.name)
-            reply, state, taken = Reply(False, str(error), self._state.frame_sequence + 1), self._state, 0
+            reply, state, taken = Reply(False, str(error)[:MOST_REPLY], self._state.frame_sequence + 1), self._state, 0
         else:
             reply, state, taken = self._asked(request)
         shown = controller_state(state, self._settings, now_ns) if request.name == "status" else None
@@ -231,17 +252,63 @@ class Controller:
         """The reply, the state that it tells of, and its number; 0 for one that is no input of the control law."""
         if request.name == CONFIGURATION:
             return Reply(True, self._configuration, self._state.frame_sequence + 1), self._state, 0
-        if request.calibration is not None:
-            self._calibrations.put(encode_calibration(request.calibration, request.time_ns))
+        self._arrays.publish(request)
         with self._turn:
             outputs = self._advance(request)
             state = self._state
             self._tell(outputs)
         reply = outputs.reply
         assert reply is not None  # noqa: S101  # every request has an answer
-        if request.calibration is not None and state.drive is not None and not reply.accepted:
-            self._calibrations.put(encode_calibration(state.drive.calibration, request.time_ns))  # the last is in use
+        if not reply.accepted:
+            self._arrays.publish_in_use(request, state)
         return reply, state, state.taken
+
+    def safe_by_signal(self) -> None:
+        """Make the loop safe as soon as the main thread gets there; to be called from a signal."""
+        self._safe_signalled = True
+        self._camera.wake()
+
+    def _obey_signal(self) -> None:
+        self._safe_signalled = False
+        request = Request(self._service.clock.now_ns(), "safe", text="SIGUSR1")
+        reply, _, taken = self._asked(request)
+        self._requests.put(codec.encode_request(request, reply, taken, None))
+
+    def _keep_safe(self) -> None:
+        """Let the latch follow the loop mode: after the answer, and by a thread of its own."""
+        safe = self._state.mode is LoopMode.SAFED
+        if safe is not self._kept_safe:
+            self._kept_safe = safe
+            self._latch.set(safe)
+
+    def _take_camera(self, sample: Sample) -> None:
+        try:
+            self._take(codec.decode_camera(sample.payload, start_of(sample.sequence)))
+        except BadMessageError as fault:
+            self._service.unreadable(sample.key, fault)
+
+    def _ask_camera(self) -> None:
+        """Ask for the settings that frames wait for: a camera may tell of them seldom."""
+        now_ns = self._service.clock.host_ns()
+        if now_ns < self._camera_due_ns:
+            return
+        self._camera_due_ns = now_ns + CAMERA_PERIOD_NS
+        for sample in self._service.bus.get(CAMERA_STATE.key, timeout_s=0.1):
+            with self._turn:
+                self._take_camera(sample)
+
+    def _await_camera(self) -> None:
+        """Take the camera's settings before its first frame; in lockstep wait for them, so that runs are the same."""
+        clock = self._service.clock
+        deadline_ns = clock.host_ns() + (CAMERA_PATIENCE_NS if clock.lockstep else 0)
+        while self._service.running:
+            for sample in self._service.bus.get(CAMERA_STATE.key, timeout_s=0.2):
+                self._take_camera(sample)
+                return
+            if clock.host_ns() >= deadline_ns:
+                return
+            self._service.beat()
+            time.sleep(0.02)
 
     def _adopt_mirror(self) -> None:
         """Learn where the mirror is before the first command, so that it does not jump."""
@@ -250,7 +317,11 @@ class Controller:
             return
         sample = self._mirror.take(MIRROR_PATIENCE_S)
         self._leave_mirror()  # from here its states would only cost time
-        shape = codec.decode_mirror(sample.payload) if sample is not None else None
+        try:
+            shape = codec.decode_mirror(sample.payload) if sample is not None else None
+        except BadMessageError as fault:
+            self._service.unreadable(MIRROR_STATE.key, fault)
+            shape = None
         if shape is not None:
             grid = self._state.drive.calibration.grid if self._state.drive is not None else shape.actuators_nm.shape
             if shape.actuators_nm.shape != grid:
@@ -265,10 +336,15 @@ class Controller:
     def _begin(self) -> None:
         """Ask for what the configuration puts on the mirror, and for its law, as an operator would."""
         for request in self._start_up.requests(self._state, self._service.clock.now_ns()):
+            request = prepared(self._settings, request)
+            self._arrays.publish(request)
             outputs = self._advance(request)
             assert outputs.reply is not None  # noqa: S101  # every request has an answer
             self._requests.put(codec.encode_request(request, outputs.reply, self._state.taken, None))
             self._tell(outputs)
+            if not outputs.reply.accepted and request.name == "law" and misfit(self._state):
+                self._service.event("LAW_NOT_IN_FORCE", why=outputs.reply.text)  # and the loop is open
+                continue
             if not outputs.reply.accepted:
                 self._start_up.refused(request, outputs.reply.text)
                 break
@@ -294,48 +370,21 @@ class Controller:
         """Publish the step and the events, and the state where more of it changed than the next frame shows."""
         if outputs.step is not None:
             self._steps.put(codec.encode_step(outputs.step, self._state.taken))
-            self._offload(outputs.step)
+            if self._state.drive is not None:
+                self._offload.add(outputs.step, self._state.drive.calibration.noll)
         for event in outputs.events:
             self._service.event(event.name, **event.details)
         if outputs.changed:
-            self._publish_state(self._service.clock.now_ns())
-            if self._state.mode is LoopMode.SAFED:
-                self._latch.touch()
-            else:
-                self._latch.unlink(missing_ok=True)
-
-    def _offload(self, step: Step) -> None:
-        """Once a second, the mean modal command, for whoever can take it over; by counting, as lockstep needs it."""
-        if self._state.drive is None:
-            return
-        noll = self._state.drive.calibration.noll
-        if self._offloaded_noll != noll:
-            self._offloaded_nm, self._offloaded, self._offloaded_noll = np.zeros(len(noll)), 0, noll
-        self._offloaded_nm += step.command_nm
-        self._offloaded += 1
-        if self._offloaded >= self._offload_frames:
-            self._offloads.put(codec.encode_offload(step, noll, self._offloaded_nm / self._offloaded, self._offloaded))
-            self._offloaded_nm[:] = self._offloaded = 0
+            now_ns = self._service.clock.now_ns()
+            self._not_closed.note(self._state, now_ns)
+            self._publish_state(now_ns)
 
     def _publish_state(self, time_ns: int) -> None:
         message = controller_state(self._state, self._settings, time_ns)
         self._states.put(message.SerializeToString())
         self._state_due_ns = self._service.clock.now_ns() + STATE_PERIOD_NS
 
-    def _publish_timing(self) -> None:
-        now_ns = self._service.clock.host_ns()
-        self._timing_due_ns = now_ns + TIMING_PERIOD_NS
-        if self._timing.frame_sequence:
-            self._timing.timestamp.CopyFrom(timestamp(now_ns))
-            self._timings.put(self._timing.SerializeToString())
-            self._timing = wire.ControlTiming()
-
     def _ask(self, query: Query) -> None:
         """On the bus's thread: leave the request for the loop, and wake it."""
         self._queries.append(query)
         self._camera.wake()
-
-
-def _column(duration_ns: int) -> int:
-    """Fit a duration into the 32 bits of its column: a camera's clock may be wrong, and a process may be stopped."""
-    return min(max(0, duration_ns), 0xFFFF_FFFF)

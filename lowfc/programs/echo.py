@@ -19,7 +19,6 @@ import zenoh
 from zenoh.handlers import Callback
 
 from lowfc.adapters.clock import HostClock
-from lowfc.adapters.envelope import Envelope
 from lowfc.adapters.join import prepare
 from lowfc.adapters.realtime import let_send
 from lowfc.adapters.run import Run, open_run
@@ -27,6 +26,7 @@ from lowfc.adapters.terminal import DEFAULT_RUN, ConfigFile, RunId, configuratio
 from lowfc.adapters.whole_file import being_written
 from lowfc.adapters.zenoh_bus import declare_publisher, session_config
 from lowfc.contract.configuration import Configuration
+from lowfc.contract.envelope import Envelope
 from lowfc.contract.errors import BusError
 from lowfc.contract.messages import COMMAND, FRAME, Role
 from lowfc.programs.frame_source import ANSWER_S, FRAMES_FILE, Payloads

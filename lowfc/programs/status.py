@@ -86,7 +86,9 @@ def summary_text(figures: dict[str, Any]) -> str:
     def percentiles(values: dict[str, float]) -> str:
         return "   ".join(f"{name.replace('_', '.')} {value:.0f} us" for name, value in values.items())
 
+    not_closed = f"not closed for {figures['not_closed_s']:.1f} s: {figures['not_closed_cause']}"
     lines = [
+        f"loop               {not_closed if figures['not_closed_s'] else 'closed all the time'}",
         f"rate               {figures['rate_hz']:.1f} Hz",
         f"frames             {figures['frames_published']} published, {figures['frames_processed']} processed, "
         f"{figures['frames_skipped']} skipped, {figures['frames_missing']} missing",

@@ -44,6 +44,8 @@ def summary(watch: Watch, record: bool) -> dict[str, Any]:
         "frames_missing": frames.missing,
         "commands_applied": camera.frame_to_mirror.count,
         "commands_late": camera.commands_late,
+        "not_closed_s": round(controller.not_closed_ns * 1e-9, 3),
+        "not_closed_cause": controller.not_closed_cause,
         "messages_recorded": None,
         "messages_lost": None,
         "lost": {},

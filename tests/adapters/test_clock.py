@@ -5,9 +5,10 @@ from pathlib import Path
 
 import pytest
 
-from lowfc.adapters.clock import SIMULATED_START_NS, FakeClock, HostClock, SimulatedClock, boot_offset_ns
+from lowfc.adapters.clock import SIMULATED_START_NS, HostClock, SimulatedClock, boot_offset_ns
 from lowfc.adapters.run import write_once
 from lowfc.contract.errors import DataFileError
+from lowfc.testing.clock import FakeClock
 
 
 def test_all_processes_of_a_boot_have_one_offset(tmp_path: Path) -> None:

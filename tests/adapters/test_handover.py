@@ -7,10 +7,10 @@ from pathlib import Path
 
 from lowfc.adapters.bus import Sample
 from lowfc.adapters.clock import HostClock
-from lowfc.adapters.envelope import count_of, sequence_of
 from lowfc.adapters.handover import LONG_AGO_NS, Handover
 from lowfc.adapters.run import open_run
 from lowfc.adapters.zenoh_bus import ZenohBus
+from lowfc.contract.envelope import count_of, sequence_of
 from lowfc.contract.messages import FRAME
 
 PATIENCE_S = 30.0

@@ -24,9 +24,9 @@ from mcap_protobuf.decoder import DecoderFactory
 from mutated_logs import boundaries
 
 from lowfc.adapters.bus import Sample
-from lowfc.adapters.envelope import count_of, sequence_of
 from lowfc.adapters.log_reader import LogReader
 from lowfc.adapters.log_writer import UNFINISHED, Attachment, LogWriter, log_path
+from lowfc.contract.envelope import count_of, sequence_of
 from lowfc.contract.errors import DataFileError
 from lowfc.contract.messages import COMMAND, EVENT, FRAME, STEP, TOPICS, image, timestamp, wire
 

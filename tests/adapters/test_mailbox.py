@@ -4,8 +4,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from lowfc.adapters.bus import Sample
-from lowfc.adapters.envelope import sequence_of
 from lowfc.adapters.mailbox import Mailbox
+from lowfc.contract.envelope import sequence_of
 
 PATIENCE_S = 30.0
 

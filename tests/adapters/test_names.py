@@ -5,16 +5,16 @@ from collections.abc import Callable
 import pytest
 
 from lowfc.adapters.bus import Sample
-from lowfc.adapters.clock import FakeClock
-from lowfc.adapters.envelope import sequence_of
 from lowfc.adapters.ledger import MOST_STARTS, Ledger
-from lowfc.adapters.memory_bus import MemoryBus, MemoryHub
 from lowfc.adapters.names import LARGEST_HEALTH_BYTES, LONGEST_NAME, MOST_NAMES, Names
 from lowfc.adapters.service import Service
+from lowfc.contract.envelope import sequence_of
 from lowfc.contract.errors import BadMessageError
 from lowfc.contract.messages import COMMAND, EVENT, FRAME, HEALTH, MIRROR_STATE, Log, Role, topic_of, wire
 from lowfc.programs.view.moment import Gatherer
 from lowfc.programs.watch import Watch
+from lowfc.testing.clock import FakeClock
+from lowfc.testing.memory_bus import MemoryBus, MemoryHub
 
 FORGED = 1000
 

@@ -6,11 +6,12 @@ import threading
 
 import pytest
 
-from lowfc.adapters.clock import FakeClock
-from lowfc.adapters.memory_bus import MemoryBus, MemoryHub
+from lowfc import __version__
 from lowfc.adapters.realtime import Granted
 from lowfc.adapters.service import HEALTH_PERIOD_NS, Service
 from lowfc.contract.messages import COMMAND, EVENT, FRAME, HEALTH, Log, from_timestamp, wire
+from lowfc.testing.clock import FakeClock
+from lowfc.testing.memory_bus import MemoryBus, MemoryHub
 
 PATIENCE_S = 30.0
 
@@ -58,7 +59,7 @@ def test_health_is_sent_when_due_and_tells_everything(hub: MemoryHub, clock: Fak
     camera.beat()
     first, second = ear.health
     assert (first.state, first.rate_hz, second.rate_hz) == ("starting", 0.0, 10.0)
-    assert (second.process, second.run_id, second.pid, second.version) == ("camera", "night", os.getpid(), "0.1.0")
+    assert (second.process, second.run_id, second.pid, second.version) == ("camera", "night", os.getpid(), __version__)
     assert (second.commands_late, second.uptime_ns, second.granted) == (3, HEALTH_PERIOD_NS, ["one BLAS thread"])
     assert from_timestamp(second.timestamp) == clock.now_ns()
     assert 1 << 20 < second.memory_bytes < 1 << 36
@@ -228,8 +229,8 @@ def test_a_stop_wakes_the_loop(hub: MemoryHub, clock: FakeClock) -> None:
 
 
 LOOP = """
-from lowfc.adapters.clock import FakeClock
-from lowfc.adapters.memory_bus import MemoryBus, MemoryHub
+from lowfc.testing.clock import FakeClock
+from lowfc.testing.memory_bus import MemoryBus, MemoryHub
 from lowfc.adapters.service import Service
 from lowfc.contract.messages import FRAME
 

@@ -12,10 +12,10 @@ import pytest
 from lowfc.adapters import shortcut
 from lowfc.adapters.bus import Sample
 from lowfc.adapters.clock import HostClock
-from lowfc.adapters.envelope import Envelope, count_of, sequence_of
 from lowfc.adapters.run import Run, open_run
 from lowfc.adapters.zenoh_bus import ZenohBus, ZenohPublisher
 from lowfc.contract.configuration import Network
+from lowfc.contract.envelope import Envelope, count_of, sequence_of
 from lowfc.contract.messages import COMMAND, FRAME
 
 PATIENCE_S = 30.0

@@ -17,10 +17,10 @@ import zenoh
 
 from lowfc.adapters.bus import Query, Sample
 from lowfc.adapters.clock import HostClock
-from lowfc.adapters.envelope import count_of, start_of
 from lowfc.adapters.mailbox import Mailbox
 from lowfc.adapters.run import Run, new_run_id, open_run
 from lowfc.adapters.zenoh_bus import ZenohBus, session_config
+from lowfc.contract.envelope import count_of, start_of
 from lowfc.contract.errors import BusError
 from lowfc.contract.messages import CALIBRATION, COMMAND, FRAME, HEALTH, REQUEST_KEY, TRUTH, Topic
 

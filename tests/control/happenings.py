@@ -26,6 +26,7 @@ def inputs(draw: st.DrawFn) -> list[Input]:
                 taken.append(frame(count, rng.normal(0, 20, len(NOLL))))
             case "b":
                 bad: dict[str, object] = {"pixels": None} if seed % 2 else {"sequence": 5}
+                count += 1
                 taken.append(frame(count, **bad))
             case "l":
                 count += 1

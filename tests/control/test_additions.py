@@ -67,7 +67,10 @@ class Night:
         drive = self.state.drive
         assert drive is not None
         again = Night(self.what)
-        again.what, again.state = decode_state(message, drive.calibration)
+        laws = {} if drive.following is None else {drive.following.law.id: drive.following.law}
+        play = drive.additions.play if drive.additions is not None else None
+        plays = {} if play is None else {play.table.id: play.table}
+        again.what, again.state = decode_state(message, drive.calibration, laws, plays)
         again.count, again.surfaces = self.count, [*self.surfaces]
         return again
 

@@ -477,15 +477,18 @@ FITTING = CameraSettings(0, SHAPE, DARK_DN, SATURATION_DN)
     ],
 )
 def test_a_camera_that_no_longer_fits_opens_the_loop(camera: CameraSettings, what: str) -> None:
-    state, (outputs,) = feed(USUAL, running(), camera)
+    state, (_, outputs) = feed(USUAL, running(), FITTING, camera)
     assert state.mode is LoopMode.OPEN
+    assert state.conditions.mode_cause.startswith("the camera does not fit the calibration")
     assert names([outputs]) == ["CAMERA_CHANGED", "MODE_CHANGED"]
     assert what in str(outputs.events[0].details["what"])
 
 
 def test_a_camera_that_fits_changes_nothing() -> None:
-    state = running()
-    after, (outputs,) = feed(USUAL, state, FITTING)
+    state, (outputs,) = feed(USUAL, running(), FITTING)
+    assert state.mode is LoopMode.CLOSED
+    assert names([outputs]) == []
+    after, (outputs,) = feed(USUAL, state, replace(FITTING, time_ns=5))
     assert after is state
     assert outputs == Outputs()
 

@@ -23,7 +23,7 @@ from lowfc.control.inputs import Frame, Input, Load, Outputs, Reply, Request, Ti
 from lowfc.control.law import Law
 from lowfc.control.linear_law import LinearLaw, integrator, integrator_block, of_blocks
 from lowfc.control.loop import advance
-from lowfc.control.requests import REQUESTS
+from lowfc.control.requests import REQUESTS, prepared
 from lowfc.control.safety import LoopMode
 from lowfc.control.state import Settings, State
 
@@ -249,7 +249,13 @@ def check(names: list[str], pauses: list[int], seed: int, delay_frames: float, t
     state, _ = replayed(what, begun, Run(begun, run.taken[:middle], run.said[:middle], Counter()), 0)
     assert state.drive is not None
     sent = controller_state(state, what, 8).SerializeToString()
-    again, resumed = decode_state(wire.ControllerState.FromString(sent), KNOWN[state.drive.calibration.id])
+    asked = [prepared(what, one) for one in run.taken[:middle] if isinstance(one, Request)]
+    again, resumed = decode_state(
+        wire.ControllerState.FromString(sent),
+        KNOWN[state.drive.calibration.id],
+        {one.law.id: one.law for one in asked if one.law is not None},
+        {one.played.id: one.played for one in asked if one.played is not None},
+    )
     end, heard = replayed(again, resumed, run, middle)
     assert heard == run.said[middle:]
     assert controller_state(end, again, 9).SerializeToString() == last

@@ -288,7 +288,7 @@ def test_the_router_may_die_and_come_back(bench: Bench) -> None:
 FORGER = """
 import sys, time
 import zenoh
-from lowfc.adapters.envelope import Envelope
+from lowfc.contract.envelope import Envelope
 from lowfc.contract.messages import timestamp, wire
 
 try:

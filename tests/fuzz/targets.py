@@ -5,7 +5,7 @@ import tempfile
 import tomllib
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from functools import partial
+from functools import cache, partial
 from pathlib import Path
 from random import Random
 
@@ -18,26 +18,35 @@ from safety_checks import violations
 from toy import GRID, NOLL, calibration, frame, loaded, settings
 
 from lowfc.adapters import calibration_file, law_file, layouts
-from lowfc.adapters.envelope import Envelope
 from lowfc.adapters.history_reader import read_history
+from lowfc.adapters.latch import Latch
 from lowfc.adapters.log_reader import LogReader
 from lowfc.adapters.log_recovery import recover
 from lowfc.adapters.masks import load_pupil
+from lowfc.adapters.service import Service
 from lowfc.contract import codec, configuration
 from lowfc.contract.calibration_codec import decode_calibration, encode_calibration, identified
-from lowfc.contract.configuration import Configuration
+from lowfc.contract.configuration import Configuration, load
+from lowfc.contract.envelope import Envelope
 from lowfc.contract.errors import LowfcError
 from lowfc.contract.law_codec import wire_law
-from lowfc.contract.messages import image, wire
+from lowfc.contract.messages import CAMERA_STATE, COMMAND, FRAME, image, wire
 from lowfc.contract.state_codec import controller_state, decode_state
-from lowfc.control.inputs import CameraSettings, Input, Load, MirrorShape, Tick
+from lowfc.control.additions import PlayTable
+from lowfc.control.camera import CameraSettings
+from lowfc.control.inputs import Input, Load, MirrorShape, Tick
 from lowfc.control.law import Law
-from lowfc.control.linear_law import integrator
+from lowfc.control.linear_law import LinearLaw, integrator
 from lowfc.control.loop import advance
+from lowfc.control.requests import prepared
 from lowfc.control.state import State
+from lowfc.programs.controller import Controller
 from lowfc.programs.view.moment import SHOWN
+from lowfc.testing.clock import FakeClock
+from lowfc.testing.memory_bus import MemoryBus, MemoryHub
 from sim_dm import process
 from sim_dm.device import Device, initial, obey, tick
+from sim_dm.process import MirrorProcess
 
 USUAL = settings()
 CALIBRATION = identified(calibration())
@@ -90,8 +99,10 @@ class Loop:
         controller_state(self.state, USUAL, 0).SerializeToString()
 
     def frame(self, payload: bytes) -> None:
+        """A frame behind the sixteen bytes of its envelope."""
         self.count += 1
-        self.take(codec.decode_frame(payload, frame(self.count).sequence, 0))
+        sequence, time_ns = Envelope.unpack(payload[:16])
+        self.take(codec.decode_frame(payload[16:], sequence, -time_ns))
 
     def request(self, name: str, payload: bytes) -> None:
         asked = codec.decode_request(payload, name, 0)
@@ -106,24 +117,90 @@ def targets(folder: Path) -> list[Target]:
     return [*_messages(), *_requests(), *_files(folder), *_logs(folder)]
 
 
+ENVELOPE = Envelope(1 << 32, 5).encode()
+
+
+class Processes:
+    """A controller and a mirror as they run, on the bus in memory: no message ends them."""
+
+    def __init__(self) -> None:
+        config = load(None, {"mirror.rows": GRID[0], "mirror.columns": GRID[1], "realtime.rehearse": False})
+        self.hub, self.clock, self.number = MemoryHub(), FakeClock(), 0
+        self.services = [Service(name, "fuzz", self.clock, MemoryBus(self.hub, name, self.clock)) for name in ROLES]
+        self.mirror = MirrorProcess(config, self.services[1])
+        self.controller = Controller(config, self.services[0], CALIBRATION, "a test", Latch(()))
+        self.controller._adopted = True
+        camera = MemoryBus(self.hub, "camera", self.clock)
+        self.frames, self.settings_of = camera.publisher(FRAME), camera.publisher(CAMERA_STATE)
+        self.commands = MemoryBus(self.hub, "somebody", self.clock).publisher(COMMAND, "dm")
+
+    def frame(self, data: bytes) -> None:
+        """Frames with extreme sequences and times, in the envelope too."""
+        self.number += 1
+        rng = Random(self.number)  # noqa: S311
+        self.frames.put(data, rng.choice(EXTREMES), rng.choice(EXTREMES))
+        self._live()
+
+    def command(self, data: bytes) -> None:
+        """Commands of anybody."""
+        self.commands.put(data)
+        self._live()
+
+    def settings(self, data: bytes) -> None:
+        """Settings of a camera."""
+        self.settings_of.put(data)
+        self._live()
+
+    def _live(self) -> None:
+        self.clock.advance(1_000_000)
+        self.mirror._wait()
+        self.controller._between_frames(self.controller._camera.take(0))
+        self.controller._publish_state(self.clock.now_ns())
+        for service in self.services:
+            assert service.running, service.why
+            service.health().SerializeToString()
+        kept = self.mirror._status.driven_nm
+        assert np.isfinite(kept).all()
+        assert violations(self.mirror._device.limits, kept, kept) == []
+
+
+ROLES = ("controller", "mirror-dm")
+EXTREMES = (0, 1, 5, 1 << 31, 1 << 32, 1_800_000_000 << 32, 1 << 62, (1 << 62) + 1, 1 << 63, (1 << 64) - 1)
+
+
 def _messages() -> list[Target]:
-    loop = Loop()
+    loop, processes = Loop(), Processes()
     whole = frame(1).pixels
     assert whole is not None
     state = loaded(USUAL)
     shape = np.ones(GRID, np.float32)
     modes = np.ones(len(NOLL), np.float32)
-    load, mirror = Load(0, CALIBRATION, "x"), MirrorShape(0, shape, modes)
-    inputs = (load, mirror, CameraSettings(0, (6, 7), 100.0, 6e4), Tick(0, 5))
+    loading, mirror = Load(0, CALIBRATION, "x"), MirrorShape(0, shape, modes)
+    inputs = (loading, mirror, CameraSettings(0, (6, 7), 100.0, 6e4), Tick(0, 5))
     told = wire.MirrorCommand(frame_sequence=5, channel="lowfc", valid_for_ns=10**8, rows=4, columns=5)
     told.actuators, told.command_nm[:] = shape.tobytes(), modes.tolist()
     mirror_state = wire.MirrorState(rows=4, columns=5, actuators=shape.tobytes(), command_nm=modes.tolist())
     camera = wire.CameraState(rows=6, columns=7, bias_dn=100, saturation_dn=6e4)
     return [
         Target("envelope", (Envelope(1 << 32, 5).encode(),), Envelope.decode, (LowfcError,)),
-        Target("frame", (image(whole, 5, "sensor").SerializeToString(),), loop.frame, message=codec.RawImage, cost=3),
-        Target("mirror state", (mirror_state.SerializeToString(),), partial(_mirror, loop), message=wire.MirrorState),
-        Target("camera state", (camera.SerializeToString(),), partial(_camera, loop), message=wire.CameraState),
+        Target("frame", (ENVELOPE + image(whole, 5, "sensor").SerializeToString(),), loop.frame, (LowfcError,), cost=3),
+        Target(
+            "camera to controller",
+            (image(whole, 5, "sensor").SerializeToString(),),
+            processes.frame,
+            message=codec.RawImage,
+            cost=10,
+        ),
+        Target(
+            "controller to mirror", (told.SerializeToString(),), processes.command, message=wire.MirrorCommand, cost=10
+        ),
+        Target(
+            "camera's settings", (camera.SerializeToString(),), processes.settings, message=wire.CameraState, cost=10
+        ),
+        Target(
+            "mirror state", (mirror_state.SerializeToString(),), partial(_mirror, loop), (LowfcError,), wire.MirrorState
+        ),
+        Target("camera state", (camera.SerializeToString(),), partial(_camera, loop), (LowfcError,), wire.CameraState),
         Target(
             "controller input",
             tuple(codec.encode_input(each, 3) for each in inputs),
@@ -141,12 +218,14 @@ def _messages() -> list[Target]:
         Target(
             "controller state",
             (_busy(state).SerializeToString(),),
-            lambda data: _go_on(*decode_state(wire.ControllerState.FromString(data), calibration())),
+            lambda data: _go_on(*decode_state(wire.ControllerState.FromString(data), calibration(), *_arrays())),
             (ValueError, codec.DecodeError),
             wire.ControllerState,
             10,
         ),
-        Target("mirror command", (told.SerializeToString(),), _obey, (codec.DecodeError,), wire.MirrorCommand, cost=2),
+        Target(
+            "mirror command", (told.SerializeToString(),), _obey, (codec.DecodeError, LowfcError), wire.MirrorCommand, 2
+        ),
         Target("a view's messages", (told.SerializeToString(),), _shown, cost=10),
     ]
 
@@ -159,9 +238,14 @@ def _mirror(loop: Loop, data: bytes) -> None:
 
 
 def _camera(loop: Loop, data: bytes) -> None:
-    found = codec.decode_camera(data)
-    if found is not None:
-        loop.take(found)
+    loop.take(codec.decode_camera(data, 3))
+
+
+@cache
+def _arrays() -> tuple[dict[str, LinearLaw], dict[str, PlayTable]]:
+    asked = [prepared(USUAL, codec.request(one, one.name, 0)) for one in _asked()]
+    laws = {one.law.id: one.law for one in asked if one.law is not None}
+    return laws, {one.played.id: one.played for one in asked if one.played is not None}
 
 
 def _busy(state: State) -> wire.ControllerState:

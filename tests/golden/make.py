@@ -16,9 +16,8 @@ import numpy as np
 
 from lowfc.adapters import calibration_file, instrument, law_file
 from lowfc.adapters.bus import Sample
-from lowfc.adapters.clock import FakeClock
+from lowfc.adapters.latch import Latch
 from lowfc.adapters.log_writer import Attachment
-from lowfc.adapters.memory_bus import MemoryBus, MemoryHub
 from lowfc.adapters.provenance import provenance
 from lowfc.adapters.service import Service
 from lowfc.client import Client
@@ -32,6 +31,8 @@ from lowfc.control.law import Law
 from lowfc.control.linear_law import LinearLaw, integrator_block, of_blocks
 from lowfc.programs.controller import Controller
 from lowfc.programs.recording.recorder import Recorder
+from lowfc.testing.clock import FakeClock
+from lowfc.testing.memory_bus import MemoryBus, MemoryHub
 from sim_camera.process import bench
 from sim_dm.process import MirrorProcess
 
@@ -85,7 +86,7 @@ class Night:
             attachments=attached,
         )
         self.controller = Controller(
-            config, self.service("controller"), calibration, "calibration.fits", folder / "run" / "safed"
+            config, self.service("controller"), calibration, "calibration.fits", Latch([folder / "run" / "safe"])
         )
         self.threads = [threading.Thread(target=one.run) for one in (self.mirror, self.controller, self.recorder)]
         for thread in self.threads:

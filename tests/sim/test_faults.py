@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 
 from lowfc.adapters.bus import Sample
-from lowfc.adapters.clock import FakeClock
-from lowfc.adapters.envelope import count_of, start_of
-from lowfc.adapters.memory_bus import MemoryBus, MemoryHub
 from lowfc.contract.codec import decode_frame
+from lowfc.contract.envelope import count_of, start_of
 from lowfc.contract.errors import ConfigurationError
 from lowfc.contract.messages import FRAME, image
+from lowfc.testing.clock import FakeClock
+from lowfc.testing.memory_bus import MemoryBus, MemoryHub
 from sim_camera.faults import LOST_SHARE, MOST_FRAMES_LATE, TRACK_PIXELS, Fault, Kind, cut, payload, pixels, sent
 from sim_camera.faulty import EARLIER_S, FaultyFrames, read_faults
 

@@ -1,15 +1,16 @@
 """Late commands: reported when they become a habit, however late in a run, and when they no longer are."""
 
+from types import SimpleNamespace
 from typing import cast
 
 import numpy as np
 import pytest
 
-from lowfc.adapters.clock import FakeClock
-from lowfc.adapters.memory_bus import MemoryBus, MemoryHub
 from lowfc.adapters.service import Service
 from lowfc.contract.configuration import Configuration
 from lowfc.contract.messages import EVENT, MIRROR_STATE, Log, wire
+from lowfc.testing.clock import FakeClock
+from lowfc.testing.memory_bus import MemoryBus, MemoryHub
 from sim_camera.bench import Bench
 from sim_camera.lateness import WINDOW, Lateness
 from sim_camera.process import CameraProcess
@@ -41,7 +42,7 @@ def test_the_camera_reports_the_habit_each_time() -> None:
         EVENT, lambda sample: events.append(Log.FromString(sample.payload).message)
     )
     service = Service("camera", "night", clock, MemoryBus(hub, "camera", clock))
-    camera = CameraProcess(config, service, cast("Bench", None), None)
+    camera = CameraProcess(config, service, cast("Bench", SimpleNamespace(shape=(80, 80))), None)
     states = MemoryBus(hub, "mirror-dm", clock).publisher(MIRROR_STATE, config.mirror.name)
     shape = np.zeros((config.mirror.rows, config.mirror.columns), np.float32)
     sequence = 0

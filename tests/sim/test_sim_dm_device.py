@@ -57,6 +57,48 @@ def broken(before: Array, after: Array) -> list[str]:
     return [name for name, value, bound in figures if not value <= bound]
 
 
+def test_clear_makes_the_mirror_forget_the_newest_command() -> None:
+    device = mirror()
+    status, _ = obey(device, initial(device), told(even(5.0), (1 << 63)), START_NS)
+    late, refused = obey(device, status, told(even(9.0), 3), START_NS)
+    assert (refused, late) == (Reason.OUT_OF_ORDER, status)
+    status, refused = obey(device, status, told(even(9.0), 3, clear_id=77), START_NS)
+    assert (refused, status.frame_sequence) == (None, 3)
+    assert obey(device, status, told(even(9.0), 2, clear_id=77), START_NS)[1] is Reason.OUT_OF_ORDER, (
+        "once for each clear"
+    )
+    assert obey(device, status, told(even(9.0), 2, clear_id=78), START_NS)[1] is None
+
+
+def test_the_mirror_has_room_for_sixteen_channels() -> None:
+    device, status = mirror(), initial(mirror())
+    for number in range(16):
+        status, refused = obey(device, status, told(even(1.0), channel=f"c{number}"), START_NS)
+        assert refused is None
+    assert obey(device, status, told(even(1.0), channel="another"), START_NS) == (status, Reason.CHANNEL)
+    assert obey(device, status, told(even(1.0), channel="c3"), START_NS)[1] is None
+    assert obey(device, initial(device), told(even(1.0), channel="x" * 33), START_NS)[1] is Reason.CHANNEL
+
+
+def test_a_command_of_safe_mode_is_remembered_by_its_channel() -> None:
+    device = mirror()
+    status, _ = obey(device, initial(device), told(even(1.0), safe=True), START_NS)
+    status, _ = obey(device, status, told(even(1.0), channel="other"), START_NS)
+    assert status.safe == {"lowfc"}
+    assert tick(device, status, START_NS + 10 * LONGEST_VALID_NS).safe == {"lowfc"}
+    assert obey(device, status, told(even(1.0), 2), START_NS)[0].safe == frozenset()
+
+
+def test_a_command_from_the_far_future_does_not_stop_the_way_to_flat() -> None:
+    device = mirror(settling_ns=50_000.0)
+    ahead = replace(told(even(100.0)), time_ns=1 << 62)
+    status, _ = obey(device, initial(device), ahead, START_NS)
+    for turn in range(1, 5):
+        status = tick(device, status, START_NS + LONGEST_VALID_NS + turn * 10 * MS)
+    assert not status.following
+    assert not status.surface_nm.any()
+
+
 values = st.one_of(
     st.floats(-1000, 1000, width=32),
     st.sampled_from([750.0, -750.0, 749.98, 150.0, 149.98, 250.0, -250.0, 3e38, -3e38, np.nan, np.inf, 1e-40]),

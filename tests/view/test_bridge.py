@@ -13,7 +13,6 @@ from tape import Tape
 
 from lowfc.adapters.bus import name_in
 from lowfc.adapters.clock import HostClock
-from lowfc.adapters.memory_bus import MemoryBus, MemoryHub
 from lowfc.adapters.rerun_viewer import Show
 from lowfc.contract.configuration import Configuration
 from lowfc.contract.messages import CALIBRATION, EVENT, FRAME, STEP, Log, topic_of
@@ -23,6 +22,7 @@ from lowfc.programs.view import wavefront
 from lowfc.programs.view.bridge import Bridge, Summary, ViewError
 from lowfc.programs.view.brush import Brush
 from lowfc.programs.view.moment import Moment
+from lowfc.testing.memory_bus import MemoryBus, MemoryHub
 
 PATIENCE_S = 10.0
 

@@ -16,11 +16,11 @@ from toy import FLUX_DN, NOLL, START, TOY, calibration
 from lowfc.adapters import instrument
 from lowfc.adapters.bus import Sample
 from lowfc.adapters.clock import SimulatedClock
-from lowfc.adapters.envelope import sequence_of
-from lowfc.adapters.memory_bus import MemoryBus, MemoryHub
+from lowfc.adapters.latch import Latch
 from lowfc.adapters.service import Service
 from lowfc.contract.calibration_codec import encode_calibration, identified
 from lowfc.contract.configuration import Configuration, load
+from lowfc.contract.envelope import sequence_of
 from lowfc.contract.events import EVENTS
 from lowfc.contract.messages import (
     CALIBRATION,
@@ -59,6 +59,7 @@ from lowfc.programs.view.tiles import (
 )
 from lowfc.programs.view.verdict import Verdict, judge
 from lowfc.programs.view.watcher import Watcher
+from lowfc.testing.memory_bus import MemoryBus, MemoryHub
 from sim_camera.process import CameraProcess, bench
 from sim_dm.process import MirrorProcess
 
@@ -89,7 +90,7 @@ def spoken(config: Configuration, camera: Configuration, latch: Path, frames: in
     ]
     optics = instrument.twin(config, None, print)
     calibrated = instrument.analytic_calibration(config, optics, instrument.mirror_on_twin(config, optics, print))
-    controller = Controller(config, services[0], calibrated, "a test", latch)
+    controller = Controller(config, services[0], calibrated, "a test", Latch([latch]))
     services[0].fill = controller.fill
     mirror = MirrorProcess(config, services[1])
     eye = CameraProcess(camera, services[2], bench(camera), frames)

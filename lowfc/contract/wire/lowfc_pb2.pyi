@@ -30,12 +30,15 @@ class Reason(int, metaclass=_enum_type_wrapper.EnumTypeWrapper):
     REASON_DARK: _ClassVar[Reason]
     REASON_NO_FRAME: _ClassVar[Reason]
     REASON_STUCK: _ClassVar[Reason]
+    REASON_AHEAD: _ClassVar[Reason]
+    REASON_CAMERA_UNKNOWN: _ClassVar[Reason]
     REASON_MODAL_LIMIT: _ClassVar[Reason]
     REASON_STROKE: _ClassVar[Reason]
     REASON_SLEW: _ClassVar[Reason]
     REASON_NEIGHBOUR: _ClassVar[Reason]
     REASON_NOT_FINITE: _ClassVar[Reason]
     REASON_WRONG_GRID: _ClassVar[Reason]
+    REASON_CHANNEL: _ClassVar[Reason]
 
 class MirrorStatus(int, metaclass=_enum_type_wrapper.EnumTypeWrapper):
     __slots__ = ()
@@ -58,19 +61,22 @@ REASON_SATURATED: Reason
 REASON_DARK: Reason
 REASON_NO_FRAME: Reason
 REASON_STUCK: Reason
+REASON_AHEAD: Reason
+REASON_CAMERA_UNKNOWN: Reason
 REASON_MODAL_LIMIT: Reason
 REASON_STROKE: Reason
 REASON_SLEW: Reason
 REASON_NEIGHBOUR: Reason
 REASON_NOT_FINITE: Reason
 REASON_WRONG_GRID: Reason
+REASON_CHANNEL: Reason
 MIRROR_STATUS_UNSPECIFIED: MirrorStatus
 MIRROR_STATUS_WAITING: MirrorStatus
 MIRROR_STATUS_FOLLOWING: MirrorStatus
 MIRROR_STATUS_EXPIRED: MirrorStatus
 
 class CameraState(_message.Message):
-    __slots__ = ("timestamp", "exposure_ns", "period_ns", "gain_e_per_dn", "bias_dn", "read_noise_e", "saturation_dn", "region_row", "region_column", "rows", "columns", "bit_depth", "em_gain")
+    __slots__ = ("timestamp", "exposure_ns", "period_ns", "gain_e_per_dn", "bias_dn", "read_noise_e", "saturation_dn", "region_row", "region_column", "rows", "columns", "bit_depth", "em_gain", "start_s")
     TIMESTAMP_FIELD_NUMBER: _ClassVar[int]
     EXPOSURE_NS_FIELD_NUMBER: _ClassVar[int]
     PERIOD_NS_FIELD_NUMBER: _ClassVar[int]
@@ -84,6 +90,7 @@ class CameraState(_message.Message):
     COLUMNS_FIELD_NUMBER: _ClassVar[int]
     BIT_DEPTH_FIELD_NUMBER: _ClassVar[int]
     EM_GAIN_FIELD_NUMBER: _ClassVar[int]
+    START_S_FIELD_NUMBER: _ClassVar[int]
     timestamp: _timestamp_pb2.Timestamp
     exposure_ns: int
     period_ns: int
@@ -97,7 +104,8 @@ class CameraState(_message.Message):
     columns: int
     bit_depth: int
     em_gain: float
-    def __init__(self, timestamp: _Optional[_Union[datetime.datetime, _timestamp_pb2.Timestamp, _Mapping]] = ..., exposure_ns: _Optional[int] = ..., period_ns: _Optional[int] = ..., gain_e_per_dn: _Optional[float] = ..., bias_dn: _Optional[float] = ..., read_noise_e: _Optional[float] = ..., saturation_dn: _Optional[float] = ..., region_row: _Optional[int] = ..., region_column: _Optional[int] = ..., rows: _Optional[int] = ..., columns: _Optional[int] = ..., bit_depth: _Optional[int] = ..., em_gain: _Optional[float] = ...) -> None: ...
+    start_s: int
+    def __init__(self, timestamp: _Optional[_Union[datetime.datetime, _timestamp_pb2.Timestamp, _Mapping]] = ..., exposure_ns: _Optional[int] = ..., period_ns: _Optional[int] = ..., gain_e_per_dn: _Optional[float] = ..., bias_dn: _Optional[float] = ..., read_noise_e: _Optional[float] = ..., saturation_dn: _Optional[float] = ..., region_row: _Optional[int] = ..., region_column: _Optional[int] = ..., rows: _Optional[int] = ..., columns: _Optional[int] = ..., bit_depth: _Optional[int] = ..., em_gain: _Optional[float] = ..., start_s: _Optional[int] = ...) -> None: ...
 
 class ControlStep(_message.Message):
     __slots__ = ("timestamp", "frame_sequence", "mode", "error_nm", "pol_nm", "command_nm", "reasons", "flux_dn", "saturated_pixels", "taken")
@@ -230,21 +238,27 @@ class Channel(_message.Message):
     def __init__(self, name: _Optional[str] = ..., actuators: _Optional[bytes] = ..., shifts: _Optional[bool] = ..., reached: _Optional[bytes] = ...) -> None: ...
 
 class Play(_message.Message):
-    __slots__ = ("target", "first_sequence", "columns", "table", "basis")
+    __slots__ = ("target", "first_sequence", "columns", "table", "basis", "id", "frames", "timestamp")
     TARGET_FIELD_NUMBER: _ClassVar[int]
     FIRST_SEQUENCE_FIELD_NUMBER: _ClassVar[int]
     COLUMNS_FIELD_NUMBER: _ClassVar[int]
     TABLE_FIELD_NUMBER: _ClassVar[int]
     BASIS_FIELD_NUMBER: _ClassVar[int]
+    ID_FIELD_NUMBER: _ClassVar[int]
+    FRAMES_FIELD_NUMBER: _ClassVar[int]
+    TIMESTAMP_FIELD_NUMBER: _ClassVar[int]
     target: str
     first_sequence: int
     columns: int
     table: bytes
     basis: bytes
-    def __init__(self, target: _Optional[str] = ..., first_sequence: _Optional[int] = ..., columns: _Optional[int] = ..., table: _Optional[bytes] = ..., basis: _Optional[bytes] = ...) -> None: ...
+    id: str
+    frames: int
+    timestamp: _timestamp_pb2.Timestamp
+    def __init__(self, target: _Optional[str] = ..., first_sequence: _Optional[int] = ..., columns: _Optional[int] = ..., table: _Optional[bytes] = ..., basis: _Optional[bytes] = ..., id: _Optional[str] = ..., frames: _Optional[int] = ..., timestamp: _Optional[_Union[datetime.datetime, _timestamp_pb2.Timestamp, _Mapping]] = ...) -> None: ...
 
 class LinearLaw(_message.Message):
-    __slots__ = ("name", "signal", "noll", "delay_frames", "rate_hz", "states", "follow", "gain", "kept", "coast", "output")
+    __slots__ = ("name", "signal", "noll", "delay_frames", "rate_hz", "states", "follow", "gain", "kept", "coast", "output", "id", "timestamp")
     NAME_FIELD_NUMBER: _ClassVar[int]
     SIGNAL_FIELD_NUMBER: _ClassVar[int]
     NOLL_FIELD_NUMBER: _ClassVar[int]
@@ -256,6 +270,8 @@ class LinearLaw(_message.Message):
     KEPT_FIELD_NUMBER: _ClassVar[int]
     COAST_FIELD_NUMBER: _ClassVar[int]
     OUTPUT_FIELD_NUMBER: _ClassVar[int]
+    ID_FIELD_NUMBER: _ClassVar[int]
+    TIMESTAMP_FIELD_NUMBER: _ClassVar[int]
     name: str
     signal: str
     noll: _containers.RepeatedScalarFieldContainer[int]
@@ -267,10 +283,12 @@ class LinearLaw(_message.Message):
     kept: bytes
     coast: bytes
     output: bytes
-    def __init__(self, name: _Optional[str] = ..., signal: _Optional[str] = ..., noll: _Optional[_Iterable[int]] = ..., delay_frames: _Optional[float] = ..., rate_hz: _Optional[float] = ..., states: _Optional[int] = ..., follow: _Optional[bytes] = ..., gain: _Optional[bytes] = ..., kept: _Optional[bytes] = ..., coast: _Optional[bytes] = ..., output: _Optional[bytes] = ...) -> None: ...
+    id: str
+    timestamp: _timestamp_pb2.Timestamp
+    def __init__(self, name: _Optional[str] = ..., signal: _Optional[str] = ..., noll: _Optional[_Iterable[int]] = ..., delay_frames: _Optional[float] = ..., rate_hz: _Optional[float] = ..., states: _Optional[int] = ..., follow: _Optional[bytes] = ..., gain: _Optional[bytes] = ..., kept: _Optional[bytes] = ..., coast: _Optional[bytes] = ..., output: _Optional[bytes] = ..., id: _Optional[str] = ..., timestamp: _Optional[_Union[datetime.datetime, _timestamp_pb2.Timestamp, _Mapping]] = ...) -> None: ...
 
 class ControllerState(_message.Message):
-    __slots__ = ("timestamp", "frame_sequence", "mode", "calibration_id", "gain", "leak", "limit_nm", "delay_frames", "command_history_nm", "actuators", "offset", "counts", "frames_used", "frame_timestamp", "refused", "refused_count", "limits_hit", "silent", "commanded", "taken", "settings", "offset_nm", "channels", "shift_history_nm", "law", "law_state", "law_frames", "play", "steps_left", "homing", "measured_nm", "flux_dn", "alike")
+    __slots__ = ("timestamp", "frame_sequence", "mode", "calibration_id", "gain", "leak", "limit_nm", "delay_frames", "command_history_nm", "actuators", "offset", "counts", "frames_used", "frame_timestamp", "refused", "refused_count", "limits_hit", "silent", "commanded", "taken", "settings", "offset_nm", "channels", "shift_history_nm", "law", "law_state", "law_frames", "play", "steps_left", "homing", "measured_nm", "flux_dn", "alike", "camera", "camera_expected", "camera_awaited", "clear_id", "mode_timestamp", "mode_cause")
     TIMESTAMP_FIELD_NUMBER: _ClassVar[int]
     FRAME_SEQUENCE_FIELD_NUMBER: _ClassVar[int]
     MODE_FIELD_NUMBER: _ClassVar[int]
@@ -304,6 +322,12 @@ class ControllerState(_message.Message):
     MEASURED_NM_FIELD_NUMBER: _ClassVar[int]
     FLUX_DN_FIELD_NUMBER: _ClassVar[int]
     ALIKE_FIELD_NUMBER: _ClassVar[int]
+    CAMERA_FIELD_NUMBER: _ClassVar[int]
+    CAMERA_EXPECTED_FIELD_NUMBER: _ClassVar[int]
+    CAMERA_AWAITED_FIELD_NUMBER: _ClassVar[int]
+    CLEAR_ID_FIELD_NUMBER: _ClassVar[int]
+    MODE_TIMESTAMP_FIELD_NUMBER: _ClassVar[int]
+    MODE_CAUSE_FIELD_NUMBER: _ClassVar[int]
     timestamp: _timestamp_pb2.Timestamp
     frame_sequence: int
     mode: LoopMode
@@ -337,10 +361,16 @@ class ControllerState(_message.Message):
     measured_nm: _containers.RepeatedScalarFieldContainer[float]
     flux_dn: float
     alike: int
-    def __init__(self, timestamp: _Optional[_Union[datetime.datetime, _timestamp_pb2.Timestamp, _Mapping]] = ..., frame_sequence: _Optional[int] = ..., mode: _Optional[_Union[LoopMode, str]] = ..., calibration_id: _Optional[str] = ..., gain: _Optional[_Iterable[float]] = ..., leak: _Optional[_Iterable[float]] = ..., limit_nm: _Optional[_Iterable[float]] = ..., delay_frames: _Optional[float] = ..., command_history_nm: _Optional[_Iterable[float]] = ..., actuators: _Optional[bytes] = ..., offset: _Optional[bytes] = ..., counts: _Optional[_Iterable[_Union[ReasonCount, _Mapping]]] = ..., frames_used: _Optional[int] = ..., frame_timestamp: _Optional[_Union[datetime.datetime, _timestamp_pb2.Timestamp, _Mapping]] = ..., refused: _Optional[_Union[Reason, str]] = ..., refused_count: _Optional[int] = ..., limits_hit: _Optional[_Iterable[_Union[Reason, str]]] = ..., silent: _Optional[bool] = ..., commanded: _Optional[bool] = ..., taken: _Optional[int] = ..., settings: _Optional[_Union[ControllerSettings, _Mapping]] = ..., offset_nm: _Optional[_Iterable[float]] = ..., channels: _Optional[_Iterable[_Union[Channel, _Mapping]]] = ..., shift_history_nm: _Optional[_Iterable[float]] = ..., law: _Optional[_Union[LinearLaw, _Mapping]] = ..., law_state: _Optional[_Iterable[float]] = ..., law_frames: _Optional[int] = ..., play: _Optional[_Union[Play, _Mapping]] = ..., steps_left: _Optional[int] = ..., homing: _Optional[bool] = ..., measured_nm: _Optional[_Iterable[float]] = ..., flux_dn: _Optional[float] = ..., alike: _Optional[int] = ...) -> None: ...
+    camera: CameraState
+    camera_expected: CameraState
+    camera_awaited: bool
+    clear_id: int
+    mode_timestamp: _timestamp_pb2.Timestamp
+    mode_cause: str
+    def __init__(self, timestamp: _Optional[_Union[datetime.datetime, _timestamp_pb2.Timestamp, _Mapping]] = ..., frame_sequence: _Optional[int] = ..., mode: _Optional[_Union[LoopMode, str]] = ..., calibration_id: _Optional[str] = ..., gain: _Optional[_Iterable[float]] = ..., leak: _Optional[_Iterable[float]] = ..., limit_nm: _Optional[_Iterable[float]] = ..., delay_frames: _Optional[float] = ..., command_history_nm: _Optional[_Iterable[float]] = ..., actuators: _Optional[bytes] = ..., offset: _Optional[bytes] = ..., counts: _Optional[_Iterable[_Union[ReasonCount, _Mapping]]] = ..., frames_used: _Optional[int] = ..., frame_timestamp: _Optional[_Union[datetime.datetime, _timestamp_pb2.Timestamp, _Mapping]] = ..., refused: _Optional[_Union[Reason, str]] = ..., refused_count: _Optional[int] = ..., limits_hit: _Optional[_Iterable[_Union[Reason, str]]] = ..., silent: _Optional[bool] = ..., commanded: _Optional[bool] = ..., taken: _Optional[int] = ..., settings: _Optional[_Union[ControllerSettings, _Mapping]] = ..., offset_nm: _Optional[_Iterable[float]] = ..., channels: _Optional[_Iterable[_Union[Channel, _Mapping]]] = ..., shift_history_nm: _Optional[_Iterable[float]] = ..., law: _Optional[_Union[LinearLaw, _Mapping]] = ..., law_state: _Optional[_Iterable[float]] = ..., law_frames: _Optional[int] = ..., play: _Optional[_Union[Play, _Mapping]] = ..., steps_left: _Optional[int] = ..., homing: _Optional[bool] = ..., measured_nm: _Optional[_Iterable[float]] = ..., flux_dn: _Optional[float] = ..., alike: _Optional[int] = ..., camera: _Optional[_Union[CameraState, _Mapping]] = ..., camera_expected: _Optional[_Union[CameraState, _Mapping]] = ..., camera_awaited: _Optional[bool] = ..., clear_id: _Optional[int] = ..., mode_timestamp: _Optional[_Union[datetime.datetime, _timestamp_pb2.Timestamp, _Mapping]] = ..., mode_cause: _Optional[str] = ...) -> None: ...
 
 class Request(_message.Message):
-    __slots__ = ("timestamp", "name", "modes", "values", "text", "accepted", "reply", "frame_sequence", "state", "taken", "actuators", "table", "columns", "law", "calibration")
+    __slots__ = ("timestamp", "name", "modes", "values", "text", "accepted", "reply", "frame_sequence", "state", "taken", "actuators", "table", "columns", "law", "calibration", "play_id")
     TIMESTAMP_FIELD_NUMBER: _ClassVar[int]
     NAME_FIELD_NUMBER: _ClassVar[int]
     MODES_FIELD_NUMBER: _ClassVar[int]
@@ -356,6 +386,7 @@ class Request(_message.Message):
     COLUMNS_FIELD_NUMBER: _ClassVar[int]
     LAW_FIELD_NUMBER: _ClassVar[int]
     CALIBRATION_FIELD_NUMBER: _ClassVar[int]
+    PLAY_ID_FIELD_NUMBER: _ClassVar[int]
     timestamp: _timestamp_pb2.Timestamp
     name: str
     modes: _containers.RepeatedScalarFieldContainer[int]
@@ -371,10 +402,11 @@ class Request(_message.Message):
     columns: int
     law: LinearLaw
     calibration: Calibration
-    def __init__(self, timestamp: _Optional[_Union[datetime.datetime, _timestamp_pb2.Timestamp, _Mapping]] = ..., name: _Optional[str] = ..., modes: _Optional[_Iterable[int]] = ..., values: _Optional[_Iterable[float]] = ..., text: _Optional[str] = ..., accepted: _Optional[bool] = ..., reply: _Optional[str] = ..., frame_sequence: _Optional[int] = ..., state: _Optional[_Union[ControllerState, _Mapping]] = ..., taken: _Optional[int] = ..., actuators: _Optional[bytes] = ..., table: _Optional[bytes] = ..., columns: _Optional[int] = ..., law: _Optional[_Union[LinearLaw, _Mapping]] = ..., calibration: _Optional[_Union[Calibration, _Mapping]] = ...) -> None: ...
+    play_id: str
+    def __init__(self, timestamp: _Optional[_Union[datetime.datetime, _timestamp_pb2.Timestamp, _Mapping]] = ..., name: _Optional[str] = ..., modes: _Optional[_Iterable[int]] = ..., values: _Optional[_Iterable[float]] = ..., text: _Optional[str] = ..., accepted: _Optional[bool] = ..., reply: _Optional[str] = ..., frame_sequence: _Optional[int] = ..., state: _Optional[_Union[ControllerState, _Mapping]] = ..., taken: _Optional[int] = ..., actuators: _Optional[bytes] = ..., table: _Optional[bytes] = ..., columns: _Optional[int] = ..., law: _Optional[_Union[LinearLaw, _Mapping]] = ..., calibration: _Optional[_Union[Calibration, _Mapping]] = ..., play_id: _Optional[str] = ...) -> None: ...
 
 class MirrorCommand(_message.Message):
-    __slots__ = ("timestamp", "frame_sequence", "channel", "valid_for_ns", "rows", "columns", "actuators", "command_nm", "taken")
+    __slots__ = ("timestamp", "frame_sequence", "channel", "valid_for_ns", "rows", "columns", "actuators", "command_nm", "taken", "safe", "clear_id")
     TIMESTAMP_FIELD_NUMBER: _ClassVar[int]
     FRAME_SEQUENCE_FIELD_NUMBER: _ClassVar[int]
     CHANNEL_FIELD_NUMBER: _ClassVar[int]
@@ -384,6 +416,8 @@ class MirrorCommand(_message.Message):
     ACTUATORS_FIELD_NUMBER: _ClassVar[int]
     COMMAND_NM_FIELD_NUMBER: _ClassVar[int]
     TAKEN_FIELD_NUMBER: _ClassVar[int]
+    SAFE_FIELD_NUMBER: _ClassVar[int]
+    CLEAR_ID_FIELD_NUMBER: _ClassVar[int]
     timestamp: _timestamp_pb2.Timestamp
     frame_sequence: int
     channel: str
@@ -393,10 +427,12 @@ class MirrorCommand(_message.Message):
     actuators: bytes
     command_nm: _containers.RepeatedScalarFieldContainer[float]
     taken: int
-    def __init__(self, timestamp: _Optional[_Union[datetime.datetime, _timestamp_pb2.Timestamp, _Mapping]] = ..., frame_sequence: _Optional[int] = ..., channel: _Optional[str] = ..., valid_for_ns: _Optional[int] = ..., rows: _Optional[int] = ..., columns: _Optional[int] = ..., actuators: _Optional[bytes] = ..., command_nm: _Optional[_Iterable[float]] = ..., taken: _Optional[int] = ...) -> None: ...
+    safe: bool
+    clear_id: int
+    def __init__(self, timestamp: _Optional[_Union[datetime.datetime, _timestamp_pb2.Timestamp, _Mapping]] = ..., frame_sequence: _Optional[int] = ..., channel: _Optional[str] = ..., valid_for_ns: _Optional[int] = ..., rows: _Optional[int] = ..., columns: _Optional[int] = ..., actuators: _Optional[bytes] = ..., command_nm: _Optional[_Iterable[float]] = ..., taken: _Optional[int] = ..., safe: _Optional[bool] = ..., clear_id: _Optional[int] = ...) -> None: ...
 
 class MirrorState(_message.Message):
-    __slots__ = ("timestamp", "frame_sequence", "status", "rows", "columns", "actuators", "command_nm", "limits_hit", "channels")
+    __slots__ = ("timestamp", "frame_sequence", "status", "rows", "columns", "actuators", "command_nm", "limits_hit", "channels", "safe", "refused")
     TIMESTAMP_FIELD_NUMBER: _ClassVar[int]
     FRAME_SEQUENCE_FIELD_NUMBER: _ClassVar[int]
     STATUS_FIELD_NUMBER: _ClassVar[int]
@@ -406,6 +442,8 @@ class MirrorState(_message.Message):
     COMMAND_NM_FIELD_NUMBER: _ClassVar[int]
     LIMITS_HIT_FIELD_NUMBER: _ClassVar[int]
     CHANNELS_FIELD_NUMBER: _ClassVar[int]
+    SAFE_FIELD_NUMBER: _ClassVar[int]
+    REFUSED_FIELD_NUMBER: _ClassVar[int]
     timestamp: _timestamp_pb2.Timestamp
     frame_sequence: int
     status: MirrorStatus
@@ -415,7 +453,9 @@ class MirrorState(_message.Message):
     command_nm: _containers.RepeatedScalarFieldContainer[float]
     limits_hit: _containers.RepeatedScalarFieldContainer[Reason]
     channels: _containers.RepeatedScalarFieldContainer[str]
-    def __init__(self, timestamp: _Optional[_Union[datetime.datetime, _timestamp_pb2.Timestamp, _Mapping]] = ..., frame_sequence: _Optional[int] = ..., status: _Optional[_Union[MirrorStatus, str]] = ..., rows: _Optional[int] = ..., columns: _Optional[int] = ..., actuators: _Optional[bytes] = ..., command_nm: _Optional[_Iterable[float]] = ..., limits_hit: _Optional[_Iterable[_Union[Reason, str]]] = ..., channels: _Optional[_Iterable[str]] = ...) -> None: ...
+    safe: bool
+    refused: Reason
+    def __init__(self, timestamp: _Optional[_Union[datetime.datetime, _timestamp_pb2.Timestamp, _Mapping]] = ..., frame_sequence: _Optional[int] = ..., status: _Optional[_Union[MirrorStatus, str]] = ..., rows: _Optional[int] = ..., columns: _Optional[int] = ..., actuators: _Optional[bytes] = ..., command_nm: _Optional[_Iterable[float]] = ..., limits_hit: _Optional[_Iterable[_Union[Reason, str]]] = ..., channels: _Optional[_Iterable[str]] = ..., safe: _Optional[bool] = ..., refused: _Optional[_Union[Reason, str]] = ...) -> None: ...
 
 class Truth(_message.Message):
     __slots__ = ("timestamp", "frame_sequence", "disturbance_nm", "residual_nm", "disturbance_rms_nm", "residual_rms_nm")
@@ -434,7 +474,7 @@ class Truth(_message.Message):
     def __init__(self, timestamp: _Optional[_Union[datetime.datetime, _timestamp_pb2.Timestamp, _Mapping]] = ..., frame_sequence: _Optional[int] = ..., disturbance_nm: _Optional[_Iterable[float]] = ..., residual_nm: _Optional[_Iterable[float]] = ..., disturbance_rms_nm: _Optional[float] = ..., residual_rms_nm: _Optional[float] = ...) -> None: ...
 
 class Calibration(_message.Message):
-    __slots__ = ("timestamp", "id", "operator_hash", "estimator", "noll", "mode_names", "wavelength_nm", "rows", "columns", "reference", "response", "reconstructor", "mask", "dark", "flux_dn", "saturation_dn", "mirror_rows", "mirror_columns", "modes_to_actuators", "actuators_to_modes")
+    __slots__ = ("timestamp", "id", "operator_hash", "estimator", "noll", "mode_names", "wavelength_nm", "rows", "columns", "reference", "response", "reconstructor", "mask", "dark", "flux_dn", "saturation_dn", "mirror_rows", "mirror_columns", "modes_to_actuators", "actuators_to_modes", "camera")
     TIMESTAMP_FIELD_NUMBER: _ClassVar[int]
     ID_FIELD_NUMBER: _ClassVar[int]
     OPERATOR_HASH_FIELD_NUMBER: _ClassVar[int]
@@ -455,6 +495,7 @@ class Calibration(_message.Message):
     MIRROR_COLUMNS_FIELD_NUMBER: _ClassVar[int]
     MODES_TO_ACTUATORS_FIELD_NUMBER: _ClassVar[int]
     ACTUATORS_TO_MODES_FIELD_NUMBER: _ClassVar[int]
+    CAMERA_FIELD_NUMBER: _ClassVar[int]
     timestamp: _timestamp_pb2.Timestamp
     id: str
     operator_hash: str
@@ -475,7 +516,8 @@ class Calibration(_message.Message):
     mirror_columns: int
     modes_to_actuators: bytes
     actuators_to_modes: bytes
-    def __init__(self, timestamp: _Optional[_Union[datetime.datetime, _timestamp_pb2.Timestamp, _Mapping]] = ..., id: _Optional[str] = ..., operator_hash: _Optional[str] = ..., estimator: _Optional[str] = ..., noll: _Optional[_Iterable[int]] = ..., mode_names: _Optional[_Iterable[str]] = ..., wavelength_nm: _Optional[float] = ..., rows: _Optional[int] = ..., columns: _Optional[int] = ..., reference: _Optional[bytes] = ..., response: _Optional[bytes] = ..., reconstructor: _Optional[bytes] = ..., mask: _Optional[bytes] = ..., dark: _Optional[bytes] = ..., flux_dn: _Optional[float] = ..., saturation_dn: _Optional[float] = ..., mirror_rows: _Optional[int] = ..., mirror_columns: _Optional[int] = ..., modes_to_actuators: _Optional[bytes] = ..., actuators_to_modes: _Optional[bytes] = ...) -> None: ...
+    camera: CameraState
+    def __init__(self, timestamp: _Optional[_Union[datetime.datetime, _timestamp_pb2.Timestamp, _Mapping]] = ..., id: _Optional[str] = ..., operator_hash: _Optional[str] = ..., estimator: _Optional[str] = ..., noll: _Optional[_Iterable[int]] = ..., mode_names: _Optional[_Iterable[str]] = ..., wavelength_nm: _Optional[float] = ..., rows: _Optional[int] = ..., columns: _Optional[int] = ..., reference: _Optional[bytes] = ..., response: _Optional[bytes] = ..., reconstructor: _Optional[bytes] = ..., mask: _Optional[bytes] = ..., dark: _Optional[bytes] = ..., flux_dn: _Optional[float] = ..., saturation_dn: _Optional[float] = ..., mirror_rows: _Optional[int] = ..., mirror_columns: _Optional[int] = ..., modes_to_actuators: _Optional[bytes] = ..., actuators_to_modes: _Optional[bytes] = ..., camera: _Optional[_Union[CameraState, _Mapping]] = ...) -> None: ...
 
 class ModalOffload(_message.Message):
     __slots__ = ("timestamp", "frame_sequence", "noll", "command_nm", "frames")
@@ -550,7 +592,7 @@ class Recording(_message.Message):
     def __init__(self, file: _Optional[str] = ..., messages: _Optional[int] = ..., lost: _Optional[int] = ..., bytes: _Optional[int] = ..., failure: _Optional[str] = ..., files: _Optional[_Iterable[str]] = ...) -> None: ...
 
 class Health(_message.Message):
-    __slots__ = ("timestamp", "process", "state", "run_id", "pid", "version", "memory_bytes", "rate_hz", "heard", "topics", "granted", "refused", "clock_offset_ns", "uptime_ns", "frame_to_command", "frame_to_mirror", "wavefront", "recording", "mode", "counts", "commands_late", "mean_rate_hz", "router_offset_ns", "router_round_trip_ns")
+    __slots__ = ("timestamp", "process", "state", "run_id", "pid", "version", "memory_bytes", "rate_hz", "heard", "topics", "granted", "refused", "clock_offset_ns", "uptime_ns", "frame_to_command", "frame_to_mirror", "wavefront", "recording", "mode", "counts", "commands_late", "mean_rate_hz", "router_offset_ns", "router_round_trip_ns", "not_closed_ns", "not_closed_cause", "command_refused", "command_expired", "limits_hit")
     TIMESTAMP_FIELD_NUMBER: _ClassVar[int]
     PROCESS_FIELD_NUMBER: _ClassVar[int]
     STATE_FIELD_NUMBER: _ClassVar[int]
@@ -575,6 +617,11 @@ class Health(_message.Message):
     MEAN_RATE_HZ_FIELD_NUMBER: _ClassVar[int]
     ROUTER_OFFSET_NS_FIELD_NUMBER: _ClassVar[int]
     ROUTER_ROUND_TRIP_NS_FIELD_NUMBER: _ClassVar[int]
+    NOT_CLOSED_NS_FIELD_NUMBER: _ClassVar[int]
+    NOT_CLOSED_CAUSE_FIELD_NUMBER: _ClassVar[int]
+    COMMAND_REFUSED_FIELD_NUMBER: _ClassVar[int]
+    COMMAND_EXPIRED_FIELD_NUMBER: _ClassVar[int]
+    LIMITS_HIT_FIELD_NUMBER: _ClassVar[int]
     timestamp: _timestamp_pb2.Timestamp
     process: str
     state: str
@@ -599,4 +646,9 @@ class Health(_message.Message):
     mean_rate_hz: float
     router_offset_ns: int
     router_round_trip_ns: int
-    def __init__(self, timestamp: _Optional[_Union[datetime.datetime, _timestamp_pb2.Timestamp, _Mapping]] = ..., process: _Optional[str] = ..., state: _Optional[str] = ..., run_id: _Optional[str] = ..., pid: _Optional[int] = ..., version: _Optional[str] = ..., memory_bytes: _Optional[int] = ..., rate_hz: _Optional[float] = ..., heard: _Optional[_Iterable[str]] = ..., topics: _Optional[_Iterable[_Union[TopicCount, _Mapping]]] = ..., granted: _Optional[_Iterable[str]] = ..., refused: _Optional[_Iterable[str]] = ..., clock_offset_ns: _Optional[int] = ..., uptime_ns: _Optional[int] = ..., frame_to_command: _Optional[_Union[Latency, _Mapping]] = ..., frame_to_mirror: _Optional[_Union[Latency, _Mapping]] = ..., wavefront: _Optional[_Union[WavefrontFigures, _Mapping]] = ..., recording: _Optional[_Union[Recording, _Mapping]] = ..., mode: _Optional[_Union[LoopMode, str]] = ..., counts: _Optional[_Iterable[_Union[ReasonCount, _Mapping]]] = ..., commands_late: _Optional[int] = ..., mean_rate_hz: _Optional[float] = ..., router_offset_ns: _Optional[int] = ..., router_round_trip_ns: _Optional[int] = ...) -> None: ...
+    not_closed_ns: int
+    not_closed_cause: str
+    command_refused: Reason
+    command_expired: bool
+    limits_hit: _containers.RepeatedScalarFieldContainer[Reason]
+    def __init__(self, timestamp: _Optional[_Union[datetime.datetime, _timestamp_pb2.Timestamp, _Mapping]] = ..., process: _Optional[str] = ..., state: _Optional[str] = ..., run_id: _Optional[str] = ..., pid: _Optional[int] = ..., version: _Optional[str] = ..., memory_bytes: _Optional[int] = ..., rate_hz: _Optional[float] = ..., heard: _Optional[_Iterable[str]] = ..., topics: _Optional[_Iterable[_Union[TopicCount, _Mapping]]] = ..., granted: _Optional[_Iterable[str]] = ..., refused: _Optional[_Iterable[str]] = ..., clock_offset_ns: _Optional[int] = ..., uptime_ns: _Optional[int] = ..., frame_to_command: _Optional[_Union[Latency, _Mapping]] = ..., frame_to_mirror: _Optional[_Union[Latency, _Mapping]] = ..., wavefront: _Optional[_Union[WavefrontFigures, _Mapping]] = ..., recording: _Optional[_Union[Recording, _Mapping]] = ..., mode: _Optional[_Union[LoopMode, str]] = ..., counts: _Optional[_Iterable[_Union[ReasonCount, _Mapping]]] = ..., commands_late: _Optional[int] = ..., mean_rate_hz: _Optional[float] = ..., router_offset_ns: _Optional[int] = ..., router_round_trip_ns: _Optional[int] = ..., not_closed_ns: _Optional[int] = ..., not_closed_cause: _Optional[str] = ..., command_refused: _Optional[_Union[Reason, str]] = ..., command_expired: _Optional[bool] = ..., limits_hit: _Optional[_Iterable[_Union[Reason, str]]] = ...) -> None: ...

@@ -42,7 +42,7 @@ class Live:
         self._past = self._expected = 0
         first, *_, last = client.steps(_RATE_STEPS)
         rate_hz = (last.frame_sequence - first.frame_sequence) * 1e9 / (last.time_ns - first.time_ns)
-        self.loop = loop_of(state, self.calibration, rate_hz)
+        self.loop = loop_of(state, self.calibration, rate_hz, self.client.laws())
 
     @contextmanager
     def kept(self) -> Iterator["Live"]:
@@ -128,7 +128,7 @@ class Live:
         nothing = np.full(modes, np.nan, np.float32)
         return played(
             what,
-            loop_of(before, self.calibration, self.loop.rate_hz),
+            loop_of(before, self.calibration, self.loop.rate_hz, self.client.laws()),
             "" if not table.shape[1] else MIRROR if basis.size else OFFSET,
             table,
             basis,

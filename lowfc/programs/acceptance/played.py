@@ -4,7 +4,7 @@ Each play is announced by a note that says what it is for, so that a log can be 
 """
 
 import json
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
 
@@ -12,9 +12,10 @@ import numpy as np
 import numpy.typing as npt
 
 from lowfc.adapters.history import History
+from lowfc.contract import codec
 from lowfc.contract.errors import DataFileError, LowfcError
 from lowfc.contract.law_codec import law_of
-from lowfc.contract.messages import floats, wire
+from lowfc.contract.messages import wire
 from lowfc.control import margins
 from lowfc.control.calibration import Calibration
 from lowfc.control.error_budget import LinearLoop
@@ -188,12 +189,13 @@ def logged(history: History, kind: Kind) -> list[Played]:
             raise DataFileError(f"{path}: the state of the controller before the test is not in it")
         steps = history.steps
         rows = np.flatnonzero((steps.sequence >= first) & (steps.sequence < first + frames))
-        basis = floats(request.actuators, -1, calibration.grid[0] * calibration.grid[1])
+        asked = codec.request(request, request.name, 0, plays=history.published.plays)
+        basis = asked.actuators_nm.reshape(-1, calibration.grid[0] * calibration.grid[1])
         one = played(
             what,
-            loop_of(before[-1], calibration, history.rate_hz),
+            loop_of(before[-1], calibration, history.rate_hz, history.published.laws),
             request.text if play else "",
-            floats(request.table, -1, request.columns) if play else np.zeros((frames, 0), np.float32),
+            asked.table if play else np.zeros((frames, 0), np.float32),
             basis,
             (steps.sequence[rows] - np.uint64(first)).astype(np.int64),
             steps.time_ns[rows],
@@ -257,11 +259,13 @@ def played(
     return Played(what, loop, target, table, basis, full[0], full[1], full[2], modes_of, reasons_of)
 
 
-def loop_of(state: wire.ControllerState, calibration: Calibration, rate_hz: float) -> Loop:
-    """The loop of a controller's state."""
+def loop_of(
+    state: wire.ControllerState, calibration: Calibration, rate_hz: float, laws: Mapping[str, LinearLaw]
+) -> Loop:
+    """The loop of a controller's state, whose law is one of these."""
     law: Law | LinearLaw
     if state.HasField("law"):
-        law = law_of(state.law)
+        law = law_of(state.law, laws)
     else:
         law = Law(*(np.array(values, np.float32) for values in (state.gain, state.leak, state.limit_nm)))
     return Loop(law, calibration.noll, state.delay_frames, rate_hz)

@@ -62,7 +62,7 @@ def aligned(
         calibration_file.save(made, out)
     else:
         with Client(run) as loop:
-            config, before = configuration_of(loop), loop.calibration()
+            config, before = configuration_of(loop), replace(loop.calibration(), camera=loop.camera())
             dark = before.dark.reshape(before.shape).astype(np.float64)
             pixels = watch(loop, frames)
             computed = _computed(config)
@@ -128,6 +128,7 @@ def on_sensor(
             flux_dn=flux,
             estimator=f"{config.control.estimator}+aligned",
             operator_hash="",
+            camera=None if before is None else before.camera,
         )
     )
 

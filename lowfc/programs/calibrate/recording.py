@@ -7,7 +7,7 @@ from typing import NamedTuple, Protocol
 import numpy as np
 import numpy.typing as npt
 
-from lowfc.adapters.envelope import start_of
+from lowfc.contract.envelope import start_of
 from lowfc.contract.errors import BusError, CalibrationError, LowfcError
 from lowfc.control.inputs import Step
 from lowfc.control.poke_plan import Plan, seen, usable

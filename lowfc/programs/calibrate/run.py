@@ -2,7 +2,7 @@
 
 import contextlib
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, NamedTuple, Protocol
 
@@ -16,6 +16,7 @@ from lowfc.contract.errors import CalibrationError, LowfcError
 from lowfc.contract.messages import wire
 from lowfc.control import poke_plan
 from lowfc.control.calibration import Calibration
+from lowfc.control.camera import CameraSettings
 from lowfc.control.delay_fit import Delay, measure_delay
 from lowfc.control.response_fit import (
     Cycle,
@@ -80,6 +81,10 @@ class Controller(Loop, Protocol):
         """Let the law drive the mirror."""
         ...
 
+    def camera(self) -> CameraSettings | None:
+        """See `Client.camera`."""
+        ...
+
     def calibration(self) -> Calibration:
         """The one in use."""
         ...
@@ -131,7 +136,7 @@ class Calibrator:
         self._say = say
         self._progress = progress
         self.config = configuration_of(loop)
-        self.before = loop.calibration()
+        self.before = replace(loop.calibration(), camera=loop.camera())
         self._basis = self.before.modes_to_actuators.T
         self._modes = len(self.before.noll)
         self._dark = self.before.dark.astype(np.float64)

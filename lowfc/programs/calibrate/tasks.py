@@ -137,7 +137,7 @@ def darkened(out: Path, run: str | None, frames: int, file: Path | None, *, load
     """
     require_folder(out)
     with Client(run) as loop:
-        before, config = loop.calibration(), configuration_of(loop)
+        before, config = replace(loop.calibration(), camera=loop.camera()), configuration_of(loop)
         found, count = _dark_frames(loop, before, frames) if file is None else _dark_file(file, before)
         camera = instrument.detector(config)
         try:
@@ -172,7 +172,7 @@ def referenced(out: Path, run: str | None, frames: int, *, load: bool) -> Found:
     """
     require_folder(out)
     with Client(run) as loop:
-        before, config = loop.calibration(), configuration_of(loop)
+        before, config = replace(loop.calibration(), camera=loop.camera()), configuration_of(loop)
         pixels = watch(loop, frames).reshape(frames, -1)
         camera = instrument.detector(config)
         try:

@@ -13,6 +13,7 @@ from lowfc.contract.messages import Role
 from lowfc.control.calibration import Calibration
 from lowfc.control.stability import limiting_gain
 from lowfc.programs.chaos.bench import CaseFailedError, ChaosBench
+from lowfc.programs.chaos.host import read_only_view
 from lowfc.programs.chaos.processes import kill_and_restart
 
 JUST_BELOW = 0.9
@@ -100,6 +101,34 @@ def safed_restart(bench: ChaosBench) -> None:
     bench.client().safe()
     bench.frames(WHILE_FRAMES)
     kill_and_restart(bench, Role.CONTROLLER)
+    bench.frames(WHILE_FRAMES)
+
+
+def safe_without_directory(bench: ChaosBench) -> None:
+    """Take the run's directory away, safe the loop, kill the controller while the latch is not in it, start it anew."""
+    path = bench.run.path
+    aside = path.with_name(f"{path.name}.aside")
+    client = bench.client()
+    path.rename(aside)
+    try:
+        client.safe()
+        bench.frames(WHILE_FRAMES)
+        bench.kill(Role.CONTROLLER)
+    finally:
+        aside.rename(path)
+    bench.restart(Role.CONTROLLER)
+    bench.wait(lambda: bench.heard(Role.CONTROLLER), "the controller started anew")
+    bench.frames(WHILE_FRAMES)
+
+
+def safe_in_read_only_directory(bench: ChaosBench) -> None:
+    """Make the run's directory read-only, join and safe the loop, kill the controller and start it anew."""
+    with read_only_view(bench.run.path):
+        bench.client().safe()
+        bench.frames(WHILE_FRAMES)
+        bench.kill(Role.CONTROLLER)
+    bench.restart(Role.CONTROLLER)
+    bench.wait(lambda: bench.heard(Role.CONTROLLER), "the controller started anew")
     bench.frames(WHILE_FRAMES)
 
 

@@ -10,9 +10,9 @@ import numpy as np
 import numpy.typing as npt
 from google.protobuf.message import DecodeError
 
-from lowfc.adapters.envelope import count_of, start_of
 from lowfc.adapters.log_reader import Logged, LogReader
 from lowfc.contract.codec import actuators
+from lowfc.contract.envelope import count_of, start_of
 from lowfc.contract.errors import DataFileError
 from lowfc.contract.messages import COMMAND, EVENT, FRAME, HEALTH, MIRROR_STATE, STEP, TRUTH, Log, wire
 

@@ -1,7 +1,10 @@
 """What a chaos case needs of its host, beside the loop."""
 
+import contextlib
 import subprocess
 import tempfile
+from collections.abc import Iterator
+from pathlib import Path
 
 
 def nothing() -> str:
@@ -18,6 +21,17 @@ def no_mounts() -> str:
     """Why nothing can be mounted here; empty where it can."""
     mount = ("mount", "-t", "tmpfs", "-o", "ro,size=1m", "tmpfs", tempfile.gettempdir())
     return _lacking("takes a mount of its own", "unshare", "--mount", *mount)
+
+
+@contextlib.contextmanager
+def read_only_view(folder: Path) -> Iterator[None]:
+    """A folder that cannot be written meanwhile, by root neither, whatever is open in it."""
+    subprocess.run(["mount", "--bind", folder, folder], check=True)  # noqa: S603, S607  # ours
+    try:
+        subprocess.run(["mount", "-o", "remount,ro,bind", folder], check=True)  # noqa: S603, S607  # ours
+        yield
+    finally:
+        subprocess.run(["umount", "--lazy", folder], check=False)  # noqa: S603, S607  # ours
 
 
 def _lacking(what: str, *words: str) -> str:

@@ -8,9 +8,9 @@ from collections.abc import Callable, Iterator
 import numpy as np
 
 from lowfc.adapters.clock import HostClock
-from lowfc.adapters.envelope import sequence_of
 from lowfc.adapters.zenoh_bus import ZenohBus
 from lowfc.client import Client
+from lowfc.contract.envelope import sequence_of
 from lowfc.contract.errors import LowfcError
 from lowfc.contract.messages import COMMAND, FRAME, REQUEST_KEY, TOPICS, Role, image, wire
 from lowfc.programs.chaos.bench import CaseFailedError, ChaosBench

@@ -8,8 +8,8 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from lowfc.adapters.envelope import start_of
 from lowfc.adapters.instrument import mirror_limits, settings
+from lowfc.contract.envelope import start_of
 from lowfc.contract.events import Level
 from lowfc.contract.messages import FRAME, Role, wire
 from lowfc.control.safety import Limits

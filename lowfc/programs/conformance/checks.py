@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 from google.protobuf.message import DecodeError
 
-from lowfc.adapters.envelope import Envelope, count_of, start_of
+from lowfc.contract.envelope import Envelope, count_of, start_of
 from lowfc.contract.errors import BusError, nearest
 from lowfc.contract.messages import EVENT, HEALTH, TOPICS, from_timestamp, topic_of, wire
 

@@ -120,7 +120,13 @@ class Dialogue:
         return [state for _, state in self.states[before:]]
 
     def put(
-        self, wanted_nm: Single, *, valid_ns: int = VALID_NS, sequence: int | None = None, cut: int = 0
+        self,
+        wanted_nm: Single,
+        *,
+        valid_ns: int = VALID_NS,
+        sequence: int | None = None,
+        cut: int = 0,
+        clear_id: int = 0,
     ) -> tuple[int, int]:
         """Send a command; return its sequence and its time.
 
@@ -129,6 +135,7 @@ class Dialogue:
             valid_ns: how long it may be held.
             sequence: of its frame; the next one if None.
             cut: bytes that are missing at the end.
+            clear_id: identity of an operator's clear; 0 for none.
         """
         if sequence is None:
             sequence, self._next = self._next, self._next + 1
@@ -142,6 +149,7 @@ class Dialogue:
             columns=wanted_nm.shape[1],
             actuators=data[: len(data) - cut],
             command_nm=[0.5, -0.25],
+            clear_id=clear_id,
         )
         self.line.put(COMMAND, self.expected.name, command.SerializeToString())
         return sequence, time_ns

@@ -10,9 +10,9 @@ import zenoh
 from zenoh.handlers import Callback
 
 from lowfc.adapters.clock import HostClock
-from lowfc.adapters.envelope import Envelope, sequence_of
 from lowfc.adapters.run import Links
 from lowfc.adapters.zenoh_bus import session_config
+from lowfc.contract.envelope import Envelope, sequence_of
 from lowfc.contract.errors import BusError
 from lowfc.contract.messages import Topic
 from lowfc.programs.conformance.checks import Heard

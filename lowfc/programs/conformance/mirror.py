@@ -286,6 +286,15 @@ def _refusals(dialogue: Dialogue, base_nm: Single) -> Iterator[Check]:
     if state is None:
         want = "good commands are followed after bad ones"
         yield wrong("after bad commands", want, "no answer any more", "catch what cannot be read, and go on")
+        return
+    want = "a command with a new clear_id is followed, though its frame_sequence is below the last"
+    dialogue.listen(0.05)
+    sequence, _ = dialogue.put(base_nm, sequence=max(0, state.frame_sequence - 1), clear_id=dialogue.line.now_ns())
+    if any(one.frame_sequence == sequence for one in dialogue.listen(0.15)):
+        yield ok("clear", want, "it was followed")
+    else:
+        advice = "on a new clear_id forget the newest frame_sequence: else an operator's clear cannot bring it back"
+        yield warning("clear", want, "it was not", advice)
 
 
 def _dead_man(dialogue: Dialogue, base_nm: Single) -> Iterator[Check]:

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from lowfc.adapters.terminal import AnyRun, Json, new_app
-from lowfc.contract.errors import ConfigurationError
+from lowfc.contract.errors import BusError, ConfigurationError, DataFileError
 from lowfc.contract.messages import RECORD_KEY, REQUEST_KEY
 from lowfc.programs.calibrate.command import dark, reference
 from lowfc.programs.ctl.requests import sentence_of
@@ -25,6 +25,10 @@ SIMPLE = ("open", "close", "pause", "safe", "clear", "reset", "stop")
 """Requests without an argument."""
 ZERO = "--zero"
 INTEGRATOR = "integrator"
+SIGNAL = (
+    "a controller that cannot be asked is made safe by a signal on its host: "
+    "pkill -USR1 -f 'python[^ ]* (-m |[^ ]*/)lowfc controller'"
+)
 _SIGNED = {"ignore_unknown_options": True}
 """So that -5 is a value and no option."""
 
@@ -34,7 +38,12 @@ Zero = Annotated[bool, typer.Option(ZERO, help="Take it away.")]
 
 def _simple(name: str) -> Callable[..., None]:
     def ask(run: AnyRun = None, as_json: Json = False) -> None:
-        _say(run, as_json, lambda loop: loop.ask(name))
+        try:
+            _say(run, as_json, lambda loop: loop.ask(name))
+        except (BusError, DataFileError) as fault:
+            if name != "safe":
+                raise
+            raise type(fault)(f"{fault}\n{SIGNAL}") from None
 
     return ask
 
@@ -48,9 +57,9 @@ def status(run: AnyRun = None, as_json: Json = False) -> None:
     from lowfc.programs.ctl.status import figures, text
 
     with _joined(run) as loop:
-        state = loop.status().state
+        state, mirrors = loop.status().state, loop.mirrors()
     assert state is not None  # noqa: S101  # that is what it answers with
-    put(figures(state), text(state), as_json=as_json)
+    put(figures(state, mirrors), text(state, mirrors), as_json=as_json)
 
 
 for _name in SIMPLE:

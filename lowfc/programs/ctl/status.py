@@ -1,22 +1,24 @@
 """What the controller is doing, as figures and for a person."""
 
+from collections.abc import Mapping
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
-from lowfc.adapters.envelope import count_of
-from lowfc.contract.messages import wire
+from lowfc.contract.envelope import count_of
+from lowfc.contract.messages import from_timestamp, wire
 from lowfc.control.safety import LoopMode, Reason
 from lowfc.control.state import FADING_FRAMES, SETTLING_FRAMES
 
 
-def figures(state: wire.ControllerState) -> dict[str, Any]:
+def figures(state: wire.ControllerState, mirrors: Mapping[str, wire.Health] = MappingProxyType({})) -> dict[str, Any]:
     """The state as `lowfc ctl status --json` prints it; modes in the calibration's order, nm rms of wavefront."""
     playing = None
     if state.HasField("play"):
         play = state.play
-        frames = len(play.table) // (4 * play.columns) if play.columns else 0
+        frames = play.frames or (len(play.table) // (4 * play.columns) if play.columns else 0)
         left = play.first_sequence + frames - 1 - state.frame_sequence
         playing = {"target": play.target, "frames": frames, "frames_left": min(max(left, 0), frames)}
     law = {"name": "integrator", "weight": 1.0}
@@ -29,6 +31,18 @@ def figures(state: wire.ControllerState) -> dict[str, Any]:
     settings = state.settings
     return {
         "mode": LoopMode(state.mode).name.lower() if state.mode else "starting",
+        "mode_s": round(max(0, from_timestamp(state.timestamp) - from_timestamp(state.mode_timestamp)) * 1e-9, 3)
+        if state.HasField("mode_timestamp")
+        else None,
+        "mode_cause": state.mode_cause,
+        "mirrors": {
+            name: {
+                "refused": _reason(one.command_refused) if one.command_refused else None,
+                "expired": one.command_expired,
+                "limits_hit": [_reason(reason) for reason in one.limits_hit],
+            }
+            for name, one in sorted(mirrors.items())
+        },
         "frame": count_of(state.frame_sequence),
         "frame_sequence": state.frame_sequence,
         "frames_used": state.frames_used,
@@ -63,9 +77,10 @@ def figures(state: wire.ControllerState) -> dict[str, Any]:
     }
 
 
-def text(state: wire.ControllerState) -> str:
+def text(state: wire.ControllerState, mirrors: Mapping[str, wire.Health] = MappingProxyType({})) -> str:
     """The same for a person."""
-    known = figures(state)
+    known = figures(state, mirrors)
+    since = "" if known["mode_s"] is None else f" for {known['mode_s']:.0f} s ({known['mode_cause']})"
     mode = known["mode"] + (f", opens after {known['steps_left']} frames" if known["steps_left"] else "")
     law = known["law"]["name"]
     if known["law"]["weight"] < 1:
@@ -77,7 +92,8 @@ def text(state: wire.ControllerState) -> str:
     ]
     playing = known["playing"]
     rows = {
-        "loop": mode,
+        "loop": mode + since,
+        **{name: _of_mirror(one) for name, one in known["mirrors"].items()},
         "frame": f"{known['frame']}, {known['frames_used']} used"
         + (f"; the last was refused: {known['refused']}" if known["refused"] else ""),
         "command": f"{known['command_rms_nm']:.3f} nm rms" + (", on its way to zero" if known["homing"] else ""),
@@ -97,6 +113,18 @@ def text(state: wire.ControllerState) -> str:
         "calibration": known["calibration_id"][:12] or "none",
     }
     return "\n".join(f"{name:14} {value}" for name, value in rows.items())
+
+
+def _reason(number: int) -> str:
+    """Its name; of a mirror of a later version, its number."""
+    return Reason(number).name if number in Reason._value2member_map_ else str(number)
+
+
+def _of_mirror(mirror: dict[str, Any]) -> str:
+    if mirror["refused"]:
+        return f"refuses commands: {mirror['refused']}"
+    state = "its last command has expired" if mirror["expired"] else "follows"
+    return f"{state}; limits acting: {', '.join(mirror['limits_hit'])}" if mirror["limits_hit"] else state
 
 
 def _values(values: list[float]) -> str:

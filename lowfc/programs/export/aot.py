@@ -38,10 +38,10 @@ from astropy.io import fits
 from google.protobuf.message import DecodeError
 
 from lowfc.adapters.bus import name_in
-from lowfc.adapters.envelope import count_of
 from lowfc.adapters.history import History
 from lowfc.adapters.log_reader import LogReader
 from lowfc.contract.codec import actuators
+from lowfc.contract.envelope import count_of
 from lowfc.contract.errors import DataFileError
 from lowfc.contract.messages import COMMAND, wire
 from lowfc.control.calibration import Calibration

@@ -7,8 +7,8 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from lowfc.adapters.envelope import count_of
 from lowfc.adapters.history import STAGES, History, rows_of
+from lowfc.contract.envelope import count_of
 from lowfc.contract.errors import DataFileError
 from lowfc.control.calibration import Calibration
 from lowfc.control.safety import LoopMode, Reason

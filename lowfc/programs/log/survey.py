@@ -12,11 +12,11 @@ from typing import Any
 from google.protobuf.message import DecodeError
 
 from lowfc.adapters.bus import Sample
-from lowfc.adapters.envelope import start_of
 from lowfc.adapters.history_reader import attached_configuration
 from lowfc.adapters.ledger import Ledger
 from lowfc.adapters.log_reader import Logged, LogReader
 from lowfc.adapters.log_recovery import RECOVERY
+from lowfc.contract.envelope import start_of
 from lowfc.contract.errors import BadMessageError
 from lowfc.contract.events import Level
 from lowfc.contract.messages import CONTROLLER_STATE, EVENT, HEALTH, Log, Topic, topic_of, wire

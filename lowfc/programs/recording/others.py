@@ -3,7 +3,7 @@
 from concurrent.futures import Future, ThreadPoolExecutor
 
 from lowfc.adapters.bus import Bus, Sample, name_in, states
-from lowfc.adapters.envelope import start_of
+from lowfc.contract.envelope import start_of
 from lowfc.contract.messages import HEALTH, TOPICS, wire
 
 

@@ -18,6 +18,7 @@ class Account:
         different: messages that differ by more than the tolerance.
         first: the first of them.
         largest_nm: largest difference of any number in nm.
+        changed: inputs of another version's log that this version answers otherwise on purpose, by the rule.
     """
 
     frames: int = 0
@@ -31,6 +32,7 @@ class Account:
     different: int = 0
     first: Difference | None = None
     largest_nm: float = 0.0
+    changed: dict[str, int] = field(default_factory=dict)
 
     @property
     def identical(self) -> bool:
@@ -44,6 +46,8 @@ class Account:
             setattr(self, count, getattr(self, count) + getattr(other, count))
         for why, steps in other.unchecked.items():
             self.leave_out(why, steps)
+        for rule, inputs in other.changed.items():
+            self.changed[rule] = self.changed.get(rule, 0) + inputs
         self.largest_nm = max(self.largest_nm, other.largest_nm)
         self.first = self.first or other.first
 

@@ -8,11 +8,11 @@ from typing import Annotated, Any
 import typer
 from rich.console import Console
 
-from lowfc.adapters.envelope import count_of
 from lowfc.adapters.log_reader import LogReader
 from lowfc.adapters.progress import passing_bar
 from lowfc.adapters.provenance import provenance
 from lowfc.adapters.terminal import DEFAULT_RUN, INTERRUPTED
+from lowfc.contract.envelope import count_of
 from lowfc.contract.errors import ConfigurationError
 from lowfc.programs.output import put
 from lowfc.programs.replay.account import Account
@@ -37,6 +37,7 @@ def verify(logs: list[Path], tolerance_nm: float, jobs: int, console: Console) -
     elapsed_s = time.monotonic() - begun_s
     return {
         **_figures(outcome.account),
+        "version": outcome.recorded_on.get("lowfc", ""),
         "tolerance_nm": tolerance_nm,
         "log_s": round(outcome.log_s, 3),
         "speed": round(outcome.log_s / elapsed_s, 2),
@@ -65,6 +66,8 @@ def render(figures: dict[str, Any]) -> str:
         f"{verdict}, largest difference {largest_nm:.3g} nm",
         f"with them          {figures['commands']} commands, {figures['states']} states, {figures['requests']} answers",
     ]
+    for rule, count in figures["rules_changed"].items():
+        lines.append(f"answered otherwise {count} since {figures['version']}: {rule}")
     for why, count in figures["unchecked_because"].items():
         lines.append(f"not checked        {count} steps {why}")
     for name, what in (("inputs_missing", "inputs of the controller"), ("commands_missing", "commands that it sent")):
@@ -108,6 +111,7 @@ def _figures(account: Account) -> dict[str, Any]:
         "states": account.states,
         "requests": account.requests,
         "unchecked_because": account.unchecked,
+        "rules_changed": account.changed,
         "inputs_missing": account.missing,
         "commands_missing": account.commands_missing,
     }

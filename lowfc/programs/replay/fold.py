@@ -10,25 +10,15 @@ from collections.abc import Iterable
 
 from google.protobuf.message import DecodeError
 
-from lowfc.adapters.envelope import start_of
 from lowfc.adapters.log_reader import Logged
-from lowfc.contract.calibration_codec import decode_calibration
-from lowfc.contract.messages import (
-    CALIBRATION,
-    COMMAND,
-    CONTROL_INPUT,
-    CONTROLLER_STATE,
-    FRAME,
-    REQUEST,
-    STEP,
-    topic_of,
-    wire,
-)
-from lowfc.control.calibration import Calibration
+from lowfc.contract import published
+from lowfc.contract.envelope import start_of
+from lowfc.contract.messages import COMMAND, CONTROL_INPUT, CONTROLLER_STATE, FRAME, REQUEST, STEP, topic_of
 from lowfc.programs.replay.account import Account
+from lowfc.programs.replay.former import Former
 from lowfc.programs.replay.lane import PATIENCE_NS, WHOLE, Frames, Lane, Share
 
-TOPICS = (FRAME, STEP, COMMAND, CONTROL_INPUT, CONTROLLER_STATE, REQUEST, CALIBRATION)
+TOPICS = (FRAME, STEP, COMMAND, CONTROL_INPUT, CONTROLLER_STATE, REQUEST, *published.TOPICS)
 """What a replay reads of a log."""
 
 
@@ -36,13 +26,18 @@ class Replay:
     """Takes the messages of a log, or of several that follow each other, and keeps the account."""
 
     def __init__(self, tolerance_nm: float = 0.0, share: Share = WHOLE) -> None:
-        """Differences up to `tolerance_nm` are none: for a log of another kind of processor."""
+        """Differences up to `tolerance_nm` are none: for a log of another kind of processor.
+
+        Attributes:
+            former: what is compared of the log of another version, to be set before the first message.
+        """
+        self.former: Former | None = None
         self.account = Account()
         self._tolerance_nm = tolerance_nm
         self._share = share
         self._from_ns = share.from_ns - PATIENCE_NS
         self._frames = Frames()
-        self._calibrations: dict[str, Calibration] = {}
+        self._published = published.Published()
         self._lanes: dict[int, Lane] = {}
         self._last_ns = self._begun_ns = self._ended_ns = 0
 
@@ -58,16 +53,18 @@ class Replay:
             DataFileError: the log is from before the inputs of the controller were numbered.
         """
         self._last_ns = message.log_time_ns
-        if message.log_time_ns < self._from_ns and message.key != CALIBRATION.key:
-            return
         topic = topic_of(message.key)
+        if message.log_time_ns < self._from_ns and topic not in published.TOPICS:
+            return
         if topic is FRAME:
             self._frames.add(message.sequence, message.payload)
             if self._share.from_ns <= message.log_time_ns < self._share.until_ns:
                 self._begun_ns = self._begun_ns or message.log_time_ns
                 self._ended_ns = message.log_time_ns
-        elif topic is CALIBRATION:
-            self._calibrate(message)
+        elif topic in published.TOPICS:
+            self._published.take(topic, message.payload)
+            for lane in self._lanes.values():
+                lane.hopeful = True
         elif topic in TOPICS:
             if topic is STEP and self._share.from_ns <= message.log_time_ns < self._share.until_ns:
                 self.account.steps += 1
@@ -92,18 +89,9 @@ class Replay:
         start_s = start_of(message.sequence)
         lane = self._lanes.get(start_s)
         if lane is None:
-            known = self._frames, self._calibrations, self.account, self._tolerance_nm, self._share
-            lane = self._lanes[start_s] = Lane(*known, message.log_time_ns)
+            known = self._frames, self._published, self.account, self._tolerance_nm, self._share
+            lane = self._lanes[start_s] = Lane(*known, message.log_time_ns, self.former)
         return lane
-
-    def _calibrate(self, message: Logged) -> None:
-        try:
-            calibration = decode_calibration(wire.Calibration.FromString(message.payload))
-        except (DecodeError, ValueError):
-            return  # a state that needs it says so
-        self._calibrations[calibration.id] = calibration
-        for lane in self._lanes.values():
-            lane.hopeful = True
 
 
 def replay(messages: Iterable[Logged], tolerance_nm: float = 0.0, share: Share = WHOLE) -> Account:

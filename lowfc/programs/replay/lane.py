@@ -8,15 +8,17 @@ from google.protobuf.message import Message
 
 from lowfc.adapters.log_reader import Logged
 from lowfc.contract import codec
-from lowfc.contract.errors import DataFileError
+from lowfc.contract.errors import BadMessageError, DataFileError
 from lowfc.contract.messages import from_timestamp, wire
+from lowfc.contract.published import Published
 from lowfc.contract.state_codec import controller_state, decode_state
-from lowfc.control.calibration import Calibration
-from lowfc.control.inputs import Frame, Input, Outputs
+from lowfc.control.inputs import Frame, Input, Outputs, Request
 from lowfc.control.loop import advance
+from lowfc.control.requests import prepared
 from lowfc.control.state import Settings, State
 from lowfc.programs.replay.account import Account
 from lowfc.programs.replay.difference import Difference, difference
+from lowfc.programs.replay.former import Former, changed_rule
 
 PATIENCE_NS = 2_000_000_000
 """Messages of several publishers are recorded in the order they arrive; what is later than this is missing."""
@@ -64,7 +66,10 @@ class Frames:
 
     def frame(self, sequence: int, time_ns: int, age_ns: int, *, last: bool = False) -> Frame | None:
         """The frame of this sequence and time, for a sequence may come twice; or the `last` one, whatever its time."""
-        found = [codec.decode_frame(payload, sequence, age_ns) for payload in self._payloads.get(sequence, ())]
+        found = []
+        for payload in self._payloads.get(sequence, ()):
+            with contextlib.suppress(BadMessageError):  # the controller left it out, too
+                found.append(codec.decode_frame(payload, sequence, age_ns))
         alike = next((frame for frame in found if frame.time_ns == time_ns), None)
         return found[-1] if alike is None and last and found else alike
 
@@ -94,17 +99,22 @@ class Lane:
     def __init__(
         self,
         frames: Frames,
-        calibrations: dict[str, Calibration],
+        published: Published,
         account: Account,
         tolerance_nm: float,
         share: Share,
         begun_ns: int,
+        former: Former | None = None,
     ) -> None:
-        """A lane whose first message has the log time `begun_ns`: of the share in which that is."""
+        """A lane whose first message has the log time `begun_ns`: of the share in which that is.
+
+        `former` says what of another version's messages is compared.
+        """
         self.done = begun_ns >= share.until_ns
         self.hopeful = False
         self._frames = frames
-        self._calibrations = calibrations
+        self._published = published
+        self._former = former
         self._account = account
         self._tolerance_nm = tolerance_nm
         self._share = share
@@ -184,8 +194,14 @@ class Lane:
             late = ended or now_ns - entry.log_time_ns > PATIENCE_NS
             if not late and entry.command is None and entry.commands and self._state.drive is not None:
                 return
+            rule = changed_rule(entry.taken) if self._former is not None else ""
+            if rule and number not in self._states and not late:
+                return  # the state after it is what may have to be gone on from
             taken = self._input(entry, late=late)
-            if taken is not None:
+            if taken is not None and rule and number in self._states:
+                del self._entries[number]
+                self._go_on_by_rule(rule, taken, self._states.pop(number))
+            elif taken is not None:
                 del self._entries[number]
                 self._check(entry, taken)
             elif late:
@@ -213,7 +229,7 @@ class Lane:
         for number in sorted(self._states):
             message = self._states[number]
             try:
-                settings, state = decode_state(message, self._calibrations.get(message.calibration_id))
+                settings, state = self._decoded(message)
             except ValueError as error:
                 self._why = self._why and f"as {error}"
                 continue
@@ -228,6 +244,10 @@ class Lane:
             self.done = number == self._last
             return not self.done
         return False
+
+    def _decoded(self, message: wire.ControllerState) -> tuple[Settings, State]:
+        known = self._published
+        return decode_state(message, known.calibrations.get(message.calibration_id), known.laws, known.plays)
 
     def _leave_out(self, upto: int) -> None:
         """Forget the inputs up to a number, and count their steps as unchecked."""
@@ -258,15 +278,59 @@ class Lane:
             case wire.ControlStep() as step:
                 age_ns = self._settings.late_ns + 1 if self._settings and wire.REASON_LATE in step.reasons else 0
                 # With no other left, a frame of another time: then the step is wrong, which the comparison finds.
-                return self._frames.frame(step.frame_sequence, from_timestamp(step.timestamp), age_ns, last=late)
+                frame = self._frames.frame(step.frame_sequence, from_timestamp(step.timestamp), age_ns, last=late)
+                if frame is not None and wire.REASON_AHEAD in step.reasons:
+                    frame = frame._replace(ahead=True)
+                return frame
             case wire.Request() as request:
                 with contextlib.suppress(ValueError):
-                    time_ns = from_timestamp(request.timestamp)
-                    return codec.request(request, request.name, time_ns, self._calibrations)
+                    time_ns, known = from_timestamp(request.timestamp), self._published
+                    asked = codec.request(request, request.name, time_ns, known.calibrations, known.laws, known.plays)
+                    return asked if self._settings is None else prepared(self._settings, asked)
             case wire.ControlInput() as other:
                 with contextlib.suppress(ValueError):
-                    return codec.decode_input(other, self._calibrations)
+                    return codec.decode_input(other, self._published.calibrations)
         return None
+
+    def _go_on_by_rule(self, rule: str, taken: Input, logged: wire.ControllerState) -> None:
+        """Take an input for which a rule has changed since; where it makes a difference, go on from the log's state."""
+        assert self._settings is not None  # noqa: S101  # there is a state
+        assert self._state is not None  # noqa: S101
+        state, _ = advance(self._settings, self._state, taken)
+        again = controller_state(state, self._settings, from_timestamp(logged.timestamp))
+        if self._same(again, logged):
+            self._account.states += 1
+        else:
+            self._account.changed[rule] = self._account.changed.get(rule, 0) + 1
+            try:
+                self._settings, state = self._decoded(logged)
+            except ValueError as error:
+                self._lose(f"as {error}")
+                return
+        self._account.requests += isinstance(taken, Request)
+        self._state = state
+        self._past.append(state)
+        self.done = state.taken == self._last
+
+    def _same(self, replayed: Message, logged: Message) -> bool:
+        """Whether they are the same in all that is compared."""
+        if self._former is None or type(replayed) is not type(logged):
+            return replayed == logged
+        if isinstance(logged, wire.ControllerState):
+            logged = self._in_todays_form(logged)
+        elif isinstance(logged, wire.Request) and logged.HasField("state"):
+            again = wire.Request()
+            again.CopyFrom(logged)
+            again.state.CopyFrom(self._in_todays_form(logged.state))
+            logged = again
+        return self._former.compared(replayed) == self._former.compared(logged)
+
+    def _in_todays_form(self, logged: wire.ControllerState) -> wire.ControllerState:
+        """A state with the same content; one that cannot be decoded as it is."""
+        with contextlib.suppress(ValueError):
+            settings, state = self._decoded(logged)
+            return controller_state(state, settings, from_timestamp(logged.timestamp))
+        return logged
 
     def _check(self, entry: _Entry, taken: Input) -> None:
         assert self._settings is not None  # noqa: S101  # there is a state
@@ -289,18 +353,17 @@ class Lane:
             account.commands_missing += 1
         if isinstance(entry.taken, wire.Request):
             account.requests += 1
-            self._compare(entry.taken, entry.taken_bytes, self._answer(entry.taken, outputs, state))
+            assert isinstance(taken, Request)  # noqa: S101
+            self._compare(entry.taken, entry.taken_bytes, self._answer(entry.taken, taken, outputs, state))
         logged = self._states.pop(state.taken, None)
         if logged is not None:
             self._compare_state(state, logged)
 
-    def _answer(self, request: wire.Request, outputs: Outputs, state: State) -> bytes | None:
+    def _answer(self, request: wire.Request, asked: Request, outputs: Outputs, state: State) -> bytes | None:
         assert self._settings is not None  # noqa: S101
         if outputs.reply is None:
             return None
-        time_ns = from_timestamp(request.timestamp)
-        shown = controller_state(state, self._settings, time_ns) if request.HasField("state") else None
-        asked = codec.request(request, request.name, time_ns, self._calibrations)
+        shown = controller_state(state, self._settings, asked.time_ns) if request.HasField("state") else None
         return codec.encode_request(asked, outputs.reply, state.taken, shown)
 
     def _compare_state(self, state: State, logged: wire.ControllerState) -> None:
@@ -308,7 +371,7 @@ class Lane:
         self._account.states += 1
         self.done = state.taken == self._last
         replayed = controller_state(state, self._settings, from_timestamp(logged.timestamp))
-        if replayed == logged:
+        if self._same(replayed, logged):
             return
         self._account.enter(difference(state.taken, state.frame_sequence, logged, replayed), self._tolerance_nm)
         if self._state is state and not self.done:  # or what differs here would differ for the rest of the log
@@ -321,5 +384,7 @@ class Lane:
             return
         assert self._state is not None  # noqa: S101
         body = None if replayed is None else type(logged).FromString(replayed)
+        if self._former is not None and body is not None and self._same(body, logged):
+            return
         found = difference(self._state.taken, self._state.frame_sequence, logged, body)
         self._account.enter(found, self._tolerance_nm)

@@ -12,12 +12,14 @@ from pathlib import Path
 
 from threadpoolctl import threadpool_limits
 
+from lowfc import __version__
 from lowfc.adapters.log_reader import LogReader
 from lowfc.adapters.log_records import LogFile
+from lowfc.contract import published
 from lowfc.contract.errors import ConfigurationError
-from lowfc.contract.messages import CALIBRATION
 from lowfc.programs.replay.account import Account
 from lowfc.programs.replay.fold import TOPICS, Replay
+from lowfc.programs.replay.former import Former
 from lowfc.programs.replay.lane import PATIENCE_NS, WHOLE, Share
 
 _WORTH_BYTES = 50_000_000
@@ -106,9 +108,12 @@ def _replay_share(paths: Sequence[Path], tolerance_nm: float, share: Share, prog
                     topics=TOPICS,
                     skip_damaged=True,
                     from_ns=max(0, share.from_ns - PATIENCE_NS),
-                    always=(CALIBRATION,),
+                    always=published.TOPICS,
                 )
+                first = True
                 for message in reader:
+                    if first:
+                        run.former, first = _former(reader), False
                     run.take(message)
                     number += 1
                     if number % _NEWS_EVERY == 0:
@@ -130,6 +135,14 @@ def _replay_share(paths: Sequence[Path], tolerance_nm: float, share: Share, prog
         gc.enable()
     outcome.log_s = run.duration_s
     return outcome
+
+
+def _former(reader: LogReader) -> Former | None:
+    """What is compared of a log, by the version that it names at its start; None for all, of this version's."""
+    version = reader.metadata.get("lowfc", {}).get("lowfc", __version__)
+    if version == __version__:
+        return None
+    return Former(reader.schemas)
 
 
 def _in_processes(

@@ -5,8 +5,8 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from lowfc.adapters.envelope import start_of
 from lowfc.adapters.history import STAGES, History, rows_of
+from lowfc.contract.envelope import start_of
 from lowfc.contract.messages import FRAME, Role
 from lowfc.programs.report.source import Run
 

@@ -13,12 +13,12 @@ from rich.console import Console
 from lowfc.adapters.bus import Sample
 from lowfc.adapters.child import Child
 from lowfc.adapters.clock import HostClock
-from lowfc.adapters.envelope import count_of, start_of
 from lowfc.adapters.log_reader import LogReader
 from lowfc.adapters.run import new_run_id, open_run
 from lowfc.adapters.usage import resident_bytes
 from lowfc.adapters.zenoh_bus import ZenohBus
 from lowfc.contract.configuration import Configuration
+from lowfc.contract.envelope import count_of, start_of
 from lowfc.contract.errors import DataFileError
 from lowfc.contract.messages import EVENT, FRAME, HEALTH, TIMING, Role, wire
 from lowfc.programs.processes import start_all, stop_all

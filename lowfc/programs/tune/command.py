@@ -142,7 +142,7 @@ def integrate(loop: "Client", gains: list[float], noll: tuple[int, ...]) -> "Ans
     """
     from lowfc.programs.tune.data import driving
 
-    before = driving(loop.status().state)
+    before = driving(loop.status().state, loop.laws())
     if before is None:
         return loop.gain(gains, noll)
     loop.law(None)  # another law has no gains

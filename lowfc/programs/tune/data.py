@@ -1,7 +1,7 @@
 """What a law is tuned from: pseudo-open-loop modes of a log, or of a loop that is running."""
 
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -93,7 +93,7 @@ def of_log(log: LogReader, progress: Callable[[int], None] | None = None) -> Tel
         run.calibration.noll,
         rate_hz,
         run.delay_frames,
-        (run.law, driving(state)),
+        (run.law, driving(state, history.published.laws)),
         (steps.sequence, mode, usable),
         (pol_nm, steps.error_nm, true_nm),
         tilt_nm_per_mas(config.star.diameter_m) if config is not None else None,
@@ -138,7 +138,7 @@ def of_run(loop: Client, seconds: float, progress: Callable[[float], None] | Non
         noll,
         1 / period_s if period_s > 0 else config.camera.rate_hz,
         float(state.delay_frames),
-        (law, driving(state)),
+        (law, driving(state, loop.laws())),
         (
             np.array([step.frame_sequence for step in steps], np.uint64),
             np.array([step.mode for step in steps], np.uint8),
@@ -192,9 +192,9 @@ def _telemetry(
     )
 
 
-def driving(state: wire.ControllerState | None) -> LinearLaw | None:
+def driving(state: wire.ControllerState | None, laws: Mapping[str, LinearLaw]) -> LinearLaw | None:
     """The law that drives the mirror of a controller, or will; None for the integrator."""
-    return law_of(state.law) if state is not None and state.HasField("law") else None
+    return law_of(state.law, laws) if state is not None and state.HasField("law") else None
 
 
 def _cut(sequence: npt.NDArray[np.uint64], values: Single, rows: Rows) -> Pieces:

@@ -9,9 +9,9 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from lowfc.adapters.envelope import start_of
 from lowfc.adapters.history import Single, Whole
 from lowfc.adapters.run import mirror_role
+from lowfc.contract.envelope import start_of
 from lowfc.contract.messages import CONTROLLER_STATE, FRAME, MIRROR_STATE, STEP, Role, Topic, wire
 from lowfc.contract.printable import printable
 from lowfc.control.estimator import saturated_pixels

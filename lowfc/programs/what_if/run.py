@@ -1,6 +1,6 @@
 """The logged run as a what-if needs it: exposures, the delay as measured, what each of them saw of the commands."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import fields
 
 import numpy as np
@@ -11,7 +11,8 @@ from lowfc.adapters.instrument import settings
 from lowfc.adapters.log_reader import LogReader
 from lowfc.contract.codec import decode_frame
 from lowfc.contract.errors import DataFileError
-from lowfc.contract.messages import FRAME, wire
+from lowfc.contract.messages import FRAME, floats, wire
+from lowfc.control.additions import PlayTable
 from lowfc.control.calibration import Calibration
 from lowfc.control.estimator import Estimator
 from lowfc.control.law import Law
@@ -70,7 +71,7 @@ class LoggedRun:
         self.steps = Steps(*(getattr(history.steps, part.name)[rows] for part in fields(Steps)))
         self.used: Rows = used[rows]
         self.missing = missing_before(self.steps.sequence)
-        self.played = _played(self.steps.sequence, history.requests)
+        self.played = _played(self.steps.sequence, history.requests, history.published.plays)
         self.law, self.controller_delay = _law_and_delay(history, self.calibration)
 
         weights = delay_weights(self.controller_delay).astype(np.float32)
@@ -144,12 +145,14 @@ class LoggedRun:
         return delay, "the times of frames and mirror"
 
 
-def _played(sequence: Sequences, requests: Sequence[wire.Request]) -> Rows:
+def _played(sequence: Sequences, requests: Sequence[wire.Request], plays: Mapping[str, PlayTable]) -> Rows:
     rows = np.zeros(sequence.shape, np.bool_)
     for request in requests:
         if request.name == "play" and request.accepted:
             first = request.frame_sequence
-            last = first + len(request.table) // (4 * max(request.columns, 1)) + LONGEST_DELAY
+            known = plays.get(request.play_id)
+            table = floats(request.table, -1, request.columns or 1) if known is None else known.rows
+            last = first + len(table) + LONGEST_DELAY
             rows |= (sequence >= first) & (sequence < last)
     return rows
 

@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 from lowfc.adapters.bus import ALL, Faults, Query, Sample
 from lowfc.adapters.clock import Clock
 from lowfc.adapters.clock_offset import ClockOffset
-from lowfc.adapters.envelope import Envelope, sequence_of
+from lowfc.contract.envelope import Envelope, sequence_of
 from lowfc.contract.errors import BusError
 from lowfc.contract.messages import Topic
 

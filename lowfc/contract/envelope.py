@@ -4,13 +4,13 @@ import struct
 from typing import NamedTuple
 
 from lowfc.contract.errors import BadMessageError
-from lowfc.control.loop import COUNT_BITS
+from lowfc.contract.messages import LATEST_NS, SEQUENCES
+from lowfc.control.inputs import COUNT_BITS
+
+__all__ = ["COUNT_BITS", "Envelope", "count_of", "sequence_of", "start_of"]
 
 _LAYOUT = struct.Struct("<QQ")
 _COUNT_MASK = (1 << COUNT_BITS) - 1
-_SEQUENCES = (1 << 64) - (2 << COUNT_BITS)
-"""Below it neither the start nor the count of the next message overflows."""
-_LATEST_NS = 1 << 62
 
 
 class Envelope(NamedTuple):
@@ -50,7 +50,7 @@ class Envelope(NamedTuple):
             BadMessageError: as for `decode`, or the sequence is not below 2^64 - 2^33, or the time above 2^62 ns.
         """
         sequence, publish_time_ns = found = cls.decode(data)
-        if sequence >= _SEQUENCES or publish_time_ns > _LATEST_NS:
+        if sequence >= SEQUENCES or publish_time_ns > LATEST_NS:
             raise BadMessageError(
                 f"an envelope's sequence is below 2^64 - 2^33 and its time at most 2^62 ns, got {sequence} and "
                 f"{publish_time_ns} ns; the sequence is the publisher's start in unix seconds << 32 | its count"

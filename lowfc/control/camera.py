@@ -1,0 +1,57 @@
+"""Camera settings, and which changes of them make a calibration wrong."""
+
+from dataclasses import dataclass, field
+
+LEAST_DN = 1.0
+"""Change of bias or saturation that is always tolerated."""
+GAIN_TOLERANCE = 0.01
+"""Relative change of a gain that is tolerated: gains are settings, not measurements."""
+
+
+@dataclass(frozen=True, slots=True)
+class CameraSettings:
+    """What of the camera must fit the calibration; two are equal whenever they were received.
+
+    Attributes:
+        time_ns: when they were published.
+        shape: rows and columns of the frame.
+        bias_dn: level without light and without dark current.
+        saturation_dn: highest value a pixel can have.
+        gain_e_per_dn: conversion gain; 0 where it is not known, as below.
+        em_gain: electron-multiplying gain.
+        read_noise_e: read noise of one pixel.
+        region: first row and first column that are read.
+        start_s: start of the camera, unix seconds; 0 where it is not known.
+    """
+
+    time_ns: int = field(compare=False)
+    shape: tuple[int, int]
+    bias_dn: float
+    saturation_dn: float
+    gain_e_per_dn: float = 0.0
+    em_gain: float = 0.0
+    read_noise_e: float = 0.0
+    region: tuple[int, int] = (0, 0)
+    start_s: int = 0
+
+    @property
+    def noise_dn(self) -> float:
+        """Read noise of a pixel in a frame; 0 where it is not known."""
+        return self.read_noise_e / self.gain_e_per_dn if self.gain_e_per_dn > 0 else 0.0
+
+
+def changes(now: CameraSettings, then: CameraSettings) -> list[str]:
+    """What differs by more than noise explains, a phrase each; `then` are the settings of the calibration."""
+    tolerance_dn = max(LEAST_DN, then.noise_dn)
+    exact = (
+        ("rows", now.shape[0], then.shape[0]),
+        ("columns", now.shape[1], then.shape[1]),
+        ("region_row", now.region[0], then.region[0]),
+        ("region_column", now.region[1], then.region[1]),
+    )
+    levels = (("bias_dn", now.bias_dn, then.bias_dn), ("saturation_dn", now.saturation_dn, then.saturation_dn))
+    gains = (("gain_e_per_dn", now.gain_e_per_dn, then.gain_e_per_dn), ("em_gain", now.em_gain, then.em_gain))
+    different: list[tuple[str, float, float]] = [one for one in exact if one[1] != one[2]]
+    different += [one for one in levels if not abs(one[1] - one[2]) <= tolerance_dn]
+    different += [one for one in gains if min(one[1:]) > 0 and abs(one[1] / one[2] - 1) > GAIN_TOLERANCE]
+    return [f"{name} is {got:g}, calibrated {want:g}" for name, got, want in different]

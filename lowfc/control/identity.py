@@ -1,0 +1,23 @@
+"""Identity of a calibration, a law or a table: a hash of everything in it, whatever it is called."""
+
+import hashlib
+from collections.abc import Iterable
+
+import numpy as np
+
+
+def identity(parts: Iterable[tuple[str, object]]) -> str:
+    """SHA-256 of named parts in their order; an array without numbers, and None, are as if they were not there.
+
+    The names are those of 0.1 and never change, so that files and logs keep their identities.
+    """
+    digest = hashlib.sha256()
+    for name, value in parts:
+        if value is None or (isinstance(value, np.ndarray) and not value.size):
+            continue
+        digest.update(name.encode())
+        if isinstance(value, np.ndarray):
+            digest.update(value.tobytes())
+        else:
+            digest.update(repr(value).encode())
+    return digest.hexdigest()

@@ -1,0 +1,74 @@
+"""The log of another version: which of its fields are compared, and which rules have changed since on purpose."""
+
+import contextlib
+from collections.abc import Mapping
+from typing import TypeVar
+
+from google.protobuf.descriptor_pb2 import DescriptorProto, FieldDescriptorProto, FileDescriptorSet
+from google.protobuf.message import DecodeError, Message
+from mcap.records import Schema
+
+from lowfc.contract.messages import wire
+
+M = TypeVar("M", bound=Message)
+
+CAMERA_RULE = "the camera's settings are compared with the calibration's, not its bias with the dark"
+CLOSE_RULE = "the loop is not closed while frames are refused, or on a camera that does not fit the calibration"
+CLEAR_RULE = "clear forgets the newest frame sequence"
+
+_REQUEST_RULES = {"close": CLOSE_RULE, "step": CLOSE_RULE, "law": CLOSE_RULE, "clear": CLEAR_RULE}
+# What a request brought along is its input and not compared; sentences may change.
+_NOT_COMPARED = {"lowfc.v1.Request": ("reply", "law", "table", "columns", "actuators", "calibration", "play_id")}
+
+
+def changed_rule(taken: Message | None) -> str:
+    """The rule for an input that was another one in former versions; empty where none has changed."""
+    if isinstance(taken, wire.Request) and taken.accepted:
+        return _REQUEST_RULES.get(taken.name, "")
+    if isinstance(taken, wire.ControlInput) and taken.HasField("camera"):
+        return CAMERA_RULE
+    return ""
+
+
+class Former:
+    """A former version's messages: the fields that its log declares, by number."""
+
+    def __init__(self, schemas: Mapping[int, Schema]) -> None:
+        """Read the schemas of a log, by their numbers; while it is read they become more."""
+        self._schemas = schemas
+        self._read: set[int] = set()
+        self._fields: dict[str, set[int]] = {}
+
+    def _known(self, name: str) -> set[int] | None:
+        """Numbers of the fields of a message; None where the log does not declare it."""
+        for number in self._schemas.keys() - self._read if name not in self._fields else ():
+            self._read.add(number)
+            with contextlib.suppress(DecodeError):
+                for file in FileDescriptorSet.FromString(self._schemas[number].data).file:
+                    for message in file.message_type:
+                        self._declare(f"{file.package}.{message.name}", message)
+        return self._fields.get(name)
+
+    def _declare(self, name: str, message: DescriptorProto) -> None:
+        fields: list[FieldDescriptorProto] = list(message.field)
+        self._fields[name] = {field.number for field in fields}
+        for nested in message.nested_type:
+            self._declare(f"{name}.{nested.name}", nested)
+
+    def compared(self, message: M) -> M:
+        """A copy with what is compared of it."""
+        copy = type(message)()
+        copy.CopyFrom(message)
+        self._prune(copy)
+        return copy
+
+    def _prune(self, message: Message) -> None:
+        descriptor = message.DESCRIPTOR
+        known = self._known(descriptor.full_name)
+        for field, value in message.ListFields():
+            left_out = field.name in _NOT_COMPARED.get(descriptor.full_name, ())
+            if left_out or (known is not None and field.number not in known):
+                message.ClearField(field.name)
+            elif field.message_type is not None:
+                for one in value if field.is_repeated else (value,):
+                    self._prune(one)

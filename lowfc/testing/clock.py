@@ -1,0 +1,34 @@
+"""A clock that moves by hand only."""
+
+from lowfc.adapters.clock import SIMULATED_START_NS
+
+_NS = 1_000_000_000
+
+
+class FakeClock:
+    """A clock for tests: host and run have the same time, which moves by hand only."""
+
+    offset_ns = 0
+
+    def __init__(self, start_ns: int = SIMULATED_START_NS, *, lockstep: bool = False) -> None:
+        self.lockstep = lockstep
+        self.time_ns = start_ns
+        self.start_s = start_ns // _NS
+
+    def now_ns(self) -> int:
+        """The time it was given."""
+        return self.time_ns
+
+    host_ns = now_ns
+
+    def ahead_ns(self) -> int:
+        """It is its own wall clock."""
+        return 0
+
+    def advance(self, duration_ns: int) -> None:
+        """Let time pass."""
+        self.time_ns += duration_ns
+
+    def sleep_until_ns(self, deadline_ns: int) -> None:
+        """Let time pass up to the deadline."""
+        self.time_ns = max(self.time_ns, deadline_ns)
