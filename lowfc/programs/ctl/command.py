@@ -27,7 +27,7 @@ ZERO = "--zero"
 INTEGRATOR = "integrator"
 SIGNAL = (
     "a controller that cannot be asked is made safe by a signal on its host: "
-    "pkill -USR1 -f 'python[^ ]* (-m |[^ ]*/)lowfc controller'"
+    "pkill -USR1 -f '^[^ ]*python.* (-m |[^ ]*/)lowfc controller'"
 )
 _SIGNED = {"ignore_unknown_options": True}
 """So that -5 is a value and no option."""
