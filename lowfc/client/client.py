@@ -233,8 +233,9 @@ class Client:
     def camera(self) -> CameraSettings | None:
         """Settings of the camera as the controller last received them, to be kept with what is measured with it."""
         state = self.status().state
-        known = state is not None and state.HasField("camera")
-        return replace(camera_settings(state.camera), start_s=0) if state is not None and known else None
+        if state is None or not state.HasField("camera"):
+            return None
+        return replace(camera_settings(state.camera), start_s=0)
 
     def mirrors(self) -> dict[str, wire.Health]:
         """What each mirror of the run says of itself, by its process's name."""

@@ -130,8 +130,8 @@ def additions_of(
             table = floats(one.table, -1, one.columns or 1)
             cut = PlayTable(one.target, table, floats(one.basis, -1, rows * columns), np.zeros(0), 0.0, "")
             play = Play(cut, one.first_sequence, len(table))
+        elif one.id not in plays:
+            raise ValueError(f"the table {one.id[:12]} that is played is not there")
         else:
-            if one.id not in plays:
-                raise ValueError(f"the table {one.id[:12]} that is played is not there")
             play = Play(plays[one.id], one.first_sequence, one.frames)
     return none._replace(offset_nm=offset_nm, shifts_nm=tuple(shifts_nm), play=play).at(channels, to_modes)

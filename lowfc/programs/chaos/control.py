@@ -7,6 +7,7 @@ import numpy as np
 
 from lowfc.adapters import calibration_file
 from lowfc.adapters.instrument import settings
+from lowfc.client import Client
 from lowfc.contract.calibration_codec import identified
 from lowfc.contract.errors import RequestRefusedError
 from lowfc.contract.messages import Role
@@ -111,22 +112,26 @@ def safe_without_directory(bench: ChaosBench) -> None:
     client = bench.client()
     path.rename(aside)
     try:
-        client.safe()
-        bench.frames(WHILE_FRAMES)
-        bench.kill(Role.CONTROLLER)
+        _safe_and_kill(bench, client)
     finally:
         aside.rename(path)
-    bench.restart(Role.CONTROLLER)
-    bench.wait(lambda: bench.heard(Role.CONTROLLER), "the controller started anew")
-    bench.frames(WHILE_FRAMES)
+    _start_anew(bench)
 
 
 def safe_in_read_only_directory(bench: ChaosBench) -> None:
     """Make the run's directory read-only, join and safe the loop, kill the controller and start it anew."""
     with read_only_view(bench.run.path):
-        bench.client().safe()
-        bench.frames(WHILE_FRAMES)
-        bench.kill(Role.CONTROLLER)
+        _safe_and_kill(bench, bench.client())
+    _start_anew(bench)
+
+
+def _safe_and_kill(bench: ChaosBench, client: Client) -> None:
+    client.safe()
+    bench.frames(WHILE_FRAMES)
+    bench.kill(Role.CONTROLLER)
+
+
+def _start_anew(bench: ChaosBench) -> None:
     bench.restart(Role.CONTROLLER)
     bench.wait(lambda: bench.heard(Role.CONTROLLER), "the controller started anew")
     bench.frames(WHILE_FRAMES)
