@@ -243,6 +243,7 @@ def request(
         table,
         law_of(message.law, laws) if message.HasField("law") else None,
         calibration,
+        lease_id=message.lease_id,
     )
 
 
@@ -268,6 +269,7 @@ def encode_request(request: Request, reply: Reply, taken: int, state: wire.Contr
         columns=request.table.shape[1] if request.table.size else 0,
         law=None if request.law is None else (law_header if request.prepared else wire_law)(request.law),
         play_id="" if played is None else played.id,
+        lease_id=request.lease_id,
         calibration=None if request.calibration is None else wire.Calibration(id=request.calibration.id),
     )
     return message.SerializeToString()

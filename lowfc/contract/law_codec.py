@@ -113,7 +113,7 @@ def additions_of(
     Raises:
         ValueError: it does not fit.
     """
-    if not message.offset_nm:
+    if not (message.offset_nm or message.channels or message.HasField("play")):
         return None
     rows, columns = none.sum_nm.shape
     modes, frames = none.shift_nm.size, len(none.shifts_nm)

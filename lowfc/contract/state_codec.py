@@ -14,6 +14,7 @@ from lowfc.control.additions import PlayTable
 from lowfc.control.calibration import Calibration
 from lowfc.control.estimator import Estimate
 from lowfc.control.law import Law
+from lowfc.control.lease import Lease
 from lowfc.control.linear_law import LinearLaw
 from lowfc.control.safety import Limits, LoopMode, Reason
 from lowfc.control.state import Conditions, Drive, Following, Settings, State
@@ -48,6 +49,17 @@ def controller_state(state: State, settings: Settings, time_ns: int) -> wire.Con
         message.mode_timestamp.CopyFrom(timestamp(conditions.mode_since_ns))
     if conditions.camera is not None:
         message.camera.CopyFrom(wire_camera(conditions.camera))
+    lease = conditions.lease
+    if lease is not None:
+        message.lease.CopyFrom(
+            wire.Lease(
+                id=lease.id,
+                holder=lease.holder,
+                until=timestamp(lease.until_ns),
+                last_sequence=lease.last_sequence,
+                ended=lease.ended,
+            )
+        )
     if state.estimate is not None:
         message.measured_nm.extend(state.estimate.error_nm.tolist())
         message.flux_dn = state.estimate.flux_dn
@@ -62,6 +74,8 @@ def controller_state(state: State, settings: Settings, time_ns: int) -> wire.Con
             message.law_state.extend(following.x.tolist())
             message.law_frames = following.frames
         message.calibration_id = state.drive.calibration.id
+        if not message.calibration_id:
+            message.mirror_rows, message.mirror_columns = state.drive.calibration.grid
         message.gain.extend(state.drive.law.gain.tolist())
         message.leak.extend(state.drive.law.leak.tolist())
         message.limit_nm.extend(state.drive.law.limit_nm.tolist())
@@ -83,7 +97,9 @@ def decode_state(
     """
     settings = _decode_settings(message.settings)
     drive = None
-    if message.calibration_id:
+    if message.mirror_rows:
+        calibration = Calibration.none((message.mirror_rows, message.mirror_columns))
+    if message.calibration_id or message.mirror_rows:
         if calibration is None or calibration.id != message.calibration_id:
             raise ValueError(f"calibration {message.calibration_id[:12]} of the controller's state is not there")
         drive = Drive.at_rest(settings, calibration)
@@ -129,9 +145,15 @@ def decode_state(
             message.clear_id,
             from_timestamp(message.mode_timestamp),
             message.mode_cause,
+            _lease(message.lease) if message.HasField("lease") else None,
         ),
     )
     return settings, state
+
+
+def _lease(message: wire.Lease) -> Lease:
+    until_ns = from_timestamp(message.until)
+    return Lease(message.id, message.holder, until_ns, message.last_sequence, message.ended)
 
 
 def reason_counts(state: State) -> list[wire.ReasonCount]:

@@ -87,9 +87,13 @@ class Play(NamedTuple):
         place = sequence - self.first_sequence
         return self.table.rows[place] if 0 <= place < self.frames else None
 
+    def left(self, sequence: int) -> int:
+        """Rows left for this frame and those to come."""
+        return min(max(self.first_sequence + self.frames - sequence, 0), self.frames)
+
     def over(self, sequence: int) -> bool:
         """Whether nothing of it is left for this frame and those to come."""
-        return sequence - self.first_sequence >= self.frames
+        return not self.left(sequence)
 
 
 class Additions(NamedTuple):

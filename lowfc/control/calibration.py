@@ -79,6 +79,28 @@ class Calibration:
         if not self.flux_dn > 0:
             raise ValueError(f"flux_dn must be above 0, got {self.flux_dn}")
 
+    @classmethod
+    def none(cls, grid: tuple[int, int]) -> "Calibration":
+        """What stands for no calibration: a mirror of (rows, columns) actuators, without modes or pixels."""
+        pixels, matrix = np.zeros(0, np.float32), np.zeros((0, 0), np.float32)
+        return cls(
+            noll=(),
+            reference=pixels,
+            response=matrix,
+            reconstructor=matrix,
+            good=pixels,
+            dark=pixels,
+            modes_to_actuators=np.zeros((grid[0] * grid[1], 0), np.float32),
+            shape=(0, 0),
+            grid=grid,
+            flux_dn=1.0,
+            saturation_dn=np.inf,
+            estimator="none",
+            wavelength_nm=0.0,
+            operator_hash="",
+            id="",
+        )
+
     def identity(self) -> str:
         """What `id` must be: a hash of everything else in it."""
         camera = self.camera

@@ -49,6 +49,7 @@ class Request:
         played: what a play's table and shapes make, once they were checked.
         refusal: why it is refused whatever the state of the loop.
         prepared: it has been checked for what needs no state; see `lowfc.control.requests.prepared`.
+        lease_id: of the lease under which it is asked for, or that is asked for; 0 for none.
     """
 
     time_ns: int
@@ -63,6 +64,7 @@ class Request:
     played: PlayTable | None = field(default=None, compare=False)
     refusal: str = ""
     prepared: bool = field(default=False, compare=False)
+    lease_id: int = 0
 
 
 @dataclass(frozen=True, slots=True)

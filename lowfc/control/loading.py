@@ -1,4 +1,4 @@
-"""A calibration or a mode taken into use: the mirror stays where it is, whatever changes."""
+"""A calibration, a mirror, a camera or a mode taken into use: the mirror stays where it is, whatever changes."""
 
 from dataclasses import replace
 
@@ -8,7 +8,7 @@ import numpy.typing as npt
 from lowfc.control.additions import ADOPTED, Channel
 from lowfc.control.calibration import Calibration
 from lowfc.control.camera import CameraSettings, changes
-from lowfc.control.inputs import Raised
+from lowfc.control.inputs import MirrorShape, Outputs, Raised
 from lowfc.control.safety import LoopMode
 from lowfc.control.state import Conditions, Drive, Settings, State
 
@@ -16,6 +16,7 @@ Single = npt.NDArray[np.float32]
 
 ADOPTED_NM = 1.0
 """Of an actuator beyond the modal command, above which a mirror's shape is adopted as a channel."""
+WITNESSED = "the mirror's last command was sent in safe mode"
 
 
 def loaded(
@@ -58,7 +59,9 @@ def loaded(
     if mode is LoopMode.SAFED:
         cause = "it was in safe mode before the controller started"
     state = state._replace(drive=drive)
-    if mode is LoopMode.CLOSED and (wrong := misfit(state)):
+    if mode is not LoopMode.SAFED and (wrong := uncalibrated(state)):
+        mode, cause = LoopMode.IDLE, wrong
+    elif mode is LoopMode.CLOSED and (wrong := misfit(state)):
         mode, cause = LoopMode.OPEN, f"the camera does not fit the calibration: {wrong}"
     if mode is not before_mode:
         events.append(mode_event(before_mode, mode, cause))
@@ -69,15 +72,80 @@ def loaded(
 def misfit(state: State) -> str:
     """Why the camera, as its settings were last received, does not fit the calibration; empty where it does."""
     camera, drive = state.conditions.camera, state.drive
-    if camera is None or drive is None:
+    if camera is None or drive is None or not drive.calibration.noll:
         return ""
     return "; ".join(changes(camera, _expected(drive, camera)))
 
 
-def with_camera(state: State, camera: CameraSettings) -> State:
+def uncalibrated(state: State) -> str:
+    """Why no mode can be measured: no calibration, or the model's, of frames of another size; empty where they can."""
+    drive, camera = state.drive, state.conditions.camera
+    hint = ": `lowfc commission` measures one"
+    if drive is None or not drive.calibration.noll:
+        return f"no calibration is loaded{hint}"
+    rows, columns = drive.calibration.shape
+    if camera is None or camera.shape == (rows, columns) or not drive.calibration.operator_hash:
+        return ""
+    frames = "{} x {}".format(*camera.shape)
+    return f"the computed calibration is for frames of {rows} x {columns} pixels, the camera's are {frames}{hint}"
+
+
+def mirror_reported(settings: Settings, state: State, shape: MirrorShape) -> tuple[State, Outputs]:
+    """Start from where the mirror is, so that it does not jump; later shapes change nothing."""
+    if state.commanded:
+        return state, Outputs()
+    witnessed: list[Raised] = []
+    if shape.safe and state.mode is not LoopMode.SAFED:
+        witnessed = [mode_event(state.mode, LoopMode.SAFED, WITNESSED), Raised("SAFED", {"why": WITNESSED})]
+        state = in_mode(state, LoopMode.SAFED, shape.time_ns, WITNESSED)
+    drive = state.drive
+    if drive is None:  # probe sequences and channels need no calibration
+        drive = Drive.at_rest(settings, Calibration.none(shape.actuators_nm.shape))
+    if shape.actuators_nm.shape != drive.calibration.grid or not np.isfinite(shape.actuators_nm).all():
+        why = f"the mirror has a grid of {shape.actuators_nm.shape}, the calibration {drive.calibration.grid}"
+        return state, Outputs(events=[*witnessed, Raised("MIRROR_REFUSED", {"why": why})], changed=bool(witnessed))
+    limit_nm = drive.law.limit_nm
+    believed = shape.command_nm.shape == limit_nm.shape and (np.abs(shape.command_nm) <= limit_nm).all()
+    command_nm = shape.command_nm if believed else drive.inverse @ shape.actuators_nm.reshape(-1)
+    drive = drive._replace(actuators_nm=shape.actuators_nm, history_nm=(command_nm,) * len(drive.history_nm))
+    events = witnessed
+    if command_nm.any():
+        events.append(Raised("MIRROR_ADOPTED", {"rms_nm": float(np.sqrt(command_nm @ command_nm))}))
+    if state.mode is not LoopMode.SAFED:  # then it is on its way to flat, and shall stay there
+        drive, rest = adopted(drive, shape.actuators_nm)
+        events += rest
+    return state._replace(drive=drive), Outputs(events=events, changed=True)
+
+
+def camera_reported(settings: Settings, state: State, camera: CameraSettings) -> tuple[State, Outputs]:
+    """Keep the camera's settings; open the loop where it is no longer the camera that was calibrated."""
+    after = _with_camera(state, camera)
+    if after is state:
+        return state, Outputs()
+    wrong = misfit(after)
+    events, mode, cause = [], after.mode, "the camera's frames fit the calibration"
+    if wrong and wrong != misfit(state):
+        events.append(Raised("CAMERA_CHANGED", {"what": wrong}))
+        cause = f"the camera does not fit the calibration: {wrong}"
+    if mode is not LoopMode.SAFED and uncalibrated(after):
+        mode = LoopMode.IDLE
+    elif (mode is LoopMode.CLOSED and wrong) or mode is LoopMode.IDLE:
+        mode = LoopMode.OPEN
+    if mode is not after.mode:
+        events.append(mode_event(after.mode, mode, cause))
+        after = in_mode(after, mode, camera.time_ns, cause)
+    return after, Outputs(events=events, changed=True)
+
+
+def _with_camera(state: State, camera: CameraSettings) -> State:
     """The state with settings of the camera just received; the very same one where they are nothing new."""
     drive, known = state.drive, state.conditions
-    if drive is not None and drive.camera is None and not changes(camera, _expected(drive, camera)):
+    if (
+        drive is not None
+        and drive.calibration.noll
+        and drive.camera is None
+        and not changes(camera, _expected(drive, camera))
+    ):
         state = state._replace(drive=drive._replace(camera=camera))
     if camera != known.camera or known.camera_awaited:
         state = state._replace(conditions=known._replace(camera=camera, camera_awaited=False))

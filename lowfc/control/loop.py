@@ -28,15 +28,17 @@ from lowfc.control.inputs import (
     Tick,
 )
 from lowfc.control.law import integrate
-from lowfc.control.loading import adopted, in_mode, loaded, misfit, mode_event, with_camera
+from lowfc.control.loading import camera_reported, in_mode, loaded, mirror_reported, mode_event
 from lowfc.control.requests import answer
+from lowfc.control.reservation import lease_checked
 from lowfc.control.safety import LoopMode, Reason, limit
 from lowfc.control.state import Drive, Settings, State
 
 Single = npt.NDArray[np.float32]
 
+UNMEASURED = frozenset({Reason.NO_CALIBRATION, Reason.WRONG_SIZE})
+"""Without a calibration of its size, a frame is an exposure all the same: probe sequences go on where no law acts."""
 STEPPED = "its last step is done"
-WITNESSED = "the mirror's last command was sent in safe mode"
 
 
 def advance(settings: Settings, state: State, taken: Input) -> tuple[State, Outputs]:
@@ -60,7 +62,9 @@ def _frame(settings: Settings, state: State, frame: Frame) -> tuple[State, Outpu
         stale = Reason.REPEATED if frame.sequence == state.frame_sequence else Reason.OUT_OF_ORDER
         return _refuse(settings, state, frame, stale, events)
     state, drive = _arrive(state, frame, events)
-    if drive is None:
+    if state.conditions.lease is not None:
+        state, drive = _lease_on_frame(state, drive, frame.sequence, events)
+    if drive is None or not drive.calibration.noll:
         return _refuse(settings, _newest(state, drive, frame), frame, Reason.NO_CALIBRATION, events)
     if state.conditions.camera_awaited:
         return _refuse(settings, _newest(state, drive, frame), frame, Reason.CAMERA_UNKNOWN, events)
@@ -75,7 +79,7 @@ def _frame(settings: Settings, state: State, frame: Frame) -> tuple[State, Outpu
     error_nm, pol_nm, drive = _aim(drive, estimate.error_nm, frame.sequence)
     drive, reasons, homing = _follow(settings, state, drive, error_nm, frame.sequence)
     if reasons:
-        drive = _cut_short(drive, frame.sequence, reasons, events)
+        drive = _cut_short(drive, frame.sequence, _acted(reasons), events)
     if state.refused is not None:
         details: dict[str, object] = {"refused": state.refused_count, "reason": state.refused.name}
         events.append(Raised("FRAMES_ACCEPTED", details))
@@ -145,6 +149,15 @@ def _arrive(state: State, frame: Frame, events: list[Raised]) -> tuple[State, Dr
     else:  # after a clear, this may be another start of the camera
         state = _awaiting_camera(state, frame)
     return state, drive
+
+
+def _lease_on_frame(
+    state: State, drive: Drive | None, sequence: int, events: list[Raised]
+) -> tuple[State, Drive | None]:
+    """The state and the drive, without a lease and its probe sequence where it was not renewed in time."""
+    after, ended = lease_checked(state._replace(drive=drive), 0, sequence)
+    events += ended
+    return after, after.drive
 
 
 def _awaiting_camera(state: State, frame: Frame) -> State:
@@ -244,12 +257,17 @@ def _respond(drive: Drive, error_nm: Single) -> tuple[Single, bool]:
     return kept_nm, not np.array_equal(kept_nm, wanted_nm)
 
 
-def _cut_short(drive: Drive, sequence: int, reasons: tuple[Reason, ...], events: list[Raised]) -> Drive:
-    """What is played is no longer what was asked for once a limit acts: it ends."""
+def _acted(limits: tuple[Reason, ...]) -> str:
+    """Why a probe sequence ends once a limit acts: it is no longer what was asked for."""
+    return f"a limit acted: {', '.join(reason.name for reason in limits)}"
+
+
+def _cut_short(drive: Drive, sequence: int, why: str, events: list[Raised]) -> Drive:
+    """The drive with nothing more to play after this frame."""
     added = drive.additions
     if added is None or added.play is None or added.play.over(sequence):
         return drive
-    events.append(Raised("PLAY_ENDED", {"why": f"a limit acted: {', '.join(reason.name for reason in reasons)}"}))
+    events.append(Raised("PLAY_ENDED", {"why": why}))
     return drive._replace(additions=added.stopped(sequence))
 
 
@@ -267,11 +285,18 @@ def _refuse(
     """Hold the command: a frame that cannot be used still yields a step and a command."""
     if reason is not state.refused:
         events.append(Raised("FRAMES_REFUSED", {"reason": reason.name}))
-    drive = state.drive
+    drive, homing, hit = state.drive, state.homing, state.limits_hit
     held = np.zeros(0, np.float32)
+    reasons: tuple[Reason, ...] = (reason,)
     if drive is not None:
         if state.mode is LoopMode.SAFED:
             drive = _relax(settings, drive)
+        elif reason in UNMEASURED and state.mode is not LoopMode.CLOSED:
+            drive, hit, homing = _follow(settings, state, drive.coasted(1), drive.history_nm[0], frame.sequence)
+            if hit:
+                drive = _cut_short(drive, frame.sequence, _acted(hit), events)
+            _limit_events(state.limits_hit, hit, events)
+            reasons = (reason, *hit)
         elif reason not in (Reason.REPEATED, Reason.OUT_OF_ORDER, Reason.AHEAD):  # those are no new exposure
             drive = drive.missed(1)
         held = drive.history_nm[0]
@@ -279,11 +304,13 @@ def _refuse(
         drive=drive,
         refused=reason,
         refused_count=state.refused_count + 1,
+        limits_hit=hit,
+        homing=homing,
         commanded=state.commanded or drive is not None,
-        counts=_counted(state.counts, (reason,)),
+        counts=_counted(state.counts, reasons),
         taken=state.taken + 1,
     )
-    step = Step(frame.sequence, frame.time_ns, state.mode, held, (reason,))
+    step = Step(frame.sequence, frame.time_ns, state.mode, held, reasons)
     if drive is None:
         return state, Outputs(step=step, events=events)
     # Under the newest frame's sequence even where an older frame came: the mirror refuses older commands.
@@ -292,11 +319,11 @@ def _refuse(
 
 def _tick(settings: Settings, state: State, tick: Tick) -> tuple[State, Outputs]:
     """Without frames: repeat the held command, so that only a dead controller lets it expire."""
+    state, events = lease_checked(state, tick.time_ns, 0)
     drive = state.drive
     safed = state.mode is LoopMode.SAFED
     if drive is None or not (state.commanded or safed):
-        return state, Outputs()
-    events = []
+        return state, Outputs(events=tuple(events))
     silent = state.silent or tick.silent_ns > settings.hold_ns  # until a newer frame comes, whatever else comes
     flatten = silent and settings.silence == "flat"
     counts = state.counts
@@ -304,6 +331,7 @@ def _tick(settings: Settings, state: State, tick: Tick) -> tuple[State, Outputs]
         action = "relaxing the mirror to flat" if flatten else "holding the command"
         events.append(Raised("NO_FRAMES", {"silent_ms": tick.silent_ns / 1e6, "action": action}))
         counts = _counted(counts, (Reason.NO_FRAME,))
+        drive = _cut_short(drive, state.frame_sequence, f"no frame for {tick.silent_ns / 1e6:.0f} ms", events)
     if flatten or safed:
         drive = _relax(settings, drive)
     state = state._replace(drive=drive, silent=silent, commanded=True, counts=counts)
@@ -313,49 +341,6 @@ def _tick(settings: Settings, state: State, tick: Tick) -> tuple[State, Outputs]
 def _load(settings: Settings, state: State, load: Load) -> tuple[State, Outputs]:
     state, events = loaded(settings, state, load.calibration, load.source, load.time_ns)
     return state, Outputs(events=events, changed=True)
-
-
-def _mirror(settings: Settings, state: State, shape: MirrorShape) -> tuple[State, Outputs]:
-    """Start from where the mirror is, so that it does not jump; later shapes change nothing."""
-    if state.commanded:
-        return state, Outputs()
-    witnessed: list[Raised] = []
-    if shape.safe and state.mode is not LoopMode.SAFED:
-        witnessed = [mode_event(state.mode, LoopMode.SAFED, WITNESSED), Raised("SAFED", {"why": WITNESSED})]
-        state = in_mode(state, LoopMode.SAFED, shape.time_ns, WITNESSED)
-    drive = state.drive
-    if drive is None:
-        return state, Outputs(events=witnessed, changed=bool(witnessed))
-    if shape.actuators_nm.shape != drive.calibration.grid or not np.isfinite(shape.actuators_nm).all():
-        why = f"the mirror has a grid of {shape.actuators_nm.shape}, the calibration {drive.calibration.grid}"
-        return state, Outputs(events=[*witnessed, Raised("MIRROR_REFUSED", {"why": why})], changed=bool(witnessed))
-    limit_nm = drive.law.limit_nm
-    believed = shape.command_nm.shape == limit_nm.shape and (np.abs(shape.command_nm) <= limit_nm).all()
-    command_nm = shape.command_nm if believed else drive.inverse @ shape.actuators_nm.reshape(-1)
-    drive = drive._replace(actuators_nm=shape.actuators_nm, history_nm=(command_nm,) * len(drive.history_nm))
-    events = witnessed
-    if command_nm.any():
-        events.append(Raised("MIRROR_ADOPTED", {"rms_nm": float(np.sqrt(command_nm @ command_nm))}))
-    if state.mode is not LoopMode.SAFED:  # then it is on its way to flat, and shall stay there
-        drive, rest = adopted(drive, shape.actuators_nm)
-        events += rest
-    return state._replace(drive=drive), Outputs(events=events, changed=True)
-
-
-def _camera(settings: Settings, state: State, camera: CameraSettings) -> tuple[State, Outputs]:
-    """Keep the camera's settings; open the loop where it is no longer the camera that was calibrated."""
-    after = with_camera(state, camera)
-    if after is state:
-        return state, Outputs()
-    wrong = misfit(after)
-    if not wrong or wrong == misfit(state):
-        return after, Outputs(changed=True)
-    events = [Raised("CAMERA_CHANGED", {"what": wrong})]
-    if after.mode is LoopMode.CLOSED:
-        cause = f"the camera does not fit the calibration: {wrong}"
-        events.append(mode_event(after.mode, LoopMode.OPEN, cause))
-        after = in_mode(after, LoopMode.OPEN, camera.time_ns, cause)
-    return after, Outputs(events=events, changed=True)
 
 
 def _request(settings: Settings, state: State, request: Request) -> tuple[State, Outputs]:
@@ -380,8 +365,8 @@ def _counted(counts: Mapping[Reason, int], reasons: tuple[Reason, ...]) -> Mappi
 
 _HANDLERS: dict[type, Callable[..., tuple[State, Outputs]]] = {
     Request: _request,
-    MirrorShape: _mirror,
-    CameraSettings: _camera,
+    MirrorShape: mirror_reported,
+    CameraSettings: camera_reported,
     Load: _load,
     Tick: _tick,
 }

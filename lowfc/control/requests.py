@@ -13,9 +13,11 @@ import numpy.typing as npt
 from lowfc.control.additions import FLAT, MIRROR, Additions, Play, play_table
 from lowfc.control.inputs import Raised, Request
 from lowfc.control.law import Law
+from lowfc.control.lease import ENDED_BY
 from lowfc.control.linear_law import LinearLaw
-from lowfc.control.loading import in_mode, loaded, misfit, mode_event
+from lowfc.control.loading import in_mode, loaded, misfit, mode_event, uncalibrated
 from lowfc.control.margins import check_stable
+from lowfc.control.reservation import lease, lease_checked, lease_ended, release, renew
 from lowfc.control.safety import Limits, LoopMode, neighbour_difference_nm, request_mode
 from lowfc.control.stability import limiting_gain
 from lowfc.control.state import Drive, Following, Settings, State
@@ -48,18 +50,25 @@ def answer(settings: Settings, state: State, request: Request) -> Answer:
     if handler is None:
         return Answer(state, False, _short(f"unknown request {request.name[:40]!r}; there are {', '.join(REQUESTS)}"))
     request = prepared(settings, request)
-    if request.refusal:
-        return Answer(state, False, _short(request.refusal))
+    now, ended = lease_checked(state, request.time_ns, 0)
+    held = now.conditions.lease
+    refusal = held.refusal(request.name, request.lease_id, request.time_ns) if held is not None else ""
+    refusal = refusal or request.refusal
+    if refusal:
+        return Answer(state, False, _short(refusal))
     try:
-        after, text, *events = handler(settings, state, request)
+        after, text, *events = handler(settings, now, request)
     except ValueError as error:
         return Answer(state, False, _short(str(error)))
+    if request.name in ENDED_BY and held is not None and held.id != request.lease_id:
+        after, others = lease_ended(after, _asked(request))
+        events += others
     if after.mode is not state.mode:
         why = _asked(request)
         events.append(mode_event(state.mode, after.mode, why))
         if after.mode is LoopMode.SAFED:
             events.append(Raised("SAFED", {"why": why}))
-    return Answer(after, True, text, tuple(events))
+    return Answer(after, True, text, (*ended, *events))
 
 
 def prepared(settings: Settings, request: Request) -> Request:
@@ -98,9 +107,10 @@ def _status(settings: Settings, state: State, request: Request) -> Handled:
 def _mode(settings: Settings, state: State, request: Request) -> Handled:
     """open, close, safe, clear; to pause is to open: the command is held until the loop is closed again."""
     asked = "open" if request.name == "pause" else request.name
-    after, refusal = request_mode(state.mode, asked, calibrated=state.drive is not None)
+    missing = uncalibrated(state)
+    after, refusal = request_mode(state.mode, asked, calibrated=not missing)
     if refusal:
-        raise ValueError(refusal)
+        raise ValueError(missing if asked == "close" and missing else refusal)
     if after is LoopMode.CLOSED:
         _check_closable(state)
     if request.name == "clear":  # the camera's and the mirror's numbers may begin anew, too
@@ -133,9 +143,10 @@ def _step(settings: Settings, state: State, request: Request) -> Handled:
     frames = request.values[0] if len(request.values) == 1 else 0.0
     if not (1 <= frames <= MOST_STEPS and frames == int(frames)):
         raise ValueError(f"step takes one whole number of frames, 1 or more; got {list(request.values)}")
-    after, refusal = request_mode(state.mode, "close", calibrated=state.drive is not None)
+    missing = uncalibrated(state)
+    after, refusal = request_mode(state.mode, "close", calibrated=not missing)
     if refusal:
-        raise ValueError(refusal)
+        raise ValueError(missing or refusal)
     _check_closable(state)
     state = in_mode(state, after, request.time_ns, _asked(request))
     return state._replace(steps_left=int(frames)), f"loop closed for {frames:g} frames"
@@ -176,7 +187,7 @@ def _offset(settings: Settings, state: State, request: Request) -> Handled:
 
 
 def _channel(settings: Settings, state: State, request: Request) -> Handled:
-    drive = _drive(state)
+    drive = _mirror(state)
     if state.mode is LoopMode.SAFED and request.text != FLAT:
         raise ValueError("the loop is safed: `lowfc ctl clear` first, when it is safe")
     grid = drive.calibration.grid
@@ -193,13 +204,13 @@ def _channel(settings: Settings, state: State, request: Request) -> Handled:
 
 
 def _play(settings: Settings, state: State, request: Request) -> Handled:
-    drive = _drive(state)
-    if state.mode not in (LoopMode.OPEN, LoopMode.CLOSED):
-        raise ValueError(f"nothing can be played while the loop is {state.mode.name.lower()}")
+    drive = _mirror(state)
+    if state.mode is LoopMode.SAFED:
+        raise ValueError("the loop is in safe mode: `lowfc ctl clear` first, when it is safe")
     if not state.frame_sequence:
         raise ValueError("no frame has come yet, from which to count those of a play")
     added = drive.added()
-    if added.play is not None:
+    if added.play is not None and not added.play.over(state.frame_sequence + 1):
         raise ValueError("something is being played already: `lowfc ctl stop` ends it")
     table = request.played
     assert table is not None  # noqa: S101  # prepared
@@ -225,9 +236,12 @@ def _play(settings: Settings, state: State, request: Request) -> Handled:
 
 def _stop(settings: Settings, state: State, request: Request) -> Handled:
     drive = state.drive
-    if drive is None or drive.additions is None or drive.additions.play is None:
+    play = drive.additions.play if drive is not None and drive.additions is not None else None
+    left = 0 if play is None else play.left(state.frame_sequence + 1)
+    if drive is None or drive.additions is None or play is None or not left:
         return state, "nothing is being played"
-    return _with(state, drive, drive.additions.stopped(state.frame_sequence)), "stopped"
+    text = f"stopped on the {play.target}: {left} of {play.frames} frames were left"
+    return _with(state, drive, drive.additions.stopped(state.frame_sequence)), text
 
 
 def _law(settings: Settings, state: State, request: Request) -> Handled:
@@ -282,8 +296,15 @@ def _note(settings: Settings, state: State, request: Request) -> Handled:
     return state, "noted", Raised("NOTE", {"text": request.text.strip()})
 
 
-def _drive(state: State) -> Drive:
+def _mirror(state: State) -> Drive:
+    """The drive, with or without a calibration."""
     if state.drive is None:
+        raise ValueError("no mirror has reported its shape yet, and no calibration is loaded")
+    return state.drive
+
+
+def _drive(state: State) -> Drive:
+    if state.drive is None or not state.drive.calibration.noll:
         raise ValueError("no calibration is loaded, so there are no modes yet")
     return state.drive
 
@@ -362,6 +383,9 @@ _HANDLERS: dict[str, Handler] = {
     "law": _law,
     "load": _load,
     "note": _note,
+    "lease": lease,
+    "renew": renew,
+    "release": release,
 }
 
 CONFIGURATION = "configuration"

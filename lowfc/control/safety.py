@@ -177,8 +177,10 @@ def request_mode(mode: LoopMode, request: str, calibrated: bool) -> tuple[LoopMo
             return mode, f"the loop is {mode.name.lower()}, not safed: there is nothing to clear"
         case "open" | "close" if mode is LoopMode.SAFED:
             return mode, "the loop is safed: `lowfc ctl clear` first, when it is safe"
-        case "open" | "close" if not calibrated:
-            return mode, "no calibration is loaded"
+        case "open" if not calibrated:
+            return LoopMode.IDLE, ""
+        case "close" if not calibrated:
+            return mode, "there is no calibration for these frames"
         case "open":
             return LoopMode.OPEN, ""
         case "close":

@@ -14,6 +14,7 @@ from lowfc.control.calibration import Calibration
 from lowfc.control.camera import CameraSettings
 from lowfc.control.estimator import Estimate, Estimator
 from lowfc.control.law import Law
+from lowfc.control.lease import Lease
 from lowfc.control.linear_law import LinearLaw
 from lowfc.control.safety import Limits, LoopMode, Reason
 from lowfc.control.stability import delay_weights
@@ -108,9 +109,10 @@ class Following(NamedTuple):
 
 
 class Drive(NamedTuple):
-    """What there is once a calibration is loaded.
+    """What there is once the mirror is known: by a calibration, or without one by what the mirror reported.
 
     Attributes:
+        calibration: in use; without modes or pixels where none was loaded.
         to_actuators: (actuators, modes) as in the calibration, laid out for the quicker product.
         inverse: (modes, actuators) modal command of a mirror shape.
         to_modes: (modes, actuators) what the sensor sees of a mirror shape.
@@ -187,10 +189,13 @@ class Drive(NamedTuple):
 
     def missed(self, frames: int) -> "Drive":
         """Some frames later, of which nothing was measured."""
-        stayed = self.stayed(frames)
+        return self.coasted(frames).stayed(frames)
+
+    def coasted(self, frames: int) -> "Drive":
+        """With a law that has done without the measurements of some frames."""
         if self.following is None:
-            return stayed
-        return stayed._replace(following=self.following.coasted(frames, self.history_nm[0]))
+            return self
+        return self._replace(following=self.following.coasted(frames, self.history_nm[0]))
 
 
 class Conditions(NamedTuple):
@@ -201,6 +206,7 @@ class Conditions(NamedTuple):
         camera_awaited: the camera restarted, and its settings have not been received since.
         clear_id: identity of the operator's last clear; 0 without one.
         mode_since_ns: time of the change to this loop mode, and `mode_cause` its cause.
+        lease: the reservation of the loop, or the last one that ended; None before the first.
     """
 
     camera: CameraSettings | None = None
@@ -208,6 +214,7 @@ class Conditions(NamedTuple):
     clear_id: int = 0
     mode_since_ns: int = 0
     mode_cause: str = ""
+    lease: Lease | None = None
 
 
 class State(NamedTuple):

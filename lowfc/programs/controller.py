@@ -66,9 +66,9 @@ class Controller:
     """Receives frames, sends commands, answers operators, until told to stop."""
 
     def __init__(
-        self, config: Configuration, service: Service, calibration: Calibration, source: str, latch: Latch
+        self, config: Configuration, service: Service, calibration: Calibration | None, source: str, latch: Latch
     ) -> None:
-        """Declare everything on the bus and load the calibration."""
+        """Declare everything on the bus and load the calibration; without one, the loop is idle."""
         name = config.mirror.name
         self._service = service
         self._latch = latch
@@ -115,8 +115,9 @@ class Controller:
         self._state_due_ns = self._camera_due_ns = 0
         self._last_frame_ns = service.clock.host_ns()
         now_ns = service.clock.now_ns()
-        self._arrays.publish(Request(now_ns, "load", calibration=calibration))
-        self._take(Load(now_ns, calibration, source))
+        if calibration is not None:
+            self._arrays.publish(Request(now_ns, "load", calibration=calibration))
+            self._take(Load(now_ns, calibration, source))
         service.state = "ready"
 
     def run(self) -> None:
@@ -173,7 +174,7 @@ class Controller:
         A frame that was overtaken is late, whatever its age, and the command is held: frames exposed under one mirror
         shape must not all be integrated.
         """
-        clock = self._service.clock
+        clock, newest = self._service.clock, self._state.frame_sequence
         taken_ns = clock.host_ns()
         age_ns = 0 if clock.lockstep else taken_ns - sample.publish_time_ns
         if overtaken:
@@ -192,7 +193,7 @@ class Controller:
         sent_ns = self._commands.handed_ns if outputs.command is not None else clock.host_ns()
         let_send()
         self._tell(outputs)
-        if sample.sequence == self._state.frame_sequence:  # an older one is no sign of a live camera
+        if self._state.frame_sequence != newest:  # an old one is no sign of a live camera
             self._last_frame_ns = taken_ns
         self._service.work += 1
         self._frame_to_command.add(sent_ns - sample.publish_time_ns)
@@ -312,7 +313,7 @@ class Controller:
 
     def _adopt_mirror(self) -> None:
         """Learn where the mirror is before the first command, so that it does not jump."""
-        if self._service.clock.lockstep:  # every lockstep run starts from flat
+        if self._service.clock.lockstep and self._state.drive is not None:  # every lockstep run starts from flat
             self._leave_mirror()
             return
         sample = self._mirror.take(MIRROR_PATIENCE_S)

@@ -95,7 +95,7 @@ class Script:
 
     def message(self, name: str) -> wire.Request:
         """A request of that name, with what belongs to it, or something else."""
-        message = wire.Request(name=name)
+        message = wire.Request(name=name, lease_id=int(self.rng.choice([0, 1, 1])))
         match name:
             case "gain" | "leak" | "limit":
                 message.modes.extend(self.modes())
@@ -123,6 +123,11 @@ class Script:
                 one = (CALIBRATION, *OTHERS, ELSEWHERE, None)[self.rng.integers(6)]
                 if one is not None:
                     message.calibration.MergeFromString(encode_calibration(one, 0))
+            case "lease" | "renew" | "release":
+                message.text = str(self.rng.choice(["lowfc calibrate"] * 8 + ["", "x" * 400]))
+                message.values.append(float(self.rng.choice([10] * 10 + [1e-6, 0, -1, np.nan, 1e9])))
+                if self.rng.random() < 0.1:
+                    message.lease_id = int(self.rng.choice([0, 2]))
             case "note":
                 message.text = str(self.rng.choice(["seeing is better", "", "n" * 20_000]))
         return message
@@ -262,7 +267,14 @@ def check(names: list[str], pauses: list[int], seed: int, delay_frames: float, t
     return run
 
 
-NAMES = [*(name for name in REQUESTS if name not in ("safe", "configuration")), *("close",) * 4, "clear", "dance"]
+NAMES = [
+    *(name for name in REQUESTS if name not in ("safe", "configuration")),
+    *("close",) * 4,
+    "lease",
+    "renew",
+    "clear",
+    "dance",
+]
 names = st.lists(st.sampled_from([*NAMES, *NAMES, "safe"]), min_size=COMMANDS, max_size=COMMANDS)
 pauses = st.lists(st.sampled_from([0, 1, 1, 2, 5, 12]), min_size=COMMANDS, max_size=COMMANDS)
 random_commands = given(names, pauses, st.integers(0, 2**32 - 1), st.sampled_from([1.0, 1.5, 2.0]), st.booleans())

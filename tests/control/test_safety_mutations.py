@@ -90,7 +90,7 @@ MUTATIONS = {
     "clear closes": ("(LoopMode.OPEN if calibrated", "(LoopMode.CLOSED if calibrated"),
     "clear in any mode": ('case "clear" if mode is LoopMode.SAFED:', 'case "clear" if True:'),
     "safed is not latched": ('case "open" | "close" if mode is LoopMode.SAFED:', 'case "open" | "close" if False:'),
-    "close without calibration": ('case "open" | "close" if not calibrated:', 'case "open" | "close" if False:'),
+    "close without calibration": ('case "close" if not calibrated:', 'case "close" if False:'),
     "safe can be refused": ('return LoopMode.SAFED, ""', 'return (LoopMode.SAFED if calibrated else mode), ""'),
 }
 
@@ -148,7 +148,8 @@ def _check_modes(module: Any) -> None:
             cleared = (mode.OPEN if calibrated else mode.IDLE) if now is mode.SAFED else now
             assert ask(now, "clear", calibrated)[0] is cleared
             free = calibrated and now is not mode.SAFED
-            assert ask(now, "open", calibrated)[0] is (mode.OPEN if free else now)
+            opened = mode.SAFED if now is mode.SAFED else mode.OPEN if calibrated else mode.IDLE
+            assert ask(now, "open", calibrated)[0] is opened
             assert ask(now, "close", calibrated)[0] is (mode.CLOSED if free else now)
 
 

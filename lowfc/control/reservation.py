@@ -1,0 +1,70 @@
+"""What leases do to the state: requested, renewed, released, ended."""
+
+from lowfc.control.inputs import Raised, Request
+from lowfc.control.lease import Lease, extended
+from lowfc.control.state import Settings, State
+
+
+def lease(settings: Settings, state: State, request: Request) -> tuple[State, str, Raised]:
+    """Reserve the loop for the client that asks.
+
+    Raises:
+        ValueError: somebody else holds it, or the request is not whole.
+    """
+    before = state.conditions.lease
+    if before is not None and not before.ended and before.id != request.lease_id:
+        raise ValueError(before.reserved(request.time_ns))
+    made = _extended(settings, state, request)
+    return _with(state, made), made.reserved(request.time_ns), Raised("LEASE_TAKEN", {"holder": made.holder})
+
+
+def renew(settings: Settings, state: State, request: Request) -> tuple[State, str]:
+    """Extend a lease that is in force.
+
+    Raises:
+        ValueError: it is not, and why it ended.
+    """
+    before = state.conditions.lease
+    if before is None or before.id != request.lease_id:
+        raise ValueError("this lease is not in force: the controller restarted, or another lease was granted")
+    if before.ended:
+        raise ValueError(f"the lease ended: {before.ended}")
+    made = _extended(settings, state, request)
+    return _with(state, made), made.reserved(request.time_ns)
+
+
+def release(settings: Settings, state: State, request: Request) -> tuple[State, str] | tuple[State, str, Raised]:
+    """End a lease at its holder's request; another's stays."""
+    held = state.conditions.lease
+    if held is None or held.ended or held.id != request.lease_id:
+        return state, "nothing was reserved"
+    after = _with(state, held._replace(ended="its holder released it"))
+    return after, "released", Raised("LEASE_RELEASED", {"holder": held.holder})
+
+
+def lease_checked(state: State, time_ns: int, frame_sequence: int) -> tuple[State, list[Raised]]:
+    """The state without a lease that was not renewed by this time or frame, and the event of its end."""
+    held = state.conditions.lease
+    if held is None or held.ended or not held.over(time_ns, frame_sequence):
+        return state, []
+    return lease_ended(state, "it was not renewed in time")
+
+
+def lease_ended(state: State, why: str) -> tuple[State, list[Raised]]:
+    """The state without the lease in force and without its probe sequence, and the event."""
+    held, drive = state.conditions.lease, state.drive
+    if held is None or held.ended:
+        return state, []
+    if drive is not None and drive.additions is not None:
+        drive = drive._replace(additions=drive.additions.stopped(state.frame_sequence))
+    after = _with(state, held._replace(ended=why))._replace(drive=drive)
+    return after, [Raised("LEASE_ENDED", {"holder": held.holder, "why": why})]
+
+
+def _extended(settings: Settings, state: State, request: Request) -> Lease:
+    now = request.time_ns, state.frame_sequence
+    return extended(request.lease_id, request.text.strip(), request.values, now, settings.rate_hz)
+
+
+def _with(state: State, lease: Lease) -> State:
+    return state._replace(conditions=state.conditions._replace(lease=lease))
