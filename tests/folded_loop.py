@@ -1,5 +1,6 @@
 """A loop in one process behind the client's interface: frames are exposed when somebody asks for the next one."""
 
+import contextlib
 import tomllib
 from collections import deque
 from collections.abc import Callable, Iterator
@@ -15,7 +16,7 @@ from lowfc.adapters.clock import HostClock
 from lowfc.client import Frame as Image
 from lowfc.client import MirrorWatch
 from lowfc.contract.configuration import Configuration
-from lowfc.contract.errors import RequestRefusedError
+from lowfc.contract.errors import CalibrationError, RequestRefusedError
 from lowfc.contract.messages import MIRROR_STATE, Topic, wire
 from lowfc.contract.state_codec import controller_state
 from lowfc.control.additions import MIRROR
@@ -99,7 +100,7 @@ class FoldedLoop:
         self._listeners: list[tuple[str, deque[Any]]] = []
         self.surfaces_nm: list[npt.NDArray[np.float32]] = []
         self.residual_nm: list[npt.NDArray[np.float32]] = []
-        self.stops = 0
+        self.stops = self.lease_id = 0
         self.first = FIRST
 
     def start_mirror(self) -> None:
@@ -138,6 +139,7 @@ class FoldedLoop:
 
     def ask(self, name: str, **fields: Any) -> Given:
         """A request, carried out before the next frame."""
+        fields = {"lease_id": self.lease_id, **fields}
         self._state, outputs = advance(self._settings, self._state, Request(0, name, **fields))
         assert outputs.reply is not None
         if not outputs.reply.accepted:
@@ -150,6 +152,25 @@ class FoldedLoop:
         self.expose()  # time goes on while somebody asks
         basis = np.asarray(basis_nm, np.float32)
         return self.ask("play", text=MIRROR, actuators_nm=basis.reshape(-1), table=np.asarray(table, np.float32))
+
+    @contextlib.contextmanager
+    def reserved(self, purpose: str, duration_s: float | None = None) -> Iterator[None]:
+        """See `Client.reserved`; nobody renews it."""
+        self.lease_id = 1
+        self.ask("lease", values=(60.0,), text=purpose)
+        try:
+            yield
+        finally:
+            self.ask("release")
+            self.lease_id = 0
+
+    def check_lease(self) -> None:
+        """See `Client.check_lease`."""
+        if self.lease_id:
+            try:
+                self.ask("renew", values=(60.0,), text="a test")
+            except RequestRefusedError as fault:
+                raise CalibrationError(str(fault)) from None
 
     def status(self) -> Given:
         """See `Client.status`."""

@@ -2,7 +2,7 @@
 
 import contextlib
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from types import TracebackType
 from typing import NamedTuple, TypeVar
@@ -15,6 +15,7 @@ from lowfc.adapters.bus import ALL, Bus, Sample, name_in
 from lowfc.adapters.clock import HostClock
 from lowfc.adapters.run import DEFAULT_RUN, open_run
 from lowfc.adapters.zenoh_bus import ZenohBus
+from lowfc.client.lease import Lease
 from lowfc.client.mirror_watch import MirrorWatch
 from lowfc.client.runs import the_run
 from lowfc.client.stream import SILENT_S, WAITING, Frame, Stream, frame_of, step_of
@@ -96,6 +97,7 @@ class Client:
                 time.sleep(0.01)
         self._bus = bus
         self._grid: tuple[int, int] | None = None
+        self._lease: Lease | None = None
 
     def __enter__(self) -> "Client":
         return self
@@ -205,6 +207,39 @@ class Client:
         """Let a linear law drive the mirror; None for the integrator."""
         return self.ask("law", law=law)
 
+    @contextlib.contextmanager
+    def reserved(self, purpose: str, duration_s: float | None = None) -> Iterator[Lease]:
+        """Reserve the loop: until the end of the block, requests of others that would change it are refused.
+
+        `safe`, `open`, `pause` and `stop` are always granted, and end the reservation: see `check_lease`.
+
+        Args:
+            purpose: For people, such as "lowfc calibrate".
+            duration_s: How long it is going to take, where that is known.
+
+        Raises:
+            RequestRefusedError: somebody else has reserved it.
+        """
+        lease = Lease(self._ask_for_lease, purpose, duration_s)
+        self._lease = lease
+        try:
+            yield lease
+        finally:
+            self._lease = None
+            lease.release()
+
+    def check_lease(self) -> None:
+        """Make sure that the loop is still reserved, where it was.
+
+        Raises:
+            CalibrationError: it is not, and why.
+        """
+        if self._lease is not None:
+            self._lease.check()
+
+    def _ask_for_lease(self, name: str, lease_id: int, seconds: float, holder: str) -> Answer:
+        return self.ask(name, values=seconds, text=holder, lease_id=lease_id)
+
     def note(self, text: str) -> Answer:
         """Leave a note in the log."""
         return self.ask("note", text=text)
@@ -285,6 +320,7 @@ class Client:
         table: Single | None = None,
         law: LinearLaw | None = None,
         calibration: Calibration | None = None,
+        lease_id: int | None = None,
     ) -> Answer:
         """Ask the controller anything; the fields are those of `lowfc.v1.Request`.
 
@@ -302,6 +338,7 @@ class Client:
                 table=b"" if table is None else table.tobytes(),
                 columns=0 if table is None else table.shape[1],
                 law=None if law is None else wire_law(law),
+                lease_id=(self._lease.id if self._lease is not None else 0) if lease_id is None else lease_id,
             )
         except (ValueError, TypeError) as fault:
             raise RequestRefusedError(f"{name} refused: {fault}") from None

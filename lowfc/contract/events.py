@@ -50,6 +50,7 @@ EVENTS: dict[str, Event] = {
         ),
         Event("REALTIME_REFUSED", Level.WARNING, "the host refused {measure}: {cost}"),
         Event("CALIBRATION_LOADED", Level.INFO, "calibration {id}: {modes} modes, {estimator}, from {source}"),
+        Event("NOT_CALIBRATED", Level.WARNING, "the loop is idle: {why}"),
         Event("CAMERA_CHANGED", Level.WARNING, "the camera does not fit the calibration: {what}"),
         Event("MODE_CHANGED", Level.INFO, "loop {before} -> {after}: {why}"),
         Event("SAFED", Level.ERROR, "safed: {why}; `lowfc ctl clear` when it is safe"),

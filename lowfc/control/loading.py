@@ -16,6 +16,7 @@ Single = npt.NDArray[np.float32]
 
 ADOPTED_NM = 1.0
 """Of an actuator beyond the modal command, above which a mirror's shape is adopted as a channel."""
+LATCHED = "it was in safe mode before the controller started"
 WITNESSED = "the mirror's last command was sent in safe mode"
 
 
@@ -57,7 +58,7 @@ def loaded(
     before_mode, cause = state.mode, "a calibration was loaded"
     mode = settings.start_mode if before_mode is LoopMode.IDLE else before_mode
     if mode is LoopMode.SAFED:
-        cause = "it was in safe mode before the controller started"
+        cause = LATCHED
     state = state._replace(drive=drive)
     if mode is not LoopMode.SAFED and (wrong := uncalibrated(state)):
         mode, cause = LoopMode.IDLE, wrong
@@ -94,21 +95,23 @@ def mirror_reported(settings: Settings, state: State, shape: MirrorShape) -> tup
     """Start from where the mirror is, so that it does not jump; later shapes change nothing."""
     if state.commanded:
         return state, Outputs()
-    witnessed: list[Raised] = []
-    if shape.safe and state.mode is not LoopMode.SAFED:
-        witnessed = [mode_event(state.mode, LoopMode.SAFED, WITNESSED), Raised("SAFED", {"why": WITNESSED})]
-        state = in_mode(state, LoopMode.SAFED, shape.time_ns, WITNESSED)
-    drive = state.drive
+    events: list[Raised] = []
+    drive, safe = state.drive, WITNESSED if shape.safe else ""
     if drive is None:  # probe sequences and channels need no calibration
         drive = Drive.at_rest(settings, Calibration.none(shape.actuators_nm.shape))
+        events.append(Raised("NOT_CALIBRATED", {"why": uncalibrated(state)}))
+        safe = safe or (LATCHED if settings.start_mode is LoopMode.SAFED else "")
+    if safe and state.mode is not LoopMode.SAFED:
+        events += [mode_event(state.mode, LoopMode.SAFED, safe), Raised("SAFED", {"why": safe})]
+        state = in_mode(state, LoopMode.SAFED, shape.time_ns, safe)
     if shape.actuators_nm.shape != drive.calibration.grid or not np.isfinite(shape.actuators_nm).all():
         why = f"the mirror has a grid of {shape.actuators_nm.shape}, the calibration {drive.calibration.grid}"
-        return state, Outputs(events=[*witnessed, Raised("MIRROR_REFUSED", {"why": why})], changed=bool(witnessed))
+        events.append(Raised("MIRROR_REFUSED", {"why": why}))
+        return state, Outputs(events=events, changed=bool(safe))
     limit_nm = drive.law.limit_nm
     believed = shape.command_nm.shape == limit_nm.shape and (np.abs(shape.command_nm) <= limit_nm).all()
     command_nm = shape.command_nm if believed else drive.inverse @ shape.actuators_nm.reshape(-1)
     drive = drive._replace(actuators_nm=shape.actuators_nm, history_nm=(command_nm,) * len(drive.history_nm))
-    events = witnessed
     if command_nm.any():
         events.append(Raised("MIRROR_ADOPTED", {"rms_nm": float(np.sqrt(command_nm @ command_nm))}))
     if state.mode is not LoopMode.SAFED:  # then it is on its way to flat, and shall stay there

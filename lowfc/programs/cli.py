@@ -134,7 +134,8 @@ def controller(
     run: RunId = DEFAULT_RUN,
     config: ConfigFile = None,
     calibration: Annotated[
-        Path | None, typer.Option(help="Calibration file (FITS); default: computed from the configuration.")
+        Path | None,
+        typer.Option(help="Calibration file (FITS), or none; default: computed from the configuration."),
     ] = None,
 ) -> None:
     """Run the controller: frames from the bus, commands to it.
@@ -156,7 +157,11 @@ def controller(
     signalled: list[int] = []  # before there is a loop to be made safe
     signal.signal(signal.SIGUSR1, lambda number, _: signalled.append(number))
     settings = configuration(config)
-    found = load(calibration) if calibration is not None else analytic(settings, Console(stderr=True))
+    found = None
+    if calibration is None:
+        found = analytic(settings, Console(stderr=True))
+    elif str(calibration) != "none":
+        found = load(calibration)
     service = join(settings, run, Role.CONTROLLER, settings.realtime.controller_cpus)
     source = calibration.name if calibration is not None else "the configuration"
     latch = Latch(

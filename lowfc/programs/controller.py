@@ -371,7 +371,7 @@ class Controller:
         """Publish the step and the events, and the state where more of it changed than the next frame shows."""
         if outputs.step is not None:
             self._steps.put(codec.encode_step(outputs.step, self._state.taken))
-            if self._state.drive is not None:
+            if self._state.drive is not None and self._state.drive.calibration.noll:
                 self._offload.add(outputs.step, self._state.drive.calibration.noll)
         for event in outputs.events:
             self._service.event(event.name, **event.details)

@@ -4,8 +4,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from tests.control.test_advance import SOME, feed, names
-from tests.control.toy import GRID, frame, frame_sequence, loaded, settings
 
 from lowfc.contract.state_codec import controller_state, decode_state
 from lowfc.control.additions import MIRROR
@@ -14,6 +12,8 @@ from lowfc.control.lease import MAX_S
 from lowfc.control.loop import advance
 from lowfc.control.safety import LoopMode
 from lowfc.control.state import State
+from tests.control.test_advance import SOME, feed, names
+from tests.control.toy import GRID, frame, frame_sequence, loaded, settings
 
 USUAL = settings(rate_hz=1000.0)
 HOLDER = "lowfc calibrate (anna, pid 7)"
@@ -163,7 +163,7 @@ def test_it_ends_with_its_holder_by_the_clock_where_no_frames_come() -> None:
 
 
 def test_it_is_gone_by_the_time_of_the_next_request() -> None:
-    state, outputs = asked(held(1.0), Request(S + 1, "gain", values=(0.3,)))
+    _state, outputs = asked(held(1.0), Request(S + 1, "gain", values=(0.3,)))
     assert outputs.reply is not None
     assert outputs.reply.accepted
     assert names([outputs]) == ["LEASE_ENDED"]

@@ -5,10 +5,6 @@ from dataclasses import replace
 import numpy as np
 import numpy.typing as npt
 import pytest
-from tests.control.safety_checks import violations
-from tests.control.test_advance import SOME, feed, names
-from tests.control.test_camera_settings import CAMERA
-from tests.control.toy import GRID, SHAPE, calibration, frame, settings
 
 from lowfc.contract.state_codec import controller_state, decode_state
 from lowfc.control.additions import MIRROR
@@ -16,6 +12,10 @@ from lowfc.control.inputs import Frame, Load, MirrorShape, Outputs, Request, Tic
 from lowfc.control.loop import advance
 from lowfc.control.safety import LoopMode, Reason
 from lowfc.control.state import State
+from tests.control.safety_checks import violations
+from tests.control.test_advance import SOME, feed, names
+from tests.control.test_camera_settings import CAMERA
+from tests.control.toy import GRID, SHAPE, calibration, frame, settings
 
 USUAL = settings(rate_hz=1000.0)
 ODD = np.full((8, 9), 5000, np.uint16)
@@ -99,6 +99,14 @@ def test_the_mirror_stays_where_it_was_and_safe_relaxes_it() -> None:
     assert state.mode is LoopMode.IDLE
 
 
+def test_what_was_made_safe_before_the_controller_started_stays_so() -> None:
+    safe = settings(start_mode=LoopMode.SAFED)
+    state, every = feed(safe, State(), MirrorShape(0, np.full(GRID, 30, np.float32), np.zeros(0, np.float32)))
+    assert names(every) == ["NOT_CALIBRATED", "MODE_CHANGED", "SAFED"]
+    _, every = feed(safe, state, odd(1))
+    assert not surfaces(every).any()
+
+
 @pytest.mark.parametrize("begin", [idle, other_size])
 @pytest.mark.parametrize("name", ["close", "step"])
 def test_it_is_not_closed_and_says_what_is_missing(begin: object, name: str) -> None:
@@ -111,7 +119,7 @@ def test_it_is_not_closed_and_says_what_is_missing(begin: object, name: str) -> 
 def test_a_calibration_ends_it_and_leaves_the_mirror_where_it_is() -> None:
     state = idle(shape_nm=30.0)
     request = Request(0, "load", calibration=calibration())
-    state, outputs = advance(replace(USUAL, start_mode=LoopMode.OPEN), state, request)
+    state, _outputs = advance(replace(USUAL, start_mode=LoopMode.OPEN), state, request)
     assert state.mode is LoopMode.OPEN
     state, every = feed(USUAL, state, frame(4, SOME))
     assert np.allclose(surfaces(every), 30, atol=1e-3)

@@ -10,6 +10,7 @@ import numpy.typing as npt
 from lowfc.contract.envelope import start_of
 from lowfc.contract.errors import BusError, CalibrationError, LowfcError
 from lowfc.control.inputs import Step
+from lowfc.control.loop import UNMEASURED
 from lowfc.control.poke_plan import Plan, seen, usable
 from lowfc.control.safety import LoopMode, Reason
 from lowfc.control.stability import delay_weights
@@ -20,6 +21,8 @@ AFTERWARDS = 8
 """Frames recorded after the last of a play: the longest delay that can be measured is over by then."""
 MOST_BEHIND = 100
 """Frames by which the mirror's reports may lag behind the controller's steps; then the mirror is taken for dead."""
+MOST_REFUSED = 50
+"""Frames refused in a row after which a probe sequence is given up."""
 _LIMITS = frozenset(reason for reason in Reason if reason >= Reason.MODAL_LIMIT)
 
 
@@ -89,6 +92,10 @@ class Loop(Protocol):
 
     def mirror_watch(self) -> Mirror:
         """What the mirror reports from now on."""
+        ...
+
+    def check_lease(self) -> None:
+        """See `Client.check_lease`."""
         ...
 
 
@@ -182,10 +189,12 @@ def play(loop: Loop, basis_nm: npt.NDArray[np.floating], table: npt.NDArray[np.f
                         mode = _check(step, mode, over=step.frame_sequence > last)
                         _check_devices(mirror, step.frame_sequence, first)
                         made.append(step)
+                        _check_refused(made)
                     step = next(steps)
             _check_devices(mirror, step.frame_sequence, first)
         except StopIteration:
             raise BusError("the frames came to an end: is the camera still running?") from None
+        loop.check_lease()
     return _recording(images, made, first)
 
 
@@ -236,6 +245,22 @@ def _check(step: Step, before: LoopMode | None, *, over: bool) -> LoopMode:
     return step.mode
 
 
+def _commanded(step: Step) -> bool:
+    """Whether the mirror followed the sequence with this step: where no law acts, it needs no measurement."""
+    return step.error_nm is not None or (step.mode is not LoopMode.CLOSED and step.reasons[0] in UNMEASURED)
+
+
+def _check_refused(made: list[Step]) -> None:
+    """Raise where no frame at all has been used for a while."""
+    last = made[-MOST_REFUSED:]
+    if len(last) == MOST_REFUSED and not any(_commanded(step) for step in last):
+        reasons = sorted({reason.name for step in last for reason in step.reasons})
+        raise CalibrationError(
+            f"the last {MOST_REFUSED} frames were refused as {', '.join(reasons)}: the sequence has ended; correct "
+            "this first, `lowfc ctl status` shows when frames are used again"
+        )
+
+
 def _check_devices(mirror: Mirror, sequence: int, first: int) -> None:
     """Raise where the pokes up to a frame were not all on the mirror, or the frame is another camera process's."""
     mirror.read()
@@ -263,6 +288,6 @@ def _recording(images: list[Image], made: list[Step], first: int) -> Recording:
         np.array([image.sequence - first for image in images]),
         np.array([image.pixels for image in images]).reshape(len(images), -1),
         np.array([step.frame_sequence - first for step in made]),
-        np.array([step.error_nm is not None for step in made]),
+        np.array([_commanded(step) for step in made]),
         command,
     )

@@ -1,0 +1,99 @@
+"""The loop reserved for one client, renewed by a thread of its own for as long as it is needed."""
+
+import contextlib
+import os
+import pwd
+import secrets
+import threading
+import time
+from collections.abc import Callable
+
+from lowfc.contract.errors import BusError, CalibrationError, LowfcError, RequestRefusedError
+
+DURATION_S = 10.0
+"""For which it is in force unless it is renewed: so long are others refused after its holder's death."""
+RENEWAL_S = 0.5
+"""Between renewals; in lockstep a loop may be twenty times as fast as its clock says."""
+
+Ask = Callable[[str, int, float, str], object]
+"""Ask for `lease`, `renew` or `release`: the request, the lease's identity, seconds, its holder."""
+
+
+class Lease:
+    """A reservation of the loop, from its construction to `release`.
+
+    Attributes:
+        id: carried by the holder's requests.
+    """
+
+    def __init__(self, ask: Ask, purpose: str, duration_s: float | None = None) -> None:
+        """Reserve the loop.
+
+        Args:
+            ask: Of the controller.
+            purpose: For people, such as "lowfc calibrate".
+            duration_s: How long it is going to take, where that is known.
+
+        Raises:
+            RequestRefusedError: somebody else has reserved it.
+            BusError: no controller is there.
+        """
+        self.id = secrets.randbits(63) | 1
+        self._ask = ask
+        self._purpose = f"{purpose} by {_user()} (process {os.getpid()})"
+        self._end_s: float | None = None
+        self._ended = ""
+        self._turn = threading.Lock()
+        self._done = threading.Event()
+        if duration_s is not None:
+            self.expect(duration_s)
+        self._ask("lease", self.id, DURATION_S, self._holder())
+        self._thread = threading.Thread(target=self._renew, name="lease", daemon=True)
+        self._thread.start()
+
+    def expect(self, duration_s: float) -> None:
+        """Say how long it is going to take from now on."""
+        self._end_s = time.monotonic() + duration_s
+
+    def check(self) -> None:
+        """Renew it now.
+
+        Raises:
+            CalibrationError: it has ended, and why.
+        """
+        with self._turn:
+            if not self._ended:
+                try:
+                    self._ask("renew", self.id, DURATION_S, self._holder())
+                except RequestRefusedError as fault:
+                    self._ended = str(fault)
+            if self._ended:
+                raise CalibrationError(f"ended from outside: {self._ended}")
+
+    def release(self) -> None:
+        """Give the loop back."""
+        self._done.set()
+        self._thread.join()
+        with contextlib.suppress(LowfcError):
+            self._ask("release", self.id, 0.0, "")
+
+    def _renew(self) -> None:
+        while not self._done.wait(RENEWAL_S):
+            try:
+                self.check()
+            except BusError:
+                continue  # the controller may come back; the next request says what is wrong
+            except CalibrationError:
+                return
+
+    def _holder(self) -> str:
+        if self._end_s is None:
+            return self._purpose
+        return f"{self._purpose}, about {max(0.0, self._end_s - time.monotonic()):.0f} s to go"
+
+
+def _user() -> str:
+    try:
+        return pwd.getpwuid(os.getuid()).pw_name
+    except KeyError:
+        return f"user {os.getuid()}"
