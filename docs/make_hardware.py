@@ -10,9 +10,10 @@ from google.protobuf.descriptor_pb2 import FileDescriptorProto, FileDescriptorSe
 
 from lowfc.contract.configuration import Mirror, keys
 from lowfc.contract.messages import CAMERA_STATE, COMMAND, EVENT, FRAME, HEALTH, MIRROR_STATE, SURFACE, Role, Topic
+from lowfc.programs.conformance.agreement import AGREEMENTS
 
 DOCUMENT = Path(__file__).parent / "hardware.md"
-TABLES = ("camera topics", "mirror topics", "CameraState", "MirrorCommand", "MirrorState", "mirror keys")
+TABLES = ("camera topics", "mirror topics", "CameraState", "MirrorCommand", "MirrorState", "mirror keys", "agreement")
 
 _MESSAGES = 4  # numbers of the fields of the descriptors, which the places of comments are made of
 _FIELDS = 2
@@ -40,6 +41,11 @@ def render(table: str) -> str:
             for name, info in keys(Mirror, "mirror.").items():
                 default = info.get_default(call_default_factory=True)
                 rows.append([f"`{name}`", f"`{default!r}`", sentence(info.description or "")])
+        case "agreement":
+            rows = [["the camera's", "the configuration's", "may differ by", "needed", "used for"]]
+            for one in AGREEMENTS:
+                needed, apart = "yes" if one.needed else "no", f"{one.apart:.0%}" if one.apart else "nothing"
+                rows.append([f"`{one.field}`", f"`{one.key}`", apart, needed, one.use])
         case "CameraState" | "MirrorCommand" | "MirrorState":
             rows = fields(table)
         case _:

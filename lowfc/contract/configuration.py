@@ -21,6 +21,7 @@ from lowfc.contract.sections import (
     Camera,
     Disturbance,
     Mirror,
+    NotNegative,
     Positive,
     Preset,
     Section,
@@ -43,6 +44,8 @@ __all__ = [
     "sensor_keys",
 ]
 
+LATE_NS, HOLD_NS = 20_000_000, 50_000_000
+"""Least age of a late frame and least silence of a camera, where the configuration leaves them open."""
 MOST_FAULTS = 20
 """Faults that are explained, of a file that may be something else altogether."""
 _LONGEST_KEY = 100  # characters of one that the nearest known key is looked for
@@ -72,10 +75,10 @@ class Control(Section):
     """Largest modal command of tip and tilt, wavefront rms."""
     limit_nm: Positive = 50.0
     """Largest modal command of the other modes, wavefront rms."""
-    late_ms: Positive = 20.0
-    """Age above which a frame is refused."""
-    hold_ms: Positive = 50.0
-    """Silence of the camera after which it is an event."""
+    late_ms: NotNegative = 0.0
+    """Age above which a frame is refused; 0 for 20 ms, or two frame periods where they are longer."""
+    hold_ms: NotNegative = 0.0
+    """Silence of the camera after which it is an event; 0 for 50 ms, or five frame periods where they are longer."""
     silence: Literal["hold", "flat"] = "hold"
     """During such a silence: hold the command, or relax the mirror to flat."""
     valid_ms: Positive = 200.0
@@ -245,6 +248,16 @@ class Configuration(Section):
     def exposure_ns(self) -> int:
         """Exposure time."""
         return round(self.period_ns * self.camera.exposure_fraction)
+
+    @property
+    def late_ns(self) -> int:
+        """Age above which a frame is refused."""
+        return round(self.control.late_ms * 1e6) or max(LATE_NS, 2 * self.period_ns)
+
+    @property
+    def hold_ns(self) -> int:
+        """Silence of the camera after which it is an event."""
+        return round(self.control.hold_ms * 1e6) or max(HOLD_NS, 5 * self.period_ns)
 
     @property
     def noll(self) -> tuple[int, ...]:

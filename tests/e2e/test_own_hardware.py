@@ -35,7 +35,7 @@ DEVICES = (
     "python examples/camera.py --run bench --config bench.toml",
 )
 CONFORMANCE = (
-    "lowfc conformance camera --run bench",
+    "lowfc conformance camera --run bench --config bench.toml",
     "lowfc conformance mirror --run bench --config bench.toml",
 )
 LOOP = ("lowfc controller --run bench --config bench.toml", "lowfc ctl close --run bench")

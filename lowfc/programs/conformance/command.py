@@ -36,19 +36,23 @@ Json = Annotated[bool, typer.Option("--json", help="Print one JSON object on sta
 @conformance_app.command()
 def camera(
     run: RunName = None,
+    config: ConfigFile = None,
     duration: Annotated[float, typer.Option(min=0.2, max=3600, help="Seconds to look at it.")] = 5.0,
     as_json: Json = False,
 ) -> None:
     """Look at a camera's messages for a while and say what is wrong with them; exit status 1 where something is.
 
-    The loop may be running meanwhile: nothing is published.
+    The loop may be running meanwhile: nothing is published. With --config, the camera's settings are compared with the
+    loop's configuration, too.
 
-    Example: lowfc conformance camera --run bench --duration 5
+    Example: lowfc conformance camera --run bench --config bench.toml
     """
     from lowfc.contract.messages import Role
+    from lowfc.programs.conformance.agreement import agreement_checks
     from lowfc.programs.conformance.camera import camera_checks, watch
     from lowfc.programs.conformance.line import ZenohLine
 
+    settings = None if config is None else configuration(config)
     found = _run_with(Role.CAMERA, run)
     line = ZenohLine(found.links, Role.OPERATOR)
     try:
@@ -57,7 +61,11 @@ def camera(
             watched = watch(line, duration, lambda done_s: show(completed=done_s))
     finally:
         line.close()
-    _end("camera", found.run_id, camera_checks(watched), as_json)
+    checks = list(camera_checks(watched))
+    states = [state for state in watched.states if state is not None]
+    if settings is not None and states:
+        checks += agreement_checks(settings, states[-1])
+    _end("camera", found.run_id, checks, as_json)
 
 
 @conformance_app.command()
