@@ -22,7 +22,7 @@ from lowfc.contract.state_codec import controller_state
 from lowfc.control.additions import MIRROR
 from lowfc.control.calibration import Calibration
 from lowfc.control.camera import CameraSettings
-from lowfc.control.inputs import Frame, Load, Request, Step
+from lowfc.control.inputs import Frame, Input, Load, MirrorShape, Request, Step
 from lowfc.control.linear_law import LinearLaw
 from lowfc.control.loop import advance
 from lowfc.control.stability import delay_weights
@@ -81,14 +81,24 @@ class FoldedLoop:
         calibration: Calibration | None = None,
         world: Configuration | None = None,
         lose: Callable[[int], bool] = lambda index: False,
+        cut: int | None = None,
     ) -> None:
-        """A loop under `config` in a world that may be another one; frames that `lose` names do not arrive."""
+        """A loop under `config` in a world that may be another one; frames that `lose` names do not arrive.
+
+        Where `cut` is given, frames lack so many pixels at each edge, and the loop begins without a calibration.
+        """
         world = config if world is None else world
         self.config = config
-        if calibration is None:
-            calibration = computed(config.to_toml())
+        self._cut = cut or 0
         self._settings = instrument.settings(config)
-        self._state, _ = advance(self._settings, State(), Load(0, calibration, "test"))
+        if cut is None:
+            if calibration is None:
+                calibration = computed(config.to_toml())
+            first: Input = Load(0, calibration, "test")
+        else:
+            grid = (config.mirror.rows, config.mirror.columns)
+            first = MirrorShape(0, np.zeros(grid, np.float32), np.zeros(0, np.float32))
+        self._state, _ = advance(self._settings, State(), first)
         self._scene, self._mirror = bench(world), device(world)
         self.hub = MemoryHub()
         self._operator = OperatorBus(self)
@@ -113,7 +123,8 @@ class FoldedLoop:
         """One frame."""
         self._shapes = [self._status.surface_nm, *self._shapes[:-1]]
         seen = np.tensordot(self._weights, np.array(self._shapes), 1)
-        pixels, truth = self._scene.expose(self._index, seen)
+        whole, truth = self._scene.expose(self._index, seen)
+        pixels = whole[self._cut : whole.shape[0] - self._cut, self._cut : whole.shape[1] - self._cut]
         self.surfaces_nm.append(seen)
         self.residual_nm.append(truth.residual_nm)
         sequence, time_ns = self.first + self._index, 10**18 + self._index * self.config.period_ns
@@ -205,6 +216,11 @@ class FoldedLoop:
     def camera(self) -> CameraSettings | None:
         """See `Client.camera`."""
         return self._state.conditions.camera
+
+    def camera_state(self) -> wire.CameraState:
+        """See `Client.camera_state`."""
+        side = 80 - 2 * self._cut
+        return instrument.camera_state(self.config, (side, side), 1)
 
     def laws(self) -> dict[str, LinearLaw]:
         """See `Client.laws`."""

@@ -21,7 +21,8 @@ from lowfc.control.response_fit import cross_talk, linear_range
 from lowfc.programs.calibrate import align as calibrate_align
 from lowfc.programs.calibrate import tasks as calibrate_commands
 from lowfc.programs.calibrate.command import calibrate_app
-from lowfc.programs.calibrate.run import AMPLITUDE_NM, Calibrator
+from lowfc.programs.calibrate.pokes import AMPLITUDE_NM, FULL_AMPLITUDE_SNR
+from lowfc.programs.calibrate.run import Calibrator
 from lowfc.programs.calibrate.tasks import compared
 
 CONFIG = {
@@ -115,7 +116,8 @@ def test_a_calibration_is_written_once_it_is_whole_and_used_and_its_figures_are_
     assert loop.calibration().id == made.id != before.id
     assert list(Path().glob("*.part.npz")) == []
     same = told("--compare", "night.fits", "night.fits")
-    assert same["cross_talk"] < 0.1  # R leaves out the noise of H, which is in both here
+    assert same["cross_talk"] < 1e-4
+    assert found["recommended"]
     assert same["same_commands"]
     assert same["reference_shift_nm"] == [0.0] * 6
     done = CliRunner().invoke(calibrate_app, ["--compare", "night.fits", "night.fits"])
@@ -243,7 +245,7 @@ def test_the_help_says_how_large_pokes_are() -> None:
     said = " ".join(CliRunner().invoke(calibrate_app, ["--help"]).stdout.split())
     usual = ", ".join(f"{amplitude_nm:g} {method}" for method, amplitude_nm in AMPLITUDE_NM.items())
     tolerance = inspect.signature(linear_range).parameters["tolerance"].default
-    assert f"default: {usual}." in said
+    assert f"default: {usual}, half of it above --snr {FULL_AMPLITUDE_SNR:g}." in said
     assert f"within {100 * tolerance:g} % of 1" in said
 
 

@@ -24,7 +24,19 @@ from lowfc.contract.codec import most_bytes
 from lowfc.contract.envelope import count_of
 from lowfc.contract.errors import BusError, RequestRefusedError
 from lowfc.contract.law_codec import wire_law
-from lowfc.contract.messages import CALIBRATION, FRAME, HEALTH, LAW, RECORD_KEY, REQUEST_KEY, STEP, Role, Topic, wire
+from lowfc.contract.messages import (
+    CALIBRATION,
+    CAMERA_STATE,
+    FRAME,
+    HEALTH,
+    LAW,
+    RECORD_KEY,
+    REQUEST_KEY,
+    STEP,
+    Role,
+    Topic,
+    wire,
+)
 from lowfc.contract.published import Published
 from lowfc.control.additions import MIRROR, OFFSET
 from lowfc.control.calibration import Calibration
@@ -272,6 +284,18 @@ class Client:
             return None
         return replace(camera_settings(state.camera), start_s=0)
 
+    def camera_state(self) -> wire.CameraState:
+        """What the camera says of itself.
+
+        Raises:
+            BusError: no camera answers.
+        """
+        sample = self._get(CAMERA_STATE.key, b"", ANSWER_S, Role.CAMERA)
+        try:
+            return wire.CameraState.FromString(sample.payload)
+        except DecodeError as fault:
+            raise BusError(f"{sample.key} was answered with what is no lowfc.v1.CameraState: {fault}") from None
+
     def mirrors(self) -> dict[str, wire.Health]:
         """What each mirror of the run says of itself, by its process's name."""
         found = {}
@@ -367,7 +391,7 @@ class Client:
                     "whether it did what was asked, the log and `lowfc ctl status` say"
                 )
             if now_s >= deadline_s:
-                raise BusError(f"no {who} is there in run {self.run_id!r}: start one with `lowfc {_COMMANDS[who]}`")
+                raise BusError(f"no {who} is there in run {self.run_id!r}: start one, as with `{_COMMANDS[who]}`")
             time.sleep(0.05)
 
     def _stream(
@@ -381,7 +405,7 @@ class Client:
         return self._grid
 
 
-_COMMANDS = {Role.CONTROLLER: "controller", Role.RECORDER: "record"}
+_COMMANDS = {Role.CONTROLLER: "lowfc controller", Role.RECORDER: "lowfc record", Role.CAMERA: "sim-camera"}
 
 
 def _answer(name: str, sample: Sample) -> Answer:

@@ -11,6 +11,11 @@ from lowfc.control.regularised import reconstruct
 Array = npt.NDArray[np.float64]
 Single = npt.NDArray[np.float32]
 
+MEASURED = frozenset(("poke", "hadamard", "in-loop"))
+"""Names in `Calibration.estimator` of ways to measure H."""
+_LEAST_LEFT = 1e-3
+"""Part of an answer to the modes below which it counts as none."""
+
 
 def with_dark(calibration: Calibration, dark_dn: Array, good: Array, read_noise_e: float, gain_e: float) -> Calibration:
     """The calibration with another dark (pixels,), DN, and only the pixels (pixels,) that are 1 in `good`.
@@ -39,6 +44,8 @@ def with_dark(calibration: Calibration, dark_dn: Array, good: Array, read_noise_
         dark=_single(dark_dn),
         flux_dn=calibration.flux_dn * share,
     )
+    if is_measured(calibration):
+        return replace(changed, reconstructor=_single(_same_answers(calibration, changed)), operator_hash="", id="")
     return _reconstructed(changed, read_noise_e, gain_e)
 
 
@@ -51,7 +58,29 @@ def with_reference(
         ValueError: there is no light on the good pixels.
     """
     I0, _ = normalise_flux(reference, calibration.response.astype(np.float64), calibration.good.astype(np.float64))
-    return _reconstructed(replace(calibration, reference=_single(I0), flux_dn=flux_dn), read_noise_e, gain_e)
+    changed = replace(calibration, reference=_single(I0), flux_dn=flux_dn)
+    if is_measured(calibration):
+        return replace(changed, operator_hash="", id="")
+    return _reconstructed(changed, read_noise_e, gain_e)
+
+
+def is_measured(calibration: Calibration) -> bool:
+    """Whether H was measured: it has noise, of which no R is made (see `regularised`)."""
+    return not MEASURED.isdisjoint(calibration.estimator.split("+"))
+
+
+def _same_answers(before: Calibration, changed: Calibration) -> Array:
+    """(modes, pixels): on the pixels that are left, R answers to the modes as it did on all.
+
+    Raises:
+        ValueError: too little is left to tell the modes apart.
+    """
+    answers = before.reconstructor.astype(np.float64) @ before.response
+    rows = before.reconstructor.astype(np.float64) * changed.good
+    left = rows @ changed.response
+    if np.linalg.matrix_rank(left, _LEAST_LEFT) < np.linalg.matrix_rank(answers, _LEAST_LEFT):
+        raise ValueError("the good pixels that are left do not tell the modes apart")
+    return np.asarray(answers @ np.linalg.pinv(left, _LEAST_LEFT) @ rows)
 
 
 def _reconstructed(calibration: Calibration, read_noise_e: float, gain_e: float) -> Calibration:

@@ -6,6 +6,7 @@ poke tells.
 """
 
 from dataclasses import dataclass, replace
+from itertools import product
 
 import numpy as np
 import numpy.typing as npt
@@ -91,14 +92,12 @@ def align(real: Array, computed: Array) -> Alignment:
     light = real - background
     if not light.sum() > 0:
         raise ValueError("the reference image has no light above its edge")
-    size, at = _moments(light)
-    own_size, own_at = _moments(np.asarray(computed, np.float64))
-    middle = (np.array(computed.shape) - 1) / 2
+    scales = {_size(light) / _size(np.asarray(computed, np.float64)), 1.0}  # a region may cut the image's wings off
     fits = []
     for parity in (1, -1):
         guesses = []
-        for angle in np.arange(_ANGLES) * 180.0 / _ANGLES:
-            guess = _placed(Geometry(size / own_size, 0.0, 0.0, float(angle), parity), at, own_at - middle)
+        for scale, angle in product(scales, np.arange(_ANGLES) * 180.0 / _ANGLES):
+            guess = _placed(spline, Geometry(scale, 0.0, 0.0, float(angle), parity), light)
             guesses.append((_left(_sample(spline, guess, real.shape), real)[0], guess))
         guesses.sort(key=lambda each: each[0])
         fits.append(min((_refine(spline, guess, real) for _, guess in guesses[:3]), key=lambda each: each[0]))
@@ -114,13 +113,15 @@ def align(real: Array, computed: Array) -> Alignment:
     return Alignment(replace(best, rotation_deg=rotation), flux, background, left, other)
 
 
-def _placed(geometry: Geometry, at: Array, offset: Array) -> Geometry:
-    """The geometry for which a point `offset` from the computed centre, (row, column), lies at `at`."""
-    angle = np.deg2rad(geometry.rotation_deg)
-    x, y = geometry.parity * offset[1], offset[0]
-    column = geometry.scale * (np.cos(angle) * x - np.sin(angle) * y)
-    row = geometry.scale * (np.sin(angle) * x + np.cos(angle) * y)
-    return replace(geometry, row=float(at[0] - row), column=float(at[1] - column))
+def _placed(spline: Array, geometry: Geometry, light: Array) -> Geometry:
+    """The geometry with its centre where the model is most like the light, to a pixel."""
+    rows, columns = light.shape
+    middle = replace(geometry, row=rows // 2, column=columns // 2)
+    model = _sample(spline, middle, (2 * rows, 2 * columns))  # so that it is not cut off on the other side
+    likeness = np.fft.irfft2(np.fft.rfft2(light, model.shape) * np.fft.rfft2(model).conj(), model.shape)
+    row, column = np.unravel_index(int(likeness.argmax()), model.shape)
+    down, across = (int(row) + rows) % (2 * rows) - rows, (int(column) + columns) % (2 * columns) - columns
+    return replace(middle, row=float(middle.row + down), column=float(middle.column + across))
 
 
 def _sample(spline: Array, geometry: Geometry, shape: tuple[int, ...]) -> Array:
@@ -159,10 +160,10 @@ def _refine(spline: Array, guess: Geometry, real: Array) -> tuple[float, Geometr
     return float(np.sqrt(np.mean(fit.fun**2))), best
 
 
-def _moments(light: Array) -> tuple[float, Array]:
-    """Rms size of an image in pixels, and its centre (row, column); faint pixels, mostly noise, are left out."""
+def _size(light: Array) -> float:
+    """Rms size of an image in pixels; faint pixels, mostly noise, are left out."""
     bright = np.where(light > 0.05 * light.max(), light, 0.0)
     rows, columns = np.indices(light.shape, dtype=np.float64)
     total = bright.sum()
-    at = np.array([(bright * rows).sum(), (bright * columns).sum()]) / total
-    return float(np.sqrt((bright * ((rows - at[0]) ** 2 + (columns - at[1]) ** 2)).sum() / total)), at
+    row, column = (bright * rows).sum() / total, (bright * columns).sum() / total
+    return float(np.sqrt((bright * ((rows - row) ** 2 + (columns - column) ** 2)).sum() / total))

@@ -118,6 +118,11 @@ _IDENTITY = (
 )
 
 
+def comparable(one: Calibration, other: Calibration) -> bool:
+    """Whether two calibrations are of the same pixels and modes."""
+    return one.shape == other.shape and one.noll == other.noll
+
+
 def normalise_flux(reference: Array, response: Array, good: Array) -> tuple[Array, Array]:
     """Pass I0 (pixels,) and H (pixels, modes) through the normalisation that frames get: divided by their own flux.
 

@@ -1,4 +1,9 @@
-"""The reconstructor of a measured response matrix: its noise taken out, truncated or damped where asked."""
+"""The reconstructor of a response matrix, measured or computed; truncated or damped where asked.
+
+A measured H has the noise of thousands of pixels in it. Its own (H'WH)^-1 H'W has that noise twice: it measures every
+mode too small, and adds noise to every frame. R = (R_a H)^-1 R_a, with any R_a of full rank that does not know that
+noise, is unbiased and has the noise of R_a.
+"""
 
 from typing import NamedTuple
 
@@ -6,8 +11,14 @@ import numpy as np
 import numpy.typing as npt
 
 from lowfc.control.calibration import ESTIMATORS
+from lowfc.control.response_fit import WORST_ANSWER
 
 Array = npt.NDArray[np.float64]
+
+_NOISE = (
+    "the response does not tell the modes apart: take more cycles, a larger amplitude or a brighter star; or leave "
+    "combinations of modes out with --truncate"
+)
 
 
 class Reconstruction(NamedTuple):
@@ -32,61 +43,65 @@ class Reconstruction(NamedTuple):
 def reconstruct(
     reference: Array,
     response: Array,
-    error: Array | None,
+    initial: Array | None,
     good: Array,
     flux_e: float,
     read_noise_e: float,
     estimator: str = "weighted",
     truncate: float = 0.0,
     tikhonov: float = 0.0,
-    nuisance: Array | None = None,
 ) -> Reconstruction:
-    """R = (H'WH)^-1 H'W from a measured H.
-
-    The noise of H adds its own power to H'WH, by which every mode would be measured too small; it is subtracted.
+    """R of a computed H, (H'WH)^-1 H'W, or of a measured one, (R_a H)^-1 R_a.
 
     Args:
         reference: (pixels,) I0, normalised.
         response: (pixels, modes) H, normalised.
-        error: (pixels, modes) standard error of H; None for a computed one.
+        initial: (modes, pixels) R_a for a measured H; what it leaves out of an image is left out by R, too. None for a
+            computed H.
         good: (pixels,) 1 where a pixel is used, else 0.
         flux_e: Electrons on the good pixels.
         read_noise_e: Of a pixel.
-        estimator: weighted or pinv, as for `control.calibration.reconstructor`.
+        estimator: weighted or pinv, as for `control.calibration.reconstructor`; of a computed H.
         truncate: Combinations of modes with a singular value below this part of the largest are left out.
         tikhonov: Combinations are damped as s^2 / (s^2 + (tikhonov s_largest)^2).
-        nuisance: (pixels, any) what else changes an image, normalised like H: fitted along, and not returned.
 
     Raises:
-        ValueError: an argument is out of range, or H is not above its noise.
+        ValueError: an argument is out of range, or H does not tell the modes apart.
     """
     if estimator not in ESTIMATORS:
         raise ValueError(f"estimator must be one of {', '.join(ESTIMATORS)}, got {estimator!r}")
     if not (0 <= truncate < 1 and 0 <= tikhonov < 1):
         raise ValueError(f"truncation and damping are 0 or more and below 1, got {truncate} and {tikhonov}")
-    variance = (np.maximum(reference, 0) * flux_e + read_noise_e**2) / flux_e**2
-    variance = np.maximum(variance, 1e-12 * variance.max())
-    weights = good / variance if estimator == "weighted" else good / variance.mean()
-    if nuisance is not None:  # what of each mode looks like it tells nothing of the mode
-        weighted = nuisance * weights[:, None]
-        response = response - nuisance @ np.linalg.solve(nuisance.T @ weighted, weighted.T @ response)
-    power = (response * weights[:, None]).T @ response
-    if error is not None:
-        power[np.diag_indices(len(power))] -= weights @ error**2
+    variance = pixel_variance(reference, flux_e, read_noise_e)
+    if initial is None:
+        weights = good / variance if estimator == "weighted" else good / variance.mean()
+        signal = (response * weights[:, None]).T
+        power = signal @ response
+    else:
+        rows = initial * good
+        answers = rows @ response
+        if not np.linalg.cond(answers) < WORST_ANSWER:
+            raise ValueError(_NOISE)
+        unbiased = np.linalg.solve(answers, rows)
+        power = np.linalg.inv((unbiased * variance) @ unbiased.T)  # H'WH for the weighted estimator
+        signal = power @ unbiased
     squares, combinations = np.linalg.eigh(power)
     squares, combinations = squares[::-1], combinations[:, ::-1]
     smallest = max(1e-16, truncate**2) * squares[0]
     if not squares[0] > 0 or (truncate == 0 and not squares[-1] > smallest):
-        raise ValueError(
-            "the response is not above its own noise in every mode: take more cycles, a larger amplitude or a brighter "
-            "star; or leave combinations of modes out with --truncate"
-        )
+        raise ValueError(_NOISE)
     kept = np.where(squares > smallest, squares / (squares + tikhonov**2 * squares[0]), 0.0)
     inverse = (combinations * (kept / np.where(squares > smallest, squares, 1.0))) @ combinations.T
-    matrix = inverse @ (response * weights[:, None]).T
+    matrix = inverse @ signal
     singular = np.sqrt(np.maximum(squares, 0))
     condition = float(singular[0] / singular[-1]) if singular[-1] > 0 else float("inf")
     return Reconstruction(np.asarray(matrix), singular, kept, condition, combinations)
+
+
+def pixel_variance(reference: Array, flux_e: float, read_noise_e: float) -> Array:
+    """Variance (pixels,) of a frame's flux fractions: photons of I0 (pixels,) and read-out."""
+    variance = (np.maximum(reference, 0) * flux_e + read_noise_e**2) / flux_e**2
+    return np.asarray(np.maximum(variance, 1e-12 * variance.max()))
 
 
 def advice(made: Reconstruction, noll: tuple[int, ...], limit_nm: float) -> str:

@@ -4,6 +4,8 @@ Each cycle of pokes, or piece of a dither, gives a response of its own: H = cov(
 is what the mirror did in each exposure and z the instrument. Open loop both are the poke. With the loop closed, `seen`
 is the poke and the loop's own command, which follows noise and disturbance; z is the poke alone, which does not, so
 that the loop's reaction does not bias the response. The scatter of the cycles is the standard error.
+
+R is built from a reconstructor R_a that does not know these frames: R = (R_a H)^-1 R_a, see `regularised`.
 """
 
 from typing import NamedTuple
@@ -13,8 +15,19 @@ import numpy.typing as npt
 
 Array = npt.NDArray[np.float64]
 
+LEAST_CYCLES = 4
+"""So that their scatter says something."""
+MOST_RMS = 1.2
+"""Rms of the elements of R H - I, in units of 1 / snr, that a calibration promises."""
+MOST_LARGEST = 4.0
+"""The largest of them."""
+WORST_ANSWER = 1e3
+"""Condition number of R H above which a reconstructor does not tell the modes apart."""
 _WORST_INSTRUMENT = 1e6
 """Condition number of cov(seen, z) above which the pokes do not tell the modes apart."""
+_BETTER = 0.95
+_SURE = 3.0
+_FAR = 4.0
 
 
 class Cycle(NamedTuple):
@@ -31,36 +44,55 @@ class Cycle(NamedTuple):
     flux_dn: float
 
 
+class Initial(NamedTuple):
+    """A reconstructor made without the frames of the calibration: the measured one is built from its rows.
+
+    Attributes:
+        matrix: (modes, pixels) nm per flux fraction; zero at bad pixels.
+        estimator: how it was made, as in `Calibration.estimator`.
+    """
+
+    matrix: Array
+    estimator: str
+
+
 class Sums(NamedTuple):
     """Of the cycles so far; another program may go on from them.
 
     Attributes:
-        cycles: how many.
+        initial: the reconstructor that the answers are of.
+        answers: (cycles, modes, modes) what it makes of the response of each cycle.
         response: (pixels, modes) sum.
-        squares: (pixels, modes) sum of the squares.
         reference: (pixels,) sum over `references` cycles.
+        references: cycles with frames without a poke.
         flux_dn: sum.
     """
 
-    cycles: int
+    initial: Initial
+    answers: Array
     response: Array
-    squares: Array
     reference: Array
     references: int
     flux_dn: float
 
     @classmethod
-    def none(cls, pixels: int, modes: int) -> "Sums":
+    def none(cls, initial: Initial) -> "Sums":
         """Of no cycle."""
-        return cls(0, np.zeros((pixels, modes)), np.zeros((pixels, modes)), np.zeros(pixels), 0, 0.0)
+        modes, pixels = initial.matrix.shape
+        return cls(initial, np.zeros((0, modes, modes)), np.zeros((pixels, modes)), np.zeros(pixels), 0, 0.0)
+
+    @property
+    def cycles(self) -> int:
+        """How many."""
+        return len(self.answers)
 
     def plus(self, cycle: Cycle) -> "Sums":
         """With one cycle more."""
         rested = cycle.reference is not None
         return Sums(
-            self.cycles + 1,
+            self.initial,
+            np.concatenate([self.answers, (self.initial.matrix @ cycle.response)[None]]),
             self.response + cycle.response,
-            self.squares + cycle.response**2,
             self.reference + cycle.reference if cycle.reference is not None else self.reference,
             self.references + rested,
             self.flux_dn + cycle.flux_dn,
@@ -72,14 +104,16 @@ class Measured(NamedTuple):
 
     Attributes:
         response: (pixels, modes) H, flux fractions per nm of wavefront rms.
-        error: (pixels, modes) its standard error; None from a single cycle.
+        initial: the reconstructor that R is built from.
+        error: (modes,) standard error of the elements of each row of R H; infinite where it is not known.
         reference: (pixels,) I0 in flux fractions; None where it was not measured.
         flux_dn: mean sum of the good pixels.
         cycles: how many.
     """
 
     response: Array
-    error: Array | None
+    initial: Initial
+    error: Array
     reference: Array | None
     flux_dn: float
     cycles: int
@@ -99,7 +133,9 @@ def normalised(frames: npt.NDArray[np.number], dark: Array, good: Array) -> tupl
     return light, flux
 
 
-def cycle_response(fractions: Array, flux_dn: Array, seen: Array, instruments: Array, used: Array) -> Cycle:
+def cycle_response(
+    fractions: Array, flux_dn: Array, seen: Array, instruments: Array, used: Array, slowest: float = 0.0
+) -> Cycle:
     """The response that one cycle shows.
 
     Args:
@@ -108,6 +144,8 @@ def cycle_response(fractions: Array, flux_dn: Array, seen: Array, instruments: A
         seen: (frames, modes) what the mirror did in each exposure, nm of wavefront.
         instruments: (frames, modes) the poke alone in each exposure; `seen` itself where the loop is open.
         used: (frames,) 1 where a frame may be used, else 0.
+        slowest: What the pokes have below this frequency, in cycles per frame, is not used: the wavefront is shaken most
+            there.
 
     Raises:
         ValueError: the pokes in the frames that may be used do not tell the modes apart.
@@ -118,7 +156,8 @@ def cycle_response(fractions: Array, flux_dn: Array, seen: Array, instruments: A
     if not poked.any():
         raise ValueError("no frame with a poke may be used: frames were lost or refused throughout")
     y, x, z = fractions[kept][poked], x[poked], z[poked]
-    z = z - z.mean(axis=0)
+    slow = _slow(np.flatnonzero(kept)[poked], len(used), slowest)
+    z = z - slow @ (slow.T @ z)
     together = (x - x.mean(axis=0)).T @ z
     if not np.linalg.cond(together) < _WORST_INSTRUMENT:
         raise ValueError(
@@ -131,6 +170,12 @@ def cycle_response(fractions: Array, flux_dn: Array, seen: Array, instruments: A
     return Cycle(response, reference, float(flux_dn[kept].mean()))
 
 
+def _slow(times: npt.NDArray[np.intp], frames: int, slowest: float) -> Array:
+    """Orthonormal (times, any): the mean, and all cosines of a piece of so many frames below a frequency."""
+    orders = np.arange(1 + int(2 * frames * slowest))
+    return np.linalg.qr(np.cos(np.pi * np.outer((times + 0.5) / frames, orders)))[0]
+
+
 def measured(sums: Sums) -> Measured:
     """Response, standard error and reference of all cycles.
 
@@ -140,12 +185,49 @@ def measured(sums: Sums) -> Measured:
     n = sums.cycles
     if n < 1:
         raise ValueError("no cycle was measured")
-    response, error = sums.response / n, None
-    if n > 1:
-        spread = np.maximum(sums.squares / n - response**2, 0) * (n / (n - 1))
-        error = np.sqrt(spread / n)
     reference = sums.reference / sums.references if sums.references else None
-    return Measured(response, error, reference, sums.flux_dn / n, n)
+    return Measured(sums.response / n, sums.initial, row_error(sums.answers), reference, sums.flux_dn / n, n)
+
+
+def row_error(answers: Array) -> Array:
+    """Standard error (modes,) of the elements of each row of R H, for the R built from all cycles.
+
+    It comes from the scatter of the cycles, so that whatever disturbed them is in it: photons, read-out, vibration.
+
+    Args:
+        answers: (cycles, modes, modes) what a reconstructor makes of the response of each cycle.
+
+    Returns:
+        Infinite from a single cycle, or where the pokes do not tell the modes apart.
+    """
+    n, modes, _ = answers.shape
+    mean = answers.mean(axis=0)
+    if n < 2 or not np.linalg.cond(mean) < WORST_ANSWER:
+        return np.full(modes, np.inf)
+    scatter = np.linalg.solve(mean, answers - mean)
+    return np.asarray(np.sqrt((scatter**2).sum(axis=0).mean(axis=1) / (n - 1) / n))
+
+
+def initial_of(candidates: list[Initial], picture: Array, mode: int, variance: Array) -> Initial:
+    """The reconstructor that sees a poke best; an earlier one unless a later is better by more than `_BETTER`.
+
+    Args:
+        candidates: One or more.
+        picture: (pixels,) answer to a poke of one mode, in flux fractions.
+        mode: Place of the mode.
+        variance: (pixels,) of a frame's noise.
+    """
+
+    def noise(initial: Initial) -> float:
+        row = initial.matrix[mode]
+        seen = abs(float(row @ picture))
+        return float(np.sqrt(row**2 @ variance)) / seen if seen > 0 else np.inf
+
+    best = candidates[0]
+    for each in candidates[1:]:
+        if noise(each) < _BETTER * noise(best):
+            best = each
+    return best
 
 
 def cross_talk(reconstructor: npt.NDArray[np.floating], response: npt.NDArray[np.floating]) -> Array:
@@ -154,12 +236,41 @@ def cross_talk(reconstructor: npt.NDArray[np.floating], response: npt.NDArray[np
     return np.asarray(product - np.eye(len(product)))
 
 
-def cross_talk_error(reconstructor: Array, error: Array) -> Array:
-    """Standard error (modes, modes) of R H - I, from that of a measured H, (pixels, modes), behind R (modes, pixels).
+class Check(NamedTuple):
+    """R against frames that were not used for it.
 
-    The errors of a column's pixels are taken as independent, as photon and read noise are.
+    Attributes:
+        rms: of the elements of R H - I, less what the noise of these frames adds.
+        largest: of the elements of R H - I, with that noise.
+        error: (modes,) standard error that the noise of these frames gives the elements of each row.
+        cycles: how many.
     """
-    return np.asarray(np.sqrt(reconstructor**2 @ error**2))
+
+    rms: float
+    largest: float
+    error: Array
+    cycles: int
+
+    def within(self, rms: float, largest: float) -> bool:
+        """Whether the cross-talk is below this, as far as the noise of these frames lets them tell."""
+        modes = len(self.error)
+        unsure = _SURE * float(np.sqrt(2 * (self.error**4).sum() / modes**3))  # of the square of the rms
+        far = _FAR * float(self.error.max())
+        return bool(self.rms**2 <= rms**2 + unsure and self.largest <= np.hypot(largest, far))
+
+
+def check(answers: Array, wanted: Array, error: Array) -> Check:
+    """Cross-talk of a reconstructor, from cycles that were not used for it.
+
+    Args:
+        answers: (cycles, modes, modes) what it makes of the response of each.
+        wanted: (modes, modes) what it shall make of a response: one, unless combinations of modes are suppressed.
+        error: (modes,) standard error of the elements of each row in one cycle.
+    """
+    talk = answers.mean(axis=0) - wanted
+    noise = error / np.sqrt(len(answers))
+    power = float((talk**2).mean() - (noise**2).mean())
+    return Check(float(np.sqrt(max(power, 0.0))), float(np.abs(talk).max()), noise, len(answers))
 
 
 class LinearRange(NamedTuple):

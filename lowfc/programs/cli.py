@@ -18,6 +18,7 @@ from lowfc.programs.bench.record import bench_record
 from lowfc.programs.bench.view import bench_view
 from lowfc.programs.calibrate.command import calibrate_app
 from lowfc.programs.chaos.command import chaos
+from lowfc.programs.commission.command import commission
 from lowfc.programs.conformance.command import conformance_app
 from lowfc.programs.ctl.command import ctl_app
 from lowfc.programs.design.command import design_app
@@ -56,6 +57,7 @@ app.command()(doctor)
 app.command()(latency)
 app.command()(validate)
 app.command()(tune)
+app.command()(commission)
 app.command()(chaos)
 app.command()(soak)
 app.command()(certs)

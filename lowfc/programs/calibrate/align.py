@@ -15,15 +15,13 @@ from lowfc.client import Client, configuration_of
 from lowfc.contract.calibration_codec import identified
 from lowfc.contract.configuration import Configuration
 from lowfc.contract.errors import CalibrationError, ConfigurationError
-from lowfc.control import poke_plan
 from lowfc.control.alignment import Alignment, Geometry, align, onto
 from lowfc.control.calibration import Calibration, normalise_flux
-from lowfc.control.delay_fit import measure_delay
 from lowfc.control.regularised import reconstruct
-from lowfc.control.response_fit import normalised
 from lowfc.programs.analytic import analytic
-from lowfc.programs.calibrate.recording import Loop, play, watch
-from lowfc.programs.calibrate.run import AMPLITUDE_NM, DELAY_FRAMES
+from lowfc.programs.calibrate.first_poke import first_poke
+from lowfc.programs.calibrate.recording import watch
+from lowfc.programs.calibrate.run import AMPLITUDE_NM
 from lowfc.programs.calibrate.tasks import Found, images
 
 Array = npt.NDArray[np.float64]
@@ -63,8 +61,14 @@ def aligned(
     else:
         with Client(run) as loop:
             config, before = configuration_of(loop), replace(loop.calibration(), camera=loop.camera())
-            dark = before.dark.reshape(before.shape).astype(np.float64)
             pixels = watch(loop, frames)
+            if pixels.shape[1:] != before.shape:
+                raise CalibrationError(
+                    f"the frames have {pixels.shape[1]} x {pixels.shape[2]} pixels, the calibration in use is for "
+                    f"{before.shape[0]} x {before.shape[1]}, and so are its dark and bad pixels: `lowfc commission` "
+                    "measures one for these frames"
+                )
+            dark = before.dark.reshape(before.shape).astype(np.float64)
             computed = _computed(config)
             found = _fit(computed, pixels.mean(axis=0) - dark, half_turn)
             made = on_sensor(config, computed, found.geometry, found.flux, before.shape, before)
@@ -126,6 +130,7 @@ def on_sensor(
             dark=dark,
             shape=(rows, columns),
             flux_dn=flux,
+            saturation_dn=computed.saturation_dn if before is None else before.saturation_dn,
             estimator=f"{config.control.estimator}+aligned",
             operator_hash="",
             camera=None if before is None else before.camera,
@@ -151,16 +156,10 @@ def _fit(computed: Calibration, image: Array, half_turn: bool) -> Alignment:
     return replace(found, geometry=found.geometry.turned()) if half_turn else found
 
 
-def _reversed(loop: Loop, made: Calibration) -> bool:
+def _reversed(loop: Client, made: Calibration) -> bool:
     """Whether a poke is seen with the sign opposite to that of a calibration."""
     mode = int(np.argmax(np.linalg.norm(made.response, axis=0)))
-    plan = poke_plan.dither(1, AMPLITUDE_NM["poke"], DELAY_FRAMES, 1, 1)
-    recording = play(loop, made.modes_to_actuators.T[mode : mode + 1], plan.table)
-    try:
-        fractions, _ = normalised(recording.pixels, made.dark.astype(np.float64), made.good.astype(np.float64))
-        seen = measure_delay(fractions[:DELAY_FRAMES], made.reference.astype(np.float64), plan.table[:, 0])
-    except ValueError as error:
-        raise CalibrationError(str(error)) from None
+    seen = first_poke(loop, made, mode, AMPLITUDE_NM["poke"])
     return bool(seen.picture @ made.response[:, mode] < 0)
 
 

@@ -27,10 +27,15 @@ def calibrate(
     out: Out = Path("calibration.fits"),
     run: AnyRun = None,
     config: ConfigFile = None,
-    snr: Annotated[float, typer.Option(min=1, max=1e6, help="To which the noisiest mode shall be known.")] = 200.0,
+    snr: Annotated[
+        float, typer.Option(min=1, max=1e4, help="Signal-to-noise ratio to reach in the noisiest mode.")
+    ] = 70.0,
     amplitude: Annotated[
         float | None,
-        typer.Option(min=0.01, help="Of a poke, nm rms of wavefront; default: 8 poke, 3 hadamard, 2 in-loop."),
+        typer.Option(
+            min=0.01,
+            help="Of a poke, nm rms of wavefront; default: 8 poke, 3 hadamard, 2 in-loop, half of it above --snr 70.",
+        ),
     ] = None,
     cycles: Annotated[int | None, typer.Option(min=1, help="How many, in place of --snr.")] = None,
     resume: Annotated[bool, typer.Option("--resume", help="Go on with one that was interrupted.")] = False,
@@ -58,6 +63,9 @@ def calibrate(
     as_json: Json = False,
 ) -> None:
     """Calibrate a running loop with pokes of its mirror, or compute its calibration.
+
+    What was measured is checked on frames of its own. Where it is not recommended, it is written, not loaded, and the
+    exit status is 1.
 
     The mirror is afterwards where it was, also after Ctrl-C; --resume then goes on with the cycles that were done.
 
@@ -90,7 +98,10 @@ def calibrate(
                     "configuration"
                 )
         wanted = commands.wanted(method, amplitude, snr, cycles, out, resume=resume, linear=linear_range)
-        _put(*commands.poked(wanted, run, truncate, tikhonov, load=load), as_json=as_json)
+        figures, text = commands.poked(wanted, run, truncate, tikhonov, load=load)
+        _put(figures, text, as_json=as_json)
+        if not figures["recommended"]:
+            raise typer.Exit(1)
 
 
 @calibrate_app.command()

@@ -11,7 +11,7 @@ import numpy as np
 from lowfc.adapters import fits_file
 from lowfc.adapters.whole_file import write_whole
 from lowfc.contract.errors import DataFileError
-from lowfc.control.response_fit import Sums
+from lowfc.control.response_fit import Initial, Sums
 
 
 def partial_of(out: Path) -> Path:
@@ -26,7 +26,8 @@ def keep(path: Path, sums: Sums, what: dict[str, Any]) -> None:
         DataFileError: it cannot be written.
     """
     stream = io.BytesIO()
-    np.savez(stream, what=np.array(json.dumps(what, sort_keys=True)), **sums._asdict())
+    arrays = sums._asdict() | {"initial": sums.initial.matrix, "estimator": sums.initial.estimator}
+    np.savez(stream, what=np.array(json.dumps(what, sort_keys=True)), **arrays)
     write_whole(path, stream.getvalue())
 
 
@@ -36,22 +37,7 @@ def go_on(path: Path, what: dict[str, Any]) -> Sums:
     Raises:
         DataFileError: there are none, the file is damaged, or they are of another calibration.
     """
-    if not path.is_file():
-        raise DataFileError(f"there is nothing to go on from: no {path}; leave --resume out")
-    try:
-        with path.open("rb") as stream, np.load(stream, allow_pickle=False) as arrays:
-            before = json.loads(str(arrays["what"]))
-            sums = Sums(
-                int(arrays["cycles"]),
-                arrays["response"],
-                arrays["squares"],
-                arrays["reference"],
-                int(arrays["references"]),
-                float(arrays["flux_dn"]),
-            )
-    except (*fits_file.DAMAGED, zipfile.BadZipFile) as error:
-        why = fits_file.in_a_line(error)
-        raise DataFileError(f"{path} is damaged, or no part of a calibration: {why}; remove it") from None
+    before, sums = begun(path)
     for key, value in what.items():
         if before.get(key) != value:
             raise DataFileError(
@@ -59,3 +45,27 @@ def go_on(path: Path, what: dict[str, Any]) -> Sums:
                 "file, or leave --resume out"
             )
     return sums
+
+
+def begun(path: Path) -> tuple[dict[str, Any], Sums]:
+    """What the cycles done are of, and these cycles.
+
+    Raises:
+        DataFileError: there are none, or the file is damaged.
+    """
+    if not path.is_file():
+        raise DataFileError(f"there is nothing to go on from: no {path}; leave --resume out")
+    try:
+        with path.open("rb") as stream, np.load(stream, allow_pickle=False) as arrays:
+            sums = Sums(
+                Initial(arrays["initial"], str(arrays["estimator"])),
+                arrays["answers"],
+                arrays["response"],
+                arrays["reference"],
+                int(arrays["references"]),
+                float(arrays["flux_dn"]),
+            )
+            return dict(json.loads(str(arrays["what"]))), sums
+    except (*fits_file.DAMAGED, zipfile.BadZipFile) as error:
+        why = fits_file.in_a_line(error)
+        raise DataFileError(f"{path} is damaged, or no part of a calibration: {why}; remove it") from None

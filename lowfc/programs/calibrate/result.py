@@ -12,13 +12,14 @@ from lowfc.contract.calibration_codec import identified
 from lowfc.contract.configuration import Configuration
 from lowfc.contract.errors import CalibrationError
 from lowfc.control.actuator_response import actuators_to_modes, of_commands
-from lowfc.control.calibration import Calibration
+from lowfc.control.calibration import Calibration, comparable
 from lowfc.control.delay_fit import Delay
 from lowfc.control.regularised import Reconstruction, reconstruct
-from lowfc.control.response_fit import LinearRange, Measured, cross_talk, cross_talk_error
+from lowfc.control.response_fit import LinearRange, Measured, cross_talk
 from lowfc.optics.twin import reference as twin_reference
 from lowfc.optics.twin import response as twin_response
 from lowfc.optics.twin_mirror import wavefront_nm
+from lowfc.programs.calibrate.verdict import Verdict
 
 Array = npt.NDArray[np.float64]
 Single = npt.NDArray[np.float32]
@@ -38,35 +39,41 @@ def measured_calibration(
         CalibrationError: H is not above its noise.
     """
     camera = instrument.detector(config)
-    good = before.good.astype(np.float64)
     I0 = taken.reference if taken.reference is not None else before.reference.astype(np.float64)
     try:
         made = reconstruct(
             I0,
             taken.response,
-            taken.error,
-            good,
+            taken.initial.matrix,
+            before.good.astype(np.float64),
             taken.flux_dn * camera.gain_e_per_dn / camera.em_gain,
             instrument.equivalent_read_noise_e(camera),
-            config.control.estimator,
-            truncate,
-            tikhonov,
-            _background(config, I0, good),
+            truncate=truncate,
+            tikhonov=tikhonov,
         )
     except ValueError as error:
         raise CalibrationError(str(error)) from None
-    fitted = [name for name in config.control.nuisance if name == "background"]
+    names = dict.fromkeys([*taken.initial.estimator.split("+"), method])
     calibration = replace(
         before,
         reference=_single(I0),
         response=_single(taken.response),
         reconstructor=_single(made.matrix),
         flux_dn=taken.flux_dn,
-        estimator="+".join((config.control.estimator, *fitted, method)),
+        estimator="+".join(names),
         operator_hash="",
         actuators_to_modes=_single(_seen_of_actuators(config, before, made.matrix)),
     )
     return identified(calibration), made
+
+
+def computed_noise_nm(config: Configuration, calibration: Calibration, computed: Calibration) -> Array | None:
+    """Noise (modes,) that a computed reconstructor has on the light of a calibration, nm; None for another sensor's."""
+    if not comparable(calibration, computed):
+        return None
+    return instrument.frame_noise_nm(
+        config, replace(calibration, reconstructor=computed.reconstructor * calibration.good)
+    )
 
 
 def figures(
@@ -77,7 +84,8 @@ def figures(
     taken: Measured | None,
     delay: Delay | None,
     linear: LinearRange | None,
-    analytic: Calibration | None,
+    computed: Calibration | None,
+    verdict: Verdict | None,
     file: Path,
 ) -> dict[str, Any]:
     """What `--json` prints; figures of each mode are in the order of `noll`."""
@@ -99,11 +107,13 @@ def figures(
         "cycles": taken.cycles if taken is not None else 0,
         "file": str(file),
     }
-    if taken is not None and taken.error is not None and analytic is not None and comparable(calibration, analytic):
-        talk = cross_talk(calibration.reconstructor, analytic.response)
-        error = cross_talk_error(calibration.reconstructor.astype(np.float64), taken.error)
-        found["cross_talk"] = float(np.abs(talk).max())
-        found["cross_talk_error"] = float(error.max())
+    noise = None if computed is None else computed_noise_nm(config, calibration, computed)
+    if taken is not None and computed is not None and noise is not None:
+        found["cross_talk"] = float(np.abs(cross_talk(calibration.reconstructor, computed.response)).max())
+        found["cross_talk_error"] = float(taken.error.max())
+        found["computed_noise_nm"] = noise.tolist()
+    if verdict is not None:
+        found |= verdict.figures()
     if linear is not None:
         found["linear_range_nm"] = linear.range_nm.tolist()
     return found
@@ -124,22 +134,22 @@ def text_of(found: dict[str, Any]) -> str:
     ]
     if "cross_talk" in found:
         lines.append(
-            f"cross-talk against the analytic H: at most {found['cross_talk']:.4f} (standard error "
-            f"{found['cross_talk_error']:.4f})"
+            f"cross-talk against the computed H: at most {found['cross_talk']:.4f} (standard error "
+            f"{found['cross_talk_error']:.4f}); where the wavefront is not flat, H is another one"
         )
     lines.append("singular values " + " ".join(f"{value:.3g}" for value in found["singular_values"]))
-    ranges = found.get("linear_range_nm")
-    lines.append(f"{'mode':>5} {'noise of a frame, nm':>22}" + (f" {'linear up to, nm':>18}" if ranges else ""))
+    computed, ranges = found.get("computed_noise_nm"), found.get("linear_range_nm")
+    lines.append(
+        f"{'mode':>5} {'noise of a frame, nm':>22}"
+        + (f" {'computed, nm':>14}" if computed else "")
+        + (f" {'linear up to, nm':>18}" if ranges else "")
+    )
     for place, (index, noise) in enumerate(zip(found["noll"], found["noise_gain_nm"], strict=True)):
+        expected = f" {computed[place]:14.3g}" if computed else ""
         reach = f" {ranges[place]:18.1f}" if ranges else ""
-        lines.append(f"{'Z' + str(index):>5} {noise:22.3g}{reach}")
+        lines.append(f"{'Z' + str(index):>5} {noise:22.3g}{expected}{reach}")
     lines.append(f"written: {found['file']}")
     return "\n".join(lines)
-
-
-def comparable(one: Calibration, other: Calibration) -> bool:
-    """Whether two calibrations are of the same pixels and modes."""
-    return one.shape == other.shape and one.noll == other.noll
 
 
 def comparison(one: Calibration, other: Calibration) -> dict[str, Any]:
@@ -207,13 +217,6 @@ def _seen_of_actuators(config: Configuration, before: Calibration, matrix: Array
     if before.actuators_to_modes.size:
         modelled[:, ~before.actuators_to_modes.any(axis=0)] = 0  # actuators that are not active
     return np.asarray(measured + modelled - (modelled @ commands) @ measured)
-
-
-def _background(config: Configuration, reference: Array, good: Array) -> Array | None:
-    """Slope of the normalised image along uniform light; None where that is not fitted."""
-    if "background" not in config.control.nuisance:
-        return None
-    return np.asarray((1 - reference * good.sum())[:, None] * good[:, None])
 
 
 def _span(calibration: Calibration) -> str:

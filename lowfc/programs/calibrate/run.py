@@ -1,9 +1,8 @@
 """Calibration through the bus: pokes are played by the controller, frames come back, H is fitted to them."""
 
 import contextlib
-from collections.abc import Callable, Iterator
-from dataclasses import dataclass, replace
-from pathlib import Path
+from collections.abc import Iterator
+from dataclasses import replace
 from typing import Any, NamedTuple, Protocol
 
 import numpy as np
@@ -14,45 +13,36 @@ from lowfc.adapters.progress import Counted
 from lowfc.client import configuration_of
 from lowfc.contract.errors import CalibrationError, LowfcError
 from lowfc.contract.messages import wire
-from lowfc.control import poke_plan
-from lowfc.control.calibration import Calibration
+from lowfc.control.calibration import Calibration, comparable
 from lowfc.control.camera import CameraSettings
 from lowfc.control.delay_fit import Delay, measure_delay
+from lowfc.control.poke_plan import Plan
+from lowfc.control.regularised import pixel_variance
 from lowfc.control.response_fit import (
+    Check,
     Cycle,
+    Initial,
     LinearRange,
     Measured,
     Sums,
+    check,
     cycle_response,
+    initial_of,
     linear_range,
     measured,
     normalised,
 )
+from lowfc.programs.calibrate.frame_count import FrameCount, Say
 from lowfc.programs.calibrate.partial import go_on, keep, partial_of
+from lowfc.programs.calibrate.pokes import AMPLITUDE_NM as AMPLITUDE_NM
+from lowfc.programs.calibrate.pokes import DELAY_FRAMES as DELAY_FRAMES
+from lowfc.programs.calibrate.pokes import DITHER_SLOWEST, Pokes, checks
+from lowfc.programs.calibrate.pokes import Wanted as Wanted
 from lowfc.programs.calibrate.recording import Answered, Loop, PlayInterruptedError, Recording, play
 
 Array = npt.NDArray[np.float64]
-Say = Callable[[str], None]
 
-METHODS = ("poke", "hadamard", "in-loop")
-AMPLITUDE_NM = {"poke": 8.0, "hadamard": 3.0, "in-loop": 2.0}
-MOST_HADAMARD_NM = 3.0
-"""Of a mode: all modes at once add up to some four times that, and the sensor must stay linear."""
-DELAY_FRAMES = 600
-SETTLE = 2
-"""Frames left out after each change: one for a delay that is a fraction, one for a command that comes late."""
-HOLD = 4
-DITHER_HOLD = 2
-"""Frames between the changes of a dither: the longer, the more of it the loop works against."""
-PIECE = 1024
-"""Frames of a piece of a dither."""
-LEAST_CYCLES = 4
-"""So that their scatter says something."""
 MOST_FAILURES = 5
-RANGE_LEVELS = (0.25, 0.5, 0.75, 1.0)
-RANGE_ERROR = 0.03
-MOST_RANGE_NM = 60.0
-_OF_THE_SLEW = 0.8
 _LIKE = 0.3
 """Likeness of the first pokes' picture to the calibration in use below which something is said."""
 
@@ -94,31 +84,6 @@ class Controller(Loop, Protocol):
         ...
 
 
-@dataclass(frozen=True, slots=True)
-class Wanted:
-    """What a calibration shall be.
-
-    Attributes:
-        method: poke, hadamard or in-loop.
-        amplitude_nm: of a mode, wavefront rms; None for the usual.
-        snr: to which R shall be known; None where `cycles` says how long.
-        cycles: how many; None where `snr` says.
-        out: the file to be written; the cycles done are kept beside it.
-        resume: go on from those.
-        seed: of a dither.
-        range: measure the linear range.
-    """
-
-    method: str
-    amplitude_nm: float | None
-    snr: float
-    cycles: int | None
-    out: Path
-    resume: bool
-    seed: int = 1
-    range: bool = True
-
-
 class Taken(NamedTuple):
     """What was measured."""
 
@@ -127,23 +92,42 @@ class Taken(NamedTuple):
 
 
 class Calibrator:
-    """One calibration of a running loop; the mirror is afterwards where it was."""
+    """One calibration of a running loop; the mirror is afterwards where it was.
 
-    def __init__(self, loop: Controller, wanted: Wanted, say: Say, progress: Counted) -> None:
-        """Ask the controller what it has."""
+    Attributes:
+        config: the loop's.
+        before: the calibration in use.
+        noise_nm: (modes,) of one frame, with that calibration.
+        pokes: what is played.
+        kept: cycles that another calibration can go on from.
+    """
+
+    def __init__(
+        self, loop: Controller, wanted: Wanted, say: Say, progress: Counted, computed: Calibration | None = None
+    ) -> None:
+        """Ask the controller what it has.
+
+        Args:
+            loop: A connection to it.
+            wanted: What is asked for.
+            say: For people.
+            progress: For people: frames so far, and of how many.
+            computed: What the optical model says, of which R is made where its pixels are the loop's.
+        """
         self._loop = loop
         self._wanted = wanted
         self._say = say
-        self._progress = progress
         self.config = configuration_of(loop)
         self.before = replace(loop.calibration(), camera=loop.camera())
+        self._computed = computed
         self._basis = self.before.modes_to_actuators.T
-        self._modes = len(self.before.noll)
         self._dark = self.before.dark.astype(np.float64)
         self._good = self.before.good.astype(np.float64)
         self.noise_nm = instrument.frame_noise_nm(self.config, self.before)
         self._closed = wanted.method == "in-loop"
-        self.amplitude_nm = self._amplitude()
+        self.pokes = Pokes(self.config, self.before, self.noise_nm, wanted)
+        self._count = FrameCount(progress)
+        self.kept = 0
 
     @contextlib.contextmanager
     def holding(self) -> Iterator[None]:
@@ -175,14 +159,30 @@ class Calibrator:
             raise
         self._loop.close_loop()
 
-    def run(self) -> Taken:
-        """Check that pokes are seen, measure the delay, then the response.
+    def run(self, delay: Delay | None = None) -> Taken:
+        """Check that pokes are seen, measure the delay unless it is known, then the response.
 
         Raises:
             CalibrationError: pokes are not seen, frames are lost, or a limit acts.
         """
-        delay = self.delay()
+        delay = self.delay() if delay is None else delay
         return Taken(self._cycles(delay), delay)
+
+    def check(self, made: Calibration, taken: Taken) -> Check:
+        """The cross-talk of a new calibration at the present zero point, from cycles of its own.
+
+        Raises:
+            CalibrationError: frames were lost, or a limit acts.
+        """
+        R = made.reconstructor.astype(np.float64)
+        cycles = taken.measured.cycles
+        count = checks(cycles)
+        answers = []
+        for number in range(count):
+            left = self.pokes.frames(cycles, cycles + number)
+            cycle = self._useful_cycle(cycles + number, taken.delay, f"check {number + 1} of {count}", left)
+            answers.append(R @ cycle.response)
+        return check(np.array(answers), R @ taken.measured.response, taken.measured.error * np.sqrt(cycles))
 
     def linear_range(self, made: Calibration, delay: Delay) -> LinearRange:
         """How far each mode is linear, seen with a new calibration; the loop is open.
@@ -190,14 +190,10 @@ class Calibrator:
         Raises:
             CalibrationError: frames were lost, or a limit acts.
         """
-        top = np.minimum(MOST_RANGE_NM, self._largest_nm())
-        amplitudes = np.outer(RANGE_LEVELS, top)
-        noise = float(self.noise_nm.max()) / (RANGE_ERROR * float(amplitudes[0].min()))
-        plan = poke_plan.ladder(amplitudes, int(np.clip(np.ceil(noise**2 / 2), 2, 200)), SETTLE)
-        self._progress("linear range", 0, len(plan))
+        plan = self.pokes.ladder()
         for _ in range(MOST_FAILURES):
             try:
-                recording = play(self._loop, self._basis, plan.table)
+                recording = self._play(self._basis, plan, "linear range", len(plan))
                 fractions, _ = self._fractions(recording)
                 modes_nm = (fractions - made.reference) @ made.reconstructor.T.astype(np.float64)
                 use = recording.usable(plan, delay.delay_frames)
@@ -209,35 +205,6 @@ class Calibrator:
             f"in {MOST_FAILURES} attempts the linear range was not measured: `lowfc doctor` looks for why frames are "
             "lost; the cycles are kept, --resume --no-linear-range makes the calibration of them"
         )
-
-    def _amplitude(self) -> float:
-        """What was asked for, or the usual, as far as the mirror's slew limit lets it."""
-        asked, method = self._wanted.amplitude_nm, self._wanted.method
-        if method == "hadamard" and asked is not None and asked > MOST_HADAMARD_NM:
-            raise CalibrationError(
-                f"--amplitude {asked:g} nm is too much for hadamard, which pokes all modes at once: at most "
-                f"{MOST_HADAMARD_NM:g} nm of each"
-            )
-        shapes = self._plan(0, 1.0).table @ self._basis
-        steepest = float(np.abs(np.diff(shapes, axis=0)).max())
-        largest = _OF_THE_SLEW * self._slew_nm / max(steepest, 1e-9)
-        if asked is None:
-            return min(AMPLITUDE_NM[method], largest)
-        if asked > largest:
-            raise CalibrationError(
-                f"--amplitude {asked:g} nm: from push to pull an actuator would move by more than {_OF_THE_SLEW:g} "
-                f"of the slew limit; at most {largest:.3g} nm"
-            )
-        return asked
-
-    @property
-    def _slew_nm(self) -> float:
-        return min(self.config.safety.slew_nm, self.config.mirror.slew_nm)
-
-    def _largest_nm(self) -> Array:
-        """(modes,) amplitude at which the mirror goes from push to pull within its slew limit."""
-        steepest = np.abs(self._basis).max(axis=1)
-        return np.asarray(_OF_THE_SLEW * self._slew_nm / (2 * np.maximum(steepest, 1e-9)), dtype=np.float64)
 
     def _fractions(self, recording: Recording) -> tuple[Array, Array]:
         try:
@@ -252,13 +219,11 @@ class Calibrator:
             CalibrationError: no poke is seen, or frames are lost.
         """
         mode = int(self.noise_nm.argmin())
-        amplitude = self.amplitude_nm if self._closed else AMPLITUDE_NM["poke"]
-        amplitude = min(amplitude, float(self._largest_nm()[mode]))
-        plan = poke_plan.dither(1, amplitude, DELAY_FRAMES, 1, self._wanted.seed)
-        self._progress("looking for pokes", 0, DELAY_FRAMES)
+        plan = self.pokes.delay(mode)
+        left = len(plan) + self.pokes.frames(self.pokes.cycles())
         for _ in range(MOST_FAILURES):
             try:
-                recording = play(self._loop, self._basis[mode : mode + 1], plan.table)
+                recording = self._play(self._basis[mode : mode + 1], plan, "looking for pokes", left)
             except PlayInterruptedError as error:
                 self._say(f"once more: {error}")
                 continue
@@ -301,56 +266,86 @@ class Calibrator:
             )
 
     def _cycles(self, delay: Delay) -> Measured:
-        wanted = self._wanted
-        example = self._plan(0, self.amplitude_nm)
-        needed = wanted.cycles
-        if needed is None:
-            frames = poke_plan.frames_for(wanted.snr, float(self.noise_nm.max()), self.amplitude_nm)
-            needed = -(-frames // example.per_column)
-        needed = max(needed, LEAST_CYCLES)
+        pokes, wanted = self.pokes, self._wanted
         what: dict[str, Any] = {
             "method": wanted.method,
-            "amplitude_nm": self.amplitude_nm,
+            "amplitude_nm": pokes.amplitude_nm,
             "calibration": self.before.id,
         }
         path = partial_of(wanted.out)
-        sums = Sums.none(self._good.size, self._modes)
         if wanted.resume:
             sums = go_on(path, what)
+            self.kept = sums.cycles
             self._say(f"going on after {sums.cycles} cycles")
-        seconds = (needed - sums.cycles) * len(example) / self.config.camera.rate_hz
-        self._say(f"{needed} cycles of {len(example)} frames; about {max(seconds, 0):.0f} s to go")
-        failures = 0
-        while sums.cycles < needed:
-            self._progress(f"{wanted.method} cycles", sums.cycles, needed)
+        else:
+            sums = Sums.none(self._initial(delay))
+        needed = max(pokes.cycles(), sums.cycles)
+        self._say(
+            f"{needed} cycles of {len(pokes.cycle(0))} frames and {checks(needed)} to check them"
+            + (", then the linear range; " if pokes.ranged else "; ")
+            + self._to_go(needed, sums.cycles)
+        )
+        while True:
+            while sums.cycles < needed:
+                done = sums.cycles
+                left = pokes.frames(needed, done)
+                sums = sums.plus(self._useful_cycle(done, delay, f"{wanted.method} cycle {done + 1} of {needed}", left))
+                keep(path, sums, what)
+                self.kept = sums.cycles
+            found = measured(sums)
+            more = pokes.more_cycles(needed, float(found.error.max()))
+            if more <= needed:
+                return found
+            self._say(
+                f"the cycles scatter by more than photons and read-out: {more} of them instead of {needed}; "
+                + self._to_go(more, needed)
+            )
+            needed = more
+
+    def _to_go(self, needed: int, done: int) -> str:
+        return f"about {self.pokes.frames(needed, done) / self.config.camera.rate_hz:.0f} s to go"
+
+    def _initial(self, delay: Delay) -> Initial:
+        """The reconstructor of which the measured one is made: the computed one, unless that in use sees more."""
+        before = self.before
+        of = [each for each in (self._computed, before) if each is not None and comparable(each, before)]
+        candidates = [Initial(each.reconstructor * self._good, each.estimator) for each in of]
+        whole = [each for each in candidates if np.linalg.matrix_rank(each.matrix) == len(before.noll)]
+        if not whole:
+            raise CalibrationError(
+                "neither the optical model nor the calibration in use tells all modes apart on these pixels, and R is "
+                "made from one of them: `lowfc calibrate align` computes it for this sensor"
+            )
+        camera = instrument.detector(self.config)
+        variance = pixel_variance(
+            before.reference.astype(np.float64),
+            before.flux_dn * camera.gain_e_per_dn / camera.em_gain,
+            instrument.equivalent_read_noise_e(camera),
+        )
+        return initial_of(whole, delay.picture, int(self.noise_nm.argmin()), variance)
+
+    def _play(self, basis_nm: npt.NDArray[np.floating], plan: Plan, doing: str, left: int) -> Recording:
+        """Play a plan; `left` frames are left with it."""
+        return play(self._count.of(self._loop, doing, left), basis_nm, plan.table)
+
+    def _useful_cycle(self, number: int, delay: Delay, doing: str, left: int) -> Cycle:
+        """Play and fit one cycle, again where it is of no use."""
+        for failures in range(1, MOST_FAILURES + 1):
             try:
-                sums = sums.plus(self._cycle(sums.cycles, delay))
-                failures = 0
+                return self._cycle(number, delay, doing, left)
             except (PlayInterruptedError, ValueError) as error:
-                failures += 1
-                if failures >= MOST_FAILURES:
+                if failures == MOST_FAILURES:
                     raise CalibrationError(f"{failures} cycles in a row were of no use: {error}") from None
                 self._say(f"a cycle is repeated: {error}")
-                continue
-            keep(path, sums, what)
-        self._progress(f"{wanted.method} cycles", needed, needed)
-        return measured(sums)
+        raise AssertionError
 
-    def _plan(self, number: int, amplitude_nm: float) -> poke_plan.Plan:
-        wanted = self._wanted
-        if self._closed:
-            seed = wanted.seed + 1000 * (number + 1)
-            return poke_plan.dither(self._modes, amplitude_nm, PIECE, DITHER_HOLD, seed)
-        patterns = poke_plan.hadamard_patterns if wanted.method == "hadamard" else poke_plan.poke_patterns
-        rest = max(16, len(poke_plan.SIGNS) * HOLD)
-        return poke_plan.cycle(patterns(self._modes, amplitude_nm), HOLD, SETTLE, rest, backwards=number % 2 == 1)
-
-    def _cycle(self, number: int, delay: Delay) -> Cycle:
+    def _cycle(self, number: int, delay: Delay, doing: str, left: int) -> Cycle:
         """Play and fit one cycle; ValueError where it is of no use."""
-        plan = self._plan(number, self.amplitude_nm)
-        recording = play(self._loop, self._basis, plan.table)
+        plan = self.pokes.cycle(number)
+        recording = self._play(self._basis, plan, doing, left)
         fractions, flux = normalised(recording.pixels, self._dark, self._good)
         poked = recording.played(plan.table, delay.delay_frames)
         moved = poked + recording.commands(delay.delay_frames) if self._closed else poked
         use = recording.usable(plan, delay.delay_frames)
-        return cycle_response(fractions, flux, moved, poked, use.astype(np.float64))
+        slowest = DITHER_SLOWEST if self._closed else 0.0
+        return cycle_response(fractions, flux, moved, poked, use.astype(np.float64), slowest)

@@ -1,7 +1,7 @@
 """What `lowfc calibrate` does: a running loop, files, a progress bar; each returns its figures and its text."""
 
 import contextlib
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -13,7 +13,7 @@ from rich.progress import TextColumn, TimeRemainingColumn
 
 from lowfc.adapters import calibration_file, instrument
 from lowfc.adapters.array_file import read_array
-from lowfc.adapters.progress import counting_bar
+from lowfc.adapters.progress import Counted, counting_bar, spoken
 from lowfc.adapters.terminal import configuration
 from lowfc.adapters.whole_file import require_folder
 from lowfc.client import Client, configuration_of
@@ -27,21 +27,19 @@ from lowfc.control.regularised import Reconstruction, advice, reconstruct
 from lowfc.control.response_fit import normalised
 from lowfc.programs.analytic import analytic
 from lowfc.programs.calibrate.at import zero_point
+from lowfc.programs.calibrate.finish import finished
 from lowfc.programs.calibrate.partial import partial_of
 from lowfc.programs.calibrate.recording import watch
 from lowfc.programs.calibrate.result import (
     comparison,
     comparison_text,
-    configured_delay,
     figures,
-    measured_calibration,
     text_of,
 )
 from lowfc.programs.calibrate.run import Calibrator, Wanted
+from lowfc.programs.calibrate.verdict import LEAST_SNR
 
 Found = tuple[dict[str, Any], str]
-DELAY_APART = 0.1
-"""Frames by which the delay that the loop counts with may be off before something is said."""
 MOST_LIGHT = 0.02
 """Part of the star's light that may be in dark frames."""
 
@@ -50,7 +48,7 @@ def wanted(
     method: str, amplitude: float | None, snr: float, cycles: int | None, out: Path, *, resume: bool, linear: bool
 ) -> Wanted:
     """What the options ask for."""
-    return Wanted(method, amplitude, snr, cycles, out, resume, range=linear)
+    return Wanted(method, amplitude, snr if cycles is None else LEAST_SNR, cycles, out, resume, range=linear)
 
 
 def poked(asked: Wanted, run: str | None, truncate: float, tikhonov: float, *, load: bool) -> Found:
@@ -63,35 +61,43 @@ def poked(asked: Wanted, run: str | None, truncate: float, tikhonov: float, *, l
     """
     require_folder(asked.out)
     console = Console(stderr=True)
+    say = sayer(console)
+    kept = partial_of(asked.out)
     with contextlib.ExitStack() as held:
         loop = held.enter_context(Client(run))
-        model = analytic(configuration_of(loop), console)
-        progress = held.enter_context(
-            counting_bar(console, TextColumn("{task.completed}/{task.total}"), TimeRemainingColumn())
-        )
-        calibrator = Calibrator(loop, asked, _sayer(console), progress)
-        config, method = calibrator.config, asked.method
+        computed = analytic(configuration_of(loop), console)
+        progress = held.enter_context(shown_progress(console, say))
+        calibrator = Calibrator(loop, asked, say, progress, computed)
+        held.enter_context(loop.reserved(f"lowfc calibrate --method {asked.method}"))
+        held.enter_context(_telling_what_is_kept(calibrator, kept, say))
         held.enter_context(calibrator.holding())
-        taken = calibrator.run()
-        made, quality = measured_calibration(config, calibrator.before, taken.measured, method, truncate, tikhonov)
-        linear = None
-        if asked.range and method != "in-loop":
-            linear = calibrator.linear_range(made, taken.delay)
-        found = figures(config, made, quality, method, taken.measured, taken.delay, linear, model, asked.out)
-        calibration_file.save(made, asked.out)
-        partial_of(asked.out).unlink(missing_ok=True)
-        if load:
-            loop.load(made)
-    counted = configured_delay(config)
-    if abs(taken.delay.delay_frames - counted) > DELAY_APART:
-        console.print(
-            f"warning: the loop counts with a delay of {counted:g} frames; set control.delay_frames = "
-            f"{max(taken.delay.delay_frames, 1):.2f}",
-            style="yellow",
-            highlight=False,
-            soft_wrap=True,
-        )
-    return found, f"{text_of(found)}\n{advice(quality, made.noll, config.control.limit_nm)}"
+        done = finished(calibrator, asked, calibrator.run(), computed, None, truncate, tikhonov)
+        if not done.faults:
+            kept.unlink(missing_ok=True)
+            if load:
+                loop.load(done.calibration)
+    return done.figures, done.text + ("\nit is not loaded" if load and done.faults else "")
+
+
+@contextlib.contextmanager
+def shown_progress(console: Console, say: Callable[[str], None]) -> Iterator[Counted]:
+    """A bar on a terminal, else a line every 10 s."""
+    if not console.is_terminal:
+        yield spoken(say)
+        return
+    with counting_bar(console, TextColumn("{task.percentage:.0f} %"), TimeRemainingColumn()) as count:
+        yield count
+
+
+@contextlib.contextmanager
+def _telling_what_is_kept(calibrator: Calibrator, kept: Path, say: Callable[[str], None]) -> Iterator[None]:
+    """Where a calibration does not come to its end: which cycles it can go on with."""
+    try:
+        yield
+    except BaseException:
+        if calibrator.kept:
+            say(f"{calibrator.kept} cycles are kept in {kept}: the same command with --resume goes on with them")
+        raise
 
 
 def computed(
@@ -118,7 +124,7 @@ def computed(
     if load:
         with Client(run) as loop:
             loop.load(made)
-    found = figures(config, made, quality, "analytic", None, None, None, None, out)
+    found = figures(config, made, quality, "analytic", None, None, None, None, None, out)
     return found, f"{text_of(found)}\n{advice(quality, made.noll, config.control.limit_nm)}"
 
 
@@ -263,7 +269,9 @@ def images(file: Path) -> npt.NDArray[np.float64]:
     return np.asarray(data, dtype=np.float64).reshape(-1, *data.shape[-2:])
 
 
-def _sayer(console: Console) -> Callable[[str], None]:
+def sayer(console: Console) -> Callable[[str], None]:
+    """A line for people, warnings in yellow."""
+
     def say(text: str) -> None:
         style = "yellow" if text.startswith("warning") else None
         console.print(text, style=style, highlight=False, soft_wrap=True, markup=False)

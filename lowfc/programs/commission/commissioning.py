@@ -1,0 +1,225 @@
+"""The steps from a camera that publishes to a calibration that is in use, and to a closed loop."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from lowfc.adapters import calibration_file, instrument
+from lowfc.adapters.progress import Counted
+from lowfc.client import Client
+from lowfc.contract.configuration import Configuration
+from lowfc.contract.errors import CalibrationError
+from lowfc.contract.messages import wire
+from lowfc.control.calibration import Calibration
+from lowfc.control.delay_fit import Delay
+from lowfc.control.inputs import Step
+from lowfc.control.law import Law
+from lowfc.control.safety import LoopMode
+from lowfc.control.what_if import settling_frames
+from lowfc.programs.calibrate.finish import finished
+from lowfc.programs.calibrate.partial import begun, partial_of
+from lowfc.programs.calibrate.pokes import Wanted, usual_nm
+from lowfc.programs.calibrate.recording import watch
+from lowfc.programs.calibrate.run import Calibrator
+from lowfc.programs.calibrate.tasks import images
+from lowfc.programs.commission.first_calibration import aligned, first_delay, linear_nm, poked
+from lowfc.programs.commission.first_light import Say, Sensor, camera_fits, darkened, referenced, undark
+from lowfc.programs.commission.prediction import measured_nm, predicted_nm
+
+METHOD = "hadamard"
+LOOKED_AT = 32
+"""Frames of which size, rate and light are seen."""
+MIN_PREDICTED = 1000
+"""Frames of the open loop that a residual is predicted from, and of the closed loop that it is measured in."""
+STEPS = (
+    *("camera", "dark and bad pixels", "reference image", "delay", "orientation and sign", "poke amplitude"),
+    *("response", "verdict", "prediction", "closed loop"),
+)
+
+
+@dataclass(frozen=True, slots=True)
+class Commission:
+    """What is asked for.
+
+    Attributes:
+        out: The file to be written; what is done so far is kept beside it.
+        frames: For the dark and for the reference image.
+        dark: File of dark frames; None to take them now.
+        no_dark: Take the camera's bias for the dark, and all pixels for good.
+        snr: Signal-to-noise ratio to reach in the noisiest mode.
+        resume: Go on with one that was interrupted.
+        close: Close the loop at the end.
+    """
+
+    out: Path
+    frames: int
+    dark: Path | None
+    no_dark: bool
+    snr: float
+    resume: bool
+    close: bool
+
+
+def first_of(out: Path) -> Path:
+    """Where the first calibration is kept until a better one is made."""
+    return out.with_name(f"{out.name}.first.fits")
+
+
+class Commissioning:
+    """One commissioning of a running loop."""
+
+    def __init__(
+        self,
+        loop: Client,
+        config: Configuration,
+        computed: Calibration,
+        asked: Commission,
+        say: Say,
+        progress: Counted,
+        confirm: Callable[[str], None],
+    ) -> None:
+        """Take what it is made with.
+
+        Args:
+            loop: A connection to it.
+            config: The loop's.
+            computed: Of the optical model: its modes and the mirror's commands, and its image where it is alike.
+            asked: What is asked for.
+            say: For people.
+            progress: For people: frames so far, and of how many.
+            confirm: Ask a person to do something, and wait until it is done.
+        """
+        self._loop, self._config, self._computed, self._asked = loop, config, computed, asked
+        self._say, self._progress, self._confirm = say, progress, confirm
+        self._figures: dict[str, Any] = {}
+        self._delay: Delay | None = None
+
+    def run(self) -> tuple[dict[str, Any], str]:
+        """All steps; the figures, and the text for people.
+
+        Raises:
+            CalibrationError: a step failed; the sentence says what to do.
+        """
+        self._open()
+        asked, config, kept = self._asked, self._config, first_of(self._asked.out)
+        resumed = asked.resume and kept.is_file()
+        if resumed:
+            first = calibration_file.load(kept)
+            self._say(f"going on from {kept}: the steps before the poke amplitude are done")
+        else:
+            first = self._first()
+            calibration_file.save(first, kept)
+        self._loop.load(first)
+        delay = self._delay if self._delay is not None else first_delay(self._loop, config, first, self._say)
+        resume = resumed and partial_of(asked.out).is_file()
+        if resume:
+            amplitude_nm = float(begun(partial_of(asked.out))[0]["amplitude_nm"])
+        else:
+            self._step("poke amplitude")
+            amplitude_nm = linear_nm(self._loop, config, first, delay, usual_nm(METHOD, asked.snr), self._say)
+        self._step("response")
+        wanted = Wanted(METHOD, amplitude_nm, asked.snr, None, asked.out, resume, range=False)
+        calibrator = Calibrator(self._loop, wanted, self._say, self._progress, self._computed)
+        taken = calibrator.run(delay)
+        self._step("verdict")
+        done = finished(calibrator, wanted, taken, self._computed)
+        self._figures |= done.figures
+        if done.faults:
+            raise CalibrationError(
+                f"{done.text}\nit is written, and not used: correct this, then the same command with --resume"
+            )
+        for path in (kept, partial_of(asked.out)):
+            path.unlink(missing_ok=True)
+        self._loop.load(done.calibration)
+        self._say(done.text)
+        law = instrument.settings(config).law(done.calibration.noll)
+        text = self._close(law, delay.delay_frames)
+        return self._figures, text
+
+    def _step(self, name: str) -> None:
+        self._say(f"[{STEPS.index(name) + 1}/{len(STEPS)}] {name}")
+
+    def _open(self) -> None:
+        """The loop as it must be: open or idle, and a mirror as configured."""
+        state = self._loop.status().state
+        if state is None:
+            raise CalibrationError("the controller did not say how it is")
+        if state.mode == wire.LOOP_MODE_SAFED:
+            raise CalibrationError("the loop is in safe mode: `lowfc ctl clear` first, when it is safe")
+        grid = (state.mirror_rows, state.mirror_columns)
+        if state.mirror_rows and grid != self._computed.grid:
+            raise CalibrationError(
+                f"the mirror has {grid[0]} x {grid[1]} actuators, the configuration {self._computed.grid[0]} x "
+                f"{self._computed.grid[1]}: set mirror.rows and mirror.columns"
+            )
+        if state.mode == wire.LOOP_MODE_CLOSED:
+            self._say("the loop is opened")
+            self._loop.open()
+
+    def _first(self) -> Calibration:
+        """The steps before there is any calibration."""
+        self._step("camera")
+        seen = list(self._loop.frames(LOOKED_AT))
+        camera = camera_fits(self._config, self._loop.camera_state(), seen, self._say)
+        self._step("dark and bad pixels")
+        asked, sensor = self._asked, undark(camera)
+        if asked.dark is not None:
+            sensor = darkened(camera, images(asked.dark), self._say)
+        elif asked.no_dark:
+            self._say(f"no dark: the camera's bias of {camera.bias_dn:g} DN everywhere, and all pixels good")
+        else:
+            self._confirm("block the star; is it dark?")
+            sensor = darkened(camera, watch(self._loop, asked.frames), self._say)
+            self._confirm("unblock the star; is it there?")
+        self._step("reference image")
+        before = self._reference(sensor)
+        self._step("delay")
+        self._delay = delay = first_delay(self._loop, self._config, before, self._say)
+        self._step("orientation and sign")
+        first = aligned(self._config, self._computed, before, delay, self._say)
+        if first is None:
+            first = poked(self._loop, self._config, before, delay, self._say)
+        self._figures |= first.figures
+        return first.calibration
+
+    def _reference(self, sensor: Sensor) -> Calibration:
+        frames: npt.NDArray[np.uint16] = watch(self._loop, self._asked.frames)
+        return referenced(sensor, frames, self._computed, self._say)
+
+    def _close(self, law: Law, delay_frames: float) -> str:
+        """Predict the residual; close the loop where that was asked for, and compare."""
+        rate_hz = self._config.camera.rate_hz
+        settling = settling_frames(law, rate_hz)
+        frames = settling + max(MIN_PREDICTED, settling)
+        self._step("prediction")
+        try:
+            expected_nm = predicted_nm(self._steps(frames), law, delay_frames, rate_hz)
+        except ValueError as error:
+            raise CalibrationError(f"the residual is not predicted: {error}") from None
+        predicted = float(np.sqrt((expected_nm**2).sum()))
+        self._figures["predicted_error_nm"] = predicted
+        text = f"the closed loop leaves {predicted:.3g} nm rms of measured error, predicted from {frames} open frames"
+        if not self._asked.close:
+            return f"{text}\n`lowfc ctl close` closes it"
+        self._step("closed loop")
+        self._loop.close_loop()
+        try:
+            found_nm = measured_nm(self._steps(frames, LoopMode.CLOSED), law, rate_hz)
+        except ValueError as error:
+            raise CalibrationError(f"the residual is not measured: {error}") from None
+        measured = float(np.sqrt((found_nm**2).sum()))
+        self._figures["measured_error_nm"] = measured
+        return f"{text}\nmeasured in the closed loop: {measured:.3g} nm rms, {measured / predicted:.2f} times that"
+
+    def _steps(self, frames: int, mode: LoopMode = LoopMode.OPEN) -> list[Step]:
+        steps: list[Step] = []
+        self._say(f"watching {frames} frames, {frames / self._config.camera.rate_hz:.0f} s")
+        for step in self._loop.steps(frames):
+            if step.mode is not mode and steps:
+                raise CalibrationError(f"the loop is {step.mode.name.lower()} instead of {mode.name.lower()}")
+            steps.append(step)
+        return steps
