@@ -11,8 +11,8 @@ from lowfc.client import stream
 from lowfc.contract.codec import MOST_BYTES
 from lowfc.contract.configuration import Acceptance, keys
 from lowfc.control import linearity, transfer_function
+from lowfc.control.stability import LEAST_GAIN_MARGIN, LEAST_PHASE_MARGIN_DEG, LOWEST_GAIN
 from lowfc.control.state import FADING_FRAMES, SETTLING_FRAMES
-from lowfc.control.tuning import LEAST_GAIN_MARGIN, LEAST_PHASE_MARGIN_DEG, LOWEST_GAIN
 from lowfc.control.vibration import FEWEST
 from lowfc.programs.acceptance import capture as acceptance_capture
 from lowfc.programs.acceptance import linearity as acceptance_linearity

@@ -1,8 +1,9 @@
-"""The true wavefront's figures over the second half of a run of unknown length."""
+"""The true wavefront's figures over the second half of a run of unknown length, and over its last frames."""
 
 from dataclasses import dataclass
 
 import numpy as np
+import numpy.typing as npt
 
 from sim_camera.bench import Truth
 
@@ -14,7 +15,7 @@ MOST_BLOCKS = 256
 
 @dataclass(frozen=True, slots=True)
 class Wavefront:
-    """Root mean squares over the second half: nm over the open pupil, mas per axis."""
+    """Root mean squares over frames: nm over the open pupil, mas per axis."""
 
     disturbance_rms_nm: float
     residual_rms_nm: float
@@ -25,26 +26,33 @@ class Wavefront:
 class Figures:
     """Sums of squares, block by block."""
 
-    def __init__(self, noll: tuple[int, ...], nm_per_mas: float) -> None:
-        """The modes of the truths to come, and what a milliarcsecond of tilt is on the wavefront."""
+    def __init__(self, noll: tuple[int, ...], nm_per_mas: float, recent: int = 1) -> None:
+        """Begin without a frame.
+
+        Args:
+            noll: modes of the truths to come.
+            nm_per_mas: wavefront rms of a milliarcsecond of tilt.
+            recent: frames of the recent figures.
+        """
         self._tilts = slice(0, sum(index in (2, 3) for index in noll))  # they come first
         self._nm_per_mas = nm_per_mas
         self._blocks: list[list[float]] = []
         self._sums = [0.0, 0.0, 0.0, 0.0]
         self._count = 0
         self._block = BLOCK
+        self._recent = np.zeros((recent, 4))
+        self._frames = 0
 
     def add(self, truth: Truth) -> None:
         """Count the truth of one frame."""
         tilt, left = truth.disturbance_nm[self._tilts], truth.residual_nm[self._tilts]
-        sums = self._sums
-        sums[0] += truth.disturbance_rms_nm**2
-        sums[1] += truth.residual_rms_nm**2
-        sums[2] += float(tilt @ tilt)
-        sums[3] += float(left @ left)
+        squares = (truth.disturbance_rms_nm**2, truth.residual_rms_nm**2, float(tilt @ tilt), float(left @ left))
+        self._sums = [total + square for total, square in zip(self._sums, squares, strict=True)]
+        self._recent[self._frames % len(self._recent)] = squares
+        self._frames += 1
         self._count += 1
         if self._count == self._block:
-            self._blocks.append(sums)
+            self._blocks.append(self._sums)
             self._sums, self._count = [0.0, 0.0, 0.0, 0.0], 0
         if len(self._blocks) == MOST_BLOCKS:
             pairs = zip(self._blocks[::2], self._blocks[1::2], strict=True)
@@ -60,5 +68,13 @@ class Figures:
             mean = np.array(self._sums) / self._count
         else:
             return None
+        return self._rms(mean)
+
+    def recent(self) -> Wavefront | None:
+        """Figures over the most recent frames; None before the first frame."""
+        found = self._recent[: self._frames]
+        return self._rms(found.mean(axis=0)) if len(found) else None
+
+    def _rms(self, mean: npt.NDArray[np.float64]) -> Wavefront:
         mean[2:] /= 2 * self._nm_per_mas**2
         return Wavefront(*(float(value) for value in np.sqrt(mean)))

@@ -2,6 +2,7 @@
 
 import threading
 from collections import deque
+from dataclasses import asdict
 from itertools import count
 
 import numpy as np
@@ -33,6 +34,8 @@ PATIENCE_S = 5.0
 """In lockstep, real time without progress after which the run is ended."""
 WAIT_S = 30.0
 """How long the first frame waits for those who must not miss it."""
+RECENT_S = 2.0
+"""Over which the wavefront is reported while the loop runs."""
 _REMEMBERED = 256
 
 
@@ -107,7 +110,8 @@ class CameraProcess:
         self._first_put_ns = 0
         self._lateness = Lateness()
         self._frame_to_mirror = Durations()
-        self._figures = Figures(config.noll, tilt_nm_per_mas(config.star.diameter_m))
+        recent = max(1, round(RECENT_S * config.camera.rate_hz))
+        self._figures = Figures(config.noll, tilt_nm_per_mas(config.star.diameter_m), recent)
         self._publish_settings(service.clock.now_ns())
         service.state = "ready"
 
@@ -153,16 +157,10 @@ class CameraProcess:
             health.mean_rate_hz = (self._frames.published - 1) * 1e9 / elapsed_ns
         if self._frame_to_mirror.count:
             health.frame_to_mirror.CopyFrom(latency(self._frame_to_mirror))
-        wavefront = self._figures.wavefront()
-        if wavefront is not None:
-            health.wavefront.CopyFrom(
-                wire.WavefrontFigures(
-                    disturbance_rms_nm=wavefront.disturbance_rms_nm,
-                    residual_rms_nm=wavefront.residual_rms_nm,
-                    tilt_disturbance_mas=wavefront.tilt_disturbance_mas,
-                    tilt_residual_mas=wavefront.tilt_residual_mas,
-                )
-            )
+        if (wavefront := self._figures.wavefront()) is not None:
+            health.wavefront.CopyFrom(wire.WavefrontFigures(**asdict(wavefront)))
+        if (recent := self._figures.recent()) is not None:
+            health.recent_wavefront.CopyFrom(wire.WavefrontFigures(**asdict(recent)))
 
     def _expose(self, index: int, end_ns: int) -> Truth:
         """Latch the mirror, make the frame during the exposure, publish it at its end and the truth after it."""

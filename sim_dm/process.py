@@ -83,6 +83,7 @@ class MirrorProcess:
         )
         service.fill = self._fill
         self._leave = service.handover(COMMAND, self._arrived, name, period_ns=config.period_ns)
+        service.awaited = lambda: "" if self._status.received_ns else "a controller"
         service.state = "ready"
 
     def run(self) -> None:

@@ -1,7 +1,10 @@
 """The client of a running loop, its command line, and the recorder's switch: what is asked, and what comes back."""
 
 import contextlib
+import os
 import socket
+import subprocess
+import sys
 from collections.abc import Callable
 from pathlib import Path
 
@@ -17,8 +20,9 @@ from lowfc.adapters.bus import Query, Sample
 from lowfc.adapters.clock import HostClock
 from lowfc.adapters.log_reader import LogReader
 from lowfc.adapters.mirror_maps import read_shape
+from lowfc.adapters.other_loops import other_loops
 from lowfc.adapters.run import open_run
-from lowfc.client import Client, Stream, client, configuration_of, running, the_run
+from lowfc.client import Answer, Client, Frame, Stream, client, configuration_of, running, the_run
 from lowfc.client.stream import WAITING, frame_of, step_of
 from lowfc.contract import codec
 from lowfc.contract.calibration_codec import encode_calibration, identified
@@ -124,7 +128,26 @@ def test_the_controller_reads_what_was_meant(controller: FakeController, loop: C
     answer = ask(loop)
     (asked,) = controller.asked
     assert asked == wanted
-    assert answer == ("done" if name == "configuration" else (True, "done", 77, asked.text, None))
+    assert answer == ("done" if name == "configuration" else (True, "done", 77, asked.text, None, "default"))
+
+
+def test_one_mode_needs_no_list(controller: FakeController, loop: Client) -> None:
+    loop.gain(0.4, modes=2)
+    loop.limit([20, 10], modes=np.array([4, 2]))
+    loop.offset(5.0, modes=np.int64(4))
+    assert [request.modes for request in controller.asked] == [(2,), (4, 2), (4,)]
+    for wrong in (2.5, "2", [2, None]):
+        with pytest.raises(RequestRefusedError, match="gain refused: "):
+            loop.gain(0.4, modes=wrong)  # type: ignore[arg-type]
+    assert len(controller.asked) == 3
+
+
+def test_frames_have_the_same_number_everywhere() -> None:
+    sequence = sequence_of(1_800_000_000, 812)
+    shown = figures(wire.ControllerState(frame_sequence=sequence))["frame"]
+    frame = Frame(sequence, 0, np.zeros((1, 1), np.uint16))
+    step = Step(sequence, 0, LoopMode.CLOSED, np.zeros(3, np.float32), ())
+    assert {shown, frame.number, step.frame, Answer(True, "done", sequence).frame} == {812}
 
 
 def test_every_request_has_its_method() -> None:
@@ -157,8 +180,8 @@ def same_law(one: LinearLaw, other: LinearLaw) -> bool:
 
 
 def test_a_refusal_is_an_error_with_the_controllers_sentence(controller: FakeController, loop: Client) -> None:
-    controller.reply = Reply(False, "the loop is safed", 3)
-    with pytest.raises(RequestRefusedError, match=r"^close refused: the loop is safed$"):
+    controller.reply = Reply(False, "the loop is in safe mode", 3)
+    with pytest.raises(RequestRefusedError, match=r"^close refused: the loop is in safe mode \(run default\)$"):
         loop.close_loop()
 
 
@@ -219,27 +242,60 @@ def listening(name: str, *roles: str) -> list[socket.socket]:
 
 def test_a_run_is_found_by_who_is_there(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
-    with pytest.raises(BusError, match="no loop is running on this host"):
+    where = rf"no loop of user \S+ is running here: {tmp_path}/lowfc was searched \(from XDG_RUNTIME_DIR\)"
+    with pytest.raises(BusError, match=where):
         the_run(None)
     open_run("empty")
     with contextlib.ExitStack() as held:
         for server in listening("left", "camera", "recorder"):
             held.enter_context(server)
         assert the_run(None) == the_run("left") == "left"
-        with pytest.raises(BusError, match=r"there is no run 'empty': there are left$"):
+        with pytest.raises(BusError, match=r"there is no run 'empty': there are left \(no controller yet\)$"):
             the_run("empty")
         for server in listening("whole", "camera", "controller"):
             held.enter_context(server)
         assert running() == ["whole"]
-        assert (the_run(None), the_run("left")) == ("whole", "left"), "the only one with a controller"
         (open_run("damaged").path / "links.json").write_text("")
-        assert (the_run(None), the_run("left")) == ("whole", "left"), "a damaged one hides no other"
+        assert (the_run("whole"), the_run("left")) == ("whole", "left"), "a damaged one hides no other"
+        with pytest.raises(BusError, match=r"choose a run with --run.*: there are left \(no controller yet\), whole$"):
+            the_run(None)  # the other one may be starting
         with pytest.raises(DataFileError, match=r"links\.json"):
             the_run("damaged")
-        for server in listening("another", "controller"):
-            held.enter_context(server)
-        with pytest.raises(BusError, match=r"say which run with --run: there are another, left, whole$"):
-            the_run(None)
+
+
+def test_the_beginning_of_a_runs_name_is_enough(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
+    with contextlib.ExitStack() as held:
+        for name in ("night", "night-2", "noon"):
+            for server in listening(name, "controller"):
+                held.enter_context(server)
+        assert [the_run(word) for word in ("night", "night-", "noo")] == ["night", "night-2", "noon"]
+        with pytest.raises(BusError, match=r"'n' is the beginning of several runs: night, night-2, noon$"):
+            the_run("n")
+        with pytest.raises(BusError, match=r"there is no run 'day': there are night, night-2, noon$"):
+            the_run("day")
+
+
+def test_a_loop_that_is_not_seen_from_here_is_told_of(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Its owner, its process and its runtime directory, where the system tells."""
+    monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
+    words = [sys.executable, "-c", "print(flush=True); input()", "lowfc", "controller", "--run", "night"]
+    for there, told in (
+        ("/run/elsewhere", ", with XDG_RUNTIME_DIR=/run/elsewhere"),
+        (str(tmp_path), ", still starting"),
+    ):
+        environment = os.environ | {"XDG_RUNTIME_DIR": there}
+        with subprocess.Popen(words, stdin=subprocess.PIPE, stdout=subprocess.PIPE, env=environment) as process:
+            assert process.stdout is not None
+            process.stdout.readline()
+            said = list(other_loops())
+            process.communicate(b"\n")
+        assert f"you run `lowfc controller --run night` (process {process.pid}{told})" in said
+    stranger = tmp_path / "proc" / "77"
+    stranger.mkdir(parents=True)
+    (stranger / "cmdline").write_text("python\0/opt/lowfc/bin/lowfc\0controller\0")
+    monkeypatch.setattr(os, "geteuid", lambda: 4_000_000_000)
+    assert list(other_loops(tmp_path / "proc")) == [f"user {stranger.owner()} runs `lowfc controller` (process 77)"]
 
 
 # The mirror.
@@ -531,7 +587,14 @@ def test_the_status_says_everything() -> None:
         {"name": "dark-hole", "rms_nm": pytest.approx(12.5**0.5), "shifts_zero_point": True, "reached": False}
     ]
     assert said["limits_hit"] == ["SLEW"]
-    for words in ("closed, opens after 12 frames", "5.000 nm rms", "lqg", "dark-hole 3.54 nm rms", "12 of 20", "SLEW"):
+    for words in (
+        "closed, opens after 12 frames",
+        "5.000 nm rms",
+        "lqg",
+        "dark-hole 3.54 nm rms",
+        "12 of 20",
+        "acting: slew",
+    ):
         assert words in text(state)
     assert figures(wire.ControllerState())["mode"] == "starting"
     assert "none" in text(wire.ControllerState())

@@ -1,14 +1,17 @@
 """The configuration: defaults that work, and one clear line for everything that does not."""
 
+import re
 import tomllib
 from pathlib import Path
 from typing import Any
 
 import pytest
+import tomli_w
 
 from lowfc.adapters.instrument import detector, mirror, mirror_limits, settings
 from lowfc.contract.configuration import PRESETS, Configuration, keys, load
 from lowfc.contract.errors import ConfigurationError
+from lowfc.programs.config import commented
 from sim_camera.disturbance import disturbance
 from sim_dm.process import device
 
@@ -118,6 +121,27 @@ def test_a_value_out_of_range_is_one_line_with_key_and_value(tmp_path: Path, key
     assert said.startswith(f"{key}")
     assert repr(value) in said or repr(value)[1:-1] in said
     assert "\n" not in said
+
+
+def test_what_is_shown_chooses_nothing_that_was_not_chosen(tmp_path: Path) -> None:
+    """Written to a file and read again, it leaves a command's own defaults in force."""
+    silent = write(tmp_path, commented(load(None)))
+    assert tomllib.loads(silent.read_text()) == {name: {} for name in tomllib.loads(silent.read_text())}
+    assert load(silent, None, {"control.start_mode": "closed"}).control.start_mode == "closed"
+    assert {line.removeprefix("#").split(" = ")[0] for line in silent.read_text().splitlines()} >= {
+        key.rpartition(".")[2] for key in KEYS
+    }
+    chosen = {
+        "control": {"start_mode": "open"},  # the default, and yet a choice
+        "disturbance": {"static_nm": {"4": 1.5}},
+        "mirror": {"dead": [1, 2], "stuck_nm": {"3": 25.0, "5": -2.0}},
+    }
+    config = load(write(tmp_path, tomli_w.dumps(chosen)))
+    shown = write(tmp_path, commented(config))
+    assert {name: keys for name, keys in tomllib.loads(shown.read_text()).items() if keys} == chosen
+    assert load(shown, None, {"control.start_mode": "closed"}) == config
+    uncommented = "\n".join(re.sub(r"^#(?! )", "", line) for line in commented(load(None)).splitlines())
+    assert load(write(tmp_path, uncommented)) == Configuration(), "each key can be uncommented as it stands"
 
 
 def test_every_fault_gets_its_own_line(tmp_path: Path) -> None:

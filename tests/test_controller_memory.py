@@ -357,6 +357,7 @@ def test_a_latch_that_cannot_be_written_starts_open(rig: Rig, tmp_path: Path) ->
     health, said = wire.Health(), []
     latch = Latch([tmp_path / "file" / "safe"], said.append)
     Controller(configured(control__start_mode="closed"), service, rig.calibration, "a test", latch).fill(health)
+    assert service.awaited() == "a camera"
     assert (LoopMode(health.mode), len(said)) == (LoopMode.OPEN, 1)
 
 

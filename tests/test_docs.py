@@ -90,6 +90,7 @@ REQUESTS = (
     "lowfc ctl close",
     "lowfc ctl safe",
     "lowfc ctl clear",
+    "lowfc runs",
 )
 FILES = (
     "lowfc config show > lowfc.toml",
@@ -139,9 +140,11 @@ def test_the_requests(tmp_path: Path) -> None:
     finally:
         out, complaints = interrupt(loop)
     assert loop.returncode == 0, complaints
-    assert "loop           closed" in said[0]
+    assert said[0].startswith("closed · residual ")
     assert "gain is now 0.3 0.3 0.05" in said[1]
-    assert [text.split(",")[0] for text in said[2:]] == ["loop open", "loop closed", "loop safed", "loop open"]
+    replies = [text.split(",")[0] for text in said[2:6]]
+    assert replies == ["loop open", "loop closed", "loop in safe mode", "loop open"]
+    assert re.match(r"\S+  open at \d+ Hz for \d+ s; camera, controller, mirror-dm; not recording\n", said[6])
     assert "frame to command" in out
 
 
@@ -162,6 +165,8 @@ def test_the_processes_by_hand(tmp_path: Path) -> None:
             process.terminate()
         complaints = [process.communicate(timeout=20)[1] for process in started]
     assert [process.returncode for process in started] == [0] * 4, complaints
+    for name, said in zip(("camera", "mirror-dm", "controller", "recorder"), complaints, strict=True):
+        assert f"{name}: ready (run bench)\n" in said
     assert len(list((tmp_path / "logs").glob("*.mcap"))) == 1
 
 

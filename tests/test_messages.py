@@ -59,6 +59,7 @@ WITHOUT_UNIT = {
         "refused_count",
         "most_saturated",
         "least_flux",
+        "flux_fraction",
         "commands_late",
         "saturated_pixels",
         "most_alike",

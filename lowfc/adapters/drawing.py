@@ -3,6 +3,7 @@
 import io
 from typing import Any
 
+from lowfc.adapters.extras import install_advice
 from lowfc.contract.errors import ConfigurationError
 
 
@@ -16,7 +17,7 @@ def figure_class() -> Any:
         from matplotlib.figure import Figure
     except ImportError as error:
         raise ConfigurationError(
-            f"plots need matplotlib, which is not there ({error}); install it with: pip install 'lowfc[plots]'"
+            f"plots need matplotlib, which is not there ({error}); install it with: {install_advice('plots')}"
         ) from None
     return Figure
 

@@ -42,4 +42,4 @@ def join(
     granted = prepare(config, role, cpus)
     run = open_run(run_id, (config.mirror.name,), network=config.network)
     clock = clock_of(config)
-    return Service(role, run_id, clock, ZenohBus(run.links, role, clock), granted=granted)
+    return Service(role, run_id, clock, ZenohBus(run.links, role, clock), granted=granted, announces=True)

@@ -14,6 +14,7 @@ import zenoh
 
 from lowfc.adapters.access import ROUTER, access_control
 from lowfc.adapters.own_certificate import WARN_DAYS, read_certificate
+from lowfc.adapters.zenoh_fault import plain
 from lowfc.contract.configuration import Network
 from lowfc.contract.errors import BusError, DataFileError
 
@@ -108,7 +109,7 @@ def open_by_router(config: zenoh.Config, network: Network, role: str) -> zenoh.S
             if refused > 1:
                 raise BusError(
                     f"the router at {network.router} takes {role}'s certificate, and zenoh opens no session: "
-                    f"{str(fault).splitlines()[0][:200]}"
+                    f"{plain(fault)}"
                 ) from fault
             if trouble != said and trouble:
                 sys.stderr.write(f"{role}: waiting for the router at {network.router}: {trouble}\n")

@@ -20,9 +20,11 @@ from lowfc.adapters.realtime import NOTHING, Granted
 from lowfc.adapters.supervision import Supervisor
 from lowfc.adapters.usage import resident_bytes
 from lowfc.contract.events import EVENTS, Level
-from lowfc.contract.messages import EVENT, HEALTH, Topic, timestamp, wire
+from lowfc.contract.messages import EVENT, HEALTH, Log, Topic, timestamp, wire
 
 HEALTH_PERIOD_NS = 500_000_000
+WAITING_NS = 2_000_000_000
+"""After it is ready a process that still waits for others says for whom."""
 STATES = ("starting", "ready", "running", "stopping", "stopped")
 
 _MET_PERIOD_S = 0.02
@@ -36,6 +38,8 @@ class Service:
         running: until SIGTERM, SIGINT or `stop`.
         work: units of work done (frames, commands, messages); `rate_hz` in Health is its rate.
         heard: last Health of every other process heard.
+        announces: on standard error, that it is ready and for whom it waits.
+        awaited: for whom, in words; empty once it waits for nobody.
     """
 
     def __init__(
@@ -47,6 +51,7 @@ class Service:
         *,
         granted: Granted = NOTHING,
         fill: Callable[[wire.Health], None] | None = None,
+        announces: bool = False,
     ) -> None:
         """Join the run; `fill` adds the role's own fields to each Health."""
         self.name = name
@@ -61,12 +66,16 @@ class Service:
         self.run_id = run_id
         self._granted = granted
         self.fill = fill
+        self.announces = announces
+        self.awaited: Callable[[], str] = str
+        self._check_waiting_ns: int | None = None
         self._state = "starting"
         self._fault: Exception | None = None
         self._names = Names()
         self._known: set[tuple[str, int]] = set()
         self._wakers: list[Callable[[], None]] = []
         self._event_lock = threading.Lock()
+        self._last_warning: Log | None = None
         self._supervisor = Supervisor()
         self._started_ns = self._beaten_ns = clock.host_ns()
         self._worked = 0
@@ -169,6 +178,9 @@ class Service:
         self._send_health(self.clock.host_ns())
         if state in ("ready", "running"):
             self._supervisor.ready()
+            if self._check_waiting_ns is None:
+                self._check_waiting_ns = self.clock.host_ns() + WAITING_NS
+                self._announce("ready")
         elif state in ("stopping", "stopped"):
             self._supervisor.stopping()
 
@@ -179,6 +191,10 @@ class Service:
         """
         now_ns = self.clock.host_ns()
         self._supervisor.alive(now_ns)
+        if self._check_waiting_ns is not None and 0 < self._check_waiting_ns <= now_ns:
+            self._check_waiting_ns = 0
+            if whom := self.awaited():
+                self._announce(f"waiting for {whom}")
         if now_ns >= self._due_ns:
             self._send_health(now_ns)
 
@@ -201,8 +217,16 @@ class Service:
         with self._event_lock:
             self._events.put(log.SerializeToString())
         if kind.level >= Level.WARNING:
-            with contextlib.suppress(OSError, ValueError):  # a terminal that is gone, or a full disk, ends nobody
-                sys.stderr.write(f"{self.name}: {log.message}\n")
+            self._last_warning = log
+            self._print(log.message)
+
+    def _announce(self, what: str) -> None:
+        if self.announces:
+            self._print(f"{what} (run {self.run_id})")
+
+    def _print(self, line: str) -> None:
+        with contextlib.suppress(OSError, ValueError):  # a terminal that is gone, or a full disk, ends nobody
+            sys.stderr.write(f"{self.name}: {line}\n")
 
     def unreadable(self, key: str, why: object) -> None:
         """Count a message that could not be read: a flood is one event with each Health. Callable from any thread."""
@@ -218,6 +242,7 @@ class Service:
         """
         wanted = tuple(names)
         deadline_s = time.monotonic() + timeout_s
+        self.awaited = lambda: ", ".join(name for name in wanted if not self._meets(name))
         while missing := tuple(name for name in wanted if not self._meets(name)):
             if not self.running or time.monotonic() >= deadline_s:
                 return missing
@@ -245,6 +270,9 @@ class Service:
             uptime_ns=now_ns - self._started_ns,
             topics=[*(self._sent(one) for one in self.publishers), *map(_got, self.arrivals)],
         )
+        if (warning := self._last_warning) is not None:
+            message.last_warning = warning.message
+            message.last_warning_timestamp.CopyFrom(warning.timestamp)
         if self.bus.offset is not None and (exchange := self.bus.offset.best) is not None:
             message.router_offset_ns, message.router_round_trip_ns = exchange
         if self.fill:

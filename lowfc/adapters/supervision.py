@@ -10,8 +10,7 @@ import socket
 from collections.abc import Mapping
 
 from lowfc.contract.messages import wire
-
-_MODE = "LOOP_MODE_"
+from lowfc.control.safety import LoopMode
 
 
 class Supervisor:
@@ -69,7 +68,7 @@ def status_line(health: wire.Health) -> str:
     """State, loop mode, rate and what failed, in one line."""
     parts = [health.state]
     if health.mode:
-        parts.append(wire.LoopMode.Name(health.mode).removeprefix(_MODE).lower())
+        parts.append(LoopMode(health.mode).in_words)
     parts.append(f"{health.rate_hz:.0f} Hz")
     if health.recording.failure:
         parts.append(f"recording failed: {health.recording.failure}")

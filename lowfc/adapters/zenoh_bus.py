@@ -23,6 +23,7 @@ from lowfc.adapters.clock_offset import ClockAsker, ClockOffset
 from lowfc.adapters.routed import RouterWatch, open_by_router, require_certificate
 from lowfc.adapters.run import Links, mirror_role
 from lowfc.adapters.shortcut import SharedShortcutReader, ShortcutReader, ShortcutWriter
+from lowfc.adapters.zenoh_fault import plain
 from lowfc.adapters.zenoh_session import session_config
 from lowfc.contract.envelope import Envelope, sequence_of
 from lowfc.contract.errors import BusError
@@ -191,9 +192,8 @@ class ZenohBus:
             listens = role in {*links.ports, ROUTER}
             where = f"cannot listen on {address}; is one running already?" if listens else "cannot join."
             raise BusError(
-                f"{role} of run {links.run_id!r} {where} Stop what is in the way, or start "
-                f"another run (zenoh says: {str(fault).splitlines()[0][:200]})"
-            ) from fault
+                f"{role} of run {links.run_id!r} {where} Stop what is in the way, or start another run ({plain(fault)})"
+            ) from None
         if role == ROUTER:
             self.queryable(CLOCK_KEY, lambda query: query.reply(b""))
 

@@ -4,6 +4,7 @@ import contextlib
 import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
+from operator import index
 from types import TracebackType
 from typing import NamedTuple, TypeVar
 
@@ -11,8 +12,9 @@ import numpy as np
 import numpy.typing as npt
 from google.protobuf.message import DecodeError
 
-from lowfc.adapters.bus import ALL, Bus, Sample, name_in
+from lowfc.adapters.bus import ALL, UNREADABLE, Bus, Sample
 from lowfc.adapters.clock import HostClock
+from lowfc.adapters.names import Names
 from lowfc.adapters.run import DEFAULT_RUN, open_run
 from lowfc.adapters.zenoh_bus import ZenohBus
 from lowfc.client.lease import Lease
@@ -64,6 +66,7 @@ class Answer(NamedTuple):
         frame_sequence: of the first frame for which the request is in force.
         text: path of the log, of `record`.
         state: the controller's, of `status`.
+        run: name of the run that answered.
     """
 
     accepted: bool
@@ -71,6 +74,7 @@ class Answer(NamedTuple):
     frame_sequence: int
     text: str = ""
     state: wire.ControllerState | None = None
+    run: str = ""
 
     @property
     def frame(self) -> int:
@@ -80,7 +84,8 @@ class Answer(NamedTuple):
     @property
     def sentence(self) -> str:
         """The answer as people read it."""
-        return f"{self.reply}, from frame {self.frame} on"
+        run = f" (run {self.run})" if self.run else ""
+        return f"{self.reply}, from frame {self.frame} on{run}"
 
 
 class Client:
@@ -154,19 +159,19 @@ class Client:
         """Take the modal command to zero within the slew limit, and clear the law's memory."""
         return self.ask("reset")
 
-    def gain(self, values: npt.ArrayLike, modes: Sequence[int] = ()) -> Answer:
-        """Set integrator gains: one value, or one for each of `modes` (Noll indices, all when empty)."""
+    def gain(self, values: npt.ArrayLike, modes: int | Sequence[int] = ()) -> Answer:
+        """Set integrator gains: one value, or one for each of `modes` (a Noll index or several, all when empty)."""
         return self.ask("gain", modes, values)
 
-    def leak(self, values: npt.ArrayLike, modes: Sequence[int] = ()) -> Answer:
+    def leak(self, values: npt.ArrayLike, modes: int | Sequence[int] = ()) -> Answer:
         """Set integrator leaks, as `gain`."""
         return self.ask("leak", modes, values)
 
-    def limit(self, values: npt.ArrayLike, modes: Sequence[int] = ()) -> Answer:
+    def limit(self, values: npt.ArrayLike, modes: int | Sequence[int] = ()) -> Answer:
         """Set the largest modal commands, nm rms of wavefront, as `gain`."""
         return self.ask("limit", modes, values)
 
-    def offset(self, values: npt.ArrayLike = (), modes: Sequence[int] = ()) -> Answer:
+    def offset(self, values: npt.ArrayLike = (), modes: int | Sequence[int] = ()) -> Answer:
         """Set the loop's target, nm rms of wavefront, as `gain`; zero without values."""
         return self.ask("offset", modes, values)
 
@@ -259,7 +264,7 @@ class Client:
     def record(self, on: bool) -> Answer:
         """Begin the next log, or finish this one: its path is the answer's text, and the file is whole."""
         key = RECORD_KEY.format(name="start" if on else "stop")
-        return _answer("record", self._get(key, b"", SLOW_ANSWER_S, Role.RECORDER))
+        return self._answer("record", self._get(key, b"", SLOW_ANSWER_S, Role.RECORDER))
 
     def configuration(self) -> str:
         """The configuration that the controller was started with, as TOML."""
@@ -296,14 +301,13 @@ class Client:
         except DecodeError as fault:
             raise BusError(f"{sample.key} was answered with what is no lowfc.v1.CameraState: {fault}") from None
 
-    def mirrors(self) -> dict[str, wire.Health]:
-        """What each mirror of the run says of itself, by its process's name."""
-        found = {}
+    def processes(self) -> dict[str, wire.Health]:
+        """What each process of the run reports of itself, by its name."""
+        found, names = {}, Names()
         for sample in self._bus.get(HEALTH.at(ALL), timeout_s=ANSWER_S):
-            name = name_in(HEALTH, sample.key)
-            if name.partition("-")[0] == Role.MIRROR:
-                with contextlib.suppress(DecodeError):
-                    found[name] = wire.Health.FromString(sample.payload)
+            with contextlib.suppress(*UNREADABLE):
+                name, health = names.health(sample.key, sample.payload)
+                found[name] = health
         return found
 
     def laws(self) -> dict[str, LinearLaw]:
@@ -336,7 +340,7 @@ class Client:
     def ask(
         self,
         name: str,
-        modes: Sequence[int] = (),
+        modes: int | Sequence[int] = (),
         values: npt.ArrayLike = (),
         *,
         text: str = "",
@@ -355,7 +359,7 @@ class Client:
         try:
             message = wire.Request(
                 name=name,
-                modes=[int(mode) for mode in modes],
+                modes=[index(mode) for mode in np.atleast_1d(modes).tolist()] if np.size(modes) else [],
                 values=np.atleast_1d(np.asarray(values, np.float64)).tolist(),
                 text=text,
                 actuators=b"" if actuators_nm is None else actuators_nm.tobytes(),
@@ -374,7 +378,7 @@ class Client:
                 f"{name} refused: it may have {most_bytes(name):,} bytes and has {len(payload):,}: ask in parts"
             )
         patience_s = SLOW_ANSWER_S if len(payload) > LARGE_BYTES else ANSWER_S
-        return _answer(name, self._get(REQUEST_KEY.format(name=name), payload, patience_s))
+        return self._answer(name, self._get(REQUEST_KEY.format(name=name), payload, patience_s))
 
     def _get(self, key: str, payload: bytes, answer_s: float, who: Role = Role.CONTROLLER) -> Sample:
         """Ask one process; a link that is just being made answers at once that nobody is there."""
@@ -394,6 +398,16 @@ class Client:
                 raise BusError(f"no {who} is there in run {self.run_id!r}: start one, as with `{_COMMANDS[who]}`")
             time.sleep(0.05)
 
+    def _answer(self, name: str, sample: Sample) -> Answer:
+        try:
+            message = wire.Request.FromString(sample.payload)
+        except DecodeError as fault:
+            raise BusError(f"{name} was answered with what is no lowfc.v1.Request: {fault}") from None
+        if not message.accepted:
+            raise RequestRefusedError(f"{name} refused: {message.reply} (run {self.run_id})")
+        state = message.state if message.HasField("state") else None
+        return Answer(True, message.reply, message.frame_sequence, message.text, state, self.run_id)
+
     def _stream(
         self, topic: Topic, decode: Callable[[Sample], T | None], what: str, count: int | None, patience_s: float
     ) -> Stream[T]:
@@ -406,14 +420,3 @@ class Client:
 
 
 _COMMANDS = {Role.CONTROLLER: "lowfc controller", Role.RECORDER: "lowfc record", Role.CAMERA: "sim-camera"}
-
-
-def _answer(name: str, sample: Sample) -> Answer:
-    try:
-        message = wire.Request.FromString(sample.payload)
-    except DecodeError as fault:
-        raise BusError(f"{name} was answered with what is no lowfc.v1.Request: {fault}") from None
-    if not message.accepted:
-        raise RequestRefusedError(f"{name} refused: {message.reply}")
-    state = message.state if message.HasField("state") else None
-    return Answer(True, message.reply, message.frame_sequence, message.text, state)

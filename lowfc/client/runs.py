@@ -1,5 +1,6 @@
 """Which runs there are on this host."""
 
+from lowfc.adapters.other_loops import none_here
 from lowfc.adapters.run import open_run, runtime_base
 from lowfc.contract.errors import BusError, DataFileError
 from lowfc.contract.messages import Role
@@ -7,30 +8,31 @@ from lowfc.contract.messages import Role
 
 def running() -> list[str]:
     """Names of the runs on this host whose controller listens; a run that was killed leaves its directory behind."""
-    return [name for name, roles in _living().items() if Role.CONTROLLER in roles]
+    return [name for name, roles in living().items() if Role.CONTROLLER in roles]
 
 
 def the_run(name: str | None) -> str:
-    """The run of that name, whoever of it is there, or the only one there is.
-
-    That is the only one with a controller; without any, the only one of which at least somebody is there.
+    """The run of that name or of the one name that begins so, or the only one there is, whoever of it is there.
 
     Raises:
         BusError: there is no such run, none at all, or more than one to choose from.
     """
-    living = _living(name)
-    if name is not None and name in living:
+    runs = living(name)
+    if name in runs:
         return name
-    runs = [run for run, roles in living.items() if Role.CONTROLLER in roles] or list(living)
-    if name is None and len(runs) == 1:
-        return runs[0]
-    there = f"there are {', '.join(living)}" if living else "no loop is running on this host"
-    if name is not None:
-        raise BusError(f"there is no run {name!r}: {there}")
-    raise BusError(f"say which run with --run: {there}" if living else there)
+    found = [run for run in runs if run.startswith(name or "")]
+    if len(found) == 1:
+        return found[0]
+    if not runs:
+        raise BusError(none_here() if name is None else f"there is no run {name!r}: {none_here()}")
+    if name is None:
+        raise BusError(f"choose a run with --run, the beginning of its name is enough: there are {_listed(runs)}")
+    if found:
+        raise BusError(f"{name!r} is the beginning of several runs: {', '.join(found)}")
+    raise BusError(f"there is no run {name!r}: there are {_listed(runs)}")
 
 
-def _living(wanted: str | None = None) -> dict[str, set[str]]:
+def living(wanted: str | None = None) -> dict[str, set[str]]:
     """Runs of which somebody listens, and who; a damaged one is left out, unless it is the one that is wanted.
 
     Raises:
@@ -47,3 +49,10 @@ def _living(wanted: str | None = None) -> dict[str, set[str]]:
         if roles:
             found[name] = roles
     return found
+
+
+def _listed(runs: dict[str, set[str]]) -> str:
+    """Names of runs, those without a controller marked: they may still be starting."""
+    return ", ".join(
+        name if Role.CONTROLLER in roles else f"{name} (no controller yet)" for name, roles in runs.items()
+    )

@@ -33,6 +33,11 @@ class Frame(NamedTuple):
     time_ns: int
     pixels: npt.NDArray[np.uint16]
 
+    @property
+    def number(self) -> int:
+        """Number of the frame within its camera's start, as `lowfc ctl` and the views show it."""
+        return count_of(self.sequence)
+
 
 class Stream(Generic[T]):
     """Messages of one topic as they come, from the moment it is made; it is there once the first one has come."""

@@ -55,7 +55,7 @@ class Control(Section):
     """The control law."""
 
     start_mode: Literal["open", "closed"] = "open"
-    """Loop mode once a calibration is loaded; sim-loop takes closed where the file says nothing."""
+    """Loop mode once a calibration is loaded; sim-loop starts closed where the file is silent."""
     delay_frames: float = Field(0.0, ge=0, le=10)
     """Frames from the one a command is made from to the first exposed wholly under it, as measured; 0 takes the
     camera's. Twice the delay halves the highest stable gain."""

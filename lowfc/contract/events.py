@@ -2,9 +2,11 @@
 
 from dataclasses import dataclass
 from enum import IntEnum
+from numbers import Integral
 
 from lowfc.contract.messages import Log, timestamp
 from lowfc.contract.printable import printable
+from lowfc.control.wording import counted
 
 
 class Level(IntEnum):
@@ -15,6 +17,13 @@ class Level(IntEnum):
     WARNING = 3
     ERROR = 4
     FATAL = 5
+
+
+class _Number(int):
+    """A number that can be formatted with its noun: "{count:frame}" is 1 frame or 2 frames."""
+
+    def __format__(self, noun: str) -> str:
+        return counted(self, noun) if noun.isalpha() and len(noun) > 1 else super().__format__(noun)
 
 
 @dataclass(frozen=True, slots=True)
@@ -30,6 +39,7 @@ class Event:
 
         Control characters in the details are shown as escapes: the message is one line for a terminal.
         """
+        details = {name: _Number(one) if isinstance(one, Integral) else one for name, one in details.items()}
         return Log(
             timestamp=timestamp(time_ns),
             level=self.level.value,  # type: ignore[arg-type]  # the schema's enum is a plain int at run time
@@ -49,16 +59,16 @@ EVENTS: dict[str, Event] = {
             "this boot's clock is {ahead_ms:+.0f} ms from the wall clock, and so are all times; see `lowfc doctor`",
         ),
         Event("REALTIME_REFUSED", Level.WARNING, "the host refused {measure}: {cost}"),
-        Event("CALIBRATION_LOADED", Level.INFO, "calibration {id}: {modes} modes, {estimator}, from {source}"),
+        Event("CALIBRATION_LOADED", Level.INFO, "calibration {id}: {modes:mode}, {estimator}, from {source}"),
         Event("NOT_CALIBRATED", Level.WARNING, "the loop is idle: {why}"),
         Event("CAMERA_CHANGED", Level.WARNING, "the camera does not fit the calibration: {what}"),
         Event("MODE_CHANGED", Level.INFO, "loop {before} -> {after}: {why}"),
-        Event("SAFED", Level.ERROR, "safed: {why}; `lowfc ctl clear` when it is safe"),
+        Event("SAFED", Level.ERROR, "loop in safe mode: {why}; `lowfc ctl clear` when it is safe"),
         Event("FRAMES_REFUSED", Level.WARNING, "frames refused: {reason}"),
-        Event("FRAMES_ACCEPTED", Level.INFO, "frames accepted again after {refused} refused: {reason}"),
+        Event("FRAMES_ACCEPTED", Level.INFO, "frames accepted again after {refused:frame} refused: {reason}"),
         Event("NO_FRAMES", Level.WARNING, "no frame for {silent_ms:.0f} ms; {action}"),
         Event("FRAMES_BACK", Level.INFO, "frames are back after {silent_ms:.0f} ms"),
-        Event("FRAMES_MISSING", Level.WARNING, "{count} frames missing or skipped before frame {number}"),
+        Event("FRAMES_MISSING", Level.WARNING, "{count:frame} missing or skipped before frame {number}"),
         Event("CAMERA_RESTARTED", Level.WARNING, "the camera restarted"),
         Event("MIRROR_ADOPTED", Level.INFO, "starting from the mirror's command, {rms_nm:.1f} nm rms of wavefront"),
         Event(
@@ -101,9 +111,9 @@ EVENTS: dict[str, Event] = {
         Event("COMMANDS_IN_TIME", Level.INFO, "commands are in time again: {percent:.0f} % late"),
         Event("RECORDING", Level.INFO, "recording"),
         Event("RECORDING_STOPPED", Level.INFO, "recording stopped: {why}"),
-        Event("MESSAGES_LOST", Level.ERROR, "{count} messages lost on {topic}"),
+        Event("MESSAGES_LOST", Level.ERROR, "{count:message} lost on {topic}"),
         Event("RECORDING_FAILED", Level.ERROR, "recording stopped: {why}"),
-        Event("DISK_SLOW", Level.WARNING, "the disk took {stall_s:.1f} s for one write; {waiting} messages waited"),
+        Event("DISK_SLOW", Level.WARNING, "the disk took {stall_s:.1f} s for one write; {waiting:message} waited"),
         Event("VIEW_STUCK", Level.WARNING, "the viewer took nothing for {stuck_s:.0f} s; close its window if it hangs"),
         Event("VIEW_RENEWED", Level.WARNING, "the view began anew: {why}"),
         Event("BAD_MESSAGE", Level.WARNING, "{count} on {topic} could not be read, the last because: {why}"),

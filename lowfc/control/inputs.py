@@ -114,6 +114,11 @@ class Step(NamedTuple):
     flux_dn: float = 0.0
     saturated_pixels: int = 0
 
+    @property
+    def frame(self) -> int:
+        """Number of its frame within its camera's start, as `lowfc ctl` and the views show it."""
+        return self.frame_sequence & 0xFFFF_FFFF
+
 
 class Command(NamedTuple):
     """Where the mirror shall be: (rows, columns) float32, nm of surface.

@@ -199,4 +199,4 @@ def in_mode(state: State, mode: LoopMode, time_ns: int, cause: str) -> State:
 
 def mode_event(before: LoopMode, after: LoopMode, why: str) -> Raised:
     """The event of a loop mode that changed."""
-    return Raised("MODE_CHANGED", {"before": before.name.lower(), "after": after.name.lower(), "why": why})
+    return Raised("MODE_CHANGED", {"before": before.in_words, "after": after.in_words, "why": why})

@@ -17,10 +17,12 @@ from lowfc.control.lease import ENDED_BY
 from lowfc.control.linear_law import LinearLaw
 from lowfc.control.loading import in_mode, loaded, misfit, mode_event, uncalibrated
 from lowfc.control.margins import check_stable
+from lowfc.control.remarks import check_offset, remark
 from lowfc.control.reservation import lease, lease_checked, lease_ended, release, renew
 from lowfc.control.safety import Limits, LoopMode, neighbour_difference_nm, request_mode
-from lowfc.control.stability import limiting_gain
+from lowfc.control.stability import highest_gain, limiting_gain
 from lowfc.control.state import Drive, Following, Settings, State
+from lowfc.control.wording import counted
 
 Single = npt.NDArray[np.float32]
 
@@ -31,6 +33,8 @@ MOST_TEXT = 10_000
 """Characters of a note."""
 MOST_REPLY = 1000
 """Characters of a reply."""
+PAUSED = "operator asked to pause"
+"""Cause of the open mode of a loop that is paused."""
 REFUSED_IN_A_ROW = 3
 """Frames refused in a row from which on the loop is not closed; fewer may be a hiccup."""
 
@@ -81,6 +85,8 @@ def prepared(settings: Settings, request: Request) -> Request:
     try:
         if request.law is not None:
             check_law(request.law, settings.delay_frames, settings.rate_hz)
+        if request.name == "gain":
+            highest_gain(settings.delay_frames)  # which the reply needs, and no frame shall wait for
         if request.name == "play":
             request = replace(request, played=play_table(request.text, request.table, request.actuators_nm.reshape(-1)))
     except ValueError as error:
@@ -101,7 +107,7 @@ Handler = Callable[[Settings, State, Request], Handled]
 
 
 def _status(settings: Settings, state: State, request: Request) -> Handled:
-    return state, state.mode.name.lower()
+    return state, state.mode.in_words
 
 
 def _mode(settings: Settings, state: State, request: Request) -> Handled:
@@ -116,7 +122,21 @@ def _mode(settings: Settings, state: State, request: Request) -> Handled:
     if request.name == "clear":  # the camera's and the mirror's numbers may begin anew, too
         conditions = state.conditions._replace(clear_id=request.time_ns)
         state = state._replace(frame_sequence=0, conditions=conditions)
-    return in_mode(state, after, request.time_ns, _asked(request)), f"loop {after.name.lower()}"
+    reply, paused = _REPLIES[request.name], state.conditions.mode_cause == PAUSED
+    if request.name == "pause" and state.mode is LoopMode.OPEN and not paused:
+        reply = "the loop is open already, and holds the command"
+    if request.name == "open" and paused:
+        state = state._replace(conditions=state.conditions._replace(mode_cause=_asked(request)))
+    return in_mode(state, after, request.time_ns, _asked(request)), reply
+
+
+_REPLIES = {
+    "open": "loop open",
+    "pause": "loop paused: the command is held until `lowfc ctl close`",
+    "close": "loop closed",
+    "safe": "loop in safe mode",
+    "clear": "loop open",
+}
 
 
 def _check_closable(state: State) -> None:
@@ -149,13 +169,13 @@ def _step(settings: Settings, state: State, request: Request) -> Handled:
         raise ValueError(missing or refusal)
     _check_closable(state)
     state = in_mode(state, after, request.time_ns, _asked(request))
-    return state._replace(steps_left=int(frames)), f"loop closed for {frames:g} frames"
+    return state._replace(steps_left=int(frames)), f"loop closed for {counted(int(frames), 'frame')}"
 
 
 def _reset(settings: Settings, state: State, request: Request) -> Handled:
     drive = _drive(state)
     if state.mode is LoopMode.SAFED:
-        raise ValueError("the loop is safed: the mirror is on its way to flat, or there")
+        raise ValueError("the loop is in safe mode: the mirror is on its way to flat, or there")
     if drive.following is not None:
         drive = drive._replace(following=Following.at_rest(drive.following.law))
     return state._replace(drive=drive, homing=True), "the modal command goes to zero"
@@ -172,7 +192,9 @@ def _law_of_modes(settings: Settings, state: State, request: Request) -> Handled
     law = _changed(drive.law, drive.calibration.noll, settings.delay_frames, request)
     attribute = _ATTRIBUTES[request.name]
     values = " ".join(f"{value:g}" for value in getattr(law, attribute).tolist())
-    return state._replace(drive=drive._replace(law=law)), f"{request.name} is now {values}"
+    return state._replace(
+        drive=drive._replace(law=law)
+    ), f"{request.name} is now {values}{remark(settings, drive, request)}"
 
 
 def _offset(settings: Settings, state: State, request: Request) -> Handled:
@@ -180,8 +202,7 @@ def _offset(settings: Settings, state: State, request: Request) -> Handled:
     added = drive.added()
     asked = request if request.values else replace(request, values=(0.0,))
     values = _per_mode(drive.calibration.noll, asked, added.offset_nm)
-    if (np.abs(values) > drive.law.limit_nm).any():
-        raise ValueError(f"an offset may be as large as the mode's limit, {drive.law.limit_nm.tolist()} nm")
+    check_offset(drive, np.abs(values))
     text = " ".join(f"{value:g}" for value in values.tolist())
     return _with(state, drive, added._replace(offset_nm=values)), f"offset is now {text} nm"
 
@@ -189,7 +210,7 @@ def _offset(settings: Settings, state: State, request: Request) -> Handled:
 def _channel(settings: Settings, state: State, request: Request) -> Handled:
     drive = _mirror(state)
     if state.mode is LoopMode.SAFED and request.text != FLAT:
-        raise ValueError("the loop is safed: `lowfc ctl clear` first, when it is safe")
+        raise ValueError("the loop is in safe mode: `lowfc ctl clear` first, when it is safe")
     grid = drive.calibration.grid
     wanted_nm = np.zeros(grid, np.float32)
     if request.actuators_nm.size:
@@ -198,6 +219,9 @@ def _channel(settings: Settings, state: State, request: Request) -> Handled:
         wanted_nm = request.actuators_nm.reshape(grid)
     _check_shape(settings.limits, wanted_nm)
     added = drive.added().with_channel(request.text, wanted_nm, drive.to_modes)
+    if not request.actuators_nm.size and drive.added().channel(request.text) is None:
+        names = ", ".join(one.name for one in drive.added().channels)
+        return state, f"there is no channel {request.text!r} to remove; there are {names or 'none'}"
     _check_shape(settings.limits, sum((one.wanted_nm for one in added.channels), np.zeros(grid, np.float32)))
     rms_nm = float(np.sqrt(np.mean(np.square(wanted_nm, dtype=np.float64))))
     return _with(state, drive, added), f"channel {request.text}: {rms_nm:.3g} nm rms of surface"
@@ -227,11 +251,10 @@ def _play(settings: Settings, state: State, request: Request) -> Handled:
         modes = len(drive.calibration.noll)
         if len(table.largest) != modes:
             raise ValueError(f"a play on the offset has {modes} columns, one for each mode; got {len(table.largest)}")
-        if (table.largest > drive.law.limit_nm).any():
-            raise ValueError(f"an offset may be as large as the mode's limit, {drive.law.limit_nm.tolist()} nm")
+        check_offset(drive, table.largest)
     frames = len(table.rows)
     made = Play(table, state.frame_sequence + 1, frames)
-    return _with(state, drive, added._replace(play=made)), f"playing {frames} frames on the {table.target}"
+    return _with(state, drive, added._replace(play=made)), f"playing {counted(frames, 'frame')} on the {table.target}"
 
 
 def _stop(settings: Settings, state: State, request: Request) -> Handled:

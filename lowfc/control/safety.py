@@ -11,6 +11,8 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
+from lowfc.control.wording import mode_word
+
 Actuators = npt.NDArray[np.float32]
 
 MARGIN_NM = 1e-3
@@ -24,6 +26,11 @@ class LoopMode(IntEnum):
     OPEN = 2
     CLOSED = 3
     SAFED = 4
+
+    @property
+    def in_words(self) -> str:
+        """As people read it."""
+        return mode_word(self.name.lower())
 
 
 class Reason(IntEnum):
@@ -174,9 +181,9 @@ def request_mode(mode: LoopMode, request: str, calibrated: bool) -> tuple[LoopMo
         case "clear" if mode is LoopMode.SAFED:
             return (LoopMode.OPEN if calibrated else LoopMode.IDLE), ""
         case "clear":
-            return mode, f"the loop is {mode.name.lower()}, not safed: there is nothing to clear"
+            return mode, f"the loop is {mode.in_words}, not in safe mode: there is nothing to clear"
         case "open" | "close" if mode is LoopMode.SAFED:
-            return mode, "the loop is safed: `lowfc ctl clear` first, when it is safe"
+            return mode, "the loop is in safe mode: `lowfc ctl clear` first, when it is safe"
         case "open" if not calibrated:
             return LoopMode.IDLE, ""
         case "close" if not calibrated:

@@ -4,11 +4,17 @@ The loop of `lowfc.control.law`: command[k+1] = (1 - leak) command[k] - gain err
 error[k] = disturbance[k] + sum_j w_j command[k - j] + noise[k], with w from the delay in frames.
 """
 
+from functools import lru_cache
+
 import numpy as np
 import numpy.typing as npt
 
 Array = npt.NDArray[np.float64]
 
+LEAST_GAIN_MARGIN = 1.8
+LEAST_PHASE_MARGIN_DEG = 45.0
+LOWEST_GAIN = 0.01
+"""Of a mode whose drift is below the noise of a log: it shall follow nevertheless."""
 SETTLING = 5.0
 """Time constants of the slowest mode after which a loop counts as settled."""
 
@@ -85,3 +91,13 @@ def limiting_gain(delay_frames: float, leak: float = 0.0) -> float:
         low, high = np.where(below, middle, low), np.where(below, high, middle)
     real = per_gain(np.append(high, np.pi)).real
     return float(np.min(-1 / real[real < 0]))
+
+
+@lru_cache(maxsize=64)
+def highest_gain(delay_frames: float, leak: float = 0.0) -> float:
+    """The integrator gain at which either margin is the least that is allowed."""
+    omega = np.linspace(1e-4, np.pi, 1 << 14)
+    loop = open_loop(omega, 1.0, leak, delay_frames)
+    late = np.unwrap(np.angle(loop)) < -np.radians(180 - LEAST_PHASE_MARGIN_DEG)
+    by_phase = 1 / np.abs(loop[np.argmax(late)]) if late.any() else np.inf
+    return float(min(limiting_gain(delay_frames, leak) / LEAST_GAIN_MARGIN, by_phase))

@@ -17,16 +17,17 @@ from lowfc.control.kalman import lqg_block
 from lowfc.control.linear_law import Block, LinearLaw, integrator_block, of_blocks
 from lowfc.control.pi_notch import Notch, pi_notch
 from lowfc.control.spectra import Pieces, Spectrum, floor_nm2_hz, spectrum
-from lowfc.control.stability import delay_weights
+from lowfc.control.stability import (
+    LEAST_GAIN_MARGIN,
+    LEAST_PHASE_MARGIN_DEG,
+    LOWEST_GAIN,
+    delay_weights,
+    highest_gain,
+)
 from lowfc.control.vibration import FEWEST, Model, identify, resolution_hz
 
 Array = npt.NDArray[np.float64]
 Single = npt.NDArray[np.float32]
-
-LEAST_GAIN_MARGIN = 1.8
-LEAST_PHASE_MARGIN_DEG = 45.0
-LOWEST_GAIN = 0.01
-"""Of a mode whose drift is below the noise of a log: it shall follow nevertheless."""
 
 _NARROWER = (0.1, 0.01, 1e-3)  # what a line's width is tried at, of that fitted, where a log cannot resolve it
 _FASTER = (10.0,)  # and where lines move
@@ -60,15 +61,6 @@ class Gains:
     gain: Array
     predicted_nm: Array
     noise_nm: Array
-
-
-def highest_gain(delay_frames: float, leak: float = 0.0) -> float:
-    """The integrator gain at which either margin is the least that is allowed."""
-    omega = np.linspace(1e-4, np.pi, 1 << 14)
-    loop = stability.open_loop(omega, 1.0, leak, delay_frames)
-    late = np.unwrap(np.angle(loop)) < -np.radians(180 - LEAST_PHASE_MARGIN_DEG)
-    by_phase = 1 / np.abs(loop[np.argmax(late)]) if late.any() else np.inf
-    return float(min(stability.limiting_gain(delay_frames, leak) / LEAST_GAIN_MARGIN, by_phase))
 
 
 def best_gains(run: Pieces, rate_hz: float, delay_frames: float, leak: Array) -> Gains:

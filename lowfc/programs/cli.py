@@ -10,7 +10,7 @@ from typing import Annotated, Any
 import typer
 
 from lowfc import __version__
-from lowfc.adapters.terminal import DEFAULT_RUN, ConfigFile, Json, RunId, configuration, new_app, run_app
+from lowfc.adapters.terminal import DEFAULT_RUN, AnyRun, ConfigFile, Json, RunId, configuration, new_app, run_app
 from lowfc.contract.configuration import Preset
 from lowfc.contract.errors import ConfigurationError
 from lowfc.programs.acceptance.command import acceptance_app
@@ -31,6 +31,7 @@ from lowfc.programs.log.recover import recover
 from lowfc.programs.output import put
 from lowfc.programs.replay.command import replay_log
 from lowfc.programs.report.command import report
+from lowfc.programs.runs import runs
 from lowfc.programs.soak.command import soak
 from lowfc.programs.tune.command import tune
 from lowfc.programs.validate.commands import validate
@@ -63,6 +64,7 @@ app.command()(soak)
 app.command()(certs)
 app.command()(router)
 app.command()(hosts)
+app.command()(runs)
 app.command()(view)
 
 
@@ -96,6 +98,7 @@ def sim_loop(
     open_loop: Annotated[bool, typer.Option("--open", help="Start with the loop open.")] = False,
     view_: Annotated[bool, typer.Option("--view", help="Look at it in a window.")] = False,
     web: Annotated[bool, typer.Option("--web", help="Look at it in a browser.")] = False,
+    name: Annotated[str | None, typer.Option("--run", help="Name of the run; default: a new one.")] = None,
     as_json: Json = False,
 ) -> None:
     """Start the simulated loop: camera, mirror, controller and recorder; show its status, end with a summary.
@@ -120,12 +123,15 @@ def sim_loop(
     }
     settings = configuration(config, overrides, {"control.start_mode": "closed", **spread(os.sched_getaffinity(0))})
     check_files(settings)
+    if settings.control.start_mode == "open":
+        chosen = "--open" if open_loop else f"control.start_mode of {config}"
+        _print(f"the loop starts open ({chosen}): `lowfc ctl close` closes it", error=True)
     if view_ and web:
         raise ConfigurationError("a view is in one place: choose --view or --web")
     if has_screen() and not (view_ or web):
         _print("to look at it: lowfc view", error=True)
     show = Show.NATIVE if view_ else Show.WEB if web else None
-    figures = run(settings, duration, not no_record, show)
+    figures = run(settings, duration, not no_record, show, name)
     put(figures, summary_text(figures), as_json=as_json)
     if figures["recording_failure"]:
         raise typer.Exit(1)
@@ -212,13 +218,12 @@ def record(
     settings = configuration(config, overrides)
     log = settings.recorder
     joined = open_run(run, (settings.mirror.name,), network=settings.network)
-    if config is None:
-        config = joined.path / "config.toml"
-        write_whole(config, settings.to_toml().encode())
+    complete = joined.path / "config.toml"  # a file may name only what was chosen; the log names every value
+    write_whole(complete, settings.to_toml().encode())
     done = run_recorder(
         joined,
         Path(log.folder),
-        configuration=config,
+        configuration=complete,
         calibration=calibration,
         seed=settings.seed,
         limits=Limits(round(log.largest_mb * 1e6), log.longest_s, round(log.min_free_mb * 1e6), int(log.file_mode, 8)),
@@ -236,7 +241,7 @@ def record(
 
 @config_app.command("show")
 def config_show(config: ConfigFile = None) -> None:
-    """Print every key with its value and its sentence, as TOML that can be used.
+    """Print every key with its value and its sentence, as TOML; keys that nobody chose are commented out.
 
     Example: lowfc config show > lowfc.toml
     """
@@ -260,7 +265,7 @@ def config_check(config: Annotated[Path, typer.Argument(help="Configuration file
 @config_app.command("zenoh")
 def config_zenoh(
     role: Annotated[str, typer.Option(help="Role of your program, such as camera.")],
-    run: RunId = DEFAULT_RUN,
+    run: AnyRun = None,
     make: Annotated[bool, typer.Option("--make", help="Make the run, if it is not there.")] = False,
 ) -> None:
     """Print the zenoh configuration for a program of your own that plays a role in a run.

@@ -46,7 +46,7 @@ from lowfc.control.loop import advance
 from lowfc.control.requests import CONFIGURATION, MOST_REPLY, prepared
 from lowfc.control.safety import LoopMode
 from lowfc.control.state import State
-from lowfc.programs.controller_report import Arrays, NotClosed, Offload, StageTiming
+from lowfc.programs.controller_report import Arrays, LastSecond, NotClosed, Offload, StageTiming
 from lowfc.programs.rehearsal import Rehearsal
 from lowfc.programs.start_up import StartUp
 
@@ -109,6 +109,7 @@ class Controller:
         self._arrays = Arrays(*(service.publisher(topic) for topic in (CALIBRATION, LAW, PLAY)))
         self._offload = Offload(service.publisher(OFFLOAD), round(1e9 / float(OFFLOAD.rate) / config.period_ns))
         self._not_closed = NotClosed()
+        self._last_second = LastSecond(config.period_ns)
         self._queries: deque[Query] = deque()
         service.bus.queryable(REQUEST_KEY.format(name=ALL), self._ask)
         self._frame_to_command = Durations()
@@ -118,6 +119,7 @@ class Controller:
         if calibration is not None:
             self._arrays.publish(Request(now_ns, "load", calibration=calibration))
             self._take(Load(now_ns, calibration, source))
+        service.awaited = lambda: "" if self._state.frame_sequence else "a camera"
         service.state = "ready"
 
     def run(self) -> None:
@@ -157,6 +159,7 @@ class Controller:
         health.counts.extend(reason_counts(self._state))
         now_ns = self._service.clock.now_ns()
         health.not_closed_ns, health.not_closed_cause = self._not_closed.note(self._state, now_ns)
+        health.last_second.CopyFrom(self._last_second.figures(self._state, self._service.clock.host_ns()))
         if self._frame_to_command.count:
             health.frame_to_command.CopyFrom(codec.latency(self._frame_to_command))
 
@@ -371,6 +374,7 @@ class Controller:
         """Publish the step and the events, and the state where more of it changed than the next frame shows."""
         if outputs.step is not None:
             self._steps.put(codec.encode_step(outputs.step, self._state.taken))
+            self._last_second.add(outputs.step, self._service.clock.host_ns())
             if self._state.drive is not None and self._state.drive.calibration.noll:
                 self._offload.add(outputs.step, self._state.drive.calibration.noll)
         for event in outputs.events:

@@ -14,6 +14,7 @@ from lowfc.control.safety import LoopMode
 from lowfc.control.state import State
 
 TIMING_PERIOD_NS = 100_000_000
+SECOND_NS = 1_000_000_000
 
 
 class StageTiming:
@@ -64,6 +65,30 @@ class Offload:
         if self._count >= self._frames:
             self._publisher.put(codec.encode_offload(step, noll, self._sum_nm / self._count, self._count))
             self._sum_nm[:] = self._count = 0
+
+
+class LastSecond:
+    """Modal error and light of the frames used in the last second."""
+
+    def __init__(self, period_ns: int) -> None:
+        self._rows = np.zeros((max(1, SECOND_NS // period_ns + 1), 3))
+        self._count = 0
+
+    def add(self, step: Step, now_ns: int) -> None:
+        """Add a step; one whose frame was refused measured nothing."""
+        if step.error_nm is not None:
+            self._rows[self._count % len(self._rows)] = now_ns, step.error_nm @ step.error_nm, step.flux_dn
+            self._count += 1
+
+    def figures(self, state: State, now_ns: int) -> wire.LoopFigures:
+        """Figures of the last second; without a frame all are zero."""
+        rows = self._rows[: self._count]
+        rows = rows[rows[:, 0] > now_ns - SECOND_NS]
+        if state.drive is None or not len(rows):
+            return wire.LoopFigures()
+        _, square_nm2, flux_dn = rows.mean(axis=0).tolist()
+        fraction = flux_dn / state.drive.calibration.flux_dn
+        return wire.LoopFigures(frames=len(rows), residual_rms_nm=square_nm2**0.5, flux_fraction=fraction)
 
 
 class Arrays:

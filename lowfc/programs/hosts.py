@@ -13,7 +13,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from lowfc.adapters.terminal import DEFAULT_RUN, ConfigFile, Json, RunId, configuration
+from lowfc.adapters.extras import install_advice
+from lowfc.adapters.terminal import DEFAULT_RUN, AnyRun, ConfigFile, Json, RunId, configuration
 from lowfc.contract.errors import BusError, ConfigurationError
 from lowfc.programs.output import put
 
@@ -53,7 +54,7 @@ def certs(
     except ImportError as fault:
         raise ConfigurationError(
             f"certificates are made with the package cryptography, which is missing here ({fault}): "
-            "pip install 'lowfc[deploy]'"
+            f"{install_advice('deploy')}"
         ) from None
     wanted = (ROUTER, *roles(map(mirror_role, mirror or ["dm"])))
     made = make_certificates(folder, wanted, router or [], days, renew=renew)
@@ -98,9 +99,7 @@ def router(
     service.catch_signals()
     with closing(service.bus):
         service.state = "running"
-        sys.stderr.write(
-            f"routing run {run!r} at {settings.network.listen or settings.network.router}; Ctrl-C ends it\n"
-        )
+        sys.stderr.write(f"routing at {settings.network.listen or settings.network.router}; Ctrl-C ends it\n")
         while service.running:
             service.beat()
             time.sleep(_TURN_S)
@@ -109,7 +108,7 @@ def router(
 
 def hosts(
     config: ConfigFile = None,
-    run: RunId = DEFAULT_RUN,
+    run: AnyRun = None,
     as_json: Json = False,
 ) -> None:
     """Say which processes are in a run, and how far the clocks of their machines are from the router's.
@@ -124,9 +123,14 @@ def hosts(
     from lowfc.adapters.routed import ending_certificates
     from lowfc.adapters.run import open_run
     from lowfc.adapters.zenoh_bus import ZenohBus
+    from lowfc.client import running
     from lowfc.contract.messages import HEALTH, Role, wire
+    from lowfc.programs.ctl.which_run import the_known_run
 
     settings = configuration(config)
+    if not settings.network.router or (run is None and running()):
+        run = the_known_run(run)
+    run = run or DEFAULT_RUN  # by a router there is a run, though nobody of it be on this host
     heard: dict[str, wire.Health] = {}
     names = Names()
 

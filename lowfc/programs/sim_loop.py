@@ -20,7 +20,7 @@ from lowfc.adapters.run import Run, free_ports, mirror_role, new_run_id, open_ru
 from lowfc.adapters.terminal import INTERRUPTED
 from lowfc.adapters.zenoh_bus import ZenohBus
 from lowfc.contract.configuration import Configuration
-from lowfc.contract.errors import LowfcError
+from lowfc.contract.errors import BusError, LowfcError
 from lowfc.contract.messages import EVENT, HEALTH, Role
 from lowfc.programs.analytic import analytic
 from lowfc.programs.processes import program, start_all, stop_all
@@ -40,7 +40,9 @@ class ProcessDiedError(LowfcError):
     exit_status = 1
 
 
-def sim_loop(config: Configuration, duration_s: float | None, record: bool, show: Show | None = None) -> dict[str, Any]:
+def sim_loop(
+    config: Configuration, duration_s: float | None, record: bool, show: Show | None = None, name: str | None = None
+) -> dict[str, Any]:
     """Run the simulated loop for a time; return the summary that `--json` prints.
 
     Args:
@@ -48,32 +50,51 @@ def sim_loop(config: Configuration, duration_s: float | None, record: bool, show
         duration_s: for so long; None until Ctrl-C.
         record: write a log.
         show: look at it, in a window or a browser; the loop goes on where the view ends.
+        name: of the run; a new one when None.
 
     Raises:
+        BusError: a run of that name is there already.
         ViewerError: there is no screen for the window.
         ProcessDiedError: a process ended by itself; the text names it and has its last words.
     """
     console = Console(stderr=True)
     require_screen(show)
-    run = open_run(new_run_id(), (config.mirror.name,), listeners=(Role.LAUNCHER,))
+    run = _new_run(config, name)
+    console.print(f"run {run.run_id}", highlight=False)
+    watch = Watch({}, [])
+    children: list[Child] = []
+    bus = ZenohBus(run.links, Role.LAUNCHER, HostClock())  # it listens: from now on others see that a loop is starting
     try:
+        bus.subscribe(HEALTH, watch.hear)
+        bus.subscribe(EVENT, watch.note)
         prepare(config, run, console)
-        children = children_of(config, run, duration_s, record)
+        children += children_of(config, run, duration_s, record)
         if show is not None:
             children.insert(len(children) - record, _view(run, show, console))  # the recorder ends last
-        watch = Watch({}, [])
         start_all(children)
-        bus = ZenohBus(run.links, Role.LAUNCHER, HostClock())
-        try:
-            bus.subscribe(HEALTH, watch.hear)
-            bus.subscribe(EVENT, watch.note)
-            _supervise(config, children, watch, console, duration_s)
-        finally:
-            bus.close()
-            stop_all(children)
-        return summary(watch, record)
+        _supervise(config, children, watch, console, duration_s)
     finally:
+        bus.close()
+        stop_all(children)
         run.remove()
+    return {"run": run.run_id} | summary(watch, record)
+
+
+def _new_run(config: Configuration, name: str | None) -> Run:
+    """A run for this launcher alone; what a launcher that was killed has left of it is used again.
+
+    Raises:
+        BusError: a process of that run is there, or it was made by processes that were started by hand.
+    """
+    run = open_run(name or new_run_id(), (config.mirror.name,), listeners=(Role.LAUNCHER,))
+    if living := run.links.live():
+        raise BusError(f"run {run.run_id!r} is running already ({', '.join(sorted(living))}): choose another name")
+    if Role.LAUNCHER not in run.links.ports:
+        raise BusError(
+            f"run {run.run_id!r} was made by processes that were started by hand: choose another name, or remove its "
+            f"directory, {run.path}"
+        )
+    return run
 
 
 def prepare(config: Configuration, run: Run, console: Console) -> None:

@@ -12,8 +12,8 @@ from lowfc.contract.configuration import Configuration
 from lowfc.contract.events import Level
 from lowfc.contract.messages import COMMAND, FRAME, Role, wire
 from lowfc.contract.printable import printable
-from lowfc.control.safety import LoopMode
-from lowfc.programs.watch import Watch, topic_count
+from lowfc.control.wording import counted, mode_word
+from lowfc.programs.watch import Watch, mode_name, topic_count
 
 _EVENTS_SHOWN = 4
 _STYLES = {Level.WARNING: "yellow", Level.ERROR: "red", Level.FATAL: "bold red"}
@@ -23,21 +23,17 @@ def screen(watch: Watch, config: Configuration, duration_s: float | None, elapse
     """The live status of a loop."""
     camera, controller = watch.of(Role.CAMERA), watch.of(Role.CONTROLLER)
     mirror, recorder = watch.of(mirror_role(config.mirror.name)), watch.of(Role.RECORDER)
-    frames, wavefront = topic_count(controller, FRAME.key), camera.wavefront
+    frames = topic_count(controller, FRAME.key)
     commands = topic_count(mirror, COMMAND.at(config.mirror.name))
     table = Table.grid(padding=(0, 2))
     table.add_column(style="dim", justify="right")
     table.add_column()
     table.add_row("loop", f"{mode(controller)}, {camera.rate_hz:.0f} Hz of {config.camera.rate_hz:g} Hz")
-    table.add_row(
-        "wavefront",
-        f"{wavefront.residual_rms_nm:.2f} nm rms left of {wavefront.disturbance_rms_nm:.2f} nm; "
-        f"tilt {wavefront.tilt_residual_mas:.2f} mas of {wavefront.tilt_disturbance_mas:.2f} mas per axis",
-    )
+    table.add_row("wavefront", wavefront(camera))
     table.add_row("frame to command", latency(controller.frame_to_command))
     table.add_row("frame to mirror", latency(camera.frame_to_mirror))
     table.add_row("frames", f"{frames.received} received, {frames.skipped} skipped, {frames.missing} missing")
-    table.add_row("mirror", f"{mirror.state or 'not there yet'}, {commands.received} commands")
+    table.add_row("mirror", f"{mirror.state or 'not there yet'}, {counted(commands.received, 'command')}")
     table.add_row("recorder", recording(recorder))
     for log in watch.events[-_EVENTS_SHOWN:]:
         table.add_row(Text(printable(log.name)), Text(printable(log.message), style=_STYLES.get(Level(log.level), "")))
@@ -49,18 +45,31 @@ def screen(watch: Watch, config: Configuration, duration_s: float | None, elapse
 def status_line(watch: Watch, elapsed_s: float) -> str:
     """The same in one line, where there is no terminal."""
     camera, controller = watch.of(Role.CAMERA), watch.of(Role.CONTROLLER)
-    frames = topic_count(controller, FRAME.key)
+    if not camera.HasField("recent_wavefront"):
+        return f"{elapsed_s:5.0f} s  no frame yet"
+    frames, recent = topic_count(controller, FRAME.key), camera.recent_wavefront
     return (
         f"{elapsed_s:5.0f} s  {mode(controller)}  {camera.rate_hz:6.0f} Hz  "
-        f"residual {camera.wavefront.residual_rms_nm:.2f} of {camera.wavefront.disturbance_rms_nm:.2f} nm rms  "
+        f"residual {recent.residual_rms_nm:.2f} of {recent.disturbance_rms_nm:.2f} nm rms  "
         f"frame to command {latency(controller.frame_to_command)}  "
         f"skipped {frames.skipped} missing {frames.missing}  {recording(watch.of(Role.RECORDER))}"
     )
 
 
+def wavefront(camera: wire.Health) -> str:
+    """The true wavefront over the last seconds."""
+    if not camera.HasField("recent_wavefront"):
+        return "no frame yet"
+    recent = camera.recent_wavefront
+    return (
+        f"{recent.residual_rms_nm:.2f} nm rms left of {recent.disturbance_rms_nm:.2f} nm; "
+        f"tilt {recent.tilt_residual_mas:.2f} mas of {recent.tilt_disturbance_mas:.2f} mas per axis"
+    )
+
+
 def mode(controller: wire.Health) -> str:
     """Loop mode in words."""
-    return LoopMode(controller.mode).name.lower() if controller.mode else "starting"
+    return mode_word(mode_name(controller.mode) or "starting")
 
 
 def latency(durations: wire.Latency) -> str:
@@ -76,7 +85,21 @@ def recording(recorder: wire.Health) -> str:
     if not recorder.process:
         return "not recording"
     done = recorder.recording
-    return f"{done.messages} messages, {done.bytes / 1e6:.1f} MB, {done.lost} lost"
+    return f"{counted(done.messages, 'message')}, {done.bytes / 1e6:.1f} MB, {done.lost} lost"
+
+
+def _loop(figures: dict[str, Any]) -> str:
+    """Loop mode at the end, and for how long it was not closed."""
+    seconds, cause = f"{figures['not_closed_s']:.1f} s", figures["not_closed_cause"]
+    match figures["mode"]:
+        case None:
+            return "no controller reported"
+        case "closed":
+            return f"closed; before that not closed for {seconds}: {cause}" if figures["not_closed_s"] else "closed"
+        case "safed":
+            return f"{mode_word('safed')}, not closed for {seconds}: {cause}"
+        case mode:
+            return f"{mode} for {seconds}" + (f": {cause}" if cause else "")
 
 
 def summary_text(figures: dict[str, Any]) -> str:
@@ -86,9 +109,8 @@ def summary_text(figures: dict[str, Any]) -> str:
     def percentiles(values: dict[str, float]) -> str:
         return "   ".join(f"{name.replace('_', '.')} {value:.0f} us" for name, value in values.items())
 
-    not_closed = f"not closed for {figures['not_closed_s']:.1f} s: {figures['not_closed_cause']}"
     lines = [
-        f"loop               {not_closed if figures['not_closed_s'] else 'closed all the time'}",
+        f"loop               {_loop(figures)}",
         f"rate               {figures['rate_hz']:.1f} Hz",
         f"frames             {figures['frames_published']} published, {figures['frames_processed']} processed, "
         f"{figures['frames_skipped']} skipped, {figures['frames_missing']} missing",
@@ -102,7 +124,7 @@ def summary_text(figures: dict[str, Any]) -> str:
     ]
     if figures["log"]:
         lines.append(
-            f"log                {' '.join(figures['logs'])}: {figures['messages_recorded']} messages, "
+            f"log                {' '.join(figures['logs'])}: {counted(figures['messages_recorded'], 'message')}, "
             f"{figures['messages_lost']} lost"
         )
     lines += [f"lost               {count} of {topic}" for topic, count in figures["lost"].items()]

@@ -6,6 +6,7 @@ from typing import Any
 from lowfc.adapters.bus import Sample
 from lowfc.adapters.names import Names
 from lowfc.contract.messages import FRAME, Log, Role, wire
+from lowfc.control.safety import LoopMode
 
 
 @dataclass(slots=True)
@@ -44,6 +45,7 @@ def summary(watch: Watch, record: bool) -> dict[str, Any]:
         "frames_missing": frames.missing,
         "commands_applied": camera.frame_to_mirror.count,
         "commands_late": camera.commands_late,
+        "mode": mode_name(controller.mode),
         "not_closed_s": round(controller.not_closed_ns * 1e-9, 3),
         "not_closed_cause": controller.not_closed_cause,
         "messages_recorded": None,
@@ -74,6 +76,11 @@ def summary(watch: Watch, record: bool) -> dict[str, Any]:
             "logs": list(recording.files),
         }
     return figures
+
+
+def mode_name(mode: wire.LoopMode) -> str | None:
+    """Loop mode; None before a controller reported one."""
+    return LoopMode(mode).name.lower() if mode else None
 
 
 def topic_count(health: wire.Health, key: str) -> wire.TopicCount:

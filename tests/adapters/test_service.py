@@ -8,7 +8,7 @@ import pytest
 
 from lowfc import __version__
 from lowfc.adapters.realtime import Granted
-from lowfc.adapters.service import HEALTH_PERIOD_NS, Service
+from lowfc.adapters.service import HEALTH_PERIOD_NS, WAITING_NS, Service
 from lowfc.contract.messages import COMMAND, EVENT, FRAME, HEALTH, Log, from_timestamp, wire
 from lowfc.testing.clock import FakeClock
 from lowfc.testing.memory_bus import MemoryBus, MemoryHub
@@ -268,3 +268,23 @@ def test_a_second_interrupt_ends_the_process() -> None:
         assert process.stdout.readline() == "SIGINT\n"
         process.send_signal(signal.SIGINT)
         assert process.wait(PATIENCE_S) == 128 + signal.SIGINT
+
+
+def test_a_process_says_once_that_it_is_ready_and_once_for_whom_it_waits(
+    hub: MemoryHub, clock: FakeClock, capsys: pytest.CaptureFixture[str]
+) -> None:
+    camera = service(hub, clock, "camera", announces=True)
+    controller = service(hub, clock, "controller", announces=True)
+    controller.awaited = lambda: "a camera"
+    quiet = service(hub, clock, "mirror-dm")
+    camera.wait_for(["controller", "recorder"], 0.0)
+    for process in (camera, controller, quiet):
+        process.state = "ready"
+    for _ in range(4):
+        clock.advance(WAITING_NS)
+        for process in (camera, controller, quiet):
+            process.state = "running"
+            process.beat()
+    shown = capsys.readouterr().err.splitlines()
+    assert shown[:2] == ["camera: ready (run night)", "controller: ready (run night)"]
+    assert shown[2:] == ["camera: waiting for recorder (run night)", "controller: waiting for a camera (run night)"]

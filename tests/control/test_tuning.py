@@ -15,11 +15,9 @@ from lowfc.control import stability
 from lowfc.control.linear_law import LinearLaw
 from lowfc.control.margins import margins
 from lowfc.control.spectra import Pieces
+from lowfc.control.stability import LEAST_GAIN_MARGIN, LEAST_PHASE_MARGIN_DEG, highest_gain
 from lowfc.control.tuning import (
-    LEAST_GAIN_MARGIN,
-    LEAST_PHASE_MARGIN_DEG,
     best_gains,
-    highest_gain,
     identified,
     left_of,
     tune_integrator,

@@ -82,14 +82,17 @@ def test_a_port_in_use(tmp_path: Path) -> None:
         with socket.socket() as taken:
             taken.bind(("127.0.0.1", held.links.ports["recorder"]))
             taken.listen()
-            _refused(tmp_path, "record", "--run", "mistakes-port", expected=str(held.links.ports["recorder"]))
+            said = _refused(tmp_path, "record", "--run", "mistakes-port", expected=str(held.links.ports["recorder"]))
+        assert "Address already in use" in said
+        assert ".rs" not in said
+        assert "cargo" not in said
     finally:
         held.remove()
 
 
 def test_nobody_is_there(tmp_path: Path) -> None:
-    _refused(tmp_path, "ctl", "status", expected="no loop is running on this host")
-    _refused(tmp_path, "ctl", "status", "--run", "none-such", expected="no loop is running on this host")
+    _refused(tmp_path, "ctl", "status", expected="lowfc was searched")
+    _refused(tmp_path, "ctl", "status", "--run", "none-such", expected="there is no run 'none-such': no loop of user")
     _refused(tmp_path, "ctl", "gain", "often", expected="valid number")
     _refused(tmp_path, "config", "check", "none.toml", expected="none.toml")
     _refused(tmp_path, "sim-lop", expected="sim-lop")

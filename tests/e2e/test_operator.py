@@ -91,6 +91,7 @@ def _ready(night: Night) -> None:
     with Client(night.name) as loop:
         until(lambda: loop.status().state.frames_used)  # type: ignore[union-attr]
         loop.steps(1, patience_s=20)
+        until(lambda: loop.processes()["controller"].last_second.frames)
         calibration, status = loop.calibration(), loop.status().state
     assert status is not None
     calibration_file.save(calibration, night.folder / "calibration.fits")
@@ -138,6 +139,15 @@ def _the_rest(night: Night) -> None:
         ):
             with pytest.raises(RequestRefusedError, match=why):
                 ask()
+        loop.pause()
+        night.said["while paused"] = night.ctl("lowfc ctl status --json")
+        loop.close_loop()
+        loop.record(False)
+        night.said["while stopped"] = night.ctl("lowfc ctl status --json")
+        loop.record(True)
+    words = ([*LOWFC, "ctl", "note", "here", "--run", night.name[:-1]], [*LOWFC, "runs", "--json"], [*LOWFC, "hosts"])
+    for name, said in zip(("beginning", "runs", "hosts"), words, strict=True):
+        night.said[name] = subprocess.run(said, capture_output=True, text=True, timeout=20, check=True).stdout
     for command in ("lowfc ctl status --json", "lowfc ctl note once --json", "lowfc ctl configuration --json"):
         night.ctl(command)
     words = [*LOWFC, "ctl", "gain", "-0.1", "--modes", "2", "--run", night.name]
@@ -152,6 +162,8 @@ def test_every_request_is_made_by_a_command_of_the_document() -> None:
 
 def test_the_commands_say_what_they_did(night: Night) -> None:
     said = night.said
+    well = r"closed · residual [\d.]+ nm rms( \(true [\d.]+\))? · light \d+ % · \d+ frames? lost · recording logs/"
+    assert re.match(well, said["lowfc ctl status"])
     assert "loop           closed" in said["lowfc ctl status"]
     assert 'preset = "bench"' in said["lowfc ctl configuration"]
     assert "loop closed for 50 frames, from frame" in said["lowfc ctl step 50"]
@@ -161,13 +173,30 @@ def test_the_commands_say_what_they_did(night: Night) -> None:
     assert "channel dark-hole: 1.47 nm rms of surface" in said["lowfc ctl channel dark-hole shape.npy"]
     assert "'leaky' takes over" in said["lowfc ctl law law.fits"]
     assert [said[f"lowfc ctl {name}"].split(",")[0] for name in ("safe", "clear", "pause", "close")] == [
-        "loop safed",
+        "loop in safe mode",
         "loop open",
-        "loop open",
+        "loop paused: the command is held until `lowfc ctl close`",
         "loop closed",
     ]
+    assert all(f"run {night.name}" in said[command] for command in COMMANDS), "every answer names its run"
     status = json.loads(said["lowfc ctl status --json"])
     assert (status["mode"], status["law"]["name"], status["offset_rms_nm"]) == ("closed", "integrator", 0.0)
+    assert (status["run"], status["paused"], status["recording"]) == (night.name, False, "recording")
+    paused, stopped = json.loads(said["while paused"]), json.loads(said["while stopped"])
+    assert (paused["mode"], paused["paused"], stopped["recording"]) == ("open", True, "stopped")
+    assert json.loads(said["runs"])["runs"] == [
+        {
+            "run": night.name,
+            "mode": "closed",
+            "recording": "recording",
+            **{key: json.loads(said["runs"])["runs"][0][key] for key in ("rate_hz", "uptime_s", "processes", "log")},
+        }
+    ]
+    processes = [(one["process"], one["state"]) for one in json.loads(said["runs"])["runs"][0]["processes"]]
+    names = ("camera", "controller", "mirror-dm", "recorder")
+    assert [name for name, _ in processes] == list(names)
+    assert all(name in said["hosts"] for name in names)
+    assert f"run {night.name}" in said["beginning"]
     assert status["channels"] == []
     assert json.loads(said["lowfc ctl note once --json"])["reply"] == "noted"
     assert json.loads(said["lowfc ctl configuration --json"])["camera"]["rate_hz"] == 200.0
@@ -184,7 +213,7 @@ def test_the_programs_of_the_document_run(night: Night) -> None:
 def test_the_log_has_every_request_and_nothing_was_lost(night: Night) -> None:
     assert night.figures["messages_lost"] == 0
     assert night.figures["recording_failure"] is None
-    assert len(night.logs) == 2, "the recording was stopped and started once"
+    assert len(night.logs) == 3, "the recording was stopped and started twice"
     messages = [payloads(log) for log in night.logs]
     requests = [wire.Request.FromString(body) for found in messages for body in found.get(f"/{REQUEST.key}", [])]
     counts = Counter((request.name, request.accepted) for request in requests)
@@ -242,7 +271,7 @@ def test_a_signal_makes_the_loop_safe_where_nobody_can_ask_any_more(tmp_path: Pa
         assert re.search(pattern[1], command)
         assert not re.search(pattern[1], f"bash -c {command}")
         os.kill(controller, signal.SIGUSR1)
-        until(lambda: "safed" in run(tmp_path, "ctl", "status").stdout)
+        until(lambda: "in safe mode" in run(tmp_path, "ctl", "status").stdout)
     finally:
         interrupt(process)
     (log,) = (tmp_path / "logs").glob("*.mcap")

@@ -2,9 +2,11 @@
 
 import json
 import os
+import re
 import resource
 import shutil
 import signal
+import socket
 import subprocess
 from pathlib import Path
 from typing import Any
@@ -12,8 +14,14 @@ from typing import Any
 import numpy as np
 import pytest
 from loops import LOWFC, children, interrupt, loop, payloads, recorded_bytes, run, start, until
+from typer.testing import CliRunner
 
+from lowfc.adapters.run import Run, open_run
+from lowfc.contract.configuration import Configuration, load
+from lowfc.contract.errors import BusError
 from lowfc.contract.messages import RawImage, from_timestamp, topic_of, wire
+from lowfc.programs import sim_loop
+from lowfc.programs.cli import app
 
 FRAMES = 3000
 
@@ -109,6 +117,17 @@ def test_an_independent_reader_agrees(live: dict[str, Any], topics: dict[str, li
     assert "lowfc" in found["metadata"]
 
 
+def test_a_configuration_that_was_shown_does_not_open_the_loop(tmp_path: Path) -> None:
+    shown = run(tmp_path, "config", "show").stdout
+    short = ("sim-loop", "--lockstep", "--duration", "0.2", "--no-record")
+    done = run(tmp_path, *short, config=shown)
+    assert done.stdout.splitlines()[0].split() == ["loop", "closed"], done.stderr
+    assert "starts open" not in done.stderr
+    done = run(tmp_path, *short, config=shown.replace('#start_mode = "open"', 'start_mode = "open"'))
+    assert re.match(r"loop +open for 0\.\d s", done.stdout), done.stderr
+    assert "the loop starts open (control.start_mode of test.toml): `lowfc ctl close` closes it" in done.stderr
+
+
 def test_ctrl_c_ends_with_a_summary(tmp_path: Path) -> None:
     process = start(tmp_path, "sim-loop", "--rate", "200", "--disturbance", "quiet")
     until(lambda: recorded_bytes(tmp_path) > 4e6)
@@ -146,6 +165,33 @@ def test_two_loops_on_one_host_do_not_mix(tmp_path: Path) -> None:
     assert figures["frames_published"] == 400
     assert len(payloads(figures["log"])["/lowfc/camera/frame"]) <= 400
     assert '"frames_published": 400' in said
+
+
+def test_a_loop_that_is_starting_is_there_for_others(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """So that an unnamed request does not reach the only other one."""
+    monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
+    found: list[object] = []
+
+    def meanwhile(config: Configuration, run: Run, console: object) -> None:
+        with socket.create_server(("127.0.0.1", open_run("other").links.ports["controller"])):
+            done = CliRunner().invoke(app, ["ctl", "open"])
+            listed = json.loads(CliRunner().invoke(app, ["runs", "--json"]).stdout)["runs"]
+            found.extend([str(done.exception), [(one["run"], one["mode"]) for one in listed]])
+        with pytest.raises(BusError, match="run 'night' is running already"):
+            sim_loop.sim_loop(config, 1.0, record=False, name="night")
+        raise BusError("enough")
+
+    monkeypatch.setattr(sim_loop, "prepare", meanwhile)
+    with pytest.raises(BusError, match="enough"):
+        sim_loop.sim_loop(load(None), 1.0, record=False, name="night")
+    refusal, listed = found
+    assert refusal == (
+        "choose a run with --run, the beginning of its name is enough: there are night (no controller yet), other"
+    )
+    assert listed == [("night", "starting"), ("other", "starting")]
+    assert not (tmp_path / "lowfc" / "night").exists()
+    with pytest.raises(BusError, match="made by processes that were started by hand"):
+        sim_loop.sim_loop(load(None), 1.0, record=False, name="other")
 
 
 def test_help_has_examples(tmp_path: Path) -> None:

@@ -35,3 +35,18 @@ def test_before_the_first_block_they_are_those_of_what_there_is() -> None:
     found = figures.wavefront()
     assert found is not None
     assert found.residual_rms_nm == pytest.approx(4.0)
+
+
+def test_the_recent_ones_forget_what_was_before() -> None:
+    figures = Figures(NOLL, 1.0, recent=100)
+    assert figures.recent() is None
+    for residual_nm, frames in ((50.0, BLOCK), (2.0, 100)):
+        for _ in range(frames):
+            figures.add(truth(residual_nm))
+        found = figures.recent()
+        assert found is not None
+        assert found.residual_rms_nm == pytest.approx(residual_nm)
+        assert found.tilt_disturbance_mas == pytest.approx(2 * residual_nm)
+    whole = figures.wavefront()
+    assert whole is not None
+    assert whole.residual_rms_nm > 40.0, "of the whole run's second half"

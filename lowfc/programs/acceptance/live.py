@@ -35,7 +35,7 @@ class Live:
         state = self._state()
         if LoopMode(state.mode) not in (LoopMode.OPEN, LoopMode.CLOSED):
             raise AcceptanceError(
-                f"the loop is {LoopMode(state.mode).name.lower()}: it must be open or closed to be measured"
+                f"the loop is {LoopMode(state.mode).in_words}: it must be open or closed to be measured"
             )
         self._found = LoopMode(state.mode)
         self._heard = heard

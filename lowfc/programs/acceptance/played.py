@@ -132,8 +132,8 @@ class Played:
         other = self.mode[(self.mode != 0) & (self.mode != mode)]
         if other.size:
             raise AcceptanceError(
-                f"the loop became {LoopMode(int(other[0])).name.lower()} while it was measured "
-                f"{mode.name.lower()}: measure again"
+                f"the loop became {LoopMode(int(other[0])).in_words} while it was measured "
+                f"{mode.in_words}: measure again"
             )
         if self.limits_hit:
             raise AcceptanceError(

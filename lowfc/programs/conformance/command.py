@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from lowfc.adapters.terminal import ConfigFile, configuration, new_app
+from lowfc.control.wording import counted
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -211,4 +212,4 @@ def report(checks: "list[Check]", console: "Console") -> None:
             table.add_row("", Text("to do", style="dim", justify="right"), Text(check.advice))
     console.print(table)
     ended = counts(checks)
-    console.print(f"\n{ended['wrong']} wrong, {ended['warning']} warnings, {ended['ok']} ok")
+    console.print(f"\n{ended['wrong']} wrong, {counted(ended['warning'], 'warning')}, {ended['ok']} ok")

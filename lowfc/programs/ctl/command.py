@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from lowfc.client import Answer, Client
 
 ctl_app = new_app("Ask a running controller.\n\nExample: lowfc ctl status")
-record_app = new_app("Begin the next log, or finish this one.\n\nExample: lowfc ctl record stop")
+record_app = new_app("Start the next log, or finish this one.\n\nExample: lowfc ctl record stop")
 ctl_app.add_typer(record_app, name="record")
 
 SIMPLE = ("open", "close", "pause", "safe", "clear", "reset", "stop")
@@ -50,16 +50,16 @@ def _simple(name: str) -> Callable[..., None]:
 
 @ctl_app.command()
 def status(run: AnyRun = None, as_json: Json = False) -> None:
-    """Say what the controller is doing.
+    """Say how the loop is: whether all is well in the first line, then what the controller is doing.
 
     Example: lowfc ctl status --json
     """
     from lowfc.programs.ctl.status import figures, text
 
     with _joined(run) as loop:
-        state, mirrors = loop.status().state, loop.mirrors()
+        state, processes = loop.status().state, loop.processes()
     assert state is not None  # noqa: S101  # that is what it answers with
-    put(figures(state, mirrors), text(state, mirrors), as_json=as_json)
+    put(figures(state, processes, loop.run_id), text(state, processes, loop.run_id), as_json=as_json)
 
 
 for _name in SIMPLE:
@@ -184,7 +184,7 @@ def configuration(run: AnyRun = None, as_json: Json = False) -> None:
 
     with _joined(run) as loop:
         text = loop.configuration()
-    put(tomllib.loads(text), text.rstrip("\n"), as_json=as_json)
+    put(tomllib.loads(text), f"# run {loop.run_id}\n{text.rstrip()}", as_json=as_json)
 
 
 @ctl_app.command()
@@ -202,8 +202,8 @@ def _recording(on: bool) -> Callable[..., None]:
     def ask(run: AnyRun = None, as_json: Json = False) -> None:
         with _joined(run) as loop:
             answer = loop.record(on)
-        said = {"accepted": answer.accepted, "reply": answer.reply, "log": answer.text}
-        put(said, answer.reply, as_json=as_json)
+        said = {"run": answer.run, "accepted": answer.accepted, "reply": answer.reply, "log": answer.text}
+        put(said, f"{answer.reply} (run {answer.run})", as_json=as_json)
 
     return ask
 
@@ -227,5 +227,5 @@ def _say(run: str | None, as_json: bool, ask: "Callable[[Client], Answer]") -> N
     """Ask, and print what was answered."""
     with _joined(run) as loop:
         answer = ask(loop)
-    said = {"accepted": answer.accepted, "reply": answer.reply}
+    said = {"run": answer.run, "accepted": answer.accepted, "reply": answer.reply}
     put({**said, "frame": answer.frame, "frame_sequence": answer.frame_sequence}, answer.sentence, as_json=as_json)

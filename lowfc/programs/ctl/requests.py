@@ -94,7 +94,8 @@ ASKED: tuple[Asked, ...] = (
     _asked("stop", "End what is being played.", "stop"),
     _asked(
         "law",
-        "Let a linear law drive the mirror, once it has followed for a while; refused where it is not stable.",
+        "Let a linear law drive the mirror: it observes for a while, then takes over in a cross-fade; refused where it "
+        "is not stable.",
         "law lqg.fits",
         ("law", "none for the integrator"),
     ),
@@ -109,13 +110,13 @@ ASKED: tuple[Asked, ...] = (
     Asked(
         RECORD_KEY.format(name="start"),
         (),
-        "Begin the next log; its path is the answer's `text`.",
+        "Start the next log and print its path.",
         "record start",
     ),
     Asked(
         RECORD_KEY.format(name="stop"),
         (),
-        "Finish the log, which is whole when the answer comes; its path is the answer's `text`.",
+        "Finish the log and print its path; the file is complete when the answer comes.",
         "record stop",
     ),
 )

@@ -8,13 +8,27 @@ import numpy as np
 import numpy.typing as npt
 
 from lowfc.contract.envelope import count_of
-from lowfc.contract.messages import from_timestamp, wire
-from lowfc.control.safety import LoopMode, Reason
+from lowfc.contract.messages import FRAME, Role, from_timestamp, wire
+from lowfc.control.requests import PAUSED
+from lowfc.control.safety import Reason
 from lowfc.control.state import FADING_FRAMES, SETTLING_FRAMES
+from lowfc.control.wording import counted, mode_word
+from lowfc.programs.watch import mode_name, topic_count
+
+NOBODY = wire.Health()
+_NO_PROCESSES: Mapping[str, wire.Health] = MappingProxyType({})
 
 
-def figures(state: wire.ControllerState, mirrors: Mapping[str, wire.Health] = MappingProxyType({})) -> dict[str, Any]:
-    """The state as `lowfc ctl status --json` prints it; modes in the calibration's order, nm rms of wavefront."""
+def figures(
+    state: wire.ControllerState, processes: Mapping[str, wire.Health] = _NO_PROCESSES, run: str = ""
+) -> dict[str, Any]:
+    """The state as `lowfc ctl status --json` prints it; modes in the calibration's order, nm rms of wavefront.
+
+    Args:
+        state: of the controller.
+        processes: what each process of the run reports of itself, by its name.
+        run: name of the run.
+    """
     playing = None
     if state.HasField("play"):
         play = state.play
@@ -29,8 +43,25 @@ def figures(state: wire.ControllerState, mirrors: Mapping[str, wire.Health] = Ma
         }
     command_nm = list(state.command_history_nm)[: len(state.gain)]
     settings = state.settings
+    controller, recorder = processes.get(Role.CONTROLLER, NOBODY), processes.get(Role.RECORDER, NOBODY)
+    lately, arrived = controller.last_second, topic_count(controller, FRAME.key)
+    camera = processes.get(Role.CAMERA, NOBODY)
     return {
-        "mode": LoopMode(state.mode).name.lower() if state.mode else "starting",
+        "run": run,
+        "mode": mode_name(state.mode) or "starting",
+        "paused": state.mode == wire.LOOP_MODE_OPEN and state.mode_cause == PAUSED,
+        "rate_hz": controller.rate_hz,
+        "frames_used_last_second": lately.frames,
+        "residual_rms_nm": lately.residual_rms_nm if lately.frames else None,
+        "true_residual_rms_nm": camera.recent_wavefront.residual_rms_nm
+        if camera.HasField("recent_wavefront")
+        else None,
+        "flux_fraction": lately.flux_fraction if lately.frames else None,
+        "frames_skipped": arrived.skipped,
+        "frames_missing": arrived.missing,
+        "recording": recording_state(recorder),
+        "log": recorder.recording.file or None,
+        "last_warning": _last_warning(state, processes),
         "mode_s": round(max(0, from_timestamp(state.timestamp) - from_timestamp(state.mode_timestamp)) * 1e-9, 3)
         if state.HasField("mode_timestamp")
         else None,
@@ -41,7 +72,8 @@ def figures(state: wire.ControllerState, mirrors: Mapping[str, wire.Health] = Ma
                 "expired": one.command_expired,
                 "limits_hit": [_reason(reason) for reason in one.limits_hit],
             }
-            for name, one in sorted(mirrors.items())
+            for name, one in sorted(processes.items())
+            if name.partition("-")[0] == Role.MIRROR
         },
         "frame": count_of(state.frame_sequence),
         "frame_sequence": state.frame_sequence,
@@ -77,11 +109,11 @@ def figures(state: wire.ControllerState, mirrors: Mapping[str, wire.Health] = Ma
     }
 
 
-def text(state: wire.ControllerState, mirrors: Mapping[str, wire.Health] = MappingProxyType({})) -> str:
-    """The same for a person."""
-    known = figures(state, mirrors)
+def text(state: wire.ControllerState, processes: Mapping[str, wire.Health] = _NO_PROCESSES, run: str = "") -> str:
+    """The same for a person: whether all is well in the first line."""
+    known = figures(state, processes, run)
     since = "" if known["mode_s"] is None else f" for {known['mode_s']:.0f} s ({known['mode_cause']})"
-    mode = known["mode"] + (f", opens after {known['steps_left']} frames" if known["steps_left"] else "")
+    mode = _mode(known) + (f", opens after {counted(known['steps_left'], 'frame')}" if known["steps_left"] else "")
     law = known["law"]["name"]
     if known["law"]["weight"] < 1:
         law += f", driving with a weight of {known['law']['weight']:.2f}; the integrator has the rest"
@@ -94,8 +126,8 @@ def text(state: wire.ControllerState, mirrors: Mapping[str, wire.Health] = Mappi
     rows = {
         "loop": mode + since,
         **{name: _of_mirror(one) for name, one in known["mirrors"].items()},
-        "frame": f"{known['frame']}, {known['frames_used']} used"
-        + (f"; the last was refused: {known['refused']}" if known["refused"] else ""),
+        "frame": f"{known['frame']} ({known['frames_used']} used)"
+        + (f"; the last was refused as {_spoken(known['refused'])}" if known["refused"] else ""),
         "command": f"{known['command_rms_nm']:.3f} nm rms" + (", on its way to zero" if known["homing"] else ""),
         "offset": f"{known['offset_rms_nm']:.3f} nm rms",
         "law": law,
@@ -103,16 +135,69 @@ def text(state: wire.ControllerState, mirrors: Mapping[str, wire.Health] = Mappi
         "leak": _values(known["leak"]),
         "limit": f"{_values(known['limit_nm'])} nm",
         "channels": "; ".join(channels) or "none",
-        "playing": f"{playing['target']}, {playing['frames_left']} of {playing['frames']} frames left"
+        "playing": f"{playing['target']}, {playing['frames_left']} of {counted(playing['frames'], 'frame')} left"
         if playing
         else "nothing",
         "mirror limits": f"stroke {known['stroke_nm']:g} nm, slew {known['slew_nm']:g} nm a frame, "
-        f"neighbours {known['neighbour_nm']:g} nm; acting: {', '.join(known['limits_hit']) or 'none'}",
-        "counted": ", ".join(f"{name} {count}" for name, count in known["counts"].items()) or "nothing",
-        "delay": f"{known['delay_frames']:g} frames",
+        f"neighbours {known['neighbour_nm']:g} nm; {_acting(known['limits_hit'])}",
+        "counted": ", ".join(_counted(name, count) for name, count in known["counts"].items()) or "nothing refused",
+        "delay": counted(float(known["delay_frames"]), "frame"),
         "calibration": known["calibration_id"][:12] or "none",
     }
-    return "\n".join(f"{name:14} {value}" for name, value in rows.items())
+    return "\n".join([_in_short(known), *(f"{name:14} {value}" for name, value in rows.items())])
+
+
+def recording_state(recorder: wire.Health) -> str:
+    """One word: recording, stopped by an operator, failed, or none without a recorder that is ready."""
+    if recorder.recording.failure:
+        return "failed"
+    if recorder.state not in ("ready", "running"):
+        return "none"
+    return "stopped" if recorder.recording.stopped else "recording"
+
+
+def _in_short(known: dict[str, Any]) -> str:
+    """Is it good: mode, residual and light of the last second, frames lost, recording, run, law, last warning."""
+    measured = ["no frame used in the last second"]
+    if known["frames_used_last_second"]:
+        true_nm = known["true_residual_rms_nm"]
+        measured = [
+            f"residual {known['residual_rms_nm']:.2f} nm rms" + ("" if true_nm is None else f" (true {true_nm:.2f})"),
+            f"light {100 * known['flux_fraction']:.0f} %",
+        ]
+    recording = {"recording": f"recording {known['log']}", "none": "not recording"}
+    warning = known["last_warning"]
+    return " · ".join(
+        (
+            _mode(known),
+            *measured,
+            f"{counted(known['frames_skipped'] + known['frames_missing'], 'frame')} lost",
+            recording.get(known["recording"], f"recording {known['recording']}"),
+            f"run {known['run']}",
+            f"law {known['law']['name']}",
+            "no warning"
+            if warning is None
+            else f"{warning['age_s']:.0f} s ago {warning['process']}: {warning['text']}",
+        )
+    )
+
+
+def _last_warning(state: wire.ControllerState, processes: Mapping[str, wire.Health]) -> dict[str, Any] | None:
+    """The newest warning of any process."""
+    found = [
+        (from_timestamp(one.last_warning_timestamp), name, one.last_warning)
+        for name, one in processes.items()
+        if one.last_warning
+    ]
+    if not found:
+        return None
+    time_ns, process, text = max(found)
+    age_s = max(0, from_timestamp(state.timestamp) - time_ns) * 1e-9
+    return {"process": process, "age_s": round(age_s, 3), "text": text}
+
+
+def _mode(known: dict[str, Any]) -> str:
+    return "paused" if known["paused"] else mode_word(known["mode"])
 
 
 def _reason(number: int) -> str:
@@ -124,7 +209,24 @@ def _of_mirror(mirror: dict[str, Any]) -> str:
     if mirror["refused"]:
         return f"refuses commands: {mirror['refused']}"
     state = "its last command has expired" if mirror["expired"] else "follows"
-    return f"{state}; limits acting: {', '.join(mirror['limits_hit'])}" if mirror["limits_hit"] else state
+    return f"{state}; {_acting(mirror['limits_hit'])}" if mirror["limits_hit"] else state
+
+
+def _acting(limits: list[str]) -> str:
+    return f"limits acting: {', '.join(map(_spoken, limits))}" if limits else "no limit acting"
+
+
+def _counted(reason: str, count: int) -> str:
+    """How often a frame was refused for a reason, or a limit acted."""
+    if Reason[reason] is Reason.NO_FRAME:
+        return f"no frame {counted(count, 'time')}"
+    if Reason[reason] < Reason.MODAL_LIMIT:
+        return f"{counted(count, 'frame')} refused as {_spoken(reason)}"
+    return f"{_spoken(reason)} acted on {counted(count, 'command')}"
+
+
+def _spoken(reason: str) -> str:
+    return reason.lower().replace("_", " ")
 
 
 def _values(values: list[float]) -> str:

@@ -1,20 +1,13 @@
 """Which run a command means."""
 
 from lowfc.adapters.run import runtime_base
-from lowfc.client import running, the_run
-from lowfc.contract.errors import BusError
+from lowfc.client import the_run
 
 
 def the_known_run(name: str | None) -> str:
-    """The run of that name, whether its controller is there or not, or the only one there is.
+    """The run of that name, whether a process of it is there or not, or the only one there is, as `the_run`.
 
     Raises:
         BusError: there is no such run, none at all, or more than one to choose from.
     """
-    if name is None:
-        return the_run(None)
-    if not (runtime_base() / name).is_dir():
-        raise BusError(
-            f"there is no run {name!r}: start its processes first; running are {', '.join(running()) or 'none'}"
-        )
-    return name
+    return name if name is not None and (runtime_base() / name).is_dir() else the_run(name)

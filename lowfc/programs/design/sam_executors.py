@@ -9,6 +9,7 @@ from contextlib import contextmanager
 from importlib import import_module
 from typing import Any
 
+from lowfc.adapters.extras import install_advice
 from lowfc.contract.errors import ConfigurationError
 
 DASK_TIMEOUT_S = 10.0
@@ -63,7 +64,7 @@ def _dask(address: str) -> Iterator[Executor]:
     try:
         client: Any = import_module("distributed").Client(address, timeout=DASK_TIMEOUT_S)
     except ImportError:
-        raise ConfigurationError("--scheduler needs Dask: pip install 'lowfc[cluster]'") from None
+        raise ConfigurationError(f"--scheduler needs Dask: {install_advice('cluster')}") from None
     except (OSError, ValueError) as error:
         raise ConfigurationError(f"no Dask scheduler answers at {address!r}: {error}") from error
     for name in ("distributed", "distributed.client"):  # a lost scheduler is ours to tell, without their traceback

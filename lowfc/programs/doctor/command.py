@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from lowfc.adapters.terminal import ConfigFile, configuration
+from lowfc.control.wording import counted
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -128,4 +129,4 @@ def report(found: "Mapping[str, Finding]", console: "Console") -> None:
                 table.add_row("", Text(label, style="dim", justify="right"), Text(text, style="dim"))
     console.print(table)
     ended = counts(found)
-    console.print(f"\n{ended['warning']} warnings, {ended['note']} notes, {ended['ok']} ok")
+    console.print(f"\n{counted(ended['warning'], 'warning')}, {counted(ended['note'], 'note')}, {ended['ok']} ok")

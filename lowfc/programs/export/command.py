@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from lowfc.adapters.extras import install_advice
 from lowfc.adapters.terminal import one_log
 from lowfc.contract.errors import ConfigurationError, DataFileError
 from lowfc.programs.output import put
@@ -128,7 +129,7 @@ def _writer(to: Format) -> "Callable[[list[Path], History, bool, Progress], None
             from lowfc.programs.export.aot import write_aot
         except ModuleNotFoundError as error:
             raise ConfigurationError(
-                f"--to aot needs aotpy, which is not there ({error}); install it with: pip install 'lowfc[aot]'"
+                f"--to aot needs aotpy, which is not there ({error}); install it with: {install_advice('aot')}"
             ) from None
         return lambda files, history, frames, progress: write_aot(files[0], history, progress, with_frames=frames)
     from lowfc.programs.export import files as formats

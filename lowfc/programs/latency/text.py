@@ -5,6 +5,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from lowfc.control.wording import counted
 from lowfc.programs.latency.figures import LOOP_SPANS, PERCENTILES
 from lowfc.programs.latency.summary import OVER
 
@@ -121,19 +122,19 @@ def _remarks(figures: Mapping[str, Any]) -> list[str]:
             parts = [f"{at} {figures[name][at]:.2f} ({low:.2f} to {high:.2f})" for at, (low, high) in spread.items()]
             lines.append(f"frame to command over half a bare echo and one control step{words}: {', '.join(parts)}")
     lines.append(
-        f"{figures['frames']} frames, {figures['frames_without_command']} without a command "
+        f"{counted(figures['frames'], 'frame')}, {figures['frames_without_command']} without a command "
         f"({figures['frames_crowded_out']} of them with the next one on their heels), {figures['frames_skipped']} "
         f"skipped and {figures['frames_missing']} missing by the controller's account; "
         f"{figures['frames_without_mirror_state']} without a mirror state; {figures['warm_up_frames']} of the warm-up "
         "left out"
     )
     if figures["frames_sent_late"] is not None:
-        lines.append(f"{figures['frames_sent_late']} frames were put more than a period after they were due")
+        lines.append(f"{counted(figures['frames_sent_late'], 'frame')} put more than a period after they were due")
     if figures["reasons"]:
         told = ", ".join(f"{name} {count}" for name, count in figures["reasons"].items())
         lines.append(f"frames that were refused or limited, the warm-up included: {told}")
     if figures["echo_lost"]:
-        lines.append(f"{figures['echo_lost']} frames of the bare echo were not answered")
+        lines.append(f"{counted(figures['echo_lost'], 'frame')} of the bare echo not answered")
     lines.append(_what(figures))
     host = figures["host"]
     lines.append(", ".join(f"{name} {host[name]}" for name in _HOST if host.get(name)))

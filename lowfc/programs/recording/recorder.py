@@ -101,6 +101,7 @@ class Recorder:
             self._write(sample)
         self._begin()
         self._begun_ns = self._clock.host_ns()
+        self.service.awaited = lambda: "" if self.service.heard else "any other process"
         self.service.state = "ready"
         while self.service.running:
             self._turn()
@@ -171,6 +172,7 @@ class Recorder:
         except DataFileError as fault:
             self._fail(fault)
         self._paused = not self._failure
+        self.service.state = "ready"  # its Health, for who asks next
         return self._failure
 
     def _resume(self) -> str:
@@ -187,6 +189,7 @@ class Recorder:
             self._series.give_up()
             return str(fault)
         self._paused = False
+        self.service.state = "ready"
         self._others.ask_again()
         return ""
 
@@ -323,6 +326,7 @@ class Recorder:
         health.recording.messages = self._series.messages
         health.recording.lost = sum(lost.values())
         health.recording.failure = self._failure
+        health.recording.stopped = self._paused and not self._failure
         health.recording.bytes = self._series.bytes_written
         counts = {count.topic: count for count in health.topics}  # of its own, those that it sent
         for key, recorded in self._ledger.recorded().items():
@@ -381,6 +385,7 @@ def record(
             granted=granted,
         )
         recorder.catch_signals()
+        recorder.service.announces = True
         return recorder.run()
     finally:
         bus.close()

@@ -6,6 +6,7 @@ from typing import Any
 
 import tomli_w
 
+from lowfc.adapters.extras import install_advice
 from lowfc.contract.errors import ConfigurationError
 from lowfc.contract.printable import LINES, printable
 from lowfc.programs.report.drawings import drawings
@@ -63,7 +64,7 @@ def _environment() -> Any:
         from jinja2 import Environment, StrictUndefined
     except ImportError as error:
         raise ConfigurationError(
-            f"a report's page needs jinja2, which is not there ({error}); install it with: pip install 'lowfc[plots]', "
+            f"a report's page needs jinja2, which is not there ({error}); install it with: {install_advice('plots')}, "
             "or take the figures with --json"
         ) from None
     environment = Environment(

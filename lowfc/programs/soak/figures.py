@@ -7,6 +7,8 @@ import numpy as np
 import numpy.typing as npt
 from scipy import stats
 
+from lowfc.control.wording import counted
+
 BLOCKS = 12
 """Means over which a slope is fitted: neighbouring samples are not independent, means of many nearly are."""
 WARM_UP = 0.25
@@ -150,9 +152,10 @@ def render(figures: dict[str, Any]) -> str:
         )
     lines += [
         f"frame to command: {told_latency(figures['latency'])}",
-        f"{figures['frames_published']} frames, {figures['frames_skipped']} skipped, "
+        f"{counted(figures['frames_published'], 'frame')}, {figures['frames_skipped']} skipped, "
         f"{figures['frames_missing']} missing; "
-        f"{figures['messages_recorded']} messages in {figures['logs']} logs, {figures['messages_lost']} lost, "
+        f"{counted(figures['messages_recorded'], 'message')} in {counted(figures['logs'], 'log')}, "
+        f"{figures['messages_lost']} lost, "
         f"{figures['gaps']} gaps",
         verdict(figures),
     ]

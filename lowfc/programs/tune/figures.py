@@ -19,6 +19,7 @@ from lowfc.control.tuning import (
     tune_pi_notch,
 )
 from lowfc.control.vibration import Model
+from lowfc.control.wording import counted
 from lowfc.optics.zernike import mode_name
 from lowfc.programs.tune.data import Telemetry
 
@@ -110,7 +111,7 @@ def render(found: dict[str, Any]) -> str:
     """The figures as a table."""
     state = "closed" if found["closed"] else "open"
     lines = [
-        f"{found['source']}: {found['frames']} frames at {found['rate_hz']:.4g} Hz, loop {state}, delay "
+        f"{found['source']}: {counted(found['frames'], 'frame')} at {found['rate_hz']:.4g} Hz, loop {state}, delay "
         f"{found['delay_frames']:.2f} frames, law {found['law_now']}",
         "",
         f"{'residual, nm rms':<26}{'gain now':>9}{'best':>7}{'achieved':>10}{'in theory':>10}  {'tuned to':<11}"

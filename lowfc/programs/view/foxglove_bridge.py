@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any
 
 from lowfc.adapters.bus import ALL, Bus, Sample, states
 from lowfc.adapters.clock import Clock
+from lowfc.adapters.extras import install_advice
 from lowfc.adapters.log_writer import declaration
 from lowfc.adapters.names import Names
 from lowfc.adapters.run import Run
@@ -190,7 +191,7 @@ def _foxglove() -> Any:
     except ImportError as error:
         raise ConfigurationError(
             f"--foxglove needs foxglove-sdk, which is not there ({error}); install it with: "
-            "pip install 'lowfc[foxglove]'"
+            f"{install_advice('foxglove')}"
         ) from None
     logging.getLogger("foxglove").setLevel(logging.CRITICAL)  # an app that is closed while it is sent to is no error
     return foxglove

@@ -55,6 +55,8 @@ def look_at_run(run_id: str, config: Configuration | None, where: Place, seconds
         )
         stack.callback(bridge.close)
         bridge.service.catch_signals()
+        bridge.service.announces = True
+        bridge.service.awaited = lambda: "" if bridge.service.heard else "any other process"
         until_s = seconds if seconds is not None or where.picture is None else PICTURE_AFTER_S
         try:
             summary = bridge.run(until_s, lambda: _say_where(where, bridge.viewer))
