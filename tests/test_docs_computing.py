@@ -30,6 +30,9 @@ def test_the_logs(tmp_path: Path) -> None:
     assert "what if" in said[2]
     assert "played" in said[3]
     assert "is whole" in said[4]
+    assert "1 in 10 frames and mirror states" in said[7]
+    assert "digest " in said[8]
+    assert "-every-10.mcap" not in said[8], "the newest log is the one that was recorded"
     assert {path.suffix for path in (tmp_path / "logs").iterdir()} == {".mcap", ".html", ".fits"}
 
 

@@ -19,12 +19,14 @@ from lowfc.adapters import host as host_module
 from lowfc.adapters import trial as trial_module
 from lowfc.adapters.clock import boot_file
 from lowfc.adapters.host import Host, Synchronisation
+from lowfc.adapters.log_selection import EVERYTHING
 from lowfc.adapters.run import runtime_base
 from lowfc.adapters.trial import Trial, lateness_ns, try_out
 from lowfc.contract.configuration import Configuration, Realtime, load
 from lowfc.programs.doctor import command as doctor_module
 from lowfc.programs.doctor.command import checks, doctor, examine, figures, gather
 from lowfc.programs.doctor.facts import Facts, note, ok, ranges
+from lowfc.programs.recording.volume import bytes_per_s
 
 DOCUMENT = Path(__file__).parents[1] / "docs" / "doctor.md"
 NO_RIGHTS = [
@@ -284,12 +286,13 @@ def test_the_disk_is_judged_by_what_the_loop_writes(tmp_path: Path, monkeypatch:
     keys = {"recorder.folder": "/not/yet", "recorder.min_free_mb": 500, "camera.rate_hz": 1000}
     looked = facts(tmp_path, config=load(None, {**keys, "mirror.rows": 10, "mirror.columns": 10}))
     assert looked.bytes_per_frame == 80 * 80 * 2 + 2 * 100 * 4
-    an_hour = 500_000_000 + looked.bytes_per_frame * 1000 * 3600
+    grows = bytes_per_s(looked.config, EVERYTHING)
+    an_hour = 500_000_000 + round(grows * 3600) + 1
     for free, status in ((an_hour, "ok"), (an_hour - 10**6, "warning"), (10**6, "warning")):
         usage.free = free
         found = examine(looked)["disk"]
         assert found.status == status
-        assert ("1.0 h of 13.6 kB at 1000 Hz" in found.detail) == (free > 10**9)
+        assert (f"1.0 h of {grows * 3600 / 1e9:.1f} GB an hour at 1000 Hz" in found.detail) == (free > 10**9)
     monkeypatch.setattr(host_module.os, "access", lambda path, mode: False)
     usage.free = an_hour
     assert "not writable" in examine(looked)["disk"].detail

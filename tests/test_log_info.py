@@ -1,6 +1,7 @@
 """`lowfc info`: what it says of a log is what was written into it."""
 
 import json
+import shutil
 from collections.abc import Callable
 from pathlib import Path
 
@@ -92,6 +93,9 @@ def test_what_was_written_is_said(log: Path, lowfc: Callable[..., Result]) -> No
     }
     assert found == {
         "log": str(log),
+        "files": [str(log)],
+        "lockstep": False,
+        "selection": "",
         "bytes": log.stat().st_size,
         "state": "complete",
         "start": "2026-01-01T00:00:00.000+00:00",
@@ -164,10 +168,12 @@ def test_a_recovered_log_says_so(log: Path, lowfc: Callable[..., Result]) -> Non
 
 
 def test_several_logs_are_told_in_turn(log: Path, lowfc: Callable[..., Result]) -> None:
-    assert lowfc(log, log).stdout == f"{lowfc(log).stdout}\n{lowfc(log).stdout}"
-    done = lowfc(log, log, "--json")
+    other = log.with_name("other.mcap")
+    shutil.copy(log, other)
+    assert lowfc(log, other).stdout == f"{lowfc(log).stdout}\n{lowfc(other).stdout}"
+    done = lowfc(log, other, "--json")
     assert isinstance(done.exception, ConfigurationError)
-    assert str(done.exception) == "--json prints one object: name one log"
+    assert str(done.exception) == "--json prints one object: name one log, not 2 (night.mcap, other.mcap)"
 
 
 def test_an_empty_log_is_a_log(tmp_path: Path, lowfc: Callable[..., Result]) -> None:

@@ -134,6 +134,7 @@ def test_everything_is_recorded_verbatim(bench: Bench) -> None:
     assert len(list(reader)) == len(messages)
     assert reader.metadata == {
         "lowfc": {"run": "night"},
+        "part": {"of": path.stem, "number": "1"},
         "recording": {"messages": str(len(messages)), "messages_lost": "0"},
     }
     final = [wire.Health.FromString(m.payload) for m in messages if m.key == HEALTH.at("camera")][-1]
@@ -348,7 +349,7 @@ RECORD = """
 import sys
 from pathlib import Path
 from lowfc.adapters.run import open_run
-from lowfc.programs.recording.recorder import record
+from lowfc.programs.recording.process import record
 run, logs, toml = sys.argv[1:]
 summary = record(open_run(run), Path(logs), configuration=Path(toml), seed=7)
 print(summary.messages, sum(summary.lost.values()), summary.failure)

@@ -36,7 +36,7 @@ RECORDERS = """
 import os, signal, sys
 from pathlib import Path
 from lowfc.adapters.run import open_run
-from lowfc.programs.recording.recorder import record
+from lowfc.programs.recording.process import record
 signal.signal(signal.SIGHUP, signal.SIG_DFL)  # tests under nohup would leave it ignored
 folder, *runs = sys.argv[1:]
 for run in runs:

@@ -190,7 +190,7 @@ def test_what_fails_half_way_leaves_nothing(
     def fail(*_: object) -> None:
         raise fault
 
-    monkeypatch.setattr(recovery, "_account", fail)  # all messages are written by then
+    monkeypatch.setattr(recovery, "account", fail)  # all messages are written by then
     with pytest.raises((KeyboardInterrupt, DataFileError)) as caught:
         recover(part, tmp_path / "new.mcap")
     assert isinstance(caught.value, KeyboardInterrupt) or "cannot be written: No space left" in str(caught.value)

@@ -7,6 +7,7 @@ from google.protobuf.message import DecodeError
 
 from lowfc.adapters.bus import Sample
 from lowfc.adapters.gaps import Gaps
+from lowfc.adapters.log_selection import EVERYTHING, Selection
 from lowfc.adapters.names import LONGEST_NAME, MOST_NAMES, Names
 from lowfc.contract.envelope import count_of, start_of
 from lowfc.contract.messages import EVENT, HEALTH, Log, Topic, topic_of, wire
@@ -42,11 +43,13 @@ class _Tally:
     def sent(self) -> int:
         return max(self.gaps.next + self.twice, self.published) - self.gaps.first
 
-    def enter(self, count: int, *, recorded: bool) -> None:
+    def enter(self, count: int, *, recorded: bool, unwanted: bool) -> None:
         if count >= self.gaps.first:
             new = self.gaps.came(count)
             self.recorded += recorded
             self.twice += recorded and not new
+            if unwanted:  # the disk cannot lose it
+                self.safe = self.safe[0] + 1, self.safe[1] + (not new)
 
     def absorb(self, other: "_Tally") -> None:
         self.published += other.sent
@@ -63,17 +66,24 @@ class Ledger:
         starts: how many starts of publishers have been counted, of each topic apart.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, selection: Selection = EVERYTHING) -> None:
+        """Nothing has been received; topics of a log that `selection` thins out are not accounted for."""
+        self._selection = selection
         self.names = Names()
         self.starts = 0
         self._authors: set[str] = set()
         self._tallies: dict[tuple[str, str], dict[int, _Tally]] = {}
 
-    def enter(self, topic: Topic, sample: Sample, *, recorded: bool) -> None:
-        """Account for a message; the first one of a publisher's start is its beginning."""
+    def enter(self, topic: Topic, sample: Sample, *, recorded: bool, unwanted: bool = False) -> None:
+        """Account for a message; the first one of a publisher's start is its beginning.
+
+        One that is left out of the log on purpose counts as recorded, and is `unwanted`.
+        """
+        if not self._selection.counts(topic):
+            return
         count = count_of(sample.sequence)
         tally = self._tally(sample.key, self._author(topic, sample), start_of(sample.sequence), count)
-        tally.enter(count, recorded=recorded)
+        tally.enter(count, recorded=recorded or unwanted, unwanted=unwanted)
 
     def believe(self, sample: Sample, health: wire.Health) -> None:
         """Take over what a publisher says it sent; what it sent before it was first heard does not count as lost.
@@ -83,7 +93,7 @@ class Ledger:
         """
         for count in health.topics:
             topic = _published(health.process, count.topic)
-            if topic is not None:
+            if topic is not None and self._selection.counts(topic):
                 self.names.admit(topic, count.topic)
                 author = self._known(health.process) if topic is EVENT else ""
                 tally = self._tally(count.topic, author, start_of(sample.sequence), count.published)

@@ -11,6 +11,7 @@ from mcap.records import Attachment, Channel, Metadata, Schema
 
 from lowfc.adapters.log_chunk import Chunk, UnsoundError
 from lowfc.adapters.log_records import HEAD, Damage, LogFile, parsed
+from lowfc.adapters.log_selection import Selection
 from lowfc.adapters.log_writer import START_KEY
 from lowfc.contract.envelope import COUNT_BITS, sequence_of
 from lowfc.contract.errors import DataFileError
@@ -46,7 +47,7 @@ class LogReader:
     Nothing is delivered of a chunk that is not as it was written.
 
     Attributes:
-        path: of the log.
+        path: of the log; `paths` are its files, this one alone.
         size: bytes of it; of one that is still growing, when reading began.
         position: bytes read so far.
         described: the metadata and attachments met so far, in their order; those of the start are there with the first
@@ -78,6 +79,7 @@ class LogReader:
             always: topics of which nothing is left out for that.
         """
         self.path = path
+        self.paths: tuple[Path, ...] = (path,)
         self.size = 0
         self.position = 0
         self.described: list[Metadata | Attachment] = []
@@ -107,6 +109,11 @@ class LogReader:
     def attachments(self) -> dict[str, bytes]:
         """Attachments met so far, by name."""
         return {record.name: record.data for record in self.described if isinstance(record, Attachment)}
+
+    @property
+    def selection(self) -> Selection:
+        """What the log was made to hold."""
+        return Selection.of(self.metadata)
 
     def __iter__(self) -> Iterator[Logged]:
         """Messages in the order they were recorded; a reader reads once.

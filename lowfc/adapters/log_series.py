@@ -9,7 +9,7 @@ from pathlib import Path
 
 from lowfc.adapters.bus import Sample
 from lowfc.adapters.clock import Clock
-from lowfc.adapters.log_writer import FILE_MODE, Attachment, LogWriter, log_path
+from lowfc.adapters.log_writer import FILE_MODE, PART, Attachment, LogWriter, log_path
 from lowfc.contract.errors import DataFileError
 
 
@@ -31,6 +31,7 @@ class Limits:
 
 
 STANDARD = Limits()
+_TELLING_S = 10.0  # of a recording, after which its growth is that of the loop and not of its beginning
 
 
 class LogSeries:
@@ -57,7 +58,8 @@ class LogSeries:
         self._attachments = attachments
         self._limits = limits
         self._log: LogWriter | None = None
-        self._opened_s = 0.0
+        self._opened_s = self._recorded_s = 0.0
+        self._recording, self._part = "", 0
         self._messages = self._bytes = self._longest_write_ns = 0
         self._finisher = ThreadPoolExecutor(1, "finish-log")
         self._finishing: tuple[LogWriter, Future[int]] | None = None
@@ -78,6 +80,12 @@ class LogSeries:
         return max(self._longest_write_ns, self._log.longest_write_ns if self._log else 0)
 
     @property
+    def bytes_per_s(self) -> float:
+        """How the logs have grown, in bytes per second; 0 where it was too short to tell."""
+        recorded_s = self._recorded_s + (time.monotonic() - self._opened_s if self._log else 0.0)
+        return self.bytes_written / recorded_s if recorded_s >= _TELLING_S else 0.0
+
+    @property
     def full(self) -> bool:
         """Whether it is time for the next log."""
         return self._log is not None and (
@@ -85,16 +93,19 @@ class LogSeries:
             or time.monotonic() - self._opened_s >= self._limits.longest_s
         )
 
-    def begin(self, first: Iterable[Sample]) -> None:
-        """Begin a log, with the messages that those in it depend on.
+    def begin(self, first: Iterable[Sample], *, anew: bool = True) -> None:
+        """Begin a log, with the messages that those in it depend on; unless `anew`, as the next part of the last one.
 
         Raises:
             DataFileError: it cannot be made.
         """
         now_ns = self._clock.host_ns()
-        self._log = LogWriter(
-            log_path(self._folder, now_ns), now_ns, self._metadata, self._attachments, self._limits.file_mode
-        )
+        path = log_path(self._folder, now_ns)
+        if anew:
+            self._recording, self._part = path.stem, 0
+        self._part += 1
+        metadata = {**self._metadata, PART: {"of": self._recording, "number": str(self._part)}}
+        self._log = LogWriter(path, now_ns, metadata, self._attachments, self._limits.file_mode)
         self._opened_s = time.monotonic()
         self.files.append(self._log.path)
         for sample in first:
@@ -154,6 +165,7 @@ class LogSeries:
     def _put_away(self) -> LogWriter:
         assert self._log is not None  # noqa: S101  # for the type checker
         log, self._log = self._log, None
+        self._recorded_s += time.monotonic() - self._opened_s
         self._messages += log.messages_written
         self._bytes += log.bytes_written
         self._longest_write_ns = max(self._longest_write_ns, log.longest_write_ns)
@@ -186,11 +198,8 @@ def shortage(folder: Path, min_free_bytes: int) -> str:
     Raises:
         DataFileError: the folder cannot be looked at.
     """
-    there = folder.absolute()
-    while not there.exists() and there != there.parent:
-        there = there.parent  # it will be made
     try:
-        free_bytes = shutil.disk_usage(there).free
+        free_bytes = shutil.disk_usage(existing(folder)).free
     except OSError as fault:
         raise DataFileError(f"{folder} cannot be looked at: {fault.strerror}") from fault
     if free_bytes >= min_free_bytes:
@@ -199,3 +208,11 @@ def shortage(folder: Path, min_free_bytes: int) -> str:
         f"the disk of {folder} has {free_bytes / 1e6:.0f} MB free, and recorder.min_free_mb is "
         f"{min_free_bytes / 1e6:.0f}; make room, record elsewhere (recorder.folder) or lower it"
     )
+
+
+def existing(folder: Path) -> Path:
+    """A folder, or as long as it has not been made the one that it will be made in."""
+    there = folder.absolute()
+    while not there.exists() and there != there.parent:
+        there = there.parent
+    return there

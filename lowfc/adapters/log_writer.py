@@ -39,6 +39,9 @@ FILE_MODE = 0o640
 """Permissions of a log, of which the process's umask may take more away: notes and frames are not for everybody."""
 
 CHUNK_BYTES = 240 * 1024  # a chunk is closed by the message that passes this; with a frame it stays below 256 KiB
+PART = "part"
+"""Name of the metadata that says which recording a log belongs to, and where in it."""
+
 START_KEY = "start_s"
 """Of a channel's metadata: the upper half of the sequences in it."""
 

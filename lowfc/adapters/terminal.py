@@ -4,7 +4,7 @@ import errno
 import os
 import signal
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from pathlib import Path
 from typing import Annotated, Any, NoReturn
 
@@ -12,17 +12,34 @@ import typer
 
 from lowfc.adapters.run import DEFAULT_RUN
 from lowfc.contract.configuration import Configuration, load
-from lowfc.contract.errors import ConfigurationError, LowfcError
+from lowfc.contract.errors import LowfcError
 from lowfc.contract.printable import LINES, printable
 
 INTERRUPTED = 130
 """Exit status after Ctrl-C."""
 
-__all__ = ["DEFAULT_RUN", "AnyRun", "ConfigFile", "Json", "RunId", "configuration", "new_app", "run_app"]
+__all__ = [
+    "DEFAULT_RUN",
+    "AnyRun",
+    "ConfigFile",
+    "Json",
+    "Logs",
+    "LogsIfAny",
+    "RunId",
+    "configuration",
+    "new_app",
+    "run_app",
+]
 
 RunId = Annotated[str, typer.Option("--run", help="Name of the run; processes of one run find each other by it.")]
 AnyRun = Annotated[str | None, typer.Option("--run", help="Name of the run; default: the only one.")]
 Json = Annotated[bool, typer.Option("--json", help="Print one JSON object on standard output.")]
+_LOGS = "Logs (MCAP), finished or not; all files of a recording are one log. `last`: the newest in the log folder."
+Logs = Annotated[list[Path], typer.Argument(help=_LOGS, metavar="LOG...", readable=False, show_default=False)]
+LogsIfAny = Annotated[
+    list[Path] | None,
+    typer.Argument(help=f"{_LOGS} None: a running loop.", metavar="[LOG...]", readable=False, show_default=False),
+]
 ConfigFile = Annotated[Path | None, typer.Option("--config", help="Configuration file (TOML).", show_default=False)]
 
 
@@ -61,18 +78,6 @@ def run_app(app: Callable[[], object]) -> NoReturn:
             sys.stderr.write("interrupted\n")
         raise
     sys.exit(0)
-
-
-def one_log(logs: Sequence[Path], out: Path | None, *, as_json: bool) -> None:
-    """Refuse several logs where there is one place for what is made of them.
-
-    Raises:
-        ConfigurationError: there are several.
-    """
-    if len(logs) > 1 and as_json:
-        raise ConfigurationError("--json prints one object: name one log")
-    if len(logs) > 1 and out is not None:
-        raise ConfigurationError("--out is one file: name one log")
 
 
 def configuration(

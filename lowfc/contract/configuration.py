@@ -143,6 +143,10 @@ class Recorder(Section):
     """Age at which a log is finished and the next one begun."""
     min_free_mb: float = Field(500.0, ge=0, le=1_000_000_000)
     """Free space on the disk below which recording is refused, or ends with a complete log while the loop goes on."""
+    every: int = Field(1, ge=1, le=1_000_000)
+    """Record every Nth frame and mirror state only; steps and commands are always whole. 1: all, as replay needs."""
+    topics: list[str] = Field(default_factory=list)
+    """Of frames, mirror state, mirror surface, truth and timing, the topics or patterns to record; empty for all."""
 
 
 class Realtime(Section):

@@ -57,6 +57,7 @@ class Topic:
         newest_only: who looks at a run wants the newest only, and gets no more than eyes can follow.
         reader: who waits for it, and gets it by a way of its own from its publisher on the same host.
         shared: on one host others may put it too, so that its reader hears the bus beside its own way.
+        optional: a recording may leave it out; what the others say of the run needs none of it.
         sentence: what it is.
     """
 
@@ -72,6 +73,7 @@ class Topic:
     newest_only: bool = False
     reader: Role | None = None
     shared: bool = False
+    optional: bool = False
 
     def at(self, name: str) -> str:
         """Key of this topic for the mirror or process `name`."""
@@ -103,6 +105,7 @@ FRAME = Topic(
     "Sensor image, mono16, DN; its time is the end of the exposure.",
     newest_only=True,
     reader=Role.CONTROLLER,
+    optional=True,
 )
 CAMERA_STATE = Topic(
     "lowfc/camera/state", wire.CameraState, 2.0, _CAMERA, EVERYBODY, "The camera's settings.", queryable=True
@@ -124,6 +127,7 @@ TIMING = Topic(
     _WATCHERS,
     "How long each stage of each step took.",
     timeless=False,
+    optional=True,
 )
 CONTROLLER_STATE = Topic(
     "lowfc/control/state",
@@ -160,6 +164,7 @@ MIRROR_STATE = Topic(
     _CONTROLLER | _CAMERA | _WATCHERS,
     "Where the mirror is.",
     newest_only=True,
+    optional=True,
 )
 SURFACE = Topic(
     "lowfc/mirror/{name}/surface",
@@ -169,6 +174,7 @@ SURFACE = Topic(
     _WATCHERS,
     "The mirror's surface over the pupil, 32FC1, nm: for eyes.",
     newest_only=True,
+    optional=True,
 )
 TRUTH = Topic(
     "lowfc/sim/truth",
@@ -178,6 +184,7 @@ TRUTH = Topic(
     _WATCHERS,
     "What the simulation knows and no sensor does.",
     simulated_only=True,
+    optional=True,
 )
 OFFLOAD = Topic(
     "lowfc/control/offload",
@@ -214,7 +221,15 @@ CALIBRATION = Topic(
     "What turns a frame into a command.",
     queryable=True,
 )
-EVENT = Topic("lowfc/event", Log, Rate.EVENT, EVERYBODY, EVERYBODY, "A named event, from the table of events.")
+EVENT = Topic(
+    "lowfc/event",
+    Log,
+    Rate.EVENT,
+    EVERYBODY,
+    EVERYBODY,
+    "A named event, from the table of events.",
+    timeless=False,
+)
 HEALTH = Topic(
     "lowfc/health/{name}", wire.Health, 2.0, EVERYBODY, EVERYBODY, "How a process is.", timeless=False, queryable=True
 )

@@ -108,6 +108,7 @@ def sim_loop(
     from lowfc.adapters.realtime import spread
     from lowfc.adapters.rerun_viewer import Show, has_screen
     from lowfc.contract.configuration import sensor_keys
+    from lowfc.programs.recording.volume import outlook
     from lowfc.programs.sim_loop import sim_loop as run
     from lowfc.programs.start_up import check_files
     from lowfc.programs.status import summary_text
@@ -130,6 +131,8 @@ def sim_loop(
         raise ConfigurationError("a view is in one place: choose --view or --web")
     if has_screen() and not (view_ or web):
         _print("to look at it: lowfc view", error=True)
+    if not no_record:
+        _print(outlook(settings), error=True)
     show = Show.NATIVE if view_ else Show.WEB if web else None
     figures = run(settings, duration, not no_record, show, name)
     put(figures, summary_text(figures), as_json=as_json)
@@ -196,6 +199,14 @@ def record(
     min_free_mb: Annotated[
         float | None, typer.Option(help="Free space on the disk below which nothing is recorded.")
     ] = None,
+    every: Annotated[
+        int | None, typer.Option(min=1, help="Record every Nth frame and mirror state; steps and commands are whole.")
+    ] = None,
+    topics: Annotated[
+        list[str] | None,
+        typer.Option(help="Of frames, mirror state and surface, truth and timing, only these; repeat."),
+    ] = None,
+    words: Annotated[list[str] | None, typer.Argument(hidden=True)] = None,
     as_json: Json = False,
 ) -> None:
     """Record a run's messages into MCAP logs until told to stop.
@@ -206,17 +217,24 @@ def record(
     from lowfc.adapters.log_series import Limits
     from lowfc.adapters.run import open_run
     from lowfc.adapters.whole_file import write_whole
-    from lowfc.programs.recording.recorder import record as run_recorder
+    from lowfc.programs.recording.process import record as run_recorder
     from lowfc.programs.recording.summary import figures, report
+    from lowfc.programs.recording.volume import bytes_per_s, outlook, selected
 
     overrides = {
         "recorder.folder": folder,
         "recorder.largest_mb": largest_mb,
         "recorder.longest_s": longest_s,
         "recorder.min_free_mb": min_free_mb,
+        "recorder.every": every,
+        "recorder.topics": topics or None,
     }
+    if words:
+        hint = f"; `lowfc ctl record {words[0]}` asks a recorder that runs" if words[0] in ("start", "stop") else ""
+        raise ConfigurationError(f"lowfc record takes options only, got {' '.join(words)!r}{hint}")
     settings = configuration(config, overrides)
-    log = settings.recorder
+    log, recorded = settings.recorder, selected(settings)
+    _print(outlook(settings), error=True)
     joined = open_run(run, (settings.mirror.name,), network=settings.network)
     complete = joined.path / "config.toml"  # a file may name only what was chosen; the log names every value
     write_whole(complete, settings.to_toml().encode())
@@ -230,6 +248,8 @@ def record(
         clock=clock_of(settings),
         priority=(settings.realtime.priority and settings.realtime.recorder_priority) or None,
         cpus=set(settings.realtime.recorder_cpus) or None,
+        selection=recorded,
+        expected_bytes_per_s=bytes_per_s(settings, recorded),
     )
     if as_json:
         _print(json.dumps(figures(done)))

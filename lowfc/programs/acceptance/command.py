@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
 
 import typer
 
-from lowfc.adapters.terminal import AnyRun, Json, configuration, new_app
+from lowfc.adapters.terminal import AnyRun, Json, LogsIfAny, configuration, new_app
 from lowfc.contract.errors import ConfigurationError, DataFileError
 from lowfc.programs.modes import Modes, noll_of
 from lowfc.programs.output import put
@@ -24,10 +24,6 @@ acceptance_app = new_app(
     "Exit status 0 only where it passed.\n\nExample: lowfc acceptance rejection"
 )
 
-Log = Annotated[
-    Path | None,
-    typer.Argument(help="Log in which the test was carried out; without one, the running loop.", show_default=False),
-]
 Plot = Annotated[Path | None, typer.Option(help="Draw it into this file (PNG).", show_default=False)]
 Required = Annotated[
     Path | None,
@@ -37,7 +33,7 @@ Required = Annotated[
 
 @acceptance_app.command()
 def rejection(
-    log: Log = None,
+    logs: LogsIfAny = None,
     duration: Annotated[float, typer.Option(min=0.1, max=1e5, help="Seconds of the multisine.")] = 60.0,
     rms_nm: Annotated[float, typer.Option(min=1e-3, max=1e3, help="Wavefront rms of each mode.")] = 5.0,
     lines: Annotated[int, typer.Option(min=1, max=1000, help="Frequencies of each mode.")] = 12,
@@ -55,13 +51,13 @@ def rejection(
     from lowfc.programs.acceptance import rejection as test
 
     how = test.Excitation(duration, rms_nm, lines, noll_of(modes), seed)
-    of = _measured(test.KIND, Where(log, run, config, plot), lambda live, must: [test.play(live, how, must)])
+    of = _measured(test.KIND, Where(logs, run, config, plot), lambda live, must: [test.play(live, how, must)])
     _say(test.figures(of.every[-1], of.required), test.render, test.draw, plot, as_json)
 
 
 @acceptance_app.command()
 def linearity(
-    log: Log = None,
+    logs: LogsIfAny = None,
     hold: Annotated[int, typer.Option(min=2, help="Frames at each level.")] = 10,
     cycles: Annotated[int, typer.Option(min=2, help="Times that each amplitude is pushed and pulled.")] = 20,
     modes: Modes = None,
@@ -77,13 +73,13 @@ def linearity(
     from lowfc.programs.acceptance import linearity as test
 
     how = test.Staircase(hold, cycles, noll_of(modes))
-    of = _measured(test.KIND, Where(log, run, config, plot), lambda live, must: test.play(live, how, must))
+    of = _measured(test.KIND, Where(logs, run, config, plot), lambda live, must: test.play(live, how, must))
     _say(test.figures(of.every, of.required), test.render, test.draw, plot, as_json)
 
 
 @acceptance_app.command("capture-range")
 def capture_range(
-    log: Log = None,
+    logs: LogsIfAny = None,
     modes: Modes = None,
     config: Required = None,
     run: AnyRun = None,
@@ -97,13 +93,13 @@ def capture_range(
     from lowfc.programs.acceptance import capture as test
 
     wanted = noll_of(modes)
-    of = _measured(test.KIND, Where(log, run, config, plot), lambda live, must: test.play(live, wanted, must))
+    of = _measured(test.KIND, Where(logs, run, config, plot), lambda live, must: test.play(live, wanted, must))
     _say(test.figures(of.every, of.required), test.render, test.draw, plot, as_json)
 
 
 @acceptance_app.command("noise-floor")
 def noise_floor(
-    log: Log = None,
+    logs: LogsIfAny = None,
     duration: Annotated[float, typer.Option(min=0.01, max=1e5, help="Seconds open, and seconds closed.")] = 10.0,
     config: Required = None,
     run: AnyRun = None,
@@ -116,7 +112,7 @@ def noise_floor(
     """
     from lowfc.programs.acceptance import noise as test
 
-    of = _measured(test.KIND, Where(log, run, config, plot), lambda live, must: test.play(live, duration))
+    of = _measured(test.KIND, Where(logs, run, config, plot), lambda live, must: test.play(live, duration))
     figures = test.figures(of.every, of.required, of.configuration, of.calibration)
     _say(figures, test.render, test.draw, plot, as_json)
 
@@ -124,7 +120,7 @@ def noise_floor(
 class Where(NamedTuple):
     """The log, or the run, that is measured; the configuration with the requirements; what is drawn into."""
 
-    log: Path | None
+    logs: list[Path] | None
     run: str | None
     config: Path | None
     plot: Path | None
@@ -146,7 +142,7 @@ def _measured(kind: "Kind", where: Where, play: "Callable[[Live, Acceptance], li
 
     from lowfc.adapters.drawing import figure_class
     from lowfc.adapters.history_reader import read_history
-    from lowfc.adapters.log_reader import LogReader
+    from lowfc.adapters.log_parts import WholeLog, the_one
     from lowfc.adapters.progress import counting_bar
     from lowfc.adapters.whole_file import require_folder
     from lowfc.client import Client
@@ -154,23 +150,24 @@ def _measured(kind: "Kind", where: Where, play: "Callable[[Live, Acceptance], li
     from lowfc.programs.acceptance.played import logged
     from lowfc.programs.log.guard import refuse_log
 
-    log, run, config, plot = where
+    logs, run, config, plot = where
     required = configuration(config).acceptance if config is not None else None
     require_folder(plot)
     if plot is not None:
         figure_class()  # says before the measurement that it could not be drawn
-    if log is not None:
+    if logs:
         if run is not None:
             raise ConfigurationError("a log, or a running loop (--run): choose one")
+        log = WholeLog(the_one(logs), skip_damaged=True)
         if plot is not None:
-            refuse_log(plot, log)
-        history = read_history(LogReader(log, skip_damaged=True))
+            refuse_log(plot, log.path)
+        history = read_history(log)
         for remark in history.remarks:
             sys.stderr.write(f"warning: {remark}\n")
         every = logged(history, kind)
         known, calibration = history.configuration, history.calibration
         if known is None or calibration is None:
-            raise DataFileError(f"{log}: has no configuration, which says what is required")
+            raise DataFileError(f"{log.path}: has no configuration, which says what is required")
         return Measured(every, required or known.acceptance, known, calibration)
     with Client(run) as client, counting_bar(Console(stderr=True), TimeRemainingColumn()) as count:
         live = Live(client, partial(count, kind))

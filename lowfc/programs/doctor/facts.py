@@ -8,9 +8,8 @@ from typing import NamedTuple
 from lowfc.adapters.host import Host
 from lowfc.adapters.trial import Trial
 from lowfc.contract.configuration import Configuration
-from lowfc.optics.sensor import Sensor
-
-_BYTES_PER_PIXEL, _BYTES_PER_ACTUATOR = 2, 4
+from lowfc.contract.messages import COMMAND, FRAME, MIRROR_STATE
+from lowfc.programs.recording.volume import payload_bytes
 
 
 class Status(StrEnum):
@@ -73,8 +72,8 @@ class Facts:
     @property
     def bytes_per_frame(self) -> int:
         """Of a frame, its command and the mirror's state; all else that is sent for a frame is small."""
-        mirror = self.config.mirror
-        return Sensor.pixels**2 * _BYTES_PER_PIXEL + 2 * mirror.rows * mirror.columns * _BYTES_PER_ACTUATOR
+        sizes = payload_bytes(self.config)
+        return sizes[FRAME] + sizes[COMMAND] + sizes[MIRROR_STATE]
 
     @property
     def bytes_per_s(self) -> float:

@@ -16,6 +16,7 @@ from lowfc.adapters.own_certificate import WARN_DAYS
 from lowfc.adapters.rerun_viewer import ViewerError, has_screen, viewer_binary, vulkan_drivers
 from lowfc.adapters.routed import ending_certificates
 from lowfc.programs.doctor.facts import Facts, Finding, note, ok, warning
+from lowfc.programs.recording.volume import bytes_per_s, selected
 
 _STALL_S = 0.1
 _SHARED_BYTES = 64e6
@@ -128,17 +129,18 @@ def shared_memory(facts: Facts) -> Finding:
 
 
 def disk(facts: Facts) -> Finding:
-    """Room for logs in `recorder.folder`, and how long it lasts at `camera.rate_hz`, as if nothing could be compressed.
+    """Room for logs in `recorder.folder`, and how long it lasts at `camera.rate_hz`, as the recorder reckons.
 
     Less than one log of `recorder.longest_s`, or nothing may be written there.
     """
     section, rate_hz = facts.config.recorder, facts.config.camera.rate_hz
     folder = Path(section.folder)
     free_bytes, _, writable = facts.host.disk(folder)
-    lasts_s = max(0.0, free_bytes - section.min_free_mb * 1e6) / facts.bytes_per_s
+    grows = bytes_per_s(facts.config, selected(facts.config))
+    lasts_s = max(0.0, free_bytes - section.min_free_mb * 1e6) / grows
     detail = (
         f"{folder.absolute()}: {free_bytes / 1e9:.1f} GB free, {lasts_s / 3600:.1f} h of "
-        f"{facts.bytes_per_frame / 1e3:.1f} kB at {rate_hz:g} Hz"
+        f"{grows * 3.6e-6:.1f} GB an hour at {rate_hz:g} Hz"
     )
     if not writable:
         return warning(f"{detail}; not writable", "set recorder.folder to a folder of yours", "nothing is recorded")

@@ -39,7 +39,7 @@ from google.protobuf.message import DecodeError
 
 from lowfc.adapters.bus import name_in
 from lowfc.adapters.history import History
-from lowfc.adapters.log_reader import LogReader
+from lowfc.adapters.log_parts import WholeLog
 from lowfc.contract.codec import actuators
 from lowfc.contract.envelope import count_of
 from lowfc.contract.errors import DataFileError
@@ -219,7 +219,7 @@ def _copy_commands(
     """The command made from each step's frame, (steps, actuators) in m, into a new extension."""
     sequence = history.steps.sequence
     shape = (len(sequence), calibration.grid[0] * calibration.grid[1])
-    log = LogReader(history.log.path, topics=(COMMAND,), skip_damaged=True)
+    log = WholeLog(history.log.paths, topics=(COMMAND,), skip_damaged=True)
     there = {int(one): row for row, one in reversed(list(enumerate(sequence)))}
     with fits_rows(path, image, shape, ">f4") as rows:
         for message in log:

@@ -10,6 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from lowfc.adapters.history import History
+from lowfc.adapters.log_parts import Parts, WholeLog
 from lowfc.adapters.log_reader import LogReader
 from lowfc.contract.codec import decode_frame
 from lowfc.contract.errors import DataFileError
@@ -104,7 +105,7 @@ def copy_frames(
         DataFileError: there is no frame, or they have several sizes.
     """
     path, count = history.log.path, history.frame_sequence.size
-    found = _frames(path, count, progress)
+    found = _frames(history.log.paths, count, progress)
     first = next(found, None)
     if first is None:
         raise DataFileError(f"{path} has no frames; export without --frames")
@@ -117,8 +118,8 @@ def copy_frames(
     return sequence, time_ns
 
 
-def _frames(path: Path, count: int, progress: Progress) -> Iterator[tuple[int, int, npt.NDArray[np.uint16]]]:
-    log = LogReader(path, topics=(FRAME,), skip_damaged=True)
+def _frames(files: Parts, count: int, progress: Progress) -> Iterator[tuple[int, int, npt.NDArray[np.uint16]]]:
+    log = WholeLog(files, topics=(FRAME,), skip_damaged=True)
     shape: tuple[int, ...] | None = None
     for message in itertools.islice(log, count):
         frame = decode_frame(message.payload, message.sequence, 0)
@@ -126,7 +127,7 @@ def _frames(path: Path, count: int, progress: Progress) -> Iterator[tuple[int, i
         shape = shape or size
         if frame.pixels is None or size != shape:
             raise DataFileError(
-                f"{path}: frame {frame.sequence} is {size}, others are {shape}: they make no cube; "
+                f"{log.path}: frame {frame.sequence} is {size}, others are {shape}: they make no cube; "
                 "export without --frames"
             )
         yield frame.sequence, frame.time_ns, frame.pixels

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from lowfc.adapters.terminal import ConfigFile, configuration
+from lowfc.adapters.terminal import ConfigFile, LogsIfAny, configuration
 from lowfc.adapters.whole_file import require_folder, write_whole
 from lowfc.contract.errors import ConfigurationError, DataFileError
 
@@ -30,10 +30,7 @@ class Camera(StrEnum):
 
 
 def latency(
-    log: Annotated[
-        Path | None,
-        typer.Argument(help="A log (MCAP): the same table of a past run. Default: measure now.", show_default=False),
-    ] = None,
+    logs: LogsIfAny = None,
     duration: Annotated[float, typer.Option(min=0.5, max=1e5, help="Seconds of each repeat.")] = 10.0,
     rate: Annotated[float | None, typer.Option(help="Frames per second; default: the file's, or 1000.")] = None,
     free_running: Annotated[
@@ -70,8 +67,8 @@ def latency(
         from lowfc.adapters.drawing import figure_class
 
         figure_class()  # before the work, where it is not there
-    if log is not None:
-        figures = _of_log(log)
+    if logs:
+        figures = _of_log(logs)
     else:
         settings = _configuration(config, rate, camera, plain=plain_scheduling)
         if camera is Camera.SIMULATED and free_running:
@@ -163,18 +160,20 @@ def _clock_source() -> str:
         return ""
 
 
-def _of_log(path: Path) -> dict[str, Any]:
+def _of_log(names: list[Path]) -> dict[str, Any]:
     """The same figures of a log."""
     from rich.console import Console
 
+    from lowfc.adapters.log_parts import the_one, titled
     from lowfc.adapters.progress import reading_bar
     from lowfc.programs.latency.log import log_figures
     from lowfc.programs.latency.summary import together
 
+    log = the_one(names)
     with reading_bar(Console(stderr=True)) as bar:
-        task = bar.add_task(f"reading {path.name}", total=None)
-        figures, host = log_figures(path, lambda position, size: bar.update(task, completed=position, total=size))
-    return together([figures]) | {"settings": {"log": str(path)}, "host": host}
+        task = bar.add_task(f"reading {titled(log)}", total=None)
+        figures, host = log_figures(log, lambda position, size: bar.update(task, completed=position, total=size))
+    return together([figures]) | {"settings": {"log": str(log[0])}, "host": host}
 
 
 def _compare(files: tuple[Path, Path], *, as_json: bool) -> None:

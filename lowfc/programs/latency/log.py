@@ -1,13 +1,12 @@
 """Latencies of a past run, from the envelopes in its log and the controller's own timing."""
 
 from collections.abc import Callable
-from pathlib import Path
 from typing import Any
 
 from google.protobuf.message import DecodeError
 
 from lowfc.adapters.bus import name_in
-from lowfc.adapters.log_reader import LogReader
+from lowfc.adapters.log_parts import LogFiles, WholeLog
 from lowfc.adapters.rows import Columns, TimingRows
 from lowfc.contract.errors import DataFileError
 from lowfc.contract.messages import COMMAND, FRAME, HEALTH, MIRROR_STATE, TIMING, Role, wire
@@ -17,11 +16,11 @@ _EVERY = 5000
 _LOOP = frozenset({Role.CAMERA, Role.CONTROLLER, Role.MIRROR})
 
 
-def log_figures(path: Path, progress: Callable[[int, int], None]) -> tuple[dict[str, Any], dict[str, Any]]:
+def log_figures(files: LogFiles, progress: Callable[[int, int], None]) -> tuple[dict[str, Any], dict[str, Any]]:
     """Figures of one log as of one repeat, and what its metadata say of the host.
 
     Args:
-        path: of the log, finished or not.
+        files: of the log, finished or not.
         progress: told now and then how many bytes of how many are read.
 
     Returns:
@@ -31,7 +30,7 @@ def log_figures(path: Path, progress: Callable[[int, int], None]) -> tuple[dict[
     Raises:
         DataFileError: this is no log, it is damaged, or it has no frame whose timing is known.
     """
-    log = LogReader(path, topics=(FRAME, COMMAND, MIRROR_STATE, TIMING, HEALTH))
+    log = WholeLog(files, topics=(FRAME, COMMAND, MIRROR_STATE, TIMING, HEALTH))
     frames, commands = Columns(sequence="Q", publish_ns="q"), Columns(sequence="Q")
     states, timings = Columns(sequence="Q", publish_ns="q"), TimingRows()
     controller = wire.Health()
@@ -61,8 +60,8 @@ def log_figures(path: Path, progress: Callable[[int, int], None]) -> tuple[dict[
     figures = repeat_figures(join(*sent, None, timings.taken(), mirror, commands.taken("sequence")))
     if "frame_to_command" not in figures["latency_us"]:
         raise DataFileError(
-            f"{path} has no frame after the first half second whose timing the controller told; it is too short, or of "
-            "no loop"
+            f"{log.path} has no frame after the first half second whose timing the controller reported; it is too "
+            "short, or of no loop"
         )
     host: dict[str, Any] = dict(log.metadata.get("lowfc", {}))
     host |= {"granted": list(controller.granted), "refused": list(controller.refused)}

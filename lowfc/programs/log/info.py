@@ -3,12 +3,11 @@
 import json
 import sys
 from collections.abc import Mapping
-from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from lowfc.adapters.terminal import one_log
+from lowfc.adapters.terminal import Json, Logs
 from lowfc.contract.printable import LINES, printable
 
 if TYPE_CHECKING:
@@ -17,29 +16,36 @@ if TYPE_CHECKING:
 _WIDTH = 120  # of the report, where there is no terminal
 _STATES = {
     "complete": "complete",
-    "truncated": "truncated: its recorder died or still writes it; `lowfc recover` makes it complete",
+    "truncated": "truncated: its recorder was killed, or is still writing; `lowfc recover` makes it complete",
     "damaged": "damaged; `lowfc recover` saves what is whole",
 }
 
 
 def info(
-    logs: Annotated[list[Path], typer.Argument(help="Logs (MCAP), finished or not.", metavar="LOG...", readable=False)],
-    as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object on standard output.")] = False,
+    logs: Logs,
+    digest: Annotated[
+        bool, typer.Option("--digest", help="SHA-256 of what is deterministic: the same for lockstep runs of one seed.")
+    ] = False,
+    as_json: Json = False,
 ) -> None:
     """Say what ran, when, what was recorded of each topic, and what is missing or damaged.
 
-    Example: lowfc info logs/20270101T220000Z.mcap
+    Example: lowfc info last --digest
     """
     from rich.console import Console
 
+    from lowfc.adapters.log_parts import one_by_one, titled
     from lowfc.adapters.progress import reading_bar
     from lowfc.programs.log.survey import survey
 
-    one_log(logs, None, as_json=as_json)
-    for number, log in enumerate(logs):
+    for number, log in enumerate(one_by_one(logs, as_json=as_json)):
         with reading_bar(Console(stderr=True)) as bar:
-            task = bar.add_task(f"reading {log.name}", total=None)
-            found = survey(log, lambda position, size: bar.update(task, completed=position, total=size))  # noqa: B023  # not kept
+            task = bar.add_task(f"reading {titled(log)}", total=None)
+
+            def progress(position: int, size: int) -> None:
+                bar.update(task, completed=position, total=size)  # noqa: B023  # not kept
+
+            found = survey(log, progress, digest=digest)
         if as_json:
             sys.stdout.write(json.dumps(found) + "\n")
         else:
@@ -64,7 +70,8 @@ def report(found: Mapping[str, Any], console: "Console") -> None:
     for key, line in found["topics"].items():
         rate_hz = "" if line["rate_hz"] is None else f"{line['rate_hz']:.1f}"
         counts = str(line["messages"]), rate_hz, f"{line['bytes'] / 1e6:.2f}", str(line["restarts"])
-        topics.add_row(Text(printable(key)), *counts, str(line["missing"]), Text(printable(line["schema"])))
+        missing = "?" if line["missing"] is None else str(line["missing"])
+        topics.add_row(Text(printable(key)), *counts, missing, Text(printable(line["schema"])))
     if found["topics"]:
         console.print()
         console.print(topics)
@@ -72,6 +79,8 @@ def report(found: Mapping[str, Any], console: "Console") -> None:
 
 def _summary(found: Mapping[str, Any]) -> dict[str, str]:
     """All but the topics, a line each."""
+    from lowfc.adapters.log_selection import SELECTION
+    from lowfc.adapters.log_writer import PART
     from lowfc.programs.log.survey import recovery_in_words
 
     metadata, recording = found["metadata"], found["metadata"].get("recording", {})
@@ -83,7 +92,9 @@ def _summary(found: Mapping[str, Any]) -> dict[str, str]:
     if found["unreadable"]:
         lost.append(f"{found['unreadable']} unreadable: what declares them was damaged")
     lines = {
-        "log": f"{found['log']}, {found['bytes'] / 1e6:.1f} MB",
+        "log": f"{', '.join(found['files'])}, {found['bytes'] / 1e6:.1f} MB",
+        "digest": _digest(found),
+        "selection": found["selection"],
         "state": _STATES[found["state"]],
         "stopped": f"recording stopped: {recording['stopped']}" if recording.get("stopped") else "",
         "recovery": recovery_in_words(metadata),
@@ -97,7 +108,13 @@ def _summary(found: Mapping[str, Any]) -> dict[str, str]:
         **{
             name: ", ".join(f"{key} {value}" for key, value in entries.items())
             for name, entries in metadata.items()
-            if name not in ("recording", "recovery")
+            if name not in ("recording", "recovery", PART, SELECTION)
         },
     }
     return {name: value for name, value in lines.items() if value}
+
+
+def _digest(found: Mapping[str, Any]) -> str:
+    """The digest, and where it says nothing."""
+    digest = str(found.get("digest", ""))
+    return digest if not digest or found["lockstep"] else f"{digest} (not a lockstep run: no other run has it)"

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from lowfc.adapters.terminal import one_log
+from lowfc.adapters.terminal import Json, Logs
 from lowfc.programs.output import put
 
 if TYPE_CHECKING:
@@ -14,29 +14,26 @@ if TYPE_CHECKING:
 
 
 def recover(
-    logs: Annotated[
-        list[Path],
-        typer.Argument(
-            help="Logs, truncated, unfinished or damaged; they are not changed.", metavar="LOG...", readable=False
-        ),
-    ],
+    logs: Logs,
     out: Annotated[
         Path | None, typer.Option(help="The new log; default: NAME-recovered.mcap beside it.", show_default=False)
     ] = None,
-    as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object on standard output.")] = False,
+    as_json: Json = False,
 ) -> None:
-    """Make a complete, indexed log of what is whole in a truncated or damaged one; of a whole one, nothing.
+    """Make a complete, indexed log of what is whole in a truncated or damaged one, which is not changed.
+
+    Each file of a recording is recovered by itself; of a whole one nothing is made.
 
     Example: lowfc recover logs/20270101T220000Z.mcap.part
     """
     from rich.console import Console
 
+    from lowfc.adapters.log_parts import in_order
     from lowfc.adapters.log_recovery import recover as run
     from lowfc.adapters.log_recovery import recovered_path
     from lowfc.adapters.progress import reading_bar
 
-    one_log(logs, out, as_json=as_json)
-    for log in logs:
+    for log in in_order(logs, out, as_json=as_json):
         with reading_bar(Console(stderr=True)) as bar:
             task = bar.add_task(f"recovering {log.name}", total=None)
             done = run(

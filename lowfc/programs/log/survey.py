@@ -6,7 +6,6 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from functools import cache
-from pathlib import Path
 from typing import Any
 
 from google.protobuf.message import DecodeError
@@ -14,13 +13,16 @@ from google.protobuf.message import DecodeError
 from lowfc.adapters.bus import Sample
 from lowfc.adapters.history_reader import attached_configuration
 from lowfc.adapters.ledger import Ledger
-from lowfc.adapters.log_reader import Logged, LogReader
+from lowfc.adapters.log_parts import LogFiles, WholeLog
+from lowfc.adapters.log_reader import Logged
 from lowfc.adapters.log_recovery import RECOVERY
+from lowfc.adapters.log_selection import EVERYTHING, Selection
 from lowfc.contract.envelope import start_of
 from lowfc.contract.errors import BadMessageError
 from lowfc.contract.events import Level
 from lowfc.contract.messages import CONTROLLER_STATE, EVENT, HEALTH, Log, Topic, topic_of, wire
 from lowfc.control.safety import LoopMode
+from lowfc.programs.log.digest import Digest
 
 _STRIDE = 1000  # messages between two words about the progress
 _MODES = {int(mode): mode.name.lower() for mode in LoopMode}
@@ -37,7 +39,7 @@ class _Line:
     size: int = 0
     starts: set[tuple[str, int]] = field(default_factory=set)
 
-    def figures(self, missing: int) -> dict[str, Any]:
+    def figures(self, missing: int | None) -> dict[str, Any]:
         length_s = (self.last_ns - self.first_ns) / 1e9
         return {
             "messages": self.messages,
@@ -52,8 +54,10 @@ class _Line:
 class _Account:
     """What the messages of a log say."""
 
-    def __init__(self) -> None:
-        self._ledger = Ledger()
+    def __init__(self, selection: Selection = EVERYTHING) -> None:
+        """Nothing so far, of a log that holds this selection."""
+        self._selection = selection
+        self._ledger = Ledger(selection)
         self._lines: dict[str, _Line] = {}
         self._events: Counter[str] = Counter()
         self._modes: list[str] = []
@@ -88,11 +92,18 @@ class _Account:
             "duration_s": None if self._begin_ns is None else round((self._end_ns - self._begin_ns) / 1e9, 3),
             "messages": sum(line.messages for line in self._lines.values()),
             "messages_missing": sum(missing.values()),
-            "topics": {key: line.figures(missing.get(key, 0)) for key, line in sorted(self._lines.items())},
+            "topics": {
+                key: line.figures(missing.get(key, 0) if self._counts(key) else None)
+                for key, line in sorted(self._lines.items())
+            },
             "missing_topics": {key: count for key, count in missing.items() if key not in self._lines},
             "loop_modes": self._modes,
             "events": dict(self._events.most_common()),
         }
+
+    def _counts(self, key: str) -> bool:
+        topic = _topic(key)
+        return topic is None or self._selection.counts(topic)
 
     def _author(self, topic: Topic, sample: Sample) -> str:
         """Take account of what a message says; return who of several publishers sent it, on a topic that has them."""
@@ -114,31 +125,47 @@ class _Account:
         return ""
 
 
-def survey(log: Path, progress: Callable[[int, int], None] = lambda done, size: None) -> dict[str, Any]:
+def survey(
+    log: LogFiles, progress: Callable[[int, int], None] = lambda done, size: None, *, digest: bool = False
+) -> dict[str, Any]:
     """Figures of a log, from all of its messages.
 
     Args:
         log: finished or not, damaged or whole.
         progress: is told how many bytes of how many are done.
+        digest: add the `Digest`, of the log and of each topic.
 
     Raises:
         DataFileError: it is no log.
     """
-    reader, account = LogReader(log, skip_damaged=True), _Account()
+    reader, account, found = WholeLog(log, skip_damaged=True), _Account(), Digest()
     for number, message in enumerate(reader):
+        if not number:
+            account = _Account(reader.selection)
         account.enter(message)
+        topic = _topic(message.key) if digest else None
+        if topic is not None:
+            found.enter(topic, message)
         if number % _STRIDE == 0:
             progress(reader.position, reader.size)
+    configuration, remarks = attached_configuration(reader)
+    figures = account.figures()
+    for key, one in found.by_key().items():
+        figures["topics"][key]["digest"] = one
     return {
-        "log": str(log),
+        "log": str(reader.path),
+        "files": [str(path) for path in reader.paths],
+        **({"digest": found.of_log()} if digest else {}),
+        "lockstep": configuration.lockstep if configuration is not None else None,
+        "selection": reader.selection.sentence,
         "bytes": reader.size,
         "state": "damaged" if reader.damage or reader.unreadable else "complete" if reader.complete else "truncated",
-        **account.figures(),
+        **figures,
         "unreadable": reader.unreadable,
         "damage": [dataclasses.asdict(damage) for damage in reader.damage],
         "metadata": reader.metadata,
         "attachments": {name: len(data) for name, data in reader.attachments.items()},
-        "remarks": attached_configuration(reader)[1],
+        "remarks": remarks,
     }
 
 

@@ -37,8 +37,10 @@ class Others:
         return all(state == "stopped" for name, (_, state) in self._states.items() if name != but)
 
     def keep(self, sample: Sample) -> None:
-        """Take note of a calibration or state that was heard."""
-        self.kept[sample.key] = sample
+        """Take note of a calibration or state that was received, unless a newer one is known."""
+        kept = self.kept.get(sample.key)
+        if kept is None or kept.sequence <= sample.sequence:
+            self.kept[sample.key] = sample
 
     def was_asked(self, sample: Sample) -> bool:
         """Whether a message that is heard now was had already, when it was asked for; says so once."""

@@ -14,21 +14,19 @@ from types import FrameType
 
 from lowfc.adapters.backlog import Backlog
 from lowfc.adapters.bus import UNREADABLE, Bus, Sample
-from lowfc.adapters.clock import Clock, HostClock
+from lowfc.adapters.clock import Clock
 from lowfc.adapters.ledger import Ledger
-from lowfc.adapters.log_series import STANDARD, Limits, LogSeries, shortage
+from lowfc.adapters.log_selection import EVERYTHING, Selection
+from lowfc.adapters.log_series import STANDARD, Limits, LogSeries
 from lowfc.adapters.log_writer import Attachment
-from lowfc.adapters.provenance import provenance
-from lowfc.adapters.realtime import NOTHING, Granted, step_back
-from lowfc.adapters.run import Run
+from lowfc.adapters.realtime import NOTHING, Granted
 from lowfc.adapters.service import Service
-from lowfc.adapters.zenoh_bus import ZenohBus
-from lowfc.contract import input_file
 from lowfc.contract.errors import BadMessageError, DataFileError
 from lowfc.contract.messages import HEALTH, TOPICS, Role, Topic, wire
 from lowfc.programs.recording.others import Others
 from lowfc.programs.recording.summary import Summary
 from lowfc.programs.recording.switch import RecordingSwitch
+from lowfc.programs.recording.volume import in_words
 
 QUEUE_MESSAGES = 20_000
 """Messages that may wait for the disk: about 4 s of a 1 kHz loop, 90 MB."""
@@ -59,13 +57,31 @@ class Recorder:
         attachments: Sequence[Attachment] = (),
         limits: Limits = STANDARD,
         granted: Granted = NOTHING,
+        selection: Selection = EVERYTHING,
+        expected_bytes_per_s: float = 0.0,
     ) -> None:
-        """Subscribe to everything; recording starts with `run`."""
+        """Subscribe to everything; recording starts with `run`.
+
+        Args:
+            bus: of the run.
+            clock: of the run.
+            run_id: name of the run.
+            folder: where the logs go.
+            metadata: for the start of each log, by name.
+            attachments: files for the start of each log.
+            limits: when a log is finished and the next begun, and when there is no room for one.
+            granted: what the host granted this process.
+            selection: what is recorded.
+            expected_bytes_per_s: growth of the logs, until it has been measured; 0 where nobody knows.
+        """
         self._bus = bus
         self._clock = clock
         self._backlog = Backlog(QUEUE_MESSAGES, QUEUE_BYTES)
         self._ledger = Ledger()
-        self._series = LogSeries(folder, clock, metadata, attachments, limits)
+        self._selection = selection
+        self._folder, self._min_free_bytes = folder, limits.min_free_bytes
+        self._expected_bytes_per_s = expected_bytes_per_s
+        self._series = LogSeries(folder, clock, {**metadata, **selection.metadata}, attachments, limits)
         self._others = Others(bus)
         self._paused = False
         self._ender = ThreadPoolExecutor(1, "end-log")
@@ -79,7 +95,7 @@ class Recorder:
         for topic in TOPICS:
             bus.subscribe(topic, partial(self._backlog.put, topic))
         self.service = Service(Role.RECORDER, run_id, clock, bus, granted=granted, fill=self._fill)
-        self._switch = RecordingSwitch(bus, clock, {"start": self._resume, "stop": self._pause})
+        self._switch = RecordingSwitch(bus, clock, {"start": self._resume, "stop": self._pause}, self._outlook)
 
     def catch_signals(self) -> None:
         """Finish the log at SIGTERM, Ctrl-C or a lost terminal; a second one does not wait for the others' last words.
@@ -127,9 +143,9 @@ class Recorder:
             if age_s >= longest_s or (age_s >= shortest_s and len(self.service.heard) >= self._bus.peers()):
                 return
 
-    def _begin(self) -> None:
-        """Begin a log, with what the messages in it depend on."""
-        self._series.begin(self._others.kept.values())
+    def _begin(self, *, anew: bool = True) -> None:
+        """Begin a log, or unless `anew` its next part, with what the messages in it depend on."""
+        self._series.begin(self._others.kept.values(), anew=anew)
         self._most_starts = self._ledger.starts + MOST_CHANNELS
         self.service.event("RECORDING")
 
@@ -211,8 +227,9 @@ class Recorder:
             self.service.unreadable(topic.key, fault)
             return
         asked = self._others.was_asked(sample)
-        recorded = not self._failure if asked else self._write(sample) or self._paused  # unwanted is not lost
-        self._ledger.enter(topic, sample, recorded=recorded)
+        unwanted = self._paused or not self._selection.keeps(topic, sample.sequence, sample.payload)
+        recorded = not self._failure if asked else not unwanted and self._write(sample)
+        self._ledger.enter(topic, sample, recorded=recorded, unwanted=unwanted)
         if topic is HEALTH:
             self._hear(topic, sample)
         elif topic.queryable:
@@ -257,10 +274,15 @@ class Recorder:
                 self.service.event("RECORDING_FAILED", why=f"{short}; the log is complete")
             elif self._series.full or self._ledger.starts >= self._most_starts:
                 self._series.end(self._figures(), wait=False)
-                self._begin()
+                self._begin(anew=False)
                 self._others.ask_again()
         except DataFileError as fault:
             self._fail(fault)
+
+    def _outlook(self) -> str:
+        """What the recording will take, by what it has taken; empty where nobody knows."""
+        growth = self._series.bytes_per_s or self._expected_bytes_per_s
+        return in_words(growth, self._folder, self._min_free_bytes) if growth else ""
 
     def _flushed(self) -> None:
         self._ledger.settle()
@@ -332,67 +354,3 @@ class Recorder:
         for key, recorded in self._ledger.recorded().items():
             count = counts[key] if key in counts else health.topics.add(topic=key)
             count.received, count.missing = recorded, lost.get(key, 0)
-
-
-def record(
-    run: Run,
-    folder: Path,
-    *,
-    configuration: Path | None = None,
-    calibration: Path | None = None,
-    seed: int | None = None,
-    limits: Limits = STANDARD,
-    clock: Clock | None = None,
-    priority: int | None = None,
-    cpus: set[int] | None = None,
-) -> Summary:
-    """Record a run into `folder` until SIGTERM or SIGINT; the process of `lowfc record`.
-
-    Args:
-        run: the run to join.
-        folder: where the logs go.
-        configuration: TOML file to put into the log.
-        calibration: FITS file to put into the log.
-        seed: of a simulated run.
-        limits: when a log is finished and the next begun, and when there is no room for one.
-        clock: the run's; the host's when None.
-        priority: of SCHED_FIFO, below the loop's; None leaves the normal class.
-        cpus: processors to stay on; None leaves all.
-
-    Raises:
-        BusError: another recorder has this run.
-        DataFileError: a file cannot be read, or no log can be written in `folder`.
-    """
-    if short := shortage(folder, limits.min_free_bytes):
-        raise DataFileError(short)
-    attachments = [
-        _attached(path, media_type)
-        for path, media_type in ((configuration, "application/toml"), (calibration, "application/fits"))
-        if path is not None
-    ]
-    granted = step_back(priority, cpus)
-    clock = HostClock() if clock is None else clock
-    bus = ZenohBus(run.links, Role.RECORDER, clock)
-    try:
-        recorder = Recorder(
-            bus,
-            clock,
-            run.run_id,
-            folder,
-            metadata={"lowfc": {**provenance(run.run_id, seed), "clock_ahead_ms": f"{clock.ahead_ns() / 1e6:.3f}"}},
-            attachments=attachments,
-            limits=limits,
-            granted=granted,
-        )
-        recorder.catch_signals()
-        recorder.service.announces = True
-        return recorder.run()
-    finally:
-        bus.close()
-
-
-def _attached(path: Path, media_type: str) -> Attachment:
-    try:
-        return Attachment(path.name, media_type, input_file.read_whole(path, _LARGEST_ATTACHMENT_BYTES))
-    except OSError as fault:
-        raise DataFileError(f"{path} cannot be read for the log: {fault.strerror}") from fault

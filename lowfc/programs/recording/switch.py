@@ -12,11 +12,15 @@ from lowfc.contract.messages import RECORD_KEY, timestamp, wire
 class RecordingSwitch:
     """Questions that wait for the recorder's loop, and their answers."""
 
-    def __init__(self, bus: Bus, clock: Clock, handlers: Mapping[str, Callable[[], str | None]]) -> None:
+    def __init__(
+        self, bus: Bus, clock: Clock, handlers: Mapping[str, Callable[[], str | None]], outlook: Callable[[], str]
+    ) -> None:
         """Declare it on the bus; each handler does what its name says.
 
-        A handler returns why not where it did not, and None while it is at it: it is called again then.
+        A handler returns why not where it did not, and None while it is at it: it is called again then. The answer to
+        "start" ends with the `outlook`, if there is one: what the recording will take.
         """
+        self._outlook = outlook
         self._clock = clock
         self._handlers = handlers
         self._queries: deque[Query] = deque()
@@ -36,11 +40,13 @@ class RecordingSwitch:
                 return
             self._queries.popleft()
             path = str(files[-1].absolute()) if files else ""
+            outlook = self._outlook() if query.name == "start" else ""
+            done = f"{query.name}: {path}" + (f"; {outlook}" if outlook else "")
             message = wire.Request(
                 timestamp=timestamp(self._clock.now_ns()),
                 name=query.name,
                 text=path,
                 accepted=not refusal,
-                reply=refusal or f"{query.name}: {path}",
+                reply=refusal or done,
             )
             query.reply(message.SerializeToString())

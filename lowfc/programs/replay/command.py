@@ -8,10 +8,10 @@ from typing import Annotated, Any
 import typer
 from rich.console import Console
 
-from lowfc.adapters.log_reader import LogReader
+from lowfc.adapters.log_parts import WholeLog, in_order, the_one
 from lowfc.adapters.progress import passing_bar
 from lowfc.adapters.provenance import provenance
-from lowfc.adapters.terminal import DEFAULT_RUN, INTERRUPTED
+from lowfc.adapters.terminal import DEFAULT_RUN, INTERRUPTED, Logs
 from lowfc.contract.envelope import count_of
 from lowfc.contract.errors import ConfigurationError
 from lowfc.programs.output import put
@@ -128,9 +128,7 @@ def _host_differs(there: dict[str, str]) -> dict[str, tuple[str, str]]:
 
 
 def replay_log(
-    logs: Annotated[
-        list[Path], typer.Argument(help="A log, or several that follow each other.", metavar="LOG...", readable=False)
-    ],
+    logs: Logs,
     tolerance: Annotated[
         float | None, typer.Option(min=0, help="Largest difference that is none, nm: for a log of another processor.")
     ] = None,
@@ -163,7 +161,7 @@ def replay_log(
     --config, --calibration, --controller): what another controller would have made of the same night. With --publish:
     the night on the bus again, for a viewer or a controller under test.
 
-    Example: lowfc replay logs/*.mcap
+    Example: lowfc replay last
     """
     console = Console(stderr=True)
     another = any(option is not None for option in (what_if, config, calibration, controller))
@@ -176,7 +174,7 @@ def replay_log(
         from lowfc.programs.replay import publish as publishing
 
         figures = publishing.publish(
-            logs,
+            in_order(logs),
             run or DEFAULT_RUN,
             speed=1.0 if speed is None else speed,
             topics=topics or (),
@@ -190,13 +188,11 @@ def replay_log(
     elif another:
         from lowfc.programs.what_if import compare as counterfactual
 
-        if len(logs) != 1:
-            raise ConfigurationError("--what-if reads one log")
         wanted = counterfactual.wanted(what_if, config, calibration, controller)
-        reader = LogReader(logs[0], skip_damaged=True)
+        reader = WholeLog(the_one(logs), skip_damaged=True)
         _show(counterfactual.what_if(reader, wanted), counterfactual.render, as_json)
     else:
-        figures = verify(logs, tolerance or 0.0, jobs or 0, console)
+        figures = verify(in_order(logs), tolerance or 0.0, jobs or 0, console)
         _show(figures, render, as_json)
         if not figures["identical"]:
             raise typer.Exit(1)

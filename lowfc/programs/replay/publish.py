@@ -134,6 +134,7 @@ class Player:
             "messages_behind": self._behind,
             "finished": all(log.finished for log in self._logs),
             "damaged": [f"{log.path}: byte {one.position}, {one.why}" for log in self._logs for one in log.damage],
+            "selection": sorted({one for log in self._logs if (one := log.selection.sentence)}),
             "interrupted": not self._service.running,
         }
 
@@ -230,6 +231,7 @@ def render(figures: dict[str, Any]) -> str:
     if not figures["finished"]:
         lines.append("truncated          the log has no end: its recorder was killed, or is still writing")
     lines += [f"damaged            left out: {part}" for part in figures["damaged"]]
+    lines += [f"the log has        {selection}" for selection in figures["selection"]]
     lines += [f"left out           {key}: {why}" for key, why in figures["left_out"].items()]
     return "\n".join(lines)
 
@@ -268,8 +270,9 @@ def _mirrors(log: Path) -> tuple[str, ...]:
     """Names of the mirrors in a log, for a run that is yet to be made; an unfinished log tells the first one's."""
     reader = LogReader(log, topics=(MIRROR_STATE, COMMAND), skip_damaged=True)
     next(iter(reader), None)
-    keys = {key for key, _ in reader.channels if MIRROR_STATE.matches(key)}
-    return tuple(sorted(name_in(MIRROR_STATE, key) for key in keys)) or ("dm",)
+    topics = MIRROR_STATE, COMMAND
+    names = {name_in(topic, key) for key, _ in reader.channels for topic in topics if topic.matches(key)}
+    return tuple(sorted(names)) or ("dm",)
 
 
 def _microseconds(durations: Durations) -> dict[str, float]:

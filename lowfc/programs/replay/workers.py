@@ -13,10 +13,11 @@ from pathlib import Path
 from threadpoolctl import threadpool_limits
 
 from lowfc import __version__
+from lowfc.adapters.log_parts import Repeated
 from lowfc.adapters.log_reader import LogReader
 from lowfc.adapters.log_records import LogFile
 from lowfc.contract import published
-from lowfc.contract.errors import ConfigurationError
+from lowfc.contract.errors import ConfigurationError, DataFileError
 from lowfc.programs.replay.account import Account
 from lowfc.programs.replay.fold import TOPICS, Replay
 from lowfc.programs.replay.former import Former
@@ -98,6 +99,7 @@ def _replay_share(paths: Sequence[Path], tolerance_nm: float, share: Share, prog
     """Replay a share, on one thread as the live loop: more threads sum in another order."""
     run = Replay(tolerance_nm, share)
     outcome = Outcome(run.account)
+    repeated = Repeated()
     done = number = 0
     gc.disable()
     try:
@@ -111,10 +113,13 @@ def _replay_share(paths: Sequence[Path], tolerance_nm: float, share: Share, prog
                     always=published.TOPICS,
                 )
                 first = True
+                repeated.next_file()
                 for message in reader:
                     if first:
+                        _refuse_thinned(reader)
                         run.former, first = _former(reader), False
-                    run.take(message)
+                    if not repeated(message):
+                        run.take(message)
                     number += 1
                     if number % _NEWS_EVERY == 0:
                         progress(done + reader.position)
@@ -135,6 +140,14 @@ def _replay_share(paths: Sequence[Path], tolerance_nm: float, share: Share, prog
         gc.enable()
     outcome.log_s = run.duration_s
     return outcome
+
+
+def _refuse_thinned(reader: LogReader) -> None:
+    if not reader.selection.has_every_frame:
+        raise DataFileError(
+            f"{reader.path} cannot be replayed, as it was made without all frames ({reader.selection.sentence}): steps "
+            "are computed again from every frame; `--what-if` and `lowfc report` read it"
+        )
 
 
 def _former(reader: LogReader) -> Former | None:

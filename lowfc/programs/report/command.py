@@ -4,21 +4,22 @@ import json
 import math
 import sys
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from lowfc.adapters.terminal import one_log
+from lowfc.adapters.terminal import Logs
 from lowfc.contract.errors import DataFileError
 from lowfc.contract.printable import LINES, printable
+
+if TYPE_CHECKING:
+    from lowfc.adapters.log_parts import Parts
 
 _LOGS = (".mcap", ".part")
 
 
 def report(
-    logs: Annotated[
-        list[Path], typer.Argument(help="Logs, finished or not.", metavar="LOG...", readable=False, show_default=False)
-    ],
+    logs: Logs,
     out: Annotated[
         Path | None, typer.Option(help="The page (HTML). Default: beside the log, under its name.", show_default=False)
     ] = None,
@@ -28,20 +29,23 @@ def report(
 ) -> None:
     """Say how a run was, from its log: one HTML page that opens anywhere, and the same figures as JSON.
 
-    Example: lowfc report logs/20260412T021500Z.mcap
+    Example: lowfc report last
     """
-    one_log(logs, out, as_json=as_json)
+    from lowfc.adapters.log_parts import one_by_one
+
+    found = one_by_one(logs, out, as_json=as_json)
     if out is not None and out.suffix in _LOGS:
         raise DataFileError(f"{out} would be a log, which a report never overwrites; give --out FILE.html")
-    for log in logs:
+    for log in found:
         _report(log, out, as_json)
 
 
-def _report(log: Path, out: Path | None, as_json: bool) -> None:
+def _report(log: "Parts", out: Path | None, as_json: bool) -> None:
     """Report one log."""
     from rich.console import Console
     from rich.progress import BarColumn, TextColumn, TimeElapsedColumn
 
+    from lowfc.adapters.log_parts import titled
     from lowfc.adapters.progress import passing_bar
     from lowfc.adapters.whole_file import require_folder, write_whole
     from lowfc.programs.log.guard import refuse_log
@@ -49,12 +53,12 @@ def _report(log: Path, out: Path | None, as_json: bool) -> None:
     from lowfc.programs.report.page import page
     from lowfc.programs.report.source import read_run
 
-    target = out if out is not None or as_json else beside(log)
+    target = out if out is not None or as_json else beside(log[0])
     require_folder(target)
     if target is not None:
-        refuse_log(target, log)
+        refuse_log(target, log[0])
     with passing_bar(Console(stderr=True), TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn()) as bar:
-        task = bar.add_task(f"reading {log.name}", total=1.0)
+        task = bar.add_task(f"reading {titled(log)}", total=1.0)
         run = read_run(log, lambda part: bar.update(task, completed=part))
         bar.update(task, description="figures", completed=1.0)
         found = report_of(run)

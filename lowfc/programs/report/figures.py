@@ -71,6 +71,8 @@ def _log(run: Run) -> Figures:
     lost = {name.removeprefix("lost "): _count(text) for name, text in account.items() if name.startswith("lost ")}
     return {
         "file": log.path.name,
+        "files": [path.name for path in log.paths],
+        "selection": log.selection.sentence,
         "bytes": log.size,
         "finished": log.finished,
         "complete": log.complete and not log.damage,

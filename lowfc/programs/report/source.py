@@ -2,14 +2,13 @@
 
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
-from pathlib import Path
 
 import numpy as np
 import numpy.typing as npt
 
 from lowfc.adapters.history import History, rows_of
 from lowfc.adapters.history_reader import read_history
-from lowfc.adapters.log_reader import LogReader
+from lowfc.adapters.log_parts import LogFiles, WholeLog
 from lowfc.contract.messages import from_timestamp
 
 Whole = npt.NDArray[np.int64]
@@ -69,17 +68,17 @@ class Run:
         return np.asarray((self.history.steps.time_ns - self.begun_ns) * 1e-9)
 
 
-def read_run(path: Path, progress: Callable[[float], None] | None = None) -> Run:
+def read_run(files: LogFiles, progress: Callable[[float], None] | None = None) -> Run:
     """Read a log, whole or not, to its end; what is damaged is left out and told by the history's reader.
 
     Args:
-        path: of the log.
-        progress: called now and then with the part of the file that was read.
+        files: of the log.
+        progress: called now and then with the part of the log that was read.
 
     Raises:
         DataFileError: this is no log, or it has a calibration that cannot be read.
     """
-    log = LogReader(path, skip_damaged=True)
+    log = WholeLog(files, skip_damaged=True)
 
     def passed(_: int) -> None:
         if progress is not None and log.size:

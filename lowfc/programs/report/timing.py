@@ -32,10 +32,13 @@ def timing_figures(run: Run) -> Figures:
 
 
 def intervals_ns(run: Run) -> dict[str, Whole]:
-    """Times between frames and between commands, as they were sent; not across a restart of the camera."""
+    """Times between frames and between commands, as they were sent; not across a restart of the camera.
+
+    There is none between frames where frames were left out of the log.
+    """
     history = run.history
-    published = history.frame_publish_ns
-    starts = history.frame_sequence >> np.uint64(32)
+    published = history.frame_publish_ns[: None if history.log.selection.has_every_frame else 0]
+    starts = history.frame_sequence[: published.size] >> np.uint64(32)
     frames = np.diff(published)[np.diff(starts) == 0] if published.size else published
     return {"frames": frames, "commands": np.diff(run.history.command_publish_ns)}
 

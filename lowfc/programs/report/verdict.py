@@ -50,7 +50,8 @@ def _record(figures: Figures) -> Figures:
         return _check("log", BAD if log["stopped"] else LOOK, "; ".join(faults))
     if log["messages_lost"] is None:
         return _check("log", UNKNOWN, "complete; lost messages were not counted")
-    return _check("log", GOOD, "complete, no message lost")
+    recorded = f"; recorded: {log['selection']}" if log["selection"] else ""
+    return _check("log", GOOD, f"complete, no message lost{recorded}")
 
 
 def _modes(figures: Figures) -> Figures:
@@ -100,10 +101,10 @@ def _commands(figures: Figures) -> Figures:
 
 def _delay(figures: Figures) -> Figures:
     frames = figures["timing"]["frames"]
-    late, recorded = frames["commands_late"], frames["recorded"]
-    if late is None or not recorded:
+    late, steps = frames["commands_late"], sum(figures["mode_steps"].values())
+    if late is None or not steps:
         return _check("delay", UNKNOWN, "whether commands came in time is not in this log")
-    if late < _MANY_LATE * recorded:
+    if late < _MANY_LATE * steps:
         return _check("delay", GOOD, f"{plural(late, 'command')} late")
     text = f"{late} commands came after the next exposure had begun, and acted a frame later than the law expects"
     return _check("delay", LOOK, text)

@@ -6,13 +6,14 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from lowfc.adapters.terminal import AnyRun, Json
+from lowfc.adapters.terminal import AnyRun, Json, LogsIfAny
 from lowfc.contract.errors import ConfigurationError, DataFileError, LowfcError, RequestRefusedError
 from lowfc.programs.output import put
 
 if TYPE_CHECKING:
     from rich.console import Console
 
+    from lowfc.adapters.log_parts import LogFiles, WholeLog
     from lowfc.client import Answer, Client
     from lowfc.control.tuning import Tuned
     from lowfc.programs.tune.data import Telemetry
@@ -27,9 +28,7 @@ class ControllerKind(StrEnum):
 
 
 def tune(
-    log: Annotated[
-        Path | None, typer.Argument(help="Log (MCAP), finished or not.", metavar="[LOG]", readable=False)
-    ] = None,
+    logs: LogsIfAny = None,
     controller: Annotated[ControllerKind, typer.Option(help="Kind of law.")] = ControllerKind.INTEGRATOR,
     live: Annotated[float | None, typer.Option(min=1.0, help="Listen to a running loop, for seconds.")] = None,
     out: Annotated[Path | None, typer.Option(help="Write the law to this file (FITS).")] = None,
@@ -40,21 +39,23 @@ def tune(
 ) -> None:
     """Find the best gains, notches or Kalman filter for what shakes the wavefront, with margins.
 
-    Example: lowfc tune logs/20270101T220000Z.mcap --controller lqg --out lqg.fits --plot lqg.png
+    Example: lowfc tune last --controller lqg --out lqg.fits --plot lqg.png
     """
     from rich.console import Console
 
+    from lowfc.adapters.log_parts import the_one
     from lowfc.programs.tune.figures import render
 
-    if (log is None) == (live is None):
+    if bool(logs) == (live is not None):
         raise ConfigurationError("name one LOG, or listen to a running loop with --live SECONDS")
+    log = the_one(logs) if logs else None
     found = tune_run(log, str(controller), live, out, apply=apply, plot=plot, run=run, console=Console(stderr=True))
     done = [f"written: {file}" for file in found["files"]] + ([found["applied"]] if found["applied"] else [])
     put(found, "\n".join([render(found), *done]), as_json=as_json)
 
 
 def tune_run(
-    log: Path | None,
+    log: "LogFiles | None",
     controller: str,
     live: float | None = None,
     out: Path | None = None,
@@ -73,16 +74,18 @@ def tune_run(
         RequestRefusedError: the controller refused what was applied.
     """
     from lowfc.adapters.law_file import save
+    from lowfc.adapters.log_parts import WholeLog
     from lowfc.adapters.progress import passing_bar
     from lowfc.adapters.whole_file import require_folder, write_whole
     from lowfc.programs.log.guard import refuse_log
     from lowfc.programs.tune.figures import figures, picture, tuned
 
     require_folder(out, plot)
+    reader = None if log is None else WholeLog(log, skip_damaged=True)
     for file in (out, plot):
-        if file is not None and log is not None:
-            refuse_log(file, log)
-    telemetry = _listened(live, run, console) if log is None else _read(log, console)
+        if file is not None and reader is not None:
+            refuse_log(file, reader.path)
+    telemetry = _listened(live, run, console) if reader is None else _read(reader, console)
     with passing_bar(console) as bar:
         bar.add_task(f"tuning {controller}", total=None)
         try:
@@ -102,12 +105,10 @@ def tune_run(
     return found
 
 
-def _read(log: Path, console: "Console") -> "Telemetry":
-    from lowfc.adapters.log_reader import LogReader
+def _read(reader: "WholeLog", console: "Console") -> "Telemetry":
     from lowfc.adapters.progress import reading_bar
     from lowfc.programs.tune.data import of_log
 
-    reader = LogReader(log, skip_damaged=True)
     with reading_bar(console) as bar:
         task = bar.add_task("reading", total=None)
         return of_log(reader, lambda _: bar.update(task, completed=reader.position, total=reader.size))

@@ -7,16 +7,13 @@ from typing import Annotated
 
 import typer
 
-from lowfc.adapters.terminal import ConfigFile, configuration
+from lowfc.adapters.terminal import ConfigFile, LogsIfAny, configuration
 from lowfc.contract.errors import ConfigurationError
 from lowfc.programs.view.tabs import Tab
 
 
 def view(
-    logs: Annotated[
-        list[Path] | None,
-        typer.Argument(help="Logs (MCAP) that follow each other; none: the running loop.", metavar="[LOG...]"),
-    ] = None,
+    logs: LogsIfAny = None,
     native: Annotated[bool, typer.Option("--native", help="In a window of its own.")] = False,
     web: Annotated[bool, typer.Option("--web", help="In a browser, at an address of this host.")] = False,
     save: Annotated[Path | None, typer.Option(help="Into a file (RRD) that rerun opens.")] = None,
@@ -49,6 +46,7 @@ def view(
         return
     if logs and (seconds or run):
         raise ConfigurationError("--seconds and --run are for a running loop, not for logs")
+    from lowfc.adapters.log_parts import in_order
     from lowfc.programs.ctl.which_run import the_known_run
     from lowfc.programs.view.look import look_at_logs, look_at_run
     from lowfc.programs.view.place import place
@@ -64,7 +62,11 @@ def view(
         web_port=web_port,
     )
     settings = None if config is None else configuration(config)
-    figures = look_at_logs(logs, settings, where) if logs else look_at_run(the_known_run(run), settings, where, seconds)
+    figures = (
+        look_at_logs(in_order(logs), settings, where)
+        if logs
+        else look_at_run(the_known_run(run), settings, where, seconds)
+    )
     if as_json:
         sys.stdout.write(json.dumps(figures) + "\n")
 

@@ -217,7 +217,8 @@ class Watcher:
         """Time without a message that comes with every frame, where it is longer than this rate explains; else None."""
         if self.moment is None or not self.begun_ns:
             return None
-        silent_s = self._since_s(self.moment.heard_ns.get(topic.key, self.begun_ns))
+        heard_ns = self.moment.heard_ns  # a step tells of its frame, which a log need not have
+        silent_s = self._since_s(max(heard_ns.get(topic.key, self.begun_ns), heard_ns.get(STEP.key, 0)))
         return silent_s if silent_s > max(FRAMES_SILENT_S, PERIODS * self.period_ns * 1e-9) else None
 
     def _total(self, span_s: float) -> Counter[Reason | str]:

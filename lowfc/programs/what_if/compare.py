@@ -13,6 +13,7 @@ from lowfc.adapters.log_reader import LogReader
 from lowfc.contract.calibration_codec import identified
 from lowfc.contract.configuration import Configuration, load
 from lowfc.contract.errors import CalibrationError, ConfigurationError
+from lowfc.contract.messages import MIRROR_STATE
 from lowfc.control.calibration import ESTIMATORS, Calibration, reconstructor
 from lowfc.control.law import Law
 from lowfc.control.safety import Reason
@@ -233,7 +234,7 @@ def _doubts_of_log(run: LoggedRun) -> list[str]:
     if log.metadata.get("recording", {}).get("stopped"):
         found.append(f"recording stopped: {log.metadata['recording']['stopped']}")
     if run.measured_delay is None:
-        found.append(f"the delay could not be measured in this log; {run.delay_frames:g} frames is the controller's")
+        found.append(f"the delay could not be measured in this log; the controller's is {run.delay_frames:g}")
     elif run.delay_frames != run.controller_delay:
         found.append(
             f"the controller reckoned with a delay of {run.controller_delay:g} frames, measured from "
@@ -249,7 +250,8 @@ def _doubts_of_log(run: LoggedRun) -> list[str]:
         found.append(f"limits acted in the logged run, {', '.join(hit)}; in the what-if only modal limits do")
     cut = np.count_nonzero(run.history.mirror.limits)
     if cut:
-        found.append(f"the mirror's own limits acted on {cut} commands: pseudo-open-loop modes are wrong there")
+        few = "" if log.selection.counts(MIRROR_STATE) else f" (of mirror states the log has: {log.selection.sentence})"
+        found.append(f"the mirror's own limits acted on {cut} commands{few}: pseudo-open-loop modes are wrong there")
     changes = sum(one.accepted and one.name in LAW_KEYS for one in run.history.requests)
     if changes:
         found.append(f"gain or leak was changed {changes} times in the logged run; the last ones are shown")

@@ -8,7 +8,7 @@ import numpy.typing as npt
 
 from lowfc.adapters.history import History, Sequences, Steps, rows_of
 from lowfc.adapters.instrument import settings
-from lowfc.adapters.log_reader import LogReader
+from lowfc.adapters.log_parts import WholeLog
 from lowfc.contract.codec import decode_frame
 from lowfc.contract.errors import DataFileError
 from lowfc.contract.messages import FRAME, floats, wire
@@ -115,12 +115,21 @@ class LoggedRun:
         return rows, settling, over
 
     def measured_again(self, calibration: Calibration, progress: Callable[[int], None] | None) -> Single:
-        """Errors (steps, modes) that another calibration measures in the frames that were used: a second pass."""
-        steps = self.steps
+        """Errors (steps, modes) that another calibration measures in the frames that were used: a second pass.
+
+        Raises:
+            DataFileError: the log was made to hold only some of the frames.
+        """
+        steps, log = self.steps, self.history.log
+        if not log.selection.has_every_frame:
+            raise DataFileError(
+                f"{log.path}: not every frame is in it ({log.selection.sentence}), so that no other reconstructor can "
+                "be tried on it; other gains, leaks and limits can"
+            )
         error_nm = np.full_like(steps.error_nm, np.nan)
         estimator = Estimator.of(calibration)
         rows = {sequence: row for row, sequence in enumerate(steps.sequence.tolist()) if self.used[row]}
-        for number, message in enumerate(LogReader(self.history.log.path, topics=[FRAME], skip_damaged=True), 1):
+        for number, message in enumerate(WholeLog(log.paths, topics=[FRAME], skip_damaged=True), 1):
             if progress is not None and number % _PROGRESS_FRAMES == 0:
                 progress(number)
             row = rows.get(message.sequence)
