@@ -77,11 +77,15 @@ class Night:
             happening()
         if view.wait(60) != 0:
             raise SystemExit(f"no picture of {name}")
-        shown = Image.open(out).convert("RGB")
-        shown = shown.crop((0, MENU_BAR, shown.width, shown.height)).resize((1280, 770), Image.Resampling.LANCZOS)
-        PICTURES.mkdir(exist_ok=True)
-        shown.quantize(SHADES, dither=Image.Dither.NONE).save(PICTURES / f"view-{name}.png", optimize=True)
-        sys.stderr.write(f"{name}\n")
+        keep(name, out)
+
+    def picture_of_the_log(self, name: str) -> None:
+        """The last log that was finished, as a whole."""
+        out = self._folder / f"{name}.png"
+        log = max(self._folder.glob("logs/*.mcap"))
+        words = [sys.executable, "-m", "lowfc", "view", str(log), "--headless-screenshot", str(out)]
+        subprocess.run(words, env=self._environment, check=True)
+        keep(name, out)
 
     def end(self) -> None:
         """End what is left."""
@@ -89,6 +93,15 @@ class Night:
             process = self.processes[name]
             process.terminate()
             process.wait(10)
+
+
+def keep(name: str, out: Path) -> None:
+    """Keep a picture among those of the documentation."""
+    shown = Image.open(out).convert("RGB")
+    shown = shown.crop((0, MENU_BAR, shown.width, shown.height)).resize((1280, 770), Image.Resampling.LANCZOS)
+    PICTURES.mkdir(exist_ok=True)
+    shown.quantize(SHADES, dither=Image.Dither.NONE).save(PICTURES / f"view-{name}.png", optimize=True)
+    sys.stderr.write(f"{name}\n")
 
 
 @contextlib.contextmanager
@@ -113,6 +126,9 @@ def main() -> None:
         time.sleep(5)
         run.picture("frames-lost", "operator", run.stumble)
         time.sleep(5)
+        run.picture("recording-stopped", "operator", lambda: run.ask("record", "stop"))
+        run.picture_of_the_log("log")
+        run.ask("record", "start")
         run.picture("star-gone", "operator", lambda: run.restart("camera", BRIGHT + "[star]\nmagnitude = 9\n"))
     with night(BRIGHT) as run:
         run.picture("controller-dead", "operator", run.processes["controller"].kill)

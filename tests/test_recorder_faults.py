@@ -218,6 +218,8 @@ def test_the_loop_of_a_recorder_goes_on_while_the_disk_takes_a_stopped_log(
     (answer,) = answers
     request = wire.Request.FromString(answer.payload)
     assert (request.accepted, "Input/output error" in request.reply) == (not refused, refused)
+    until(lambda: bool(bench.camera.heard["recorder"].recording.failure) is refused)
+    until(lambda: bench.camera.heard["recorder"].recording.stopped is not refused)
     monkeypatch.undo()
     summary = bench.stop()
     (log,) = summary.files

@@ -68,6 +68,7 @@ class LogReader:
         skip_damaged: bool = False,
         from_ns: int = 0,
         always: Collection[Topic] = (),
+        sparse: bool = False,
     ) -> None:
         """Read the log at `path`.
 
@@ -77,6 +78,8 @@ class LogReader:
             skip_damaged: leave out what is damaged instead of raising an error.
             from_ns: leave out the chunks that end before this log time.
             always: topics of which nothing is left out for that.
+            sparse: leave chunks unread that have no message of `topics`, by their indexes: for topics with few messages
+                in a long log. Of those chunks no checksum is checked.
         """
         self.path = path
         self.paths: tuple[Path, ...] = (path,)
@@ -93,6 +96,7 @@ class LogReader:
         self._skip_damaged = skip_damaged
         self._from_ns = from_ns
         self._always = always
+        self._sparse = sparse
         self._declared: dict[int, Channel] = {}
         self._wanted: dict[int, tuple[str, str, int] | None] = {}
         self._chunks: set[int] = set()
@@ -125,7 +129,7 @@ class LogReader:
             self.size, self.finished, self._file = file.size, file.finished, file
             if (declarations := file.declarations()) is not None:
                 self._chunk(declarations)
-            for part in file.parts(self._from_ns, self._kept(file)):
+            for part in file.parts(self._from_ns, self._kept(file), self._needs if self._sparse else None):
                 match part:
                     case Chunk():
                         self._has_chunks = True
@@ -148,6 +152,10 @@ class LogReader:
         wanted = {one.id for (key, _), one in held if any(topic.matches(key) for topic in self._always)}
         index = file.index() if self._from_ns else ()
         return {one.chunk_start_offset for one in index if not wanted.isdisjoint(one.message_index_offsets)}
+
+    def _needs(self, channels: Collection[int]) -> bool:
+        """Whether one of these channels is wanted, or not declared yet: that stands with its first message."""
+        return any(number not in self._wanted or self._wanted[number] is not None for number in channels)
 
     def _chunk(self, chunk: Chunk) -> list[Logged]:
         """Messages of a chunk, unless it is not in its place."""

@@ -8,7 +8,7 @@ has rewritten may lack checksums and chunks: what was not computed is not checke
 import io
 import struct
 import zlib
-from collections.abc import Collection, Iterator
+from collections.abc import Callable, Collection, Iterator
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -125,10 +125,16 @@ class LogFile:
         for body in self._in_summary(Opcode.CHUNK_INDEX):
             yield parsed(ChunkIndex, body)
 
-    def parts(self, from_ns: int = 0, always: Collection[int] = ()) -> Iterator[Chunk | Metadata | Attachment | Damage]:
+    def parts(
+        self,
+        from_ns: int = 0,
+        always: Collection[int] = (),
+        needed: Callable[[Collection[int]], bool] | None = None,
+    ) -> Iterator[Chunk | Metadata | Attachment | Damage]:
         """What the file holds, in its order.
 
-        Chunks that end before the log time `from_ns` are passed over unread, but for those that begin at `always`.
+        Chunks that end before the log time `from_ns` are passed over unread, but for those that begin at `always`; so
+        are those of which `needed` is false, given the channels (ids) of their messages.
 
         Raises:
             DataFileError: the disk refuses.
@@ -141,9 +147,10 @@ class LogFile:
             head = self._read(at, HEAD.size)
             opcode, length = HEAD.unpack(head) if len(head) == HEAD.size else (0, self.size)
             end = at + HEAD.size + length
-            if from_ns and opcode == Opcode.CHUNK and end <= self.size and at not in always:
+            if (from_ns or needed) and opcode == Opcode.CHUNK and end <= self.size and at not in always:
                 intact = False  # no checksum of the whole without all of it
-                if int.from_bytes(self._read(at + HEAD.size + 8, 8), "little") < from_ns:
+                too_early = from_ns and int.from_bytes(self._read(at + HEAD.size + 8, 8), "little") < from_ns
+                if too_early or (needed and (there := self._channels_after(end)) and not needed(there)):
                     at = end
                     continue
             try:
@@ -191,6 +198,17 @@ class LogFile:
         for at in range(start, footer_at, _BLOCK_BYTES):
             crc = zlib.crc32(self._read(at, min(_BLOCK_BYTES, footer_at - at)), crc)
         return start if zlib.crc32(footer[: HEAD.size + 16], crc) == stored else None
+
+    def _channels_after(self, at: int) -> list[int]:
+        """Ids of the channels in the indexes of messages at `at`, behind a chunk; none where it has no index."""
+        found = []
+        while len(head := self._read(at, HEAD.size + 2)) == HEAD.size + 2:
+            opcode, length = HEAD.unpack_from(head)
+            if opcode != Opcode.MESSAGE_INDEX:
+                break
+            found.append(int.from_bytes(head[HEAD.size :], "little"))
+            at += HEAD.size + length
+        return found
 
     def _resume(self, at: int, end: int) -> int:
         """Where to read on after an unsound record: behind it if a record begins there, else at the next whole one."""

@@ -2,6 +2,7 @@
 
 import contextlib
 import os
+import platform
 import signal
 import sys
 import threading
@@ -65,6 +66,7 @@ class Service:
         self.arrivals: list[Arrivals] = []
         self.run_id = run_id
         self._granted = granted
+        self._host = platform.node()
         self.fill = fill
         self.announces = announces
         self.awaited: Callable[[], str] = str
@@ -260,6 +262,7 @@ class Service:
             state=self._state,
             run_id=self.run_id,
             pid=os.getpid(),
+            host=self._host,
             version=__version__,
             memory_bytes=resident_bytes(),
             rate_hz=(self.work - self._worked) / span_s,

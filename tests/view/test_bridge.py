@@ -4,6 +4,7 @@ import threading
 import time
 from collections.abc import Iterator
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -15,7 +16,7 @@ from lowfc.adapters.bus import name_in
 from lowfc.adapters.clock import HostClock
 from lowfc.adapters.rerun_viewer import Show
 from lowfc.contract.configuration import Configuration
-from lowfc.contract.messages import CALIBRATION, EVENT, FRAME, STEP, Log, topic_of
+from lowfc.contract.messages import CALIBRATION, EVENT, FRAME, HEALTH, STEP, Log, topic_of, wire
 from lowfc.programs.view import bridge as bridges
 from lowfc.programs.view import brush as brushes
 from lowfc.programs.view import wavefront
@@ -147,6 +148,32 @@ def test_who_comes_late_asks_for_the_calibration(scene: Scene) -> None:
     assert topic_of(CALIBRATION.key).queryable
     scene.publishers[STEP.key].put(next(one.payload for one in scene.night.samples if one.key == STEP.key))
     until(lambda: scene.drawn(1))
+
+
+def test_who_comes_late_shows_the_events_from_before_once(tmp_path: Path) -> None:
+    before = Night()
+    before.event("NOTE", text="before the view")
+    log = before.write(tmp_path / "night.mcap", finish=False)
+    scene = Scene()
+    recording = wire.Recording(files=[str(tmp_path / "night.mcap")], folder="/")
+    health = wire.Health(process="recorder", state="running", pid=5, recording=recording)
+    MemoryBus(scene.hub, "recorder", scene.clock).publisher(HEALTH, "recorder").put(health.SerializeToString())
+
+    def notes() -> list[str]:
+        lines = [line for tape in scene.tapes for _, (line,) in list(tape.logged["log/controller"])]
+        return [text for text in (str(line.text.as_arrow_array().to_pylist()[0]) for line in lines) if "NOTE" in text]
+
+    until(notes)
+    assert len(notes()) == 1
+    assert log.name.endswith(".part")
+    scene.end()
+
+
+def test_without_a_recorder_the_view_says_that_it_does_not_know(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(bridges, "_RECORDER_S", 0.1)
+    scene = Scene()
+    until(lambda: scene.tapes and scene.tapes[0].logged["log/view"])
+    scene.end()
 
 
 def test_a_viewer_that_died_is_started_again_and_shows_everything(scene: Scene) -> None:

@@ -79,9 +79,9 @@ def test_every_step_and_truth_is_drawn_under_its_name() -> None:
     np.testing.assert_array_equal(tape.column(wavefront.TRUTH)[1], np.array([one.residual_nm for one in truths]))
     assert tape.names(wavefront.ERROR) == [mode_name(index) for index in NOLL]
     np.testing.assert_allclose(
-        tape.column(wavefront.RMS)[1], [[one.residual_rms_nm, one.disturbance_rms_nm] for one in truths], rtol=1e-6
+        tape.column(wavefront.RMS)[1], [[one.disturbance_rms_nm, one.residual_rms_nm] for one in truths], rtol=1e-6
     )
-    assert tape.names(wavefront.RMS) == ["residual, true", "with a flat mirror, true"]
+    assert tape.names(wavefront.RMS) == ["with a flat mirror, true", "residual, true"]  # the last lies on top
     mas = np.array([one.residual_nm[:2] for one in truths]) / tilt_nm_per_mas(Configuration().star.diameter_m)
     np.testing.assert_allclose(tape.column(wavefront.TILT)[1], mas, rtol=1e-6)
 
@@ -90,9 +90,9 @@ def test_without_truth_it_is_measured_and_says_so() -> None:
     made = night(truth=False)
     tape = painted(whole(made))
     steps = [wire.ControlStep.FromString(one.payload) for one in made.samples if one.key == STEP.key]
-    rms_nm = [[np.hypot.reduce(step.error_nm), np.hypot.reduce(step.pol_nm)] for step in steps]
+    rms_nm = [[np.hypot.reduce(step.pol_nm), np.hypot.reduce(step.error_nm)] for step in steps]
     np.testing.assert_allclose(tape.column(wavefront.RMS)[1], rms_nm, rtol=1e-5)
-    assert tape.names(wavefront.RMS) == ["residual, measured", "with a flat mirror, pseudo-open-loop"]
+    assert tape.names(wavefront.RMS) == ["with a flat mirror, pseudo-open-loop", "residual, measured"]
     assert wavefront.TRUTH not in tape.rows
 
 

@@ -16,7 +16,7 @@ from lowfc.control.stability import rejection
 from lowfc.optics.coronagraph import mean_contrast
 from lowfc.optics.grid import pupil_axis
 from lowfc.optics.zernike import zernikes
-from lowfc.programs.view import latency, science, spectra
+from lowfc.programs.view import latency, science, spectra, steady
 from lowfc.programs.view.moment import Heard, Moment
 
 START_NS = 1_795_000_000_000_000_000
@@ -92,14 +92,14 @@ def test_contrast_is_that_of_the_newest_wavefronts() -> None:
     np.testing.assert_array_equal(times_ns - START_NS, [0, science.PERIOD_NS])
     flat = mean_of(pupil, np.zeros(MODES))
     expected = [
-        [flat, mean_of(pupil, left_nm[1]), mean_of(pupil, open_nm[1])],  # the last row was refused
-        [flat, *(np.mean([mean_of(pupil, modes_nm[row]) for row in (2, 3)]) for modes_nm in (left_nm, open_nm))],
+        [mean_of(pupil, open_nm[1]), mean_of(pupil, left_nm[1]), flat],  # the last row was refused
+        [*(np.mean([mean_of(pupil, modes_nm[row]) for row in (2, 3)]) for modes_nm in (open_nm, left_nm)), flat],
     ]
     np.testing.assert_allclose(10**found, expected, rtol=3e-3)
     assert np.ptp(np.unique(found)) > 1
     named = [tape_names.names.as_arrow_array().to_pylist() for _, (tape_names,) in tape.logged[science.CONTRAST]]
     assert ["measured" in names[1] for names in named] == [True, False]
-    assert ["true" in names[2] for names in named] == [False, True]
+    assert ["true" in names[0] for names in named] == [False, True]
 
 
 def test_a_brighter_dark_zone_is_brighter_in_the_picture() -> None:
@@ -124,7 +124,7 @@ def _every_second(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(spectra, "PERIOD_NS", 1_000_000_000)
 
 
-def run_spectra(tape: Tape, mode: int = LoopMode.CLOSED, frames: int = 3000) -> spectra.Spectra:
+def run_spectra(tape: Tape, mode: int = LoopMode.CLOSED, frames: int = 3000, **law: Any) -> spectra.Spectra:
     """A tone in the first mode and white noise in all, as it would be open and as this law leaves it."""
     rng = np.random.default_rng(1)
     pol_nm = rng.normal(0, 0.2, (frames, MODES))
@@ -143,7 +143,7 @@ def run_spectra(tape: Tape, mode: int = LoopMode.CLOSED, frames: int = 3000) -> 
                 round((first + 50) * 1e9 / RATE_HZ),
                 steps=steps(first, error_nm[rows], pol_nm[rows], mode),
                 camera=wire.CameraState(period_ns=round(1e9 / RATE_HZ)),
-                controller=wire.ControllerState(**LAW),
+                controller=wire.ControllerState(**LAW, **law),
             ),
         )
     return panel
@@ -198,6 +198,12 @@ def test_without_a_closed_loop_there_is_no_theory_and_after_a_change_no_past() -
     assert said.startswith("loop closed: too few frames")
 
 
+def test_the_integrators_rejection_is_not_drawn_for_another_law() -> None:
+    tape = Tape()
+    run_spectra(tape, law=wire.LinearLaw(name="lqg"))
+    assert len(tape.last(f"{spectra.TILTS}/curves").strips.as_arrow_array().to_pylist()) == 2
+
+
 def test_a_wavefront_that_stands_still_has_no_spectrum() -> None:
     tape, panel, still = Tape(), spectra.Spectra(), np.zeros((200, MODES))
     panel.draw(tape, moment(0, steps=steps(0, still, still)))  # type: ignore[arg-type]
@@ -206,10 +212,10 @@ def test_a_wavefront_that_stands_still_has_no_spectrum() -> None:
 
 def test_memory_of_the_spectra_is_bounded() -> None:
     tape, panel, some = Tape(), spectra.Spectra(), np.ones((500, MODES))
-    for first in range(0, 2 * spectra.FRAMES, 500):
+    for first in range(0, 2 * steady.FRAMES, 500):
         panel.draw(tape, moment(first, steps=steps(first, some, some)))  # type: ignore[arg-type]
-    kept = sum(len(sequence) for sequence, _ in panel._recent)
-    assert spectra.FRAMES <= kept < spectra.FRAMES + 500
+    kept = len(panel._steady.rows()[0])
+    assert steady.FRAMES <= kept < steady.FRAMES + 500
 
 
 def test_latencies_are_those_of_the_last_second() -> None:

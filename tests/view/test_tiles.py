@@ -334,7 +334,7 @@ STATES: dict[str, tuple[Callable[[Stage], object], str, str, Level, str]] = {
         "worse than a flat mirror: `lowfc ctl safe` flattens it",
     ),
     "camera changed": (opened_by_itself, "LOOP", "OPEN", Level.WARNING, "opened by itself"),
-    "safed": (setting(mode=LoopMode.SAFED), "LOOP", "SAFED", Level.BAD, "lowfc ctl clear"),
+    "safed": (setting(mode=LoopMode.SAFED), "LOOP", "SAFE", Level.BAD, "lowfc ctl clear"),
     "no calibration": (
         setting(mode=LoopMode.IDLE, reasons=(Reason.NO_CALIBRATION,)),
         "FRAMES",
@@ -346,10 +346,10 @@ STATES: dict[str, tuple[Callable[[Stage], object], str, str, Level, str]] = {
     "camera dead": (silence("camera"), "FRAMES", "NO FRAMES", Level.BAD, "No frame for 4 s, camera silent"),
     "mirror dead": (silence("mirror-dm"), "MIRROR", "DEAD", Level.BAD, "Mirror silent for 4 s"),
     "recorder dead": (silence("recorder"), "RECORDER", "DEAD", Level.BAD, "Recorder silent"),
-    "everybody dead": (silence(*EVERYBODY), "LOOP", "NOTHING HEARD", Level.BAD, "of any process for 4 s"),
+    "everybody dead": (silence(*EVERYBODY), "LOOP", "NO MESSAGES", Level.BAD, "No message from any process for 4 s"),
     "ended": (stop(*EVERYBODY), "LOOP", "ENDED", Level.NEUTRAL, "The run has ended"),
-    "controller stopped": (stop("controller"), "LOOP", "STOPPED", Level.NEUTRAL, "The controller was told to stop"),
-    "camera stopped": (stop("camera"), "LOOP", "HOLDING", Level.NEUTRAL, "The camera was told to stop"),
+    "controller stopped": (stop("controller"), "LOOP", "STOPPED", Level.NEUTRAL, "The controller was stopped"),
+    "camera stopped": (stop("camera"), "LOOP", "HOLDING", Level.NEUTRAL, "The camera was stopped"),
     "skipped": (counting(skipped=12), "FRAMES", "12 LOST", Level.WARNING, "12 skipped (controller busy)"),
     "missing": (counting(missing=90), "FRAMES", "90 LOST", Level.BAD, "90 never arrived"),
     "late frames": (setting(reasons=(Reason.LATE,)), "FRAMES", "REFUSED", Level.BAD, "too late"),
@@ -367,7 +367,7 @@ STATES: dict[str, tuple[Callable[[Stage], object], str, str, Level, str]] = {
     "stroke": (setting(reasons=(Reason.STROKE,)), "MIRROR", "AT LIMIT", Level.BAD, "actuator stroke"),
     "modal limit": (setting(reasons=(Reason.MODAL_LIMIT,)), "MIRROR", "AT LIMIT", Level.BAD, "modal limit"),
     "little stroke left": (setting(stroke_nm=650.0), "MIRROR", "93 %", Level.WARNING, "little is left"),
-    "expired": (setting(status=wire.MIRROR_STATUS_EXPIRED), "MIRROR", "EXPIRED", Level.BAD, "gets no commands"),
+    "expired": (setting(status=wire.MIRROR_STATUS_EXPIRED), "MIRROR", "EXPIRED", Level.BAD, "receives no commands"),
     "harmful": (setting(residual_nm=60.0), "WAVEFRONT", "60.0 nm rms", Level.WARNING, "The loop does harm"),
     "diverging": (setting(residual_nm=400.0), "WAVEFRONT", "400 nm rms", Level.BAD, "40.0 nm with a flat mirror"),
     "late commands": (saying("camera", commands_late=80), "LATENCY", "80 LATE", Level.WARNING, "80 commands, "),
@@ -379,6 +379,14 @@ STATES: dict[str, tuple[Callable[[Stage], object], str, str, Level, str]] = {
         Level.BAD,
         "no space left",
     ),
+    "recording stopped": (
+        saying("recorder", recording=wire.Recording(file="logs/a.mcap", stopped=True)),
+        "RECORDER",
+        "STOPPED",
+        Level.WARNING,
+        "the night is not kept",
+    ),
+    "recorder stopped": (stop("recorder"), "RECORDER", "STOPPED", Level.WARNING, "The recorder was stopped"),
     "recorder losing": (
         saying("recorder", recording=wire.Recording(file="a", lost=5)),
         "RECORDER",
@@ -630,4 +638,4 @@ def test_the_panel_draws_the_clock_each_second_and_speaks_when_something_changes
     stage.mode = LoopMode.SAFED
     stage.run(0.5)
     assert [path for path, _ in logged][:2] == [TILES, HEADLINE]
-    assert "lowfc ctl clear" in str(logged[1][1])
+    assert "Loop in safe mode" in str(logged[1][1])

@@ -598,7 +598,7 @@ class WavefrontFigures(_message.Message):
     def __init__(self, disturbance_rms_nm: _Optional[float] = ..., residual_rms_nm: _Optional[float] = ..., tilt_disturbance_mas: _Optional[float] = ..., tilt_residual_mas: _Optional[float] = ...) -> None: ...
 
 class Recording(_message.Message):
-    __slots__ = ("file", "messages", "lost", "bytes", "failure", "files", "stopped")
+    __slots__ = ("file", "messages", "lost", "bytes", "failure", "files", "stopped", "folder")
     FILE_FIELD_NUMBER: _ClassVar[int]
     MESSAGES_FIELD_NUMBER: _ClassVar[int]
     LOST_FIELD_NUMBER: _ClassVar[int]
@@ -606,6 +606,7 @@ class Recording(_message.Message):
     FAILURE_FIELD_NUMBER: _ClassVar[int]
     FILES_FIELD_NUMBER: _ClassVar[int]
     STOPPED_FIELD_NUMBER: _ClassVar[int]
+    FOLDER_FIELD_NUMBER: _ClassVar[int]
     file: str
     messages: int
     lost: int
@@ -613,7 +614,8 @@ class Recording(_message.Message):
     failure: str
     files: _containers.RepeatedScalarFieldContainer[str]
     stopped: bool
-    def __init__(self, file: _Optional[str] = ..., messages: _Optional[int] = ..., lost: _Optional[int] = ..., bytes: _Optional[int] = ..., failure: _Optional[str] = ..., files: _Optional[_Iterable[str]] = ..., stopped: _Optional[bool] = ...) -> None: ...
+    folder: str
+    def __init__(self, file: _Optional[str] = ..., messages: _Optional[int] = ..., lost: _Optional[int] = ..., bytes: _Optional[int] = ..., failure: _Optional[str] = ..., files: _Optional[_Iterable[str]] = ..., stopped: _Optional[bool] = ..., folder: _Optional[str] = ...) -> None: ...
 
 class LoopFigures(_message.Message):
     __slots__ = ("frames", "residual_rms_nm", "flux_fraction")
@@ -626,7 +628,7 @@ class LoopFigures(_message.Message):
     def __init__(self, frames: _Optional[int] = ..., residual_rms_nm: _Optional[float] = ..., flux_fraction: _Optional[float] = ...) -> None: ...
 
 class Health(_message.Message):
-    __slots__ = ("timestamp", "process", "state", "run_id", "pid", "version", "memory_bytes", "rate_hz", "heard", "topics", "granted", "refused", "clock_offset_ns", "uptime_ns", "frame_to_command", "frame_to_mirror", "wavefront", "recording", "mode", "counts", "commands_late", "mean_rate_hz", "router_offset_ns", "router_round_trip_ns", "not_closed_ns", "not_closed_cause", "command_refused", "command_expired", "limits_hit", "recent_wavefront", "last_second", "last_warning", "last_warning_timestamp")
+    __slots__ = ("timestamp", "process", "state", "run_id", "pid", "version", "memory_bytes", "rate_hz", "heard", "topics", "granted", "refused", "clock_offset_ns", "uptime_ns", "frame_to_command", "frame_to_mirror", "wavefront", "recording", "mode", "counts", "commands_late", "mean_rate_hz", "router_offset_ns", "router_round_trip_ns", "not_closed_ns", "not_closed_cause", "command_refused", "command_expired", "limits_hit", "recent_wavefront", "last_second", "last_warning", "last_warning_timestamp", "host")
     TIMESTAMP_FIELD_NUMBER: _ClassVar[int]
     PROCESS_FIELD_NUMBER: _ClassVar[int]
     STATE_FIELD_NUMBER: _ClassVar[int]
@@ -660,6 +662,7 @@ class Health(_message.Message):
     LAST_SECOND_FIELD_NUMBER: _ClassVar[int]
     LAST_WARNING_FIELD_NUMBER: _ClassVar[int]
     LAST_WARNING_TIMESTAMP_FIELD_NUMBER: _ClassVar[int]
+    HOST_FIELD_NUMBER: _ClassVar[int]
     timestamp: _timestamp_pb2.Timestamp
     process: str
     state: str
@@ -693,4 +696,5 @@ class Health(_message.Message):
     last_second: LoopFigures
     last_warning: str
     last_warning_timestamp: _timestamp_pb2.Timestamp
-    def __init__(self, timestamp: _Optional[_Union[datetime.datetime, _timestamp_pb2.Timestamp, _Mapping]] = ..., process: _Optional[str] = ..., state: _Optional[str] = ..., run_id: _Optional[str] = ..., pid: _Optional[int] = ..., version: _Optional[str] = ..., memory_bytes: _Optional[int] = ..., rate_hz: _Optional[float] = ..., heard: _Optional[_Iterable[str]] = ..., topics: _Optional[_Iterable[_Union[TopicCount, _Mapping]]] = ..., granted: _Optional[_Iterable[str]] = ..., refused: _Optional[_Iterable[str]] = ..., clock_offset_ns: _Optional[int] = ..., uptime_ns: _Optional[int] = ..., frame_to_command: _Optional[_Union[Latency, _Mapping]] = ..., frame_to_mirror: _Optional[_Union[Latency, _Mapping]] = ..., wavefront: _Optional[_Union[WavefrontFigures, _Mapping]] = ..., recording: _Optional[_Union[Recording, _Mapping]] = ..., mode: _Optional[_Union[LoopMode, str]] = ..., counts: _Optional[_Iterable[_Union[ReasonCount, _Mapping]]] = ..., commands_late: _Optional[int] = ..., mean_rate_hz: _Optional[float] = ..., router_offset_ns: _Optional[int] = ..., router_round_trip_ns: _Optional[int] = ..., not_closed_ns: _Optional[int] = ..., not_closed_cause: _Optional[str] = ..., command_refused: _Optional[_Union[Reason, str]] = ..., command_expired: _Optional[bool] = ..., limits_hit: _Optional[_Iterable[_Union[Reason, str]]] = ..., recent_wavefront: _Optional[_Union[WavefrontFigures, _Mapping]] = ..., last_second: _Optional[_Union[LoopFigures, _Mapping]] = ..., last_warning: _Optional[str] = ..., last_warning_timestamp: _Optional[_Union[datetime.datetime, _timestamp_pb2.Timestamp, _Mapping]] = ...) -> None: ...
+    host: str
+    def __init__(self, timestamp: _Optional[_Union[datetime.datetime, _timestamp_pb2.Timestamp, _Mapping]] = ..., process: _Optional[str] = ..., state: _Optional[str] = ..., run_id: _Optional[str] = ..., pid: _Optional[int] = ..., version: _Optional[str] = ..., memory_bytes: _Optional[int] = ..., rate_hz: _Optional[float] = ..., heard: _Optional[_Iterable[str]] = ..., topics: _Optional[_Iterable[_Union[TopicCount, _Mapping]]] = ..., granted: _Optional[_Iterable[str]] = ..., refused: _Optional[_Iterable[str]] = ..., clock_offset_ns: _Optional[int] = ..., uptime_ns: _Optional[int] = ..., frame_to_command: _Optional[_Union[Latency, _Mapping]] = ..., frame_to_mirror: _Optional[_Union[Latency, _Mapping]] = ..., wavefront: _Optional[_Union[WavefrontFigures, _Mapping]] = ..., recording: _Optional[_Union[Recording, _Mapping]] = ..., mode: _Optional[_Union[LoopMode, str]] = ..., counts: _Optional[_Iterable[_Union[ReasonCount, _Mapping]]] = ..., commands_late: _Optional[int] = ..., mean_rate_hz: _Optional[float] = ..., router_offset_ns: _Optional[int] = ..., router_round_trip_ns: _Optional[int] = ..., not_closed_ns: _Optional[int] = ..., not_closed_cause: _Optional[str] = ..., command_refused: _Optional[_Union[Reason, str]] = ..., command_expired: _Optional[bool] = ..., limits_hit: _Optional[_Iterable[_Union[Reason, str]]] = ..., recent_wavefront: _Optional[_Union[WavefrontFigures, _Mapping]] = ..., last_second: _Optional[_Union[LoopFigures, _Mapping]] = ..., last_warning: _Optional[str] = ..., last_warning_timestamp: _Optional[_Union[datetime.datetime, _timestamp_pb2.Timestamp, _Mapping]] = ..., host: _Optional[str] = ...) -> None: ...

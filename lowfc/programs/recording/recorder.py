@@ -345,6 +345,7 @@ class Recorder:
         lost = self._ledger.lost()
         health.recording.files.extend(map(str, self._series.files))
         health.recording.file = health.recording.files[-1] if health.recording.files else ""
+        health.recording.folder = str(Path.cwd())
         health.recording.messages = self._series.messages
         health.recording.lost = sum(lost.values())
         health.recording.failure = self._failure

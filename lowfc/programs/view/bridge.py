@@ -11,15 +11,16 @@ from dataclasses import dataclass
 
 import rerun as rr
 
-from lowfc.adapters.bus import Bus, Sample, states
+from lowfc.adapters.bus import Bus, states
 from lowfc.adapters.clock import Clock
 from lowfc.adapters.rerun_viewer import RerunViewer, Show, ViewerError
 from lowfc.adapters.service import Service
 from lowfc.adapters.usage import resident_bytes
 from lowfc.contract.configuration import Configuration
 from lowfc.contract.errors import LowfcError
-from lowfc.contract.messages import STEP, TRUTH, Role, Topic
+from lowfc.contract.messages import EVENT, STEP, TRUTH, Role
 from lowfc.programs.view.brush import Brush
+from lowfc.programs.view.earlier import earlier_events
 from lowfc.programs.view.moment import SHOWN
 
 WAITING = {topic: 1 if topic.newest_only else 100 for topic in SHOWN} | {STEP: 2000, TRUTH: 2000}
@@ -31,6 +32,7 @@ VIEWER_SPARE_BYTES = 1_500_000_000
 STUCK_S = 10.0
 """Without a moment drawn, the viewer is taken for hung."""
 
+_RECORDER_S = 3.0  # after which a recorder that has not been heard is none
 _TURN_S = 0.1
 _LOOK_S = 1.0
 _FROZEN_S = 3.0
@@ -87,8 +89,8 @@ class Bridge:
         self._brush: Brush | None = None
         self._drawn = self._renewals = self._most_bytes = 0
         self._renewed_s: list[float] = []
-        self._stuck = False
-        self._awake_s = time.monotonic()
+        self._stuck = self._past_known = False
+        self._awake_s = self._began_s = time.monotonic()
         self._rings = {topic: bus.ring(topic, WAITING[topic]) for topic in SHOWN}
         self.service = Service(Role.VIEWER, run_id, clock, bus)
 
@@ -146,9 +148,10 @@ class Bridge:
         self._viewer = self._open_viewer() if self._open_viewer is not None else None
         viewer = self._viewer
         self._brush = Brush(self._config, self._clock, self._rings, lambda: self._make_stream(viewer))
-        self._brush.tell(self._ask())
         self._brush.start()
-        self._stuck = False
+        self._began_s = time.monotonic()
+        self._past_known = self._stuck = False
+        self._inform(self._brush)
 
     def _lay_down(self, patience_s: float = 3.0) -> None:
         """End the brush, as far as it can be ended."""
@@ -158,15 +161,26 @@ class Bridge:
             self._drawn += self._brush.moments
             self._brush = None
 
-    def _ask(self) -> list[tuple[Topic, Sample]]:
-        """States from before our start."""
-        return list(states(self._bus, SHOWN))
+    def _inform(self, brush: Brush) -> None:
+        """Let a brush know what was sent before this view received anything; a peer that is frozen answers late."""
+        recorder = self.service.heard.get(Role.RECORDER)
+        past_known = self._past_known
+        if recorder is not None or time.monotonic() - self._began_s > _RECORDER_S:
+            self._past_known = True
+
+        def ask() -> None:
+            brush.tell(states(self._bus, SHOWN))
+            if self._past_known and not past_known:
+                brush.tell((EVENT, event) for event in earlier_events(recorder, self._clock.now_ns()))
+
+        threading.Thread(target=ask, name="ask", daemon=True).start()
 
     def _look(self, now_s: float) -> None:
         """Is everything well?"""
-        if (brush := self._brush) is not None and self.service.newcomers():
-            # One who is frozen answers late; the rest goes on meanwhile.
-            threading.Thread(target=lambda: brush.tell(self._ask()), name="ask", daemon=True).start()
+        if self._brush is not None and (
+            self.service.newcomers() or (not self._past_known and now_s - self._began_s > _RECORDER_S)
+        ):
+            self._inform(self._brush)
         own_bytes = resident_bytes()
         self._most_bytes = max(self._most_bytes, own_bytes)
         if self._viewer is not None and not self._viewer.alive:

@@ -15,7 +15,7 @@ DARK, DIM, BRIGHT = 0.2, 0.5, 2.0
 """A fifth of the light is what a controller refuses as dark unless told otherwise; half the light is 1.4 times the
 noise; twice the light is not the star that was calibrated."""
 
-_REFUSED: dict[Reason, tuple[str, str]] = {
+REFUSED: dict[Reason, tuple[str, str]] = {
     Reason.DARK: ("too dark", "the star is gone; look at pointing, shutter and clouds"),
     Reason.SATURATED: ("detector saturated", "there is too much light; shorten the exposure or dim the star"),
     Reason.WRONG_SIZE: ("wrong size", "they are not what was calibrated; set the camera back or calibrate again"),
@@ -25,6 +25,7 @@ _REFUSED: dict[Reason, tuple[str, str]] = {
     Reason.REPEATED: ("repeated", "the camera sends a frame twice; restart it"),
     Reason.OUT_OF_ORDER: ("out of order", "there may be a second camera on the bus; stop one"),
 }
+"""Of each reason for which a frame is refused, its words, and what they mean."""
 
 
 def frames(watcher: Watcher) -> Tile:
@@ -32,22 +33,24 @@ def frames(watcher: Watcher) -> Tile:
     title, camera, silent_s = "FRAMES", watcher.camera(), watcher.silent_s(FRAME)
     if camera.life is Life.NEVER:
         if watcher.running_s > GRACE_S:
-            return Tile(title, "NO CAMERA", "not heard of", Level.WARNING, "There is no camera. Start it for this run.")
+            return Tile(
+                title, "NO CAMERA", "no message from it", Level.WARNING, "There is no camera. Start it for this run."
+            )
         return Tile(title, "WAITING", "for the camera", Level.NEUTRAL)
     if camera.life in (Life.STOPPED, Life.STARTING):
-        return Tile(title, camera.life.name, "the camera, as told", Level.NEUTRAL)
+        return Tile(title, camera.life.name, "the camera, on request", Level.NEUTRAL)
     if silent_s is not None:
         alive = camera.life is not Life.SILENT and silent_s > 2 * SILENT_S
-        who = "the camera lives, but sends none" if alive else "camera silent"
-        advice = f"No frame for {ago(silent_s)}, {who}: the loop holds. See the camera's last words, restart it."
+        who = "the camera runs, but sends none" if alive else "camera silent"
+        advice = f"No frame for {ago(silent_s)}, {who}: the loop holds. See the camera's last output, restart it."
         return Tile(title, "NO FRAMES", f"for {ago(silent_s)}: {who}", Level.BAD, advice)
     return max((_rate(watcher), _lost(watcher), _refused(watcher)), key=lambda tile: tile.level)
 
 
 def _refused(watcher: Watcher) -> Tile:
     title, every = "FRAMES", all_refused(watcher)
-    counts = {reason: watcher.now(reason) if every else watcher.recent(reason) for reason in _REFUSED}
-    word, what = _REFUSED[max(counts, key=lambda one: counts[one])]
+    counts = {reason: watcher.now(reason) if every else watcher.recent(reason) for reason in REFUSED}
+    word, what = REFUSED[max(counts, key=lambda one: counts[one])]
     if every:
         advice = f"Every frame is refused, {word}: {what}. The mirror holds."
         return Tile(title, "REFUSED", f"all: {word}", Level.BAD, advice)
@@ -81,7 +84,7 @@ def _few(watcher: Watcher) -> str:
     counts = {
         "skipped": watcher.recent("skipped"),
         "never arrived": watcher.recent("missing"),
-        "refused": sum(watcher.recent(reason) for reason in _REFUSED),
+        "refused": sum(watcher.recent(reason) for reason in REFUSED),
     }
     said = [f"{counted(count, 'frame')} {what}" for what, count in counts.items() if count]
     return f"{', '.join(said)} in the last {RECENT_S:g} s" if said else "none lost, none refused"
@@ -92,7 +95,7 @@ def _rate(watcher: Watcher) -> Tile:
     if rate_hz is None and watcher.now("steps"):
         return Tile(title, "STARTING", "too few for a rate", Level.NEUTRAL)
     if rate_hz is None:
-        return Tile(title, "UNUSED", "frames come, nobody takes them", Level.NEUTRAL)
+        return Tile(title, "UNUSED", "frames arrive, no controller uses them", Level.NEUTRAL)
     clock = ", simulated time" if watcher.simulated else ""
     value = f"{rate_hz:.0f} Hz" if rate_hz >= 10 else f"{rate_hz:.2g} Hz"
     nominal_hz = 1e9 / watcher.period_ns if watcher.period_ns else 0.0
@@ -134,4 +137,4 @@ def star(watcher: Watcher) -> Tile:
 def all_refused(watcher: Watcher) -> bool:
     """Whether no frame of the last second was used."""
     steps = watcher.now("steps")
-    return steps > 0 and sum(watcher.now(reason) for reason in _REFUSED) >= steps
+    return steps > 0 and sum(watcher.now(reason) for reason in REFUSED) >= steps

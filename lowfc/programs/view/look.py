@@ -97,7 +97,7 @@ def look_at_logs(logs: list[Path], config: Configuration | None, where: Place) -
         stack.callback(_end, stream, viewer)
         if viewer is None or where.picture is not None:
             _say_where(where, viewer)
-            drawn = _draw(logs, config, stream)
+            drawn = _draw(logs, config, stream, where)
             stream.disconnect()  # a viewer keeps what it has
             if viewer is not None:
                 viewer.screenshot(where.picture)
@@ -105,7 +105,7 @@ def look_at_logs(logs: list[Path], config: Configuration | None, where: Place) -
             drawn = Drawn()
             with contextlib.suppress(KeyboardInterrupt):  # the way to end it, whether everything is drawn yet or not
                 _say_where(where, viewer)
-                drawn = _draw(logs, config, stream)
+                drawn = _draw(logs, config, stream, where)
                 while viewer.alive:
                     time.sleep(_POLL_S)
     _say_written(where)
@@ -118,11 +118,12 @@ def look_at_logs(logs: list[Path], config: Configuration | None, where: Place) -
     }
 
 
-def _draw(logs: list[Path], config: Configuration | None, stream: rr.RecordingStream) -> Drawn:
+def _draw(logs: list[Path], config: Configuration | None, stream: rr.RecordingStream, where: Place) -> Drawn:
     total = sum(log.stat().st_size for log in logs if log.exists())
     with passing_bar(Console(stderr=True)) as bar:
         task = bar.add_task("drawing", total=total)
         drawn = draw_logs(logs, config, lambda own: Painter(own, stream), lambda done: bar.update(task, completed=done))
+    where.show_whole(stream, drawn.span_ns)
     for remark in drawn.remarks:
         sys.stderr.write(f"{remark}\n")
     return drawn

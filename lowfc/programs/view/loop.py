@@ -22,6 +22,7 @@ MODE_COLOURS: dict[LoopMode, Colour] = {
     LoopMode.CLOSED: GREEN,
     LoopMode.SAFED: RED,
 }
+MODE_NAMES = {mode: "safe" if mode is LoopMode.SAFED else mode.name.lower() for mode in MODE_COLOURS}
 _NAMES = {mode.value: mode.name for mode in LoopMode}
 _LEVELS: dict[int, rr.TextLogLevel] = {
     Level.DEBUG: rr.TextLogLevel.DEBUG,
@@ -42,7 +43,7 @@ class Loop(Panel):
         """Name what is drawn."""
         style = rr.StateConfiguration(
             values=[mode.name for mode in MODE_COLOURS],
-            labels=[mode.name.lower() for mode in MODE_COLOURS],
+            labels=list(MODE_NAMES.values()),
             colors=[(*colour, 255) for colour in MODE_COLOURS.values()],
         )
         stream.log(MODE, style, static=True)
@@ -51,14 +52,18 @@ class Loop(Panel):
 
     def draw(self, stream: rr.RecordingStream, moment: Moment) -> None:
         """Add what is new."""
-        steps = moment.steps
+        steps, state = moment.steps, moment.controller
+        if not self._mode and state is not None and state.mode in _NAMES and state.HasField("mode_timestamp"):
+            since_ns = from_timestamp(state.mode_timestamp)
+            if not steps.time_ns.size or since_ns < steps.time_ns[0]:  # before the view began
+                self._change(stream, state.mode, since_ns)
         for row in np.flatnonzero(np.diff(steps.mode.astype(int), prepend=self._mode)):
-            self._mode = int(steps.mode[row])
-            at(stream, int(steps.time_ns[row]))
-            stream.log(MODE, rr.StateChange(state=_NAMES.get(self._mode, f"mode {self._mode}")))
+            self._change(stream, int(steps.mode[row]), int(steps.time_ns[row]))
         if steps.sequence.size and moment.calibration is not None:
-            curves(stream, FLUX, steps.time_ns, 100 * steps.flux_dn / moment.calibration.flux_dn)
-            curves(stream, SATURATED, steps.time_ns, steps.saturated_pixels.astype(float))
+            light = np.stack([100 * steps.flux_dn / moment.calibration.flux_dn, steps.saturated_pixels], axis=1)
+            light[~np.isfinite(steps.error_nm).all(axis=1)] = np.nan  # of a refused frame neither is measured
+            curves(stream, FLUX, steps.time_ns, light[:, 0])
+            curves(stream, SATURATED, steps.time_ns, light[:, 1])
         for event in moment.events:
             time_ns = from_timestamp(event.timestamp)
             clock = datetime.fromtimestamp(time_ns * 1e-9, UTC).strftime("%H:%M:%S")  # rerun's own column is cut
@@ -66,6 +71,11 @@ class Loop(Panel):
             level = _LEVELS.get(event.level, rr.TextLogLevel.INFO)
             name, message = printable(event.name), printable(event.message)
             stream.log(f"{LOG}/{name}", rr.TextLog(f"{clock}  {name}: {message}", level=level))
+
+    def _change(self, stream: rr.RecordingStream, mode: int, time_ns: int) -> None:
+        self._mode = mode
+        at(stream, time_ns)
+        stream.log(MODE, rr.StateChange(state=_NAMES.get(mode, f"mode {mode}")))
 
 
 def mode_view() -> rrb.View:
@@ -83,10 +93,12 @@ def saturated_view() -> rrb.View:
     return rrb.TimeSeriesView(origin=SATURATED, name="Pixels at full well")
 
 
-def log_view() -> rrb.View:
-    """Events."""
+def log_view(*, worst: bool = False) -> rrb.View:
+    """Events; or the warnings and errors among them."""
+    shown = [rr.TextLogLevel.WARN, rr.TextLogLevel.ERROR, rr.TextLogLevel.CRITICAL]
     return rrb.TextLogView(
         origin=LOG,
-        name="Events",
+        name="Warnings and errors" if worst else "Events",
+        rows=rrb.TextLogRows(filter_by_log_level=shown) if worst else None,
         columns=rrb.TextLogColumns(text_log_columns=["loglevel", "body"]),
     )

@@ -16,7 +16,7 @@ from lowfc.contract.codec import wire_mode
 from lowfc.contract.messages import EVENT, FRAME, STEP, SURFACE, TIMING, TRUTH, Topic, wire
 from lowfc.optics.zernike import NOLLS_14, mode_name
 from lowfc.programs.view.colours import distinct
-from lowfc.programs.view.loop import MODE_COLOURS
+from lowfc.programs.view.loop import MODE_COLOURS, MODE_NAMES
 
 TIMELINE = "message_publish_time"
 """Of the timelines that rerun gives to a log, the one by which messages were sent."""
@@ -25,7 +25,7 @@ _MIRROR = "dm"
 _MODE_NAMES = tuple(map(mode_name, NOLLS_14))
 _STATES = rr.StateConfiguration(
     values=[wire.LoopMode.Name(wire_mode(mode)) for mode in MODE_COLOURS],
-    labels=[mode.name.lower() for mode in MODE_COLOURS],
+    labels=list(MODE_NAMES.values()),
     colors=[(*colour, 255) for colour in MODE_COLOURS.values()],
 )
 

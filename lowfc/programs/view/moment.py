@@ -54,6 +54,7 @@ PICTURES_HZ = 30.0
 PICTURES_PER_WHOLE = 8
 """Moments for each that is whole: curves grow four times a second, for many rows cost hardly more than one."""
 
+_KNOWN_EVENTS = 5000
 _NO_STEPS, _NO_TRUTHS, _NO_TIMINGS = StepRows(0).taken(), TruthRows(0).taken(), TimingRows().taken()[1]
 
 
@@ -62,6 +63,22 @@ class Heard(NamedTuple):
 
     time_ns: int
     health: wire.Health
+
+
+@dataclass(frozen=True, slots=True)
+class LogEnd:
+    """The end of logs that are looked at.
+
+    Attributes:
+        name: of the last one.
+        complete: it was finished, and all of it is there.
+        run, host: of the run; empty where the log does not say.
+    """
+
+    name: str
+    complete: bool
+    run: str
+    host: str
 
 
 @dataclass(frozen=True, slots=True)
@@ -81,6 +98,7 @@ class Moment:
         heard_ns: when the last message of each topic was sent, by the topic's key in the table.
         whole: everything is in it; otherwise only what is newest, and rows and events wait for a later moment.
         behind_s: how late this moment is.
+        ended: the end of the logs, at their last moment.
     """
 
     time_ns: int
@@ -100,6 +118,7 @@ class Moment:
     heard_ns: Mapping[str, int]
     whole: bool = True
     behind_s: float = 0.0
+    ended: LogEnd | None = None
 
 
 class Gatherer:
@@ -114,6 +133,7 @@ class Gatherer:
         self._timings = TimingRows()
         self._newest: dict[str, bytes] = {}
         self._events: list[Log] = []
+        self._known_events: dict[tuple[int, bytes], None] = {}
         self._calibration: Calibration | None = None
         self._camera: wire.CameraState | None = None
         self._controller: wire.ControllerState | None = None
@@ -135,6 +155,8 @@ class Gatherer:
             if sequence < self._sequences.get(key, 0):
                 return
             self._sequences[key] = sequence
+        if topic is EVENT and not self._is_new(sequence, payload):
+            return
         self._heard_ns[topic.key] = max(publish_time_ns, self._heard_ns.get(topic.key, 0))
         if topic.newest_only:
             self._newest[topic.key] = payload
@@ -144,13 +166,14 @@ class Gatherer:
         except (BadMessageError, DecodeError, OverflowError, ValueError):
             self.unreadable += 1
 
-    def moment(self, host_ns: int, *, whole: bool = True, behind_s: float = 0.0) -> Moment:
+    def moment(self, host_ns: int, *, whole: bool = True, behind_s: float = 0.0, ended: LogEnd | None = None) -> Moment:
         """What is new at this time of the host's clock; the next moment begins here.
 
         Args:
             host_ns: now.
             whole: take rows and events too; otherwise they wait for a later moment, in which more come at once.
             behind_s: how late it is.
+            ended: the end of the logs, where this is their last moment.
         """
         frame, frame_ns = self._frame()
         if frame is not None:
@@ -181,7 +204,18 @@ class Gatherer:
             heard_ns=self._heard_ns,
             whole=whole,
             behind_s=behind_s,
+            ended=ended,
         )
+
+    def _is_new(self, sequence: int, payload: bytes) -> bool:
+        """Whether an event is new: those of the last minutes come by the bus, and in a log that is being written."""
+        known, identity = self._known_events, (sequence, payload)
+        if identity in known:
+            return False
+        known[identity] = None
+        if len(known) > _KNOWN_EVENTS:
+            del known[next(iter(known))]
+        return True
 
     def _time_ns(self, host_ns: int) -> int:
         if self._simulated_ns is not None:

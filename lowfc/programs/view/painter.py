@@ -20,6 +20,7 @@ from lowfc.programs.view.science import Science
 from lowfc.programs.view.sensor import Sensor
 from lowfc.programs.view.spectra import Spectra
 from lowfc.programs.view.tiles import Tiles
+from lowfc.programs.view.trend import Trend
 from lowfc.programs.view.wavefront import Wavefront
 
 RETRY_NS = 5_000_000_000
@@ -52,6 +53,7 @@ class Painter:
             Mirror,
             lambda: Wavefront(nm_per_mas),
             lambda: Pointing(nm_per_mas),
+            Trend,
             Loop,
             Latency,
             Spectra,

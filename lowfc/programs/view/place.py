@@ -47,12 +47,16 @@ class Place:
     def stream(
         self, viewer: RerunViewer | None, part: Path | None, recording: str, window_s: float | None
     ) -> rr.RecordingStream:
-        """Stream to the viewer, or into a file; plots show the last `window_s` seconds, or everything."""
+        """Stream to the viewer, or into a file; plots show the last `window_s` seconds, or what `show_whole` says."""
         blueprint = layout(self.tab, window_s)
         if viewer is not None:
             return to_viewer(viewer.url, recording, blueprint)
         assert part is not None  # noqa: S101  # there is a viewer or a file
         return to_file(part, recording, blueprint)
+
+    def show_whole(self, stream: rr.RecordingStream, span_ns: tuple[int, int] | None) -> None:
+        """Let the plots show all of a log that was drawn; a picture has nothing of its last instant alone."""
+        stream.send_blueprint(layout(self.tab, None, span_ns=span_ns, still=self.picture is not None))
 
 
 def place(

@@ -10,7 +10,7 @@ from lowfc.adapters.log_reader import Logged, LogReader
 from lowfc.contract.configuration import Configuration
 from lowfc.contract.errors import DataFileError
 from lowfc.contract.messages import topic_of
-from lowfc.programs.view.moment import PICTURES_HZ, PICTURES_PER_WHOLE, SHOWN, Gatherer
+from lowfc.programs.view.moment import PICTURES_HZ, PICTURES_PER_WHOLE, SHOWN, Gatherer, LogEnd
 from lowfc.programs.view.painter import Painter
 
 _PERIOD_NS = round(1e9 / PICTURES_HZ)
@@ -24,11 +24,13 @@ class Drawn:
     Attributes:
         moments: drawn.
         log_s: from the first message to the last.
+        span_ns: times of the first and of the last moment with a frame, on the timeline; None without one.
         remarks: what a person should know: what is damaged, truncated, unreadable.
     """
 
     moments: int = 0
     log_s: float = 0.0
+    span_ns: tuple[int, int] | None = None
     remarks: list[str] = field(default_factory=list)
 
 
@@ -52,6 +54,7 @@ def draw_logs(
     drawn, gatherer, run = Drawn(), Gatherer(), ""
     painter: Painter | None = None
     due_ns = first_ns = last_ns = behind = 0
+    complete, host = True, ""
     for log in logs:
         reader = LogReader(log, topics=SHOWN, skip_damaged=True)
         for number, message in enumerate(reader):
@@ -62,21 +65,27 @@ def draw_logs(
                 first_ns = message.log_time_ns
             if number == 0:
                 run = _same_run(run, reader)
+                host = host or reader.metadata.get("lowfc", {}).get("host", "")
             last_ns = message.log_time_ns
             _take(gatherer, message)
             if last_ns >= due_ns:
-                painter.draw(gatherer.moment(last_ns, whole=drawn.moments % PICTURES_PER_WHOLE == 0))
+                moment = gatherer.moment(last_ns, whole=drawn.moments % PICTURES_PER_WHOLE == 0)
+                painter.draw(moment)
+                if moment.frame is not None:
+                    drawn.span_ns = (drawn.span_ns[0] if drawn.span_ns else moment.frame_ns), moment.time_ns
                 drawn.moments += 1
                 due_ns = last_ns + _PERIOD_NS
             if number % _STRIDE == 0:
                 progress(behind + reader.position)
         behind += reader.size
+        complete &= reader.complete
         drawn.remarks += [f"{log.name}: {damage}" for damage in reader.damage]
         if not reader.complete and not reader.damage:
             drawn.remarks.append(f"{log.name} has no end: its recorder was killed, or is still writing")
     if painter is None:
         raise DataFileError(f"there is nothing to see in {', '.join(map(str, logs))}: no message that a view shows")
-    painter.draw(gatherer.moment(last_ns))
+    ended = LogEnd(logs[-1].name.partition(".")[0], complete, run, host)
+    painter.draw(gatherer.moment(last_ns, ended=ended))
     if gatherer.unreadable:
         drawn.remarks.append(f"{gatherer.unreadable} messages could not be read")
     drawn.log_s = (last_ns - first_ns) * 1e-9

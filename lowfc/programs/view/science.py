@@ -31,8 +31,8 @@ _SCALE = 2 * _SECOND
 _WIDTH = _SCALE + _BAR
 _LABEL = 5  # samples by which the viewer sets a label below its place
 _NAMES = {
-    "true": ("now, true wavefront", "with a flat mirror, true wavefront"),
-    "measured": ("now, measured error", "with a flat mirror, pseudo-open-loop"),
+    "true": ("with a flat mirror, true wavefront", "now, true wavefront"),
+    "measured": ("with a flat mirror, pseudo-open-loop", "now, measured error"),
 }
 """What the wavefronts are, those of a simulation first: they are taken where there are any."""
 
@@ -104,12 +104,12 @@ class Science(Panel):
         means = [camera.mean_contrast(image, WEDGE) for image in images]
         if source != self._named:
             self._named = source
-            name_curves(stream, CONTRAST, ["flat wavefront", *_NAMES[source]], [BLUE, GREEN, GREY], 1.6)
+            name_curves(stream, CONTRAST, [*_NAMES[source], "flat wavefront"], [GREY, GREEN, BLUE], 1.6)
         self._pictures.show(stream, time_ns, _side_by_side(*images))
         captions = [f"{title}: {mean:.1e}" for title, mean in zip(("now", "flat mirror"), means, strict=True)]
         places = [(start + _SAMPLES / 2, -_LABEL - _GAP) for start in (0, _SECOND)]
         stream.log(f"{IMAGE}/captions", words(places, captions))
-        curves(stream, CONTRAST, np.array([time_ns]), np.log10([[self._flat, *means]]))
+        curves(stream, CONTRAST, np.array([time_ns]), np.log10([[*reversed(means), self._flat]]))
 
 
 def image_view() -> rrb.View:

@@ -3,6 +3,8 @@
 from dataclasses import dataclass
 from enum import IntEnum
 
+_LONGEST = 110  # letters
+
 
 class Level(IntEnum):
     """How a tile is; from `WARNING` on somebody should look."""
@@ -47,3 +49,16 @@ def counted(count: int, noun: str) -> str:
 def ago(seconds: float) -> str:
     """A span of time in words."""
     return f"{seconds:.0f} s" if seconds < 120 else f"{seconds / 60:.0f} min"
+
+
+def long_time(seconds: float) -> str:
+    """A span of time that may be a night."""
+    if seconds < 120:
+        return f"{seconds:.0f} s" if seconds >= 10 else f"{seconds:.2g} s"
+    minutes = round(seconds / 60)
+    return f"{minutes} min" if minutes < 120 else f"{minutes // 60} h {minutes % 60} min"
+
+
+def short(text: str) -> str:
+    """A text of somebody else's, as long as a tile has room for."""
+    return text if len(text) <= _LONGEST else f"{text[: _LONGEST - 3]}..."

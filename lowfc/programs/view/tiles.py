@@ -3,6 +3,7 @@
 import io
 from datetime import UTC, datetime
 from functools import lru_cache
+from itertools import pairwise
 from math import ceil
 
 import numpy as np
@@ -12,15 +13,17 @@ import rerun.blueprint as rrb
 from PIL import Image, ImageDraw, ImageFont
 
 from lowfc.programs.view.colours import Colour
+from lowfc.programs.view.facts import Fact
 from lowfc.programs.view.marks import at
 from lowfc.programs.view.moment import Moment
+from lowfc.programs.view.night import Night
 from lowfc.programs.view.panel import Panel
 from lowfc.programs.view.tile import Level, Tile
 from lowfc.programs.view.verdict import Verdict, judge
 from lowfc.programs.view.watcher import Watcher
 
 TILES, HEADLINE = "status/tiles", "status/headline"
-WIDTH, HEIGHT = 1760, 196
+WIDTH, HEIGHT = 1760, 256
 GROUND: Colour = (13, 16, 17)
 """Rerun's own, so that only the tiles are seen."""
 FILL: dict[Level, Colour] = {
@@ -45,6 +48,8 @@ FIGURES_NS = 1_000_000_000
 clock is drawn as often where nothing else is new: when it stands, the view does."""
 
 _GAP, _INSET, _BAND, _CLOCK = 6, 9, 46, 190
+_TILES_END = 196
+_FACTS = (3, 4, 4, 4)  # widths of the facts below the tiles, to each other
 _SMALLEST = 8
 _SHADES = 16
 _PITCH = 1.16
@@ -54,18 +59,23 @@ Shades = npt.NDArray[np.uint8]
 
 
 class Tiles(Panel):
-    """Watches the run, and draws the verdict when it is another one."""
+    """Watches the run, and draws the verdict when it is another one; at the end of a log, that on all of it."""
 
     def __init__(self, nm_per_mas: float | None = None) -> None:
         """With the wavefront rms of a tilt of 1 mas, where the telescope is known."""
         self._nm_per_mas = nm_per_mas
         self._watcher = Watcher()
+        self._night = Night()
         self._drawn: Verdict | None = None
         self._drawn_ns = self._judged_ns = self._clock_ns = 0
 
     def draw(self, stream: rr.RecordingStream, moment: Moment) -> None:
         """Judge, and show the verdict if it changed, or the clock did."""
         self._watcher.feed(moment)
+        self._night.feed(moment, self._watcher)
+        if moment.ended is not None:
+            self._show(stream, moment.time_ns, self._night.verdict(self._watcher, moment.ended))
+            return
         if 0 <= moment.host_ns - self._judged_ns < SHORTEST_NS:
             return
         self._judged_ns = moment.host_ns
@@ -77,11 +87,14 @@ class Tiles(Panel):
             and 0 <= moment.host_ns - self._drawn_ns < FIGURES_NS
         ):
             return
-        at(stream, moment.time_ns)
-        stream.log(TILES, rr.EncodedImage(contents=png(picture(verdict, moment.time_ns)), media_type="image/png"))
+        self._show(stream, moment.time_ns, verdict)
+        self._drawn, self._drawn_ns, self._clock_ns = verdict, moment.host_ns, moment.time_ns
+
+    def _show(self, stream: rr.RecordingStream, time_ns: int, verdict: Verdict) -> None:
+        at(stream, time_ns)
+        stream.log(TILES, rr.EncodedImage(contents=png(picture(verdict, time_ns)), media_type="image/png"))
         if self._drawn is None or verdict.headline != self._drawn.headline:
             stream.log(HEADLINE, rr.TextDocument(verdict.headline))
-        self._drawn, self._drawn_ns, self._clock_ns = verdict, moment.host_ns, moment.time_ns
 
 
 def tiles_view() -> rrb.View:
@@ -97,6 +110,8 @@ def picture(verdict: Verdict, time_ns: int) -> Image.Image:
     _put(colours, (WIDTH - _CLOCK, 0, WIDTH, _BAND), verdict.level, _clock(time_ns // 10**9))
     for box, tile in zip(boxes, verdict.tiles, strict=True):
         _put(colours, box, tile.level, _tile(tile, box[2] - box[0], box[3] - box[1]))
+    for box, fact in zip(fact_places(), verdict.facts, strict=False):
+        _put(colours, box, Level.NEUTRAL, _fact(fact, box[2] - box[0], box[3] - box[1]))
     image = Image.fromarray(colours).convert("P")
     image.putpalette(_palette())
     return image
@@ -107,8 +122,14 @@ def places(tiles: int) -> list[Box]:
     boxes = [(0, 0, WIDTH, _BAND)]
     for number in range(tiles):
         left, right = ((WIDTH + _GAP) * one // tiles for one in (number, number + 1))
-        boxes.append((left, _BAND + _GAP, right - _GAP, HEIGHT))
+        boxes.append((left, _BAND + _GAP, right - _GAP, _TILES_END))
     return boxes
+
+
+def fact_places() -> list[Box]:
+    """Where the facts are, below the tiles."""
+    ends = [(WIDTH + _GAP) * sum(_FACTS[:number]) // sum(_FACTS) for number in range(len(_FACTS) + 1)]
+    return [(left, _TILES_END + _GAP, right - _GAP, HEIGHT) for left, right in pairwise(ends)]
 
 
 def png(image: Image.Image) -> bytes:
@@ -158,6 +179,15 @@ def _tile(tile: Tile, width: int, height: int) -> Shades:
     page.line((_INSET, 5, middle - _INSET, 25), tile.title, 17)
     page.line((_INSET, 27, right, 69), tile.value, 34)
     page.write((_INSET, 71, right, height - 4), tile.detail, 19)
+    return page.shades()
+
+
+@lru_cache(maxsize=16)
+def _fact(fact: Fact, width: int, height: int) -> Shades:
+    """Title and words of a fact."""
+    page = _Page(width, height)
+    page.line((_INSET, 2, width - _INSET, 17), fact.title, 13)
+    page.write((_INSET, 18, width - _INSET, height - 3), fact.text, 18)
     return page.shades()
 
 

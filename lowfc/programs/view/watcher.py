@@ -11,11 +11,23 @@ import numpy.typing as npt
 
 from lowfc.adapters.history import Single, Whole
 from lowfc.adapters.run import mirror_role
+from lowfc.contract.codec import actuators
 from lowfc.contract.envelope import start_of
-from lowfc.contract.messages import CONTROLLER_STATE, FRAME, MIRROR_STATE, STEP, Role, Topic, wire
+from lowfc.contract.messages import (
+    CONTROLLER_STATE,
+    FRAME,
+    MIRROR_STATE,
+    STEP,
+    Log,
+    Role,
+    Topic,
+    from_timestamp,
+    wire,
+)
 from lowfc.contract.printable import printable
 from lowfc.control.estimator import saturated_pixels
 from lowfc.control.safety import LoopMode, Reason
+from lowfc.programs.view.attainable import Attainable
 from lowfc.programs.view.moment import Moment
 from lowfc.programs.watch import topic_count
 
@@ -85,6 +97,9 @@ class Watcher:
         flux: light on the newest frame, of what the calibration expects; None without both.
         saturated: good pixels at full well in the newest frame.
         mirror: its last state.
+        note: the operator's last one; None before the first.
+        totals: of everything that `recent` counts, since the first moment.
+        attainable: what the loop could leave.
         begun_ns: host time of the first moment with a message.
     """
 
@@ -97,6 +112,10 @@ class Watcher:
         self.saturated = 0
         self.mirror: wire.MirrorState | None = None
         self.begun_ns = 0
+        self.note: Log | None = None
+        self.totals: Counter[Reason | str] = Counter()
+        self.attainable = Attainable()
+        self._why_ns = 0
         self._glances: deque[_Glance] = deque(maxlen=_GLANCES)
         self._totals: dict[float, Counter[Reason | str]] = {}
         self._counted: dict[str, tuple[int, int]] = {}
@@ -115,6 +134,8 @@ class Watcher:
         if not self.begun_ns and moment.heard_ns:
             self.begun_ns = moment.host_ns
         self._mode(moment)
+        self._events(moment.events)
+        self.attainable.feed(moment)
         self.mirror = moment.mirror or self.mirror
         if moment.frame is not None and moment.calibration is not None:
             self._light(moment.frame, moment)
@@ -138,6 +159,7 @@ class Watcher:
                 moment.timings["frame_to_command"],
             )
         )
+        self.totals.update(self._glances[-1].counts)
         while self._glances[0].host_ns < moment.host_ns - RECENT_S * 1e9 - PERIODS * self.period_ns:
             self._glances.popleft()
         if moment.steps.mode.size:
@@ -148,6 +170,16 @@ class Watcher:
         """Of the frames; 0 where the camera does not say."""
         camera = self.moment.camera if self.moment else None
         return camera.period_ns if camera is not None else 0
+
+    def run_and_host(self) -> tuple[str, str]:
+        """Name of the run, and the host of its controller or, without one, of the process heard first."""
+        if self.moment is None:
+            return "", ""
+        if self.moment.ended is not None:
+            return self.moment.ended.run, self.moment.ended.host
+        heard = {name: one.health for name, one in self.moment.health.items() if name != Role.VIEWER}
+        health = heard.get(Role.CONTROLLER) or next(iter(heard.values()), wire.Health())
+        return printable(health.run_id), printable(health.host)
 
     @property
     def simulated(self) -> bool:
@@ -190,6 +222,16 @@ class Watcher:
         durations = [glance.durations_ns for glance in (self._worked if ended else self._last(NOW_S))]
         every = np.concatenate(durations) if durations else np.zeros(0)
         return None if not every.size else (float(np.median(every)) / 1e3, float(np.percentile(every, 99)) / 1e3)
+
+    def stroke_nm(self) -> float:
+        """Largest deviation of an actuator from flat in the mirror's last state; 0 without one."""
+        surface_nm = actuators(self.mirror) if self.mirror is not None else None
+        return float(np.abs(surface_nm).max(initial=0.0)) if surface_nm is not None else 0.0
+
+    def messages_lost(self) -> int:
+        """By the recorder, as it reported last."""
+        heard = self.moment.health.get(Role.RECORDER) if self.moment else None
+        return heard.health.recording.lost if heard is not None else 0
 
     def controller(self) -> Sign:
         """Of the controller."""
@@ -266,9 +308,17 @@ class Watcher:
             self._told[name] = said
         if moment.steps.mode.size:
             self.mode = _MODES.get(int(moment.steps.mode[-1]), self.mode)
-        for event in moment.events:
-            if event.message.startswith("MODE_CHANGED"):
-                self.why = printable(event.message.partition(": ")[2])
+
+    def _events(self, events: Iterable[Log]) -> None:
+        """The newest note and cause: events from before a view began come after those that it received itself."""
+        for event in events:
+            time_ns = from_timestamp(event.timestamp)
+            if event.message.startswith("MODE_CHANGED") and time_ns >= self._why_ns:
+                self.why, self._why_ns = printable(event.message.partition(": ")[2]), time_ns
+            if event.message.startswith("NOTE ") and (
+                self.note is None or time_ns >= from_timestamp(self.note.timestamp)
+            ):
+                self.note = event
 
     def _light(self, frame: npt.NDArray[np.uint16], moment: Moment) -> None:
         calibration = moment.calibration

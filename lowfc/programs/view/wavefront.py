@@ -45,10 +45,10 @@ class Wavefront(Panel):
             curves(stream, COMMAND, steps.time_ns, steps.command_nm)
         if true:
             curves(stream, TRUTH, truths.time_ns, truths.residual_nm)
-            rms_nm = np.stack([truths.residual_rms_nm, truths.disturbance_rms_nm], axis=1)
+            rms_nm = np.stack([truths.disturbance_rms_nm, truths.residual_rms_nm], axis=1)
             self._sum_up(stream, truths.time_ns, truths.residual_nm, rms_nm)
         elif steps.sequence.size and not self._was_true and steps.command_nm.shape[1] == len(noll):
-            rms_nm = np.stack([_rss(steps.error_nm), _rss(steps.pol_nm)], axis=1)
+            rms_nm = np.stack([_rss(steps.pol_nm), _rss(steps.error_nm)], axis=1)
             self._sum_up(stream, steps.time_ns, steps.error_nm, rms_nm)
 
     @property
@@ -69,8 +69,8 @@ class Wavefront(Panel):
         for path in (ERROR, POL, COMMAND, TRUTH):
             name_curves(stream, path, names, colours)
         what = "true" if true else "measured"
-        with_loop = [f"residual, {what}", f"with a flat mirror, {what if true else 'pseudo-open-loop'}"]
-        name_curves(stream, RMS, with_loop, [GREEN, GREY], 1.6)
+        with_loop = [f"with a flat mirror, {what if true else 'pseudo-open-loop'}", f"residual, {what}"]
+        name_curves(stream, RMS, with_loop, [GREY, GREEN], 1.6)  # the last one lies on top
         degrees = np.array([noll_to_nm(index)[0] for index in noll])
         found = sorted(set(degrees.tolist()))
         self._groups = [np.flatnonzero(degrees == degree) for degree in found]
