@@ -28,7 +28,7 @@ from lowfc.contract import codec
 from lowfc.contract.calibration_codec import encode_calibration, identified
 from lowfc.contract.configuration import Configuration
 from lowfc.contract.envelope import sequence_of
-from lowfc.contract.errors import BusError, ConfigurationError, DataFileError, RequestRefusedError
+from lowfc.contract.errors import BusError, CalibrationError, ConfigurationError, DataFileError, RequestRefusedError
 from lowfc.contract.events import EVENTS
 from lowfc.contract.messages import (
     CALIBRATION,
@@ -118,6 +118,15 @@ ASKS: dict[str, tuple[Callable[[Client], object], Request]] = {
     "law": (lambda loop: loop.law(), Request(0, "law")),
     "load": (lambda loop: loop.load(KNOWN), Request(0, "load", calibration=KNOWN)),
     "note": (lambda loop: loop.note("höher"), Request(0, "note", text="höher")),
+    "lease": (
+        lambda loop: loop.ask("lease", values=10, text="a test", lease_id=7),
+        Request(0, "lease", values=(10.0,), text="a test", lease_id=7),
+    ),
+    "renew": (
+        lambda loop: loop.ask("renew", values=10, text="a test", lease_id=7),
+        Request(0, "renew", values=(10.0,), text="a test", lease_id=7),
+    ),
+    "release": (lambda loop: loop.ask("release", lease_id=7), Request(0, "release", lease_id=7)),
     "configuration": (lambda loop: loop.configuration(), Request(0, "configuration")),
 }
 
@@ -140,6 +149,32 @@ def test_one_mode_needs_no_list(controller: FakeController, loop: Client) -> Non
         with pytest.raises(RequestRefusedError, match="gain refused: "):
             loop.gain(0.4, modes=wrong)  # type: ignore[arg-type]
     assert len(controller.asked) == 3
+
+
+def test_a_reservation_is_renewed_and_every_request_of_its_holder_carries_it(controller: FakeController) -> None:
+    loop = controller.join()
+    with loop.reserved("a test", 30.0) as lease:
+        loop.gain(0.1)
+        loop.check_lease()
+    loop.gain(0.2)
+    first, gain, *renewals, release, after = controller.asked
+    assert (first.name, first.lease_id, first.values) == ("lease", lease.id, (10.0,))
+    assert first.text.startswith("a test by ")
+    assert f"(process {os.getpid()}), about 30 s to go" in first.text
+    assert (gain.name, gain.lease_id) == ("gain", lease.id)
+    assert renewals
+    assert {(one.name, one.lease_id) for one in renewals} == {("renew", lease.id)}
+    assert (release.name, release.lease_id) == ("release", lease.id)
+    assert after.lease_id == 0
+
+
+def test_a_reservation_that_ended_says_why(controller: FakeController) -> None:
+    loop = controller.join()
+    with loop.reserved("a test"):
+        controller.reply = Reply(False, "the lease ended: operator asked to open", 77)
+        for _ in range(2):
+            with pytest.raises(CalibrationError, match="ended from outside: .*operator asked to open"):
+                loop.check_lease()
 
 
 def test_frames_have_the_same_number_everywhere() -> None:
@@ -210,12 +245,12 @@ def test_nobody_there_and_nobody_answering_are_told_apart(controller: FakeContro
     controller.silent = True
     with pytest.raises(BusError, match=r"the controller of run 'default' did not answer within 0.05 s"):
         loop.open()
-    with pytest.raises(BusError, match="no recorder is there in run 'default': start one with `lowfc record`"):
+    with pytest.raises(BusError, match="no recorder is there in run 'default': start one, as with `lowfc record`"):
         loop.record(True)
     controller.bus.close()
     for ask in (loop.open, loop.calibration):
         with pytest.raises(
-            BusError, match="no controller is there in run 'default': start one with `lowfc controller`"
+            BusError, match="no controller is there in run 'default': start one, as with `lowfc controller`"
         ):
             ask()
 

@@ -6,7 +6,8 @@ with Client() as loop:
     errors_nm = [step.error_nm for step in loop.steps(200) if step.frame_sequence >= since]
 """
 
-from lowfc.client.client import Answer, Client
+from lowfc.client.answer import Answer
+from lowfc.client.client import Client
 from lowfc.client.configuration import configuration_of
 from lowfc.client.mirror_watch import MirrorWatch
 from lowfc.client.runs import running, the_run

@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from operator import index
 from types import TracebackType
-from typing import NamedTuple, TypeVar
+from typing import TypeVar
 
 import numpy as np
 import numpy.typing as npt
@@ -17,13 +17,13 @@ from lowfc.adapters.clock import HostClock
 from lowfc.adapters.names import Names
 from lowfc.adapters.run import DEFAULT_RUN, open_run
 from lowfc.adapters.zenoh_bus import ZenohBus
+from lowfc.client.answer import Answer
 from lowfc.client.lease import Lease
 from lowfc.client.mirror_watch import MirrorWatch
 from lowfc.client.runs import the_run
 from lowfc.client.stream import SILENT_S, WAITING, Frame, Stream, frame_of, step_of
 from lowfc.contract.calibration_codec import camera_settings, decode_calibration, encode_calibration
 from lowfc.contract.codec import most_bytes
-from lowfc.contract.envelope import count_of
 from lowfc.contract.errors import BusError, RequestRefusedError
 from lowfc.contract.law_codec import wire_law
 from lowfc.contract.messages import (
@@ -55,37 +55,6 @@ SLOW_ANSWER_S = 30.0
 """To load a calibration, to take a long play, to finish a log."""
 LARGE_BYTES = 100_000
 """Of a request; a larger one takes its time."""
-
-
-class Answer(NamedTuple):
-    """What was answered to a request that was carried out; one that was refused raises RequestRefusedError.
-
-    Attributes:
-        accepted: always true.
-        reply: the sentence.
-        frame_sequence: of the first frame for which the request is in force.
-        text: path of the log, of `record`.
-        state: the controller's, of `status`.
-        run: name of the run that answered.
-    """
-
-    accepted: bool
-    reply: str
-    frame_sequence: int
-    text: str = ""
-    state: wire.ControllerState | None = None
-    run: str = ""
-
-    @property
-    def frame(self) -> int:
-        """Number of that frame among those of its camera."""
-        return count_of(self.frame_sequence)
-
-    @property
-    def sentence(self) -> str:
-        """The answer as people read it."""
-        run = f" (run {self.run})" if self.run else ""
-        return f"{self.reply}, from frame {self.frame} on{run}"
 
 
 class Client:

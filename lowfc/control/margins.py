@@ -17,6 +17,8 @@ Array = npt.NDArray[np.float64]
 Complex = npt.NDArray[np.complex128]
 Whole = npt.NDArray[np.intp]
 
+SAME_RATE = 0.01
+"""By which the rate of a law's frames may differ from the camera's."""
 MOST_COUPLED = 100
 """States that have to do with each other: the poles of so many take 30 ms, within which no frame is answered."""
 
@@ -69,6 +71,25 @@ def margins(law: LinearLaw, delay_frames: float) -> Margins:
             found.gain_margin[mode], found.gain_reduction[mode] = _gain_margins(loop)
             found.phase_margin_deg[mode] = _phase_margin_deg(loop)
     return found
+
+
+def check_law(law: LinearLaw, delay_frames: float, rate_hz: float) -> None:
+    """Refuse a law that was made for another loop; `rate_hz` is 0 where it is not known.
+
+    Raises:
+        ValueError: it reckons with another delay, is of another rate, or is not stable here.
+    """
+    if law.signal == "pol" and abs(law.delay_frames - delay_frames) > 1e-3:
+        raise ValueError(
+            f"the law reckons with a delay of {law.delay_frames:g} frames, the loop with {delay_frames:g}: "
+            "set control.delay_frames, or make the law for that"
+        )
+    if rate_hz and abs(law.rate_hz - rate_hz) > SAME_RATE * rate_hz:
+        raise ValueError(
+            f"the law was made for {law.rate_hz:g} Hz, the frames come at {rate_hz:g} Hz: make another with "
+            "`lowfc tune` from a log of this rate"
+        )
+    check_stable(law, delay_frames)
 
 
 def check_stable(law: LinearLaw, delay_frames: float) -> None:

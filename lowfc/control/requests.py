@@ -14,9 +14,8 @@ from lowfc.control.additions import FLAT, MIRROR, Additions, Play, play_table
 from lowfc.control.inputs import Raised, Request
 from lowfc.control.law import Law
 from lowfc.control.lease import ENDED_BY
-from lowfc.control.linear_law import LinearLaw
 from lowfc.control.loading import in_mode, loaded, misfit, mode_event, uncalibrated
-from lowfc.control.margins import check_stable
+from lowfc.control.margins import check_law
 from lowfc.control.remarks import check_offset, remark
 from lowfc.control.reservation import lease, lease_checked, lease_ended, release, renew
 from lowfc.control.safety import Limits, LoopMode, neighbour_difference_nm, request_mode
@@ -27,8 +26,6 @@ from lowfc.control.wording import counted
 Single = npt.NDArray[np.float32]
 
 MOST_STEPS = 1 << 32
-SAME_RATE = 0.01
-"""By which the rate of a law's frames may differ from the camera's."""
 MOST_TEXT = 10_000
 """Characters of a note."""
 MOST_REPLY = 1000
@@ -277,25 +274,6 @@ def _law(settings: Settings, state: State, request: Request) -> Handled:
         raise ValueError(f"the law is of the modes {list(law.noll)}, the loop of {list(drive.calibration.noll)}")
     drive = drive._replace(following=Following.at_rest(law))
     return state._replace(drive=drive), f"the law {law.name!r} takes over from the integrator"
-
-
-def check_law(law: LinearLaw, delay_frames: float, rate_hz: float) -> None:
-    """Refuse a law that was made for another loop; `rate_hz` is 0 where it is not known.
-
-    Raises:
-        ValueError: it reckons with another delay, is of another rate, or is not stable here.
-    """
-    if law.signal == "pol" and abs(law.delay_frames - delay_frames) > 1e-3:
-        raise ValueError(
-            f"the law reckons with a delay of {law.delay_frames:g} frames, the loop with {delay_frames:g}: "
-            "set control.delay_frames, or make the law for that"
-        )
-    if rate_hz and abs(law.rate_hz - rate_hz) > SAME_RATE * rate_hz:
-        raise ValueError(
-            f"the law was made for {law.rate_hz:g} Hz, the frames come at {rate_hz:g} Hz: make another with "
-            "`lowfc tune` from a log of this rate"
-        )
-    check_stable(law, delay_frames)
 
 
 def _load(settings: Settings, state: State, request: Request) -> Handled:

@@ -14,7 +14,7 @@ from lowfc.control.additions import ADOPTED, FLAT
 from lowfc.control.inputs import Request
 from lowfc.control.linear_law import LinearLaw
 from lowfc.control.loading import ADOPTED_NM
-from lowfc.control.requests import check_law
+from lowfc.control.margins import check_law
 from lowfc.control.safety import Reason, limit
 from lowfc.control.state import State
 

@@ -23,7 +23,7 @@ from typer.testing import CliRunner
 
 from lowfc.adapters import calibration_file, law_file
 from lowfc.client import Client, running
-from lowfc.contract.errors import RequestRefusedError
+from lowfc.contract.errors import CalibrationError, RequestRefusedError
 from lowfc.contract.messages import COMMAND, EVENT, REQUEST, Log, wire
 from lowfc.control.linear_law import integrator_block, of_blocks
 from lowfc.control.requests import REQUESTS
@@ -139,6 +139,16 @@ def _the_rest(night: Night) -> None:
         ):
             with pytest.raises(RequestRefusedError, match=why):
                 ask()
+        with loop.reserved("a test", 30.0), Client(night.name) as other:
+            with pytest.raises(RequestRefusedError, match=r"reserved for a test by .*, about \d+ s to go"):
+                other.gain(0.1)
+            night.said["while reserved"] = night.ctl("lowfc ctl status")
+            loop.gain(0.05)
+            loop.check_lease()
+            other.open()
+            with pytest.raises(CalibrationError, match="operator asked to open"):
+                loop.check_lease()
+        loop.close_loop()
         loop.pause()
         night.said["while paused"] = night.ctl("lowfc ctl status --json")
         loop.close_loop()
@@ -208,6 +218,7 @@ def test_the_programs_of_the_document_run(night: Night) -> None:
     assert "mean image (" in night.said["program 0"]
     assert night.said["program 1"].startswith("True gain is now 0.3 0.3")
     assert json.loads(night.said["played"]) == [60, 0]
+    assert "reserved       for a test by " in night.said["while reserved"]
 
 
 def test_the_log_has_every_request_and_nothing_was_lost(night: Night) -> None:
@@ -218,7 +229,15 @@ def test_the_log_has_every_request_and_nothing_was_lost(night: Night) -> None:
     requests = [wire.Request.FromString(body) for found in messages for body in found.get(f"/{REQUEST.key}", [])]
     counts = Counter((request.name, request.accepted) for request in requests)
     assert {name for name, accepted in counts if accepted} == set(REQUESTS)
-    assert {name for name, accepted in counts if not accepted} == {"gain", "offset", "channel", "load", "note", "dance"}
+    assert {name for name, accepted in counts if not accepted} == {
+        "gain",
+        "offset",
+        "channel",
+        "load",
+        "note",
+        "renew",
+        "dance",
+    }
     commanded = Counter(command.split()[2] for command in COMMANDS)
     for name, count in commanded.items():
         assert name == "record" or sum(counts[name, good] for good in (True, False)) >= count

@@ -172,7 +172,7 @@ def _measured(kind: "Kind", where: Where, play: "Callable[[Live, Acceptance], li
     with Client(run) as client, counting_bar(Console(stderr=True), TimeRemainingColumn()) as count:
         live = Live(client, partial(count, kind))
         required = required or live.configuration.acceptance
-        with live.kept():
+        with client.reserved("lowfc acceptance"), live.kept():
             return Measured(play(live, required), required, live.configuration, live.calibration)
 
 

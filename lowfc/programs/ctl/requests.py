@@ -106,6 +106,24 @@ ASKED: tuple[Asked, ...] = (
         ("calibration", "all of it"),
     ),
     _asked("note", "Leave a note in the log.", 'note "new star"', ("text", "the note")),
+    _asked(
+        "lease",
+        "Reserve the loop: until that ends, requests of others that would change it are refused; `safe`, `open`, "
+        "`pause` and `stop` are granted to anybody, and end it.",
+        "",
+        ("lease_id", "a random number, which all requests of the holder carry"),
+        ("values", "seconds for which it holds without being renewed, at most 60"),
+        ("text", "the holder and its purpose, for people"),
+    ),
+    _asked(
+        "renew",
+        "Let a reservation that is in force hold longer; refused where it has ended, with the cause.",
+        "",
+        ("lease_id", "as in `lease`"),
+        ("values", "seconds"),
+        ("text", "as in `lease`"),
+    ),
+    _asked("release", "End a reservation.", "", ("lease_id", "as in `lease`")),
     _asked("configuration", "Answer with the configuration that the controller was started with.", "configuration"),
     Asked(
         RECORD_KEY.format(name="start"),

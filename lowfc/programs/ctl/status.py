@@ -98,6 +98,7 @@ def figures(
             for one in state.channels
         ],
         "playing": playing,
+        "reserved_for": state.lease.holder if state.lease.id and not state.lease.ended else None,
         "limits_hit": [Reason(reason).name for reason in state.limits_hit],
         "refused": Reason(state.refused).name if state.refused else None,
         "counts": {Reason(line.reason).name: line.count for line in state.counts},
@@ -138,6 +139,7 @@ def text(state: wire.ControllerState, processes: Mapping[str, wire.Health] = _NO
         "playing": f"{playing['target']}, {playing['frames_left']} of {counted(playing['frames'], 'frame')} left"
         if playing
         else "nothing",
+        "reserved": f"for {known['reserved_for']}" if known["reserved_for"] else "for nobody",
         "mirror limits": f"stroke {known['stroke_nm']:g} nm, slew {known['slew_nm']:g} nm a frame, "
         f"neighbours {known['neighbour_nm']:g} nm; {_acting(known['limits_hit'])}",
         "counted": ", ".join(_counted(name, count) for name, count in known["counts"].items()) or "nothing refused",
