@@ -144,8 +144,8 @@ def cycle_response(
         seen: (frames, modes) what the mirror did in each exposure, nm of wavefront.
         instruments: (frames, modes) the poke alone in each exposure; `seen` itself where the loop is open.
         used: (frames,) 1 where a frame may be used, else 0.
-        slowest: What the pokes have below this frequency, in cycles per frame, is not used: the wavefront is shaken most
-            there.
+        slowest: What the pokes have below this frequency, in cycles per frame, is not used: there the wavefront moves
+            most.
 
     Raises:
         ValueError: the pokes in the frames that may be used do not tell the modes apart.

@@ -638,7 +638,7 @@ def test_whatever_comes_in_it_is_pure_finite_and_within_the_limits(
         assert same((after, outputs), again)
         assert same((state, taken), copies)
         for event in outputs.events:
-            EVENTS[event.name].sentence.format(**event.details)
+            EVENTS[event.name].log("controller", 0, **event.details)
         if isinstance(taken, Frame):
             assert outputs.step is not None
             assert (outputs.command is None) == (after.drive is None)

@@ -29,6 +29,17 @@ stay_awake = false
 """
 
 
+SHAKEN = """
+[sensor]
+modes = 6
+[disturbance]
+preset = "bench"
+[realtime]
+priority = 0
+stay_awake = false
+"""
+
+
 @pytest.mark.slow
 def test_a_running_loop_is_calibrated_interrupted_and_gone_on_with(tmp_path: Path) -> None:
     (tmp_path / "test.toml").write_text(CONFIG)
@@ -50,6 +61,7 @@ def test_a_running_loop_is_calibrated_interrupted_and_gone_on_with(tmp_path: Pat
         assert {"method", "modes", "condition_number", "delay_frames", "noise_gain_nm", "file"} <= found.keys()
         assert 1.45 < found["delay_frames"] < 2.5  # commands that come late act a frame later, and so it is measured
         assert found["cross_talk"] < 0.02 + 4 * found["cross_talk_error"]
+        assert found["recommended"]
         assert not (tmp_path / "night.fits.part.npz").exists()
         made = calibration_file.load(tmp_path / "night.fits")
         with Client() as client:
@@ -63,6 +75,33 @@ def test_a_running_loop_is_calibrated_interrupted_and_gone_on_with(tmp_path: Pat
             state = client.status().state
             assert state is not None
             assert np.abs(np.array(state.command_history_nm)).max() < 5
+    finally:
+        interrupt(loop)
+
+
+@pytest.mark.parametrize(
+    "method", ["hadamard", *(pytest.param(name, marks=pytest.mark.slow) for name in ("poke", "in-loop"))]
+)
+def test_the_promise_is_kept_over_the_bus(method: str, tmp_path: Path) -> None:
+    (tmp_path / "test.toml").write_text(SHAKEN)
+    opened = [] if method == "in-loop" else ["--open"]
+    loop = start(tmp_path, "sim-loop", "--config", "test.toml", "--no-record", "--lockstep", *opened)
+    try:
+        until(running)
+        words = ("--method", method, "--snr", "20", "--no-linear-range", "--out", "night.fits", "--json")
+        done = run(tmp_path, "calibrate", *words)
+        assert done.returncode == 0, done.stderr
+        found = json.loads(done.stdout)
+        assert found["recommended"]
+        assert found["snr_reached"] >= 20
+        made = calibration_file.load(tmp_path / "night.fits")
+        with Client() as client:
+            talk = cross_talk(made.reconstructor, client.calibration().response)
+        assert np.sqrt((talk**2).mean()) < 1.2 / 20
+        assert np.abs(talk).max() < 4 / 20
+        ratio = np.array(found["noise_gain_nm"]) / found["computed_noise_nm"]
+        assert ratio.max() < 1.2
+        assert not list(tmp_path.glob("*.part.npz"))
     finally:
         interrupt(loop)
 

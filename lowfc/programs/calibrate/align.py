@@ -19,10 +19,11 @@ from lowfc.control.alignment import Alignment, Geometry, align, onto
 from lowfc.control.calibration import Calibration, normalise_flux
 from lowfc.control.regularised import reconstruct
 from lowfc.programs.analytic import analytic
-from lowfc.programs.calibrate.first_poke import first_poke
+from lowfc.programs.calibrate.first_poke import first_poke, sequence
+from lowfc.programs.calibrate.frame_count import Say
 from lowfc.programs.calibrate.recording import watch
 from lowfc.programs.calibrate.run import AMPLITUDE_NM
-from lowfc.programs.calibrate.tasks import Found, images
+from lowfc.programs.calibrate.tasks import Found, images, sayer
 
 Array = npt.NDArray[np.float64]
 
@@ -59,7 +60,7 @@ def aligned(
         made = on_sensor(config, computed, found.geometry, found.flux, picture.shape, None)
         calibration_file.save(made, out)
     else:
-        with Client(run) as loop:
+        with Client(run) as loop, loop.reserved("lowfc calibrate align"):
             config, before = configuration_of(loop), replace(loop.calibration(), camera=loop.camera())
             pixels = watch(loop, frames)
             if pixels.shape[1:] != before.shape:
@@ -73,7 +74,7 @@ def aligned(
             found = _fit(computed, pixels.mean(axis=0) - dark, half_turn)
             made = on_sensor(config, computed, found.geometry, found.flux, before.shape, before)
             told = True
-            if _reversed(loop, made):
+            if _reversed(loop, made, sayer(Console(stderr=True))):
                 found = replace(found, geometry=found.geometry.turned())
                 made = on_sensor(config, computed, found.geometry, found.flux, before.shape, before)
             calibration_file.save(made, out)
@@ -156,10 +157,10 @@ def _fit(computed: Calibration, image: Array, half_turn: bool) -> Alignment:
     return replace(found, geometry=found.geometry.turned()) if half_turn else found
 
 
-def _reversed(loop: Client, made: Calibration) -> bool:
+def _reversed(loop: Client, made: Calibration, say: Say) -> bool:
     """Whether a poke is seen with the sign opposite to that of a calibration."""
     mode = int(np.argmax(np.linalg.norm(made.response, axis=0)))
-    seen = first_poke(loop, made, mode, AMPLITUDE_NM["poke"])
+    seen = first_poke(loop, made, mode, sequence(AMPLITUDE_NM["poke"]), say)
     return bool(seen.picture @ made.response[:, mode] < 0)
 
 

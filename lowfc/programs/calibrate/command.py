@@ -37,7 +37,7 @@ def calibrate(
             help="Of a poke, nm rms of wavefront; default: 8 poke, 3 hadamard, 2 in-loop, half of it above --snr 70.",
         ),
     ] = None,
-    cycles: Annotated[int | None, typer.Option(min=1, help="How many, in place of --snr.")] = None,
+    cycles: Annotated[int | None, typer.Option(min=1, help="How many; --snr then judges them, default 20.")] = None,
     resume: Annotated[bool, typer.Option("--resume", help="Go on with one that was interrupted.")] = False,
     truncate: Annotated[
         float, typer.Option(min=0, max=0.99, help="Leave out singular values below this part of the largest.")
@@ -84,6 +84,7 @@ def calibrate(
             )
         return
     from lowfc.programs.calibrate import tasks as commands
+    from lowfc.programs.calibrate.pokes import LEAST_SNR, Wanted
 
     if compare is not None:
         _put(*commands.compared(*compare), as_json=as_json)
@@ -97,7 +98,9 @@ def calibrate(
                     f"{option} goes with --method analytic: a running loop is measured where it is, by its own "
                     "configuration"
                 )
-        wanted = commands.wanted(method, amplitude, snr, cycles, out, resume=resume, linear=linear_range)
+        if cycles is not None and "--snr" not in given:
+            snr = LEAST_SNR
+        wanted = Wanted(method, amplitude, snr, cycles, out, resume, range=linear_range)
         figures, text = commands.poked(wanted, run, truncate, tikhonov, load=load)
         _put(figures, text, as_json=as_json)
         if not figures["recommended"]:

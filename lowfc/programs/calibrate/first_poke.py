@@ -5,42 +5,51 @@ from lowfc.control import poke_plan
 from lowfc.control.calibration import Calibration
 from lowfc.control.delay_fit import Delay, measure_delay
 from lowfc.control.response_fit import normalised
+from lowfc.programs.calibrate.frame_count import Say
 from lowfc.programs.calibrate.recording import Loop, PlayInterruptedError, play
 
 FRAMES = 600
 ATTEMPTS = 5
 
 
-def first_poke(loop: Loop, before: Calibration, mode: int, amplitude_nm: float, seed: int = 1) -> Delay:
-    """Poke one mode of an open loop.
+def sequence(amplitude_nm: float, seed: int = 1) -> poke_plan.Plan:
+    """The sequence of pokes of one mode, of this amplitude (wavefront rms)."""
+    return poke_plan.dither(1, amplitude_nm, FRAMES, 1, seed)
+
+
+def first_poke(
+    loop: Loop, before: Calibration, mode: int, plan: poke_plan.Plan, say: Say, *, closed: bool = False
+) -> Delay:
+    """Poke one mode.
 
     Args:
         loop: To play on.
         before: Has dark, good pixels, reference and the mirror's commands; its response is not needed.
         mode: Place of the mode.
-        amplitude_nm: Of wavefront, rms.
-        seed: Of the sequence.
+        plan: As from `sequence`.
+        say: For people.
+        closed: The loop works against the pokes.
 
     Raises:
         CalibrationError: no poke is seen, or there was no run without a lost frame.
     """
-    plan = poke_plan.dither(1, amplitude_nm, FRAMES, 1, seed)
-    why = "frames were lost or refused"
     for _ in range(ATTEMPTS):
         try:
             recording = play(loop, before.modes_to_actuators.T[mode : mode + 1], plan.table)
         except PlayInterruptedError as error:
-            why = str(error)
+            say(f"once more: {error}")
             continue
         if recording.whole:
             break
+        say("frames were lost or refused while the delay was measured: once more")
     else:
         raise CalibrationError(
-            f"in {ATTEMPTS} attempts there was no run of {FRAMES} frames without a lost or refused one ({why}): "
+            f"in {ATTEMPTS} attempts there was no run of {len(plan)} frames without a lost or refused one: "
             "`lowfc doctor` looks for why"
         )
+    command = recording.command_nm[: len(plan), mode] if closed else None
     try:
         fractions, _ = normalised(recording.pixels, before.dark.astype(float), before.good.astype(float))
-        return measure_delay(fractions[:FRAMES], before.reference.astype(float), plan.table[:, 0])
+        return measure_delay(fractions[: len(plan)], before.reference.astype(float), plan.table[:, 0], command)
     except ValueError as error:
         raise CalibrationError(str(error)) from None

@@ -12,16 +12,18 @@ from lowfc.contract.errors import CalibrationError
 from lowfc.control import poke_plan
 from lowfc.control.calibration import Calibration
 from lowfc.control.response_fit import LEAST_CYCLES
+from lowfc.programs.calibrate.first_poke import sequence
 from lowfc.programs.calibrate.recording import AFTERWARDS
 
 Array = npt.NDArray[np.float64]
 
 AMPLITUDE_NM = {"poke": 8.0, "hadamard": 3.0, "in-loop": 2.0}
+LEAST_SNR = 20.0
+"""That a calibration of a given number of cycles must reach to be recommended."""
 FULL_AMPLITUDE_SNR = 70.0
 """Up to which the usual amplitude does: the error of the third-order terms goes as its square."""
 MOST_HADAMARD_NM = 3.0
 """Of a mode: all modes at once add up to some four times that, and the sensor must stay linear."""
-DELAY_FRAMES = 600
 SETTLE = 2
 """Frames left out after each change: one for a delay that is a fraction, and one for a command that comes late."""
 HOLD = 4
@@ -100,9 +102,10 @@ class Pokes:
         return self._cycle(number, self.amplitude_nm)
 
     def delay(self, mode: int) -> poke_plan.Plan:
-        """For the delay: one column."""
-        amplitude = self.amplitude_nm if self._wanted.method == "in-loop" else AMPLITUDE_NM["poke"]
-        return poke_plan.dither(1, min(amplitude, float(self._largest_nm()[mode])), DELAY_FRAMES, 1, self._wanted.seed)
+        """For the delay: one column, in a closed loop of the wavefront that all columns of a dither add up to."""
+        closed = self._wanted.method == "in-loop"
+        amplitude = self.amplitude_nm * float(np.sqrt(self._modes)) if closed else AMPLITUDE_NM["poke"]
+        return sequence(min(amplitude, float(self._largest_nm()[mode])), self._wanted.seed)
 
     def ladder(self) -> poke_plan.Plan:
         """For the linear range."""

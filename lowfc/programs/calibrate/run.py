@@ -15,7 +15,7 @@ from lowfc.contract.errors import CalibrationError, LowfcError
 from lowfc.contract.messages import wire
 from lowfc.control.calibration import Calibration, comparable
 from lowfc.control.camera import CameraSettings
-from lowfc.control.delay_fit import Delay, measure_delay
+from lowfc.control.delay_fit import Delay
 from lowfc.control.poke_plan import Plan
 from lowfc.control.regularised import pixel_variance
 from lowfc.control.response_fit import (
@@ -32,10 +32,10 @@ from lowfc.control.response_fit import (
     measured,
     normalised,
 )
+from lowfc.programs.calibrate.first_poke import first_poke
 from lowfc.programs.calibrate.frame_count import FrameCount, Say
 from lowfc.programs.calibrate.partial import go_on, keep, partial_of
 from lowfc.programs.calibrate.pokes import AMPLITUDE_NM as AMPLITUDE_NM
-from lowfc.programs.calibrate.pokes import DELAY_FRAMES as DELAY_FRAMES
 from lowfc.programs.calibrate.pokes import DITHER_SLOWEST, Pokes, checks
 from lowfc.programs.calibrate.pokes import Wanted as Wanted
 from lowfc.programs.calibrate.recording import Answered, Loop, PlayInterruptedError, Recording, play
@@ -206,6 +206,12 @@ class Calibrator:
             "lost; the cycles are kept, --resume --no-linear-range makes the calibration of them"
         )
 
+    @property
+    def _best(self) -> int:
+        """Place of the mode that is measured best; tip and tilt, which are shaken most, only without others."""
+        tilt = np.array([index in (2, 3) for index in self.before.noll])
+        return int(np.where(tilt & ~tilt.all(), np.inf, self.noise_nm).argmin())
+
     def _fractions(self, recording: Recording) -> tuple[Array, Array]:
         try:
             return normalised(recording.pixels, self._dark, self._good)
@@ -218,31 +224,10 @@ class Calibrator:
         Raises:
             CalibrationError: no poke is seen, or frames are lost.
         """
-        mode = int(self.noise_nm.argmin())
+        mode = self._best
         plan = self.pokes.delay(mode)
-        left = len(plan) + self.pokes.frames(self.pokes.cycles())
-        for _ in range(MOST_FAILURES):
-            try:
-                recording = self._play(self._basis[mode : mode + 1], plan, "looking for pokes", left)
-            except PlayInterruptedError as error:
-                self._say(f"once more: {error}")
-                continue
-            if recording.whole:
-                break
-            self._say("frames were lost or refused while the delay was measured: once more")
-        else:
-            raise CalibrationError(
-                f"in {MOST_FAILURES} attempts there was no run of {DELAY_FRAMES} frames without a lost or refused "
-                "one: `lowfc doctor` looks for why"
-            )
-        fractions, _ = self._fractions(recording)
-        command = recording.command_nm[:DELAY_FRAMES, mode] if self._closed else None
-        try:
-            found = measure_delay(
-                fractions[:DELAY_FRAMES], self.before.reference.astype(np.float64), plan.table[:, 0], command
-            )
-        except ValueError as error:
-            raise CalibrationError(str(error)) from None
+        loop = self._count.of(self._loop, "looking for pokes", len(plan) + self.pokes.frames(self.pokes.cycles()))
+        found = first_poke(loop, self.before, mode, plan, self._say, closed=self._closed)
         self._compare_picture(found.picture, mode)
         self._say(
             f"pokes of Z{self.before.noll[mode]} are seen after {found.delay_frames:.3f} +- {found.error_frames:.3f} "
@@ -322,7 +307,7 @@ class Calibrator:
             before.flux_dn * camera.gain_e_per_dn / camera.em_gain,
             instrument.equivalent_read_noise_e(camera),
         )
-        return initial_of(whole, delay.picture, int(self.noise_nm.argmin()), variance)
+        return initial_of(whole, delay.picture, self._best, variance)
 
     def _play(self, basis_nm: npt.NDArray[np.floating], plan: Plan, doing: str, left: int) -> Recording:
         """Play a plan; `left` frames are left with it."""

@@ -29,6 +29,7 @@ from lowfc.programs.analytic import analytic
 from lowfc.programs.calibrate.at import zero_point
 from lowfc.programs.calibrate.finish import finished
 from lowfc.programs.calibrate.partial import partial_of
+from lowfc.programs.calibrate.pokes import Wanted
 from lowfc.programs.calibrate.recording import watch
 from lowfc.programs.calibrate.result import (
     comparison,
@@ -36,19 +37,11 @@ from lowfc.programs.calibrate.result import (
     figures,
     text_of,
 )
-from lowfc.programs.calibrate.run import Calibrator, Wanted
-from lowfc.programs.calibrate.verdict import LEAST_SNR
+from lowfc.programs.calibrate.run import Calibrator
 
 Found = tuple[dict[str, Any], str]
 MOST_LIGHT = 0.02
 """Part of the star's light that may be in dark frames."""
-
-
-def wanted(
-    method: str, amplitude: float | None, snr: float, cycles: int | None, out: Path, *, resume: bool, linear: bool
-) -> Wanted:
-    """What the options ask for."""
-    return Wanted(method, amplitude, snr if cycles is None else LEAST_SNR, cycles, out, resume, range=linear)
 
 
 def poked(asked: Wanted, run: str | None, truncate: float, tikhonov: float, *, load: bool) -> Found:

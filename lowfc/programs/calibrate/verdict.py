@@ -10,8 +10,6 @@ from lowfc.programs.calibrate.pokes import cycles_for
 
 Array = npt.NDArray[np.float64]
 
-LEAST_SNR = 20.0
-"""That a calibration of a given number of cycles must reach to be recommended."""
 MOST_NOISE = 1.5
 """Times the noise of the computed reconstructor on the same light; farther from flat the sensor sees less."""
 
@@ -64,10 +62,11 @@ def judge(
     rms, largest = MOST_RMS / asked_snr, MOST_LARGEST / asked_snr
     faults = []
     if reached < asked_snr:
+        needed = cycles_for(asked_snr, cycles, float(error.max()))
         faults.append(
             f"signal-to-noise ratio {reached:.3g} in Z{noll[int(error.argmax())]}, {asked_snr:g} was to be reached: "
-            f"find what shakes this mode, or take about {cycles_for(asked_snr, cycles, float(error.max()))} cycles (the "
-            "same command with --resume and --cycles)"
+            f"find what shakes this mode, or take about {needed} cycles (the same command with --resume --cycles "
+            f"{needed})"
         )
     if not check.within(rms, largest):
         faults.append(

@@ -17,7 +17,7 @@ from lowfc.control.delay_fit import Delay
 from lowfc.control.regularised import reconstruct
 from lowfc.control.response_fit import cycle_response, normalised
 from lowfc.programs.calibrate.align import computed_scale, on_sensor
-from lowfc.programs.calibrate.first_poke import first_poke
+from lowfc.programs.calibrate.first_poke import first_poke, sequence
 from lowfc.programs.calibrate.recording import Loop, PlayInterruptedError, play
 from lowfc.programs.commission.first_light import Say
 
@@ -55,7 +55,7 @@ def first_delay(loop: Loop, config: Configuration, before: Calibration, say: Say
     while True:
         amplitude_nm = min(amplitude_nm, largest_nm)
         try:
-            found = first_poke(loop, before, 0, amplitude_nm)
+            found = first_poke(loop, before, 0, sequence(amplitude_nm), say)
             break
         except CalibrationError as error:
             if amplitude_nm >= min(MAX_FIRST_NM, largest_nm) or "not seen" not in str(error):
