@@ -5,18 +5,19 @@ VENV := .venv
 BIN := $(VENV)/bin
 INSTALL := $(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt
 # Tests that only compute run side by side; those with processes and a clock in them run alone, after them.
-COMPUTING := tests/control tests/design tests/fuzz tests/optics tests/sim tests/test_acceptance.py \
-	tests/test_calibrate.py tests/test_calibrate_at.py tests/test_calibrate_commands.py tests/test_chaos.py \
-	tests/test_calibration_file.py tests/test_certificates.py tests/test_configuration.py tests/test_conformance.py \
-	tests/test_controller_memory.py tests/test_docs_computing.py tests/test_export.py tests/test_history.py \
-	tests/test_hosts_commands.py tests/test_layers.py tests/test_layout_files.py tests/test_log_info.py \
-	tests/test_loop.py tests/test_messages.py tests/test_mirror_maps.py tests/test_recover.py \
-	tests/test_rehearsal.py tests/test_replay.py tests/test_report.py tests/test_state_codec.py tests/test_step.py \
-	tests/test_tune.py tests/test_validate.py tests/test_validate_figures.py tests/test_what_if.py \
-	tests/test_what_if_options.py tests/test_wheel.py tests/view tests/adapters/test_access.py \
-	tests/adapters/test_gaps.py tests/adapters/test_log_files.py tests/adapters/test_log_mutations.py \
-	tests/e2e/test_acceptance_loop.py tests/e2e/test_dark_hole.py tests/e2e/test_lockstep.py \
-	tests/e2e/test_mistakes.py tests/e2e/test_report_browser.py tests/e2e/test_sensors.py
+COMPUTING := tests/control tests/design tests/fuzz tests/optics tests/sim tests/view tests/adapters/test_access.py \
+	tests/adapters/test_extras.py tests/adapters/test_gaps.py tests/adapters/test_log_files.py \
+	tests/adapters/test_log_mutations.py tests/e2e/test_acceptance_loop.py tests/e2e/test_dark_hole.py \
+	tests/e2e/test_lockstep.py tests/e2e/test_mistakes.py tests/e2e/test_report_browser.py tests/e2e/test_sensors.py \
+	tests/test_acceptance.py tests/test_agreement.py tests/test_calibrate.py tests/test_calibrate_at.py \
+	tests/test_calibrate_commands.py tests/test_calibrate_promise.py tests/test_calibration_file.py \
+	tests/test_certificates.py tests/test_chaos.py tests/test_commission.py tests/test_configuration.py \
+	tests/test_conformance.py tests/test_controller_memory.py tests/test_docs_computing.py tests/test_export.py \
+	tests/test_history.py tests/test_hosts_commands.py tests/test_layers.py tests/test_layout_files.py \
+	tests/test_log_info.py tests/test_log_parts.py tests/test_loop.py \
+	tests/test_messages.py tests/test_mirror_maps.py tests/test_recover.py tests/test_rehearsal.py tests/test_replay.py \
+	tests/test_report.py tests/test_state_codec.py tests/test_step.py tests/test_tune.py tests/test_validate.py \
+	tests/test_validate_figures.py tests/test_what_if.py tests/test_what_if_options.py tests/test_wheel.py
 
 .PHONY: help sim-loop test test-all bench lint types format proto node clean
 

@@ -17,7 +17,7 @@ from lowfc.contract.events import EVENTS
 from lowfc.contract.messages import EVENT, wire
 from lowfc.control.calibration import Calibration
 from lowfc.control.response_fit import Initial, Sums, cross_talk
-from lowfc.programs.calibrate import run as calibrate_run
+from lowfc.programs.calibrate import first_poke
 from lowfc.programs.calibrate.partial import go_on, keep, partial_of
 from lowfc.programs.calibrate.result import measured_calibration
 from lowfc.programs.calibrate.run import Calibrator, Taken, Wanted
@@ -235,6 +235,31 @@ def test_what_went_wrong_first_is_told() -> None:
     assert said[-1].startswith("warning: the loop is not closed again: close refused")
 
 
+class Opening(FoldedLoop):
+    """Another operator opens the loop in the middle of a play."""
+
+    def play(self, basis_nm: npt.ArrayLike, table: npt.ArrayLike) -> Given:
+        given = super().play(basis_nm, table)
+        self.run(50)
+        self.ask("open", lease_id=0)
+        return given
+
+
+def test_another_operators_open_ends_a_calibration_and_the_loop_stays_open() -> None:
+    loop = Opening(configured(**FEW))
+    loop.close_loop()
+    said: list[str] = []
+    calibrator = Calibrator(loop, Wanted("poke", None, 50.0, 4, OUT, resume=False), said.append, ignore)
+    with (
+        loop.reserved("a test"),
+        pytest.raises(CalibrationError, match="operator asked to open"),
+        calibrator.holding(),
+    ):
+        calibrator.run()
+    assert mode_of(loop) == wire.LOOP_MODE_OPEN
+    assert "the loop is not closed again" in said[-1]
+
+
 def test_a_loop_is_closed_again_after_a_failure() -> None:
     loop = FoldedLoop(configured(**FEW))
     loop.close_loop()
@@ -266,7 +291,7 @@ def test_lost_frames_cost_only_themselves() -> None:
 
 
 def test_what_cannot_be_calibrated_is_said(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(calibrate_run, "MOST_FAILURES", 2)
+    monkeypatch.setattr(first_poke, "ATTEMPTS", 2)
     blind = FoldedLoop(configured(**FEW), world=configured(**FEW, mirror__dead=list(range(34 * 34))))
     with pytest.raises(CalibrationError, match="pokes are not seen"):
         taken_of(blind, "hadamard", 4)

@@ -9,19 +9,21 @@ from typing import Any
 import numpy as np
 import pytest
 from astropy.io import fits
-from folded_loop import FoldedLoop
+from folded_loop import FoldedLoop, computed
 from typer.testing import CliRunner
 
-from lowfc.adapters import calibration_file
+from lowfc.adapters import calibration_file, instrument
+from lowfc.adapters.progress import spoken
 from lowfc.contract.calibration_codec import identified
 from lowfc.contract.configuration import Configuration, load
 from lowfc.contract.errors import CalibrationError, ConfigurationError, DataFileError
 from lowfc.control.alignment import Geometry, onto
 from lowfc.control.response_fit import cross_talk, linear_range
 from lowfc.programs.calibrate import align as calibrate_align
+from lowfc.programs.calibrate import first_poke
 from lowfc.programs.calibrate import tasks as calibrate_commands
-from lowfc.programs.calibrate.command import calibrate_app
-from lowfc.programs.calibrate.pokes import AMPLITUDE_NM, FULL_AMPLITUDE_SNR
+from lowfc.programs.calibrate.command import calibrate, calibrate_app
+from lowfc.programs.calibrate.pokes import AMPLITUDE_NM, FULL_AMPLITUDE_SNR, Pokes, Wanted
 from lowfc.programs.calibrate.run import Calibrator
 from lowfc.programs.calibrate.tasks import compared
 
@@ -122,6 +124,86 @@ def test_a_calibration_is_written_once_it_is_whole_and_used_and_its_figures_are_
     assert same["reference_shift_nm"] == [0.0] * 6
     done = CliRunner().invoke(calibrate_app, ["--compare", "night.fits", "night.fits"])
     assert "largest cross-talk" in done.stdout
+
+
+def test_what_is_kept_is_named_where_a_calibration_ends_badly(loop: Connected, monkeypatch: pytest.MonkeyPatch) -> None:
+    def stop(*what: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(Calibrator, "check", stop)
+    done = CliRunner().invoke(calibrate_app, ["--cycles", "4", "--out", "night.fits"])
+    assert done.exit_code == 130
+    assert not Path("night.fits").exists()
+    assert done.stderr.splitlines()[-1] == (
+        "4 cycles are kept in night.fits.part.npz: the same command with --resume goes on with them"
+    )
+
+
+def test_a_bad_calibration_is_written_not_loaded_and_told(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.chdir(tmp_path)
+    faint = load(None, CONFIG | {"star.magnitude": 5.0})
+    loop = Connected(faint)
+    connect(loop, monkeypatch)
+    before = loop.calibration()
+    words = ["--cycles", "4", "--out", "night.fits", "--no-linear-range", "--load"]
+    done = CliRunner().invoke(calibrate_app, [*words, "--json"])
+    assert done.exit_code == 1
+    found = json.loads(done.stdout)
+    assert not found["recommended"]
+    assert found["snr_reached"] < 20
+    assert "20 was to be reached: find what shakes this mode, or take about" in found["faults"][0]
+    assert calibration_file.load(Path("night.fits")).id != before.id
+    assert loop.calibration().id == before.id
+    done = CliRunner().invoke(calibrate_app, [*words, "--resume"])
+    assert done.exit_code == 1
+    assert "verdict: NOT RECOMMENDED" in done.stdout
+    assert done.stdout.endswith("it is not loaded\n")
+
+
+def test_frames_that_changed_meanwhile_show_in_the_verdict(loop: Connected, monkeypatch: pytest.MonkeyPatch) -> None:
+    own, expose = Calibrator.check, loop._scene.expose
+
+    def shifted(index: int, surface_nm: np.ndarray) -> Any:
+        pixels, truth = expose(index, surface_nm)
+        return np.roll(pixels, 2, axis=1), truth
+
+    def moved(self: Calibrator, *what: Any) -> Any:
+        monkeypatch.setattr(loop._scene, "expose", shifted)
+        return own(self, *what)
+
+    monkeypatch.setattr(Calibrator, "check", moved)
+    done = CliRunner().invoke(calibrate_app, ["--cycles", "4", "--out", "night.fits", "--no-linear-range", "--json"])
+    assert done.exit_code == 1
+    assert "cross-talk on frames that were not used for it" in json.loads(done.stdout)["faults"][0]
+
+
+def test_the_time_to_go_has_everything_in_it(loop: Connected) -> None:
+    done = CliRunner().invoke(calibrate_app, ["--method", "poke", "--cycles", "4", "--out", "night.fits"])
+    assert done.exit_code == 0, done.output
+    said = next(line for line in done.stderr.splitlines() if "to go" in line)
+    seconds = float(said.partition("about ")[2].split()[0])
+    begun = 600 + 2 * 8  # what was played before it was said
+    assert seconds * 250 == pytest.approx(len(loop.surfaces_nm) - begun, abs=0.6 * 250)  # it is said in whole seconds
+    assert "4 cycles of" in said
+    assert "2 to check them, then the linear range" in said
+
+
+def test_a_calibration_by_default_takes_less_than_three_minutes() -> None:
+    config = load(None, {})
+    calibration = computed(config.to_toml())
+    noise_nm = instrument.frame_noise_nm(config, calibration)
+    snr = inspect.signature(calibrate).parameters["snr"].default
+    pokes = Pokes(config, calibration, noise_nm, Wanted("hadamard", None, snr, None, Path("night.fits"), resume=False))
+    assert (first_poke.FRAMES + pokes.frames(pokes.cycles())) / 250 < 180
+
+
+def test_without_a_terminal_a_line_every_10_s() -> None:
+    said, times = list[str](), iter(np.arange(0.0, 100.0, 0.5))
+    count = spoken(said.append, lambda: float(next(times)))
+    for done in range(0, 2000, 20):
+        count("hadamard cycle 3 of 8", done, 4000)
+    assert said[0] == "hadamard cycle 3 of 8: 10%, about 90 s to go"
+    assert len(said) == 4
 
 
 def test_the_reference_is_the_present_state(loop: Connected) -> None:

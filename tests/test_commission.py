@@ -84,6 +84,7 @@ def test_the_wavefront_is_held_where_the_reference_was_taken(commissioned: tuple
     assert float(np.sqrt(true.var(axis=0).sum())) < figures["measured_error_nm"]  # in which there is noise, too
 
 
+@pytest.mark.slow
 def test_a_sensor_unlike_the_configured_one_is_measured_without_the_model(tmp_path: Path) -> None:
     """The optical model is of another sensor; it gives only the modes and the mirror's commands."""
     other = Configuration.model_validate({**tomllib.loads(TOML), "sensor": {"kind": "clowfs"}})

@@ -11,6 +11,7 @@ from pathlib import Path
 import pytest
 from loops import children, interrupt, recorded_bytes, start, until
 from test_bench_day import COMMANDS as BENCH_DAY
+from test_commission_page import COMMANDS as COMMISSIONING
 from test_operator import COMMANDS as OPERATING
 from test_own_hardware import DOCUMENTED
 from viewers import needs_vulkan
@@ -66,7 +67,7 @@ def test_every_command_of_the_documents_is_known() -> None:
     ]
     assert len(found) > 15
     tested = {*ELSEWHERE, *LOOPS, *LOGS, *REQUESTS, *FILES, *BY_HAND, *SESSION, *BENCH, *VALIDATE, *DESIGN, *LOOKING}
-    tested |= {FEWER, *STAYING, *DOCUMENTED, *OPERATING, *BENCH_DAY}
+    tested |= {FEWER, *STAYING, *DOCUMENTED, *OPERATING, *BENCH_DAY, *COMMISSIONING}
     assert set(found) == tested
     for command, where in ELSEWHERE.items():
         assert command.split()[0] in (ROOT / where).read_text()

@@ -287,6 +287,7 @@ def _load(settings: Settings, state: State, request: Request) -> Handled:
             f"the calibration is for a mirror of {request.calibration.grid} actuators, this one has "
             f"{before.calibration.grid}"
         )
+    settings = replace(settings, start_mode=LoopMode.OPEN)  # an idle loop is not closed by what may be a first try
     after, events = loaded(settings, state, request.calibration, "operator", request.time_ns)
     return after, f"calibration {request.calibration.id[:12]}", events[0]
 

@@ -26,8 +26,11 @@ WORST_ANSWER = 1e3
 _WORST_INSTRUMENT = 1e6
 """Condition number of cov(seen, z) above which the pokes do not tell the modes apart."""
 _BETTER = 0.95
+"""Times the noise of an earlier candidate below which a later one is taken."""
 _SURE = 3.0
-_FAR = 4.0
+"""Standard errors that the square of their rms may be off by."""
+_FAR = 5.0
+"""Standard errors that the largest of some hundred elements may be off by."""
 
 
 class Cycle(NamedTuple):

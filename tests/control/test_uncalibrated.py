@@ -119,8 +119,9 @@ def test_it_is_not_closed_and_says_what_is_missing(begin: object, name: str) -> 
 def test_a_calibration_ends_it_and_leaves_the_mirror_where_it_is() -> None:
     state = idle(shape_nm=30.0)
     request = Request(0, "load", calibration=calibration())
-    state, _outputs = advance(replace(USUAL, start_mode=LoopMode.OPEN), state, request)
-    assert state.mode is LoopMode.OPEN
+    state, _ = advance(USUAL, state, request)
+    assert USUAL.start_mode is LoopMode.CLOSED
+    assert state.mode is LoopMode.OPEN, "what may be a first try closes nothing"
     state, every = feed(USUAL, state, frame(4, SOME))
     assert np.allclose(surfaces(every), 30, atol=1e-3)
     assert every[0].step is not None

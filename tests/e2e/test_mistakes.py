@@ -136,7 +136,7 @@ def test_ctrl_c_while_it_loads_is_quiet(tmp_path: Path) -> None:
         (("info", "empty.mcap"), "empty.mcap is empty: nothing was recorded"),
         (("recover", "header.mcap"), "nothing in it is whole, so there is nothing to recover"),
         (("replay", "night.mcap.part"), "it is finished now: night.mcap"),
-        (("replay", "night.mcap", "night.mcap"), "a log is named twice"),
+        (("replay", "night.mcap", "night.mcap"), "are the same part of one log"),
         (("replay", "pipe"), "pipe cannot be read: not a regular file"),
         (("replay", "circle"), "circle cannot be read: Too many levels of symbolic links"),
         (("config", "check", "/dev/zero"), "/dev/zero: not a readable TOML file: not a regular file"),

@@ -50,6 +50,7 @@ class Live:
         try:
             yield self
         finally:
+            self.client.check_lease()  # whoever ended it has the last word on the loop
             self.client.stop()
             now = LoopMode(self._state().mode)
             if now in (LoopMode.OPEN, LoopMode.CLOSED) and now is not self._found:

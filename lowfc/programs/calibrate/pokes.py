@@ -145,7 +145,10 @@ class Pokes:
             return poke_plan.dither(self._modes, amplitude_nm, PIECE, DITHER_HOLD, seed)
         patterns = poke_plan.hadamard_patterns if wanted.method == "hadamard" else poke_plan.poke_patterns
         rest = max(16, len(poke_plan.SIGNS) * HOLD)
-        return poke_plan.cycle(patterns(self._modes, amplitude_nm), HOLD, SETTLE, rest, backwards=number % 2 == 1)
+        shapes = patterns(self._modes, amplitude_nm)
+        # in an order of its own, so that a vibration disturbs each pair of cycles otherwise, and their scatter shows it
+        shapes = np.random.default_rng([wanted.seed, number // 2]).permutation(shapes)
+        return poke_plan.cycle(shapes, HOLD, SETTLE, rest, backwards=number % 2 == 1)
 
     def _amplitude(self) -> float:
         """What was asked for, or the usual, as far as the mirror's slew limit lets it."""

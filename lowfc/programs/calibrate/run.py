@@ -153,6 +153,7 @@ class Calibrator:
             yield
         except BaseException:
             try:
+                self._loop.check_lease()  # whoever ended it has the last word on the loop
                 self._loop.close_loop()
             except LowfcError as fault:  # what went wrong first is what is told
                 self._say(f"warning: the loop is not closed again: {fault}")

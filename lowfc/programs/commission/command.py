@@ -40,7 +40,7 @@ def commission(
     from lowfc.client import Client, configuration_of
     from lowfc.programs.analytic import analytic
     from lowfc.programs.calibrate.tasks import sayer, shown_progress
-    from lowfc.programs.commission.commissioning import Commission, Commissioning
+    from lowfc.programs.commission.commissioning import Commission, Commissioning, first_of
 
     if dark is not None and no_dark:
         raise ConfigurationError("--dark FILE and --no-dark exclude each other: choose one")
@@ -59,5 +59,10 @@ def commission(
 
     with Client(run) as loop, loop.reserved("lowfc commission"), shown_progress(console, say) as progress:
         config = configuration_of(loop)
-        found, text = Commissioning(loop, config, analytic(config, console), asked, say, progress, confirm).run()
+        try:
+            found, text = Commissioning(loop, config, analytic(config, console), asked, say, progress, confirm).run()
+        except BaseException:
+            if first_of(out).is_file():
+                say(f"what was done is kept in {first_of(out)}: the same command with --resume goes on with it")
+            raise
     put(found, text, as_json=as_json)

@@ -109,6 +109,12 @@ class Commissioning:
         resumed = asked.resume and kept.is_file()
         if resumed:
             first = calibration_file.load(kept)
+            camera = self._loop.camera()
+            if camera is not None and camera.shape != first.shape:
+                raise CalibrationError(
+                    f"{kept} is for frames of {first.shape[0]} x {first.shape[1]} pixels, the camera's are "
+                    f"{camera.shape[0]} x {camera.shape[1]}: leave --resume out"
+                )
             self._say(f"going on from {kept}: the steps before the poke amplitude are done")
         else:
             first = self._first()
