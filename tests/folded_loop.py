@@ -50,6 +50,14 @@ class Given(NamedTuple):
     state: wire.ControllerState | None
 
 
+class Reservation:
+    """In the place of `lowfc.client.lease.Lease`; nobody is told how long it is going to take."""
+
+    def expecting(self, progress: Callable[[str, int, int], None], rate_hz: float) -> Callable[[str, int, int], None]:
+        """See `Lease.expecting`."""
+        return progress
+
+
 class OperatorBus(MemoryBus):
     """The connection of an operator's program; a frame is exposed while it subscribes."""
 
@@ -165,12 +173,12 @@ class FoldedLoop:
         return self.ask("play", text=MIRROR, actuators_nm=basis.reshape(-1), table=np.asarray(table, np.float32))
 
     @contextlib.contextmanager
-    def reserved(self, purpose: str, duration_s: float | None = None) -> Iterator[None]:
+    def reserved(self, purpose: str, duration_s: float | None = None) -> Iterator[Reservation]:
         """See `Client.reserved`; nobody renews it."""
         self.lease_id = 1
         self.ask("lease", values=(60.0,), text=purpose)
         try:
-            yield
+            yield Reservation()
         finally:
             self.ask("release")
             self.lease_id = 0

@@ -135,7 +135,7 @@ def test_what_is_kept_is_named_where_a_calibration_ends_badly(loop: Connected, m
     assert done.exit_code == 130
     assert not Path("night.fits").exists()
     assert done.stderr.splitlines()[-1] == (
-        "4 cycles are kept in night.fits.part.npz: the same command with --resume goes on with them"
+        "kept in night.fits.part.npz: 4 cycles, with which the same command with --resume goes on"
     )
 
 
@@ -152,7 +152,9 @@ def test_a_bad_calibration_is_written_not_loaded_and_told(monkeypatch: pytest.Mo
     assert not found["recommended"]
     assert found["snr_reached"] < 20
     assert "20 was to be reached: find what shakes this mode, or take about" in found["faults"][0]
-    assert calibration_file.load(Path("night.fits")).id != before.id
+    assert found["file"] == "night.rejected.fits"
+    assert calibration_file.load(Path("night.rejected.fits")).id != before.id
+    assert not Path("night.fits").exists(), "a good one of that name would have been lost"
     assert loop.calibration().id == before.id
     done = CliRunner().invoke(calibrate_app, [*words, "--resume"])
     assert done.exit_code == 1
@@ -185,7 +187,7 @@ def test_the_time_to_go_has_everything_in_it(loop: Connected) -> None:
     begun = 600 + 2 * 8  # what was played before it was said
     assert seconds * 250 == pytest.approx(len(loop.surfaces_nm) - begun, abs=0.6 * 250)  # it is said in whole seconds
     assert "4 cycles of" in said
-    assert "2 to check them, then the linear range" in said
+    assert "3 to check them, then the linear range" in said
 
 
 def test_a_calibration_by_default_takes_less_than_three_minutes() -> None:

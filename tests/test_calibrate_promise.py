@@ -33,18 +33,21 @@ class Outcome(NamedTuple):
     verdict: Verdict
 
 
-def response_there(loop: FoldedLoop) -> np.ndarray:
-    """The analytic H (pixels, modes) of the commands where the wavefront is on average: with screen and mirror."""
-    before, config = loop.calibration(), loop.config
+def response_there(loop: FoldedLoop, *, closed: bool) -> np.ndarray:
+    """The analytic H (pixels, modes) of the commands, mean over where the wavefront was; pokes do not count."""
+    before, config, scene = loop.calibration(), loop.config, loop._scene
     optics = instrument.twin(config, None, lambda _: None)
     mirror = instrument.mirror_on_twin(config, optics, lambda _: None)
-    shape = np.mean(loop.surfaces_nm, axis=0).astype(np.float32)
-    opd = (loop._scene._screen + wavefront_nm(mirror, shape)).astype(np.float64)
+    still = scene._screen + wavefront_nm(mirror, np.mean(loop.surfaces_nm, axis=0).astype(np.float32))
+    moving = [0.0] if closed else [scene._modes(i) @ scene._basis for i in np.linspace(0, loop._index, 32).astype(int)]
     shapes = np.array(
         [wavefront_nm(mirror, each.reshape(before.grid)) for each in before.modes_to_actuators.T], dtype=np.float64
     )
-    light = reference(optics, opd).reshape(-1)
-    return normalise_flux(light, response(optics, shapes, opd), before.good.astype(np.float64))[1]
+    good, found = before.good.astype(np.float64), []
+    for opd_nm in (np.asarray(still + each, dtype=np.float64) for each in moving):
+        light = reference(optics, opd_nm).reshape(-1)
+        found.append(normalise_flux(light, response(optics, shapes, opd_nm), good)[1])
+    return np.mean(found, axis=0)
 
 
 def outcome(method: str, preset: str, seed: int, snr: float, folder: Path, cycles: int | None = None) -> Outcome:
@@ -65,7 +68,7 @@ def outcome(method: str, preset: str, seed: int, snr: float, folder: Path, cycle
     assert computed is not None
     ratio = instrument.frame_noise_nm(config, made) / computed
     verdict = judge(snr, taken.measured.cycles, taken.measured.error, check, ratio, made.noll)
-    return Outcome(cross_talk(made.reconstructor, response_there(loop)), ratio, verdict)
+    return Outcome(cross_talk(made.reconstructor, response_there(loop, closed=method == "in-loop")), ratio, verdict)
 
 
 def assert_kept(found: Outcome, snr: float) -> None:
@@ -75,7 +78,7 @@ def assert_kept(found: Outcome, snr: float) -> None:
     assert found.noise_ratio.max() < 1.5
 
 
-@pytest.mark.parametrize(("method", "preset"), [("hadamard", "bench"), ("poke", "step"), ("in-loop", "bench")])
+@pytest.mark.parametrize(("method", "preset"), [("hadamard", "bench"), ("in-loop", "bench")])
 def test_a_few_cycles_keep_the_promise(method: str, preset: str, tmp_path: Path) -> None:
     found = outcome(method, preset, 1, 30.0, tmp_path)
     assert not found.verdict.faults

@@ -10,7 +10,7 @@ from folded_loop import FoldedLoop, computed
 
 from lowfc.adapters import calibration_file
 from lowfc.contract.configuration import Camera, Configuration, Control
-from lowfc.contract.errors import CalibrationError
+from lowfc.contract.errors import CalibrationError, RequestRefusedError
 from lowfc.contract.messages import wire
 from lowfc.programs.calibrate.partial import partial_of
 from lowfc.programs.commission.commissioning import Commission, Commissioning, first_of
@@ -38,7 +38,15 @@ class Bench:
         self.asked: list[str] = []
 
     def commission(self, *, model: Configuration | None = None, **asked: Any) -> dict[str, Any]:
-        usual = {"dark": None, "no_dark": True, "frames": 100, "snr": 40.0, "resume": False, "close": True}
+        usual = {
+            "dark": None,
+            "no_dark": True,
+            "frames": 100,
+            "snr": 40.0,
+            "cycles": None,
+            "resume": False,
+            "close": True,
+        }
         made = Commissioning(
             self.loop,  # type: ignore[arg-type]  # in the place of a client
             self.config,
@@ -142,5 +150,5 @@ def test_a_camera_that_is_not_as_configured_is_refused(tmp_path: Path, config: d
 def test_in_safe_mode_nothing_begins(tmp_path: Path) -> None:
     bench = Bench(tmp_path)
     bench.loop.ask("safe")
-    with pytest.raises(CalibrationError, match="safe mode"):
+    with pytest.raises(RequestRefusedError, match="safe mode"):
         bench.commission()

@@ -62,7 +62,7 @@ def test_the_recorder_is_given_the_key(tmp_path: Path, monkeypatch: pytest.Monke
         return Summary((), 0, {}, "", 0, 0, 0)
 
     monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
-    monkeypatch.setattr("lowfc.programs.recording.recorder.record", record)
+    monkeypatch.setattr("lowfc.programs.recording.process.record", record)
     (tmp_path / "lowfc.toml").write_text('[recorder]\nfile_mode = "0604"\n')
     done = CliRunner().invoke(app, ["record", "--config", str(tmp_path / "lowfc.toml")])
     assert done.exit_code == 0, done.output

@@ -260,7 +260,7 @@ def test_what_cannot_be_recorded_is_refused_before_anything_is_made(
     process = lowfc("record", "--run", new_run_id(), *(str(option).format(tmp_path) for option in options))
     out, wrong = process.communicate(timeout=PATIENCE_S)
     assert (process.returncode, out) == (2, "")
-    (line,) = wrong.strip().splitlines()
+    *_, line = wrong.strip().splitlines()
     assert line.startswith("error: ")
     assert complaint in line
     assert list(tmp_path.iterdir()) == []

@@ -58,7 +58,9 @@ LARGE_BYTES = 100_000
 
 
 class Client:
-    """A connection to a loop, for one thread; it stays until `close`. Of the run, only who is asked need be there.
+    """A connection to a loop, for one thread (another renews a reservation); it stays until `close`.
+
+    Of the run, only who is asked need be there.
 
     Every request is carried out between two frames or refused, and answered with the first frame for which it is in
     force. What is refused raises RequestRefusedError, what is not answered BusError.

@@ -15,6 +15,8 @@ DURATION_S = 10.0
 RENEWAL_S = 0.5
 """Between renewals; in lockstep a loop may be twenty times as fast as its clock says."""
 
+Progress = Callable[[str, int, int], None]
+"""What is being done, how much of it is, and of how much."""
 Ask = Callable[[str, int, float, str], object]
 """Ask for `lease`, `renew` or `release`: the request, the lease's identity, seconds, its holder."""
 
@@ -55,6 +57,15 @@ class Lease:
         """Say how long it is going to take from now on."""
         self._end_s = time.monotonic() + duration_s
 
+    def expecting(self, progress: Progress, rate_hz: float) -> Progress:
+        """Progress in frames, from which others are told how long it is going to take."""
+
+        def told(what: str, done: int, total: int) -> None:
+            self.expect((total - done) / rate_hz)
+            progress(what, done, total)
+
+        return told
+
     def check(self) -> None:
         """Renew it now.
 
@@ -66,9 +77,9 @@ class Lease:
                 try:
                     self._ask("renew", self.id, DURATION_S, self._holder())
                 except RequestRefusedError as fault:
-                    self._ended = str(fault)
+                    self._ended = str(fault).removeprefix("renew refused: ")
             if self._ended:
-                raise CalibrationError(f"ended from outside: {self._ended}")
+                raise CalibrationError(f"ended by somebody else: {self._ended}")
 
     def release(self) -> None:
         """Give the loop back."""

@@ -60,13 +60,13 @@ def dark_of(frames: npt.NDArray[np.number]) -> Dark:
     return Dark(mean, noise, hot, noise > usual + _SIGMAS * of_noise, dead)
 
 
-def light_in(dark: Dark, reference: Array) -> float:
+def light_in(dark_dn: Array, reference: Array) -> float:
     """Flux in DN of a reference image (pixels,), in flux fractions, that is in frames said to be dark.
 
     Of all pixels: those that light falls on pass for hot and noisy.
     """
     shape = reference - reference.mean()
-    return float(shape @ dark.dark_dn / (shape @ shape))
+    return float(shape @ dark_dn / (shape @ shape))
 
 
 def _spread(values: Array) -> float:

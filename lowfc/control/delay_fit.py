@@ -37,6 +37,10 @@ class Delay(NamedTuple):
     snr: float
 
 
+class NotSeenError(ValueError):
+    """A poke has no answer in the frames."""
+
+
 def measure_delay(fractions: Array, reference: Array, poke: Array, command: Array | None = None) -> Delay:
     """The delay from frames under a pseudo-random poke.
 
@@ -47,7 +51,8 @@ def measure_delay(fractions: Array, reference: Array, poke: Array, command: Arra
         command: (frames,) the loop's own command of that mode beside it; None where the loop is open.
 
     Raises:
-        ValueError: there are too few frames, no poke is seen, or its answer comes later than is looked for.
+        ValueError: there are too few frames, or the answer comes later than is looked for.
+        NotSeenError: no poke is seen.
     """
     if len(fractions) < LEAST_FRAMES:
         raise ValueError(f"the delay needs at least {LEAST_FRAMES} frames without a gap, got {len(fractions)}")
@@ -72,7 +77,7 @@ def measure_delay(fractions: Array, reference: Array, poke: Array, command: Arra
     snr = float(np.sqrt(power))
     total = factors.sum()
     if snr < LEAST_SNR:
-        raise ValueError(
+        raise NotSeenError(
             "the pokes are not seen in the frames: is the light on the sensor, does the mirror follow the commands, is "
             "the amplitude too small?"
         )

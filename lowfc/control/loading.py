@@ -130,9 +130,9 @@ def camera_reported(settings: Settings, state: State, camera: CameraSettings) ->
     if wrong and wrong != misfit(state):
         events.append(Raised("CAMERA_CHANGED", {"what": wrong}))
         cause = f"the camera does not fit the calibration: {wrong}"
-    if mode is not LoopMode.SAFED and uncalibrated(after):
+    if mode is not LoopMode.SAFED and uncalibrated(after) and not after.frames_used:
         mode = LoopMode.IDLE
-    elif (mode is LoopMode.CLOSED and wrong) or mode is LoopMode.IDLE:
+    elif (mode is LoopMode.CLOSED and wrong) or (mode is LoopMode.IDLE and not uncalibrated(after)):
         mode = LoopMode.OPEN
     if mode is not after.mode:
         events.append(mode_event(after.mode, mode, cause))

@@ -62,8 +62,9 @@ def _frame(settings: Settings, state: State, frame: Frame) -> tuple[State, Outpu
         stale = Reason.REPEATED if frame.sequence == state.frame_sequence else Reason.OUT_OF_ORDER
         return _refuse(settings, state, frame, stale, events)
     state, drive = _arrive(state, frame, events)
+    freed = False
     if state.conditions.lease is not None:
-        state, drive = _lease_on_frame(state, drive, frame.sequence, events)
+        state, drive, freed = _lease_on_frame(state, drive, frame.sequence, events)
     if drive is None or not drive.calibration.noll:
         return _refuse(settings, _newest(state, drive, frame), frame, Reason.NO_CALIBRATION, events)
     if state.conditions.camera_awaited:
@@ -119,7 +120,7 @@ def _frame(settings: Settings, state: State, frame: Frame) -> tuple[State, Outpu
         saturated,
     )
     command = _command(state, drive, command_nm)
-    return state, Outputs(step, command, None, events, changed=ended)
+    return state, Outputs(step, command, None, events, changed=ended or freed)
 
 
 def _command(state: State, drive: Drive, command_nm: Single) -> Command:
@@ -153,11 +154,11 @@ def _arrive(state: State, frame: Frame, events: list[Raised]) -> tuple[State, Dr
 
 def _lease_on_frame(
     state: State, drive: Drive | None, sequence: int, events: list[Raised]
-) -> tuple[State, Drive | None]:
-    """The state and the drive, without a lease and its probe sequence where it was not renewed in time."""
+) -> tuple[State, Drive | None, bool]:
+    """The state and the drive, without a lease and its probe sequence where it was not renewed in time; whether so."""
     after, ended = lease_checked(state._replace(drive=drive), 0, sequence)
     events += ended
-    return after, after.drive
+    return after, after.drive, bool(ended)
 
 
 def _awaiting_camera(state: State, frame: Frame) -> State:
@@ -320,10 +321,11 @@ def _refuse(
 def _tick(settings: Settings, state: State, tick: Tick) -> tuple[State, Outputs]:
     """Without frames: repeat the held command, so that only a dead controller lets it expire."""
     state, events = lease_checked(state, tick.time_ns, 0)
+    freed = bool(events)
     drive = state.drive
     safed = state.mode is LoopMode.SAFED
     if drive is None or not (state.commanded or safed):
-        return state, Outputs(events=tuple(events))
+        return state, Outputs(events=tuple(events), changed=freed)
     silent = state.silent or tick.silent_ns > settings.hold_ns  # until a newer frame comes, whatever else comes
     flatten = silent and settings.silence == "flat"
     counts = state.counts
@@ -335,7 +337,7 @@ def _tick(settings: Settings, state: State, tick: Tick) -> tuple[State, Outputs]
     if flatten or safed:
         drive = _relax(settings, drive)
     state = state._replace(drive=drive, silent=silent, commanded=True, counts=counts)
-    return state, Outputs(command=_command(state, drive, drive.history_nm[0]), events=events)
+    return state, Outputs(command=_command(state, drive, drive.history_nm[0]), events=events, changed=freed)
 
 
 def _load(settings: Settings, state: State, load: Load) -> tuple[State, Outputs]:

@@ -13,7 +13,7 @@ import numpy.typing as npt
 from lowfc.control.additions import FLAT, MIRROR, Additions, Play, play_table
 from lowfc.control.inputs import Raised, Request
 from lowfc.control.law import Law
-from lowfc.control.lease import ENDED_BY
+from lowfc.control.lease import ENDED_BY, refusal
 from lowfc.control.loading import in_mode, loaded, misfit, mode_event, uncalibrated
 from lowfc.control.margins import check_law
 from lowfc.control.remarks import check_offset, remark
@@ -53,17 +53,17 @@ def answer(settings: Settings, state: State, request: Request) -> Answer:
     request = prepared(settings, request)
     now, ended = lease_checked(state, request.time_ns, 0)
     held = now.conditions.lease
-    refusal = held.refusal(request.name, request.lease_id, request.time_ns) if held is not None else ""
-    refusal = refusal or request.refusal
-    if refusal:
-        return Answer(state, False, _short(refusal))
+    refused = refusal(held, request.name, request.lease_id, request.time_ns) or request.refusal
+    if refused:
+        return Answer(state, False, _short(refused))
     try:
         after, text, *events = handler(settings, now, request)
     except ValueError as error:
         return Answer(state, False, _short(str(error)))
-    if request.name in ENDED_BY and held is not None and held.id != request.lease_id:
+    if request.name == "safe" or (request.name in ENDED_BY and held is not None and held.id != request.lease_id):
         after, others = lease_ended(after, _asked(request))
         events += others
+        text += "".join(f"; the reservation for {event.details['holder']} ended" for event in others)
     if after.mode is not state.mode:
         why = _asked(request)
         events.append(mode_event(state.mode, after.mode, why))
@@ -99,7 +99,7 @@ def _short(text: str) -> str:
     return text if len(text) <= MOST_REPLY else f"{text[: MOST_REPLY - 3]}..."
 
 
-Handled = tuple[State, str] | tuple[State, str, Raised]
+Handled = tuple[State, str, *tuple[Raised, ...]]
 Handler = Callable[[Settings, State, Request], Handled]
 
 
@@ -111,9 +111,9 @@ def _mode(settings: Settings, state: State, request: Request) -> Handled:
     """open, close, safe, clear; to pause is to open: the command is held until the loop is closed again."""
     asked = "open" if request.name == "pause" else request.name
     missing = uncalibrated(state)
-    after, refusal = request_mode(state.mode, asked, calibrated=not missing)
-    if refusal:
-        raise ValueError(missing if asked == "close" and missing else refusal)
+    after, why = request_mode(state.mode, asked, calibrated=not missing)
+    if why:
+        raise ValueError(missing if asked == "close" and missing else why)
     if after is LoopMode.CLOSED:
         _check_closable(state)
     if request.name == "clear":  # the camera's and the mirror's numbers may begin anew, too
@@ -124,6 +124,8 @@ def _mode(settings: Settings, state: State, request: Request) -> Handled:
         reply = "the loop is open already, and holds the command"
     if request.name == "open" and paused:
         state = state._replace(conditions=state.conditions._replace(mode_cause=_asked(request)))
+    if after is LoopMode.IDLE:
+        reply = f"loop idle: {missing}"
     return in_mode(state, after, request.time_ns, _asked(request)), reply
 
 
@@ -161,9 +163,9 @@ def _step(settings: Settings, state: State, request: Request) -> Handled:
     if not (1 <= frames <= MOST_STEPS and frames == int(frames)):
         raise ValueError(f"step takes one whole number of frames, 1 or more; got {list(request.values)}")
     missing = uncalibrated(state)
-    after, refusal = request_mode(state.mode, "close", calibrated=not missing)
-    if refusal:
-        raise ValueError(missing or refusal)
+    after, why = request_mode(state.mode, "close", calibrated=not missing)
+    if why:
+        raise ValueError(missing or why)
     _check_closable(state)
     state = in_mode(state, after, request.time_ns, _asked(request))
     return state._replace(steps_left=int(frames)), f"loop closed for {counted(int(frames), 'frame')}"
@@ -289,7 +291,8 @@ def _load(settings: Settings, state: State, request: Request) -> Handled:
         )
     settings = replace(settings, start_mode=LoopMode.OPEN)  # an idle loop is not closed by what may be a first try
     after, events = loaded(settings, state, request.calibration, "operator", request.time_ns)
-    return after, f"calibration {request.calibration.id[:12]}", events[0]
+    said = (event for event in events if event.name != "MODE_CHANGED")  # which every request has
+    return after, f"calibration {request.calibration.id[:12]}", *said
 
 
 def _note(settings: Settings, state: State, request: Request) -> Handled:

@@ -2,6 +2,7 @@
 
 from lowfc.control.inputs import Raised, Request
 from lowfc.control.lease import Lease, extended
+from lowfc.control.safety import LoopMode
 from lowfc.control.state import Settings, State
 
 
@@ -9,9 +10,11 @@ def lease(settings: Settings, state: State, request: Request) -> tuple[State, st
     """Reserve the loop for the client that asks.
 
     Raises:
-        ValueError: somebody else holds it, or the request is not whole.
+        ValueError: somebody else holds it, the loop is in safe mode, or the request is not whole.
     """
     before = state.conditions.lease
+    if state.mode is LoopMode.SAFED:
+        raise ValueError("the loop is in safe mode: `lowfc ctl clear` first, when it is safe")
     if before is not None and not before.ended and before.id != request.lease_id:
         raise ValueError(before.reserved(request.time_ns))
     made = _extended(settings, state, request)

@@ -25,6 +25,10 @@ WORST_ANSWER = 1e3
 """Condition number of R H above which a reconstructor does not tell the modes apart."""
 _WORST_INSTRUMENT = 1e6
 """Condition number of cov(seen, z) above which the pokes do not tell the modes apart."""
+_OUTLIER = 4.0
+"""Standard deviations from the median within which a cycle counts as it is."""
+_OF_A_MEDIAN = 1.2
+"""Noise of the median of a few values over that of their mean."""
 _BETTER = 0.95
 """Times the noise of an earlier candidate below which a later one is taken."""
 _SURE = 3.0
@@ -188,8 +192,20 @@ def measured(sums: Sums) -> Measured:
     n = sums.cycles
     if n < 1:
         raise ValueError("no cycle was measured")
+    response, kept = sums.response / n, without_outliers(sums.answers)
+    mean = sums.answers.mean(axis=0)
+    if np.linalg.cond(mean) < WORST_ANSWER:
+        response = response @ np.linalg.solve(mean, kept.mean(axis=0))
     reference = sums.reference / sums.references if sums.references else None
-    return Measured(sums.response / n, sums.initial, row_error(sums.answers), reference, sums.flux_dn / n, n)
+    return Measured(response, sums.initial, row_error(kept), reference, sums.flux_dn / n, n)
+
+
+def without_outliers(answers: Array) -> Array:
+    """Answers (cycles, modes, modes) kept near their median: a jolt of the wavefront spoils one cycle, not the mean."""
+    median = np.median(answers, axis=0)
+    # 1.48: from the median deviation to the standard deviation; of a row, for all its elements have the same noise
+    scale = 1.48 * np.median(np.abs(answers - median), axis=(0, 2))[:, None]
+    return np.clip(answers, median - _OUTLIER * scale, median + _OUTLIER * scale)
 
 
 def row_error(answers: Array) -> Array:
@@ -259,7 +275,7 @@ class Check(NamedTuple):
         modes = len(self.error)
         unsure = _SURE * float(np.sqrt(2 * (self.error**4).sum() / modes**3))  # of the square of the rms
         far = _FAR * float(self.error.max())
-        return bool(self.rms**2 <= rms**2 + unsure and self.largest <= np.hypot(largest, far))
+        return bool(self.rms**2 <= rms**2 + unsure and self.largest <= largest + far)
 
 
 def check(answers: Array, wanted: Array, error: Array) -> Check:
@@ -270,8 +286,8 @@ def check(answers: Array, wanted: Array, error: Array) -> Check:
         wanted: (modes, modes) what it shall make of a response: one, unless combinations of modes are suppressed.
         error: (modes,) standard error of the elements of each row in one cycle.
     """
-    talk = answers.mean(axis=0) - wanted
-    noise = error / np.sqrt(len(answers))
+    talk = np.median(answers, axis=0) - wanted  # as a jolt of the wavefront spoils one cycle only
+    noise = _OF_A_MEDIAN * error / np.sqrt(len(answers))
     power = float((talk**2).mean() - (noise**2).mean())
     return Check(float(np.sqrt(max(power, 0.0))), float(np.abs(talk).max()), noise, len(answers))
 

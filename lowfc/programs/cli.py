@@ -234,7 +234,6 @@ def record(
         raise ConfigurationError(f"lowfc record takes options only, got {' '.join(words)!r}{hint}")
     settings = configuration(config, overrides)
     log, recorded = settings.recorder, selected(settings)
-    _print(outlook(settings), error=True)
     joined = open_run(run, (settings.mirror.name,), network=settings.network)
     complete = joined.path / "config.toml"  # a file may name only what was chosen; the log names every value
     write_whole(complete, settings.to_toml().encode())
@@ -250,6 +249,7 @@ def record(
         cpus=set(settings.realtime.recorder_cpus) or None,
         selection=recorded,
         expected_bytes_per_s=bytes_per_s(settings, recorded),
+        begins=lambda: _print(outlook(settings), error=True),
     )
     if as_json:
         _print(json.dumps(figures(done)))

@@ -102,6 +102,28 @@ def test_these_are_granted_to_anybody_and_end_the_lease_and_what_it_plays(name: 
     assert outputs.reply.text == f"the lease ended: operator asked to {name}"
 
 
+@pytest.mark.parametrize("name", ["close", "gain", "play", "load"])
+@pytest.mark.parametrize("ended", [True, False])
+def test_a_former_holder_is_refused_and_told_why(name: str, ended: bool) -> None:
+    state = asked(held(), Request(S, "pause"))[0] if ended else loaded(USUAL)
+    _, outputs = asked(state, Request(2 * S, name, values=(0.1,), lease_id=MINE))
+    assert outputs.reply is not None
+    assert not outputs.reply.accepted
+    assert ("operator asked to pause" if ended else "did the controller restart") in outputs.reply.text
+
+
+def test_in_safe_mode_nothing_is_reserved_and_its_holders_safe_ends_it() -> None:
+    state, outputs = asked(held(), Request(S, "safe", lease_id=MINE))
+    assert outputs.reply is not None
+    assert outputs.reply.text == f"loop in safe mode; the reservation for {HOLDER} ended"
+    _, outputs = asked(state, Request(S, "lease", values=(5.0,), text=HOLDER, lease_id=12))
+    assert outputs.reply is not None
+    assert "safe mode" in outputs.reply.text
+    _, outputs = asked(state, Request(S, "clear"))
+    assert outputs.reply is not None
+    assert outputs.reply.accepted
+
+
 @pytest.mark.parametrize("name", ["status", "note"])
 def test_these_disturb_nobody(name: str) -> None:
     state, outputs = asked(held(), Request(S, name, text="cloud"))
@@ -134,6 +156,7 @@ def test_it_is_granted_to_one_at_a_time_and_released_by_its_holder_only() -> Non
         ({"values": ()}, "one duration"),
         ({"text": " "}, "characters"),
         ({"text": "x" * 201}, "characters"),
+        ({"text": "\x1b[31mred"}, "printable"),
         ({"lease_id": 0}, "identity"),
     ],
 )

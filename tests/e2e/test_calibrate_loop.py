@@ -81,9 +81,8 @@ def test_a_running_loop_is_calibrated_interrupted_and_gone_on_with(tmp_path: Pat
         interrupt(loop)
 
 
-@pytest.mark.parametrize(
-    "method", ["hadamard", *(pytest.param(name, marks=pytest.mark.slow) for name in ("poke", "in-loop"))]
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("method", ["hadamard", "poke", "in-loop"])
 def test_the_promise_is_kept_over_the_bus(method: str, tmp_path: Path) -> None:
     (tmp_path / "test.toml").write_text(SHAKEN)
     opened = [] if method == "in-loop" else ["--open"]

@@ -20,10 +20,10 @@ from lowfc.adapters.join import clock_of
 from lowfc.adapters.rerun_viewer import RerunViewer, Show
 from lowfc.adapters.run import open_run
 from lowfc.adapters.zenoh_bus import ZenohBus
+from lowfc.client import running
 from lowfc.contract.configuration import load
 from lowfc.contract.errors import LowfcError
 from lowfc.contract.messages import Role
-from lowfc.programs.ctl.which_run import running
 from lowfc.programs.view.bridge import Bridge
 from lowfc.programs.view.command import view
 from lowfc.programs.view.layout import layout

@@ -64,8 +64,8 @@ def calibrate(
 ) -> None:
     """Calibrate a running loop with pokes of its mirror, or compute its calibration.
 
-    What was measured is checked on frames of its own. Where it is not recommended, it is written, not loaded, and the
-    exit status is 1.
+    What was measured is checked on frames of its own. Where it is not recommended, it is written as
+    NAME.rejected.fits, not loaded, and the exit status is 1.
 
     The mirror is afterwards where it was, also after Ctrl-C; --resume then goes on with the cycles that were done.
 

@@ -1,5 +1,6 @@
-"""From what was measured to a calibration in its file, judged."""
+"""Make a calibration of what was measured, judge it, and write its file."""
 
+from pathlib import Path
 from typing import Any, NamedTuple
 
 from lowfc.adapters import calibration_file, instrument
@@ -25,6 +26,11 @@ class Finished(NamedTuple):
     faults: tuple[str, ...]
 
 
+def rejected_of(out: Path) -> Path:
+    """Where a calibration is written that is not recommended: what may be a good one stays."""
+    return out.with_name(f"{out.stem}.rejected{out.suffix}")
+
+
 def finished(
     calibrator: Calibrator,
     asked: Wanted,
@@ -34,7 +40,7 @@ def finished(
     truncate: float = 0.0,
     tikhonov: float = 0.0,
 ) -> Finished:
-    """Make R, check it on other frames, write the file.
+    """Make R, check it on other frames, write the file: under another name where it is not recommended.
 
     Args:
         calibrator: Of the running loop.
@@ -57,10 +63,9 @@ def finished(
     noise = computed_noise_nm(config, made, computed)
     ratio = None if noise is None else instrument.frame_noise_nm(config, made) / noise
     verdict = judge(asked.snr, taken.measured.cycles, taken.measured.error, check, ratio, made.noll)
-    found = figures(
-        config, made, quality, asked.method, taken.measured, taken.delay, linear, computed, verdict, asked.out
-    )
-    calibration_file.save(made, asked.out)
+    file = rejected_of(asked.out) if verdict.faults else asked.out
+    found = figures(config, made, quality, asked.method, taken.measured, taken.delay, linear, computed, verdict, file)
+    calibration_file.save(made, file)
     lines = [text_of(found), advice(quality, made.noll, config.control.limit_nm), verdict_text(found)]
     counted = configured_delay(config)
     if abs(taken.delay.delay_frames - counted) > DELAY_APART:

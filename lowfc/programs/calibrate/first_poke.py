@@ -3,10 +3,15 @@
 from lowfc.contract.errors import CalibrationError
 from lowfc.control import poke_plan
 from lowfc.control.calibration import Calibration
-from lowfc.control.delay_fit import Delay, measure_delay
+from lowfc.control.delay_fit import Delay, NotSeenError, measure_delay
 from lowfc.control.response_fit import normalised
 from lowfc.programs.calibrate.frame_count import Say
 from lowfc.programs.calibrate.recording import Loop, PlayInterruptedError, play
+
+
+class PokesNotSeenError(CalibrationError):
+    """Pokes have no answer in the frames: they may be too small."""
+
 
 FRAMES = 600
 ATTEMPTS = 5
@@ -51,5 +56,7 @@ def first_poke(
     try:
         fractions, _ = normalised(recording.pixels, before.dark.astype(float), before.good.astype(float))
         return measure_delay(fractions[: len(plan)], before.reference.astype(float), plan.table[:, 0], command)
+    except NotSeenError as error:
+        raise PokesNotSeenError(str(error)) from None
     except ValueError as error:
         raise CalibrationError(str(error)) from None

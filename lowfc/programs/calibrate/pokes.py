@@ -42,7 +42,7 @@ MOST_TIMES = 4
 """So many times the cycles that photons and read-out call for are played at most: beyond, the operator decides."""
 CHECK_PART = 0.25
 """Cycles that check R, for each one that it is made from."""
-_LEAST_CHECKS = 2
+_LEAST_CHECKS = 3
 _OF_THE_SLEW = 0.8
 
 

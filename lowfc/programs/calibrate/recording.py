@@ -21,6 +21,8 @@ AFTERWARDS = 8
 """Frames recorded after the last of a play: the longest delay that can be measured is over by then."""
 MOST_BEHIND = 100
 """Frames by which the mirror's reports may lag behind the controller's steps; then the mirror is taken for dead."""
+CHECKED = 100
+"""Frames between two looks at whether the loop is still reserved."""
 MOST_REFUSED = 50
 """Frames refused in a row after which a probe sequence is given up."""
 _LIMITS = frozenset(reason for reason in Reason if reason >= Reason.MODAL_LIMIT)
@@ -169,6 +171,7 @@ def play(loop: Loop, basis_nm: npt.NDArray[np.floating], table: npt.NDArray[np.f
         BusError: frames or steps stopped, or no mirror is there.
         RequestRefusedError: the controller would not play it.
     """
+    loop.check_lease()
     with _streams(loop) as (frames, steps):
         mirror = loop.mirror_watch()
         first = loop.play(basis_nm.astype(np.float32), table.astype(np.float32)).frame_sequence
@@ -190,6 +193,8 @@ def play(loop: Loop, basis_nm: npt.NDArray[np.floating], table: npt.NDArray[np.f
                         _check_devices(mirror, step.frame_sequence, first)
                         made.append(step)
                         _check_refused(made)
+                        if len(made) % CHECKED == 0:
+                            loop.check_lease()
                     step = next(steps)
             _check_devices(mirror, step.frame_sequence, first)
         except StopIteration:

@@ -25,6 +25,7 @@ from lowfc.control.calibration import Calibration
 from lowfc.control.dark_frames import Dark, dark_of, light_in
 from lowfc.control.regularised import Reconstruction, advice, reconstruct
 from lowfc.control.response_fit import normalised
+from lowfc.control.wording import counted
 from lowfc.programs.analytic import analytic
 from lowfc.programs.calibrate.at import zero_point
 from lowfc.programs.calibrate.finish import finished
@@ -60,8 +61,9 @@ def poked(asked: Wanted, run: str | None, truncate: float, tikhonov: float, *, l
         loop = held.enter_context(Client(run))
         computed = analytic(configuration_of(loop), console)
         progress = held.enter_context(shown_progress(console, say))
+        lease = held.enter_context(loop.reserved(f"lowfc calibrate --method {asked.method}"))
+        progress = lease.expecting(progress, configuration_of(loop).camera.rate_hz)
         calibrator = Calibrator(loop, asked, say, progress, computed)
-        held.enter_context(loop.reserved(f"lowfc calibrate --method {asked.method}"))
         held.enter_context(_telling_what_is_kept(calibrator, kept, say))
         held.enter_context(calibrator.holding())
         done = finished(calibrator, asked, calibrator.run(), computed, None, truncate, tikhonov)
@@ -89,7 +91,8 @@ def _telling_what_is_kept(calibrator: Calibrator, kept: Path, say: Callable[[str
         yield
     except BaseException:
         if calibrator.kept:
-            say(f"{calibrator.kept} cycles are kept in {kept}: the same command with --resume goes on with them")
+            kept_cycles = counted(calibrator.kept, "cycle")
+            say(f"kept in {kept}: {kept_cycles}, with which the same command with --resume goes on")
         raise
 
 
@@ -205,7 +208,7 @@ def referenced(out: Path, run: str | None, frames: int, *, load: bool) -> Found:
 def _dark_frames(loop: Client, before: Calibration, frames: int) -> tuple[Dark, int]:
     """The dark of the loop's next frames; the star must not be in them."""
     found = _dark(watch(loop, frames), before, "the camera")
-    light = light_in(found, before.reference.astype(np.float64))
+    light = light_in(found.dark_dn, before.reference.astype(np.float64))
     if light > MOST_LIGHT * before.flux_dn:
         raise CalibrationError(
             f"the frames are not dark: {light / before.flux_dn:.1%} of the star's light is in them; block the star"

@@ -20,8 +20,9 @@ def commission(
         bool, typer.Option("--no-dark", help="Take the camera's bias for the dark, and all pixels for good.")
     ] = False,
     snr: Annotated[
-        float, typer.Option(min=1, max=1e6, help="Signal-to-noise ratio to reach in the noisiest mode.")
+        float, typer.Option(min=1, max=1e4, help="Signal-to-noise ratio to reach in the noisiest mode.")
     ] = 50.0,
+    cycles: Annotated[int | None, typer.Option(min=1, help="How many of the response, in place of --snr.")] = None,
     resume: Annotated[bool, typer.Option("--resume", help="Go on with one that was interrupted.")] = False,
     close: Annotated[bool, typer.Option("--close", help="Close the loop at the end.")] = False,
     as_json: Json = False,
@@ -52,17 +53,21 @@ def commission(
     require_folder(out)
     console = Console(stderr=True)
     say = sayer(console)
-    asked = Commission(out, frames, dark, no_dark, snr, resume, close)
+    asked = Commission(out, frames, dark, no_dark, snr, cycles, resume, close)
 
     def confirm(what: str) -> None:
         typer.confirm(what, default=True, abort=True, err=True)
 
-    with Client(run) as loop, loop.reserved("lowfc commission"), shown_progress(console, say) as progress:
+    with Client(run) as loop, loop.reserved("lowfc commission") as lease, shown_progress(console, say) as shown:
         config = configuration_of(loop)
+        progress = lease.expecting(shown, config.camera.rate_hz)
         try:
             found, text = Commissioning(loop, config, analytic(config, console), asked, say, progress, confirm).run()
         except BaseException:
             if first_of(out).is_file():
-                say(f"what was done is kept in {first_of(out)}: the same command with --resume goes on with it")
+                say(
+                    f"what was done is kept in {first_of(out)}: the same command with --resume goes on with it; until "
+                    "then a first calibration is in use, which nobody has judged"
+                )
             raise
     put(found, text, as_json=as_json)

@@ -1,5 +1,6 @@
 """The steps from a camera that publishes to a calibration that is in use, and to a closed loop."""
 
+import contextlib
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,7 +13,7 @@ from lowfc.adapters import calibration_file, instrument
 from lowfc.adapters.progress import Counted
 from lowfc.client import Client
 from lowfc.contract.configuration import Configuration
-from lowfc.contract.errors import CalibrationError
+from lowfc.contract.errors import CalibrationError, LowfcError
 from lowfc.contract.messages import wire
 from lowfc.control.calibration import Calibration
 from lowfc.control.delay_fit import Delay
@@ -22,17 +23,19 @@ from lowfc.control.safety import LoopMode
 from lowfc.control.what_if import settling_frames
 from lowfc.programs.calibrate.finish import finished
 from lowfc.programs.calibrate.partial import begun, partial_of
-from lowfc.programs.calibrate.pokes import Wanted, usual_nm
-from lowfc.programs.calibrate.recording import watch
+from lowfc.programs.calibrate.pokes import Pokes, Wanted
+from lowfc.programs.calibrate.recording import CHECKED, watch
 from lowfc.programs.calibrate.run import Calibrator
 from lowfc.programs.calibrate.tasks import images
 from lowfc.programs.commission.first_calibration import aligned, first_delay, linear_nm, poked
-from lowfc.programs.commission.first_light import Say, Sensor, camera_fits, darkened, referenced, undark
+from lowfc.programs.commission.first_light import Say, Sensor, camera_fits, darkened, referenced, without_dark
 from lowfc.programs.commission.prediction import measured_nm, predicted_nm
 
 METHOD = "hadamard"
 LOOKED_AT = 32
 """Frames of which size, rate and light are seen."""
+MAX_OF_PREDICTED = 1.5
+"""Measured over predicted error beyond which the closed loop is not what was expected."""
 MIN_PREDICTED = 1000
 """Frames of the open loop that a residual is predicted from, and of the closed loop that it is measured in."""
 STEPS = (
@@ -51,6 +54,7 @@ class Commission:
         dark: File of dark frames; None to take them now.
         no_dark: Take the camera's bias for the dark, and all pixels for good.
         snr: Signal-to-noise ratio to reach in the noisiest mode.
+        cycles: Of the response; None for as many as that takes.
         resume: Go on with one that was interrupted.
         close: Close the loop at the end.
     """
@@ -60,6 +64,7 @@ class Commission:
     dark: Path | None
     no_dark: bool
     snr: float
+    cycles: int | None
     resume: bool
     close: bool
 
@@ -115,7 +120,7 @@ class Commissioning:
                     f"{kept} is for frames of {first.shape[0]} x {first.shape[1]} pixels, the camera's are "
                     f"{camera.shape[0]} x {camera.shape[1]}: leave --resume out"
                 )
-            self._say(f"going on from {kept}: the steps before the poke amplitude are done")
+            self._say(f"going on from {kept}: the camera's steps, orientation and sign are done")
         else:
             first = self._first()
             calibration_file.save(first, kept)
@@ -126,9 +131,10 @@ class Commissioning:
             amplitude_nm = float(begun(partial_of(asked.out))[0]["amplitude_nm"])
         else:
             self._step("poke amplitude")
-            amplitude_nm = linear_nm(self._loop, config, first, delay, usual_nm(METHOD, asked.snr), self._say)
+            usual_nm = Pokes(config, first, instrument.frame_noise_nm(config, first), self._wanted()).amplitude_nm
+            amplitude_nm = linear_nm(self._loop, config, first, delay, usual_nm, self._say)
         self._step("response")
-        wanted = Wanted(METHOD, amplitude_nm, asked.snr, None, asked.out, resume, range=False)
+        wanted = self._wanted(amplitude_nm, resume=resume)
         calibrator = Calibrator(self._loop, wanted, self._say, self._progress, self._computed)
         taken = calibrator.run(delay)
         self._step("verdict")
@@ -136,15 +142,20 @@ class Commissioning:
         self._figures |= done.figures
         if done.faults:
             raise CalibrationError(
-                f"{done.text}\nit is written, and not used: correct this, then the same command with --resume"
+                f"{done.text}\nit is not used: correct this, then the same command again; with --resume it goes on "
+                "with these cycles, as for more of them (--cycles)"
             )
-        for path in (kept, partial_of(asked.out)):
-            path.unlink(missing_ok=True)
         self._loop.load(done.calibration)
         self._say(done.text)
         law = instrument.settings(config).law(done.calibration.noll)
         text = self._close(law, delay.delay_frames)
+        for path in (kept, partial_of(asked.out)):
+            path.unlink(missing_ok=True)
         return self._figures, text
+
+    def _wanted(self, amplitude_nm: float | None = None, *, resume: bool = False) -> Wanted:
+        asked = self._asked
+        return Wanted(METHOD, amplitude_nm, asked.snr, asked.cycles, asked.out, resume, range=False)
 
     def _step(self, name: str) -> None:
         self._say(f"[{STEPS.index(name) + 1}/{len(STEPS)}] {name}")
@@ -172,7 +183,7 @@ class Commissioning:
         seen = list(self._loop.frames(LOOKED_AT))
         camera = camera_fits(self._config, self._loop.camera_state(), seen, self._say)
         self._step("dark and bad pixels")
-        asked, sensor = self._asked, undark(camera)
+        asked, sensor = self._asked, without_dark(camera)
         if asked.dark is not None:
             sensor = darkened(camera, images(asked.dark), self._say)
         elif asked.no_dark:
@@ -215,17 +226,32 @@ class Commissioning:
         self._loop.close_loop()
         try:
             found_nm = measured_nm(self._steps(frames, LoopMode.CLOSED), law, rate_hz)
-        except ValueError as error:
-            raise CalibrationError(f"the residual is not measured: {error}") from None
-        measured = float(np.sqrt((found_nm**2).sum()))
-        self._figures["measured_error_nm"] = measured
+            measured = float(np.sqrt((found_nm**2).sum()))
+            self._figures["measured_error_nm"] = measured
+            if measured > MAX_OF_PREDICTED * predicted:
+                raise CalibrationError(
+                    f"the closed loop leaves {measured:.3g} nm rms of measured error, {predicted:.3g} was predicted: "
+                    "is the delay right, did the disturbance change? The loop is opened"
+                )
+        except BaseException as error:
+            with contextlib.suppress(LowfcError):
+                self._loop.check_lease()  # whoever ended it has the last word on the loop
+                self._loop.open()
+            if isinstance(error, ValueError):
+                raise CalibrationError(f"the residual is not measured: {error}") from None
+            raise
         return f"{text}\nmeasured in the closed loop: {measured:.3g} nm rms, {measured / predicted:.2f} times that"
 
     def _steps(self, frames: int, mode: LoopMode = LoopMode.OPEN) -> list[Step]:
         steps: list[Step] = []
         self._say(f"watching {frames} frames, {frames / self._config.camera.rate_hz:.0f} s")
-        for step in self._loop.steps(frames):
-            if step.mode is not mode and steps:
-                raise CalibrationError(f"the loop is {step.mode.name.lower()} instead of {mode.name.lower()}")
-            steps.append(step)
+        for step in self._loop.steps():
+            if step.mode is mode:
+                steps.append(step)
+            elif steps:  # those before are of the mode before
+                raise CalibrationError(f"the loop went from {mode.in_words} to {step.mode.in_words}")
+            if len(steps) >= frames:
+                break
+            if len(steps) % CHECKED == 0:
+                self._loop.check_lease()
         return steps

@@ -17,8 +17,8 @@ from lowfc.control.delay_fit import Delay
 from lowfc.control.regularised import reconstruct
 from lowfc.control.response_fit import cycle_response, normalised
 from lowfc.programs.calibrate.align import computed_scale, on_sensor
-from lowfc.programs.calibrate.first_poke import first_poke, sequence
-from lowfc.programs.calibrate.recording import Loop, PlayInterruptedError, play
+from lowfc.programs.calibrate.first_poke import PokesNotSeenError, first_poke, sequence
+from lowfc.programs.calibrate.recording import AFTERWARDS, Loop, PlayInterruptedError, play
 from lowfc.programs.commission.first_light import Say
 
 Array = npt.NDArray[np.float64]
@@ -57,8 +57,8 @@ def first_delay(loop: Loop, config: Configuration, before: Calibration, say: Say
         try:
             found = first_poke(loop, before, 0, sequence(amplitude_nm), say)
             break
-        except CalibrationError as error:
-            if amplitude_nm >= min(MAX_FIRST_NM, largest_nm) or "not seen" not in str(error):
+        except PokesNotSeenError:
+            if amplitude_nm >= min(MAX_FIRST_NM, largest_nm):
                 raise
             say(f"pokes of {amplitude_nm:g} nm are not seen: twice as large")
             amplitude_nm *= 2
@@ -128,10 +128,9 @@ def poked(loop: Loop, config: Configuration, before: Calibration, poke: Delay, s
     modes = len(before.noll)
     amplitude_nm = min(FIRST_NM, *(largest_poke_nm(config, before, mode) for mode in range(modes)))
     response = np.zeros_like(before.response, dtype=np.float64)
+    _say_time(config, modes, CYCLES, say)
     for number in range(CYCLES):
-        patterns = poke_plan.poke_patterns(modes, amplitude_nm)
-        plan = poke_plan.cycle(patterns, HOLD, SETTLE, 16, backwards=number % 2 == 1)
-        response += _response(loop, before, plan, poke.delay_frames) / CYCLES
+        response += _response(loop, before, _poke_cycle(modes, amplitude_nm, number), poke.delay_frames) / CYCLES
     camera = instrument.detector(config)
     good, reference = before.good.astype(np.float64), before.reference.astype(np.float64)
     try:
@@ -166,10 +165,10 @@ def linear_nm(loop: Loop, config: Configuration, first: Calibration, delay: Dela
     R, modes = first.reconstructor.astype(np.float64), len(first.noll)
     largest_nm = min(FIRST_NM, *(largest_poke_nm(config, first, mode) for mode in range(modes)))
     gains = np.empty((2, 2, modes))
+    _say_time(config, modes, gains[..., 0].size, say)
     for level, amplitude_nm in enumerate((largest_nm, largest_nm / 2)):
         for again in range(2):
-            patterns = poke_plan.poke_patterns(modes, amplitude_nm)
-            plan = poke_plan.cycle(patterns, HOLD, SETTLE, 16, backwards=bool(again))
+            plan = _poke_cycle(modes, amplitude_nm, again)
             gains[level, again] = np.diag(R @ _response(loop, first, plan, delay.delay_frames))
     off = np.abs(gains[0].mean(axis=0) / gains[1].mean(axis=0) - 1)
     error = float(np.sqrt(np.mean(np.diff(gains, axis=1) ** 2) / 2))  # of the mean of two, doubled: two amplitudes
@@ -180,6 +179,16 @@ def linear_nm(loop: Loop, config: Configuration, first: Calibration, delay: Dela
         f"Z{first.noll[worst]}): {chosen_nm:.3g} nm in each mode"
     )
     return chosen_nm
+
+
+def _say_time(config: Configuration, modes: int, cycles: int, say: Say) -> None:
+    frames = len(_poke_cycle(modes, 1.0, 0)) + AFTERWARDS
+    say(f"{cycles} cycles of {frames} frames; about {cycles * frames / config.camera.rate_hz:.0f} s to go")
+
+
+def _poke_cycle(modes: int, amplitude_nm: float, number: int) -> poke_plan.Plan:
+    """Pokes of each mode by itself; every other cycle backwards."""
+    return poke_plan.cycle(poke_plan.poke_patterns(modes, amplitude_nm), HOLD, SETTLE, 16, backwards=number % 2 == 1)
 
 
 def _response(loop: Loop, before: Calibration, plan: poke_plan.Plan, delay_frames: float) -> Array:

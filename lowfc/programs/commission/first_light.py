@@ -13,7 +13,7 @@ from lowfc.contract.errors import CalibrationError
 from lowfc.contract.messages import wire
 from lowfc.control.calibration import Calibration
 from lowfc.control.camera import CameraSettings
-from lowfc.control.dark_frames import Dark, dark_of
+from lowfc.control.dark_frames import dark_of, light_in
 from lowfc.programs.conformance.agreement import agreement_checks
 from lowfc.programs.conformance.checks import Status
 
@@ -49,11 +49,13 @@ class Sensor(NamedTuple):
         camera: its settings.
         dark_dn: (pixels,) mean.
         good: (pixels,) 1 where a pixel is used, else 0.
+        taken: Whether the dark was measured.
     """
 
     camera: CameraSettings
     dark_dn: Array
     good: Array
+    taken: bool
 
 
 def camera_fits(config: Configuration, state: wire.CameraState, images: Sequence[Image], say: Say) -> CameraSettings:
@@ -78,9 +80,12 @@ def camera_fits(config: Configuration, state: wire.CameraState, images: Sequence
     if shapes != {(state.rows, state.columns)}:
         sizes = ", ".join(f"{rows} x {columns}" for rows, columns in sorted(shapes))
         faults.append(f"size: the camera says {state.rows} x {state.columns} pixels, its frames have {sizes}")
-    spans = np.diff([image.time_ns for image in images])
-    period_ns = float(np.median(spans))
-    if abs(period_ns / state.period_ns - 1) > RATE_APART:
+    period_ns = float(np.median(np.diff([image.time_ns for image in images])))
+    if not (state.period_ns and period_ns > 0):
+        faults.append(
+            f"times: the camera's period_ns is {state.period_ns}, the times of its frames are {period_ns:g} ns apart"
+        )
+    elif abs(period_ns / state.period_ns - 1) > RATE_APART:
         faults.append(
             f"rate: the camera says {_NS / state.period_ns:.5g} Hz, its frames come at {_NS / period_ns:.5g} Hz"
         )
@@ -102,22 +107,22 @@ def camera_fits(config: Configuration, state: wire.CameraState, images: Sequence
     return replace(camera_settings(state), start_s=0)
 
 
-def undark(camera: CameraSettings) -> Sensor:
+def without_dark(camera: CameraSettings) -> Sensor:
     """A sensor of which no dark is taken: its bias everywhere, and no bad pixel."""
     pixels = camera.shape[0] * camera.shape[1]
-    return Sensor(camera, np.full(pixels, float(camera.bias_dn)), np.ones(pixels))
+    return Sensor(camera, np.full(pixels, float(camera.bias_dn)), np.ones(pixels), taken=False)
 
 
 def darkened(camera: CameraSettings, frames: npt.NDArray[np.number], say: Say) -> Sensor:
     """A sensor with a dark (frames, rows, columns) and what it shows of bad pixels.
 
     Raises:
-        CalibrationError: the frames are of another size, too few, or not dark.
+        CalibrationError: the frames are of another size, too few, or much brighter in some pixels than in others.
     """
     if frames.shape[1:] != camera.shape:
         raise CalibrationError(f"the dark frames have {frames.shape[1:]} pixels, the camera {camera.shape}")
     try:
-        found: Dark = dark_of(frames.reshape(len(frames), -1))
+        found = dark_of(frames.reshape(len(frames), -1))
     except ValueError as error:
         raise CalibrationError(str(error)) from None
     bad = {name: int(np.count_nonzero(getattr(found, name))) for name in ("hot", "noisy", "dead")}
@@ -125,7 +130,7 @@ def darkened(camera: CameraSettings, frames: npt.NDArray[np.number], say: Say) -
         f"dark {np.median(found.dark_dn):.2f} DN, noise {np.median(found.noise_dn):.2f} DN; bad pixels: "
         f"{bad['hot']} hot, {bad['noisy']} noisy, {bad['dead']} dead"
     )
-    return Sensor(camera, found.dark_dn, found.good)
+    return Sensor(camera, found.dark_dn, found.good, taken=True)
 
 
 def referenced(sensor: Sensor, frames: npt.NDArray[np.number], computed: Calibration, say: Say) -> Calibration:
@@ -134,7 +139,7 @@ def referenced(sensor: Sensor, frames: npt.NDArray[np.number], computed: Calibra
     Its modes and the mirror's commands are those of a computed calibration.
 
     Raises:
-        CalibrationError: there is no light on the sensor.
+        CalibrationError: there is no light on the sensor, or it is in the dark frames, too.
     """
     image = frames.reshape(len(frames), -1).astype(np.float64).mean(axis=0) - sensor.dark_dn
     flux_dn = float(image @ sensor.good)
@@ -144,11 +149,16 @@ def referenced(sensor: Sensor, frames: npt.NDArray[np.number], computed: Calibra
             f"there is no more light on the sensor than in the dark: {flux_dn:.4g} DN in all, with a noise of "
             f"{noise_dn:.2g} DN; is the star blocked now, or was it not blocked for the dark?"
         )
+    reference = image * sensor.good / flux_dn
+    if sensor.taken and (light := light_in(sensor.dark_dn, reference)) > MOST_LIGHT * flux_dn:
+        raise CalibrationError(
+            f"the dark frames are not dark: {light / flux_dn:.1%} of the star's light is in them; block the star"
+        )
     modes = len(computed.noll)
     say(f"{flux_dn:.4g} DN of light in a frame, mean of {len(frames)} frames")
     return replace(
         computed,
-        reference=(image * sensor.good / flux_dn).astype(np.float32),
+        reference=reference.astype(np.float32),
         response=np.zeros((image.size, modes), np.float32),
         reconstructor=np.zeros((modes, image.size), np.float32),
         good=sensor.good.astype(np.float32),

@@ -54,7 +54,7 @@ def agreement_checks(config: Configuration, state: wire.CameraState) -> Iterator
             yield ok(name, f"{configured:.6g}", f"{found:.6g}")
             continue
         what = wrong if one.needed else warning
-        advice = f"set {one.key}, or the camera: by it go {one.use}"
+        advice = f"set {one.key}, or the camera; it is used for: {one.use}"
         yield what(name, f"{configured:.6g}, as configured", f"{found:.6g}", advice)
     hold_ms, period_ms = config.hold_ns * 1e-6, state.period_ns * 1e-6
     name, expected = "control.hold_ms", f"at least {PERIODS_OF_TIMEOUT:g} frame periods"

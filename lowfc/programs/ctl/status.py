@@ -134,7 +134,7 @@ def text(state: wire.ControllerState, processes: Mapping[str, wire.Health] = _NO
         "law": law,
         "gain": _values(known["gain"]),
         "leak": _values(known["leak"]),
-        "limit": f"{_values(known['limit_nm'])} nm",
+        "limit": _values(known["limit_nm"], " nm"),
         "channels": "; ".join(channels) or "none",
         "playing": f"{playing['target']}, {playing['frames_left']} of {counted(playing['frames'], 'frame')} left"
         if playing
@@ -231,10 +231,12 @@ def _spoken(reason: str) -> str:
     return reason.lower().replace("_", " ")
 
 
-def _values(values: list[float]) -> str:
-    """One figure where all are the same."""
+def _values(values: list[float], unit: str = "") -> str:
+    """One figure where all are the same; none without a calibration."""
+    if not values:
+        return "none"
     same = len(set(values)) == 1
-    return f"{values[0]:g} for all" if same else " ".join(f"{value:g}" for value in values)
+    return (f"{values[0]:g} for all" if same else " ".join(f"{value:g}" for value in values)) + unit
 
 
 def _rss(values: npt.ArrayLike) -> float:

@@ -1,5 +1,6 @@
 """The recorder's process: joins a run, and records it until it is stopped."""
 
+from collections.abc import Callable
 from pathlib import Path
 
 from lowfc.adapters.clock import Clock, HostClock
@@ -32,6 +33,7 @@ def record(
     cpus: set[int] | None = None,
     selection: Selection = EVERYTHING,
     expected_bytes_per_s: float = 0.0,
+    begins: Callable[[], None] = lambda: None,
 ) -> Summary:
     """Record a run into `folder` until SIGTERM or SIGINT; the process of `lowfc record`.
 
@@ -47,6 +49,7 @@ def record(
         cpus: processors to stay on; None leaves all.
         selection: what is recorded.
         expected_bytes_per_s: growth of the logs, by the configuration.
+        begins: called once there is room for a log.
 
     Raises:
         BusError: another recorder has this run.
@@ -54,6 +57,7 @@ def record(
     """
     if short := shortage(folder, limits.min_free_bytes):
         raise DataFileError(short)
+    begins()
     attachments = [
         _attached(path, media_type)
         for path, media_type in ((configuration, "application/toml"), (calibration, "application/fits"))
