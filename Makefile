@@ -4,21 +4,6 @@ PYTHON ?= $(shell for p in python3.13 python3.12 python3.11 python3 python; do \
 VENV := .venv
 BIN := $(VENV)/bin
 INSTALL := $(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt
-# Tests that only compute run side by side; those with processes and a clock in them run alone, after them.
-COMPUTING := tests/control tests/design tests/fuzz tests/optics tests/sim tests/view tests/adapters/test_access.py \
-	tests/adapters/test_extras.py tests/adapters/test_gaps.py tests/adapters/test_log_files.py \
-	tests/adapters/test_log_mutations.py tests/e2e/test_acceptance_loop.py tests/e2e/test_dark_hole.py \
-	tests/e2e/test_lockstep.py tests/e2e/test_mistakes.py tests/e2e/test_report_browser.py tests/e2e/test_sensors.py \
-	tests/test_acceptance.py tests/test_agreement.py tests/test_calibrate.py tests/test_calibrate_at.py \
-	tests/test_calibrate_commands.py tests/test_calibrate_promise.py tests/test_calibration_file.py \
-	tests/test_certificates.py tests/test_chaos.py tests/test_commission.py tests/test_configuration.py \
-	tests/test_conformance.py tests/test_controller_memory.py tests/test_docs_computing.py tests/test_export.py \
-	tests/test_history.py tests/test_hosts_commands.py tests/test_layers.py tests/test_layout_files.py \
-	tests/test_log_info.py tests/test_log_parts.py tests/test_loop.py \
-	tests/test_messages.py tests/test_mirror_maps.py tests/test_recover.py tests/test_rehearsal.py tests/test_replay.py \
-	tests/test_report.py tests/test_state_codec.py tests/test_step.py tests/test_tune.py tests/test_validate.py \
-	tests/test_validate_figures.py tests/test_what_if.py tests/test_what_if_options.py tests/test_wheel.py
-
 .PHONY: help sim-loop test test-all bench lint types format proto node clean
 
 help:  ## list the targets
@@ -42,8 +27,8 @@ sim-loop: $(VENV)/.installed  ## install, then run the simulated loop for 20 s
 	$(BIN)/lowfc sim-loop --duration 20
 
 test: $(VENV)/.tests lint types  ## install, then lint, types and tests
-	OPENBLAS_NUM_THREADS=1 $(BIN)/python -m pytest -m 'not slow' -n auto --dist loadfile $(COMPUTING)
-	$(BIN)/python -m pytest -m 'not slow' $(COMPUTING:%=--ignore=%)
+	OPENBLAS_NUM_THREADS=1 $(BIN)/python -m pytest -m 'not slow and not exclusive' -n auto --dist loadgroup
+	$(BIN)/python -m pytest -m 'exclusive and not slow'
 
 test-all: $(VENV)/.tests node lint types  ## everything, the slow tests and those that need node, chromium and a graphics driver too
 	@ls /usr/share/vulkan/icd.d/*.json >/dev/null 2>&1 || { test "$$(id -u)" = 0 && apt-get install --yes mesa-vulkan-drivers libvulkan1; } || \
@@ -52,8 +37,12 @@ test-all: $(VENV)/.tests node lint types  ## everything, the slow tests and thos
 		echo "no chromium: the browser tests will skip. Debian: apt install chromium" >&2
 	$(BIN)/python -m pytest
 
-bench: $(VENV)/.installed  ## time the loop beside the last release's figures; STORE=--store keeps them
-	@figures=$$($(BIN)/lowfc latency --json) && printf '%s' "$$figures" | $(BIN)/python -m benchmarks.releases $(STORE)
+bench: $(VENV)/.installed  ## time the loop beside the last release's figures; STORE=1 keeps them as this release's
+	@today=$$(mktemp); stored=benchmarks/history/$$($(BIN)/lowfc --version).json; \
+	test -z "$(STORE)" -o ! -e $$stored || { echo "$$stored is there already: remove it first" >&2; exit 1; }; \
+	$(BIN)/lowfc latency --json >$$today && \
+	$(BIN)/lowfc latency --compare $$(ls benchmarks/history/*.json | sort -V | tail -1) $$today && \
+	{ test -z "$(STORE)" || cp $$today $$stored; }; status=$$?; rm $$today; exit $$status
 
 lint: $(VENV)/.tests  ## ruff
 	$(BIN)/ruff check .

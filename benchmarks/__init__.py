@@ -1,1 +1,1 @@
-"""Measurements that are no part of the product: against its peers, and against its own past."""
+"""Benchmarks of the loop; `python -m benchmarks --help` lists them."""

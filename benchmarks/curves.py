@@ -7,16 +7,14 @@ Beside them stand what the step cannot do without: reading every byte of its mat
 limit that memory sets, and its two matrix-vector products.
 
 Example:
-    python -m benchmarks.curves --markdown --plot curves.png
-    python -m benchmarks.curves --pixels 80 256 --modes --actuators --no-loop
+    python -m benchmarks curves --markdown --plot curves.png
+    python -m benchmarks curves --pixels 80 256 --modes --actuators --no-loop
 """
 
 import argparse
-import contextlib
 import os
 import time
-import warnings
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import asdict
 from itertools import cycle
 from pathlib import Path
@@ -24,40 +22,32 @@ from statistics import median
 from typing import Any
 
 import numpy as np
-from astropy.io.fits.verify import VerifyWarning
-from rich.console import Console
 
-from benchmarks import cells
-from benchmarks.command import add_forms, occasion, run_main, say
-from benchmarks.load import Watched
-from benchmarks.sizes import FRAMES, Size, configuration, made_up
-from lowfc.adapters import calibration_file
-from lowfc.adapters.clock import HostClock
-from lowfc.adapters.progress import passing_bar
-from lowfc.adapters.realtime import set_up
-from lowfc.adapters.run import Run, new_run_id, open_run
-from lowfc.adapters.whole_file import require_folder, write_whole
-from lowfc.contract.configuration import Configuration
-from lowfc.contract.errors import LowfcError
-from lowfc.contract.messages import Role
-from lowfc.control.safety import LoopMode
-from lowfc.programs.control_step import ControlStep
-from lowfc.programs.frame_source import FRAMES_FILE, Payloads
-from lowfc.programs.latency.figures import WARM_UP_S
-from lowfc.programs.latency.run import Asked, run_repeats
+from benchmarks.load import shares, watched
+from benchmarks.runner import Lines, Result, Tell, add_times, ranged, us
+from benchmarks.sizes import FRAMES, Size, configuration, made_up, run_loop
+from lowfc.adapters.files.whole_file import require_folder, write_whole
+from lowfc.adapters.process.clock import HostClock
+from lowfc.adapters.process.realtime import set_up
+from lowfc.contract.errors import ConfigurationError, LowfcError
+from lowfc.control.loop.safety import LoopMode
+from lowfc.programs.measure.control_step import ControlStep
+from lowfc.programs.measure.frame_source import Payloads
+from lowfc.programs.measure.latency.figures import WARM_UP_S
 
-Figures = dict[str, Any]
-
-SIDES = (32, 48, 64, 80, 128, 192, 256, 384, 512)
-MODES = (5, 10, 20, 50, 100, 200, 500)
-MIRROR_SIDES = (10, 16, 23, 34, 48, 64)
+AXES = {
+    "pixels": ((32, 48, 64, 80, 128, 192, 256, 384, 512), "side", "across the frame"),
+    "modes": ((5, 10, 20, 50, 100, 200, 500), "modes", "how many"),
+    "actuators": ((10, 16, 23, 34, 48, 64), "mirror_side", "across the mirror"),
+}
+"""Of each curve its sizes, which of `Size` they are, and what that is."""
 RATE_HZ = 250.0
 
 _STEP = ("step_us", "stream_us", "products_us")
 _LOOP = ("frame_to_command_us", "echo_us")
 
 
-def step_figures(size: Size, seconds: float) -> Figures:
+def step_figures(size: Size, seconds: float) -> Result:
     """The control step of that size, and beside it what it cannot do without.
 
     Args:
@@ -77,7 +67,7 @@ def step_figures(size: Size, seconds: float) -> Figures:
     step = ControlStep(config, calibration, HostClock().host_ns())
     made = Payloads(frames)
     payloads = cycle([made.at(index, HostClock().host_ns()) for index in range(FRAMES)])
-    figures: Figures = {"step_us": timed(lambda: step(next(payloads)), seconds)}
+    figures: Result = {"step_us": timed(lambda: step(next(payloads)), seconds)}
     if step.state.mode is not LoopMode.CLOSED or step.state.counts:
         raise RuntimeError(f"{size}: the step is {step.state.mode.name.lower()}, and was {step.state.counts}")
     one_half, other_half = np.ones((2, size.bytes // 8), np.float32)
@@ -104,7 +94,7 @@ def timed(work: Callable[[], object], seconds: float) -> dict[str, float]:
     return {"p50": p50_ns / 1e3, "p99": p99_ns / 1e3, "cpu": cpu_ns / len(durations_ns) / 1e3}
 
 
-def loop_figures(size: Size, rate_hz: float, seconds: float) -> Figures:
+def loop_figures(size: Size, rate_hz: float, seconds: float) -> Result:
     """The loop of that size, and a bare echo of its messages.
 
     Args:
@@ -116,62 +106,69 @@ def loop_figures(size: Size, rate_hz: float, seconds: float) -> Figures:
         frame_to_command_us (p50 and p99; cpu: the controller's, for each frame), echo_us (p50 and p99 of half a round
         trip), frames and frames_without_command; or failure, what was wrong.
     """
-    config = configuration(size, rate_hz)
     try:
-        with _prepared(size, config) as run, Watched(os.getpid()) as watched:
-            (found,) = run_repeats(Asked(config, seconds, 1), run, lambda _: None)
+        with watched(os.getpid()) as moments:
+            found = run_loop(size, configuration(size, rate_hz), seconds)
     except LowfcError as fault:
         return {"failure": str(fault)}
-    taken = {name: found["latency_us"]["frame_to_command"][name] for name in ("p50", "p99")}
-    used = watched.shares(WARM_UP_S + seconds)
+    latency_us = {name: found["latency_us"]["frame_to_command"][name] for name in ("p50", "p99")}
+    used = shares(moments, WARM_UP_S + seconds)
     if "controller" in used:
-        taken["cpu"] = used["controller"].share * 1e6 / found["rate_hz"]
+        latency_us["cpu"] = used["controller"]["share"] * 1e6 / found["rate_hz"]
     return {
-        "frame_to_command_us": taken,
+        "frame_to_command_us": latency_us,
         "echo_us": {name: found["echo_us"][name] / 2 for name in ("p50", "p99")},
         "frames": found["frames"],
         "frames_without_command": found["frames_without_command"],
     }
 
 
-@contextlib.contextmanager
-def _prepared(size: Size, config: Configuration) -> Iterator[Run]:
-    """A run with a made-up calibration and frames in place of the instrument's."""
-    run = open_run(new_run_id(), (config.mirror.name,), listeners=(Role.LAUNCHER,))
-    try:
-        calibration, frames = made_up(size, config)
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", VerifyWarning)  # hundreds of modes leave no room for a card's comment
-            calibration_file.save(calibration, run.path / "calibration.fits")
-        (run.path / "config.toml").write_text(config.to_toml(), encoding="utf-8")
-        np.save(run.path / FRAMES_FILE, frames)
-        yield run
-    finally:
-        run.remove()
+def options(parser: argparse.ArgumentParser) -> None:
+    """The sizes, and whether the loop is measured too."""
+    add_times(parser, seconds=2.0, repeats=3)
+    parser.add_argument("--rate", type=float, default=RATE_HZ, help="frames per second of the loop (%(default)g)")
+    parser.add_argument("--loop", action=argparse.BooleanOptionalAction, default=True, help="the loop too")
+    for name, (sizes, _, what) in AXES.items():
+        parser.add_argument(f"--{name}", type=int, nargs="*", default=sizes, metavar="N", help=f"{what} (%(default)s)")
+    parser.add_argument("--plot", type=Path, metavar="FILE.png", help="draw the curves")
 
 
-def measure(
-    curves: dict[str, list[Size]], seconds: float, repeats: int, rate_hz: float | None, told: Callable[[str], None]
-) -> dict[str, list[Figures]]:
-    """Every point of every curve, the repeats around all of them; rate_hz None leaves the loop out.
+def measure(asked: argparse.Namespace, tell: Tell) -> Result:
+    """Measure every point of every curve, the repeats around all of them.
 
     Returns:
-        Of each curve its points: pixels, modes, actuators, bytes, and of `step_figures` and `loop_figures` the medians
-        over the repeats, `spread` with the lowest and highest p50; failures where a loop failed.
+        curves, of each its points: pixels, modes, actuators, bytes, and of `step_figures` and `loop_figures` the
+        medians over the repeats, `spread` with the lowest and highest p50; default, seconds, repeats, rate_hz (None
+        without the loop) and failed.
     """
+    curves = {name: [Size(**{field: n}) for n in getattr(asked, name)] for name, (_, field, _) in AXES.items()}
     sizes = list(dict.fromkeys(size for curve in curves.values() for size in curve))
-    found: dict[Size, list[Figures]] = {size: [] for size in sizes}
-    for number in range(1, repeats + 1):
+    if not sizes:
+        raise ConfigurationError("nothing to measure: name sizes of --pixels, --modes or --actuators")
+    require_folder(asked.plot)
+    set_up(None, None, lock_memory=False, disable_cpu_idle=False)
+    found: dict[Size, list[Result]] = {size: [] for size in sizes}
+    for number in range(1, asked.repeats + 1):
         for size in sizes:
-            told(f"{number} of {repeats}: {size.pixels} pixels, {size.modes} modes, {size.actuators} actuators")
-            figures = step_figures(size, seconds)
-            found[size].append(figures | (loop_figures(size, rate_hz, seconds) if rate_hz else {}))
-    return {name: [point(size, found[size]) for size in curve] for name, curve in curves.items()}
+            tell(f"{number} of {asked.repeats}: {size.pixels} pixels, {size.modes} modes, {size.actuators} actuators")
+            figures = step_figures(size, asked.seconds)
+            found[size].append(figures | (loop_figures(size, asked.rate, asked.seconds) if asked.loop else {}))
+    result = {
+        "curves": {name: [point(size, found[size]) for size in curve] for name, curve in curves.items()},
+        "default": asdict(Size()),
+        "seconds": asked.seconds,
+        "repeats": asked.repeats,
+        "rate_hz": asked.rate if asked.loop else None,
+        "failed": [f"{size}: {one['failure']}" for size in sizes for one in found[size] if "failure" in one],
+    }
+    if asked.plot is not None:
+        write_whole(asked.plot, picture(result))
+    return result
 
 
-def point(size: Size, repeats: Sequence[Figures]) -> Figures:
+def point(size: Size, repeats: Sequence[Result]) -> Result:
     """One point of a curve from its repeats."""
-    made: Figures = {name: getattr(size, name) for name in ("pixels", "modes", "actuators", "bytes")}
+    made: Result = {name: getattr(size, name) for name in ("pixels", "modes", "actuators", "bytes")}
     made |= asdict(size)
     for name in (*_STEP, *_LOOP):
         each = [repeat[name] for repeat in repeats if name in repeat]
@@ -202,88 +199,62 @@ HEADINGS = (
     "half a bare echo",
     "frames without a command",
 )
-AXES = {"pixels": "side", "modes": "modes", "actuators": "mirror_side"}
 
 
-def tables(result: Figures) -> dict[str, list[list[str]]]:
-    """Of each curve its table, headings first."""
-    return {
-        name: [[name, *HEADINGS], *([_label(name, one), *_cells(one)] for one in points)]
+def tables(result: Result) -> list[Lines]:
+    """Of each curve its table."""
+    return [
+        [[name, *HEADINGS], *([_label(name, one), *_cells(one)] for one in points)]
         for name, points in result["curves"].items()
         if points
-    }
+    ]
 
 
-def _label(name: str, one: Figures) -> str:
-    return str(one[name]) if AXES[name] == name else f"{one[name]} ({one[AXES[name]]} x {one[AXES[name]]})"
+def _label(name: str, one: Result) -> str:
+    side = one[AXES[name][1]]
+    return str(side) if AXES[name][1] == name else f"{one[name]} ({side} x {side})"
 
 
-def _cells(one: Figures) -> list[str]:
+def _cells(one: Result) -> list[str]:
     step, stream_us, loop = one["step_us"], one["stream_us"]["p50"], one.get("frame_to_command_us")
     made = [
-        _with_spread(step),
-        *(_us(step[kind]) for kind in ("p99", "cpu")),
-        _us(one["products_us"]["p50"]),
+        ranged([step["p50"], *step["spread"]]),
+        *(us(step[kind]) for kind in ("p99", "cpu")),
+        us(one["products_us"]["p50"]),
         f"{one['bytes'] / 1e6:.2f}",
         f"{one['bytes'] / stream_us / 1e3:.0f}",
-        _us(stream_us),
+        us(stream_us),
         f"{step['p50'] / stream_us:.1f}",
     ]
     if loop is None:
         return [*made, "failed" if one["failures"] else "", *[""] * 4]
     return [
         *made,
-        _with_spread(loop),
-        _us(loop["p99"]),
-        _us(loop["cpu"]) if "cpu" in loop else "",
-        _us(one["echo_us"]["p50"]),
+        ranged([loop["p50"], *loop["spread"]]),
+        us(loop["p99"]),
+        us(loop["cpu"]) if "cpu" in loop else "",
+        us(one["echo_us"]["p50"]),
         f"{one['frames_without_command']} of {one['frames']}",
     ]
 
 
-def _us(value: float) -> str:
-    return f"{value:.{1 if value < 100 else 0}f}"
-
-
-def _with_spread(figures: Figures) -> str:
-    low, high = figures["spread"]
-    return f"{_us(figures['p50'])} ({_us(low)} to {_us(high)})"
-
-
-def about(result: Figures) -> str:
-    """What the figures are, and of which host."""
-    where, default = result["host"], Size(**result["default"])
+def about(result: Result) -> str:
+    """What the figures are."""
+    default = Size(**result["default"])
     loops = (
         f"The loop runs at {result['rate_hz']:g} Hz, real-time set-up included; from just before a frame's put to just "
-        "after its command's; the controller's cpu is that of all its threads, telemetry included, for each frame. "
+        "after its command's; the controller's cpu is that of all its threads, telemetry included, for each frame."
         if result["rate_hz"]
         else ""
     )
-    failures = "".join(
-        f"Failed, {_label(name, one)} {name}: {fault}. "
-        for name, points in result["curves"].items()
-        for one in points
-        for fault in one["failures"]
-    )
+    failed = "".join(f" Failed, {fault}." for fault in result["failed"])
     return (
         f"us; medians over {result['repeats']} repeats of {result['seconds']:g} s each, in brackets the lowest and "
         f"highest p50. What is not on the axis is {default.pixels} pixels, {default.modes} modes, {default.actuators} "
         "actuators. The step: one thread, one after the other, normal scheduling, matrices as warm as the caches keep "
         "them. The limit: as many bytes as a step must touch, read once, by a float32 dot product of one half with the "
-        f"other. {loops}{failures}Measured {result['date']} on {where['processors']} processors of "
-        f"{where['processor']}, Linux {where['kernel']}, Python {where['python']}, load {result['load_before']:g} "
-        f"before, by `{result['command']}`."
+        f"other. {loops}{failed}"
     )
-
-
-def text(result: Figures) -> str:
-    """The result for a terminal."""
-    return "\n\n".join([*(cells.text(lines) for lines in tables(result).values()), about(result)])
-
-
-def markdown(result: Figures) -> str:
-    """The result for a document."""
-    return "\n\n".join([*(cells.markdown(lines) for lines in tables(result).values()), about(result)])
 
 
 # Okabe and Ito's colours, told apart by every eye; and each line has a mark and a dash of its own.
@@ -298,13 +269,13 @@ _DRAWN = (
 )
 
 
-def picture(result: Figures) -> bytes:
+def picture(result: Result) -> bytes:
     """PNG: a panel for each curve, all on one scale of time.
 
     Raises:
         ConfigurationError: matplotlib is not installed.
     """
-    from lowfc.adapters.drawing import figure_class, png
+    from lowfc.adapters.files.drawing import figure_class, png
 
     drawn = {name: points for name, points in result["curves"].items() if points}
     figure = figure_class()(figsize=(13, 5.5), layout="constrained")
@@ -323,57 +294,3 @@ def picture(result: Figures) -> bytes:
     panels[0].set_ylabel("us for each frame (p50; processor time: mean)")
     figure.legend(lines.values(), lines, loc="outside lower center", ncols=4, frameon=False)
     return png(figure, dpi=110)
-
-
-def main() -> int:
-    """The command line; returns its exit status."""
-    asked = _parser().parse_args()
-    curves = {
-        "pixels": [Size(side=side) for side in asked.pixels],
-        "modes": [Size(modes=modes) for modes in asked.modes],
-        "actuators": [Size(mirror_side=side) for side in asked.actuators],
-    }
-    if not any(curves.values()):
-        raise SystemExit("nothing to measure: name sizes of --pixels, --modes or --actuators")
-    require_folder(asked.plot)
-    measured = occasion("python -m benchmarks.curves")
-    set_up(None, None, lock_memory=False, stay_awake=False)
-    with passing_bar(Console(stderr=True)) as bar:
-        task = bar.add_task("curves", total=None)
-        rate_hz = asked.rate if asked.loop else None
-        found = measure(curves, asked.seconds, asked.repeats, rate_hz, lambda what: bar.update(task, description=what))
-    result = {
-        "curves": found,
-        "default": asdict(Size()),
-        "seconds": asked.seconds,
-        "repeats": asked.repeats,
-        "rate_hz": rate_hz,
-        **measured,
-    }
-    if asked.plot is not None:
-        write_whole(asked.plot, picture(result))
-    say(result, asked, text, markdown)
-    return 1 if any(one["failures"] for points in found.values() for one in points) else 0
-
-
-def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(
-        "python -m benchmarks.curves", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument("--seconds", type=float, default=2.0, help="of each measurement (%(default)g)")
-    parser.add_argument("--repeats", type=int, default=3, help="of everything (%(default)s)")
-    parser.add_argument("--rate", type=float, default=RATE_HZ, help="frames per second of the loop (%(default)g)")
-    parser.add_argument("--loop", action=argparse.BooleanOptionalAction, default=True, help="the loop too")
-    for name, values, what in (
-        ("pixels", SIDES, "across the frame"),
-        ("modes", MODES, "how many"),
-        ("actuators", MIRROR_SIDES, "across the mirror"),
-    ):
-        parser.add_argument(f"--{name}", type=int, nargs="*", default=values, metavar="N", help=f"{what} (%(default)s)")
-    parser.add_argument("--plot", type=Path, metavar="FILE.png", help="draw the curves")
-    add_forms(parser, "the tables")
-    return parser
-
-
-if __name__ == "__main__":
-    run_main(main)

@@ -1,83 +1,83 @@
-"""Processor time of a loop's processes, from /proc, while a command of ours runs them."""
+"""A command of ours run for a benchmark, and what the processes that it starts use of the host meanwhile."""
 
 import contextlib
+import json
+import os
+import subprocess
+import sys
+import tempfile
 import threading
 import time
-from collections.abc import Iterator
-from pathlib import Path
-from typing import NamedTuple
+from collections.abc import Iterator, Sequence
+from typing import Any, NamedTuple
 
-from lowfc.adapters.usage import processor_s
+import psutil
+
+from benchmarks.runner import Result
 
 MODULES = {
     "sim_camera": "camera",
-    "lowfc.programs.frame_source": "camera",
+    "lowfc.programs.measure.frame_source": "camera",
     "lowfc controller": "controller",
     "sim_dm": "mirror",
     "lowfc record": "recorder",
+    "lowfc view": "view",
 }
 """What Python was told to run, and the role that it has in the loop."""
 LOOP = {"camera", "controller", "mirror"}
 
 _EVERY_S = 0.2
 _PART = 0.8
+_START_S, _SLOWEST = 60.0, 12.0
 
 
-class Share(NamedTuple):
-    """What a process used.
+class Used(NamedTuple):
+    """What a process has used so far: processor time, where it may run, and its memory."""
 
-    Attributes:
-        share: of one processor, all its threads.
-        processors: those that it may run on, as the kernel lists them.
-    """
-
-    share: float
+    used_s: float
     processors: str
+    resident_bytes: int
 
 
 class Moment(NamedTuple):
-    """Processor time used so far by each role's process, seconds, and where it may run."""
+    """The processes at one time, by role."""
 
     at_s: float
-    used_s: dict[str, float]
-    processors: dict[str, str]
+    roles: dict[str, Used]
 
 
-class Watched:
-    """Looks at the processes below one, five times a second, within a `with` block."""
+@contextlib.contextmanager
+def watched(pid: int) -> Iterator[list[Moment]]:
+    """Look at the processes below one, five times a second, within a `with` block; see `shares`."""
+    moments: list[Moment] = []
+    ended = threading.Event()
 
-    def __init__(self, pid: int) -> None:
-        """Name the process that starts the loop's."""
-        self._pid = pid
-        self._moments: list[Moment] = []
-        self._ended = threading.Event()
-        self._thread = threading.Thread(target=self._look, daemon=True)
+    def look() -> None:
+        while not ended.wait(_EVERY_S):
+            moments.append(_moment(pid))
 
-    def __enter__(self) -> "Watched":
-        self._thread.start()
-        return self
-
-    def __exit__(self, *how: object) -> None:
-        self._ended.set()
-        self._thread.join()
-
-    def shares(self, seconds: float) -> dict[str, Share]:
-        """Of each role, at the end of a loop that lasts so long; see `shares`."""
-        return shares(self._moments, seconds)
-
-    def _look(self) -> None:
-        while not self._ended.wait(_EVERY_S):
-            moment = Moment(time.monotonic(), {}, {})
-            for pid in below(self._pid):
-                with contextlib.suppress(OSError):  # it has just ended
-                    role = role_of(Path(f"/proc/{pid}/cmdline").read_text().split("\0"))
-                    if role is not None:
-                        moment.used_s[role] = processor_s(pid)
-                        moment.processors[role] = _processors(pid)
-            self._moments.append(moment)
+    thread = threading.Thread(target=look, daemon=True)
+    thread.start()
+    try:
+        yield moments
+    finally:
+        ended.set()
+        thread.join()
 
 
-def shares(moments: list[Moment], seconds: float) -> dict[str, Share]:
+def _moment(pid: int) -> Moment:
+    moment = Moment(time.monotonic(), {})
+    with contextlib.suppress(psutil.Error):
+        for process in psutil.Process(pid).children(recursive=True):
+            with contextlib.suppress(psutil.Error):  # it has just ended
+                role = role_of(process.cmdline())
+                if role is not None:
+                    times, cpus = process.cpu_times(), ",".join(map(str, process.cpu_affinity()))
+                    moment.roles[role] = Used(times.user + times.system, cpus, process.memory_info().rss)
+    return moment
+
+
+def shares(moments: Sequence[Moment], seconds: float) -> dict[str, Result]:
     """What each role used while the loop went on: over the last four fifths of it, before its processes ended.
 
     Args:
@@ -85,37 +85,56 @@ def shares(moments: list[Moment], seconds: float) -> dict[str, Share]:
         seconds: for how long frames came.
 
     Returns:
-        Nothing where fewer than two moments fall into that time.
+        By role: share (of one processor, all threads), processors (on which it may run) and mb (of memory); nothing
+        where fewer than two moments fall into that time.
     """
-    whole = [moment for moment in moments if moment.used_s.keys() >= LOOP][:-1]
-    inside = [moment for moment in whole if moment.at_s >= whole[-1].at_s - _PART * seconds]
+    complete = [moment for moment in moments if moment.roles.keys() >= LOOP][:-1]
+    inside = [moment for moment in complete if moment.at_s >= complete[-1].at_s - _PART * seconds]
     if len(inside) < 2:
         return {}
     first, last = inside[0], inside[-1]
     return {
-        role: Share((used_s - first.used_s[role]) / (last.at_s - first.at_s), last.processors[role])
-        for role, used_s in last.used_s.items()
-        if role in first.used_s
+        role: {
+            "share": (used.used_s - first.roles[role].used_s) / (last.at_s - first.at_s),
+            "processors": used.processors,
+            "mb": used.resident_bytes / 1e6,
+        }
+        for role, used in last.roles.items()
+        if role in first.roles
     }
 
 
-def role_of(words: list[str]) -> str | None:
+def role_of(words: Sequence[str]) -> str | None:
     """Role of a process in the loop, from its command line; None where it has none."""
     module = words[words.index("-m") + 1 :] if "-m" in words else []
     return MODULES.get(" ".join(module[:1])) or MODULES.get(" ".join(module[:2]))
 
 
-def below(pid: int) -> Iterator[int]:
-    """Numbers of the processes that one has started, and that those have."""
-    with contextlib.suppress(FileNotFoundError, ProcessLookupError):
-        for task in Path(f"/proc/{pid}/task").iterdir():
-            for child in map(int, (task / "children").read_text().split()):
-                yield child
-                yield from below(child)
+def run_lowfc(words: Sequence[str], seconds: float) -> dict[str, Any]:
+    """Run `lowfc` with these words and `--json` for so long, in a folder of its own.
 
-
-def _processors(pid: int) -> str:
-    for line in Path(f"/proc/{pid}/status").read_text().splitlines():
-        if line.startswith("Cpus_allowed_list:"):
-            return line.split()[1]
-    return ""
+    Returns:
+        What it prints, and usage (`shares` of its processes); or failure, what it said last.
+    """
+    command = [sys.executable, "-P", "-m", "lowfc", *words, "--duration", f"{seconds:g}", "--json"]
+    patience_s = _START_S + _SLOWEST * seconds
+    with tempfile.TemporaryDirectory() as folder, tempfile.TemporaryFile("w+") as stderr:
+        environment = os.environ | {"XDG_RUNTIME_DIR": folder}
+        process = subprocess.Popen(  # noqa: S603  # our own
+            command, cwd=folder, env=environment, stdout=subprocess.PIPE, stderr=stderr, text=True
+        )
+        try:
+            with watched(process.pid) as moments:
+                out, _ = process.communicate(timeout=patience_s)
+        except subprocess.TimeoutExpired:
+            return {"failure": f"not done after {patience_s:g} s"}
+        finally:
+            if process.poll() is None:
+                process.terminate()
+                process.wait()
+        stderr.seek(0)
+        last = stderr.read().strip().splitlines()[-1:]
+    if process.returncode:
+        return {"failure": "; ".join(last) or f"exit status {process.returncode}"}
+    found: dict[str, Any] = json.loads(out)
+    return found | {"usage": shares(moments, seconds)}

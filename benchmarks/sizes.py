@@ -1,17 +1,23 @@
-"""Sizes of a loop, and random calibrations and frames of any size."""
+"""Loops of any size: random calibrations, frames to go with them, and the real processes run on those."""
 
 import os
+import warnings
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
+from astropy.io.fits.verify import VerifyWarning
 
-from lowfc.adapters import instrument
-from lowfc.adapters.realtime import spread
-from lowfc.contract.calibration_codec import identified
+from lowfc.adapters.bus.run import Run
+from lowfc.adapters.files import calibration_file, factory
+from lowfc.adapters.process.realtime import spread
+from lowfc.contract.codecs.calibration_codec import identified
 from lowfc.contract.configuration import Configuration, load
-from lowfc.control.calibration import Calibration
-from lowfc.optics.detector import saturation_dn
+from lowfc.control.calibration.calibration import Calibration
+from lowfc.optics.detector.detector import saturation_dn
+from lowfc.programs.measure.frame_source import FRAMES_FILE
+from lowfc.programs.measure.latency.run import Asked, prepared, run_repeats
 
 Single = npt.NDArray[np.float32]
 Frames = npt.NDArray[np.uint16]
@@ -53,8 +59,8 @@ class Size:
         return 4 * self.pixels * (self.modes + 3) + 2 * self.pixels + 4 * self.modes * self.actuators
 
 
-def configuration(size: Size, rate_hz: float) -> Configuration:
-    """Of a loop with a mirror of that size."""
+def configuration(size: Size, rate_hz: float, **realtime: Any) -> Configuration:
+    """Of a loop with a mirror of that size; keys of [realtime] as given."""
     overrides = {
         "camera.rate_hz": rate_hz,
         "mirror.rows": size.mirror_side,
@@ -63,6 +69,7 @@ def configuration(size: Size, rate_hz: float) -> Configuration:
         "control.start_mode": "closed",
         "control.tilt_leak": _LEAK,
         "control.leak": _LEAK,
+        **{f"realtime.{key}": value for key, value in realtime.items()},
     }
     return load(None, overrides, spread(os.sched_getaffinity(0), simulated=False))
 
@@ -85,13 +92,33 @@ def made_up(size: Size, config: Configuration) -> tuple[Calibration, Frames]:
         shape=(size.side, size.side),
         grid=(size.mirror_side, size.mirror_side),
         flux_dn=flux_dn,
-        saturation_dn=float(saturation_dn(instrument.detector(config))),
+        saturation_dn=float(saturation_dn(factory.detector(config))),
         estimator="weighted",
         wavelength_nm=config.star.wavelength_nm,
         operator_hash="",
         id="",
     )
     return identified(calibration), frames.astype(np.uint16).reshape(FRAMES, size.side, size.side)
+
+
+def run_loop(size: Size, config: Configuration, seconds: float) -> dict[str, Any]:
+    """Run the loop of that size once, and then a bare echo of its messages; one repeat's figures of `run_repeats`.
+
+    Raises:
+        LowfcError: a process of the loop ended by itself, or said nothing.
+    """
+
+    def fill(config: Configuration, run: Run) -> None:
+        calibration, frames = made_up(size, config)
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", VerifyWarning)  # hundreds of modes leave no room for a card's comment
+            calibration_file.save(calibration, run.path / "calibration.fits")
+        (run.path / "config.toml").write_text(config.to_toml(), encoding="utf-8")
+        np.save(run.path / FRAMES_FILE, frames)
+
+    with prepared(config, fill) as run:
+        (found,) = run_repeats(Asked(config, seconds, 1), run, lambda _: None)
+    return found
 
 
 def _random(rng: np.random.Generator, shape: tuple[int, int], scale: float) -> Single:

@@ -5,7 +5,7 @@ back to back and as in the loop, after a rest as long as a frame's period; it ta
 After that it is timed stage by stage, which takes a little longer.
 
 Example:
-    python -m benchmarks.step --seconds 5 --markdown
+    python -m benchmarks step --seconds 5 --markdown
 """
 
 import argparse
@@ -19,28 +19,26 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks import cells
-from benchmarks.command import add_forms, run_main, say
-from benchmarks.host import host
+from benchmarks.runner import Lines, Result, Tell, add_times
 from benchmarks.sizes import Size, configuration, made_up
-from lowfc.adapters.realtime import set_up
-from lowfc.contract import codec
-from lowfc.control import loop
-from lowfc.control.estimator import Estimator
-from lowfc.control.safety import LoopMode
-from lowfc.control.state import Drive
-from lowfc.programs.control_step import ControlStep
-from lowfc.programs.frame_source import Payloads
-from lowfc.programs.latency.figures import percentiles
+from lowfc.adapters.process.realtime import set_up
+from lowfc.contract.codecs import codec
+from lowfc.control.loop import advance
+from lowfc.control.loop.estimator import Estimator
+from lowfc.control.loop.safety import LoopMode
+from lowfc.control.loop.state import ActiveLoop
+from lowfc.programs.measure.control_step import ControlStep
+from lowfc.programs.measure.frame_source import Payloads
+from lowfc.programs.measure.latency.figures import percentiles
 
 RATE_HZ = 1000.0
 STAGES: dict[str, tuple[Any, str]] = {
     "decode": (codec, "decode_frame"),
-    "full well": (loop, "saturated_pixels"),
+    "full well": (advance, "saturated_pixels"),
     "estimate": (Estimator, "estimate"),
-    "seen": (Drive, "seen_nm"),
-    "law": (loop, "integrate"),
-    "limits": (loop, "limit"),
+    "seen": (ActiveLoop, "seen_nm"),
+    "law": (advance, "integrate"),
+    "limits": (advance, "limit"),
     "encode": (codec, "encode_command"),
 }
 REST, STEP, PRODUCT = "modes to actuators, state, step", "the whole step", "one product R x"
@@ -50,39 +48,35 @@ _TRACED = 1000
 Durations = dict[str, list[int]]
 
 
-def main() -> int:
-    """The command line; returns its exit status."""
-    parser = argparse.ArgumentParser("python -m benchmarks.step", description=__doc__.splitlines()[0])
-    parser.add_argument("--seconds", type=float, default=5.0, help="of each of both (%(default)s)")
-    add_forms(parser)
-    asked = parser.parse_args()
-    say(measure(asked.seconds), asked, text, markdown)
-    return 0
+def options(parser: argparse.ArgumentParser) -> None:
+    """For how long."""
+    add_times(parser, seconds=5.0)
 
 
-def measure(seconds: float) -> dict[str, Any]:
+def measure(asked: argparse.Namespace, tell: Tell) -> Result:
     """Time the stages.
 
     Returns:
         hot_us and paced_us (percentiles by stage), over_product (the whole step over the product, p50, of both), memory
-        (see `allocated`), rate_hz, granted and host.
+        (see `allocated`), rate_hz and granted.
     """
     size = Size()
     config = configuration(size, RATE_HZ)
     calibration, frames = made_up(size, config)
     payloads = Payloads(frames)
-    granted = set_up(config.realtime.priority or None, None, lock_memory=True, stay_awake=True)
+    granted = set_up(config.realtime.priority or None, None, lock_memory=True, disable_cpu_idle=True)
     step = ControlStep(config, calibration, 0)
     memory = allocated(step, payloads)
     x = np.random.default_rng(1).standard_normal(size.pixels, np.float32)
-    found: dict[str, Any] = {}
+    found: Result = {}
     for name, period_s in (("hot_us", None), ("paced_us", 1 / RATE_HZ)):
-        durations = _timed(step, payloads, lambda: calibration.reconstructor @ x, seconds, period_s)
+        tell(name)
+        durations = _timed(step, payloads, lambda: calibration.reconstructor @ x, asked.seconds, period_s)
         found[name] = {stage: percentiles(np.array(each) / 1e3) for stage, each in durations.items()}
     if step.state.mode is not LoopMode.CLOSED or step.state.counts:
         raise ValueError(f"frames were refused or limits acted: {dict(step.state.counts)}; this is not the usual step")
     found["over_product"] = {name: found[name][STEP]["p50"] / found[name][PRODUCT]["p50"] for name in found}
-    return found | {"memory": memory, "rate_hz": RATE_HZ, "granted": list(granted.granted), "host": host()}
+    return found | {"memory": memory, "rate_hz": RATE_HZ, "granted": list(granted.granted)}
 
 
 def allocated(step: ControlStep, payloads: Payloads) -> dict[str, float]:
@@ -113,26 +107,16 @@ def allocated(step: ControlStep, payloads: Payloads) -> dict[str, float]:
     return {"peak_bytes": float(highest), "kept_bytes": kept, "frame_bytes": 4.0 * rows * columns}
 
 
-def table(found: dict[str, Any]) -> list[list[str]]:
+def tables(found: Result) -> list[Lines]:
     """One line a stage."""
     columns = [(name, at) for name in ("hot_us", "paced_us") for at in ("p50", "p99")]
     head = ["us", "back to back p50", "p99", f"at {found['rate_hz']:g} Hz p50", "p99"]
     stages = (*STAGES, REST, STEP, PRODUCT)
-    return [head, *([stage, *(f"{found[name][stage][at]:.1f}" for name, at in columns)] for stage in stages)]
+    return [[head, *([stage, *(f"{found[name][stage][at]:.1f}" for name, at in columns)] for stage in stages)]]
 
 
-def text(found: dict[str, Any]) -> str:
-    """The table and what it does not say for a terminal."""
-    return f"{cells.text(table(found))}\n\n{remarks(found)}"
-
-
-def markdown(found: dict[str, Any]) -> str:
-    """The table and what it does not say for a document."""
-    return f"{cells.markdown(table(found))}\n\n{remarks(found)}"
-
-
-def remarks(found: dict[str, Any]) -> str:
-    """What the table does not say."""
+def about(found: Result) -> str:
+    """How the step compares with one product, and what it takes of memory."""
     over, memory, size = found["over_product"], found["memory"], Size()
     return (
         f"The step takes {over['hot_us']:.1f} times as long as one product back to back, "
@@ -200,7 +184,3 @@ def _clock(original: Callable[..., Any], durations: list[int]) -> Callable[..., 
         return found
 
     return clocked
-
-
-if __name__ == "__main__":
-    run_main(main)

@@ -2,57 +2,31 @@
 
 A rate is sustained where at most one frame in a thousand is without a command, the recorder loses no message, and the
 frames come within 1 % as fast as asked for. It is looked for on a geometric grid: by halves with one run each, then
-around the edge with the majority of up to three, until a rate that holds stands beside one that does not. The commands
-are those that a user has: `lowfc sim-loop`, and `lowfc latency`, which sends frames made beforehand. Of both the first
-half second is left out, except of what the recorder lost.
+around the edge with the majority of up to three, until a rate that holds stands beside one that does not. The loops are
+those of `lowfc latency`, which leaves the first half second out, except of what the recorder lost and of late commands.
 
 Example:
-    python -m benchmarks.throughput --markdown
-    python -m benchmarks.throughput --seconds 2 --lowest 1000 --highest 4000 --way "prepared frames"
+    python -m benchmarks throughput --markdown
+    python -m benchmarks throughput --seconds 2 --lowest 1000 --highest 4000 --way "prepared frames"
 """
 
 import argparse
-import contextlib
-import json
 import math
-import os
 import shlex
-import subprocess
-import sys
-import tempfile
-import time
-from collections.abc import Callable, Iterator, Sequence
-from pathlib import Path
-from typing import Any, NamedTuple
+from collections.abc import Callable, Sequence
 
-from rich.console import Console
+from benchmarks.load import run_lowfc
+from benchmarks.runner import Lines, Result, Tell, add_times
+from lowfc.contract.errors import ConfigurationError
 
-from benchmarks import cells
-from benchmarks.command import add_forms, occasion, run_main, say
-from benchmarks.load import Watched
-from lowfc.adapters.bus import Sample
-from lowfc.adapters.clock import HostClock
-from lowfc.adapters.progress import passing_bar
-from lowfc.adapters.run import open_run
-from lowfc.adapters.zenoh_bus import ZenohBus
-from lowfc.contract.messages import FRAME, HEALTH, Role, wire
-from lowfc.programs.latency.figures import WARM_UP_S
-from lowfc.programs.watch import topic_count
-
-Figures = dict[str, Any]
-
-SIMULATED, PREPARED = "sim-loop", "latency"
 WAYS = {
-    "simulated camera, recorder": [SIMULATED],
-    "simulated camera": [SIMULATED, "--no-record"],
-    "prepared frames, recorder": [PREPARED, "--record"],
-    "prepared frames": [PREPARED],
+    "simulated camera, recorder": ["--camera", "simulated", "--record"],
+    "simulated camera": ["--camera", "simulated"],
+    "prepared frames, recorder": ["--record"],
+    "prepared frames": [],
 }
-"""What is searched for its highest rate, and the command behind it; --rate, --duration and --json are added."""
-FREE_RUNNING = {
-    "free-running, recorder": [PREPARED, "--free-running", "--record"],
-    "free-running": [PREPARED, "--free-running"],
-}
+"""What is searched for its highest rate, and the options of `lowfc latency` for it."""
+FREE_RUNNING = {"free-running, recorder": ["--free-running", "--record"], "free-running": ["--free-running"]}
 """What finds its rate by itself: the next frame as soon as the last one's command is back."""
 
 MOST_WITHOUT = 0.001
@@ -60,118 +34,69 @@ MOST_WITHOUT = 0.001
 RATE_WITHIN = 0.01
 COMPARED_HZ = 1000.0
 
-_LOOK_S = 0.05
 _ROLES = ("camera", "controller", "mirror", "recorder")
-_START_S, _SLOWEST = 60.0, 12.0
 
 
-class Heard(NamedTuple):
-    """When a Health came, and what it said."""
+def options(parser: argparse.ArgumentParser) -> None:
+    """The grid of rates, and which loops."""
+    add_times(parser, seconds=10.0)
+    parser.add_argument("--lowest", type=float, default=500.0, help="rate of the grid, Hz (%(default)g)")
+    parser.add_argument("--highest", type=float, default=10_000.0, help="rate of the grid, Hz (%(default)g)")
+    parser.add_argument("--step", type=float, default=1.1, help="from one rate to the next (%(default)g times)")
+    parser.add_argument("--way", action="append", choices=[*WAYS, *FREE_RUNNING], help="only this one; repeat")
 
-    at_s: float
-    health: wire.Health
+
+def measure(asked: argparse.Namespace, tell: Tell) -> Result:
+    """Look for the highest rate of each way.
+
+    Returns:
+        ways (of each what `find` returns), free_running (of each what `run_once` returns), seconds and rates_hz.
+    """
+    if not (0 < asked.lowest <= asked.highest and asked.step > 1):
+        raise ConfigurationError("--lowest must be above 0 and at most --highest, and --step above 1")
+    rates = grid(asked.lowest, asked.highest, asked.step)
+    ways, free = {}, {}
+    for name in asked.way or [*WAYS, *FREE_RUNNING]:
+        tell(name)
+        if name in FREE_RUNNING:
+            free[name] = run_once(FREE_RUNNING[name], None, asked.seconds)
+        else:
+            ways[name] = find(WAYS[name], rates, asked.seconds, tell)
+    return {"ways": ways, "free_running": free, "seconds": asked.seconds, "rates_hz": rates}
 
 
-def measure(words: Sequence[str], rate_hz: float | None, seconds: float) -> Figures:
+def run_once(words: Sequence[str], rate_hz: float | None, seconds: float) -> Result:
     """Run a loop once.
 
     Args:
-        words: of the command; see `WAYS`.
+        words: options of `lowfc latency`; see `WAYS`.
         rate_hz: asked for; None where there is no schedule.
         seconds: of frames.
 
     Returns:
         asked_hz, rate_hz, frames, without_command, messages_lost (None without a recorder), frame_to_command_us (p50,
-        p99), commands_late (part of them all, of a simulated camera), usage (share of one processor and processors, by
-        role); or failure, what the command said last.
+        p99), commands_late (part of them all, of a simulated camera), usage (see `shares`); or failure, what the
+        command said last.
     """
     rate = [] if rate_hz is None else ["--rate", f"{rate_hz:g}"]
-    command = [sys.executable, "-P", "-m", "lowfc", *words, *rate, "--duration", f"{seconds:g}", "--json"]
-    heard: list[Heard] = []
-    with tempfile.TemporaryDirectory() as folder, (Path(folder) / "said").open("w+") as said:
-        environment = os.environ | {"XDG_RUNTIME_DIR": folder}
-        process = subprocess.Popen(  # noqa: S603  # our own
-            command, cwd=folder, env=environment, stdout=subprocess.PIPE, stderr=said, text=True
-        )
-        try:
-            with Watched(process.pid) as watched, _joined(Path(folder), process, heard):
-                out, _ = process.communicate(timeout=_START_S + _SLOWEST * seconds)
-        except subprocess.TimeoutExpired:
-            return {"asked_hz": rate_hz, "failure": f"not done after {_START_S + _SLOWEST * seconds:g} s"}
-        finally:
-            if process.poll() is None:
-                process.terminate()
-                process.wait()
-        said.seek(0)
-        last = said.read().strip().splitlines()[-1:]
-    if process.returncode:
-        return {"asked_hz": rate_hz, "failure": "; ".join(last) or f"exit status {process.returncode}"}
-    usage = {role: used._asdict() for role, used in watched.shares(seconds).items()}
-    return {"asked_hz": rate_hz, **account(json.loads(out)), **(steady(heard) or {}), "usage": usage}
-
-
-@contextlib.contextmanager
-def _joined(folder: Path, process: "subprocess.Popen[str]", heard: list[Heard]) -> Iterator[None]:
-    """Hear the Health of the processes of a simulated loop; `lowfc latency` leaves its start out by itself."""
-    if SIMULATED not in process.args:  # type: ignore[operator]  # a list
-        yield
-        return
-
-    def hear(sample: Sample) -> None:
-        heard.append(Heard(time.monotonic(), wire.Health.FromString(sample.payload)))
-
-    while not (made := list(folder.glob("lowfc/[a-z0-9]*/config.toml"))) and process.poll() is None:
-        time.sleep(_LOOK_S)
-    with contextlib.ExitStack() as stack:
-        if made:
-            run = open_run(made[0].parent.name, (), made[0].parent.parent)
-            bus = ZenohBus(run.links, Role.OPERATOR, HostClock())
-            stack.callback(bus.close)
-            bus.subscribe(HEALTH, hear)
-        yield
-
-
-def steady(heard: Sequence[Heard]) -> Figures | None:
-    """Of a simulated loop without its start: rate_hz, frames and without_command; None where it was too short."""
-    running = [one.at_s for one in heard if one.health.process == Role.CAMERA and one.health.state == "running"]
-    if not running:
-        return None
-    inside = [one.health for one in heard if running[0] + WARM_UP_S <= one.at_s <= running[-1]]
-    camera = [health for health in inside if health.process == Role.CAMERA]
-    controller = [health for health in inside if health.process == Role.CONTROLLER]
-    if min(len(camera), len(controller)) < 2:
-        return None
-    first, last = (topic_count(controller[place], FRAME.key) for place in (0, -1))
-    published = [topic_count(camera[place], FRAME.key).published for place in (0, -1)]
-    return {
-        "rate_hz": (published[1] - published[0]) * 1e9 / (camera[-1].uptime_ns - camera[0].uptime_ns),
-        "frames": last.received + last.missing - first.received - first.missing,
-        "without_command": last.skipped + last.missing - first.skipped - first.missing,
+    found = run_lowfc(["latency", *words, *rate], seconds)
+    if "failure" in found:
+        return {"asked_hz": rate_hz, "failure": found["failure"]}
+    own = {
+        "asked_hz": rate_hz,
+        "rate_hz": found["rate_hz"],
+        "frames": found["frames"],
+        "without_command": found["frames_without_command"],
+        "messages_lost": found["messages_lost"],
+        "frame_to_command_us": {name: found["latency_us"]["frame_to_command"][name] for name in ("p50", "p99")},
+        "usage": found["usage"],
     }
+    if found["commands_late"] is not None:
+        own["commands_late"] = found["commands_late"] / (found["frames"] + found["warm_up_frames"])
+    return own
 
 
-def account(said: Figures) -> Figures:
-    """What `--json` of either command says of the frames."""
-    if "frames_published" in said:  # sim-loop
-        own = {
-            "frames": said["frames_published"],
-            "without_command": said["frames_published"] - said["frames_processed"],
-            "frame_to_command_us": said["latency_us"]["frame_to_command"],
-            "commands_late": said["commands_late"] / said["frames_published"],
-        }
-        if said["recording_failure"]:
-            own["failure"] = said["recording_failure"]
-    else:
-        own = {
-            "frames": said["frames"],
-            "without_command": said["frames_without_command"],
-            "frame_to_command_us": said["latency_us"]["frame_to_command"],
-        }
-    own["frame_to_command_us"] = {name: own["frame_to_command_us"][name] for name in ("p50", "p99")}
-    return {"rate_hz": said["rate_hz"], "messages_lost": said["messages_lost"], **own}
-
-
-def complaints(run: Figures) -> list[str]:
+def complaints(run: Result) -> list[str]:
     """Why this rate was not sustained; none where it was."""
     if "failure" in run:
         return [run["failure"]]
@@ -219,29 +144,29 @@ def search(sustains: Callable[[int], bool], count: int) -> int:
     return low
 
 
-def find(words: Sequence[str], rates: Sequence[float], seconds: float, told: Callable[[str], None]) -> Figures:
+def find(words: Sequence[str], rates: Sequence[float], seconds: float, tell: Tell) -> Result:
     """Look for the highest rate of one way.
 
     Returns:
         command, highest_hz (None where not even the lowest is sustained), at_highest (a sustained run there), above (a
         run that was not, one step faster; None where the grid ends), compared (a run at `COMPARED_HZ`) and all runs.
     """
-    command = shlex.join(["lowfc", *words])
-    runs: list[Figures] = []
+    command = shlex.join(["lowfc", "latency", *words])
+    runs: list[Result] = []
 
     def sustains(place: int) -> bool:
-        told(f"{command}: {rates[place]:g} Hz")
-        runs.append(measure(words, rates[place], seconds) | {"place": place})
+        tell(f"{command}: {rates[place]:g} Hz")
+        runs.append(run_once(words, rates[place], seconds) | {"place": place})
         return not complaints(runs[-1])
 
     place = search(sustains, len(rates))
-    told(f"{command}: {COMPARED_HZ:g} Hz")
+    tell(f"{command}: {COMPARED_HZ:g} Hz")
     return {
         "command": command,
         "highest_hz": rates[place] if place >= 0 else None,
         "at_highest": next((run for run in runs if run["place"] == place and not complaints(run)), None),
         "above": next((run for run in runs if run["place"] == place + 1 and complaints(run)), None),
-        "compared": measure(words, COMPARED_HZ, seconds),
+        "compared": run_once(words, COMPARED_HZ, seconds),
         "runs": runs,
     }
 
@@ -250,8 +175,8 @@ HEADINGS = ("loop", "highest rate, Hz", "frame to command p50, us", "p99", "comm
 USE_HEADINGS = ("loop", "at, Hz", *_ROLES, "on one processor")
 
 
-def tables(result: Figures) -> list[list[list[str]]]:
-    """Rates, and what the processes used; headings first."""
+def tables(result: Result) -> list[Lines]:
+    """Rates, and what the processes used."""
     rates, use = [list(HEADINGS)], [list(USE_HEADINGS)]
     for name, way in result["ways"].items():
         run, above = way["at_highest"], way["above"]
@@ -268,14 +193,14 @@ def tables(result: Figures) -> list[list[list[str]]]:
     return [rates, use]
 
 
-def _latency(run: Figures | None) -> list[str]:
+def _latency(run: Result | None) -> list[str]:
     if run is None or "frame_to_command_us" not in run:
         return [""] * 3
     late = f"{100 * run['commands_late']:.3g} %" if "commands_late" in run else ""
     return [*(f"{run['frame_to_command_us'][name]:.0f}" for name in ("p50", "p99")), late]
 
 
-def _use(name: str, run: Figures) -> list[str]:
+def _use(name: str, run: Result) -> list[str]:
     used = run.get("usage", {})
     rate_hz = run["asked_hz"] or run.get("rate_hz")
     together: dict[str, float] = {}
@@ -292,9 +217,9 @@ def _use(name: str, run: Figures) -> list[str]:
     return [name, "" if rate_hz is None else f"{rate_hz:.0f}", *found, sums]
 
 
-def about(result: Figures) -> str:
-    """What the figures are, and of which host."""
-    where, rates = result["host"], result["rates_hz"]
+def about(result: Result) -> str:
+    """What the figures are."""
+    rates = result["rates_hz"]
     runs = sum(len(way["runs"]) for way in result["ways"].values())
     return (
         f"Sustained over {result['seconds']:g} s: at most {100 * MOST_WITHOUT:g} % of the frames without a command, no "
@@ -302,64 +227,5 @@ def about(result: Figures) -> str:
         f"grid of {len(rates)} rates from {rates[0]:g} to {rates[-1]:g} Hz. Latencies are of one run at that rate; "
         "late are commands that were not there when the next exposure began, which the simulated camera sees. Percent "
         "are of one processor, all threads of the process, over the last four fifths of a run; in brackets the "
-        "processors that it may run on, and at the end the sum of those that may run on one only. "
-        f"Measured {result['date']} on {where['processors']} processors of {where['processor']}, Linux "
-        f"{where['kernel']}, Python {where['python']}, load {result['load_before']:g} before, by `{result['command']}`."
+        "processors that it may run on, and at the end the sum of those that may run on one only."
     )
-
-
-def text(result: Figures) -> str:
-    """The result for a terminal."""
-    return "\n\n".join([*map(cells.text, tables(result)), about(result)])
-
-
-def markdown(result: Figures) -> str:
-    """The result for a document."""
-    return "\n\n".join([*map(cells.markdown, tables(result)), about(result)])
-
-
-def main() -> int:
-    """The command line; returns its exit status."""
-    asked = _parser().parse_args()
-    if not (0 < asked.lowest <= asked.highest and asked.step > 1):
-        raise SystemExit("--lowest must be above 0 and at most --highest, and --step above 1")
-    every = WAYS | FREE_RUNNING
-    chosen = asked.way or list(every)
-    measured = occasion("python -m benchmarks.throughput")
-    rates = grid(asked.lowest, asked.highest, asked.step)
-    ways: Figures = {}
-    free: Figures = {}
-    with passing_bar(Console(stderr=True)) as bar:
-        task = bar.add_task("throughput", total=None)
-        for name in chosen:
-            bar.update(task, description=name)
-            if name in FREE_RUNNING:
-                free[name] = measure(every[name], None, asked.seconds)
-            else:
-                ways[name] = find(every[name], rates, asked.seconds, lambda what: bar.update(task, description=what))
-    result = {
-        "ways": ways,
-        "free_running": free,
-        "seconds": asked.seconds,
-        "rates_hz": rates,
-        **measured,
-    }
-    say(result, asked, text, markdown)
-    return 0
-
-
-def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(
-        "python -m benchmarks.throughput", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument("--seconds", type=float, default=10.0, help="of each run (%(default)g)")
-    parser.add_argument("--lowest", type=float, default=500.0, help="rate of the grid, Hz (%(default)g)")
-    parser.add_argument("--highest", type=float, default=10_000.0, help="rate of the grid, Hz (%(default)g)")
-    parser.add_argument("--step", type=float, default=1.1, help="from one rate to the next (%(default)g times)")
-    parser.add_argument("--way", action="append", choices=[*WAYS, *FREE_RUNNING], help="only this one; repeat")
-    add_forms(parser, "the tables")
-    return parser
-
-
-if __name__ == "__main__":
-    run_main(main)

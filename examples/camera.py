@@ -9,8 +9,8 @@ from functools import partial
 import typer
 from stand_in import Optics
 
-from lowfc.adapters.join import join
-from lowfc.adapters.terminal import DEFAULT_RUN, ConfigFile, RunId, configuration, run_app
+from lowfc.adapters.process.join import join
+from lowfc.adapters.process.terminal import DEFAULT_RUN, ConfigFile, RunId, configuration, run_app
 from lowfc.contract.messages import CAMERA_STATE, FRAME, Role, image, timestamp, wire
 
 SETTINGS = wire.CameraState(

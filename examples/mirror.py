@@ -10,12 +10,13 @@ import numpy as np
 import typer
 from google.protobuf.message import DecodeError
 
-from lowfc.adapters.join import join
-from lowfc.adapters.run import mirror_role
-from lowfc.adapters.terminal import DEFAULT_RUN, ConfigFile, RunId, configuration, run_app
-from lowfc.contract.codec import Single, actuators
+from lowfc.adapters.bus.run import mirror_role
+from lowfc.adapters.process.join import join
+from lowfc.adapters.process.terminal import DEFAULT_RUN, ConfigFile, RunId, configuration, run_app
+from lowfc.arrays import Single
+from lowfc.contract.codecs.codec import actuators
 from lowfc.contract.messages import COMMAND, MIRROR_STATE, wire
-from lowfc.control.safety import Limits, limit
+from lowfc.control.loop.safety import Limits, limit
 
 GRID, STEP_NM = (34, 34), 1500 / 2**16
 LIMITS = Limits(750 - STEP_NM, 150 - STEP_NM, 500 - STEP_NM)  # stroke, slew, neighbours: a step inside the hardware's
@@ -70,10 +71,11 @@ def main(run: RunId = DEFAULT_RUN, config: ConfigFile = None) -> None:
                 service.event("COMMAND_REFUSED", reason="out of order, not finite, or for another grid")
             if state.status == wire.MIRROR_STATUS_FOLLOWING and now_ns - obeyed_ns > valid_ns:  # the dead-man
                 state.status = wire.MIRROR_STATUS_EXPIRED
-                service.event("COMMAND_EXPIRED", valid_ms=valid_ns / 1e6, action="relaxing to flat")
+                service.event("COMMAND_EXPIRED", command_timeout_ms=valid_ns / 1e6, action="relaxing to flat")
             relaxing = state.status == wire.MIRROR_STATUS_EXPIRED and where_nm.any()
             if relaxing:
                 where_nm = moved(limit(LIMITS, where_nm, np.zeros_like(where_nm)).actuators_nm)
+                del state.command_nm[:]  # it is no longer where a command wanted it
             if followed is not None or relaxing or now_ns >= due_ns:  # without commands ten times a second
                 state.timestamp.FromNanoseconds(time_ns)
                 state.actuators = where_nm.tobytes()

@@ -3,9 +3,9 @@
 import numpy as np
 import numpy.typing as npt
 
-from lowfc.adapters.bus import Sample
-from lowfc.adapters.service import Service
-from lowfc.contract.codec import decode_mirror
+from lowfc.adapters.bus.bus import Sample
+from lowfc.adapters.process.service import Service
+from lowfc.contract.codecs.codec import decode_mirror
 from lowfc.contract.configuration import Configuration
 from lowfc.contract.messages import MIRROR_STATE
 from sim_camera.process import bench

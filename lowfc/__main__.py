@@ -6,7 +6,7 @@ import signal
 def main() -> None:
     """Entry point; until everything is loaded, Ctrl-C ends it without a word."""
     signal.signal(signal.SIGINT, signal.SIG_DFL)
-    from lowfc.programs.cli import main as run
+    from lowfc.programs.cli.main import main as run
 
     run()
 

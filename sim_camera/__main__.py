@@ -6,10 +6,10 @@ from typing import Annotated
 
 import typer
 
-from lowfc.adapters.join import join
-from lowfc.adapters.terminal import DEFAULT_RUN, ConfigFile, RunId, configuration, new_app, run_app
+from lowfc.adapters.process.join import join
+from lowfc.adapters.process.terminal import DEFAULT_RUN, ConfigFile, RunId, configuration, new_app, run_app
 from lowfc.contract.messages import Role
-from sim_camera.faulty import read_faults
+from sim_camera.faulty import read_fault
 from sim_camera.process import CameraProcess, bench
 
 app = new_app("The simulated sensor camera.\n\nExample: sim-camera --run bench --config lowfc.toml")
@@ -21,7 +21,7 @@ def camera(
     config: ConfigFile = None,
     frames: Annotated[int | None, typer.Option(min=1, help="Stop after so many frames; default: when told to.")] = None,
     wait_for: Annotated[list[str] | None, typer.Option(help="Process that the first frame waits for; repeat.")] = None,
-    faults: Annotated[Path | None, typer.Option(hidden=True, help="Faults of the frames (JSON).")] = None,
+    fault: Annotated[Path | None, typer.Option(hidden=True, help="Fault of the frames (JSON).")] = None,
 ) -> None:
     """Expose frames of a run: the mirror's surface from the bus, a disturbance from the seed, full diffraction.
 
@@ -30,7 +30,7 @@ def camera(
     settings = configuration(config)
     optics = bench(settings)
     service = join(settings, run, Role.CAMERA, settings.realtime.camera_cpus)
-    process = CameraProcess(settings, service, optics, frames, () if faults is None else read_faults(faults))
+    process = CameraProcess(settings, service, optics, frames, None if fault is None else read_fault(fault))
     service.fill = process.fill
     service.catch_signals()
     with closing(service.bus):  # a callback on zenoh's threads must not outlive the interpreter

@@ -6,10 +6,10 @@ from math import sqrt
 import numpy as np
 import numpy.typing as npt
 
-from lowfc.optics.detector import Detector, expose, laws_of, saturation_dn
-from lowfc.optics.twin import Evaluator, Twin, node_radii, wavefront_rms_nm
-from lowfc.optics.twin_mirror import TwinMirror, wavefront_nm
-from lowfc.optics.zernike import zernikes
+from lowfc.optics.chain.zernike import zernikes
+from lowfc.optics.detector.detector import Detector, expose, laws_of, saturation_dn
+from lowfc.optics.twin.twin import Evaluator, Twin, node_radii, wavefront_rms_nm
+from lowfc.optics.twin.twin_mirror import TwinMirror, wavefront_nm
 from sim_camera.disturbance import BLOCK, Disturbance, modes_nm, screen
 
 Single = npt.NDArray[np.float32]

@@ -1,4 +1,4 @@
-"""Seeded faults of a camera: what it publishes instead of its frames, as a function of the frame index."""
+"""A seeded fault of a camera: what it publishes instead of its frames, as a function of the frame index."""
 
 from dataclasses import dataclass
 from enum import StrEnum
@@ -47,67 +47,71 @@ class Fault:
         if self.first < 1 or self.frames < 1:
             raise ValueError(f"a fault begins at frame 1 or later and has frames, got {self.first} and {self.frames}")
 
-    def strikes(self, index: int) -> bool:
-        """Whether it befalls the frame of this index."""
-        return self.first <= index < self.first + self.frames
+    def befalling(self, index: int) -> Kind | None:
+        """What befalls the frame of this index."""
+        return self.kind if self.first <= index < self.first + self.frames else None
 
     def random(self, index: int) -> np.random.Generator:
         """Random numbers of this frame."""
         return np.random.default_rng([self.seed, index])
 
+    def sent(self, index: int) -> tuple[int, ...]:
+        """Indices of the frames that are published at the end of exposure `index`, the newest first."""
+        return tuple(
+            frame
+            for frame in range(index, max(index - MOST_FRAMES_LATE, 0) - 1, -1)
+            for when in self._due(frame)
+            if when == index
+        )
 
-def sent(faults: tuple[Fault, ...], index: int) -> tuple[int, ...]:
-    """Indices of the frames that are published at the end of exposure `index`, the newest first."""
-    return tuple(
-        frame
-        for frame in range(index, max(index - MOST_FRAMES_LATE, 0) - 1, -1)
-        for when in _due(faults, frame)
-        if when == index
-    )
+    def _due(self, frame: int) -> tuple[int, ...]:
+        """Indices of the exposures at whose end a frame is published."""
+        match self.befalling(frame):
+            case Kind.LOST if self.random(frame).random() < LOST_SHARE:
+                return ()
+            case Kind.DUPLICATED:
+                return frame, frame
+            case Kind.REORDERED:  # in pairs, the second one first
+                return (frame + 1 - (frame - self.first) % 2,)
+            case Kind.LATE:
+                return (frame + int(self.random(frame).integers(1, MOST_FRAMES_LATE + 1)),)
+        return (frame,)
 
+    def pixels(self, index: int, frame: Frame, before: Frame, dark: int, highest: int) -> Frame:
+        """What the detector gives instead of a frame (rows, columns).
 
-def _due(faults: tuple[Fault, ...], frame: int) -> tuple[int, ...]:
-    """Indices of the exposures at whose end a frame is published."""
-    for fault in faults:
-        if fault.strikes(frame):
-            match fault.kind:
-                case Kind.LOST if fault.random(frame).random() < LOST_SHARE:
-                    return ()
-                case Kind.DUPLICATED:
-                    return frame, frame
-                case Kind.REORDERED:  # in pairs, the second one first
-                    return (frame + 1 - (frame - fault.first) % 2,)
-                case Kind.LATE:
-                    return (frame + int(fault.random(frame).integers(1, MOST_FRAMES_LATE + 1)),)
-    return (frame,)
+        Args:
+            index: of the frame.
+            frame: as it would be.
+            before: what the detector gave last.
+            dark: value without light, DN.
+            highest: value of a pixel at full well, DN.
+        """
+        rng = self.random(index)
+        match self.befalling(index):
+            case Kind.SATURATED:
+                return np.full_like(frame, highest)
+            case Kind.DARK:
+                return rng.integers(max(dark - 2, 0), dark + 3, frame.shape).astype(np.uint16)
+            case Kind.HOT_PIXELS:
+                return np.where(rng.random(frame.shape) < HOT_SHARE, np.uint16(highest), frame)
+            case Kind.COSMIC_RAYS if rng.random() < COSMIC_SHARE:
+                return _with_track(frame, rng, highest)
+            case Kind.STUCK:
+                return before
+            case Kind.WRONG_SIZE:  # as a camera with another region sends it
+                return np.ascontiguousarray(frame[1:, :-1])
+        return frame
 
-
-def pixels(faults: tuple[Fault, ...], index: int, frame: Frame, before: Frame, dark: int, highest: int) -> Frame:
-    """What the detector gives instead of a frame (rows, columns).
-
-    Args:
-        faults: of the camera.
-        index: of the frame.
-        frame: as it would be.
-        before: what the detector gave last.
-        dark: value without light, DN.
-        highest: value of a pixel at full well, DN.
-    """
-    for fault in faults:
-        if fault.strikes(index):
-            rng = fault.random(index)
-            match fault.kind:
-                case Kind.SATURATED:
-                    frame = np.full_like(frame, highest)
-                case Kind.DARK:
-                    frame = rng.integers(max(dark - 2, 0), dark + 3, frame.shape).astype(np.uint16)
-                case Kind.HOT_PIXELS:
-                    frame = np.where(rng.random(frame.shape) < HOT_SHARE, np.uint16(highest), frame)
-                case Kind.COSMIC_RAYS if rng.random() < COSMIC_SHARE:
-                    frame = _with_track(frame, rng, highest)
-                case Kind.STUCK:
-                    frame = before
-    return frame
+    def payload(self, index: int, message: bytes, image_end: int) -> bytes:
+        """The bytes of a frame's message, whose image ends at `image_end`, as they come."""
+        rng = self.random(index)
+        match self.befalling(index):
+            case Kind.TRUNCATED:
+                return message[: int(rng.integers(0, image_end))]
+            case Kind.RANDOM:
+                return rng.bytes(int(rng.integers(1, 2 * len(message))))
+        return message
 
 
 def _with_track(frame: Frame, rng: np.random.Generator, highest: int) -> Frame:
@@ -119,27 +123,3 @@ def _with_track(frame: Frame, rng: np.random.Generator, highest: int) -> Frame:
     struck = frame.copy()
     struck[rows[inside], columns[inside]] = highest
     return struck
-
-
-def cut(faults: tuple[Fault, ...], index: int, frame: Frame) -> Frame:
-    """The part of a frame (rows, columns) that a camera with another region would send."""
-    wrong = any(fault.kind is Kind.WRONG_SIZE and fault.strikes(index) for fault in faults)
-    return np.ascontiguousarray(frame[1:, :-1]) if wrong else frame
-
-
-def payload(faults: tuple[Fault, ...], index: int, message: bytes, image_end: int) -> bytes:
-    """The bytes of a frame's message, whose image ends at `image_end`, as they come."""
-    for fault in faults:
-        if fault.strikes(index):
-            rng = fault.random(index)
-            match fault.kind:
-                case Kind.TRUNCATED:
-                    message = message[: int(rng.integers(0, image_end))]
-                case Kind.RANDOM:
-                    message = rng.bytes(int(rng.integers(1, 2 * len(message))))
-    return message
-
-
-def starts_before(faults: tuple[Fault, ...], index: int) -> bool:
-    """Whether the camera numbers this frame as if it had been started earlier, by a clock that was set back."""
-    return any(fault.kind is Kind.OLD_SEQUENCE and fault.strikes(index) for fault in faults)

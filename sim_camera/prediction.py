@@ -2,10 +2,11 @@
 
 import numpy as np
 
-from lowfc.adapters import instrument
+from lowfc.adapters.files import factory
 from lowfc.contract.configuration import Configuration
-from lowfc.control.stability import noise_gain, rejection
-from lowfc.optics.photometry import tilt_nm_per_mas
+from lowfc.control.laws.linear_law import integrator
+from lowfc.control.laws.margins import noise_gain, rejection
+from lowfc.optics.detector.photometry import tilt_nm_per_mas
 from sim_camera.process import disturbance_of, ignore
 
 
@@ -14,12 +15,10 @@ def tilt_residual_mas(config: Configuration, delay_frames: float) -> float:
 
     The disturbance's sine waves are known exactly; photon and read noise come through R.
     """
-    control, rate_hz = config.control, config.camera.rate_hz
-    shaken = disturbance_of(config)
-    rejected = rejection(shaken.frequency_hz, rate_hz, control.tilt_gain, control.tilt_leak, delay_frames)
-    waves = np.sum(np.abs(shaken.amplitude_nm[:, :2]) ** 2 / 2 * rejected[:, None] ** 2, axis=0)
-    optics = instrument.twin(config, None, ignore)
-    calibration = instrument.analytic_calibration(config, optics, instrument.mirror_on_twin(config, optics, ignore))
-    noise = instrument.frame_noise_nm(config, calibration)[:2] ** 2
-    through = noise_gain(control.tilt_gain, control.tilt_leak, delay_frames)
-    return float(np.sqrt(np.mean(waves + noise * through)) / tilt_nm_per_mas(config.star.diameter_m))
+    control, shaken = config.control, disturbance_of(config)
+    law = integrator([control.tilt_gain], [control.tilt_leak], (2,), delay_frames, config.camera.rate_hz)
+    waves = np.sum(np.abs(shaken.amplitude_nm[:, :2]) ** 2 / 2 * rejection(law, shaken.frequency_hz) ** 2, axis=0)
+    optics = factory.twin(config, None, ignore)
+    calibration = factory.analytic_calibration(config, optics, factory.mirror_on_twin(config, optics, ignore))
+    noise = factory.frame_noise_nm(config, calibration)[:2] ** 2
+    return float(np.sqrt(np.mean(waves + noise * noise_gain(law))) / tilt_nm_per_mas(config.star.diameter_m))

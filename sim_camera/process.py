@@ -9,18 +9,18 @@ import numpy as np
 import numpy.typing as npt
 from google.protobuf.message import DecodeError
 
-from lowfc.adapters import instrument
-from lowfc.adapters.bus import Sample
-from lowfc.adapters.realtime import let_send
-from lowfc.adapters.service import Service
-from lowfc.contract.codec import actuators, latency
+from lowfc.adapters.bus.bus import Sample
+from lowfc.adapters.files import factory
+from lowfc.adapters.process.realtime import let_send
+from lowfc.adapters.process.service import Service
+from lowfc.contract.codecs.codec import actuators, latency
 from lowfc.contract.configuration import Configuration
 from lowfc.contract.errors import BusError, ConfigurationError
 from lowfc.contract.messages import CAMERA_STATE, FRAME, MIRROR_STATE, TRUTH, image, timestamp, wire
-from lowfc.control.durations import Durations
-from lowfc.control.stability import delay_weights
-from lowfc.optics.detector import saturation_dn
-from lowfc.optics.photometry import tilt_nm_per_mas
+from lowfc.control.laws.stability import delay_weights
+from lowfc.control.loop.durations import Durations
+from lowfc.optics.detector.detector import saturation_dn
+from lowfc.optics.detector.photometry import tilt_nm_per_mas
 from sim_camera.bench import Bench, Truth
 from sim_camera.disturbance import Disturbance, disturbance
 from sim_camera.faults import Fault
@@ -58,12 +58,12 @@ def disturbance_of(config: Configuration) -> Disturbance:
 
 def bench(config: Configuration) -> Bench:
     """The bench of a configuration; its twin comes from the cache."""
-    optics = instrument.twin(config, None, ignore)
+    optics = factory.twin(config, None, ignore)
     return Bench(
         optics,
-        instrument.true_mirror_on_twin(config, optics, ignore),
-        instrument.detector(config),
-        instrument.electrons_per_exposure(config),
+        factory.true_mirror_on_twin(config, optics, ignore),
+        factory.detector(config),
+        factory.electrons_per_exposure(config),
         disturbance_of(config),
         config.camera.rate_hz,
         config.seed,
@@ -84,16 +84,16 @@ class CameraProcess:
         service: Service,
         optics: Bench,
         frames: int | None,
-        faults: tuple[Fault, ...] = (),
+        fault: Fault | None = None,
     ) -> None:
-        """Declare everything on the bus; `faults` befall the frames."""
+        """Declare everything on the bus; `fault` befalls the frames."""
         self._config = config
         self._service = service
         self._bench = optics
         self._limit = frames
         self._frames = service.publisher(FRAME)
-        highest = saturation_dn(instrument.detector(config))
-        self._faulty = FaultyFrames(faults, self._frames, config.camera.bias_dn, highest) if faults else None
+        highest = saturation_dn(factory.detector(config))
+        self._faulty = FaultyFrames(fault, self._frames, config.camera.bias_dn, highest) if fault else None
         self._truths = service.publisher(TRUTH)
         self._settings = service.publisher(CAMERA_STATE)
         self._weights = delay_weights(config.camera.delay_frames).astype(np.float32)
@@ -248,5 +248,5 @@ class CameraProcess:
         )
 
     def _publish_settings(self, time_ns: int) -> None:
-        state = instrument.camera_state(self._config, self._bench.shape, time_ns)
+        state = factory.camera_state(self._config, self._bench.shape, time_ns)
         self._settings.put(state.SerializeToString())

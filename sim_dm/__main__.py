@@ -2,9 +2,9 @@
 
 from contextlib import closing
 
-from lowfc.adapters.join import join
-from lowfc.adapters.run import mirror_role
-from lowfc.adapters.terminal import DEFAULT_RUN, ConfigFile, RunId, configuration, new_app, run_app
+from lowfc.adapters.bus.run import mirror_role
+from lowfc.adapters.process.join import join
+from lowfc.adapters.process.terminal import DEFAULT_RUN, ConfigFile, RunId, configuration, new_app, run_app
 from sim_dm.process import MirrorProcess
 
 app = new_app("The simulated deformable mirror.\n\nExample: sim-dm --run bench --config lowfc.toml")

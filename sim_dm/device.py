@@ -13,8 +13,8 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from lowfc.control.additions import LONGEST_NAME, MOST_CHANNELS
-from lowfc.control.safety import Limits, Reason, expired, limit
+from lowfc.control.loop.additions import LONGEST_NAME, MOST_CHANNELS
+from lowfc.control.loop.safety import Limits, Reason, expired, limit
 
 Single = npt.NDArray[np.float32]
 
@@ -60,7 +60,7 @@ class Device:
 
 
 @dataclass(frozen=True, slots=True)
-class Told:
+class Command:
     """A command as it came.
 
     Attributes:
@@ -120,7 +120,7 @@ def initial(device: Device) -> Status:
     return Status(flat, _at_rest(device, flat))
 
 
-def obey(device: Device, status: Status, told: Told, now_ns: int) -> tuple[Status, Reason | None]:
+def apply_command(device: Device, status: Status, told: Command, now_ns: int) -> tuple[Status, Reason | None]:
     """Follow a command that came at `now_ns`; a refused one changes nothing, and the reason is returned."""
     reason = _refusal(device, status, told)
     if reason is not None:
@@ -168,7 +168,7 @@ def tick(device: Device, status: Status, now_ns: int) -> Status:
     return status._replace(surface_nm=surface_nm, time_ns=time_ns)
 
 
-def _refusal(device: Device, status: Status, told: Told) -> Reason | None:
+def _refusal(device: Device, status: Status, told: Command) -> Reason | None:
     if told.actuators_nm is None or told.actuators_nm.shape != device.grid:
         return Reason.WRONG_GRID
     if not (np.isfinite(told.actuators_nm).all() and np.isfinite(told.command_nm).all()):

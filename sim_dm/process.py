@@ -6,13 +6,13 @@ import numpy as np
 import numpy.typing as npt
 from google.protobuf.message import DecodeError
 
-from lowfc.adapters.bus import Sample
-from lowfc.adapters.clock import SimulatedClock
-from lowfc.adapters.instrument import mirror_limits, true_mirror
-from lowfc.adapters.mailbox import Mailbox
-from lowfc.adapters.service import Service
-from lowfc.adapters.start_check import StartCheck
-from lowfc.contract.codec import actuators
+from lowfc.adapters.bus.bus import Sample
+from lowfc.adapters.bus.mailbox import Mailbox
+from lowfc.adapters.bus.start_check import StartCheck
+from lowfc.adapters.files.factory import mirror_limits, true_mirror
+from lowfc.adapters.process.clock import SimulatedClock
+from lowfc.adapters.process.service import Service
+from lowfc.contract.codecs.codec import actuators
 from lowfc.contract.configuration import Configuration
 from lowfc.contract.errors import BadMessageError
 from lowfc.contract.messages import (
@@ -25,10 +25,10 @@ from lowfc.contract.messages import (
     timestamp,
     wire,
 )
-from lowfc.control.safety import Reason
-from lowfc.optics.grid import pupil_axis
-from lowfc.optics.mirror import influence_factors
-from sim_dm.device import Device, Told, initial, obey, tick
+from lowfc.control.loop.safety import Reason
+from lowfc.optics.chain.grid import pupil_axis
+from lowfc.optics.chain.mirror import influence_factors
+from sim_dm.device import Command, Device, apply_command, initial, tick
 
 Single = npt.NDArray[np.float32]
 
@@ -51,7 +51,7 @@ def device(config: Configuration) -> Device:
         section.stroke_nm / 2**section.driver_bits,
         section.settling_us * 1e3,
         fixed_nm,
-        section.expired == "flat",
+        section.on_command_timeout == "flat",
     )
 
 
@@ -102,9 +102,9 @@ class MirrorProcess:
         """On the thread that receives: a command. Those that waited while this process stood still are skipped."""
         with self._turn:
             if self._service.running:
-                self._follow(sample)
+                self._next_command(sample)
 
-    def _follow(self, sample: Sample) -> None:
+    def _next_command(self, sample: Sample) -> None:
         clock = self._service.clock
         try:
             told = _told(sample.payload, self._start_check)
@@ -114,7 +114,7 @@ class MirrorProcess:
         if isinstance(clock, SimulatedClock):
             clock.set_ns(told.time_ns)
         before, refused_before = self._status, self._refused
-        self._status, self._refused = obey(self._device, before, told, clock.now_ns())
+        self._status, self._refused = apply_command(self._device, before, told, clock.now_ns())
         refused = self._refused
         self._publish(self._status.time_ns or clock.now_ns())
         self._service.work += 1
@@ -134,7 +134,7 @@ class MirrorProcess:
         self._status = tick(self._device, before, now_ns)
         if before.following and not self._status.following:
             action = "relaxing to flat" if self._device.flatten else "holding the shape"
-            self._service.event("COMMAND_EXPIRED", valid_ms=before.valid_for_ns / 1e6, action=action)
+            self._service.event("COMMAND_EXPIRED", command_timeout_ms=before.valid_for_ns / 1e6, action=action)
         moved = (
             self._status.surface_nm is not before.surface_nm and (self._status.surface_nm != before.surface_nm).any()
         )
@@ -174,9 +174,9 @@ class MirrorProcess:
         health.limits_hit.extend(reason.value for reason in status.limits_hit)  # type: ignore[misc]
 
 
-def _told(payload: bytes, start_check: StartCheck | None = None) -> Told:
+def _told(payload: bytes, start_check: StartCheck | None = None) -> Command:
     message = wire.MirrorCommand.FromString(payload)
-    return Told(
+    return Command(
         message.channel,
         checked_sequence(message.frame_sequence),
         checked_time_ns(message.timestamp),

@@ -1,4 +1,4 @@
-"""One contest, one table: other ways to close the same loop, at the same sizes, on this host, at the same time.
+"""A contest: other ways to close the same loop, at the same sizes, on this host, at the same time.
 
-Nothing here is needed to run lowfc. `python -m benchmarks.peers --help` says how it is run.
+Nothing here is needed to run lowfc. `python -m benchmarks peers --help` says how it is run.
 """

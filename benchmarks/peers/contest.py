@@ -1,34 +1,43 @@
-"""Run the contestants, in turn within every repeat, and keep what each run showed."""
+"""Other ways to close the same loop beside lowfc, at the same sizes, on this host, at the same time.
 
+The contestants take turns within every repeat, once in the normal scheduling class and once under SCHED_FIFO.
+
+Example:
+    python -m benchmarks peers --pyrtcao DIR/bin/python --markdown
+"""
+
+import argparse
 import contextlib
+import importlib.metadata
 import os
 import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
+from statistics import median
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
-from benchmarks.peers.contestants import PAIR, Contestant
-from benchmarks.peers.process import Plan, go, ready_file
-from lowfc.adapters.run import free_ports
+from benchmarks.peers.shared import ACTUATORS, GRID, MODES, SHAPE, Plan, go, ready_file
+from benchmarks.runner import Lines, Result, Tell, add_times, ranged
+from benchmarks.sizes import Size, configuration, run_loop
+from lowfc.adapters.bus.run import free_ports
+from lowfc.adapters.process.child import Child
+from lowfc.contract.errors import ConfigurationError, LowfcError
+from lowfc.programs.measure.latency.figures import percentiles
 
 ROOT = Path(__file__).parents[2]
 PRIORITY = 50
-_ONLOOKERS_PRIORITY = 10
-_MEMORY = Path("/dev/shm")  # noqa: S108  # a folder of one's own is made in it
-_READY_S = 60.0
-_SETTLE_S = 0.3
-_LATER_S = 10.0
-_LOOK_S = 0.02
-_ONE_THREAD = dict.fromkeys(("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS"), "1")
-
 SCHEDULING = {"normal": 0, "FIFO": PRIORITY}
+PAIR = ("source", "controller")
+
+_MEMORY = Path("/dev/shm")  # noqa: S108  # a folder of one's own is made in it
+_READY_S, _SETTLE_S, _LATER_S, _LOOK_S, _PATIENCE_S = 60.0, 0.3, 10.0, 0.02, 0.5
+_ONE_THREAD = dict.fromkeys(("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS"), "1")
 
 
 class ContestError(Exception):
@@ -36,126 +45,219 @@ class ContestError(Exception):
 
 
 @dataclass(frozen=True)
-class Rules:
-    """What is the same for all.
+class Contestant:
+    """One row of the table.
 
     Attributes:
-        seconds: that are measured of each run, after `warm_up` frames.
-        rate_hz: of the frames.
-        pyrtcao: an interpreter that has pyrtcao, if one does.
+        name: in the table.
+        what: it is, in a sentence.
+        roles: its processes in the order in which they start; the source's end is the end of a run. None: lowfc itself.
+        options: of its processes.
+        module: whose roles its processes play.
+        package: that must be installed in the interpreter of its processes, beside what lowfc needs.
     """
 
-    seconds: float
-    warm_up: int
-    rate_hz: float
-    pyrtcao: str = sys.executable
+    name: str
+    what: str
+    roles: tuple[str, ...] = ()
+    options: Mapping[str, Any] = field(default_factory=dict)
+    module: str = "benchmarks.peers.plain"
+    package: str = ""
+
+    @property
+    def pacer(self) -> str:
+        """The role that waits for the start and ends by itself."""
+        return "source" if "source" in self.roles else self.roles[0]
 
 
-def hold(
-    contestants: Sequence[Contestant],
-    rules: Rules,
-    repeats: int,
-    scheduling: Sequence[str],
-    tell: Callable[[str], None] = lambda _: None,
-) -> list[dict[str, Any]]:
-    """Run them all, each once in every repeat and scheduling class.
+TIMER, BARE = "timer wake-up of this host", "zenoh"
+_PYRTCAO = {"module": "benchmarks.peers.pyrtcao_loop", "package": "pyrtcao"}
+CONTESTANTS = (
+    Contestant(
+        TIMER,
+        "no loop: how late a sleep until an absolute time ends on the controller's processor, in turn with the rest",
+        ("timer",),
+    ),
+    Contestant(
+        "shared memory, semaphore",
+        "a ring in shared memory each way, the step in numpy, on a thread that waits for a POSIX semaphore",
+        PAIR,
+        {"transport": "ring"},
+    ),
+    Contestant(
+        BARE,
+        "zenoh as it comes, in sessions set up as lowfc's, the step in numpy, in the subscriber's callback",
+        PAIR,
+        {"transport": "zenoh"},
+    ),
+    Contestant(
+        "lowfc",
+        "its controller and mirror as they run, frames made beforehand: the loop of `lowfc latency`, of this size",
+    ),
+    Contestant(
+        "pyrtcao, fused",
+        "WavefrontSensor, one component of one's own with all of the step compiled, and WavefrontCorrector, each a "
+        "process; in the normal class it sets nice -20 where it may",
+        ("mirror", "source", "controller"),
+        {"fused": True},
+        **_PYRTCAO,
+    ),
+    Contestant(
+        "pyrtcao, stock",
+        "WavefrontSensor, a component that makes a signal of the pixels, Loop.standard_integrator, WavefrontCorrector, "
+        "each a process; its command is modes, and the actuators are made after it",
+        ("mirror", "source", "signal", "controller"),
+        {"fused": False},
+        **_PYRTCAO,
+    ),
+)
+
+DEFINITIONS = {
+    "t0": "just before the source sends a frame: before the put, the ring's put, or pyrtcao's WavefrontSensor.expose",
+    "t1": "just after the controller has sent the frame's command: after the put, the ring's put, or pyrtcao's "
+    "write_stream; for lowfc after its socket's send, before zenoh's",
+    "to the mirror": "from t0 until the command is in the mirror's process: the source's own, on its receiving thread; "
+    "for pyrtcao the corrector's process, its actuators made; for lowfc until just before the mirror's state is put",
+    "clock": "CLOCK_MONOTONIC, one host",
+    "pacing": "the source sleeps until absolute times; a late frame is sent at once, its t0 is when it was sent, and "
+    "none is left out",
+    "cells": "us, median (lowest to highest) over the repeats; contestants and classes take turns within every repeat",
+    "without a command": "measured frames that no command was made from: median over the repeats, of how many",
+    "pinning": "source and mirror on the first processor, controller (pyrtcao: and signal) on the second",
+    "threads": "BLAS and numba 1; garbage collection off everywhere",
+    "FIFO": f"SCHED_FIFO {PRIORITY} for all, idle processors kept awake",
+}
+
+
+def options(parser: argparse.ArgumentParser) -> None:
+    """How long, how often, how fast, and who."""
+    add_times(parser, seconds=8.0, repeats=5)
+    parser.add_argument("--warm-up", type=int, default=500, help="frames before (%(default)s)")
+    parser.add_argument("--rate", dest="rate_hz", type=float, default=1000.0, help="frames per second (%(default)g)")
+    parser.add_argument("--only", action="append", metavar="WORD", help="contestants with this in their name; repeat")
+    parser.add_argument("--pyrtcao", default=sys.executable, metavar="PYTHON", help="an interpreter that has pyrtcao")
+
+
+def measure(asked: argparse.Namespace, tell: Tell) -> Result:
+    """Hold the contest.
 
     Returns:
-        One row for each contestant and class: contestant, what, scheduling, repeats (the figures of each run that came
-        to its end, see `figures`), failures (what is said of the others), and missing where it could not take part.
+        rows, one for each contestant and class: contestant, what, scheduling, repeats (figures of each run that came to
+        its end, see `figures`), failures (what is said of the others), and missing where it could not take part;
+        rules, notes, pinned_to, versions, command and failed.
     """
+    chosen = [one for one in CONTESTANTS if any(word in one.name for word in asked.only or [""])]
+    if not chosen:
+        raise ConfigurationError(f"--only: none of {'; '.join(one.name for one in CONTESTANTS)}")
+    classes, notes = list(SCHEDULING), []
+    if not may_run_first():
+        classes.remove("FIFO")
+        notes.append(f"FIFO: this host does not allow SCHED_FIFO {PRIORITY} (LimitRTPRIO=, CAP_SYS_NICE).")
     rows: list[dict[str, Any]] = [
         {"contestant": one.name, "what": one.what, "scheduling": name, "repeats": [], "failures": []}
-        for name in scheduling
-        for one in contestants
+        for name in classes
+        for one in chosen
     ]
-    missing = {one.name: _missing(one, rules) for one in contestants}
-    for repeat in range(repeats):
-        for row, one in zip(rows, [*contestants] * len(scheduling), strict=True):
+    missing = {one.name: _missing(one, asked.pyrtcao) for one in chosen}
+    for repeat in range(asked.repeats):
+        for row, one in zip(rows, [*chosen] * len(classes), strict=True):
             if missing[one.name]:
                 row["missing"] = missing[one.name]
                 continue
-            tell(f"repeat {repeat + 1} of {repeats}: {one.name}, {row['scheduling']}")
+            tell(f"repeat {repeat + 1} of {asked.repeats}: {one.name}, {row['scheduling']}")
             try:
-                row["repeats"].append(one_run(one, rules, SCHEDULING[row["scheduling"]]))
-            except ContestError as fault:
-                row["failures"].append(str(fault))
-    return rows
+                row["repeats"].append(one_run(one, asked, SCHEDULING[row["scheduling"]]))
+            except (ContestError, LowfcError) as fault:
+                row["failures"].append(f"{one.name}: {fault}")
+    words = " ".join(sys.argv[1:]).replace(asked.pyrtcao, "PYTHON")  # its path is nobody's business
+    return {
+        "rows": rows,
+        "rules": {name: getattr(asked, name) for name in ("repeats", "seconds", "warm_up", "rate_hz")},
+        "notes": notes,
+        "pinned_to": list(processors()),
+        "versions": _versions(asked.pyrtcao),
+        "command": f"python -m benchmarks {words}",
+        "failed": [fault for row in rows for fault in row["failures"]],
+    }
 
 
-def one_run(contestant: Contestant, rules: Rules, priority: int) -> dict[str, Any]:
+def one_run(contestant: Contestant, rules: argparse.Namespace, priority: int) -> dict[str, Any]:
     """Run one contestant once; figures as `figures` makes them.
 
     Raises:
         ContestError: it did not start, did not come to its end, or made no command at all.
+        LowfcError: the same of lowfc's loop.
     """
+    if not contestant.roles:
+        return _lowfc(rules, priority)
     frames = rules.warm_up + round(rules.seconds * rules.rate_hz)
     first, second = processors()
     plan = Plan(
         rate_hz=rules.rate_hz,
         frames=frames,
         cpus={role: second if role in ("controller", "signal", "timer") else first for role in contestant.roles},
-        priority={
-            role: min(priority, _ONLOOKERS_PRIORITY) if role == "onlooker" else priority for role in contestant.roles
-        },
+        priority=dict.fromkeys(contestant.roles, priority),
         ports=dict(zip(PAIR, free_ports(len(PAIR)), strict=True)),
-        options=contestant.options,
+        options=dict(contestant.options),
     )
     with tempfile.TemporaryDirectory(prefix="lowfc-peers-", dir=_MEMORY) as name:
         folder = Path(name)
         plan.write(folder)
         (folder / "credentials").write_text("contest:contest\n")
-        with _awake() if priority else contextlib.nullcontext(), _processes(contestant, rules, folder) as pacer:
+        with _awake(priority), _processes(contestant, rules.pyrtcao, folder) as children:
             time.sleep(_SETTLE_S)
             go(folder)
-            try:
-                pacer.wait(frames / rules.rate_hz + _LATER_S)
-            except subprocess.TimeoutExpired:
-                raise ContestError(f"{contestant.name}: the frames did not come to an end") from None
-            if pacer.returncode:
-                raise ContestError(f"{contestant.name}: {_said(folder, contestant.pacer)}")
-        found = figures(folder, rules.warm_up, observed="onlooker" in contestant.roles)
+            pacer = children[contestant.pacer]
+            deadline_s = time.monotonic() + frames / rules.rate_hz + _LATER_S
+            while pacer.status is None and time.monotonic() < deadline_s:
+                time.sleep(_LOOK_S)
+            if pacer.status != 0:
+                raise ContestError(f"the frames did not come to an end: {pacer.stderr_tail()}")
+            words = children["controller"].stderr_tail() if "controller" in children else ""
+        found = figures(folder, rules.warm_up)
         if found["frame_to_command"] is None:
-            raise ContestError(f"{contestant.name}: no command came: {_said(folder, 'controller')}")
+            raise ContestError(f"no command came: {words}")
         return found
 
 
-def figures(folder: Path, warm_up: int, *, observed: bool = False) -> dict[str, Any]:
+def figures(folder: Path, warm_up: int) -> dict[str, Any]:
     """What the times of a run say, its first `warm_up` frames left out.
 
     Returns:
         frames; without_command of them; sent_late, of them, more than a period after they were due; frame_to_command
-        and frame_to_mirror (until the command was back), each p50_us, p99_us, p99_9_us and max_us, None where no
-        command came; frames_observed where somebody looks on.
+        and frame_to_mirror (until the command was back), each percentiles in us, None where no command came.
     """
-    due, published, commanded, received, seen = (
-        np.fromfile(folder / name, np.int64)[1 + warm_up :]
-        for name in ("due", "published", "commanded", "received", "observed")
+    due, published, commanded, received = (
+        np.fromfile(folder / name, np.int64)[1 + warm_up :] for name in ("due", "published", "commanded", "received")
     )
     period_ns = np.diff(due).mean() if due.size > 1 else np.inf
-    found = {
+    return {
         "frames": int(due.size),
         "without_command": int((commanded == 0).sum()),
         "sent_late": int((published - due > period_ns).sum()),
-        "frame_to_command": _percentiles(published, commanded),
-        "frame_to_mirror": _percentiles(published, received),
+        "frame_to_command": percentiles((commanded - published)[commanded > 0] / 1e3),
+        "frame_to_mirror": percentiles((received - published)[received > 0] / 1e3),
     }
-    return found | ({"frames_observed": int((seen > 0).sum())} if observed else {})
+
+
+def _lowfc(rules: argparse.Namespace, priority: int) -> dict[str, Any]:
+    """The real loop, of the contest's size; it warms up for half a second by itself."""
+    size = Size(SHAPE[0], MODES, GRID[0])
+    found = run_loop(
+        size, configuration(size, rules.rate_hz, priority=priority, disable_cpu_idle=bool(priority)), rules.seconds
+    )
+    return {
+        "frames": found["frames"],
+        "without_command": found["frames_without_command"],
+        "sent_late": found["frames_sent_late"],
+        **{span: found["latency_us"][span] for span in ("frame_to_command", "frame_to_mirror")},
+    }
 
 
 def processors() -> tuple[int, int]:
     """The first two that this process may run on; the same one twice where there is but one."""
     allowed = sorted(os.sched_getaffinity(0))
     return allowed[0], allowed[1 % len(allowed)]
-
-
-@contextlib.contextmanager
-def _awake() -> Iterator[None]:
-    """Idle processors kept awake for everybody, where this user may."""
-    with contextlib.ExitStack() as held:
-        with contextlib.suppress(OSError):
-            held.enter_context(Path("/dev/cpu_dma_latency").open("wb", buffering=0)).write(bytes(4))
-        yield
 
 
 def may_run_first() -> bool:
@@ -169,72 +271,116 @@ def may_run_first() -> bool:
     return True
 
 
-def _percentiles(begun_ns: npt.NDArray[np.int64], ended_ns: npt.NDArray[np.int64]) -> dict[str, float] | None:
-    took_us = (ended_ns - begun_ns)[ended_ns > 0] / 1e3
-    if not took_us.size:
-        return None
-    p50, p99, p99_9 = np.percentile(took_us, (50, 99, 99.9), method="inverted_cdf")
-    return {"p50_us": float(p50), "p99_us": float(p99), "p99_9_us": float(p99_9), "max_us": float(took_us.max())}
+@contextlib.contextmanager
+def _awake(priority: int) -> Iterator[None]:
+    """Idle processors kept awake for everybody under FIFO, where this user may."""
+    with contextlib.ExitStack() as held:
+        if priority:
+            with contextlib.suppress(OSError):
+                held.enter_context(Path("/dev/cpu_dma_latency").open("wb", buffering=0)).write(bytes(4))
+        yield
 
 
 @contextlib.contextmanager
-def _processes(contestant: Contestant, rules: Rules, folder: Path) -> "Iterator[subprocess.Popen[bytes]]":
-    """Start all processes, one after the other is ready; yield the one that paces, end all."""
-    started: dict[str, subprocess.Popen[bytes]] = {}
+def _processes(contestant: Contestant, pyrtcao: str, folder: Path) -> Iterator[dict[str, Child]]:
+    """Start all processes, one after the other is ready; end all."""
+    python = pyrtcao if contestant.package else sys.executable
+    environment = os.environ | _ONE_THREAD | {"PYTHONPATH": str(ROOT)}
+    children = {
+        role: Child(role, [python, "-m", contestant.module, role, str(folder)], folder / f"{role}.txt", environment)
+        for role in contestant.roles
+    }
     try:
-        for role in contestant.roles:
-            started[role] = _start(contestant, rules, folder, role)
+        for role, child in children.items():
+            child.start()
             deadline_s = time.monotonic() + _READY_S
             while not ready_file(folder, role).exists():
-                if started[role].poll() is not None or time.monotonic() > deadline_s:
-                    raise ContestError(f"{contestant.name}: {role} did not get ready: {_said(folder, role)}")
+                if child.status is not None or time.monotonic() > deadline_s:
+                    raise ContestError(f"{role} did not get ready: {child.stderr_tail()}")
                 time.sleep(_LOOK_S)
-        yield started[contestant.pacer]
+        yield children
     except BaseException:
         if contestant.package:  # it may have left streams in shared memory
-            _start(contestant, rules, folder, "clear").wait()
+            words = [python, "-m", contestant.module, "clear", str(folder)]
+            subprocess.run(words, env=environment, check=False)  # noqa: S603  # our own program
         raise
     finally:
-        for process in started.values():
-            process.kill()
-            process.wait()
+        for child in children.values():
+            child.stop(_PATIENCE_S)
 
 
-def _start(contestant: Contestant, rules: Rules, folder: Path, role: str) -> "subprocess.Popen[bytes]":
-    with (folder / f"{role}.txt").open("wb") as said:
-        return subprocess.Popen(  # noqa: S603  # our own programs
-            [_python(contestant, rules), "-m", contestant.module, role, str(folder)],
-            cwd=folder,
-            env=os.environ | _ONE_THREAD | {"PYTHONPATH": str(ROOT)},
-            stdin=subprocess.DEVNULL,
-            stdout=said,
-            stderr=subprocess.STDOUT,
-        )
-
-
-def _said(folder: Path, role: str) -> str:
-    """The last line of what a process wrote: of a traceback, the fault."""
-    lines = (folder / f"{role}.txt").read_text(errors="replace").strip().splitlines()
-    return lines[-1][:500] if lines else "it said nothing"
-
-
-def _python(contestant: Contestant, rules: Rules) -> str:
-    return rules.pyrtcao if contestant.package else sys.executable
-
-
-def _missing(contestant: Contestant, rules: Rules) -> str:
+def _missing(contestant: Contestant, python: str) -> str:
     """Why a contestant cannot take part; empty where it can."""
-    if not contestant.package:
+    package = contestant.package
+    if not package or package in _versions(python):
         return ""
-    python = _python(contestant, rules)
-    asked = f"import importlib.metadata as m; m.version({contestant.package!r})"
-    try:
-        done = subprocess.run([python, "-c", asked], capture_output=True, check=False)  # noqa: S603  # an interpreter
-    except OSError as fault:
-        return f"not run: {python} cannot be started ({fault.strerror})"
-    if not done.returncode:
-        return ""
-    return (
-        f"not installed: python -m venv DIR && DIR/bin/pip install {contestant.package}, then "
-        f"--{contestant.package} DIR/bin/python"
+    how = f"python -m venv DIR && DIR/bin/pip install {package}, then --{package} DIR/bin/python"
+    return f"not installed in {python}: {how}"
+
+
+def _versions(python: str) -> dict[str, str]:
+    """Of the packages in the contest; pyrtcao's where that interpreter has it."""
+    found = {name: importlib.metadata.version(name) for name in ("lowfc", "eclipse-zenoh", "numpy")}
+    words = [python, "-c", "import importlib.metadata as m; print(m.version('pyrtcao'))"]
+    with contextlib.suppress(OSError):
+        done = subprocess.run(words, capture_output=True, text=True, check=False)  # noqa: S603  # an interpreter
+        if not done.returncode:
+            found["pyrtcao"] = done.stdout.strip()
+    return found
+
+
+PERCENTILES = {"p50": "p50", "p99": "p99", "p99_9": "p99.9", "max": "max"}
+HEADINGS = ["contestant", "class", *PERCENTILES.values(), f"p50 of {BARE}'s", "p99", "without a command"]
+HEADINGS += ["to the mirror p50", "p99"]
+
+
+def tables(result: Result) -> list[Lines]:
+    """One line for each contestant and class."""
+    bare = {row["scheduling"]: row for row in result["rows"] if row["contestant"] == BARE}
+    lines = [_cells(row, bare.get(row["scheduling"])) for row in result["rows"]]
+    return [[HEADINGS, *(line + [""] * (len(HEADINGS) - len(line)) for line in lines)]]
+
+
+def _cells(row: Result, bare: Result | None) -> list[str]:
+    head, runs = [row["contestant"], row["scheduling"]], row["repeats"]
+    if "missing" in row:
+        return [*head, "not installed"]
+    if not runs:
+        return [*head, "failed"]
+    head += _span(runs, "frame_to_command", PERCENTILES)
+    if row["contestant"] == TIMER:
+        return head
+    without, frames = (median(run[name] for run in runs) for name in ("without_command", "frames"))
+    both = [_medians(runs), _medians(bare["repeats"] if bare else [])]
+    head += [f"{both[0][at] / both[1][at]:.2f}" if all(both) else "" for at in ("p50", "p99")]
+    return [*head, f"{without:g} of {frames:g}", *_span(runs, "frame_to_mirror", ("p50", "p99"))]
+
+
+def _span(runs: Sequence[Result], span: str, names: Iterable[str]) -> list[str]:
+    known = [run[span] for run in runs if run[span] is not None]
+    return [ranged([one[at] for one in known], "{:.0f}".format) if known else "" for at in names]
+
+
+def _medians(runs: Sequence[Result]) -> dict[str, float]:
+    known = [run["frame_to_command"] for run in runs if run["frame_to_command"] is not None]
+    return {at: median(one[at] for one in known) for at in ("p50", "p99")} if known else {}
+
+
+def about(result: Result) -> str:
+    """What the table's figures are."""
+    rules, rows = result["rules"], result["rows"]
+    lines = [
+        f"{name}: {what}." for name, what in (DEFINITIONS | {row["contestant"]: row["what"] for row in rows}).items()
+    ]
+    lines.append(
+        f"{rules['repeats']} repeats of {rules['seconds']:g} s at {rules['rate_hz']:g} Hz after {rules['warm_up']} "
+        f"frames; {SHAPE[0]} x {SHAPE[1]} uint16 pixels, {MODES} modes, {ACTUATORS} actuators."
     )
+    late, sent = (sum(run[name] for row in rows for run in row["repeats"]) for name in ("sent_late", "frames"))
+    lines.append(f"{late} of all {sent} frames were sent more than a period late.")
+    lines += sorted({f"{row['contestant']}: {row['missing']}." for row in rows if "missing" in row})
+    lines += [f"Failed, {row['scheduling']}: {fault}." for row in rows for fault in row["failures"]]
+    lines += result["notes"]
+    versions = ", ".join(f"{name} {version}" for name, version in result["versions"].items())
+    lines.append(f"Processors {result['pinned_to']}; {versions}.")
+    return "\n".join(f"- {line}" for line in lines)

@@ -25,8 +25,7 @@ from pyrtc.utils import set_affinity_and_priority
 from pyrtc.wavefront_corrector import WavefrontCorrector
 from pyrtc.wavefront_sensor import WavefrontSensor
 
-from benchmarks.peers.problem import ACTUATORS, DIFFERENT, GAIN, LEAK, LIMIT_NM, MODES, SHAPE, Problem
-from benchmarks.peers.process import Part
+from benchmarks.peers.shared import ACTUATORS, DIFFERENT, GAIN, LEAK, LIMIT_NM, MODES, SHAPE, Part, Problem
 
 Array = npt.NDArray[np.float32]
 

@@ -12,6 +12,6 @@ from lowfc.client.configuration import configuration_of
 from lowfc.client.mirror_watch import MirrorWatch
 from lowfc.client.runs import running, the_run
 from lowfc.client.stream import Frame, Stream
-from lowfc.control.inputs import Step
+from lowfc.control.loop.inputs import Step
 
 __all__ = ["Answer", "Client", "Frame", "MirrorWatch", "Step", "Stream", "configuration_of", "running", "the_run"]

@@ -12,20 +12,21 @@ import numpy as np
 import numpy.typing as npt
 from google.protobuf.message import DecodeError
 
-from lowfc.adapters.bus import ALL, UNREADABLE, Bus, Sample
-from lowfc.adapters.clock import HostClock
-from lowfc.adapters.names import Names
-from lowfc.adapters.run import DEFAULT_RUN, open_run
-from lowfc.adapters.zenoh_bus import ZenohBus
+from lowfc.adapters.bus.bus import ALL, UNREADABLE, Bus, Sample
+from lowfc.adapters.bus.names import Names
+from lowfc.adapters.bus.run import DEFAULT_RUN, open_run
+from lowfc.adapters.bus.zenoh_bus import ZenohBus
+from lowfc.adapters.process.clock import HostClock
 from lowfc.client.answer import Answer
 from lowfc.client.lease import Lease
 from lowfc.client.mirror_watch import MirrorWatch
+from lowfc.client.requests import BY_NAME
 from lowfc.client.runs import the_run
 from lowfc.client.stream import SILENT_S, WAITING, Frame, Stream, frame_of, step_of
-from lowfc.contract.calibration_codec import camera_settings, decode_calibration, encode_calibration
-from lowfc.contract.codec import most_bytes
+from lowfc.contract.codecs.calibration_codec import camera_settings, decode_calibration, encode_calibration
+from lowfc.contract.codecs.codec import most_bytes
+from lowfc.contract.codecs.law_codec import wire_law
 from lowfc.contract.errors import BusError, RequestRefusedError
-from lowfc.contract.law_codec import wire_law
 from lowfc.contract.messages import (
     CALIBRATION,
     CAMERA_STATE,
@@ -40,11 +41,11 @@ from lowfc.contract.messages import (
     wire,
 )
 from lowfc.contract.published import Published
-from lowfc.control.additions import MIRROR, OFFSET
-from lowfc.control.calibration import Calibration
-from lowfc.control.camera import CameraSettings
-from lowfc.control.inputs import Step
-from lowfc.control.linear_law import LinearLaw
+from lowfc.control.calibration.calibration import Calibration
+from lowfc.control.laws.linear_law import LinearLaw
+from lowfc.control.loop.additions import MIRROR, OFFSET
+from lowfc.control.loop.camera import CameraSettings
+from lowfc.control.loop.inputs import Step
 
 Single = npt.NDArray[np.float32]
 T = TypeVar("T")
@@ -57,8 +58,18 @@ LARGE_BYTES = 100_000
 """Of a request; a larger one takes its time."""
 
 
+def _plain(name: str) -> Callable[["Client"], Answer]:
+    """The method of a request without fields, as declared."""
+
+    def ask(client: "Client") -> Answer:
+        return client.ask(name)
+
+    ask.__doc__ = BY_NAME[name].sentence
+    return ask
+
+
 class Client:
-    """A connection to a loop, for one thread (another renews a reservation); it stays until `close`.
+    """A connection to a loop, for one thread (another renews a reservation); it stays until `disconnect`.
 
     Of the run, only who is asked need be there.
 
@@ -71,7 +82,7 @@ class Client:
 
         Args:
             run: its name; the only one on this host when None.
-            bus: of a process that has joined it already; `close` leaves that alone.
+            bus: of a process that has joined it already; `disconnect` leaves that alone.
 
         Raises:
             BusError: there is no such run, none at all, or more than one to choose from.
@@ -91,44 +102,21 @@ class Client:
         return self
 
     def __exit__(self, kind: type[BaseException] | None, fault: BaseException | None, at: TracebackType | None) -> None:
-        self.close()
+        self.disconnect()
 
-    def close(self) -> None:
-        """Leave the run; the loop goes on as it is. To close the loop is `close_loop`."""
+    def disconnect(self) -> None:
+        """Leave the run; the loop goes on as it is."""
         if self._own is not None:
             self._own.close()
 
-    def status(self) -> Answer:
-        """What the controller is doing, in `state`."""
-        return self.ask("status")
-
-    def open(self) -> Answer:
-        """Stop driving the mirror; it holds its shape."""
-        return self.ask("open")
-
-    def close_loop(self) -> Answer:
-        """Let the control law drive the mirror."""
-        return self.ask("close")
-
-    def pause(self) -> Answer:
-        """Hold the command; `close_loop` goes on from it."""
-        return self.ask("pause")
-
-    def step(self, frames: int) -> Answer:
-        """Close the loop for some frames; then it opens by itself."""
-        return self.ask("step", values=frames)
-
-    def safe(self) -> Answer:
-        """Relax the mirror to flat and latch it there."""
-        return self.ask("safe")
-
-    def clear(self) -> Answer:
-        """Leave the latched safe state; the loop is open afterwards."""
-        return self.ask("clear")
-
-    def reset(self) -> Answer:
-        """Take the modal command to zero within the slew limit, and clear the law's memory."""
-        return self.ask("reset")
+    status = _plain("status")
+    open_loop = _plain("open")
+    close_loop = _plain("close")
+    pause = _plain("pause")
+    safe = _plain("safe")
+    clear = _plain("clear")
+    reset = _plain("reset")
+    stop = _plain("stop")
 
     def gain(self, values: npt.ArrayLike, modes: int | Sequence[int] = ()) -> Answer:
         """Set integrator gains: one value, or one for each of `modes` (a Noll index or several, all when empty)."""
@@ -141,6 +129,10 @@ class Client:
     def limit(self, values: npt.ArrayLike, modes: int | Sequence[int] = ()) -> Answer:
         """Set the largest modal commands, nm rms of wavefront, as `gain`."""
         return self.ask("limit", modes, values)
+
+    def step(self, frames: int) -> Answer:
+        """Close the loop for some frames; then it opens by itself."""
+        return self.ask("step", values=frames)
 
     def offset(self, values: npt.ArrayLike = (), modes: int | Sequence[int] = ()) -> Answer:
         """Set the loop's target, nm rms of wavefront, as `gain`; zero without values."""
@@ -182,10 +174,6 @@ class Client:
         if table.ndim != 2:
             raise RequestRefusedError(f"play refused: it takes a table (frames, modes), got an array of {table.shape}")
         return self.ask("play", text=OFFSET, table=table)
-
-    def stop(self) -> Answer:
-        """End what is being played."""
-        return self.ask("stop")
 
     def load(self, calibration: Calibration) -> Answer:
         """Use another calibration; the loop must be open."""
@@ -233,7 +221,7 @@ class Client:
         return self.ask("note", text=text)
 
     def record(self, on: bool) -> Answer:
-        """Begin the next log, or finish this one: its path is the answer's text, and the file is whole."""
+        """Start the next log, or finish this one, and return its path as the answer's text."""
         key = RECORD_KEY.format(name="start" if on else "stop")
         return self._answer("record", self._get(key, b"", SLOW_ANSWER_S, Role.RECORDER))
 

@@ -1,28 +1,25 @@
 """The configuration of a running loop."""
 
 import tomllib
-from typing import Protocol
+from typing import TYPE_CHECKING
 
 from pydantic import ValidationError
 
-from lowfc.contract.configuration import Configuration
 from lowfc.contract.errors import ConfigurationError
 
-
-class Configured(Protocol):
-    """What answers as a client does."""
-
-    def configuration(self) -> str:
-        """The configuration that the controller was started with, as TOML."""
-        ...
+if TYPE_CHECKING:
+    from lowfc.client.client import Client
+    from lowfc.contract.configuration import Configuration
 
 
-def configuration_of(loop: Configured) -> Configuration:
+def configuration_of(loop: "Client") -> "Configuration":
     """The configuration that a loop's controller was started with.
 
     Raises:
         ConfigurationError: it is one of another version.
     """
+    from lowfc.contract.configuration import Configuration
+
     try:
         return Configuration.model_validate(tomllib.loads(loop.configuration()))
     except ValidationError as fault:

@@ -7,16 +7,18 @@ import secrets
 import threading
 import time
 from collections.abc import Callable
+from typing import TYPE_CHECKING
 
 from lowfc.contract.errors import BusError, CalibrationError, LowfcError, RequestRefusedError
+
+if TYPE_CHECKING:
+    from lowfc.adapters.process.progress import Counted
 
 DURATION_S = 10.0
 """For which it is in force unless it is renewed: so long are others refused after its holder's death."""
 RENEWAL_S = 0.5
 """Between renewals; in lockstep a loop may be twenty times as fast as its clock says."""
 
-Progress = Callable[[str, int, int], None]
-"""What is being done, how much of it is, and of how much."""
 Ask = Callable[[str, int, float, str], object]
 """Ask for `lease`, `renew` or `release`: the request, the lease's identity, seconds, its holder."""
 
@@ -57,7 +59,7 @@ class Lease:
         """Say how long it is going to take from now on."""
         self._end_s = time.monotonic() + duration_s
 
-    def expecting(self, progress: Progress, rate_hz: float) -> Progress:
+    def expecting(self, progress: "Counted", rate_hz: float) -> "Counted":
         """Progress in frames, from which others are told how long it is going to take."""
 
         def told(what: str, done: int, total: int) -> None:

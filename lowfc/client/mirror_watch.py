@@ -4,7 +4,7 @@ import time
 
 from google.protobuf.message import DecodeError
 
-from lowfc.adapters.bus import Bus, Ring, name_in
+from lowfc.adapters.bus.bus import Bus, Ring, name_in
 from lowfc.client.stream import SILENT_S, WAITING
 from lowfc.contract.envelope import start_of
 from lowfc.contract.errors import BusError

@@ -1,7 +1,7 @@
 """Which runs there are on this host."""
 
-from lowfc.adapters.other_loops import none_here
-from lowfc.adapters.run import open_run, runtime_base
+from lowfc.adapters.bus.other_loops import none_here
+from lowfc.adapters.bus.run import open_run, runtime_base
 from lowfc.contract.errors import BusError, DataFileError
 from lowfc.contract.messages import Role
 

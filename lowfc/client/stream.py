@@ -9,14 +9,14 @@ import numpy as np
 import numpy.typing as npt
 from google.protobuf.message import DecodeError
 
-from lowfc.adapters.bus import Ring, Sample
-from lowfc.adapters.gaps import Gaps
-from lowfc.contract import codec
+from lowfc.adapters.bus.bus import Ring, Sample
+from lowfc.adapters.logs.sequence_gaps import Gaps
+from lowfc.contract.codecs import codec
 from lowfc.contract.envelope import count_of, start_of
 from lowfc.contract.errors import BusError
 from lowfc.contract.messages import from_timestamp, wire
-from lowfc.control.inputs import Step
-from lowfc.control.safety import LoopMode, Reason
+from lowfc.control.loop.inputs import Step
+from lowfc.control.loop.safety import LoopMode, Reason
 
 T = TypeVar("T")
 

@@ -5,6 +5,7 @@ the nearest known one. `lowfc config show` prints all keys with their sentences.
 """
 
 import difflib
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any, Literal
 
@@ -12,8 +13,11 @@ import tomli_w
 from pydantic import BaseModel, Field, ValidationError, model_validator
 from pydantic.fields import FieldInfo
 
-from lowfc.contract import input_file, toml_text
+from lowfc.contract import toml_text
+from lowfc.contract.codecs import input_file
 from lowfc.contract.errors import ConfigurationError, brief
+from lowfc.contract.former_names import renamed_keys
+from lowfc.contract.network import Network as Network
 from lowfc.contract.printable import printable
 from lowfc.contract.sections import (
     PRESETS,
@@ -75,22 +79,22 @@ class Control(Section):
     """Largest modal command of tip and tilt, wavefront rms."""
     limit_nm: Positive = 50.0
     """Largest modal command of the other modes, wavefront rms."""
-    late_ms: NotNegative = 0.0
+    max_frame_age_ms: NotNegative = 0.0
     """Age above which a frame is refused; 0 for 20 ms, or two frame periods where they are longer."""
-    hold_ms: NotNegative = 0.0
+    frame_timeout_ms: NotNegative = 0.0
     """Silence of the camera after which it is an event; 0 for 50 ms, or five frame periods where they are longer."""
-    silence: Literal["hold", "flat"] = "hold"
+    on_frame_timeout: Literal["hold", "flat"] = "hold"
     """During such a silence: hold the command, or relax the mirror to flat."""
-    valid_ms: Positive = 200.0
+    command_timeout_ms: Positive = 200.0
     """How long the mirror may hold a command without another one."""
     max_start_ahead_h: float = Field(24.0, ge=0)
     """Hours by which the start in a camera's or a controller's sequences may lie ahead of this host's clock; 0 for any,
     as on a host whose clock is not set."""
-    least_flux: float = Field(0.2, ge=0, lt=1)
+    min_flux_fraction: float = Field(0.2, ge=0, lt=1)
     """Fraction of the expected light below which a frame is dark."""
-    most_saturated: int = Field(8, ge=0)
+    max_saturated_pixels: int = Field(8, ge=0)
     """Pixels at full well above which a frame is refused."""
-    most_alike: int = Field(3, ge=0)
+    max_identical_frames: int = Field(3, ge=0)
     """Frames in a row that may be the very image of the one before, as a stuck camera sends it; 0 for any number."""
     law: str = ""
     """File (FITS) of a law that `lowfc tune` wrote, which takes over from the integrator; empty for the integrator."""
@@ -158,9 +162,9 @@ class Realtime(Section):
     """SCHED_FIFO priority of the recorder, below the loop's; 0, or a loop without, for normal scheduling."""
     lock_memory: bool = True
     """Keep the processes' memory from being paged out."""
-    stay_awake: bool = True
+    disable_cpu_idle: bool = True
     """Keep idle processors awake while the loop runs: waking one takes longer than a hand-off; it costs power."""
-    rehearse: bool = True
+    cache_warmup: bool = True
     """Do each control step a second time for nothing, so that the next frame finds the caches warm; not above 2 kHz."""
     camera_cpus: list[int] = Field(default_factory=list)
     """Processors of the camera; empty for all. Where the file says nothing, sim-loop gives the controller its own."""
@@ -170,29 +174,6 @@ class Realtime(Section):
     """Processors of the mirror; empty for all."""
     recorder_cpus: list[int] = Field(default_factory=list)
     """Processors of the recorder; empty for all. sim-loop keeps it off the controller's."""
-
-
-class Network(Section):
-    """The way between machines; without a router all processes are on this one."""
-
-    router: str = Field("", pattern=r"^(tls/.+:[0-9]{1,5})?$")
-    """Where the router listens, such as "tls/bench.example.org:7447"; empty for none."""
-    certificates: str = ""
-    """Folder with ca.pem and, for each role on this machine, ROLE.pem and ROLE.key, as `lowfc certs` makes them."""
-    listen: str = Field("", pattern=r"^(tls/.+:[0-9]{1,5})?$")
-    """Of the router: where it listens, if that is not what the others connect to."""
-
-    @model_validator(mode="after")
-    def _both(self) -> "Network":
-        if self.router and not self.certificates:
-            raise ValueError("certificates: a folder is needed, for the router takes nobody without one")
-        return self
-
-    @property
-    def address(self) -> tuple[str, int]:
-        """Host and port of the router."""
-        host, _, port = self.router.partition("/")[2].rpartition(":")
-        return host.strip("[]"), int(port)
 
 
 class Configuration(Section):
@@ -254,14 +235,14 @@ class Configuration(Section):
         return round(self.period_ns * self.camera.exposure_fraction)
 
     @property
-    def late_ns(self) -> int:
+    def max_frame_age_ns(self) -> int:
         """Age above which a frame is refused."""
-        return round(self.control.late_ms * 1e6) or max(LATE_NS, 2 * self.period_ns)
+        return round(self.control.max_frame_age_ms * 1e6) or max(LATE_NS, 2 * self.period_ns)
 
     @property
-    def hold_ns(self) -> int:
+    def frame_timeout_ns(self) -> int:
         """Silence of the camera after which it is an event."""
-        return round(self.control.hold_ms * 1e6) or max(HOLD_NS, 5 * self.period_ns)
+        return round(self.control.frame_timeout_ms * 1e6) or max(HOLD_NS, 5 * self.period_ns)
 
     @property
     def noll(self) -> tuple[int, ...]:
@@ -274,9 +255,14 @@ class Configuration(Section):
 
 
 def load(
-    path: Path | None, overrides: dict[str, Any] | None = None, defaults: dict[str, Any] | None = None
+    path: Path | None,
+    overrides: dict[str, Any] | None = None,
+    defaults: dict[str, Any] | None = None,
+    remark: Callable[[str], None] = lambda text: None,
 ) -> Configuration:
     """Read a TOML file (None: all defaults), lay `overrides` over it and `defaults` under it: dotted keys to values.
+
+    A former key has the meaning of the present one, and `remark` is called with a sentence that names both.
 
     Raises:
         ConfigurationError: the file is missing or no TOML, or a key or value is wrong.
@@ -285,6 +271,8 @@ def load(
     if path is not None:
         try:
             data = toml_text.parsed(input_file.read_whole(path, toml_text.LARGEST_BYTES))
+            for text in renamed_keys(data):
+                remark(f"{path}: {text}")
         except FileNotFoundError:
             raise ConfigurationError(f"{path}: there is no such configuration file") from None
         except (OSError, ValueError) as error:

@@ -5,7 +5,7 @@ from typing import NamedTuple
 
 from lowfc.contract.errors import BadMessageError
 from lowfc.contract.messages import LATEST_NS, SEQUENCES
-from lowfc.control.inputs import COUNT_BITS
+from lowfc.control.loop.inputs import COUNT_BITS
 
 __all__ = ["COUNT_BITS", "Envelope", "count_of", "sequence_of", "start_of"]
 

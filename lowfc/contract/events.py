@@ -6,7 +6,7 @@ from numbers import Integral
 
 from lowfc.contract.messages import Log, timestamp
 from lowfc.contract.printable import printable
-from lowfc.control.wording import counted
+from lowfc.control.loop.wording import counted
 
 
 class Level(IntEnum):
@@ -88,7 +88,7 @@ EVENTS: dict[str, Event] = {
         Event("MIRROR_REFUSED", Level.WARNING, "the mirror's shape is not adopted: {why}"),
         Event("LIMIT_HIT", Level.WARNING, "mirror limit reached: {reason}"),
         Event("LIMIT_CLEARED", Level.INFO, "mirror limit no longer reached: {reason}"),
-        Event("COMMAND_EXPIRED", Level.WARNING, "the last command expired after {valid_ms:.0f} ms; {action}"),
+        Event("COMMAND_EXPIRED", Level.WARNING, "the last command expired after {command_timeout_ms:.0f} ms; {action}"),
         Event("COMMAND_BACK", Level.INFO, "commands are back"),
         Event("COMMAND_REFUSED", Level.WARNING, "command refused: {reason}"),
         Event(

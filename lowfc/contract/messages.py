@@ -4,17 +4,19 @@ A topic's key on the bus is its topic in a log without the leading slash. Payloa
 package `lowfc.v1` (declared in `proto/lowfc/v1/lowfc.proto`) and Foxglove's schemas for images and log lines.
 """
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 from enum import StrEnum
 from functools import lru_cache
+from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 from foxglove_schemas_protobuf.Log_pb2 import Log
 from foxglove_schemas_protobuf.RawImage_pb2 import RawImage
 from google.protobuf.message import Message
 from google.protobuf.timestamp_pb2 import Timestamp
 
+from lowfc.arrays import Pixels, Single
 from lowfc.contract.errors import BadMessageError
 from lowfc.contract.wire import lowfc_pb2 as wire
 
@@ -52,11 +54,11 @@ class Topic:
         publisher: whose it is to put; by a router, nobody else's messages get through.
         subscribers: who gets it.
         simulated_only: there is no such topic on a bench with real devices.
-        timeless: in lockstep two runs with the same seed write the same payload bytes.
+        deterministic: in lockstep two runs with the same seed write the same payload bytes.
         queryable: a late joiner may ask the publisher for the last one.
-        newest_only: who looks at a run wants the newest only, and gets no more than eyes can follow.
-        reader: who waits for it, and gets it by a way of its own from its publisher on the same host.
-        shared: on one host others may put it too, so that its reader hears the bus beside its own way.
+        latest_only: who looks at a run wants the newest only, and gets no more than eyes can follow.
+        direct_subscriber: who waits for it, and gets it by a way of its own from its publisher on the same host.
+        multiple_publishers: on one host others may put it too, so that its reader hears the bus beside its own way.
         optional: a recording may leave it out; what the others say of the run needs none of it.
         sentence: what it is.
     """
@@ -68,11 +70,11 @@ class Topic:
     subscribers: frozenset[Role]
     sentence: str
     simulated_only: bool = False
-    timeless: bool = True
+    deterministic: bool = True
     queryable: bool = False
-    newest_only: bool = False
-    reader: Role | None = None
-    shared: bool = False
+    latest_only: bool = False
+    direct_subscriber: Role | None = None
+    multiple_publishers: bool = False
     optional: bool = False
 
     def at(self, name: str) -> str:
@@ -103,8 +105,8 @@ FRAME = Topic(
     _CAMERA,
     _CONTROLLER | _WATCHERS,
     "Sensor image, mono16, DN; its time is the end of the exposure.",
-    newest_only=True,
-    reader=Role.CONTROLLER,
+    latest_only=True,
+    direct_subscriber=Role.CONTROLLER,
     optional=True,
 )
 CAMERA_STATE = Topic(
@@ -126,7 +128,7 @@ TIMING = Topic(
     _CONTROLLER,
     _WATCHERS,
     "How long each stage of each step took.",
-    timeless=False,
+    deterministic=False,
     optional=True,
 )
 CONTROLLER_STATE = Topic(
@@ -139,12 +141,7 @@ CONTROLLER_STATE = Topic(
     queryable=True,
 )
 REQUEST = Topic(
-    "lowfc/control/request",
-    wire.Request,
-    Rate.EVENT,
-    _CONTROLLER,
-    _WATCHERS,
-    "What an operator asked, and the answer.",
+    "lowfc/control/request", wire.Request, Rate.EVENT, _CONTROLLER, _WATCHERS, "What an operator asked, and the answer."
 )
 COMMAND = Topic(
     "lowfc/mirror/{name}/command",
@@ -153,8 +150,8 @@ COMMAND = Topic(
     _CONTROLLER,
     _MIRROR | {Role.RECORDER},
     "Where the mirror shall be.",
-    reader=Role.MIRROR,
-    shared=True,
+    direct_subscriber=Role.MIRROR,
+    multiple_publishers=True,
 )
 MIRROR_STATE = Topic(
     "lowfc/mirror/{name}/state",
@@ -163,7 +160,7 @@ MIRROR_STATE = Topic(
     _MIRROR,
     _CONTROLLER | _CAMERA | _WATCHERS,
     "Where the mirror is.",
-    newest_only=True,
+    latest_only=True,
     optional=True,
 )
 SURFACE = Topic(
@@ -173,7 +170,7 @@ SURFACE = Topic(
     _MIRROR,
     _WATCHERS,
     "The mirror's surface over the pupil, 32FC1, nm: for eyes.",
-    newest_only=True,
+    latest_only=True,
     optional=True,
 )
 TRUTH = Topic(
@@ -228,10 +225,17 @@ EVENT = Topic(
     EVERYBODY,
     EVERYBODY,
     "A named event, from the table of events.",
-    timeless=False,
+    deterministic=False,
 )
 HEALTH = Topic(
-    "lowfc/health/{name}", wire.Health, 2.0, EVERYBODY, EVERYBODY, "How a process is.", timeless=False, queryable=True
+    "lowfc/health/{name}",
+    wire.Health,
+    2.0,
+    EVERYBODY,
+    EVERYBODY,
+    "How a process is.",
+    deterministic=False,
+    queryable=True,
 )
 
 TOPICS: tuple[Topic, ...] = (
@@ -321,7 +325,7 @@ def checked_sequence(sequence: int) -> int:
     return sequence
 
 
-def floats(data: bytes, *shape: int) -> npt.NDArray[np.float32]:
+def floats(data: bytes, *shape: int) -> Single:
     """Little-endian float32 of a message, in that shape.
 
     Raises:
@@ -330,7 +334,12 @@ def floats(data: bytes, *shape: int) -> npt.NDArray[np.float32]:
     return np.frombuffer(data, dtype="<f4").reshape(shape)
 
 
-def image(array: npt.NDArray[np.uint16] | npt.NDArray[np.float32], time_ns: int, frame_id: str) -> RawImage:
+def fields_of(source: object, names: Iterable[str]) -> dict[str, Any]:
+    """Fields by their names, which are the same in a value and in its message."""
+    return {name: getattr(source, name) for name in names}
+
+
+def image(array: Pixels | Single, time_ns: int, frame_id: str) -> RawImage:
     """Message of an image (rows, columns): uint16 becomes mono16, float32 becomes 32FC1, both little-endian."""
     rows, columns = array.shape
     return RawImage(

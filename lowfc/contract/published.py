@@ -5,12 +5,12 @@ from dataclasses import dataclass, field
 
 from google.protobuf.message import DecodeError
 
-from lowfc.contract.calibration_codec import decode_calibration
-from lowfc.contract.law_codec import law_of, table_of
+from lowfc.contract.codecs.calibration_codec import decode_calibration
+from lowfc.contract.codecs.law_codec import law_of, table_of
 from lowfc.contract.messages import CALIBRATION, LAW, PLAY, Topic, wire
-from lowfc.control.additions import PlayTable
-from lowfc.control.calibration import Calibration
-from lowfc.control.linear_law import LinearLaw
+from lowfc.control.calibration.calibration import Calibration
+from lowfc.control.laws.linear_law import LinearLaw
+from lowfc.control.loop.additions import PlayTable
 
 TOPICS = (CALIBRATION, LAW, PLAY)
 

@@ -7,6 +7,7 @@ from pydantic import BaseModel, ValidationError
 from lowfc.contract import toml_text
 from lowfc.contract.configuration import MOST_FAULTS, Configuration, explain
 from lowfc.contract.errors import ConfigurationError
+from lowfc.contract.former_names import renamed_keys
 
 _SECTIONS: dict[str, type[BaseModel]] = {
     name: info.annotation
@@ -26,6 +27,7 @@ def recorded(content: bytes) -> tuple[Configuration, list[str]]:
     """
     try:
         data = toml_text.parsed(content)
+        renamed_keys(data)
     except ValueError as error:
         raise ConfigurationError(f"not a readable TOML file: {error}") from None
     remarks: list[str] = []

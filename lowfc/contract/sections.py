@@ -2,19 +2,15 @@
 
 from typing import Annotated, Any, Literal, get_args
 
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import Field, model_validator
+
+from lowfc.contract.network import Section as Section
 
 Preset = Literal["quiet", "bench", "thermal", "reaction-wheel", "step", "kolmogorov"]
 PRESETS: tuple[str, ...] = get_args(Preset)
 
 Positive = Annotated[float, Field(gt=0)]
 NotNegative = Annotated[float, Field(ge=0)]
-
-
-class Section(BaseModel):
-    """A section: unknown keys are errors, values do not change."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True, use_attribute_docstrings=True, allow_inf_nan=False)
 
 
 class Star(Section):
@@ -163,7 +159,7 @@ class Mirror(Section):
     """Largest change of an actuator per command that the mirror accepts."""
     neighbour_nm: float = Field(500.0, gt=0.01)
     """Largest difference between neighbouring actuators that the mirror accepts."""
-    expired: Literal["hold", "flat"] = "flat"
+    on_command_timeout: Literal["hold", "flat"] = "flat"
     """When the last command has expired: hold the shape, or relax to flat within the slew limit."""
     flat: str = ""
     """File (FITS or .npy) of the flat map, nm of surface, which is on the mirror from the start; empty for none."""

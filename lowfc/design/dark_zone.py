@@ -3,9 +3,8 @@
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
-Float = NDArray[np.float64]
+from lowfc.arrays import Array, Mask
 
 FINE_STEP = 0.1
 """Between the points where a mask must keep its promise."""
@@ -26,13 +25,13 @@ class DarkZone:
     half_angle_deg: float
 
 
-def fine_grid(zone: DarkZone) -> tuple[Float, NDArray[np.bool_]]:
+def fine_grid(zone: DarkZone) -> tuple[Array, Mask]:
     """Coordinates (n,) from the star outward, and where (n, n), [row = y, column = x], they are in the zone."""
     axis = _axis(FINE_STEP, zone.outer)
     return axis, _inside(zone, axis)
 
 
-def first_points(zone: DarkZone, step: float) -> Float:
+def first_points(zone: DarkZone, step: float) -> Array:
     """Points (n, 2), x and y, of a square grid in the zone and along its edges, where the field is worst."""
     axis = _axis(step, zone.outer)
     y, x = np.nonzero(_inside(zone, axis))
@@ -40,7 +39,7 @@ def first_points(zone: DarkZone, step: float) -> Float:
     return np.unique(np.round(found, 9), axis=0)
 
 
-def edge_points(zone: DarkZone, step: float) -> Float:
+def edge_points(zone: DarkZone, step: float) -> Array:
     """Points (n, 2), x and y, along the zone's edges: the inner arc, the ray, and the outer arc back."""
     reach = float(np.deg2rad(zone.half_angle_deg))
     upward = np.linspace(0.0, reach, int(np.ceil(zone.inner * reach / step)) + 1)
@@ -51,11 +50,11 @@ def edge_points(zone: DarkZone, step: float) -> Float:
     return np.column_stack([radii * np.cos(angles), radii * np.sin(angles)])
 
 
-def _axis(step: float, outer: float) -> Float:
+def _axis(step: float, outer: float) -> Array:
     return np.arange(int(np.floor(outer / step + 1e-9)) + 1, dtype=np.float64) * step
 
 
-def _inside(zone: DarkZone, axis: Float) -> NDArray[np.bool_]:
+def _inside(zone: DarkZone, axis: Array) -> Mask:
     x, y, rounding = axis, axis[:, None], 1e-9
     radius, angle_deg = np.hypot(x, y), np.rad2deg(np.arctan2(y, x))
     within = (radius >= zone.inner - rounding) & (radius <= zone.outer + rounding)

@@ -4,11 +4,10 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
-from lowfc.control.calibration import ESTIMATORS, reconstructor
+from lowfc.arrays import Array
+from lowfc.control.calibration.calibration import ESTIMATORS, reconstructor
 
-Array = NDArray[np.float64]
 Model = Callable[[Array], Array]
 """Image (pixels,), fractions of the open circle's light, of modes in nm: with exp(i phi) and not its expansion."""
 
@@ -56,7 +55,7 @@ def fit(
         read_noise_e: Of each pixel.
         kind: "pinv" weighs all pixels alike, "weighted" by the inverse variance of the flat image.
         nuisance: (pixels, extra) changes of the image that are no wavefront, in fractions per unit of each: I0 for the
-            flux, `lowfc.optics.sensor.shear_response` for the pupil's shear. They are fitted along and dropped.
+            flux, `lowfc.optics.chain.sensor.shear_response` for the pupil's shear. They are fitted along and dropped.
 
     Raises:
         ValueError: Unknown kind, or modes that this sensor cannot tell apart.
@@ -70,25 +69,18 @@ def estimate(fit: Fit, image_e: Array) -> Array:
     return np.asarray((image_e - fit.reference_e) @ fit.R.T)
 
 
-def refine(fit: Fit, image_e: Array, start_nm: Array, model: Model, iterations: int) -> Array:
-    """Modes (modes,) in nm, improved by a <- a + R (I - I_model(a)): the gain stays, the model is not linear.
+def iterated(fit: Fit, image_e: Array, model: Model, iterations: int) -> list[Array]:
+    """Estimates (modes,) in nm after none, one, ... `iterations` with the full model: a <- a + R (I - I_model(a)).
+
+    The gain stays, the model is not linear; two iterations are enough for the wavefronts of Sect. 3.1.
 
     Args:
         fit: The linear estimator.
         image_e: (pixels,) electrons.
-        start_nm: (modes,) what `estimate` gave.
         model: The sensor's image for modes in nm.
-        iterations: How many; two are enough for the wavefronts of Sect. 3.1.
+        iterations: How many.
     """
-    modes_nm = start_nm
-    for _ in range(iterations):
-        modes_nm = modes_nm + fit.R @ (image_e - fit.scale_e * model(modes_nm))
-    return modes_nm
-
-
-def iterated(fit: Fit, image_e: Array, model: Model, iterations: int) -> list[Array]:
-    """Estimates (modes,) in nm of an image after none, one, ... `iterations` with the full model."""
     found = [estimate(fit, image_e)]
     for _ in range(iterations):
-        found.append(refine(fit, image_e, found[-1], model, 1))
+        found.append(found[-1] + fit.R @ (image_e - fit.scale_e * model(found[-1])))
     return found

@@ -1,11 +1,9 @@
 """What noise leaves of an estimate: the covariance of a linear one, and the least that any unbiased one can have."""
 
 import numpy as np
-from numpy.typing import NDArray
 
-from lowfc.control.calibration import SINGULAR, condition_number
-
-Array = NDArray[np.float64]
+from lowfc.arrays import Array
+from lowfc.control.calibration.calibration import SINGULAR, condition_number
 
 
 def variance_e(reference_e: Array, read_noise_e: float) -> Array:

@@ -1,17 +1,16 @@
 """Linear programs of the kind that a shaped pupil is, each begun where a similar one ended."""
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.optimize import linprog
 
-Float = NDArray[np.float64]
+from lowfc.arrays import Array
 
 
 class NotSolvedError(ValueError):
     """The solver gave up."""
 
 
-def maximise(rows: Float, weights: Float, multipliers: Float) -> tuple[Float, Float, float]:
+def maximise(rows: Array, weights: Array, multipliers: Array) -> tuple[Array, Array, float]:
     """The x in [0, 1] of the largest weights @ x with rows @ x <= 0, by HiGHS' dual simplex.
 
     scipy takes no starting basis. A row with a multiplier is therefore given a slack of its own, and is added to the

@@ -1,6 +1,6 @@
 """The paper's conditions and results that both the tables and the search for better masks need (Sects. 2 and 3)."""
 
-from lowfc.optics.photometry import Photometry
+from lowfc.optics.detector.photometry import Photometry
 
 MODES = (14, 20)
 """Numbers of modes of the two columns of Table 3: radial degrees up to 4 and up to 5."""

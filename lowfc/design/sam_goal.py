@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 
-from lowfc.control.calibration import ESTIMATORS
+from lowfc.control.calibration.calibration import ESTIMATORS
 from lowfc.design.paper import MODES, TABLE3_WAVES, TABLE4_MAS, TABLE4_MODES
 from lowfc.design.sam_merit import (
     Optics,

@@ -13,7 +13,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from lowfc.control.calibration import ESTIMATORS, condition_number
+from lowfc.arrays import Array, Complex
+from lowfc.control.calibration.calibration import ESTIMATORS, condition_number
 from lowfc.design.paper import (
     PEAK_E,
     STAR,
@@ -22,14 +23,13 @@ from lowfc.design.paper import (
     TABLE4_READ_NOISE_E,
 )
 from lowfc.design.trials import expected_rms, gram
-from lowfc.optics.band import Band, uniform
-from lowfc.optics.focal_mask import bowtie, disk
-from lowfc.optics.fourier import Field, kernel, to_image, to_pupil
-from lowfc.optics.grid import OPEN_AREA, pupil_axis
-from lowfc.optics.photometry import electrons, tilt_nm_per_mas
-from lowfc.optics.zernike import NOLLS_20, zernikes
+from lowfc.optics.chain.band import Band, uniform
+from lowfc.optics.chain.focal_mask import bowtie, disk
+from lowfc.optics.chain.fourier import kernel, to_image, to_pupil
+from lowfc.optics.chain.grid import OPEN_AREA, pupil_axis
+from lowfc.optics.chain.zernike import NOLLS_20, zernikes
+from lowfc.optics.detector.photometry import electrons, tilt_nm_per_mas
 
-Array = NDArray[np.float64]
 Single = NDArray[np.complex64]
 Hole = tuple[float, float, float]
 
@@ -260,7 +260,7 @@ def throughput(seen: Signal) -> float:
     return float(seen.I0.sum()) * seen.pixels_per_sample
 
 
-def _relay(amplitude: Field, focal_mask: str, samples: int, scale: float) -> Field:
+def _relay(amplitude: Complex, focal_mask: str, samples: int, scale: float) -> Complex:
     mask = FOCAL_MASKS[focal_mask](FOCAL_SAMPLES_PER)
     focal = to_image(amplitude, len(mask), FOCAL_SAMPLES_PER, scale)
     return to_pupil(focal * mask, samples, FOCAL_SAMPLES_PER, scale)

@@ -15,14 +15,13 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import maximum_filter
 
+from lowfc.arrays import Array, Mask, Whole
 from lowfc.design.dark_zone import FINE_STEP, DarkZone, edge_points, fine_grid, first_points
 from lowfc.design.linear_program import maximise
-from lowfc.optics.focal_mask import disk
-from lowfc.optics.fourier import to_image
-from lowfc.optics.grid import OPEN_AREA, SAMPLES, pupil_axis
-from lowfc.optics.pupil import circle, from_quarter
-
-Float = NDArray[np.float64]
+from lowfc.optics.chain.focal_mask import disk
+from lowfc.optics.chain.fourier import to_image
+from lowfc.optics.chain.grid import OPEN_AREA, SAMPLES, pupil_axis
+from lowfc.optics.chain.pupil import circle, from_quarter
 
 FOCAL_MASK_RADIUS = 4.0
 """Of the disk whose share of the light is reported, in lambda / D (Sect. 2.1)."""
@@ -38,18 +37,18 @@ COARSEST_CELLS = 32
 
 @dataclass(frozen=True)
 class Request:
-    """What is asked of a shaped pupil; angles from the star in lambda / D.
+    """What is asked of a shaped pupil: the options of `lowfc design spc`.
 
     Attributes:
-        inner: Where the dark zone begins.
-        outer: Where it ends.
-        half_angle_deg: The zone lies within this angle of the x axis, on both sides; 90 is the full annulus.
-        contrast: The largest intensity in the zone over the one at the star, every `FINE_STEP` and on the edges.
-        limit: The programs' contrast over the promised one; below 1 the exchange ends sooner.
-        cells: Across half the diameter, a divisor of 256.
-        step: Of the first grid of points.
-        symmetry: "quarter" about both axes, "octant" about both diagonals too (the zone then has them as well).
-        rounds: Programs to be solved at most with each number of cells.
+        inner: Where the dark zone begins, in lambda/D.
+        outer: Where it ends, in lambda/D.
+        half_angle_deg: Degrees from the x axis, on both sides, within which it lies; 90: all around.
+        contrast: Largest intensity in it, over the star's; kept every 0.1 lambda/D and on its edges.
+        limit: Contrast in the linear programs, over the one promised; below 1 they end sooner.
+        cells: In half the diameter: 8, 16, 32, 64, 128 or 256.
+        step: Of the first grid of points, in lambda/D.
+        symmetry: quarter: about both axes; octant: about the diagonals too, as the zone then is, four times as fast.
+        rounds: Programs at most, with each number of cells on the way.
     """
 
     inner: float = 4.0
@@ -107,7 +106,7 @@ class Round:
 
     number: int
     points: int
-    quarter: Float
+    quarter: Array
     open_area: float
     bound: float
     contrast: float
@@ -170,7 +169,7 @@ def exchange(request: Request) -> Iterator[Round]:
             points, signs, multipliers = points[kept], signs[kept], multipliers[kept]
 
 
-def relative_field(quarter: Float, axis: Float) -> Float:
+def relative_field(quarter: Array, axis: Array) -> Array:
     """Field E / E(0) of a mask at all pairs of coordinates, [row = y, column = x].
 
     Args:
@@ -181,7 +180,7 @@ def relative_field(quarter: Float, axis: Float) -> Float:
     return np.asarray(waves @ quarter @ waves.T / quarter.sum())
 
 
-def largest_contrast(quarter: Float, request: Request) -> float:
+def largest_contrast(quarter: Array, request: Request) -> float:
     """Of a mask, on the fine grid of the dark zone and on its edges."""
     axis, zone = fine_grid(request.zone)
     on_grid = relative_field(quarter, axis)[zone]
@@ -189,7 +188,7 @@ def largest_contrast(quarter: Float, request: Request) -> float:
     return float(max(np.abs(on_grid).max(), np.abs(on_edge).max()) ** 2)
 
 
-def figures(quarter: Float, request: Request) -> Figures:
+def figures(quarter: Array, request: Request) -> Figures:
     """What a mask does in the dark zone of a request."""
     axis, zone = fine_grid(request.zone)
     contrast = relative_field(quarter, axis)[zone] ** 2
@@ -208,7 +207,7 @@ def figures(quarter: Float, request: Request) -> Figures:
     )
 
 
-def stored(quarter: Float, request: Request) -> NDArray[np.floating]:
+def stored(quarter: Array, request: Request) -> NDArray[np.floating]:
     """The mask in the shortest floating-point type in which it keeps the promise."""
     for kind in (np.float16, np.float32):
         short: NDArray[np.floating] = quarter.astype(kind)
@@ -259,7 +258,7 @@ def _levels(request: Request) -> list[int]:
     return [*coarser, finest]
 
 
-def _variables(cells: int, symmetry: str) -> tuple[NDArray[np.intp], NDArray[np.intp], Float]:
+def _variables(cells: int, symmetry: str) -> tuple[Whole, Whole, Array]:
     """Indices y and x (n,) of the cells that stand for themselves and their mirror images, and how many those are."""
     y, x = np.nonzero(_circle_quarter(cells))
     if symmetry == "quarter":
@@ -269,7 +268,7 @@ def _variables(cells: int, symmetry: str) -> tuple[NDArray[np.intp], NDArray[np.
     return y, x, np.where(y == x, 1.0, 2.0)
 
 
-def _rows(points: Float, signs: Float, cells: int, symmetry: str) -> Float:
+def _rows(points: Array, signs: Array, cells: int, symmetry: str) -> Array:
     """Field (points, n) at points, with a sign, of each variable; a cell adds 1 to E(0)."""
     y, x, weights = _variables(cells, symmetry)
     along_x, along_y = (_waves(points[:, k], cells) for k in (0, 1))
@@ -279,19 +278,19 @@ def _rows(points: Float, signs: Float, cells: int, symmetry: str) -> Float:
     return np.asarray(signs[:, None] * rows)
 
 
-def _waves(axis: Float, cells: int) -> Float:
+def _waves(axis: Array, cells: int) -> Array:
     """Kernel (n, cells) from a half-axis of cells, mirrored, to the image: the mean over each cell's samples."""
     u = pupil_axis(SAMPLES)[SAMPLES // 2 :]
     return np.asarray(np.cos(2.0 * np.pi * np.outer(axis, u)).reshape(axis.size, cells, -1).mean(axis=2))
 
 
-def _field_at(quarter: Float, points: Float) -> Float:
+def _field_at(quarter: Array, points: Array) -> Array:
     """Field E / E(0) of a mask (n,) at points (n, 2)."""
     along_x, along_y = (_waves(points[:, k], len(quarter)) for k in (0, 1))
     return np.asarray(((along_y @ quarter) * along_x).sum(axis=1) / quarter.sum())
 
 
-def _maxima(quarter: Float, request: Request, level: float) -> tuple[Float, Float]:
+def _maxima(quarter: Array, request: Request, level: float) -> tuple[Array, Array]:
     """Where the field's absolute value has maxima above a level, points (n, 2), and its signs (n,) there."""
     axis, zone = fine_grid(request.zone)
     field = np.where(zone, relative_field(quarter, axis), 0.0)
@@ -303,14 +302,14 @@ def _maxima(quarter: Float, request: Request, level: float) -> tuple[Float, Floa
     return points, np.sign(np.concatenate([field[y, x], on_edge[peaks]]))
 
 
-def _peaks(field: Float, level: float) -> NDArray[np.bool_]:
+def _peaks(field: Array, level: float) -> Mask:
     size = np.abs(field)
     return np.asarray((size > level) & (size >= maximum_filter(size, 3)))
 
 
-def _circle_quarter(cells: int) -> NDArray[np.bool_]:
+def _circle_quarter(cells: int) -> Mask:
     return circle(2 * cells)[cells:, cells:] > 0
 
 
-def _open_area(quarter: Float) -> float:
+def _open_area(quarter: Array) -> float:
     return float(quarter.mean() / OPEN_AREA)

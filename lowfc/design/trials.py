@@ -3,11 +3,10 @@
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-from lowfc.optics.zernike import noll_to_nm
-
-Array = NDArray[np.float64]
+from lowfc.arrays import Array
+from lowfc.optics.chain.zernike import noll_to_nm
 
 LITERAL_WAVES = (0.04, 0.016)
 """Bounds of Sect. 3.1 for radial degrees 1 and 2, and above; read as uniform between minus and plus these."""

@@ -1,6 +1,6 @@
 """A clock that moves by hand only."""
 
-from lowfc.adapters.clock import SIMULATED_START_NS
+from lowfc.adapters.process.clock import SIMULATED_START_NS
 
 _NS = 1_000_000_000
 

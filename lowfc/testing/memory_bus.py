@@ -6,9 +6,9 @@ from collections import deque
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 
-from lowfc.adapters.bus import ALL, Faults, Query, Sample
-from lowfc.adapters.clock import Clock
-from lowfc.adapters.clock_offset import ClockOffset
+from lowfc.adapters.bus.bus import ALL, Faults, Query, Sample
+from lowfc.adapters.process.clock import Clock
+from lowfc.adapters.process.clock_offset import ClockOffset
 from lowfc.contract.envelope import Envelope, sequence_of
 from lowfc.contract.errors import BusError
 from lowfc.contract.messages import Topic

@@ -11,14 +11,14 @@ import pytest
 import zenoh
 from typer.testing import CliRunner
 
-from lowfc.adapters.access import CLOCK_KEY, ROUTER, access_control, grant, roles
-from lowfc.adapters.bus import Sample
-from lowfc.adapters.clock import HostClock
-from lowfc.adapters.clock_offset import RECENT, ClockOffset
-from lowfc.adapters.run import free_ports, open_run
-from lowfc.adapters.service import Service
-from lowfc.adapters.zenoh_bus import ZenohBus
-from lowfc.adapters.zenoh_session import session_config
+from lowfc.adapters.bus.access import CLOCK_KEY, ROUTER, access_control, grant, roles
+from lowfc.adapters.bus.bus import Sample
+from lowfc.adapters.bus.run import free_ports, open_run
+from lowfc.adapters.bus.zenoh_bus import ZenohBus
+from lowfc.adapters.bus.zenoh_session import session_config
+from lowfc.adapters.process.clock import HostClock
+from lowfc.adapters.process.clock_offset import RECENT, ClockOffset
+from lowfc.adapters.process.service import Service
 from lowfc.contract.configuration import Network
 from lowfc.contract.errors import BusError, DataFileError
 from lowfc.contract.messages import (
@@ -34,9 +34,9 @@ from lowfc.contract.messages import (
     Role,
     Topic,
 )
-from lowfc.programs.cli import app
+from lowfc.programs.cli.main import app
 
-certificates = pytest.importorskip("lowfc.adapters.certificates", reason="needs the package cryptography")
+certificates = pytest.importorskip("lowfc.adapters.bus.certificates", reason="needs the package cryptography")
 ROLES = roles(["mirror-dm"])
 
 
@@ -302,7 +302,7 @@ def test_a_router_that_cannot_be_found_is_not_waited_for(hosts: Hosts, monkeypat
     def unknown(*_: object) -> None:
         raise socket.gaierror(socket.EAI_NONAME, "Name or service not known")
 
-    monkeypatch.setattr("lowfc.adapters.routed.socket.create_connection", unknown)
+    monkeypatch.setattr("lowfc.adapters.bus.routed.socket.create_connection", unknown)
     with pytest.raises(BusError, match=r"nowhere\.invalid.*cannot be reached .*resolve it"):
         hosts.join("camera", network=hosts.network(host="nowhere.invalid"))
 
@@ -313,13 +313,13 @@ def test_a_session_that_zenoh_refuses_is_not_waited_for(hosts: Hosts, monkeypatc
     def refuse(config: object) -> None:
         raise zenoh.ZError("this and that")
 
-    monkeypatch.setattr("lowfc.adapters.routed.zenoh.open", refuse)
+    monkeypatch.setattr("lowfc.adapters.bus.routed.zenoh.open", refuse)
     with pytest.raises(BusError, match="takes camera's certificate, and zenoh opens no session: this and that"):
         hosts.join("camera")
 
 
 def test_a_role_does_not_pass_for_the_router(hosts: Hosts, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("lowfc.adapters.zenoh_bus.require_certificate", lambda *_: None)  # as in a router of theirs
+    monkeypatch.setattr("lowfc.adapters.bus.zenoh_bus.require_certificate", lambda *_: None)  # as in a router of theirs
     folder = hosts.folder / "false"
     folder.mkdir()
     for name, source in (("ca.pem", "ca.pem"), ("router.pem", "camera.pem"), ("router.key", "camera.key")):

@@ -4,13 +4,14 @@ import os
 import signal
 import subprocess
 import sys
-import time
-from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 
-from lowfc.adapters.child import Child
+from lowfc.adapters.process.child import Child
+from tests.support.loops import until
+
+pytestmark = pytest.mark.exclusive
 
 PATIENCE_S = 30.0
 
@@ -18,20 +19,13 @@ PATIENCE_S = 30.0
 PARENT = """
 import signal, sys, time
 from pathlib import Path
-from lowfc.adapters.child import Child
+from lowfc.adapters.process.child import Child
 program = "import signal, time; signal.signal(signal.SIGTERM, signal.SIG_IGN); print(1, flush=True); time.sleep(600)"
-child = Child("one", [sys.executable, "-c", program], Path(sys.argv[1]), when_we_die=signal.SIGKILL)
+child = Child("one", [sys.executable, "-c", program], Path(sys.argv[1]), death_signal=signal.SIGKILL)
 child.start()
 print(child.process.pid, flush=True)
 time.sleep(600)
 """
-
-
-def until(met: Callable[[], object]) -> None:
-    deadline_s = time.monotonic() + PATIENCE_S
-    while not met():
-        assert time.monotonic() < deadline_s
-        time.sleep(0.01)
 
 
 def command_line(pid: int) -> bytes:
@@ -58,7 +52,7 @@ def test_a_child_is_the_program_itself_in_a_session_of_its_own(tmp_path: Path) -
     child.start()
     assert child.process is not None
     child.process.wait(PATIENCE_S)
-    assert (child.status, child.last_words()) == (0, repr((child.process.pid, child.process.pid, "heard")))
+    assert (child.status, child.stderr_tail()) == (0, repr((child.process.pid, child.process.pid, "heard")))
     child.stop(PATIENCE_S)
 
 

@@ -5,14 +5,19 @@ from pathlib import Path
 
 import pytest
 
-from lowfc.adapters.clock import SIMULATED_START_NS, HostClock, SimulatedClock, boot_offset_ns
-from lowfc.adapters.run import write_once
+from lowfc.adapters.bus.run import write_once
+from lowfc.adapters.process.clock import SIMULATED_START_NS, HostClock, SimulatedClock, boot_offset_ns
 from lowfc.contract.errors import DataFileError
 from lowfc.testing.clock import FakeClock
 
+pytestmark = pytest.mark.exclusive
+
 
 def test_all_processes_of_a_boot_have_one_offset(tmp_path: Path) -> None:
-    ask = f"from lowfc.adapters.clock import *; import pathlib; print(boot_offset_ns(pathlib.Path({str(tmp_path)!r})))"
+    ask = (
+        "from lowfc.adapters.process.clock import *; import pathlib; "
+        f"print(boot_offset_ns(pathlib.Path({str(tmp_path)!r})))"
+    )
     asked = [subprocess.Popen([sys.executable, "-c", ask], stdout=subprocess.PIPE, text=True) for _ in range(4)]
     answers = {process.communicate()[0] for process in asked}
     assert answers == {f"{boot_offset_ns(tmp_path)}\n"}
@@ -37,7 +42,7 @@ def test_it_knows_how_far_it_is_from_the_wall_clock(tmp_path: Path) -> None:
     file.write_text(str(clock.offset_ns - 3600 * 10**9))  # as fixed before NTP was there
     late = HostClock(tmp_path)
     assert abs(late.ahead_ns() + 3600 * 10**9) < 1_000_000_000
-    assert abs(SimulatedClock(host=late).ahead_ns() + 3600 * 10**9) < 1_000_000_000
+    assert abs(SimulatedClock(base=tmp_path).ahead_ns() + 3600 * 10**9) < 1_000_000_000
 
 
 def test_sleep_ends_after_its_deadline_and_not_before(tmp_path: Path) -> None:
@@ -63,7 +68,7 @@ def test_what_is_written_once_stays(tmp_path: Path) -> None:
 
 def test_simulated_time_moves_by_hand_and_host_time_by_itself(tmp_path: Path) -> None:
     host = HostClock(tmp_path)
-    clock = SimulatedClock(host=host)
+    clock = SimulatedClock(base=tmp_path)
     assert (clock.now_ns(), clock.start_s, clock.lockstep) == (SIMULATED_START_NS, SIMULATED_START_NS // 10**9, True)
     clock.set_ns(SIMULATED_START_NS + 7)
     clock.sleep_until_ns(SIMULATED_START_NS + 9)

@@ -6,8 +6,8 @@ from importlib import metadata
 import pytest
 import zenoh
 
-from lowfc.adapters.extras import install_advice
-from lowfc.adapters.zenoh_fault import plain
+from lowfc.adapters.bus.zenoh_fault import plain
+from lowfc.adapters.process.extras import install_advice
 
 EDITABLE = {"dir_info": {"editable": True}, "url": "file:///home/a%20b/lowfc"}
 WHEEL = {"archive_info": {}, "url": "file:///dist/lowfc-0.2.0-py3-none-any.whl"}

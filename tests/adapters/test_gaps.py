@@ -1,6 +1,6 @@
 import numpy as np
 
-from lowfc.adapters.gaps import REMEMBERED, Gaps
+from lowfc.adapters.logs.sequence_gaps import REMEMBERED, Gaps
 
 
 def test_a_gap_is_closed_by_a_late_message_and_by_no_repeated_one() -> None:

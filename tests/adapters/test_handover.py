@@ -5,13 +5,17 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 
-from lowfc.adapters.bus import Sample
-from lowfc.adapters.clock import HostClock
-from lowfc.adapters.handover import LONG_AGO_NS, Handover
-from lowfc.adapters.run import open_run
-from lowfc.adapters.zenoh_bus import ZenohBus
+import pytest
+
+from lowfc.adapters.bus.bus import Sample
+from lowfc.adapters.bus.dispatch import LONG_AGO_NS, Handover
+from lowfc.adapters.bus.run import open_run
+from lowfc.adapters.bus.zenoh_bus import ZenohBus
+from lowfc.adapters.process.clock import HostClock
 from lowfc.contract.envelope import count_of, sequence_of
 from lowfc.contract.messages import FRAME
+
+pytestmark = pytest.mark.exclusive
 
 PATIENCE_S = 30.0
 
@@ -25,9 +29,9 @@ class Bench:
     def __init__(self, period_ns: int | None = PERIOD_NS, *, told: bool = False) -> None:
         self.now_ns, self.work_ns = 10**9, 100_000
         self.handled: list[int] = []
-        self.overtaken: list[int] = []
-        overtaken = self._hear(self.overtaken) if told else None
-        self.handover = Handover(FRAME.key, self._hear(self.handled), lambda: self.now_ns, period_ns, overtaken)
+        self.superseded: list[int] = []
+        superseded = self._hear(self.superseded) if told else None
+        self.handover = Handover(FRAME.key, self._hear(self.handled), lambda: self.now_ns, period_ns, superseded)
 
     def _hear(self, where: list[int]) -> Callable[[Sample], None]:
         def hear(sample: Sample) -> None:
@@ -50,11 +54,11 @@ def test_of_what_waited_only_the_newest_is_as_good_as_ever() -> None:
     bench.now_ns = begun_ns + 10 * PERIOD_NS + 1000
     for count in range(1, 11):
         bench.come(count, begun_ns + count * PERIOD_NS)
-    assert (bench.handled, bench.overtaken) == ([0, 10], list(range(1, 10)))
+    assert (bench.handled, bench.superseded) == ([0, 10], list(range(1, 10)))
     assert (bench.handover.received, bench.handover.skipped, bench.handover.missing) == (11, 0, 0)
 
 
-def test_who_does_not_want_what_was_overtaken_skips_it() -> None:
+def test_who_does_not_want_what_was_superseded_skips_it() -> None:
     bench = Bench()
     begun_ns = bench.now_ns + 10**8
     bench.now_ns = begun_ns + 9 * PERIOD_NS + PERIOD_NS // 2
@@ -64,7 +68,7 @@ def test_who_does_not_want_what_was_overtaken_skips_it() -> None:
     assert bench.handled == [9]
 
 
-def test_an_old_message_alone_was_overtaken_too() -> None:
+def test_an_old_message_alone_was_superseded_too() -> None:
     bench = Bench()
     bench.come(0, bench.now_ns + 10**8)
     bench.now_ns += 10**9
@@ -74,7 +78,7 @@ def test_an_old_message_alone_was_overtaken_too() -> None:
     assert bench.handled == [0, 2]
 
 
-def test_where_each_waits_for_the_last_nothing_is_overtaken() -> None:
+def test_where_each_waits_for_the_last_nothing_is_superseded() -> None:
     bench = Bench(None)
     for count in range(50):
         bench.come(count, 0)
@@ -94,7 +98,7 @@ def test_a_slow_handler_is_never_far_behind() -> None:
             behind.append((bench.now_ns - bench.work_ns - put_ns) / PERIOD_NS)
     assert max(behind) < 5
     assert len(bench.handled) > 5
-    assert len(bench.handled) + len(bench.overtaken) + bench.handover.skipped == bench.handover.received == 500
+    assert len(bench.handled) + len(bench.superseded) + bench.handover.skipped == bench.handover.received == 500
 
 
 def test_frames_faster_than_their_handler_are_skipped_on_the_real_bus(tmp_path: Path) -> None:

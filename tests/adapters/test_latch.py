@@ -1,27 +1,17 @@
 """The latch of safe mode: two places that fail apart, no exception, no delay."""
 
 import os
-import threading
-from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 
-from lowfc.adapters import latch as latch_module
-from lowfc.adapters.latch import Latch, latch_files
-from lowfc.adapters.run import open_run
+from lowfc.adapters.bus.run import open_run
+from lowfc.adapters.process import latch as latch_module
+from lowfc.adapters.process.latch import Latch, latch_files
 from lowfc.contract.messages import Role
+from tests.support.loops import until
 
-PATIENCE_S = 10.0
-
-
-def until(met: Callable[[], bool]) -> None:
-    waiting = threading.Event()
-    for _ in range(round(PATIENCE_S / 0.005)):
-        if met():
-            return
-        waiting.wait(0.005)
-    raise AssertionError("waited in vain")
+pytestmark = pytest.mark.exclusive
 
 
 @pytest.fixture

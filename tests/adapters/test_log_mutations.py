@@ -6,11 +6,11 @@ from pathlib import Path
 
 import pytest
 from mcap.writer import MCAP0_MAGIC as MAGIC
-from mutated_logs import MISPLACED, MUTATIONS, boundaries, identity, mutations, small_log, small_samples
 
-from lowfc.adapters.log_reader import Logged, LogReader
-from lowfc.adapters.log_records import LogFile
+from lowfc.adapters.logs.reader import Logged, LogReader
+from lowfc.adapters.logs.records import LogFile
 from lowfc.contract.errors import DataFileError
+from tests.support.mutated_logs import MISPLACED, MUTATIONS, boundaries, identity, mutations, small_log, small_samples
 
 Message = tuple[str, bytes, int, int, int]
 SENT: list[Message] = identity(small_samples())

@@ -1,11 +1,13 @@
 import pytest
 
-from lowfc.adapters.bus import Query, Sample, name_in
+from lowfc.adapters.bus.bus import Query, Sample, name_in
 from lowfc.contract.envelope import Envelope, count_of, sequence_of, start_of
 from lowfc.contract.errors import BadMessageError, BusError
 from lowfc.contract.messages import CALIBRATION, CAMERA_STATE, COMMAND, FRAME, HEALTH
 from lowfc.testing.clock import FakeClock
 from lowfc.testing.memory_bus import MemoryBus, MemoryHub
+
+pytestmark = pytest.mark.exclusive
 
 
 def test_an_envelope_is_16_little_endian_bytes() -> None:

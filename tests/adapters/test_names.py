@@ -4,17 +4,19 @@ from collections.abc import Callable
 
 import pytest
 
-from lowfc.adapters.bus import Sample
-from lowfc.adapters.ledger import MOST_STARTS, Ledger
-from lowfc.adapters.names import LARGEST_HEALTH_BYTES, LONGEST_NAME, MOST_NAMES, Names
-from lowfc.adapters.service import Service
+from lowfc.adapters.bus.bus import Sample
+from lowfc.adapters.bus.names import LARGEST_HEALTH_BYTES, LONGEST_NAME, MOST_NAMES, Names
+from lowfc.adapters.logs.loss_account import MOST_STARTS, LossAccount
+from lowfc.adapters.process.service import Service
 from lowfc.contract.envelope import sequence_of
 from lowfc.contract.errors import BadMessageError
 from lowfc.contract.messages import COMMAND, EVENT, FRAME, HEALTH, MIRROR_STATE, Log, Role, topic_of, wire
-from lowfc.programs.view.moment import Gatherer
-from lowfc.programs.watch import Watch
+from lowfc.programs.launch.watch import Watch
+from lowfc.programs.view.snapshot import Accumulator
 from lowfc.testing.clock import FakeClock
 from lowfc.testing.memory_bus import MemoryBus, MemoryHub
+
+pytestmark = pytest.mark.exclusive
 
 FORGED = 1000
 
@@ -99,13 +101,13 @@ def test_a_process_that_returns_under_many_numbers_is_remembered_once(hub: Memor
 
 
 def test_a_launcher_and_a_view_are_not_filled_either(hub: MemoryHub) -> None:
-    watch, view = Watch({}, []), Gatherer()
+    watch, view = Watch({}, []), Accumulator()
     launcher = MemoryBus(hub, "launcher", FakeClock())
     launcher.subscribe(HEALTH, watch.hear)
     for number in range(FORGED):
-        view.take(HEALTH, HEALTH.at(f"forged-{number}"), health(number), 1, 1)
+        view.add(HEALTH, HEALTH.at(f"forged-{number}"), health(number), 1, 1)
         launcher.publisher(HEALTH, f"forged-{number}").put(health(number))
-    assert len(watch.health) == len(view.moment(1).health) == MOST_NAMES
+    assert len(watch.health) == len(view.snapshot(1).health) == MOST_NAMES
     assert view.unreadable == launcher.faults.unreadable[HEALTH.at("*")][0] == FORGED - MOST_NAMES
 
 
@@ -114,7 +116,7 @@ def entry(start_s: int, count: int, payload: bytes = b"") -> Sample:
 
 
 def test_the_ledger_keeps_the_newest_starts_apart_and_the_sum_of_all() -> None:
-    ledger = Ledger()
+    ledger = LossAccount()
     for start_s in range(FORGED):
         ledger.enter(FRAME, entry(start_s, 0), recorded=True)
         ledger.enter(FRAME, entry(start_s, 3), recorded=start_s != 5)  # 1 and 2 are missing, in one 3 too
@@ -128,7 +130,7 @@ def test_the_ledger_keeps_the_newest_starts_apart_and_the_sum_of_all() -> None:
 
 
 def test_the_ledger_takes_no_number_of_names_from_messages() -> None:
-    ledger = Ledger()
+    ledger = LossAccount()
     for number in range(FORGED):
         ledger.enter(EVENT, entry(1, 0, Log(name=f"forged-{number}").SerializeToString()), recorded=True)
     forged = wire.Health(process="controller", state="stopped")

@@ -8,7 +8,9 @@ import sys
 
 import pytest
 
-from lowfc.adapters.realtime import spread
+from lowfc.adapters.process.realtime import spread
+
+pytestmark = pytest.mark.exclusive
 
 LATENCY_DEVICE = "/dev/cpu_dma_latency"
 REPORT = """
@@ -16,7 +18,7 @@ import gc, json, os, sys
 import numpy
 from threadpoolctl import threadpool_info
 {limits}
-from lowfc.adapters.realtime import set_up, step_back
+from lowfc.adapters.process.realtime import set_up, step_back
 granted = {call}
 print(json.dumps({{
     "granted": granted.granted, "refused": granted.refused,
@@ -39,8 +41,8 @@ assert ctypes.CDLL(None).capset(version_3, no_capabilities) == 0
 """
 
 NO_DEVICE = """
-import lowfc.adapters.realtime
-lowfc.adapters.realtime._LATENCY_DEVICE = "/there/is/none"
+import lowfc.adapters.process.realtime
+lowfc.adapters.process.realtime._LATENCY_DEVICE = "/there/is/none"
 """
 
 
@@ -52,7 +54,7 @@ def report(call: str, limits: str = "") -> dict[str, object]:
 
 
 def test_the_interpreter_is_quiet_and_nothing_unasked_is_changed() -> None:
-    found = report("set_up(None, None, lock_memory=False, stay_awake=False)")
+    found = report("set_up(None, None, lock_memory=False, disable_cpu_idle=False)")
     assert found["granted"] == ["memory kept", "one BLAS thread", "garbage collector off", "timer slack 1 ns"]
     assert found["refused"] == []
     assert (found["policy"], found["cpus"]) == (os.SCHED_OTHER, sorted(os.sched_getaffinity(0)))
@@ -62,7 +64,7 @@ def test_the_interpreter_is_quiet_and_nothing_unasked_is_changed() -> None:
 
 
 def test_what_the_host_refuses_is_named_with_its_cost() -> None:
-    found = report("set_up(50, {4096}, lock_memory=True, stay_awake=True)", UNPRIVILEGED + NO_DEVICE)
+    found = report("set_up(50, {4096}, lock_memory=True, disable_cpu_idle=True)", UNPRIVILEGED + NO_DEVICE)
     measures = [measure for measure, _ in found["refused"]]
     assert [measure.split(" (")[0] for measure in measures] == [
         "processors [4096]",
@@ -84,7 +86,7 @@ def may_be_real_time() -> bool:
 @pytest.mark.skipif(not may_be_real_time(), reason="this user may not have SCHED_FIFO")
 def test_a_host_that_allows_it_grants_real_time() -> None:
     cpu = min(os.sched_getaffinity(0))
-    found = report(f"set_up(10, {{{cpu}}}, lock_memory=False, stay_awake=False)")
+    found = report(f"set_up(10, {{{cpu}}}, lock_memory=False, disable_cpu_idle=False)")
     if found["refused"]:  # a container's root may not have CAP_SYS_NICE
         pytest.skip(str(found["refused"]))
     assert (found["policy"], found["priority"], found["cpus"]) == (os.SCHED_FIFO, 10, [cpu])
@@ -93,7 +95,7 @@ def test_a_host_that_allows_it_grants_real_time() -> None:
 
 @pytest.mark.skipif(not os.access(LATENCY_DEVICE, os.W_OK), reason="this user may not keep processors awake")
 def test_processors_are_kept_awake_as_long_as_the_process_lives() -> None:
-    twice = "[set_up(None, None, lock_memory=False, stay_awake=True) for _ in range(2)][-1]"
+    twice = "[set_up(None, None, lock_memory=False, disable_cpu_idle=True) for _ in range(2)][-1]"
     found = report(twice)
     assert (found["granted"][-1], found["open"].count(LATENCY_DEVICE)) == ("processors awake", 1)
 

@@ -14,12 +14,14 @@ from mcap.records import Chunk
 from mcap.stream_reader import StreamReader
 from mcap.writer import MCAP0_MAGIC as MAGIC
 from mcap.writer import CompressionType, Writer
-from mutated_logs import ATTACHMENTS, METADATA, boundaries, identity, small_log, small_samples
 
-from lowfc.adapters.log_reader import LogReader
-from lowfc.adapters.log_recovery import recover
+from lowfc.adapters.logs.reader import LogReader
+from lowfc.adapters.logs.recovery import recover
 from lowfc.contract.errors import DataFileError
-from lowfc.programs.log.survey import survey
+from lowfc.programs.logs.survey import survey
+from tests.support.mutated_logs import ATTACHMENTS, METADATA, boundaries, identity, small_log, small_samples
+
+pytestmark = pytest.mark.exclusive
 
 SENT = sorted(identity(small_samples()))
 

@@ -7,13 +7,15 @@ from pathlib import Path
 import pytest
 from typer.testing import CliRunner
 
-from lowfc.adapters.bus import ALL, Query
-from lowfc.adapters.clock import HostClock
-from lowfc.adapters.run import Run, free_ports, mirror_role, new_run_id, open_run, own_directory, runtime_base
-from lowfc.adapters.zenoh_bus import ZenohBus
+from lowfc.adapters.bus.bus import ALL, Query
+from lowfc.adapters.bus.run import Run, free_ports, mirror_role, new_run_id, open_run, own_directory, runtime_base
+from lowfc.adapters.bus.zenoh_bus import ZenohBus
+from lowfc.adapters.process.clock import HostClock
 from lowfc.contract.errors import BusError, DataFileError
 from lowfc.contract.messages import REQUEST_KEY, wire
-from lowfc.programs.cli import app
+from lowfc.programs.cli.main import app
+
+pytestmark = pytest.mark.exclusive
 
 
 @pytest.fixture(autouse=True)
@@ -35,7 +37,7 @@ def test_a_run_has_ports_a_secret_and_closed_doors() -> None:
 
 
 def test_all_who_open_a_run_at_once_get_the_same(tmp_path: Path) -> None:
-    ask = "import lowfc.adapters.run as r; l = r.open_run('one').links; print(sorted(l.ports.items()), l.secret)"
+    ask = "import lowfc.adapters.bus.run as r; l = r.open_run('one').links; print(sorted(l.ports.items()), l.secret)"
     asked = [subprocess.Popen([sys.executable, "-c", ask], stdout=subprocess.PIPE, text=True) for _ in range(5)]
     assert len({process.communicate()[0] for process in asked}) == 1
     assert [path.name for path in (tmp_path / "lowfc").iterdir()] == ["one"]

@@ -7,11 +7,13 @@ import threading
 import pytest
 
 from lowfc import __version__
-from lowfc.adapters.realtime import Granted
-from lowfc.adapters.service import HEALTH_PERIOD_NS, WAITING_NS, Service
+from lowfc.adapters.process.realtime import Granted
+from lowfc.adapters.process.service import HEALTH_PERIOD_NS, WAITING_NS, Service
 from lowfc.contract.messages import COMMAND, EVENT, FRAME, HEALTH, Log, from_timestamp, wire
 from lowfc.testing.clock import FakeClock
 from lowfc.testing.memory_bus import MemoryBus, MemoryHub
+
+pytestmark = pytest.mark.exclusive
 
 PATIENCE_S = 30.0
 
@@ -60,7 +62,11 @@ def test_health_is_sent_when_due_and_tells_everything(hub: MemoryHub, clock: Fak
     first, second = ear.health
     assert (first.state, first.rate_hz, second.rate_hz) == ("starting", 0.0, 10.0)
     assert (second.process, second.run_id, second.pid, second.version) == ("camera", "night", os.getpid(), __version__)
-    assert (second.commands_late, second.uptime_ns, second.granted) == (3, HEALTH_PERIOD_NS, ["one BLAS thread"])
+    assert (second.commands_late, second.uptime_ns, second.realtime_granted) == (
+        3,
+        HEALTH_PERIOD_NS,
+        ["one BLAS thread"],
+    )
     assert from_timestamp(second.timestamp) == clock.now_ns()
     assert 1 << 20 < second.memory_bytes < 1 << 36
     assert {count.topic: count.published for count in second.topics} == {
@@ -135,7 +141,7 @@ def test_a_newcomer_is_answered_before_the_next_health_is_due(hub: MemoryHub, cl
     assert ear.health == []
     service(hub, clock, "controller").beat()
     camera.beat()
-    assert list(ear.health[-1].heard) == ["controller"]
+    assert list(ear.health[-1].peers_alive) == ["controller"]
     again = service(hub, clock, "controller")
     camera.beat()
     assert len(ear.health) == 2  # one of each process
@@ -231,7 +237,7 @@ def test_a_stop_wakes_the_loop(hub: MemoryHub, clock: FakeClock) -> None:
 LOOP = """
 from lowfc.testing.clock import FakeClock
 from lowfc.testing.memory_bus import MemoryBus, MemoryHub
-from lowfc.adapters.service import Service
+from lowfc.adapters.process.service import Service
 from lowfc.contract.messages import FRAME
 
 clock = FakeClock()

@@ -9,14 +9,16 @@ from pathlib import Path
 
 import pytest
 
-from lowfc.adapters import shortcut
-from lowfc.adapters.bus import Sample
-from lowfc.adapters.clock import HostClock
-from lowfc.adapters.run import Run, open_run
-from lowfc.adapters.zenoh_bus import ZenohBus, ZenohPublisher
+from lowfc.adapters.bus import direct_link
+from lowfc.adapters.bus.bus import Sample
+from lowfc.adapters.bus.run import Run, open_run
+from lowfc.adapters.bus.zenoh_bus import ZenohBus, ZenohPublisher
+from lowfc.adapters.process.clock import HostClock
 from lowfc.contract.configuration import Network
 from lowfc.contract.envelope import Envelope, count_of, sequence_of
 from lowfc.contract.messages import COMMAND, FRAME
+
+pytestmark = pytest.mark.exclusive
 
 PATIENCE_S = 30.0
 
@@ -104,6 +106,28 @@ def test_the_switch_loses_and_repeats_nothing(ends: Ends) -> None:
     assert "shortcut" in ends.threads
 
 
+def test_a_message_under_way_while_the_bus_is_left_comes_once(tmp_path: Path) -> None:
+    got: list[int] = []
+    left: list[bool] = []
+    reader = direct_link.DirectReader(
+        tmp_path / "socket",
+        FRAME.key,
+        lambda sample: got.append(sample.sequence),
+        lambda handler: lambda: left.append(True),
+        time.time_ns,
+        pytest.fail,
+    )
+    one, other = (Sample(FRAME.key, b"", sequence, 1, 1) for sequence in (1, 2))
+    reader._by_socket(one)
+    reader._by_bus(one)
+    reader._heard()
+    assert left == [True]
+    reader._by_bus(other)
+    reader._by_socket(other)
+    reader.close()
+    assert got == [1, 2]
+
+
 def test_a_restarted_reader_and_a_restarted_writer_find_each_other_again(ends: Ends) -> None:
     controller, camera = ends.bus("controller"), ends.bus("camera")
     controller.subscribe(FRAME, ends.hear)
@@ -126,7 +150,7 @@ def test_without_its_writer_the_reader_hears_the_bus(ends: Ends, monkeypatch: py
     ends.meet(camera.publisher(FRAME))
     camera.close()
     ends.buses.remove(camera)
-    monkeypatch.setattr(shortcut.ShortcutWriter, "send", lambda *_: None)  # as one in another language
+    monkeypatch.setattr(direct_link.DirectWriter, "send", lambda *_: None)  # as one in another language
     frames = ends.bus("camera").publisher(FRAME)
 
     def heard() -> bool:
@@ -155,7 +179,7 @@ def test_a_reader_that_stalls_never_holds_the_writer(tmp_path: Path) -> None:
     listener = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET)
     listener.bind(str(tmp_path / "stalled.in"))
     listener.listen(1)
-    writer = shortcut.ShortcutWriter(tmp_path / "stalled.in")
+    writer = direct_link.DirectWriter(tmp_path / "stalled.in")
     for _ in range(2000):  # far more than a socket holds: a send that waited would wait for ever
         writer.send(Envelope(1, 2).encode(), bytes(12800))
     taken, _ = listener.accept()
@@ -174,7 +198,7 @@ def test_a_message_that_makes_no_sense_is_counted_and_the_next_is_heard(
     controller.subscribe(FRAME, ends.hear)
     path = ends.run.links.shortcut("controller")
     assert path is not None
-    writer = shortcut.ShortcutWriter(path)
+    writer = direct_link.DirectWriter(path)
     writer.send(b"short", b"")
     writer.send(b"\xff" * 16, b"from the end of time")
     writer.send(Envelope(7, 0).encode(), b"fine")
@@ -281,8 +305,8 @@ class Shared:
         self.got: list[int] = []
         self.by_bus: Callable[[Sample], None] = lambda _: None
         path = folder / "mirror-dm.in"
-        self.reader = shortcut.SharedShortcutReader(path, "k", self.hear, self.subscribe, lambda: 0, self.failed)
-        self.writer = shortcut.ShortcutWriter(path)
+        self.reader = direct_link.SharedDirectReader(path, "k", self.hear, self.subscribe, lambda: 0, self.failed)
+        self.writer = direct_link.DirectWriter(path)
 
     def subscribe(self, handler: Callable[[Sample], None]) -> Callable[[], None]:
         self.by_bus = handler

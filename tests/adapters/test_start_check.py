@@ -1,9 +1,13 @@
 """A sequence whose start lies far ahead of this host's clock is refused, and both clocks are named."""
 
-from lowfc.adapters.clock import SIMULATED_START_NS
-from lowfc.adapters.start_check import StartCheck
+import pytest
+
+from lowfc.adapters.bus.start_check import StartCheck
+from lowfc.adapters.process.clock import SIMULATED_START_NS
 from lowfc.contract.envelope import sequence_of
 from lowfc.testing.clock import FakeClock
+
+pytestmark = pytest.mark.exclusive
 
 NOW_S = SIMULATED_START_NS // 10**9
 DAY_S = 86_400

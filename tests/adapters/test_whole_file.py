@@ -3,8 +3,10 @@ from pathlib import Path
 
 import pytest
 
-from lowfc.adapters.whole_file import write_whole
+from lowfc.adapters.files.whole_file import write_whole
 from lowfc.contract.errors import DataFileError
+
+pytestmark = pytest.mark.exclusive
 
 
 def test_a_file_is_replaced_as_a_whole(tmp_path: Path) -> None:

@@ -15,14 +15,16 @@ from pathlib import Path
 import pytest
 import zenoh
 
-from lowfc.adapters.bus import Query, Sample
-from lowfc.adapters.clock import HostClock
-from lowfc.adapters.mailbox import Mailbox
-from lowfc.adapters.run import Run, new_run_id, open_run
-from lowfc.adapters.zenoh_bus import ZenohBus, session_config
+from lowfc.adapters.bus.bus import Query, Sample
+from lowfc.adapters.bus.mailbox import Mailbox
+from lowfc.adapters.bus.run import Run, new_run_id, open_run
+from lowfc.adapters.bus.zenoh_bus import ZenohBus, session_config
+from lowfc.adapters.process.clock import HostClock
 from lowfc.contract.envelope import count_of, start_of
 from lowfc.contract.errors import BusError
 from lowfc.contract.messages import CALIBRATION, COMMAND, FRAME, HEALTH, REQUEST_KEY, TRUTH, Topic
+
+pytestmark = pytest.mark.exclusive
 
 ROLES = ("camera", "controller", "mirror-dm")
 PATIENCE_S = 30.0
@@ -31,9 +33,9 @@ PATIENCE_S = 30.0
 # It publishes its topic all the time and remembers, of every key, how many messages it got and the last one.
 TOY = """
 import json, sys, threading, time
-from lowfc.adapters.clock import HostClock
-from lowfc.adapters.run import open_run
-from lowfc.adapters.zenoh_bus import ZenohBus
+from lowfc.adapters.process.clock import HostClock
+from lowfc.adapters.bus.run import open_run
+from lowfc.adapters.bus.zenoh_bus import ZenohBus
 from lowfc.contract.errors import LowfcError
 from lowfc.contract.messages import COMMAND, FRAME, MIRROR_STATE
 

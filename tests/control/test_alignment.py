@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.ndimage import gaussian_filter
 
-from lowfc.control.alignment import Geometry, align, onto
+from lowfc.control.calibration.alignment import Geometry, align, onto
 
 
 def computed() -> np.ndarray:

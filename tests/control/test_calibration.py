@@ -4,16 +4,17 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from toy import TOY, calibration
 
-from lowfc.control.calibration import ESTIMATORS, condition_number, noise_nm, normalise_flux, reconstructor
-from lowfc.control.estimator import Estimator, difference, saturated_pixels
+from lowfc.control.calibration.calibration import ESTIMATORS, condition_number, noise_nm, normalise_flux, reconstructor
+from lowfc.control.loop.estimator import Estimator, difference, saturated_pixels
+from tests.support.toy import TOY, calibration
 
 PIXELS = TOY.reference.size
 RESPONSE = TOY.response + 0.001 * np.outer(TOY.reference, [1, -2, 3])  # modes that also change the flux
 GOOD = np.ones(PIXELS)
 SOME_BAD = GOOD.copy()
 SOME_BAD[[3, 17, 30]] = 0
+I0, H = normalise_flux(TOY.reference, RESPONSE, GOOD)
 
 
 @pytest.mark.parametrize("good", [GOOD, SOME_BAD])
@@ -46,7 +47,6 @@ def test_modes_are_recovered_exactly_without_noise(estimator: str, good: np.ndar
 
 
 def test_plain_is_numpys_pseudo_inverse_and_weighted_is_not() -> None:
-    I0, H = normalise_flux(TOY.reference, RESPONSE, GOOD)
     assert np.allclose(reconstructor(I0, H, GOOD, 1e5, 2.0, "pinv"), np.linalg.pinv(H), rtol=1e-9)
     assert not np.allclose(reconstructor(I0, H, GOOD, 1e5, 2.0), np.linalg.pinv(H), rtol=1e-3)
 
@@ -62,7 +62,6 @@ def cramer_rao(flux_e: float, read_noise_e: float) -> np.ndarray:
 
 def covariance(estimator: str, flux_e: float, read_noise_e: float) -> np.ndarray:
     """Covariance (modes, modes) of R on frames that are divided by their own noisy flux."""
-    I0, H = normalise_flux(TOY.reference, RESPONSE, GOOD)
     R = reconstructor(I0, H, GOOD, flux_e, read_noise_e, estimator)
     each = R - np.outer(R @ I0, GOOD)
     result: np.ndarray = each @ np.diag((I0 * flux_e + read_noise_e**2) / flux_e**2) @ each.T
@@ -117,7 +116,6 @@ def test_a_sensor_that_cannot_tell_modes_apart_is_refused(response: np.ndarray, 
 def test_a_nuisance_mode_is_not_seen_whatever_its_unit(estimator: str, unit: float) -> None:
     ramp = np.linspace(-1, 1, PIXELS)
     background = np.column_stack([np.ones(PIXELS), TOY.reference * ramp])
-    I0, H = normalise_flux(TOY.reference, RESPONSE, GOOD)
     beside = normalise_flux(TOY.reference, background, GOOD)[1]
     R = reconstructor(I0, H, GOOD, 1e5, 2.0, estimator, unit * beside)
     assert R.shape == (3, PIXELS)
@@ -131,7 +129,6 @@ def test_a_nuisance_mode_is_not_seen_whatever_its_unit(estimator: str, unit: flo
 
 @pytest.mark.parametrize("nuisance", [RESPONSE[:, :1], np.zeros((PIXELS, 1))])
 def test_a_nuisance_that_is_a_mode_or_nothing_is_refused(nuisance: np.ndarray) -> None:
-    I0, H = normalise_flux(TOY.reference, RESPONSE, GOOD)
     beside = normalise_flux(TOY.reference, nuisance, GOOD)[1]
     with pytest.raises(ValueError, match="nuisance modes"):
         reconstructor(I0, H, GOOD, 1e5, 1.0, nuisance=beside)
@@ -158,7 +155,6 @@ def test_an_estimate_is_right_at_any_flux_and_overwrites_only_its_scratch() -> N
         pixels = TOY.pixels((3, -4, 5), flux_dn).reshape(-1)
         before = pixels.copy()
         found = estimator.estimate(pixels, 1000.0)
-        assert found is not None
         assert np.abs(found.error_nm - (3, -4, 5)).max() < 0.1
         assert found.error_nm.dtype == np.float32
         assert found.flux_dn == pytest.approx(flux_dn, rel=1e-4)
@@ -173,7 +169,6 @@ def test_an_estimate_is_the_reconstructor_times_the_difference_from_the_referenc
     for flux_dn in (30_000.0, 300_000.0):
         pixels = rng.poisson(TOY.pixels((3, -4, 5), flux_dn).reshape(-1)).astype(np.uint16)
         found = Estimator.of(known).estimate(pixels, 0.0)
-        assert found is not None
         assert found.flux_dn == pytest.approx(difference(known, pixels, 0.0, out), rel=1e-6)
         expected_nm = known.reconstructor.astype(np.float64) @ out
         assert np.abs(expected_nm).max() > 1

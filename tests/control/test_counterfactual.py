@@ -2,33 +2,29 @@
 
 import numpy as np
 import pytest
-from toy import frame_sequence, live, settings
 
-from lowfc.control.inputs import Step
-from lowfc.control.law import Law
-from lowfc.control.safety import Limits
-from lowfc.control.stability import delay_weights
-from lowfc.control.state import Settings
-from lowfc.control.what_if import (
+from lowfc.control.laws.stability import delay_weights, settling_frames
+from lowfc.control.laws.what_if import (
+    as_logged,
     counterfactual,
     delay_from_times,
     delay_from_truth,
     exposed,
     frames_since,
-    integrator,
     missing_before,
     rms,
     seen_nm,
-    settling_frames,
 )
+from lowfc.control.loop.inputs import Step
+from lowfc.control.loop.safety import Limits
+from lowfc.control.loop.state import Settings
+from tests.support.theory import law_of
+from tests.support.toy import frame_sequence, live, settings
 
 WIDE = {"limits": Limits(7000.0, 7000.0, 7000.0), "limit_nm": (5000.0, 5000.0)}
 DELAYS = [1.0, 1.4, 2.0, 3.0]
 NOTHING_MISSING = np.zeros(12, np.int64)
-
-
-def law(gain: float = 0.5, leak: float = 0.0, limit_nm: float = 1000.0, modes: int = 1) -> Law:
-    return Law(*(np.full(modes, value, np.float32) for value in (gain, leak, limit_nm)))
+HALF = as_logged(law_of(modes=1))
 
 
 def single(*values: float) -> np.ndarray:
@@ -70,7 +66,7 @@ def test_with_the_gains_that_were_used_it_is_the_logged_run(delay: float) -> Non
     assert missing.sum() == 9
     assert np.isnan(error).any(axis=1).sum() == len(DARK)
     assert (np.abs(command[:, 0]) == 12.0).any()
-    again_error, again_command = counterfactual(integrator(what.law((2, 3, 4))), weights(delay), pol, missing)
+    again_error, again_command = counterfactual(as_logged(what.law((2, 3, 4))), weights(delay), pol, missing)
     np.testing.assert_allclose(again_error, error, atol=2e-5, rtol=0)
     np.testing.assert_allclose(again_command, command, atol=2e-5, rtol=0)
 
@@ -83,44 +79,40 @@ def test_with_other_gains_it_is_the_run_with_those(delay: float) -> None:
     disturbance = walk(160)
     _, pol, _, missing = columns(used(before, disturbance))
     error, _, command, _ = columns(used(after, disturbance))
-    other_error, other_command = counterfactual(integrator(after.law((2, 3, 4))), weights(delay), pol, missing)
+    other_error, other_command = counterfactual(as_logged(after.law((2, 3, 4))), weights(delay), pol, missing)
     np.testing.assert_allclose(other_error, error, atol=0.05)
     np.testing.assert_allclose(other_command, command, atol=0.05)
     assert np.nanmax(np.abs(other_error - pol)) > 5
 
 
 @pytest.mark.parametrize(
-    ("delay", "errors"),
-    [
-        (1.0, [8, 4, 2, 1]),
-        (2.0, [8, 8, 4, 0]),
-        (3.0, [8, 8, 8, 4]),
-        (1.5, [8, 6, 2.5, 0.375]),
-    ],
+    ("delay", "errors"), [(1.0, [8, 4, 2, 1]), (2.0, [8, 8, 4, 0]), (3.0, [8, 8, 8, 4]), (1.5, [8, 6, 2.5, 0.375])]
 )
 def test_an_integrator_of_half_on_a_step_by_hand(delay: float, errors: list[float]) -> None:
     pol = single(8, 8, 8, 8)
-    error, command = counterfactual(integrator(law()), weights(delay), pol, NOTHING_MISSING[:4])
+    error, command = counterfactual(HALF, weights(delay), pol, NOTHING_MISSING[:4])
     assert error[:, 0].tolist() == errors
     assert command[:, 0].tolist() == np.cumsum([-0.5 * value for value in errors]).tolist()
 
 
 def test_under_refused_and_missing_frames_the_command_is_held() -> None:
     pol, missing = single(8, np.nan, 8, 8), np.array([0, 0, 0, 2])
-    error, command = counterfactual(integrator(law()), weights(2.0), pol, missing)
+    error, command = counterfactual(HALF, weights(2.0), pol, missing)
     # frame 0 commands -4; 1 is refused, so that 2 sees -4; it commands -6; after two missing frames 5 sees -6
     np.testing.assert_array_equal(error[:, 0], [8, np.nan, 4, 2])
     assert command[:, 0].tolist() == [-4, -4, -6, -7]
 
 
 def test_modal_limits_act() -> None:
-    error, command = counterfactual(integrator(law(limit_nm=5.0)), weights(1.0), single(8, 8, 8), NOTHING_MISSING[:3])
+    error, command = counterfactual(
+        as_logged(law_of(limit_nm=5.0, modes=1)), weights(1.0), single(8, 8, 8), NOTHING_MISSING[:3]
+    )
     assert command[:, 0].tolist() == [-4, -5, -5]
     assert error[:, 0].tolist() == [8, 4, 3]
 
 
 def test_any_function_of_state_and_error_is_a_controller() -> None:
-    def every_other(state: int | None, error_nm: np.ndarray) -> tuple[int, np.ndarray]:
+    def every_other(state: int | None, error_nm: np.ndarray, pol_nm: np.ndarray) -> tuple[int, np.ndarray]:
         count = state or 0
         return count + 1, -error_nm if count % 2 else np.zeros_like(error_nm)
 
@@ -182,11 +174,12 @@ def test_times_beside_a_missing_frame_do_not_count() -> None:
     assert delay_from_times(sequence, start_ns, sequence, start_ns + 900) == 1.0
 
 
-def test_settling_takes_five_time_constants_and_at_least_a_second() -> None:
-    assert settling_frames(law(gain=0.5), 250.0) == 250
-    slow = Law(*(np.array(values, np.float32) for values in ([0.5, 0.001, 0], [0, 0.001, 0], [9, 9, 9])))
-    assert settling_frames(slow, 250.0) == 2500
-    assert settling_frames(law(gain=0.0), 250.0) == 250
+@pytest.mark.parametrize(
+    ("gain", "leak", "frames"), [(0.5, 0.0, 250), ([0.5, 0.001, 0], [0, 0.001, 0], 2500), (0.0, 0.0, 250)]
+)
+def test_settling_takes_five_time_constants_and_at_least_a_second(gain: object, leak: object, frames: int) -> None:
+    law = law_of(gain, leak)
+    assert settling_frames(law.gain, law.leak, 250.0) == frames
 
 
 def test_frames_are_counted_from_where_the_loop_begins_to_run() -> None:

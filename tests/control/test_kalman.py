@@ -6,13 +6,12 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 from scipy.fft import fft, ifft, irfft
-from test_linear_law import integrators, run
-from test_vibration import realised
 
-from lowfc.control.kalman import covariance_nm2, lqg
-from lowfc.control.margins import check_stable, margins, rejection
-from lowfc.control.tuning import predicted_nm
-from lowfc.control.vibration import Line, Model
+from lowfc.control.laws.kalman import covariance_nm2, lqg
+from lowfc.control.laws.margins import check_stable, margins, rejection
+from lowfc.control.laws.tuning import predicted_nm
+from lowfc.control.laws.vibration import Line, Model
+from tests.support.theory import integrators, realised, run
 
 RATE_HZ = 1000.0
 MODEL = Model(0.02, 5.0, (Line(18, 0.3, 60.0), Line(71, 0.5, 20.0)), 0.7, RATE_HZ)

@@ -5,15 +5,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from lowfc.contract.state_codec import controller_state, decode_state
-from lowfc.control.additions import MIRROR
-from lowfc.control.inputs import Outputs, Request, Tick
-from lowfc.control.lease import MAX_S
-from lowfc.control.loop import advance
-from lowfc.control.safety import LoopMode
-from lowfc.control.state import State
-from tests.control.test_advance import SOME, feed, names
-from tests.control.toy import GRID, frame, frame_sequence, loaded, settings
+from lowfc.control.loop.additions import MIRROR
+from lowfc.control.loop.advance import advance
+from lowfc.control.loop.inputs import Outputs, Request, Tick
+from lowfc.control.loop.lease import MAX_S
+from lowfc.control.loop.safety import LoopMode
+from lowfc.control.loop.state import State
+from tests.support.toy import GRID, SOME, answered, feed, frame, frame_sequence, loaded, names, settings
 
 USUAL = settings(rate_hz=1000.0)
 HOLDER = "lowfc calibrate (anna, pid 7)"
@@ -24,7 +22,6 @@ def held(seconds: float = 10.0, frames: int = 3) -> State:
     """A closed loop that is reserved from time 0 on."""
     state, _ = feed(USUAL, loaded(USUAL), *(frame(count, SOME) for count in range(1, frames + 1)))
     state, reply = asked(state, Request(0, "lease", values=(seconds,), text=HOLDER, lease_id=MINE))
-    assert reply.reply is not None
     assert reply.reply.accepted
     assert names([reply]) == ["LEASE_TAKEN"]
     return state
@@ -40,13 +37,11 @@ def played(state: State, frames: int = 500, lease_id: int = MINE) -> State:
     table = np.ones((frames, 1), np.float32)
     request = Request(0, "play", text=MIRROR, actuators_nm=shape, table=table, lease_id=lease_id)
     state, outputs = asked(state, request)
-    assert outputs.reply is not None
-    assert outputs.reply.accepted, outputs.reply.text
+    answered(outputs, True)
     return state
 
 
 def left(state: State) -> int:
-    assert state.drive is not None
     added = state.drive.additions
     return 0 if added is None or added.play is None else added.play.left(state.frame_sequence + 1)
 
@@ -71,34 +66,26 @@ REFUSED = {
 def test_requests_of_others_are_refused_and_name_the_holder(name: str) -> None:
     state = held()
     after, outputs = asked(state, Request(4 * S, name, values=REFUSED[name]))
-    assert outputs.reply is not None
-    assert not outputs.reply.accepted
-    assert HOLDER in outputs.reply.text
-    assert "6 s" in outputs.reply.text
-    assert "lowfc ctl open" in outputs.reply.text
+    answered(outputs, False, HOLDER, "6 s", "lowfc ctl open")
     assert all(now is was for now, was in zip(after[:-1], state[:-1], strict=True))
 
 
 def test_the_holder_is_not_hindered() -> None:
     state, outputs = asked(held(), Request(S, "gain", values=(0.3,), lease_id=MINE))
-    assert outputs.reply is not None
-    assert outputs.reply.accepted
+    answered(outputs, True)
     state, outputs = asked(state, Request(S, "open", lease_id=MINE))
     assert state.mode is LoopMode.OPEN
     state, outputs = asked(state, Request(2 * S, "renew", values=(10.0,), text=HOLDER, lease_id=MINE))
-    assert outputs.reply is not None
-    assert outputs.reply.accepted
+    answered(outputs, True)
 
 
 @pytest.mark.parametrize("name", ["safe", "open", "pause", "stop"])
 def test_these_are_granted_to_anybody_and_end_the_lease_and_what_it_plays(name: str) -> None:
     state, outputs = asked(played(held()), Request(S, name))
-    assert outputs.reply is not None
-    assert outputs.reply.accepted
+    answered(outputs, True)
     assert "LEASE_ENDED" in names([outputs])
     assert not left(state)
     state, outputs = asked(state, Request(2 * S, "renew", values=(10.0,), text=HOLDER, lease_id=MINE))
-    assert outputs.reply is not None
     assert outputs.reply.text == f"the lease ended: operator asked to {name}"
 
 
@@ -107,44 +94,35 @@ def test_these_are_granted_to_anybody_and_end_the_lease_and_what_it_plays(name: 
 def test_a_former_holder_is_refused_and_told_why(name: str, ended: bool) -> None:
     state = asked(held(), Request(S, "pause"))[0] if ended else loaded(USUAL)
     _, outputs = asked(state, Request(2 * S, name, values=(0.1,), lease_id=MINE))
-    assert outputs.reply is not None
-    assert not outputs.reply.accepted
-    assert ("operator asked to pause" if ended else "did the controller restart") in outputs.reply.text
+    answered(outputs, False, ("operator asked to pause" if ended else "did the controller restart"))
 
 
 def test_in_safe_mode_nothing_is_reserved_and_its_holders_safe_ends_it() -> None:
     state, outputs = asked(held(), Request(S, "safe", lease_id=MINE))
-    assert outputs.reply is not None
-    assert outputs.reply.text == f"loop in safe mode; the reservation for {HOLDER} ended"
+    assert outputs.reply.text == f"loop in safe mode; this ended the reservation for {HOLDER}"
     _, outputs = asked(state, Request(S, "lease", values=(5.0,), text=HOLDER, lease_id=12))
-    assert outputs.reply is not None
     assert "safe mode" in outputs.reply.text
     _, outputs = asked(state, Request(S, "clear"))
-    assert outputs.reply is not None
-    assert outputs.reply.accepted
+    answered(outputs, True)
 
 
 @pytest.mark.parametrize("name", ["status", "note"])
 def test_these_disturb_nobody(name: str) -> None:
     state, outputs = asked(held(), Request(S, name, text="cloud"))
-    assert outputs.reply is not None
-    assert outputs.reply.accepted
-    assert state.conditions.lease is not None
+    answered(outputs, True)
     assert not state.conditions.lease.ended
 
 
 def test_it_is_granted_to_one_at_a_time_and_released_by_its_holder_only() -> None:
     state = held()
     after, outputs = asked(state, Request(S, "lease", values=(5.0,), text="somebody", lease_id=12))
-    assert outputs.reply is not None
-    assert not outputs.reply.accepted
+    answered(outputs, False)
     after, outputs = asked(after, Request(S, "release", lease_id=12))
     assert after.conditions == state.conditions
     after, outputs = asked(after, Request(S, "release", lease_id=MINE))
     assert names([outputs]) == ["LEASE_RELEASED"]
     after, outputs = asked(after, Request(S, "gain", values=(0.2,)))
-    assert outputs.reply is not None
-    assert outputs.reply.accepted
+    answered(outputs, True)
 
 
 @pytest.mark.parametrize(
@@ -163,9 +141,7 @@ def test_it_is_granted_to_one_at_a_time_and_released_by_its_holder_only() -> Non
 def test_a_lease_that_is_not_whole_is_refused(fields: dict[str, object], why: str) -> None:
     request = Request(0, "lease", values=(5.0,), text=HOLDER, lease_id=MINE)
     _, outputs = asked(loaded(USUAL), replace(request, **fields))  # type: ignore[arg-type]  # each of its own type
-    assert outputs.reply is not None
-    assert not outputs.reply.accepted
-    assert why in outputs.reply.text
+    answered(outputs, False, why)
 
 
 def test_it_ends_with_its_holder_by_the_frames() -> None:
@@ -187,20 +163,10 @@ def test_it_ends_with_its_holder_by_the_clock_where_no_frames_come() -> None:
 
 def test_it_is_gone_by_the_time_of_the_next_request() -> None:
     _state, outputs = asked(held(1.0), Request(S + 1, "gain", values=(0.3,)))
-    assert outputs.reply is not None
-    assert outputs.reply.accepted
+    answered(outputs, True)
     assert names([outputs]) == ["LEASE_ENDED"]
 
 
 def test_it_outlives_a_camera_that_restarts() -> None:
     state, _ = feed(USUAL, held(1.0), frame(1, SOME, sequence=frame_sequence(1, start=1_800_000_000)))
-    assert state.conditions.lease is not None
     assert not state.conditions.lease.ended
-
-
-def test_a_state_in_the_log_has_it() -> None:
-    for state in (held(), asked(held(), Request(S, "open"))[0]):
-        assert state.drive is not None
-        message = controller_state(state, USUAL, 0)
-        _, again = decode_state(message, state.drive.calibration)
-        assert again.conditions.lease == state.conditions.lease

@@ -1,41 +1,20 @@
 """Linear laws: what the loop's integrator does, bumpless closing, no wind-up, and shapes that are checked."""
 
-from collections.abc import Iterable
 from dataclasses import replace
 
 import numpy as np
 import numpy.typing as npt
 import pytest
 
-from lowfc.control.law import Law, integrate
-from lowfc.control.linear_law import (
-    LinearLaw,
-    Signal,
-    at_rest,
-    coast,
-    follow,
-    integrator,
-    integrator_block,
-    of_blocks,
-    respond,
-)
-from lowfc.control.pi_notch import Notch, pi_notch
-from lowfc.control.stability import delay_weights
+from lowfc.control.laws.law import integrate
+from lowfc.control.laws.linear_law import LinearLaw, at_rest, coast, follow, respond
+from lowfc.control.laws.pi_notch import Notch, pi_notch
+from tests.support.theory import LAWS, integrators, law_of, linear, run
 
 NOLL, RATE_HZ = (2, 3, 4), 1000.0
 GAIN, LEAK = np.array([0.5, 0.3, 0.1]), np.array([0.0, 0.01, 0.1])
+PLAIN = law_of(GAIN, LEAK, 1e9)
 Array = npt.NDArray[np.float64]
-
-
-def plain(limit_nm: float = 1e9) -> Law:
-    return Law(*(np.asarray(values, np.float32) for values in (GAIN, LEAK, np.full(3, limit_nm))))
-
-
-def integrators(modes: Iterable[tuple[float, float]], signal: Signal, delay_frames: float) -> LinearLaw:
-    """Integrators of gain and leak, as a linear law of this signal."""
-    blocks = [integrator_block(gain, leak, signal, delay_frames) for gain, leak in modes]
-    noll = tuple(range(2, 2 + len(blocks)))
-    return of_blocks(blocks, signal, "integrator", noll, delay_frames, RATE_HZ)
 
 
 def pi(gain: Array, proportional: Array, leak: Array) -> LinearLaw:
@@ -43,28 +22,12 @@ def pi(gain: Array, proportional: Array, leak: Array) -> LinearLaw:
     return pi_notch(NOLL, gain, proportional, leak, [()] * len(NOLL), 1.0, RATE_HZ)
 
 
-def run(law: LinearLaw, disturbance_nm: Array, delay_frames: float, limit_nm: float = np.inf) -> tuple[Array, Array]:
-    """Errors and commands (frames, modes) of a loop in which nothing else acts; its delay may not be the law's."""
-    weights = delay_weights(delay_frames).astype(np.float32)
-    believed = delay_weights(law.delay_frames).astype(np.float32)
-    history = [np.zeros(disturbance_nm.shape[1], np.float32)] * max(len(weights), len(believed))
-    x, errors, commands = at_rest(law), [], []
-    for disturbance in disturbance_nm.astype(np.float32):
-        error = disturbance + sum(weight * past for weight, past in zip(weights, history, strict=False))
-        pol = error - sum(weight * past for weight, past in zip(believed, history, strict=False))
-        x = follow(law, x, error if law.signal == "error" else pol, history[0])
-        history = [np.clip(respond(law, x), -limit_nm, limit_nm, dtype=np.float32), *history[:-1]]
-        errors.append(error)
-        commands.append(history[0])
-    return np.array(errors, float), np.array(commands, float)
-
-
 def test_the_integrator_as_a_linear_law_is_the_integrator_to_the_bit() -> None:
-    law, rng = integrator(plain(), NOLL, 1.0, RATE_HZ), np.random.default_rng(1)
+    law, rng = linear(PLAIN), np.random.default_rng(1)
     x, command = at_rest(law), np.zeros(3, np.float32)
     for error in rng.standard_normal((100, 3)).astype(np.float32):
         x = follow(law, x, error, command)
-        command, _ = integrate(plain(), command, error)
+        command, _ = integrate(PLAIN, command, error)
         np.testing.assert_allclose(respond(law, x), command, rtol=1e-6, atol=1e-6)
 
 
@@ -86,12 +49,6 @@ def test_a_pi_law_follows_its_difference_equation() -> None:
         wanted = (1 - LEAK) * (kept + proportional * before) - (GAIN + proportional) * error
         np.testing.assert_allclose(respond(law, x), wanted, atol=1e-5)
         kept, before = np.clip(wanted, -1, 1), error
-
-
-LAWS = {
-    "pi": pi(GAIN, GAIN / 2, 0 * LEAK),
-    "notch": pi_notch(NOLL, GAIN, 0 * GAIN, 0 * LEAK, [(Notch(18, 8, 10), Notch(71, 8, 5))] * 3, 1.0, RATE_HZ),
-}
 
 
 @pytest.mark.parametrize("name", LAWS)
@@ -138,9 +95,9 @@ def test_coasting_holds_an_integrator_and_lets_a_resonator_ring() -> None:
     ("change", "sentence"),
     [
         ({"signal": "errors"}, "signal of a law must be one of error, pol"),
-        ({"gain": np.zeros((3, 2))}, r"gain must have shape \(3, 3\), got \(3, 2\)"),
+        ({"measurement_gain": np.zeros((3, 2))}, r"measurement_gain must have shape \(3, 3\), got \(3, 2\)"),
         ({"output": np.zeros((2, 3))}, "output must have shape"),
-        ({"coast": np.full((3, 3), np.nan)}, "coast holds values that are not finite"),
+        ({"predict_only": np.full((3, 3), np.nan)}, "predict_only holds values that are not finite"),
         ({"delay_frames": 0.5}, "a delay is at least 1 frame"),
         ({"rate_hz": 0.0}, "rate_hz must be above 0"),
         ({"noll": (2, 3)}, "gain must have shape"),
@@ -148,13 +105,13 @@ def test_coasting_holds_an_integrator_and_lets_a_resonator_ring() -> None:
 )
 def test_a_law_that_does_not_fit_itself_is_refused(change: dict[str, object], sentence: str) -> None:
     with pytest.raises(ValueError, match=sentence):
-        replace(integrator(plain(), NOLL, 1.0, RATE_HZ), **change)
+        replace(linear(PLAIN), **change)
 
 
 def test_a_law_is_in_single_precision() -> None:
     law = LAWS["notch"]
     x = follow(law, at_rest(law), np.ones(3, np.float32), np.zeros(3, np.float32))
-    assert {law.follow.dtype, x.dtype, respond(law, x).dtype, coast(law, x, x[:3]).dtype} == {np.dtype(np.float32)}
+    assert {law.transition.dtype, x.dtype, respond(law, x).dtype, coast(law, x, x[:3]).dtype} == {np.dtype(np.float32)}
 
 
 @pytest.mark.parametrize("notch", [Notch(0, 1, 5), Notch(600, 1, 5), Notch(20, 0, 5), Notch(20, 1, 1)])

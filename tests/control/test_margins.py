@@ -4,12 +4,10 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from test_linear_law import LAWS, RATE_HZ, integrators, run
 
-from lowfc.control import stability
-from lowfc.control.law import Law
-from lowfc.control.linear_law import LinearLaw, Signal, integrator
-from lowfc.control.margins import (
+from lowfc.control.laws import stability
+from lowfc.control.laws.linear_law import LinearLaw, Signal
+from lowfc.control.laws.margins import (
     MOST_COUPLED,
     check_stable,
     margins,
@@ -18,28 +16,29 @@ from lowfc.control.margins import (
     rejection,
     sentence,
 )
-from lowfc.control.pi_notch import Notch, pi_notch
+from lowfc.control.laws.pi_notch import Notch, pi_notch
+from tests.support import theory
+from tests.support.theory import LAWS, integrators, law_of, linear, run
 
 FREQUENCY_HZ = np.geomspace(0.1, 499, 200)
 
 
-def plain(gain: float, leak: float = 0.0) -> Law:
-    return Law(np.full(1, gain, np.float32), np.full(1, leak, np.float32), np.full(1, 1e3, np.float32))
+RATE_HZ = 1000.0
 
 
 def one(gain: float, delay_frames: float, leak: float = 0.0) -> LinearLaw:
-    return integrator(plain(gain, leak), (4,), delay_frames, RATE_HZ)
+    return linear(law_of(gain, leak, modes=1), (4,), delay_frames)
 
 
 @pytest.mark.parametrize("delay_frames", [1.0, 1.5, 2.0, 3.0])
 @pytest.mark.parametrize("leak", [0.0, 0.05])
 def test_the_integrator_has_the_transfer_functions_of_stability(delay_frames: float, leak: float) -> None:
     law, gain = one(0.3, delay_frames, leak), float(np.float32(0.3))
-    expected = stability.rejection(FREQUENCY_HZ, RATE_HZ, gain, leak, delay_frames)
+    expected = theory.rejection(FREQUENCY_HZ, RATE_HZ, gain, leak, delay_frames)
     np.testing.assert_allclose(rejection(law, FREQUENCY_HZ, delay_frames)[:, 0], expected, rtol=1e-5)
-    expected = stability.noise_transfer(FREQUENCY_HZ, RATE_HZ, gain, leak, delay_frames)
+    expected = theory.noise_transfer(FREQUENCY_HZ, RATE_HZ, gain, leak, delay_frames)
     np.testing.assert_allclose(noise_transfer(law, FREQUENCY_HZ, delay_frames)[:, 0], expected, rtol=1e-5)
-    assert noise_gain(law, delay_frames)[0] == pytest.approx(stability.noise_gain(gain, leak, delay_frames), rel=1e-3)
+    assert noise_gain(law, delay_frames)[0] == pytest.approx(theory.noise_gain(gain, leak, delay_frames), rel=1e-3)
 
 
 @pytest.mark.parametrize("delay_frames", [1.0, 1.3, 1.5, 2.0, 3.0])
@@ -100,7 +99,7 @@ def test_a_notch_is_as_deep_and_as_wide_as_it_says() -> None:
 
 
 def test_modes_of_which_none_moves_count_as_stable() -> None:
-    law = integrator(plain(0.0), (4,), 1.0, RATE_HZ)
+    law = one(0.0, 1.0)
     check_stable(law, 1.0)
     found = margins(law, 1.0)
     assert found.stable
@@ -118,17 +117,19 @@ def test_an_unstable_law_is_refused_in_a_sentence() -> None:
 def test_a_law_that_runs_away_while_open_is_refused() -> None:
     law = one(0.5, 1.0)
     with pytest.raises(ValueError, match=r"without frames, Z4 has a pole at 1.0100"):
-        check_stable(replace(law, coast=np.full((1, 1), 1.01)), 1.0)
-    growing = replace(law, follow=np.full((1, 1), 1.01), kept=law.kept - np.float32(1.01))
+        check_stable(replace(law, predict_only=np.full((1, 1), 1.01)), 1.0)
+    growing = replace(law, transition=np.full((1, 1), 1.01), command_gain=law.command_gain - np.float32(1.01))
     with pytest.raises(ValueError, match=r"open, Z4 has a pole at 1\.0100"):
         check_stable(growing, 1.0)
 
 
 def test_modes_that_a_law_couples_are_taken_with_the_others_closed() -> None:
     """Turning the modes into each other and back is the same loop: poles and |S| of a turned law are known."""
-    law = integrator(Law(*(np.full(2, v, np.float32) for v in (0.5, 0.0, 1e3))), (4, 5), 1.0, RATE_HZ)
+    law = linear(law_of(modes=2), (4, 5))
     turn = np.array([[0.8, -0.6], [0.6, 0.8]], np.float32)
-    turned = replace(law, gain=turn @ law.gain @ turn.T, kept=turn @ law.kept @ turn.T)
+    turned = replace(
+        law, measurement_gain=turn @ law.measurement_gain @ turn.T, command_gain=turn @ law.command_gain @ turn.T
+    )
     found = margins(turned, 1.0)
     np.testing.assert_allclose(found.radius, 0.5, rtol=1e-5)
     np.testing.assert_allclose(found.gain_margin, 4, rtol=1e-3)

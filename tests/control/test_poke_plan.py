@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from lowfc.control.poke_plan import (
+from lowfc.control.calibration.poke_plan import (
     REST,
     SIGNS,
     cycle,

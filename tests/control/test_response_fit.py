@@ -4,15 +4,14 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from toy import calibration
 
-from lowfc.control.adapted import with_dark, with_reference
-from lowfc.control.calibration import normalise_flux, reconstructor
-from lowfc.control.dark_frames import dark_of, light_in
-from lowfc.control.delay_fit import measure_delay
-from lowfc.control.poke_plan import cycle, dither, hadamard_patterns, ladder, poke_patterns
-from lowfc.control.regularised import advice, reconstruct
-from lowfc.control.response_fit import (
+from lowfc.control.calibration.adapted import with_dark, with_reference
+from lowfc.control.calibration.calibration import normalise_flux, reconstructor
+from lowfc.control.calibration.dark_frames import dark_of, light_in
+from lowfc.control.calibration.delay_fit import measure_delay
+from lowfc.control.calibration.poke_plan import cycle, dither, hadamard_patterns, ladder, poke_patterns
+from lowfc.control.calibration.regularised import advice, reconstruct
+from lowfc.control.calibration.response_fit import (
     Initial,
     Measured,
     Sums,
@@ -26,7 +25,8 @@ from lowfc.control.response_fit import (
     row_error,
     without_outliers,
 )
-from lowfc.control.stability import delay_weights
+from lowfc.control.laws.stability import delay_weights
+from tests.support.toy import calibration
 
 PIXELS, MODES = 300, 4
 FLUX_E = 1e5
@@ -40,38 +40,43 @@ def truth(seed: int = 1) -> tuple[np.ndarray, np.ndarray]:
     return normalise_flux(light, slopes, np.ones(PIXELS))
 
 
-def exposed(seen: np.ndarray, seed: int, I0: np.ndarray, H: np.ndarray) -> np.ndarray:
+I0, H = truth()
+GOOD = np.ones(PIXELS)
+
+
+def exposed(seen: np.ndarray, seed: int) -> np.ndarray:
     """Frames (frames, pixels) in electrons with photon noise."""
     rng = np.random.default_rng(seed)
     return rng.poisson(np.maximum(I0 + seen @ H.T, 0) * FLUX_E).astype(np.float64)
 
 
+def fractions_of(frames: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    return normalised(frames, np.zeros(PIXELS), GOOD)
+
+
 def known(seed: int = 1) -> Initial:
     """The reconstructor of the computed H."""
-    I0, H = truth(seed)
-    return Initial(reconstructor(I0, H, np.ones(PIXELS), FLUX_E, 0.0), "weighted")
+    return Initial(reconstructor(*truth(seed), GOOD, FLUX_E, 0.0), "weighted")
 
 
 def calibrated(patterns: np.ndarray, cycles: int, drift: float = 0.0) -> Measured:
-    I0, H = truth()
     sums = Sums.none(known())
     for number in range(cycles):
         plan = cycle(patterns, hold=4, settle=1, rest=16, backwards=number % 2 == 1)
         time = np.arange(len(plan))[:, None] / len(plan)
         wander = drift * (time - 0.7 * time**2) * np.arange(1, MODES + 1)
-        frames = exposed(plan.table + wander, 100 + number, I0, H)
-        fractions, flux = normalised(frames, np.zeros(PIXELS), np.ones(PIXELS))
+        frames = exposed(plan.table + wander, 100 + number)
+        fractions, flux = fractions_of(frames)
         sums = sums.plus(cycle_response(fractions, flux, plan.table, plan.table, plan.used.astype(float)))
     return measured(sums)
 
 
 @pytest.mark.parametrize("patterns", [poke_patterns(MODES, 8.0), hadamard_patterns(MODES, 3.0)])
 def test_r_is_found_within_its_standard_error(patterns: np.ndarray) -> None:
-    I0, H = truth()
     found = calibrated(patterns, 20)
     assert found.reference is not None
     assert found.flux_dn == pytest.approx(FLUX_E, rel=1e-3)
-    made = reconstruct(I0, found.response, found.initial.matrix, np.ones(PIXELS), FLUX_E, 0.0)
+    made = reconstruct(I0, found.response, found.initial.matrix, GOOD, FLUX_E, 0.0)
     deviation = cross_talk(made.matrix, H) / found.error[:, None]
     assert 0.75 < np.sqrt((deviation**2).mean()) < 1.25
     assert np.abs(deviation).max() < 4
@@ -88,44 +93,39 @@ def test_a_drift_does_not_get_into_h() -> None:
 @pytest.mark.parametrize("seed", range(3))
 def test_the_noise_of_h_neither_makes_modes_small_nor_gets_into_r(seed: int) -> None:
     """H is measured so shortly that its pixels' noise is as strong as the modes."""
-    I0, H = truth()
     found = calibrated(poke_patterns(MODES, 0.3), 10)
-    good, variance = np.ones(PIXELS), I0 / FLUX_E
-    plain = reconstruct(I0, found.response, None, good, FLUX_E, 0.0)
-    made = reconstruct(I0, found.response, found.initial.matrix, good, FLUX_E, 0.0)
+    variance = I0 / FLUX_E
+    plain = reconstruct(I0, found.response, None, GOOD, FLUX_E, 0.0)
+    made = reconstruct(I0, found.response, found.initial.matrix, GOOD, FLUX_E, 0.0)
     least = np.sqrt(found.initial.matrix**2 @ variance)
     assert np.diag(cross_talk(plain.matrix, H)).mean() < -0.3
     assert abs(np.diag(cross_talk(made.matrix, H)).mean()) < 3 * found.error.max() / np.sqrt(MODES)
     assert (np.sqrt(made.matrix**2 @ variance) / least).max() < 1 + 3 * found.error.max()
     # one whose weights are wrong, with other modes mixed in, does as well but for its own noise
     mixed = np.random.default_rng(seed).standard_normal((MODES, MODES)) @ reconstructor(
-        I0, H, good, FLUX_E, 0.0, "pinv"
+        I0, H, GOOD, FLUX_E, 0.0, "pinv"
     )
-    other = reconstruct(I0, found.response, mixed, good, FLUX_E, 0.0)
+    other = reconstruct(I0, found.response, mixed, GOOD, FLUX_E, 0.0)
     assert np.abs(cross_talk(other.matrix, H)).max() < 6 * found.error.max()
 
 
 def test_r_answers_to_the_measured_h_and_a_single_cycle_has_no_standard_error() -> None:
-    I0 = truth()[0]
     assert calibrated(hadamard_patterns(MODES, 3.0), 1).error.tolist() == [np.inf] * MODES
     found = calibrated(hadamard_patterns(MODES, 3.0), 4)
-    made = reconstruct(I0, found.response, found.initial.matrix, np.ones(PIXELS), FLUX_E, 0.0)
+    made = reconstruct(I0, found.response, found.initial.matrix, GOOD, FLUX_E, 0.0)
     assert np.allclose(made.matrix @ found.response, np.eye(MODES), atol=1e-9)
     with pytest.raises(ValueError, match="does not tell the modes apart"):
-        reconstruct(I0, found.response, np.zeros((MODES, PIXELS)), np.ones(PIXELS), FLUX_E, 0.0)
+        reconstruct(I0, found.response, np.zeros((MODES, PIXELS)), GOOD, FLUX_E, 0.0)
 
 
 def test_what_a_reconstructor_leaves_out_the_measured_one_leaves_out() -> None:
-    I0, H = truth()
-    good = np.ones(PIXELS)
-    background = normalise_flux(I0, np.ones((PIXELS, 1)), good)[1]
-    blind = reconstructor(I0, H, good, FLUX_E, 2.0, "weighted", background)
+    background = normalise_flux(I0, np.ones((PIXELS, 1)), GOOD)[1]
+    blind = reconstructor(I0, H, GOOD, FLUX_E, 2.0, "weighted", background)
     found = calibrated(hadamard_patterns(MODES, 3.0), 4)
-    assert np.abs(reconstruct(I0, found.response, blind, good, FLUX_E, 2.0).matrix @ background).max() < 1e-9
+    assert np.abs(reconstruct(I0, found.response, blind, GOOD, FLUX_E, 2.0).matrix @ background).max() < 1e-9
 
 
 def test_the_reconstructor_that_sees_a_poke_best_is_taken() -> None:
-    I0, H = truth()
     one = known()
     blind = Initial(np.zeros_like(one.matrix), "blind")
     turned = Initial(known(2).matrix, "of another sensor")
@@ -167,8 +167,7 @@ def test_frames_of_their_own_show_a_wrong_reconstructor() -> None:
 
 
 def test_the_loops_reaction_does_not_bias_h() -> None:
-    I0, H = truth()
-    R = reconstructor(I0, H, np.ones(PIXELS), FLUX_E, 0.0)
+    R = reconstructor(I0, H, GOOD, FLUX_E, 0.0)
     sums, biased = (Sums.none(known()) for _ in range(2))
     rng = np.random.default_rng(7)
     for piece in range(6):
@@ -179,13 +178,13 @@ def test_the_loops_reaction_does_not_bias_h() -> None:
         for row in plan.table:
             wander = 0.99 * wander + 0.5 * rng.standard_normal(MODES)
             seen = before + command  # one frame of delay
-            frame = exposed((seen + wander)[None], int(rng.integers(1 << 31)), I0, H)[0]
+            frame = exposed((seen + wander)[None], int(rng.integers(1 << 31)))[0]
             frames.append(frame)
             moved.append(seen)
             command = command - 0.5 * (R @ (frame / frame.sum() - I0))
             before = row
         poked = np.vstack([np.zeros(MODES), plan.table[:-1]])
-        fractions, flux = normalised(np.array(frames), np.zeros(PIXELS), np.ones(PIXELS))
+        fractions, flux = fractions_of(np.array(frames))
         used = np.ones(len(frames))
         sums = sums.plus(cycle_response(fractions, flux, np.array(moved), poked, used))
         biased = biased.plus(cycle_response(fractions, flux, np.array(moved), np.array(moved), used))
@@ -198,12 +197,11 @@ def test_the_loops_reaction_does_not_bias_h() -> None:
 
 @pytest.mark.parametrize("delay", [1.0, 1.3, 1.5, 2.0, 2.75])
 def test_the_delay_is_found(delay: float) -> None:
-    I0, H = truth()
     poke = dither(1, 8.0, 600, 1, 3).table[:, 0]
     weights = np.concatenate([[0.0], delay_weights(delay)])
     seen = np.convolve(poke, weights)[: len(poke)]
-    frames = exposed(np.outer(seen, [0, 1, 0, 0]), 5, I0, H)
-    fractions, _ = normalised(frames, np.zeros(PIXELS), np.ones(PIXELS))
+    frames = exposed(np.outer(seen, [0, 1, 0, 0]), 5)
+    fractions, _ = fractions_of(frames)
     found = measure_delay(fractions, I0, poke)
     assert abs(found.delay_frames - delay) < min(0.05, 5 * found.error_frames + 1e-3)
     assert found.picture @ H[:, 1] > 0.9 * np.linalg.norm(found.picture) * np.linalg.norm(H[:, 1])
@@ -215,9 +213,8 @@ def test_the_delay_is_found(delay: float) -> None:
 
 @pytest.mark.parametrize("seed", range(5))
 def test_pokes_that_are_not_there_are_not_seen(seed: int) -> None:
-    I0, H = truth()
     poke = dither(1, 8.0, 600, 1, seed).table[:, 0]
-    fractions, _ = normalised(exposed(np.zeros((600, MODES)), seed, I0, H), np.zeros(PIXELS), np.ones(PIXELS))
+    fractions, _ = fractions_of(exposed(np.zeros((600, MODES)), seed))
     with pytest.raises(ValueError, match="pokes are not seen"):
         measure_delay(fractions, I0, poke)
     with pytest.raises(ValueError, match="at least 240 frames"):
@@ -225,11 +222,8 @@ def test_pokes_that_are_not_there_are_not_seen(seed: int) -> None:
 
 
 def test_an_answer_that_comes_too_late_is_said() -> None:
-    I0, H = truth()
     poke = dither(1, 8.0, 600, 1, 3).table[:, 0]
-    fractions, _ = normalised(
-        exposed(np.outer(np.roll(poke, 5), [0, 1, 0, 0]), 5, I0, H), np.zeros(PIXELS), np.ones(PIXELS)
-    )
+    fractions, _ = fractions_of(exposed(np.outer(np.roll(poke, 5), [0, 1, 0, 0]), 5))
     with pytest.raises(ValueError, match="not over after"):
         measure_delay(fractions, I0, poke)
 
@@ -270,45 +264,41 @@ def test_bad_pixels_are_found_and_good_ones_are_not() -> None:
 
 
 def test_a_computed_h_gives_the_reconstructor_that_it_always_gave() -> None:
-    I0, H = truth()
-    good = np.ones(PIXELS)
     for estimator in ("weighted", "pinv"):
-        made = reconstruct(I0, H, None, good, FLUX_E, 2.0, estimator)
-        assert np.allclose(made.matrix, reconstructor(I0, H, good, FLUX_E, 2.0, estimator), rtol=1e-6, atol=1e-9)
+        made = reconstruct(I0, H, None, GOOD, FLUX_E, 2.0, estimator)
+        assert np.allclose(made.matrix, reconstructor(I0, H, GOOD, FLUX_E, 2.0, estimator), rtol=1e-6, atol=1e-9)
 
 
 def test_combinations_that_are_hardly_measured_can_be_left_out_or_damped() -> None:
-    I0, H = truth()
-    H[:, 3] = H[:, 2] + 0.01 * H[:, 3]
-    good = np.ones(PIXELS)
-    whole = reconstruct(I0, H, None, good, FLUX_E, 0.0)
+    faint = np.column_stack([H[:, :3], H[:, 2] + 0.01 * H[:, 3]])
+    whole = reconstruct(I0, faint, None, GOOD, FLUX_E, 0.0)
     assert whole.condition_number > 50
     assert "Z4 and Z5" in advice(whole, (2, 3, 4, 5), 1.0) or "Z5 and Z4" in advice(whole, (2, 3, 4, 5), 1.0)
     assert "no regularisation" in advice(whole, (2, 3, 4, 5), 1e6)
-    cut = reconstruct(I0, H, None, good, FLUX_E, 0.0, truncate=0.05)
+    cut = reconstruct(I0, faint, None, GOOD, FLUX_E, 0.0, truncate=0.05)
     assert np.count_nonzero(cut.kept) == 3
     assert np.linalg.matrix_rank(cut.matrix) == 3
     assert "1 of 4 combinations" in advice(cut, (2, 3, 4, 5), 1.0)
-    damped = reconstruct(I0, H, None, good, FLUX_E, 0.0, tikhonov=0.05)
+    damped = reconstruct(I0, faint, None, GOOD, FLUX_E, 0.0, tikhonov=0.05)
     assert np.linalg.norm(cut.matrix) < np.linalg.norm(damped.matrix) < np.linalg.norm(whole.matrix)
     with pytest.raises(ValueError, match="0 or more and below 1"):
-        reconstruct(I0, H, None, good, FLUX_E, 0.0, truncate=1.0)
+        reconstruct(I0, faint, None, GOOD, FLUX_E, 0.0, truncate=1.0)
     with pytest.raises(ValueError, match="weighted"):
-        reconstruct(I0, H, None, good, FLUX_E, 0.0, "best")
-    of_measured = reconstruct(I0, H, whole.matrix, good, FLUX_E, 0.0, truncate=0.05)
+        reconstruct(I0, faint, None, GOOD, FLUX_E, 0.0, "best")
+    of_measured = reconstruct(I0, faint, whole.matrix, GOOD, FLUX_E, 0.0, truncate=0.05)
     assert np.allclose(of_measured.matrix, cut.matrix, rtol=1e-6, atol=1e-6)
 
 
 def test_too_few_usable_frames_are_said() -> None:
     plan = cycle(poke_patterns(MODES, 8.0), hold=1, settle=0, rest=0)
-    frames = exposed(plan.table, 1, *truth())
-    fractions, flux = normalised(frames, np.zeros(PIXELS), np.ones(PIXELS))
+    frames = exposed(plan.table, 1)
+    fractions, flux = fractions_of(frames)
     with pytest.raises(ValueError, match="do not tell the 4 modes apart"):
         cycle_response(fractions, flux, plan.table, plan.table, (plan.block < 2).astype(float))
     with pytest.raises(ValueError, match="no frame with a poke"):
         cycle_response(fractions, flux, plan.table, plan.table, np.zeros(len(plan)))
     with pytest.raises(ValueError, match="no light"):
-        normalised(np.zeros((3, PIXELS)), np.zeros(PIXELS), np.ones(PIXELS))
+        fractions_of(np.zeros((3, PIXELS)))
 
 
 def test_another_dark_mask_or_reference_gives_a_calibration_that_reads_the_same_modes() -> None:

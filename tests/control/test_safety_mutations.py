@@ -8,9 +8,9 @@ from typing import Any
 
 import numpy as np
 import pytest
-from safety_checks import CASES, LIMITS, check_kept, violations
 
-from lowfc.control import safety
+from lowfc.control.loop import safety
+from tests.support.safety_checks import CASES, LIMITS, check_kept, violations
 
 SOURCE = Path(safety.__file__).read_text(encoding="utf-8")
 
@@ -19,28 +19,16 @@ MUTATIONS = {
     "stroke cut on one side": ("np.clip(kept, -stroke, stroke)", "np.clip(kept, None, stroke)"),
     "stroke cut on the other side": ("np.clip(kept, -stroke, stroke)", "np.clip(kept, -stroke, None)"),
     "stroke without a sign": ("if max(highest_nm, -lowest_nm) > stroke:", "if highest_nm > stroke:"),
-    "stroke without a margin": (
-        "np.float32(self.stroke_nm - margin_nm)",
-        "np.float32(self.stroke_nm + margin_nm)",
-    ),
+    "stroke without a margin": ("np.float32(self.stroke_nm - margin_nm)", "np.float32(self.stroke_nm + margin_nm)"),
     "slew never looked at": ("if max(highest_move, -lowest_move) > slew:", "if False:"),
     "slew without a sign": ("if max(highest_move, -lowest_move) > slew:", "if highest_move > slew:"),
     "slew cut on one side": ("np.clip(move, -slew, slew)", "np.clip(move, None, slew)"),
     "slew cut on the other side": ("np.clip(move, -slew, slew)", "np.clip(move, -slew, None)"),
     "slew from flat": ("kept = previous_nm + move", "kept = move"),
     "slew the wrong way": ("kept = previous_nm + move", "kept = previous_nm - move"),
-    "slew without a margin": (
-        "np.float32(self.slew_nm - margin_nm)",
-        "np.float32(self.slew_nm + margin_nm)",
-    ),
-    "stroke limit for slew": (
-        "np.float32(self.slew_nm - margin_nm)",
-        "np.float32(self.stroke_nm - margin_nm)",
-    ),
-    "neighbours never looked at": (
-        "if highest_nm - lowest_nm > apart_nm and",
-        "if False and",
-    ),
+    "slew without a margin": ("np.float32(self.slew_nm - margin_nm)", "np.float32(self.slew_nm + margin_nm)"),
+    "stroke limit for slew": ("np.float32(self.slew_nm - margin_nm)", "np.float32(self.stroke_nm - margin_nm)"),
+    "neighbours never looked at": ("if highest_nm - lowest_nm > apart_nm and", "if False and"),
     "neighbours looked at where twice as far apart": (
         "if highest_nm - lowest_nm > apart_nm and",
         "if highest_nm - lowest_nm > 2 * apart_nm and",
@@ -49,14 +37,8 @@ MUTATIONS = {
         "apart_nm = limits.neighbour_nm - limits.margin_nm / 2",
         "apart_nm = limits.neighbour_nm + limits.margin_nm",
     ),
-    "neighbours in a column only": (
-        "float(max(rows, columns))",
-        "float(rows)",
-    ),
-    "neighbours in a row only": (
-        "float(max(rows, columns))",
-        "float(columns)",
-    ),
+    "neighbours in a column only": ("float(max(rows, columns))", "float(rows)"),
+    "neighbours in a row only": ("float(max(rows, columns))", "float(columns)"),
     "neighbours without a sign": (
         "np.abs(actuators_nm[1:] - actuators_nm[:-1])",
         "(actuators_nm[1:] - actuators_nm[:-1])",
@@ -88,17 +70,16 @@ MUTATIONS = {
     "dead-man asleep": ("not 0 <= age_ns <= valid_for_ns", "False"),
     "dead-man trusts the clock": ("not 0 <= age_ns <= valid_for_ns", "age_ns > valid_for_ns"),
     "clear closes": ("(LoopMode.OPEN if calibrated", "(LoopMode.CLOSED if calibrated"),
-    "clear in any mode": ('case "clear" if mode is LoopMode.SAFED:', 'case "clear" if True:'),
-    "safed is not latched": ('case "open" | "close" if mode is LoopMode.SAFED:', 'case "open" | "close" if False:'),
+    "clear in any mode": ('case "clear" if mode is LoopMode.SAFE:', 'case "clear" if True:'),
+    "safed is not latched": ('case "open" | "close" if mode is LoopMode.SAFE:', 'case "open" | "close" if False:'),
     "close without calibration": ('case "close" if not calibrated:', 'case "close" if False:'),
-    "safe can be refused": ('return LoopMode.SAFED, ""', 'return (LoopMode.SAFED if calibrated else mode), ""'),
+    "safe can be refused": ('return LoopMode.SAFE, ""', 'return (LoopMode.SAFE if calibrated else mode), ""'),
 }
 
 
 def module_of(source: str) -> ModuleType:
     """The safety module from this source, beside the real one."""
     spec = importlib.util.spec_from_loader("mutated_safety", loader=None)
-    assert spec is not None
     module = importlib.util.module_from_spec(spec)
     sys.modules[module.__name__] = module  # dataclasses look their module up
     try:
@@ -144,11 +125,11 @@ def _check_modes(module: Any) -> None:
     mode, ask = module.LoopMode, module.request_mode
     for now in mode:
         for calibrated in (True, False):
-            assert ask(now, "safe", calibrated)[0] is mode.SAFED
-            cleared = (mode.OPEN if calibrated else mode.IDLE) if now is mode.SAFED else now
+            assert ask(now, "safe", calibrated)[0] is mode.SAFE
+            cleared = (mode.OPEN if calibrated else mode.IDLE) if now is mode.SAFE else now
             assert ask(now, "clear", calibrated)[0] is cleared
-            free = calibrated and now is not mode.SAFED
-            opened = mode.SAFED if now is mode.SAFED else mode.OPEN if calibrated else mode.IDLE
+            free = calibrated and now is not mode.SAFE
+            opened = mode.SAFE if now is mode.SAFE else mode.OPEN if calibrated else mode.IDLE
             assert ask(now, "open", calibrated)[0] is opened
             assert ask(now, "close", calibrated)[0] is (mode.CLOSED if free else now)
 

@@ -1,34 +1,23 @@
 """Tuned laws: Gendron and Lena against theory, LQG and notches on the reaction wheel, in images and without."""
 
-import json
-from types import ModuleType
-
-import measure_laws
-import measure_slow_modes
 import numpy as np
 import pytest
-from law_bench import Bench, calibrated, configured, tuned, with_lines_moved
-from test_linear_law import integrators, run
-from test_vibration import NM_PER_MAS, RATE_HZ, realised
 
-from lowfc.control import stability
-from lowfc.control.linear_law import LinearLaw
-from lowfc.control.margins import margins
-from lowfc.control.spectra import Pieces
-from lowfc.control.stability import LEAST_GAIN_MARGIN, LEAST_PHASE_MARGIN_DEG, highest_gain
-from lowfc.control.tuning import (
-    best_gains,
-    identified,
-    left_of,
-    tune_integrator,
-    tune_lqg,
-    tune_pi_notch,
-)
-from lowfc.control.vibration import Model
+from lowfc.control.laws.linear_law import LinearLaw
+from lowfc.control.laws.margins import margins
+from lowfc.control.laws.spectra import Pieces
+from lowfc.control.laws.stability import LEAST_GAIN_MARGIN, LEAST_PHASE_MARGIN_DEG, highest_gain
+from lowfc.control.laws.tuning import best_gains, identified, left_of, tune_integrator, tune_lqg, tune_pi_notch
+from lowfc.control.laws.vibration import Model
+from lowfc.optics.detector.photometry import tilt_nm_per_mas
 from sim_camera.disturbance import disturbance, modes_nm
 from sim_camera.process import disturbance_of
+from tests.support.theory import integrators, noise_transfer, realised, rejection, run
+from tools import laws
+from tools.law_bench import Bench, calibrated, configured, tuned, with_lines_moved
 
-NOLL = (2, 3)
+NOLL, RATE_HZ = (2, 3), 1000.0
+NM_PER_MAS = tilt_nm_per_mas(2.0)
 NONE = np.zeros(2)
 
 
@@ -63,7 +52,7 @@ def test_the_best_gain_is_that_of_theory() -> None:
     hz = omega * RATE_HZ / (2 * np.pi)
 
     def left(gain: float) -> float:
-        S, T = (of(hz, RATE_HZ, gain, 0.0, 1.0) ** 2 for of in (stability.rejection, stability.noise_transfer))
+        S, T = (of(hz, RATE_HZ, gain, 0.0, 1.0) ** 2 for of in (rejection, noise_transfer))
         return float(np.trapezoid(S * model.spectrum_nm2(omega) + T, omega) / np.pi)
 
     gains = np.linspace(0.02, 0.6, 59)
@@ -158,7 +147,7 @@ def test_lqg_is_near_its_theory_and_follows_lines_that_moved(delay: float) -> No
     bench.run(10_000)
     got = bench.tilt_mas(5000)
     assert got < (1.0 if delay == 1 else 2.0)
-    assert got < 1.15 * float(np.hypot(*measure_laws.theory_mas(config, calibration, law)))
+    assert got < 1.15 * float(np.hypot(*laws.theory_mas(config, calibration, law)))
 
     moved = Bench(config, calibration, with_lines_moved(disturbance_of(config), 1.02))
     moved.load(law)
@@ -191,9 +180,3 @@ def test_capture_from_14_mas_on_100_seeds() -> None:
         fresh.run(3500)
         left[seed] = fresh.tilt_mas(500)
     assert {seed: mas for seed, mas in left.items() if mas >= 1.0} == {}
-
-
-@pytest.mark.parametrize("by", [measure_laws, measure_slow_modes])
-def test_the_documents_table_is_that_of_its_figures(by: ModuleType) -> None:
-    table = by.DOCUMENT.read_text().partition(by.BEGIN)[2].partition(by.END)[0]
-    assert table == by.render(json.loads(by.MEASURED.read_text()))

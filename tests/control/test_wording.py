@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from lowfc.contract.events import EVENTS
-from lowfc.control.safety import LoopMode
-from lowfc.control.wording import counted
+from lowfc.control.loop.safety import LoopMode
+from lowfc.control.loop.wording import counted
 
 
 @pytest.mark.parametrize(

@@ -2,7 +2,7 @@
 
 import pytest
 
-from lowfc.adapters.masks import load_pupil
+from lowfc.adapters.files.sensors import load_pupil
 from lowfc.design.sam_merit import Optics, build_optics
 
 

@@ -12,17 +12,17 @@ import pytest
 from rich.console import Console
 from typer.testing import CliRunner
 
-from lowfc.adapters.layouts import SHIPPED, load_layout
-from lowfc.adapters.terminal import new_app
+from lowfc.adapters.files.layouts import SHIPPED, load_layout
+from lowfc.adapters.process.terminal import new_app
 from lowfc.contract.errors import ConfigurationError, DataFileError, LowfcError
 from lowfc.design.sam_search import BLOCK
-from lowfc.optics.sam import Layout
+from lowfc.optics.chain.sam import Layout
 from lowfc.programs.design import sam as program
 from lowfc.programs.design import sam_executors as executors
 from lowfc.programs.design.command import design_app
 from lowfc.programs.design.sam_executors import Here, open_executor
 from lowfc.programs.design.sam_files import front, read_state
-from lowfc.programs.design.sam_request import Search, command_of, request
+from lowfc.programs.design.sam_request import Search
 
 RECORDED = {
     name: entry["command"] for name, entry in json.loads(SHIPPED.read_text())["layouts"].items() if "command" in entry
@@ -44,8 +44,7 @@ class Interrupted(Executor):
 
 
 def searched(**options) -> Search:
-    defaults = {"estimator": None, "modes": 14, "weight": None, "focal_mask": None, "gap": 0.01, "edge": 0.0}
-    return request(**{**defaults, "symmetry": "none", "name": "small", **SMALL, **options})
+    return Search(**{"name": "small", **SMALL, **options})
 
 
 def run(search, folder, executor, chains=None, console=None, **files):
@@ -228,7 +227,7 @@ def test_the_command_records_itself_and_finds_the_same_again(tmp_path, monkeypat
     again = cli(*words[3:], "--jobs", 1, "--out", "again.json")
     assert again.exit_code == 0, again.output
     assert json.loads((tmp_path / "again.json").read_text())["layouts"]["sam"] == first
-    assert command_of(searched()) in program.render({**result, "command": command_of(searched())})
+    assert result["command"] in program.render(result)
 
 
 @pytest.mark.parametrize(

@@ -4,8 +4,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from lowfc.adapters.layouts import load_layout
-from lowfc.adapters.masks import load_pupil
+from lowfc.adapters.files.layouts import load_layout
+from lowfc.adapters.files.sensors import load_pupil
 from lowfc.contract.configuration import SensorSection
 from lowfc.design.sam_goal import MERITS, Goal, figures, merit, paper_ratios
 from lowfc.design.sam_merit import (
@@ -16,13 +16,13 @@ from lowfc.design.sam_merit import (
     signal,
     table3_waves,
 )
-from lowfc.optics.band import monochromatic, uniform
-from lowfc.optics.focal_mask import disk
-from lowfc.optics.fourier import to_image, to_pupil
-from lowfc.optics.grid import OPEN_AREA, pupil_axis
-from lowfc.optics.photometry import Photometry, electrons, tilt_nm_per_mas
-from lowfc.optics.sam import Layout, transmission
-from lowfc.optics.zernike import NOLLS_20, zernikes
+from lowfc.optics.chain.band import monochromatic, uniform
+from lowfc.optics.chain.focal_mask import disk
+from lowfc.optics.chain.fourier import to_image, to_pupil
+from lowfc.optics.chain.grid import OPEN_AREA, pupil_axis
+from lowfc.optics.chain.sam import Layout, transmission
+from lowfc.optics.chain.zernike import NOLLS_20, zernikes
+from lowfc.optics.detector.photometry import Photometry, electrons, tilt_nm_per_mas
 
 RECORDED_TABLES = Path(__file__).parents[2] / "docs" / "paper.json"
 

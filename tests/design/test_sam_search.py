@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 from lowfc.design import sam_search
 from lowfc.design.sam_goal import Goal, merit
 from lowfc.design.sam_search import BLOCK, Bounds, advance, holes, images, start
-from lowfc.optics.sam import Layout, check
+from lowfc.optics.chain.sam import Layout, check
 
 
 @st.composite

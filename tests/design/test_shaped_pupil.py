@@ -12,7 +12,7 @@ from scipy.optimize import linprog
 from scipy.special import j0, j1
 from typer.testing import CliRunner
 
-from lowfc.adapters.masks import load_pupil
+from lowfc.adapters.files.sensors import load_pupil
 from lowfc.contract.errors import ConfigurationError, DataFileError
 from lowfc.design import shaped_pupil
 from lowfc.design.linear_program import NotSolvedError
@@ -24,9 +24,9 @@ from lowfc.design.shaped_pupil import (
     relative_field,
     stored,
 )
-from lowfc.optics.fourier import to_image
-from lowfc.optics.grid import OPEN_AREA, SAMPLES, image_axis, pupil_axis
-from lowfc.optics.pupil import circle, from_quarter
+from lowfc.optics.chain.fourier import to_image
+from lowfc.optics.chain.grid import OPEN_AREA, SAMPLES, image_axis, pupil_axis
+from lowfc.optics.chain.pupil import circle, from_quarter
 from lowfc.programs.design.command import design_app
 
 SMALL = Request(outer=8.0, cells=16)
@@ -201,7 +201,7 @@ def test_a_file_that_cannot_be_written_is_said_first(tmp_path):
 
 
 def test_ctrl_c_stops_within_a_program_and_leaves_no_file(tmp_path):
-    source = "from lowfc.adapters.terminal import run_app; from lowfc.programs.design.command import design_app"
+    source = "from lowfc.adapters.process.terminal import run_app; from lowfc.programs.design.command import design_app"
     command = [sys.executable, "-c", f"{source}; run_app(design_app)", "spc", "--outer", "12"]
     command += ["--out", str(tmp_path / "spc.npz")]
     with subprocess.Popen(command, stderr=subprocess.PIPE, text=True) as process:

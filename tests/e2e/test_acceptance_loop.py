@@ -4,7 +4,8 @@ import json
 from pathlib import Path
 
 import pytest
-from loops import interrupt, recorded_bytes, run, start, until
+
+from tests.support.loops import interrupt, recorded_bytes, run, start, until
 
 TOML = """
 [star]

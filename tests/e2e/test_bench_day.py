@@ -7,9 +7,11 @@ from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
-from loops import LOWFC, children, interrupt, start, until
 
 from lowfc.client import running
+from tests.support.loops import LOWFC, children, interrupt, start, until
+
+pytestmark = pytest.mark.exclusive
 
 COMPUTED = (
     "lowfc calibrate --method analytic --config lowfc.toml --out computed.fits",

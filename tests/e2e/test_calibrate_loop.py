@@ -6,11 +6,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from loops import interrupt, run, start, until
 
-from lowfc.adapters import calibration_file
+from lowfc.adapters.files import calibration_file
 from lowfc.client import Client, running
-from lowfc.control.response_fit import cross_talk
+from lowfc.control.calibration.response_fit import cross_talk
+from tests.support.loops import interrupt, run, start, until
+
+pytestmark = pytest.mark.exclusive
 
 CONFIG = """
 [sensor]
@@ -25,7 +27,7 @@ delay_frames = 1.5
 preset = "quiet"
 [realtime]
 priority = 0
-stay_awake = false
+disable_cpu_idle = false
 """
 
 
@@ -36,7 +38,7 @@ modes = 6
 preset = "bench"
 [realtime]
 priority = 0
-stay_awake = false
+disable_cpu_idle = false
 """
 
 

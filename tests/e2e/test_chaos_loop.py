@@ -6,9 +6,11 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from loops import LOWFC, run
 
-from lowfc.programs.chaos.cases import CASES
+from lowfc.programs.reliability.chaos.cases import CASES
+from tests.support.loops import LOWFC, run
+
+pytestmark = pytest.mark.exclusive
 
 QUICK = ("frames-random",)
 STALLS = tuple(name for name in CASES if name.startswith("stall-"))

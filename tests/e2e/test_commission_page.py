@@ -6,12 +6,14 @@ import shutil
 from pathlib import Path
 
 import pytest
-from loops import until
-from test_own_hardware import ROOT, listening, running, started
 
-from lowfc.adapters import calibration_file
+from lowfc.adapters.files import calibration_file
 from lowfc.client import Client
 from lowfc.contract.messages import FRAME, MIRROR_STATE
+from tests.e2e.test_own_hardware import ROOT, listening, running, started
+from tests.support.loops import until
+
+pytestmark = pytest.mark.exclusive
 
 TEXT = (ROOT / "docs/commissioning.md").read_text()
 COMMANDS = re.findall(r"^    ((?:python|lowfc) .*)$", TEXT, flags=re.MULTILINE)

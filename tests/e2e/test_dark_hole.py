@@ -5,11 +5,11 @@ import json
 import numpy as np
 import numpy.typing as npt
 import pytest
-from loops import payloads, run
-from measure_zero_point import PLAIN, SHIFTED, STEPS, Night, dark_hole
 
-from lowfc.contract.calibration_codec import decode_calibration
+from lowfc.contract.codecs.calibration_codec import decode_calibration
 from lowfc.contract.messages import CALIBRATION, COMMAND, OFFLOAD, STEP, wire
+from tests.support.loops import payloads, run
+from tools.dark_hole import PLAIN, SHIFTED, STEPS, Night, dark_hole
 
 GRID = (34, 34)
 DEAD = (352, 561, 595, 757)

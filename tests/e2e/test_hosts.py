@@ -14,17 +14,18 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
-import networks
 import pytest
-from networks import ROUTER_ADDRESS, Host, Lab
 
-from lowfc.adapters import calibration_file, instrument
-from lowfc.adapters.access import ROUTER, roles
-from lowfc.adapters.certificates import make_certificates
+from lowfc.adapters.bus.access import ROUTER, roles
+from lowfc.adapters.bus.certificates import make_certificates
+from lowfc.adapters.files import calibration_file, factory
 from lowfc.contract.configuration import load
+from tests.support import networks
+from tests.support.networks import ROUTER_ADDRESS, Host, Lab
 
 pytestmark = [
     pytest.mark.slow,
+    pytest.mark.exclusive,
     pytest.mark.skipif(not networks.possible(), reason="network namespaces cannot be made here"),
 ]
 
@@ -44,7 +45,7 @@ gain = 0.3
 [realtime]
 priority = 0
 recorder_priority = 0
-stay_awake = false
+disable_cpu_idle = false
 [recorder]
 min_free_mb = 10
 [network]
@@ -54,7 +55,7 @@ certificates = "CERTIFICATES"
 SHIFTS_NS = {"camera": 37_000_000, "controller": -250_000_000, "mirror": 3_000_000_000, "desk": -1_000_000}
 PLACES = {"camera": "camera", "controller": "controller", "mirror-dm": "mirror", "recorder": "desk"}
 """Process -> host."""
-HERE = Path(__file__).parent
+SUPPORT = Path(__file__).parents[1] / "support"
 ROLES = roles(["mirror-dm"])
 
 
@@ -74,8 +75,8 @@ class Bench:
         make_certificates(self.authority, (ROUTER, *ROLES), [ROUTER_ADDRESS])
         (folder / "lowfc.toml").write_text(TOML)
         config = load(folder / "lowfc.toml")
-        optics = instrument.twin(config, None, print)
-        calibration = instrument.analytic_calibration(config, optics, instrument.mirror_on_twin(config, optics, print))
+        optics = factory.twin(config, None, print)
+        calibration = factory.analytic_calibration(config, optics, factory.mirror_on_twin(config, optics, print))
         self.lab = Lab(folder, SHIFTS_NS)
         for host in self.lab.hosts.values():
             (host.folder / "lowfc.toml").write_text(TOML.replace("CERTIFICATES", str(host.folder / "certs")))
@@ -98,7 +99,7 @@ class Bench:
             self.begin(self.lab[place], name)
         self.begin(self.lab.middle, "router")
         config = str(self.lab.middle.folder / "lowfc.toml")
-        self.lab.middle.start("observer", str(HERE / "host_observer.py"), RUN, config, "viewer")
+        self.lab.middle.start("observer", str(SUPPORT / "host_observer.py"), RUN, config, "viewer")
 
     def begin(self, host: Host, name: str) -> None:
         host.start(name, *self.line(host, name))
@@ -128,7 +129,7 @@ class Bench:
         deadline_s = time.monotonic() + timeout_s
         while not condition():
             self.check_alive()
-            assert time.monotonic() < deadline_s, f"waited in vain for {what}: {self.newest()}\n{self.last_words()}"
+            assert time.monotonic() < deadline_s, f"waited in vain for {what}: {self.newest()}\n{self.stderr_tail()}"
             time.sleep(0.05)
 
     def settled(self, timeout_s: float = 40) -> None:
@@ -147,7 +148,7 @@ class Bench:
             for name, child in host.children.items():
                 assert child.status is None, f"{name} on {host.name} ended: {host.said(name)}"
 
-    def last_words(self) -> str:
+    def stderr_tail(self) -> str:
         everybody = [(host, name) for host in self.lab.hosts.values() for name in host.children if name != "observer"]
         return "\n".join(f"{name}: {host.said(name)[-400:]}" for host, name in everybody)
 
@@ -436,7 +437,7 @@ def test_a_second_controller_is_refused(bench: Bench) -> None:
 HELD = """
 import signal, sys, time
 from pathlib import Path
-from networks import Lab
+from tests.support.networks import Lab
 signal.signal(signal.SIGINT, signal.default_int_handler)  # tests in the background of a shell would leave it ignored
 lab = Lab(Path(sys.argv[1]), {"one": 0, "two": 0})
 sleeper = lab["one"].start("sleeper", "-c", "import time; time.sleep(600)")
@@ -447,7 +448,7 @@ time.sleep(600)
 
 @pytest.mark.parametrize("how", [signal.SIGINT, signal.SIGTERM, signal.SIGKILL])
 def test_hosts_are_gone_however_the_test_ends(tmp_path: Path, how: signal.Signals) -> None:
-    environment = os.environ | {"PYTHONPATH": str(HERE)}
+    environment = os.environ | {"PYTHONPATH": str(SUPPORT.parents[1])}
     words = [sys.executable, "-c", HELD, str(tmp_path)]
     with subprocess.Popen(words, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, env=environment) as holder:
         assert holder.stdout is not None

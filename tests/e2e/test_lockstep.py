@@ -6,13 +6,13 @@ import signal
 from pathlib import Path
 
 import pytest
-from loops import children, loop, payloads, recorded_bytes, run, start, until
 
-from lowfc.adapters.log_selection import EVERYTHING
+from lowfc.adapters.logs.selection import EVERYTHING
 from lowfc.contract.configuration import load
 from lowfc.contract.messages import topic_of
-from lowfc.programs.recording.volume import bytes_per_s
+from lowfc.programs.core.recording.volume import bytes_per_s
 from sim_camera.prediction import tilt_residual_mas
+from tests.support.loops import children, loop, payloads, recorded_bytes, run, start, until
 
 GENTLE = """
 [camera]
@@ -42,14 +42,14 @@ def test_two_runs_with_one_seed_write_the_same_bytes_and_have_one_digest(tmp_pat
     digests = [info["digest"] for info in infos]
     assert digests[0] == digests[1] != digests[2]
     assert {key for key, line in infos[0]["topics"].items() if "digest" not in line} == {
-        key for key in infos[0]["topics"] if not topic_of(key).timeless
+        key for key in infos[0]["topics"] if not topic_of(key).deterministic
     }
     assert "lowfc/event" not in {key for key, line in infos[0]["topics"].items() if "digest" in line}
     config = load(None, {"camera.rate_hz": 1000.0})
     constant = sum(infos[0]["attachments"].values()) + infos[0]["topics"]["lowfc/calibration"]["bytes"]
     growth = (infos[0]["bytes"] - constant) / 0.5  # bytes in a second of simulated time
     assert bytes_per_s(config, EVERYTHING) == pytest.approx(growth, rel=0.25)
-    one, two, other = ({t: p for t, p in log.items() if topic_of(t[1:]).timeless} for log in logs)
+    one, two, other = ({t: p for t, p in log.items() if topic_of(t[1:]).deterministic} for log in logs)
     assert one.keys() == two.keys()
     assert len(one["/lowfc/camera/frame"]) == 500
     for topic, values in one.items():

@@ -1,20 +1,26 @@
-"""A user's mistakes: one clear message, exit status 2, nothing half done."""
+"""A user's mistakes: one clear message, exit status 2, nothing half done; most by the command line in this process."""
 
+import contextlib
+import io
 import json
 import os
 import signal
 import socket
 import subprocess
+import sys
 import time
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import pytest
-from loops import LOWFC, run
 
-from lowfc.adapters import calibration_file, instrument
-from lowfc.adapters.log_writer import LogWriter
-from lowfc.adapters.run import open_run
+from lowfc.adapters.bus.run import open_run
+from lowfc.adapters.files import calibration_file, factory
+from lowfc.adapters.logs.writer import LogWriter
 from lowfc.contract.configuration import load
+from lowfc.programs.cli.main import main
+from tests.support.loops import LOWFC, run
 
 SHORT = ["sim-loop", "--duration", "0.1"]
 
@@ -59,17 +65,19 @@ def test_a_layout(tmp_path: Path, content: str, expected: str) -> None:
 
 def test_an_even_symmetric_layout_is_warned_about(tmp_path: Path) -> None:
     (tmp_path / "mask.json").write_text(layout(holes=[[0.3, 0.1], [-0.3, -0.1], [0.1, -0.3], [-0.1, 0.3]]))
-    complaints = _refused(tmp_path, *SHORT, "--sensor", "mask.json:mine", expected="cannot tell the modes apart")
+    complaints = _refused(
+        tmp_path, *SHORT, "--sensor", "mask.json:mine", expected="cannot tell the modes apart", by=run
+    )
     assert "warning: " in complaints
     assert "even" in complaints
 
 
 def test_a_calibration(tmp_path: Path) -> None:
     missing = ["controller", "--run", "mistakes", "--calibration", "none.fits"]
-    _refused(tmp_path, *missing, expected="there is no such calibration file")
+    _refused(tmp_path, *missing, expected="there is no such calibration file", by=run)
     config = load(None)
-    optics = instrument.twin(config, None, print)
-    found = instrument.analytic_calibration(config, optics, instrument.mirror_on_twin(config, optics, print))
+    optics = factory.twin(config, None, print)
+    found = factory.analytic_calibration(config, optics, factory.mirror_on_twin(config, optics, print))
     whole = calibration_file.to_bytes(found)
     for name, content in (("cut", whole[: len(whole) // 2]), ("text", b"hello"), ("flipped", _flip(whole))):
         (tmp_path / f"{name}.fits").write_bytes(content)
@@ -82,7 +90,9 @@ def test_a_port_in_use(tmp_path: Path) -> None:
         with socket.socket() as taken:
             taken.bind(("127.0.0.1", held.links.ports["recorder"]))
             taken.listen()
-            said = _refused(tmp_path, "record", "--run", "mistakes-port", expected=str(held.links.ports["recorder"]))
+            said = _refused(
+                tmp_path, "record", "--run", "mistakes-port", expected=str(held.links.ports["recorder"]), by=run
+            )
         assert "Address already in use" in said
         assert ".rs" not in said
         assert "cargo" not in said
@@ -103,14 +113,33 @@ def _flip(content: bytes) -> bytes:
     return content[:middle] + bytes([content[middle] ^ 0x10]) + content[middle + 1 :]
 
 
-def _refused(folder: Path, *arguments: str, expected: str, config: str = "") -> str:
-    done = run(folder, *arguments, config=config)
+def _here(folder: Path, *arguments: str, config: str = "") -> "subprocess.CompletedProcess[str]":
+    """As `run`, in this process, whose signals stay as they were."""
+    if config:
+        (folder / "test.toml").write_text(config)
+        arguments = (*arguments, "--config", "test.toml")
+    handlers = {number: signal.getsignal(number) for number in (signal.SIGTERM, signal.SIGINT, signal.SIGUSR1)}
+    told, complained = io.StringIO(), io.StringIO()
+    with pytest.MonkeyPatch.context() as patch, contextlib.chdir(folder):
+        patch.setattr(sys, "argv", ["lowfc", *arguments])
+        with contextlib.redirect_stdout(told), contextlib.redirect_stderr(complained):
+            try:
+                with pytest.raises(SystemExit) as end:
+                    main()
+            finally:
+                for number, handler in handlers.items():
+                    signal.signal(number, handler)
+    return subprocess.CompletedProcess(arguments, int(end.value.code or 0), told.getvalue(), complained.getvalue())
+
+
+def _refused(folder: Path, *arguments: str, expected: str, config: str = "", by: Callable[..., Any] = _here) -> str:
+    done = by(folder, *arguments, config=config)
     assert done.returncode == 2, done.stderr
     assert expected in done.stderr
     assert "Traceback" not in done.stderr
     assert not done.stdout
     assert not (folder / "logs").exists()
-    return done.stderr
+    return str(done.stderr)
 
 
 def test_a_full_disk_on_standard_output_is_one_line(tmp_path: Path) -> None:
@@ -141,8 +170,8 @@ def test_ctrl_c_while_it_loads_is_quiet(tmp_path: Path) -> None:
         (("replay", "circle"), "circle cannot be read: Too many levels of symbolic links"),
         (("config", "check", "/dev/zero"), "/dev/zero: not a readable TOML file: not a regular file"),
         (("config", "check", "brackets.toml"), "nested too deeply"),
-        (("replay", "night.mcap", "--speed", "2"), "belong to --publish"),
-        (("replay", "night.mcap", "--publish", "--what-if", "gain=1"), "three different things"),
+        (("replay", "night.mcap", "--speed", "2"), "lowfc publish LOG --run NAME"),
+        (("replay", "night.mcap", "--what-if", "gain=1"), "lowfc what-if LOG --set gain=0.3"),
         (("recover", "night.mcap", "header.mcap", "--json"), "name one"),
         (("bench", "record", "--folder", "nowhere"), "nowhere cannot be written"),
     ],
@@ -155,7 +184,7 @@ def test_logs(tmp_path: Path, words: tuple[str, ...], expected: str) -> None:
     (tmp_path / "circle").symlink_to("circle")
     (tmp_path / "brackets.toml").write_text("a = " + "[" * 100_000)
     before = sorted(path.name for path in tmp_path.iterdir())
-    done = run(tmp_path, *words)
+    done = _here(tmp_path, *words)
     assert done.returncode == 2, done.stdout
     assert expected in done.stderr
     assert len(done.stderr.splitlines()) == 1

@@ -17,19 +17,21 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from loops import LOWFC, children, interrupt, payloads, recorded_bytes, run, start, until
-from safety_checks import violations
 from typer.testing import CliRunner
 
-from lowfc.adapters import calibration_file, law_file
+from lowfc.adapters.files import calibration_file, law_file
 from lowfc.client import Client, running
+from lowfc.client.requests import ASKED
 from lowfc.contract.errors import CalibrationError, RequestRefusedError
 from lowfc.contract.messages import COMMAND, EVENT, REQUEST, Log, wire
-from lowfc.control.linear_law import integrator_block, of_blocks
-from lowfc.control.requests import REQUESTS
-from lowfc.control.safety import Limits
-from lowfc.programs.ctl.command import SIGNAL, ctl_app
-from lowfc.programs.ctl.requests import ASKED
+from lowfc.control.laws.linear_law import integrator_block, of_blocks
+from lowfc.control.loop.requests import REQUESTS
+from lowfc.control.loop.safety import Limits
+from lowfc.programs.cli.ctl.command import SIGNAL, ctl_app
+from tests.support.loops import LOWFC, children, interrupt, payloads, recorded_bytes, run, start, until
+from tests.support.safety_checks import violations
+
+pytestmark = pytest.mark.exclusive
 
 DOCUMENT = Path(__file__).parents[2] / "docs" / "operating.md"
 COMMANDS = re.findall(r"^    (lowfc ctl .*)$", DOCUMENT.read_text(), flags=re.MULTILINE)
@@ -116,7 +118,7 @@ def _the_rest(night: Night) -> None:
     """What the document has no command for: plays, refusals, JSON, and a process of its own."""
     with Client(night.name) as loop:
         grid = loop.calibration().grid
-        loop.open()
+        loop.open_loop()
         shapes = np.zeros((2, *grid))
         shapes[0, 10:20, 10:20], shapes[1, 5:9, 20:30] = 2.0, -3.0
         steps = loop.steps(60)
@@ -145,7 +147,7 @@ def _the_rest(night: Night) -> None:
             night.said["while reserved"] = night.ctl("lowfc ctl status")
             loop.gain(0.05)
             loop.check_lease()
-            other.open()
+            other.open_loop()
             with pytest.raises(CalibrationError, match="operator asked to open"):
                 loop.check_lease()
         loop.close_loop()
@@ -241,7 +243,7 @@ def test_the_log_has_every_request_and_nothing_was_lost(night: Night) -> None:
     commanded = Counter(command.split()[2] for command in COMMANDS)
     for name, count in commanded.items():
         assert name == "record" or sum(counts[name, good] for good in (True, False)) >= count
-    taken = [request.taken for request in requests if request.taken]
+    taken = [request.input_number for request in requests if request.input_number]
     assert taken == sorted(taken)
     events = [Log.FromString(body).message for found in messages for body in found[f"/{EVENT.key}"]]
     for wanted in (

@@ -10,13 +10,15 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from loops import until
 
-from lowfc.adapters.bus import Sample
-from lowfc.adapters.clock import HostClock
-from lowfc.adapters.run import open_run
-from lowfc.adapters.zenoh_bus import ZenohBus
+from lowfc.adapters.bus.bus import Sample
+from lowfc.adapters.bus.run import open_run
+from lowfc.adapters.bus.zenoh_bus import ZenohBus
+from lowfc.adapters.process.clock import HostClock
 from lowfc.contract.messages import FRAME, MIRROR_STATE, STEP, Role, wire
+from tests.support.loops import until
+
+pytestmark = pytest.mark.exclusive
 
 ROOT = Path(__file__).parents[2]
 BENCH = """
@@ -146,6 +148,10 @@ def test_the_loop_closes_on_a_camera_and_a_mirror_of_ones_own(bench: Path) -> No
             before_nm = rms_nm()
             assert "loop closed" in said(bench, LOOP[1])
             until(lambda: rms_nm() < 0.1 * before_nm)
+        states: list[wire.MirrorState] = []
+        bus.subscribe(MIRROR_STATE, lambda sample: states.append(wire.MirrorState.FromString(sample.payload)))
+        until(lambda: states and not np.frombuffer(states[-1].actuators, np.float32).any())
+        assert not states[-1].command_nm, "a flat mirror that names a command: the next controller takes it for a shape"
     assert before_nm == pytest.approx(17, rel=0.15)
 
 
@@ -159,4 +165,4 @@ def test_the_simulated_devices_and_a_camera_in_plain_zenoh_keep_the_contract(ben
     with running(bench, *SIMULATED, PLAIN[1]):
         with listening() as bus:
             heard(bus)
-        conformance(bench, *CONFORMANCE, CONFORMANCE[0].replace("bench", "plain"))
+        conformance(bench, *CONFORMANCE, CONFORMANCE[0].partition(" --config")[0].replace("bench", "plain"))

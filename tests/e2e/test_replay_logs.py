@@ -11,21 +11,23 @@ from typing import Any
 
 import numpy as np
 import pytest
-from loops import LOWFC, loop, run, until
 
-from lowfc.adapters.bus import Sample
-from lowfc.adapters.clock import HostClock
-from lowfc.adapters.log_reader import LogReader
-from lowfc.adapters.log_writer import LogWriter
-from lowfc.adapters.run import Run, new_run_id, open_run
-from lowfc.adapters.zenoh_bus import ZenohBus
+from lowfc.adapters.bus.bus import Sample
+from lowfc.adapters.bus.run import Run, new_run_id, open_run
+from lowfc.adapters.bus.zenoh_bus import ZenohBus
+from lowfc.adapters.logs.reader import LogReader
+from lowfc.adapters.logs.writer import LogWriter
+from lowfc.adapters.process.clock import HostClock
 from lowfc.contract.messages import CONTROLLER_STATE, STEP, wire
-from lowfc.programs.replay.workers import replay_files
+from lowfc.programs.logs.replay.workers import replay_files
+from tests.support.loops import LOWFC, loop, run, until
+
+pytestmark = pytest.mark.exclusive
 
 # A camera that loses one frame in a hundred on the way, as a bad cable does.
 LOSSY_CAMERA = """
 import sys
-from lowfc.adapters.zenoh_bus import ZenohPublisher
+from lowfc.adapters.bus.zenoh_bus import ZenohPublisher
 from lowfc.contract.messages import FRAME
 from sim_camera.__main__ import main
 
@@ -91,7 +93,7 @@ HELD = """
 [control]
 start_mode = "closed"
 [mirror]
-expired = "hold"
+on_command_timeout = "hold"
 """
 
 

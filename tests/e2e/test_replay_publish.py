@@ -10,14 +10,13 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from loops import LOWFC, loop, until
 
-from lowfc.adapters.bus import Sample
-from lowfc.adapters.clock import HostClock
-from lowfc.adapters.log_reader import Logged, LogReader
-from lowfc.adapters.run import Run, new_run_id, open_run
-from lowfc.adapters.terminal import INTERRUPTED
-from lowfc.adapters.zenoh_bus import ZenohBus
+from lowfc.adapters.bus.bus import Sample
+from lowfc.adapters.bus.run import Run, new_run_id, open_run
+from lowfc.adapters.bus.zenoh_bus import ZenohBus
+from lowfc.adapters.logs.reader import Logged, LogReader
+from lowfc.adapters.process.clock import HostClock
+from lowfc.adapters.process.terminal import INTERRUPTED
 from lowfc.contract.errors import BusError, ConfigurationError
 from lowfc.contract.messages import (
     CALIBRATION,
@@ -31,8 +30,11 @@ from lowfc.contract.messages import (
     Topic,
     wire,
 )
-from lowfc.programs.replay.publish import publish, render
-from lowfc.programs.replay.selection import Selection
+from lowfc.programs.logs.publish.player import publish, render
+from lowfc.programs.logs.publish.selection import Selection
+from tests.support.loops import LOWFC, loop, until
+
+pytestmark = pytest.mark.exclusive
 
 
 @pytest.fixture(scope="module")
@@ -76,7 +78,7 @@ def tool(run: Run) -> Iterator[Tool]:
 
 
 def start(log: Path, run: Run, *options: str) -> "subprocess.Popen[str]":
-    words = [*LOWFC, "replay", str(log), "--publish", "--run", run.run_id, "--json", *options]
+    words = [*LOWFC, "publish", str(log), "--run", run.run_id, "--json", *options]
     return subprocess.Popen(words, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
 
 

@@ -13,8 +13,9 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 import pytest
-from loops import run
-from report_log import Night
+
+from tests.support.loops import run
+from tests.support.report_log import Night
 
 CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
 PICTURES = {"overview", "intervals", "residual", "spectra", "budget", "light", "timeline", "stroke"}

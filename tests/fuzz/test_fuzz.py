@@ -1,8 +1,9 @@
 """Every reader of foreign bytes, fed with damage: it says what is wrong, and neither crashes, hangs nor swells."""
 
 import pytest
-from fuzzing import MOST_GROWTH_BYTES, fuzz, shares
-from targets import Target, targets
+
+from tests.support.fuzzing import MOST_GROWTH_BYTES, fuzz, shares
+from tests.support.targets import Target, targets
 
 FEW, MANY = 15_000, 1_000_000
 
@@ -36,7 +37,7 @@ def test_an_input_is_made_from_its_number_alone(every: list[Target]) -> None:
 
 
 def test_a_reader_that_crashes_or_hangs_is_found(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("fuzzing.HANG_S", 0.05)
+    monkeypatch.setattr("tests.support.fuzzing.HANG_S", 0.05)
 
     def read(data: bytes) -> None:
         if data.startswith(b"\xff"):

@@ -14,23 +14,23 @@ from typing import Any
 
 import numpy as np
 
-from lowfc.adapters import calibration_file, instrument, law_file
-from lowfc.adapters.bus import Sample
-from lowfc.adapters.latch import Latch
-from lowfc.adapters.log_writer import Attachment
-from lowfc.adapters.provenance import provenance
-from lowfc.adapters.service import Service
+from lowfc.adapters.bus.bus import Sample
+from lowfc.adapters.files import calibration_file, factory, law_file
+from lowfc.adapters.logs.writer import Attachment
+from lowfc.adapters.process.latch import Latch
+from lowfc.adapters.process.provenance import provenance
+from lowfc.adapters.process.service import Service
 from lowfc.client import Client
-from lowfc.contract.calibration_codec import identified
-from lowfc.contract.codec import actuators
+from lowfc.contract.codecs.calibration_codec import identified
+from lowfc.contract.codecs.codec import actuators
 from lowfc.contract.configuration import Configuration, load
 from lowfc.contract.errors import RequestRefusedError
 from lowfc.contract.messages import CAMERA_STATE, FRAME, MIRROR_STATE, STEP, TRUTH, image, timestamp, wire
-from lowfc.control.calibration import Calibration
-from lowfc.control.law import Law
-from lowfc.control.linear_law import LinearLaw, integrator_block, of_blocks
-from lowfc.programs.controller import Controller
-from lowfc.programs.recording.recorder import Recorder
+from lowfc.control.calibration.calibration import Calibration
+from lowfc.control.laws.law import Law
+from lowfc.control.laws.linear_law import LinearLaw, integrator_block, of_blocks
+from lowfc.programs.core.controller import Controller
+from lowfc.programs.core.recording.recorder import Recorder
 from lowfc.testing.clock import FakeClock
 from lowfc.testing.memory_bus import MemoryBus, MemoryHub
 from sim_camera.process import bench
@@ -106,7 +106,7 @@ class Night:
         bus = self.bus("camera")
         self.frames, self.truths = bus.publisher(FRAME), bus.publisher(TRUTH)
         self.settings = bus.publisher(CAMERA_STATE)
-        state = instrument.camera_state(self.config, self.scene.shape, self.clock.now_ns())
+        state = factory.camera_state(self.config, self.scene.shape, self.clock.now_ns())
         for name, value in changes.items():
             setattr(state, name, value)
         self.settings.put(state.SerializeToString())
@@ -172,7 +172,7 @@ class Night:
 
 def law(config: Configuration) -> LinearLaw:
     """An integrator of the pseudo-open-loop modes, which remembers commands."""
-    settings = instrument.settings(config)
+    settings = factory.settings(config)
     of_modes: Law = settings.law(config.noll)
     blocks = [
         integrator_block(gain, 0.01, "pol", settings.delay_frames) for gain in of_modes.gain.astype(float).tolist()
@@ -184,8 +184,8 @@ def main(folder: Path) -> None:
     """Write all golden files."""
     folder.mkdir(parents=True)
     config = load(None, CONFIGURATION)
-    optics = instrument.twin(config, None, print)
-    calibration = instrument.analytic_calibration(config, optics, instrument.mirror_on_twin(config, optics, print))
+    optics = factory.twin(config, None, print)
+    calibration = factory.analytic_calibration(config, optics, factory.mirror_on_twin(config, optics, print))
     made = law(config)
     calibration_file.save(calibration, folder / "calibration.fits")
     law_file.save(made, folder / "law.fits")

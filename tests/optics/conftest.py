@@ -9,12 +9,12 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from lowfc.adapters.masks import sensor_from
-from lowfc.adapters.twin_store import load_or_build
-from lowfc.optics.band import gauss_legendre
-from lowfc.optics.sensor import pupil_radii
-from lowfc.optics.twin import ACCURATE, FAST
-from lowfc.optics.zernike import NOLLS_20, zernikes
+from lowfc.adapters.files.sensors import sensor_from
+from lowfc.adapters.files.twin_cache import load_or_build
+from lowfc.optics.chain.band import gauss_legendre
+from lowfc.optics.chain.sensor import pupil_radii
+from lowfc.optics.chain.zernike import NOLLS_20, zernikes
+from lowfc.optics.twin.twin import ACCURATE, FAST
 
 
 @pytest.fixture(scope="session")

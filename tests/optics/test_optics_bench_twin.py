@@ -1,6 +1,6 @@
 import json
 
-from lowfc.programs.bench.twin import bench_twin, render
+from lowfc.programs.measure.bench.twin import bench_twin, render
 
 
 def test_the_bench_reports_all_three_twins(cache_dir, fast, accurate, broadband):

@@ -1,13 +1,13 @@
-"""Each sentence of lowfc.optics.grid, as a test."""
+"""Each sentence of lowfc.optics.chain.grid, as a test."""
 
 import numpy as np
 import pytest
 
-from lowfc.optics.fourier import to_image, to_pupil
-from lowfc.optics.grid import OPEN_AREA, image_axis, pupil_axis
-from lowfc.optics.pupil import circle, from_quarter
-from lowfc.optics.relay import ApertureMask
-from lowfc.optics.sensor import Sensor, image
+from lowfc.optics.chain.fourier import to_image, to_pupil
+from lowfc.optics.chain.grid import OPEN_AREA, image_axis, pupil_axis
+from lowfc.optics.chain.pupil import circle, from_quarter
+from lowfc.optics.chain.relay import ApertureMask
+from lowfc.optics.chain.sensor import Sensor, image
 
 
 def blob(samples, x0, y0, width=0.08):

@@ -2,12 +2,12 @@ import numpy as np
 import pytest
 from scipy.special import j0, j1
 
-from lowfc.adapters.masks import load_pupil
-from lowfc.optics.coronagraph import DARK_ZONE, Wedge, contrast, contrast_curve, mean_contrast, wedge_samples
-from lowfc.optics.grid import image_axis, pupil_axis
-from lowfc.optics.pupil import circle
-from lowfc.optics.screen import kolmogorov
-from lowfc.optics.zernike import zernikes
+from lowfc.adapters.files.sensors import load_pupil
+from lowfc.optics.chain.coronagraph import DARK_ZONE, Wedge, contrast, contrast_curve, mean_contrast, wedge_samples
+from lowfc.optics.chain.grid import image_axis, pupil_axis
+from lowfc.optics.chain.pupil import circle
+from lowfc.optics.chain.screen import kolmogorov
+from lowfc.optics.chain.zernike import zernikes
 
 NM = 550.0
 

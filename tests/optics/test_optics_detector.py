@@ -2,9 +2,9 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from lowfc.optics.detector import Detector, expose, laws_of, saturation_dn
-from lowfc.optics.photometry import Photometry, electrons, tilt_nm_per_mas
-from lowfc.optics.pixel_laws import FAINT_E, STEP_E
+from lowfc.optics.detector.detector import Detector, expose, laws_of, saturation_dn
+from lowfc.optics.detector.detector_noise_table import FAINT_E, STEP_E
+from lowfc.optics.detector.photometry import Photometry, electrons, tilt_nm_per_mas
 
 QUIET = Detector(read_noise_e=0.0, bias_dn=0.0)
 

@@ -1,8 +1,8 @@
 import numpy as np
 import pytest
 
-from lowfc.optics.grid import pupil_axis
-from lowfc.optics.mirror import (
+from lowfc.optics.chain.grid import pupil_axis
+from lowfc.optics.chain.mirror import (
     Mirror,
     active_actuators,
     actuator_axis,
@@ -10,7 +10,7 @@ from lowfc.optics.mirror import (
     modes_to_actuators,
     surface_nm,
 )
-from lowfc.optics.zernike import NOLLS_20, zernikes
+from lowfc.optics.chain.zernike import NOLLS_20, zernikes
 
 MIRROR = Mirror()
 

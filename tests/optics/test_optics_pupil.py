@@ -3,13 +3,13 @@
 import numpy as np
 import pytest
 
-from lowfc.adapters.masks import load_pupil, sensor_from, sensor_named
+from lowfc.adapters.files.sensors import load_pupil, sensor_from, sensor_named
 from lowfc.contract.configuration import SensorSection
 from lowfc.contract.errors import ConfigurationError, DataFileError
-from lowfc.optics.focal_mask import disk, phase_spot
-from lowfc.optics.fourier import to_image, to_pupil
-from lowfc.optics.grid import SAMPLES, image_axis, pupil_axis
-from lowfc.optics.pupil import circle, prolate, with_bar
+from lowfc.optics.chain.focal_mask import disk, phase_spot
+from lowfc.optics.chain.fourier import to_image, to_pupil
+from lowfc.optics.chain.grid import SAMPLES, image_axis, pupil_axis
+from lowfc.optics.chain.pupil import circle, prolate, with_bar
 
 
 @pytest.mark.parametrize("angle_deg", [0.0, 20.0, 135.0, 300.0])

@@ -1,12 +1,12 @@
 import numpy as np
 import pytest
 
-from lowfc.adapters.masks import load_pupil, sensor_named
-from lowfc.optics.band import Band, gauss_legendre, monochromatic, uniform
-from lowfc.optics.fourier import kernel
-from lowfc.optics.grid import pupil_axis
-from lowfc.optics.relay import ApertureMask
-from lowfc.optics.sensor import Sensor, field, image, light_budget, reference, response
+from lowfc.adapters.files.sensors import load_pupil, sensor_named
+from lowfc.optics.chain.band import Band, gauss_legendre, monochromatic, uniform
+from lowfc.optics.chain.fourier import kernel
+from lowfc.optics.chain.grid import pupil_axis
+from lowfc.optics.chain.relay import ApertureMask
+from lowfc.optics.chain.sensor import Sensor, field, image, light_budget, reference, response
 
 
 def relative_l2(ours, truth):

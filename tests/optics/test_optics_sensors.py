@@ -5,15 +5,15 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from lowfc.adapters import instrument
-from lowfc.adapters.masks import sensor_from, sensor_named
+from lowfc.adapters.files import factory
+from lowfc.adapters.files.sensors import sensor_from, sensor_named
 from lowfc.contract.configuration import SENSORS, SensorSection, load
 from lowfc.contract.errors import CalibrationError
-from lowfc.optics.band import gauss_legendre, monochromatic
-from lowfc.optics.fourier import to_image
-from lowfc.optics.grid import image_axis
-from lowfc.optics.relay import ApertureMask, Defocus, PupilImage, direct_kernel, fresnel_distance
-from lowfc.optics.sensor import field, image, light_budget, reference, response, shear_response
+from lowfc.optics.chain.band import gauss_legendre, monochromatic
+from lowfc.optics.chain.fourier import to_image
+from lowfc.optics.chain.grid import image_axis
+from lowfc.optics.chain.relay import ApertureMask, Defocus, PupilImage, direct_kernel, fresnel_distance
+from lowfc.optics.chain.sensor import field, image, light_budget, reference, response, shear_response
 
 
 def relative_l2(ours, truth):
@@ -236,9 +236,9 @@ def calibrated(tmp_path, monkeypatch):
     def make(**changed):
         keys = {"mirror.rows": 12, "mirror.columns": 12, "mirror.pitches_per_pupil": 11.0}
         config = load(None, keys | {key.replace("__", "."): value for key, value in changed.items()})
-        optics = instrument.twin(config, None, pytest.fail)
-        made = instrument.analytic_calibration(config, optics, instrument.mirror_on_twin(config, optics, pytest.fail))
-        return made, instrument.frame_noise_nm(config, made)
+        optics = factory.twin(config, None, pytest.fail)
+        made = factory.analytic_calibration(config, optics, factory.mirror_on_twin(config, optics, pytest.fail))
+        return made, factory.frame_noise_nm(config, made)
 
     return make
 

@@ -5,19 +5,19 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from lowfc.adapters.masks import sensor_from, sensor_named
+from lowfc.adapters.files.sensors import sensor_from, sensor_named
 from lowfc.contract.configuration import SensorSection
-from lowfc.optics.band import gauss_legendre
-from lowfc.optics.grid import pupil_axis
-from lowfc.optics.mirror import Mirror, influence_factors, modes_to_actuators, surface_nm
-from lowfc.optics.nodes import interpolation, node_axis
-from lowfc.optics.sensor import image, response
-from lowfc.optics.twin import ACCURATE, FAST, Evaluator, TwinSpec, node_radii, wavefront_rms_nm
-from lowfc.optics.twin import reference as twin_reference
-from lowfc.optics.twin import response as twin_response
-from lowfc.optics.twin_build import build
-from lowfc.optics.twin_mirror import twin_mirror, wavefront_nm
-from lowfc.optics.zernike import NOLLS_20, zernikes
+from lowfc.optics.chain.band import gauss_legendre
+from lowfc.optics.chain.grid import pupil_axis
+from lowfc.optics.chain.mirror import Mirror, influence_factors, modes_to_actuators, surface_nm
+from lowfc.optics.chain.sensor import image, response
+from lowfc.optics.chain.zernike import NOLLS_20, zernikes
+from lowfc.optics.twin.nodes import interpolation, node_axis
+from lowfc.optics.twin.twin import ACCURATE, FAST, Evaluator, TwinSpec, node_radii, wavefront_rms_nm
+from lowfc.optics.twin.twin import reference as twin_reference
+from lowfc.optics.twin.twin import response as twin_response
+from lowfc.optics.twin.twin_build import build
+from lowfc.optics.twin.twin_mirror import twin_mirror, wavefront_nm
 
 
 def relative_l2(ours, truth):

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from lowfc.adapters.twin_store import (
+from lowfc.adapters.files.twin_cache import (
     default_cache_dir,
     load_or_build,
     load_or_fit_mirror,
@@ -16,16 +16,17 @@ from lowfc.adapters.twin_store import (
     source_hash,
     sources,
 )
-from lowfc.optics.band import gauss_legendre, monochromatic
-from lowfc.optics.mirror import Mirror
-from lowfc.optics.relay import ApertureMask
-from lowfc.optics.twin import FAST, Evaluator, TwinSpec, reference
+from lowfc.optics.chain.band import gauss_legendre, monochromatic
+from lowfc.optics.chain.mirror import Mirror
+from lowfc.optics.chain.relay import ApertureMask
+from lowfc.optics.twin.twin import FAST, Evaluator, TwinSpec, reference
 
 SMALL = TwinSpec(nodes=16, order=4, rank=40, guards=4)  # the real optics, coarser, for tests of the file
 HASH_OF_ONES = "a4449a9f81f26403e8a1f5dda2c0cbe7385184dc0b31b34b2b78eb5a92ba3eec"
 IMPORTED_BY_THE_BUILDERS = """
-import sys, lowfc.optics.twin_build, lowfc.optics.twin_mirror
-print(*(name for name in sys.modules if name.startswith("lowfc.optics.")))
+import sys, lowfc.optics.twin.twin_build, lowfc.optics.twin.twin_mirror
+modules = sys.modules.items()
+print(*(name for name, module in modules if name.startswith("lowfc.optics.") and not hasattr(module, "__path__")))
 """
 
 
@@ -97,13 +98,17 @@ def test_the_sources_are_the_modules_that_building_a_twin_imports():
     imported = subprocess.run(
         [sys.executable, "-c", IMPORTED_BY_THE_BUILDERS], capture_output=True, text=True, check=True
     ).stdout.split()
-    assert set(sources()) == {"lowfc.adapters.twin_store", *imported}
+    assert set(sources()) == {"lowfc.adapters.files.twin_cache", *imported}
     assert len(imported) > 8
 
 
 @pytest.mark.parametrize(
     ("module", "again"),
-    [("lowfc.optics.fourier", True), ("lowfc.adapters.twin_store", True), ("lowfc.optics.screen", False)],
+    [
+        ("lowfc.optics.chain.fourier", True),
+        ("lowfc.adapters.files.twin_cache", True),
+        ("lowfc.optics.chain.screen", False),
+    ],
 )
 def test_a_changed_source_builds_again(module, again, sensor, stored, tmp_path, monkeypatch):
     twin, mirror = stored[0], Mirror(rows=6, columns=5, pitches_per_pupil=4.0)

@@ -1,8 +1,8 @@
 import numpy as np
 import pytest
 
-from lowfc.optics.grid import pupil_axis
-from lowfc.optics.zernike import NOLLS_20, mode_name, noll_to_nm, zernike, zernikes
+from lowfc.optics.chain.grid import pupil_axis
+from lowfc.optics.chain.zernike import NOLLS_20, mode_name, noll_to_nm, zernike, zernikes
 
 
 def test_every_mode_agrees_with_hcipy(hcipy):

@@ -3,13 +3,13 @@
 import numpy as np
 import pytest
 
-from lowfc.adapters.masks import load_pupil
-from lowfc.optics.coronagraph import Wedge, contrast, mean_contrast, wedge_samples
-from lowfc.optics.grid import pupil_axis
-from lowfc.optics.photometry import tilt_nm_per_mas
-from lowfc.optics.pupil import circle
-from lowfc.optics.science_camera import ScienceCamera
-from lowfc.optics.zernike import NOLLS_14, zernikes
+from lowfc.adapters.files.sensors import load_pupil
+from lowfc.optics.chain.coronagraph import Wedge, contrast, mean_contrast, wedge_samples
+from lowfc.optics.chain.grid import pupil_axis
+from lowfc.optics.chain.pupil import circle
+from lowfc.optics.chain.science_camera import ScienceCamera
+from lowfc.optics.chain.zernike import NOLLS_14, zernikes
+from lowfc.optics.detector.photometry import tilt_nm_per_mas
 
 NM = 550.0
 RING = Wedge(4.0, 6.0)

@@ -3,14 +3,12 @@
 import numpy as np
 import pytest
 
-from lowfc.adapters.instrument import analytic_calibration, mirror_on_twin, twin
+from lowfc.adapters.files.factory import analytic_calibration, mirror_on_twin, twin
 from lowfc.contract.configuration import Configuration, load
-from lowfc.control.calibration import Calibration
-from lowfc.control.estimator import Estimator
-from sim_camera.bench import Bench, Truth
+from lowfc.control.calibration.calibration import Calibration
+from lowfc.control.loop.estimator import Estimator
+from sim_camera.bench import Bench
 from sim_camera.disturbance import BLOCK
-from sim_camera.figures import BLOCK as FIGURES_BLOCK
-from sim_camera.figures import Figures
 from sim_camera.process import bench
 
 FLAT = np.zeros((34, 34), np.float32)
@@ -123,30 +121,3 @@ def test_a_kolmogorov_screen_has_its_rms_over_the_open_pupil() -> None:
     _, truth = scene.expose(0, FLAT)
     assert truth.disturbance_rms_nm == pytest.approx(0.05 * 550, rel=1e-3)
     assert np.abs(truth.disturbance_nm).max() > 5  # its low orders are among the true modes
-
-
-def truth(tilt_x_nm: float, residual_x_nm: float, rms_nm: float, residual_rms_nm: float) -> Truth:
-    modes = np.array([tilt_x_nm, 0, 99], np.float32)
-    left = np.array([residual_x_nm, residual_x_nm, 99], np.float32)
-    return Truth(modes, left, rms_nm, residual_rms_nm)
-
-
-def test_figures_are_of_the_second_half() -> None:
-    figures = Figures((2, 3, 4), nm_per_mas=2.0)
-    assert figures.wavefront() is None
-    figures.add(truth(8.0, 4.0, 10.0, 5.0))
-    first = figures.wavefront()
-    assert first is not None
-    assert first.tilt_disturbance_mas == pytest.approx(8 / 2 / np.sqrt(2))
-    assert first.tilt_residual_mas == pytest.approx(2.0)
-    assert (first.disturbance_rms_nm, first.residual_rms_nm) == pytest.approx((10, 5))
-    for _ in range(2 * FIGURES_BLOCK - 1):
-        figures.add(truth(1000.0, 1000.0, 1000.0, 1000.0))
-    for index in range(2 * FIGURES_BLOCK):
-        figures.add(truth(6.0, 2.0, (3.0, 4.0)[index % 2], 1.0))
-    second = figures.wavefront()
-    assert second is not None
-    assert second.disturbance_rms_nm == pytest.approx(np.sqrt(12.5))
-    assert second.residual_rms_nm == pytest.approx(1)
-    assert second.tilt_disturbance_mas == pytest.approx(6 / 2 / np.sqrt(2))
-    assert second.tilt_residual_mas == pytest.approx(1)

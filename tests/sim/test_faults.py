@@ -7,15 +7,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from lowfc.adapters.bus import Sample
-from lowfc.contract.codec import decode_frame
+from lowfc.adapters.bus.bus import Sample
+from lowfc.contract.codecs.codec import decode_frame
 from lowfc.contract.envelope import count_of, start_of
 from lowfc.contract.errors import ConfigurationError
 from lowfc.contract.messages import FRAME, image
 from lowfc.testing.clock import FakeClock
 from lowfc.testing.memory_bus import MemoryBus, MemoryHub
-from sim_camera.faults import LOST_SHARE, MOST_FRAMES_LATE, TRACK_PIXELS, Fault, Kind, cut, payload, pixels, sent
-from sim_camera.faulty import EARLIER_S, FaultyFrames, read_faults
+from sim_camera.faults import LOST_SHARE, MOST_FRAMES_LATE, TRACK_PIXELS, Fault, Kind
+from sim_camera.faulty import EARLIER_S, FaultyFrames, read_fault
 
 FIRST, FRAMES = 100, 400
 LAST = FIRST + FRAMES + MOST_FRAMES_LATE + 1
@@ -23,25 +23,24 @@ IMAGE = np.arange(400, dtype=np.uint16).reshape(20, 20)
 DARK, HIGHEST = 100, 60_000
 
 
-def fault(kind: Kind, seed: int = 5) -> tuple[Fault, ...]:
-    return (Fault(kind, FIRST, FRAMES, seed),)
+def fault(kind: Kind, seed: int = 5) -> Fault:
+    return Fault(kind, FIRST, FRAMES, seed)
 
 
 def order(kind: Kind, seed: int = 5) -> list[int]:
-    return [frame for index in range(LAST) for frame in sent(fault(kind, seed), index)]
+    return [frame for index in range(LAST) for frame in fault(kind, seed).sent(index)]
 
 
 def spoilt(kind: Kind, index: int) -> np.ndarray:
-    return pixels(fault(kind), index, IMAGE, IMAGE[::-1], DARK, HIGHEST)
+    return fault(kind).pixels(index, IMAGE, IMAGE[::-1], DARK, HIGHEST)
 
 
 @pytest.mark.parametrize("kind", Kind)
 def test_outside_its_time_a_fault_changes_nothing(kind: Kind) -> None:
     for index in (1, FIRST - 1, FIRST + FRAMES + MOST_FRAMES_LATE + 1):
-        assert sent(fault(kind), index) == (index,)
+        assert fault(kind).sent(index) == (index,)
         assert spoilt(kind, index) is IMAGE
-        np.testing.assert_array_equal(cut(fault(kind), index, IMAGE), IMAGE)
-        assert payload(fault(kind), index, b"whole", 5) == b"whole"
+        assert fault(kind).payload(index, b"whole", 5) == b"whole"
 
 
 def test_a_tenth_of_the_frames_is_lost_as_the_seed_says() -> None:
@@ -64,7 +63,7 @@ def test_reordered_frames_come_in_pairs_the_second_one_first() -> None:
 
 
 def test_late_frames_all_come_by_up_to_fifty_frames_late() -> None:
-    when = {frame: index for index in range(LAST) for frame in sent(fault(Kind.LATE), index)}
+    when = {frame: index for index in range(LAST) for frame in fault(Kind.LATE).sent(index)}
     assert set(when) == set(range(LAST))
     late = [when[frame] - frame for frame in range(FIRST, FIRST + FRAMES)]
     assert (min(late), max(late)) == (1, MOST_FRAMES_LATE)
@@ -86,11 +85,11 @@ def test_what_is_on_the_wire() -> None:
     sound = image(IMAGE, 0, "sensor")
     message = sound.SerializeToString()
     end = message.index(sound.data) + len(sound.data)
-    assert cut(fault(Kind.WRONG_SIZE), FIRST, IMAGE).shape == (19, 19)
-    cutting = (Fault(Kind.TRUNCATED, FIRST, 5000, 5),)
-    short = [payload(cutting, index, message, end) for index in range(FIRST, FIRST + 5000)]
+    assert spoilt(Kind.WRONG_SIZE, FIRST).shape == (19, 19)
+    cutting = Fault(Kind.TRUNCATED, FIRST, 5000, 5)
+    short = [cutting.payload(index, message, end) for index in range(FIRST, FIRST + 5000)]
     assert all(message.startswith(one) and decode_frame(one, 1, 0).pixels is None for one in short)
-    assert len({payload(fault(Kind.RANDOM), index, message, end) for index in range(FIRST, FIRST + 50)}) == 50
+    assert len({fault(Kind.RANDOM).payload(index, message, end) for index in range(FIRST, FIRST + 50)}) == 50
 
 
 @pytest.mark.parametrize("kind", [Kind.DUPLICATED, Kind.REORDERED, Kind.LATE, Kind.OLD_SEQUENCE, Kind.TRUNCATED])
@@ -99,7 +98,7 @@ def test_what_is_published(kind: Kind) -> None:
     camera, reader = MemoryBus(hub, "camera", clock), MemoryBus(hub, "controller", clock)
     got: list[Sample] = []
     reader.subscribe(FRAME, got.append)
-    faulty = FaultyFrames((Fault(kind, 10, 10),), camera.publisher(FRAME), DARK, HIGHEST)
+    faulty = FaultyFrames(Fault(kind, 10, 10), camera.publisher(FRAME), DARK, HIGHEST)
     for index in range(90):
         envelope = faulty.put(index, faulty.message(index, IMAGE + np.uint16(index), index), 1000 + index)
         assert count_of(envelope.sequence) == index
@@ -124,18 +123,18 @@ def test_what_is_published(kind: Kind) -> None:
     "content",
     [
         "",
-        '{"kind": "lost"}',
         "[1]",
-        '[{"kind": "bent", "first": 1, "frames": 1}]',
-        '[{"kind": "lost", "first": 0, "frames": 1}]',
+        '{"kind": "lost"}',
+        '{"kind": "bent", "first": 1, "frames": 1}',
+        '{"kind": "lost", "first": 0, "frames": 1}',
     ],
 )
-def test_a_file_of_faults_that_is_none(tmp_path: Path, content: str) -> None:
-    (tmp_path / "faults.json").write_text(content)
-    with pytest.raises(ConfigurationError, match="not a list of faults"):
-        read_faults(tmp_path / "faults.json")
+def test_a_file_of_a_fault_that_is_none(tmp_path: Path, content: str) -> None:
+    (tmp_path / "fault.json").write_text(content)
+    with pytest.raises(ConfigurationError, match="not a fault"):
+        read_fault(tmp_path / "fault.json")
 
 
-def test_a_file_of_faults(tmp_path: Path) -> None:
-    (tmp_path / "faults.json").write_text(json.dumps([{"kind": "dark", "first": 3, "frames": 4, "seed": 5}]))
-    assert read_faults(tmp_path / "faults.json") == (Fault(Kind.DARK, 3, 4, 5),)
+def test_a_file_of_a_fault(tmp_path: Path) -> None:
+    (tmp_path / "fault.json").write_text(json.dumps({"kind": "dark", "first": 3, "frames": 4, "seed": 5}))
+    assert read_fault(tmp_path / "fault.json") == Fault(Kind.DARK, 3, 4, 5)

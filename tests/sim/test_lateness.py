@@ -6,7 +6,7 @@ from typing import cast
 import numpy as np
 import pytest
 
-from lowfc.adapters.service import Service
+from lowfc.adapters.process.service import Service
 from lowfc.contract.configuration import Configuration
 from lowfc.contract.messages import EVENT, MIRROR_STATE, Log, wire
 from lowfc.testing.clock import FakeClock

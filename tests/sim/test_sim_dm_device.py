@@ -10,8 +10,8 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
 from lowfc.contract.configuration import load
-from lowfc.control.safety import Limits, Reason, neighbour_difference_nm
-from sim_dm.device import LONGEST_VALID_NS, Device, Status, Told, initial, obey, tick
+from lowfc.control.loop.safety import Limits, Reason, neighbour_difference_nm
+from sim_dm.device import LONGEST_VALID_NS, Command, Device, Status, apply_command, initial, tick
 from sim_dm.process import device as device_of
 
 Array = npt.NDArray[np.float32]
@@ -28,8 +28,8 @@ def mirror(**changes: object) -> Device:
     return replace(Device(GRID, LIMITS, STEP_NM, 0.0, free, flatten=True), **changes)
 
 
-def told(actuators_nm: Array | None, index: int = 1, **changes: object) -> Told:
-    usual = Told("lowfc", index, START_NS + index * MS, 200 * MS, actuators_nm, np.array([1, 2], np.float32))
+def told(actuators_nm: Array | None, index: int = 1, **changes: object) -> Command:
+    usual = Command("lowfc", index, START_NS + index * MS, 200 * MS, actuators_nm, np.array([1, 2], np.float32))
     return replace(usual, **changes)
 
 
@@ -40,7 +40,7 @@ def even(height_nm: float) -> Array:
 def follow(device: Device, status: Status, *heights_nm: float) -> Status:
     for height_nm in heights_nm:
         index = status.frame_sequence + 1
-        status, refused = obey(device, status, told(even(height_nm), index), START_NS + index * MS)
+        status, refused = apply_command(device, status, told(even(height_nm), index), START_NS + index * MS)
         assert refused is None
     return status
 
@@ -59,40 +59,40 @@ def broken(before: Array, after: Array) -> list[str]:
 
 def test_clear_makes_the_mirror_forget_the_newest_command() -> None:
     device = mirror()
-    status, _ = obey(device, initial(device), told(even(5.0), (1 << 63)), START_NS)
-    late, refused = obey(device, status, told(even(9.0), 3), START_NS)
+    status, _ = apply_command(device, initial(device), told(even(5.0), (1 << 63)), START_NS)
+    late, refused = apply_command(device, status, told(even(9.0), 3), START_NS)
     assert (refused, late) == (Reason.OUT_OF_ORDER, status)
-    status, refused = obey(device, status, told(even(9.0), 3, clear_id=77), START_NS)
+    status, refused = apply_command(device, status, told(even(9.0), 3, clear_id=77), START_NS)
     assert (refused, status.frame_sequence) == (None, 3)
-    assert obey(device, status, told(even(9.0), 2, clear_id=77), START_NS)[1] is Reason.OUT_OF_ORDER, (
+    assert apply_command(device, status, told(even(9.0), 2, clear_id=77), START_NS)[1] is Reason.OUT_OF_ORDER, (
         "once for each clear"
     )
-    assert obey(device, status, told(even(9.0), 2, clear_id=78), START_NS)[1] is None
+    assert apply_command(device, status, told(even(9.0), 2, clear_id=78), START_NS)[1] is None
 
 
 def test_the_mirror_has_room_for_sixteen_channels() -> None:
     device, status = mirror(), initial(mirror())
     for number in range(16):
-        status, refused = obey(device, status, told(even(1.0), channel=f"c{number}"), START_NS)
+        status, refused = apply_command(device, status, told(even(1.0), channel=f"c{number}"), START_NS)
         assert refused is None
-    assert obey(device, status, told(even(1.0), channel="another"), START_NS) == (status, Reason.CHANNEL)
-    assert obey(device, status, told(even(1.0), channel="c3"), START_NS)[1] is None
-    assert obey(device, initial(device), told(even(1.0), channel="x" * 33), START_NS)[1] is Reason.CHANNEL
+    assert apply_command(device, status, told(even(1.0), channel="another"), START_NS) == (status, Reason.CHANNEL)
+    assert apply_command(device, status, told(even(1.0), channel="c3"), START_NS)[1] is None
+    assert apply_command(device, initial(device), told(even(1.0), channel="x" * 33), START_NS)[1] is Reason.CHANNEL
 
 
 def test_a_command_of_safe_mode_is_remembered_by_its_channel() -> None:
     device = mirror()
-    status, _ = obey(device, initial(device), told(even(1.0), safe=True), START_NS)
-    status, _ = obey(device, status, told(even(1.0), channel="other"), START_NS)
+    status, _ = apply_command(device, initial(device), told(even(1.0), safe=True), START_NS)
+    status, _ = apply_command(device, status, told(even(1.0), channel="other"), START_NS)
     assert status.safe == {"lowfc"}
     assert tick(device, status, START_NS + 10 * LONGEST_VALID_NS).safe == {"lowfc"}
-    assert obey(device, status, told(even(1.0), 2), START_NS)[0].safe == frozenset()
+    assert apply_command(device, status, told(even(1.0), 2), START_NS)[0].safe == frozenset()
 
 
 def test_a_command_from_the_far_future_does_not_stop_the_way_to_flat() -> None:
     device = mirror(settling_ns=50_000.0)
     ahead = replace(told(even(100.0)), time_ns=1 << 62)
-    status, _ = obey(device, initial(device), ahead, START_NS)
+    status, _ = apply_command(device, initial(device), ahead, START_NS)
     for turn in range(1, 5):
         status = tick(device, status, START_NS + LONGEST_VALID_NS + turn * 10 * MS)
     assert not status.following
@@ -126,7 +126,7 @@ def test_whatever_it_is_told_the_surface_keeps_the_limits(script: list[object], 
             now_ns += what
             after = tick(device, status, now_ns)
         else:
-            after, _ = obey(device, status, told(what, index + 1), now_ns)
+            after, _ = apply_command(device, status, told(what, index + 1), now_ns)
         assert broken(status.surface_nm, after.surface_nm) == []
         status = after
 
@@ -135,7 +135,7 @@ def test_whatever_it_is_told_the_surface_keeps_the_limits(script: list[object], 
 def test_a_command_is_rounded_to_the_drivers_steps(bits: int) -> None:
     device = mirror(step_nm=1500 / 2**bits)
     wanted = np.linspace(-100, 100, 20, dtype=np.float32).reshape(GRID)
-    status, _ = obey(device, initial(device), told(wanted), START_NS)
+    status, _ = apply_command(device, initial(device), told(wanted), START_NS)
     steps = status.surface_nm / device.step_nm
     assert np.abs(steps - np.round(steps)).max() < 1e-3
     assert np.abs(status.surface_nm - wanted).max() <= device.step_nm * 0.501
@@ -150,7 +150,7 @@ def test_a_mirror_pressed_against_its_neighbour_limit_stays_there() -> None:
     wanted[2:] = -740
     status = initial(device)
     for index in range(1, 60):
-        status, _ = obey(device, status, told(wanted, index), START_NS + index * MS)
+        status, _ = apply_command(device, status, told(wanted, index), START_NS + index * MS)
         if index == 30:
             settled = status.surface_nm
     assert neighbour_difference_nm(status.surface_nm) > LIMITS.neighbour_nm - 3 * device.step_nm
@@ -159,13 +159,13 @@ def test_a_mirror_pressed_against_its_neighbour_limit_stays_there() -> None:
 
 def test_its_own_limits_are_named_and_the_modal_command_is_forgotten() -> None:
     device = mirror()
-    status, _ = obey(device, initial(device), told(even(100)), START_NS)
+    status, _ = apply_command(device, initial(device), told(even(100)), START_NS)
     assert status.limits_hit == ()
     assert status.command_nm.tolist() == [1, 2]
-    status, _ = obey(device, status, told(even(900), 2), START_NS + MS)
+    status, _ = apply_command(device, status, told(even(900), 2), START_NS + MS)
     assert status.limits_hit == (Reason.STROKE, Reason.SLEW)
     assert status.command_nm.size == 0
-    status, _ = obey(device, status, told(even(300), 3), START_NS + 2 * MS)
+    status, _ = apply_command(device, status, told(even(300), 3), START_NS + 2 * MS)
     assert status.limits_hit == ()
 
 
@@ -180,10 +180,10 @@ def test_its_own_limits_are_named_and_the_modal_command_is_forgotten() -> None:
         (told(even(5), 4), Reason.OUT_OF_ORDER),
     ],
 )
-def test_a_bad_command_changes_nothing_and_does_not_feed_the_dead_man(what: Told, reason: Reason) -> None:
+def test_a_bad_command_changes_nothing_and_does_not_feed_the_dead_man(what: Command, reason: Reason) -> None:
     device = mirror()
     before = follow(device, initial(device), 10, 20, 30, 40, 50)
-    after, refused = obey(device, before, what, START_NS + 100 * MS)
+    after, refused = apply_command(device, before, what, START_NS + 100 * MS)
     assert refused is reason
     assert after is before
 
@@ -191,39 +191,31 @@ def test_a_bad_command_changes_nothing_and_does_not_feed_the_dead_man(what: Told
 def test_a_repeated_command_is_taken_so_that_a_held_one_can_be_renewed() -> None:
     device = mirror()
     status = follow(device, initial(device), 10)
-    after, refused = obey(device, status, told(even(10), 1), START_NS + 150 * MS)
+    after, refused = apply_command(device, status, told(even(10), 1), START_NS + 150 * MS)
     assert refused is None
     assert after.received_ns == START_NS + 150 * MS
     assert np.array_equal(after.surface_nm, status.surface_nm)
 
 
-def test_the_dead_man_acts_just_after_what_the_command_promised() -> None:
+@pytest.mark.parametrize(
+    ("valid_ns", "held_ns"),
+    [(200 * MS, 200 * MS), (2**64 - 1, LONGEST_VALID_NS), (0, 0)],
+    ids=["valid", "most", "none"],
+)
+def test_the_dead_man_acts_just_after_what_the_command_promised(valid_ns: int, held_ns: int) -> None:
     device = mirror()
-    status, _ = obey(device, initial(device), told(even(50)), START_NS)
-    held = tick(device, status, START_NS + 200 * MS)
+    status, _ = apply_command(device, initial(device), told(even(50), valid_for_ns=valid_ns), START_NS)
+    held = tick(device, status, START_NS + held_ns)
     assert held.following
     assert np.array_equal(held.surface_nm, status.surface_nm)
-    expired = tick(device, held, START_NS + 200 * MS + 1)
+    expired = tick(device, held, START_NS + held_ns + 1)
     assert not expired.following
     assert not expired.surface_nm.any()
 
 
-def test_no_command_is_held_longer_than_the_mirror_allows() -> None:
-    device = mirror()
-    status, _ = obey(device, initial(device), told(even(50), valid_for_ns=2**64 - 1), START_NS)
-    assert tick(device, status, START_NS + LONGEST_VALID_NS).following
-    assert not tick(device, status, START_NS + LONGEST_VALID_NS + 1).following
-
-
-def test_a_command_that_promises_nothing_is_not_held() -> None:
-    device = mirror()
-    status, _ = obey(device, initial(device), told(even(50), valid_for_ns=0), START_NS)
-    assert not tick(device, status, START_NS + 1).following
-
-
 def test_a_clock_that_goes_back_does_not_keep_a_command_alive() -> None:
     device = mirror()
-    status, _ = obey(device, initial(device), told(even(50)), START_NS)
+    status, _ = apply_command(device, initial(device), told(even(50)), START_NS)
     gone_back = tick(device, status, START_NS - 1)
     assert not gone_back.following
     assert gone_back.time_ns >= status.time_ns
@@ -241,7 +233,7 @@ def test_once_expired_it_relaxes_to_flat_within_the_slew_limit_and_follows_again
     assert heights[0] == pytest.approx(350, abs=0.1)
     assert heights[3:] == [0, 0, 0]
     assert status.channels == {}
-    status, refused = obey(device, status, told(even(100), 700), now_ns)
+    status, refused = apply_command(device, status, told(even(100), 700), now_ns)
     assert refused is None
     assert status.following
     assert status.surface_nm.max() == pytest.approx(100, abs=STEP_NM)
@@ -256,21 +248,19 @@ def test_once_expired_it_holds_its_shape_where_that_is_configured() -> None:
 
 
 def test_before_the_first_command_it_is_flat_and_waits() -> None:
-    device = mirror()
-    status = tick(device, initial(device), START_NS)
-    assert not status.following
-    assert not status.surface_nm.any()
+    status = tick(mirror(), initial(mirror()), START_NS)
+    assert (status.following, status.surface_nm.any()) == (False, False)
 
 
 def test_channels_are_summed_and_the_sum_is_limited() -> None:
     device = mirror()
     status = initial(device)
     for index, (channel, height_nm) in enumerate((("lowfc", 60), ("offset", -20), ("lowfc", 80)), start=1):
-        status, _ = obey(device, status, told(even(height_nm), index, channel=channel), START_NS + index * MS)
+        status, _ = apply_command(device, status, told(even(height_nm), index, channel=channel), START_NS + index * MS)
     assert status.surface_nm.max() == pytest.approx(60, abs=STEP_NM)
     assert sorted(status.channels) == ["lowfc", "offset"]
-    status, _ = obey(device, status, told(even(3e38), 4, channel="lowfc"), START_NS + 4 * MS)
-    status, _ = obey(device, status, told(even(3e38), 5, channel="offset"), START_NS + 5 * MS)
+    status, _ = apply_command(device, status, told(even(3e38), 4, channel="lowfc"), START_NS + 4 * MS)
+    status, _ = apply_command(device, status, told(even(3e38), 5, channel="offset"), START_NS + 5 * MS)
     assert status.limits_hit == (Reason.NOT_FINITE,)
     assert np.abs(status.surface_nm).max() <= LIMITS.stroke_nm
 
@@ -294,8 +284,8 @@ def test_dead_and_stuck_actuators_stay_where_they_are() -> None:
 def test_settling_is_a_first_order_response() -> None:
     """A third command, one time constant after the second: the surface is 1 - 1/e of the way."""
     device = mirror(settling_ns=1e6)
-    status, _ = obey(device, initial(device), told(even(0), 1), START_NS)
-    status, _ = obey(device, status, told(even(100), 2), START_NS)
+    status, _ = apply_command(device, initial(device), told(even(0), 1), START_NS)
+    status, _ = apply_command(device, status, told(even(100), 2), START_NS)
     assert status.surface_nm.max() == pytest.approx(100 * (1 - np.exp(-1)), abs=STEP_NM)
     status = tick(device, status, status.time_ns + 2 * MS)
     assert status.surface_nm.max() == pytest.approx(100 * (1 - np.exp(-3)), abs=STEP_NM)
@@ -306,7 +296,7 @@ def test_settling_is_a_first_order_response() -> None:
 def test_an_older_time_does_not_move_the_surface_back() -> None:
     device = mirror(settling_ns=1e6)
     status = follow(device, initial(device), 0, 100)
-    again, _ = obey(device, status, told(even(100), 2, time_ns=0), START_NS)
+    again, _ = apply_command(device, status, told(even(100), 2, time_ns=0), START_NS)
     assert np.array_equal(again.surface_nm, status.surface_nm)
 
 
@@ -317,7 +307,7 @@ def test_commands_of_the_same_frame_move_the_surface_within_the_slew() -> None:
     for number, height_nm in enumerate((200, 100, 0), start=1):
         before = status.surface_nm
         now_ns = status.received_ns + 10 * MS
-        status, _ = obey(device, status, told(even(height_nm), 3, time_ns=status.commanded_ns), now_ns)
+        status, _ = apply_command(device, status, told(even(height_nm), 3, time_ns=status.commanded_ns), now_ns)
         assert status.surface_nm.max() == pytest.approx(height_nm, abs=1), number
         assert np.abs(status.surface_nm - before).max() <= LIMITS.slew_nm
 
@@ -327,7 +317,7 @@ def test_obeying_changes_nothing_that_it_was_given() -> None:
     status = follow(device, initial(device), 10)
     driven, surface, channels = status.driven_nm.copy(), status.surface_nm.copy(), dict(status.channels)
     what = told(even(700), 2, channel="other")
-    obey(device, status, what, START_NS)
+    apply_command(device, status, what, START_NS)
     tick(device, status, START_NS + 10_000 * MS)
     assert np.array_equal(status.driven_nm, driven)
     assert np.array_equal(status.surface_nm, surface)
@@ -341,7 +331,7 @@ def test_a_driver_too_coarse_for_the_limits_is_refused() -> None:
 
 
 def test_the_mirror_of_a_configuration() -> None:
-    config = load(None, {"mirror.dead": [0, 35], "mirror.stuck_nm": {"40": -70.0}, "mirror.expired": "hold"})
+    config = load(None, {"mirror.dead": [0, 35], "mirror.stuck_nm": {"40": -70.0}, "mirror.on_command_timeout": "hold"})
     made = device_of(config)
     assert made.grid == (34, 34)
     assert (made.limits.stroke_nm, made.limits.slew_nm, made.limits.neighbour_nm) == (750, 150, 500)

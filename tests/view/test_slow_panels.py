@@ -1,23 +1,26 @@
 """What is drawn about once a second: contrast, spectra, latencies; read back as numbers."""
 
+import dataclasses
 from typing import Any
 
 import numpy as np
 import pytest
-from tape import Tape, pixels
-from toy import calibration
 
-from lowfc.adapters.history import STAGES, Steps, Truths
-from lowfc.adapters.masks import load_pupil
+from lowfc.adapters.files.sensors import load_pupil
+from lowfc.adapters.logs.columns import STAGES, Steps, Truths
 from lowfc.contract.messages import FRAME, Role, wire
-from lowfc.control.error_budget import LinearLoop
-from lowfc.control.safety import LoopMode
-from lowfc.control.stability import rejection
-from lowfc.optics.coronagraph import mean_contrast
-from lowfc.optics.grid import pupil_axis
-from lowfc.optics.zernike import zernikes
-from lowfc.programs.view import latency, science, spectra, steady
-from lowfc.programs.view.moment import Heard, Moment
+from lowfc.control.loop.safety import LoopMode
+from lowfc.optics.chain.coronagraph import mean_contrast
+from lowfc.optics.chain.grid import pupil_axis
+from lowfc.optics.chain.zernike import zernikes
+from lowfc.programs.view.draw.plots import BOX_HEIGHT
+from lowfc.programs.view.panels import latency, science, spectra
+from lowfc.programs.view.panels.panel import Panel
+from lowfc.programs.view.snapshot import Accumulator, LastHealth
+from lowfc.programs.view.verdicts import steady
+from tests.support.tape import Tape, pixels, values_of
+from tests.support.theory import rejection
+from tests.support.toy import calibration
 
 START_NS = 1_795_000_000_000_000_000
 NM = 550.0
@@ -47,27 +50,17 @@ def steps(first: int, error_nm: Any, pol_nm: Any, mode: int = LoopMode.CLOSED) -
 
 
 def truths(residual_nm: Any, disturbance_nm: Any) -> Truths:
-    rows, some = len(residual_nm), np.zeros(len(residual_nm))
-    return Truths(
-        np.arange(rows, dtype=np.uint64),
-        np.full(rows, START_NS),
-        np.asarray(disturbance_nm, np.float32),
-        np.asarray(residual_nm, np.float32),
-        some.astype(np.float32),
-        some.astype(np.float32),
-    )
+    rows = len(residual_nm)
+    modes = (np.asarray(one, np.float32) for one in (disturbance_nm, residual_nm))
+    return Truths(np.arange(rows, dtype=np.uint64), np.full(rows, START_NS), *modes, *np.zeros((2, rows), np.float32))
 
 
-NO_STEPS, NO_TRUTHS = steps(0, np.zeros((0, MODES)), np.zeros((0, MODES))), truths(*np.zeros((2, 0, MODES)))
-NO_TIMINGS = {stage: np.zeros(0, np.int64) for stage in STAGES}
-
-
-def moment(after_ns: int, **changes: Any) -> Moment:
-    """A moment with nothing new but the changes."""
-    given: dict[str, Any] = dict.fromkeys(("frame", "mirror", "surface", "camera", "controller"))
-    given |= {"time_ns": START_NS + after_ns, "host_ns": 0, "frame_ns": 0, "events": [], "health": {}, "heard_ns": {}}
-    given |= {"steps": NO_STEPS, "truths": NO_TRUTHS, "timings": NO_TIMINGS, "calibration": CALIBRATION}
-    return Moment(**(given | changes))
+def drawn(panel: Panel, tape: Tape, after_ns: int, **changes: Any) -> None:
+    """Draw a snapshot with nothing new but the changes."""
+    empty = Accumulator().snapshot(0)
+    nothing = {"steps": steps(0, *np.zeros((2, 0, MODES))), "truths": truths(*np.zeros((2, 0, MODES)))}
+    given = {"time_ns": START_NS + after_ns, "calibration": CALIBRATION} | nothing | changes
+    panel.draw(tape, dataclasses.replace(empty, **given))
 
 
 def mean_of(pupil: Any, modes_nm: Any) -> float:
@@ -80,15 +73,14 @@ def test_contrast_is_that_of_the_newest_wavefronts() -> None:
     left_nm, open_nm = rng.normal(0, 30.0, (4, MODES)), rng.normal(0, 80.0, (4, MODES))
     refused = np.full((1, MODES), np.nan)
     tape, panel = Tape(), science.Science(pupil, NM)
-    panel.begin(tape)  # type: ignore[arg-type]
+    panel.begin(tape)
     measured = steps(0, np.vstack([left_nm[:2], refused]), np.vstack([open_nm[:2], refused]))
-    panel.draw(tape, moment(0, steps=measured, calibration=None))  # type: ignore[arg-type]
+    drawn(panel, tape, 0, steps=measured, calibration=None)
     assert not tape.rows
-    panel.draw(tape, moment(0, steps=measured))  # type: ignore[arg-type]  # the first moment is drawn at once
-    truth = [truths(left_nm[row : row + 1], open_nm[row : row + 1]) for row in (2, 3)]
-    panel.draw(tape, moment(TICK_NS, steps=measured, truths=truth[0]))  # type: ignore[arg-type]
-    panel.draw(tape, moment(science.PERIOD_NS, truths=truth[1]))  # type: ignore[arg-type]
-    times_ns, found = tape.column(science.CONTRAST)
+    drawn(panel, tape, 0, steps=measured)  # the first snapshot is drawn at once
+    drawn(panel, tape, TICK_NS, steps=measured, truths=truths(left_nm[2:3], open_nm[2:3]))
+    drawn(panel, tape, science.PERIOD_NS, truths=truths(left_nm[3:4], open_nm[3:4]))
+    times_ns, found = tape.column(science.CONTRAST.path)
     np.testing.assert_array_equal(times_ns - START_NS, [0, science.PERIOD_NS])
     flat = mean_of(pupil, np.zeros(MODES))
     expected = [
@@ -97,26 +89,26 @@ def test_contrast_is_that_of_the_newest_wavefronts() -> None:
     ]
     np.testing.assert_allclose(10**found, expected, rtol=3e-3)
     assert np.ptp(np.unique(found)) > 1
-    named = [tape_names.names.as_arrow_array().to_pylist() for _, (tape_names,) in tape.logged[science.CONTRAST]]
-    assert ["measured" in names[1] for names in named] == [True, False]
-    assert ["true" in names[0] for names in named] == [False, True]
+    names = [values_of(style.names) for _, (style,) in tape.logged[science.CONTRAST.path]]
+    assert [("measured" in now, "true" in as_open) for as_open, now, _ in names] == [(True, False), (False, True)]
 
 
 def test_a_brighter_dark_zone_is_brighter_in_the_picture() -> None:
     tape, panel = Tape(), science.Science(load_pupil(), NM)
     open_nm = np.full((1, MODES), 90.0)
-    panel.draw(tape, moment(0, truths=truths(0 * open_nm, open_nm)))  # type: ignore[arg-type]
+    drawn(panel, tape, 0, truths=truths(0 * open_nm, open_nm))
     shown = pixels(tape, f"{science.IMAGE}/contrast").astype(float).sum(axis=2)
     rows = slice(44, 52)  # about the x axis, from 5 to 11 lambda/D right of each star; the second begins at 102
     now, as_open = (shown[rows, start + 68 : start + 92].mean() for start in (0, 102))
     assert as_open > 2 * now
     assert shown[48, 48] == shown[48, 102 + 48] == shown.max()  # both stars
-    panel.draw(tape, moment(science.PERIOD_NS))  # type: ignore[arg-type]  # nothing new, nothing drawn
-    assert len(tape.rows[science.CONTRAST]) == 1
+    drawn(panel, tape, science.PERIOD_NS)  # nothing new, nothing drawn
+    assert len(tape.rows[science.CONTRAST.path]) == 1
 
 
 TONE_HZ, TONE_NM = 20.0, 3.0
 LAW = {"gain": [0.4] * MODES, "leak": [0.01] * MODES, "delay_frames": 2.0}
+CAMERA = wire.CameraState(period_ns=round(1e9 / RATE_HZ))
 
 
 @pytest.fixture(autouse=True)
@@ -133,44 +125,38 @@ def run_spectra(tape: Tape, mode: int = LoopMode.CLOSED, frames: int = 3000, **l
     for k in range(frames):  # a delay of two frames: the command of the frame before is seen
         error_nm[k] = pol_nm[k] + command_nm[max(k - 1, 0)]
         command_nm[k + 1] = 0.99 * command_nm[k] - 0.4 * error_nm[k]
-    panel = spectra.Spectra()
-    panel.begin(tape)  # type: ignore[arg-type]
+    panel, controller = spectra.Spectra(), wire.ControllerState(**LAW, **law)
+    panel.begin(tape)
     for first in range(0, frames, 50):
-        rows = slice(first, first + 50)
-        panel.draw(
-            tape,  # type: ignore[arg-type]
-            moment(
-                round((first + 50) * 1e9 / RATE_HZ),
-                steps=steps(first, error_nm[rows], pol_nm[rows], mode),
-                camera=wire.CameraState(period_ns=round(1e9 / RATE_HZ)),
-                controller=wire.ControllerState(**LAW, **law),
-            ),
-        )
+        new = steps(first, error_nm[first : first + 50], pol_nm[first : first + 50], mode)
+        drawn(panel, tape, round((first + 50) * 1e9 / RATE_HZ), steps=new, camera=CAMERA, controller=controller)
     return panel
 
 
-def curves_of(tape: Tape, panel: spectra.Spectra, path: str) -> list[Any]:
+def strips_of(tape: Tape, path: str) -> list[Any]:
+    return [np.array(strip) for strip in values_of(tape.last(f"{path}/curves").strips)]
+
+
+def curves_of(tape: Tape, path: str) -> list[Any]:
     """Frequency and power of each curve, read off the plot by its own ticks."""
     ticks = tape.last(f"{path}/ticks")
-    places = np.array(ticks.positions.as_arrow_array().to_pylist())
-    labels = ticks.labels.as_arrow_array().to_pylist()
-    on_x = [place[0] for place, label in zip(places, labels, strict=True) if label.endswith(" Hz")]
-    hz = [float(label.removesuffix(" Hz")) for label in labels if label.endswith(" Hz")]
-    grid = [np.array(line) for line in tape.last(f"{path}/grid").strips.as_arrow_array().to_pylist()]
+    places = dict(zip(values_of(ticks.labels), values_of(ticks.positions), strict=True))
+    hz = {float(label.removesuffix(" Hz")): x for label, (x, _) in places.items() if label.endswith(" Hz")}
+    grid = [np.array(line) for line in values_of(tape.last(f"{path}/grid").strips)]
     on_y = [line[0, 1] for line in grid[1:] if line[0, 1] == line[1, 1]]
-    power = [float(label) for label in labels if not label.endswith(" Hz")]
-    x, y = np.polyfit(on_x, np.log10(hz), 1), np.polyfit(on_y, np.log10(power), 1)
-    strips = [np.array(strip) for strip in tape.last(f"{path}/curves").strips.as_arrow_array().to_pylist()]
+    power = [float(label) for label in places if not label.endswith(" Hz")]
+    x, y = np.polyfit(list(hz.values()), np.log10(list(hz)), 1), np.polyfit(on_y, np.log10(power), 1)
+    strips = strips_of(tape, path)
     for strip in strips:
         assert (strip >= -0.01).all(), "outside the box"
-        assert (strip <= [spectra.WIDTH + 0.01, spectra.HEIGHT + 0.01]).all(), "outside the box"
+        assert (strip <= [spectra.WIDTH + 0.01, BOX_HEIGHT + 0.01]).all(), "outside the box"
     return [(10 ** np.polyval(x, strip[:, 0]), 10 ** np.polyval(y, strip[:, 1])) for strip in strips]
 
 
 def test_a_tone_stands_at_its_frequency_with_its_power() -> None:
     tape = Tape()
-    panel = run_spectra(tape)
-    (hz, as_open), (_, error), (_, theory) = curves_of(tape, panel, spectra.TILTS)
+    run_spectra(tape)
+    (hz, as_open), (_, error), (_, theory) = curves_of(tape, spectra.TILTS)
     tone = int(as_open.argmax())
     assert hz[tone] == pytest.approx(TONE_HZ, rel=0.05)
     noise = 2 * 0.2**2 * 2 / RATE_HZ  # of two modes, one-sided
@@ -179,41 +165,41 @@ def test_a_tone_stands_at_its_frequency_with_its_power() -> None:
     expected = rejection(np.array([TONE_HZ]), RATE_HZ, 0.4, 0.01, 2.0)[0] ** 2
     assert error[tone] / as_open[tone] == pytest.approx(expected, rel=0.1)
     np.testing.assert_allclose(np.log10(error[2:]), np.log10(theory[2:]), atol=0.15)
-    (_, others), _, left = curves_of(tape, panel, spectra.OTHERS)
+    (_, others), _, left = curves_of(tape, spectra.OTHERS)
     assert np.median(others[hz > 50]) == pytest.approx(noise / 2 * (MODES - 2), rel=0.1)
-    loop = LinearLoop(np.array([0.4]), np.array([0.01]), 2.0, RATE_HZ)
     high = hz > 50
-    np.testing.assert_allclose(left[1][high] / others[high], loop.rejection(hz[high])[:, 0] ** 2, rtol=0.15)
+    passed = rejection(hz[high], RATE_HZ, 0.4, 0.01, 2.0) ** 2
+    np.testing.assert_allclose(left[1][high] / others[high], passed, rtol=0.15)
 
 
 def test_without_a_closed_loop_there_is_no_theory_and_after_a_change_no_past() -> None:
     tape = Tape()
     panel = run_spectra(tape, LoopMode.OPEN, 1000)
-    assert len(curves_of(tape, panel, spectra.TILTS)) == 2
-    panel.draw(tape, moment(round(8e9), controller=wire.ControllerState(gain=[0.1] * MODES)))  # type: ignore[arg-type]
+    assert len(curves_of(tape, spectra.TILTS)) == 2
+    drawn(panel, tape, round(8e9), controller=wire.ControllerState(gain=[0.1] * MODES))
     few = np.ones((20, MODES))
-    panel.draw(tape, moment(round(9e9), steps=steps(1000, few, few), camera=wire.CameraState(period_ns=2_000_000)))  # type: ignore[arg-type]
-    assert not tape.last(f"{spectra.TILTS}/curves").strips.as_arrow_array().to_pylist()
-    (said,) = tape.last(f"{spectra.TILTS}/state").labels.as_arrow_array().to_pylist()
-    assert said.startswith("loop closed: too few frames")
+    drawn(panel, tape, round(9e9), steps=steps(1000, few, few), camera=CAMERA)
+    assert not strips_of(tape, spectra.TILTS)
+    (text,) = values_of(tape.last(f"{spectra.TILTS}/state").labels)
+    assert text.startswith("loop closed: too few frames")
 
 
 def test_the_integrators_rejection_is_not_drawn_for_another_law() -> None:
     tape = Tape()
     run_spectra(tape, law=wire.LinearLaw(name="lqg"))
-    assert len(tape.last(f"{spectra.TILTS}/curves").strips.as_arrow_array().to_pylist()) == 2
+    assert len(strips_of(tape, spectra.TILTS)) == 2
 
 
 def test_a_wavefront_that_stands_still_has_no_spectrum() -> None:
-    tape, panel, still = Tape(), spectra.Spectra(), np.zeros((200, MODES))
-    panel.draw(tape, moment(0, steps=steps(0, still, still)))  # type: ignore[arg-type]
-    assert not tape.last(f"{spectra.OTHERS}/curves").strips.as_arrow_array().to_pylist()
+    tape, still = Tape(), np.zeros((200, MODES))
+    drawn(spectra.Spectra(), tape, 0, steps=steps(0, still, still))
+    assert not strips_of(tape, spectra.OTHERS)
 
 
 def test_memory_of_the_spectra_is_bounded() -> None:
     tape, panel, some = Tape(), spectra.Spectra(), np.ones((500, MODES))
     for first in range(0, 2 * steady.FRAMES, 500):
-        panel.draw(tape, moment(first, steps=steps(first, some, some)))  # type: ignore[arg-type]
+        drawn(panel, tape, first, steps=steps(first, some, some))
     kept = len(panel._steady.rows()[0])
     assert steady.FRAMES <= kept < steady.FRAMES + 500
 
@@ -221,39 +207,37 @@ def test_memory_of_the_spectra_is_bounded() -> None:
 def test_latencies_are_those_of_the_last_second() -> None:
     rng = np.random.default_rng(2)
     tape, panel = Tape(), latency.Latency()
-    panel.begin(tape)  # type: ignore[arg-type]
+    panel.begin(tape)
     batches = [
         {stage: rng.integers(100_000, 900_000, 100) * (1 + number) for number, stage in enumerate(STAGES)}
         for _ in range(16)
     ]
     controller = wire.Health(topics=[wire.TopicCount(topic=FRAME.key, received=90, skipped=7, missing=3)])
     recorder = wire.Health(recording=wire.Recording(lost=5))
-    health = {Role.CONTROLLER: Heard(0, controller), Role.RECORDER: Heard(0, recorder)}
+    health = {Role.CONTROLLER: LastHealth(0, controller), Role.RECORDER: LastHealth(0, recorder)}
     for number, timings in enumerate(batches):
-        panel.draw(tape, moment(number * 100_000_000, timings=timings, health=health))  # type: ignore[arg-type]
-    times_ns, found = tape.column(latency.WHOLE)
+        drawn(panel, tape, number * 100_000_000, timings=timings, health=health)
+    times_ns, found = tape.column(latency.WHOLE.path)
     np.testing.assert_array_equal(times_ns - START_NS, np.arange(4) * latency.PERIOD_NS)
     last_us = {stage: np.concatenate([one[stage] for one in batches[6:]]) / 1e3 for stage in STAGES}
     whole_us = last_us["frame_to_command"]
     np.testing.assert_allclose(found[-1], [*np.percentile(whole_us, [50, 99]), whole_us.max()])
-    stages_us = [np.percentile(last_us[stage], 99) for stage in tape.names(latency.PARTS)]
-    np.testing.assert_allclose(tape.column(latency.PARTS)[1][-1], stages_us)
+    stages_us = [np.percentile(last_us[stage], 99) for stage in tape.names(latency.PARTS.path)]
+    np.testing.assert_allclose(tape.column(latency.PARTS.path)[1][-1], stages_us)
     bars = tape.last(latency.HISTOGRAM)
-    counts, middles = (np.array(one.as_arrow_array().to_pylist()[0]["buffer"]) for one in (bars.values, bars.abscissa))
-    widths = np.array(bars.widths.as_arrow_array().to_pylist()).ravel()
+    counts, middles = (np.array(values_of(one)[0]["buffer"]) for one in (bars.values, bars.abscissa))
+    widths = np.array(values_of(bars.widths)).ravel()
     assert counts.sum() == 1000
-    share = np.average(middles, weights=counts)
-    assert share == pytest.approx(whole_us.mean(), abs=widths[0] / 2)
+    assert np.average(middles, weights=counts) == pytest.approx(whole_us.mean(), abs=widths[0] / 2)
     np.testing.assert_allclose(np.diff(middles), widths[1:], rtol=1e-6)
-    assert tape.column(latency.COUNTS)[1][-1].tolist() == [7, 3]
-    assert tape.column(latency.LOST)[1][-1].tolist() == [5]
+    assert tape.column(latency.COUNTS.path)[1][-1].tolist() == [7, 3]
+    assert tape.column(latency.LOST.path)[1][-1].tolist() == [5]
 
 
 def test_a_silent_controller_has_no_latency() -> None:
     tape, panel = Tape(), latency.Latency()
-    panel.begin(tape)  # type: ignore[arg-type]
-    panel.draw(tape, moment(0, timings={stage: np.full(10, 400_000) for stage in STAGES}))  # type: ignore[arg-type]
-    panel.draw(tape, moment(5_000_000_000))  # type: ignore[arg-type]
-    assert len(tape.rows[latency.WHOLE]) == 1
-    assert not any(tape.last(latency.HISTOGRAM).values.as_arrow_array().to_pylist()[0]["buffer"])
-    assert not tape.rows[latency.COUNTS], "nobody has told"
+    drawn(panel, tape, 0, timings={stage: np.full(10, 400_000) for stage in STAGES})
+    drawn(panel, tape, 5_000_000_000)
+    assert len(tape.rows[latency.WHOLE.path]) == 1
+    assert not any(values_of(tape.last(latency.HISTOGRAM).values)[0]["buffer"])
+    assert not tape.rows[latency.COUNTS.path], "no Health has arrived"

@@ -16,7 +16,7 @@ class LoopMode(int, metaclass=_enum_type_wrapper.EnumTypeWrapper):
     LOOP_MODE_IDLE: _ClassVar[LoopMode]
     LOOP_MODE_OPEN: _ClassVar[LoopMode]
     LOOP_MODE_CLOSED: _ClassVar[LoopMode]
-    LOOP_MODE_SAFED: _ClassVar[LoopMode]
+    LOOP_MODE_SAFE: _ClassVar[LoopMode]
 
 class Reason(int, metaclass=_enum_type_wrapper.EnumTypeWrapper):
     __slots__ = ()
@@ -50,7 +50,7 @@ LOOP_MODE_UNSPECIFIED: LoopMode
 LOOP_MODE_IDLE: LoopMode
 LOOP_MODE_OPEN: LoopMode
 LOOP_MODE_CLOSED: LoopMode
-LOOP_MODE_SAFED: LoopMode
+LOOP_MODE_SAFE: LoopMode
 REASON_UNSPECIFIED: Reason
 REASON_NO_CALIBRATION: Reason
 REASON_WRONG_SIZE: Reason
@@ -108,7 +108,7 @@ class CameraState(_message.Message):
     def __init__(self, timestamp: _Optional[_Union[datetime.datetime, _timestamp_pb2.Timestamp, _Mapping]] = ..., exposure_ns: _Optional[int] = ..., period_ns: _Optional[int] = ..., gain_e_per_dn: _Optional[float] = ..., bias_dn: _Optional[float] = ..., read_noise_e: _Optional[float] = ..., saturation_dn: _Optional[float] = ..., region_row: _Optional[int] = ..., region_column: _Optional[int] = ..., rows: _Optional[int] = ..., columns: _Optional[int] = ..., bit_depth: _Optional[int] = ..., em_gain: _Optional[float] = ..., start_s: _Optional[int] = ...) -> None: ...
 
 class ControlStep(_message.Message):
-    __slots__ = ("timestamp", "frame_sequence", "mode", "error_nm", "pol_nm", "command_nm", "reasons", "flux_dn", "saturated_pixels", "taken")
+    __slots__ = ("timestamp", "frame_sequence", "mode", "error_nm", "pol_nm", "command_nm", "reasons", "flux_dn", "saturated_pixels", "input_number")
     TIMESTAMP_FIELD_NUMBER: _ClassVar[int]
     FRAME_SEQUENCE_FIELD_NUMBER: _ClassVar[int]
     MODE_FIELD_NUMBER: _ClassVar[int]
@@ -118,7 +118,7 @@ class ControlStep(_message.Message):
     REASONS_FIELD_NUMBER: _ClassVar[int]
     FLUX_DN_FIELD_NUMBER: _ClassVar[int]
     SATURATED_PIXELS_FIELD_NUMBER: _ClassVar[int]
-    TAKEN_FIELD_NUMBER: _ClassVar[int]
+    INPUT_NUMBER_FIELD_NUMBER: _ClassVar[int]
     timestamp: _timestamp_pb2.Timestamp
     frame_sequence: int
     mode: LoopMode
@@ -128,8 +128,8 @@ class ControlStep(_message.Message):
     reasons: _containers.RepeatedScalarFieldContainer[Reason]
     flux_dn: float
     saturated_pixels: int
-    taken: int
-    def __init__(self, timestamp: _Optional[_Union[datetime.datetime, _timestamp_pb2.Timestamp, _Mapping]] = ..., frame_sequence: _Optional[int] = ..., mode: _Optional[_Union[LoopMode, str]] = ..., error_nm: _Optional[_Iterable[float]] = ..., pol_nm: _Optional[_Iterable[float]] = ..., command_nm: _Optional[_Iterable[float]] = ..., reasons: _Optional[_Iterable[_Union[Reason, str]]] = ..., flux_dn: _Optional[float] = ..., saturated_pixels: _Optional[int] = ..., taken: _Optional[int] = ...) -> None: ...
+    input_number: int
+    def __init__(self, timestamp: _Optional[_Union[datetime.datetime, _timestamp_pb2.Timestamp, _Mapping]] = ..., frame_sequence: _Optional[int] = ..., mode: _Optional[_Union[LoopMode, str]] = ..., error_nm: _Optional[_Iterable[float]] = ..., pol_nm: _Optional[_Iterable[float]] = ..., command_nm: _Optional[_Iterable[float]] = ..., reasons: _Optional[_Iterable[_Union[Reason, str]]] = ..., flux_dn: _Optional[float] = ..., saturated_pixels: _Optional[int] = ..., input_number: _Optional[int] = ...) -> None: ...
 
 class Tick(_message.Message):
     __slots__ = ("timestamp", "silent_ns")
@@ -150,20 +150,20 @@ class Load(_message.Message):
     def __init__(self, timestamp: _Optional[_Union[datetime.datetime, _timestamp_pb2.Timestamp, _Mapping]] = ..., calibration_id: _Optional[str] = ..., source: _Optional[str] = ...) -> None: ...
 
 class ControlInput(_message.Message):
-    __slots__ = ("timestamp", "taken", "load", "mirror", "camera", "tick")
+    __slots__ = ("timestamp", "input_number", "load", "mirror", "camera", "tick")
     TIMESTAMP_FIELD_NUMBER: _ClassVar[int]
-    TAKEN_FIELD_NUMBER: _ClassVar[int]
+    INPUT_NUMBER_FIELD_NUMBER: _ClassVar[int]
     LOAD_FIELD_NUMBER: _ClassVar[int]
     MIRROR_FIELD_NUMBER: _ClassVar[int]
     CAMERA_FIELD_NUMBER: _ClassVar[int]
     TICK_FIELD_NUMBER: _ClassVar[int]
     timestamp: _timestamp_pb2.Timestamp
-    taken: int
+    input_number: int
     load: Load
     mirror: MirrorState
     camera: CameraState
     tick: Tick
-    def __init__(self, timestamp: _Optional[_Union[datetime.datetime, _timestamp_pb2.Timestamp, _Mapping]] = ..., taken: _Optional[int] = ..., load: _Optional[_Union[Load, _Mapping]] = ..., mirror: _Optional[_Union[MirrorState, _Mapping]] = ..., camera: _Optional[_Union[CameraState, _Mapping]] = ..., tick: _Optional[_Union[Tick, _Mapping]] = ...) -> None: ...
+    def __init__(self, timestamp: _Optional[_Union[datetime.datetime, _timestamp_pb2.Timestamp, _Mapping]] = ..., input_number: _Optional[int] = ..., load: _Optional[_Union[Load, _Mapping]] = ..., mirror: _Optional[_Union[MirrorState, _Mapping]] = ..., camera: _Optional[_Union[CameraState, _Mapping]] = ..., tick: _Optional[_Union[Tick, _Mapping]] = ...) -> None: ...
 
 class ControlTiming(_message.Message):
     __slots__ = ("timestamp", "frame_sequence", "transport_ns", "wakeup_ns", "compute_ns", "publish_ns", "frame_to_command_ns")
@@ -192,38 +192,38 @@ class ReasonCount(_message.Message):
     def __init__(self, reason: _Optional[_Union[Reason, str]] = ..., count: _Optional[int] = ...) -> None: ...
 
 class ControllerSettings(_message.Message):
-    __slots__ = ("stroke_nm", "slew_nm", "neighbour_nm", "delay_frames", "start_mode", "late_ns", "hold_ns", "silence", "least_flux", "most_saturated", "gain", "leak", "limit_nm", "most_alike", "rate_hz")
+    __slots__ = ("stroke_nm", "slew_nm", "neighbour_nm", "delay_frames", "start_mode", "max_frame_age_ns", "frame_timeout_ns", "on_frame_timeout", "min_flux_fraction", "max_saturated_pixels", "gain", "leak", "limit_nm", "max_identical_frames", "rate_hz")
     STROKE_NM_FIELD_NUMBER: _ClassVar[int]
     SLEW_NM_FIELD_NUMBER: _ClassVar[int]
     NEIGHBOUR_NM_FIELD_NUMBER: _ClassVar[int]
     DELAY_FRAMES_FIELD_NUMBER: _ClassVar[int]
     START_MODE_FIELD_NUMBER: _ClassVar[int]
-    LATE_NS_FIELD_NUMBER: _ClassVar[int]
-    HOLD_NS_FIELD_NUMBER: _ClassVar[int]
-    SILENCE_FIELD_NUMBER: _ClassVar[int]
-    LEAST_FLUX_FIELD_NUMBER: _ClassVar[int]
-    MOST_SATURATED_FIELD_NUMBER: _ClassVar[int]
+    MAX_FRAME_AGE_NS_FIELD_NUMBER: _ClassVar[int]
+    FRAME_TIMEOUT_NS_FIELD_NUMBER: _ClassVar[int]
+    ON_FRAME_TIMEOUT_FIELD_NUMBER: _ClassVar[int]
+    MIN_FLUX_FRACTION_FIELD_NUMBER: _ClassVar[int]
+    MAX_SATURATED_PIXELS_FIELD_NUMBER: _ClassVar[int]
     GAIN_FIELD_NUMBER: _ClassVar[int]
     LEAK_FIELD_NUMBER: _ClassVar[int]
     LIMIT_NM_FIELD_NUMBER: _ClassVar[int]
-    MOST_ALIKE_FIELD_NUMBER: _ClassVar[int]
+    MAX_IDENTICAL_FRAMES_FIELD_NUMBER: _ClassVar[int]
     RATE_HZ_FIELD_NUMBER: _ClassVar[int]
     stroke_nm: float
     slew_nm: float
     neighbour_nm: float
     delay_frames: float
     start_mode: LoopMode
-    late_ns: int
-    hold_ns: int
-    silence: str
-    least_flux: float
-    most_saturated: int
+    max_frame_age_ns: int
+    frame_timeout_ns: int
+    on_frame_timeout: str
+    min_flux_fraction: float
+    max_saturated_pixels: int
     gain: _containers.RepeatedScalarFieldContainer[float]
     leak: _containers.RepeatedScalarFieldContainer[float]
     limit_nm: _containers.RepeatedScalarFieldContainer[float]
-    most_alike: int
+    max_identical_frames: int
     rate_hz: float
-    def __init__(self, stroke_nm: _Optional[float] = ..., slew_nm: _Optional[float] = ..., neighbour_nm: _Optional[float] = ..., delay_frames: _Optional[float] = ..., start_mode: _Optional[_Union[LoopMode, str]] = ..., late_ns: _Optional[int] = ..., hold_ns: _Optional[int] = ..., silence: _Optional[str] = ..., least_flux: _Optional[float] = ..., most_saturated: _Optional[int] = ..., gain: _Optional[_Iterable[float]] = ..., leak: _Optional[_Iterable[float]] = ..., limit_nm: _Optional[_Iterable[float]] = ..., most_alike: _Optional[int] = ..., rate_hz: _Optional[float] = ...) -> None: ...
+    def __init__(self, stroke_nm: _Optional[float] = ..., slew_nm: _Optional[float] = ..., neighbour_nm: _Optional[float] = ..., delay_frames: _Optional[float] = ..., start_mode: _Optional[_Union[LoopMode, str]] = ..., max_frame_age_ns: _Optional[int] = ..., frame_timeout_ns: _Optional[int] = ..., on_frame_timeout: _Optional[str] = ..., min_flux_fraction: _Optional[float] = ..., max_saturated_pixels: _Optional[int] = ..., gain: _Optional[_Iterable[float]] = ..., leak: _Optional[_Iterable[float]] = ..., limit_nm: _Optional[_Iterable[float]] = ..., max_identical_frames: _Optional[int] = ..., rate_hz: _Optional[float] = ...) -> None: ...
 
 class Channel(_message.Message):
     __slots__ = ("name", "actuators", "shifts", "reached")
@@ -258,17 +258,17 @@ class Play(_message.Message):
     def __init__(self, target: _Optional[str] = ..., first_sequence: _Optional[int] = ..., columns: _Optional[int] = ..., table: _Optional[bytes] = ..., basis: _Optional[bytes] = ..., id: _Optional[str] = ..., frames: _Optional[int] = ..., timestamp: _Optional[_Union[datetime.datetime, _timestamp_pb2.Timestamp, _Mapping]] = ...) -> None: ...
 
 class LinearLaw(_message.Message):
-    __slots__ = ("name", "signal", "noll", "delay_frames", "rate_hz", "states", "follow", "gain", "kept", "coast", "output", "id", "timestamp")
+    __slots__ = ("name", "signal", "noll", "delay_frames", "rate_hz", "states", "transition", "measurement_gain", "command_gain", "predict_only", "output", "id", "timestamp")
     NAME_FIELD_NUMBER: _ClassVar[int]
     SIGNAL_FIELD_NUMBER: _ClassVar[int]
     NOLL_FIELD_NUMBER: _ClassVar[int]
     DELAY_FRAMES_FIELD_NUMBER: _ClassVar[int]
     RATE_HZ_FIELD_NUMBER: _ClassVar[int]
     STATES_FIELD_NUMBER: _ClassVar[int]
-    FOLLOW_FIELD_NUMBER: _ClassVar[int]
-    GAIN_FIELD_NUMBER: _ClassVar[int]
-    KEPT_FIELD_NUMBER: _ClassVar[int]
-    COAST_FIELD_NUMBER: _ClassVar[int]
+    TRANSITION_FIELD_NUMBER: _ClassVar[int]
+    MEASUREMENT_GAIN_FIELD_NUMBER: _ClassVar[int]
+    COMMAND_GAIN_FIELD_NUMBER: _ClassVar[int]
+    PREDICT_ONLY_FIELD_NUMBER: _ClassVar[int]
     OUTPUT_FIELD_NUMBER: _ClassVar[int]
     ID_FIELD_NUMBER: _ClassVar[int]
     TIMESTAMP_FIELD_NUMBER: _ClassVar[int]
@@ -278,17 +278,17 @@ class LinearLaw(_message.Message):
     delay_frames: float
     rate_hz: float
     states: int
-    follow: bytes
-    gain: bytes
-    kept: bytes
-    coast: bytes
+    transition: bytes
+    measurement_gain: bytes
+    command_gain: bytes
+    predict_only: bytes
     output: bytes
     id: str
     timestamp: _timestamp_pb2.Timestamp
-    def __init__(self, name: _Optional[str] = ..., signal: _Optional[str] = ..., noll: _Optional[_Iterable[int]] = ..., delay_frames: _Optional[float] = ..., rate_hz: _Optional[float] = ..., states: _Optional[int] = ..., follow: _Optional[bytes] = ..., gain: _Optional[bytes] = ..., kept: _Optional[bytes] = ..., coast: _Optional[bytes] = ..., output: _Optional[bytes] = ..., id: _Optional[str] = ..., timestamp: _Optional[_Union[datetime.datetime, _timestamp_pb2.Timestamp, _Mapping]] = ...) -> None: ...
+    def __init__(self, name: _Optional[str] = ..., signal: _Optional[str] = ..., noll: _Optional[_Iterable[int]] = ..., delay_frames: _Optional[float] = ..., rate_hz: _Optional[float] = ..., states: _Optional[int] = ..., transition: _Optional[bytes] = ..., measurement_gain: _Optional[bytes] = ..., command_gain: _Optional[bytes] = ..., predict_only: _Optional[bytes] = ..., output: _Optional[bytes] = ..., id: _Optional[str] = ..., timestamp: _Optional[_Union[datetime.datetime, _timestamp_pb2.Timestamp, _Mapping]] = ...) -> None: ...
 
 class ControllerState(_message.Message):
-    __slots__ = ("timestamp", "frame_sequence", "mode", "calibration_id", "gain", "leak", "limit_nm", "delay_frames", "command_history_nm", "actuators", "offset", "counts", "frames_used", "frame_timestamp", "refused", "refused_count", "limits_hit", "silent", "commanded", "taken", "settings", "offset_nm", "channels", "shift_history_nm", "law", "law_state", "law_frames", "play", "steps_left", "homing", "measured_nm", "flux_dn", "alike", "camera", "camera_expected", "camera_awaited", "clear_id", "mode_timestamp", "mode_cause", "lease", "mirror_rows", "mirror_columns")
+    __slots__ = ("timestamp", "frame_sequence", "mode", "calibration_id", "gain", "leak", "limit_nm", "delay_frames", "command_history_nm", "actuators", "offset", "counts", "frames_used", "frame_timestamp", "refused", "refused_count", "limits_hit", "frame_timeout", "commanded", "input_number", "settings", "offset_nm", "channels", "shift_history_nm", "law", "law_state", "law_frames", "play", "steps_left", "returning_to_zero", "measured_nm", "flux_dn", "identical_frames", "camera", "camera_expected", "camera_awaited", "clear_id", "mode_timestamp", "mode_cause", "lease", "mirror_rows", "mirror_columns")
     TIMESTAMP_FIELD_NUMBER: _ClassVar[int]
     FRAME_SEQUENCE_FIELD_NUMBER: _ClassVar[int]
     MODE_FIELD_NUMBER: _ClassVar[int]
@@ -306,9 +306,9 @@ class ControllerState(_message.Message):
     REFUSED_FIELD_NUMBER: _ClassVar[int]
     REFUSED_COUNT_FIELD_NUMBER: _ClassVar[int]
     LIMITS_HIT_FIELD_NUMBER: _ClassVar[int]
-    SILENT_FIELD_NUMBER: _ClassVar[int]
+    FRAME_TIMEOUT_FIELD_NUMBER: _ClassVar[int]
     COMMANDED_FIELD_NUMBER: _ClassVar[int]
-    TAKEN_FIELD_NUMBER: _ClassVar[int]
+    INPUT_NUMBER_FIELD_NUMBER: _ClassVar[int]
     SETTINGS_FIELD_NUMBER: _ClassVar[int]
     OFFSET_NM_FIELD_NUMBER: _ClassVar[int]
     CHANNELS_FIELD_NUMBER: _ClassVar[int]
@@ -318,10 +318,10 @@ class ControllerState(_message.Message):
     LAW_FRAMES_FIELD_NUMBER: _ClassVar[int]
     PLAY_FIELD_NUMBER: _ClassVar[int]
     STEPS_LEFT_FIELD_NUMBER: _ClassVar[int]
-    HOMING_FIELD_NUMBER: _ClassVar[int]
+    RETURNING_TO_ZERO_FIELD_NUMBER: _ClassVar[int]
     MEASURED_NM_FIELD_NUMBER: _ClassVar[int]
     FLUX_DN_FIELD_NUMBER: _ClassVar[int]
-    ALIKE_FIELD_NUMBER: _ClassVar[int]
+    IDENTICAL_FRAMES_FIELD_NUMBER: _ClassVar[int]
     CAMERA_FIELD_NUMBER: _ClassVar[int]
     CAMERA_EXPECTED_FIELD_NUMBER: _ClassVar[int]
     CAMERA_AWAITED_FIELD_NUMBER: _ClassVar[int]
@@ -348,9 +348,9 @@ class ControllerState(_message.Message):
     refused: Reason
     refused_count: int
     limits_hit: _containers.RepeatedScalarFieldContainer[Reason]
-    silent: bool
+    frame_timeout: bool
     commanded: bool
-    taken: int
+    input_number: int
     settings: ControllerSettings
     offset_nm: _containers.RepeatedScalarFieldContainer[float]
     channels: _containers.RepeatedCompositeFieldContainer[Channel]
@@ -360,10 +360,10 @@ class ControllerState(_message.Message):
     law_frames: int
     play: Play
     steps_left: int
-    homing: bool
+    returning_to_zero: bool
     measured_nm: _containers.RepeatedScalarFieldContainer[float]
     flux_dn: float
-    alike: int
+    identical_frames: int
     camera: CameraState
     camera_expected: CameraState
     camera_awaited: bool
@@ -373,7 +373,7 @@ class ControllerState(_message.Message):
     lease: Lease
     mirror_rows: int
     mirror_columns: int
-    def __init__(self, timestamp: _Optional[_Union[datetime.datetime, _timestamp_pb2.Timestamp, _Mapping]] = ..., frame_sequence: _Optional[int] = ..., mode: _Optional[_Union[LoopMode, str]] = ..., calibration_id: _Optional[str] = ..., gain: _Optional[_Iterable[float]] = ..., leak: _Optional[_Iterable[float]] = ..., limit_nm: _Optional[_Iterable[float]] = ..., delay_frames: _Optional[float] = ..., command_history_nm: _Optional[_Iterable[float]] = ..., actuators: _Optional[bytes] = ..., offset: _Optional[bytes] = ..., counts: _Optional[_Iterable[_Union[ReasonCount, _Mapping]]] = ..., frames_used: _Optional[int] = ..., frame_timestamp: _Optional[_Union[datetime.datetime, _timestamp_pb2.Timestamp, _Mapping]] = ..., refused: _Optional[_Union[Reason, str]] = ..., refused_count: _Optional[int] = ..., limits_hit: _Optional[_Iterable[_Union[Reason, str]]] = ..., silent: _Optional[bool] = ..., commanded: _Optional[bool] = ..., taken: _Optional[int] = ..., settings: _Optional[_Union[ControllerSettings, _Mapping]] = ..., offset_nm: _Optional[_Iterable[float]] = ..., channels: _Optional[_Iterable[_Union[Channel, _Mapping]]] = ..., shift_history_nm: _Optional[_Iterable[float]] = ..., law: _Optional[_Union[LinearLaw, _Mapping]] = ..., law_state: _Optional[_Iterable[float]] = ..., law_frames: _Optional[int] = ..., play: _Optional[_Union[Play, _Mapping]] = ..., steps_left: _Optional[int] = ..., homing: _Optional[bool] = ..., measured_nm: _Optional[_Iterable[float]] = ..., flux_dn: _Optional[float] = ..., alike: _Optional[int] = ..., camera: _Optional[_Union[CameraState, _Mapping]] = ..., camera_expected: _Optional[_Union[CameraState, _Mapping]] = ..., camera_awaited: _Optional[bool] = ..., clear_id: _Optional[int] = ..., mode_timestamp: _Optional[_Union[datetime.datetime, _timestamp_pb2.Timestamp, _Mapping]] = ..., mode_cause: _Optional[str] = ..., lease: _Optional[_Union[Lease, _Mapping]] = ..., mirror_rows: _Optional[int] = ..., mirror_columns: _Optional[int] = ...) -> None: ...
+    def __init__(self, timestamp: _Optional[_Union[datetime.datetime, _timestamp_pb2.Timestamp, _Mapping]] = ..., frame_sequence: _Optional[int] = ..., mode: _Optional[_Union[LoopMode, str]] = ..., calibration_id: _Optional[str] = ..., gain: _Optional[_Iterable[float]] = ..., leak: _Optional[_Iterable[float]] = ..., limit_nm: _Optional[_Iterable[float]] = ..., delay_frames: _Optional[float] = ..., command_history_nm: _Optional[_Iterable[float]] = ..., actuators: _Optional[bytes] = ..., offset: _Optional[bytes] = ..., counts: _Optional[_Iterable[_Union[ReasonCount, _Mapping]]] = ..., frames_used: _Optional[int] = ..., frame_timestamp: _Optional[_Union[datetime.datetime, _timestamp_pb2.Timestamp, _Mapping]] = ..., refused: _Optional[_Union[Reason, str]] = ..., refused_count: _Optional[int] = ..., limits_hit: _Optional[_Iterable[_Union[Reason, str]]] = ..., frame_timeout: _Optional[bool] = ..., commanded: _Optional[bool] = ..., input_number: _Optional[int] = ..., settings: _Optional[_Union[ControllerSettings, _Mapping]] = ..., offset_nm: _Optional[_Iterable[float]] = ..., channels: _Optional[_Iterable[_Union[Channel, _Mapping]]] = ..., shift_history_nm: _Optional[_Iterable[float]] = ..., law: _Optional[_Union[LinearLaw, _Mapping]] = ..., law_state: _Optional[_Iterable[float]] = ..., law_frames: _Optional[int] = ..., play: _Optional[_Union[Play, _Mapping]] = ..., steps_left: _Optional[int] = ..., returning_to_zero: _Optional[bool] = ..., measured_nm: _Optional[_Iterable[float]] = ..., flux_dn: _Optional[float] = ..., identical_frames: _Optional[int] = ..., camera: _Optional[_Union[CameraState, _Mapping]] = ..., camera_expected: _Optional[_Union[CameraState, _Mapping]] = ..., camera_awaited: _Optional[bool] = ..., clear_id: _Optional[int] = ..., mode_timestamp: _Optional[_Union[datetime.datetime, _timestamp_pb2.Timestamp, _Mapping]] = ..., mode_cause: _Optional[str] = ..., lease: _Optional[_Union[Lease, _Mapping]] = ..., mirror_rows: _Optional[int] = ..., mirror_columns: _Optional[int] = ...) -> None: ...
 
 class Lease(_message.Message):
     __slots__ = ("id", "holder", "until", "last_sequence", "ended")
@@ -390,7 +390,7 @@ class Lease(_message.Message):
     def __init__(self, id: _Optional[int] = ..., holder: _Optional[str] = ..., until: _Optional[_Union[datetime.datetime, _timestamp_pb2.Timestamp, _Mapping]] = ..., last_sequence: _Optional[int] = ..., ended: _Optional[str] = ...) -> None: ...
 
 class Request(_message.Message):
-    __slots__ = ("timestamp", "name", "modes", "values", "text", "accepted", "reply", "frame_sequence", "state", "taken", "actuators", "table", "columns", "law", "calibration", "play_id", "lease_id")
+    __slots__ = ("timestamp", "name", "modes", "values", "text", "accepted", "reply", "frame_sequence", "state", "input_number", "actuators", "table", "columns", "law", "calibration", "play_id", "lease_id")
     TIMESTAMP_FIELD_NUMBER: _ClassVar[int]
     NAME_FIELD_NUMBER: _ClassVar[int]
     MODES_FIELD_NUMBER: _ClassVar[int]
@@ -400,7 +400,7 @@ class Request(_message.Message):
     REPLY_FIELD_NUMBER: _ClassVar[int]
     FRAME_SEQUENCE_FIELD_NUMBER: _ClassVar[int]
     STATE_FIELD_NUMBER: _ClassVar[int]
-    TAKEN_FIELD_NUMBER: _ClassVar[int]
+    INPUT_NUMBER_FIELD_NUMBER: _ClassVar[int]
     ACTUATORS_FIELD_NUMBER: _ClassVar[int]
     TABLE_FIELD_NUMBER: _ClassVar[int]
     COLUMNS_FIELD_NUMBER: _ClassVar[int]
@@ -417,7 +417,7 @@ class Request(_message.Message):
     reply: str
     frame_sequence: int
     state: ControllerState
-    taken: int
+    input_number: int
     actuators: bytes
     table: bytes
     columns: int
@@ -425,10 +425,10 @@ class Request(_message.Message):
     calibration: Calibration
     play_id: str
     lease_id: int
-    def __init__(self, timestamp: _Optional[_Union[datetime.datetime, _timestamp_pb2.Timestamp, _Mapping]] = ..., name: _Optional[str] = ..., modes: _Optional[_Iterable[int]] = ..., values: _Optional[_Iterable[float]] = ..., text: _Optional[str] = ..., accepted: _Optional[bool] = ..., reply: _Optional[str] = ..., frame_sequence: _Optional[int] = ..., state: _Optional[_Union[ControllerState, _Mapping]] = ..., taken: _Optional[int] = ..., actuators: _Optional[bytes] = ..., table: _Optional[bytes] = ..., columns: _Optional[int] = ..., law: _Optional[_Union[LinearLaw, _Mapping]] = ..., calibration: _Optional[_Union[Calibration, _Mapping]] = ..., play_id: _Optional[str] = ..., lease_id: _Optional[int] = ...) -> None: ...
+    def __init__(self, timestamp: _Optional[_Union[datetime.datetime, _timestamp_pb2.Timestamp, _Mapping]] = ..., name: _Optional[str] = ..., modes: _Optional[_Iterable[int]] = ..., values: _Optional[_Iterable[float]] = ..., text: _Optional[str] = ..., accepted: _Optional[bool] = ..., reply: _Optional[str] = ..., frame_sequence: _Optional[int] = ..., state: _Optional[_Union[ControllerState, _Mapping]] = ..., input_number: _Optional[int] = ..., actuators: _Optional[bytes] = ..., table: _Optional[bytes] = ..., columns: _Optional[int] = ..., law: _Optional[_Union[LinearLaw, _Mapping]] = ..., calibration: _Optional[_Union[Calibration, _Mapping]] = ..., play_id: _Optional[str] = ..., lease_id: _Optional[int] = ...) -> None: ...
 
 class MirrorCommand(_message.Message):
-    __slots__ = ("timestamp", "frame_sequence", "channel", "valid_for_ns", "rows", "columns", "actuators", "command_nm", "taken", "safe", "clear_id")
+    __slots__ = ("timestamp", "frame_sequence", "channel", "valid_for_ns", "rows", "columns", "actuators", "command_nm", "input_number", "safe", "clear_id")
     TIMESTAMP_FIELD_NUMBER: _ClassVar[int]
     FRAME_SEQUENCE_FIELD_NUMBER: _ClassVar[int]
     CHANNEL_FIELD_NUMBER: _ClassVar[int]
@@ -437,7 +437,7 @@ class MirrorCommand(_message.Message):
     COLUMNS_FIELD_NUMBER: _ClassVar[int]
     ACTUATORS_FIELD_NUMBER: _ClassVar[int]
     COMMAND_NM_FIELD_NUMBER: _ClassVar[int]
-    TAKEN_FIELD_NUMBER: _ClassVar[int]
+    INPUT_NUMBER_FIELD_NUMBER: _ClassVar[int]
     SAFE_FIELD_NUMBER: _ClassVar[int]
     CLEAR_ID_FIELD_NUMBER: _ClassVar[int]
     timestamp: _timestamp_pb2.Timestamp
@@ -448,10 +448,10 @@ class MirrorCommand(_message.Message):
     columns: int
     actuators: bytes
     command_nm: _containers.RepeatedScalarFieldContainer[float]
-    taken: int
+    input_number: int
     safe: bool
     clear_id: int
-    def __init__(self, timestamp: _Optional[_Union[datetime.datetime, _timestamp_pb2.Timestamp, _Mapping]] = ..., frame_sequence: _Optional[int] = ..., channel: _Optional[str] = ..., valid_for_ns: _Optional[int] = ..., rows: _Optional[int] = ..., columns: _Optional[int] = ..., actuators: _Optional[bytes] = ..., command_nm: _Optional[_Iterable[float]] = ..., taken: _Optional[int] = ..., safe: _Optional[bool] = ..., clear_id: _Optional[int] = ...) -> None: ...
+    def __init__(self, timestamp: _Optional[_Union[datetime.datetime, _timestamp_pb2.Timestamp, _Mapping]] = ..., frame_sequence: _Optional[int] = ..., channel: _Optional[str] = ..., valid_for_ns: _Optional[int] = ..., rows: _Optional[int] = ..., columns: _Optional[int] = ..., actuators: _Optional[bytes] = ..., command_nm: _Optional[_Iterable[float]] = ..., input_number: _Optional[int] = ..., safe: _Optional[bool] = ..., clear_id: _Optional[int] = ...) -> None: ...
 
 class MirrorState(_message.Message):
     __slots__ = ("timestamp", "frame_sequence", "status", "rows", "columns", "actuators", "command_nm", "limits_hit", "channels", "safe", "refused")
@@ -628,7 +628,7 @@ class LoopFigures(_message.Message):
     def __init__(self, frames: _Optional[int] = ..., residual_rms_nm: _Optional[float] = ..., flux_fraction: _Optional[float] = ...) -> None: ...
 
 class Health(_message.Message):
-    __slots__ = ("timestamp", "process", "state", "run_id", "pid", "version", "memory_bytes", "rate_hz", "heard", "topics", "granted", "refused", "clock_offset_ns", "uptime_ns", "frame_to_command", "frame_to_mirror", "wavefront", "recording", "mode", "counts", "commands_late", "mean_rate_hz", "router_offset_ns", "router_round_trip_ns", "not_closed_ns", "not_closed_cause", "command_refused", "command_expired", "limits_hit", "recent_wavefront", "last_second", "last_warning", "last_warning_timestamp", "host")
+    __slots__ = ("timestamp", "process", "state", "run_id", "pid", "version", "memory_bytes", "rate_hz", "peers_alive", "topics", "realtime_granted", "realtime_refused", "clock_offset_ns", "uptime_ns", "frame_to_command", "frame_to_mirror", "wavefront", "recording", "mode", "counts", "commands_late", "mean_rate_hz", "router_offset_ns", "router_round_trip_ns", "not_closed_ns", "not_closed_cause", "command_refused", "command_expired", "limits_hit", "recent_wavefront", "last_second", "last_warning", "last_warning_timestamp", "host")
     TIMESTAMP_FIELD_NUMBER: _ClassVar[int]
     PROCESS_FIELD_NUMBER: _ClassVar[int]
     STATE_FIELD_NUMBER: _ClassVar[int]
@@ -637,10 +637,10 @@ class Health(_message.Message):
     VERSION_FIELD_NUMBER: _ClassVar[int]
     MEMORY_BYTES_FIELD_NUMBER: _ClassVar[int]
     RATE_HZ_FIELD_NUMBER: _ClassVar[int]
-    HEARD_FIELD_NUMBER: _ClassVar[int]
+    PEERS_ALIVE_FIELD_NUMBER: _ClassVar[int]
     TOPICS_FIELD_NUMBER: _ClassVar[int]
-    GRANTED_FIELD_NUMBER: _ClassVar[int]
-    REFUSED_FIELD_NUMBER: _ClassVar[int]
+    REALTIME_GRANTED_FIELD_NUMBER: _ClassVar[int]
+    REALTIME_REFUSED_FIELD_NUMBER: _ClassVar[int]
     CLOCK_OFFSET_NS_FIELD_NUMBER: _ClassVar[int]
     UPTIME_NS_FIELD_NUMBER: _ClassVar[int]
     FRAME_TO_COMMAND_FIELD_NUMBER: _ClassVar[int]
@@ -671,10 +671,10 @@ class Health(_message.Message):
     version: str
     memory_bytes: int
     rate_hz: float
-    heard: _containers.RepeatedScalarFieldContainer[str]
+    peers_alive: _containers.RepeatedScalarFieldContainer[str]
     topics: _containers.RepeatedCompositeFieldContainer[TopicCount]
-    granted: _containers.RepeatedScalarFieldContainer[str]
-    refused: _containers.RepeatedScalarFieldContainer[str]
+    realtime_granted: _containers.RepeatedScalarFieldContainer[str]
+    realtime_refused: _containers.RepeatedScalarFieldContainer[str]
     clock_offset_ns: int
     uptime_ns: int
     frame_to_command: Latency
@@ -697,4 +697,4 @@ class Health(_message.Message):
     last_warning: str
     last_warning_timestamp: _timestamp_pb2.Timestamp
     host: str
-    def __init__(self, timestamp: _Optional[_Union[datetime.datetime, _timestamp_pb2.Timestamp, _Mapping]] = ..., process: _Optional[str] = ..., state: _Optional[str] = ..., run_id: _Optional[str] = ..., pid: _Optional[int] = ..., version: _Optional[str] = ..., memory_bytes: _Optional[int] = ..., rate_hz: _Optional[float] = ..., heard: _Optional[_Iterable[str]] = ..., topics: _Optional[_Iterable[_Union[TopicCount, _Mapping]]] = ..., granted: _Optional[_Iterable[str]] = ..., refused: _Optional[_Iterable[str]] = ..., clock_offset_ns: _Optional[int] = ..., uptime_ns: _Optional[int] = ..., frame_to_command: _Optional[_Union[Latency, _Mapping]] = ..., frame_to_mirror: _Optional[_Union[Latency, _Mapping]] = ..., wavefront: _Optional[_Union[WavefrontFigures, _Mapping]] = ..., recording: _Optional[_Union[Recording, _Mapping]] = ..., mode: _Optional[_Union[LoopMode, str]] = ..., counts: _Optional[_Iterable[_Union[ReasonCount, _Mapping]]] = ..., commands_late: _Optional[int] = ..., mean_rate_hz: _Optional[float] = ..., router_offset_ns: _Optional[int] = ..., router_round_trip_ns: _Optional[int] = ..., not_closed_ns: _Optional[int] = ..., not_closed_cause: _Optional[str] = ..., command_refused: _Optional[_Union[Reason, str]] = ..., command_expired: _Optional[bool] = ..., limits_hit: _Optional[_Iterable[_Union[Reason, str]]] = ..., recent_wavefront: _Optional[_Union[WavefrontFigures, _Mapping]] = ..., last_second: _Optional[_Union[LoopFigures, _Mapping]] = ..., last_warning: _Optional[str] = ..., last_warning_timestamp: _Optional[_Union[datetime.datetime, _timestamp_pb2.Timestamp, _Mapping]] = ..., host: _Optional[str] = ...) -> None: ...
+    def __init__(self, timestamp: _Optional[_Union[datetime.datetime, _timestamp_pb2.Timestamp, _Mapping]] = ..., process: _Optional[str] = ..., state: _Optional[str] = ..., run_id: _Optional[str] = ..., pid: _Optional[int] = ..., version: _Optional[str] = ..., memory_bytes: _Optional[int] = ..., rate_hz: _Optional[float] = ..., peers_alive: _Optional[_Iterable[str]] = ..., topics: _Optional[_Iterable[_Union[TopicCount, _Mapping]]] = ..., realtime_granted: _Optional[_Iterable[str]] = ..., realtime_refused: _Optional[_Iterable[str]] = ..., clock_offset_ns: _Optional[int] = ..., uptime_ns: _Optional[int] = ..., frame_to_command: _Optional[_Union[Latency, _Mapping]] = ..., frame_to_mirror: _Optional[_Union[Latency, _Mapping]] = ..., wavefront: _Optional[_Union[WavefrontFigures, _Mapping]] = ..., recording: _Optional[_Union[Recording, _Mapping]] = ..., mode: _Optional[_Union[LoopMode, str]] = ..., counts: _Optional[_Iterable[_Union[ReasonCount, _Mapping]]] = ..., commands_late: _Optional[int] = ..., mean_rate_hz: _Optional[float] = ..., router_offset_ns: _Optional[int] = ..., router_round_trip_ns: _Optional[int] = ..., not_closed_ns: _Optional[int] = ..., not_closed_cause: _Optional[str] = ..., command_refused: _Optional[_Union[Reason, str]] = ..., command_expired: _Optional[bool] = ..., limits_hit: _Optional[_Iterable[_Union[Reason, str]]] = ..., recent_wavefront: _Optional[_Union[WavefrontFigures, _Mapping]] = ..., last_second: _Optional[_Union[LoopFigures, _Mapping]] = ..., last_warning: _Optional[str] = ..., last_warning_timestamp: _Optional[_Union[datetime.datetime, _timestamp_pb2.Timestamp, _Mapping]] = ..., host: _Optional[str] = ...) -> None: ...

@@ -3,35 +3,28 @@
 import json
 import os
 import sys
+from dataclasses import fields
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
-from lowfc.adapters.terminal import INTERRUPTED, new_app
+from lowfc.adapters.process.terminal import INTERRUPTED, Json, new_app
 from lowfc.contract.errors import ConfigurationError
+from lowfc.design.shaped_pupil import Request
+from lowfc.programs.design.options import flag, with_options_of
+from lowfc.programs.design.sam_request import Search
 
 design_app = new_app("Design masks.\n\nExample: lowfc design spc --help")
 
 
 @design_app.command()
+@with_options_of(Request)
 def spc(
-    inner: Annotated[float, typer.Option(help="Where the dark zone begins, in lambda/D.")] = 4.0,
-    outer: Annotated[float, typer.Option(help="Where it ends, in lambda/D.")] = 20.0,
-    half_angle: Annotated[
-        float, typer.Option(help="Degrees from the x axis, on both sides, within which it lies; 90: all around.")
-    ] = 42.5,
-    contrast: Annotated[float, typer.Option(help="Largest intensity in it, over the star's; kept every 0.1.")] = 1e-9,
-    limit: Annotated[float, typer.Option(help="Contrast in the linear programs, over the one promised.")] = 0.95,
-    cells: Annotated[int, typer.Option(help="In half the diameter: 8, 16, 32, 64, 128 or 256.")] = 128,
-    step: Annotated[float, typer.Option(help="Of the first grid of points, in lambda/D.")] = 0.5,
-    symmetry: Annotated[
-        str, typer.Option(help="quarter: about both axes; octant: about the diagonals too, four times as fast.")
-    ] = "quarter",
-    rounds: Annotated[int, typer.Option(help="Programs at most, with each number of cells on the way.")] = 20,
+    request: Request,
     out: Annotated[Path, typer.Option(help="Mask file.")] = Path("spc.npz"),
     plot: Annotated[Path | None, typer.Option(help="Draw mask, image and contrast (PNG).")] = None,
-    as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object on standard output.")] = False,
+    as_json: Json = False,
 ) -> None:
     """Design a shaped pupil: by linear programs, the most open mask with a dark zone beside the star.
 
@@ -39,49 +32,17 @@ def spc(
     """
     from rich.console import Console
 
-    from lowfc.programs.design.spc import design_spc, render, request
+    from lowfc.programs.design.spc import design_spc, render
 
-    wanted = request(
-        inner=inner,
-        outer=outer,
-        half_angle_deg=half_angle,
-        contrast=contrast,
-        limit=limit,
-        cells=cells,
-        step=step,
-        symmetry=symmetry,
-        rounds=rounds,
-    )
-    result = design_spc(wanted, out, plot, Console(stderr=True))
+    result = design_spc(request, out, plot, Console(stderr=True))
     sys.stdout.write((json.dumps(result) if as_json else render(result)) + "\n")
 
 
 @design_app.command()
+@with_options_of(Search)
 def sam(
+    search: Search,
     context: typer.Context,
-    merit: Annotated[
-        str, typer.Option(help="What to minimise: paper, table3, table4, condition, throughput or pareto.")
-    ] = "paper",
-    estimator: Annotated[
-        str | None,
-        typer.Option(help="pinv, or weighted for the Cramer-Rao bound. Default: weighted; pinv for the merit paper."),
-    ] = None,
-    modes: Annotated[int, typer.Option(help="Modes in Table 3: 14 or 20.")] = 14,
-    weight: Annotated[
-        float | None, typer.Option(help="Of Table 4 in paper and pareto, 0 to 1. Default: 0.5; in pareto, a front.")
-    ] = None,
-    focal_mask: Annotated[
-        str | None, typer.Option(help="disk, bowtie or both. Default: disk; both for the merit paper.")
-    ] = None,
-    holes: Annotated[str, typer.Option(help="Number of holes, or FEWEST:MOST.")] = "27",
-    diameter: Annotated[str, typer.Option(help="Of the holes, or SMALLEST:LARGEST, in pupil diameters.")] = "0.07",
-    gap: Annotated[float, typer.Option(help="Least distance between two holes' rims, in pupil diameters.")] = 0.01,
-    edge: Annotated[float, typer.Option(help="Least distance from a hole to the pupil's edge.")] = 0.0,
-    symmetry: Annotated[str, typer.Option(help="none, or the axis of a mirror symmetry: x or y.")] = "none",
-    seed: Annotated[int, typer.Option(help="Of all random numbers.")] = 1,
-    chains: Annotated[int, typer.Option(help="Independent searches; the best one counts.")] = 4,
-    steps: Annotated[int, typer.Option(help="Of each chain.")] = 20_000,
-    name: Annotated[str, typer.Option(help="Of the layout.")] = "sam",
     jobs: Annotated[int | None, typer.Option(min=1, help="Processes. Default: one for each core.")] = None,
     scheduler: Annotated[str | None, typer.Option(help="Address of a Dask scheduler, to use its workers.")] = None,
     out: Annotated[Path | None, typer.Option(help="Layout file (.json). Default: the layout's name.")] = None,
@@ -90,7 +51,7 @@ def sam(
     ] = None,
     front: Annotated[Path | None, typer.Option(help="Write a table of every chain's best (CSV).")] = None,
     plot: Annotated[Path | None, typer.Option(help="Draw every chain's best (PNG).")] = None,
-    as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object on standard output.")] = False,
+    as_json: Json = False,
 ) -> None:
     """Search for a sparse aperture mask: where its holes are, how large and how many. Ctrl-C keeps the best so far.
 
@@ -99,17 +60,14 @@ def sam(
     from lowfc.programs.design.sam import begin, design_sam, render, resumed
     from lowfc.programs.design.sam_executors import open_executor
     from lowfc.programs.design.sam_files import check_files
-    from lowfc.programs.design.sam_request import SEARCH_OPTIONS, request
 
-    values = context.params
     if resume is not None:
-        given = [key for key in SEARCH_OPTIONS if str(context.get_parameter_source(key)).endswith("COMMANDLINE")]
+        names = [field.name for field in fields(Search)]
+        given = [name for name in names if str(context.get_parameter_source(name)).endswith("COMMANDLINE")]
         if given:
-            option = given[0].replace("_", "-")
-            raise ConfigurationError(f"--resume goes on with the search of {resume}: leave out --{option}")
+            raise ConfigurationError(f"--resume goes on with the search of {resume}: leave out {flag(given[0])}")
         search, found = resumed(resume)
     else:
-        search = request(**{key: values[key] for key in SEARCH_OPTIONS})
         found = begin(search)
     out = out if out is not None else Path(f"{search.name}.json")
     state = check_files(out, resume, front, plot)

@@ -15,15 +15,16 @@ from rich.console import Console
 from rich.progress import BarColumn, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 from threadpoolctl import threadpool_limits
 
-from lowfc.adapters.drawing import figure_class
-from lowfc.adapters.masks import load_pupil
-from lowfc.adapters.progress import passing_bar
+from lowfc.adapters.files.drawing import figure_class
+from lowfc.adapters.files.sensors import load_pupil
+from lowfc.adapters.process.progress import passing_bar
 from lowfc.contract.errors import ConfigurationError, LowfcError
 from lowfc.design.paper import TABLE4_MODES
 from lowfc.design.sam_goal import figures
 from lowfc.design.sam_merit import FOCAL_MASKS, Hole, Optics, Single, build_optics, hole_fields
 from lowfc.design.sam_search import BLOCK, Chain, advance, holes, start
-from lowfc.optics.sam import Layout
+from lowfc.optics.chain.sam import Layout
+from lowfc.programs.design.options import command_line
 from lowfc.programs.design.sam_executors import is_lost
 from lowfc.programs.design.sam_files import (
     Point,
@@ -34,7 +35,7 @@ from lowfc.programs.design.sam_files import (
     write_plot,
     write_state,
 )
-from lowfc.programs.design.sam_request import Search, command_of, goal_of
+from lowfc.programs.design.sam_request import Search
 
 STATE_PERIOD_S = 10.0
 
@@ -116,7 +117,8 @@ def design_sam(
             raise LowfcError(f"the workers were lost ({error!r}); {go_on}") from error
     points = [point_of(search, chain) for chain in chains if chain.step]
     best = front(points) if search.sweeps else [min(points, key=lambda point: point.merit)]
-    write_layouts(out, best, search, command_of(search))
+    command = command_line("lowfc design sam", search)
+    write_layouts(out, best, search, command)
     if front_file is not None:
         write_front(front_file, points)
     if plot_file is not None:
@@ -124,7 +126,7 @@ def design_sam(
     if not interrupted:
         state.unlink()
     return {
-        "command": command_of(search),
+        "command": command,
         "file": str(out),
         "merit": search.goal.merit,
         "seed": search.seed,
@@ -190,14 +192,14 @@ def advance_block(search: Search, chain: Chain, pupil: str) -> Chain:
     if pupil != pupil_digest():
         raise ConfigurationError("a worker has another shaped pupil: install the same lowfc on all machines")
     _one_thread()
-    return advance(_optics(search.focal_masks), goal_of(search, chain.index), search.bounds, chain)
+    return advance(_optics(search.focal_masks), search.goal_of(chain.index), search.bounds, chain)
 
 
 def point_of(search: Search, chain: Chain) -> Point:
     """The best layout of a chain."""
     found = holes(chain.best, search.bounds.symmetry)
     name = f"{search.name}_{chain.index}" if search.sweeps else search.name
-    goal = goal_of(search, chain.index)
+    goal = search.goal_of(chain.index)
     weight = "" if goal.weight is None else f" with weight {goal.weight:g}"
     masks = " and ".join(search.focal_masks)
     purpose = f"{_described(found)}: merit {goal.merit}{weight}, focal-plane mask {masks}"

@@ -9,7 +9,7 @@ from contextlib import contextmanager
 from importlib import import_module
 from typing import Any
 
-from lowfc.adapters.extras import install_advice
+from lowfc.adapters.process.extras import install_advice
 from lowfc.contract.errors import ConfigurationError
 
 DASK_TIMEOUT_S = 10.0

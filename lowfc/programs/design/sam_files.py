@@ -8,15 +8,14 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-from lowfc.adapters.drawing import figure_class, png
-from lowfc.adapters.layouts import parse_layout
-from lowfc.adapters.whole_file import require_folder, write_whole
-from lowfc.contract import input_file
+from lowfc.adapters.files.drawing import figure_class, png
+from lowfc.adapters.files.layouts import parse_layout
+from lowfc.adapters.files.whole_file import require_folder, write_whole
+from lowfc.contract.codecs import input_file
 from lowfc.contract.errors import ConfigurationError, DataFileError
 from lowfc.design.paper import TABLE3_WAVES, TABLE4_MAS
-from lowfc.design.sam_goal import Goal
-from lowfc.design.sam_search import Bounds, Chain
-from lowfc.optics.sam import Layout
+from lowfc.design.sam_search import Chain
+from lowfc.optics.chain.sam import Layout
 from lowfc.programs.design.sam_request import Search
 
 _LARGEST_BYTES = 1 << 26
@@ -83,13 +82,7 @@ def read_state(path: Path, pupil: str) -> tuple[Search, list[Chain]]:
     """
     try:
         state = json.loads(input_file.read_whole(path, _LARGEST_BYTES))
-        kept = state["search"]
-        search = Search(
-            goal=Goal(**kept["goal"]),
-            focal_masks=tuple(kept["focal_masks"]),
-            bounds=Bounds(**{key: _as_tuple(value) for key, value in kept["bounds"].items()}),
-            **{key: kept[key] for key in ("seed", "chains", "steps", "name")},
-        )
+        search = Search(**state["search"])
         chains = [Chain(**{key: _as_tuple(value) for key, value in chain.items()}) for chain in state["chains"]]
         made_for = state["pupil"]
     except FileNotFoundError:

@@ -10,12 +10,12 @@ from threading import Thread
 from typing import Any, TypeVar
 
 import numpy as np
-from numpy.typing import NDArray
 from rich.console import Console
 from threadpoolctl import threadpool_limits
 
-from lowfc.adapters.drawing import figure_class, png
-from lowfc.adapters.whole_file import require_folder, write_whole
+from lowfc.adapters.files.drawing import figure_class, png
+from lowfc.adapters.files.whole_file import require_folder, write_whole
+from lowfc.arrays import Array
 from lowfc.contract.errors import ConfigurationError
 from lowfc.design.dark_zone import FINE_STEP, fine_grid
 from lowfc.design.linear_program import NotSolvedError
@@ -30,30 +30,10 @@ from lowfc.design.shaped_pupil import (
     relative_field,
     stored,
 )
-from lowfc.optics.pupil import from_quarter
+from lowfc.optics.chain.pupil import from_quarter
+from lowfc.programs.design.options import command_line
 
 Result = TypeVar("Result")
-
-OPTIONS = {"half_angle_deg": "half-angle"}
-"""Options that are not called as in the request."""
-
-
-def request(**options: Any) -> Request:
-    """What the options ask for.
-
-    Raises:
-        ConfigurationError: A value is out of range.
-    """
-    try:
-        return Request(**options)
-    except ValueError as error:
-        raise ConfigurationError(str(error)) from error
-
-
-def command_of(wanted: Request) -> str:
-    """The command that makes this mask."""
-    given = ((OPTIONS.get(key, key), value) for key, value in asdict(wanted).items())
-    return " ".join(["lowfc design spc", *(f"--{key} {value}" for key, value in given)])
 
 
 def design_spc(wanted: Request, out: Path, plot: Path | None, console: Console) -> dict[str, Any]:
@@ -99,7 +79,7 @@ def design_spc(wanted: Request, out: Path, plot: Path | None, console: Console) 
     return {
         "file": str(out),
         "dtype": str(quarter.dtype),
-        "command": command_of(wanted),
+        "command": command_line("lowfc design spc", wanted),
         "open_area_fraction": found.open_area,
         "energy_fraction": found.energy,
         "focal_mask_fraction": found.focal_mask,
@@ -193,7 +173,7 @@ def _interruptibly(work: Callable[[], Result]) -> Result:
     return value
 
 
-def _picture(quarter: NDArray[np.float64], wanted: Request) -> bytes:
+def _picture(quarter: Array, wanted: Request) -> bytes:
     """Mask, image on a log scale with the dark zone outlined, and contrast against angle (PNG)."""
     figure = figure_class()(figsize=(15, 4.6), layout="constrained")
     mask, image, curve = figure.subplots(1, 3)

@@ -7,9 +7,9 @@ from typing import Annotated
 
 import typer
 
-from lowfc.adapters.terminal import ConfigFile, LogsIfAny, configuration
+from lowfc.adapters.process.terminal import ConfigFile, LogsIfAny, configuration
 from lowfc.contract.errors import ConfigurationError
-from lowfc.programs.view.tabs import Tab
+from lowfc.programs.view.draw.tabs import Tab
 
 
 def view(
@@ -36,7 +36,7 @@ def view(
 
     Example: lowfc view --web
     """
-    from lowfc.adapters.realtime import give_way
+    from lowfc.adapters.process.realtime import give_way
 
     give_way()
     if foxglove:
@@ -46,36 +46,28 @@ def view(
         return
     if logs and (seconds or run):
         raise ConfigurationError("--seconds and --run are for a running loop, not for logs")
-    from lowfc.adapters.log_parts import in_order
-    from lowfc.programs.ctl.which_run import the_known_run
-    from lowfc.programs.view.look import look_at_logs, look_at_run
-    from lowfc.programs.view.place import place
+    from lowfc.adapters.logs.parts import in_order
+    from lowfc.programs.cli.ctl.which_run import the_known_run
+    from lowfc.programs.view.session import show_logs, show_run
+    from lowfc.programs.view.target import Target
 
-    where = place(
-        native=native,
-        web=web,
-        save=save,
-        picture=headless_screenshot,
-        tab=tab,
-        memory_mb=memory_mb,
-        port=port,
-        web_port=web_port,
-    )
+    target = Target(native, web, save, headless_screenshot, tab, memory_mb, port or 0, web_port or 0)
     settings = None if config is None else configuration(config)
-    figures = (
-        look_at_logs(in_order(logs), settings, where)
-        if logs
-        else look_at_run(the_known_run(run), settings, where, seconds)
-    )
+    if logs:
+        figures = show_logs(in_order(logs), settings, target)
+    else:
+        figures = show_run(the_known_run(run), settings, target, seconds)
     if as_json:
         sys.stdout.write(json.dumps(figures) + "\n")
 
 
 def _serve_foxglove(run: str | None, port: int | None) -> None:
-    from lowfc.adapters.clock import HostClock
-    from lowfc.adapters.run import open_run
-    from lowfc.programs.ctl.which_run import the_known_run
+    from lowfc.adapters.bus.run import open_run
+    from lowfc.adapters.process.clock import HostClock
+    from lowfc.programs.cli.ctl.which_run import the_known_run
     from lowfc.programs.view.foxglove_bridge import DEFAULT_PORT, serve_foxglove
 
-    summary = serve_foxglove(open_run(the_known_run(run), ()), HostClock(), DEFAULT_PORT if port is None else port)
-    sys.stderr.write(f"{summary}\n")
+    clients, messages = serve_foxglove(
+        open_run(the_known_run(run), ()), HostClock(), DEFAULT_PORT if port is None else port
+    )
+    sys.stderr.write(f"clients: {clients}, messages: {messages}\n")

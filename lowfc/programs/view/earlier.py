@@ -1,12 +1,11 @@
 """Events from before a view began, from the logs that the run's recorder has written so far."""
 
 import platform
-from collections import deque
 from pathlib import Path
 
-from lowfc.adapters.bus import Sample
-from lowfc.adapters.log_reader import LogReader
-from lowfc.adapters.log_writer import UNFINISHED
+from lowfc.adapters.bus.bus import Sample
+from lowfc.adapters.logs.reader import LogReader
+from lowfc.adapters.logs.writer import UNFINISHED
 from lowfc.contract.errors import DataFileError
 from lowfc.contract.events import Level
 from lowfc.contract.messages import EVENT, Log, timestamp, wire
@@ -28,29 +27,25 @@ def earlier_events(recorder: wire.Health | None, now_ns: int) -> list[Sample]:
         return [_line("earlier events are not shown: no recorder has kept them", now_ns)]
     if recorder.host and recorder.host != platform.node():
         return [_line(f"earlier events are not shown: they are in the log on {recorder.host}", now_ns)]
-    found: deque[Sample] = deque()
-    unread = []
+    found: list[Sample] = []
+    missing = []
     for name in reversed(recorder.recording.files):
+        path = _present(Path(recorder.recording.folder, name))
         try:
-            reader = LogReader(
-                _present(Path(recorder.recording.folder, name)), topics=(EVENT,), skip_damaged=True, sparse=True
-            )
-            events = [
-                Sample(one.key, one.payload, one.sequence, one.publish_time_ns, one.log_time_ns) for one in reader
-            ]
+            log = list(LogReader(path, topics=(EVENT,), skip_damaged=True, sparse=True))
         except DataFileError as fault:
-            unread.append(_line(f"earlier events are missing here: {fault}", now_ns))
+            missing.append(_line(f"earlier events are missing here: {fault}", now_ns))
             continue
-        found.extendleft(reversed(events))
+        found[:0] = [Sample(one.key, one.payload, one.sequence, one.publish_time_ns, one.log_time_ns) for one in log]
         if len(found) >= MOST:
             break
-    return [*list(found)[-MOST:], *unread]
+    return [*found[-MOST:], *missing]
 
 
 def _present(path: Path) -> Path:
     """A log under the name that it has now: it may be finished meanwhile, or not yet."""
-    part = path.with_name(path.name.removesuffix(UNFINISHED) + UNFINISHED)
     finished = path.with_name(path.name.removesuffix(UNFINISHED))
+    part = path.with_name(finished.name + UNFINISHED)
     return finished if finished.exists() or not part.exists() else part
 
 

@@ -1,7 +1,7 @@
-"""The bus as a Foxglove WebSocket server, for those who look with Foxglove or Lichtblick.
+"""The bus as a Foxglove WebSocket server, for Foxglove and Lichtblick.
 
 Payloads go out as they came: the schemas are those of the log. A channel hands its message to the server's own threads
-and returns at once, and a client that does not read loses its oldest messages (1024 wait for it at most), so that the
+and returns at once, and a client that does not read loses its oldest messages (at most 1024 wait for it). Therefore the
 bus's threads log directly.
 """
 
@@ -9,18 +9,17 @@ import logging
 import sys
 import threading
 import time
-from dataclasses import dataclass
 from functools import partial
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
-from lowfc.adapters.bus import ALL, Bus, Sample, states
-from lowfc.adapters.clock import Clock
-from lowfc.adapters.extras import install_advice
-from lowfc.adapters.log_writer import declaration
-from lowfc.adapters.names import Names
-from lowfc.adapters.run import Run
-from lowfc.adapters.service import Service
-from lowfc.adapters.zenoh_bus import ZenohBus
+from lowfc.adapters.bus.bus import ALL, Bus, Sample, states
+from lowfc.adapters.bus.names import Names
+from lowfc.adapters.bus.run import Run
+from lowfc.adapters.bus.zenoh_bus import ZenohBus
+from lowfc.adapters.logs.writer import declaration
+from lowfc.adapters.process.clock import Clock
+from lowfc.adapters.process.extras import install_advice
+from lowfc.adapters.process.service import Service
 from lowfc.contract.errors import BusError, ConfigurationError
 from lowfc.contract.messages import TOPICS, Role, Topic
 
@@ -38,30 +37,20 @@ _TURN_S = 0.05
 _PATIENCE_S = 0.2
 
 
-@dataclass(frozen=True, slots=True)
-class Summary:
-    """What a bridge did.
-
-    Attributes:
-        clients: those that looked at something.
-        messages: logged, whether anybody looked or not.
-    """
+class Summary(NamedTuple):
+    """Clients that subscribed to something, and messages that were logged, received by a client or not."""
 
     clients: int
     messages: int
 
-    def __str__(self) -> str:
-        """The line for a person."""
-        return f"clients: {self.clients}, messages: {self.messages}"
-
 
 class FoxgloveBridge:
-    """Passes on what is on a bus to whoever connects.
+    """Passes on the messages of a bus to the apps that connect.
 
     Attributes:
         service: this process as the others of the run see it.
         port: where apps connect, on loopback.
-        looking: client and topic of every subscription that there is now.
+        subscriptions: client and topic of each that there is now.
         kept: the states in force, by key.
     """
 
@@ -80,10 +69,10 @@ class FoxgloveBridge:
         self._channels_lock = threading.Lock()
         self._seen: set[int] = set()
         self.kept: dict[str, Sample] = {}
-        self.looking: set[tuple[int, str]] = set()
+        self.subscriptions: set[tuple[int, str]] = set()
         self._messages = 0
         for topic in SHOWN:
-            if topic.key == topic.at(ALL):  # the names in the others' keys are yet to be heard
+            if topic.key == topic.at(ALL):  # the names in the others' keys are not known yet
                 self._channel(topic, topic.key)
         try:
             self._server = self._foxglove.start_server(
@@ -94,7 +83,7 @@ class FoxgloveBridge:
                 f"cannot listen on {HOST}:{port} ({fault}); stop what is there, or choose another with --port"
             ) from None
         self.port: int = self._server.port
-        # Before the service, which subscribes to Health: who has heard of that has heard of all others.
+        # Before the service, which subscribes to Health: a peer with that subscription has all others, too.
         for topic in SHOWN:
             bus.subscribe(topic, partial(self._take, topic))
         self.service = Service(Role.VIEWER, run_id, clock, bus)
@@ -104,7 +93,7 @@ class FoxgloveBridge:
         self.service.state = "running"
         while self.service.running:
             if self.service.newcomers():
-                self._ask()
+                self._take_states()
             self.service.work = self._messages
             self.service.beat()
             time.sleep(_TURN_S)
@@ -115,16 +104,16 @@ class FoxgloveBridge:
     def on_subscribe(self, client: "Client", channel: "ChannelView") -> None:
         """Give a client the state that is in force; called by the server."""
         self._seen.add(client.id)
-        self.looking.add((client.id, channel.topic))
+        self.subscriptions.add((client.id, channel.topic))
         kept = self.kept.get(channel.topic.removeprefix("/"))
         if kept is not None:
             self._channels[kept.key].log(kept.payload, log_time=kept.publish_time_ns)
 
     def on_unsubscribe(self, client: "Client", channel: "ChannelView") -> None:
-        """A client has seen enough of a topic; called by the server."""
-        self.looking.discard((client.id, channel.topic))
+        """A client has unsubscribed; called by the server."""
+        self.subscriptions.discard((client.id, channel.topic))
 
-    def _ask(self) -> None:
+    def _take_states(self) -> None:
         """Get the states that a process published before it was linked to this one."""
         for topic, sample in states(self._bus, SHOWN, _PATIENCE_S):
             kept = self.kept.get(sample.key)
@@ -140,27 +129,22 @@ class FoxgloveBridge:
         self._channel(topic, sample.key).log(sample.payload, log_time=sample.publish_time_ns)
 
     def _channel(self, topic: Topic, key: str) -> "Channel":
-        channel = self._channels.get(key)
-        if channel is None:
+        if key not in self._channels:
             with self._channels_lock:  # two processes may be the first with an event
-                channel = self._channels.get(key) or self._new_channel(topic, key)
-                self._channels[key] = channel
-        return channel
-
-    def _new_channel(self, topic: Topic, key: str) -> "Channel":
-        schema = self._foxglove.Schema(
-            name=topic.message.DESCRIPTOR.full_name,
-            encoding="protobuf",
-            data=declaration(topic.message).SerializeToString(),
-        )
-        channel: Channel = self._foxglove.Channel(
-            "/" + key,
-            schema=schema,
-            message_encoding="protobuf",
-            context=self._context,
-            metadata={"description": topic.sentence},
-        )
-        return channel
+                if key not in self._channels:
+                    schema = self._foxglove.Schema(
+                        name=topic.message.DESCRIPTOR.full_name,
+                        encoding="protobuf",
+                        data=declaration(topic.message).SerializeToString(),
+                    )
+                    self._channels[key] = self._foxglove.Channel(
+                        "/" + key,
+                        schema=schema,
+                        message_encoding="protobuf",
+                        context=self._context,
+                        metadata={"description": topic.sentence},
+                    )
+        return self._channels[key]
 
 
 def serve_foxglove(run: Run, clock: Clock, port: int = DEFAULT_PORT) -> Summary:

@@ -2,15 +2,43 @@
 
 from collections.abc import Iterable
 
+import rerun as rr
 import rerun.blueprint as rrb
 
-from lowfc.programs.view import latency, loop, mirror, pointing, science, sensor, spectra, tiles, trend, wavefront
-from lowfc.programs.view.marks import TIMELINE
-from lowfc.programs.view.tabs import Tab
+from lowfc.programs.view.draw.plots import TIMELINE
+from lowfc.programs.view.draw.tabs import Tab
+from lowfc.programs.view.panels import (
+    latency,
+    loop,
+    mirror,
+    pointing,
+    science,
+    sensor,
+    spectra,
+    tiles,
+    trend,
+    wavefront,
+)
 
 APPLICATION = "lowfc"
 LIVE_WINDOW_S = 20.0
 """Of a live plot."""
+
+_PICTURES: dict[str, tuple[str, rrb.VisualBounds2D | None]] = {
+    tiles.TILES: ("Status", None),
+    sensor.FRAME: ("Sensor frame, DN", None),
+    sensor.DIFFERENCE: ("I - I0, DN", None),
+    sensor.REFERENCE: ("Reference I0, DN", None),
+    sensor.RAW: ("Frame as it came, DN", None),
+    mirror.COMMAND: ("Mirror, nm (ring: at limit)", None),
+    mirror.SURFACE: ("Mirror over the pupil, nm", None),
+    pointing.TRAIL: ("Residual pointing, mas", pointing.BOUNDS),
+    science.IMAGE: ("Science camera: contrast, mean in the wedge from 4 to 6 λ/D", science.BOUNDS),
+    trend.TREND: ("Trend of the residual wavefront, nm rms", trend.BOUNDS),
+    spectra.TILTS: ("Power spectrum of tip and tilt, nm²/Hz", spectra.BOUNDS),
+    spectra.OTHERS: ("Power spectrum of the other modes, nm²/Hz", spectra.BOUNDS),
+}
+"""Title and bounds of each picture, by its path."""
 
 
 def layout(
@@ -51,45 +79,72 @@ def layout(
 
 def _operator() -> rrb.Container:
     pictures = rrb.Horizontal(
-        sensor.frame_view(),
-        sensor.difference_view(),
-        mirror.command_view(),
-        pointing.pointing_view(),
-        science.image_view(),
+        *map(_picture, (sensor.FRAME, sensor.DIFFERENCE, mirror.COMMAND, pointing.TRAIL, science.IMAGE)),
         column_shares=[1, 1, 1, 1, 2],
     )
-    courses = rrb.Horizontal(trend.trend_view(), wavefront.rms_view(), wavefront.tilt_view(), science.contrast_view())
-    below = rrb.Horizontal(loop.mode_view(), latency.percentiles_view(), loop.log_view(), column_shares=[2, 3, 4])
-    return rrb.Vertical(tiles.tiles_view(), pictures, courses, below, row_shares=[10, 9, 9, 7], name=Tab.OPERATOR)
+    courses = rrb.Horizontal(_picture(trend.TREND), wavefront.RMS.view(), wavefront.TILT.view(), _contrast())
+    below = rrb.Horizontal(_mode(), latency.WHOLE.view(), _events(), column_shares=[2, 3, 4])
+    return rrb.Vertical(_picture(tiles.TILES), pictures, courses, below, row_shares=[10, 9, 9, 7], name=Tab.OPERATOR)
 
 
 def _night() -> rrb.Container:
     """Everything against time, and the events."""
-    courses = rrb.Horizontal(trend.trend_view(), wavefront.tilt_view(), science.contrast_view())
-    rates = rrb.Horizontal(loop.light_view(), mirror.stroke_view(), latency.percentiles_view(), latency.counts_view())
-    below = rrb.Horizontal(loop.mode_view(), loop.log_view(worst=True), column_shares=[3, 5])
-    return rrb.Vertical(tiles.tiles_view(), courses, rates, below, row_shares=[11, 10, 8, 9], name=Tab.OPERATOR)
+    courses = rrb.Horizontal(_picture(trend.TREND), wavefront.TILT.view(), _contrast())
+    rates = rrb.Horizontal(loop.FLUX.view(), mirror.STROKE.view(), latency.WHOLE.view(), _losses())
+    below = rrb.Horizontal(_mode(), _events(worst=True), column_shares=[3, 5])
+    return rrb.Vertical(_picture(tiles.TILES), courses, rates, below, row_shares=[11, 10, 8, 9], name=Tab.OPERATOR)
 
 
 def _optics() -> rrb.Container:
     return rrb.Vertical(
-        rrb.Horizontal(sensor.frame_view(), sensor.difference_view(), sensor.reference_view(), sensor.raw_view()),
-        rrb.Horizontal(mirror.command_view(), mirror.surface_view(), science.image_view(), column_shares=[1, 1, 2]),
+        rrb.Horizontal(*map(_picture, (sensor.FRAME, sensor.DIFFERENCE, sensor.REFERENCE, sensor.RAW))),
+        rrb.Horizontal(*map(_picture, (mirror.COMMAND, mirror.SURFACE, science.IMAGE)), column_shares=[1, 1, 2]),
         name=Tab.OPTICS,
     )
 
 
 def _engineering() -> rrb.Container:
+    histogram = rrb.BarChartView(
+        origin=latency.HISTOGRAM,
+        name="Frame to command, us; last bar: or longer",
+        plot_legend=rrb.PlotLegend(visible=False),
+    )
+    spectra_ = (_picture(path) for path in (spectra.TILTS, spectra.OTHERS))
     return rrb.Horizontal(
-        rrb.Vertical(*wavefront.mode_views(), row_shares=[5, 2, 2, 2]),  # room for the names of the modes
-        rrb.Vertical(wavefront.groups_view(), *spectra.spectra_views(), mirror.stroke_view(), row_shares=[2, 4, 4, 2]),
+        rrb.Vertical(*(plot.view() for plot in wavefront.MODES), row_shares=[5, 2, 2, 2]),  # room for the modes' names
+        rrb.Vertical(wavefront.GROUPS.view(), *spectra_, mirror.STROKE.view(), row_shares=[2, 4, 4, 2]),
         rrb.Vertical(
-            latency.histogram_view(),
-            latency.stages_view(),
-            latency.counts_view(),
-            rrb.Horizontal(loop.light_view(), loop.saturated_view()),
+            histogram, latency.PARTS.view(), _losses(), rrb.Horizontal(loop.FLUX.view(), loop.SATURATED.view())
         ),
         name=Tab.ENGINEERING,
+    )
+
+
+def _picture(path: str) -> rrb.View:
+    title, bounds = _PICTURES[path]
+    return rrb.Spatial2DView(origin=path, name=title, visual_bounds=bounds)
+
+
+def _contrast() -> rrb.View:
+    return science.CONTRAST.view(axis_y=science.CONTRAST_AXIS)
+
+
+def _losses() -> rrb.View:
+    return latency.COUNTS.view(origin="latency", contents=[latency.COUNTS.path, latency.LOST.path])
+
+
+def _mode() -> rrb.View:
+    return rrb.StateTimelineView(origin=loop.MODE, name="Loop mode")
+
+
+def _events(*, worst: bool = False) -> rrb.View:
+    """Events; or the warnings and errors among them."""
+    shown = [rr.TextLogLevel.WARN, rr.TextLogLevel.ERROR, rr.TextLogLevel.CRITICAL]
+    return rrb.TextLogView(
+        origin=loop.LOG,
+        name="Warnings and errors" if worst else "Events",
+        rows=rrb.TextLogRows(filter_by_log_level=shown) if worst else None,
+        columns=rrb.TextLogColumns(text_log_columns=["loglevel", "body"]),
     )
 
 

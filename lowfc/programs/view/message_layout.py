@@ -11,12 +11,12 @@ import rerun.blueprint as rrb
 from rerun.blueprint.components import VisualizerComponentMapping
 from rerun.blueprint.encodings import ComponentSourceKind
 
-from lowfc.adapters.history import STAGES
-from lowfc.contract.codec import wire_mode
+from lowfc.adapters.logs.columns import STAGES
+from lowfc.contract.codecs.codec import wire_mode
 from lowfc.contract.messages import EVENT, FRAME, STEP, SURFACE, TIMING, TRUTH, Topic, wire
-from lowfc.optics.zernike import NOLLS_14, mode_name
-from lowfc.programs.view.colours import distinct
-from lowfc.programs.view.loop import MODE_COLOURS, MODE_NAMES
+from lowfc.optics.chain.zernike import NOLLS_14, mode_name
+from lowfc.programs.view.draw.colours import distinct
+from lowfc.programs.view.panels.loop import MODE_COLOURS, MODE_NAMES
 
 TIMELINE = "message_publish_time"
 """Of the timelines that rerun gives to a log, the one by which messages were sent."""

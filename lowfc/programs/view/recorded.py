@@ -4,17 +4,17 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from lowfc.adapters.clock import SimulatedClock
-from lowfc.adapters.history_reader import attached_configuration
-from lowfc.adapters.log_reader import Logged, LogReader
+from lowfc.adapters.logs.history import attached_configuration
+from lowfc.adapters.logs.reader import LogReader
+from lowfc.adapters.process.clock import SimulatedClock
 from lowfc.contract.configuration import Configuration
 from lowfc.contract.errors import DataFileError
 from lowfc.contract.messages import topic_of
-from lowfc.programs.view.moment import PICTURES_HZ, PICTURES_PER_WHOLE, SHOWN, Gatherer, LogEnd
-from lowfc.programs.view.painter import Painter
+from lowfc.programs.view.renderer import Renderer
+from lowfc.programs.view.snapshot import PICTURES_HZ, PICTURES_PER_COMPLETE, SHOWN, Accumulator, LogEnd
 
 _PERIOD_NS = round(1e9 / PICTURES_HZ)
-_STRIDE = 500  # messages between two words about the progress
+_STRIDE = 500  # messages between two reports of the progress
 
 
 @dataclass(slots=True)
@@ -22,13 +22,13 @@ class Drawn:
     """What was drawn of some logs.
 
     Attributes:
-        moments: drawn.
+        snapshots: drawn.
         log_s: from the first message to the last.
-        span_ns: times of the first and of the last moment with a frame, on the timeline; None without one.
+        span_ns: times of the first and of the last snapshot with a frame, on the timeline; None without one.
         remarks: what a person should know: what is damaged, truncated, unreadable.
     """
 
-    moments: int = 0
+    snapshots: int = 0
     log_s: float = 0.0
     span_ns: tuple[int, int] | None = None
     remarks: list[str] = field(default_factory=list)
@@ -37,43 +37,43 @@ class Drawn:
 def draw_logs(
     logs: Sequence[Path],
     config: Configuration | None,
-    make_painter: Callable[[Configuration], Painter],
+    make_renderer: Callable[[Configuration], Renderer],
     progress: Callable[[int], None] = lambda done: None,
 ) -> Drawn:
     """Draw logs that follow each other.
 
     Args:
-        logs: finished or not, damaged or whole.
+        logs: finished or not, damaged or complete.
         config: of the run; None takes the first log's own.
-        make_painter: makes the painter, once the configuration is known.
-        progress: is told how many bytes are done.
+        make_renderer: makes the renderer, once the configuration is known.
+        progress: gets the number of bytes that are done.
 
     Raises:
         DataFileError: one is no log, they are of several runs, or there is nothing to see in any of them.
     """
-    drawn, gatherer, run = Drawn(), Gatherer(), ""
-    painter: Painter | None = None
+    drawn, accumulator = Drawn(), Accumulator()
+    renderer: Renderer | None = None
     due_ns = first_ns = last_ns = behind = 0
-    complete, host = True, ""
+    complete, run, host = True, "", ""
     for log in logs:
         reader = LogReader(log, topics=SHOWN, skip_damaged=True)
         for number, message in enumerate(reader):
-            if painter is None:
+            if renderer is None:
                 own = config or _own(reader, drawn)
-                painter = make_painter(own)
-                gatherer = Gatherer(SimulatedClock().now_ns() if own.lockstep else None)
+                renderer = make_renderer(own)
+                accumulator = Accumulator(SimulatedClock().now_ns() if own.lockstep else None)
                 first_ns = message.log_time_ns
             if number == 0:
-                run = _same_run(run, reader)
-                host = host or reader.metadata.get("lowfc", {}).get("host", "")
-            last_ns = message.log_time_ns
-            _take(gatherer, message)
+                recorded = reader.metadata.get("lowfc", {})
+                run, host = _same_run(run, recorded.get("run", ""), log), host or recorded.get("host", "")
+            last_ns, topic = message.log_time_ns, topic_of(message.key)
+            accumulator.add(topic, message.key, message.payload, message.publish_time_ns, message.sequence)
             if last_ns >= due_ns:
-                moment = gatherer.moment(last_ns, whole=drawn.moments % PICTURES_PER_WHOLE == 0)
-                painter.draw(moment)
-                if moment.frame is not None:
-                    drawn.span_ns = (drawn.span_ns[0] if drawn.span_ns else moment.frame_ns), moment.time_ns
-                drawn.moments += 1
+                snapshot = accumulator.snapshot(last_ns, complete=drawn.snapshots % PICTURES_PER_COMPLETE == 0)
+                renderer.draw(snapshot)
+                if snapshot.frame is not None:
+                    drawn.span_ns = (drawn.span_ns[0] if drawn.span_ns else snapshot.frame_ns), snapshot.time_ns
+                drawn.snapshots += 1
                 due_ns = last_ns + _PERIOD_NS
             if number % _STRIDE == 0:
                 progress(behind + reader.position)
@@ -82,26 +82,19 @@ def draw_logs(
         drawn.remarks += [f"{log.name}: {damage}" for damage in reader.damage]
         if not reader.complete and not reader.damage:
             drawn.remarks.append(f"{log.name} has no end: its recorder was killed, or is still writing")
-    if painter is None:
+    if renderer is None:
         raise DataFileError(f"there is nothing to see in {', '.join(map(str, logs))}: no message that a view shows")
     ended = LogEnd(logs[-1].name.partition(".")[0], complete, run, host)
-    painter.draw(gatherer.moment(last_ns, ended=ended))
-    if gatherer.unreadable:
-        drawn.remarks.append(f"{gatherer.unreadable} messages could not be read")
+    renderer.draw(accumulator.snapshot(last_ns, ended=ended))
+    if accumulator.unreadable:
+        drawn.remarks.append(f"{accumulator.unreadable} messages could not be read")
     drawn.log_s = (last_ns - first_ns) * 1e-9
     return drawn
 
 
-def _take(gatherer: Gatherer, message: Logged) -> None:
-    gatherer.take(topic_of(message.key), message.key, message.payload, message.publish_time_ns, message.sequence)
-
-
-def _same_run(before: str, reader: LogReader) -> str:
-    run = reader.metadata.get("lowfc", {}).get("run", "")
+def _same_run(before: str, run: str, log: Path) -> str:
     if before and run and run != before:
-        raise DataFileError(
-            f"{reader.path} is of run {run!r}, and the log before it of {before!r}: look at one at a time"
-        )
+        raise DataFileError(f"{log} is of run {run!r}, and the log before it of {before!r}: look at one at a time")
     return run or before
 
 

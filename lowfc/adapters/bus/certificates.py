@@ -1,0 +1,173 @@
+"""Certificates: an authority of the bench's own, and one certificate per role, its common name, signed by it.
+
+The authority's folder has ca.key, which signs: it belongs on no machine of the loop. A machine gets ca.pem, and of each
+role that it has ROLE.pem and ROLE.key.
+"""
+
+import contextlib
+import datetime
+import ipaddress
+import os
+import tempfile
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+
+from cryptography import x509
+from cryptography.hazmat.primitives.asymmetric.ec import SECP256R1, EllipticCurvePrivateKey, generate_private_key
+from cryptography.hazmat.primitives.hashes import SHA256
+from cryptography.hazmat.primitives.serialization import (
+    Encoding,
+    NoEncryption,
+    PrivateFormat,
+    load_pem_private_key,
+)
+from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
+
+from lowfc.adapters.bus.access import ROUTER
+from lowfc.adapters.bus.routed import CA, CA_KEY
+from lowfc.adapters.files.whole_file import write_whole
+from lowfc.contract.errors import ConfigurationError, DataFileError
+
+CA_DAYS = 3650
+DAYS = 825
+"""How long a role's certificate is valid, unless it is said."""
+
+_EARLY = datetime.timedelta(hours=1)  # hosts' clocks differ
+
+
+def make_certificates(
+    folder: Path, roles: Iterable[str], addresses: Sequence[str], days: int = DAYS, *, renew: bool = False
+) -> list[Path]:
+    """Make the authority, if there is none, and those certificates that are not there yet.
+
+    Args:
+        folder: of the authority; it is made, closed to others.
+        roles: to make certificates for, the router's among them.
+        addresses: names and IP addresses by which the others reach the router.
+        days: that the certificates are valid.
+        renew: make those that are there anew, too, of the keys that they have; not the authority.
+
+    Returns:
+        The certificates that were made.
+
+    Raises:
+        ConfigurationError: the router's certificate has no address, or one that is none.
+        DataFileError: the folder holds something else, or cannot be written.
+    """
+    wanted = [role for role in roles if renew or not (folder / f"{role}.pem").exists()]
+    names = [_general_name(address) for address in addresses]
+    if ROUTER in wanted and not names:
+        raise ConfigurationError("the router's certificate is for its address: say by which name the others reach it")
+    try:
+        folder.mkdir(mode=0o700, parents=True, exist_ok=True)
+        key, authority = _authority(folder)
+        for role in wanted:
+            own = _own_key(folder, role)
+            usage = ExtendedKeyUsageOID.SERVER_AUTH if role == ROUTER else ExtendedKeyUsageOID.CLIENT_AUTH
+            builder = _builder(role, own, days).issuer_name(authority.subject)
+            builder = builder.add_extension(x509.ExtendedKeyUsage([usage]), critical=False)
+            if role == ROUTER:
+                builder = builder.add_extension(x509.SubjectAlternativeName(names), critical=False)
+            write_whole(folder / f"{role}.pem", builder.sign(key, SHA256()).public_bytes(Encoding.PEM))
+    except OSError as fault:
+        raise DataFileError(f"no certificates can be written in {folder}: {fault.strerror or fault}") from fault
+    return [folder / f"{role}.pem" for role in wanted]
+
+
+def _authority(folder: Path) -> tuple[EllipticCurvePrivateKey, x509.Certificate]:
+    """The authority's key and certificate, made where there are none."""
+    certificate_file, key_file = folder / CA, folder / CA_KEY
+    missing = [file.name for file in (certificate_file, key_file) if not file.exists()]
+    if len(missing) == 2:
+        own = generate_private_key(SECP256R1())
+        builder = _builder("lowfc authority", own, CA_DAYS, authority=True).issuer_name(_name("lowfc authority"))
+        _write_secret(key_file, _pem(own))
+        write_whole(certificate_file, builder.sign(own, SHA256()).public_bytes(Encoding.PEM))
+    elif missing:
+        raise DataFileError(
+            f"{folder} has no {missing[0]}: make certificates where the authority's key is, or all anew in an empty "
+            "folder"
+        )
+    try:
+        key = load_pem_private_key(key_file.read_bytes(), password=None)
+        certificate = x509.load_pem_x509_certificate(certificate_file.read_bytes())
+    except (ValueError, TypeError) as fault:
+        raise DataFileError(f"{key_file} and {certificate_file} are not an authority's key and certificate") from fault
+    if not isinstance(key, EllipticCurvePrivateKey) or key.public_key() != certificate.public_key():
+        raise DataFileError(f"{key_file} is not the key of {certificate_file}; make all anew in an empty folder")
+    return key, certificate
+
+
+def _own_key(folder: Path, role: str) -> EllipticCurvePrivateKey:
+    """A role's key, which it keeps for good: whatever is interrupted, a certificate that is there is of this key."""
+    file = folder / f"{role}.key"
+    if not file.exists():
+        (folder / f"{role}.pem").unlink(missing_ok=True)  # of a key that is not here
+        own = generate_private_key(SECP256R1())
+        _write_secret(file, _pem(own))
+        return own
+    with contextlib.suppress(ValueError, TypeError):
+        found = load_pem_private_key(file.read_bytes(), password=None)
+        if isinstance(found, EllipticCurvePrivateKey):
+            return found
+    raise DataFileError(f"{file} is not a key that was made here; remove it to have another one made")
+
+
+def _builder(name: str, own: EllipticCurvePrivateKey, days: int, *, authority: bool = False) -> x509.CertificateBuilder:
+    """A certificate for a key, all but its issuer and what it is for."""
+    now = datetime.datetime.now(datetime.UTC)
+    usage = x509.KeyUsage(
+        digital_signature=not authority,
+        key_cert_sign=authority,
+        crl_sign=authority,
+        content_commitment=False,
+        key_encipherment=False,
+        data_encipherment=False,
+        key_agreement=False,
+        encipher_only=False,
+        decipher_only=False,
+    )
+    return (
+        x509.CertificateBuilder()
+        .subject_name(_name(name))
+        .public_key(own.public_key())
+        .serial_number(x509.random_serial_number())
+        .not_valid_before(now - _EARLY)
+        .not_valid_after(now + datetime.timedelta(days=days))
+        .add_extension(x509.BasicConstraints(ca=authority, path_length=0 if authority else None), critical=True)
+        .add_extension(usage, critical=True)
+        .add_extension(x509.SubjectKeyIdentifier.from_public_key(own.public_key()), critical=False)
+    )
+
+
+def _name(common: str) -> x509.Name:
+    return x509.Name([x509.NameAttribute(NameOID.COMMON_NAME, common)])
+
+
+def _general_name(address: str) -> x509.GeneralName:
+    try:
+        return x509.IPAddress(ipaddress.ip_address(address))
+    except ValueError:
+        pass
+    if not address or not address.isascii() or not set(address) <= _IN_A_NAME:
+        raise ConfigurationError(f"the router's address is a host's name or IP address, without port; got {address!r}")
+    return x509.DNSName(address)
+
+
+_IN_A_NAME = set("abcdefghijklmnopqrstuvwxyzABCDEFGHIJKLMNOPQRSTUVWXYZ0123456789.-")
+
+
+def _pem(key: EllipticCurvePrivateKey) -> bytes:
+    return key.private_bytes(Encoding.PEM, PrivateFormat.PKCS8, NoEncryption())
+
+
+def _write_secret(file: Path, content: bytes) -> None:
+    """Write a whole file that nobody else can read, from its first byte on."""
+    descriptor, name = tempfile.mkstemp(prefix=f".{file.name}-", dir=file.parent)  # mode 0600
+    draft = Path(name)
+    try:
+        with os.fdopen(descriptor, "wb") as stream:
+            stream.write(content)
+        draft.replace(file)
+    finally:
+        draft.unlink(missing_ok=True)

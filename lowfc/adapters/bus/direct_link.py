@@ -1,0 +1,259 @@
+"""The direct link between two processes of one host that wait for each other: a Unix socket, beside the bus.
+
+The bus still carries every message to everybody. The one reader that a topic names (`Topic.reader`) gets it first by a
+socket in the run's directory: no thread of the bus is between the put and the reader. Whoever publishes from another
+host, or without this library, is heard by the bus as ever.
+"""
+
+import contextlib
+import errno
+import math
+import os
+import socket
+import threading
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+from lowfc.adapters.bus.bus import Sample
+from lowfc.contract.envelope import Envelope
+
+Handler = Callable[[Sample], None]
+
+_BUFFER_BYTES = 4 << 20  # some hundred frames, where the host allows it; the kernel allows twice as much
+_RETRY_S = 0.1
+_LATELY = 1 << 13  # envelopes: more messages than wait in a socket while its reader stands still
+_ENVELOPE_BYTES = len(Envelope(0, 0).encode())
+
+
+class DirectWriter:
+    """Sends to the reader, if there is one; never waits."""
+
+    def __init__(self, path: Path) -> None:
+        """Send to whoever listens at `path`, now or later."""
+        self._path = os.fspath(path)
+        self._socket: socket.socket | None = None
+        self._again_s = 0.0
+
+    def send(self, envelope: bytes, payload: bytes) -> bool:
+        """Send a message, and say whether it went; a reader that is too far behind loses it, as it would on the bus."""
+        if self._socket is None:
+            self._connect()
+            if self._socket is None:
+                return False
+        try:
+            self._socket.sendmsg((envelope, payload))
+        except BlockingIOError:
+            return False
+        except OSError as fault:
+            self.close()  # the reader has gone
+            if fault.errno == errno.EMSGSIZE:  # more than a socket takes on this host: it will be so with the next
+                self._again_s = math.inf
+            return False
+        return True
+
+    def close(self) -> None:
+        """Leave the reader to the bus."""
+        if self._socket is not None:
+            self._socket.close()
+            self._socket = None
+
+    def _connect(self) -> None:
+        now_s = time.monotonic()
+        if now_s < self._again_s:
+            return
+        self._again_s = now_s + _RETRY_S
+        made = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET | socket.SOCK_NONBLOCK)
+        try:
+            made.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, _BUFFER_BYTES)  # the kernel gives what it allows
+            made.connect(self._path)
+        except OSError:  # nobody is there, or not yet
+            made.close()
+        else:
+            self._socket = made
+
+
+class _Receiver:
+    """The reader's end of the socket, and its place on the bus; what to make of both is for who inherits.
+
+    `_by_bus` and `_by_socket` get each message, on the bus's thread and on one of this receiver's own.
+    """
+
+    def __init__(
+        self,
+        path: Path,
+        key: str,
+        handler: Handler,
+        subscribe: Callable[[Handler], Callable[[], None]],
+        now_ns: Callable[[], int],
+        failed: Callable[[Exception], None],
+    ) -> None:
+        """Listen, at once.
+
+        Args:
+            path: where the writer sends to.
+            key: of the topic.
+            handler: gets each message, one at a time, on the bus's thread or on one of this reader's own.
+            subscribe: to the same topic on the bus; returns what ends that.
+            now_ns: the host's clock.
+            failed: told of what the handler raises.
+        """
+        self._handler = handler
+        self._subscribe = subscribe
+        self._now_ns = now_ns
+        self._failed = failed
+        self._turn = threading.Lock()
+        self._key = key
+        self._closed = False
+        self._begin()
+        self._leave_bus: Callable[[], None] | None = subscribe(self._by_bus)
+        path.unlink(missing_ok=True)  # of a process that was killed: there is one of each role
+        self._listener = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+        self._listener.bind(os.fspath(path))
+        self._listener.listen(1)
+        self._accepting = threading.Thread(target=self._accept, name="shortcut-accept", daemon=True)
+        self._accepting.start()
+
+    def close(self) -> None:
+        """Hand on nothing more; for any thread but those that hand on."""
+        with self._turn:
+            if self._closed:
+                return
+            self._closed = True
+        _end(self._listener)
+        self._accepting.join()
+        if self._leave_bus is not None:
+            self._leave_bus()
+
+    def _begin(self) -> None:
+        raise NotImplementedError
+
+    def _by_bus(self, sample: Sample) -> None:
+        raise NotImplementedError
+
+    def _by_socket(self, sample: Sample) -> None:
+        raise NotImplementedError
+
+    def _heard(self) -> None:
+        """Called after each message of the socket."""
+
+    def _left(self) -> None:
+        """Called when a writer has gone."""
+
+    def _accept(self) -> None:
+        """Serve one writer after the other: who comes anew takes the place of the last."""
+        served: threading.Thread | None = None
+        connection: socket.socket | None = None
+        with self._listener:
+            while True:
+                coming = None
+                with contextlib.suppress(OSError):
+                    coming, _ = self._listener.accept()
+                if coming is None and not self._closed:  # out of descriptors, say
+                    time.sleep(_RETRY_S)
+                    continue
+                if served is not None and connection is not None:
+                    _end(connection)
+                    served.join()
+                if coming is None:
+                    return
+                connection = coming
+                served = threading.Thread(target=self._serve, args=(connection,), name="shortcut", daemon=True)
+                served.start()
+
+    def _serve(self, connection: socket.socket) -> None:
+        with connection:
+            self._receive(connection)
+        self._left()
+
+    def _receive(self, connection: socket.socket) -> None:
+        buffer = memoryview(bytearray(2 * _BUFFER_BYTES))
+        while not self._closed:
+            try:
+                size = connection.recv_into(buffer)
+            except OSError:
+                return
+            if not size:
+                return
+            now_ns = self._now_ns()
+            try:
+                envelope = bytes(buffer[: min(size, _ENVELOPE_BYTES)])
+                payload = bytes(buffer[_ENVELOPE_BYTES:size])
+                self._by_socket(Sample(self._key, payload, *Envelope.unpack(envelope), now_ns))
+            except Exception as fault:
+                self._failed(fault)
+            self._heard()
+
+
+class DirectReader(_Receiver):
+    """Hands on each message of one publisher once: by the socket while it has a writer, by the bus otherwise.
+
+    A message that is still on the bus when a newer one has come by the socket is too late, and left out.
+    """
+
+    def _begin(self) -> None:
+        self._first = self._newest = self._newest_by_bus = -1
+        self._both = False
+
+    def _by_bus(self, sample: Sample) -> None:
+        with self._turn:
+            if self._first >= 0 and sample.sequence <= self._newest:
+                self._both = self._both or sample.sequence >= self._first  # it has come by both: the bus can be left
+            elif not self._closed:
+                self._newest_by_bus = sample.sequence
+                self._handler(sample)
+
+    def _by_socket(self, sample: Sample) -> None:
+        with self._turn:
+            if self._closed:
+                return
+            if self._first < 0:
+                self._first = sample.sequence
+            if sample.sequence <= self._newest_by_bus:
+                return  # the bus was quicker, be it with a message that was under way while it was left
+            self._newest = sample.sequence
+            self._handler(sample)
+
+    def _heard(self) -> None:
+        if self._both and self._leave_bus is not None:
+            self._leave_bus()
+            self._leave_bus, self._both = None, False
+
+    def _left(self) -> None:
+        with self._turn:
+            self._both, self._first = False, -1
+        if self._leave_bus is None and not self._closed:
+            self._leave_bus = self._subscribe(self._by_bus)
+
+
+class SharedDirectReader(_Receiver):
+    """Hands on each message once where others may publish too, by the bus alone: it is never left.
+
+    A copy is known by its envelope; numbers alone would not do, for another publisher may have started in the same
+    second. A message that only the bus carried, because the socket was full, may come after a newer one.
+    """
+
+    def _begin(self) -> None:
+        self._lately: dict[tuple[int, int], None] = {}
+
+    def _by_bus(self, sample: Sample) -> None:
+        self._once(sample)
+
+    def _by_socket(self, sample: Sample) -> None:
+        self._once(sample)
+
+    def _once(self, sample: Sample) -> None:
+        envelope = sample.sequence, sample.publish_time_ns
+        with self._turn:
+            if self._closed or envelope in self._lately:
+                return
+            self._lately[envelope] = None
+            if len(self._lately) > _LATELY:
+                del self._lately[next(iter(self._lately))]
+            self._handler(sample)
+
+
+def _end(one: socket.socket) -> None:
+    """End the wait of whoever accepts or receives there."""
+    with contextlib.suppress(OSError):
+        one.shutdown(socket.SHUT_RDWR)

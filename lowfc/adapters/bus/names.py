@@ -1,0 +1,51 @@
+"""Names of processes and mirrors from the bus: bounded, because whoever has the run's secret can invent any number."""
+
+from lowfc.adapters.bus.bus import name_in
+from lowfc.contract.errors import BadMessageError
+from lowfc.contract.messages import HEALTH, Role, Topic, wire
+
+MOST_NAMES = 64
+"""Names on one topic, beside those of `Role`, which always have room."""
+LONGEST_NAME = 128
+LARGEST_HEALTH_BYTES = 256_000
+"""A recorder's names all of its logs: about 3000 of them."""
+
+
+class Names:
+    """The names received on each topic."""
+
+    def __init__(self) -> None:
+        self._known: dict[str, set[str]] = {}
+
+    def admit(self, topic: Topic, key: str) -> str:
+        """Name of the mirror or process in a key of this topic; empty for a topic without one.
+
+        Raises:
+            BadMessageError: the name is too long, or new and there is no room for it.
+        """
+        name = name_in(topic, key)
+        known = self._known.setdefault(topic.key, set())
+        if name in known:
+            return name
+        if len(name) > LONGEST_NAME:
+            raise BadMessageError(f"a name has up to {LONGEST_NAME} characters, got {len(name)}: {name[:40]!r}...")
+        if name not in _ROLES:
+            if len(known) >= MOST_NAMES:
+                raise BadMessageError(f"{MOST_NAMES} names are known on this topic, and there is no room for {name!r}")
+            known.add(name)
+        return name
+
+    def health(self, key: str, payload: bytes) -> tuple[str, wire.Health]:
+        """Name and Health of a process.
+
+        Raises:
+            BadMessageError: as for `admit`, or the message is too large.
+            DecodeError: it is no Health.
+        """
+        if len(payload) > LARGEST_HEALTH_BYTES:
+            raise BadMessageError(f"a Health has up to {LARGEST_HEALTH_BYTES} bytes, got {len(payload)}")
+        health = wire.Health.FromString(payload)
+        return self.admit(HEALTH, key), health
+
+
+_ROLES = frozenset(Role)

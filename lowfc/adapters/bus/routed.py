@@ -1,0 +1,236 @@
+"""The bus across hosts: zenoh's configuration of the router, and of those who come to it by mutual TLS."""
+
+import contextlib
+import datetime
+import errno
+import socket
+import ssl
+import sys
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Any
+
+import zenoh
+
+from lowfc.adapters.bus.access import ROUTER, access_control
+from lowfc.adapters.bus.own_certificate import WARN_DAYS, read_certificate
+from lowfc.adapters.bus.zenoh_fault import plain
+from lowfc.contract.errors import BusError, DataFileError
+from lowfc.contract.network import Network
+
+CA = "ca.pem"
+"""File of a folder of certificates: the authority that signed all of them."""
+CA_KEY = "ca.key"
+"""The authority's key, which belongs on no machine of the loop."""
+
+CONNECT_MS = 1000
+_LEASE_MS = 2000
+_ALERT_S = 0.5
+_NOT_THERE = {
+    *(errno.ECONNREFUSED, errno.ECONNRESET, errno.ETIMEDOUT),
+    *(errno.EHOSTUNREACH, errno.EHOSTDOWN, errno.ENETUNREACH, errno.ENETDOWN),
+    socket.EAI_AGAIN,
+}
+"""Faults of a router, or of a network, that is not there yet; with all others waiting is in vain."""
+
+
+def client_session(network: Network, role: str, sending: dict[str, Any]) -> dict[str, Any]:
+    """What a role's session has across hosts in place of its links on one.
+
+    Args:
+        network: where the router is, and the certificates.
+        role: whose.
+        sending: zenoh's `transport/link/tx`, as on one host.
+    """
+    ca, certificate, key = certificate_files(network, role)
+    return {
+        "mode": "client",
+        "listen": {"endpoints": []},
+        "connect": {
+            "endpoints": [network.router],
+            # Opening a session without a router waits so long; a session that has lost it tries again for ever.
+            "timeout_ms": CONNECT_MS,
+            "exit_on_failure": True,
+            "retry": {"period_init_ms": 50, "period_max_ms": 1000, "period_increase_factor": 2},
+        },
+        "transport": _transport(
+            {
+                "root_ca_certificate": str(ca),
+                "enable_mtls": True,
+                "connect_certificate": str(certificate),
+                "connect_private_key": str(key),
+                "verify_name_on_connect": True,
+            },
+            sending,
+        ),
+    }
+
+
+def router_session(network: Network, mirrors: Iterable[str], sending: dict[str, Any]) -> dict[str, Any]:
+    """What the router's session has: it listens by TLS only, and lets nobody do what the table of topics does not.
+
+    Args:
+        network: where it is, and its certificates.
+        mirrors: roles of the mirrors, such as "mirror-dm".
+        sending: zenoh's `transport/link/tx`, as on one host.
+    """
+    ca, certificate, key = certificate_files(network, ROUTER)
+    return {
+        "mode": "router",
+        "listen": {"endpoints": [network.listen or network.router], "exit_on_failure": True, "timeout_ms": 0},
+        "connect": {"endpoints": []},
+        "transport": _transport(
+            {
+                "root_ca_certificate": str(ca),
+                "enable_mtls": True,
+                "listen_certificate": str(certificate),
+                "listen_private_key": str(key),
+            },
+            sending,
+        ),
+        "access_control": access_control(mirrors),
+    }
+
+
+def open_by_router(config: zenoh.Config, network: Network, role: str) -> zenoh.Session:
+    """Session by the router, which is waited for while nobody listens there.
+
+    Raises:
+        BusError: the router does not take this certificate, or is not who it should be; it cannot be reached for
+            another reason than that it is not there; or zenoh refuses the session though the router is there.
+    """
+    said, refused = "", 0
+    while True:
+        try:
+            return zenoh.open(config)
+        except zenoh.ZError as fault:
+            trouble = router_trouble(network, role)
+            refused = 0 if trouble else refused + 1  # once it may have come just now
+            if refused > 1:
+                raise BusError(
+                    f"the router at {network.router} takes {role}'s certificate, and zenoh opens no session: "
+                    f"{plain(fault)}"
+                ) from fault
+            if trouble != said and trouble:
+                sys.stderr.write(f"{role}: waiting for the router at {network.router}: {trouble}\n")
+                said = trouble
+
+
+def router_trouble(network: Network, role: str) -> str:
+    """Why there is no link to the router: it is not there, or going down; empty where it is there.
+
+    Raises:
+        BusError: it is there, and one of the two does not take the other's certificate; or it cannot be reached for
+            another reason, such as a name that nobody knows.
+    """
+    ca, certificate, key = certificate_files(network, role)
+    host, port = network.address
+    try:
+        context = ssl.create_default_context(cafile=str(ca))
+        context.load_cert_chain(certificate, key)
+        with (
+            socket.create_connection((host, port), CONNECT_MS * 1e-3) as plain,
+            context.wrap_socket(plain, server_hostname=host) as link,
+        ):
+            link.settimeout(_ALERT_S)
+            with contextlib.suppress(TimeoutError):
+                link.recv(1)  # who is not taken is told so only now
+    except ssl.SSLEOFError:
+        return "who answers there ends the connection in the midst of the handshake: it is going down, or no router"
+    except ssl.SSLError as fault:
+        raise BusError(
+            f"the router at {network.router} and {certificate} do not take each other ({fault.reason or fault}): both "
+            f"must be signed by {ca}, valid today, and the router's made for the name {host!r}; see lowfc certs"
+        ) from fault
+    except OSError as fault:
+        why = fault.strerror or str(fault)
+        if isinstance(fault, TimeoutError) or fault.errno in _NOT_THERE:
+            return why
+        raise BusError(
+            f"the router at {network.router} cannot be reached ({why}): is network.router its name and port, and can "
+            "this host resolve it?"
+        ) from fault
+    return ""
+
+
+class RouterWatch:
+    """Says why a process has lost its router, and when it is back."""
+
+    def __init__(self, network: Network, role: str) -> None:
+        self._network = network
+        self._role = role
+        self._said = ""
+
+    def look(self, *, linked: bool) -> None:
+        """Take note of whether there is a link now; to be called now and then."""
+        if linked:
+            why = ""
+        else:
+            try:
+                why = router_trouble(self._network, self._role) or "it is there, and the link is being made anew"
+            except BusError as fault:
+                why = str(fault)
+        if why != self._said:
+            text = f"no link to the router at {self._network.router}: {why}" if why else "the router is back"
+            sys.stderr.write(f"{self._role}: {text}\n")
+            self._said = why
+
+
+def certificate_files(network: Network, role: str) -> tuple[Path, Path, Path]:
+    """Files of the authority, of a role's certificate and of its key."""
+    folder = Path(network.certificates)
+    return folder / CA, folder / f"{role}.pem", folder / f"{role}.key"
+
+
+def require_certificate(network: Network, role: str) -> None:
+    """Say before a session is opened that it would not be let in, or let in and sent nothing.
+
+    Raises:
+        DataFileError: a file is missing or cannot be read, or the certificate is not valid, or another role's.
+    """
+    files = certificate_files(network, role)
+    for file in files:
+        try:
+            file.open("rb").close()
+        except OSError as fault:
+            raise DataFileError(
+                f"{file} cannot be read ({fault.strerror}): the router takes nobody without it; make it where the "
+                "authority's key is (lowfc certs) and copy it here"
+            ) from fault
+    name = read_certificate(*files, server=role == ROUTER).name
+    if name != role:
+        raise DataFileError(
+            f"{files[1]} is the certificate of {name!r}, and this process is {role!r}: the router would let it in and "
+            f"pass on nothing; copy {role}.pem and {role}.key of that role here"
+        )
+
+
+def ending_certificates(network: Network, now: datetime.datetime) -> list[str]:
+    """A sentence for each certificate in this host's folder that is invalid, or ends within `WARN_DAYS`."""
+    said = []
+    for key in sorted(Path(network.certificates).glob("*.key")):
+        role = key.stem
+        if key.name == CA_KEY:
+            continue
+        try:
+            found = read_certificate(*certificate_files(network, role), server=role == ROUTER)
+        except DataFileError as fault:
+            said.append(str(fault))
+            continue
+        left = found.ends - now
+        if left < datetime.timedelta(days=WARN_DAYS):
+            said.append(f"the certificate of {role} ends in {left.days} days, on {found.ends:%Y-%m-%d}")
+    return said
+
+
+def _transport(tls: dict[str, object], sending: dict[str, Any]) -> dict[str, Any]:
+    return {
+        "link": {
+            "protocols": ["tls"],  # nothing else is connected to or listened for
+            "tls": tls,
+            # A link that says nothing for so long is down: it is closed, and made anew as soon as that is possible.
+            # What is sent until then waits in it, and arrives stale.
+            "tx": {**sending, "lease": _LEASE_MS, "keep_alive": 4},
+        },
+        "shared_memory": {"enabled": False},
+    }

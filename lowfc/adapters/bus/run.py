@@ -1,0 +1,332 @@
+"""A run: one loop's runtime directory, ports and secret, so that two loops on one host never mix.
+
+The directory is made complete under another name and renamed, so that whoever comes first makes it and all others
+read the same. It is the user's own (0700), under $XDG_RUNTIME_DIR, or /tmp where the host has none.
+"""
+
+import contextlib
+import fcntl
+import json
+import os
+import random
+import re
+import secrets
+import shutil
+import socket
+import stat
+import tempfile
+import time
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from lowfc.adapters.bus import DEFAULT_RUN as DEFAULT_RUN
+from lowfc.contract.errors import BusError, DataFileError
+from lowfc.contract.messages import Role
+from lowfc.contract.network import Network
+
+_LINKS = "links.json"
+_CREDENTIALS = "credentials"
+_USER = "lowfc"
+_RUN_ID = re.compile(r"[a-z0-9][a-z0-9._-]{0,47}")
+_LOWEST_PORT = 15000
+_CONNECT_S = 1.0
+_LONGEST_START = 20  # characters
+_LATEST_START_S = (1 << 32) - 3  # a sequence has no room for a later one
+_LONGEST_SOCKET = 107  # bytes of a Unix socket's address
+_PORT_RANGE = Path("/proc/sys/net/ipv4/ip_local_port_range")
+
+
+@dataclass(frozen=True, slots=True)
+class Links:
+    """Who listens where, and the secret that lets them talk.
+
+    Attributes:
+        run_id: the run they belong to.
+        ports: loopback TCP port of each role that listens: "camera", "controller", "mirror-dm", "recorder".
+        user: name for zenoh's user/password authentication.
+        secret_file: zenoh's dictionary, one line "user:password".
+        network: the way by a router, where the run is on several hosts; ports and secret are then not used.
+    """
+
+    run_id: str
+    ports: dict[str, int]
+    user: str
+    secret_file: Path
+    network: Network = field(default_factory=Network)
+
+    @property
+    def secret(self) -> str:
+        """The run's password.
+
+        Raises:
+            DataFileError: the file is missing or damaged.
+        """
+        try:
+            user, _, secret = self.secret_file.read_text().strip().partition(":")
+        except OSError as fault:
+            raise DataFileError(f"{self.secret_file} cannot be read ({fault.strerror}); {_ADVICE}") from fault
+        if user != self.user or not secret:
+            raise DataFileError(f"{self.secret_file} should hold one line '{self.user}:password'; {_ADVICE}")
+        return secret
+
+    def socket(self, role: str) -> Path | None:
+        """Unix socket of a role, beside its port; None where the directory's name is too long for one."""
+        return self._beside(f"{role}.sock") if role in self.ports else None
+
+    def shortcut(self, role: str) -> Path | None:
+        """Socket at which a role gets what it waits for; None where the directory's name is too long for one.
+
+        None by a router: who may put what is the router's to say, and no process shall get round it.
+        """
+        return None if self.network.router else self._beside(f"{role}.in")
+
+    def _beside(self, name: str) -> Path | None:
+        path = self.secret_file.parent / name
+        return path if len(os.fsencode(path)) <= _LONGEST_SOCKET else None
+
+    def live(self) -> set[str]:
+        """Roles whose processes listen now; a run that was killed leaves its directory behind.
+
+        By a router, nobody else listens: while it does, any may be there.
+        """
+        if self.network.router:
+            return set(self.ports) if _listens(*self.network.address) else set()
+        return {role for role, port in self.ports.items() if _listens("127.0.0.1", port)}
+
+    @property
+    def mirrors(self) -> tuple[str, ...]:
+        """Roles of the mirrors."""
+        return tuple(role for role in self.ports if role.partition("-")[0] == Role.MIRROR)
+
+    def claim_start(self, role: str, start_s: int) -> int:
+        """Start of a role's process for its sequences: `start_s`, or more where this run has had that one already.
+
+        A process that is killed and restarted within one second must not repeat its sequences. Where the run's
+        directory cannot be written it is `start_s`: an operator must be able to ask for `safe` there, too.
+        """
+        path = self.secret_file.parent / f"start-{role}"
+        with contextlib.suppress(OSError, ValueError), path.open("a+") as file:
+            fcntl.flock(file, fcntl.LOCK_EX)
+            file.seek(0)
+            last = file.read(_LONGEST_START).strip()
+            claimed = max(start_s, int(last) + 1) if last.isdecimal() else start_s
+            if claimed > _LATEST_START_S:
+                claimed = start_s
+            file.seek(0)
+            file.truncate()
+            file.write(str(claimed))
+            file.flush()
+            return claimed
+        return start_s
+
+
+@dataclass(frozen=True, slots=True)
+class Run:
+    """One run and its directory."""
+
+    run_id: str
+    path: Path
+    links: Links
+
+    def remove(self) -> None:
+        """Delete the directory; for whoever made the run, when all its processes have ended."""
+        shutil.rmtree(self.path, ignore_errors=True)
+
+
+_ADVICE = "stop the processes of this run, remove its directory and start again"
+
+
+def _listens(host: str, port: int) -> bool:
+    try:
+        socket.create_connection((host, port), _CONNECT_S).close()
+    except OSError:
+        return False
+    return True
+
+
+def new_run_id() -> str:
+    """Name for a run that nobody else has: UTC time and a random part."""
+    return f"{time.strftime('%Y%m%d-%H%M%S', time.gmtime())}-{secrets.token_hex(3)}"
+
+
+def open_run(
+    run_id: str,
+    mirrors: tuple[str, ...] = ("dm",),
+    base: Path | None = None,
+    listeners: tuple[str, ...] = (),
+    network: Network | None = None,
+) -> Run:
+    """Run of that name; the first to open it makes its directory, chooses its ports and its secret.
+
+    Args:
+        run_id: its name.
+        mirrors: that it has.
+        base: directory of its directory; the user's runtime directory when None.
+        listeners: roles that get a port of their own beside the usual ones, where this makes the run: a launcher hears
+            a view, which only connects, if it listens.
+        network: the way to other hosts, where this makes the run; who gives none, or one without a router, takes the
+            run's. A launcher's run stays on its host.
+
+    Raises:
+        BusError: the name is not usable, or the run was made without one of `mirrors`, or goes another way.
+        DataFileError: the run's directory is damaged.
+    """
+    if not _RUN_ID.fullmatch(run_id):
+        raise BusError(
+            f"a run's name is up to 48 of a-z, 0-9, '.', '_', '-' and begins with a letter or digit; got {run_id!r}"
+        )
+    path = (runtime_base() if base is None else base) / run_id
+    if not path.is_dir():
+        _make(path, mirrors, listeners, _absolute(network or Network()))
+    own_directory(path)
+    links = _read(path)
+    if (
+        network is not None
+        and network.router
+        and _absolute(network) != links.network
+        and Role.LAUNCHER not in links.ports
+    ):
+        there = f"by {links.network.router}" if links.network.router else "on this host alone"
+        raise BusError(
+            f"run {run_id!r} is {there} with certificates {links.network.certificates!r}, and the configuration has "
+            f"{network.router} with {_absolute(network).certificates!r}; {_ADVICE} ({path}), or start another run"
+        )
+    for role in map(mirror_role, mirrors):
+        if role not in links.ports:
+            raise BusError(
+                f"run {run_id!r} has no {role!r} (it has {', '.join(sorted(links.ports))}); "
+                "start another run, or stop this one and start it with that mirror"
+            )
+    return Run(run_id, path, links)
+
+
+def mirror_role(name: str) -> str:
+    """Role of the process of the mirror `name`."""
+    return f"{Role.MIRROR}-{name}"
+
+
+def runtime_path() -> Path:
+    """The user's runtime directory for lowfc, whether it is there or not."""
+    given = os.environ.get("XDG_RUNTIME_DIR")
+    return Path(given) / "lowfc" if given else Path("/tmp") / f"lowfc-{os.geteuid()}"  # noqa: S108  # own_directory() checks it
+
+
+def runtime_base() -> Path:
+    """The user's runtime directory for lowfc, made if there is none.
+
+    Raises:
+        DataFileError: it belongs to somebody else, is open to others, or is not a directory.
+    """
+    base = runtime_path()
+    try:
+        base.mkdir(mode=0o700, exist_ok=True)
+    except FileExistsError:
+        raise DataFileError(f"{base} should be a directory; remove it") from None
+    except OSError as fault:
+        raise DataFileError(
+            f"{base} cannot be made ({fault.strerror}); set XDG_RUNTIME_DIR to a directory of yours, or unset it"
+        ) from fault
+    return own_directory(base)
+
+
+def own_directory(path: Path) -> Path:
+    """Check that `path` is a directory, not a link, of this user and closed to all others.
+
+    Raises:
+        DataFileError: it is not.
+    """
+    found = path.lstat()
+    if not stat.S_ISDIR(found.st_mode) or found.st_uid != os.geteuid() or found.st_mode & 0o077:
+        raise DataFileError(
+            f"{path} should be a directory of user {os.geteuid()} with mode 700, and is {stat.filemode(found.st_mode)} "
+            f"of user {found.st_uid}; remove it if it is not somebody else's"
+        )
+    return path
+
+
+def write_once(path: Path, text: str) -> str:
+    """Write a file unless there is one; return what it holds. Two writers at once agree on one text."""
+    with contextlib.suppress(FileNotFoundError):
+        return path.read_text()
+    draft = _draft(path, text)
+    with contextlib.suppress(FileExistsError):
+        os.link(draft, path)
+    draft.unlink()
+    return path.read_text()
+
+
+def _draft(path: Path, text: str) -> Path:
+    descriptor, name = tempfile.mkstemp(prefix=f".{path.name}-", dir=path.parent)  # mode 0600
+    with os.fdopen(descriptor, "w") as file:
+        file.write(text)
+    return Path(name)
+
+
+def _absolute(network: Network) -> Network:
+    """The same from wherever a process is started."""
+    if not network.router:
+        return Network()
+    return network.model_copy(update={"certificates": str(Path(network.certificates).expanduser().absolute())})
+
+
+def _make(path: Path, mirrors: tuple[str, ...], listeners: tuple[str, ...], network: Network) -> None:
+    """Make the directory under another name and rename it; whoever is second leaves the first one's in place."""
+    # Monitors connect and do not listen: there may be several, and no other process searches for one.
+    roles = [Role.CAMERA, Role.CONTROLLER, *map(mirror_role, mirrors), Role.RECORDER, *listeners]
+    draft = Path(tempfile.mkdtemp(prefix=f".{path.name}-", dir=path.parent))  # mode 0700
+    links = {
+        "run_id": path.name,
+        "user": _USER,
+        "ports": dict(zip(map(str, roles), free_ports(len(roles)), strict=True)),
+        **({"network": network.model_dump()} if network.router else {}),
+    }
+    for name, text in ((_LINKS, json.dumps(links, indent=2)), (_CREDENTIALS, f"{_USER}:{secrets.token_hex(32)}\n")):
+        _draft(draft / name, text).rename(draft / name)
+    try:
+        draft.rename(path)
+    except OSError:
+        shutil.rmtree(draft)
+        if not path.is_dir():
+            raise
+
+
+def _read(path: Path) -> Links:
+    file = path / _LINKS
+    try:
+        found = json.loads(file.read_text())
+        ports = {str(role): int(port) for role, port in found["ports"].items()}
+        if found["run_id"] != path.name or not all(0 < port < 1 << 16 for port in ports.values()):
+            raise ValueError("another run's, or a port that is none")
+        network = Network.model_validate(found.get("network", {}))
+        return Links(path.name, ports, str(found["user"]), path / _CREDENTIALS, network)
+    except (OSError, ValueError, KeyError, TypeError, AttributeError) as fault:
+        raise DataFileError(
+            f"{file} should hold run_id, user and ports as JSON, and could not be read ({fault}); {_ADVICE}: {path}"
+        ) from fault
+
+
+def free_ports(count: int) -> list[int]:
+    """Return loopback TCP ports that nobody listens on, below those that the host gives to outgoing connections.
+
+    A port of the ephemeral range may be taken by any outgoing connection before its role listens, and a connection
+    retried to one without a listener may even be given that port and reach itself.
+    """
+    try:
+        highest = int(_PORT_RANGE.read_text().split()[0])
+    except (OSError, ValueError, IndexError):
+        highest = 32768
+    candidates = range(_LOWEST_PORT, highest)
+    chooser = random.SystemRandom()
+    with contextlib.ExitStack() as held:
+        ports: list[int] = []
+        for _ in range(1000):
+            port = chooser.choice(candidates) if candidates else 0
+            probe = held.enter_context(socket.socket())
+            try:
+                probe.bind(("127.0.0.1", port))
+            except OSError:
+                continue
+            ports.append(probe.getsockname()[1])
+            if len(ports) == count:
+                return ports
+    raise BusError(f"found only {len(ports)} of {count} free TCP ports on 127.0.0.1; stop what occupies them")

@@ -1,0 +1,45 @@
+"""Refusal of sequences that start too far in the future: after one, every true message would be out of order."""
+
+from collections.abc import Callable
+from datetime import UTC, datetime
+
+from lowfc.adapters.process.clock import Clock
+from lowfc.contract.envelope import sequence_of, start_of
+
+_HOUR_S = 3600
+_NS = 1_000_000_000
+
+
+class StartCheck:
+    """Compares the start in received sequences with this host's clock."""
+
+    def __init__(self, clock: Clock, max_ahead_h: float, refused: Callable[[str, str], None]) -> None:
+        """Refuse starts more than `max_ahead_h` hours ahead of `clock`; none for 0, nor by a simulated clock.
+
+        `refused` is called with the start and this host's time, in UTC, once for each start that is refused, at
+        most once a second.
+        """
+        self._clock = clock
+        self._ahead_s = round(max_ahead_h * _HOUR_S)
+        self._refused = refused
+        self._named_s = self._at_s = 0
+        self._compares = max_ahead_h > 0 and not clock.lockstep
+        self._allowed = 0
+
+    def ahead(self, sequence: int) -> bool:
+        """Whether this sequence starts too far ahead."""
+        if sequence < self._allowed or not self._compares:  # time only goes on: what was allowed is
+            return False
+        now_s = self._clock.host_ns() // _NS
+        self._allowed = sequence_of(now_s + self._ahead_s + 1, 0)
+        if sequence < self._allowed:
+            return False
+        start_s = start_of(sequence)
+        if start_s != self._named_s and now_s != self._at_s:  # whoever invents starts does not fill the log
+            self._named_s, self._at_s = start_s, now_s
+            self._refused(_utc(start_s), _utc(now_s))
+        return True
+
+
+def _utc(time_s: int) -> str:
+    return datetime.fromtimestamp(time_s, UTC).strftime("%Y-%m-%dT%H:%M:%SZ")

@@ -1,0 +1,362 @@
+"""The bus between processes: zenoh peers over loopback TCP, each connected to all others of its run.
+
+Monitors connect by Unix socket instead, and are sent fewer pictures.
+
+Why each setting is what it is stands in `zenoh_session`; all of them were measured.
+"""
+
+import contextlib
+import json
+import os
+import threading
+from collections.abc import Callable, Iterator
+from functools import partial
+from pathlib import Path
+
+import zenoh
+from zenoh.handlers import Callback, Handler, RingChannel
+
+from lowfc.adapters.bus.access import CLOCK_KEY, ROUTER
+from lowfc.adapters.bus.bus import ALL, Faults, Query, Sample
+from lowfc.adapters.bus.direct_link import DirectReader, DirectWriter, SharedDirectReader
+from lowfc.adapters.bus.routed import RouterWatch, open_by_router, require_certificate
+from lowfc.adapters.bus.run import Links, mirror_role
+from lowfc.adapters.bus.zenoh_fault import plain
+from lowfc.adapters.bus.zenoh_session import session_config
+from lowfc.adapters.process.clock import Clock
+from lowfc.adapters.process.clock_offset import ClockAsker, ClockOffset
+from lowfc.contract.envelope import Envelope, sequence_of
+from lowfc.contract.errors import BusError
+from lowfc.contract.messages import HEALTH, Role, Topic
+
+__all__ = [
+    "ZenohBus",
+    "ZenohPublisher",
+    "declare_publisher",
+    "receive_in_one_thread",
+    "session_config",
+]
+
+TAKEN_S = 0.5
+"""How long the router, or who has one's place already, may take to answer."""
+
+
+def receive_in_one_thread() -> None:
+    """Let zenoh's thread that waits for messages read them too, instead of waking another; before the first session.
+
+    Right for a process that waits for what it receives; one that computes meanwhile would hold it up. Its children
+    inherit it.
+    """
+    os.environ.setdefault("ZENOH_RUNTIME", "(rx: (handover: net))")
+
+
+def declare_publisher(session: zenoh.Session, topic: Topic, key: str) -> zenoh.Publisher:
+    """Return zenoh's own publisher of a topic, with the settings of the loop."""
+    return session.declare_publisher(
+        key,
+        encoding=f"application/protobuf;{topic.message.DESCRIPTOR.full_name}",
+        congestion_control=zenoh.CongestionControl.DROP,
+        priority=zenoh.Priority.REAL_TIME if topic.in_loop else zenoh.Priority.DATA,
+        # Express gives every message a batch of its own, so that a burst of 16 fills the queue and the rest is lost;
+        # without it the latency is the same, for messages are batched under back-pressure only.
+        express=False,
+    )
+
+
+class ZenohPublisher:
+    """Publishes one topic; see `Publisher`."""
+
+    def __init__(self, bus: "ZenohBus", session: zenoh.Session, topic: Topic, key: str, shortcut: Path | None) -> None:
+        self.topic = topic
+        self.key = key
+        self.published = 0
+        self.handed_ns = 0
+        self.last: tuple[bytes, Envelope] | None = None
+        self._keeps = topic.queryable
+        self._host_ns = bus.clock.host_ns
+        self._start_s = bus.start_s
+        self._offset = bus.offset
+        self._replying = bus.replying
+        self._publisher = declare_publisher(session, topic, key)
+        self._shortcut = None if shortcut is None else DirectWriter(shortcut)
+        if self._keeps:
+            session.declare_queryable(key, Callback(self._answer, indirect=False))
+
+    def put(self, payload: bytes, publish_time_ns: int | None = None, sequence: int | None = None) -> Envelope:
+        """Send `payload`; waits at most 1 ms for a reader that does not keep up, then loses the message to it."""
+        envelope = Envelope(
+            sequence_of(self._start_s, self.published) if sequence is None else sequence,
+            self._host_ns() if publish_time_ns is None else publish_time_ns,
+        )
+        self.published += 1
+        if self._keeps:
+            self.last = (payload, envelope)
+        handed = self._shortcut is not None and self._shortcut.send(envelope.encode(), payload)
+        if handed:
+            self.handed_ns = self._host_ns()
+        self._publisher.put(payload, attachment=self._sent(envelope))
+        if not handed:
+            self.handed_ns = self._host_ns()
+        return envelope
+
+    def close(self) -> None:
+        """Let go of what is not zenoh's."""
+        if self._shortcut is not None:
+            self._shortcut.close()
+
+    def _answer(self, query: zenoh.Query) -> None:
+        with self._replying(query):
+            if self.last is not None:
+                payload, envelope = self.last
+                query.reply(self.key, payload, attachment=self._sent(envelope))
+
+    def _sent(self, envelope: Envelope) -> bytes:
+        """What goes out: across hosts, by the router's clock."""
+        if self._offset is None:
+            return envelope.encode()
+        return Envelope(envelope.sequence, envelope.publish_time_ns + self._offset.offset_ns).encode()
+
+
+class ZenohRing:
+    """See `Ring`."""
+
+    def __init__(self, bus: "ZenohBus", subscriber: "zenoh.Subscriber[Handler[zenoh.Sample]]") -> None:
+        self._bus = bus
+        self._subscriber = subscriber
+        self._expression = str(subscriber.key_expr)
+        self._key = _known_key(self._expression)
+
+    def drain(self) -> list[Sample]:
+        """See `Ring.drain`."""
+        found: list[Sample] = []
+        now_ns = self._bus.clock.host_ns()
+        while (sample := self._subscriber.try_recv()) is not None:
+            try:
+                found.append(self._bus.read(sample, now_ns, self._key))
+            except Exception as fault:
+                self._bus.faults.add(f"{self._bus.role}: ring of", self._expression, fault)
+        return found
+
+    def close(self) -> None:
+        """See `Ring.close`."""
+        with contextlib.suppress(zenoh.ZError):
+            self._subscriber.undeclare()  # type: ignore[no-untyped-call]
+
+
+class ZenohBus:
+    """One process's zenoh session; see `Bus`.
+
+    Attributes:
+        offset: of the router's clock, where the run is on several hosts. Envelopes go by that clock; what is sent and
+            received here is by this host's.
+        read: what a message of zenoh's says.
+    """
+
+    def __init__(self, links: Links, role: str, clock: Clock, *, looks_on: bool = False) -> None:
+        """Join a run.
+
+        Args:
+            links: of the run.
+            role: this process's.
+            clock: the run's.
+            looks_on: this process takes no part in the loop: it looks at what it kept in a `Ring` now and then. It is
+                sent the topics of which only the newest matters no faster than it looks, receives into spare buffers,
+                and in one thread: half the cost. To be set in a process's first bus.
+
+        Raises:
+            BusError: the role's port is taken, or the role itself on another host; zenoh refuses the configuration, or
+                the router the certificate.
+            DataFileError: the role has no certificate, across hosts.
+        """
+        self.role = role
+        self._links = links
+        self._closers: list[Callable[[], None]] = []
+        self.clock = clock
+        self.faults = Faults()
+        self.offset: ClockOffset | None = None
+        self.read = _sample
+        self.start_s = links.claim_start(role, clock.start_s)
+        if looks_on:
+            receive_in_one_thread()
+        if links.network.router:
+            require_certificate(links.network, role)
+        config = zenoh.Config.from_json5(json.dumps(session_config(links, role, looks_on=looks_on)))
+        if links.network.router and role != ROUTER:
+            self._session = open_by_router(config, links.network, role)
+            self._join_hosts()
+            return
+        try:
+            self._session = zenoh.open(config)
+        except zenoh.ZError as fault:
+            address = links.network.listen or links.network.router or f"127.0.0.1:{links.ports.get(role)}"
+            listens = role in {*links.ports, ROUTER}
+            where = f"cannot listen on {address}; is one running already?" if listens else "cannot join."
+            raise BusError(
+                f"{role} of run {links.run_id!r} {where} Stop what is in the way, or start another run ({plain(fault)})"
+            ) from None
+        if role == ROUTER:
+            self.queryable(CLOCK_KEY, lambda query: query.reply(b""))
+
+    def _join_hosts(self) -> None:
+        """Take no place that is taken, which ports prevent on one host; and set envelopes by the router's clock."""
+        if self.role in self._links.ports and self.get(HEALTH.at(self.role), timeout_s=TAKEN_S):
+            self._session.close()  # type: ignore[no-untyped-call]
+            raise BusError(
+                f"run {self._links.run_id!r} has a {self.role} already, on this host or another; stop it first"
+            )
+        self.offset = ClockOffset()
+        self.read = partial(_sample_from_afar, self.offset)
+        self._router = RouterWatch(self._links.network, self.role)
+        self._closers.append(ClockAsker(self.offset, self._ask_the_time, self.clock.host_ns).close)
+
+    def _ask_the_time(self) -> list[tuple[int, int]]:
+        self._router.look(linked=bool(self._session.info.routers_zid()))
+        answers = self.get(CLOCK_KEY, timeout_s=TAKEN_S)
+        return [(answer.publish_time_ns, answer.receive_time_ns) for answer in answers]
+
+    def publisher(self, topic: Topic, name: str = "") -> ZenohPublisher:
+        """See `Bus.publisher`."""
+        by_table = self.role.partition("-")[0] in topic.publisher
+        path = self._shortcut(topic, name) if by_table else None
+        publisher = ZenohPublisher(self, self._session, topic, topic.at(name), path)
+        self._closers.append(publisher.close)
+        return publisher
+
+    def subscribe(self, topic: Topic, handler: Callable[[Sample], None], name: str = ALL) -> Callable[[], None]:
+        """See `Bus.subscribe`; `handler` runs on a thread that receives, on one at a time."""
+        if _reader(topic, name) != self.role or (path := self._shortcut(topic, name)) is None:
+            return self._subscribe(topic, handler, name)
+        key = topic.at(name)
+        reader = (SharedDirectReader if topic.multiple_publishers else DirectReader)(
+            path,
+            key,
+            handler,
+            lambda by_bus: self._subscribe(topic, by_bus, name),
+            self.clock.host_ns,
+            lambda fault: self.faults.add(f"{self.role}: handler of", key, fault),
+        )
+        self._closers.append(reader.close)
+        return reader.close
+
+    def _subscribe(self, topic: Topic, handler: Callable[[Sample], None], name: str) -> Callable[[], None]:
+        key, host_ns, faults, read = topic.at(name), self.clock.host_ns, self.faults, self.read
+        known_key = _known_key(key)
+
+        def received(sample: zenoh.Sample) -> None:
+            now_ns = host_ns()
+            try:
+                handler(read(sample, now_ns, known_key))
+            except Exception as fault:  # zenoh would print it and go on; it is counted here
+                faults.add(f"{self.role}: handler of", key, fault)
+
+        subscriber = self._session.declare_subscriber(key, Callback(received, indirect=False))
+        return subscriber.undeclare
+
+    def ring(self, topic: Topic, capacity: int) -> "ZenohRing":
+        """See `Bus.ring`; zenoh's own threads keep the messages, and Python is not woken for any of them."""
+        return ZenohRing(self, self._session.declare_subscriber(topic.at(ALL), RingChannel(capacity)))
+
+    def queryable(self, key_expression: str, handler: Callable[[Query], None]) -> None:
+        """See `Bus.queryable`."""
+
+        def asked(query: zenoh.Query) -> None:
+            key = str(query.key_expr)
+            try:
+                handler(
+                    Query(key, b"" if query.payload is None else query.payload.to_bytes(), self._replier(query, key))
+                )
+            except Exception as fault:
+                query.drop()  # type: ignore[no-untyped-call]
+                self.faults.add(f"{self.role}: queryable of", key, fault)
+
+        self._session.declare_queryable(key_expression, Callback(asked, indirect=False))
+
+    def get(self, key: str, payload: bytes = b"", timeout_s: float = 1.0) -> list[Sample]:
+        """See `Bus.get`."""
+        answers: list[Sample] = []
+        done = threading.Event()
+
+        def answered(reply: zenoh.Reply) -> None:
+            if reply.ok is None:  # a timeout
+                return
+            try:
+                answers.append(self.read(reply.ok, self.clock.host_ns()))
+            except Exception as fault:
+                self.faults.add(f"{self.role}: answer to", key, fault)
+
+        self._session.get(
+            key,
+            Callback(answered, done.set, indirect=False),
+            payload=payload,
+            timeout=timeout_s,
+            target=zenoh.QueryTarget.ALL,
+            consolidation=zenoh.ConsolidationMode.NONE,
+            # An operator's question waits for room, or a large one is lost; those of late joiners are empty.
+            congestion_control=zenoh.CongestionControl.BLOCK if payload else zenoh.CongestionControl.DROP,
+        )
+        done.wait(timeout_s + 1.0)
+        return list(answers)
+
+    def peers(self) -> int:
+        """See `Bus.peers`; across hosts, the router alone."""
+        return len(self._session.info.peers_zid()) + len(self._session.info.routers_zid())
+
+    def close(self) -> None:
+        """Leave the run."""
+        for close in self._closers:
+            close()
+        with contextlib.suppress(zenoh.ZError):
+            self._session.close()  # type: ignore[no-untyped-call]
+
+    def _shortcut(self, topic: Topic, name: str) -> Path | None:
+        reader = _reader(topic, name)
+        return None if reader is None else self._links.shortcut(reader)
+
+    @contextlib.contextmanager
+    def replying(self, query: zenoh.Query) -> Iterator[None]:
+        """End a question, answered or not, so that its asker does not wait; a fault harms nobody here."""
+        try:
+            yield
+        except Exception as fault:
+            self.faults.add(f"{self.role}: queryable of", str(query.key_expr), fault)
+        finally:
+            query.drop()  # type: ignore[no-untyped-call]
+
+    def _replier(self, query: zenoh.Query, key: str) -> Callable[[bytes], None]:
+        def reply(body: bytes) -> None:
+            with self.replying(query):
+                shift_ns = 0 if self.offset is None else self.offset.offset_ns
+                envelope = Envelope(sequence_of(self.start_s, 0), self.clock.host_ns() + shift_ns)
+                query.reply(key, body, attachment=envelope.encode())
+
+        return reply
+
+
+def _reader(topic: Topic, name: str) -> str | None:
+    """Role of the process that waits for a topic."""
+    return mirror_role(name) if topic.direct_subscriber is Role.MIRROR else topic.direct_subscriber
+
+
+def _known_key(expression: str) -> str | None:
+    """The key of every message, where there is but one."""
+    return None if ALL in expression else expression
+
+
+def _sample(sample: zenoh.Sample, receive_time_ns: int, key: str | None = None) -> Sample:
+    attachment = sample.attachment
+    sequence, publish_time_ns = Envelope.unpack(b"" if attachment is None else attachment.to_bytes())
+    return Sample(
+        str(sample.key_expr) if key is None else key,
+        sample.payload.to_bytes(),
+        sequence,
+        publish_time_ns,
+        receive_time_ns,
+    )
+
+
+def _sample_from_afar(
+    offset: ClockOffset, sample: zenoh.Sample, receive_time_ns: int, key: str | None = None
+) -> Sample:
+    """The same across hosts: when it was sent, by this host's clock."""
+    found = _sample(sample, receive_time_ns, key)
+    return found._replace(publish_time_ns=found.publish_time_ns - offset.offset_ns)

@@ -1,0 +1,48 @@
+"""An array of numbers in a file: the first image of a FITS file, or a .npy file."""
+
+from pathlib import Path
+from tokenize import TokenError
+
+import numpy as np
+import numpy.typing as npt
+from numpy.lib.format import read_array as read_npy
+
+from lowfc.adapters.files import fits_file
+from lowfc.contract.codecs import input_file
+from lowfc.contract.errors import DataFileError
+
+
+def read_array(path: Path, what: str, dimensions: tuple[int, ...]) -> npt.NDArray[np.generic]:
+    """The array of a file.
+
+    Args:
+        path: of the file.
+        what: it should be, for people.
+        dimensions: which number of them it may have.
+
+    Raises:
+        DataFileError: the file is missing, damaged or holds something else.
+    """
+    try:
+        array = _npy(path) if path.suffix == ".npy" else _fits(path)
+    except FileNotFoundError:
+        raise DataFileError(f"{path}: there is no such file") from None
+    except fits_file.DAMAGED as error:
+        why = fits_file.in_a_line(error)
+        raise DataFileError(f"{path}: neither a FITS image nor a numpy array (.npy): {why}") from None
+    if array.ndim not in dimensions or not array.size or array.dtype.kind not in "biuf":
+        raise DataFileError(f"{path}: {what} of numbers, got {array.shape} of {array.dtype}")
+    return array
+
+
+def _npy(path: Path) -> npt.NDArray[np.generic]:
+    with input_file.opened(path, fits_file.LARGEST_BYTES) as stream:
+        try:
+            return np.asarray(read_npy(stream, allow_pickle=False))
+        except TokenError as error:
+            raise ValueError(f"its header cannot be read: {error}") from None
+
+
+def _fits(path: Path) -> npt.NDArray[np.generic]:
+    with fits_file.opened(path) as units:
+        return fits_file.first_image(units)

@@ -1,0 +1,113 @@
+"""Calibrations as FITS: one named extension for each array, units in the headers."""
+
+from pathlib import Path
+
+from astropy.io import fits
+
+from lowfc.adapters.files import fits_file
+from lowfc.adapters.files.whole_file import write_whole
+from lowfc.control.calibration.calibration import Calibration
+from lowfc.control.loop.camera import CameraSettings
+
+KIND = "lowfc calibration 1"
+
+# Extension, attribute of Calibration, unit.
+_EXTENSIONS = (
+    ("REFERENCE", "reference", "", "reference image I0, fraction of the flux"),
+    ("RESPONSE", "response", "nm-1", "response matrix H, fraction of the flux per nm rms of wavefront"),
+    ("RECONSTRUCTOR", "reconstructor", "nm", "reconstructor R, nm rms of wavefront per fraction of the flux"),
+    ("MASK", "good", "", "1 where a pixel is used"),
+    ("DARK", "dark", "adu", "frame without light"),
+    ("MODES2ACT", "modes_to_actuators", "", "nm of surface per nm rms of wavefront"),
+    ("ACT2MODES", "actuators_to_modes", "", "nm rms of wavefront that R makes of a nm of surface"),
+)
+_MAY_LACK = "ACT2MODES"
+
+
+def to_bytes(calibration: Calibration) -> bytes:
+    """Calibration as a FITS file."""
+    primary = fits_file.header_of(KIND)
+    header = primary.header
+    header["CALID"] = calibration.id
+    header["OPERATOR"] = calibration.operator_hash
+    header["ESTIMATE"] = (calibration.estimator, "how R was made")
+    header["NOLL"] = (" ".join(map(str, calibration.noll)), "Noll index of each mode")
+    header["WAVELEN"] = (calibration.wavelength_nm, "[nm] wavelength")
+    header["ROWS"] = (calibration.shape[0], "rows of the frame")
+    header["COLUMNS"] = (calibration.shape[1], "columns of the frame")
+    header["MIRROWS"] = (calibration.grid[0], "rows of the mirror")
+    header["MIRCOLS"] = (calibration.grid[1], "columns of the mirror")
+    header["FLUX"] = (calibration.flux_dn, "[adu] expected sum of the good pixels")
+    header["SATURATE"] = (calibration.saturation_dn, "[adu] highest value of a pixel")
+    if (camera := calibration.camera) is not None:
+        header["CAMBIAS"] = (camera.bias_dn, "[adu] bias of the camera when this was made")
+        header["CAMFULL"] = (camera.saturation_dn, "[adu] its highest value of a pixel")
+        header["CAMGAIN"] = (camera.gain_e_per_dn, "[e-/adu] its conversion gain")
+        header["CAMEM"] = (camera.em_gain, "its electron-multiplying gain")
+        header["CAMNOISE"] = (camera.read_noise_e, "[e-] its read noise")
+        header["CAMROW"] = (camera.region[0], "first row read")
+        header["CAMCOL"] = (camera.region[1], "first column read")
+    arrays = {name: getattr(calibration, attribute) for name, attribute, _, _ in _EXTENSIONS}
+    return fits_file.to_bytes(
+        primary,
+        [
+            fits_file.extension(name, arrays[name], sentence, unit)
+            for name, _, unit, sentence in _EXTENSIONS
+            if name != _MAY_LACK or arrays[name].size
+        ],
+    )
+
+
+def save(calibration: Calibration, path: Path) -> None:
+    """Write a FITS file.
+
+    Raises:
+        DataFileError: the file cannot be written.
+    """
+    write_whole(path, to_bytes(calibration))
+
+
+def load(path: Path) -> Calibration:
+    """Read a FITS file and check that it is whole.
+
+    Raises:
+        DataFileError: the file is missing, damaged or holds something else.
+    """
+    calibration = fits_file.load(path, (KIND,), "calibration file", _read)
+    fits_file.require_identity(path, calibration.identity(), calibration.id)
+    return calibration
+
+
+def _read(units: fits.HDUList) -> Calibration:
+    header = units[0].header
+    arrays = {
+        attribute: fits_file.single(units, name)
+        for name, attribute, _, _ in _EXTENSIONS
+        if name != _MAY_LACK or name in units
+    }
+    return Calibration(
+        noll=tuple(int(index) for index in str(header["NOLL"]).split()),
+        shape=(int(header["ROWS"]), int(header["COLUMNS"])),
+        grid=(int(header["MIRROWS"]), int(header["MIRCOLS"])),
+        flux_dn=float(header["FLUX"]),
+        saturation_dn=float(header["SATURATE"]),
+        estimator=str(header["ESTIMATE"]),
+        wavelength_nm=float(header["WAVELEN"]),
+        operator_hash=str(header["OPERATOR"]),
+        id=str(header["CALID"]),
+        camera=_camera(header) if "CAMBIAS" in header else None,
+        **arrays,
+    )
+
+
+def _camera(header: fits.Header) -> CameraSettings:
+    return CameraSettings(
+        0,
+        (int(header["ROWS"]), int(header["COLUMNS"])),
+        float(header["CAMBIAS"]),
+        float(header["CAMFULL"]),
+        float(header["CAMGAIN"]),
+        float(header["CAMEM"]),
+        float(header["CAMNOISE"]),
+        (int(header["CAMROW"]), int(header["CAMCOL"])),
+    )

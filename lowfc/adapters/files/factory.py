@@ -1,0 +1,285 @@
+"""The simulated instrument that a configuration describes: optics, star, detector, mirror, calibration.
+
+The camera, the mirror and the launcher build the same parts from the same keys; nothing else interprets them.
+"""
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+
+from lowfc.adapters.files.mirror_maps import active_actuators
+from lowfc.adapters.files.sensors import sensor_from
+from lowfc.adapters.files.twin_cache import load_or_build, load_or_fit_mirror
+from lowfc.arrays import Array, single
+from lowfc.contract.codecs.calibration_codec import camera_settings, identified
+from lowfc.contract.configuration import Configuration
+from lowfc.contract.errors import CalibrationError, ConfigurationError
+from lowfc.contract.messages import timestamp, wire
+from lowfc.control.calibration.actuator_response import actuators_to_modes
+from lowfc.control.calibration.calibration import Calibration, noise_nm, normalise_flux, reconstructor
+from lowfc.control.loop.safety import Limits, LoopMode
+from lowfc.control.loop.state import Settings
+from lowfc.optics.chain.band import Band, gauss_legendre, monochromatic, uniform
+from lowfc.optics.chain.mirror import Mirror, modes_to_actuators
+from lowfc.optics.chain.sensor import Sensor, shear_response
+from lowfc.optics.chain.zernike import zernikes
+from lowfc.optics.detector.detector import Detector, saturation_dn
+from lowfc.optics.detector.photometry import Photometry, electrons
+from lowfc.optics.twin.twin import ACCURATE, FAST, Twin, node_radii, reference, response
+from lowfc.optics.twin.twin_mirror import TwinMirror, wavefront_nm
+
+Progress = Callable[[int, int], None]
+
+_TWINS = {spec.nodes: spec for spec in (FAST, ACCURATE)}
+
+
+def sensor(config: Configuration, warn: Callable[[str], None]) -> Sensor:
+    """The wavefront sensor's optics."""
+    return sensor_from(config.sensor, config.star.wavelength_nm, warn)
+
+
+def band(config: Configuration) -> Band:
+    """The wavelengths that stand for the star's band."""
+    if config.sensor.wavelengths == 1:
+        return monochromatic(config.star.wavelength_nm)
+    quadrature = gauss_legendre if config.sensor.quadrature == "gauss-legendre" else uniform
+    return quadrature(config.star.wavelength_nm, config.star.bandwidth, config.sensor.wavelengths)
+
+
+def twin(config: Configuration, progress: Progress | None, warn: Callable[[str], None]) -> Twin:
+    """The real-time twin of the sensor, from the cache or built.
+
+    Raises:
+        ConfigurationError: the optics do not have as many modes as they ask for.
+    """
+    spec = replace(_TWINS[config.sensor.nodes], rank=config.sensor.rank)
+    try:
+        return load_or_build(sensor(config, warn), spec, band(config), progress, notice=warn)
+    except ValueError as error:
+        raise ConfigurationError(f"sensor: {error}") from None
+
+
+def electrons_per_exposure(config: Configuration) -> float:
+    """Electrons in one exposure of all the light through the open circle; an image times this is in electrons."""
+    star = config.star
+    photometry = Photometry(
+        star.magnitude,
+        star.diameter_m,
+        star.wavelength_nm * star.bandwidth,
+        star.throughput,
+        config.camera.quantum_efficiency,
+    )
+    return electrons(photometry, config.exposure_ns * 1e-9)
+
+
+def detector(config: Configuration) -> Detector:
+    """The camera's detector."""
+    camera = config.camera
+    try:
+        return Detector(
+            camera.gain_e_per_dn,
+            camera.read_noise_e,
+            camera.bias_dn,
+            camera.full_well_e,
+            camera.bit_depth,
+            camera.em_gain,
+            camera.clock_induced_charge_e,
+            camera.photon_noise == "exact",
+        )
+    except ValueError as error:
+        raise ConfigurationError(f"camera: {error}") from None
+
+
+def camera_state(config: Configuration, shape: tuple[int, int], time_ns: int) -> wire.CameraState:
+    """What the camera says of itself; `shape` are the rows and columns of its frames."""
+    camera = config.camera
+    return wire.CameraState(
+        timestamp=timestamp(time_ns),
+        exposure_ns=config.exposure_ns,
+        period_ns=config.period_ns,
+        gain_e_per_dn=camera.gain_e_per_dn,
+        bias_dn=camera.bias_dn,
+        read_noise_e=camera.read_noise_e,
+        saturation_dn=saturation_dn(detector(config)),
+        rows=shape[0],
+        columns=shape[1],
+        bit_depth=camera.bit_depth,
+        em_gain=camera.em_gain,
+    )
+
+
+def mirror(config: Configuration) -> Mirror:
+    """The mirror's geometry, as it is believed to be."""
+    section = config.mirror
+    return Mirror(section.rows, section.columns, section.pitches_per_pupil, section.coupling)
+
+
+def true_mirror(config: Configuration) -> Mirror:
+    """The simulated mirror's geometry, with its errors of registration."""
+    section = config.mirror
+    pitches_per_pupil = section.pitches_per_pupil / section.magnification
+    return replace(mirror(config), pitches_per_pupil=pitches_per_pupil, shift_pitches=section.shift_pitches)
+
+
+def mirror_on_twin(config: Configuration, optics: Twin, warn: Callable[[str], None]) -> TwinMirror:
+    """The mirror's wavefront at the twin's nodes as it is believed to be, from the cache or fitted."""
+    return load_or_fit_mirror(sensor(config, warn), optics, mirror(config), notice=warn)
+
+
+def true_mirror_on_twin(config: Configuration, optics: Twin, warn: Callable[[str], None]) -> TwinMirror:
+    """The simulated mirror's wavefront at the twin's nodes, with its errors of registration."""
+    return load_or_fit_mirror(sensor(config, warn), optics, true_mirror(config), notice=warn)
+
+
+def mirror_limits(config: Configuration) -> Limits:
+    """What the mirror itself allows."""
+    return Limits(config.mirror.stroke_nm / 2, config.mirror.slew_nm, config.mirror.neighbour_nm)
+
+
+def settings(config: Configuration) -> Settings:
+    """What of the controller does not change during a run."""
+    control, safety = config.control, config.safety
+    return Settings(
+        limits=Limits(safety.stroke_nm, safety.slew_nm, safety.neighbour_nm),
+        delay_frames=control.delay_frames or config.camera.delay_frames,
+        start_mode=LoopMode[control.start_mode.upper()],
+        max_frame_age_ns=config.max_frame_age_ns,
+        frame_timeout_ns=config.frame_timeout_ns,
+        on_frame_timeout=control.on_frame_timeout,
+        min_flux_fraction=control.min_flux_fraction,
+        max_saturated_pixels=control.max_saturated_pixels,
+        gain=(control.tilt_gain, control.gain),
+        leak=(control.tilt_leak, control.leak),
+        limit_nm=(control.tilt_limit_nm, control.limit_nm),
+        max_identical_frames=control.max_identical_frames
+        if config.camera.noise
+        else 0,  # without noise images are alike
+        rate_hz=config.camera.rate_hz,
+    )
+
+
+def analytic_calibration(
+    config: Configuration, optics: Twin, on_nodes: TwinMirror, opd_nm: Array | None = None
+) -> Calibration:
+    """I0 and H from the camera's own operator, eqs. (6) to (12), R from them, and the mirror's modes.
+
+    The modes are fitted to the influence functions, then mixed a little so that a modal command is what the sensor
+    measures of it: through the shaped pupil some of the mirror's print-through looks like low orders, by 2 to 6 %.
+
+    Actuators that are not active stay out of the modes, and the sensor sees nothing of them.
+
+    Args:
+        config: The instrument's.
+        optics: Its twin.
+        on_nodes: Its mirror.
+        opd_nm: Wavefront at the twin's used nodes at which I0 and H are wanted; flat when None.
+
+    Raises:
+        CalibrationError: this sensor cannot tell the modes apart, the star saturates it, or shear is to be fitted
+            along at a wavefront that is not flat.
+        ConfigurationError: the map of active actuators cannot be used.
+    """
+    if opd_nm is not None and "shear" in config.control.nuisance:
+        raise CalibrationError(
+            "what shear of the beam does is known at a flat wavefront only: leave it out of control.nuisance"
+        )
+    camera = detector(config)
+    nolls = config.noll
+    radii = node_radii(optics)
+    I0, H = reference(optics, opd_nm), response(optics, zernikes(nolls, *radii), opd_nm)
+    shape = I0.shape
+    good = np.ones(I0.size)
+    flux_e = electrons_per_exposure(config) * float(I0.sum())
+    light = I0.reshape(-1)
+    I0, H = normalise_flux(light, H, good)
+    nuisance = _nuisance(config, light, good)
+    try:
+        R = reconstructor(I0, H, good, flux_e, equivalent_read_noise_e(camera), config.control.estimator, nuisance)
+    except ValueError as error:
+        raise CalibrationError(f"sensor.kind = {config.sensor.kind!r}, {len(nolls)} modes: {error}") from None
+    _check_exposure(config, light)
+
+    active = active_actuators(config)
+    try:
+        commands = modes_to_actuators(mirror(config), nolls, active)
+    except ValueError as error:
+        raise ConfigurationError(f"mirror: {error}") from None
+    actuators = config.mirror.rows * config.mirror.columns
+    pokes = np.eye(actuators, dtype=np.float32).reshape(actuators, config.mirror.rows, config.mirror.columns)
+    wavefronts = np.array([wavefront_nm(on_nodes, poke) for poke in pokes])
+    seen = actuators_to_modes(R, light, good, lambda shapes: response(optics, shapes, opd_nm), wavefronts)
+    if active is not None:
+        seen[:, ~active.reshape(-1)] = 0
+    commands = commands @ np.linalg.inv(seen @ commands)
+
+    grid = (config.mirror.rows, config.mirror.columns)
+    return identified(
+        Calibration(
+            noll=nolls,
+            reference=single(I0),
+            response=single(H),
+            reconstructor=single(R),
+            good=single(good),
+            dark=np.full(I0.size, _dark_dn(camera), np.float32),
+            modes_to_actuators=single(commands),
+            shape=(shape[0], shape[1]),
+            grid=grid,
+            flux_dn=flux_e * camera.em_gain / camera.gain_e_per_dn,
+            saturation_dn=float(saturation_dn(camera)),
+            estimator="+".join((config.control.estimator, *config.control.nuisance)),
+            wavelength_nm=config.star.wavelength_nm,
+            operator_hash=optics.operator_hash,
+            id="",
+            actuators_to_modes=single(seen),
+            camera=camera_settings(camera_state(config, (shape[0], shape[1]), 0)),
+        )
+    )
+
+
+def frame_noise_nm(config: Configuration, calibration: Calibration) -> Array:
+    """Standard deviation of each mode of one frame, nm of wavefront rms: photon and read noise through R."""
+    camera = detector(config)
+    flux_e = calibration.flux_dn * camera.gain_e_per_dn / camera.em_gain
+    reference, matrix = calibration.reference.astype(float), calibration.reconstructor.astype(float)
+    excess = np.sqrt(2) if camera.em_gain > 1 else 1.0
+    return excess * noise_nm(matrix, reference, flux_e, equivalent_read_noise_e(camera))
+
+
+def _check_exposure(config: Configuration, light: Array) -> None:
+    """Raise where a pixel is at full well in the reference image: what it then says is no longer linear."""
+    camera = detector(config)
+    charge_e = float(light.max()) * electrons_per_exposure(config) * camera.em_gain
+    full_dn = float(saturation_dn(camera))
+    if _dark_dn(camera) + charge_e / camera.gain_e_per_dn >= full_dn:
+        raise CalibrationError(
+            f"the star saturates the sensor: {charge_e:.0f} e- in the brightest pixel of the reference image, which "
+            f"holds {(full_dn - _dark_dn(camera)) * camera.gain_e_per_dn:.0f} e-; shorten camera.exposure_fraction or "
+            "raise camera.rate_hz"
+        )
+
+
+def _nuisance(config: Configuration, light: Array, good: Array) -> Array | None:
+    """Slopes (pixels, any) of the normalised image along what is fitted beside the modes; None without any."""
+    columns = []
+    for name in config.control.nuisance:
+        if name == "background":
+            columns.append(np.ones((light.size, 1)))
+        else:
+            columns.append(shear_response(sensor(config, lambda _: None), band(config)))
+    return normalise_flux(light, np.hstack(columns), good)[1] if columns else None
+
+
+def _dark_dn(camera: Detector) -> float:
+    return camera.bias_dn + camera.clock_induced_charge_e * camera.em_gain / camera.gain_e_per_dn
+
+
+def equivalent_read_noise_e(camera: Detector) -> float:
+    """Read noise beside photon noise as the weights see it, in electrons before multiplication.
+
+    The register doubles the photons' variance, to 2 (I0 + read_noise^2 / (2 gain^2)); spurious charge counts as light.
+    """
+    read_noise_e = camera.read_noise_e
+    if camera.em_gain > 1:
+        read_noise_e /= camera.em_gain * np.sqrt(2)
+    return float(np.hypot(read_noise_e, np.sqrt(camera.clock_induced_charge_e)))

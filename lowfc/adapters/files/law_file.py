@@ -1,0 +1,75 @@
+"""Control laws as FITS: one named extension for each matrix."""
+
+from pathlib import Path
+from typing import cast
+
+from astropy.io import fits
+
+from lowfc.adapters.files import fits_file
+from lowfc.adapters.files.whole_file import write_whole
+from lowfc.contract.former_names import LAW_EXTENSIONS
+from lowfc.control.laws.linear_law import LinearLaw, Signal
+
+KIND = "lowfc law 2"
+FORMER_KIND = "lowfc law 1"
+
+# Extension, attribute of LinearLaw, sentence.
+_EXTENSIONS = (
+    ("TRANSITION", "transition", "F of x[k] = F x[k-1] + G y[k] + H c[k-1]"),
+    ("MEASUREMENT_GAIN", "measurement_gain", "G, of the modes measured"),
+    ("COMMAND_GAIN", "command_gain", "H, of the modal command before"),
+    ("PREDICT_ONLY", "predict_only", "A of x[k] = A x[k-1] + H c[k-1], without a frame"),
+    ("OUTPUT", "output", "K, the modal command is K x[k]"),
+)
+
+
+def to_bytes(law: LinearLaw) -> bytes:
+    """Law as a FITS file."""
+    primary = fits_file.header_of(KIND)
+    header = primary.header
+    header["LAWID"] = law.id
+    header["NAME"] = (law.name, "what kind of law it is")
+    header["SIGNAL"] = (law.signal, "y: the error, or pseudo-open-loop modes")
+    header["NOLL"] = (" ".join(map(str, law.noll)), "Noll index of each mode")
+    header["DELAY"] = (law.delay_frames, "[frames] delay it was made for")
+    header["RATE"] = (law.rate_hz, "[Hz] frame rate it was made for")
+    return fits_file.to_bytes(
+        primary,
+        [fits_file.extension(name, getattr(law, attribute), sentence) for name, attribute, sentence in _EXTENSIONS],
+    )
+
+
+def save(law: LinearLaw, path: Path) -> None:
+    """Write a FITS file.
+
+    Raises:
+        DataFileError: the file cannot be written.
+    """
+    write_whole(path, to_bytes(law))
+
+
+def load(path: Path) -> LinearLaw:
+    """Read a FITS file and check that it is whole.
+
+    Raises:
+        DataFileError: the file is missing, damaged or holds something else.
+    """
+    law, stated = fits_file.load(
+        path, (KIND, FORMER_KIND), "law file", _read, ": make one with `lowfc tune LOG --out FILE`"
+    )
+    fits_file.require_identity(path, law.id, stated)
+    return law
+
+
+def _read(units: fits.HDUList) -> tuple[LinearLaw, str]:
+    header = units[0].header
+    former = LAW_EXTENSIONS if header["KIND"] == FORMER_KIND else {}
+    law = LinearLaw(
+        signal=cast("Signal", str(header["SIGNAL"])),  # a law refuses any other
+        name=str(header["NAME"]),
+        noll=tuple(int(index) for index in str(header["NOLL"]).split()),
+        delay_frames=float(header["DELAY"]),
+        rate_hz=float(header["RATE"]),
+        **{attribute: fits_file.single(units, former.get(name, name)) for name, attribute, _ in _EXTENSIONS},
+    )
+    return law, str(header["LAWID"])

@@ -1,0 +1,108 @@
+"""Sparse-aperture layouts: the shipped ones, and those of a user's own files."""
+
+import json
+import re
+from importlib import resources
+from importlib.resources.abc import Traversable
+from pathlib import Path
+from typing import Any
+
+from lowfc.contract.codecs import input_file
+from lowfc.contract.errors import ConfigurationError, DataFileError, brief, nearest
+from lowfc.optics.chain import sam as sams
+
+SHIPPED = resources.files("lowfc") / "data" / "sam_layouts.json"
+
+_LARGEST_BYTES = 1 << 24
+
+
+def layout_names() -> list[str]:
+    """Names of the layouts that are shipped."""
+    return sorted(_read_layouts(SHIPPED))
+
+
+def load_layout(name: str) -> sams.Layout:
+    """A layout by name, checked.
+
+    Args:
+        name: A shipped layout, `file.json` with one layout, or `file.json:name` with several. A file has the shape of
+            the shipped one: {"layouts": {name: {"purpose", "hole_diameter", "holes": [[x, y], ...]}}} in pupil
+            diameters; a hole [x, y, diameter] has its own size. A single layout may stand alone, without "layouts".
+
+    Raises:
+        ConfigurationError: No layout has that name.
+        DataFileError: The file is missing, damaged, or its holes overlap or leave the pupil.
+    """
+    in_file = re.fullmatch(r"(.*\.json)(?::(.*))?", name)
+    file: Traversable = Path(in_file[1]) if in_file else SHIPPED
+    layouts = _read_layouts(file)
+    wanted = (in_file[2] or "") if in_file else name
+    if not wanted and len(layouts) == 1:
+        wanted = next(iter(layouts))
+    if wanted not in layouts:
+        known = ", ".join(sorted(layouts))
+        if not wanted:
+            raise ConfigurationError(f"{file} holds several layouts; say which as {file}:name, of {known}")
+        raise ConfigurationError(f"no sparse-aperture layout is called {wanted!r}{nearest(wanted, layouts)}; {known}")
+    return parse_layout(file, wanted, layouts[wanted])
+
+
+def parse_layout(file: Traversable, name: str, entry: Any) -> sams.Layout:
+    """A layout from what a JSON file holds under its name, checked.
+
+    Args:
+        file: Named in errors.
+        name: Of the layout.
+        entry: "hole_diameter", "holes" and perhaps "purpose", as in `load_layout`.
+
+    Raises:
+        DataFileError: It is malformed, or its holes overlap or leave the pupil.
+    """
+    try:
+        holes = tuple(_hole(hole, entry) for hole in entry["holes"])
+        layout = sams.Layout(name, str(entry.get("purpose", "")), holes)
+    except (AttributeError, KeyError, TypeError, ValueError) as error:
+        raise DataFileError(
+            f'{file}: layout {name} must have "hole_diameter" and "holes" as pairs [x, y], or as [x, y, diameter], in '
+            f"pupil diameters ({type(error).__name__}: {brief(str(error))})"
+        ) from error
+    try:
+        sams.check(layout)
+    except ValueError as error:
+        raise DataFileError(f"{file}: {error}") from error
+    return layout
+
+
+def layout_warnings(layout: sams.Layout) -> list[str]:
+    """What a user should know about a layout that is legal but of little use."""
+    if sams.is_even_symmetric(layout):
+        return [
+            f"{layout.name} is symmetric about the pupil's centre: it cannot sense even modes such as focus and "
+            "astigmatism; move at least one hole"
+        ]
+    return []
+
+
+def _read_layouts(file: Traversable) -> dict[str, Any]:
+    try:
+        content = json.loads(
+            input_file.read_whole(file, _LARGEST_BYTES) if isinstance(file, Path) else file.read_bytes()
+        )
+    except FileNotFoundError:
+        raise DataFileError(f"there is no layout file {file}") from None
+    except (OSError, ValueError) as error:
+        why = error.strerror if isinstance(error, OSError) else error
+        raise DataFileError(f"{file} is not a readable JSON file: {why}") from error
+    except RecursionError:
+        raise DataFileError(f"{file} is not a readable JSON file: its lists or objects are nested too deeply") from None
+    if isinstance(content, dict) and "holes" in content:
+        return {str(content.get("name", Path(file.name).stem)): content}
+    layouts = content.get("layouts") if isinstance(content, dict) else None
+    if not isinstance(layouts, dict) or not layouts:
+        raise DataFileError(f'{file} holds no layouts: expected {{"layouts": {{name: ...}}}} or one with "holes"')
+    return layouts
+
+
+def _hole(hole: Any, entry: Any) -> tuple[float, float, float]:
+    x, y, diameter = hole if len(hole) == 3 else (*hole, entry["hole_diameter"])
+    return float(x), float(y), float(diameter)

@@ -1,0 +1,75 @@
+"""Maps of the mirror in files, FITS or numpy's: its shapes, and the actuators that may be commanded."""
+
+from pathlib import Path
+
+import numpy as np
+
+from lowfc.adapters.files.array_file import read_array
+from lowfc.arrays import Mask, Single, single
+from lowfc.contract.configuration import Configuration
+from lowfc.contract.errors import ConfigurationError, DataFileError
+
+
+def read_shape(path: Path) -> Single:
+    """Shape of a mirror (rows, columns), nm of surface: the first image of a FITS file, or the array of a .npy file.
+
+    Raises:
+        DataFileError: the file is missing, damaged or holds something else.
+    """
+    shape = read_array(path, "a mirror's shape is an array (rows, columns)", (2,))
+    return single(shape)
+
+
+def active_actuators(config: Configuration) -> Mask | None:
+    """Actuators (rows, columns) that may be commanded, of `mirror.active`; None where all may.
+
+    Raises:
+        ConfigurationError: the file is missing, damaged or does not fit the mirror.
+    """
+    if not config.mirror.active:
+        return None
+    found = _map(config, "mirror.active", config.mirror.active)
+    if not np.isin(found, (0, 1)).all():
+        raise ConfigurationError(f"mirror.active = {config.mirror.active!r}: every value must be 0 or 1")
+    if not found.any():
+        raise ConfigurationError(f"mirror.active = {config.mirror.active!r}: no actuator is active")
+    return np.asarray(found, dtype=np.bool_)
+
+
+def flat_nm(config: Configuration) -> Single | None:
+    """The flat map (rows, columns) of `mirror.flat`, nm of surface, zero at inactive actuators; None without one.
+
+    Raises:
+        ConfigurationError: the file is missing, damaged or does not fit the mirror.
+    """
+    if not config.mirror.flat:
+        return None
+    found = shape_of(config, "mirror.flat", config.mirror.flat)
+    active = active_actuators(config)
+    return found if active is None else np.where(active, found, np.float32(0))
+
+
+def shape_of(config: Configuration, key: str, file: str) -> Single:
+    """A shape (rows, columns) of the configured mirror, nm of surface, from the file that `key` names.
+
+    Raises:
+        ConfigurationError: the file is missing, damaged or does not fit the mirror.
+    """
+    found = _map(config, key, file)
+    if not np.isfinite(found).all():
+        raise ConfigurationError(f"{key} = {file!r}: every value must be finite")
+    return found
+
+
+def _map(config: Configuration, key: str, file: str) -> Single:
+    try:
+        found = read_shape(Path(file).expanduser())
+    except DataFileError as fault:
+        raise ConfigurationError(f"{key}: {fault}") from None
+    grid = (config.mirror.rows, config.mirror.columns)
+    if found.shape != grid:
+        raise ConfigurationError(
+            f"{key} = {file!r}: {found.shape[0]} x {found.shape[1]} values, the mirror has {grid[0]} x {grid[1]} "
+            "actuators"
+        )
+    return found

@@ -1,0 +1,148 @@
+"""Pupils from files, and a sensor built from the names of its masks."""
+
+import logging
+from collections.abc import Callable
+from importlib import resources
+from importlib.resources.abc import Traversable
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lowfc.adapters.files.layouts import layout_warnings, load_layout
+from lowfc.arrays import Array
+from lowfc.contract.codecs import input_file
+from lowfc.contract.configuration import SENSORS, SensorSection, sensor_keys
+from lowfc.contract.errors import ConfigurationError, DataFileError, nearest
+from lowfc.optics.chain import sam as sams
+from lowfc.optics.chain.focal_mask import bowtie, disk, phase_spot
+from lowfc.optics.chain.grid import SAMPLES
+from lowfc.optics.chain.pupil import circle, from_quarter, prolate, with_bar
+from lowfc.optics.chain.relay import ApertureMask, Defocus, PupilImage, Relay, fresnel_distance
+from lowfc.optics.chain.sensor import Sensor
+
+_DATA = resources.files("lowfc") / "data"
+_LARGEST_BYTES = 1 << 30
+_WITH_LYOT_STOP = ("circle", "prolate")
+_log = logging.getLogger(__name__)
+
+
+def load_pupil(samples: int = SAMPLES, file: Traversable = _DATA / "spc_quarter128.npz") -> Array:
+    """The shaped pupil (samples, samples): 1e-9 between 4 and 20 lambda/D within 42.5 degrees of the x axis.
+
+    Args:
+        samples: Across the diameter, a multiple of 256.
+        file: An npz file whose array `quarter` is the quadrant x >= 0, y >= 0.
+
+    Raises:
+        DataFileError: The file is missing, damaged or holds no such quadrant.
+        ConfigurationError: The quadrant does not divide `samples`.
+    """
+    try:
+        opened = input_file.opened(file, _LARGEST_BYTES) if isinstance(file, Path) else file.open("rb")
+        with opened as stream, np.load(stream, allow_pickle=False) as arrays:
+            quarter = np.asarray(arrays["quarter"])
+    except FileNotFoundError:
+        raise DataFileError(f"there is no pupil file {file}") from None
+    except Exception as error:  # zipfile, zlib and numpy each raise their own on a damaged file
+        raise DataFileError(f"{file} is damaged, or not a pupil file with an array `quarter`: {error}") from error
+    try:
+        from_quarter(quarter, 2 * max(len(np.atleast_1d(quarter)), 1))
+    except ValueError as error:
+        raise DataFileError(f"{file}: {error}") from error
+    try:
+        return from_quarter(quarter, samples)
+    except ValueError as error:
+        raise ConfigurationError(f"pupil sampling: {error}") from error
+
+
+def sensor_from(
+    section: SensorSection | None = None, wavelength_nm: float = 550.0, warn: Callable[[str], None] = _log.warning
+) -> Sensor:
+    """The optics that [sensor] describes, at the sampling of Table 1.
+
+    Args:
+        section: All defaults when None.
+        wavelength_nm: The central wavelength.
+        warn: Called with each of `layout_warnings`.
+
+    Raises:
+        ConfigurationError: A name is not known, or values do not go together.
+        DataFileError: A file is missing or damaged, or a layout is impossible.
+    """
+    section = SensorSection() if section is None else section
+    pupil = _pupil(section)
+    try:
+        focal_mask = _focal_mask(section)
+        match section.kind:
+            case "clowfs":
+                relay: Relay = Defocus(fresnel_distance(section.defocus_mm, section.focal_ratio, wavelength_nm))
+            case "zwfs":
+                return Sensor(pupil, focal_mask, PupilImage(), wavelength_nm, pixels=40)
+            case "bar":
+                relay = ApertureMask(with_bar(len(pupil), section.bar_width, section.bar_angle_deg))
+            case "open":
+                relay = ApertureMask(circle(len(pupil)))
+            case "sam":
+                layout = _layout(section.sam)
+                for text in layout_warnings(layout):
+                    warn(text)
+                relay = ApertureMask(sams.transmission(layout, len(pupil)))
+        return Sensor(pupil, focal_mask, relay, wavelength_nm)
+    except ValueError as error:
+        raise ConfigurationError(f"sensor: {error}") from error
+
+
+def sensor_named(name: str) -> Sensor:
+    """One of `SENSORS`, or the sparse aperture mask with that layout."""
+    return sensor_from(SensorSection.model_validate(sensor_keys(name)))
+
+
+def science_pupil(section: SensorSection) -> Array | None:
+    """The shaped pupil (samples, samples) in front of the science camera; None where a Lyot stop makes its image.
+
+    Raises:
+        ConfigurationError: There is no such pupil.
+        DataFileError: Its file is missing or damaged.
+    """
+    return None if section.pupil in _WITH_LYOT_STOP else _pupil(section)
+
+
+def _layout(name: str) -> sams.Layout:
+    try:
+        return load_layout(name)
+    except ConfigurationError as error:  # on the command line sensors and layouts share an option
+        slip = nearest(name, SENSORS)
+        raise ConfigurationError(f"{error}; nor is it a sensor{slip}" if slip else str(error)) from None
+
+
+def _pupil(section: SensorSection) -> Array:
+    match section.pupil:
+        case "shaped":
+            return load_pupil()
+        case "circle":
+            return circle(SAMPLES)
+        case "prolate":
+            return prolate(SAMPLES, section.focal_radius)
+    if section.pupil.endswith(".npz"):
+        return load_pupil(file=Path(section.pupil))
+    slip = nearest(section.pupil, ("shaped", "circle", "prolate"))
+    raise ConfigurationError(
+        f"sensor.pupil = {section.pupil!r}: no such pupil{slip}; shaped, circle, prolate, or FILE.npz"
+    )
+
+
+def _focal_mask(section: SensorSection) -> NDArray[np.inexact]:
+    if section.focal_mask == "bowtie":
+        if section.kind == "zwfs" or section.inner_radius:
+            raise ValueError("a bowtie has neither a phase spot nor an inner radius; take focal_mask = 'disk'")
+        return bowtie(radius=section.focal_radius)
+    if section.kind == "zwfs":
+        return phase_spot(radius=section.focal_radius, spot_diameter=section.spot_diameter)
+    if section.kind == "clowfs":
+        if not section.inner_radius < section.focal_radius:
+            raise ValueError(
+                f"inner_radius, {section.inner_radius} lambda/D, must be below focal_radius, {section.focal_radius}"
+            )
+        return disk(radius=section.focal_radius, inner_radius=section.inner_radius)
+    return disk(radius=section.focal_radius)

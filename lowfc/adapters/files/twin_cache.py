@@ -1,0 +1,220 @@
+"""The twin's cache: twin and mirror are built once, then read from files named by a hash of all they depend on.
+
+That includes the source of the modules that build them, so that no other version's file is ever read.
+"""
+
+import ast
+import functools
+import hashlib
+import io
+import logging
+import os
+import sys
+from collections.abc import Callable, Iterator
+from dataclasses import astuple, fields
+from pathlib import Path
+from typing import Any, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lowfc.adapters.files.whole_file import write_whole
+from lowfc.contract.errors import DataFileError
+from lowfc.optics.chain.band import Band, monochromatic
+from lowfc.optics.chain.mirror import Mirror
+from lowfc.optics.chain.relay import ApertureMask
+from lowfc.optics.chain.sensor import Sensor
+from lowfc.optics.twin.twin import Operator, Twin, TwinSpec
+from lowfc.optics.twin.twin_build import build
+from lowfc.optics.twin.twin_mirror import TwinMirror, twin_mirror
+
+_HASHED_AS = 3
+"""Part of every operator hash, and so of the identity of every computed calibration: it stays as it is."""
+
+_Kept = TypeVar("_Kept", Twin, TwinMirror)
+
+_log = logging.getLogger(__name__)
+
+
+def operator_hash(sensor: Sensor, spec: TwinSpec, band: Band) -> str:
+    """SHA-256, hexadecimal, of every array and number that the twin depends on."""
+    numbers = (_HASHED_AS, sensor.wavelength_nm, sensor.samples_per, sensor.binning, sensor.pixels)
+    arrays: dict[str, NDArray[Any]] = {"pupil": sensor.pupil, "focal_mask": sensor.focal_mask}
+    relay: tuple[object, ...] = (type(sensor.relay).__name__,)
+    if isinstance(sensor.relay, ApertureMask):
+        arrays["relay_mask"] = sensor.relay.transmission
+    else:
+        relay += astuple(sensor.relay)
+    return _digest(arrays, repr((numbers, relay, astuple(spec), astuple(band))))
+
+
+def sources() -> dict[str, Path]:
+    """Modules that determine what is kept, and their files: this one, and all of `lowfc.optics` that it imports."""
+    found: dict[str, Path] = {}
+    pending = [__name__]
+    while pending:
+        name = pending.pop()
+        if name not in found and (path := getattr(sys.modules.get(name), "__file__", None)) is not None:
+            found[name] = Path(path)
+            pending += (one for one in _imports(found[name]) if one.startswith("lowfc.optics."))
+    return found
+
+
+@functools.cache
+def source_hash() -> str:
+    """SHA-256, hexadecimal, of the modules in `sources`."""
+    digest = hashlib.sha256()
+    for name, path in sorted(sources().items()):
+        content = path.read_bytes()
+        digest.update(f"{name} {len(content)}".encode() + content)
+    return digest.hexdigest()
+
+
+def _imports(path: Path) -> Iterator[str]:
+    """Names that may be modules among those that a file imports."""
+    for node in ast.walk(ast.parse(path.read_bytes())):
+        if isinstance(node, ast.Import):
+            yield from (alias.name for alias in node.names)
+        elif isinstance(node, ast.ImportFrom) and node.module:
+            yield node.module
+            yield from (f"{node.module}.{alias.name}" for alias in node.names)
+
+
+def default_cache_dir() -> Path:
+    """`$XDG_CACHE_HOME/lowfc`, or `~/.cache/lowfc`."""
+    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "lowfc"
+
+
+def load_or_build(
+    sensor: Sensor,
+    spec: TwinSpec,
+    band: Band | None = None,
+    progress: Callable[[int, int], None] | None = None,
+    cache_dir: Path | None = None,
+    notice: Callable[[str], None] = _log.warning,
+) -> Twin:
+    """The twin from the cache, or built and put there.
+
+    Args:
+        sensor: The optics.
+        spec: How far they are compressed.
+        band: The central wavelength alone when None.
+        progress: Called with the steps done and the steps in all, only while building.
+        cache_dir: `default_cache_dir()` when None.
+        notice: Called with a sentence about a damaged file or a directory that cannot be written; neither is fatal.
+    """
+    band = monochromatic(sensor.wavelength_nm) if band is None else band
+    key = operator_hash(sensor, spec, band)
+    return _cached(
+        _file("twin", key, cache_dir),
+        lambda content: _unpack(content, key, spec),
+        lambda: build(sensor, spec, band, key, progress),
+        _pack,
+        notice,
+    )
+
+
+def load_or_fit_mirror(
+    sensor: Sensor,
+    twin: Twin,
+    mirror: Mirror,
+    cache_dir: Path | None = None,
+    notice: Callable[[str], None] = _log.warning,
+) -> TwinMirror:
+    """A mirror on the twin's nodes from the cache, or fitted and put there; arguments as for `load_or_build`."""
+    return _cached(
+        _file("mirror", repr((twin.operator_hash, astuple(mirror))), cache_dir),
+        lambda content: TwinMirror(**_arrays(content)),
+        lambda: twin_mirror(sensor, twin, mirror),
+        lambda fitted: _packed({part.name: getattr(fitted, part.name) for part in fields(fitted)}),
+        notice,
+    )
+
+
+def _file(kind: str, key: str, cache_dir: Path | None) -> Path:
+    """Where what has this key is kept, if it was built by these sources."""
+    name = f"{kind}-{_digest({}, source_hash() + key)[:32]}.npz"
+    return (default_cache_dir() if cache_dir is None else cache_dir) / name
+
+
+def _cached(
+    path: Path,
+    unpack: Callable[[bytes], _Kept],
+    make: Callable[[], _Kept],
+    pack: Callable[[_Kept], bytes],
+    notice: Callable[[str], None],
+) -> _Kept:
+    """What the file holds; made and written there where the file is missing or damaged."""
+    try:
+        return unpack(path.read_bytes())
+    except FileNotFoundError:
+        pass
+    except Exception as error:  # a damaged file fails in zipfile, zlib, numpy or the checks below: always rebuild
+        notice(f"the cached {path} cannot be used and is built again: {type(error).__name__}: {error}")
+    made = make()
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        write_whole(path, pack(made))
+    except (OSError, DataFileError) as error:
+        notice(f"{path} cannot be written, so that it will be built again next time: {error}")
+    return made
+
+
+def _digest(arrays: dict[str, NDArray[Any]], extra: str = "") -> str:
+    digest = hashlib.sha256(extra.encode())
+    for name in sorted(arrays):
+        array = np.ascontiguousarray(arrays[name])
+        digest.update(f"{name} {array.dtype.str} {array.shape}".encode())
+        digest.update(array.tobytes())
+    return digest.hexdigest()
+
+
+def _pack(twin: Twin) -> bytes:
+    arrays: dict[str, NDArray[Any]] = {
+        "operator_hash": np.array(twin.operator_hash),
+        "axis": twin.axis,
+        "used": twin.used,
+        "area_weights": twin.area_weights,
+        "to_pixels": twin.to_pixels,
+        "band": np.array([(operator.wavelength_nm, operator.weight) for operator in twin.operators]),
+    }
+    for i, operator in enumerate(twin.operators):
+        arrays |= {
+            f"modes_{i}": operator.modes,
+            f"to_modes_{i}": operator.to_modes,
+            f"to_coefficients_{i}": operator.to_coefficients,
+            f"basis_{i}": operator.basis,
+        }
+    return _packed(arrays)
+
+
+def _packed(arrays: dict[str, NDArray[Any]]) -> bytes:
+    stream = io.BytesIO()
+    np.savez(stream, allow_pickle=False, checksum=np.array(_digest(arrays)), **arrays)
+    return stream.getvalue()
+
+
+def _arrays(content: bytes) -> dict[str, NDArray[Any]]:
+    with np.load(io.BytesIO(content), allow_pickle=False) as stored:
+        arrays = {name: stored[name] for name in stored.files}
+    if str(arrays.pop("checksum")) != _digest(arrays):
+        raise ValueError("the checksum does not match the content")
+    return arrays
+
+
+def _unpack(content: bytes, key: str, spec: TwinSpec) -> Twin:
+    arrays = _arrays(content)
+    if str(arrays["operator_hash"]) != key:
+        raise ValueError("it was made from other optics")
+    operators = tuple(
+        Operator(
+            nm,
+            weight,
+            arrays[f"modes_{i}"],
+            arrays[f"to_modes_{i}"],
+            arrays[f"to_coefficients_{i}"],
+            arrays[f"basis_{i}"],
+        )
+        for i, (nm, weight) in enumerate(arrays["band"].tolist())
+    )
+    return Twin(spec, arrays["axis"], arrays["used"], arrays["area_weights"], operators, arrays["to_pixels"], key)

@@ -1,0 +1,1 @@
+"""MCAP logs: written, read, recovered, copied."""

@@ -1,0 +1,122 @@
+"""Copying logs: what a file holds, message by message, into a new log that is complete and indexed."""
+
+import contextlib
+import os
+import tempfile
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+from typing import IO
+
+from mcap.records import Attachment, Metadata
+from mcap.writer import CompressionType, Writer
+
+from lowfc import __version__
+from lowfc.adapters.logs.reader import Logged, LogReader
+from lowfc.adapters.logs.writer import CHUNK_BYTES
+from lowfc.contract.envelope import count_of, start_of
+from lowfc.contract.errors import DataFileError
+
+
+class LogCopy:
+    """A new log, into which files are copied, one after the other.
+
+    Attributes:
+        messages: written so far.
+    """
+
+    def __init__(self, file: IO[bytes]) -> None:
+        self.messages = 0
+        self._channels: dict[tuple[str, int], int] = {}
+        self._schemas: dict[tuple[str, bytes], int] = {}
+        self._writer = Writer(
+            file, chunk_size=CHUNK_BYTES, compression=CompressionType.LZ4, enable_crcs=True, enable_data_crcs=True
+        )
+        self._writer.start(profile="", library=f"lowfc {__version__}")
+
+    def describe(self, records: Sequence[Metadata | Attachment]) -> None:
+        """Copy metadata and attachments."""
+        for record in records:
+            if isinstance(record, Metadata):
+                self._writer.add_metadata(record.name, record.metadata)
+            else:
+                self._writer.add_attachment(
+                    record.create_time, record.log_time, record.name, record.media_type, record.data
+                )
+
+    def note(self, name: str, entries: dict[str, str]) -> None:
+        """Add metadata."""
+        self._writer.add_metadata(name, entries)
+
+    def take(
+        self,
+        reader: LogReader,
+        *,
+        wanted: Callable[[Logged], bool] = lambda message: True,
+        described: Callable[[Metadata | Attachment], bool] = lambda record: True,
+    ) -> None:
+        """Copy a file's messages, and where it stands what describes it.
+
+        Args:
+            reader: of the file; it has not been read.
+            wanted: whether to copy a message.
+            described: whether to copy metadata or an attachment.
+        """
+        done = 0
+        for message in reader:
+            self.describe(list(filter(described, reader.described[done:])))
+            done = len(reader.described)
+            if wanted(message):
+                self._add(reader, message)
+        self.describe(list(filter(described, reader.described[done:])))
+
+    def finish(self) -> None:
+        """Write the index."""
+        self._writer.finish()  # type: ignore[no-untyped-call]
+
+    def _add(self, reader: LogReader, message: Logged) -> None:
+        name = message.key, start_of(message.sequence)
+        if name not in self._channels:
+            channel = reader.channels[name]
+            schema = reader.schemas[channel.schema_id]
+            known = schema.name, schema.data
+            if known not in self._schemas:
+                self._schemas[known] = self._writer.register_schema(schema.name, schema.encoding, schema.data)
+            self._channels[name] = self._writer.register_channel(
+                channel.topic, channel.message_encoding, self._schemas[known], channel.metadata
+            )
+        self._writer.add_message(
+            channel_id=self._channels[name],
+            log_time=message.log_time_ns,
+            publish_time=message.publish_time_ns,
+            sequence=count_of(message.sequence),
+            data=message.payload,
+        )
+        self.messages += 1
+
+
+@contextlib.contextmanager
+def new_log(path: Path, source: Path) -> Iterator[IO[bytes]]:
+    """A file with the permissions of `source`: it has its name when it is whole, and is gone when something fails.
+
+    Raises:
+        DataFileError: there is such a file, or the disk refuses.
+    """
+    if path.exists():
+        raise DataFileError(f"{path} exists already; a log is never overwritten; name another one with --out")
+    try:
+        mode = source.stat().st_mode & 0o666
+        with tempfile.NamedTemporaryFile(dir=path.parent, prefix=f".{path.name}.", delete=False) as file:
+            part = Path(file.name)
+            try:
+                yield file
+                file.flush()
+                os.fsync(file.fileno())
+                part.chmod(mode)
+                if path.exists():
+                    raise DataFileError(f"{path} has come into being meanwhile; a log is never overwritten")
+                part.rename(path)
+            except BaseException:
+                part.unlink(missing_ok=True)
+                raise
+    except OSError as fault:
+        raise DataFileError(f"{path} cannot be written: {fault.strerror or fault}") from fault

@@ -1,0 +1,237 @@
+"""The files of one recording, which are one log: which belong together, which is the newest, reading them as one."""
+
+import contextlib
+import re
+from collections.abc import Collection, Iterator, Sequence
+from pathlib import Path
+
+from mcap.records import Attachment, Metadata
+
+from lowfc.adapters.logs.chunk import Chunk
+from lowfc.adapters.logs.reader import Logged, LogReader
+from lowfc.adapters.logs.records import LogFile
+from lowfc.adapters.logs.writer import PART
+from lowfc.contract.configuration import Recorder
+from lowfc.contract.errors import ConfigurationError, DataFileError
+from lowfc.contract.messages import Topic, topic_of
+
+LAST = "last"
+"""Stands for the newest log where a log is named."""
+
+Parts = tuple[Path, ...]
+"""Files of one log, in order."""
+LogFiles = Path | Sequence[Path]
+"""A log to be read: its file, or its files in order."""
+
+_NAMED = re.compile(r"(\d{8}T\d{6}Z)(?:-(\d+))?(-[a-z].*)?\.mcap(\.part)?", re.ASCII)
+
+
+class Repeated:
+    """Tells which messages a file of a log repeats at its start: calibrations and states of the file before."""
+
+    def __init__(self) -> None:
+        self._newest: dict[str, int] = {}
+        self._before: dict[str, int] = {}
+
+    def next_file(self) -> None:
+        """The messages of another file follow."""
+        self._before = dict(self._newest)
+
+    def __call__(self, message: Logged) -> bool:
+        """Whether this message was in the files before."""
+        with contextlib.suppress(KeyError):
+            if topic_of(message.key).queryable:
+                if message.sequence <= self._before.get(message.key, -1):
+                    return True
+                self._newest[message.key] = max(message.sequence, self._newest.get(message.key, -1))
+        return False
+
+
+class WholeLog(LogReader):
+    """Reads the files of one log as one; what a file repeats at its start of the one before is delivered once.
+
+    `path` is the first file; the other attributes are of all files.
+    """
+
+    def __init__(self, log: LogFiles, *, topics: Collection[Topic] | None = None, skip_damaged: bool = False) -> None:
+        """Read a log, of its messages only those of `topics`; see `LogReader`."""
+        paths = (log,) if isinstance(log, Path) else tuple(log)
+        super().__init__(paths[0], topics=topics, skip_damaged=skip_damaged)
+        self.paths = paths
+
+    def __iter__(self) -> Iterator[Logged]:
+        """Messages in the order they were recorded; a reader reads once.
+
+        Raises:
+            DataFileError: a file is no log, or a part of it is damaged.
+        """
+        if len(self.paths) == 1:
+            yield from super().__iter__()
+            return
+        sizes = [_size(path) for path in self.paths]
+        self.size = sum(sizes)
+        described: list[Metadata | Attachment] = []
+        repeated = Repeated()
+        finished = complete = True
+        for number, path in enumerate(self.paths):
+            part = LogReader(path, topics=self._topics, skip_damaged=self._skip_damaged)
+            behind = sum(sizes[:number])
+            repeated.next_file()
+            for message in part:
+                if len(self.described) != len(described) + len(part.described):
+                    self.described = described + part.described
+                if self.position != behind + part.position:
+                    self.position = behind + part.position
+                    if self.progress is not None:
+                        self.progress(self.position, self.size)
+                if not repeated(message):
+                    yield message
+            self.described = described = described + part.described
+            self.channels |= part.channels
+            for damage in part.damage:
+                damage.why += f" ({path.name})"
+            self.damage += part.damage
+            self.unreadable += part.unreadable
+            finished, complete = finished and part.finished, complete and part.complete
+        self.position = self.size
+        self.finished, self.complete = finished, complete
+
+
+def one_by_one(names: Sequence[Path], out: Path | None = None, *, as_json: bool = False) -> list[Parts]:
+    """Logs that a command line names, each with all of its files that are named.
+
+    `last` is the newest log in the default folder, with every file of its recording, and FOLDER/last that of another
+    folder; a file of that name goes before.
+
+    Args:
+        names: as given.
+        out: the one file that is written, if so.
+        as_json: one JSON object is printed.
+
+    Raises:
+        ConfigurationError: there are several logs, and one place for what is made of them; or a part is named twice.
+        DataFileError: there is no log in the folder.
+    """
+    logs: dict[tuple[str, ...], dict[int, Path]] = {}
+    for path in _files(names):
+        key, number = _place(path) if len(names) > 1 or path != names[0] else ((), 1)
+        there = logs.setdefault(key or (str(path.absolute()),), {})
+        if number in there:
+            raise ConfigurationError(f"{there[number]} and {path} are the same part of one log: name one of them")
+        there[number] = path
+    found = [tuple(parts[number] for number in sorted(parts)) for parts in logs.values()]
+    _refuse_several(found, out, as_json=as_json)
+    return found
+
+
+def the_one(names: Sequence[Path]) -> Parts:
+    """The one log that a command line names; see `one_by_one`.
+
+    Raises:
+        ConfigurationError: they are several.
+        DataFileError: there is no log in the folder.
+    """
+    found = one_by_one(names)
+    if len(found) > 1:
+        raise ConfigurationError(f"this reads one log: name one, not {_listed(found)}; the newest one is `{LAST}`")
+    return found[0]
+
+
+def in_order(names: Sequence[Path], out: Path | None = None, *, as_json: bool = False) -> list[Path]:
+    """Files of logs that follow each other, as named, those of one recording in their order; see `one_by_one`."""
+    files = [path for parts in one_by_one(names) for path in parts]
+    _refuse_several([(path,) for path in files], out, as_json=as_json)
+    return files
+
+
+def titled(paths: Parts) -> str:
+    """Name of a log's files for a person."""
+    return str(paths[0]) if len(paths) == 1 else f"{paths[0]} to {paths[-1].name} ({len(paths)} files)"
+
+
+def metadata_at_start(path: Path) -> dict[str, dict[str, str]]:
+    """Metadata that stand before the messages of a log, by name.
+
+    Raises:
+        DataFileError: it cannot be read.
+    """
+    found: dict[str, dict[str, str]] = {}
+    with LogFile(path) as file:
+        for part in file.parts():
+            if isinstance(part, Chunk):
+                break
+            if isinstance(part, Metadata):
+                found[part.name] = part.metadata
+    return found
+
+
+def _refuse_several(logs: Sequence[Parts], out: Path | None, *, as_json: bool) -> None:
+    if len(logs) > 1 and (as_json or out is not None):
+        place = "--json prints one object" if as_json else "--out is one file"
+        raise ConfigurationError(f"{place}: name one log, not {_listed(logs)}")
+
+
+def _listed(logs: Sequence[Parts]) -> str:
+    return f"{len(logs)} ({', '.join(parts[0].name for parts in logs[:3])}{', ...' if len(logs) > 3 else ''})"
+
+
+def _files(names: Sequence[Path]) -> Iterator[Path]:
+    for name in names:
+        if name.name == LAST and not name.exists():
+            yield from _newest(name.parent if len(name.parts) > 1 else Path(Recorder().folder))
+        else:
+            yield name
+
+
+def _newest(folder: Path) -> list[Path]:
+    """Files of the newest log of a folder, by their names, which begin with the time; in order.
+
+    Raises:
+        DataFileError: there is none.
+    """
+    try:
+        files = {path: match for path in folder.iterdir() if (match := _NAMED.fullmatch(path.name))}
+    except OSError as fault:
+        raise DataFileError(f"`{LAST}` is the newest log in {folder}, which cannot be read: {fault.strerror}") from None
+    if not files:
+        raise DataFileError(
+            f"`{LAST}` is the newest log in {folder}, and there is none; a folder of yours is FOLDER/{LAST}"
+        )
+    # Of several files of one time the finished one as recorded, then one that was recovered, then an unfinished one.
+    order = {
+        path: (time, int(number or 1), not (suffix or part), suffix == "-recovered", bool(part))
+        for path, match in files.items()
+        for time, number, suffix, part in [match.groups()]
+    }
+    best = {order[path][:2]: path for path in sorted(files, key=order.__getitem__)}
+    newest = best.pop(max(best))
+    recording, number = _place(newest)
+    parts = {number: newest}
+    for path in best.values():
+        if number > 1 and _time(path) >= _time(Path(recording[-1])):
+            key, place = _place(path)
+            if key == recording:
+                parts[place] = path
+    return [parts[place] for place in sorted(parts)]
+
+
+def _time(path: Path) -> str:
+    return path.name.partition("Z")[0]
+
+
+def _place(path: Path) -> tuple[tuple[str, ...], int]:
+    """Recording that a file belongs to (nothing where it does not say, as before 0.2), and its number there."""
+    try:
+        metadata = metadata_at_start(path)
+    except DataFileError:
+        return (), 1  # whoever reads it says what is wrong
+    entries = metadata.get(PART, {})
+    number, of = entries.get("number", ""), entries.get("of", "")
+    if not of or not re.fullmatch("[1-9][0-9]{0,8}", number):
+        return (), 1
+    return (metadata.get("lowfc", {}).get("run", ""), of), int(number)
+
+
+def _size(path: Path) -> int:
+    with LogFile(path) as file:
+        return file.size

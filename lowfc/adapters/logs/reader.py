@@ -1,0 +1,249 @@
+"""Reading logs, finished or not: messages in the order they were recorded, every checksum checked."""
+
+import re
+import struct
+from collections.abc import Callable, Collection, Iterator
+from pathlib import Path
+from typing import NamedTuple
+
+from mcap.opcode import Opcode
+from mcap.records import Attachment, Channel, Metadata, Schema
+
+from lowfc.adapters.logs.chunk import Chunk, UnsoundError
+from lowfc.adapters.logs.records import HEAD, Damage, LogFile, parsed
+from lowfc.adapters.logs.selection import Selection
+from lowfc.adapters.logs.writer import START_KEY
+from lowfc.contract.envelope import COUNT_BITS, sequence_of
+from lowfc.contract.errors import DataFileError
+from lowfc.contract.messages import Topic
+
+_BEGINNING = 64  # bytes of a chunk, with the first message's times: a night has too many chunks for 32 bits of CRC
+_MESSAGE_HEAD = struct.Struct("<HIQQ")  # channel, count, log time, publish time
+
+
+class Logged(NamedTuple):
+    """One message of a log.
+
+    Attributes:
+        key: where it was published; the log's topic without the leading slash.
+        schema: full name of its protobuf message.
+        payload: as it was on the bus.
+        sequence: see `Envelope`.
+        publish_time_ns: when it was sent.
+        log_time_ns: when the recorder received it.
+    """
+
+    key: str
+    schema: str
+    payload: bytes
+    sequence: int
+    publish_time_ns: int
+    log_time_ns: int
+
+
+class LogReader:
+    """Reads a log from its start, finished or not, and checks every checksum.
+
+    Nothing is delivered of a chunk that is not as it was written.
+
+    Attributes:
+        path: of the log; `paths` are its files, this one alone.
+        size: bytes of it; of one that is still growing, when reading began.
+        position: bytes read so far.
+        described: the metadata and attachments met so far, in their order; those of the start are there with the first
+            message.
+        schemas: those declared so far, by id.
+        channels: those declared so far, by key and start of the publisher.
+        damage: what was left out because it is damaged.
+        unreadable: messages left out because what declares them was in one of those.
+        finished: it ends as a log that was finished ends, whatever is before; False for one whose recorder died.
+        complete: the end was reached, and the summary there is sound; False while reading.
+        progress: is told now and then how many bytes of how many are read.
+    """
+
+    progress: Callable[[int, int], None] | None = None
+
+    def __init__(
+        self,
+        path: Path,
+        *,
+        topics: Collection[Topic] | None = None,
+        skip_damaged: bool = False,
+        from_ns: int = 0,
+        always: Collection[Topic] = (),
+        sparse: bool = False,
+    ) -> None:
+        """Read the log at `path`.
+
+        Args:
+            path: of a log, whatever its name.
+            topics: deliver only messages of these; all when None.
+            skip_damaged: leave out what is damaged instead of raising an error.
+            from_ns: leave out the chunks that end before this log time.
+            always: topics of which nothing is left out for that.
+            sparse: leave chunks unread that have no message of `topics`, by their indexes: for topics with few messages
+                in a long log. Of those chunks no checksum is checked.
+        """
+        self.path = path
+        self.paths: tuple[Path, ...] = (path,)
+        self.size = 0
+        self.position = 0
+        self.described: list[Metadata | Attachment] = []
+        self.schemas: dict[int, Schema] = {}
+        self.channels: dict[tuple[str, int], Channel] = {}
+        self.damage: list[Damage] = []
+        self.unreadable = 0
+        self.finished = False
+        self.complete = False
+        self._topics = topics
+        self._skip_damaged = skip_damaged
+        self._from_ns = from_ns
+        self._always = always
+        self._sparse = sparse
+        self._declared: dict[int, Channel] = {}
+        self._wanted: dict[int, tuple[str, str, int] | None] = {}
+        self._chunks: set[int] = set()
+        self._last_ns: int | None = None
+        self._spanned = 0
+        self._has_chunks = False
+
+    @property
+    def metadata(self) -> dict[str, dict[str, str]]:
+        """Metadata met so far, by name."""
+        return {record.name: record.metadata for record in self.described if isinstance(record, Metadata)}
+
+    @property
+    def attachments(self) -> dict[str, bytes]:
+        """Attachments met so far, by name."""
+        return {record.name: record.data for record in self.described if isinstance(record, Attachment)}
+
+    @property
+    def selection(self) -> Selection:
+        """What the log was made to hold."""
+        return Selection.of(self.metadata)
+
+    def __iter__(self) -> Iterator[Logged]:
+        """Messages in the order they were recorded; a reader reads once.
+
+        Raises:
+            DataFileError: this is no log, or a part of it is damaged.
+        """
+        with LogFile(self.path) as file:
+            self.size, self.finished, self._file = file.size, file.finished, file
+            if (declarations := file.declarations()) is not None:
+                self._chunk(declarations)
+            for part in file.parts(self._needs if self._sparse or self._from_ns else None):
+                match part:
+                    case Chunk():
+                        self._has_chunks = True
+                        self.position = part.position + part.length
+                        if self.progress is not None:
+                            self.progress(self.position, self.size)
+                        yield from self._chunk(part)
+                    case Damage():
+                        self._leave_out(part)
+                    case _:
+                        self.described.append(part)
+            self.position = self.size
+            self.complete = file.complete
+        if file.unread and not self._has_chunks:
+            raise self._error(0, "")
+        if self.damage and not (self.damage[0].position or self.described or self._chunks):
+            raise DataFileError(f"{self.path} is not an MCAP file")
+
+    def _needs(self, end_ns: int, channels: Collection[int]) -> bool:
+        """Whether one of these channels is wanted then, or not declared yet: that stands with its first message."""
+        if any(number not in self._wanted for number in channels):
+            return True
+        if end_ns < self._from_ns:
+            keys = [self._declared[number].topic.removeprefix("/") for number in channels]
+            return any(topic.matches(key) for topic in self._always for key in keys)
+        return not self._sparse or any(self._wanted[number] for number in channels)
+
+    def _chunk(self, chunk: Chunk) -> list[Logged]:
+        """Messages of a chunk, unless it is not in its place."""
+        identity = hash((chunk.crc, chunk.content[:_BEGINNING]))
+        try:
+            if identity in self._chunks:
+                raise UnsoundError("a chunk is there a second time")
+            messages = self._messages(chunk.content)
+        except UnsoundError as fault:
+            self._leave_out(Damage(chunk.position, chunk.length, str(fault)))
+            return []
+        self._chunks.add(identity)
+        if self.unreadable and not self._skip_damaged:
+            raise self._error(chunk.position, "what declares its messages is not there")
+        if messages:
+            for damage in self.damage[self._spanned :]:
+                damage.before_ns = messages[0].log_time_ns
+            self._spanned = len(self.damage)
+            self._last_ns = messages[-1].log_time_ns
+        return messages
+
+    def _messages(self, content: bytes) -> list[Logged]:
+        """Messages in a chunk that are wanted; what it declares is remembered.
+
+        Raises:
+            UnsoundError: its records do not hold together, or contradict those before.
+        """
+        found: list[Logged] = []
+        wanted, at, end = self._wanted, 0, len(content)
+        read_head, read_message, logged = HEAD.unpack_from, _MESSAGE_HEAD.unpack_from, Logged._make
+        message_opcode, head_bytes, message_bytes = int(Opcode.MESSAGE), HEAD.size, HEAD.size + _MESSAGE_HEAD.size
+        try:
+            while at < end:
+                opcode, length = read_head(content, at)
+                begin, at = at, at + head_bytes + length
+                if opcode == message_opcode:
+                    number, count, log_time_ns, publish_time_ns = read_message(content, begin + head_bytes)
+                    channel = wanted.get(number)
+                    if channel is not None:
+                        key, schema, start = channel
+                        payload = content[begin + message_bytes : at]
+                        found.append(logged((key, schema, payload, start | count, publish_time_ns, log_time_ns)))
+                    elif number not in wanted:
+                        self.unreadable += 1
+                elif opcode == Opcode.SCHEMA:
+                    self._declare_schema(parsed(Schema, content[begin + head_bytes : at]))
+                elif opcode == Opcode.CHANNEL:
+                    self._declare_channel(parsed(Channel, content[begin + head_bytes : at]))
+        except struct.error as fault:
+            raise UnsoundError("a record in a chunk is longer than the chunk") from fault
+        if at > end:
+            raise UnsoundError("a record in a chunk is longer than the chunk")
+        return found
+
+    def _declare_schema(self, schema: Schema) -> None:
+        if self.schemas.setdefault(schema.id, schema) != schema:
+            raise UnsoundError(f"schema {schema.id} is declared a second time, and not as before")
+
+    def _declare_channel(self, channel: Channel) -> None:
+        if self._declared.setdefault(channel.id, channel) != channel:
+            raise UnsoundError(f"channel {channel.id} is declared a second time, and not as before")
+        if channel.schema_id not in self.schemas:
+            return  # its declaration was in a damaged chunk: what its messages are cannot be said
+        given = channel.metadata.get(START_KEY, "0")
+        start_s = int(given) if re.fullmatch("[0-9]{1,10}", given) else -1
+        if not 0 <= start_s < 1 << COUNT_BITS:
+            raise UnsoundError(f"channel {channel.id} has {START_KEY} {given!r}, not a time in seconds")
+        key = channel.topic.removeprefix("/")
+        self.channels[key, start_s] = channel
+        asked = self._topics is None or any(topic.matches(key) for topic in self._topics)
+        schema = self.schemas[channel.schema_id].name
+        self._wanted[channel.id] = (key, schema, sequence_of(start_s, 0)) if asked else None
+
+    def _leave_out(self, damage: Damage) -> None:
+        if not self._skip_damaged:
+            raise self._error(damage.position, damage.why)
+        damage.after_ns = self._last_ns
+        self.damage.append(damage)
+
+    def _error(self, position: int, why: str) -> DataFileError:
+        if self._file.unread and not self._has_chunks:
+            return DataFileError(
+                f"{self.path} is compressed with {self._file.unread!r}, which is not read; lz4, zstd and none are: "
+                "compress it again with `mcap compress --compression zstd`"
+            )
+        if position == 0:
+            return DataFileError(f"{self.path} is not an MCAP file; if it was one, `lowfc recover` saves what is whole")
+        return DataFileError(f"{self.path} is damaged at byte {position} ({why}); `lowfc recover` saves what is whole")

@@ -1,0 +1,334 @@
+"""The records of a log file as they lie on the disk: what is whole, what is damaged, where the file breaks off.
+
+Nothing passes that its checksum does not vouch for. Of a finished log every byte is under one: the chunks and the
+attachments have their own, DataEnd has that of all before it, the footer that of the summary. A log that another tool
+has rewritten may lack checksums and chunks: what was not computed is not checked.
+"""
+
+import io
+import struct
+import zlib
+from collections.abc import Callable, Collection, Iterator
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import TypeVar
+
+from mcap.data_stream import ReadDataStream
+from mcap.exceptions import McapError
+from mcap.opcode import Opcode
+from mcap.records import Attachment, Channel, ChunkIndex, Header, Metadata, Schema, Statistics
+from mcap.writer import MCAP0_MAGIC as MAGIC
+
+from lowfc.adapters.logs.chunk import (
+    CHUNK_HERE,
+    LARGEST_BYTES,
+    LONGEST_HEAD_BYTES,
+    Chunk,
+    CompressionError,
+    UnsoundError,
+    read_chunk,
+    read_head,
+)
+from lowfc.adapters.logs.writer import UNFINISHED
+from lowfc.contract.codecs import input_file
+from lowfc.contract.errors import DataFileError
+
+HEAD = struct.Struct("<BQ")
+"""What every record begins with: opcode, and length of what follows."""
+
+_FOOTER_BYTES = HEAD.size + 20 + len(MAGIC)
+_BLOCK_BYTES = 1 << 20
+_EXPECTED = {Opcode.CHUNK, Opcode.MESSAGE_INDEX, Opcode.ATTACHMENT, Opcode.METADATA, Opcode.DATA_END}
+_CHANGED = "its parts are whole, but not all are there, or not in order, or what lies between them has changed"
+_OF_CHUNKS = {Opcode.SCHEMA, Opcode.CHANNEL, Opcode.MESSAGE}
+_FIRST_BLOCK_BYTES = 1 << 12
+_TRIES = 4  # times the file's size is read in search of chunks; then the rest is given up, of a file made to mislead
+
+
+@dataclass(slots=True)
+class Damage:
+    """A stretch of a log that is not as it was written, and is left out.
+
+    Attributes:
+        position: its first byte.
+        length: its bytes.
+        why: what is wrong with it.
+        after_ns: log time of the last message delivered before it; None before the first.
+        before_ns: log time of the next one delivered; None after the last.
+    """
+
+    position: int
+    length: int
+    why: str
+    after_ns: int | None = None
+    before_ns: int | None = None
+
+
+class LogFile:
+    """A log file that is open for reading, up to where it ends now; a context.
+
+    Attributes:
+        path: of the file.
+        size: bytes of it when it was opened.
+        finished: it ends as a log that was finished ends.
+        complete: finished, and read up to a sound summary; known when all `parts` have been taken.
+        unread: compression of a chunk that is not read; empty for none.
+    """
+
+    def __init__(self, path: Path) -> None:
+        """Open the log at `path`.
+
+        Raises:
+            DataFileError: it cannot be read.
+        """
+        self.path = path
+        self.complete = False
+        self.unread = ""
+        try:
+            self._file = input_file.opened(path, input_file.UNBOUNDED)
+            self.size = self._file.seek(0, io.SEEK_END)
+        except OSError as fault:
+            finished = path.with_name(path.name.removesuffix(UNFINISHED))
+            hint = f"; it is finished now: {finished}" if finished != path and finished.exists() else ""
+            raise DataFileError(f"{path} cannot be read: {fault.strerror}{hint}") from fault
+        if not self.size:
+            self._file.close()
+            raise DataFileError(f"{path} is empty: nothing was recorded")
+        self.finished = self._read(max(0, self.size - len(MAGIC)), len(MAGIC)) == MAGIC
+        self._ours = self._is_ours()
+        self._summary = self._sound_summary()
+        self._bytes_to_try = _TRIES * self.size
+
+    def __enter__(self) -> "LogFile":
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._file.close()
+
+    def declarations(self) -> Chunk | None:
+        """What the summary declares, schemas and channels, like a chunk; None unless the summary is sound."""
+        if self._summary is None:
+            return None
+        end = self._summary
+        while end + HEAD.size <= self.size:
+            opcode, length = HEAD.unpack(self._read(end, HEAD.size))
+            if opcode not in (Opcode.SCHEMA, Opcode.CHANNEL):
+                break
+            end += HEAD.size + length
+        length = min(end, self.size) - self._summary
+        content = self._read(self._summary, length)
+        return Chunk(self._summary, length, zlib.crc32(content), content)
+
+    def index(self) -> Iterator[ChunkIndex]:
+        """What the summary says of each chunk, in the order of the file; nothing unless it is sound."""
+        for body in self._in_summary(Opcode.CHUNK_INDEX):
+            yield parsed(ChunkIndex, body)
+
+    def parts(
+        self, needed: Callable[[int, Collection[int]], bool] | None = None
+    ) -> Iterator[Chunk | Metadata | Attachment | Damage]:
+        """What the file holds, in its order.
+
+        Chunks of which `needed` is false are passed over unread; it is asked with the log time at which one ends and
+        the channels (ids) of its messages.
+
+        Raises:
+            DataFileError: the disk refuses.
+        """
+        magic = self._read(0, len(MAGIC))
+        at, crc, intact = len(MAGIC), zlib.crc32(magic), MAGIC.startswith(magic)
+        if not intact:
+            yield Damage(0, len(magic), "it does not begin as an MCAP file")
+        while at < self.size:
+            head = self._read(at, HEAD.size)
+            opcode, length = HEAD.unpack(head) if len(head) == HEAD.size else (0, self.size)
+            end = at + HEAD.size + length
+            if needed and opcode == Opcode.CHUNK and end <= self.size:
+                intact = False  # no checksum of the whole without all of it
+                end_ns = int.from_bytes(self._read(at + HEAD.size + 8, 8), "little")
+                if (there := self._channels_after(end)) and not needed(end_ns, there):
+                    at = end
+                    continue
+            try:
+                if opcode in _OF_CHUNKS and self._unchunked and (content := self._loose(at)):
+                    yield Chunk(at, len(content), zlib.crc32(content), content)
+                    crc, at = zlib.crc32(content, crc), at + len(content)
+                    continue
+                if end > self.size or length > LARGEST_BYTES:
+                    raise UnsoundError("a record is longer than it can be")
+                body = self._read(at + HEAD.size, length)
+                if opcode == Opcode.DATA_END and length == 4 and self._summary in (None, end):
+                    if intact and int.from_bytes(body, "little") not in (0, crc):
+                        yield Damage(at, 0, _CHANGED)
+                    if self.finished and self._summary is None:
+                        yield Damage(end, self.size - end, "the summary is damaged")
+                    self.complete = self._summary is not None
+                    return
+                crc = zlib.crc32(body, zlib.crc32(head, crc))
+                part = self._part(opcode, body, at)
+            except UnsoundError as fault:
+                resumed = self._resume(at, end)
+                if resumed == self.size < end and not self.finished:
+                    return  # the last record was not written to its end
+                intact = False
+                yield Damage(at, resumed - at, str(fault))
+                at = resumed
+            else:
+                if part is not None:
+                    yield part
+                at = end
+
+    def _sound_summary(self) -> int | None:
+        """Where the summary begins; None unless its checksum is right."""
+        footer_at = self.size - _FOOTER_BYTES
+        footer = self._read(footer_at, _FOOTER_BYTES) if self.finished and footer_at > 0 else b""
+        if not footer or HEAD.unpack_from(footer) != (Opcode.FOOTER, 20):
+            return None
+        start, _, stored = struct.unpack_from("<QQI", footer, HEAD.size)
+        if not self._ours and not (start and stored):
+            start = start or footer_at  # where there is none, nothing follows the data but the footer
+            return start if len(MAGIC) <= start <= footer_at else None
+        if not len(MAGIC) <= start < footer_at:
+            return None
+        crc = 0
+        for at in range(start, footer_at, _BLOCK_BYTES):
+            crc = zlib.crc32(self._read(at, min(_BLOCK_BYTES, footer_at - at)), crc)
+        return start if zlib.crc32(footer[: HEAD.size + 16], crc) == stored else None
+
+    def _channels_after(self, at: int) -> list[int]:
+        """Ids of the channels in the indexes of messages at `at`, behind a chunk; none where it has no index."""
+        found = []
+        while len(head := self._read(at, HEAD.size + 2)) == HEAD.size + 2:
+            opcode, length = HEAD.unpack_from(head)
+            if opcode != Opcode.MESSAGE_INDEX:
+                break
+            found.append(int.from_bytes(head[HEAD.size :], "little"))
+            at += HEAD.size + length
+        return found
+
+    def _resume(self, at: int, end: int) -> int:
+        """Where to read on after an unsound record: behind it if a record begins there, else at the next whole one."""
+        if end == self.size:
+            return end
+        if end < self.size:
+            head = self._read(end, HEAD.size)
+            if len(head) == HEAD.size:
+                opcode, length = HEAD.unpack(head)
+                if opcode in _EXPECTED and end + HEAD.size + length <= self.size:
+                    return end
+            self._bytes_to_try -= min(end - at, LARGEST_BYTES)  # read once, and now searched
+        start, block = at + 1, _FIRST_BLOCK_BYTES
+        while start < self.size and self._bytes_to_try > 0:
+            for match in CHUNK_HERE.finditer(self._read(start, block + 64)):
+                if self._chunk_at(start + match.start()):
+                    return start + match.start()
+            start, block = start + block, min(2 * block, _BLOCK_BYTES)
+        data_end = 0 if self._summary is None else self._summary - HEAD.size - 4
+        return data_end if data_end > at else self.size
+
+    def _chunk_at(self, at: int) -> bool:
+        """Whether a whole chunk begins at `at`."""
+        _, length = HEAD.unpack(self._read(at, HEAD.size))
+        at += HEAD.size
+        if at + length > self.size or length > min(LARGEST_BYTES, self._bytes_to_try):
+            return False
+        try:
+            read_head(self._read(at, min(LONGEST_HEAD_BYTES, length)), length)
+            self._bytes_to_try -= length
+            read_chunk(self._read(at, length), at, length, may_lack_crc=not self._ours)
+        except UnsoundError:
+            return False
+        return True
+
+    def _part(self, opcode: int, body: bytes, at: int) -> Chunk | Metadata | Attachment | None:
+        """A record of the data section, checked; None for one that only helps to find others.
+
+        Raises:
+            UnsoundError: it is damaged, or has no place in a log.
+        """
+        match opcode:
+            case Opcode.CHUNK:
+                try:
+                    return read_chunk(body, at, HEAD.size + len(body), may_lack_crc=not self._ours)
+                except CompressionError as fault:
+                    self.unread = fault.name
+                    raise
+            case Opcode.ATTACHMENT:
+                crc = int.from_bytes(body[-4:], "little")
+                if crc != zlib.crc32(body[:-4]) and (crc or self._ours):
+                    raise UnsoundError("the checksum of an attachment is wrong")
+                return parsed(Attachment, body)
+            case Opcode.METADATA:
+                return parsed(Metadata, body)
+            case Opcode.MESSAGE_INDEX:
+                if len(body) < 6 or int.from_bytes(body[2:6], "little") != len(body) - 6:
+                    raise UnsoundError("an index of messages is damaged")
+            case Opcode.HEADER if at == len(MAGIC):
+                pass
+            case Opcode.MESSAGE | Opcode.SCHEMA | Opcode.CHANNEL:
+                raise UnsoundError("a record stands outside of the chunks, where no checksum vouches for it")
+            case _:
+                raise UnsoundError("no record begins here")
+        return None
+
+    def _is_ours(self) -> bool:
+        """Whether the recorder wrote this file, with every checksum; another tool says so in the header."""
+        head = self._read(len(MAGIC), HEAD.size)
+        opcode, length = HEAD.unpack(head) if len(head) == HEAD.size else (0, 0)
+        if opcode != Opcode.HEADER or length > _BLOCK_BYTES:
+            return True
+        try:
+            header = parsed(Header, self._read(len(MAGIC) + HEAD.size, length))
+        except UnsoundError:
+            return True
+        return header.library.startswith("lowfc ")
+
+    @cached_property
+    def _unchunked(self) -> bool:
+        """Whether messages may stand outside of chunks."""
+        statistics = (parsed(Statistics, body) for body in self._in_summary(Opcode.STATISTICS))
+        return not self._ours or any(not one.chunk_count for one in statistics)
+
+    def _loose(self, at: int) -> bytes:
+        """Whole records from `at` on of those that usually stand in chunks."""
+        end = at
+        while end - at < _BLOCK_BYTES and len(head := self._read(end, HEAD.size)) == HEAD.size:
+            opcode, length = HEAD.unpack(head)
+            if opcode not in _OF_CHUNKS or length > LARGEST_BYTES or end + HEAD.size + length > self.size:
+                break
+            end += HEAD.size + length
+        return self._read(at, end - at)
+
+    def _in_summary(self, opcode: Opcode) -> Iterator[bytes]:
+        """Records of one kind in the summary; none unless it is sound."""
+        at = self.size if self._summary is None else self._summary
+        while at < self.size - _FOOTER_BYTES:
+            found, length = HEAD.unpack(self._read(at, HEAD.size))
+            if found == opcode:
+                yield self._read(at + HEAD.size, length)
+            at += HEAD.size + length
+
+    def _read(self, at: int, length: int) -> bytes:
+        try:
+            self._file.seek(at)
+            return self._file.read(length)
+        except OSError as fault:
+            raise DataFileError(f"{self.path} cannot be read: {fault.strerror}") from fault
+
+
+_Record = TypeVar("_Record", Attachment, ChunkIndex, Header, Metadata, Schema, Statistics, Channel)
+
+
+def parsed(kind: type[_Record], body: bytes) -> _Record:
+    """A record of this kind.
+
+    Raises:
+        UnsoundError: it is not one.
+    """
+    stream = ReadDataStream(io.BytesIO(body))
+    try:
+        record: _Record = kind.read(stream)
+    except (McapError, UnicodeDecodeError, struct.error) as fault:
+        raise UnsoundError(f"a record ({kind.__name__.lower()}) cannot be read") from fault
+    return record

@@ -1,0 +1,218 @@
+"""The logs of one recording, one after the other: when the next is begun, and where the disk ends."""
+
+import shutil
+import time
+from collections.abc import Iterable, Mapping, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import dataclass
+from pathlib import Path
+
+from lowfc.adapters.bus.bus import Sample
+from lowfc.adapters.logs.writer import FILE_MODE, PART, Attachment, LogWriter, log_path
+from lowfc.adapters.process.clock import Clock
+from lowfc.contract.errors import DataFileError
+
+
+@dataclass(frozen=True, slots=True)
+class Limits:
+    """When a log is finished and the next one begun, who may read it, and what is left of the disk for others.
+
+    Attributes:
+        largest_bytes: size at which the next log is begun.
+        longest_s: age at which the next log is begun.
+        min_free_bytes: free space below which nothing is recorded.
+        file_mode: permissions of a log.
+    """
+
+    largest_bytes: int = 4_000_000_000
+    longest_s: float = 3600.0
+    min_free_bytes: int = 500_000_000
+    file_mode: int = FILE_MODE
+
+
+STANDARD = Limits()
+_TELLING_S = 10.0  # of a recording, after which its growth is that of the loop and not of its beginning
+
+
+class LogSeries:
+    """Writes logs into a folder.
+
+    A full log is finished by a thread of its own, for the disk may need seconds to have all of it.
+
+    Attributes:
+        files: of the logs so far, under the names that they have now.
+    """
+
+    def __init__(
+        self,
+        folder: Path,
+        clock: Clock,
+        metadata: Mapping[str, Mapping[str, str]],
+        attachments: Sequence[Attachment],
+        limits: Limits,
+    ) -> None:
+        self.files: list[Path] = []
+        self._folder = folder
+        self._clock = clock
+        self._metadata = metadata
+        self._attachments = attachments
+        self._limits = limits
+        self._log: LogWriter | None = None
+        self._opened_s = self._recorded_s = 0.0
+        self._recording, self._part = "", 0
+        self._messages = self._bytes = self._longest_write_ns = 0
+        self._finisher = ThreadPoolExecutor(1, "finish-log")
+        self._finishing: tuple[LogWriter, Future[int]] | None = None
+
+    @property
+    def messages(self) -> int:
+        """Messages written, up to the last flush."""
+        return self._messages + (self._log.messages_written if self._log else 0)
+
+    @property
+    def bytes_written(self) -> int:
+        """Size of all logs, up to the last flush."""
+        return self._bytes + (self._log.bytes_written if self._log else 0)
+
+    @property
+    def longest_write_ns(self) -> int:
+        """How long one write took at most."""
+        return max(self._longest_write_ns, self._log.longest_write_ns if self._log else 0)
+
+    @property
+    def bytes_per_s(self) -> float:
+        """How the logs have grown, in bytes per second; 0 where it was too short to tell."""
+        recorded_s = self._recorded_s + (time.monotonic() - self._opened_s if self._log else 0.0)
+        return self.bytes_written / recorded_s if recorded_s >= _TELLING_S else 0.0
+
+    @property
+    def full(self) -> bool:
+        """Whether it is time for the next log."""
+        return self._log is not None and (
+            self._log.bytes_written >= self._limits.largest_bytes
+            or time.monotonic() - self._opened_s >= self._limits.longest_s
+        )
+
+    def begin(self, first: Iterable[Sample], *, anew: bool = True) -> None:
+        """Begin a log, with the messages that those in it depend on; unless `anew`, as the next part of the last one.
+
+        Raises:
+            DataFileError: it cannot be made.
+        """
+        now_ns = self._clock.host_ns()
+        path = log_path(self._folder, now_ns)
+        if anew:
+            self._recording, self._part = path.stem, 0
+        self._part += 1
+        metadata = {**self._metadata, PART: {"of": self._recording, "number": str(self._part)}}
+        self._log = LogWriter(path, now_ns, metadata, self._attachments, self._limits.file_mode)
+        self._opened_s = time.monotonic()
+        self.files.append(self._log.path)
+        for sample in first:
+            self._log.write(sample)
+
+    def write(self, sample: Sample) -> bool:
+        """Write a message; False where there is no log.
+
+        Raises:
+            DataFileError: the disk refuses; see `give_up`.
+        """
+        if self._log is None:
+            return False
+        self._log.write(sample)
+        return True
+
+    def flush(self) -> None:
+        """Flush the log, and hear how it went with the one before.
+
+        Raises:
+            DataFileError: the disk refuses; see `give_up`.
+        """
+        if self._log is not None:
+            self._log.flush()
+        if self._finishing is not None and self._finishing[1].done():
+            self._finished()
+
+    def shortage(self) -> str:
+        """What to say where the disk is too full to go on; empty where it is not.
+
+        Raises:
+            DataFileError: the folder is not there.
+        """
+        return shortage(self._folder, self._limits.min_free_bytes)
+
+    def end(self, figures: Mapping[str, str], *, wait: bool = True) -> None:
+        """Finish the log with its "recording" figures, if there is one; without `wait` while the next is written.
+
+        Raises:
+            DataFileError: the disk refuses; see `give_up`.
+        """
+        self._finished()
+        if self._log is not None:
+            self._log.flush()
+            log = self._put_away()
+            self._finishing = log, self._finisher.submit(_finish, log, figures)
+        if wait:
+            self._finished()
+
+    def give_up(self) -> None:
+        """Leave the log as it was when it was flushed last."""
+        if self._log is not None:
+            log = self._put_away()
+            log.abandon()
+            self._unfinished(log)
+
+    def _put_away(self) -> LogWriter:
+        assert self._log is not None  # noqa: S101  # for the type checker
+        log, self._log = self._log, None
+        self._recorded_s += time.monotonic() - self._opened_s
+        self._messages += log.messages_written
+        self._bytes += log.bytes_written
+        self._longest_write_ns = max(self._longest_write_ns, log.longest_write_ns)
+        return log
+
+    def _finished(self) -> None:
+        """Wait for the log that is being finished."""
+        if self._finishing is None:
+            return
+        (log, growth_bytes), self._finishing = self._finishing, None
+        try:
+            self._bytes += growth_bytes.result()
+        except DataFileError:
+            self._unfinished(log)
+            raise
+
+    def _unfinished(self, log: LogWriter) -> None:
+        self.files[self.files.index(log.path)] = log.part
+
+
+def _finish(log: LogWriter, figures: Mapping[str, str]) -> int:
+    """Finish a log; return by how many bytes that made it longer."""
+    before_bytes = log.bytes_written
+    return log.finish({"recording": figures}).stat().st_size - before_bytes
+
+
+def shortage(folder: Path, min_free_bytes: int) -> str:
+    """What to say where a folder's disk has less room than it should; empty where it has enough.
+
+    Raises:
+        DataFileError: the folder cannot be looked at.
+    """
+    try:
+        free_bytes = shutil.disk_usage(existing(folder)).free
+    except OSError as fault:
+        raise DataFileError(f"{folder} cannot be looked at: {fault.strerror}") from fault
+    if free_bytes >= min_free_bytes:
+        return ""
+    return (
+        f"the disk of {folder} has {free_bytes / 1e6:.0f} MB free, and recorder.min_free_mb is "
+        f"{min_free_bytes / 1e6:.0f}; make room, record elsewhere (recorder.folder) or lower it"
+    )
+
+
+def existing(folder: Path) -> Path:
+    """A folder, or as long as it has not been made the one that it will be made in."""
+    there = folder.absolute()
+    while not there.exists() and there != there.parent:
+        there = there.parent
+    return there

@@ -1,0 +1,101 @@
+"""Thinning logs: a smaller copy of one, by the same rules as a recorder's that was asked to leave something out."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+from mcap.records import Attachment, Metadata
+
+from lowfc.adapters.logs.log_copy import LogCopy, new_log
+from lowfc.adapters.logs.parts import Parts, Repeated, metadata_at_start
+from lowfc.adapters.logs.reader import Logged, LogReader
+from lowfc.adapters.logs.recovery import RECOVERY, account, faults, in_words
+from lowfc.adapters.logs.selection import SELECTION, Selection
+from lowfc.adapters.logs.writer import PART, UNFINISHED
+from lowfc.contract.messages import topic_of
+
+
+@dataclass(frozen=True, slots=True)
+class Thinned:
+    """A smaller copy of a log.
+
+    Attributes:
+        file: the copy.
+        selection: what it has, in words.
+        messages, bytes: of the copy; of the log `messages_before` and `bytes_before`.
+        finished: the log had been finished.
+        damaged: what of the log could not be read, a sentence each.
+    """
+
+    file: str
+    selection: str
+    messages: int
+    bytes: int
+    messages_before: int
+    bytes_before: int
+    finished: bool
+    damaged: list[str]
+
+    def __str__(self) -> str:
+        """The same for a person."""
+        lines = [
+            f"{self.file}: {self.messages} of {self.messages_before} messages, "
+            f"{self.bytes / 1e6:.1f} of {self.bytes_before / 1e6:.1f} MB; {self.selection or 'nothing was left out'}"
+        ]
+        return "\n".join([*lines, *faults(self.damaged, finished=self.finished)])
+
+
+def thinned_path(source: Path, asked: Selection) -> Path:
+    """Name for a smaller copy of a log, beside it."""
+    stem = source.name.removesuffix(UNFINISHED).removesuffix(".mcap")
+    return source.with_name(f"{stem}-every-{asked.every}.mcap")
+
+
+def thin(log: Parts, out: Path, asked: Selection, progress: Callable[[int, int], None] | None = None) -> Thinned:
+    """Write a smaller log of all files of a log; its metadata says what was left out.
+
+    Raises:
+        DataFileError: a file is no log, `out` is there already, or the disk refuses.
+    """
+    made = Selection.of(metadata_at_start(log[0])).within(asked)
+    repeated, messages = Repeated(), 0
+
+    def wanted(message: Logged) -> bool:
+        nonlocal messages
+        if repeated(message):
+            return False
+        messages += 1
+        return made.keeps(topic_of(message.key), message.sequence, message.payload)
+
+    readers = [LogReader(path, skip_damaged=True) for path in log]
+    with new_log(out, log[0]) as file:
+        copy = LogCopy(file)
+        for name, entries in made.metadata.items():
+            copy.note(name, entries)
+        for reader in readers:
+            repeated.next_file()
+            reader.progress = progress
+            copy.take(reader, wanted=wanted, described=_at_start if reader is readers[0] else _at_end)
+            if not reader.complete or reader.damage or reader.unreadable:
+                copy.note(RECOVERY, account(reader, copy.messages))
+        copy.finish()
+    return Thinned(
+        str(out),
+        made.sentence,
+        copy.messages,
+        out.stat().st_size,
+        messages,
+        sum(reader.size for reader in readers),
+        all(reader.finished for reader in readers),
+        [f"{reader.path.name}, {in_words(one)}" for reader in readers for one in reader.damage],
+    )
+
+
+def _at_start(record: Metadata | Attachment) -> bool:
+    """Of the first file: all but what the copy says of itself."""
+    return record.name not in (PART, SELECTION)
+
+
+def _at_end(record: Metadata | Attachment) -> bool:
+    """Of a later file: its account, which replaces that of the file before."""
+    return record.name in ("recording", RECOVERY)

@@ -1,0 +1,96 @@
+"""A child process that dies with its parent, and what it said last."""
+
+import contextlib
+import errno
+import os
+import shutil
+import signal
+import subprocess
+import sys
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import IO
+
+_LAST_WORDS = 6
+_DIES_WITH = """
+import ctypes, os, sys
+number, parent = map(int, sys.argv[1:3])
+ctypes.CDLL(None).prctl(1, number)  # PR_SET_PDEATHSIG, which exec keeps
+if os.getppid() == parent:  # it lives still
+    os.execvp(sys.argv[3], sys.argv[3:])
+"""
+"""Becomes the program, with the signal set: between fork and exec no code may run where other threads hold locks."""
+
+
+@dataclass(slots=True)
+class Child:
+    """One process, what it says going to a file.
+
+    Attributes:
+        name: as in its Health, or in what is told about it.
+        command: the program and its arguments.
+        stderr_path: file with its standard error.
+        environment: of the process; None for ours.
+        death_signal: the signal it gets then; only SIGKILL ends one that is stopped.
+    """
+
+    name: str
+    command: list[str]
+    stderr_path: Path
+    environment: Mapping[str, str] | None = None
+    death_signal: signal.Signals = signal.SIGTERM
+    process: "subprocess.Popen[bytes] | None" = None
+    _stream: "IO[bytes] | None" = field(default=None, repr=False)
+
+    def start(self) -> None:
+        """Start it in a session of its own, so that Ctrl-C reaches only us.
+
+        It dies with us; the kernel takes the end of the thread that starts it for ours.
+
+        Raises:
+            OSError: there is no such program.
+        """
+        if shutil.which(self.command[0], path=(self.environment or os.environ).get("PATH")) is None:
+            raise FileNotFoundError(errno.ENOENT, os.strerror(errno.ENOENT), self.command[0])
+        death = [sys.executable, "-I", "-S", "-c", _DIES_WITH, str(self.death_signal.value), str(os.getpid())]
+        self._stream = self.stderr_path.open("wb")
+        self.process = subprocess.Popen(  # noqa: S603  # our own programs, and the viewer's
+            [*death, *self.command],
+            stdin=subprocess.DEVNULL,
+            stdout=subprocess.DEVNULL,
+            stderr=self._stream,
+            env=self.environment,
+            start_new_session=True,
+        )
+
+    @property
+    def status(self) -> int | None:
+        """Exit status; None while it runs, negative where a signal ended it."""
+        return self.process.poll() if self.process is not None else None
+
+    def stop(self, patience_s: float) -> None:
+        """Ask it to end, wait, and kill it where it does not."""
+        if self.process is None:
+            return
+        if self.status is None:
+            self.process.send_signal(signal.SIGTERM)
+            with contextlib.suppress(subprocess.TimeoutExpired):
+                self.process.wait(patience_s)
+        if self.status is None:
+            self.process.kill()
+            self.process.wait()
+        if self._stream is not None:
+            self._stream.close()
+
+    def stderr_tail(self) -> str:
+        """The end of what it said on standard error."""
+        lines = self.stderr_path.read_text(errors="replace").strip().splitlines() if self.stderr_path.exists() else []
+        return "\n".join(lines[-_LAST_WORDS:])
+
+    def how_it_ended(self) -> str:
+        """One line about a process that ended by itself."""
+        status = self.status
+        if status is not None and status < 0:
+            return f"{self.name} was killed by {signal.Signals(-status).name}"
+        return f"{self.name} ended with exit status {status}"

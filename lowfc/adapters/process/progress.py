@@ -1,0 +1,75 @@
+"""Progress bars that leave nothing behind."""
+
+import contextlib
+import time
+from collections.abc import Callable, Iterator
+from math import inf
+
+from rich.console import Console
+from rich.progress import (
+    BarColumn,
+    DownloadColumn,
+    Progress,
+    ProgressColumn,
+    TaskID,
+    TextColumn,
+    TimeRemainingColumn,
+)
+
+Counted = Callable[[str, int, int], None]
+"""What is being done, how much of it is, and of how much."""
+_EVERY_S = 10.0
+
+
+def passing_bar(console: Console, *columns: ProgressColumn) -> Progress:
+    """A bar that vanishes at its end, and is not there at all where nobody looks: it would leave an empty line."""
+    return Progress(*columns, console=console, transient=True, disable=not console.is_terminal)
+
+
+@contextlib.contextmanager
+def counting_bar(console: Console, *columns: ProgressColumn) -> Iterator[Counted]:
+    """One bar for what is done one after the other; it appears with the first step.
+
+    Args:
+        console: where it is drawn.
+        columns: beside its description.
+    """
+    with passing_bar(console, TextColumn("{task.description}"), BarColumn(), *columns) as bar:
+        tasks: list[TaskID] = []
+
+        def count(what: str, done: int, total: int) -> None:
+            if not tasks:
+                tasks.append(bar.add_task(what, total=total))
+            bar.update(tasks[0], description=what, completed=done, total=total)
+
+        yield count
+
+
+def reading_bar(console: Console) -> contextlib.AbstractContextManager[Counted]:
+    """The same for a file: how many of its bytes have been read."""
+    return counting_bar(console, DownloadColumn(), TimeRemainingColumn())
+
+
+def spoken(say: Callable[[str], None], clock: Callable[[], float] = time.monotonic) -> Counted:
+    """Progress where nobody looks at a bar: a line every 10 s, with the time to go at the rate so far.
+
+    Args:
+        say: What prints a line.
+        clock: Seconds.
+    """
+    first: list[tuple[float, int]] = []  # clock and count
+    spoken_at = -inf
+
+    def count(what: str, done: int, total: int) -> None:
+        nonlocal spoken_at
+        now = clock()
+        if not first:
+            first.append((now, done))
+            spoken_at = now
+        begun, before = first[0]
+        if now - spoken_at >= _EVERY_S and done > before:
+            spoken_at = now
+            seconds = (now - begun) / (done - before) * (total - done)
+            say(f"{what}: {done / total:.0%}, about {seconds:.0f} s to go")
+
+    return count

@@ -1,0 +1,221 @@
+"""Real-time set-up of a process, in one place; call it before the first zenoh session.
+
+A session's threads keep the scheduling class and the processors they are born with.
+"""
+
+import ctypes
+import gc
+import os
+import resource
+import struct
+import sys
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+
+from threadpoolctl import threadpool_limits
+
+from lowfc.adapters.process.clock import sharpen_sleep
+
+_SWITCH_INTERVAL_S = 5e-3
+_MCL_CURRENT, _MCL_FUTURE, _MCL_ONFAULT = 1, 2, 4
+_M_TRIM_THRESHOLD, _M_TOP_PAD, _M_MMAP_THRESHOLD = -1, -2, -3
+_CAP_IPC_LOCK = 1 << 14
+_LOOKING_ON = 5  # of nice's 19
+_LATENCY_DEVICE = "/dev/cpu_dma_latency"
+
+_Wish = tuple[Callable[[], str], str, str]
+"""A measure, how it is called where it is refused, and what that costs."""
+
+_held: list[int] = []
+
+
+@dataclass(frozen=True, slots=True)
+class Granted:
+    """What the host allowed.
+
+    Attributes:
+        granted: measures in force.
+        refused: measures that are not, each with what that costs.
+    """
+
+    granted: tuple[str, ...]
+    refused: tuple[tuple[str, str], ...]
+
+
+NOTHING = Granted((), ())
+
+
+class _RefusedError(Exception):
+    """The host does not allow a measure."""
+
+
+def set_up(priority: int | None, cpus: set[int] | None, *, lock_memory: bool, disable_cpu_idle: bool) -> Granted:
+    """Prepare this process for the loop.
+
+    Args:
+        priority: of SCHED_FIFO, 1 to 99; None leaves the normal class.
+        cpus: processors to stay on; None leaves all.
+        lock_memory: keep every page in memory.
+        disable_cpu_idle: keep the host's idle processors awake as long as this process lives.
+
+    Returns:
+        What was granted; a refusal is no error, for the loop runs without, only less evenly.
+    """
+    wishes: list[_Wish] = []
+    if cpus is not None:
+        cost = "the kernel moves the loop between processors; expect a longer tail"
+        wishes.append((partial(_stay_on, cpus), f"processors {sorted(cpus)}", cost))
+    if lock_memory:
+        wishes.append((_lock_memory, "locked memory", "a page that was swapped out stalls the loop for milliseconds"))
+    if disable_cpu_idle:
+        cost = (
+            "a processor that sleeps between frames takes tens of microseconds longer to wake, several times a "
+            f"frame; let this user write to {_LATENCY_DEVICE}"
+        )
+        wishes.append((_stay_awake, "processors awake", cost))
+    if priority is not None:
+        cost = (
+            "other programs may run first, and one frame in a thousand comes milliseconds late on a busy host; "
+            "allow it with LimitRTPRIO= or CAP_SYS_NICE"
+        )
+        wishes.append((partial(_run_first, priority), f"SCHED_FIFO priority {priority}", cost))
+    return _ask(_quiet_interpreter(), wishes)
+
+
+def _ask(in_force: Iterable[str], wishes: Iterable[_Wish]) -> Granted:
+    """Ask the host for measures, beside those in force."""
+    granted, refused = [*in_force], []
+    for measure, what, cost in wishes:
+        try:
+            granted.append(measure())
+        except (_RefusedError, OSError, ValueError) as fault:
+            refused.append((f"{what} ({getattr(fault, 'strerror', None) or fault})", cost))
+    return Granted(tuple(granted), tuple(refused))
+
+
+def spread(cpus: Iterable[int], *, simulated: bool = True) -> dict[str, list[int]]:
+    """Configuration keys that keep the loop's processes apart on these processors; none where there is only one.
+
+    The controller has one to itself where it can: whatever else runs there pushes its code and data out of the caches,
+    and the recorder, which is sent each frame together with it, would run first. Of two processors, though, a simulated
+    camera needs one, and the recorder whatever is left of either: a processor whose real-time share is used up stands
+    still for 50 ms.
+
+    Args:
+        cpus: to spread them on.
+        simulated: the camera computes its frames.
+    """
+    camera, *others = cpus = sorted(cpus)
+    if not others:
+        return {}
+    controller, *others = others
+    few = simulated and not others
+    return {
+        "realtime.camera_cpus": [camera],
+        "realtime.controller_cpus": [controller],
+        "realtime.mirror_cpus": [controller if few else (others or cpus)[0]],
+        "realtime.recorder_cpus": [] if few else [cpu for cpu in cpus if cpu != controller],
+    }
+
+
+def step_back(priority: int | None, cpus: set[int] | None = None) -> Granted:
+    """Prepare a process that must keep up but never get in the loop's way, such as the recorder.
+
+    Its SCHED_FIFO priority, where it may have one, is below the loop's and above all else on the host: in the normal
+    class, beside other work, a recorder loses messages of a 1 kHz loop.
+    """
+    os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))  # not the class of a parent that is in the loop
+    wishes: list[_Wish] = []
+    if cpus is not None:
+        cost = "the recorder may get in the loop's way"
+        wishes.append((partial(_stay_on, cpus), f"processors {sorted(cpus)}", cost))
+    if priority is not None:
+        wishes.append((partial(_run_first, priority), "SCHED_FIFO", "on a busy host the recorder loses messages"))
+    found = _ask([_keep_memory()], wishes)
+    return found if priority is not None else Granted((*found.granted, "normal scheduling class"), found.refused)
+
+
+def let_send() -> None:
+    """Let the bus's thread send what was just put before this one goes on.
+
+    Of equal SCHED_FIFO priority and on the same processor, it would wait until this one rests; so would the mirror that
+    got a command, and the bus's thread of the mirror, which is woken only then. In the normal class the kernel sees to
+    that, and yielding would give way to everybody.
+    """
+    if os.sched_getscheduler(0) == os.SCHED_FIFO:
+        os.sched_yield()
+        os.sched_yield()
+
+
+def give_way() -> None:
+    """Let the loop and its recorder run first: for a process that only looks on. It may be late, and loses nothing."""
+    os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))  # not the class of a parent that is in the loop
+    os.nice(_LOOKING_ON)
+    threadpool_limits(limits=1)
+
+
+def _quiet_interpreter() -> tuple[str, ...]:
+    """One BLAS thread, no garbage collection, quick hand-over between threads, sharp sleeps."""
+    threadpool_limits(limits=1)
+    gc.collect()
+    gc.freeze()
+    gc.disable()
+    sys.setswitchinterval(_SWITCH_INTERVAL_S)
+    sharpen_sleep()
+    return _keep_memory(), "one BLAS thread", "garbage collector off", "timer slack 1 ns"
+
+
+def _keep_memory() -> str:
+    """Never give freed memory back to the kernel: fetching it again costs a page fault in the middle of a frame."""
+    libc = ctypes.CDLL(None)
+    for option, value in ((_M_MMAP_THRESHOLD, 32 << 20), (_M_TRIM_THRESHOLD, 1 << 30), (_M_TOP_PAD, 4 << 20)):
+        libc.mallopt(option, value)
+    return "memory kept"
+
+
+def _run_first(priority: int) -> str:
+    os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(priority))
+    return f"SCHED_FIFO priority {priority}"
+
+
+def _stay_on(cpus: set[int]) -> str:
+    os.sched_setaffinity(0, cpus)
+    return f"processors {sorted(cpus)}"
+
+
+def _stay_awake() -> str:
+    """Ask the kernel for processors that wake at once; it holds as long as the device is open."""
+    if not _held:
+        device = os.open(_LATENCY_DEVICE, os.O_WRONLY)
+        try:
+            os.write(device, struct.pack("=i", 0))
+        except OSError:
+            os.close(device)
+            raise
+        _held.append(device)
+    return "processors awake"
+
+
+def _lock_memory() -> str:
+    """Lock what is there, and every later page once it is touched.
+
+    Under a limit, later allocations would fail instead of being slow, so nothing is locked then.
+    """
+    limit = resource.getrlimit(resource.RLIMIT_MEMLOCK)[1]
+    if limit != resource.RLIM_INFINITY and not _capabilities() & _CAP_IPC_LOCK:
+        raise _RefusedError(f"the limit is {limit // 1024} kB; set LimitMEMLOCK=infinity")
+    libc = ctypes.CDLL(None, use_errno=True)
+    for flags in (_MCL_CURRENT, _MCL_FUTURE | _MCL_ONFAULT):
+        if libc.mlockall(flags) != 0:
+            raise _RefusedError(os.strerror(ctypes.get_errno()))
+    return "locked memory"
+
+
+def _capabilities() -> int:
+    """Effective capabilities of this process, as the kernel's bit mask."""
+    for line in Path("/proc/self/status").read_text().splitlines():
+        if line.startswith("CapEff:"):
+            return int(line.split()[1], 16)
+    return 0

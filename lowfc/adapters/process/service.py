@@ -1,0 +1,327 @@
+"""What every process of a run does alike: stop when told, say how it is, report events, hear the others."""
+
+import contextlib
+import os
+import platform
+import signal
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterable
+from types import FrameType
+
+from lowfc import __version__
+from lowfc.adapters.bus.bus import ALL, UNREADABLE, Bus, Publisher, Sample
+from lowfc.adapters.bus.dispatch import Handover
+from lowfc.adapters.bus.mailbox import Mailbox
+from lowfc.adapters.bus.names import Names
+from lowfc.adapters.logs.sequence_gaps import Arrivals
+from lowfc.adapters.process.clock import WALL_TOLERANCE_NS, Clock
+from lowfc.adapters.process.realtime import NOTHING, Granted
+from lowfc.adapters.process.supervision import Supervisor
+from lowfc.adapters.process.usage import resident_bytes
+from lowfc.contract.events import EVENTS, Level
+from lowfc.contract.messages import EVENT, HEALTH, Log, Topic, timestamp, wire
+
+HEALTH_PERIOD_NS = 500_000_000
+WAITING_NS = 2_000_000_000
+"""After it is ready a process that still waits for others says for whom."""
+STATES = ("starting", "ready", "running", "stopping", "stopped")
+
+_MET_PERIOD_S = 0.02
+
+
+class Service:
+    """One process of a run.
+
+    Attributes:
+        name: of the process, such as "camera" or "mirror-dm".
+        running: until SIGTERM, SIGINT or `stop`.
+        work: units of work done (frames, commands, messages); `rate_hz` in Health is its rate.
+        heard: last Health of every other process heard.
+        announces: on standard error, that it is ready and for whom it waits.
+        awaited: for whom, in words; empty once it waits for nobody.
+    """
+
+    def __init__(
+        self,
+        name: str,
+        run_id: str,
+        clock: Clock,
+        bus: Bus,
+        *,
+        granted: Granted = NOTHING,
+        fill: Callable[[wire.Health], None] | None = None,
+        announces: bool = False,
+    ) -> None:
+        """Join the run; `fill` adds the role's own fields to each Health."""
+        self.name = name
+        self.clock = clock
+        self.bus = bus
+        self.running = True
+        self.why = "finished"
+        self.work = 0
+        self.heard: dict[str, wire.Health] = {}
+        self.publishers: list[Publisher] = []
+        self.arrivals: list[Arrivals] = []
+        self.run_id = run_id
+        self._granted = granted
+        self._host = platform.node()
+        self.fill = fill
+        self.announces = announces
+        self.awaited: Callable[[], str] = str
+        self._check_waiting_ns: int | None = None
+        self._state = "starting"
+        self._fault: Exception | None = None
+        self._names = Names()
+        self._known: set[tuple[str, int]] = set()
+        self._wakers: list[Callable[[], None]] = []
+        self._event_lock = threading.Lock()
+        self._last_warning: Log | None = None
+        self._supervisor = Supervisor()
+        self._started_ns = self._beaten_ns = clock.host_ns()
+        self._worked = 0
+        self._due_ns = 0
+        self._events = self.publisher(EVENT)
+        self._health = self.publisher(HEALTH, name)
+        bus.subscribe(HEALTH, self._hear)
+        self.event("STARTED", process=name, version=__version__)
+        if abs(ahead_ns := clock.ahead_ns()) > WALL_TOLERANCE_NS:
+            self.event("CLOCK_OFF", ahead_ms=ahead_ns / 1e6)
+        for measure, cost in granted.refused:
+            self.event("REALTIME_REFUSED", measure=measure, cost=cost)
+
+    def publisher(self, topic: Topic, name: str = "") -> Publisher:
+        """Publisher of a topic, counted in Health."""
+        publisher = self.bus.publisher(topic, name)
+        self.publishers.append(publisher)
+        return publisher
+
+    def mailbox(self, topic: Topic, name: str = "") -> Mailbox:
+        """Mailbox that gets a topic, counted in Health and woken at a stop."""
+        mailbox = Mailbox(topic.at(name))
+        self.arrivals.append(mailbox)
+        self.on_stop(mailbox.wake)
+        self.bus.subscribe(topic, mailbox.put, name or ALL)
+        return mailbox
+
+    def handover(
+        self,
+        topic: Topic,
+        handler: Callable[[Sample], None],
+        name: str = "",
+        *,
+        period_ns: int,
+        superseded: Callable[[Sample], None] | None = None,
+    ) -> Callable[[], None]:
+        """Handle a topic's messages on the thread that receives them, counted in Health; what is returned ends it.
+
+        What a handler raises ends the process, except for a message that cannot be read: `finish` raises it again. The
+        bus would count it and go on. Periods and `superseded` are as for `Handover`; in lockstep none is superseded.
+        """
+
+        def guarded(handle: Callable[[Sample], None]) -> Callable[[Sample], None]:
+            def guard(sample: Sample) -> None:
+                try:
+                    handle(sample)
+                except UNREADABLE as fault:
+                    self.unreadable(sample.key, fault)
+                except Exception as fault:
+                    self._fault = fault
+                    self.stop("a message could not be dealt with")
+
+            return guard
+
+        handover = Handover(
+            topic.at(name),
+            guarded(handler),
+            self.clock.host_ns,
+            None if self.clock.lockstep else period_ns,
+            None if superseded is None else guarded(superseded),
+        )
+        self.arrivals.append(handover)
+        return self.bus.subscribe(topic, handover.put, name or ALL)
+
+    def newcomers(self) -> bool:
+        """Whether somebody is heard whom the last call did not know: who answers what is asked, or answers anew."""
+        there = {(name, health.pid) for name, health in list(self.heard.items())}
+        new = not there <= self._known
+        self._known = there
+        return new
+
+    def catch_signals(self) -> None:
+        """Stop at SIGTERM and SIGINT; a second SIGINT ends the process at once. For the main thread."""
+        signal.signal(signal.SIGTERM, self._caught)
+        signal.signal(signal.SIGINT, self._caught)
+
+    def on_stop(self, waker: Callable[[], None]) -> None:
+        """Call `waker` when the process is told to stop, so that a waiting loop notices."""
+        self._wakers.append(waker)
+
+    def stop(self, why: str) -> None:
+        """End the loop: `running` is False from here."""
+        if self.running:
+            self.why = why
+            self.running = False
+            self._supervisor.stopping()
+        for waker in self._wakers:
+            waker()
+
+    @property
+    def state(self) -> str:
+        """One of `STATES`; setting it sends Health at once."""
+        return self._state
+
+    @state.setter
+    def state(self, state: str) -> None:
+        if state not in STATES:
+            raise ValueError(f"a process's state is one of {', '.join(STATES)}; got {state!r}")
+        self._state = state
+        self._send_health(self.clock.host_ns())
+        if state in ("ready", "running"):
+            self._supervisor.ready()
+            if self._check_waiting_ns is None:
+                self._check_waiting_ns = self.clock.host_ns() + WAITING_NS
+                self._announce("ready")
+        elif state in ("stopping", "stopped"):
+            self._supervisor.stopping()
+
+    def beat(self) -> None:
+        """Send Health when it is due, twice a second, and a sign of life to the service manager.
+
+        Call it in every turn of the loop that does the work, and nowhere else.
+        """
+        now_ns = self.clock.host_ns()
+        self._supervisor.alive(now_ns)
+        if self._check_waiting_ns is not None and 0 < self._check_waiting_ns <= now_ns:
+            self._check_waiting_ns = 0
+            if whom := self.awaited():
+                self._announce(f"waiting for {whom}")
+        if now_ns >= self._due_ns:
+            self._send_health(now_ns)
+
+    def finish(self) -> None:
+        """Send the last Health, with all counts: nothing may be published after it.
+
+        Raises:
+            Exception: what ended the process, where a handler failed.
+        """
+        if self._fault is not None:
+            raise self._fault
+        self._tell_unreadable()
+        self.event("STOPPED", process=self.name, why=self.why)
+        self.state = "stopped"
+
+    def event(self, event: str, **details: object) -> None:
+        """Publish an event of the table; warnings and worse go to standard error too. Callable from any thread."""
+        kind = EVENTS[event]
+        log = kind.log(self.name, self.clock.now_ns(), **details)
+        with self._event_lock:
+            self._events.put(log.SerializeToString())
+        if kind.level >= Level.WARNING:
+            self._last_warning = log
+            self._print(log.message)
+
+    def _announce(self, what: str) -> None:
+        if self.announces:
+            self._print(f"{what} (run {self.run_id})")
+
+    def _print(self, line: str) -> None:
+        with contextlib.suppress(OSError, ValueError):  # a terminal that is gone, or a full disk, ends nobody
+            sys.stderr.write(f"{self.name}: {line}\n")
+
+    def unreadable(self, key: str, why: object) -> None:
+        """Count a message that could not be read: a flood is one event with each Health. Callable from any thread."""
+        self.bus.faults.add_unreadable(key, why)
+
+    def wait_for(self, names: Iterable[str], timeout_s: float) -> tuple[str, ...]:
+        """Wait until these processes are ready and have heard this one, so that they get its first message.
+
+        Set `state` to "ready" before: others may be waiting for this one.
+
+        Returns:
+            Names of those that did not answer in time; empty when all did, or the process was told to stop.
+        """
+        wanted = tuple(names)
+        deadline_s = time.monotonic() + timeout_s
+        self.awaited = lambda: ", ".join(name for name in wanted if not self._meets(name))
+        while missing := tuple(name for name in wanted if not self._meets(name)):
+            if not self.running or time.monotonic() >= deadline_s:
+                return missing
+            self.beat()
+            time.sleep(_MET_PERIOD_S)
+        return ()
+
+    def health(self) -> wire.Health:
+        """How the process is."""
+        now_ns = self.clock.host_ns()
+        span_s = max(now_ns - self._beaten_ns, 1) * 1e-9
+        message = wire.Health(
+            timestamp=timestamp(now_ns),
+            process=self.name,
+            state=self._state,
+            run_id=self.run_id,
+            pid=os.getpid(),
+            host=self._host,
+            version=__version__,
+            memory_bytes=resident_bytes(),
+            rate_hz=(self.work - self._worked) / span_s,
+            peers_alive=sorted(self.heard),
+            realtime_granted=self._granted.granted,
+            realtime_refused=[f"{measure}: {cost}" for measure, cost in self._granted.refused],
+            clock_offset_ns=self.clock.offset_ns,
+            uptime_ns=now_ns - self._started_ns,
+            topics=[*(self._sent(one) for one in self.publishers), *map(_got, self.arrivals)],
+        )
+        if (warning := self._last_warning) is not None:
+            message.last_warning = warning.message
+            message.last_warning_timestamp.CopyFrom(warning.timestamp)
+        if self.bus.offset is not None and (exchange := self.bus.offset.best) is not None:
+            message.router_offset_ns, message.router_round_trip_ns = exchange
+        if self.fill:
+            self.fill(message)
+        return message
+
+    def _sent(self, publisher: Publisher) -> wire.TopicCount:
+        own = publisher is self._health  # the message that carries the count is one of them
+        return wire.TopicCount(topic=publisher.key, published=publisher.published + own)
+
+    def _tell_unreadable(self) -> None:
+        for key, (count, why) in self.bus.faults.take_unreadable().items():
+            self.event("BAD_MESSAGE", count=count, topic=key, why=why)
+
+    def _send_health(self, now_ns: int) -> None:
+        self._due_ns = now_ns + HEALTH_PERIOD_NS
+        self._tell_unreadable()
+        message = self.health()
+        self._beaten_ns, self._worked = now_ns, self.work
+        self._health.put(message.SerializeToString())
+        self._supervisor.tell(message)
+
+    def _hear(self, sample: Sample) -> None:
+        name, health = self._names.health(sample.key, sample.payload)
+        if name == self.name:
+            return
+        known = self.heard.get(name)
+        self.heard[name] = health
+        if known is None or known.pid != health.pid:
+            self._due_ns = 0  # answer a newcomer at the next beat, so that it need not wait for us
+
+    def _meets(self, name: str) -> bool:
+        health = self.heard.get(name)
+        return health is not None and health.state in ("ready", "running") and self.name in health.peers_alive
+
+    def _caught(self, number: int, frame: FrameType | None) -> None:
+        if number == signal.SIGINT and not self.running:
+            os._exit(128 + number)
+        self.stop(signal.Signals(number).name)
+
+
+def _got(arrivals: Arrivals) -> wire.TopicCount:
+    return wire.TopicCount(
+        topic=arrivals.key,
+        received=arrivals.received,
+        skipped=arrivals.skipped,
+        missing=arrivals.missing,
+        last_sequence=arrivals.last_sequence,
+    )

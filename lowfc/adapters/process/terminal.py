@@ -1,0 +1,83 @@
+"""Command lines: how a user's mistake looks, and the options that every process of a run has."""
+
+import errno
+import os
+import signal
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, NoReturn
+
+import typer
+
+from lowfc.adapters.bus import DEFAULT_RUN as DEFAULT_RUN
+from lowfc.contract.errors import LowfcError
+from lowfc.contract.printable import LINES, printable
+
+if TYPE_CHECKING:
+    from lowfc.contract.configuration import Configuration
+
+INTERRUPTED = 130
+"""Exit status after Ctrl-C."""
+
+RunId = Annotated[str, typer.Option("--run", help="Name of the run; processes of one run find each other by it.")]
+AnyRun = Annotated[str | None, typer.Option("--run", help="Name of the run; default: the only one.")]
+Json = Annotated[bool, typer.Option("--json", help="Print one JSON object on standard output.")]
+_LOGS = "Logs (MCAP), finished or not; all files of a recording are one log. `last`: the newest in the log folder."
+Logs = Annotated[list[Path], typer.Argument(help=_LOGS, metavar="LOG...", readable=False, show_default=False)]
+LogsIfAny = Annotated[
+    list[Path] | None,
+    typer.Argument(help=f"{_LOGS} None: a running loop.", metavar="[LOG...]", readable=False, show_default=False),
+]
+ConfigFile = Annotated[Path | None, typer.Option("--config", help="Configuration file (TOML).", show_default=False)]
+
+
+def new_app(help_text: str) -> typer.Typer:
+    """A command line with plain errors."""
+    return typer.Typer(
+        help=help_text,
+        add_completion=False,
+        pretty_exceptions_enable=False,
+        rich_markup_mode=None,
+        context_settings={"help_option_names": ["-h", "--help"]},
+    )
+
+
+def _warn(text: str) -> None:
+    sys.stderr.write(f"warning: {printable(text)}\n")
+
+
+def run_app(app: Callable[[], object]) -> NoReturn:
+    """Run a command line; a user's mistake is one clear message and exit status 2, never a traceback.
+
+    Being told to stop ends a command as Ctrl-C does; the processes of a loop catch both themselves.
+    """
+    signal.signal(signal.SIGTERM, signal.default_int_handler)
+    signal.signal(signal.SIGINT, signal.default_int_handler)
+    try:
+        app()
+        sys.stdout.flush()
+    except OSError as fault:
+        if fault.filename is not None or fault.errno not in (errno.ENOSPC, errno.EIO, errno.EPIPE):
+            raise
+        sys.stderr.write(f"error: standard output cannot be written: {fault.strerror}\n")
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # what is left of it cannot go anywhere
+        sys.exit(2)
+    except LowfcError as error:
+        sys.stderr.write(f"error: {printable(str(error), keep=LINES)}\n")
+        sys.exit(error.exit_status)
+    except SystemExit as end:
+        if end.code == INTERRUPTED:
+            sys.stderr.write("interrupted\n")
+        raise
+    sys.exit(0)
+
+
+def configuration(
+    file: Path | None, overrides: dict[str, Any] | None = None, defaults: dict[str, Any] | None = None
+) -> "Configuration":
+    """Configuration of a file, options given on the command line (not None) over it, a command's defaults under it."""
+    from lowfc.contract.configuration import load
+
+    given = {key: value for key, value in (overrides or {}).items() if value is not None}
+    return load(file, given, defaults, remark=_warn)

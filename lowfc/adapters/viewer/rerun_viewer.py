@@ -1,0 +1,391 @@
+"""The rerun viewer as a child process: a window, a picture without a screen, or a page for the browser.
+
+It listens on loopback only, asks nobody on the network, and dies with us. rerun's own servers inside of a Python
+process (`serve_grpc`, `serve_web_viewer`) have no option for where to listen, and its `rerun` on the path is a script
+that starts the binary and leaves it behind when killed: hence the binary itself.
+
+What was measured with rerun 0.41, and decides how it is used:
+
+- `RecordingStream.log` goes on into a viewer that hangs, our memory growing by some 150 MB, until about 100 MB are
+  unsent; then it blocks until the viewer goes on or is killed. Into one that is dead it neither blocks nor grows; the
+  stream does not come back, but a new one with the same ids to a new viewer on the same port does.
+- `disconnect`, `del`, and the end of the process (with `rerun.unregister_shutdown`, too) block as long as the viewer
+  hangs. Hence: stop() the viewer first, and all of them return.
+- A viewer or a browser's page whose server was restarted does not come back by itself; the page must be reloaded.
+- The memory limit is one for the data as rerun counts it. A stream far longer than that levelled off at 184 MB for
+  "100MB" (web, 33 MB at start) and at 545 MB for "200MB" (headless, 156 MB at start): whoever needs a bound watches
+  resident_bytes().
+- ViewerClient has no time limit of its own towards a viewer that hangs. All calls here run in a thread that is left.
+"""
+
+import http.client
+import importlib.util
+import os
+import signal
+import socket
+import tempfile
+import threading
+import time
+from collections.abc import Callable, Mapping
+from enum import StrEnum
+from pathlib import Path
+from typing import TYPE_CHECKING, TypeVar
+from urllib.parse import quote
+
+from lowfc.adapters.bus.run import free_ports
+from lowfc.adapters.files.whole_file import being_written
+from lowfc.adapters.process.child import Child
+from lowfc.adapters.process.usage import resident_bytes
+from lowfc.adapters.viewer.viewer_page import ViewerPage
+from lowfc.contract.errors import LowfcError
+
+if TYPE_CHECKING:
+    from rerun.experimental import ViewerClient, ViewerState
+
+HOST = "127.0.0.1"
+DEFAULT_MEMORY = "512MB"
+_DRIVER_FOLDERS = ("/usr/share/vulkan/icd.d", "/usr/local/share/vulkan/icd.d", "/etc/vulkan/icd.d")
+_DRIVER_VARIABLES = ("VK_ICD_FILENAMES", "VK_DRIVER_FILES")
+_SCREEN_VARIABLES = ("DISPLAY", "WAYLAND_DISPLAY")
+_START_S = 20.0
+_POLL_S = 0.05
+_CALL_S = 20.0
+_STOP_S = 1.0
+_REDRAW_S = 0.5  # longer than a notification stands still when nobody looks
+_FAILURES = ("panicked at", "Error:", "ERROR")
+_HTTP2_HELLO = b"PRI * HTTP/2.0\r\n\r\nSM\r\n\r\n" + bytes([0, 0, 0, 4, 0, 0, 0, 0, 0])  # and empty SETTINGS
+
+Answer = TypeVar("Answer")
+
+
+class ViewerError(LowfcError):
+    """The viewer cannot be started, or does not answer."""
+
+
+class Show(StrEnum):
+    """How the viewer is looked at."""
+
+    NATIVE = "native"
+    HEADLESS = "headless"
+    WEB = "web"
+
+
+class RerunViewer:
+    """One viewer, running from construction until stop() or the end of its `with` block.
+
+    Attributes:
+        url: where a RecordingStream connects to.
+        web_address: what to open in a browser; None for a viewer that is not for browsers.
+    """
+
+    def __init__(
+        self,
+        show: Show,
+        *,
+        memory_limit: str = DEFAULT_MEMORY,
+        size_px: tuple[int, int] = (1600, 1000),
+        port: int | None = None,
+        web_port: int | None = None,
+    ) -> None:
+        """Start it and wait until it answers.
+
+        Args:
+            show: window, picture or page.
+            memory_limit: what it may keep of the stream, such as "512MB".
+            size_px: width and height of a headless viewer.
+            port: TCP port to listen on for the stream; None for a free one.
+            web_port: TCP port of the page; None for a free one.
+
+        Raises:
+            ViewerError: the binary, a screen or a driver is missing, or it does not come up.
+        """
+        free = free_ports(3)
+        self.show = show
+        self.port = port or free[0]
+        self.web_port = (web_port or free[1]) if show is Show.WEB else None
+        self.url = stream_url(self.port)
+        self.web_address = web_address(self.url, self.web_port) if self.web_port else None
+        self._page: ViewerPage | None = None
+        self._source_port = free[2]
+        self._stderr = tempfile.TemporaryFile()  # noqa: SIM115  # nameless: nothing is left if this process is killed
+        self._output = ""
+        self._child = Child(
+            f"the viewer on port {self.port}",
+            [],
+            Path(f"/proc/self/fd/{self._stderr.fileno()}"),
+            death_signal=signal.SIGKILL,
+        )
+        try:
+            self._child.environment = _environment(show)
+            self._child.command = [str(viewer_binary()), "--bind", HOST, "--port", str(self.port)]
+            self._child.command += _words(show, memory_limit, size_px, self._source_port)
+            self._start()
+            if self.web_port:
+                self._page = self._serve_page(self.web_port)
+        except BaseException:
+            self.stop()
+            raise
+
+    def __enter__(self) -> "RerunViewer":
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.stop()
+
+    @property
+    def pid(self) -> int:
+        """Number of its process."""
+        assert self._child.process is not None  # noqa: S101  # __init__ started it
+        return self._child.process.pid
+
+    @property
+    def alive(self) -> bool:
+        """Whether its process is there; one that hangs is."""
+        return self._child.process is not None and self._child.status is None
+
+    def answers(self, patience_s: float = 1.0) -> bool:
+        """Whether its server greets a new connection; one that hangs does not, though the kernel accepts for it."""
+        try:
+            with socket.create_connection((HOST, self.port), patience_s) as link:
+                link.settimeout(patience_s)
+                link.sendall(_HTTP2_HELLO)
+                return bool(link.recv(9))
+        except OSError:
+            return False
+
+    def resident_bytes(self) -> int:
+        """Memory of its process; 0 when it is gone."""
+        try:
+            return resident_bytes(self.pid)
+        except (OSError, IndexError):
+            return 0
+
+    def how_it_ended(self) -> str:
+        """One line about a viewer that is no longer alive."""
+        how = self._child.how_it_ended()
+        return how if (self._child.status or 0) < 0 else f"{how} ({self._failure()})"
+
+    def stop(self) -> None:
+        """End it, kindly for a second and then not; one that has ended stays so."""
+        if self._page is not None:
+            self._page.stop()
+            self._page = None
+        self._child.stop(_STOP_S)
+        self._failure()  # read for the last time
+        self._stderr.close()
+
+    def screenshot(self, path: Path | None = None, patience_s: float = 20.0) -> bytes:
+        """Picture of the whole viewer once it has loaded and stands still.
+
+        A live stream does not stand still; then it is the picture at the end of the patience.
+
+        Args:
+            path: PNG to write as well.
+            patience_s: how long to wait for it to load, and then for it to stand still.
+
+        Returns:
+            The PNG.
+
+        Raises:
+            ViewerError: it does not answer, or nothing is loaded.
+            DataFileError: the file cannot be written.
+        """
+        deadline_s = time.monotonic() + patience_s
+        while not ((state := self.state()).recordings and state.views and not state.loading):
+            if time.monotonic() > deadline_s:
+                raise ViewerError(
+                    f"the viewer has {len(state.recordings)} recordings, {len(state.views)} views and "
+                    f"{len(state.loading)} still to load after {patience_s:g} s; is anything sent to {self.url}?"
+                )
+            time.sleep(_POLL_S)
+        deadline_s = time.monotonic() + patience_s
+        picture = before = b""
+        while not picture or (picture != before and time.monotonic() < deadline_s):
+            if picture:
+                time.sleep(_REDRAW_S)
+            before, picture = picture, self._ask(lambda client: client.take_screenshot())
+        if path is not None:
+            with being_written(path) as part:
+                part.write_bytes(picture)
+        return picture
+
+    def complaints(self) -> list[str]:
+        """What its views could not draw, and its warnings and errors; one line each."""
+        reports = [
+            f"{view.name or view.origin}: {report.severity}: {report.summary}"
+            for view in self.state().views
+            for report in view.reports
+        ]
+        logs = self._ask(lambda client: client.get_logs())
+        return reports + [f"{entry.level}: {entry.message}" for entry in logs if entry.level != "INFO"]
+
+    def state(self) -> "ViewerState":
+        """What it shows: recordings, views, what it is loading.
+
+        Raises:
+            ViewerError: it does not answer.
+        """
+        return self._ask(lambda client: client.get_state())
+
+    def _start(self) -> None:
+        try:
+            self._child.start()
+        except OSError as fault:
+            raise ViewerError(f"{self._child.command[0]} cannot be started ({fault.strerror}); {_REINSTALL}") from fault
+        deadline_s = time.monotonic() + _START_S
+        ready = self._page_is_there if self.show is Show.WEB else self._draws
+        while not (ready() and self.alive):
+            if not self.alive:
+                raise ViewerError(f"{self.how_it_ended()}{_ADVICE[self.show]}")
+            if time.monotonic() > deadline_s:
+                raise ViewerError(
+                    f"the viewer does not answer on {self.url} after {_START_S:g} s; its last output: "
+                    f"{self._failure()}{_ADVICE[self.show]}"
+                )
+            time.sleep(_POLL_S)
+
+    def _failure(self) -> str:
+        """The most useful line of its output: the failure before a stack trace, or the last."""
+        if not self._stderr.closed:
+            self._stderr.seek(0)
+            self._output = self._stderr.read().decode(errors="replace")
+        lines = [line.strip() for line in self._output.split("\n") if line.strip()]
+        failures = [line for line in lines if any(word in line for word in _FAILURES)]
+        return next(iter(failures or lines[-1:]), "it wrote nothing")
+
+    def _page_is_there(self) -> bool:
+        page = http.client.HTTPConnection(HOST, self._source_port, timeout=1.0)
+        try:
+            page.request("HEAD", "/")
+            return page.getresponse().status == http.client.OK and self.answers()
+        except (OSError, http.client.HTTPException):
+            return False
+        finally:
+            page.close()
+
+    def _serve_page(self, port: int) -> ViewerPage:
+        try:
+            return ViewerPage(HOST, port, self._source_port, self.port)
+        except OSError as fault:
+            raise ViewerError(f"the page cannot be served on port {port} ({fault.strerror}); use another") from fault
+
+    def _draws(self) -> bool:
+        """Whether the viewer, not only its server, is up: without a driver the server is, for a moment."""
+        if not self.answers():
+            return False
+        try:
+            if self.show is Show.HEADLESS:
+                self._ask(lambda client: client.take_screenshot(max_size=16))
+            else:
+                self.state()
+        except ViewerError:
+            return False
+        return True
+
+    def _ask(self, question: "Callable[[ViewerClient], Answer]") -> Answer:
+        """Ask the viewer; a call to one that hangs would not return, so it is made by a thread that may be left."""
+        answers: list[Answer] = []
+        faults: list[Exception] = []
+
+        def call() -> None:
+            from rerun.experimental import ViewerClient
+
+            try:
+                answers.append(question(ViewerClient.connect(self.url)))
+            except Exception as fault:  # rerun raises RuntimeError, ConnectionError and others
+                faults.append(fault)
+
+        asker = threading.Thread(target=call, name="ask-viewer", daemon=True)
+        asker.start()
+        asker.join(_CALL_S)
+        if answers:
+            return answers[0]
+        if not self.alive:
+            raise ViewerError(self.how_it_ended())
+        what = f"answers with {faults[0]}" if faults else f"does not answer within {_CALL_S:g} s"
+        raise ViewerError(f"the viewer on {self.url} {what}; stop it and start it again")
+
+
+_REINSTALL = "install it again: pip install --force-reinstall rerun-sdk"
+_NO_SCREEN = "use --web and a browser, --headless-screenshot FILE.png, or --save FILE.rrd"
+_PACKAGES = "apt install mesa-vulkan-drivers libvulkan1"
+_ADVICE = {
+    Show.NATIVE: f"; {_NO_SCREEN}",
+    Show.HEADLESS: f"; if it has no Vulkan driver: {_PACKAGES}",
+    Show.WEB: "",
+}
+
+
+def stream_url(port: int) -> str:
+    """Where a RecordingStream connects to a viewer that listens on a port."""
+    return f"rerun+http://{HOST}:{port}/proxy"
+
+
+def web_address(url: str, web_port: int) -> str:
+    """Page that opens the stream, dark as the colours of our layout need it; it keeps nothing between two visits."""
+    return f"http://{HOST}:{web_port}/?url={quote(url, safe='')}&hide_welcome_screen&persist=0&theme=dark"
+
+
+def has_screen(environment: Mapping[str, str] = os.environ) -> bool:
+    """Whether there is a screen for a window to be on."""
+    return any(environment.get(name) for name in _SCREEN_VARIABLES)
+
+
+def require_screen(show: Show | None, environment: Mapping[str, str] = os.environ) -> None:
+    """Check that what is to be shown in a window can be.
+
+    Raises:
+        ViewerError: there is no screen for it.
+    """
+    if show is Show.NATIVE and not has_screen(environment):
+        raise ViewerError(f"there is no screen for a window (neither DISPLAY nor WAYLAND_DISPLAY is set); {_NO_SCREEN}")
+
+
+def vulkan_drivers() -> list[Path]:
+    """Vulkan drivers that are installed, the one that draws without a graphics card first."""
+    found = [path for folder in _DRIVER_FOLDERS for path in sorted(Path(folder).glob("*.json"))]
+    return sorted(found, key=lambda path: not path.name.startswith("lvp"))
+
+
+def viewer_binary() -> Path:
+    """The viewer's program, as rerun-sdk installs it.
+
+    Raises:
+        ViewerError: it is not there.
+    """
+    package = importlib.util.find_spec("rerun_cli")
+    if package is None or package.origin is None:
+        raise ViewerError(f"the package rerun-sdk has no viewer here; {_REINSTALL}")
+    binary = Path(package.origin).parent / "rerun"
+    if not binary.is_file():
+        raise ViewerError(f"{binary} is missing; {_REINSTALL}")
+    return binary
+
+
+def _words(show: Show, memory_limit: str, size_px: tuple[int, int], source_port: int) -> list[str]:
+    if show is Show.WEB:
+        return ["--serve-web", "--web-viewer-port", str(source_port), "--server-memory-limit", memory_limit]
+    words = ["--memory-limit", memory_limit, "--server-memory-limit", "0B"]
+    words += ["--hide-welcome-screen", "--expect-data-soon"]
+    return [*words, "--headless", "--window-size", f"{size_px[0]}x{size_px[1]}"] if show is Show.HEADLESS else words
+
+
+def _environment(show: Show) -> dict[str, str]:
+    """Environment of the viewer: no usage statistics, no question to the network, no chatter.
+
+    Raises:
+        ViewerError: there is no screen, or no driver.
+    """
+    environment = {name: value for name, value in os.environ.items() if name.lower() != "no_proxy"}
+    require_screen(show, environment)
+    if show is Show.HEADLESS and not any(environment.get(name) for name in _DRIVER_VARIABLES):
+        drivers = vulkan_drivers()
+        if not drivers:
+            raise ViewerError(f"there is no Vulkan driver to draw with; {_PACKAGES}")
+        environment["VK_ICD_FILENAMES"] = str(drivers[0])
+    environment.pop("FORCE_RERUN_ANALYTICS", None)
+    environment["CI"] = "1"  # rerun sends no usage statistics then, and the user's own settings stay as they are
+    environment["ALL_PROXY"] = f"http://{HOST}:9"  # nobody there: it asks api.github.com for a newer version otherwise
+    environment["NO_COLOR"] = "1"  # its last words go into ours
+    environment["RUST_LOG"] = "warn,egui_wgpu=error,re_renderer=error,re_viewer::native=error"
+    return environment

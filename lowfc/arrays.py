@@ -1,0 +1,17 @@
+"""Names of array types, once for the whole project."""
+
+import numpy as np
+import numpy.typing as npt
+
+Array = npt.NDArray[np.float64]
+Single = npt.NDArray[np.float32]
+Complex = npt.NDArray[np.complex128]
+Whole = npt.NDArray[np.intp]
+Mask = npt.NDArray[np.bool_]
+Pixels = npt.NDArray[np.uint16]
+Sequences = npt.NDArray[np.uint64]
+
+
+def single(array: npt.ArrayLike) -> Single:
+    """In single precision and row after row, as the loop uses it."""
+    return np.ascontiguousarray(array, dtype=np.float32)

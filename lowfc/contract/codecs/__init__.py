@@ -1,0 +1,1 @@
+"""Messages and files to values of the numerics, and back."""

@@ -1,0 +1,116 @@
+"""Control laws, channels and plays as messages, both ways."""
+
+from collections.abc import Mapping
+from types import MappingProxyType
+from typing import Any
+
+import numpy as np
+
+from lowfc.arrays import Single
+from lowfc.contract.messages import fields_of, floats, timestamp, wire
+from lowfc.control.laws.linear_law import LinearLaw, matrix_shapes
+from lowfc.control.loop.additions import Channel, CommandChannels, Play, PlayTable, play_table
+
+_PLAIN = ("name", "signal", "delay_frames", "rate_hz")  # of the same name in law and message
+
+
+def law_header(law: LinearLaw) -> wire.LinearLaw:
+    """A law as a message without its matrices, which are known by its identity."""
+    plain = fields_of(law, _PLAIN)
+    return wire.LinearLaw(noll=law.noll, states=len(law.transition), id=law.id, **plain)
+
+
+def wire_law(law: LinearLaw, time_ns: int = 0) -> wire.LinearLaw:
+    """A law as a message, whole."""
+    message = law_header(law)
+    message.timestamp.CopyFrom(timestamp(time_ns))
+    for name in matrix_shapes(0, 0):
+        setattr(message, name, getattr(law, name).tobytes())
+    return message
+
+
+def law_of(message: wire.LinearLaw, known: Mapping[str, LinearLaw] = MappingProxyType({})) -> LinearLaw:
+    """The law of a message; of one without matrices, that of its identity among the `known` ones.
+
+    Raises:
+        ValueError: it is not whole, or not known.
+    """
+    if message.id and not message.transition:
+        if message.id not in known:
+            raise ValueError(f"the law {message.id[:12]} is not there")
+        return known[message.id]
+    shapes = matrix_shapes(message.states, len(message.noll))
+    matrices: dict[str, Any] = {name: floats(getattr(message, name), *shape) for name, shape in shapes.items()}
+    return LinearLaw(noll=tuple(message.noll), **fields_of(message, _PLAIN), **matrices)
+
+
+def wire_play(table: PlayTable, time_ns: int) -> wire.Play:
+    """A table that can be played as a message, whole."""
+    return wire.Play(
+        target=table.target,
+        columns=table.rows.shape[1],
+        table=table.rows.tobytes(),
+        basis=table.basis.tobytes(),
+        id=table.id,
+        frames=len(table.rows),
+        timestamp=timestamp(time_ns),
+    )
+
+
+def table_of(message: wire.Play) -> PlayTable:
+    """The table of a message.
+
+    Raises:
+        ValueError: it is not whole.
+    """
+    return play_table(message.target, floats(message.table, -1, message.columns or 1), floats(message.basis, -1))
+
+
+def put_additions(message: wire.ControllerState, additions: CommandChannels) -> None:
+    """What is added to the law's command, into a state."""
+    message.offset_nm.extend(additions.offset_nm.tolist())
+    message.shift_history_nm.extend(np.concatenate(additions.shifts_nm).tolist())
+    for one in additions.channels:
+        wanted, reached = one.wanted_nm.tobytes(), one.reached_nm.tobytes()
+        message.channels.add(name=one.name, actuators=wanted, shifts=one.shifts, reached=reached)
+    play = additions.play
+    if play is not None:
+        message.play.target = play.target
+        message.play.first_sequence = play.first_sequence
+        message.play.columns = play.table.rows.shape[1]
+        message.play.frames = play.frames
+        message.play.id = play.table.id
+
+
+def additions_of(
+    message: wire.ControllerState, none: CommandChannels, to_modes: Single, plays: Mapping[str, PlayTable]
+) -> CommandChannels | None:
+    """What is added, of a state; `none` has its shapes. None where the state has nothing of it.
+
+    A table that is played is among `plays`, by its identity; before 0.2 the state had it, cut to what was played.
+
+    Raises:
+        ValueError: it does not fit.
+    """
+    if not (message.offset_nm or message.channels or message.HasField("play")):
+        return None
+    rows, columns = none.sum_nm.shape
+    modes, frames = none.shift_nm.size, len(none.shifts_nm)
+    offset_nm = np.array(message.offset_nm, np.float32).reshape(modes)
+    shifts_nm = np.array(message.shift_history_nm, np.float32).reshape(frames, modes)
+    channels = tuple(
+        Channel.of(one.name, floats(one.actuators, rows, columns), floats(one.reached, rows, columns))
+        for one in message.channels
+    )
+    play = None
+    if message.HasField("play"):
+        one = message.play
+        if not one.id:
+            table = floats(one.table, -1, one.columns or 1)
+            cut = PlayTable(one.target, table, floats(one.basis, -1, rows * columns), np.zeros(0), 0.0, "")
+            play = Play(cut, one.first_sequence, len(table))
+        elif one.id not in plays:
+            raise ValueError(f"the table {one.id[:12]} that is played is not there")
+        else:
+            play = Play(plays[one.id], one.first_sequence, one.frames)
+    return none._replace(offset_nm=offset_nm, shifts_nm=tuple(shifts_nm), play=play).at(channels, to_modes)

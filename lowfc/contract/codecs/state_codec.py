@@ -1,0 +1,176 @@
+"""The controller's state and settings as a message, both ways: whoever reads it goes on with the same next command."""
+
+from collections.abc import Mapping
+from types import MappingProxyType
+from typing import Any
+
+import numpy as np
+
+from lowfc.contract.codecs.calibration_codec import camera_settings, wire_camera
+from lowfc.contract.codecs.codec import wire_mode, wire_reasons
+from lowfc.contract.codecs.law_codec import additions_of, law_header, law_of, put_additions
+from lowfc.contract.messages import fields_of, floats, from_timestamp, timestamp, wire
+from lowfc.control.calibration.calibration import Calibration
+from lowfc.control.laws import linear_law
+from lowfc.control.laws.law import Law
+from lowfc.control.laws.linear_law import LinearLaw
+from lowfc.control.loop.additions import PlayTable
+from lowfc.control.loop.estimator import Estimate
+from lowfc.control.loop.lease import Lease
+from lowfc.control.loop.safety import Limits, LoopMode, Reason
+from lowfc.control.loop.state import ActiveLoop, Conditions, LawRunner, Settings, State
+
+# What has the same name in the values and in the messages.
+_LIMITS = ("stroke_nm", "slew_nm", "neighbour_nm")
+_PAIRS = ("gain", "leak", "limit_nm")
+_SETTINGS = (
+    *("delay_frames", "max_frame_age_ns", "frame_timeout_ns", "on_frame_timeout", "rate_hz"),
+    *("min_flux_fraction", "max_saturated_pixels", "max_identical_frames"),
+)
+_STATE = (
+    *("frame_sequence", "frames_used", "refused_count", "frame_timeout", "commanded"),
+    *("input_number", "steps_left", "returning_to_zero", "identical_frames"),
+)
+_CONDITIONS = ("camera_awaited", "clear_id", "mode_cause")
+
+
+def controller_state(state: State, settings: Settings, time_ns: int) -> wire.ControllerState:
+    """Everything the next command depends on, besides the calibration."""
+    message = wire.ControllerState(
+        timestamp=timestamp(time_ns),
+        frame_timestamp=timestamp(state.frame_time_ns),
+        mode=wire_mode(state.mode),
+        delay_frames=settings.delay_frames,
+        counts=reason_counts(state),
+        refused=wire_reasons((state.refused,))[0] if state.refused is not None else wire.REASON_UNSPECIFIED,
+        limits_hit=wire_reasons(state.limits_hit),
+        settings=_encode_settings(settings),
+        **fields_of(state, _STATE),
+        **fields_of(state.conditions, _CONDITIONS),
+    )
+    conditions = state.conditions
+    if conditions.mode_since_ns:
+        message.mode_timestamp.CopyFrom(timestamp(conditions.mode_since_ns))
+    if conditions.camera is not None:
+        message.camera.CopyFrom(wire_camera(conditions.camera))
+    lease = conditions.lease
+    if lease is not None:
+        message.lease.CopyFrom(
+            wire.Lease(
+                id=lease.id,
+                holder=lease.holder,
+                until=timestamp(lease.until_ns),
+                last_sequence=lease.last_sequence,
+                ended=lease.ended,
+            )
+        )
+    if state.estimate is not None:
+        message.measured_nm.extend(state.estimate.error_nm.tolist())
+        message.flux_dn = state.estimate.flux_dn
+    if state.drive is not None:
+        if state.drive.additions is not None:
+            put_additions(message, state.drive.additions)
+        if state.drive.camera is not None:
+            message.camera_expected.CopyFrom(wire_camera(state.drive.camera))
+        following = state.drive.following
+        if following is not None:
+            message.law.CopyFrom(law_header(following.law))
+            message.law_state.extend(following.x.tolist())
+            message.law_frames = following.frames
+        message.calibration_id = state.drive.calibration.id
+        if not message.calibration_id:
+            message.mirror_rows, message.mirror_columns = state.drive.calibration.grid
+        message.gain.extend(state.drive.law.gain.tolist())
+        message.leak.extend(state.drive.law.leak.tolist())
+        message.limit_nm.extend(state.drive.law.limit_nm.tolist())
+        message.command_history_nm.extend(np.concatenate(state.drive.history_nm).tolist())
+        message.actuators = state.drive.actuators_nm.tobytes()
+    return message
+
+
+def decode_state(
+    message: wire.ControllerState,
+    calibration: Calibration | None,
+    laws: Mapping[str, LinearLaw] = MappingProxyType({}),
+    plays: Mapping[str, PlayTable] = MappingProxyType({}),
+) -> tuple[Settings, State]:
+    """Settings and state of a message; `calibration` is the one that it names, as are one of `laws` and of `plays`.
+
+    Raises:
+        ValueError: the message is not whole, the calibration is another one, or its law or table is not there.
+    """
+    settings = _decode_settings(message.settings)
+    drive = None
+    if message.mirror_rows:
+        calibration = Calibration.none((message.mirror_rows, message.mirror_columns))
+    if message.calibration_id or message.mirror_rows:
+        if calibration is None or calibration.id != message.calibration_id:
+            raise ValueError(f"calibration {message.calibration_id[:12]} of the controller's state is not there")
+        drive = ActiveLoop.at_rest(settings, calibration)
+        law = Law(*(np.array(values, np.float32) for values in (message.gain, message.leak, message.limit_nm)))
+        history = np.array(message.command_history_nm, np.float32).reshape(len(drive.history_nm), -1)
+        actuators = floats(message.actuators, *calibration.grid)
+        if law.gain.shape != drive.law.gain.shape or history.shape[1] != len(calibration.noll):
+            raise ValueError(f"the controller's state is not of {len(calibration.noll)} modes")
+        following = None
+        if message.HasField("law"):
+            x = np.array(message.law_state, np.float32)
+            following = LawRunner(law_of(message.law, laws), x, message.law_frames)
+            if x.shape != linear_law.at_rest(following.law).shape or following.law.noll != calibration.noll:
+                raise ValueError("the law of the controller's state does not fit")
+        drive = drive._replace(
+            law=law,
+            camera=camera_settings(message.camera_expected) if message.HasField("camera_expected") else drive.camera,
+            following=following,
+            additions=additions_of(message, drive.added(), drive.to_modes, plays),
+            history_nm=tuple(history),
+            actuators_nm=actuators,
+        )
+    state = State(
+        mode=LoopMode(message.mode),
+        drive=drive,
+        frame_time_ns=from_timestamp(message.frame_timestamp),
+        refused=Reason(message.refused) if message.refused else None,
+        limits_hit=tuple(Reason(reason) for reason in message.limits_hit),
+        counts={Reason(line.reason): line.count for line in message.counts},
+        estimate=Estimate(np.array(message.measured_nm, np.float32), message.flux_dn) if message.measured_nm else None,
+        conditions=Conditions(
+            camera=camera_settings(message.camera) if message.HasField("camera") else None,
+            mode_since_ns=from_timestamp(message.mode_timestamp),
+            lease=_lease(message.lease) if message.HasField("lease") else None,
+            **fields_of(message, _CONDITIONS),
+        ),
+        **fields_of(message, _STATE),
+    )
+    return settings, state
+
+
+def _lease(message: wire.Lease) -> Lease:
+    until_ns = from_timestamp(message.until)
+    return Lease(message.id, message.holder, until_ns, message.last_sequence, message.ended)
+
+
+def reason_counts(state: State) -> list[wire.ReasonCount]:
+    """How often each reason was given."""
+    pairs = zip(wire_reasons(tuple(state.counts)), state.counts.values(), strict=True)
+    return [wire.ReasonCount(reason=reason, count=count) for reason, count in pairs]
+
+
+def _encode_settings(settings: Settings) -> wire.ControllerSettings:
+    return wire.ControllerSettings(
+        start_mode=wire_mode(settings.start_mode),
+        **fields_of(settings.limits, _LIMITS),
+        **fields_of(settings, (*_SETTINGS, *_PAIRS)),
+    )
+
+
+def _decode_settings(message: wire.ControllerSettings) -> Settings:
+    pairs: dict[str, Any] = {name: tuple(getattr(message, name)) for name in _PAIRS}
+    if any(len(pair) != 2 for pair in pairs.values()):
+        raise ValueError("the settings of a controller have two gains, leaks and limits")
+    return Settings(
+        limits=Limits(*(getattr(message, name) for name in _LIMITS)),
+        start_mode=LoopMode(message.start_mode),
+        **fields_of(message, _SETTINGS),
+        **pairs,
+    )

@@ -1,0 +1,1 @@
+"""Calibrations and what is measured to make them."""

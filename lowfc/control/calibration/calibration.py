@@ -1,0 +1,199 @@
+"""From reference image and response matrix to the reconstructor: flux normalisation, weights, condition."""
+
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from lowfc.arrays import Array, Single
+from lowfc.control.loop.camera import CameraSettings
+from lowfc.control.loop.identity import identity
+
+ESTIMATORS = ("weighted", "pinv")
+
+SINGULAR = 1e8
+"""Condition number above which modes count as the same."""
+
+FIRST = "+first"
+"""Of an estimator: the first calibration of a commissioning."""
+
+
+@dataclass(frozen=True, slots=True)
+class Calibration:
+    """What turns a frame into modes and modes into actuators; single precision, as the loop uses it.
+
+    Attributes:
+        noll: Noll index of each mode.
+        reference: (pixels,) I0 in flux fractions; sums to 1 over the good pixels.
+        response: (pixels, modes) H in flux fractions per nm of wavefront rms.
+        reconstructor: (modes, pixels) R in nm per flux fraction; zero at bad pixels.
+        good: (pixels,) 1 where a pixel is used, 0 where not.
+        dark: (pixels,) DN.
+        modes_to_actuators: (actuators, modes) nm of surface per nm of wavefront rms; it contains the 1/2.
+        actuators_to_modes: (modes, actuators) nm of wavefront rms that R makes of a nm of surface; empty where it is
+            not known.
+        shape: rows and columns of the frame.
+        grid: rows and columns of the mirror.
+        flux_dn: expected sum of the good pixels, dark subtracted.
+        saturation_dn: highest value a pixel can have.
+        estimator: how R was made: weighted or pinv, and what was fitted along, as in weighted+shear.
+        wavelength_nm: at which H was made.
+        operator_hash: of the optical model behind it; empty for a measured calibration.
+        id: identity of the whole.
+        camera: settings at which it was made; None where they are not known.
+    """
+
+    noll: tuple[int, ...]
+    reference: Single
+    response: Single
+    reconstructor: Single
+    good: Single
+    dark: Single
+    modes_to_actuators: Single
+    shape: tuple[int, int]
+    grid: tuple[int, int]
+    flux_dn: float
+    saturation_dn: float
+    estimator: str
+    wavelength_nm: float
+    operator_hash: str
+    id: str
+    actuators_to_modes: Single = field(default_factory=lambda: np.zeros((0, 0), np.float32))
+    camera: CameraSettings | None = None
+
+    def __post_init__(self) -> None:
+        for name, shape in array_shapes(len(self.noll), self.shape, self.grid).items():
+            array = getattr(self, name)
+            if array.shape != shape and not (name == "actuators_to_modes" and not array.size):
+                raise ValueError(f"{name} must have shape {shape}, got {array.shape}")
+            if not np.isfinite(array).all():
+                raise ValueError(f"{name} holds values that are not finite")
+        if not self.flux_dn > 0:
+            raise ValueError(f"flux_dn must be above 0, got {self.flux_dn}")
+
+    @property
+    def provisional(self) -> bool:
+        """Whether it is the first one of a commissioning, which nobody has judged."""
+        return self.estimator.endswith(FIRST)
+
+    @classmethod
+    def none(cls, grid: tuple[int, int]) -> "Calibration":
+        """What stands for no calibration: a mirror of (rows, columns) actuators, without modes or pixels."""
+        shapes = array_shapes(0, (0, 0), grid)
+        arrays: dict[str, Any] = {name: np.zeros(shape, np.float32) for name, shape in shapes.items()}
+        rest: dict[str, Any] = {"estimator": "none", "wavelength_nm": 0.0, "operator_hash": "", "id": ""}
+        return cls((), shape=(0, 0), grid=grid, flux_dn=1.0, saturation_dn=np.inf, **arrays, **rest)
+
+    def identity(self) -> str:
+        """What `id` must be: a hash of everything else in it."""
+        camera = self.camera
+        settings = camera and (
+            *(camera.shape, camera.region, camera.bias_dn, camera.saturation_dn),
+            *(camera.gain_e_per_dn, camera.em_gain, camera.read_noise_e),
+        )
+        parts = [(name, getattr(self, name)) for name in _IDENTITY]
+        return identity([*parts, ("camera", settings)])
+
+
+_IDENTITY = (
+    *("noll", "reference", "response", "reconstructor", "good", "dark", "modes_to_actuators", "shape", "grid"),
+    *("flux_dn", "saturation_dn", "estimator", "wavelength_nm", "operator_hash", "actuators_to_modes"),
+)
+
+
+def array_shapes(modes: int, shape: tuple[int, int], grid: tuple[int, int]) -> dict[str, tuple[int, ...]]:
+    """Shape of each array of a calibration, by its name; `actuators_to_modes` may be empty."""
+    pixels, actuators = shape[0] * shape[1], grid[0] * grid[1]
+    return {
+        **dict.fromkeys(("reference", "good", "dark"), (pixels,)),
+        "response": (pixels, modes),
+        "reconstructor": (modes, pixels),
+        "modes_to_actuators": (actuators, modes),
+        "actuators_to_modes": (modes, actuators),
+    }
+
+
+def comparable(one: Calibration, other: Calibration) -> bool:
+    """Whether two calibrations are of the same pixels and modes."""
+    return one.shape == other.shape and one.noll == other.noll
+
+
+def normalise_flux(reference: Array, response: Array, good: Array) -> tuple[Array, Array]:
+    """Pass I0 (pixels,) and H (pixels, modes) through the normalisation that frames get: divided by their own flux.
+
+    Returns I0 in flux fractions and the derivative of I/sum(I) with respect to each mode, in flux fractions per nm.
+    """
+    flux = float(reference @ good)
+    if not flux > 0:
+        raise ValueError(f"the reference image has no light on the good pixels (sum {flux})")
+    fraction = reference / flux
+    change = good @ response / flux
+    return fraction, response / flux - np.outer(fraction, change)
+
+
+def reconstructor(
+    reference: Array,
+    response: Array,
+    good: Array,
+    flux_e: float,
+    read_noise_e: float,
+    estimator: str = "weighted",
+    nuisance: Array | None = None,
+) -> Array:
+    """R (modes, pixels) from normalised I0 and H: error = R (I - I0), the least-squares solution of eq. (11).
+
+    `weighted` is (H' W H)^-1 H' W with W = 1 / (I0 + read_noise^2) in electrons, the least noise that an unbiased
+    linear estimate can have; `pinv` weighs all pixels alike. Bad pixels get zero.
+
+    Args:
+        reference: (pixels,) I0, normalised.
+        response: (pixels, modes) H, normalised.
+        good: (pixels,) 1 where a pixel is used, else 0.
+        flux_e: Electrons on the good pixels.
+        read_noise_e: Of a pixel.
+        estimator: One of `ESTIMATORS`.
+        nuisance: (pixels, any) what else changes an image, normalised like H, in any unit: fitted along, so that it
+            does not pass for modes, and not returned. Of the flux itself, normalisation leaves nothing to fit.
+
+    Raises:
+        ValueError: unknown estimator, or modes that this sensor cannot tell apart.
+    """
+    if estimator == "weighted":
+        variance_e = np.maximum(reference, 0) * flux_e + read_noise_e**2
+        weights = good / np.maximum(variance_e, 1e-12 * variance_e.max())
+    elif estimator == "pinv":
+        weights = good
+    else:
+        raise ValueError(f"estimator must be one of {', '.join(ESTIMATORS)}, got {estimator!r}")
+    root = np.sqrt(weights)[:, None]
+    scaled = root * response
+    if not condition_number(scaled) < SINGULAR:
+        raise ValueError(
+            f"the sensor cannot tell the modes apart (condition number above {SINGULAR:.0e}): "
+            "an even-symmetric aperture mask cannot sense even modes; use another mask or fewer modes"
+        )
+    if nuisance is None:
+        return np.asarray(np.linalg.pinv(scaled) * root.T)
+    both = np.hstack([scaled, root * nuisance])
+    sizes = np.linalg.norm(both, axis=0)  # pinv leaves out singular values that are small beside the largest
+    if not (sizes.all() and condition_number(both / sizes) < SINGULAR):
+        raise ValueError("the sensor cannot tell the nuisance modes from the others: fit fewer of either")
+    inverse = np.linalg.pinv(both / sizes) / sizes[:, None]
+    return np.asarray((inverse * root.T)[: response.shape[1]])
+
+
+def condition_number(response: Array) -> float:
+    """Largest over smallest singular value of H (pixels, modes); infinite where a mode has no signal."""
+    singular = np.linalg.svd(response, compute_uv=False)
+    return float(singular[0] / singular[-1]) if singular[-1] > 0 else float("inf")
+
+
+def noise_nm(matrix: Array, reference: Array, flux_e: float, read_noise_e: float) -> Array:
+    """Standard deviation of each mode of one frame, in nm: photon and read noise through R (modes, pixels).
+
+    The normalisation divides by the frame's own noisy flux, so that each pixel's noise n acts as n - I0 sum(n).
+    """
+    good = (np.abs(matrix).sum(axis=0) > 0).astype(float)
+    variance = (np.maximum(reference, 0) * flux_e + read_noise_e**2) / flux_e**2
+    effective = matrix - np.outer(matrix @ reference, good)
+    return np.asarray(np.sqrt(effective**2 @ (variance * good)))

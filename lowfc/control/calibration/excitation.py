@@ -1,0 +1,103 @@
+"""What is played to measure a loop: multisines, whose lines belong to one mode each, and staircases of one mode.
+
+All lines of a multisine are odd multiples of one over its period, so that what a second-order nonlinearity makes of
+them falls between them, and no two are neighbours: Hann's window keeps them apart.
+"""
+
+import numpy as np
+import numpy.typing as npt
+
+from lowfc.arrays import Array, Single, Whole
+
+FEWEST_CYCLES = 3
+"""Of the lowest line in a period; below, the drift of the mean passes for it."""
+_APART = 3  # odd bins from one line of a mode to its next, at the least: the noise is measured between them
+_DRAWS = 32  # of the phases, of which the one with the lowest crest is kept
+
+
+def lines(period_frames: int, modes: int, lines_per_mode: int, lowest: float, highest: float) -> list[Whole]:
+    """Choose the lines of each mode, evenly in the logarithm of frequency as far as there are enough of them.
+
+    Args:
+        period_frames: Frames in a period.
+        modes: Modes that are excited at once.
+        lines_per_mode: Lines of each.
+        lowest: Frequency of the first line, cycles per frame.
+        highest: Frequency above which there is none, cycles per frame.
+
+    Returns:
+        For each mode (lines,), cycles per period: odd, ascending, and of no other mode.
+
+    Raises:
+        ValueError: the period is too short for the lowest frequency, or for so many lines.
+    """
+    if not 0 < lowest < highest <= 0.5:
+        raise ValueError(f"frequencies must ascend from above 0 to at most half of the rate, got {lowest}, {highest}")
+    if lowest * period_frames < FEWEST_CYCLES:
+        raise ValueError(
+            f"a period of {period_frames} frames holds {lowest * period_frames:.2g} cycles of the lowest frequency, it "
+            f"must be {FEWEST_CYCLES} or more"
+        )
+    first = int(np.ceil(lowest * period_frames)) | 1
+    count = modes * lines_per_mode
+    step = 2 * -(-_APART // modes)
+    places = (np.geomspace(first, highest * period_frames, count).astype(np.intp) - 1) | 1
+    places[0] = first
+    ahead = np.arange(count) * step
+    places = np.maximum.accumulate(places - ahead) + ahead  # each at least a step above the one before
+    if places[-1] > highest * period_frames:
+        room = int((highest * period_frames - first) // step) + 1
+        raise ValueError(
+            f"a period of {period_frames} frames has room for {room} lines, {count} are wanted: take a longer one, or "
+            "fewer lines or modes"
+        )
+    return [places[mode::modes] for mode in range(modes)]
+
+
+def multisine(period_frames: int, bins: list[Whole], rms_nm: float, seed: int) -> Single:
+    """One period (period_frames, modes) of sines of even height, with random phases of a low crest.
+
+    Args:
+        period_frames: Frames in the period.
+        bins: Lines of each mode, as `lines` gives them.
+        rms_nm: Of each mode.
+        seed: Of the phases.
+    """
+    rng = np.random.default_rng([seed, 7])
+    columns = []
+    for places in bins:
+        height = rms_nm * np.sqrt(2 / len(places)) * period_frames / 2
+        drawn = []
+        for _ in range(_DRAWS):
+            spectrum = np.zeros(period_frames // 2 + 1, complex)
+            spectrum[places] = height * np.exp(2j * np.pi * rng.random(len(places)))
+            drawn.append(np.fft.irfft(spectrum, period_frames))
+        columns.append(min(drawn, key=lambda column: float(np.abs(column).max())))
+    return np.stack(columns, axis=1).astype(np.float32)
+
+
+def led_in(period: Single, lead_frames: int) -> Single:
+    """A period (frames, modes) with what came before it, so that the loop has settled when it begins."""
+    return np.concatenate([period[np.arange(-lead_frames, 0) % len(period)], period])
+
+
+def climb(levels_nm: npt.ArrayLike, hold_frames: int, largest_step_nm: float) -> tuple[Array, Whole]:
+    """A staircase from zero over all levels and back to zero, as quickly as a step may be.
+
+    Args:
+        levels_nm: (levels,) in their order.
+        hold_frames: Frames at each level.
+        largest_step_nm: From one frame to the next.
+
+    Returns:
+        The staircase (frames,), and the first frame (levels,) at each level.
+    """
+    parts, starts, at_nm, frames = [], [], 0.0, 0
+    for level_nm in [*np.asarray(levels_nm, float).tolist(), 0.0]:
+        steps = max(1, int(np.ceil(abs(level_nm - at_nm) / largest_step_nm)))
+        ramp = np.linspace(at_nm, level_nm, steps + 1)[1:]
+        starts.append(frames + steps - 1)
+        parts += [ramp, np.full(hold_frames - 1, level_nm)]
+        frames += steps + hold_frames - 1
+        at_nm = level_nm
+    return np.concatenate(parts), np.array(starts[:-1], np.intp)

@@ -1,0 +1,150 @@
+"""The error budget of a closed loop: what noise, delay, cross-talk and nonlinearity each leave of the wavefront.
+
+A frame measures error = residual + m, where m is noise, cross-talk and nonlinearity; the loop leaves
+residual = S disturbance - T m, with S and T of `lowfc.control.laws.margins`.
+All terms are variances of the true residual.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from lowfc.arrays import Array, Mask
+from lowfc.control.calibration.calibration import noise_nm
+from lowfc.control.laws.linear_law import LinearLaw
+from lowfc.control.laws.margins import noise_gain, noise_transfer, rejection
+from lowfc.control.laws.spectra import Pieces, Spectrum, floor_nm2_hz, spectrum
+
+ROWS_PER_REGRESSOR = 10
+"""Frames for each regressor below which a fit mostly explains noise."""
+CERTAIN = 2.0
+"""Standard errors above which a difference of two variances is seen."""
+
+_ALIKE = 1e-7  # beside the largest singular value of the regressors
+
+
+@dataclass(frozen=True, slots=True)
+class Term:
+    """One term: variance of the true residual (modes,), and its standard error where it is a difference."""
+
+    variance_nm2: Array
+    error_nm2: Array | float = 0.0
+
+    def total(self, modes: Mask) -> tuple[float, bool]:
+        """Rms in nm over some of the modes (modes,), and whether it was seen: otherwise it is an upper limit."""
+        variance = float(self.variance_nm2[modes].sum())
+        error = float(np.sqrt((np.broadcast_to(self.error_nm2, self.variance_nm2.shape)[modes] ** 2).sum()))
+        if error == 0 or variance > CERTAIN * error:
+            return float(np.sqrt(max(variance, 0.0))), True
+        return float(np.sqrt(max(variance, 0.0) + CERTAIN * error)), False
+
+
+@dataclass(frozen=True, slots=True)
+class SensorNoise:
+    """Standard deviation (modes,) of one frame's modes, nm: by the light, and by reading it out."""
+
+    photon_nm: Array
+    read_nm: Array
+
+    @property
+    def total_nm(self) -> Array:
+        """Both (modes,)."""
+        return np.hypot(self.photon_nm, self.read_nm)
+
+
+def sensor_noise(
+    matrix: Array, reference: Array, flux_e: float, read_noise_e: float, excess: float = 1.0
+) -> SensorNoise:
+    """Noise of one frame through R (modes, pixels), split in two.
+
+    Args:
+        matrix: (modes, pixels) R, nm per flux fraction.
+        reference: (pixels,) I0, flux fractions.
+        flux_e: Electrons on the good pixels, before multiplication.
+        read_noise_e: Of a pixel, all that is not the light's, as electrons before multiplication.
+        excess: By which a multiplication register raises the photons' variance: 2, or 1 without one.
+    """
+    photon = noise_nm(matrix, reference, flux_e, 0.0)
+    both = noise_nm(matrix, reference, flux_e, read_noise_e)
+    return SensorNoise(np.sqrt(excess) * photon, np.sqrt(np.maximum(both**2 - photon**2, 0.0)))
+
+
+def white_noise(law: LinearLaw, noise_nm: Array) -> Term:
+    """What white noise of a frame (modes,) leaves through the loop."""
+    return Term(noise_nm**2 * noise_gain(law))
+
+
+def lag(law: LinearLaw, disturbance: Spectrum, mean_nm: Array) -> Term:
+    """What the loop leaves of a disturbance that is known, by its spectrum and its mean (modes,)."""
+    steady = (mean_nm * rejection(law, np.zeros(1))[0]) ** 2
+    return Term(disturbance.variance_nm2(rejection(law, disturbance.frequency_hz) ** 2) + steady)
+
+
+def lag_under_noise(law: LinearLaw, measured: Spectrum, mean_nm: Array) -> Term:
+    """The same of a disturbance that was measured with noise: the floor of its spectrum is taken off."""
+    passed = rejection(law, measured.frequency_hz) ** 2
+    floor = floor_nm2_hz(measured)
+    steady = (mean_nm * rejection(law, np.zeros(1))[0]) ** 2
+    above = measured.variance_nm2(passed) - floor * passed.sum(axis=0) * measured.spacing_hz
+    return Term(above + steady, measured.error_nm2(passed))
+
+
+@dataclass(frozen=True, slots=True)
+class MeasurementError:
+    """What the sensor adds to the true residual, beyond its noise."""
+
+    crosstalk: Term
+    nonlinearity: Term
+
+
+def measurement_error(
+    law: LinearLaw, error: Pieces, residual: Pieces, seen: Pieces, noise_nm: Array
+) -> MeasurementError | None:
+    """Split m = error - residual by a fit, and pass each part through the loop.
+
+    The part of m that follows linearly from a constant, the true residual and the command is cross-talk: a response
+    that is not the calibration's, light of what is no mode (a static screen, the mirror's print-through). What is left,
+    less the noise (modes,) that a frame must have, is nonlinearity. m's noise is younger than residual and command, so
+    that the fit is not biased by it; what it explains of the noise by chance is taken off.
+
+    Args:
+        law: Of the loop; its delay is the true one.
+        error: Measured modes of each frame.
+        residual: True modes of the same frames.
+        seen: Modal command that each of them saw.
+        noise_nm: Standard deviation of one frame's modes.
+
+    Returns:
+        None where the frames are too few for the fit, or for a spectrum.
+    """
+    rows = error.frames
+    if rows < ROWS_PER_REGRESSOR * (1 + 2 * len(law.noll)):
+        return None
+    regressors = np.hstack([np.ones((rows, 1)), residual.joined(), seen.joined()])
+    basis, sizes, _ = np.linalg.svd(regressors / np.maximum(np.linalg.norm(regressors, axis=0), 1e-30), False)
+    basis = basis[:, sizes > _ALIKE * sizes[0]]
+    added = error.joined() - residual.joined()
+    linear = basis @ (basis.T @ added)
+    rest = added - linear
+
+    def cut(column: Array) -> Spectrum | None:
+        ends = np.cumsum([len(piece) for piece in error.values])[:-1]
+        return spectrum(Pieces(tuple(np.split(column, ends)), error.bridged), law.rate_hz)
+
+    smooth, rough, each = cut(linear), cut(rest), cut(basis)
+    if smooth is None or rough is None or each is None:
+        return None
+    passed, at_rest = noise_transfer(law, rough.frequency_hz) ** 2, noise_transfer(law, np.zeros(1))[0] ** 2
+    steady = linear.mean(axis=0) ** 2 * at_rest
+    freedom = rows - basis.shape[1]
+    # What one unit of noise in each direction of the basis becomes behind the loop, (modes, directions).
+    by_chance = passed.T @ each.power_nm2_hz * each.spacing_hz + np.outer(at_rest, basis.mean(axis=0) ** 2)
+    noise_nm2 = np.sum(rest**2, axis=0) / freedom
+    left = rough.variance_nm2(passed) * rows / freedom - noise_nm**2 * noise_gain(law)
+    return MeasurementError(
+        Term(
+            smooth.variance_nm2(passed) + steady - noise_nm2 * by_chance.sum(axis=1),
+            noise_nm2 * np.sqrt(2 * np.sum(by_chance**2, axis=1)),
+        ),
+        Term(left, rough.error_nm2(passed)),
+    )

@@ -1,0 +1,47 @@
+"""The integrator: gain, leak and limit of each mode."""
+
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from lowfc.arrays import Single
+
+
+@dataclass(frozen=True, slots=True)
+class Law:
+    """Gain, leak and limit of each mode, each (modes,) float32; the limit is nm of wavefront rms.
+
+    Attributes:
+        kept: (modes,) 1 - leak.
+    """
+
+    gain: Single
+    leak: Single
+    limit_nm: Single
+    kept: Single = field(init=False)
+
+    def __post_init__(self) -> None:
+        if not self.gain.shape == self.leak.shape == self.limit_nm.shape:
+            raise ValueError(
+                f"gain, leak and limit must be as long as each other, got {self.gain.shape}, {self.leak.shape} "
+                f"and {self.limit_nm.shape}"
+            )
+        for name, array, low, high in (
+            ("gain", self.gain, 0, 4),
+            ("leak", self.leak, 0, 1),
+            ("limit_nm", self.limit_nm, 0, np.inf),
+        ):
+            if not (np.isfinite(array).all() and (array >= low).all() and (array <= high).all()):
+                raise ValueError(f"every {name} must be between {low} and {high}, got {array.tolist()}")
+        object.__setattr__(self, "kept", 1 - self.leak)
+
+
+def integrate(law: Law, command_nm: Single, error_nm: Single) -> tuple[Single, bool]:
+    """command[k+1] = (1 - leak) command[k] - gain error[k], cut to the limit of each mode; and whether any was cut.
+
+    All (modes,) float32, nm of wavefront rms.
+    """
+    wanted = law.kept * command_nm - law.gain * error_nm
+    if np.count_nonzero(np.abs(wanted) > law.limit_nm):
+        return np.clip(wanted, -law.limit_nm, law.limit_nm), True
+    return wanted, False

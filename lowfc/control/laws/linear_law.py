@@ -1,0 +1,190 @@
+"""A law of any kind as one linear system for all modes: PI, notches and Kalman filters are values of it."""
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, field
+from typing import Literal, NamedTuple
+
+import numpy as np
+
+from lowfc.arrays import Array, Single
+from lowfc.control.laws.stability import delay_weights
+from lowfc.control.loop.identity import identity
+
+Signal = Literal["error", "pol"]
+
+MOST_STATES = 512
+"""Of a law: a step of so many takes as long as a frame at 1 kHz may."""
+SIGNALS: tuple[Signal, ...] = ("error", "pol")
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class LinearLaw:
+    """x[k] = F x[k-1] + G y[k] + H c[k-1], wanted[k] = K x[k]; single precision, as the loop uses it.
+
+    y is the measured error or the pseudo-open-loop modes of frame k, c the modal command that was kept after all
+    limits. In place of a frame that is missing or refused, x[k] = A x[k-1] + H c[k-1].
+
+    Attributes:
+        signal: what y is.
+        transition: (states, states) F.
+        measurement_gain: (states, modes) G.
+        command_gain: (states, modes) H.
+        predict_only: (states, states) A.
+        output: (modes, states) K.
+        name: what kind of law it is, for people.
+        noll: Noll index of each mode.
+        delay_frames: the delay it was made for, as `lowfc.control.laws.stability.delay_weights`.
+        rate_hz: the frame rate it was made for.
+        id: identity of the whole.
+    """
+
+    signal: Signal
+    transition: Single
+    measurement_gain: Single
+    command_gain: Single
+    predict_only: Single
+    output: Single
+    name: str
+    noll: tuple[int, ...]
+    delay_frames: float
+    rate_hz: float
+    id: str = field(init=False)
+
+    def __post_init__(self) -> None:
+        if self.signal not in SIGNALS:
+            raise ValueError(f"the signal of a law must be one of {', '.join(SIGNALS)}, got {self.signal!r}")
+        states, modes = self.transition.shape[0], len(self.noll)
+        for name, shape in matrix_shapes(states, modes).items():
+            array = np.ascontiguousarray(getattr(self, name), dtype=np.float32)
+            if array.shape != shape:
+                raise ValueError(f"{name} must have shape {shape}, got {array.shape}")
+            if not np.isfinite(array).all():
+                raise ValueError(f"{name} holds values that are not finite")
+            object.__setattr__(self, name, array)
+        if not (states and modes) or states > MOST_STATES:
+            raise ValueError(f"a law must have modes, and 1 to {MOST_STATES} states; got {modes} and {states}")
+        delay_weights(self.delay_frames)  # says what is wrong with a delay
+        if not (np.isfinite(self.rate_hz) and self.rate_hz > 0):
+            raise ValueError(f"rate_hz must be above 0, got {self.rate_hz}")
+        object.__setattr__(self, "id", identity((hashed, getattr(self, name)) for hashed, name in _IDENTITY))
+
+
+def matrix_shapes(states: int, modes: int) -> dict[str, tuple[int, int]]:
+    """Shape of each matrix of a law, by its name."""
+    square, in_, out = (states, states), (states, modes), (modes, states)
+    return {
+        "transition": square,
+        "measurement_gain": in_,
+        "command_gain": in_,
+        "predict_only": square,
+        "output": out,
+    }
+
+
+# The names that are hashed are those of 0.1, so that laws keep their identities.
+_IDENTITY = (
+    ("signal", "signal"),
+    ("follow", "transition"),
+    ("gain", "measurement_gain"),
+    ("kept", "command_gain"),
+    ("coast", "predict_only"),
+    *((name, name) for name in ("output", "name", "noll", "delay_frames", "rate_hz")),
+)
+
+
+def at_rest(law: LinearLaw) -> Single:
+    """The state x (states,) before the first frame."""
+    return np.zeros(len(law.transition), np.float32)
+
+
+def follow(law: LinearLaw, x: Single, y: Single, kept: Single) -> Single:
+    """The state (states,) after a frame: y (modes,) of it, and the command (modes,) kept before it."""
+    after: Single = law.transition @ x
+    after += law.measurement_gain @ y
+    after += law.command_gain @ kept
+    return after
+
+
+def coast(law: LinearLaw, x: Single, kept: Single) -> Single:
+    """The state (states,) one frame later, where that frame is missing or refused."""
+    after: Single = law.predict_only @ x
+    after += law.command_gain @ kept
+    return after
+
+
+def respond(law: LinearLaw, x: Single) -> Single:
+    """The command (modes,) that the law wants, nm of wavefront rms, before any limit."""
+    wanted: Single = law.output @ x
+    return wanted
+
+
+class Block(NamedTuple):
+    """The part of a law that belongs to one mode: F (s, s), G (s,), H (s,), A (s, s), K (s,)."""
+
+    follow: Array
+    gain: Array
+    kept: Array
+    coast: Array
+    output: Array
+
+
+def of_blocks(
+    blocks: Sequence[Block], signal: Signal, name: str, noll: tuple[int, ...], delay_frames: float, rate_hz: float
+) -> LinearLaw:
+    """The law whose modes are these blocks, one for each mode.
+
+    Raises:
+        ValueError: another number of blocks than of modes, or one of them does not fit itself.
+    """
+    if len(blocks) != len(noll):
+        raise ValueError(f"a law of {len(noll)} modes needs as many blocks, got {len(blocks)}")
+    ends = np.cumsum([len(block.gain) for block in blocks])
+    states = int(ends[-1])
+    F, A = np.zeros((states, states)), np.zeros((states, states))
+    G, H = np.zeros((states, len(noll))), np.zeros((states, len(noll)))
+    K = np.zeros((len(noll), states))
+    for mode, (block, end) in enumerate(zip(blocks, ends.tolist(), strict=True)):
+        here = slice(end - len(block.gain), end)
+        F[here, here], A[here, here] = block.follow, block.coast
+        G[here, mode], H[here, mode], K[mode, here] = block.gain, block.kept, block.output
+
+    def single(array: Array) -> Single:
+        return array.astype(np.float32)
+
+    matrices = (single(F), single(G), single(H), single(A), single(K))
+    return LinearLaw(signal, *matrices, name, noll, delay_frames, rate_hz)
+
+
+def integrator_block(gain: float, leak: float, signal: Signal, delay_frames: float) -> Block:
+    """c[k] = (1 - leak) c[k-1] - gain e[k], of the error or of pseudo-open-loop modes.
+
+    Of the latter, e[k] = pol[k] + sum_j w_j c[k-1-j], for which the block remembers commands. Where frames are missing
+    it holds, from the second of them on if it remembers commands.
+    """
+    if signal == "error":
+        return Block(np.zeros((1, 1)), np.array([-gain]), np.array([1 - leak]), np.zeros((1, 1)), np.ones(1))
+    weights = delay_weights(delay_frames)
+    registers = len(weights)  # x = pol[k], c[k-1], c[k-2], ...
+    F = np.diag(np.ones(registers), -1)
+    F[1, 0] = 0.0
+    A = F.copy()
+    A[0, 1:] = -weights
+    G, H = np.zeros(1 + registers), np.zeros(1 + registers)
+    G[0] = H[1] = 1.0
+    K = np.concatenate([[-gain], -gain * weights])
+    K[1] += 1 - leak
+    return Block(F, G, H, A, K)
+
+
+def integrator(
+    gain: Iterable[float], leak: Iterable[float], noll: tuple[int, ...], delay_frames: float, rate_hz: float
+) -> LinearLaw:
+    """The loop's integrator, of gain and leak (modes,), as a linear law of the error; its limits are not in it.
+
+    Raises:
+        ValueError: they are not of as many modes.
+    """
+    blocks = [
+        integrator_block(float(g), float(lost), "error", delay_frames) for g, lost in zip(gain, leak, strict=True)
+    ]
+    return of_blocks(blocks, "error", "integrator", noll, delay_frames, rate_hz)

@@ -1,0 +1,278 @@
+"""What a linear law makes of a loop: closed-loop poles, margins, rejection, noise transfer, for any true delay.
+
+A frame measures error = disturbance + noise + B command with B(z) = sum_j w_j z^-(1+j), w of the true delay; the law
+answers command = -C error. Then L = C B, S = 1 / (1 + L) and T = L S. Modes that a law couples are taken one by one,
+the others closed: L of a mode is 1/S - 1.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from lowfc.arrays import Array, Complex, Mask, Whole
+from lowfc.control.laws.linear_law import LinearLaw
+from lowfc.control.laws.stability import delay_weights
+
+SAME_RATE = 0.01
+"""By which the rate of a law's frames may differ from the camera's."""
+MOST_COUPLED = 100
+"""States that have to do with each other: the poles of so many take 30 ms, within which no frame is answered."""
+
+_GRID = 2048
+_AROUND_POLE = np.concatenate([-np.geomspace(1e-2, 1e2, 33)[::-1], [0.0], np.geomspace(1e-2, 1e2, 33)])
+_LOWEST = 1e-6  # rad per frame: an integrator has no value at 0 Hz
+_STILL = 1e-6  # pole above 1 by rounding to single precision, where nothing is driven
+
+
+@dataclass(frozen=True, slots=True)
+class Margins:
+    """Of each mode, (modes,); all but `radius` mean something only where the loop is stable.
+
+    Attributes:
+        radius: largest modulus of the closed-loop poles of the mode (and of those that it is coupled with).
+        gain_margin: factor by which the loop's gain may grow, infinite where it may by any.
+        gain_reduction: factor above which it must stay; 0 where it may fall to nothing.
+        phase_margin_deg: lag at which it oscillates; 180 where the loop never has a gain of 1.
+        peak: largest |S|: 1 over the modulus margin, the least distance of L from -1.
+    """
+
+    radius: Array
+    gain_margin: Array
+    gain_reduction: Array
+    phase_margin_deg: Array
+    peak: Array
+
+    @property
+    def stable(self) -> bool:
+        """Whether every pole lies within the unit circle."""
+        return bool((self.radius < 1).all())
+
+
+def margins(law: LinearLaw, delay_frames: float) -> Margins:
+    """Poles and margins of the loop that this law closes, when the true delay is `delay_frames`."""
+    modes = len(law.noll)
+    found = Margins(*(np.full(modes, fill) for fill in (0.0, np.inf, 0.0, 180.0, 1.0)))
+    for part in _parts(law):
+        poles = _poles(part.closed(delay_weights(delay_frames)))
+        radius = float(np.abs(poles).max())
+        found.radius[part.modes] = radius if part.driven or radius > 1 + _STILL else min(radius, 1 - _STILL)
+        if not part.driven:
+            continue
+        omega = _frequencies(np.concatenate([poles, _poles(part.F + part.H @ part.K)]))
+        S = part.sensitivity(omega, delay_weights(delay_frames))
+        for place, mode in enumerate(part.modes.tolist()):
+            own = S[:, place, place]
+            loop = 1 / own - 1
+            found.peak[mode] = np.abs(own).max()
+            found.gain_margin[mode], found.gain_reduction[mode] = _gain_margins(loop)
+            found.phase_margin_deg[mode] = _phase_margin_deg(loop)
+    return found
+
+
+def check_law(law: LinearLaw, delay_frames: float, rate_hz: float) -> None:
+    """Refuse a law that was made for another loop; `rate_hz` is 0 where it is not known.
+
+    Raises:
+        ValueError: it reckons with another delay, is of another rate, or is not stable here.
+    """
+    if law.signal == "pol" and abs(law.delay_frames - delay_frames) > 1e-3:
+        raise ValueError(
+            f"the law reckons with a delay of {law.delay_frames:g} frames, the loop with {delay_frames:g}: "
+            "set control.delay_frames, or make the law for that"
+        )
+    if rate_hz and abs(law.rate_hz - rate_hz) > SAME_RATE * rate_hz:
+        raise ValueError(
+            f"the law was made for {law.rate_hz:g} Hz, the frames come at {rate_hz:g} Hz: make another with "
+            "`lowfc tune` from a log of this rate"
+        )
+    check_stable(law, delay_frames)
+
+
+def check_stable(law: LinearLaw, delay_frames: float) -> None:
+    """Refuse a law that does not settle, closed or while the loop is open or frames are missing.
+
+    It takes a few milliseconds, for poles are all it needs; `margins` takes a hundred times as long.
+
+    Raises:
+        ValueError: it does not settle, and the sentence has the pole; or more than `MOST_COUPLED` states have to do
+            with each other.
+    """
+    weights = delay_weights(delay_frames)
+    for part in _parts(law):
+        if len(part.F) > MOST_COUPLED:
+            raise ValueError(
+                f"{len(part.F)} states of the law {law.name!r} have to do with each other; {MOST_COUPLED} are the most "
+                "whose poles can be found between two frames"
+            )
+        matrices = (
+            ("closed", part.closed(weights)),
+            ("open", part.F),
+            ("without frames", part.A),
+            ("without frames", part.A + part.H @ part.K),
+        )
+        for state, matrix in matrices:
+            radius = float(np.abs(_poles(matrix)).max())
+            at_most = 1 + _STILL if state != "closed" or not part.driven else 1.0
+            if radius > at_most or (radius == 1 and at_most == 1):
+                modes = ", ".join(f"Z{law.noll[mode]}" for mode in part.modes)
+                raise ValueError(
+                    f"the law {law.name!r} is unstable with a delay of {delay_frames:g} frames: {state}, {modes} has "
+                    f"a pole at {radius:.4f}, it must be below 1 (it was made for {law.delay_frames:g} frames at "
+                    f"{law.rate_hz:g} Hz)"
+                )
+
+
+def sentence(found: Margins) -> str:
+    """The smallest margins of all modes in words."""
+    return (
+        f"gain margin {found.gain_margin.min():.3g}, phase margin {found.phase_margin_deg.min():.0f} deg, "
+        f"max |S| {found.peak.max():.3g}"
+    )
+
+
+def rejection(law: LinearLaw, frequency_hz: Array, delay_frames: float | None = None) -> Array:
+    """|S| (frequencies, modes): true residual over disturbance; with the delay of the law where none is given."""
+    return np.abs(_sensitivity(law, frequency_hz, delay_frames))
+
+
+def noise_transfer(law: LinearLaw, frequency_hz: Array, delay_frames: float | None = None) -> Array:
+    """|T| (frequencies, modes): true residual over measurement noise of the same mode."""
+    return np.abs(_sensitivity(law, frequency_hz, delay_frames) - 1)
+
+
+def noise_gain(law: LinearLaw, delay_frames: float | None = None) -> Array:
+    """Variance (modes,) of the residual per variance of white noise of one frame of the same mode."""
+    found, weights = np.zeros(len(law.noll)), _weights(law, delay_frames)
+    for part in _parts(law):
+        if not part.driven:
+            continue
+        omega = _frequencies(_poles(part.closed(weights)))
+        S = part.sensitivity(omega, weights)
+        for place, mode in enumerate(part.modes.tolist()):
+            found[mode] = np.trapezoid(np.abs(S[:, place, place] - 1) ** 2, omega) / np.pi
+    return found
+
+
+def _weights(law: LinearLaw, delay_frames: float | None) -> Array:
+    return delay_weights(law.delay_frames if delay_frames is None else delay_frames)
+
+
+def _sensitivity(law: LinearLaw, frequency_hz: Array, delay_frames: float | None) -> Complex:
+    """S (frequencies, modes) of each mode."""
+    weights = _weights(law, delay_frames)
+    omega = np.maximum(2 * np.pi * np.asarray(frequency_hz, dtype=float) / law.rate_hz, _LOWEST)
+    found = np.ones((omega.size, len(law.noll)), complex)
+    for part in _parts(law):
+        S = part.sensitivity(omega, weights)
+        found[:, part.modes] = np.einsum("fmm->fm", S)
+    return found
+
+
+@dataclass(frozen=True, slots=True)
+class _Part:
+    """The states and modes of a law that have to do with each other, in double precision."""
+
+    modes: Whole
+    F: Array
+    G: Array
+    H: Array
+    A: Array
+    K: Array
+    own_weights: Array
+    """Of the delay that the law reckons with in y; empty where y is the error."""
+
+    @property
+    def driven(self) -> bool:
+        """Whether what is measured moves the command at all."""
+        return bool(self.G.any() and self.K.any())
+
+    def answer(self, z: Complex) -> Complex:
+        """What the law commands of an error, (frequencies, modes, modes)."""
+        identity = np.eye(len(self.F))
+        inside = identity - (self.F + self.H @ self.K) / z[:, None, None]
+        answer = self.K @ np.linalg.solve(inside, np.broadcast_to(self.G.astype(complex), (z.size, *self.G.shape)))
+        if not self.own_weights.size:
+            return np.asarray(answer)
+        believed = np.polynomial.polynomial.polyval(1 / z, self.own_weights) / z
+        return np.asarray(np.linalg.solve(np.eye(len(self.modes)) + answer * believed[:, None, None], answer))
+
+    def sensitivity(self, omega: Array, weights: Array) -> Complex:
+        """S (frequencies, modes, modes) at rad per frame."""
+        z = np.exp(1j * omega)
+        seen = np.polynomial.polynomial.polyval(1 / z, weights) / z
+        return np.asarray(np.linalg.inv(np.eye(len(self.modes)) - seen[:, None, None] * self.answer(z)))
+
+    def closed(self, weights: Array) -> Array:
+        """The matrix of the closed loop: x[k-1], c[k-1], c[k-2], ... one frame on."""
+        states, modes = len(self.F), len(self.modes)
+        lags = max(weights.size, self.own_weights.size)
+        sees = np.zeros(lags)
+        sees[: weights.size] += weights
+        sees[: self.own_weights.size] -= self.own_weights
+        history = np.kron(sees, self.G)  # y[k] = sum_j sees_j c[k-1-j]
+        history[:, :modes] += self.H
+        state = np.hstack([self.F, history])
+        command = self.K @ state
+        older = np.eye(modes * (lags - 1), states + modes * lags, states)
+        return np.vstack([state, command, older])
+
+
+def _parts(law: LinearLaw) -> list[_Part]:
+    """The law cut into parts that have nothing to do with each other."""
+    matrices = (law.transition, law.measurement_gain, law.command_gain, law.predict_only, law.output)
+    F, G, H, A, K = (matrix.astype(np.float64) for matrix in matrices)
+    states, modes = len(F), len(law.noll)
+    linked = np.block([[np.abs(F) + np.abs(A), np.abs(G) + np.abs(H)], [np.abs(K), np.zeros((modes, modes))]])
+    label = _first_linked(linked + linked.T + np.eye(len(linked)) > 0)
+    own = delay_weights(law.delay_frames) if law.signal == "pol" else np.zeros(0)
+    found = []
+    for number in np.unique(label).tolist():
+        x, m = np.flatnonzero(label[:states] == number), np.flatnonzero(label[states:] == number)
+        if m.size and x.size:
+            own_states, driving = np.ix_(x, x), np.ix_(x, m)
+            found.append(_Part(m, F[own_states], G[driving], H[driving], A[own_states], K[np.ix_(m, x)], own))
+    return found
+
+
+def _first_linked(linked: Mask) -> Whole:
+    """The first of those that each (n,) is linked with over others, from (n, n); scipy.sparse takes 0.3 s to import."""
+    while True:
+        further = linked.astype(np.float32) @ linked.astype(np.float32) > 0
+        if (further == linked).all():
+            return np.asarray(np.argmax(linked, axis=1))
+        linked = further
+
+
+def _poles(matrix: Array) -> Complex:
+    return np.asarray(np.linalg.eigvals(matrix), dtype=np.complex128)
+
+
+def _frequencies(poles: Complex) -> Array:
+    """Rad per frame from 0 to pi, ascending: everywhere, towards 0, and densely around each pole."""
+    near = poles[np.abs(poles) > 0.5]
+    gap = np.maximum(np.abs(1 - np.abs(near)), 1e-9)
+    around = np.abs(np.angle(near))[:, None] + gap[:, None] * _AROUND_POLE
+    grids = (np.linspace(0, np.pi, _GRID), np.geomspace(_LOWEST, np.pi, _GRID), around.ravel())
+    every = np.unique(np.concatenate(grids))
+    return np.asarray(every[(every >= _LOWEST) & (every <= np.pi)])
+
+
+def _gain_margins(loop: Complex) -> tuple[float, float]:
+    """Growth and reduction at which L passes through -1: where it crosses the negative real axis."""
+    before, after = loop[:-1], loop[1:]
+    crosses = np.signbit(before.imag) != np.signbit(after.imag)
+    a, b = before[crosses], after[crosses]
+    real = a.real - a.imag * (b.real - a.real) / (b.imag - a.imag)
+    real = np.append(real, loop[-1].real)  # at pi it is real
+    sizes = -real[real < 0]
+    below, above = sizes[sizes < 1], sizes[sizes >= 1]
+    return float(1 / below.max()) if below.size else np.inf, float(1 / above.min(initial=np.inf))
+
+
+def _phase_margin_deg(loop: Complex) -> float:
+    """Least angle between L and -1 where |L| = 1."""
+    size = np.log(np.abs(loop))
+    crosses = np.flatnonzero(np.signbit(size[:-1]) != np.signbit(size[1:]))
+    share = size[crosses] / (size[crosses] - size[crosses + 1])
+    at = loop[crosses] + share * (loop[crosses + 1] - loop[crosses])
+    return float(np.degrees(np.abs(np.angle(-at)).min(initial=np.pi)))

@@ -1,0 +1,115 @@
+"""PI laws, leaky or not, with notches in their rejection: resonators that take out a line each."""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+from scipy.linalg import block_diag, solve_discrete_are
+
+from lowfc.arrays import Array
+from lowfc.control.laws.linear_law import Block, LinearLaw, of_blocks
+from lowfc.control.laws.stability import delay_weights
+
+_EXACT = 1e-6  # variance of what was kept beside that of the states; the Riccati equation needs some
+_UNKNOWN = 1e-3  # more of it, and a law takes longer to leave a limit; less, and its states forget more slowly
+
+
+class Notch(NamedTuple):
+    """A notch of the rejection: at `frequency_hz` it is divided by `depth`; `width_hz` is between its -3 dB points."""
+
+    frequency_hz: float
+    width_hz: float
+    depth: float
+
+
+def pi_notch(
+    noll: tuple[int, ...],
+    gain: Array,
+    proportional: Array,
+    leak: Array,
+    notches: Sequence[Sequence[Notch]],
+    delay_frames: float,
+    rate_hz: float,
+) -> LinearLaw:
+    """A PI law with a resonator for each notch, whose phase makes up for the delay at its own frequency.
+
+    Without notches c[k] = (1 - leak) (c[k-1] + proportional e[k-1]) - (gain + proportional) e[k]. Its states follow the
+    command that was kept, so that a limit does not wind it up and closing starts from the command that is held. Whether
+    it is stable, `lowfc.control.laws.margins` says.
+
+    Args:
+        noll: Noll index of each mode.
+        gain: (modes,) integral gain, per frame.
+        proportional: (modes,) proportional gain.
+        leak: (modes,) of the integral, per frame.
+        notches: Of each mode.
+        delay_frames: See `lowfc.control.laws.stability.delay_weights`.
+        rate_hz: Frame rate.
+
+    Raises:
+        ValueError: arrays of other lengths, or impossible values.
+    """
+    for name, values in (("gain", gain), ("proportional", proportional), ("leak", leak), ("notches", notches)):
+        if len(values) != len(noll):
+            raise ValueError(f"{name} must be given for each of {len(noll)} modes, got {len(values)}")
+    for notch in (one for many in notches for one in many):
+        if not (0 < notch.frequency_hz < rate_hz / 2 and 0 < notch.width_hz < rate_hz / 2 and notch.depth > 1):
+            raise ValueError(
+                f"a notch lies between 0 and {rate_hz / 2:g} Hz, has a width in the same range and a depth above 1, "
+                f"got {notch}"
+            )
+    modes = zip(gain.tolist(), proportional.tolist(), leak.tolist(), notches, strict=True)
+    blocks = [_block(*of_mode, delay_frames, rate_hz) for of_mode in modes]
+    name = "pi-notch" if any(notches) else "pi"
+    return of_blocks(blocks, "error", name, noll, delay_frames, rate_hz)
+
+
+def _block(
+    gain: float, proportional: float, leak: float, notches: Sequence[Notch], delay_frames: float, rate_hz: float
+) -> Block:
+    """States: the integral, the error, and a rotating pair for each notch; u = C s, s[k] = P s[k-1] + B e[k]."""
+    weights = delay_weights(delay_frames)
+    residues: list[tuple[complex, complex]] = []  # pole, residue
+
+    def law(z: complex) -> complex:
+        found = gain / (1 - (1 - leak) / z) + proportional
+        for pole, residue in residues:
+            found += residue / (1 - pole / z) + residue.conjugate() / (1 - pole.conjugate() / z)
+        return found
+
+    for notch in notches:
+        omega = 2 * np.pi * notch.frequency_hz / rate_hz
+        z = complex(np.exp(1j * omega))
+        # The resonator R makes S = S0 / (1 + R P S0); with R P S0 = (depth - 1) a / (a + i (w - w0)) that is a notch
+        # of this depth and, between its -3 dB points, of width 2 a depth.
+        pole = complex(np.exp(-np.pi * notch.width_hz / rate_hz / notch.depth) * z)
+        seen = complex(np.polynomial.polynomial.polyval(1 / z, weights)) / z
+        wanted = (notch.depth - 1) * (1 / seen + law(z))
+        near, far = 1 / (1 - pole / z), 1 / (1 - pole.conjugate() / z)
+        parts = np.array([[(near + far).real, (far - near).imag], [(near + far).imag, (near - far).real]])
+        real, imaginary = np.linalg.solve(parts, [wanted.real, wanted.imag])
+        residues.append((pole, complex(real, imaginary)))
+
+    rotations = [np.array([[pole.real, -pole.imag], [pole.imag, pole.real]]) for pole, _ in residues]
+    P = block_diag([[1 - leak]], [[0.0]], *rotations)
+    B = np.array([-gain, 1.0, *([1.0, 0.0] * len(residues))])
+    C = np.array([1.0, -proportional])
+    for _, residue in residues:
+        C = np.append(C, [-2 * residue.real, 2 * residue.imag])
+    M = _correction(P, B, C)
+    F = P @ (np.eye(len(P)) - np.outer(M, C))
+    return Block(F, B, P @ M, F, C)
+
+
+def _correction(P: Array, B: Array, C: Array) -> Array:
+    """M (states,): how much of kept - wanted goes to each state, so that C (s + M (kept - C s)) = kept.
+
+    Without notches all of it is the integral's. Otherwise it is the steady Kalman gain for the states of a law that
+    kept commands came from: errors of variance 1, and a little that the law does not know.
+    """
+    if len(C) == 2:
+        return np.array([1.0, 0.0])
+    unknown = np.concatenate([[1.0, 0.0], np.repeat(1 / np.sum(C[2:].reshape(-1, 2) ** 2, axis=1), 2)])
+    covariance = solve_discrete_are(P.T, C[:, None], np.outer(B, B) + _UNKNOWN * np.diag(unknown), [[_EXACT]])
+    towards = covariance @ C
+    return np.asarray(towards / (C @ towards))

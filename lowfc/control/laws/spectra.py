@@ -1,0 +1,145 @@
+"""Power spectra of modes, where frames are missing too: short gaps are bridged, long ones part a run into pieces."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+from scipy.signal import welch
+
+from lowfc.arrays import Array, Sequences, Whole
+
+MOST_BRIDGED = 3
+"""Frames missing in a row that are interpolated; a longer gap begins a new piece."""
+SHORTEST, LONGEST = 64, 2048
+"""Frames in a segment of Welch's method; with less than the shortest there is no spectrum."""
+_SEGMENT_SHARE = 4  # of the longest piece: seven segments of it, each over half of the next
+
+
+@dataclass(frozen=True, slots=True)
+class Pieces:
+    """Evenly sampled pieces of a run.
+
+    Attributes:
+        values: (frames, columns) each.
+        bridged: frames among them that were missing and are interpolated.
+    """
+
+    values: tuple[Array, ...]
+    bridged: int
+
+    @property
+    def frames(self) -> int:
+        """Frames in all of them."""
+        return sum(len(piece) for piece in self.values)
+
+    def columns(self, which: slice) -> "Pieces":
+        """The same frames, some of the columns."""
+        return Pieces(tuple(piece[:, which] for piece in self.values), self.bridged)
+
+    def joined(self) -> Array:
+        """All frames (frames, columns), one piece after the other."""
+        return np.concatenate(self.values)
+
+
+@dataclass(frozen=True, slots=True)
+class Spectrum:
+    """One-sided power spectral density.
+
+    Attributes:
+        frequency_hz: (frequencies,) from 0 to half of the rate, evenly spaced.
+        power_nm2_hz: (frequencies, columns); its sum times the spacing is the variance.
+        segments: averaged; half of each is in the next.
+    """
+
+    frequency_hz: Array
+    power_nm2_hz: Array
+    segments: int
+
+    @property
+    def spacing_hz(self) -> float:
+        """From one frequency to the next."""
+        return float(self.frequency_hz[1])
+
+    def variance_nm2(self, filtered: Array | float = 1.0) -> Array:
+        """Variance (columns,) behind a filter whose power transmission is (frequencies,) or (frequencies, columns)."""
+        return np.asarray(np.sum(self.power_nm2_hz * filtered, axis=0) * self.spacing_hz)
+
+    def error_nm2(self, filtered: Array | float = 1.0) -> Array:
+        """Standard error (columns,) of that variance, for noise.
+
+        Hann's window makes neighbours alike: three of them are worth two. Its segments, half over each other, are all
+        but independent.
+        """
+        squares = np.sum((self.power_nm2_hz * filtered) ** 2, axis=0)
+        return np.asarray(np.sqrt(1.5 * squares / self.segments) * self.spacing_hz)
+
+
+def pieces(sequence: Sequences, values: npt.NDArray[np.floating]) -> Pieces:
+    """Cut a run into evenly sampled pieces.
+
+    Args:
+        sequence: (rows,) of each row's frame, consecutive where nothing is missing; what does not grow is left out.
+        values: (rows, columns); a row with a NaN is a missing frame.
+    """
+    there = np.isfinite(values).all(axis=1)
+    sequence, values = sequence[there], values[there].astype(np.float64)
+    if not sequence.size:
+        return Pieces((), 0)
+    newest = np.maximum.accumulate(sequence)
+    newer = np.concatenate([[True], sequence[1:] > newest[:-1]])
+    sequence, values = sequence[newer], values[newer]
+    missing = np.diff(sequence) - np.uint64(1)
+    cuts = np.flatnonzero(missing > MOST_BRIDGED) + 1
+    found = [
+        _even((numbers - numbers[0]).astype(np.int64), rows)
+        for numbers, rows in zip(np.split(sequence, cuts), np.split(values, cuts), strict=True)
+    ]
+    return Pieces(tuple(found), int(missing[missing <= MOST_BRIDGED].sum()))
+
+
+def spectrum(run: Pieces, rate_hz: float) -> Spectrum | None:
+    """Welch's estimate over all pieces that hold a segment; None where none does.
+
+    Segments have Hann's window and lose their mean; their length, a power of two, follows from the longest piece.
+    """
+    longest = max((len(piece) for piece in run.values), default=0)
+    if longest < SHORTEST:
+        return None
+    frames = min(LONGEST, max(SHORTEST, 1 << ((longest // _SEGMENT_SHARE).bit_length() - 1)))
+    total = np.zeros((frames // 2 + 1, run.values[0].shape[1]))
+    segments = 0
+    for piece in run.values:
+        if len(piece) >= frames:
+            count = (len(piece) - frames) // (frames // 2) + 1
+            total += count * welch(piece, rate_hz, "hann", frames, detrend="constant", axis=0)[1]
+            segments += count
+    frequency_hz = np.asarray(np.fft.rfftfreq(frames, 1 / rate_hz), dtype=np.float64)
+    return Spectrum(frequency_hz, total / segments, segments)
+
+
+def floor_nm2_hz(found: Spectrum) -> Array:
+    """Level (columns,) of white noise: the median over the upper half of the frequencies, its bias removed.
+
+    A median of chi-squared values lies below their mean; lines and slopes of the disturbance hardly move it.
+    """
+    upper = found.power_nm2_hz[found.frequency_hz.size // 2 : -1]
+    freedom = 2 * found.segments
+    return np.asarray(np.median(upper, axis=0) / (1 - 2 / (9 * freedom)) ** 3)
+
+
+def in_bins(frequency_hz: Array, columns: Sequence[Array], per_decade: int = 20) -> tuple[Array, list[Array]]:
+    """Means over bins of even width in the logarithm of frequency, without 0 Hz: the frequencies, and each column."""
+    places = np.floor(per_decade * np.log10(frequency_hz[1:])).astype(int)
+    starts = np.flatnonzero(np.diff(places, prepend=places[0] - 1))
+    counts = np.diff(starts, append=places.size)
+    means = [np.add.reduceat(column[1:], starts) / counts for column in (frequency_hz, *columns)]
+    return means[0], means[1:]
+
+
+def _even(position: Whole, rows: Array) -> Array:
+    """Rows at every position from the first to the last, interpolated where there is none."""
+    everywhere = np.arange(position[-1] + 1)
+    if everywhere.size == position.size:
+        return rows
+    return np.stack([np.interp(everywhere, position, column) for column in rows.T], axis=1)

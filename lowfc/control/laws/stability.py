@@ -1,0 +1,83 @@
+"""The integrator's limits: the gains at which its loop oscillates, or has just the margins that are allowed.
+
+The loop of `lowfc.control.laws.law`: command[k+1] = (1 - leak) command[k] - gain error[k], and
+error[k] = disturbance[k] + sum_j w_j command[k - j] + noise[k], with w from the delay in frames.
+"""
+
+from functools import lru_cache
+
+import numpy as np
+
+from lowfc.arrays import Array, Complex, Single
+
+LEAST_GAIN_MARGIN = 1.8
+LEAST_PHASE_MARGIN_DEG = 45.0
+LOWEST_GAIN = 0.01
+"""Of a mode whose drift is below the noise of a log: it shall follow nevertheless."""
+SETTLING = 5.0
+"""Time constants of the slowest mode after which a loop counts as settled."""
+
+_BISECTIONS = 50
+"""Of a 4096th of pi: to the rounding of a double. scipy.optimize would cost every command 0.3 s at its start."""
+
+
+def settling_frames(gain: Array | Single, leak: Array | Single, least: float = 0.0) -> int:
+    """Frames until the slowest mode, of gain and leak (modes,), has settled after the loop was closed, or the least."""
+    slowest = float((gain + leak)[gain + leak > 0].min(initial=1.0))
+    return int(np.ceil(max(SETTLING / slowest, least)))
+
+
+def delay_weights(delay_frames: float) -> Array:
+    """Return w: how much of command[k - j], j = 0, 1, ..., is seen in exposure k; sums to 1.
+
+    A delay of d frames (d >= 1) goes from the frame a command was made from to the first exposed wholly under it;
+    a fraction f of a frame sees (1 - f) of the newer and f of the older command.
+
+    Raises:
+        ValueError: the delay is below 1 frame or not finite.
+    """
+    if not (np.isfinite(delay_frames) and delay_frames >= 1):
+        raise ValueError(f"a delay is at least 1 frame, got {delay_frames}")
+    whole = int(np.floor(delay_frames))
+    fraction = delay_frames - whole
+    weights = np.zeros(whole + (fraction > 0))
+    weights[whole - 1] = 1 - fraction
+    if fraction > 0:
+        weights[whole] = fraction
+    return weights
+
+
+def open_loop(omega: Array | float, gain: float, leak: float, delay_frames: float) -> Complex:
+    """Loop transfer function L at angular frequencies omega (rad per frame)."""
+    z = np.exp(1j * np.asarray(omega, dtype=float))
+    weights = delay_weights(delay_frames)
+    seen = np.polynomial.polynomial.polyval(1 / z, weights)
+    return np.asarray(gain * seen / (z - (1 - leak)))
+
+
+def limiting_gain(delay_frames: float, leak: float = 0.0) -> float:
+    """Gain at which the loop starts to oscillate; 2 sin(pi / (2 (2d - 1))) for a whole delay d without leak."""
+
+    def per_gain(omega: Array) -> Complex:
+        return open_loop(omega, 1.0, leak, delay_frames)
+
+    grid = np.linspace(1e-6, np.pi, 4096)
+    values = per_gain(grid).imag
+    rising = np.flatnonzero((values[:-1] < 0) & (values[1:] >= 0))
+    low, high = grid[rising], grid[rising + 1]
+    for _ in range(_BISECTIONS):
+        middle = (low + high) / 2
+        below = per_gain(middle).imag < 0
+        low, high = np.where(below, middle, low), np.where(below, high, middle)
+    real = per_gain(np.append(high, np.pi)).real
+    return float(np.min(-1 / real[real < 0]))
+
+
+@lru_cache(maxsize=64)
+def highest_gain(delay_frames: float, leak: float = 0.0) -> float:
+    """The integrator gain at which either margin is the least that is allowed."""
+    omega = np.linspace(1e-4, np.pi, 1 << 14)
+    loop = open_loop(omega, 1.0, leak, delay_frames)
+    late = np.unwrap(np.angle(loop)) < -np.radians(180 - LEAST_PHASE_MARGIN_DEG)
+    by_phase = 1 / np.abs(loop[np.argmax(late)]) if late.any() else np.inf
+    return float(min(limiting_gain(delay_frames, leak) / LEAST_GAIN_MARGIN, by_phase))

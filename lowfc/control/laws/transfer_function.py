@@ -1,0 +1,131 @@
+"""The rejection and noise transfer functions of a loop as measured under a multisine, and their departure from theory.
+
+What is added to the loop's input, u (an offset is taken away: u = -offset), and the error that it measures go together
+as error = S (disturbance + noise + u): S = error / u at the lines, and T = 1 - S. All else appears as S (disturbance +
+noise), so that how certain a line is does not depend on how much the loop rejects there.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from lowfc.arrays import Array, Complex, Mask, Whole
+
+_FAINTEST = 1e-3  # beside the highest line of the mode: below is rounding to single precision
+_BESIDE = np.array([*range(-16, -1), *range(2, 17)])  # bins from which a line's noise is measured
+_OF_FLANKS = 12 / 7  # white noise of a bin under Hann's window, beside that of a flank less the line
+_DB = 20 / np.log(10)
+
+SURE = 3.5
+"""Standard errors that must fit into the tolerance, for a line to be judged."""
+
+
+@dataclass(frozen=True, slots=True)
+class Lines:
+    """The lines of all modes, ascending within each mode.
+
+    Attributes:
+        mode: (lines,) place of its mode.
+        frequency: (lines,) cycles per frame.
+        rejection: (lines,) S, complex.
+        error: (lines,) standard error of S, in each of its two directions.
+    """
+
+    mode: Whole
+    frequency: Array
+    rejection: Complex
+    error: Array
+
+    @property
+    def noise_transfer(self) -> Complex:
+        """T (lines,), complex; its standard error is that of S."""
+        return 1 - self.rejection
+
+
+@dataclass(frozen=True, slots=True)
+class Departure:
+    """How far measured lines are from theory.
+
+    Attributes:
+        db: (lines,) measured over theory.
+        error_db: (lines,) its standard error.
+        judged: (lines,) whether it is certain enough for the tolerance.
+        within: (lines,) whether it was judged and is within.
+    """
+
+    db: Array
+    error_db: Array
+    judged: Mask
+    within: Mask
+
+
+def measured(error_nm: Array, added_nm: Array) -> Lines:
+    """S at the lines of what was added to the loop's input.
+
+    Hann's window keeps what the loop does not reject at high frequencies out of the low ones, where the error is small;
+    lines are at least two bins apart, and it does not mix those. The noise of a line is that of the bins beside it,
+    which takes in what other modes' lines leave there by cross-talk.
+
+    Args:
+        error_nm: (frames, modes) of one period.
+        added_nm: (frames, modes) in the same frames.
+
+    Raises:
+        ValueError: they are not of the same frames, or nothing was added.
+    """
+    if error_nm.shape != added_nm.shape:
+        raise ValueError(f"errors {error_nm.shape} and what was added {added_nm.shape} are not of the same frames")
+    frames = len(error_nm)
+    answer, added = _hann(error_nm), _hann(added_nm)
+    found: list[tuple[Whole, Whole, Complex, Array]] = []
+    for mode in range(error_nm.shape[1]):
+        plain = np.abs(np.fft.rfft(added_nm[:, mode])) / frames
+        places = np.flatnonzero(plain[1:-1] > _FAINTEST * plain[1:-1].max(initial=0.0)) + 1
+        if not places.size:
+            continue
+        own = np.zeros(len(plain), bool)
+        own[:2] = own[-2:] = True
+        for near in (-1, 0, 1):
+            own[np.clip(places + near, 0, len(plain) - 1)] = True
+        beside = np.clip(places[:, None] + _BESIDE, 0, len(plain) - 1)
+        power = np.where(own[beside], np.nan, np.abs(answer[beside, mode]) ** 2)
+        # A vibration on the line itself is seen in the bins next to it alone, less the line's own part.
+        flanks = answer[places[:, None] + np.array([-1, 1]), mode] + answer[places, mode][:, None] / 2
+        nearest = _OF_FLANKS * np.mean(np.abs(flanks) ** 2, axis=1)
+        noise = np.sqrt(np.maximum(np.nanmean(power, axis=1), nearest) / 2)
+        S = answer[places, mode] / added[places, mode]
+        found.append((np.full(places.size, mode), places, S, noise / np.abs(added[places, mode])))
+    if not found:
+        raise ValueError("nothing was added to the loop's input: there is nothing to measure")
+    modes, places, S, error = (np.concatenate(parts) for parts in zip(*found, strict=True))
+    return Lines(modes, places / frames, S, error)
+
+
+def seen_of_mirror(played_nm: Array, weights: Array) -> Array:
+    """What exposures see (frames, modes) of modes played on the mirror in one period after another.
+
+    Args:
+        played_nm: (frames, modes) with each frame's command.
+        weights: Of the delay, `lowfc.control.laws.stability.delay_weights`.
+    """
+    seen = np.zeros_like(played_nm)
+    for lag, weight in enumerate(weights):
+        seen += weight * np.roll(played_nm, 1 + lag, axis=0)
+    return seen
+
+
+def departure(value: Complex, theory: Array, error: Array, tolerance_db: float) -> Departure:
+    """Compare the sizes of lines (lines,) with theory (lines,), given their standard error (lines,)."""
+    size = np.maximum(np.abs(value), 1e-30)
+    db = _DB * np.log(size / np.maximum(theory, 1e-30))
+    error_db = _DB * error / size
+    judged = error_db * SURE <= tolerance_db
+    return Departure(db, error_db, judged, judged & (np.abs(db) <= tolerance_db))
+
+
+def _hann(values: Array) -> Complex:
+    """Spectrum (frequencies, columns) under Hann's window, where a line has its height."""
+    spectrum = np.fft.rfft(values, axis=0) * (2 / len(values))
+    after = spectrum.copy()
+    after[1:-1] -= (spectrum[:-2] + spectrum[2:]) / 2
+    return np.asarray(after)

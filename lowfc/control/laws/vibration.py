@@ -1,0 +1,332 @@
+"""What shakes a mode: a model of drift, lines and white noise, fitted to the spectrum of pseudo-open-loop modes.
+
+The fit is Whittle's: over frequencies, the sum of log S + I / S is least, with I the periodogram (Hann's window) and S
+the model's spectrum. A line more must raise the likelihood by more than chance does among all frequencies.
+"""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.fft import rfft
+from scipy.linalg import block_diag
+from scipy.optimize import minimize
+
+from lowfc.arrays import Array
+from lowfc.control.laws.spectra import Pieces
+
+FEWEST = 2048
+"""Frames in a row below which no model is fitted."""
+
+_LONGEST = 1 << 16  # frames of a segment
+_MOST_LINES = 12
+_SCALES = (3, 9, 27, 81)  # frequencies over which a line is looked for
+_PENALTY = 2.5  # of a line: log-likelihood per log(frequencies); 1.5 is Schwarz's for 3 figures, 1 for choosing a place
+_SHARE = 0.3
+_HANN = 1.5  # neighbours are alike: three are worth two
+_LOBE = 12  # frequencies on either side of a line in which the window leaves something of it
+_FULL = 40  # frequencies on either side of a line, and from 0 on, that are not averaged
+_PER_DECADE = 48
+_LEAST_DRIFT = 1e-8  # variance of its step per variance of noise: a constant is followed in 10^4 frames
+_LEAST_NOISE = 1e-3  # of the level of the upper frequencies, all of which drift may explain: no filter is made of none
+
+
+@dataclass(frozen=True, slots=True)
+class Line:
+    """A lightly damped vibration: `width_hz` between half-power points, variance in nm^2."""
+
+    frequency_hz: float
+    width_hz: float
+    variance_nm2: float
+
+
+@dataclass(frozen=True, slots=True)
+class Model:
+    """A mode's disturbance and the noise of measuring it.
+
+    Attributes:
+        drift_nm2: variance of the step that a random walk makes in a frame, behind the low-pass.
+        cutoff_hz: corner of a low-pass of the walk; infinite for none.
+        lines: of frequency, width and variance each.
+        noise_nm2: variance of one frame's white measurement noise.
+        rate_hz: frame rate.
+    """
+
+    drift_nm2: float
+    cutoff_hz: float
+    lines: tuple[Line, ...]
+    noise_nm2: float
+    rate_hz: float
+
+    def spectrum_nm2(self, omega: Array) -> Array:
+        """Spectrum of the disturbance at rad per frame, without noise: its mean over a turn is the variance."""
+        found = _drift(omega, self.drift_nm2, self.cutoff_hz / self.rate_hz)
+        for line in self.lines:
+            found = found + _line(omega, *_per_frame(line, self.rate_hz))
+        return found
+
+    def states(self) -> tuple[Array, Array, Array]:
+        """F, Q, C of x[k] = F x[k-1] + q, disturbance[k] = C x[k], with Q the covariance of q."""
+        blocks, noise, seen = [np.ones((1, 1))], [self.drift_nm2], [1.0]
+        if np.isfinite(self.cutoff_hz):  # x0 the walk, x1 what the low-pass makes of it
+            kept = _kept(self.cutoff_hz / self.rate_hz)
+            blocks = [np.array([[1.0, 0.0], [1 - kept, kept]])]
+            covariance = self.drift_nm2 * np.outer([1, 1 - kept], [1, 1 - kept])
+            seen = [0.0, 1.0]
+        else:
+            covariance = np.array([noise])
+        parts = [covariance]
+        for line in self.lines:
+            omega, left, variance = _per_frame(line, self.rate_hz)
+            cos, sin = np.cos(omega), np.sin(omega)
+            blocks.append(left * np.array([[cos, -sin], [sin, cos]]))
+            parts.append(variance * (1 - left**2) * np.eye(2))
+            seen += [1.0, 0.0]
+        return block_diag(*blocks), block_diag(*parts), np.array(seen)
+
+
+def identify(run: Pieces, rate_hz: float) -> Model | None:
+    """The model of a mode, from its pseudo-open-loop values (frames, 1) in pieces; None where they are too few.
+
+    A fit to a closed loop's log serves as well as an open loop's: its pseudo-open-loop modes are the disturbance and
+    white noise too.
+    """
+    whittle = _Whittle.of(run, rate_hz)
+    if whittle is None:
+        return None
+    model = whittle.fit_floor(Model(0.0, np.inf, (), 1.0, rate_hz), robust=True)
+    while len(model.lines) < _MOST_LINES:
+        line = whittle.another_line(model)
+        if line is None:
+            break
+        model = whittle.fit_floor(replace(model, lines=(*model.lines, line)), robust=False)
+    lines = tuple(sorted(model.lines, key=lambda line: line.frequency_hz))
+    model = whittle.fit_all(replace(model, lines=lines))
+    needed = whittle.needed(model)
+    return model if needed == model.lines else whittle.fit_all(replace(model, lines=needed))
+
+
+def resolution_hz(run: Pieces, rate_hz: float) -> float:
+    """Distance of two frequencies in the periodogram that `identify` fits; 0 where there is none."""
+    longest = max((len(piece) for piece in run.values), default=0)
+    return rate_hz / min(longest, _LONGEST) if longest >= FEWEST else 0.0
+
+
+@dataclass(frozen=True, slots=True)
+class _Whittle:
+    """A periodogram (frequencies,) without the lowest ones, and how many segments it is the mean of."""
+
+    omega: Array
+    power: Array
+    segments: int
+    rate_hz: float
+
+    @classmethod
+    def of(cls, run: Pieces, rate_hz: float) -> "_Whittle | None":
+        longest = max((len(piece) for piece in run.values), default=0)
+        frames = min(longest, _LONGEST)
+        if frames < FEWEST:
+            return None
+        window = np.hanning(frames + 2)[1:-1]
+        window /= np.sqrt(np.sum(window**2))
+        found, segments = np.zeros(frames // 2 + 1), 0
+        for piece in run.values:
+            for start in range(0, len(piece) - frames + 1, frames):
+                values = piece[start : start + frames, 0]
+                found += np.abs(rfft(window * (values - values.mean()))) ** 2
+                segments += 1
+        keep = slice(3, -1)  # the window takes the lowest for a mean
+        omega = 2 * np.pi * np.arange(found.size) / frames
+        return cls(omega[keep], np.maximum(found[keep] / segments, 1e-300), segments, rate_hz)
+
+    @property
+    def frequency_hz(self) -> Array:
+        return np.asarray(self.omega * self.rate_hz / (2 * np.pi))
+
+    @property
+    def spacing_hz(self) -> float:
+        return float((self.omega[1] - self.omega[0]) * self.rate_hz / (2 * np.pi))
+
+    def misfit(self, power: Array, spectrum: Array, counts: Array | float) -> float:
+        """Minus the log-likelihood, a constant apart."""
+        return float(np.sum(counts * (np.log(spectrum) + power / spectrum))) * self.segments / _HANN
+
+    def grouped(self, lines: tuple[Line, ...], robust: bool) -> tuple[Array, Array, Array]:
+        """Frequency, power and count of groups: single ones near lines and 0, even in the logarithm elsewhere."""
+        places = np.arange(self.omega.size)
+        group = _FULL + np.floor(_PER_DECADE * np.log10(np.maximum(places, 1)))
+        single = places < _FULL
+        for line in lines:
+            near = max(_FULL * self.spacing_hz, 4 * line.width_hz)
+            single |= np.abs(self.frequency_hz - line.frequency_hz) < near
+        fresh = np.diff(group, prepend=-1) != 0
+        fresh |= single | np.concatenate([[True], single[:-1]])
+        starts = np.flatnonzero(fresh)
+        counts = np.diff(starts, append=places.size)
+        omega, power = (np.add.reduceat(each, starts) / counts for each in (self.omega, self.power))
+        if robust:  # medians: lines that are not yet known hardly move them
+            parts = np.split(self.power, starts[1:])
+            low = 1 if self.segments > 1 else np.log(2)
+            power = np.array([np.median(part) / low if part.size > 4 else np.nan for part in parts])
+            there = np.isfinite(power)
+            return omega[there], power[there], counts[there].astype(float)
+        return omega, power, counts.astype(float)
+
+    def fit_floor(self, model: Model, robust: bool) -> Model:
+        """Drift and noise anew, the lines as they are."""
+        omega, power, counts = self.grouped(model.lines, robust)
+        known = replace(model, drift_nm2=0.0).spectrum_nm2(omega)
+        white = float(np.median(self.power[self.power.size // 2 :])) / (np.log(2) if self.segments == 1 else 1)
+        low = slice(0, max(8, omega.size // 20))
+        step = float(np.median(np.maximum(power[low] - white - known[low], 1e-3 * white) * omega[low] ** 2))
+        best: tuple[float, Model] | None = None
+        for cutoff in (np.inf, 0.03, 0.003):  # cycles per frame to begin with
+
+            def of(figures: Array, cutoff: float = cutoff) -> Model:
+                corner = np.exp(min(figures[2], 0.0)) * self.rate_hz if np.isfinite(cutoff) else np.inf
+                return replace(
+                    model,
+                    drift_nm2=max(np.exp(figures[0]), _LEAST_DRIFT * np.exp(figures[1])),
+                    noise_nm2=float(np.exp(figures[1])),
+                    cutoff_hz=float(np.clip(corner, self.spacing_hz, self.rate_hz / 2)) if corner < np.inf else corner,
+                )
+
+            def cost(figures: Array) -> float:
+                one = of(figures)
+                floor = _drift(omega, one.drift_nm2, one.cutoff_hz / self.rate_hz) + one.noise_nm2
+                return self.misfit(power, floor + known, counts)
+
+            start = np.log([step, white] + ([cutoff] if np.isfinite(cutoff) else []))
+            found = minimize(cost, start, method="Nelder-Mead", options={"maxiter": 300, "xatol": 1e-2, "fatol": 1e-2})
+            price = 0.5 * len(start) * np.log(self.omega.size)
+            if best is None or found.fun + price < best[0]:
+                best = found.fun + price, of(found.x)
+        assert best is not None  # noqa: S101  # there was a first one
+        return replace(best[1], noise_nm2=max(best[1].noise_nm2, _LEAST_NOISE * white))
+
+    def another_line(self, model: Model) -> Line | None:
+        """The line that is missing most; None where none is certain."""
+        spectrum = model.spectrum_nm2(self.omega) + model.noise_nm2
+        ratio = self.power / spectrum
+        free = np.ones(ratio.size, bool)
+        free[:_LOBE] = False  # there it is drift
+        for line in model.lines:
+            free &= np.abs(self.frequency_hz - line.frequency_hz) > max(_LOBE * self.spacing_hz, 1.5 * line.width_hz)
+        found = []
+        for scale in _SCALES:
+            mean = np.convolve(ratio, np.ones(scale) / scale, "same")
+            gain = scale * self.segments / _HANN * (mean - 1 - np.log(mean)) * (mean > 1) * free
+            place = int(np.argmax(gain))
+            found.append((float(gain[place]), place, scale))
+        largest = max(gain for gain, _, _ in found)
+        if largest < _PENALTY * np.log(ratio.size):
+            return None
+        # The narrowest that explains most of it: a wide one could be two that are apart.
+        place, scale = next((place, scale) for gain, place, scale in found if gain >= _SHARE * largest)
+        if scale == _SCALES[0]:  # on the highest of the three
+            place += int(np.argmax(self.power[place - 1 : place + 2])) - 1
+        near = slice(max(place - max(_FULL, 3 * scale), 0), place + max(_FULL, 3 * scale) + 1)
+        return self._fit_line(near, place, scale, spectrum[near])
+
+    def _fit_line(self, near: slice, place: int, scale: int, known: Array) -> Line:
+        omega, power, step = self.omega[near], self.power[near], 2 * np.pi / self.rate_hz
+        excess = self.power[max(place - scale, 0) : place + scale + 1].sum() / self.power.size
+
+        def of(figures: Array) -> Line:
+            width = float(np.clip(np.exp(figures[1]), 1e-3, 1e3)) * self.spacing_hz
+            offset = float(np.clip(figures[0], -scale / 3, scale / 3)) * self.spacing_hz
+            centre = max(float(self.omega[place]) / step + offset, _LOBE * self.spacing_hz)
+            return Line(centre, width, float(np.exp(figures[2])))
+
+        def cost(figures: Array) -> float:
+            return self.misfit(power, known + _line(omega, *_per_frame(of(figures), self.rate_hz)), 1.0)
+
+        start = np.array([0.0, np.log(0.3 * scale), np.log(excess)])
+        return of(minimize(cost, start, method="Nelder-Mead", options={"maxiter": 400, "xatol": 1e-3}).x)
+
+    def needed(self, model: Model) -> tuple[Line, ...]:
+        """The lines without which the likelihood is certainly lower: one found early may have stood for others."""
+        lines, whole = model.lines, self.misfit(self.power, model.spectrum_nm2(self.omega) + model.noise_nm2, 1.0)
+        for line in sorted(lines, key=lambda line: line.variance_nm2):
+            fewer = tuple(other for other in lines if other is not line)
+            without = replace(model, lines=fewer).spectrum_nm2(self.omega) + model.noise_nm2
+            lost = self.misfit(self.power, without, 1.0) - whole
+            if lost < _PENALTY * np.log(self.omega.size):
+                lines, whole = fewer, whole + lost
+        return lines
+
+    def fit_all(self, model: Model) -> Model:
+        """Everything at once, from a model that is nearly right."""
+        omega, power, counts = self.grouped(model.lines, robust=False)
+        spacing = self.spacing_hz
+        corner = np.isfinite(model.cutoff_hz)
+
+        def figures_of(one: Model) -> Array:
+            floor = [np.log(one.drift_nm2), np.log(one.noise_nm2)] + ([np.log(one.cutoff_hz)] if corner else [])
+            lines = [[0.0, np.log(line.width_hz), np.log(line.variance_nm2)] for line in one.lines]
+            return np.concatenate([floor, *lines])
+
+        def of(figures: Array) -> Model:
+            floor, rest = figures[: 2 + corner], figures[2 + corner :].reshape(-1, 3)
+            lines = tuple(
+                Line(line.frequency_hz + float(shift) * spacing, float(np.exp(width)), float(np.exp(variance)))
+                for line, (shift, width, variance) in zip(model.lines, rest, strict=True)
+            )
+            cutoff = float(np.exp(floor[2])) if corner else np.inf
+            return replace(
+                model,
+                drift_nm2=float(np.exp(floor[0])),
+                noise_nm2=float(np.exp(floor[1])),
+                cutoff_hz=cutoff,
+                lines=lines,
+            )
+
+        def cost(figures: Array) -> float:
+            one = of(figures)
+            return self.misfit(power, one.spectrum_nm2(omega) + one.noise_nm2, counts)
+
+        start = figures_of(model)
+        wide = [(value - 3, value + 3) for value in start[: 2 + corner]]
+        for line, (_, width, variance) in zip(model.lines, start[2 + corner :].reshape(-1, 3), strict=True):
+            reach = max(1.0, line.width_hz / spacing)
+            wide += [(-reach, reach), (np.log(1e-3 * spacing), width + 2), (variance - 2, variance + 2)]
+        found = minimize(cost, start, method="L-BFGS-B", bounds=wide, options={"maxiter": 60})
+        fitted = of(found.x) if found.fun < cost(start) else model
+        fitted = replace(fitted, lines=tuple(self._with_its_power(line, fitted) for line in fitted.lines))
+        return replace(fitted, drift_nm2=max(fitted.drift_nm2, _LEAST_DRIFT * fitted.noise_nm2))
+
+    def _with_its_power(self, line: Line, model: Model) -> Line:
+        """A line that is too narrow to be resolved, with the variance that is there: so far only its wings counted."""
+        if line.width_hz > self.spacing_hz:
+            return line
+        near = np.abs(self.frequency_hz - line.frequency_hz) < 3 * self.spacing_hz
+        others = replace(model, lines=tuple(other for other in model.lines if other is not line))
+        floor = others.spectrum_nm2(self.omega[near]) + model.noise_nm2
+        variance = float(np.sum(np.maximum(self.power[near] - floor, 0.0))) / self.omega.size
+        if not variance > 0:
+            return line
+        return Line(line.frequency_hz, line.width_hz * line.variance_nm2 / variance, variance)
+
+
+def _kept(cutoff: float) -> float:
+    """What a low-pass of this corner, in cycles per frame, keeps of its value in a frame."""
+    return float(np.exp(-2 * np.pi * cutoff))
+
+
+def _drift(omega: Array, step_nm2: float, cutoff: float) -> Array:
+    walk = step_nm2 / (4 * np.sin(omega / 2) ** 2)
+    if not np.isfinite(cutoff):
+        return np.asarray(walk)
+    kept = _kept(cutoff)
+    return np.asarray(walk * (1 - kept) ** 2 / (1 - 2 * kept * np.cos(omega) + kept**2))
+
+
+def _per_frame(line: Line, rate_hz: float) -> tuple[float, float, float]:
+    """Rad per frame, what is left of an amplitude after a frame, variance."""
+    return 2 * np.pi * line.frequency_hz / rate_hz, float(np.exp(-np.pi * line.width_hz / rate_hz)), line.variance_nm2
+
+
+def _line(omega: Array, centre: float, left: float, variance_nm2: float) -> Array:
+    """Spectrum of a process with the covariance variance left^k cos(centre k)."""
+    lost = (1 - left) ** 2  # |1 - left e^(i x)|^2 = (1 - left)^2 + 4 left sin^2(x/2), without cancellation
+    near, far = (lost + 4 * left * np.sin((omega + sign * centre) / 2) ** 2 for sign in (-1, 1))
+    return np.asarray(variance_nm2 * (1 - left**2) / 2 * (1 / near + 1 / far))

@@ -1,0 +1,172 @@
+"""What another controller would have made of the disturbance that a log shows.
+
+Pseudo-open-loop modes are what was measured less the commands that were seen; a sensor in its linear range would have
+measured them plus whatever other commands were given instead.
+"""
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from lowfc.arrays import Array, Mask, Sequences, Single, Whole
+from lowfc.control.laws.law import Law
+from lowfc.control.laws.linear_law import LinearLaw, at_rest, follow, integrator, respond
+from lowfc.control.laws.stability import delay_weights
+from lowfc.control.loop.inputs import COUNT_BITS
+
+Controller = Callable[[Any, Single, Single], tuple[Any, Single]]
+"""(state, error_nm, pol_nm) to (state, command_nm); the state is None at first, the arrays are (modes,) float32."""
+
+LONGEST_DELAY = 5
+"""Frames; what is measured as longer is no delay of a loop that works."""
+_STILL_NM = 0.01
+_FEWEST = 20
+
+
+def driven_by(law: LinearLaw, limit_nm: Single | None = None) -> Controller:
+    """A linear law from rest and a flat mirror; `limit_nm` (modes,) cuts its commands, as in the live loop."""
+
+    def step(before: tuple[Single, Single] | None, error_nm: Single, pol_nm: Single) -> tuple[Any, Single]:
+        x, held_nm = before or (at_rest(law), np.zeros_like(error_nm))
+        x = follow(law, x, pol_nm if law.signal == "pol" else error_nm, held_nm)
+        command_nm = respond(law, x)
+        if limit_nm is not None:
+            command_nm = np.clip(command_nm, -limit_nm, limit_nm)
+        return (x, command_nm), command_nm
+
+    return step
+
+
+def as_logged(law: Law) -> Controller:
+    """The live loop's integrator with its limits."""
+    noll = tuple(range(2, 2 + law.gain.size))  # these have no part in it, nor have delay and rate
+    return driven_by(integrator(law.gain, law.leak, noll, 1.0, 1.0), law.limit_nm)
+
+
+def exposed(sequence: Sequences) -> Mask:
+    """Which steps (steps,) are of an exposure of their own: not of a frame that came again or out of order."""
+    newest: Sequences = np.maximum.accumulate(sequence)
+    return np.concatenate([np.ones(min(1, len(sequence)), bool), sequence[1:] > newest[:-1]])
+
+
+def missing_before(sequence: Sequences) -> Whole:
+    """Exposures (steps,) without a step between each step and the one before; `sequence` ascends."""
+    same_start = sequence[1:] >> np.uint64(COUNT_BITS) == sequence[:-1] >> np.uint64(COUNT_BITS)
+    between = np.where(same_start, sequence[1:] - sequence[:-1] - np.uint64(1), np.uint64(0))
+    return np.concatenate([np.zeros(min(1, len(sequence)), np.int64), between.astype(np.int64)])
+
+
+def seen_nm(weights: Single, command_nm: Single, missing: Whole, first_nm: Single) -> Single:
+    """Command (steps, modes) that each exposure saw; under exposures without a step the command is held.
+
+    Args:
+        weights: see `lowfc.control.laws.stability.delay_weights`.
+        command_nm: (steps, modes) after each step.
+        missing: (steps,) of `missing_before`.
+        first_nm: (modes,) command before the first step.
+    """
+    held = np.minimum(missing, len(weights))  # holding longer than that changes nothing
+    rows = np.arange(len(command_nm))
+    place = rows + np.cumsum(held)  # of each step on an axis of all exposures
+    source = np.repeat(rows - 1, held + 1)  # the last step before each exposure
+    given = np.concatenate([first_nm[None], command_nm])
+    seen = np.zeros_like(command_nm)
+    for lag, weight in enumerate(weights):
+        if weight:
+            seen += weight * given[source[np.maximum(place - lag, 0)] + 1]
+    return seen
+
+
+def counterfactual(controller: Controller, weights: Single, pol_nm: Single, missing: Whole) -> tuple[Single, Single]:
+    """Fold a controller over a disturbance, from a flat mirror; return its errors and commands (steps, modes).
+
+    Args:
+        controller: what to fold; it is not called for refused frames, under which the command is held.
+        weights: see `lowfc.control.laws.stability.delay_weights`.
+        pol_nm: (steps, modes) disturbance and measurement noise; NaN where the frame was refused, and there the error
+            is NaN too.
+        missing: (steps,) of `missing_before`.
+    """
+    usable = np.isfinite(pol_nm.sum(axis=1)).tolist()
+    gaps = np.minimum(missing, len(weights)).tolist()
+    terms = [(lag, weight) for lag, weight in enumerate(weights.astype(np.float32)) if weight]
+    history = [np.zeros(pol_nm.shape[1], np.float32)] * len(weights)
+    error_nm, command_nm = np.full_like(pol_nm, np.nan), np.zeros_like(pol_nm)
+    state = None
+    for row, pol in enumerate(pol_nm):
+        if gaps[row]:
+            history = (history[:1] * gaps[row] + history)[: len(history)]
+        held = history[0]
+        if usable[row]:
+            seen = sum(weight * history[lag] for lag, weight in terms)
+            error_nm[row] = pol + seen
+            state, held = controller(state, error_nm[row], pol)
+        command_nm[row] = held
+        history = [held, *history[:-1]]
+    return error_nm, command_nm
+
+
+def delay_from_truth(true_nm: Single, command_nm: Single, missing: Whole) -> float | None:
+    """Delay in frames at which the commands (steps, modes) are most like what the mirror truly did (steps, modes).
+
+    The least-squares fit of `delay_weights`; `true_nm` may have rows of NaN. None where the commands hardly move.
+    """
+    rows = np.isfinite(true_nm).all(axis=1)
+    if rows.sum() < _FEWEST:
+        return None
+    first_nm, best = command_nm[0], (np.inf, 1.0)
+    for lag in range(1, LONGEST_DELAY):
+        newer, older = (
+            seen_nm(delay_weights(delay).astype(np.float32), command_nm, missing, first_nm)[rows].astype(np.float64)
+            for delay in (lag, lag + 1)
+        )
+        move, left = older - newer, true_nm[rows] - newer
+        if np.sqrt(np.mean(move**2)) < _STILL_NM:
+            return None
+        fraction = float(np.clip(np.sum(left * move) / np.sum(move**2), 0, 1))
+        best = min(best, (float(np.sum((left - fraction * move) ** 2)), lag + fraction))
+    return best[1]
+
+
+def delay_from_times(
+    sequence: Sequences, exposure_start_ns: Whole, applied_sequence: Sequences, applied_ns: Whole
+) -> float | None:
+    """Mean delay in frames: from the frame behind a command to the first whose exposure began after it was applied.
+
+    Args:
+        sequence: (steps,) of the frames, ascending.
+        exposure_start_ns: (steps,) on the clock of `applied_ns`.
+        applied_sequence: (states,) of the frame behind the command that the mirror had.
+        applied_ns: (states,) when the mirror said so.
+
+    Returns:
+        None where there are too few of both to tell.
+    """
+    behind, first = np.unique(applied_sequence, return_index=True)  # a command may be applied again and again
+    after = np.searchsorted(exposure_start_ns, applied_ns[first], side="right")
+    known = (after > 0) & (after < len(sequence))
+    behind, after = behind[known], after[known]
+    neighbours = sequence[after] - sequence[after - 1] == 1  # else an earlier frame may be missing here
+    delay = (sequence[after] - behind).astype(np.int64)[neighbours]
+    delay = delay[(delay >= 1) & (delay <= 2 * LONGEST_DELAY)]
+    return float(delay.mean()) if len(delay) >= _FEWEST else None
+
+
+def frames_since(begins: Mask, running: Mask, missing: Whole) -> Whole:
+    """Frames (steps,) since the loop began to run, or began anew; -1 where it does not run.
+
+    Args:
+        begins: (steps,) where it begins anew although it ran before.
+        running: (steps,) whether it runs.
+        missing: (steps,) of `missing_before`.
+    """
+    place = np.arange(len(running)) + np.cumsum(missing)
+    started = running & (begins | ~np.concatenate([[False], running[:-1]]))
+    return np.where(running, place - np.maximum.accumulate(np.where(started, place, 0)), -1)
+
+
+def rms(values: npt.NDArray[np.floating], rows: Mask) -> Array:
+    """Root mean square (modes,) of these rows of (steps, modes), about zero."""
+    return np.asarray(np.sqrt(np.mean(values[rows].astype(np.float64) ** 2, axis=0)))

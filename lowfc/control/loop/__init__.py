@@ -1,0 +1,1 @@
+"""The controller as one pure function: state, inputs, requests, safety."""

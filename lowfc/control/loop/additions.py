@@ -1,0 +1,244 @@
+"""What is added to the loop's command: channels that stay, an offset of its target, a table played frame by frame.
+
+A channel is a shape of the mirror that somebody else wants, a dark hole's for one. The sensor sees it, and its zero
+point is shifted along (Sect. 1 and 4), with the delay of a command, so that the loop does not undo it. What is played
+is for calibration and for tests: nothing is shifted along.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from lowfc.arrays import Array, Single
+from lowfc.control.loop.identity import identity
+
+FLAT = "flat"
+"""The channel of the mirror's flat map: the reference image is taken with it, so that it shifts nothing."""
+ADOPTED = "adopted"
+"""The channel of what a mirror already had, beyond the modes, when the controller started."""
+MOST_CHANNELS = 16
+MOST_PLAYED = 1 << 24
+"""Numbers in the table of a play, and in its basis."""
+MIRROR, OFFSET = "mirror", "offset"
+LONGEST_NAME = 32
+
+
+class Channel(NamedTuple):
+    """A shape added to the command: (rows, columns), nm of surface; what is wanted, and how far the mirror is.
+
+    The two are one array where it is there: `of` sees to that.
+    """
+
+    name: str
+    wanted_nm: Single
+    reached_nm: Single
+
+    @classmethod
+    def of(cls, name: str, wanted_nm: Single, reached_nm: Single) -> "Channel":
+        """A channel on its way, or there."""
+        return cls(name, wanted_nm, wanted_nm if np.array_equal(wanted_nm, reached_nm) else reached_nm)
+
+    @property
+    def shifts(self) -> bool:
+        """Whether the sensor's zero point is shifted along."""
+        return self.name != FLAT
+
+    @property
+    def moving(self) -> bool:
+        """Whether the mirror is still on its way."""
+        return self.reached_nm is not self.wanted_nm
+
+
+class PlayTable(NamedTuple):
+    """A table (frames, columns) that can be played, a row for each frame.
+
+    Attributes:
+        target: `MIRROR`, where a row holds the factors of the shapes in `basis` (columns, actuators), nm of surface; or
+            `OFFSET`, where it is added to the loop's target, nm of wavefront of each mode.
+        largest: (columns,) largest absolute number of each column.
+        reach_nm: on the mirror, what no actuator can exceed.
+        id: identity of target, rows and basis.
+    """
+
+    target: str
+    rows: Single
+    basis: Single
+    largest: Array
+    reach_nm: float
+    id: str
+
+
+class Play(NamedTuple):
+    """A table that is being played: its first row for the frame `first_sequence`, and `frames` rows in all."""
+
+    table: PlayTable
+    first_sequence: int
+    frames: int
+
+    @property
+    def target(self) -> str:
+        """`MIRROR` or `OFFSET`."""
+        return self.table.target
+
+    def row(self, sequence: int) -> Single | None:
+        """The row for a frame; None before the first and after the last."""
+        place = sequence - self.first_sequence
+        return self.table.rows[place] if 0 <= place < self.frames else None
+
+    def left(self, sequence: int) -> int:
+        """Rows left for this frame and those to come."""
+        return min(max(self.first_sequence + self.frames - sequence, 0), self.frames)
+
+    def over(self, sequence: int) -> bool:
+        """Whether nothing of it is left for this frame and those to come."""
+        return not self.left(sequence)
+
+
+class CommandChannels(NamedTuple):
+    """All that is added.
+
+    Attributes:
+        channels: by the order of their names.
+        sum_nm: (rows, columns) sum of the channels as far as the mirror is.
+        shift_nm: (modes,) what the sensor sees of those that shift it.
+        shifts_nm: `shift_nm` under the last frames, newest first, as many as there are weights of the delay.
+        offset_nm: (modes,) the loop's target.
+        play: what is being played.
+    """
+
+    channels: tuple[Channel, ...]
+    sum_nm: Single
+    shift_nm: Single
+    shifts_nm: tuple[Single, ...]
+    offset_nm: Single
+    play: Play | None = None
+
+    @classmethod
+    def none(cls, grid: tuple[int, int], modes: int, frames: int) -> "CommandChannels":
+        """Nothing added; `frames` are those that a command takes to be seen."""
+        rest = np.zeros(modes, np.float32)
+        return cls((), np.zeros(grid, np.float32), rest, (rest,) * frames, rest)
+
+    @property
+    def moving(self) -> bool:
+        """Whether the command changes with the next frame even where the loop is open."""
+        return self.play is not None or any(channel.moving for channel in self.channels)
+
+    def seen_nm(self, weights: tuple[tuple[int, np.float32], ...]) -> Single:
+        """The shift (modes,) in the last exposure."""
+        seen = np.zeros_like(self.shift_nm)
+        for lag, weight in weights:
+            seen += weight * self.shifts_nm[lag]
+        return seen
+
+    def target_nm(self, sequence: int) -> Single:
+        """The loop's target (modes,) for a frame."""
+        row = self.play.row(sequence) if self.play is not None and self.play.target == OFFSET else None
+        return self.offset_nm if row is None else self.offset_nm + row
+
+    def played_nm(self, sequence: int) -> Single | None:
+        """The shape (rows, columns) played for a frame, nm of surface."""
+        row = self.play.row(sequence) if self.play is not None and self.play.target == MIRROR else None
+        if row is None or self.play is None:
+            return None
+        return (row @ self.play.table.basis).reshape(self.sum_nm.shape)
+
+    def moved(self, sequence: int, step_nm: float, to_modes: Single) -> "CommandChannels":
+        """For the next command: each channel nearer to what is wanted of it, all together by at most `step_nm`."""
+        play = None if self.play is not None and self.play.over(sequence) else self.play
+        moving = sum(channel.moving for channel in self.channels)
+        if not moving:
+            return self._replace(play=play)
+        step = np.float32(step_nm / moving)
+        return self._replace(play=play).at(tuple(_nearer(channel, step) for channel in self.channels), to_modes)
+
+    def at(self, channels: tuple[Channel, ...], to_modes: Single) -> "CommandChannels":
+        """With these channels; those that are wanted flat and are flat are gone."""
+        kept = tuple(one for one in channels if one.wanted_nm.any() or one.reached_nm.any())
+        sums = [
+            sum((one.reached_nm for one in kept if one.shifts is shifts), np.zeros_like(self.sum_nm))
+            for shifts in (True, False)
+        ]
+        return self._replace(channels=kept, sum_nm=sums[0] + sums[1], shift_nm=to_modes @ sums[0].reshape(-1))
+
+    def with_channel(self, name: str, wanted_nm: Single, to_modes: Single) -> "CommandChannels":
+        """With a new shape for a channel, which the mirror goes to from where that channel is.
+
+        Raises:
+            ValueError: the name is none, or there are too many.
+        """
+        plain = name.isascii() and name == name.lower() and name.replace("-", "").isalnum()
+        if not (plain and name[0].isalpha() and len(name) <= LONGEST_NAME):
+            raise ValueError(f"a channel's name is up to 32 of a-z, 0-9 and -, a letter first; got {name!r}")
+        before = self.channel(name)
+        if before is None and len(self.channels) >= MOST_CHANNELS:
+            raise ValueError(f"there are {MOST_CHANNELS} channels already, which is the most: remove one")
+        reached_nm = np.zeros_like(wanted_nm) if before is None else before.reached_nm
+        return self.having(Channel.of(name, wanted_nm, reached_nm), to_modes)
+
+    def channel(self, name: str) -> Channel | None:
+        """The channel of that name."""
+        return next((one for one in self.channels if one.name == name), None)
+
+    def having(self, channel: Channel, to_modes: Single) -> "CommandChannels":
+        """With this channel in the place of the one of its name, or beside the others."""
+        channels = {one.name: one for one in (*self.channels, channel)}
+        return self.at(tuple(channels[name] for name in sorted(channels)), to_modes)
+
+    def stopped(self, sequence: int) -> "CommandChannels":
+        """With nothing more to play after this frame; what was played for it goes with the next command."""
+        if self.play is None:
+            return self
+        left = min(max(sequence + 1 - self.play.first_sequence, 0), self.play.frames)
+        return self._replace(play=self.play._replace(frames=left))
+
+    def passed(self, frames: int = 1) -> "CommandChannels":
+        """Some frames later."""
+        newest = (self.shift_nm,) * min(frames, len(self.shifts_nm))
+        return self._replace(shifts_nm=(*newest, *self.shifts_nm)[: len(self.shifts_nm)])
+
+    def settled(self) -> "CommandChannels":
+        """As if the channels had always been where they are."""
+        return self.passed(len(self.shifts_nm))
+
+    def lowered(self, to_modes: Single, *, only_flat: bool = False) -> "CommandChannels":
+        """The mirror goes to zero: no channel has reached anything, and nothing is played."""
+        flat = np.zeros_like(self.sum_nm)
+        kept = (Channel.of(one.name, one.wanted_nm, flat) for one in self.channels if one.name == FLAT or not only_flat)
+        return self._replace(play=None).at(tuple(kept), to_modes)
+
+
+def play_table(target: str, rows: Single, basis: Single) -> PlayTable:
+    """A table to be played, checked for all that needs no loop; shapes as in `PlayTable`.
+
+    Raises:
+        ValueError: its parts do not fit together, it is too long, or a number in it is not finite.
+    """
+    if target not in (MIRROR, OFFSET):
+        raise ValueError(f"a play's target is {MIRROR} or {OFFSET}, got {target!r}")
+    if rows.ndim != 2 or not rows.size:
+        raise ValueError(f"a play's table has a row for each frame and a column for each shape, got {rows.shape}")
+    columns = rows.shape[1]
+    if target == MIRROR and (not basis.size or basis.size % columns):
+        raise ValueError(
+            f"a play on the mirror needs the actuators of a shape for each of {columns} columns, got {basis.size}"
+        )
+    if max(rows.size, basis.size) > MOST_PLAYED:
+        raise ValueError(
+            f"a play holds at most {MOST_PLAYED} numbers, {MOST_PLAYED // columns} frames of {columns} columns; "
+            f"got {max(rows.size, basis.size)}: play it in parts"
+        )
+    if not (np.isfinite(rows).all() and np.isfinite(basis).all()):
+        raise ValueError("every number of a play must be finite")
+    basis = basis.reshape(columns, -1) if target == MIRROR else np.zeros((0, 0), np.float32)
+    largest = np.abs(rows).max(axis=0).astype(np.float64)
+    reach_nm = float(largest @ np.abs(basis).max(axis=1)) if basis.size else 0.0
+    made = identity((("target", target), ("table", rows), ("columns", columns), ("basis", basis)))
+    return PlayTable(target, rows, basis, largest, reach_nm, made)
+
+
+def _nearer(channel: Channel, step_nm: np.float32) -> Channel:
+    rest = channel.wanted_nm - channel.reached_nm
+    if np.abs(rest).max() <= step_nm:
+        return channel._replace(reached_nm=channel.wanted_nm)
+    return channel._replace(reached_nm=channel.reached_nm + np.clip(rest, -step_nm, step_nm))

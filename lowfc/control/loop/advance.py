@@ -1,0 +1,364 @@
+"""The controller: one pure function, `advance(settings, state, input)`, of which every run is a fold.
+
+The live loop, replay and the tests call it with frames, requests, mirror shapes, camera settings, calibrations and
+ticks, in the order in which they were taken. Nothing here reads a clock: each input brings its time, and every verdict
+that needs one (how late a frame is, how long it has been silent) comes with the input.
+"""
+
+from collections.abc import Callable, Mapping
+
+import numpy as np
+
+from lowfc.arrays import Single
+from lowfc.control.laws import linear_law
+from lowfc.control.laws.law import integrate
+from lowfc.control.loop.camera import CameraSettings
+from lowfc.control.loop.estimator import Estimate, filled, saturated_pixels
+from lowfc.control.loop.inputs import (
+    COUNT_BITS,
+    Command,
+    Frame,
+    Input,
+    Load,
+    MirrorShape,
+    Outputs,
+    PendingEvent,
+    Reply,
+    Request,
+    Step,
+    Tick,
+)
+from lowfc.control.loop.loading import camera_reported, in_mode, loaded, mirror_reported, mode_event
+from lowfc.control.loop.requests import answer
+from lowfc.control.loop.reservation import lease_checked
+from lowfc.control.loop.safety import LoopMode, Reason, limit
+from lowfc.control.loop.state import ActiveLoop, Settings, State
+
+UNMEASURED = frozenset({Reason.NO_CALIBRATION, Reason.WRONG_SIZE})
+"""Without a calibration of its size, a frame is an exposure all the same: probe sequences go on where no law acts."""
+STEPPED = "its last step is done"
+
+
+def advance(settings: Settings, state: State, taken: Input) -> tuple[State, Outputs]:
+    """Take one input; return the state after it and what shall be sent.
+
+    An input that changes nothing and gives rise to nothing leaves the very same state, and is not counted in it.
+    """
+    if isinstance(taken, Frame):
+        return _frame(settings, state, taken)
+    after, outputs = _HANDLERS[type(taken)](settings, state, taken)
+    if after is not state or outputs.events:
+        after = after._replace(input_number=state.input_number + 1)
+    return after, outputs
+
+
+def _frame(settings: Settings, state: State, frame: Frame) -> tuple[State, Outputs]:
+    events: list[PendingEvent] = []
+    if frame.ahead:
+        return _refuse(settings, state, frame, Reason.AHEAD, events)
+    if frame.sequence <= state.frame_sequence:
+        stale = Reason.REPEATED if frame.sequence == state.frame_sequence else Reason.OUT_OF_ORDER
+        return _refuse(settings, state, frame, stale, events)
+    state, drive = _arrive(state, frame, events)
+    freed = False
+    if state.conditions.lease is not None:
+        state, drive, freed = _lease_on_frame(state, drive, frame.sequence, events)
+    if drive is None or not drive.calibration.noll:
+        return _refuse(settings, _newest(state, drive, frame), frame, Reason.NO_CALIBRATION, events)
+    if state.conditions.camera_awaited:
+        return _refuse(settings, _newest(state, drive, frame), frame, Reason.CAMERA_UNKNOWN, events)
+    measured = _measure(settings, drive, frame)
+    if isinstance(measured, Reason):
+        return _refuse(settings, _newest(state, drive, frame), frame, measured, events)
+    estimate, saturated = measured
+    alike = state.identical_frames + 1 if estimate.same(state.estimate) else 0
+    if 0 < settings.max_identical_frames < alike:
+        stuck = _newest(state, drive, frame)._replace(identical_frames=alike)
+        return _refuse(settings, stuck, frame, Reason.STUCK, events)
+    error_nm, pol_nm, drive = _pseudo_open_loop(drive, estimate.error_nm, frame.sequence)
+    drive, reasons, homing = _next_command(settings, state, drive, error_nm, frame.sequence)
+    if reasons:
+        drive = _end_probe(drive, frame.sequence, _acted(reasons), events)
+    if state.refused is not None:
+        details: dict[str, object] = {"refused": state.refused_count, "reason": state.refused.name}
+        events.append(PendingEvent("FRAMES_ACCEPTED", details))
+    if reasons != state.limits_hit:
+        _limit_events(state.limits_hit, reasons, events)
+    mode, command_nm = state.mode, drive.history_nm[0]
+    steps_left, ended = max(state.steps_left - 1, 0), state.steps_left == 1
+    if ended:
+        events += [PendingEvent("LOOP_STEPPED", {}), mode_event(mode, LoopMode.OPEN, STEPPED)]
+    state = State(  # made anew: `_replace` takes four times as long
+        mode,
+        drive,
+        frame.sequence,
+        frame.time_ns,
+        state.frames_used + 1,
+        limits_hit=reasons,
+        commanded=True,
+        counts=_counted(state.counts, reasons),
+        steps_left=steps_left,
+        returning_to_zero=homing,
+        input_number=state.input_number + 1,
+        estimate=estimate,
+        identical_frames=alike,
+        conditions=state.conditions,
+    )
+    if ended:
+        state = in_mode(state, LoopMode.OPEN, frame.time_ns, STEPPED)
+    step = Step(frame.sequence, frame.time_ns, mode, command_nm, reasons, error_nm, pol_nm, estimate.flux_dn, saturated)
+    command = _command(state, drive, command_nm)
+    return state, Outputs(step, command, None, events, changed=ended or freed)
+
+
+def _command(state: State, drive: ActiveLoop, command_nm: Single) -> Command:
+    """The command of the newest frame."""
+    safe = state.mode is LoopMode.SAFE
+    newest = state.frame_sequence, state.frame_time_ns
+    return Command(*newest, drive.actuators_nm, command_nm, safe, state.conditions.clear_id)
+
+
+def _arrive(state: State, frame: Frame, events: list[PendingEvent]) -> tuple[State, ActiveLoop | None]:
+    """The state, and the drive after the frames that never came before this one."""
+    if state.frame_timeout:
+        events.append(PendingEvent("FRAMES_BACK", {"silent_ms": (frame.time_ns - state.frame_time_ns) / 1e6}))
+    drive = state.drive
+    if frame.sequence >> COUNT_BITS == state.frame_sequence >> COUNT_BITS:
+        missing = frame.sequence - state.frame_sequence - 1
+        if missing:
+            number = frame.sequence & ((1 << COUNT_BITS) - 1)
+            events.append(PendingEvent("FRAMES_MISSING", {"count": missing, "number": number}))
+            drive = drive.missed(missing) if drive is not None else None
+    elif state.frame_sequence:
+        events.append(PendingEvent("CAMERA_RESTARTED", {}))
+        state = _awaiting_camera(state, frame)
+        if drive is not None and drive.additions is not None and drive.additions.play is not None:
+            drive = drive._replace(additions=drive.additions.stopped(0))  # its frames were the former camera's
+            events.append(PendingEvent("PLAY_ENDED", {"why": "the camera restarted"}))
+    else:  # after a clear, this may be another start of the camera
+        state = _awaiting_camera(state, frame)
+    return state, drive
+
+
+def _lease_on_frame(
+    state: State, drive: ActiveLoop | None, sequence: int, events: list[PendingEvent]
+) -> tuple[State, ActiveLoop | None, bool]:
+    """The state and the drive, without a lease and its probe sequence where it was not renewed in time; whether so."""
+    after, ended = lease_checked(state._replace(drive=drive), 0, sequence)
+    events += ended
+    return after, after.drive, bool(ended)
+
+
+def _awaiting_camera(state: State, frame: Frame) -> State:
+    """The state, in which settings are awaited unless those that are known may be of the camera's present start."""
+    camera = state.conditions.camera
+    if camera is None or camera.start_s in (0, frame.sequence >> COUNT_BITS):
+        return state
+    return state._replace(conditions=state.conditions._replace(camera_awaited=True))
+
+
+def _newest(state: State, drive: ActiveLoop | None, frame: Frame) -> State:
+    return state._replace(drive=drive, frame_timeout=False, frame_sequence=frame.sequence, frame_time_ns=frame.time_ns)
+
+
+def _measure(settings: Settings, drive: ActiveLoop, frame: Frame) -> tuple[Estimate, int] | Reason:
+    """Modal errors of a frame and its saturated pixels, or why it cannot be used."""
+    calibration = drive.calibration
+    if frame.pixels is None or frame.pixels.shape != calibration.shape:
+        return Reason.WRONG_SIZE
+    if frame.age_ns > settings.max_frame_age_ns:
+        return Reason.LATE
+    pixels = frame.pixels.ravel()
+    saturated = saturated_pixels(calibration, pixels)
+    if saturated > settings.max_saturated_pixels:
+        return Reason.SATURATED
+    if saturated:
+        pixels = filled(calibration, pixels)
+    estimate = drive.estimator.estimate(pixels, settings.min_flux_fraction * calibration.flux_dn)
+    return Reason.DARK if estimate is None else (estimate, saturated)
+
+
+def _pseudo_open_loop(drive: ActiveLoop, measured_nm: Single, sequence: int) -> tuple[Single, Single, ActiveLoop]:
+    """Error and pseudo-open-loop modes (modes,) of what the sensor measured, and the drive whose law has seen them.
+
+    Channels are taken out of both, as far as the exposure saw them; what the loop is to aim at is taken out of the
+    error.
+    """
+    added, error_nm = drive.additions, measured_nm
+    if added is not None:
+        error_nm = measured_nm - added.seen_nm(drive.weights)
+    pol_nm = to_undo_nm = error_nm - drive.seen_nm()
+    if added is not None:
+        target_nm = added.target_nm(sequence)
+        error_nm, to_undo_nm = error_nm - target_nm, pol_nm - target_nm
+    if drive.following is not None:
+        drive = drive._replace(following=drive.following.followed(error_nm, to_undo_nm, drive.history_nm[0]))
+    return error_nm, pol_nm, drive
+
+
+def _next_command(
+    settings: Settings, state: State, drive: ActiveLoop, error_nm: Single, sequence: int
+) -> tuple[ActiveLoop, tuple[Reason, ...], bool]:
+    """The command after an error (modes,), the limits that acted, and whether it is still on its way to zero."""
+    if state.mode is LoopMode.SAFE:
+        return _step_to_flat(settings, drive), (), False
+    added, homing = drive.additions, state.returning_to_zero
+    closed = state.mode is LoopMode.CLOSED
+    # A limit that acted on the last command has kept the mirror from where it was to go.
+    if not closed and not homing and (added is None or not (added.moving or state.limits_hit)):
+        return drive.stayed(1), (), False
+    command_nm, cut = drive.history_nm[0], False
+    if homing:
+        command_nm = np.zeros_like(command_nm)
+    elif closed:
+        command_nm, cut = _law_output(drive, error_nm)
+    wanted_nm = drive.to_actuators.dot(command_nm).reshape(drive.calibration.grid)
+    extra_nm: Single | None = None
+    if added is not None:
+        added = added.moved(sequence, settings.limits.kept_slew_nm / 2, drive.to_modes)
+        drive = drive._replace(additions=added)
+        played_nm = added.played_nm(sequence)
+        extra_nm = added.sum_nm if played_nm is None else added.sum_nm + played_nm
+        wanted_nm += extra_nm
+    limited = limit(settings.limits, drive.actuators_nm, wanted_nm)
+    if limited.reasons and (closed or homing):  # the modal command becomes what was kept, against wind-up
+        kept_nm = limited.actuators_nm
+        if extra_nm is not None:
+            kept_nm = np.subtract(kept_nm, extra_nm)
+        command_nm = drive.inverse @ kept_nm.reshape(-1)
+    reasons = (Reason.MODAL_LIMIT, *limited.reasons) if cut else limited.reasons
+    homing = homing and bool(limited.reasons) and not np.array_equal(limited.actuators_nm, drive.actuators_nm)
+    return drive.pushed(command_nm, limited.actuators_nm), reasons, homing
+
+
+def _law_output(drive: ActiveLoop, error_nm: Single) -> tuple[Single, bool]:
+    """The law's modal command (modes,) in its limits, and whether one was cut."""
+    following, held_nm = drive.following, drive.history_nm[0]
+    weight = following.weight if following is not None else np.float32(0)
+    if following is None or weight < 1:
+        integrated_nm, cut = integrate(drive.law, held_nm, error_nm)
+        if following is None or not weight:
+            return integrated_nm, cut
+    wanted_nm = linear_law.respond(following.law, following.x)
+    if weight < 1:
+        wanted_nm = wanted_nm * weight + integrated_nm * (1 - weight)
+    kept_nm = np.clip(wanted_nm, -drive.law.limit_nm, drive.law.limit_nm)
+    return kept_nm, not np.array_equal(kept_nm, wanted_nm)
+
+
+def _acted(limits: tuple[Reason, ...]) -> str:
+    """Why a probe sequence ends once a limit acts: it is no longer what was asked for."""
+    return f"a limit acted: {', '.join(reason.name for reason in limits)}"
+
+
+def _end_probe(drive: ActiveLoop, sequence: int, why: str, events: list[PendingEvent]) -> ActiveLoop:
+    """The drive with nothing more to play after this frame."""
+    added = drive.additions
+    if added is None or added.play is None or added.play.over(sequence):
+        return drive
+    events.append(PendingEvent("PLAY_ENDED", {"why": why}))
+    return drive._replace(additions=added.stopped(sequence))
+
+
+def _step_to_flat(settings: Settings, drive: ActiveLoop) -> ActiveLoop:
+    """One frame towards flat, within the slew limit."""
+    flat = limit(settings.limits, drive.actuators_nm, np.zeros_like(drive.actuators_nm)).actuators_nm
+    if drive.additions is not None:
+        drive = drive._replace(additions=drive.additions.lowered(drive.to_modes))
+    return drive.pushed(drive.inverse @ flat.reshape(-1), flat)
+
+
+def _refuse(
+    settings: Settings, state: State, frame: Frame, reason: Reason, events: list[PendingEvent]
+) -> tuple[State, Outputs]:
+    """Hold the command: a frame that cannot be used still yields a step and a command."""
+    if reason is not state.refused:
+        events.append(PendingEvent("FRAMES_REFUSED", {"reason": reason.name}))
+    drive, homing, hit = state.drive, state.returning_to_zero, state.limits_hit
+    held = np.zeros(0, np.float32)
+    reasons: tuple[Reason, ...] = (reason,)
+    if drive is not None:
+        if state.mode is LoopMode.SAFE:
+            drive = _step_to_flat(settings, drive)
+        elif reason in UNMEASURED and state.mode is not LoopMode.CLOSED:
+            drive, hit, homing = _next_command(settings, state, drive.coasted(1), drive.history_nm[0], frame.sequence)
+            if hit:
+                drive = _end_probe(drive, frame.sequence, _acted(hit), events)
+            _limit_events(state.limits_hit, hit, events)
+            reasons = (reason, *hit)
+        elif reason not in (Reason.REPEATED, Reason.OUT_OF_ORDER, Reason.AHEAD):  # those are no new exposure
+            drive = drive.missed(1)
+        held = drive.history_nm[0]
+    state = state._replace(
+        drive=drive,
+        refused=reason,
+        refused_count=state.refused_count + 1,
+        limits_hit=hit,
+        returning_to_zero=homing,
+        commanded=state.commanded or drive is not None,
+        counts=_counted(state.counts, reasons),
+        input_number=state.input_number + 1,
+    )
+    step = Step(frame.sequence, frame.time_ns, state.mode, held, reasons)
+    if drive is None:
+        return state, Outputs(step=step, events=events)
+    # Under the newest frame's sequence even where an older frame came: the mirror refuses older commands.
+    return state, Outputs(step=step, command=_command(state, drive, held), events=events)
+
+
+def _tick(settings: Settings, state: State, tick: Tick) -> tuple[State, Outputs]:
+    """Without frames: repeat the held command, so that only a dead controller lets it expire."""
+    state, events = lease_checked(state, tick.time_ns, 0)
+    freed = bool(events)
+    drive = state.drive
+    safe = state.mode is LoopMode.SAFE
+    if drive is None or not (state.commanded or safe):
+        return state, Outputs(events=tuple(events), changed=freed)
+    silent = (
+        state.frame_timeout or tick.silent_ns > settings.frame_timeout_ns
+    )  # until a newer frame comes, whatever else comes
+    flatten = silent and settings.on_frame_timeout == "flat"
+    counts = state.counts
+    if silent and not state.frame_timeout:
+        action = "relaxing the mirror to flat" if flatten else "holding the command"
+        events.append(PendingEvent("NO_FRAMES", {"silent_ms": tick.silent_ns / 1e6, "action": action}))
+        counts = _counted(counts, (Reason.NO_FRAME,))
+        drive = _end_probe(drive, state.frame_sequence, f"no frame for {tick.silent_ns / 1e6:.0f} ms", events)
+    if flatten or safe:
+        drive = _step_to_flat(settings, drive)
+    state = state._replace(drive=drive, frame_timeout=silent, commanded=True, counts=counts)
+    return state, Outputs(command=_command(state, drive, drive.history_nm[0]), events=events, changed=freed)
+
+
+def _load(settings: Settings, state: State, load: Load) -> tuple[State, Outputs]:
+    state, events = loaded(settings, state, load.calibration, load.source, load.time_ns)
+    return state, Outputs(events=events, changed=True)
+
+
+def _request(settings: Settings, state: State, request: Request) -> tuple[State, Outputs]:
+    answered = answer(settings, state, request)
+    reply = Reply(answered.accepted, answered.text, state.frame_sequence + 1)
+    changed = answered.state is not state
+    # Every request is counted, for its answer is in the log.
+    after = answered.state if changed else state._replace()
+    return after, Outputs(reply=reply, events=answered.events, changed=changed)
+
+
+def _limit_events(before: tuple[Reason, ...], now: tuple[Reason, ...], events: list[PendingEvent]) -> None:
+    events.extend(PendingEvent("LIMIT_HIT", {"reason": reason.name}) for reason in now if reason not in before)
+    events.extend(PendingEvent("LIMIT_CLEARED", {"reason": reason.name}) for reason in before if reason not in now)
+
+
+def _counted(counts: Mapping[Reason, int], reasons: tuple[Reason, ...]) -> Mapping[Reason, int]:
+    if not reasons:
+        return counts
+    return {**counts, **{reason: counts.get(reason, 0) + 1 for reason in reasons}}
+
+
+_HANDLERS: dict[type, Callable[..., tuple[State, Outputs]]] = {
+    Request: _request,
+    MirrorShape: mirror_reported,
+    CameraSettings: camera_reported,
+    Load: _load,
+    Tick: _tick,
+}

@@ -1,0 +1,91 @@
+"""From a frame to modal errors: dark, flux normalisation, reference, reconstructor."""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from lowfc.arrays import Pixels, Single
+from lowfc.control.calibration.calibration import Calibration
+
+
+class Estimate(NamedTuple):
+    """Modal errors of a frame (modes,), nm of wavefront rms, and the sum of its good pixels, dark subtracted, DN."""
+
+    error_nm: Single
+    flux_dn: float
+
+    def same(self, other: "Estimate | None") -> bool:
+        """Whether the other is of the same image: photons are never twice the same, a stuck camera's are."""
+        return other is not None and self.flux_dn == other.flux_dn and np.array_equal(self.error_nm, other.error_nm)
+
+
+class Estimator(NamedTuple):
+    """R times the `difference` of a frame, in the order in which it is quickest: R (I - dark) and the flux at once.
+
+    Rounding adds some 1e-5 nm to a mode of the paper's sensor.
+
+    Attributes:
+        rows: (modes + 1, pixels) R, and below it the good pixels.
+        reference_nm: (modes,) R I0.
+        dark: (pixels,) DN.
+        scratch: (pixels,) overwritten by every frame, so that nothing the size of a frame is allocated; it carries
+            nothing from one call to the next.
+    """
+
+    rows: Single
+    reference_nm: Single
+    dark: Single
+    scratch: Single
+
+    @classmethod
+    def of(cls, calibration: Calibration) -> "Estimator":
+        """The estimator of a calibration."""
+        R, I0 = calibration.reconstructor, calibration.reference
+        reference_nm = (R.astype(np.float64) @ I0).astype(np.float32)
+        return cls(np.vstack([R, calibration.good]), reference_nm, calibration.dark, np.empty_like(calibration.dark))
+
+    def estimate(self, pixels: Pixels, min_flux_dn: float) -> Estimate | None:
+        """Modal error of a frame (pixels,); None where its flux is at most `min_flux_dn`."""
+        np.copyto(self.scratch, pixels)  # by itself, for it is quicker than a subtraction of two types
+        np.subtract(self.scratch, self.dark, out=self.scratch)
+        sums = self.rows.dot(self.scratch)  # half a microsecond less than `@`
+        flux_dn = float(sums[-1])
+        if not flux_dn > min_flux_dn:
+            return None
+        return Estimate(sums[:-1] * np.float32(1 / flux_dn) - self.reference_nm, flux_dn)
+
+
+def difference(calibration: Calibration, pixels: Pixels, min_flux_dn: float, out: Single) -> float | None:
+    """Put (I - dark) / flux - I0 of a frame (pixels,) into `out` (pixels,), float32.
+
+    Returns:
+        The flux: the sum of the good pixels, dark subtracted, DN. None where it is at most `min_flux_dn`; `out` then
+        holds I - dark.
+    """
+    np.subtract(pixels, calibration.dark, out=out)
+    flux_dn = float(out @ calibration.good)
+    if not flux_dn > min_flux_dn:
+        return None
+    out *= np.float32(1 / flux_dn)
+    out -= calibration.reference
+    return flux_dn
+
+
+def filled(calibration: Calibration, pixels: Pixels) -> Pixels:
+    """A frame (pixels,) whose pixels at full well are what the reference has there, for the light of all the others.
+
+    A pixel that was hit says nothing of the wavefront, but would weigh as much as its charge.
+    """
+    full = pixels >= calibration.saturation_dn
+    others = calibration.good * ~full
+    light, share = float((pixels - calibration.dark) @ others), float(calibration.reference @ others)
+    flux_dn = light / share if share > 0 else 0.0
+    expected = np.clip(calibration.dark + calibration.reference * np.float32(flux_dn), 0, calibration.saturation_dn)
+    return np.where(full, np.rint(expected), pixels).astype(np.uint16)
+
+
+def saturated_pixels(calibration: Calibration, pixels: Pixels) -> int:
+    """How many good pixels of a frame (pixels,) are at full well."""
+    if pixels.item(pixels.argmax()) < calibration.saturation_dn:
+        return 0
+    return int(np.count_nonzero((pixels >= calibration.saturation_dn) & (calibration.good > 0)))

@@ -1,0 +1,202 @@
+"""A calibration, a mirror, a camera or a mode taken into use: the mirror stays where it is, whatever changes."""
+
+from dataclasses import replace
+
+import numpy as np
+
+from lowfc.arrays import Single
+from lowfc.control.calibration.calibration import Calibration
+from lowfc.control.loop.additions import ADOPTED, Channel
+from lowfc.control.loop.camera import CameraSettings, changes
+from lowfc.control.loop.inputs import MirrorShape, Outputs, PendingEvent
+from lowfc.control.loop.safety import LoopMode
+from lowfc.control.loop.state import ActiveLoop, Conditions, Settings, State
+
+ADOPTED_NM = 1.0
+"""Of an actuator beyond the modal command, above which a mirror's shape is adopted as a channel."""
+LATCHED = "it was in safe mode before the controller started"
+WITNESSED = "the mirror's last command was sent in safe mode"
+
+
+def loaded(
+    settings: Settings, state: State, calibration: Calibration, source: str, time_ns: int
+) -> tuple[State, list[PendingEvent]]:
+    """The state under another calibration, and what there is to say of it.
+
+    Where the mirror has the same grid, its shape stays: the channels as they are, the rest as a command of the new
+    modes, and what these cannot make as a channel of its own. Offset, play and a law of other modes are of no meaning
+    any more.
+    """
+    drive, before = ActiveLoop.at_rest(settings, calibration), state.drive
+    details: dict[str, object] = {
+        "id": calibration.id[:12],
+        "modes": len(calibration.noll),
+        "estimator": calibration.estimator,
+        "source": source,
+    }
+    events = [PendingEvent("CALIBRATION_LOADED", details)]
+    if before is not None and before.actuators_nm.shape == calibration.grid:
+        shape_nm = before.actuators_nm
+        same = before.calibration.noll == calibration.noll
+        if before.additions is not None:
+            shape_nm = shape_nm - before.additions.sum_nm
+            additions = drive.added().at(before.additions.channels, drive.to_modes)
+            if same:
+                additions = additions._replace(offset_nm=before.additions.offset_nm)
+            drive = drive._replace(additions=additions.settled())
+        command_nm = drive.inverse @ shape_nm.reshape(-1)
+        drive = drive._replace(
+            law=before.law if same else drive.law,
+            following=before.following if same else None,
+            actuators_nm=before.actuators_nm,
+            history_nm=(command_nm,) * len(drive.history_nm),
+        )
+        drive, rest = adopted(drive, shape_nm)
+        events += rest
+    before_mode, cause = state.mode, "a calibration was loaded"
+    mode = settings.start_mode if before_mode is LoopMode.IDLE else before_mode
+    if mode is LoopMode.SAFE:
+        cause = LATCHED
+    state = state._replace(drive=drive)
+    if mode is not LoopMode.SAFE and (wrong := uncalibrated(state)):
+        mode, cause = LoopMode.IDLE, wrong
+    elif mode is LoopMode.CLOSED and (wrong := misfit(state)):
+        mode, cause = LoopMode.OPEN, f"the camera does not fit the calibration: {wrong}"
+    if mode is not before_mode:
+        events.append(mode_event(before_mode, mode, cause))
+        state = state._replace(mode=mode, conditions=_since(state, time_ns, cause))
+    return state, events
+
+
+def misfit(state: State) -> str:
+    """Why the camera, as its settings were last received, does not fit the calibration; empty where it does."""
+    camera, drive = state.conditions.camera, state.drive
+    if camera is None or drive is None or not drive.calibration.noll:
+        return ""
+    return "; ".join(changes(camera, _expected(drive, camera)))
+
+
+def uncalibrated(state: State) -> str:
+    """Why no mode can be measured: no calibration, or the model's, of frames of another size; empty where they can."""
+    drive, camera = state.drive, state.conditions.camera
+    hint = ": `lowfc commission` measures one"
+    if drive is None or not drive.calibration.noll:
+        return f"no calibration is loaded{hint}"
+    rows, columns = drive.calibration.shape
+    if camera is None or camera.shape == (rows, columns) or not drive.calibration.operator_hash:
+        return ""
+    frames = "{} x {}".format(*camera.shape)
+    return f"the computed calibration is for frames of {rows} x {columns} pixels, the camera's are {frames}{hint}"
+
+
+def mirror_reported(settings: Settings, state: State, shape: MirrorShape) -> tuple[State, Outputs]:
+    """Start from where the mirror is, so that it does not jump; later shapes change nothing."""
+    if state.commanded:
+        return state, Outputs()
+    events: list[PendingEvent] = []
+    drive, safe = state.drive, WITNESSED if shape.safe else ""
+    if drive is None:  # probe sequences and channels need no calibration
+        drive = ActiveLoop.at_rest(settings, Calibration.none(shape.actuators_nm.shape))
+        events.append(PendingEvent("NOT_CALIBRATED", {"why": uncalibrated(state)}))
+        safe = safe or (LATCHED if settings.start_mode is LoopMode.SAFE else "")
+    if safe and state.mode is not LoopMode.SAFE:
+        events += [mode_event(state.mode, LoopMode.SAFE, safe), PendingEvent("SAFED", {"why": safe})]
+        state = in_mode(state, LoopMode.SAFE, shape.time_ns, safe)
+    if shape.actuators_nm.shape != drive.calibration.grid or not np.isfinite(shape.actuators_nm).all():
+        why = f"the mirror has a grid of {shape.actuators_nm.shape}, the calibration {drive.calibration.grid}"
+        events.append(PendingEvent("MIRROR_REFUSED", {"why": why}))
+        return state, Outputs(events=events, changed=bool(safe))
+    limit_nm = drive.law.limit_nm
+    believed = shape.command_nm.shape == limit_nm.shape and (np.abs(shape.command_nm) <= limit_nm).all()
+    command_nm = shape.command_nm if believed else drive.inverse @ shape.actuators_nm.reshape(-1)
+    drive = drive._replace(actuators_nm=shape.actuators_nm, history_nm=(command_nm,) * len(drive.history_nm))
+    if command_nm.any():
+        events.append(PendingEvent("MIRROR_ADOPTED", {"rms_nm": float(np.sqrt(command_nm @ command_nm))}))
+    if state.mode is not LoopMode.SAFE:  # then it is on its way to flat, and shall stay there
+        drive, rest = adopted(drive, shape.actuators_nm)
+        events += rest
+    return state._replace(drive=drive), Outputs(events=events, changed=True)
+
+
+def camera_reported(settings: Settings, state: State, camera: CameraSettings) -> tuple[State, Outputs]:
+    """Keep the camera's settings; open the loop where it is no longer the camera that was calibrated."""
+    after = _with_camera(state, camera)
+    if after is state:
+        return state, Outputs()
+    wrong = misfit(after)
+    events, mode, cause = [], after.mode, "the camera's frames fit the calibration"
+    if wrong and wrong != misfit(state):
+        events.append(PendingEvent("CAMERA_CHANGED", {"what": wrong}))
+        cause = f"the camera does not fit the calibration: {wrong}"
+    if mode is not LoopMode.SAFE and uncalibrated(after) and not after.frames_used:
+        mode = LoopMode.IDLE
+    elif (mode is LoopMode.CLOSED and wrong) or (mode is LoopMode.IDLE and not uncalibrated(after)):
+        mode = LoopMode.OPEN
+    if mode is not after.mode:
+        events.append(mode_event(after.mode, mode, cause))
+        after = in_mode(after, mode, camera.time_ns, cause)
+    return after, Outputs(events=events, changed=True)
+
+
+def _with_camera(state: State, camera: CameraSettings) -> State:
+    """The state with settings of the camera just received; the very same one where they are nothing new."""
+    drive, known = state.drive, state.conditions
+    if (
+        drive is not None
+        and drive.calibration.noll
+        and drive.camera is None
+        and not changes(camera, _expected(drive, camera))
+    ):
+        state = state._replace(drive=drive._replace(camera=camera))
+    if camera != known.camera or known.camera_awaited:
+        state = state._replace(conditions=known._replace(camera=camera, camera_awaited=False))
+    return state
+
+
+def _expected(drive: ActiveLoop, camera: CameraSettings) -> CameraSettings:
+    """Settings of the calibration; where it has none yet, those of the camera as far as the calibration allows."""
+    if drive.camera is not None:
+        return drive.camera
+    calibration = drive.calibration
+    return replace(camera, shape=calibration.shape, saturation_dn=calibration.saturation_dn)
+
+
+def _since(state: State, time_ns: int, cause: str) -> Conditions:
+    return state.conditions._replace(mode_since_ns=time_ns, mode_cause=cause)
+
+
+def adopted(drive: ActiveLoop, shape_nm: Single) -> tuple[ActiveLoop, list[PendingEvent]]:
+    """What a shape (rows, columns) has beyond the modal command, kept as a channel; the driver's rounding is not."""
+    rest_nm = shape_nm.copy()
+    rest_nm -= (drive.to_actuators @ drive.history_nm[0]).reshape(rest_nm.shape)
+    if not np.abs(rest_nm).max() > ADOPTED_NM:
+        return drive, []
+    added = drive.added()
+    before = added.channel(ADOPTED)
+    there_nm = rest_nm if before is None else before.wanted_nm + rest_nm
+    added = added.having(Channel(ADOPTED, there_nm, there_nm), drive.to_modes).settled()
+    rms_nm = float(np.sqrt(np.mean(np.square(rest_nm))))
+    drive = drive._replace(additions=added)
+    return drive, [PendingEvent("SHAPE_ADOPTED", {"rms_nm": rms_nm})]
+
+
+def in_mode(state: State, mode: LoopMode, time_ns: int, cause: str) -> State:
+    """Nothing of the last mode goes on in the next one."""
+    drive = state.drive
+    if drive is not None and mode is not state.mode:
+        if drive.additions is not None:
+            only_flat = mode is LoopMode.SAFE
+            added = drive.additions.stopped(state.frame_sequence)
+            drive = drive._replace(additions=added.lowered(drive.to_modes, only_flat=True) if only_flat else added)
+        if drive.following is not None and mode is LoopMode.CLOSED:
+            drive = drive._replace(following=drive.following.taking_over())
+    same = mode is state.mode
+    conditions = state.conditions if same else _since(state, time_ns, cause)
+    return state._replace(
+        mode=mode, drive=drive, steps_left=0, returning_to_zero=state.returning_to_zero and same, conditions=conditions
+    )
+
+
+def mode_event(before: LoopMode, after: LoopMode, why: str) -> PendingEvent:
+    """The event of a loop mode that changed."""
+    return PendingEvent("MODE_CHANGED", {"before": before.in_words, "after": after.in_words, "why": why})

@@ -1,0 +1,398 @@
+"""Operators' requests: what each does to the state, and the sentence it is answered with.
+
+Each is applied whole, between two frames, or refused with a sentence and nothing changed.
+"""
+
+from collections.abc import Callable
+from dataclasses import replace
+from typing import NamedTuple
+
+import numpy as np
+
+from lowfc.arrays import Single
+from lowfc.control.laws.law import Law
+from lowfc.control.laws.margins import check_law
+from lowfc.control.laws.stability import highest_gain, limiting_gain
+from lowfc.control.loop.additions import FLAT, MIRROR, CommandChannels, Play, play_table
+from lowfc.control.loop.inputs import PendingEvent, Request
+from lowfc.control.loop.lease import ENDED_BY, refusal
+from lowfc.control.loop.loading import in_mode, loaded, misfit, mode_event, uncalibrated
+from lowfc.control.loop.remarks import check_offset, remark
+from lowfc.control.loop.reservation import lease, lease_checked, lease_ended, release, renew
+from lowfc.control.loop.safety import Limits, LoopMode, neighbour_difference_nm, request_mode
+from lowfc.control.loop.state import ActiveLoop, LawRunner, Settings, State
+from lowfc.control.loop.wording import MOST_TEXT, PAUSED, counted
+
+MOST_STEPS = 1 << 32
+MOST_REPLY = 1000
+"""Characters of a reply."""
+REFUSED_IN_A_ROW = 3
+"""Frames refused in a row from which on the loop is not closed; fewer may be a hiccup."""
+
+
+class Answer(NamedTuple):
+    """State after a request, whether it was accepted, the sentence about it, and the events it gave rise to."""
+
+    state: State
+    accepted: bool
+    text: str
+    events: tuple[PendingEvent, ...] = ()
+
+
+def answer(settings: Settings, state: State, request: Request) -> Answer:
+    """What a request does; a refused one changes nothing."""
+    handler = _HANDLERS.get(request.name)
+    if handler is None:
+        return Answer(state, False, _short(f"unknown request {request.name[:40]!r}; there are {', '.join(REQUESTS)}"))
+    request = prepared(settings, request)
+    now, ended = lease_checked(state, request.time_ns, 0)
+    held = now.conditions.lease
+    refused = refusal(held, request.name, request.lease_id, request.time_ns) or request.refusal
+    if refused:
+        return Answer(state, False, _short(refused))
+    try:
+        after, text, *events = handler(settings, now, request)
+    except ValueError as error:
+        return Answer(state, False, _short(str(error)))
+    if request.name == "safe" or (request.name in ENDED_BY and held is not None and held.id != request.lease_id):
+        after, others = lease_ended(after, _asked(request))
+        events += others
+        text += "".join(f"; this ended the reservation for {event.details['holder']}" for event in others)
+    if after.mode is not state.mode:
+        why = _asked(request)
+        events.append(mode_event(state.mode, after.mode, why))
+        if after.mode is LoopMode.SAFE:
+            events.append(PendingEvent("SAFED", {"why": why}))
+    return Answer(after, True, text, (*ended, *events))
+
+
+def prepared(settings: Settings, request: Request) -> Request:
+    """The request, checked for what needs no state and may take long: for a thread that no frame waits for.
+
+    What is wrong with it is its `refusal`. A request that was prepared is returned as it is.
+    """
+    if request.prepared:
+        return request
+    try:
+        if request.law is not None:
+            check_law(request.law, settings.delay_frames, settings.rate_hz)
+        if request.name == "gain":
+            highest_gain(settings.delay_frames)  # which the reply needs, and no frame shall wait for
+        if request.name == "play":
+            request = replace(request, played=play_table(request.text, request.table, request.actuators_nm.reshape(-1)))
+    except ValueError as error:
+        request = replace(request, refusal=str(error))
+    return replace(request, prepared=True)
+
+
+def _asked(request: Request) -> str:
+    return f"operator asked to {request.name}"
+
+
+def _short(text: str) -> str:
+    return text if len(text) <= MOST_REPLY else f"{text[: MOST_REPLY - 3]}..."
+
+
+Handled = tuple[State, str, *tuple[PendingEvent, ...]]
+Handler = Callable[[Settings, State, Request], Handled]
+
+
+def _status(settings: Settings, state: State, request: Request) -> Handled:
+    return state, state.mode.in_words
+
+
+def _mode(settings: Settings, state: State, request: Request) -> Handled:
+    """open, close, safe, clear; to pause is to open: the command is held until the loop is closed again."""
+    asked = "open" if request.name == "pause" else request.name
+    after = _granted(state, asked)
+    if request.name == "clear":  # the camera's and the mirror's numbers may begin anew, too
+        conditions = state.conditions._replace(clear_id=request.time_ns)
+        state = state._replace(frame_sequence=0, conditions=conditions)
+    reply, paused = _REPLIES[request.name], state.conditions.mode_cause == PAUSED
+    if request.name == "pause" and state.mode is LoopMode.OPEN and not paused:
+        reply = "the loop is open already, and holds the command"
+    if request.name == "open" and paused:
+        state = state._replace(conditions=state.conditions._replace(mode_cause=_asked(request)))
+    if after is LoopMode.CLOSED and state.drive is not None and state.drive.calibration.provisional:
+        reply += (
+            "; nobody has judged its calibration, the first one of a commissioning: `lowfc commission --resume` makes "
+            "the next, `lowfc ctl load FILE` puts another one in use"
+        )
+    if after is LoopMode.IDLE:
+        reply = f"loop idle: {uncalibrated(state)}"
+    return in_mode(state, after, request.time_ns, _asked(request)), reply
+
+
+def _granted(state: State, asked: str) -> LoopMode:
+    """The mode that a request leads to; ValueError says why it is refused."""
+    missing = uncalibrated(state)
+    after, why = request_mode(state.mode, asked, calibrated=not missing)
+    if why:
+        raise ValueError(missing if asked == "close" and missing else why)
+    if after is LoopMode.CLOSED:
+        _check_closable(state)
+    return after
+
+
+_REPLIES = {
+    "open": "loop open",
+    "pause": "loop paused: the command is held until `lowfc ctl close`",
+    "close": "loop closed",
+    "safe": "loop in safe mode",
+    "clear": "loop open",
+}
+
+
+def _check_closable(state: State) -> None:
+    """Refuse to close the loop on a camera that is known to be wrong, or none of whose frames can be used."""
+    _check_camera(state)
+    if state.refused is not None and state.refused_count >= REFUSED_IN_A_ROW:
+        raise ValueError(
+            f"the last {state.refused_count} frames were refused as {state.refused.name}: correct this first; if the "
+            "frame sequences are wrong, `lowfc ctl safe` and then `lowfc ctl clear` reset the newest sequence"
+        )
+
+
+def _check_camera(state: State) -> None:
+    wrong = misfit(state)
+    if wrong:
+        raise ValueError(
+            f"the camera does not fit the calibration ({wrong}): set it back, or load a calibration made with it"
+        )
+    if state.conditions.camera_awaited:
+        raise ValueError("the camera restarted, and its settings have not been received yet: try again")
+
+
+def _step(settings: Settings, state: State, request: Request) -> Handled:
+    frames = request.values[0] if len(request.values) == 1 else 0.0
+    if not (1 <= frames <= MOST_STEPS and frames == int(frames)):
+        raise ValueError(f"step takes one whole number of frames, 1 or more; got {list(request.values)}")
+    state = in_mode(state, _granted(state, "close"), request.time_ns, _asked(request))
+    return state._replace(steps_left=int(frames)), f"loop closed for {counted(int(frames), 'frame')}"
+
+
+def _reset(settings: Settings, state: State, request: Request) -> Handled:
+    drive = _drive(state)
+    if state.mode is LoopMode.SAFE:
+        raise ValueError("the loop is in safe mode: the mirror is on its way to flat, or there")
+    if drive.following is not None:
+        drive = drive._replace(following=LawRunner.at_rest(drive.following.law))
+    return state._replace(drive=drive, returning_to_zero=True), "the modal command goes to zero"
+
+
+def _law_of_modes(settings: Settings, state: State, request: Request) -> Handled:
+    """gain, leak and limit of the integrator."""
+    drive = _drive(state)
+    if drive.following is not None and request.name != "limit":
+        raise ValueError(
+            f"the law {drive.following.law.name!r} drives the mirror, and has no {request.name}: "
+            "`lowfc ctl law integrator` goes back to the one that has"
+        )
+    law = _changed(drive.law, drive.calibration.noll, settings.delay_frames, request)
+    attribute = _ATTRIBUTES[request.name]
+    values = " ".join(f"{value:g}" for value in getattr(law, attribute).tolist())
+    return state._replace(
+        drive=drive._replace(law=law)
+    ), f"{request.name} is now {values}{remark(settings, drive, request)}"
+
+
+def _offset(settings: Settings, state: State, request: Request) -> Handled:
+    drive = _drive(state)
+    added = drive.added()
+    asked = request if request.values else replace(request, values=(0.0,))
+    values = _per_mode(drive.calibration.noll, asked, added.offset_nm)
+    check_offset(drive, np.abs(values))
+    text = " ".join(f"{value:g}" for value in values.tolist())
+    return _with(state, drive, added._replace(offset_nm=values)), f"offset is now {text} nm"
+
+
+def _channel(settings: Settings, state: State, request: Request) -> Handled:
+    drive = _mirror(state)
+    if state.mode is LoopMode.SAFE and request.text != FLAT:
+        raise ValueError("the loop is in safe mode: `lowfc ctl clear` first, when it is safe")
+    grid = drive.calibration.grid
+    wanted_nm = np.zeros(grid, np.float32)
+    if request.actuators_nm.size:
+        if request.actuators_nm.size != wanted_nm.size:
+            raise ValueError(f"a channel has {grid[0]} x {grid[1]} actuators, got {request.actuators_nm.size}")
+        wanted_nm = request.actuators_nm.reshape(grid)
+    _check_shape(settings.limits, wanted_nm)
+    added = drive.added().with_channel(request.text, wanted_nm, drive.to_modes)
+    if not request.actuators_nm.size and drive.added().channel(request.text) is None:
+        names = ", ".join(one.name for one in drive.added().channels)
+        return state, f"there is no channel {request.text!r} to remove; there are {names or 'none'}"
+    _check_shape(settings.limits, sum((one.wanted_nm for one in added.channels), np.zeros(grid, np.float32)))
+    rms_nm = float(np.sqrt(np.mean(np.square(wanted_nm, dtype=np.float64))))
+    return _with(state, drive, added), f"channel {request.text}: {rms_nm:.3g} nm rms of surface"
+
+
+def _play(settings: Settings, state: State, request: Request) -> Handled:
+    drive = _mirror(state)
+    if state.mode is LoopMode.SAFE:
+        raise ValueError("the loop is in safe mode: `lowfc ctl clear` first, when it is safe")
+    if not state.frame_sequence:
+        raise ValueError("no frame has come yet, from which to count those of a play")
+    added = drive.added()
+    if added.play is not None and not added.play.over(state.frame_sequence + 1):
+        raise ValueError("something is being played already: `lowfc ctl stop` ends it")
+    table = request.played
+    assert table is not None  # noqa: S101  # prepared
+    if table.target == MIRROR:
+        grid = drive.calibration.grid
+        if table.basis.shape[1] != grid[0] * grid[1]:
+            raise ValueError(
+                f"a play needs a shape of {grid[0]} x {grid[1]} actuators for each of {len(table.largest)} columns, "
+                f"got {table.basis.shape[1]} actuators for each"
+            )
+        if table.reach_nm > settings.limits.stroke_nm:
+            raise ValueError(f"the shapes of the play may go beyond the stroke of {settings.limits.stroke_nm:g} nm")
+    else:
+        modes = len(drive.calibration.noll)
+        if len(table.largest) != modes:
+            raise ValueError(f"a play on the offset has {modes} columns, one for each mode; got {len(table.largest)}")
+        check_offset(drive, table.largest)
+    frames = len(table.rows)
+    made = Play(table, state.frame_sequence + 1, frames)
+    return _with(state, drive, added._replace(play=made)), f"playing {counted(frames, 'frame')} on the {table.target}"
+
+
+def _stop(settings: Settings, state: State, request: Request) -> Handled:
+    drive = state.drive
+    play = drive.additions.play if drive is not None and drive.additions is not None else None
+    left = 0 if play is None else play.left(state.frame_sequence + 1)
+    if drive is None or drive.additions is None or play is None or not left:
+        return state, "nothing is being played"
+    text = f"stopped on the {play.target}: {left} of {play.frames} frames were left"
+    return _with(state, drive, drive.additions.stopped(state.frame_sequence)), text
+
+
+def _law(settings: Settings, state: State, request: Request) -> Handled:
+    drive = _drive(state)
+    if request.law is None:
+        return state._replace(drive=drive._replace(following=None)), "the integrator drives the mirror"
+    _check_camera(state)
+    law = request.law
+    if law.noll != drive.calibration.noll:
+        raise ValueError(f"the law is of the modes {list(law.noll)}, the loop of {list(drive.calibration.noll)}")
+    drive = drive._replace(following=LawRunner.at_rest(law))
+    return state._replace(drive=drive), f"the law {law.name!r} takes over from the integrator"
+
+
+def _load(settings: Settings, state: State, request: Request) -> Handled:
+    if request.calibration is None:
+        raise ValueError("there is no calibration in the request")
+    if state.mode is LoopMode.CLOSED:
+        raise ValueError("the loop is closed: open it before another calibration is loaded")
+    before = state.drive
+    if before is not None and before.calibration.grid != request.calibration.grid:
+        raise ValueError(
+            f"the calibration is for a mirror of {request.calibration.grid} actuators, this one has "
+            f"{before.calibration.grid}"
+        )
+    settings = replace(settings, start_mode=LoopMode.OPEN)  # an idle loop is not closed by what may be a first try
+    after, events = loaded(settings, state, request.calibration, "operator", request.time_ns)
+    said = (event for event in events if event.name != "MODE_CHANGED")  # which every request has
+    return after, f"calibration {request.calibration.id[:12]}", *said
+
+
+def _note(settings: Settings, state: State, request: Request) -> Handled:
+    if not 0 < len(request.text.strip()) <= MOST_TEXT:
+        raise ValueError(f"a note has 1 to {MOST_TEXT} characters, got {len(request.text)}")
+    return state, "noted", PendingEvent("NOTE", {"text": request.text.strip()})
+
+
+def _mirror(state: State) -> ActiveLoop:
+    """The drive, with or without a calibration."""
+    if state.drive is None:
+        raise ValueError("no mirror has reported its shape yet, and no calibration is loaded")
+    return state.drive
+
+
+def _drive(state: State) -> ActiveLoop:
+    if state.drive is None or not state.drive.calibration.noll:
+        raise ValueError("no calibration is loaded, so there are no modes yet")
+    return state.drive
+
+
+def _with(state: State, drive: ActiveLoop, additions: CommandChannels) -> State:
+    return state._replace(drive=drive._replace(additions=additions))
+
+
+def _check_shape(limits: Limits, wanted_nm: Single) -> None:
+    """A channel that the mirror could not take by itself is refused here, where it can still be said."""
+    if not np.isfinite(wanted_nm).all():
+        raise ValueError("every actuator of a channel must be finite")
+    largest, apart = float(np.abs(wanted_nm).max()), neighbour_difference_nm(wanted_nm)
+    if largest > limits.kept_stroke_nm:
+        raise ValueError(f"an actuator is {largest:.4g} nm from flat, the limit is {limits.stroke_nm:g} nm")
+    if apart > limits.neighbour_nm - limits.margin_nm:
+        raise ValueError(f"neighbours differ by {apart:.4g} nm, the limit is {limits.neighbour_nm:g} nm")
+
+
+def _per_mode(noll: tuple[int, ...], request: Request, before: Single) -> Single:
+    """The values of all modes (modes,) with those of the request in their places.
+
+    Raises:
+        ValueError: what is wrong with the request.
+    """
+    modes = request.modes or noll
+    unknown = sorted(set(modes) - set(noll))
+    if unknown:
+        raise ValueError(f"Noll modes {unknown} are not controlled; there are {noll[0]} to {noll[-1]}")
+    if len(request.values) not in (1, len(modes)):
+        raise ValueError(f"give one value, or one for each of the {len(modes)} modes; got {len(request.values)}")
+    if not np.isfinite(request.values).all():
+        raise ValueError(f"{request.name} must be finite, got {list(request.values)}")
+    array = before.copy()
+    array[[noll.index(mode) for mode in modes]] = np.asarray(request.values, dtype=np.float32)
+    return array
+
+
+def _changed(law: Law, noll: tuple[int, ...], delay_frames: float, request: Request) -> Law:
+    """The law with new gains, leaks or limits; ValueError says what is wrong with the request."""
+    attribute = _ATTRIBUTES[request.name]
+    values = _per_mode(noll, request, getattr(law, attribute))
+    lowest, highest = min(request.values), max(request.values)
+    if request.name == "gain":
+        limiting = limiting_gain(delay_frames)
+        if not (lowest >= 0 and highest < limiting):
+            raise ValueError(
+                f"gain must be at least 0 and below {limiting:.3g}, where a loop with a delay of {delay_frames:g} "
+                f"frames becomes unstable; got {max(request.values, key=abs):g}"
+            )
+    elif request.name == "leak" and not (lowest >= 0 and highest <= 1):
+        raise ValueError(f"leak must be between 0 and 1, got {max(request.values, key=abs):g}")
+    elif lowest < 0:
+        raise ValueError(f"limit must be at least 0 nm, got {lowest:g}")
+    return replace(law, **{attribute: values})
+
+
+_ATTRIBUTES = {"gain": "gain", "leak": "leak", "limit": "limit_nm"}
+
+_HANDLERS: dict[str, Handler] = {
+    "status": _status,
+    "open": _mode,
+    "close": _mode,
+    "pause": _mode,
+    "step": _step,
+    "safe": _mode,
+    "clear": _mode,
+    "reset": _reset,
+    "gain": _law_of_modes,
+    "leak": _law_of_modes,
+    "limit": _law_of_modes,
+    "offset": _offset,
+    "channel": _channel,
+    "play": _play,
+    "stop": _stop,
+    "law": _law,
+    "load": _load,
+    "note": _note,
+    "lease": lease,
+    "renew": renew,
+    "release": release,
+}
+
+CONFIGURATION = "configuration"
+"""The one request that the process answers, which knows its configuration."""
+REQUESTS = (*_HANDLERS, CONFIGURATION)

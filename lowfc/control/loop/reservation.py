@@ -1,0 +1,85 @@
+"""What leases do to the state: requested, renewed, released, ended."""
+
+from math import ceil
+
+from lowfc.control.loop.inputs import PendingEvent, Request
+from lowfc.control.loop.lease import MAX_HOLDER, MAX_S, Lease
+from lowfc.control.loop.safety import LoopMode
+from lowfc.control.loop.state import Settings, State
+
+
+def lease(settings: Settings, state: State, request: Request) -> tuple[State, str, PendingEvent]:
+    """Reserve the loop for the client that asks.
+
+    Raises:
+        ValueError: somebody else holds it, the loop is in safe mode, or the request is not whole.
+    """
+    before = state.conditions.lease
+    if state.mode is LoopMode.SAFE:
+        raise ValueError("the loop is in safe mode: `lowfc ctl clear` first, when it is safe")
+    if before is not None and not before.ended and before.id != request.lease_id:
+        raise ValueError(before.reserved(request.time_ns))
+    made = _extended(settings, state, request)
+    return _with(state, made), made.reserved(request.time_ns), PendingEvent("LEASE_TAKEN", {"holder": made.holder})
+
+
+def renew(settings: Settings, state: State, request: Request) -> tuple[State, str]:
+    """Extend a lease that is in force.
+
+    Raises:
+        ValueError: it is not, and why it ended.
+    """
+    before = state.conditions.lease
+    if before is None or before.id != request.lease_id:
+        raise ValueError("this lease is not in force: the controller restarted, or another lease was granted")
+    if before.ended:
+        raise ValueError(f"the lease ended: {before.ended}")
+    made = _extended(settings, state, request)
+    return _with(state, made), made.reserved(request.time_ns)
+
+
+def release(settings: Settings, state: State, request: Request) -> tuple[State, str] | tuple[State, str, PendingEvent]:
+    """End a lease at its holder's request; another's stays."""
+    held = state.conditions.lease
+    if held is None or held.ended or held.id != request.lease_id:
+        return state, "nothing was reserved"
+    after = _with(state, held._replace(ended="its holder released it"))
+    return after, "released", PendingEvent("LEASE_RELEASED", {"holder": held.holder})
+
+
+def lease_checked(state: State, time_ns: int, frame_sequence: int) -> tuple[State, list[PendingEvent]]:
+    """The state without a lease that was not renewed by this time or frame, and the event of its end."""
+    held = state.conditions.lease
+    if held is None or held.ended or not held.over(time_ns, frame_sequence):
+        return state, []
+    return lease_ended(state, "it was not renewed in time")
+
+
+def lease_ended(state: State, why: str) -> tuple[State, list[PendingEvent]]:
+    """The state without the lease in force and without its probe sequence, and the event."""
+    held, drive = state.conditions.lease, state.drive
+    if held is None or held.ended:
+        return state, []
+    if drive is not None and drive.additions is not None:
+        drive = drive._replace(additions=drive.additions.stopped(state.frame_sequence))
+    after = _with(state, held._replace(ended=why))._replace(drive=drive)
+    return after, [PendingEvent("LEASE_ENDED", {"holder": held.holder, "why": why})]
+
+
+def _extended(settings: Settings, state: State, request: Request) -> Lease:
+    """A lease from now on; ValueError says what is wrong with the request."""
+    holder, values = request.text.strip(), request.values
+    duration_s = values[0] if len(values) == 1 else 0.0
+    if not 0 < duration_s <= MAX_S:
+        raise ValueError(f"a lease takes one duration above 0 and of at most {MAX_S:g} s, got {list(values)}")
+    if not request.lease_id:
+        raise ValueError("a lease needs an identity above 0, got 0")
+    if not (0 < len(holder) <= MAX_HOLDER and holder.isprintable()):
+        raise ValueError(f"a lease names its holder in 1 to {MAX_HOLDER} printable characters, got {holder[:40]!r}")
+    sequence, rate_hz = state.frame_sequence, settings.rate_hz
+    last_sequence = sequence + ceil(duration_s * rate_hz) if sequence and rate_hz else 0
+    return Lease(request.lease_id, holder, request.time_ns + round(duration_s * 1e9), last_sequence)
+
+
+def _with(state: State, lease: Lease) -> State:
+    return state._replace(conditions=state.conditions._replace(lease=lease))

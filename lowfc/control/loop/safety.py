@@ -1,0 +1,195 @@
+"""Limits of the mirror, the loop-mode machine and the dead-man: no control law, no estimate, no trust.
+
+Used by the controller on what it sends and again by the mirror on what it gets. `docs/safety.md` lists the hazards.
+"""
+
+from dataclasses import dataclass, field
+from enum import IntEnum
+from math import frexp, isfinite, ldexp
+from typing import NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from lowfc.control.loop.wording import mode_word
+
+Actuators = npt.NDArray[np.float32]
+
+MARGIN_NM = 1e-3
+"""Kept clear of every limit, at least, so that float32 rounding (6e-5 nm at 750 nm) cannot cross it."""
+
+
+class LoopMode(IntEnum):
+    """What the controller does with the mirror; numbered as on the wire."""
+
+    IDLE = 1
+    OPEN = 2
+    CLOSED = 3
+    SAFE = 4
+
+    @property
+    def in_words(self) -> str:
+        """As people read it."""
+        return mode_word(self.name.lower())
+
+
+class Reason(IntEnum):
+    """Why a frame or a command was not used as it came; numbered as on the wire."""
+
+    NO_CALIBRATION = 1
+    WRONG_SIZE = 2
+    OUT_OF_ORDER = 3
+    REPEATED = 4
+    LATE = 5
+    SATURATED = 6
+    DARK = 7
+    NO_FRAME = 8
+    STUCK = 9
+    AHEAD = 10
+    CAMERA_UNKNOWN = 11
+    MODAL_LIMIT = 20
+    STROKE = 21
+    SLEW = 22
+    NEIGHBOUR = 23
+    NOT_FINITE = 24
+    WRONG_GRID = 25
+    CHANNEL = 26
+
+
+@dataclass(frozen=True, slots=True)
+class Limits:
+    """What the mirror may do, in nm of surface.
+
+    Attributes:
+        stroke_nm: largest deviation of an actuator from flat, either way.
+        slew_nm: largest change of an actuator from one command to the next.
+        neighbour_nm: largest difference between actuators side by side.
+        margin_nm: kept clear of each limit: 1e-3 nm, or sixteen roundings of float32 where the stroke is so long.
+        kept_stroke_nm: stroke without the margin, a float32, so that what was cut to it is not cut again.
+        kept_slew_nm: the same of the slew.
+    """
+
+    stroke_nm: float
+    slew_nm: float
+    neighbour_nm: float
+    margin_nm: float = field(init=False)
+    kept_stroke_nm: float = field(init=False)
+    kept_slew_nm: float = field(init=False)
+
+    def __post_init__(self) -> None:
+        margin_nm = max(MARGIN_NM, ldexp(1.0, frexp(self.stroke_nm)[1] - 20))
+        object.__setattr__(self, "margin_nm", margin_nm)
+        object.__setattr__(self, "kept_stroke_nm", float(np.float32(self.stroke_nm - margin_nm)))
+        object.__setattr__(self, "kept_slew_nm", float(np.float32(self.slew_nm - margin_nm)))
+        for name in ("stroke_nm", "slew_nm", "neighbour_nm"):
+            value = getattr(self, name)
+            if not 2 * self.margin_nm < value < np.inf:
+                raise ValueError(f"{name} must be a finite number above {2 * self.margin_nm:g} nm, got {value}")
+
+
+class Limited(NamedTuple):
+    """A command that may be sent: (rows, columns) float32, nm of surface, and the limits that changed it."""
+
+    actuators_nm: Actuators
+    reasons: tuple[Reason, ...]
+
+
+def limit(limits: Limits, previous_nm: Actuators, wanted_nm: Actuators) -> Limited:
+    """Return the command nearest to `wanted_nm` that may follow `previous_nm`.
+
+    Both are (rows, columns) float32, nm of surface; the previous one is finite, for it was made here. Stroke, then
+    slew, cut each actuator by itself; the neighbour limit shortens the whole move. Whatever is wanted, the result is
+    finite, no actuator moves further than the slew limit, and if `previous_nm` keeps the stroke and neighbour limits,
+    so does the result; if it does not, it comes back to them at the slew limit.
+    """
+    if wanted_nm.shape != previous_nm.shape:
+        return Limited(previous_nm, (Reason.WRONG_GRID,))
+    lowest_nm, highest_nm = _range_nm(wanted_nm)
+    if not (isfinite(lowest_nm) and isfinite(highest_nm)):
+        return Limited(previous_nm, (Reason.NOT_FINITE,))
+    reasons: list[Reason] = []
+    stroke, slew = limits.kept_stroke_nm, limits.kept_slew_nm
+    kept = wanted_nm
+    if max(highest_nm, -lowest_nm) > stroke:
+        reasons.append(Reason.STROKE)
+        kept = np.clip(kept, -stroke, stroke)
+    move = kept - previous_nm
+    lowest_move, highest_move = _range_nm(move)
+    if max(highest_move, -lowest_move) > slew:
+        reasons.append(Reason.SLEW)
+        move = np.clip(move, -slew, slew)
+        kept = previous_nm + move
+        lowest_nm, highest_nm = _range_nm(kept)
+    apart_nm = limits.neighbour_nm - limits.margin_nm / 2
+    # Where no two actuators at all are that far apart, no neighbours are; it costs a fraction of looking at each pair.
+    if highest_nm - lowest_nm > apart_nm and neighbour_difference_nm(kept) > apart_nm:
+        reasons.append(Reason.NEIGHBOUR)
+        kept = _shorten(limits, previous_nm, kept)
+    return Limited(kept if kept.dtype == np.float32 else kept.astype(np.float32), tuple(reasons))
+
+
+def _shorten(limits: Limits, previous_nm: Actuators, kept_nm: Actuators) -> Actuators:
+    """Go from `previous_nm` towards `kept_nm` as far as neighbours allow; if they are apart already, shrink the shape.
+
+    It goes half a margin further inside than `limit` asks, so that rounding does not hold the mirror there.
+    """
+    margin_nm = limits.margin_nm
+    neighbour_nm = limits.neighbour_nm - margin_nm
+    apart_nm, largest_nm = neighbour_difference_nm(previous_nm.astype(np.float64)), float(np.abs(previous_nm).max())
+    if apart_nm > neighbour_nm or largest_nm > limits.stroke_nm:
+        stroke_nm = limits.stroke_nm - margin_nm
+        enough = min(neighbour_nm / max(apart_nm, neighbour_nm), stroke_nm / max(largest_nm, stroke_nm))
+        slowest = 1.0 - (limits.slew_nm - margin_nm) / largest_nm
+        return previous_nm * np.float32(max(enough, slowest))
+    fraction = 1.0
+    for axis in (0, 1):
+        before = np.diff(previous_nm.astype(np.float64), axis=axis)
+        after = np.diff(kept_nm.astype(np.float64), axis=axis)
+        over = np.abs(after) > neighbour_nm
+        if over.any():
+            room = neighbour_nm - np.sign(after[over]) * before[over]
+            fraction = min(fraction, float((room / np.abs(after[over] - before[over])).min()))
+    return previous_nm + np.float32(fraction) * (kept_nm - previous_nm)
+
+
+def _range_nm(actuators_nm: Actuators) -> tuple[float, float]:
+    """Lowest and highest; not finite where any is not."""
+    flat = actuators_nm.ravel()  # where there is a NaN, both functions find it
+    return flat.item(flat.argmin()), flat.item(flat.argmax())
+
+
+def neighbour_difference_nm(actuators_nm: npt.NDArray[np.floating]) -> float:
+    """Largest difference between actuators (rows, columns) side by side, in nm; rounded as the actuators are."""
+    rows = np.abs(actuators_nm[1:] - actuators_nm[:-1]).max(initial=0)
+    columns = np.abs(actuators_nm[:, 1:] - actuators_nm[:, :-1]).max(initial=0)
+    return float(max(rows, columns))
+
+
+def expired(age_ns: int, valid_for_ns: int) -> bool:
+    """Whether a command that came `age_ns` ago may no longer be held: the dead-man; a clock gone back is no excuse."""
+    return not 0 <= age_ns <= valid_for_ns
+
+
+def request_mode(mode: LoopMode, request: str, calibrated: bool) -> tuple[LoopMode, str]:
+    """Mode after an operator's request, and why it was refused (empty where it was not).
+
+    `safe` is always granted and latched; only `clear` leaves it, and never straight to closed.
+    """
+    match request:
+        case "safe":
+            return LoopMode.SAFE, ""
+        case "clear" if mode is LoopMode.SAFE:
+            return (LoopMode.OPEN if calibrated else LoopMode.IDLE), ""
+        case "clear":
+            return mode, f"the loop is {mode.in_words}, not in safe mode: there is nothing to clear"
+        case "open" | "close" if mode is LoopMode.SAFE:
+            return mode, "the loop is in safe mode: `lowfc ctl clear` first, when it is safe"
+        case "open" if not calibrated:
+            return LoopMode.IDLE, ""
+        case "close" if not calibrated:
+            return mode, "there is no calibration for these frames"
+        case "open":
+            return LoopMode.OPEN, ""
+        case "close":
+            return LoopMode.CLOSED, ""
+    raise ValueError(f"{request!r} is not a request for a loop mode: open, close, safe or clear")

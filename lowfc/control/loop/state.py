@@ -1,0 +1,249 @@
+"""What the controller knows: settings that stay, the state that changes."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from types import MappingProxyType
+from typing import NamedTuple
+
+import numpy as np
+
+from lowfc.arrays import Single
+from lowfc.control.calibration.calibration import Calibration
+from lowfc.control.laws import linear_law
+from lowfc.control.laws.law import Law
+from lowfc.control.laws.linear_law import LinearLaw
+from lowfc.control.laws.stability import delay_weights
+from lowfc.control.loop.additions import CommandChannels
+from lowfc.control.loop.camera import CameraSettings
+from lowfc.control.loop.estimator import Estimate, Estimator
+from lowfc.control.loop.lease import Lease
+from lowfc.control.loop.safety import Limits, LoopMode, Reason
+
+SETTLING_FRAMES = 100
+"""For which a new law only follows."""
+FADING_FRAMES = 100
+"""In which a law takes over."""
+MOST_COASTED = 100
+"""Frames missing in a row after which a law begins anew."""
+
+
+@dataclass(frozen=True, slots=True)
+class Settings:
+    """What does not change during a run.
+
+    Attributes:
+        limits: of the mirror, applied here before they are applied again by the mirror.
+        delay_frames: frames from the one a command is made from to the first exposed wholly under it.
+        start_mode: mode once a calibration is loaded: open or closed.
+        max_frame_age_ns: age above which a frame is refused.
+        frame_timeout_ns: silence after which it is an event, and `on_frame_timeout` is done.
+        on_frame_timeout: hold the command, or relax the mirror to flat.
+        min_flux_fraction: fraction of the expected flux below which a frame is dark.
+        max_saturated_pixels: good pixels at full well above which a frame is refused.
+        max_identical_frames: frames in a row that may be measured exactly as the one before; 0 for any number.
+        gain: gain, leak and limit (nm) of tip and tilt, then of the other modes.
+        rate_hz: of the frames; 0 where it is not known.
+    """
+
+    limits: Limits
+    delay_frames: float
+    start_mode: LoopMode
+    max_frame_age_ns: int
+    frame_timeout_ns: int
+    on_frame_timeout: str
+    min_flux_fraction: float
+    max_saturated_pixels: int
+    gain: tuple[float, float]
+    leak: tuple[float, float]
+    limit_nm: tuple[float, float]
+    max_identical_frames: int = 0
+    rate_hz: float = 0.0
+
+    def law(self, noll: tuple[int, ...]) -> Law:
+        """The law for these modes: the first figure of each pair for tip and tilt, the second for the rest."""
+
+        def per_mode(pair: tuple[float, float]) -> Single:
+            return np.array([pair[0] if index in (2, 3) else pair[1] for index in noll], dtype=np.float32)
+
+        return Law(per_mode(self.gain), per_mode(self.leak), per_mode(self.limit_nm))
+
+
+class LawRunner(NamedTuple):
+    """A linear law that follows the measurements: its x (states,), and the frames for which it has done so.
+
+    It drives the mirror once it has followed for `SETTLING_FRAMES`; over the next `FADING_FRAMES` it takes over from
+    the integrator, so that the mirror does not jump.
+    """
+
+    law: LinearLaw
+    x: Single
+    frames: int = 0
+
+    @classmethod
+    def at_rest(cls, law: LinearLaw) -> "LawRunner":
+        """A law that has seen nothing yet."""
+        return cls(law, linear_law.at_rest(law))
+
+    def followed(self, error_nm: Single, pol_nm: Single, kept_nm: Single) -> "LawRunner":
+        """One frame later; all (modes,): both without the loop's target, and the command kept of the last frame."""
+        signal = error_nm if self.law.signal == "error" else pol_nm
+        return LawRunner(self.law, linear_law.follow(self.law, self.x, signal, kept_nm), self.frames + 1)
+
+    def coasted(self, frames: int, kept_nm: Single) -> "LawRunner":
+        """Some frames later, which were missing or of no use."""
+        x = self.x
+        for _ in range(min(frames, MOST_COASTED)):
+            x = linear_law.coast(self.law, x, kept_nm)
+        return LawRunner(self.law, x, self.frames if frames <= MOST_COASTED else 0)
+
+    @property
+    def weight(self) -> np.float32:
+        """Its part of the command; the integrator's is the rest."""
+        return np.float32(min(max(self.frames - SETTLING_FRAMES, 0) / FADING_FRAMES, 1))
+
+    def taking_over(self) -> "LawRunner":
+        """The same where the loop was just closed: it fades in."""
+        return self._replace(frames=min(self.frames, SETTLING_FRAMES))
+
+
+class ActiveLoop(NamedTuple):
+    """What there is once the mirror is known: by a calibration, or without one by what the mirror reported.
+
+    Attributes:
+        calibration: in use; without modes or pixels where none was loaded.
+        to_actuators: (actuators, modes) as in the calibration, laid out for the quicker product.
+        inverse: (modes, actuators) modal command of a mirror shape.
+        to_modes: (modes, actuators) what the sensor sees of a mirror shape.
+        weights: which commands of the history are seen in an exposure, and how much of each.
+        camera: settings that the calibration goes with: its own, or the first received after it was loaded; None until
+            then.
+        following: a law in place of the integrator's.
+        additions: to what the law commands; None for nothing at all.
+        history_nm: modal commands, newest first.
+        actuators_nm: (rows, columns), the last command.
+    """
+
+    calibration: Calibration
+    estimator: Estimator
+    law: Law
+    to_actuators: Single
+    inverse: Single
+    to_modes: Single
+    weights: tuple[tuple[int, np.float32], ...]
+    camera: CameraSettings | None
+    following: LawRunner | None
+    additions: CommandChannels | None
+    history_nm: tuple[Single, ...]
+    actuators_nm: Single
+
+    @classmethod
+    def at_rest(cls, settings: Settings, calibration: Calibration) -> "ActiveLoop":
+        """A drive with nothing commanded yet, under the law that the settings begin with."""
+        modes = len(calibration.noll)
+        weights = delay_weights(settings.delay_frames).astype(np.float32)
+        inverse = np.linalg.pinv(calibration.modes_to_actuators.astype(np.float64)).astype(np.float32)
+        return cls(
+            calibration,
+            Estimator.of(calibration),
+            settings.law(calibration.noll),
+            np.asfortranarray(calibration.modes_to_actuators),
+            inverse,
+            calibration.actuators_to_modes if calibration.actuators_to_modes.size else inverse,
+            tuple((lag, weight) for lag, weight in enumerate(weights) if weight),
+            calibration.camera,
+            None,
+            None,
+            (np.zeros(modes, np.float32),) * len(weights),
+            np.zeros(calibration.grid, np.float32),
+        )
+
+    def seen_nm(self) -> Single:
+        """The modal command (modes,) that the last exposure saw."""
+        (lag, weight), *others = self.weights
+        seen: Single = self.history_nm[lag] if weight == 1 else weight * self.history_nm[lag]
+        for lag, weight in others:
+            seen = seen + weight * self.history_nm[lag]
+        return seen
+
+    def added(self) -> CommandChannels:
+        """What is added, though it be nothing."""
+        if self.additions is not None:
+            return self.additions
+        return CommandChannels.none(self.calibration.grid, len(self.calibration.noll), len(self.history_nm))
+
+    def pushed(self, command_nm: Single, actuators_nm: Single) -> "ActiveLoop":
+        """One frame later, under this command."""
+        fixed = self[:-3]  # `_replace` takes four times as long
+        additions = None if self.additions is None else self.additions.passed()
+        return ActiveLoop(*fixed, additions, (command_nm, *self.history_nm[:-1]), actuators_nm)
+
+    def stayed(self, frames: int) -> "ActiveLoop":
+        """Some frames later, the command held under each of them."""
+        held = min(frames, len(self.history_nm))
+        history_nm = (self.history_nm[:1] * held + self.history_nm)[: len(self.history_nm)]
+        if self.additions is None:
+            return self._replace(history_nm=history_nm)
+        return self._replace(history_nm=history_nm, additions=self.additions.passed(frames))
+
+    def missed(self, frames: int) -> "ActiveLoop":
+        """Some frames later, of which nothing was measured."""
+        return self.coasted(frames).stayed(frames)
+
+    def coasted(self, frames: int) -> "ActiveLoop":
+        """With a law that has done without the measurements of some frames."""
+        if self.following is None:
+            return self
+        return self._replace(following=self.following.coasted(frames, self.history_nm[0]))
+
+
+class Conditions(NamedTuple):
+    """What of the state changes rarely.
+
+    Attributes:
+        camera: settings of the camera as last received; None before the first.
+        camera_awaited: the camera restarted, and its settings have not been received since.
+        clear_id: identity of the operator's last clear; 0 without one.
+        mode_since_ns: time of the change to this loop mode, and `mode_cause` its cause.
+        lease: the reservation of the loop, or the last one that ended; None before the first.
+    """
+
+    camera: CameraSettings | None = None
+    camera_awaited: bool = False
+    clear_id: int = 0
+    mode_since_ns: int = 0
+    mode_cause: str = ""
+    lease: Lease | None = None
+
+
+class State(NamedTuple):
+    """Everything the next command depends on.
+
+    Attributes:
+        frame_sequence: of the newest frame taken; its time is `frame_time_ns`.
+        refused: why the last frame was refused, if it was, and how many in a row.
+        limits_hit: limits that acted on the last command.
+        frame_timeout: whether the silence has been announced.
+        commanded: whether a command has been sent, so that the mirror is no longer adopted.
+        steps_left: frames until the loop opens by itself; 0 for never.
+        returning_to_zero: the modal command is on its way to zero.
+        estimate: what was last measured, and `identical_frames`, how many in a row were the same as the one before.
+        input_number: inputs that changed something or gave rise to something; the order of what is replayed.
+    """
+
+    mode: LoopMode = LoopMode.IDLE
+    drive: ActiveLoop | None = None
+    frame_sequence: int = 0
+    frame_time_ns: int = 0
+    frames_used: int = 0
+    refused: Reason | None = None
+    refused_count: int = 0
+    limits_hit: tuple[Reason, ...] = ()
+    frame_timeout: bool = False
+    commanded: bool = False
+    counts: Mapping[Reason, int] = MappingProxyType({})
+    steps_left: int = 0
+    returning_to_zero: bool = False
+    estimate: Estimate | None = None
+    identical_frames: int = 0
+    conditions: Conditions = Conditions()
+    input_number: int = 0

@@ -1,0 +1,1 @@
+"""Light from the pupil to the sensor's pixels: pupils, masks, propagation."""

@@ -1,0 +1,51 @@
+"""The coronagraph's focal-plane mask: the part that reflects star light to the sensor."""
+
+import numpy as np
+
+from lowfc.arrays import Array, Complex
+from lowfc.optics.chain.grid import image_axis
+
+_FINE = 16  # by which a sample is divided to find how much of it the phase spot covers
+
+
+def disk(samples_per: int = 8, radius: float = 4.0, inner_radius: float = 0.0) -> Array:
+    """Reflecting disk of a radius in lambda0 / D (Sect. 2.1), on the smallest square grid that holds it.
+
+    Args:
+        samples_per: Samples per lambda0 / D.
+        radius: In lambda0 / D.
+        inner_radius: Of the hole in its middle; the annulus of Sect. 2.4 where it is not zero.
+    """
+    r, _ = _polar(samples_per, radius)
+    return np.asarray((r <= radius) & (r >= inner_radius), dtype=np.float64)
+
+
+def phase_spot(samples_per: int = 8, radius: float = 4.0, spot_diameter: float = 1.06) -> Complex:
+    """The disk with a spot in its middle that delays by a quarter of a wave: the Zernike sensor's two masks as one.
+
+    Samples that the spot's edge cuts have the mean of both sides, for the spot is only eight samples wide. The delay
+    is taken to be the same at all wavelengths, the spot's size to be physical.
+
+    Args:
+        samples_per: Samples per lambda0 / D.
+        radius: Of the disk, in lambda0 / D.
+        spot_diameter: In lambda0 / D.
+    """
+    mask = disk(samples_per, radius)
+    size = len(mask)
+    x = image_axis(size * _FINE, samples_per * _FINE)
+    inside = np.hypot(x[:, None], x) <= spot_diameter / 2.0
+    covered = inside.reshape(size, _FINE, size, _FINE).mean(axis=(1, 3))
+    return np.asarray(mask * (1.0 + (1j - 1.0) * covered))
+
+
+def bowtie(samples_per: int = 8, radius: float = 4.0, outer_radius: float = 10.0, opening_deg: float = 95.0) -> Array:
+    """The disk and a wedge above and below it out to the outer radius (Fig. 3); radii in lambda0 / D."""
+    r, from_vertical = _polar(samples_per, outer_radius)
+    wedge = (r <= outer_radius) & (from_vertical <= np.deg2rad(opening_deg) / 2.0)
+    return np.asarray((r <= radius) | wedge, dtype=np.float64)
+
+
+def _polar(samples_per: int, radius: float) -> tuple[Array, Array]:
+    x = image_axis(2 * int(np.ceil(radius * samples_per)), samples_per)
+    return np.hypot(x[:, None], x), np.arctan2(np.abs(x), np.abs(x)[:, None])

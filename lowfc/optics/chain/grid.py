@@ -1,0 +1,33 @@
+"""Where the samples are, and the conventions that every other optics module keeps to.
+
+    arrays      [row = y, column = x]; y grows with the row index
+    pupils      coordinates u in pupil diameters, u_i = (i + 1/2) / n - 1/2
+    images      coordinates x in lambda0 / D, x_i = (i - (n - 1) / 2) / samples_per; lambda0 is the central wavelength
+    kernels     pupil to focal plane exp(-2 pi i x u lambda0 / lambda), focal plane to relay pupil the conjugate (so the
+                relay pupil is upright), relay pupil to sensor the first again
+    phase       2 pi OPD / lambda; wavefronts are optical path differences in nm
+    intensity   the fraction, per pixel, of the light that enters the open circular pupil, before any mask
+
+All samples lie at half-integer offsets, symmetric about the axis: no sample is at zero. The focal-plane mask and the
+pixels are hardware: their size in lambda0 / D does not change with the wavelength.
+"""
+
+import numpy as np
+
+from lowfc.arrays import Array
+
+SAMPLES = 512
+"""Across a pupil, Table 1."""
+
+OPEN_AREA = np.pi / 4.0
+"""Area of the open circular pupil, in squared pupil diameters."""
+
+
+def pupil_axis(samples: int) -> Array:
+    """Coordinates (samples,) across a pupil, in pupil diameters."""
+    return (np.arange(samples) + 0.5) / samples - 0.5
+
+
+def image_axis(samples: int, samples_per: float) -> Array:
+    """Coordinates (samples,) across a focal plane, in lambda0 / D, with `samples_per` samples in each."""
+    return np.asarray((np.arange(samples) - (samples - 1) / 2.0) / samples_per)

@@ -1,0 +1,120 @@
+"""What lies between the focal-plane mask and the detector: this is where one sensor differs from another."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from lowfc.arrays import Array, Complex
+from lowfc.optics.chain.fourier import kernel
+from lowfc.optics.chain.grid import image_axis
+
+
+@dataclass(frozen=True, eq=False)
+class ApertureMask:
+    """A mask in the relay pupil and a focus behind it: sparse (Sect. 2.2), with a radial bar, or open (Sect. 4).
+
+    Attributes:
+        transmission: (n, n), sampled like the pupil.
+    """
+
+    transmission: Array
+
+
+@dataclass(frozen=True)
+class Defocus:
+    """No relay pupil, and the detector out of focus: the coronagraphic low-order wavefront sensor (Sect. 2.4).
+
+    Attributes:
+        distance: From the image of the focal-plane mask, in (lambda0/D)^2: see `fresnel_distance`.
+    """
+
+    distance: float
+
+    def __post_init__(self) -> None:
+        if not self.distance > 0:
+            raise ValueError(f"the detector must be behind the focal-plane mask, got a distance of {self.distance}")
+
+
+@dataclass(frozen=True)
+class PupilImage:
+    """The relay pupil itself on the detector: the Zernike wavefront sensor, whose phase spot is in the focal mask.
+
+    Attributes:
+        width: Of the square image, in pupil diameters.
+    """
+
+    width: float = 1.1
+
+    def __post_init__(self) -> None:
+        if not self.width > 0:
+            raise ValueError(f"the image of the pupil must have a width, got {self.width}")
+
+
+Relay = ApertureMask | Defocus | PupilImage
+
+
+def fresnel_distance(defocus_mm: float, focal_ratio: float, wavelength_nm: float) -> float:
+    """Distance z / (lambda0 F^2): 27.3 for the 6 mm, F/20 and 550 nm of Sect. 3."""
+    return defocus_mm * 1e6 / (wavelength_nm * focal_ratio**2)
+
+
+def least_distance(reach: float, samples_per: int) -> float:
+    """Shortest distance of a `Defocus` whose chirp the samples resolve, in (lambda0/D)^2.
+
+    The sum over the focal plane repeats itself where chirp and field together turn by a wave from sample to sample.
+
+    Args:
+        reach: From the edge of the detector to the far edge of the focal-plane mask, in lambda0 / D.
+        samples_per: Samples per lambda0 / D.
+    """
+    spare = 2.0  # half a cycle for the pupil's light, the rest for the short end of a wide band
+    return reach / (samples_per - spare)
+
+
+def pitch(relay: Relay, samples: int, samples_per: int) -> float:
+    """Distance between the samples on the detector, in lambda0 / D; in D where it sees the pupil."""
+    return relay.width / samples if isinstance(relay, PupilImage) else 1.0 / samples_per
+
+
+def direct_kernel(
+    relay: Defocus | PupilImage, samples: int, focal_samples: int, samples_per: int, scale: float
+) -> Complex:
+    """Kernel (samples, focal_samples) of one axis from the focal-plane mask to the detector; conserves energy.
+
+    Eq. (13)'s Fresnel integral, exp(i pi (x' - x)^2 scale / distance), sampled exactly as long as the chirp is
+    resolved; or the transform to the relay pupil.
+
+    Args:
+        relay: The optics between them.
+        samples: Across the detector.
+        focal_samples: Across the focal-plane mask.
+        samples_per: Samples per lambda0 / D in the focal plane.
+        scale: lambda0 / lambda.
+    """
+    if isinstance(relay, PupilImage):
+        # The pupil's samples are spaced by the width over their number, not by 1 / samples as `kernel` has them.
+        stretch = scale * relay.width
+        return np.asarray(np.sqrt(scale) / samples_per * kernel(focal_samples, samples_per, samples, stretch).conj().T)
+    x = image_axis(focal_samples, samples_per)
+    chirp = np.exp(1j * np.pi * scale / relay.distance * (image_axis(samples, samples_per)[:, None] - x) ** 2)
+    return np.asarray(np.sqrt(scale / (1j * relay.distance)) / samples_per * chirp)
+
+
+def half_band(relay: Relay, width: float, mask_radius: float, scale: float) -> float:
+    """Half of the band of the field on the detector, in cycles per unit of its axis.
+
+    Args:
+        relay: The optics before the detector.
+        width: Of the detector, in its unit.
+        mask_radius: Of the focal-plane mask, in lambda0 / D.
+        scale: lambda0 / lambda.
+    """
+    match relay:
+        case ApertureMask():
+            return scale / 2.0
+        case PupilImage():
+            return scale * mask_radius
+        case Defocus():
+            # A frequency moves light by distance times frequency; more than this leaves the detector.
+            distance = relay.distance / scale
+            return (width / 2.0 + mask_radius + float(np.sqrt(distance))) / distance

@@ -1,0 +1,84 @@
+"""The sparse aperture mask: circular holes in the relay pupil, eqs. (1) and (2)."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from lowfc.arrays import Array
+from lowfc.optics.chain.grid import pupil_axis
+
+
+@dataclass(frozen=True)
+class Layout:
+    """Where the holes of a sparse aperture mask are.
+
+    Attributes:
+        name: What users call it.
+        purpose: One line on what it was designed for.
+        holes: Each (x, y, diameter): the centre from the pupil's centre, all in pupil diameters.
+    """
+
+    name: str
+    purpose: str
+    holes: tuple[tuple[float, float, float], ...]
+
+
+def equal_holes(centres: Sequence[Sequence[float]], diameter: float) -> tuple[tuple[float, float, float], ...]:
+    """Holes of one diameter at centres (x, y)."""
+    return tuple((float(x), float(y), float(diameter)) for x, y in centres)
+
+
+def check(layout: Layout) -> None:
+    """Raise ValueError unless every hole lies inside the pupil and none overlaps another."""
+    if not layout.holes:
+        raise ValueError(f"{layout.name}: a sparse aperture mask needs at least one hole")
+    holes = np.array(layout.holes, dtype=np.float64)
+    if holes.ndim != 2 or holes.shape[1] != 3 or not np.isfinite(holes).all():
+        raise ValueError(f"{layout.name}: every hole is three finite numbers x, y, diameter in pupil diameters")
+    centres, diameters = holes[:, :2], holes[:, 2]
+    if not (diameters.min() > 0.0 and diameters.max() <= 1.0):
+        raise ValueError(
+            f"{layout.name}: hole diameters must lie between 0 and 1 pupil diameter, got {diameters.min()} to "
+            f"{diameters.max()}"
+        )
+    tolerance = 1e-9  # holes may touch each other and the edge
+    reach = np.hypot(*centres.T) + diameters / 2.0
+    outside = np.flatnonzero(reach > 0.5 + tolerance)
+    if outside.size:
+        worst = int(outside[np.argmax(reach[outside])])
+        raise ValueError(
+            f"{layout.name}: {outside.size} hole(s) reach outside the pupil, the worst is hole {worst} at "
+            f"{layout.holes[worst][:2]}, which reaches {reach[worst]:.4f} D from the centre; the edge is at 0.5 D"
+        )
+    gaps = separations(centres) - (diameters[:, None] + diameters) / 2.0
+    first, second = np.unravel_index(np.argmin(gaps), gaps.shape)
+    if gaps[first, second] < -tolerance:
+        raise ValueError(
+            f"{layout.name}: holes {first} at {layout.holes[first][:2]} and {second} at {layout.holes[second][:2]} "
+            f"overlap by {-gaps[first, second]:.4f} D"
+        )
+
+
+def separations(centres: Array) -> Array:
+    """Distances (holes, holes) between centres (holes, 2); infinite from a hole to itself."""
+    distances = np.hypot(*(centres[:, None] - centres).transpose(2, 0, 1))
+    np.fill_diagonal(distances, np.inf)
+    return np.asarray(distances)
+
+
+def is_even_symmetric(layout: Layout) -> bool:
+    """Whether every hole has its mirror image through the centre; such a mask cannot sense focus or astigmatism."""
+    holes = np.array(layout.holes, dtype=np.float64)
+    mirrored = holes * np.array([-1.0, -1.0, 1.0])
+    distances = np.linalg.norm(holes[:, None] - mirrored, axis=2)
+    return bool((distances.min(axis=1) < 1e-6).all())
+
+
+def transmission(layout: Layout, samples: int) -> Array:
+    """The mask (samples, samples): 1 where the sample's centre is in a hole, else 0, eqs. (1) and (2)."""
+    u = pupil_axis(samples)
+    mask = np.zeros((samples, samples))
+    for x, y, diameter in layout.holes:
+        mask[np.hypot(u[:, None] - y, u - x) <= diameter / 2.0] = 1.0
+    return mask

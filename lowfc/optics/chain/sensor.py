@@ -1,0 +1,228 @@
+"""The whole optical chain of a sensor, with full diffraction: star to binned sensor image (Sect. 2, Table 1)."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lowfc.arrays import Array, Complex
+from lowfc.optics.chain.band import Band, monochromatic
+from lowfc.optics.chain.fourier import to_image, to_pupil
+from lowfc.optics.chain.grid import OPEN_AREA, image_axis, pupil_axis
+from lowfc.optics.chain.relay import ApertureMask, Defocus, Relay, direct_kernel, least_distance, pitch
+
+
+@dataclass(frozen=True, eq=False)
+class Sensor:
+    """The hardware of a wavefront sensor that lives on the light a coronagraph's focal-plane mask rejects.
+
+    Attributes:
+        pupil: (n, n) amplitude transmission of the coronagraph's pupil.
+        focal_mask: (k, k) the part of the focal plane that goes to the sensor, k even, centred; complex where it
+            delays light, as the spot of a Zernike sensor does.
+        relay: What lies between the focal-plane mask and the detector.
+        wavelength_nm: The central wavelength, lambda0.
+        samples_per: Samples per lambda0 / D in the focal planes.
+        binning: Samples per pixel, in each direction.
+        pixels: Pixels across the square image.
+    """
+
+    pupil: Array
+    focal_mask: NDArray[np.inexact]
+    relay: Relay
+    wavelength_nm: float = 550.0
+    samples_per: int = 8
+    binning: int = 2
+    pixels: int = 80
+
+    def __post_init__(self) -> None:
+        if self.pupil.ndim != 2 or self.pupil.shape[0] != self.pupil.shape[1]:
+            raise ValueError(f"the pupil must be square, got shape {self.pupil.shape}")
+        if isinstance(self.relay, ApertureMask) and self.relay.transmission.shape != self.pupil.shape:
+            raise ValueError(
+                f"the relay mask must be sampled like the pupil, {self.pupil.shape}, got "
+                f"{self.relay.transmission.shape}"
+            )
+        if self.focal_mask.ndim != 2 or self.focal_mask.shape[0] != self.focal_mask.shape[1]:
+            raise ValueError(f"the focal-plane mask must be square, got shape {self.focal_mask.shape}")
+        if isinstance(self.relay, Defocus):
+            reach = (self.pixels * self.binning + self.focal_mask.shape[0]) / (2.0 * self.samples_per)
+            least = least_distance(reach, self.samples_per)
+            if self.relay.distance < least:
+                raise ValueError(
+                    f"{self.samples_per} samples per lambda/D resolve a defocus of at least {least:.3g} (lambda/D)^2, "
+                    f"got {self.relay.distance:.3g}; take a longer distance or a smaller focal ratio"
+                )
+        if not self.wavelength_nm > 0:
+            raise ValueError(f"the wavelength must be positive, got {self.wavelength_nm} nm")
+
+    @property
+    def samples(self) -> int:
+        """Samples across the detector."""
+        return self.pixels * self.binning
+
+    @property
+    def pitch(self) -> float:
+        """Distance between them, in lambda0 / D; in D where the detector sees the pupil."""
+        return pitch(self.relay, self.samples, self.samples_per)
+
+
+@dataclass(frozen=True)
+class LightBudget:
+    """Where the light goes: each a fraction of what reached the element before it, but `total` and `peak`.
+
+    Attributes:
+        pupil: Of the open circle's light, what the shaped pupil lets through.
+        focal_mask: Of that, what the focal-plane mask sends to the sensor.
+        relay_mask: Of that, what passes a mask in the relay pupil.
+        sensor: Of the light on the relay mask, what falls on the pixels.
+        total: Of the open circle's light, what falls on the pixels.
+        peak: Of the light on the pixels, what falls on the brightest.
+    """
+
+    pupil: float
+    focal_mask: float
+    relay_mask: float
+    sensor: float
+    total: float
+    peak: float
+
+
+def pupil_radii(sensor: Sensor) -> tuple[Array, Array]:
+    """Coordinates x (1, n) and y (n, 1) of the pupil samples in pupil radii, for Zernike polynomials."""
+    u = 2.0 * pupil_axis(sensor.pupil.shape[0])
+    return u[None, :], u[:, None]
+
+
+def propagate(
+    sensor: Sensor,
+    pupil_field: NDArray[np.inexact],
+    wavelength_nm: float,
+    focal_mask: NDArray[np.inexact] | None = None,
+) -> Complex:
+    """Field at the sensor's samples, eqs. (4) to (6) or (13), of a field (n, n) that has passed the pupil's mask.
+
+    Args:
+        sensor: The optics.
+        pupil_field: The field.
+        wavelength_nm: Its wavelength.
+        focal_mask: Instead of the sensor's own.
+    """
+    scale = sensor.wavelength_nm / wavelength_nm
+    mask = sensor.focal_mask if focal_mask is None else focal_mask
+    size, relay = mask.shape[0], sensor.relay
+    focal = to_image(np.asarray(pupil_field, np.complex128), size, sensor.samples_per, scale) * mask
+    if isinstance(relay, ApertureMask):
+        in_relay = to_pupil(focal, sensor.pupil.shape[0], sensor.samples_per, scale)
+        return to_image(in_relay * relay.transmission, sensor.samples, sensor.samples_per, scale)
+    matrix = direct_kernel(relay, sensor.samples, size, sensor.samples_per, scale)
+    return np.asarray(matrix @ focal @ matrix.T)
+
+
+def field(sensor: Sensor, opd_nm: NDArray[np.floating], wavelength_nm: float | None = None) -> Complex:
+    """Field at the sensor's samples for a wavefront (n, n) in nm, with exp(i phi) and not its expansion.
+
+    Args:
+        sensor: The optics.
+        opd_nm: Optical path difference.
+        wavelength_nm: The central wavelength when None.
+
+    Raises:
+        ValueError: The wavefront is not sampled like the pupil.
+    """
+    if opd_nm.shape != sensor.pupil.shape:
+        raise ValueError(f"a wavefront must be sampled like the pupil, {sensor.pupil.shape}, got {opd_nm.shape}")
+    wavelength_nm = sensor.wavelength_nm if wavelength_nm is None else wavelength_nm
+    return propagate(sensor, sensor.pupil * np.exp((2j * np.pi / wavelength_nm) * opd_nm), wavelength_nm)
+
+
+def image(sensor: Sensor, opd_nm: NDArray[np.floating], band: Band | None = None) -> Array:
+    """Image (pixels, pixels), fraction per pixel of the light entering the open circular pupil.
+
+    Args:
+        sensor: The optics.
+        opd_nm: Wavefront (n, n).
+        band: The central wavelength alone when None.
+    """
+    band = monochromatic(sensor.wavelength_nm) if band is None else band
+    total = np.zeros((sensor.pixels, sensor.pixels))
+    for wavelength_nm, weight in zip(band.wavelengths_nm, band.weights, strict=True):
+        at_sensor = field(sensor, opd_nm, wavelength_nm)
+        total += weight * _pixel_sums(sensor, at_sensor.real**2 + at_sensor.imag**2)
+    return total
+
+
+def reference(sensor: Sensor, band: Band | None = None) -> Array:
+    """I0 (pixels, pixels): the image of a flat wavefront, eq. (6), in the units of `image`."""
+    return image(sensor, np.zeros(sensor.pupil.shape), band)
+
+
+def response(sensor: Sensor, basis: NDArray[np.floating], band: Band | None = None) -> Array:
+    """H = dI/da (pixels squared, modes), in the units of `image` per nm of each mode.
+
+    H = 2 (2 pi / lambda) Re{E0 conj(i E_k)}: eq. (12) with the 2 of eq. (9), so that I - I0 = H a.
+
+    Args:
+        sensor: The optics.
+        basis: Modes (modes, n, n), unit rms where a is to be nm rms.
+        band: The central wavelength alone when None.
+    """
+    band = monochromatic(sensor.wavelength_nm) if band is None else band
+    H = np.zeros((sensor.pixels**2, len(basis)))
+    for wavelength_nm, weight in zip(band.wavelengths_nm, band.weights, strict=True):
+        E0 = propagate(sensor, sensor.pupil, wavelength_nm)
+        for k, mode in enumerate(basis):
+            Ek = propagate(sensor, sensor.pupil * mode, wavelength_nm)
+            slope = (4.0 * np.pi / wavelength_nm) * (E0 * np.conj(1j * Ek)).real
+            H[:, k] += weight * _pixel_sums(sensor, slope).ravel()
+    return H
+
+
+def shear_response(sensor: Sensor, band: Band | None = None) -> Array:
+    """dI/ds (pixels squared, 2), in the units of `image` per pupil diameter of shear of the beam along x and y.
+
+    A shift of the beam in the pupil is a ramp of phase on the focal plane, where -2 pi i x of the field is its slope.
+    It is a nuisance: the beam wanders on the relay mask, which looks like a wavefront and is none.
+
+    Args:
+        sensor: The optics.
+        band: The central wavelength alone when None.
+    """
+    band = monochromatic(sensor.wavelength_nm) if band is None else band
+    x = image_axis(sensor.focal_mask.shape[0], sensor.samples_per)
+    slopes = np.zeros((sensor.pixels**2, 2))
+    for wavelength_nm, weight in zip(band.wavelengths_nm, band.weights, strict=True):
+        ramp = (-2j * np.pi * sensor.wavelength_nm / wavelength_nm) * x
+        E0 = propagate(sensor, sensor.pupil, wavelength_nm)
+        for k, along in enumerate((ramp[None, :], ramp[:, None])):
+            E1 = propagate(sensor, sensor.pupil, wavelength_nm, sensor.focal_mask * along)
+            slopes[:, k] += weight * _pixel_sums(sensor, 2.0 * (E0 * np.conj(E1)).real).ravel()
+    return slopes
+
+
+def light_budget(sensor: Sensor) -> LightBudget:
+    """The throughput of each element at the central wavelength, flat wavefront."""
+    samples, area = sensor.pupil.shape[0], 1.0 / sensor.samples_per**2
+    focal = to_image(sensor.pupil.astype(np.complex128), sensor.focal_mask.shape[0], sensor.samples_per, 1.0)
+    focal = focal * sensor.focal_mask
+    after_pupil = np.sum(sensor.pupil**2) / samples**2
+    after_focal = np.sum(np.abs(focal) ** 2) * area
+    after_relay = after_focal
+    if isinstance(sensor.relay, ApertureMask):
+        in_relay = to_pupil(focal, samples, sensor.samples_per, 1.0)
+        after_relay = np.sum(np.abs(in_relay * sensor.relay.transmission) ** 2) / samples**2
+    I0 = reference(sensor)
+    return LightBudget(
+        pupil=float(after_pupil / OPEN_AREA),
+        focal_mask=float(after_focal / after_pupil),
+        relay_mask=float(after_relay / after_focal),
+        sensor=float(I0.sum() * OPEN_AREA / after_focal),
+        total=float(I0.sum()),
+        peak=float(I0.max() / I0.sum()),
+    )
+
+
+def _pixel_sums(sensor: Sensor, intensity: Array) -> Array:
+    """Bin samples to pixels and normalise to the light that enters the open circle."""
+    shape = (sensor.pixels, sensor.binning, sensor.pixels, sensor.binning)
+    return np.asarray(intensity.reshape(shape).sum(axis=(1, 3))) * (sensor.pitch**2 / OPEN_AREA)

@@ -1,0 +1,1 @@
+"""Photons and detectors."""

@@ -1,0 +1,86 @@
+"""A deformable mirror on the twin's nodes: its wavefront in microseconds.
+
+Nodes are too coarse for the print-through of the actuators: sampled there, it would fold to low orders, and in truth
+the shaped pupil's fine structure mixes some of it back into them. The nodes therefore carry the surface's least-squares
+fit, and a small correction makes the field at the sensor, to first order, the one that the full surface gives.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lowfc.arrays import Single, Whole
+from lowfc.optics.chain.grid import pupil_axis
+from lowfc.optics.chain.mirror import Mirror, influence_factors
+from lowfc.optics.chain.sensor import Sensor
+from lowfc.optics.twin.field_operator import field_operator, sensor_functions
+from lowfc.optics.twin.nodes import interpolation
+from lowfc.optics.twin.twin import Twin
+
+_LEAST_WEIGHT = 0.01  # of the largest; leaves alone the guard nodes that hardly any of the pupil depends on
+_SMALLEST_SINGULAR_VALUE = 0.01  # of the largest; the correction's error stops falling there
+
+
+@dataclass(frozen=True, eq=False)
+class TwinMirror:
+    """Matrices from actuators to the used nodes of a twin.
+
+    Attributes:
+        used: The twin's used nodes.
+        y_factors: (axis, rows) influence functions along y, fitted by values at the nodes.
+        x_factors: (axis, columns) along x.
+        reduce: (few, rows times columns) what that leaves out, seen through the sensor.
+        expand: (used, few) the smooth surface that gives the same.
+    """
+
+    used: Whole
+    y_factors: Single
+    x_factors: Single
+    reduce: Single
+    expand: Single
+
+
+def twin_mirror(sensor: Sensor, twin: Twin, mirror: Mirror) -> TwinMirror:
+    """Fit a mirror to a twin; the correction is exact at the wavelength in the middle of the band.
+
+    Args:
+        sensor: The optics that the twin was built from.
+        twin: The twin.
+        mirror: The mirror.
+    """
+    operator = twin.operators[len(twin.operators) // 2]
+    scale = sensor.wavelength_nm / operator.wavelength_nm
+    u = pupil_axis(sensor.pupil.shape[0])
+    actuators = np.arange(mirror.rows * mirror.columns)
+    functions = sensor_functions(sensor, scale, twin.spec.guards)
+    y_full = influence_factors(mirror, u, mirror.rows)
+    x_full = influence_factors(mirror, u, mirror.columns)
+    to_field = operator.modes.T @ field_operator(sensor, scale, functions, y_full, x_full, actuators)
+    fit = np.linalg.pinv(interpolation(u.size, twin.spec.nodes, twin.spec.order), _LEAST_WEIGHT)
+    y_factors, x_factors = fit @ y_full, fit @ x_full
+    rows, columns = np.divmod(twin.used, twin.axis.size)
+    sampled = (y_factors[rows][:, :, None] * x_factors[columns][:, None, :]).reshape(twin.used.size, -1)
+    left, values, right = np.linalg.svd(operator.to_modes, full_matrices=False)
+    kept = values > _SMALLEST_SINGULAR_VALUE * values[0]
+    missing = left[:, kept].T @ (to_field - operator.to_modes @ sampled) / values[kept, None]
+    return TwinMirror(
+        used=twin.used,
+        y_factors=y_factors.astype(np.float32),
+        x_factors=x_factors.astype(np.float32),
+        reduce=missing.astype(np.float32),
+        expand=right[kept].astype(np.float32).T,  # so ordered, its product takes half the time
+    )
+
+
+def wavefront_nm(mirror: TwinMirror, actuators_nm: NDArray[np.floating]) -> Single:
+    """Wavefront (used,) at the twin's nodes: twice the surface.
+
+    Args:
+        mirror: From `twin_mirror`.
+        actuators_nm: (rows, columns) nm of surface.
+    """
+    twice = np.multiply(actuators_nm, np.float32(2.0), dtype=np.float32)
+    wavefront = (mirror.y_factors @ twice @ mirror.x_factors.T).take(mirror.used)
+    wavefront += mirror.expand @ (mirror.reduce @ twice.ravel())
+    return np.asarray(wavefront)

@@ -1,0 +1,247 @@
+"""What the controller is doing, as figures and for a person."""
+
+from collections.abc import Mapping
+from types import MappingProxyType
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from lowfc.contract.envelope import count_of
+from lowfc.contract.messages import FRAME, Role, from_timestamp, wire
+from lowfc.control.loop.safety import Reason
+from lowfc.control.loop.state import FADING_FRAMES, SETTLING_FRAMES
+from lowfc.control.loop.wording import PAUSED, counted, mode_word
+from lowfc.programs.launch.watch import mode_name, topic_count
+
+NOBODY = wire.Health()
+_NO_PROCESSES: Mapping[str, wire.Health] = MappingProxyType({})
+
+
+def figures(
+    state: wire.ControllerState, processes: Mapping[str, wire.Health] = _NO_PROCESSES, run: str = ""
+) -> dict[str, Any]:
+    """The state as `lowfc ctl status --json` prints it; modes in the calibration's order, nm rms of wavefront.
+
+    Args:
+        state: of the controller.
+        processes: what each process of the run reports of itself, by its name.
+        run: name of the run.
+    """
+    playing = None
+    if state.HasField("play"):
+        play = state.play
+        frames = play.frames or (len(play.table) // (4 * play.columns) if play.columns else 0)
+        left = play.first_sequence + frames - 1 - state.frame_sequence
+        playing = {"target": play.target, "frames": frames, "frames_left": min(max(left, 0), frames)}
+    law = {"name": "integrator", "weight": 1.0}
+    if state.HasField("law"):
+        law = {
+            "name": state.law.name,
+            "weight": min(max(state.law_frames - SETTLING_FRAMES, 0) / FADING_FRAMES, 1.0),
+        }
+    command_nm = list(state.command_history_nm)[: len(state.gain)]
+    settings = state.settings
+    controller, recorder = processes.get(Role.CONTROLLER, NOBODY), processes.get(Role.RECORDER, NOBODY)
+    lately, arrived = controller.last_second, topic_count(controller, FRAME.key)
+    camera = processes.get(Role.CAMERA, NOBODY)
+    return {
+        "run": run,
+        "mode": mode_name(state.mode) or "starting",
+        "paused": state.mode == wire.LOOP_MODE_OPEN and state.mode_cause == PAUSED,
+        "rate_hz": controller.rate_hz,
+        "frames_used_last_second": lately.frames,
+        "residual_rms_nm": lately.residual_rms_nm if lately.frames else None,
+        "true_residual_rms_nm": camera.recent_wavefront.residual_rms_nm
+        if camera.HasField("recent_wavefront")
+        else None,
+        "flux_fraction": lately.flux_fraction if lately.frames else None,
+        "frames_skipped": arrived.skipped,
+        "frames_missing": arrived.missing,
+        "recording": recording_state(recorder),
+        "log": recorder.recording.file or None,
+        "last_warning": _last_warning(state, processes),
+        "mode_s": round(max(0, from_timestamp(state.timestamp) - from_timestamp(state.mode_timestamp)) * 1e-9, 3)
+        if state.HasField("mode_timestamp")
+        else None,
+        "mode_cause": state.mode_cause,
+        "mirrors": {
+            name: {
+                "refused": _reason(one.command_refused) if one.command_refused else None,
+                "expired": one.command_expired,
+                "limits_hit": [_reason(reason) for reason in one.limits_hit],
+            }
+            for name, one in sorted(processes.items())
+            if name.partition("-")[0] == Role.MIRROR
+        },
+        "frame": count_of(state.frame_sequence),
+        "frame_sequence": state.frame_sequence,
+        "frames_used": state.frames_used,
+        "steps_left": state.steps_left,
+        "homing": state.returning_to_zero,
+        "command_nm": command_nm,
+        "command_rms_nm": _rss(command_nm),
+        "offset_nm": list(state.offset_nm),
+        "offset_rms_nm": _rss(state.offset_nm),
+        "law": law,
+        "gain": list(state.gain),
+        "leak": list(state.leak),
+        "limit_nm": list(state.limit_nm),
+        "channels": [
+            {
+                "name": one.name,
+                "rms_nm": _rms(one.actuators),
+                "shifts_zero_point": one.shifts,
+                "reached": one.actuators == one.reached,
+            }
+            for one in state.channels
+        ],
+        "playing": playing,
+        "reserved_for": state.lease.holder if state.lease.id and not state.lease.ended else None,
+        "limits_hit": [Reason(reason).name for reason in state.limits_hit],
+        "refused": Reason(state.refused).name if state.refused else None,
+        "counts": {Reason(line.reason).name: line.count for line in state.counts},
+        "stroke_nm": settings.stroke_nm,
+        "slew_nm": settings.slew_nm,
+        "neighbour_nm": settings.neighbour_nm,
+        "delay_frames": settings.delay_frames,
+        "calibration_id": state.calibration_id,
+    }
+
+
+def text(state: wire.ControllerState, processes: Mapping[str, wire.Health] = _NO_PROCESSES, run: str = "") -> str:
+    """The same for a person: whether all is well in the first line."""
+    known = figures(state, processes, run)
+    since = "" if known["mode_s"] is None else f" for {known['mode_s']:.0f} s ({known['mode_cause']})"
+    mode = _mode(known) + (f", opens after {counted(known['steps_left'], 'frame')}" if known["steps_left"] else "")
+    law = known["law"]["name"]
+    if known["law"]["weight"] < 1:
+        law += f", driving with a weight of {known['law']['weight']:.2f}; the integrator has the rest"
+    channels = [
+        f"{one['name']} {one['rms_nm']:.3g} nm rms of surface"
+        f"{'' if one['reached'] else ', on its way'}{'' if one['shifts_zero_point'] else ', zero point not shifted'}"
+        for one in known["channels"]
+    ]
+    playing = known["playing"]
+    rows = {
+        "loop": mode + since,
+        **{name: _of_mirror(one) for name, one in known["mirrors"].items()},
+        "frame": f"{known['frame']} ({known['frames_used']} used)"
+        + (f"; the last was refused as {_spoken(known['refused'])}" if known["refused"] else ""),
+        "command": f"{known['command_rms_nm']:.3f} nm rms" + (", on its way to zero" if known["homing"] else ""),
+        "offset": f"{known['offset_rms_nm']:.3f} nm rms",
+        "law": law,
+        "gain": _values(known["gain"]),
+        "leak": _values(known["leak"]),
+        "limit": _values(known["limit_nm"], " nm"),
+        "channels": "; ".join(channels) or "none",
+        "playing": f"{playing['target']}, {playing['frames_left']} of {counted(playing['frames'], 'frame')} left"
+        if playing
+        else "nothing",
+        "reserved": f"for {known['reserved_for']}" if known["reserved_for"] else "for nobody",
+        "mirror limits": f"stroke {known['stroke_nm']:g} nm, slew {known['slew_nm']:g} nm a frame, "
+        f"neighbours {known['neighbour_nm']:g} nm; {_acting(known['limits_hit'])}",
+        "counted": ", ".join(_counted(name, count) for name, count in known["counts"].items()) or "nothing refused",
+        "delay": counted(float(known["delay_frames"]), "frame"),
+        "calibration": known["calibration_id"][:12] or "none",
+    }
+    return "\n".join([_in_short(known), *(f"{name:14} {value}" for name, value in rows.items())])
+
+
+def recording_state(recorder: wire.Health) -> str:
+    """One word: recording, stopped by an operator, failed, or none without a recorder that is ready."""
+    if recorder.recording.failure:
+        return "failed"
+    if recorder.state not in ("ready", "running"):
+        return "none"
+    return "stopped" if recorder.recording.stopped else "recording"
+
+
+def _in_short(known: dict[str, Any]) -> str:
+    """Is it good: mode, residual and light of the last second, frames lost, recording, run, law, last warning."""
+    measured = ["no frame used in the last second"]
+    if known["frames_used_last_second"]:
+        true_nm = known["true_residual_rms_nm"]
+        measured = [
+            f"residual {known['residual_rms_nm']:.2f} nm rms" + ("" if true_nm is None else f" (true {true_nm:.2f})"),
+            f"light {100 * known['flux_fraction']:.0f} %",
+        ]
+    recording = {"recording": f"recording {known['log']}", "none": "not recording"}
+    warning = known["last_warning"]
+    return " · ".join(
+        (
+            _mode(known),
+            *measured,
+            f"{counted(known['frames_skipped'] + known['frames_missing'], 'frame')} lost",
+            recording.get(known["recording"], f"recording {known['recording']}"),
+            f"run {known['run']}",
+            f"law {known['law']['name']}",
+            "no warning"
+            if warning is None
+            else f"{warning['age_s']:.0f} s ago {warning['process']}: {warning['text']}",
+        )
+    )
+
+
+def _last_warning(state: wire.ControllerState, processes: Mapping[str, wire.Health]) -> dict[str, Any] | None:
+    """The newest warning of any process."""
+    found = [
+        (from_timestamp(one.last_warning_timestamp), name, one.last_warning)
+        for name, one in processes.items()
+        if one.last_warning
+    ]
+    if not found:
+        return None
+    time_ns, process, text = max(found)
+    age_s = max(0, from_timestamp(state.timestamp) - time_ns) * 1e-9
+    return {"process": process, "age_s": round(age_s, 3), "text": text}
+
+
+def _mode(known: dict[str, Any]) -> str:
+    return "paused" if known["paused"] else mode_word(known["mode"])
+
+
+def _reason(number: int) -> str:
+    """Its name; of a mirror of a later version, its number."""
+    return Reason(number).name if number in Reason._value2member_map_ else str(number)
+
+
+def _of_mirror(mirror: dict[str, Any]) -> str:
+    if mirror["refused"]:
+        return f"refuses commands: {mirror['refused']}"
+    state = "its last command has expired" if mirror["expired"] else "follows"
+    return f"{state}; {_acting(mirror['limits_hit'])}" if mirror["limits_hit"] else state
+
+
+def _acting(limits: list[str]) -> str:
+    return f"limits acting: {', '.join(map(_spoken, limits))}" if limits else "no limit acting"
+
+
+def _counted(reason: str, count: int) -> str:
+    """How often a frame was refused for a reason, or a limit acted."""
+    if Reason[reason] is Reason.NO_FRAME:
+        return f"no frame {counted(count, 'time')}"
+    if Reason[reason] < Reason.MODAL_LIMIT:
+        return f"{counted(count, 'frame')} refused as {_spoken(reason)}"
+    return f"{_spoken(reason)} acted on {counted(count, 'command')}"
+
+
+def _spoken(reason: str) -> str:
+    return reason.lower().replace("_", " ")
+
+
+def _values(values: list[float], unit: str = "") -> str:
+    """One figure where all are the same; none without a calibration."""
+    if not values:
+        return "none"
+    same = len(set(values)) == 1
+    return (f"{values[0]:g} for all" if same else " ".join(f"{value:g}" for value in values)) + unit
+
+
+def _rss(values: npt.ArrayLike) -> float:
+    return float(np.sqrt(np.sum(np.square(np.asarray(values, np.float64)))))
+
+
+def _rms(actuators: bytes) -> float:
+    shape = np.frombuffer(actuators, "<f4").astype(np.float64)
+    return float(np.sqrt(np.mean(np.square(shape)))) if shape.size else 0.0

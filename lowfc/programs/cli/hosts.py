@@ -1,0 +1,198 @@
+"""The commands for a run on several machines: certificates, the router, and who is there by which clock."""
+
+import datetime
+import json
+import re
+import sys
+import tempfile
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from lowfc.adapters.process.extras import install_advice
+from lowfc.adapters.process.terminal import DEFAULT_RUN, AnyRun, ConfigFile, Json, RunId, configuration
+from lowfc.contract.errors import BusError, ConfigurationError
+from lowfc.programs.cli.result import Result, figure, put
+
+if TYPE_CHECKING:
+    from lowfc.adapters.bus.run import Links
+    from lowfc.contract.configuration import Configuration
+    from lowfc.contract.messages import wire
+
+LISTEN_S = 1.5
+"""Health comes twice a second."""
+
+_TURN_S = 0.1
+
+
+class HostProcess(Result):
+    """A process, and its host's clock."""
+
+    process: str = figure("process")
+    state: str = figure("state")
+    clock_offset_us: float | None = figure("router's clock less its own", "us", "+.0f")
+    clock_error_us: float | None = figure("wrong by at most", "us", ".0f")
+
+
+class HostsResult(Result):
+    """The processes of a run."""
+
+    run: str = figure("run")
+    processes: list[HostProcess] = figure("processes")
+
+
+def certs(
+    folder: Annotated[Path, typer.Argument(help="Folder of the authority; made where there is none.")],
+    router: Annotated[
+        list[str] | None, typer.Option(help="Name or IP address by which the others reach the router; repeat.")
+    ] = None,
+    mirror: Annotated[list[str] | None, typer.Option(help="Name of a mirror; repeat. Default: dm.")] = None,
+    days: Annotated[int, typer.Option(min=1, max=3650, help="How long the certificates are valid.")] = 825,
+    renew: Annotated[
+        bool, typer.Option("--renew", help="Sign those that are there anew; they keep their keys.")
+    ] = False,
+) -> None:
+    """Make a certificate for each role of a run on several machines, and the authority that signs them.
+
+    Give each machine ca.pem, and ROLE.pem and ROLE.key of its roles; ca.key stays where it is.
+
+    Example: lowfc certs certs --router bench.example.org --router 192.168.7.1
+    """
+    from lowfc.adapters.bus.access import ROUTER, roles
+    from lowfc.adapters.bus.run import mirror_role
+
+    try:
+        from lowfc.adapters.bus.certificates import make_certificates
+    except ImportError as fault:
+        raise ConfigurationError(
+            f"certificates are made with the package cryptography, which is missing here ({fault}): "
+            f"{install_advice('deploy')}"
+        ) from None
+    wanted = (ROUTER, *roles(map(mirror_role, mirror or ["dm"])))
+    made = make_certificates(folder, wanted, router or [], days, renew=renew)
+    for file in made:
+        sys.stdout.write(f"{file}\n")
+    sys.stderr.write(
+        f"{len(made)} made, {len(wanted) - len(made)} there already; keep {folder / 'ca.key'} to yourself\n"
+    )
+
+
+def router(
+    config: ConfigFile = None,
+    run: RunId = DEFAULT_RUN,
+    show: Annotated[
+        bool, typer.Option("--show", help="Print zenoh's configuration of it instead, for a zenohd of your own.")
+    ] = False,
+) -> None:
+    """Run the router of a run on several machines: mutual TLS, and only what the table of messages allows.
+
+    It listens at network.router of the configuration, or at network.listen. A zenohd of your own does as well, but for
+    the clocks: hosts then set envelopes by their own.
+
+    Example: lowfc router --config lowfc.toml --run bench
+    """
+    from contextlib import closing
+
+    from lowfc.adapters.bus.access import ROUTER
+    from lowfc.adapters.bus.zenoh_session import session_config
+    from lowfc.adapters.process.join import join
+
+    settings = configuration(config)
+    if not settings.network.router:
+        raise ConfigurationError(
+            'there is no router in the configuration: give --config a file with router = "tls/HOST:PORT" and '
+            "certificates in [network]"
+        )
+    if show:
+        with joined(settings, run) as links:
+            sys.stdout.write(_short_lists(json.dumps(session_config(links, ROUTER), indent=2)) + "\n")
+        return
+    service = join(settings, run, ROUTER, [])
+    service.catch_signals()
+    with closing(service.bus):
+        service.state = "running"
+        sys.stderr.write(f"routing at {settings.network.listen or settings.network.router}; Ctrl-C ends it\n")
+        while service.running:
+            service.beat()
+            time.sleep(_TURN_S)
+        service.finish()
+
+
+def hosts(
+    config: ConfigFile = None,
+    run: AnyRun = None,
+    as_json: Json = False,
+) -> None:
+    """Say which processes are in a run, and how far the clocks of their machines are from the router's.
+
+    Example: lowfc hosts --config lowfc.toml --run bench
+    """
+    from contextlib import closing
+
+    from lowfc.adapters.bus.bus import Sample
+    from lowfc.adapters.bus.names import Names
+    from lowfc.adapters.bus.routed import ending_certificates
+    from lowfc.adapters.bus.run import open_run
+    from lowfc.adapters.bus.zenoh_bus import ZenohBus
+    from lowfc.adapters.process.clock import HostClock
+    from lowfc.client import running
+    from lowfc.contract.messages import HEALTH, Role, wire
+    from lowfc.programs.cli.ctl.which_run import the_known_run
+
+    settings = configuration(config)
+    if not settings.network.router or (run is None and running()):
+        run = the_known_run(run)
+    run = run or DEFAULT_RUN  # by a router there is a run, though nobody of it be on this host
+    heard: dict[str, wire.Health] = {}
+    names = Names()
+
+    def hear(sample: Sample) -> None:
+        name, health = names.health(sample.key, sample.payload)
+        heard[name] = health
+
+    with joined(settings, run) as links, closing(ZenohBus(links, Role.OPERATOR, HostClock())) as bus:
+        bus.subscribe(HEALTH, hear)
+        time.sleep(LISTEN_S)
+    if not heard:
+        raise BusError(f"nobody is heard in run {run!r} within {LISTEN_S:g} s")
+    known = open_run(run, (settings.mirror.name,), network=settings.network)  # from now on its folder knows the way
+    if known.links.network.router:
+        for said in ending_certificates(known.links.network, datetime.datetime.now(datetime.UTC)):
+            sys.stderr.write(f"warning: {said}; lowfc certs --renew\n")
+    put(HostsResult(run=run, processes=[_row(heard[name]) for name in sorted(heard)]), as_json=as_json)
+
+
+def _row(health: "wire.Health") -> HostProcess:
+    measured = health.router_round_trip_ns > 0
+    return HostProcess(
+        process=health.process,
+        state=health.state,
+        clock_offset_us=health.router_offset_ns / 1e3 if measured else None,
+        clock_error_us=health.router_round_trip_ns / 2e3 if measured else None,
+    )
+
+
+@contextmanager
+def joined(settings: "Configuration", run: str) -> Iterator["Links"]:
+    """Links of a run that is there, or by the configuration's router as if it were: nothing is left of having asked.
+
+    Raises:
+        BusError: there is no such run, and no router.
+    """
+    from lowfc.adapters.bus.run import open_run, runtime_base
+    from lowfc.programs.cli.ctl.which_run import the_known_run
+
+    if not settings.network.router:
+        the_known_run(run)
+    with tempfile.TemporaryDirectory(prefix="lowfc-") as elsewhere:
+        base = None if (runtime_base() / run).is_dir() else Path(elsewhere)
+        yield open_run(run, (settings.mirror.name,), base, network=settings.network).links
+
+
+def _short_lists(text: str) -> str:
+    """JSON with each list of plain values on one line."""
+    return re.sub(r"\[\s+([^][{}]*?)\s+\]", lambda found: f"[{' '.join(found[1].split())}]", text)

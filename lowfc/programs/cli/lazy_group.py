@@ -1,0 +1,82 @@
+"""A group of commands that are listed by purpose and imported when they are used."""
+
+from collections.abc import Iterator, Mapping, Sequence
+from importlib import import_module
+from typing import Any, NamedTuple
+
+import typer
+from typer.core import TyperGroup
+from typer.main import get_command
+
+from lowfc.adapters.process.terminal import new_app
+
+
+class Row(NamedTuple):
+    """One command.
+
+    Attributes:
+        name: as it is typed.
+        where: "module:attribute" below `lowfc.programs`, a function or a typer application; empty for a group.
+        sentence: what it does; it fits beside the name in 80 columns.
+    """
+
+    name: str
+    where: str
+    sentence: str
+
+
+class Commands(Mapping[str, Any]):
+    """The commands of some rows by name; one is imported when it is looked up."""
+
+    def __init__(self, rows: Sequence[Row], parts: Sequence[Row]) -> None:
+        """Rows of commands, and rows of the commands of their groups."""
+        self._rows, self._parts = {row.name: row for row in rows}, parts
+
+    def __getitem__(self, name: str) -> Any:
+        row = self._rows[name]
+        if row.where:
+            module, _, attribute = row.where.partition(":")
+            found = getattr(import_module(f"lowfc.programs.{module}"), attribute)
+        else:
+            own = [part for part in self._parts if part.name.startswith(f"{name} ")]
+            named = [part._replace(name=part.name.removeprefix(f"{name} ")) for part in own]
+            found = lazy_app(f"{row.sentence}\n\nExample: lowfc {own[0].name}", {"Commands": named})
+            found.callback()(lambda: None)
+        app = found if isinstance(found, typer.Typer) else new_app("")
+        if app is not found:
+            app.command(name)(found)
+        command = get_command(app)
+        command.name = name
+        return command
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._rows)
+
+    def __len__(self) -> int:
+        return len(self._rows)
+
+
+def lazy_app(help_text: str, panels: Mapping[str, Sequence[Row]], parts: Sequence[Row] = ()) -> typer.Typer:
+    """A command line of rows by the heading under which its help lists them; it needs a callback.
+
+    Args:
+        help_text: Of the command line itself.
+        panels: Rows by heading.
+        parts: Rows of groups, "group command".
+    """
+    rows = [row for panel in panels.values() for row in panel]
+    wide = max(len(row.name) for row in rows)
+
+    class Group(TyperGroup):
+        def __init__(self, **settings: Any) -> None:
+            super().__init__(**settings)
+            self.commands = Commands(rows, parts)  # type: ignore[assignment]  # nobody adds to them
+
+        def format_commands(self, ctx: Any, formatter: Any) -> None:
+            for heading, panel in panels.items():
+                with formatter.section(heading):
+                    formatter.write_dl([(f"{row.name:{wide}}", row.sentence) for row in panel])
+
+    app = new_app(help_text)
+    app.info.cls = Group
+    return app

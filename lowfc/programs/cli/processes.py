@@ -1,0 +1,125 @@
+"""The commands of a loop's own processes: `lowfc controller` and `lowfc record`."""
+
+import json
+from contextlib import closing
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from lowfc.adapters.process.terminal import DEFAULT_RUN, ConfigFile, Json, RunId, configuration
+from lowfc.contract.errors import ConfigurationError
+
+
+def controller(
+    run: RunId = DEFAULT_RUN,
+    config: ConfigFile = None,
+    calibration: Annotated[
+        Path | None,
+        typer.Option(help="Calibration file (FITS), or none; default: computed from the configuration."),
+    ] = None,
+) -> None:
+    """Run the controller: frames from the bus, commands to it.
+
+    Example: lowfc controller --run bench --calibration calibration.fits
+    """
+    import signal
+
+    from rich.console import Console
+
+    from lowfc.adapters.bus.run import open_run
+    from lowfc.adapters.files.calibration_file import load
+    from lowfc.adapters.process.join import join
+    from lowfc.adapters.process.latch import Latch, latch_files
+    from lowfc.contract.messages import Role
+    from lowfc.programs.commissioning.analytic import analytic
+    from lowfc.programs.core.controller import Controller
+
+    signalled: list[int] = []  # before there is a loop to be made safe
+    signal.signal(signal.SIGUSR1, lambda number, _: signalled.append(number))
+    settings = configuration(config)
+    found = None
+    if calibration is None:
+        found = analytic(settings, Console(stderr=True))
+    elif str(calibration) != "none":
+        found = load(calibration)
+    service = join(settings, run, Role.CONTROLLER, settings.realtime.controller_cpus)
+    source = calibration.name if calibration is not None else "the configuration"
+    latch = Latch(
+        latch_files(open_run(run, (settings.mirror.name,))), lambda why: service.event("LATCH_FAILED", why=why)
+    )
+    process = Controller(settings, service, found, source, latch)
+    signal.signal(signal.SIGUSR1, lambda number, _: process.safe_by_signal())
+    if signalled:
+        process.safe_by_signal()
+    service.fill = process.fill
+    service.catch_signals()
+    with closing(service.bus):  # a callback on zenoh's threads must not outlive the interpreter
+        process.run()
+
+
+def record(
+    run: RunId = DEFAULT_RUN,
+    config: ConfigFile = None,
+    calibration: Annotated[Path | None, typer.Option(help="Calibration file to put into the log.")] = None,
+    folder: Annotated[str | None, typer.Option(help="Where logs are written; default: recorder.folder.")] = None,
+    largest_mb: Annotated[float | None, typer.Option(help="Size at which the next log is begun.")] = None,
+    longest_s: Annotated[float | None, typer.Option(help="Age at which the next log is begun.")] = None,
+    min_free_mb: Annotated[
+        float | None, typer.Option(help="Free space on the disk below which nothing is recorded.")
+    ] = None,
+    every: Annotated[
+        int | None, typer.Option(min=1, help="Record every Nth frame and mirror state; steps and commands are whole.")
+    ] = None,
+    topics: Annotated[
+        list[str] | None,
+        typer.Option(help="Of frames, mirror state and surface, truth and timing, only these; repeat."),
+    ] = None,
+    words: Annotated[list[str] | None, typer.Argument(hidden=True)] = None,
+    as_json: Json = False,
+) -> None:
+    """Record a run's messages into MCAP logs until told to stop.
+
+    Example: lowfc record --run bench --folder logs --longest-s 600 --min-free-mb 2000
+    """
+    from lowfc.adapters.bus.run import open_run
+    from lowfc.adapters.files.whole_file import write_whole
+    from lowfc.adapters.logs.series import Limits
+    from lowfc.adapters.process.join import clock_of
+    from lowfc.programs.core.recording.process import record as run_recorder
+    from lowfc.programs.core.recording.summary import figures, report
+    from lowfc.programs.core.recording.volume import bytes_per_s, outlook, selected
+
+    overrides = {
+        "recorder.folder": folder,
+        "recorder.largest_mb": largest_mb,
+        "recorder.longest_s": longest_s,
+        "recorder.min_free_mb": min_free_mb,
+        "recorder.every": every,
+        "recorder.topics": topics or None,
+    }
+    if words:
+        hint = f"; `lowfc ctl record {words[0]}` asks a recorder that runs" if words[0] in ("start", "stop") else ""
+        raise ConfigurationError(f"lowfc record takes options only, got {' '.join(words)!r}{hint}")
+    settings = configuration(config, overrides)
+    log, recorded = settings.recorder, selected(settings)
+    joined = open_run(run, (settings.mirror.name,), network=settings.network)
+    complete = joined.path / "config.toml"  # a file may name only what was chosen; the log names every value
+    write_whole(complete, settings.to_toml().encode())
+    done = run_recorder(
+        joined,
+        Path(log.folder),
+        configuration=complete,
+        calibration=calibration,
+        seed=settings.seed,
+        limits=Limits(round(log.largest_mb * 1e6), log.longest_s, round(log.min_free_mb * 1e6), int(log.file_mode, 8)),
+        clock=clock_of(settings),
+        priority=(settings.realtime.priority and settings.realtime.recorder_priority) or None,
+        cpus=set(settings.realtime.recorder_cpus) or None,
+        selection=recorded,
+        expected_bytes_per_s=bytes_per_s(settings, recorded),
+        begins=lambda: typer.echo(outlook(settings), err=True),
+    )
+    typer.echo(json.dumps(figures(done)) if as_json else report(done), err=not as_json)
+    if done.failure:
+        raise typer.Exit(1)

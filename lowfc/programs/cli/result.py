@@ -1,0 +1,121 @@
+"""What a command returns, as one typed object: its `--json` object and its text are made here, from the same fields.
+
+A field is declared once, with `figure`: its label, its unit and how it is formatted. Text has a line for each labelled
+figure, then a table for each list of parts; figures of one length that are declared as columns stand in one table.
+"""
+
+import json
+import sys
+from collections.abc import Iterator, Sequence
+from typing import Any
+
+from pydantic import BaseModel, ConfigDict, Field
+from pydantic.fields import FieldInfo
+
+from lowfc.contract.printable import LINES, printable
+
+_LABEL_WIDTH = 18
+
+
+def figure(label: str = "", unit: str = "", form: str = "", *, column: bool = False, **field: Any) -> Any:
+    """A field of a result.
+
+    Args:
+        label: In the text and at the head of a table's column; a figure without one stands in the JSON alone.
+        unit: Behind the value, or the label of a column.
+        form: As of `format`, such as ".3g", or with something around it, such as "Z{}".
+        column: It is a list, and a column of the result's own table.
+        field: As of pydantic's `Field`.
+    """
+    return Field(description=label or None, json_schema_extra={"unit": unit, "form": form, "column": column}, **field)
+
+
+class Result(BaseModel):
+    """A typed result, or a part of one."""
+
+    model_config = ConfigDict(arbitrary_types_allowed=True, populate_by_name=True)
+
+    def figures(self) -> dict[str, Any]:
+        """What `--json` prints: what was measured or set; what does not apply is left out."""
+        return self.model_dump(by_alias=True, exclude_unset=True)
+
+    def text(self) -> str:
+        """What a person reads."""
+        return "\n".join([*self.head(), *self._labelled(), *self._tables(), *self.remarks()])
+
+    def head(self) -> Sequence[str]:
+        """Lines before the figures."""
+        return ()
+
+    def remarks(self) -> Sequence[str]:
+        """Lines after the figures: what follows from them, what to do."""
+        return ()
+
+    def _labelled(self) -> Iterator[str]:
+        for name, info in type(self).model_fields.items():
+            value = getattr(self, name, None)
+            if info.description and value is not None and not _is_table(info, value):
+                yield f"{info.description:{_LABEL_WIDTH}} {formatted(info, value, with_unit=True)}"
+
+    def _tables(self) -> Iterator[str]:
+        fields = type(self).model_fields
+        columns = [(info, getattr(self, name, None) or []) for name, info in fields.items() if _setting(info, "column")]
+        columns = [(info, values) for info, values in columns if values]
+        if columns:
+            cells = [[formatted(info, value) for value in values] for info, values in columns]
+            yield from table([_heading(info) for info, _ in columns], zip(*cells, strict=True))
+        for name in fields:
+            parts = getattr(self, name, None)
+            if isinstance(parts, list) and parts and isinstance(parts[0], Result):
+                yield from parts_table(parts)
+
+
+def parts_table(parts: Sequence[Result]) -> list[str]:
+    """A row for each part, a column for each of its labelled figures; its remarks stand behind the row."""
+    shown = [(name, info) for name, info in type(parts[0]).model_fields.items() if info.description]
+    rows = [[formatted(info, getattr(part, name)) for name, info in shown] for part in parts]
+    lines = table([_heading(info) for _, info in shown], rows)
+    return [lines[0], *("   ".join([line, *part.remarks()]) for line, part in zip(lines[1:], parts, strict=True))]
+
+
+def table(heads: Sequence[str], rows: Any) -> list[str]:
+    """Lines of a table, its first column to the left, the others to the right."""
+    cells = [list(heads), *(list(row) for row in rows)]
+    widths = [max(map(len, column)) for column in zip(*cells, strict=True)]
+    first, *others = widths
+    return [
+        "  ".join([f"{row[0]:{first}}", *(f"{cell:>{wide}}" for cell, wide in zip(row[1:], others, strict=True))])
+        for row in cells
+    ]
+
+
+def formatted(info: FieldInfo, value: Any, *, with_unit: bool = False) -> str:
+    """A figure as text; a dash for none."""
+    if value is None:
+        return "-"
+    if isinstance(value, bool):
+        return "yes" if value else "no"
+    if isinstance(value, list | tuple):
+        return " ".join(formatted(info, each) for each in value) or "none"
+    form, unit = _setting(info, "form"), _setting(info, "unit")
+    text = form.format(value) if "{" in form else f"{value:{form}}"
+    return f"{text} {unit}" if with_unit and unit else text
+
+
+def put(result: Result, *, as_json: bool) -> None:
+    """Print a result: one JSON object, or its text with control characters escaped."""
+    sys.stdout.write((json.dumps(result.figures()) if as_json else printable(result.text(), keep=LINES)) + "\n")
+
+
+def _heading(info: FieldInfo) -> str:
+    unit = _setting(info, "unit")
+    return f"{info.description}, {unit}" if unit else info.description or ""
+
+
+def _is_table(info: FieldInfo, value: Any) -> bool:
+    return bool(_setting(info, "column")) or (isinstance(value, list) and bool(value) and isinstance(value[0], Result))
+
+
+def _setting(info: FieldInfo, name: str) -> Any:
+    extra = info.json_schema_extra
+    return extra.get(name, "") if isinstance(extra, dict) else ""

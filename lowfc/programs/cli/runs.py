@@ -1,0 +1,57 @@
+"""`lowfc runs`: the runs on this host, with their loop mode, processes and log."""
+
+from typing import Any
+
+from lowfc.adapters.process.terminal import Json
+from lowfc.programs.cli.output import put
+
+
+def runs(as_json: Json = False) -> None:
+    """List the runs on this host: loop mode, processes, log.
+
+    Example: lowfc runs
+    """
+    from lowfc.adapters.bus.other_loops import none_here
+    from lowfc.adapters.bus.run import runtime_path
+    from lowfc.client.runs import living
+
+    rows = [_row(name, roles) for name, roles in living().items()]
+    figures = {"runs": rows, "searched": str(runtime_path())}
+    put(figures, "\n".join(_lines(rows)) if rows else none_here(), as_json=as_json)
+
+
+def _row(name: str, roles: set[str]) -> dict[str, Any]:
+    """What the processes of a run report of themselves; one that only listens so far is starting."""
+    from lowfc.client import Client
+    from lowfc.contract.messages import Role
+    from lowfc.programs.cli.ctl.status import NOBODY, recording_state
+    from lowfc.programs.launch.watch import mode_name
+
+    with Client(name) as loop:
+        found = loop.processes()
+    controller, recorder = found.get(Role.CONTROLLER, NOBODY), found.get(Role.RECORDER, NOBODY)
+    starting = [{"process": role, "state": "starting", "pid": None} for role in roles - {*found, Role.LAUNCHER}]
+    processes = [{"process": key, "state": health.state, "pid": health.pid} for key, health in found.items()]
+    return {
+        "run": name,
+        "mode": mode_name(controller.mode) or ("starting" if {Role.LAUNCHER, Role.CONTROLLER} & roles else None),
+        "rate_hz": controller.rate_hz if controller.mode else None,
+        "uptime_s": controller.uptime_ns * 1e-9 if controller.mode else None,
+        "processes": sorted(processes + starting, key=lambda one: str(one["process"])),
+        "recording": recording_state(recorder),
+        "log": recorder.recording.file or None,
+    }
+
+
+def _lines(rows: list[dict[str, Any]]) -> list[str]:
+    from lowfc.control.loop.wording import mode_word
+
+    lines = []
+    for row in rows:
+        mode = "no controller" if row["mode"] is None else mode_word(row["mode"])
+        rate = "" if row["rate_hz"] is None else f" at {row['rate_hz']:.0f} Hz for {row['uptime_s']:.0f} s"
+        log = {"recording": f"recording {row['log']}", "none": "not recording"}
+        processes = ", ".join(one["process"] for one in row["processes"]) or "no process yet"
+        what = log.get(row["recording"], f"recording {row['recording']}")
+        lines.append(f"{row['run']}  {mode}{rate}; {processes}; {what}")
+    return lines

@@ -1,0 +1,183 @@
+"""`lowfc acceptance linearity`: gain and cross-talk of each mode against its size, with the loop open."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from lowfc.contract.configuration import Acceptance
+from lowfc.control.calibration.excitation import climb
+from lowfc.control.calibration.linearity import SURE, gains, levels
+from lowfc.control.loop.safety import LoopMode
+from lowfc.optics.chain.zernike import mode_name
+from lowfc.programs.cli.result import Result, figure
+from lowfc.programs.commissioning.acceptance.judged import AcceptanceResult, ModeResult
+from lowfc.programs.commissioning.acceptance.live import Live
+from lowfc.programs.commissioning.acceptance.played import AcceptanceError, Kind, Played, chosen
+
+KIND: Kind = "linearity"
+AMPLITUDES = (0.5, 1.0, 2.0)
+"""Of a mode, beside the one up to which it must be linear."""
+_SPARE_FRAMES = 2  # beside the delay: a mirror that is still settling
+
+
+@dataclass(frozen=True, slots=True)
+class Staircase:
+    """What is played: frames at each level, cycles at each amplitude, Noll indices (empty for all)."""
+
+    hold_frames: int
+    cycles: int
+    modes: tuple[int, ...]
+
+
+class Level(Result):
+    """The gain of a mode, and its largest cross-talk, at one amplitude."""
+
+    amplitude_nm: float = figure()
+    gain: float = figure()
+    gain_error: float = figure()
+    crosstalk: float = figure()
+    crosstalk_error: float = figure()
+    crosstalk_noll: int = figure()
+    within: bool | None = figure()
+
+
+class LinearityMode(ModeResult):
+    """Up to which amplitude a mode is linear, nm rms of wavefront."""
+
+    linear_nm: float = figure("linear to", "nm", ".3g")
+    levels: list[Level] = figure()
+
+    def remarks(self) -> Sequence[str]:
+        """Gain - 1 and cross-talk at each amplitude."""
+        cells = [
+            f"{row.amplitude_nm:g}: {row.gain - 1:+.3f} ({abs(row.crosstalk):.3f})"
+            + {True: "", False: "!", None: "?"}[row.within]
+            for row in self.levels
+        ]
+        return [*cells, *super().remarks()]
+
+
+class LinearityResult(AcceptanceResult):
+    """Linearity; behind each mode stand gain - 1 and the largest cross-talk at each amplitude, nm."""
+
+    required_nm: float = figure("required linear to", "nm", "g")
+    required_gain_error: float = figure("required |gain - 1|", form="g")
+    required_crosstalk: float = figure("required cross-talk", form="g")
+    modes: list[LinearityMode] = figure("modes")
+
+    def remarks(self) -> Sequence[str]:
+        """What the marks mean."""
+        key = f"amplitude, nm: gain - 1 (largest cross-talk); {SURE:g} standard errors are forgiven"
+        unsure = any(row.within is None for mode in self.modes for row in mode.levels)
+        noisy = ["?: too noisy to say; more cycles, or longer levels, help"] if unsure else []
+        return [key, *noisy, *super().remarks()]
+
+
+def play(live: Live, how: Staircase, required: Acceptance) -> list[Played]:
+    """Play a staircase of each mode to the mirror, with the loop open.
+
+    Raises:
+        AcceptanceError: a mode is not one of the loop's, or the levels are too short.
+    """
+    skipped = int(np.ceil(live.loop.delay_frames)) + _SPARE_FRAMES
+    if how.hold_frames <= skipped:
+        raise AcceptanceError(
+            f"{how.hold_frames} frames at each level are too few: {skipped} pass until the mirror is seen there"
+        )
+    plan = []
+    for noll in chosen(how.modes, live.loop.noll):
+        shape = live.calibration.modes_to_actuators[:, live.loop.noll.index(noll)][None]
+        step_nm = live.configuration.safety.slew_nm / 2 / float(np.abs(shape).max())
+        levels_nm = levels(np.array(AMPLITUDES) * required.linear_nm, how.cycles)
+        stairs, starts = climb(levels_nm, how.hold_frames, step_nm)
+        what = {
+            "noll": noll,
+            "levels_nm": levels_nm.tolist(),
+            "starts": (starts + skipped).tolist(),
+            "averaged": how.hold_frames - skipped,
+        }
+        plan.append((what, stairs.astype(np.float32)[:, None], shape))
+    live.expect(sum(len(table) for _, table, _ in plan))
+    return [live.play(KIND, what, LoopMode.OPEN, table, shape) for what, table, shape in plan]
+
+
+def judge(every: Sequence[Played], required: Acceptance) -> LinearityResult:
+    """Gains and cross-talk of what was played.
+
+    Raises:
+        AcceptanceError: the loop was disturbed meanwhile.
+    """
+    modes = []
+    for played in every:
+        played.check(LoopMode.OPEN)
+        what, noll = played.what, played.loop.noll
+        levels_nm, starts = np.array(what["levels_nm"]), np.array(what["starts"], np.intp)
+        found = gains(played.filled(played.error_nm), noll.index(what["noll"]), levels_nm, starts, what["averaged"])
+        within = found.within(required.gain_error, required.crosstalk)
+        rows = []
+        for row, amplitude_nm in enumerate(found.amplitude_nm.tolist()):
+            other = int(np.argmax(np.abs(found.crosstalk[row])))
+            rows.append(
+                Level(
+                    amplitude_nm=amplitude_nm,
+                    gain=float(found.gain[row, found.mode]),
+                    gain_error=float(found.error[row, found.mode]),
+                    crosstalk=float(found.crosstalk[row, other]),
+                    crosstalk_error=float(found.error[row, other]),
+                    crosstalk_noll=noll[other],
+                    within=within[row],
+                )
+            )
+        beyond = min([row.amplitude_nm for row in rows if row.within is False], default=np.inf)
+        linear_nm = max([row.amplitude_nm for row in rows if row.within and row.amplitude_nm < beyond], default=0.0)
+        passed = linear_nm >= required.linear_nm * (1 - 1e-6)
+        modes.append(
+            LinearityMode(
+                noll=what["noll"],
+                name=mode_name(what["noll"]),
+                passed=passed,
+                too_noisy=not passed and beyond > required.linear_nm * (1 + 1e-6),
+                linear_nm=linear_nm,
+                levels=rows,
+            )
+        )
+    return LinearityResult(
+        test=KIND,
+        passed=bool(modes) and all(mode.passed for mode in modes),
+        required_nm=required.linear_nm,
+        required_gain_error=required.gain_error,
+        required_crosstalk=required.crosstalk,
+        modes=modes,
+    )
+
+
+def draw(found: dict[str, Any], figure: Any) -> None:
+    """Gain and cross-talk against amplitude."""
+    axes = figure.subplots(1, 2, sharex=True)
+    for number, mode in enumerate(found["modes"]):
+        x = [row["amplitude_nm"] for row in mode["levels"]]
+        style = {"color": f"C{number % 10}", "marker": "o", "markersize": 3, "linewidth": 1}
+        axes[0].errorbar(
+            x,
+            [row["gain"] for row in mode["levels"]],
+            [row["gain_error"] for row in mode["levels"]],
+            label=f"Z{mode['noll']}",
+            **style,
+        )
+        axes[1].errorbar(
+            x,
+            [abs(row["crosstalk"]) for row in mode["levels"]],
+            [row["crosstalk_error"] for row in mode["levels"]],
+            **style,
+        )
+    for side in (-1, 1):
+        axes[0].axhline(1 + side * found["required_gain_error"], color="grey", linestyle=":")
+    axes[1].axhline(found["required_crosstalk"], color="grey", linestyle=":")
+    for ax, title in zip(axes, ("measured over true size", "largest cross-talk"), strict=True):
+        ax.axvline(found["required_nm"], color="grey", linestyle=":")
+        ax.set_title(title)
+        ax.set_xlabel("size of the mode, nm rms of wavefront")
+        ax.grid(alpha=0.3)
+    axes[0].legend(fontsize=6, ncols=2)

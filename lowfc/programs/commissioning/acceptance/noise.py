@@ -1,0 +1,114 @@
+"""`lowfc acceptance noise-floor`: the sensor's white noise against what photons and read-out make of it."""
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from lowfc.adapters.files.factory import frame_noise_nm
+from lowfc.contract.configuration import Acceptance, Configuration
+from lowfc.control.calibration.calibration import Calibration
+from lowfc.control.laws.spectra import SHORTEST, Pieces, floor_nm2_hz, spectrum
+from lowfc.control.loop.safety import LoopMode
+from lowfc.optics.chain.zernike import mode_name
+from lowfc.programs.cli.result import figure
+from lowfc.programs.commissioning.acceptance.judged import AcceptanceResult, ModeResult
+from lowfc.programs.commissioning.acceptance.live import Live
+from lowfc.programs.commissioning.acceptance.played import AcceptanceError, Kind, Played
+
+Double = npt.NDArray[np.float64]
+
+KIND: Kind = "noise-floor"
+_LOOPS = {"open": LoopMode.OPEN, "closed": LoopMode.CLOSED}
+
+
+class NoiseMode(ModeResult):
+    """White noise of a mode in a frame, and what the closed loop leaves of it, nm rms of wavefront."""
+
+    expected_nm: float = figure("expected", "nm", ".3f")
+    open_nm: float = figure("open", "nm", ".3f")
+    closed_nm: float = figure("closed", "nm", ".3f")
+    residual_floor_nm: float = figure("residual from it", "nm", ".3f")
+    open_rms_nm: float = figure("error open", "nm", ".3f")
+    closed_rms_nm: float = figure("error closed", "nm", ".3f")
+
+
+class NoiseResult(AcceptanceResult):
+    """The noise floor."""
+
+    noise_ratio: float = figure("required ratio", form="g")
+    law: str = figure("law")
+    frames: dict[str, int] = figure()
+    modes: list[NoiseMode] = figure("modes")
+
+
+def play(live: Live, duration_s: float) -> list[Played]:
+    """Keep what the loop measures with nothing being played: open, then closed, each for so long."""
+    frames = max(round(duration_s * live.loop.rate_hz), SHORTEST)
+    live.expect(frames * len(_LOOPS))
+    nothing = np.zeros((frames, 0), np.float32)
+    return [live.play(KIND, {"loop": name}, mode, nothing) for name, mode in _LOOPS.items()]
+
+
+def judge(
+    every: Sequence[Played], required: Acceptance, configuration: Configuration, calibration: Calibration
+) -> NoiseResult:
+    """The noise of an open and of a closed stretch.
+
+    Raises:
+        AcceptanceError: the loop was disturbed meanwhile, or a stretch is missing.
+    """
+    stretches = {played.what["loop"]: played for played in every}
+    if set(stretches) != set(_LOOPS):
+        raise AcceptanceError(f"there must be an open and a closed stretch, there is {', '.join(stretches) or 'none'}")
+    floors, rms = {}, {}
+    for name, played in stretches.items():
+        played.check(_LOOPS[name])
+        floors[name] = _floor_nm(played)
+        rms[name] = np.nanstd(played.error_nm, axis=0)
+    loop = stretches["closed"].loop
+    expected, gain = frame_noise_nm(configuration, calibration), np.sqrt(loop.noise_gain())
+    modes = [
+        NoiseMode(
+            noll=noll,
+            name=mode_name(noll),
+            passed=bool(max(floors["open"][k], floors["closed"][k]) <= required.noise_ratio * expected[k]),
+            expected_nm=float(expected[k]),
+            open_nm=float(floors["open"][k]),
+            closed_nm=float(floors["closed"][k]),
+            open_rms_nm=float(rms["open"][k]),
+            closed_rms_nm=float(rms["closed"][k]),
+            residual_floor_nm=float(floors["closed"][k] * gain[k]),
+        )
+        for k, noll in enumerate(loop.noll)
+    ]
+    return NoiseResult(
+        test=KIND,
+        passed=all(mode.passed for mode in modes),
+        noise_ratio=required.noise_ratio,
+        law=loop.name,
+        frames={name: len(played.error_nm) for name, played in stretches.items()},
+        modes=modes,
+    )
+
+
+def draw(found: dict[str, Any], figure: Any) -> None:
+    """The noise of each mode, measured and expected."""
+    ax = figure.subplots()
+    x = np.arange(len(found["modes"]))
+    for name, marker in (("expected_nm", "k_"), ("open_nm", "C0o"), ("closed_nm", "C1s"), ("residual_floor_nm", "C2^")):
+        label = name.removesuffix("_nm").replace("_", " ")
+        ax.semilogy(x, [mode[name] for mode in found["modes"]], marker, label=label)
+    ax.set_xticks(x, [f"Z{mode['noll']}" for mode in found["modes"]])
+    ax.set_ylabel("nm rms of wavefront in a frame")
+    ax.grid(alpha=0.3)
+    ax.legend()
+
+
+def _floor_nm(played: Played) -> Double:
+    """White noise (modes,) of a frame: of pseudo-open-loop modes, which the loop does not filter."""
+    made = spectrum(Pieces((played.filled(played.pol_nm),), 0), played.loop.rate_hz)
+    if made is None:
+        raise AcceptanceError(f"{len(played.pol_nm)} frames are too few for a spectrum, {SHORTEST} are needed")
+    return np.asarray(np.sqrt(floor_nm2_hz(made) * played.loop.rate_hz / 2))

@@ -1,0 +1,267 @@
+"""What was played to a loop and what it did meanwhile, for the tests to judge; from a log.
+
+Each play is announced by a note that says what it is for, so that a log can be judged as the live loop was.
+"""
+
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import numpy as np
+import numpy.typing as npt
+
+from lowfc.adapters.logs.history import History
+from lowfc.contract.codecs import codec
+from lowfc.contract.codecs.law_codec import law_of
+from lowfc.contract.errors import DataFileError, LowfcError
+from lowfc.contract.messages import wire
+from lowfc.control.calibration.calibration import Calibration
+from lowfc.control.laws import margins
+from lowfc.control.laws.law import Law
+from lowfc.control.laws.linear_law import LinearLaw, integrator
+from lowfc.control.laws.stability import settling_frames
+from lowfc.control.loop.safety import LoopMode, Reason
+
+Kind = Literal["rejection", "linearity", "capture-range", "noise-floor"]
+Single = npt.NDArray[np.float32]
+Double = npt.NDArray[np.float64]
+
+LIMITS = (Reason.MODAL_LIMIT, Reason.STROKE, Reason.SLEW, Reason.NEIGHBOUR)
+MOST_MISSING = 0.01
+"""Part of the frames that may be missing or refused."""
+LONGEST_SETTLING = 4000
+"""Frames that a linear law is given to settle, at the most."""
+
+SAID = "acceptance "
+"""How a note begins that announces a test; its parameters follow as JSON."""
+_CHANGES = ("gain", "leak", "limit", "law", "load", "offset", "channel", "reset")
+
+
+class AcceptanceError(LowfcError):
+    """A loop could not be measured: it was disturbed, or is in no state for it."""
+
+
+@dataclass(frozen=True, slots=True)
+class Loop:
+    """The loop that is measured: its law, its delay as configured, its rate."""
+
+    law: Law | LinearLaw
+    noll: tuple[int, ...]
+    delay_frames: float
+    rate_hz: float
+
+    @property
+    def linear(self) -> LinearLaw:
+        """Its law as a linear one."""
+        if isinstance(self.law, LinearLaw):
+            return self.law
+        return integrator(self.law.gain, self.law.leak, self.noll, self.delay_frames, self.rate_hz)
+
+    def rejection(self, frequency_hz: Double) -> Double:
+        """|S| (frequencies, modes) in theory."""
+        return margins.rejection(self.linear, frequency_hz, self.delay_frames)
+
+    def noise_transfer(self, frequency_hz: Double) -> Double:
+        """|T| (frequencies, modes) in theory."""
+        return margins.noise_transfer(self.linear, frequency_hz, self.delay_frames)
+
+    def noise_gain(self) -> Double:
+        """Variance (modes,) of the residual per variance of white noise of a frame, in theory."""
+        return margins.noise_gain(self.linear, self.delay_frames)
+
+    def settling_frames(self) -> int:
+        """Frames in which it settles."""
+        if isinstance(self.law, Law):
+            return settling_frames(self.law.gain, self.law.leak)
+        radius = float(margins.margins(self.law, self.delay_frames).radius.max())
+        return int(min(5 / max(1 - radius, 1e-9), LONGEST_SETTLING)) + 1
+
+    @property
+    def name(self) -> str:
+        """What kind of law it is."""
+        return self.law.name if isinstance(self.law, LinearLaw) else "integrator"
+
+
+@dataclass(frozen=True, slots=True)
+class Played:
+    """One play, or a stretch of nothing, frame by frame.
+
+    Attributes:
+        what: the parameters that it was announced with.
+        target: of the play; empty for none.
+        table: (frames, columns) of the play; (frames, 0) for none.
+        basis: (columns, actuators) of the play, nm of surface.
+        error_nm: (frames, modes), NaN where a frame is missing or was refused; so is pol_nm.
+        command_nm: (frames, modes) after each frame; NaN where it is missing.
+        mode: (frames,) loop mode, 0 where a frame is missing.
+        reasons: (frames,) bit `1 << reason` for each.
+    """
+
+    what: dict[str, Any]
+    loop: Loop
+    target: str
+    table: Single
+    basis: Single
+    error_nm: Double
+    pol_nm: Double
+    command_nm: Double
+    mode: npt.NDArray[np.uint8]
+    reasons: npt.NDArray[np.int64]
+
+    @property
+    def limits_hit(self) -> list[str]:
+        """Names of the limits that acted, which ended the play."""
+        return [one.name for one in LIMITS if np.any(self.reasons & (1 << one))]
+
+    @property
+    def missing(self) -> int:
+        """Frames of which nothing was measured."""
+        return int(np.count_nonzero(~np.isfinite(self.error_nm).all(axis=1)))
+
+    def check(self, mode: LoopMode) -> None:
+        """Refuse what was disturbed.
+
+        Raises:
+            AcceptanceError: it was, and how.
+        """
+        other = self.mode[(self.mode != 0) & (self.mode != mode)]
+        if other.size:
+            raise AcceptanceError(
+                f"the loop became {LoopMode(int(other[0])).in_words} while it was measured "
+                f"{mode.in_words}: measure again"
+            )
+        if self.limits_hit:
+            raise AcceptanceError(
+                f"a limit acted ({', '.join(self.limits_hit)}) and ended what was played: take a smaller amplitude, or "
+                "measure when the disturbance is smaller"
+            )
+        if self.missing > MOST_MISSING * len(self.error_nm):
+            raise AcceptanceError(
+                f"{self.missing} of {len(self.error_nm)} frames are missing or were refused, at most "
+                f"{MOST_MISSING:.0%} may: `lowfc info` and `lowfc ctl status` say why"
+            )
+
+    def filled(self, values: Double) -> Double:
+        """(frames, modes) with what is missing interpolated."""
+        there = np.isfinite(values).all(axis=1)
+        if there.all():
+            return values
+        rows = np.arange(len(values))
+        return np.stack([np.interp(rows, rows[there], column[there]) for column in values.T], axis=1)
+
+
+def chosen(wanted: Sequence[int], noll: Sequence[int]) -> tuple[int, ...]:
+    """The Noll indices asked for, all where none are.
+
+    Raises:
+        AcceptanceError: one is not the loop's.
+    """
+    unknown = sorted(set(wanted) - set(noll))
+    if unknown:
+        raise AcceptanceError(f"Noll modes {unknown} are not controlled; there are {noll[0]} to {noll[-1]}")
+    return tuple(wanted or noll)
+
+
+def logged(history: History, kind: Kind) -> list[Played]:
+    """What was played for a test while a log was written.
+
+    Raises:
+        DataFileError: nothing was, or the loop was changed meanwhile.
+    """
+    path, calibration = history.log.path, history.calibration
+    announced = _announced(history.requests, kind)
+    if calibration is None or not announced:
+        raise DataFileError(f"{path}: no `lowfc acceptance {kind}` was carried out while it was written")
+    modes, found = len(calibration.noll), []
+    for what, request in announced:
+        frames = what.pop("frames")
+        first, play = request.frame_sequence, request.name == "play"
+        for other in history.requests:
+            if other.accepted and other.name in _CHANGES and first < other.frame_sequence < first + frames:
+                raise DataFileError(f"{path}: {other.name} was asked for while the loop was measured")
+        before = [one for one in history.controllers if one.frame_sequence < first and len(one.gain) == modes]
+        if not before:
+            raise DataFileError(f"{path}: the state of the controller before the test is not in it")
+        steps = history.steps
+        rows = np.flatnonzero((steps.sequence >= first) & (steps.sequence < first + frames))
+        asked = codec.request(request, request.name, 0, plays=history.published.plays)
+        basis = asked.actuators_nm.reshape(-1, calibration.grid[0] * calibration.grid[1])
+        one = played(
+            what,
+            loop_of(before[-1], calibration, history.rate_hz, history.published.laws),
+            request.text if play else "",
+            asked.table if play else np.zeros((frames, 0), np.float32),
+            basis,
+            (steps.sequence[rows] - np.uint64(first)).astype(np.int64),
+            steps.time_ns[rows],
+            steps.mode[rows],
+            steps.reasons[rows],
+            steps.error_nm[rows],
+            steps.pol_nm[rows],
+            steps.command_nm[rows],
+        )
+        found.append(one)
+    return found
+
+
+def _announced(requests: Sequence[wire.Request], kind: Kind) -> list[tuple[dict[str, Any], wire.Request]]:
+    """Parameters and request of each play of a test; the note itself where nothing is played."""
+    found: list[tuple[dict[str, Any], wire.Request]] = []
+    what: dict[str, Any] | None = None
+    for request in requests:
+        if not request.accepted:
+            continue
+        if request.name == "note" and request.text.startswith(SAID):
+            try:
+                what = json.loads(request.text.removeprefix(SAID))
+            except (ValueError, RecursionError):
+                what = None  # somebody's own note that begins alike
+            if not isinstance(what, dict) or what.pop("test", None) != kind or not isinstance(what.get("frames"), int):
+                what = None
+            elif kind == "noise-floor":
+                found.append((what, request))
+        elif request.name == "play" and what is not None:
+            found.append((what, request))
+            what = None
+    return found
+
+
+def played(
+    what: dict[str, Any],
+    loop: Loop,
+    target: str,
+    table: Single,
+    basis: Single,
+    places: npt.NDArray[np.int64],
+    time_ns: npt.NDArray[np.int64],
+    mode: npt.NDArray[np.uint8],
+    reasons: npt.NDArray[np.int64],
+    *columns: Single,
+) -> Played:
+    """Steps at some places of a play as one row for each of its frames; the rate is that of these steps."""
+    frames, modes = len(table), columns[0].shape[1]
+    own = (reasons & (1 << Reason.REPEATED | 1 << Reason.OUT_OF_ORDER)) == 0  # the others are of a frame seen before
+    places, time_ns, mode, reasons = places[own], time_ns[own], mode[own], reasons[own]
+    columns = tuple(column[own] for column in columns)
+    if len(places) > 1:
+        rate_hz = float((places[-1] - places[0]) * 1e9 / (time_ns[-1] - time_ns[0]))
+        loop = Loop(loop.law, loop.noll, loop.delay_frames, rate_hz)
+    full = np.full((len(columns), frames, modes), np.nan)
+    for filled, column in zip(full, columns, strict=True):
+        filled[places] = column
+    modes_of, reasons_of = np.zeros(frames, np.uint8), np.zeros(frames, np.int64)
+    modes_of[places], reasons_of[places] = mode, reasons
+    return Played(what, loop, target, table, basis, full[0], full[1], full[2], modes_of, reasons_of)
+
+
+def loop_of(
+    state: wire.ControllerState, calibration: Calibration, rate_hz: float, laws: Mapping[str, LinearLaw]
+) -> Loop:
+    """The loop of a controller's state, whose law is one of these."""
+    law: Law | LinearLaw
+    if state.HasField("law"):
+        law = law_of(state.law, laws)
+    else:
+        law = Law(*(np.array(values, np.float32) for values in (state.gain, state.leak, state.limit_nm)))
+    return Loop(law, calibration.noll, state.delay_frames, rate_hz)

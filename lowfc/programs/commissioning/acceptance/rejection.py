@@ -1,0 +1,249 @@
+"""`lowfc acceptance rejection`: the loop's rejection and noise transfer functions, measured, against theory."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from lowfc.contract.configuration import Acceptance
+from lowfc.control.calibration.excitation import led_in, lines, multisine
+from lowfc.control.laws.linear_law import LinearLaw
+from lowfc.control.laws.stability import delay_weights
+from lowfc.control.laws.transfer_function import Departure, Lines, departure, measured, seen_of_mirror
+from lowfc.control.loop.additions import MIRROR, OFFSET
+from lowfc.control.loop.safety import LoopMode
+from lowfc.optics.chain.zernike import mode_name
+from lowfc.programs.cli.result import Result, figure
+from lowfc.programs.commissioning.acceptance.judged import AcceptanceResult, ModeResult
+from lowfc.programs.commissioning.acceptance.live import Live
+from lowfc.programs.commissioning.acceptance.played import AcceptanceError, Kind, Played, chosen
+
+Double = npt.NDArray[np.float64]
+
+KIND: Kind = "rejection"
+LEAST_JUDGED = 0.5
+"""Part of a mode's lines at which its rejection must be certain enough to be judged.
+
+The noise transfer is judged where it can be: where it is small, nothing of it can be seen.
+"""
+_LEAD_FRAMES = 50  # beside the time to settle: what the bus takes to bring the first steps
+
+
+@dataclass(frozen=True, slots=True)
+class Excitation:
+    """What is played: seconds of a period, rms and lines of each mode, Noll indices (empty for all), and a seed."""
+
+    duration_s: float
+    rms_nm: float
+    lines_per_mode: int
+    modes: tuple[int, ...]
+    seed: int
+
+
+class Part(Result):
+    """How far a transfer function of a mode is from theory, where that can be judged."""
+
+    within: bool = figure()
+    lines: int = figure()
+    judged: int = figure()
+    largest_departure_db: float | None = figure(form="+.2f")
+    unsure_hz: list[float] = figure()
+
+    def __str__(self) -> str:
+        worst = "-" if self.largest_departure_db is None else f"{self.largest_departure_db:+.2f}"
+        return f"{worst} on {self.judged} of {self.lines}"
+
+
+class RejectionMode(ModeResult):
+    """Departure of a mode's rejection and noise transfer from theory, dB, and on how many lines."""
+
+    rejection: Part = figure("rejection", "dB on lines")
+    noise_transfer: Part = figure("noise transfer", "dB on lines")
+
+
+class RejectionResult(AcceptanceResult):
+    """Rejection and noise transfer under a multisine; `points` has each of its lines."""
+
+    law: str = figure("law")
+    delay_frames: float = figure("delay", "frames", "g")
+    rate_hz: float = figure("rate", "Hz", ".4g")
+    injected: str = figure("multisine on the")
+    lines: int = figure("lines")
+    lowest_hz: float = figure("lowest", "Hz", ".3g")
+    highest_hz: float = figure("highest", "Hz", ".4g")
+    frames: int = figure("frames")
+    frames_missing: int = figure()
+    tolerance_db: float = figure("tolerance", "dB", "g")
+    lines_judged: int = figure()
+    largest_departure_db: float | None = figure()
+    largest_noise_departure_db: float | None = figure()
+    modes: list[RejectionMode] = figure("modes")
+    points: list[dict[str, Any]] = figure()
+
+    def remarks(self) -> Sequence[str]:
+        """What was too noisy, what was missing, and the verdict."""
+        lines = [
+            f"Z{mode.noll}: rejection too noisy to be judged at "
+            f"{', '.join(f'{frequency:.3g}' for frequency in mode.rejection.unsure_hz)} Hz"
+            for mode in self.modes
+            if mode.rejection.unsure_hz
+        ]
+        if any(mode.too_noisy for mode in self.modes):
+            lines.append("a longer --duration, a larger --rms-nm or fewer --modes make it more certain")
+        if self.frames_missing:
+            lines.append(f"{self.frames_missing} frames are missing, or were refused, and are interpolated")
+        return [*lines, *super().remarks()]
+
+
+def play(live: Live, how: Excitation, required: Acceptance) -> list[Played]:
+    """Play a multisine to the closed loop.
+
+    It goes to the offset of the loop; to the mirror where the law is one of pseudo-open-loop modes, for how such a law
+    goes to an offset is not how it rejects a disturbance.
+
+    Raises:
+        AcceptanceError: the duration is too short for the lines, or a mode is not one of the loop's.
+    """
+    noll, rate_hz = live.loop.noll, live.loop.rate_hz
+    wanted = chosen(how.modes, noll)
+    frames = round(how.duration_s * rate_hz)
+    try:
+        places = lines(frames, len(wanted), how.lines_per_mode, required.lowest_hz / rate_hz, required.highest_of_rate)
+    except ValueError as error:
+        raise AcceptanceError(
+            f"{how.duration_s:g} s at {rate_hz:.4g} Hz, {len(wanted)} modes, from {required.lowest_hz:g} Hz on: {error}"
+        ) from None
+    period = np.zeros((frames, len(noll)), np.float32)
+    period[:, [noll.index(mode) for mode in wanted]] = multisine(frames, places, how.rms_nm, how.seed)
+    live.into(LoopMode.CLOSED)
+    table = led_in(period, live.loop.settling_frames() + _LEAD_FRAMES)
+    basis = None
+    if isinstance(live.loop.law, LinearLaw) and live.loop.law.signal == "pol":
+        basis = np.ascontiguousarray(live.calibration.modes_to_actuators.T)
+    return [live.play(KIND, {"period_frames": frames}, LoopMode.CLOSED, table, basis)]
+
+
+def transfer_function(played: Played) -> Lines:
+    """The lines of what was played, as measured.
+
+    Raises:
+        AcceptanceError: the loop was disturbed meanwhile.
+    """
+    played.check(LoopMode.CLOSED)
+    period = played.table[-played.what["period_frames"] :].astype(float)
+    added = -period if played.target == OFFSET else seen_of_mirror(period, delay_weights(played.loop.delay_frames))
+    return measured(played.filled(played.error_nm)[-len(period) :], added)
+
+
+def judge(every: Sequence[Played], required: Acceptance) -> RejectionResult:
+    """The last of what was played, against theory.
+
+    Raises:
+        AcceptanceError: the loop was disturbed meanwhile.
+    """
+    played = every[-1]
+    found, rate_hz = transfer_function(played), played.loop.rate_hz
+    tolerance_db = required.rejection_db
+    frequency_hz = found.frequency * rate_hz
+    places = np.arange(found.mode.size)
+    theory_s = played.loop.rejection(frequency_hz)[places, found.mode]
+    theory_t = played.loop.noise_transfer(frequency_hz)[places, found.mode]
+    of_s = departure(found.rejection, theory_s, found.error, tolerance_db)
+    of_t = departure(found.noise_transfer, theory_t, found.error, tolerance_db)
+    modes = []
+    for place, noll in enumerate(played.loop.noll):
+        rows = np.flatnonzero(found.mode == place)
+        if rows.size:
+            rejection, noise = _part(of_s, rows, frequency_hz), _part(of_t, rows, frequency_hz)
+            within = rejection.within and noise.within
+            enough = rejection.judged >= LEAST_JUDGED * rows.size
+            modes.append(
+                RejectionMode(
+                    noll=noll,
+                    name=mode_name(noll),
+                    passed=within and enough,
+                    too_noisy=within and not enough,
+                    rejection=rejection,
+                    noise_transfer=noise,
+                )
+            )
+    return RejectionResult(
+        test=KIND,
+        passed=bool(modes) and all(mode.passed for mode in modes),
+        law=played.loop.name,
+        rate_hz=rate_hz,
+        delay_frames=played.loop.delay_frames,
+        injected=MIRROR if played.target == MIRROR else OFFSET,
+        frames=len(played.table),
+        frames_missing=played.missing,
+        tolerance_db=tolerance_db,
+        lowest_hz=float(frequency_hz.min()),
+        highest_hz=float(frequency_hz.max()),
+        lines=int(found.mode.size),
+        lines_judged=int(np.count_nonzero(of_s.judged)),
+        largest_departure_db=_largest(of_s),
+        largest_noise_departure_db=_largest(of_t),
+        modes=modes,
+        points=[
+            {
+                "noll": played.loop.noll[found.mode[row]],
+                "frequency_hz": float(frequency_hz[row]),
+                "rejection": float(np.abs(found.rejection[row])),
+                "rejection_theory": float(theory_s[row]),
+                "rejection_error_db": float(of_s.error_db[row]),
+                "rejection_judged": bool(of_s.judged[row]),
+                "noise_transfer": float(np.abs(found.noise_transfer[row])),
+                "noise_transfer_theory": float(theory_t[row]),
+                "noise_transfer_error_db": float(of_t.error_db[row]),
+                "noise_transfer_judged": bool(of_t.judged[row]),
+            }
+            for row in places
+        ],
+    )
+
+
+def draw(found: dict[str, Any], figure: Any) -> None:
+    """Measured lines over theory, rejection and noise transfer side by side."""
+    axes = figure.subplots(1, 2, sharex=True)
+    for ax, name, title in zip(
+        axes, ("rejection", "noise_transfer"), ("rejection |S|", "noise transfer |T|"), strict=True
+    ):
+        for number, mode in enumerate(found["modes"]):
+            points = [point for point in found["points"] if point["noll"] == mode["noll"]]
+            hz = [point["frequency_hz"] for point in points]
+            colour = f"C{number % 10}"
+            ax.loglog(hz, [point[f"{name}_theory"] for point in points], "-", color=colour, linewidth=1)
+            for judged, marker, face in ((True, "o", colour), (False, "o", "none")):
+                of = [point for point in points if point[f"{name}_judged"] is judged]
+                ax.loglog(
+                    [point["frequency_hz"] for point in of],
+                    [point[name] for point in of],
+                    marker,
+                    color=colour,
+                    markerfacecolor=face,
+                    markersize=3,
+                    label=f"Z{mode['noll']}" if judged else None,
+                )
+        ax.set_title(title)
+        ax.set_xlabel("frequency, Hz")
+        ax.grid(alpha=0.3)
+    axes[0].set_ylabel("measured (open where too noisy) over theory (lines)")
+    axes[1].legend(fontsize=6, ncols=2)
+
+
+def _part(of: Departure, rows: npt.NDArray[np.intp], frequency_hz: Double) -> Part:
+    judged = rows[of.judged[rows]]
+    worst = float(of.db[judged][np.argmax(np.abs(of.db[judged]))]) if judged.size else None
+    return Part(
+        within=bool(of.within[judged].all()),
+        lines=int(rows.size),
+        judged=int(judged.size),
+        largest_departure_db=worst,
+        unsure_hz=frequency_hz[rows[~of.judged[rows]]].tolist(),
+    )
+
+
+def _largest(of: Departure) -> float | None:
+    return float(np.abs(of.db[of.judged]).max()) if of.judged.any() else None

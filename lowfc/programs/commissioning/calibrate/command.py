@@ -1,0 +1,179 @@
+"""The command `lowfc calibrate`: options only; what is done is in `tasks` and `align`."""
+
+from pathlib import Path
+from typing import Annotated, Literal
+
+import typer
+
+from lowfc.adapters.process.terminal import AnyRun, ConfigFile, Json, new_app
+from lowfc.contract.errors import ConfigurationError
+from lowfc.programs.cli.result import put
+
+calibrate_app = new_app(
+    "Measure or compute what turns a frame into modes.\n\nExample: lowfc calibrate --method hadamard --out night.fits"
+)
+
+Method = Literal["analytic", "poke", "hadamard", "in-loop"]
+Out = Annotated[Path, typer.Option("--out", help="File to be written (FITS).")]
+Load = Annotated[bool, typer.Option("--load", help="Use it at once; the loop must be open.")]
+Frames = Annotated[int, typer.Option(min=16, max=100_000, help="How many frames are averaged.")]
+
+
+@calibrate_app.callback(invoke_without_command=True)
+def calibrate(
+    context: typer.Context,
+    method: Annotated[Method, typer.Option(help="How H is found.")] = "hadamard",
+    out: Out = Path("calibration.fits"),
+    run: AnyRun = None,
+    config: ConfigFile = None,
+    snr: Annotated[
+        float, typer.Option(min=1, max=1e4, help="Signal-to-noise ratio to reach in the noisiest mode.")
+    ] = 70.0,
+    amplitude: Annotated[
+        float | None,
+        typer.Option(
+            min=0.01,
+            help="Of a poke, nm rms of wavefront; default: 8 poke, 3 hadamard, 2 in-loop, half of it above --snr 70.",
+        ),
+    ] = None,
+    cycles: Annotated[int | None, typer.Option(min=1, help="How many; --snr then judges them, default 20.")] = None,
+    resume: Annotated[bool, typer.Option("--resume", help="Go on with one that was interrupted.")] = False,
+    truncate: Annotated[
+        float, typer.Option(min=0, max=0.99, help="Leave out singular values below this part of the largest.")
+    ] = 0.0,
+    tikhonov: Annotated[
+        float, typer.Option(min=0, max=0.99, help="Damp singular values of about this part of the largest.")
+    ] = 0.0,
+    at: Annotated[
+        str | None,
+        typer.Option(
+            help="Where --method analytic computes I0 and H: modes in nm rms, as in 4=15,7=-10, or a file with a shape "
+            "of the mirror, nm of surface. Default: flat.",
+            show_default=False,
+        ),
+    ] = None,
+    linear_range: Annotated[
+        bool, typer.Option(help="Measure up to which amplitude each mode's gain is within 10 % of 1.")
+    ] = True,
+    load: Load = False,
+    compare: Annotated[
+        tuple[Path, Path] | None, typer.Option(help="Say how two calibration files differ, and do nothing else.")
+    ] = None,
+    as_json: Json = False,
+) -> None:
+    """Calibrate a running loop with pokes of its mirror, or compute its calibration.
+
+    What was measured is checked on frames of its own. Where it is not recommended, it is written as
+    NAME.rejected.fits, not loaded, and the exit status is 1.
+
+    The mirror is afterwards where it was, also after Ctrl-C; --resume then goes on with the cycles that were done.
+
+    Example: lowfc calibrate --method poke --snr 300 --out night.fits
+    """
+    given = [
+        parameter.opts[0]
+        for parameter in context.command.params
+        if parameter.name and str(context.get_parameter_source(parameter.name)).endswith("COMMANDLINE")
+    ]
+    if context.invoked_subcommand is not None:
+        if given:
+            raise ConfigurationError(
+                f"{given[0]} stands before `{context.invoked_subcommand}`, which has options of its own: they stand "
+                "after it"
+            )
+        return
+    from lowfc.programs.commissioning.calibrate import tasks
+    from lowfc.programs.commissioning.calibrate.pokes import LEAST_SNR, CalibrationRequest
+
+    if compare is not None:
+        put(tasks.compared(*compare), as_json=as_json)
+        return
+    if cycles is not None and "--snr" not in given:
+        snr = LEAST_SNR
+    wanted = CalibrationRequest(method, out, snr, cycles, amplitude, resume, linear_range, truncate, tikhonov)
+    if method == "analytic":
+        put(tasks.computed(config, wanted, at, run if load else None, load=load), as_json=as_json)
+        return
+    for option in ("--config", "--at"):
+        if option in given:
+            raise ConfigurationError(
+                f"{option} goes with --method analytic: a running loop is measured where it is, by its own "
+                "configuration"
+            )
+    result = tasks.poked(wanted, run, load=load)
+    put(result, as_json=as_json)
+    if not result.recommended:
+        raise typer.Exit(1)
+
+
+@calibrate_app.command()
+def dark(
+    out: Out = Path("calibration.fits"),
+    run: AnyRun = None,
+    frames: Frames = 400,
+    dark_taken: Annotated[
+        bool, typer.Option("--dark-taken", help="The star is blocked already: do not ask for it.")
+    ] = False,
+    file: Annotated[
+        Path | None, typer.Option("--file", help="Dark frames from a FITS cube (frames, rows, columns) instead.")
+    ] = None,
+    load: Load = False,
+    as_json: Json = False,
+) -> None:
+    """Take a dark and find bad pixels; write the calibration in use with both.
+
+    The star must be blocked meanwhile, which nobody can do from here.
+
+    Example: lowfc calibrate dark --frames 1000 --out night.fits
+    """
+    from lowfc.programs.commissioning.calibrate.tasks import darkened
+
+    if file is None and not dark_taken:
+        typer.confirm("block the star; is it dark?", default=True, abort=True, err=True)
+    put(darkened(out, run, frames, file, load=load), as_json=as_json)
+
+
+@calibrate_app.command()
+def reference(
+    out: Out = Path("calibration.fits"),
+    run: AnyRun = None,
+    frames: Frames = 1000,
+    load: Load = False,
+    as_json: Json = False,
+) -> None:
+    """Take the present state of the wavefront as the zero point; write the calibration in use with it.
+
+    It need not be flat. H stays as it is: far from flat, measure it there with --method poke or hadamard, or compute it
+    with --method analytic --at.
+
+    Example: lowfc calibrate reference --frames 5000 --out night.fits
+    """
+    from lowfc.programs.commissioning.calibrate.tasks import referenced
+
+    put(referenced(out, run, frames, load=load), as_json=as_json)
+
+
+@calibrate_app.command()
+def align(
+    out: Out = Path("calibration.fits"),
+    run: AnyRun = None,
+    config: ConfigFile = None,
+    frames: Frames = 1000,
+    file: Annotated[
+        Path | None, typer.Option("--file", help="The reference image from a FITS file (rows, columns) instead.")
+    ] = None,
+    half_turn: Annotated[
+        bool, typer.Option("--half-turn", help="The other one of the two rotations that the image cannot tell apart.")
+    ] = False,
+    load: Load = False,
+    as_json: Json = False,
+) -> None:
+    """Fit how the sensor lies to the computed image; write the computed calibration for its pixels.
+
+    A half turn more or less leaves the image as it is and reverses every mode: pokes tell, where there is a loop.
+
+    Example: lowfc calibrate align --out aligned.fits
+    """
+    from lowfc.programs.commissioning.calibrate.align import aligned
+
+    put(aligned(config, out, run, frames, file, half_turn=half_turn, load=load), as_json=as_json)

@@ -1,0 +1,205 @@
+"""What a calibration plays: of which amplitude, how often, and in how many frames."""
+
+from dataclasses import dataclass
+from math import ceil, log
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+
+from lowfc.contract.configuration import Configuration
+from lowfc.contract.errors import CalibrationError
+from lowfc.control.calibration import poke_plan
+from lowfc.control.calibration.calibration import Calibration
+from lowfc.control.calibration.response_fit import LEAST_CYCLES
+from lowfc.programs.commissioning.calibrate.recording import AFTERWARDS
+
+Array = npt.NDArray[np.float64]
+
+AMPLITUDE_NM = {"poke": 8.0, "hadamard": 3.0, "in-loop": 2.0}
+LEAST_SNR = 20.0
+"""That a calibration of a given number of cycles must reach to be recommended."""
+FULL_AMPLITUDE_SNR = 70.0
+"""Up to which the usual amplitude does: the error of the third-order terms goes as its square."""
+MOST_HADAMARD_NM = 3.0
+"""Of a mode: all modes at once add up to some four times that, and the sensor must stay linear."""
+SETTLE = 2
+"""Frames left out after each change: one for a delay that is a fraction, and one for a command that comes late."""
+HOLD = 4
+DITHER_HOLD = 2
+"""Frames between the changes of a dither: the longer, the more of it the loop works against."""
+PIECE = 1024
+"""Frames of a piece of a dither."""
+RANGE_LEVELS = (0.25, 0.5, 0.75, 1.0)
+RANGE_ERROR = 0.03
+MOST_RANGE_NM = 60.0
+MARGIN = 0.9
+"""Part of the promised error that is aimed at, so that the scatter of the cycles seldom asks for more."""
+MOST_TIMES = 4
+"""So many times the cycles that photons and read-out call for are played at most: beyond, the operator decides."""
+CHECK_PART = 0.25
+"""Cycles that check R, for each one that it is made from."""
+_LEAST_CHECKS = 3
+_OF_THE_SLEW = 0.8
+DELAY_FRAMES = 600
+"""Of the sequence that the delay is measured with."""
+
+
+@dataclass(frozen=True, slots=True)
+class CalibrationRequest:
+    """What a calibration shall be.
+
+    Attributes:
+        method: poke, hadamard or in-loop.
+        out: the file to be written; the cycles done are kept beside it.
+        snr: to which R shall be known; where `cycles` says how long, what R must reach to be recommended.
+        cycles: how many; None where `snr` says.
+        amplitude_nm: of a mode, wavefront rms; None for the usual.
+        resume: go on from the cycles done.
+        range: measure the linear range.
+        truncate: leave out singular values below this part of the largest.
+        tikhonov: damp singular values of about this part of the largest.
+        seed: of a dither.
+    """
+
+    method: str
+    out: Path
+    snr: float
+    cycles: int | None = None
+    amplitude_nm: float | None = None
+    resume: bool = False
+    range: bool = True
+    truncate: float = 0.0
+    tikhonov: float = 0.0
+    seed: int = 1
+
+
+class Pokes:
+    """The plans of one calibration.
+
+    Attributes:
+        amplitude_nm: of a mode, wavefront rms.
+    """
+
+    def __init__(
+        self, config: Configuration, calibration: Calibration, noise_nm: Array, wanted: CalibrationRequest
+    ) -> None:
+        """Choose the amplitude.
+
+        Args:
+            config: The loop's.
+            calibration: In use; it has the commands.
+            noise_nm: (modes,) of one frame.
+            wanted: What is asked for.
+
+        Raises:
+            CalibrationError: the amplitude asked for is too large.
+        """
+        self._wanted = wanted
+        self._noise_nm = noise_nm
+        self._modes = len(calibration.noll)
+        self._basis = calibration.modes_to_actuators.T
+        self._largest_nm = largest_nm(config, calibration)
+        self._slew_nm = min(config.safety.slew_nm, config.mirror.slew_nm)
+        self.amplitude_nm = self._amplitude()
+
+    def cycle(self, number: int) -> poke_plan.Plan:
+        """The cycle of this number."""
+        return self._cycle(number, self.amplitude_nm)
+
+    def delay(self, mode: int) -> poke_plan.Plan:
+        """For the delay: one column, in a closed loop of the wavefront that all columns of a dither add up to."""
+        closed = self._wanted.method == "in-loop"
+        amplitude = self.amplitude_nm * float(np.sqrt(self._modes)) if closed else AMPLITUDE_NM["poke"]
+        return sequence(min(amplitude, float(self._largest_nm[mode])), self._wanted.seed)
+
+    def ladder(self) -> poke_plan.Plan:
+        """For the linear range."""
+        top = np.minimum(MOST_RANGE_NM, self._largest_nm)
+        amplitudes = np.outer(RANGE_LEVELS, top)
+        noise = float(self._noise_nm.max()) / (RANGE_ERROR * float(amplitudes[0].min()))
+        return poke_plan.ladder(amplitudes, int(np.clip(np.ceil(noise**2 / 2), 2, 200)), SETTLE)
+
+    def cycles(self) -> int:
+        """How many are needed, as far as photons and read-out say."""
+        wanted = self._wanted
+        if wanted.cycles is not None:
+            return max(wanted.cycles, LEAST_CYCLES)
+        frames = poke_plan.frames_for(wanted.snr / MARGIN, float(self._noise_nm.max()), self.amplitude_nm)
+        return max(-(-frames // self.cycle(0).per_column), LEAST_CYCLES)
+
+    def more_cycles(self, cycles: int, error: float) -> int:
+        """How many are needed where so many have left this standard error; no more where that is out of reach."""
+        needed = cycles_for(self._wanted.snr, cycles, error)
+        reachable = self._wanted.cycles is None and needed <= MOST_TIMES * self.cycles()
+        return needed if reachable and error * self._wanted.snr > 1 else cycles
+
+    def frames(self, cycles: int, done: int = 0) -> int:
+        """Of so many cycles, less those done, of those that check them, and of the linear range."""
+        frames = (cycles + checks(cycles) - done) * (len(self.cycle(0)) + AFTERWARDS)
+        return frames + (len(self.ladder()) + AFTERWARDS if self.ranged else 0)
+
+    @property
+    def ranged(self) -> bool:
+        """Whether the linear range is measured: not under a closed loop, which would work against it."""
+        return self._wanted.range and self._wanted.method != "in-loop"
+
+    def _cycle(self, number: int, amplitude_nm: float) -> poke_plan.Plan:
+        wanted = self._wanted
+        if wanted.method == "in-loop":
+            seed = wanted.seed + 1000 * (number + 1)
+            return poke_plan.dither(self._modes, amplitude_nm, PIECE, DITHER_HOLD, seed)
+        patterns = poke_plan.hadamard_patterns if wanted.method == "hadamard" else poke_plan.poke_patterns
+        rest = max(16, len(poke_plan.SIGNS) * HOLD)
+        shapes = patterns(self._modes, amplitude_nm)
+        # in an order of its own, so that a vibration disturbs each pair of cycles otherwise, and their scatter shows it
+        shapes = np.random.default_rng([wanted.seed, number // 2]).permutation(shapes)
+        return poke_plan.cycle(shapes, HOLD, SETTLE, rest, backwards=number % 2 == 1)
+
+    def _amplitude(self) -> float:
+        """What was asked for, or the usual, as far as the mirror's slew limit lets it."""
+        asked, method = self._wanted.amplitude_nm, self._wanted.method
+        if method == "hadamard" and asked is not None and asked > MOST_HADAMARD_NM:
+            raise CalibrationError(
+                f"--amplitude {asked:g} nm is too much for hadamard, which pokes all modes at once: at most "
+                f"{MOST_HADAMARD_NM:g} nm of each"
+            )
+        shapes = self._cycle(0, 1.0).table @ self._basis
+        steepest = float(np.abs(np.diff(shapes, axis=0)).max())
+        largest = _OF_THE_SLEW * self._slew_nm / max(steepest, 1e-9)
+        if asked is None:
+            return min(usual_nm(method, self._wanted.snr), largest)
+        if asked > largest:
+            raise CalibrationError(
+                f"--amplitude {asked:g} nm: from push to pull an actuator would move by more than {_OF_THE_SLEW:g} "
+                f"of the slew limit; at most {largest:.3g} nm"
+            )
+        return asked
+
+
+def sequence(amplitude_nm: float, seed: int = 1) -> poke_plan.Plan:
+    """The sequence of pokes of one mode, of this amplitude (wavefront rms), for `Player.first_poke`."""
+    return poke_plan.dither(1, amplitude_nm, DELAY_FRAMES, 1, seed)
+
+
+def largest_nm(config: Configuration, calibration: Calibration) -> Array:
+    """(modes,) amplitude at which the mirror goes from push to pull within its slew limit, wavefront rms."""
+    slew_nm = min(config.safety.slew_nm, config.mirror.slew_nm)
+    steepest = np.abs(calibration.modes_to_actuators).max(axis=0)
+    return np.asarray(_OF_THE_SLEW * slew_nm / (2 * np.maximum(steepest, 1e-9)), dtype=np.float64)
+
+
+def usual_nm(method: str, snr: float) -> float:
+    """Amplitude of a mode: halved above `FULL_AMPLITUDE_SNR`, and again for each four times that."""
+    halvings = max(0, ceil(log(snr / FULL_AMPLITUDE_SNR, 4)))
+    return float(AMPLITUDE_NM[method] / 2**halvings)
+
+
+def cycles_for(snr: float, cycles: int, error: float) -> int:
+    """How many cycles reach a signal-to-noise ratio where so many have left this standard error."""
+    return max(ceil(min(cycles * (error * snr / MARGIN) ** 2, 1e9)), cycles + 1)
+
+
+def checks(cycles: int) -> int:
+    """How many cycles check a reconstructor made from so many."""
+    return max(_LEAST_CHECKS, round(CHECK_PART * cycles))

@@ -1,0 +1,379 @@
+"""What is played on the mirror of a running loop, the frames and steps that come of it, and what is fitted to them."""
+
+import contextlib
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from typing import NamedTuple, TypeVar
+
+import numpy as np
+import numpy.typing as npt
+
+from lowfc.adapters.process.progress import Counted
+from lowfc.client import Client, Frame, MirrorWatch
+from lowfc.contract.envelope import start_of
+from lowfc.contract.errors import BusError, CalibrationError, LowfcError
+from lowfc.control.calibration.calibration import Calibration
+from lowfc.control.calibration.delay_fit import Delay, NotSeenError, measure_delay
+from lowfc.control.calibration.poke_plan import Plan, seen, usable
+from lowfc.control.calibration.response_fit import Cycle, LinearRange, cycle_response, linear_range, normalised
+from lowfc.control.laws.stability import delay_weights
+from lowfc.control.loop.advance import UNMEASURED
+from lowfc.control.loop.inputs import Step
+from lowfc.control.loop.safety import LoopMode, Reason
+
+Array = npt.NDArray[np.float64]
+Say = Callable[[str], None]
+T = TypeVar("T")
+
+AFTERWARDS = 8
+"""Frames recorded after the last of a play: the longest delay that can be measured is over by then."""
+MOST_BEHIND = 100
+"""Frames by which the mirror's reports may lag behind the controller's steps; then the mirror is taken for dead."""
+CHECKED = 100
+"""Frames between two looks at whether the loop is still reserved."""
+MOST_REFUSED = 50
+"""Frames refused in a row after which a probe sequence is given up."""
+ATTEMPTS = 5
+"""So often a sequence is played, where frames are lost or a device restarts."""
+DITHER_SLOWEST = 1 / 16
+"""Cycles per frame below which a dither is not used."""
+_EVERY = 20
+"""Frames between two reports of progress."""
+_LIMITS = frozenset(reason for reason in Reason if reason >= Reason.MODAL_LIMIT)
+
+
+class PlayInterruptedError(CalibrationError):
+    """A device restarted or stood still while pokes were played: they are to be played again."""
+
+
+class PokesNotSeenError(CalibrationError):
+    """Pokes have no answer in the frames: they may be too small."""
+
+
+class Recording(NamedTuple):
+    """Frames of a play, counted from the first whose command had a row.
+
+    Attributes:
+        sequence: (frames,) rising; frames that were lost are not there.
+        pixels: (frames, pixels) uint16, DN.
+        steps: (steps,) sequences of the controller's steps, which may be more.
+        commanded: (steps,) whether the frame was used and a command made of it.
+        command_nm: (steps, modes) the loop's own modal command.
+    """
+
+    sequence: npt.NDArray[np.int64]
+    pixels: npt.NDArray[np.uint16]
+    steps: npt.NDArray[np.int64]
+    commanded: npt.NDArray[np.bool_]
+    command_nm: Array
+
+    def played(self, table: Array, delay_frames: float) -> Array:
+        """(frames, columns): what of a table each exposure saw."""
+        return seen(table, _weights(delay_frames), self.steps, self.commanded)[self._steps_of_frames]
+
+    def commands(self, delay_frames: float) -> Array:
+        """(frames, modes): what of the loop's own command each exposure saw."""
+        places = np.arange(self.steps[-1] + 1)
+        newest = np.searchsorted(self.steps, places, side="right") - 1  # where a step is missing, the one before held
+        all_of_them = np.ones(len(self.steps), np.bool_)
+        return seen(self.command_nm[newest], _weights(delay_frames), self.steps, all_of_them)[self._steps_of_frames]
+
+    def usable(self, plan: Plan, delay_frames: float) -> npt.NDArray[np.bool_]:
+        """(frames,) whether each frame may be used."""
+        return usable(plan, self.steps, self.commanded, _lag(delay_frames))[self._steps_of_frames]
+
+    def blocks(self, plan: Plan, delay_frames: float) -> npt.NDArray[np.intp]:
+        """(frames,) the block of a plan that each frame sees."""
+        return plan.block[np.clip(self.sequence - _lag(delay_frames), 0, len(plan) - 1)]
+
+    @property
+    def whole(self) -> bool:
+        """Whether no frame was lost or refused."""
+        return bool(self.commanded.all()) and len(self.sequence) == len(self.steps) == self.steps[-1] + 1
+
+    @property
+    def _steps_of_frames(self) -> npt.NDArray[np.intp]:
+        return np.searchsorted(self.steps, self.sequence)
+
+
+def _lag(delay_frames: float) -> int:
+    """Whole frames from a row's frame to the first exposure that sees it; one frame is measured as 0.998, too."""
+    return int(max(delay_frames, 1.0))
+
+
+def _weights(delay_frames: float) -> Array:
+    """(lags,) part of the row of so many frames before that an exposure sees."""
+    return np.concatenate([[0.0], delay_weights(max(delay_frames, 1.0))])
+
+
+def nothing() -> None:
+    """Count no frames."""
+
+
+def play(
+    loop: Client,
+    basis_nm: npt.NDArray[np.floating],
+    table: npt.NDArray[np.floating],
+    came: Callable[[], None] = nothing,
+) -> Recording:
+    """Play a table on the mirror and record until its last row has been seen.
+
+    Args:
+        loop: A connection to the controller.
+        basis_nm: (shapes, actuators) nm of surface.
+        table: (frames, shapes).
+        came: Called for each frame.
+
+    Raises:
+        CalibrationError: the loop ended the play, or too little of it came through.
+        PlayInterruptedError: the mirror or the camera restarted, or the mirror did not follow commands throughout.
+        BusError: frames or steps stopped, or no mirror is there.
+        RequestRefusedError: the controller would not play it.
+    """
+    loop.check_lease()
+    with _streams(loop) as (frames, steps):
+        mirror = loop.mirror_watch()
+        first = loop.play(basis_nm.astype(np.float32), table.astype(np.float32)).frame_sequence
+        last = first + len(table) - 1
+        end = last + 1 + AFTERWARDS
+        images: list[Frame] = []
+        made: list[Step] = []
+        try:
+            image, step = next(frames), next(steps)
+            mode = None
+            while image.sequence < end or step.frame_sequence < end or mirror.frame_sequence < last:
+                if image.sequence <= step.frame_sequence:
+                    if first <= image.sequence:
+                        images.append(image)
+                    image = next(frames)
+                    came()
+                else:
+                    if first <= step.frame_sequence:
+                        mode = _check(loop, step, mode, over=step.frame_sequence > last)
+                        _check_devices(mirror, step.frame_sequence, first)
+                        made.append(step)
+                        _check_refused(made)
+                        if len(made) % CHECKED == 0:
+                            loop.check_lease()
+                    step = next(steps)
+            _check_devices(mirror, step.frame_sequence, first)
+        except StopIteration:
+            raise BusError("the frames came to an end: is the camera still running?") from None
+        loop.check_lease()
+    return _recording(images, made, first)
+
+
+def watch(loop: Client, count: int) -> npt.NDArray[np.uint16]:
+    """The next `count` frames (count, rows, columns), DN.
+
+    Raises:
+        BusError: they stopped.
+    """
+    stream = loop.frames(count)
+    taken = [np.asarray(image.pixels) for image in stream]
+    if len(taken) < count:
+        raise BusError(f"the frames came to an end after {len(taken)} of {count}: is the camera still running?")
+    return np.array(taken)
+
+
+@contextlib.contextmanager
+def _streams(loop: Client) -> Iterator[tuple[Iterator[Frame], Iterator[Step]]]:
+    """Frames and steps from now on; where anything goes wrong, nothing is played any more."""
+    frames, steps = loop.frames(), loop.steps()
+    done = False
+    try:
+        yield frames, steps
+        done = True
+    finally:
+        for stream in (frames, steps):
+            close = getattr(stream, "close", None)
+            if close is not None:
+                close()
+        if not done:
+            with contextlib.suppress(LowfcError):  # what went wrong first is what is told
+                loop.stop()
+
+
+def _check(loop: Client, step: Step, before: LoopMode | None, *, over: bool) -> LoopMode:
+    """The mode of a step; raise where the play has been ended."""
+    if not over and before is not None and step.mode is not before:
+        loop.check_lease()  # which says who ended it
+        raise CalibrationError(
+            f"the loop went from {before.name.lower()} to {step.mode.name.lower()} while pokes were played, which "
+            "ended them; leave it alone during a calibration"
+        )
+    limits = [reason.name for reason in step.reasons if reason in _LIMITS and reason is not Reason.MODAL_LIMIT]
+    if limits and not over:
+        raise CalibrationError(
+            f"a limit of the mirror acted on the pokes ({', '.join(limits)}), which ended them: take a smaller "
+            "--amplitude, or bring the mirror nearer to flat"
+        )
+    return step.mode
+
+
+def _commanded(step: Step) -> bool:
+    """Whether the mirror followed the sequence with this step: where no law acts, it needs no measurement."""
+    return step.error_nm is not None or (step.mode is not LoopMode.CLOSED and step.reasons[0] in UNMEASURED)
+
+
+def _check_refused(made: list[Step]) -> None:
+    """Raise where no frame at all has been used for a while."""
+    last = made[-MOST_REFUSED:]
+    if len(last) == MOST_REFUSED and not any(_commanded(step) for step in last):
+        reasons = sorted({reason.name for step in last for reason in step.reasons})
+        raise CalibrationError(
+            f"the last {MOST_REFUSED} frames were refused as {', '.join(reasons)}: the sequence has ended; correct "
+            "this first, `lowfc ctl status` shows when frames are used again"
+        )
+
+
+def _check_devices(mirror: MirrorWatch, sequence: int, first: int) -> None:
+    """Raise where the pokes up to a frame were not all on the mirror, or the frame is another camera process's."""
+    mirror.read()
+    behind = sequence - max(mirror.frame_sequence, first)
+    if start_of(sequence) != start_of(first):
+        why = "the camera restarted"
+    elif mirror.interruption or behind <= MOST_BEHIND:
+        why = mirror.interruption
+    else:
+        why = f"the mirror has reported no command as followed for {behind} frames"
+    if why:
+        raise PlayInterruptedError(f"{why} while pokes were played")
+
+
+def _recording(images: list[Frame], made: list[Step], first: int) -> Recording:
+    known = {step.frame_sequence for step in made}
+    images = [image for image in images if image.sequence in known]
+    if not images:
+        raise CalibrationError("no frame of the play was received: is the loop's camera running?")
+    modes = max(step.command_nm.size for step in made)
+    command = np.zeros((len(made), modes))
+    for row, step in enumerate(made):
+        command[row] = step.command_nm if step.command_nm.size == modes else command[max(row - 1, 0)]
+    return Recording(
+        np.array([image.sequence - first for image in images]),
+        np.array([image.pixels for image in images]).reshape(len(images), -1),
+        np.array([step.frame_sequence - first for step in made]),
+        np.array([_commanded(step) for step in made]),
+        command,
+    )
+
+
+class FrameCount:
+    """Frames received so far, in however many plays."""
+
+    def __init__(self, progress: Counted) -> None:
+        """Report to `progress`."""
+        self._progress, self._doing, self._done, self._total = progress, "", 0, 0
+
+    def begin(self, doing: str, left: int) -> None:
+        """A play begins; `left` frames are to come until the end of the calibration, its own included."""
+        self._doing, self._total = doing, self._done + left
+        self._progress(doing, self._done, self._total)
+
+    def came(self) -> None:
+        """One frame."""
+        self._done += 1
+        if self._done % _EVERY == 0:
+            self._progress(self._doing, min(self._done, self._total), self._total)
+
+
+@dataclass(frozen=True, slots=True)
+class Player:
+    """Sequences of pokes on the mirror of a loop, played again where frames were lost or a device restarted.
+
+    Attributes:
+        loop: to play on.
+        before: has dark, good pixels, reference and the mirror's commands.
+        say: for people: why a sequence is played again.
+        closed: the loop works against the pokes.
+        came: called for each frame.
+    """
+
+    loop: Client
+    before: Calibration
+    say: Say
+    closed: bool = False
+    came: Callable[[], None] = nothing
+
+    def first_poke(self, mode: int, plan: Plan) -> Delay:
+        """Poke the mode at one place in a pseudo-random sequence: the delay, and the image of the poke.
+
+        Raises:
+            CalibrationError: no poke is seen, or there was no run without a lost frame.
+        """
+
+        def attempt() -> Recording:
+            played = self._play(plan, slice(mode, mode + 1))
+            if not played.whole:
+                raise ValueError("frames were lost or refused while the delay was measured")
+            return played
+
+        recording = self._repeated(
+            attempt,
+            "once more",
+            f"there was no run of {len(plan)} frames without a lost or refused one: `lowfc doctor` looks for why",
+        )
+        command = recording.command_nm[: len(plan), mode] if self.closed else None
+        try:
+            fractions, _ = self._normalised(recording)
+            reference = self.before.reference.astype(float)
+            return measure_delay(fractions[: len(plan)], reference, plan.table[:, 0], command)
+        except NotSeenError as error:
+            raise PokesNotSeenError(str(error)) from None
+        except ValueError as error:
+            raise CalibrationError(str(error)) from None
+
+    def cycle(self, plan: Plan, delay_frames: float) -> Cycle:
+        """Play a cycle of pokes of all modes; `delay_frames` pass from a poke to its image.
+
+        Raises:
+            CalibrationError: several in a row were of no use.
+        """
+
+        def attempt() -> Cycle:
+            recording = self._play(plan)
+            fractions, flux = self._normalised(recording)
+            poked = recording.played(plan.table, delay_frames)
+            moved = poked + recording.commands(delay_frames) if self.closed else poked
+            used = recording.usable(plan, delay_frames).astype(np.float64)
+            return cycle_response(fractions, flux, moved, poked, used, DITHER_SLOWEST if self.closed else 0.0)
+
+        return self._repeated(attempt, "a cycle is repeated", "no cycle was of use")
+
+    def linear_range(self, made: Calibration, plan: Plan, delay_frames: float) -> LinearRange:
+        """How far each mode is linear, seen with a new calibration; the loop is open.
+
+        Raises:
+            CalibrationError: frames were lost, or a limit acts.
+        """
+
+        def attempt() -> LinearRange:
+            recording = self._play(plan)
+            fractions, _ = self._normalised(recording)
+            modes_nm = (fractions - made.reference) @ made.reconstructor.T.astype(np.float64)
+            use = recording.usable(plan, delay_frames)
+            poked = recording.played(plan.table, delay_frames)
+            return linear_range(modes_nm[use], poked[use], recording.blocks(plan, delay_frames)[use])
+
+        return self._repeated(
+            attempt,
+            "once more",
+            "the linear range was not measured: `lowfc doctor` looks for why frames are lost; the cycles are kept, "
+            "--resume --no-linear-range makes the calibration of them",
+        )
+
+    def _play(self, plan: Plan, modes: slice = slice(None)) -> Recording:
+        return play(self.loop, self.before.modes_to_actuators.T[modes], plan.table, self.came)
+
+    def _normalised(self, recording: Recording) -> tuple[Array, Array]:
+        return normalised(recording.pixels, self.before.dark.astype(float), self.before.good.astype(float))
+
+    def _repeated(self, attempt: Callable[[], T], again: str, given_up: str) -> T:
+        for _ in range(ATTEMPTS):
+            try:
+                return attempt()
+            except (PlayInterruptedError, ValueError) as error:
+                why = error
+                self.say(f"{again}: {error}")
+        raise CalibrationError(f"in {ATTEMPTS} attempts {given_up}; the last: {why}")

@@ -1,0 +1,361 @@
+"""What a calibration is: the file's content, its figures, and whether it is recommended."""
+
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from lowfc.adapters.files import calibration_file, factory
+from lowfc.contract.codecs.calibration_codec import identified
+from lowfc.contract.configuration import Configuration
+from lowfc.contract.errors import CalibrationError
+from lowfc.control.calibration.actuator_response import actuators_to_modes, of_commands
+from lowfc.control.calibration.calibration import Calibration, comparable
+from lowfc.control.calibration.regularised import Reconstruction, advice, reconstruct
+from lowfc.control.calibration.response_fit import MOST_LARGEST, MOST_RMS, Check, LinearRange, Measured, cross_talk
+from lowfc.optics.twin.twin import reference as twin_reference
+from lowfc.optics.twin.twin import response as twin_response
+from lowfc.optics.twin.twin_mirror import wavefront_nm
+from lowfc.programs.cli.result import Result, figure
+from lowfc.programs.commissioning.calibrate.pokes import CalibrationRequest, cycles_for
+from lowfc.programs.commissioning.calibrate.run import CalibrationData, Calibrator
+
+Array = npt.NDArray[np.float64]
+Single = npt.NDArray[np.float32]
+
+MOST_NOISE = 1.5
+"""Times the noise of the computed reconstructor on the same light; farther from flat the sensor sees less."""
+DELAY_APART = 0.1
+"""Frames by which the delay that the loop counts with may be off before something is said."""
+
+
+class Verdict(Result):
+    """What is wrong with a measured reconstructor: its cross-talk is on frames that were not used for it."""
+
+    snr: float = figure("signal-to-noise ratio requested", form=".3g")
+    snr_reached: float = figure("signal-to-noise ratio reached", form=".3g")
+    check_cycles: int = figure("cycles that check it")
+    check_cross_talk_rms: float = figure("their cross-talk, rms", form=".3g")
+    check_cross_talk_max: float = figure("their cross-talk, largest", form=".3g")
+    check_error: float = figure("noise of this cross-talk", form=".2g")
+    promised_cross_talk_rms: float = figure("promised cross-talk, rms", form=".3g")
+    promised_cross_talk_max: float = figure("promised cross-talk, largest", form=".3g")
+    recommended: bool = figure()
+    faults: list[str] = figure()
+
+
+class Figures(Result):
+    """The figures of a calibration; those of each mode are in the order of `noll`."""
+
+    method: str = figure("method")
+    modes: int = figure("modes")
+    noll: list[int] = figure("mode", form="Z{}", column=True)
+    condition_number: float = figure("condition number", form=".3g")
+    singular_values: list[float] = figure("singular values", form=".3g")
+    kept: list[float] = figure()
+    delay_frames: float = figure("delay", "frames", ".3f")
+    delay_error_frames: float = figure("standard error of the delay", "frames", ".3f")
+    frame_to_effect_ms: float = figure("frame to effect", "ms", ".3g")
+    noise_gain_nm: list[float] = figure("noise of a frame", "nm", ".3g", column=True)
+    computed_noise_nm: list[float] | None = figure("computed", "nm", ".3g", column=True, default=None)
+    linear_range_nm: list[float] | None = figure("linear up to", "nm", ".1f", column=True, default=None)
+    bad_pixels: int = figure("bad pixels")
+    flux_dn: float = figure("light", "DN", ".4g")
+    cycles: int = figure("cycles")
+    cross_talk: float | None = figure("cross-talk against the computed H, largest", form=".4f", default=None)
+    cross_talk_error: float | None = figure("standard error of this cross-talk", form=".4f", default=None)
+    file: str = figure("written")
+
+
+class CalibrationResult(Verdict, Figures):
+    """A calibration that was measured and judged, or computed: then there is no verdict."""
+
+    advice: list[str] = figure(exclude=True, default=[])
+    not_loaded: bool = figure(exclude=True, default=False)
+
+    def remarks(self) -> Sequence[str]:
+        """What to do, and the verdict."""
+        if "recommended" not in self.model_fields_set:
+            return self.advice
+        said = [
+            "verdict: good" if self.recommended else "verdict: NOT RECOMMENDED",
+            *(f"  {one}" for one in self.faults),
+        ]
+        return [*self.advice, *said, *(["it is not loaded"] if self.not_loaded else [])]
+
+
+class Comparison(Result):
+    """How two calibrations differ; what is of each mode is in the order of `noll`."""
+
+    modes: int = figure("modes")
+    noll: list[int] = figure("mode", form="Z{}", column=True)
+    estimators: list[str] = figure("estimators")
+    cross_talk: float = figure("largest cross-talk", form=".4f")
+    gain: list[float] = figure("gain", form=".4f", column=True)
+    reference_shift_nm: list[float] = figure("zero point", "nm", ".3f", column=True)
+    flux_ratio: float = figure("ratio of the light", form=".4f")
+    dark_shift_dn: float = figure("shift of the dark", "DN", "+.2f")
+    bad_pixels: list[int] = figure("bad pixels")
+    same_commands: bool = figure("same commands")
+
+
+class Finished(NamedTuple):
+    """A calibration that was written, and its figures."""
+
+    calibration: Calibration
+    result: CalibrationResult
+
+
+def rejected_of(out: Path) -> Path:
+    """Where a calibration is written that is not recommended: what may be a good one stays."""
+    return out.with_name(f"{out.stem}.rejected{out.suffix}")
+
+
+def finished(
+    calibrator: Calibrator, wanted: CalibrationRequest, data: CalibrationData, computed: Calibration
+) -> Finished:
+    """Make R, check it on other frames, write the file: under another name where it is not recommended.
+
+    Raises:
+        CalibrationError: H is not above its noise, or frames are lost.
+        DataFileError: the file cannot be written.
+    """
+    config = calibrator.config
+    made, quality = measured_calibration(config, calibrator.before, data.measured, wanted)
+    check = calibrator.check(made, data)
+    linear = calibrator.linear_range(made, data.delay) if calibrator.pokes.ranged else None
+    noise = computed_noise_nm(config, made, computed)
+    ratio = None if noise is None else factory.frame_noise_nm(config, made) / noise
+    verdict = judge(wanted.snr, data.measured.cycles, data.measured.error, check, ratio, made.noll)
+    file = rejected_of(wanted.out) if verdict.faults else wanted.out
+    found = result_of(config, made, quality, wanted.method, file, data, linear, computed, verdict)
+    calibration_file.save(made, file)
+    counted = configured_delay(config)
+    if abs(data.delay.delay_frames - counted) > DELAY_APART:
+        found.advice.append(
+            f"warning: the loop counts with a delay of {counted:g} frames; set control.delay_frames = "
+            f"{max(data.delay.delay_frames, 1):.2f}"
+        )
+    return Finished(made, found)
+
+
+def reconstructed(
+    config: Configuration,
+    reference: Array,
+    response: Array,
+    initial: Array | None,
+    good: Array,
+    flux_dn: float,
+    *,
+    estimator: str = "weighted",
+    truncate: float = 0.0,
+    tikhonov: float = 0.0,
+) -> Reconstruction:
+    """R of H on the camera of a configuration; the arguments are those of `reconstruct`, the light is in DN.
+
+    Raises:
+        CalibrationError: H does not tell the modes apart.
+    """
+    camera = factory.detector(config)
+    flux_e, read_noise_e = flux_dn * camera.gain_e_per_dn / camera.em_gain, factory.equivalent_read_noise_e(camera)
+    try:
+        return reconstruct(reference, response, initial, good, flux_e, read_noise_e, estimator, truncate, tikhonov)
+    except ValueError as error:
+        raise CalibrationError(str(error)) from None
+
+
+def measured_calibration(
+    config: Configuration, before: Calibration, taken: Measured, wanted: CalibrationRequest
+) -> tuple[Calibration, Reconstruction]:
+    """The calibration that cycles of pokes give, with the dark, the mask and the commands of the one before.
+
+    Raises:
+        CalibrationError: H is not above its noise.
+    """
+    I0 = taken.reference if taken.reference is not None else before.reference.astype(np.float64)
+    made = reconstructed(
+        config,
+        I0,
+        taken.response,
+        taken.initial.matrix,
+        before.good.astype(np.float64),
+        taken.flux_dn,
+        truncate=wanted.truncate,
+        tikhonov=wanted.tikhonov,
+    )
+    names = dict.fromkeys([*taken.initial.estimator.split("+"), wanted.method])
+    calibration = replace(
+        before,
+        reference=_single(I0),
+        response=_single(taken.response),
+        reconstructor=_single(made.matrix),
+        flux_dn=taken.flux_dn,
+        estimator="+".join(names),
+        operator_hash="",
+        actuators_to_modes=_single(_seen_of_actuators(config, before, made.matrix)),
+    )
+    return identified(calibration), made
+
+
+def computed_noise_nm(config: Configuration, calibration: Calibration, computed: Calibration) -> Array | None:
+    """Noise (modes,) that a computed reconstructor has on the light of a calibration, nm; None for another sensor's."""
+    if not comparable(calibration, computed):
+        return None
+    return factory.frame_noise_nm(config, replace(calibration, reconstructor=computed.reconstructor * calibration.good))
+
+
+def result_of(
+    config: Configuration,
+    calibration: Calibration,
+    made: Reconstruction,
+    method: str,
+    file: Path,
+    data: CalibrationData | None = None,
+    linear: LinearRange | None = None,
+    computed: Calibration | None = None,
+    verdict: Verdict | None = None,
+) -> CalibrationResult:
+    """The figures of a calibration that was measured, or computed."""
+    delay_frames, error_frames = (configured_delay(config), 0.0) if data is None else data.delay[:2]
+    found: dict[str, Any] = {}
+    noise = None if computed is None else computed_noise_nm(config, calibration, computed)
+    if data is not None and computed is not None and noise is not None:
+        found["cross_talk"] = float(np.abs(cross_talk(calibration.reconstructor, computed.response)).max())
+        found["cross_talk_error"] = float(data.measured.error.max())
+        found["computed_noise_nm"] = noise.tolist()
+    if linear is not None:
+        found["linear_range_nm"] = linear.range_nm.tolist()
+    return CalibrationResult.model_construct(
+        method=method,
+        modes=len(calibration.noll),
+        noll=list(calibration.noll),
+        condition_number=made.condition_number,
+        singular_values=made.singular_values.tolist(),
+        kept=made.kept.tolist(),
+        delay_frames=delay_frames,
+        delay_error_frames=error_frames,
+        frame_to_effect_ms=delay_frames * config.period_ns * 1e-6,
+        noise_gain_nm=factory.frame_noise_nm(config, calibration).tolist(),
+        bad_pixels=int(np.count_nonzero(calibration.good == 0)),
+        flux_dn=calibration.flux_dn,
+        cycles=0 if data is None else data.measured.cycles,
+        file=str(file),
+        advice=[advice(made, calibration.noll, config.control.limit_nm)],
+        **found,
+        **({} if verdict is None else verdict.figures()),
+    )
+
+
+def configured_delay(config: Configuration) -> float:
+    """The delay that the loop counts with."""
+    return config.control.delay_frames or config.camera.delay_frames
+
+
+def judge(
+    asked_snr: float, cycles: int, error: Array, check: Check, noise_ratio: Array | None, noll: tuple[int, ...]
+) -> Verdict:
+    """Judge a reconstructor.
+
+    Args:
+        asked_snr: signal-to-noise ratio that it must have.
+        cycles: that it was made from.
+        error: (modes,) standard error of the elements of each row of R H.
+        check: its cross-talk on other frames.
+        noise_ratio: (modes,) its noise in a frame over that of the computed one; None where there is none to compare.
+        noll: Noll index of each mode.
+    """
+    reached = 1 / max(float(error.max()), 1e-300)
+    rms, largest = MOST_RMS / asked_snr, MOST_LARGEST / asked_snr
+    faults = []
+    if reached < asked_snr:
+        needed = cycles_for(asked_snr, cycles, float(error.max()))
+        faults.append(
+            f"signal-to-noise ratio {reached:.3g} in Z{noll[int(error.argmax())]}, {asked_snr:g} was to be reached: "
+            f"find what shakes this mode, or take about {needed} cycles (the same command with --resume --cycles "
+            f"{needed})"
+        )
+    if not check.within(rms, largest):
+        faults.append(
+            f"cross-talk on frames that were not used for it: rms {check.rms:.3g} and at most {check.largest:.3g}, "
+            f"where {rms:.3g} and {largest:.3g} is expected; did the wavefront, the light or the sensor change "
+            "meanwhile?"
+        )
+    if noise_ratio is not None and noise_ratio.max() > MOST_NOISE:
+        faults.append(
+            f"Z{noll[int(noise_ratio.argmax())]} has {noise_ratio.max():.2g} times the noise of the computed "
+            f"reconstructor, at most {MOST_NOISE:g} is expected: is the sensor aligned (`lowfc calibrate align`), the "
+            "wavefront near its zero point?"
+        )
+    return Verdict(
+        snr=asked_snr,
+        snr_reached=reached,
+        check_cycles=check.cycles,
+        check_cross_talk_rms=check.rms,
+        check_cross_talk_max=check.largest,
+        check_error=float(check.error.max()),
+        promised_cross_talk_rms=rms,
+        promised_cross_talk_max=largest,
+        recommended=not faults,
+        faults=faults,
+    )
+
+
+def comparison(one: Calibration, other: Calibration) -> Comparison:
+    """How two calibrations differ; what is of each mode is in the order of `noll`.
+
+    Raises:
+        CalibrationError: they are of different sensors or modes.
+    """
+    if not comparable(one, other):
+        raise CalibrationError(
+            f"they cannot be compared: {one.shape[0]} x {one.shape[1]} pixels and modes {_span(one)} against "
+            f"{other.shape[0]} x {other.shape[1]} and {_span(other)}"
+        )
+    both = (one.good * other.good).astype(np.float64)
+    R = one.reconstructor.astype(np.float64)
+    talk = cross_talk(R, other.response)
+    shift = R @ ((other.reference - one.reference) * both)
+    commands = one.modes_to_actuators, other.modes_to_actuators
+    return Comparison(
+        modes=len(one.noll),
+        noll=list(one.noll),
+        estimators=[one.estimator, other.estimator],
+        cross_talk=float(np.abs(talk).max()),
+        gain=(1 + np.diag(talk)).tolist(),
+        reference_shift_nm=shift.tolist(),
+        flux_ratio=other.flux_dn / one.flux_dn,
+        dark_shift_dn=float(np.median(other.dark - one.dark)),
+        bad_pixels=[int(np.count_nonzero(each.good == 0)) for each in (one, other)],
+        same_commands=bool(commands[0].shape == commands[1].shape and np.array_equal(*commands)),
+    )
+
+
+def _seen_of_actuators(config: Configuration, before: Calibration, matrix: Array) -> Array:
+    """Z (modes, actuators): of the commands what was measured, of other shapes what the optical model says."""
+    commands = before.modes_to_actuators.astype(np.float64)
+    measured = of_commands(commands)
+    optics = factory.twin(config, None, lambda _: None)
+    light = twin_reference(optics)
+    if light.shape != before.shape:
+        return measured
+    on_nodes = factory.mirror_on_twin(config, optics, lambda _: None)
+    pokes = np.eye(len(commands), dtype=np.float32).reshape(-1, *before.grid)
+    wavefronts = np.array([wavefront_nm(on_nodes, poke) for poke in pokes])
+    good = before.good.astype(np.float64)
+    modelled = actuators_to_modes(
+        matrix, light.reshape(-1), good, lambda shapes: twin_response(optics, shapes), wavefronts
+    )
+    if before.actuators_to_modes.size:
+        modelled[:, ~before.actuators_to_modes.any(axis=0)] = 0  # actuators that are not active
+    return np.asarray(measured + modelled - (modelled @ commands) @ measured)
+
+
+def _span(calibration: Calibration) -> str:
+    return f"Z{calibration.noll[0]} to Z{calibration.noll[-1]}"
+
+
+def _single(array: Array) -> Single:
+    return np.ascontiguousarray(array, dtype=np.float32)

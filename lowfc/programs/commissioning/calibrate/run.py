@@ -1,0 +1,310 @@
+"""Calibration through the bus: pokes are played by the controller, frames come back, H is fitted to them.
+
+The cycles done are kept beside the calibration's file, as FILE.part.npz, until it is whole.
+"""
+
+import contextlib
+import io
+import json
+import zipfile
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from lowfc.adapters.files import factory, fits_file
+from lowfc.adapters.files.whole_file import write_whole
+from lowfc.adapters.process.progress import Counted
+from lowfc.client import Client, configuration_of
+from lowfc.contract.errors import CalibrationError, DataFileError, LowfcError
+from lowfc.contract.messages import wire
+from lowfc.control.calibration.calibration import Calibration, comparable
+from lowfc.control.calibration.delay_fit import Delay
+from lowfc.control.calibration.regularised import pixel_variance
+from lowfc.control.calibration.response_fit import (
+    Check,
+    Initial,
+    LinearRange,
+    Measured,
+    Sums,
+    check,
+    initial_of,
+    likeness,
+    measured,
+)
+from lowfc.programs.commissioning.calibrate.pokes import CalibrationRequest, Pokes, checks
+from lowfc.programs.commissioning.calibrate.recording import FrameCount, Player, Say
+
+Array = npt.NDArray[np.float64]
+
+_LIKE = 0.3
+"""Likeness of the first pokes' picture to the calibration in use below which something is said."""
+
+
+class CalibrationData(NamedTuple):
+    """What was measured."""
+
+    measured: Measured
+    delay: Delay
+
+
+class Calibrator:
+    """One calibration of a running loop; the mirror is afterwards where it was.
+
+    Attributes:
+        config: the loop's.
+        before: the calibration in use.
+        noise_nm: (modes,) of one frame, with that calibration.
+        pokes: what is played.
+        kept: cycles that another calibration can go on from.
+    """
+
+    def __init__(
+        self, loop: Client, wanted: CalibrationRequest, say: Say, progress: Counted, computed: Calibration | None = None
+    ) -> None:
+        """Ask the controller what it has.
+
+        Args:
+            loop: A connection to it.
+            wanted: What is asked for.
+            say: For people.
+            progress: For people: frames so far, and of how many.
+            computed: What the optical model says, of which R is made where its pixels are the loop's.
+        """
+        self._loop = loop
+        self._wanted = wanted
+        self._say = say
+        self.config = configuration_of(loop)
+        self.before = replace(loop.calibration(), camera=loop.camera())
+        self._computed = computed
+        self.noise_nm = factory.frame_noise_nm(self.config, self.before)
+        self._closed = wanted.method == "in-loop"
+        self.pokes = Pokes(self.config, self.before, self.noise_nm, wanted)
+        self._count = FrameCount(progress)
+        self._player = Player(loop, self.before, say, self._closed, self._count.came)
+        self.kept = 0
+
+    @contextlib.contextmanager
+    def holding(self) -> Iterator[None]:
+        """The loop as the method needs it; afterwards it is as it was.
+
+        Raises:
+            CalibrationError: the loop is open where it must be closed, or in safe mode.
+        """
+        state = self._loop.status().state
+        mode = state.mode if state is not None else wire.LOOP_MODE_OPEN
+        if mode not in (wire.LOOP_MODE_OPEN, wire.LOOP_MODE_CLOSED):
+            raise CalibrationError("the loop must be open or closed: `lowfc ctl clear` leaves the safe state")
+        if self._closed and mode != wire.LOOP_MODE_CLOSED:
+            raise CalibrationError(
+                "--method in-loop dithers under a closed loop, but the loop is open: `lowfc ctl close` first"
+            )
+        if self._closed or mode != wire.LOOP_MODE_CLOSED:
+            yield
+            return
+        self._say("the loop is opened for the calibration, and closed again after it")
+        self._loop.open_loop()
+        try:
+            yield
+        except BaseException:
+            try:
+                self._loop.check_lease()  # whoever ended it has the last word on the loop
+                self._loop.close_loop()
+            except LowfcError as fault:  # what went wrong first is what is told
+                self._say(f"warning: the loop is not closed again: {fault}")
+            raise
+        self._loop.close_loop()
+
+    def run(self, delay: Delay | None = None) -> CalibrationData:
+        """Check that pokes are seen, measure the delay unless it is known, then the response.
+
+        Raises:
+            CalibrationError: pokes are not seen, frames are lost, or a limit acts.
+        """
+        delay = self.delay() if delay is None else delay
+        return CalibrationData(self._cycles(delay), delay)
+
+    def check(self, made: Calibration, taken: CalibrationData) -> Check:
+        """The cross-talk of a new calibration at the present zero point, from cycles of its own.
+
+        Raises:
+            CalibrationError: frames were lost, or a limit acts.
+        """
+        R = made.reconstructor.astype(np.float64)
+        cycles = taken.measured.cycles
+        count = checks(cycles)
+        answers = []
+        for number in range(count):
+            left = self.pokes.frames(cycles, cycles + number)
+            self._count.begin(f"check {number + 1} of {count}", left)
+            plan = self.pokes.cycle(cycles + number)
+            answers.append(R @ self._player.cycle(plan, taken.delay.delay_frames).response)
+        return check(np.array(answers), R @ taken.measured.response, taken.measured.error * np.sqrt(cycles))
+
+    def linear_range(self, made: Calibration, delay: Delay) -> LinearRange:
+        """How far each mode is linear, seen with a new calibration; the loop is open.
+
+        Raises:
+            CalibrationError: frames were lost, or a limit acts.
+        """
+        plan = self.pokes.ladder()
+        self._count.begin("linear range", len(plan))
+        return self._player.linear_range(made, plan, delay.delay_frames)
+
+    @property
+    def _best(self) -> int:
+        """Place of the mode that is measured best; tip and tilt, which are shaken most, only without others."""
+        tilt = np.array([index in (2, 3) for index in self.before.noll])
+        return int(np.where(tilt & ~tilt.all(), np.inf, self.noise_nm).argmin())
+
+    def delay(self) -> Delay:
+        """From poke to image, with the mode that is measured best.
+
+        Raises:
+            CalibrationError: no poke is seen, or frames are lost.
+        """
+        mode = self._best
+        plan = self.pokes.delay(mode)
+        self._count.begin("looking for pokes", len(plan) + self.pokes.frames(self.pokes.cycles()))
+        found = self._player.first_poke(mode, plan)
+        self._compare_picture(found.picture, mode)
+        self._say(
+            f"pokes of Z{self.before.noll[mode]} are seen after {found.delay_frames:.3f} +- {found.error_frames:.3f} "
+            f"frames, {found.delay_frames * self.config.period_ns * 1e-6:.3g} ms from the end of one exposure to that "
+            "of the one that sees what was made of it"
+        )
+        return found
+
+    def _compare_picture(self, picture: Array, mode: int) -> None:
+        known = self.before.response[:, mode].astype(np.float64)
+        like = likeness(picture, known)
+        if abs(like) < _LIKE:
+            self._say(
+                f"warning: the picture of Z{self.before.noll[mode]} is not like that of the calibration in use (their "
+                f"correlation is {like:.2f}): is the sensor aligned (`lowfc calibrate align`)?"
+            )
+        elif like < 0:
+            self._say(
+                f"warning: Z{self.before.noll[mode]} is seen with the opposite sign of the calibration in use: the "
+                "mirror or the camera is reflected or turned; do not close the loop on that one"
+            )
+
+    def _cycles(self, delay: Delay) -> Measured:
+        pokes, wanted = self.pokes, self._wanted
+        what: dict[str, Any] = {
+            "method": wanted.method,
+            "amplitude_nm": pokes.amplitude_nm,
+            "calibration": self.before.id,
+        }
+        path = partial_of(wanted.out)
+        if wanted.resume:
+            sums = go_on(path, what)
+            self.kept = sums.cycles
+            self._say(f"going on after {sums.cycles} cycles")
+        else:
+            sums = Sums.none(self._initial(delay))
+        needed = max(pokes.cycles(), sums.cycles)
+        self._say(
+            f"{needed} cycles of {len(pokes.cycle(0))} frames and {checks(needed)} to check them"
+            + (", then the linear range; " if pokes.ranged else "; ")
+            + self._to_go(needed, sums.cycles)
+        )
+        while True:
+            while sums.cycles < needed:
+                done = sums.cycles
+                left = pokes.frames(needed, done)
+                self._count.begin(f"{wanted.method} cycle {done + 1} of {needed}", left)
+                sums = sums.plus(self._player.cycle(pokes.cycle(done), delay.delay_frames))
+                keep(path, sums, what)
+                self.kept = sums.cycles
+            found = measured(sums)
+            more = pokes.more_cycles(needed, float(found.error.max()))
+            if more <= needed:
+                return found
+            self._say(
+                f"the cycles scatter by more than photons and read-out: {more} of them instead of {needed}; "
+                + self._to_go(more, needed)
+            )
+            needed = more
+
+    def _to_go(self, needed: int, done: int) -> str:
+        return f"about {self.pokes.frames(needed, done) / self.config.camera.rate_hz:.0f} s to go"
+
+    def _initial(self, delay: Delay) -> Initial:
+        """The reconstructor of which the measured one is made: the computed one, unless that in use sees more."""
+        before = self.before
+        of = [each for each in (self._computed, before) if each is not None and comparable(each, before)]
+        candidates = [Initial(each.reconstructor.astype(np.float64) * before.good, each.estimator) for each in of]
+        whole = [each for each in candidates if np.linalg.matrix_rank(each.matrix) == len(before.noll)]
+        if not whole:
+            raise CalibrationError(
+                "neither the optical model nor the calibration in use tells all modes apart on these pixels, and R is "
+                "made from one of them: `lowfc calibrate align` computes it for this sensor"
+            )
+        camera = factory.detector(self.config)
+        variance = pixel_variance(
+            before.reference.astype(np.float64),
+            before.flux_dn * camera.gain_e_per_dn / camera.em_gain,
+            factory.equivalent_read_noise_e(camera),
+        )
+        return initial_of(whole, delay.picture, self._best, variance)
+
+
+def partial_of(out: Path) -> Path:
+    """Where the cycles done are kept until a calibration is whole."""
+    return out.with_name(out.name + ".part.npz")
+
+
+def keep(path: Path, sums: Sums, what: dict[str, Any]) -> None:
+    """Write the cycles done, and what they are of.
+
+    Raises:
+        DataFileError: it cannot be written.
+    """
+    stream = io.BytesIO()
+    arrays = sums._asdict() | {"initial": sums.initial.matrix, "estimator": sums.initial.estimator}
+    np.savez(stream, what=np.array(json.dumps(what, sort_keys=True)), **arrays)
+    write_whole(path, stream.getvalue())
+
+
+def go_on(path: Path, what: dict[str, Any]) -> Sums:
+    """The cycles done.
+
+    Raises:
+        DataFileError: there are none, the file is damaged, or they are of another calibration.
+    """
+    before, sums = begun(path)
+    for key, value in what.items():
+        if before.get(key) != value:
+            raise DataFileError(
+                f"{path} is of another calibration: its {key} is {before.get(key)}, now it is {value}; remove the "
+                "file, or leave --resume out"
+            )
+    return sums
+
+
+def begun(path: Path) -> tuple[dict[str, Any], Sums]:
+    """What the cycles done are of, and these cycles.
+
+    Raises:
+        DataFileError: there are none, or the file is damaged.
+    """
+    if not path.is_file():
+        raise DataFileError(f"there is nothing to go on from: no {path}; leave --resume out")
+    try:
+        with path.open("rb") as stream, np.load(stream, allow_pickle=False) as arrays:
+            sums = Sums(
+                Initial(arrays["initial"], str(arrays["estimator"])),
+                arrays["answers"],
+                arrays["response"],
+                arrays["reference"],
+                int(arrays["references"]),
+                float(arrays["flux_dn"]),
+            )
+            return dict(json.loads(str(arrays["what"]))), sums
+    except (*fits_file.DAMAGED, zipfile.BadZipFile) as error:
+        why = fits_file.in_a_line(error)
+        raise DataFileError(f"{path} is damaged, or no part of a calibration: {why}; remove it") from None

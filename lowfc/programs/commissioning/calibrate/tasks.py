@@ -1,0 +1,301 @@
+"""What `lowfc calibrate` does: a running loop, files, a progress bar; each returns its typed result."""
+
+import contextlib
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from pathlib import Path
+from typing import NamedTuple, TypeVar
+
+import numpy as np
+import numpy.typing as npt
+from rich.console import Console
+from rich.progress import TextColumn, TimeRemainingColumn
+
+from lowfc.adapters.files import calibration_file, factory
+from lowfc.adapters.files.array_file import read_array
+from lowfc.adapters.files.mirror_maps import shape_of
+from lowfc.adapters.files.whole_file import require_folder
+from lowfc.adapters.process.progress import Counted, counting_bar, spoken
+from lowfc.adapters.process.terminal import configuration
+from lowfc.client import Client, configuration_of
+from lowfc.contract.codecs.calibration_codec import identified
+from lowfc.contract.configuration import Configuration
+from lowfc.contract.errors import CalibrationError, ConfigurationError, DataFileError
+from lowfc.control.calibration.adapted import with_dark, with_reference
+from lowfc.control.calibration.calibration import Calibration
+from lowfc.control.calibration.dark_frames import check_dark, dark_of
+from lowfc.control.calibration.response_fit import normalised
+from lowfc.control.loop.wording import counted
+from lowfc.optics.chain.zernike import zernikes
+from lowfc.optics.twin.twin import Twin, node_radii
+from lowfc.optics.twin.twin_mirror import TwinMirror, wavefront_nm
+from lowfc.programs.cli.result import Result, figure
+from lowfc.programs.commissioning.analytic import Wavefront, analytic
+from lowfc.programs.commissioning.calibrate.pokes import CalibrationRequest
+from lowfc.programs.commissioning.calibrate.recording import Say, watch
+from lowfc.programs.commissioning.calibrate.result import (
+    CalibrationResult,
+    Comparison,
+    comparison,
+    finished,
+    reconstructed,
+    result_of,
+)
+from lowfc.programs.commissioning.calibrate.run import Calibrator, partial_of
+
+R = TypeVar("R", bound=Result)
+
+
+class DarkResult(Result):
+    """A dark and the bad pixels that it shows."""
+
+    frames: int = figure("frames")
+    dark_dn: float = figure("dark, median", "DN", ".4g")
+    noise_dn: float = figure("noise, median", "DN", ".3g")
+    hot: int = figure("hot pixels")
+    noisy: int = figure("noisy pixels")
+    dead: int = figure("dead pixels")
+    file: str = figure("written")
+
+
+class ReferenceResult(Result):
+    """How far the zero point moved."""
+
+    frames: int = figure("frames")
+    noll: list[int] = figure("mode", form="Z{}", column=True)
+    reference_shift_nm: list[float] = figure("zero point moved by", "nm", "+.2f", column=True)
+    flux_dn: float = figure("light", "DN", ".4g")
+    file: str = figure("written")
+
+
+def poked(wanted: CalibrationRequest, run: str | None, *, load: bool) -> CalibrationResult:
+    """Calibrate a running loop and write the file, once nothing else can go wrong.
+
+    Raises:
+        CalibrationError: pokes are not seen, frames are lost, or H is not above its noise.
+        BusError: there is no such loop.
+        DataFileError: a file cannot be written, or there is nothing to go on from.
+    """
+    require_folder(wanted.out)
+    console = Console(stderr=True)
+    say = sayer(console)
+    with contextlib.ExitStack() as held:
+        loop = held.enter_context(Client(run))
+        computed = analytic(configuration_of(loop), console)
+        progress = held.enter_context(shown_progress(console, say))
+        lease = held.enter_context(loop.reserved(f"lowfc calibrate --method {wanted.method}"))
+        progress = lease.expecting(progress, configuration_of(loop).camera.rate_hz)
+        calibrator = Calibrator(loop, wanted, say, progress, computed)
+        try:
+            with calibrator.holding():
+                done = finished(calibrator, wanted, calibrator.run(), computed)
+                if done.result.recommended:
+                    partial_of(wanted.out).unlink(missing_ok=True)
+                    if load:
+                        loop.load(done.calibration)
+        except BaseException:
+            if calibrator.kept:
+                kept_cycles = counted(calibrator.kept, "cycle")
+                say(
+                    f"kept in {partial_of(wanted.out)}: {kept_cycles}, with which the same command with --resume goes "
+                    "on"
+                )
+            raise
+    if load and not done.result.recommended:
+        done.result.not_loaded = True
+    return done.result
+
+
+@contextlib.contextmanager
+def shown_progress(console: Console, say: Callable[[str], None]) -> Iterator[Counted]:
+    """A bar on a terminal, else a line every 10 s."""
+    if not console.is_terminal:
+        yield spoken(say)
+        return
+    with counting_bar(console, TextColumn("{task.percentage:.0f} %"), TimeRemainingColumn()) as count:
+        yield count
+
+
+def computed(
+    file: Path | None, wanted: CalibrationRequest, at: str | None, run: str | None, *, load: bool
+) -> CalibrationResult:
+    """Compute a calibration from a configuration, flat or at a wavefront, and write the file.
+
+    Raises:
+        CalibrationError: this sensor cannot tell the modes apart.
+        ConfigurationError: there is no such wavefront.
+        DataFileError: the file cannot be written.
+    """
+    require_folder(wanted.out)
+    config = configuration(file)
+    there = None if at is None else zero_point(config, at)
+    made = analytic(config, Console(stderr=True), None if there is None else there.wavefront)
+    quality = reconstructed(
+        config,
+        made.reference.astype(np.float64),
+        made.response.astype(np.float64),
+        None,
+        made.good.astype(np.float64),
+        made.flux_dn,
+        estimator=config.control.estimator,
+        truncate=wanted.truncate,
+        tikhonov=wanted.tikhonov,
+    )
+    if there is not None:
+        made = replace(made, estimator=f"{made.estimator}+at {there.name}")
+    if wanted.truncate or wanted.tikhonov:
+        matrix = np.ascontiguousarray(quality.matrix, dtype=np.float32)
+        made = replace(made, reconstructor=matrix, estimator=f"{made.estimator}+regularised")
+    made = identified(made)
+    calibration_file.save(made, wanted.out)
+    if load:
+        with Client(run) as loop:
+            loop.load(made)
+    return result_of(config, made, quality, "analytic", wanted.out)
+
+
+class ZeroPoint(NamedTuple):
+    """A wavefront that is not flat, and its name in a calibration."""
+
+    name: str
+    wavefront: Wavefront
+
+
+def zero_point(config: Configuration, text: str) -> ZeroPoint:
+    """What --at asks for: modes as in 4=15,7=-10, Noll index = nm rms, or a file as `lowfc ctl channel` takes it.
+
+    Raises:
+        ConfigurationError: it is neither, or the shape does not fit the mirror.
+    """
+    if "=" not in text:
+        shape = shape_of(config, "--at", text)
+        return ZeroPoint("a shape", lambda _, mirror: wavefront_nm(mirror, shape).astype(np.float64))
+    modes_nm = _modes(text)
+
+    def of_modes(optics: Twin, _: TwinMirror) -> npt.NDArray[np.float64]:
+        return np.array(list(modes_nm.values())) @ zernikes(list(modes_nm), *node_radii(optics))
+
+    return ZeroPoint(",".join(f"{mode}={amplitude_nm:g}" for mode, amplitude_nm in modes_nm.items()), of_modes)
+
+
+def _modes(text: str) -> dict[int, float]:
+    found: dict[int, float] = {}
+    for part in text.split(","):
+        index, _, value = part.partition("=")
+        try:
+            mode, amplitude_nm = int(index), float(value)
+        except ValueError:
+            raise ConfigurationError(f"--at takes modes in nm, as in 4=15,7=-10, or a file; got {part!r}") from None
+        if mode < 2 or mode in found or not np.isfinite(amplitude_nm):
+            raise ConfigurationError(
+                f"--at: {part!r} is not a Noll index of 2 or more, named once, and its amplitude in nm"
+            )
+        found[mode] = amplitude_nm
+    return found
+
+
+def compared(one: Path, other: Path) -> Comparison:
+    """How two calibration files differ."""
+    return comparison(calibration_file.load(one), calibration_file.load(other))
+
+
+class Camera(NamedTuple):
+    """What a reconstructor needs to know of a camera: the noise of a pixel, electrons per DN."""
+
+    read_noise_e: float
+    gain_e: float
+
+
+def darkened(out: Path, run: str | None, frames: int, file: Path | None, *, load: bool) -> DarkResult:
+    """The calibration in use with a dark and a mask, from the loop's frames or a cube of them.
+
+    Raises:
+        CalibrationError: the frames are not dark.
+        DataFileError: the cube cannot be read, or the file not be written.
+    """
+
+    def adapted(loop: Client, before: Calibration, camera: Camera) -> tuple[Calibration, DarkResult]:
+        cube, whose = (watch(loop, frames), "the camera") if file is None else (images(file), str(file))
+        if cube.shape[1:] != before.shape:
+            raise DataFileError(f"{whose}: frames of {cube.shape[1:]}, the calibration has {before.shape}")
+        try:
+            found = dark_of(cube.reshape(len(cube), -1))
+        except ValueError as error:
+            raise CalibrationError(f"{whose}: {error}") from None
+        if file is None:
+            check_dark(found.dark_dn, before.reference.astype(np.float64), before.flux_dn)
+        made = with_dark(before, found.dark_dn, found.good, camera.read_noise_e, camera.gain_e)
+        counts = {name: int(np.count_nonzero(getattr(found, name))) for name in ("hot", "noisy", "dead")}
+        level, noise = float(np.median(found.dark_dn)), float(np.median(found.noise_dn))
+        return made, DarkResult(frames=len(cube), dark_dn=level, noise_dn=noise, **counts, file=str(out))
+
+    return _adapted(out, run, adapted, load=load)
+
+
+def referenced(out: Path, run: str | None, frames: int, *, load: bool) -> ReferenceResult:
+    """The calibration in use with the present image as its reference.
+
+    Raises:
+        CalibrationError: there is no light.
+        DataFileError: the file cannot be written.
+    """
+
+    def adapted(loop: Client, before: Calibration, camera: Camera) -> tuple[Calibration, ReferenceResult]:
+        pixels = watch(loop, frames).reshape(frames, -1)
+        light, flux = normalised(pixels, before.dark.astype(np.float64), before.good.astype(np.float64))
+        image = light.mean(axis=0)
+        made = with_reference(before, image, float(flux.mean()), camera.read_noise_e, camera.gain_e)
+        moved = before.reconstructor.astype(np.float64) @ (image - before.reference)
+        return made, ReferenceResult(
+            frames=frames,
+            noll=list(made.noll),
+            reference_shift_nm=moved.tolist(),
+            flux_dn=made.flux_dn,
+            file=str(out),
+        )
+
+    return _adapted(out, run, adapted, load=load)
+
+
+def _adapted(
+    out: Path,
+    run: str | None,
+    adapted: Callable[[Client, Calibration, Camera], tuple[Calibration, R]],
+    *,
+    load: bool,
+) -> R:
+    """Write the calibration in use with something else in it, and use it if asked."""
+    require_folder(out)
+    with Client(run) as loop:
+        before, config = replace(loop.calibration(), camera=loop.camera()), configuration_of(loop)
+        camera = factory.detector(config)
+        of = Camera(factory.equivalent_read_noise_e(camera), camera.gain_e_per_dn / camera.em_gain)
+        try:
+            made, result = adapted(loop, before, of)
+        except ValueError as error:
+            raise CalibrationError(str(error)) from None
+        made = identified(made)
+        calibration_file.save(made, out)
+        if load:
+            loop.load(made)
+    return result
+
+
+def images(file: Path) -> npt.NDArray[np.float64]:
+    """Frames (frames, rows, columns) of a file's image or cube.
+
+    Raises:
+        DataFileError: there are none, or the file is damaged.
+    """
+    data = read_array(file, "frames are an array (rows, columns) or (frames, rows, columns)", (2, 3))
+    return np.asarray(data, dtype=np.float64).reshape(-1, *data.shape[-2:])
+
+
+def sayer(console: Console) -> Say:
+    """A line for people, warnings in yellow."""
+
+    def say(text: str) -> None:
+        style = "yellow" if text.startswith("warning") else None
+        console.print(text, style=style, highlight=False, soft_wrap=True, markup=False)
+
+    return say

@@ -1,0 +1,146 @@
+"""Checks of a host or a device as data: a table of them, what each one found, and the report as text or JSON."""
+
+import json
+import sys
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from enum import StrEnum
+from typing import TYPE_CHECKING, Any, Generic, NamedTuple, TypeVar
+
+from lowfc.control.loop.wording import counted
+
+if TYPE_CHECKING:
+    from rich.console import Console
+
+S = TypeVar("S")
+
+_WIDTH = 120  # where there is no terminal
+
+
+class Status(StrEnum):
+    """How a check ended."""
+
+    OK = "ok"
+    NOTE = "note"
+    WARNING = "warning"
+    WRONG = "wrong"
+
+
+_STYLES = {Status.OK: "green", Status.NOTE: "cyan", Status.WARNING: "bold yellow", Status.WRONG: "bold red"}
+
+
+class Check(NamedTuple):
+    """One line of a report.
+
+    Attributes:
+        status: wrong breaks the contract; a warning costs something or could not be tried; a note is worth knowing.
+        got: what was found.
+        advice: what to do about it; empty where there is nothing to do.
+        cost: what it costs otherwise.
+        name: what was looked at.
+        expected: what the contract says.
+    """
+
+    status: Status
+    got: str
+    advice: str = ""
+    cost: str = ""
+    name: str = ""
+    expected: str = ""
+
+
+def ok(got: str) -> Check:
+    """As it should be."""
+    return Check(Status.OK, got)
+
+
+def note(got: str, advice: str = "", cost: str = "") -> Check:
+    """Something worth knowing."""
+    return Check(Status.NOTE, got, advice, cost)
+
+
+def warning(got: str, advice: str, cost: str = "") -> Check:
+    """Something that costs, or could not be tried."""
+    return Check(Status.WARNING, got, advice, cost)
+
+
+def wrong(got: str, advice: str) -> Check:
+    """Something that breaks the contract."""
+    return Check(Status.WRONG, got, advice)
+
+
+class Table(Generic[S]):
+    """Checks by name, in the order of the report; each looks at the same thing."""
+
+    def __init__(self) -> None:
+        self.looks: dict[str, tuple[str, Callable[[S], Check | None]]] = {}
+
+    def check(self, name: str, expected: str = "") -> Callable[[Callable[[S], Check | None]], Callable[[S], object]]:
+        """Enter a function that looks; it returns None where there is nothing to look at."""
+
+        def enter(look: Callable[[S], Check | None]) -> Callable[[S], object]:
+            self.looks[name] = (expected, look)
+            return look
+
+        return enter
+
+    def of(self, seen: S, unknown: tuple[type[Exception], ...] = ()) -> Iterator[Check]:
+        """What every check finds; a note where one of these exceptions keeps it from finding anything."""
+        for name, (expected, look) in self.looks.items():
+            try:
+                found = look(seen)
+            except unknown as fault:
+                found = note(f"not known: {fault}")
+            if found is not None:
+                yield found._replace(name=name, expected=expected)
+
+
+def counts(checks: Iterable[Check], statuses: Iterable[Status]) -> dict[str, int]:
+    """How many checks ended in which way."""
+    ended = [check.status for check in checks]
+    return {str(status): ended.count(status) for status in statuses}
+
+
+def put(
+    checks: list[Check], worst_first: tuple[Status, ...], fields: Mapping[str, str], about: dict[str, Any] | None
+) -> None:
+    """Print a report.
+
+    Args:
+        checks: in their order.
+        worst_first: statuses that the last line counts.
+        fields: attribute of a check by its key in JSON.
+        about: the rest of the JSON object; None for a table.
+    """
+    if about is not None:
+        sys.stdout.write(json.dumps(figures(checks, worst_first, fields) | about) + "\n")
+        return
+    from rich.console import Console
+
+    table(checks, worst_first, Console(width=None if sys.stdout.isatty() else _WIDTH, highlight=False))
+
+
+def figures(checks: list[Check], worst_first: tuple[Status, ...], fields: Mapping[str, str]) -> dict[str, Any]:
+    """Checks and counts as JSON has them."""
+    rows = [{key: getattr(check, attribute) for key, attribute in fields.items()} for check in checks]
+    return {"checks": rows, "counts": counts(checks, reversed(worst_first))}
+
+
+def table(checks: list[Check], worst_first: tuple[Status, ...], console: "Console") -> None:
+    """Print checks for a person: a line of what is ok, of the rest also what was expected and what to do."""
+    from rich.table import Table as Grid
+    from rich.text import Text
+
+    grid = Grid.grid(padding=(0, 2))
+    for check in checks:
+        grid.add_row(Text(check.status, style=_STYLES[check.status]), Text(check.name), Text(check.got))
+        if check.advice:
+            for label, text in (("expected", check.expected), ("to do", check.advice), ("otherwise", check.cost)):
+                if text:
+                    style = "" if label == "to do" else "dim"
+                    grid.add_row("", Text(label, style="dim", justify="right"), Text(text, style=style))
+    console.print(grid)
+    ended = counts(checks, worst_first)
+    words = [
+        f"{count} {status}" if status in ("ok", "wrong") else counted(count, status) for status, count in ended.items()
+    ]
+    console.print(f"\n{', '.join(words)}")

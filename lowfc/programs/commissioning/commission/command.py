@@ -1,0 +1,68 @@
+"""The command `lowfc commission`: options only."""
+
+import sys
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from lowfc.adapters.process.terminal import AnyRun, Json
+from lowfc.contract.errors import ConfigurationError
+from lowfc.programs.cli.output import put
+
+
+def commission(
+    out: Annotated[Path, typer.Option("--out", help="File to be written (FITS).")] = Path("calibration.fits"),
+    run: AnyRun = None,
+    frames: Annotated[int, typer.Option(min=16, max=100_000, help="For the dark and for the reference image.")] = 400,
+    dark: Annotated[Path | None, typer.Option(help="Dark frames: a FITS or .npy cube (frames, rows, columns).")] = None,
+    no_dark: Annotated[
+        bool, typer.Option("--no-dark", help="Take the camera's bias for the dark, and all pixels for good.")
+    ] = False,
+    snr: Annotated[
+        float, typer.Option(min=1, max=1e4, help="Signal-to-noise ratio to reach in the noisiest mode.")
+    ] = 50.0,
+    cycles: Annotated[
+        int | None,
+        typer.Option(min=1, help="How many of the response, at least 4, in place of --snr, which is 20 then."),
+    ] = None,
+    resume: Annotated[bool, typer.Option("--resume", help="Go on with one that was interrupted.")] = False,
+    close: Annotated[bool, typer.Option("--close", help="Close the loop at the end.")] = False,
+    as_json: Json = False,
+) -> None:
+    """Commission a new camera and mirror: from frames that are published to a calibration that is in use.
+
+    Camera, mirror and controller must be running (`lowfc controller --calibration none`); the light must be on the
+    sensor. Steps: camera, dark and bad pixels, reference image, delay, orientation and sign, poke amplitude, response,
+    verdict, prediction, closed loop. The mirror is afterwards where it was.
+
+    Example: lowfc commission --run bench --out calibration.fits --close
+    """
+    from rich.console import Console
+
+    from lowfc.adapters.files.whole_file import require_folder
+    from lowfc.client import Client, configuration_of
+    from lowfc.programs.commissioning.analytic import analytic
+    from lowfc.programs.commissioning.calibrate.tasks import sayer, shown_progress
+    from lowfc.programs.commissioning.commission.commissioning import Commission, Commissioning
+
+    if dark is not None and no_dark:
+        raise ConfigurationError("--dark FILE and --no-dark exclude each other: choose one")
+    if dark is None and not no_dark and not resume and not sys.stdin.isatty():
+        raise ConfigurationError(
+            "a dark needs somebody to block the star, and there is no terminal to ask at: give dark frames with --dark "
+            "FILE, or take the camera's bias with --no-dark"
+        )
+    require_folder(out)
+    console = Console(stderr=True)
+    say = sayer(console)
+    asked = Commission(out, frames, dark, no_dark, snr, cycles, resume, close)
+
+    def confirm(what: str) -> None:
+        typer.confirm(what, default=True, abort=True, err=True)
+
+    with Client(run) as loop, loop.reserved("lowfc commission") as lease, shown_progress(console, say) as shown:
+        config = configuration_of(loop)
+        progress = lease.expecting(shown, config.camera.rate_hz)
+        found, text = Commissioning(loop, config, analytic(config, console), asked, say, progress, confirm).run()
+    put(found, text, as_json=as_json)

@@ -1,0 +1,298 @@
+"""The steps from a camera that publishes to a calibration that is in use, and to a closed loop."""
+
+import contextlib
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from lowfc.adapters.files import calibration_file, factory
+from lowfc.adapters.process.progress import Counted
+from lowfc.client import Client
+from lowfc.contract.configuration import Configuration
+from lowfc.contract.errors import CalibrationError, LowfcError
+from lowfc.contract.messages import wire
+from lowfc.control.calibration.calibration import Calibration
+from lowfc.control.calibration.delay_fit import Delay
+from lowfc.control.laws.law import Law
+from lowfc.control.laws.stability import settling_frames
+from lowfc.control.loop.inputs import Step
+from lowfc.control.loop.safety import LoopMode
+from lowfc.programs.commissioning.calibrate.pokes import LEAST_SNR, CalibrationRequest, Pokes
+from lowfc.programs.commissioning.calibrate.recording import CHECKED, Say, watch
+from lowfc.programs.commissioning.calibrate.result import finished
+from lowfc.programs.commissioning.calibrate.run import Calibrator, begun, partial_of
+from lowfc.programs.commissioning.calibrate.tasks import images
+from lowfc.programs.commissioning.commission.first_calibration import aligned, first_delay, linear_nm, poked
+from lowfc.programs.commissioning.commission.first_light import (
+    Sensor,
+    camera_fits,
+    darkened,
+    referenced,
+    without_dark,
+)
+from lowfc.programs.commissioning.commission.prediction import measured_nm, predicted_nm
+
+METHOD = "hadamard"
+LOOKED_AT = 32
+"""Frames of which size, rate and light are seen."""
+MAX_OF_PREDICTED = 1.5
+"""Measured over predicted error beyond which the closed loop is not what was expected."""
+MIN_PREDICTED = 1000
+"""Frames of the open loop that a residual is predicted from, and of the closed loop that it is measured in."""
+STEPS = (
+    *("camera", "dark and bad pixels", "reference image", "delay", "orientation and sign", "poke amplitude"),
+    *("response", "verdict", "prediction", "closed loop"),
+)
+
+
+@dataclass(frozen=True, slots=True)
+class Commission:
+    """What is asked for.
+
+    Attributes:
+        out: The file to be written; what is done so far is kept beside it.
+        frames: For the dark and for the reference image.
+        dark: File of dark frames; None to take them now.
+        no_dark: Take the camera's bias for the dark, and all pixels for good.
+        snr: Signal-to-noise ratio to reach in the noisiest mode.
+        cycles: Of the response; None for as many as that takes.
+        resume: Go on with one that was interrupted.
+        close: Close the loop at the end.
+    """
+
+    out: Path
+    frames: int
+    dark: Path | None
+    no_dark: bool
+    snr: float
+    cycles: int | None
+    resume: bool
+    close: bool
+
+
+def first_of(out: Path) -> Path:
+    """Where the first calibration is kept until a better one is made."""
+    return out.with_name(f"{out.name}.first.fits")
+
+
+class Commissioning:
+    """One commissioning of a running loop."""
+
+    def __init__(
+        self,
+        loop: Client,
+        config: Configuration,
+        computed: Calibration,
+        asked: Commission,
+        say: Say,
+        progress: Counted,
+        confirm: Callable[[str], None],
+    ) -> None:
+        """Take what it is made with.
+
+        Args:
+            loop: A connection to it.
+            config: The loop's.
+            computed: Of the optical model: its modes and the mirror's commands, and its image where it is alike.
+            asked: What is asked for.
+            say: For people.
+            progress: For people: frames so far, and of how many.
+            confirm: Ask a person to do something, and wait until it is done.
+        """
+        self._loop, self._config, self._computed, self._asked = loop, config, computed, asked
+        self._say, self._progress, self._confirm = say, progress, confirm
+        self._figures: dict[str, Any] = {}
+        self._delay: Delay | None = None
+        self._judged = False
+
+    def run(self) -> tuple[dict[str, Any], str]:
+        """All steps; the figures, and the text for people.
+
+        Raises:
+            CalibrationError: a step failed; the sentence says what to do.
+        """
+        asked, kept = self._asked, first_of(self._asked.out)
+        if asked.resume and not kept.is_file():
+            if asked.out.is_file():
+                raise CalibrationError(
+                    f"there is nothing to go on with: {asked.out} is finished; `lowfc ctl load {asked.out}` puts it in "
+                    "use, and without --resume a new one is begun"
+                )
+            self._say(f"there is nothing to go on with beside {asked.out}: this begins anew")
+        before = self._open()
+        try:
+            return self._steps_of(kept)
+        except BaseException:
+            self._say(self._left(before, kept))
+            raise
+
+    def _left(self, before: Calibration | None, kept: Path) -> str:
+        """What is in use after a commissioning that did not come to its end, and how to go on."""
+        if self._judged:
+            return f"the calibration is good, in {self._asked.out} and in use: `lowfc ctl close` closes the loop"
+        if not kept.is_file():
+            return "no calibration was changed"
+        text = f"what was done is kept in {kept}: the same command with --resume goes on with it"
+        with contextlib.suppress(LowfcError):
+            if before is not None:
+                self._loop.check_lease()
+                self._loop.load(before)
+                return f"{text}; the calibration from before is in use again"
+        return (
+            f"{text}; until then a first calibration is in use, which nobody has judged: `lowfc ctl load FILE` puts "
+            "another one in use"
+        )
+
+    def _steps_of(self, kept: Path) -> tuple[dict[str, Any], str]:
+        asked, config = self._asked, self._config
+        resumed = asked.resume and kept.is_file()
+        if resumed:
+            first = calibration_file.load(kept)
+            camera = self._loop.camera()
+            if camera is not None and camera.shape != first.shape:
+                raise CalibrationError(
+                    f"{kept} is for frames of {first.shape[0]} x {first.shape[1]} pixels, the camera's are "
+                    f"{camera.shape[0]} x {camera.shape[1]}: leave --resume out"
+                )
+            self._say(f"going on from {kept}: the camera's steps, orientation and sign are done")
+        else:
+            first = self._first()
+            calibration_file.save(first, kept)
+        self._loop.load(first)
+        delay = self._delay if self._delay is not None else first_delay(self._loop, config, first, self._say)
+        resume = resumed and partial_of(asked.out).is_file()
+        if resume:
+            amplitude_nm = float(begun(partial_of(asked.out))[0]["amplitude_nm"])
+        else:
+            self._step("poke amplitude")
+            usual_nm = Pokes(config, first, factory.frame_noise_nm(config, first), self._wanted()).amplitude_nm
+            amplitude_nm = linear_nm(self._loop, config, first, delay, usual_nm, self._say)
+        self._step("response")
+        wanted = self._wanted(amplitude_nm, resume=resume)
+        calibrator = Calibrator(self._loop, wanted, self._say, self._progress, self._computed)
+        taken = calibrator.run(delay)
+        self._step("verdict")
+        done = finished(calibrator, wanted, taken, self._computed)
+        self._figures |= done.result.figures()
+        if not done.result.recommended:
+            raise CalibrationError(
+                f"{done.result.text()}\nit is not used: correct this, then the same command again; with --resume it "
+                "goes on with these cycles, as for more of them (--cycles)"
+            )
+        self._loop.load(done.calibration)
+        self._judged = True
+        for path in (kept, partial_of(asked.out)):
+            path.unlink(missing_ok=True)
+        self._say(done.result.text())
+        law = factory.settings(config).law(done.calibration.noll)
+        return self._figures, self._close(law, delay.delay_frames)
+
+    def _wanted(self, amplitude_nm: float | None = None, *, resume: bool = False) -> CalibrationRequest:
+        asked = self._asked
+        snr = asked.snr if asked.cycles is None else LEAST_SNR
+        return CalibrationRequest(METHOD, asked.out, snr, asked.cycles, amplitude_nm, resume, range=False)
+
+    def _step(self, name: str) -> None:
+        self._say(f"[{STEPS.index(name) + 1}/{len(STEPS)}] {name}")
+
+    def _open(self) -> Calibration | None:
+        """The loop as it must be: open or idle, and a mirror as configured; the calibration in use, if there is one."""
+        state = self._loop.status().state
+        if state is None:
+            raise CalibrationError("the controller did not say how it is")
+        if state.mode == wire.LOOP_MODE_SAFE:
+            raise CalibrationError("the loop is in safe mode: `lowfc ctl clear` first, when it is safe")
+        grid = (state.mirror_rows, state.mirror_columns)
+        if state.mirror_rows and grid != self._computed.grid:
+            raise CalibrationError(
+                f"the mirror has {grid[0]} x {grid[1]} actuators, the configuration {self._computed.grid[0]} x "
+                f"{self._computed.grid[1]}: set mirror.rows and mirror.columns"
+            )
+        if state.mode == wire.LOOP_MODE_CLOSED:
+            self._say("the loop is opened")
+            self._loop.open_loop()
+        return self._loop.calibration() if state.calibration_id and state.mode != wire.LOOP_MODE_IDLE else None
+
+    def _first(self) -> Calibration:
+        """The steps before there is any calibration."""
+        self._step("camera")
+        seen = list(self._loop.frames(LOOKED_AT))
+        camera = camera_fits(self._config, self._loop.camera_state(), seen, self._say)
+        self._step("dark and bad pixels")
+        asked, sensor = self._asked, without_dark(camera)
+        if asked.dark is not None:
+            sensor = darkened(camera, images(asked.dark), self._say)
+        elif asked.no_dark:
+            self._say(f"no dark: the camera's bias of {camera.bias_dn:g} DN everywhere, and all pixels good")
+        else:
+            self._confirm("block the star; is it dark?")
+            sensor = darkened(camera, watch(self._loop, asked.frames), self._say)
+            self._confirm("unblock the star; is it there?")
+        self._step("reference image")
+        before = self._reference(sensor)
+        self._step("delay")
+        self._delay = delay = first_delay(self._loop, self._config, before, self._say)
+        self._step("orientation and sign")
+        first = aligned(self._config, self._computed, before, delay, self._say)
+        if first is None:
+            first = poked(self._loop, self._config, before, delay, self._say)
+        self._figures |= first.figures
+        return first.calibration
+
+    def _reference(self, sensor: Sensor) -> Calibration:
+        frames: npt.NDArray[np.uint16] = watch(self._loop, self._asked.frames)
+        return referenced(sensor, frames, self._computed, self._say)
+
+    def _close(self, law: Law, delay_frames: float) -> str:
+        """Predict the residual; close the loop where that was asked for, and compare."""
+        rate_hz = self._config.camera.rate_hz
+        settling = settling_frames(law.gain, law.leak, rate_hz)
+        frames = settling + max(MIN_PREDICTED, settling)
+        self._step("prediction")
+        try:
+            expected_nm = predicted_nm(self._steps(frames), law, delay_frames, rate_hz)
+        except ValueError as error:
+            raise CalibrationError(f"the residual is not predicted: {error}") from None
+        predicted = float(np.sqrt((expected_nm**2).sum()))
+        self._figures["predicted_error_nm"] = predicted
+        text = f"the closed loop leaves {predicted:.3g} nm rms of measured error, predicted from {frames} open frames"
+        if not self._asked.close:
+            return f"{text}\n`lowfc ctl close` closes it"
+        self._step("closed loop")
+        self._loop.close_loop()
+        try:
+            found_nm = measured_nm(self._steps(frames, LoopMode.CLOSED), law, rate_hz)
+            measured = float(np.sqrt((found_nm**2).sum()))
+            self._figures["measured_error_nm"] = measured
+            if measured > MAX_OF_PREDICTED * predicted:
+                raise CalibrationError(
+                    f"the closed loop leaves {measured:.3g} nm rms of measured error, {predicted:.3g} was predicted: "
+                    "is the delay right, did the disturbance change? The loop is opened"
+                )
+        except BaseException as error:
+            with contextlib.suppress(LowfcError):
+                self._loop.check_lease()  # whoever ended it has the last word on the loop
+                self._loop.open_loop()
+            if isinstance(error, ValueError):
+                raise CalibrationError(f"the residual is not measured: {error}") from None
+            raise
+        return f"{text}\nmeasured in the closed loop: {measured:.3g} nm rms, {measured / predicted:.2f} times that"
+
+    def _steps(self, frames: int, mode: LoopMode = LoopMode.OPEN) -> list[Step]:
+        steps: list[Step] = []
+        self._say(f"watching {frames} frames, {frames / self._config.camera.rate_hz:.0f} s")
+        for step in self._loop.steps():
+            if step.mode is mode:
+                steps.append(step)
+            elif steps:  # those before are of the mode before
+                self._loop.check_lease()  # which says who ended it
+                raise CalibrationError(f"the loop went from {mode.in_words} to {step.mode.in_words}")
+            if len(steps) >= frames:
+                break
+            if len(steps) % CHECKED == 0:
+                self._loop.check_lease()
+        return steps

@@ -1,0 +1,168 @@
+"""A first calibration, from the image of one poke and the computed response, or from pokes of all modes."""
+
+from dataclasses import replace
+from typing import Any, NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from lowfc.client import Client
+from lowfc.contract.codecs.calibration_codec import identified
+from lowfc.contract.configuration import Configuration
+from lowfc.contract.errors import CalibrationError
+from lowfc.control.calibration import poke_plan
+from lowfc.control.calibration.alignment import align
+from lowfc.control.calibration.calibration import FIRST, Calibration
+from lowfc.control.calibration.delay_fit import Delay
+from lowfc.control.calibration.response_fit import likeness
+from lowfc.programs.commissioning.calibrate.align import computed_scale, in_words, on_sensor
+from lowfc.programs.commissioning.calibrate.pokes import AMPLITUDE_NM, HOLD, SETTLE, largest_nm, sequence
+from lowfc.programs.commissioning.calibrate.recording import AFTERWARDS, Player, PokesNotSeenError, Say
+from lowfc.programs.commissioning.calibrate.result import reconstructed
+
+Array = npt.NDArray[np.float64]
+
+FIRST_NM = AMPLITUDE_NM["poke"]
+MAX_FIRST_NM = 32.0
+"""Up to which the amplitude of the first pokes is doubled until they are seen, wavefront rms."""
+MAX_MISFIT = 0.35
+"""Part of the image that the computed one may leave; more is another sensor."""
+MIN_LIKENESS = 0.5
+"""Correlation of a poke's image with the computed one; less is another sensor."""
+CYCLES = 12
+MAX_NOT_LINEAR = 0.1
+_SURE = 3.0
+
+
+class First(NamedTuple):
+    """A calibration to begin with, and how it was found."""
+
+    calibration: Calibration
+    figures: dict[str, Any]
+
+
+def first_delay(loop: Client, config: Configuration, before: Calibration, say: Say) -> Delay:
+    """The delay, and the image of a poke of the first mode: pokes that grow until they are seen.
+
+    Raises:
+        CalibrationError: no poke is seen, or frames are lost.
+    """
+    amplitude_nm, most_nm = FIRST_NM, float(largest_nm(config, before)[0])
+    while True:
+        amplitude_nm = min(amplitude_nm, most_nm)
+        try:
+            found = Player(loop, before, say).first_poke(0, sequence(amplitude_nm))
+            break
+        except PokesNotSeenError:
+            if amplitude_nm >= min(MAX_FIRST_NM, most_nm):
+                raise
+            say(f"pokes of {amplitude_nm:g} nm are not seen: twice as large")
+            amplitude_nm *= 2
+    say(
+        f"pokes of Z{before.noll[0]} of {amplitude_nm:g} nm are seen after {found.delay_frames:.3f} +- "
+        f"{found.error_frames:.3f} frames, {found.delay_frames * config.period_ns * 1e-6:.3g} ms"
+    )
+    return found
+
+
+def aligned(config: Configuration, computed: Calibration, before: Calibration, poke: Delay, say: Say) -> First | None:
+    """The computed calibration on the sensor's pixels, with the sign that the poke shows; None for another sensor.
+
+    Args:
+        config: The loop's.
+        computed: Of the optical model.
+        before: Has dark, good pixels and reference.
+        poke: Of the first mode.
+        say: For people.
+    """
+    image = (before.reference * before.flux_dn).reshape(before.shape).astype(np.float64)
+    model = computed.reference.astype(np.float64).reshape(computed.shape)
+    try:
+        found = align(image, model)
+        made = on_sensor(config, computed, found.geometry, before.flux_dn, before.shape, before)
+    except (ValueError, CalibrationError) as error:
+        say(f"the image is not compared with the computed one: {error}")
+        return None
+    like = likeness(poke.picture, made.response[:, 0])
+    if like < 0:
+        found = replace(found, geometry=found.geometry.turned())
+        made = on_sensor(config, computed, found.geometry, before.flux_dn, before.shape, before)
+        like = likeness(poke.picture, made.response[:, 0])
+    scale = found.geometry.scale * computed_scale(config)
+    say(f"{in_words(found, scale)}; the poke's image correlates by {like:.2f} with the computed one")
+    if found.residual > MAX_MISFIT or like < MIN_LIKENESS:
+        say("this is not the configured sensor: the response is measured without the optical model")
+        return None
+    found_figures = {
+        "pixels_per_lambda_d": scale,
+        "rotation_deg": found.geometry.rotation_deg,
+        "parity": found.geometry.parity,
+        "image_residual": found.residual,
+        "poke_correlation": like,
+    }
+    made = replace(made, reference=before.reference, estimator=f"{made.estimator}{FIRST}")
+    return First(identified(made), found_figures)
+
+
+def poked(loop: Client, config: Configuration, before: Calibration, poke: Delay, say: Say) -> First:
+    """A calibration of each mode's own pokes, without an optical model.
+
+    Raises:
+        CalibrationError: frames are lost, or the sensor cannot tell the modes apart.
+    """
+    modes = len(before.noll)
+    amplitude_nm = min(FIRST_NM, float(largest_nm(config, before).min()))
+    response = np.zeros_like(before.response, dtype=np.float64)
+    _say_time(config, modes, CYCLES, say)
+    for number in range(CYCLES):
+        plan = _poke_cycle(modes, amplitude_nm, number)
+        response += Player(loop, before, say).cycle(plan, poke.delay_frames).response / CYCLES
+    good, reference = before.good.astype(np.float64), before.reference.astype(np.float64)
+    matrix = reconstructed(config, reference, response, None, good, before.flux_dn).matrix
+    say(f"{CYCLES} pokes of each mode by {amplitude_nm:.3g} nm")
+    made = replace(
+        before,
+        response=response.astype(np.float32),
+        reconstructor=np.ascontiguousarray(matrix, np.float32),
+        estimator=f"{config.control.estimator}+poke{FIRST}",
+    )
+    return First(identified(made), {})
+
+
+def linear_nm(
+    loop: Client, config: Configuration, first: Calibration, delay: Delay, usual_nm: float, say: Say
+) -> float:
+    """Amplitude at which all modes may be poked at once, nm rms of each.
+
+    It is the usual one, halved where single pokes and those of half their amplitude show a sensor that is not linear.
+
+    Raises:
+        CalibrationError: frames are lost.
+    """
+    R, modes = first.reconstructor.astype(np.float64), len(first.noll)
+    top_nm = min(FIRST_NM, float(largest_nm(config, first).min()))
+    gains, player = np.empty((2, 2, modes)), Player(loop, first, say)
+    _say_time(config, modes, gains[..., 0].size, say)
+    for level, amplitude_nm in enumerate((top_nm, top_nm / 2)):
+        for again in range(2):
+            plan = _poke_cycle(modes, amplitude_nm, again)
+            gains[level, again] = np.diag(R @ player.cycle(plan, delay.delay_frames).response)
+    off = np.abs(gains[0].mean(axis=0) / gains[1].mean(axis=0) - 1)
+    error = float(np.sqrt(np.mean(np.diff(gains, axis=1) ** 2) / 2))  # of the mean of two, doubled: two amplitudes
+    worst = int(off.argmax())
+    chosen_nm = usual_nm / 2 if off[worst] > MAX_NOT_LINEAR + _SURE * error else usual_nm
+    say(
+        f"pokes of {top_nm:.3g} nm and of half of it answer alike within {off[worst]:.1%} (+- {error:.1%}; "
+        f"Z{first.noll[worst]}): {chosen_nm:.3g} nm in each mode"
+    )
+    return chosen_nm
+
+
+def _say_time(config: Configuration, modes: int, cycles: int, say: Say) -> None:
+    frames = len(_poke_cycle(modes, 1.0, 0)) + AFTERWARDS
+    say(f"{cycles} cycles of {frames} frames; about {cycles * frames / config.camera.rate_hz:.0f} s to go")
+
+
+def _poke_cycle(modes: int, amplitude_nm: float, number: int) -> poke_plan.Plan:
+    """Pokes of each mode by itself; every other cycle backwards."""
+    return poke_plan.cycle(poke_plan.poke_patterns(modes, amplitude_nm), HOLD, SETTLE, 16, backwards=number % 2 == 1)

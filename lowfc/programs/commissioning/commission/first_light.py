@@ -1,0 +1,156 @@
+"""What a camera sends before anything is calibrated: its size and rate, dark, bad pixels, and the reference image."""
+
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from lowfc.client import Frame
+from lowfc.contract.codecs.calibration_codec import camera_settings
+from lowfc.contract.configuration import Configuration
+from lowfc.contract.errors import CalibrationError
+from lowfc.contract.messages import wire
+from lowfc.control.calibration.calibration import Calibration
+from lowfc.control.calibration.dark_frames import check_dark, dark_of
+from lowfc.control.loop.camera import CameraSettings
+from lowfc.programs.commissioning.calibrate.recording import Say
+from lowfc.programs.commissioning.checks import Status
+from lowfc.programs.commissioning.conformance.agreement import agreement_checks
+
+Array = npt.NDArray[np.float64]
+
+RATE_APART = 0.05
+"""Part by which the rate of the frames' times may differ from what the camera says."""
+_FULL = 0.9
+_NS = 1e9
+
+
+class Sensor(NamedTuple):
+    """A camera without light.
+
+    Attributes:
+        camera: its settings.
+        dark_dn: (pixels,) mean.
+        good: (pixels,) 1 where a pixel is used, else 0.
+        taken: Whether the dark was measured.
+    """
+
+    camera: CameraSettings
+    dark_dn: Array
+    good: Array
+    taken: bool
+
+
+def camera_fits(config: Configuration, state: wire.CameraState, images: Sequence[Frame], say: Say) -> CameraSettings:
+    """The camera's settings, once its frames and the configuration agree with them.
+
+    Args:
+        config: The loop's.
+        state: The camera's settings.
+        images: Some frames.
+        say: For people.
+
+    Raises:
+        CalibrationError: they do not agree, or the frames are saturated.
+    """
+    checks = list(agreement_checks(config, state))
+    faults = [
+        f"{check.name}: the camera has {check.got}, expected {check.expected}; {check.advice}"
+        for check in checks
+        if check.status is Status.WRONG
+    ]
+    shapes = {image.pixels.shape for image in images}
+    if shapes != {(state.rows, state.columns)}:
+        sizes = ", ".join(f"{rows} x {columns}" for rows, columns in sorted(shapes))
+        faults.append(f"size: the camera says {state.rows} x {state.columns} pixels, its frames have {sizes}")
+    period_ns = float(np.median(np.diff([image.time_ns for image in images])))
+    if not (state.period_ns and period_ns > 0):
+        faults.append(
+            f"times: the camera's period_ns is {state.period_ns}, the times of its frames are {period_ns:g} ns apart"
+        )
+    elif abs(period_ns / state.period_ns - 1) > RATE_APART:
+        faults.append(
+            f"rate: the camera says {_NS / state.period_ns:.5g} Hz, its frames come at {_NS / period_ns:.5g} Hz"
+        )
+    brightest = max(int(image.pixels.max()) for image in images)
+    if brightest > _FULL * state.saturation_dn:
+        faults.append(
+            f"light: the brightest pixel is at {brightest} of {state.saturation_dn:g} DN; shorten the exposure until "
+            "it is below half of that"
+        )
+    if faults:
+        raise CalibrationError("the camera cannot be used as it is:\n" + "\n".join(f"  {fault}" for fault in faults))
+    for check in checks:
+        if check.status is Status.WARNING:
+            say(f"remark: {check.name}: the camera has {check.got}, expected {check.expected}")
+    say(
+        f"{state.rows} x {state.columns} pixels of {state.bit_depth} bits at {_NS / period_ns:.5g} Hz, brightest pixel "
+        f"{brightest} of {state.saturation_dn:g} DN"
+    )
+    return replace(camera_settings(state), start_s=0)
+
+
+def without_dark(camera: CameraSettings) -> Sensor:
+    """A sensor of which no dark is taken: its bias everywhere, and no bad pixel."""
+    pixels = camera.shape[0] * camera.shape[1]
+    return Sensor(camera, np.full(pixels, float(camera.bias_dn)), np.ones(pixels), taken=False)
+
+
+def darkened(camera: CameraSettings, frames: npt.NDArray[np.number], say: Say) -> Sensor:
+    """A sensor with a dark (frames, rows, columns) and what it shows of bad pixels.
+
+    Raises:
+        CalibrationError: the frames are of another size, too few, or much brighter in some pixels than in others.
+    """
+    if frames.shape[1:] != camera.shape:
+        raise CalibrationError(f"the dark frames have {frames.shape[1:]} pixels, the camera {camera.shape}")
+    try:
+        found = dark_of(frames.reshape(len(frames), -1))
+    except ValueError as error:
+        raise CalibrationError(str(error)) from None
+    say(str(found))
+    return Sensor(camera, found.dark_dn, found.good, taken=True)
+
+
+def referenced(sensor: Sensor, frames: npt.NDArray[np.number], computed: Calibration, say: Say) -> Calibration:
+    """A calibration with the reference image of these frames (frames, rows, columns), and no response yet.
+
+    Its modes and the mirror's commands are those of a computed calibration.
+
+    Raises:
+        CalibrationError: there is no light on the sensor, or it is in the dark frames, too.
+    """
+    image = frames.reshape(len(frames), -1).astype(np.float64).mean(axis=0) - sensor.dark_dn
+    flux_dn = float(image @ sensor.good)
+    noise_dn = float(np.std(frames.reshape(len(frames), -1).astype(np.float64) @ sensor.good)) / np.sqrt(len(frames))
+    if not flux_dn > max(10 * noise_dn, 0.0):
+        raise CalibrationError(
+            f"there is no more light on the sensor than in the dark: {flux_dn:.4g} DN in all, with a noise of "
+            f"{noise_dn:.2g} DN; is the star blocked now, or was it not blocked for the dark?"
+        )
+    reference = image * sensor.good / flux_dn
+    if sensor.taken:
+        try:
+            check_dark(sensor.dark_dn, reference, flux_dn)
+        except ValueError as error:
+            raise CalibrationError(str(error)) from None
+    modes = len(computed.noll)
+    say(f"{flux_dn:.4g} DN of light in a frame, mean of {len(frames)} frames")
+    return replace(
+        computed,
+        reference=reference.astype(np.float32),
+        response=np.zeros((image.size, modes), np.float32),
+        reconstructor=np.zeros((modes, image.size), np.float32),
+        good=sensor.good.astype(np.float32),
+        dark=sensor.dark_dn.astype(np.float32),
+        shape=sensor.camera.shape,
+        flux_dn=flux_dn,
+        saturation_dn=float(sensor.camera.saturation_dn),
+        estimator="none",
+        operator_hash="",
+        id="",
+        actuators_to_modes=np.zeros((0, 0), np.float32),
+        camera=sensor.camera,
+    )

@@ -1,0 +1,119 @@
+"""What is received of a camera: its frames, its settings, its times, for a while."""
+
+import zlib
+from collections.abc import Callable
+from functools import cached_property
+from itertools import pairwise
+from typing import NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+from google.protobuf.message import DecodeError
+
+from lowfc.contract.messages import CAMERA_STATE, FRAME, RawImage, Role, from_timestamp, wire
+from lowfc.programs.commissioning.conformance.line import NS, Collected, Line, Received
+from lowfc.programs.commissioning.conformance.publisher import LATE_NS
+
+TURN_S = 0.02
+PICTURES = 50
+"""Frames whose pixels are kept."""
+
+
+class Picture(NamedTuple):
+    """A frame without its pixels; `highest` is its brightest pixel, None where it is not whole."""
+
+    receive_time_ns: int
+    put_ns: int
+    image: RawImage
+    size: int
+    checksum: int
+    highest: int | None
+
+    @property
+    def time_ns(self) -> int:
+        """End of the exposure."""
+        return from_timestamp(self.image.timestamp)
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """Rows and columns."""
+        return self.image.height, self.image.width
+
+
+class Camera(Collected):
+    """What was received of a camera.
+
+    Attributes:
+        frames: every frame, without its pixels.
+        unreadable: payloads that are no RawImage.
+        pixels: (rows, columns) of some of them, as little-endian.
+        states: the camera's settings as they came; None for one that could not be read.
+        answers: to a query for the settings.
+    """
+
+    def __init__(self, line: Line) -> None:
+        super().__init__(line, FRAME.key, Role.CAMERA)
+        self.frames: list[Picture] = []
+        self.unreadable = 0
+        self.pixels: list[npt.NDArray[np.uint16]] = []
+        self.states: list[wire.CameraState | None] = []
+        self.answers: list[Received] = []
+
+    def take(self, message: Received) -> None:
+        """Keep what is looked at later."""
+        if message.key == FRAME.key:
+            try:
+                self._frame(message, RawImage.FromString(message.payload))
+            except DecodeError:
+                self.unreadable += 1
+            message = message._replace(payload=b"")
+        elif message.key == CAMERA_STATE.key:
+            try:
+                self.states.append(wire.CameraState.FromString(message.payload))
+            except DecodeError:
+                self.states.append(None)
+        super().take(message)
+
+    def _frame(self, message: Received, image: RawImage) -> None:
+        data, envelope, highest = image.data, message.envelope, None
+        if image.step == 2 * image.width and len(data) == image.step * image.height > 0:
+            pixels = np.frombuffer(data, "<u2").reshape(image.height, image.width)
+            highest = int(pixels.max())
+            if len(self.pixels) < PICTURES:
+                self.pixels.append(pixels)
+        image.ClearField("data")
+        put_ns = 0 if envelope is None else envelope.publish_time_ns
+        self.frames.append(Picture(message.receive_time_ns, put_ns, image, len(data), zlib.crc32(data), highest))
+
+    @property
+    def settings(self) -> wire.CameraState | None:
+        """The last settings that could be read."""
+        return next((state for state in reversed(self.states) if state is not None), None)
+
+    @cached_property
+    def shapes(self) -> list[tuple[int, int]]:
+        """Rows and columns of the frames: one pair, unless they change."""
+        return sorted({frame.shape for frame in self.frames})
+
+    @cached_property
+    def brightest_dn(self) -> int:
+        """The brightest pixel of all frames."""
+        return max((frame.highest or 0 for frame in self.frames), default=0)
+
+    @cached_property
+    def put_times_ns(self) -> list[int]:
+        """When each frame was put; when it arrived, where the envelopes' times are no good."""
+        puts, arrivals = [frame.put_ns for frame in self.frames], [frame.receive_time_ns for frame in self.frames]
+        near = all(abs(arrival - put) <= LATE_NS for put, arrival in zip(puts, arrivals, strict=True))
+        return puts if near and all(later > earlier for earlier, later in pairwise(puts)) else arrivals
+
+
+def watch(line: Line, seconds: float, advance: Callable[[float], None]) -> Camera:
+    """Look at a camera for so long; `advance` is called with how long it has been."""
+    seen, begun_ns = Camera(line), line.now_ns()
+    while (elapsed_s := (line.now_ns() - begun_ns) / NS) < seconds:
+        advance(elapsed_s)
+        seen.collect(min(TURN_S, seconds - elapsed_s))
+    seen.seconds = seconds
+    seen.answers = line.ask(CAMERA_STATE.key)
+    return seen

@@ -1,0 +1,161 @@
+"""The command `lowfc conformance`: what a driver's author still has to put right."""
+
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from functools import partial
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from lowfc.adapters.process.terminal import ConfigFile, Json, configuration, new_app
+from lowfc.programs.commissioning.checks import Check, Status, put
+
+if TYPE_CHECKING:
+    from lowfc.adapters.bus.run import Run
+    from lowfc.programs.commissioning.conformance.line import Line
+
+CONNECT_S = 3.0
+"""How long a device is waited for."""
+
+STATUSES = (Status.WRONG, Status.WARNING, Status.OK)
+FIELDS = {name: name for name in ("name", "status", "expected", "got", "advice")}
+
+conformance_app = new_app(
+    "Check a camera or mirror driver against the message contract.\n\nExample: lowfc conformance camera --run bench"
+)
+
+RunName = Annotated[
+    str | None, typer.Option("--run", help="Name of the run; default: the only one with such a device.")
+]
+
+
+@conformance_app.command()
+def camera(
+    run: RunName = None,
+    config: ConfigFile = None,
+    duration: Annotated[float, typer.Option(min=0.2, max=3600, help="Seconds to look at it.")] = 5.0,
+    as_json: Json = False,
+) -> None:
+    """Look at a camera's messages for a while and say what is wrong with them; exit status 1 where something is.
+
+    The loop may be running meanwhile: nothing is published. With --config, the camera's settings are compared with the
+    loop's configuration, too.
+
+    Example: lowfc conformance camera --run bench --config bench.toml
+    """
+    from lowfc.contract.messages import Role
+    from lowfc.programs.commissioning.conformance.agreement import agreement_checks
+    from lowfc.programs.commissioning.conformance.camera import watch
+    from lowfc.programs.commissioning.conformance.frames import camera_checks
+
+    settings = None if config is None else configuration(config)
+    found = _run_with(Role.CAMERA, run)
+    with _line(found, Role.OPERATOR) as line, _bar(f"looking at the camera for {duration:g} s", duration) as show:
+        seen = watch(line, duration, lambda done_s: show(completed=done_s))
+    checks = list(camera_checks(seen))
+    if settings is not None and seen.settings is not None:
+        checks += agreement_checks(settings, seen.settings)
+    _end("camera", found.run_id, checks, as_json)
+
+
+@conformance_app.command()
+def mirror(
+    run: RunName = None,
+    config: ConfigFile = None,
+    duration: Annotated[float, typer.Option(min=0.05, max=3600, help="Seconds of ordinary commands.")] = 5.0,
+    gentle: Annotated[bool, typer.Option("--gentle", help="Do not try its limits.")] = False,
+    as_json: Json = False,
+) -> None:
+    """Command a mirror and say what is wrong with its answers; exit status 1 where something is.
+
+    It takes the controller's place, so none may be running. The commands are a twentieth of what the configuration
+    allows in one move; only where all of them were answered rightly, and without --gentle, stroke, slew and neighbour
+    limits are exceeded by a little, to see them kept. The mirror ends where it was.
+
+    Example: lowfc conformance mirror --run bench --config lowfc.toml
+    """
+    from lowfc.adapters.bus.run import mirror_role
+    from lowfc.contract.errors import BusError, ConfigurationError
+    from lowfc.contract.messages import Role
+    from lowfc.programs.commissioning.conformance.dialogue import Dialogue, expected_of
+    from lowfc.programs.commissioning.conformance.mirror import mirror_checks
+
+    settings = configuration(config)
+    if settings.lockstep:
+        raise ConfigurationError("lockstep = true: time stands still there, and a mirror has no dead-man; leave it out")
+    found = _run_with(mirror_role(settings.mirror.name), run)
+    if Role.CONTROLLER in found.links.live():
+        raise BusError(f"run {found.run_id!r} has a controller, and only one process may command the mirror: stop it")
+    with _line(found, Role.CONTROLLER) as line, _bar("the mirror", None) as show:
+        dialogue = Dialogue(line, expected_of(settings))
+        checks = mirror_checks(dialogue, duration, lambda what: show(description=f"the mirror: {what}"), gentle=gentle)
+    _end(f"mirror-{settings.mirror.name}", found.run_id, checks, as_json)
+
+
+def _run_with(role: str, name: str | None) -> "Run":
+    """The run of that name, or the only one in which such a role listens.
+
+    Raises:
+        BusError: there is no such run, or none or several to choose from.
+    """
+    from lowfc.adapters.bus.run import open_run, runtime_base
+    from lowfc.contract.errors import BusError
+    from lowfc.programs.cli.ctl.which_run import the_known_run
+
+    if name is not None:
+        named = open_run(the_known_run(name), ())
+        if named.links.network.router:
+            raise BusError(
+                f"run {name!r} goes by a router, whose clock its times are of: try the device on its own host, in a "
+                "run of that host alone"
+            )
+        return named
+    runs = sorted(path.parent.name for path in runtime_base().glob("*/links.json"))
+    links = [open_run(run, ()).links for run in runs]
+    found = [one.run_id for one in links if not one.network.router and role in one.live()]
+    if len(found) == 1:
+        return open_run(found[0], ())
+    if found:
+        raise BusError(f"say which run with --run: {role} is in {', '.join(found)}")
+    raise BusError(
+        f"no {role} listens in any run of this host: start yours with the session file of "
+        f"`lowfc config zenoh --role {role} --run NAME --make`, and name the run with --run"
+    )
+
+
+@contextmanager
+def _line(run: "Run", role: str) -> "Iterator[Line]":
+    """A line to a run, once somebody is connected."""
+    import time
+
+    from lowfc.programs.commissioning.conformance.line import Line
+
+    line = Line(run.links, role)
+    try:
+        deadline_s = time.monotonic() + CONNECT_S
+        while not line.peers() and time.monotonic() < deadline_s:
+            time.sleep(0.02)
+        yield line
+    finally:
+        line.close()
+
+
+@contextmanager
+def _bar(text: str, total: float | None) -> Iterator[Callable[..., None]]:
+    """A progress bar that is gone when it is done; what it yields changes it."""
+    from rich.console import Console
+    from rich.progress import BarColumn, TextColumn, TimeElapsedColumn
+
+    from lowfc.adapters.process.progress import passing_bar
+
+    columns = (TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn())
+    with passing_bar(Console(stderr=True), *columns) as bar:
+        task = bar.add_task(text, total=total)
+        yield partial(bar.update, task)
+
+
+def _end(device: str, run_id: str, checks: list[Check], as_json: bool) -> None:
+    """Print what was found; exit status 1 where something is wrong."""
+    put(checks, STATUSES, FIELDS, {"device": device, "run": run_id} if as_json else None)
+    if any(check.status is Status.WRONG for check in checks):
+        raise typer.Exit(1)

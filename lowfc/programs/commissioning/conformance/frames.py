@@ -1,0 +1,181 @@
+"""What a camera gets wrong of its frames: form, time, rate and pixels."""
+
+from collections.abc import Iterator, Sequence
+from itertools import pairwise
+
+import numpy as np
+import numpy.typing as npt
+
+from lowfc.contract.messages import FRAME, MONO16, wire
+from lowfc.programs.commissioning.checks import Check, Table, ok, warning, wrong
+from lowfc.programs.commissioning.conformance.camera import Camera
+from lowfc.programs.commissioning.conformance.line import NS
+from lowfc.programs.commissioning.conformance.publisher import PROCESS, PUBLISHER
+from lowfc.programs.commissioning.conformance.settings import SETTINGS
+
+_SILENT_PERIODS = 5
+_JITTER = 0.1
+_SMOOTHER = 2.0
+_READOUT_NS = 50_000_000
+_FULL = 0.01
+_STOPPED_NS = 300_000_000
+_VARIED = 8
+_AGE_NS = 1_000_000
+_OWN_WAIT_NS = 10_000_000  # may be this host's, not the camera's
+
+ARRIVED: Table[Camera] = Table()
+FRAMES: Table[Camera] = Table()
+"""Checks of frames, of which there are some."""
+
+
+def camera_checks(seen: Camera) -> Iterator[Check]:
+    """What is right and wrong with a camera."""
+    yield from ARRIVED.of(seen)
+    yield from PUBLISHER.of(seen)
+    if seen.frames:
+        yield from FRAMES.of(seen)
+    yield from SETTINGS.of(seen)
+    yield from PROCESS.of(seen)
+
+
+@ARRIVED.check("frames", f"{FRAME.key}: foxglove.RawImage, one for each exposure")
+def _frames(seen: Camera) -> Check:
+    count = len(seen.published)
+    if not count:
+        advice = "is the camera in this run, with the session file of `lowfc config zenoh --role camera`, on this key?"
+        return wrong(f"none in {seen.seconds:g} s; received: {seen.keys}", advice)
+    if seen.unreadable:
+        got = f"{seen.unreadable} of {count} payloads are no foxglove.RawImage"
+        return wrong(got, "encode the message with its declaration, foxglove/RawImage.proto")
+    return ok(f"{count} in {seen.seconds:g} s")
+
+
+@FRAMES.check("frame time", "end of the exposure, on the clock of the puts, growing")
+def _frame_time(seen: Camera) -> Check:
+    times = [frame.time_ns for frame in seen.frames]
+    if not all(times):
+        return wrong(f"{times.count(0)} frames without a timestamp", "set it in every frame")
+    back = sum(later <= earlier for earlier, later in pairwise(times))
+    if back:
+        got = f"not above the one before it, {back} times of {len(times)}"
+        return wrong(got, "take it anew for every exposure, from a clock that never steps")
+    age_ns = int(np.median(np.subtract(seen.put_times_ns, times)))
+    exposure_ns = 0 if seen.settings is None else seen.settings.exposure_ns
+    got = f"{age_ns / 1e6:.3g} ms before the put"
+    if age_ns < -_AGE_NS:
+        return wrong(f"{-age_ns / 1e6:.3g} ms after the put", "use the same clock for both")
+    if age_ns > _READOUT_NS + exposure_ns:
+        return wrong(got, "use the same clock for both, in nanoseconds since the epoch")
+    if exposure_ns > _AGE_NS and 0.9 * exposure_ns <= age_ns < 1.5 * exposure_ns:
+        advice = "about as long as the exposure: is it the time of its start? If the readout takes so long, all is well"
+        return warning(got, advice)
+    return ok(got)
+
+
+@FRAMES.check("encoding", MONO16)
+def _encoding(seen: Camera) -> Check:
+    encodings = {frame.image.encoding for frame in seen.frames}
+    if encodings == {MONO16}:
+        return ok(MONO16)
+    return wrong(", ".join(map(repr, sorted(encodings))), "send uint16 in DN, little-endian, and call it mono16")
+
+
+@FRAMES.check("bytes", "step is 2 x width, and data are step x height bytes")
+def _bytes(seen: Camera) -> Check:
+    last = next((frame for frame in reversed(seen.frames) if frame.highest is None), None)
+    if last is None:
+        return ok(f"step {seen.frames[-1].image.step}, {seen.frames[-1].size} bytes")
+    rows, columns = last.shape
+    advice = "send whole rows without padding, with the width and height they have"
+    if last.size == rows * columns:
+        advice = "these are bytes, not uint16"
+    elif last.size == 2 * rows * columns:
+        advice = "set step, in bytes"
+    return wrong(f"{rows} x {columns} (height x width), step {last.image.step}, {last.size} bytes", advice)
+
+
+@FRAMES.check("shape", "the same rows and columns in every frame")
+def _shape(seen: Camera) -> Check:
+    got = ", ".join(f"{rows} x {columns}" for rows, columns in seen.shapes)
+    return ok(got) if len(seen.shapes) == 1 else wrong(got, "keep one region while the loop runs")
+
+
+@FRAMES.check("steadiness", "frames at an even rate, as long as the camera is looked at")
+def _steadiness(seen: Camera) -> Check:
+    spans = np.diff(seen.put_times_ns)
+    if not spans.size:
+        return warning("one frame", "look for longer: --duration")
+    period_ns = float(np.median(spans))
+    elapsed_ns = seen.frames[-1].receive_time_ns - seen.frames[0].receive_time_ns
+    lacking_ns = seen.seconds * NS - elapsed_ns
+    if lacking_ns > max(_SILENT_PERIODS * period_ns, 0.2 * seen.seconds * NS, _STOPPED_NS):
+        got = f"frames during {elapsed_ns / 1e9:.1f} of {seen.seconds:g} s"
+        return wrong(got, "does the camera go on, whether or not somebody subscribes? Look again while it runs")
+    late_ns, longest_ns = float(np.percentile(np.abs(spans - period_ns), 99)), float(spans.max())
+    got = (
+        f"every {period_ns / 1e6:.4g} ms, 99 % within {late_ns / 1e6:.3g} ms of it, "
+        f"longest wait {longest_ns / 1e6:.3g} ms"
+    )
+    if longest_ns > max(_SILENT_PERIODS * period_ns, _OWN_WAIT_NS):
+        return warning(got, "what holds the camera up? `lowfc doctor` looks at the host")
+    if late_ns > _JITTER * period_ns:
+        return warning(got, "jitter costs delay: real-time scheduling for the publisher (`lowfc doctor`)")
+    return ok(got)
+
+
+@FRAMES.check("live image", "no two frames alike: there is noise in each")
+def _live_image(seen: Camera) -> Check:
+    sums = [frame.checksum for frame in seen.frames]
+    same = sum(earlier == later for earlier, later in pairwise(sums))
+    if len(sums) > 1 and same == len(sums) - 1:
+        return wrong("all are alike", "is the camera read out anew for every frame?")
+    if same:
+        advice = "publish each exposure once, and count what the camera dropped"
+        return wrong(f"{same} of {len(sums)} are the one before", advice)
+    return ok(f"{len(set(sums))} different ones of {len(sums)}")
+
+
+@FRAMES.check("light", "light above the bias, and hardly a pixel at full well")
+def _light(seen: Camera) -> Check | None:
+    if not seen.pixels:
+        return None
+    highest, state = seen.brightest_dn, seen.settings or wire.CameraState()
+    noise_dn = state.read_noise_e / state.gain_e_per_dn if state.gain_e_per_dn > 0 else 0.0
+    if not highest:
+        return wrong("every pixel of every frame is 0", "are the pixels copied into the message?")
+    if highest <= state.bias_dn + 10 * noise_dn:
+        got = f"brightest pixel {highest} DN, bias {state.bias_dn:g} DN"
+        return warning(got, "all dark: is the shutter open, is the star there?")
+    full = np.mean([np.mean(one >= highest) for one in seen.pixels])
+    if highest == int(state.saturation_dn) and full > _FULL:
+        got = f"{100 * full:.0f} % of the pixels at {highest} DN"
+        return warning(got, "expose for less: what is at full well measures nothing")
+    return ok(f"brightest pixel {highest} DN")
+
+
+@FRAMES.check("byte order", "little-endian, in DN from bit 0 on")
+def _byte_order(seen: Camera) -> Check | None:
+    """By what makes neighbouring pixels alike."""
+    if not seen.pixels:
+        return None
+    picture = seen.pixels[-1]  # not their median: that of swapped bytes is nothing
+    as_is, swapped = _roughness(picture), _roughness(picture.byteswap())
+    if as_is > _SMOOTHER * swapped:
+        got = f"neighbours differ {as_is / max(swapped, 1e-9):.0f} times less with the bytes swapped: big-endian?"
+        return wrong(got, "write the low byte of each pixel first")
+    values = np.unique(np.concatenate([one.reshape(-1) for one in seen.pixels]))
+    bits = int(np.bitwise_or.reduce(values))
+    spare = (bits & -bits).bit_length() - 1 if bits else 0
+    if spare >= 2 and values.size > _VARIED:
+        advice = f"shift them right by {spare}: left-aligned data make gain, bias and saturation wrong"
+        return wrong(f"all pixels are multiples of {1 << spare}", advice)
+    return ok("neighbouring pixels are alike as they are")
+
+
+def _roughness(picture: npt.NDArray[np.uint16]) -> float:
+    """Mean difference of neighbours, as a fraction of the scatter of all pixels."""
+    values = picture.astype(np.float64)
+    if values.size < 4 or not values.std():
+        return 0.0
+    steps: Sequence[float] = [np.abs(np.diff(values, axis=axis)).mean() for axis in (0, 1) if values.shape[axis] > 1]
+    return float(np.mean(steps) / values.std())

@@ -1,0 +1,306 @@
+"""What a mirror's driver gets wrong: it is commanded, gently at first, and its states are held against the contract."""
+
+from collections.abc import Iterator
+from itertools import pairwise
+
+import numpy as np
+
+from lowfc.contract.messages import from_timestamp, wire
+from lowfc.programs.commissioning.checks import Check, Status, ok, warning, wrong
+from lowfc.programs.commissioning.conformance.dialogue import ANSWER_S, MODAL_NM, Dialogue, Single, Tell
+from lowfc.programs.commissioning.conformance.limits import limit_checks
+from lowfc.programs.commissioning.conformance.line import NS
+from lowfc.programs.commissioning.conformance.publisher import PROCESS, PUBLISHER
+
+IDLE_S = 1.0
+EXPIRES_NS = 300_000_000
+SLACK_NS = 400_000_000
+LONGEST_NS = 2_000_000_000
+"""However long a command says that it is valid, a mirror does not hold it longer."""
+
+_FOLLOWING, _EXPIRED = wire.MIRROR_STATUS_FOLLOWING, wire.MIRROR_STATUS_EXPIRED
+_LONG_NS = 60 * NS
+_REFUSED_EVERY_NS = 50_000_000
+_REFUSAL_S = 0.15
+_SETTLE_S = 0.05  # of actuators that are reported where they are, not where they are going
+
+
+def mirror_checks(mirror: Dialogue, seconds: float, tell: Tell, *, gentle: bool = False) -> list[Check]:
+    """What is right and wrong with a mirror; it ends where it was.
+
+    Args:
+        mirror: nobody else commands it.
+        seconds: for how long it is given ordinary commands.
+        tell: called with what is being tried.
+        gentle: do not try its limits.
+    """
+    found: list[Check] = []
+    base_nm = np.zeros(mirror.expected.grid, np.float32)
+    begun_ns = mirror.line.now_ns()
+    try:
+        tell("idle")
+        found += _idle(mirror)
+        if (last := mirror.last) is not None:
+            base_nm = base_nm if (where_nm := mirror.surface_nm(last)) is None else where_nm
+        if not _bad(found, "grid", "state"):
+            mirror.begin(base_nm, 0 if last is None else last.frame_sequence)
+            tell("ordinary commands")
+            found += _next_command(mirror, base_nm, seconds)
+        if not _bad(found, "grid", "state", "answers"):
+            tell("commands that must be refused")
+            found += _refusals(mirror, base_nm)
+            tell("the command timeout")
+            found += _timeout(mirror, base_nm)
+        if gentle or _bad(found):
+            untried = warning("not tried: something above is wrong", "put that right first")
+            if gentle:
+                untried = warning("not tried: --gentle", "try them before the loop is closed, without --gentle")
+            found.append(untried._replace(name="limits", expected="its own stroke, slew and neighbour limits"))
+        else:
+            tell("its limits")
+            found += limit_checks(mirror)
+    finally:
+        if mirror.states and not _bad(found, "grid", "state"):
+            mirror.go(base_nm)
+    mirror.seconds = (mirror.line.now_ns() - begun_ns) / NS
+    return [*found, *PUBLISHER.of(mirror), *PROCESS.of(mirror)]
+
+
+def _bad(found: list[Check], *names: str) -> bool:
+    return any(check.status is Status.WRONG and (not names or check.name in names) for check in found)
+
+
+def _idle(mirror: Dialogue) -> Iterator[Check]:
+    """Before the first command: does it report where it is?"""
+    states = mirror.listen(IDLE_S)
+    expected = f"{mirror.key}: lowfc.v1.MirrorState ten times a second without commands"
+    if mirror.unreadable:
+        got = f"{mirror.unreadable} states are no lowfc.v1.MirrorState"
+        yield wrong(got, "encode the message with its declaration")._replace(name="state", expected=expected)
+        return
+    check, rate_hz = ok(f"{len(states) / IDLE_S:.0f} a second"), len(states) / IDLE_S
+    if not states:
+        advice = "publish it: a starting controller waits a second to learn where the mirror is, then assumes flat"
+        check = wrong(f"none in {IDLE_S:g} s; received: {mirror.keys}", advice)
+    elif rate_hz < 4:
+        advice = "publish it ten times a second: a controller waits for one as it starts"
+        check = warning(f"{rate_hz:.1f} a second", advice)
+    yield check._replace(name="idle state", expected=expected)
+    if states:
+        rows, columns = mirror.expected.grid
+        yield _grid(mirror, states[-1])._replace(name="grid", expected=f"{rows} x {columns} finite float32")
+
+
+def _grid(mirror: Dialogue, state: wire.MirrorState) -> Check:
+    size, got = 4 * state.rows * state.columns, f"{state.rows} x {state.columns}, {len(state.actuators)} bytes"
+    if (state.rows, state.columns) != mirror.expected.grid:
+        return wrong(got, "set mirror.rows and mirror.columns of the configuration, or the driver's grid")
+    if len(state.actuators) != size:
+        return wrong(got, f"send float32, row by row: {size} bytes")
+    odd = np.count_nonzero(~np.isfinite(np.frombuffer(state.actuators, "<f4")))
+    if odd:
+        return wrong(f"{odd} not finite", "NaN is never a value: report 0 for an actuator that is not there")
+    return ok(got)
+
+
+def _next_command(mirror: Dialogue, base_nm: Single, seconds: float) -> Iterator[Check]:
+    """Small commands, one after the other: are they answered, and followed?"""
+    line, period_ns = mirror.line, mirror.expected.period_ns
+    answers: list[wire.MirrorState] = []
+    commanded_nm = base_nm
+    took_ns: list[int] = []
+    same_time = unanswered = 0
+    end_ns, sign = line.now_ns() + round(seconds * NS), 1
+    while line.now_ns() < end_ns and (answers or unanswered < 3):
+        sign = -sign
+        wanted_nm = base_nm + np.float32(sign) * mirror.expected.pattern_nm
+        state, sent_ns, duration_ns = mirror.ask(wanted_nm)
+        if state is None:
+            unanswered += 1
+            continue
+        answers.append(state)
+        commanded_nm = wanted_nm
+        took_ns.append(duration_ns)
+        same_time += from_timestamp(state.timestamp) == sent_ns
+        line.wait(max(0.0, (sent_ns + period_ns - line.now_ns()) / NS))
+    expected = f"a state with each command's frame_sequence within {ANSWER_S * 1e3:.0f} ms"
+    yield _answers(mirror, took_ns, unanswered)._replace(name="answers", expected=expected)
+    if not answers:
+        return
+    last = answers[-1]
+    mirror.listen(_SETTLE_S)
+    settled = [state for _, state in mirror.states if state.frame_sequence == last.frame_sequence]
+    expected = f"the commanded surface within a step of the driver, {mirror.expected.step_nm:.3g} nm"
+    yield _applied(mirror, base_nm, commanded_nm, settled[-1])._replace(name="applied", expected=expected)
+    check = ok(wire.MirrorStatus.Name(last.status).removeprefix("MIRROR_STATUS_"))
+    if last.status != _FOLLOWING:
+        check = wrong(check.got, "report FOLLOWING while a command is in force")
+    yield check._replace(name="status", expected="FOLLOWING")
+    check = ok("the same")
+    if others := len(answers) - same_time:
+        age_ms = (from_timestamp(last.timestamp) - line.now_ns()) / 1e6
+        got = f"{others} of {len(answers)} another, the last {age_ms:.3g} ms from now"
+        check = warning(got, "copy the command's timestamp: logs are joined by it")
+    yield check._replace(name="time", expected="the time of the command that was followed")
+    check = ok(f"{len(last.command_nm)} values")
+    if tuple(last.command_nm) != MODAL_NM:
+        advice = "copy it; leave it out where your limits changed the command: a restarted controller goes on from it"
+        check = warning(check.got, advice)
+    yield check._replace(name="modal command", expected="command_nm of the command that was followed")
+
+
+def _answers(mirror: Dialogue, took_ns: list[int], unanswered: int) -> Check:
+    total = len(took_ns) + unanswered
+    if not took_ns:
+        got = f"none to {total} commands"
+        if mirror.last is not None:
+            got += f"; states say {mirror.last.frame_sequence}"
+        advice = "subscribe the command's key, and publish a state for each with the command's frame_sequence"
+        return wrong(got, advice)
+    if unanswered:
+        got = f"{unanswered} of {total} commands without an answer"
+        severity = warning if unanswered <= total // 50 else wrong
+        return severity(got, "publish a state for every command that is followed")
+    p50_ns, worst_ns = np.percentile(took_ns, (50, 100)).tolist()
+    got = f"{total} answered after {p50_ns / 1e6:.2g} ms, the slowest {worst_ns / 1e6:.2g} ms"
+    period_ns = mirror.expected.period_ns
+    if p50_ns > period_ns / 2:
+        return warning(got, f"more than half of the period, {period_ns / 1e6:g} ms: each adds to the loop's delay")
+    return ok(got)
+
+
+def _applied(mirror: Dialogue, base_nm: Single, commanded_nm: Single, state: wire.MirrorState) -> Check:
+    """Is the reported surface the commanded one? If not, by what does it differ?"""
+    expected, where_nm = mirror.expected, mirror.surface_nm(state)
+    if where_nm is None:
+        got = f"{state.rows} x {state.columns}, {len(state.actuators)} bytes"
+        return wrong(got, "report the actuators' heights, rows x columns finite float32")
+    off_nm = np.where(expected.moving, np.abs(where_nm - commanded_nm), 0)
+    away = np.flatnonzero(off_nm > expected.tolerance_nm)
+    if not away.size:
+        return ok(f"within {float(off_nm.max()):.2g} nm")
+    got = f"{away.size} of {off_nm.size} actuators off, by {float(off_nm.max()):.3g} nm at most"
+    if away.size <= off_nm.size // 10:
+        return warning(got, f"are they dead? Name them in mirror.dead: {', '.join(map(str, away[:8]))}")
+    return wrong(got, _difference(base_nm, commanded_nm, where_nm))
+
+
+def _difference(base_nm: Single, commanded_nm: Single, where_nm: Single) -> str:
+    """What kind of mistake turns the one shape into the other."""
+    asked, got = commanded_nm.astype(np.float64) - base_nm, where_nm.astype(np.float64) - base_nm
+    turns = {
+        "as commanded": got,
+        "with rows and columns exchanged": got.T,
+        "upside down": got[::-1],
+        "left to right": got[:, ::-1],
+        "turned by 180 degrees": got[::-1, ::-1],
+    }
+    alike = {
+        how: float((asked * one).sum() / max(np.linalg.norm(asked) * np.linalg.norm(one), 1e-30))
+        for how, one in turns.items()
+        if one.shape == asked.shape
+    }
+    how = max(alike, key=lambda one: abs(alike[one]))
+    if abs(alike[how]) < 0.9:
+        return "it is another shape altogether: in which order does the driver take the actuators?"
+    scale = float((asked * turns[how]).sum() / (asked**2).sum())
+    advice = f"it is the shape {how}, times {scale:.3g}"
+    if abs(scale - 2) < 0.02:
+        advice += ": report surface, not wavefront"
+    elif abs(scale - 1e-3) < 1e-4:
+        advice += ": report nm, not um"
+    elif scale < 0:
+        advice += ": up is up, in nm of surface"
+    return advice
+
+
+def _refusals(mirror: Dialogue, base_nm: Single) -> Iterator[Check]:
+    """Commands that no mirror may follow; between them good ones, which it must."""
+    rows, columns = mirror.expected.grid
+    other_nm = base_nm + np.float32(0.5) * mirror.expected.pattern_nm[::-1]
+    nan_nm, infinite_nm = other_nm.copy(), other_nm.copy()
+    nan_nm[rows // 2, columns // 2], infinite_nm[rows // 2, columns // 2] = np.nan, np.inf
+    for name, what, wanted_nm, cut in (
+        ("NaN refused", "one actuator NaN", nan_nm, 0),
+        ("infinity refused", "one actuator infinite", infinite_nm, 0),
+        ("wrong grid refused", "one row more", np.zeros((rows + 1, columns), np.float32), 0),
+        ("short command refused", "four bytes missing", other_nm, 4),
+        ("old command refused", "the frame_sequence before the last", other_nm, 0),
+    ):
+        expected = f"a command with {what} changes nothing, and the next good one is followed"
+        state, _, _ = mirror.ask(base_nm)
+        before_nm = mirror.surface_nm(state)
+        if state is None or before_nm is None:
+            check = wrong("a good command before it is not answered", "go on after a command that is refused")
+            yield check._replace(name=name, expected=expected)
+            return
+        earlier = max(0, state.frame_sequence - 1) if name == "old command refused" else None
+        sequence, _ = mirror.put(wanted_nm, sequence=earlier, cut=cut)
+        after, check = mirror.listen(_REFUSAL_S), ok("nothing changed")
+        bad = [one for one in after if mirror.moved(before_nm, one) or one.frame_sequence == sequence]
+        if bad:
+            got = "the state is no finite grid" if mirror.surface_nm(bad[-1]) is None else "it was followed"
+            advice = "check it before anything moves: shape, byte count, isfinite, frame_sequence not below the last"
+            check = wrong(got, advice)
+        yield check._replace(name=name, expected=expected)
+    state, _, _ = mirror.ask(base_nm)
+    if state is None:
+        check = wrong("no answer any more", "catch what cannot be read, and go on")
+        yield check._replace(name="after bad commands", expected="good commands are followed after bad ones")
+        return
+    mirror.listen(_SETTLE_S)
+    sequence, _ = mirror.put(base_nm, sequence=max(0, state.frame_sequence - 1), clear_id=mirror.line.now_ns())
+    check = ok("it was followed")
+    if not any(one.frame_sequence == sequence for one in mirror.listen(_REFUSAL_S)):
+        advice = "on a new clear_id forget the newest frame_sequence: else an operator's clear cannot bring it back"
+        check = warning("it was not", advice)
+    expected = "a command with a new clear_id is followed, though its frame_sequence is below the last"
+    yield check._replace(name="clear", expected=expected)
+
+
+def _timeout(mirror: Dialogue, base_nm: Single) -> Iterator[Check]:
+    """Does a command expire, in its time, and does the mirror follow again?"""
+    mirror.ask(base_nm, EXPIRES_NS)
+    sent_ns = mirror.line.now_ns()
+    mirror.listen(EXPIRES_NS / 2e9)
+    nan_nm = np.full(mirror.expected.grid, np.nan, np.float32)
+    for _ in range(round((EXPIRES_NS / 2 + SLACK_NS) / _REFUSED_EVERY_NS)):
+        mirror.put(nan_nm, valid_ns=_LONG_NS)
+        mirror.listen(_REFUSED_EVERY_NS / NS)
+    expired_ns = _expired_ns(mirror, sent_ns)
+    if expired_ns is None:
+        advice = "watch valid_for_ns by the mirror's own clock, from the command's arrival; then hold or relax, and "
+        check = wrong(f"not within {(EXPIRES_NS + SLACK_NS) / 1e6:.0f} ms", f"{advice}report EXPIRED")
+    else:
+        check = ok(f"after {(expired_ns - sent_ns) / 1e6:.0f} ms")
+        if expired_ns - sent_ns < 0.8 * EXPIRES_NS:
+            check = wrong(check.got, "hold the command for as long as it is valid")
+    expected = f"EXPIRED after valid_for_ns, {EXPIRES_NS / 1e6:.0f} ms here; refused commands in between renew nothing"
+    yield check._replace(name="dead-man", expected=expected)
+    mirror.go(base_nm)
+    state, _, _ = mirror.ask(base_nm, _LONG_NS)
+    sent_ns, check = mirror.line.now_ns(), ok("it is")
+    if state is None or state.status == _EXPIRED:
+        check = wrong("it is not", "let a new command take over")
+    yield check._replace(name="after the dead-man", expected="a good command is followed again")
+    mirror.listen((LONGEST_NS + SLACK_NS) / NS)
+    check = ok("EXPIRED")
+    if _expired_ns(mirror, sent_ns) is None:
+        advice = "bound valid_for_ns yourself: a sender's mistake must not hold the mirror for ever"
+        check = warning(f"not within {(LONGEST_NS + SLACK_NS) / 1e9:g} s", advice)
+    expected = f"EXPIRED after {LONGEST_NS / 1e9:g} s, however long a command says that it is valid"
+    yield check._replace(name="longest command", expected=expected)
+    arrivals = [message.receive_time_ns for message, _ in mirror.since(sent_ns)]
+    longest_s = max((later - earlier for earlier, later in pairwise(arrivals)), default=LONGEST_NS) / 1e9
+    check = ok(f"{longest_s:.2g} s at most without one")
+    if longest_s > 1.0:
+        check = wrong(f"{longest_s:.2g} s without one", "publish the state when it is idle, too")
+    elif longest_s > 0.25:
+        check = warning(f"{longest_s:.2g} s without one", "publish the state ten times a second")
+    yield check._replace(name="silence", expected="states all the time, ten a second, while no command comes")
+
+
+def _expired_ns(mirror: Dialogue, since_ns: int) -> int | None:
+    """When the first state that says EXPIRED came."""
+    arrivals = (message.receive_time_ns for message, state in mirror.since(since_ns) if state.status == _EXPIRED)
+    return next(arrivals, None)

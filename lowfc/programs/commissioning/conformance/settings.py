@@ -1,0 +1,121 @@
+"""What a camera gets wrong of its settings: there, possible, unchanged, those of its frames, sent on request."""
+
+from math import isfinite
+
+import numpy as np
+from google.protobuf.message import DecodeError
+
+from lowfc.contract.messages import CAMERA_STATE, from_timestamp, wire
+from lowfc.programs.commissioning.checks import Check, Table, ok, warning, wrong
+from lowfc.programs.commissioning.conformance.camera import Camera
+
+_FIELDS = tuple(field.name for field in wire.CameraState.DESCRIPTOR.fields if field.name != "timestamp")
+_ABOVE_ZERO = ("exposure_ns", "period_ns", "gain_e_per_dn", "saturation_dn", "rows", "columns", "bit_depth")
+_MOST_BITS = 16
+
+SETTINGS: Table[Camera] = Table()
+
+
+@SETTINGS.check("settings", f"{CAMERA_STATE.key}: lowfc.v1.CameraState on change and twice a second")
+def _settings(seen: Camera) -> Check:
+    count, unreadable = len(seen.states), seen.states.count(None)
+    if unreadable:
+        got = f"{unreadable} of {count} are no lowfc.v1.CameraState"
+        return wrong(got, "encode the message with its declaration")
+    if not count:
+        advice = "publish it: calibration, noise and the guard against a changed camera go by it"
+        return wrong(f"none in {seen.seconds:g} s", advice)
+    if seen.seconds >= 2 and not 1 < count / seen.seconds < 20:
+        return warning(f"{count / seen.seconds:.1f} a second", "publish them twice a second")
+    return ok(f"{count} in {seen.seconds:g} s")
+
+
+@SETTINGS.check("settings' values", "a timestamp; period, gain, saturation, rows, columns and bit depth above 0")
+def _values(seen: Camera) -> Check | None:
+    """Values that a camera can have."""
+    if (state := seen.settings) is None:
+        return None
+    values, highest = {field: float(getattr(state, field)) for field in _FIELDS}, 2.0**state.bit_depth - 1
+    impossible = [f"{field} {value:g}" for field, value in values.items() if not isfinite(value) or value < 0]
+    impossible += [f"{field} 0" for field in _ABOVE_ZERO if values[field] == 0]
+    if not from_timestamp(state.timestamp):
+        impossible.append("no timestamp")
+    if state.bit_depth > _MOST_BITS:
+        impossible.append(f"bit_depth {state.bit_depth}, and pixels of {_MOST_BITS} bits")
+    elif 0 < highest < state.saturation_dn:
+        impossible.append(f"saturation_dn {state.saturation_dn:g} above {highest:g}, the converter's highest")
+    if 0 < state.saturation_dn <= state.bias_dn:
+        impossible.append(f"bias_dn {state.bias_dn:g} not below saturation_dn {state.saturation_dn:g}")
+    if impossible:
+        return wrong(", ".join(impossible), "say what the camera is set to; units are in the names")
+    if state.em_gain < 1:
+        return warning(f"em_gain {state.em_gain:g}", "1 is a detector without multiplication")
+    exposure_ms, period_ms = state.exposure_ns / 1e6, state.period_ns / 1e6
+    if exposure_ms > period_ms:
+        got = f"exposure {exposure_ms:g} ms, period {period_ms:g} ms"
+        return warning(got, "an exposure longer than the period sees two mirror shapes")
+    return ok(f"exposure {exposure_ms:g} of {period_ms:g} ms, saturation {state.saturation_dn:g} DN")
+
+
+@SETTINGS.check("settings kept", "the same all the time: a change opens the loop")
+def _kept(seen: Camera) -> Check | None:
+    states = [state for state in seen.states if state is not None]
+    if not states:
+        return None
+    changed = [field for field in _FIELDS if len({str(getattr(state, field)) for state in states}) > 1]
+    if changed:
+        return warning(f"{', '.join(changed)} changed", "was that wanted? Publish what is set, not what is measured")
+    return ok(f"{len(states)} alike")
+
+
+@SETTINGS.check("settings' size", "rows and columns of the frames")
+def _size(seen: Camera) -> Check | None:
+    if (state := seen.settings) is None or not seen.frames:
+        return None
+    size = (state.rows, state.columns)
+    shapes = ", ".join(f"{rows} x {columns}" for rows, columns in seen.shapes)
+    got = f"{size[0]} x {size[1]}, frames {shapes}"
+    if seen.shapes == [size]:
+        return ok(got)
+    swapped = seen.shapes == [size[::-1]]
+    return wrong(got, "exchange rows and columns" if swapped else "say the size of the region that is sent")
+
+
+@SETTINGS.check("settings' range", "no pixel above saturation_dn and the converter")
+def _range(seen: Camera) -> Check | None:
+    if (state := seen.settings) is None or not seen.frames:
+        return None
+    top = min(state.saturation_dn, 2.0**state.bit_depth - 1)
+    got = f"brightest {seen.brightest_dn} DN, highest {top:g} DN"
+    if seen.brightest_dn > top > 0:
+        return wrong(got, "raise saturation_dn to what pixels reach, or bit_depth; in DN, bias included")
+    return ok(got)
+
+
+@SETTINGS.check("settings' period", "period_ns is what is between two frames' times")
+def _period(seen: Camera) -> Check | None:
+    spans = np.diff([frame.time_ns for frame in seen.frames])
+    period_ns = float(np.median(spans)) if spans.size else 0.0
+    if (state := seen.settings) is None or period_ns <= 0 or not state.period_ns:
+        return None
+    off = abs(period_ns / state.period_ns - 1)
+    got = f"{period_ns / 1e6:.5g} ms, period_ns {state.period_ns / 1e6:.5g} ms"
+    if off > 0.1:
+        return wrong(got, "say the real period: gains and spectra go by it")
+    return warning(got, "say the real period: spectra go by it") if off > 0.01 else ok(got)
+
+
+@SETTINGS.check("settings on request", f"the last one, with its envelope, to a zenoh query of {CAMERA_STATE.key}")
+def _on_request(seen: Camera) -> Check | None:
+    if not seen.states:
+        return None
+    if not seen.answers:
+        return warning("no answer", "declare a queryable on that key: a late joiner asks, and a log begins with it")
+    for answer in seen.answers:
+        if answer.envelope is None:
+            return wrong("an answer without an envelope", "attach the envelope of the message's put")
+        try:
+            wire.CameraState.FromString(answer.payload)
+        except DecodeError:
+            return wrong("an answer that is no lowfc.v1.CameraState", "answer with the last payload")
+    return ok(f"{len(seen.answers)} answer")

@@ -1,0 +1,63 @@
+"""The command `lowfc doctor`: is this host fit for a real-time loop?"""
+
+import sys
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from lowfc.adapters.process.terminal import ConfigFile, Json, configuration
+from lowfc.programs.commissioning.checks import Check, Status, put
+
+if TYPE_CHECKING:
+    from lowfc.programs.commissioning.doctor.facts import Facts
+
+TRIAL_S = 1.0
+"""How long wake-ups are measured in each scheduling class."""
+
+STATUSES = (Status.WARNING, Status.NOTE, Status.OK)
+FIELDS = {"name": "name", "status": "status", "detail": "got", "advice": "advice", "cost": "cost"}
+
+
+def doctor(
+    config: ConfigFile = None,
+    strict: Annotated[bool, typer.Option("--strict", help="Exit status 1 where there is a warning.")] = False,
+    as_json: Json = False,
+) -> None:
+    """Say whether this host is fit for a real-time loop, what to do where it is not, and what it costs otherwise.
+
+    Nothing is changed and nothing needs root: what the loop asks of the host is tried in a process of its own.
+
+    Example: lowfc doctor --config lowfc.toml --strict
+    """
+    from lowfc.adapters.process.host import Host
+    from lowfc.programs.commissioning.doctor.facts import gather
+
+    settings = configuration(config)
+    sys.stderr.write(
+        f"sleeping 1000 times a second for {TRIAL_S:g} s in each scheduling class, to see how late this host wakes\n"
+    )
+    facts = gather(Host(), settings, TRIAL_S)
+    checks = examine(facts)
+    put(checks, STATUSES, FIELDS, measured(facts) if as_json else None)
+    if strict and any(check.status is Status.WARNING for check in checks):
+        raise typer.Exit(1)
+
+
+def examine(facts: "Facts") -> list[Check]:
+    """What every check found; one that cannot read what it needs finds just that."""
+    from lowfc.contract.errors import LowfcError
+    from lowfc.programs.commissioning.doctor import room, timing
+
+    unknown = (OSError, ValueError, LookupError, LowfcError)
+    return [*timing.CHECKS.of(facts, unknown), *room.CHECKS.of(facts, unknown)]
+
+
+def measured(facts: "Facts") -> dict[str, Any]:
+    """What `--json` prints beside the checks: percentiles of the wake-up by scheduling class, and the host."""
+    from lowfc.adapters.process.provenance import provenance
+    from lowfc.programs.commissioning.doctor.timing import wake_up_us
+
+    return {
+        "wake_up_us": {} if isinstance(facts.trial, OSError) else wake_up_us(facts.trial),
+        "host": provenance(),
+    }

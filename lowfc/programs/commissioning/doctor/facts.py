@@ -1,0 +1,87 @@
+"""What the checks of `lowfc doctor` look at."""
+
+import os
+import time
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+from lowfc.adapters.process.host import Host
+from lowfc.adapters.process.trial import Trial, try_out
+from lowfc.contract.configuration import Configuration
+from lowfc.contract.messages import COMMAND, FRAME, MIRROR_STATE
+from lowfc.programs.core.recording.volume import payload_bytes
+
+
+@dataclass(frozen=True, slots=True)
+class Facts:
+    """What the checks look at.
+
+    Attributes:
+        host: the kernel's account of it.
+        config: of the loop that is to run.
+        trial: what was granted and measured; why not, where it could not be tried.
+        busy: other processes while that was measured, the busiest first: name with number, and share of one
+            processor.
+    """
+
+    host: Host
+    config: Configuration
+    trial: Trial | OSError
+    busy: tuple[tuple[str, float], ...]
+
+    @property
+    def tried(self) -> Trial:
+        """What was granted and measured.
+
+        Raises:
+            OSError: it could not be tried.
+        """
+        if isinstance(self.trial, OSError):
+            raise self.trial
+        return self.trial
+
+    @property
+    def asked_cpus(self) -> set[int]:
+        """Processors that the configuration names for camera, controller, mirror and recorder."""
+        asked = self.config.realtime
+        return {*asked.camera_cpus, *asked.controller_cpus, *asked.mirror_cpus, *asked.recorder_cpus}
+
+    @property
+    def bytes_per_frame(self) -> int:
+        """Of a frame, its command and the mirror's state; all else that is sent for a frame is small."""
+        sizes = payload_bytes(self.config)
+        return sizes[FRAME] + sizes[COMMAND] + sizes[MIRROR_STATE]
+
+    @property
+    def bytes_per_s(self) -> float:
+        """Of the loop's traffic."""
+        return self.bytes_per_frame * self.config.camera.rate_hz
+
+
+def gather(host: Host, config: Configuration, seconds: float) -> Facts:
+    """Try what the loop asks for and measure wake-ups for so long in each class; note who else is busy meanwhile."""
+    before, begun_s = host.used_s(), time.monotonic()
+    facts = Facts(host, config, OSError("not tried"), ())
+    trial: Trial | OSError
+    try:
+        trial = try_out(config.realtime, facts.asked_cpus, seconds)
+    except OSError as fault:
+        trial = fault
+    elapsed_s = time.monotonic() - begun_s
+    shares = [
+        (f"{name} ({one[0]})", (used_s - before.get(one, ("", 0.0))[1]) / elapsed_s)
+        for one, (name, used_s) in host.used_s().items()
+        if one[0] != os.getpid()
+    ]
+    return Facts(host, config, trial, tuple(sorted(shares, key=lambda one: -one[1])))
+
+
+def ranges(cpus: Iterable[int]) -> str:
+    """Processors as the kernel writes them, such as 0-3,8."""
+    runs: list[list[int]] = []
+    for cpu in sorted(cpus):
+        if runs and runs[-1][-1] == cpu - 1:
+            runs[-1].append(cpu)
+        else:
+            runs.append([cpu])
+    return ",".join(f"{run[0]}-{run[-1]}" if len(run) > 1 else f"{run[0]}" for run in runs)

@@ -1,0 +1,260 @@
+"""Checks of what a process of the loop may keep and use: memory, sockets, files, disk, libraries, the viewer."""
+
+import datetime
+import platform
+import shutil
+import sys
+from pathlib import Path
+
+import numpy as np
+from threadpoolctl import threadpool_info, threadpool_limits
+
+from lowfc.adapters.bus.own_certificate import WARN_DAYS
+from lowfc.adapters.bus.routed import ending_certificates
+from lowfc.adapters.viewer.rerun_viewer import ViewerError, has_screen, viewer_binary, vulkan_drivers
+from lowfc.programs.commissioning.checks import Check, Table, note, ok, warning
+from lowfc.programs.commissioning.doctor.facts import Facts
+from lowfc.programs.core.recording.volume import bytes_per_s, selected
+
+CHECKS: Table[Facts] = Table()
+"""In a docstring, the first paragraph is what a check looks at, the second when it warns; docs/doctor.md has both."""
+
+_STALL_S = 0.1
+_SHARED_BYTES = 64e6
+_OPEN_FILES = 256
+_BROWSERS = ("chromium", "chromium-browser", "google-chrome", "firefox", "firefox-esr")
+_LIMITS = "give the user memlock unlimited in /etc/security/limits.d, or the service LimitMEMLOCK=infinity"
+
+
+@CHECKS.check("locked memory")
+def _locked_memory(facts: Facts) -> Check:
+    """Locking a process's memory, asked for as the loop asks for it.
+
+    Refused.
+    """
+    if not facts.config.realtime.lock_memory:
+        return note("the configuration does not ask for it: realtime.lock_memory = false")
+    if refused := facts.tried.refused.get("lock_memory"):
+        what, cost = refused
+        return warning(f"refused: {what}", _LIMITS, cost)
+    return ok("granted")
+
+
+@CHECKS.check("swap")
+def _swap(facts: Facts) -> Check:
+    """Swap space, and whether the loop's memory can go there.
+
+    There is some, and the memory is not locked.
+    """
+    total_bytes, used_bytes = facts.host.swap()
+    if not total_bytes:
+        return ok("none")
+    detail = f"{used_bytes / 1e6:.0f} MB in use of {total_bytes / 1e6:.0f} MB"
+    if facts.config.realtime.lock_memory and "lock_memory" not in facts.tried.refused:
+        return ok(f"{detail}; the loop's memory is locked")
+    return warning(
+        f"{detail}; the loop's memory is not locked",
+        f"swapoff --all; or {_LIMITS}",
+        "a page that was swapped out stalls the loop for milliseconds",
+    )
+
+
+@CHECKS.check("huge pages")
+def _huge_pages(facts: Facts) -> Check:
+    """When the kernel takes huge pages by itself: `transparent_hugepage/enabled`.
+
+    Always.
+    """
+    when = facts.host.huge_pages()
+    if when != "always":
+        return ok(when)
+    return warning(
+        when,
+        "echo madvise > /sys/kernel/mm/transparent_hugepage/enabled, or boot with transparent_hugepage=madvise",
+        "a page fault may clear or gather 2 MB in the middle of a frame",
+    )
+
+
+@CHECKS.check("BLAS")
+def _blas(facts: Facts) -> Check:
+    """Linear algebra of numpy, and whether it can be held to one thread, as the loop does.
+
+    It cannot.
+    """
+    names = ", ".join(f"{name}, {threads} threads" for name, threads in sorted(_blas_threads().items()))
+    with threadpool_limits(limits=1):
+        held = _blas_threads()
+    if held and max(held.values()) == 1:
+        return ok(f"{names}; the loop holds it to one")
+    return warning(
+        names or f"none that threadpoolctl knows, in numpy {np.__version__}",
+        "start the loop with OMP_NUM_THREADS=1, OPENBLAS_NUM_THREADS=1 and MKL_NUM_THREADS=1",
+        "threads of a small product wait for each other on the loop's processors",
+    )
+
+
+@CHECKS.check("socket buffers")
+def _socket_buffers(facts: Facts) -> Check:
+    """Bytes that sockets hold for a slow reader: `net.core.{r,w}mem_{default,max}` and `net.ipv4.tcp_{r,w}mem`.
+
+    TCP, by which the processes talk, holds less than 100 ms of the loop's frames, commands and mirror states.
+    """
+    default_bytes, largest_bytes, tcp_bytes = facts.host.socket_buffers()
+    held_s = tcp_bytes / facts.bytes_per_s
+    detail = (
+        f"TCP up to {tcp_bytes / 1e3:.0f} kB, {held_s * 1e3:.0f} ms of the loop's traffic; other sockets "
+        f"{default_bytes / 1e3:.0f} kB, at most {largest_bytes / 1e3:.0f} kB"
+    )
+    if held_s >= _STALL_S:
+        return ok(detail)
+    need = round(facts.bytes_per_s * _STALL_S)
+    return warning(
+        detail,
+        f"raise the third value of sysctl net.ipv4.tcp_rmem and net.ipv4.tcp_wmem to {need} or more",
+        f"a reader that stands still for more than {held_s * 1e3:.0f} ms loses messages, where it need not",
+    )
+
+
+@CHECKS.check("shared memory")
+def _shared_memory(facts: Facts) -> Check:
+    """Size and free room of /dev/shm.
+
+    There is none, it cannot be written, or less than 64 MB is free, which is all that a container gets by default.
+    """
+    cost = "`lowfc replay` cannot start its workers, and a browser with the view may die"
+    found = facts.host.shared_memory()
+    if found is None:
+        return warning("there is no /dev/shm", "mount a tmpfs on /dev/shm", cost)
+    detail = f"{found.free_bytes / 1e6:.0f} MB free of {found.total_bytes / 1e6:.0f} MB"
+    if found.writable and found.free_bytes >= _SHARED_BYTES:
+        return ok(detail)
+    detail += "" if found.writable else ", not writable"
+    return warning(detail, "make it larger: mount -o remount,size=1G /dev/shm, or --shm-size of the container", cost)
+
+
+@CHECKS.check("disk")
+def _disk(facts: Facts) -> Check:
+    """Room for logs in `recorder.folder`, and how long it lasts at `camera.rate_hz`, as the recorder reckons.
+
+    Less than one log of `recorder.longest_s`, or nothing may be written there.
+    """
+    section, rate_hz = facts.config.recorder, facts.config.camera.rate_hz
+    folder = Path(section.folder)
+    free_bytes, _, writable = facts.host.disk(folder)
+    grows = bytes_per_s(facts.config, selected(facts.config))
+    lasts_s = max(0.0, free_bytes - section.min_free_mb * 1e6) / grows
+    detail = (
+        f"{folder.absolute()}: {free_bytes / 1e9:.1f} GB free, {lasts_s / 3600:.1f} h of "
+        f"{grows * 3.6e-6:.1f} GB an hour at {rate_hz:g} Hz"
+    )
+    if not writable:
+        return warning(f"{detail}; not writable", "set recorder.folder to a folder of yours", "nothing is recorded")
+    if lasts_s >= section.longest_s:
+        return ok(detail)
+    return warning(
+        detail,
+        "make room, or set recorder.folder to a larger disk",
+        f"recording ends when {section.min_free_mb:g} MB are left (recorder.min_free_mb); the loop goes on",
+    )
+
+
+@CHECKS.check("open files")
+def _open_files(facts: Facts) -> Check:
+    """How many files and sockets a process may have open.
+
+    Fewer than 256.
+    """
+    limit = facts.host.open_files()
+    detail = "no limit" if limit is None else f"{limit}"
+    if limit is None or limit >= _OPEN_FILES:
+        return ok(detail)
+    return warning(detail, "ulimit -n 1024, or LimitNOFILE=1024 of the service", "a process may fail to join the bus")
+
+
+@CHECKS.check("certificates")
+def _certificates(facts: Facts) -> Check:
+    """Certificates in this host's folder, `network.certificates`, where the loop goes by a router.
+
+    One is not valid, or ends within 60 days.
+    """
+    network = facts.config.network
+    if not network.router:
+        return ok("none needed: the configuration names no router")
+    said = ending_certificates(network, datetime.datetime.now(datetime.UTC))
+    if not said:
+        return ok(f"all in {network.certificates} are valid for more than {WARN_DAYS} days")
+    return warning(
+        "; ".join(said),
+        "lowfc certs --renew where the authority's key is, and copy each ROLE.pem here",
+        "a link that is up stays up; a process or a router that starts after the end is not let in",
+    )
+
+
+@CHECKS.check("python")
+def _python(facts: Facts) -> Check:
+    """The Python that runs the loop.
+
+    A debug build, development mode, or a tracer.
+    """
+    detail = f"{platform.python_implementation()} {platform.python_version()}"
+    slow = {
+        "a debug build": hasattr(sys, "gettotalrefcount"),
+        "development mode": sys.flags.dev_mode,
+        "a tracer or profiler": sys.gettrace() is not None or sys.getprofile() is not None,
+    }
+    if not any(slow.values()):
+        return ok(detail)
+    why = ", ".join(name for name, there in slow.items() if there)
+    return warning(f"{detail}, {why}", "run the loop without", "every line of the loop takes longer")
+
+
+@CHECKS.check("viewer")
+def _viewer(facts: Facts) -> Check:
+    """The rerun viewer, and a screen for its window.
+
+    The viewer is missing.
+    """
+    try:
+        binary = viewer_binary()
+    except ViewerError as fault:
+        return warning("missing", str(fault), "`lowfc view` shows nothing; the loop does not need it")
+    if has_screen():
+        return ok(f"{binary}, and a screen")
+    return note(f"{binary}; no screen for a window", "lowfc view --web", "`lowfc view` opens no window here")
+
+
+@CHECKS.check("graphics driver")
+def _graphics_driver(facts: Facts) -> Check:
+    """Vulkan drivers, with which the viewer draws a window, or a picture without a screen.
+
+    There is none.
+    """
+    drivers = vulkan_drivers()
+    if drivers:
+        return ok(", ".join(path.name for path in drivers))
+    return warning(
+        "no Vulkan driver",
+        "apt install mesa-vulkan-drivers libvulkan1",
+        "`lowfc view --headless-screenshot` makes no picture; --web needs none",
+    )
+
+
+@CHECKS.check("browser")
+def _browser(facts: Facts) -> Check:
+    """A browser for `lowfc view --web`.
+
+    Never; without one it is a note.
+    """
+    found = [name for name in _BROWSERS if shutil.which(name)]
+    if found:
+        return ok(", ".join(found))
+    return note("none found", "apt install chromium, or look from another host through ssh -L", "no `lowfc view --web`")
+
+
+def _blas_threads() -> dict[str, int]:
+    """How many threads each loaded linear algebra takes, by its name."""
+    return {
+        f"{library['internal_api']} {library['version']}": library["num_threads"]
+        for library in threadpool_info()
+        if library["user_api"] == "blas"
+    }

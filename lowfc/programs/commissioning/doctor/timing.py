@@ -1,0 +1,325 @@
+"""Checks of what decides when a process of the loop runs: processors, kernel, clocks, other processes."""
+
+import time
+
+import numpy as np
+
+from lowfc.adapters.process.clock import WALL_TOLERANCE_NS, HostClock, boot_file
+from lowfc.adapters.process.trial import Trial
+from lowfc.programs.commissioning.checks import Check, Table, note, ok, warning
+from lowfc.programs.commissioning.doctor.facts import Facts, ranges
+
+CHECKS: Table[Facts] = Table()
+"""In a docstring, the first paragraph is what a check looks at, the second when it warns; docs/doctor.md has both."""
+
+PROCESSES = ("camera", "controller", "mirror", "recorder")
+
+_IN_LOOP = 3  # of them
+_SLOW_EXIT_US = 50
+_SLOW_SOURCES = ("hpet", "acpi_pm", "jiffies", "refined-jiffies", "pit")
+_SLOW_READING_NS = 1000
+_READINGS = 2000
+_PART_OF_PERIOD = 0.1
+_STOLEN = 1e-3
+_BUSY = 0.1
+_BUSY_SHOWN = 3
+
+
+@CHECKS.check("scheduling class")
+def _scheduling_class(facts: Facts) -> Check:
+    """SCHED_FIFO at `realtime.priority`, asked for as the loop asks for it.
+
+    Refused.
+    """
+    priority = facts.config.realtime.priority
+    if not priority:
+        return note("the configuration asks for the normal class: realtime.priority = 0")
+    if refused := facts.tried.refused.get("priority"):
+        what, cost = refused
+        advice = f"give the user rtprio {priority} in /etc/security/limits.d, or the service LimitRTPRIO={priority}"
+        return warning(f"refused: {what}", advice, cost)
+    return ok(f"SCHED_FIFO priority {priority} is granted")
+
+
+@CHECKS.check("real-time share")
+def _realtime_share(facts: Facts) -> Check:
+    """How much of a processor real-time processes may use: `kernel.sched_rt_runtime_us`.
+
+    None of it. Less than all is a note where camera, controller and mirror must share processors.
+    """
+    runtime_us, period_us = facts.host.realtime_share()
+    if runtime_us < 0:
+        return ok("real-time processes may use all of a processor")
+    detail = f"real-time processes may use {runtime_us / 1e3:g} ms of every {period_us / 1e3:g} ms"
+    advice = "a processor for each of camera, controller and mirror, or sysctl kernel.sched_rt_runtime_us=-1"
+    if runtime_us == 0:
+        return warning(detail, "sysctl kernel.sched_rt_runtime_us=950000", "SCHED_FIFO is refused to everybody")
+    if len(facts.host.usable_cpus()) >= _IN_LOOP:
+        return ok(detail)
+    cost = f"a processor whose share is used up stands still for {(period_us - runtime_us) / 1e3:g} ms"
+    return note(detail, advice, cost)
+
+
+@CHECKS.check("processors")
+def _processors(facts: Facts) -> Check:
+    """Processors that the loop's processes may use, and those that the configuration names.
+
+    Fewer than one for each of camera, controller, mirror and recorder; or one is named that may not be used.
+    """
+    usable, online = facts.host.usable_cpus(), facts.host.online_cpus()
+    detail = f"{len(usable)} usable ({ranges(usable)}) of {len(online)}"
+    asked = facts.asked_cpus
+    if missing := asked and asked - facts.tried.cpus:
+        return warning(
+            f"{detail}; the configuration names {ranges(missing)}",
+            "correct realtime.camera_cpus, controller_cpus and mirror_cpus",
+            "the kernel moves the loop between processors; expect a longer tail",
+        )
+    if len(usable | asked) < len(PROCESSES):
+        return warning(
+            f"{detail}, for {len(PROCESSES)} processes: {', '.join(PROCESSES)}",
+            f"a host with {len(PROCESSES)} processors or more; where it has them, a wider affinity (taskset, cpuset)",
+            "the processes wait for each other: a longer tail, and a lower highest rate",
+        )
+    return ok(detail)
+
+
+@CHECKS.check("isolation")
+def _isolation(facts: Facts) -> Check:
+    """Processors kept free of other programs: `isolcpus` and `nohz_full`.
+
+    There are enough processors to isolate some and none is; or those isolated are not the ones that the configuration
+    names.
+    """
+    isolated, online = facts.host.isolated_cpus(), facts.host.online_cpus()
+    cost = "other programs and the kernel's own work share the loop's processors; expect a longer tail"
+    if not isolated:
+        if len(online) <= len(PROCESSES):
+            return note(f"none, and of {len(online)} there is none to spare")
+        spare = ranges(sorted(online)[-_IN_LOOP:])
+        advice = f"boot with isolcpus={spare} nohz_full={spare} and name them in realtime.*_cpus"
+        return warning("none", advice, cost)
+    without_tick = ranges(isolated & facts.host.tickless_cpus()) or "none"
+    detail = f"{ranges(isolated)}; of these without a timer tick: {without_tick}"
+    asked = facts.asked_cpus
+    if asked and asked <= isolated:
+        return ok(detail)
+    named = ranges(asked) if asked else "none"
+    return warning(
+        f"{detail}; the configuration names {named}", "name the isolated ones in realtime.*_cpus", f"unused; {cost}"
+    )
+
+
+@CHECKS.check("quota")
+def _quota(facts: Facts) -> Check:
+    """Limits of processor time on this process's control groups, such as a container's.
+
+    There is one.
+    """
+    cpus = facts.host.quota_cpus()
+    if cpus is None:
+        return ok("none")
+    return warning(
+        f"{cpus:g} processors' worth of time",
+        "lift it: CPUQuota= of the service, --cpus of the container",
+        "once it is used up every process stands still until the quota is renewed",
+    )
+
+
+@CHECKS.check("frequency")
+def _frequency(facts: Facts) -> Check:
+    """Frequency governor of the usable processors, and turbo.
+
+    A governor other than `performance`.
+    """
+    governors = set(facts.host.governors().values())
+    if not governors:
+        return note("not shown; in a virtual machine the hypervisor decides")
+    turbo = {True: ", turbo on", False: ", turbo off", None: ""}[facts.host.turbo()]
+    detail = f"{', '.join(sorted(governors))}{turbo}"
+    if governors == {"performance"}:
+        return ok(detail)
+    return warning(
+        detail,
+        "cpupower frequency-set --governor performance",
+        "a processor slows down while it waits for a frame, and computes the next one slowly",
+    )
+
+
+@CHECKS.check("idle states")
+def _idle_states(facts: Facts) -> Check:
+    """How deeply an idle processor sleeps: the driver and the longest waking of the states in use.
+
+    The loop is not allowed to keep processors awake, or is not asked to and waking one takes more than 50 us.
+    """
+    driver = facts.host.idle_driver()
+    used = [state for state in facts.host.idle_states() if state.enabled]
+    if driver == "none" or not used:
+        return note(f"driver {driver}, no states shown; in a virtual machine the hypervisor decides")
+    deepest = max(used, key=lambda state: state.exit_us)
+    detail = f"driver {driver}, deepest state {deepest.name} with {deepest.exit_us} us to wake"
+    if facts.config.realtime.disable_cpu_idle:
+        if refused := facts.tried.refused.get("disable_cpu_idle"):
+            what, cost = refused
+            return warning(
+                f"{detail}; not granted: {what}",
+                'a udev rule: KERNEL=="cpu_dma_latency", GROUP="realtime", MODE="0660"; this user in that group',
+                cost,
+            )
+        return ok(f"{detail}; kept awake while the loop runs")
+    if deepest.exit_us <= _SLOW_EXIT_US:
+        return ok(detail)
+    return warning(
+        detail,
+        f"cpupower idle-set --disable-by-latency {_SLOW_EXIT_US}, or boot with processor.max_cstate=1",
+        f"a frame that wakes a processor may wait {deepest.exit_us} us for it",
+    )
+
+
+@CHECKS.check("kernel")
+def _kernel(facts: Facts) -> Check:
+    """Preemption model of the kernel.
+
+    Neither PREEMPT_RT nor full preemption.
+    """
+    words = facts.host.kernel().split()
+    release = words[2]
+    advice = "boot with preempt=full, or a kernel with PREEMPT_RT"
+    cost = "a system call of another program delays a frame until it is done"
+    if "PREEMPT_RT" in words:
+        return ok(f"{release}, PREEMPT_RT")
+    if "PREEMPT_DYNAMIC" in words:
+        model = facts.host.preemption()
+        if not model:
+            return note(f"{release}, PREEMPT_DYNAMIC; which model is in force is hidden", advice, cost)
+        detail = f"{release}, PREEMPT_DYNAMIC, {model}"
+        return ok(detail) if model == "full" else warning(detail, advice, cost)
+    if "PREEMPT" in words:
+        return ok(f"{release}, PREEMPT")
+    return warning(f"{release}, no preemption of the kernel", advice, cost)
+
+
+@CHECKS.check("virtualisation")
+def _virtualisation(facts: Facts) -> Check:
+    """Hypervisor, and the processor time that it gave to others since boot.
+
+    There is one.
+    """
+    name, stolen = facts.host.hypervisor(), facts.host.stolen_share()
+    if not name:
+        return ok("none")
+    much = "; that is much" if stolen > _STOLEN else ""
+    return warning(
+        f"a virtual machine ({name}); {100 * stolen:.2f} % of its time went to others since boot{much}",
+        "the machine itself, or processors that the hypervisor gives to nobody else",
+        "the hypervisor stops a processor without saying so, whatever the scheduling class",
+    )
+
+
+@CHECKS.check("clock source")
+def _clock_source(facts: Facts) -> Check:
+    """What the kernel reads the time from, and what a reading takes.
+
+    A slow source (hpet, acpi_pm, jiffies), or a reading of more than 1000 ns.
+    """
+    source = facts.host.clock_source()
+    begun_ns = time.perf_counter_ns()
+    for _ in range(_READINGS):
+        time.monotonic_ns()
+    reading_ns = (time.perf_counter_ns() - begun_ns) / _READINGS
+    detail = f"{source}, {reading_ns:.0f} ns for a reading"
+    if source not in _SLOW_SOURCES and reading_ns <= _SLOW_READING_NS:
+        return ok(detail)
+    return warning(
+        detail,
+        "boot with clocksource=tsc, on x86 with tsc=reliable where the processor's counter is sound",
+        "every process reads the time several times a frame",
+    )
+
+
+@CHECKS.check("synchronisation")
+def _synchronisation(facts: Facts) -> Check:
+    """Whether a daemon keeps CLOCK_REALTIME, and how well, by the kernel's account.
+
+    None does: it may step.
+    """
+    kept = facts.host.synchronisation()
+    if kept.synchronised:
+        return ok(f"kept; {kept.offset_s * 1e6:.0f} us to correct, error at most {kept.error_s * 1e3:.1f} ms")
+    return warning(
+        "not kept: CLOCK_REALTIME may be wrong, and step when somebody sets it",
+        "run chronyd (with rtcsync), ntpd, systemd-timesyncd or phc2sys before the first run after a boot",
+        "no loop notices a step, but the times in a log are as wrong as the clock was at the first run since the boot, "
+        "and those of two hosts cannot be compared",
+    )
+
+
+@CHECKS.check("boot's clock")
+def _boot_clock(facts: Facts) -> Check:
+    """The clock of all runs since the boot, which the first one set by CLOCK_REALTIME, against CLOCK_REALTIME now.
+
+    They differ by more than 100 ms: CLOCK_REALTIME was wrong then, or is now.
+    """
+    file = boot_file()
+    if not file.exists():
+        return ok("not set yet: the first process of a run does it")
+    ahead_ns = HostClock(file.parent).ahead_ns()
+    detail = f"{ahead_ns / 1e6:+.1f} ms from CLOCK_REALTIME"
+    if abs(ahead_ns) <= WALL_TOLERANCE_NS:
+        return ok(detail)
+    return warning(
+        detail,
+        f"once CLOCK_REALTIME is right: stop all lowfc processes, remove {file} and start them again",
+        "the times in logs are off by so much; the loop does not mind",
+    )
+
+
+@CHECKS.check("wake-up")
+def _wake_up(facts: Facts) -> Check:
+    """How late a process wakes that sleeps until a time, 1000 times in one second, in both scheduling classes.
+
+    In the best class granted, p99 is above a tenth of the frame period, or the latest is above all of it.
+    """
+    figures = wake_up_us(facts.tried)
+    detail = "; ".join(
+        f"{name}: p50 {one['p50']:.0f} us, p99 {one['p99']:.0f} us, max {one['max']:.0f} us"
+        for name, one in figures.items()
+    )
+    best = list(figures.values())[-1]
+    period_us = facts.config.period_ns / 1e3
+    if best["p99"] <= _PART_OF_PERIOD * period_us and best["max"] <= period_us:
+        return ok(detail)
+    return warning(
+        f"{detail}; a frame period is {period_us:.0f} us",
+        "see scheduling class, processors, idle states, virtualisation and load",
+        "frames wait so long before they are looked at, however fast the loop computes",
+    )
+
+
+def wake_up_us(trial: Trial) -> dict[str, dict[str, float]]:
+    """Percentiles of how late a process wakes, us, by scheduling class; the best class last."""
+    classes = {"normal": trial.normal_ns, "SCHED_FIFO": trial.first_ns}
+    return {
+        name: dict(zip(("p50", "p99", "max"), (np.percentile(late_ns, (50, 99, 100)) / 1e3).tolist(), strict=True))
+        for name, late_ns in classes.items()
+        if late_ns
+    }
+
+
+@CHECKS.check("load")
+def _load(facts: Facts) -> Check:
+    """Load average, and which other processes were busy during the measurement.
+
+    The load is above the number of usable processors, or a process took more than a tenth of one.
+    """
+    load, cpus = facts.host.load(), len(facts.host.usable_cpus())
+    busy = [(name, share) for name, share in facts.busy if share > _BUSY]
+    who = ", ".join(f"{name} {100 * share:.0f} %" for name, share in busy[:_BUSY_SHOWN]) or "nobody"
+    detail = f"{load:.2f} in the last minute, {cpus} processors; busy now: {who}"
+    if not busy and load <= cpus:
+        return ok(detail)
+    return warning(
+        detail,
+        "end them, or keep them off the loop's processors",
+        "in the normal class the loop takes turns with them; under SCHED_FIFO they still empty its caches",
+    )

@@ -1,0 +1,209 @@
+"""What a law is tuned from: pseudo-open-loop modes of a log, or of a loop that is running."""
+
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from lowfc.adapters.logs.history import read_history
+from lowfc.adapters.logs.reader import LogReader
+from lowfc.client import Client, configuration_of
+from lowfc.contract.codecs.law_codec import law_of
+from lowfc.contract.errors import DataFileError
+from lowfc.contract.messages import wire
+from lowfc.control.laws.law import Law
+from lowfc.control.laws.linear_law import LinearLaw
+from lowfc.control.laws.spectra import Pieces, pieces
+from lowfc.control.laws.vibration import FEWEST
+from lowfc.control.loop.inputs import Step
+from lowfc.control.loop.safety import LoopMode
+from lowfc.optics.detector.photometry import tilt_nm_per_mas
+from lowfc.programs.logs.what_if.run import LoggedRun
+
+Single = npt.NDArray[np.float32]
+Double = npt.NDArray[np.float64]
+Rows = npt.NDArray[np.bool_]
+
+_SETTLING_S = 0.5  # after the loop was closed
+
+
+@dataclass(frozen=True, slots=True)
+class Telemetry:
+    """Modes of a run, nm rms of wavefront, and the law it ran under.
+
+    Attributes:
+        source: path of the log, or name of the run.
+        noll: Noll index of each mode.
+        delay_frames: the true one, as far as it is known.
+        law: the integrator's gains; `driving` is the linear law in its place, where there was one.
+        closed: whether the rows are of a closed loop.
+        pol: (frames, modes) pseudo-open-loop, in pieces.
+        error: (frames, modes) of the same frames.
+        true_nm: (modes,) rms of the true residual over them; None where nobody knows it.
+        nm_per_mas: of tilt; None where the telescope's size is not known.
+        warnings: what makes the figures less sure.
+    """
+
+    source: str
+    noll: tuple[int, ...]
+    rate_hz: float
+    delay_frames: float
+    law: Law
+    driving: LinearLaw | None
+    closed: bool
+    pol: Pieces
+    error: Pieces
+    true_nm: Double | None
+    nm_per_mas: float | None
+    warnings: tuple[str, ...]
+
+
+def of_log(log: LogReader) -> Telemetry:
+    """The frames of a log that were used while the loop was closed; all of them, where it hardly was.
+
+    What was played, by an acceptance test for one, is nothing that a law shall learn: those frames are left out.
+
+    Raises:
+        DataFileError: the log cannot be read, or has too few frames in a row.
+    """
+    history = read_history(log)
+    run = LoggedRun(history)
+    steps = run.steps
+    rate_hz = history.rate_hz
+    same = run.delay_frames == run.controller_delay
+    pol_nm = steps.pol_nm if same else steps.error_nm - run.seen_nm
+    usable = run.used & np.isfinite(pol_nm).all(axis=1) & ~run.torn & ~run.played & (steps.saturated_pixels == 0)
+    mode = np.where(run.played, np.uint8(0), steps.mode)  # it settles after a play as after it was closed
+    true_nm = None if run.true_nm is None else run.true_nm[1]
+    state = history.controller
+    warnings = list(history.remarks)
+    if not same:
+        warnings.append(
+            f"the controller reckoned with a delay of {run.controller_delay:g} frames, measured from "
+            f"{run.measured_from} it is {run.measured_delay:.2f}: the law is made for {run.delay_frames:g} frames; set "
+            "control.delay_frames"
+        )
+    if log.damage:
+        warnings.append("the log is damaged; what cannot be read is left out")
+    config = history.configuration
+    return _telemetry(
+        str(log.path),
+        run.calibration.noll,
+        rate_hz,
+        run.delay_frames,
+        (run.law, driving(state, history.published.laws)),
+        (steps.sequence, mode, usable),
+        (pol_nm, steps.error_nm, true_nm),
+        tilt_nm_per_mas(config.star.diameter_m) if config is not None else None,
+        warnings,
+    )
+
+
+def of_run(loop: Client, seconds: float, progress: Callable[[float], None] | None = None) -> Telemetry:
+    """The steps that a running loop makes in the next seconds.
+
+    Args:
+        loop: a client of it.
+        seconds: how long to listen.
+        progress: called now and then with the seconds that have passed.
+
+    Raises:
+        BusError: the loop does not answer, or makes no steps.
+        DataFileError: there are too few frames in a row.
+    """
+    state = loop.status().state
+    noll = loop.calibration().noll
+    config = configuration_of(loop)
+    begun_s = time.monotonic()
+    steps: list[Step] = []
+    stream = loop.steps()
+    for step in stream:
+        steps.append(step)
+        passed_s = time.monotonic() - begun_s
+        if progress is not None and len(steps) % 100 == 0:
+            progress(passed_s)
+        if passed_s >= seconds:
+            break
+    stream.close()
+    if state is None or not state.gain:
+        raise DataFileError(f"run {loop.run_id!r} has no calibration yet: `lowfc ctl load` gives it one")
+    period_s = float(np.median(np.diff([step.time_ns for step in steps]))) * 1e-9 if len(steps) > 1 else 0.0
+    usable = np.array([step.pol_nm is not None and step.saturated_pixels == 0 for step in steps])
+    none = np.full(len(noll), np.nan, np.float32)
+    law = Law(*(np.array(values, np.float32) for values in (state.gain, state.leak, state.limit_nm)))
+    return _telemetry(
+        loop.run_id,
+        noll,
+        1 / period_s if period_s > 0 else config.camera.rate_hz,
+        float(state.delay_frames),
+        (law, driving(state, loop.laws())),
+        (
+            np.array([step.frame_sequence for step in steps], np.uint64),
+            np.array([step.mode for step in steps], np.uint8),
+            usable,
+        ),
+        (_rows([step.pol_nm for step in steps], none), _rows([step.error_nm for step in steps], none), None),
+        tilt_nm_per_mas(config.star.diameter_m),
+        [f"{stream.lost} steps did not get here in time"] if stream.lost else [],
+    )
+
+
+def _telemetry(
+    source: str,
+    noll: tuple[int, ...],
+    rate_hz: float,
+    delay_frames: float,
+    laws: tuple[Law, LinearLaw | None],
+    frames: tuple[npt.NDArray[np.uint64], npt.NDArray[np.uint8], Rows],
+    modes_nm: tuple[Single, Single, Single | None],
+    nm_per_mas: float | None,
+    warnings: Sequence[str],
+) -> Telemetry:
+    sequence, mode, usable = frames
+    pol_nm, error_nm, true_nm = modes_nm
+    was_closed = mode == LoopMode.CLOSED
+    opened = np.flatnonzero(~was_closed)
+    since = np.arange(len(mode)) - np.concatenate([[-1], opened])[np.searchsorted(opened, np.arange(len(mode)))]
+    settled = usable & was_closed & (since > _SETTLING_S * rate_hz)
+    pol, closed, rows = _cut(sequence, pol_nm, settled), True, settled
+    if _longest(pol) < FEWEST:
+        pol, closed, rows = _cut(sequence, pol_nm, usable), False, usable
+    if _longest(pol) < FEWEST:
+        raise DataFileError(
+            f"{source}: a law is tuned from at least {FEWEST} frames in a row, {FEWEST / rate_hz:.2g} s; the longest "
+            f"run of good ones has {_longest(pol)}"
+        )
+    known = true_nm is not None and np.isfinite(true_nm[rows]).all()
+    return Telemetry(
+        source=source,
+        noll=noll,
+        rate_hz=rate_hz,
+        delay_frames=delay_frames,
+        law=laws[0],
+        driving=laws[1],
+        closed=closed,
+        pol=pol,
+        error=_cut(sequence, error_nm, rows),
+        true_nm=np.sqrt(np.mean(true_nm[rows].astype(float) ** 2, axis=0)) if known and true_nm is not None else None,
+        nm_per_mas=nm_per_mas,
+        warnings=tuple(warnings),
+    )
+
+
+def driving(state: wire.ControllerState | None, laws: Mapping[str, LinearLaw]) -> LinearLaw | None:
+    """The law that drives the mirror of a controller, or will; None for the integrator."""
+    return law_of(state.law, laws) if state is not None and state.HasField("law") else None
+
+
+def _cut(sequence: npt.NDArray[np.uint64], values: Single, rows: Rows) -> Pieces:
+    return pieces(sequence[rows], values[rows])
+
+
+def _longest(run: Pieces) -> int:
+    return max((len(piece) for piece in run.values), default=0)
+
+
+def _rows(values: Sequence[Single | None], none: Single) -> Single:
+    return np.array([none if value is None else value for value in values], np.float32).reshape(-1, none.size)

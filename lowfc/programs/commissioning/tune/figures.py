@@ -1,0 +1,224 @@
+"""The figures of `lowfc tune`: what the loop leaves now and what a tuned law would, in numbers, words and pictures."""
+
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from lowfc.control.laws import margins
+from lowfc.control.laws.linear_law import LinearLaw, integrator
+from lowfc.control.laws.spectra import in_bins, spectrum
+from lowfc.control.laws.tuning import (
+    Gains,
+    Tuned,
+    best_gains,
+    identified,
+    predicted_nm,
+    tune_integrator,
+    tune_lqg,
+    tune_pi_notch,
+)
+from lowfc.control.laws.vibration import Model
+from lowfc.control.loop.wording import counted
+from lowfc.optics.chain.zernike import mode_name
+from lowfc.programs.commissioning.tune.data import Telemetry
+
+Double = npt.NDArray[np.float64]
+
+CONTROLLERS = ("integrator", "pi-notch", "lqg")
+OPTICAL_GAIN_MAS = 10.0
+"""Tilt of an open loop, rms per axis, above which the sensor shows less than there is."""
+TILTS = (2, 3)
+
+
+def tuned(run: Telemetry, controller: str) -> tuple[Tuned, Gains]:
+    """The best law of a kind for a run.
+
+    Raises:
+        ValueError: there are too few frames, or no law of this kind is stable.
+    """
+    leak = run.law.leak.astype(np.float64)
+    gains = best_gains(run.pol, run.rate_hz, run.delay_frames, leak)
+    models = identified(run.pol, run.rate_hz)
+    match controller:
+        case "integrator":
+            return tune_integrator(models, gains, run.noll, leak, run.delay_frames), gains
+        case "pi-notch":
+            return tune_pi_notch(models, gains, run.noll, leak, run.delay_frames), gains
+        case _:
+            return tune_lqg(run.pol, models, gains, run.noll, leak, run.delay_frames), gains
+
+
+def law_now(run: Telemetry) -> LinearLaw:
+    """The law that the run ended with."""
+    return run.driving or integrator(run.law.gain, run.law.leak, run.noll, run.delay_frames, run.rate_hz)
+
+
+def figures(run: Telemetry, best: Tuned, gains: Gains, controller: str) -> dict[str, Any]:
+    """What `--json` prints."""
+    now = law_now(run)
+    achieved_nm = _achieved_nm(run, gains.noise_nm)
+    leak = run.law.leak.astype(np.float64)
+    integrator_nm = tune_integrator(best.models, gains, run.noll, leak, run.delay_frames).predicted_nm
+    now_nm = predicted_nm(now, best.models, run.delay_frames) if margins.margins(now, run.delay_frames).stable else None
+    modes: list[dict[str, Any]] = []
+    for place, index in enumerate(run.noll):
+        model = best.models[place]
+        modes.append(
+            {
+                "noll": index,
+                "name": mode_name(index),
+                "kind": best.kinds[place],
+                "gain_now": None if run.driving else round(float(run.law.gain[place]), 6),
+                "gain_best": round(float(gains.gain[place]), 4),
+                "achieved_nm": None if achieved_nm is None else float(achieved_nm[place]),
+                "predicted_now_nm": None if now_nm is None else float(now_nm[place]),
+                "predicted_nm": float(best.predicted_nm[place]),
+                "integrator_predicted_nm": float(integrator_nm[place]),
+                "noise_nm": float(np.sqrt(model.noise_nm2)),
+                "gain_margin": _finite(float(best.margins.gain_margin[place])),
+                "phase_margin_deg": float(best.margins.phase_margin_deg[place]),
+                "max_rejection": float(best.margins.peak[place]),
+                "lines": _lines(model),
+            }
+        )
+    open_nm = np.sqrt(np.mean(run.pol.joined() ** 2, axis=0))
+    tilt: dict[str, Any] = {
+        "open": _tilt_mas(run, open_nm),
+        "achieved": _tilt_mas(run, achieved_nm),
+        "predicted": _tilt_mas(run, best.predicted_nm),
+        "integrator_predicted": _tilt_mas(run, integrator_nm),
+    }
+    return {
+        "source": run.source,
+        "controller": controller,
+        "law_now": now.name,
+        "rate_hz": run.rate_hz,
+        "delay_frames": run.delay_frames,
+        "closed": run.closed,
+        "frames": run.pol.frames,
+        "achieved_from": None if achieved_nm is None else ("truth" if run.true_nm is not None else "error less noise"),
+        "tilt_mas": tilt,
+        "gain_margin": _finite(float(best.margins.gain_margin.min())),
+        "phase_margin_deg": float(best.margins.phase_margin_deg.min()),
+        "max_rejection": float(best.margins.peak.max()),
+        "modes": modes,
+        "warnings": [*run.warnings, *_doubts(run, tilt["open"], now_nm is not None)],
+    }
+
+
+def render(found: dict[str, Any]) -> str:
+    """The figures as a table."""
+    state = "closed" if found["closed"] else "open"
+    lines = [
+        f"{found['source']}: {counted(found['frames'], 'frame')} at {found['rate_hz']:.4g} Hz, loop {state}, delay "
+        f"{found['delay_frames']:.2f} frames, law {found['law_now']}",
+        "",
+        f"{'residual, nm rms':<26}{'gain now':>9}{'best':>7}{'achieved':>10}{'in theory':>10}  {'tuned to':<11}"
+        f"{'predicted':>9}{'gain m.':>9}{'phase m.':>9}{'max |S|':>8}  lines, Hz (nm rms)",
+    ]
+    for mode in found["modes"]:
+        found_lines = ", ".join(f"{line['frequency_hz']:.2f} ({line['rms_nm']:.2g})" for line in mode["lines"])
+        lines.append(
+            f"{mode['noll']:>3} {mode['name']:<22}{_or_dash(mode['gain_now'], '>9.3g')}{mode['gain_best']:>7.2f}"
+            f"{_or_dash(mode['achieved_nm'], '>10.3f')}{_or_dash(mode['predicted_now_nm'], '>10.3f')}  "
+            f"{mode['kind']:<11}{mode['predicted_nm']:>9.3f}{_factor(mode['gain_margin'])}"
+            f"{mode['phase_margin_deg']:>9.0f}{mode['max_rejection']:>8.2f}  {found_lines}".rstrip()
+        )
+    tilt = found["tilt_mas"]
+    if tilt["predicted"] is not None:
+        achieved = "" if tilt["achieved"] is None else f", achieved {tilt['achieved']:.2f}"
+        lines += [
+            "",
+            f"tilt per axis, mas rms: open {tilt['open']:.2f}{achieved}, predicted {tilt['predicted']:.2f} "
+            f"({found['controller']}), {tilt['integrator_predicted']:.2f} (best integrator)",
+        ]
+    lines += [f"warning: {warning}" for warning in found["warnings"]]
+    return "\n".join(lines)
+
+
+def picture(run: Telemetry, best: Tuned) -> bytes:
+    """PNG: spectra of the two largest modes: as it was, as modelled, and what the tuned law would leave.
+
+    Raises:
+        ConfigurationError: matplotlib is not installed.
+    """
+    from lowfc.adapters.files.drawing import figure_class, png
+
+    figure = figure_class()(figsize=(10, 8), layout="constrained")
+    found = spectrum(run.pol, run.rate_hz)
+    if found is None:  # a run that can be tuned from has one
+        return b""
+    largest = np.argsort(-found.variance_nm2())[:2]
+    for axes, place in zip(figure.subplots(2, 1, sharex=True), largest.tolist(), strict=False):
+        model = best.models[place]
+        omega = 2 * np.pi * found.frequency_hz[1:] / run.rate_hz
+        one_sided = 2 / run.rate_hz
+        modelled = one_sided * (model.spectrum_nm2(omega) + model.noise_nm2)
+        S = margins.rejection(best.law, found.frequency_hz[1:], run.delay_frames)[:, place]
+        T = margins.noise_transfer(best.law, found.frequency_hz[1:], run.delay_frames)[:, place]
+        left = one_sided * (S**2 * model.spectrum_nm2(omega) + T**2 * model.noise_nm2)
+        axes.loglog(found.frequency_hz[1:], found.power_nm2_hz[1:, place], color="0.6", label="pseudo-open-loop")
+        closed = spectrum(run.error, run.rate_hz) if run.closed else None
+        if closed is not None:
+            binned_hz, (power,) = in_bins(closed.frequency_hz, [closed.power_nm2_hz[:, place]])
+            axes.loglog(binned_hz, power, color="tab:orange", label="error, as it was")
+        axes.loglog(found.frequency_hz[1:], modelled, color="tab:blue", lw=1, label="model")
+        axes.loglog(found.frequency_hz[1:], left, color="tab:green", label=f"residual, {best.kinds[place]}, in theory")
+        axes.set(ylabel=f"Z{run.noll[place]} {mode_name(run.noll[place])}, nm$^2$/Hz")
+        axes.legend()
+    axes.set(xlabel="Hz")
+    return png(figure)
+
+
+def _achieved_nm(run: Telemetry, noise_nm: Double) -> Double | None:
+    """Rms (modes,) of the residual: the true one where it is known, or the error's less the noise's."""
+    if not run.closed:
+        return None
+    if run.true_nm is not None:
+        return run.true_nm
+    squares = np.mean(run.error.joined() ** 2, axis=0)
+    return np.asarray(np.sqrt(np.maximum(squares - noise_nm**2, 0.0)))
+
+
+def _lines(model: Model) -> list[dict[str, float]]:
+    return [
+        {
+            "frequency_hz": round(line.frequency_hz, 4),
+            "width_hz": float(f"{line.width_hz:.3g}"),
+            "rms_nm": float(f"{np.sqrt(line.variance_nm2):.4g}"),
+        }
+        for line in model.lines
+    ]
+
+
+def _tilt_mas(run: Telemetry, rms_nm: Double | None) -> float | None:
+    tilts = np.isin(run.noll, TILTS)
+    if rms_nm is None or run.nm_per_mas is None or not tilts.any():
+        return None
+    return float(np.sqrt(np.mean(rms_nm[tilts] ** 2))) / run.nm_per_mas
+
+
+def _doubts(run: Telemetry, open_mas: float | None, stable: bool) -> list[str]:
+    found = []
+    if not run.closed and open_mas is not None and open_mas > OPTICAL_GAIN_MAS:
+        found.append(
+            f"an open loop with {open_mas:.1f} mas rms of tilt per axis, above {OPTICAL_GAIN_MAS:g}: the sensor shows "
+            "less than there is (optical gain), and lines that are none; close the loop with any stable gain and tune "
+            "from that log"
+        )
+    if not stable:
+        found.append("the law of the log is unstable with this delay, so that theory says nothing about it")
+    return found
+
+
+def _or_dash(value: float | None, form: str) -> str:
+    return f"{'-':>{int(form[1:].split('.')[0])}}" if value is None else f"{value:{form}}"
+
+
+def _finite(value: float) -> float | None:
+    return value if np.isfinite(value) else None
+
+
+def _factor(value: float | None) -> str:
+    return f"{'>100':>9}" if value is None or value > 100 else f"{value:>9.2f}"

@@ -1,0 +1,1 @@
+"""The controller's and the recorder's processes."""

@@ -1,0 +1,93 @@
+"""The recorder's process: joins a run, and records it until it is stopped."""
+
+from collections.abc import Callable
+from pathlib import Path
+
+from lowfc.adapters.bus.run import Run
+from lowfc.adapters.bus.zenoh_bus import ZenohBus
+from lowfc.adapters.logs.selection import EVERYTHING, Selection
+from lowfc.adapters.logs.series import STANDARD, Limits, shortage
+from lowfc.adapters.logs.writer import Attachment
+from lowfc.adapters.process.clock import Clock, HostClock
+from lowfc.adapters.process.provenance import provenance
+from lowfc.adapters.process.realtime import step_back
+from lowfc.contract.codecs import input_file
+from lowfc.contract.errors import DataFileError
+from lowfc.contract.messages import Role
+from lowfc.programs.core.recording.recorder import Recorder
+from lowfc.programs.core.recording.summary import Summary
+
+_LARGEST_ATTACHMENT_BYTES = 1 << 28
+
+
+def record(
+    run: Run,
+    folder: Path,
+    *,
+    configuration: Path | None = None,
+    calibration: Path | None = None,
+    seed: int | None = None,
+    limits: Limits = STANDARD,
+    clock: Clock | None = None,
+    priority: int | None = None,
+    cpus: set[int] | None = None,
+    selection: Selection = EVERYTHING,
+    expected_bytes_per_s: float = 0.0,
+    begins: Callable[[], None] = lambda: None,
+) -> Summary:
+    """Record a run into `folder` until SIGTERM or SIGINT; the process of `lowfc record`.
+
+    Args:
+        run: the run to join.
+        folder: where the logs go.
+        configuration: TOML file to put into the log.
+        calibration: FITS file to put into the log.
+        seed: of a simulated run.
+        limits: when a log is finished and the next begun, and when there is no room for one.
+        clock: the run's; the host's when None.
+        priority: of SCHED_FIFO, below the loop's; None leaves the normal class.
+        cpus: processors to stay on; None leaves all.
+        selection: what is recorded.
+        expected_bytes_per_s: growth of the logs, by the configuration.
+        begins: called once there is room for a log.
+
+    Raises:
+        BusError: another recorder has this run.
+        DataFileError: a file cannot be read, or no log can be written in `folder`.
+    """
+    if short := shortage(folder, limits.min_free_bytes):
+        raise DataFileError(short)
+    begins()
+    attachments = [
+        _attached(path, media_type)
+        for path, media_type in ((configuration, "application/toml"), (calibration, "application/fits"))
+        if path is not None
+    ]
+    granted = step_back(priority, cpus)
+    clock = HostClock() if clock is None else clock
+    bus = ZenohBus(run.links, Role.RECORDER, clock)
+    try:
+        recorder = Recorder(
+            bus,
+            clock,
+            run.run_id,
+            folder,
+            metadata={"lowfc": {**provenance(run.run_id, seed), "clock_ahead_ms": f"{clock.ahead_ns() / 1e6:.3f}"}},
+            attachments=attachments,
+            limits=limits,
+            granted=granted,
+            selection=selection,
+            expected_bytes_per_s=expected_bytes_per_s,
+        )
+        recorder.catch_signals()
+        recorder.service.announces = True
+        return recorder.run()
+    finally:
+        bus.close()
+
+
+def _attached(path: Path, media_type: str) -> Attachment:
+    try:
+        return Attachment(path.name, media_type, input_file.read_whole(path, _LARGEST_ATTACHMENT_BYTES))
+    except OSError as fault:
+        raise DataFileError(f"{path} cannot be read for the log: {fault.strerror}") from fault

@@ -1,0 +1,357 @@
+"""The recorder: every message of a run into one log, and an account of those that it did not get.
+
+The bus's threads only append to a bounded queue; the loop here empties it, so that a slow disk costs messages, which
+are counted, and never time in the loop. A disk that refuses ends the recording and nothing else.
+"""
+
+import signal
+import time
+from collections.abc import Mapping, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
+from functools import partial
+from pathlib import Path
+from types import FrameType
+
+from lowfc.adapters.bus.backlog import Backlog
+from lowfc.adapters.bus.bus import UNREADABLE, Bus, Sample
+from lowfc.adapters.logs.loss_account import LossAccount
+from lowfc.adapters.logs.selection import EVERYTHING, Selection
+from lowfc.adapters.logs.series import STANDARD, Limits, LogSeries
+from lowfc.adapters.logs.writer import Attachment
+from lowfc.adapters.process.clock import Clock
+from lowfc.adapters.process.realtime import NOTHING, Granted
+from lowfc.adapters.process.service import Service
+from lowfc.contract.errors import BadMessageError, DataFileError
+from lowfc.contract.messages import HEALTH, TOPICS, Role, Topic, wire
+from lowfc.programs.core.recording.peers import Others
+from lowfc.programs.core.recording.summary import Summary
+from lowfc.programs.core.recording.switch import RecordingSwitch
+from lowfc.programs.core.recording.volume import in_words
+
+QUEUE_MESSAGES = 20_000
+"""Messages that may wait for the disk: about 4 s of a 1 kHz loop, 90 MB."""
+QUEUE_BYTES = 256_000_000
+"""Payloads that may wait for the disk, whatever their size."""
+MOST_CHANNELS = 4096
+"""Starts of publishers after which the next log is begun: each is a channel of the log, and costs memory."""
+
+_TURN_S = 0.02
+_FLUSH_NS = 250_000_000
+_SETTLE_S = (0.3, 1.5)
+_DRAIN_S = 1.0
+_SLOW_NS = 1_000_000_000
+_LARGEST_ATTACHMENT_BYTES = 1 << 28
+
+
+class Recorder:
+    """Records a run, from its bus to its logs."""
+
+    def __init__(
+        self,
+        bus: Bus,
+        clock: Clock,
+        run_id: str,
+        folder: Path,
+        *,
+        metadata: Mapping[str, Mapping[str, str]],
+        attachments: Sequence[Attachment] = (),
+        limits: Limits = STANDARD,
+        granted: Granted = NOTHING,
+        selection: Selection = EVERYTHING,
+        expected_bytes_per_s: float = 0.0,
+    ) -> None:
+        """Subscribe to everything; recording starts with `run`.
+
+        Args:
+            bus: of the run.
+            clock: of the run.
+            run_id: name of the run.
+            folder: where the logs go.
+            metadata: for the start of each log, by name.
+            attachments: files for the start of each log.
+            limits: when a log is finished and the next begun, and when there is no room for one.
+            granted: what the host granted this process.
+            selection: what is recorded.
+            expected_bytes_per_s: growth of the logs, until it has been measured; 0 where nobody knows.
+        """
+        self._bus = bus
+        self._clock = clock
+        self._backlog = Backlog(QUEUE_MESSAGES, QUEUE_BYTES)
+        self._ledger = LossAccount()
+        self._selection = selection
+        self._folder, self._min_free_bytes = folder, limits.min_free_bytes
+        self._expected_bytes_per_s = expected_bytes_per_s
+        self._series = LogSeries(folder, clock, {**metadata, **selection.metadata}, attachments, limits)
+        self._others = Others(bus)
+        self._paused = False
+        self._ender = ThreadPoolExecutor(1, "end-log")
+        self._ending: Future[None] | None = None
+        self._hurried = False
+        self._failure = ""
+        self._flush_due_ns = self._most_starts = 0
+        self._begun_ns = self._oldest_ns = 0
+        self._longest_wait_ns = self._longest_unflushed_ns = self._slowest_ns = 0
+        # Before the service, which subscribes to Health: who has heard of that has heard of all others.
+        for topic in TOPICS:
+            bus.subscribe(topic, partial(self._backlog.put, topic))
+        self.service = Service(Role.RECORDER, run_id, clock, bus, granted=granted, fill=self._fill)
+        self._switch = RecordingSwitch(bus, clock, {"start": self._resume, "stop": self._pause}, self._outlook)
+
+    def catch_signals(self) -> None:
+        """Finish the log at SIGTERM, Ctrl-C or a lost terminal; a second one does not wait for the others' last words.
+
+        For the main thread.
+        """
+        for number in (signal.SIGTERM, signal.SIGINT, signal.SIGHUP):
+            if number != signal.SIGHUP or signal.getsignal(number) is not signal.SIG_IGN:  # as nohup leaves it
+                signal.signal(number, self._told)
+
+    def run(self) -> Summary:
+        """Record until told to stop.
+
+        Raises:
+            DataFileError: the first log cannot be opened.
+        """
+        self._settle()
+        for sample in self._others.ask():
+            self._write(sample)
+        self._begin()
+        self._begun_ns = self._clock.host_ns()
+        self.service.awaited = lambda: "" if self.service.heard else "any other process"
+        self.service.state = "ready"
+        while self.service.running:
+            self._turn()
+            time.sleep(_TURN_S)
+        self.service.state = "stopping"
+        self._drain()
+        summary = self._close()
+        self.service.finish()
+        return summary
+
+    def _told(self, number: int, frame: FrameType | None) -> None:
+        self._hurried = not self.service.running
+        self.service.stop(signal.Signals(number).name)
+
+    def _settle(self) -> None:
+        """Wait until those who are there already have been heard, so that they can be asked."""
+        begun_s = time.monotonic()
+        shortest_s, longest_s = _SETTLE_S
+        while self.service.running:
+            self.service.beat()
+            time.sleep(_TURN_S)
+            age_s = time.monotonic() - begun_s
+            if age_s >= longest_s or (age_s >= shortest_s and len(self.service.heard) >= self._bus.peers()):
+                return
+
+    def _begin(self, *, anew: bool = True) -> None:
+        """Begin a log, or unless `anew` its next part, with what the messages in it depend on."""
+        self._series.begin(self._others.kept.values(), anew=anew)
+        self._most_starts = self._ledger.starts + MOST_CHANNELS
+        self.service.event("RECORDING")
+
+    def _turn(self) -> None:
+        """Write what has arrived; now and then flush, report and rotate; do what an operator asks."""
+        self._write_waiting()
+        for sample in self._others.ask_meanwhile(more=self.service.running):
+            self._write(sample)
+        if self._clock.host_ns() >= self._flush_due_ns:
+            self._look_after()
+        self._switch.serve(self._series.files)
+        self.service.beat()
+
+    def _write_waiting(self) -> None:
+        for _ in range(len(self._backlog)):
+            topic, sample = self._backlog.take()
+            self._take(topic, sample)
+            now_ns = self._clock.host_ns()
+            self._longest_wait_ns = max(self._longest_wait_ns, now_ns - self._arrival_ns(sample))
+            if now_ns >= self._flush_due_ns:
+                self._look_after()
+
+    def _pause(self) -> str | None:
+        """Finish the log with all that has arrived; return why not, if so, and None until the disk has it."""
+        try:
+            if self._ending is None:
+                if self._failure or self._paused:
+                    return self._failure or "nothing is being recorded"
+                self.service.event("RECORDING_STOPPED", why="operator asked")
+                self._say_losses()
+                self._write_waiting()
+                self._flush()
+                self._series.end(self._figures(), wait=False)
+                self._paused = True
+                self._ending = self._ender.submit(self._series.end, {})  # waits for it
+            if not self._ending.done():
+                return None
+            ending, self._ending = self._ending, None
+            ending.result()
+        except DataFileError as fault:
+            self._fail(fault)
+        self._paused = not self._failure
+        self.service.state = "ready"  # its Health, for who asks next
+        return self._failure
+
+    def _resume(self) -> str:
+        """Begin the next log; return why not, if so."""
+        if self._failure:
+            return f"{self._failure}; start another recorder"
+        if not self._paused or not self.service.running:
+            return "it is being recorded already" if self.service.running else "the recorder is ending"
+        try:
+            if short := self._series.shortage():
+                return short
+            self._begin()
+        except DataFileError as fault:
+            self._series.give_up()
+            return str(fault)
+        self._paused = False
+        self.service.state = "ready"
+        self._others.ask_again()
+        return ""
+
+    def _look_after(self) -> None:
+        """Flush, begin the next log when it is time, say what was lost, be heard."""
+        self._flush()
+        self._flush_due_ns = self._clock.host_ns() + _FLUSH_NS
+        self._say_losses()
+        if self._series.longest_write_ns > max(_SLOW_NS, self._slowest_ns):
+            self._slowest_ns = self._series.longest_write_ns
+            self.service.event("DISK_SLOW", stall_s=self._slowest_ns * 1e-9, waiting=len(self._backlog))
+        self.service.beat()
+
+    def _take(self, topic: Topic, sample: Sample) -> None:
+        """Record one message, unless it was recorded when it was asked for."""
+        try:
+            self._ledger.names.admit(topic, sample.key)
+        except BadMessageError as fault:
+            self.service.unreadable(topic.key, fault)
+            return
+        asked = self._others.was_asked(sample)
+        unwanted = self._paused or not self._selection.keeps(topic, sample.sequence, sample.payload)
+        recorded = not self._failure if asked else not unwanted and self._write(sample)
+        self._ledger.enter(topic, sample, recorded=recorded, unwanted=unwanted)
+        if topic is HEALTH:
+            self._hear(topic, sample)
+        elif topic.queryable:
+            self._others.keep(sample)
+
+    def _hear(self, topic: Topic, sample: Sample) -> None:
+        try:
+            _, health = self._ledger.names.health(sample.key, sample.payload)
+        except UNREADABLE:
+            return  # it is in the log as it came; the service counts it
+        self._others.hear(sample, health)
+        try:
+            self._ledger.believe(sample, health)
+        except BadMessageError as fault:
+            self.service.unreadable(topic.key, fault)
+
+    def _write(self, sample: Sample) -> bool:
+        try:
+            written = self._series.write(sample)
+        except DataFileError as fault:
+            self._fail(fault)
+            return False
+        if written:
+            self.service.work += 1
+            self._oldest_ns = self._oldest_ns or self._arrival_ns(sample)
+        return written
+
+    def _arrival_ns(self, sample: Sample) -> int:
+        return max(sample.receive_time_ns, self._begun_ns)
+
+    def _flush(self) -> None:
+        """Make what was written safe; end the log where it is full, and the recording where the disk nearly is."""
+        try:
+            if self._ending is None:
+                self._series.flush()
+            self._flushed()
+            if self._failure or self._paused:
+                return
+            if short := self._series.shortage():
+                self._failure = short
+                self._series.end(self._figures() | {"stopped": short})
+                self.service.event("RECORDING_FAILED", why=f"{short}; the log is complete")
+            elif self._series.full or self._ledger.starts >= self._most_starts:
+                self._series.end(self._figures(), wait=False)
+                self._begin(anew=False)
+                self._others.ask_again()
+        except DataFileError as fault:
+            self._fail(fault)
+
+    def _outlook(self) -> str:
+        """What the recording will take, by what it has taken; empty where nobody knows."""
+        growth = self._series.bytes_per_s or self._expected_bytes_per_s
+        return in_words(growth, self._folder, self._min_free_bytes) if growth else ""
+
+    def _flushed(self) -> None:
+        self._ledger.settle()
+        if self._oldest_ns:
+            age_ns = self._clock.host_ns() - self._oldest_ns
+            self._longest_unflushed_ns = max(self._longest_unflushed_ns, age_ns)
+            self._oldest_ns = 0
+
+    def _fail(self, fault: DataFileError) -> None:
+        """Give up recording, and nothing else: the process lives, and counts what is lost from here."""
+        self._series.give_up()
+        self._ledger.revert()
+        self._failure = str(fault)
+        self.service.event("RECORDING_FAILED", why=fault)
+
+    def _say_losses(self) -> None:
+        for topic, count in self._ledger.news().items():
+            self.service.event("MESSAGES_LOST", topic=topic, count=count)
+
+    def _drain(self) -> None:
+        """Wait a while for the last Health of the others, which counts what they sent."""
+        deadline_s = time.monotonic() + _DRAIN_S
+        while not self._hurried:
+            self._turn()
+            if self._others.stopped(but=self.service.name) or time.monotonic() >= deadline_s:
+                return
+            time.sleep(_TURN_S)
+
+    def _close(self) -> Summary:
+        while self._ending is not None:
+            self._turn()
+            time.sleep(_TURN_S)
+        self._say_losses()
+        self._turn()
+        self._flush()
+        try:
+            self._series.end(self._figures())
+        except DataFileError as fault:
+            self._fail(fault)
+        return Summary(
+            tuple(self._series.files),
+            self._series.messages,
+            self._ledger.lost(),
+            self._failure,
+            self._longest_wait_ns,
+            self._longest_unflushed_ns,
+            self._series.longest_write_ns,
+        )
+
+    def _figures(self) -> dict[str, str]:
+        """What a log says of its recording at its end: of all logs so far."""
+        lost = self._ledger.lost()
+        return {
+            "messages": str(self._series.messages),
+            "messages_lost": str(sum(lost.values())),
+            **{f"lost {key}": str(count) for key, count in lost.items()},
+        }
+
+    def _fill(self, health: wire.Health) -> None:
+        lost = self._ledger.lost()
+        health.recording.files.extend(map(str, self._series.files))
+        health.recording.file = health.recording.files[-1] if health.recording.files else ""
+        health.recording.folder = str(Path.cwd())
+        health.recording.messages = self._series.messages
+        health.recording.lost = sum(lost.values())
+        health.recording.failure = self._failure
+        health.recording.stopped = self._paused and not self._failure
+        health.recording.bytes = self._series.bytes_written
+        counts = {count.topic: count for count in health.topics}  # of its own, those that it sent
+        for key, recorded in self._ledger.recorded().items():
+            count = counts[key] if key in counts else health.topics.add(topic=key)
+            count.received, count.missing = recorded, lost.get(key, 0)

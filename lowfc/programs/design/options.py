@@ -1,0 +1,63 @@
+"""A dataclass as the options of a command: each is declared once, with its help in the docstring's attributes."""
+
+import functools
+import inspect
+import re
+import shlex
+from collections.abc import Callable
+from dataclasses import asdict, fields
+from typing import Annotated, Any, get_type_hints
+
+import typer
+
+from lowfc.contract.errors import ConfigurationError
+
+
+def flag(name: str) -> str:
+    """The option of a field, such as --half-angle of half_angle_deg."""
+    return f"--{name.removesuffix('_deg').replace('_', '-')}"
+
+
+def command_line(command: str, request: Any) -> str:
+    """The command that asks for the same again; what is None is left out."""
+    given = {flag(name): value for name, value in asdict(request).items() if value is not None}
+    return shlex.join([*command.split(), *(str(word) for option in given.items() for word in option)])
+
+
+def with_options_of(kind: type[Any]) -> Callable[[Callable[..., None]], Callable[..., None]]:
+    """Let typer see the fields of a dataclass in place of a command's first parameter, which receives the instance.
+
+    The command raises ConfigurationError where the dataclass refuses its values.
+    """
+    types, helps = get_type_hints(kind), _attributes(kind)
+    options = [
+        inspect.Parameter(
+            field.name,
+            inspect.Parameter.KEYWORD_ONLY,
+            default=field.default,
+            annotation=Annotated[types[field.name], typer.Option(flag(field.name), help=helps[field.name])],
+        )
+        for field in fields(kind)
+    ]
+
+    def decorated(command: Callable[..., None]) -> Callable[..., None]:
+        @functools.wraps(command)
+        def run(**values: Any) -> None:
+            try:
+                request = kind(**{option.name: values.pop(option.name) for option in options})
+            except ValueError as error:
+                raise ConfigurationError(str(error)) from error
+            command(request, **values)
+
+        _, *others = inspect.signature(command, eval_str=True).parameters.values()
+        rest = [other.replace(kind=inspect.Parameter.KEYWORD_ONLY) for other in others]
+        run.__signature__ = inspect.Signature([*options, *rest])  # type: ignore[attr-defined]
+        return run
+
+    return decorated
+
+
+def _attributes(kind: type[Any]) -> dict[str, str]:
+    """The sentences of a docstring's attributes, each on one line."""
+    _, _, text = inspect.cleandoc(kind.__doc__ or "").partition("Attributes:\n")
+    return {name: " ".join(help_.split()) for name, help_ in re.findall(r"^    (\w+): ((?:.|\n {5,})+)", text, re.M)}

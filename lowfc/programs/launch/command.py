@@ -1,0 +1,71 @@
+"""The command `lowfc sim-loop`."""
+
+import os
+from typing import Annotated, Any
+
+import typer
+
+from lowfc.adapters.process.terminal import ConfigFile, Json, configuration
+from lowfc.contract.configuration import Preset
+from lowfc.contract.errors import ConfigurationError
+from lowfc.programs.cli.output import put
+
+
+def sim_loop(
+    config: ConfigFile = None,
+    duration: Annotated[float | None, typer.Option(min=0.01, max=1e7, help="Seconds; default: until Ctrl-C.")] = None,
+    rate: Annotated[float | None, typer.Option(help="Frames per second.")] = None,
+    disturbance: Annotated[Preset | None, typer.Option(help="What shakes the wavefront.")] = None,
+    seed: Annotated[int | None, typer.Option(help="Seed of every random number.")] = None,
+    sensor: Annotated[
+        str | None,
+        typer.Option(help="sam, bowtie, clowfs, zwfs, bar, lyot, aplc; or a layout, FILE.json or FILE.json:NAME."),
+    ] = None,
+    star_magnitude: Annotated[float | None, typer.Option(help="V magnitude of the star.")] = None,
+    lockstep: Annotated[
+        bool, typer.Option("--lockstep", help="Deterministic: each frame waits for the mirror.")
+    ] = False,
+    no_record: Annotated[bool, typer.Option("--no-record", help="Write no log.")] = False,
+    open_loop: Annotated[bool, typer.Option("--open", help="Start with the loop open.")] = False,
+    view_: Annotated[bool, typer.Option("--view", help="Look at it in a window.")] = False,
+    web: Annotated[bool, typer.Option("--web", help="Look at it in a browser.")] = False,
+    name: Annotated[str | None, typer.Option("--run", help="Name of the run; default: a new one.")] = None,
+    as_json: Json = False,
+) -> None:
+    """Start the simulated loop: camera, mirror, controller and recorder; show its status, end with a summary.
+
+    Example: lowfc sim-loop --rate 1000 --duration 20 --disturbance reaction-wheel --star-magnitude 2
+    """
+    from lowfc.adapters.process.realtime import spread
+    from lowfc.adapters.viewer.rerun_viewer import Show, has_screen
+    from lowfc.contract.configuration import sensor_keys
+    from lowfc.programs.core.recording.volume import outlook
+    from lowfc.programs.core.start_up import check_files
+    from lowfc.programs.launch.sim_loop import sim_loop as run
+    from lowfc.programs.launch.status import summary_text
+
+    overrides: dict[str, Any] = {
+        "camera.rate_hz": rate,
+        "disturbance.preset": disturbance,
+        "seed": seed,
+        **({f"sensor.{key}": value for key, value in sensor_keys(sensor).items()} if sensor else {}),
+        "star.magnitude": star_magnitude,
+        "lockstep": lockstep or None,
+        "control.start_mode": "open" if open_loop else None,
+    }
+    settings = configuration(config, overrides, {"control.start_mode": "closed", **spread(os.sched_getaffinity(0))})
+    check_files(settings)
+    if settings.control.start_mode == "open":
+        chosen = "--open" if open_loop else f"control.start_mode of {config}"
+        typer.echo(f"the loop starts open ({chosen}): `lowfc ctl close` closes it", err=True)
+    if view_ and web:
+        raise ConfigurationError("a view is in one place: choose --view or --web")
+    if has_screen() and not (view_ or web):
+        typer.echo("to look at it: lowfc view", err=True)
+    if not no_record:
+        typer.echo(outlook(settings), err=True)
+    show = Show.NATIVE if view_ else Show.WEB if web else None
+    figures = run(settings, duration, not no_record, show, name)
+    put(figures, summary_text(figures), as_json=as_json)
+    if figures["recording_failure"]:
+        raise typer.Exit(1)

@@ -1,0 +1,227 @@
+"""The launcher of the simulated loop: starts camera, mirror, controller, recorder and view, watches them, sums up."""
+
+import contextlib
+import math
+import signal
+import sys
+import time
+from collections.abc import Callable, Iterator
+from types import FrameType
+from typing import Any
+
+from rich.console import Console
+from rich.live import Live
+
+from lowfc.adapters.bus.run import Run, free_ports, mirror_role, new_run_id, open_run
+from lowfc.adapters.bus.zenoh_bus import ZenohBus
+from lowfc.adapters.files import calibration_file
+from lowfc.adapters.process.child import Child
+from lowfc.adapters.process.clock import HostClock
+from lowfc.adapters.process.terminal import INTERRUPTED
+from lowfc.adapters.viewer.rerun_viewer import Show, require_screen, stream_url, web_address
+from lowfc.contract.configuration import Configuration
+from lowfc.contract.errors import BusError, LowfcError
+from lowfc.contract.messages import EVENT, HEALTH, Role
+from lowfc.programs.commissioning.analytic import analytic
+from lowfc.programs.launch.processes import program, start_all, stop_all
+from lowfc.programs.launch.status import screen, status_line
+from lowfc.programs.launch.watch import Watch, summary
+
+POLL_S = 0.02
+SETTLE_S = 0.02
+"""After the last frame, before the controller is stopped: the last command is on its way."""
+LINE_PERIOD_S = 5.0
+SHOW_S = 0.1
+
+
+class ProcessDiedError(LowfcError):
+    """A process of the loop ended by itself."""
+
+    exit_status = 1
+
+
+def sim_loop(
+    config: Configuration, duration_s: float | None, record: bool, show: Show | None = None, name: str | None = None
+) -> dict[str, Any]:
+    """Run the simulated loop for a time; return the summary that `--json` prints.
+
+    Args:
+        config: of the run.
+        duration_s: for so long; None until Ctrl-C.
+        record: write a log.
+        show: look at it, in a window or a browser; the loop goes on where the view ends.
+        name: of the run; a new one when None.
+
+    Raises:
+        BusError: a run of that name is there already.
+        ViewerError: there is no screen for the window.
+        ProcessDiedError: a process ended by itself; the text names it and has its last words.
+    """
+    console = Console(stderr=True)
+    require_screen(show)
+    run = _new_run(config, name)
+    console.print(f"run {run.run_id}", highlight=False)
+    watch = Watch({}, [])
+    children: list[Child] = []
+    bus = ZenohBus(run.links, Role.LAUNCHER, HostClock())  # it listens: from now on others see that a loop is starting
+    try:
+        bus.subscribe(HEALTH, watch.hear)
+        bus.subscribe(EVENT, watch.note)
+        prepare(config, run, console)
+        children += children_of(config, run, duration_s, record)
+        if show is not None:
+            children.insert(len(children) - record, _view(run, show, console))  # the recorder ends last
+        start_all(children)
+        _supervise(config, children, watch, console, duration_s)
+    finally:
+        bus.close()
+        stop_all(children)
+        run.remove()
+    return {"run": run.run_id} | summary(watch, record)
+
+
+def _new_run(config: Configuration, name: str | None) -> Run:
+    """A run for this launcher alone; what a launcher that was killed has left of it is used again.
+
+    Raises:
+        BusError: a process of that run is there, or it was made by processes that were started by hand.
+    """
+    run = open_run(name or new_run_id(), (config.mirror.name,), listeners=(Role.LAUNCHER,))
+    if living := run.links.live():
+        raise BusError(f"run {run.run_id!r} is running already ({', '.join(sorted(living))}): choose another name")
+    if Role.LAUNCHER not in run.links.ports:
+        raise BusError(
+            f"run {run.run_id!r} was made by processes that were started by hand: choose another name, or remove its "
+            f"directory, {run.path}"
+        )
+    return run
+
+
+def prepare(config: Configuration, run: Run, console: Console) -> None:
+    """Put what the processes share into the run's directory: calibration and configuration."""
+    calibration_file.save(analytic(config, console), run.path / "calibration.fits")
+    (run.path / "config.toml").write_text(config.to_toml(), encoding="utf-8")
+
+
+def children_of(config: Configuration, run: Run, duration_s: float | None, record: bool) -> list[Child]:
+    """The processes, in the order in which they are stopped: from the source of the data to its end."""
+    shared = ["--run", run.run_id, "--config", str(run.path / "config.toml")]
+    calibration = ["--calibration", str(run.path / "calibration.fits")]
+    mirror = mirror_role(config.mirror.name)
+    awaited = [Role.CONTROLLER, mirror, *([Role.RECORDER] if record else [])]
+    camera = ["-m", "sim_camera", *shared, *(word for name in awaited for word in ("--wait-for", str(name)))]
+    if duration_s is not None:
+        camera += ["--frames", str(max(1, math.ceil(duration_s * config.camera.rate_hz)))]
+    commands = {
+        str(Role.CAMERA): camera,
+        str(Role.CONTROLLER): ["-m", "lowfc", "controller", *shared, *calibration],
+        mirror: ["-m", "sim_dm", *shared],
+    }
+    if record:
+        commands[str(Role.RECORDER)] = ["-m", "lowfc", "record", *shared, *calibration]
+    return [program(name, arguments, run.path / f"{name}.stderr") for name, arguments in commands.items()]
+
+
+def _view(run: Run, show: Show, console: Console) -> Child:
+    """The view's process; where it is to be seen is said now."""
+    port, web_port = free_ports(2)
+    if show is Show.WEB:
+        console.print(f"look at {web_address(stream_url(port), web_port)}", soft_wrap=True, highlight=False)
+    words = ["-m", "lowfc", "view", "--run", run.run_id, f"--{show}", "--port", str(port), "--web-port", str(web_port)]
+    return program(str(Role.VIEWER), words, run.path / f"{Role.VIEWER}.stderr")
+
+
+def _supervise(
+    config: Configuration,
+    children: list[Child],
+    watch: Watch,
+    console: Console,
+    duration_s: float | None,
+) -> None:
+    """Until the camera has exposed its frames, Ctrl-C, or the death of a process."""
+    camera = children[0]
+    viewless = False
+    with held_back() as interrupted, _display(console) as show:
+        begun_s = time.monotonic()
+        shown_s = 0.0
+        while camera.status is None and watch.of(Role.CAMERA).state != "stopped" and not interrupted():
+            check(children[1:])
+            viewless = viewless or _say_view_ended(children, console)
+            elapsed_s = time.monotonic() - begun_s
+            if elapsed_s > shown_s + SHOW_S:
+                shown_s = elapsed_s
+                show(watch, config, duration_s, elapsed_s)
+            time.sleep(POLL_S)
+        if not interrupted():
+            check(children)
+        if interrupted():
+            camera.stop(patience_s=5.0)
+        time.sleep(SETTLE_S)
+        stop_all([*children[1:], camera])
+        time.sleep(SHOW_S)  # the last Health is on its way
+    for child in children:
+        if child.name == Role.VIEWER:
+            continue
+        if child.name == Role.RECORDER and watch.of(Role.RECORDER).recording.failure:
+            continue  # the loop ran to its end without it; the summary says why
+        if child.status not in (0, -signal.SIGTERM, INTERRUPTED):  # told to end before it was ready is no failure
+            raise ProcessDiedError(f"{child.how_it_ended()}\n{child.stderr_tail()}")
+
+
+def check(children: list[Child]) -> None:
+    """Raise where a process ended by itself; the camera may end when it is done, and the view whenever it likes."""
+    for child in children:
+        done = child.name == Role.VIEWER or (child.name == Role.CAMERA and child.status == 0)
+        if child.status is not None and not done:
+            raise ProcessDiedError(f"{child.how_it_ended()}; its last words:\n{child.stderr_tail()}")
+
+
+def _say_view_ended(children: list[Child], console: Console) -> bool:
+    """Whether the view has ended by itself; what it said last is shown, unless its window was just closed."""
+    for child in children:
+        if child.name == Role.VIEWER and child.status is not None:
+            if child.status != 0:
+                why = child.stderr_tail().splitlines()[-1:] if child.status > 0 else []
+                told = "; ".join([child.how_it_ended(), *why])
+                console.print(
+                    f"the loop goes on without its view ({told}); `lowfc view` starts another",
+                    markup=False,
+                    soft_wrap=True,
+                )
+            return True
+    return False
+
+
+@contextlib.contextmanager
+def held_back() -> Iterator[Callable[[], bool]]:
+    """Whether Ctrl-C or SIGTERM has come; a second Ctrl-C ends at once."""
+    caught: list[int] = []
+
+    def catch(number: int, frame: FrameType | None) -> None:
+        if caught:
+            raise KeyboardInterrupt
+        caught.append(number)
+
+    before = {number: signal.signal(number, catch) for number in (signal.SIGINT, signal.SIGTERM)}
+    try:
+        yield lambda: bool(caught)
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+
+@contextlib.contextmanager
+def _display(console: Console) -> Iterator[Callable[..., None]]:
+    """A live screen on a terminal, a line every few seconds elsewhere."""
+    if console.is_terminal:
+        with Live(console=console, refresh_per_second=4, transient=True) as live:
+            yield lambda *what: live.update(screen(*what))
+    else:
+        due_s = [LINE_PERIOD_S]
+
+        def line(watch: Watch, config: Configuration, duration_s: float | None, elapsed_s: float) -> None:
+            if elapsed_s >= due_s[0]:
+                due_s[0] += LINE_PERIOD_S
+                sys.stderr.write(status_line(watch, elapsed_s) + "\n")
+
+        yield line

@@ -1,0 +1,133 @@
+"""What a person sees of a running loop: a screen, a line, a summary."""
+
+from typing import Any
+
+from rich.console import Group
+from rich.panel import Panel
+from rich.table import Table
+from rich.text import Text
+
+from lowfc.adapters.bus.run import mirror_role
+from lowfc.contract.configuration import Configuration
+from lowfc.contract.events import Level
+from lowfc.contract.messages import COMMAND, FRAME, Role, wire
+from lowfc.contract.printable import printable
+from lowfc.control.loop.wording import counted, mode_word
+from lowfc.programs.launch.watch import Watch, mode_name, topic_count
+
+_EVENTS_SHOWN = 4
+_STYLES = {Level.WARNING: "yellow", Level.ERROR: "red", Level.FATAL: "bold red"}
+
+
+def screen(watch: Watch, config: Configuration, duration_s: float | None, elapsed_s: float) -> Panel:
+    """The live status of a loop."""
+    camera, controller = watch.of(Role.CAMERA), watch.of(Role.CONTROLLER)
+    mirror, recorder = watch.of(mirror_role(config.mirror.name)), watch.of(Role.RECORDER)
+    frames = topic_count(controller, FRAME.key)
+    commands = topic_count(mirror, COMMAND.at(config.mirror.name))
+    table = Table.grid(padding=(0, 2))
+    table.add_column(style="dim", justify="right")
+    table.add_column()
+    table.add_row("loop", f"{mode(controller)}, {camera.rate_hz:.0f} Hz of {config.camera.rate_hz:g} Hz")
+    table.add_row("wavefront", wavefront(camera))
+    table.add_row("frame to command", latency(controller.frame_to_command))
+    table.add_row("frame to mirror", latency(camera.frame_to_mirror))
+    table.add_row("frames", f"{frames.received} received, {frames.skipped} skipped, {frames.missing} missing")
+    table.add_row("mirror", f"{mirror.state or 'not there yet'}, {counted(commands.received, 'command')}")
+    table.add_row("recorder", recording(recorder))
+    for log in watch.events[-_EVENTS_SHOWN:]:
+        table.add_row(Text(printable(log.name)), Text(printable(log.message), style=_STYLES.get(Level(log.level), "")))
+    left = f" of {duration_s:g} s" if duration_s is not None else ", Ctrl-C ends it"
+    what = f"{config.disturbance.preset}, V = {config.star.magnitude:g}, {config.sensor.sam}"
+    return Panel(Group(table), title="lowfc", subtitle=f"{what}; {elapsed_s:.0f} s{left}", expand=False)
+
+
+def status_line(watch: Watch, elapsed_s: float) -> str:
+    """The same in one line, where there is no terminal."""
+    camera, controller = watch.of(Role.CAMERA), watch.of(Role.CONTROLLER)
+    if not camera.HasField("recent_wavefront"):
+        return f"{elapsed_s:5.0f} s  no frame yet"
+    frames, recent = topic_count(controller, FRAME.key), camera.recent_wavefront
+    return (
+        f"{elapsed_s:5.0f} s  {mode(controller)}  {camera.rate_hz:6.0f} Hz  "
+        f"residual {recent.residual_rms_nm:.2f} of {recent.disturbance_rms_nm:.2f} nm rms  "
+        f"frame to command {latency(controller.frame_to_command)}  "
+        f"skipped {frames.skipped} missing {frames.missing}  {recording(watch.of(Role.RECORDER))}"
+    )
+
+
+def wavefront(camera: wire.Health) -> str:
+    """The true wavefront over the last seconds."""
+    if not camera.HasField("recent_wavefront"):
+        return "no frame yet"
+    recent = camera.recent_wavefront
+    return (
+        f"{recent.residual_rms_nm:.2f} nm rms left of {recent.disturbance_rms_nm:.2f} nm; "
+        f"tilt {recent.tilt_residual_mas:.2f} mas of {recent.tilt_disturbance_mas:.2f} mas per axis"
+    )
+
+
+def mode(controller: wire.Health) -> str:
+    """Loop mode in words."""
+    return mode_word(mode_name(controller.mode) or "starting")
+
+
+def latency(durations: wire.Latency) -> str:
+    """Percentiles in one line."""
+    if not durations.count:
+        return "-"
+    p50, p99, largest = (value / 1e3 for value in (durations.p50_ns, durations.p99_ns, durations.max_ns))
+    return f"p50 {p50:.0f} us, p99 {p99:.0f} us, max {largest:.0f} us"
+
+
+def recording(recorder: wire.Health) -> str:
+    """What the recorder has."""
+    if not recorder.process:
+        return "not recording"
+    done = recorder.recording
+    return f"{counted(done.messages, 'message')}, {done.bytes / 1e6:.1f} MB, {done.lost} lost"
+
+
+def _loop(figures: dict[str, Any]) -> str:
+    """Loop mode at the end, and for how long it was not closed."""
+    seconds, cause = f"{figures['not_closed_s']:.1f} s", figures["not_closed_cause"]
+    match figures["mode"]:
+        case None:
+            return "no controller reported"
+        case "closed":
+            return f"closed; before that not closed for {seconds}: {cause}" if figures["not_closed_s"] else "closed"
+        case "safe":
+            return f"{mode_word('safe')}, not closed for {seconds}: {cause}"
+        case mode:
+            return f"{mode} for {seconds}" + (f": {cause}" if cause else "")
+
+
+def summary_text(figures: dict[str, Any]) -> str:
+    """The summary of a run for a person."""
+    command, mirror = (figures["latency_us"][name] for name in ("frame_to_command", "frame_to_mirror"))
+
+    def percentiles(values: dict[str, float]) -> str:
+        return "   ".join(f"{name.replace('_', '.')} {value:.0f} us" for name, value in values.items())
+
+    lines = [
+        f"loop               {_loop(figures)}",
+        f"rate               {figures['rate_hz']:.1f} Hz",
+        f"frames             {figures['frames_published']} published, {figures['frames_processed']} processed, "
+        f"{figures['frames_skipped']} skipped, {figures['frames_missing']} missing",
+        f"commands           {figures['commands_applied']} applied, {figures['commands_late']} after the next exposure "
+        "had begun",
+        f"wavefront          {figures['residual_rms_nm']:.2f} nm rms left of {figures['disturbance_rms_nm']:.2f} nm",
+        f"tilt per axis      {figures['tilt_residual_mas']:.2f} mas rms left of "
+        f"{figures['tilt_disturbance_mas']:.2f} mas",
+        f"frame to command   {percentiles(command)}",
+        f"frame to mirror    {percentiles(mirror)}",
+    ]
+    if figures["log"]:
+        lines.append(
+            f"log                {' '.join(figures['logs'])}: {counted(figures['messages_recorded'], 'message')}, "
+            f"{figures['messages_lost']} lost"
+        )
+    lines += [f"lost               {count} of {topic}" for topic, count in figures["lost"].items()]
+    if figures["recording_failure"]:
+        lines.append(f"recording stopped  {figures['recording_failure']}")
+    return "\n".join(lines)

@@ -1,0 +1,97 @@
+"""What a launcher hears of a run, and the figures that it sums up from the last Health of each process."""
+
+from dataclasses import dataclass, field
+from typing import Any
+
+from lowfc.adapters.bus.bus import Sample
+from lowfc.adapters.bus.names import Names
+from lowfc.contract.messages import FRAME, Log, Role, wire
+from lowfc.control.loop.safety import LoopMode
+
+
+@dataclass(slots=True)
+class Watch:
+    """What the launcher hears: the last Health of each process and the last events."""
+
+    health: dict[str, wire.Health]
+    events: list[Log]
+    _names: Names = field(default_factory=Names)
+
+    def of(self, name: str) -> wire.Health:
+        """Last Health of a process; an empty one before the first."""
+        return self.health.get(name, wire.Health())
+
+    def hear(self, sample: Sample) -> None:
+        """Keep a Health."""
+        name, health = self._names.health(sample.key, sample.payload)
+        self.health[name] = health
+
+    def note(self, sample: Sample) -> None:
+        """Keep an event."""
+        self.events.append(Log.FromString(sample.payload))
+        del self.events[:-100]
+
+
+def summary(watch: Watch, record: bool) -> dict[str, Any]:
+    """Figures of a run, from the last Health of each process."""
+    camera, controller = watch.of(Role.CAMERA), watch.of(Role.CONTROLLER)
+    frames = topic_count(controller, FRAME.key)
+    wavefront = camera.wavefront
+    figures: dict[str, Any] = {
+        "rate_hz": round(camera.mean_rate_hz, 2),
+        "frames_published": topic_count(camera, FRAME.key).published,
+        "frames_processed": frames.received - frames.skipped,
+        "frames_skipped": frames.skipped,
+        "frames_missing": frames.missing,
+        "commands_applied": camera.frame_to_mirror.count,
+        "commands_late": camera.commands_late,
+        "mode": mode_name(controller.mode),
+        "not_closed_s": round(controller.not_closed_ns * 1e-9, 3),
+        "not_closed_cause": controller.not_closed_cause,
+        "messages_recorded": None,
+        "messages_lost": None,
+        "lost": {},
+        "recording_failure": None,
+        "disturbance_rms_nm": round(wavefront.disturbance_rms_nm, 4),
+        "residual_rms_nm": round(wavefront.residual_rms_nm, 4),
+        "tilt_disturbance_mas": round(wavefront.tilt_disturbance_mas, 4),
+        "tilt_residual_mas": round(wavefront.tilt_residual_mas, 4),
+        "latency_us": {
+            "frame_to_command": _microseconds(controller.frame_to_command),
+            "frame_to_mirror": _microseconds(camera.frame_to_mirror),
+        },
+        "realtime_granted": list(controller.realtime_granted),
+        "realtime_refused": list(controller.realtime_refused),
+        "log": None,
+        "logs": [],
+    }
+    if record:
+        recording = watch.of(Role.RECORDER).recording
+        figures |= {
+            "messages_recorded": recording.messages,
+            "messages_lost": recording.lost,
+            "lost": {topic.topic: topic.missing for topic in watch.of(Role.RECORDER).topics if topic.missing},
+            "recording_failure": recording.failure or None,
+            "log": recording.file,
+            "logs": list(recording.files),
+        }
+    return figures
+
+
+def mode_name(mode: wire.LoopMode) -> str | None:
+    """Loop mode; None before a controller reported one."""
+    return LoopMode(mode).name.lower() if mode else None
+
+
+def topic_count(health: wire.Health, key: str) -> wire.TopicCount:
+    """What a process counted of a topic; zeros where it says nothing."""
+    return next((topic for topic in health.topics if topic.topic == key), wire.TopicCount())
+
+
+def _microseconds(latency: wire.Latency) -> dict[str, float]:
+    return {
+        "p50": latency.p50_ns / 1e3,
+        "p99": latency.p99_ns / 1e3,
+        "p99_9": latency.p99_9_ns / 1e3,
+        "max": latency.max_ns / 1e3,
+    }

@@ -1,0 +1,242 @@
+"""Adaptive Optics Telemetry (AOT): a log as the field's exchange format, written and checked by `aotpy`.
+
+Its world is a telescope with a Shack-Hartmann or pyramid sensor; ours maps to it so:
+
+    AOSystem            the run; versions, camera and star in its metadata, the configuration as JSON in its config
+    MainTelescope       the open circular aperture
+    NaturalGuideStar    the star, which is the coronagraph's and the sensor's
+    Pyramid             the sensor: AOT has no other class for one whose pixels are the measurement. Each good pixel is
+                        a subaperture with one signal, and there is one image, so that n_sides is 1
+      measurements        not in the file: (frame - dark) / flux - reference over the good pixels makes them
+      ref_measurements    I0, fraction of the flux
+    Detector            the camera: dark, bad pixels, exposure, and the frames if asked for
+    DeformableMirror    the mirror; actuators in m across the pupil, row by row; stroke either way
+    ControlLoop         one row for each step, in the log's order
+      time                end of exposure, and the frame's count
+      modal_coefficients  measured modal error, nm rms of wavefront; NaN where the frame was refused
+      commands            surface at each actuator as sent, m; NaN where no command of this frame is in the log
+      modes               Zernike polynomials in Noll's order, over the circle
+      measurements_to_modes, modes_to_measurements, modes_to_commands: R, H and MODES2ACT
+      time_filter_num, _den: the integrator g / (z - (1 - leak)) of each mode, as it was at the end
+      delay               from mid-exposure to the middle of the command's period: delay_frames + (1 - exposure /
+                          period) / 2
+      closed              whether the loop was closed for more than half of the steps
+
+Flux, reasons, durations and truth have no place there; the other formats have them.
+"""
+
+import json
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+import aotpy
+import numpy as np
+import numpy.typing as npt
+from aotpy.io.fits import AOTFITSErrorLevel, AOTFITSReader, AOTFITSWriter
+from astropy.io import fits
+from google.protobuf.message import DecodeError
+
+from lowfc.adapters.bus.bus import name_in
+from lowfc.adapters.logs.history import History
+from lowfc.contract.codecs.codec import actuators
+from lowfc.contract.envelope import count_of
+from lowfc.contract.errors import DataFileError
+from lowfc.contract.messages import COMMAND, wire
+from lowfc.control.calibration.calibration import Calibration
+from lowfc.control.loop.safety import LoopMode
+from lowfc.optics.chain.zernike import zernikes
+from lowfc.programs.logs.export.columns import step_columns
+from lowfc.programs.logs.export.cubes import copy_frames_to_fits, fits_cube
+
+_COMMANDS = "COMMANDS"
+_FRAMES = "FRAMES"
+_MODES_PIXELS = 64
+_NM = 1e-9
+
+
+def write_aot(files: list[Path], history: History, *, with_frames: bool) -> None:
+    """Write a run as AOT, and have `aotpy` read it and check it.
+
+    Raises:
+        DataFileError: the log has no step, no calibration, no frame, or frames of several sizes.
+    """
+    step_columns(history)  # there are some
+    path = files[0]
+    if history.calibration is None:
+        raise DataFileError(f"{history.log.path} has no calibration, and AOT describes the loop by it")
+    system = _System(history, history.calibration, with_frames=with_frames).system
+    units = AOTFITSWriter(system).get_hdulist()
+    units.writeto(path, overwrite=True)
+    AOTFITSReader(path, exception_level=AOTFITSErrorLevel.WARNING)
+    cubes = {unit.name: unit for unit in units if unit.name in (_COMMANDS, _FRAMES)}
+    fits.HDUList([unit for unit in units if unit.name not in cubes]).writeto(path, overwrite=True)
+    if _COMMANDS in cubes:
+        _copy_commands(path, cubes[_COMMANDS], history, history.calibration)
+    if _FRAMES in cubes:
+        copy_frames_to_fits(path, cubes[_FRAMES], history)
+
+
+class _System:
+    """A run in AOT's classes; what is copied from the log later is there as an empty image."""
+
+    def __init__(self, history: History, calibration: Calibration, *, with_frames: bool) -> None:
+        self._history = history
+        self._calibration = calibration
+        self._good = calibration.good > 0
+        first_ns, last_ns = (int(history.steps.time_ns[row]) for row in (0, -1))
+        config = history.configuration
+        telescope = aotpy.MainTelescope(uid="telescope")
+        if config is not None:
+            telescope.enclosing_diameter = telescope.inscribed_diameter = config.star.diameter_m
+        source = aotpy.NaturalGuideStar(uid="star")
+        sensor = self._sensor(source, self._detector(with_frames=with_frames))
+        mirror = self._mirror(telescope)
+        self.system = aotpy.AOSystem(
+            ao_mode="SCAO",
+            name="lowfc",
+            date_beginning=_date(first_ns),
+            date_end=_date(last_ns),
+            config=json.dumps(config.model_dump()) if config is not None else None,
+            main_telescope=telescope,
+            sources=[source],
+            wavefront_sensors=[sensor],
+            wavefront_correctors=[mirror],
+            loops=[self._loop(sensor, mirror)],
+            metadata=self._metadata(),
+        )
+
+    def _detector(self, *, with_frames: bool) -> aotpy.Detector:
+        shape, camera = self._calibration.shape, self._history.camera
+        detector = aotpy.Detector(
+            uid="camera",
+            dark=aotpy.Image("DARK", self._calibration.dark.reshape(shape), "adu"),
+            bad_pixel_map=aotpy.Image("BAD PIXELS", (~self._good).astype(np.uint8).reshape(shape)),
+            frame_rate=self._history.rate_hz,
+            integration_time=camera.exposure_ns * 1e-9 if camera is not None else None,
+        )
+        if with_frames:
+            times = self._history.frame_sequence
+            clock = aotpy.Time(uid="frames", frame_numbers=[float(count_of(int(one))) for one in times])
+            detector.pixel_intensities = aotpy.Image(_FRAMES, np.zeros((1, 1, 1), np.float32), "adu", time=clock)
+        return detector
+
+    def _sensor(self, source: aotpy.Source, detector: aotpy.Detector) -> aotpy.Pyramid:
+        good, shape = self._good, self._calibration.shape
+        numbers = np.where(good, np.cumsum(good) - 1, -1).astype(np.int32).reshape(shape)
+        return aotpy.Pyramid(
+            uid="sensor",
+            source=source,
+            dimensions=1,
+            n_sides=1,
+            n_valid_subapertures=int(good.sum()),
+            ref_measurements=aotpy.Image("REFERENCE", self._calibration.reference[None, good]),
+            subaperture_mask=aotpy.Image("SUBAPERTURES", numbers),
+            mask_offsets=[aotpy.Coordinates(0.0, 0.0)],
+            subaperture_size=1.0,
+            wavelength=self._calibration.wavelength_nm * _NM,
+            detector=detector,
+        )
+
+    def _mirror(self, telescope: aotpy.MainTelescope) -> aotpy.DeformableMirror:
+        rows, columns = self._calibration.grid
+        config = self._history.configuration
+        keys = [key for key in self._history.counts if COMMAND.matches(key)]
+        mirror = aotpy.DeformableMirror(
+            uid=name_in(COMMAND, keys[0]) if keys else "dm", telescope=telescope, n_valid_actuators=rows * columns
+        )
+        if config is not None:
+            pitch_m = config.star.diameter_m / config.mirror.pitches_per_pupil
+            x, y = ((np.arange(count) - (count - 1) / 2) * pitch_m for count in (columns, rows))
+            mirror.actuator_coordinates = [aotpy.Coordinates(float(at_x), float(at_y)) for at_y in y for at_x in x]
+            mirror.stroke = config.mirror.stroke_nm / 2 * _NM
+        return mirror
+
+    def _loop(self, sensor: aotpy.Pyramid, mirror: aotpy.DeformableMirror) -> aotpy.ControlLoop:
+        steps, calibration, state = self._history.steps, self._calibration, self._history.controller
+        clock = aotpy.Time(
+            uid="steps",
+            timestamps=(steps.time_ns / 1e9).tolist(),
+            frame_numbers=[float(count_of(int(sequence))) for sequence in steps.sequence],
+        )
+        good = self._good
+        loop = aotpy.ControlLoop(
+            uid="loop",
+            input_sensor=sensor,
+            commanded_corrector=mirror,
+            time=clock,
+            closed=bool(np.mean(steps.mode == LoopMode.CLOSED) > 0.5),
+            framerate=self._history.rate_hz,
+            modes=aotpy.Image("MODES", _modes(calibration.noll)),
+            modal_coefficients=aotpy.Image("MODAL ERROR", steps.error_nm, "nm", time=clock),
+            measurements_to_modes=aotpy.Image("R", calibration.reconstructor[:, None, good], "nm"),
+            modes_to_measurements=aotpy.Image("H", calibration.response[good][:, None, :], "nm-1"),
+            modes_to_commands=aotpy.Image("MODES2ACT", calibration.modes_to_actuators * np.float32(_NM), "m nm-1"),
+        )
+        if any(COMMAND.matches(key) for key in self._history.counts):
+            loop.commands = aotpy.Image(_COMMANDS, np.zeros((1, 1), np.float32), "m", time=clock)
+        if state is not None and len(state.gain) == len(calibration.noll):
+            gain, leak = np.array(state.gain, np.float32), np.array(state.leak, np.float32)
+            loop.delay = state.delay_frames + self._idle_fraction() / 2
+            loop.time_filter_num = aotpy.Image("TIME FILTER NUM", gain[:, None])
+            loop.time_filter_den = aotpy.Image("TIME FILTER DEN", np.stack([leak - 1, np.ones_like(leak)], axis=1))
+        return loop
+
+    def _idle_fraction(self) -> float:
+        camera = self._history.camera
+        return 1 - camera.exposure_ns / camera.period_ns if camera is not None and camera.period_ns else 0.0
+
+    def _metadata(self) -> list[aotpy.Metadatum]:
+        history, calibration = self._history, self._calibration
+        closed = float(np.mean(history.steps.mode == LoopMode.CLOSED))
+        recorded = history.log.metadata.get("lowfc", {})
+        found: dict[str, tuple[Any, str | None]] = {
+            "LOG": (history.log.path.name, None),  # a card of 80 characters has no room for more than these
+            "RUN": (recorded.get("run", ""), None),
+            "CALID": (calibration.id, None),
+            "NOLL": (" ".join(map(str, calibration.noll)), None),
+            "VERSION": (recorded.get("lowfc", ""), "of lowfc, when it was recorded"),
+            "FLUX": (calibration.flux_dn, "[adu] expected sum of the good pixels"),
+            "CLOSED": (closed, "fraction of the steps with the loop closed"),
+            "GAINSETS": (sum(one.name in ("gain", "leak") for one in history.requests), "changes of gain or leak"),
+        }
+        if history.camera is not None:
+            found |= {
+                "EPERADU": (history.camera.gain_e_per_dn, "[electron/adu] conversion gain"),
+                "RDNOISE": (history.camera.read_noise_e, "[electron] read noise of a pixel and frame"),
+                "BIAS": (history.camera.bias_dn, "[adu] level without light"),
+                "EMGAIN": (history.camera.em_gain, "electron-multiplying gain"),
+            }
+        if history.configuration is not None:
+            found["STARMAG"] = (history.configuration.star.magnitude, "V magnitude of the star")
+            found["SENSOR"] = (history.configuration.sensor.kind, "kind of wavefront sensor: no pyramid")
+        return [aotpy.Metadatum(key, value, comment) for key, (value, comment) in found.items()]
+
+
+def _copy_commands(path: Path, image: fits.ImageHDU, history: History, calibration: Calibration) -> None:
+    """The command made from each step's frame, (steps, actuators) in m, into a new extension."""
+    sequence = history.steps.sequence
+    shape = (len(sequence), calibration.grid[0] * calibration.grid[1])
+    there = {int(one): row for row, one in reversed(list(enumerate(sequence)))}
+    rows = fits_cube(path, image, shape, ">f4")
+    rows[:] = np.nan
+    for message in history.again(COMMAND):
+        try:
+            command = wire.MirrorCommand.FromString(message.payload)
+        except DecodeError:
+            continue
+        surface_nm = actuators(command)
+        row = there.pop(command.frame_sequence, None)  # later ones only repeat what is held
+        if row is not None and surface_nm is not None and surface_nm.size == shape[1]:
+            rows[row] = surface_nm.ravel() * np.float32(_NM)
+
+
+def _modes(noll: tuple[int, ...]) -> npt.NDArray[np.float32]:
+    """Zernike polynomials (modes, rows, columns) over the circle, 0 outside."""
+    axis = (np.arange(_MODES_PIXELS) + 0.5) / (_MODES_PIXELS / 2) - 1
+    x, y = np.meshgrid(axis, axis)
+    return np.asarray(zernikes(noll, x, y) * (np.hypot(x, y) <= 1), np.float32)
+
+
+def _date(time_ns: int) -> datetime:
+    return datetime.fromtimestamp(time_ns / 1e9, UTC)

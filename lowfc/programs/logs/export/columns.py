@@ -1,0 +1,134 @@
+"""What an export says of every step and of the calibration: names with units, arrays, a sentence for each."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from lowfc.adapters.logs.columns import STAGES, joined, rows_of
+from lowfc.adapters.logs.history import History
+from lowfc.contract.envelope import count_of
+from lowfc.contract.errors import DataFileError
+from lowfc.control.calibration.calibration import Calibration
+from lowfc.control.loop.safety import LoopMode, Reason
+
+
+@dataclass(frozen=True, slots=True)
+class Column:
+    """One quantity of every step, or one array of the calibration.
+
+    Attributes:
+        name: with its unit at the end.
+        values: (steps,) or (steps, modes); of a calibration any shape.
+        unit: as FITS writes it; empty for none.
+        sentence: what it is.
+    """
+
+    name: str
+    values: npt.NDArray[Any]
+    unit: str
+    sentence: str
+
+    def headings(self, noll: tuple[int, ...]) -> list[str]:
+        """Names of its columns where each mode has one of its own, such as "error_z2_nm"."""
+        if self.values.ndim == 1:
+            return [self.name]
+        stem, _, unit = self.name.rpartition("_")
+        return [f"{stem}_z{index}_{unit}" for index in noll]
+
+
+def step_columns(history: History) -> list[Column]:
+    """Every quantity of a run's steps, one row per step in the order they were recorded.
+
+    What is joined by the frame's sequence (truth, durations, mirror) is NaN where the log does not have it.
+
+    Raises:
+        DataFileError: the log has no step.
+    """
+    steps = history.steps
+    if not steps.sequence.size:
+        others = f" that fit its calibration ({history.left_out} do not)" if history.left_out else ""
+        raise DataFileError(f"{history.log.path} has no steps{others}: there is nothing to export")
+    columns = [
+        Column("sequence", steps.sequence, "", "of the frame: start of the camera in unix seconds << 32 | count"),
+        Column("count", np.array([count_of(int(one)) for one in steps.sequence]), "", "of the frame"),
+        Column("time_ns", steps.time_ns, "ns", "end of the frame's exposure, since 1970-01-01 UTC"),
+        Column("time_utc", steps.time_ns.astype("datetime64[ns]"), "", "the same as a date"),
+        Column("mode", _named(steps.mode, lambda mode: LoopMode(mode).name.lower()), "", "of the loop"),
+        Column("reasons", _named(steps.reasons, _reasons), "", "why the frame was refused, or which limits acted"),
+        Column("flux_dn", steps.flux_dn, "adu", "sum of the good pixels, dark subtracted"),
+        Column("saturated_pixels", steps.saturated_pixels, "pix", "good pixels at full well"),
+        Column("error_nm", steps.error_nm, "nm", "measured modal error, wavefront rms"),
+        Column("pol_nm", steps.pol_nm, "nm", "pseudo-open-loop modes, wavefront rms"),
+        Column("command_nm", steps.command_nm, "nm", "modal command after the step, wavefront rms"),
+    ]
+    return [*columns, *_truth(history), *_mirror(history), *_durations(history)]
+
+
+def calibration_columns(calibration: Calibration) -> list[Column]:
+    """Arrays of a calibration, those of pixels and actuators as images."""
+    frame, grid, modes = calibration.shape, calibration.grid, len(calibration.noll)
+    return [
+        Column("reference", calibration.reference.reshape(frame), "", "reference image I0, fraction of the flux"),
+        Column(
+            "response_per_nm",
+            calibration.response.T.reshape(modes, *frame),
+            "nm-1",
+            "response H of each mode, fraction of the flux per nm rms of wavefront",
+        ),
+        Column(
+            "reconstructor_nm",
+            calibration.reconstructor.reshape(modes, *frame),
+            "nm",
+            "reconstructor R of each mode, nm rms of wavefront per fraction of the flux",
+        ),
+        Column("good", calibration.good.reshape(frame), "", "1 where a pixel is used"),
+        Column("dark_dn", calibration.dark.reshape(frame), "adu", "frame without light"),
+        Column(
+            "modes_to_actuators",
+            calibration.modes_to_actuators.T.reshape(modes, *grid),
+            "",
+            "each mode on the mirror, nm of surface per nm rms of wavefront",
+        ),
+    ]
+
+
+def _truth(history: History) -> list[Column]:
+    true, modes, pupil = history.true, "of each mode, wavefront rms", "over the open pupil, no piston"
+    if true is None:
+        return []
+    return [
+        Column("true_disturbance_nm", true.disturbance_nm, "nm", modes),
+        Column("true_residual_nm", true.residual_nm, "nm", modes),
+        Column("true_disturbance_rms_nm", true.disturbance_rms_nm, "nm", pupil),
+        Column("true_residual_rms_nm", true.residual_rms_nm, "nm", pupil),
+    ]
+
+
+def _mirror(history: History) -> list[Column]:
+    if not history.mirror.sequence.size:
+        return []
+    rows = rows_of(history.steps.sequence, history.mirror.sequence)
+    stroke = joined(history.mirror.stroke_nm, rows)
+    return [Column("mirror_stroke_nm", stroke, "nm", "largest deviation of an actuator from flat, surface")]
+
+
+def _durations(history: History) -> list[Column]:
+    if not history.timed_sequence.size:
+        return []
+    rows = rows_of(history.steps.sequence, history.timed_sequence)
+    return [
+        Column(f"{stage}_us", joined(history.stages_ns[stage] / 1e3, rows), "us", "duration of this stage")
+        for stage in STAGES
+    ]
+
+
+def _named(codes: npt.NDArray[Any], name: Callable[[int], str]) -> npt.NDArray[np.str_]:
+    different, places = np.unique(codes, return_inverse=True)
+    return np.array([name(int(code)) for code in different])[places]
+
+
+def _reasons(bits: int) -> str:
+    return " ".join(reason.name.lower() for reason in Reason if bits >> reason & 1)

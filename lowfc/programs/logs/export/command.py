@@ -1,0 +1,176 @@
+"""The command `lowfc export`: a log for the field's own tools."""
+
+import contextlib
+import dataclasses
+from collections.abc import Callable
+from enum import StrEnum
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from lowfc.adapters.logs.selection import selection
+from lowfc.adapters.process.extras import install_advice
+from lowfc.adapters.process.terminal import Json, Logs
+from lowfc.contract.errors import ConfigurationError, DataFileError
+from lowfc.programs.cli.output import put
+
+if TYPE_CHECKING:
+    from rich.console import Console
+
+    from lowfc.adapters.logs.history import History
+    from lowfc.adapters.logs.parts import LogFiles
+
+
+class Format(StrEnum):
+    """What a log can become."""
+
+    CSV = "csv"
+    NPZ = "npz"
+    FITS = "fits"
+    AOT = "aot"
+
+
+_ENDINGS = {Format.CSV: ".csv", Format.NPZ: ".npz", Format.FITS: ".fits", Format.AOT: ".aot.fits"}
+
+
+def export(
+    logs: Logs,
+    to: Annotated[
+        Format | None, typer.Option("--to", help="csv, npz, fits, or aot: Adaptive Optics Telemetry.")
+    ] = None,
+    decimate: Annotated[
+        int | None,
+        typer.Option(min=1, help="A smaller log instead: every Nth frame and mirror state, all steps and commands."),
+    ] = None,
+    topics: Annotated[
+        list[str] | None,
+        typer.Option(help="Decimate: of frames, mirror state and surface, truth and timing, only these; repeat."),
+    ] = None,
+    out: Annotated[Path | None, typer.Option(help="File to write; default: the log's name beside the log.")] = None,
+    frames: Annotated[bool, typer.Option("--frames", help="The frames too; with npz as OUT.frames.npy.")] = False,
+    force: Annotated[bool, typer.Option("--force", help="Replace a file that is there already.")] = False,
+    as_json: Json = False,
+) -> None:
+    """Write the steps of a log with their units, the calibration, and the frames if asked, for other tools.
+
+    Or, with --decimate, a smaller log.
+
+    Example: lowfc export last --to fits --frames
+    """
+    from rich.console import Console
+
+    from lowfc.adapters.logs.parts import one_by_one
+    from lowfc.adapters.logs.thinning import thin, thinned_path
+    from lowfc.adapters.process.progress import reading_bar
+
+    of_table, of_log = bool(frames or force), bool(topics)
+    if (to is None) == (decimate is None) or (of_log if decimate is None else of_table):
+        raise ConfigurationError(
+            "an export is a table (--to FORMAT, with --frames and --force) or a smaller log (--decimate N, with "
+            "--topics): choose one"
+        )
+    console = Console(stderr=True)
+    for log in one_by_one(logs, out, as_json=as_json):
+        if decimate is not None:
+            wanted = selection(decimate, topics or ())
+            with reading_bar(console) as count:
+                done = thin(log, out or thinned_path(log[0], wanted), wanted, partial(count, "copying"))
+            put(dataclasses.asdict(done), str(done), as_json=as_json)
+        elif to is not None:
+            figures = export_log(log, to, out, frames=frames, force=force, console=console)
+            put(figures, render(figures), as_json=as_json)
+
+
+def export_log(
+    log: "LogFiles",
+    to: Format,
+    out: Path | None = None,
+    *,
+    frames: bool = False,
+    force: bool = False,
+    console: "Console",
+) -> dict[str, Any]:
+    """Export a log; return the figures that `--json` prints.
+
+    Args:
+        log: finished or not.
+        to: what it becomes.
+        out: file to write; the log's name with another ending, beside it, when None.
+        frames: export the frames too.
+        force: replace a file that is there, unless it is a log.
+        console: for the progress.
+
+    Raises:
+        ConfigurationError: this format has no place for frames, or needs a library that is not there.
+        DataFileError: the log cannot be read or has no steps, or the file is there already or cannot be written.
+    """
+    from lowfc.adapters.files.whole_file import being_written
+    from lowfc.adapters.logs.history import read_history
+    from lowfc.adapters.logs.parts import WholeLog
+    from lowfc.adapters.process.progress import reading_bar
+    from lowfc.programs.logs.guard import refuse_log
+
+    if frames and to is Format.CSV:
+        raise ConfigurationError("a CSV file has no place for frames: use --to npz, fits or aot, or leave out --frames")
+    write = _writer(to, with_frames=frames)
+    reader = WholeLog(log, skip_damaged=True)
+    stem = reader.path.name.removesuffix(".part").removesuffix(".mcap")
+    out = out if out is not None else reader.path.parent / (stem + _ENDINGS[to])
+    files = [out] + ([out.with_suffix(".frames.npy")] if frames and to is Format.NPZ else [])
+    for file in files:
+        refuse_log(file, reader.path)
+        if file.exists() and not force:
+            raise DataFileError(f"{file} exists already; choose another name (--out), or --force replaces it")
+    with contextlib.ExitStack() as held:
+        count = held.enter_context(reading_bar(console))
+        reader.progress = partial(count, "reading")
+        history = read_history(reader)
+        if frames and not history.frame_sequence.size:
+            raise DataFileError(f"{reader.path} has no frames; export without --frames")
+        reader.progress = partial(count, "writing")
+        write([held.enter_context(being_written(file)) for file in files], history)
+    return {
+        "format": str(to),
+        "files": [str(file) for file in files],
+        "steps": len(history.steps.sequence),
+        "modes": history.steps.error_nm.shape[1],
+        "frames": len(history.frame_sequence) if frames else 0,
+        "steps_left_out": history.left_out,
+        "selection": reader.selection.sentence,
+        "finished": reader.finished,
+        "damaged": [f"byte {one.position}, {one.why}" for one in reader.damage],
+        "remarks": history.remarks,
+    }
+
+
+def render(figures: dict[str, Any]) -> str:
+    """What was written, for a person."""
+    from lowfc.adapters.logs.recovery import faults
+
+    frames = f", {figures['frames']} frames" if figures["frames"] else ""
+    lines = [f"the log has        {figures['selection']}"] if figures["selection"] else []
+    lines += [f"{', '.join(figures['files'])}: {figures['steps']} steps of {figures['modes']} modes{frames}"]
+    if figures["steps_left_out"]:
+        lines.append(f"left out           {figures['steps_left_out']} steps with another calibration's modes")
+    lines += faults(figures["damaged"], finished=figures["finished"])
+    lines += [f"configuration      {remark}" for remark in figures["remarks"]]
+    return "\n".join(lines)
+
+
+def _writer(to: Format, *, with_frames: bool) -> "Callable[[list[Path], History], None]":
+    """What writes a format: it gets the files to write and the run."""
+    if to is Format.AOT:
+        try:
+            from lowfc.programs.logs.export.aot import write_aot
+        except ModuleNotFoundError as error:
+            raise ConfigurationError(
+                f"--to aot needs aotpy, which is not there ({error}); install it with: {install_advice('aot')}"
+            ) from None
+        return partial(write_aot, with_frames=with_frames)
+    from lowfc.programs.logs.export import files
+
+    if to is Format.FITS:
+        return partial(files.write_fits, with_frames=with_frames)
+    return files.write_csv if to is Format.CSV else files.write_npz

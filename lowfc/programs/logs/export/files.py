@@ -1,0 +1,142 @@
+"""Exports that spreadsheets, numpy and FITS readers open: the table of steps, the calibration, and the frames."""
+
+import csv
+import json
+import zipfile
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+from astropy.io import fits
+from astropy.table import Column as TableColumn
+from astropy.table import Table
+
+from lowfc.adapters.logs.history import History
+from lowfc.programs.logs.export.columns import Column, calibration_columns, step_columns
+from lowfc.programs.logs.export.cubes import copy_frames_to_fits, copy_frames_to_npy
+
+KIND = "lowfc export 1"
+
+_ROWS_AT_ONCE = 1000
+
+
+def write_csv(files: list[Path], history: History) -> None:
+    """A table of the steps as comma-separated values: a column for each mode, nothing where there is no value.
+
+    A number is the shortest that becomes the log's when it is read in the log's precision.
+
+    Raises:
+        DataFileError: the log has no step.
+    """
+    columns = step_columns(history)
+    noll = _noll(history)
+    with files[0].open("w", newline="", encoding="utf-8") as stream:
+        table = csv.writer(stream, lineterminator="\n")
+        table.writerow([heading for column in columns for heading in column.headings(noll)])
+        for first in range(0, len(columns[0].values), _ROWS_AT_ONCE):
+            cells = [_cells(column.values[first : first + _ROWS_AT_ONCE]) for column in columns]
+            table.writerows(np.hstack(cells).tolist())
+
+
+def write_npz(files: list[Path], history: History) -> None:
+    """Arrays of the steps and of the calibration under names with units, none pickled.
+
+    Args:
+        files: the .npz, and a .npy for the frames (frames, rows, columns) in DN if they are wanted: `numpy.load` maps
+            it with `mmap_mode="r"`. Its order is that of `frame_sequence` in the .npz.
+        history: of the run.
+
+    Raises:
+        DataFileError: the log has no step, no frame, or frames of several sizes.
+    """
+    arrays = {column.name: column.values for column in step_columns(history)}
+    arrays["frame_sequence"] = history.frame_sequence
+    calibration = history.calibration
+    if calibration is not None:
+        arrays |= {f"calibration_{one.name}": one.values for one in calibration_columns(calibration)}
+        for name in ("id", "noll", "wavelength_nm", "flux_dn", "saturation_dn", "estimator"):
+            arrays[f"calibration_{name}"] = np.array(getattr(calibration, name))
+    if history.configuration is not None:
+        arrays["configuration_toml"] = np.array(history.configuration.to_toml())
+    arrays["metadata_json"] = np.array(json.dumps(history.log.metadata))
+    table, *cubes = files
+    with zipfile.ZipFile(table, "w", zipfile.ZIP_DEFLATED, compresslevel=1) as archive:
+        for name, values in arrays.items():
+            with archive.open(f"{name}.npy", "w", force_zip64=True) as stream:
+                np.lib.format.write_array(stream, np.asanyarray(values), allow_pickle=False)
+    for cube in cubes:
+        copy_frames_to_npy(cube, history)
+
+
+def write_fits(files: list[Path], history: History, *, with_frames: bool) -> None:
+    """The steps as binary table STEPS, each array of the calibration as an image, the frames as cube FRAMES.
+
+    Raises:
+        DataFileError: the log has no step, no frame, or frames of several sizes.
+    """
+    units = [_primary(history), _table("STEPS", step_columns(history))]
+    for column in calibration_columns(history.calibration) if history.calibration is not None else ():
+        image = fits.ImageHDU(column.values, name=column.name)
+        image.header["BUNIT"] = column.unit
+        image.header["CONTENT"] = column.sentence
+        units.append(image)
+    fits.HDUList(units).writeto(files[0], overwrite=True, checksum=True)
+    if not with_frames:
+        return
+    cube = fits.ImageHDU(np.zeros((1, 1, 1), np.float32), name="FRAMES")
+    cube.header["BUNIT"] = "adu"
+    sequence, time_ns = copy_frames_to_fits(files[0], cube, history)
+    identity = [
+        Column("sequence", sequence, "", "of the frame"),
+        Column("time_ns", time_ns, "ns", "end of the exposure, since 1970-01-01 UTC"),
+    ]
+    with fits.open(files[0], mode="append") as file:
+        file.append(_table("FRAME_TIMES", identity))
+
+
+def _noll(history: History) -> tuple[int, ...]:
+    return history.calibration.noll if history.calibration is not None else ()
+
+
+def _cells(values: npt.NDArray[Any]) -> npt.NDArray[np.str_]:
+    """Text of some rows, (rows, columns)."""
+    text = values.astype(str).reshape(len(values), -1)
+    if values.dtype.kind == "f":
+        text[~np.isfinite(values).reshape(text.shape)] = ""
+    return text
+
+
+def _primary(history: History) -> fits.PrimaryHDU:
+    primary = fits.PrimaryHDU()
+    header = primary.header
+    header["KIND"] = (KIND, "what this file is")
+    header["LOG"] = history.log.path.name
+    header["RATE"] = (history.rate_hz, "[Hz] frame rate")
+    if history.calibration is not None:
+        header["CALID"] = history.calibration.id
+        header["NOLL"] = " ".join(map(str, _noll(history)))
+        header["WAVELEN"] = (history.calibration.wavelength_nm, "[nm] wavelength")
+        header["FLUX"] = (history.calibration.flux_dn, "[adu] expected sum of the good pixels")
+    lines = [f"{name}: {key} = {value}" for name, group in history.log.metadata.items() for key, value in group.items()]
+    if history.configuration is not None:
+        lines += ["configuration:", *history.configuration.to_toml().splitlines()]
+    for line in lines:
+        header.add_comment(line.encode("ascii", "backslashreplace").decode())
+    return primary
+
+
+def _table(name: str, columns: list[Column]) -> fits.BinTableHDU:
+    rows = Table()
+    for column in columns:
+        values = column.values
+        if values.dtype.kind == "M":
+            values = np.datetime_as_string(values)
+        elif values.dtype == np.uint64:
+            values = values.astype(np.int64)  # FITS has no unsigned one, and a start in seconds << 32 fits
+        rows[column.name] = TableColumn(values, unit=column.unit or None)
+    unit = fits.table_to_hdu(rows)
+    unit.name = name
+    for number, column in enumerate(columns, 1):
+        unit.header.set(f"TCOMM{number}", column.sentence)
+    return unit

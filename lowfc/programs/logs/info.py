@@ -1,0 +1,116 @@
+"""The command `lowfc info`: what a log holds, whether it is whole, and what is missing from it."""
+
+import sys
+from collections.abc import Mapping
+from functools import partial
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from lowfc.adapters.process.terminal import Json, Logs
+from lowfc.contract.printable import LINES, printable
+from lowfc.programs.cli.output import put
+
+if TYPE_CHECKING:
+    from rich.console import Console
+
+_WIDTH = 120  # of the report, where there is no terminal
+_STATES = {
+    "complete": "complete",
+    "truncated": "truncated: its recorder was killed, or is still writing; `lowfc recover` makes it complete",
+    "damaged": "damaged; `lowfc recover` saves what is whole",
+}
+
+
+def info(
+    logs: Logs,
+    digest: Annotated[
+        bool, typer.Option("--digest", help="SHA-256 of what is deterministic: the same for lockstep runs of one seed.")
+    ] = False,
+    as_json: Json = False,
+) -> None:
+    """Say what ran, when, what was recorded of each topic, and what is missing or damaged.
+
+    Example: lowfc info last --digest
+    """
+    from rich.console import Console
+
+    from lowfc.adapters.logs.parts import one_by_one, titled
+    from lowfc.adapters.process.progress import reading_bar
+    from lowfc.programs.logs.survey import survey
+
+    for number, log in enumerate(one_by_one(logs, as_json=as_json)):
+        with reading_bar(Console(stderr=True)) as count:
+            found = survey(log, partial(count, f"reading {titled(log)}"), digest=digest)
+        if as_json:
+            put(found, "", as_json=True)
+        else:
+            sys.stdout.write("\n" if number else "")
+            report(found, Console(width=None if sys.stdout.isatty() else _WIDTH, highlight=False))
+
+
+def report(found: Mapping[str, Any], console: "Console") -> None:
+    """Print the figures of a log for a person."""
+    from rich.table import Table
+    from rich.text import Text
+
+    lines = Table.grid(padding=(0, 2))
+    for name, value in _summary(found).items():
+        lines.add_row(Text(printable(name), style="dim"), Text(printable(value, keep=LINES)))
+    console.print(lines)
+    topics = Table(box=None, padding=(0, 2, 0, 0))
+    topics.add_column("topic", no_wrap=True)
+    for name in ("messages", "Hz", "MB", "restarts", "missing"):
+        topics.add_column(name, justify="right", no_wrap=True)
+    topics.add_column("schema")
+    for key, line in found["topics"].items():
+        rate_hz = "" if line["rate_hz"] is None else f"{line['rate_hz']:.1f}"
+        counts = str(line["messages"]), rate_hz, f"{line['bytes'] / 1e6:.2f}", str(line["restarts"])
+        missing = "?" if line["missing"] is None else str(line["missing"])
+        topics.add_row(Text(printable(key)), *counts, missing, Text(printable(line["schema"])))
+    if found["topics"]:
+        console.print()
+        console.print(topics)
+
+
+def _summary(found: Mapping[str, Any]) -> dict[str, str]:
+    """All but the topics, a line each."""
+    from lowfc.adapters.logs.selection import SELECTION
+    from lowfc.adapters.logs.writer import PART
+    from lowfc.programs.logs.survey import recovery_in_words
+
+    metadata, recording = found["metadata"], found["metadata"].get("recording", {})
+    damage = [f"byte {one['position']}, {one['length']} bytes: {one['why']}" for one in found["damage"]]
+    lost = [f"{found['messages_missing']} missing by their counts"]
+    if "messages_lost" in recording:
+        lost.append(f"the recorder says that it lost {recording['messages_lost']}")
+    lost += [f"{count} of {key} (all)" for key, count in found["missing_topics"].items()]
+    if found["unreadable"]:
+        lost.append(f"{found['unreadable']} unreadable: what declares them was damaged")
+    lines = {
+        "log": f"{', '.join(found['files'])}, {found['bytes'] / 1e6:.1f} MB",
+        "digest": _digest(found),
+        "selection": found["selection"],
+        "state": _STATES[found["state"]],
+        "stopped": f"recording stopped: {recording['stopped']}" if recording.get("stopped") else "",
+        "recovery": recovery_in_words(metadata),
+        "damage": "\n".join(damage),
+        "start": "" if found["start"] is None else f"{found['start']}, {found['duration_s']:.3f} s",
+        "messages": f"{found['messages']}; {', '.join(lost)}",
+        "loop": ", ".join(found["loop_modes"]),
+        "events": ", ".join(f"{name} {count}" for name, count in found["events"].items()),
+        "configuration": "\n".join(found["remarks"]),
+        "attachments": ", ".join(f"{name} ({size} bytes)" for name, size in found["attachments"].items()),
+        **{
+            name: ", ".join(f"{key} {value}" for key, value in entries.items())
+            for name, entries in metadata.items()
+            if name not in ("recording", "recovery", PART, SELECTION)
+        },
+    }
+    return {name: value for name, value in lines.items() if value}
+
+
+def _digest(found: Mapping[str, Any]) -> str:
+    """The digest, and where it says nothing."""
+    digest = str(found.get("digest", ""))
+    return digest if not digest or found["lockstep"] else f"{digest} (not a lockstep run: no other run has it)"

@@ -1,0 +1,1 @@
+"""A log back on the bus, in its own time."""

@@ -1,0 +1,35 @@
+"""The command `lowfc publish`: a recorded run back on the bus."""
+
+from typing import Annotated
+
+import typer
+
+from lowfc.adapters.process.terminal import DEFAULT_RUN, INTERRUPTED, Json, Logs, RunId
+from lowfc.programs.cli.output import put
+
+
+def publish(
+    logs: Logs,
+    run: RunId = DEFAULT_RUN,
+    speed: Annotated[float, typer.Option(help="Times as fast as it was.")] = 1.0,
+    topics: Annotated[list[str] | None, typer.Option(help="Only these keys or patterns; repeat.")] = None,
+    allow_commands: Annotated[
+        bool, typer.Option("--allow-commands", help="Commands too, which a live mirror obeys.")
+    ] = False,
+    wait_for: Annotated[list[str] | None, typer.Option(help="Begin when this role is there; repeat.")] = None,
+    as_json: Json = False,
+) -> None:
+    """Put the recorded traffic on the bus again, for a viewer or a controller under test.
+
+    Example: lowfc publish last --speed 2
+    """
+    from lowfc.adapters.logs.parts import in_order
+    from lowfc.programs.logs.publish.player import publish as play
+    from lowfc.programs.logs.publish.player import render
+
+    figures = play(
+        in_order(logs), run, speed=speed, topics=topics or (), allow_commands=allow_commands, wait_for=wait_for or ()
+    )
+    put(figures, render(figures), as_json=as_json)
+    if figures["interrupted"]:
+        raise typer.Exit(INTERRUPTED)

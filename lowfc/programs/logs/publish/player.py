@@ -1,0 +1,281 @@
+"""A log back on the bus, in its own time: a viewer, a controller under test or a user's tool sees the night again.
+
+Payloads and sequences are those of the log, so that frame, step, command and mirror state still join; the time of
+publication is fresh, so that nothing passes for late. Deadlines are absolute: an error does not add to the next.
+"""
+
+import contextlib
+import time
+from collections import Counter
+from collections.abc import Collection, Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+from rich.console import Console
+from rich.progress import BarColumn, Progress, TaskID, TextColumn
+
+from lowfc.adapters.bus.bus import Publisher, name_in
+from lowfc.adapters.bus.run import Run, open_run
+from lowfc.adapters.bus.zenoh_bus import ZenohBus
+from lowfc.adapters.logs.reader import Logged, LogReader
+from lowfc.adapters.logs.recovery import faults
+from lowfc.adapters.process.clock import HostClock
+from lowfc.adapters.process.progress import passing_bar
+from lowfc.adapters.process.realtime import Granted, set_up
+from lowfc.adapters.process.service import Service
+from lowfc.contract.errors import ConfigurationError, DataFileError, nearest
+from lowfc.contract.messages import COMMAND, HEALTH, MIRROR_STATE, Role, topic_of
+from lowfc.control.loop.durations import Durations
+from lowfc.programs.logs.publish.selection import Selection, role_of
+
+BEHIND_NS = 1_000_000
+"""A message that is sent later than this after its time is counted as behind."""
+
+_SLICE_NS = 100_000_000
+_SHOW_NS = 200_000_000
+_SETTLE_S = 0.5  # a program that only connects tries at least every 0.2 s
+_PATIENCE_S = 2.0
+_ORDER_NS = 2_000_000_000
+
+
+def publish(
+    logs: Sequence[Path],
+    run_id: str,
+    *,
+    speed: float = 1.0,
+    topics: Sequence[str] = (),
+    allow_commands: bool = False,
+    wait_for: Collection[str] = (),
+) -> dict[str, Any]:
+    """Play logs into a run until their end, or until SIGTERM or SIGINT.
+
+    Args:
+        logs: files in the order of their recording, finished or not.
+        run_id: the run to play into; made where there is none of that name.
+        speed: 2 is twice as fast, a large one as fast as it goes. As from a live camera, whoever does not keep up loses
+            messages.
+        topics: names or shell patterns of keys; all topics but commands when empty.
+        allow_commands: play commands too, and frames where a live mirror may follow them.
+        wait_for: roles that must be live and linked before the first message; their topics are left to them.
+
+    Returns:
+        Figures for `render` and `--json`.
+
+    Raises:
+        ConfigurationError: an option makes no sense.
+        BusError: a live process of the run publishes what should be played.
+        DataFileError: a log cannot be read, or has nothing to play.
+    """
+    if not 0 < speed < float("inf"):
+        raise ConfigurationError(f"--speed is a factor above 0, 1 as recorded; got {speed:g}")
+    shown = Console(stderr=True)
+    run = open_run(run_id, _mirrors(logs[0]))
+    for role in wait_for:
+        if role not in run.links.ports:
+            raise ConfigurationError(
+                f"run {run_id!r} has no role {role!r} to wait for{nearest(role, run.links.ports)}; "
+                f"it has {', '.join(sorted(run.links.ports))}"
+            )
+    selection = Selection(run.links, topics, run.links.live() | set(wait_for), allow_commands=allow_commands)
+    granted = set_up(None, None, lock_memory=False, disable_cpu_idle=False)
+    with _joined(run, selection, granted) as (service, buses):
+        shown.print(f"playing into run {run_id!r} as {', '.join(buses)}", highlight=False)
+        player = Player(service, buses, selection, speed)
+        if _linked(service, selection.live, wait_for, shown):
+            service.state = "running"
+            player.play(logs, shown)
+        return {"run": run_id, "logs": [str(path) for path in logs], "speed": speed, **player.figures()}
+
+
+class Player:
+    """Puts the messages of logs on the bus, each at its time."""
+
+    def __init__(self, service: Service, buses: dict[str, ZenohBus], selection: Selection, speed: float) -> None:
+        """Play `selection` as the roles of `buses`, and be told when to stop by `service`."""
+        self._service = service
+        self._clock = service.clock
+        self._buses = buses
+        self._selection = selection
+        self._speed = speed
+        self._publishers: dict[str, Publisher | None] = {}
+        self._left_out: dict[str, str] = {}
+        self._errors, self._interval_errors = Durations(), Durations()
+        self._behind = 0
+        self._late_ns = 0
+        self._first_log_ns = self._last_log_ns = 0
+        self._begun_ns = self._sent_ns = 0
+        self._show_ns = 0
+        self._logs: list[LogReader] = []
+        self._at_once: Counter[str] = Counter()
+
+    def play(self, logs: Sequence[Path], console: Console) -> None:
+        """Play logs, one after the other."""
+        with passing_bar(console, TextColumn("{task.description}"), BarColumn()) as bar:
+            for path in logs:
+                log = LogReader(path, skip_damaged=True)
+                self._logs.append(log)
+                self._play(log, bar, bar.add_task(path.name))
+                if not self._service.running:
+                    return
+        if not self._at_once and not self._errors.count:
+            raise DataFileError(f"{', '.join(map(str, logs))}: there is no message of the topics to play")
+
+    def figures(self) -> dict[str, Any]:
+        """What was played, and how well its times were kept."""
+        return {
+            "messages": self._errors.count + self._at_once.total(),
+            "published": {key: one.published for key, one in sorted(self._publishers.items()) if one is not None},
+            "left_out": dict(sorted(self._left_out.items())),
+            "span_s": (self._last_log_ns - self._first_log_ns) * 1e-9,
+            "took_s": (self._sent_ns - self._begun_ns) * 1e-9,
+            "timing_error_us": _microseconds(self._errors),
+            "interval_error_us": _microseconds(self._interval_errors),
+            "messages_behind": self._behind,
+            "finished": all(log.finished for log in self._logs),
+            "damaged": [f"{log.path}: byte {one.position}, {one.why}" for log in self._logs for one in log.damage],
+            "selection": sorted({one for log in self._logs if (one := log.selection.sentence)}),
+            "interrupted": not self._service.running,
+        }
+
+    def _play(self, log: LogReader, bar: Progress, task: TaskID) -> None:
+        opening = True
+        kept: set[str] = set()
+        for message in log:
+            if not self._service.running:
+                return
+            publisher = self._publisher(message.key)
+            if publisher is None:
+                continue
+            if publisher.last is not None and publisher.last[1].sequence == message.sequence:
+                continue  # the next log of a series begins with what was valid at the end of the one before
+            if opening:
+                # A log begins with the calibration and states that were valid then, as old as they may be.
+                opening = publisher.topic.queryable and publisher.topic is not HEALTH and message.key not in kept
+                if opening:
+                    kept.add(message.key)
+                    publisher.put(message.payload, None, message.sequence)
+                    self._at_once[message.key] += 1
+                    continue
+                self._check_order(log, message)
+            self._send(publisher, message)
+            if self._sent_ns >= self._show_ns:
+                self._show_ns = self._sent_ns + _SHOW_NS
+                self._service.beat()
+                bar.update(task, completed=log.position, total=log.size, description=_utc(message.log_time_ns))
+
+    def _send(self, publisher: Publisher, message: Logged) -> None:
+        """Wait for a message's time and send it."""
+        self._last_log_ns = max(self._last_log_ns, message.log_time_ns)
+        if not self._begun_ns:
+            self._first_log_ns = self._last_log_ns
+            self._begun_ns = self._sent_ns = self._clock.host_ns()
+        due_ns = self._begun_ns + round((self._last_log_ns - self._first_log_ns) / self._speed)
+        self._sleep_until(due_ns)
+        if not self._service.running:
+            return
+        self._sent_ns = publisher.put(message.payload, None, message.sequence).publish_time_ns
+        late_ns = self._sent_ns - due_ns
+        if self._errors.count:
+            self._interval_errors.add(abs(late_ns - self._late_ns))
+        self._errors.add(abs(late_ns))
+        self._behind += late_ns > BEHIND_NS
+        self._late_ns = late_ns
+
+    def _sleep_until(self, due_ns: int) -> None:
+        while (left_ns := due_ns - self._clock.host_ns()) > 0 and self._service.running:
+            time.sleep(min(left_ns, _SLICE_NS) * 1e-9)
+            if left_ns > _SLICE_NS:
+                self._service.beat()
+
+    def _check_order(self, log: LogReader, message: Logged) -> None:
+        if message.log_time_ns < self._last_log_ns - _ORDER_NS:
+            raise DataFileError(
+                f"{log.path} begins before the log given before it ends; give logs in the order of their recording"
+            )
+
+    def _publisher(self, key: str) -> Publisher | None:
+        """Publisher of a key in its role's place; None where it is not played."""
+        if key not in self._publishers:
+            self._publishers[key] = self._new_publisher(key)
+        return self._publishers[key]
+
+    def _new_publisher(self, key: str) -> Publisher | None:
+        try:
+            topic = topic_of(key)
+        except KeyError:
+            self._left_out[key] = "no topic of this version"
+            return None
+        if not self._selection.asked(key):
+            return None
+        if why := self._selection.why_not(key):
+            self._left_out[key] = why
+            return None
+        bus = self._buses.get(role_of(key)) or next(iter(self._buses.values()))
+        return bus.publisher(topic, name_in(topic, key))
+
+
+def render(figures: dict[str, Any]) -> str:
+    """The summary for a person."""
+    error, interval = (
+        ", ".join(f"{name} {value:.0f} us" for name, value in figures[which].items())
+        for which in ("timing_error_us", "interval_error_us")
+    )
+    lines = [
+        f"played             {figures['messages']} messages into run {figures['run']!r}: {figures['span_s']:.1f} s of "
+        f"log in {figures['took_s']:.1f} s" + (", interrupted" if figures["interrupted"] else ""),
+        f"times              off by {error}",
+        f"intervals          off by {interval}",
+        f"behind             {figures['messages_behind']} messages by more than {BEHIND_NS / 1e6:g} ms",
+    ]
+    lines += faults(figures["damaged"], finished=figures["finished"])
+    lines += [f"the log has        {selection}" for selection in figures["selection"]]
+    lines += [f"left out           {key}: {why}" for key, why in figures["left_out"].items()]
+    return "\n".join(lines)
+
+
+@contextlib.contextmanager
+def _joined(run: Run, selection: Selection, granted: Granted) -> Iterator[tuple[Service, dict[str, ZenohBus]]]:
+    """Take the places of the roles to be played; a replay of events alone takes none."""
+    with contextlib.ExitStack() as held:
+        clock = HostClock()
+        buses: dict[str, ZenohBus] = {}
+        for role in selection.roles or (Role.REPLAY,):
+            buses[role] = ZenohBus(run.links, role, clock)
+            held.callback(buses[role].close)
+        service = Service(Role.REPLAY, run.run_id, clock, next(iter(buses.values())), granted=granted)
+        service.catch_signals()
+        held.callback(service.finish)
+        yield service, buses
+
+
+def _linked(service: Service, live: Collection[str], wait_for: Collection[str], console: Console) -> bool:
+    """Wait for those who shall see the first message; False when told to stop."""
+    service.state = "ready"
+    missing = service.wait_for(wait_for, _PATIENCE_S)
+    if missing and service.running:
+        console.print(f"waiting for {', '.join(missing)} of run {service.run_id!r}; Ctrl-C ends it", highlight=False)
+    while missing and service.running:
+        missing = service.wait_for(missing, _PATIENCE_S)
+    begun_s = time.monotonic()
+    service.wait_for(live, _PATIENCE_S)  # a user's own program need not have a health
+    while service.running and time.monotonic() - begun_s < _SETTLE_S:
+        time.sleep(0.02)
+    return service.running
+
+
+def _mirrors(log: Path) -> tuple[str, ...]:
+    """Names of the mirrors in a log, for a run that is yet to be made; an unfinished log tells the first one's."""
+    reader = LogReader(log, topics=(MIRROR_STATE, COMMAND), skip_damaged=True)
+    next(iter(reader), None)
+    topics = MIRROR_STATE, COMMAND
+    names = {name_in(topic, key) for key, _ in reader.channels for topic in topics if topic.matches(key)}
+    return tuple(sorted(names)) or ("dm",)
+
+
+def _microseconds(durations: Durations) -> dict[str, float]:
+    p50_ns, p99_ns = durations.percentiles_ns(0.5, 0.99)
+    return {"p50": p50_ns / 1e3, "p99": p99_ns / 1e3, "max": durations.max_ns / 1e3}
+
+
+def _utc(time_ns: int) -> str:
+    return time.strftime("%Y-%m-%d %H:%M:%S", time.gmtime(time_ns // 1_000_000_000)) + f".{time_ns // 10**8 % 10}Z"

@@ -1,0 +1,36 @@
+"""The command `lowfc recover`: what is whole of a truncated or damaged log, as a log."""
+
+from functools import partial
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from lowfc.adapters.process.terminal import Json, Logs
+from lowfc.programs.cli.output import put
+
+
+def recover(
+    logs: Logs,
+    out: Annotated[
+        Path | None, typer.Option(help="The new log; default: NAME-recovered.mcap beside it.", show_default=False)
+    ] = None,
+    as_json: Json = False,
+) -> None:
+    """Make a complete, indexed log of what is whole in a truncated or damaged one, which is not changed.
+
+    Each file of a recording is recovered by itself; of a whole one nothing is made.
+
+    Example: lowfc recover logs/20270101T220000Z.mcap.part
+    """
+    from rich.console import Console
+
+    from lowfc.adapters.logs.parts import in_order
+    from lowfc.adapters.logs.recovery import recover as run
+    from lowfc.adapters.logs.recovery import recovered_path
+    from lowfc.adapters.process.progress import reading_bar
+
+    for log in in_order(logs, out, as_json=as_json):
+        with reading_bar(Console(stderr=True)) as count:
+            done = run(log, out or recovered_path(log), partial(count, f"recovering {log.name}"))
+        put(done.figures, str(done), as_json=as_json)

@@ -1,0 +1,155 @@
+"""The command `lowfc replay`."""
+
+import time
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+from rich.console import Console
+
+from lowfc.adapters.logs.parts import in_order
+from lowfc.adapters.logs.recovery import faults
+from lowfc.adapters.process.progress import reading_bar
+from lowfc.adapters.process.provenance import provenance
+from lowfc.adapters.process.terminal import Json, Logs
+from lowfc.contract.envelope import count_of
+from lowfc.contract.errors import ConfigurationError
+from lowfc.programs.cli.output import put
+from lowfc.programs.logs.replay.account import Account
+
+_HOST = ("lowfc", "git", "python", "numpy", "scipy", "blas", "processor", "cpu_features")
+"""What the same bytes may depend on; of the processor's features, those that only one of the two has."""
+
+
+def verify(logs: list[Path], tolerance_nm: float, jobs: int, console: Console) -> dict[str, Any]:
+    """Replay logs that follow each other; return the figures that `--json` prints.
+
+    Raises:
+        DataFileError: a log cannot be read, or cannot be replayed.
+    """
+    from lowfc.programs.logs.replay.workers import replay_files
+
+    total = sum(path.stat().st_size for path in logs if path.exists())
+    begun_s = time.monotonic()
+    with reading_bar(console) as count:
+        outcome = replay_files(logs, tolerance_nm, jobs, lambda done: count("replaying", done, total))
+    elapsed_s = time.monotonic() - begun_s
+    return {
+        **_figures(outcome.account),
+        "version": outcome.recorded_on.get("lowfc", ""),
+        "tolerance_nm": tolerance_nm,
+        "log_s": round(outcome.log_s, 3),
+        "speed": round(outcome.log_s / elapsed_s, 2),
+        "complete": outcome.complete,
+        "damaged": outcome.damage,
+        "runs": outcome.runs,
+        "stopped": outcome.stopped,
+        "host_differs": _host_differs(outcome.recorded_on),
+    }
+
+
+def render(figures: dict[str, Any]) -> str:
+    """The figures of a replay for a person."""
+    frames, largest_nm = figures["frames"], figures["largest_difference_nm"]
+    if not frames:
+        verdict = "nothing could be replayed"
+    elif figures["identical"] and figures["tolerance_nm"]:
+        verdict = f"{frames} frames, commands identical within {figures['tolerance_nm']:g} nm"
+    elif figures["identical"]:
+        verdict = f"{frames} frames, commands identical"
+    elif not figures["different"]:
+        verdict = f"{frames} frames, steps identical, but no command is in the log"
+    else:
+        verdict = f"{frames} frames, {figures['different']} messages differ"
+    lines = [
+        f"{verdict}, largest difference {largest_nm:.3g} nm",
+        f"with them          {figures['commands']} commands, {figures['states']} states, {figures['requests']} answers",
+    ]
+    for rule, count in figures["rules_changed"].items():
+        lines.append(f"answered otherwise {count} since {figures['version']}: {rule}")
+    for why, count in figures["unchecked_because"].items():
+        lines.append(f"not checked        {count} steps {why}")
+    for name, what in (("inputs_missing", "inputs of the controller"), ("commands_missing", "commands that it sent")):
+        if figures[name]:
+            lines.append(f"not in the log     {figures[name]} {what}")
+    lines += faults(figures["damaged"], finished=figures["complete"])
+    lines += [f"recording stopped  {why}" for why in figures["stopped"]]
+    if len(figures["runs"]) > 1:
+        lines.append(f"of several runs    {', '.join(figures['runs'])}")
+    first = figures["first_difference"]
+    if first:
+        lines.append(
+            f"first difference   {first['message']} of frame {count_of(first['frame_sequence'])} "
+            f"(sequence {first['frame_sequence']}), input {first['taken']} of the controller"
+        )
+        lines += [f"                   {line}" for line in first["fields"]]
+    for key, (there, here) in figures["host_differs"].items():
+        lines.append(f"{key:18} {there or 'none'} in the log, {here or 'none'} here")
+    lines.append(f"speed              {figures['log_s']:.1f} s of log, {figures['speed']:.1f} times as fast as it was")
+    return "\n".join(lines)
+
+
+def _figures(account: Account) -> dict[str, Any]:
+    first = account.first
+    return {
+        "frames": account.frames,
+        "commands": account.commands,
+        "unchecked": sum(account.unchecked.values()),
+        "identical": account.identical,
+        "largest_difference_nm": account.largest_nm,
+        "first_difference": first
+        and {
+            "message": first.what,
+            "frame_sequence": first.frame_sequence,
+            "taken": first.taken,
+            "fields": first.fields,
+        },
+        "different": account.different,
+        "states": account.states,
+        "requests": account.requests,
+        "unchecked_because": account.unchecked,
+        "rules_changed": account.changed,
+        "inputs_missing": account.missing,
+        "commands_missing": account.commands_missing,
+    }
+
+
+def _host_differs(there: dict[str, str]) -> dict[str, tuple[str, str]]:
+    """What of versions and processor is not as it was when the log was recorded: the log's, and here."""
+    here = provenance()
+    found = {key: (there[key], here.get(key, "")) for key in _HOST if key in there and there[key] != here.get(key, "")}
+    if "cpu_features" in found:
+        before, now = (set(features.split()) for features in found["cpu_features"])
+        found["cpu_features"] = " ".join(sorted(before - now)), " ".join(sorted(now - before))
+    return found
+
+
+def replay_log(
+    logs: Logs,
+    tolerance: Annotated[
+        float, typer.Option(min=0, help="Largest difference that is none, nm: for a log of another processor.")
+    ] = 0.0,
+    jobs: Annotated[
+        int | None, typer.Option(min=1, help="Processes, at most; default: one on every processor.")
+    ] = None,
+    as_json: Json = False,
+    other_loop: Annotated[
+        str | None, typer.Option("--what-if", "--config", "--calibration", "--controller", hidden=True)
+    ] = None,
+    on_the_bus: Annotated[bool, typer.Option("--publish", "--allow-commands", hidden=True)] = False,
+    how: Annotated[list[str] | None, typer.Option("--run", "--speed", "--topics", "--wait-for", hidden=True)] = None,
+) -> None:
+    """Run the loop again on what it took in, and compare every step and command with the log, to the bit.
+
+    Exit status 0 only if they are identical. Logs may be complete, rotated, truncated or damaged.
+
+    Example: lowfc replay last
+    """
+    if other_loop is not None:
+        raise ConfigurationError("a what-if is a command of its own: lowfc what-if LOG --set gain=0.3")
+    if on_the_bus or how:
+        raise ConfigurationError("a log is put on the bus by a command of its own: lowfc publish LOG --run NAME")
+    figures = verify(in_order(logs), tolerance, jobs or 0, Console(stderr=True))
+    put(figures, render(figures), as_json=as_json)
+    if not figures["identical"]:
+        raise typer.Exit(1)

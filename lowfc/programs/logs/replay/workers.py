@@ -1,0 +1,190 @@
+"""Replaying log files, a long one in shares on several processors."""
+
+import gc
+import multiprocessing
+import os
+import signal
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from itertools import pairwise
+from multiprocessing.sharedctypes import SynchronizedArray
+from pathlib import Path
+
+from threadpoolctl import threadpool_limits
+
+from lowfc import __version__
+from lowfc.adapters.logs.parts import Repeated
+from lowfc.adapters.logs.reader import LogReader
+from lowfc.adapters.logs.records import LogFile
+from lowfc.contract import published
+from lowfc.contract.errors import ConfigurationError, DataFileError
+from lowfc.programs.logs.replay.account import Account
+from lowfc.programs.logs.replay.controller_replay import PATIENCE_NS, WHOLE, Share
+from lowfc.programs.logs.replay.fold import TOPICS, Replay
+from lowfc.programs.logs.replay.former import Former
+
+_WORTH_BYTES = 50_000_000
+"""Of log, for another process: below that it costs more time than it saves."""
+_POLL_S = 0.1
+_NEWS_EVERY = 5000
+
+Progress = Callable[[int], None]
+
+
+@dataclass(slots=True)
+class Outcome:
+    """What a replay has found, and what the logs were like.
+
+    Attributes:
+        complete: every log has its end.
+        damage: what was left out of the logs, a sentence each.
+        recorded_on: versions and host, as the first log has them.
+        runs: names of the runs that are in the logs.
+        stopped: why a recording ended early, a sentence each.
+        log_s: from the first frame to the last.
+    """
+
+    account: Account
+    complete: bool = True
+    damage: list[str] = field(default_factory=list)
+    recorded_on: dict[str, str] = field(default_factory=dict)
+    log_s: float = 0.0
+    runs: list[str] = field(default_factory=list)
+    stopped: list[str] = field(default_factory=list)
+
+
+def replay_files(paths: Sequence[Path], tolerance_nm: float, jobs: int, progress: Progress) -> Outcome:
+    """Replay logs that follow each other.
+
+    Args:
+        paths: of the logs, in their order.
+        tolerance_nm: differences up to this are none.
+        jobs: processes, at most; 0 for as many as there are processors.
+        progress: called with the bytes replayed so far.
+
+    Raises:
+        ConfigurationError: a log is named twice.
+        DataFileError: a log cannot be read, or cannot be replayed.
+    """
+    ends_ns = [one for path in paths for one in _chunk_ends_ns(path)]
+    if len({path.resolve() for path in paths}) < len(paths):
+        raise ConfigurationError("a log is named twice; name each once, in the order they were recorded")
+    worth = sum(path.stat().st_size for path in paths) // _WORTH_BYTES if ends_ns else 1
+    count = max(1, min(jobs or len(os.sched_getaffinity(0)), worth))
+    edges = [0, *(ends_ns[len(ends_ns) * share // count] for share in range(1, count)), WHOLE.until_ns]
+    shares = [Share(from_ns, until_ns) for from_ns, until_ns in pairwise(edges)]
+    if count == 1:
+        outcomes = [_replay_share(paths, tolerance_nm, shares[0], progress)]
+    else:
+        outcomes = _in_processes(paths, tolerance_nm, shares, progress)
+    whole = outcomes[0]
+    for outcome in outcomes[1:]:
+        whole.account.add(outcome.account)
+        whole.log_s += outcome.log_s
+        whole.damage = sorted({*whole.damage, *outcome.damage})
+    last = outcomes[-1]  # its worker has read the logs to their end
+    whole.complete, whole.runs, whole.stopped = last.complete, sorted(set(last.runs)), last.stopped
+    unaccounted = whole.account.steps - whole.account.frames - sum(whole.account.unchecked.values())
+    whole.account.leave_out("that no state came before", max(0, unaccounted))
+    return whole
+
+
+def _chunk_ends_ns(path: Path) -> list[int]:
+    """Log times at which the chunks of a log end, as its summary says; none for one that is not finished."""
+    with LogFile(path) as file:
+        return [chunk.message_end_time for chunk in file.index()]
+
+
+def _replay_share(paths: Sequence[Path], tolerance_nm: float, share: Share, progress: Progress) -> Outcome:
+    """Replay a share, on one thread as the live loop: more threads sum in another order."""
+    run = Replay(tolerance_nm, share)
+    outcome = Outcome(run.account)
+    repeated = Repeated()
+    done = number = 0
+    gc.disable()
+    try:
+        with threadpool_limits(1):
+            for path in paths:
+                reader = LogReader(
+                    path,
+                    topics=TOPICS,
+                    skip_damaged=True,
+                    from_ns=max(0, share.from_ns - PATIENCE_NS),
+                    always=published.TOPICS,
+                )
+                first = True
+                repeated.next_file()
+                for message in reader:
+                    if first:
+                        _refuse_thinned(reader)
+                        run.former, first = _former(reader), False
+                    if not repeated(message):
+                        run.take(message)
+                    number += 1
+                    if number % _NEWS_EVERY == 0:
+                        progress(done + reader.position)
+                    if run.done:
+                        break
+                done += reader.size
+                outcome.complete &= reader.complete
+                outcome.damage += [f"{path.name}, byte {one.position}: {one.why}" for one in reader.damage]
+                metadata = reader.metadata
+                outcome.recorded_on = outcome.recorded_on or metadata.get("lowfc", {})
+                outcome.runs.append(metadata.get("lowfc", {}).get("run", "?"))
+                if why := metadata.get("recording", {}).get("stopped"):
+                    outcome.stopped.append(f"{path.name}: {why}")
+                if run.done:
+                    break
+            run.finish()
+    finally:
+        gc.enable()
+    outcome.log_s = run.duration_s
+    return outcome
+
+
+def _refuse_thinned(reader: LogReader) -> None:
+    if not reader.selection.has_every_frame:
+        raise DataFileError(
+            f"{reader.path} cannot be replayed, as it was made without all frames ({reader.selection.sentence}): steps "
+            "are computed again from every frame; `lowfc what-if` and `lowfc report` read it"
+        )
+
+
+def _former(reader: LogReader) -> Former | None:
+    """What is compared of a log, by the version that it names at its start; None for all, of this version's."""
+    version = reader.metadata.get("lowfc", {}).get("lowfc", __version__)
+    if version == __version__:
+        return None
+    return Former(reader.schemas)
+
+
+def _in_processes(
+    paths: Sequence[Path], tolerance_nm: float, shares: Sequence[Share], progress: Progress
+) -> list[Outcome]:
+    context = multiprocessing.get_context("spawn")
+    progresses = context.Array("q", len(shares))
+    tasks = [(paths, tolerance_nm, share, number) for number, share in enumerate(shares)]
+    with context.Pool(len(shares), _begin, (progresses,)) as pool:
+        running = pool.starmap_async(_work, tasks, chunksize=1)
+        while not running.ready():
+            running.wait(_POLL_S)
+            progress(sum(progresses[:]) // len(shares))
+        return running.get()
+
+
+_progresses: "SynchronizedArray[int] | None" = None
+
+
+def _begin(progresses: "SynchronizedArray[int]") -> None:
+    """In a worker: Ctrl-C is for the parent, which ends its workers."""
+    global _progresses  # the only way into a pool's worker
+    _progresses = progresses
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+
+
+def _work(paths: Sequence[Path], tolerance_nm: float, share: Share, number: int) -> Outcome:
+    def progress(done: int) -> None:
+        assert _progresses is not None  # noqa: S101  # `_begin` came first
+        _progresses[number] = done
+
+    return _replay_share(paths, tolerance_nm, share, progress)

@@ -1,0 +1,140 @@
+"""The error budget of a run's longest closed stretch, each term with the way it was obtained."""
+
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from lowfc.control.laws.error_budget import SensorNoise, Term, lag, lag_under_noise, measurement_error, white_noise
+from lowfc.control.laws.spectra import Pieces
+from lowfc.programs.logs.report.closed_loop import (
+    DISTURBANCE,
+    ERROR,
+    POL,
+    RESIDUAL,
+    Spectra,
+    Stretch,
+    noise_of,
+    why_none,
+)
+from lowfc.programs.logs.report.source import Run
+
+Double = npt.NDArray[np.float64]
+Masks = dict[str, npt.NDArray[np.bool_]]
+Figures = dict[str, Any]
+
+Entry = tuple[Term | None, str]
+"""A term and how it was obtained; or none, and what it would take."""
+
+_THROUGH = "times the loop's noise transfer"
+_NO_CAMERA = "the camera's gain and read noise"
+_NO_TRUTH = "the true wavefront, which only a simulation knows"
+_TOO_SHORT = "a longer stretch with the loop closed"
+
+
+def budget_figures(run: Run, stretch: Stretch | None, spectra: Spectra | None, masks: Masks) -> Figures:
+    """Terms, their sum, and what it is compared with, in nm rms over each of the groups of modes."""
+    if stretch is None:
+        return {"why_not": why_none(run)}
+    noise = noise_of(run.history, stretch.rows)
+    terms = _terms(stretch, spectra, noise)
+    rows = [
+        {"name": name, "how": how} | _columns(term, masks) | {"missing": term is None}
+        for name, (term, how) in terms.items()
+    ]
+    found = [term for term, _ in terms.values() if term is not None]
+    total = Term(np.sum([np.maximum(term.variance_nm2, 0) for term in found], axis=0)) if found else None
+    left = [name for name, (term, _) in terms.items() if term is None]
+    true = _mean_square(stretch.signal(RESIDUAL).joined()) if stretch.true and stretch.frames.values else None
+    measured = _mean_square(stretch.signal(ERROR).joined()) if stretch.frames.values else None
+    return {
+        "terms": rows,
+        "sum": _columns(total, masks),
+        "sum_lacks": left,
+        "true_residual": _columns(true, masks),
+        "measured_error": _columns(measured, masks),
+        "sum_over_true": _over(total, true, masks),
+        "frame_noise": None
+        if noise is None
+        else {
+            "photon_nm": noise.photon_nm.tolist(),
+            "read_nm": noise.read_nm.tolist(),
+            "total_nm": noise.total_nm.tolist(),
+        },
+    }
+
+
+def _terms(stretch: Stretch, spectra: Spectra | None, noise: SensorNoise | None) -> dict[str, Entry]:
+    """Each term, or None, and how it was obtained, or what it would take."""
+    law = stretch.law
+    found: dict[str, Entry] = {}
+    if noise is None:
+        found = dict.fromkeys(("photon noise", "read noise"), (None, f"it takes {_NO_CAMERA}"))
+    else:
+        for name, one_nm, source in (
+            ("photon noise", noise.photon_nm, "flux as measured"),
+            ("read noise", noise.read_nm, "camera's read noise and rounding"),
+        ):
+            how = f"{source}, through the reconstructor, {_THROUGH}"
+            found[name] = (white_noise(law, one_nm), how if noise.total_nm.any() else "the simulation has no noise")
+    if spectra is None:
+        found["lag"] = (None, f"it takes {_TOO_SHORT}")
+    elif spectra.true is not None:
+        mean_nm = stretch.signal(DISTURBANCE).joined().mean(axis=0)
+        found["lag"] = (lag(law, spectra.true[0], mean_nm), "spectrum of the true disturbance times the rejection")
+    else:
+        mean_nm = stretch.signal(POL).joined().mean(axis=0)
+        how = "pseudo-open-loop spectrum, its noise floor taken off, times the rejection"
+        found["lag"] = (lag_under_noise(law, spectra.measured[1], mean_nm), how)
+    crosstalk, nonlinearity = _measurement_terms(stretch, noise)
+    found["cross-talk and aliasing"] = crosstalk
+    found["nonlinearity"] = nonlinearity
+    return found
+
+
+def _measurement_terms(stretch: Stretch, noise: SensorNoise | None) -> tuple[Entry, Entry]:
+    split, missing = None, _TOO_SHORT
+    if not stretch.true:
+        missing = _NO_TRUTH
+    elif noise is None:
+        missing = _NO_CAMERA
+    else:
+        error = stretch.signal(ERROR)
+        seen = _difference(error, stretch.signal(POL))
+        split = measurement_error(stretch.law, error, stretch.signal(RESIDUAL), seen, noise.total_nm)
+    if split is None:
+        nothing = (None, f"it takes {missing}")
+        return nothing, nothing
+    linear = "what of error less true residual follows linearly from a constant, the residual and the command"
+    rest = "what is left of error less true residual, beyond the noise of a frame"
+    return (split.crosstalk, f"{linear}, {_THROUGH}"), (split.nonlinearity, f"{rest}, {_THROUGH}")
+
+
+def _difference(one: Pieces, other: Pieces) -> Pieces:
+    return Pieces(tuple(a - b for a, b in zip(one.values, other.values, strict=True)), one.bridged)
+
+
+def _mean_square(values: Double) -> Term:
+    return Term(np.mean(values**2, axis=0))
+
+
+def _columns(term: Term | None, masks: Masks) -> Figures:
+    """Rms of each group in nm; `upper_limit` names the groups in which it was not seen."""
+    if term is None:
+        return {"rms_nm": dict.fromkeys(masks), "upper_limit": []}
+    totals = {name: term.total(mask) for name, mask in masks.items()}
+    return {
+        "rms_nm": {name: rms_nm for name, (rms_nm, _) in totals.items()},
+        "upper_limit": [name for name, (_, seen) in totals.items() if not seen],
+    }
+
+
+def _over(total: Term | None, true: Term | None, masks: Masks) -> dict[str, float | None]:
+    """Sum over true residual, rms over rms."""
+    if total is None or true is None:
+        return dict.fromkeys(masks)
+    ratios = {}
+    for name, mask in masks.items():
+        below = true.total(mask)[0]
+        ratios[name] = total.total(mask)[0] / below if below > 0 else None
+    return ratios

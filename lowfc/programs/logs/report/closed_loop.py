@@ -1,0 +1,241 @@
+"""The longest stretch of a run with the loop closed under one law: its spectra, against the theory, and its budget."""
+
+from dataclasses import dataclass
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from lowfc.adapters.logs.history import History
+from lowfc.control.laws.error_budget import SensorNoise, sensor_noise
+from lowfc.control.laws.linear_law import LinearLaw, integrator
+from lowfc.control.laws.margins import noise_transfer, rejection
+from lowfc.control.laws.spectra import SHORTEST, Pieces, Spectrum, in_bins, pieces, spectrum
+from lowfc.control.laws.stability import settling_frames
+from lowfc.control.loop.safety import LoopMode
+from lowfc.programs.logs.report.source import InForce, Run
+
+Double = npt.NDArray[np.float64]
+Figures = dict[str, Any]
+
+MOST_STEPS = 200_000
+"""Of a longer stretch only the last ones are looked at: memory does not grow with the night."""
+BANDS_HZ = (1.0, 10.0, 100.0, 1000.0)
+"""Where bands of frequency end, above the resolution."""
+
+_TIP, _TILT = 2, 3
+
+
+@dataclass(frozen=True, slots=True)
+class Stretch:
+    """Steps with the loop closed under one law.
+
+    Attributes:
+        rows: of the steps, settled.
+        settling: steps before them that are left out, and `earlier` more of a long stretch.
+        frames: error, pseudo-open-loop and, where the log has truth, disturbance and residual, side by side.
+    """
+
+    rows: slice
+    settling: int
+    earlier: int
+    in_force: InForce
+    law: LinearLaw
+    frames: Pieces
+    true: bool
+
+    def signal(self, number: int) -> Pieces:
+        """Error 0, pseudo-open-loop 1, disturbance 2, residual 3; (frames, modes) each."""
+        modes = len(self.law.noll)
+        return self.frames.columns(slice(number * modes, (number + 1) * modes))
+
+
+ERROR, POL, DISTURBANCE, RESIDUAL = range(4)
+
+
+def longest_stretch(run: Run) -> Stretch | None:
+    """The longest one; None where the loop was never closed, or the log does not tell under which law."""
+    history, laws = run.history, run.law_rows()
+    steps = history.steps
+    closed = (steps.mode == LoopMode.CLOSED) & (laws >= 0)
+    edges = np.flatnonzero(np.diff(np.where(closed, laws, -1), prepend=-1, append=-1))
+    spans = [(first, last) for first, last in pairwise(edges.tolist()) if closed[first]]
+    if not spans:
+        return None
+    first, last = max(spans, key=lambda span: int(np.isfinite(steps.error_nm[span[0] : span[1], :1]).sum()))
+    in_force = run.laws[laws[first]]
+    gain, leak = np.array(in_force.gain, float), np.array(in_force.leak, float)
+    settling = min(settling_frames(gain, leak), (last - first) // 10)
+    rows = slice(max(first + settling, last - MOST_STEPS), last)
+    earlier = rows.start - first - settling
+    signals = [steps.error_nm[rows], steps.pol_nm[rows]]
+    true = history.true is not None and bool(np.isfinite(history.true.residual_nm[rows]).any())
+    if true and history.true is not None:
+        signals += [history.true.disturbance_nm[rows], history.true.residual_nm[rows]]
+    found = pieces(steps.sequence[rows], np.hstack(signals))
+    noll = tuple(range(2, 2 + gain.size))
+    rate_hz = history.rate_hz or 1.0  # of one step alone none is known, and nothing is reckoned with it
+    law = integrator(gain, leak, noll, in_force.delay_frames, rate_hz)
+    return Stretch(rows, settling, earlier, in_force, law, found, true)
+
+
+def why_none(run: Run) -> str:
+    """Why there is no stretch."""
+    if (run.history.steps.mode == LoopMode.CLOSED).any():
+        return "this log does not tell under which law the loop was closed"
+    return "the loop was not closed in this log"
+
+
+def stretch_figures(run: Run, stretch: Stretch | None) -> Figures | None:
+    """Which part of the run it is, and under which law."""
+    if stretch is None:
+        return None
+    steps = run.history.steps
+    times_s = run.step_s[stretch.rows]
+    limited = (steps.reasons[stretch.rows] >> 20) != 0
+    return {
+        "from_s": float(times_s[0]),
+        "to_s": float(times_s[-1]),
+        "true": stretch.true,
+        "frames": stretch.frames.frames,
+        "pieces": len(stretch.frames.values),
+        "frames_bridged": stretch.frames.bridged,
+        "steps_settling": stretch.settling,
+        "steps_earlier": stretch.earlier,
+        "steps_limited": int(limited.sum()),
+        "gain": list(stretch.in_force.gain),
+        "leak": list(stretch.in_force.leak),
+        "delay_frames": stretch.law.delay_frames,
+    }
+
+
+def groups_of(noll: tuple[int, ...]) -> dict[str, npt.NDArray[np.bool_]]:
+    """Tip, tilt and the others as masks (modes,); only groups that have modes."""
+    index = np.array(noll, dtype=int)
+    masks = {"tilt x": index == _TIP, "tilt y": index == _TILT, "other modes": index > _TILT}
+    return {name: mask for name, mask in masks.items() if mask.any()}
+
+
+@dataclass(frozen=True, slots=True)
+class Spectra:
+    """Spectra of all signals of a stretch; of disturbance and residual where the log has truth."""
+
+    measured: tuple[Spectrum, Spectrum]
+    true: tuple[Spectrum, Spectrum] | None
+
+
+def spectra_of(stretch: Stretch | None) -> Spectra | None:
+    """None where there is no stretch, or it is too short."""
+    if stretch is None:
+        return None
+    found = [spectrum(stretch.signal(number), stretch.law.rate_hz) for number in range(4 if stretch.true else 2)]
+    whole = [one for one in found if one is not None]
+    if len(whole) < len(found):
+        return None
+    return Spectra((whole[0], whole[1]), (whole[2], whole[3]) if stretch.true else None)
+
+
+def spectra_figures(run: Run, stretch: Stretch | None, found: Spectra | None) -> Figures:
+    """Spectra of tip, tilt and the total of the others: in bins, by band, and against the theory."""
+    if stretch is None:
+        return {"why_not": why_none(run)}
+    if found is None:
+        longest = max((len(piece) for piece in stretch.frames.values), default=0)
+        return {"why_not": f"the longest gap-free stretch has {longest} frames, and a spectrum takes {SHORTEST}"}
+    calibration = run.history.calibration
+    groups = groups_of(calibration.noll if calibration is not None else ())
+    noise = _noise_floor(run, stretch)
+    return {
+        "segments": found.measured[0].segments,
+        "resolution_hz": found.measured[0].spacing_hz,
+        "groups": [_group(name, mask, stretch.law, found, noise) for name, mask in groups.items()],
+    }
+
+
+def _group(
+    name: str, modes: npt.NDArray[np.bool_], law: LinearLaw, found: Spectra, noise_nm2_hz: Double | None
+) -> Figures:
+    """One group's spectra; what is summed over modes is summed in power."""
+
+    def total(one: Spectrum) -> Double:
+        return np.asarray(one.power_nm2_hz[:, modes].sum(axis=1))
+
+    error, pol = found.measured
+    frequency_hz = pol.frequency_hz
+    passed = rejection(law, frequency_hz)[:, modes] ** 2
+    columns = {
+        "pseudo_open_loop": total(pol),
+        "error": total(error),
+        "error_predicted": (passed * pol.power_nm2_hz[:, modes]).sum(axis=1),
+    }
+    if found.true is not None:
+        disturbance, residual = found.true
+        left = (passed * disturbance.power_nm2_hz[:, modes]).sum(axis=1)
+        columns |= {"disturbance": total(disturbance), "residual": total(residual), "disturbance_left": left}
+        if noise_nm2_hz is not None:
+            added = noise_transfer(law, frequency_hz)[:, modes] ** 2 * noise_nm2_hz[modes]
+            columns["residual_predicted"] = left + added.sum(axis=1)
+    centres_hz, means = in_bins(frequency_hz, list(columns.values()))
+    binned = dict(zip(columns, means, strict=True))
+    over = {"measured_over_theory": _ratio(binned["error"], binned["error_predicted"])}
+    if "residual_predicted" in binned:
+        over["true_over_theory"] = _ratio(binned["residual"], binned["residual_predicted"])
+    highest_hz = float(frequency_hz[-1])
+    edges_hz = [0.0, *(edge for edge in BANDS_HZ if frequency_hz[1] < edge < highest_hz), highest_hz]
+    bands = [
+        {"from_hz": low, "to_hz": high}
+        | {f"{key}_rms_nm": _band_rms(frequency_hz, column, low, high) for key, column in columns.items()}
+        for low, high in pairwise(edges_hz)
+    ]
+    return {
+        "name": name,
+        **over,
+        "bands": bands,
+        "frequency_hz": centres_hz.tolist(),
+        "power_nm2_hz": {key: column.tolist() for key, column in binned.items()},
+    }
+
+
+def _ratio(measured: Double, theory: Double) -> Figures:
+    """Amplitude of the measured over the theory's, over all bins: the middle, and where nine tenths of them lie."""
+    there = (theory > 0) & (measured > 0)
+    if not there.any():
+        return {"median": None, "p5": None, "p95": None}
+    p5, median, p95 = np.percentile(np.sqrt(measured[there] / theory[there]), [5, 50, 95])
+    return {"median": float(median), "p5": float(p5), "p95": float(p95)}
+
+
+def _band_rms(frequency_hz: Double, power: Double, low_hz: float, high_hz: float) -> float:
+    inside = (frequency_hz >= low_hz) & ((frequency_hz < high_hz) | (high_hz == frequency_hz[-1]))
+    return float(np.sqrt(power[inside].sum() * frequency_hz[1]))
+
+
+def noise_of(history: History, rows: slice) -> SensorNoise | None:
+    """Sensor noise of one frame at the flux that these steps had; None where the log lacks camera or calibration."""
+    camera, calibration = history.camera, history.calibration
+    flux_dn = history.steps.flux_dn[rows]
+    flux_dn = flux_dn[flux_dn > 0]
+    if camera is None or calibration is None or not flux_dn.size or not camera.gain_e_per_dn:
+        return None
+    charge_e = 0.0
+    if history.configuration is not None:
+        if not history.configuration.camera.noise:
+            nothing = np.zeros(len(calibration.noll))
+            return SensorNoise(nothing, nothing)
+        charge_e = history.configuration.camera.clock_induced_charge_e
+    em_gain = max(camera.em_gain, 1.0)
+    excess = 2.0 if em_gain > 1 else 1.0
+    behind_e2 = camera.read_noise_e**2 + camera.gain_e_per_dn**2 / 12  # rounding to whole DN
+    return sensor_noise(
+        calibration.reconstructor.astype(float),
+        calibration.reference.astype(float),
+        float(flux_dn.mean()) * camera.gain_e_per_dn / em_gain,
+        float(np.sqrt(behind_e2 / em_gain**2 + excess * charge_e)),
+        excess,
+    )
+
+
+def _noise_floor(run: Run, stretch: Stretch) -> Double | None:
+    noise = noise_of(run.history, stretch.rows)
+    return None if noise is None else 2 * noise.total_nm**2 / stretch.law.rate_hz

@@ -1,0 +1,94 @@
+"""The command `lowfc report`: arguments only; the work is elsewhere."""
+
+import json
+import math
+import sys
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from lowfc.adapters.process.terminal import Logs
+from lowfc.contract.errors import DataFileError
+from lowfc.contract.printable import LINES, printable
+
+if TYPE_CHECKING:
+    from lowfc.adapters.logs.parts import Parts
+
+_LOGS = (".mcap", ".part")
+
+
+def report(
+    logs: Logs,
+    out: Annotated[
+        Path | None, typer.Option(help="The page (HTML). Default: beside the log, under its name.", show_default=False)
+    ] = None,
+    as_json: Annotated[
+        bool, typer.Option("--json", help="Print the figures as one JSON object; the page only with --out.")
+    ] = False,
+) -> None:
+    """Summarise a run from its log: one HTML page that opens anywhere, and the same figures as JSON.
+
+    Example: lowfc report last
+    """
+    from lowfc.adapters.logs.parts import one_by_one
+
+    found = one_by_one(logs, out, as_json=as_json)
+    if out is not None and out.suffix in _LOGS:
+        raise DataFileError(f"{out} would be a log, which a report never overwrites; give --out FILE.html")
+    for log in found:
+        _report(log, out, as_json)
+
+
+def _report(log: "Parts", out: Path | None, as_json: bool) -> None:
+    """Report one log."""
+    from rich.console import Console
+    from rich.progress import TimeElapsedColumn
+
+    from lowfc.adapters.files.whole_file import require_folder, write_whole
+    from lowfc.adapters.logs.parts import titled
+    from lowfc.adapters.process.progress import counting_bar
+    from lowfc.programs.logs.guard import refuse_log
+    from lowfc.programs.logs.report.figures import report_of
+    from lowfc.programs.logs.report.page import page
+    from lowfc.programs.logs.report.source import read_run
+
+    target = out if out is not None or as_json else beside(log[0])
+    require_folder(target)
+    if target is not None:
+        refuse_log(target, log[0])
+    with counting_bar(Console(stderr=True), TimeElapsedColumn()) as count:
+        run = read_run(log, partial(count, f"reading {titled(log)}"))
+        found = report_of(run)
+        if target is not None:
+            made = page(found, lambda name: count(f"drawing {name}", 1, 1))
+            write_whole(target, made.encode())
+    for remark in run.history.remarks:
+        sys.stderr.write(f"warning: {remark}\n")
+    if as_json:
+        sys.stdout.write(json.dumps(_finite(found.figures), allow_nan=False) + "\n")
+    else:
+        verdict = found.figures["verdict"]
+        because = f": {verdict['because']}" if verdict["because"] else ""
+        sys.stdout.write(printable(f"{verdict['heading']}{because}\n{target}\n", keep=LINES))
+
+
+def _finite(figures: Any) -> Any:
+    """The figures with None for what JSON has no number for: a log may hold any value."""
+    match figures:
+        case dict():
+            return {key: _finite(value) for key, value in figures.items()}
+        case list() | tuple():
+            return [_finite(value) for value in figures]
+        case float() if not math.isfinite(figures):
+            return None
+    return figures
+
+
+def beside(log: Path) -> Path:
+    """Where a log's page is written: its folder, its name without what says that it is a log."""
+    name = log.name
+    for suffix in reversed(_LOGS):
+        name = name.removesuffix(suffix)
+    return log.parent / f"{name}.html"

@@ -1,0 +1,143 @@
+"""The course of a run: loop modes, events, requests, light, refused frames, the mirror's stroke."""
+
+from collections import Counter
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from lowfc.adapters.logs.history import History
+from lowfc.contract.events import Level
+from lowfc.contract.messages import wire
+from lowfc.control.loop.safety import LoopMode, Reason
+from lowfc.programs.logs.report.source import Run
+
+Figures = dict[str, Any]
+
+_FIRST_LIMIT = Reason.MODAL_LIMIT
+_LEVELS = {level.value: level.name.lower() for level in Level}
+
+
+def mode_spans(run: Run) -> list[Figures]:
+    """Loop modes in their order, from when to when in seconds since the first step."""
+    mode = run.history.steps.mode
+    if not mode.size:
+        return []
+    starts = np.flatnonzero(np.diff(mode.astype(int), prepend=-1))
+    ends = np.append(starts[1:], mode.size - 1)
+    times_s = run.step_s
+    return [
+        {"mode": mode_name(int(mode[first])), "from_s": float(times_s[first]), "to_s": float(times_s[last])}
+        for first, last in zip(starts, ends, strict=True)
+    ]
+
+
+def mode_steps(history: History) -> dict[str, int]:
+    """Steps in each loop mode."""
+    counted = Counter(history.steps.mode.tolist())
+    return {mode_name(number): count for number, count in sorted(counted.items())}
+
+
+def mode_name(number: int) -> str:
+    """Name of a loop mode, as operators say it."""
+    return LoopMode(number).name.lower() if number in list(LoopMode) else f"mode {number}"
+
+
+def events(run: Run) -> list[Figures]:
+    """Events in their order, with level, process, name and sentence."""
+    found = run.history.events
+    times_s = run.seconds([time_ns for time_ns, _ in found])
+    return [
+        {
+            "time_s": float(time_s),
+            "level": _LEVELS.get(int(event.level), "info"),
+            "process": event.name,
+            "name": event.message.partition(" ")[0],
+            "text": event.message.partition(" ")[2],
+        }
+        for time_s, (_, event) in zip(times_s, found, strict=True)
+    ]
+
+
+def requests(run: Run) -> list[Figures]:
+    """What operators asked and were answered, other than for the status."""
+    steps = run.history.steps
+    found = [request for request in run.history.requests if request.name != "status"]
+    return [
+        {
+            "time_s": _when(run, request),
+            "name": request.name,
+            "modes": list(request.modes),
+            "values": list(request.values),
+            "accepted": request.accepted,
+            "reply": request.reply,
+        }
+        for request in found
+        if steps.sequence.size
+    ]
+
+
+def laws(run: Run) -> list[Figures]:
+    """The laws in force, from when on."""
+    return [
+        {
+            "from_s": float(run.step_s[law.first]),
+            "gain": list(law.gain),
+            "leak": list(law.leak),
+            "delay_frames": law.delay_frames,
+        }
+        for law in run.laws
+    ]
+
+
+def light_figures(history: History) -> Figures:
+    """Flux, saturation, and frames refused by reason."""
+    steps = history.steps
+    flux = steps.flux_dn[steps.flux_dn > 0]
+    refused = {reason.name.lower(): _given(steps.reasons, reason) for reason in Reason if reason < _FIRST_LIMIT}
+    return {
+        "flux_expected_dn": history.calibration.flux_dn if history.calibration is not None else None,
+        "flux_mean_dn": float(flux.mean()) if flux.size else None,
+        "flux_least_dn": float(flux.min()) if flux.size else None,
+        "flux_largest_dn": float(flux.max()) if flux.size else None,
+        "frames_saturated": int((steps.saturated_pixels > 0).sum()),
+        "saturated_pixels_most": int(steps.saturated_pixels.max(initial=0)),
+        "frames_refused": sum(refused.values()),
+        "refused": {reason: count for reason, count in refused.items() if count},
+    }
+
+
+def mirror_figures(history: History) -> Figures:
+    """Stroke used, and limits that acted, at the controller and at the mirror."""
+    mirror, settings = history.mirror, history.controller.settings if history.controller is not None else None
+    limit_nm = settings.stroke_nm if settings is not None and settings.stroke_nm else None
+    most_nm = float(mirror.stroke_nm.max()) if mirror.stroke_nm.size else None
+    return {
+        "stroke_limit_nm": limit_nm,
+        "stroke_most_nm": most_nm,
+        "stroke_most_share": most_nm / limit_nm if most_nm is not None and limit_nm else None,
+        "states": int(mirror.sequence.size),
+        "limits_at_controller": _limits(history.steps.reasons),
+        "limits_at_mirror": _limits(mirror.limits),
+    }
+
+
+def actuator_extremes_nm(history: History) -> npt.NDArray[np.float32]:
+    """Largest deviation from flat of each actuator (rows, columns) over the run."""
+    return np.maximum(np.abs(history.mirror.highest_nm), np.abs(history.mirror.lowest_nm))
+
+
+def _limits(reasons: npt.NDArray[np.int64]) -> dict[str, int]:
+    counted = {reason.name.lower(): _given(reasons, reason) for reason in Reason if reason >= _FIRST_LIMIT}
+    return {reason: count for reason, count in counted.items() if count}
+
+
+def _given(reasons: npt.NDArray[np.int64], reason: Reason) -> int:
+    return int(np.count_nonzero(reasons >> int(reason) & 1))
+
+
+def _when(run: Run, request: wire.Request) -> float:
+    """Time of the first step for which a request was in force, or of the last step before."""
+    sequence = run.history.steps.sequence
+    later = sequence >= request.frame_sequence
+    return float(run.step_s[int(np.argmax(later)) if later.any() else -1])

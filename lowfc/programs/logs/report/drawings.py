@@ -1,0 +1,339 @@
+"""The drawings of a report."""
+
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import numpy.typing as npt
+
+from lowfc.contract.printable import printable
+from lowfc.programs.logs.report.course import actuator_extremes_nm
+from lowfc.programs.logs.report.figures import Report
+from lowfc.programs.logs.report.residual import bin_starts, binned_rms
+from lowfc.programs.logs.report.svg import COLOURS, svg
+from lowfc.programs.logs.report.timing import intervals_ns, latencies_ns
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+Double = npt.NDArray[np.float64]
+
+INK, FAINT, OPEN, CLOSED = (COLOURS[name] for name in ("ink", "faint", "open", "closed"))
+_MODES = {"open": OPEN, "closed": CLOSED, "safe": COLOURS["safe"], "idle": FAINT}
+_BESIDE_TRUTH: dict[str, Any] = {"linestyle": ":", "linewidth": 0.9, "alpha": 0.7}
+"""Of what was measured, where the log has what was true."""
+_NEAR = 0.25
+"""Part of the stroke from which on its limit is drawn."""
+_MOST_MARKS = 300
+_SECONDS = "seconds since the first step"
+
+
+def drawings(report: Report, progress: Callable[[str], None] = lambda name: None) -> dict[str, str]:
+    """SVG of every drawing that the log has something for, by name.
+
+    Args:
+        report: What is drawn.
+        progress: Called with the name of each drawing before it is drawn.
+
+    Raises:
+        ConfigurationError: matplotlib is not installed.
+    """
+    found = {}
+    for name, (height_in, draw) in _DRAWINGS.items():
+        progress(name)
+        drawn = svg(name, height_in, draw, report)
+        if drawn is not None:
+            found[name] = drawn
+    return found
+
+
+def _overview(figure: "Figure", report: Report) -> bool:
+    """Loop mode as a band, and before and after over time."""
+    run = report.run
+    if not run.history.steps.sequence.size:
+        return False
+    band, plot = figure.subplots(2, 1, sharex=True, height_ratios=(1, 6))
+    _mode_band(band, report)
+    binned = binned_rms(run)
+    time_s = binned["time_s"]
+    true = "disturbance" in binned
+    names = (
+        ("disturbance", "before: true disturbance", OPEN),
+        ("residual", "after: true residual", CLOSED),
+        ("pseudo_open_loop", "before: pseudo-open-loop", OPEN),
+        ("error", "after: measured error", CLOSED),
+    )
+    for name, label, colour in names:
+        if name in binned and np.isfinite(binned[name]).any():
+            look = _BESIDE_TRUTH if true and name in ("pseudo_open_loop", "error") else {}
+            plot.plot(time_s, binned[name], label=label, color=colour, **look)
+    plot.set(ylabel="all modes, nm rms", xlabel=_SECONDS)
+    plot.set_ylim(bottom=0)
+    if plot.lines:
+        plot.legend(loc="upper center", bbox_to_anchor=(0.5, -0.16), ncols=4)
+    return True
+
+
+def _mode_band(axes: "Axes", report: Report) -> None:
+    shown: set[str] = set()
+    end_s = max(float(report.run.step_s[-1]), 1e-9)
+    for span in report.figures["mode_spans"]:
+        name, width_s = span["mode"], span["to_s"] - span["from_s"]
+        axes.broken_barh([(span["from_s"], width_s)], (0, 1), facecolor=_MODES.get(name, FAINT))
+        if width_s > 0.06 * end_s:
+            middle_s = span["from_s"] + width_s / 2
+            axes.text(middle_s, 0.45, name, ha="center", va="center", fontweight="bold", color=COLOURS["paper"])
+        elif name not in shown:
+            axes.text(span["from_s"], 1.1, name, ha="left", va="bottom", fontsize=8)
+        shown.add(name)
+    axes.set(ylim=(0, 1), yticks=[], ylabel="loop")
+    axes.grid(visible=False)
+    axes.spines[["left", "bottom"]].set_visible(False)
+    axes.tick_params(axis="x", length=0)
+
+
+def _intervals(figure: "Figure", report: Report) -> bool:
+    """Histograms of the intervals, and how slow the slowest are."""
+    found = {name: values * 1e-3 for name, values in intervals_ns(report.run).items() if values.size}
+    stages = {name: values * 1e-3 for name, values in latencies_ns(report.run.history).items() if values.size}
+    if not found and not stages:
+        return False
+    left, right = figure.subplots(1, 2)
+    if found:
+        everything = np.concatenate(list(found.values()))
+        low, high = np.percentile(everything, [0.1, 99.9])
+        edges = np.linspace(low, max(high, low + 1.0), 80)
+        for (name, values), colour, style in zip(found.items(), (INK, COLOURS["other"]), ("-", "--"), strict=False):
+            counts, _ = np.histogram(np.clip(values, edges[0], edges[-1]), edges)
+            left.stairs(counts, edges, label=name, color=colour, linestyle=style, linewidth=1.2)
+        left.set(yscale="log", xlabel="interval, µs (the ends hold what lies beyond)", ylabel="number")
+        left.legend()
+    colours = (COLOURS["other"], COLOURS["another"], FAINT, COLOURS["error"], INK, INK)
+    styles = ("-", "--", "-.", ":", "-", "--")
+    for (name, values), colour, style in zip(stages.items(), colours, styles, strict=False):
+        ordered = np.sort(values)
+        keep = np.unique(np.append(_spread(ordered.size), ordered.size - 1))
+        beyond = 1 - keep / ordered.size
+        right.plot(np.maximum(ordered[keep], 0.1), beyond, label=name.replace("_", " "), color=colour, linestyle=style)
+    if stages:
+        right.set(xscale="log", yscale="log", xlabel="latency, µs", ylabel="part of the frames that take longer")
+        right.legend(loc="lower left")
+    return True
+
+
+def _spread(size: int, most: int = 400) -> npt.NDArray[np.int64]:
+    """Places in an ordered column, ever closer towards its end."""
+    return size - 1 - np.unique(np.geomspace(1, size, min(most, size)).astype(np.int64) - 1)
+
+
+def _residual(figure: "Figure", report: Report) -> bool:
+    """Bars of each mode: before and after; true ones filled, measured ones hatched."""
+    modes = report.figures["residual"]["modes"]
+    kinds = (
+        ("disturbance", "true disturbance", OPEN, True),
+        ("residual", "true residual", CLOSED, True),
+        ("pseudo_open_loop", "pseudo-open-loop", OPEN, False),
+        ("error", "measured error", CLOSED, False),
+        ("open_error", "measured error, loop open", OPEN, False),
+    )
+    there = [kind for kind in kinds if modes and modes[0][f"{kind[0]}_rms_nm"] is not None]
+    if len(there) > 1:
+        there = [kind for kind in there if kind[0] != "open_error"]
+    if not there:
+        return False
+    axes = figure.subplots()
+    width = 0.8 / len(there)
+    for place, (key, label, colour, filled) in enumerate(there):
+        heights = [mode[f"{key}_rms_nm"] for mode in modes]
+        left = np.arange(len(modes)) - 0.4 + (place + 0.5) * width
+        look: dict[str, Any] = {"facecolor": colour}
+        if not filled:
+            look = {"facecolor": "none", "edgecolor": colour, "hatch": "//////"}
+        axes.bar(left, heights, 0.92 * width, label=label, **look)
+    names = [f"Z{mode['noll']} {mode['name']}" for mode in modes]
+    axes.set_xticks(range(len(modes)), names, rotation=35, ha="right", rotation_mode="anchor")
+    axes.set_ylabel("nm rms")
+    axes.grid(visible=False, axis="x")
+    axes.legend(ncols=len(there), loc="upper right")
+    return True
+
+
+def _spectra(figure: "Figure", report: Report) -> bool:
+    """Power above, and below it the ratio closed over open with the theory."""
+    groups = report.figures["spectra"].get("groups")
+    if not groups:
+        return False
+    grid = figure.subplots(2, len(groups), sharex=True, squeeze=False, height_ratios=(3, 2))
+    for column, group in enumerate(groups):
+        above, below = grid[0][column], grid[1][column]
+        frequency_hz, power = group["frequency_hz"], {k: np.array(v) for k, v in group["power_nm2_hz"].items()}
+        true = "disturbance" in power
+        quiet = _BESIDE_TRUTH if true else {}
+        above.plot(frequency_hz, power["pseudo_open_loop"], color=OPEN, label="open: pseudo-open-loop", **quiet)
+        above.plot(frequency_hz, power["error"], color=CLOSED, label="closed: measured error", **quiet)
+        ratio = np.sqrt(_over(power["error"], power["pseudo_open_loop"]))
+        theory = np.sqrt(_over(power["error_predicted"], power["pseudo_open_loop"]))
+        below.plot(frequency_hz, ratio, color=CLOSED, label="measured error / pseudo-open-loop", **quiet)
+        below.plot(frequency_hz, theory, color=INK, linestyle="--", linewidth=0.9, label="theory: rejection")
+        if true:
+            above.plot(frequency_hz, power["disturbance"], color=OPEN, label="open: true disturbance")
+            above.plot(frequency_hz, power["residual"], color=CLOSED, label="closed: true residual")
+            lowest = 1e-3 * min(power["residual"].min(), power["error"].min())
+            above.set_ylim(bottom=max(lowest, 1e-2 * power["residual"].min()))
+        if "residual_predicted" in power:
+            style = {"color": INK, "linestyle": "--", "linewidth": 0.9}
+            above.plot(frequency_hz, power["residual_predicted"], label="closed: theory, rejection and noise", **style)
+            clear = power["disturbance_left"] > 0.5 * power["residual_predicted"]
+            rejected = np.where(clear, np.sqrt(_over(power["residual"], power["disturbance"])), np.nan)
+            label = "true residual / disturbance, where noise is less"
+            below.plot(frequency_hz, rejected, "o", color=CLOSED, markersize=4, markerfacecolor="none", label=label)
+        above.set(title=group["name"], xscale="log", yscale="log")
+        below.set(xscale="log", yscale="log", xlabel="frequency, Hz")
+        below.set_ylim(bottom=min(0.1, 0.8 * float(np.nanmin(theory))))
+        for axes in (above, below):
+            axes.yaxis.set_minor_formatter("")
+    grid[0][0].set_ylabel("nm²/Hz")
+    grid[1][0].set_ylabel("closed / open, amplitude")
+    handles = [*grid[0][0].get_legend_handles_labels()[0], *grid[1][0].get_legend_handles_labels()[0]]
+    labels = [*grid[0][0].get_legend_handles_labels()[1], *grid[1][0].get_legend_handles_labels()[1]]
+    figure.legend(handles, labels, loc="outside lower center", ncols=3)
+    return True
+
+
+def _over(one: Double, other: Double) -> Double:
+    return np.divide(one, other, out=np.full_like(one, np.nan), where=other > 0)
+
+
+def _budget(figure: "Figure", report: Report) -> bool:
+    """Bars of the terms, their sum and what it should be, by group of modes."""
+    budget = report.figures["error_budget"]
+    if "why_not" in budget:
+        return False
+    rows = [(term["name"], term["rms_nm"], term["upper_limit"]) for term in budget["terms"] if not term["missing"]]
+    rows.append(("sum of the terms", budget["sum"]["rms_nm"], []))
+    if report.figures["closed_stretch"]["true"]:
+        rows.append(("true residual", budget["true_residual"]["rms_nm"], []))
+    groups = [name for name in budget["sum"]["rms_nm"] if name != "all modes"]
+    panels = figure.subplots(1, len(groups), sharey=True, squeeze=False)[0]
+    for axes, group in zip(panels, groups, strict=True):
+        for place, (name, values, limits) in enumerate(rows):
+            if values[group] is None:
+                continue
+            whole = name in ("sum of the terms", "true residual")
+            colour = CLOSED if name == "true residual" else INK if whole else COLOURS["other"]
+            limited = group in limits
+            look: dict[str, Any] = {"facecolor": colour}
+            if limited:
+                look = {"facecolor": "none", "edgecolor": colour, "linestyle": "--"}
+            axes.barh(place, values[group], 0.6, **look)
+            axes.text(values[group], place, f" {'< ' if limited else ''}{values[group]:.2g}", va="center", fontsize=8)
+        axes.set(title=group, xlabel="nm rms")
+        axes.grid(visible=False, axis="y")
+        axes.margins(x=0.2)
+    panels[0].set_yticks(range(len(rows)), [name for name, _, _ in rows])
+    panels[0].invert_yaxis()
+    return True
+
+
+def _light(figure: "Figure", report: Report) -> bool:
+    """Flux and saturated pixels over time, refused frames as marks."""
+    steps, time_s = report.run.history.steps, report.run.step_s
+    if not time_s.size:
+        return False
+    upper, lower = figure.subplots(2, 1, sharex=True, height_ratios=(3, 1))
+    starts = bin_starts(time_s.size, 600)
+    flux = np.where(steps.flux_dn > 0, steps.flux_dn, np.nan)
+    _envelope(upper, time_s[starts], flux, starts, INK)
+    refused = (steps.reasons & ((1 << 20) - 1)) != 0
+    if refused.any():
+        marks = time_s[refused][bin_starts(int(refused.sum()), _MOST_MARKS)]
+        look: dict[str, Any] = {"color": COLOURS["error"], "markersize": 5, "clip_on": False}
+        upper.plot(marks, np.zeros(marks.size), "x", label="frame refused", **look)
+    expected = report.figures["light"]["flux_expected_dn"]
+    if expected is not None:
+        upper.axhline(expected, color=FAINT, linestyle="--", linewidth=1.0, label="expected by the calibration")
+    upper.set_ylim(bottom=0)
+    upper.set_ylabel("flux, DN")
+    if upper.get_legend_handles_labels()[0]:
+        upper.legend(loc="lower right", ncols=2)
+    most = np.maximum.reduceat(steps.saturated_pixels, starts)
+    lower.fill_between(time_s[starts], most, step="post", color=INK, alpha=0.7, linewidth=0)
+    lower.set(ylabel="saturated\npixels", xlabel=_SECONDS, ylim=(0, max(1, 1.1 * float(most.max()))))
+    return True
+
+
+def _timeline(figure: "Figure", report: Report) -> bool:
+    """Loop modes, requests and events by level."""
+    events, requests = report.figures["events"], report.figures["requests"]
+    if not events and not report.figures["mode_spans"]:
+        return False
+    band, axes = figure.subplots(2, 1, sharex=True, height_ratios=(1, 4))
+    if report.figures["mode_spans"]:
+        _mode_band(band, report)
+    else:
+        band.set_axis_off()
+    levels = ("request", "info", "warning", "error")
+    looks = {"info": ("o", INK, "none"), "warning": ("^", INK, OPEN), "error": ("X", INK, COLOURS["error"])}
+    for level, (marker, edge, face) in looks.items():
+        found = [e["time_s"] for e in events if e["level"] == level or (level, e["level"]) == ("error", "fatal")]
+        times_s = np.array(found)[bin_starts(len(found), _MOST_MARKS)]
+        place = np.full(times_s.size, levels.index(level))
+        axes.plot(times_s, place, marker, markeredgecolor=edge, markerfacecolor=face, markersize=7, linestyle="none")
+    for number, request in enumerate(requests[:_MOST_MARKS]):
+        axes.axvline(request["time_s"], color=FAINT, linewidth=0.8, linestyle=":")
+        values = " ".join(f"{value:g}" for value in request["values"][:2])
+        text = f"{printable(request['name'])} {values}{'' if request['accepted'] else ' refused'}".strip()
+        height = 0.25 * (number % 3 - 1)
+        axes.text(request["time_s"], height, f" {text}", va="center", fontsize=8, parse_math=False)
+        axes.plot(request["time_s"], 0, "|", color=INK, markersize=9)
+    axes.set(ylim=(-0.7, 3.6), xlabel=_SECONDS)
+    axes.set_yticks(range(len(levels)), levels)
+    return True
+
+
+def _stroke(figure: "Figure", report: Report) -> bool:
+    """Largest actuator over time, and where on the mirror it was."""
+    history = report.run.history
+    mirror = history.mirror
+    if not mirror.sequence.size:
+        return False
+    plot, image = figure.subplots(1, 2, width_ratios=(2, 1))
+    time_s = report.run.seconds(mirror.publish_time_ns)
+    starts = bin_starts(time_s.size, 600)
+    _envelope(plot, time_s[starts], mirror.stroke_nm, starts, CLOSED)
+    figures = report.figures["mirror"]
+    limit_nm, title = figures["stroke_limit_nm"], "over time"
+    if limit_nm is not None:
+        title += f"; the limit is {limit_nm:g} nm"
+        if figures["stroke_most_share"] > _NEAR:  # else it would flatten the line
+            plot.axhline(limit_nm, color=COLOURS["error"], linestyle="--")
+    plot.set(ylabel="largest |actuator|, nm of surface", xlabel=_SECONDS, title=title)
+    plot.set_ylim(bottom=0)
+    extremes = actuator_extremes_nm(history)
+    shown = image.imshow(extremes, cmap="cividis", vmin=0, interpolation="nearest", origin="lower")
+    figure.colorbar(shown, ax=image, label="nm of surface")
+    share = f",\nat most {figures['stroke_most_share']:.1%} of the limit" if limit_nm is not None else ""
+    image.set(title=f"extreme of each actuator{share}", xlabel="column", ylabel="row")
+    image.locator_params(integer=True)
+    image.grid(visible=False)
+    return True
+
+
+def _envelope(axes: "Axes", time_s: Double, values: npt.NDArray[np.floating], starts: Any, colour: str) -> None:
+    """Least and largest of each bin as an area, and a line through the middle."""
+    least, most = np.fmin.reduceat(values, starts), np.fmax.reduceat(values, starts)
+    axes.fill_between(time_s, least, most, color=colour, alpha=0.25, linewidth=0)
+    axes.plot(time_s, (least + most) / 2, color=colour, linewidth=1.0)
+
+
+_DRAWINGS: dict[str, tuple[float, Callable[["Figure", Report], bool]]] = {
+    "overview": (3.2, _overview),
+    "intervals": (3.4, _intervals),
+    "residual": (3.6, _residual),
+    "spectra": (5.6, _spectra),
+    "budget": (3.0, _budget),
+    "light": (3.0, _light),
+    "timeline": (3.0, _timeline),
+    "stroke": (3.6, _stroke),
+}

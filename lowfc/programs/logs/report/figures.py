@@ -1,0 +1,130 @@
+"""All figures of a report: one object, of what JSON has."""
+
+import re
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from typing import Any
+
+import numpy as np
+
+from lowfc.programs.logs.report import course
+from lowfc.programs.logs.report.budget import budget_figures
+from lowfc.programs.logs.report.closed_loop import (
+    Spectra,
+    Stretch,
+    groups_of,
+    longest_stretch,
+    spectra_figures,
+    spectra_of,
+    stretch_figures,
+)
+from lowfc.programs.logs.report.residual import residual_figures
+from lowfc.programs.logs.report.source import Run
+from lowfc.programs.logs.report.timing import timing_figures
+from lowfc.programs.logs.report.verdict import verdict
+from lowfc.programs.logs.survey import recovery_in_words
+
+Figures = dict[str, Any]
+
+_NOT_VERSIONS = ("host", "kernel", "processor", "processors", "cpu_features", "blas", "run", "seed", "git")
+
+
+@dataclass(frozen=True, slots=True)
+class Report:
+    """A run, what was worked out of it for drawings, and its figures."""
+
+    run: Run
+    stretch: Stretch | None
+    spectra: Spectra | None
+    figures: Figures
+
+
+def report_of(run: Run) -> Report:
+    """Work everything out."""
+    history = run.history
+    stretch = longest_stretch(run)
+    spectra = spectra_of(stretch)
+    noll = history.calibration.noll if history.calibration is not None else ()
+    masks = groups_of(noll) | {"all modes": np.ones(len(noll), bool)}
+    figures: Figures = {
+        "log": _log(run),
+        "run": _run(run),
+        "mode_steps": course.mode_steps(history),
+        "mode_spans": course.mode_spans(run),
+        "laws": course.laws(run),
+        "closed_stretch": stretch_figures(run, stretch),
+        "timing": timing_figures(run),
+        "residual": residual_figures(run, stretch),
+        "spectra": spectra_figures(run, stretch, spectra),
+        "error_budget": budget_figures(run, stretch, spectra, masks),
+        "light": course.light_figures(history),
+        "mirror": course.mirror_figures(history),
+        "events": course.events(run),
+        "requests": course.requests(run),
+    }
+    return Report(run, stretch, spectra, {"verdict": verdict(figures)} | figures)
+
+
+def _log(run: Run) -> Figures:
+    log = run.history.log
+    account = log.metadata.get("recording", {})
+    lost = {name.removeprefix("lost "): _count(text) for name, text in account.items() if name.startswith("lost ")}
+    return {
+        "file": log.path.name,
+        "files": [path.name for path in log.paths],
+        "selection": log.selection.sentence,
+        "bytes": log.size,
+        "finished": log.finished,
+        "complete": log.complete and not log.damage,
+        "stopped": account.get("stopped") or None,
+        "recovery": recovery_in_words(log.metadata) or None,
+        "damage": [{"byte": damage.position, "bytes": damage.length, "why": damage.why} for damage in log.damage],
+        "remarks": run.history.remarks,
+        "messages": sum(run.history.counts.values()),
+        "messages_by_topic": dict(sorted(run.history.counts.items())),
+        "messages_lost": _count(account.get("messages_lost", "")),
+        "lost_by_topic": {name: count for name, count in lost.items() if count is not None},
+        "messages_unreadable": log.unreadable,
+        "steps_left_out": run.history.left_out,
+    }
+
+
+def _count(text: str) -> int | None:
+    return int(text) if re.fullmatch("[0-9]{1,20}", text) else None  # whatever stands there, it is the log's text
+
+
+def _run(run: Run) -> Figures:
+    history = run.history
+    about = history.log.metadata.get("lowfc", {})
+    first_ns, last_ns = history.span_ns
+    calibration, configuration, steps = history.calibration, history.configuration, history.steps
+    began = datetime.fromtimestamp(first_ns // 1_000_000_000, UTC).strftime("%Y-%m-%d %H:%M:%S UTC")
+    return {
+        "began": began if first_ns else None,
+        "recorded_s": (last_ns - first_ns) * 1e-9,
+        "steps": int(steps.sequence.size),
+        "steps_s": float(run.step_s[-1]) if steps.sequence.size else 0.0,
+        "simulated": bool(history.truths.sequence.size),
+        "lockstep": configuration.lockstep if configuration is not None else None,
+        **{key: about.get(key) for key in _NOT_VERSIONS},
+        "versions": {name: value for name, value in about.items() if name not in _NOT_VERSIONS},
+        "calibration": None
+        if calibration is None
+        else {
+            "id": calibration.id,
+            "modes": len(calibration.noll),
+            "estimator": calibration.estimator,
+            "wavelength_nm": calibration.wavelength_nm,
+            "measured": not calibration.operator_hash,
+            "frame_rows": calibration.shape[0],
+            "frame_columns": calibration.shape[1],
+            "mirror_rows": calibration.grid[0],
+            "mirror_columns": calibration.grid[1],
+        },
+        "configuration": configuration.model_dump() if configuration is not None else None,
+        "realtime_refused": {
+            name: list(health.realtime_refused)
+            for name, health in sorted(history.health.items())
+            if health.realtime_refused
+        },
+    }

@@ -1,0 +1,74 @@
+"""The report's page: one file with everything in it, made from figures and drawings."""
+
+from collections.abc import Callable
+from importlib.resources import files
+from typing import Any
+
+import tomli_w
+
+from lowfc.adapters.process.extras import install_advice
+from lowfc.contract.errors import ConfigurationError
+from lowfc.contract.printable import LINES, printable
+from lowfc.programs.logs.report.drawings import drawings
+from lowfc.programs.logs.report.figures import Report
+
+NOT_HERE = "not in this log"
+"""What stands where a log has no figure: never zero."""
+
+
+def page(report: Report, progress: Callable[[str], None] = lambda name: None) -> str:
+    """HTML that needs no other file and no network.
+
+    Args:
+        report: What it shows.
+        progress: Called with the name of each part before it is made.
+
+    Raises:
+        ConfigurationError: jinja2 or matplotlib is not installed.
+    """
+    environment = _environment()
+    template = environment.from_string((files("lowfc") / "data" / "report.html").read_text(encoding="utf-8"))
+    configuration = report.figures["run"]["configuration"]
+    text: str = template.render(
+        **report.figures,
+        drawings=drawings(report, progress),
+        toml=tomli_w.dumps(configuration) if configuration is not None else None,
+    )
+    return text
+
+
+def number(value: float | str | None, digits: int = 3) -> str:
+    """A figure in running text, with so many significant digits; or that it is not there."""
+    if value is None:
+        return NOT_HERE
+    if isinstance(value, str | int):
+        return str(value)
+    return f"{value:.0f}" if abs(value) >= 10**digits else f"{value:.{digits}g}"
+
+
+def fixed(value: float | str, decimals: int = 3) -> str:
+    """A figure of a column, its point under the others'; what would look like zero and is not is said to be less."""
+    if isinstance(value, str | int):
+        return str(value)
+    least = 10.0**-decimals
+    return f"< {least:.{decimals}f}" if 0 < value < least / 2 else f"{value:.{decimals}f}"
+
+
+def _finalized(value: Any) -> Any:
+    """What the page shows of a value: text of the log with its control characters escaped."""
+    return printable(value, keep=LINES) if type(value) is str else value  # a drawing is Markup
+
+
+def _environment() -> Any:
+    try:
+        from jinja2 import Environment, StrictUndefined
+    except ImportError as error:
+        raise ConfigurationError(
+            f"a report's page needs jinja2, which is not there ({error}); install it with: {install_advice('plots')}, "
+            "or take the figures with --json"
+        ) from None
+    environment = Environment(
+        autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True, finalize=_finalized
+    )
+    environment.filters |= {"n": number, "fixed": fixed}
+    return environment

@@ -1,0 +1,110 @@
+"""How much of the wavefront is left: rms of each mode, and of tip and tilt on the sky."""
+
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from lowfc.adapters.logs.columns import TruthRows
+from lowfc.contract.configuration import Configuration
+from lowfc.control.loop.safety import LoopMode
+from lowfc.optics.chain.zernike import mode_name
+from lowfc.optics.detector.photometry import tilt_nm_per_mas
+from lowfc.programs.logs.report.closed_loop import Stretch, noise_of
+from lowfc.programs.logs.report.source import Run
+
+Figures = dict[str, Any]
+Rows = npt.NDArray[np.intp]
+
+
+def residual_figures(run: Run, stretch: Stretch | None) -> Figures:
+    """Rms in nm of each mode and signal, and of tip and tilt per axis in mas; None for what the log does not have.
+
+    With the loop closed they are of the longest stretch under one law, settled, without and with the correction; with
+    it open of all of those steps.
+    """
+    history = run.history
+    steps = history.steps
+    opened = np.flatnonzero(steps.mode == LoopMode.OPEN)
+    closed = np.arange(steps.sequence.size)[stretch.rows] if stretch is not None else opened[:0]
+    noll = history.calibration.noll if history.calibration is not None else ()
+    true = history.true or TruthRows(0).taken()
+    values = {
+        "open_error": _rms(steps.error_nm, opened),
+        "open_residual": _rms(true.residual_nm, opened),
+        "pseudo_open_loop": _rms(steps.pol_nm, closed),
+        "disturbance": _rms(true.disturbance_nm, closed),
+        "error": _rms(steps.error_nm, closed),
+        "residual": _rms(true.residual_nm, closed),
+    }
+    noise = noise_of(history, stretch.rows if stretch is not None else slice(None))
+    modes = [
+        {
+            "noll": index,
+            "name": mode_name(index),
+            **{f"{signal}_rms_nm": _at(found, k) for signal, found in values.items()},
+            "frame_noise_nm": float(noise.total_nm[k]) if noise is not None else None,
+        }
+        for k, index in enumerate(noll)
+    ]
+    open_pupil = {
+        f"{name}_open_pupil_rms_nm": _at(_rms(column[:, None], rows), 0)
+        for name, column, rows in (
+            ("disturbance", true.disturbance_rms_nm, closed if closed.size else opened),
+            ("residual", true.residual_rms_nm, closed),
+        )
+    }
+    return {
+        "modes": modes,
+        "tilt_mas": {signal: _tilt_mas(found, noll, history.configuration) for signal, found in values.items()},
+        "total_rms_nm": {
+            signal: float(np.sqrt(np.sum(found**2))) if found is not None else None for signal, found in values.items()
+        },
+        "open_pupil": open_pupil,
+        "steps_open": int(opened.size),
+        "steps_closed": int(closed.size),
+    }
+
+
+def binned_rms(run: Run, most: int = 300) -> dict[str, npt.NDArray[np.float64]]:
+    """Over time, at most so many bins: `time_s`, and rms of all modes in nm of what the log has of before and after."""
+    steps, true = run.history.steps, run.history.true
+    columns = {"pseudo_open_loop": steps.pol_nm, "error": steps.error_nm}
+    if true is not None:
+        columns |= {"disturbance": true.disturbance_nm, "residual": true.residual_nm}
+    starts = bin_starts(steps.sequence.size, most)
+    found = {"time_s": run.step_s[starts]}
+    for name, column in columns.items():
+        if column.size:
+            squares = np.sum(column.astype(float) ** 2, axis=1)
+            known = np.isfinite(squares)
+            counts = np.add.reduceat(known, starts, dtype=float)
+            sums = np.add.reduceat(np.where(known, squares, 0.0), starts)
+            found[name] = np.sqrt(np.divide(sums, counts, out=np.full_like(sums, np.nan), where=counts > 0))
+    return found
+
+
+def bin_starts(rows: int, most: int) -> Rows:
+    """First row of each of at most so many bins of even width."""
+    return np.arange(0, rows, max(1, -(-rows // most)))
+
+
+def _rms(values: npt.NDArray[np.float32], rows: Rows) -> npt.NDArray[np.float64] | None:
+    """Root mean square (modes,) of those rows that hold values; None where none does, or there are none at all."""
+    found = values[rows] if values.size else values
+    known = found[np.isfinite(found).all(axis=1)].astype(float)
+    return np.sqrt(np.mean(known**2, axis=0)) if len(known) else None
+
+
+def _at(values: npt.NDArray[np.float64] | None, place: int) -> float | None:
+    return float(values[place]) if values is not None else None
+
+
+def _tilt_mas(
+    values: npt.NDArray[np.float64] | None, noll: tuple[int, ...], configuration: Configuration | None
+) -> Figures | None:
+    """Tip, tilt and both per axis, sqrt((x^2 + y^2) / 2); None without telescope or without the two modes."""
+    if values is None or configuration is None or not {2, 3} <= set(noll):
+        return None
+    x, y = values[[noll.index(2), noll.index(3)]] / tilt_nm_per_mas(configuration.star.diameter_m)
+    return {"x": float(x), "y": float(y), "per_axis": float(np.sqrt((x**2 + y**2) / 2))}

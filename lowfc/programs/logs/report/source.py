@@ -1,0 +1,109 @@
+"""What a report is made from: the history of a run, and the law that was in force at each of its steps."""
+
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass, field
+
+import numpy as np
+import numpy.typing as npt
+
+from lowfc.adapters.logs.columns import rows_of
+from lowfc.adapters.logs.history import History, read_history
+from lowfc.adapters.logs.parts import LogFiles, WholeLog
+from lowfc.contract.messages import from_timestamp
+
+Whole = npt.NDArray[np.int64]
+Double = npt.NDArray[np.float64]
+
+
+@dataclass(frozen=True, slots=True)
+class InForce:
+    """A law: gain and leak (modes,), delay; from the step `first` on, which does not tell laws apart."""
+
+    first: int = field(compare=False)
+    gain: tuple[float, ...]
+    leak: tuple[float, ...]
+    delay_frames: float
+
+
+@dataclass(frozen=True, slots=True)
+class Run:
+    """A log that was read.
+
+    Attributes:
+        laws: in order; the steps before the first one are under a law that the log does not tell.
+    """
+
+    history: History
+    laws: tuple[InForce, ...]
+
+    def law_rows(self) -> Whole:
+        """Index of the law of each step; -1 where it is not known."""
+        firsts = np.array([law.first for law in self.laws])
+        return np.searchsorted(firsts, np.arange(self.history.steps.sequence.size), side="right").astype(np.int64) - 1
+
+    def seconds(self, host_ns: npt.ArrayLike) -> Double:
+        """Host times as seconds of frame time since the first step, by the frames that were published then.
+
+        In lockstep frame time is simulated; otherwise this only takes off the beginning.
+        """
+        history, host = self.history, np.asarray(host_ns, dtype=np.int64)
+        rows = rows_of(history.frame_sequence, history.steps.sequence)
+        published, shown = history.frame_publish_ns[rows >= 0], history.steps.time_ns[rows[rows >= 0]]
+        if not published.size:
+            return np.asarray((host - history.span_ns[0]) * 1e-9, dtype=np.float64)
+        order = np.argsort(published, kind="stable")
+        published, shown = published[order], shown[order]
+        inside = np.interp((host - published[0]) * 1e-9, (published - published[0]) * 1e-9, (shown - shown[0]) * 1e-9)
+        outside = np.minimum(host - published[0], 0) + np.maximum(host - published[-1], 0)
+        return np.asarray(inside + outside * 1e-9 + (shown[0] - self.begun_ns) * 1e-9, dtype=np.float64)
+
+    @property
+    def begun_ns(self) -> int:
+        """Frame time of the first step; 0 without any."""
+        return int(self.history.steps.time_ns[0]) if self.history.steps.time_ns.size else 0
+
+    @property
+    def step_s(self) -> Double:
+        """Time of each step since the first one."""
+        return np.asarray((self.history.steps.time_ns - self.begun_ns) * 1e-9)
+
+
+def read_run(files: LogFiles, progress: Callable[[int, int], None] | None = None) -> Run:
+    """Read a log, whole or not, to its end; what is damaged is left out and told by the history's reader.
+
+    Args:
+        files: of the log.
+        progress: is told now and then how many bytes of how many are read.
+
+    Raises:
+        DataFileError: this is no log, or it has a calibration that cannot be read.
+    """
+    log = WholeLog(files, skip_damaged=True)
+    log.progress = progress
+    history = read_history(log)
+    return Run(history, _laws(history))
+
+
+def _laws(history: History) -> tuple[InForce, ...]:
+    """The laws of a run, from the states that its controllers published at every change."""
+    steps = history.steps
+    found: list[InForce] = []
+    for state in history.controllers:
+        if len(state.gain) != steps.command_nm.shape[1] or not steps.sequence.size:
+            continue
+        if state.frame_sequence:
+            later = steps.sequence > state.frame_sequence
+        else:  # a controller that has just started
+            later = steps.time_ns > from_timestamp(state.timestamp)
+        first = int(np.argmax(later)) if later.any() else int(steps.sequence.size)
+        law = InForce(first, _shortest(state.gain), _shortest(state.leak), _shortest([state.delay_frames])[0])
+        while found and found[-1].first >= first:
+            found.pop()
+        if not found or found[-1] != law:
+            found.append(law)
+    return tuple(law for law in found if law.first < steps.sequence.size)
+
+
+def _shortest(singles: Iterable[float]) -> tuple[float, ...]:
+    """Single precision as people wrote it: 0.05, not 0.0500000007."""
+    return tuple(float(str(np.float32(value))) for value in singles)

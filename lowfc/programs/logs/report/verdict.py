@@ -1,0 +1,152 @@
+"""Whether a run was good, in a few lines that can be read within seconds."""
+
+from typing import Any
+
+Figures = dict[str, Any]
+
+GOOD, LOOK, BAD, UNKNOWN = "good", "look", "bad", "unknown"
+
+_MANY_WITHOUT_COMMAND = 0.01
+_MANY_LATE = 0.01
+_MUCH_STROKE = 0.9
+_NO_LOOP = "no step of the control law is in this log"
+
+
+def verdict(figures: Figures) -> Figures:
+    """Checks with a level each, and a sentence; the level of the whole is the worst one."""
+    checks = [_record(figures), _modes(figures), _residual(figures), _commands(figures)]
+    checks += [_delay(figures), _frames(figures), _mirror(figures), _events(figures)]
+    order = (GOOD, UNKNOWN, LOOK, BAD)
+    level = max((check["level"] for check in checks), key=order.index)
+    first = next((check["text"] for check in checks if check["level"] == level), "")
+    heading = {
+        GOOD: "A good run",
+        UNKNOWN: "Nothing wrong, but not everything can be told",
+        LOOK: "Have a look",
+        BAD: "Not a good run",
+    }[level]
+    return {"level": level, "heading": heading, "because": first if level != GOOD else "", "checks": checks}
+
+
+def _check(name: str, level: str, text: str) -> Figures:
+    return {"name": name, "level": level, "text": text}
+
+
+def _record(figures: Figures) -> Figures:
+    log = figures["log"]
+    faults = [f"recording stopped: {log['stopped']}"] if log["stopped"] else []
+    if log["damage"]:
+        faults.append(f"{plural(len(log['damage']), 'damaged part')} left out")
+    if not log["finished"]:
+        faults.append("its end is missing: the recorder did not finish it")
+    if log["recovery"]:
+        faults.append(log["recovery"])
+    if log["messages_lost"]:
+        faults.append(f"{plural(log['messages_lost'], 'message')} lost")
+    if log["steps_left_out"]:
+        what = "of another calibration's modes, or with impossible values"
+        faults.append(f"{plural(log['steps_left_out'], 'step')} {what}, left out")
+    if faults:
+        return _check("log", BAD if log["stopped"] else LOOK, "; ".join(faults))
+    if log["messages_lost"] is None:
+        return _check("log", UNKNOWN, "complete; lost messages were not counted")
+    recorded = f"; recorded: {log['selection']}" if log["selection"] else ""
+    return _check("log", GOOD, f"complete, no message lost{recorded}")
+
+
+def _modes(figures: Figures) -> Figures:
+    steps = figures["mode_steps"]
+    total = sum(steps.values())
+    if not total:
+        return _check("loop", BAD, _NO_LOOP)
+    shares = ", ".join(f"{name} {count / total:.1%}" for name, count in steps.items())
+    if steps.get("safe"):
+        return _check("loop", BAD, shares)
+    return _check("loop", GOOD if steps.get("closed") else UNKNOWN, shares)
+
+
+def _residual(figures: Figures) -> Figures:
+    """Before and after: true over the open pupil where the log has truth, else the modes as measured."""
+    totals, tilts = figures["residual"]["total_rms_nm"], figures["residual"]["tilt_mas"]
+    true = totals["residual"] is not None
+    before, after = ("disturbance", "residual") if true else ("pseudo_open_loop", "error")
+    before_nm, after_nm = totals[before], totals[after]
+    over = "in all modes over the circle"
+    open_pupil = figures["residual"]["open_pupil"]
+    pupil_nm = [open_pupil[f"{name}_open_pupil_rms_nm"] for name in ("disturbance", "residual")]
+    if true and all(pupil_nm):
+        before_nm, after_nm = pupil_nm
+        over = "over the open pupil"
+    if before_nm is None or after_nm is None:
+        why = figures["error_budget"].get("why_not", "no good frame with the loop closed is in this log")
+        return _check("residual", UNKNOWN, why)
+    text = f"{before_nm:.3g} nm before, {after_nm:.3g} nm after {over}"
+    if tilts[before] and tilts[after]:
+        text += f"; tip and tilt {tilts[before]['per_axis']:.3g} mas to {tilts[after]['per_axis']:.3g} mas per axis"
+    text += " (true)" if true else " (as measured, with the sensor's noise in both)"
+    return _check("residual", GOOD if after_nm < before_nm else LOOK, text)
+
+
+def _commands(figures: Figures) -> Figures:
+    frames = figures["timing"]["frames"]
+    without, recorded = frames["without_command"], frames["recorded"] - frames["at_the_end"]
+    if not recorded:
+        return _check("commands", UNKNOWN, "no frame is in this log")
+    if not without:
+        return _check("commands", GOOD, f"every one of {recorded} frames got its command")
+    share = without / recorded
+    text = f"{without} of {recorded} frames ({share:.2%}) got no command"
+    return _check("commands", BAD if share >= _MANY_WITHOUT_COMMAND else LOOK, text)
+
+
+def _delay(figures: Figures) -> Figures:
+    frames = figures["timing"]["frames"]
+    late, steps = frames["commands_late"], sum(figures["mode_steps"].values())
+    if late is None or not steps:
+        return _check("delay", UNKNOWN, "whether commands came in time is not in this log")
+    if late < _MANY_LATE * steps:
+        return _check("delay", GOOD, f"{plural(late, 'command')} late")
+    text = f"{late} commands came after the next exposure had begun, and acted a frame later than the law expects"
+    return _check("delay", LOOK, text)
+
+
+def _frames(figures: Figures) -> Figures:
+    light = figures["light"]
+    faults = []
+    if light["frames_refused"]:
+        faults.append(f"{plural(light['frames_refused'], 'frame')} refused ({_listed(light['refused'])})")
+    if light["frames_saturated"]:
+        faults.append(f"{plural(light['frames_saturated'], 'frame')} with saturated pixels")
+    return _check("light", LOOK if faults else GOOD, "; ".join(faults) or "no frame refused, none saturated")
+
+
+def _mirror(figures: Figures) -> Figures:
+    mirror = figures["mirror"]
+    limits = {**mirror["limits_at_mirror"], **mirror["limits_at_controller"]}
+    if limits:
+        return _check("mirror", LOOK, f"limits acted: {_listed(limits)}")
+    share = mirror["stroke_most_share"]
+    if share is None:
+        return _check("mirror", UNKNOWN, "the stroke used is not in this log")
+    text = f"at most {share:.1%} of the stroke used"
+    return _check("mirror", LOOK if share > _MUCH_STROKE else GOOD, text)
+
+
+def _events(figures: Figures) -> Figures:
+    grave = [event for event in figures["events"] if event["level"] in ("error", "fatal")]
+    warned = [event for event in figures["events"] if event["level"] == "warning"]
+    worst = grave or warned
+    if not worst:
+        return _check("events", GOOD, "no warning, no error")
+    names = _listed({name: sum(one["name"] == name for one in worst) for name in {one["name"] for one in worst}})
+    what = "error" if grave else "warning"
+    return _check("events", BAD if grave else LOOK, f"{plural(len(worst), what)}: {names}")
+
+
+def plural(number: int, noun: str) -> str:
+    """Such as "1 frame" and "2 frames"."""
+    return f"{number} {noun}" if number == 1 else f"{number} {noun}s"
+
+
+def _listed(counts: dict[str, int]) -> str:
+    return ", ".join(f"{name} {count}" for name, count in sorted(counts.items(), key=lambda pair: -pair[1]))

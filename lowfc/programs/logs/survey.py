@@ -1,0 +1,189 @@
+"""What a log holds: what ran and when, how much of each topic, and what is missing."""
+
+import dataclasses
+from collections import Counter
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from datetime import UTC, datetime
+from functools import cache
+from typing import Any
+
+from google.protobuf.message import DecodeError
+
+from lowfc.adapters.bus.bus import Sample
+from lowfc.adapters.logs.history import attached_configuration
+from lowfc.adapters.logs.loss_account import LossAccount
+from lowfc.adapters.logs.parts import LogFiles, WholeLog
+from lowfc.adapters.logs.reader import Logged
+from lowfc.adapters.logs.recovery import RECOVERY
+from lowfc.adapters.logs.selection import EVERYTHING, Selection
+from lowfc.contract.envelope import start_of
+from lowfc.contract.errors import BadMessageError
+from lowfc.contract.events import Level
+from lowfc.contract.messages import CONTROLLER_STATE, EVENT, HEALTH, Log, Topic, topic_of, wire
+from lowfc.control.loop.safety import LoopMode
+from lowfc.programs.logs.digest import Digest
+
+_MODES = {int(mode): mode.name.lower() for mode in LoopMode}
+
+
+@dataclass(slots=True)
+class _Line:
+    """Messages of one key; `starts` holds who published them and since when."""
+
+    schema: str
+    first_ns: int
+    last_ns: int
+    messages: int = 0
+    size: int = 0
+    starts: set[tuple[str, int]] = field(default_factory=set)
+
+    def figures(self, missing: int | None) -> dict[str, Any]:
+        length_s = (self.last_ns - self.first_ns) / 1e9
+        return {
+            "messages": self.messages,
+            "rate_hz": round((self.messages - 1) / length_s, 3) if length_s > 0 else None,
+            "bytes": self.size,
+            "restarts": len(self.starts) - len({author for author, _ in self.starts}),
+            "missing": missing,
+            "schema": self.schema,
+        }
+
+
+class _Account:
+    """What the messages of a log say."""
+
+    def __init__(self, selection: Selection = EVERYTHING) -> None:
+        """Nothing so far, of a log that holds this selection."""
+        self._selection = selection
+        self._ledger = LossAccount(selection)
+        self._lines: dict[str, _Line] = {}
+        self._events: Counter[str] = Counter()
+        self._modes: list[str] = []
+        self._begin_ns: int | None = None
+        self._end_ns = 0
+
+    def enter(self, message: Logged) -> None:
+        """Take account of one message."""
+        now_ns = message.log_time_ns
+        line = self._lines.get(message.key)
+        if line is None:
+            line = self._lines[message.key] = _Line(message.schema, now_ns, now_ns)
+        line.messages += 1
+        line.size += len(message.payload)
+        line.first_ns, line.last_ns = min(line.first_ns, now_ns), max(line.last_ns, now_ns)
+        topic = _topic(message.key)
+        if topic is None:
+            return
+        self._end_ns = max(self._end_ns, now_ns)
+        if not topic.queryable and (self._begin_ns is None or now_ns < self._begin_ns):
+            self._begin_ns = now_ns  # what was asked for at the log's beginning may be hours old
+        sample = Sample(message.key, message.payload, message.sequence, message.publish_time_ns, now_ns)
+        self._ledger.enter(topic, sample, recorded=True)
+        line.starts.add((self._author(topic, sample), start_of(message.sequence)))
+
+    def figures(self) -> dict[str, Any]:
+        """The account, for a program."""
+        missing = self._ledger.lost()
+        begin = None if self._begin_ns is None else datetime.fromtimestamp(self._begin_ns / 1e9, UTC)
+        return {
+            "start": None if begin is None else begin.isoformat(timespec="milliseconds"),
+            "duration_s": None if self._begin_ns is None else round((self._end_ns - self._begin_ns) / 1e9, 3),
+            "messages": sum(line.messages for line in self._lines.values()),
+            "messages_missing": sum(missing.values()),
+            "topics": {
+                key: line.figures(missing.get(key, 0) if self._counts(key) else None)
+                for key, line in sorted(self._lines.items())
+            },
+            "missing_topics": {key: count for key, count in missing.items() if key not in self._lines},
+            "loop_modes": self._modes,
+            "events": dict(self._events.most_common()),
+        }
+
+    def _counts(self, key: str) -> bool:
+        topic = _topic(key)
+        return topic is None or self._selection.counts(topic)
+
+    def _author(self, topic: Topic, sample: Sample) -> str:
+        """Take account of what a message says; return who of several publishers sent it, on a topic that has them."""
+        try:
+            if topic is HEALTH:
+                self._ledger.believe(sample, wire.Health.FromString(sample.payload))
+            elif topic is CONTROLLER_STATE:
+                number = wire.ControllerState.FromString(sample.payload).mode
+                mode = _MODES.get(number, f"mode {number}")
+                if self._modes[-1:] != [mode]:
+                    self._modes.append(mode)
+            elif topic is EVENT:
+                event = Log.FromString(sample.payload)
+                if event.level >= Level.WARNING:
+                    self._events[event.message.partition(" ")[0]] += 1
+                return event.name
+        except (BadMessageError, DecodeError):
+            pass  # it is in the log as it came
+        return ""
+
+
+def survey(
+    log: LogFiles, progress: Callable[[int, int], None] | None = None, *, digest: bool = False
+) -> dict[str, Any]:
+    """Figures of a log, from all of its messages.
+
+    Args:
+        log: finished or not, damaged or whole.
+        progress: is told how many bytes of how many are done.
+        digest: add the `Digest`, of the log and of each topic.
+
+    Raises:
+        DataFileError: it is no log.
+    """
+    reader, account, found = WholeLog(log, skip_damaged=True), _Account(), Digest()
+    reader.progress = progress
+    for number, message in enumerate(reader):
+        if not number:
+            account = _Account(reader.selection)
+        account.enter(message)
+        topic = _topic(message.key) if digest else None
+        if topic is not None:
+            found.enter(topic, message)
+    configuration, remarks = attached_configuration(reader)
+    figures = account.figures()
+    for key, one in found.by_key().items():
+        figures["topics"][key]["digest"] = one
+    return {
+        "log": str(reader.path),
+        "files": [str(path) for path in reader.paths],
+        **({"digest": found.of_log()} if digest else {}),
+        "lockstep": configuration.lockstep if configuration is not None else None,
+        "selection": reader.selection.sentence,
+        "bytes": reader.size,
+        "state": "damaged" if reader.damage or reader.unreadable else "complete" if reader.complete else "truncated",
+        **figures,
+        "unreadable": reader.unreadable,
+        "damage": [dataclasses.asdict(damage) for damage in reader.damage],
+        "metadata": reader.metadata,
+        "attachments": {name: len(data) for name, data in reader.attachments.items()},
+        "remarks": remarks,
+    }
+
+
+def recovery_in_words(metadata: Mapping[str, Mapping[str, str]]) -> str:
+    """What a recovered log was made from, and what was left out; nothing for another log."""
+    account = metadata.get(RECOVERY)
+    if account is None:
+        return ""
+    unfinished = ", which had not been finished" if account.get("source_finished") == "false" else ""
+    parts, unreadable = account.get("left_out", "?"), account.get("unreadable", "?")
+    return (
+        f"recovered from {account.get('source', '?')}{unfinished}; "
+        f"left out: damaged parts {parts}, unreadable messages {unreadable}"
+    )
+
+
+@cache
+def _topic(key: str) -> Topic | None:
+    """Line of the table of topics; None for a key of a newer version."""
+    try:
+        return topic_of(key)
+    except KeyError:
+        return None

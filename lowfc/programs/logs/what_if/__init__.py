@@ -1,0 +1,1 @@
+"""`lowfc what-if`: a log under other gains, another reconstructor or another law."""

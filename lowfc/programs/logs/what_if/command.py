@@ -1,0 +1,42 @@
+"""The command `lowfc what-if`: what another controller would have made of the same night."""
+
+from functools import partial
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from lowfc.adapters.process.terminal import Json, Logs
+from lowfc.programs.cli.output import put
+
+
+def what_if(
+    logs: Logs,
+    changes: Annotated[
+        str | None,
+        typer.Option("--set", metavar="KEY=VALUE,...", help="Other gains: gain, leak, limit_nm, tilt_gain, ..."),
+    ] = None,
+    config: Annotated[Path | None, typer.Option(help="The [control] section of this file.")] = None,
+    calibration: Annotated[Path | None, typer.Option(help="Another calibration (FITS).")] = None,
+    controller: Annotated[
+        str | None, typer.Option(metavar="FILE.py:NAME", help="Your step(state, error_nm) -> (state, command_nm).")
+    ] = None,
+    as_json: Json = False,
+) -> None:
+    """Compute what other gains, another reconstructor or a controller of your own would have left of the disturbance.
+
+    Example: lowfc what-if last --set gain=0.3,leak=0.01
+    """
+    from rich.console import Console
+
+    from lowfc.adapters.logs.parts import WholeLog, the_one, titled
+    from lowfc.adapters.process.progress import reading_bar
+    from lowfc.programs.logs.what_if.compare import render, wanted
+    from lowfc.programs.logs.what_if.compare import what_if as run
+
+    asked = wanted(changes, config, calibration, controller)
+    reader = WholeLog(log := the_one(logs), skip_damaged=True)
+    with reading_bar(Console(stderr=True)) as count:
+        reader.progress = partial(count, f"reading {titled(log)}")
+        figures = run(reader, asked)
+    put(figures, render(figures), as_json=as_json)

@@ -1,0 +1,291 @@
+"""`lowfc what-if`: what other gains, another reconstructor or another controller would have made of a log."""
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from lowfc.adapters.files.factory import detector, equivalent_read_noise_e
+from lowfc.adapters.logs.history import read_history
+from lowfc.adapters.logs.reader import LogReader
+from lowfc.contract.codecs.calibration_codec import identified
+from lowfc.contract.configuration import Configuration, load
+from lowfc.contract.errors import CalibrationError, ConfigurationError
+from lowfc.contract.messages import MIRROR_STATE
+from lowfc.control.calibration.calibration import ESTIMATORS, Calibration, reconstructor
+from lowfc.control.laws.law import Law
+from lowfc.control.laws.stability import limiting_gain
+from lowfc.control.laws.what_if import Controller, as_logged, counterfactual, rms
+from lowfc.control.loop.safety import Reason
+from lowfc.optics.chain.zernike import mode_name
+from lowfc.optics.detector.photometry import tilt_nm_per_mas
+from lowfc.programs.logs.what_if.options import LAW_KEYS, TILTS, WhatIf, law, user_controller, wanted
+from lowfc.programs.logs.what_if.run import LoggedRun
+
+__all__ = ["WhatIf", "render", "wanted", "what_if"]
+
+Single = npt.NDArray[np.float32]
+Double = npt.NDArray[np.float64]
+
+LINEAR_WAVES = 5 * tilt_nm_per_mas(2.0) / 550
+"""Rms of a mode up to which the sensor is taken as linear: 5 mas of tilt with 2 m at 550 nm, 0.022 waves."""
+
+_LIMITS = (Reason.MODAL_LIMIT, Reason.STROKE, Reason.SLEW, Reason.NEIGHBOUR)
+_TITLES = {
+    "open": "open loop",
+    "was": "as it was",
+    "what_if": "what if",
+    "true_was": "true as it was",
+    "true_what_if": "true what if",
+}
+
+
+def what_if(log: LogReader, what: WhatIf) -> dict[str, Any]:
+    """Figures of the logged run, and of the run that it would have been.
+
+    The other loop is closed throughout, from a flat mirror, and meets the pseudo-open-loop modes of every frame that
+    was used; where a frame was refused or missing it holds, as the live loop does. Its modal limits act, the
+    actuators' do not. All figures are over the same frames: those at which the logged loop was closed and both had
+    settled (all frames, where it never was closed), without those that have saturated pixels. Where the log has the
+    truth, the true residual is given too: the measured one is noise for the most part where the star is faint.
+
+    Args:
+        log: a reader that has not been read.
+        what: what shall be different; for another reconstructor the frames are read in a second pass.
+
+    Raises:
+        DataFileError: the log cannot be read, or has too little in it.
+        ConfigurationError: what shall be different makes no sense.
+        CalibrationError: the other calibration does not fit the log, or the reconstructor cannot be made.
+    """
+    config = load(what.config) if what.config is not None else None
+    own = user_controller(what.controller) if what.controller is not None else None
+    return compared(LoggedRun(read_history(log)), what, config, own)
+
+
+def compared(run: LoggedRun, what: WhatIf, config: Configuration | None, own: Controller | None) -> dict[str, Any]:
+    """As `what_if`, for a run that has been read, with the configuration and the controller that are asked for."""
+    noll = run.calibration.noll
+    after = law(what, config, noll, run.law)
+    calibration = _calibration(what, config, run)
+
+    was_nm, seen_nm = run.steps.error_nm, run.seen_nm
+    if calibration is run.calibration:
+        error_nm = was_nm
+    else:
+        error_nm = run.measured_again(calibration)
+        seen_nm = _in_other_modes(run.calibration, calibration, seen_nm)
+    pol_nm = error_nm - seen_nm
+    what_if_nm, command_nm = counterfactual(own or as_logged(after), run.weights, pol_nm, run.missing)
+
+    usable = run.used & np.isfinite(what_if_nm).all(axis=1)
+    lost = np.count_nonzero(run.used & ~usable)
+    rows, settling, over = run.rows_to_compare([run.law, after], usable)
+    columns = {"open": rms(pol_nm, rows), "was": rms(was_nm, rows), "what_if": rms(what_if_nm, rows)}
+    if run.true_nm is not None:
+        _, residual_nm = run.true_nm
+        known = rows & np.isfinite(residual_nm).all(axis=1)
+        if known.any():
+            columns["true_was"] = rms(residual_nm, known)
+            columns["true_what_if"] = rms(residual_nm + (what_if_nm - pol_nm - seen_nm), known)
+    return {
+        "log": str(run.history.log.path),
+        "complete": run.history.log.complete,
+        "rate_hz": run.history.rate_hz,
+        "frames": len(rows),
+        "frames_compared": int(rows.sum()),
+        "compared": over,
+        "settling_s": settling / run.history.rate_hz,
+        "frames_refused": int(np.count_nonzero(~run.used)),
+        "frames_saturated": int(np.count_nonzero(run.used & (run.steps.saturated_pixels > 0))),
+        "frames_missing": int(run.missing.sum()),
+        "delay_frames": run.delay_frames,
+        "delay_controller_frames": run.controller_delay,
+        "delay_measured_frames": run.measured_delay,
+        "controller": what.controller or "integrator",
+        "estimator": calibration.estimator,
+        "calibration": calibration.id,
+        "modes": [
+            {"noll": index, "name": mode_name(index), **_one(run.law, row, "_was"), **({} if own else _one(after, row))}
+            | {f"{name}_nm": float(values[row]) for name, values in columns.items()}
+            for row, index in enumerate(noll)
+        ],
+        **{f"{name}_nm": float(np.sqrt(np.sum(values**2))) for name, values in columns.items()},
+        **_tilt_mas(run, columns),
+        "warnings": [
+            *_doubts_of_log(run),
+            *([f"{lost} frames that were used are not in the log: the what-if holds there"] if lost else []),
+            *_doubts_of_range(run.calibration, columns),
+            *([] if own else _doubts_of_law(run, after, command_nm[rows])),
+        ],
+    }
+
+
+def render(figures: dict[str, Any]) -> str:
+    """The figures of `what_if` as a table."""
+    columns = [name for name in _TITLES if f"{name}_nm" in figures]
+    gains = all("gain" in mode for mode in figures["modes"])  # a controller of one's own has none
+    lines = [
+        f"{figures['frames_compared']} of {figures['frames']} frames compared: {figures['compared']}, after "
+        f"{figures['settling_s']:.2g} s to settle; {figures['frames_refused']} were refused, "
+        f"{figures['frames_saturated']} saturated, {figures['frames_missing']} missing",
+        f"delay {figures['delay_frames']:.2f} frames, {figures['estimator']} reconstructor, {figures['controller']}",
+        "",
+        f"{'residual, nm rms':<28}"
+        + "".join(f"{_TITLES[name]:>16}" for name in columns)
+        + (f"{'gain':>16}" if gains else ""),
+    ]
+    for mode in figures["modes"]:
+        gain = f"{mode['gain_was']:.3g} -> {mode['gain']:.3g}" if gains else ""
+        values = "".join(f"{mode[f'{name}_nm']:>16.2f}" for name in columns)
+        lines.append(f"{mode['noll']:>3} {mode['name']:<24}{values}" + (f"{gain:>16}" if gains else ""))
+    lines.append(f"{'all modes':<28}" + "".join(f"{figures[f'{name}_nm']:>16.2f}" for name in columns))
+    if "tilt_was_mas" in figures:
+        values = "".join(f"{figures[f'tilt_{name}_mas']:>16.2f}" for name in columns)
+        lines.append(f"{'tilt per axis, mas':<28}{values}")
+    lines += ["", "measured with the sensor's noise where it does not say true; a linear sensor, no actuator limits"]
+    lines += [f"warning: {warning}" for warning in figures["warnings"]]
+    return "\n".join(lines)
+
+
+def _calibration(what: WhatIf, config: Configuration | None, run: LoggedRun) -> Calibration:
+    """The calibration of the what-if; the very one of the log where it is no other."""
+    calibration, estimator = run.calibration, what.estimator
+    if what.calibration is not None:
+        from lowfc.adapters.files.calibration_file import load as load_calibration  # astropy takes its time
+
+        calibration = load_calibration(what.calibration)
+        for name in ("noll", "shape", "grid"):
+            got, expected = getattr(calibration, name), getattr(run.calibration, name)
+            if got != expected:
+                raise CalibrationError(f"{what.calibration}: its {name} is {got}, in the log it is {expected}")
+    elif estimator is None and config is not None:
+        estimator = "+".join((config.control.estimator, *config.control.nuisance))
+    if estimator in (None, calibration.estimator):
+        return run.calibration if calibration.id == run.calibration.id else calibration
+    if estimator not in ESTIMATORS:
+        raise ConfigurationError(
+            f"{what.config}: {estimator}: what is fitted along with the modes needs the sensor's optics; leave out "
+            "control.nuisance, or make that calibration and name it with --calibration"
+        )
+    return _reconstructed(calibration, estimator, run)
+
+
+def _reconstructed(calibration: Calibration, estimator: str, run: LoggedRun) -> Calibration:
+    """The same I0 and H with another R."""
+    path, configuration = run.history.log.path, run.history.configuration
+    if configuration is None:
+        raise ConfigurationError(f"{path}: has no configuration, so that the noise of a pixel is not known")
+    camera = detector(configuration)
+    try:
+        R = reconstructor(
+            calibration.reference.astype(float),
+            calibration.response.astype(float),
+            calibration.good.astype(float),
+            calibration.flux_dn * camera.gain_e_per_dn / camera.em_gain,
+            equivalent_read_noise_e(camera),
+            estimator,
+        )
+    except ValueError as error:
+        raise CalibrationError(f"{path}: {estimator} reconstructor: {error}") from None
+    return identified(replace(calibration, reconstructor=R.astype(np.float32), estimator=estimator))
+
+
+def _in_other_modes(logged: Calibration, other: Calibration, command_nm: Single) -> Single:
+    """Commands (steps, modes) of the logged calibration as those of the other that shape the mirror alike."""
+    if np.array_equal(other.modes_to_actuators, logged.modes_to_actuators):
+        return command_nm
+    change = np.linalg.pinv(other.modes_to_actuators.astype(float)) @ logged.modes_to_actuators.astype(float)
+    return np.asarray(command_nm @ change.T, np.float32)
+
+
+def _one(every: Law, row: int, suffix: str = "") -> dict[str, float]:
+    return {f"{key}{suffix}": round(float(getattr(every, key)[row]), 6) for key in LAW_KEYS}
+
+
+def _tilt_mas(run: LoggedRun, columns: dict[str, Double]) -> dict[str, float]:
+    """Tilt per axis on the sky, where the log says how large the telescope is."""
+    tilts = np.isin(run.calibration.noll, TILTS)
+    if run.history.configuration is None or not tilts.any():
+        return {}
+    nm_per_mas = tilt_nm_per_mas(run.history.configuration.star.diameter_m)
+    return {f"tilt_{name}_mas": float(np.sqrt(np.mean(rms[tilts] ** 2))) / nm_per_mas for name, rms in columns.items()}
+
+
+def _doubts_of_log(run: LoggedRun) -> list[str]:
+    """What of the log makes the figures less sure."""
+    found, log = list(run.history.remarks), run.history.log
+    if log.damage:
+        parts = ", ".join(f"byte {one.position}, {one.why}" for one in log.damage)
+        found.append(f"the log is damaged, and these parts are left out: {parts}")
+    if not log.finished:
+        found.append("the log has no end: its recorder was killed, or is still writing")
+    if log.metadata.get("recording", {}).get("stopped"):
+        found.append(f"recording stopped: {log.metadata['recording']['stopped']}")
+    if run.measured_delay is None:
+        found.append(f"the delay could not be measured in this log; the controller's is {run.delay_frames:g}")
+    elif run.delay_frames != run.controller_delay:
+        found.append(
+            f"the controller reckoned with a delay of {run.controller_delay:g} frames, measured from "
+            f"{run.measured_from} it is {run.measured_delay:.2f} in the mean: pseudo-open-loop modes were computed "
+            "again with that for every frame"
+        )
+    hit = [
+        f"{reason.name.lower()} at {count} frames"
+        for reason in _LIMITS
+        if (count := np.count_nonzero(run.steps.reasons & (1 << reason)))
+    ]
+    if hit:
+        found.append(f"limits acted in the logged run, {', '.join(hit)}; in the what-if only modal limits do")
+    cut = np.count_nonzero(run.history.mirror.limits)
+    if cut:
+        few = "" if log.selection.counts(MIRROR_STATE) else f" (of mirror states the log has: {log.selection.sentence})"
+        found.append(f"the mirror's own limits acted on {cut} commands{few}: pseudo-open-loop modes are wrong there")
+    changes = sum(one.accepted and one.name in LAW_KEYS for one in run.history.requests)
+    if changes:
+        found.append(f"gain or leak was changed {changes} times in the logged run; the last ones are shown")
+    torn = np.count_nonzero(run.torn)
+    if torn:
+        found.append(f"the log does not have every command: {torn} gaps, each with the time to settle, are left out")
+    return found
+
+
+def _doubts_of_range(calibration: Calibration, columns: dict[str, Double]) -> list[str]:
+    limit_nm = LINEAR_WAVES * calibration.wavelength_nm
+    largest = np.max([columns[name] for name in ("open", "was", "what_if")], axis=0)
+    beyond = [
+        f"{mode_name(index)} with {value:.1f} nm"
+        for index, value in zip(calibration.noll, largest, strict=True)
+        if value > limit_nm
+    ]
+    if not beyond:
+        return []
+    return [
+        f"beyond the linear range, {limit_nm:.1f} nm rms of a mode, in which a what-if is right: {', '.join(beyond)}; "
+        "the figures are only approximate"
+    ]
+
+
+def _doubts_of_law(run: LoggedRun, law: Law, command_nm: Single) -> list[str]:
+    """Where the law makes a loop that does not work; `command_nm` (frames, modes) is what it commanded."""
+    found = []
+    noll = run.calibration.noll
+    # A mean of frames on time and late ones is not the steady mixture that a delay with a fraction stands for.
+    delay_frames = run.delay_frames if run.delay_frames == run.controller_delay else np.ceil(run.delay_frames)
+    highest = {leak: limiting_gain(delay_frames, leak) for leak in set(law.leak.tolist())}
+    unstable = [
+        f"{mode_name(index)} from {highest[leak]:.2f} on"
+        for index, gain, leak in zip(noll, law.gain.tolist(), law.leak.tolist(), strict=True)
+        if gain >= highest[leak]
+    ]
+    if unstable:
+        found.append(f"the what-if is unstable with a delay of {delay_frames:g} frames: {', '.join(unstable)}")
+    limited = [
+        f"{mode_name(index)} at {count} frames"
+        for index, count in zip(noll, np.count_nonzero(np.abs(command_nm) >= law.limit_nm, axis=0), strict=True)
+        if count
+    ]
+    if limited:
+        found.append(f"modal limits act in the what-if: {', '.join(limited)}")
+    return found

@@ -1,0 +1,174 @@
+"""The logged run as a what-if needs it: exposures, the delay as measured, what each of them saw of the commands."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import fields
+
+import numpy as np
+import numpy.typing as npt
+
+from lowfc.adapters.files.factory import settings
+from lowfc.adapters.logs.columns import Sequences, Steps
+from lowfc.adapters.logs.history import History
+from lowfc.contract.codecs.codec import decode_frame
+from lowfc.contract.errors import DataFileError
+from lowfc.contract.messages import FRAME, floats, wire
+from lowfc.control.calibration.calibration import Calibration
+from lowfc.control.laws.law import Law
+from lowfc.control.laws.stability import delay_weights, settling_frames
+from lowfc.control.laws.what_if import (
+    LONGEST_DELAY,
+    delay_from_times,
+    delay_from_truth,
+    exposed,
+    frames_since,
+    missing_before,
+    seen_nm,
+)
+from lowfc.control.loop.additions import PlayTable
+from lowfc.control.loop.estimator import Estimator
+from lowfc.control.loop.safety import LoopMode
+
+Single = npt.NDArray[np.float32]
+Double = npt.NDArray[np.float64]
+Rows = npt.NDArray[np.bool_]
+
+DELAY_DIFFERS = 0.05
+"""Frames by which a measured delay must differ from the controller's, or a whole number, to be another one."""
+_TORN_NM = 0.01
+
+
+class LoggedRun:
+    """Steps of a log that are exposures of their own, from the first that was used.
+
+    Attributes:
+        steps: those steps; `missing` exposures (steps,) without one before each.
+        true_nm: disturbance and residual (steps, modes), NaN where it is not known; None without any.
+        calibration: of the log.
+        used: (steps,) whether the frame was used.
+        law: the one that the run ended with.
+        controller_delay: frames that the controller reckoned with; `measured_delay` is None where it cannot be
+            measured, `measured_from` says from what; `delay_frames` is the one to go by, and `weights` are its.
+        seen_nm: (steps, modes) commands that the exposures saw; NaN where a frame was not used and the delay is the
+            controller's.
+        played: (steps,) where something was played, which moves the mirror beside the commands.
+        torn: (steps,) where the command before is not the one that the log has: something was not recorded.
+    """
+
+    def __init__(self, history: History) -> None:
+        """Take the run out of a history.
+
+        Raises:
+            DataFileError: no frame was used, or gains and delay are not known.
+        """
+        self.history = history
+        rows = exposed(history.steps.sequence)
+        used = rows & np.isfinite(history.steps.error_nm).all(axis=1)
+        if history.calibration is None or not used.any() or not history.rate_hz:
+            raise DataFileError(f"{history.log.path}: too few frames that a calibrated controller used are in it")
+        rows[: int(np.argmax(used))] = False  # of the disturbance before nothing is known
+        self.calibration = history.calibration
+        self.steps = Steps(*(getattr(history.steps, part.name)[rows] for part in fields(Steps)))
+        true = history.true
+        self.true_nm = None if true is None else (true.disturbance_nm[rows], true.residual_nm[rows])
+        self.used: Rows = used[rows]
+        self.missing = missing_before(self.steps.sequence)
+        self.played = _played(self.steps.sequence, history.requests, history.published.plays)
+        self.law, self.controller_delay = _law_and_delay(history, self.calibration)
+
+        weights = delay_weights(self.controller_delay).astype(np.float32)
+        believed_nm = self.steps.error_nm - self.steps.pol_nm
+        reckoned_nm = seen_nm(weights, self.steps.command_nm, self.missing, believed_nm[0])
+        self.torn: Rows = np.abs(reckoned_nm - believed_nm).max(axis=1) > _TORN_NM
+
+        self.measured_delay, self.measured_from = self._measured_delay()
+        self.delay_frames, self.weights, self.seen_nm = self.controller_delay, weights, believed_nm
+        if self.measured_delay is not None and abs(self.measured_delay - self.controller_delay) > DELAY_DIFFERS:
+            whole = round(self.measured_delay)
+            near = abs(self.measured_delay - whole) <= DELAY_DIFFERS
+            self.delay_frames = float(whole) if near else self.measured_delay
+            self.weights = delay_weights(self.delay_frames).astype(np.float32)
+            self.seen_nm = seen_nm(self.weights, self.steps.command_nm, self.missing, believed_nm[0])
+
+    def rows_to_compare(self, laws: list[Law], usable: Rows) -> tuple[Rows, int, str]:
+        """Which of the usable steps to compare runs at, the frames in which these laws settle, and in words.
+
+        Raises:
+            DataFileError: none are left.
+        """
+        steps, missing = self.steps, self.missing
+        closed, over = steps.mode == LoopMode.CLOSED, "closed loop"
+        if not (closed & usable).any():
+            closed, over = np.ones_like(closed), "the loop was never closed"
+        since = frames_since(self.torn, closed, missing)
+        settling = max(settling_frames(law.gain, law.leak, self.history.rate_hz) for law in laws)
+        settling = min(settling, int(since.max()) // 2)
+        rows = usable & (since >= settling) & (steps.saturated_pixels == 0)
+        if not rows.any():
+            raise DataFileError(
+                f"{self.history.log.path}: no frame is left to compare: of {len(rows)}, {np.count_nonzero(~usable)} "
+                f"were refused and {np.count_nonzero(steps.saturated_pixels)} have saturated pixels"
+            )
+        return rows, settling, over
+
+    def measured_again(self, calibration: Calibration) -> Single:
+        """Errors (steps, modes) that another calibration measures in the frames that were used: a second pass.
+
+        Raises:
+            DataFileError: the log was made to hold only some of the frames.
+        """
+        steps, log = self.steps, self.history.log
+        if not log.selection.has_every_frame:
+            raise DataFileError(
+                f"{log.path}: not every frame is in it ({log.selection.sentence}), so that no other reconstructor can "
+                "be tried on it; other gains, leaks and limits can"
+            )
+        error_nm = np.full_like(steps.error_nm, np.nan)
+        estimator = Estimator.of(calibration)
+        rows = {sequence: row for row, sequence in enumerate(steps.sequence.tolist()) if self.used[row]}
+        for message in self.history.again(FRAME):
+            row = rows.get(message.sequence)
+            pixels = decode_frame(message.payload, message.sequence, 0).pixels if row is not None else None
+            if pixels is not None and pixels.shape == calibration.shape:
+                found = estimator.estimate(pixels.reshape(-1), 0.0)
+                if found is not None:
+                    error_nm[row] = found.error_nm
+        return error_nm
+
+    def _measured_delay(self) -> tuple[float | None, str]:
+        history, steps = self.history, self.steps
+        if self.true_nm is not None:
+            disturbance_nm, residual_nm = self.true_nm
+            moved_nm = residual_nm - disturbance_nm
+            moved_nm[self.played] = np.nan
+            return delay_from_truth(moved_nm, steps.command_nm, self.missing), "the true wavefront"
+        if history.camera is None:
+            return None, ""
+        starts_ns = steps.time_ns - int(history.camera.exposure_ns)
+        mirror = history.mirror
+        delay = delay_from_times(steps.sequence, starts_ns, mirror.sequence, mirror.publish_time_ns)
+        return delay, "the times of frames and mirror"
+
+
+def _played(sequence: Sequences, requests: Sequence[wire.Request], plays: Mapping[str, PlayTable]) -> Rows:
+    rows = np.zeros(sequence.shape, np.bool_)
+    for request in requests:
+        if request.name == "play" and request.accepted:
+            first = request.frame_sequence
+            known = plays.get(request.play_id)
+            table = floats(request.table, -1, request.columns or 1) if known is None else known.rows
+            last = first + len(table) + LONGEST_DELAY
+            rows |= (sequence >= first) & (sequence < last)
+    return rows
+
+
+def _law_and_delay(history: History, calibration: Calibration) -> tuple[Law, float]:
+    state = history.controller
+    if state is not None and len(state.gain) == len(calibration.noll):
+        law = Law(*(np.array(values, np.float32) for values in (state.gain, state.leak, state.limit_nm)))
+        return law, state.delay_frames
+    if history.configuration is None:
+        raise DataFileError(
+            f"{history.log.path}: its gains and delay are not known: no state of the controller is there"
+        )
+    known = settings(history.configuration)
+    return known.law(calibration.noll), known.delay_frames

@@ -1,0 +1,1 @@
+"""`lowfc bench`: what recording and the optical model cost on this host."""

@@ -1,0 +1,205 @@
+"""The cost of recording: a real recorder on a real bus, fed with a loop's messages at the loop's rate."""
+
+import contextlib
+import json
+import os
+import platform
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from lowfc.adapters.process.terminal import Json
+from lowfc.adapters.process.usage import processor_s
+from lowfc.contract.errors import BusError, DataFileError
+from lowfc.programs.cli.output import put
+
+if TYPE_CHECKING:
+    from lowfc.adapters.bus.run import Run
+
+RATES_HZ = (1000.0, 2000.0, 5000.0)
+
+_READY_S = 30.0
+_LOOK_S = 0.5
+_WARM_UP_S = 0.5
+_COPY_S = 0.5
+_COPY_BYTES = 256 * 1024
+
+
+def bench_record(
+    seconds: Annotated[float, typer.Option(min=0.5, max=3600, help="For how long each rate is measured.")] = 5.0,
+    rate: Annotated[
+        list[float] | None,
+        typer.Option(min=10, max=20_000, help="Frames per second; repeat. Default: 1000, 2000 and 5000."),
+    ] = None,
+    folder: Annotated[
+        Path | None,
+        typer.Option(help="Folder on the disk to be measured; default: the system's temporary one."),
+    ] = None,
+    as_json: Json = False,
+) -> None:
+    """Measure what recording costs: processor, losses and stalls of a recorder process beside a loop's traffic.
+
+    Another process sends what camera, controller and mirror send for every frame (frame of 80 x 80, command, step,
+    mirror state, truth) and their timing and health, over the real bus. The processor's share is set against that of
+    copying the same payloads to the same disk.
+
+    Example: lowfc bench record --seconds 5 --json
+    """
+    try:
+        figures = measure(tuple(rate or RATES_HZ), seconds, folder)
+    except OSError as fault:
+        where = folder or tempfile.gettempdir()
+        raise DataFileError(f"{where} cannot be written: {fault.strerror or fault}") from fault
+    put(figures, render(figures), as_json=as_json)
+
+
+def measure(rates_hz: tuple[float, ...], seconds: float, folder: Path | None = None) -> dict[str, Any]:
+    """Record at each rate for a time, into `folder`, which is left as it was.
+
+    Returns:
+        host, payload_bytes_per_frame, copy_us_per_frame (processor time of copying the payloads) and rates, one for
+        each: rate_hz as asked and offered_hz as sent; seconds; cpu_share (of one processor) and publisher_cpu_share;
+        ratio (cpu_share over that of copying); messages_published, messages_recorded and messages_lost by the
+        recorder's account; log_bytes; and three stalls: longest_wait_ms (a message's arrival to its being written),
+        longest_unflushed_ms (arrival to its surviving a kill -9) and longest_write_ms (one write to the disk).
+
+    Raises:
+        BusError: the recorder did not get ready, or failed.
+    """
+    from rich.console import Console
+
+    from lowfc.adapters.process.clock import sharpen_sleep
+    from lowfc.adapters.process.progress import passing_bar
+
+    sharpen_sleep()
+    rates: list[dict[str, Any]] = []
+    with tempfile.TemporaryDirectory(prefix="lowfc-bench-", dir=folder) as name:
+        copy_us, frame_bytes = _copying(Path(name))
+        with passing_bar(Console(stderr=True)) as bar:
+            task = bar.add_task("recording", total=len(rates_hz))
+            for rate_hz in rates_hz:
+                bar.update(task, description=f"recording at {rate_hz:g} Hz")
+                figures = _one_rate(rate_hz, seconds, Path(name))
+                rates.append(figures | {"ratio": figures["cpu_share"] / (copy_us * 1e-6 * figures["offered_hz"])})
+                bar.advance(task)
+    return {
+        "rates": rates,
+        "payload_bytes_per_frame": frame_bytes,
+        "copy_us_per_frame": copy_us,
+        "host": {
+            "machine": platform.machine(),
+            "processors": os.cpu_count(),
+            "python": platform.python_version(),
+        },
+    }
+
+
+def render(figures: dict[str, Any]) -> str:
+    """The result of `measure` as a table."""
+    lines = [f"{'loop':>8} {'processor':>10} {'of copying':>11} {'messages':>9} {'lost':>6} {'longest wait':>13} "
+             f"{'unflushed':>10} {'write':>9}"]  # fmt: skip
+    lines += [
+        f"{rate['offered_hz']:>5.0f} Hz {100 * rate['cpu_share']:>8.1f} % {rate['ratio']:>9.1f} x "
+        f"{rate['messages_published']:>9} {rate['messages_lost']:>6} {rate['longest_wait_ms']:>10.0f} ms "
+        f"{rate['longest_unflushed_ms']:>7.0f} ms {rate['longest_write_ms']:>6.1f} ms"
+        for rate in figures["rates"]
+    ]
+    lines.append(
+        f"processor: of one, all threads of the recorder; copying a frame's {figures['payload_bytes_per_frame']:.0f} "
+        f"bytes to the same disk takes {figures['copy_us_per_frame']:.1f} us of it. Longest wait: from a message's "
+        "arrival to its being written; unflushed: to its surviving a kill -9; write: of one write to the disk."
+    )
+    return "\n".join(lines)
+
+
+def _one_rate(rate_hz: float, seconds: float, folder: Path) -> dict[str, Any]:
+    """Figures of one recorder process at one rate."""
+    from lowfc.adapters.bus.run import new_run_id, open_run
+    from lowfc.programs.measure.traffic import Traffic
+
+    run = open_run(new_run_id())
+    try:
+        with _recorder(run, folder) as process, contextlib.closing(Traffic(run, rate_hz)) as traffic:
+            deadline_s = time.monotonic() + _READY_S
+            while not traffic.wait_for("recorder", _LOOK_S):
+                if process.poll() is not None or time.monotonic() > deadline_s:
+                    process.kill()
+                    raise BusError(f"the recorder did not get ready: {process.communicate()[1].strip()[-500:]}")
+            traffic.run(_WARM_UP_S)
+            begun_s, frames = time.monotonic(), traffic.frames
+            own_s, others_s = time.process_time(), processor_s(process.pid)
+            traffic.run(seconds)
+            elapsed_s = time.monotonic() - begun_s
+            own_s, others_s = time.process_time() - own_s, processor_s(process.pid) - others_s
+            traffic.finish()
+            process.send_signal(signal.SIGTERM)
+            out, error = process.communicate()
+            if process.returncode:
+                raise BusError(f"the recorder failed: {error.strip()[-500:]}")
+            done = json.loads(out)
+        (log,) = map(Path, done["logs"])
+        size = log.stat().st_size
+        log.unlink()
+    finally:
+        run.remove()
+    stalls = ("longest_wait_ms", "longest_unflushed_ms", "longest_write_ms")
+    return {
+        "rate_hz": rate_hz,
+        "offered_hz": (traffic.frames - frames) / elapsed_s,
+        "seconds": elapsed_s,
+        "cpu_share": others_s / elapsed_s,
+        "publisher_cpu_share": own_s / elapsed_s,
+        "messages_published": traffic.messages,
+        "messages_recorded": done["messages_recorded"],
+        "messages_lost": done["messages_lost"],
+        "log_bytes": size,
+        **{stall: done[stall] for stall in stalls},
+    }
+
+
+@contextlib.contextmanager
+def _recorder(run: "Run", folder: Path) -> Iterator["subprocess.Popen[str]"]:
+    """The process of `lowfc record`; it ends with this one."""
+    words = ["record", "--run", run.run_id, "--folder", str(folder), "--json"]
+    process = subprocess.Popen(  # noqa: S603  # our own program
+        [sys.executable, "-P", "-m", "lowfc", *words],
+        stdin=subprocess.DEVNULL,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        start_new_session=True,
+    )
+    try:
+        yield process
+    finally:
+        if process.poll() is None:
+            process.kill()
+            process.communicate()
+
+
+def _copying(folder: Path) -> tuple[float, float]:
+    """Processor time of copying one frame's payloads to a file, us, and their size, bytes."""
+    from lowfc.programs.measure.traffic import frame_payloads
+
+    frames = frame_payloads()
+    path = folder / "copy"
+    copied = 0
+    with path.open("wb", buffering=_COPY_BYTES) as file:
+        begun_s, end_s = time.process_time(), time.monotonic() + _COPY_S
+        while time.monotonic() < end_s:
+            for payloads in frames:
+                for payload in payloads:
+                    file.write(payload)
+            copied += len(frames)
+        file.flush()
+        used_s = time.process_time() - begun_s
+    path.unlink()
+    size = sum(len(payload) for payloads in frames for payload in payloads)
+    return used_s / copied * 1e6, size / len(frames)

@@ -1,0 +1,116 @@
+"""Speed and accuracy of the real-time twin against the full optical chain, both on one thread."""
+
+import platform
+import statistics
+import time
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from threadpoolctl import threadpool_limits
+
+from lowfc.adapters.files.sensors import sensor_named
+from lowfc.adapters.files.twin_cache import load_or_build
+from lowfc.optics.chain.band import gauss_legendre, monochromatic
+from lowfc.optics.chain.sensor import image, pupil_radii
+from lowfc.optics.chain.zernike import NOLLS_20, zernikes
+from lowfc.optics.twin.twin import ACCURATE, FAST, Evaluator, node_radii
+
+WAVEFRONTS = 20
+
+
+def bench_twin(
+    sensor: str = "sam",
+    seconds: float = 1.0,
+    progress: Callable[[str], None] = lambda name: None,
+    cache_dir: Path | None = None,
+) -> dict[str, Any]:
+    """Measure the three twins; the figures of the live loop's default are also at the top level.
+
+    Times are medians of one frame, from the phase to the binned image, the two models in turn. `relative_l2` is the
+    worst of 20 random wavefronts: radial degrees 1 to 5 within the literal bounds of Sect. 3.1.
+
+    Args:
+        sensor: Its name, or that of a layout.
+        seconds: For how long each model is timed.
+        progress: Called with the name of each case.
+        cache_dir: Of the twins; the usual one when None.
+    """
+    optics = sensor_named(sensor)
+    nm = optics.wavelength_nm
+    cases = (
+        ("monochromatic, rank 60", FAST, monochromatic(nm)),
+        ("monochromatic, rank 80", ACCURATE, monochromatic(nm)),
+        ("20 % band in 3 wavelengths, rank 60", FAST, gauss_legendre(nm)),
+    )
+    coefficients_nm = nm * random_coefficients_waves(np.random.default_rng(1), WAVEFRONTS)
+    opds_nm = np.tensordot(coefficients_nm, zernikes(NOLLS_20, *pupil_radii(optics)), 1)
+    results = []
+    with threadpool_limits(1):
+        for name, spec, band in cases:
+            progress(name)
+            begin = time.perf_counter()
+            twin = load_or_build(optics, spec, band, cache_dir=cache_dir)
+            load_s = time.perf_counter() - begin
+            evaluator = Evaluator(twin)
+            at_nodes = (coefficients_nm @ zernikes(NOLLS_20, *node_radii(twin))).astype(np.float32)
+            errors = []
+            for opd_nm, nodes_nm in zip(opds_nm, at_nodes, strict=True):
+                truth = image(optics, opd_nm, band)
+                errors.append(float(np.linalg.norm(evaluator.image(nodes_nm) - truth) / np.linalg.norm(truth)))
+            full_us = _median_us(partial(image, optics, band=band), opds_nm, seconds)
+            twin_us = _median_us(evaluator.image, at_nodes, seconds)
+            results.append(
+                {
+                    "name": name,
+                    "wavelengths": len(band.wavelengths_nm),
+                    "rank": len(twin.operators[0].to_modes),
+                    "nodes": int(twin.used.size),
+                    "twin_us": twin_us,
+                    "full_us": full_us,
+                    "ratio": full_us / twin_us,
+                    "relative_l2": max(errors),
+                    "load_s": load_s,
+                }
+            )
+    top = {key: results[0][key] for key in ("twin_us", "full_us", "ratio", "relative_l2", "rank")}
+    host = {"machine": platform.machine(), "python": platform.python_version(), "numpy": np.__version__}
+    return {**top, "sensor": sensor, "wavefronts": WAVEFRONTS, "cases": results, "host": host}
+
+
+def random_coefficients_waves(rng: np.random.Generator, count: int) -> NDArray[np.float64]:
+    """Random wavefronts (count, 20), Noll 2 to 21, uniform within 0.04 waves rms for n = 1, 2 and 0.016 above."""
+    bounds = np.where(np.array(NOLLS_20) <= 6, 0.04, 0.016)
+    return np.asarray(rng.uniform(-1.0, 1.0, (count, bounds.size)) * bounds)
+
+
+def render(result: dict[str, Any]) -> str:
+    """The result of `bench_twin` as a table."""
+    lines = [f"{'twin':<36} {'twin':>9} {'full chain':>12} {'ratio':>7} {'relative L2':>12}"]
+    lines += [
+        f"{case['name']:<36} {case['twin_us']:>6.0f} us {case['full_us']:>9.0f} us {case['ratio']:>6.0f}x "
+        f"{case['relative_l2']:>12.1e}"
+        for case in result["cases"]
+    ]
+    lines.append(
+        f"one thread, medians; sensor {result['sensor']}; relative L2 is the worst of "
+        f"{result['wavefronts']} random wavefronts"
+    )
+    return "\n".join(lines)
+
+
+def _median_us(frame: Callable[[Any], object], wavefronts: NDArray[Any], seconds: float) -> float:
+    """Median time of one frame over the wavefronts in turn, after a few to warm up."""
+    for wavefront in wavefronts[:3]:
+        frame(wavefront)
+    times: list[int] = []
+    end = time.perf_counter() + seconds
+    while not times or time.perf_counter() < end:
+        wavefront = wavefronts[len(times) % len(wavefronts)]
+        begin = time.perf_counter_ns()
+        frame(wavefront)
+        times.append(time.perf_counter_ns() - begin)
+    return statistics.median(times) / 1000.0

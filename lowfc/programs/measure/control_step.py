@@ -1,0 +1,82 @@
+"""What a loop's latency is set against in one process: the control step without a bus, and the host's timer."""
+
+from typing import NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from lowfc.adapters.files.factory import settings
+from lowfc.adapters.process.clock import HostClock
+from lowfc.contract.codecs import codec
+from lowfc.contract.configuration import Configuration
+from lowfc.control.calibration.calibration import Calibration
+from lowfc.control.loop.advance import advance
+from lowfc.control.loop.inputs import Load
+from lowfc.control.loop.state import State
+from lowfc.programs.core.controller import CHANNEL
+from lowfc.programs.measure.frame_source import Payloads
+
+Whole = npt.NDArray[np.int64]
+
+
+class ControlStep:
+    """The controller's arithmetic: a frame's bytes in, a command's bytes out.
+
+    Attributes:
+        state: after the last frame.
+    """
+
+    def __init__(self, config: Configuration, calibration: Calibration, now_ns: int) -> None:
+        """Load the calibration."""
+        self._settings = settings(config)
+        self._valid_ns = round(config.control.command_timeout_ms * 1e6)
+        self.state, _ = advance(self._settings, State(), Load(now_ns, calibration, "the run's"))
+
+    def __call__(self, payload: bytes) -> bytes:
+        """Decode, check, advance, limit, encode; each frame is newer than the last."""
+        frame = codec.decode_frame(payload, self.state.frame_sequence + 1, 0)
+        self.state, outputs = advance(self._settings, self.state, frame)
+        assert outputs.command is not None  # noqa: S101  # every frame yields one
+        return codec.encode_command(outputs.command, self._valid_ns, CHANNEL, self.state.input_number)
+
+
+class Alone(NamedTuple):
+    """Durations of what was timed alone, ns, one for each frame.
+
+    Attributes:
+        timer_ns: from the moment a sleep ought to end to the moment it did; empty without a schedule.
+        step_ns: of the control step.
+    """
+
+    timer_ns: Whole
+    step_ns: Whole
+
+
+def time_alone(step: ControlStep, payloads: Payloads, clock: HostClock, seconds: float, period_ns: int | None) -> Alone:
+    """Sleep to the next moment of a schedule, then do one control step, over and over.
+
+    Args:
+        step: to be timed.
+        payloads: its frames.
+        clock: the host's.
+        seconds: for how long.
+        period_ns: of the schedule; None for one step after the other.
+    """
+    timer_ns: list[int] = []
+    step_ns: list[int] = []
+    due_ns = clock.host_ns()
+    end_ns = due_ns + round(seconds * 1e9)
+    while due_ns < end_ns:
+        payload = payloads.at(len(step_ns), due_ns)
+        if period_ns is not None:
+            due_ns += period_ns * (1 + max(0, clock.host_ns() - due_ns) // period_ns)  # always a sleep
+            clock.sleep_until_ns(due_ns)
+        begun_ns = clock.host_ns()
+        step(payload)
+        done_ns = clock.host_ns()
+        step_ns.append(done_ns - begun_ns)
+        if period_ns is not None:
+            timer_ns.append(begun_ns - due_ns)
+        else:
+            due_ns = done_ns
+    return Alone(np.array(timer_ns, np.int64), np.array(step_ns, np.int64))

@@ -1,0 +1,179 @@
+"""A camera that only sends: frames made beforehand, on an absolute schedule or as fast as commands come back.
+
+It takes the simulated camera's place where the loop is timed, so that the arithmetic of the simulation is not in the
+measurement. What it put, and when each frame was due, is written to a file at its end.
+"""
+
+import math
+from array import array
+from contextlib import closing
+from pathlib import Path
+from typing import Annotated
+
+import numpy as np
+import numpy.typing as npt
+import typer
+
+from lowfc.adapters.bus.mailbox import Mailbox
+from lowfc.adapters.bus.run import open_run
+from lowfc.adapters.files import factory
+from lowfc.adapters.files.whole_file import being_written
+from lowfc.adapters.process.join import join
+from lowfc.adapters.process.realtime import let_send
+from lowfc.adapters.process.service import Service
+from lowfc.adapters.process.terminal import DEFAULT_RUN, ConfigFile, RunId, configuration, new_app, run_app
+from lowfc.contract.configuration import Configuration
+from lowfc.contract.errors import BusError
+from lowfc.contract.messages import CAMERA_STATE, COMMAND, FRAME, RawImage, Role, image, timestamp, wire
+from lowfc.optics.chain.zernike import zernikes
+from lowfc.optics.detector.detector import expose
+from lowfc.optics.twin.twin import Evaluator, node_radii
+
+FRAMES_FILE = "frames.npy"
+"""In the run's directory: the frames, (frames, rows, columns) uint16."""
+SENT_FILE = "sent.npz"
+"""In the run's directory: sequence, put_ns and due_ns of every frame sent; due_ns is empty without a schedule."""
+ANSWER_S = 0.1
+"""Free-running, a frame whose command was not seen for so long is followed by the next one."""
+
+_COUNT = 32
+_TILT_NM, _OTHER_NM = 3.0, 1.0
+_FASTEST = 3
+_WAIT_S = 60.0  # a view may have to load
+_LEAD_PERIODS = 10
+
+app = new_app(
+    "A camera that sends frames made beforehand.\n\nExample: python -m lowfc.programs.measure.frame_source --seconds 5"
+)
+
+
+def prepared_frames(config: Configuration) -> npt.NDArray[np.uint16]:
+    """Noisy frames (frames, rows, columns) of a wavefront that moves by a few nm and returns, from the instrument."""
+    optics = factory.twin(config, None, lambda _: None)
+    evaluator, detector = Evaluator(optics), factory.detector(config)
+    electrons = np.float32(factory.electrons_per_exposure(config))
+    rng = np.random.default_rng([config.seed, 4])
+    noll = np.array(config.noll)
+    amplitude_nm = np.where(noll <= 3, _TILT_NM, _OTHER_NM)
+    cycles, phase = rng.integers(1, _FASTEST + 1, noll.size), rng.uniform(0, 2 * np.pi, noll.size)
+    modes_nm = amplitude_nm * np.sin(2 * np.pi * np.outer(np.arange(_COUNT) / _COUNT, cycles) + phase)
+    wavefronts_nm = (modes_nm @ zernikes(config.noll, *node_radii(optics))).astype(np.float32)
+    return np.stack([expose(detector, evaluator.image(opd_nm) * electrons, rng) for opd_nm in wavefronts_nm])
+
+
+class Payloads:
+    """Frames as messages: encoded once, only the time put before each.
+
+    Attributes:
+        shape: rows and columns.
+    """
+
+    def __init__(self, pixels: npt.NDArray[np.uint16]) -> None:
+        """Encode frames (frames, rows, columns)."""
+        self.shape: tuple[int, int] = (pixels.shape[1], pixels.shape[2])
+        self._bodies = []
+        for frame in pixels:
+            message = image(frame, 0, "lowfc_camera")
+            message.ClearField("timestamp")
+            self._bodies.append(message.SerializeToString())
+
+    def at(self, index: int, time_ns: int) -> bytes:
+        """Payload number `index`, of that time: fields of a protobuf message may follow each other in pieces."""
+        head = RawImage(timestamp=timestamp(time_ns)).SerializeToString()
+        return head + self._bodies[index % len(self._bodies)]
+
+
+@app.command()
+def frame_source(
+    run: RunId = DEFAULT_RUN,
+    config: ConfigFile = None,
+    seconds: Annotated[float, typer.Option(help="For how long.")] = 10.0,
+    free_running: Annotated[bool, typer.Option("--free-running", help="Next frame at the last one's command.")] = False,
+    wait_for: Annotated[list[str] | None, typer.Option(help="Process that the first frame waits for; repeat.")] = None,
+) -> None:
+    """Send the frames in the run's directory as its camera, and write there when each was due and put.
+
+    Example: python -m lowfc.programs.measure.frame_source --run bench --seconds 5 --wait-for controller
+    """
+    settings = configuration(config)
+    folder = open_run(run, (settings.mirror.name,)).path
+    payloads = Payloads(np.load(folder / FRAMES_FILE))
+    service = join(settings, run, Role.CAMERA, settings.realtime.camera_cpus)
+    service.catch_signals()
+    with closing(service.bus):  # a callback on zenoh's threads must not outlive the interpreter
+        Source(settings, service, payloads).run(seconds, tuple(wait_for or ()), folder, free_running=free_running)
+
+
+class Source:
+    """Sends frame after frame for a time, or until told to stop."""
+
+    def __init__(self, config: Configuration, service: Service, payloads: Payloads) -> None:
+        """Declare everything on the bus."""
+        self._config = config
+        self._service = service
+        self._payloads = payloads
+        self._frames = service.publisher(FRAME)
+        self._settings = service.publisher(CAMERA_STATE)
+        self._sequence, self._put_ns, self._due_ns = array("Q"), array("q"), array("q")
+
+    def run(self, seconds: float, wait_for: tuple[str, ...], folder: Path, *, free_running: bool) -> None:
+        """Wait for those named, send, and write what was sent into `folder`.
+
+        Raises:
+            BusError: somebody did not come.
+        """
+        service = self._service
+        commands = service.mailbox(COMMAND, self._config.mirror.name) if free_running else None
+        service.state = "ready"
+        missing = service.wait_for(wait_for, _WAIT_S)
+        if missing and service.running:
+            raise BusError(f"no sign of {', '.join(missing)} after {_WAIT_S:g} s; no frame is sent without")
+        state = factory.camera_state(self._config, self._payloads.shape, service.clock.now_ns())
+        self._settings.put(state.SerializeToString())
+        service.state = "running"
+        if commands is None:
+            self._on_schedule(math.ceil(seconds * self._config.camera.rate_hz))
+        else:
+            self._as_answered(seconds, commands)
+        with being_written(folder / SENT_FILE) as part, part.open("wb") as file:
+            put_ns, due_ns = np.array(self._put_ns), np.array(self._due_ns)
+            np.savez(file, sequence=np.array(self._sequence), put_ns=put_ns, due_ns=due_ns)
+        service.finish()
+
+    def _on_schedule(self, frames: int) -> None:
+        """Every frame at its moment, whatever became of the last; what is late is put at once, and none left out."""
+        clock, period_ns = self._service.clock, self._config.period_ns
+        origin_ns = clock.now_ns() + _LEAD_PERIODS * period_ns
+        for index in range(frames):
+            due_ns = origin_ns + index * period_ns
+            payload = self._payloads.at(index, due_ns)
+            clock.sleep_until_ns(due_ns)
+            if not self._service.running:
+                break
+            self._due_ns.append(due_ns)
+            self._put(payload)
+
+    def _as_answered(self, seconds: float, commands: Mailbox) -> None:
+        """The next frame as soon as the command for the last one was seen."""
+        clock = self._service.clock
+        end_ns = clock.now_ns() + round(seconds * 1e9)
+        while self._service.running and (now_ns := clock.now_ns()) < end_ns:
+            sequence = self._put(self._payloads.at(len(self._put_ns), now_ns))
+            patience_ns = now_ns + round(ANSWER_S * 1e9)
+            while (left_ns := patience_ns - clock.now_ns()) > 0:
+                sample = commands.take(left_ns * 1e-9)
+                if sample is None or wire.MirrorCommand.FromString(sample.payload).frame_sequence >= sequence:
+                    break
+
+    def _put(self, payload: bytes) -> int:
+        envelope = self._frames.put(payload)
+        let_send()
+        self._sequence.append(envelope.sequence)
+        self._put_ns.append(envelope.publish_time_ns)
+        self._service.work += 1
+        self._service.beat()
+        return envelope.sequence
+
+
+if __name__ == "__main__":
+    run_app(app)

@@ -1,0 +1,181 @@
+"""The command `lowfc latency`: how long a frame takes to become a command, on this host or in a log."""
+
+import contextlib
+import json
+import os
+import shlex
+import sys
+import time
+from enum import StrEnum
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from lowfc.adapters.files.whole_file import require_folder, write_whole
+from lowfc.adapters.process.terminal import ConfigFile, Json, LogsIfAny, configuration
+from lowfc.contract.errors import ConfigurationError, DataFileError
+from lowfc.programs.cli.output import put
+
+if TYPE_CHECKING:
+    from lowfc.contract.configuration import Configuration
+    from lowfc.programs.measure.latency.run import Asked
+
+_RATE_HZ = 1000.0
+_LEAK = 0.01
+
+
+class Camera(StrEnum):
+    """Where the frames come from."""
+
+    PREPARED = "prepared"
+    SIMULATED = "simulated"
+
+
+def latency(
+    logs: LogsIfAny = None,
+    duration: Annotated[float, typer.Option(min=0.5, max=1e5, help="Seconds of each repeat.")] = 10.0,
+    rate: Annotated[float | None, typer.Option(help="Frames per second; default: the file's, or 1000.")] = None,
+    free_running: Annotated[
+        bool, typer.Option("--free-running", help="Without a schedule: the next frame as soon as a command is back.")
+    ] = False,
+    camera: Annotated[Camera, typer.Option(help="Frames made beforehand, or the simulated camera.")] = Camera.PREPARED,
+    repeats: Annotated[int, typer.Option(min=1, max=1000, help="Loop and yardsticks in turns, so often.")] = 1,
+    record: Annotated[bool, typer.Option("--record/--no-record", help="With the recorder beside.")] = False,
+    view: Annotated[bool, typer.Option("--view/--no-view", help="With a view served for a browser beside.")] = False,
+    plain_scheduling: Annotated[
+        bool,
+        typer.Option("--plain-scheduling", help="Without real-time class, own processors, locked memory."),
+    ] = False,
+    config: ConfigFile = None,
+    plot: Annotated[Path | None, typer.Option(help="Draw histograms and latency against time (PNG).")] = None,
+    compare: Annotated[
+        tuple[Path, Path] | None, typer.Option(help="Compare two results of --json.", metavar="A.json B.json")
+    ] = None,
+    as_json: Json = False,
+) -> None:
+    """Time every frame through the real controller and mirror, and set that against what this host can do.
+
+    A source of frames made beforehand takes the camera's place: on an absolute schedule, late frames counted, so that a
+    stall hides nothing. In turns with the loop, a bare zenoh echo of the same sizes, one control step alone and the
+    host's timer are measured. Times are from just before a frame's put to just after its command's.
+
+    Example: lowfc latency --duration 10 --repeats 5 --json > latency.json
+    """
+    from lowfc.programs.measure.latency.text import compared, picture, table
+
+    if compare is not None:
+        found = _compare(compare)
+        put(found, compared(found), as_json=as_json)
+        return
+    require_folder(plot)
+    if plot is not None:
+        from lowfc.adapters.files.drawing import figure_class
+
+        figure_class()  # before the work, where it is not there
+    if logs:
+        figures = _of_log(logs)
+    else:
+        settings = _configuration(config, rate, camera, plain=plain_scheduling)
+        if camera is Camera.SIMULATED and free_running:
+            raise ConfigurationError("the simulated camera has a schedule: leave out --free-running or --camera")
+        from lowfc.programs.measure.latency.run import Asked
+
+        simulated = camera is Camera.SIMULATED
+        figures = _measure(Asked(settings, duration, repeats, free_running, simulated, record, view))
+    if plot is not None:
+        write_whole(plot, picture(figures))
+    put(figures, table(figures), as_json=as_json)
+
+
+def _configuration(file: Path | None, rate: float | None, camera: Camera, *, plain: bool) -> "Configuration":
+    """The loop's configuration: closed, in real time, and where nothing answers to the mirror with a leak."""
+    from lowfc.adapters.process.realtime import spread
+
+    overrides: dict[str, Any] = {"camera.rate_hz": rate, "lockstep": False}
+    if camera is Camera.PREPARED:  # the integrator would add up noise without end
+        overrides |= {"control.tilt_leak": _LEAK, "control.leak": _LEAK}
+    if plain:
+        overrides |= {"realtime.priority": 0, "realtime.lock_memory": False, "realtime.disable_cpu_idle": False}
+        overrides |= {f"realtime.{role}_cpus": [] for role in ("camera", "controller", "mirror", "recorder")}
+    apart = spread(os.sched_getaffinity(0), simulated=camera is Camera.SIMULATED)
+    defaults = {"control.start_mode": "closed", "camera.rate_hz": _RATE_HZ, **apart}
+    return configuration(file, overrides, defaults)
+
+
+def _measure(asked: "Asked") -> dict[str, Any]:
+    """Run the loop and what it is set against."""
+    from rich.console import Console
+
+    from lowfc.adapters.process.clock import sharpen_sleep
+    from lowfc.adapters.process.host import Host
+    from lowfc.adapters.process.progress import passing_bar
+    from lowfc.adapters.process.provenance import provenance
+    from lowfc.programs.measure.latency.run import prepared, run_repeats
+    from lowfc.programs.measure.latency.summary import together
+
+    sharpen_sleep()
+    host: dict[str, Any] = {**provenance(), "clock_source": "", "load": os.getloadavg()[0]}
+    with contextlib.suppress(OSError):
+        host["clock_source"] = Host().clock_source()
+    begun = time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime())
+    with prepared(asked.config) as run, passing_bar(Console(stderr=True)) as bar:
+        task = bar.add_task("starting", total=1 + 2 * asked.repeats)
+        done = run_repeats(asked, run, lambda what: bar.update(task, description=what, advance=1))
+    return together(done) | {
+        "settings": {
+            "rate_hz": asked.config.camera.rate_hz,
+            "duration_s": asked.duration_s,
+            "repeats": asked.repeats,
+            "free_running": asked.free_running,
+            "camera": str(Camera.SIMULATED if asked.simulated else Camera.PREPARED),
+            "record": asked.record,
+            "view": asked.view,
+            "realtime": asked.config.realtime.model_dump(),
+        },
+        "logs": [log for one in done for log in one["logs"]],
+        "date": begun,
+        "command": shlex.join(["lowfc", *sys.argv[1:]]),
+        "host": host | {name: done[-1][name] for name in ("granted", "refused")},
+    }
+
+
+def _of_log(names: list[Path]) -> dict[str, Any]:
+    """The same figures of a log."""
+    from rich.console import Console
+
+    from lowfc.adapters.logs.parts import the_one, titled
+    from lowfc.adapters.process.progress import reading_bar
+    from lowfc.programs.measure.latency.log import log_figures
+    from lowfc.programs.measure.latency.summary import together
+
+    log = the_one(names)
+    with reading_bar(Console(stderr=True)) as count:
+        figures, host = log_figures(log, partial(count, f"reading {titled(log)}"))
+    return together([figures]) | {"settings": {"log": str(log[0])}, "host": host}
+
+
+def _compare(files: tuple[Path, Path]) -> dict[str, Any]:
+    """Which of two results is better, and whether by more than the repeats differ; with both names."""
+    from lowfc.programs.measure.latency.summary import compare
+
+    try:
+        found = compare(*(_result(file) for file in files))
+    except (KeyError, TypeError) as fault:
+        raise DataFileError(
+            f"{files[0]} and {files[1]} should be results of `lowfc latency --json`: {fault!r} is not there"
+        ) from None
+    return dict(zip("ab", map(str, files), strict=True)) | found
+
+
+def _result(file: Path) -> dict[str, Any]:
+    try:
+        found = json.loads(file.read_text(encoding="utf-8"))
+    except OSError as fault:
+        raise DataFileError(f"{file} cannot be read: {fault.strerror}") from None
+    except ValueError as fault:  # no UTF-8, no JSON
+        raise DataFileError(f"{file} should be a result of `lowfc latency --json`, and is no JSON: {fault}") from None
+    if not isinstance(found, dict) or "latency_us" not in found:
+        raise DataFileError(f"{file} should be a result of `lowfc latency --json`, and has no latency_us")
+    return found

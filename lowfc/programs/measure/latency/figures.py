@@ -1,0 +1,203 @@
+"""Latencies of frames as columns, and the figures of one repeat made of them: percentiles, histograms, counts."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from lowfc.adapters.logs.columns import STAGES as TIMED
+from lowfc.adapters.logs.columns import rows_of
+from lowfc.contract.messages import FRAME, wire
+from lowfc.control.loop.safety import Reason
+from lowfc.programs.launch.watch import topic_count
+
+Whole = npt.NDArray[np.int64]
+Sequences = npt.NDArray[np.uint64]
+Double = npt.NDArray[np.float64]
+Flags = npt.NDArray[np.bool_]
+
+WARM_UP_S = 0.5
+"""Frames put so soon after the first one are left out."""
+STAGES = TIMED[1:-1]
+"""What receive to command is made of, as in ControlTiming."""
+LOOP_SPANS = ("frame_to_receive", "receive_to_command", "frame_to_command", "command_to_mirror", "frame_to_mirror")
+PERCENTILES = {"p50": 500, "p90": 900, "p99": 990, "p99_9": 999, "max": 1000}
+"""Each in thousandths, so that its place among the values is exact."""
+
+SPANS = {
+    "frame_to_receive": "frame to receive",
+    "receive_to_command": "receive to command",
+    "wakeup": "  waking",
+    "compute": "  computing",
+    "publish": "  publishing",
+    "frame_to_command": "frame to command",
+    "command_to_mirror": "command to mirror",
+    "frame_to_mirror": "frame to mirror",
+    "due_to_frame": "  due to frame",
+    "due_to_command": "  due to command",
+    "due_to_mirror": "  due to mirror",
+}
+"""In latency_us, and what each is called; percentiles in us."""
+ALONE = {
+    "echo_us": "half a bare echo",
+    "step_us": "control step alone",
+    "hot_step_us": "  back to back",
+    "timer_us": "timer wake-up",
+}
+"""What the host can do, likewise."""
+RATIOS = {"ratio": ("step_us", ""), "ratio_hot": ("hot_step_us", " of those back to back")}
+"""Of frame to command to half an echo and the step named here, and what is added to the step's name."""
+RATIOS_AT = ("p50", "p99")
+COUNTS = {
+    "frames": "frames",
+    "frames_without_command": "without a command",
+    "frames_crowded_out": "of these crowded out by the next frame",
+    "frames_untimed": "with a command whose timing is not known",
+    "frames_without_mirror_state": "without a mirror state",
+    "frames_sent_late": "put more than a period after they were due",
+    "frames_skipped": "skipped by the controller",
+    "frames_missing": "missing at the controller",
+    "warm_up_frames": "of the warm-up left out",
+    "commands_late": "commands late for the next exposure",
+    "echo_lost": "frames of the bare echo not answered",
+    "messages_lost": "messages lost by the recorder",
+}
+"""Sums over the repeats, and the words after each; None where it does not apply."""
+
+_BINS_PER_OCTAVE = 8
+_LOWEST_US, _OCTAVES = 1.0, 20
+_MOMENTS = 200
+_BURST = 0.5
+
+
+@dataclass(frozen=True, slots=True)
+class Frames:
+    """What became of each frame that was sent, in the order in which they were put; (frames,).
+
+    Attributes:
+        put_ns: just before the camera's put.
+        commanded: whether there is a command made from it.
+        spans_us: of `SPANS`, NaN where it is not known; those from the moment due only where there was a schedule.
+    """
+
+    put_ns: Whole
+    commanded: Flags
+    spans_us: Mapping[str, Double]
+
+
+def join(
+    sequence: Sequences,
+    put_ns: Whole,
+    due_ns: Whole | None,
+    timing: tuple[Sequences, Mapping[str, Whole]],
+    mirror: tuple[Sequences, Whole],
+    commanded: Sequences | None = None,
+) -> Frames:
+    """Frames that were sent, and what is known of each.
+
+    Args:
+        sequence: of each frame sent.
+        put_ns: just before the camera's put.
+        due_ns: when it ought to have been put; None where there was no schedule.
+        timing: sequences, and the controller's stages, ns, as in ControlTiming.
+        mirror: frame sequence and time of each state; the first of a frame counts.
+        commanded: frame sequences of the commands; when None, what was timed or followed by the mirror had one.
+    """
+    row, mirror_row = rows_of(sequence, timing[0]), rows_of(sequence, mirror[0])
+    stages_us = {stage: np.append(column / 1e3, np.nan)[row] for stage, column in timing[1].items()}
+    transport_us, command_us = stages_us["transport"], stages_us["frame_to_command"]
+    mirror_us = np.where(mirror_row < 0, np.nan, (np.append(mirror[1], 0)[mirror_row] - put_ns) / 1e3)
+    spans_us = {
+        "frame_to_receive": transport_us,
+        "receive_to_command": command_us - transport_us,
+        **{stage: stages_us[stage] for stage in STAGES},
+        "frame_to_command": command_us,
+        "command_to_mirror": mirror_us - command_us,
+        "frame_to_mirror": mirror_us,
+    }
+    if due_ns is not None:
+        late_us = (put_ns - due_ns) / 1e3
+        spans_us |= {
+            "due_to_frame": late_us,
+            "due_to_command": late_us + command_us,
+            "due_to_mirror": late_us + mirror_us,
+        }
+    known = (row >= 0) | (mirror_row >= 0) if commanded is None else rows_of(sequence, commanded) >= 0
+    return Frames(put_ns, known, spans_us)
+
+
+def percentiles(values: npt.NDArray[Any]) -> dict[str, float] | None:
+    """Values that these fractions do not exceed (each is one of the values); None where none is known."""
+    known = np.sort(values[np.isfinite(values)])
+    if not known.size:
+        return None
+    places = {name: -(-known.size * thousandths // 1000) - 1 for name, thousandths in PERCENTILES.items()}
+    return {name: round(float(known[place]), 3) for name, place in places.items()}
+
+
+def edges_us() -> Double:
+    """Edges of the histograms' bins; what lies beyond them is in the outermost bins."""
+    return np.asarray(_LOWEST_US * 2.0 ** (np.arange(_OCTAVES * _BINS_PER_OCTAVE + 1) / _BINS_PER_OCTAVE))
+
+
+def histogram(values_us: Double) -> Whole:
+    """Counts in the bins of `edges_us`."""
+    edges = edges_us()
+    known = values_us[np.isfinite(values_us)]
+    return np.histogram(np.clip(known, edges[0], edges[-1]), edges)[0].astype(np.int64)
+
+
+def repeat_figures(frames: Frames) -> dict[str, Any]:
+    """Figures of one repeat, the warm-up left out.
+
+    Returns:
+        latency_us (percentiles by span), histogram (counts by span), over_time (seconds, p50_us and max_us of frame to
+        command), rate_hz as sent, and numbers of frames: frames, warm_up_frames, frames_without_command, of these
+        frames_crowded_out (the next one was put within half the mean period), frames_untimed (there is a command, but
+        no word of how long it took), frames_without_mirror_state and frames_sent_late (by more than a period).
+    """
+    warm = frames.put_ns - frames.put_ns[:1] >= round(WARM_UP_S * 1e9)
+    put_ns, commanded = frames.put_ns[warm], frames.commanded[warm]
+    spans = {span: column[warm] for span, column in frames.spans_us.items()}
+    count = put_ns.size
+    span_ns = int(put_ns[-1] - put_ns[0]) if count > 1 else 0
+    period_ns = span_ns / (count - 1) if span_ns else 0.0
+    next_ns = np.append(np.diff(put_ns), np.iinfo(np.int64).max)
+    found = {span: percentiles(values) for span, values in spans.items()}
+    return {
+        "latency_us": {span: figures for span, figures in found.items() if figures is not None},
+        "histogram": {span: histogram(values).tolist() for span, values in spans.items()},
+        "over_time": _over_time(put_ns, spans["frame_to_command"]),
+        "rate_hz": round(1e9 / period_ns, 3) if period_ns else 0.0,
+        "frames": count,
+        "warm_up_frames": frames.put_ns.size - count,
+        "frames_without_command": int(np.sum(~commanded)),
+        "frames_crowded_out": int(np.sum(~commanded & (next_ns[:count] < _BURST * period_ns))),
+        "frames_untimed": int(np.sum(commanded & np.isnan(spans["frame_to_command"]))),
+        "frames_without_mirror_state": int(np.sum(np.isnan(spans["frame_to_mirror"]))),
+        "frames_sent_late": int(np.sum(spans["due_to_frame"] > period_ns / 1e3)) if "due_to_frame" in spans else None,
+    }
+
+
+def controllers_account(health: wire.Health) -> dict[str, Any]:
+    """Of the whole run, by the controller: frames_skipped, frames_missing, and reasons given for a frame, counted."""
+    frames = topic_count(health, FRAME.key)
+    reasons = {Reason(one.reason): one.count for one in health.counts}
+    return {
+        "frames_skipped": frames.skipped,
+        "frames_missing": frames.missing,
+        "reasons": {reason.name: count for reason, count in reasons.items() if reason is not Reason.NO_FRAME},
+    }
+
+
+def _over_time(put_ns: Whole, command_us: Double) -> dict[str, list[float]]:
+    """Median and largest in each of up to `_MOMENTS` equal parts, by the time of the first frame of each."""
+    known = np.flatnonzero(np.isfinite(command_us))
+    parts = np.array_split(known, min(_MOMENTS, known.size)) if known.size else []
+    return {
+        "seconds": [round(float(put_ns[part[0]] - put_ns[0]) / 1e9, 6) for part in parts],
+        "p50_us": [round(float(np.median(command_us[part])), 3) for part in parts],
+        "max_us": [round(float(command_us[part].max()), 3) for part in parts],
+    }

@@ -1,0 +1,242 @@
+"""The live latency test: controller and mirror driven by a source of frames; then what they are set against.
+
+Every repeat starts its processes anew: first the loop's, then those of the bare echo, which also time the control step
+and the host's timer alone. Nothing else of ours runs beside either.
+"""
+
+import contextlib
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from rich.console import Console
+from threadpoolctl import threadpool_limits
+
+from lowfc.adapters.bus.bus import Sample
+from lowfc.adapters.bus.run import Run, mirror_role, new_run_id, open_run
+from lowfc.adapters.bus.zenoh_bus import ZenohBus
+from lowfc.adapters.logs.columns import Columns, TimingRows
+from lowfc.adapters.process.child import Child
+from lowfc.adapters.process.clock import HostClock
+from lowfc.adapters.process.terminal import INTERRUPTED
+from lowfc.contract.configuration import Configuration
+from lowfc.contract.errors import BusError
+from lowfc.contract.messages import FRAME, HEALTH, MIRROR_STATE, TIMING, Role, wire
+from lowfc.programs.launch.processes import program, start_all, stop_all
+from lowfc.programs.launch.sim_loop import ProcessDiedError, children_of, held_back, prepare
+from lowfc.programs.launch.watch import Watch
+from lowfc.programs.measure import echo
+from lowfc.programs.measure.frame_source import FRAMES_FILE, SENT_FILE, prepared_frames
+from lowfc.programs.measure.latency.figures import (
+    WARM_UP_S,
+    controllers_account,
+    join,
+    percentiles,
+    repeat_figures,
+)
+
+_TURN_S = 0.25
+_RING = 1 << 14
+_SETTLE_S = 0.15
+_LAST_WORDS_S = 0.1
+
+
+@dataclass(frozen=True, slots=True)
+class Asked:
+    """What to run.
+
+    Attributes:
+        config: of the loop; its camera.rate_hz is the schedule's.
+        duration_s: of each repeat of the loop, after the warm-up; what it is set against takes half as long each.
+        repeats: number of them.
+        free_running: without a schedule.
+        simulated: with the simulated camera instead of frames made beforehand.
+        record: with the recorder.
+        view: with a view served for a browser.
+    """
+
+    config: Configuration
+    duration_s: float
+    repeats: int
+    free_running: bool = False
+    simulated: bool = False
+    record: bool = False
+    view: bool = False
+
+
+def fill(config: Configuration, run: Run) -> None:
+    """Put into the run's directory what its processes share, the frames among it."""
+    with threadpool_limits(limits=1):  # more spin, and are waited for where something else has their processor
+        prepare(config, run, Console(stderr=True))
+        np.save(run.path / FRAMES_FILE, prepared_frames(config))
+
+
+@contextlib.contextmanager
+def prepared(config: Configuration, fill: Callable[[Configuration, Run], None] = fill) -> Iterator[Run]:
+    """A run with what its processes share; nothing is left of it afterwards."""
+    run = open_run(new_run_id(), (config.mirror.name,), listeners=(Role.LAUNCHER,))
+    try:
+        fill(config, run)
+        yield run
+    finally:
+        run.remove()
+
+
+def run_repeats(asked: Asked, run: Run, progress: Callable[[str], None]) -> list[dict[str, Any]]:
+    """Measure; figures of each repeat.
+
+    Args:
+        asked: what to measure.
+        run: of `prepared`.
+        progress: told what begins now, twice a repeat.
+
+    Returns:
+        For each repeat `repeat_figures` and `controllers_account`; granted, refused, logs, messages_lost and
+        commands_late; echo_us, step_us, hot_step_us and timer_us (percentiles; timer_us None without a schedule) and
+        echo_lost.
+
+    Raises:
+        ProcessDiedError: a process ended by itself.
+        BusError: the controller said nothing of its timing.
+    """
+    repeats = []
+    for number in range(1, asked.repeats + 1):
+        progress(f"{number} of {asked.repeats}: the loop")
+        loop = _loop(asked, run)
+        progress(f"{number} of {asked.repeats}: the bare echo, the step and the timer")
+        repeats.append(loop | _alone(asked, run))
+    return repeats
+
+
+def _loop(asked: Asked, run: Run) -> dict[str, Any]:
+    """One repeat of the loop: figures of its frames, and what its processes reported at their end.
+
+    Python is woken ten times a second, and by Health; frames and mirror states wait in rings.
+    """
+    watch, timings = Watch({}, []), TimingRows()
+    states, frames = (Columns(sequence="Q", publish_ns="q") for _ in range(2))
+
+    def time_frames(sample: Sample) -> None:
+        timings.add(wire.ControlTiming.FromString(sample.payload))
+
+    def drain() -> None:
+        for sample in state_ring.drain():
+            sequence = wire.MirrorState.FromString(sample.payload).frame_sequence
+            states.add(sequence=sequence, publish_ns=sample.publish_time_ns)
+        for sample in frame_ring.drain() if frame_ring is not None else ():
+            frames.add(sequence=sample.sequence, publish_ns=sample.publish_time_ns)
+
+    children = _children(asked, run)
+    with contextlib.ExitStack() as stack:
+        bus = ZenohBus(run.links, Role.LAUNCHER, HostClock())
+        stack.callback(bus.close)
+        bus.subscribe(HEALTH, watch.hear)
+        bus.subscribe(TIMING, time_frames)
+        state_ring = bus.ring(MIRROR_STATE, _RING)
+        frame_ring = bus.ring(FRAME, _RING) if asked.simulated else None
+        stack.callback(stop_all, children)
+        _run(children, children[:1], drain)
+        time.sleep(_SETTLE_S)
+        stop_all([*children[1:], children[0]])
+        time.sleep(_LAST_WORDS_S)
+        drain()
+        _check_ends(children)
+    heard = timings.taken(), (states.taken("sequence"), states.taken("publish_ns"))
+    if asked.simulated:
+        joined = join(frames.taken("sequence"), frames.taken("publish_ns"), None, *heard)
+    else:
+        with np.load(run.path / SENT_FILE) as sent:
+            due_ns = sent["due_ns"] if sent["due_ns"].size else None
+            joined = join(sent["sequence"], sent["put_ns"], due_ns, *heard)
+    figures = repeat_figures(joined)
+    if "frame_to_command" not in figures["latency_us"]:
+        raise BusError("the controller told the timing of no frame after the warm-up; let the test last longer")
+    controller, recording = watch.of(Role.CONTROLLER), watch.of(Role.RECORDER).recording
+    if recording.failure:
+        raise BusError(f"the recorder stopped: {recording.failure}")
+    account = {
+        "granted": list(controller.realtime_granted),
+        "refused": list(controller.realtime_refused),
+        "logs": list(recording.files),
+        "messages_lost": recording.lost if asked.record else None,
+        "commands_late": watch.of(Role.CAMERA).commands_late if asked.simulated else None,
+    }
+    return figures | controllers_account(controller) | account
+
+
+def _children(asked: Asked, run: Run) -> list[Child]:
+    """The loop's processes in the order in which they are stopped; the first one ends by itself."""
+    config, seconds = asked.config, WARM_UP_S + asked.duration_s
+    children = children_of(config, run, seconds, asked.record)
+    if asked.view:
+        words = ["-m", "lowfc", "view", "--run", run.run_id, "--web"]
+        view = program(str(Role.VIEWER), words, run.path / f"{Role.VIEWER}.stderr")
+        children.insert(len(children) - asked.record, view)  # the recorder ends last
+    awaited = [str(Role.CONTROLLER), mirror_role(config.mirror.name)]
+    awaited += [str(Role.RECORDER)] * asked.record + [str(Role.VIEWER)] * asked.view
+    waits = [word for name in awaited for word in ("--wait-for", name)]
+    if asked.simulated:
+        children[0].command += waits[-2:] if asked.view else []
+    else:
+        words = ["-m", "lowfc.programs.measure.frame_source", *_shared(run), "--seconds", str(seconds), *waits]
+        words += ["--free-running"] * asked.free_running
+        children[0] = program(str(Role.CAMERA), words, run.path / f"{Role.CAMERA}.stderr")
+    return children
+
+
+def _alone(asked: Asked, run: Run) -> dict[str, Any]:
+    """One repeat of what the loop is set against."""
+    words = [*_shared(run), "--seconds", str(asked.duration_s / 2), *["--free-running"] * asked.free_running]
+    children = [
+        program(f"echo ({verb})", ["-m", echo.__name__, verb, *words], run.path / f"echo-{verb}.stderr")
+        for verb in ("ask", "answer")
+    ]
+    try:
+        _run(children, children, lambda: None)
+    finally:
+        stop_all(children)
+    with np.load(run.path / echo.ECHO_FILE) as echoed, np.load(run.path / echo.ALONE_FILE) as alone:
+        round_trip_ns = echoed["round_trip_ns"]
+        durations_ns = {"echo_us": round_trip_ns[round_trip_ns >= 0]}
+        durations_ns |= {name: alone[name.replace("_us", "_ns")] for name in ("step_us", "hot_step_us", "timer_us")}
+    if not durations_ns["echo_us"].size:
+        raise BusError("no answer of the bare echo came back; let the test last longer (--duration)")
+    found = {name: percentiles(each_ns / 1e3) for name, each_ns in durations_ns.items()}
+    return found | {"echo_lost": int(np.sum(round_trip_ns < 0))}
+
+
+def _shared(run: Run) -> list[str]:
+    return ["--run", run.run_id, "--config", str(run.path / "config.toml")]
+
+
+def _run(children: list[Child], awaited: list[Child], meanwhile: Callable[[], None]) -> None:
+    """Start processes, and return when those awaited have ended by themselves.
+
+    Raises:
+        ProcessDiedError: a process ended that should not have, or with an error.
+        KeyboardInterrupt: at Ctrl-C, or when told to end.
+    """
+    with held_back() as interrupted:  # while a process forks, Python may swallow what signals would raise
+        start_all(children)
+        while any(child.status is None for child in awaited) and not interrupted():
+            for child in children:
+                if child.status is not None and (child.status != 0 or child not in awaited):
+                    raise _died(child)
+            meanwhile()
+            time.sleep(_TURN_S)
+    if interrupted():
+        raise KeyboardInterrupt
+    _check_ends(awaited)
+
+
+def _check_ends(children: list[Child]) -> None:
+    for child in children:
+        if child.status not in (0, INTERRUPTED):
+            raise _died(child)
+
+
+def _died(child: Child) -> ProcessDiedError:
+    words = child.stderr_tail()
+    return ProcessDiedError(child.how_it_ended() + (f"; its last words:\n{words}" if words else ""))

@@ -1,0 +1,119 @@
+"""What `lowfc latency` prints: repeats brought together, and two of its results compared."""
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from lowfc.programs.measure.latency.figures import ALONE, COUNTS, RATIOS, RATIOS_AT, edges_us
+
+OVER = "over_echo_and_step"
+COMPARED = ("p50", "p99", "p99_9")
+
+Repeats = Sequence[Mapping[str, Any]]
+
+
+def together(repeats: Repeats) -> dict[str, Any]:
+    """Figures of all repeats.
+
+    Returns:
+        latency_us and spread_us by span: median, and lowest and highest, over the repeats of each percentile (max: the
+        largest); echo_us{round_trip}, step_us, hot_step_us, timer_us, ratio (p50 and p99; see `RATIOS`) and ratio_hot,
+        its step of those back to back, and the same with _spread; histogram{edges_us, counts by span}; over_time of
+        each repeat; `COUNTS`, and reasons; and repeats, the percentiles of each.
+    """
+    spans = [span for span in repeats[0]["latency_us"] if all(span in one["latency_us"] for one in repeats)]
+    each = {span: [one["latency_us"][span] for one in repeats] for span in spans}
+    found: dict[str, Any] = {
+        "latency_us": {span: median_of(values) for span, values in each.items()},
+        "spread_us": {span: spread_of(values) for span, values in each.items()},
+    }
+    beside = {name: [one[name] for one in repeats if one.get(name)] for name in ALONE}
+    for name in RATIOS:
+        beside[name] = [{at: ratio(one, at, name) for at in RATIOS_AT} for one in repeats if one.get("echo_us")]
+    for name, values in beside.items():
+        found[name], found[f"{name}_spread"] = (median_of(values), spread_of(values)) if values else (None, None)
+    for name in ("echo_us", "echo_us_spread"):
+        found[name] = found[name] and {"round_trip": found[name]}
+    for name in COUNTS:
+        counts = [one[name] for one in repeats if one.get(name) is not None]
+        found[name] = sum(counts) if counts else None
+    names = sorted({name for one in repeats for name in one["reasons"]})
+    found["reasons"] = {name: sum(one["reasons"].get(name, 0) for one in repeats) for name in names}
+    found["rate_hz"] = float(np.median([one["rate_hz"] for one in repeats]))
+    found["histogram"] = _histogram(repeats, spans)
+    found["over_time"] = [one["over_time"] for one in repeats]
+    found["repeats"] = [{name: one.get(name) for name in ("latency_us", *ALONE)} for one in repeats]
+    return found
+
+
+def median_of(repeats: Sequence[Mapping[str, float]]) -> dict[str, float]:
+    """Median over the repeats of each percentile; of the largest values, the largest."""
+    each = {at: [one[at] for one in repeats] for at in repeats[0]}
+    return {at: float(max(values) if at == "max" else np.median(values)) for at, values in each.items()}
+
+
+def spread_of(repeats: Sequence[Mapping[str, float]]) -> dict[str, list[float]]:
+    """Lowest and highest over the repeats of each percentile."""
+    return {at: [float(one([each[at] for each in repeats])) for one in (min, max)] for at in repeats[0]}
+
+
+def ratio(repeat: Mapping[str, Any], at: str, name: str = "ratio") -> float:
+    """Frame to command over what it is made of: half the round trip of the bare echo, and one control step alone."""
+    made_of_us: float = repeat["echo_us"][at] / 2 + repeat[RATIOS[name][0]][at]
+    return float(repeat["latency_us"]["frame_to_command"][at] / made_of_us)
+
+
+def compare(before: Mapping[str, Any], after: Mapping[str, Any]) -> dict[str, Any]:
+    """Two results side by side.
+
+    Returns:
+        rows, one for each span and percentile that both have, and for each ratio to what the host can do: name, at,
+        a, b, ratio (b over a), better ("a", "b" or "same"), difference (b minus a), spread (the larger of both ranges
+        over the repeats; None for a single one) and beyond_spread; unit is us, or empty for a ratio. And counts: of
+        each of `COUNTS` that both have, a and b.
+    """
+    both = (before, after)
+    pairs = [
+        (span, at, "us", [(one["latency_us"][span][at], one["spread_us"][span][at]) for one in both])
+        for span in before["latency_us"]
+        if span in after["latency_us"]
+        for at in COMPARED
+    ]
+    if before["ratio"] and after["ratio"]:
+        pairs += [(OVER, at, "", [(one["ratio"][at], one["ratio_spread"][at]) for one in both]) for at in RATIOS_AT]
+    single = min(len(one["repeats"]) for one in both) < 2
+    return {
+        "rows": [_row(*pair, single=single) for pair in pairs],
+        "counts": {
+            name: [one[name] for one in both] for name in COUNTS if all(one.get(name) is not None for one in both)
+        },
+    }
+
+
+def _row(name: str, at: str, unit: str, figures: list[tuple[float, list[float]]], *, single: bool) -> dict[str, Any]:
+    (a, a_spread), (b, b_spread) = figures
+    spread = None if single else max(high - low for low, high in (a_spread, b_spread))
+    return {
+        "name": name,
+        "at": at,
+        "unit": unit,
+        "a": a,
+        "b": b,
+        "ratio": b / a if a else None,
+        "better": "same" if a == b else "a" if a < b else "b",
+        "difference": b - a,
+        "spread": spread,
+        "beyond_spread": None if spread is None else abs(b - a) > spread,
+    }
+
+
+def _histogram(repeats: Repeats, spans: Sequence[str]) -> dict[str, Any]:
+    """Counts of all repeats, without the empty bins at both ends."""
+    counts = {span: np.sum([one["histogram"][span] for one in repeats], axis=0) for span in spans}
+    filled = np.flatnonzero(np.sum(list(counts.values()), axis=0))
+    first, last = int(filled[0]), int(filled[-1]) + 1
+    return {
+        "edges_us": np.round(edges_us()[first : last + 1], 4).tolist(),
+        "counts": {span: column[first:last].tolist() for span, column in counts.items()},
+    }

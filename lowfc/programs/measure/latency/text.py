@@ -1,0 +1,129 @@
+"""The figures of `lowfc latency` as text and as a picture."""
+
+import math
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from lowfc.programs.measure.latency.figures import ALONE, COUNTS, LOOP_SPANS, PERCENTILES, RATIOS, SPANS
+from lowfc.programs.measure.latency.summary import OVER
+
+_COMPARED = SPANS | {OVER: "over echo and step"}
+_ALWAYS = ("frames", "frames_without_command", "warm_up_frames", "messages_lost")
+"""Counts that are shown even where they are 0."""
+_HOST = ("processor", "processors", "kernel", "python", "clock_source", "load")
+_BLOCKS = " ▁▂▃▄▅▆▇█"
+_LINE = 32
+"""Characters of a histogram in the table."""
+
+
+def table(figures: Mapping[str, Any]) -> str:
+    """The result for a person."""
+    title = f"{'us':<22}" + "".join(f"{name.replace('_', '.'):>9}" for name in PERCENTILES)
+    edges = figures["histogram"]["edges_us"]
+    lines = [f"{title}   log counts, {edges[0]:.0f} to {edges[-1]:.0f} us"]
+    for span, values in figures["latency_us"].items():
+        if span == "due_to_frame":
+            lines.append("from the moment the frame was due, not from when it was put:")
+        bars = sparkline(figures["histogram"]["counts"][span])
+        lines.append(f"{_row(SPANS[span], values)}   {bars}")
+    for name, words in ALONE.items():
+        values = figures[name]
+        if name == "echo_us" and values:
+            values = {at: value / 2 for at, value in values["round_trip"].items()}
+        if values:
+            lines.append(_row(words, values))
+    return "\n".join([*lines, *_remarks(figures)])
+
+
+def compared(comparison: Mapping[str, Any]) -> str:
+    """Two results for a person; a and b are the names of both."""
+    lines = [f"{name}: {comparison[name]}" for name in "ab"]
+    lines.append(f"{'':<22}{'':>7}{'a':>10}{'b':>10}{'b/a':>8}{'b - a':>10}{'spread':>10}   better")
+    for row in comparison["rows"]:
+        digits = 1 if row["unit"] else 3
+        spread = "-" if row["spread"] is None else f"{row['spread']:.{digits}f}"
+        verdict = row["better"] if row["beyond_spread"] is not False else f"{row['better']}, within the spread"
+        over = "-" if row["ratio"] is None else f"{row['ratio']:.3f}"
+        lines.append(
+            f"{_COMPARED[row['name']].strip():<22}{row['at'].replace('_', '.'):>7}{row['a']:>10.{digits}f}"
+            f"{row['b']:>10.{digits}f}{over:>8}{row['difference']:>+10.{digits}f}{spread:>10}   {verdict}"
+        )
+    lines += [f"{COUNTS[name]}: a {a}, b {b}" for name, (a, b) in comparison["counts"].items() if a or b]
+    lines.append("us; spread: the larger of both ranges over the repeats, unknown where one has a single repeat.")
+    return "\n".join(lines)
+
+
+def sparkline(counts: Sequence[int]) -> str:
+    """Counts as blocks of logarithmic height, several bins in one where there are many."""
+    per = math.ceil(len(counts) / _LINE)
+    sums = [sum(counts[start : start + per]) for start in range(0, len(counts), per)]
+    highest = math.log1p(max(sums, default=0)) or 1.0
+    return "".join(_BLOCKS[math.ceil(math.log1p(one) / highest * (len(_BLOCKS) - 1))] for one in sums).rstrip()
+
+
+def picture(figures: Mapping[str, Any]) -> bytes:
+    """PNG: a histogram of each span, and frame to command against time.
+
+    Raises:
+        ConfigurationError: matplotlib is not installed.
+    """
+    from lowfc.adapters.files.drawing import figure_class, png
+
+    figure = figure_class()(figsize=(9, 8), layout="constrained")
+    counted, timed = figure.subplots(2, 1)
+    edges = figures["histogram"]["edges_us"]
+    for span in LOOP_SPANS:
+        if span in figures["latency_us"]:
+            counted.stairs(figures["histogram"]["counts"][span], edges, label=SPANS[span])
+    counted.set(xscale="log", yscale="log", xlabel="us", ylabel="frames", title=_what(figures))
+    counted.legend()
+    begun_s = 0.0
+    for number, repeat in enumerate(figures["over_time"]):
+        seconds = [begun_s + second for second in repeat["seconds"]]
+        labels = ("largest", "median") if number == 0 else (None, None)
+        timed.plot(seconds, repeat["max_us"], ".", color="tab:red", markersize=3, label=labels[0])
+        timed.plot(seconds, repeat["p50_us"], color="tab:blue", label=labels[1])
+        begun_s = seconds[-1] if seconds else begun_s
+    timed.set(yscale="log", xlabel="s, one repeat after the other", ylabel="frame to command, us")
+    timed.legend()
+    return png(figure)
+
+
+def _row(name: str, values: Mapping[str, float]) -> str:
+    return f"{name:<22}" + "".join(f"{values[at]:>9.1f}" for at in PERCENTILES)
+
+
+def _remarks(figures: Mapping[str, Any]) -> list[str]:
+    lines = []
+    for name, (_, words) in RATIOS.items():
+        if figures[name]:
+            spread = figures[f"{name}_spread"]
+            parts = [f"{at} {figures[name][at]:.2f} ({low:.2f} to {high:.2f})" for at, (low, high) in spread.items()]
+            lines.append(f"frame to command over half a bare echo and one control step{words}: {', '.join(parts)}")
+    counts = {name: figures.get(name) for name in COUNTS}
+    shown = [name for name, count in counts.items() if count or (name in _ALWAYS and count is not None)]
+    lines.append(", ".join(f"{counts[name]} {COUNTS[name]}" for name in shown))
+    if figures["reasons"]:
+        reasons = ", ".join(f"{name} {count}" for name, count in figures["reasons"].items())
+        lines.append(f"frames that were refused or limited, the warm-up included: {reasons}")
+    lines.append(_what(figures))
+    host = figures["host"]
+    lines.append(", ".join(f"{name} {host[name]}" for name in _HOST if host.get(name)))
+    if "clock_error_us" in host:
+        lines.append(
+            f"on several hosts, by their clocks' measured offsets: a span from one to another may be wrong by "
+            f"{host['clock_error_us']:.0f} us, however often it was measured"
+        )
+    return lines + [f"{word}: {', '.join(host[word])}" for word in ("granted", "refused") if host.get(word)]
+
+
+def _what(figures: Mapping[str, Any]) -> str:
+    """One line about the run."""
+    settings, count = figures["settings"], len(figures["repeats"])
+    if settings.get("log"):
+        return f"{Path(settings['log']).name}, {figures['rate_hz']:.1f} Hz"
+    pace = "free-running" if settings["free_running"] else f"{settings['rate_hz']:g} Hz"
+    beside = "".join(f", {name} beside" for name in ("record", "view") if settings[name])
+    times = f"medians over {count} times {settings['duration_s']:g} s" if count > 1 else f"{settings['duration_s']:g} s"
+    return f"{pace} ({figures['rate_hz']:.1f} Hz reached), {settings['camera']} frames{beside}, {times}"

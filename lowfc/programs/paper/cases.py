@@ -1,0 +1,231 @@
+"""What a table or figure is, what it is given to work with, and the sensors, each made ready once."""
+
+import threading
+import zlib
+from collections.abc import Callable, Iterable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from functools import cached_property, lru_cache
+from pathlib import Path
+from typing import TypeVar
+
+import numpy as np
+
+from lowfc.adapters.files.layouts import layout_names
+from lowfc.adapters.files.sensors import sensor_from, sensor_named
+from lowfc.adapters.files.twin_cache import load_or_build
+from lowfc.arrays import Array, Mask
+from lowfc.contract.configuration import SensorSection
+from lowfc.contract.errors import ConfigurationError
+from lowfc.design.estimators import Fit, fit
+from lowfc.design.trials import gram
+from lowfc.optics.chain.band import Band, uniform
+from lowfc.optics.chain.grid import pupil_axis
+from lowfc.optics.chain.sensor import LightBudget, Sensor, image, light_budget, reference, response, shear_response
+from lowfc.optics.chain.zernike import NOLLS_20, zernikes
+from lowfc.optics.twin.twin import ACCURATE, Evaluator, Twin, node_radii
+from lowfc.programs.paper.rows import Row
+
+DEFAULT_SAM = SensorSection().sam
+Item = TypeVar("Item")
+Result = TypeVar("Result")
+
+
+def no_progress(what: str, done: int, total: int) -> None:
+    """Show nothing."""
+
+
+class Prepared:
+    """A sensor at the paper's sampling with everything the tables ask of it, made when first asked for.
+
+    Attributes:
+        name: What the command line calls it.
+        sensor: Its optics.
+    """
+
+    def __init__(self, name: str, sensor: Sensor) -> None:
+        self.name, self.sensor = name, sensor
+        self._own = threading.local()
+
+    @cached_property
+    def modes(self) -> Array:
+        """The 20 modes (20, n, n) at the pupil's samples."""
+        return modes_at(len(self.sensor.pupil))
+
+    @cached_property
+    def open(self) -> Mask:
+        """The open part (n, n) of the pupil, where wavefronts are compared."""
+        return np.asarray(self.sensor.pupil > 0.5)
+
+    @cached_property
+    def open_modes(self) -> Array:
+        """The 20 modes (20, samples) in the open part of the pupil."""
+        return self.modes[:, self.open]
+
+    @cached_property
+    def gram(self) -> Array:
+        """Their mean products (20, 20), piston removed."""
+        return gram(self.open_modes)
+
+    @cached_property
+    def I0(self) -> Array:
+        """Flat wavefront's image (pixels,) at the central wavelength, fractions of the open circle's light."""
+        return reference(self.sensor).ravel()
+
+    @cached_property
+    def H(self) -> Array:
+        """Its derivative (pixels, 20) per nm of each mode."""
+        return response(self.sensor, self.modes)
+
+    @cached_property
+    def band(self) -> Band:
+        """The band of Sect. 3.3: 20 % in five wavelengths, both ends included."""
+        return uniform(self.sensor.wavelength_nm)
+
+    @cached_property
+    def band_I0(self) -> Array:
+        """`I0` over the band."""
+        return reference(self.sensor, self.band).ravel()
+
+    @cached_property
+    def band_H(self) -> Array:
+        """`H` over the band."""
+        return response(self.sensor, self.modes, self.band)
+
+    @cached_property
+    def nuisance(self) -> Array:
+        """Changes of the image (pixels, 3) that are no wavefront: flux (whole), pupil shear in x and y (diameters)."""
+        return np.column_stack([self.I0, shear_response(self.sensor)])
+
+    @cached_property
+    def budget(self) -> LightBudget:
+        """Where the light goes."""
+        return light_budget(self.sensor)
+
+    @cached_property
+    def twin(self) -> Twin:
+        """The real-time twin that the full-model iterations run on: right to about 1e-5 of the image."""
+        return load_or_build(self.sensor, ACCURATE)
+
+    def opd_nm(self, modes_nm: Array) -> Array:
+        """Wavefront (n, n) of the first modes (up to 20,) in nm."""
+        return np.asarray(np.tensordot(modes_nm, self.modes[: len(modes_nm)], 1))
+
+    def image(self, modes_nm: Array, band: Band | None = None) -> Array:
+        """Image (pixels,) of the first modes (up to 20,) in nm by the full optical chain, the truth of every trial."""
+        return image(self.sensor, self.opd_nm(modes_nm), band).ravel()
+
+    def fit(
+        self,
+        modes: int,
+        scale_e: float,
+        read_noise_e: float,
+        kind: str,
+        in_band: bool = False,
+        nuisance: Array | None = None,
+    ) -> Fit:
+        """A linear estimator of the first modes, at the central wavelength or over the band.
+
+        Raises:
+            ConfigurationError: This sensor cannot tell the modes apart.
+        """
+        I0, H = (self.band_I0, self.band_H) if in_band else (self.I0, self.H)
+        try:
+            return fit(NOLLS_20[:modes], I0, H[:, :modes], scale_e, read_noise_e, kind, nuisance)
+        except ValueError as error:
+            raise ConfigurationError(f"sensor {self.name}, {modes} modes: {error}") from error
+
+    @cached_property
+    def _node_modes(self) -> Array:
+        return zernikes(NOLLS_20, *node_radii(self.twin))
+
+    def model(self, modes_nm: Array) -> Array:
+        """The same by the twin; any thread may call it."""
+        if not hasattr(self._own, "evaluator"):
+            self._own.evaluator = Evaluator(self.twin)
+        opd_nm = modes_nm @ self._node_modes[: len(modes_nm)]
+        return np.asarray(self._own.evaluator.image(opd_nm.astype(np.float32)), np.float64).ravel()
+
+
+@lru_cache(maxsize=1)
+def modes_at(samples: int) -> Array:
+    """The 20 modes (20, samples, samples) of a pupil."""
+    u = 2.0 * pupil_axis(samples)
+    return zernikes(NOLLS_20, u, u[:, None])
+
+
+def sparse_apertures() -> tuple[str, ...]:
+    """Names of the default sensor and of one with each of the other layouts that are shipped."""
+    return "sam", *(name for name in layout_names() if name != DEFAULT_SAM)
+
+
+@lru_cache(maxsize=64)
+def prepared(name: str) -> Prepared:
+    """A sensor by the name of `lowfc.adapters.files.sensors.sensor_named`; clowfs:MM, its defocus; or bowtie:LAYOUT."""
+    kind, _, detail = name.partition(":")
+    if kind == "clowfs" and detail:
+        try:
+            section = SensorSection(kind="clowfs", defocus_mm=float(detail))
+        except ValueError:
+            raise ConfigurationError(f"{name}: after the colon comes the defocus in mm, 1 to 50") from None
+        return Prepared(name, sensor_from(section))
+    if kind == "bowtie" and detail:
+        return Prepared(name, sensor_from(SensorSection(focal_mask="bowtie", sam=detail)))
+    return Prepared(name, sensor_named(name))
+
+
+@dataclass(frozen=True)
+class Context:
+    """What a table is given to work with.
+
+    Attributes:
+        trials: Wavefronts, noise realisations.
+        seed: Of all random numbers.
+        jobs: Threads; no figure depends on them.
+        sensors: Instead of a table's own sensors, where it has a choice.
+        progress: Called with what is being done, how much of it is, and how much there is.
+    """
+
+    trials: int = 100
+    seed: int = 1
+    jobs: int = 1
+    sensors: tuple[str, ...] | None = None
+    progress: Callable[[str, int, int], None] = no_progress
+
+    def names(self, *own: str) -> tuple[str, ...]:
+        """The sensors that are asked for, or else a table's own."""
+        return self.sensors or own
+
+    def prepared(self, name: str) -> Prepared:
+        """A sensor by name, made ready once in a process."""
+        return prepared(name)
+
+    def rng(self, *key: str | int) -> np.random.Generator:
+        """A generator that depends on the seed and the key alone, so that no trial depends on another's."""
+        words = [part if isinstance(part, int) else zlib.crc32(part.encode()) for part in key]
+        return np.random.default_rng([self.seed, *words])
+
+    def map(self, what: str, function: Callable[[Item], Result], items: Iterable[Item]) -> list[Result]:
+        """The function's values of all items, in their order, on `jobs` threads, with progress."""
+        todo: Sequence[Item] = list(items)
+        results: list[Result] = []
+        with ThreadPoolExecutor(self.jobs) as pool:
+            for result in pool.map(function, todo):
+                results.append(result)
+                self.progress(what, len(results), len(todo))
+        return results
+
+
+@dataclass(frozen=True)
+class Case:
+    """A table or a figure of the paper.
+
+    Attributes:
+        title: What it shows, one line.
+        run: Makes its rows.
+        plot: Draws it into a PNG file, as the paper does; None where there is nothing to draw.
+    """
+
+    title: str
+    run: Callable[[Context], list[Row]]
+    plot: Callable[[Context, Path], None] | None = None

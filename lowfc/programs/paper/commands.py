@@ -1,0 +1,68 @@
+"""The command `lowfc validate`: arguments only; the work is elsewhere."""
+
+import os
+import sys
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from lowfc.contract.errors import ConfigurationError, nearest
+
+TABLES = (
+    *("table1", "table2", "table3", "table4"),
+    *("fig1", "fig2", "fig3", "fig4", "fig5", "fig6", "fig7", "fig8", "fig9", "fig10"),
+    *("conditioning", "photometry"),
+)
+
+OF_THE_PAPER = ("table1", "photometry")
+"""What compares the paper's own sensors and takes no others."""
+
+
+def validate(
+    tables: Annotated[
+        list[str],
+        typer.Argument(help=f"Any of {', '.join(TABLES)}; or all.", metavar="TABLE...", show_default=False),
+    ],
+    trials: Annotated[int, typer.Option(min=2, max=1_000_000, help="Wavefronts, and noise realisations.")] = 100,
+    seed: Annotated[int, typer.Option(min=0, help="Of all random numbers.")] = 1,
+    jobs: Annotated[int | None, typer.Option(min=1, help="Threads. Default: one for each core.")] = None,
+    sensor: Annotated[
+        list[str] | None,
+        typer.Option(
+            help=f"Only this sensor, in all tables and figures but {' and '.join(OF_THE_PAPER)}: sam, bowtie, "
+            "bowtie:LAYOUT, clowfs, clowfs:MM (its defocus), zwfs, bar, open, lyot, aplc; or a layout, FILE.json or "
+            "FILE.json:NAME. Repeat.",
+            show_default=False,
+        ),
+    ] = None,
+    plots: Annotated[
+        Path | None, typer.Option(help="Folder for drawings of the figures (PNG).", show_default=False)
+    ] = None,
+    docs: Annotated[
+        Path | None,
+        typer.Option(help="Folder to write paper.md, paper.json and the drawings to; with all.", show_default=False),
+    ] = None,
+    as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object on standard output.")] = False,
+) -> None:
+    """Reproduce the paper's tables and figures: paper, measured, limit and assumption.
+
+    Example: lowfc validate table3 table4 --trials 20
+    """
+    known = (*TABLES, "all")
+    for name in tables:
+        if name not in known:
+            raise ConfigurationError(f"there is no table {name!r}{nearest(name, known)}; {', '.join(known)}")
+    wanted = [name for name in TABLES if name in tables or "all" in tables]
+    if docs is not None and (tuple(wanted) != TABLES or sensor or plots is not None):
+        raise ConfigurationError("--docs writes the whole document: use it with all, without --sensor and --plots")
+
+    from lowfc.programs.paper.cases import Context
+    from lowfc.programs.paper.report import run, run_into, to_json, to_text
+
+    context = Context(trials, seed, jobs or len(os.sched_getaffinity(0)), tuple(sensor) if sensor else None)
+    fixed = [name for name in wanted if name in OF_THE_PAPER]
+    if sensor and fixed:
+        typer.echo(f"{', '.join(fixed)}: of the paper's own sensors, --sensor changes nothing there", err=True)
+    found = run(wanted, context, plots) if docs is None else run_into(docs, wanted, context)
+    sys.stdout.write((to_json(found) if as_json else "\n\n".join(map(to_text, found))) + "\n")

@@ -1,0 +1,44 @@
+"""The bright exposure in which the figures measure one wavefront (Sect. 3.1), and all ways to estimate it."""
+
+import numpy as np
+
+from lowfc.arrays import Array
+from lowfc.design.estimators import KINDS, Fit, iterated
+from lowfc.design.fisher import cramer_rao, variance_e
+from lowfc.design.paper import PEAK_E, TABLE3_READ_NOISE_E
+from lowfc.design.trials import noisy_e
+from lowfc.optics.chain.zernike import NOLLS_14
+from lowfc.programs.paper.cases import Prepared
+from lowfc.programs.paper.tables.reconstruction import ITERATIONS, label, scale_e
+
+MODES = len(NOLLS_14)
+BRIGHT = (
+    f"{PEAK_E:,.0f} e- in the brightest pixel of the flat image, {TABLE3_READ_NOISE_E:.0f} e- read noise, whole "
+    "electrons, monochromatic."
+)
+FULL_CHAIN = "Images by the full optical chain; iterations with the twin, right to about 1e-5."
+
+
+ESTIMATORS = tuple(label(kind, iterations) for kind in KINDS for iterations in ITERATIONS)
+PINV = label("pinv", 0)
+WEIGHTED, WEIGHTED_1, WEIGHTED_2 = (label("weighted", iterations) for iterations in ITERATIONS)
+
+
+def exposed_e(ready: Prepared, image: Array, rng: np.random.Generator) -> Array:
+    """A noisy image (pixels,) in electrons of one in fractions of the open circle's light."""
+    return noisy_e(rng, scale_e(ready) * image, TABLE3_READ_NOISE_E)
+
+
+def estimates_nm(ready: Prepared, linear: dict[str, Fit], image_e: Array) -> dict[str, Array]:
+    """What each of `ESTIMATORS` makes (modes,) of an image (pixels,) in electrons; of the kinds in `linear` alone."""
+    found: dict[str, Array] = {}
+    for kind, fit in linear.items():
+        steps_nm = iterated(fit, image_e, ready.model, ITERATIONS[-1])
+        found |= {label(kind, iterations): steps_nm[iterations] for iterations in ITERATIONS}
+    return found
+
+
+def bound_nm2(ready: Prepared) -> Array:
+    """Cramer-Rao bound (modes, modes) of the exposure."""
+    light_e = scale_e(ready)
+    return cramer_rao(light_e * ready.H[:, :MODES], variance_e(light_e * ready.I0, TABLE3_READ_NOISE_E))

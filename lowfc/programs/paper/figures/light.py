@@ -1,0 +1,198 @@
+"""Figures 2, 3, 4 and 10: light in the planes of the sensor, its focal-plane masks, and differences of images."""
+
+from pathlib import Path
+
+import numpy as np
+
+from lowfc.arrays import Array
+from lowfc.design.fisher import variance_e
+from lowfc.design.paper import STAR, TABLE4_EXPOSURE_S, TABLE4_READ_NOISE_E
+from lowfc.design.trials import noisy_e
+from lowfc.optics.chain.fourier import to_image, to_pupil
+from lowfc.optics.chain.relay import ApertureMask, PupilImage
+from lowfc.optics.chain.zernike import mode_name
+from lowfc.optics.detector.photometry import electrons
+from lowfc.programs.paper import plots
+from lowfc.programs.paper.cases import Case, Context, Prepared
+from lowfc.programs.paper.rows import Row, assuming
+from lowfc.programs.paper.tables.photometry import PAPER_PEAK, PAPER_SIGNAL, differential, tilt_signal
+from lowfc.programs.paper.tables.pointing import PAPER_FOCAL_MASK, PAPER_PUPIL, PAPER_RELAY_MASK
+from lowfc.programs.paper.tables.tables import PAPER_TABLE2
+
+_CHANGED = (4, 5, 6, 7, 8)
+_DRAWN = (4, 5, 7)
+_VIEW, _VIEW_SAMPLES_PER = 10, 8
+_FAINTEST = {"focal": 1e-8, "relay": 1e-4, "sensor": 1e-5}
+
+
+def fig2(context: Context) -> list[Row]:
+    """What part of the light passes each plane, Fig. 2 and Sect. 3.3."""
+    rows = []
+    for name in context.names("sam"):
+        budget = context.prepared(name).budget
+        relay = PAPER_RELAY_MASK if name.startswith("sam") else None
+        rows += [
+            Row(name, "shaped pupil, of the open circle's light", "", budget.pupil, PAPER_PUPIL),
+            Row(name, "focal-plane mask, of the light on it", "", budget.focal_mask, PAPER_FOCAL_MASK),
+            Row(name, "sensor, of the light that the focal-plane mask reflects", "", budget.sensor, relay),
+            Row(name, "brightest pixel, of the light on the sensor", "", budget.peak, PAPER_PEAK.get(name)),
+        ]
+    return assuming(
+        rows,
+        "Flat wavefront at the central wavelength. Our pupil and layout are not the paper's, which are not published.",
+    )
+
+
+def plot_fig2(context: Context, path: Path) -> None:
+    """Draw Fig. 2: intensities in the focal plane, behind the aperture mask and on the sensor."""
+    ready = context.prepared(context.names("sam")[0])
+    optics = ready.sensor
+    pupil = optics.pupil.astype(np.complex128)
+    sky = np.abs(to_image(pupil, 2 * _VIEW * _VIEW_SAMPLES_PER, _VIEW_SAMPLES_PER, 1.0)) ** 2
+    panels: list[plots.Panel] = [
+        plots.Picture(sky / sky.max(), "focal plane", plots.SKY, _VIEW, (_FAINTEST["focal"], 1.0), "of peak", "log")
+    ]
+    if isinstance(optics.relay, ApertureMask):
+        focal = to_image(pupil, len(optics.focal_mask), optics.samples_per, 1.0) * optics.focal_mask
+        relay = np.abs(to_pupil(focal, len(pupil), optics.samples_per, 1.0)) ** 2
+        shown = relay / relay.max() * optics.relay.transmission**2
+        bounds = (_FAINTEST["relay"], 1.0)
+        panels.append(plots.Picture(shown, "behind the aperture mask", plots.PUPIL, 0.5, bounds, "of peak", "log"))
+    image, bounds = ready.I0 / ready.I0.max(), (_FAINTEST["sensor"], 1.0)
+    panels.append(_on_sensor(ready, image, "sensor, $I_0$", bounds, "of peak", "log"))
+    plots.draw(path, panels, f"Fig. 2. {ready.name}: flat wavefront at {optics.wavelength_nm:.0f} nm.")
+
+
+def fig3(context: Context) -> list[Row]:
+    """The focal-plane masks, Fig. 3: how large they are, and what they reflect."""
+    rows = []
+    for name in context.names("sam", "bowtie"):
+        ready = context.prepared(name)
+        mask = np.abs(ready.sensor.focal_mask) ** 2
+        radius = len(mask) / (2.0 * ready.sensor.samples_per)
+        rows += [
+            Row(name, "outer radius", "lambda/D", radius, {"sam": 4.0, "bowtie": 10.0}.get(name)),
+            Row(name, "reflecting area", "(lambda/D)^2", float(mask.sum()) / ready.sensor.samples_per**2),
+            Row(
+                name,
+                "reflected, of the light on it",
+                "",
+                ready.budget.focal_mask,
+                PAPER_FOCAL_MASK if name == "sam" else None,
+            ),
+        ]
+    return assuming(rows, "The paper gives the light of its own pupil on the disk only; the wedges open to 95 degrees.")
+
+
+def plot_fig3(context: Context, path: Path) -> None:
+    """Draw Fig. 3: the disk and the bowtie."""
+    chosen = [context.prepared(name) for name in context.names("sam", "bowtie")]
+    widest = max(len(ready.sensor.focal_mask) for ready in chosen)
+    panels: list[plots.Panel] = []
+    for ready in chosen:
+        mask = np.abs(ready.sensor.focal_mask) ** 2
+        whole = np.pad(mask, (widest - len(mask)) // 2)
+        half_width = widest / (2.0 * ready.sensor.samples_per)
+        panels.append(plots.Picture(whole, ready.name, plots.SKY, half_width, (0.0, 1.0), "reflectivity"))
+    plots.draw(path, panels, "Fig. 3. Focal-plane masks: bright is what goes to the sensor.")
+
+
+def fig4(context: Context) -> list[Row]:
+    """Largest change of the image by a thirtieth of a wave, Fig. 4 and Table 2."""
+    rows = []
+    for name in context.names("sam"):
+        ready = context.prepared(name)
+        rows += [
+            Row(
+                f"{name}, Z{noll} {mode_name(noll)}",
+                "peak of |I - I0| over peak of I0",
+                "",
+                float(np.abs(differential(ready, noll)).max()),
+                PAPER_TABLE2[noll] if name.startswith("sam") else None,
+            )
+            for noll in _CHANGED
+        ]
+    return assuming(
+        rows,
+        "lambda/30 rms, full optical chain, no noise; 'normalised to unity' is read as I0's brightest pixel. "
+        "The layout is not the paper's.",
+    )
+
+
+def plot_fig4(context: Context, path: Path) -> None:
+    """Draw Fig. 4: differential images of focus, astigmatism and coma."""
+    ready = context.prepared(context.names("sam")[0])
+    panels: list[plots.Panel] = []
+    for noll in _DRAWN:
+        change = differential(ready, noll)
+        bound = float(np.abs(change).max())
+        panels.append(
+            _on_sensor(ready, change, f"Z{noll}, {mode_name(noll)}", (-bound, bound), "$(I - I_0)$ / peak", "signed")
+        )
+    plots.draw(path, panels, rf"Fig. 4. {ready.name}: differential images of $\lambda$/30 rms, without noise.")
+
+
+def _tilted_e(ready: Prepared, axis: int) -> tuple[Array, Array]:
+    """A short exposure, electrons (pixels,), and how a star that is off by 1 mas changes it."""
+    light_e = electrons(STAR, TABLE4_EXPOSURE_S)
+    return light_e * ready.band_I0, light_e * tilt_signal(ready, axis)
+
+
+def fig10(context: Context) -> list[Row]:
+    """Signal of 1 mas of tilt in a short exposure, Fig. 10 and Sect. 3.3."""
+    rows = []
+    for name in context.names("sam", "clowfs"):
+        ready = context.prepared(name)
+        for axis in (0, 1):
+            what, (flat_e, change_e) = f"{name}, tilt {'xy'[axis]}", _tilted_e(ready, axis)
+            signal_e = float(np.ptp(change_e))
+            ratio = np.abs(change_e) / np.sqrt(variance_e(flat_e + change_e, TABLE4_READ_NOISE_E))
+            rows += [
+                Row(what, "P-V change over peak", "", signal_e / float(flat_e.max()), PAPER_SIGNAL.get(name)),
+                Row(what, "P-V change", "e-", signal_e),
+                Row(what, "largest signal over noise of a pixel", "", float(ratio.max())),
+                Row(what, "signal over noise of the image", "", float(np.sqrt(np.sum(ratio**2)))),
+            ]
+    return assuming(
+        rows,
+        f"1 mas, {TABLE4_EXPOSURE_S} s, V = {STAR.magnitude}, 20 % band in five wavelengths with both ends, "
+        "1 e- read noise, our own photometry and masks, full optical chain. "
+        "The ratio of the image is that of the best filter for it.",
+    )
+
+
+def plot_fig10(context: Context, path: Path) -> None:
+    """Draw Fig. 10: noisy differential images of 1 mas."""
+    panels: list[plots.Panel] = []
+    for name in context.names("sam", "clowfs"):
+        ready = context.prepared(name)
+        flat_e, change_e = _tilted_e(ready, 0)
+        image_e = noisy_e(context.rng("fig10", name), flat_e + change_e, TABLE4_READ_NOISE_E)
+        for values, title in ((image_e - flat_e, name), (change_e, f"{name}, without noise")):
+            bound = float(np.percentile(np.abs(values), 99.8))
+            panels.append(_on_sensor(ready, values, title, (-bound, bound), "e-", "signed"))
+    plots.draw(
+        path,
+        panels,
+        f"Fig. 10. One exposure minus the mean of the flat wavefront's: 1 mas in x, {TABLE4_EXPOSURE_S} s, "
+        f"V = {STAR.magnitude}, 20 % band, 1 e- read noise, our own photometry.",
+        columns=2,
+    )
+
+
+def _on_sensor(
+    ready: Prepared, image: Array, title: str, bounds: tuple[float, float], unit: str, scale: plots.Scale
+) -> plots.Picture:
+    optics = ready.sensor
+    axes = plots.PUPIL if isinstance(optics.relay, PupilImage) else plots.SKY
+    half_width = optics.samples * optics.pitch / 2.0
+    shape = (optics.pixels, optics.pixels)
+    return plots.Picture(image.reshape(shape), title, axes, half_width, bounds, unit, scale)
+
+
+CASES = {
+    "fig2": Case("Fig. 2: intensity in the planes of the sensor", fig2, plot_fig2),
+    "fig3": Case("Fig. 3: focal-plane masks", fig3, plot_fig3),
+    "fig4": Case("Fig. 4: differential images of focus, astigmatism and coma", fig4, plot_fig4),
+    "fig10": Case("Fig. 10: differential images of 1 mas of tilt in a short exposure", fig10, plot_fig10),
+}

@@ -1,0 +1,275 @@
+"""Figures 5, 6 and 8: estimated against true coefficients, how well each mode is fitted, and the linear range."""
+
+from collections.abc import Iterator
+from functools import lru_cache, partial
+from pathlib import Path
+
+import numpy as np
+
+from lowfc.arrays import Array
+from lowfc.design.estimators import iterated
+from lowfc.design.trials import LITERAL_WAVES, bounds_waves, expected_r_squared, r_squared, random_wavefronts
+from lowfc.optics.chain.zernike import NOLLS_14, noll_to_nm
+from lowfc.programs.paper import plots
+from lowfc.programs.paper.cases import Case, Context, Prepared
+from lowfc.programs.paper.figures.exposure import (
+    BRIGHT,
+    FULL_CHAIN,
+    MODES,
+    PINV,
+    WEIGHTED_2,
+    bound_nm2,
+    estimates_nm,
+    exposed_e,
+)
+from lowfc.programs.paper.rows import Row, assuming
+from lowfc.programs.paper.tables.reconstruction import ITERATIONS, Ensemble, Input, ensemble, fits, inputs, label
+
+DEGREES = np.array([noll_to_nm(noll)[0] for noll in NOLLS_14])
+AMPLITUDES = np.array([0.005 * step for step in range(1, 31)])
+"""In waves rms, of the pure modes of Fig. 8(a)."""
+_MODE_TICKS = [str(noll) for noll in NOLLS_14]
+_PAPER_R2 = {"sam": (0.95, 0.97), "clowfs": (0.79, 0.90)}
+_PAPER_LINEAR = {"sam": ("linear", 0.1), "clowfs": ("linear", 0.1), "zwfs": ("linear to 0.03 waves", None)}
+_PAPER_ERROR_WAVES = 0.01
+_DEVIATION = 0.1
+
+
+def _matched(ready: Prepared) -> Input:
+    return next(inputs(ready, MODES, literal=False))
+
+
+@lru_cache(maxsize=8)
+def _ensemble(context: Context, name: str) -> Ensemble:
+    return ensemble(context, name, MODES, _matched(context.prepared(name)))
+
+
+def fig5(context: Context) -> list[Row]:
+    """Line through estimated against true coefficients of each radial degree, Fig. 5."""
+    rows = []
+    for name in context.names("sam"):
+        ready, found = context.prepared(name), _ensemble(context, name)
+        for degree in range(1, 5):
+            truth, estimates = (values[:, degree == DEGREES].ravel() for values in _waves(ready, found))
+            (slope, intercept), covariance = np.polyfit(truth, estimates, 1, cov=True)
+            fitted = partial(Row, f"{name}, n = {degree}", modes=MODES, estimator=PINV)
+            errors = np.sqrt(np.diag(covariance))
+            rows += [
+                fitted("slope", "", float(slope), 1.0, float(errors[0])),
+                fitted("intercept", "waves", float(intercept), 0.0, float(errors[1])),
+                fitted("correlation", "", float(np.corrcoef(truth, estimates)[0, 1])),
+            ]
+    return assuming(
+        rows,
+        "The wavefronts of Table 3, n = 1 to 4, input matched to its rms; the paper shows the points only, 'tight' "
+        f"about y = x. {BRIGHT} Images by the full optical chain.",
+    )
+
+
+def plot_fig5(context: Context, path: Path) -> None:
+    """Draw Fig. 5: estimated against true coefficients, a panel for each radial degree."""
+    name = context.names("sam")[0]
+    ready = context.prepared(name)
+    truth, estimates = _waves(ready, _ensemble(context, name))
+    panels = []
+    for degree in range(1, 5):
+        lines = [
+            plots.Line(f"Z{NOLLS_14[k]}", truth[:, k], estimates[:, k], joined=False)
+            for k in np.flatnonzero(degree == DEGREES)
+        ]
+        axes = ("true, waves rms", "estimated, waves rms")
+        panels.append(plots.Curves(lines, f"n = {degree}", *axes, diagonal=True, legend="upper left"))
+    plots.draw(path, panels, f"Fig. 5. {name}, {PINV}, {len(truth)} wavefronts of Table 3. {BRIGHT}", columns=2)
+
+
+def _waves(ready: Prepared, found: Ensemble) -> tuple[Array, Array]:
+    """Truth and plain estimates (trials, modes) in waves."""
+    wavelength_nm = ready.sensor.wavelength_nm
+    return found.truth_nm / wavelength_nm, found.estimates_nm[PINV] / wavelength_nm
+
+
+def fig6(context: Context) -> list[Row]:
+    """Coefficient of determination of each mode, Fig. 6 and eq. (15)."""
+    rows = []
+    for name, values in _r_squared(context).items():
+        limits = _r_squared_limit(context.prepared(name))
+        fitted = partial(Row, unit="", modes=MODES, estimator=PINV)
+        paper = _PAPER_R2.get(name, (None, None))
+        rows += [
+            fitted(name, "least R^2", measured=float(values.min()), paper=paper[0], limit=float(limits.min())),
+            fitted(name, "mean R^2", measured=float(values.mean()), paper=paper[1], limit=float(limits.mean())),
+        ]
+        rows += [
+            fitted(f"{name}, Z{noll}", "R^2", measured=float(value), limit=float(limit))
+            for noll, value, limit in zip(NOLLS_14, values, limits, strict=True)
+        ]
+    return assuming(
+        rows,
+        "The wavefronts of Table 3, n = 1 to 4, input matched to its rms; limit: R^2 of "
+        f"estimates whose errors are at the Cramer-Rao bound. {BRIGHT} Images by the full optical chain.",
+    )
+
+
+def plot_fig6(context: Context, path: Path) -> None:
+    """Draw Fig. 6: R^2 against the mode for each sensor."""
+    x = np.arange(MODES, dtype=float)
+    lines = [plots.Line(name, x, values) for name, values in _r_squared(context).items()]
+    lowest = min(float(line.y.min()) for line in lines)
+    panel = plots.Curves(
+        lines,
+        f"{PINV}, n = 1 to 4",
+        "Noll index",
+        "$R^2$",
+        y_bounds=(max(min(lowest, 0.75) - 0.05, 0.0), 1.01),
+        ticks=_MODE_TICKS,
+        legend="lower left",
+    )
+    plots.draw(path, [panel], f"Fig. 6. {context.trials} wavefronts of Table 3. {BRIGHT}", wide=True)
+
+
+def _r_squared(context: Context) -> dict[str, Array]:
+    found = {name: _ensemble(context, name) for name in context.names("sam", "bowtie", "clowfs", "zwfs")}
+    return {name: r_squared(each.estimates_nm[PINV], each.truth_nm) for name, each in found.items()}
+
+
+def _r_squared_limit(ready: Prepared) -> Array:
+    wavefronts = _matched(ready)
+    bounds_nm = bounds_waves(NOLLS_14, wavefronts.low, wavefronts.high) * ready.sensor.wavelength_nm
+    return expected_r_squared(np.diag(bound_nm2(ready)), bounds_nm)
+
+
+@lru_cache(maxsize=8)
+def _pure_modes(context: Context, name: str) -> Array:
+    """Estimates (iterations, modes, amplitudes) in waves of a pure mode by itself, without noise."""
+    ready = context.prepared(name)
+    wavelength_nm, linear = ready.sensor.wavelength_nm, fits(ready, MODES)["pinv"]
+    ready.model(np.zeros(MODES))  # the twin is built before the threads ask for it
+
+    def one(k: int) -> Array:
+        found = np.empty((len(ITERATIONS), AMPLITUDES.size))
+        for j, amplitude in enumerate(AMPLITUDES):
+            truth_nm = np.zeros(MODES)
+            truth_nm[k] = amplitude * wavelength_nm
+            image_e = linear.scale_e * ready.model(truth_nm)
+            steps_nm = iterated(linear, image_e, ready.model, ITERATIONS[-1])
+            found[:, j] = [steps_nm[iterations][k] / wavelength_nm for iterations in ITERATIONS]
+        return found
+
+    return np.stack(context.map(f"{name}, pure modes", one, range(MODES)), axis=1)
+
+
+def deviations(estimates: Array) -> Array:
+    """Part by which estimates (..., amplitudes) of a pure mode differ from its amplitude, linear being 0."""
+    return np.asarray(np.abs(estimates / AMPLITUDES - 1.0))
+
+
+def linear_range(deviation: Array) -> float:
+    """Amplitude at which a deviation (amplitudes,) first passes 10 %; infinite where it never does."""
+    above = np.flatnonzero(deviation > _DEVIATION)
+    if not above.size:
+        return float("inf")
+    ends = slice(above[0] - 1, above[0] + 1) if above[0] else slice(0, 1)
+    x, y = np.concatenate([[0.0], AMPLITUDES[ends]])[-2:], np.concatenate([[0.0], deviation[ends]])[-2:]
+    return float(np.interp(_DEVIATION, y, x))
+
+
+@lru_cache(maxsize=8)
+def _one_wavefront(context: Context, name: str, literal: bool) -> tuple[Array, dict[str, Array]]:
+    """A random wavefront (modes,) in waves, and its estimates."""
+    ready = context.prepared(name)
+    wavelength_nm, matched = ready.sensor.wavelength_nm, _matched(ready)
+    low, high = LITERAL_WAVES if literal else (matched.low, matched.high)
+    truth = random_wavefronts(context.rng("fig8"), 1, NOLLS_14, low, high)[0]
+    image_e = exposed_e(ready, ready.image(truth * wavelength_nm), context.rng("fig8", name))
+    found = estimates_nm(ready, fits(ready, MODES), image_e)
+    return truth, {key: modes_nm / wavelength_nm for key, modes_nm in found.items()}
+
+
+def fig8(context: Context) -> list[Row]:
+    """Deviation from linear of pure modes, Fig. 8(a), and errors of one random wavefront, Fig. 8(b)."""
+    names = context.names("sam", "clowfs", "zwfs")
+    rows = [row for name in names for row in _range_rows(context, name)]
+    for literal, bounds in ((False, "matched"), (True, "literal")):
+        truth, estimates = _one_wavefront(context, names[0], literal)
+        for key in (PINV, WEIGHTED_2):
+            worst = float(np.abs(estimates[key] - truth).max())
+            rows.append(
+                Row(
+                    names[0],
+                    f"largest error of a random wavefront, {bounds} input",
+                    "waves",
+                    worst,
+                    _PAPER_ERROR_WAVES if names[0].startswith("sam") else None,
+                    modes=MODES,
+                    estimator=key,
+                    assumption=f"One wavefront and one exposure. {BRIGHT} {FULL_CHAIN}",
+                )
+            )
+    return rows
+
+
+def _range_rows(context: Context, name: str) -> Iterator[Row]:
+    assumption = (
+        "Pure modes of one sign from 0.005 to 0.15 waves rms, fitted with 14 modes, no noise, images by the twin "
+        "right to about 1e-5; deviation: part by which a mode's own estimate differs from its amplitude."
+    )
+    at = {"lambda/20": int(np.argmin(np.abs(AMPLITUDES - 0.05))), "lambda/10": int(np.argmin(np.abs(AMPLITUDES - 0.1)))}
+    linear = dict(zip(at, _PAPER_LINEAR.get(name, (None, None)), strict=True))
+    for iterations, estimates in zip(ITERATIONS, _pure_modes(context, name), strict=True):
+        off = deviations(estimates)
+        fitted = partial(Row, modes=MODES, estimator=label("pinv", iterations), assumption=assumption)
+        for amplitude, j in at.items():
+            paper = linear[amplitude] if iterations == 0 else None
+            yield fitted(name, f"mean deviation at {amplitude}", "", float(off[:, j].mean()), paper)
+            yield fitted(name, f"largest deviation at {amplitude}", "", float(off[:, j].max()))
+        ranges = np.array([linear_range(mode) for mode in off])
+        what = "amplitude of 10 % deviation"
+        yield fitted(name, f"{what}, median mode", "waves", _amplitude(float(np.median(ranges))))
+        yield fitted(name, f"{what}, worst mode", "waves", _amplitude(float(ranges.min())))
+        for noll, each in zip(NOLLS_14, ranges, strict=True) if iterations == 0 else ():
+            yield fitted(f"{name}, Z{noll}", what, "waves", _amplitude(each))
+
+
+def _amplitude(waves: float) -> float | str:
+    return waves if np.isfinite(waves) else f"above {AMPLITUDES[-1]:.2f}"
+
+
+def plot_fig8(context: Context, path: Path) -> None:
+    """Draw Fig. 8: response to pure modes, mean deviation from linear, and one random wavefront."""
+    names = context.names("sam", "clowfs", "zwfs")
+    responses = _pure_modes(context, names[0])[0]
+    truth, estimates = _one_wavefront(context, names[0], False)
+    modes = [plots.Line(f"Z{noll}", AMPLITUDES, each) for noll, each in zip(NOLLS_14, responses, strict=True)]
+    means = [
+        plots.Line(f"{name}, {label('pinv', i)}", AMPLITUDES, 100.0 * deviations(each).mean(axis=0))
+        for name in names
+        for i, each in zip(ITERATIONS, _pure_modes(context, name), strict=True)
+        if i != 1
+    ]
+    x_label, fitted = "amplitude, waves rms", {"true": truth, PINV: estimates[PINV]}
+    errors = {key: estimates[key] - truth for key in (PINV, WEIGHTED_2)}
+    panels: list[plots.Panel] = [
+        plots.Curves(
+            modes, f"(a) {names[0]}, {PINV}", x_label, "estimate, waves rms", diagonal=True, legend="upper left"
+        ),
+        plots.Curves(
+            means, "mean of 14 modes", x_label, "deviation from linear, %", y_bounds=(0.0, 40.0), legend="upper left"
+        ),
+        plots.Bars(fitted, _MODE_TICKS, f"(b) {names[0]}, {PINV}", "waves rms"),
+        plots.Bars(errors, _MODE_TICKS, f"{names[0]}, errors of (b)", "waves rms"),
+    ]
+    plots.draw(
+        path,
+        panels,
+        "Fig. 8. (a) Estimates of pure modes without noise, by the twin. (b) One random wavefront, n = 1 to 4, input "
+        f"matched to Table 3's rms, by Noll index. {BRIGHT}",
+        columns=2,
+        wide=True,
+    )
+
+
+CASES = {
+    "fig5": Case("Fig. 5: estimated against true coefficients", fig5, plot_fig5),
+    "fig6": Case("Fig. 6: coefficient of determination of each mode", fig6, plot_fig6),
+    "fig8": Case("Fig. 8: linear range of pure modes, and one random wavefront", fig8, plot_fig8),
+}

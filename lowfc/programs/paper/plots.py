@@ -1,0 +1,208 @@
+"""Drawings of the figures as PNG files; matplotlib is loaded only here, and only when something is drawn."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from importlib import import_module
+from math import ceil
+from pathlib import Path
+from textwrap import fill
+from typing import TYPE_CHECKING, Any, Literal
+
+import numpy as np
+
+from lowfc.adapters.files.drawing import figure_class, png
+from lowfc.adapters.files.whole_file import write_whole
+from lowfc.arrays import Array
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+Scale = Literal["log", "linear", "signed"]
+
+SKY_UNIT = r"$\lambda$/D"
+SKY = (f"x, {SKY_UNIT}", f"y, {SKY_UNIT}")
+PUPIL = ("x, pupil diameters", "y, pupil diameters")
+
+# Okabe and Ito's colours, which the colour-blind can tell apart, black first; lines differ in style and marker, too.
+_COLOURS = ("#000000", "#D55E00", "#0072B2", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#F0E442")
+_STYLES = ("-", "--", "-.", ":")
+_MARKERS = ("o", "s", "^", "D", "v", "P", "X")
+_MAPS = {"log": "inferno", "linear": "inferno", "signed": "PuOr_r"}
+_PANEL_IN = (3.6, 3.3)
+_DPI = 110
+
+
+@dataclass(frozen=True, eq=False)
+class Picture:
+    """An image with its colour bar.
+
+    Attributes:
+        values: (rows, columns); NaN is left grey.
+        title: Above it.
+        axes: Labels of x and y.
+        half_width: Of the square image, in the axes' unit.
+        bounds: Of the colours.
+        unit: Beside the colour bar.
+        scale: Logarithmic, linear, or linear with two colours about zero.
+    """
+
+    values: Array
+    title: str
+    axes: tuple[str, str]
+    half_width: float
+    bounds: tuple[float, float]
+    unit: str
+    scale: Scale = "linear"
+
+
+@dataclass(frozen=True, eq=False)
+class Line:
+    """Points (n,) with a name, joined or single."""
+
+    name: str
+    x: Array
+    y: Array
+    joined: bool = True
+
+
+@dataclass(frozen=True, eq=False)
+class Curves:
+    """Lines over one pair of axes.
+
+    Attributes:
+        lines: What is drawn.
+        title: Above it.
+        x_label: Of the x axis.
+        y_label: Of the y axis.
+        scale: Of the y axis.
+        y_bounds: Of the y axis; chosen when None.
+        ticks: Names of the whole numbers on the x axis, where it counts things.
+        diagonal: Whether y = x is drawn.
+        legend: Where the names are.
+    """
+
+    lines: Sequence[Line]
+    title: str
+    x_label: str
+    y_label: str
+    scale: Literal["log", "linear"] = "linear"
+    y_bounds: tuple[float, float] | None = None
+    ticks: Sequence[str] = ()
+    diagonal: bool = False
+    legend: Literal["upper right", "upper left", "lower left"] = "upper right"
+
+
+@dataclass(frozen=True, eq=False)
+class Bars:
+    """Groups of bars, side by side.
+
+    Attributes:
+        heights: Of each name, (groups,).
+        groups: Their names.
+        title: Above it.
+        y_label: Of the y axis.
+    """
+
+    heights: dict[str, Array]
+    groups: Sequence[str]
+    title: str
+    y_label: str
+
+
+Panel = Picture | Curves | Bars
+
+
+def draw(path: Path, panels: Sequence[Panel], caption: str, columns: int = 3, wide: bool = False) -> None:
+    """Draw panels in rows with a caption beneath, as a PNG file.
+
+    Args:
+        path: Of the file.
+        panels: In rows, from the left.
+        caption: What it is and what was assumed.
+        columns: Panels in a row.
+        wide: Whether a panel is half again as wide.
+
+    Raises:
+        ConfigurationError: matplotlib is not installed.
+        DataFileError: The file cannot be written.
+    """
+    figure_type = figure_class()
+    columns = min(columns, len(panels))
+    rows = ceil(len(panels) / columns)
+    width = columns * _PANEL_IN[0] * (1.5 if wide else 1.0)
+    text = fill(caption, int(width * 16))
+    height = rows * _PANEL_IN[1]
+    below = 0.2 * (text.count("\n") + 1) + 0.1
+    figure = figure_type(figsize=(width, height + below), dpi=_DPI, layout="constrained")
+    figure.get_layout_engine().set(w_pad=0.1, rect=(0, below / (height + below), 1, height / (height + below)))
+    for i, panel in enumerate(panels):
+        axes = figure.add_subplot(rows, columns, i + 1)
+        axes.set_title(panel.title, fontsize=9)
+        axes.tick_params(labelsize=8)
+        match panel:
+            case Picture():
+                _picture(figure, axes, panel)
+            case Curves():
+                _curves(axes, panel)
+            case Bars():
+                _bars(axes, panel)
+    figure.text(0.01, 0.005, text, fontsize=8, va="bottom")
+    write_whole(path, png(figure, _DPI))
+
+
+def _picture(figure: "Figure", axes: "Axes", panel: Picture) -> None:
+    low, high = panel.bounds
+    options: dict[str, Any] = {"vmin": low, "vmax": high}
+    values = panel.values
+    if panel.scale == "log":
+        options = {"norm": import_module("matplotlib.colors").LogNorm(low, high)}
+        values = np.maximum(values, low)
+    w = panel.half_width
+    shown = axes.imshow(
+        values, cmap=_MAPS[panel.scale], origin="lower", extent=(-w, w, -w, w), interpolation="nearest", **options
+    )
+    axes.set_facecolor("0.75")
+    axes.set_xlabel(panel.axes[0], fontsize=8)
+    axes.set_ylabel(panel.axes[1], fontsize=8)
+    bar = figure.colorbar(shown, ax=axes, shrink=0.85)
+    bar.set_label(panel.unit, fontsize=8)
+    bar.ax.tick_params(labelsize=7)
+
+
+def _curves(axes: "Axes", panel: Curves) -> None:
+    if panel.diagonal:
+        ends = [min(line.x.min() for line in panel.lines), max(line.x.max() for line in panel.lines)]
+        axes.plot(ends, ends, color="0.6", linewidth=1, zorder=0)
+    for i, line in enumerate(panel.lines):
+        colour, marker = _COLOURS[i % len(_COLOURS)], _MARKERS[i % len(_MARKERS)]
+        style = _STYLES[(i + i // len(_COLOURS)) % len(_STYLES)]
+        if line.joined:
+            axes.plot(line.x, line.y, style, color=colour, label=line.name, linewidth=1.3)
+        else:
+            axes.plot(line.x, line.y, marker, color=colour, label=line.name, markersize=3, alpha=0.7)
+    axes.set_yscale(panel.scale)
+    axes.set_xlabel(panel.x_label, fontsize=8)
+    axes.set_ylabel(panel.y_label, fontsize=8)
+    axes.grid(alpha=0.3)
+    if panel.y_bounds is not None:
+        axes.set_ylim(panel.y_bounds)
+    if panel.ticks:
+        axes.set_xticks(range(len(panel.ticks)), panel.ticks)
+    else:
+        axes.locator_params(axis="x", nbins=4)
+    if len(panel.lines) > 1:
+        axes.legend(fontsize=7, loc=panel.legend, ncols=1 + len(panel.lines) // 8)
+
+
+def _bars(axes: "Axes", panel: Bars) -> None:
+    width = 0.8 / len(panel.heights)
+    middle = np.arange(len(panel.groups))
+    for i, (name, heights) in enumerate(panel.heights.items()):
+        left = middle + (i - (len(panel.heights) - 1) / 2) * width
+        axes.bar(left, heights, width, label=name, color=_COLOURS[1 + i], edgecolor="black", linewidth=0.4)
+    axes.set_xticks(middle, panel.groups)
+    axes.set_ylabel(panel.y_label, fontsize=8)
+    axes.axhline(0, color="black", linewidth=0.8)
+    axes.grid(axis="y", alpha=0.3)
+    axes.legend(fontsize=7)

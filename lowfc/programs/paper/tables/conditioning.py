@@ -1,0 +1,96 @@
+"""Sect. 4: how well the modes can be told apart behind an open circle, bars, and holes of several sizes."""
+
+from collections.abc import Iterator
+
+import numpy as np
+
+from lowfc.adapters.files.layouts import load_layout
+from lowfc.adapters.files.sensors import sensor_from
+from lowfc.contract.configuration import SensorSection
+from lowfc.control.calibration.calibration import condition_number
+from lowfc.design.fisher import cramer_rao, variance_e
+from lowfc.design.paper import STAR, TABLE4_EXPOSURE_S, TABLE4_READ_NOISE_E
+from lowfc.optics.chain import sam as sams
+from lowfc.optics.chain.relay import ApertureMask
+from lowfc.optics.chain.sensor import Sensor
+from lowfc.optics.detector.photometry import electrons
+from lowfc.programs.paper.cases import Context, Prepared, sparse_apertures
+from lowfc.programs.paper.rows import Row
+from lowfc.programs.paper.tables.pointing import NM_PER_MAS
+
+OTHERS = ("clowfs", "zwfs")
+"""Sensors besides the shipped sparse apertures."""
+BARS = ((0.05, 20.0), (0.1, 20.0), (0.2, 20.0), (0.1, 0.0), (0.1, 45.0), (0.1, 90.0))
+"""Width in pupil diameters and angle in degrees."""
+HOLES = (0.09, 0.08, 0.07, 0.06, 0.05, 0.04, 0.03)
+
+MONOCHROMATIC = "H at the central wavelength, in nm rms of each mode over the circle."
+FIXED_STAR = (
+    f"Cramer-Rao bound at the central wavelength: V = {STAR.magnitude}, {STAR.diameter_m:g} m, {TABLE4_EXPOSURE_S} s, "
+    "our own masks. Smaller holes are better conditioned and yet worse: the condition number does not know the light."
+)
+CLAIMS = {
+    "open": "Sect. 4: extremely high. limit: above 1e12 is singular in double precision.",
+    "bar": "Sect. 4: below 1000 (the limit here), an order of magnitude above the sparse aperture mask's.",
+    "holes": "Sect. 4: smaller holes lower it; said of the 14 modes that the mask was made for.",
+    "sensor": "limit: an order of magnitude below the bar's.",
+}
+LIMITS = {"open": 1e12, "bar": 1000.0, "holes": None, "sensor": 100.0}
+
+
+def conditioning(context: Context) -> list[Row]:
+    """Condition numbers, throughput and the tilt's Cramer-Rao bound of each mask in the relay pupil."""
+    masks = [("open", context.prepared("open"))]
+    masks += [("bar", _bar(width, angle)) for width, angle in BARS]
+    masks += [("sensor", context.prepared(name)) for name in context.names(*sparse_apertures(), *OTHERS)]
+    holes = [_with_holes(diameter) for diameter in HOLES]
+    masks += [("holes", each) for each in holes if isinstance(each, Prepared)]
+
+    def measure(mask: tuple[str, Prepared]) -> list[Row]:
+        return list(_rows(*mask))
+
+    rows = [row for found in context.map("conditioning", measure, masks) for row in found]
+    return rows + [each for each in holes if isinstance(each, Row)]
+
+
+def _bar(width: float, angle_deg: float) -> Prepared:
+    section = SensorSection(kind="bar", bar_width=width, bar_angle_deg=angle_deg)
+    return Prepared(f"bar of {100 * width:g} % at {angle_deg:g} deg", sensor_from(section))
+
+
+def _with_holes(diameter: float) -> Prepared | Row:
+    """The default layout with holes of another diameter; a row that says so where they would overlap."""
+    layout = load_layout(SensorSection().sam)
+    name = f"default layout with holes of {100 * diameter:g} %"
+    shrunk = sams.Layout(name, layout.purpose, sams.equal_holes([hole[:2] for hole in layout.holes], diameter))
+    try:
+        sams.check(shrunk)
+    except ValueError:
+        return Row(name, "condition number", "", None, modes=14, assumption="These holes would overlap.")
+    sensor = sensor_from()
+    relay = ApertureMask(sams.transmission(shrunk, len(sensor.pupil)))
+    return Prepared(name, Sensor(sensor.pupil, sensor.focal_mask, relay, sensor.wavelength_nm))
+
+
+def _rows(kind: str, mask: Prepared) -> Iterator[Row]:
+    for modes in (14, 20):
+        yield Row(
+            mask.name,
+            "condition number",
+            "",
+            condition_number(mask.H[:, :modes]),
+            "extremely high" if kind == "open" else "below 1000" if kind == "bar" else None,
+            limit=LIMITS[kind] if modes == 14 else None,
+            modes=modes,
+            assumption=f"{MONOCHROMATIC}\n{CLAIMS[kind]}",
+        )
+    yield Row(mask.name, "open circle's light that falls on the sensor", "", float(mask.I0.sum()))
+    scale_e = electrons(STAR, TABLE4_EXPOSURE_S)
+    variance = variance_e(mask.I0 * scale_e, TABLE4_READ_NOISE_E)
+    for modes in (2, 14):
+        try:
+            tilt = float(np.sqrt(cramer_rao(mask.H[:, :modes] * scale_e, variance)[0, 0]) / NM_PER_MAS)
+        except ValueError:
+            tilt = None
+        quantity = "least std of x tilt"
+        yield Row(mask.name, quantity, "mas", tilt, modes=modes, estimator="Cramer-Rao bound", assumption=FIXED_STAR)

@@ -1,0 +1,223 @@
+"""Table 3: what is left of random wavefronts after their estimate is taken off, for every sensor and estimator."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+
+from lowfc.arrays import Array
+from lowfc.design import trials as random
+from lowfc.design.estimators import KINDS, Fit, estimate, iterated
+from lowfc.design.fisher import cramer_rao, variance_e
+from lowfc.design.paper import MODES, PEAK_E, TABLE3_READ_NOISE_E, TABLE3_WAVES
+from lowfc.optics.chain.zernike import NOLLS_20
+from lowfc.programs.paper.cases import DEFAULT_SAM, Context, Prepared, sparse_apertures
+from lowfc.programs.paper.rows import Row
+
+OTHERS = ("bowtie", f"bowtie:{DEFAULT_SAM}", "clowfs", "zwfs", "bar", "lyot", "aplc")
+"""Sensors besides the shipped sparse apertures."""
+ITERATIONS = (0, 1, 2)
+WITH_NUISANCES = "weighted, flux and shear fitted along"
+EVEN = (
+    "Where pupil and masks are real and the pupil is symmetric, flux and shear change the image evenly and every mode "
+    "oddly: fitting them along costs a sparse aperture mask nothing. CLOWFS and the Zernike sensor mistake a shear for "
+    "a tilt."
+)
+
+INPUT_RMS_WAVES = {14: 0.015, 20: 0.018}
+INPUT_PV_WAVES = {14: 0.097, 20: 0.11}
+PAPER_WAVES = {
+    "sam": TABLE3_WAVES["disk"],
+    "bowtie": TABLE3_WAVES["bowtie"],
+    f"bowtie:{DEFAULT_SAM}": TABLE3_WAVES["bowtie"],
+    "clowfs": TABLE3_WAVES["clowfs"],
+}
+
+NOISE = (
+    "40,000 e- in the brightest pixel of the sensor's own flat image (which rewards a mask that wastes light: read it "
+    "with Table 4), 3 e- read noise, whole electrons, total known, monochromatic; open area: transmission above 0.5, "
+    "piston removed. limit: root mean square of the residual at the Cramer-Rao bound."
+)
+
+
+def label(kind: str, iterations: int) -> str:
+    """An estimator's name: its kind, and how many iterations with the full model follow."""
+    return kind if iterations == 0 else f"{kind} + {iterations} iteration{'s' * (iterations > 1)}"
+
+
+ESTIMATORS = ("pinv", *(label("weighted", iterations) for iterations in ITERATIONS))
+
+
+@dataclass(frozen=True)
+class Input:
+    """How large the random wavefronts are.
+
+    Attributes:
+        name: Of the reading of Sect. 3.1.
+        low: Bound for radial degrees 1 and 2, in waves rms.
+        high: Bound above.
+        assumption: The reading in words.
+    """
+
+    name: str
+    low: float
+    high: float
+    assumption: str
+
+
+def inputs(sensor: Prepared, modes: int, literal: bool) -> Iterator[Input]:
+    """The readings of Sect. 3.1: the one that has the input of Table 3, and where asked for the text's own."""
+    low, high = random.LITERAL_WAVES
+    bounds = random.bounds_waves(NOLLS_20[:modes], low, high)
+    literal_rms = random.input_rms(sensor.gram[:modes, :modes], bounds)
+    scale = INPUT_RMS_WAVES[modes] / literal_rms
+    yield Input(
+        "matched",
+        low * scale,
+        high * scale,
+        f"Coefficients uniform within {low * scale:.4f} (n <= 2) and {high * scale:.4f} waves rms, for which the root "
+        f"mean square of the input is Table 3's {INPUT_RMS_WAVES[modes]}; with the text's {low} and {high} it would be "
+        f"{literal_rms:.3f}.",
+    )
+    if literal:
+        yield Input("literal", low, high, f"Coefficients uniform within {low} and {high} waves rms, as in the text.")
+        yield Input(
+            "quarter",
+            low / 4,
+            high / 4,
+            f"Coefficients uniform within {low / 4} and {high / 4} waves rms, as if the text's were peak to valley.",
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class Ensemble:
+    """Random wavefronts and their estimates by one sensor.
+
+    Attributes:
+        truth_nm: (trials, modes).
+        estimates_nm: Of each estimator, (trials, modes).
+        bound_nm: Root mean square over the open pupil at the Cramer-Rao bound.
+    """
+
+    truth_nm: Array
+    estimates_nm: dict[str, Array]
+    bound_nm: float
+
+
+def scale_e(sensor: Prepared) -> float:
+    """Electrons of the open circle's light for Table 3's exposure."""
+    return PEAK_E / float(sensor.I0.max())
+
+
+def fits(sensor: Prepared, modes: int, nuisances: bool = False) -> dict[str, Fit]:
+    """The linear estimators of Table 3."""
+    exposure = (modes, scale_e(sensor), TABLE3_READ_NOISE_E)
+    made = {kind: sensor.fit(*exposure, kind) for kind in KINDS}
+    if nuisances:
+        made[WITH_NUISANCES] = sensor.fit(*exposure, "weighted", nuisance=sensor.nuisance)
+    return made
+
+
+def ensemble(context: Context, name: str, modes: int, wavefronts: Input, nuisances: bool = False) -> Ensemble:
+    """Draw the wavefronts, image them with the full chain and noise, and estimate them in every way.
+
+    Args:
+        context: Trials, seed, threads.
+        name: Of the sensor.
+        modes: In the wavefronts and in the fit.
+        wavefronts: How large they are.
+        nuisances: Whether flux and shear are fitted along, too.
+    """
+    sensor = context.prepared(name)
+    linear, light_e, wavelength_nm = fits(sensor, modes, nuisances), scale_e(sensor), sensor.sensor.wavelength_nm
+    rng = context.rng("table3", modes, wavefronts.name)
+    nolls = NOLLS_20[:modes]
+    truth_nm = wavelength_nm * random.random_wavefronts(rng, context.trials, nolls, wavefronts.low, wavefronts.high)
+    sensor.model(np.zeros(modes))  # the twin is built before the threads ask for it
+
+    def trial(i: int) -> dict[str, Array]:
+        noise = context.rng("table3", name, modes, wavefronts.name, i)
+        image_e = random.noisy_e(noise, light_e * sensor.image(truth_nm[i]), TABLE3_READ_NOISE_E)
+        found = {key: estimate(each, image_e) for key, each in linear.items()}
+        steps_nm = iterated(linear["weighted"], image_e, sensor.model, ITERATIONS[-1])
+        return found | {label("weighted", iterations): steps_nm[iterations] for iterations in ITERATIONS}
+
+    results = context.map(f"table3 {name}, {modes} modes, {wavefronts.name}", trial, range(context.trials))
+    H_e, variance = linear["weighted"].response_e, variance_e(linear["weighted"].reference_e, TABLE3_READ_NOISE_E)
+    bound_nm = random.expected_rms(sensor.gram[:modes, :modes], cramer_rao(H_e, variance))
+    return Ensemble(truth_nm, {key: np.stack([each[key] for each in results]) for key in results[0]}, bound_nm)
+
+
+def mean_and_error(values: Array) -> tuple[float, float]:
+    """Mean of (n,) values and its standard error."""
+    return float(values.mean()), float(values.std(ddof=1) / np.sqrt(len(values)))
+
+
+def table3(context: Context) -> list[Row]:
+    """Rows of Table 3: input, then RMS and P-V residual of each sensor, range, reading and estimator."""
+    rows: list[Row] = []
+    pupils: set[tuple[bytes, int, str]] = set()
+    for name in context.names(*sparse_apertures(), *OTHERS):
+        sensor = context.prepared(name)
+        main = name in ("sam", "clowfs")
+        for modes in MODES:
+            for wavefronts in inputs(sensor, modes, literal=main):
+                found = ensemble(context, name, modes, wavefronts, nuisances=main and wavefronts.name == "matched")
+                shown = sensor.open.tobytes(), modes, wavefronts.name
+                if shown not in pupils:
+                    rows += _input_rows(sensor, modes, wavefronts, found)
+                    pupils.add(shown)
+                rows += _residual_rows(sensor, modes, wavefronts, found)
+    return rows
+
+
+def _input_rows(sensor: Prepared, modes: int, wavefronts: Input, found: Ensemble) -> Iterator[Row]:
+    for figure, unit_paper, (mean, error) in (
+        ("RMS", INPUT_RMS_WAVES, _rms(sensor, found.truth_nm)),
+        ("P-V", INPUT_PV_WAVES, _pv(sensor, found.truth_nm)),
+    ):
+        yield Row(
+            f"input, pupil of {sensor.name}",
+            f"{figure}, {wavefronts.name} input",
+            "waves",
+            mean,
+            unit_paper[modes],
+            error,
+            modes=modes,
+            assumption=wavefronts.assumption,
+        )
+
+
+def _residual_rows(sensor: Prepared, modes: int, wavefronts: Input, found: Ensemble) -> Iterator[Row]:
+    paper = PAPER_WAVES.get(sensor.name, TABLE3_WAVES["disk"] if sensor.name.startswith("sam") else {}).get(
+        modes, (None, None)
+    )
+    for estimator, estimates_nm in found.estimates_nm.items():
+        residuals_nm = found.truth_nm - estimates_nm
+        for figure, value, limit_nm, (mean, error) in (
+            ("RMS", paper[0], found.bound_nm, _rms(sensor, residuals_nm)),
+            ("P-V", paper[1], None, _pv(sensor, residuals_nm)),
+        ):
+            yield Row(
+                sensor.name,
+                f"{figure} residual, {wavefronts.name} input",
+                "waves",
+                mean,
+                value,
+                error,
+                limit=None if limit_nm is None else limit_nm / sensor.sensor.wavelength_nm,
+                modes=modes,
+                estimator=estimator,
+                assumption="\n".join((wavefronts.assumption, NOISE, *((EVEN,) if estimator == WITH_NUISANCES else ()))),
+            )
+
+
+def _rms(sensor: Prepared, coefficients_nm: Array) -> tuple[float, float]:
+    modes = coefficients_nm.shape[1]
+    values = random.residual_rms(sensor.gram[:modes, :modes], coefficients_nm)
+    return mean_and_error(values / sensor.sensor.wavelength_nm)
+
+
+def _pv(sensor: Prepared, coefficients_nm: Array) -> tuple[float, float]:
+    values = random.residual_pv(sensor.open_modes[: coefficients_nm.shape[1]], coefficients_nm)
+    return mean_and_error(values / sensor.sensor.wavelength_nm)

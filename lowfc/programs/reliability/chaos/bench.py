@@ -1,0 +1,283 @@
+"""The bench of one chaos case: the real processes, what is done to them, and what is left of it."""
+
+import contextlib
+import itertools
+import json
+import os
+import random
+import signal
+import time
+from collections import deque
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import psutil
+from google.protobuf.message import DecodeError
+from rich.console import Console
+
+from lowfc.adapters.bus.bus import Sample
+from lowfc.adapters.bus.run import mirror_role, new_run_id, open_run
+from lowfc.adapters.bus.zenoh_bus import ZenohBus
+from lowfc.adapters.process.child import Child
+from lowfc.adapters.process.clock import HostClock
+from lowfc.client import Client
+from lowfc.contract.configuration import Configuration
+from lowfc.contract.errors import LowfcError
+from lowfc.contract.messages import HEALTH, STEP, TRUTH, Role, wire
+from lowfc.programs.launch.processes import program, start_all
+from lowfc.programs.launch.sim_loop import children_of, prepare
+
+_POLL_S = 0.02
+_QUIET_FRAMES = 250
+_LAST_HEALTH_S = 0.2
+SETTLED_FRAMES = 500
+"""After a fault: two seconds, of which the last is judged."""
+PATIENCE_S = 5.0
+"""How long a process may take to end when it is told to."""
+START_S = 240.0
+WAIT_S = 60.0
+
+
+class CaseFailedError(LowfcError):
+    """What a case waits for does not come."""
+
+
+@dataclass(slots=True)
+class Ended:
+    """How a process ended: exit status, negative for a signal, after so long; whether the case meant it to."""
+
+    name: str
+    status: int
+    after_s: float
+    meant: bool
+
+
+@dataclass(slots=True)
+class Left:
+    """What is left of a case.
+
+    Attributes:
+        folder: with the logs and what the processes wrote on standard error.
+        config: of the run.
+        marks: when it was quiet and when the fault was, by the host's clock, ns.
+        ended: every process.
+        alive: processes of the case that live on after its end.
+        killed_ns: when each recorder was killed.
+        mode: of the loop, at the end.
+        lost: what the last recorder reports as lost, by key.
+        failure: why it stopped recording, if it did.
+        residuals_nm: true residuals of the last second, rms, as they were received.
+        figures: what the case measured.
+        notes: what went wrong while it ran.
+    """
+
+    folder: Path
+    config: Configuration
+    marks: dict[str, int] = field(default_factory=dict)
+    ended: list[Ended] = field(default_factory=list)
+    alive: list[str] = field(default_factory=list)
+    killed_ns: list[int] = field(default_factory=list)
+    mode: int = 0
+    lost: dict[str, int] = field(default_factory=dict)
+    failure: str = ""
+    residuals_nm: deque[float] = field(default_factory=lambda: deque(maxlen=_QUIET_FRAMES))
+    figures: dict[str, Any] = field(default_factory=dict)
+    notes: list[str] = field(default_factory=list)
+
+
+class ChaosBench:
+    """A simulated loop to which things are done.
+
+    Attributes:
+        run: of its processes.
+        mirror: role of the mirror's process.
+        children: the process that has each role now.
+        health: the last Health of each process that was started last under its role.
+    """
+
+    def __init__(self, config: Configuration, folder: Path, rng: random.Random, fault: dict[str, Any] | None) -> None:
+        """Prepare a run in a folder of its own; `fault` befalls the camera's frames."""
+        self.config = config
+        self.folder = folder
+        self.rng = rng
+        self.left = Left(folder, config)
+        self.mirror = mirror_role(config.mirror.name)
+        self.newest_frame = 0
+        self.health: dict[str, wire.Health] = {}
+        self._steps = self._good = 0
+        self._numbers = itertools.count(1)
+        self.run = open_run(new_run_id(), (config.mirror.name,), listeners=(Role.LAUNCHER,))
+        prepare(config, self.run, Console(stderr=True, quiet=True))
+        self.children = {child.name: child for child in children_of(config, self.run, None, record=True)}
+        if fault is not None:
+            file = folder / "fault.json"
+            file.write_text(json.dumps(fault))
+            self.children[Role.CAMERA].command += ["--fault", str(file)]
+        for child in self.children.values():
+            child.stderr_path = folder / f"{child.name}.stderr"
+        self._started: list[Child] = []
+        self._noted: set[int] = set()
+        self.bus: ZenohBus | None = None
+
+    def begin(self) -> None:
+        """Start the processes, and wait for the loop to run quietly."""
+        self._started += self.children.values()
+        start_all(self._started)
+        self.bus = ZenohBus(self.run.links, Role.LAUNCHER, HostClock())
+        for topic, receive in ((HEALTH, self._health), (STEP, self._step), (TRUTH, self._truth)):
+            self.bus.subscribe(topic, receive)
+        self.wait(lambda: self._steps > 0, "the first frame", START_S)
+        self.settled(_QUIET_FRAMES)
+        self.mark("quiet")
+
+    def client(self) -> Client:
+        """An operator, on this process's connection."""
+        return Client(self.run.run_id, bus=self.bus)
+
+    def mark(self, name: str) -> None:
+        """Note when something was."""
+        self.left.marks[name] = HostClock().host_ns()
+
+    def frames(self, count: int) -> None:
+        """Wait until the controller has made so many more steps."""
+        wanted = self._steps + count
+        self.wait(lambda: self._steps >= wanted, f"{count} steps")
+
+    def settled(self, frames: int = SETTLED_FRAMES) -> None:
+        """Wait until so many frames have been used since the loop was closed."""
+        self._good = 0
+        self.wait(lambda: self._good >= frames, f"{frames} good frames with the loop closed")
+
+    def wait(self, condition: Callable[[], bool], what: str, timeout_s: float = WAIT_S) -> None:
+        """Wait for something.
+
+        Raises:
+            CaseFailedError: it did not come.
+        """
+        deadline_s = time.monotonic() + timeout_s
+        while not condition():
+            if time.monotonic() >= deadline_s:
+                raise CaseFailedError(f"waited {timeout_s:g} s in vain for {what}")
+            time.sleep(_POLL_S)
+
+    def pause(self, shortest_s: float, longest_s: float) -> None:
+        """Wait for a random time."""
+        time.sleep(self.rng.uniform(shortest_s, longest_s))
+
+    def view(self) -> None:
+        """Start a viewer that writes into a file."""
+        words = ["-m", "lowfc", "view", "--run", self.run.run_id, "--save", str(self.folder / "view.rrd")]
+        self._start(program(Role.VIEWER, words, self.folder / f"{Role.VIEWER}.stderr"))
+        self.ready(Role.VIEWER)
+
+    def kill(self, name: str) -> None:
+        """Kill -9."""
+        child = self.children[name]
+        if name == Role.RECORDER:
+            self.left.killed_ns.append(HostClock().host_ns())
+        self.signal(name, signal.SIGKILL)
+        self.wait(lambda: child.status is not None, f"the end of {name}")
+        self._note_end(child, 0.0, meant=True)
+
+    @contextlib.contextmanager
+    def stopped(self, name: str) -> Iterator[None]:
+        """A process stands still meanwhile: SIGSTOP, SIGCONT."""
+        self.signal(name, signal.SIGSTOP)
+        try:
+            yield
+        finally:
+            self.signal(name, signal.SIGCONT)
+
+    def signal(self, name: str, number: signal.Signals) -> None:
+        """Send a signal to a process."""
+        process = self.children[name].process
+        assert process is not None  # noqa: S101  # it was started
+        process.send_signal(number)
+
+    def restart(self, name: str, command: list[str] | None = None) -> None:
+        """Start a process that has ended anew, with its command line or another."""
+        stderr = self.folder / f"{name}-{next(self._numbers)}.stderr"
+        self._start(Child(name, command or self.children[name].command, stderr))
+
+    def ready(self, name: str) -> None:
+        """Wait until a process that was started anew reports that it is ready."""
+        self.wait(
+            lambda: name in self.health and self.health[name].state in ("ready", "running"), f"{name} started anew"
+        )
+
+    def ends(self, name: str, status: int) -> str:
+        """Wait until a process ends by itself, as the case means it to; return the last that it wrote.
+
+        Raises:
+            CaseFailedError: it did not end, or with another exit status.
+        """
+        child, begun_s = self.children[name], time.monotonic()
+        self.wait(lambda: child.status is not None, f"the end of {name}")
+        self._note_end(child, time.monotonic() - begun_s, meant=True)
+        if child.status != status:
+            raise CaseFailedError(f"{name} should have ended with exit status {status}, got {child.status}")
+        return child.stderr_tail()
+
+    def end(self) -> None:
+        """Stop everything; what is left can be judged."""
+        self.mark("end")
+        try:
+            order = (Role.CAMERA, Role.CONTROLLER, self.mirror, Role.VIEWER, Role.RECORDER)
+            rank = {str(name): number for number, name in enumerate(order)}
+            for child in sorted(self._started, key=lambda one: rank[one.name]):
+                begun_s, meant = time.monotonic(), child.status is None
+                child.stop(PATIENCE_S)
+                self._note_end(child, time.monotonic() - begun_s, meant=meant)
+            time.sleep(_LAST_HEALTH_S)
+            last = self.health.get(Role.RECORDER, wire.Health())
+            self.left.lost = {count.topic: count.missing for count in last.topics if count.missing}
+            self.left.failure = last.recording.failure
+        finally:
+            if self.bus is not None:
+                self.bus.close()
+            self.left.alive = _alive({child.process.pid for child in self._started if child.process is not None})
+            self.run.remove()
+
+    def _start(self, child: Child) -> None:
+        self.children[child.name] = child
+        self.health.pop(child.name, None)
+        child.start()
+        self._started.append(child)
+
+    def _note_end(self, child: Child, after_s: float, *, meant: bool) -> None:
+        """Note how a process ended, once."""
+        if id(child) not in self._noted:
+            self._noted.add(id(child))
+            self.left.ended.append(Ended(child.name, child.status or 0, after_s, meant))
+
+    def _health(self, sample: Sample) -> None:
+        with contextlib.suppress(DecodeError):  # some cases send junk
+            health = wire.Health.FromString(sample.payload)
+            self.health[health.process] = health
+
+    def _step(self, sample: Sample) -> None:
+        with contextlib.suppress(DecodeError):
+            step = wire.ControlStep.FromString(sample.payload)
+            self._steps += 1
+            self.newest_frame = step.frame_sequence
+            self.left.mode = step.mode
+            if step.mode != wire.LOOP_MODE_CLOSED:
+                self._good = 0
+            elif step.error_nm:
+                self._good += 1
+
+    def _truth(self, sample: Sample) -> None:
+        with contextlib.suppress(DecodeError):
+            self.left.residuals_nm.append(wire.Truth.FromString(sample.payload).residual_rms_nm)
+
+
+def _alive(sessions: set[int]) -> list[str]:
+    """Processes of these sessions that are there still; each child has a session of its own."""
+    found = []
+    for process in psutil.process_iter(["name", "status"]):
+        with contextlib.suppress(ProcessLookupError):
+            if process.pid != os.getpid() and os.getsid(process.pid) in sessions:
+                found.append(f"{process.info['name']} ({process.pid}, {process.info['status']})")
+    return found

@@ -1,0 +1,184 @@
+"""The command `lowfc chaos`: faults done to the real processes, and what came of it."""
+
+import json
+import os
+import random
+import shutil
+import sys
+import tempfile
+import time
+import traceback
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from lowfc.adapters.process.terminal import INTERRUPTED, Json
+from lowfc.contract.errors import ConfigurationError, LowfcError, nearest
+
+if TYPE_CHECKING:
+    from lowfc.contract.configuration import Configuration
+    from lowfc.programs.reliability.chaos.case import Case
+
+FAILED_LOGS = Path("chaos-logs")
+
+
+def chaos(
+    case: Annotated[list[str] | None, typer.Option(help="Name of a case; repeat.")] = None,
+    all_: Annotated[bool, typer.Option("--all", help="All cases.")] = False,
+    seed: Annotated[int, typer.Option(min=0, help="Seed of everything that is random.")] = 1,
+    keep: Annotated[
+        Path | None,
+        typer.Option(help=f"Keep the logs of all cases here; default: of those that failed, {FAILED_LOGS}."),
+    ] = None,
+    as_json: Json = False,
+) -> None:
+    """Inject faults into a simulated loop, case by case, and check its log; exit status 1 where a case failed.
+
+    Without a case, they are listed. Frames, processes, the bus, the mirror, the disk and the operator are spoilt in
+    turn; the mirror must stay within its limits, the loop come back, and everything be named and counted in the log.
+    What this host cannot do is skipped, and said so.
+
+    Example: lowfc chaos --case frames-dark --case kill-controller --seed 3
+    """
+    from lowfc.programs.reliability.chaos.cases import CASES
+
+    unknown = [name for name in case or () if name not in CASES]
+    if unknown:
+        raise ConfigurationError(
+            f"there is no case {unknown[0]!r}{nearest(unknown[0], CASES)}; `lowfc chaos` lists them"
+        )
+    names = list(CASES) if all_ else case or []
+    if not names:
+        width = max(map(len, CASES))
+        sys.stdout.write("".join(f"{one.name:{width}}  {one.sentence}\n" for one in CASES.values()))
+        return
+    rows: list[dict[str, Any]] = []
+    interrupted = False
+    try:
+        for number, name in enumerate(names, 1):
+            sys.stderr.write(f"{number} of {len(names)}: {name}: {CASES[name].sentence}\n")
+            rows.append(run_case(CASES[name], seed, keep))
+            sys.stderr.write(f"    {_word(rows[-1])} in {rows[-1]['seconds']:.0f} s\n")
+    except KeyboardInterrupt:
+        interrupted = True  # what is known is printed all the same
+    figures = {"seed": seed, "asked": len(names), **counts(rows), "cases": rows}
+    sys.stdout.write(json.dumps(figures) + "\n" if as_json else render(figures))
+    if interrupted:
+        raise typer.Exit(INTERRUPTED)
+    if figures["failed"]:
+        raise typer.Exit(1)
+
+
+def run_case(case: "Case", seed: int, keep: Path | None) -> dict[str, Any]:
+    """Run one case in a folder of its own, and judge it.
+
+    Args:
+        case: what is done.
+        seed: of everything that is random.
+        keep: folder for its log; None to keep only that of a case that fails.
+    """
+    row: dict[str, Any] = {"name": case.name, "group": case.group, "sentence": case.sentence, "seconds": 0.0}
+    row |= {"passed": False, "skipped": case.lacks() or None, "findings": {}, "figures": {}}
+    if row["skipped"]:
+        return row
+    begun_s, folder = time.monotonic(), Path(tempfile.mkdtemp(prefix=f"lowfc-chaos-{case.name}-"))
+    try:
+        row |= _judged(case, folder, random.Random(f"{seed} {case.name}"))  # noqa: S311  # nothing secret
+    finally:
+        if keep is not None or (row["findings"] and not row["passed"]):
+            kept = (keep or FAILED_LOGS) / f"{case.name}-{seed}"
+            kept.parent.mkdir(parents=True, exist_ok=True)
+            shutil.rmtree(kept, ignore_errors=True)
+            shutil.move(folder, kept)
+        shutil.rmtree(folder, ignore_errors=True)
+    return row | {"seconds": time.monotonic() - begun_s}
+
+
+def _judged(case: "Case", folder: Path, rng: random.Random) -> dict[str, Any]:
+    """What came of a case; a mistake of ours on the way is a finding, with its traceback in the case's folder."""
+    from lowfc.programs.reliability.chaos.evidence import read
+    from lowfc.programs.reliability.chaos.rules import judge, recovered_s, restart_steps_nm
+
+    try:
+        left = _run(case, folder, rng)
+        evidence = read(folder)
+        findings = judge(case, left, evidence)
+        figures = dict(left.figures)
+        if steps_nm := restart_steps_nm(evidence):
+            figures["restart_step_nm"] = round(max(steps_nm), 3)
+        if (seconds := recovered_s(left, evidence)) is not None:
+            figures["recovered_s"] = round(seconds, 3)
+    except Exception as error:
+        return {"findings": {"error": {"held": False, "found": _told(error, folder)}}}
+    return {
+        "passed": all(finding.held for finding in findings),
+        "findings": {one.rule: {"held": one.held, "found": one.found} for one in findings},
+        "figures": figures,
+    }
+
+
+def _told(error: Exception, folder: Path) -> str:
+    """An error in one line; where it comes from is written into the case's folder."""
+    with (folder / "error.txt").open("a") as file:
+        traceback.print_exception(error, file=file)
+    return str(error) if isinstance(error, LowfcError) else f"{type(error).__name__}: {error}"
+
+
+def _run(case: "Case", folder: Path, rng: random.Random) -> Any:
+    """Run a case; what goes wrong on the way is noted, and the processes end whatever happens."""
+    from lowfc.programs.reliability.chaos.bench import ChaosBench
+    from lowfc.programs.reliability.chaos.frames import FIRST, STRUCK
+
+    fault = {"kind": case.fault, "first": FIRST, "frames": STRUCK, "seed": rng.getrandbits(32)}
+    bench = ChaosBench(configured(case, folder), folder, rng, fault if case.fault else None)
+    try:
+        bench.begin()
+        case.play(bench)
+    except Exception as error:
+        bench.left.notes.append(_told(error, folder))
+    finally:
+        bench.end()
+    return bench.left
+
+
+def configured(case: "Case", folder: Path) -> "Configuration":
+    """The configuration of a case: the loop closed, at the default rate, its log in the case's folder."""
+    from lowfc.adapters.process.realtime import spread
+    from lowfc.contract.configuration import load
+
+    usual = {
+        "control.start_mode": "closed",
+        "recorder.folder": str(folder),
+        "recorder.min_free_mb": 50.0,
+        **spread(os.sched_getaffinity(0)),
+    }
+    return load(None, {**usual, **case.config})
+
+
+def counts(rows: list[dict[str, Any]]) -> dict[str, int]:
+    """How many cases ended in which way."""
+    passed, skipped = (sum(bool(row[key]) for row in rows) for key in ("passed", "skipped"))
+    return {"passed": passed, "failed": len(rows) - passed - skipped, "skipped": skipped}
+
+
+def _word(row: dict[str, Any]) -> str:
+    return f"skipped: {row['skipped']}" if row["skipped"] else "passed" if row["passed"] else "FAILED"
+
+
+def render(figures: dict[str, Any]) -> str:
+    """The table for people: a line for each case, and below it the rules that did not hold."""
+    lines = []
+    width = max((len(row["name"]) for row in figures["cases"]), default=0)
+    for row in figures["cases"]:
+        recovery = row["findings"].get("recovery", {}).get("found", "")
+        lines.append(f"{row['name']:{width}}  {_word(row):6}  {row['seconds']:5.1f} s  {recovery}")
+        lines += [f"    {rule}: {one['found']}" for rule, one in row["findings"].items() if not one["held"]]
+        lines += [f"    {name}: {value}" for name, value in row["figures"].items()]
+    ended = [f"{figures['passed']} passed", f"{figures['failed']} failed"]
+    if figures["skipped"]:
+        ended.append(f"{figures['skipped']} skipped")
+    if not_run := figures["asked"] - len(figures["cases"]):
+        ended.append(f"{not_run} not run")
+    lines.append(f"{', '.join(ended)}, seed {figures['seed']}")
+    return "\n".join(lines) + "\n"

@@ -1,0 +1,197 @@
+"""Chaos cases: gains, calibrations, safe mode and clocks."""
+
+from dataclasses import replace
+from functools import partial
+
+import numpy as np
+
+from lowfc.adapters.files import calibration_file
+from lowfc.adapters.files.factory import settings
+from lowfc.client import Client
+from lowfc.contract.codecs.calibration_codec import identified
+from lowfc.contract.errors import RequestRefusedError
+from lowfc.contract.messages import Role
+from lowfc.control.calibration.calibration import Calibration
+from lowfc.control.laws.stability import limiting_gain
+from lowfc.programs.reliability.chaos.bench import CaseFailedError, ChaosBench
+from lowfc.programs.reliability.chaos.case import LOST, WHILE_FRAMES, End, case, no_mounts, no_other_clock, read_only
+from lowfc.programs.reliability.chaos.processes import kill_and_restart
+
+JUST_BELOW = 0.9
+_UNKEPT = ("SAFED", "LATCH_FAILED")
+
+
+@case("gain", "control", "the highest gain that is granted, then one above, refused")
+def _highest_gain(bench: ChaosBench) -> None:
+    client, limiting = bench.client(), limiting_gain(settings(bench.config).delay_frames)
+    try:
+        client.gain(1.01 * limiting)
+    except RequestRefusedError:
+        pass
+    else:
+        raise CaseFailedError(f"a gain of {1.01 * limiting:.3g} was granted, where {limiting:.3g} is unstable")
+    client.gain(JUST_BELOW * limiting)
+    bench.frames(WHILE_FRAMES)
+    client.gain(bench.config.control.gain)
+    client.gain(bench.config.control.tilt_gain, modes=[2, 3])
+
+
+def _good(bench: ChaosBench) -> Calibration:
+    return calibration_file.load(bench.run.path / "calibration.fits")
+
+
+def _load_and_close(client: Client, calibration: Calibration) -> None:
+    client.load(calibration)
+    client.close_loop()
+
+
+@case(
+    "reversed-calibration",
+    "control",
+    "a calibration of the right shape that drives the loop away; the operator ends it by `safe`",
+    expected=("SAFED",),
+    allowed=("SAFED",),
+)
+def _reversed_calibration(bench: ChaosBench) -> None:
+    client, good = bench.client(), _good(bench)
+    client.open_loop()
+    _load_and_close(client, identified(replace(good, reconstructor=-good.reconstructor)))
+    bench.frames(WHILE_FRAMES)
+    client.safe()
+    bench.frames(WHILE_FRAMES)
+    client.clear()
+    _load_and_close(client, good)
+
+
+@case(
+    "foreign-calibration",
+    "control",
+    "a calibration for frames of another size",
+    expected=("FRAMES_REFUSED frames refused: WRONG_SIZE",),
+)
+def _foreign_calibration(bench: ChaosBench) -> None:
+    client, good = bench.client(), _good(bench)
+    rows, columns = good.shape
+    kept = np.arange(rows * columns).reshape(rows, columns)[1:, 1:].ravel()
+    foreign = replace(
+        good,
+        shape=(rows - 1, columns - 1),
+        reference=good.reference[kept],
+        response=good.response[kept],
+        reconstructor=np.ascontiguousarray(good.reconstructor[:, kept]),
+        good=good.good[kept],
+        dark=good.dark[kept],
+    )
+    client.open_loop()
+    client.load(identified(foreign))
+    bench.frames(WHILE_FRAMES)
+    _load_and_close(client, good)
+
+
+@case(
+    "damaged-calibration",
+    "control",
+    "the controller is started with NaN in its file, which it refuses, then with a good one",
+    expected=("STARTED controller",),
+    statuses={Role.CONTROLLER: 2},
+)
+def _damaged_calibration(bench: ChaosBench) -> None:
+    path = bench.run.path / "damaged.fits"
+    content = bytearray((bench.run.path / "calibration.fits").read_bytes())
+    middle = len(content) // 2
+    content[middle : middle + 4] = np.array([np.nan], ">f4").tobytes()
+    path.write_bytes(content)
+    bench.kill(Role.CONTROLLER)
+    good = bench.children[Role.CONTROLLER].command
+    bench.restart(Role.CONTROLLER, [*good[:-1], str(path)])
+    stderr_tail = bench.ends(Role.CONTROLLER, 2)
+    if "damaged" not in stderr_tail:
+        raise CaseFailedError(f"the controller should have named the damaged calibration, got: {stderr_tail}")
+    bench.restart(Role.CONTROLLER, good)
+    bench.ready(Role.CONTROLLER)
+
+
+@case(
+    "safed-restart",
+    "control",
+    "safe mode, then the controller is killed and started anew",
+    expected=("SAFED",),
+    allowed=("SAFED",),
+    end=End.SAFE,
+)
+def _restart_in_safe_mode(bench: ChaosBench) -> None:
+    bench.client().safe()
+    bench.frames(WHILE_FRAMES)
+    kill_and_restart(bench, Role.CONTROLLER)
+
+
+def _safe_and_kill(bench: ChaosBench, client: Client) -> None:
+    client.safe()
+    bench.frames(WHILE_FRAMES)
+    bench.kill(Role.CONTROLLER)
+
+
+def _start_anew(bench: ChaosBench) -> None:
+    bench.restart(Role.CONTROLLER)
+    bench.ready(Role.CONTROLLER)
+
+
+@case(
+    "safe-without-directory",
+    "control",
+    "safe while the run's directory is gone; then the controller is killed and started anew",
+    expected=_UNKEPT,
+    allowed=_UNKEPT,
+    end=End.SAFE,
+)
+def _safe_without_directory(bench: ChaosBench) -> None:
+    path, client = bench.run.path, bench.client()
+    aside = path.rename(path.with_name(f"{path.name}.aside"))
+    try:
+        _safe_and_kill(bench, client)
+    finally:
+        aside.rename(path)
+    _start_anew(bench)
+
+
+@case(
+    "safe-read-only",
+    "control",
+    "safe while the run's directory cannot be written; then the controller is killed and started anew",
+    expected=_UNKEPT,
+    allowed=_UNKEPT,
+    end=End.SAFE,
+    lacks=no_mounts,
+)
+def _safe_in_read_only_directory(bench: ChaosBench) -> None:
+    with read_only(bench.run.path):
+        _safe_and_kill(bench, bench.client())
+    _start_anew(bench)
+
+
+def _other_clock(bench: ChaosBench, seconds: int) -> None:
+    """Let a camera with another clock take the camera's place for a while."""
+    usual = bench.children[Role.CAMERA].command
+    for command in (["unshare", "--time", "--monotonic", str(seconds), *usual], usual):
+        bench.kill(Role.CAMERA)
+        bench.restart(Role.CAMERA, command)
+        bench.ready(Role.CAMERA)
+        if command is not usual:
+            bench.frames(WHILE_FRAMES)
+
+
+case(
+    "clock-ahead",
+    "control",
+    "a camera whose clock is an hour ahead takes the place of the camera",
+    expected=("CAMERA_RESTARTED",),
+    allowed=LOST,
+    lacks=no_other_clock,
+)(partial(_other_clock, seconds=3600))
+case(
+    "clock-behind",
+    "control",
+    "a camera whose clock is an hour behind, until the camera is back",
+    allowed=LOST,
+    lacks=no_other_clock,
+)(partial(_other_clock, seconds=-3600))

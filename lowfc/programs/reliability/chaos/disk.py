@@ -1,0 +1,103 @@
+"""Chaos cases: disks that are full, slow, or not to be written."""
+
+import contextlib
+import resource
+import signal
+from collections.abc import Iterator
+
+from lowfc.contract.messages import Role
+from lowfc.programs.reliability.chaos.bench import CaseFailedError, ChaosBench
+from lowfc.programs.reliability.chaos.case import LOST, case, no_mounts, read_only
+from lowfc.programs.reliability.chaos.processes import STALL_S, compare
+
+ROOM_BYTES = 3_000_000
+"""What the log may still grow before its disk is full: about a second of the loop."""
+SLOW_S = 3.0
+
+# The recorder itself, with a file that takes its time, and reports it as a slow one would.
+_SLOW = """
+import sys, time
+from lowfc.adapters.logs import writer
+plain, writes = writer._File.write, [0]
+seconds, after, times = float(sys.argv.pop(1)), int(sys.argv.pop(1)), int(sys.argv.pop(1))
+def write(file, data):
+    writes[0] += 1
+    begun_ns = time.monotonic_ns()
+    if after < writes[0] <= after + times:
+        time.sleep(seconds)
+    written = plain(file, data)
+    file.longest_write_ns = max(file.longest_write_ns, time.monotonic_ns() - begun_ns)
+    return written
+writer._File.write = write
+sys.argv[0] = "lowfc"
+from lowfc.programs.cli.main import main
+main()
+"""
+
+
+@case(
+    "disk-full",
+    "disk",
+    "the disk fills up",
+    allowed=("RECORDING_FAILED", "MESSAGES_LOST"),
+    statuses={Role.RECORDER: 1},
+)
+def _full(bench: ChaosBench) -> None:
+    """Let no file of the recorder grow any further: as a full disk, it refuses the next write."""
+    process = bench.children[Role.RECORDER].process
+    assert process is not None  # noqa: S101  # it was started
+    limit = max(path.stat().st_size for path in bench.folder.glob("*.part")) + ROOM_BYTES
+    resource.prlimit(process.pid, resource.RLIMIT_FSIZE, (limit, limit))
+    bench.wait(lambda: bool(bench.health[Role.RECORDER].recording.failure), "the recorder to report that it failed")
+
+
+@case(
+    "disk-read-only",
+    "disk",
+    "a recorder on a read-only disk refuses, another one records",
+    statuses={Role.RECORDER: 2},
+    lacks=no_mounts,
+)
+def _read_only(bench: ChaosBench) -> None:
+    locked = bench.folder / "locked"
+    locked.mkdir()
+    with read_only(locked):
+        usual = bench.children[Role.RECORDER].command
+        _instead(bench, [*usual, "--folder", str(locked)])
+        stderr_tail = bench.ends(Role.RECORDER, 2)
+        if "error:" not in stderr_tail or "Traceback" in stderr_tail:
+            raise CaseFailedError(f"the recorder should have named what is wrong in one line, got: {stderr_tail}")
+    bench.restart(Role.RECORDER, [*usual, "--folder", str(bench.folder)])  # the last one wrote its own into the run's
+    bench.ready(Role.RECORDER)
+
+
+@case("disk-slow", "disk", "the disk takes 3 s for each write", expected=("DISK_SLOW",), allowed=LOST)
+def _slow(bench: ChaosBench) -> None:
+    _on_slow_disk(bench, SLOW_S, 8, 2)
+    bench.wait(lambda: bench.health[Role.RECORDER].recording.messages > 0, "a recording")
+    bench.frames(1000)  # of which two writes take the most
+
+
+@case("stall-disk", "disk", "the disk takes nothing for 10 s", allowed=LOST)
+def _stalled(bench: ChaosBench) -> None:
+    @contextlib.contextmanager
+    def stall() -> Iterator[None]:
+        _on_slow_disk(bench, STALL_S + 2, 12, 1)
+        yield
+        bench.wait(lambda: bench.health[Role.RECORDER].recording.messages > 1000, "the disk to go on")
+
+    compare(bench, stall)
+
+
+def _on_slow_disk(bench: ChaosBench, seconds: float, after: int, times: int) -> None:
+    words = bench.children[Role.RECORDER].command
+    at = words.index("-m")
+    _instead(bench, [*words[:at], "-c", _SLOW, str(seconds), str(after), str(times), *words[at + 2 :]])
+    bench.ready(Role.RECORDER)
+
+
+def _instead(bench: ChaosBench, command: list[str]) -> None:
+    """Stop the recorder, and start one with another command line."""
+    bench.signal(Role.RECORDER, signal.SIGTERM)
+    bench.ends(Role.RECORDER, 0)
+    bench.restart(Role.RECORDER, command)

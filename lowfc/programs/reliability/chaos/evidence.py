@@ -1,0 +1,113 @@
+"""What the logs of a chaos case hold, read and decoded once for all rules."""
+
+from collections import defaultdict
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+from google.protobuf.message import DecodeError
+
+from lowfc.adapters.logs.reader import Logged, LogReader
+from lowfc.adapters.logs.sequence_gaps import Gaps
+from lowfc.contract.codecs.codec import actuators
+from lowfc.contract.envelope import count_of, start_of
+from lowfc.contract.errors import DataFileError
+from lowfc.contract.messages import COMMAND, EVENT, HEALTH, MIRROR_STATE, STEP, TRUTH, Topic
+
+FORGED_S = 1
+"""Start that our forged and damaged messages have, in 1970: no process of a run has it."""
+DECODED = (COMMAND, MIRROR_STATE, STEP, EVENT, TRUTH, HEALTH)
+_NONE = np.zeros((0, 0), np.float32)
+
+
+class Entry(NamedTuple):
+    """A decoded message of the loop's processes; of a command or a mirror's state also its actuators."""
+
+    sequence: int
+    log_time_ns: int
+    message: Any
+    actuators_nm: npt.NDArray[np.float32] = _NONE
+
+    @property
+    def start_s(self) -> int:
+        """Start of its publisher."""
+        return start_of(self.sequence)
+
+
+@dataclass(slots=True)
+class Evidence:
+    """What the logs hold.
+
+    Attributes:
+        entries: of each topic of `DECODED`, in the order of the logs.
+        came: which messages are in each finished log, by the log's number, key and start of the publisher; each log is
+            of another recorder, which answers for what came while it was there.
+        sent: what each publisher reported at its end that it had sent, by the same.
+        lost: what the recorders report as lost, by key.
+        unreadable: what is wrong with a log.
+        last_ns: when the last message of each log was recorded, and whether that log was finished.
+        messages: how many there are.
+    """
+
+    entries: dict[Topic, list[Entry]] = field(default_factory=lambda: {topic: [] for topic in DECODED})
+    came: dict[tuple[int, str, int], Gaps] = field(default_factory=dict)
+    sent: dict[tuple[int, str, int], int] = field(default_factory=dict)
+    lost: dict[str, int] = field(default_factory=lambda: defaultdict(int))
+    unreadable: list[str] = field(default_factory=list)
+    last_ns: list[tuple[int, bool]] = field(default_factory=list)
+    messages: int = 0
+
+    def residuals_nm(self) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.float64]]:
+        """When each true residual was recorded, and the residual, nm rms over the pupil."""
+        truths = self.entries[TRUTH]
+        times_ns = np.array([truth.log_time_ns for truth in truths], np.int64)
+        return times_ns, np.array([truth.message.residual_rms_nm for truth in truths], np.float64)
+
+    def residual_nm(self, begin_ns: int, end_ns: int) -> float:
+        """Root mean square of the true residual between two times; NaN where there is none."""
+        times_ns, residuals_nm = self.residuals_nm()
+        within = residuals_nm[(times_ns >= begin_ns) & (times_ns < end_ns)]
+        return float(np.sqrt(np.mean(within**2))) if within.size else float("nan")
+
+
+def read(folder: Path) -> Evidence:
+    """Read all logs of a case, in their order."""
+    found = Evidence()
+    for number, path in enumerate(sorted(folder.glob("*.mcap*"))):
+        reader, last_ns = LogReader(path), 0
+        try:
+            for message in reader:
+                last_ns = message.log_time_ns
+                _enter(found, message, number if reader.finished else None)
+        except DataFileError as fault:
+            found.unreadable.append(str(fault))
+        found.last_ns.append((last_ns, reader.finished))
+        for name, value in reader.metadata.get("recording", {}).items():
+            word, _, key = name.partition(" ")
+            if word == "lost":
+                found.lost[key] += int(value)
+    return found
+
+
+def _enter(found: Evidence, message: Logged, number: int | None) -> None:
+    found.messages += 1
+    start_s, count = start_of(message.sequence), count_of(message.sequence)
+    if start_s <= FORGED_S:
+        return
+    if number is not None and message.key != EVENT.key:  # all publish there, and their counts do not tell them apart
+        found.came.setdefault((number, message.key, start_s), Gaps(count)).came(count)
+    topic = next((one for one in DECODED if one.matches(message.key)), None)
+    if topic is None:
+        return
+    try:
+        decoded: Any = topic.message.FromString(message.payload)
+    except DecodeError:
+        found.unreadable.append(f"a message on {message.key} that the case did not send cannot be read")
+        return
+    shape = actuators(decoded) if topic in (COMMAND, MIRROR_STATE) else _NONE
+    if shape is not None:
+        found.entries[topic].append(Entry(message.sequence, message.log_time_ns, decoded, shape))
+    if topic is HEALTH and decoded.state == "stopped" and number is not None:
+        found.sent |= {(number, one.topic, start_s): one.published for one in decoded.topics if one.published}

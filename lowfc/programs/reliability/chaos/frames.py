@@ -1,0 +1,61 @@
+"""Chaos cases: faults of the camera's frames, and of the mirror."""
+
+from lowfc.contract.configuration import Control
+from lowfc.programs.reliability.chaos.bench import ChaosBench
+from lowfc.programs.reliability.chaos.case import LOST, case
+
+FIRST = 600
+"""Index of the first frame that a camera's fault befalls: the loop has settled and been quiet for a second."""
+STRUCK = 250
+"""Frames that it befalls: a second."""
+LATEST = 50
+"""Frames by which one may be late."""
+
+# Kind, what befalls the frames, event, how many of those struck (the first ones) may be used, whether some get lost.
+_KINDS = (
+    ("lost", "10 % of the frames are not sent", "FRAMES_MISSING", STRUCK, True),
+    ("duplicated", "each frame is sent twice", "REPEATED", STRUCK, True),
+    ("reordered", "frames come in pairs, the second one first", "OUT_OF_ORDER", STRUCK, True),
+    ("late", "each frame comes 1 to 50 frames late", "OUT_OF_ORDER", STRUCK, True),
+    ("wrong-size", "frames of another size", "WRONG_SIZE", 0, False),
+    ("truncated", "messages cut off anywhere", "WRONG_SIZE", 0, False),
+    ("random", "random bytes", "WRONG_SIZE", 0, False),
+    ("old-sequence", "numbers of an hour ago", "OUT_OF_ORDER", 0, True),
+    ("saturated", "all pixels at full well", "SATURATED", 0, False),
+    ("dark", "the star is lost, and found", "DARK", 0, False),
+    ("hot-pixels", "a tenth of the pixels at full well", "SATURATED", 0, False),
+    ("cosmic-rays", "a track of six pixels at full well in every fifth frame", "", STRUCK, False),
+    ("stuck", "the same image again and again, as new frames", "STUCK", Control().max_identical_frames, False),
+)
+
+
+def _through(bench: ChaosBench) -> None:
+    """Wait until the camera's fault is over."""
+    last = FIRST + STRUCK + LATEST
+    bench.wait(lambda: bench.newest_frame & 0xFFFFFFFF >= last, f"frame {last}")
+
+
+for _kind, _sentence, _reason, _used, _lost in _KINDS:
+    _event = _reason if _reason in ("", "FRAMES_MISSING") else f"FRAMES_REFUSED frames refused: {_reason}"
+    case(
+        f"frames-{_kind}",
+        "frames",
+        _sentence,
+        fault=_kind,
+        expected=(_event,) if _event else (),
+        allowed=LOST if _lost else (),
+        bad=range(FIRST + _used, FIRST + STRUCK).__contains__ if _used < STRUCK else None,
+    )(_through)
+case(
+    "stuck-actuators",
+    "mirror",
+    "dead and stuck actuators",
+    config={"mirror.dead": [500, 501], "mirror.stuck_nm": {"600": 80.0}},
+)(_through)
+case(
+    "saturating",
+    "mirror",
+    "a disturbance beyond what the modes may do",
+    config={"disturbance.preset": "step", "disturbance.scale": 6.0, "control.tilt_limit_nm": 20.0},
+    expected=("LIMIT_HIT",),
+)(_through)

@@ -1,0 +1,238 @@
+"""What must hold of every chaos case, judged by its logs and by how its processes ended."""
+
+import signal
+from collections import Counter
+from collections.abc import Iterator
+from typing import NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from lowfc.adapters.files.factory import mirror_limits, settings
+from lowfc.contract.events import Level
+from lowfc.contract.messages import COMMAND, EVENT, FRAME, MIRROR_STATE, STEP, Role, wire
+from lowfc.control.loop.safety import Limits
+from lowfc.programs.reliability.chaos.bench import PATIENCE_S, Left
+from lowfc.programs.reliability.chaos.case import Case, End
+from lowfc.programs.reliability.chaos.evidence import Entry, Evidence
+
+WITHIN = 2.0
+"""Factor within which the residual comes back."""
+FLOOR_NM = 1.0
+"""Residuals below are noise: this much is added to what they were."""
+FLUSHED_S = 1.0
+"""What was recorded longer ago than this before a kill is in the log: it is flushed four times a second."""
+SPAN_NS = 1_000_000_000
+SHORT_FRAMES = 50
+ROUNDING_NM = 0.03
+"""The driver rounds to 0.023 nm: a mirror's state may be that far from its command."""
+REFUSALS = frozenset(range(wire.REASON_NO_CALIBRATION, wire.REASON_STUCK + 1))
+HOST_EVENTS = frozenset({"COMMANDS_LATE", "FRAMES_REFUSED", "FRAMES_MISSING", "REALTIME_REFUSED", "DISK_SLOW"})
+"""Warnings for which a busy host is enough."""
+
+
+class Finding(NamedTuple):
+    """One rule: whether it held, and what was found."""
+
+    rule: str
+    held: bool
+    found: str
+
+
+def _found(rule: str, wrong: list[str], else_: str) -> Finding:
+    """A rule that held unless something is wrong, of which the first three are named."""
+    return Finding(rule, not wrong, "; ".join(wrong[:3]) or else_)
+
+
+def judge(case: Case, left: Left, evidence: Evidence) -> list[Finding]:
+    """Every rule of a case."""
+    return [
+        _limits(left, evidence),
+        _bad_frames(case, evidence),
+        _recovery(case, left, evidence),
+        _events(case, evidence),
+        _account(left, evidence),
+        _processes(case, left),
+    ]
+
+
+def _limits(left: Left, evidence: Evidence) -> Finding:
+    config = left.config
+    commands, states = evidence.entries[COMMAND], evidence.entries[MIRROR_STATE]
+    moving = np.ones((config.mirror.rows, config.mirror.columns), bool)
+    moving.flat[[*config.mirror.dead, *map(int, config.mirror.stuck_nm)]] = False
+    wrong = [
+        *_broken("command", settings(config).limits, commands, np.ones_like(moving)),
+        *_broken("mirror", mirror_limits(config), states, moving),
+    ]
+    wrong += [
+        f"a restarted controller moved the mirror by {step_nm:.2f} nm"
+        for step_nm in restart_steps_nm(evidence)
+        if step_nm > config.safety.slew_nm + ROUNDING_NM
+    ]
+    count = f"{len(commands)} commands, {len(states)} states"
+    return _found("limits", wrong if states else [count], count)
+
+
+def _broken(what: str, limits: Limits, shapes: list[Entry], moving: npt.NDArray[np.bool_]) -> Iterator[str]:
+    """Limits that shapes break; a gap in their counts allows as many moves. Fixed actuators are left out."""
+    if not shapes:
+        return
+    surface = np.array([shape.actuators_nm for shape in shapes], np.float64)
+    if not np.isfinite(surface[:, moving]).all():
+        yield f"{what} that is not finite"
+        return
+    surface[:, ~moving] = np.nan
+    moves = np.diff([shape.sequence for shape in shapes])
+    same = (np.diff([shape.start_s for shape in shapes]) == 0) & (moves > 0)
+    slews = np.nanmax(np.abs(np.diff(surface, axis=0)), axis=(1, 2)) / np.maximum(moves, 1)
+    apart = max(np.nanmax(np.abs(np.diff(surface, axis=axis)), initial=0) for axis in (1, 2))
+    for name, value, bound in (
+        ("stroke", np.nanmax(np.abs(surface)), limits.stroke_nm),
+        ("neighbours", apart, limits.neighbour_nm),
+        ("slew", slews[same].max(initial=0), limits.slew_nm),
+    ):
+        if value > bound:
+            yield f"{what}: {name} {value:.2f} nm above {bound:g}"
+
+
+def restart_steps_nm(evidence: Evidence) -> list[float]:
+    """Largest move of an actuator by the first command of each restarted controller, from where the mirror was."""
+    first: dict[int, Entry] = {}
+    for command in evidence.entries[COMMAND]:
+        first.setdefault(command.start_s, command)
+    states = evidence.entries[MIRROR_STATE]
+    times = np.array([state.log_time_ns for state in states])
+    pairs = [(command, int(np.searchsorted(times, command.log_time_ns)) - 1) for command in list(first.values())[1:]]
+    moves = [np.subtract(one.actuators_nm, states[before].actuators_nm) for one, before in pairs if before >= 0]
+    return [float(np.abs(move).max()) for move in moves]
+
+
+def recovered_s(left: Left, evidence: Evidence) -> float | None:
+    """From the first frame that a restarted controller used to a residual as before; None where there was none.
+
+    A residual is that of the next 50 frames.
+    """
+    steps = evidence.entries[STEP]
+    started = [step for step in steps if step.message.error_nm and step.start_s > steps[0].start_s]
+    if not started or "quiet" not in left.marks:
+        return None
+    begun_ns, quiet_ns = started[0].log_time_ns, left.marks["quiet"]
+    most_nm = WITHIN * evidence.residual_nm(quiet_ns - SPAN_NS, quiet_ns) + FLOOR_NM
+    times_ns, residuals_nm = evidence.residuals_nm()
+    later = times_ns >= begun_ns
+    times_ns, squares = times_ns[later], residuals_nm[later] ** 2
+    if squares.size < SHORT_FRAMES:
+        return None
+    rms_nm = np.sqrt(np.convolve(squares, np.full(SHORT_FRAMES, 1 / SHORT_FRAMES), "valid"))
+    good = np.flatnonzero(rms_nm <= most_nm)
+    return float((times_ns[good[0]] - begun_ns) * 1e-9) if good.size else None
+
+
+def _number(step: Entry) -> int:
+    return int(step.message.frame_sequence & 0xFFFFFFFF)
+
+
+def _bad_frames(case: Case, evidence: Evidence) -> Finding:
+    """A refused frame holds the command; what is bad is refused; nothing is used twice or after a newer one."""
+    commands, steps = evidence.entries[COMMAND], evidence.entries[STEP]
+    at = {(command.start_s, command.message.input_number): number for number, command in enumerate(commands)}
+    refused = [step for step in steps if REFUSALS.intersection(step.message.reasons)]
+    wrong = []
+    for step in refused:
+        number = at.get((step.start_s, step.message.input_number), 0)
+        if number and step.message.mode != wire.LOOP_MODE_SAFE:
+            before, now = commands[number - 1 : number + 1]
+            adjacent = now.sequence == before.sequence + 1  # and so of one controller
+            if adjacent and not np.array_equal(now.actuators_nm, before.actuators_nm):
+                wrong.append(f"a command was made from frame {_number(step)}, which was refused")
+    newest: dict[int, int] = {}
+    for step in steps:
+        if step.message.error_nm:
+            last = newest.get(step.start_s, -1)
+            if step.message.frame_sequence <= last:
+                wrong.append(f"frame {_number(step)} was used after a newer one, or twice")
+            newest[step.start_s] = max(step.message.frame_sequence, last)
+    if case.bad is not None:
+        struck = [step for step in steps if case.bad(_number(step))]
+        wrong += [f"bad frame {_number(step)} was used" for step in struck if step.message.error_nm]
+        wrong += [] if struck else ["no bad frame came"]
+    return _found("bad frames", wrong, f"{len(refused)} refused, {len(steps)} steps")
+
+
+def _recovery(case: Case, left: Left, evidence: Evidence) -> Finding:
+    quiet_ns, end_ns = left.marks.get("quiet", 0), left.marks["end"]
+    before = evidence.residual_nm(quiet_ns - SPAN_NS, quiet_ns)
+    after = evidence.residual_nm(end_ns - SPAN_NS, end_ns)
+    if np.isnan(after) and left.failure and left.residuals_nm:  # the recording ended before the loop did
+        after = float(np.sqrt(np.mean(np.square(left.residuals_nm))))
+    where = wire.LoopMode.Name(left.mode).removeprefix("LOOP_MODE_").lower()
+    if left.notes:
+        return Finding("recovery", False, "; ".join(left.notes))
+    if case.end is End.RECOVERS:
+        held = left.mode == wire.LOOP_MODE_CLOSED and after <= WITHIN * before + FLOOR_NM
+        return Finding("recovery", held, f"residual {before:.2f} -> {after:.2f} nm, {where}")
+    states = evidence.entries[MIRROR_STATE]
+    flat_nm = float(np.abs(states[-1].actuators_nm).max()) if states else float("inf")
+    return Finding("recovery", left.mode == wire.LOOP_MODE_SAFE and flat_nm < 1, f"{where}, mirror at {flat_nm:.2f} nm")
+
+
+def _events(case: Case, evidence: Evidence) -> Finding:
+    events = [event.message for event in evidence.entries[EVENT]]
+    wrong = [
+        f"no event {expected!r}"
+        for expected in case.expected
+        if not any(event.message.startswith(expected) for event in events)
+    ]
+    names = [(event.message.partition(" ")[0], event.level) for event in events]
+    allowed = {*(text.partition(" ")[0] for text in case.expected), *case.allowed, *HOST_EVENTS}
+    loud = Counter(name for name, level in names if level >= Level.WARNING)
+    bad = {name for name, level in names if level >= Level.ERROR}
+    wrong += [f"{loud[name]} unexpected {name}" for name in sorted(bad - allowed)]
+    rest = ", ".join(f"{name} {count}" for name, count in sorted(loud.items()))
+    return Finding("events", not wrong, "; ".join(wrong) or rest or "none above info")
+
+
+def _account(left: Left, evidence: Evidence) -> Finding:
+    wrong = list(evidence.unreadable)
+    missing: Counter[str] = Counter()
+    counted = {key: max(evidence.lost.get(key, 0), left.lost.get(key, 0)) for key in (*evidence.lost, *left.lost)}
+    for line, came in evidence.came.items():
+        missing[line[1]] += came.missing
+        if line[1] != FRAME.key:  # of which a faulty camera sends more, or fewer, than it numbers
+            missing[line[1]] += max(0, evidence.sent.get(line, 0) - came.next)
+    wrong += [
+        f"{count} of {key} missing, {counted.get(key, 0)} counted as lost"
+        for key, count in missing.items()
+        if count > counted.get(key, 0)
+    ]
+    unfinished = [last_ns for last_ns, finished in evidence.last_ns if not finished]
+    wrong += [
+        f"nothing was flushed within {FLUSHED_S:g} s before the recorder was killed"
+        for killed_ns in left.killed_ns
+        if not any(abs(killed_ns - last_ns) < FLUSHED_S * 1e9 for last_ns in unfinished)
+    ]
+    lost = sum(counted.values())
+    if left.failure and not lost:
+        wrong.append(f"the recording failed ({left.failure}), and nothing is counted as lost")
+    if not evidence.messages:
+        wrong.append("there is no log")
+    return _found("account", wrong, f"{evidence.messages} recorded, {lost} counted as lost")
+
+
+def _processes(case: Case, left: Left) -> Finding:
+    wrong = [f"{name} lives on" for name in left.alive]
+    for ended in left.ended:
+        allowed = {0, -signal.SIGTERM, case.statuses.get(ended.name, 0)} | ({-signal.SIGKILL} if ended.meant else set())
+        if ended.after_s >= PATIENCE_S and ended.status == -signal.SIGKILL:
+            wrong.append(f"{ended.name} did not end within {PATIENCE_S:g} s")
+        elif ended.status not in allowed:
+            wrong.append(f"{ended.name} ended with {ended.status}" + ("" if ended.meant else ", by itself"))
+        elif not ended.meant and ended.status == 0:
+            wrong.append(f"{ended.name} ended by itself")
+    written = [] if case.noisy else sorted(left.folder.glob("*.stderr"))
+    wrong += [f"a traceback in {one.name}" for one in written if "Traceback" in one.read_text(errors="replace")]
+    if not {ended.name for ended in left.ended} & set(map(str, Role)):
+        wrong.append("no process ended")
+    slowest_s = max((ended.after_s for ended in left.ended), default=0.0)
+    return _found("processes", wrong, f"ended within {slowest_s:.1f} s")

@@ -1,0 +1,134 @@
+"""What a soak found: how each process's memory, handles, threads and the latency went with time."""
+
+from collections.abc import Mapping, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+from scipy import stats
+
+from lowfc.control.loop.wording import counted
+
+BLOCKS = 12
+"""Means over which a slope is fitted: neighbouring samples are not independent, means of many nearly are."""
+WARM_UP = 0.25
+"""Part of the time at the start that does not count: caches and queues fill."""
+SIGNIFICANT = 3.0
+"""Standard errors above which a slope is one."""
+LEAST_GROWTH_MB = 1.0
+"""Over the time that counts; less than a leak of a night would be, and more than the allocator's steps."""
+TOO_SHORT = "too short to judge"
+
+
+class Usage(NamedTuple):
+    """What a process has at one time."""
+
+    time_s: float
+    memory_bytes: int
+    handles: int
+    threads: int
+
+
+def slope(times_s: Sequence[float], values: Sequence[float]) -> tuple[float, float] | None:
+    """Change per hour and its standard error, fitted to means of blocks after the warm-up; None of too little."""
+    times, found = np.asarray(times_s, np.float64) / 3600, np.asarray(values, np.float64)
+    later = times >= times[0] + WARM_UP * (times[-1] - times[0]) if times.size else times
+    if np.count_nonzero(later) < 2 * BLOCKS:
+        return None
+    when, means = (np.array([part.mean() for part in np.array_split(one[later], BLOCKS)]) for one in (times, found))
+    fit = stats.linregress(when, means)
+    return float(fit.slope), float(np.nan_to_num(fit.stderr))  # NaN where all are equal
+
+
+def _more(counts: Sequence[int]) -> bool:
+    """Whether there are usually more of something in the last quarter of the samples than in the second."""
+    quarter = len(counts) // 4
+    return bool(np.median(counts[-quarter:]) > np.median(counts[quarter : 2 * quarter]))
+
+
+def of_process(samples: Sequence[Usage]) -> dict[str, Any]:
+    """Figures of one process."""
+    times_s, memory_bytes, handles, threads = zip(*samples, strict=True)
+    memory_mb = [one / 1e6 for one in memory_bytes]
+    memory = slope(times_s, memory_mb)
+    grows, too_short = [], ["memory", "handles", "threads"]
+    if memory is not None:
+        counted_hours = (times_s[-1] - times_s[0]) / 3600 * (1 - WARM_UP)
+        leaks = memory[0] > SIGNIFICANT * memory[1] and memory[0] * counted_hours > LEAST_GROWTH_MB
+        grown = {"memory": leaks, "handles": _more(handles), "threads": _more(threads)}
+        grows, too_short = [name for name, grew in grown.items() if grew], []
+    return {
+        "memory_first_mb": round(memory_mb[0], 2),
+        "memory_last_mb": round(memory_mb[-1], 2),
+        "memory_most_mb": round(max(memory_mb), 2),
+        **_per_hour("memory_mb", memory),
+        "handles_first": handles[0],
+        "handles_most": max(handles),
+        "handles_last": handles[-1],
+        "threads_first": threads[0],
+        "threads_most": max(threads),
+        "threads_last": threads[-1],
+        "grows": grows,
+        "too_short": too_short,
+    }
+
+
+def of_latency(samples: Sequence[tuple[float, float, float]]) -> dict[str, float | None]:
+    """How the frame-to-command latency went: from when it was looked at, s, and its p50 and p99 since before, us."""
+    times_s, *each = zip(*samples, strict=True) if samples else ((), (), ())
+    found: dict[str, float | None] = {}
+    for name, latencies_us in zip(("p50_us", "p99_us"), each, strict=True):
+        found[name] = float(np.median(latencies_us)) if latencies_us else None
+        found |= _per_hour(name, slope(times_s, latencies_us))
+    return found
+
+
+def _per_hour(name: str, found: tuple[float, float] | None) -> dict[str, float | None]:
+    """A slope as JSON has it: null where it was too short to judge."""
+    per_hour, error = found or (None, None)
+    return {f"{name}_per_hour": per_hour, f"{name}_per_hour_error": error}
+
+
+def too_short(processes: Mapping[str, Mapping[str, Any]], latency: Mapping[str, float | None]) -> list[str]:
+    """What the time was too short to judge."""
+    found = [f"the {name}'s {what}" for name, one in processes.items() for what in one["too_short"]]
+    return found + ["the latency"] * (latency["p50_us_per_hour"] is None)
+
+
+def verdict(figures: Mapping[str, Any]) -> str:
+    """Passed, failed and why, or too short to judge and of what."""
+    if figures["why"]:
+        return "FAILED: " + "; ".join(figures["why"])
+    return f"{TOO_SHORT}: {', '.join(figures['too_short'])}" if figures["too_short"] else "passed"
+
+
+def told_latency(latency: Mapping[str, float | None]) -> str:
+    """The latencies and how they change, in words."""
+    words = []
+    for name in ("p50", "p99"):
+        value_us, per_hour, error = (latency[f"{name}_us{end}"] for end in ("", "_per_hour", "_per_hour_error"))
+        change = TOO_SHORT if per_hour is None else f"{per_hour:+.1f} +- {error:.1f} us per hour"
+        words.append(f"{name} {TOO_SHORT}" if value_us is None else f"{name} {value_us:.0f} us, {change}")
+    return "; ".join(words)
+
+
+def render(figures: dict[str, Any]) -> str:
+    """For people."""
+    lines = [f"{'process':<11} {'memory, MB':>22} {'MB per hour':>20} {'handles':>14} {'threads':>10}"]
+    for name, one in figures["processes"].items():
+        slope_mb, error_mb = one["memory_mb_per_hour"], one["memory_mb_per_hour_error"]
+        change = f"{TOO_SHORT:>20}" if slope_mb is None else f"{slope_mb:>11.2f} +- {error_mb:<5.2f}"
+        lines.append(
+            f"{name:<11} {one['memory_first_mb']:>9.1f} -> {one['memory_last_mb']:>9.1f} {change} "
+            f"{one['handles_first']:>6} -> {one['handles_last']:<4} "
+            f"{one['threads_first']:>3} -> {one['threads_last']:<3}"
+        )
+    lines += [
+        f"frame to command: {told_latency(figures['latency'])}",
+        f"{counted(figures['frames_published'], 'frame')}, {figures['frames_skipped']} skipped, "
+        f"{figures['frames_missing']} missing; "
+        f"{counted(figures['messages_recorded'], 'message')} in {counted(figures['logs'], 'log')}, "
+        f"{figures['messages_lost']} lost, "
+        f"{figures['gaps']} gaps",
+        verdict(figures),
+    ]
+    return "\n".join(lines) + "\n"

@@ -1,0 +1,180 @@
+"""A soak: the simulated loop for hours, looked at once a second, its logs checked and removed as they are finished."""
+
+import contextlib
+import tempfile
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import psutil
+from google.protobuf.message import DecodeError
+from rich.console import Console
+
+from lowfc.adapters.bus.bus import Sample
+from lowfc.adapters.bus.run import new_run_id, open_run
+from lowfc.adapters.bus.zenoh_bus import ZenohBus
+from lowfc.adapters.logs.reader import LogReader
+from lowfc.adapters.logs.sequence_gaps import Gaps
+from lowfc.adapters.process.clock import HostClock
+from lowfc.contract.configuration import Configuration
+from lowfc.contract.envelope import count_of, start_of
+from lowfc.contract.errors import DataFileError
+from lowfc.contract.messages import EVENT, FRAME, HEALTH, TIMING, Role, wire
+from lowfc.programs.launch.processes import start_all, stop_all
+from lowfc.programs.launch.sim_loop import check, children_of, prepare
+from lowfc.programs.launch.watch import Watch, topic_count
+from lowfc.programs.reliability.soak.figures import Usage, of_latency, of_process, too_short
+
+LOOK_S = 1.0
+_READY_S = 240.0
+_PATIENCE_S = 10.0
+_LAST_HEALTH_S = 0.2
+_NONE_OF = (
+    ("messages_lost", "messages lost"),
+    ("gaps", "messages missing in the logs"),
+    ("frames_missing", "frames never arrived"),
+)
+
+
+class LogChecker:
+    """Reads each log once it is finished, and removes it: a night's would not fit on a disk.
+
+    Attributes:
+        logs: how many there were.
+        messages: in all of them.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        """Check the logs of a folder."""
+        self._folder = folder
+        self._came: dict[tuple[str, int], Gaps] = {}
+        self.logs = self.messages = 0
+
+    @property
+    def gaps(self) -> int:
+        """Messages that are not in the logs, between others of the same publisher."""
+        return sum(one.missing for one in self._came.values())
+
+    def look(self) -> None:
+        """Check and remove what has been finished.
+
+        Raises:
+            DataFileError: a log is damaged.
+        """
+        for path in sorted(self._folder.glob("*.mcap"), key=lambda one: (one.stat().st_mtime_ns, one.name)):
+            for message in LogReader(path):
+                self.messages += 1
+                if message.key != EVENT.key:  # all publish there, and their counts do not tell them apart
+                    count = count_of(message.sequence)
+                    self._came.setdefault((message.key, start_of(message.sequence)), Gaps(count)).came(count)
+            self.logs += 1
+            path.unlink()
+
+
+class _Soak:
+    """The processes of a soak, and what is seen of them."""
+
+    def __init__(self, config: Configuration, folder: Path) -> None:
+        self.checker = LogChecker(folder)
+        self.watch = Watch({}, [])
+        self.usage: dict[str, list[Usage]] = {}
+        self.latency: list[tuple[float, float, float]] = []
+        self._latencies_ns: list[int] = []
+        self.run = open_run(new_run_id(), (config.mirror.name,), listeners=(Role.LAUNCHER,))
+        prepare(config, self.run, Console(stderr=True, quiet=True))
+        self.children = children_of(config, self.run, None, record=True)
+
+    def receive_timing(self, sample: Sample) -> None:
+        with contextlib.suppress(DecodeError):
+            self._latencies_ns += wire.ControlTiming.FromString(sample.payload).frame_to_command_ns
+
+    def await_frames(self) -> None:
+        """Wait for the first frame."""
+        deadline_s = time.monotonic() + _READY_S
+        while not topic_count(self.watch.of(Role.CONTROLLER), FRAME.key).received:
+            check(self.children)
+            if time.monotonic() >= deadline_s:
+                raise DataFileError(f"no frame came within {_READY_S:g} s")
+            time.sleep(LOOK_S / 10)
+
+    def look(self, now_s: float) -> None:
+        """Sample processes and latency, and check finished logs."""
+        check(self.children)
+        for child in self.children:
+            assert child.process is not None  # noqa: S101  # it was started
+            with contextlib.suppress(psutil.Error):  # one that has just ended: the next look says so
+                process = psutil.Process(child.process.pid)
+                used = Usage(now_s, process.memory_info().rss, process.num_fds(), process.num_threads())
+                self.usage.setdefault(child.name, []).append(used)
+        latencies_ns, self._latencies_ns = self._latencies_ns, []
+        if latencies_ns:
+            p50, p99 = (np.percentile(latencies_ns, (50, 99)) / 1e3).tolist()
+            self.latency.append((now_s, p50, p99))
+        self.checker.look()
+
+    def figures(self, seconds: float, stopped_s: float, unfinished: list[str]) -> dict[str, Any]:
+        """What `lowfc soak --json` prints."""
+        frames = topic_count(self.watch.of(Role.CONTROLLER), FRAME.key)
+        recording, camera = self.watch.of(Role.RECORDER).recording, self.watch.of(Role.CAMERA)
+        processes = {name: of_process(samples) for name, samples in self.usage.items()}
+        found: dict[str, Any] = {
+            "hours": seconds / 3600,
+            "rate_hz": round(camera.mean_rate_hz, 2),
+            "frames_published": topic_count(camera, FRAME.key).published,
+            "frames_skipped": frames.skipped,
+            "frames_missing": frames.missing,
+            "messages_recorded": self.checker.messages,
+            "messages_lost": recording.lost,
+            "logs": self.checker.logs,
+            "gaps": self.checker.gaps,
+            "stopped_within_s": round(stopped_s, 2),
+            "processes": processes,
+            "latency": of_latency(self.latency),
+        }
+        why = [f"the {name}'s {what} grow" for name, one in processes.items() for what in one["grows"]]
+        why += [f"{found[key]} {word}" for key, word in _NONE_OF if found[key]]
+        why += [f"{name} was not finished" for name in unfinished]
+        if recording.messages != self.checker.messages:
+            why.append(f"the recorder reports {recording.messages} messages, in the logs are {self.checker.messages}")
+        unjudged = too_short(processes, found["latency"])
+        return found | {"why": why, "too_short": unjudged, "passed": not why and not unjudged}
+
+
+def soak_loop(config: Configuration, seconds: float, progress: Callable[[float], None]) -> dict[str, Any]:
+    """Run the loop for so long; the figures that `lowfc soak --json` prints.
+
+    Args:
+        config: of the loop; its logs go elsewhere.
+        seconds: of looking, from the first frame on.
+        progress: called with how many have passed.
+
+    Raises:
+        ProcessDiedError: a process ended by itself.
+        DataFileError: a log is damaged.
+    """
+    with tempfile.TemporaryDirectory(prefix="lowfc-soak-") as name:
+        logged = config.model_copy(update={"recorder": config.recorder.model_copy(update={"folder": name})})
+        soak = _Soak(logged, Path(name))
+        try:
+            start_all(soak.children)
+            with contextlib.closing(ZenohBus(soak.run.links, Role.LAUNCHER, HostClock())) as bus:
+                bus.subscribe(HEALTH, soak.watch.hear)
+                bus.subscribe(TIMING, soak.receive_timing)
+                soak.await_frames()
+                begun_s = time.monotonic()
+                while (elapsed_s := time.monotonic() - begun_s) < seconds:
+                    soak.look(elapsed_s)
+                    progress(elapsed_s)
+                    time.sleep(max(0.0, LOOK_S - (time.monotonic() - begun_s - elapsed_s)))
+                begun_s = time.monotonic()
+                stop_all(soak.children, _PATIENCE_S)
+                stopped_s = time.monotonic() - begun_s
+                time.sleep(_LAST_HEALTH_S)
+            soak.checker.look()
+            unfinished = [path.name for path in Path(name).glob("*.part")]
+        finally:
+            stop_all(soak.children)
+            soak.run.remove()
+    return soak.figures(seconds, stopped_s, unfinished)

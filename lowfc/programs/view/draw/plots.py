@@ -1,0 +1,131 @@
+"""Plots on a rerun stream, all on one timeline: curves against time, and plots with axes of their own."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import rerun as rr
+import rerun.blueprint as rrb
+from rerun.components import AggregationPolicy
+
+from lowfc.programs.view.draw.colours import WHITE, Colour
+
+TIMELINE = "time"
+BOX_HEIGHT = 90.0
+"""Of a plot with axes of its own."""
+LABEL = 5.0
+"""By which the viewer sets a label below its place, for a box of this height."""
+
+Double = npt.NDArray[np.float64]
+Ticks = Sequence[tuple[float, str]]
+"""Values and their labels."""
+
+
+def at(stream: rr.RecordingStream, time_ns: int) -> None:
+    """Set the time of what is logged next."""
+    stream.set_time(TIMELINE, timestamp=np.datetime64(time_ns, "ns"))
+
+
+def words(places: npt.ArrayLike, texts: Sequence[str], colours: Sequence[Colour] = (WHITE,)) -> rr.Points2D:
+    """Words at places (words, 2); the viewer sets them a little below."""
+    return rr.Points2D(places, radii=0.0, colors=colours, labels=texts, show_labels=True)
+
+
+@dataclass(frozen=True, slots=True)
+class Plot:
+    """Curves against time, as a panel declares them.
+
+    Attributes:
+        path: of the entity.
+        title: of the view, with the unit.
+        curves: name and colour of each, the last one on top; empty where they depend on the run.
+        width: of the lines, points.
+        legend: its place; None leaves it to the viewer.
+    """
+
+    path: str
+    title: str = ""
+    curves: Mapping[str, Colour] = field(default_factory=dict)
+    width: float = 1.2
+    legend: rrb.Corner2D | rrb.PlotLegend | None = rrb.Corner2D.LeftTop
+
+    def name(self, stream: rr.RecordingStream, curves: Mapping[str, Colour] | None = None) -> None:
+        """Send names and colours for all times: the declared ones, or these."""
+        named = self.curves if curves is None else curves
+        style = rr.SeriesLines(
+            names=list(named),
+            colors=list(named.values()),
+            widths=[self.width] * len(named),
+            aggregation_policy=AggregationPolicy.MinMax,  # where a pixel holds many rows: peaks stay
+        )
+        stream.log(self.path, style, static=True)
+
+    def add(
+        self, stream: rr.RecordingStream, times_ns: npt.NDArray[np.int64], values: npt.NDArray[np.floating]
+    ) -> None:
+        """Add (rows,) or (rows, curves) values in one message; of rows that are not finite one is left, as a gap."""
+        if not len(times_ns):
+            return
+        columns = values.reshape(len(times_ns), -1)
+        finite = np.isfinite(columns).all(axis=1)
+        kept = finite | np.concatenate([[True], finite[:-1]])
+        times, columns = times_ns[kept], columns[kept]
+        scalars = rr.Scalars.columns(scalars=columns.astype(np.float64).ravel())
+        stream.send_columns(
+            self.path,
+            indexes=[rr.TimeColumn(TIMELINE, timestamp=times.view("datetime64[ns]"))],
+            columns=scalars.partition([columns.shape[1]] * len(times)),
+        )
+
+    def add_one(self, stream: rr.RecordingStream, time_ns: int, *values: float) -> None:
+        """Add one row."""
+        self.add(stream, np.array([time_ns]), np.array([values], np.float64))
+
+    def view(self, **options: Any) -> rrb.TimeSeriesView:
+        """The plot's place in a layout, with the viewer's own options."""
+        return rrb.TimeSeriesView(**({"origin": self.path, "name": self.title, "plot_legend": self.legend} | options))
+
+
+class Axes:
+    """A box whose axes are linear in what is given; the grid is drawn when it changes.
+
+    rerun's own plots have no logarithmic axis, and forget the oldest points.
+    """
+
+    def __init__(self, path: str, width: float) -> None:
+        self.path = path
+        self._width = width
+        self._x, self._y = (0.0, 1.0), (0.0, 1.0)
+        self._drawn: object = None
+
+    def fit(
+        self, stream: rr.RecordingStream, x: tuple[float, float], y: tuple[float, float], x_ticks: Ticks, y_ticks: Ticks
+    ) -> None:
+        """Span from the first to the second value of each axis."""
+        wanted = x, y, tuple(x_ticks), tuple(y_ticks)
+        if wanted == self._drawn:
+            return
+        self._x, self._y, self._drawn = x, y, wanted
+        width, height = self._width, BOX_HEIGHT
+        columns = [float(self.places([value], [y[0]])[0, 0]) for value, _ in x_ticks]
+        rows = [float(self.places([x[0]], [value])[0, 1]) for value, _ in y_ticks]
+        box = np.array([[0, 0], [width, 0], [width, height], [0, height], [0, 0]])
+        lines = [box, *(np.array([[at_x, 0], [at_x, height]]) for at_x in columns)]
+        lines += [np.array([[0, at_y], [width, at_y]]) for at_y in rows]
+        grid = rr.LineStrips2D(lines, colors=[(70, 72, 80)], radii=rr.Radius.ui_points(0.5), draw_order=-1.0)
+        stream.log(f"{self.path}/grid", grid)
+        places = [(at_x, height + 1) for at_x in columns] + [(-11.0, at_y - LABEL) for at_y in rows]
+        stream.log(f"{self.path}/ticks", words(places, [label for _, label in (*x_ticks, *y_ticks)]))
+
+    def places(self, x: npt.ArrayLike, y: npt.ArrayLike) -> Double:
+        """Places of values (points, 2) on the view, whose y axis points down."""
+        share_x = (np.asarray(x, np.float64) - self._x[0]) / (self._x[1] - self._x[0])
+        share_y = (np.asarray(y, np.float64) - self._y[0]) / (self._y[1] - self._y[0])
+        return np.stack([self._width * share_x, BOX_HEIGHT * (1 - share_y)], axis=1)
+
+
+def lines(strips: Sequence[Double], colours: Sequence[Colour], widths: Sequence[float]) -> rr.LineStrips2D:
+    """Lines (points, 2) of these colours and widths, points."""
+    return rr.LineStrips2D(strips, colors=list(colours), radii=rr.Radius.ui_points(list(widths)))

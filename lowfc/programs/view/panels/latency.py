@@ -1,0 +1,85 @@
+"""How fast the loop is: percentiles of the last second, their histogram, and what was skipped or lost."""
+
+from collections import deque
+
+import numpy as np
+import numpy.typing as npt
+import rerun as rr
+
+from lowfc.adapters.logs.columns import STAGES
+from lowfc.contract.messages import FRAME, Role
+from lowfc.programs.launch.watch import topic_count
+from lowfc.programs.view.draw.colours import BLUE, GREEN, GREY, ORANGE, RED, distinct
+from lowfc.programs.view.draw.pictures import Scale
+from lowfc.programs.view.draw.plots import Plot, at
+from lowfc.programs.view.panels.panel import Panel
+from lowfc.programs.view.snapshot import Snapshot
+
+HISTOGRAM = "latency/histogram"
+WHOLE = Plot("latency/frame_to_command", "Frame to command, last second, us", {"p50": BLUE, "p99": ORANGE, "max": RED})
+PARTS = Plot(
+    "latency/stages",
+    "Stages of it, p99 of the last second, us",
+    dict(zip(STAGES[:-1], distinct(len(STAGES) - 1), strict=True)),
+)
+COUNTS = Plot(
+    "latency/frames",
+    "Frames skipped and missing, messages lost, since the start",
+    {"skipped: a newer one was there": ORANGE, "missing: never arrived": RED},
+)
+LOST = Plot("latency/lost", curves={"messages lost by the recorder": GREY})
+"""Beside `COUNTS`, in one view."""
+PERIOD_NS = 500_000_000
+WINDOW_NS = 1_000_000_000
+BINS = 40
+"""Bars of the histogram; whatever took longer than its axis is in the last."""
+
+_LEAST_US = 100.0
+_BODY = 99.0
+"""Percentile that the histogram's axis has to hold: a single late frame does not squeeze all others into one bar."""
+
+Double = npt.NDArray[np.float64]
+
+
+class Latency(Panel):
+    """From a frame to its command, and the stages of it."""
+
+    plots = (WHOLE, PARTS, COUNTS, LOST)
+
+    def __init__(self) -> None:
+        self._recent: deque[tuple[int, Double]] = deque()
+        self._scale = Scale(_LEAST_US)
+        self._drawn_ns = 0
+
+    def draw(self, stream: rr.RecordingStream, snapshot: Snapshot) -> None:
+        """Keep a second; twice in it, draw."""
+        now_ns = snapshot.time_ns
+        if snapshot.timings[STAGES[-1]].size:
+            stages_us = np.stack([snapshot.timings[stage] for stage in STAGES], axis=1) / 1e3
+            self._recent.append((now_ns, stages_us))
+        while self._recent and not 0 <= now_ns - self._recent[0][0] < WINDOW_NS:
+            self._recent.popleft()
+        if 0 <= now_ns - self._drawn_ns < PERIOD_NS:
+            return
+        self._drawn_ns = now_ns
+        us = np.concatenate([stages_us for _, stages_us in self._recent] or [np.zeros((0, len(STAGES)))])
+        if len(us):
+            WHOLE.add_one(stream, now_ns, *np.percentile(us[:, -1], [50, 99, 100]))
+            PARTS.add_one(stream, now_ns, *np.percentile(us[:, :-1], 99, axis=0))
+        self._draw_histogram(stream, now_ns, us[:, -1])
+        if (controller := snapshot.health.get(Role.CONTROLLER)) is not None:
+            frames = topic_count(controller.health, FRAME.key)
+            COUNTS.add_one(stream, now_ns, frames.skipped, frames.missing)
+        if (recorder := snapshot.health.get(Role.RECORDER)) is not None:
+            LOST.add_one(stream, now_ns, recorder.health.recording.lost)
+
+    def _draw_histogram(self, stream: rr.RecordingStream, time_ns: int, us: Double) -> None:
+        """Draw bars of even width from 0 to the axis' end, which changes seldom."""
+        if us.size:
+            self._scale.fit(np.percentile(us, [_BODY]), time_ns)
+        width_us = max(self._scale.limit, _LEAST_US) / BINS
+        counts = np.bincount(np.minimum(us // width_us, BINS - 1).astype(int), minlength=BINS)
+        middles_us = (np.arange(BINS) + 0.5) * width_us
+        at(stream, time_ns)
+        bars = rr.BarChart(counts, color=GREEN, abscissa=middles_us, widths=np.full(BINS, width_us, np.float32))
+        stream.log(HISTOGRAM, bars)

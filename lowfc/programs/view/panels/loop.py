@@ -1,0 +1,80 @@
+"""How the loop runs: its mode as a band, the light, saturated pixels, and the events of every process."""
+
+from datetime import UTC, datetime
+
+import numpy as np
+import rerun as rr
+
+from lowfc.contract.events import Level
+from lowfc.contract.messages import from_timestamp
+from lowfc.contract.printable import printable
+from lowfc.control.loop.safety import LoopMode
+from lowfc.programs.view.draw.colours import BLUE, GREEN, GREY, ORANGE, RED, Colour
+from lowfc.programs.view.draw.plots import Plot, at
+from lowfc.programs.view.panels.panel import Panel
+from lowfc.programs.view.snapshot import Snapshot
+
+MODE, LOG = "loop/mode", "log"
+FLUX = Plot("loop/flux", "Light, % of expected", {"light on the sensor, % of expected": ORANGE}, legend=None)
+SATURATED = Plot("loop/saturated", "Pixels at full well", {"pixels at full well": RED}, legend=None)
+MODE_COLOURS: dict[LoopMode, Colour] = {
+    LoopMode.IDLE: GREY,
+    LoopMode.OPEN: BLUE,
+    LoopMode.CLOSED: GREEN,
+    LoopMode.SAFE: RED,
+}
+MODE_NAMES = {mode: "safe" if mode is LoopMode.SAFE else mode.name.lower() for mode in MODE_COLOURS}
+_NAMES = {mode.value: mode.name for mode in LoopMode}
+_LEVELS: dict[int, rr.TextLogLevel] = {
+    Level.DEBUG: rr.TextLogLevel.DEBUG,
+    Level.INFO: rr.TextLogLevel.INFO,
+    Level.WARNING: rr.TextLogLevel.WARN,
+    Level.ERROR: rr.TextLogLevel.ERROR,
+    Level.FATAL: rr.TextLogLevel.CRITICAL,
+}
+
+
+class Loop(Panel):
+    """Mode changes, light, saturation, events."""
+
+    plots = (FLUX, SATURATED)
+
+    def __init__(self) -> None:
+        self._mode = 0
+
+    def begin(self, stream: rr.RecordingStream) -> None:
+        """Name what is drawn."""
+        style = rr.StateConfiguration(
+            values=[mode.name for mode in MODE_COLOURS],
+            labels=list(MODE_NAMES.values()),
+            colors=[(*colour, 255) for colour in MODE_COLOURS.values()],
+        )
+        stream.log(MODE, style, static=True)
+        super().begin(stream)
+
+    def draw(self, stream: rr.RecordingStream, snapshot: Snapshot) -> None:
+        """Add what is new."""
+        steps, state = snapshot.steps, snapshot.controller
+        if not self._mode and state is not None and state.mode in _NAMES and state.HasField("mode_timestamp"):
+            since_ns = from_timestamp(state.mode_timestamp)
+            if not steps.time_ns.size or since_ns < steps.time_ns[0]:  # before the view began
+                self._change(stream, state.mode, since_ns)
+        for row in np.flatnonzero(np.diff(steps.mode.astype(int), prepend=self._mode)):
+            self._change(stream, int(steps.mode[row]), int(steps.time_ns[row]))
+        if snapshot.calibration is not None:
+            refused = ~np.isfinite(steps.error_nm).all(axis=1)  # of those neither is measured
+            percent = 100 * steps.flux_dn / snapshot.calibration.flux_dn
+            for plot, values in ((FLUX, percent), (SATURATED, steps.saturated_pixels)):
+                plot.add(stream, steps.time_ns, np.where(refused, np.nan, values))
+        for event in snapshot.events:
+            time_ns = from_timestamp(event.timestamp)
+            clock = datetime.fromtimestamp(time_ns * 1e-9, UTC).strftime("%H:%M:%S")  # rerun's own column is cut
+            at(stream, time_ns)
+            level = _LEVELS.get(event.level, rr.TextLogLevel.INFO)
+            name, message = printable(event.name), printable(event.message)
+            stream.log(f"{LOG}/{name}", rr.TextLog(f"{clock}  {name}: {message}", level=level))
+
+    def _change(self, stream: rr.RecordingStream, mode: int, time_ns: int) -> None:
+        self._mode = mode
+        at(stream, time_ns)
+        stream.log(MODE, rr.StateChange(state=_NAMES.get(mode, f"mode {mode}")))

@@ -1,0 +1,53 @@
+"""The mirror's pictures: the surface at each actuator, which of them are at a limit, and the surface over the pupil."""
+
+import numpy as np
+import numpy.typing as npt
+import rerun as rr
+
+from lowfc.contract.codecs.codec import actuators
+from lowfc.programs.view.draw.colours import YELLOW
+from lowfc.programs.view.draw.pictures import SignedPicture
+from lowfc.programs.view.draw.plots import Plot, at
+from lowfc.programs.view.panels.panel import Panel
+from lowfc.programs.view.snapshot import Snapshot
+
+COMMAND, SURFACE = "mirror/command", "mirror/surface"
+STROKE = Plot("mirror/stroke", "Mirror: stroke used, %", {"largest stroke used, % of the limit": YELLOW}, legend=None)
+_NEAR = 0.995
+"""Share of the stroke from which on an actuator counts as at its limit: the driver's step and margins lie above."""
+
+
+class Mirror(Panel):
+    """The newest state, as a picture."""
+
+    pictures = True
+    plots = (STROKE,)
+
+    def __init__(self) -> None:
+        self._command, self._surface = SignedPicture(COMMAND, 1.0, "nm"), SignedPicture(SURFACE, 1.0, "nm")
+        self._limited = False
+
+    def draw(self, stream: rr.RecordingStream, snapshot: Snapshot) -> None:
+        """Show where the mirror is."""
+        surface_nm = actuators(snapshot.mirror) if snapshot.mirror is not None else None
+        if surface_nm is not None:
+            self._command.show_values(stream, snapshot.time_ns, surface_nm)
+            self._mark(stream, snapshot, surface_nm)
+        if snapshot.surface is not None:
+            self._surface.show_values(stream, snapshot.time_ns, snapshot.surface)
+
+    def _mark(self, stream: rr.RecordingStream, snapshot: Snapshot, surface_nm: npt.NDArray[np.float32]) -> None:
+        """Draw a ring round each actuator at its stroke."""
+        stroke_nm = snapshot.stroke_nm
+        if not stroke_nm:
+            return
+        largest = max(float(surface_nm.max()), -float(surface_nm.min())) / stroke_nm
+        limited = largest >= _NEAR
+        if limited or self._limited:
+            rows, columns = np.nonzero(np.abs(surface_nm) >= _NEAR * stroke_nm)
+            places = np.stack([columns + 0.5, rows + 0.5], axis=1)
+            at(stream, snapshot.time_ns)
+            stream.log(f"{COMMAND}/at_limit", rr.Points2D(places, radii=0.3, colors=[YELLOW]))
+        self._limited = limited
+        if snapshot.complete:
+            STROKE.add_one(stream, snapshot.time_ns, 100 * largest)

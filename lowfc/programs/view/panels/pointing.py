@@ -1,0 +1,77 @@
+"""Where the star's image wanders: tip against tilt of the last two seconds, in mas, over rings."""
+
+from collections import deque
+
+import numpy as np
+import numpy.typing as npt
+import rerun as rr
+import rerun.blueprint as rrb
+
+from lowfc.programs.view.draw.colours import BLUE, GREY, YELLOW
+from lowfc.programs.view.draw.pictures import Scale
+from lowfc.programs.view.draw.plots import at, words
+from lowfc.programs.view.panels.panel import Panel
+from lowfc.programs.view.panels.wavefront import TIP_TILT
+from lowfc.programs.view.snapshot import Snapshot
+
+TRAIL = "pointing/trail"
+BOUNDS = rrb.VisualBounds2D(x_range=[-1.15, 1.15], y_range=[-1.15, 1.15])
+_KEPT = 400
+"""Points of the trail; of a faster loop not every one."""
+_TRAIL_NS = 2_000_000_000
+_RINGS = (0.25, 0.5, 1.0)
+_LEAST_MAS = 0.5
+
+Points = npt.NDArray[np.floating]
+
+
+class Pointing(Panel):
+    """The trail of the last two seconds; the outer ring follows it."""
+
+    def __init__(self, nm_per_mas: float) -> None:
+        self._nm_per_mas = nm_per_mas
+        self._scale = Scale(_LEAST_MAS)
+        self._pieces: deque[tuple[npt.NDArray[np.int64], Points]] = deque()
+
+    def draw(self, stream: rr.RecordingStream, snapshot: Snapshot) -> None:
+        """Move the trail on."""
+        if snapshot.calibration is None or not set(TIP_TILT) <= set(snapshot.calibration.noll):
+            return
+        columns = [snapshot.calibration.noll.index(index) for index in TIP_TILT]
+        times_ns, modes_nm = snapshot.truths.time_ns, snapshot.truths.residual_nm
+        if not times_ns.size:
+            times_ns, modes_nm = snapshot.steps.time_ns, snapshot.steps.error_nm
+        if not times_ns.size or modes_nm.shape[1] != len(snapshot.calibration.noll):
+            return
+        mas = modes_nm[:, columns] / self._nm_per_mas
+        finite = np.isfinite(mas).all(axis=1)
+        self._pieces.append((times_ns[finite], mas[finite]))
+        while self._pieces and self._pieces[0][0].max(initial=0) < snapshot.time_ns - _TRAIL_NS:
+            self._pieces.popleft()
+        mas = np.concatenate([piece for _, piece in self._pieces] or [mas[:0]])
+        mas = mas[:: max(1, len(mas) // _KEPT)]
+        if not len(mas):
+            return
+        at(stream, snapshot.time_ns)
+        if self._scale.fit(mas, snapshot.time_ns):
+            self._draw_rings(stream)
+        places = _screen(mas / self._scale.limit)
+        fading = np.linspace(40, 220, len(places)).astype(np.uint8)
+        colours = np.concatenate([np.tile(BLUE, (len(places), 1)), fading[:, None]], axis=1).astype(np.uint8)
+        stream.log(f"{TRAIL}/points", rr.Points2D(places, colors=colours, radii=0.012))
+        stream.log(f"{TRAIL}/now", rr.Points2D(places[-1:], colors=[YELLOW], radii=0.035))
+
+    def _draw_rings(self, stream: rr.RecordingStream) -> None:
+        turn = np.linspace(0, 2 * np.pi, 97)
+        circle = np.stack([np.cos(turn), np.sin(turn)], axis=1)
+        cross = [np.array([[-1.0, 0.0], [1.0, 0.0]]), np.array([[0.0, -1.0], [0.0, 1.0]])]
+        lines = [*(circle * ring for ring in _RINGS), *cross]
+        stream.log(f"{TRAIL}/rings", rr.LineStrips2D(lines, colors=[GREY], radii=0.003))
+        labels = [f"{ring * self._scale.limit:g} mas" for ring in _RINGS]
+        places = _screen(np.array([[0.0, ring] for ring in _RINGS]))
+        stream.log(f"{TRAIL}/labels", words(places, labels))
+
+
+def _screen(points: Points) -> Points:
+    """Turn the y axis down, as a screen's is."""
+    return np.asarray(points * np.array([1.0, -1.0]))

@@ -1,0 +1,144 @@
+"""What the science camera sees: the dark zone's contrast with the wavefront as it is, and with a flat mirror."""
+
+from collections import deque
+
+import numpy as np
+import numpy.typing as npt
+import rerun as rr
+import rerun.blueprint as rrb
+
+from lowfc.optics.chain.coronagraph import DARK_ZONE, Wedge
+from lowfc.optics.chain.science_camera import ScienceCamera
+from lowfc.programs.view.draw.colours import BLUE, GREEN, GREY, Rgb, sequential
+from lowfc.programs.view.draw.pictures import Picture
+from lowfc.programs.view.draw.plots import Plot, words
+from lowfc.programs.view.panels.panel import Panel
+from lowfc.programs.view.snapshot import Snapshot
+
+IMAGE = "science/image"
+CONTRAST = Plot("science/contrast", "Mean contrast from 4 to 6 λ/D, log10", width=1.6)
+PERIOD_NS = 1_000_000_000
+WEDGE = Wedge(4.0, 6.0)
+"""Where contrast is averaged."""
+
+_MEAN_OF = 5
+"""Wavefronts, each the newest of a snapshot, that one image is the mean of."""
+_DARKEST, _BRIGHTEST = -10, -4
+"""Decades of contrast that the colours span."""
+_HALF_WIDTH, _SAMPLES_PER = 12, 4
+_SAMPLES = 2 * _HALF_WIDTH * _SAMPLES_PER
+_GAP, _BAR = 6, 5  # samples between the pictures, and of the colour scale
+_SECOND = _SAMPLES + _GAP  # where the second picture begins, and the colour scale
+_SCALE = 2 * _SECOND
+_WIDTH = _SCALE + _BAR
+_LABEL = 5  # samples by which the viewer sets a label below its place
+BOUNDS = rrb.VisualBounds2D(x_range=[-4, _WIDTH + 24], y_range=[-2 * _GAP - _LABEL, _SAMPLES + 14])
+CONTRAST_AXIS = rrb.ScalarAxis(range=(_DARKEST, _BRIGHTEST - 1))
+_NAMES = {
+    "true": ("with a flat mirror, true wavefront", "now, true wavefront"),
+    "measured": ("with a flat mirror, pseudo-open-loop", "now, measured error"),
+}
+"""What the wavefronts are, those of a simulation first: they are taken where there are any."""
+
+Single = npt.NDArray[np.float32]
+
+
+class Science(Panel):
+    """Two images side by side and the mean contrast, once a second."""
+
+    def __init__(self, pupil: npt.NDArray[np.float64], wavelength_nm: float) -> None:
+        self._pupil = pupil
+        self._wavelength_nm = wavelength_nm
+        self._noll: tuple[int, ...] = ()
+        self._camera: ScienceCamera | None = None
+        self._flat = np.nan
+        self._waves: dict[str, deque[tuple[Single, Single]]] = {source: deque(maxlen=_MEAN_OF) for source in _NAMES}
+        self._picture = Picture(f"{IMAGE}/contrast")
+        self._named = ""
+        self._drawn_ns = 0
+
+    def begin(self, stream: rr.RecordingStream) -> None:
+        """Draw what stays: where the mask ends and contrast is averaged, and the scale of the colours."""
+        lines = [line + np.array([start, 0]) for start in (0, _SECOND) for line in _outlines()]
+        outlines = rr.LineStrips2D(lines, colors=[GREY], radii=rr.Radius.ui_points(0.7))
+        stream.log(f"{IMAGE}/outlines", outlines, static=True)
+        decades = range(_DARKEST, _BRIGHTEST + 1)
+        places = [(_WIDTH + 12, _SAMPLES * (1 - float(_share(decade))) - _LABEL) for decade in decades]
+        stream.log(f"{IMAGE}/scale", words(places, [f"1e{decade}" for decade in decades]), static=True)
+
+    def draw(self, stream: rr.RecordingStream, snapshot: Snapshot) -> None:
+        """Keep the newest wavefront; now and then, draw."""
+        if snapshot.calibration is None:
+            return
+        camera = self._prepared(snapshot.calibration.noll)
+        truths, steps = snapshot.truths, snapshot.steps
+        self._keep("true", truths.residual_nm, truths.disturbance_nm)
+        self._keep("measured", steps.error_nm, steps.pol_nm)
+        if 0 <= snapshot.time_ns - self._drawn_ns < PERIOD_NS:
+            return
+        source = next((name for name, waves in self._waves.items() if waves), None)
+        if source is None:
+            return
+        self._drawn_ns = snapshot.time_ns
+        self._show(stream, snapshot.time_ns, camera, source)
+        for waves in self._waves.values():
+            waves.clear()
+
+    def _prepared(self, noll: tuple[int, ...]) -> ScienceCamera:
+        """The camera for these modes; wavefronts of others are forgotten."""
+        if self._camera is None or noll != self._noll:
+            self._noll = noll
+            self._camera = ScienceCamera(self._pupil, noll, self._wavelength_nm, _HALF_WIDTH, _SAMPLES_PER)
+            self._flat = self._camera.mean_contrast(self._camera.image(np.zeros(len(noll))), WEDGE)
+            for waves in self._waves.values():
+                waves.clear()
+        return self._camera
+
+    def _keep(self, source: str, now_nm: Single, open_nm: Single) -> None:
+        """Keep the newest row; a refused frame has no wavefront."""
+        if now_nm.shape[1] != len(self._noll):
+            return
+        finite = np.flatnonzero(np.isfinite(now_nm).all(axis=1) & np.isfinite(open_nm).all(axis=1))
+        if finite.size:
+            self._waves[source].append((now_nm[finite[-1]], open_nm[finite[-1]]))
+
+    def _show(self, stream: rr.RecordingStream, time_ns: int, camera: ScienceCamera, source: str) -> None:
+        waves = self._waves[source]
+        images = [np.mean([camera.image(wave[which]) for wave in waves], axis=0) for which in (0, 1)]
+        means = [camera.mean_contrast(image, WEDGE) for image in images]
+        if source != self._named:
+            self._named = source
+            CONTRAST.name(stream, dict(zip((*_NAMES[source], "flat wavefront"), (GREY, GREEN, BLUE), strict=True)))
+        self._picture.show(stream, time_ns, _side_by_side(*images))
+        captions = [f"{title}: {mean:.1e}" for title, mean in zip(("now", "flat mirror"), means, strict=True)]
+        places = [(start + _SAMPLES / 2, -_LABEL - _GAP) for start in (0, _SECOND)]
+        stream.log(f"{IMAGE}/captions", words(places, captions))
+        CONTRAST.add_one(stream, time_ns, *np.log10([*reversed(means), self._flat]))
+
+
+def _share(decade: npt.NDArray[np.floating] | float) -> npt.NDArray[np.floating]:
+    """Place of a logarithm of contrast among the colours, from 0 to 1."""
+    return np.clip((np.asarray(decade) - _DARKEST) / (_BRIGHTEST - _DARKEST), 0, 1)
+
+
+def _side_by_side(now: Single, as_open: Single) -> Rgb:
+    """Colours of both images and of the scale beside them, on black."""
+    shares = np.zeros((_SAMPLES, _WIDTH))
+    tiny = 10.0 ** (_DARKEST - 1)  # a logarithm has no value at zero
+    shares[:, :_SAMPLES] = _share(np.log10(now + tiny))
+    shares[:, _SECOND : _SECOND + _SAMPLES] = _share(np.log10(as_open + tiny))
+    shares[:, _SCALE:] = np.linspace(1, 0, _SAMPLES)[:, None]
+    return sequential(shares)
+
+
+def _outlines() -> list[npt.NDArray[np.float64]]:
+    """Lines (points, 2) in pixels of one image: the mask's edge, and the wedge on either side of the star."""
+    turn = np.linspace(0, 2 * np.pi, 97)
+    opening = np.deg2rad(WEDGE.half_opening_deg) * np.linspace(-1, 1, 33)
+    arcs = [radius * _directions(opening) for radius in (WEDGE.inner, WEDGE.outer)]
+    right = np.concatenate([arcs[0], arcs[1][::-1], arcs[0][:1]])
+    return [_SAMPLES / 2 + _SAMPLES_PER * line for line in (DARK_ZONE.inner * _directions(turn), right, -right)]
+
+
+def _directions(angle: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
+    return np.stack([np.cos(angle), np.sin(angle)], axis=1)

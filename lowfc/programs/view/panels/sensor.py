@@ -1,0 +1,72 @@
+"""The sensor's pictures: the frame, its difference from the reference, and the reference itself."""
+
+import numpy as np
+import numpy.typing as npt
+import rerun as rr
+
+from lowfc.control.calibration.calibration import Calibration
+from lowfc.control.loop.estimator import difference
+from lowfc.programs.view.draw.colours import Rgb, sequential
+from lowfc.programs.view.draw.pictures import Picture, Scale, SignedPicture
+from lowfc.programs.view.panels.panel import Panel
+from lowfc.programs.view.snapshot import Snapshot
+
+FRAME, DIFFERENCE, REFERENCE, RAW = "sensor/frame", "sensor/difference", "sensor/reference", "sensor/raw"
+_RAW_PERIOD_NS = 500_000_000
+
+Single = npt.NDArray[np.float32]
+
+
+class Sensor(Panel):
+    """Frame and difference as they come; the reference of each new calibration."""
+
+    pictures = True
+
+    def __init__(self) -> None:
+        self._calibration: Calibration | None = None
+        self._difference = np.zeros(0, np.float32)
+        self._frame, self._reference = Picture(FRAME), Picture(REFERENCE)
+        self._change = SignedPicture(DIFFERENCE, 1.0, "DN")
+        self._brightest = Scale(10.0)
+        self._stretch = np.zeros((1, 3), np.uint8)
+        self._raw_due_ns = 0
+
+    def draw(self, stream: rr.RecordingStream, snapshot: Snapshot) -> None:
+        """Show the newest frame."""
+        calibration, frame, time_ns = snapshot.calibration, snapshot.frame, snapshot.frame_ns
+        if calibration is not None and calibration is not self._calibration:
+            self._calibration = calibration
+            self._difference = np.empty(calibration.dark.size, np.float32)
+            expected_dn = (calibration.reference * calibration.flux_dn).reshape(calibration.shape)
+            limit_dn = float(expected_dn.max())
+            caption = f"0 to {limit_dn:.0f} DN expected, logarithmic"
+            self._reference.show(stream, snapshot.time_ns, _log_stretched(expected_dn, limit_dn), caption)
+        if frame is None:
+            return
+        dark_dn = 0
+        if calibration is not None and calibration.shape == frame.shape:
+            dark_dn = round(float(calibration.dark[0]))
+            # Without light nothing differs.
+            flux_dn = difference(calibration, frame.ravel(), 0.0, self._difference) or 0.0
+            change_dn = self._difference * flux_dn * calibration.good if flux_dn else np.zeros(frame.size)
+            self._change.show_values(stream, time_ns, change_dn.reshape(frame.shape))
+        self._show_frame(stream, frame, dark_dn, time_ns)
+        if time_ns >= self._raw_due_ns:
+            self._raw_due_ns = time_ns + _RAW_PERIOD_NS
+            stream.log(RAW, rr.Image(frame, color_model="L"))
+
+    def _show_frame(
+        self, stream: rr.RecordingStream, frame: npt.NDArray[np.uint16], dark_dn: int, time_ns: int
+    ) -> None:
+        changed = self._brightest.fit(np.array([max(0, int(frame.max()) - dark_dn)]), time_ns)
+        limit = round(self._brightest.limit)
+        if changed:  # a colour for each DN: looking up is cheaper than a logarithm of every pixel
+            self._stretch = _log_stretched(np.arange(limit + 1, dtype=np.float32), limit)
+        light = np.clip(frame, dark_dn, dark_dn + limit) - np.uint16(dark_dn)
+        self._frame.show(stream, time_ns, np.take(self._stretch, light, axis=0), f"0 to {limit} DN, logarithmic")
+
+
+def _log_stretched(light_dn: Single, limit_dn: float) -> Rgb:
+    """Two decades below the limit, in colours; less light is nearly black."""
+    knee_dn = np.float32(limit_dn * 1e-2)
+    return sequential(np.log1p(np.maximum(light_dn, 0) / knee_dn) / np.log1p(limit_dn / knee_dn))

@@ -1,0 +1,147 @@
+"""Showing a run or logs from the beginning to the end."""
+
+import contextlib
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+import rerun as rr
+from rich.console import Console
+
+from lowfc.adapters.bus.run import open_run
+from lowfc.adapters.bus.zenoh_bus import ZenohBus
+from lowfc.adapters.files.whole_file import being_written, require_folder
+from lowfc.adapters.process.join import clock_of
+from lowfc.adapters.process.progress import passing_bar
+from lowfc.adapters.viewer.rerun_viewer import RerunViewer, Show
+from lowfc.contract.configuration import Configuration, load
+from lowfc.contract.messages import Role
+from lowfc.programs.view.bridge import Bridge, ViewError
+from lowfc.programs.view.layout import LIVE_WINDOW_S
+from lowfc.programs.view.recorded import Drawn, draw_logs
+from lowfc.programs.view.renderer import Renderer
+from lowfc.programs.view.target import Target
+
+PICTURE_AFTER_S = 8.0
+"""Of a running loop: its plots have something to show by then."""
+_POLL_S = 0.1
+
+
+def show_run(run_id: str, config: Configuration | None, target: Target, seconds: float | None) -> dict[str, Any]:
+    """Show a running loop until told to stop, until the window is closed, or for some seconds.
+
+    Raises:
+        ViewerError, ViewError: there is no viewer, or it fails again and again.
+        DataFileError: a file cannot be written.
+    """
+    require_folder(target.save, target.picture)
+    run = open_run(run_id, ())
+    own = run.path / "config.toml"
+    config = config or load(own if own.exists() else None)
+    clock = clock_of(config)
+    with contextlib.ExitStack() as stack:
+        part = stack.enter_context(being_written(target.save)) if target.save is not None else None
+        bus = ZenohBus(run.links, Role.VIEWER, clock, looks_on=True)
+        stack.callback(bus.close)
+        bridge = Bridge(
+            config,
+            run_id,
+            clock,
+            bus,
+            target.viewer,
+            lambda viewer: target.stream(viewer, part, run_id, LIVE_WINDOW_S),
+            round(target.memory_mb * 1e6),
+        )
+        stack.callback(bridge.close)
+        bridge.service.catch_signals()
+        bridge.service.announces = True
+        bridge.service.awaited = lambda: "" if bridge.service.heard else "any other process"
+        until_s = seconds if seconds is not None or target.picture is None else PICTURE_AFTER_S
+        try:
+            summary = bridge.run(until_s, lambda: _print_address(target, bridge.viewer))
+        except ViewError as error:
+            if part is None:
+                raise
+            rest = Path(f"{target.save}.part")
+            part.replace(rest)
+            raise ViewError(f"{error}; what there is of it is in {rest}") from error
+        if not bridge.service.heard and target.show in (None, Show.HEADLESS):
+            raise ViewError(f"no message of run {run_id!r} has arrived: nothing is written")
+        if target.picture is not None and bridge.viewer is not None:
+            bridge.viewer.screenshot(target.picture)
+    return {
+        "run": run_id,
+        "moments": summary.snapshots,
+        "renewals": summary.renewals,
+        "memory_mb": round(summary.most_bytes / 1e6, 1),
+        "file": _written(target),
+    }
+
+
+def show_logs(logs: list[Path], config: Configuration | None, target: Target) -> dict[str, Any]:
+    """Show logs that follow each other; a window or page stays until it is closed or Ctrl-C.
+
+    Raises:
+        ViewerError: there is no viewer, or it ended while it was drawn on.
+        DataFileError: a file cannot be read or written.
+    """
+    require_folder(target.save, target.picture)
+    drawn = Drawn()
+    with contextlib.ExitStack() as stack:
+        part = stack.enter_context(being_written(target.save)) if target.save is not None else None
+        viewer = target.viewer()
+        if viewer is not None:
+            stack.callback(viewer.stop)
+        stream = target.stream(viewer, part, logs[0].stem, None)
+        stack.callback(_end, stream, viewer)
+        watched = viewer if target.written is None else None
+        # Ctrl-C is the way to end what is watched, whether everything is drawn yet or not.
+        with contextlib.suppress(KeyboardInterrupt) if watched is not None else contextlib.nullcontext():
+            _print_address(target, viewer)
+            drawn = _draw(logs, config, stream, target)
+            while watched is not None and watched.alive:
+                time.sleep(_POLL_S)
+        if watched is None:
+            stream.disconnect()  # a viewer keeps what it has
+            if viewer is not None:
+                viewer.screenshot(target.picture)
+    return {
+        "logs": [str(log) for log in logs],
+        "moments": drawn.snapshots,
+        "log_s": round(drawn.log_s, 3),
+        "remarks": drawn.remarks,
+        "file": _written(target),
+    }
+
+
+def _draw(logs: list[Path], config: Configuration | None, stream: rr.RecordingStream, target: Target) -> Drawn:
+    total = sum(log.stat().st_size for log in logs if log.exists())
+    with passing_bar(Console(stderr=True)) as bar:
+        task = bar.add_task("drawing", total=total)
+        drawn = draw_logs(
+            logs, config, lambda own: Renderer(own, stream), lambda done: bar.update(task, completed=done)
+        )
+    target.show_all(stream, drawn.span_ns)
+    for remark in drawn.remarks:
+        sys.stderr.write(f"{remark}\n")
+    return drawn
+
+
+def _end(stream: rr.RecordingStream, viewer: RerunViewer | None) -> None:
+    """End a stream; one into a viewer that hangs would wait for it, so that the viewer is stopped first."""
+    if viewer is not None and not viewer.answers():
+        viewer.stop()
+    stream.disconnect()
+
+
+def _print_address(target: Target, viewer: RerunViewer | None) -> None:
+    if viewer is not None and target.show is Show.WEB:
+        sys.stderr.write(f"look at {viewer.web_address}\nCtrl-C ends the view\n")
+
+
+def _written(target: Target) -> str | None:
+    if target.written is None:
+        return None
+    sys.stderr.write(f"{target.written} written\n")
+    return str(target.written)

@@ -1,0 +1,276 @@
+"""What is new on the bus or in a log since the last look: columns, pictures, and the last of each state."""
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+from google.protobuf.message import DecodeError
+
+from lowfc.adapters.bus.names import Names
+from lowfc.adapters.logs.columns import StepRows, Steps, TimingRows, TruthRows, Truths
+from lowfc.contract.codecs.calibration_codec import decode_calibration
+from lowfc.contract.codecs.codec import decode_frame
+from lowfc.contract.errors import BadMessageError
+from lowfc.contract.messages import (
+    CALIBRATION,
+    CAMERA_STATE,
+    CONTROLLER_STATE,
+    EVENT,
+    FLOAT32,
+    FRAME,
+    HEALTH,
+    MIRROR_STATE,
+    STEP,
+    SURFACE,
+    TIMING,
+    TRUTH,
+    Log,
+    RawImage,
+    Topic,
+    from_timestamp,
+    wire,
+)
+from lowfc.control.calibration.calibration import Calibration
+from lowfc.control.loop.inputs import Frame
+
+SHOWN: tuple[Topic, ...] = (
+    FRAME,
+    STEP,
+    TRUTH,
+    TIMING,
+    MIRROR_STATE,
+    SURFACE,
+    CALIBRATION,
+    CAMERA_STATE,
+    CONTROLLER_STATE,
+    EVENT,
+    HEALTH,
+)
+"""Topics that a view shows."""
+
+PICTURES_HZ = 30.0
+PICTURES_PER_COMPLETE = 8
+"""Snapshots for each that is complete: curves grow four times a second, for many rows cost hardly more than one."""
+
+_KNOWN_EVENTS = 5000
+_NO_STEPS, _NO_TRUTHS, _NO_TIMINGS = StepRows(0).taken(), TruthRows(0).taken(), TimingRows().taken()[1]
+_UNREADABLE = (BadMessageError, DecodeError, OverflowError, ValueError)
+
+
+class LastHealth(NamedTuple):
+    """A process's last Health, and when it was sent (host clock)."""
+
+    time_ns: int
+    health: wire.Health
+
+
+@dataclass(frozen=True, slots=True)
+class LogEnd:
+    """The end of the logs that are shown.
+
+    Attributes:
+        name: of the last one.
+        complete: it was finished, and all of it is there.
+        run, host: of the run; empty where the log does not say.
+    """
+
+    name: str
+    complete: bool
+    run: str
+    host: str
+
+
+@dataclass(frozen=True, slots=True)
+class Snapshot:
+    """What is new, and the last of what stays.
+
+    Attributes:
+        time_ns: on the timeline: that of the newest data, and what has passed since. In lockstep it is simulated time.
+        host_ns: host clock, the one of `sent_ns` and of `LastHealth`.
+        steps, truths: new rows; `timings` the new durations of the controller's stages.
+        frame: newest frame, DN; None without a new one. `frame_ns` is its time.
+        mirror: newest state of the mirror; None without a new one.
+        surface: newest surface over the pupil, nm; None without a new one.
+        events: new ones.
+        calibration, camera, controller: the last of each; None before the first.
+        health: of every process, by name.
+        sent_ns: when the last message of each topic was sent.
+        complete: everything is in it; otherwise only what is newest, and rows and events wait for a later snapshot.
+        behind_s: how late this snapshot is.
+        ended: the end of the logs, at their last snapshot.
+    """
+
+    time_ns: int
+    host_ns: int
+    steps: Steps
+    truths: Truths
+    timings: dict[str, npt.NDArray[np.int64]]
+    frame: npt.NDArray[np.uint16] | None
+    frame_ns: int
+    mirror: wire.MirrorState | None
+    surface: npt.NDArray[np.float32] | None
+    events: list[Log]
+    calibration: Calibration | None
+    camera: wire.CameraState | None
+    controller: wire.ControllerState | None
+    health: Mapping[str, LastHealth]
+    sent_ns: Mapping[Topic, int]
+    complete: bool = True
+    behind_s: float = 0.0
+    ended: LogEnd | None = None
+
+    @property
+    def stroke_nm(self) -> float:
+        """Limit of an actuator's deviation from flat; 0 where the controller has not reported it."""
+        return self.controller.settings.stroke_nm if self.controller is not None else 0.0
+
+
+class Accumulator:
+    """Receives messages and makes snapshots of them; what cannot be read is left out and counted in `unreadable`."""
+
+    def __init__(self, simulated_ns: int | None = None) -> None:
+        """With the time at which a run in lockstep begins: its data's clock is not the host's."""
+        self._simulated_ns = simulated_ns
+        self.unreadable = 0
+        self._steps, self._truths, self._timings = StepRows(0), TruthRows(0), TimingRows()
+        self._newest: dict[Topic, bytes] = {}
+        self._events: list[Log] = []
+        self._known_events: dict[tuple[int, bytes], None] = {}
+        self._states: dict[Topic, Any] = {}
+        self._names = Names()
+        self._health: dict[str, LastHealth] = {}
+        self._sent_ns: dict[Topic, int] = {}
+        self._sequences: dict[str, int] = {}
+        self._data_ns = 0
+        self._data_host_ns = 0
+
+    def add(self, topic: Topic, key: str, payload: bytes, publish_time_ns: int, sequence: int = 0) -> None:
+        """Add one message of one of `SHOWN`; a state that is older than the last one is left out."""
+        try:
+            self._names.admit(topic, key)
+            if topic.queryable:
+                if sequence < self._sequences.get(key, 0):
+                    return
+                self._sequences[key] = sequence
+            if topic is EVENT and not self._is_new(sequence, payload):
+                return
+            self._sent_ns[topic] = max(publish_time_ns, self._sent_ns.get(topic, 0))
+            if topic.latest_only:
+                self._newest[topic] = payload
+            else:
+                self._read(topic, key, payload, publish_time_ns)
+        except _UNREADABLE:
+            self.unreadable += 1
+
+    def snapshot(
+        self, host_ns: int, *, complete: bool = True, behind_s: float = 0.0, ended: LogEnd | None = None
+    ) -> Snapshot:
+        """Return what is new at this time of the host's clock; the next snapshot begins here.
+
+        Args:
+            host_ns: now.
+            complete: with rows and events; otherwise they wait for a later snapshot, in which more come at once.
+            behind_s: how late it is.
+            ended: the end of the logs, where this is their last snapshot.
+        """
+        frame: Frame | None = self._newest_of(FRAME, _frame)
+        if frame is not None:
+            self._date(frame.time_ns, self._sent_ns[FRAME])
+        steps, truths, timings, events = _NO_STEPS, _NO_TRUTHS, _NO_TIMINGS, list[Log]()
+        if complete:
+            steps, truths, timings = self._steps.taken(), self._truths.taken(), self._timings.taken()[1]
+            self._steps, self._truths = StepRows(self._steps.modes), TruthRows(self._truths.modes)
+            self._timings = TimingRows()
+            events, self._events = self._events, events
+        return Snapshot(
+            time_ns=self._time_ns(host_ns),
+            host_ns=host_ns,
+            steps=steps,
+            truths=truths,
+            timings=timings,
+            frame=frame.pixels if frame is not None else None,
+            frame_ns=frame.time_ns if frame is not None else 0,
+            mirror=self._newest_of(MIRROR_STATE, wire.MirrorState.FromString),
+            surface=self._newest_of(SURFACE, _surface),
+            events=events,
+            calibration=self._states.get(CALIBRATION),
+            camera=self._states.get(CAMERA_STATE),
+            controller=self._states.get(CONTROLLER_STATE),
+            health=self._health,
+            sent_ns=self._sent_ns,
+            complete=complete,
+            behind_s=behind_s,
+            ended=ended,
+        )
+
+    def _is_new(self, sequence: int, payload: bytes) -> bool:
+        """Whether an event is new: those of the last minutes come by the bus, and in a log that is being written."""
+        known, identity = self._known_events, (sequence, payload)
+        if identity in known:
+            return False
+        known[identity] = None
+        if len(known) > _KNOWN_EVENTS:
+            del known[next(iter(known))]
+        return True
+
+    def _time_ns(self, host_ns: int) -> int:
+        if self._simulated_ns is not None:
+            return self._data_ns or self._simulated_ns
+        return self._data_ns + max(0, host_ns - self._data_host_ns) if self._data_ns else host_ns
+
+    def _read(self, topic: Topic, key: str, payload: bytes, publish_time_ns: int) -> None:
+        """Read a message of which every one counts; one of another number of modes begins the rows anew."""
+        if topic is STEP:
+            step = wire.ControlStep.FromString(payload)
+            if not self._steps.add(step):
+                self._steps = _begun(StepRows(len(step.command_nm)), step)
+            self._date(from_timestamp(step.timestamp), publish_time_ns)
+        elif topic is TRUTH:
+            truth = wire.Truth.FromString(payload)
+            if not self._truths.add(truth):
+                self._truths = _begun(TruthRows(len(truth.residual_nm)), truth)
+        elif topic is TIMING:
+            self.unreadable += not self._timings.add(wire.ControlTiming.FromString(payload))
+        elif topic is HEALTH:
+            name, health = self._names.health(key, payload)
+            self._health[name] = LastHealth(publish_time_ns, health)
+        elif topic is EVENT:
+            self._events.append(Log.FromString(payload))
+        else:
+            state = topic.message.FromString(payload)
+            self._states[topic] = decode_calibration(state) if isinstance(state, wire.Calibration) else state
+
+    def _date(self, data_ns: int, publish_time_ns: int) -> None:
+        if data_ns >= self._data_ns:
+            self._data_ns, self._data_host_ns = data_ns, publish_time_ns
+
+    def _newest_of(self, topic: Topic, decode: Callable[[bytes], Any]) -> Any:
+        """The newest message of a topic, decoded; None without a new one that can be read."""
+        payload = self._newest.pop(topic, None)
+        try:
+            return None if payload is None else decode(payload)
+        except _UNREADABLE:
+            self.unreadable += 1
+            return None
+
+
+def _begun(rows: Any, message: wire.ControlStep | wire.Truth) -> Any:
+    if not rows.add(message):
+        raise ValueError("a message whose modes differ in number")
+    return rows
+
+
+def _frame(payload: bytes) -> Frame:
+    frame = decode_frame(payload, 0, 0)
+    if frame.pixels is None:
+        raise ValueError("a frame that cannot be read")
+    return frame
+
+
+def _surface(payload: bytes) -> npt.NDArray[np.float32]:
+    image = RawImage.FromString(payload)
+    if image.encoding != FLOAT32:
+        raise ValueError(f"a surface is {FLOAT32}, got {image.encoding!r}")
+    return np.frombuffer(image.data, "<f4").reshape(image.height, image.width)

@@ -1,0 +1,1 @@
+"""Judgement on a run: good, degraded, wrong."""

@@ -1,0 +1,80 @@
+"""What is set, in words: run and host, control law and gains, offset and channels, the last note."""
+
+from collections import Counter
+from datetime import UTC, datetime
+
+import numpy as np
+
+from lowfc.contract.messages import from_timestamp, wire
+from lowfc.contract.printable import printable
+from lowfc.control.loop.state import FADING_FRAMES, SETTLING_FRAMES
+from lowfc.optics.chain.zernike import mode_name
+from lowfc.programs.view.verdicts.tile import counted, short
+from lowfc.programs.view.verdicts.watcher import Watcher
+
+_MOST = 3
+"""Different values, modes or channels that are named one by one."""
+
+
+def facts(watcher: Watcher) -> dict[str, str]:
+    """The facts of a run by title, as far as they are known."""
+    state, calibration = watcher.snapshot.controller, watcher.snapshot.calibration
+    noll = calibration.noll if calibration is not None else ()
+    run, host = watcher.run_and_host()
+    return {
+        "RUN": (f"{run} on {host}" if host else run) or "not known",
+        "CONTROL LAW": "not known" if state is None else _law(state),
+        "OFFSET AND CHANNELS": "not known" if state is None else f"{_offset(state, noll)}; {_channels(state)}",
+        "LAST NOTE": _note(watcher),
+    }
+
+
+def _law(state: wire.ControllerState) -> str:
+    delay = f"delay {state.delay_frames:g} {'frame' if state.delay_frames == 1 else 'frames'}"
+    if state.HasField("law"):
+        weight = min(max(state.law_frames - SETTLING_FRAMES, 0) / FADING_FRAMES, 1.0)
+        drives = "" if weight == 1 else f", taking over from the integrator ({100 * weight:.0f} %)"
+        return f"{short(printable(state.law.name))}{drives}; {delay}"
+    if not state.gain:
+        return f"integrator, no calibration; {delay}"
+    leak = f", leak {_values(list(state.leak))}" if any(state.leak) else ""
+    return f"integrator, gain {_values(list(state.gain))}{leak}; {delay}"
+
+
+def _values(values: list[float]) -> str:
+    """Each value with the number of its modes, where there are few; the range where there are many."""
+    counts = Counter(values)
+    if len(counts) == 1:
+        return f"{values[0]:.3g}"
+    if len(counts) > _MOST:
+        return f"{min(values):.3g} to {max(values):.3g}"
+    return ", ".join(f"{value:.3g} ({counted(count, 'mode')})" for value, count in counts.items())
+
+
+def _offset(state: wire.ControllerState, noll: tuple[int, ...]) -> str:
+    values = np.array(state.offset_nm)
+    set_ = np.flatnonzero(values)
+    if not set_.size:
+        return "no offset"
+    if len(noll) != len(values) or len(set_) > _MOST:
+        return f"offset {np.linalg.norm(values):.3g} nm rms, {counted(len(set_), 'mode')}"
+    return f"offset {', '.join(f'{mode_name(noll[place])} {values[place]:.3g}' for place in set_)} nm"
+
+
+def _channels(state: wire.ControllerState) -> str:
+    named = []
+    for one in state.channels[:_MOST]:
+        shape = np.frombuffer(one.actuators, "<f4").astype(np.float64)
+        rms_nm = float(np.sqrt(np.mean(shape**2))) if shape.size else 0.0
+        named.append(f"{printable(one.name)} {rms_nm:.3g} nm{'' if one.actuators == one.reached else ' (on its way)'}")
+    if len(state.channels) > _MOST:
+        named.append(f"{len(state.channels) - _MOST} more")
+    text = f"{'channel' if len(state.channels) == 1 else 'channels'} {', '.join(named)}" if named else "no channels"
+    return f"{text}; probe sequence on the {printable(state.play.target)}" if state.HasField("play") else text
+
+
+def _note(watcher: Watcher) -> str:
+    if watcher.note is None:
+        return "none known"
+    clock = datetime.fromtimestamp(from_timestamp(watcher.note.timestamp) * 1e-9, UTC)
+    return f"{clock:%H:%M} {short(printable(watcher.note.message.partition(' ')[2]))}"

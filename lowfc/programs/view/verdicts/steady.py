@@ -1,0 +1,130 @@
+"""The last frames under one loop mode and one control law, and what the law leaves beside what it could leave."""
+
+from collections import deque
+from typing import NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from lowfc.adapters.logs.columns import frame_rate_hz
+from lowfc.contract.messages import wire
+from lowfc.control.laws.spectra import pieces
+from lowfc.control.laws.stability import settling_frames
+from lowfc.control.laws.tuning import best_gains
+from lowfc.control.loop.safety import LoopMode
+from lowfc.programs.view.snapshot import Snapshot
+
+FRAMES = 6144
+"""Frames kept: for spectra eleven segments of 1024."""
+PERIOD_NS = 10_000_000_000
+"""Between two computations of the best gains, which take some 50 ms for 14 modes."""
+
+Single = npt.NDArray[np.float32]
+
+
+class LawInForce(NamedTuple):
+    """Gain and leak of each mode of the integrator, the delay in frames, and the linear law in its place, if any."""
+
+    gain: tuple[float, ...]
+    leak: tuple[float, ...]
+    delay_frames: float
+    linear: str
+
+
+class Steady:
+    """Measured error and pseudo-open-loop of the last frames since loop mode or law changed, and the law has settled.
+
+    Attributes:
+        mode: of the loop, as in a step; 0 before the first step.
+        law: in force; None where the controller does not report it, or reports one for other modes.
+    """
+
+    def __init__(self) -> None:
+        self.mode = 0
+        self.law: LawInForce | None = None
+        self._settling = 0
+        self._kept: deque[tuple[npt.NDArray[np.uint64], Single]] = deque()
+
+    def feed(self, snapshot: Snapshot) -> bool:
+        """Add the steps of a snapshot; False where it has none that belong to its calibration."""
+        steps, calibration = snapshot.steps, snapshot.calibration
+        if calibration is None or not len(steps.error_nm) or steps.error_nm.shape[1] != len(calibration.noll):
+            return False
+        law = _law_of(snapshot.controller, len(calibration.noll))
+        changes = np.flatnonzero(np.diff(steps.mode.astype(int), prepend=self.mode))
+        first = int(changes[-1]) if changes.size else 0
+        if changes.size or law != self.law:
+            self._kept.clear()
+            self.mode, self.law = int(steps.mode[-1]), law
+            self._settling = 0
+            if law is not None and self.mode == LoopMode.CLOSED:
+                self._settling = min(settling_frames(np.array(law.gain), np.array(law.leak)), FRAMES)
+        signals = np.concatenate([steps.error_nm, steps.pol_nm], axis=1)
+        left_out = min(self._settling, len(signals) - first)
+        self._settling -= left_out
+        self._kept.append((steps.sequence[first + left_out :], signals[first + left_out :]))
+        kept = sum(len(sequence) for sequence, _ in self._kept)
+        while kept - len(self._kept[0][0]) >= FRAMES:
+            kept -= len(self._kept.popleft()[0])
+        return True
+
+    def rows(self) -> tuple[npt.NDArray[np.uint64], Single]:
+        """Sequence of each frame, and error and pseudo-open-loop (frames, 2 x modes); after the first `feed`."""
+        sequence, signals = (np.concatenate(column) for column in zip(*self._kept, strict=True))
+        return sequence, signals
+
+
+class Attained(NamedTuple):
+    """Rms over the circle of all modes of the last frames under one law, nm; the sensor's noise is subtracted.
+
+    Attributes:
+        left_nm: what the loop leaves.
+        best_nm: what integrators with the best gains would leave, as `lowfc tune` predicts it.
+        noise_nm: the sensor's noise in one frame.
+    """
+
+    left_nm: float
+    best_nm: float
+    noise_nm: float
+
+
+class Attainable:
+    """Computes `found` every ten seconds of a closed loop; None while there are too few frames under one law."""
+
+    def __init__(self) -> None:
+        self.found: Attained | None = None
+        self._steady = Steady()
+        self._computed_ns = 0
+
+    def feed(self, snapshot: Snapshot) -> None:
+        """Add what is new."""
+        before = self._steady.mode, self._steady.law
+        if not self._steady.feed(snapshot):
+            return
+        if before != (self._steady.mode, self._steady.law):
+            self.found, self._computed_ns = None, snapshot.time_ns  # of another law
+        if snapshot.time_ns - self._computed_ns >= PERIOD_NS:
+            self._computed_ns = snapshot.time_ns
+            self.found = self._compute(frame_rate_hz(snapshot.camera, snapshot.steps))
+
+    def _compute(self, rate_hz: float) -> Attained | None:
+        law = self._steady.law
+        if law is None or self._steady.mode != LoopMode.CLOSED or not rate_hz:
+            return None
+        sequence, signals = self._steady.rows()
+        modes = len(law.gain)
+        try:
+            best = best_gains(pieces(sequence, signals[:, modes:]), rate_hz, law.delay_frames, np.array(law.leak))
+        except ValueError:
+            return None  # too few frames in a row
+        error_nm = signals[np.isfinite(signals).all(axis=1), :modes].astype(np.float64)
+        noise_nm2 = float(np.sum(best.noise_nm**2))
+        left_nm2 = max(float(np.mean(np.sum(error_nm**2, axis=1))) - noise_nm2, 0.0)
+        return Attained(left_nm2**0.5, float(np.linalg.norm(best.predicted_nm)), noise_nm2**0.5)
+
+
+def _law_of(state: wire.ControllerState | None, modes: int) -> LawInForce | None:
+    if state is None or not len(state.gain) == len(state.leak) == modes or not state.delay_frames >= 1:
+        return None
+    linear = (state.law.id or state.law.name) if state.HasField("law") else ""
+    return LawInForce(tuple(state.gain), tuple(state.leak), state.delay_frames, linear)

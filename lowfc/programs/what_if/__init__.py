@@ -1,1 +1,0 @@
-"""`lowfc replay --what-if`: a log under other gains, another reconstructor or another law."""

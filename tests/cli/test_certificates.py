@@ -1,0 +1,223 @@
+"""`lowfc certs`, read by another implementation: the standard library's OpenSSL."""
+
+import contextlib
+import datetime
+import socket
+import ssl
+import stat
+import threading
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import pytest
+from typer.testing import CliRunner
+
+from lowfc.adapters.bus.access import ROUTER
+from lowfc.adapters.bus.own_certificate import WARN_DAYS, read_certificate
+from lowfc.adapters.bus.routed import ending_certificates, router_trouble
+from lowfc.contract.configuration import Network
+from lowfc.contract.errors import ConfigurationError, DataFileError
+from lowfc.programs.cli.main import app
+
+make = pytest.importorskip("lowfc.adapters.bus.certificates", reason="needs the package cryptography").make_certificates
+
+
+def handshake(server: Path, client: Path, role: str, name: str = "localhost") -> None:
+    """Mutual TLS of a folder's router with another folder's role, in memory.
+
+    Raises:
+        ssl.SSLError: one of them does not take the other.
+    """
+    theirs, ours = (ssl.SSLContext(kind) for kind in (ssl.PROTOCOL_TLS_SERVER, ssl.PROTOCOL_TLS_CLIENT))
+    theirs.verify_mode = ssl.CERT_REQUIRED
+    theirs.load_verify_locations(server / "ca.pem")
+    theirs.load_cert_chain(server / "router.pem", server / "router.key")
+    ours.load_verify_locations(client / "ca.pem")
+    ours.load_cert_chain(client / f"{role}.pem", client / f"{role}.key")
+    to_server, to_client = ssl.MemoryBIO(), ssl.MemoryBIO()
+    ends = [
+        theirs.wrap_bio(to_server, to_client, server_side=True),
+        ours.wrap_bio(to_client, to_server, server_hostname=name),
+    ]
+    for _ in range(10):
+        for end in ends:
+            try:
+                end.do_handshake()
+            except ssl.SSLWantReadError:
+                continue
+    assert ends[0].getpeercert()["subject"] == ((("commonName", role),),)  # type: ignore[index]
+
+
+def test_router_and_roles_take_each_other(tmp_path: Path) -> None:
+    made = make(tmp_path, (ROUTER, "camera", "mirror-dm"), ["localhost", "10.0.0.1"])
+    assert [file.name for file in made] == ["router.pem", "camera.pem", "mirror-dm.pem"]
+    for role in ("camera", "mirror-dm"):
+        handshake(tmp_path, tmp_path, role)
+    handshake(tmp_path, tmp_path, "camera", "10.0.0.1")
+    with pytest.raises(ssl.SSLCertVerificationError, match=r"Hostname mismatch|not valid for"):
+        handshake(tmp_path, tmp_path, "camera", "example.org")
+
+
+def test_nobody_takes_another_authoritys(tmp_path: Path) -> None:
+    for name in ("ours", "theirs"):
+        make(tmp_path / name, (ROUTER, "camera"), ["localhost"])
+    with pytest.raises(ssl.SSLCertVerificationError):
+        handshake(tmp_path / "theirs", tmp_path / "ours", "camera")
+    (tmp_path / "ours" / "ca.pem").write_bytes((tmp_path / "theirs" / "ca.pem").read_bytes())
+    with pytest.raises(ssl.SSLError):
+        handshake(tmp_path / "theirs", tmp_path / "ours", "camera")
+
+
+def test_a_role_is_no_server(tmp_path: Path) -> None:
+    make(tmp_path, (ROUTER, "camera"), ["localhost"])
+    for kind in ("pem", "key"):
+        (tmp_path / f"router.{kind}").write_bytes((tmp_path / f"camera.{kind}").read_bytes())
+    with pytest.raises(ssl.SSLCertVerificationError, match=r"unsupported certificate purpose|unsuitable"):
+        handshake(tmp_path, tmp_path, "camera")
+
+
+def test_keys_are_closed_to_others(tmp_path: Path) -> None:
+    folder = tmp_path / "authority"
+    make(folder, (ROUTER, "camera"), ["localhost"])
+    modes = {file.name: stat.S_IMODE(file.stat().st_mode) for file in folder.iterdir()}
+    assert {name: mode for name, mode in modes.items() if name.endswith(".key")} == {
+        "ca.key": 0o600,
+        "camera.key": 0o600,
+        "router.key": 0o600,
+    }
+    assert set(modes) == {f"{name}.{kind}" for name in ("ca", "camera", "router") for kind in ("pem", "key")}
+    assert stat.S_IMODE(folder.stat().st_mode) == 0o700
+
+
+def test_what_is_there_stays_unless_it_is_renewed(tmp_path: Path) -> None:
+    make(tmp_path, (ROUTER, "camera"), ["localhost"])
+    before = {file.name: file.read_bytes() for file in tmp_path.iterdir()}
+    assert [file.name for file in make(tmp_path, (ROUTER, "camera", "viewer"), [])] == ["viewer.pem"]
+    assert {name: (tmp_path / name).read_bytes() for name in before} == before
+    make(tmp_path, ("camera",), [], renew=True)
+    changed = {name for name in before if (tmp_path / name).read_bytes() != before[name]}
+    assert changed == {"camera.pem"}  # it is of the key that is there: a machine that has the old key takes the new one
+    handshake(tmp_path, tmp_path, "camera")
+    handshake(tmp_path, tmp_path, "viewer")
+
+
+@pytest.mark.parametrize("gone", [(), ("camera.key",), ("camera.pem",), ("camera.key", "camera.pem")])
+@pytest.mark.parametrize("file", ["camera.key", "camera.pem", "viewer.pem"])
+def test_wherever_it_is_interrupted_a_pair_is_whole_or_not_there(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, file: str, gone: tuple[str, ...]
+) -> None:
+    roles = (ROUTER, "camera", "viewer")
+    make(tmp_path, roles, ["localhost"])
+    for name in gone:
+        (tmp_path / name).unlink()
+    replace = Path.replace
+
+    def interrupted(draft: Path, target: Path) -> Path:
+        if target.name == file:
+            raise KeyboardInterrupt
+        return replace(draft, target)
+
+    monkeypatch.setattr(Path, "replace", interrupted)
+    with contextlib.suppress(KeyboardInterrupt):
+        make(tmp_path, roles, ["localhost"], renew=True)
+    monkeypatch.undo()
+    for role in roles:
+        if all((tmp_path / f"{role}.{kind}").exists() for kind in ("pem", "key")):
+            handshake(tmp_path, tmp_path, role if role != ROUTER else "viewer")
+    assert not [name for name in tmp_path.iterdir() if name.name.startswith(".")]
+    make(tmp_path, roles, ["localhost"], renew=True)
+    handshake(tmp_path, tmp_path, "camera")
+    assert stat.S_IMODE((tmp_path / "camera.key").stat().st_mode) == 0o600
+
+
+@contextlib.contextmanager
+def answering(answer: Callable[[socket.socket], object]) -> Iterator[int]:
+    """Somebody who takes one connection, on a port of this host."""
+    with socket.create_server(("127.0.0.1", 0)) as server:
+
+        def serve() -> None:
+            connection, _ = server.accept()
+            with connection:
+                answer(connection)
+
+        thread = threading.Thread(target=serve)
+        thread.start()
+        yield server.getsockname()[1]
+        thread.join()
+
+
+def test_who_hangs_up_in_the_handshake_is_not_one_who_refuses_the_certificate(tmp_path: Path) -> None:
+    make(tmp_path, (ROUTER, "camera"), ["127.0.0.1"])
+    with answering(lambda connection: connection.recv(4096)) as port:
+        network = Network(router=f"tls/127.0.0.1:{port}", certificates=str(tmp_path))
+        assert "ends the connection in the midst of the handshake" in router_trouble(network, "camera")
+    assert "refused" in router_trouble(network, "camera")
+
+
+def test_a_certificate_is_read_as_its_peers_read_it(tmp_path: Path) -> None:
+    made = datetime.datetime.now(datetime.UTC)
+    make(tmp_path, (ROUTER, "camera"), ["localhost"], 100)
+    for role in (ROUTER, "camera"):
+        files = (tmp_path / "ca.pem", tmp_path / f"{role}.pem", tmp_path / f"{role}.key")
+        found = read_certificate(*files, server=role == ROUTER)
+        assert found.name == role
+        assert abs(found.ends - made - datetime.timedelta(days=100)) < datetime.timedelta(minutes=10)
+        with pytest.raises(DataFileError, match="is not a valid certificate"):
+            read_certificate(*files, server=role != ROUTER)
+    camera = tmp_path / "camera.pem", tmp_path / "camera.key"
+    for wrong in (
+        (tmp_path / "ca.pem", camera[0], tmp_path / "router.key"),
+        (camera[0], *camera),
+        (tmp_path / "none.pem", *camera),
+        (camera[1], *camera),
+    ):
+        with pytest.raises(DataFileError, match=r"camera\.pem is not a valid certificate of .* signed by"):
+            read_certificate(*wrong)
+
+
+def test_certificates_are_warned_about_before_their_end(tmp_path: Path) -> None:
+    now, day = datetime.datetime.now(datetime.UTC), datetime.timedelta(days=1)
+    network = Network(router="tls/localhost:7447", certificates=str(tmp_path))
+    make(tmp_path, (ROUTER, "camera"), ["localhost"], 100)
+    make(tmp_path, ("viewer",), [], 300)
+    assert ending_certificates(network, now + (99 - WARN_DAYS) * day) == []
+    date = now + 100 * day
+    assert ending_certificates(network, now + (100.5 - WARN_DAYS) * day) == [
+        f"the certificate of {role} ends in {WARN_DAYS - 1} days, on {date:%Y-%m-%d}" for role in ("camera", "router")
+    ]
+    assert len(ending_certificates(network, now + (3650 - WARN_DAYS + 1) * day)) == 3, "and the authority's own"
+    (tmp_path / "camera.key").write_bytes((tmp_path / "viewer.key").read_bytes())
+    (said,) = ending_certificates(network, now)
+    assert "camera.pem is not a valid certificate" in said
+
+
+def test_mistakes_are_said(tmp_path: Path) -> None:
+    with pytest.raises(ConfigurationError, match="by which name the others reach it"):
+        make(tmp_path / "none", (ROUTER,), [])
+    with pytest.raises(ConfigurationError, match=r"without port; got 'host:7447'"):
+        make(tmp_path / "none", (ROUTER,), ["host:7447"])
+    assert not (tmp_path / "none").exists()
+    make(tmp_path / "half", ("camera",), [])
+    (tmp_path / "half" / "ca.key").unlink()
+    with pytest.raises(DataFileError, match=r"has no ca\.key: make certificates where the authority's key is"):
+        make(tmp_path / "half", ("viewer",), [])
+    for name in ("one", "other"):
+        make(tmp_path / name, ("camera",), [])
+    (tmp_path / "one" / "ca.key").write_bytes((tmp_path / "other" / "ca.key").read_bytes())
+    with pytest.raises(DataFileError, match="is not the key of"):
+        make(tmp_path / "one", ("viewer",), [])
+    (tmp_path / "other" / "camera.key").write_bytes(b"nonsense")
+    with pytest.raises(DataFileError, match=r"camera\.key is not a key that was made here; remove it"):
+        make(tmp_path / "other", ("camera",), [], renew=True)
+    (tmp_path / "one" / "ca.key").write_bytes(b"nonsense")
+    with pytest.raises(DataFileError, match="are not an authority's key and certificate"):
+        make(tmp_path / "one", ("viewer",), [])
+
+
+def test_the_command_makes_all_roles(tmp_path: Path) -> None:
+    words = ["certs", str(tmp_path / "certs"), "--router", "localhost", "--mirror", "dm", "--mirror", "tip"]
+    done = CliRunner().invoke(app, words)
+    assert done.exit_code == 0, done.output
+    roles = {"router", "camera", "controller", "mirror-dm", "mirror-tip", "operator", "recorder", "viewer"}
+    assert {file.stem for file in (tmp_path / "certs").glob("*.pem")} == roles | {"ca"}
+    handshake(tmp_path / "certs", tmp_path / "certs", "mirror-tip")

@@ -1,0 +1,94 @@
+"""`lowfc hosts` and `lowfc router` leave nothing of having asked; docs/hosts.md has the code's figures."""
+
+import inspect
+import json
+import re
+from pathlib import Path
+
+import pytest
+from typer.testing import CliRunner
+
+from lowfc.adapters.bus import certificates, routed
+from lowfc.adapters.bus.run import open_run, runtime_base
+from lowfc.adapters.process.clock_offset import AT_ONCE, PERIOD_S, RECENT
+from lowfc.contract.configuration import Network, load
+from lowfc.contract.errors import BusError
+from lowfc.programs.cli.hosts import certs, joined
+from lowfc.programs.cli.main import app
+from tests.e2e.test_hosts import SHIFTS_NS
+
+DOCUMENT = Path(__file__).parents[2] / "docs" / "hosts.md"
+WAY = Network(router="tls/127.0.0.1:7447", certificates="/etc/lowfc/certs")
+
+
+@pytest.fixture
+def toml(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A configuration with a router, and no run at all."""
+    monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
+    file = tmp_path / "lowfc.toml"
+    file.write_text(f'[network]\nrouter = "{WAY.router}"\ncertificates = "{WAY.certificates}"\n')
+    return file
+
+
+def runs() -> list[str]:
+    return [path.name for path in runtime_base().iterdir() if path.is_dir()]
+
+
+@pytest.mark.usefixtures("toml")
+def test_a_run_that_is_not_there_is_not_made_by_asking() -> None:
+    done = CliRunner().invoke(app, ["hosts", "--run", "tpyo"])
+    assert isinstance(done.exception, BusError)
+    assert "there is no run 'tpyo'" in str(done.exception)
+    assert runs() == []
+
+
+@pytest.mark.usefixtures("toml")
+def test_a_session_is_of_a_run_that_is_there_or_is_to_be_made() -> None:
+    words = ["config", "zenoh", "--role", "camera", "--run", "tpyo"]
+    done = CliRunner().invoke(app, words)
+    assert isinstance(done.exception, BusError)
+    assert "there is no run 'tpyo'" in str(done.exception)
+    assert runs() == []
+    made = CliRunner().invoke(app, [*words, "--make"])
+    assert made.exit_code == 0
+    assert runs() == ["tpyo"]
+    assert CliRunner().invoke(app, words).stdout == made.stdout
+
+
+def test_the_routers_configuration_is_shown_without_making_its_run(toml: Path) -> None:
+    done = CliRunner().invoke(app, ["router", "--show", "--config", str(toml), "--run", "bench"])
+    assert done.exit_code == 0
+    assert json.loads(done.stdout)["listen"]["endpoints"] == [WAY.router]
+    assert runs() == []
+
+
+def test_by_a_router_one_asks_without_a_run_and_in_one_that_is_there(toml: Path) -> None:
+    settings = load(toml)
+    with joined(settings, "tpyo") as links:
+        assert links.network == WAY
+        assert links.secret_file.exists()
+    assert not links.secret_file.exists()
+    assert runs() == []
+    there = open_run("bench", network=WAY)
+    for one in (settings, load(None)):  # once it is there, its folder knows the way
+        with joined(one, "bench") as links:
+            assert links == there.links
+    assert runs() == ["bench"]
+
+
+def test_the_documents_figures_are_the_codes() -> None:
+    text = " ".join(DOCUMENT.read_text().split())
+    retry = routed.client_session(WAY, "camera", {})["connect"]["retry"]
+    shifts = [f"{ns / 1e9:g} s" if abs(ns) >= 1e9 else f"{ns / 1e6:g} ms" for ns in SHIFTS_NS.values()]
+    assert inspect.signature(certs).parameters["days"].default == certificates.DAYS
+    assert retry["period_max_ms"] == 1000
+    for sentence in (
+        f"Certificates are valid for {certificates.DAYS} days",
+        f"A link that is silent for {routed._LEASE_MS / 1000:g} s is closed, and tried anew at least every second",
+        f"{AT_ONCE} times before its first message and then {1 / PERIOD_S:g} times a second",
+        f"the shortest round trip of the last {RECENT}:",
+        f"put off by {', '.join(shifts[:-1])} and {shifts[-1]}",
+        f"with clocks {max(SHIFTS_NS.values()) / 1e9:g} s apart",
+    ):
+        assert sentence in text
+    assert not re.findall(r"\d+ (?:us|MHz|kB|MB|%)", text)  # what is measured is not typed in

@@ -1,0 +1,80 @@
+"""`lowfc --help`, and how a typed result becomes text and JSON."""
+
+import subprocess
+import sys
+
+import pytest
+import typer
+from typer.testing import CliRunner
+
+from lowfc.programs.cli.main import COMMANDS, PARTS, app
+from lowfc.programs.cli.result import Result, figure
+
+
+def test_every_command_is_listed_under_its_purpose_with_a_whole_sentence() -> None:
+    lines = CliRunner().invoke(app, ["--help"], terminal_width=80).stdout.splitlines()
+    assert max(map(len, lines)) <= 80
+    for heading, rows in COMMANDS.items():
+        assert f"{heading}:" in lines
+        for row in rows:
+            assert any(line.split(maxsplit=1) == [row.name, row.sentence] for line in lines), row.name
+
+
+@pytest.mark.parametrize("name", [row.name for rows in (*COMMANDS.values(), PARTS) for row in rows])
+def test_every_command_has_help_with_an_example(name: str) -> None:
+    done = CliRunner().invoke(app, [*name.split(), "--help"])
+    assert done.exit_code == 0, done.output
+    assert "Example: " in done.stdout
+
+
+def test_a_command_is_imported_when_it_is_used() -> None:
+    names = "('numpy', 'zenoh', 'rich')"
+    said = f"import sys, lowfc.programs.cli.main; print(*(name for name in {names} if name in sys.modules))"
+    done = subprocess.run([sys.executable, "-c", said], capture_output=True, text=True, check=True)
+    assert done.stdout == "\n"
+
+
+def test_a_name_that_is_none_is_answered_with_the_nearest() -> None:
+    group = typer.main.get_command(app)
+    with pytest.raises(Exception, match="Did you mean 'sim-loop'"), group.make_context("lowfc", ["sim-lop"]) as context:
+        group.resolve_command(context, ["sim-lop"])  # type: ignore[attr-defined]
+
+
+class Mode(Result):
+    noll: int = figure("mode", form="Z{}")
+    gain: float | None = figure("gain", form=".2f")
+    hidden: int = figure(default=0)
+
+    def remarks(self) -> list[str]:
+        return ["low"] if self.gain is not None and self.gain < 1 else []
+
+
+class Found(Result):
+    rate_hz: float = figure("rate", "Hz", "g")
+    good: bool = figure("good")
+    noll: list[int] = figure("mode", form="Z{}", column=True)
+    noise_nm: list[float] = figure("noise", "nm", ".1f", column=True)
+    modes: list[Mode] = figure("modes")
+    missing: float | None = figure("missing", default=None)
+
+
+def test_a_result_is_text_and_json_of_the_same_fields() -> None:
+    modes = [Mode(noll=2, gain=0.5), Mode(noll=11, gain=None)]
+    found = Found(rate_hz=250, good=True, noll=[2, 11], noise_nm=[1, 12.25], modes=modes)
+    assert found.text().splitlines() == [
+        "rate               250 Hz",
+        "good               yes",
+        "mode  noise, nm",
+        "Z2          1.0",
+        "Z11        12.2",
+        "mode  gain",
+        "Z2    0.50   low",
+        "Z11      -",
+    ]
+    assert found.figures() == {
+        "rate_hz": 250,
+        "good": True,
+        "noll": [2, 11],
+        "noise_nm": [1, 12.25],
+        "modes": [{"noll": 2, "gain": 0.5}, {"noll": 11, "gain": None}],
+    }

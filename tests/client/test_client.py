@@ -1,0 +1,725 @@
+"""The client of a running loop, its command line, and the recorder's switch: what is asked, and what comes back."""
+
+import contextlib
+import os
+import socket
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+import typer
+from astropy.io import fits
+
+from lowfc.adapters.bus.bus import Query, Sample
+from lowfc.adapters.bus.other_loops import other_loops
+from lowfc.adapters.bus.run import open_run
+from lowfc.adapters.files.mirror_maps import read_shape
+from lowfc.adapters.logs.reader import LogReader
+from lowfc.adapters.process.clock import HostClock
+from lowfc.client import Answer, Client, Frame, Stream, client, configuration_of, running, the_run
+from lowfc.client.requests import ASKED
+from lowfc.client.stream import WAITING, frame_of, step_of
+from lowfc.contract.codecs import codec
+from lowfc.contract.codecs.calibration_codec import encode_calibration, identified
+from lowfc.contract.configuration import Configuration
+from lowfc.contract.envelope import sequence_of
+from lowfc.contract.errors import BusError, CalibrationError, ConfigurationError, DataFileError, RequestRefusedError
+from lowfc.contract.events import EVENTS
+from lowfc.contract.messages import (
+    CALIBRATION,
+    CAMERA_STATE,
+    EVENT,
+    FRAME,
+    MIRROR_STATE,
+    REQUEST_KEY,
+    STEP,
+    Log,
+    Topic,
+    image,
+    wire,
+)
+from lowfc.control.laws.linear_law import LinearLaw, integrator_block, of_blocks
+from lowfc.control.loop.inputs import Reply, Request, Step
+from lowfc.control.loop.requests import REQUESTS
+from lowfc.control.loop.safety import LoopMode, Reason
+from lowfc.programs.cli.ctl.command import SIMPLE, ctl_app
+from lowfc.programs.cli.ctl.status import figures, text
+from lowfc.programs.cli.modes import noll_of
+from lowfc.testing.memory_bus import MemoryBus, MemoryHub, MemoryRing
+from tests.support.recording import Bench, bodies_of, put, until
+from tests.support.toy import NOLL, calibration
+
+pytestmark = pytest.mark.exclusive
+
+DOCUMENT = Path(__file__).parents[2] / "docs" / "operating.md"
+KNOWN = identified(calibration())
+LAW = of_blocks([integrator_block(0.2, 0.01, "pol", 1.5)] * 3, "pol", "leaky", NOLL, 1.5, 1000.0)
+SHAPE = np.arange(20.0).reshape(KNOWN.grid)
+
+
+class FakeController:
+    """Reads requests as the controller does, and answers what it is told to."""
+
+    def __init__(self) -> None:
+        self.hub = MemoryHub()
+        self.bus = MemoryBus(self.hub, "controller", HostClock())
+        self.bus.queryable(REQUEST_KEY.format(name="*"), self._ask)
+        self.bus.publisher(CALIBRATION).put(encode_calibration(KNOWN, 0))
+        self.asked: list[Request] = []
+        self.reply = Reply(True, "done", 77)
+        self.silent = False
+
+    def _ask(self, query: Query) -> None:
+        self.asked.append(codec.decode_request(query.payload, query.name, 0))
+        if not self.silent:
+            query.reply(codec.encode_request(self.asked[-1], self.reply, 1, None))
+
+    def join(self) -> Client:
+        return Client(bus=MemoryBus(self.hub, "operator", HostClock()))
+
+
+@pytest.fixture
+def controller() -> FakeController:
+    return FakeController()
+
+
+@pytest.fixture
+def loop(controller: FakeController) -> Client:
+    return controller.join()
+
+
+@pytest.fixture(autouse=True)
+def short_patience(monkeypatch: pytest.MonkeyPatch) -> None:
+    for name in ("CONNECT_S", "ANSWER_S"):
+        monkeypatch.setattr(client, name, 0.05)
+
+
+ASKS: dict[str, tuple[Callable[[Client], object], Request]] = {
+    "status": (lambda loop: loop.status(), Request(0, "status")),
+    "open": (lambda loop: loop.open_loop(), Request(0, "open")),
+    "close": (lambda loop: loop.close_loop(), Request(0, "close")),
+    "pause": (lambda loop: loop.pause(), Request(0, "pause")),
+    "step": (lambda loop: loop.step(7), Request(0, "step", (), (7.0,))),
+    "safe": (lambda loop: loop.safe(), Request(0, "safe")),
+    "clear": (lambda loop: loop.clear(), Request(0, "clear")),
+    "reset": (lambda loop: loop.reset(), Request(0, "reset")),
+    "gain": (lambda loop: loop.gain(0.5, [2, 3]), Request(0, "gain", (2, 3), (0.5,))),
+    "leak": (lambda loop: loop.leak(np.float32([0.5, 0.25])), Request(0, "leak", (), (0.5, 0.25))),
+    "limit": (lambda loop: loop.limit([20, 10], (4, 2)), Request(0, "limit", (4, 2), (20.0, 10.0))),
+    "offset": (lambda loop: loop.offset(), Request(0, "offset")),
+    "channel": (lambda loop: loop.channel("dark-hole", SHAPE), Request(0, "channel", text="dark-hole")),
+    "play": (
+        lambda loop: loop.play(np.stack([SHAPE, -SHAPE]), [[1, 2], [3, 4], [5, 6]]),
+        Request(0, "play", text="mirror"),
+    ),
+    "stop": (lambda loop: loop.stop(), Request(0, "stop")),
+    "law": (lambda loop: loop.law(), Request(0, "law")),
+    "load": (lambda loop: loop.load(KNOWN), Request(0, "load", calibration=KNOWN)),
+    "note": (lambda loop: loop.note("höher"), Request(0, "note", text="höher")),
+    "lease": (
+        lambda loop: loop.ask("lease", values=10, text="a test", lease_id=7),
+        Request(0, "lease", values=(10.0,), text="a test", lease_id=7),
+    ),
+    "renew": (
+        lambda loop: loop.ask("renew", values=10, text="a test", lease_id=7),
+        Request(0, "renew", values=(10.0,), text="a test", lease_id=7),
+    ),
+    "release": (lambda loop: loop.ask("release", lease_id=7), Request(0, "release", lease_id=7)),
+    "configuration": (lambda loop: loop.configuration(), Request(0, "configuration")),
+}
+
+
+@pytest.mark.parametrize("name", ASKS)
+def test_the_controller_reads_what_was_meant(controller: FakeController, loop: Client, name: str) -> None:
+    ask, wanted = ASKS[name]
+    answer = ask(loop)
+    (asked,) = controller.asked
+    assert asked == wanted
+    assert answer == ("done" if name == "configuration" else (True, "done", 77, asked.text, None, "default"))
+
+
+def test_one_mode_needs_no_list(controller: FakeController, loop: Client) -> None:
+    loop.gain(0.4, modes=2)
+    loop.limit([20, 10], modes=np.array([4, 2]))
+    loop.offset(5.0, modes=np.int64(4))
+    assert [request.modes for request in controller.asked] == [(2,), (4, 2), (4,)]
+    for wrong in (2.5, "2", [2, None]):
+        with pytest.raises(RequestRefusedError, match="gain refused: "):
+            loop.gain(0.4, modes=wrong)  # type: ignore[arg-type]
+    assert len(controller.asked) == 3
+
+
+def test_a_reservation_is_renewed_and_every_request_of_its_holder_carries_it(controller: FakeController) -> None:
+    loop = controller.join()
+    with loop.reserved("a test", 30.0) as lease:
+        loop.gain(0.1)
+        loop.check_lease()
+    loop.gain(0.2)
+    first, gain, *renewals, release, after = controller.asked
+    assert (first.name, first.lease_id, first.values) == ("lease", lease.id, (10.0,))
+    assert first.text.startswith("a test by ")
+    assert f"(process {os.getpid()}), about 30 s to go" in first.text
+    assert (gain.name, gain.lease_id) == ("gain", lease.id)
+    assert renewals
+    assert {(one.name, one.lease_id) for one in renewals} == {("renew", lease.id)}
+    assert (release.name, release.lease_id) == ("release", lease.id)
+    assert after.lease_id == 0
+
+
+def test_a_reservation_that_ended_says_why(controller: FakeController) -> None:
+    loop = controller.join()
+    with loop.reserved("a test"):
+        controller.reply = Reply(False, "the lease ended: operator asked to open", 77)
+        for _ in range(2):
+            with pytest.raises(CalibrationError, match="the lease ended: operator asked to open"):
+                loop.check_lease()
+
+
+def test_frames_have_the_same_number_everywhere() -> None:
+    sequence = sequence_of(1_800_000_000, 812)
+    shown = figures(wire.ControllerState(frame_sequence=sequence))["frame"]
+    frame = Frame(sequence, 0, np.zeros((1, 1), np.uint16))
+    step = Step(sequence, 0, LoopMode.CLOSED, np.zeros(3, np.float32), ())
+    assert {shown, frame.number, step.frame, Answer(True, "done", sequence).frame} == {812}
+
+
+def test_every_request_has_its_method() -> None:
+    assert tuple(ASKS) == REQUESTS
+
+
+def test_arrays_arrive_as_they_were(controller: FakeController, loop: Client) -> None:
+    loop.channel("dark-hole", SHAPE)
+    loop.channel("dark-hole")
+    loop.play(np.stack([SHAPE, -SHAPE]), [[1, 2], [3, 4], [5, 6]])
+    loop.play_offset(np.ones((4, 3)))
+    loop.law(LAW)
+    shape, removed, played, offset, law = controller.asked
+    assert np.array_equal(shape.actuators_nm, SHAPE.ravel())
+    assert removed.actuators_nm.size == 0
+    assert np.array_equal(played.actuators_nm, [*SHAPE.ravel(), *-SHAPE.ravel()])
+    assert np.array_equal(played.table, [[1, 2], [3, 4], [5, 6]])
+    assert (offset.text, offset.table.tolist()) == ("offset", np.ones((4, 3)).tolist())
+    assert law.law is not None
+    assert same_law(law.law, LAW)
+
+
+def same_law(one: LinearLaw, other: LinearLaw) -> bool:
+    arrays = all(
+        np.array_equal(getattr(one, name), getattr(other, name))
+        for name in ("transition", "measurement_gain", "command_gain", "predict_only", "output")
+    )
+    plain = all(getattr(one, name) == getattr(other, name) for name in ("name", "signal", "noll", "rate_hz"))
+    return arrays and plain and one.delay_frames == other.delay_frames
+
+
+def test_a_refusal_is_an_error_with_the_controllers_sentence(controller: FakeController, loop: Client) -> None:
+    controller.reply = Reply(False, "the loop is in safe mode", 3)
+    with pytest.raises(RequestRefusedError, match=r"^close refused: the loop is in safe mode \(run default\)$"):
+        loop.close_loop()
+
+
+@pytest.mark.parametrize(
+    ("ask", "why"),
+    [
+        (lambda loop: loop.gain(0.1, [-2]), "gain refused: .*-2"),
+        (lambda loop: loop.gain("much"), "gain refused: .*much"),
+        (lambda loop: loop.channel("a", SHAPE.T), r"the mirror has actuators of shape \(4, 5\), got .* \(5, 4\)"),
+        (lambda loop: loop.channel("a", SHAPE.ravel()), r"got an array of shape \(20,\)"),
+        (lambda loop: loop.play(np.stack([SHAPE]), [[1, 2]]), r"got arrays of shape \(1, 20\) and \(1, 2\)"),
+        (lambda loop: loop.play(SHAPE, [1, 2, 3, 4]), r"\(4, 5\) and \(4,\)"),
+        (lambda loop: loop.play_offset([1, 2, 3]), r"takes a table \(frames, modes\)"),
+        (lambda loop: loop.play_offset(np.zeros((3_000_000, 3))), "may have 16,000,000 bytes and has 36,000,0"),
+    ],
+)
+def test_what_cannot_be_asked_is_refused_here(
+    controller: FakeController, loop: Client, ask: Callable[[Client], object], why: str
+) -> None:
+    with pytest.raises(RequestRefusedError, match=why):
+        ask(loop)
+    assert controller.asked == []
+
+
+def test_nobody_there_and_nobody_answering_are_told_apart(controller: FakeController, loop: Client) -> None:
+    controller.silent = True
+    with pytest.raises(BusError, match=r"the controller of run 'default' did not answer within 0.05 s"):
+        loop.open_loop()
+    with pytest.raises(BusError, match="no recorder is there in run 'default': start one, as with `lowfc record`"):
+        loop.record(True)
+    controller.bus.close()
+    for ask in (loop.open_loop, loop.calibration):
+        with pytest.raises(
+            BusError, match="no controller is there in run 'default': start one, as with `lowfc controller`"
+        ):
+            ask()
+
+
+def test_the_calibration_in_use(loop: Client) -> None:
+    assert loop.calibration().id == KNOWN.id
+
+
+def test_the_configuration_of_a_loop_and_of_one_of_another_version(controller: FakeController, loop: Client) -> None:
+    for toml, rate_hz in ((Configuration().to_toml(), 250.0), ("[camera]\nrate_hz = 500.0\n", 500.0)):
+        controller.reply = Reply(True, toml, 77)
+        assert configuration_of(loop).camera.rate_hz == rate_hz
+    controller.reply = Reply(True, "[camera]\nspeed = 3\n", 77)
+    with pytest.raises(ConfigurationError, match=r"another version of lowfc: camera\.speed: .*; use the ") as caught:
+        configuration_of(loop)
+    assert "\n" not in str(caught.value)
+
+
+def listening(name: str, *roles: str) -> list[socket.socket]:
+    """Processes of a run that do nothing else."""
+    ports = open_run(name).links.ports
+    return [socket.create_server(("127.0.0.1", ports[role])) for role in roles]
+
+
+def test_a_run_is_found_by_who_is_there(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
+    where = rf"no loop of user \S+ is running here: {tmp_path}/lowfc was searched \(from XDG_RUNTIME_DIR\)"
+    with pytest.raises(BusError, match=where):
+        the_run(None)
+    open_run("empty")
+    with contextlib.ExitStack() as held:
+        for server in listening("left", "camera", "recorder"):
+            held.enter_context(server)
+        assert the_run(None) == the_run("left") == "left"
+        with pytest.raises(BusError, match=r"there is no run 'empty': there are left \(no controller yet\)$"):
+            the_run("empty")
+        for server in listening("whole", "camera", "controller"):
+            held.enter_context(server)
+        assert running() == ["whole"]
+        (open_run("damaged").path / "links.json").write_text("")
+        assert (the_run("whole"), the_run("left")) == ("whole", "left"), "a damaged one hides no other"
+        with pytest.raises(BusError, match=r"choose a run with --run.*: there are left \(no controller yet\), whole$"):
+            the_run(None)  # the other one may be starting
+        with pytest.raises(DataFileError, match=r"links\.json"):
+            the_run("damaged")
+
+
+def test_the_beginning_of_a_runs_name_is_enough(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
+    with contextlib.ExitStack() as held:
+        for name in ("night", "night-2", "noon"):
+            for server in listening(name, "controller"):
+                held.enter_context(server)
+        assert [the_run(word) for word in ("night", "night-", "noo")] == ["night", "night-2", "noon"]
+        with pytest.raises(BusError, match=r"'n' is the beginning of several runs: night, night-2, noon$"):
+            the_run("n")
+        with pytest.raises(BusError, match=r"there is no run 'day': there are night, night-2, noon$"):
+            the_run("day")
+
+
+def test_a_loop_that_is_not_seen_from_here_is_told_of(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Its owner, its process and its runtime directory, where the system tells."""
+    monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
+    words = [sys.executable, "-c", "print(flush=True); input()", "lowfc", "controller", "--run", "night"]
+    for there, told in (
+        ("/run/elsewhere", ", with XDG_RUNTIME_DIR=/run/elsewhere"),
+        (str(tmp_path), ", still starting"),
+    ):
+        environment = os.environ | {"XDG_RUNTIME_DIR": there}
+        with subprocess.Popen(words, stdin=subprocess.PIPE, stdout=subprocess.PIPE, env=environment) as process:
+            assert process.stdout is not None
+            process.stdout.readline()
+            said = list(other_loops())
+            process.communicate(b"\n")
+        assert f"you run `lowfc controller --run night` (process {process.pid}{told})" in said
+    stranger = tmp_path / "proc" / "77"
+    stranger.mkdir(parents=True)
+    (stranger / "cmdline").write_text("python\0/opt/lowfc/bin/lowfc\0controller\0")
+    monkeypatch.setattr(os, "geteuid", lambda: 4_000_000_000)
+    assert list(other_loops(tmp_path / "proc")) == [f"user {stranger.owner()} runs `lowfc controller` (process 77)"]
+
+
+# The mirror.
+
+
+def test_a_mirrors_restart_and_its_expired_command_are_seen_and_damaged_messages_are_not() -> None:
+    hub = MemoryHub()
+
+    def process(role: str) -> Callable[[int], object]:
+        states = MemoryBus(hub, role, HostClock()).publisher(MIRROR_STATE, role.removeprefix("mirror-"))
+        return lambda frame: states.put(wire.MirrorState(frame_sequence=frame).SerializeToString())
+
+    slow, quick = process("mirror-slow"), process("mirror-quick")
+    bus = Announced(hub, slow)
+    watch = Client(bus=bus).mirror_watch()
+    assert (watch.frame_sequence, watch.interruption) == (1, "")
+    slow(7)
+    quick(9)
+    for topic, name in ((MIRROR_STATE, "slow"), (EVENT, "")):
+        bus.publisher(topic, name).put(b"\xff")
+    bus.publisher(EVENT).put(EVENTS["COMMAND_BACK"].log("mirror-slow", 0).SerializeToString())
+    watch.read()
+    assert (watch.frame_sequence, watch.interruption) == (7, "")
+    process("mirror-quick")(10)
+    watch.read()
+    assert (watch.frame_sequence, watch.interruption) == (7, "the mirror 'quick' restarted")
+    expired = EVENTS["COMMAND_EXPIRED"].log("mirror-slow", 0, command_timeout_ms=200.0, action="holding the shape")
+    bus.publisher(EVENT).put(expired.SerializeToString())
+    watch.read()
+    assert watch.interruption.startswith("mirror-slow was without commands for too long (COMMAND_EXPIRED ")
+
+
+class Announced(MemoryBus):
+    """A mirror reports as soon as somebody listens."""
+
+    def __init__(self, hub: MemoryHub, report: Callable[[int], object]) -> None:
+        super().__init__(hub, "operator", HostClock())
+        self._report = report
+
+    def ring(self, topic: Topic, capacity: int) -> MemoryRing:
+        ring = super().ring(topic, capacity)
+        self._report(1)
+        return ring
+
+
+# Streams.
+
+
+class Queue:
+    """A ring that has these messages, all at once."""
+
+    def __init__(self, *samples: Sample) -> None:
+        self.samples = list(samples)
+
+    def drain(self) -> list[Sample]:
+        found, self.samples = self.samples, []
+        return found
+
+    def close(self) -> None:
+        pass
+
+
+def frame_sample(count: int, start_s: int = 1_700_000_000) -> Sample:
+    pixels = np.full((3, 4), count, np.uint16)
+    return Sample(
+        FRAME.key, image(pixels, count * 1000, "camera").SerializeToString(), sequence_of(start_s, count), 0, 0
+    )
+
+
+def stream(*samples: Sample, count: int | None = None) -> Stream[client.Frame]:
+    return Stream(Queue(*samples), frame_of, "frame", count, 0.02)
+
+
+def test_frames_come_in_their_order_as_arrays() -> None:
+    found = list(stream(*map(frame_sample, range(5, 15)), count=4))
+    assert [frame.pixels[0, 0] for frame in found] == [5, 6, 7, 8]
+    assert [(frame.sequence & 0xFFFF, frame.time_ns) for frame in found] == [(5, 5000), (6, 6000), (7, 7000), (8, 8000)]
+    assert (found[0].pixels.shape, found[0].pixels.dtype) == ((3, 4), np.uint16)
+
+
+def test_what_did_not_get_here_is_counted_and_a_restart_is_no_loss() -> None:
+    broken = frame_sample(9)._replace(payload=b"\xff")
+    again = [frame_sample(count, 1_700_000_060) for count in (0, 2)]
+    frames = stream(frame_sample(5), frame_sample(8), broken, frame_sample(10), *again, count=5)
+    assert len(list(frames)) == 5
+    assert frames.lost == 2 + 1 + 1
+
+
+def test_what_comes_twice_or_out_of_order_is_not_lost() -> None:
+    before = frame_sample(2, 1_699_999_000)
+    frames = stream(*map(frame_sample, (5, 7, 7, 6)), before, *map(frame_sample, (8, 8, 11, 10)), count=9)
+    assert [frame.sequence & 0xFFFF for frame in frames] == [5, 7, 7, 6, 2, 8, 8, 11, 10]
+    assert frames.lost == 1, "9 alone did not come"
+
+
+def test_silence_is_an_error_and_so_is_a_stream_that_never_begins() -> None:
+    frames = stream(frame_sample(1))
+    next(frames)
+    with pytest.raises(BusError, match=r"no frame came within 0.02 s: `lowfc ctl status` says why"):
+        next(frames)
+    with pytest.raises(BusError, match="no frame came"):
+        stream()
+
+
+def test_a_closed_stream_has_ended() -> None:
+    frames = stream(*map(frame_sample, range(9)))
+    next(frames)
+    frames.close()
+    assert list(frames) == []
+
+
+def test_a_stream_that_has_ended_is_sent_nothing_more(
+    controller: FakeController, loop: Client, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    publisher, ring, before = controller.bus.publisher(FRAME), loop._bus.ring, list(loop._bus._subscriptions)
+    monkeypatch.setattr(loop._bus, "ring", lambda topic, capacity: _fed(ring(topic, capacity), publisher.put))
+    assert len(list(loop.frames(2))) == 2
+    assert loop._bus._subscriptions == before
+    frames = loop.frames(patience_s=0.02)
+    with pytest.raises(BusError):
+        list(frames)
+    assert loop._bus._subscriptions == before
+    assert list(frames) == []
+
+
+def test_a_slow_reader_loses_the_oldest_and_knows(controller: FakeController, loop: Client) -> None:
+    ring = loop._bus.ring(FRAME, WAITING)
+    publisher = controller.bus.publisher(FRAME)
+    payload = frame_sample(1).payload
+    for _ in range(WAITING + 30):
+        publisher.put(payload)
+    frames = Stream(ring, frame_of, "frame", WAITING, 0.02)
+    first = next(frames)
+    for _ in range(5):
+        publisher.put(payload)
+    assert first.sequence & 0xFFFF == 30
+    assert len(list(frames)) == WAITING - 1
+    assert frames.lost == 0, "what came before the first one was not asked for"
+
+
+def test_the_frames_of_a_bus(controller: FakeController, loop: Client, monkeypatch: pytest.MonkeyPatch) -> None:
+    """From the moment `frames` returns, none is missed."""
+    publisher = controller.bus.publisher(FRAME)
+    ring = loop._bus.ring
+    monkeypatch.setattr(loop._bus, "ring", lambda topic, capacity: _fed(ring(topic, capacity), publisher.put))
+    assert [frame.pixels[0, 0] for frame in loop.frames(3)] == [0, 1, 2]
+
+
+def _fed(ring: object, put: Callable[[bytes], object]) -> object:
+    for count in range(3):
+        put(frame_sample(count).payload)
+    return ring
+
+
+def test_an_answer_that_is_none_is_an_error_with_a_sentence() -> None:
+    hub = MemoryHub()
+    controller = MemoryBus(hub, "controller", HostClock())
+    controller.queryable(REQUEST_KEY.format(name="*"), lambda query: query.reply(b"\xff"))
+    loop = Client(bus=MemoryBus(hub, "operator", HostClock()))
+    with pytest.raises(BusError, match=r"safe was answered with what is no lowfc\.v1\.Request"):
+        loop.safe()
+    for payload in (b"\xff", b""):
+        controller.publisher(CALIBRATION).put(payload)
+        with pytest.raises(BusError, match="lowfc/calibration was answered with what is no calibration"):
+            loop.calibration()
+        hub.buses.remove(controller)
+        controller = MemoryBus(hub, "controller", HostClock())
+
+
+def test_a_step_comes_as_it_was_sent() -> None:
+    three = np.array([1.5, -2.0, 0.25], np.float32)
+    sent = Step(9, 5_000, LoopMode.CLOSED, three, (Reason.SLEW,), three + 1, three + 2, 1234.5, 3)
+    got = step_of(Sample(STEP.key, codec.encode_step(sent, 1), 0, 0, 0))
+    assert got is not None
+    for name in Step._fields:
+        assert np.array_equal(getattr(got, name), getattr(sent, name)), name
+    held = step_of(Sample(STEP.key, codec.encode_step(sent._replace(error_nm=None, pol_nm=None), 1), 0, 0, 0))
+    assert held is not None
+    assert (held.error_nm, held.pol_nm) == (None, None)
+    assert step_of(Sample(STEP.key, b"\xff", 0, 0, 0)) is None
+
+
+# The declaration, the document and the command line.
+
+
+def test_the_declared_requests_are_those_that_there_are() -> None:
+    by_key = {asked.key: asked for asked in ASKED}
+    assert len(by_key) == len(ASKED)
+    assert list(by_key) == [
+        *(REQUEST_KEY.format(name=name) for name in REQUESTS),
+        "lowfc/record/start",
+        "lowfc/record/stop",
+    ]
+    fields = set(wire.Request.DESCRIPTOR.fields_by_name)
+    assert all({name for name, _ in asked.fields} <= fields for asked in ASKED)
+    assert all(not by_key[REQUEST_KEY.format(name=name)].fields for name in SIMPLE)
+
+
+def test_every_command_has_help_with_an_example() -> None:
+    group = typer.main.get_command(ctl_app)
+    commands = dict(group.commands) | {  # type: ignore[attr-defined]
+        f"record {name}": each
+        for name, each in group.commands["record"].commands.items()  # type: ignore[attr-defined]
+    }
+    names = {asked.example.split()[0] for asked in ASKED if asked.example}
+    assert names | {"dark", "reference"} == {name.split()[0] for name in commands}
+    for name, command in commands.items():
+        assert f"Example: lowfc {'calibrate' if name in ('dark', 'reference') else 'ctl'}" in command.help, name
+
+
+@pytest.mark.parametrize(
+    ("words", "noll"),
+    [(None, ()), (["2,3"], (2, 3)), (["2", "3"], (2, 3)), (["4-7, 11"], (4, 5, 6, 7, 11)), (["3,2-4"], (3, 2, 4))],
+)
+def test_modes_are_read_as_people_write_them(words: list[str] | None, noll: tuple[int, ...]) -> None:
+    assert noll_of(words) == noll
+
+
+@pytest.mark.parametrize("word", ["x", "2-", "-2", "2.5", "11-4", "2,11-4", "", ",", "2-9999999999"])
+def test_modes_that_are_none_are_refused(word: str) -> None:
+    with pytest.raises(ConfigurationError, match="as in 2,3 or 4-11") as caught:
+        noll_of([word])
+    assert "\n" not in str(caught.value)
+
+
+def test_shapes_are_read_from_fits_and_numpy(tmp_path: Path) -> None:
+    np.save(tmp_path / "shape.npy", SHAPE)
+    fits.HDUList([fits.PrimaryHDU(), fits.ImageHDU(SHAPE)]).writeto(tmp_path / "shape.fits")
+    for name in ("shape.npy", "shape.fits"):
+        read = read_shape(tmp_path / name)
+        assert (read.dtype, read.tolist()) == (np.float32, SHAPE.tolist())
+
+
+def test_files_that_hold_no_shape_are_refused(tmp_path: Path) -> None:
+    np.save(tmp_path / "cube.npy", np.zeros((2, 3, 4)))
+    np.save(tmp_path / "pickled.npy", np.array([{}], object), allow_pickle=True)
+    (tmp_path / "text.fits").write_text("no")
+    fits.PrimaryHDU().writeto(tmp_path / "empty.fits")
+    for name, why in {
+        "none.fits": "there is no such file",
+        "cube.npy": r"\(2, 3, 4\) of float64",
+        "pickled.npy": "neither",
+        "text.fits": "neither",
+        "empty.fits": "there is no image",
+    }.items():
+        with pytest.raises(DataFileError, match=why):
+            read_shape(tmp_path / name)
+
+
+def test_the_status_says_everything() -> None:
+    state = wire.ControllerState(
+        mode=wire.LOOP_MODE_CLOSED,
+        frame_sequence=(5 << 32) + 107,
+        frames_used=90,
+        gain=[0.5, 0.25],
+        leak=[0, 0],
+        limit_nm=[100, 100],
+        offset_nm=[3, -4],
+        command_history_nm=[6, 8, 1, 1],
+        steps_left=12,
+        returning_to_zero=True,
+        calibration_id="0123456789abcdef",
+        limits_hit=[wire.REASON_SLEW],
+        law=wire.LinearLaw(name="lqg"),
+        law_frames=150,
+        play=wire.Play(target="mirror", first_sequence=(5 << 32) + 100, columns=2, table=bytes(8 * 20)),
+    )
+    state.channels.add(
+        name="dark-hole", actuators=np.float32([3, 4]).tobytes(), shifts=True, reached=np.float32([3, 3]).tobytes()
+    )
+    said = figures(state)
+    assert (said["mode"], said["frame"], said["steps_left"]) == ("closed", 107, 12)
+    assert (said["command_rms_nm"], said["offset_rms_nm"]) == (10.0, 5.0)
+    assert said["law"] == {"name": "lqg", "weight": 0.5}
+    assert said["playing"] == {"target": "mirror", "frames": 20, "frames_left": 12}
+    assert said["channels"] == [
+        {"name": "dark-hole", "rms_nm": pytest.approx(12.5**0.5), "shifts_zero_point": True, "reached": False}
+    ]
+    assert said["limits_hit"] == ["SLEW"]
+    for words in (
+        "closed, opens after 12 frames",
+        "5.000 nm rms",
+        "lqg",
+        "dark-hole 3.54 nm rms",
+        "12 of 20",
+        "acting: slew",
+    ):
+        assert words in text(state)
+    assert figures(wire.ControllerState())["mode"] == "starting"
+    assert "none" in text(wire.ControllerState())
+
+
+# The recorder's switch.
+
+
+@pytest.fixture
+def bench(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Bench:
+    monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
+    monkeypatch.setattr(client, "SLOW_ANSWER_S", 10.0)
+    return Bench(tmp_path / "logs")
+
+
+def operator(bench: Bench) -> Client:
+    return Client(bus=MemoryBus(bench.hub, "operator", bench.clock))
+
+
+def test_a_recording_is_stopped_and_started(bench: Bench) -> None:
+    put(bench.controller.publisher(CALIBRATION), 1)
+    states = bench.camera.publisher(CAMERA_STATE)
+    frames = bench.camera.publisher(FRAME)
+    bench.start()
+    hand = operator(bench)
+    first = put(frames, 50)
+    stopped = Path(hand.record(False).text)
+    assert stopped.is_absolute()
+    reader = LogReader(stopped)
+    read = list(reader)
+    assert reader.complete
+    assert bodies_of(read, FRAME) == first
+    events = [Log.FromString(body).message for body in bodies_of(read, EVENT)]
+    assert "RECORDING_STOPPED recording stopped: operator asked" in events
+    put(frames, 40)
+    put(states, 1)
+    with pytest.raises(RequestRefusedError, match="nothing is being recorded"):
+        hand.record(False)
+    until(lambda: not len(bench.recorder._backlog))
+    started = hand.record(True)
+    with pytest.raises(RequestRefusedError, match="it is being recorded already"):
+        hand.record(True)
+    second = put(frames, 30)
+    summary = bench.stop()
+    assert [path.absolute() for path in summary.files] == [stopped, Path(started.text)]
+    read = list(LogReader(summary.files[1]))
+    assert [message.key for message in read[:2]] == [CALIBRATION.key, CAMERA_STATE.key], "what came meanwhile too"
+    assert bodies_of(read, FRAME) == second
+    assert "RECORDING recording" in [Log.FromString(body).message for body in bodies_of(read, EVENT)]
+    assert (summary.lost, summary.failure) == ({}, ""), "what nobody wanted recorded is not lost"
+    assert summary.messages == sum(len(list(LogReader(path))) for path in summary.files)
+
+
+def test_a_recorder_ends_well_while_it_is_stopped(bench: Bench) -> None:
+    frames = bench.camera.publisher(FRAME)
+    bench.start()
+    sent = put(frames, 20)
+    operator(bench).record(False)
+    put(frames, 20)
+    summary = bench.stop()
+    (path,) = summary.files
+    assert bodies_of(list(LogReader(path)), FRAME) == sent
+    assert (summary.lost, summary.failure) == ({}, "")
+
+
+def test_losses_are_counted_on_both_sides_of_a_stop(bench: Bench) -> None:
+    frames = bench.camera.publisher(FRAME)
+    bench.hub.lose = lambda role, key, envelope: (
+        role == "recorder" and key == FRAME.key and envelope.sequence & 0xFFFF in (5, 25)
+    )
+    bench.start()
+    hand = operator(bench)
+    put(frames, 10)
+    hand.record(False)
+    put(frames, 10)
+    hand.record(True)
+    put(frames, 10)
+    assert bench.stop().lost == {FRAME.key: 2}
+
+
+def test_a_log_that_cannot_be_begun_is_refused_and_may_be_asked_for_again(bench: Bench) -> None:
+    bench.start()
+    hand = operator(bench)
+    whole = hand.record(False).text
+    moved = bench.folder.with_name("elsewhere")
+    bench.folder.rename(moved)
+    bench.folder.write_text("a file")
+    with pytest.raises(RequestRefusedError, match="cannot be made"):
+        hand.record(True)
+    bench.folder.unlink()
+    moved.rename(bench.folder)
+    assert hand.record(True).text != whole
+    summary = bench.stop()
+    assert len(summary.files) == 2
+    assert summary.failure == ""
+
+
+def test_a_recorder_is_told_nothing_else(bench: Bench) -> None:
+    bench.start()
+    bus = MemoryBus(bench.hub, "operator", bench.clock)
+    (answer,) = bus.get("lowfc/record/dance", timeout_s=10)
+    message = wire.Request.FromString(answer.payload)
+    assert (message.accepted, message.reply) == (False, "a recorder is told to start or to stop, not to dance")
+    bench.stop()

@@ -1,0 +1,402 @@
+"""Calibration of a whole loop in one process: the controller's own functions, the simulated optics, photon noise."""
+
+import contextlib
+import io
+import re
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import pytest
+
+from lowfc.client import mirror_watch
+from lowfc.contract.configuration import Configuration, load
+from lowfc.contract.errors import BusError, CalibrationError, DataFileError
+from lowfc.contract.events import EVENTS
+from lowfc.contract.messages import EVENT, wire
+from lowfc.control.calibration.calibration import Calibration
+from lowfc.control.calibration.response_fit import Initial, Sums, cross_talk
+from lowfc.programs.commissioning.calibrate import recording
+from lowfc.programs.commissioning.calibrate.pokes import CalibrationRequest
+from lowfc.programs.commissioning.calibrate.result import measured_calibration
+from lowfc.programs.commissioning.calibrate.run import CalibrationData, Calibrator, go_on, keep, partial_of
+from tests.support.folded_loop import FoldedLoop, Given
+
+OUT = Path("night.fits")
+BRIGHT = {
+    "sensor.sam": "sam27d10_bal14",
+    "star.magnitude": 0.0,
+    "disturbance.preset": "quiet",
+}
+
+
+def configured(**changes: object) -> Configuration:
+    return load(None, BRIGHT | {key.replace("__", "."): value for key, value in changes.items()})
+
+
+FEW = {"sensor.modes": 6}
+"""Modes, for what does not hang on their number: a cycle is half as long."""
+
+
+@pytest.fixture(autouse=True)
+def _folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+
+
+def ignore(*told: object) -> None:
+    pass
+
+
+def of(
+    loop: FoldedLoop, method: str, cycles: int = 4, *, say: Callable[[str], None] = ignore, **more: Any
+) -> Calibrator:
+    wanted = CalibrationRequest(method, **{"out": OUT, "snr": 50.0, "cycles": cycles, **more})
+    return Calibrator(loop, wanted, say, ignore)
+
+
+def taken_of(loop: FoldedLoop, method: str, cycles: int = 4, **wanted: Any) -> tuple[Calibrator, CalibrationData]:
+    calibrator = of(loop, method, cycles, **wanted)
+    with calibrator.holding():
+        return calibrator, calibrator.run()
+
+
+def mode_of(loop: FoldedLoop) -> int:
+    state = loop.status().state
+    assert state is not None
+    return state.mode
+
+
+def calibrated(loop: FoldedLoop, method: str, cycles: int) -> tuple[Calibration, CalibrationData]:
+    calibrator, taken = taken_of(loop, method, cycles)
+    made, _ = measured_calibration(
+        loop.config, calibrator.before, taken.measured, CalibrationRequest(method, OUT, 50.0)
+    )
+    return made, taken
+
+
+@pytest.mark.parametrize(
+    ("method", "delay", "modes", "cycles"),
+    [
+        pytest.param("hadamard", 1.0, 14, 4, marks=pytest.mark.slow),
+        ("hadamard", 1.0, 6, 4),
+        ("poke", 1.5, 6, 6),
+        pytest.param("in-loop", 2.0, 6, 4, marks=pytest.mark.slow),
+    ],
+)
+def test_what_is_measured_reads_the_true_modes(method: str, delay: float, modes: int, cycles: int) -> None:
+    config = configured(camera__delay_frames=delay, sensor__modes=modes)
+    loop = FoldedLoop(config)
+    if method == "in-loop":
+        loop.close_loop()
+        loop.run(30)
+    before = loop.calibration()
+    made, taken = calibrated(loop, method, cycles)
+    assert abs(taken.delay.delay_frames - delay) < 0.05
+    assert taken.measured.error.max() < 0.02
+    talk = np.abs(cross_talk(made.reconstructor, before.response))
+    assert (talk - 4 * taken.measured.error[:, None]).max() < 0.02
+    assert np.allclose(made.actuators_to_modes @ made.modes_to_actuators, np.eye(len(made.noll)), atol=1e-4)
+    close = made.actuators_to_modes - before.actuators_to_modes
+    assert np.linalg.norm(close) < 0.1 * np.linalg.norm(before.actuators_to_modes)
+    assert made.id != before.id
+    assert made.estimator == f"weighted+{method}"
+
+
+def closed(config: Configuration, calibration: Calibration, frames: int, world: Configuration) -> np.ndarray:
+    """True residual (frames, modes) of the second half of a closed loop."""
+    loop = FoldedLoop(config, calibration, world)
+    loop.close_loop()
+    loop.run(frames)
+    return np.array(loop.residual_nm[frames // 2 :], dtype=np.float64)
+
+
+def test_a_loop_on_the_measured_calibration_is_as_good_as_on_the_computed_one() -> None:
+    loop = FoldedLoop(configured(**FEW))
+    made, _ = calibrated(loop, "hadamard", 4)
+    shaken = configured(**FEW, disturbance__preset="bench")
+    of_computed, of_measured = (closed(shaken, each, 600, shaken) for each in (loop.calibration(), made))
+    one, other = (np.sqrt((each**2).sum(axis=1).mean()) for each in (of_computed, of_measured))
+    assert abs(other / one - 1) < 0.05
+
+
+def test_a_mirror_with_dead_actuators_and_another_scale_calibrates_and_closes() -> None:
+    dead = [300, 417, 595, 700, 812]
+    active = np.ones(34 * 34)
+    active[dead] = 0
+    np.save("active.npy", active.reshape(34, 34))
+    config = configured(**FEW, mirror__active="active.npy")
+    true = {"mirror__dead": dead, "mirror__magnification": 1.01}
+    loop = FoldedLoop(config, world=configured(**FEW, **true))
+    made, taken = calibrated(loop, "hadamard", 4)
+    assert of(loop, "hadamard", 4).pokes.amplitude_nm <= 3
+    assert not made.modes_to_actuators[dead].any()
+    assert not made.actuators_to_modes[:, dead].any()
+    wrong = cross_talk(loop.calibration().reconstructor, taken.measured.response)
+    assert np.abs(wrong).max() > 0.02  # the computed calibration does not know of it
+    shaken = configured(**FEW, **true, disturbance__static_nm={"2": 10.0, "5": 8.0, "7": -6.0})
+    settled = closed(config, made, 400, shaken).mean(axis=0)
+    assert np.abs(settled).max() < 0.5
+
+
+def test_a_reference_that_is_not_flat_is_held() -> None:
+    state = {"4": 15.0, "7": -10.0}
+    config = configured(**FEW)
+    loop = FoldedLoop(config, world=configured(**FEW, disturbance__static_nm=state))
+    made, _ = calibrated(loop, "hadamard", 4)
+    zero = loop.residual_nm[0]
+    moved = configured(**FEW, disturbance__static_nm=state | {"4": 35.0, "6": 20.0})
+    off = closed(config, made, 600, moved).mean(axis=0) - zero
+    assert np.abs(off).max() < 0.02 * 20.0
+
+
+class Interrupting(FoldedLoop):
+    """Ctrl-C during the second play."""
+
+    plays = 0
+
+    def play(self, basis_nm: npt.ArrayLike, table: npt.ArrayLike) -> Given:
+        given = super().play(basis_nm, table)
+        self.plays += 1
+        if self.plays == 3:
+            self.run(100)
+            raise KeyboardInterrupt
+        return given
+
+
+def test_after_ctrl_c_the_mirror_is_where_it_was_and_the_cycles_done_are_kept() -> None:
+    loop = Interrupting(configured(**FEW, disturbance__static_nm={"4": 5.0}))
+    loop.close_loop()
+    loop.run(50)
+    loop.open_loop()
+    loop.run(5)
+    held = loop.surfaces_nm[-1]
+    assert np.abs(held).max() > 1
+    with pytest.raises(KeyboardInterrupt):
+        taken_of(loop, "hadamard", 4)
+    assert np.abs(loop.surfaces_nm[-1] - held).max() > 1
+    loop.run(5)
+    assert np.array_equal(loop.surfaces_nm[-1], held)
+    assert loop.stops == 1
+    kept = go_on(partial_of(OUT), {"method": "hadamard"})
+    assert kept.cycles == 1
+    _, taken = taken_of(loop, "hadamard", 4, resume=True)
+    assert taken.measured.cycles == 4
+    assert np.array_equal(loop.surfaces_nm[-1], held)
+    with pytest.raises(DataFileError, match="its method is hadamard, now it is poke"):
+        taken_of(loop, "poke", 4, resume=True)
+    with pytest.raises(DataFileError, match="nothing to go on from"):
+        taken_of(loop, "poke", 4, out=Path("other.fits"), resume=True)
+
+
+def test_a_closed_loop_is_opened_for_pokes_and_closed_again() -> None:
+    loop = FoldedLoop(configured(**FEW))
+    with pytest.raises(CalibrationError, match="the loop is open: `lowfc ctl close` first"):
+        taken_of(loop, "in-loop", 4)
+    loop.close_loop()
+    calibrator = of(loop, "poke", 4)
+    modes = []
+    with calibrator.holding():
+        modes.append(mode_of(loop))
+    assert [*modes, mode_of(loop)] == [wire.LOOP_MODE_OPEN, wire.LOOP_MODE_CLOSED]
+    loop.ask("safe")
+    with pytest.raises(CalibrationError, match="must be open or closed"), calibrator.holding():
+        pass
+
+
+class Meddled(FoldedLoop):
+    """Somebody asks for something in the middle of a play, and a play is then not to be stopped where it is mute."""
+
+    def __init__(self, name: str, *, mute: bool = False, **fields: Any) -> None:
+        super().__init__(configured(**FEW))
+        self._name, self._fields, self._mute = name, fields, mute
+
+    def play(self, basis_nm: npt.ArrayLike, table: npt.ArrayLike) -> Given:
+        given = super().play(basis_nm, table)
+        self.run(50)
+        self.ask(self._name, **self._fields)
+        return given
+
+    def stop(self) -> Given:
+        given = super().stop()
+        if self._mute:
+            raise BusError("no answer")
+        return given
+
+
+@pytest.mark.parametrize(
+    ("asked", "why", "mode", "after"),
+    [
+        ({"name": "safe", "mute": True}, "the loop went from open to safe", wire.LOOP_MODE_SAFE, "close refused"),
+        ({"name": "open", "lease_id": 0}, "operator asked to open", wire.LOOP_MODE_OPEN, ""),
+    ],
+    ids=["safe", "open"],
+)
+def test_what_another_operator_asks_ends_a_calibration_and_has_the_last_word(
+    asked: dict[str, Any], why: str, mode: int, after: str
+) -> None:
+    loop = Meddled(**asked)
+    loop.close_loop()
+    said: list[str] = []
+    calibrator = of(loop, "poke", say=said.append)
+    reserved = loop.reserved("a test") if mode == wire.LOOP_MODE_OPEN else contextlib.nullcontext()
+    with reserved, pytest.raises(CalibrationError, match=why), calibrator.holding():
+        calibrator.run()
+    assert mode_of(loop) == mode
+    assert loop.stops == 1
+    assert said[-1].startswith(f"warning: the loop is not closed again: {after}")
+
+
+def test_a_loop_is_closed_again_after_a_failure() -> None:
+    loop = FoldedLoop(configured(**FEW))
+    loop.close_loop()
+    with pytest.raises(CalibrationError, match="failed"), of(loop, "poke", 4).holding():
+        raise CalibrationError("failed")
+    assert mode_of(loop) == wire.LOOP_MODE_CLOSED
+
+
+def test_cycles_that_cannot_be_read_are_a_line() -> None:
+    path = partial_of(OUT)
+    keep(path, Sums.none(Initial(np.zeros((2, 4)), "weighted")), {"method": "poke"})
+    whole = path.read_bytes()
+    one = io.BytesIO()
+    np.save(one, np.zeros(3))
+    for damaged in (b"", whole[: len(whole) // 2], one.getvalue()):
+        path.write_bytes(damaged)
+        with pytest.raises(DataFileError, match="is damaged, or no part of a calibration") as caught:
+            go_on(path, {"method": "poke"})
+        assert "\n" not in str(caught.value)
+
+
+def test_lost_frames_cost_only_themselves() -> None:
+    config = configured(**FEW, camera__delay_frames=1.5)
+    loop = FoldedLoop(config, lose=lambda index: index > 700 and index % 41 == 0)
+    before = loop.calibration()
+    made, taken = calibrated(loop, "hadamard", 4)
+    talk = np.abs(cross_talk(made.reconstructor, before.response))
+    assert (talk - 4 * taken.measured.error[:, None]).max() < 0.02
+
+
+def test_what_cannot_be_calibrated_is_said(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(recording, "ATTEMPTS", 2)
+    blind = FoldedLoop(configured(**FEW), world=configured(**FEW, mirror__dead=list(range(34 * 34))))
+    with pytest.raises(CalibrationError, match="pokes are not seen"):
+        taken_of(blind, "hadamard", 4)
+    loop = FoldedLoop(configured(**FEW))
+    with pytest.raises(CalibrationError, match="at most 3 nm of each"):
+        of(loop, "hadamard", 4, amplitude_nm=5.0)
+    with pytest.raises(CalibrationError, match="slew limit; at most"):
+        of(loop, "poke", 4, amplitude_nm=500.0)
+    lossy = FoldedLoop(configured(**FEW), lose=lambda index: index % 50 == 49)
+    with pytest.raises(CalibrationError, match="in 2 attempts there was no run of 600 frames"):
+        taken_of(lossy, "hadamard", 4)
+
+
+class Struck(FoldedLoop):
+    """Something happens to a device in the middle of one of the plays, and something else 20 frames later.
+
+    Attributes:
+        begun: frame at which each play began.
+    """
+
+    def __init__(self, play: int, strike: Callable[[FoldedLoop], None], heal: Callable[[FoldedLoop], None]) -> None:
+        self.begun: list[int] = []
+        self.before_the_end: int | None = None
+        self.struck_at = self.healed_at = -1
+        self._play, self._strike, self._heal = play, strike, heal
+        super().__init__(configured(**FEW))
+
+    def play(self, basis_nm: npt.ArrayLike, table: npt.ArrayLike) -> Given:
+        given = super().play(basis_nm, table)
+        self.begun.append(len(self.surfaces_nm))
+        if len(self.begun) == self._play:
+            after = 50 if self.before_the_end is None else len(np.asarray(table)) - self.before_the_end
+            self.struck_at, self.healed_at = self.begun[-1] + after, self.begun[-1] + after + 20
+        return given
+
+    def expose(self) -> None:
+        super().expose()
+        if len(self.surfaces_nm) == self.struck_at:
+            self._strike(self)
+        if len(self.surfaces_nm) == self.healed_at:
+            self._heal(self)
+
+
+def kill_mirror(loop: FoldedLoop) -> None:
+    loop.mirror_bus.close()
+
+
+def expire(loop: FoldedLoop) -> None:
+    event = EVENTS["COMMAND_EXPIRED"].log("mirror-dm", 0, command_timeout_ms=200.0, action="relaxing to flat")
+    loop.mirror_bus.publisher(EVENT).put(event.SerializeToString())
+
+
+def restart_camera(loop: FoldedLoop) -> None:
+    loop.first += 5 << 32
+
+
+@pytest.mark.parametrize(
+    ("strike", "heal", "why"),
+    [
+        (kill_mirror, FoldedLoop.start_mirror, "the mirror 'dm' restarted while pokes were played"),
+        (expire, ignore, r"mirror-dm was .* \(COMMAND_EXPIRED .* relaxing to flat\) while pokes were played"),
+        (restart_camera, ignore, "the camera restarted while pokes were played"),
+    ],
+    ids=["mirror", "command", "camera"],
+)
+@pytest.mark.parametrize("play", [1, 3, 6], ids=["delay", "cycle", "range"])
+def test_what_is_played_while_a_device_restarts_is_given_up_at_once_and_played_again(
+    strike: Callable[[FoldedLoop], None], heal: Callable[[FoldedLoop], None], why: str, play: int
+) -> None:
+    loop, said = Struck(play, strike, heal), list[str]()
+    calibrator = of(loop, "hadamard", say=said.append)
+    with calibrator.holding():
+        taken = calibrator.run()
+        calibrator.linear_range(loop.calibration(), taken.delay)
+    (again,) = [one for one in said if re.match("once more|a cycle is repeated", one)]
+    assert re.search(why, again)
+    assert (len(loop.begun), loop.stops) == (1 + 4 + 1 + 1, 1)
+    assert loop.begun[play] < loop.healed_at + 10, "it went on to its end"
+    assert np.abs(cross_talk(loop.calibration().reconstructor, taken.measured.response)).max() < 0.05
+
+
+@pytest.mark.parametrize("before_the_end", [None, 3])
+def test_a_mirror_that_died_ends_the_calibration(monkeypatch: pytest.MonkeyPatch, before_the_end: int | None) -> None:
+    monkeypatch.setattr(mirror_watch, "SILENT_S", 0.0)
+    loop, said = Struck(3, kill_mirror, ignore), list[str]()
+    loop.before_the_end = before_the_end
+    calibrator = of(loop, "hadamard", say=said.append)
+    with pytest.raises(BusError, match=r"no mirror state came .* is the mirror's process running"):
+        calibrator.run()
+    assert said[-1].startswith("a cycle is repeated: the mirror has reported no command as followed for 101 frames")
+    assert go_on(partial_of(OUT), {"method": "hadamard"}).cycles == 1
+
+
+def test_a_delay_of_one_frame_that_is_measured_as_a_little_less_gives_the_same_linear_range() -> None:
+    found = []
+    for measured in (0.998, 1.002):
+        loop, said = FoldedLoop(configured(**FEW)), list[str]()
+        calibrator = of(loop, "hadamard", say=said.append)
+        with calibrator.holding():
+            delay = calibrator.delay()
+            assert delay.delay_frames == pytest.approx(1, abs=0.05)
+            found.append(calibrator.linear_range(loop.calibration(), delay._replace(delay_frames=measured)))
+        assert not any("once more" in one for one in said)
+    np.testing.assert_allclose(found[0].gain, found[1].gain, rtol=0.01)
+
+
+def test_the_linear_range_is_measured_again_where_frames_were_lost() -> None:
+    lost = [range(0)]
+    loop = FoldedLoop(configured(**FEW), lose=lambda index: index in lost[-1])
+    said: list[str] = []
+    calibrator = of(loop, "hadamard", say=said.append)
+    with calibrator.holding():
+        delay = calibrator.delay()
+        at = len(loop.surfaces_nm)
+        lost.append(range(at + 10, at + 180))
+        found = calibrator.linear_range(loop.calibration(), delay)
+    assert said[-1].startswith("once more: the linear range needs every mode pushed and pulled")
+    assert found.range_nm.shape == (6,)
+    assert (found.range_nm > 15).all()  # Sect. 3.2: linear to about a twentieth of a wave, 27 nm
+    assert np.abs(found.gain[0] - 1).max() < 0.1

@@ -1,0 +1,356 @@
+"""`lowfc calibrate` and what stands beside it: files, figures and mistakes; the loop is in this process."""
+
+import inspect
+import json
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from astropy.io import fits
+from typer.testing import CliRunner
+
+from lowfc.adapters.files import calibration_file, factory
+from lowfc.adapters.process.progress import spoken
+from lowfc.contract.codecs.calibration_codec import identified
+from lowfc.contract.configuration import Configuration, load
+from lowfc.contract.errors import CalibrationError, ConfigurationError, DataFileError
+from lowfc.control.calibration.alignment import Geometry, onto
+from lowfc.control.calibration.response_fit import cross_talk, linear_range
+from lowfc.programs.commissioning.calibrate import align as calibrate_align
+from lowfc.programs.commissioning.calibrate import tasks as calibrate_commands
+from lowfc.programs.commissioning.calibrate.command import calibrate, calibrate_app
+from lowfc.programs.commissioning.calibrate.pokes import (
+    AMPLITUDE_NM,
+    DELAY_FRAMES,
+    FULL_AMPLITUDE_SNR,
+    CalibrationRequest,
+    Pokes,
+)
+from lowfc.programs.commissioning.calibrate.run import Calibrator
+from lowfc.programs.commissioning.calibrate.tasks import compared
+from tests.support.folded_loop import FoldedLoop, computed
+
+CONFIG = {
+    "sensor.sam": "sam27d10_bal14",
+    "sensor.modes": 6,
+    "star.magnitude": 0.0,
+    "disturbance.preset": "quiet",
+}
+
+
+class Connected(FoldedLoop):
+    """A loop that commands connect to."""
+
+    def __enter__(self) -> "Connected":
+        return self
+
+    def __exit__(self, *what: object) -> None:
+        pass
+
+
+@pytest.fixture
+def loop(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Connected:
+    monkeypatch.chdir(tmp_path)
+    made = Connected(load(None, CONFIG), world=load(None, CONFIG | {"disturbance.static_nm": {"4": 6.0}}))
+    connect(made, monkeypatch)
+    return made
+
+
+def connect(loop: Connected, monkeypatch: pytest.MonkeyPatch) -> None:
+    for module in (calibrate_commands, calibrate_align):
+        monkeypatch.setattr(module, "Client", lambda run: loop)
+
+
+def told(*words: str) -> dict[str, Any]:
+    """The JSON of a command that must succeed."""
+    done = CliRunner().invoke(calibrate_app, [*words, "--json"], catch_exceptions=False)
+    assert done.exit_code == 0, done.output
+    found: dict[str, Any] = json.loads(done.stdout)
+    return found
+
+
+class OfAnotherVersion(Connected):
+    """Its controller has a key that this version does not know."""
+
+    def configuration(self) -> str:
+        return self.config.to_toml().replace("[camera]", "[camera]\nspeed = 3", 1)
+
+
+@pytest.mark.parametrize("words", [("--out", "night.fits"), ("dark", "--dark-taken"), ("reference",), ("align",)])
+def test_a_controller_of_another_version_is_a_line(
+    words: tuple[str, ...], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    connect(OfAnotherVersion(load(None, CONFIG)), monkeypatch)
+    with pytest.raises(
+        ConfigurationError, match=r"another version of lowfc: camera\.speed: .*; use the lowfc that"
+    ) as it:
+        told(*words)
+    assert "\n" not in str(it.value)
+
+
+def toml(config: Configuration) -> str:
+    Path("test.toml").write_text(config.to_toml())
+    return "test.toml"
+
+
+def test_a_calibration_is_written_once_it_is_whole_and_used_and_its_figures_are_told(
+    loop: Connected, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def fail(*what: object) -> None:
+        raise CalibrationError("a limit of the mirror acted on the pokes")
+
+    monkeypatch.setattr(Calibrator, "linear_range", fail)
+    before = loop.calibration()
+    words = ("--method", "hadamard", "--cycles", "4", "--out", "night.fits", "--load")
+    with pytest.raises(CalibrationError, match="a limit of the mirror"):
+        told(*words)
+    assert not Path("night.fits").exists()
+    assert loop.calibration().id == before.id
+    found = told(*words, "--resume", "--no-linear-range")
+    made = calibration_file.load(Path("night.fits"))
+    assert (found["method"], found["cycles"]) == ("hadamard", 4)
+    assert found["modes"] == 6
+    assert found["file"] == "night.fits"
+    assert found["condition_number"] > 1
+    assert abs(found["delay_frames"] - 1) < 0.05
+    assert found["frame_to_effect_ms"] == pytest.approx(4.0, rel=0.05)
+    assert len(found["noise_gain_nm"]) == len(found["singular_values"]) == 6
+    # H was measured 6 nm from flat, where the computed one is a little off
+    assert found["cross_talk"] < 0.1 + 4 * found["cross_talk_error"]
+    assert loop.calibration().id == made.id != before.id
+    assert list(Path().glob("*.part.npz")) == []
+    same = told("--compare", "night.fits", "night.fits")
+    assert same["cross_talk"] < 1e-4
+    assert found["recommended"]
+    assert same["same_commands"]
+    assert same["reference_shift_nm"] == [0.0] * 6
+    done = CliRunner().invoke(calibrate_app, ["--compare", "night.fits", "night.fits"])
+    assert "largest cross-talk" in done.stdout
+
+
+def test_what_is_kept_is_named_where_a_calibration_ends_badly(loop: Connected, monkeypatch: pytest.MonkeyPatch) -> None:
+    def stop(*what: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(Calibrator, "check", stop)
+    done = CliRunner().invoke(calibrate_app, ["--cycles", "4", "--out", "night.fits"])
+    assert done.exit_code == 130
+    assert not Path("night.fits").exists()
+    assert done.stderr.splitlines()[-1] == (
+        "kept in night.fits.part.npz: 4 cycles, with which the same command with --resume goes on"
+    )
+
+
+def test_a_bad_calibration_is_written_not_loaded_and_told(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.chdir(tmp_path)
+    faint = load(None, CONFIG | {"star.magnitude": 5.0})
+    loop = Connected(faint)
+    connect(loop, monkeypatch)
+    before = loop.calibration()
+    words = ["--cycles", "4", "--out", "night.fits", "--no-linear-range", "--load"]
+    done = CliRunner().invoke(calibrate_app, [*words, "--json"])
+    assert done.exit_code == 1
+    found = json.loads(done.stdout)
+    assert not found["recommended"]
+    assert found["snr_reached"] < 20
+    assert "20 was to be reached: find what shakes this mode, or take about" in found["faults"][0]
+    assert found["file"] == "night.rejected.fits"
+    assert calibration_file.load(Path("night.rejected.fits")).id != before.id
+    assert not Path("night.fits").exists(), "a good one of that name would have been lost"
+    assert loop.calibration().id == before.id
+    done = CliRunner().invoke(calibrate_app, [*words, "--resume"])
+    assert done.exit_code == 1
+    assert "verdict: NOT RECOMMENDED" in done.stdout
+    assert done.stdout.endswith("it is not loaded\n")
+
+
+def test_frames_that_changed_meanwhile_show_in_the_verdict(loop: Connected, monkeypatch: pytest.MonkeyPatch) -> None:
+    own, expose = Calibrator.check, loop._scene.expose
+
+    def shifted(index: int, surface_nm: np.ndarray) -> Any:
+        pixels, truth = expose(index, surface_nm)
+        return np.roll(pixels, 2, axis=1), truth
+
+    def moved(self: Calibrator, *what: Any) -> Any:
+        monkeypatch.setattr(loop._scene, "expose", shifted)
+        return own(self, *what)
+
+    monkeypatch.setattr(Calibrator, "check", moved)
+    done = CliRunner().invoke(calibrate_app, ["--cycles", "4", "--out", "night.fits", "--no-linear-range", "--json"])
+    assert done.exit_code == 1
+    assert "cross-talk on frames that were not used for it" in json.loads(done.stdout)["faults"][0]
+
+
+def test_the_time_to_go_has_everything_in_it(loop: Connected) -> None:
+    done = CliRunner().invoke(calibrate_app, ["--method", "poke", "--cycles", "4", "--out", "night.fits"])
+    assert done.exit_code == 0, done.output
+    said = next(line for line in done.stderr.splitlines() if "to go" in line)
+    seconds = float(said.partition("about ")[2].split()[0])
+    begun = 600 + 2 * 8  # what was played before it was said
+    assert seconds * 250 == pytest.approx(len(loop.surfaces_nm) - begun, abs=0.6 * 250)  # it is said in whole seconds
+    assert "4 cycles of" in said
+    assert "3 to check them, then the linear range" in said
+
+
+def test_a_calibration_by_default_takes_less_than_three_minutes() -> None:
+    config = load(None, {})
+    calibration = computed(config.to_toml())
+    noise_nm = factory.frame_noise_nm(config, calibration)
+    snr = inspect.signature(calibrate).parameters["snr"].default
+    pokes = Pokes(config, calibration, noise_nm, CalibrationRequest("hadamard", Path("night.fits"), snr))
+    assert (DELAY_FRAMES + pokes.frames(pokes.cycles())) / 250 < 180
+
+
+def test_without_a_terminal_a_line_every_10_s() -> None:
+    said, times = list[str](), iter(np.arange(0.0, 100.0, 0.5))
+    count = spoken(said.append, lambda: float(next(times)))
+    for done in range(0, 2000, 20):
+        count("hadamard cycle 3 of 8", done, 4000)
+    assert said[0] == "hadamard cycle 3 of 8: 10%, about 90 s to go"
+    assert len(said) == 4
+
+
+def test_the_reference_is_the_present_state(loop: Connected) -> None:
+    found = told("reference", "--frames", "200", "--out", "there.fits")
+    shift = dict(zip(found["noll"], found["reference_shift_nm"], strict=True))
+    assert shift[4] == pytest.approx(6.0, abs=0.6)
+    made = calibration_file.load(Path("there.fits"))
+    assert np.abs(cross_talk(made.reconstructor, made.response)).max() < 1e-3
+    assert np.array_equal(made.response, loop.calibration().response)
+
+
+def test_a_dark_finds_bad_pixels_and_is_not_taken_in_light(loop: Connected, monkeypatch: pytest.MonkeyPatch) -> None:
+    with pytest.raises(CalibrationError, match=r"not dark: .*; block the star|not dark"):
+        told("dark", "--dark-taken", "--frames", "50")
+    rng = np.random.default_rng(5)
+    cube = np.rint(100 + 1.5 * rng.standard_normal((64, 80, 80)))
+    cube[:, 40, 41] += 500
+    fits.PrimaryHDU(cube.astype(np.int16)).writeto("dark.fits")
+    found = told("dark", "--file", "dark.fits", "--out", "masked.fits")
+    assert (found["hot"], found["noisy"], found["dead"]) == (1, 0, 0)
+    made = calibration_file.load(Path("masked.fits"))
+    assert made.good.reshape(80, 80)[40, 41] == 0
+    assert not made.reconstructor[:, 40 * 80 + 41].any()
+    fits.PrimaryHDU(cube[:, :20].astype(np.int16)).writeto("small.fits")
+    with pytest.raises(DataFileError, match=r"frames of \(20, 80\), the calibration has \(80, 80\)"):
+        told("dark", "--file", "small.fits")
+    np.save("cube.npy", cube)
+    assert told("dark", "--file", "cube.npy")["frames"] == 64
+    whole = Path("dark.fits").read_bytes()
+    Path("cut.fits").write_bytes(whole[: len(whole) // 2])
+    np.savez("cubes.npz", cube)
+    Path("cubes.npz").rename("cubes.npy")
+    for file, why in {
+        "none.fits": "there is no such file",
+        "cut.fits": "neither",
+        "cubes.npy": "neither",
+        "masked.fits": r"\(6400,\)",
+    }.items():
+        for command in ("dark", "align"):
+            with pytest.raises(DataFileError, match=f"^{file}: .*{why}") as caught:
+                told(command, "--file", file)
+            assert "\n" not in str(caught.value)
+    dark = Connected(load(None, CONFIG), world=load(None, CONFIG | {"star.magnitude": 20.0}))
+    connect(dark, monkeypatch)
+    found = told("dark", "--dark-taken", "--frames", "50", "--out", "night.fits")
+    assert found["dark_dn"] == pytest.approx(100, abs=0.5)
+    assert found["hot"] < 5
+
+
+def test_a_sensor_that_lies_otherwise_gets_the_computed_calibration_on_its_pixels(loop: Connected) -> None:
+    before = loop.calibration()
+    geometry = Geometry(1.08, 44.0, 47.5, 12.0, -1)
+    light = 3e5 * onto(before.reference.astype(float).reshape(80, 80), geometry, (90, 96)) + 3
+    fits.PrimaryHDU(np.random.default_rng(2).poisson(np.maximum(light, 0)).astype(np.int32)).writeto("real.fits")
+    found = told("align", "--file", "real.fits", "--config", toml(loop.config), "--out", "aligned.fits")
+    assert found["pixels_per_lambda_d"] == pytest.approx(4 * 1.08, rel=0.003)
+    assert (found["row"], found["column"]) == pytest.approx((44.0, 47.5), abs=0.1)
+    assert found["rotation_deg"] == pytest.approx(12.0, abs=0.3)
+    assert found["parity"] == -1
+    made = calibration_file.load(Path("aligned.fits"))
+    assert made.shape == (90, 96)
+    H = onto(before.response.astype(float).reshape(80, 80, -1), geometry, (90, 96)).reshape(90 * 96, -1)
+    assert np.abs(cross_talk(made.reconstructor, H)).max() < 0.03
+    told("align", "--file", "real.fits", "--config", "test.toml", "--out", "turned.fits", "--half-turn")
+    turned = calibration_file.load(Path("turned.fits"))
+    assert np.diag(turned.reconstructor.astype(float) @ H).max() < -0.9
+
+
+def test_pokes_tell_the_half_turn(loop: Connected) -> None:
+    found = told("align", "--out", "aligned.fits", "--frames", "200")
+    assert found["half_turn_known"]
+    made = calibration_file.load(Path("aligned.fits"))
+    assert np.abs(cross_talk(made.reconstructor, loop.calibration().response)).max() < 0.05
+
+
+def test_a_computed_calibration_may_leave_combinations_out(loop: Connected) -> None:
+    config = toml(loop.config)
+    found = told("--method", "analytic", "--config", config, "--out", "all.fits")
+    assert found["kept"] == [1.0] * 6
+    smallest = found["singular_values"][-1] / found["singular_values"][0]
+    cut = told("--method", "analytic", "--config", config, "--out", "few.fits", "--truncate", str(1.01 * smallest))
+    assert np.count_nonzero(cut["kept"]) == 5
+    one, other = (calibration_file.load(Path(name)) for name in ("all.fits", "few.fits"))
+    assert np.linalg.matrix_rank(one.reconstructor) == 6
+    assert np.linalg.matrix_rank(other.reconstructor) == 5
+    done = CliRunner().invoke(calibrate_app, ["--method", "analytic", "--config", config, "--out", "all.fits"])
+    assert "no regularisation needed" in done.stdout
+
+
+def test_a_computed_calibration_may_be_of_another_wavefront(loop: Connected) -> None:
+    config = toml(loop.config)
+    told("--method", "analytic", "--config", config, "--out", "flat.fits")
+    told("--method", "analytic", "--config", config, "--out", "there.fits", "--at", "4=15,7=-10")
+    found = told("--compare", "flat.fits", "there.fits")
+    assert found["estimators"] == ["weighted", "weighted+at 4=15,7=-10"]
+    assert found["cross_talk"] > 0.02
+    shift = dict(zip(found["noll"], found["reference_shift_nm"], strict=True))
+    assert (shift[4], shift[7]) == pytest.approx((15, -10), abs=1.5)
+
+
+@pytest.mark.parametrize(
+    ("words", "why"),
+    [
+        ("--out there.fits dark --dark-taken", "--out stands before `dark`, .* after it"),
+        ("--json reference", "--json stands before `reference`"),
+        ("--config test.toml align", "--config stands before `align`"),
+        ("align --config test.toml", "--config goes with --file"),
+        ("align --file real.fits --load", "--load goes with the frames of a running loop"),
+        ("--method poke --config test.toml", "--config goes with --method analytic"),
+        ("--at 4=15", "--at goes with --method analytic"),
+    ],
+)
+def test_an_option_that_would_be_of_no_effect_is_refused(loop: Connected, words: str, why: str) -> None:
+    before = {path.name for path in Path().iterdir()}
+    with pytest.raises(ConfigurationError, match=why):
+        CliRunner().invoke(calibrate_app, words.split(), catch_exceptions=False)
+    assert {path.name for path in Path().iterdir()} == before
+
+
+def test_the_help_says_how_large_pokes_are() -> None:
+    said = " ".join(CliRunner().invoke(calibrate_app, ["--help"]).stdout.split())
+    usual = ", ".join(f"{amplitude_nm:g} {method}" for method, amplitude_nm in AMPLITUDE_NM.items())
+    tolerance = inspect.signature(linear_range).parameters["tolerance"].default
+    assert f"default: {usual}, half of it above --snr {FULL_AMPLITUDE_SNR:g}." in said
+    assert f"within {100 * tolerance:g} % of 1" in said
+
+
+def test_calibrations_of_different_sensors_are_not_compared(loop: Connected) -> None:
+    one = loop.calibration()
+    calibration_file.save(one, Path("one.fits"))
+    other = replace(
+        one,
+        noll=one.noll[:5],
+        response=one.response[:, :5],
+        reconstructor=one.reconstructor[:5],
+        modes_to_actuators=one.modes_to_actuators[:, :5],
+        actuators_to_modes=one.actuators_to_modes[:5],
+    )
+    calibration_file.save(identified(other), Path("other.fits"))
+    with pytest.raises(CalibrationError, match="cannot be compared"):
+        compared(Path("one.fits"), Path("other.fits"))
+    with pytest.raises(DataFileError, match="there is no directory"):
+        told("--method", "hadamard", "--out", "nowhere/night.fits")

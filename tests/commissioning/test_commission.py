@@ -1,0 +1,212 @@
+"""`lowfc commission` step by step, on a loop in one process."""
+
+import tomllib
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from lowfc.adapters.files import calibration_file
+from lowfc.contract.configuration import Camera, Configuration, Control
+from lowfc.contract.errors import CalibrationError, RequestRefusedError
+from lowfc.contract.messages import wire
+from lowfc.programs.commissioning.calibrate.run import partial_of
+from lowfc.programs.commissioning.commission.commissioning import Commission, Commissioning, first_of
+from tests.support.folded_loop import FoldedLoop, computed
+
+TOML = """
+[star]
+magnitude = 0
+[camera]
+rate_hz = 100
+bit_depth = 14
+[control]
+gain = 0.2
+"""
+CONFIG = Configuration.model_validate(tomllib.loads(TOML))
+
+
+class Talk(list[str]):
+    """What is said; something happens after some of it."""
+
+    def __init__(self, then: dict[str, Callable[[], None]]) -> None:
+        super().__init__()
+        self.then = then
+
+    def append(self, text: str) -> None:
+        super().append(text)
+        for begin, happens in self.then.items():
+            if text.startswith(begin):
+                happens()
+
+
+class Bench:
+    """A loop without a calibration, and what is said while it is commissioned."""
+
+    def __init__(self, folder: Path, config: Configuration = CONFIG, **loop: Any) -> None:
+        self.config, self.out = config, folder / "calibration.fits"
+        self.loop = FoldedLoop(config, cut=8, **loop)
+        self.loop.run(5)
+        self.said: list[str] = []
+        self.asked: list[str] = []
+
+    def commission(self, *, model: Configuration | None = None, **asked: Any) -> dict[str, Any]:
+        usual = {
+            "dark": None,
+            "no_dark": True,
+            "frames": 100,
+            "snr": 40.0,
+            "cycles": None,
+            "resume": False,
+            "close": True,
+        }
+        made = Commissioning(
+            self.loop,  # type: ignore[arg-type]  # in the place of a client
+            self.config,
+            computed((model or self.config).to_toml()),
+            Commission(self.out, **{**usual, **asked}),
+            self.said.append,
+            lambda what, done, total: None,
+            self.asked.append,
+        )
+        with self.loop.reserved("a test"):
+            figures, _ = made.run()
+        return figures
+
+    @property
+    def shown(self) -> str:
+        return "\n".join(self.said)
+
+
+@pytest.fixture(scope="module")
+def commissioned(tmp_path_factory: pytest.TempPathFactory) -> tuple[Bench, dict[str, Any]]:
+    bench = Bench(tmp_path_factory.mktemp("bench"))
+    return bench, bench.commission()
+
+
+def test_frames_of_another_size_come_to_a_closed_loop(commissioned: tuple[Bench, dict[str, Any]]) -> None:
+    bench, figures = commissioned
+    assert figures["recommended"]
+    assert figures["measured_error_nm"] == pytest.approx(figures["predicted_error_nm"], rel=0.15)
+    state = bench.loop.status().state
+    assert state is not None
+    assert state.mode == wire.LOOP_MODE_CLOSED
+    made = calibration_file.load(bench.out)
+    assert made.shape == (64, 64)
+    assert made.saturation_dn == 2**14 - 1
+    assert not first_of(bench.out).exists()
+    assert not partial_of(bench.out).exists()
+
+
+def test_the_wavefront_is_held_where_the_reference_was_taken(commissioned: tuple[Bench, dict[str, Any]]) -> None:
+    bench, figures = commissioned
+    bench.loop.run(300)
+    true = np.array(bench.loop.residual_nm[-300:])
+    assert float(np.sqrt(true.var(axis=0).sum())) < figures["measured_error_nm"]  # in which there is noise, too
+
+
+@pytest.mark.slow
+def test_a_sensor_unlike_the_configured_one_is_measured_without_the_model(tmp_path: Path) -> None:
+    """The optical model is of another sensor; it gives only the modes and the mirror's commands."""
+    other = Configuration.model_validate({**tomllib.loads(TOML), "sensor": {"kind": "clowfs"}})
+    bench = Bench(tmp_path)
+    figures = bench.commission(model=other, close=False)
+    assert "without the optical model" in bench.shown or "not compared" in bench.shown
+    assert figures["recommended"]
+
+
+def test_it_goes_on_where_it_was_interrupted(tmp_path: Path) -> None:
+    bench = Bench(tmp_path)
+    bench.loop.ask("stop")
+    lost = bench.loop.ask
+
+    def interrupted(name: str, **fields: Any) -> Any:
+        if "[7/10] response" in bench.said and partial_of(bench.out).exists():
+            raise KeyboardInterrupt
+        return lost(name, **fields)
+
+    bench.loop.ask = interrupted  # type: ignore[method-assign]
+    with pytest.raises(KeyboardInterrupt):
+        bench.commission()
+    bench.loop.ask = lost  # type: ignore[method-assign]
+    bench.loop.ask("release", lease_id=1)
+    assert first_of(bench.out).exists()
+    assert "nobody has judged" in bench.shown
+    assert "nobody has judged its calibration" in bench.loop.ask("close", lease_id=0).text
+    bench.loop.ask("open", lease_id=0)
+    bench.said.clear()
+    bench.commission(resume=True, close=False)
+    assert "[1/10]" not in bench.shown
+    assert "going on after" in bench.shown
+
+
+def test_the_calibration_from_before_is_in_use_again_after_a_failure(
+    commissioned: tuple[Bench, dict[str, Any]],
+) -> None:
+    bench, _ = commissioned
+    before = bench.loop.calibration().id
+
+    def give_up() -> None:
+        raise KeyboardInterrupt
+
+    bench.said = Talk({"[7/10] response": give_up})
+    with pytest.raises(KeyboardInterrupt):
+        bench.commission()
+    assert bench.loop.calibration().id == before
+    assert "the calibration from before is in use again" in bench.shown
+
+
+def test_there_is_nothing_to_go_on_with_after_the_end(commissioned: tuple[Bench, dict[str, Any]]) -> None:
+    bench, _ = commissioned
+    first_of(bench.out).unlink(missing_ok=True)
+    with pytest.raises(CalibrationError, match="nothing to go on with"):
+        bench.commission(resume=True)
+
+
+def test_who_opens_the_loop_at_the_end_is_named_and_the_calibration_stays(tmp_path: Path) -> None:
+    bench = Bench(tmp_path)
+
+    def somebody_opens() -> None:
+        if "[10/10] closed loop" in bench.said:
+            bench.loop.run(20)
+            bench.loop.ask("open", lease_id=0)
+
+    bench.said = Talk({"watching": somebody_opens})
+    with pytest.raises(CalibrationError, match="the lease ended: operator asked to open"):
+        bench.commission()
+    assert "the calibration is good" in bench.shown
+    state = bench.loop.status().state
+    assert state is not None
+    assert (state.mode, state.calibration_id) == (wire.LOOP_MODE_OPEN, calibration_file.load(bench.out).id)
+
+
+def test_a_dark_is_asked_for_with_a_person(tmp_path: Path) -> None:
+    bench = Bench(tmp_path)
+    with pytest.raises(CalibrationError, match="was it not blocked for the dark"):
+        bench.commission(no_dark=False)
+    assert bench.asked == ["block the star; is it dark?", "unblock the star; is it there?"]
+
+
+@pytest.mark.parametrize(
+    ("config", "why"),
+    [
+        ({"camera": Camera(rate_hz=250.0)}, "camera.rate_hz"),
+        ({"camera": Camera(rate_hz=100.0, gain_e_per_dn=3.0)}, "camera.gain_e_per_dn"),
+        ({"camera": Camera(rate_hz=100.0), "control": Control(frame_timeout_ms=12.0)}, "control.frame_timeout_ms"),
+    ],
+)
+def test_a_camera_that_is_not_as_configured_is_refused(tmp_path: Path, config: dict[str, Any], why: str) -> None:
+    bench = Bench(tmp_path)
+    bench.config = CONFIG.model_copy(update=config)
+    with pytest.raises(CalibrationError, match=why):
+        bench.commission()
+    assert not bench.out.exists()
+
+
+def test_in_safe_mode_nothing_begins(tmp_path: Path) -> None:
+    bench = Bench(tmp_path)
+    bench.loop.ask("safe")
+    with pytest.raises(RequestRefusedError, match="safe mode"):
+        bench.commission()

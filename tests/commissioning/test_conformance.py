@@ -1,0 +1,586 @@
+"""What `lowfc conformance` says of good publishers, and of those with one mistake: that mistake, and nothing else."""
+
+import io
+import json
+import re
+import socket
+from collections import Counter
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import pytest
+import zenoh
+from google.protobuf.message import DecodeError, Message
+from rich.console import Console
+from typer.testing import CliRunner
+
+from lowfc.adapters.bus.run import open_run
+from lowfc.adapters.bus.zenoh_bus import session_config
+from lowfc.adapters.files.factory import camera_state
+from lowfc.contract.configuration import Configuration, Network, load
+from lowfc.contract.envelope import Envelope, sequence_of
+from lowfc.contract.errors import BusError, ConfigurationError
+from lowfc.contract.messages import (
+    CAMERA_STATE,
+    FRAME,
+    HEALTH,
+    MIRROR_STATE,
+    RawImage,
+    Role,
+    Topic,
+    image,
+    timestamp,
+    wire,
+)
+from lowfc.control.loop.safety import Limits
+from lowfc.programs.commissioning.checks import Check, figures, table
+from lowfc.programs.commissioning.conformance import command as conformance
+from lowfc.programs.commissioning.conformance.camera import watch
+from lowfc.programs.commissioning.conformance.command import FIELDS, STATUSES, conformance_app
+from lowfc.programs.commissioning.conformance.dialogue import Dialogue, expected_of
+from lowfc.programs.commissioning.conformance.frames import camera_checks
+from lowfc.programs.commissioning.conformance.line import Line, Received
+from lowfc.programs.commissioning.conformance.mirror import mirror_checks
+from lowfc.testing.clock import FakeClock
+from sim_dm.device import Command, Status, apply_command, initial, tick
+from sim_dm.process import _told, device
+from tests.e2e import test_own_hardware
+from tests.support.loops import until
+
+Array = npt.NDArray[np.float32]
+
+MS = 1_000_000
+LATENCY_NS = 100_000
+SMALL = {"camera.rate_hz": 100, "mirror.rows": 6, "mirror.columns": 7}
+CONFIG = load(None, SMALL)
+SHAPE = (12, 16)
+OFFSET_NS = 1_700_000_000_000_000_000
+
+
+def envelope(sequence: int, time_ns: int) -> bytes | None:
+    return Envelope(sequence, time_ns).encode()
+
+
+class Device:
+    """A line to itself: it publishes with envelopes and Health, rightly but for `changes`: functions, values by name.
+
+    Time passes in milliseconds, and only while somebody waits.
+    """
+
+    process = ""
+    offset_ns = OFFSET_NS
+
+    def __init__(self, **changes: Any) -> None:
+        self.clock = FakeClock()
+        self.clock.time_ns += 3600 * 1_000_000_000  # some time after the start of the publishers
+        self.now_ns = self.clock.now_ns
+        self.changes = changes
+        self.counts: Counter[str] = Counter()
+        self.last: dict[str, Received] = {}
+        self._waiting: list[Received] = []
+        self._health_ns = 0
+
+    def wait(self, seconds: float) -> None:
+        end_ns = self.now_ns() + max(1, round(seconds * 1e9))
+        while self.now_ns() < end_ns:
+            self.clock.advance(min(MS, end_ns - self.now_ns()))
+            self.turn(self.now_ns())
+
+    def received(self) -> list[Received]:
+        found, self._waiting = self._waiting, []
+        return found
+
+    def put(self, topic: Topic, name: str, payload: bytes) -> None:
+        self.told(payload, self.now_ns())
+
+    def ask(self, key: str) -> list[Received]:
+        return self.changed("answer", [self.last[key]] if key in self.last else [])
+
+    def changed(self, name: str, value: Any, *what: Any) -> Any:
+        change = self.changes.get(name)
+        return value if change is None else change(value, *what)
+
+    def publish(self, key: str, message: Message | bytes, now_ns: int) -> None:
+        count = self.changed("count", self.counts[key], key)
+        self.counts[key] += 1
+        attach: Callable[[int, int], bytes | None] = self.changes.get("attach", envelope)
+        attachment = attach(sequence_of(self.clock.start_s, count), now_ns)
+        payload = message if isinstance(message, bytes) else message.SerializeToString()
+        self.last[key] = Received(self.changed("key", key), payload, attachment, now_ns + LATENCY_NS)
+        self._waiting.append(self.last[key])
+
+    def turn(self, now_ns: int) -> None:
+        if now_ns >= self._health_ns:
+            self._health_ns = now_ns + 500 * MS
+            health = wire.Health(timestamp=timestamp(now_ns), process=self.process, state="running")
+            for key, count in self.counts.items():
+                health.topics.add(topic=key, published=count)
+            health = self.changed("health", health)
+            if health is not None:
+                self.publish(HEALTH.at(self.process), health, now_ns)
+
+
+class Camera(Device):
+    """A spot on 12 x 16 pixels with noise, a hundred times a second."""
+
+    process = "camera"
+
+    def __init__(self, **changes: Any) -> None:
+        super().__init__(**changes)
+        self._due_ns = 0
+        self._index = 0
+        y, x = np.mgrid[: SHAPE[0], : SHAPE[1]]
+        self._spot = 100 + 3000 * np.exp(-((y - 5.5) ** 2 + (x - 7.5) ** 2) / 12)
+        self._rng = np.random.default_rng(1)
+
+    def turn(self, now_ns: int) -> None:
+        super().turn(now_ns)
+        if now_ns < self._due_ns:
+            return
+        self._due_ns = now_ns + CONFIG.period_ns
+        time_ns = now_ns - 50_000
+        if self._index % 50 == 0:
+            state = self.changed("state", camera_state(CONFIG, SHAPE, time_ns), self._index)
+            if state is not None:
+                self.publish(CAMERA_STATE.key, state, now_ns)
+        pixels = self._rng.poisson(self._spot).astype(np.uint16)
+        pixels = self.changed("pixels", pixels, self._index)
+        frame = self.changed("frame", image(pixels, time_ns, "camera"), self._index)
+        self._index += 1
+        if frame is not None:
+            self.publish(FRAME.key, frame, now_ns)
+
+
+class Mirror(Device):
+    """The simulated mirror's own functions, with hooks."""
+
+    process = "mirror-dm"
+
+    def __init__(self, **changes: Any) -> None:
+        super().__init__(**changes)
+        self.device = device(CONFIG)
+        self.device = replace(self.device, **changes.get("device", {}))
+        self.status = initial(self.device)
+        self._published_ns = 0
+        self._told = 0
+
+    def told(self, payload: bytes, now_ns: int) -> None:
+        self._told += 1
+        if self.changes.get("deaf") or self._told % self.changes.get("drops", self._told + 1) == 0:
+            return
+        try:
+            command = wire.MirrorCommand.FromString(payload)
+        except DecodeError:
+            return
+        told = self.changed("told", _told(payload), command, self.status)
+        self.status, refused = apply_command(self.device, self.status, told, now_ns)
+        if refused is None:
+            self._publish(self.status.time_ns, now_ns)
+        elif self.changes.get("renews"):
+            self.status = self.status._replace(received_ns=now_ns)
+
+    def turn(self, now_ns: int) -> None:
+        super().turn(now_ns)
+        self.status = self.changed("tick", tick)(self.device, self.status, now_ns)
+        if now_ns - self._published_ns >= 100 * MS and not self.changes.get("silent"):
+            self._publish(now_ns, now_ns)
+
+    def _publish(self, time_ns: int, now_ns: int) -> None:
+        status = self.status
+        following = wire.MIRROR_STATUS_FOLLOWING if status.following else wire.MIRROR_STATUS_EXPIRED
+        state = wire.MirrorState(
+            timestamp=timestamp(time_ns),
+            frame_sequence=status.frame_sequence,
+            status=following if status.frame_sequence else wire.MIRROR_STATUS_WAITING,
+            rows=status.surface_nm.shape[0],
+            columns=status.surface_nm.shape[1],
+            actuators=status.surface_nm.tobytes(),
+            command_nm=status.command_nm.tolist(),
+            limits_hit=[reason.value for reason in status.limits_hit],  # type: ignore[misc]
+        )
+        self.publish(MIRROR_STATE.at("dm"), self.changed("state", state), now_ns)
+        self._published_ns = now_ns
+
+
+def found(checks: Iterator[Check]) -> dict[str, str]:
+    """What is not ok, by name."""
+    listed = list(checks)
+    assert len({check.name for check in listed}) == len(listed)
+    assert all(check.expected and check.got and bool(check.advice) != (check.status == "ok") for check in listed)
+    return {check.name: str(check.status) for check in listed if check.status != "ok"}
+
+
+def of_camera(**changes: Any) -> dict[str, str]:
+    return found(camera_checks(watch(Camera(**changes), 3.0, lambda _: None)))
+
+
+def of_mirror(*, gentle: bool = False, config: Configuration = CONFIG, **changes: Any) -> dict[str, str]:
+    dialogue = Dialogue(Mirror(**changes), expected_of(config))
+    return found(mirror_checks(dialogue, 0.2, lambda _: None, gentle=gentle))
+
+
+def setting(**values: Any) -> Callable[..., Any]:
+    """A message with some fields changed."""
+
+    def change(message: Any, *_: Any) -> Any:
+        for name, value in values.items():
+            setattr(message, name, value)
+        return message
+
+    return change
+
+
+def stamped(shift_ns: int) -> Callable[..., RawImage]:
+    def change(frame: RawImage, _: int) -> RawImage:
+        frame.timestamp.FromNanoseconds(frame.timestamp.ToNanoseconds() + shift_ns)
+        return frame
+
+    return change
+
+
+def swapped(sequence: int, time_ns: int) -> bytes:
+    return sequence.to_bytes(8, "big") + time_ns.to_bytes(8, "big")
+
+
+def put_at(function: Callable[[int], int]) -> Callable[[int, int], bytes | None]:
+    return lambda sequence, time_ns: envelope(sequence, function(time_ns))
+
+
+def growing(state: wire.CameraState, index: int) -> wire.CameraState:
+    state.exposure_ns += index
+    return state
+
+
+def halved(frame: RawImage, _: int) -> RawImage:
+    frame.data, frame.step = frame.data[::2], frame.width
+    return frame
+
+
+def cropped(frame: RawImage, index: int) -> RawImage:
+    if index % 2:
+        frame.height, frame.data = 6, frame.data[: len(frame.data) // 2]
+    return frame
+
+
+WRONG, WARNING = "wrong", "warning"
+CAMERAS: dict[str, tuple[dict[str, Any], dict[str, str]]] = {
+    "no envelope": ({"attach": lambda *_: None}, {"envelope": WRONG, "settings on request": WRONG}),
+    "a short envelope": ({"attach": lambda s, t: b"12345678"}, {"envelope": WRONG, "settings on request": WRONG}),
+    "a big-endian envelope": ({"attach": swapped}, {"sequence": WRONG, "publish time": WRONG}),
+    "a count without start": ({"attach": lambda s, t: envelope(s & 0xFFFF, t)}, {"sequence": WRONG}),
+    "milliseconds for the start": ({"attach": lambda s, t: envelope(s * 1000 % 2**64, t)}, {"sequence": WRONG}),
+    "a count that stands still": ({"count": lambda count, _: 7}, {"sequence": WRONG}),
+    "a count of all topics": ({"count": lambda count, _: 3 * count}, {"sequence": WRONG}),
+    "a gap": ({"count": lambda count, _: count + 4 * (count > 100)}, {"sequence": WARNING}),
+    "microseconds": ({"attach": put_at(lambda t: t // 1000)}, {"publish time": WRONG}),
+    "seconds": ({"attach": put_at(lambda t: t // 10**9)}, {"publish time": WRONG}),
+    "a monotonic clock": ({"attach": put_at(lambda t: t - OFFSET_NS)}, {"publish time": WRONG}),
+    "another clock": ({"attach": put_at(lambda t: t - 35 * MS)}, {"publish time": WRONG}),
+    "a clock that steps": (
+        {"attach": put_at(lambda t: t - t % (25 * MS))},
+        {"publish time": WRONG},
+    ),
+    "no frame time": ({"frame": lambda frame, _: frame.ClearField("timestamp") or frame}, {"frame time": WRONG}),
+    "a frame time ahead": ({"frame": stamped(20 * MS)}, {"frame time": WRONG}),
+    "a frame time of long ago": ({"frame": stamped(-3600 * 1000 * MS)}, {"frame time": WRONG}),
+    "the start of the exposure": ({"frame": stamped(-5 * MS)}, {"frame time": WARNING}),
+    "bytes that are no message": ({"frame": lambda *_: b"\xff\xff\xff"}, {"frames": WRONG}),
+    "eight bits": ({"frame": halved}, {"bytes": WRONG}),
+    "another encoding": ({"frame": setting(encoding="16UC1")}, {"encoding": WRONG}),
+    "no step": ({"frame": setting(step=0)}, {"bytes": WRONG}),
+    "rows for columns": ({"frame": setting(width=12, height=16, step=24)}, {"settings' size": WRONG}),
+    "a region that changes": ({"frame": cropped}, {"shape": WRONG, "settings' size": WRONG}),
+    "no frames": ({"frame": lambda *_: None}, {"frames": WRONG}),
+    "another key": (
+        {"key": lambda key: key.replace("camera/frame", "camera/frames")},
+        {"frames": WRONG, "topics": WRONG},
+    ),
+    "frames that stop": ({"frame": lambda frame, i: frame if i < 100 else None}, {"steadiness": WRONG}),
+    "a frame in ten late": ({"frame": lambda frame, i: frame if i % 10 else None}, {"steadiness": WARNING}),
+    "a stuck image": ({"pixels": lambda one, i: np.full(SHAPE, 500, np.uint16)}, {"live image": WRONG}),
+    "zeros": ({"pixels": lambda one, i: 0 * one}, {"live image": WRONG, "light": WRONG}),
+    "darkness": ({"pixels": lambda one, i: one // 3000 + 100 + i % 2}, {"light": WARNING}),
+    "full well": (
+        {"pixels": lambda one, i: np.minimum(one * 100 + i, 40_100 - (np.arange(16) == 3) * i).astype(np.uint16)},
+        {"light": WARNING},
+    ),
+    "big-endian pixels": ({"pixels": lambda one, i: one.byteswap()}, {"byte order": WRONG, "settings' range": WRONG}),
+    "left-aligned pixels": ({"pixels": lambda one, i: one * 16}, {"byte order": WRONG, "settings' range": WRONG}),
+    "no settings": ({"state": lambda *_: None}, {"settings": WRONG}),
+    "settings that are no message": (
+        {"state": lambda *_: b"\xff\xff\xff"},
+        {"settings": WRONG, "settings on request": WRONG},
+    ),
+    "settings once": ({"state": lambda state, i: state if i == 0 else None}, {"settings": WARNING}),
+    "empty settings": ({"state": lambda *_: wire.CameraState()}, {"settings' values": WRONG, "settings' size": WRONG}),
+    "settings that change": ({"state": growing}, {"settings kept": WARNING}),
+    "settings of another region": ({"state": setting(rows=16, columns=12)}, {"settings' size": WRONG}),
+    "ten bits": ({"state": setting(bit_depth=10)}, {"settings' values": WRONG, "settings' range": WRONG}),
+    "saturation too low": ({"state": setting(saturation_dn=2000)}, {"settings' range": WRONG}),
+    "a period in us": ({"state": setting(period_ns=10_000, exposure_ns=5_000)}, {"settings' period": WRONG}),
+    "NaN": ({"state": setting(bias_dn=float("nan"))}, {"settings' values": WRONG}),
+    "no answer": ({"answer": lambda _: []}, {"settings on request": WARNING}),
+    "no health": ({"health": lambda _: None}, {"health": WARNING}),
+    "another's health": ({"health": setting(process="mycam")}, {"health": WARNING}),
+}
+
+
+def test_a_good_camera_has_nothing_wrong() -> None:
+    assert of_camera() == {}
+
+
+@pytest.mark.parametrize("mistake", CAMERAS)
+def test_a_cameras_mistake_is_found(mistake: str) -> None:
+    changes, expected = CAMERAS[mistake]
+    assert of_camera(**changes) == expected
+
+
+def shaped(function: Callable[[Array], Array]) -> Callable[[wire.MirrorState], wire.MirrorState]:
+    """A state with another shape."""
+
+    def change(state: wire.MirrorState) -> wire.MirrorState:
+        shape = np.frombuffer(state.actuators, np.float32).reshape(state.rows, state.columns)
+        state.actuators = np.ascontiguousarray(function(shape), np.float32).tobytes()
+        return state
+
+    return change
+
+
+def one_dead(shape: Array, height_nm: float = 0.0) -> Array:
+    return np.where(np.arange(shape.size).reshape(shape.shape) == 9, np.float32(height_nm), shape)
+
+
+def careless(what: str) -> Callable[..., Command]:
+    """Repair what should have been refused."""
+
+    def change(told: Command, command: wire.MirrorCommand, status: Status) -> Command:
+        wanted = told.actuators_nm
+        if what == "bytes" and wanted is None:
+            return replace(told, actuators_nm=np.resize(np.frombuffer(command.actuators, np.float32), (6, 7)))
+        if what == "grid" and wanted is not None:
+            return replace(told, actuators_nm=np.resize(wanted, (6, 7)))
+        if what == "finite" and wanted is not None:
+            return replace(told, actuators_nm=np.nan_to_num(wanted, nan=0.0, posinf=0.0))
+        if what == "order":
+            return replace(told, frame_sequence=max(told.frame_sequence, status.frame_sequence))
+        return told
+
+    return change
+
+
+WIDE = Limits(10_000.0, 10_000.0, 10_000.0)
+UNTRIED = {"limits": WARNING}
+MIRRORS: dict[str, tuple[dict[str, Any], dict[str, str]]] = {
+    "silent and deaf": ({"silent": True, "deaf": True}, {"idle state": WRONG, "answers": WRONG} | UNTRIED),
+    "no answers": ({"deaf": True}, {"answers": WRONG} | UNTRIED),
+    "one command in three unanswered": ({"drops": 3}, {"answers": WRONG} | UNTRIED),
+    "silent when idle": (
+        {"silent": True},
+        {"idle state": WRONG, "dead-man": WRONG, "longest command": WARNING, "silence": WRONG} | UNTRIED,
+    ),
+    "no envelope": ({"attach": lambda *_: None}, {"envelope": WRONG}),
+    "a count without start": ({"attach": lambda s, t: envelope(s & 0xFFFF, t)}, {"sequence": WRONG}),
+    "another clock": ({"attach": put_at(lambda t: t - 35 * MS)}, {"publish time": WRONG}),
+    "no message": ({"state": lambda _: b"\xff\xff\xff"}, {"state": WRONG} | UNTRIED),
+    "another grid": ({"state": setting(rows=7, columns=6)}, {"grid": WRONG} | UNTRIED),
+    "doubles": ({"state": lambda one: setting(actuators=2 * one.actuators)(one)}, {"grid": WRONG} | UNTRIED),
+    "NaN for who is not there": (
+        {"state": shaped(lambda shape: one_dead(shape, np.nan))},
+        {"grid": WRONG} | UNTRIED,
+    ),
+    "wavefront": ({"state": shaped(lambda shape: 2 * shape)}, {"applied": WRONG} | UNTRIED),
+    "um": ({"state": shaped(lambda shape: shape / 1000)}, {"applied": WRONG} | UNTRIED),
+    "upside down": ({"state": shaped(lambda shape: shape[::-1])}, {"applied": WRONG} | UNTRIED),
+    "down is up": ({"state": shaped(lambda shape: -shape)}, {"applied": WRONG} | UNTRIED),
+    "another order": ({"state": shaped(lambda shape: shape.reshape(7, 6).T)}, {"applied": WRONG} | UNTRIED),
+    "a dead actuator": ({"state": shaped(one_dead)}, {"applied": WARNING}),
+    "a status that says nothing": (
+        {"state": setting(status=0)},
+        {"status": WRONG, "dead-man": WRONG, "longest command": WARNING} | UNTRIED,
+    ),
+    "its own time": ({"state": lambda one: stamped(3 * MS)(one, 0)}, {"time": WARNING}),
+    "no modal command": ({"state": lambda one: one.ClearField("command_nm") or one}, {"modal command": WARNING}),
+    "NaN taken for zero": (
+        {"told": careless("finite")},
+        {"NaN refused": WRONG, "infinity refused": WRONG, "dead-man": WRONG} | UNTRIED,
+    ),
+    "any grid": ({"told": careless("grid")}, {"wrong grid refused": WRONG} | UNTRIED),
+    "any length": ({"told": careless("bytes")}, {"short command refused": WRONG} | UNTRIED),
+    "any order": ({"told": careless("order")}, {"old command refused": WRONG, "clear": WARNING} | UNTRIED),
+    "no dead-man": (
+        {"tick": lambda one: lambda device, status, now_ns: status},
+        {"dead-man": WRONG, "longest command": WARNING} | UNTRIED,
+    ),
+    "a refused command renews": ({"renews": True}, {"dead-man": WRONG} | UNTRIED),
+    "expired at once": (
+        {"tick": lambda one: lambda device, status, now_ns: one(device, status._replace(valid_for_ns=MS), now_ns)},
+        {"dead-man": WRONG} | UNTRIED,
+    ),
+    "no limits": ({"device": {"limits": WIDE}}, {"stroke": WRONG, "slew": WRONG, "neighbours": WRONG}),
+    "no stroke limit": ({"device": {"limits": Limits(10_000.0, 150.0, 500.0)}}, {"stroke": WRONG}),
+    "no neighbour limit": ({"device": {"limits": Limits(750.0, 150.0, 10_000.0)}}, {"neighbours": WRONG}),
+    "a shorter stroke": ({"device": {"limits": Limits(400.0, 150.0, 500.0)}}, {"stroke": WARNING}),
+    "limits that are not named": (
+        {"state": lambda one: one.ClearField("limits_hit") or one},
+        {"stroke": WARNING, "slew": WARNING, "neighbours": WARNING},
+    ),
+    "no health": ({"health": lambda _: None}, {"health": WARNING}),
+}
+
+
+def test_a_good_mirror_has_nothing_wrong_and_ends_where_it_was() -> None:
+    mirror = Mirror()
+    start = np.full((6, 7), 40, np.float32)
+    told = Command("lowfc", 5, mirror.device.settling_ns and 1, 10**10, start, np.zeros(2, np.float32))
+    mirror.status, _ = apply_command(replace(mirror.device, flatten=False), mirror.status, told, mirror.now_ns())
+    mirror.device = replace(mirror.device, flatten=False)
+    dialogue = Dialogue(mirror, expected_of(CONFIG))
+    assert found(mirror_checks(dialogue, 0.2, lambda _: None)) == {}
+    np.testing.assert_allclose(mirror.status.surface_nm, start, atol=0.03)
+    assert 5 < mirror.status.frame_sequence < 5000  # a camera that ran before is not behind
+
+
+@pytest.mark.parametrize("mistake", MIRRORS)
+def test_a_mirrors_mistake_is_found(mistake: str) -> None:
+    changes, expected = MIRRORS[mistake]
+    assert of_mirror(**changes) == expected
+
+
+def test_gently_the_limits_are_left_alone() -> None:
+    mirror = Mirror()
+    highest_nm: list[float] = []
+    mirror.changes["state"] = shaped(lambda shape: highest_nm.append(float(np.abs(shape).max())) or shape)
+    assert found(mirror_checks(Dialogue(mirror, expected_of(CONFIG)), 0.2, lambda _: None, gentle=True)) == UNTRIED
+    assert 0 < max(highest_nm) < 0.051 * CONFIG.mirror.slew_nm
+
+
+def test_however_it_ends_the_mirror_is_brought_back() -> None:
+    mirror = Mirror()
+
+    def interrupted(what: str) -> None:
+        if what == "its limits":
+            mirror.changes["state"] = raising
+
+    def raising(state: wire.MirrorState) -> wire.MirrorState:
+        if np.frombuffer(state.actuators, np.float32).max() > 400:
+            del mirror.changes["state"]
+            raise KeyboardInterrupt
+        return state
+
+    with pytest.raises(KeyboardInterrupt):
+        list(mirror_checks(Dialogue(mirror, expected_of(CONFIG)), 0.2, interrupted))
+    assert mirror.status.following
+    np.testing.assert_allclose(mirror.status.surface_nm, 0, atol=0.03)
+
+
+def test_dead_and_stuck_actuators_of_the_configuration_are_no_mistake() -> None:
+    config = load(None, {**SMALL, "mirror.dead": [9, 17], "mirror.stuck_nm": {"24": 30.0}})
+    free = Mirror()
+    free.device = device(config)
+    free.status = initial(free.device)
+    assert found(mirror_checks(Dialogue(free, expected_of(config)), 0.2, lambda _: None)) == {}
+
+
+def test_the_report_says_what_to_do_of_what_is_not_right() -> None:
+    checks = list(camera_checks(watch(Camera(frame=setting(encoding="16UC1")), 1.0, lambda _: None)))
+    console = Console(width=120, record=True, file=io.StringIO())
+    table(checks, STATUSES, console)
+    text = console.export_text()
+    assert "'16UC1'" in text
+    assert "call it mono16" in text
+    assert text.splitlines()[-1].startswith("1 wrong, 0 warnings")
+    printed = json.loads(json.dumps(figures(checks, STATUSES, FIELDS)))
+    assert printed["counts"] == {"ok": len(checks) - 1, "warning": 0, "wrong": 1}
+    assert {"name": "encoding", "status": "wrong"}.items() <= printed["checks"][5].items()
+
+
+@pytest.fixture
+def runtime(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
+
+
+@pytest.mark.usefixtures("runtime")
+@pytest.mark.parametrize("name", ["camera", "mirror"])
+def test_without_a_device_it_says_how_to_start_one(name: str) -> None:
+    done = CliRunner().invoke(conformance_app, [name])
+    assert isinstance(done.exception, BusError)
+    assert "lowfc config zenoh --role" in str(done.exception)
+    done = CliRunner().invoke(conformance_app, [name, "--run", "bench"])
+    assert "there is no run 'bench'" in str(done.exception)
+
+
+@pytest.mark.usefixtures("runtime")
+def test_a_mirror_that_a_controller_commands_is_left_alone() -> None:
+    links = open_run("bench").links
+    with socket.create_server(("127.0.0.1", links.ports[Role.CONTROLLER])):
+        done = CliRunner().invoke(conformance_app, ["mirror", "--run", "bench"])
+    assert "has a controller" in str(done.exception)
+
+
+@pytest.mark.usefixtures("runtime")
+def test_a_camera_that_is_not_there_is_what_is_wrong(monkeypatch: pytest.MonkeyPatch) -> None:
+    open_run("bench")
+    monkeypatch.setattr(conformance, "CONNECT_S", 0.0)
+    done = CliRunner().invoke(conformance_app, ["camera", "--run", "bench", "--duration", "0.2", "--json"])
+    assert done.exit_code == 1
+    checks = {check["name"]: check for check in json.loads(done.stdout)["checks"]}
+    assert checks["frames"]["status"] == "wrong"
+    assert "received: nothing" in checks["frames"]["got"]
+
+
+@pytest.mark.usefixtures("runtime")
+def test_lockstep_has_no_dead_man_to_try(tmp_path: Path) -> None:
+    (tmp_path / "lockstep.toml").write_text("lockstep = true\n")
+    done = CliRunner().invoke(conformance_app, ["mirror", "--config", str(tmp_path / "lockstep.toml")])
+    assert isinstance(done.exception, ConfigurationError)
+
+
+def test_every_command_of_the_document_is_run_by_the_test_of_the_examples() -> None:
+    lines = re.findall(
+        r"^    (\S.*)$", (Path(__file__).parents[2] / "docs" / "hardware.md").read_text(), flags=re.MULTILINE
+    )
+    assert sorted(lines) == sorted(test_own_hardware.DOCUMENTED)
+
+
+@pytest.mark.usefixtures("runtime")
+def test_a_line_hears_what_has_no_envelope_and_asks() -> None:
+    links = open_run("bench").links
+    with zenoh.open(zenoh.Config.from_json5(json.dumps(session_config(links, Role.CAMERA)))) as session:
+        session.declare_queryable(CAMERA_STATE.key, lambda query: query.reply(CAMERA_STATE.key, b"settings"))
+        line = Line(links, Role.OPERATOR)
+        try:
+            until(line.peers)
+            until(lambda: [one.payload for one in line.ask(CAMERA_STATE.key)] == [b"settings"])
+            got: list[Received] = []
+
+            def come() -> bool:
+                session.put(FRAME.key, b"frame")
+                got.extend(line.received())
+                return bool(got)
+
+            until(come)
+            assert got[0][:3] == (FRAME.key, b"frame", None)
+        finally:
+            line.close()
+
+
+@pytest.mark.usefixtures("runtime")
+def test_the_controllers_place_is_taken_by_one_at_a_time() -> None:
+    links = open_run("bench").links
+    line = Line(links, Role.CONTROLLER)
+    try:
+        with pytest.raises(BusError, match="is one running"):
+            Line(links, Role.CONTROLLER)
+    finally:
+        line.close()
+
+
+@pytest.mark.usefixtures("runtime")
+def test_a_run_on_several_hosts_has_another_clock() -> None:
+    open_run("bench", network=Network(router="tls/127.0.0.1:7447", certificates="."))
+    done = CliRunner().invoke(conformance_app, ["camera", "--run", "bench"])
+    assert "goes by a router" in str(done.exception)

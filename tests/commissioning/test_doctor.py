@@ -1,0 +1,416 @@
+"""What `lowfc doctor` says of hosts that are fit, of hosts that are not, and of the one that runs the tests."""
+
+import ctypes
+import json
+import os
+import re
+import subprocess
+import sys
+import time
+from pathlib import Path
+from types import SimpleNamespace
+
+import pytest
+import typer
+from typer.testing import CliRunner
+
+from lowfc.adapters.bus.run import runtime_base
+from lowfc.adapters.logs.selection import EVERYTHING
+from lowfc.adapters.process import host as host_module
+from lowfc.adapters.process import trial as trial_module
+from lowfc.adapters.process.clock import boot_file
+from lowfc.adapters.process.host import Host, Synchronisation, Timex
+from lowfc.adapters.process.trial import Trial, lateness_ns, try_out
+from lowfc.contract.configuration import Configuration, Realtime, load
+from lowfc.programs.commissioning.checks import Check, note, ok
+from lowfc.programs.commissioning.doctor import command, room, timing
+from lowfc.programs.commissioning.doctor.facts import Facts, gather, ranges
+from lowfc.programs.core.recording.volume import bytes_per_s
+
+pytestmark = pytest.mark.exclusive
+
+DOCUMENT = Path(__file__).parents[2] / "docs" / "doctor.md"
+LOOKS = {**timing.CHECKS.looks, **room.CHECKS.looks}
+NO_RIGHTS = [
+    *(["setpriv", "--inh-caps=-all", "--bounding-set=-sys_nice,-ipc_lock,-sys_resource"] if os.geteuid() == 0 else []),
+    *("prlimit", "--rtprio=0", "--memlock=65536", sys.executable, "-P", "-c"),
+]
+"""What runs a Python that may neither have a real-time class nor lock its memory, whoever runs the tests."""
+
+CPUS = "sys/devices/system/cpu"
+CLOCKSOURCE = "sys/devices/system/clocksource/clocksource0/current_clocksource"
+HUGE_PAGES = "sys/kernel/mm/transparent_hugepage/enabled"
+METAL = {
+    "proc/self/cgroup": "0::/user.slice/loop.scope\n",
+    "proc/sys/kernel/sched_rt_runtime_us": "950000\n",
+    "proc/sys/kernel/sched_rt_period_us": "1000000\n",
+    "proc/cpuinfo": "processor\t: 0\nflags\t\t: fpu tsc constant_tsc\n",
+    "proc/version": "Linux version 6.12.1-rt (gcc) #1 SMP PREEMPT_RT Thu Jan 1\n",
+    "proc/cmdline": "quiet isolcpus=4-7 nohz_full=4-7\n",
+    "proc/sys/net/core/rmem_default": "212992\n",
+    "proc/sys/net/core/wmem_default": "212992\n",
+    "proc/sys/net/core/rmem_max": "8388608\n",
+    "proc/sys/net/core/wmem_max": "4194304\n",
+    "proc/sys/net/ipv4/tcp_rmem": "4096\t131072\t6291456\n",
+    "proc/sys/net/ipv4/tcp_wmem": "4096\t16384\t4194304\n",
+    f"{CPUS}/online": "0-7\n",
+    f"{CPUS}/isolated": "4-7\n",
+    f"{CPUS}/nohz_full": "4-6\n",
+    **{f"{CPUS}/cpu{cpu}/cpufreq/scaling_governor": "performance\n" for cpu in range(8)},
+    f"{CPUS}/intel_pstate/no_turbo": "1\n",
+    f"{CPUS}/cpuidle/current_driver": "intel_idle\n",
+    **{
+        f"{CPUS}/cpu0/cpuidle/state{number}/{key}": f"{value}\n"
+        for number, state in enumerate((("POLL", 0, 0), ("C1", 2, 0), ("C6", 133, 1)))
+        for key, value in zip(("name", "latency", "disable"), state, strict=True)
+    },
+    HUGE_PAGES: "always [madvise] never\n",
+    CLOCKSOURCE: "tsc\n",
+    "dev/shm/is_there": "",
+    "usable_cpus": {0, 1, 2, 3},
+    "open_files": 1024,
+    "swap": (0, 0),
+    "stolen_share": 0.0,
+    "load": 0.15,
+}
+"""A computer that is fit: eight processors, four of them kept free for the loop. Files by path, readings by name."""
+
+OF_THE_HOST = [
+    *("real-time share", "processors", "isolation", "quota", "frequency", "idle states", "kernel", "virtualisation"),
+    *("clock source", "wake-up", "load", "scheduling class", "locked memory", "swap", "huge pages"),
+    *("socket buffers", "open files"),
+]
+DMI = ("sys/class/dmi/id/sys_vendor", "sys/class/dmi/id/product_name")
+DYNAMIC = {"proc/version": "Linux version 6.1.0 (gcc) #1 SMP PREEMPT_DYNAMIC Thu"}
+NAMED = {"realtime.camera_cpus": [4], "realtime.controller_cpus": [5], "realtime.mirror_cpus": [6]}
+UNASKED = load(None, {"realtime.priority": 0, "realtime.recorder_priority": 0, "realtime.lock_memory": False})
+
+
+def trial(refused: dict[str, tuple[str, str]] | None = None, cpus: int = 8, **late_ns: list[int]) -> Trial:
+    usual = {"normal_ns": [40_000] * 99 + [900_000], "first_ns": [20_000] * 99 + [60_000]}
+    return Trial(refused=refused or {}, cpus=set(range(cpus)), **{**usual, **late_ns})
+
+
+def machine(root: Path, changes: dict[str, object]) -> Host:
+    """A host of these files and readings; None takes one away."""
+    host = Host(root)
+
+    def unreadable() -> None:
+        raise OSError("there is none")
+
+    for what, value in {**METAL, **changes}.items():
+        if "/" not in what:
+            setattr(host, what, unreadable if value is None else lambda value=value: value)
+        elif value is not None:
+            (root / what).parent.mkdir(parents=True, exist_ok=True)
+            (root / what).write_text(value)
+    return host
+
+
+def facts(root: Path, changes: dict[str, object] | None = None, **others: object) -> Facts:
+    config = others.pop("config", load(None, {"recorder.folder": "/logs", "realtime.disable_cpu_idle": False, **NAMED}))
+    return Facts(**{"host": machine(root, changes or {}), "config": config, "trial": trial(), "busy": (), **others})
+
+
+def examine(facts: Facts) -> dict[str, Check]:
+    return {check.name: check for check in command.examine(facts)}
+
+
+@pytest.fixture
+def alone(monkeypatch: pytest.MonkeyPatch) -> CliRunner:
+    """The command alone, measuring for a moment."""
+    monkeypatch.setattr(command, "TRIAL_S", 0.02)
+    return CliRunner()
+
+
+def app() -> typer.Typer:
+    found = typer.Typer()
+    found.command()(command.doctor)
+    return found
+
+
+def test_a_fit_host_has_no_warning(tmp_path: Path) -> None:
+    found = examine(facts(tmp_path))
+    assert {name: found[name] for name in OF_THE_HOST if found[name].status != "ok"} == {}
+    assert found["isolation"].got == "4-7; of these without a timer tick: 4-6"
+    assert "turbo off" in found["frequency"].got
+    assert "C1 with 2 us" in found["idle states"].got
+    assert "4194 kB" in found["socket buffers"].got
+    assert "213 kB, at most 4194 kB" in found["socket buffers"].got
+    assert "p99 20 us, max 60 us" in found["wake-up"].got
+
+
+@pytest.mark.parametrize(
+    ("name", "status", "said", "changes"),
+    [
+        ("real-time share", "note", "stands still for 50 ms", {"usable_cpus": {0, 1}}),
+        ("real-time share", "warning", "0 ms of every", {"proc/sys/kernel/sched_rt_runtime_us": "0"}),
+        ("real-time share", "ok", "all of a processor", {"proc/sys/kernel/sched_rt_runtime_us": "-1"}),
+        ("processors", "warning", "names 6", {"trial": trial(cpus=6)}),
+        ("isolation", "warning", "isolcpus=5-7 nohz_full=5-7", {f"{CPUS}/isolated": "\n"}),
+        ("isolation", "note", "of 2 there is none to spare", {f"{CPUS}/isolated": "\n", f"{CPUS}/online": "0-1"}),
+        ("isolation", "warning", "the configuration names 4-6", {f"{CPUS}/isolated": "4-5"}),
+        ("isolation", "ok", "without a timer tick: none", {f"{CPUS}/nohz_full": "(null)\n"}),
+        ("quota", "warning", "1.5 processors", {"sys/fs/cgroup/user.slice/cpu.max": "150000 100000\n"}),
+        ("quota", "ok", "none", {"sys/fs/cgroup/user.slice/cpu.max": "max 100000\n"}),
+        (
+            "quota",
+            "warning",
+            "0.5 processors",
+            {
+                "proc/self/cgroup": "4:cpuset:/b\n3:cpu,cpuacct:/a\n0::/\n",
+                "sys/fs/cgroup/cpu/a/cpu.cfs_quota_us": "50000\n",
+                "sys/fs/cgroup/cpu/a/cpu.cfs_period_us": "100000\n",
+                "sys/fs/cgroup/cpu/cpu.cfs_quota_us": "-1\n",
+                "sys/fs/cgroup/cpu/cpu.cfs_period_us": "100000\n",
+            },
+        ),
+        ("frequency", "warning", "powersave", {f"{CPUS}/cpu2/cpufreq/scaling_governor": "powersave\n"}),
+        ("frequency", "ok", "turbo on", {f"{CPUS}/intel_pstate/no_turbo": None, f"{CPUS}/cpufreq/boost": "1\n"}),
+        ("frequency", "note", "not shown", {f"{CPUS}/cpu{cpu}/cpufreq/scaling_governor": None for cpu in range(4)}),
+        ("idle states", "warning", "may wait 133 us", {f"{CPUS}/cpu0/cpuidle/state2/disable": "0\n"}),
+        ("idle states", "note", "no states shown", {f"{CPUS}/cpuidle/current_driver": "none\n"}),
+        ("kernel", "warning", "no preemption", {"proc/version": "Linux version 6.1.0 (gcc) #1 SMP Thu"}),
+        ("kernel", "ok", "PREEMPT", {"proc/version": "Linux version 6.1.0 (gcc) #1 SMP PREEMPT Thu"}),
+        ("kernel", "note", "hidden", DYNAMIC),
+        ("kernel", "ok", "full", DYNAMIC | {"proc/cmdline": "quiet preempt=full"}),
+        ("kernel", "warning", "voluntary", DYNAMIC | {"sys/kernel/debug/sched/preempt": "none (voluntary) full\n"}),
+        (
+            "virtualisation",
+            "warning",
+            "QEMU Standard PC",
+            {"proc/cpuinfo": "flags\t: fpu hypervisor\n"} | dict(zip(DMI, ("QEMU\n", "Standard PC\n"), strict=True)),
+        ),
+        (
+            "virtualisation",
+            "warning",
+            "10.00 % of its time went to others since boot; that is much",
+            {"sys/hypervisor/type": "xen\n", "stolen_share": 0.1},
+        ),
+        ("clock source", "warning", "hpet", {CLOCKSOURCE: "hpet\n"}),
+        ("load", "warning", "9.50 in the last minute", {"load": 9.5}),
+        ("swap", "ok", "1 MB in use of 2097 MB; the loop's memory is locked", {"swap": (2_097_152_000, 1_048_576)}),
+        ("huge pages", "warning", "always", {HUGE_PAGES: "[always] madvise never\n"}),
+        ("socket buffers", "warning", "550 kB", {"proc/sys/net/ipv4/tcp_rmem": "4096 131072 550000\n"}),
+        ("socket buffers", "ok", "560 kB", {"proc/sys/net/ipv4/tcp_rmem": "4096 131072 560000\n"}),
+        ("shared memory", "warning", "there is no /dev/shm", {"dev/shm/is_there": None}),
+        ("open files", "warning", "64", {"open_files": 64}),
+        ("synchronisation", "ok", "kept; 12 us to correct", {"synchronisation": Synchronisation(True, 12e-6, 0.001)}),
+        ("synchronisation", "warning", "not kept", {"synchronisation": Synchronisation(False, 12e-6, 0.001)}),
+        ("wake-up", "warning", "max 4100 us", {"trial": trial(first_ns=[1000] * 999 + [4_100_000])}),
+        ("scheduling class", "note", "realtime.priority = 0", {"config": UNASKED}),
+        ("locked memory", "note", "lock_memory = false", {"config": UNASKED}),
+    ],
+)
+def test_every_host_is_called_what_it_is(
+    tmp_path: Path, name: str, status: str, said: str, changes: dict[str, object]
+) -> None:
+    others = {key: changes[key] for key in ("trial", "config") if key in changes}
+    check = examine(facts(tmp_path, {key: changes[key] for key in changes.keys() - others.keys()}, **others))[name]
+    assert (check.status, said in " ".join(check)) == (status, True), check
+    assert (status == "warning") <= bool(check.advice and check.cost)
+
+
+def test_what_cannot_be_read_is_a_note_and_never_a_fault(tmp_path: Path) -> None:
+    nothing = dict.fromkeys(METAL)
+    failed = OSError("the process that tries it ended with exit status 1: no")
+    found = examine(facts(tmp_path, nothing, trial=failed))
+    unknown = {name for name, check in found.items() if check.got.startswith("not known: ")}
+    assert unknown >= set(OF_THE_HOST)
+    assert {found[name].status for name in unknown} == {"note"}
+    assert found["scheduling class"].got == f"not known: {failed}"
+    assert command.measured(facts(tmp_path, nothing, trial=failed))["wake_up_us"] == {}
+    files = {path: "\x00 ?" for path in METAL if "/" in path}
+    nonsense = examine(facts(tmp_path, files))
+    assert {nonsense[name].status for name in ("isolation", "huge pages")} == {"note"}
+
+
+def test_what_is_refused_is_said_with_its_cost(tmp_path: Path) -> None:
+    refused = {"priority": ("SCHED_FIFO priority 50 (no)", "frames come late"), "lock_memory": ("locked", "stalls")}
+    late_ns = [500_000] * 100
+    found = examine(facts(tmp_path, {"swap": (1 << 31, 0)}, trial=trial(refused, normal_ns=late_ns, first_ns=[])))
+    assert found["scheduling class"].cost == "frames come late"
+    assert "rtprio 50" in found["scheduling class"].advice
+    assert found["locked memory"].cost == "stalls"
+    assert found["swap"].status == "warning"
+    late = found["wake-up"]
+    assert (late.status, "SCHED_FIFO" in late.got) == ("warning", False)
+    assert "a frame period is 4000 us" in late.got
+
+
+def test_processors_that_the_loop_keeps_awake_may_have_deep_states(tmp_path: Path) -> None:
+    deep = {f"{CPUS}/cpu0/cpuidle/state2/disable": "0\n"}
+    config = load(None, NAMED)
+    kept = examine(facts(tmp_path, deep, config=config))["idle states"]
+    assert (kept.status, "133 us" in kept.got, "kept awake" in kept.got) == ("ok", True, True)
+    refused = {"disable_cpu_idle": ("processors awake (no)", "it wakes late")}
+    found = examine(facts(tmp_path, deep, config=config, trial=trial(refused)))
+    assert (found["idle states"].status, found["idle states"].cost) == ("warning", "it wakes late")
+    assert "cpu_dma_latency" in found["idle states"].advice
+
+
+def test_a_busy_process_is_named(tmp_path: Path) -> None:
+    busy = (("chromium", 0.6), ("sshd", 0.05))
+    found = examine(facts(tmp_path, busy=busy))["load"]
+    assert (found.status, "chromium 60 %" in found.got, "sshd" in found.got) == ("warning", True, False)
+
+
+def test_the_disk_is_judged_by_what_the_loop_writes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    usage = SimpleNamespace(free=0, total=10**12)
+    monkeypatch.setattr(host_module.psutil, "disk_usage", lambda path: usage)
+    keys = {"recorder.folder": "/not/yet", "recorder.min_free_mb": 500, "camera.rate_hz": 1000}
+    looked = facts(tmp_path, config=load(None, {**keys, "mirror.rows": 10, "mirror.columns": 10}))
+    assert looked.bytes_per_frame == 80 * 80 * 2 + 2 * 100 * 4
+    grows = bytes_per_s(looked.config, EVERYTHING)
+    an_hour = 500_000_000 + round(grows * 3600) + 1
+    for free, status in ((an_hour, "ok"), (an_hour - 10**6, "warning"), (10**6, "warning")):
+        usage.free = free
+        found = examine(looked)["disk"]
+        assert found.status == status
+        assert (f"1.0 h of {grows * 3600 / 1e9:.1f} GB an hour at 1000 Hz" in found.got) == (free > 10**9)
+    monkeypatch.setattr(host_module.os, "access", lambda path, mode: False)
+    usage.free = an_hour
+    assert "not writable" in examine(looked)["disk"].got
+
+
+@pytest.mark.parametrize(("behind_ms", "status"), [(50, "ok"), (1000, "warning"), (-1000, "warning")])
+def test_a_boots_clock_that_was_set_wrong_is_a_warning(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, behind_ms: int, status: str
+) -> None:
+    monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
+    assert examine(facts(tmp_path))["boot's clock"][:2] == ok("not set yet: the first process of a run does it")[:2]
+    assert not (tmp_path / "lowfc").exists(), "looking changes nothing"
+    file = boot_file(runtime_base())
+    file.write_text(str(time.time_ns() - time.monotonic_ns() - behind_ms * 1_000_000))
+    finding = examine(facts(tmp_path))["boot's clock"]
+    assert finding.status == status
+    assert (status == "warning") == (f"remove {file}" in finding.advice)
+    file.write_text("noon")
+    assert "not known" in examine(facts(tmp_path))["boot's clock"].got
+
+
+def test_certificates_that_end_are_a_warning(tmp_path: Path) -> None:
+    certificates = pytest.importorskip("lowfc.adapters.bus.certificates")
+    folder = tmp_path / "certs"
+    way = load(None, {"network.router": "tls/bench:7447", "network.certificates": str(folder), **NAMED})
+    certificates.make_certificates(folder, ("camera",), [])
+    assert examine(facts(tmp_path))["certificates"].status == "ok"
+    assert examine(facts(tmp_path, config=way))["certificates"].status == "ok"
+    certificates.make_certificates(folder, ("camera",), [], 59, renew=True)
+    finding = examine(facts(tmp_path, config=way))["certificates"]
+    assert finding.status == "warning"
+    assert "certificate of camera ends in 58 days" in finding.got
+
+
+def test_the_kernels_account_of_the_clock_is_read_where_it_is() -> None:
+    timex = Timex(modes=0)
+    assert ctypes.CDLL(None).adjtimex(ctypes.byref(timex)) >= 0
+    seconds = timex.rest[3]  # after constant, precision and tolerance: the time itself
+    assert abs(seconds - time.time()) < 60
+    assert Host().synchronisation().error_s >= 0
+
+
+def test_a_wake_up_that_is_missed_counts_as_late(monkeypatch: pytest.MonkeyPatch) -> None:
+    now_ns = [0]
+    stalls = iter([500_000, 3_200_000])
+
+    def sleep(seconds: float) -> None:
+        now_ns[0] += round(seconds * 1e9) + next(stalls, 0)
+
+    monkeypatch.setattr(trial_module, "time", SimpleNamespace(monotonic_ns=lambda: now_ns[0], sleep=sleep))
+    assert lateness_ns(7, 1_000_000) == [500_000, 3_200_000, 2_200_000, 1_200_000, 200_000, 0, 0]
+
+
+def test_what_was_tried_does_not_stay() -> None:
+    before = os.sched_getscheduler(0), os.sched_getaffinity(0)
+    tried = try_out(Realtime(), {min(before[1])}, 0.02)
+    assert (os.sched_getscheduler(0), os.sched_getaffinity(0)) == before
+    assert tried.cpus >= before[1]
+    assert len(tried.normal_ns) == 20
+    assert len(tried.first_ns) == (0 if "priority" in tried.refused else 20)
+
+
+def test_a_user_without_rights_is_told_what_is_refused() -> None:
+    program = """
+from lowfc.adapters.process.trial import try_out
+from lowfc.contract.configuration import Realtime
+trial = try_out(Realtime(), set(), 0.01)
+print(*trial.refused["priority"], *trial.refused["lock_memory"], len(trial.normal_ns), len(trial.first_ns), sep="\\n")
+"""
+    done = subprocess.run([*NO_RIGHTS, program], capture_output=True, text=True, timeout=60, check=True)
+    refused, cost, unlocked, stall, normal, first = done.stdout.splitlines()
+    assert refused.startswith("SCHED_FIFO priority 50 (")
+    assert "LimitRTPRIO" in cost
+    assert "the limit is 64 kB" in unlocked
+    assert "swapped out" in stall
+    assert (normal, first) == ("10", "0")
+
+
+def test_a_trial_that_fails_says_why(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    broken = tmp_path / "python"
+    broken.write_text("#!/bin/sh\necho no memory >&2\nexit 3\n")
+    broken.chmod(0o755)
+    monkeypatch.setattr(sys, "executable", str(broken))
+    with pytest.raises(OSError, match="exit status 3: no memory"):
+        try_out(Realtime(), set(), 0.01)
+    found = examine(gather(Host(), Configuration(), 0.01))
+    assert "no memory" in found["wake-up"].got
+    assert found["wake-up"].status == "note"
+
+
+def test_a_process_is_seen_at_work() -> None:
+    me = {one: used_s for one, (_, used_s) in Host().used_s().items() if one[0] == os.getpid()}
+    begun_s = time.process_time()
+    while time.process_time() < begun_s + 0.05:
+        pass
+    later = {one: used_s for one, (_, used_s) in Host().used_s().items() if one[0] == os.getpid()}
+    assert later.keys() == me.keys()
+    assert sum(later.values()) > sum(me.values())
+
+
+def test_processors_are_written_as_the_kernel_writes_them() -> None:
+    assert ranges({3, 0, 1, 8}) == "0-1,3,8"
+
+
+def test_this_host_is_looked_at(alone: CliRunner) -> None:
+    done = alone.invoke(app(), ["--json"])
+    assert done.exit_code == 0, done.output
+    (line,) = done.stdout.splitlines()
+    found = json.loads(line)
+    assert [check["name"] for check in found["checks"]] == list(LOOKS)
+    assert all(set(check) == {"name", "status", "detail", "advice", "cost"} for check in found["checks"])
+    assert not [check for check in found["checks"] if check["status"] == "warning" and not check["advice"]]
+    assert sum(found["counts"].values()) == len(found["checks"])
+    normal = found["wake_up_us"]["normal"]
+    assert 0 < normal["p50"] <= normal["p99"] <= normal["max"]
+    assert "sleeping 1000 times a second" in done.stderr
+
+
+def test_strict_is_about_warnings(alone: CliRunner, tmp_path: Path) -> None:
+    config = tmp_path / "lowfc.toml"
+    config.write_text("[realtime]\ncamera_cpus = [8000]\n")
+    done = alone.invoke(app(), ["--config", str(config)])
+    assert done.exit_code == 0, done.output
+    row = next(line for line in done.stdout.splitlines() if " processors " in line)
+    assert row.startswith("warning")
+    assert re.search(r"\d+ warnings, \d+ notes, \d+ ok", done.stdout)
+    assert alone.invoke(app(), ["--config", str(config), "--strict"]).exit_code == 1
+
+
+def test_strict_is_content_with_notes(alone: CliRunner, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(command, "examine", lambda _: [ok("fine"), note("odd")])
+    assert alone.invoke(app(), ["--strict"]).exit_code == 0
+
+
+def test_the_document_has_every_check_in_its_own_words() -> None:
+    def words(name: str) -> str:
+        looks_at, warns = (" ".join(part.split()) for part in LOOKS[name][1].__doc__.strip().split("\n\n"))
+        return f"| {name} | {looks_at} | {warns} |"
+
+    rows = [line for line in DOCUMENT.read_text().splitlines() if line.startswith("| ")]
+    assert rows[1:] == [words(name) for name in LOOKS], "the table must have the checks and their docstrings"
+
+
+def test_percentiles_are_of_all_wake_ups() -> None:
+    found = timing.wake_up_us(trial(normal_ns=[1000 * number for number in range(1, 1001)], first_ns=[]))
+    assert found == {"normal": {"p50": 500.5, "p99": pytest.approx(990.01), "max": 1000.0}}

@@ -1,0 +1,299 @@
+"""`lowfc tune`: figures, files and mistakes, on a log that the live loop's own `advance` makes; and law files."""
+
+import json
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from astropy.io import fits
+from rich.console import Console
+
+from lowfc.adapters.files import law_file
+from lowfc.adapters.logs.reader import LogReader
+from lowfc.client import Answer
+from lowfc.contract.codecs.state_codec import controller_state
+from lowfc.contract.configuration import Configuration
+from lowfc.contract.errors import BusError, ConfigurationError, DataFileError, RequestRefusedError
+from lowfc.contract.messages import wire
+from lowfc.control.calibration.calibration import Calibration
+from lowfc.control.laws.linear_law import LinearLaw
+from lowfc.control.laws.margins import check_stable
+from lowfc.control.loop.advance import advance
+from lowfc.control.loop.inputs import Load, Request, Step
+from lowfc.control.loop.safety import LoopMode
+from lowfc.control.loop.state import State
+from lowfc.programs.commissioning.tune.command import integrate, tune, tune_run
+from lowfc.programs.commissioning.tune.data import driving, of_log, of_run
+from lowfc.programs.commissioning.tune.figures import figures, render, tuned
+from tests.support.report_log import Night
+from tests.support.theory import LAWS
+from tests.support.toy import NOLL, PERIOD_NS, calibration, frame_sequence, settings
+
+QUIET = Console(quiet=True)
+
+
+@pytest.fixture(scope="module")
+def log(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    night = Night()
+    night.request("close")
+    night.frames(5000)
+    return night.write(tmp_path_factory.mktemp("night") / "night.mcap")
+
+
+@pytest.mark.parametrize("controller", ["integrator", "pi-notch", "lqg"])
+def test_each_law_is_tuned_from_a_closed_loop(log: Path, controller: str, tmp_path: Path) -> None:
+    """Tip is a sine of 12 nm at 7 Hz under noise: it is found, and each law leaves less than the loop did."""
+    out = tmp_path / "law.fits"
+    found = tune_run(log, controller, out=out, console=QUIET)
+    json.loads(json.dumps(found, allow_nan=False))
+    tip = found["modes"][0]
+    assert [line["frequency_hz"] for line in tip["lines"]] == pytest.approx([7.0], abs=0.05)
+    assert tip["lines"][0]["rms_nm"] == pytest.approx(12 / np.sqrt(2), rel=0.1)
+    assert tip["gain_now"] == pytest.approx(0.4)
+    assert tip["achieved_nm"] == pytest.approx(tip["predicted_now_nm"], rel=0.15)
+    assert tip["predicted_nm"] < tip["achieved_nm"]
+    assert found["closed"]
+    assert found["achieved_from"] == "truth"
+    law = law_file.load(out)
+    assert law.name == controller
+    check_stable(law, found["delay_frames"])
+    text = render(found)
+    assert "7.00 (8." in text
+    assert "tilt per axis, mas rms: open" in text
+
+
+def test_laws_get_better_from_the_integrator_to_lqg(log: Path) -> None:
+    left = [
+        tune_run(log, name, console=QUIET)["modes"][0]["predicted_nm"] for name in ("integrator", "pi-notch", "lqg")
+    ]
+    assert left == sorted(left, reverse=True)
+
+
+def test_what_was_played_is_neither_tuned_for_nor_taken_for_the_delay(tmp_path: Path) -> None:
+    """The loop follows what is played to the mirror frames later: the true wavefront then moves unlike the commands."""
+    night = Night()
+    night.request("close")
+    night.frames(1500)
+    shape = night.calibration.modes_to_actuators[:, 0]
+    table = 20 * np.sin(2 * np.pi * 31 * np.arange(4000) * PERIOD_NS * 1e-9).astype(np.float32)[:, None]
+    night.request("play", text="mirror", actuators_nm=shape, table=table)
+    night.frames(7000)
+    found = tune_run(night.write(tmp_path / "played.mcap"), "integrator", console=QUIET)
+    assert found["delay_frames"] == 1.0
+    assert found["warnings"] == []
+    assert found["frames"] < 4500
+    assert [line["frequency_hz"] for line in found["modes"][0]["lines"]] == pytest.approx([7.0], abs=0.05)
+
+
+def test_an_open_loop_with_much_tilt_is_flagged(tmp_path: Path) -> None:
+    night = Night()
+    night.request("open")
+    night.frames(3000)
+    path = night.write(tmp_path / "open.mcap")
+    found = tune_run(path, "integrator", console=QUIET)
+    assert not found["closed"]
+    assert found["modes"][0]["achieved_nm"] is None
+    small = found["tilt_mas"]["open"]
+    assert ("optical gain" in " ".join(found["warnings"])) == (small > 10)
+    run = of_log(LogReader(path))
+    larger = replace(run, nm_per_mas=run.nm_per_mas / 10)  # type: ignore[operator]
+    warned = figures(larger, *tuned(larger, "integrator"), "integrator")["warnings"]
+    assert "above 10: the sensor shows less than there is (optical gain)" in " ".join(warned)
+
+
+class Listening:
+    """Steps of a loop as a client gets them; every thousandth does not come, and every hundredth was refused."""
+
+    lost = 4
+
+    def __init__(self, frames: int) -> None:
+        noise = np.random.default_rng(3).standard_normal((frames, 3)).astype(np.float32)
+        tip = 10 * np.sin(2 * np.pi * 20 * np.arange(frames) * PERIOD_NS * 1e-9)
+        noise[:, 0] += tip.astype(np.float32)
+        self.steps = iter(
+            Step(
+                frame_sequence(index),
+                index * PERIOD_NS,
+                LoopMode.CLOSED,
+                np.zeros(3, np.float32),
+                (),
+                None if index % 100 == 99 else pol,
+                None if index % 100 == 99 else pol,
+            )
+            for index, pol in enumerate(noise)
+            if index % 1000 != 500
+        )
+
+    def __iter__(self) -> Iterator[Step]:
+        return self.steps
+
+    def close(self) -> None:
+        self.steps = iter(())
+
+
+class Loop:
+    """What `of_run` asks of a client."""
+
+    run_id = "bench"
+
+    def status(self) -> Answer:
+        state = wire.ControllerState(gain=[0.5] * 3, leak=[0.0] * 3, limit_nm=[50.0] * 3, delay_frames=1.0)
+        return Answer(True, "closed", 1, state=state)
+
+    def laws(self) -> dict[str, LinearLaw]:
+        return {}
+
+    def calibration(self) -> Calibration:
+        return calibration()
+
+    def configuration(self) -> str:
+        return Configuration().to_toml()
+
+    def steps(self) -> Listening:
+        return Listening(6000)
+
+
+def test_a_running_loop_is_listened_to() -> None:
+    """Missing and refused frames are bridged; the first half second after closing does not count."""
+    run = of_run(Loop(), 60.0)  # type: ignore[arg-type]
+    assert run.closed
+    assert (run.source, run.noll, run.delay_frames) == ("bench", (2, 3, 4), 1.0)
+    assert run.rate_hz == pytest.approx(1000)
+    assert run.warnings == ("4 steps did not get here in time",)
+    assert run.pol.frames == pytest.approx(5500, abs=5)
+    found = figures(run, *tuned(run, "lqg"), "lqg")
+    assert found["modes"][0]["lines"][0]["frequency_hz"] == pytest.approx(20, abs=0.05)
+    assert found["achieved_from"] == "error less noise"
+
+
+class Steered:
+    """What `integrate` asks of a client; requests go to the live controller's `advance`."""
+
+    def __init__(self) -> None:
+        self.settings = settings(gain=(0.4, 0.2))
+        self.state, _ = advance(self.settings, State(), Load(0, calibration(), "test"))
+        self.asked: list[str] = []
+        self.deaf: tuple[int, ...] = ()
+
+    def laws(self) -> dict[str, LinearLaw]:
+        return {law.id: law for law in LAWS.values()}
+
+    def _ask(self, request: Request) -> Answer:
+        self.asked.append(request.name)
+        if len(self.asked) in self.deaf:
+            raise BusError("the controller did not answer")
+        self.state, outputs = advance(self.settings, self.state, request)
+        assert outputs.reply is not None
+        if not outputs.reply.accepted:
+            raise RequestRefusedError(f"{request.name} refused: {outputs.reply.text}")
+        return Answer(True, outputs.reply.text, frame_sequence(7))
+
+    def status(self) -> Answer:
+        return Answer(True, "", 0, state=controller_state(self.state, self.settings, 0))
+
+    def law(self, law: LinearLaw | None = None) -> Answer:
+        return self._ask(Request(0, "law", law=law))
+
+    def gain(self, values: list[float], modes: tuple[int, ...]) -> Answer:
+        return self._ask(Request(0, "gain", modes, tuple(values)))
+
+    def known(self) -> tuple[str | None, list[float]]:
+        state = self.status().state
+        law = driving(state, self.laws())
+        assert state is not None
+        return (None if law is None else law.name), [round(gain, 6) for gain in state.gain]
+
+
+def test_gains_are_given_to_whatever_law_drives() -> None:
+    loop = Steered()
+    answer = integrate(loop, [0.3, 0.25, 0.1], NOLL)  # type: ignore[arg-type]
+    assert answer.sentence == "gain is now 0.3 0.25 0.1, from frame 7 on"
+    assert loop.asked == ["gain"]
+    loop.law(LAWS["pi"])
+    integrate(loop, [0.2, 0.2, 0.1], NOLL)  # type: ignore[arg-type]
+    assert loop.known() == (None, [0.2, 0.2, 0.1])
+
+
+def test_the_law_that_drove_goes_on_where_the_gains_are_refused() -> None:
+    loop = Steered()
+    loop.law(LAWS["pi"])
+    before = loop.known()
+    with pytest.raises(RequestRefusedError, match=r"^gain refused: gain must be at least 0 and below"):
+        integrate(loop, [0.3, 0.3, 9.0], NOLL)  # type: ignore[arg-type]
+    assert loop.known() == before == (LAWS["pi"].name, [0.4, 0.4, 0.2])
+    with pytest.raises(RequestRefusedError, match="are not controlled"):
+        integrate(loop, [0.3, 0.3], (2, 9))  # type: ignore[arg-type]
+    assert loop.known() == before
+
+
+def test_the_law_that_drove_goes_on_where_nobody_answers_or_it_is_said_that_it_does_not() -> None:
+    loop = Steered()
+    loop.law(LAWS["pi"])
+    before = loop.known()
+    loop.deaf = (3,)
+    with pytest.raises(BusError, match="did not answer"):
+        integrate(loop, [0.3, 0.3, 0.3], NOLL)  # type: ignore[arg-type]
+    assert loop.known() == before
+    loop.deaf = (6, 7)
+    with pytest.raises(RequestRefusedError, match=f"the integrator drives .* law {before[0]!r} could not be put back"):
+        integrate(loop, [0.3, 0.3, 0.3], NOLL)  # type: ignore[arg-type]
+    assert loop.known() == (None, before[1])
+
+
+def test_a_picture_is_drawn(log: Path, tmp_path: Path) -> None:
+    found = tune_run(log, "lqg", plot=tmp_path / "lqg.png", console=QUIET)
+    assert (tmp_path / "lqg.png").read_bytes()[:4] == b"\x89PNG"
+    assert found["files"] == [str(tmp_path / "lqg.png")]
+
+
+def test_a_log_that_is_too_short_is_refused(tmp_path: Path) -> None:
+    night = Night()
+    night.request("close")
+    night.frames(700)
+    with pytest.raises(DataFileError, match="tuned from at least 2048 frames in a row, 2 s; the longest run of good"):
+        tune_run(night.write(tmp_path / "short.mcap"), "lqg", console=QUIET)
+
+
+def test_what_is_written_is_never_a_log(log: Path) -> None:
+    with pytest.raises(DataFileError, match="is a log, which is never overwritten"):
+        tune_run(log, "lqg", out=log, console=QUIET)
+
+
+def test_a_log_or_a_running_loop_is_named() -> None:
+    with pytest.raises(ConfigurationError, match="name one LOG, or listen to a running loop"):
+        tune(None, live=None)
+    with pytest.raises(ConfigurationError, match="name one LOG"):
+        tune(Path("x.mcap"), live=3.0)
+
+
+@pytest.mark.parametrize("name", LAWS)
+def test_a_law_comes_back_from_its_file_as_it_was(name: str, tmp_path: Path) -> None:
+    law_file.save(LAWS[name], tmp_path / "law.fits")
+    again = law_file.load(tmp_path / "law.fits")
+    assert again.id == LAWS[name].id
+    assert (again.name, again.noll, again.delay_frames) == (LAWS[name].name, LAWS[name].noll, 1.0)
+
+
+def test_damage_of_a_law_file_is_found(tmp_path: Path) -> None:
+    path = tmp_path / "law.fits"
+    with pytest.raises(DataFileError, match="there is no such law file: make one with `lowfc tune"):
+        law_file.load(path)
+    law_file.save(LAWS["notch"], path)
+    whole = path.read_bytes()
+    path.write_bytes(whole[: len(whole) // 2])
+    with pytest.raises(DataFileError, match="not a whole law file"):
+        law_file.load(path)
+    path.write_bytes(whole)
+    with fits.open(path, mode="update") as units:
+        units["MEASUREMENT_GAIN"].data[0, 0] += 1
+    with pytest.raises(DataFileError, match="damaged: its content has identity"):
+        law_file.load(path)
+    path.write_bytes(b"SIMPLE")
+    with pytest.raises(DataFileError, match=r"law\.fits: not a whole law file") as caught:
+        law_file.load(path)
+    assert "\n" not in str(caught.value)
+    fits.PrimaryHDU().writeto(path, overwrite=True)
+    with pytest.raises(DataFileError, match="its header should say KIND = 'lowfc law 2'"):
+        law_file.load(path)

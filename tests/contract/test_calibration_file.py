@@ -1,0 +1,134 @@
+"""Calibrations as FITS: nothing is lost, damage is found, units are in the headers."""
+
+import io
+from dataclasses import fields, replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from astropy.io import fits
+
+from lowfc.adapters.files.calibration_file import load, save, to_bytes
+from lowfc.contract.codecs import calibration_codec
+from lowfc.contract.errors import DataFileError
+from lowfc.control.calibration.calibration import Calibration
+
+
+def calibration() -> Calibration:
+    rng = np.random.default_rng(3)
+
+    def single(*shape: int) -> np.ndarray:
+        return rng.standard_normal(shape).astype(np.float32)
+
+    return calibration_codec.identified(
+        Calibration(
+            noll=(2, 3, 4),
+            reference=single(30),
+            response=single(30, 3),
+            reconstructor=single(3, 30),
+            good=(rng.random(30) > 0.2).astype(np.float32),
+            dark=single(30),
+            modes_to_actuators=single(12, 3),
+            shape=(5, 6),
+            grid=(3, 4),
+            flux_dn=1234.5678901234,
+            saturation_dn=65535.0,
+            estimator="weighted",
+            wavelength_nm=549.9999999,
+            operator_hash="0a" * 32,
+            id="",
+        )
+    )
+
+
+def test_what_is_saved_is_loaded_bit_for_bit(tmp_path: Path) -> None:
+    saved, path = calibration(), tmp_path / "night.fits"
+    save(saved, path)
+    found = load(path)
+    for part in fields(Calibration):
+        one, other = getattr(saved, part.name), getattr(found, part.name)
+        if isinstance(one, np.ndarray):
+            assert one.dtype == other.dtype
+            assert one.tobytes() == other.tobytes()
+            assert other.dtype.isnative
+        else:
+            assert one == other
+            assert type(one) is type(other)
+    assert list(tmp_path.iterdir()) == [path]
+
+
+def test_the_file_is_fits_with_named_extensions_and_units() -> None:
+    with fits.open(io.BytesIO(to_bytes(calibration()))) as units:
+        units.verify("exception")
+        names = {unit.name: unit.header.get("BUNIT") for unit in units[1:]}
+        assert names == {
+            "REFERENCE": "",
+            "RESPONSE": "nm-1",
+            "RECONSTRUCTOR": "nm",
+            "MASK": "",
+            "DARK": "adu",
+            "MODES2ACT": "",
+        }
+        assert units[0].header["NOLL"] == "2 3 4"
+
+
+def test_damage_is_found(tmp_path: Path) -> None:
+    path = tmp_path / "night.fits"
+    content = to_bytes(calibration())
+    path.write_bytes(content)
+    with fits.open(path, mode="update") as units:
+        units["DARK"].data[3] += 1
+    with pytest.raises(DataFileError, match="damaged: its content has identity"):
+        load(path)
+    path.write_bytes(content[: len(content) // 2])
+    with pytest.raises(DataFileError, match=r"night\.fits"):
+        load(path)
+
+
+@pytest.mark.parametrize("content", [b"", b"not FITS at all" * 400])
+def test_another_kind_of_file_is_refused(tmp_path: Path, content: bytes) -> None:
+    path = tmp_path / "night.fits"
+    path.write_bytes(content)
+    with pytest.raises(DataFileError, match="not a whole calibration file"):
+        load(path)
+
+
+def test_a_fits_file_of_something_else_is_refused(tmp_path: Path) -> None:
+    path = tmp_path / "picture.fits"
+    fits.PrimaryHDU(np.zeros((3, 3))).writeto(path)
+    with pytest.raises(DataFileError, match="KIND"):
+        load(path)
+    with pytest.raises(DataFileError, match="no such calibration file"):
+        load(tmp_path / "none.fits")
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"flux_dn": 2.0},
+        {"estimator": "pinv"},
+        {"noll": (2, 3, 5)},
+        {"dark": np.zeros(30, np.float32)},
+        {"operator_hash": ""},
+    ],
+)
+def test_the_identity_is_of_everything(change: dict[str, object]) -> None:
+    one = calibration()
+    assert calibration_codec.identified(one).id == one.id
+    assert len(one.id) == 64
+    assert calibration_codec.identified(replace(one, **change)).id != one.id
+
+
+def test_what_r_makes_of_each_actuator_is_kept_and_may_be_missing(tmp_path: Path) -> None:
+    one, path = calibration(), tmp_path / "night.fits"
+    seen = np.arange(36, dtype=np.float32).reshape(3, 12)
+    whole = calibration_codec.identified(replace(one, actuators_to_modes=seen))
+    save(whole, path)
+    assert np.array_equal(load(path).actuators_to_modes, seen)
+    assert whole.id != one.id
+    with fits.open(path) as units:
+        assert "ACT2MODES" in units
+    save(one, path)
+    assert load(path).actuators_to_modes.size == 0
+    with fits.open(path) as units:
+        assert "ACT2MODES" not in units

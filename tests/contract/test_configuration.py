@@ -1,0 +1,198 @@
+"""The configuration: defaults that work, and one clear line for everything that does not."""
+
+import re
+import tomllib
+from pathlib import Path
+from typing import Any
+
+import pytest
+import tomli_w
+
+from lowfc.adapters.files.factory import detector, mirror, mirror_limits, settings
+from lowfc.contract.configuration import PRESETS, Configuration, keys, load
+from lowfc.contract.errors import ConfigurationError
+from lowfc.programs.cli.config import commented
+from sim_camera.disturbance import disturbance
+from sim_dm.process import device
+
+KEYS = keys()
+
+
+def write(folder: Path, text: str) -> Path:
+    path = folder / "lowfc.toml"
+    path.write_text(text, encoding="utf-8")
+    return path
+
+
+def complaint(path: Path | None, overrides: dict[str, Any] | None = None) -> str:
+    with pytest.raises(ConfigurationError) as caught:
+        load(path, overrides)
+    return str(caught.value)
+
+
+def test_the_defaults_are_valid_and_make_every_part() -> None:
+    config = load(None)
+    assert config == Configuration()
+    detector(config)
+    mirror(config)
+    mirror_limits(config)
+    settings(config)
+    assert device(config).tighter.stroke_nm > config.safety.stroke_nm
+
+
+@pytest.mark.parametrize("preset", PRESETS)
+def test_every_preset_that_can_be_asked_for_exists(preset: str) -> None:
+    config = load(None, {"disturbance.preset": preset})
+    disturbance(config.disturbance.preset, config.noll, config.seed, 2.4, 550.0)
+
+
+@pytest.mark.parametrize("key", KEYS)
+def test_every_key_has_a_sentence(key: str) -> None:
+    sentence = KEYS[key].description
+    assert sentence, f"{key} has no sentence"
+    assert sentence.endswith(".")
+    assert len(sentence) > 10
+
+
+def test_toml_round_trip(tmp_path: Path) -> None:
+    config = load(None, {"seed": 7, "mirror.stuck_nm": {"3": 25.0}, "mirror.dead": [1, 2], "camera.delay_frames": 1.5})
+    assert load(write(tmp_path, config.to_toml())) == config
+    written = tomllib.loads(config.to_toml())
+    for key in KEYS:
+        *sections, last = key.split(".")
+        part = written
+        for section in sections:
+            part = part[section]
+        assert last in part
+
+
+@pytest.mark.parametrize(
+    ("text", "unknown", "near"),
+    [
+        ("[camera]\nrate_hertz = 500", "camera.rate_hertz", "camera.rate_hz"),
+        ("[control]\ntiltgain = 0.5", "control.tiltgain", "control.tilt_gain"),
+        ("[contol]\ngain = 0.5", "contol", "control"),
+        ("lock_step = true", "lock_step", "lockstep"),
+        ("[mirror]\nzzz = 1", "mirror.zzz", "mirror"),
+    ],
+)
+def test_an_unknown_key_is_refused_with_the_nearest_known_one(
+    tmp_path: Path, text: str, unknown: str, near: str
+) -> None:
+    path = write(tmp_path, text)
+    said = complaint(path)
+    assert said.startswith(f"{path}: unknown key {unknown!r}; the nearest known one is '{near}")
+    assert "\n" not in said
+
+
+@pytest.mark.parametrize(
+    ("key", "value"),
+    [
+        ("camera.rate_hz", 0),
+        ("camera.rate_hz", -5),
+        ("camera.rate_hz", float("nan")),
+        ("camera.rate_hz", float("inf")),
+        ("camera.rate_hz", "fast"),
+        ("camera.delay_frames", 0.5),
+        ("camera.exposure_fraction", 1.5),
+        ("camera.bit_depth", 17),
+        ("camera.bit_depth", 12.5),
+        ("control.leak", 1.1),
+        ("control.gain", -0.1),
+        ("control.estimator", "best"),
+        ("control.on_frame_timeout", "panic"),
+        ("control.start_mode", "safed"),
+        ("disturbance.preset", "earthquake"),
+        ("mirror.name", "DM 1"),
+        ("mirror.rows", 0),
+        ("mirror.dead", ["x"]),
+        ("mirror.nm_per_unit", 0),
+        ("mirror.magnification", 2.0),
+        ("mirror.shift_pitches", -3.0),
+        ("mirror.flat", 7),
+        ("safety.slew_nm", 0),
+        ("seed", -1),
+        ("sensor.nodes", 48),
+        ("lockstep", "perhaps"),
+    ],
+)
+def test_a_value_out_of_range_is_one_line_with_key_and_value(tmp_path: Path, key: str, value: object) -> None:
+    said = complaint(None, {key: value})
+    assert said.startswith(f"{key}")
+    assert repr(value) in said or repr(value)[1:-1] in said
+    assert "\n" not in said
+
+
+def test_what_is_shown_chooses_nothing_that_was_not_chosen(tmp_path: Path) -> None:
+    """Written to a file and read again, it leaves a command's own defaults in force."""
+    silent = write(tmp_path, commented(load(None)))
+    assert tomllib.loads(silent.read_text()) == {name: {} for name in tomllib.loads(silent.read_text())}
+    assert load(silent, None, {"control.start_mode": "closed"}).control.start_mode == "closed"
+    assert {line.removeprefix("#").split(" = ")[0] for line in silent.read_text().splitlines()} >= {
+        key.rpartition(".")[2] for key in KEYS
+    }
+    chosen = {
+        "control": {"start_mode": "open"},  # the default, and yet a choice
+        "disturbance": {"static_nm": {"4": 1.5}},
+        "mirror": {"dead": [1, 2], "stuck_nm": {"3": 25.0, "5": -2.0}},
+    }
+    config = load(write(tmp_path, tomli_w.dumps(chosen)))
+    shown = write(tmp_path, commented(config))
+    assert {name: keys for name, keys in tomllib.loads(shown.read_text()).items() if keys} == chosen
+    assert load(shown, None, {"control.start_mode": "closed"}) == config
+    uncommented = "\n".join(re.sub(r"^#(?! )", "", line) for line in commented(load(None)).splitlines())
+    assert load(write(tmp_path, uncommented)) == Configuration(), "each key can be uncommented as it stands"
+
+
+def test_every_fault_gets_its_own_line(tmp_path: Path) -> None:
+    said = complaint(write(tmp_path, "[camera]\nrate_hz = -1\ngain = 2\n[safety]\nslew_nm = 0"))
+    lines = said.splitlines()
+    assert len(lines) == 3
+    assert all(line.startswith(f"{tmp_path / 'lowfc.toml'}: ") for line in lines)
+
+
+@pytest.mark.parametrize(
+    ("overrides", "words"),
+    [
+        ({"safety.stroke_nm": 800.0}, ("safety.stroke_nm", "800", "750")),
+        ({"mirror.dead": [34 * 34]}, ("1156", "1155")),
+        ({"mirror.dead": [-1]}, ("-1", "1155")),
+        ({"mirror.stuck_nm": {"2000": 1.0}}, ("2000", "1155")),
+        ({"mirror.driver_bits": 8, "mirror.slew_nm": 3.0}, ("mirror.slew_nm", "8 bits", "5.859")),
+        ({"disturbance.static_nm": {"focus": 3.0}}, ("focus", "Noll")),
+        ({"disturbance.static_nm": {"1": 3.0}}, ("'1'", "Noll")),
+    ],
+)
+def test_values_that_do_not_go_together_are_refused(overrides: dict[str, Any], words: tuple[str, ...]) -> None:
+    said = complaint(None, overrides)
+    assert all(word in said for word in words), said
+    assert "\n" not in said
+
+
+def test_the_stroke_may_be_all_that_the_mirror_has() -> None:
+    assert load(None, {"safety.stroke_nm": 750.0}).safety.stroke_nm == 750
+
+
+def test_a_file_that_is_missing_or_no_toml_is_named(tmp_path: Path) -> None:
+    assert complaint(tmp_path / "none.toml") == f"{tmp_path / 'none.toml'}: there is no such configuration file"
+    assert "not a readable TOML file" in complaint(write(tmp_path, "seed = = 3"))
+    (tmp_path / "latin.toml").write_bytes(b"seed = 3 # caf\xe9")
+    assert "not a readable TOML file" in complaint(tmp_path / "latin.toml")
+    assert "not a readable TOML file" in complaint(tmp_path)
+
+
+def test_overrides_lie_over_the_file(tmp_path: Path) -> None:
+    path = write(tmp_path, "seed = 3\n[camera]\nrate_hz = 500")
+    config = load(path, {"camera.rate_hz": 250.0})
+    assert (config.seed, config.camera.rate_hz) == (3, 250.0)
+    assert "must be a section" in complaint(path, {"seed.deep": 1})
+
+
+def test_times_follow_from_the_rate() -> None:
+    config = load(None, {"camera.rate_hz": 800.0, "camera.exposure_fraction": 0.4, "sensor.modes": 3})
+    assert (config.period_ns, config.exposure_ns, config.noll) == (1_250_000, 500_000, (2, 3, 4))
+
+
+def test_a_configuration_does_not_change() -> None:
+    with pytest.raises(ValueError, match="frozen"):
+        Configuration().seed = 4

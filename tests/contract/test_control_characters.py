@@ -1,0 +1,134 @@
+"""Control characters in notes and other text of unknown origin: shown as escapes, never given to a terminal."""
+
+import io
+import signal
+import sys
+from pathlib import Path
+
+import pytest
+from rich.console import Console
+from typer.testing import CliRunner
+
+from lowfc.adapters.process.service import Service
+from lowfc.adapters.process.terminal import new_app, run_app
+from lowfc.contract.configuration import Configuration, load
+from lowfc.contract.errors import ConfigurationError, RequestRefusedError
+from lowfc.contract.events import EVENTS
+from lowfc.contract.messages import EVENT, REQUEST, Log, wire
+from lowfc.contract.printable import LINES, printable
+from lowfc.programs.cli.main import app
+from lowfc.programs.cli.output import put
+from lowfc.programs.launch.status import screen
+from lowfc.programs.launch.watch import Watch
+from lowfc.programs.view.panels.loop import LOG
+from lowfc.programs.view.recorded import draw_logs
+from lowfc.programs.view.renderer import Renderer
+from lowfc.testing.clock import FakeClock
+from lowfc.testing.memory_bus import MemoryBus, MemoryHub
+from tests.support import report_log
+from tests.support.report_log import Night
+from tests.support.tape import Tape
+
+pytestmark = pytest.mark.exclusive
+
+HOSTILE = "clouds\x1b[2J\x07 \x9b31mred \u202egnorts \u2028 caf\u00e9 5\u2009nm\r\nerror: fine"
+SHOWN = r"clouds\x1b[2J\x07 \x9b31mred \u202egnorts \u2028 café 5" + "\u2009" + r"nm\r\nerror: fine"
+
+
+def check(said: str, *, keep: str = "\n") -> None:
+    """No control character is in what was printed, and what was said is."""
+    assert printable(said, keep) == said
+    assert "clouds\\x1b[2J" in said
+
+
+def test_control_characters_are_shown_and_nothing_else_is_changed() -> None:
+    assert printable(HOSTILE) == SHOWN
+    assert printable(HOSTILE, LINES) == SHOWN.replace("\\n", "\n")
+    usual = "R = 3 µm, \u00a0 ±2 \\n 日本 🔭 \u2009"
+    assert printable(usual) == usual
+    assert printable("a\udc80b") == r"a\udc80b"
+
+
+def test_an_event_is_one_line() -> None:
+    assert EVENTS["NOTE"].log("controller", 0, text=HOSTILE).message == f"NOTE {SHOWN}"
+
+
+def test_a_process_prints_its_events_so(capsys: pytest.CaptureFixture[str]) -> None:
+    clock = FakeClock()
+    Service("camera", "night", clock, MemoryBus(MemoryHub(), "camera", clock)).event("RECORDING_FAILED", why=HOSTILE)
+    assert capsys.readouterr().err == f"camera: RECORDING_FAILED recording stopped: {SHOWN}\n"
+
+
+def test_a_commands_answer_and_error_are_printed_so(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    put({}, f"{HOSTILE}\nframe 3", as_json=False)
+    check(capsys.readouterr().out)
+    failing = new_app("")
+
+    @failing.command()
+    def fail() -> None:
+        raise RequestRefusedError(HOSTILE)
+
+    monkeypatch.setattr(sys, "argv", ["lowfc"])
+    before = {number: signal.getsignal(number) for number in (2, 15)}
+    try:
+        with pytest.raises(SystemExit):
+            run_app(failing)
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+    check(capsys.readouterr().err)
+
+
+def test_a_configuration_is_complained_of_so() -> None:
+    with pytest.raises(ConfigurationError) as caught:
+        load(None, {"mirror.stuck_nm": {HOSTILE: "high"}})
+    check(str(caught.value))
+
+
+def test_the_screen_of_a_loop_shows_them() -> None:
+    watch = Watch({}, [Log(level=2, name=HOSTILE, message=f"NOTE {HOSTILE}")])
+    stream = io.StringIO()
+    Console(file=stream, width=300, color_system=None).print(screen(watch, Configuration(), None, 1.0))
+    check(stream.getvalue())
+    assert stream.getvalue().count("clouds") == 2
+
+
+@pytest.fixture
+def log(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A log whose recorder escaped nothing."""
+    monkeypatch.setattr(report_log, "METADATA", {"lowfc": {"host": HOSTILE, "numpy": HOSTILE}})
+    night = Night()
+    night.frames(200)
+    night.put(EVENT, Log(level=3, name=HOSTILE, message=HOSTILE))  # type: ignore[arg-type]
+    night.put(EVENT, Log(level=2, name="controller", message=f"MODE_CHANGED loop open -> closed: {HOSTILE}"))  # type: ignore[arg-type]
+    night.put(REQUEST, wire.Request(name=HOSTILE, accepted=True, reply=HOSTILE))
+    night.frames(50)
+    return night.write(tmp_path / "night.mcap")
+
+
+@pytest.mark.parametrize("command", ["info", "report", "replay"])
+def test_readers_of_a_log_print_them_so(log: Path, command: str) -> None:
+    done = CliRunner().invoke(app, [command, str(log)])
+    assert done.exit_code == 0, done.output
+    check(done.output)
+
+
+def test_a_report_page_shows_them(log: Path) -> None:
+    assert CliRunner().invoke(app, ["report", str(log)]).exit_code == 0
+    page = log.with_suffix(".html").read_text()
+    check(page.replace("\u2028", ""), keep=LINES)
+    assert page.count("clouds\\x1b[2J") >= 6, "events, requests, what ran"
+    assert page.count("<svg") > 3, "drawings are left as they are"
+
+
+def test_a_view_shows_them(log: Path) -> None:
+    tape = Tape()
+    draw_logs([log], None, lambda config: Renderer(config, tape))  # type: ignore[arg-type]
+    paths = [path for path in tape.paths if path.startswith(LOG)]
+    assert any("clouds" in path for path in paths)
+    texts = [text for path in paths for text in tape.last(path).text.as_arrow_array().to_pylist()]
+    assert sum("clouds" in text for text in texts) == 2
+    for text in (*paths, *texts):
+        assert printable(text) == text

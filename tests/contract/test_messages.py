@@ -1,0 +1,324 @@
+"""The wire contract: a schema that only grows, topics and events that are whole.
+
+After a field was added on purpose: `python tests/contract/test_messages.py` writes `tests/golden/lowfc_v1.txt` anew.
+"""
+
+import ast
+import re
+import string
+import subprocess
+import sys
+from collections.abc import Iterator
+from enum import IntEnum
+from pathlib import Path
+
+import numpy as np
+import pytest
+from google.protobuf.descriptor_pb2 import FieldDescriptorProto, FileDescriptorProto, FileDescriptorSet
+
+from lowfc.contract.codecs import codec
+from lowfc.contract.events import EVENTS, Level
+from lowfc.contract.messages import (
+    EVERYBODY,
+    TOPICS,
+    Log,
+    RawImage,
+    Role,
+    Topic,
+    from_timestamp,
+    image,
+    timestamp,
+    topic_of,
+    wire,
+)
+from lowfc.control.loop.inputs import Command, Reply, Request, Step
+from lowfc.control.loop.safety import LoopMode, Reason
+
+ROOT = Path(__file__).parents[2]
+WIRE = ROOT / "lowfc" / "contract" / "wire"
+GOLDEN = Path(__file__).parents[1] / "golden" / "lowfc_v1.txt"
+UNITS = ("_s", "_nm", "_ns", "_hz", "_e", "_dn", "_mas", "_bytes", "_e_per_dn", "_frames")
+# Numbers that are counts, indices, identities, ratios or free values: they have no unit to say.
+WITHOUT_UNIT = {
+    *(
+        "identical_frames",
+        "bit_depth",
+        "bytes",
+        "clear_id",
+        "columns",
+        "commands_late",
+        "count",
+        "em_gain",
+        "first_sequence",
+    ),
+    *("flux_fraction", "frame_sequence", "frames", "frames_used", "gain", "id", "last_sequence", "law_frames"),
+    *("law_state", "leak", "lease_id", "min_flux_fraction", "lost", "messages", "mirror_columns", "mirror_rows"),
+    "missing",
+    *("modes", "max_identical_frames", "max_saturated_pixels", "noll", "pid", "published", "received", "refused_count"),
+    *("region_column", "region_row", "rows", "saturated_pixels", "skipped", "states", "steps_left", "input_number"),
+    "values",
+}
+
+
+def declared() -> FileDescriptorProto:
+    """The project's file in the descriptor that is checked in, comments included."""
+    every = FileDescriptorSet.FromString((WIRE / "lowfc.desc").read_bytes())
+    return next(file for file in every.file if file.package == "lowfc.v1")
+
+
+def comments(file: FileDescriptorProto) -> dict[tuple[int, ...], str]:
+    return {
+        tuple(location.path): " ".join(location.leading_comments.split()) for location in file.source_code_info.location
+    }
+
+
+def schema() -> list[str]:
+    """One line for each field and each enum value: message, number, name, type, label, comment."""
+    file, lines = declared(), []
+    said = comments(file)
+    for index, message in enumerate(file.message_type):
+        for position, field in enumerate(message.field):
+            kind = field.type_name.lstrip(".") or FieldDescriptorProto.Type.Name(field.type)[5:].lower()
+            label = FieldDescriptorProto.Label.Name(field.label)[6:].lower()
+            sentence = said.get((4, index, 2, position), "")
+            lines.append(f"{message.name} | {field.number} | {field.name} | {kind} | {label} | {sentence}".rstrip())
+    for index, enum in enumerate(file.enum_type):
+        for position, value in enumerate(enum.value):
+            sentence = said.get((5, index, 2, position), "")
+            lines.append(f"{enum.name} | {value.number} | {value.name} | value | | {sentence}".rstrip())
+    return lines
+
+
+def test_the_schema_only_grows() -> None:
+    """What 0.1 had is compared with its own descriptor (tests/logs/test_golden.py)."""
+    assert GOLDEN.read_text(encoding="utf-8").splitlines() == schema(), (
+        "the schema is another one: a number, name, type or label that there is stays as it is, a new field gets a new "
+        f"number; if that is so, run `python {Path(__file__).relative_to(ROOT)}` and commit the golden file"
+    )
+
+
+def test_numbers_and_names_are_used_once() -> None:
+    for message in declared().message_type:
+        numbers, names = [one.number for one in message.field], [one.name for one in message.field]
+        assert len(set(numbers)) == len(numbers)
+        assert len(set(names)) == len(names)
+
+
+def test_the_generated_code_is_what_the_declaration_compiles_to(tmp_path: Path) -> None:
+    pytest.importorskip("grpc_tools", reason="grpcio-tools, which carries protoc, is for development only")
+    command = [sys.executable, "-m", "lowfc.contract.compile_proto", "--into", str(tmp_path)]
+    subprocess.run(command, check=True, cwd=ROOT)
+    made = sorted(path.name for path in tmp_path.iterdir())
+    assert made == ["lowfc.desc", "lowfc_pb2.py", "lowfc_pb2.pyi"]
+    for name in made:
+        assert (tmp_path / name).read_bytes() == (WIRE / name).read_bytes(), f"{name} is stale: run `make proto`"
+
+
+@pytest.mark.parametrize(("ours", "prefix"), [(LoopMode, "LOOP_MODE_"), (Reason, "REASON_")])
+def test_enums_are_numbered_as_on_the_wire(ours: type[IntEnum], prefix: str) -> None:
+    theirs = dict(getattr(wire, ours.__name__).items())
+    assert theirs == {f"{prefix}UNSPECIFIED": 0} | {f"{prefix}{one.name}": one.value for one in ours}
+
+
+def test_levels_are_numbered_as_in_foxgloves_schema() -> None:
+    theirs = {value.name: value.number for value in Log.DESCRIPTOR.enum_types_by_name["Level"].values}
+    assert theirs == {"UNKNOWN": 0} | {level.name: level.value for level in Level}
+
+
+def test_every_message_and_every_field_has_a_comment() -> None:
+    file = declared()
+    said = comments(file)
+    bare = [message.name for index, message in enumerate(file.message_type) if not said.get((4, index))]
+    for index, message in enumerate(file.message_type):
+        for position, field in enumerate(message.field):
+            if field.name != "timestamp" and not said.get((4, index, 2, position)):
+                bare.append(f"{message.name}.{field.name}")
+    for index, enum in enumerate(file.enum_type):
+        bare += [one.name for at, one in enumerate(enum.value) if one.number and not said.get((5, index, 2, at))]
+    assert bare == []
+
+
+def test_every_number_with_a_unit_says_it() -> None:
+    numeric = {
+        FieldDescriptorProto.Type.Value(f"TYPE_{name}")
+        for name in ("DOUBLE", "FLOAT", "INT32", "INT64", "UINT32", "UINT64", "FIXED64", "SFIXED64")
+    }
+    silent = [
+        f"{message.name}.{field.name}"
+        for message in declared().message_type
+        for field in message.field
+        if field.type in numeric and field.name not in WITHOUT_UNIT and not field.name.endswith(UNITS)
+    ]
+    assert silent == []
+
+
+# Topics.
+
+
+def test_keys_are_unique_and_found_again() -> None:
+    assert len({topic.key for topic in TOPICS}) == len(TOPICS)
+    for topic in TOPICS:
+        assert topic_of(topic.at("dm")) is topic
+        assert [other.key for other in TOPICS if other.matches(topic.at("x"))] == [topic.key]
+
+
+@pytest.mark.parametrize("key", ["", "lowfc", "lowfc/mirror//command", "lowfc/mirror/dm", "lowfc/request/open"])
+def test_another_key_is_no_topic(key: str) -> None:
+    with pytest.raises(KeyError):
+        topic_of(key)
+
+
+@pytest.mark.parametrize("topic", TOPICS, ids=lambda topic: topic.key)
+def test_every_topic_has_a_publisher_a_reader_and_a_sentence(topic: Topic) -> None:
+    assert topic.publisher <= EVERYBODY
+    assert topic.publisher
+    assert Role.RECORDER in topic.subscribers
+    assert topic.sentence.endswith(".")
+    package = topic.message.DESCRIPTOR.file.package
+    assert package in ("lowfc.v1", "foxglove")
+    assert "timestamp" in topic.message.DESCRIPTOR.fields_by_name
+
+
+def test_only_what_the_loop_waits_for_is_in_the_loop() -> None:
+    keys = {topic.key for topic in TOPICS if topic.in_loop}
+    assert keys == {
+        "lowfc/camera/frame",
+        "lowfc/control/step",
+        "lowfc/mirror/{name}/command",
+        "lowfc/mirror/{name}/state",
+    }
+
+
+# Events.
+
+
+def raised() -> Iterator[tuple[str, str, set[str]]]:
+    """Where an event is raised, its name, and the keys of its details: every Raised(...) and ...event(...) call."""
+    for package in ("lowfc", "sim_camera", "sim_dm"):
+        for path in sorted((ROOT / package).rglob("*.py")):
+            tree = ast.parse(path.read_text(encoding="utf-8"))
+            for scope in ast.walk(tree):
+                if isinstance(scope, ast.FunctionDef):
+                    yield from _raised_in(scope, path)
+
+
+def _raised_in(scope: ast.FunctionDef, path: Path) -> Iterator[tuple[str, str, set[str]]]:
+    dicts = {
+        ast.unparse(node.target): node.value
+        for node in ast.walk(scope)
+        if isinstance(node, ast.AnnAssign) and isinstance(node.value, ast.Dict)
+    }
+    for node in ast.walk(scope):
+        if not isinstance(node, ast.Call) or not node.args or not isinstance(node.args[0], ast.Constant):
+            continue
+        called, where = ast.unparse(node.func), f"{path.relative_to(ROOT)}:{node.lineno}"
+        if called == "PendingEvent":
+            details = dicts.get(ast.unparse(node.args[1]), node.args[1])
+            assert isinstance(details, ast.Dict), f"{where}: the details are no dict that can be checked"
+            yield where, node.args[0].value, {ast.literal_eval(key) for key in details.keys if key}
+        elif called.endswith(".event") and all(keyword.arg for keyword in node.keywords):
+            yield where, node.args[0].value, {str(keyword.arg) for keyword in node.keywords}
+
+
+def wanted(sentence: str) -> set[str]:
+    return {name for _, name, _, _ in string.Formatter().parse(sentence) if name}
+
+
+def test_every_event_that_is_raised_is_in_the_table_with_its_details() -> None:
+    found = list(raised())
+    wrong = [
+        f"{where}: {name} with {sorted(details)}"
+        for where, name, details in found
+        if name not in EVENTS or details != wanted(EVENTS[name].sentence)
+    ]
+    assert wrong == []
+    assert len(found) > 25
+    assert {"MODE_CHANGED", "CALIBRATION_LOADED", "COMMAND_EXPIRED"} <= {name for _, name, _ in found}
+
+
+@pytest.mark.parametrize("name", EVENTS)
+def test_every_event_makes_a_line(name: str) -> None:
+    event = EVENTS[name]
+    assert re.fullmatch(r"[A-Z]+(_[A-Z]+)*", name)
+    log = event.log("controller", 1_500_000_000_123_456_789, **dict.fromkeys(wanted(event.sentence), 3))
+    assert log.message.startswith(f"{name} ")
+    assert log.level == event.level
+    assert from_timestamp(log.timestamp) == 1_500_000_000_123_456_789
+    assert "{" not in log.message
+
+
+# Messages there and back.
+
+
+@pytest.mark.parametrize("time_ns", [0, 1, 999_999_999, 1_000_000_000, 1_767_225_600_123_456_789])
+def test_times_survive(time_ns: int) -> None:
+    assert from_timestamp(timestamp(time_ns)) == time_ns
+
+
+def test_a_frame_survives() -> None:
+    pixels = np.arange(12, dtype=np.uint16).reshape(3, 4) * 5000
+    frame = codec.decode_frame(image(pixels, 77, "camera").SerializeToString(), 5, 9)
+    assert (frame.sequence, frame.time_ns, frame.age_ns) == (5, 77, 9)
+    assert np.array_equal(frame.pixels, pixels)
+
+
+@pytest.mark.parametrize(
+    "payload",
+    [
+        b"",
+        b"\xff\xff\xff",
+        RawImage(width=4, height=3, step=8, encoding="mono16", data=bytes(23)).SerializeToString(),
+        RawImage(width=4, height=3, step=4, encoding="mono8", data=bytes(12)).SerializeToString(),
+        RawImage(width=0, height=0, step=0, encoding="mono16", data=b"").SerializeToString(),
+        RawImage(width=4, height=3, step=9, encoding="mono16", data=bytes(27)).SerializeToString(),
+    ],
+)
+def test_what_is_no_frame_has_no_pixels(payload: bytes) -> None:
+    assert codec.decode_frame(payload, 1, 0).pixels is None
+
+
+def test_a_step_a_command_and_a_request_survive() -> None:
+    modes, shape = np.array([1.5, -2.25], np.float32), np.arange(6, dtype=np.float32).reshape(2, 3)
+    step = Step(9, 77, LoopMode.CLOSED, modes, (Reason.SLEW, Reason.NEIGHBOUR), modes + 1, modes + 2, 12.5, 3)
+    sent = wire.ControlStep.FromString(codec.encode_step(step, 4))
+    assert (sent.frame_sequence, from_timestamp(sent.timestamp), sent.mode) == (9, 77, wire.LOOP_MODE_CLOSED)
+    assert sent.input_number == 4
+    assert list(sent.reasons) == [wire.REASON_SLEW, wire.REASON_NEIGHBOUR]
+    assert list(sent.command_nm) == modes.tolist()
+    assert list(sent.error_nm) == (modes + 1).tolist()
+    assert list(sent.pol_nm) == (modes + 2).tolist()
+    assert (sent.flux_dn, sent.saturated_pixels) == (12.5, 3)
+
+    told = wire.MirrorCommand.FromString(codec.encode_command(Command(9, 77, shape, modes), 5, "lowfc", 4))
+    assert (told.frame_sequence, told.valid_for_ns, told.channel, told.input_number) == (9, 5, "lowfc", 4)
+    assert np.array_equal(codec.actuators(told), shape)
+    told.actuators += b"\0"
+    assert codec.actuators(told) is None
+    told.actuators = b""
+    assert codec.actuators(told) is None
+
+    asked = Request(77, "gain", (2, 3), (0.5, 0.25))
+    answered = codec.encode_request(asked, Reply(True, "done", 10), 4, None)
+    assert codec.decode_request(answered, "gain", 77) == asked
+    reply = wire.Request.FromString(answered)
+    assert (reply.accepted, reply.reply, reply.frame_sequence, reply.input_number) == (True, "done", 10, 4)
+    with pytest.raises(ValueError, match="could not be read"):
+        codec.decode_request(b"\xff", "gain", 77)
+
+
+def test_a_mirrors_state_survives() -> None:
+    shape = np.arange(6, dtype=np.float32).reshape(2, 3)
+    state = wire.MirrorState(timestamp=timestamp(77), rows=2, columns=3, actuators=shape.tobytes(), command_nm=[1, 2])
+    found = codec.decode_mirror(state.SerializeToString())
+    assert found.time_ns == 77
+    assert np.array_equal(found.actuators_nm, shape)
+    assert found.command_nm.tolist() == [1, 2]
+    state.rows = 3
+    assert codec.decode_mirror(state.SerializeToString()) is None
+    assert codec.decode_mirror(b"\xff") is None
+
+
+if __name__ == "__main__":
+    GOLDEN.parent.mkdir(exist_ok=True)
+    GOLDEN.write_text("\n".join(schema()) + "\n", encoding="utf-8")
+    print(f"wrote {len(schema())} lines to {GOLDEN}")

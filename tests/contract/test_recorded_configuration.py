@@ -1,0 +1,199 @@
+"""The configuration in a log of another version: what this one cannot use is a remark, and the log is read."""
+
+import json
+import tempfile
+from pathlib import Path
+
+import pytest
+from click.testing import Result
+from typer.testing import CliRunner
+
+from lowfc.adapters.logs.history import attached_configuration, read_history
+from lowfc.adapters.logs.reader import LogReader
+from lowfc.contract.configuration import MOST_FAULTS, Configuration, load
+from lowfc.contract.errors import ConfigurationError, DataFileError
+from lowfc.contract.recorded_configuration import recorded
+from lowfc.programs.cli.main import app
+from lowfc.programs.commissioning.acceptance.played import SAID
+from lowfc.programs.view.recorded import draw_logs
+from lowfc.programs.view.renderer import Renderer
+from tests.support.report_log import Night
+from tests.support.tape import Tape
+
+pytestmark = pytest.mark.exclusive
+
+OTHER = "[camera]\nrate_hz = 300.0\nshutter = 'rolling'\n[control]\nleak = 7.0\n[weather]\nwind = 3\n"
+"""Two keys that this version does not know, and a value that it refuses."""
+REMARKS = [
+    "unknown key 'camera.shutter'; the nearest known one is 'camera.noise'; it is ignored",
+    "control.leak = 7.0: Input should be less than or equal to 1; the default is used",
+    "unknown key 'weather'; the nearest known one is 'realtime'; it is ignored",
+]
+
+
+def test_what_this_version_knows_is_used() -> None:
+    config, remarks = recorded(OTHER.encode())
+    assert config == load(None, {"camera.rate_hz": 300.0})
+    assert remarks == REMARKS
+    assert recorded(Configuration().to_toml().encode()) == (Configuration(), [])
+
+
+@pytest.mark.parametrize(
+    ("toml", "changed", "remark"),
+    [
+        ("camera = 5", {}, "camera = 5: Input should be a valid dictionary"),
+        ("seed = -1", {}, "seed = -1: "),
+        ("[mirror]\ndead = [1, 'x']\nrows = 33", {"mirror.rows": 33}, "mirror.dead.1 = 'x': "),
+        ("[disturbance]\npreset = 'quake'\nscale = 2.0", {"disturbance.scale": 2.0}, "disturbance.preset = 'quake'"),
+        ("[[control]]\ngain = 0.1", {}, "control = [{'gain': 0.1}]"),
+    ],
+)
+def test_a_value_that_is_refused_has_the_default(toml: str, changed: dict[str, object], remark: str) -> None:
+    config, remarks = recorded(toml.encode())
+    assert config == load(None, changed)
+    (found,) = remarks
+    assert found.startswith(remark)
+    assert found.endswith("; the default is used")
+
+
+def test_values_that_do_not_go_together_stay_as_the_run_had_them() -> None:
+    toml = "[safety]\nstroke_nm = 900.0\n[mirror]\nrows = 33\n[disturbance.static_nm]\nfocus = 3.0\n[camera]\nfoo = 1\n"
+    config, remarks = recorded(toml.encode())
+    assert (config.safety.stroke_nm, config.mirror.rows, config.disturbance.static_nm) == (900.0, 33, {"focus": 3.0})
+    assert (config.mirror.columns, config.disturbance.preset, config.camera) == (34, "bench", Configuration().camera)
+    assert len(remarks) == 2
+    assert remarks[1].endswith("; used as recorded")
+    config, remarks = recorded(b"[safety]\nstroke_nm = 900.0\n")
+    assert config.safety.stroke_nm == 900.0
+    assert remarks == [
+        "safety.stroke_nm is 900 nm either way, but mirror.stroke_nm gives only 750 nm either way; used as recorded"
+    ]
+    assert "stroke_nm = 900.0" in config.to_toml()
+
+
+def test_of_very_many_remarks_the_first_are_made() -> None:
+    _, remarks = recorded("".join(f"k{number} = 1\n" for number in range(50_000)).encode())
+    assert len(remarks) == MOST_FAULTS + 1
+    assert remarks[-1] == f"and {50_000 - MOST_FAULTS} more"
+
+
+@pytest.mark.parametrize("toml", ["[camera", "a = " + "[" * 100_000, "#" * (1 << 20) + "#"])
+def test_what_is_no_configuration_is_a_remark_too(tmp_path: Path, toml: str) -> None:
+    with pytest.raises(ConfigurationError, match="not a readable TOML file"):
+        recorded(toml.encode())
+    night = Night()
+    night.frames(5)
+    log = night.write(tmp_path / "night.mcap", toml=toml)
+    history = read_history(LogReader(log))
+    assert history.configuration is None
+    (remark,) = history.remarks
+    assert remark.startswith(f"{log}: its config.toml cannot be used: not a readable TOML file")
+
+
+def test_a_file_that_a_person_passes_is_still_refused(tmp_path: Path) -> None:
+    path = tmp_path / "other.toml"
+    path.write_text(OTHER)
+    with pytest.raises(ConfigurationError) as caught:
+        load(path)
+    assert len(str(caught.value).splitlines()) == len(REMARKS)
+
+
+@pytest.fixture(scope="module")
+def night() -> Night:
+    """A loop that was open, then closed, with an acceptance test of its noise."""
+    made = Night()
+    for loop, frames in (("open", 1000), ("closed", 3000)):
+        made.request({"open": "open", "closed": "close"}[loop])
+        made.frames(200)
+        made.request("note", text=SAID + json.dumps({"test": "noise-floor", "loop": loop, "frames": 900}))
+        made.frames(frames)
+    return made
+
+
+@pytest.fixture
+def log(tmp_path: Path, night: Night) -> Path:
+    return night.write(tmp_path / "night.mcap", toml=OTHER)
+
+
+def lowfc(*words: object) -> Result:
+    return CliRunner().invoke(app, [str(word) for word in words])
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        ("info",),
+        ("info", "--json"),
+        ("report",),
+        ("report", "--json"),
+        ("export", "--to", "csv"),
+        ("export", "--to", "npz", "--json"),
+        ("tune",),
+        ("tune", "--json"),
+        ("what-if", "--set", "gain=0.3"),
+        ("what-if", "--set", "gain=0.3", "--json"),
+        ("what-if", "--set", "estimator=pinv"),
+        ("acceptance", "noise-floor"),
+        ("acceptance", "noise-floor", "--json"),
+    ],
+    ids=" ".join,
+)
+def test_every_reader_reads_the_log_and_says_what_it_does_not_use(log: Path, words: tuple[str, ...]) -> None:
+    done = lowfc(*words, log)
+    assert done.exception is None or isinstance(done.exception, SystemExit), done.exception
+    assert done.exit_code == (1 if "acceptance" in words and "FAILED" in done.output else 0), done.output
+    said = "".join(done.output.split())
+    for remark in attached_configuration_of(log):
+        assert "".join(remark.split()) in said
+    assert tempfile.gettempdir() not in said.replace("".join(str(log.parent).split()), "")
+    if "--json" in words:
+        assert json.loads(done.stdout)
+
+
+def attached_configuration_of(log: Path) -> list[str]:
+    reader = LogReader(log)
+    list(reader)
+    remarks = attached_configuration(reader)[1]
+    assert len(remarks) == len(REMARKS)
+    assert all(remark.startswith(f"{log}: its config.toml: ") for remark in remarks)
+    return remarks
+
+
+def test_a_replay_does_not_depend_on_it(log: Path) -> None:
+    done = lowfc("replay", log)
+    assert (done.exit_code, done.exception) == (0, None)
+    assert "commands identical" in done.stdout
+
+
+def test_a_report_page_has_it(log: Path) -> None:
+    assert lowfc("report", log).exit_code == 0
+    page = log.with_suffix(".html").read_text()
+    assert page.count("its config.toml:") == len(REMARKS)
+
+
+def test_a_view_has_it(log: Path) -> None:
+    tape = Tape()
+    drawn = draw_logs([log], None, lambda config: Renderer(config, tape))  # type: ignore[arg-type]
+    assert drawn.remarks == attached_configuration_of(log)
+
+
+def test_a_view_of_a_log_with_an_unreadable_one_takes_the_default(tmp_path: Path, night: Night) -> None:
+    log = night.write(tmp_path / "night.mcap", toml="[camera")
+    taken: list[Configuration] = []
+    tape = Tape()
+
+    def painter(config: Configuration) -> Renderer:
+        taken.append(config)
+        return Renderer(config, tape)  # type: ignore[arg-type]
+
+    drawn = draw_logs([log], None, painter)
+    assert taken == [Configuration()]
+    assert [str(log) in remark for remark in drawn.remarks] == [True, False]
+
+
+def test_what_needs_the_configuration_says_so(tmp_path: Path, night: Night) -> None:
+    log = night.write(tmp_path / "night.mcap", toml="[camera")
+    done = lowfc("acceptance", "noise-floor", log)
+    assert isinstance(done.exception, DataFileError)
+    assert "has no configuration" in str(done.exception)
+    assert f"{log}: its config.toml cannot be used" in done.stderr

@@ -1,0 +1,78 @@
+"""Whoever reads a controller's state from the wire goes on as the controller does, to the bit."""
+
+from dataclasses import fields
+
+import numpy as np
+import pytest
+
+from lowfc.contract.codecs import codec
+from lowfc.contract.codecs.calibration_codec import decode_calibration, encode_calibration
+from lowfc.contract.codecs.state_codec import controller_state, decode_state
+from lowfc.contract.messages import wire
+from lowfc.control.loop.advance import advance
+from lowfc.control.loop.inputs import CameraSettings, Load, MirrorShape, Tick
+from lowfc.control.loop.state import State
+from tests.support.happenings import CALIBRATION
+from tests.support.toy import frame, loaded, settings
+
+
+def test_a_state_without_a_calibration_survives() -> None:
+    what = settings()
+    state, _ = advance(what, State(), frame(3))
+    again, resumed = decode_state(controller_state(state, what, 1), None)
+    assert (again, resumed) == (what, state._replace(counts=dict(state.counts)))
+
+
+def test_a_state_of_another_calibration_is_refused() -> None:
+    message = controller_state(loaded(settings()), settings(), 1)
+    with pytest.raises(ValueError, match="calibration toy of the controller's state is not there"):
+        decode_state(message, None)
+    with pytest.raises(ValueError, match="is not there"):
+        decode_state(message, CALIBRATION)
+    message.calibration_id = CALIBRATION.id
+    del message.gain[0]
+    with pytest.raises(ValueError, match=r"as long as each other|is not of 3 modes"):
+        decode_state(message, CALIBRATION)
+
+
+@pytest.mark.parametrize(
+    "taken",
+    [
+        Tick(5, 7),
+        CameraSettings(5, (3, 4), 100.0, 65535.0),
+        MirrorShape(5, np.arange(6, dtype=np.float32).reshape(2, 3), np.ones(2, np.float32)),
+        Load(5, CALIBRATION, "a file"),
+    ],
+    ids=lambda one: type(one).__name__,
+)
+def test_an_input_survives(taken: MirrorShape | CameraSettings | Load | Tick) -> None:
+    message = wire.ControlInput.FromString(codec.encode_input(taken, 9))
+    assert message.input_number == 9
+    found = codec.decode_input(message, {CALIBRATION.id: CALIBRATION})
+    assert type(found) is type(taken)
+    for field in fields(taken):
+        assert np.array_equal(getattr(found, field.name), getattr(taken, field.name)), field.name
+    with pytest.raises(ValueError, match="input 0 of the controller cannot be read"):
+        codec.decode_input(wire.ControlInput(), {})
+
+
+def test_a_calibration_survives() -> None:
+    message = wire.Calibration.FromString(encode_calibration(CALIBRATION, 5_000_000_001))
+    assert message.timestamp.ToNanoseconds() == 5_000_000_001
+    assert list(message.mode_names) == ["tilt x", "tilt y", "focus"]
+    found = decode_calibration(message)
+    for field in fields(CALIBRATION):
+        assert np.array_equal(getattr(found, field.name), getattr(CALIBRATION, field.name)), field.name
+    message.flux_dn += 1
+    with pytest.raises(ValueError, match="is not whole: its content has another identity"):
+        decode_calibration(message)
+
+
+def test_only_what_makes_a_difference_is_counted() -> None:
+    what = settings()
+    state = loaded(what)
+    camera = CameraSettings(1, CALIBRATION.shape, 100.0, CALIBRATION.saturation_dn)
+    bad = frame(2)._replace(pixels=None)
+    for taken, count in ((camera, 2), (camera, 2), (Tick(1, 1), 2), (frame(1), 3), (Tick(1, 1), 4), (bad, 5)):
+        state, _ = advance(what, state, taken)
+        assert state.input_number == count

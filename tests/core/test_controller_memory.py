@@ -1,0 +1,542 @@
+"""Controller and mirror as they run, on a bus within one process, with a camera that exposes when it is told."""
+
+import tempfile
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import pytest
+
+from lowfc.adapters.bus.bus import Sample
+from lowfc.adapters.files import factory
+from lowfc.adapters.process.clock import HostClock, SimulatedClock
+from lowfc.adapters.process.latch import Latch
+from lowfc.adapters.process.service import Service
+from lowfc.contract.codecs.codec import actuators
+from lowfc.contract.codecs.law_codec import wire_law
+from lowfc.contract.configuration import Configuration, load
+from lowfc.contract.errors import CalibrationError
+from lowfc.contract.messages import (
+    CALIBRATION,
+    CAMERA_STATE,
+    COMMAND,
+    CONTROLLER_STATE,
+    EVENT,
+    FRAME,
+    LAW,
+    MIRROR_STATE,
+    PLAY,
+    REQUEST,
+    STEP,
+    TIMING,
+    Log,
+    Message,
+    image,
+    timestamp,
+    wire,
+)
+from lowfc.contract.published import Published
+from lowfc.control.calibration.calibration import Calibration, noise_nm
+from lowfc.control.laws.linear_law import integrator
+from lowfc.control.loop.safety import LoopMode
+from lowfc.programs.core import cache_warmup
+from lowfc.programs.core.controller import Controller
+from lowfc.testing.memory_bus import MemoryBus, MemoryHub
+from sim_camera.bench import Bench, Truth
+from sim_camera.process import bench
+from sim_dm.process import MirrorProcess
+
+Single = npt.NDArray[np.float32]
+
+PATIENCE_S = 20.0
+START_NS = 1_767_225_600_000_000_000
+
+
+def configured(**overrides: object) -> Configuration:
+    bright = {"disturbance.preset": "quiet", "star.magnitude": -2.0, "lockstep": True, "mirror.settling_us": 0.0}
+    return load(None, bright | {key.replace("__", "."): value for key, value in overrides.items()})
+
+
+CONFIG = configured()
+
+
+class Rig:
+    """A run in one process: two roles on threads of their own, and everything that was said."""
+
+    def __init__(self, config: Configuration, calibration: Calibration, scene: Bench) -> None:
+        self.config, self.calibration, self.scene, self.hub = config, calibration, scene, MemoryHub()
+        self.said: dict[str, list[Any]] = {}
+        self.offset_nm = np.zeros((34, 34), np.float32)
+        self._index = 0
+        self._newest = threading.Condition()
+        self.operator = self.bus("operator")
+        for topic in (STEP, COMMAND, MIRROR_STATE, EVENT, REQUEST, TIMING):
+            self.operator.subscribe(topic, self._hear(topic.message, topic.key))
+        camera = self.bus("camera")
+        self.frames, self.settings = camera.publisher(FRAME), camera.publisher(CAMERA_STATE)
+        self.services = [Service(role, "test", self.clock(), self.bus(role)) for role in ("controller", "mirror-dm")]
+        self.mirror = MirrorProcess(config, self.services[1])
+        state = factory.camera_state(config, scene.shape, START_NS)
+        self.settings.put(state.SerializeToString())
+        self.latch = Path(tempfile.mkdtemp()) / "safe"
+        self.controller = Controller(config, self.services[0], calibration, "a test", Latch([self.latch]))
+        self.threads = [threading.Thread(target=one.run) for one in (self.mirror, self.controller)]
+        for thread in self.threads:
+            thread.start()
+
+    def clock(self) -> HostClock | SimulatedClock:
+        return SimulatedClock(START_NS) if self.config.lockstep else HostClock()
+
+    def bus(self, role: str) -> MemoryBus:
+        return MemoryBus(self.hub, role, self.clock())
+
+    def _hear(self, kind: type[Message], key: str) -> Callable[[Sample], None]:
+        def heard(sample: Sample) -> None:
+            with self._newest:
+                self.said.setdefault(key, []).append(kind.FromString(sample.payload))
+                self._newest.notify_all()
+
+        return heard
+
+    def until(self, what: str, met: Callable[[], bool]) -> None:
+        with self._newest:
+            assert self._newest.wait_for(met, PATIENCE_S), f"{what} did not happen"
+
+    def put(self, pixels: npt.NDArray[np.uint16], publish_time_ns: int | None = None) -> int:
+        """Publish a frame, and wait until the mirror has answered the command made from it."""
+        time_ns = START_NS + (self._index + 1) * self.config.period_ns
+        self._index += 1
+        payload = image(pixels, time_ns, "camera").SerializeToString()
+        sequence = self.frames.put(payload, publish_time_ns).sequence
+        key = MIRROR_STATE.key
+        self.until("the mirror's answer", lambda: key in self.said and self.said[key][-1].frame_sequence == sequence)
+        return sequence
+
+    def until_file(self, path: Path, *, there: bool) -> None:
+        deadline_s = time.monotonic() + PATIENCE_S
+        while path.exists() is not there:
+            assert time.monotonic() < deadline_s, path
+            time.sleep(0.005)
+
+    def expose(self, count: int) -> list[Truth]:
+        """Frames of the scene through the mirror as it is, plus the offset."""
+        truths = []
+        for _ in range(count):
+            states = self.said.get(MIRROR_STATE.key)
+            shape = actuators(states[-1]) if states else None
+            seen = self.offset_nm if shape is None else shape + self.offset_nm
+            pixels, truth = self.scene.expose(self._index, seen)
+            self.put(pixels)
+            truths.append(truth)
+        return truths
+
+    def inject(self, modes_nm: npt.ArrayLike) -> None:
+        """Add modes to the wavefront, by a second mirror in the same place."""
+        shape = self.calibration.modes_to_actuators @ np.asarray(modes_nm, np.float32)
+        self.offset_nm = shape.reshape(34, 34)
+
+    def ask(self, name: str, *values: float, modes: tuple[int, ...] = ()) -> wire.Request:
+        payload = wire.Request(modes=modes, values=values).SerializeToString()
+        (answer,) = self.operator.get(f"lowfc/request/{name}", payload, PATIENCE_S)
+        return wire.Request.FromString(answer.payload)
+
+    def steps(self, count: int) -> list[wire.ControlStep]:
+        self.until("the step", lambda: len(self.said[STEP.key]) >= self._index)
+        return self.said[STEP.key][-count:]
+
+    def events(self) -> list[str]:
+        return [log.message.split()[0] for log in self.said.get(EVENT.key, []) if isinstance(log, Log)]
+
+    def stop(self) -> None:
+        for service in self.services:
+            service.stop("the test is over")
+        for thread in self.threads:
+            thread.join(PATIENCE_S)
+        assert not any(thread.is_alive() for thread in self.threads)
+        assert not any(bus.faults.counts for bus in self.hub.buses)
+
+
+@pytest.fixture(scope="module")
+def calibration() -> Calibration:
+    optics = factory.twin(CONFIG, None, print)
+    return factory.analytic_calibration(CONFIG, optics, factory.mirror_on_twin(CONFIG, optics, print))
+
+
+@pytest.fixture(scope="module")
+def scene() -> Bench:
+    return bench(CONFIG)
+
+
+@contextmanager
+def running(config: Configuration, calibration: Calibration, scene: Bench) -> Iterator[Rig]:
+    rig = Rig(config, calibration, scene)
+    try:
+        yield rig
+    finally:
+        rig.stop()
+
+
+@pytest.fixture
+def rig(calibration: Calibration, scene: Bench) -> Iterator[Rig]:
+    with running(CONFIG, calibration, scene) as one:
+        yield one
+
+
+def errors_of(steps: list[wire.ControlStep]) -> npt.NDArray[np.float64]:
+    return np.array([step.error_nm for step in steps], float)
+
+
+def test_a_quiet_open_loop_measures_nothing_with_the_noise_that_is_predicted(rig: Rig) -> None:
+    rig.expose(400)
+    errors = errors_of(rig.steps(400))
+    known = rig.calibration
+    camera = rig.config.camera
+    predicted = noise_nm(
+        known.reconstructor.astype(float),
+        known.reference.astype(float),
+        known.flux_dn * camera.gain_e_per_dn,
+        float(np.hypot(camera.read_noise_e, camera.gain_e_per_dn / np.sqrt(12))),  # and the rounding to DN
+    )
+    assert (np.abs(errors.mean(axis=0)) < 4 * errors.std(axis=0) / np.sqrt(400)).all()
+    # The standard deviation of a standard deviation is 1 / sqrt(2 * 400): four of them are 14 %.
+    assert np.abs(errors.std(axis=0) / predicted - 1).max() < 0.15
+
+
+def test_every_mode_is_measured_with_its_size_and_sign(rig: Rig) -> None:
+    pairs = 100
+    for mode in range(14):
+        taken = []
+        for sign in (1, -1):
+            rig.inject(sign * 5.0 * np.eye(14)[mode])
+            rig.expose(pairs)
+            taken.append(errors_of(rig.steps(pairs)))
+        half = (taken[0] - taken[1]) / 2
+        allowed = np.maximum(4 * half.std(axis=0) / np.sqrt(pairs), 0.05)
+        assert (np.abs(half.mean(axis=0) - 5.0 * np.eye(14)[mode]) < allowed).all(), f"mode {mode}"
+        assert half.mean(axis=0)[mode] > 4.5
+
+
+def test_closing_the_loop_corrects_every_mode(rig: Rig) -> None:
+    injected = 12.0 * np.array([1, -1] * 7)
+    rig.inject(injected)
+    rig.expose(3)
+    assert rig.ask("gain", 0.25).accepted
+    assert rig.ask("close").accepted
+    rig.expose(60)
+    last = rig.steps(20)
+    assert all(step.mode == wire.LOOP_MODE_CLOSED for step in last)
+    command = np.array([step.command_nm for step in last], float)
+    error = errors_of(last)
+    # Noise through an integrator of gain 0.25 is correlated over some 7 frames.
+    allowed = 4 * error.std(axis=0) / np.sqrt(20) * 2 + 0.03 * 12
+    assert (np.abs(command.mean(axis=0) + injected) < allowed).all()
+    assert (np.abs(error.mean(axis=0)) < allowed).all()
+    pol = np.array([step.pol_nm for step in last], float).mean(axis=0)
+    assert (np.abs(pol - injected) < allowed).all()
+
+
+def test_the_true_wavefront_gets_flat_too(rig: Rig) -> None:
+    rig.inject(10.0 * np.array([1, -1] * 7))
+    before = rig.expose(1)[0].residual_rms_nm
+    rig.ask("gain", 0.25)
+    rig.ask("close")
+    after = rig.expose(60)[-1].residual_rms_nm
+    assert after < 0.2 * before
+
+
+def test_requests_are_answered_with_the_frame_they_are_in_force_for(rig: Rig) -> None:
+    rig.expose(5)
+    newest = rig.steps(1)[0].frame_sequence
+    answer = rig.ask("close")
+    assert (answer.accepted, answer.reply, answer.frame_sequence) == (True, "loop closed", newest + 1)
+    rig.expose(1)
+    step = rig.steps(1)[0]
+    assert (step.frame_sequence, step.mode) == (answer.frame_sequence, wire.LOOP_MODE_CLOSED)
+    refused = rig.ask("gain", 9.0)
+    assert not refused.accepted
+    assert "unstable" in refused.reply
+    status = rig.ask("status")
+    assert status.state.mode == wire.LOOP_MODE_CLOSED
+    assert status.state.frame_sequence == newest + 1
+    assert not rig.ask("dance").accepted
+    (bad,) = rig.operator.get("lowfc/request/gain", b"\xff\xff", PATIENCE_S)
+    assert "could not be read" in wire.Request.FromString(bad.payload).reply
+    rig.until("five published requests", lambda: len(rig.said.get(REQUEST.key, [])) == 5)
+    published = [(one.name, one.accepted) for one in rig.said[REQUEST.key]]
+    assert published == [("close", True), ("gain", False), ("status", True), ("dance", False), ("gain", False)]
+
+
+def test_safe_flattens_the_mirror_and_stays(rig: Rig) -> None:
+    rig.inject(10.0 * np.ones(14))
+    rig.ask("close")
+    rig.expose(10)
+    assert actuators(rig.said[MIRROR_STATE.key][-1]).any()
+    assert rig.ask("safe").accepted
+    assert not rig.ask("close").accepted
+    rig.expose(5)
+    assert not actuators(rig.said[MIRROR_STATE.key][-1]).any()
+    assert rig.steps(1)[0].mode == wire.LOOP_MODE_SAFE
+    rig.until_file(rig.latch, there=True)
+    assert rig.ask("clear").accepted
+    rig.expose(1)
+    rig.until_file(rig.latch, there=False)
+    assert rig.steps(1)[0].mode == wire.LOOP_MODE_OPEN
+    assert {"SAFED", "MODE_CHANGED"} <= set(rig.events())
+
+
+def test_a_late_joiner_gets_calibration_and_state(rig: Rig) -> None:
+    rig.expose(2)
+    late = rig.bus("viewer")
+    (answer,) = late.get(CALIBRATION.key)
+    assert wire.Calibration.FromString(answer.payload).id == rig.calibration.id
+    (answer,) = late.get(CONTROLLER_STATE.key)
+    state = wire.ControllerState.FromString(answer.payload)
+    assert state.calibration_id == rig.calibration.id
+    assert len(state.gain) == len(state.leak) == len(state.limit_nm) == 14
+
+
+def test_every_frame_yields_one_step_and_one_command(rig: Rig) -> None:
+    size = rig.scene.shape[0]
+    dark, odd = np.full((size, size), 100, np.uint16), np.zeros((3, 3), np.uint16)
+    full = np.full((size, size), 65535, np.uint16)
+    good = rig.scene.expose(0, rig.offset_nm)[0]
+    sequences = [rig.put(pixels) for pixels in (good, odd, good, dark, full, good)]
+    steps = rig.steps(6)
+    assert [step.frame_sequence for step in steps] == sequences
+    assert [one.frame_sequence for one in rig.said[COMMAND.key]] == sequences
+    assert [list(step.reasons) for step in steps] == [
+        [],
+        [wire.REASON_WRONG_SIZE],
+        [],
+        [wire.REASON_DARK],
+        [wire.REASON_SATURATED],
+        [],
+    ]
+    for step, command in zip(steps, rig.said[COMMAND.key], strict=True):
+        assert step.timestamp == command.timestamp
+        assert step.command_nm == command.command_nm
+
+
+def test_a_camera_that_changes_opens_the_loop(rig: Rig) -> None:
+    rig.expose(1)
+    rig.ask("close")
+    changed = wire.CameraState(timestamp=timestamp(START_NS), rows=5, columns=5, bias_dn=100, saturation_dn=65535)
+    rig.settings.put(changed.SerializeToString())
+    rig.until("CAMERA_CHANGED", lambda: "CAMERA_CHANGED" in rig.events())
+    rig.expose(1)
+    assert rig.steps(1)[0].mode == wire.LOOP_MODE_OPEN
+
+
+def test_a_camera_with_a_wrong_clock_is_late_and_does_not_stop_the_controller(
+    calibration: Calibration, scene: Bench
+) -> None:
+    """Durations of years do not fit the columns of the timing; and without frames the command is repeated."""
+    with running(configured(lockstep=False), calibration, scene) as rig:
+        pixels = scene.expose(0, rig.offset_nm)[0]
+        rig.until("a mirror that waits", lambda: MIRROR_STATE.key in rig.said)
+        rig.put(pixels, publish_time_ns=1)
+        rig.put(pixels, publish_time_ns=2**62)
+        rig.put(pixels)
+        reasons = [list(step.reasons) for step in rig.steps(3)]
+        assert reasons[0] == [wire.REASON_LATE]
+        assert reasons[1] == []
+        sent = len(rig.said[COMMAND.key])
+        rig.until("a repeated command", lambda: len(rig.said[COMMAND.key]) > sent + 3)
+        rig.until("NO_FRAMES", lambda: "NO_FRAMES" in rig.events())
+    assert max(rig.said[TIMING.key][0].transport_ns) == 2**32 - 1
+
+
+def test_a_latch_that_cannot_be_written_starts_open(rig: Rig, tmp_path: Path) -> None:
+    (tmp_path / "file").touch()
+    service = Service("controller", "test", rig.clock(), MemoryBus(MemoryHub(), "controller", rig.clock()))
+    health, said = wire.Health(), []
+    latch = Latch([tmp_path / "file" / "safe"], said.append)
+    Controller(configured(control__start_mode="closed"), service, rig.calibration, "a test", latch).fill(health)
+    assert service.awaited() == "a camera"
+    assert (LoopMode(health.mode), len(said)) == (LoopMode.OPEN, 1)
+
+
+def test_a_signal_makes_the_loop_safe(rig: Rig) -> None:
+    rig.ask("close")
+    rig.expose(1)
+    rig.controller.safe_by_signal()
+    rig.until("SAFED", lambda: "SAFED" in rig.events())
+    rig.until("the request in the log", lambda: rig.said[REQUEST.key][-1].text == "SIGUSR1")
+    assert (rig.said[REQUEST.key][-1].name, rig.said[REQUEST.key][-1].accepted) == ("safe", True)
+    rig.expose(3)
+    assert not actuators(rig.said[MIRROR_STATE.key][-1]).any()
+    assert rig.said[COMMAND.key][-1].safe
+    assert rig.said[MIRROR_STATE.key][-1].safe
+    rig.until_file(rig.latch, there=True)
+
+
+def test_requests_have_sizes(rig: Rig) -> None:
+    """They are refused before they are decoded, and with a short sentence."""
+    for name in ("step", "gain", "note", "channel", "dance"):
+        values = wire.Request(modes=range(200_000), values=[1.0] * 200_000, text="x" * 100).SerializeToString()
+        (answer,) = rig.operator.get(f"lowfc/request/{name}", values, PATIENCE_S)
+        reply = wire.Request.FromString(answer.payload)
+        assert not reply.accepted
+        assert "holds at most" in reply.reply
+        assert len(answer.payload) < 2000
+    (answer,) = rig.operator.get("lowfc/request/" + "x" * 5000, b"", PATIENCE_S)
+    assert len(wire.Request.FromString(answer.payload).reply) <= 1000
+
+
+def test_states_carry_the_identity_of_a_law_and_of_a_play(rig: Rig) -> None:
+    """Their arrays are published once, by themselves, and can be asked for."""
+    rig.expose(1)
+    settings_of = factory.settings(rig.config)
+    noll = rig.calibration.noll
+    now = settings_of.law(noll)
+    law = integrator(now.gain, now.leak, noll, settings_of.delay_frames, rig.config.camera.rate_hz)
+    table = np.zeros((50_000, 14), np.float32)
+    play = wire.Request(text="offset", table=table.tobytes(), columns=14)
+    for name, request in (("law", wire.Request(law=wire_law(law))), ("play", play)):
+        (answer,) = rig.operator.get(f"lowfc/request/{name}", request.SerializeToString(), PATIENCE_S)
+        assert wire.Request.FromString(answer.payload).accepted
+    (answer,) = rig.operator.get(CONTROLLER_STATE.key)
+    state = wire.ControllerState.FromString(answer.payload)
+    assert (state.law.id, state.law.transition, state.play.table, state.play.frames) == (law.id, b"", b"", 50_000)
+    assert len(answer.payload) < 20_000
+    logged = rig.said[REQUEST.key][-1]
+    assert (logged.play_id, logged.table) == (state.play.id, b"")
+    published = Published()
+    for topic in (LAW, PLAY):
+        (answer,) = rig.bus("recorder").get(topic.key)
+        published.take(topic, answer.payload)
+    assert list(published.laws) == [law.id]
+    assert published.plays[state.play.id].rows.shape == (50_000, 14)
+
+
+def test_safed_outlives_the_controller(rig: Rig, tmp_path: Path) -> None:
+    """The latch is a file of the run: only an operator's clear removes it."""
+    latch = tmp_path / "safe"
+    closed = configured(control__start_mode="closed")
+
+    def mode() -> LoopMode:
+        service = Service("controller", "test", rig.clock(), MemoryBus(MemoryHub(), "controller", rig.clock()))
+        health = wire.Health()
+        Controller(closed, service, rig.calibration, "a test", Latch([latch])).fill(health)
+        return LoopMode(health.mode)
+
+    assert mode() is LoopMode.CLOSED
+    latch.touch()
+    assert mode() is LoopMode.SAFE
+    latch.unlink()
+    assert mode() is LoopMode.CLOSED
+
+
+def test_another_mirror_than_the_calibrations_is_refused(rig: Rig, tmp_path: Path) -> None:
+    live = configured(lockstep=False)
+    hub = MemoryHub()
+    service = Service("controller", "test", HostClock(), MemoryBus(hub, "controller", HostClock()))
+    controller = Controller(live, service, rig.calibration, "a test", Latch([tmp_path / "safe"]))
+    small = wire.MirrorState(rows=20, columns=20, actuators=np.zeros(400, np.float32).tobytes())
+    MemoryBus(hub, "mirror-dm", HostClock()).publisher(MIRROR_STATE, "dm").put(small.SerializeToString())
+    with pytest.raises(CalibrationError, match="20, 20"):
+        controller.run()
+
+
+def test_a_warm_up_changes_nothing_and_says_nothing(
+    calibration: Calibration, scene: Bench, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    rehearsed: list[bool] = []
+    original = Controller._warm_up
+
+    monkeypatch.setattr(cache_warmup, "LEAD_NS", 30_000_000)  # a host with other tests on it is late now and then
+    with running(configured(lockstep=False, camera__rate_hz=20.0), calibration, scene) as rig:
+
+        def said() -> list[int]:
+            return [len(rig.said.get(topic.key, ())) for topic in (STEP, COMMAND, TIMING)]
+
+        def watched(self: Controller) -> None:
+            before, said_before = self._state, said()
+            original(self)
+            rehearsed.append(self._state is before and said() == said_before)
+
+        monkeypatch.setattr(Controller, "_warm_up", watched)
+        rig.until("a mirror that waits", lambda: MIRROR_STATE.key in rig.said)
+        for index in range(5):
+            pixels = scene.expose(index, rig.offset_nm)[0]
+            rig.put(pixels)
+            time.sleep(0.1)  # two periods
+        assert [list(step.reasons) for step in rig.steps(5)] == [[]] * 5
+    assert len(rehearsed) >= 3
+    assert all(rehearsed)
+
+
+def test_a_frame_that_cannot_be_dealt_with_ends_the_controller(
+    rig: Rig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """On the bus's thread it would be counted, and the loop would stand still."""
+    monkeypatch.setattr("lowfc.programs.core.controller.MIRROR_PATIENCE_S", 0.01)
+    hub = MemoryHub()
+    service = Service("controller", "test", HostClock(), MemoryBus(hub, "controller", HostClock()))
+    controller = Controller(configured(lockstep=False), service, rig.calibration, "a test", Latch([tmp_path / "safe"]))
+
+    def broken(*_: object) -> None:
+        raise ArithmeticError("one and one is three")
+
+    monkeypatch.setattr(controller, "_frame", broken)
+    frames = MemoryBus(hub, "camera", HostClock()).publisher(FRAME)
+    late = threading.Timer(0.2, frames.put, [b""])
+    late.start()
+    with pytest.raises(ArithmeticError, match="three"):
+        controller.run()
+    late.join()
+
+
+def test_frames_that_waited_are_not_all_integrated(calibration: Calibration, scene: Bench) -> None:
+    """They saw one and the same mirror: together they may move the command by one gain, not by ten."""
+    config = configured(lockstep=False, control__start_mode="closed")
+    with running(config, calibration, scene) as rig:
+        rig.inject(2.0 * np.eye(14)[3])
+        pixels = scene.expose(0, rig.offset_nm)[0]
+        rig.until("a mirror that waits", lambda: MIRROR_STATE.key in rig.said)
+        payload = image(pixels, 1, "camera").SerializeToString()
+        handover = next(one for one in rig.services[0].arrivals if one.key == FRAME.key)
+        deadline_s = time.monotonic() + PATIENCE_S
+        while not rig.controller._adopted:
+            assert time.monotonic() < deadline_s
+            time.sleep(0.01)
+        now_ns = HostClock().now_ns()
+        newest = rig.settings.last[1].sequence + 100
+        for age in range(9, -1, -1):  # periods; they arrive one upon the other, after the controller stood still
+            handover.put(Sample(FRAME.key, payload, newest - age, now_ns - age * config.period_ns, now_ns))
+        steps = rig.said[STEP.key][-10:]
+    used = [step for step in steps if not step.reasons]
+    assert len(steps) == 10
+    assert used == steps[-1:]
+    assert all(list(step.reasons) == [wire.REASON_LATE] for step in steps[:-1])
+    assert abs(used[0].error_nm[3]) > 1
+    assert used[0].command_nm[3] == pytest.approx(-config.control.gain * used[0].error_nm[3], rel=1e-3)
+
+
+NOT_FINITE = np.full((34, 34), np.nan, np.float32).tobytes()
+
+
+@pytest.mark.parametrize("actuators", [b"", NOT_FINITE])
+def test_what_the_mirror_refuses_does_not_feed_its_dead_man(
+    calibration: Calibration, scene: Bench, actuators: bytes
+) -> None:
+    """However much of it comes."""
+    with running(configured(lockstep=False, control__command_timeout_ms=50.0), calibration, scene) as rig:
+        rig.until("a mirror that waits", lambda: MIRROR_STATE.key in rig.said)
+        rig.put(scene.expose(0, rig.offset_nm)[0])
+        rig.services[0].stop("the controller has died")
+        rig.threads[1].join(PATIENCE_S)
+        other = rig.bus("other").publisher(COMMAND, "dm")
+        nonsense = wire.MirrorCommand(
+            rows=34, columns=34, actuators=actuators, frame_sequence=2**63, valid_for_ns=10**9
+        )
+        deadline_s = time.monotonic() + PATIENCE_S
+        while "COMMAND_EXPIRED" not in rig.events():
+            other.put(nonsense.SerializeToString())
+            time.sleep(0.001)
+            assert time.monotonic() < deadline_s

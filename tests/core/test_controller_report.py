@@ -1,0 +1,140 @@
+"""For how long a loop was not closed, and why: in Health, in the summary and in the status."""
+
+import io
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+from rich.console import Console
+
+from lowfc.contract.codecs.state_codec import controller_state
+from lowfc.contract.configuration import Configuration
+from lowfc.contract.messages import FRAME, timestamp, wire
+from lowfc.control.loop.advance import advance
+from lowfc.control.loop.camera import CameraSettings
+from lowfc.control.loop.inputs import Request, Step
+from lowfc.control.loop.safety import LoopMode
+from lowfc.programs.cli.ctl import status
+from lowfc.programs.core.controller_report import LastSecond, NotClosed
+from lowfc.programs.launch.status import screen, status_line, summary_text
+from lowfc.programs.launch.watch import Watch, summary
+from tests.support.toy import DARK_DN, SATURATION_DN, SHAPE, START, frame, loaded, settings
+
+pytestmark = pytest.mark.exclusive
+
+USUAL = settings()
+CAMERA = CameraSettings(START * 10**9, SHAPE, DARK_DN, SATURATION_DN)
+SECOND = 10**9
+PROCESSES = {
+    "controller": wire.Health(
+        last_second=wire.LoopFigures(frames=250, residual_rms_nm=2.5, flux_fraction=0.97),
+        topics=[wire.TopicCount(topic=FRAME.key, received=100, skipped=1, missing=2)],
+    ),
+    "camera": wire.Health(
+        recent_wavefront=wire.WavefrontFigures(residual_rms_nm=2.0),
+        last_warning="COMMANDS_LATE 9 % late",
+        last_warning_timestamp=timestamp((START + 2) * SECOND),
+    ),
+    "recorder": wire.Health(
+        state="ready",
+        recording=wire.Recording(file="logs/a.mcap"),
+        last_warning="DISK_SLOW the disk took 2 s",
+        last_warning_timestamp=timestamp((START + 1) * SECOND),
+    ),
+}
+
+
+def test_the_time_not_closed_and_its_cause_add_up() -> None:
+    account, state = NotClosed(), loaded(USUAL)
+    assert account.note(state, 0) == (0, "")
+    for one in (CAMERA, frame(1)):
+        state, _ = advance(USUAL, state, one)
+    assert account.note(state, 1 * SECOND) == (0, ""), "closed from its first frame on"
+    state, _ = advance(USUAL, state, replace(CAMERA, bias_dn=DARK_DN + 300))
+    assert account.note(state, 2 * SECOND)[0] == 0
+    total_ns, cause = account.note(state, 5 * SECOND)
+    assert (total_ns, "bias_dn is 400" in cause) == (3 * SECOND, True)
+
+
+def test_the_summary_and_the_status_say_it() -> None:
+    def first(**health: Any) -> str:
+        watch = Watch({"controller": wire.Health(**health)}, [])
+        return summary_text(summary(watch, record=False)).splitlines()[0].split(maxsplit=1)[1]
+
+    late = {"not_closed_ns": 3 * SECOND, "not_closed_cause": "the camera does not fit"}
+    assert first(mode=wire.LOOP_MODE_CLOSED) == "closed"
+    before = "closed; before that not closed for 3.0 s: the camera does not fit"
+    assert first(mode=wire.LOOP_MODE_CLOSED, **late) == before
+    assert first(mode=wire.LOOP_MODE_OPEN, **late) == "open for 3.0 s: the camera does not fit"
+    assert first(mode=wire.LOOP_MODE_SAFE, **late) == "in safe mode, not closed for 3.0 s: the camera does not fit"
+    assert first() == "no controller reported", "a loop that never started was not closed"
+    state = loaded(USUAL)
+    for one in (CAMERA, frame(1), replace(CAMERA, bias_dn=DARK_DN + 300)):
+        state, _ = advance(USUAL, state, one)
+    message = controller_state(state, USUAL, (START + 12) * SECOND)
+    mirror = wire.Health(command_refused=wire.REASON_OUT_OF_ORDER)
+    _, *lines = status.text(message, {"mirror-dm": mirror}).splitlines()
+    assert lines[0].split(maxsplit=1)[1].startswith("open for 12 s (the camera does not fit the calibration: bias_dn")
+    assert lines[1].split(maxsplit=1)[1] == "refuses commands: OUT_OF_ORDER"
+    assert status.figures(message, {"mirror-x": wire.Health(command_expired=True)})["mirrors"]["mirror-x"]["expired"]
+
+
+def test_the_first_line_of_the_status_says_whether_all_is_well() -> None:
+    state = loaded(USUAL)
+    for one in (CAMERA, frame(1)):
+        state, _ = advance(USUAL, state, one)
+
+    def first(**changes: Any) -> str:
+        message = controller_state(state, USUAL, (START + 12) * SECOND)
+        return status.text(message, PROCESSES | changes, "night").splitlines()[0]
+
+    well = "closed · residual 2.50 nm rms (true 2.00) · light 97 % · 3 frames lost · recording logs/a.mcap · run night"
+    warned = "10 s ago camera: COMMANDS_LATE 9 % late"
+    assert first() == f"{well} · law integrator · {warned}"
+    stopped = wire.Health(state="ready", recording=wire.Recording(file="logs/a.mcap", stopped=True))
+    assert "· recording stopped ·" in first(recorder=stopped)
+    failed = wire.Health(state="ready", recording=wire.Recording(failure="full"))
+    assert "· recording failed ·" in first(recorder=failed)
+    assert "· not recording ·" in first(recorder=wire.Health(state="stopped"))
+    assert first(controller=wire.Health()).startswith("closed · no frame used in the last second · 0 frames lost ·")
+    assert first(camera=wire.Health(), recorder=wire.Health()).endswith(" · no warning")
+    for name, word in (
+        ("pause", "paused"),
+        ("open", "open"),
+        ("pause", "open"),  # it was open already
+        ("close", "closed"),
+        ("safe", "in safe mode"),
+    ):
+        state, outputs = advance(USUAL, state, Request((START + 2) * SECOND, name))
+        assert outputs.reply.accepted
+        assert first().startswith(f"{word} ·")
+        assert status.figures(controller_state(state, USUAL, 0))["paused"] == (word == "paused")
+
+
+def test_the_last_second_forgets_what_was_before_and_what_was_refused() -> None:
+    state, last = loaded(USUAL), LastSecond(SECOND // 4)
+    assert last.figures(state, SECOND) == wire.LoopFigures()
+    flux_dn = state.drive.calibration.flux_dn
+
+    def step(error_nm: float | None) -> Step:
+        errors = None if error_nm is None else np.full(4, error_nm, np.float32)
+        return Step(1, 0, LoopMode.CLOSED, np.zeros(4, np.float32), (), errors, None, flux_dn / 2)
+
+    for quarter, error_nm in enumerate((9.0, 9.0, 9.0, 9.0, 9.0, 1.0, 1.0, None, 1.0, 1.0)):
+        last.add(step(error_nm), quarter * SECOND // 4)
+    found = last.figures(state, 9 * SECOND // 4)
+    assert (found.frames, found.residual_rms_nm, found.flux_fraction) == (3, pytest.approx(2.0), pytest.approx(0.5))
+    assert last.figures(state, 20 * SECOND).frames == 0
+
+
+def test_the_status_line_is_of_the_last_seconds_and_says_nothing_before_the_first_frame() -> None:
+    watch = Watch({"controller": wire.Health(mode=wire.LOOP_MODE_CLOSED), "camera": wire.Health(process="camera")}, [])
+    assert status_line(watch, 5.0) == "    5 s  no frame yet"
+    whole = wire.WavefrontFigures(residual_rms_nm=27.0, disturbance_rms_nm=31.0)
+    recent = wire.WavefrontFigures(residual_rms_nm=2.2, disturbance_rms_nm=30.0)
+    watch.health["camera"] = wire.Health(process="camera", rate_hz=250, wavefront=whole, recent_wavefront=recent)
+    assert "closed     250 Hz  residual 2.20 of 30.00 nm rms" in status_line(watch, 10.0)
+    with Console(width=120, file=io.StringIO(), record=True) as console:
+        console.print(screen(watch, Configuration(), None, 10.0))
+    assert "2.20 nm rms left of 30.00 nm" in console.export_text()

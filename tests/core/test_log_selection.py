@@ -1,0 +1,261 @@
+"""Recordings and copies with every Nth frame and mirror state: what they hold, and who can use them."""
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from lowfc.adapters.logs.history import read_history
+from lowfc.adapters.logs.parts import WholeLog
+from lowfc.adapters.logs.reader import Logged, LogReader
+from lowfc.adapters.logs.selection import EVERYTHING, Selection, selection
+from lowfc.adapters.logs.series import Limits
+from lowfc.adapters.logs.thinning import thin
+from lowfc.contract.configuration import load
+from lowfc.contract.envelope import count_of
+from lowfc.contract.errors import ConfigurationError, DataFileError, LowfcError
+from lowfc.contract.messages import (
+    COMMAND,
+    FRAME,
+    MIRROR_STATE,
+    STEP,
+    SURFACE,
+    TIMING,
+    TOPICS,
+    TRUTH,
+    Topic,
+    wire,
+)
+from lowfc.programs.cli.main import app
+from lowfc.programs.core.recording.volume import bytes_per_s, outlook, selected
+from lowfc.programs.logs.survey import survey
+from lowfc.programs.logs.what_if.compare import WhatIf, wanted, what_if
+from tests.support.recording import Bench, bodies_of, logged, put
+from tests.support.report_log import Night
+
+pytestmark = pytest.mark.exclusive
+
+EVERY = 10
+
+
+@pytest.fixture(autouse=True)
+def runtime(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    night = Night()
+    night.request("close")
+    night.frames(2500)
+    night.health("camera", topics=[wire.TopicCount(topic=FRAME.key, published=2500)], state="stopped")
+    return night.write(tmp_path_factory.mktemp("night") / "night.mcap")
+
+
+@pytest.fixture(scope="module")
+def small(whole: Path) -> Path:
+    out = whole.with_name("small.mcap")
+    done = thin((whole,), out, Selection(EVERY))
+    assert done.bytes < 0.8 * done.bytes_before
+    return out
+
+
+def of(messages: list[Logged], topic: Topic) -> list[Logged]:
+    return [message for message in messages if topic.matches(message.key)]
+
+
+def test_steps_and_commands_are_never_left_out() -> None:
+    asked = selection(1, ["lowfc/sim/*"])
+    assert asked.left_out == {FRAME, MIRROR_STATE, SURFACE, TIMING}
+    assert {topic.key for topic in TOPICS if topic.optional} == {topic.key for topic in (*asked.left_out, TRUTH)}
+    assert selection() == EVERYTHING == selection(1, ["lowfc/*"])
+    assert selection(1, ["/lowfc/mirror/dm/state"]).left_out == {FRAME, SURFACE, TIMING, TRUTH}
+    assert Selection.of(asked.metadata) == asked
+    assert Selection.of({"selection": {"every": "-3", "left_out": "nothing"}}) == EVERYTHING
+    with pytest.raises(ConfigurationError, match="did you mean 'lowfc/camera/frame'"):
+        selection(1, ["lowfc/camera/frames"])
+
+
+def test_the_recorder_records_every_tenth_and_loses_none(tmp_path: Path) -> None:
+    """The frame's number decides, for the mirror's states too; what is lost of the rest is lost."""
+    bench = Bench(tmp_path / "logs")
+    frames, commands = bench.camera.publisher(FRAME), bench.controller.publisher(COMMAND, "dm")
+    mirror = bench.join("mirror-dm")
+    states, surfaces = mirror.publisher(MIRROR_STATE, "dm"), mirror.publisher(SURFACE, "dm")
+    bench.hub.lose = lambda role, key, envelope: (
+        role == "recorder" and key == FRAME.key and count_of(envelope.sequence) in (55, 60)
+    )
+    bench.start(selection=Selection(EVERY, frozenset({SURFACE})))
+    put(surfaces, 5)
+    put(commands, 95)
+    for _ in range(95):
+        sequence = frames.put(b"frame").sequence
+        states.put(wire.MirrorState(frame_sequence=sequence).SerializeToString())
+        states.put(wire.MirrorState(frame_sequence=sequence).SerializeToString())  # it is held
+    mirror.finish()
+    summary = bench.stop()
+    messages = logged(summary)
+    assert [count_of(one.sequence) for one in of(messages, FRAME)] == [0, 10, 20, 30, 40, 50, 70, 80, 90]
+    shown = [count_of(wire.MirrorState.FromString(one.payload).frame_sequence) for one in of(messages, MIRROR_STATE)]
+    assert shown == [number for ten in range(0, 100, 10) for number in (ten, ten)]
+    assert len(of(messages, COMMAND)) == 95
+    assert not of(messages, SURFACE)
+    assert summary.lost == {FRAME.key: 2}
+    (path,) = summary.files
+    found = survey(path)
+    assert found["selection"] == "1 in 10 frames and mirror states, without lowfc/mirror/{name}/surface"
+    assert (found["messages_missing"], found["missing_topics"]) == (0, {})
+    assert found["topics"][FRAME.key]["missing"] is None
+    assert found["metadata"]["recording"]["messages_lost"] == "2"
+    assert found["metadata"]["selection"] == {"every": "10", "left_out": "lowfc/mirror/{name}/surface"}
+
+
+def test_a_disk_that_refuses_does_not_lose_what_was_left_out(tmp_path: Path) -> None:
+    bench = Bench(tmp_path / "logs")
+    frames = bench.camera.publisher(FRAME)
+    bench.start(selection=Selection(EVERY))
+    put(frames, 45)
+    while len(bench.recorder._backlog):
+        pass
+    bench.recorder._series.flush = lambda: (_ for _ in ()).throw(DataFileError("full"))
+    put(frames, 5)
+    summary = bench.stop()
+    assert summary.failure == "full"
+    assert summary.lost.get(FRAME.key, 0) <= 5
+
+
+def test_the_next_file_says_it_too(tmp_path: Path) -> None:
+    bench = Bench(tmp_path / "logs")
+    frames = bench.camera.publisher(FRAME)
+    bench.start(selection=Selection(2), limits=Limits(largest_bytes=20_000))
+    for number in range(2):
+        before = len(bench.recorder._series.files)
+        frames.put(np.random.default_rng(number).bytes(30_000), sequence=2 * number)
+        while not number and len(bench.recorder._series.files) == before:
+            pass
+    summary = bench.stop()
+    assert len(summary.files) >= 2
+    assert all(survey(path)["selection"] for path in summary.files)
+
+
+def test_a_smaller_copy_has_the_same_steps(whole: Path, small: Path) -> None:
+    before, after = list(LogReader(whole)), list(LogReader(small))
+    assert bodies_of(after, STEP) == bodies_of(before, STEP)
+    assert len(of(after, COMMAND)) == len(of(before, COMMAND))
+    assert [one.sequence for one in of(after, FRAME)] == [one.sequence for one in of(before, FRAME)][::EVERY]
+    frames = {one.sequence for one in of(after, FRAME)}
+    states = of(after, MIRROR_STATE)
+    assert {wire.MirrorState.FromString(one.payload).frame_sequence for one in states} == frames
+    found = survey(small)
+    assert (found["messages_missing"], found["state"], "recovery" in found["metadata"]) == (0, "complete", False)
+    again = thin((small,), small.with_name("again.mcap"), selection(4, ["lowfc/camera/*"]))
+    made = Selection(20, frozenset({MIRROR_STATE, SURFACE, TIMING, TRUTH}))
+    assert again.selection == made.sentence
+    assert Selection.of(survey(path := Path(again.file))["metadata"]) == made
+    assert len(of(list(LogReader(path)), FRAME)) == 2500 // 20
+    with pytest.raises(DataFileError, match="exists already"):
+        thin((whole,), small, Selection(2))
+
+
+def test_replay_refuses_it_in_one_sentence(small: Path) -> None:
+    for words in (["--jobs", "1"], ["--jobs", "2"]):
+        done = CliRunner().invoke(app, ["replay", str(small), *words])
+        assert isinstance(done.exception, LowfcError)
+        assert "\n" not in str(done.exception)
+        assert "1 in 10 frames and mirror states" in str(done.exception)
+
+
+def test_replay_needs_frames_and_nothing_else_that_may_be_left_out(whole: Path) -> None:
+    out = whole.with_name("frames.mcap")
+    thin((whole,), out, selection(1, [FRAME.key]))
+    done = CliRunner().invoke(app, ["replay", str(out), "--json"])
+    assert done.exit_code == 0, done.exception
+    assert json.loads(done.stdout)["frames"] == 2500
+
+
+def test_a_what_if_is_the_same(whole: Path, small: Path, tmp_path: Path) -> None:
+    asked = wanted("gain=0.3", None, None, None)
+    found = [what_if(LogReader(log), asked) for log in (whole, small)]
+    for figures in found:
+        del figures["log"]
+    assert found[0] == found[1]
+    with pytest.raises(DataFileError, match=r"no other reconstructor can be tried.*other gains, leaks and limits can"):
+        what_if(LogReader(small), WhatIf(estimator="weighted" if _estimator(small) == "pinv" else "pinv"))
+
+
+def _estimator(log: Path) -> str:
+    calibration = read_history(WholeLog(log)).calibration
+    return calibration.estimator
+
+
+def test_a_report_is_of_the_same_run(whole: Path, small: Path) -> None:
+    found: list[dict[str, Any]] = []
+    for log in (whole, small):
+        done = CliRunner().invoke(app, ["report", str(log), "--json", "--out", str(log.with_suffix(".html"))])
+        assert done.exit_code == 0, done.exception
+        found.append(json.loads(done.stdout))
+    for part in ("residual", "spectra", "error_budget", "closed_stretch", "light", "laws", "requests"):
+        assert found[0][part] == found[1][part], part
+    levels = [{check["name"]: check["level"] for check in one["verdict"]["checks"]} for one in found]
+    assert levels[0] == levels[1]
+    assert found[1]["timing"]["interval_us"]["frames"]["count"] == 0
+    assert found[1]["timing"]["latency_us"]["frame_to_mirror"]["count"] == 2500 // EVERY
+    assert "1 in 10 frames and mirror states" in small.with_suffix(".html").read_text()
+
+
+def test_an_export_joins_what_is_there(small: Path, tmp_path: Path) -> None:
+    out = tmp_path / "small.npz"
+    done = CliRunner().invoke(app, ["export", str(small), "--to", "npz", "--frames", "--out", str(out), "--json"])
+    assert done.exit_code == 0, done.exception
+    assert json.loads(done.stdout)["selection"] == "1 in 10 frames and mirror states"
+    with np.load(out) as found:
+        arrays = dict(found)
+    assert (len(arrays["sequence"]), len(arrays["frame_sequence"])) == (2500, 250)
+    assert np.count_nonzero(np.isfinite(arrays["mirror_stroke_nm"])) == 250
+    assert len(np.load(out.with_suffix(".frames.npy"))) == 250
+
+
+@pytest.mark.parametrize(
+    "words",
+    [["--to", "csv", "--decimate", "3"], [], ["--decimate", "3", "--frames"], ["--to", "csv", "--topics", FRAME.key]],
+)
+def test_an_export_is_one_thing(whole: Path, words: list[str]) -> None:
+    done = CliRunner().invoke(app, ["export", str(whole), *words])
+    assert isinstance(done.exception, ConfigurationError)
+    assert "choose one" in str(done.exception)
+
+
+def test_what_it_will_take_is_said_before(tmp_path: Path) -> None:
+    keys = {"recorder.folder": str(tmp_path), "camera.rate_hz": 250.0}
+    config = load(None, keys)
+    grows = bytes_per_s(config, selected(config))
+    assert 3e6 < grows < 5e6
+    assert outlook(config).startswith(f"recording into {tmp_path}: about {grows * 3600 / 1e9:.0f} GB an hour; ")
+    assert outlook(config).endswith(" h, at 250 Hz")
+    assert bytes_per_s(load(None, keys | {"camera.rate_hz": 500.0}), EVERYTHING) > 1.8 * grows
+    fewer = load(None, keys | {"recorder.every": 10, "recorder.topics": [FRAME.key, "lowfc/mirror/{name}/state"]})
+    assert bytes_per_s(fewer, selected(fewer)) < 0.5 * grows
+    assert "1 in 10 frames" in outlook(fewer)
+
+
+def test_record_start_names_the_request(tmp_path: Path) -> None:
+    done = CliRunner().invoke(app, ["record", "start"])
+    assert isinstance(done.exception, ConfigurationError)
+    assert "`lowfc ctl record start`" in str(done.exception)
+
+
+def test_the_answer_to_start_says_what_it_takes(tmp_path: Path) -> None:
+    bench = Bench(tmp_path / "logs")
+    bench.start(expected_bytes_per_s=1e6)
+    operator = bench.join("operator")
+    answers = []
+    for name in ("stop", "start"):
+        (sample,) = operator.bus.get(f"lowfc/record/{name}", b"", 20.0)
+        answers.append(wire.Request.FromString(sample.payload))
+    bench.stop()
+    assert [answer.accepted for answer in answers] == [True, True]
+    assert "an hour" not in answers[0].reply
+    assert "about 3.6 GB an hour; " in answers[1].reply

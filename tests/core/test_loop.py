@@ -1,0 +1,68 @@
+"""The loop on real diffraction, without processes: stability, pseudo-open-loop, convergence."""
+
+import numpy as np
+import pytest
+
+from lowfc.contract.configuration import Configuration, load
+from lowfc.control.laws.stability import limiting_gain
+from lowfc.optics.detector.photometry import tilt_nm_per_mas
+from tests.support.fold import fold
+
+QUIET = {
+    "camera.rate_hz": 1000,
+    "disturbance.preset": "quiet",
+    "control.start_mode": "closed",
+    "mirror.settling_us": 0,
+    "mirror.driver_bits": 24,
+    "camera.noise": False,
+    "camera.gain_e_per_dn": 0.0008,  # fine steps, so that rounding moves a mode by less than a picometre
+    "camera.full_well_e": 52.0,
+}
+
+
+def configured(**overrides: object) -> Configuration:
+    return load(None, QUIET | {key.replace("__", "."): value for key, value in overrides.items()})
+
+
+@pytest.mark.parametrize("delay", [1, 2, 3])
+@pytest.mark.parametrize(("factor", "stable"), [(0.99, True), (1.01, False)])
+def test_the_limiting_gain_is_right_within_a_percent(delay: int, factor: float, stable: bool) -> None:
+    """2 sin(pi / (2 (2d - 1))), with noiseless diffraction and a tilt of less than 1 mas."""
+    gain = factor * 2 * np.sin(np.pi / (2 * (2 * delay - 1)))
+    assert limiting_gain(delay) == pytest.approx(gain / factor, rel=1e-9)
+    start_nm = 0.2 * tilt_nm_per_mas(2.0)
+    config = configured(
+        camera__delay_frames=delay, control__tilt_gain=gain, control__gain=0.0, disturbance__static_nm={"2": start_nm}
+    )
+    run = fold(config, 240)
+    tilt = np.abs(run.residual_nm[:, 0])
+    early, late = tilt[40:80].max(), tilt[-40:].max()
+    assert tilt[:80].max() < tilt_nm_per_mas(2.0)
+    assert (late < early) == stable
+
+
+def test_a_static_disturbance_is_what_pseudo_open_loop_says() -> None:
+    static = {"2": 6.0, "3": -4.0, "4": 3.0, "7": -2.0, "11": 1.5}
+    run = fold(configured(disturbance__static_nm=static, control__gain=0.3), 120)
+    wanted = run.disturbance_nm[-1]
+    assert wanted[0] == pytest.approx(6.0)
+    np.testing.assert_allclose(run.pol_nm[-1], wanted, atol=0.15)
+    np.testing.assert_allclose(run.command_nm[-1], -wanted, atol=0.15)
+    np.testing.assert_allclose(run.residual_nm[-1], 0, atol=0.15)
+
+
+def test_the_closed_loop_converges_for_every_mode() -> None:
+    config = configured(
+        disturbance__static_nm={str(index): 4.0 for index in range(2, 16)}, control__gain=0.3, control__tilt_gain=0.3
+    )
+    run = fold(config, 100)
+    np.testing.assert_allclose(run.disturbance_nm[0], 4.0, atol=1e-5)
+    np.testing.assert_allclose(run.residual_nm[-1], 0, atol=0.15)
+
+
+def test_a_screen_is_held_as_far_as_the_modes_reach() -> None:
+    """The paper's case (3): 0.05 waves before, high orders are left; they are over a third of the rms."""
+    run = fold(configured(disturbance__preset="kolmogorov", control__gain=0.2, control__tilt_gain=0.3), 150)
+    assert run.disturbance_rms_nm[-1] == pytest.approx(0.05 * 550, rel=1e-5)
+    assert 0.35 < run.residual_rms_nm[-1] / run.disturbance_rms_nm[-1] < 0.6
+    np.testing.assert_allclose(run.error_nm[-1], 0, atol=0.01)

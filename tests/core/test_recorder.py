@@ -1,0 +1,382 @@
+"""The recorder: everything on the bus is in the log, or the log says what is missing."""
+
+import resource
+import signal
+import subprocess
+import sys
+import time
+from collections import Counter
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from lowfc import __version__
+from lowfc.adapters.bus.bus import Sample
+from lowfc.adapters.bus.run import Run, new_run_id, open_run
+from lowfc.adapters.bus.zenoh_bus import ZenohBus
+from lowfc.adapters.logs.loss_account import LossAccount
+from lowfc.adapters.logs.reader import LogReader
+from lowfc.adapters.logs.series import Limits
+from lowfc.adapters.logs.writer import UNFINISHED
+from lowfc.adapters.process.clock import HostClock
+from lowfc.adapters.process.service import Service
+from lowfc.contract.envelope import Envelope, count_of, sequence_of
+from lowfc.contract.errors import DataFileError
+from lowfc.contract.messages import (
+    CALIBRATION,
+    CAMERA_STATE,
+    CONTROLLER_STATE,
+    EVENT,
+    FRAME,
+    HEALTH,
+    STEP,
+    Log,
+    Topic,
+    wire,
+)
+from lowfc.programs.core.recording.recorder import Recorder
+from lowfc.testing.memory_bus import MemoryBus
+from tests.support.recording import PATIENCE_S, Bench, bodies_of, logged, put, until
+
+pytestmark = pytest.mark.exclusive
+
+
+@pytest.fixture(autouse=True)
+def runtime(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
+
+
+@pytest.fixture
+def bench(tmp_path: Path) -> Bench:
+    return Bench(tmp_path / "logs")
+
+
+@pytest.fixture
+def small_disk() -> Iterator[None]:
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (300_000, before[1]))
+    yield
+    resource.setrlimit(resource.RLIMIT_FSIZE, before)
+
+
+def test_everything_is_recorded_verbatim(bench: Bench) -> None:
+    frames, steps = bench.camera.publisher(FRAME), bench.controller.publisher(STEP)
+    bench.start()
+    sent = put(frames, 500), put(steps, 300)
+    summary = bench.stop()
+    messages = logged(summary)
+    assert (bodies_of(messages, FRAME), bodies_of(messages, STEP)) == sent
+    assert (summary.messages, summary.lost, summary.failure) == (len(messages), {}, "")
+    (path,) = summary.files
+    reader = LogReader(path)
+    assert len(list(reader)) == len(messages)
+    assert reader.metadata == {
+        "lowfc": {"run": "night"},
+        "part": {"of": path.stem, "number": "1"},
+        "recording": {"messages": str(len(messages)), "messages_lost": "0"},
+    }
+    final = [wire.Health.FromString(m.payload) for m in messages if m.key == HEALTH.at("camera")][-1]
+    assert final.state == "stopped"
+    assert bench.camera.heard["recorder"].recording == wire.Recording(
+        file=str(path),
+        messages=len(messages),
+        bytes=path.stat().st_size,
+        files=[str(path)],
+        folder=str(Path.cwd()),
+    )
+
+
+def test_what_came_before_the_recorder_comes_first_and_once(bench: Bench) -> None:
+    calibrations = bench.controller.publisher(CALIBRATION)
+    states = bench.camera.publisher(CAMERA_STATE), bench.controller.publisher(CONTROLLER_STATE)
+    put(calibrations, 2)
+    for state in states:
+        put(state, 3)
+    frames = bench.camera.publisher(FRAME)
+    put(frames, 10)  # before the recorder: not its loss
+    bench.start()
+    put(states[0], 1)
+    put(frames, 10)
+    summary = bench.stop()
+    messages = logged(summary)
+    firsts = [message for message in messages if message.key in (CALIBRATION.key, *(s.key for s in states))]
+    assert [(m.key, count_of(m.sequence)) for m in firsts] == [
+        (CAMERA_STATE.key, 2),
+        (CONTROLLER_STATE.key, 2),
+        (CALIBRATION.key, 1),
+        (CAMERA_STATE.key, 3),
+    ]
+    assert messages[:3] == firsts[:3]
+    assert len(bodies_of(messages, FRAME)) == 10
+    assert summary.lost == {}
+
+
+def test_a_controller_that_comes_later_is_asked(bench: Bench) -> None:
+    bench.hub.lose = lambda role, key, envelope: role == "recorder" and key == CALIBRATION.key
+    bench.start()
+    late = bench.join("controller-2")
+    late.publisher(CALIBRATION).put(b"late")  # before the link to the recorder is up
+    late.beat()
+    until(lambda: CALIBRATION.key in bench.recorder._others.kept)
+    late.finish()
+    assert bodies_of(logged(bench.stop()), CALIBRATION) == [b"late"]
+
+
+def test_every_lost_message_is_counted(bench: Bench) -> None:
+    frames, steps = bench.camera.publisher(FRAME), bench.controller.publisher(STEP)
+
+    def lose(role: str, key: str, envelope: Envelope) -> bool:
+        count = count_of(envelope.sequence)
+        return role == "recorder" and ((key == FRAME.key and count in (7, 8, 20, 49)) or key == STEP.key)
+
+    bench.hub.lose = lose
+    bench.start()
+    put(frames, 50)  # the last one is lost too: only the camera knows
+    put(steps, 5)  # none arrives
+    summary = bench.stop()
+    assert summary.lost == {FRAME.key: 4, STEP.key: 5}
+    told = [event for event in bench.events if event.startswith("MESSAGES_LOST")]
+    counts: Counter[str] = Counter()
+    for event in told:
+        _, count, *_, topic = event.split()
+        counts[topic] += int(count)
+    assert counts == summary.lost
+    missing = {count.topic: count.missing for count in bench.camera.heard["recorder"].topics if count.missing}
+    assert missing == summary.lost
+    (path,) = summary.files
+    reader = LogReader(path)
+    recorded = [Log.FromString(m.payload).message for m in reader if m.key == EVENT.key]
+    assert [event for event in recorded if event.startswith("MESSAGES_LOST")] == told
+    assert reader.metadata["recording"] == {
+        "messages": str(summary.messages),
+        "messages_lost": "9",
+        f"lost {FRAME.key}": "4",
+        f"lost {STEP.key}": "5",
+    }
+
+
+def test_what_comes_twice_or_out_of_order_is_not_lost(bench: Bench) -> None:
+    frames = bench.camera.publisher(FRAME)
+    bench.start()
+    first = frames.put(b"0").sequence
+    for number in (1, 1, 3, 2, 4, 4):
+        frames.put(b"%d" % number, sequence=first + number)
+    summary = bench.stop()
+    assert bodies_of(logged(summary), FRAME) == [b"0", b"1", b"1", b"3", b"2", b"4", b"4"]
+    assert (summary.lost, bench.recorder._ledger.recorded()[FRAME.key]) == ({}, 7)
+    assert not any(event.startswith("MESSAGES_LOST") for event in bench.events)
+
+
+def test_logs_are_rotated_and_each_begins_with_the_calibration(bench: Bench) -> None:
+    put(bench.controller.publisher(CALIBRATION), 1)
+    frames = bench.camera.publisher(FRAME)
+    bench.start(limits=Limits(largest_bytes=20_000))
+    sent = []
+    for number in range(4):
+        before = len(bench.recorder._series.files)
+        sent.append(np.random.default_rng(number).bytes(30_000))
+        frames.put(sent[-1])
+        until(lambda before=before: len(bench.recorder._series.files) > before)
+    summary = bench.stop()
+    assert len(summary.files) == 5
+    for path in summary.files:
+        messages = list(LogReader(path))
+        assert messages[0].key == CALIBRATION.key
+        assert len(bodies_of(messages, CALIBRATION)) == 1
+    assert bodies_of(logged(summary), FRAME) == sent
+    assert summary.lost == {}
+    assert len(set(summary.files)) == 5
+
+
+def test_a_full_disk_ends_the_recording_and_nothing_else(bench: Bench, small_disk: None) -> None:
+    frames = bench.camera.publisher(FRAME)
+    bench.start()
+    for number in range(40):
+        frames.put(np.random.default_rng(number).bytes(20_000))
+    until(lambda: any(event.startswith("RECORDING_FAILED") for event in bench.events))
+    put(frames, 10)
+    assert bench.thread.is_alive()
+    summary = bench.stop()
+    assert "cannot be written" in summary.failure
+    (path,) = summary.files
+    read = list(LogReader(path))
+    assert path.suffix == UNFINISHED
+    assert [found.name for found in bench.folder.iterdir()] == [path.name]
+    assert len(read) == summary.messages
+    assert summary.lost[FRAME.key] == 50 - len(bodies_of(read, FRAME))  # to the last one, the unflushed ones too
+    assert bench.camera.heard["recorder"].recording.lost == sum(summary.lost.values())
+
+
+def test_a_folder_that_cannot_be_written_is_an_error(bench: Bench) -> None:
+    bench.folder.write_text("a file")
+    bus = MemoryBus(bench.hub, "recorder", bench.clock)
+    with pytest.raises(DataFileError, match="cannot be made"):
+        Recorder(bus, bench.clock, "night", bench.folder, metadata={}).run()
+
+
+def entry(topic: Topic, count: int, start_s: int = 100, payload: bytes = b"", key: str = "") -> tuple[Topic, Sample]:
+    return topic, Sample(key or topic.key, payload, sequence_of(start_s, count), 0, 0)
+
+
+def test_the_ledger_knows_beginnings_gaps_and_restarts() -> None:
+    ledger = LossAccount()
+    for count in (5, 6, 9, 9, 4):  # one that came before, or is older than the first, fills no gap
+        ledger.enter(*entry(FRAME, count), recorded=True)
+    assert ledger.lost() == {FRAME.key: 2}
+    for count in (3, 5):
+        ledger.enter(*entry(FRAME, count, start_s=101), recorded=True)
+    ledger.enter(*entry(FRAME, 6, start_s=101), recorded=False)
+    assert ledger.lost() == {FRAME.key: 4}
+    assert (ledger.news(), ledger.news()) == ({FRAME.key: 4}, {})
+    ledger.enter(*entry(FRAME, 8, start_s=101), recorded=True)
+    assert ledger.news() == {FRAME.key: 1}
+
+
+def test_the_ledger_takes_a_loss_back_when_the_message_comes_late() -> None:
+    ledger = LossAccount()
+    for count in (5, 9, 7):
+        ledger.enter(*entry(FRAME, count), recorded=True)
+    assert (ledger.lost(), ledger.news()) == ({FRAME.key: 2}, {FRAME.key: 2})
+    ledger.enter(*entry(FRAME, 6), recorded=True)
+    ledger.enter(*entry(FRAME, 8), recorded=False)  # the disk did not take it
+    assert (ledger.lost(), ledger.news(), ledger.recorded()) == ({FRAME.key: 1}, {}, {FRAME.key: 4})
+    ledger.enter(*entry(FRAME, 12), recorded=True)
+    assert (ledger.lost(), ledger.news()) == ({FRAME.key: 3}, {FRAME.key: 1}), "two were said already"
+
+
+def test_the_ledger_counts_nothing_as_lost_that_was_sent_twice() -> None:
+    ledger = LossAccount()
+    for count in (0, 1, 1, 2, 2, 4, 4):
+        ledger.enter(*entry(FRAME, count), recorded=True)
+    ledger.settle()
+    ledger.enter(*entry(FRAME, 4), recorded=True)
+    ledger.revert()
+    for published, lost in ((7, 1), (8, 1), (9, 2)):
+        message = wire.Health(process="camera", state="stopped")
+        message.topics.add(topic=FRAME.key, published=published)
+        ledger.believe(entry(HEALTH, 0)[1], message)
+        assert ledger.lost() == {FRAME.key: lost}, "3 was not heard, and what the camera sent beyond those seven"
+    assert ledger.recorded() == {FRAME.key: 7}
+
+
+def test_the_ledger_believes_the_last_health_of_each_start() -> None:
+    ledger = LossAccount()
+
+    def health(published: int, state: str, start_s: int = 100) -> None:
+        message = wire.Health(process="camera", state=state)
+        message.topics.add(topic=FRAME.key, published=published)
+        message.topics.add(topic=STEP.key, received=9)
+        message.topics.add(topic="lowfc/nothing", published=9)
+        ledger.believe(entry(HEALTH, 0, start_s)[1], message)
+
+    health(40, "running")  # what it sent before it was heard is not lost
+    health(90, "running")  # and what is on its way is not lost yet
+    assert ledger.lost() == {}
+    health(100, "stopped")
+    assert ledger.lost() == {FRAME.key: 60}
+    ledger.enter(*entry(FRAME, 2, start_s=101), recorded=True)
+    health(5, "stopped", start_s=101)
+    assert ledger.lost() == {FRAME.key: 62}
+
+
+def test_the_ledger_tells_apart_who_shares_a_topic() -> None:
+    ledger = LossAccount()
+    for name, count in (("camera", 0), ("controller", 0), ("camera", 1), ("controller", 2)):
+        ledger.enter(*entry(EVENT, count, payload=Log(name=name).SerializeToString()), recorded=True)
+    ledger.enter(*entry(EVENT, 0, payload=b"\xff"), recorded=True)
+    assert ledger.lost() == {EVENT.key: 1}
+
+
+RECORD = """
+import sys
+from pathlib import Path
+from lowfc.adapters.bus.run import open_run
+from lowfc.programs.core.recording.process import record
+run, logs, toml = sys.argv[1:]
+summary = record(open_run(run), Path(logs), configuration=Path(toml), seed=7)
+print(summary.messages, sum(summary.lost.values()), summary.failure)
+"""
+
+
+class Camera:
+    """A camera on the real bus, in this process."""
+
+    def __init__(self, run: Run) -> None:
+        clock = HostClock()
+        self.bus = ZenohBus(run.links, "camera", clock)
+        self.service = Service("camera", run.run_id, clock, self.bus)
+        self.frames = self.service.publisher(FRAME)
+        self.service.state = "ready"
+
+
+@pytest.fixture
+def camera() -> Iterator[Camera]:
+    found = Camera(open_run(new_run_id()))
+    yield found
+    found.bus.close()
+
+
+@pytest.fixture
+def recording(camera: Camera, tmp_path: Path) -> Iterator[subprocess.Popen[str]]:
+    (tmp_path / "lowfc.toml").write_text("[loop]\n")
+    run_id = camera.service.health().run_id
+    process = subprocess.Popen(
+        [sys.executable, "-c", RECORD, run_id, tmp_path / "logs", tmp_path / "lowfc.toml"],
+        stdout=subprocess.PIPE,
+        text=True,
+    )
+    assert camera.service.wait_for(["recorder"], PATIENCE_S) == ()
+    yield process
+    process.kill()
+    process.communicate()
+
+
+def test_a_recorder_process_loses_nothing_from_the_first_frame_on(
+    camera: Camera, recording: subprocess.Popen[str], tmp_path: Path
+) -> None:
+    sent = []
+    for number in range(300):
+        sent.append(number.to_bytes(2) * 6400)
+        camera.frames.put(sent[-1])
+        camera.service.beat()
+        time.sleep(0.001)
+    recording.send_signal(signal.SIGTERM)
+    until(lambda: camera.service.heard["recorder"].state == "stopping")
+    camera.frames.put(b"the last one, after the signal")
+    camera.service.finish()
+    out, _ = recording.communicate(timeout=PATIENCE_S)
+    (path,) = (tmp_path / "logs").iterdir()
+    reader = LogReader(path)
+    messages = list(reader)
+    assert bodies_of(messages, FRAME) == [*sent, b"the last one, after the signal"]
+    assert (recording.returncode, out) == (0, f"{len(messages)} 0 \n")
+    assert reader.complete
+    assert reader.attachments == {"lowfc.toml": b"[loop]\n"}
+    described = reader.metadata["lowfc"]
+    assert abs(float(described["clock_ahead_ms"])) < 1000
+    assert (described["seed"], described["lowfc"]) == ("7", __version__)
+    assert all(described[key] for key in ("host", "kernel", "processor", "python", "numpy", "eclipse-zenoh", "run"))
+
+
+def test_a_killed_recorder_leaves_a_readable_log_and_a_loop_that_goes_on(
+    camera: Camera, recording: subprocess.Popen[str], tmp_path: Path
+) -> None:
+    def on_disk() -> int:
+        return sum(len(bodies_of(list(LogReader(path)), FRAME)) for path in (tmp_path / "logs").iterdir())
+
+    def put_until_there() -> bool:
+        camera.frames.put(bytes(12_800))
+        camera.service.beat()
+        return on_disk() >= 20
+
+    until(put_until_there)
+    recording.kill()
+    recording.wait()
+    before = on_disk()
+    put(camera.frames, 100)
+    (path,) = (tmp_path / "logs").iterdir()
+    reader = LogReader(path)
+    assert len(bodies_of(list(reader), FRAME)) == before
+    assert (path.suffix, reader.complete, list(reader.attachments)) == (UNFINISHED, False, ["lowfc.toml"])

@@ -1,0 +1,374 @@
+"""What befalls a recorder: disks that refuse, stall, fill up or vanish; frozen processes; the loop goes on."""
+
+import os
+import shutil
+import subprocess
+import threading
+import time
+from collections import Counter
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from lowfc.adapters.bus.backlog import Backlog
+from lowfc.adapters.bus.bus import Publisher, Sample
+from lowfc.adapters.bus.names import MOST_NAMES
+from lowfc.adapters.logs import writer
+from lowfc.adapters.logs.reader import LogReader
+from lowfc.adapters.logs.series import Limits
+from lowfc.adapters.logs.writer import UNFINISHED, Attachment
+from lowfc.contract.envelope import Envelope, count_of, sequence_of
+from lowfc.contract.messages import CALIBRATION, COMMAND, EVENT, FRAME, HEALTH, RECORD_KEY, STEP, Topic, wire
+from lowfc.programs.core.recording import recorder as recorder_module
+from lowfc.programs.core.recording.recorder import Recorder
+from lowfc.programs.core.recording.summary import Summary
+from lowfc.testing.clock import FakeClock
+from lowfc.testing.memory_bus import MemoryBus, MemoryHub
+from tests.support.recording import PATIENCE_S, Bench, bodies_of, logged, put, until
+
+pytestmark = pytest.mark.exclusive
+
+
+@pytest.fixture
+def bench(tmp_path: Path) -> Bench:
+    return Bench(tmp_path / "logs")
+
+
+@pytest.fixture
+def small_disk(tmp_path: Path) -> Iterator[Path]:
+    """A disk of 4 MB."""
+    folder = tmp_path / "disk"
+    folder.mkdir()
+    subprocess.run(["mount", "-t", "tmpfs", "-o", "size=4m", "tmpfs", folder], check=True)
+    yield folder
+    subprocess.run(["umount", "--lazy", folder], check=True)
+
+
+def put_until(frames: Publisher, happened: Callable[[], bool]) -> None:
+    """Put frames that cannot be compressed until something happens, and ten after it."""
+
+    def put_and_look() -> bool:
+        frames.put(np.random.default_rng(frames.published).bytes(12_800))
+        return happened()
+
+    until(put_and_look)
+    put(frames, 10)
+
+
+def told(bench: Bench, event: str) -> bool:
+    return any(message.startswith(event) for message in bench.events)
+
+
+def check_account(bench: Bench, summary: Summary, frames: Publisher) -> int:
+    """Every frame is in a log or counted: by the summary, the last Health and the events; return how many are lost."""
+    messages = logged(summary)
+    recorded = len(bodies_of(messages, FRAME))
+    lost = frames.published - recorded
+    assert summary.messages == len(messages)
+    assert summary.lost.get(FRAME.key, 0) == lost
+    health = bench.camera.heard["recorder"]
+    assert (health.state, health.recording.lost) == ("stopped", sum(summary.lost.values()))
+    (count,) = (count for count in health.topics if count.topic == FRAME.key)
+    assert (count.received, count.missing) == (recorded, lost)
+    events: Counter[str] = Counter()
+    for event in bench.events:
+        if event.startswith("MESSAGES_LOST"):
+            _, number, *_, topic = event.split()
+            events[topic] += int(number)
+    assert events[FRAME.key] == lost
+    return lost
+
+
+def orphaned_terminal() -> int:
+    """A terminal whose other end is gone: a write to it fails with EIO."""
+    master, slave = os.openpty()
+    os.close(master)
+    return slave
+
+
+def full_device() -> int:
+    return os.open("/dev/full", os.O_WRONLY)
+
+
+@pytest.mark.parametrize(
+    ("device", "why"), [(orphaned_terminal, "Input/output error"), (full_device, "No space left on device")]
+)
+def test_a_disk_that_refuses_ends_the_recording_only(bench: Bench, device: Callable[[], int], why: str) -> None:
+    bench.start()
+    log, frames = bench.recorder._series._log, bench.camera.publisher(FRAME)
+    put_until(frames, lambda: log.messages_written > 20)
+    descriptor = device()
+    os.dup2(descriptor, log._raw.fileno())
+    os.close(descriptor)
+    put_until(frames, lambda: told(bench, "RECORDING_FAILED"))
+    assert bench.thread.is_alive()
+    summary = bench.stop()
+    assert why in summary.failure
+    assert summary.files == (log.part,)
+    assert 10 <= check_account(bench, summary, frames) < frames.published - 10
+
+
+def test_a_real_disk_that_fills_up_ends_the_recording_only(bench: Bench, small_disk: Path) -> None:
+    bench.folder = small_disk
+    bench.start(limits=Limits(min_free_bytes=0))
+    frames = bench.camera.publisher(FRAME)
+    put_until(frames, lambda: told(bench, "RECORDING_FAILED"))
+    summary = bench.stop()
+    assert "No space left on device" in summary.failure
+    assert summary.files[0].suffix == UNFINISHED
+    assert 10 <= check_account(bench, summary, frames) < frames.published - 10
+
+
+def test_a_disk_that_is_nearly_full_leaves_a_complete_log(bench: Bench, small_disk: Path) -> None:
+    bench.folder = small_disk / "logs"
+    bench.start(limits=Limits(min_free_bytes=1_500_000))
+    frames = bench.camera.publisher(FRAME)
+    put_until(frames, lambda: told(bench, "RECORDING_FAILED"))
+    assert bench.thread.is_alive()
+    summary = bench.stop()
+    assert "make room" in summary.failure
+    reader = LogReader(summary.files[0])
+    list(reader)
+    assert reader.complete
+    assert reader.metadata["recording"]["stopped"] == summary.failure
+    assert 10 <= check_account(bench, summary, frames) < frames.published - 10
+    assert shutil.disk_usage(small_disk).free > 500_000
+
+
+def test_a_folder_that_vanishes_ends_the_recording_only(bench: Bench) -> None:
+    bench.start()
+    shutil.rmtree(bench.folder)
+    frames = bench.camera.publisher(FRAME)
+    put_until(frames, lambda: told(bench, "RECORDING_FAILED"))
+    assert bench.thread.is_alive()
+    summary = bench.stop()
+    assert "somebody removed it" in summary.failure
+    assert summary.lost[FRAME.key] >= 10
+    assert not bench.folder.exists()
+
+
+def test_a_disk_that_stalls_costs_messages_and_they_are_counted(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(recorder_module, "QUEUE_MESSAGES", 100)
+    monkeypatch.setattr(recorder_module, "_SLOW_NS", 50_000_000)
+    monkeypatch.setattr(writer.os, "fsync", lambda descriptor: None)  # a pipe has no disk
+    bench.start()
+    log, frames, going_on = bench.recorder._series._log, bench.camera.publisher(FRAME), threading.Event()
+    file, (outlet, inlet) = os.dup(log._raw.fileno()), os.pipe()
+    os.dup2(inlet, log._raw.fileno())  # a pipe to the file, through which nothing comes for a while
+    os.close(inlet)
+
+    def copy() -> None:
+        going_on.wait(PATIENCE_S)
+        while data := os.read(outlet, 1 << 16):
+            os.write(file, data)
+
+    copier = threading.Thread(target=copy)
+    copier.start()
+    put_until(frames, lambda: len(bench.recorder._backlog) >= 100)
+    time.sleep(0.1)
+    going_on.set()
+    put_until(frames, lambda: told(bench, "DISK_SLOW"))
+    until(lambda: len(bench.recorder._backlog) == 0)
+    put(frames, 10)
+    summary = bench.stop()
+    copier.join()
+    os.close(file)
+    os.close(outlet)
+    assert summary.failure == ""
+    assert 10 <= check_account(bench, summary, frames) < frames.published - 100
+    assert bodies_of(logged(summary), FRAME)[-1] == b"%s %d" % (FRAME.key.encode(), frames.published - 1)
+    reader = LogReader(summary.files[0])
+    list(reader)
+    assert reader.metadata["recording"][f"lost {FRAME.key}"] == str(summary.lost[FRAME.key])
+    assert summary.longest_unflushed_ns > 100_000_000
+
+
+@pytest.mark.parametrize("refused", [False, True])
+def test_the_loop_of_a_recorder_goes_on_while_the_disk_takes_a_stopped_log(
+    bench: Bench, monkeypatch: pytest.MonkeyPatch, refused: bool
+) -> None:
+    reached, release, answers = threading.Event(), threading.Event(), list[Sample]()
+    sync = os.fsync
+
+    def slow(descriptor: int) -> None:
+        reached.set()
+        assert release.wait(PATIENCE_S)
+        if refused:
+            raise OSError(5, "Input/output error")
+        sync(descriptor)
+
+    bench.start()
+    put(bench.camera.publisher(FRAME), 10)
+    monkeypatch.setattr(writer.os, "fsync", slow)
+    operator = MemoryBus(bench.hub, "operator", bench.clock)
+    asking = threading.Thread(
+        target=lambda: answers.extend(operator.get(RECORD_KEY.format(name="stop"), timeout_s=PATIENCE_S))
+    )
+    asking.start()
+    assert reached.wait(PATIENCE_S)
+    beats: list[int] = []
+    operator.subscribe(HEALTH, lambda sample: beats.append(sample.sequence), "recorder")
+    until(lambda: len(beats) >= 3)
+    put(bench.camera.publisher(STEP), 5)  # unwanted now, and not lost
+    assert not answers
+    release.set()
+    asking.join(PATIENCE_S)
+    (answer,) = answers
+    request = wire.Request.FromString(answer.payload)
+    assert (request.accepted, "Input/output error" in request.reply) == (not refused, refused)
+    until(lambda: bool(bench.camera.heard["recorder"].recording.failure) is refused)
+    until(lambda: bench.camera.heard["recorder"].recording.stopped is not refused)
+    monkeypatch.undo()
+    summary = bench.stop()
+    (log,) = summary.files
+    assert str(log) == request.text
+    assert log.name.endswith(UNFINISHED) == refused
+    assert len(bodies_of(list(LogReader(log)), FRAME)) == 10
+    assert refused or STEP.key not in summary.lost
+
+
+def test_a_recorder_told_to_end_while_a_log_is_being_stopped_ends_with_it(
+    bench: Bench, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    reached, release = threading.Event(), threading.Event()
+    sync = os.fsync
+
+    def slow(descriptor: int) -> None:
+        reached.set()
+        assert release.wait(PATIENCE_S)
+        sync(descriptor)
+
+    bench.start()
+    monkeypatch.setattr(writer.os, "fsync", slow)
+    operator = MemoryBus(bench.hub, "operator", bench.clock)
+    operator.get(RECORD_KEY.format(name="stop"), timeout_s=0)
+    assert reached.wait(PATIENCE_S)
+    bench.recorder.service.stop("told")
+    until(lambda: bench.recorder.service.state == "stopping")
+    release.set()
+    (log,) = bench.stop().files
+    assert not log.name.endswith(UNFINISHED)
+
+
+def test_a_frozen_process_that_is_asked_does_not_hold_up_the_recorder(
+    bench: Bench, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    bench.start()
+    asked, thawed = threading.Event(), threading.Event()
+
+    def get(key: str, *, timeout_s: float) -> list[Sample]:
+        asked.set()
+        thawed.wait(PATIENCE_S)
+        return []
+
+    monkeypatch.setattr(bench.recorder._bus, "get", get)
+    bench.join("camera-2").beat()  # somebody new: the recorder asks
+    frames = bench.camera.publisher(FRAME)
+    put_until(frames, asked.is_set)
+    sent = frames.published
+    until(lambda: bench.recorder._ledger.recorded().get(FRAME.key, 0) == sent)
+    (part,) = bench.folder.iterdir()
+    until(lambda: len(bodies_of(list(LogReader(part)), FRAME)) == sent)
+    thawed.set()
+    assert check_account(bench, bench.stop(), frames) == 0
+
+
+def test_each_log_of_a_run_can_be_read_by_itself(bench: Bench) -> None:
+    calibrations, frames = bench.controller.publisher(CALIBRATION), bench.camera.publisher(FRAME)
+    put(calibrations, 1)
+
+    def lose(role: str, key: str, envelope: Envelope) -> bool:
+        return (role, key, count_of(envelope.sequence)) == ("recorder", CALIBRATION.key, 1)
+
+    bench.hub.lose = lose
+    bench.start(
+        limits=Limits(longest_s=0.6, min_free_bytes=0), attachments=[Attachment("a.toml", "application/toml", b"[a]")]
+    )
+    others = bench.recorder._others
+    until(lambda: len(others._states) == 3 and not others._newcomers and others._answers is None)
+    (second,) = put(calibrations, 1)
+    put_until(frames, lambda: len(bench.recorder._series.files) == 3)
+    summary = bench.stop()
+    assert check_account(bench, summary, frames) == 0
+    for number, path in enumerate(summary.files):
+        reader = LogReader(path)
+        messages = list(reader)
+        assert reader.complete
+        assert (reader.attachments, reader.metadata["lowfc"]) == ({"a.toml": b"[a]"}, {"run": "night"})
+        assert messages[0].key == CALIBRATION.key
+        # The second calibration was lost on its way, and asked for when the second log was begun.
+        assert (second in bodies_of(messages, CALIBRATION)) == (number > 0)
+
+
+class Moving(FakeClock):
+    """A clock that goes on by a millisecond whenever it is looked at."""
+
+    def host_ns(self) -> int:
+        self.advance(1_000_000)
+        return self.time_ns
+
+
+def test_what_was_written_is_flushed_in_time_whether_many_messages_come_or_none(tmp_path: Path) -> None:
+    clock, hub = Moving(), MemoryHub()
+    recorder = Recorder(MemoryBus(hub, "recorder", clock), clock, "night", tmp_path, metadata={})
+    camera = MemoryBus(hub, "camera", clock).publisher(FRAME)
+    recorder._begin()
+    log = recorder._series._log
+    flushed: list[int] = []
+    flush = log.flush
+    log.flush = lambda: (flush(), flushed.append(log.messages))[0]  # type: ignore[method-assign]
+    put(camera, 1000)
+    recorder._turn()  # takes 1 s and more by that clock
+    gaps = np.diff(flushed)
+    assert len(gaps) >= 2
+    assert gaps.max() <= 250
+    put(camera, 1)
+    recorder._turn()
+    clock.advance(250_000_000)
+    recorder._turn()
+    assert bodies_of(list(LogReader(log.part)), FRAME)[-1] == b"%s 1000" % FRAME.key.encode()
+    log.abandon()
+
+
+def waiting(topic: Topic, size: int) -> tuple[Topic, Sample]:
+    return topic, Sample(topic.key, bytes(size), 0, 0, 0)
+
+
+def test_what_waits_is_bounded_by_number_and_by_size() -> None:
+    backlog = Backlog(most_messages=3, most_bytes=1000)
+    for size in (400, 400, 400, 200, 0):
+        backlog.put(*waiting(FRAME, size))
+    assert [len(backlog.take()[1].payload) for _ in range(len(backlog))] == [400, 400, 200]
+    for _ in range(9):
+        backlog.put(*waiting(STEP, 1))
+    assert len(backlog) == 3
+    for topic in (HEALTH, EVENT):  # few, and others are understood by them
+        backlog.put(*waiting(topic, 5000))
+    assert len(backlog) == 5
+    for _ in range(5):
+        backlog.take()
+    backlog.put(*waiting(FRAME, 1000))
+    assert len(backlog) == 1
+
+
+def test_forged_names_and_starts_fill_neither_the_recorder_nor_a_log(
+    bench: Bench, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("lowfc.programs.core.recording.recorder.MOST_CHANNELS", 100)
+    bench.start()
+    forger = MemoryBus(bench.hub, "operator", bench.clock)
+    for number in range(1000):
+        body = wire.Health(process=f"forged-{number}").SerializeToString()
+        forger.publisher(HEALTH, f"forged-{number}").put(body)
+        forger.publisher(COMMAND, f"forged-{number}").put(b"")
+    until(lambda: told(bench, "BAD_MESSAGE"))
+    first = bench.recorder.service.health().recording.file
+    for start_s in range(1, 200):
+        forger.publisher(FRAME).put(b"", sequence=sequence_of(start_s, 0))
+    until(lambda: bench.recorder.service.health().recording.file != first)
+    summary = bench.stop()
+    keys = {message.key for log in summary.files for message in LogReader(log)}
+    assert sum("forged" in key for key in keys) == 2 * MOST_NAMES
+    assert sum("forged" in key for key in bench.recorder._ledger.recorded()) == 2 * MOST_NAMES

@@ -1,0 +1,398 @@
+"""What is shipped for a host of its own: units that systemd likes, and processes that answer to their supervisor.
+
+The processes here are started as their units start them, with a socket of the test in place of systemd's.
+"""
+
+import contextlib
+import itertools
+import os
+import re
+import shutil
+import signal
+import socket
+import subprocess
+import sys
+import threading
+import time
+from collections import defaultdict
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+import typer
+import yaml
+
+from lowfc.adapters.bus.run import free_ports
+from lowfc.adapters.process.realtime import _LATENCY_DEVICE
+from lowfc.adapters.process.supervision import Supervisor, status_line
+from lowfc.contract.configuration import Configuration, load
+from lowfc.contract.messages import wire
+from lowfc.programs.cli.config import commented
+from lowfc.programs.core.controller import MIRROR_PATIENCE_S
+from sim_camera.process import PATIENCE_S
+from tests.support.loops import until
+
+pytestmark = pytest.mark.exclusive
+
+DEPLOY = Path(__file__).parents[2] / "deploy"
+UNITS = sorted(path.name for path in (DEPLOY / "systemd").glob("*.service"))
+LOOP = ("lowfc-controller.service", "lowfc-sim-camera.service", "lowfc-sim-mirror.service")
+COMMON = "lowfc-.service.d/10-common.conf"
+INSTALLED = "/opt/lowfc/bin/"
+CONFIGURED = "/etc/lowfc/lowfc.toml"
+MOST_EXPOSED = 2.0
+needs_systemd = pytest.mark.skipif(shutil.which("systemd-analyze") is None, reason="there is no systemd-analyze")
+
+
+def settings(name: str) -> dict[str, list[str]]:
+    """Every value of every key of a unit and of what all have in common, in order."""
+    found = defaultdict(list)
+    for line in (DEPLOY / "systemd" / name).read_text().splitlines() + (
+        (DEPLOY / "systemd" / COMMON).read_text().splitlines() if name.endswith(".service") else []
+    ):
+        if "=" in line and not line.startswith("#"):
+            key, _, value = line.partition("=")
+            found[key].append(value)
+    return found
+
+
+def processors(name: str) -> set[int]:
+    """A unit's, of a host that has sixteen."""
+    (words,) = settings(name)["CPUAffinity"]
+    ends = [[int(end) for end in word.split("-")] for word in words.split()]
+    return {cpu for first, *last in ends for cpu in range(first, max([first, *last]) + 1) if cpu < 16}
+
+
+def command(name: str) -> list[str]:
+    """What a unit starts, without the path and with no calibration."""
+    (line,) = settings(name)["ExecStart"]
+    assert line.startswith(INSTALLED)
+    return line.removeprefix(INSTALLED).replace("$CALIBRATION", "").split()
+
+
+def program(words: list[str]) -> str:
+    """Which of our programs a command line is, whose options it takes; typer ends the test where one is unknown."""
+    import sim_camera.__main__ as camera
+    import sim_dm.__main__ as mirror
+    from lowfc.programs.cli import main
+
+    apps = {"lowfc": main.app, "sim-camera": camera.app, "sim-dm": mirror.app}
+    with typer.main.get_command(apps[words[0]]).make_context(words[0], words[1:]) as context:
+        if words[0] != "lowfc":
+            return words[0]
+        name, part, rest = context.command.resolve_command(context, [*context._protected_args, *context.args])
+        part.make_context(name, rest, parent=context).close()
+        return str(name)
+
+
+@pytest.fixture(scope="module")
+def units(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The units, for the programs that are installed here."""
+    folder = tmp_path_factory.mktemp("units") / "systemd"
+    shutil.copytree(DEPLOY / "systemd", folder)
+    for path in folder.glob("*.service"):
+        path.write_text(path.read_text().replace(INSTALLED, f"{Path(sys.executable).parent}/"))
+    return folder
+
+
+def analyze(folder: Path, *words: str) -> "subprocess.CompletedProcess[str]":
+    return subprocess.run(["systemd-analyze", *words], cwd=folder, capture_output=True, text=True, check=False)
+
+
+def exposure(folder: Path, name: str) -> float:
+    done = analyze(folder, "security", "--offline=yes", "--no-pager", name)
+    return float(re.search(rf"exposure level for {name}: ([\d.]+)", done.stdout)[1])  # type: ignore[index]
+
+
+@needs_systemd
+def test_systemd_finds_nothing_wrong_with_the_units(units: Path) -> None:
+    verify = ("verify", "--man=no", "--generators=no", "--recursive-errors=yes")
+    names = [*UNITS, "lowfc.target"]
+    done = analyze(units, *verify, *names)
+    assert (done.returncode, done.stdout + done.stderr) == (0, "")
+    wrong = units / COMMON
+    kept = wrong.read_text()
+    wrong.write_text(kept.replace("ProtectSystem=", "ProtectSystme="))  # the test can fail: what is shared is read
+    assert "ProtectSystme" in analyze(units, *verify, *names).stderr
+    wrong.write_text(kept)
+
+
+@needs_systemd
+def test_the_units_are_hardened(units: Path, tmp_path: Path) -> None:
+    assert {name: exposure(units, name) for name in UNITS if exposure(units, name) >= MOST_EXPOSED} == {}
+    shutil.copy(units / UNITS[0], tmp_path)
+    assert exposure(tmp_path, UNITS[0]) > 3 * MOST_EXPOSED  # without what they share
+
+
+@needs_systemd
+def test_user_and_folders_are_made(tmp_path: Path) -> None:
+    (tmp_path / "etc").mkdir()
+    for words in (["systemd-sysusers"], ["systemd-tmpfiles", "--create"]):
+        of = words[0].removeprefix("systemd-")
+        done = subprocess.run(
+            [*words, f"--root={tmp_path}", DEPLOY / f"{of}.d" / "lowfc.conf"],
+            capture_output=True,
+            text=True,
+            check=False,
+        )
+        if os.geteuid() == 0:  # others may not give folders away
+            assert done.returncode == 0, done.stderr
+    (line,) = (tmp_path / "etc" / "passwd").read_text().splitlines()
+    name, _, number, _, _, home, shell = line.split(":")
+    assert (name, home, Path(shell).name) == ("lowfc", "/var/lib/lowfc", "nologin")
+    made = {"run/lowfc": 0o700, "var/lib/lowfc": 0o750, "etc/lowfc": 0o755}
+    assert {path: (tmp_path / path).stat().st_mode & 0o777 for path in made} == made
+    if os.geteuid() == 0:
+        owners = [(tmp_path / path).stat().st_uid for path in made]
+        assert owners == [int(number), int(number), 0]
+
+
+def test_the_units_fit_the_programs_and_the_configuration() -> None:
+    realtime = Configuration().realtime
+    programs = ["controller", "record", "router", "sim-camera", "sim-dm", "view"]
+    assert sorted(program(command(name)) for name in UNITS) == programs
+    for name in UNITS:
+        unit = settings(name)
+        assert unit["Type"] == ["notify"]
+        assert unit["Restart"] == ["on-failure"]
+        assert unit["WantedBy"] == unit["PartOf"] == ["lowfc.target"]
+        priority = {"lowfc-recorder.service": realtime.recorder_priority, "lowfc-viewer.service": 0}.get(
+            name, realtime.priority
+        )
+        assert unit["LimitRTPRIO"] == ([str(priority)] if priority else [])
+        assert ("RestrictRealtime" in unit) == (priority == 0)
+        assert unit["DeviceAllow"] == ([f"{_LATENCY_DEVICE} w"] if priority == realtime.priority else [])
+        others = [processors(other) for other in LOOP if other != name]
+        assert all(processors(name).isdisjoint(other) for other in others)
+        assert len(processors(name)) == 1 or name not in LOOP
+    assert Path(_LATENCY_DEVICE).name in (DEPLOY / "udev" / "70-lowfc.rules").read_text()
+    # What may take long without a sign of life is no hang.
+    assert float(settings("lowfc-controller.service")["WatchdogSec"][0]) > MIRROR_PATIENCE_S
+    assert float(settings("lowfc-sim-camera.service")["WatchdogSec"][0]) > PATIENCE_S
+
+
+def test_the_documented_commands_install_every_file(tmp_path: Path) -> None:
+    lines = re.findall(r"^    sudo (install .*)$", (DEPLOY / "README.md").read_text(), re.MULTILINE)
+    (tmp_path / "lowfc").mkdir()
+    for line in lines:
+        subprocess.run(["bash", "-ec", line.replace(" /etc/", f" {tmp_path}/")], cwd=DEPLOY, check=True)
+    installed = {path.relative_to(tmp_path).as_posix(): path.read_text() for path in files_in(tmp_path)}
+    wanted = {f"systemd/system/{path.relative_to(DEPLOY / 'systemd')}": path for path in files_in(DEPLOY / "systemd")}
+    wanted |= {f"{kind}/lowfc.conf": DEPLOY / kind / "lowfc.conf" for kind in ("sysusers.d", "tmpfiles.d")}
+    wanted |= {"udev/rules.d/70-lowfc.rules": DEPLOY / "udev/70-lowfc.rules", "lowfc/lowfc.toml": DEPLOY / "lowfc.toml"}
+    assert installed == {name: path.read_text() for name, path in wanted.items()}
+
+
+def files_in(folder: Path) -> list[Path]:
+    return [path for path in folder.rglob("*") if path.is_file()]
+
+
+def test_the_configuration_file_is_the_configuration() -> None:
+    shipped = DEPLOY / "lowfc.toml"
+    advice = "lowfc config show > deploy/lowfc.toml"
+    assert shipped.read_text() == commented(Configuration()) + "\n", advice
+    assert load(shipped) == Configuration()
+    lines = shipped.read_text().splitlines()
+    keys = re.compile(r"#?[a-z_]+ = ")
+    assert all(before.startswith("# ") for before, line in itertools.pairwise(lines) if keys.match(line))
+
+
+def test_the_containers_run_the_same_as_the_units() -> None:
+    services = yaml.safe_load((DEPLOY / "compose.yaml").read_text())["services"]
+    ours = {"controller": "controller", "recorder": "recorder", "viewer": "viewer"}
+    for name, service in services.items():
+        unit = f"lowfc-{ours.get(name, f'sim-{name}')}.service"
+        assert service["command"] == command(unit)
+        assert program(service["command"])
+        assert service["cap_drop"] == ["ALL"]
+        assert service["security_opt"] == ["no-new-privileges:true"]
+        assert service["read_only"]
+        assert "ports" not in service
+        assert "privileged" not in service
+        assert set(map(int, service["cpuset"].split(","))) <= processors(unit)
+        assert [str(service.get("ulimits", {}).get("rtprio", ""))] == (settings(unit)["LimitRTPRIO"] or [""])
+        assert f"./lowfc.toml:{CONFIGURED}:ro" in service["volumes"]
+    assert len(services) == len(UNITS) - 1  # all but the router, which is for several hosts
+    assert program(services["controller"]["healthcheck"]["test"][1:]) == "ctl"
+    built = (DEPLOY / "Containerfile").read_text()
+    last = built.rpartition("\nFROM ")[2]
+    assert re.search(r"^USER [1-9]\d*:[1-9]\d*$", last, re.MULTILINE)
+    assert all(":" in image and "latest" not in image for image in re.findall(r"^FROM (\S+)", built, re.MULTILINE))
+    for word in re.findall(r"^COPY (?!--)(.+) \S+$", built, re.MULTILINE):
+        assert all((DEPLOY.parent / source).exists() for source in word.split())
+
+
+class Manager:
+    """What systemd is to a process: who listens to it."""
+
+    def __init__(self, path: Path, wait_s: float) -> None:
+        self.environment = {"NOTIFY_SOCKET": str(path), "WATCHDOG_USEC": str(round(wait_s * 1e6))}
+        self.said: list[str] = []
+        self.times_s: list[float] = []  # of the signs of life
+        self._socket = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
+        self._socket.bind(str(path))
+        self._socket.settimeout(0.02)
+        self._open = True
+        self._thread = threading.Thread(target=self._listen)
+        self._thread.start()
+
+    def _listen(self) -> None:
+        while self._open:
+            with contextlib.suppress(TimeoutError):
+                said = self._socket.recv(4096).decode()
+                self.said.append(said)
+                if said == "WATCHDOG=1":
+                    self.times_s.append(time.monotonic())
+
+    @property
+    def beats(self) -> int:
+        return len(self.times_s)
+
+    def status(self) -> str:
+        return next((one.removeprefix("STATUS=") for one in reversed(self.said) if one.startswith("STATUS=")), "")
+
+    def close(self) -> None:
+        self._open = False
+        self._thread.join()
+        self._socket.close()
+
+
+WAIT_S = 0.2
+HANGING = """
+import os, sys, time
+import lowfc.programs.core.controller as process
+from lowfc.__main__ import main
+advance = process.advance
+def advance_or_hang(*taken):
+    while os.path.exists(HANGS):
+        time.sleep(1)
+    return advance(*taken)
+process.advance = advance_or_hang
+main()
+"""
+"""The controller, whose control law does not return once a file is there."""
+
+
+class Supervised:
+    """One of the units' processes."""
+
+    def __init__(self, name: str, folder: Path, run: str) -> None:
+        self.name = name
+        self.manager = Manager(folder / f"{name}.notify", WAIT_S)
+        words = [str(DEPLOY / "lowfc.toml") if word == CONFIGURED else word for word in command(name)]
+        if "--run" in words:
+            words[words.index("--run") + 1] = run
+        else:
+            words += ["--run", run]
+        for port, free in zip(("9876", "9090"), free_ports(2), strict=True):
+            words = [str(free) if word == port else word for word in words]
+        start = [str(Path(sys.executable).parent / words[0])]
+        if name == "lowfc-controller.service":
+            start = [sys.executable, "-c", HANGING.replace("HANGS", repr(str(folder / "hang")))]
+        self.words_file = folder / f"{name}.stderr"
+        with self.words_file.open("wb") as said:
+            environment = os.environ | self.manager.environment | {"PYTHONFAULTHANDLER": "1"}
+            self.process = subprocess.Popen([*start, *words[1:]], cwd=folder, stderr=said, env=environment)
+
+
+@contextlib.contextmanager
+def supervised(folder: Path, *names: str) -> Iterator[dict[str, Supervised]]:
+    started: dict[str, Supervised] = {}
+    try:
+        for name in names:
+            started[name] = Supervised(f"lowfc-{name}.service", folder, "supervised")
+        yield started
+    finally:
+        for one in started.values():
+            one.process.kill()
+            one.process.wait()
+            one.manager.close()
+
+
+def ready_and_alive(one: Supervised) -> bool:
+    assert one.process.poll() is None, one.words_file.read_text()
+    return "READY=1" in one.manager.said and one.manager.beats > 5
+
+
+def told_to_stop(those: list[Supervised]) -> None:
+    """They say that they stop, once, and how they were last."""
+    for one in those:
+        assert "STOPPING=1" not in one.manager.said
+        one.process.send_signal(signal.SIGTERM)
+    for one in those:
+        assert one.process.wait(20) == 0, one.words_file.read_text()
+        assert one.manager.said.count("READY=1") == one.manager.said.count("STOPPING=1") == 1
+        assert one.manager.status().startswith("stopped")
+
+
+def test_processes_are_ready_alive_and_stopping(tmp_path: Path) -> None:
+    with supervised(tmp_path, "recorder", "sim-mirror", "controller", "sim-camera") as found:
+        until(lambda: all(ready_and_alive(one) for one in found.values()))
+        for name, one in found.items():
+            span_s = one.manager.times_s[-1] - one.manager.times_s[0]
+            assert one.manager.beats - 1 <= span_s / (WAIT_S / 2) + 1, f"{name} says so too often"
+        controller, mirror = found["controller"], found["sim-mirror"]
+        until(lambda: re.fullmatch(r"running, open, \d+ Hz", controller.manager.status()))
+
+        def quiet() -> bool:
+            """Whether the controller is silent while the mirror gives five signs of life: for longer than the wait."""
+            time.sleep(0.05)  # what it had sent is taken
+            before, others = controller.manager.beats, mirror.manager.beats
+            until(lambda: mirror.manager.beats >= others + 5)
+            return controller.manager.beats == before
+
+        assert not quiet()
+        controller.process.send_signal(signal.SIGSTOP)
+        assert quiet()
+        controller.process.send_signal(signal.SIGCONT)
+        assert not quiet()
+        (tmp_path / "hang").touch()
+        until(lambda: "COMMAND_EXPIRED" in mirror.words_file.read_text())  # nothing comes from the controller
+        assert quiet()
+        controller.process.send_signal(signal.SIGABRT)  # as systemd does then
+        assert controller.process.wait(20) == -signal.SIGABRT
+        assert "advance_or_hang" in controller.words_file.read_text()  # what hung is in the journal
+        told_to_stop([one for one in found.values() if one is not controller])
+
+
+@pytest.mark.slow
+def test_a_viewer_is_ready_alive_and_stopping(tmp_path: Path) -> None:
+    with supervised(tmp_path, "controller") as found:
+        until(lambda: ready_and_alive(found["controller"]))
+        with supervised(tmp_path, "viewer") as looking:
+            until(lambda: ready_and_alive(looking["viewer"]))
+            told_to_stop([looking["viewer"], found["controller"]])
+
+
+def test_without_a_manager_nothing_is_said() -> None:
+    nobody = Supervisor({"WATCHDOG_USEC": "1000000"})
+    assert nobody.period_ns is None
+    nobody.ready()
+    nobody.alive(0)
+    nobody.stopping()
+    nobody.tell(wire.Health())
+
+
+def test_a_managers_watchdog_is_not_a_parents(tmp_path: Path) -> None:
+    given = {"NOTIFY_SOCKET": str(tmp_path / "nobody"), "WATCHDOG_USEC": "1000000"}
+    assert Supervisor(given | {"WATCHDOG_PID": str(os.getpid())}).period_ns == 500_000_000
+    assert Supervisor(given | {"WATCHDOG_PID": str(os.getppid())}).period_ns is None
+    assert Supervisor(given | {"WATCHDOG_USEC": "0"}).period_ns is None
+    Supervisor(given).ready()  # nobody listens there: no error
+
+
+def test_the_loop_does_not_wait_for_a_manager_that_does_not_read() -> None:
+    with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as deaf:
+        deaf.bind("")  # the kernel gives it a name without a file, as systemd may have
+        name = deaf.getsockname().decode().replace("\0", "@", 1)
+        supervisor = Supervisor({"NOTIFY_SOCKET": name, "WATCHDOG_USEC": "2"})
+        for turn in range(2000):  # more than a socket holds
+            supervisor.alive(turn * 1000)
+        assert deaf.recv(4096) == b"WATCHDOG=1"
+
+
+def test_a_status_is_one_line() -> None:
+    health = wire.Health(state="ready", rate_hz=3.2, recording=wire.Recording(failure="disk full\nREADY=1"))
+    assert status_line(health) == "ready, 3 Hz, recording failed: disk full READY=1"
+    closed = wire.Health(state="running", rate_hz=1000.4, mode=wire.LOOP_MODE_SAFE)
+    assert status_line(closed) == "running, in safe mode, 1000 Hz"

@@ -1,0 +1,213 @@
+"""Documents that cannot rot: every command in them is run, every figure comes from a file."""
+
+import json
+import re
+import shlex
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from tests.e2e.test_bench_day import COMMANDS as BENCH_DAY
+from tests.e2e.test_commission_page import COMMANDS as COMMISSIONING
+from tests.e2e.test_operator import COMMANDS as OPERATING
+from tests.e2e.test_own_hardware import DOCUMENTED
+from tests.support.loops import children, interrupt, recorded_bytes, start, until
+from tests.support.viewers import needs_vulkan
+
+pytestmark = pytest.mark.exclusive
+
+ROOT = Path(__file__).parents[2]
+README = ROOT / "README.md"
+# Run by CI itself, which runs this test; and by the test of the viewer.
+ROUTE = "rerun rrd route --application-id $(basename $log .mcap) deploy/layouts/log.rbl | rerun $log -"
+ELSEWHERE = {
+    "make sim-loop": ".ci/run",
+    "make test": ".ci/run",
+    "lowfc doctor": "tests/commissioning/test_doctor.py",
+    "rerun $(ls -t logs/*.mcap | head -1)": "tests/e2e/test_viewer.py",
+    ROUTE: "tests/design/test_layout_files.py",
+}
+SHORTER = {
+    "--duration 20": "--duration 2",
+    "--seconds 2": "--seconds 0.5",
+    "--trials 20": "--trials 4",
+    "--steps 200": "--steps 40",
+}
+PROGRAMS = ("lowfc", "sim-camera", "sim-dm", "make", "rerun", "python")
+
+
+def commands(document: Path) -> list[str]:
+    """Command lines of a document: indented by four, without the comment behind them."""
+    lines = re.findall(r"^    (\S.*)$", document.read_text(), flags=re.MULTILINE)
+    bare = [line.split("  #")[0].strip() for line in lines]
+    return [line for line in bare if line.split()[0] in PROGRAMS]
+
+
+def run(folder: Path, command: str) -> str:
+    """Run a documented command as it stands, only shorter."""
+    shorter = command
+    for long, short in SHORTER.items():
+        shorter = shorter.replace(long, short)
+    words = shlex.split(shorter, comments=True)
+    output = None
+    if ">" in words:
+        output = folder / words[words.index(">") + 1]
+        words = words[: words.index(">")]
+    program = Path(sys.executable).parent / words[0]
+    done = subprocess.run([program, *words[1:]], cwd=folder, capture_output=True, text=True, timeout=120, check=False)
+    assert done.returncode == 0, f"{command}: {done.stderr}"
+    if output is not None:
+        output.write_text(done.stdout)
+    return done.stdout
+
+
+def test_every_command_of_the_documents_is_known() -> None:
+    found = [
+        line for document in (README, *ROOT.glob("docs/*.md"), *ROOT.glob("deploy/*.md")) for line in commands(document)
+    ]
+    assert len(found) > 15
+    tested = {*ELSEWHERE, *LOOPS, *LOGS, *REQUESTS, *FILES, *BY_HAND, *SESSION, *BENCH, *VALIDATE, *DESIGN, *LOOKING}
+    tested |= {FEWER, *STAYING, *DOCUMENTED, *OPERATING, *BENCH_DAY, *COMMISSIONING}
+    assert set(found) == tested
+    for command, where in ELSEWHERE.items():
+        assert command.split()[0] in (ROOT / where).read_text()
+
+
+LOOPS = (
+    "lowfc sim-loop --rate 1000 --duration 20 --disturbance reaction-wheel --star-magnitude 2",
+    "lowfc sim-loop --lockstep --duration 2 --seed 7",
+    "lowfc sim-loop --sensor clowfs --duration 2",
+)
+VALIDATE = ("lowfc validate table4 photometry --trials 20",)
+DESIGN = (
+    "lowfc design spc --cells 32 --outer 8 --out pupil.npz",
+    "lowfc design sam --steps 200 --out mask.json",
+)
+REQUESTS = (
+    "lowfc ctl status",
+    "lowfc ctl gain 0.3 --mode 2 --mode 3",
+    "lowfc ctl open",
+    "lowfc ctl close",
+    "lowfc ctl safe",
+    "lowfc ctl clear",
+    "lowfc runs",
+)
+FILES = (
+    "lowfc config show > lowfc.toml",
+    "lowfc config check lowfc.toml",
+    "lowfc sim-loop --config lowfc.toml --duration 2",
+)
+FEWER = "lowfc record --run bench --every 10 --topics lowfc/camera/frame --topics 'lowfc/mirror/*/state'"
+BY_HAND = ("sim-camera --run bench", "sim-dm --run bench", "lowfc controller --run bench", "lowfc record --run bench")
+SESSION = ("lowfc config zenoh --run bench --role camera",)
+BENCH = ("lowfc bench twin", "lowfc bench record --rate 1000 --seconds 2")
+STAYING = (
+    "lowfc sim-loop --web",
+    "lowfc view",
+    "lowfc view --web",
+    "lowfc view --foxglove",
+    "lowfc view last",
+)
+"""They go on until Ctrl-C."""
+LOOKING = (
+    "lowfc view --headless-screenshot now.png",
+    "lowfc view --save night.rrd --seconds 60",
+    "lowfc view last --headless-screenshot log.png --tab optics",
+)
+LOGS = (
+    "lowfc info last",
+    "lowfc replay last",
+    "lowfc what-if last --set gain=0.3,leak=0.01",
+    "lowfc publish last --speed 2",
+    "lowfc recover last",
+    "lowfc report last",
+    "lowfc export last --to fits",
+    "lowfc export last --decimate 10",
+    "lowfc info last --digest",
+)
+
+
+@pytest.mark.parametrize("command", [LOOPS[0], *(pytest.param(one, marks=pytest.mark.slow) for one in LOOPS[1:])])
+def test_the_loops(tmp_path: Path, command: str) -> None:
+    assert "frame to command" in run(tmp_path, command)
+    assert len(list((tmp_path / "logs").glob("*.mcap"))) == 1
+
+
+@pytest.mark.slow
+def test_the_requests(tmp_path: Path) -> None:
+    loop = start(tmp_path, "sim-loop", "--rate", "100", "--no-record")
+    try:
+        until(lambda: "controller" in children(loop.pid))
+        time.sleep(3)
+        said = [run(tmp_path, command) for command in REQUESTS]
+    finally:
+        out, complaints = interrupt(loop)
+    assert loop.returncode == 0, complaints
+    assert said[0].startswith("closed · residual ")
+    assert "gain is now 0.3 0.3 0.05" in said[1]
+    replies = [text.split(",")[0] for text in said[2:6]]
+    assert replies == ["loop open", "loop closed", "loop in safe mode", "loop open"]
+    assert re.match(r"\S+  open at \d+ Hz for \d+ s; camera, controller, mirror-dm; not recording\n", said[6])
+    assert "frame to command" in out
+
+
+@pytest.mark.parametrize("recorder", [BY_HAND[3], pytest.param(FEWER, marks=pytest.mark.slow)])
+def test_the_processes_by_hand(tmp_path: Path, recorder: str) -> None:
+    program = Path(sys.executable).parent
+    started = [
+        subprocess.Popen([program / words[0], *words[1:]], cwd=tmp_path, stderr=subprocess.PIPE, text=True)
+        for words in map(shlex.split, [*BY_HAND[:3], recorder])
+    ]
+    try:
+        status = [sys.executable, "-m", "lowfc", "ctl", "status", "--run", "bench"]
+        until(lambda: subprocess.run(status, cwd=tmp_path, capture_output=True, check=False).returncode == 0, 120)
+        until(lambda: recorded_bytes(tmp_path) > 4e6)
+        session = json.loads(run(tmp_path, SESSION[0]))
+        assert session["listen"]["endpoints"][0].startswith("tcp/127.0.0.1:")
+    finally:
+        for process in started:
+            process.terminate()
+        complaints = [process.communicate(timeout=20)[1] for process in started]
+    assert [process.returncode for process in started] == [0] * 4, complaints
+    for name, said in zip(("camera", "mirror-dm", "controller", "recorder"), complaints, strict=True):
+        assert f"{name}: ready (run bench)\n" in said
+    assert len(list((tmp_path / "logs").glob("*.mcap"))) == 1
+
+
+@pytest.mark.slow
+def test_the_bench(tmp_path: Path) -> None:
+    assert "rank" in run(tmp_path, BENCH[0])
+    assert "longest wait" in run(tmp_path, BENCH[1])
+
+
+@pytest.mark.slow
+@pytest.mark.viewer
+@needs_vulkan
+def test_the_views(tmp_path: Path) -> None:
+    loop = start(tmp_path, *STAYING[0].split()[1:], "--rate", "100")
+    try:
+        until(lambda: recorded_bytes(tmp_path) > 4e6)
+        for command in STAYING[1:4]:
+            look(tmp_path, command)
+        for command in LOOKING[:2]:
+            run(tmp_path, command.replace("--seconds 60", "--seconds 1").replace("now.png", "now.png --seconds 2"))
+    finally:
+        _, complaints = interrupt(loop)
+    assert loop.returncode == 0, complaints
+    assert "http://127.0.0.1:" in complaints
+    look(tmp_path, STAYING[4])
+    run(tmp_path, LOOKING[2])
+    assert {path.name for path in tmp_path.iterdir()} >= {"now.png", "night.rrd", "log.png"}
+
+
+def look(folder: Path, command: str) -> None:
+    """Run a view until it says where it is to be seen, then Ctrl-C."""
+    process = start(folder, *command.split()[1:])
+    assert process.stderr is not None
+    said = process.stderr.readline()
+    assert "127.0.0.1" in said
+    _, complaints = interrupt(process)
+    assert process.returncode == 0, complaints

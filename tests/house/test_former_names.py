@@ -1,0 +1,88 @@
+"""Former names are in the table of former names, and nowhere else."""
+
+import ast
+from pathlib import Path
+
+import pytest
+
+from lowfc.adapters.files import law_file
+from lowfc.contract import configuration, former_names
+from lowfc.contract.messages import wire
+
+ROOT = Path(__file__).parents[2]
+IDENTIFIERS = {
+    *("Drive", "Following", "Additions", "Raised", "Lane", "hopeful", "Wanted", "Taken", "Told", "obey"),
+    *("ShortcutReader", "SharedShortcutReader", "ShortcutWriter", "Ledger", "Rehearsal"),
+    *("when_we_die", "last_words", "newest_only", "timeless", "stay_awake", "SAFED"),
+    *("late_ms", "hold_ms", "valid_ms", "most_alike", "most_saturated", "least_flux"),
+}
+FOLDERS = ("lowfc", "sim_camera", "sim_dm", "tests", "benchmarks", "tools", "examples")
+SENTENCES = (
+    "Nobody asks for who is not there",
+    "Who waits for its messages receives",
+    "It has the place of the last one taken",
+    "When that was which it tells",
+    "Do harm to a simulated loop",
+    "Say how a run was",
+    "Hold your own camera or mirror against",
+    "The night back on the bus",
+    "Get the same bytes twice",
+    "takes nothing away where",
+    "kept from where it was to go",
+    "To which the noisiest mode shall be known",
+    "How the sensor lies to",
+    "stop it first, so that this one can",
+    "its path is the answer",
+    "loop safed",
+    "acting: none",
+    "an offset may be as large as",
+    "It follows for a while before it drives",
+    "Who only looks on",
+    "found on the road",
+    "Run the loop again from it",
+)
+"""Of which `docs/glossary.md` and the present sentences say the same in the field's words."""
+SOURCES = [path for folder in FOLDERS for path in (ROOT / folder).rglob("*.py") if path != Path(__file__)]
+
+
+def identifiers(source: str) -> set[str]:
+    """Names, attributes, arguments and definitions of a module."""
+    found = set()
+    for node in ast.walk(ast.parse(source)):
+        for field in ("id", "attr", "arg", "name"):
+            if isinstance(name := getattr(node, field, None), str):
+                found.add(name)
+    return found
+
+
+def test_no_source_has_a_former_identifier() -> None:
+    found = {path: identifiers(path.read_text(encoding="utf-8")) & IDENTIFIERS for path in SOURCES}
+    assert {str(path.relative_to(ROOT)): names for path, names in found.items() if names} == {}
+    assert len(SOURCES) > 400
+
+
+def test_no_text_has_a_former_sentence() -> None:
+    pages = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *(ROOT / "docs").glob("*.md")]
+    texts = {path: " ".join(path.read_text(encoding="utf-8").split()) for path in [*SOURCES, *pages]}
+    assert {str(path): one for path, text in texts.items() for one in SENTENCES if one in text} == {}
+
+
+def test_no_message_has_a_former_field() -> None:
+    for former in former_names.FIELDS:
+        message, _, field = former.partition(".")
+        assert field not in getattr(wire, message).DESCRIPTOR.fields_by_name, former
+    values = {value for enum in wire.DESCRIPTOR.enum_types_by_name.values() for value in enum.values_by_name}
+    assert values & former_names.VALUES.keys() == set()
+
+
+def test_no_key_and_no_extension_has_a_former_name() -> None:
+    assert configuration.keys().keys() & former_names.KEYS.keys() == set()
+    former = {old for new, old in former_names.LAW_EXTENSIONS.items() if old != new}
+    assert {name for name, _, _ in law_file._EXTENSIONS} & former == set()
+
+
+@pytest.mark.parametrize(
+    "source", ["class Drive: ...", "x = state.hopeful", "def obey(): ...", "f(late_ms=1)", "from a import Lane"]
+)
+def test_a_former_identifier_is_found(source: str) -> None:
+    assert identifiers(source) & IDENTIFIERS

@@ -1,0 +1,246 @@
+"""Imports point downward, the numerics are pure, no file and no folder is too large."""
+
+import ast
+import tomllib
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[2]
+PACKAGES = ("lowfc", "sim_camera", "sim_dm")
+FILES = {
+    ".".join(path.relative_to(ROOT).with_suffix("").parts).removesuffix(".__init__"): path
+    for package in PACKAGES
+    for path in sorted((ROOT / package).rglob("*.py"))
+}
+GENERATED = "lowfc.contract.wire"
+
+# What each layer may import of the project, besides itself.
+BELOW = {
+    "lowfc.arrays": (),
+    "lowfc.optics": (),
+    "lowfc.control": (),
+    "lowfc.design": ("lowfc.optics", "lowfc.control"),
+    "lowfc.contract": ("lowfc.optics", "lowfc.control"),
+    "lowfc.adapters": ("lowfc.optics", "lowfc.control", "lowfc.contract"),
+    "lowfc.testing": ("lowfc.optics", "lowfc.control", "lowfc.contract", "lowfc.adapters"),
+    "lowfc.client": ("lowfc.control", "lowfc.contract", "lowfc.adapters"),
+    "lowfc.programs": (
+        *("lowfc.optics", "lowfc.control", "lowfc.design", "lowfc.contract", "lowfc.adapters", "lowfc.client"),
+    ),
+    "sim_camera": ("lowfc.optics", "lowfc.control", "lowfc.contract", "lowfc.adapters"),
+    "sim_dm": ("lowfc.optics", "lowfc.control", "lowfc.contract", "lowfc.adapters"),
+}
+LAYERS = tuple(BELOW)
+BELOW_ALL = "lowfc.arrays"
+
+PURE_LAYERS = ("lowfc.arrays", "lowfc.optics", "lowfc.control", "lowfc.design")
+PURE_MODULES = (
+    "sim_dm.device",
+    "sim_camera.bench",
+    "sim_camera.disturbance",
+    "sim_camera.faults",
+    "sim_camera.figures",
+)
+PURE_IMPORTS = (
+    *(
+        "numpy",
+        "scipy",
+        "abc",
+        "collections",
+        "dataclasses",
+        "enum",
+        "functools",
+        "hashlib",
+        "itertools",
+        "math",
+        "operator",
+    ),
+    *("types", "typing"),
+)
+# A generator made from a seed is a value; everything else in numpy.random is state that all share.
+FROM_A_SEED = ("Generator", "default_rng", "SeedSequence", "SFC64", "PCG64")
+NUMPY_FILES = ("load", "loadtxt", "save", "savez", "savez_compressed", "savetxt", "fromfile", "memmap", "genfromtxt")
+FORBIDDEN_CALLS = ("open", "print", "input", "exec", "eval", "__import__", "breakpoint", "globals")
+LONGEST = 400
+MOST_MODULES = 16
+
+
+def imports_of(tree: ast.AST) -> Iterator[str]:
+    """Every module imported anywhere in a file; `a.b` and `a.b.c` for `from a.b import c`."""
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Import):
+            yield from (alias.name for alias in node.names)
+        elif isinstance(node, ast.ImportFrom):
+            yield "." * node.level + (node.module or "")
+            yield from ("." * node.level + f"{node.module or ''}.{alias.name}" for alias in node.names)
+
+
+def inside(name: str, package: str) -> bool:
+    return name == package or name.startswith(package + ".")
+
+
+def layer_of(module: str) -> str:
+    if module == "lowfc.__main__":  # `python -m lowfc` is the command line
+        return "lowfc.programs"
+    return next((layer for layer in LAYERS if inside(module, layer)), "")
+
+
+def is_pure(module: str) -> bool:
+    return layer_of(module) in PURE_LAYERS or module in PURE_MODULES
+
+
+def layer_faults(module: str, source: str) -> list[str]:
+    """Imports that point upward or sideways."""
+    own, faults = layer_of(module), []
+    for name in imports_of(ast.parse(source)):
+        if name.startswith("."):
+            faults.append(f"{module} imports {name}: relative")
+        target = layer_of(name)
+        if target and own and target != own and target not in (BELOW_ALL, *BELOW[own]):
+            faults.append(f"{module} imports {name}")
+    return faults
+
+
+def purity_faults(module: str, source: str) -> list[str]:
+    """Imports and calls by which a module of the numerics would depend on more than its arguments."""
+    tree, faults = ast.parse(source), []
+    for name in imports_of(tree):
+        if layer_of(name) or name == "lowfc":
+            if layer_of(name) and not is_pure(name) and not any(inside(name, pure) for pure in PURE_MODULES):
+                faults.append(f"imports {name}")
+        elif not any(inside(name, allowed) for allowed in PURE_IMPORTS):
+            faults.append(f"imports {name}")
+        if inside(name, "numpy.random") and name.rpartition(".")[2] not in ("random", *FROM_A_SEED):
+            faults.append(f"imports {name}")
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Call) and isinstance(node.func, ast.Name) and node.func.id in FORBIDDEN_CALLS:
+            faults.append(f"calls {node.func.id}")
+        if isinstance(node, ast.Global):
+            faults.append("changes a global")
+        if isinstance(node, ast.Attribute):
+            text = ast.unparse(node)
+            kind, _, attribute = text.rpartition(".")
+            if kind in ("np.random", "numpy.random") and attribute not in FROM_A_SEED:
+                faults.append(f"uses {text}")
+            if kind in ("np", "numpy") and attribute in NUMPY_FILES:
+                faults.append(f"uses {text}")
+        unseeded = isinstance(node, ast.Call) and ast.unparse(node.func).rpartition(".")[2] in FROM_A_SEED[1:]
+        if unseeded and not (node.args or node.keywords):
+            faults.append(f"calls {ast.unparse(node)} without a seed")
+    return [f"{module} {fault}" for fault in faults]
+
+
+def test_imports_point_downward() -> None:
+    assert [fault for name, path in FILES.items() for fault in layer_faults(name, path.read_text("utf-8"))] == []
+
+
+def test_the_numerics_are_pure() -> None:
+    pure = {name: path.read_text("utf-8") for name, path in FILES.items() if is_pure(name)}
+    assert [fault for name, source in pure.items() for fault in purity_faults(name, source)] == []
+
+
+def test_every_module_is_in_a_layer() -> None:
+    outside = [module for module in FILES if not layer_of(module) and module != "lowfc"]
+    assert outside == []
+    assert sum(map(is_pure, FILES)) > 25  # the list above still finds the numerics
+
+
+def test_every_source_but_the_tests_is_type_checked() -> None:
+    mypy = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["tool"]["mypy"]
+    folders = {path.relative_to(ROOT).parts[0] for path in ROOT.glob("[!.]*/**/*.py")}
+    assert set(mypy["files"]) == folders - {"tests", "build"}
+    assert mypy["strict"]
+
+
+def test_no_file_outgrows_its_noun() -> None:
+    long = {module: len(path.read_text(encoding="utf-8").splitlines()) for module, path in FILES.items()}
+    assert {module: lines for module, lines in long.items() if lines > LONGEST and not inside(module, GENERATED)} == {}
+    vague = {"utils", "util", "helpers", "common", "misc"}
+    assert [module for module in FILES if vague & set(module.split("."))] == []
+
+
+def packages() -> dict[str, Path]:
+    """Folders with modules, by their dotted names."""
+    return {name: path for name, path in FILES.items() if path.name == "__init__.py" and name != GENERATED}
+
+
+def test_every_folder_of_modules_is_a_package_of_at_most_sixteen() -> None:
+    folders = {path.parent for path in FILES.values()}
+    assert folders - {path.parent for path in packages().values()} - {FILES[GENERATED].parent} == set()
+    sizes = {folder: sum(path.stem[:2] != "__" for path in folder.glob("*.py")) for folder in folders}
+    assert {folder: size for folder, size in sizes.items() if size > MOST_MODULES} == {}
+
+
+@pytest.mark.parametrize(
+    ("module", "source"),
+    [
+        ("lowfc.control.laws.law", "from lowfc.contract import codec"),
+        ("lowfc.control.laws.law", "from lowfc.optics.twin.twin import Twin"),
+        ("lowfc.optics.twin.twin", "import lowfc.control.laws.law"),
+        ("lowfc.contract.codecs.codec", "def later():\n    from lowfc.adapters.process.clock import HostClock"),
+        ("lowfc.adapters.bus.bus", "from lowfc.programs import controller"),
+        ("lowfc.adapters.bus.bus", "import sim_dm.device"),
+        ("lowfc.programs.launch.sim_loop", "from sim_camera.bench import Bench"),
+        ("lowfc.client.client", "from lowfc.programs.cli.ctl import which_run"),
+        ("lowfc.adapters.bus.bus", "from lowfc.client import Client"),
+        ("sim_camera.process", "import lowfc.programs.core.controller"),
+        ("sim_dm.process", "from sim_camera import bench"),
+        ("lowfc.adapters.bus.bus", "from . import clock"),
+    ],
+)
+def test_an_import_upward_is_found(module: str, source: str) -> None:
+    assert layer_faults(module, source) != []
+
+
+@pytest.mark.parametrize(
+    ("module", "source"),
+    [
+        ("lowfc.contract.codecs.codec", "from lowfc.control.laws.law import Law\nfrom lowfc.optics import zernike"),
+        ("lowfc.programs.core.controller", "import lowfc.adapters.bus.bus\nfrom lowfc import __version__"),
+        ("sim_dm.process", "from lowfc.adapters.process.service import Service\nimport time"),
+    ],
+)
+def test_an_import_downward_is_fine(module: str, source: str) -> None:
+    assert layer_faults(module, source) == []
+
+
+@pytest.mark.parametrize(
+    "source",
+    [
+        "import time",
+        "import os",
+        "from pathlib import Path",
+        "from datetime import datetime",
+        "import random",
+        "import pydantic",
+        "def later():\n    import time",
+        "from lowfc.contract.errors import LowfcError",
+        "import numpy as np\nnp.random.seed(1)",
+        "import numpy as np\nx = np.random.standard_normal(3)",
+        "import numpy\nx = numpy.random.rand(3)",
+        "from numpy.random import rand",
+        "from numpy import random\nrandom.default_rng()",
+        "import numpy as np\nrng = np.random.default_rng()",
+        "import numpy as np\nseeds = np.random.SeedSequence()",
+        "import numpy as np\nx = np.load('file')",
+        "x = open('file')",
+        "def f():\n    global x\n    x = 1",
+        "print('x')",
+    ],
+)
+def test_an_impurity_is_found(source: str) -> None:
+    assert purity_faults("lowfc.control.laws.law", source) != []
+
+
+@pytest.mark.parametrize(
+    "source",
+    [
+        "import numpy as np\nimport numpy.typing as npt\nfrom scipy.optimize import brentq",
+        "import numpy as np\nrng = np.random.default_rng([1, 2])\ndef f(rng: np.random.Generator): ...",
+        "from lowfc.control.loop.safety import limit\nfrom dataclasses import dataclass",
+    ],
+)
+def test_pure_source_is_fine(source: str) -> None:
+    assert purity_faults("lowfc.control.laws.law", source) == []

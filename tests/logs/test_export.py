@@ -1,0 +1,316 @@
+"""Exports, read back with other people's readers and compared with the messages of the log."""
+
+import csv
+import json
+import sys
+import tracemalloc
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import aotpy
+import numpy as np
+import numpy.typing as npt
+import pytest
+from aotpy.io.fits import AOTFITSErrorLevel
+from astropy.io import fits
+from astropy.table import Table
+from rich.console import Console
+from typer.testing import CliRunner
+
+from lowfc.adapters.process.terminal import new_app
+from lowfc.contract.codecs.calibration_codec import identified
+from lowfc.contract.codecs.codec import decode_frame
+from lowfc.contract.configuration import Configuration
+from lowfc.contract.envelope import count_of
+from lowfc.contract.errors import ConfigurationError, DataFileError
+from lowfc.contract.messages import (
+    COMMAND,
+    FRAME,
+    MIRROR_STATE,
+    STEP,
+    TIMING,
+    TRUTH,
+    Topic,
+    from_timestamp,
+    image,
+)
+from lowfc.programs.logs.export.command import Format, export, export_log, render
+from tests.support import toy
+from tests.support.report_log import METADATA, Night
+
+STEPS, REFUSED, UNSENT, UNTRUE = 30, 4, 7, 9
+MODES, ACTUATORS = len(toy.NOLL), toy.GRID[0] * toy.GRID[1]
+QUIET = Console(quiet=True)
+GOOD = np.arange(toy.SHAPE[0] * toy.SHAPE[1]) != 10
+CALIBRATED = identified(replace(toy.calibration(), good=GOOD.astype(np.float32)))
+Double = npt.NDArray[np.float64]
+
+
+def a_night() -> Night:
+    """An open and 29 closed steps, one of them refused; a command and a truth are missing; the camera is restarted."""
+    night = Night(calibration=CALIBRATED)
+    night.request("open")
+    night.frames(1)
+    night.request("close")
+    night.frames(STEPS // 2 - 1, dark={REFUSED - 1})
+    night.start_camera()
+    night.frames(STEPS // 2)
+    for topic, number in ((COMMAND, UNSENT), (TRUTH, UNTRUE)):
+        del night.samples[[place for place, one in enumerate(night.samples) if topic.matches(one.key)][number]]
+    held = COMMAND.message.FromString(of(night, COMMAND)[0])
+    held.actuators = bytes(4 * ACTUATORS)  # type: ignore[attr-defined]
+    night.put(COMMAND, held)  # repeated while no frame came
+    return night
+
+
+def of(night: Night, topic: Topic) -> list[bytes]:
+    return [sample.payload for sample in night.samples if topic.matches(sample.key)]
+
+
+NIGHT = a_night()
+STEPS_SENT = [STEP.message.FromString(payload) for payload in of(NIGHT, STEP)]
+SEQUENCES = [step.frame_sequence for step in STEPS_SENT]  # type: ignore[attr-defined]
+TIMES_NS = [from_timestamp(step.timestamp) for step in STEPS_SENT]  # type: ignore[attr-defined]
+FRAMES = np.array([decode_frame(payload, 0, 0).pixels for payload in of(NIGHT, FRAME)])
+
+
+def sent(topic: Topic, name: str, width: int = MODES) -> Double:
+    """A quantity of each step, as float32; NaN where it was not sent."""
+    rows = np.full((STEPS, width), np.nan, np.float32)
+    for payload in reversed(of(NIGHT, topic)):
+        body: Any = topic.message.FromString(payload)
+        value = getattr(body, name)
+        if len(value):
+            rows[SEQUENCES.index(body.frame_sequence)] = np.frombuffer(value, "<f4") if name == "actuators" else value
+    return rows
+
+
+def written(path: Path, *without: Topic, finish: bool = True) -> Path:
+    night = a_night()
+    night.samples = [one for one in night.samples if not any(topic.matches(one.key) for topic in without)]
+    return night.write(path, finish=finish)
+
+
+@pytest.fixture(scope="module")
+def log(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return written(tmp_path_factory.mktemp("night") / "night.mcap")
+
+
+def test_csv(log: Path, tmp_path: Path) -> None:
+    figures = export_log(log, Format.CSV, tmp_path / "out.csv", console=QUIET)
+    assert figures["files"] == [str(tmp_path / "out.csv")]
+    assert (figures["steps"], figures["modes"], figures["finished"]) == (STEPS, MODES, True)
+    with (tmp_path / "out.csv").open(newline="") as stream:
+        rows = list(csv.DictReader(stream))
+    assert [int(row["sequence"]) for row in rows] == SEQUENCES
+    assert [int(row["count"]) for row in rows] == [count_of(one) for one in SEQUENCES]
+    assert [int(row["time_ns"]) for row in rows] == TIMES_NS
+    assert rows[1]["time_utc"] == f"{np.datetime64(TIMES_NS[1], 'ns')}"
+    assert [row["mode"] for row in rows[:2]] == ["open", "closed"]
+    assert (rows[0]["reasons"], rows[REFUSED]["reasons"]) == ("", "dark")
+    assert rows[REFUSED]["error_z2_nm"] == rows[UNTRUE]["true_residual_rms_nm"] == ""
+    assert float(rows[3]["transport_us"]) == 90
+    for place, noll in enumerate(toy.NOLL):
+        for stem, topic, name in (("error", STEP, "error_nm"), ("true_disturbance", TRUTH, "disturbance_nm")):
+            read = np.array([float(row[f"{stem}_z{noll}_nm"] or "nan") for row in rows], np.float32)
+            np.testing.assert_array_equal(read, sent(topic, name)[:, place])
+    table = Table.read(tmp_path / "out.csv")
+    np.testing.assert_array_equal(np.array(table["command_z4_nm"], np.float32), sent(STEP, "command_nm")[:, 2])
+
+
+def test_npz(log: Path, tmp_path: Path) -> None:
+    figures = export_log(log, Format.NPZ, tmp_path / "out.npz", frames=True, console=QUIET)
+    assert figures["files"] == [str(tmp_path / "out.npz"), str(tmp_path / "out.frames.npy")]
+    assert figures["frames"] == STEPS
+    with np.load(tmp_path / "out.npz", allow_pickle=False) as found:
+        for name in ("sequence", "frame_sequence"):
+            np.testing.assert_array_equal(found[name], SEQUENCES)
+        np.testing.assert_array_equal(found["pol_nm"], sent(STEP, "pol_nm"))
+        np.testing.assert_array_equal(found["true_residual_nm"], sent(TRUTH, "residual_nm"))
+        stroke_nm = np.abs(sent(MIRROR_STATE, "actuators", ACTUATORS)).max(axis=1)
+        np.testing.assert_array_equal(found["mirror_stroke_nm"], stroke_nm)
+        assert found["time_utc"][2] == np.datetime64(TIMES_NS[2], "ns")
+        np.testing.assert_array_equal(found["calibration_reference"].ravel(), CALIBRATED.reference)
+        np.testing.assert_array_equal(found["calibration_response_per_nm"][1].ravel(), CALIBRATED.response[:, 1])
+        assert found["calibration_id"] == CALIBRATED.id
+        assert json.loads(str(found["metadata_json"]))["lowfc"] == METADATA["lowfc"]
+    np.testing.assert_array_equal(np.load(tmp_path / "out.frames.npy", mmap_mode="r"), FRAMES)
+
+
+def test_fits(log: Path, tmp_path: Path) -> None:
+    export_log(log, Format.FITS, tmp_path / "out.fits", frames=True, console=QUIET)
+    with fits.open(tmp_path / "out.fits", checksum=True) as units:
+        units.verify("exception")
+        assert units[0].header["RATE"] == 1000
+        assert "lowfc: run = night" in list(units[0].header["COMMENT"])
+        np.testing.assert_array_equal(units["FRAMES"].data, FRAMES)
+        np.testing.assert_array_equal(units["FRAME_TIMES"].data["sequence"], SEQUENCES)
+        np.testing.assert_array_equal(units["FRAME_TIMES"].data["time_ns"], TIMES_NS)
+        assert units["RECONSTRUCTOR_NM"].header["BUNIT"] == "nm"
+        np.testing.assert_array_equal(units["RECONSTRUCTOR_NM"].data[2].ravel(), CALIBRATED.reconstructor[2])
+    table = Table.read(tmp_path / "out.fits", hdu="STEPS", mask_invalid=False)
+    units_of = {name: str(table[name].unit or "") for name in ("error_nm", "time_ns", "compute_us", "flux_dn")}
+    assert units_of == {"error_nm": "nm", "time_ns": "ns", "compute_us": "us", "flux_dn": "adu"}
+    np.testing.assert_array_equal(table["sequence"], SEQUENCES)
+    np.testing.assert_array_equal(table["error_nm"], sent(STEP, "error_nm"))
+    np.testing.assert_array_equal(table["flux_dn"], np.float32([one.flux_dn for one in STEPS_SENT]))  # type: ignore[attr-defined]
+    assert table["reasons"][REFUSED].strip() == "dark"
+    assert table["time_utc"][1] == f"{np.datetime64(TIMES_NS[1], 'ns')}"
+
+
+def test_aot(log: Path, tmp_path: Path) -> None:
+    path = tmp_path / "out.aot.fits"
+    export_log(log, Format.AOT, path, frames=True, console=QUIET)
+    system = aotpy.AOSystem.read_from_file(path, exception_level=AOTFITSErrorLevel.WARNING)
+    (loop,) = system.loops
+    sensor, mirror = loop.input_sensor, loop.commanded_corrector
+    calibration, good = CALIBRATED, GOOD
+
+    def check(found: aotpy.Image, unit: str | None, expected: npt.ArrayLike) -> None:
+        assert found.unit == unit
+        assert found.data.shape == np.shape(expected)
+        np.testing.assert_array_equal(found.data, expected)
+
+    commands_nm = sent(COMMAND, "actuators", ACTUATORS)
+    assert np.flatnonzero(np.isnan(commands_nm[:, 0])).tolist() == [UNSENT]
+    check(loop.modal_coefficients, "nm", sent(STEP, "error_nm"))
+    check(loop.commands, "m", commands_nm * np.float32(1e-9))
+    check(loop.measurements_to_modes, "nm", calibration.reconstructor[:, None, good])
+    check(loop.modes_to_measurements, "nm-1", calibration.response[good][:, None])
+    check(loop.modes_to_commands, "m nm-1", calibration.modes_to_actuators * np.float32(1e-9))
+    check(loop.time_filter_num, None, np.array([[0.4], [0.4], [0.2]], np.float32))
+    check(loop.time_filter_den, None, [[-1, 1]] * 3)
+    assert loop.modes.data.shape == (MODES, 64, 64)
+    inside = np.abs(loop.modes.data).sum(axis=0) > 0
+    products = np.einsum("iyx,jyx->ij", loop.modes.data, loop.modes.data) / inside.sum()
+    np.testing.assert_allclose(products, np.eye(MODES), atol=0.02)
+    np.testing.assert_allclose(loop.time.timestamps, np.array(TIMES_NS) / 1e9, rtol=0, atol=1e-6)
+    assert list(loop.time.frame_numbers) == [count_of(one) for one in SEQUENCES]
+    assert loop.modal_coefficients.time is loop.commands.time is loop.time
+    assert (loop.closed, loop.framerate, loop.delay) == (True, 1000, 1.25)
+
+    check(sensor.detector.pixel_intensities, "adu", FRAMES)
+    check(sensor.detector.dark, "adu", calibration.dark.reshape(toy.SHAPE))
+    check(sensor.ref_measurements, None, calibration.reference[None, good])
+    assert sensor.n_valid_subapertures == good.sum() == (sensor.subaperture_mask.data >= 0).sum()
+    assert sensor.wavelength == pytest.approx(calibration.wavelength_nm * 1e-9)
+    assert mirror.uid == "dm"
+    assert mirror.n_valid_actuators == len(mirror.actuator_coordinates) == ACTUATORS
+    across = [coordinate.x for coordinate in mirror.actuator_coordinates[: toy.GRID[1]]]
+    np.testing.assert_allclose(np.diff(across), 2.0 / 31.0)
+    assert system.main_telescope.enclosing_diameter == 2.0
+    told = {one.key: one.value for one in system.metadata}
+    assert (told["CALID"], told["RUN"], told["EPERADU"]) == (calibration.id, "night", 1.0)
+    assert json.loads(system.config) == Configuration().model_dump()
+
+
+@pytest.mark.parametrize("to", list(Format))
+def test_a_truncated_log_without_truth(tmp_path: Path, to: Format) -> None:
+    part = written(tmp_path / "cut.mcap", TRUTH, finish=False)
+    part.write_bytes(part.read_bytes()[:-2000])
+    figures = export_log(part, to, console=QUIET)
+    assert figures["files"] == [str(tmp_path / f"cut.{'aot.fits' if to is Format.AOT else to}")]
+    assert 0 < figures["steps"] < STEPS
+    assert not figures["finished"]
+    assert "truncated" in render(figures)
+    if to is Format.CSV:
+        heading = (tmp_path / "cut.csv").read_text().splitlines()[0]
+        assert "error_z2_nm" in heading
+        assert "true" not in heading
+
+
+@pytest.mark.parametrize("to", list(Format))
+def test_no_steps(tmp_path: Path, to: Format) -> None:
+    empty = written(tmp_path / "empty.mcap", STEP)
+    with pytest.raises(DataFileError, match="no steps"):
+        export_log(empty, to, console=QUIET)
+    assert list(tmp_path.iterdir()) == [empty]
+
+
+@pytest.mark.parametrize("to", [Format.NPZ, Format.FITS, Format.AOT])
+@pytest.mark.parametrize("odd", [True, False])
+def test_half_a_file_is_never_left(tmp_path: Path, to: Format, odd: bool) -> None:
+    """Frames of several sizes, or none at all."""
+    night = a_night()
+    place = max(number for number, one in enumerate(night.samples) if one.key == FRAME.key)
+    small = image(np.zeros((3, 3), np.uint16), 0, "sensor").SerializeToString()
+    night.samples[place] = night.samples[place]._replace(payload=small)
+    night.samples = [one for one in night.samples if odd or one.key != FRAME.key]
+    path = night.write(tmp_path / "odd.mcap")
+    with pytest.raises(DataFileError, match="export without --frames"):
+        export_log(path, to, frames=True, console=QUIET)
+    assert list(tmp_path.iterdir()) == [path]
+
+
+def test_mistakes(log: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    with pytest.raises(ConfigurationError, match="no place for frames"):
+        export_log(log, Format.CSV, frames=True, console=QUIET)
+    with pytest.raises(DataFileError, match="cannot be written"):
+        export_log(log, Format.CSV, tmp_path / "nowhere" / "out.csv", console=QUIET)
+    monkeypatch.setitem(sys.modules, "aotpy", None)
+    monkeypatch.delitem(sys.modules, "lowfc.programs.logs.export.aot", raising=False)
+    with pytest.raises(ConfigurationError, match=r"pip install .*\[aot\]'"):
+        export_log(log, Format.AOT, console=QUIET)
+
+
+def command(*words: object) -> Any:
+    app = new_app("Test.")
+    app.command()(export)
+    return CliRunner().invoke(app, list(map(str, words)))
+
+
+def test_nothing_is_replaced_unless_forced(log: Path, tmp_path: Path) -> None:
+    out = tmp_path / "out.csv"
+    out.write_text("mine")
+    with pytest.raises(DataFileError, match="--force"):
+        export_log(log, Format.CSV, out, console=QUIET)
+    assert out.read_text() == "mine"
+    done = command(log, "--to", "csv", "--out", out, "--force", "--json")
+    assert done.exit_code == 0
+    assert json.loads(done.stdout)["steps"] == STEPS
+    assert out.read_text().startswith("sequence,")
+
+
+@pytest.mark.parametrize("name", ["night.mcap", "other.mcap", "torn.mcap", "linked.csv", "out.frames.npy"])
+def test_a_log_is_not_replaced_even_if_forced(log: Path, tmp_path: Path, name: str) -> None:
+    content = log.read_bytes()
+    source, torn = tmp_path / "night.mcap", tmp_path / "torn.mcap"
+    for path in (source, tmp_path / "other.mcap", tmp_path / "out.frames.npy"):
+        path.write_bytes(content)
+    (tmp_path / "linked.csv").symlink_to(source)
+    torn.write_bytes(b"?" + content[1:])
+    before = (tmp_path / name).read_bytes()
+    frames = name.endswith(".npy")
+    with pytest.raises(DataFileError, match="never overwritten"):
+        export_log(
+            torn if name == torn.name else source,
+            Format.NPZ if frames else Format.CSV,
+            tmp_path / ("out.npz" if frames else name),
+            frames=frames,
+            force=True,
+            console=QUIET,
+        )
+    assert (tmp_path / name).read_bytes() == before
+
+
+@pytest.mark.parametrize("to", [Format.NPZ, Format.FITS])  # with aot they are copied as with fits
+def test_frames_are_not_held_in_memory(tmp_path: Path, to: Format) -> None:
+    frames, shape = 90, (200, 200)
+    night = a_night()
+    night.samples = [one for one in night.samples if one.key not in (FRAME.key, TIMING.key)]
+    for number in range(frames):
+        noise = np.random.default_rng(number).integers(0, 65536, shape, dtype=np.uint16)
+        night.put(FRAME, image(noise, number, "sensor"))
+    big = night.write(tmp_path / "big.mcap")
+    size = frames * shape[0] * shape[1] * 2
+    export_log(big, to, tmp_path / "warm.out", console=QUIET)  # imports
+    tracemalloc.start()
+    try:
+        figures = export_log(big, to, tmp_path / "out.out", frames=True, console=QUIET)
+        _, peak = tracemalloc.get_traced_memory()
+    finally:
+        tracemalloc.stop()
+    assert figures["frames"] == frames
+    assert sum(Path(file).stat().st_size for file in figures["files"]) > size
+    assert peak < size / 2

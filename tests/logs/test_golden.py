@@ -1,0 +1,178 @@
+"""What released versions wrote stays readable, and a replay of their logs is identical."""
+
+import json
+import tomllib
+from pathlib import Path
+from typing import Any
+
+import pytest
+from google.protobuf.descriptor_pb2 import FileDescriptorSet
+from typer.testing import CliRunner
+
+from lowfc.adapters.files import calibration_file, factory, law_file
+from lowfc.adapters.logs.history import read_history
+from lowfc.adapters.logs.reader import LogReader
+from lowfc.contract import configuration, former_names
+from lowfc.contract.errors import ConfigurationError, LowfcError
+from lowfc.control.loop.advance import advance
+from lowfc.control.loop.inputs import Load, Request
+from lowfc.control.loop.state import State
+from lowfc.programs.cli.main import app
+
+pytestmark = pytest.mark.exclusive
+
+WIRE = Path(__file__).parents[2] / "lowfc" / "contract" / "wire"
+FOLDER = Path(__file__).parents[1] / "golden" / "0.1"
+FORMER_KEY = next(old for old, new in former_names.KEYS.items() if new.endswith("frame_timeout_ms")).partition(".")[2]
+NIGHT, KILLED = FOLDER / "night.mcap", FOLDER / "killed.mcap"
+CALIBRATION_ID = "88418bc31223bb21a6b588e0b43a360fda6133511792fa03b8c6af46764afa20"
+LAW_ID = "15560553d408bce3394be8a5123a916a091b94f0a6f0d423cc89d546b4e967f3"
+
+
+def asked(*words: object, status: int = 0) -> dict[str, Any]:
+    done = CliRunner().invoke(app, [*map(str, words), "--json"])
+    assert done.exit_code == status, (done.output, done.exception)
+    found: dict[str, Any] = json.loads(done.stdout)
+    return found
+
+
+@pytest.mark.parametrize(("log", "frames"), [(NIGHT, 163), (KILLED, 18)])
+def test_a_replay_is_identical(log: Path, frames: int) -> None:
+    # Another processor's linear algebra rounds otherwise; the tolerance is nothing where it is the same.
+    figures = asked("replay", log, "--tolerance", 1e-3)
+    assert (figures["frames"], figures["different"], figures["unchecked"]) == (frames, 0, 0)
+    if not {"blas", "cpu_features", "numpy"} & figures["host_differs"].keys():
+        assert (figures["identical"], figures["largest_difference_nm"]) == (True, 0.0)
+
+
+def test_rules_that_changed_on_purpose_are_said_and_counted() -> None:
+    figures = asked("replay", NIGHT, "--tolerance", 1e-3)
+    assert sorted(figures["rules_changed"].values()) == [1, 1]
+    assert {rule.split()[0] for rule in figures["rules_changed"]} == {"the", "clear"}
+    assert "rules_changed" in asked("replay", KILLED, "--tolerance", 1e-3)
+
+
+@pytest.mark.parametrize("log", [NIGHT, KILLED])
+@pytest.mark.parametrize("command", ["info", "report"])
+def test_readers_of_logs(command: str, log: Path, tmp_path: Path) -> None:
+    out = ["--out", tmp_path / "page.html"] if command == "report" else []
+    assert asked(command, log, *out)
+
+
+@pytest.mark.parametrize("form", ["csv", "npz", "fits", "aot"])
+def test_exports(form: str, tmp_path: Path) -> None:
+    assert asked("export", NIGHT, "--to", form, "--out", tmp_path / f"night.{form}")
+
+
+def test_what_if_another_gain() -> None:
+    assert asked("what-if", NIGHT, "--set", "gain=0.3")["frames"] > 20
+
+
+def test_a_killed_recorders_log_is_recovered_and_replays_as_before(tmp_path: Path) -> None:
+    path = tmp_path / KILLED.name
+    path.write_bytes(KILLED.read_bytes())
+    assert asked("recover", path)
+    recovered = tmp_path / "killed-recovered.mcap"
+    assert asked("replay", recovered, "--tolerance", 1e-3)["frames"] == 18
+
+
+def test_it_is_looked_at(tmp_path: Path) -> None:
+    out = tmp_path / "night.rrd"
+    done = CliRunner().invoke(app, ["view", str(NIGHT), "--save", str(out)])
+    assert done.exit_code == 0, (done.output, done.exception)
+    assert out.stat().st_size > 100_000
+
+
+@pytest.mark.parametrize(
+    ("words", "sentence"),
+    [(["tune", NIGHT], "a law is tuned from at least"), (["acceptance", "linearity", NIGHT], "no `lowfc acceptance")],
+)
+def test_what_the_log_is_too_short_for_is_said(words: list[object], sentence: str, tmp_path: Path) -> None:
+    done = CliRunner().invoke(
+        app, [*map(str, words), *(["--out", str(tmp_path / "law")] if words[0] == "tune" else [])]
+    )
+    assert isinstance(done.exception, LowfcError)
+    assert sentence in str(done.exception)
+
+
+def test_the_log_has_every_kind_of_input() -> None:
+    history = read_history(LogReader(NIGHT, skip_damaged=True))
+    names = {request.name for request in history.requests}
+    assert {"law", "channel", "play", "offset", "load", "safe", "clear", "step", "reset", "note"} <= names
+    assert any(not request.accepted for request in history.requests)
+    assert any(state.HasField("law") for state in history.controllers)
+    assert any(state.HasField("play") for state in history.controllers)
+
+
+def test_identities_are_what_they_were() -> None:
+    assert calibration_file.load(FOLDER / "calibration.fits").identity() == CALIBRATION_ID
+    assert law_file.load(FOLDER / "law.fits").id == LAW_ID
+
+
+def test_a_former_message_is_todays() -> None:
+    """No field of 0.1 has changed its number, type or label, and none its name but those in the table."""
+    former, now = (fields_of(path) for path in (FOLDER / "lowfc.desc", WIRE / "lowfc.desc"))
+    renamed = {
+        (message, number): (kind, label, former_names.FIELDS.get(f"{message}.{name}", name))
+        for (message, number), (kind, label, name) in former.items()
+    }
+    assert {key: now.get(key) for key in renamed} == renamed
+    names = {f"{message}.{name}" for (message, _), (_, _, name) in former.items()}
+    assert former_names.FIELDS.keys() <= names, "the table has a name that 0.1 had not"
+
+
+def test_a_former_value_of_an_enumeration_is_todays() -> None:
+    former, now = (values_of(path) for path in (FOLDER / "lowfc.desc", WIRE / "lowfc.desc"))
+    renamed = {key: former_names.VALUES.get(name, name) for key, name in former.items()}
+    assert {key: now.get(key) for key in renamed} == renamed
+
+
+def test_former_keys_of_a_configuration_are_warned_of() -> None:
+    remarks: list[str] = []
+    config = configuration.load(FOLDER / "lowfc.toml", remark=remarks.append)
+    former = tomllib.loads((FOLDER / "lowfc.toml").read_text())
+    assert config.control.frame_timeout_ms == former["control"][FORMER_KEY]
+    assert any(f"control.{FORMER_KEY} is now called control.frame_timeout_ms" in remark for remark in remarks)
+    assert set(former_names.KEYS.values()) <= set(configuration.keys())
+
+
+def test_a_key_under_both_names_is_refused(tmp_path: Path) -> None:
+    path = tmp_path / "lowfc.toml"
+    path.write_text(f"[control]\n{FORMER_KEY} = 50\nframe_timeout_ms = 60\n")
+    with pytest.raises(ConfigurationError, match=r"former name of control\.frame_timeout_ms, and both are there"):
+        configuration.load(path)
+
+
+def values_of(path: Path) -> dict[tuple[str, int], str]:
+    """Name of each value, by enumeration and number."""
+    return {
+        (enum.name, value.number): value.name
+        for file in FileDescriptorSet.FromString(path.read_bytes()).file
+        if file.package == "lowfc.v1"
+        for enum in file.enum_type
+        for value in enum.value
+    }
+
+
+def fields_of(path: Path) -> dict[tuple[str, int], tuple[int, int, str]]:
+    """Type, label and name of each field, by message and number."""
+    return {
+        (message.name, field.number): (field.type, field.label, field.name)
+        for file in FileDescriptorSet.FromString(path.read_bytes()).file
+        if file.package == "lowfc.v1"
+        for message in file.message_type
+        for field in message.field
+    }
+
+
+def test_a_calibration_and_a_law_of_0_1_are_taken_by_a_loop() -> None:
+    config = configuration.load(FOLDER / "lowfc.toml")
+    settings = factory.settings(config)
+    state, _ = advance(settings, State(), Load(0, calibration_file.load(FOLDER / "calibration.fits"), "golden"))
+    _, outputs = advance(settings, state, Request(0, "law", law=law_file.load(FOLDER / "law.fits")))
+    assert outputs.reply is not None
+    assert outputs.reply.accepted, outputs.reply.text
+
+
+def test_a_configuration_is_read() -> None:
+    assert configuration.load(FOLDER / "lowfc.toml").sensor.modes == 2

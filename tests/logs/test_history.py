@@ -1,0 +1,109 @@
+"""A history of a log whose values protobuf allows, and nobody of the loop would send."""
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from lowfc.adapters.logs.history import History, read_history
+from lowfc.adapters.logs.reader import LogReader
+from lowfc.contract.messages import EVENT, MIRROR_STATE, STEP, TIMING, TRUTH, Message, Topic, wire
+from tests.support.report_log import Night
+
+STEPS = 20
+
+
+def changed(night: Night, topic: Topic, change: Callable[[Any], object]) -> None:
+    """Change one message of a topic, the tenth from the end."""
+    number = [place for place, sample in enumerate(night.samples) if topic.matches(sample.key)][-10]
+    sample = night.samples[number]
+    message: Message = topic.message.FromString(sample.payload)
+    change(message)
+    night.samples[number] = sample._replace(payload=message.SerializeToString())
+
+
+def history_of(night: Night, path: Path) -> History:
+    return read_history(LogReader(night.write(path)))
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [
+        ("mode", [300]),
+        ("mode", [-1]),
+        ("reasons", [70]),
+        ("reasons", [-1]),
+        ("reasons", [2**31 - 1]),
+        ("timestamp", [10**12]),
+        ("timestamp", [-(10**12)]),
+        ("error_nm", [1.0]),
+        ("pol_nm", [1.0] * 5),
+    ],
+)
+def test_an_impossible_step_is_left_out_whole(tmp_path: Path, name: str, value: list[int]) -> None:
+    def change(step: Any) -> None:
+        if name == "mode":
+            step.mode = value[0]
+        elif name == "timestamp":
+            step.timestamp.seconds = value[0]
+        else:
+            del getattr(step, name)[:]
+            getattr(step, name).extend(value)
+
+    night = Night()
+    night.frames(STEPS)
+    changed(night, STEP, change)
+    steps = (history := history_of(night, tmp_path / "x.mcap")).steps
+    assert history.left_out == 1
+    assert len(steps.sequence) == STEPS - 1
+    assert {len(getattr(steps, column)) for column in steps.__slots__} == {STEPS - 1}
+    assert np.isfinite(steps.error_nm).all()
+    assert len(history.truths.sequence) == len(history.mirror.sequence) == STEPS
+
+
+def test_a_reason_given_twice_is_one_bit(tmp_path: Path) -> None:
+    night = Night()
+    night.frames(STEPS)
+    changed(night, STEP, lambda step: step.reasons.extend([62, 62, 5]))
+    history = history_of(night, tmp_path / "x.mcap")
+    assert history.left_out == 0
+    assert history.steps.reasons.max() == 1 << 62 | 1 << 5
+
+
+@pytest.mark.parametrize(
+    ("topic", "change"),
+    [
+        (MIRROR_STATE, lambda state: state.limits_hit.append(70)),
+        (MIRROR_STATE, lambda state: state.limits_hit.append(-3)),
+        (TRUTH, lambda truth: truth.residual_nm.append(1.0)),
+        (TIMING, lambda timing: timing.compute_ns.append(1)),
+        (TIMING, lambda timing: timing.ClearField("frame_sequence")),
+    ],
+)
+def test_an_impossible_message_leaves_no_column_longer(
+    tmp_path: Path, topic: Topic, change: Callable[[Any], object]
+) -> None:
+    night = Night()
+    night.frames(STEPS)
+    before = history_of(night, tmp_path / "before.mcap")
+    changed(night, topic, change)
+    history = history_of(night, tmp_path / "x.mcap")
+    for kind, name in ((MIRROR_STATE, "mirror"), (TRUTH, "truths")):
+        had, columns = len(getattr(before, name).sequence), getattr(history, name)
+        extremes = ("highest_nm", "lowest_nm")
+        lengths = {len(getattr(columns, column)) for column in columns.__slots__ if column not in extremes}
+        assert lengths == {had - (kind is topic)}
+    assert {len(stage) for stage in history.stages_ns.values()} == {len(history.timed_sequence)}
+    assert len(history.timed_sequence) == STEPS - (topic is TIMING)
+    assert len(history.steps.sequence) == STEPS
+
+
+def test_a_time_that_no_clock_has_is_left_out(tmp_path: Path) -> None:
+    night = Night()
+    night.frames(STEPS)
+    night.put(EVENT, wire.Tick(), late_ns=(1 << 63) - night.now_ns)
+    history = history_of(night, tmp_path / "x.mcap")
+    assert history.left_out == 1
+    assert history.span_ns[1] < 1 << 62

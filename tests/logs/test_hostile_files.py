@@ -1,0 +1,193 @@
+"""Files made to harm: whatever is named on a command line or in a configuration, it ends with one sentence."""
+
+import os
+import struct
+import zipfile
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from lowfc.adapters.files import calibration_file, law_file
+from lowfc.adapters.files.array_file import read_array
+from lowfc.adapters.files.layouts import load_layout
+from lowfc.adapters.files.sensors import load_pupil
+from lowfc.adapters.logs.reader import LogReader
+from lowfc.contract.codecs import input_file
+from lowfc.contract.configuration import MOST_FAULTS, load
+from lowfc.contract.errors import ConfigurationError, DataFileError, LowfcError
+from lowfc.programs.core.start_up import check_files
+from lowfc.programs.design.sam_files import read_state
+from lowfc.programs.logs.replay.workers import replay_files
+
+pytestmark = pytest.mark.exclusive
+
+LONGEST = 500
+"""Characters of a sentence."""
+
+
+def sentence(call: Callable[[], object]) -> str:
+    with pytest.raises(LowfcError) as caught:
+        call()
+    said = str(caught.value)
+    assert len(said) < LONGEST + len(str(Path.cwd()))
+    assert said.isprintable(), "it has one line"
+    return said
+
+
+@pytest.mark.parametrize(
+    ("content", "expected"),
+    [
+        (b"seed = " + b"[" * 100_000, "nested too deeply"),
+        (b"seed = " + b"{a=" * 100_000, "nested too deeply"),
+        (b"seed = " + b"9" * 100_000, "a number in it has too many digits"),
+        (b"seed = 0x" + b"f" * 100_000, "seed = a number of too many digits: Input should be less than"),
+        (b".".join([b"a"] * 200_000) + b" = 1", "line 1 has more than 100 dots"),
+        (b"seed = 1\n[" + b" . ".join([b"a"] * 200_000) + b"]", "line 2 has more than 100 dots"),
+        (b"".join(b"a.b.c%d = 1\n" % number for number in range(200_000)), "larger than the 1048576 bytes"),
+        (b"".join(b"a.b.c%d = 1\n" % number for number in range(50_000)), "unknown key 'a'"),
+        (b"k" * 900_000 + b" = 1", "unknown key 'kkk"),
+        (b"[camera]\nrate_hz = '" + b"k" * 900_000 + b"'", "camera.rate_hz = 'kkk"),
+        (b"[disturbance]\npreset = {" + b".".join([b"a"] * 90) + b" = 1}", "disturbance.preset = {'a': {'a'"),
+        (b"seed = 1\n" * 2, "not a readable TOML file: Cannot overwrite a value"),
+        (b"\xff\xfe", "not a readable TOML file: 'utf-8' codec can't decode"),
+    ],
+    ids=lambda value: value if isinstance(value, str) else "",
+)
+def test_a_configuration(tmp_path: Path, content: bytes, expected: str) -> None:
+    path = tmp_path / "hostile.toml"
+    path.write_bytes(content)
+    said = sentence(lambda: load(path))
+    assert said.startswith(f"{path}: ")
+    assert expected in said
+
+
+def test_of_very_many_mistakes_the_first_are_explained(tmp_path: Path) -> None:
+    path = tmp_path / "hostile.toml"
+    path.write_text("".join(f"k{number} = 1\n" for number in range(50_000)))
+    with pytest.raises(ConfigurationError) as caught:
+        load(path)
+    lines = str(caught.value).splitlines()
+    assert (len(lines), lines[-1]) == (MOST_FAULTS + 1, f"{path}: and {50_000 - MOST_FAULTS} more")
+
+
+def test_a_line_with_many_floats_in_a_comment_or_a_list_is_no_key(tmp_path: Path) -> None:
+    path = tmp_path / "usual.toml"
+    values = ", ".join(f'"{number}" = {number}.5' for number in range(90))
+    path.write_text(f"# {'.' * 1000}\n[mirror]\nstuck_nm = {{ {values} }}\n")
+    assert load(path).mirror.stuck_nm["7"] == 7.5
+
+
+def loop_of_links(folder: Path) -> Path:
+    (folder / "a").symlink_to(folder / "b")
+    (folder / "b").symlink_to(folder / "a")
+    return folder / "a"
+
+
+def pipe(folder: Path) -> Path:
+    os.mkfifo(folder / "pipe")
+    return folder / "pipe"
+
+
+def zeros(folder: Path) -> Path:
+    return Path("/dev/zero")
+
+
+READERS: dict[str, Callable[[Path], object]] = {
+    "toml": load,
+    "json": lambda path: load_layout(str(path)),
+    "npz": lambda path: load_pupil(file=path),
+    "npy": lambda path: read_array(path, "an array", (2,)),
+    "fits": lambda path: read_array(path, "an array", (2,)),
+    "calibration.fits": calibration_file.load,
+    "law.fits": law_file.load,
+    "state.json": lambda path: read_state(path, "pupil"),
+    "mcap": lambda path: list(LogReader(path)),
+    "replay.mcap": lambda path: replay_files([path], 0.0, 1, lambda done: None),
+}
+
+
+@pytest.mark.parametrize("kind", READERS)
+@pytest.mark.parametrize(
+    ("make", "expected"),
+    [
+        (loop_of_links, "Too many levels of symbolic links"),
+        (pipe, "not a regular file"),
+        (zeros, "not a regular file"),
+        (lambda folder: folder, "not a regular file"),
+    ],
+    ids=["loop", "pipe", "device", "directory"],
+)
+def test_what_is_no_regular_file_is_never_read(
+    tmp_path: Path, kind: str, make: Callable[[Path], Path], expected: str
+) -> None:
+    path = tmp_path / f"named.{kind}"
+    path.symlink_to(make(tmp_path))
+    said = sentence(lambda: READERS[kind](path))
+    assert str(path) in said
+    assert expected in said
+
+
+def npy(header: bytes) -> bytes:
+    header += b"\n"
+    return b"\x93NUMPY\x01\x00" + struct.pack("<H", len(header)) + header + bytes(64)
+
+
+BOAST = npy(b"{'descr': '<f4', 'fortran_order': False, 'shape': (4000000, 4000000), }")
+"""An array of 58 TiB, as its header says."""
+
+
+@pytest.mark.parametrize(
+    ("content", "key"),
+    [
+        (BOAST, "mirror.flat"),
+        (BOAST, "mirror.active"),
+        (npy(b"{'descr': '<f4', 'fortran_order': False, 'shape': " + b"(" * 9000 + b"}"), "mirror.flat"),
+        (npy(b"(" * 9000 + b")" * 9000), "mirror.flat"),
+    ],
+)
+def test_an_array_that_is_not_there(tmp_path: Path, content: bytes, key: str) -> None:
+    path = tmp_path / "hostile.npy"
+    path.write_bytes(content)
+    said = sentence(lambda: check_files(load(None, {key: str(path)})))
+    assert said.startswith(f"{key}: {path}: neither a FITS image nor a numpy array")
+
+
+def test_fits_images_and_pupils_that_boast(tmp_path: Path) -> None:
+    cards = ("SIMPLE  = T", "BITPIX  = -32", "NAXIS   = 2", "NAXIS1  = 4000000", "NAXIS2  = 4000000", "END")
+    fields = (card.partition(" = ") for card in cards)
+    header = "".join(f"{name}{equals}{value:>20}".ljust(80) for name, equals, value in fields)
+    fits, npz = tmp_path / "hostile.fits", tmp_path / "hostile.npz"
+    fits.write_bytes(header.ljust(2880).encode() + bytes(2880))
+    with zipfile.ZipFile(npz, "w") as archive:
+        archive.writestr("quarter.npy", BOAST)
+    for path, key in ((fits, "mirror.flat"), (fits, "control.law"), (npz, "sensor.pupil")):
+        assert str(path) in sentence(lambda path=path, key=key: check_files(load(None, {key: str(path)})))
+
+
+@pytest.mark.parametrize("content", [b"[" * 100_000, b'{"holes": ' + b"[" * 900 + b"]" * 900 + b"}", b"9" * 100_000])
+def test_a_layout(tmp_path: Path, content: bytes) -> None:
+    path = tmp_path / "hostile.json"
+    path.write_bytes(content)
+    assert str(path) in sentence(lambda: load_layout(str(path)))
+    assert str(path) in sentence(lambda: read_state(path, "pupil"))
+
+
+def test_a_file_is_read_whole_up_to_its_largest_size(tmp_path: Path) -> None:
+    path = tmp_path / "file"
+    path.write_bytes(b"12345")
+    assert input_file.read_whole(path, 5) == b"12345"
+    with pytest.raises(OSError, match="larger than the 4 bytes"):
+        input_file.read_whole(path, 4)
+    with pytest.raises(OSError, match="larger than the 4 bytes"):  # it says that it is empty
+        input_file.read_whole(Path("/proc/self/status"), 4)
+    before = set(Path("/proc/self/fd").iterdir())
+    with pytest.raises(OSError, match="not a regular file"):
+        input_file.opened(tmp_path, 5)
+    assert set(Path("/proc/self/fd").iterdir()) == before
+
+
+def test_a_missing_file_is_still_said_to_be_missing(tmp_path: Path) -> None:
+    for kind in ("calibration.fits", "law.fits", "npy", "fits"):
+        with pytest.raises(DataFileError, match="there is no such "):
+            READERS[kind](tmp_path / f"none.{kind}")

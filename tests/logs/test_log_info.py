@@ -1,0 +1,153 @@
+"""`lowfc info`: what it says of a log is what was written into it."""
+
+import json
+from pathlib import Path
+
+import pytest
+from click.testing import Result
+from typer.testing import CliRunner
+
+from lowfc.adapters.bus.bus import Sample
+from lowfc.adapters.logs.recovery import recover
+from lowfc.adapters.logs.writer import Attachment, LogWriter
+from lowfc.contract.envelope import sequence_of
+from lowfc.contract.events import EVENTS
+from lowfc.contract.messages import CALIBRATION, CONTROLLER_STATE, EVENT, FRAME, HEALTH, STEP, Message, wire
+from lowfc.programs.cli.main import app
+
+START_S = 1_767_225_600  # 2026-01-01T00:00:00Z
+START_NS = START_S * 10**9
+SECOND = 10**9
+
+
+def sample(key: str, message: Message, count: int, time_ns: int, start_s: int = START_S) -> Sample:
+    return Sample(key, message.SerializeToString(), sequence_of(start_s, count), time_ns, time_ns)
+
+
+def event(name: str, process: str, start_s: int, number: int, **details: object) -> Sample:
+    now_ns = START_NS + 2 * SECOND
+    return sample(EVENT.key, EVENTS[name].log(process, now_ns, **details), number, now_ns, start_s)
+
+
+def lowfc(*words: object) -> Result:
+    return CliRunner().invoke(app, ["info", *map(str, words)])
+
+
+@pytest.fixture
+def log(tmp_path: Path) -> Path:
+    """Ten seconds: a camera that restarts, frames 5 to 7 and the last step lost, two processes with events."""
+    writer = LogWriter(
+        tmp_path / "night.mcap",
+        START_NS,
+        {"lowfc": {"lowfc": "0.1.0", "host": "bench", "run": "night", "seed": "3"}},
+        [Attachment("config.toml", "application/toml", b"[loop]\n")],
+    )
+    writer.write(sample(CALIBRATION.key, wire.Calibration(id="c1"), 0, START_NS - 3600 * SECOND))  # asked for
+    frames = [n for n in range(50) if n not in (5, 6, 7)]
+    for number in range(101):
+        now_ns = START_NS + number * SECOND // 10
+        restarted = number > 50
+        count = number - 51 if restarted else number
+        if count in frames:
+            writer.write(sample(FRAME.key, wire.Health(process="x" * 1000), count, now_ns, START_S + 5 * restarted))
+        if number < 100:
+            writer.write(sample(STEP.key, wire.ControlStep(), number, now_ns))
+    for count, mode in enumerate((wire.LOOP_MODE_OPEN, wire.LOOP_MODE_CLOSED, wire.LOOP_MODE_CLOSED)):
+        state = wire.ControllerState(mode=mode)
+        writer.write(sample(CONTROLLER_STATE.key, state, count, START_NS + (count + 1) * SECOND))
+    writer.write(event("CAMERA_RESTARTED", "controller", START_S + 1, 0))
+    writer.write(event("CAMERA_RESTARTED", "controller", START_S + 1, 1))
+    writer.write(event("RECORDING", "recorder", START_S, 0))
+    writer.write(event("MESSAGES_LOST", "recorder", START_S, 1, count=3, topic="lowfc/camera/frame"))
+    last = wire.Health(process="controller", state="stopped", topics=[wire.TopicCount(topic=STEP.key, published=101)])
+    writer.write(sample(HEALTH.at("controller"), last, 0, START_NS + 10 * SECOND))
+    return writer.finish({"recording": {"messages": str(writer.messages), "messages_lost": "4"}})
+
+
+def test_what_was_written_is_said(log: Path) -> None:
+    done = lowfc(log, "--json")
+    assert done.exit_code == 0, done.output
+    found = json.loads(done.stdout)
+    frame = found["topics"].pop(FRAME.key)
+    assert not any(line["restarts"] for line in found["topics"].values()), "starts of one publisher"
+    assert {key: line["messages"] for key, line in found.pop("topics").items()} == {
+        CALIBRATION.key: 1,
+        CONTROLLER_STATE.key: 3,
+        STEP.key: 100,
+        EVENT.key: 4,
+        HEALTH.at("controller"): 1,
+    }
+    assert frame.pop("bytes") > 94_000
+    assert frame == {
+        "messages": 94,
+        "rate_hz": round(93 / 10.0, 3),
+        "restarts": 1,
+        "missing": 6,
+        "schema": "foxglove.RawImage",
+    }
+    assert found == {
+        "log": str(log),
+        "files": [str(log)],
+        "lockstep": False,
+        "selection": "",
+        "bytes": log.stat().st_size,
+        "state": "complete",
+        "start": "2026-01-01T00:00:00.000+00:00",
+        "duration_s": 10.0,
+        "messages": 203,
+        "messages_missing": 7,
+        "missing_topics": {},
+        "loop_modes": ["open", "closed"],
+        "events": {"CAMERA_RESTARTED": 2, "MESSAGES_LOST": 1},
+        "unreadable": 0,
+        "damage": [],
+        "metadata": {
+            "lowfc": {"lowfc": "0.1.0", "host": "bench", "run": "night", "seed": "3"},
+            "recording": {"messages": "203", "messages_lost": "4"},
+        },
+        "attachments": {"config.toml": 7},
+        "remarks": [f"{log}: its config.toml: unknown key 'loop'; the nearest known one is 'lockstep'; it is ignored"],
+    }
+
+
+def test_a_person_reads_the_same(log: Path) -> None:
+    said = lowfc(log).stdout
+    for words in (
+        "complete",
+        "2026-01-01T00:00:00.000+00:00, 10.000 s",
+        "203; 7 missing by their counts, the recorder says that it lost 4",
+        "open, closed",
+        "CAMERA_RESTARTED 2, MESSAGES_LOST 1",
+        "config.toml (7 bytes)",
+        "lowfc 0.1.0, host bench, run night, seed 3",
+    ):
+        assert words in said
+    line = next(line.split() for line in said.splitlines() if line.startswith(FRAME.key))
+    assert line[1:] == ["94", "9.3", "0.09", "1", "6", "foxglove.RawImage"]
+
+
+def test_an_unfinished_and_a_damaged_log_say_so(log: Path) -> None:
+    data = bytearray(log.read_bytes())
+    log.write_bytes(data[:-500])
+    recover(log, recovered := log.with_name("recovered.mcap"))
+    said = lowfc(recovered).stdout
+    assert "recovered from night.mcap, which had not been finished; left out: damaged parts 0" in said
+    said = lowfc(log)
+    assert said.exit_code == 0
+    assert "truncated" in said.stdout
+    assert json.loads(lowfc(log, "--json").stdout)["state"] == "truncated"
+    data[data.index(b"[loop]")] ^= 1
+    log.write_bytes(data)
+    said = lowfc(log)
+    assert said.exit_code == 0
+    assert "damaged; `lowfc recover` saves what is whole" in said.stdout
+    assert "the checksum of an attachment is wrong" in said.stdout
+    found = json.loads(lowfc(log, "--json").stdout)
+    assert (found["state"], len(found["damage"]), found["attachments"]) == ("damaged", 1, {})
+
+
+def test_an_empty_log_is_a_log(tmp_path: Path) -> None:
+    path = LogWriter(tmp_path / "a.mcap", START_NS, {}).finish({"recording": {"stopped": "the disk is full"}})
+    assert "recording stopped: the disk is full" in lowfc(path).stdout
+    found = json.loads(lowfc(path, "--json").stdout)
+    assert (found["start"], found["duration_s"], found["messages"], found["state"]) == (None, None, 0, "complete")

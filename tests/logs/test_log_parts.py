@@ -1,0 +1,203 @@
+"""`last`, and several files of one recording as one log, in every command that reads logs."""
+
+import json
+import os
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import pytest
+from typer.testing import CliRunner
+
+from lowfc.adapters.bus.bus import Sample
+from lowfc.adapters.logs.parts import LAST, WholeLog, in_order, one_by_one, the_one
+from lowfc.adapters.logs.reader import LogReader
+from lowfc.adapters.logs.recovery import recover
+from lowfc.adapters.logs.series import STANDARD, LogSeries
+from lowfc.adapters.logs.writer import Attachment, LogWriter
+from lowfc.adapters.process.clock import HostClock
+from lowfc.contract.configuration import Configuration
+from lowfc.contract.errors import ConfigurationError, DataFileError, LowfcError
+from lowfc.contract.messages import CALIBRATION, CONTROLLER_STATE, FRAME, topic_of
+from lowfc.programs.cli.main import app
+from tests.support.report_log import METADATA, Night
+
+FRAMES = 2600
+TOML = [Attachment("config.toml", "application/toml", Configuration().to_toml().encode())]
+
+
+def recorded(folder: Path, samples: Sequence[Sample], files: int, *, finish: bool = True) -> list[Path]:
+    """What a recorder makes that begins the next file every so often, with the newest calibration and states."""
+    series = LogSeries(folder, HostClock(), METADATA, TOML, STANDARD)
+    kept: dict[str, Sample] = {}
+    for number in range(files):
+        series.begin(kept.values(), anew=not number)
+        for sample in samples[len(samples) * number // files : len(samples) * (number + 1) // files]:
+            series.write(sample)
+            if topic_of(sample.key).queryable:
+                kept[sample.key] = sample
+        if finish or number < files - 1:
+            series.end({"messages": str(len(samples)), "messages_lost": "0"})
+    if not finish:
+        series.flush()
+        series.give_up()
+    return series.files
+
+
+@pytest.fixture(scope="module")
+def samples() -> list[Sample]:
+    night = Night()
+    night.request("close")
+    night.frames(FRAMES, lost=[700, 701])
+    return night.samples
+
+
+@pytest.fixture
+def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    monkeypatch.chdir(tmp_path)
+    return Path("logs")
+
+
+def test_last_is_the_newest_log_with_all_its_files(folder: Path, samples: list[Sample]) -> None:
+    (older,) = recorded(folder, samples[:20], 1)
+    newer = recorded(folder, samples[:60], 11)  # `-2` to `-12`: not in the order of the alphabet
+    assert [older, *newer] != sorted([older, *newer])
+    Path(folder, "notes.txt").touch()
+    Path(folder, "zzz.mcap").touch()
+    assert in_order([Path(LAST)]) == newer
+    assert the_one([folder / LAST]) == tuple(newer)
+    assert in_order([*reversed(newer)]) == newer
+    assert one_by_one([newer[1], older, newer[0]]) == [(newer[0], newer[1]), (older,)]
+    with pytest.raises(ConfigurationError, match="one log"):
+        the_one([older, *newer])
+    with pytest.raises(ConfigurationError, match="same part"):
+        in_order([older, older])
+    Path(LAST).symlink_to(older)
+    assert in_order([Path(LAST)]) == [Path(LAST)]
+
+
+def test_where_there_is_no_log_it_is_said(folder: Path) -> None:
+    with pytest.raises(DataFileError, match="newest log in logs, which cannot be read: No such file"):
+        in_order([Path(LAST)])
+    folder.mkdir()
+    with pytest.raises(DataFileError, match="there is none"):
+        in_order([Path(LAST)])
+
+
+def test_a_log_of_a_killed_recorder_is_the_last_until_it_is_recovered(folder: Path, samples: list[Sample]) -> None:
+    files = recorded(folder, samples[:300], 2, finish=False)
+    assert files[1].name.endswith(".mcap.part")
+    assert in_order([Path(LAST)]) == files
+    saved = folder / files[1].name.replace(".mcap.part", "-recovered.mcap")
+    recover(files[1], saved)
+    assert in_order([Path(LAST)]) == [files[0], saved]
+
+
+def test_logs_that_do_not_say_where_they_belong_are_by_themselves(folder: Path) -> None:
+    """As those of 0.1."""
+    logs = [LogWriter(folder / f"20260101T00000{n}Z.mcap", 0, METADATA).finish({}) for n in range(3)]
+    assert one_by_one(logs) == [(log,) for log in logs]
+    assert in_order([Path(LAST)]) == logs[-1:]
+
+
+def test_the_files_of_a_log_are_read_as_one(folder: Path, samples: list[Sample]) -> None:
+    files = recorded(folder, samples, 4)
+    assert sum(len(list(LogReader(path))) for path in files) > len(samples)
+    assert next(iter(LogReader(files[3]))).key in (CALIBRATION.key, CONTROLLER_STATE.key, "lowfc/camera/state")
+    log = WholeLog(files)
+    read = list(log)
+    assert [(one.key, one.sequence) for one in read] == [(one.key, one.sequence) for one in samples]
+    assert log.complete
+    assert (log.size, log.position) == (sum(path.stat().st_size for path in files),) * 2
+    assert log.metadata["recording"]["messages"] == str(len(samples))
+    os.truncate(files[3], files[3].stat().st_size - 50)
+    log = WholeLog(files, topics=[FRAME], skip_damaged=True)
+    assert len(list(log)) == FRAMES
+    assert not log.complete
+
+
+COMMANDS = {
+    "info": ["info"],
+    "digest": ["info", "--digest"],
+    "report": ["report"],
+    "replay": ["replay", "--jobs", "1"],
+    "what-if": ["what-if", "--set", "gain=0.3"],
+    "estimator": ["what-if", "--calibration", "other.fits"],
+    "tune": ["tune", "--controller", "lqg"],
+    "export": ["export", "--to", "npz", "--frames", "--force"],
+    "decimate": ["export", "--decimate", "7"],
+    "latency": ["latency"],
+}
+OF_FILES = {
+    *("log", "logs", "file", "files", "bytes", "bytes_before", "metadata", "attachments", "speed", "runs", "source"),
+    *("remarks", "settings", "warnings"),
+}
+
+
+def without_files(figures: Any) -> Any:
+    """Figures but for those that are of files and of how long it took."""
+    if isinstance(figures, dict):
+        return {key: without_files(value) for key, value in figures.items() if key not in OF_FILES}
+    return figures
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_every_command_reads_ten_files_as_it_reads_one(folder: Path, samples: list[Sample], command: str) -> None:
+    from lowfc.adapters.files import calibration_file
+
+    calibration_file.save(Night().calibration, Path("other.fits"))
+    recorded(folder, samples[:9], 1)  # there is an older one
+    recorded(folder, samples, 10)
+    recorded(Path("one"), samples, 1)
+    figures = []
+    for log in (LAST, f"one/{LAST}"):
+        words = COMMANDS[command]
+        done = CliRunner().invoke(app, [words[0], log, *words[1:], "--json"])
+        assert done.exit_code == 0, (done.output, done.exception)
+        figures.append(without_files(json.loads(done.stdout)))
+    assert figures[0] == figures[1]
+
+
+def test_acceptance_takes_several_files(folder: Path, samples: list[Sample]) -> None:
+    """Nothing was tested in this one, which it says of the log and not of a file."""
+    files = recorded(folder, samples, 3)
+    for words in ([LAST], [str(path) for path in files]):
+        done = CliRunner().invoke(app, ["acceptance", "rejection", *words])
+        assert isinstance(done.exception, LowfcError)
+        assert "no `lowfc acceptance rejection` was carried out" in str(done.exception)
+
+
+def test_recover_takes_the_files_one_by_one(folder: Path, samples: list[Sample]) -> None:
+    files = recorded(folder, samples[:3000], 3, finish=False)
+    done = CliRunner().invoke(app, ["recover", LAST])
+    assert done.exit_code == 0, done.exception
+    assert done.stdout.count("there is nothing to recover") == 2
+    assert in_order([Path(LAST)])[:2] == files[:2]
+
+
+IN_TURN = [["info"], ["report"], ["export", "--to", "csv", "--force"], ["recover"]]
+
+
+@pytest.mark.parametrize("words", IN_TURN, ids=lambda words: words[0])
+def test_several_logs_are_taken_in_turn(folder: Path, words: list[str]) -> None:
+    (night := Night()).frames(3)
+    first, second = (str(night.write(Path(f"{name}.mcap"))) for name in "ab")
+    several = CliRunner().invoke(app, [*words, first, second])
+    alone = [CliRunner().invoke(app, [*words, log]).stdout for log in (first, second)]
+    assert several.exit_code == 0, several.exception
+    assert several.stdout.replace("\n", "") == "".join(alone).replace("\n", "")
+    for more in [["--json"], *([["--out", "c"]] if words != ["info"] else [])]:
+        done = CliRunner().invoke(app, [*words, first, second, *more])
+        assert isinstance(done.exception, ConfigurationError)
+        assert f"name one log, not 2 ({Path(first).name}, {Path(second).name})" in str(done.exception)
+
+
+@pytest.mark.parametrize("words", [*IN_TURN, ["what-if", "--set", "gain=1"]], ids=lambda words: words[0])
+def test_what_is_no_log_is_an_error(tmp_path: Path, words: list[str]) -> None:
+    (tmp_path / "text").write_text("this is not an MCAP file, by far")
+    for name, said in (("text", "is not an MCAP file"), ("gone", "cannot be read: No such file")):
+        done = CliRunner().invoke(app, [*words, str(tmp_path / name)])
+        assert isinstance(done.exception, DataFileError)
+        assert said in str(done.exception)
+        assert done.stdout == ""
+    assert [path.name for path in tmp_path.iterdir()] == ["text"]

@@ -1,0 +1,77 @@
+"""Who may read a log: its owner, and others only as `recorder.file_mode` says."""
+
+import os
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+from typer.testing import CliRunner
+
+from lowfc.adapters.logs.recovery import recover
+from lowfc.adapters.logs.series import Limits, LogSeries
+from lowfc.adapters.logs.writer import LogWriter
+from lowfc.adapters.process.clock import HostClock
+from lowfc.contract.configuration import load
+from lowfc.contract.errors import ConfigurationError
+from lowfc.programs.cli.main import app
+from lowfc.programs.core.recording.summary import Summary
+from tests.support.mutated_logs import small_log
+
+pytestmark = pytest.mark.exclusive
+
+
+@pytest.fixture(autouse=True, params=[0o000, 0o022, 0o027, 0o077])
+def umask(request: pytest.FixtureRequest) -> Iterator[int]:
+    before = os.umask(request.param)
+    yield request.param
+    os.umask(before)
+
+
+def mode_of(path: Path) -> int:
+    return path.stat().st_mode & 0o777
+
+
+def test_a_log_is_not_for_others(tmp_path: Path, umask: int) -> None:
+    log = LogWriter(tmp_path / "night.mcap", 1, {})
+    assert mode_of(log.part) == 0o640 & ~umask
+    assert mode_of(log.finish({})) == 0o640 & ~umask
+
+
+@pytest.mark.parametrize("mode", [0o600, 0o644, 0o664])
+def test_every_log_of_a_series_has_the_configured_mode(tmp_path: Path, umask: int, mode: int) -> None:
+    series = LogSeries(tmp_path / "logs", HostClock(), {}, [], Limits(min_free_bytes=0, file_mode=mode))
+    for _ in range(2):
+        series.begin([])
+        series.end({})
+    assert [mode_of(path) for path in series.files] == [mode & ~umask] * 2
+
+
+def test_what_is_recovered_has_the_mode_of_its_source(tmp_path: Path) -> None:
+    source = small_log(tmp_path / "night.mcap", finished=False)
+    for mode in (0o600, 0o640, 0o644):
+        source.chmod(mode)
+        out = tmp_path / f"{mode:o}.mcap"
+        recover(source, out)
+        assert mode_of(out) == mode
+
+
+def test_the_recorder_is_given_the_key(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    given: dict[str, Any] = {}
+
+    def record(*words: object, **options: object) -> Summary:
+        given.update(options)
+        return Summary((), 0, {}, "", 0, 0, 0)
+
+    monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
+    monkeypatch.setattr("lowfc.programs.core.recording.process.record", record)
+    (tmp_path / "lowfc.toml").write_text('[recorder]\nfile_mode = "0604"\n')
+    done = CliRunner().invoke(app, ["record", "--config", str(tmp_path / "lowfc.toml")])
+    assert done.exit_code == 0, done.output
+    assert given["limits"].file_mode == 0o604
+
+
+@pytest.mark.parametrize("mode", ["0666 ", "640", "0o640", "0440", "0641", "0x20", "", 416])
+def test_what_is_no_mode_is_refused(mode: object) -> None:
+    with pytest.raises(ConfigurationError, match=r"recorder\.file_mode = "):
+        load(None, {"recorder.file_mode": mode})

@@ -1,0 +1,192 @@
+"""`lowfc recover`: what is whole of a damaged log is a log again, for every reader there is."""
+
+import json
+from collections import Counter
+from pathlib import Path
+from typing import Any
+
+import pytest
+from click.testing import Result
+from mcap.reader import make_reader
+from mcap.records import Attachment, Channel, Metadata, Schema
+from typer.testing import CliRunner
+
+import lowfc.adapters.logs.recovery as recovery
+from lowfc.adapters.logs.reader import LogReader
+from lowfc.adapters.logs.recovery import recover, recovered_path
+from lowfc.contract.errors import DataFileError
+from lowfc.programs.cli.main import app
+from tests.support.mutated_logs import ATTACHMENTS, METADATA, identity, mutations, small_log, small_samples
+from tests.support.other_readers import foxglove, rerun
+
+RECOVERED = 120  # of the mutations
+
+
+def lowfc(*words: object) -> Result:
+    return CliRunner().invoke(app, ["recover", *map(str, words)])
+
+
+@pytest.fixture(scope="module")
+def recovered(tmp_path_factory: pytest.TempPathFactory) -> dict[Path, Counter[str]]:
+    """Logs recovered from damaged ones, and how many messages of each topic could be read of those."""
+    folder = tmp_path_factory.mktemp("recovered")
+    found = {}
+    for finished in (True, False):
+        data = small_log(folder / f"whole-{finished}.mcap", finished=finished).read_bytes()
+        for number, kind, changed in mutations(data, range(RECOVERED // 2)):
+            source = folder / f"{finished}-{number}-{kind}.mcap"
+            source.write_bytes(changed)
+            reader = LogReader(source, skip_damaged=True)
+            try:
+                counts = Counter("/" + message.key for message in reader)
+            except DataFileError:
+                with pytest.raises(DataFileError):
+                    recover(source, recovered_path(source))
+                continue
+            done = recover(source, recovered_path(source))
+            assert source.read_bytes() == changed
+            assert (done.messages, done.damage) == (counts.total(), reader.damage)
+            found[recovered_path(source)] = counts
+    assert len(found) > 0.9 * RECOVERED
+    return found
+
+
+def described(path: Path) -> tuple[list[Any], dict[tuple[str, int], tuple[Channel, Schema]]]:
+    """What describes a log, and its channels with their schemas, but for the numbers that files give them."""
+    reader = LogReader(path, skip_damaged=True)
+    assert list(reader)
+    channels = {}
+    for name, channel in reader.channels.items():
+        schema = reader.schemas[channel.schema_id]
+        channels[name] = (
+            (channel.topic, channel.message_encoding, channel.metadata),
+            (schema.name, schema.encoding, schema.data),
+        )
+    return reader.described, channels
+
+
+def test_recovered_logs_are_whole(recovered: dict[Path, Counter[str]]) -> None:
+    for path, counts in recovered.items():
+        reader = LogReader(path)
+        assert Counter("/" + message.key for message in reader) == counts
+        assert reader.complete
+        assert reader.metadata["recovery"]["messages"] == str(counts.total())
+        with path.open("rb") as file:
+            other = make_reader(file, validate_crcs=True)
+            assert Counter(channel.topic for _, channel, _ in other.iter_messages()) == counts, path.name
+            statistics = other.get_summary().statistics
+            assert statistics.message_count == counts.total()
+            assert statistics.attachment_count == len(list(other.iter_attachments()))
+
+
+@pytest.mark.node
+def test_recovered_logs_are_whole_for_the_reader_of_foxglove(recovered: dict[Path, Counter[str]]) -> None:
+    found = foxglove(recovered)
+    assert [(one["counts"], one["counted"]) for one in found] == [(c, c.total()) for c in recovered.values()]
+    assert all("recovery" in one["metadata"] for one in found)
+
+
+def test_recovered_logs_are_whole_for_rerun(recovered: dict[Path, Counter[str]]) -> None:
+    for path, counts in [one for one in recovered.items() if one[1]][::4]:
+        checked = rerun("check", path)
+        lines = [line.split() for line in rerun("info", path).splitlines()]
+        assert ["Messages", str(counts.total())] in lines
+        assert ["Summary", "embedded"] in lines
+        seen: Counter[str] = Counter()
+        for words in lines:
+            if len(words) > 2 and words[1].startswith("/"):
+                seen[words[1]] += int(words[2])
+        assert seen == counts
+        assert all(topic in checked for topic in counts)
+
+
+def test_an_unfinished_log_is_finished(tmp_path: Path) -> None:
+    part = small_log(tmp_path / "night.mcap", finished=False)
+    before = part.read_bytes()
+    done = lowfc(part, "--json")
+    assert done.exit_code == 0, done.output
+    figures = json.loads(done.stdout)
+    new = tmp_path / "night-recovered.mcap"
+    assert figures == {
+        "log": str(part),
+        "bytes": len(before),
+        "finished": False,
+        "recovered": str(new),
+        "messages": len(small_samples()),
+        "unreadable": 0,
+        "damage": [],
+    }
+    assert part.read_bytes() == before
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["night-recovered.mcap", "night.mcap.part"]
+    assert identity(list(LogReader(new))) == identity(small_samples())
+    records, channels = described(part)
+    copies, copied_channels = described(new)
+    assert copies[:-1] == records
+    assert [type(record) for record in copies] == [Metadata, Attachment, Attachment, Metadata]
+    assert copied_channels == channels
+    assert {name: record.data for name, record in zip(("lowfc.toml", "h.fits"), copies[1:3], strict=True)} == {
+        attachment.name: attachment.data for attachment in ATTACHMENTS
+    }
+    assert copies[0].metadata == METADATA["lowfc"]
+    assert new.stat().st_mode == part.stat().st_mode
+
+
+def test_what_is_left_out_is_said(tmp_path: Path) -> None:
+    path = small_log(tmp_path / "night.mcap")
+    data = bytearray(path.read_bytes())
+    middle = len(data) // 2
+    data[middle] ^= 1
+    path.write_bytes(data)
+    out = tmp_path / "else" / "saved.mcap"
+    out.parent.mkdir()
+    done = lowfc(path, "--out", out)
+    assert done.exit_code == 0, done.output
+    first, last = done.stdout.splitlines()
+    kept = len(list(LogReader(out)))
+    assert 0 < kept < len(small_samples())
+    assert first.startswith("left out at byte ")
+    assert "s between the messages around it" in first
+    assert last == f"{out}: {kept} messages"
+    account = LogReader(out)
+    list(account)
+    assert account.metadata["recovery"]["source"] == "night.mcap"
+    assert "left out " + account.metadata["recovery"]["left_out 1"] == first
+    damage = json.loads(lowfc(path, "--json").stdout)["damage"]
+    assert len(damage) == 1
+    assert damage[0]["position"] < middle < damage[0]["position"] + damage[0]["length"]
+
+
+def test_a_whole_log_is_left_alone(tmp_path: Path) -> None:
+    path = small_log(tmp_path / "night.mcap")
+    done = lowfc(path)
+    assert (done.exit_code, done.stdout) == (0, f"{path} is whole; there is nothing to recover\n")
+    assert json.loads(lowfc(path, "--json").stdout)["recovered"] is None
+    assert [path.name for path in tmp_path.iterdir()] == ["night.mcap"]
+    part = path.rename(tmp_path / "night.mcap.part")  # its recorder died between its last write and this
+    assert lowfc(part).stdout == f"{part} is whole; only rename it to night.mcap\n"
+
+
+def test_nothing_is_overwritten(tmp_path: Path) -> None:
+    part = small_log(tmp_path / "night.mcap", finished=False)
+    taken = recovered_path(part)
+    taken.write_text("mine")
+    for out in (taken, part):
+        with pytest.raises(DataFileError, match="never overwritten"):
+            recover(part, out)
+    assert taken.read_text() == "mine"
+
+
+@pytest.mark.parametrize("fault", [KeyboardInterrupt(), OSError(28, "No space left on device")])
+def test_what_fails_half_way_leaves_nothing(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, fault: BaseException
+) -> None:
+    part = small_log(tmp_path / "night.mcap", finished=False)
+
+    def fail(*_: object) -> None:
+        raise fault
+
+    monkeypatch.setattr(recovery, "account", fail)  # all messages are written by then
+    with pytest.raises((KeyboardInterrupt, DataFileError)) as caught:
+        recover(part, tmp_path / "new.mcap")
+    assert isinstance(caught.value, KeyboardInterrupt) or "cannot be written: No space left" in str(caught.value)
+    assert [path.name for path in tmp_path.iterdir()] == [part.name]

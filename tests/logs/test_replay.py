@@ -1,0 +1,385 @@
+"""Replay finds what is the same, says what is not, and counts what it cannot know."""
+
+from dataclasses import replace as changed
+from itertools import pairwise
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import settings as effort
+from hypothesis import strategies as st
+
+from lowfc.adapters.logs.reader import Logged
+from lowfc.contract.codecs import codec
+from lowfc.contract.codecs.calibration_codec import encode_calibration
+from lowfc.contract.codecs.law_codec import wire_law, wire_play
+from lowfc.contract.codecs.state_codec import controller_state
+from lowfc.contract.envelope import sequence_of
+from lowfc.contract.errors import DataFileError
+from lowfc.contract.messages import (
+    CALIBRATION as CALIBRATION_TOPIC,
+)
+from lowfc.contract.messages import (
+    COMMAND,
+    CONTROL_INPUT,
+    CONTROLLER_STATE,
+    FRAME,
+    LAW,
+    PLAY,
+    REQUEST,
+    STEP,
+    RawImage,
+    Topic,
+    image,
+    timestamp,
+    wire,
+)
+from lowfc.control.loop.advance import advance
+from lowfc.control.loop.inputs import Frame, Input, Load, Request
+from lowfc.control.loop.requests import prepared
+from lowfc.control.loop.state import Settings, State
+from lowfc.programs.logs.replay import controller_replay as replay_lane
+from lowfc.programs.logs.replay.account import Account
+from lowfc.programs.logs.replay.controller_replay import PATIENCE_NS, Frames, Share
+from lowfc.programs.logs.replay.fold import replay
+from tests.support.happenings import CALIBRATION, TIGHT, inputs
+from tests.support.toy import NOLL, frame, settings
+
+START_S = 1_767_225_600
+STATE_EVERY = 12
+
+
+class Night:
+    """A log as the controller's process and its neighbours make it, from a list of inputs."""
+
+    def __init__(self, what: Settings) -> None:
+        self.messages: list[Logged] = []
+        self.what = what
+        self.start_s = START_S
+        self.now_ns = START_S * 10**9
+        self._counts: dict[tuple[str, int], int] = {}
+        self._start()
+
+    def restart(self) -> None:
+        """The controller dies and comes back."""
+        self.start_s += 1
+        self._start()
+
+    def take(self, taken: Input) -> None:
+        self.now_ns += 1_000_000
+        if isinstance(taken, Frame):
+            self._frame(taken)
+        if isinstance(taken, Request):
+            taken = prepared(self.what, taken)
+            if taken.law is not None:
+                self._put(LAW, wire_law(taken.law, taken.time_ns).SerializeToString())
+            if taken.played is not None:
+                self._put(PLAY, wire_play(taken.played, taken.time_ns).SerializeToString())
+        self.state, outputs = advance(self.what, self.state, taken)
+        number = self.state.input_number
+        if outputs.command is not None:
+            self._put(COMMAND, codec.encode_command(outputs.command, 200, "lowfc", number), "dm")
+        if outputs.step is not None:
+            self._put(STEP, codec.encode_step(outputs.step, number))
+        if isinstance(taken, Request):
+            assert outputs.reply is not None
+            shown = controller_state(self.state, self.what, taken.time_ns) if taken.name == "status" else None
+            self._put(REQUEST, codec.encode_request(taken, outputs.reply, number, shown))
+        elif not isinstance(taken, Frame) and number > self._told:
+            self._put(CONTROL_INPUT, codec.encode_input(taken, number))
+        self._told = number
+        if outputs.changed or number % STATE_EVERY == 0:
+            self._say_state()
+
+    def steps(self) -> int:
+        return sum(message.key == STEP.key for message in self.messages)
+
+    def _start(self) -> None:
+        self.state, self._told = State(), 0
+        self._put(CALIBRATION_TOPIC, encode_calibration(CALIBRATION, self.now_ns))
+        self.take(Load(self.now_ns, CALIBRATION, "a test"))
+
+    def _say_state(self) -> None:
+        message = controller_state(self.state, self.what, self.now_ns)
+        self._put(CONTROLLER_STATE, message.SerializeToString())
+
+    def _frame(self, taken: Frame) -> None:
+        message = RawImage(timestamp=timestamp(taken.time_ns))
+        if taken.pixels is not None:
+            message = image(taken.pixels, taken.time_ns, "sensor")
+        payload = message.SerializeToString()
+        self.messages.append(Logged(FRAME.key, "", payload, taken.sequence, self.now_ns, self.now_ns))
+
+    def _put(self, topic: Topic, payload: bytes, name: str = "") -> None:
+        key = topic.at(name)
+        count = self._counts.get((key, self.start_s), 0)
+        self._counts[key, self.start_s] = count + 1
+        sequence = sequence_of(self.start_s, count)
+        self.messages.append(Logged(key, "", payload, sequence, self.now_ns, self.now_ns))
+
+
+def night(taken: list[Input], **changes: object) -> Night:
+    made = Night(settings(**(TIGHT | changes)))
+    for one in taken:
+        made.take(one)
+    return made
+
+
+def of_another_camera(taken: list[Input]) -> list[Input]:
+    """The same after a restart of the camera, so that no two frames share sequence and time."""
+    return [
+        one._replace(sequence=one.sequence + (1 << 32), time_ns=one.time_ns + 10**9) if isinstance(one, Frame) else one
+        for one in taken
+    ]
+
+
+def frames(count: int, first: int = 0) -> list[Input]:
+    rng = np.random.default_rng(first)
+    return [frame(first + index, rng.normal(0, 4, len(NOLL))) for index in range(count)]
+
+
+@effort(deadline=None)
+@given(inputs(), inputs(), st.sampled_from(["hold", "flat"]), st.sampled_from([1.0, 2.5]))
+def test_whatever_happens_is_replayed_to_the_bit(
+    before: list[Input], after: list[Input], silence: str, delay_frames: float
+) -> None:
+    made = night(before, on_frame_timeout=silence, delay_frames=delay_frames)
+    made.restart()
+    for one in of_another_camera(after):
+        made.take(one)
+    account = replay(made.messages)
+    assert (account.different, account.largest_nm, account.unchecked) == (0, 0.0, {})
+    kinds = {topic.key: 0 for topic in (STEP, CONTROLLER_STATE, REQUEST)}
+    kinds |= {COMMAND.at("dm"): 0}
+    for message in made.messages:
+        kinds[message.key] = kinds.get(message.key, 0) + 1
+    assert account.frames == kinds[STEP.key]
+    assert account.commands == kinds[COMMAND.at("dm")]
+    assert account.requests == kinds[REQUEST.key]
+    assert account.states == kinds[CONTROLLER_STATE.key] - 2  # each start is begun from one
+
+
+@effort(deadline=None)
+@given(inputs(), st.randoms(use_true_random=False), st.integers(1, 6))
+def test_lost_messages_are_never_a_difference_and_every_step_is_accounted_for(
+    taken: list[Input], random: st.DataObject, losses: int
+) -> None:
+    made = night([*frames(30, 9000), *of_another_camera([*taken, *frames(30, 5000)])])
+    kept = list(made.messages)
+    for _ in range(losses):
+        kept.pop(random.randrange(len(kept)))  # type: ignore[attr-defined]
+    account = replay(kept)
+    assert (account.different, account.largest_nm) == (0, 0.0)
+    assert account.frames + sum(account.unchecked.values()) == sum(message.key == STEP.key for message in kept)
+
+
+@effort(deadline=None)
+@given(inputs(), st.randoms(use_true_random=False))
+def test_the_order_between_publishers_does_not_matter(taken: list[Input], random: st.DataObject) -> None:
+    made = night([*taken, *frames(20, 5000)])
+    late_ns = {True: random.randrange(PATIENCE_NS // 2), False: random.randrange(PATIENCE_NS // 2)}  # type: ignore[attr-defined]
+    late = [
+        message._replace(log_time_ns=message.log_time_ns + late_ns[message.key == FRAME.key])
+        for message in made.messages
+    ]
+    shuffled = sorted(late, key=lambda message: message.log_time_ns)
+    account = replay(shuffled)
+    assert account.identical
+    assert account.frames == made.steps()
+
+
+@effort(deadline=None)
+@given(
+    inputs(),
+    inputs(),
+    st.lists(st.floats(0, 1), max_size=4),
+    st.lists(st.tuples(st.floats(0, 1), st.integers(1, 60)), max_size=3),
+    st.booleans(),
+    st.sampled_from([1, 30, 300]),
+)
+def test_shares_are_together_what_the_whole_is(
+    before: list[Input],
+    after: list[Input],
+    cuts: list[float],
+    holes: list[tuple[float, int]],
+    only_states: bool,
+    slower: int,
+) -> None:
+    """Whatever is lost, a message or a second of them or of the states, and however slowly the night went by."""
+    made = night([*before, *frames(60, 9000)])
+    made.restart()
+    for one in of_another_camera([*after, *frames(60, 9000)]):
+        made.take(one)
+    begun_ns = made.messages[0].log_time_ns
+    messages = [
+        message._replace(log_time_ns=begun_ns + slower * (message.log_time_ns - begun_ns)) for message in made.messages
+    ]
+    for place, count in holes:
+        first = int(place * (len(messages) - 1))
+        gone = list(range(first, min(first + count, len(messages))))
+        if only_states:
+            gone = [index for index in range(first, len(messages)) if messages[index].key == CONTROLLER_STATE.key][
+                :count
+            ]
+        messages = [message for index, message in enumerate(messages) if index not in gone]
+    span_ns = messages[-1].log_time_ns - messages[0].log_time_ns if messages else 0
+    edges = sorted({begun_ns + 1 + int(cut * span_ns) for cut in cuts})
+    whole = replay(messages)
+    parts = [replay(messages, share=Share(begin, end)) for begin, end in pairwise([0, *edges, 1 << 63])]
+    steps = sum(message.key == STEP.key for message in messages)
+    assert sum(part.steps for part in parts) == whole.steps == steps
+    assert whole.frames + sum(whole.unchecked.values()) == steps
+    for count in ("frames", "commands", "requests", "different", "commands_missing"):
+        assert sum(getattr(part, count) for part in parts) == getattr(whole, count), count
+    unchecked = sum(sum(part.unchecked.values()) for part in parts)
+    assert unchecked >= sum(whole.unchecked.values())  # where states are missing, two shares may count the same step
+    if not holes:
+        assert unchecked == 0
+
+
+def test_a_log_that_begins_in_the_middle_is_replayed_from_its_first_state() -> None:
+    made = night(frames(100))
+    cut = [message for message in made.messages if message.key == CALIBRATION_TOPIC.key]
+    cut += made.messages[len(made.messages) // 2 :]
+    account = replay(cut)
+    assert account.identical
+    assert 0 < account.unchecked["before the first complete state"] <= STATE_EVERY
+    assert account.frames + sum(account.unchecked.values()) == sum(message.key == STEP.key for message in cut)
+
+
+def test_after_a_hole_it_goes_on_at_the_next_state_and_says_what_it_could_not_check() -> None:
+    made = night(frames(100))
+    steps = [index for index, message in enumerate(made.messages) if message.key == STEP.key]
+    hole = [message for index, message in enumerate(made.messages) if not steps[30] <= index < steps[40]]
+    account = replay(hole)
+    assert account.identical
+    assert list(account.unchecked) == ["after an input that the log does not have"]
+    assert account.frames + sum(account.unchecked.values()) == 90
+    without = [message for message in made.messages if message.key != FRAME.key or message.sequence % 100 != 50]
+    account = replay(without)
+    assert account.identical
+    assert account.unchecked["after a frame that the log does not have"] >= 1
+
+
+def tampered(made: Night, topic: Topic, number: int, how: str) -> Account:
+    """Change one message a little, and replay."""
+    messages = list(made.messages)
+    places = [index for index, message in enumerate(messages) if topic.matches(message.key)]
+    index = places[number]
+    body = topic.message.FromString(messages[index].payload)
+    if how == "actuators":
+        surface = np.frombuffer(body.actuators, np.float32).copy()  # type: ignore[attr-defined]
+        surface[7] = np.nextafter(surface[7], np.float32(np.inf))
+        body.actuators = surface.tobytes()  # type: ignore[attr-defined]
+    else:
+        exec(how, {"body": body})  # noqa: S102  # the test's own text
+    messages[index] = messages[index]._replace(payload=body.SerializeToString())
+    return replay(messages)
+
+
+@pytest.mark.parametrize(
+    ("topic", "how", "said"),
+    [
+        (COMMAND, "actuators", "actuators: [7] log"),
+        (STEP, "body.error_nm[1] += 1e-6", "error_nm: [1] log"),
+        (STEP, "body.mode = 2", "mode: log 2, replay 3"),
+        (STEP, "body.flux_dn += 1", "flux_dn: log"),
+        (STEP, "body.command_nm[0] = float('nan')", "command_nm: log [nan"),
+        (STEP, "body.flux_dn = float('inf')", "flux_dn: log inf"),
+        (STEP, "body.timestamp.nanos += 1", "timestamp.nanos: log"),
+        (STEP, "body.MergeFromString(bytes([0xA0, 0x06, 1]))", "bytes that no value explains"),
+        (COMMAND, "body.channel = 'other'", "channel: log other, replay lowfc"),
+        (COMMAND, "body.valid_for_ns = 10**12", "valid_for_ns: log 1000000000000"),
+        (CONTROLLER_STATE, "body.gain[0] += 0.125", "gain: log"),
+        (CONTROLLER_STATE, "body.command_history_nm[0] += 0.5", "command_history_nm: [0] log"),
+        (CONTROLLER_STATE, "body.settings.slew_nm += 1", "settings.slew_nm: [0] log"),
+    ],
+    ids=lambda value: value if isinstance(value, str) else "",
+)
+def test_the_smallest_difference_is_found_and_named(topic: Topic, how: str, said: str) -> None:
+    account = tampered(night(frames(60)), topic, 2, how)
+    assert not account.identical
+    assert account.first is not None
+    assert account.first.what == topic.message.DESCRIPTOR.name
+    assert any(line.startswith(said) for line in account.first.fields), account.first.fields
+    if how == "actuators":
+        assert 0 < account.largest_nm < 1e-5
+        assert (account.different, account.first.taken, account.first.frame_sequence & 0xFF) == (1, 4, 2)
+
+
+def test_a_second_message_for_one_input_differs() -> None:
+    made = night(frames(60))
+    place = [index for index, message in enumerate(made.messages) if message.key == STEP.key][20]
+    account = replay([*made.messages, made.messages[place]])
+    assert account.different == 1
+    assert account.first is not None
+    assert account.first.fields == ["a second one of input 22"]
+
+
+def test_commands_that_are_not_in_the_log_are_counted() -> None:
+    made = night(frames(60))
+    commands = [index for index, message in enumerate(made.messages) if COMMAND.matches(message.key)]
+    without = [message for index, message in enumerate(made.messages) if index not in commands[10:13]]
+    account = replay(without)
+    assert (account.identical, account.commands, account.commands_missing) == (True, 57, 3)
+    none = replay([message for message in made.messages if not COMMAND.matches(message.key)])
+    assert (none.different, none.commands, none.commands_missing) == (0, 0, 60)
+    assert not none.identical
+
+
+def test_another_law_differs() -> None:
+    made = night(frames(40))
+    made.what = changed(made.what, min_flux_fraction=0.99)
+    for one in frames(40, 100):
+        made.take(one)
+    account = replay(made.messages)
+    assert account.different >= 1
+    assert account.first is not None
+    assert account.first.what in ("ControlStep", "MirrorCommand", "ControllerState")
+
+
+def test_a_tolerance_lets_small_differences_pass() -> None:
+    made = night(frames(60))
+    assert not tampered(made, STEP, 5, "body.error_nm[1] += 1e-4").identical
+    messages = [
+        message._replace(payload=_nudged(message.payload)) if message.key == STEP.key else message
+        for message in made.messages
+    ]
+    account = replay(messages, tolerance_nm=1e-3)
+    assert account.identical
+    assert 0 < account.largest_nm < 1e-3
+
+
+def _nudged(payload: bytes) -> bytes:
+    step = wire.ControlStep.FromString(payload)
+    step.error_nm[0] += 1e-4
+    return step.SerializeToString()
+
+
+def test_a_log_from_before_inputs_were_numbered_is_refused() -> None:
+    made = night(frames(3))
+    with pytest.raises(DataFileError, match="the steps in this log are not numbered"):
+        tampered(made, STEP, 0, "body.input_number = 0")
+    made.messages.append(Logged(REQUEST.key, "", wire.Request(name="gain").SerializeToString(), 0, 0, 0))
+    assert replay(made.messages).identical
+
+
+def test_nothing_to_check_is_not_identical() -> None:
+    assert not replay([]).identical
+    made = night(frames(5))
+    assert not replay([message for message in made.messages if message.key != CALIBRATION_TOPIC.key]).identical
+
+
+def test_frames_are_kept_within_a_budget(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(replay_lane, "FRAMES_BYTES", 1000)
+    kept = Frames()
+    pixels = np.arange(100, dtype=np.uint16).reshape(10, 10)
+    for sequence in range(50):
+        kept.add(sequence, image(pixels + sequence, sequence, "sensor").SerializeToString())
+    found = [kept.frame(sequence, sequence, 0) for sequence in range(50)]
+    assert found[49] is not None
+    assert found[49].pixels is not None
+    assert np.array_equal(found[49].pixels, pixels + 49)
+    assert [one is not None for one in found].count(True) == 4
+    assert kept.frame(49, 48, 0) is None
+    assert kept.frame(49, 48, 0, last=True) is not None

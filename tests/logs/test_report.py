@@ -1,0 +1,438 @@
+"""The report of a run: its figures against a log whose content is known, and a page for every kind of log."""
+
+import json
+import re
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import typer.testing
+
+from lowfc.adapters.logs.recovery import recover
+from lowfc.adapters.logs.writer import LogWriter
+from lowfc.adapters.process.terminal import new_app
+from lowfc.contract.errors import DataFileError
+from lowfc.contract.messages import CONTROLLER_STATE, EVENT, FRAME, REQUEST, Log, wire
+from lowfc.control.laws.error_budget import sensor_noise
+from lowfc.optics.detector.photometry import tilt_nm_per_mas
+from lowfc.programs.logs.report import closed_loop
+from lowfc.programs.logs.report.command import beside, report
+from lowfc.programs.logs.report.figures import report_of
+from lowfc.programs.logs.report.page import NOT_HERE, fixed, number, page
+from lowfc.programs.logs.report.source import read_run
+from tests.support import report_log
+from tests.support.report_log import READ_NOISE_E, Night
+from tests.support.theory import noise_gain, rejection
+
+RATE_HZ = 1000.0
+
+
+def figures(log: Path) -> dict[str, Any]:
+    found = report_of(read_run(log)).figures
+    json.dumps(found, allow_nan=False)
+    return found
+
+
+def command(*words: str) -> typer.testing.Result:
+    app = new_app("Reports.")
+    app.command()(report)
+    return typer.testing.CliRunner().invoke(app, list(words))
+
+
+@pytest.fixture(scope="module")
+def eventful(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
+    """Opened, closed, frames lost and dark, gains changed, controller and camera restarted."""
+    night = Night()
+    night.request("open")
+    night.frames(300)
+    night.request("close")
+    night.frames(1500, lost={200, 201, 202, 203, 204, 700}, dark={800})
+    night.request("gain", (0.2,))
+    night.frames(200)
+    night.request("gain", (9.0,))
+    night.frames(100)
+    night.start_controller()
+    night.frames(50)
+    night.start_camera()
+    night.frames(100)
+    counts = [wire.TopicCount(topic=FRAME.key, received=2244, skipped=4, missing=2)]
+    night.health("controller", topics=counts, state="stopped")
+    night.health("camera", commands_late=3, state="stopped")
+    return figures(night.write(tmp_path_factory.mktemp("eventful") / "night.mcap"))
+
+
+def test_the_loop_s_course_is_told(eventful: dict[str, Any]) -> None:
+    assert eventful["mode_steps"] == {"open": 300, "closed": 1944}
+    assert [span["mode"] for span in eventful["mode_spans"]] == ["open", "closed"]
+    assert eventful["mode_spans"][1]["from_s"] == pytest.approx(0.3)
+    assert [(one["from_s"], one["gain"]) for one in eventful["laws"]] == [
+        (0.0, [0.4, 0.4, 0.2]),
+        (pytest.approx(1.8), [0.2, 0.2, 0.2]),
+        (pytest.approx(2.1), [0.4, 0.4, 0.2]),
+    ]
+    assert [(one["name"], one["accepted"]) for one in eventful["requests"]] == [
+        ("open", True),
+        ("close", True),
+        ("gain", True),
+        ("gain", False),
+    ]
+    assert [one["time_s"] for one in eventful["requests"]] == pytest.approx([0, 0.3, 1.8, 2.0], abs=1e-3)
+    assert eventful["run"]["steps"] == 2244
+    assert eventful["run"]["host"] == "bench"
+    assert eventful["run"]["versions"] == {"lowfc": "0.1.0", "numpy": "2.0"}
+
+
+def test_frames_are_accounted_for(eventful: dict[str, Any]) -> None:
+    assert eventful["timing"]["frames"] == {
+        "recorded": 2250,
+        "without_command": 6,
+        "at_the_end": 0,
+        "skipped_by_controller": 4,
+        "missing_at_controller": 2,
+        "commands_late": 3,
+        "camera_starts": 2,
+    }
+    assert eventful["light"]["refused"] == {"dark": 1}
+    assert eventful["timing"]["rate_hz"] == RATE_HZ
+
+
+def test_latencies_are_those_of_the_messages(eventful: dict[str, Any]) -> None:
+    latency = eventful["timing"]["latency_us"]
+    assert latency["transport"] == {"count": 2244, **dict.fromkeys(("p50", "p90", "p99", "p99_9", "max"), 90.0)}
+    assert latency["frame_to_command"]["max"] == 349
+    assert 320 < latency["frame_to_command"]["p50"] < 330
+    assert latency["frame_to_mirror"]["max"] == 549
+    assert latency["frame_to_mirror"]["count"] == 2244
+    assert eventful["timing"]["interval_us"]["frames"]["max"] == 1000
+    assert eventful["timing"]["interval_us"]["commands"]["max"] == pytest.approx(6006)  # five frames lost in a row
+
+
+def test_the_longest_stretch_under_one_law_is_taken(eventful: dict[str, Any]) -> None:
+    stretch = eventful["closed_stretch"]
+    assert stretch["gain"] == [0.4, 0.4, 0.2]
+    assert stretch["steps_settling"] == 25
+    assert stretch["from_s"] == pytest.approx(0.325)
+    assert stretch["to_s"] == pytest.approx(1.799)
+    assert (stretch["pieces"], stretch["frames_bridged"]) == (2, 2)  # one lost, one dark; five lost are too many
+    assert stretch["frames"] == 1475 - 5
+
+
+def test_the_budget_is_what_the_toy_is_made_of(eventful: dict[str, Any]) -> None:
+    made = Night().calibration
+    noise = sensor_noise(
+        made.reconstructor.astype(float), made.reference.astype(float), made.flux_dn, np.hypot(READ_NOISE_E, 12**-0.5)
+    )
+    terms = {term["name"]: term for term in eventful["error_budget"]["terms"]}
+    through = np.sqrt([noise_gain(gain, 0.0, 1.0) for gain in (0.4, 0.4, 0.2)])
+    groups = ("tilt x", "tilt y", "other modes")
+    for name, expected in (("photon noise", noise.photon_nm), ("read noise", noise.read_nm)):
+        found = [terms[name]["rms_nm"][group] for group in groups]
+        assert found == pytest.approx((expected * through).tolist(), rel=0.01)
+    expected_nm = 12 / np.sqrt(2) * rejection(np.array([7.0]), RATE_HZ, 0.4, 0.0, 1.0)[0]
+    assert terms["lag"]["rms_nm"]["tilt x"] == pytest.approx(expected_nm, rel=0.1)
+    assert terms["lag"]["rms_nm"]["tilt y"] < 0.01
+    assert "all modes" in terms["nonlinearity"]["upper_limit"]
+    for group in (*groups, "all modes"):
+        assert eventful["error_budget"]["sum_over_true"][group] == pytest.approx(1, abs=0.1)
+    assert eventful["error_budget"]["sum_lacks"] == []
+
+
+def test_the_residual_is_before_and_after(eventful: dict[str, Any]) -> None:
+    tip = eventful["residual"]["modes"][0]
+    assert tip["name"] == "tilt x"
+    assert tip["disturbance_rms_nm"] == pytest.approx(12 / np.sqrt(2), rel=0.05)
+    assert tip["residual_rms_nm"] < 0.15 * tip["disturbance_rms_nm"]
+    assert tip["pseudo_open_loop_rms_nm"] == pytest.approx(tip["disturbance_rms_nm"], rel=0.05)
+    assert tip["open_residual_rms_nm"] == pytest.approx(12 / np.sqrt(2), rel=0.15)
+    x_mas = tip["residual_rms_nm"] / tilt_nm_per_mas(2.0)
+    tilt = eventful["residual"]["tilt_mas"]["residual"]
+    assert tilt["x"] == pytest.approx(x_mas)
+    assert tilt["per_axis"] == pytest.approx(np.sqrt((tilt["x"] ** 2 + tilt["y"] ** 2) / 2))
+
+
+def test_spectra_are_held_against_theory(eventful: dict[str, Any]) -> None:
+    tip = eventful["spectra"]["groups"][0]
+    assert tip["measured_over_theory"]["median"] == pytest.approx(1, abs=0.02)
+    assert tip["true_over_theory"]["median"] == pytest.approx(1, abs=0.15)
+    assert sum(band["disturbance_rms_nm"] ** 2 for band in tip["bands"]) == pytest.approx(72, rel=0.1)
+    loudest = int(np.argmax(tip["power_nm2_hz"]["disturbance"]))
+    assert tip["frequency_hz"][loudest] == pytest.approx(7, abs=eventful["spectra"]["resolution_hz"])
+
+
+def test_the_verdict_names_what_was_wrong(eventful: dict[str, Any]) -> None:
+    verdict = eventful["verdict"]
+    levels = {check["name"]: check["level"] for check in verdict["checks"]}
+    assert verdict["level"] == "look"
+    assert levels == {
+        "log": "good",
+        "loop": "good",
+        "residual": "good",
+        "commands": "look",
+        "delay": "good",
+        "light": "look",
+        "mirror": "good",
+        "events": "look",
+    }
+    assert verdict["because"] == "6 of 2250 frames (0.27%) got no command"
+
+
+def quiet(night: Night, number: int = 700) -> Night:
+    """A run in which nothing went wrong."""
+    night.frames(number)
+    night.health("camera", state="stopped")
+    return night
+
+
+@pytest.fixture(scope="module")
+def good(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A log of a run in which nothing went wrong."""
+    return quiet(Night(), 1500).write(tmp_path_factory.mktemp("good") / "x.mcap")
+
+
+def damaged(good: Path, folder: Path) -> Path:
+    content = bytearray(good.read_bytes())
+    content[len(content) // 2] ^= 0xFF
+    (folder / "x.mcap").write_bytes(content)
+    return folder / "x.mcap"
+
+
+def cut_off(good: Path, folder: Path) -> Path:
+    content = good.read_bytes()
+    (folder / "x.mcap.part").write_bytes(content[: int(0.7 * len(content))])
+    return folder / "x.mcap.part"
+
+
+def recovered(good: Path, folder: Path) -> Path:
+    recover(cut_off(good, folder), folder / "y.mcap")
+    return folder / "y.mcap"
+
+
+def stopped(good: Path, folder: Path) -> Path:
+    writer = LogWriter(folder / "x.mcap", report_log.START * 10**9, report_log.METADATA)
+    for sample in quiet(Night()).samples:
+        writer.write(sample)
+    return writer.finish({"recording": {"messages_lost": "0", "stopped": "the disk is full"}})
+
+
+@pytest.mark.parametrize(
+    ("make", "level", "text", "complete"),
+    [
+        (lambda good, folder: good, "good", "complete, no message lost", True),
+        (damaged, "look", "1 damaged part left out", False),
+        (cut_off, "look", "its end is missing: the recorder did not finish it", False),
+        (recovered, "look", "recovered from x.mcap.part, which had not been finished; left out: damaged parts 0", True),
+        (stopped, "bad", "recording stopped: the disk is full", True),
+    ],
+)
+def test_the_state_of_the_log_is_in_the_verdict(
+    good: Path, tmp_path: Path, make: Callable[[Path, Path], Path], level: str, text: str, complete: bool
+) -> None:
+    log = make(good, tmp_path)
+    made = report_of(read_run(log))
+    check = made.figures["verdict"]["checks"][0]
+    assert (check["name"], check["level"], check["text"].partition(", unreadable")[0]) == ("log", level, text)
+    assert (made.figures["log"]["complete"], made.figures["log"]["finished"]) == (complete, make is not cut_off)
+    assert 0 < made.figures["run"]["steps"] <= 1500
+    assert made.figures["verdict"]["level"] == level
+    assert made.figures["verdict"]["because"] == ("" if level == "good" else check["text"])
+    if level == "bad":
+        assert '<td class="text">the disk is full</td>' in page(made)
+
+
+def test_the_verdict_is_over_the_open_pupil_where_the_truth_is_known(good: Path) -> None:
+    found = figures(good)
+    before_nm = found["residual"]["open_pupil"]["disturbance_open_pupil_rms_nm"]
+    text = found["verdict"]["checks"][2]["text"]
+    assert text.startswith(f"{before_nm:.3g} nm before")
+    assert "nm after over the open pupil;" in text
+
+
+def test_of_a_very_long_stretch_the_end_is_taken(good: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(closed_loop, "MOST_STEPS", 400)
+    stretch = figures(good)["closed_stretch"]
+    assert stretch["frames"] == 400
+    assert stretch["steps_settling"] + stretch["steps_earlier"] == 1100
+    assert stretch["to_s"] == pytest.approx(1.499)
+
+
+@pytest.mark.parametrize("empty", [True, False])
+def test_a_log_without_a_step_still_has_a_page(tmp_path: Path, empty: bool) -> None:
+    night = Night()
+    if empty:
+        night.samples.clear()
+    made = report_of(read_run(night.write(tmp_path / "x.mcap", config=not empty)))
+    assert made.figures["verdict"]["level"] == "bad"
+    assert made.figures["verdict"]["because"] == "no step of the control law is in this log"
+    assert "No step of the control law is in this log" in page(made)
+
+
+def test_an_error_or_a_safed_loop_is_not_good(tmp_path: Path) -> None:
+    night = quiet(Night())
+    night.request("safe")
+    night.frames(50)
+    found = figures(night.write(tmp_path / "x.mcap"))
+    assert found["verdict"]["level"] == "bad"
+    assert {check["name"] for check in found["verdict"]["checks"] if check["level"] == "bad"} == {"loop", "events"}
+    assert [event["name"] for event in found["events"] if event["level"] == "error"] == ["SAFED"]
+
+
+def test_without_truth_its_terms_are_missing_and_not_zero(tmp_path: Path) -> None:
+    found = figures(quiet(Night(truth=False), 1500).write(tmp_path / "x.mcap"))
+    terms = {term["name"]: term for term in found["error_budget"]["terms"]}
+    for name in ("cross-talk and aliasing", "nonlinearity"):
+        assert terms[name]["missing"]
+        assert set(terms[name]["rms_nm"].values()) == {None}
+        assert "true wavefront" in terms[name]["how"]
+    expected_nm = 12 / np.sqrt(2) * rejection(np.array([7.0]), RATE_HZ, 0.4, 0.0, 1.0)[0]
+    assert terms["lag"]["rms_nm"]["tilt x"] == pytest.approx(expected_nm, rel=0.25)
+    assert "noise floor" in terms["lag"]["how"]
+    assert found["error_budget"]["sum_lacks"] == ["cross-talk and aliasing", "nonlinearity"]
+    assert set(found["error_budget"]["true_residual"]["rms_nm"].values()) == {None}
+    assert found["residual"]["total_rms_nm"]["residual"] is None
+    assert "true_over_theory" not in found["spectra"]["groups"][0]
+    assert found["run"]["simulated"] is False
+    assert "nm after in all modes over the circle;" in found["verdict"]["checks"][2]["text"]
+
+
+def test_a_log_of_an_open_loop_has_neither_spectra_nor_budget(tmp_path: Path) -> None:
+    night = Night()
+    night.request("open")
+    found = figures(quiet(night, 300).write(tmp_path / "x.mcap"))
+    assert found["closed_stretch"] is None
+    assert found["spectra"] == found["error_budget"] == {"why_not": "the loop was not closed in this log"}
+    assert found["residual"]["total_rms_nm"]["open_error"] > 5
+    assert found["residual"]["total_rms_nm"]["error"] is None
+    assert found["verdict"]["level"] == "unknown"
+
+
+def test_a_loop_closed_under_an_unknown_law_is_not_called_open(tmp_path: Path) -> None:
+    night = Night()
+    night.frames(300)
+    night.samples = [sample for sample in night.samples if sample.key != CONTROLLER_STATE.key]
+    found = figures(night.write(tmp_path / "x.mcap"))
+    assert found["mode_steps"] == {"closed": 300}
+    why = "this log does not tell under which law the loop was closed"
+    assert found["spectra"] == found["error_budget"] == {"why_not": why}
+    assert found["verdict"]["checks"][2]["text"] == why
+
+
+def test_a_closed_loop_without_a_good_frame_has_neither(tmp_path: Path) -> None:
+    night = Night()
+    night.frames(200, dark=range(200))
+    found = figures(night.write(tmp_path / "x.mcap"))
+    assert found["closed_stretch"]["frames"] == 0
+    assert "has 0 frames" in found["spectra"]["why_not"]
+    assert {term["missing"] for term in found["error_budget"]["terms"]} == {True}
+    assert found["light"]["refused"] == {"dark": 200}
+    assert found["verdict"]["checks"][2]["level"] == "look"  # truly the wavefront is as it was
+
+
+@pytest.mark.parametrize(("lost", "without", "at_the_end"), [(1, 0, 1), (50, 0, 50), (80, 30, 50)])
+def test_the_last_frames_may_have_their_command_after_the_log(
+    tmp_path: Path, lost: int, without: int, at_the_end: int
+) -> None:
+    night = Night()
+    night.frames(200, lost=range(200 - lost, 200))
+    found = figures(night.write(tmp_path / "x.mcap"))["timing"]["frames"]
+    assert (found["without_command"], found["at_the_end"]) == (without, at_the_end)
+
+
+def test_the_command_prints_one_object_or_writes_one_page(tmp_path: Path) -> None:
+    log = quiet(Night(), 3).write(tmp_path / "night.mcap")
+    printed = command(str(log), "--json")
+    assert printed.exit_code == 0, printed.output
+    found = json.loads(printed.stdout)
+    assert found["run"]["steps"] == 3
+    assert "has 3 frames" in found["spectra"]["why_not"]
+    assert [term["missing"] for term in found["error_budget"]["terms"]] == [False, False, True, True, True]
+    assert not beside(log).exists()
+
+    out = tmp_path / "told.html"
+    written = command(str(log), "--out", str(out))
+    assert written.exit_code == 0, written.output
+    assert written.stdout.splitlines() == ["A good run", str(out)]
+    text = out.read_text()
+    assert text.lstrip().startswith("<!DOCTYPE html>")
+    assert "No spectra: the longest gap-free stretch has 3 frames" in text
+    assert f'<td class="none">{NOT_HERE}</td>' in text
+    assert not re.search(r"""(src|href)=["'](?!#|data:)""", text)
+    assert not re.search(r"url\((?!#)|@import|<script|<link|<iframe", text)
+    identifiers = re.findall(r'\bid="([^"]+)"', text)
+    assert len(identifiers) == len(set(identifiers))
+    for target in re.findall(r'href="#([^"]+)"', text):
+        assert target in identifiers
+
+
+MARKUP = '<script>alert("x")</script>'
+
+
+def test_text_of_a_log_is_no_markup(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    night = quiet(Night(), 30)
+    for name in (f"1 {MARKUP}", r"2 $\foo{$", "3 $x^2$"):
+        night.put(REQUEST, wire.Request(name=name, reply=f"4 {MARKUP}", accepted=False))
+    night.put(EVENT, Log(name=f"5 {MARKUP}", message=f"6{MARKUP} 7 {MARKUP}", level=3))
+    night.health("camera", realtime_refused=[f"8 {MARKUP}"])
+    about = {name: f"{name} {MARKUP}" for name in (f"9 {MARKUP}", "host", "kernel", "processor", "git", "lowfc")}
+    recording = {"messages_lost": MARKUP, f"lost {MARKUP}": MARKUP}
+    monkeypatch.setattr(report_log, "METADATA", {"lowfc": about, "recording": recording})
+    text = page(report_of(read_run(night.write(tmp_path / "x.mcap", finish=False))))
+    assert "<script" not in text
+    for digit in "123456789":
+        assert re.search(rf"{digit}( ?&lt;script&gt;| \$)", text), digit
+    for name in ("host", "kernel", "processor", "lowfc"):
+        assert f"{name} &lt;script&gt;" in text
+    assert text.count("3 $x^2$") == 2, "in the drawing and in the table"
+
+
+def test_a_figure_that_is_no_number_is_none(tmp_path: Path) -> None:
+    night = quiet(Night(), 30)
+    night.put(REQUEST, wire.Request(name="gain", values=[np.nan, np.inf, 0.5]))
+    log = night.write(tmp_path / "x.mcap")
+    printed = command(str(log), "--json", "--out", str(tmp_path / "x.html"))
+    assert printed.exit_code == 0, printed.output
+    assert json.loads(printed.stdout)["requests"][-1]["values"] == [None, None, 0.5]
+    assert "gain nan inf" in (tmp_path / "x.html").read_text()
+
+
+@pytest.mark.parametrize("name", ["night.mcap", "other.mcap.part", "link.html"])
+def test_a_report_never_overwrites_a_log(tmp_path: Path, name: str) -> None:
+    log = quiet(Night(), 3).write(tmp_path / "night.mcap")
+    before = log.read_bytes()
+    (tmp_path / "link.html").hardlink_to(log)
+    done = command(str(log), "--out", str(tmp_path / name))
+    assert isinstance(done.exception, DataFileError)
+    assert log.read_bytes() == before
+    assert not (tmp_path / "other.mcap.part").exists()
+
+
+@pytest.mark.parametrize(
+    ("log", "expected"),
+    [("a/n.mcap", "a/n.html"), ("n.mcap.part", "n.html"), ("n.recovered.mcap", "n.recovered.html"), ("n", "n.html")],
+)
+def test_the_page_is_beside_the_log(log: str, expected: str) -> None:
+    assert beside(Path(log)) == Path(expected)
+
+
+def test_figures_are_written_for_people() -> None:
+    assert [number(value) for value in (None, "x", 3, 0.0, 1234.5, 12.345, 0.05)] == [
+        *(NOT_HERE, "x", "3", "0", "1234", "12.3", "0.05"),
+    ]
+    assert [fixed(value) for value in (3, 0.0, 12.3456, 0.0006, 0.0004, -0.25)] == [
+        *("3", "0.000", "12.346", "0.001", "< 0.001", "-0.250"),
+    ]
+
+
+def test_the_figures_take_neither_matplotlib_nor_jinja2(tmp_path: Path) -> None:
+    log = quiet(Night(), 3).write(tmp_path / "x.mcap")
+    code = (
+        "import sys, pathlib; from lowfc.programs.logs.report.command import report; "
+        f"report([pathlib.Path({str(log)!r})], None, True); "
+        "sys.exit(bool({'matplotlib', 'jinja2'} & set(sys.modules)))"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60, check=False)
+    assert done.returncode == 0, done.stderr
+    assert json.loads(done.stdout)["log"]["file"] == "x.mcap"

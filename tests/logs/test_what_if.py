@@ -1,0 +1,392 @@
+"""What-ifs of logs: against runs with the gains in question, and the mistakes a user may make."""
+
+import json
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from lowfc.adapters.files import calibration_file, factory
+from lowfc.adapters.logs.columns import Steps
+from lowfc.adapters.logs.history import History, read_history
+from lowfc.adapters.logs.reader import LogReader
+from lowfc.adapters.logs.records import Damage
+from lowfc.contract.codecs.calibration_codec import identified
+from lowfc.contract.configuration import Configuration, load
+from lowfc.contract.errors import CalibrationError, ConfigurationError, DataFileError
+from lowfc.contract.messages import wire
+from lowfc.control.calibration.calibration import reconstructor
+from lowfc.control.laws.stability import delay_weights, limiting_gain
+from lowfc.control.laws.what_if import as_logged, counterfactual, rms
+from lowfc.control.loop.safety import LoopMode, Reason
+from lowfc.optics.detector.photometry import tilt_nm_per_mas
+from lowfc.programs.logs.what_if.compare import LINEAR_WAVES, WhatIf, compared, render, wanted, what_if
+from lowfc.programs.logs.what_if.run import LoggedRun
+from tests.support import toy
+from tests.support.fold import Fold, fold
+from tests.support.loops import loop
+
+RATE_HZ = 250
+Gains = tuple[float, float, float]
+"""Gain of tip and tilt and gain of the others, in parts of the highest stable one; leak of all."""
+
+HARD, SOFT, LEAKY = (0.45, 0.03, 0.0), (0.1, 0.35, 0.0), (0.5, 0.02, 0.03)
+
+
+def configured(gains: Gains, delay: float, **overrides: object) -> Configuration:
+    tilt_gain, gain, leak = gains
+    highest = limiting_gain(np.ceil(delay))
+    return load(
+        None,
+        {
+            "camera.rate_hz": RATE_HZ,
+            "camera.delay_frames": delay,
+            "disturbance.preset": "reaction-wheel",
+            "disturbance.scale": 0.3,
+            "control.start_mode": "closed",
+            "control.tilt_gain": tilt_gain * highest,
+            "control.gain": gain * highest,
+            "control.tilt_leak": leak,
+            "control.leak": leak,
+        }
+        | {key.replace("__", "."): value for key, value in overrides.items()},
+    )
+
+
+def settled_rms(values: np.ndarray) -> np.ndarray:
+    return rms(values, np.arange(len(values)) >= RATE_HZ)
+
+
+def as_if(run: Fold, config: Configuration) -> np.ndarray:
+    """Errors (frames, modes) that the run would have had under another configuration's law."""
+    settings = factory.settings(config)
+    weights = delay_weights(settings.delay_frames).astype(np.float32)
+    pol_nm = run.pol_nm.astype(np.float32)
+    law = settings.law(config.noll)
+    return counterfactual(as_logged(law), weights, pol_nm, np.zeros(len(pol_nm), np.int64))[0]
+
+
+def check_agreement(
+    frames: int, pair: tuple[Gains, Gains], delay: float, within_nm: float = 0.0, **overrides: object
+) -> None:
+    """Both ways between two laws: each mode within 10 % of the simulated run, and the law itself to the rounding."""
+    configs = [configured(gains, delay, **overrides) for gains in pair]
+    runs = [fold(config, frames) for config in configs]
+    for run, config in zip(runs, configs, strict=True):
+        tilt_mas = settled_rms(run.disturbance_nm)[:2] / tilt_nm_per_mas(config.star.diameter_m)
+        assert tilt_mas.max() < 5
+        np.testing.assert_allclose(as_if(run, config), run.error_nm, atol=2e-5, rtol=0)
+    for run, other, config in ((runs[0], runs[1], configs[1]), (runs[1], runs[0], configs[0])):
+        expected = settled_rms(other.error_nm)
+        np.testing.assert_allclose(settled_rms(as_if(run, config)), expected, rtol=0.1, atol=within_nm)
+        # and not because the two runs were alike
+        assert np.abs(settled_rms(run.error_nm) / expected - 1).max() > 0.1
+
+
+@pytest.mark.parametrize(("delay", "pair"), [(1, (HARD, SOFT)), (2, (SOFT, LEAKY))])
+def test_in_the_linear_range_it_agrees_with_a_run_with_those_gains(delay: int, pair: tuple[Gains, Gains]) -> None:
+    """Two runs of 1750 frames differ by 2.4 % rms by their noise alone; it is 10 % at most of 28 modes."""
+    check_agreement(2000, pair, delay)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("pair", [(HARD, SOFT), (SOFT, LEAKY)])
+@pytest.mark.parametrize("delay", [1, 1.4, 2, 3])
+@pytest.mark.parametrize(("preset", "scale"), [("reaction-wheel", 0.3), ("bench", 0.7)])
+def test_more_gains_and_delays_agree(delay: float, pair: tuple[Gains, Gains], preset: str, scale: float) -> None:
+    check_agreement(4000, pair, delay, disturbance__preset=preset, disturbance__scale=scale)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("pair", [(HARD, SOFT), (SOFT, LEAKY)])
+def test_without_noise_what_is_left_is_the_sensors_own_curvature(pair: tuple[Gains, Gains]) -> None:
+    """Tilt near 5 mas looks like a tenth of a nanometre of other modes, which is all that some of them then have."""
+    check_agreement(2000, pair, 1, within_nm=0.1, camera__noise=False)
+
+
+CONTROL = """
+[disturbance]
+preset = "reaction-wheel"
+scale = 0.3
+[control]
+"""
+OTHER = "gain=0.3,tilt_gain=0.2,leak=0.01"
+
+
+@pytest.fixture(scope="module")
+def logs(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
+    """Lockstep runs with the usual gains, and with others and a wrong idea of the delay."""
+    made = {}
+    for name, law in (
+        ("usual", ""),
+        ("other", "tilt_gain=0.2\ngain=0.3\ntilt_leak=0.01\nleak=0.01\ndelay_frames=2\n"),
+    ):
+        arguments = ("--lockstep", "--rate", str(RATE_HZ), "--duration", "6")
+        figures = loop(tmp_path_factory.mktemp(name), *arguments, config=CONTROL + law)
+        assert figures["messages_lost"] == 0
+        made[name] = figures["log"]
+    return made
+
+
+def figures_of(log: Path, what: WhatIf | None = None) -> dict[str, Any]:
+    found = what_if(LogReader(log), what or WhatIf())
+    assert found == json.loads(json.dumps(found))
+    return found
+
+
+def column(figures: dict[str, Any], name: str) -> np.ndarray:
+    return np.array([mode[f"{name}_nm"] for mode in figures["modes"]])
+
+
+def test_the_gains_that_were_used_give_the_logged_run(logs: dict[str, Path]) -> None:
+    figures = figures_of(logs["usual"])
+    np.testing.assert_allclose(column(figures, "what_if"), column(figures, "was"), atol=1e-5)
+    np.testing.assert_allclose(column(figures, "true_what_if"), column(figures, "true_was"), atol=1e-5)
+    assert figures["frames"] == 6 * RATE_HZ
+    assert figures["frames_compared"] == 5 * RATE_HZ
+    assert figures["settling_s"] == 1
+    assert figures["delay_frames"] == 1
+    assert figures["delay_measured_frames"] == pytest.approx(1, abs=0.01)
+    assert figures["warnings"] == []
+
+
+def test_a_log_says_what_other_gains_give(logs: dict[str, Path]) -> None:
+    """Measured residual with measured residual, mode by mode, of two runs of the real processes."""
+    guess, run = figures_of(logs["usual"], wanted(OTHER)), figures_of(logs["other"])
+    np.testing.assert_allclose(column(guess, "what_if"), column(run, "was"), rtol=0.1)
+    np.testing.assert_allclose(column(guess, "open"), column(run, "open"), rtol=0.1)
+    assert np.abs(column(guess, "was") / column(run, "was") - 1).max() > 0.1
+    assert guess["what_if_nm"] == pytest.approx(run["was_nm"], rel=0.05)
+    assert guess["true_what_if_nm"] == pytest.approx(run["true_was_nm"], rel=0.05)
+    assert guess["tilt_what_if_mas"] == pytest.approx(run["tilt_was_mas"], rel=0.05)
+    assert guess["tilt_was_mas"] == pytest.approx(
+        np.sqrt(np.mean(column(guess, "was")[:2] ** 2)) / tilt_nm_per_mas(2.0), rel=1e-6
+    )
+    assert {key: guess["modes"][2][key] for key in ("name", "gain_was", "gain", "leak_was", "leak")} == {
+        "name": "focus",
+        "gain_was": 0.05,
+        "gain": 0.3,
+        "leak_was": 0.0,
+        "leak": 0.01,
+    }
+
+
+def test_a_wrong_idea_of_the_delay_is_found_and_put_right(logs: dict[str, Path]) -> None:
+    figures = figures_of(logs["other"])
+    assert figures["delay_controller_frames"] == 2
+    assert figures["delay_frames"] == 1
+    assert "reckoned with a delay of 2 frames" in figures["warnings"][0]
+    np.testing.assert_allclose(column(figures, "what_if"), column(figures, "was"), atol=1e-5)
+
+
+def test_a_configuration_says_the_same_as_the_words(logs: dict[str, Path], tmp_path: Path) -> None:
+    path = tmp_path / "other.toml"
+    path.write_text("[control]\ntilt_gain=0.2\ngain=0.9\nleak=0.01\ntilt_leak=0.01\n")
+    by_file = figures_of(logs["usual"], wanted("gain=0.3,tilt_gain=0.2", path))
+    assert by_file == figures_of(logs["usual"], wanted(OTHER))
+    table = render(by_file).splitlines()
+    assert sum(" -> " in line for line in table) == len(by_file["modes"])
+    assert any("0.5 -> 0.2" in line and "tilt x" in line for line in table)
+    assert any(f"{by_file['tilt_what_if_mas']:.2f}" in line and "mas" in line for line in table)
+
+
+def test_another_reconstructor_measures_the_same_frames(logs: dict[str, Path], tmp_path: Path) -> None:
+    """pinv by name and as a file are the same; and back from there to the logged one."""
+    by_name = figures_of(logs["usual"], wanted("estimator=pinv"))
+    assert by_name["estimator"] == "pinv"
+    assert by_name["what_if_nm"] > 1.05 * by_name["was_nm"]  # it weighs noisy pixels like the others
+    np.testing.assert_allclose(column(by_name, "open")[:2], column(figures_of(logs["usual"]), "open")[:2], rtol=0.1)
+
+    calibration = read_history(LogReader(logs["usual"])).calibration
+    assert calibration is not None
+    I0, H, good = (array.astype(float) for array in (calibration.reference, calibration.response, calibration.good))
+    R = reconstructor(I0, H, good, 1.0, 0.0, "pinv").astype(np.float32)
+    path = tmp_path / "pinv.fits"
+    calibration_file.save(identified(replace(calibration, reconstructor=R, estimator="pinv")), path)
+    by_file = figures_of(logs["usual"], wanted(calibration=path))
+    np.testing.assert_allclose(column(by_file, "what_if"), column(by_name, "what_if"), rtol=1e-4)
+    back = figures_of(logs["usual"], wanted("estimator=weighted", calibration=path))
+    np.testing.assert_allclose(column(back, "what_if"), column(back, "was"), rtol=1e-4)
+
+
+def test_frames_that_are_not_in_the_log_are_counted(logs: dict[str, Path], monkeypatch: pytest.MonkeyPatch) -> None:
+    """Another reconstructor cannot measure them, and the what-if holds, as it would without those frames."""
+    run = LoggedRun(read_history(LogReader(logs["usual"])))
+    found = run.measured_again(run.calibration)
+    np.testing.assert_allclose(found, run.steps.error_nm, atol=1e-4)
+    found[7::100] = np.nan
+    monkeypatch.setattr(run, "measured_again", lambda *_: found)
+    figures = compared(run, wanted("estimator=pinv"), None, None)
+    assert figures["frames_compared"] == 5 * RATE_HZ - 12
+    assert "15 frames that were used are not in the log" in figures["warnings"][0]
+
+
+def test_modes_of_another_size_shape_the_mirror_alike(logs: dict[str, Path], tmp_path: Path) -> None:
+    """A calibration in which every mode is twice as large measures half of everything."""
+    calibration = read_history(LogReader(logs["usual"])).calibration
+    assert calibration is not None
+    twice = replace(
+        calibration,
+        response=calibration.response * 2,
+        reconstructor=calibration.reconstructor / 2,
+        modes_to_actuators=calibration.modes_to_actuators * 2,
+    )
+    path = tmp_path / "twice.fits"
+    calibration_file.save(identified(twice), path)
+    figures = figures_of(logs["usual"], wanted(calibration=path))
+    np.testing.assert_allclose(column(figures, "what_if"), column(figures, "was") / 2, rtol=1e-4)
+
+
+def test_a_calibration_of_something_else_is_refused(logs: dict[str, Path], tmp_path: Path) -> None:
+    path = tmp_path / "toy.fits"
+    calibration_file.save(identified(toy.calibration()), path)
+    with pytest.raises(CalibrationError, match=r"its noll is \(2, 3, 4\), in the log it is \(2, 3, 4, 5,"):
+        figures_of(logs["usual"], wanted(calibration=path))
+
+
+def test_what_is_fitted_along_needs_a_calibration(logs: dict[str, Path], tmp_path: Path) -> None:
+    path = tmp_path / "shear.toml"
+    path.write_text('[control]\nnuisance = ["shear"]\n')
+    with pytest.raises(ConfigurationError, match=r"weighted\+shear: .* --calibration"):
+        figures_of(logs["usual"], wanted(config=path))
+
+
+INTEGRATOR = """
+from __future__ import annotations
+from dataclasses import dataclass
+import numpy as np
+
+GAIN = np.array([0.2, 0.2] + 12 * [0.3])
+
+@dataclass
+class State:
+    command_nm: np.ndarray
+
+def step(state: State | None, error_nm: np.ndarray) -> tuple[State, np.ndarray]:
+    state = state or State(np.zeros(14))
+    state.command_nm *= 0.99
+    state.command_nm -= GAIN * error_nm
+    return state, state.command_nm
+"""
+
+
+def test_a_controller_of_ones_own_is_folded_like_the_integrator(logs: dict[str, Path], tmp_path: Path) -> None:
+    (tmp_path / "mine.py").write_text(INTEGRATOR)
+    where = f"{tmp_path / 'mine.py'}:step"
+    own, ours = figures_of(logs["usual"], wanted(controller=where)), figures_of(logs["usual"], wanted(OTHER))
+    np.testing.assert_allclose(column(own, "what_if"), column(ours, "what_if"), rtol=1e-4)
+    assert own["controller"] == where
+    assert "gain" not in own["modes"][0]
+    assert where in render(own)
+
+
+@pytest.mark.parametrize("text", ["gain=5", "gain=-0.1", "leak=2", "gain=nan", "limit_nm=-1"])
+def test_figures_out_of_range_are_refused(text: str) -> None:
+    with pytest.raises(ConfigurationError, match=r"--set: every .* must be between"):
+        compared(LoggedRun(history()), wanted(text), None, None)
+
+
+def history(frames: int = 40, **columns: Any) -> History:
+    """The toy's history: an open loop that measures 4 nm of each mode, frame by frame."""
+    values = np.full((frames, 3), 4.0, np.float32)
+    usual: dict[str, Any] = {
+        "sequence": np.array([toy.frame_sequence(count) for count in range(frames)], np.uint64),
+        "time_ns": 10**18 + toy.PERIOD_NS * np.arange(frames),
+        "mode": np.full(frames, LoopMode.CLOSED, np.uint8),
+        "reasons": np.zeros(frames, np.int64),
+        "error_nm": values,
+        "pol_nm": values.copy(),
+        "command_nm": np.zeros((frames, 3), np.float32),
+        "flux_dn": np.ones(frames, np.float32),
+        "saturated_pixels": np.zeros(frames, np.int64),
+    }
+    ends = wire.ControllerState(gain=[0.5] * 3, leak=[0] * 3, limit_nm=[100] * 3, delay_frames=1)
+    log = LogReader(Path("toy.mcap"))
+    log.finished = True
+    return History(
+        log=log,
+        calibration=toy.calibration(),
+        controllers=[ends],
+        camera=wire.CameraState(period_ns=toy.PERIOD_NS * 200, exposure_ns=toy.PERIOD_NS),
+        frame_sequence=usual["sequence"],
+        steps=Steps(**(usual | columns)),
+    )
+
+
+def rows_compared(run: LoggedRun) -> list[int]:
+    return np.flatnonzero(run.rows_to_compare([run.law], run.used)[0]).tolist()
+
+
+def test_which_rows_are_compared() -> None:
+    """Five time constants of a gain of 0.5 are 10 frames to settle."""
+    error, saturated = np.full((40, 3), 4, np.float32), np.zeros(40, np.int64)
+    error[[10, 11]], saturated[[20, 21]] = np.nan, 3
+    run = LoggedRun(history(error_nm=error, pol_nm=error.copy(), saturated_pixels=saturated))
+    assert rows_compared(run) == [row for row in range(10, 40) if row not in (10, 11, 20, 21)]
+
+    mode = np.full(40, LoopMode.OPEN, np.uint8)
+    mode[15:] = LoopMode.CLOSED
+    assert rows_compared(LoggedRun(history(mode=mode))) == list(range(25, 40))
+
+    pol = np.full((60, 3), 4, np.float32)
+    pol[20] -= 1  # it saw a command that the log does not have: it settles anew
+    run = LoggedRun(history(60, pol_nm=pol))
+    assert np.flatnonzero(run.torn).tolist() == [20]
+    assert rows_compared(run) == [*range(10, 20), *range(30, 60)]
+
+    error[:6] = np.nan  # the run begins with the first frame that was used
+    assert len(LoggedRun(history(error_nm=error, pol_nm=error.copy())).steps.sequence) == 34
+
+
+def test_too_little_to_compare_is_said() -> None:
+    with pytest.raises(DataFileError, match="no frame is left to compare: of 40, 0 were refused and 40 have saturated"):
+        rows_compared(LoggedRun(history(saturated_pixels=np.ones(40, np.int64))))
+    nothing = np.full((40, 3), np.nan, np.float32)
+    for short in (history(error_nm=nothing), replace(history(), calibration=None)):
+        with pytest.raises(DataFileError, match="too few frames that a calibrated controller used"):
+            LoggedRun(short)
+    with pytest.raises(DataFileError, match="gains and delay are not known"):
+        LoggedRun(replace(history(), controllers=[]))
+
+
+def test_the_table_of_another_controller_has_no_gains() -> None:
+    own = compared(
+        LoggedRun(history()), WhatIf(controller="mine.py:step"), None, lambda state, error, _: (state, error)
+    )
+    assert "gain" not in render(own)
+    assert "0.5" not in render(own).split("tilt x")[1].splitlines()[0]
+
+
+def test_doubts_are_said() -> None:
+    reasons = np.zeros(40, np.int64)
+    reasons[3:7] = 1 << Reason.STROKE | 1 << Reason.SLEW
+    known = replace(history(reasons=reasons), requests=[wire.Request(name="gain", accepted=True)])
+    known.mirror.limits = np.array([0, 1, 1])
+    known.log.finished = False
+    known.log.damage.append(Damage(77, 5, "the checksum of a chunk is wrong"))
+    figures = compared(LoggedRun(known), WhatIf(), None, None)
+    doubts = "\n".join(figures["warnings"])
+    assert "stroke at 4 frames, slew at 4 frames" in doubts
+    assert "the mirror's own limits acted on 2 commands" in doubts
+    assert "changed 1 times" in doubts
+    assert "could not be measured" in doubts
+    assert "left out: byte 77, the checksum of a chunk is wrong" in doubts
+    assert "the log has no end" in doubts
+
+
+def test_an_open_loop_far_out_is_warned_of() -> None:
+    far = np.full((40, 3), [20.0, -30.0, 12.0], np.float32)
+    run = LoggedRun(history(error_nm=far, pol_nm=far.copy(), mode=np.full(40, LoopMode.OPEN, np.uint8)))
+    figures = compared(run, wanted("tilt_gain=2.5"), None, None)
+    assert figures["compared"] == "the loop was never closed"
+    assert column(figures, "was").tolist() == column(figures, "open").tolist() == [20, 30, 12]
+    delay, linear, unstable, limits = figures["warnings"]
+    assert "could not be measured" in delay
+    assert pytest.approx(5 * 2.424, abs=0.01) == LINEAR_WAVES * 550
+    assert "12.1 nm rms" in linear
+    assert "tilt x with " in linear
+    assert "focus" not in linear
+    assert unstable.endswith("unstable with a delay of 1 frames: tilt x from 2.00 on, tilt y from 2.00 on")
+    assert "tilt x at" in limits

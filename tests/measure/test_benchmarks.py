@@ -1,0 +1,451 @@
+"""The benchmarks' own arithmetic, on made-up figures, and one small run of each for real."""
+
+import json
+import os
+import subprocess
+import sys
+import threading
+import time
+from argparse import Namespace
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from benchmarks import curves, load, runner, step, throughput, view
+from benchmarks.peers import contest, plain
+from benchmarks.peers.contest import BARE, CONTESTANTS, TIMER
+from benchmarks.peers.shared import ACTUATORS, MARKS, NumpyStep, Plan, Problem
+from benchmarks.sizes import Size, configuration, made_up
+from lowfc.contract.configuration import Camera
+from lowfc.control.loop import advance
+from lowfc.programs.measure.control_step import ControlStep
+from lowfc.programs.measure.frame_source import Payloads
+
+pytestmark = pytest.mark.exclusive
+
+ROOT = Path(__file__).parents[2]
+SMALL = Size(side=32, modes=5, mirror_side=10)
+HOST = {"processors": 2, "processor": "P", "kernel": "6.1", "clock_source": "tsc", "python": "3.11"}
+ABOUT = {"host": HOST, "load_before": 0.1, "date": "2026-01-01", "command": "python -m benchmarks it"}
+
+
+def run(*words: str | Path) -> "subprocess.CompletedProcess[str]":
+    command = [sys.executable, "-m", "benchmarks", *map(str, words)]
+    return subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
+
+
+def by_heading(lines: runner.Lines) -> list[dict[str, str]]:
+    assert len({len(line) for line in lines}) == 1
+    return [dict(reversed(list(zip(lines[0], line, strict=True)))) for line in lines[1:]]
+
+
+def test_both_kinds_of_table_have_every_cell() -> None:
+    lines = [["a", "bb", "ff"], ["ccc", "1", "d|e"]]
+    assert runner.in_columns(lines) == "a    bb  ff\nccc   1  d|e"
+    assert runner.in_markdown(lines) == "| a | bb | ff |\n|---|---|---|\n| ccc | 1 | d/e |"
+    assert runner.ranged([30.0, 20.0, 125.0]) == "30.0 (20.0 to 125)"
+
+
+# The control step
+
+
+def test_a_step_keeps_nothing_and_takes_no_more_than_the_frame_and_the_shapes(monkeypatch: pytest.MonkeyPatch) -> None:
+    config = configuration(SMALL, step.RATE_HZ)
+    calibration, frames = made_up(SMALL, config)
+    found = step.allocated(ControlStep(config, calibration, 0), Payloads(frames))
+    assert abs(found["kept_bytes"]) < 1
+    assert 2 * SMALL.pixels < found["peak_bytes"] < 2 * SMALL.pixels + 5 * 4 * SMALL.actuators + 4096
+    kept, original = [], advance.integrate
+    monkeypatch.setattr(advance, "integrate", lambda *given: (kept.append(bytes(100)), original(*given))[1])
+    assert step.allocated(ControlStep(config, calibration, 0), Payloads(frames))["kept_bytes"] > 100
+
+
+def test_the_stages_are_those_of_a_step_and_add_up(monkeypatch: pytest.MonkeyPatch) -> None:
+    nothing = step.set_up(None, None, lock_memory=False, disable_cpu_idle=False)
+    monkeypatch.setattr(step, "set_up", lambda *_, **__: nothing)  # this process stays what it is
+    original = advance.limit
+    found = step.measure(Namespace(seconds=0.2), lambda _: None)
+    assert advance.limit is original
+    (lines,) = step.tables(found)
+    assert [line[0] for line in lines[1:]] == [*step.STAGES, step.REST, step.STEP, step.PRODUCT]
+    assert all(float(cell) >= 0 for line in lines[1:] for cell in line[1:])
+    over = found["hot_us"][step.STEP]["p50"] / found["hot_us"][step.PRODUCT]["p50"]
+    assert f"{over:.1f} times" in step.about(found)
+
+
+# Cost curves
+
+
+def test_a_made_up_calibration_sees_noise_and_has_the_bytes_that_are_counted() -> None:
+    size = Size(32, 7, 16)
+    calibration, frames = made_up(size, configuration(SMALL, 100.0))
+    pixels = frames.reshape(len(frames), -1).astype(float) - calibration.dark
+    seen = pixels / pixels.sum(axis=1, keepdims=True) - calibration.reference
+    assert 0.5 < np.sqrt(np.mean((seen @ calibration.reconstructor.T) ** 2)) < 2
+    touched = ("reconstructor", "reference", "dark", "good", "modes_to_actuators")
+    assert size.bytes == sum(getattr(calibration, name).nbytes for name in touched) + frames[0].nbytes
+
+
+def test_a_step_that_holds_its_command_is_no_measurement(monkeypatch: pytest.MonkeyPatch) -> None:
+    dazzled = configuration(SMALL, 100.0).model_copy(update={"camera": Camera(full_well_e=500.0)})
+    monkeypatch.setattr(curves, "configuration", lambda size, rate_hz: dazzled)
+    with pytest.raises(RuntimeError, match="SATURATED"):
+        curves.step_figures(SMALL, 0.01)
+
+
+@pytest.mark.slow
+def test_a_loop_of_sizes_without_an_optical_model_is_run() -> None:
+    found = curves.loop_figures(Size(side=32, modes=40, mirror_side=16), 500.0, 0.5)
+    assert found["frames"] > 200
+    assert found["echo_us"]["p50"] > 0
+    assert 0 < found["frame_to_command_us"]["p50"] <= found["frame_to_command_us"]["p99"]
+    assert found["frame_to_command_us"]["cpu"] > 0
+    assert found["frames_without_command"] < found["frames"]
+
+
+def repeat(step_us: float, without: int = 0, **more: Any) -> dict[str, Any]:
+    alone = {"step_us": step_us, "stream_us": 10.0, "products_us": 15.0}
+    figures: dict[str, Any] = {name: {"p50": us, "p99": 2 * us, "cpu": us} for name, us in alone.items()}
+    if not more:
+        figures |= {"frame_to_command_us": {"p50": 200.0, "p99": 400.0}, "echo_us": {"p50": 50.0, "p99": 60.0}}
+        figures |= {"frames": 100, "frames_without_command": without}
+    return figures | more
+
+
+def curves_result() -> dict[str, Any]:
+    points = [
+        curves.point(Size(side=32), [repeat(30.0), repeat(20.0, 2), repeat(25.0)]),
+        curves.point(Size(side=48), [repeat(50.0, failure="the mirror ended")]),
+    ]
+    return ABOUT | {
+        "curves": {"pixels": points, "modes": points[:1], "actuators": []},
+        "default": {"side": 80, "modes": 20, "mirror_side": 34},
+        "seconds": 1.0,
+        "repeats": 3,
+        "rate_hz": 250.0,
+        "failed": ["48: the mirror ended"],
+    }
+
+
+def test_a_point_is_the_median_of_its_repeats_and_says_what_the_limit_is() -> None:
+    result = json.loads(json.dumps(curves_result()))
+    pixels, modes = curves.tables(result)
+    first, second = by_heading(pixels)
+    assert first["pixels"] == "1024 (32 x 32)"
+    assert modes[1][0] == "20"
+    assert first["step p50, us"] == "25.0 (20.0 to 30.0)"
+    assert first["step of the limit"] == "2.5"
+    assert first["read at, GB/s"] == f"{Size(side=32).bytes / 10.0 / 1e3:.0f}"
+    assert first["frames without a command"] == "2 of 300"
+    assert second["loop p50, us"] == "failed"
+    assert curves.picture(result).startswith(b"\x89PNG")
+    for markdown in (True, False):
+        text = runner.said(curves, result, markdown=markdown)
+        assert "Failed, 48: the mirror ended." in text
+        assert "Measured 2026-01-01 on 2 processors of P, Linux 6.1, clock source tsc" in text
+
+
+def test_the_curves_of_a_few_sizes_from_the_command_line(tmp_path: Path) -> None:
+    sizes = ("--pixels", "32", "--modes", "20", "--actuators", "--no-loop")
+    done = run("curves", *sizes, "--seconds", "0.02", "--repeats", "2", "--json", "--plot", tmp_path / "curves.png")
+    assert done.returncode == 0, done.stderr
+    found = json.loads(done.stdout)
+    assert [one["pixels"] for one in found["curves"]["pixels"]] == [1024]
+    assert [one["pixels"] for one in found["curves"]["modes"]] == [6400]
+    assert found["curves"]["actuators"] == []
+    for name in ("step_us", "stream_us", "products_us"):
+        figures = found["curves"]["pixels"][0][name]
+        assert 0 < figures["p50"] <= figures["p99"]
+        assert figures["cpu"] > 0
+    assert (tmp_path / "curves.png").read_bytes().startswith(b"\x89PNG")
+    (tmp_path / "curves.json").write_text(done.stdout)
+    again = run("curves", "--render", tmp_path / "curves.json", "--markdown")
+    assert again.stdout == runner.said(curves, found, markdown=True) + "\n"
+    nothing = run("curves", "--pixels", "--modes", "--actuators")
+    assert (nothing.returncode, nothing.stderr.split(":")[0]) == (2, "error")
+
+
+# The highest rate
+
+
+def test_a_grid_is_geometric_and_has_both_ends() -> None:
+    assert throughput.grid(500, 800, 1.1) == [500, 550, 605, 666, 732]
+    assert throughput.grid(1000, 4000, 2) == [1000, 2000, 4000]
+    assert throughput.grid(700, 700, 1.1) == [700]
+
+
+@pytest.mark.parametrize("edge", range(-1, 32))
+def test_the_search_finds_the_last_rate_that_holds(edge: int) -> None:
+    asked: list[int] = []
+
+    def sustains(place: int) -> bool:
+        asked.append(place)
+        return place <= edge
+
+    assert throughput.search(sustains, 32) == edge
+    assert all(asked.count(place) == 2 for place in (edge, edge + 1) if 0 <= place < 32)
+    assert len(asked) <= 6 + 2
+
+
+@pytest.mark.parametrize("wrong", [7, 15, 11, 12, 13])
+def test_the_search_is_not_misled_by_one_wrong_verdict(wrong: int) -> None:
+    asked: set[int] = set()
+
+    def sustains(place: int) -> bool:
+        mistaken = place == wrong and place not in asked
+        asked.add(place)
+        return (place <= 11) != mistaken
+
+    assert throughput.search(sustains, 16) == 11
+
+
+def good(**changed: Any) -> dict[str, Any]:
+    latency_us = {"p50": 200.0, "p99": 400.0}
+    one = {"asked_hz": 1000.0, "rate_hz": 995.0, "frames": 10_000, "without_command": 10, "messages_lost": 0}
+    return one | {"frame_to_command_us": latency_us, "usage": {}} | changed
+
+
+@pytest.mark.parametrize(
+    ("one", "complaints"),
+    [
+        (good(), []),
+        (good(messages_lost=None), []),
+        (good(rate_hz=989.0), ["989 frames a second"]),
+        (good(without_command=11), ["0.11 % of the frames without a command"]),
+        (good(messages_lost=1), ["1 messages lost"]),
+        ({"asked_hz": 1000.0, "failure": "it fell"}, ["it fell"]),
+    ],
+)
+def test_a_rate_holds_where_nothing_is_to_be_complained_of(one: dict[str, Any], complaints: list[str]) -> None:
+    assert throughput.complaints(one) == complaints
+
+
+def test_a_way_has_its_highest_rate_and_why_it_goes_no_faster(monkeypatch: pytest.MonkeyPatch) -> None:
+    shares = {"camera": (0.5, "0"), "controller": (0.6, "1"), "mirror": (0.3, "1"), "recorder": (0.2, "0,1")}
+    usage = {role: {"share": share, "processors": where} for role, (share, where) in shares.items()}
+
+    def run_once(words: Sequence[str], rate_hz: float, seconds: float) -> dict[str, Any]:
+        lost = 0 if rate_hz <= 1300 else 7
+        return good(asked_hz=rate_hz, rate_hz=rate_hz, messages_lost=lost, usage=usage, commands_late=0.25)
+
+    monkeypatch.setattr(throughput, "run_once", run_once)
+    rates = throughput.grid(1000, 2000, 1.1)
+    way = throughput.find([], rates, 1.0, lambda _: None)
+    assert way["highest_hz"] == 1210
+    none = throughput.find([], [1400.0], 1.0, lambda _: None)
+    assert none["highest_hz"] is None
+    free = {"free": good(asked_hz=None, rate_hz=2345.6), "fallen": {"asked_hz": None, "failure": "it fell"}}
+    ways = {"simulated": way, "none": none}
+    result = ABOUT | {"ways": ways, "free_running": free, "seconds": 1.0, "rates_hz": rates}
+    speeds, use = throughput.tables(json.loads(json.dumps(result)))
+    assert speeds[1] == ["simulated", "1210", "200", "400", "25 %", "1331 Hz: 7 messages lost"]
+    assert speeds[2] == ["none", "none", "", "", "", "1400 Hz: 7 messages lost"]
+    assert speeds[3][:3] == ["free", "2346", "200"]
+    assert speeds[4][-1] == "it fell"
+    assert use[1] == ["simulated", "1210", "50 % (0)", "60 % (1)", "30 % (1)", "20 % (0,1)", "0: 50 %, 1: 90 %"]
+    assert use[2][:2] == ["simulated", "1000"]
+    assert f"{len(way['runs']) + len(none['runs'])} runs on a grid of 8 rates" in throughput.about(result)
+
+
+@pytest.mark.slow
+def test_a_loop_with_the_simulated_camera_is_measured_for_real() -> None:
+    one = throughput.run_once(throughput.WAYS["simulated camera, recorder"], 100.0, 1.5)
+    assert 0 < one["frames"] <= 151
+    assert one["messages_lost"] is not None
+    assert 0 <= one["commands_late"] <= 1
+    assert set(one["usage"]) == {*load.LOOP, "recorder"}
+
+
+def test_a_command_that_fails_says_why() -> None:
+    one = throughput.run_once(["--camera", "simulated", "--free-running"], None, 1.0)
+    assert "has a schedule" in throughput.complaints(one)[0]
+
+
+# What processes use
+
+
+def moment(at_s: float, **used_s: float) -> load.Moment:
+    return load.Moment(at_s, {role: load.Used(one, "0", 2_000_000) for role, one in used_s.items()})
+
+
+def test_shares_are_of_the_time_in_which_all_were_there() -> None:
+    moments = [moment(0.0, camera=5.0)]
+    moments += [moment(1 + tenth / 10, camera=9 + tenth / 20, controller=1, mirror=tenth / 40) for tenth in range(12)]
+    moments += [moment(3.0, camera=99.0)]
+    found = load.shares(moments, 1.0)
+    assert found["camera"] == {"share": pytest.approx(0.5), "processors": "0", "mb": 2.0}
+    assert found["controller"]["share"] == 0
+    assert found["mirror"]["share"] == pytest.approx(0.25)
+    assert load.shares(moments[:3], 1.0) == load.shares([], 1.0) == {}
+
+
+def test_processes_are_known_by_what_python_was_told_to_run() -> None:
+    assert load.role_of(["python", "-P", "-m", "sim_camera", "--run", "x"]) == "camera"
+    assert load.role_of(["python", "-m", "lowfc", "record"]) == "recorder"
+    assert load.role_of(["python", "-m", "lowfc", "latency"]) is None
+    assert load.role_of(["python", "-m"]) is load.role_of([]) is None
+
+
+def test_real_processes_below_this_one_are_watched() -> None:
+    busy, idle = "while True: pass", "import time; time.sleep(60)"
+    programs = {busy: ["sim_camera"], idle: ["lowfc", "controller"], f"{idle} ": ["sim_dm"]}
+    children = [subprocess.Popen([sys.executable, "-c", code, "-m", *words]) for code, words in programs.items()]
+    try:
+        with load.watched(os.getpid()) as moments:
+            time.sleep(1.2)
+    finally:
+        for child in children:
+            child.kill()
+            child.wait()
+    found = load.shares(moments, 1.0)
+    assert set(found) == load.LOOP
+    assert found["camera"]["share"] > 0.1 > found["controller"]["share"]
+    assert found["mirror"]["processors"] == found["camera"]["processors"] != ""
+    assert found["mirror"]["mb"] > 1
+
+
+# A view
+
+
+def test_what_a_view_costs_is_a_ratio_pair_by_pair(monkeypatch: pytest.MonkeyPatch) -> None:
+    order: list[bool] = []
+
+    def run_lowfc(words: Sequence[str], seconds: float) -> dict[str, Any]:
+        web = "--web" in words
+        order.append(web)
+        us = {"p50": 100.0 * len(order) * (1 + web), "p99": 300.0}
+        usage = {"view": {"share": 0.25, "mb": 200.0}} if web else {}
+        lost = {"frames_published": 9, "frames_skipped": web, "frames_missing": 0, "messages_lost": 0}
+        return {"latency_us": dict.fromkeys(("frame_to_command", "frame_to_mirror"), us), "usage": usage, **lost}
+
+    monkeypatch.setattr(view, "run_lowfc", run_lowfc)
+    found = view.measure(Namespace(repeats=2, rate=1000.0, seconds=1.0), lambda _: None)
+    assert order == [False, True, True, False]
+    (lines,) = view.tables(found)
+    first, second, *_ = lines[1:]
+    assert first == ["frame to command p50", "250 (100 to 400)", "500 (400 to 600)", "2.750 (1.500 to 4.000)"]
+    assert second[3] == "1.000 (1.000 to 1.000)"
+    assert ["frames skipped", "0", "2", ""] in lines
+    assert "25.0 (25.0 to 25.0) % of one processor and 200 (200 to 200) MB" in view.about(found)
+
+
+@pytest.mark.slow
+def test_the_view_that_is_measured_is_a_real_one() -> None:
+    found = view.measure(Namespace(repeats=1, rate=200.0, seconds=3.0), lambda _: None)
+    ((without, with_),) = ([pair["without"], pair["with"]] for pair in found["pairs"])
+    assert "view" not in without["usage"]
+    assert with_["usage"]["view"]["mb"] > 50
+    assert with_["frames_published"] == without["frames_published"] == 600
+
+
+# The contest
+
+
+def one(p50: float, p99: float, without: int = 0, **more: Any) -> dict[str, Any]:
+    span = {"p50": p50, "p99": p99, "p99_9": 2 * p99, "max": 3 * p99}
+    counts = {"frames": 1000, "without_command": without, "sent_late": 0}
+    return counts | {"frame_to_command": span, "frame_to_mirror": None} | more
+
+
+def row(contestant: str, *runs: dict[str, Any], scheduling: str = "normal", **more: Any) -> dict[str, Any]:
+    fixed = {"contestant": contestant, "what": "what it is", "scheduling": scheduling, "failures": []}
+    return fixed | {"repeats": list(runs)} | more
+
+
+def test_the_figures_of_a_run_are_those_of_its_times(tmp_path: Path) -> None:
+    Plan(1000.0, 6, {}, {}).write(tmp_path)
+    due = np.arange(7) * 1_000_000 + 50_000_000
+    published = due + 10_000
+    published[5] += 1_200_000
+    commanded, received = published + np.arange(7) * 1000, published + 50_000
+    commanded[4] = received[4] = 0
+    for name, times in zip(MARKS, (due, published, commanded, received), strict=True):
+        times.astype(np.int64).tofile(tmp_path / name)
+    found = contest.figures(tmp_path, 2)  # frames 3 to 6
+    assert found["frames"] == 4
+    assert found["without_command"] == found["sent_late"] == 1
+    assert found["frame_to_command"] == {"p50": 5.0, "p90": 6.0, "p99": 6.0, "p99_9": 6.0, "max": 6.0}
+    assert set(found["frame_to_mirror"].values()) == {50.0}
+
+
+def test_the_table_has_ranges_and_ratios_within_a_class_and_who_is_not_there() -> None:
+    rows = [
+        row(TIMER, one(50, 60)),
+        row(BARE, one(100, 200), one(110, 230), one(150, 220)),
+        row("other", one(55, 440, 3), one(66, 110, 9), one(40, 120, 1)),
+        row(BARE, one(1000, 1000), scheduling="FIFO"),
+        row("other", one(500, 100), scheduling="FIFO"),
+        row("pyrtcao, stock", missing="not installed in python: get it"),
+        row("pyrtcao, fused", failures=["it fell"]),
+        row("deaf", one(1, 1, 1000, frame_to_command=None)),
+    ]
+    rules = {"repeats": 1, "seconds": 1.0, "rate_hz": 1000.0, "warm_up": 5}
+    result = ABOUT | {
+        "rows": rows,
+        "rules": rules,
+        "notes": ["a note"],
+        "pinned_to": [0, 1],
+        "versions": {"lowfc": "1"},
+    }
+    (lines,) = contest.tables(result)
+    timer, bare, other, _, fifo, absent, failed, deaf = by_heading(lines)
+    assert bare["p50"] == "110 (100 to 150)"
+    assert bare["max"] == "660 (600 to 690)"
+    assert (other["p50 of zenoh's"], lines[3][7]) == ("0.50", "0.55")
+    assert other["without a command"] == "3 of 1000"
+    assert (fifo["p50 of zenoh's"], lines[5][7]) == ("0.50", "0.10")
+    assert timer["without a command"] == timer["p50 of zenoh's"] == ""
+    assert (absent["p50"], failed["p50"], deaf["p50"]) == ("not installed", "failed", "")
+    assert deaf["without a command"] == "1000 of 1000"
+    about = contest.about(result)
+    for words in ("CLOCK_MONOTONIC", "get it", "a note", "it fell"):
+        assert words in about
+
+
+def test_pyrtcao_is_said_to_be_missing_and_how_to_get_it() -> None:
+    done = run("peers", "--only", "pyrtcao, stock", "--pyrtcao", "/no/such/python", "--repeats", "1", "--json")
+    assert done.returncode == 0, done.stderr
+    found = json.loads(done.stdout)
+    assert all("/no/such/python" in one["missing"] for one in found["rows"])
+    assert "--pyrtcao PYTHON" in found["command"]
+
+
+def test_the_step_is_an_integrator_with_a_leak() -> None:
+    problem = Problem()
+    plain_step, pixels = NumpyStep(problem), problem.frames[0]
+    error_nm = problem.R @ (pixels.ravel() - problem.I0)
+    for command_nm in (-0.3 * error_nm, -0.3 * 1.99 * error_nm):
+        actuators = np.frombuffer(plain_step.command(pixels.tobytes()), np.float32)
+        assert actuators.shape == (ACTUATORS,)
+        np.testing.assert_allclose(actuators, problem.to_actuators @ command_nm, rtol=1e-3, atol=1e-3)
+
+
+def test_a_ring_hands_over_the_newest_and_wakes(tmp_path: Path) -> None:
+    there = plain.Ring(tmp_path / "ring", 9, make=True)
+    here = plain.Ring(tmp_path / "ring", 9, make=False)
+    for number in range(1, 12):  # once around, and nobody takes
+        there.put(number, f"message{number:02}".encode())
+    assert here.take() == (11, b"message11")
+    later = threading.Timer(0.05, there.put, (12, b"message12"))
+    later.start()
+    assert here.take() == (12, b"message12")
+    later.join()
+
+
+@pytest.mark.parametrize("name", ["shared memory, semaphore", "zenoh", pytest.param("lowfc", marks=pytest.mark.slow)])
+def test_a_contestant_is_really_run(name: str) -> None:
+    (chosen,) = (one for one in CONTESTANTS if one.name == name)
+    seconds, rate_hz = 0.5, 500.0
+    rules = Namespace(seconds=seconds, warm_up=10, rate_hz=rate_hz, pyrtcao=sys.executable)
+    found = contest.one_run(chosen, rules, 0)
+    assert found["frames"] == pytest.approx(seconds * rate_hz, abs=10)  # lowfc warms up by time
+    assert found["without_command"] < found["frames"]
+    there, back = found["frame_to_command"], found["frame_to_mirror"]
+    assert 0 < there["p50"] <= there["p99"] <= there["max"]
+    assert back["max"] > there["p50"]
+
+
+# The document

@@ -1,0 +1,370 @@
+"""Latencies: figures of made-up frames, a real loop with its log, and two results compared."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import typer
+from typer.testing import CliRunner
+
+from lowfc.adapters.bus.run import runtime_base
+from lowfc.adapters.files import factory
+from lowfc.adapters.process.clock import HostClock
+from lowfc.contract.configuration import load
+from lowfc.contract.errors import DataFileError
+from lowfc.contract.messages import RawImage, image
+from lowfc.programs.measure.control_step import ControlStep, time_alone
+from lowfc.programs.measure.frame_source import Payloads, prepared_frames
+from lowfc.programs.measure.latency.command import Camera, _configuration, latency
+from lowfc.programs.measure.latency.figures import (
+    LOOP_SPANS,
+    SPANS,
+    STAGES,
+    WARM_UP_S,
+    Frames,
+    edges_us,
+    histogram,
+    join,
+    percentiles,
+    repeat_figures,
+)
+from lowfc.programs.measure.latency.summary import compare, ratio, together
+from lowfc.programs.measure.latency.text import compared, sparkline, table
+from tests.support.loops import until
+
+pytestmark = pytest.mark.exclusive
+
+START = 1_700_000_000 << 32
+MS = 1_000_000
+RATE_HZ, SECONDS = 200, 0.5
+HISTORY = Path(__file__).parents[2] / "benchmarks" / "history"
+
+
+def frames(
+    put_ns: Any = 1000,
+    command_us: Any = 100.0,
+    late_us: Any = 0.0,
+    mirror_lost: tuple[int, ...] = (),
+    *,
+    scheduled: bool = True,
+) -> Frames:
+    """Frames put so (or so many, 1 ms apart), commanded after so long and applied 50 us later; NaN: never."""
+    put_ns = np.arange(put_ns) * MS if isinstance(put_ns, int) else put_ns
+    sequence = START + np.arange(put_ns.size, dtype=np.uint64)
+    command_ns = np.broadcast_to(np.asarray(command_us) * 1e3, put_ns.shape)
+    timed = np.isfinite(command_ns)
+    stages: dict[str, Any] = dict.fromkeys(("transport", *STAGES), np.full(timed.sum(), 40_000))
+    stages["frame_to_command"] = command_ns[timed].astype(np.int64)
+    applied = timed & ~np.isin(np.arange(put_ns.size), mirror_lost)
+    mirror_ns = (put_ns[applied] + command_ns[applied] + 50_000).astype(np.int64)
+    due_ns = put_ns - np.asarray(np.round(np.asarray(late_us) * 1e3), np.int64) if scheduled else None
+    return join(sequence, put_ns, due_ns, (sequence[timed], stages), (sequence[applied], mirror_ns))
+
+
+def test_percentiles_are_values_that_were_measured() -> None:
+    found = percentiles(np.random.default_rng(1).permutation(np.arange(1.0, 1001.0)))
+    assert found == {"p50": 500, "p90": 900, "p99": 990, "p99_9": 999, "max": 1000}
+    assert percentiles(np.array([np.nan, 3.0])) == dict.fromkeys(("p50", "p90", "p99", "p99_9", "max"), 3.0)
+    assert percentiles(np.array([np.nan])) is None
+
+
+def test_what_was_heard_is_put_beside_what_was_sent() -> None:
+    sequence = START + np.arange(4, dtype=np.uint64)
+    timed = sequence[[0, 1, 3]]  # the third frame was skipped
+    columns = {"transport": 10, "wakeup": 20, "compute": 30, "publish": 40, "frame_to_command": 100}
+    stages = {stage: np.array([0, 1, 3]) + value for stage, value in columns.items()}
+    states = sequence[[0, 0, 3]], np.array([1200, 9999, 4200])  # the first one was said twice, the second one lost
+    put_ns = np.array([1000, 2000, 3000, 4000])
+    found = join(sequence, put_ns, put_ns - 5, (timed, stages), states)
+    assert found.commanded.tolist() == [True, True, False, True]
+    expected_ns = {
+        "frame_to_receive": [10, 11, np.nan, 13],
+        "frame_to_command": [100, 101, np.nan, 103],
+        "compute": [30, 31, np.nan, 33],
+        "frame_to_mirror": [200, np.nan, np.nan, 200],
+        "due_to_frame": [5, 5, 5, 5],
+    }
+    for span, values_ns in expected_ns.items():
+        np.testing.assert_allclose(found.spans_us[span] * 1e3, values_ns)
+    commands = join(sequence, put_ns, None, (timed, stages), states, sequence[:3])
+    assert commands.commanded.tolist() == [True, True, True, False]
+
+
+def test_spans_of_a_late_source_count_from_the_moment_due() -> None:
+    spans = frames(3, late_us=[0, 0, 700]).spans_us
+    assert list(spans) == list(SPANS)
+    expected_us = {
+        "frame_to_command": [100, 100, 100],
+        "receive_to_command": [60, 60, 60],
+        "command_to_mirror": [50, 50, 50],
+        "frame_to_mirror": [150, 150, 150],
+        "due_to_frame": [0, 0, 700],
+        "due_to_command": [100, 100, 800],
+        "due_to_mirror": [150, 150, 850],
+    }
+    for span, values_us in expected_us.items():
+        np.testing.assert_allclose(spans[span], values_us)
+    assert "due_to_command" not in frames(3, scheduled=False).spans_us
+
+
+def test_figures_leave_the_warm_up_out_and_count_what_is_not_there() -> None:
+    command_us = np.full(1000, 100.0)
+    command_us[:500] = 9000  # of the warm-up
+    command_us[700] = np.nan
+    command_us[900] = 400
+    found = repeat_figures(frames(command_us=command_us, mirror_lost=(800,)))
+    assert (found["frames"], found["warm_up_frames"]) == (500, 500)
+    assert (found["frames_without_command"], found["frames_untimed"], found["frames_without_mirror_state"]) == (1, 0, 2)
+    assert (found["frames_crowded_out"], found["frames_sent_late"]) == (0, 0)
+    assert found["rate_hz"] == pytest.approx(1000)
+    assert found["latency_us"]["frame_to_command"] == {"p50": 100, "p90": 100, "p99": 100, "p99_9": 400, "max": 400}
+    assert sum(found["histogram"]["frame_to_command"]) == 499
+    assert max(found["over_time"]["max_us"]) == 400
+    assert found["over_time"]["seconds"][0] == 0
+
+
+def test_frames_of_a_burst_are_told_from_those_lost_alone() -> None:
+    put_ns = np.arange(1000) * MS
+    due_ns = put_ns.copy()
+    put_ns[800] = put_ns[802] - 2000  # two that a stalled source put late, and the next on their heels
+    put_ns[801] = put_ns[802] - 1000
+    command_us = np.full(1000, 100.0)
+    command_us[[600, 800, 801]] = np.nan
+    found = repeat_figures(frames(put_ns, command_us, (put_ns - due_ns) / 1e3))
+    assert (found["frames_without_command"], found["frames_crowded_out"]) == (3, 2)
+    assert found["frames_sent_late"] == 1  # by 2 ms; the other one by less than its period
+
+
+def test_no_frames_are_no_latencies() -> None:
+    nothing = repeat_figures(frames(0))
+    assert (nothing["frames"], nothing["latency_us"]) == (0, {})
+    assert repeat_figures(frames(1, scheduled=False))["frames_sent_late"] is None
+
+
+def test_a_histogram_holds_every_value() -> None:
+    counts = histogram(np.array([0.1, 1.0, 100.0, 101.0, 1e9, np.nan]))
+    assert counts.sum() == 5
+    assert counts[0] == 2  # with the one below
+    assert counts[-1] == 1
+    bin_of_100 = int(np.searchsorted(edges_us(), 100.0, side="right")) - 1
+    assert counts[bin_of_100] == 2
+    assert sparkline([0, 1, 0, 1000, 0]) == " ▁ █"
+    assert len(sparkline([1] * 160)) == 32
+
+
+def repeat(command_us: float, echo_us: float = 100, step_us: float = 50, **changes: Any) -> dict[str, Any]:
+    """A repeat in which everything took the same."""
+    names = ("p50", "p90", "p99", "p99_9", "max")
+    figures = repeat_figures(frames(command_us=float(command_us)))
+    alone = {
+        "echo_us": dict.fromkeys(names, echo_us),
+        "step_us": dict.fromkeys(names, step_us),
+        "hot_step_us": dict.fromkeys(names, step_us / 2),
+        "timer_us": dict.fromkeys(names, 5.0),
+    }
+    return (
+        figures | alone | {"echo_lost": 1, "frames_skipped": 2, "frames_missing": 0, "reasons": {"LATE": 1}} | changes
+    )
+
+
+def test_repeats_come_together_as_medians_with_their_range() -> None:
+    found = together([repeat(100), repeat(300), repeat(110, echo_us=20)])
+    command = found["latency_us"]["frame_to_command"]
+    assert (command["p50"], command["max"]) == (110, 300)
+    assert found["spread_us"]["frame_to_command"]["p99"] == [100, 300]
+    assert found["echo_us"]["round_trip"]["p50"] == 100
+    assert found["ratio"]["p50"] == pytest.approx(110 / 60)  # the median of 100/100, 300/100 and 110/60
+    assert found["ratio_spread"]["p99"] == [1.0, 3.0]
+    assert found["ratio_hot"]["p50"] == pytest.approx(110 / 35)
+    assert (found["frames"], found["frames_skipped"], found["echo_lost"]) == (1500, 6, 3)
+    assert found["reasons"] == {"LATE": 3}
+    assert sum(found["histogram"]["counts"]["frame_to_command"]) == 1500
+    assert len(found["histogram"]["edges_us"]) == len(found["histogram"]["counts"]["frame_to_command"]) + 1
+    assert ratio(repeat(300), "p99", "ratio_hot") == 4
+
+
+def test_a_difference_is_set_against_the_spread() -> None:
+    before, after = together([repeat(100), repeat(130)]), together([repeat(120), repeat(140)])
+    rows = {(row["name"], row["at"]): row for row in compare(before, after)["rows"]}
+    command = rows["frame_to_command", "p50"]
+    assert (command["a"], command["b"], command["difference"], command["spread"]) == (115, 130, 15, 30)
+    assert (command["better"], command["beyond_spread"]) == ("a", False)
+    assert command["ratio"] == pytest.approx(130 / 115)
+    far = {(row["name"], row["at"]): row for row in compare(before, together([repeat(10), repeat(11)]))["rows"]}
+    assert far["frame_to_command", "p99"]["better"] == "b"
+    assert far["frame_to_command", "p99"]["beyond_spread"] is True
+    assert far["over_echo_and_step", "p50"]["b"] == pytest.approx(0.105)
+    assert far["frame_to_receive", "p50"]["better"] == "same"
+    single = compare(before, together([repeat(10)]))["rows"]
+    assert {row["spread"] for row in single} == {None}
+    assert "within the spread" in compared({"a": "a.json", "b": "b.json"} | compare(before, after))
+
+
+@pytest.mark.parametrize("file", sorted(HISTORY.glob("*.json")), ids=lambda file: file.stem)
+def test_the_figures_of_a_release_can_be_compared_with_todays(file: Path) -> None:
+    today = together([repeat(100), repeat(130)])
+    found = compare(json.loads(file.read_text()), today)
+    assert {(row["name"], row["at"]) for row in found["rows"]} >= {
+        ("frame_to_mirror", "p99"),
+        ("over_echo_and_step", "p50"),
+    }
+    assert found["counts"]["frames"][1] == today["frames"]
+    assert "skipped by the controller: a 0, b 4" in compared({"a": "a.json", "b": "b.json"} | found)
+
+
+def test_a_step_alone_takes_every_frame_as_the_controller_does() -> None:
+    config = load(None, {"control.start_mode": "closed", "control.tilt_leak": 0.01, "control.leak": 0.01})
+    optics = factory.twin(config, None, lambda _: None)
+    calibration = factory.analytic_calibration(config, optics, factory.mirror_on_twin(config, optics, lambda _: None))
+    pixels = prepared_frames(config)
+    assert len({frame.tobytes() for frame in pixels}) == len(pixels)
+    payloads = Payloads(pixels)
+    payload = payloads.at(len(pixels) + 1, 123)
+    assert RawImage.FromString(payload) == image(pixels[1], 123, "lowfc_camera")
+    clock = HostClock()
+    step = ControlStep(config, calibration, clock.host_ns())
+    paced, hot = time_alone(step, payloads, clock, 0.1, MS), time_alone(step, payloads, clock, 0.05, None)
+    assert 0 < paced.timer_ns.size == paced.step_ns.size <= 101
+    assert hot.timer_ns.size == 0
+    assert paced.timer_ns.min() >= 0
+    assert step.state.frames_used == paced.step_ns.size + hot.step_ns.size  # none was refused
+    assert not step.state.counts
+
+
+def test_plain_scheduling_leaves_nothing_of_the_set_up() -> None:
+    plain = _configuration(None, None, Camera.PREPARED, plain=True).realtime
+    assert not any(
+        (plain.priority, plain.lock_memory, plain.disable_cpu_idle, plain.controller_cpus, plain.mirror_cpus)
+    )
+
+
+def invoke(*words: str | Path) -> Any:
+    app = typer.Typer()
+    app.command()(latency)
+    return CliRunner().invoke(app, [str(word) for word in words])
+
+
+def runs() -> set[Path]:
+    """Directories of runs that are there: those of other tests, and what a run has left behind."""
+    return {path for path in runtime_base().iterdir() if path.is_dir()}
+
+
+@pytest.fixture(scope="module")
+def measured(tmp_path_factory: pytest.TempPathFactory) -> tuple[dict[str, Any], Path]:
+    folder = tmp_path_factory.mktemp("latency")
+    (folder / "loop.toml").write_text(f'[recorder]\nfolder = "{folder}"\nmin_free_mb = 0\n')
+    words = ("--duration", str(SECONDS), "--rate", str(RATE_HZ), "--record", "--config", folder / "loop.toml")
+    before = runs()
+    done = invoke(*words, "--plot", folder / "latency.png", "--json")
+    assert done.exit_code == 0, (done.output, done.exception)
+    assert runs() == before
+    (folder / "a.json").write_text(done.stdout)
+    return json.loads(done.stdout), folder
+
+
+def test_every_frame_of_a_real_loop_is_in_the_account(measured: tuple[dict[str, Any], Path]) -> None:
+    figures, _ = measured
+    sent = round(RATE_HZ * (SECONDS + WARM_UP_S))
+    assert figures["frames"] + figures["warm_up_frames"] == sent
+    assert figures["frames_untimed"] == figures["frames_missing"] == 0
+    counted = sum(figures["histogram"]["counts"]["frame_to_command"])
+    assert counted == figures["frames"] - figures["frames_without_command"] > 0.5 * figures["frames"]
+    assert set(figures["latency_us"]) >= set(LOOP_SPANS)
+    for span in (*LOOP_SPANS[:3], "due_to_command", "frame_to_mirror"):
+        values = figures["latency_us"][span]
+        assert 0 < values["p50"] <= values["p90"] <= values["p99"] <= values["p99_9"] <= values["max"]
+    assert figures["latency_us"]["due_to_command"]["p50"] > figures["latency_us"]["frame_to_command"]["p50"]
+    for alone in (figures["echo_us"]["round_trip"], figures["step_us"], figures["hot_step_us"], figures["timer_us"]):
+        assert 0 < alone["p50"] <= alone["max"]
+    made_of = figures["echo_us"]["round_trip"]["p50"] / 2 + figures["step_us"]["p50"]
+    assert figures["ratio"]["p50"] == pytest.approx(figures["latency_us"]["frame_to_command"]["p50"] / made_of)
+    assert figures["settings"]["rate_hz"] == RATE_HZ
+    assert figures["host"]["kernel"]
+    assert figures["host"]["clock_source"]
+    assert any("garbage collector off" in measure for measure in figures["host"]["granted"])
+
+
+def test_the_log_of_the_run_says_the_same(measured: tuple[dict[str, Any], Path]) -> None:
+    live, folder = measured
+    assert live["messages_lost"] == 0
+    done = invoke(live["logs"][0], "--json")
+    assert done.exit_code == 0, done.output
+    logged = json.loads(done.stdout)
+    assert (logged["frames"], logged["warm_up_frames"]) == (live["frames"], live["warm_up_frames"])
+    assert logged["frames_without_command"] == live["frames_without_command"]
+    assert logged["frames_skipped"] == live["frames_skipped"]
+    for span in LOOP_SPANS:
+        assert logged["latency_us"][span] == live["latency_us"][span]
+    assert "due_to_command" not in logged["latency_us"]
+    assert logged["host"]["processor"] == live["host"]["processor"]
+    done = invoke("--compare", folder / "a.json", folder / "a.json", "--json")
+    assert {row["better"] for row in json.loads(done.stdout)["rows"]} == {"same"}
+    (folder / "log.json").write_text(json.dumps(logged))
+    done = invoke("--compare", folder / "a.json", folder / "log.json")
+    assert done.exit_code == 0, done.output
+    assert "frame to mirror" in done.stdout
+
+
+def test_a_person_reads_a_table_and_a_picture(measured: tuple[dict[str, Any], Path]) -> None:
+    figures, folder = measured
+    text = table(figures)
+    for words in ("frame to command", "due to command", "half a bare echo", "timer wake-up", "without a command"):
+        assert words in text
+    title, *_ = text.splitlines()
+    assert title.split()[:6] == ["us", "p50", "p90", "p99", "p99.9", "max"]
+    content = (folder / "latency.png").read_bytes()
+    assert content.startswith(b"\x89PNG")
+    assert len(content) > 10_000
+
+
+def test_what_is_no_result_and_no_log_is_said(tmp_path: Path) -> None:
+    other = tmp_path / "other.json"
+    for content, expected in (("{", "no JSON"), ("[]", "no latency_us"), ('{"latency_us": {}}', "ratio")):
+        other.write_text(content)
+        fault = invoke("--compare", other, other).exception
+        assert isinstance(fault, DataFileError)
+        assert expected in str(fault)
+    assert isinstance(invoke(tmp_path / "none.mcap").exception, DataFileError)
+    assert "schedule" in str(invoke("--camera", "simulated", "--free-running").exception)
+
+
+STARTED = (
+    "from lowfc.adapters.process.terminal import *; from lowfc.programs.measure.latency.command import latency; "
+    "app = new_app(''); app.command()(latency); run_app(app)"
+)
+
+
+def child(launcher: int, program: str) -> int:
+    """Number of the launcher's child that is this program; 0 for none."""
+    for pid in map(int, Path(f"/proc/{launcher}/task/{launcher}/children").read_text().split()):
+        if f"-m {program} " in Path(f"/proc/{pid}/cmdline").read_text().replace("\0", " "):
+            return pid
+    return 0
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("victim", "number", "status", "said"),
+    [
+        ("", signal.SIGINT, 130, "interrupted"),
+        ("lowfc controller", signal.SIGKILL, 1, "controller was killed by SIGKILL"),
+        ("lowfc.programs.measure.frame_source", signal.SIGKILL, 1, "camera was killed by SIGKILL"),
+        ("lowfc.programs.measure.echo answer", signal.SIGKILL, 1, "echo (answer) was killed by SIGKILL"),
+    ],
+)
+def test_an_end_before_the_end_leaves_nothing(victim: str, number: int, status: int, said: str) -> None:
+    seconds, before = "2" if "echo" in victim else "30", runs()
+    words: Mapping[str, Any] = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
+    with subprocess.Popen([sys.executable, "-c", STARTED, "--duration", seconds, "--rate", "100"], **words) as process:
+        until(lambda: child(process.pid, victim or "lowfc controller"))
+        os.kill(child(process.pid, victim) if victim else process.pid, number)
+        _, error = process.communicate(timeout=30)
+    assert (process.returncode, error.strip().splitlines()[-1].removeprefix("error: ")[: len(said)]) == (status, said)
+    assert runs() == before

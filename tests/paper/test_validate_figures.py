@@ -1,0 +1,193 @@
+import sys
+from dataclasses import replace
+from itertools import pairwise
+
+import numpy as np
+import pytest
+from matplotlib.image import imread
+
+from lowfc.contract.errors import LowfcError
+from lowfc.design.fisher import cramer_rao, variance_e
+from lowfc.design.paper import STAR, TABLE4_EXPOSURE_S
+from lowfc.optics.chain.grid import pupil_axis
+from lowfc.optics.detector.photometry import electrons
+from lowfc.programs.paper.cases import Context
+from lowfc.programs.paper.figures.exposure import ESTIMATORS
+from lowfc.programs.paper.figures.figures import FIGURES
+from lowfc.programs.paper.figures.modes import AMPLITUDES, deviations, linear_range
+from lowfc.programs.paper.tables.pointing import NM_PER_MAS
+
+FEW = Context(trials=4, seed=1, sensors=("sam",))
+
+
+@pytest.fixture(scope="module")
+def tables():
+    """Rows of every figure by its name, of few trials with the default sensor."""
+    return {name: case.run(FEW) for name, case in FIGURES.items()}
+
+
+def values(rows, quantity, estimator=None, name=""):
+    found = [
+        row.measured
+        for row in rows
+        if row.quantity == quantity and row.estimator == estimator and row.name.startswith(name)
+    ]
+    assert found
+    return found
+
+
+def test_all_ten_figures_are_there():
+    assert list(FIGURES) == [f"fig{i}" for i in range(1, 11)]
+    assert all(case.title and case.plot for case in FIGURES.values())
+
+
+@pytest.mark.parametrize("figure", FIGURES)
+def test_every_row_is_finite_and_says_what_was_assumed(tables, figure):
+    rows = tables[figure]
+    assert len({row.key for row in rows}) == len(rows)
+    for row in rows:
+        assert row.assumption
+        assert row.name.startswith("sam")
+        for figures in (row.measured, row.error, row.limit):
+            assert figures is None or isinstance(figures, str) or np.isfinite(figures)
+        if row.estimator is not None:
+            assert row.modes == 14
+        if isinstance(row.measured, str):
+            assert row.measured == "above 0.15"
+
+
+@pytest.mark.parametrize("figure", FIGURES)
+def test_every_figure_is_drawn(figure, tables, tmp_path):
+    path = tmp_path / f"{figure}.png"
+    FIGURES[figure].plot(FEW, path)
+    picture = imread(path)
+    assert min(picture.shape[:2]) > 300
+    assert np.std(picture[..., :3]) > 0.05
+
+
+def test_the_estimate_restores_the_contrast(tables):
+    rows = tables["fig1"]
+    assert max(values(rows, "contrast, flat wavefront")) < 5e-10
+    assert max(values(rows, "aberrated over flat", name="sam, coma Z8")) > 100
+    assert min(values(rows, "aberrated over flat")) > 20
+    for estimator in ("pinv", "weighted + 1 iteration", "weighted + 2 iterations"):
+        assert max(values(rows, "corrected over flat", estimator)) < 2
+
+
+def test_masks_and_light_are_those_of_the_sensors(tables):
+    assert values(tables["fig3"], "outer radius") == [4.0]
+    assert values(tables["fig3"], "reflecting area")[0] == pytest.approx(16 * np.pi, rel=0.01)
+    light = {row.quantity: row.measured for row in tables["fig2"]}
+    assert light["focal-plane mask, of the light on it"] == values(tables["fig3"], "reflected, of the light on it")[0]
+    assert all(0 < part < 1 for part in light.values())
+
+
+def test_estimates_follow_the_truth(tables):
+    assert values(tables["fig5"], "slope", "pinv") == pytest.approx([1.0] * 4, abs=0.1)
+    assert min(values(tables["fig5"], "correlation", "pinv")) > 0.95
+    rows = tables["fig6"]
+    assert all(row.limit < 1.0 for row in rows)
+    assert len(values(rows, "R^2", "pinv")) == 14
+    assert values(rows, "mean R^2", "pinv")[0] > 0.97
+    assert values(rows, "least R^2", "pinv")[0] > 0.8  # of four wavefronts; of a hundred below
+
+
+def test_two_iterations_come_close_to_the_limit(tables):
+    rows = tables["fig7"]
+    assert {row.estimator for row in rows} == set(ESTIMATORS)
+    for name in ("sam, coma Z7", "sam, coma Z8"):
+        plain, one, two = (values(rows, "P-V residual", each, name)[0] for each in ESTIMATORS[3:])
+        assert one < 0.6 * plain
+        assert two < 1.6 * rows[0].limit
+
+
+def test_pure_modes_are_linear_and_iterations_widen_the_range(tables):
+    rows = tables["fig8"]
+    mean = [values(rows, "mean deviation at lambda/20", each)[0] for each in ESTIMATORS[:3]]
+    assert mean[0] < 0.06
+    assert all(more < 0.5 * fewer for fewer, more in pairwise(mean))
+    assert all(value < 0.01 for value in values(rows, "largest error of a random wavefront, matched input", "pinv"))
+    assert len(values(rows, "amplitude of 10 % deviation", "pinv", "sam, Z")) == 14
+
+
+def test_screens_lose_what_fourteen_modes_can_take(tables):
+    rows = tables["fig9"]
+    for name in ("sam, cut from", "sam, periodic"):
+        best = values(rows, "residual rms", "best possible fit", name)[0]
+        assert 0.01 < best < 0.03
+        together = np.hypot(best, values(rows, "reconstructed rms", "best possible fit", name)[0])
+        assert together == pytest.approx(0.05, rel=0.03)  # squares add for each screen, these are means of them
+        assert all((row.limit is None) == (row.quantity != "residual rms") for row in rows)
+        for estimator in ("pinv", "weighted", "weighted + 2 iterations"):
+            assert best < values(rows, "residual rms", estimator, name)[0] < 2.5 * best
+
+
+def test_a_milliarcsecond_is_as_large_as_the_slope_of_the_image(tables):
+    rows = tables["fig10"]
+    ready = FEW.prepared("sam")
+    u = 2 * pupil_axis(512)
+    tilt_nm = 1e-3 / 3600 * np.pi / 180 * 2.0 / 4 * 1e9 * 2 * np.broadcast_to(u, (512, 512))  # 2 m; Z2 = 2 u
+    np.testing.assert_allclose(ready.opd_nm(np.array([2.4241, 0.0])), tilt_nm, atol=1e-3)
+    slope = ready.band_H[:, 0] * 2.4241 / ready.band_I0.max()
+    assert values(rows, "P-V change over peak", name="sam, tilt x")[0] == pytest.approx(np.ptp(slope), rel=0.02)
+
+
+def test_the_signal_over_noise_of_an_image_is_what_the_bound_of_its_tilt_says(tables):
+    rows, ready = tables["fig10"], FEW.prepared("sam")
+    light_e = electrons(STAR, TABLE4_EXPOSURE_S)
+    slope_e, noise_e2 = light_e * NM_PER_MAS * ready.band_H[:, 1:2], variance_e(light_e * ready.band_I0, 1.0)
+    least_mas = np.sqrt(cramer_rao(slope_e, noise_e2)[0, 0])
+    ratio = values(rows, "signal over noise of the image", name="sam, tilt y")[0]
+    assert ratio == pytest.approx(1.0 / least_mas, rel=0.03)
+    brightest = np.max(np.abs(slope_e[:, 0]) / np.sqrt(noise_e2))
+    assert values(rows, "largest signal over noise of a pixel", name="sam, tilt y")[0] == pytest.approx(
+        brightest, rel=0.03
+    )
+    assert brightest < ratio
+
+
+def test_rows_depend_on_the_seed_and_not_on_the_threads():
+    few = replace(FEW, trials=2)
+    once, again = FIGURES["fig7"].run(few), FIGURES["fig7"].run(replace(few, jobs=2))
+    assert once == again
+    assert once != FIGURES["fig7"].run(replace(few, seed=2))
+
+
+def test_a_figure_drawn_again_is_the_same_file(tmp_path):
+    paths = [tmp_path / "once.png", tmp_path / "again.png"]
+    for path in paths:
+        FIGURES["fig10"].plot(FEW, path)
+    assert paths[0].read_bytes() == paths[1].read_bytes()
+
+
+def test_the_linear_range_ends_where_the_deviation_passes_a_tenth():
+    estimates = np.stack([AMPLITUDES * (1 - 2 * AMPLITUDES), AMPLITUDES * 1.05, AMPLITUDES * (1 - 50 * AMPLITUDES)])
+    off = deviations(estimates)
+    np.testing.assert_allclose(off[0], 2 * AMPLITUDES)
+    assert linear_range(off[0]) == pytest.approx(0.05)
+    assert linear_range(off[1]) == np.inf
+    assert linear_range(off[2]) == pytest.approx(0.002)
+
+
+def test_without_matplotlib_the_user_is_told_what_to_install(monkeypatch, tmp_path):
+    monkeypatch.setitem(sys.modules, "matplotlib.figure", None)
+    with pytest.raises(LowfcError, match=r"pip install .*\[plots\]'"):
+        FIGURES["fig3"].plot(FEW, tmp_path / "fig3.png")
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.slow
+def test_the_papers_figures_are_reached_with_a_hundred_trials():
+    many = Context(trials=100, seed=1, jobs=2)
+    fig6 = FIGURES["fig6"].run(many)
+    assert values(fig6, "least R^2", "pinv", "sam")[0] > 0.95
+    assert values(fig6, "mean R^2", "pinv", "sam")[0] > 0.97
+    fig7 = FIGURES["fig7"].run(many)
+    for estimator in ESTIMATORS[4:]:
+        assert values(fig7, "P-V residual", estimator, "sam, coma Z7")[0] <= 6e-3
+        assert values(fig7, "P-V residual", estimator, "sam, coma Z8")[0] <= 8e-3
+    fig1 = FIGURES["fig1"].run(many)
+    for estimator in ("pinv", "weighted + 1 iteration", "weighted + 2 iterations"):
+        assert max(values(fig1, "corrected over flat", estimator)) < 2
+    fig8 = FIGURES["fig8"].run(many)
+    assert values(fig8, "mean deviation at lambda/20", "pinv", "sam")[0] < 0.06

@@ -1,0 +1,107 @@
+"""What a soak makes of its samples: growth is found, noise is not, gaps are counted."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from lowfc.adapters.bus.bus import Sample
+from lowfc.adapters.logs.writer import LogWriter
+from lowfc.contract.envelope import sequence_of
+from lowfc.contract.messages import STEP, TRUTH
+from lowfc.programs.reliability.soak.figures import Usage, of_latency, of_process, render, slope, too_short
+from lowfc.programs.reliability.soak.run import LogChecker
+
+pytestmark = pytest.mark.exclusive
+
+SECONDS = 1800
+START_S = 1_800_000_000
+COUNTS = {
+    "frames_published": 10,
+    "frames_skipped": 1,
+    "frames_missing": 0,
+    "messages_recorded": 50,
+    "messages_lost": 0,
+    "logs": 2,
+    "gaps": 0,
+}
+
+
+def usage(leak_mb_per_hour: float, seed: int = 1, handles_per_hour: float = 0.0) -> list[Usage]:
+    rng = np.random.default_rng(seed)
+    times = np.arange(SECONDS)
+    memory = 100e6 + leak_mb_per_hour * 1e6 * times / 3600 + 2e6 * rng.standard_normal(SECONDS)
+    memory[: SECONDS // 8] -= 20e6  # caches fill at the start
+    return [
+        Usage(float(time), round(one), 20 + int(handles_per_hour * time / 3600), 5)
+        for time, one in zip(times, memory, strict=True)
+    ]
+
+
+@pytest.mark.parametrize("seed", range(10))
+def test_noise_and_the_start_are_no_growth(seed: int) -> None:
+    found = of_process(usage(0.0, seed))
+    assert found["grows"] == []
+    assert abs(found["memory_mb_per_hour"]) < 4 * found["memory_mb_per_hour_error"] < 4
+
+
+@pytest.mark.parametrize("seed", range(10))
+def test_a_leak_is_found_and_measured(seed: int) -> None:
+    found = of_process(usage(20.0, seed))
+    assert found["grows"] == ["memory"]
+    assert found["memory_mb_per_hour"] == pytest.approx(20, abs=5 * found["memory_mb_per_hour_error"])
+
+
+def test_handles_that_are_not_given_back_are_found() -> None:
+    assert of_process(usage(0.0, handles_per_hour=60))["grows"] == ["handles"]
+
+
+def test_what_is_too_short_is_not_judged_and_has_not_passed() -> None:
+    assert slope([0.0, 1.0, 2.0], [1.0, 2.0, 3.0]) is None
+    assert slope(range(100), [5.0] * 100) == (0.0, 0.0)
+    processes = {"camera": of_process(usage(0.0)), "recorder": of_process(usage(0.0)[:3])}
+    latency = of_latency([])
+    assert (processes["camera"]["too_short"], processes["recorder"]["grows"]) == ([], [])
+    short = too_short(processes, latency)
+    assert short == ["the recorder's memory", "the recorder's handles", "the recorder's threads", "the latency"]
+    figures = {"processes": processes, "latency": latency, **COUNTS, "too_short": short, "why": []}
+    assert json.loads(json.dumps(figures, allow_nan=False)) == figures
+    text = render(figures)
+    assert "nan" not in text
+    assert text.splitlines()[2].split()[-10:-6] == ["too", "short", "to", "judge"]
+    assert "p50 too short to judge; p99 too short to judge" in text
+    assert text.endswith(f"too short to judge: {', '.join(short)}\n")
+
+
+def log(folder: Path, name: str, counts: dict[str, list[int]]) -> None:
+    writer = LogWriter(folder / f"{name}.mcap", 0, {})
+    for key, numbers in counts.items():
+        for number in numbers:
+            writer.write(Sample(key, b"", sequence_of(START_S, number), number, number))
+    writer.finish({})
+
+
+def test_gaps_are_counted_within_logs_and_between_them(tmp_path: Path) -> None:
+    checker = LogChecker(tmp_path)
+    log(tmp_path, "1", {STEP.key: [0, 1, 3], TRUTH.key: [5, 6]})
+    checker.look()
+    assert (checker.logs, checker.messages, checker.gaps) == (1, 5, 1)
+    assert list(tmp_path.iterdir()) == []
+    log(tmp_path, "2", {STEP.key: [4, 5], TRUTH.key: [9]})
+    checker.look()
+    assert (checker.logs, checker.messages, checker.gaps) == (2, 8, 3)
+
+
+def test_the_table() -> None:
+    times = [float(one) for one in range(SECONDS)]
+    figures = {
+        "processes": {"camera": of_process(usage(0.0))},
+        "latency": of_latency([(one, 500 + 8 * one / 3600, 900.0) for one in times]),
+        **COUNTS,
+        "too_short": [],
+        "why": ["the camera's memory grow"],
+    }
+    text = render(figures)
+    assert "p50 502 us, +8.0 +- 0.0 us per hour" in text
+    assert text.endswith("FAILED: the camera's memory grow\n")

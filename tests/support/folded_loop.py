@@ -1,0 +1,245 @@
+"""A loop in one process behind the interface of `lowfc.client`: frames are exposed when the next one is asked for."""
+
+import contextlib
+import tomllib
+from collections import deque
+from collections.abc import Callable, Iterator
+from functools import lru_cache
+from typing import Any, NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from lowfc.adapters.bus.bus import Publisher
+from lowfc.adapters.files import factory
+from lowfc.adapters.process.clock import HostClock
+from lowfc.client import Frame as Image
+from lowfc.client import MirrorWatch
+from lowfc.contract.codecs.state_codec import controller_state
+from lowfc.contract.configuration import Configuration
+from lowfc.contract.errors import CalibrationError, RequestRefusedError
+from lowfc.contract.messages import MIRROR_STATE, Topic, wire
+from lowfc.control.calibration.calibration import Calibration
+from lowfc.control.laws.linear_law import LinearLaw
+from lowfc.control.laws.stability import delay_weights
+from lowfc.control.loop.additions import MIRROR
+from lowfc.control.loop.advance import advance
+from lowfc.control.loop.camera import CameraSettings
+from lowfc.control.loop.inputs import Frame, Input, Load, MirrorShape, Request, Step
+from lowfc.control.loop.state import State
+from lowfc.testing.memory_bus import MemoryBus, MemoryHub, MemoryRing
+from sim_camera.process import bench
+from sim_dm.device import Command, apply_command, initial
+from sim_dm.process import device
+
+FIRST = 1 << 32
+
+
+@lru_cache(maxsize=4)
+def computed(toml: str) -> Calibration:
+    """The computed calibration of a configuration."""
+    config = Configuration.model_validate(tomllib.loads(toml))
+    optics = factory.twin(config, None, print)
+    return factory.analytic_calibration(config, optics, factory.mirror_on_twin(config, optics, print))
+
+
+class Given(NamedTuple):
+    """An answer."""
+
+    frame_sequence: int
+    state: wire.ControllerState | None
+    text: str
+
+
+class Reservation:
+    """In the place of `lowfc.client.lease.Lease`; nobody is told how long it is going to take."""
+
+    def expecting(self, progress: Callable[[str, int, int], None], rate_hz: float) -> Callable[[str, int, int], None]:
+        return progress
+
+
+class OperatorBus(MemoryBus):
+    """The connection of an operator's program; a frame is exposed while it subscribes."""
+
+    def __init__(self, loop: "FoldedLoop") -> None:
+        super().__init__(loop.hub, "operator", HostClock())
+        self._loop = loop
+
+    def ring(self, topic: Topic, capacity: int) -> MemoryRing:
+        ring = super().ring(topic, capacity)
+        self._loop.expose()
+        return ring
+
+
+class FoldedLoop:
+    """Camera, controller and mirror, one frame after the other.
+
+    Attributes:
+        hub: on which the mirror's process reports.
+        mirror_bus: that process's connection; once it is closed, the mirror stays as it is.
+        first: sequence of frame 0.
+        surfaces_nm: shape of the mirror in each exposure.
+        residual_nm: true modes in each exposure.
+    """
+
+    def __init__(
+        self,
+        config: Configuration,
+        calibration: Calibration | None = None,
+        world: Configuration | None = None,
+        lose: Callable[[int], bool] = lambda index: False,
+        cut: int | None = None,
+    ) -> None:
+        """A loop under `config` in a world that may be another one; frames that `lose` names do not arrive.
+
+        Where `cut` is given, frames lack so many pixels at each edge, and the loop begins without a calibration.
+        """
+        world = config if world is None else world
+        self.config = config
+        self._cut = cut or 0
+        self._settings = factory.settings(config)
+        if cut is None:
+            if calibration is None:
+                calibration = computed(config.to_toml())
+            first: Input = Load(0, calibration, "test")
+        else:
+            grid = (config.mirror.rows, config.mirror.columns)
+            first = MirrorShape(0, np.zeros(grid, np.float32), np.zeros(0, np.float32))
+        self._state, _ = advance(self._settings, State(), first)
+        self._scene, self._mirror = bench(world), device(world)
+        self.hub = MemoryHub()
+        self._operator = OperatorBus(self)
+        self.start_mirror()
+        self._weights = delay_weights(world.camera.delay_frames).astype(np.float32)
+        self._shapes = [self._status.surface_nm] * len(self._weights)
+        self._index = 0
+        self._lose = lose
+        self._listeners: list[tuple[str, deque[Any]]] = []
+        self.surfaces_nm: list[npt.NDArray[np.float32]] = []
+        self.residual_nm: list[npt.NDArray[np.float32]] = []
+        self.stops = self.lease_id = 0
+        self.first = FIRST
+
+    def start_mirror(self) -> None:
+        """The mirror's process, anew and flat."""
+        self._status = initial(self._mirror)
+        self.mirror_bus = MemoryBus(self.hub, "mirror-dm", HostClock())
+        self._states: Publisher = self.mirror_bus.publisher(MIRROR_STATE, "dm")
+
+    def expose(self) -> None:
+        """One frame."""
+        self._shapes = [self._status.surface_nm, *self._shapes[:-1]]
+        seen = np.tensordot(self._weights, np.array(self._shapes), 1)
+        whole, truth = self._scene.expose(self._index, seen)
+        pixels = whole[self._cut : whole.shape[0] - self._cut, self._cut : whole.shape[1] - self._cut]
+        self.surfaces_nm.append(seen)
+        self.residual_nm.append(truth.residual_nm)
+        sequence, time_ns = self.first + self._index, 10**18 + self._index * self.config.period_ns
+        self._index += 1
+        if self._lose(self._index - 1):
+            return
+        self._state, outputs = advance(self._settings, self._state, Frame(sequence, time_ns, 0, pixels))
+        step, command = outputs.step, outputs.command
+        told = Command("lowfc", sequence, time_ns, 10**9, command.actuators_nm, command.command_nm)
+        if not self.mirror_bus.closed:
+            self._status, refused = apply_command(self._mirror, self._status, told, time_ns)
+            assert refused is None
+            self._states.put(wire.MirrorState(frame_sequence=sequence).SerializeToString())
+        for kind, waiting in self._listeners:
+            waiting.append(Image(sequence, time_ns, pixels) if kind == "frames" else step)
+
+    def run(self, frames: int) -> None:
+        """Some frames that nobody looks at."""
+        for _ in range(frames):
+            self.expose()
+
+    def ask(self, name: str, **fields: Any) -> Given:
+        """A request, carried out before the next frame."""
+        fields = {"lease_id": self.lease_id, **fields}
+        self._state, outputs = advance(self._settings, self._state, Request(0, name, **fields))
+        if not outputs.reply.accepted:
+            raise RequestRefusedError(f"{name} refused: {outputs.reply.text}")
+        state = controller_state(self._state, self._settings, 0) if name == "status" else None
+        return Given(outputs.reply.frame_sequence, state, outputs.reply.text)
+
+    def play(self, basis_nm: npt.ArrayLike, table: npt.ArrayLike) -> Given:
+        self.expose()  # time goes on while somebody asks
+        basis = np.asarray(basis_nm, np.float32)
+        return self.ask("play", text=MIRROR, actuators_nm=basis.reshape(-1), table=np.asarray(table, np.float32))
+
+    @contextlib.contextmanager
+    def reserved(self, purpose: str, duration_s: float | None = None) -> Iterator[Reservation]:
+        self.lease_id = 1
+        self.ask("lease", values=(60.0,), text=purpose)
+        try:
+            yield Reservation()
+        finally:
+            self.ask("release")
+            self.lease_id = 0
+
+    def check_lease(self) -> None:
+        if self.lease_id:
+            try:
+                self.ask("renew", values=(60.0,), text="a test")
+            except RequestRefusedError as fault:
+                raise CalibrationError(str(fault)) from None
+
+    def status(self) -> Given:
+        return self.ask("status")
+
+    def open_loop(self) -> Given:
+        return self.ask("open")
+
+    def close_loop(self) -> Given:
+        return self.ask("close")
+
+    def stop(self) -> Given:
+        self.stops += 1
+        return self.ask("stop")
+
+    def load(self, calibration: Calibration) -> Given:
+        return self.ask("load", calibration=calibration)
+
+    def calibration(self) -> Calibration:
+        return self._state.drive.calibration
+
+    def configuration(self) -> str:
+        return self.config.to_toml()
+
+    def camera(self) -> CameraSettings | None:
+        return self._state.conditions.camera
+
+    def camera_state(self) -> wire.CameraState:
+        side = 80 - 2 * self._cut
+        return factory.camera_state(self.config, (side, side), 1)
+
+    def laws(self) -> dict[str, LinearLaw]:
+        following = self._state.drive.following
+        return {} if following is None else {following.law.id: following.law}
+
+    def frames(self, count: int | None = None) -> Iterator[Image]:
+        return self._listen("frames", count)
+
+    def steps(self, count: int | None = None) -> Iterator[Step]:
+        return self._listen("steps", count)
+
+    def mirror_watch(self) -> MirrorWatch:
+        return MirrorWatch(self._operator)
+
+    def _listen(self, kind: str, count: int | None) -> Iterator[Any]:
+        waiting: deque[Any] = deque()
+        listener = (kind, waiting)
+        self._listeners.append(listener)
+
+        def each() -> Iterator[Any]:
+            left = count
+            try:
+                while left is None or left > 0:
+                    while not waiting:
+                        self.expose()
+                    left = None if left is None else left - 1
+                    yield waiting.popleft()
+            finally:
+                self._listeners = [one for one in self._listeners if one is not listener]
+
+        return each()

@@ -1,0 +1,117 @@
+"""Feed readers with damaged inputs, watched for crashes, hangs and memory: python tests/support/fuzzing.py --help."""
+
+import argparse
+import json
+import resource
+import signal
+import sys
+import tempfile
+import time
+import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from types import FrameType
+from typing import Any
+
+import numpy as np
+
+from tests.support.targets import Target, targets
+
+HANG_S = 10.0
+"""An input that takes longer hangs."""
+MOST_GROWTH_BYTES = 200_000_000
+"""Memory that one target's inputs may add to the process."""
+
+
+class HungError(Exception):
+    """An input took longer than `HANG_S`."""
+
+
+def fuzz(target: Target, numbers: range) -> dict[str, Any]:
+    """Feed inputs of these numbers to a target.
+
+    Returns:
+        name, inputs, refused (those that raised what they may), crashes (number, error), hangs (number), grown_bytes.
+    """
+    refused, crashes, hangs = 0, [], []
+    before = _peak_bytes()
+    with warnings.catch_warnings(), np.errstate(all="ignore"):
+        warnings.simplefilter("ignore")
+        for number in numbers:
+            data = target.input(number)
+            try:
+                with _limited():
+                    target.read(data)
+            except target.errors:
+                refused += 1
+            except HungError:
+                hangs.append(number)
+            except Exception as error:
+                crashes.append((number, f"{type(error).__name__}: {error}"[:300]))
+    return {
+        "name": target.name,
+        "inputs": len(numbers),
+        "refused": refused,
+        "crashes": crashes,
+        "hangs": hangs,
+        "grown_bytes": _peak_bytes() - before,
+    }
+
+
+def shares(every: list[Target], inputs: int) -> dict[str, int]:
+    """How many inputs each gets: fewer of those that take longer."""
+    weights = {target.name: target.cost**-0.75 for target in every}
+    total = sum(weights.values())
+    return {name: max(1, round(inputs * weight / total)) for name, weight in weights.items()}
+
+
+@contextmanager
+def _limited() -> Iterator[None]:
+    def hung(number: int, frame: FrameType | None) -> None:
+        raise HungError
+
+    before = signal.signal(signal.SIGALRM, hung)
+    signal.setitimer(signal.ITIMER_REAL, HANG_S)
+    try:
+        yield
+    finally:
+        signal.setitimer(signal.ITIMER_REAL, 0)
+        signal.signal(signal.SIGALRM, before)
+
+
+def _peak_bytes() -> int:
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024
+
+
+def main() -> int:
+    """The command line."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--inputs", type=int, default=1_000_000, help="for all targets together")
+    parser.add_argument("--first", type=int, default=0, help="number of the first input of each target")
+    parser.add_argument("--only", help="targets whose name holds this")
+    parser.add_argument("--json", action="store_true")
+    asked = parser.parse_args()
+    begun_s = time.monotonic()
+    with tempfile.TemporaryDirectory() as folder:
+        every = [one for one in targets(Path(folder)) if not asked.only or asked.only in one.name]
+        counts = shares(every, asked.inputs)
+        results = []
+        for target in every:
+            results.append(fuzz(target, range(asked.first, asked.first + counts[target.name])))
+            found = results[-1]
+            line = f"{found['name']:20} {found['inputs']:8} inputs, {found['refused']:8} refused, "
+            line += (
+                f"{len(found['crashes'])} crashes, {len(found['hangs'])} hangs, {found['grown_bytes'] / 1e6:.0f} MB\n"
+            )
+            sys.stderr.write(line)
+    if asked.json:
+        sys.stdout.write(json.dumps({"targets": results, "seconds": round(time.monotonic() - begun_s, 1)}) + "\n")
+    for found in results:
+        for number, error in found["crashes"][:3]:
+            sys.stderr.write(f"{found['name']} {number}: {error}\n")
+    return int(any(found["crashes"] or found["hangs"] for found in results))
+
+
+if __name__ == "__main__":
+    sys.exit(main())

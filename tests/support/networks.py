@@ -1,0 +1,134 @@
+"""Hosts on one machine: network namespaces with addresses of their own, joined by a bridge.
+
+A namespace lives as long as a process in it. Each is held by a `cat` that ends when our end of its pipe does, and every
+other process in it dies with us: nothing is left behind, however the test ends.
+"""
+
+import contextlib
+import os
+import shutil
+import signal
+import subprocess
+import sys
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+
+from lowfc.adapters.process.child import Child
+from lowfc.adapters.process.clock import HostClock
+
+SUBNET = "10.77.0"
+ROUTER_ADDRESS = f"{SUBNET}.1"
+
+
+def possible() -> bool:
+    """Whether this machine lets us make network namespaces with a bridge."""
+    if shutil.which("unshare") is None or shutil.which("nsenter") is None or shutil.which("ip") is None:
+        return False
+    trial = "ip link add name trial type bridge && ip link add name one type veth peer name two"
+    return subprocess.run(["unshare", "--net", "sh", "-c", trial], capture_output=True, check=False).returncode == 0
+
+
+class Host:
+    """One namespace, with a folder of its own for what a machine keeps."""
+
+    def __init__(self, name: str, address: str, folder: Path, clock_shift_ns: int = 0) -> None:
+        self.name = name
+        self.address = address
+        self.folder = folder / name
+        self.shift_ns = clock_shift_ns
+        self.holder = subprocess.Popen(
+            ["unshare", "--net", "cat"], stdin=subprocess.PIPE, stdout=subprocess.DEVNULL, start_new_session=True
+        )
+        self.children: dict[str, Child] = {}
+        home = self.folder / "runtime" / "lowfc"
+        home.mkdir(mode=0o700, parents=True)
+        HostClock(home)  # chooses the offset of this boot, which is then another one here
+        for chosen in home.glob("clock-*"):
+            chosen.write_text(str(int(chosen.read_text()) + clock_shift_ns))
+
+    @property
+    def environment(self) -> Mapping[str, str]:
+        return os.environ | {"XDG_RUNTIME_DIR": str(self.folder / "runtime"), "OMP_NUM_THREADS": "1"}
+
+    def inside(self, *words: str) -> list[str]:
+        """A command line that runs here."""
+        return ["nsenter", f"--net=/proc/{self.holder.pid}/ns/net", *words]
+
+    def ip(self, *words: str) -> None:
+        subprocess.run(self.inside("ip", *words), check=True, capture_output=True)
+
+    def run(self, *words: str, timeout_s: float = 60) -> "subprocess.CompletedProcess[str]":
+        """A Python program here, to its end."""
+        return subprocess.run(
+            self.inside(sys.executable, "-P", *words),
+            capture_output=True,
+            text=True,
+            timeout=timeout_s,
+            check=False,
+            env=self.environment,
+            cwd=self.folder,
+        )
+
+    def start(self, name: str, *words: str) -> Child:
+        """A Python program here that goes on."""
+        child = Child(
+            name,
+            self.inside(sys.executable, "-P", *words),
+            self.folder / f"{name}.said",
+            self.environment,
+            death_signal=signal.SIGKILL,
+        )
+        child.start()
+        self.children[name] = child
+        return child
+
+    def said(self, name: str) -> str:
+        return (self.folder / f"{name}.said").read_text(errors="replace")
+
+    def close(self) -> None:
+        for child in self.children.values():
+            child.stop(5.0)
+        assert self.holder.stdin is not None
+        self.holder.stdin.close()
+        self.holder.wait()
+
+
+class Lab:
+    """A machine in the middle with the bridge, and hosts with one link each, which can be cut."""
+
+    def __init__(self, folder: Path, shifts_ns: Mapping[str, int]) -> None:
+        """Make the hosts, with the named shifts of their clocks."""
+        self.middle = Host("middle", ROUTER_ADDRESS, folder)
+        self.hosts = {self.middle.name: self.middle}
+        try:
+            self.middle.ip("link", "add", "name", "bridge", "type", "bridge")
+            self.middle.ip("address", "add", f"{ROUTER_ADDRESS}/24", "dev", "bridge")
+            for device in ("lo", "bridge"):
+                self.middle.ip("link", "set", device, "up")
+            for number, (name, shift_ns) in enumerate(shifts_ns.items(), start=11):
+                host = self.hosts[name] = Host(name, f"{SUBNET}.{number}", folder, shift_ns)
+                ends = ("link", "add", "name", name, "type", "veth", "peer", "name", "eth0", "netns")
+                self.middle.ip(*ends, str(host.holder.pid))
+                self.middle.ip("link", "set", name, "master", "bridge", "up")
+                host.ip("address", "add", f"{host.address}/24", "dev", "eth0")
+                for device in ("lo", "eth0"):
+                    host.ip("link", "set", device, "up")
+        except BaseException:
+            self.close()
+            raise
+
+    def __getitem__(self, name: str) -> Host:
+        return self.hosts[name]
+
+    @contextlib.contextmanager
+    def cut(self, name: str) -> Iterator[None]:
+        """Lose everything to and from a host, without either end being told."""
+        self.middle.ip("link", "set", name, "nomaster")
+        try:
+            yield
+        finally:
+            self.middle.ip("link", "set", name, "master", "bridge")
+
+    def close(self) -> None:
+        for host in reversed(list(self.hosts.values())):
+            host.close()

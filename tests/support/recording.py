@@ -1,0 +1,76 @@
+"""A recorder, a camera and a controller on a bus in memory."""
+
+import threading
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+from lowfc.adapters.bus.bus import Publisher
+from lowfc.adapters.logs.reader import Logged, LogReader
+from lowfc.adapters.process.clock import HostClock
+from lowfc.adapters.process.service import Service
+from lowfc.contract.messages import EVENT, Log, Topic
+from lowfc.programs.core.recording.recorder import Recorder
+from lowfc.programs.core.recording.summary import Summary
+from lowfc.testing.memory_bus import MemoryBus, MemoryHub
+
+PATIENCE_S = 20.0
+
+
+def until(condition: Callable[[], bool]) -> None:
+    deadline = time.monotonic() + PATIENCE_S
+    while not condition():
+        assert time.monotonic() < deadline
+        time.sleep(0.005)
+
+
+class Bench:
+    """A run in memory: a camera, a controller, and a recorder in a thread."""
+
+    def __init__(self, folder: Path) -> None:
+        self.hub = MemoryHub()
+        self.clock = HostClock()
+        self.folder = folder
+        self.summary: Summary | None = None
+        self.thread = threading.Thread(target=self._record, daemon=True)
+        self.events: list[str] = []
+        self.camera = self.join("camera")
+        self.camera.bus.subscribe(EVENT, lambda sample: self.events.append(Log.FromString(sample.payload).message))
+        self.controller = self.join("controller")
+
+    def join(self, name: str) -> Service:
+        return Service(name, "night", self.clock, MemoryBus(self.hub, name, self.clock))
+
+    def start(self, **more: object) -> None:
+        bus = MemoryBus(self.hub, "recorder", self.clock)
+        self.recorder = Recorder(bus, self.clock, "night", self.folder, metadata={"lowfc": {"run": "night"}}, **more)
+        self.thread.start()
+        for service in (self.camera, self.controller):
+            service.state = "ready"
+        until(lambda: self.recorder.service.state == "ready" or not self.thread.is_alive())
+
+    def stop(self) -> Summary:
+        for service in (self.camera, self.controller):
+            service.finish()
+        self.recorder.service.stop("told")
+        self.thread.join(PATIENCE_S)
+        assert self.summary is not None
+        return self.summary
+
+    def _record(self) -> None:
+        self.summary = self.recorder.run()
+
+
+def put(publisher: Publisher, count: int) -> list[bytes]:
+    bodies = [b"%s %d" % (publisher.key.encode(), publisher.published + number) for number in range(count)]
+    for body in bodies:
+        publisher.put(body)
+    return bodies
+
+
+def logged(summary: Summary) -> list[Logged]:
+    return [message for path in summary.files for message in LogReader(path)]
+
+
+def bodies_of(messages: list[Logged], topic: Topic) -> list[bytes]:
+    return [message.payload for message in messages if message.key == topic.key]

@@ -1,0 +1,193 @@
+"""A log of the toy's loop, message by message as the live controller's `advance` makes them, without processes."""
+
+from collections.abc import Collection
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from lowfc.adapters.bus.bus import Sample
+from lowfc.adapters.logs.writer import Attachment, LogWriter
+from lowfc.contract.codecs import codec
+from lowfc.contract.codecs.calibration_codec import encode_calibration, identified
+from lowfc.contract.codecs.state_codec import controller_state
+from lowfc.contract.configuration import Configuration
+from lowfc.contract.envelope import sequence_of
+from lowfc.contract.events import EVENTS
+from lowfc.contract.messages import (
+    CALIBRATION,
+    CAMERA_STATE,
+    COMMAND,
+    CONTROLLER_STATE,
+    EVENT,
+    FRAME,
+    HEALTH,
+    MIRROR_STATE,
+    REQUEST,
+    STEP,
+    TIMING,
+    TRUTH,
+    Message,
+    Topic,
+    image,
+    timestamp,
+    wire,
+)
+from lowfc.control.calibration.calibration import Calibration
+from lowfc.control.loop.advance import advance
+from lowfc.control.loop.inputs import Frame, Load, Outputs, Request
+from lowfc.control.loop.state import State
+from tests.support.toy import FLUX_DN, NOLL, PERIOD_NS, SHAPE, START, TOY, calibration, settings
+
+TOYS = identified(calibration())
+DELAY_NS = 300_000  # from a frame to its command
+READ_NOISE_E = 2.0
+METADATA = {"lowfc": {"lowfc": "0.1.0", "numpy": "2.0", "host": "bench", "run": "night", "seed": "5"}}
+
+
+class Night:
+    """Messages of a run, appended as it goes on; the disturbance of tip is a sine of 12 nm at 7 Hz."""
+
+    def __init__(self, *, truth: bool = True, calibration: Calibration = TOYS) -> None:
+        self.samples: list[Sample] = []
+        self.truth = truth
+        self.now_ns = START * 10**9
+        self.calibration = calibration
+        self.settings = settings(gain=(0.4, 0.2))
+        self._rng = np.random.default_rng(8)
+        self._counts: dict[tuple[str, int], int] = {}
+        self._camera_start = START
+        self._count = self._frames = 0
+        self._to_modes = np.linalg.pinv(self.calibration.modes_to_actuators)
+        self._moved_nm = np.zeros(len(NOLL), np.float32)
+        self._state = State()
+        self.start_controller()
+        camera = wire.CameraState(
+            period_ns=PERIOD_NS,
+            exposure_ns=PERIOD_NS // 2,
+            gain_e_per_dn=1.0,
+            read_noise_e=READ_NOISE_E,
+            em_gain=1.0,
+            bit_depth=16,
+        )
+        self.put(CAMERA_STATE, camera)
+
+    def start_controller(self) -> None:
+        """A controller that knows nothing of the one before."""
+        self.event("STARTED", process="controller", version="0.1.0")
+        self.put(CALIBRATION, encode_calibration(self.calibration, self.now_ns))
+        self._state = State()
+        self._take(advance(self.settings, self._state, Load(self.now_ns, self.calibration, "test")))
+
+    def start_camera(self) -> None:
+        """A camera that counts from nothing."""
+        self._camera_start += 60
+        self._count = 0
+
+    def frames(self, number: int, *, lost: Collection[int] = (), dark: Collection[int] = ()) -> None:
+        """So many frames; some never reach the controller, some have no light."""
+        for index in range(number):
+            self.now_ns += PERIOD_NS
+            sequence = sequence_of(self._camera_start, self._count)
+            wave_nm = self._disturbance_nm()
+            residual_nm = wave_nm + self._moved_nm
+            frame = self._pixels(residual_nm, 0.0 if index in dark else FLUX_DN)
+            self._count, self._frames = self._count + 1, self._frames + 1
+            self.put(FRAME, image(frame, self.now_ns, "sensor"), sequence)
+            if self.truth:
+                rms = [float(np.linalg.norm(one)) for one in (wave_nm, residual_nm)]
+                truth = wire.Truth(
+                    timestamp=timestamp(self.now_ns),
+                    frame_sequence=sequence,
+                    disturbance_nm=wave_nm,
+                    residual_nm=residual_nm,
+                    disturbance_rms_nm=rms[0],
+                    residual_rms_nm=rms[1],
+                )
+                self.put(TRUTH, truth)
+            if index not in lost:
+                taken = Frame(sequence, self.now_ns, 100_000, frame)
+                self._take(advance(self.settings, self._state, taken), DELAY_NS + 1000 * (self._count % 50))
+
+    def request(self, name: str, values: tuple[float, ...] = (), modes: tuple[int, ...] = (), **fields: Any) -> None:
+        """What an operator asks."""
+        asked = Request(self.now_ns, name, modes, values, **fields)
+        before = self._state
+        after, outputs = advance(self.settings, before, asked)
+        assert outputs.reply is not None
+        self.put(REQUEST, codec.encode_request(asked, outputs.reply, after.input_number, None))
+        self._take((after, outputs))
+
+    def event(self, name: str, **details: object) -> None:
+        self.put(EVENT, EVENTS[name].log("controller", self.now_ns, **details))
+
+    def health(self, process: str, **fields: object) -> None:
+        self.put(HEALTH, wire.Health(process=process, **fields), name=process)
+
+    def put(
+        self, topic: Topic, message: Message | bytes, sequence: int | None = None, name: str = "dm", late_ns: int = 0
+    ) -> None:
+        """Append a message; its sequence counts by itself where none is given."""
+        key = topic.at(name)
+        if sequence is None:
+            count = self._counts[key, START] = self._counts.get((key, START), -1) + 1
+            sequence = sequence_of(START, count)
+        payload = message if isinstance(message, bytes) else message.SerializeToString()
+        sent_ns = self.now_ns + late_ns
+        self.samples.append(Sample(key, payload, sequence, sent_ns, sent_ns + 50_000))
+
+    def write(self, path: Path, *, finish: bool = True, config: bool = True, toml: str | None = None) -> Path:
+        """Write the log, finished or as a recorder that died leaves it; return where it is."""
+        content = (Configuration().to_toml() if toml is None else toml).encode()
+        attached = [Attachment("config.toml", "application/toml", content)] if config else []
+        log = LogWriter(path, START * 10**9, METADATA, attached)
+        for number, sample in enumerate(self.samples):
+            log.write(sample)
+            if not finish and number % 100 == 99:
+                log.flush()
+        if finish:
+            return log.finish({"recording": {"messages": str(len(self.samples)), "messages_lost": "0"}})
+        log.flush()
+        log.abandon()
+        return log.part
+
+    def _take(self, answered: tuple[State, Outputs], late_ns: int = 0) -> None:
+        self._state, outputs = answered
+        for raised in outputs.events:
+            self.event(raised.name, **raised.details)
+        if outputs.command is not None:
+            command = outputs.command
+            self._moved_nm = self._to_modes @ command.actuators_nm.ravel()
+            self.put(COMMAND, codec.encode_command(command, 10**9, "lowfc", self._state.input_number), late_ns=late_ns)
+            state = wire.MirrorState(
+                frame_sequence=command.frame_sequence,
+                rows=command.actuators_nm.shape[0],
+                columns=command.actuators_nm.shape[1],
+                actuators=command.actuators_nm.tobytes(),
+                command_nm=command.command_nm,
+            )
+            self.put(MIRROR_STATE, state, late_ns=late_ns + 200_000)
+        if outputs.step is not None:
+            self.put(STEP, codec.encode_step(outputs.step, self._state.input_number), late_ns=late_ns)
+            columns = {"transport_ns": 90_000, "wakeup_ns": 10_000, "compute_ns": late_ns // 2, "publish_ns": 20_000}
+            timing = wire.ControlTiming(
+                frame_sequence=[outputs.step.frame_sequence],
+                frame_to_command_ns=[late_ns],
+                **{name: [value] for name, value in columns.items()},
+            )
+            self.put(TIMING, timing, late_ns=late_ns)
+        if outputs.changed or self._frames % 100 == 0:
+            state_now = controller_state(self._state, self.settings, self.now_ns)
+            self.put(CONTROLLER_STATE, state_now, late_ns=late_ns)
+
+    def _disturbance_nm(self) -> npt.NDArray[np.float32]:
+        time_s = self._frames * PERIOD_NS * 1e-9
+        return np.array([12 * np.sin(2 * np.pi * 7 * time_s), 3.0, -2.0], np.float32)
+
+    def _pixels(self, residual_nm: npt.NDArray[np.float32], flux_dn: float) -> npt.NDArray[np.uint16]:
+        """Photons are drawn, and read-out adds its noise."""
+        mean_dn = TOY.pixels(residual_nm, flux_dn).astype(float)
+        dark_dn = self.calibration.dark.reshape(SHAPE).astype(float)
+        drawn = dark_dn + self._rng.poisson(mean_dn - dark_dn) + READ_NOISE_E * self._rng.standard_normal(SHAPE)
+        return np.asarray(np.rint(np.clip(drawn, 0, 65_535)), np.uint16)

@@ -1,0 +1,115 @@
+"""What must hold of `limit`, and cases chosen by hand: for the tests, and for the mutations of the source."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from lowfc.control.loop.safety import Limited, Limits
+
+Array = npt.NDArray[np.float32]
+
+LIMITS = Limits(stroke_nm=700.0, slew_nm=100.0, neighbour_nm=400.0)
+
+
+@dataclass(frozen=True)
+class Case:
+    """From `previous_nm`, `wanted_nm` is asked `steps` times; the end is `expected_nm` to 0.01 nm where it is given."""
+
+    name: str
+    previous_nm: Array
+    wanted_nm: Array
+    reasons: tuple[str, ...]
+    expected_nm: Array | None = None
+    steps: int = 1
+
+
+def rows(*values: float) -> Array:
+    """A shape of three columns whose rows have these heights."""
+    return np.repeat(np.array(values, np.float32)[:, None], 3, axis=1)
+
+
+def columns(*values: float) -> Array:
+    """A shape of three rows whose columns have these heights."""
+    return np.ascontiguousarray(rows(*values).T)
+
+
+CASES = (
+    Case("nothing", rows(0, 0, 0), rows(0, 0, 0), (), rows(0, 0, 0)),
+    Case("small move", rows(1, 2, 3), rows(50, -40, 30), (), rows(50, -40, 30)),
+    Case("stroke up", rows(690, 690, 690), rows(720, 690, 690), ("STROKE",), rows(700, 690, 690)),
+    Case("stroke down", rows(-690, -690, -690), rows(-720, -690, -690), ("STROKE",), rows(-700, -690, -690)),
+    Case("slew up", rows(0, 0, 0), rows(150, 0, 0), ("SLEW",), rows(100, 0, 0)),
+    Case("slew down", rows(0, 0, 0), rows(0, -150, 0), ("SLEW",), rows(0, -100, 0)),
+    Case("stroke and slew", rows(0, 0, 0), rows(900, 900, 900), ("STROKE", "SLEW"), rows(100, 100, 100)),
+    Case("neighbours in a column", rows(190, -190, -190), rows(230, -230, -230), ("NEIGHBOUR",), rows(200, -200, -200)),
+    Case(
+        "neighbours in a row",
+        columns(190, -190, -190),
+        columns(230, -230, -230),
+        ("NEIGHBOUR",),
+        columns(200, -200, -200),
+    ),
+    Case("neighbours upside down", rows(-190, 190, 190), rows(-230, 230, 230), ("NEIGHBOUR",), rows(-200, 200, 200)),
+    Case("neighbours crossing over", rows(60, -60, 0), rows(-45, 45, 0), ("SLEW",), rows(-40, 40, 0)),
+    Case("all neighbours together", rows(500, 500, 500), rows(550, 550, 550), (), rows(550, 550, 550)),
+    Case("pressed against neighbours", rows(0, 0, 0), rows(600, -600, -600), ("STROKE",), rows(200, -200, -200), 40),
+    Case(
+        "in the margin of neighbours", rows(200, -199.9996, 0), rows(250, -250, 0), ("NEIGHBOUR",), rows(200, -200, 0)
+    ),
+    Case("apart, to flat", rows(600, 0, 0), rows(0, 0, 0), (), rows(0, 0, 0), 20),
+    Case("apart, wanting more", rows(600, 0, 0), rows(680, 0, 0), ("NEIGHBOUR",), rows(500, 0, 0)),
+    Case("far out, to flat", rows(5000, 5000, 5000), rows(0, 0, 0), (), rows(0, 0, 0), 60),
+    Case("far out, one step", rows(900, 900, 900), rows(0, 0, 0), ("SLEW",), rows(800, 800, 800)),
+    Case("NaN", rows(1, 2, 3), rows(np.nan, 0, 0), ("NOT_FINITE",), rows(1, 2, 3)),
+    Case("infinity", rows(1, 2, 3), rows(0, -np.inf, 0), ("NOT_FINITE",), rows(1, 2, 3)),
+    Case("huge", rows(0, 0, 0), rows(3e38, 3e38, 3e38), ("STROKE", "SLEW"), rows(100, 100, 100)),
+    Case("another grid", rows(1, 2, 3), rows(1, 2), ("WRONG_GRID",), rows(1, 2, 3)),
+    Case("at the slew limit", rows(0.3, 0, 0), rows(100.3, 100, 0), ("SLEW",), rows(100.3, 100, 0)),
+    Case("at the stroke limit", rows(650, 650, 650), rows(700, 700, 700), ("STROKE",), rows(700, 700, 700)),
+    Case("within the slew", rows(3, 3, 3), rows(102.99, 3, 3), (), rows(102.99, 3, 3)),
+    Case("beyond the slew", rows(3, 3, 3), rows(103.01, 3, 3), ("SLEW",), rows(103, 3, 3)),
+    Case("within the stroke", rows(650, 650, 650), rows(699.99, 650, 650), (), rows(699.99, 650, 650)),
+    Case("beyond the stroke down", rows(-650, -650, -650), rows(-700.01, -650, -650), ("STROKE",)),
+    Case("within neighbours in a column", rows(170, -170, -170), rows(199.99, -200, -200), ()),
+    Case("within neighbours in a row", columns(170, -170, -170), columns(199.99, -200, -200), ()),
+    Case("beyond neighbours in a column", rows(170, -170, -170), rows(200.01, -200, -200), ("NEIGHBOUR",)),
+    Case("beyond neighbours in a row", columns(170, -170, -170), columns(200.01, -200, -200), ("NEIGHBOUR",)),
+    Case("at the neighbour limit", rows(195, -195, 0), rows(200, -200, 0), ("NEIGHBOUR",), rows(200, -200, 0)),
+)
+
+
+def violations(limits: Limits, previous_nm: Array, actuators_nm: Array) -> list[str]:
+    """Limits that a command breaks after one that kept them; exact, by float64 and without tolerance."""
+    now, before = actuators_nm.astype(np.float64), previous_nm.astype(np.float64)
+    if now.shape != before.shape or not np.isfinite(now).all():
+        return ["finite"]
+    apart = [np.abs(np.diff(now, axis=axis)).max(initial=0) for axis in (0, 1)]
+    figures = {
+        "stroke": (np.abs(now).max(), limits.stroke_nm),
+        "slew": (np.abs(now - before).max(), limits.slew_nm),
+        "neighbours in a column": (apart[0], limits.neighbour_nm),
+        "neighbours in a row": (apart[1], limits.neighbour_nm),
+    }
+    return [f"{name}: {value} > {bound}" for name, (value, bound) in figures.items() if not value <= bound]
+
+
+def check_kept(limit: Callable[[Limits, Array, Array], Limited], case: Case) -> None:
+    """AssertionError where `limit` does not do with a case what it must."""
+    shape = case.previous_nm
+    outside = bool(violations(LIMITS, shape, shape))
+    for _ in range(case.steps):
+        limited = limit(LIMITS, shape, case.wanted_nm)
+        after: Array = limited.actuators_nm
+        broken = violations(LIMITS, shape, after)
+        if outside:
+            broken = [one for one in broken if one.startswith(("slew", "finite"))]
+        assert broken == [], f"{case.name}: {broken}"
+        shape = after
+    names = tuple(reason.name for reason in limited.reasons)
+    if case.steps == 1:
+        assert names == case.reasons, f"{case.name}: {names}"
+    if case.expected_nm is not None:
+        worst = np.abs(shape - case.expected_nm).max()
+        assert worst < 0.01, f"{case.name}: {worst} nm from what was expected\n{shape}"

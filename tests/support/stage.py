@@ -1,0 +1,136 @@
+"""A run of the toy, state by state, and the verdict on it; for tests of what an operator is shown."""
+
+from collections.abc import Callable, Iterable
+
+import numpy as np
+
+from lowfc.adapters.bus.bus import Sample
+from lowfc.contract.codecs.calibration_codec import encode_calibration, identified
+from lowfc.contract.envelope import sequence_of
+from lowfc.contract.messages import (
+    CALIBRATION,
+    CAMERA_STATE,
+    CONTROLLER_STATE,
+    FRAME,
+    HEALTH,
+    MIRROR_STATE,
+    STEP,
+    TIMING,
+    TRUTH,
+    Message,
+    Topic,
+    image,
+    timestamp,
+    topic_of,
+    wire,
+)
+from lowfc.control.loop.safety import LoopMode, Reason
+from lowfc.optics.detector.photometry import tilt_nm_per_mas
+from lowfc.programs.view.snapshot import Accumulator, Snapshot
+from lowfc.programs.view.verdicts.tile import Tile, Verdict
+from lowfc.programs.view.verdicts.verdict import judge
+from lowfc.programs.view.verdicts.watcher import Watcher
+from tests.support.toy import FLUX_DN, NOLL, START, TOY, calibration
+
+MAS = tilt_nm_per_mas(2.0)
+
+
+def tile(verdict: Verdict, title: str) -> Tile:
+    return next(one for one in verdict.tiles if one.title == title)
+
+
+def accumulated(samples: Iterable[Sample]) -> Accumulator:
+    accumulator = Accumulator()
+    for one in samples:
+        accumulator.add(topic_of(one.key), one.key, one.payload, one.publish_time_ns, one.sequence)
+    return accumulator
+
+
+def snapshot_of(samples: list[Sample]) -> Snapshot:
+    """Everything of a run as one snapshot."""
+    return accumulated(samples).snapshot(samples[-1].publish_time_ns)
+
+
+class Stage:
+    """A run of the toy, whose processes send what they are made to send.
+
+    Attributes:
+        silent: processes that send nothing any more; a silent camera sends no frames, and so on.
+        states: state in each process's Health.
+        health: more of a process's Health.
+        reasons: of every step; from the first seven on the frame was refused.
+    """
+
+    def __init__(self, *, data_ns: int = START * 10**9) -> None:
+        self.host_ns, self.data_ns = START * 10**9, data_ns
+        self.accumulator, self.watcher = Accumulator(), Watcher()
+        self.each: Callable[[Snapshot], object] = lambda snapshot: None
+        self.silent: set[str] = set()
+        self.states = dict.fromkeys(("camera", "controller", "mirror-dm", "recorder"), "running")
+        self.health: dict[str, dict[str, object]] = {"recorder": {"recording": wire.Recording(file="logs/a.mcap")}}
+        self.mode, self.reasons = LoopMode.CLOSED, ()
+        self.truth, self.residual_nm, self.open_nm = True, 5.0, 40.0
+        self.flux, self.full = 1.0, 0
+        self.stroke_nm, self.latency_us = 100.0, 500
+        self.status = wire.MIRROR_STATUS_FOLLOWING
+        self.frames, self.start_s = 0, START
+        self.behind_s = 0.0
+
+    def send(self, topic: Topic, message: Message | bytes, name: str = "dm") -> None:
+        payload = message if isinstance(message, bytes) else message.SerializeToString()
+        self.accumulator.add(topic, topic.at(name), payload, self.host_ns)
+
+    def begin(self) -> None:
+        self.send(CALIBRATION, encode_calibration(identified(calibration()), self.data_ns))
+        settings = wire.ControllerSettings(stroke_nm=700.0, min_flux_fraction=0.2)
+        self.send(CONTROLLER_STATE, wire.ControllerState(mode=self.mode.value, settings=settings))
+        self.send(CAMERA_STATE, wire.CameraState(period_ns=20_000_000))
+
+    def run(self, seconds: float) -> Verdict:
+        """Frames at 50 Hz, Health at 2 Hz, snapshots at 10 Hz."""
+        for _ in range(round(seconds * 50)):
+            self.host_ns += 20_000_000
+            self.data_ns += 20_000_000
+            self._frame()
+            if self.frames % 25 == 0:
+                for name in sorted(self.states.keys() - self.silent):
+                    health = wire.Health(process=name, state=self.states[name], pid=7, **self.health.get(name, {}))
+                    if name == "controller":
+                        health.mode = self.mode.value
+                    self.send(HEALTH, health, name)
+            if self.frames % 5 == 0:
+                snapshot = self.accumulator.snapshot(self.host_ns, behind_s=self.behind_s)
+                self.watcher.feed(snapshot)
+                self.each(snapshot)
+        assert not self.accumulator.unreadable
+        return judge(self.watcher, MAS)
+
+    def _runs(self, name: str) -> bool:
+        return name not in self.silent and self.states.get(name) == "running"
+
+    def _frame(self) -> None:
+        self.frames += 1
+        frame = {"timestamp": timestamp(self.data_ns), "frame_sequence": sequence_of(self.start_s, self.frames)}
+        residual_nm, open_nm = ([size, 0.0, 0.0] for size in (self.residual_nm, self.open_nm))
+        if self._runs("camera"):
+            pixels = TOY.pixels([0.0] * len(NOLL), self.flux * FLUX_DN)
+            pixels.flat[: self.full] = 60_000
+            self.send(FRAME, image(pixels, self.data_ns, "toy"))
+            if self.truth:
+                truth = wire.Truth(**frame, disturbance_nm=open_nm, residual_nm=residual_nm)
+                truth.disturbance_rms_nm, truth.residual_rms_nm = self.open_nm, self.residual_nm
+                self.send(TRUTH, truth)
+        if self._runs("mirror-dm"):
+            shape = np.full(4, self.stroke_nm, "<f4").tobytes()
+            self.send(MIRROR_STATE, wire.MirrorState(status=self.status, rows=2, columns=2, actuators=shape))
+        if self._runs("camera") and self._runs("controller"):
+            step = wire.ControlStep(**frame, mode=self.mode.value, command_nm=[0.0] * 3)
+            step.reasons.extend(reason.value for reason in self.reasons)
+            if not any(reason <= Reason.DARK for reason in self.reasons):
+                step.error_nm.extend(residual_nm)
+                step.pol_nm.extend(open_nm)
+            self.send(STEP, step)
+            stages = dict.fromkeys(("transport_ns", "wakeup_ns", "compute_ns", "publish_ns"), (1,))
+            whole_ns = (1000 * self.latency_us,)
+            sequence = (frame["frame_sequence"],)
+            self.send(TIMING, wire.ControlTiming(frame_sequence=sequence, frame_to_command_ns=whole_ns, **stages))

@@ -1,0 +1,393 @@
+"""Everything that reads what others wrote, each with whole inputs to begin from and the errors it may raise."""
+
+import json
+import tempfile
+import tomllib
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from functools import cache, partial
+from pathlib import Path
+from random import Random
+
+import numpy as np
+from google.protobuf.message import Message
+
+from lowfc.adapters.files import calibration_file, law_file, layouts
+from lowfc.adapters.files.sensors import load_pupil
+from lowfc.adapters.logs.history import read_history
+from lowfc.adapters.logs.reader import LogReader
+from lowfc.adapters.logs.recovery import recover
+from lowfc.adapters.process.latch import Latch
+from lowfc.adapters.process.service import Service
+from lowfc.contract import configuration
+from lowfc.contract.codecs import codec
+from lowfc.contract.codecs.calibration_codec import decode_calibration, encode_calibration, identified
+from lowfc.contract.codecs.law_codec import wire_law
+from lowfc.contract.codecs.state_codec import controller_state, decode_state
+from lowfc.contract.configuration import Configuration, load
+from lowfc.contract.envelope import Envelope
+from lowfc.contract.errors import LowfcError
+from lowfc.contract.messages import CAMERA_STATE, COMMAND, FRAME, image, wire
+from lowfc.control.laws.law import Law
+from lowfc.control.laws.linear_law import LinearLaw, integrator
+from lowfc.control.loop.additions import PlayTable
+from lowfc.control.loop.advance import advance
+from lowfc.control.loop.camera import CameraSettings
+from lowfc.control.loop.inputs import Input, Load, MirrorShape, Tick
+from lowfc.control.loop.requests import prepared
+from lowfc.control.loop.state import State
+from lowfc.programs.core.controller import Controller
+from lowfc.programs.view.snapshot import SHOWN
+from lowfc.testing.clock import FakeClock
+from lowfc.testing.memory_bus import MemoryBus, MemoryHub
+from sim_dm import process
+from sim_dm.device import Device, apply_command, initial, tick
+from sim_dm.process import MirrorProcess
+from tests.support.damage import damaged, rewritten
+from tests.support.mutated_logs import mutated, small_log
+from tests.support.report_log import Night
+from tests.support.safety_checks import violations
+from tests.support.toy import GRID, NOLL, calibration, frame, loaded, settings
+
+USUAL = settings()
+CALIBRATION = identified(calibration())
+
+
+@dataclass(frozen=True)
+class Target:
+    """A reader of foreign bytes.
+
+    Attributes:
+        corpus: whole inputs.
+        read: reads one; raises nothing but `errors`.
+        message: the inputs' class, where they are messages.
+        cost: how many times as long one takes as a message does, about.
+    """
+
+    name: str
+    corpus: tuple[bytes, ...]
+    read: Callable[[bytes], object]
+    errors: tuple[type[Exception], ...] = ()
+    message: type[Message] | None = None
+    cost: int = 1
+
+    def input(self, number: int) -> bytes:
+        """Input `number`, made from its number alone."""
+        rng = Random(f"{self.name} {number}")  # noqa: S311
+        data = rng.choice(self.corpus)
+        if self.message is not None and rng.random() < 0.5:
+            return rewritten(self.message.FromString(data), rng)
+        if self.name.startswith("log"):
+            return mutated(data, number)[1]
+        return damaged(data, self.corpus, rng)
+
+
+class Loop:
+    """A controller that takes whatever comes, and the limits that its commands must keep."""
+
+    def __init__(self) -> None:
+        self.state = loaded(USUAL)
+        self.count = 0
+
+    def take(self, taken: Input) -> None:
+        before = self.state.drive.actuators_nm if self.state.drive is not None else np.zeros(GRID, np.float32)
+        self.state, outputs = advance(USUAL, self.state, taken)
+        if outputs.step is not None:
+            codec.encode_step(outputs.step, self.state.input_number)
+        if outputs.command is not None:
+            assert violations(USUAL.limits, before, outputs.command.actuators_nm) == []
+            codec.encode_command(outputs.command, 1, "lowfc", 1)
+        controller_state(self.state, USUAL, 0).SerializeToString()
+
+    def frame(self, payload: bytes) -> None:
+        """A frame behind the sixteen bytes of its envelope."""
+        self.count += 1
+        sequence, time_ns = Envelope.unpack(payload[:16])
+        self.take(codec.decode_frame(payload[16:], sequence, -time_ns))
+
+    def request(self, name: str, payload: bytes) -> None:
+        asked = codec.decode_request(payload, name, 0)
+        self.take(asked)
+        codec.encode_request(asked, codec.Reply(True, "", 0), 1, None)
+        self.count += 1
+        self.take(frame(self.count))
+
+
+def targets(folder: Path) -> list[Target]:
+    """All of them; files are written to `folder`."""
+    return [*_messages(), *_requests(), *_files(folder), *_logs(folder)]
+
+
+ENVELOPE = Envelope(1 << 32, 5).encode()
+
+
+class Processes:
+    """A controller and a mirror as they run, on the bus in memory: no message ends them."""
+
+    def __init__(self) -> None:
+        config = load(None, {"mirror.rows": GRID[0], "mirror.columns": GRID[1], "realtime.cache_warmup": False})
+        self.hub, self.clock, self.number = MemoryHub(), FakeClock(), 0
+        self.services = [Service(name, "fuzz", self.clock, MemoryBus(self.hub, name, self.clock)) for name in ROLES]
+        self.mirror = MirrorProcess(config, self.services[1])
+        self.controller = Controller(config, self.services[0], CALIBRATION, "a test", Latch(()))
+        self.controller._adopted = True
+        camera = MemoryBus(self.hub, "camera", self.clock)
+        self.frames, self.settings_of = camera.publisher(FRAME), camera.publisher(CAMERA_STATE)
+        self.commands = MemoryBus(self.hub, "somebody", self.clock).publisher(COMMAND, "dm")
+
+    def frame(self, data: bytes) -> None:
+        """Frames with extreme sequences and times, in the envelope too."""
+        self.number += 1
+        rng = Random(self.number)  # noqa: S311
+        self.frames.put(data, rng.choice(EXTREMES), rng.choice(EXTREMES))
+        self._live()
+
+    def command(self, data: bytes) -> None:
+        """Commands of anybody."""
+        self.commands.put(data)
+        self._live()
+
+    def settings(self, data: bytes) -> None:
+        """Settings of a camera."""
+        self.settings_of.put(data)
+        self._live()
+
+    def _live(self) -> None:
+        self.clock.advance(1_000_000)
+        self.mirror._wait()
+        self.controller._between_frames(self.controller._camera.take(0))
+        self.controller._publish_state(self.clock.now_ns())
+        for service in self.services:
+            assert service.running, service.why
+            service.health().SerializeToString()
+        kept = self.mirror._status.driven_nm
+        assert np.isfinite(kept).all()
+        assert violations(self.mirror._device.limits, kept, kept) == []
+
+
+ROLES = ("controller", "mirror-dm")
+EXTREMES = (0, 1, 5, 1 << 31, 1 << 32, 1_800_000_000 << 32, 1 << 62, (1 << 62) + 1, 1 << 63, (1 << 64) - 1)
+
+
+def _messages() -> list[Target]:
+    loop, processes = Loop(), Processes()
+    whole = frame(1).pixels
+    assert whole is not None
+    state = loaded(USUAL)
+    shape = np.ones(GRID, np.float32)
+    modes = np.ones(len(NOLL), np.float32)
+    loading, mirror = Load(0, CALIBRATION, "x"), MirrorShape(0, shape, modes)
+    inputs = (loading, mirror, CameraSettings(0, (6, 7), 100.0, 6e4), Tick(0, 5))
+    told = wire.MirrorCommand(frame_sequence=5, channel="lowfc", valid_for_ns=10**8, rows=4, columns=5)
+    told.actuators, told.command_nm[:] = shape.tobytes(), modes.tolist()
+    mirror_state = wire.MirrorState(rows=4, columns=5, actuators=shape.tobytes(), command_nm=modes.tolist())
+    camera = wire.CameraState(rows=6, columns=7, bias_dn=100, saturation_dn=6e4)
+    return [
+        Target("envelope", (Envelope(1 << 32, 5).encode(),), Envelope.decode, (LowfcError,)),
+        Target("frame", (ENVELOPE + image(whole, 5, "sensor").SerializeToString(),), loop.frame, (LowfcError,), cost=3),
+        Target(
+            "camera to controller",
+            (image(whole, 5, "sensor").SerializeToString(),),
+            processes.frame,
+            message=codec.RawImage,
+            cost=10,
+        ),
+        Target(
+            "controller to mirror", (told.SerializeToString(),), processes.command, message=wire.MirrorCommand, cost=10
+        ),
+        Target(
+            "camera's settings", (camera.SerializeToString(),), processes.settings, message=wire.CameraState, cost=10
+        ),
+        Target(
+            "mirror state", (mirror_state.SerializeToString(),), partial(_mirror, loop), (LowfcError,), wire.MirrorState
+        ),
+        Target("camera state", (camera.SerializeToString(),), partial(_camera, loop), (LowfcError,), wire.CameraState),
+        Target(
+            "controller input",
+            tuple(codec.encode_input(each, 3) for each in inputs),
+            lambda data: codec.decode_input(wire.ControlInput.FromString(data), {CALIBRATION.id: CALIBRATION}),
+            (ValueError, codec.DecodeError),
+            wire.ControlInput,
+        ),
+        Target(
+            "calibration",
+            (encode_calibration(CALIBRATION, 0),),
+            lambda data: decode_calibration(wire.Calibration.FromString(data)),
+            (ValueError, codec.DecodeError),
+            wire.Calibration,
+        ),
+        Target(
+            "controller state",
+            (_busy(state).SerializeToString(),),
+            lambda data: _go_on(*decode_state(wire.ControllerState.FromString(data), calibration(), *_arrays())),
+            (ValueError, codec.DecodeError),
+            wire.ControllerState,
+            10,
+        ),
+        Target(
+            "mirror command", (told.SerializeToString(),), _obey, (codec.DecodeError, LowfcError), wire.MirrorCommand, 2
+        ),
+        Target("a view's messages", (told.SerializeToString(),), _shown, cost=10),
+    ]
+
+
+def _mirror(loop: Loop, data: bytes) -> None:
+    shape = codec.decode_mirror(data)
+    if shape is not None:
+        loop.take(shape)
+        advance(USUAL, loaded(USUAL), shape)  # one that has commanded nothing takes it for its own
+
+
+def _camera(loop: Loop, data: bytes) -> None:
+    loop.take(codec.decode_camera(data, 3))
+
+
+@cache
+def _arrays() -> tuple[dict[str, LinearLaw], dict[str, PlayTable]]:
+    asked = [prepared(USUAL, codec.request(one, one.name, 0)) for one in _asked()]
+    laws = {one.law.id: one.law for one in asked if one.law is not None}
+    return laws, {one.played.id: one.played for one in asked if one.played is not None}
+
+
+def _busy(state: State) -> wire.ControllerState:
+    """A state with everything in it."""
+    for asked in _asked():
+        if asked.name in ("channel", "offset", "law", "play"):
+            state, _ = advance(USUAL, state, codec.request(asked, asked.name, 0))
+    return controller_state(state, USUAL, 0)
+
+
+def _go_on(what: object, state: State) -> None:
+    """A state that was read is one to go on from."""
+    for number in range(1, 4):
+        state, _ = advance(USUAL, state, frame(number + 1000))
+
+
+def _obey(data: bytes) -> None:
+    device = Device(GRID, USUAL.limits, 0.01, 5e4, np.full(GRID, np.nan, np.float32), True)
+    status = initial(device)
+    after, _ = apply_command(device, status, process._told(data), 10)
+    assert violations(device.limits, status.driven_nm, after.driven_nm) == []
+    tick(device, after, 10**9)
+
+
+def _shown(data: bytes) -> None:
+    """Whatever is called by the name of a topic that is looked at."""
+    for topic in SHOWN:
+        try:
+            topic.message.FromString(data)
+        except codec.DecodeError:
+            continue
+
+
+def _asked() -> list[wire.Request]:
+    law = Law(*(np.full(len(NOLL), value, np.float32) for value in (0.4, 0.0, 50.0)))
+    shape = np.ones(GRID, np.float32).tobytes()
+    table = np.ones((5, 1), np.float32).tobytes()
+    whole = wire.Calibration.FromString(encode_calibration(CALIBRATION, 0))
+    return [
+        wire.Request(name="gain", modes=[2, 3], values=[0.3, 0.2]),
+        wire.Request(name="limit", values=[40.0]),
+        wire.Request(name="offset", values=[1.0]),
+        wire.Request(name="step", values=[5.0]),
+        wire.Request(name="close"),
+        wire.Request(name="channel", text="dark-hole", actuators=shape),
+        wire.Request(name="play", text="mirror", table=table, columns=1, actuators=shape),
+        wire.Request(name="law", law=wire_law(integrator(law.gain, law.leak, NOLL, 1.0, 1000.0))),
+        wire.Request(name="load", calibration=whole),
+        wire.Request(name="note", text="clouds"),
+    ]
+
+
+def _requests() -> list[Target]:
+    found = []
+    for asked in _asked():
+        read = partial(Loop().request, asked.name)
+        name, corpus = f"request {asked.name}", (asked.SerializeToString(),)
+        found.append(Target(name, corpus, read, (ValueError,), wire.Request, 10))
+    return found
+
+
+def _files(folder: Path) -> list[Target]:
+    def by(read: Callable[[Path], object], suffix: str) -> Callable[[bytes], object]:
+        def run(data: bytes) -> object:
+            path = folder / f"input{suffix}"
+            path.write_bytes(data)
+            return read(path)
+
+        return run
+
+    def bytes_of(save: Callable[[Path], None], suffix: str) -> bytes:
+        path = folder / f"whole{suffix}"
+        save(path)
+        return path.read_bytes()
+
+    law = Law(*(np.full(len(NOLL), value, np.float32) for value in (0.4, 0.0, 50.0)))
+    linear = integrator(law.gain, law.leak, NOLL, 1.0, 1000.0)
+    with_modes = identified(replace(CALIBRATION, actuators_to_modes=np.ones((len(NOLL), 20), np.float32)))
+    fits = tuple(calibration_file.to_bytes(each) for each in (CALIBRATION, with_modes))
+    sam = json.loads(layouts.SHIPPED.read_text(encoding="utf-8"))["layouts"]["sam27d07"]
+    named = json.dumps({"layouts": {"a": sam}}).encode()
+    toml = Configuration().to_toml().encode()
+    assert tomllib.loads(toml.decode())
+    quarter = np.ones((4, 4))
+    wrong = (LowfcError,)
+    return [
+        Target("calibration file", fits, by(calibration_file.load, ".fits"), wrong, cost=300),
+        Target(
+            "law file",
+            (bytes_of(partial(law_file.save, linear), ".fits"),),
+            by(law_file.load, ".fits"),
+            wrong,
+            cost=300,
+        ),
+        Target("configuration file", (toml,), by(configuration.load, ".toml"), wrong, cost=60),
+        Target(
+            "layout file",
+            (json.dumps(sam).encode(), named),
+            by(lambda path: layouts.load_layout(f"{path}"), ".json"),
+            wrong,
+            cost=20,
+        ),
+        Target(
+            "pupil file",
+            (bytes_of(lambda path: np.savez(path, quarter=quarter), ".npz"),),
+            by(lambda path: load_pupil(256, path), ".npz"),
+            wrong,
+            cost=30,
+        ),
+    ]
+
+
+def _logs(folder: Path) -> list[Target]:
+    whole = tuple(
+        small_log(folder / f"log{finished}.mcap", finished=finished).read_bytes() for finished in (True, False)
+    )
+    night = Night()
+    night.frames(30)
+    night.request("gain", (0.3,))
+    night.frames(20)
+    run = (night.write(folder / "night.mcap").read_bytes(),)
+
+    def read(data: bytes) -> None:
+        path = folder / "read.mcap"
+        path.write_bytes(data)
+        for _ in LogReader(path, skip_damaged=True):
+            pass
+
+    def history(data: bytes) -> None:
+        path = folder / "history.mcap"
+        path.write_bytes(data)
+        read_history(LogReader(path))
+
+    def recovered(data: bytes) -> None:
+        path = folder / "recover.mcap"
+        path.write_bytes(data)
+        with tempfile.TemporaryDirectory(dir=folder) as out:
+            recover(path, Path(out) / "out.mcap")
+
+    return [
+        Target("log, read", whole, read, (LowfcError,), cost=300),
+        Target("log, its history", run, history, (LowfcError,), cost=300),
+        Target("log, recovered", whole, recovered, (LowfcError,), cost=600),
+    ]

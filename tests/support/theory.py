@@ -1,0 +1,95 @@
+"""What an integrator's loop leaves, worked out by its open loop alone: beside `lowfc.control.laws.margins`."""
+
+from collections.abc import Iterable
+
+import numpy as np
+import numpy.typing as npt
+
+from lowfc.arrays import Array
+from lowfc.control.laws.law import Law
+from lowfc.control.laws.linear_law import (
+    LinearLaw,
+    Signal,
+    at_rest,
+    follow,
+    integrator,
+    integrator_block,
+    of_blocks,
+    respond,
+)
+from lowfc.control.laws.pi_notch import Notch, pi_notch
+from lowfc.control.laws.stability import delay_weights, open_loop
+from lowfc.control.laws.vibration import Model
+
+
+def law_of(
+    gain: npt.ArrayLike = 0.5, leak: npt.ArrayLike = 0.0, limit_nm: npt.ArrayLike = 1000.0, modes: int = 3
+) -> Law:
+    """An integrator; one gain for all modes, or one for each."""
+    return Law(*(np.broadcast_to(np.asarray(each, np.float32), (modes,)) for each in (gain, leak, limit_nm)))
+
+
+def linear(law: Law, noll: tuple[int, ...] = (2, 3, 4), delay_frames: float = 1.0, rate_hz: float = 1e3) -> LinearLaw:
+    """The same as a linear law."""
+    return integrator(law.gain, law.leak, noll, delay_frames, rate_hz)
+
+
+def rejection(frequency_hz: Array, rate_hz: float, gain: float, leak: float, delay_frames: float) -> Array:
+    """|S|: true residual over disturbance."""
+    return np.abs(1 / (1 + open_loop(2 * np.pi * frequency_hz / rate_hz, gain, leak, delay_frames)))
+
+
+def noise_transfer(frequency_hz: Array, rate_hz: float, gain: float, leak: float, delay_frames: float) -> Array:
+    """|T|: true residual over measurement noise."""
+    loop = open_loop(2 * np.pi * frequency_hz / rate_hz, gain, leak, delay_frames)
+    return np.abs(loop / (1 + loop))
+
+
+def noise_gain(gain: float, leak: float, delay_frames: float) -> float:
+    """Variance of the residual per variance of white measurement noise: the mean of |T|^2 over frequency."""
+    turns = (np.arange(1 << 14) + 0.5) / (1 << 15)
+    return float(np.mean(noise_transfer(turns, 1.0, gain, leak, delay_frames) ** 2))
+
+
+def integrators(modes: Iterable[tuple[float, float]], signal: Signal, delay_frames: float) -> LinearLaw:
+    """Integrators of gain and leak, as a linear law of this signal, at 1 kHz."""
+    blocks = [integrator_block(gain, leak, signal, delay_frames) for gain, leak in modes]
+    return of_blocks(blocks, signal, "integrator", tuple(range(2, 2 + len(blocks))), delay_frames, 1000.0)
+
+
+def run(law: LinearLaw, disturbance_nm: Array, delay_frames: float, limit_nm: float = np.inf) -> tuple[Array, Array]:
+    """Errors and commands (frames, modes) of a loop in which nothing else acts; its delay may not be the law's."""
+    weights = delay_weights(delay_frames).astype(np.float32)
+    believed = delay_weights(law.delay_frames).astype(np.float32)
+    history = [np.zeros(disturbance_nm.shape[1], np.float32)] * max(len(weights), len(believed))
+    x, errors, commands = at_rest(law), [], []
+    for disturbance in disturbance_nm.astype(np.float32):
+        error = disturbance + sum(weight * past for weight, past in zip(weights, history, strict=False))
+        pol = error - sum(weight * past for weight, past in zip(believed, history, strict=False))
+        x = follow(law, x, error if law.signal == "error" else pol, history[0])
+        history = [np.clip(respond(law, x), -limit_nm, limit_nm, dtype=np.float32), *history[:-1]]
+        errors.append(error)
+        commands.append(history[0])
+    return np.array(errors, float), np.array(commands, float)
+
+
+def realised(model: Model, frames: int, seed: int = 0) -> Array:
+    """A disturbance that the model describes, and its noise, (frames, 1)."""
+    rng = np.random.default_rng(seed)
+    F, Q, C = model.states()
+    root = np.linalg.svd(Q)
+    steps = rng.standard_normal((frames, len(F))) @ (root.U * np.sqrt(root.S)).T
+    x, found = np.zeros(len(F)), np.zeros((frames, 1))
+    for row, step in enumerate(steps):
+        x = F @ x + step
+        found[row] = C @ x
+    return found + np.sqrt(model.noise_nm2) * rng.standard_normal((frames, 1))
+
+
+_GAIN, _NONE = np.array([0.5, 0.3, 0.1]), np.zeros(3)
+_NOTCHES = [(Notch(18, 8, 10), Notch(71, 8, 5))] * 3
+LAWS = {
+    "pi": pi_notch((2, 3, 4), _GAIN, _GAIN / 2, _NONE, [()] * 3, 1.0, 1000.0),
+    "notch": pi_notch((2, 3, 4), _GAIN, _NONE, _NONE, _NOTCHES, 1.0, 1000.0),
+}
+"""Of three modes and one frame of delay, at 1 kHz."""

@@ -1,0 +1,176 @@
+"""A small sensor and mirror with exact algebra, in place of diffraction: for tests of the control law alone."""
+
+from collections.abc import Container
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from lowfc.control.calibration.calibration import Calibration, normalise_flux, reconstructor
+from lowfc.control.laws.stability import delay_weights
+from lowfc.control.loop.advance import advance
+from lowfc.control.loop.camera import CameraSettings
+from lowfc.control.loop.inputs import Frame, Input, Load, Outputs, Step
+from lowfc.control.loop.safety import Limits, LoopMode
+from lowfc.control.loop.state import Settings, State
+
+Array = npt.NDArray[np.float64]
+
+SHAPE, GRID, NOLL = (6, 7), (4, 5), (2, 3, 4)
+FLUX_DN, DARK_DN, SATURATION_DN = 200_000.0, 100.0, 60_000.0
+START = 1_700_000_000
+PERIOD_NS = 1_000_000
+SOME = (10.0, -5.0, 3.0)
+# Clock-induced charge and dark current lift the dark above the bias.
+CAMERA = CameraSettings(0, SHAPE, DARK_DN - 40, SATURATION_DN, 1.0, 1.0, 3.0, start_s=START)
+
+
+def frame_sequence(count: int, start: int = START) -> int:
+    return start << 32 | count
+
+
+@dataclass(frozen=True)
+class Toy:
+    """I0 (pixels,) and H (pixels, modes) before normalisation, and the modes' shapes on the mirror."""
+
+    reference: Array
+    response: Array
+    modes_to_actuators: Array
+
+    def pixels(self, modes_nm: npt.ArrayLike, flux_dn: float = FLUX_DN) -> npt.NDArray[np.uint16]:
+        """Frame (rows, columns) of a wavefront, exactly linear up to the rounding to DN."""
+        image = self.reference + self.response @ np.asarray(modes_nm, float)
+        return np.rint(DARK_DN + flux_dn * image.reshape(SHAPE) / self.reference.sum()).astype(np.uint16)
+
+
+def toy() -> Toy:
+    rng = np.random.default_rng(11)
+    count = SHAPE[0] * SHAPE[1]
+    reference = rng.uniform(0.5, 1.5, count)
+    response = 0.002 * rng.standard_normal((count, len(NOLL)))
+    response -= response.mean(axis=0)  # the flux stays the same, so that the sensor is linear
+    y, x = np.meshgrid(np.linspace(-1, 1, GRID[0]), np.linspace(-1, 1, GRID[1]), indexing="ij")
+    shapes = np.stack([x, y, x**2 + y**2 - 1]).reshape(len(NOLL), -1).T
+    return Toy(reference, response, shapes / 2)
+
+
+TOY = toy()
+
+
+def calibration(noll: tuple[int, ...] = NOLL, scale: float = 1.0) -> Calibration:
+    """The toy's calibration, of some of its modes; `scale` makes a different one."""
+    good = np.ones(SHAPE[0] * SHAPE[1])
+    chosen = [NOLL.index(index) for index in noll]
+    I0, H = normalise_flux(TOY.reference, TOY.response[:, chosen] * scale, good)
+    R = reconstructor(I0, H, good, FLUX_DN, 1.0)
+    return Calibration(
+        noll=noll,
+        reference=I0.astype(np.float32),
+        response=H.astype(np.float32),
+        reconstructor=R.astype(np.float32),
+        good=good.astype(np.float32),
+        dark=np.full(good.size, DARK_DN, np.float32),
+        modes_to_actuators=TOY.modes_to_actuators[:, chosen].astype(np.float32),
+        shape=SHAPE,
+        grid=GRID,
+        flux_dn=FLUX_DN,
+        saturation_dn=SATURATION_DN,
+        estimator="weighted",
+        wavelength_nm=550.0,
+        operator_hash="",
+        id="toy",
+    )
+
+
+def settings(**changes: object) -> Settings:
+    usual: dict[str, object] = {
+        "limits": Limits(700.0, 100.0, 400.0),
+        "delay_frames": 1.0,
+        "start_mode": LoopMode.CLOSED,
+        "max_frame_age_ns": 20_000_000,
+        "frame_timeout_ns": 50_000_000,
+        "on_frame_timeout": "hold",
+        "min_flux_fraction": 0.2,
+        "max_saturated_pixels": 8,
+        "gain": (0.5, 0.3),
+        "leak": (0.0, 0.0),
+        "limit_nm": (150.0, 50.0),
+    }
+    return Settings(**(usual | changes))
+
+
+def loaded(what: Settings) -> State:
+    """State with the toy's calibration loaded."""
+    return advance(what, State(), Load(0, calibration(), "test"))[0]
+
+
+def frame(count: int, modes_nm: npt.ArrayLike = (0, 0, 0), **changes: object) -> Frame:
+    """Frame number `count` of a wavefront."""
+    usual: dict[str, object] = {
+        "sequence": frame_sequence(count),
+        "time_ns": START * 10**9 + count * PERIOD_NS,
+        "age_ns": 100_000,
+        "pixels": TOY.pixels(modes_nm),
+    }
+    return Frame(**(usual | changes))
+
+
+def feed(what: Settings, state: State, *inputs: Input) -> tuple[State, list[Outputs]]:
+    """The state after these inputs, and what each gave rise to."""
+    every = []
+    for taken in inputs:
+        state, outputs = advance(what, state, taken)
+        every.append(outputs)
+    return state, every
+
+
+def names(every: list[Outputs]) -> list[str]:
+    """Of the events."""
+    return [event.name for outputs in every for event in outputs.events]
+
+
+def answered(outputs: Outputs, accepted: bool, *words: str) -> None:
+    """Assert that a request was accepted, or refused, in a sentence with these words."""
+    assert outputs.reply is not None
+    assert outputs.reply.accepted is accepted, outputs.reply.text
+    for word in words:
+        assert word in outputs.reply.text
+
+
+def live(
+    what: Settings,
+    disturbance_nm: Array,
+    noise_nm: npt.ArrayLike = 0.0,
+    state: State | None = None,
+    first: int = 1,
+    missing: Container[int] = (),
+    dark: Container[int] = (),
+) -> tuple[list[Step], Array, State]:
+    """Steps of the live loop, the residual (frames, modes) in each exposure, and the state at the end.
+
+    Args:
+        what: the controller's.
+        disturbance_nm: (frames, modes), to which the mirror adds.
+        noise_nm: of the sensor, which sees the residual and this.
+        state: to begin with; of `loaded` when None.
+        first: number of the first frame.
+        missing: exposures whose frames do not arrive, counted from 0.
+        dark: those without light.
+    """
+    state = loaded(what) if state is None else state
+    weights, to_modes = delay_weights(what.delay_frames), np.linalg.pinv(TOY.modes_to_actuators)
+    given = [np.zeros(len(NOLL))] * len(weights)
+    noise_nm = np.broadcast_to(noise_nm, disturbance_nm.shape)
+    steps, residual_nm = [], np.empty(disturbance_nm.shape)
+    for count, wave_nm in enumerate(disturbance_nm):
+        residual_nm[count] = wave_nm + sum(weight * past for weight, past in zip(weights, given, strict=True))
+        newest = given[0]
+        if count not in missing:
+            light = {"pixels": TOY.pixels((0, 0, 0), flux_dn=0)} if count in dark else {}
+            state, outputs = advance(what, state, frame(first + count, residual_nm[count] + noise_nm[count], **light))
+            assert outputs.step is not None
+            steps.append(outputs.step)
+            if outputs.command is not None:
+                newest = to_modes @ outputs.command.actuators_nm.reshape(-1)
+        given = [newest, *given[:-1]]
+    return steps, residual_nm, state

@@ -1,0 +1,164 @@
+"""Viewers as the tests look at them: rerun's own, and its page in a real browser."""
+
+import base64
+import contextlib
+import io
+import itertools
+import json
+import os
+import shutil
+import signal
+import subprocess
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import pytest
+from websockets.sync.client import ClientConnection, connect
+
+from lowfc.adapters.viewer.rerun_viewer import vulkan_drivers
+from tests.support.loops import until
+
+CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
+CALL_S = 60.0  # software that draws a frame of WebGL on a busy machine takes its time
+
+needs_vulkan = pytest.mark.skipif(
+    not vulkan_drivers() and "VK_ICD_FILENAMES" not in os.environ,
+    reason="no Vulkan driver is installed: apt install mesa-vulkan-drivers libvulkan1",
+)
+needs_chromium = pytest.mark.skipif(CHROMIUM is None, reason="no browser is installed: apt install chromium")
+
+Pixels = npt.NDArray[np.uint8]
+
+
+def pixels(png: bytes) -> Pixels:
+    """(rows, columns, 3) of a PNG."""
+    from PIL import Image
+
+    with Image.open(io.BytesIO(png)) as picture:
+        return np.asarray(picture.convert("RGB"))
+
+
+def share_of(picture: Pixels, colour: tuple[int, int, int], tolerance: int = 12) -> float:
+    """Which part of a picture has a colour, 0 to 1."""
+    return float(np.all(np.abs(picture.astype(int) - colour) <= tolerance, axis=2).mean())
+
+
+class Page:
+    """One page of a headless Chromium, by its debugging protocol.
+
+    Attributes:
+        fetched: address of everything it asked for, by number; without what its own policy forbade.
+        complaints: errors and warnings of its console.
+    """
+
+    def __init__(self, connection: ClientConnection) -> None:
+        self.fetched: dict[str, str] = {}
+        self.complaints: list[str] = []
+        self._connection = connection
+        self._loaded = False
+        self._numbers = itertools.count(1)
+        self._session: dict[str, str] = {}
+        target = self.call("Target.createTarget", url="about:blank")["targetId"]
+        self._session = {"sessionId": self.call("Target.attachToTarget", targetId=target, flatten=True)["sessionId"]}
+        for domain in ("Page", "Network", "Runtime", "Log"):
+            self.call(f"{domain}.enable")
+
+    def open(self, address: str) -> None:
+        """Go there and wait until the page has loaded, which the viewer in it has not yet."""
+        self._loaded = False
+        self.call("Page.navigate", url=address)
+        while not self._loaded:
+            self._note(self._next())
+
+    def screenshot_when(self, shows: Callable[[Pixels], bool], seconds: float) -> bytes:
+        """PNG of the page once it shows what is waited for, or at the end of the time."""
+        deadline_s = time.monotonic() + seconds
+        while True:
+            picture = base64.b64decode(self.call("Page.captureScreenshot", format="png")["data"])
+            if shows(pixels(picture)) or time.monotonic() > deadline_s:
+                return picture
+            time.sleep(0.5)
+
+    def call(self, method: str, **parameters: Any) -> Any:
+        number = next(self._numbers)
+        self._connection.send(json.dumps({"id": number, "method": method, "params": parameters} | self._session))
+        while (answer := self._next()).get("id") != number:
+            self._note(answer)
+        assert "error" not in answer, (method, answer)
+        return answer["result"]
+
+    def _next(self) -> dict[str, Any]:
+        return dict(json.loads(self._connection.recv(timeout=CALL_S)))
+
+    def _note(self, message: dict[str, Any]) -> None:
+        event, about = message.get("method"), message.get("params", {})
+        if event == "Page.loadEventFired":
+            self._loaded = True
+        elif event == "Network.requestWillBeSent":
+            self.fetched[about["requestId"]] = about["request"]["url"]
+        elif event == "Network.loadingFailed" and about.get("blockedReason") == "csp":
+            self.fetched.pop(about["requestId"], None)
+        elif event == "Log.entryAdded" and about["entry"]["level"] in ("warning", "error"):
+            self.complaints.append(f"{about['entry']['text']} {about['entry'].get('url', '')}")
+        elif event == "Runtime.consoleAPICalled" and about["type"] in ("warning", "error"):
+            self.complaints.append(" ".join(str(one.get("value", "")) for one in about["args"]))
+        elif event == "Runtime.exceptionThrown":
+            self.complaints.append(str(about["exceptionDetails"].get("exception", about["exceptionDetails"])))
+
+
+@contextlib.contextmanager
+def browser(folder: Path, size_px: tuple[int, int]) -> Iterator[Page]:
+    """A headless Chromium that draws WebGL in software, with a profile of its own; it fetches from this host only."""
+    quiet = ("quic", "background-networking", "component-update", "sync", "default-apps", "extensions", "dev-shm-usage")
+    options = ["headless", "no-sandbox", "no-first-run", "hide-scrollbars", "remote-debugging-port=0"]
+    options += ["use-angle=swiftshader", "enable-unsafe-swiftshader", "ignore-gpu-blocklist"]
+    options += [f"disable-{name}" for name in quiet]
+    options += ["proxy-server=http://127.0.0.1:9", f"user-data-dir={folder / 'profile'}"]  # nobody listens there
+    options += [f"window-size={size_px[0]},{size_px[1]}"]
+    with (folder / "browser.txt").open("wb") as output:
+        words = [str(CHROMIUM), *(f"--{option}" for option in options)]
+        process = subprocess.Popen(words, stdout=output, stderr=output, start_new_session=True)
+    try:
+        active = folder / "profile" / "DevToolsActivePort"
+        until(lambda: active.exists() and active.read_text().count("\n"), CALL_S)
+        port, path = active.read_text().split("\n")
+        with connect(f"ws://127.0.0.1:{port}{path}", max_size=None, proxy=None) as connection:
+            yield Page(connection)
+    finally:
+        with contextlib.suppress(ProcessLookupError):
+            os.killpg(process.pid, signal.SIGKILL)
+        process.wait(timeout=10)
+
+
+def browser_screenshot(
+    address: str,
+    path: Path,
+    seconds: float,
+    shows: Callable[[Pixels], bool],
+    size_px: tuple[int, int] = (1600, 1000),
+) -> Page:
+    """Picture of a page in a browser, once it shows what is waited for or after so many seconds.
+
+    Args:
+        address: of the page.
+        path: PNG to write; the browser's profile is beside it while it runs.
+        seconds: at most to wait.
+        shows: whether a picture is what is waited for.
+        size_px: width and height of the window; drawing takes time in proportion.
+
+    Returns:
+        What the page fetched and complained of.
+    """
+    folder = path.parent / f"{path.stem}-browser"
+    folder.mkdir()
+    try:
+        with browser(folder, size_px) as page:
+            page.open(address)
+            path.write_bytes(page.screenshot_when(shows, seconds))
+            return page
+    finally:
+        shutil.rmtree(folder, ignore_errors=True)

@@ -1,0 +1,294 @@
+"""A real Foxglove server on a bus, and a client that speaks its protocol as the apps do."""
+
+import base64
+import contextlib
+import json
+import os
+import signal
+import socket
+import struct
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from google.protobuf import descriptor_pool
+from google.protobuf.descriptor_pb2 import FileDescriptorSet
+from google.protobuf.json_format import MessageToDict
+from google.protobuf.message_factory import GetMessageClass
+from websockets.sync.client import connect
+
+from lowfc.adapters.bus.bus import ALL
+from lowfc.adapters.bus.run import new_run_id, open_run
+from lowfc.adapters.bus.zenoh_bus import ZenohBus
+from lowfc.adapters.process.clock import HostClock
+from lowfc.contract.errors import BusError, ConfigurationError
+from lowfc.contract.messages import (
+    CALIBRATION,
+    CAMERA_STATE,
+    COMMAND,
+    FRAME,
+    HEALTH,
+    MIRROR_STATE,
+    STEP,
+    TOPICS,
+    TRUTH,
+    RawImage,
+    Role,
+    image,
+    wire,
+)
+from lowfc.programs.view.foxglove_bridge import FoxgloveBridge
+from lowfc.testing.clock import FakeClock
+from lowfc.testing.memory_bus import MemoryBus, MemoryHub
+from tests.support.loops import until
+
+pytestmark = pytest.mark.exclusive
+
+pytest.importorskip("foxglove")
+
+PATIENCE_S = 10.0
+COUNT = 200  # messages of each topic, one a millisecond
+_DATA = struct.Struct("<BIQ")  # 1, the subscription's number, time
+
+STEP_BYTES = wire.ControlStep(frame_sequence=7, mode=wire.LOOP_MODE_CLOSED, error_nm=[1.5, -2.0]).SerializeToString()
+FRAME_BYTES = image(np.arange(12, dtype=np.uint16).reshape(3, 4), 5, "camera").SerializeToString()
+
+
+class Client:
+    """One app: what the server advertises, and the messages of the topics asked for."""
+
+    def __init__(self, connection: Any) -> None:
+        self._connection = connection
+        self.channels: dict[str, dict[str, Any]] = {}
+        self._topics: dict[int, str] = {}
+
+    def vanish(self) -> None:
+        """End as an app that was killed."""
+        self._connection.socket.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))
+        self._connection.socket.shutdown(socket.SHUT_RD)
+        self._connection.socket.close()
+
+    def subscribe(self, *topics: str) -> None:
+        """Wait until the topics are advertised, and ask for them."""
+        while not self.channels.keys() >= set(topics):
+            assert self.next(advertised=True) is None
+        wanted = []
+        for topic in topics:
+            number = len(self._topics)
+            self._topics[number] = topic
+            wanted.append({"id": number, "channelId": self.channels[topic]["id"]})
+        self._connection.send(json.dumps({"op": "subscribe", "subscriptions": wanted}))
+
+    def next(self, *, advertised: bool = False) -> tuple[str, int, bytes] | None:
+        """Topic, time and payload of the next message; None for what is advertised, if that was asked for."""
+        while True:
+            received = self._connection.recv(timeout=PATIENCE_S)
+            if isinstance(received, bytes):
+                kind, number, time_ns = _DATA.unpack_from(received)
+                assert kind == 1
+                return self._topics[number], time_ns, received[_DATA.size :]
+            said = json.loads(received)
+            if said["op"] == "advertise":
+                self.channels |= {channel["topic"]: channel for channel in said["channels"]}
+                if advertised:
+                    return None
+
+    def decode(self, topic: str, payload: bytes) -> dict[str, Any]:
+        """A message decoded with nothing but what the server advertised."""
+        channel = self.channels[topic]
+        assert (channel["encoding"], channel["schemaEncoding"]) == ("protobuf", "protobuf")
+        pool = descriptor_pool.DescriptorPool()
+        for file in FileDescriptorSet.FromString(base64.b64decode(channel["schema"])).file:
+            pool.Add(file)
+        message = GetMessageClass(pool.FindMessageTypeByName(channel["schemaName"]))
+        return MessageToDict(message.FromString(payload), preserving_proto_field_name=True)
+
+
+@contextlib.contextmanager
+def connected(port: int, most_waiting: int | None = None) -> Iterator[Client]:
+    with connect(
+        f"ws://127.0.0.1:{port}",
+        subprotocols=["foxglove.sdk.v1"],
+        max_size=None,
+        max_queue=most_waiting,
+        compression=None,
+    ) as connection:
+        assert connection.subprotocol == "foxglove.sdk.v1"
+        yield Client(connection)
+
+
+@contextlib.contextmanager
+def running(bus: MemoryBus) -> Iterator[FoxgloveBridge]:
+    bridge = FoxgloveBridge(MemoryBus(bus.hub, Role.VIEWER, bus.clock), bus.clock, "test", port=0)
+    thread = threading.Thread(target=bridge.run)
+    thread.start()
+    try:
+        yield bridge
+    finally:
+        bridge.service.stop("the test is over")
+        thread.join(PATIENCE_S)
+        assert not thread.is_alive()
+
+
+@pytest.fixture
+def bus() -> MemoryBus:
+    """Of the process that publishes."""
+    return MemoryBus(MemoryHub(), Role.CONTROLLER, FakeClock())
+
+
+@pytest.fixture
+def bridge(bus: MemoryBus) -> Iterator[FoxgloveBridge]:
+    with running(bus) as one:
+        yield one
+
+
+def test_the_channels_are_those_of_the_table_and_explain_themselves(bridge: FoxgloveBridge, bus: MemoryBus) -> None:
+    examples = {topic.at("dm"): (topic, topic.message().SerializeToString()) for topic in TOPICS if topic is not HEALTH}
+    with connected(bridge.port) as client:
+        bus.publisher(COMMAND, "dm").put(b"")  # which is nothing for a viewer, and must not appear
+        bus.publisher(MIRROR_STATE, "dm").put(b"")
+        client.subscribe("/lowfc/mirror/dm/state", "/" + HEALTH.at(Role.VIEWER))
+        shown = {"/" + topic.at("dm") for topic in TOPICS if Role.VIEWER in topic.subscribers and topic is not HEALTH}
+        assert client.channels.keys() - {"/" + HEALTH.at(Role.VIEWER)} == shown - {"/lowfc/mirror/dm/surface"}
+        for topic, channel in client.channels.items():
+            if topic.removeprefix("/") in examples:
+                declared, empty = examples[topic.removeprefix("/")]
+                assert channel["schemaName"] == declared.message.DESCRIPTOR.full_name
+                assert client.decode(topic, empty) == {}
+
+
+def test_messages_arrive_as_they_were_sent(bridge: FoxgloveBridge, bus: MemoryBus) -> None:
+    with connected(bridge.port) as client:
+        client.subscribe("/" + FRAME.key, "/" + STEP.key)
+        until(lambda: bridge.subscriptions)
+        bus.publisher(FRAME).put(FRAME_BYTES, publish_time_ns=11)
+        bus.publisher(STEP).put(STEP_BYTES, publish_time_ns=12)
+        assert client.next() == ("/" + FRAME.key, 11, FRAME_BYTES)
+        assert client.next() == ("/" + STEP.key, 12, STEP_BYTES)
+        client.subscribe("/" + CAMERA_STATE.key)
+        until(lambda: len(bridge.subscriptions) == 3)
+        states = bus.publisher(CAMERA_STATE)
+        for sequence in (9, 9, 4):  # a log that is played twice, and then an older one
+            states.put(b"", publish_time_ns=13, sequence=sequence)
+            assert client.next() == ("/" + CAMERA_STATE.key, 13, b"")
+        assert client.decode("/" + STEP.key, STEP_BYTES)["mode"] == "LOOP_MODE_CLOSED"
+        assert RawImage.FromString(FRAME_BYTES).width == 4
+    until(lambda: not bridge.subscriptions)
+
+
+def test_an_app_that_comes_late_gets_the_calibration(bus: MemoryBus) -> None:
+    calibration = wire.Calibration(id="before anybody was there", noll=[2, 3]).SerializeToString()
+    bus.publisher(CALIBRATION).put(calibration, publish_time_ns=3)
+    with running(bus) as bridge:
+        bus.publisher(HEALTH, "controller").put(wire.Health(process="controller", pid=1).SerializeToString())
+        until(lambda: CALIBRATION.key in bridge.kept)
+        for _ in range(2):
+            with connected(bridge.port) as client:
+                client.subscribe("/" + CALIBRATION.key)
+                assert client.next() == ("/" + CALIBRATION.key, 3, calibration)
+
+
+def test_a_client_that_does_not_read_loses_messages_and_holds_up_nobody(bridge: FoxgloveBridge, bus: MemoryBus) -> None:
+    truth = bus.publisher(TRUTH)
+    payload = wire.Truth(residual_nm=[1.0] * 4000).SerializeToString()
+    count = 3000  # 48 MB: more than the sockets hold
+    with connected(bridge.port, most_waiting=1) as frozen, connected(bridge.port) as awake:
+        frozen.subscribe("/" + TRUTH.key)
+        awake.subscribe("/" + STEP.key)
+        until(lambda: len(bridge.subscriptions) == 2)
+        for number in range(1, count + 1):
+            truth.put(payload, publish_time_ns=number)
+        bus.publisher(STEP).put(STEP_BYTES)
+        assert awake.next() is not None
+        got = [0]
+        while got[-1] < count:
+            message = frozen.next()
+            assert message is not None
+            got.append(message[1])
+    assert got == sorted(got)
+    assert 1000 < len(got) < count, "it has a bounded number of the newest"
+
+
+def test_only_this_host_is_listened_to(bridge: FoxgloveBridge) -> None:
+    listening = [
+        line.split()[1]
+        for table in ("tcp", "tcp6")
+        for line in Path(f"/proc/net/{table}").read_text().splitlines()[1:]
+        if line.split()[3] == "0A" and line.split()[1].endswith(f":{bridge.port:04X}")
+    ]
+    assert listening == [f"0100007F:{bridge.port:04X}"]
+
+
+def test_a_taken_port_and_a_missing_library_are_said_in_one_line(
+    bridge: FoxgloveBridge, bus: MemoryBus, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with pytest.raises(BusError, match=f"127.0.0.1:{bridge.port} .*--port") as taken:
+        FoxgloveBridge(bus, bus.clock, "test", bridge.port)
+    monkeypatch.setitem(sys.modules, "foxglove", None)
+    with pytest.raises(ConfigurationError, match=r"pip install .*\[foxglove\]'") as missing:
+        FoxgloveBridge(bus, bus.clock, "test", 0)
+    assert "\n" not in f"{taken.value}{missing.value}"
+
+
+def test_a_process_of_a_real_run() -> None:
+    run = open_run(new_run_id())
+    program = (
+        "import sys\n"
+        "from lowfc.adapters.process.clock import HostClock\n"
+        "from lowfc.adapters.bus.run import open_run\n"
+        "from lowfc.programs.view.foxglove_bridge import serve_foxglove\n"
+        "print(*serve_foxglove(open_run(sys.argv[1]), HostClock(), port=0))"
+    )
+    process = subprocess.Popen(
+        [sys.executable, "-c", program, run.run_id],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        env=os.environ | {"PYTHONUNBUFFERED": "1"},
+    )
+    assert process.stderr is not None
+    bus = ZenohBus(run.links, Role.CONTROLLER, HostClock())
+    try:
+        address = process.stderr.readline().split()[4]
+        heard: list[wire.Health] = []
+        bus.subscribe(HEALTH, lambda sample: heard.append(wire.Health.FromString(sample.payload)), ALL)
+        calibration, frames, steps = map(bus.publisher, (CALIBRATION, FRAME, STEP))
+        with connected(int(address.rpartition(":")[2].rstrip(";"))) as client:
+            until(lambda: heard)
+            calibration.put(b"")
+            client.subscribe("/" + CALIBRATION.key)
+            assert client.next() is not None
+            client.subscribe("/" + FRAME.key, "/" + STEP.key)
+            time.sleep(0.2)  # the server takes a moment to subscribe
+            for _ in range(COUNT):
+                frames.put(FRAME_BYTES)
+                steps.put(STEP_BYTES)
+                time.sleep(0.001)
+            got = {"/" + FRAME.key: 0, "/" + STEP.key: 0}
+            while got["/" + STEP.key] < COUNT:
+                message = client.next()
+                assert message is not None
+                if message[0] == "/" + CALIBRATION.key:
+                    continue  # once more, for it was asked for meanwhile
+                assert message[2] == (FRAME_BYTES if message[0] == "/" + FRAME.key else STEP_BYTES)
+                got[message[0]] += 1
+            assert 0 < got["/" + FRAME.key] < COUNT / 2, "images are thinned, and nothing else is"
+            client.vanish()
+            until(lambda: steps.put(STEP_BYTES * 1000) and steps.published > COUNT + 20)
+        assert {health.process for health in heard} == {Role.VIEWER}
+        process.send_signal(signal.SIGTERM)
+        said, complaints = process.communicate(timeout=PATIENCE_S)
+    finally:
+        process.kill()
+        process.wait()
+        bus.close()
+        run.remove()
+    assert (process.returncode, complaints) == (0, "")
+    (summary,) = said.splitlines()
+    assert summary.startswith("1 ")

@@ -1,0 +1,209 @@
+"""A log as it is drawn: the verdict on all of it, the trend, and the events from before a view began."""
+
+import platform
+from pathlib import Path
+
+import numpy as np
+import pytest
+import rerun.blueprint as rrb
+
+from lowfc.adapters.logs.reader import LogReader
+from lowfc.contract.configuration import Configuration
+from lowfc.contract.errors import DataFileError
+from lowfc.contract.messages import EVENT, SURFACE, TRUTH, Log, image, wire
+from lowfc.programs.view.earlier import earlier_events
+from lowfc.programs.view.layout import layout
+from lowfc.programs.view.panels import mirror, pointing, sensor, tiles, trend, wavefront
+from lowfc.programs.view.recorded import Drawn, draw_logs
+from lowfc.programs.view.renderer import Renderer
+from lowfc.programs.view.verdicts import course
+from lowfc.programs.view.verdicts.course import Course, round_125
+from lowfc.programs.view.verdicts.tile import Level, Verdict
+from tests.support import report_log
+from tests.support.report_log import Night
+from tests.support.stage import accumulated, snapshot_of, tile
+from tests.support.tape import Tape, values_of
+
+Shown = list[Verdict]
+
+
+@pytest.fixture
+def shown(monkeypatch: pytest.MonkeyPatch) -> Shown:
+    """The verdicts that are drawn."""
+    verdicts, picture = Shown(), tiles.picture
+
+    def keep(verdict: Verdict, time_ns: int) -> object:
+        verdicts.append(verdict)
+        return picture(verdict, time_ns)
+
+    monkeypatch.setattr(tiles, "picture", keep)
+    return verdicts
+
+
+def drawn(*logs: Path, config: Configuration | None = None) -> tuple[Drawn, Tape]:
+    tape = Tape()
+    return draw_logs(logs, config or Configuration(), lambda own: Renderer(own, tape)), tape
+
+
+def night(frames: int) -> Night:
+    made = Night()
+    made.frames(frames)
+    return made
+
+
+@pytest.mark.parametrize(
+    ("finish", "value", "level"), [(True, "FINISHED", Level.GOOD), (False, "NO END", Level.WARNING)]
+)
+def test_the_end_of_a_log_is_no_recording(tmp_path: Path, shown: Shown, finish: bool, value: str, level: Level) -> None:
+    made = Night()
+    for _ in range(10):
+        made.frames(50)
+        made.health("recorder", state="running", recording=wire.Recording(file="logs/a.mcap"))
+    drawn(made.write(tmp_path / "night.mcap", finish=finish))
+    assert tile(shown[-2], "RECORDER").value == "RECORDING"  # so it was
+    end = shown[-1]
+    assert (tile(end, "LOG").value, tile(end, "LOG").level) == (value, level)
+    assert [one.title for one in end.tiles if "RECORD" in one.value] == []
+
+
+def test_the_verdict_at_the_end_of_a_log_is_on_all_of_it(tmp_path: Path, shown: Shown) -> None:
+    made = night(1500)
+    made.frames(100, dark=range(100))
+    made.request("open")
+    made.frames(400)
+    drawn(made.write(tmp_path / "night.mcap"))
+    instant, end = shown[-2], shown[-1]
+    assert tile(instant, "LOOP").value == "OPEN"
+    assert tile(end, "LOOP").value == "80 % CLOSED"
+    assert tile(end, "FRAMES").value == "100 UNUSED"
+    assert "of 2000 frames: 0 lost, 100 refused (100 too dark)" in tile(end, "FRAMES").detail
+    assert "0 frames lost, 100 refused" in end.headline
+    truths = [wire.Truth.FromString(one.payload) for one in made.samples if one.key == TRUTH.key][:1600]
+    rms_nm = float(np.sqrt(np.mean([one.residual_rms_nm**2 for one in truths])))
+    assert float(tile(end, "WAVEFRONT").value.split()[0]) == pytest.approx(rms_nm, rel=0.05)
+
+
+def test_a_night_in_safe_mode_is_pointed_out(tmp_path: Path, shown: Shown) -> None:
+    made = night(500)
+    made.request("safe")
+    made.frames(100)
+    drawn(made.write(tmp_path / "night.mcap"))
+    assert shown[-1].level is Level.WARNING
+    assert "in safe mode for" in shown[-1].headline
+
+
+def test_a_log_without_a_step_has_nothing_to_judge(tmp_path: Path, shown: Shown) -> None:
+    made = Night()
+    made.health("recorder", state="running", recording=wire.Recording(lost=3))
+    drawn(made.write(tmp_path / "night.mcap"))
+    assert shown[-1].headline.startswith("Log without a step of the controller. The recorder lost 3 messages")
+    assert [one.value for one in shown[-1].tiles] == ["NOT CLOSED", "?", "1000 Hz", "?", "0 %", "?", "FINISHED"]
+
+
+def test_the_trend_holds_a_night_in_so_many_spans() -> None:
+    kept, snapshot = Course(), snapshot_of(night(200).samples)
+    kept.feed(snapshot)
+    _, rms_nm = kept.wavefront()
+    squares = np.stack([snapshot.truths.residual_rms_nm, snapshot.truths.disturbance_rms_nm], axis=1).astype(float) ** 2
+    np.testing.assert_allclose(rms_nm[0], np.sqrt(squares.mean(axis=0)), rtol=1e-6)
+    kept._add(np.array([snapshot.truths.time_ns[0] + 10 * 3600 * 10**9]), slice(0, 3), np.ones(1), np.ones(1))
+    after_ns, rms_nm = kept.wavefront()
+    assert course.MOST / 2 <= len(after_ns) <= course.MOST
+    np.testing.assert_allclose(rms_nm[0], np.sqrt(squares.mean(axis=0)), rtol=1e-6)
+    assert np.isnan(rms_nm[1:-1]).all()  # nothing in between: a gap
+
+
+@pytest.mark.parametrize(
+    ("value", "up", "down"), [(1.0, 1.0, 1.0), (3.0, 5.0, 2.0), (0.7, 1.0, 0.5), (70.0, 100.0, 50.0)]
+)
+def test_ticks_are_one_two_or_five(value: float, up: float, down: float) -> None:
+    assert round_125(value, up=True) == pytest.approx(up)
+    assert round_125(value, up=False) == pytest.approx(down)
+
+
+def test_every_view_of_the_layout_has_something_and_the_plots_show_all_of_a_log(tmp_path: Path) -> None:
+    made = night(120)
+    made.put(SURFACE, image(np.eye(8, dtype=np.float32), made.now_ns, "dm"))
+    made.frames(2880)
+    done, tape = drawn(made.write(tmp_path / "night.mcap"))
+    assert done.remarks == []
+    assert done.snapshots > 5
+    times_ns, _ = tape.column(wavefront.ERROR.path)
+    assert len(times_ns) == 3000
+    assert np.all(np.diff(times_ns) > 0)
+    origins = {str(view.origin) for view in views(layout().root_container)}
+    assert not [origin for origin in origins if not any(path.startswith(origin) for path in tape.paths)]
+    flat, residual = values_of(tape.last(f"{trend.TREND}/lines").strips)  # the residual on top
+    assert np.mean([y for _, y in flat]) < np.mean([y for _, y in residual])  # upwards is less
+    assert len(residual) == len(flat) > 1
+    assert done.span_ns is not None
+    begin_ns, end_ns = done.span_ns
+    assert (end_ns - begin_ns) * 1e-9 == pytest.approx(done.log_s, abs=0.1)
+    blueprint = layout(window_s=None, span_ns=done.span_ns, still=True)
+    operator = views(blueprint.root_container.contents[0])
+    ranges = [str(view.properties["TimeAxis"]) for view in operator if isinstance(view, rrb.TimeSeriesView)]
+    assert len(ranges) > 4
+    assert all(str(end_ns) in one for one in ranges)
+    assert not {sensor.FRAME, mirror.COMMAND, pointing.TRAIL} & {str(view.origin) for view in operator}
+
+
+def views(part: rrb.Container | rrb.View) -> list[rrb.View]:
+    """Every view of a part of a layout."""
+    return [part] if isinstance(part, rrb.View) else [view for one in part.contents for view in views(one)]
+
+
+def test_a_log_without_an_end_is_drawn_as_far_as_it_goes(tmp_path: Path) -> None:
+    log = night(120).write(tmp_path / "night.mcap")
+    log.write_bytes(log.read_bytes()[: int(log.stat().st_size * 0.6)])
+    assert any("no end" in remark for remark in drawn(log)[0].remarks)
+    assert not LogReader(log).complete
+
+
+def test_logs_of_two_runs_are_not_laid_over_each_other(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    logs = [night(120).write(tmp_path / f"{name}.mcap") for name in "ab"]
+    assert drawn(*logs)[0].snapshots > 0
+    monkeypatch.setitem(report_log.METADATA["lowfc"], "run", "another")
+    other = night(120).write(tmp_path / "c.mcap")
+    with pytest.raises(DataFileError, match="one at a time"):
+        drawn(logs[0], other)
+
+
+# From before the view began.
+
+
+def recorder_of(log: Path, host: str = "") -> wire.Health:
+    return wire.Health(host=host, recording=wire.Recording(files=[log.name], folder=str(log.parent)))
+
+
+@pytest.mark.parametrize("finish", [True, False])
+def test_events_from_before_come_from_the_log_finished_or_not(tmp_path: Path, finish: bool) -> None:
+    made = night(100)
+    made.request("note", text="new star")
+    made.frames(100)
+    made.event("RECORDING_STOPPED", why="operator asked")
+    made.write(tmp_path / "night.mcap", finish=finish)
+    wanted = [one for one in made.samples if one.key == EVENT.key]
+    found = earlier_events(recorder_of(tmp_path / "night.mcap", platform.node()), 0)
+    assert [(one.sequence, one.payload) for one in found] == [(one.sequence, one.payload) for one in wanted]
+    accumulator = accumulated([*wanted[-1:], *found])  # the last one came by the bus, too
+    assert len(accumulator.snapshot(1).events) == len(wanted)
+
+
+@pytest.mark.parametrize(
+    ("recorder", "text"),
+    [
+        (None, "no recorder has kept them"),
+        (recorder_of(Path("/nowhere/a.mcap"), "another"), "in the log on another"),
+        (recorder_of(Path("/nowhere/a.mcap")), "/nowhere/a.mcap cannot be read"),
+    ],
+)
+def test_a_view_without_the_log_reports_that_events_are_missing(recorder: wire.Health | None, text: str) -> None:
+    (line,) = earlier_events(recorder, 7)
+    assert text in Log.FromString(line.payload).message
+
+
+def test_only_chunks_with_events_are_read(tmp_path: Path) -> None:
+    log = night(3000).write(tmp_path / "night.mcap")
+    every, sparse = (LogReader(log, topics=(EVENT,), sparse=sparse) for sparse in (False, True))
+    assert list(every) == list(sparse)
+    assert len(sparse._chunks) < len(every._chunks) / 2

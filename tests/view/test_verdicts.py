@@ -1,0 +1,459 @@
+"""The verdict on a run in words and levels: of real runs, and of each state by itself."""
+
+import re
+import threading
+from collections import Counter
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from lowfc.adapters.bus.bus import Sample
+from lowfc.adapters.files import factory
+from lowfc.adapters.process.clock import SimulatedClock
+from lowfc.adapters.process.latch import Latch
+from lowfc.adapters.process.service import Service
+from lowfc.contract.configuration import Configuration, load
+from lowfc.contract.events import EVENTS
+from lowfc.contract.messages import CONTROLLER_STATE, EVENT, FRAME, HEALTH, STEP, topic_of, wire
+from lowfc.control.loop.safety import LoopMode, Reason
+from lowfc.programs.core.controller import Controller
+from lowfc.programs.view.snapshot import SHOWN, Accumulator
+from lowfc.programs.view.verdicts import steady
+from lowfc.programs.view.verdicts.facts import facts
+from lowfc.programs.view.verdicts.steady import Attained
+from lowfc.programs.view.verdicts.tile import Level, Verdict
+from lowfc.programs.view.verdicts.verdict import judge
+from lowfc.programs.view.verdicts.watcher import Rms, Watcher
+from lowfc.programs.view.verdicts.wavefront_verdict import factor, merit
+from lowfc.testing.memory_bus import MemoryBus, MemoryHub
+from sim_camera.process import CameraProcess, bench
+from sim_dm.process import MirrorProcess
+from tests.support.report_log import Night
+from tests.support.stage import MAS, Stage, tile
+from tests.support.toy import FLUX_DN, NOLL, START, TOY
+
+CALM = {Level.NEUTRAL, Level.GOOD}
+
+
+def levels(verdict: Verdict) -> dict[str, Level]:
+    return {one.title: one.level for one in verdict.tiles}
+
+
+# The loop's real processes, as threads on the bus in memory, in lockstep.
+
+
+def recorded(config: Configuration, camera: Configuration, latch: Path, frames: int) -> list[Sample]:
+    """All messages of a run whose camera has another sky or detector than the one that was calibrated."""
+    hub, received = MemoryHub(), list[Sample]()
+    observer = MemoryBus(hub, "viewer", SimulatedClock())
+    for topic in SHOWN:
+        observer.subscribe(topic, received.append)
+    clocks = {name: SimulatedClock() for name in ("controller", "mirror-dm", "camera")}
+    services = [Service(name, "run", clock, MemoryBus(hub, name, clock)) for name, clock in clocks.items()]
+    optics = factory.twin(config, None, print)
+    calibrated = factory.analytic_calibration(config, optics, factory.mirror_on_twin(config, optics, print))
+    controller = Controller(config, services[0], calibrated, "a test", Latch([latch]))
+    services[0].fill = controller.fill
+    mirror = MirrorProcess(config, services[1])
+    eye = CameraProcess(camera, services[2], bench(camera), frames)
+    services[2].fill = eye.fill
+    threads = [threading.Thread(target=run) for run in (controller.run, mirror.run)]
+    for thread in threads:
+        thread.start()
+    eye.run(("controller", "mirror-dm"))
+    for service in services:
+        service.stop("done")
+    for thread in threads:
+        thread.join()
+    return received
+
+
+def judged(received: list[Sample]) -> Verdict:
+    """The verdict on a run at its last step before a process reported its end, ten snapshots a second."""
+    accumulator, watcher, due_ns = Accumulator(), Watcher(), 0
+    ends = (topic_of(one.key) is HEALTH and wire.Health.FromString(one.payload).state == "stopped" for one in received)
+    end = next((place for place, ended in enumerate(ends) if ended), len(received))
+    last = max(place for place, sample in enumerate(received[:end]) if topic_of(sample.key) is STEP)
+    for sample in received[: last + 1]:
+        accumulator.add(topic_of(sample.key), sample.key, sample.payload, sample.publish_time_ns)
+        if sample.publish_time_ns >= due_ns:
+            due_ns = sample.publish_time_ns + 100_000_000
+            watcher.feed(accumulator.snapshot(sample.publish_time_ns))
+    watcher.feed(accumulator.snapshot(received[last].publish_time_ns))
+    assert not accumulator.unreadable
+    return judge(watcher, MAS)
+
+
+OPEN, SHALLOW = {"control.start_mode": "open"}, {"camera.full_well_e": 1500.0}
+SHORT = {"safety.stroke_nm": 6.0}
+
+
+@pytest.mark.parametrize(
+    ("frames", "calibrated", "seen", "headline", "tiles"),
+    [
+        (
+            260,
+            {},
+            {},
+            "Loop closed, nothing is wrong.",
+            {
+                "LOOP": "CLOSED",
+                "WAVEFRONT": "x better than .* mas per axis; true",
+                "FRAMES": "250 Hz .* simulated time",
+                "LATENCY": "simulated time",
+            },
+        ),
+        (
+            120,
+            OPEN,
+            OPEN,
+            "lowfc ctl close",
+            {"LOOP": "OPEN .*mirror holds its last shape", "WAVEFRONT": "not corrected"},
+        ),
+        (
+            120,
+            SHALLOW,
+            SHALLOW | {"star.magnitude": -2.0},
+            "detector saturated",
+            {"STAR": "SATURATED", "LOOP": "HOLDING"},
+        ),
+        (120, {}, {"star.magnitude": 9.0}, "the star is gone", {"STAR": "GONE"}),
+        (260, SHORT, SHORT, "actuator stroke", {"MIRROR": "AT LIMIT"}),
+    ],
+)
+def test_a_real_run_has_its_verdict(
+    tmp_path: Path,
+    frames: int,
+    calibrated: dict[str, Any],
+    seen: dict[str, Any],
+    headline: str,
+    tiles: dict[str, str],
+) -> None:
+    usual = {"lockstep": True, "control.start_mode": "closed"}
+    config, camera = load(None, usual | calibrated), load(None, usual | seen)
+    verdict = judged(recorded(config, camera, tmp_path / "safed", frames))
+    assert headline in verdict.headline
+    for title, words in tiles.items():
+        found = tile(verdict, title)
+        assert re.search(words, f"{found.value} {found.detail}"), found
+    calm = calibrated == seen and calibrated is not SHORT
+    assert (set(levels(verdict).values()) <= CALM) == calm
+    assert not calm or verdict.level is (Level.NEUTRAL if seen is OPEN else Level.GOOD)
+
+
+# One state at a time: what each process sends, half a second after half a second.
+
+
+def staged(change: Callable[[Stage], object], before_s: float = 3.0, after_s: float = 4.0) -> Verdict:
+    """A healthy run for a while, and then something is changed."""
+    stage = begun()
+    assert stage.run(before_s).level is Level.GOOD
+    change(stage)
+    return stage.run(after_s)
+
+
+def begun(seconds: float = 0.0, **values: object) -> Stage:
+    stage = Stage()
+    setting(**values)(stage)
+    stage.begin()
+    stage.run(seconds)
+    return stage
+
+
+def setting(**values: object) -> Callable[[Stage], None]:
+    return lambda stage: stage.__dict__.update(values)
+
+
+def silence(*names: str) -> Callable[[Stage], None]:
+    return lambda stage: stage.silent.update(names)
+
+
+def health(name: str, **fields: object) -> Callable[[Stage], None]:
+    return lambda stage: stage.health.__setitem__(name, fields)
+
+
+def recording(**fields: object) -> Callable[[Stage], None]:
+    return health("recorder", recording=wire.Recording(**fields))
+
+
+def counting(**counts: int) -> Callable[[Stage], None]:
+    return health("controller", topics=[wire.TopicCount(topic=FRAME.key, **counts)])
+
+
+def opened_by_itself(stage: Stage) -> None:
+    stage.mode = LoopMode.OPEN
+    details = {"before": "closed", "after": "open", "why": "the camera changed"}
+    stage.send(EVENT, EVENTS["MODE_CHANGED"].log("controller", stage.data_ns, **details))
+
+
+def stop(*names: str) -> Callable[[Stage], None]:
+    return lambda stage: stage.states.update(dict.fromkeys(names, "stopped"))
+
+
+def brightened(full: int) -> str:
+    """Light of a frame of which so many pixels are full, as its tile has it."""
+    pixels = TOY.pixels([0.0] * len(NOLL)).ravel() - 100.0
+    pixels[:full] = 60_000 - 100
+    return f"{100 * pixels.sum() / FLUX_DN:.0f} %"
+
+
+EVERYBODY = ("camera", "controller", "mirror-dm", "recorder")
+HARMFUL = "worse than a flat mirror: `lowfc ctl safe` flattens it"
+STATES: dict[str, tuple[Callable[[Stage], object], str, str]] = {
+    # name: what changes; title, value and level of the tile that shows it; words of the headline
+    "healthy": (setting(), "LOOP CLOSED GOOD", "nothing is wrong"),
+    "open": (setting(mode=LoopMode.OPEN), "LOOP OPEN NEUTRAL", "lowfc ctl close"),
+    "open, worse than flat": (setting(mode=LoopMode.OPEN, residual_nm=60.0), "LOOP OPEN NEUTRAL", HARMFUL),
+    "camera changed": (opened_by_itself, "LOOP OPEN WARNING", "opened by itself"),
+    "safed": (setting(mode=LoopMode.SAFE), "LOOP SAFE BAD", "lowfc ctl clear"),
+    "idle": (setting(mode=LoopMode.IDLE, reasons=(Reason.NO_CALIBRATION,)), "FRAMES REFUSED BAD", "no calibration"),
+    "controller dead": (silence("controller"), "LOOP DEAD BAD", "Controller silent for 4 s"),
+    "camera dead": (silence("camera"), "FRAMES NO FRAMES BAD", "No frame for 4 s, camera silent"),
+    "mirror dead": (silence("mirror-dm"), "MIRROR DEAD BAD", "Mirror silent for 4 s"),
+    "recorder dead": (silence("recorder"), "RECORDER DEAD BAD", "Recorder silent"),
+    "everybody dead": (silence(*EVERYBODY), "LOOP NO MESSAGES BAD", "No message from any process for 4 s"),
+    "ended": (stop(*EVERYBODY), "LOOP ENDED NEUTRAL", "The run has ended"),
+    "controller stopped": (stop("controller"), "LOOP STOPPED NEUTRAL", "The controller was stopped"),
+    "camera stopped": (stop("camera"), "LOOP HOLDING NEUTRAL", "The camera was stopped"),
+    "skipped": (counting(skipped=12), "FRAMES 12 LOST WARNING", "12 skipped (controller busy)"),
+    "missing": (counting(missing=90), "FRAMES 90 LOST BAD", "90 never arrived"),
+    "late frames": (setting(reasons=(Reason.LATE,)), "FRAMES REFUSED BAD", "too late"),
+    "wrong size": (setting(reasons=(Reason.WRONG_SIZE,)), "FRAMES REFUSED BAD", "wrong size"),
+    "saturated": (
+        setting(reasons=(Reason.SATURATED,), full=20),
+        "STAR SATURATED BAD",
+        "Every frame is refused, detector saturated",
+    ),
+    "nearly saturated": (setting(full=3), f"STAR {brightened(3)} WARNING", "3 pixels at full well"),
+    "star gone": (setting(reasons=(Reason.DARK,), flux=0.01), "STAR GONE BAD", "the star is gone"),
+    "dim": (setting(flux=0.4), "STAR 40 % WARNING", "The star is dim"),
+    "stroke": (setting(reasons=(Reason.STROKE,)), "MIRROR AT LIMIT BAD", "actuator stroke"),
+    "modal limit": (setting(reasons=(Reason.MODAL_LIMIT,)), "MIRROR AT LIMIT BAD", "modal limit"),
+    "little stroke left": (setting(stroke_nm=650.0), "MIRROR 93 % WARNING", "little is left"),
+    "expired": (setting(status=wire.MIRROR_STATUS_EXPIRED), "MIRROR EXPIRED BAD", "receives no commands"),
+    "harmful": (setting(residual_nm=60.0), "WAVEFRONT 60.0 nm rms WARNING", "The loop does harm"),
+    "diverging": (setting(residual_nm=400.0), "WAVEFRONT 400 nm rms BAD", "40.0 nm with a flat mirror"),
+    "late commands": (health("camera", commands_late=80), "LATENCY 80 LATE WARNING", "80 commands, "),
+    "slow": (setting(latency_us=30_000), "LATENCY 30000 us WARNING", "longer than a frame"),
+    "recorder failed": (recording(failure="no space left"), "RECORDER FAILED BAD", "no space left"),
+    "recording stopped": (recording(file="a", stopped=True), "RECORDER STOPPED WARNING", "the night is not kept"),
+    "recorder stopped": (stop("recorder"), "RECORDER STOPPED WARNING", "The recorder was stopped"),
+    "recorder losing": (recording(file="a", lost=5), "RECORDER LOSING BAD", "lost 5 messages"),
+    "view behind": (setting(behind_s=3.0), "VIEW 3 s WARNING", "This view is 3 s behind"),
+}
+
+
+@pytest.fixture(scope="module")
+def verdicts() -> dict[str, Verdict]:
+    return {name: staged(change) for name, (change, *_) in STATES.items()}
+
+
+@pytest.mark.parametrize("name", STATES)
+def test_each_state_has_its_tile_its_level_and_its_words(verdicts: dict[str, Verdict], name: str) -> None:
+    _, expected, words = STATES[name]
+    verdict = verdicts[name]
+    found = tile(verdict, expected.split()[0])
+    assert f"{found.title} {found.value} {found.level.name}" == expected, verdict
+    assert words in verdict.headline
+    assert all(one.advice for one in verdict.tiles if one.level is verdict.level >= Level.WARNING)
+    assert verdict.level is (found.level if found.level >= Level.WARNING else tile(verdict, "LOOP").level)
+
+
+def test_no_two_states_have_the_same_headline(verdicts: dict[str, Verdict]) -> None:
+    assert [line for line, count in Counter(one.headline for one in verdicts.values()).items() if count > 1] == []
+
+
+def test_a_loop_without_frames_holds(verdicts: dict[str, Verdict]) -> None:
+    assert tile(verdicts["camera dead"], "LOOP").value == tile(verdicts["star gone"], "LOOP").value == "HOLDING"
+
+
+@pytest.mark.parametrize("name", ["open", "safed", "controller dead", "star gone", "ended"])
+def test_a_wavefront_is_called_uncorrected_only_where_nothing_corrects(verdicts: dict[str, Verdict], name: str) -> None:
+    found = tile(verdicts[name], "WAVEFRONT")
+    compared = "of" if name in ("star gone", "ended") else "not corrected;"
+    assert found.detail.startswith(f"{compared} 40.0 nm with a flat mirror")
+    assert found.level is Level.NEUTRAL
+
+
+@pytest.mark.parametrize("after_s", [0.5, 20.0])
+def test_what_is_left_of_an_ended_run_is_called_the_last_of_it_and_is_grey(after_s: float) -> None:
+    verdict = staged(stop(*EVERYBODY), after_s=after_s)
+    last = [tile(verdict, title).value for title in ("WAVEFRONT", "STAR", "LATENCY")]
+    assert last == ["last: 5.0 nm", "last: 100 %", "last: 500 us"]
+    assert set(levels(verdict).values()) == {Level.NEUTRAL}
+
+
+def test_few_unused_frames_are_reported_and_are_no_alarm() -> None:
+    stage = begun(3)
+    counting(skipped=1)(stage)
+    verdict = stage.run(1)
+    frames = tile(verdict, "FRAMES")
+    assert (frames.value, frames.level, verdict.level) == ("50 Hz", Level.GOOD, Level.GOOD)
+    assert frames.detail == "1 frame skipped in the last 5 s"
+    counting(skipped=2)(stage)  # 2 of 250 are more than 0.5 %
+    verdict = stage.run(1)
+    assert (tile(verdict, "FRAMES").value, verdict.level) == ("2 LOST", Level.WARNING)
+    assert verdict.headline.startswith("2 frames lost in the last 5 s")
+    stage = begun(3)
+    stage.reasons = (Reason.LATE,)
+    stage.run(0.02)
+    stage.reasons = ()
+    frames = tile(stage.run(0.98), "FRAMES")
+    assert (frames.level, frames.detail) == (Level.GOOD, "1 frame refused in the last 5 s")
+
+
+def test_a_camera_that_restarts_is_never_called_unused() -> None:
+    stage = begun(3)
+    stage.start_s += 100
+    assert {tile(stage.run(0.1), "FRAMES").value for _ in range(15)} == {"50 Hz"}
+
+
+def test_a_dead_mirror_is_not_hidden_by_one_that_was_stopped_or_runs() -> None:
+    stage = begun()
+    stage.states |= {"mirror-dm": "running", "mirror-tt": "running", "mirror-old": "stopped"}
+    stage.run(1)
+    stage.silent = {"mirror-old"}
+    assert tile(stage.run(3), "MIRROR").level is Level.GOOD
+    stage.silent.add("mirror-tt")
+    assert (tile(stage.run(3), "MIRROR").value, tile(stage.run(3), "LOOP").level) == ("DEAD", Level.WARNING)
+
+
+def test_losses_stay_for_five_seconds_and_then_go() -> None:
+    stage = begun(3)
+    counting(missing=4)(stage)
+    assert tile(stage.run(4.5), "FRAMES").value == "4 LOST"
+    assert levels(stage.run(2))["FRAMES"] is Level.GOOD
+
+
+def test_without_truth_the_wavefront_is_the_measured_one_and_named_so() -> None:
+    found = tile(begun(truth=False).run(3), "WAVEFRONT")
+    tilt = f"tilt {5 / np.sqrt(2) / MAS:.1f} of {40 / np.sqrt(2) / MAS:.1f} mas per axis"
+    assert found.value == "5.0 nm rms"
+    assert found.detail == f"8.0 x better than 40.0 nm with a flat mirror; {tilt}; measured, with noise"
+
+
+def test_simulated_time_is_neither_silence_nor_latency() -> None:
+    stage = Stage(data_ns=10**18)
+    stage.latency_us = 30_000
+    stage.begin()
+    verdict = stage.run(5)
+    assert verdict.level is Level.GOOD
+    assert set(levels(verdict).values()) == CALM
+
+
+def test_a_run_that_starts_is_waited_for_and_missed_only_later() -> None:
+    watcher = Watcher()
+    watcher.feed(Accumulator().snapshot(START * 10**9))
+    nothing = judge(watcher)
+    assert (nothing.level, nothing.headline) == (Level.NEUTRAL, "Waiting for the run to start.")
+    stage = begun(silent={"camera", "mirror-dm", "recorder"}, states={"controller": "ready"})
+    assert stage.run(5).level is Level.NEUTRAL
+    late = stage.run(10)
+    assert (tile(late, "FRAMES").value, tile(late, "MIRROR").value) == ("NO CAMERA", "NO MIRROR")
+    assert late.level is Level.WARNING
+
+
+def test_steps_of_a_camera_without_settings_are_judged_too() -> None:
+    stage = Stage()
+    stage.states = {"controller": "running", "camera": "running"}
+    assert tile(stage.run(0.1), "FRAMES").value == "50 Hz"
+    assert levels(stage.run(3))["FRAMES"] is Level.GOOD
+
+
+def test_a_view_that_is_behind_does_not_take_the_run_for_dead() -> None:
+    stage = begun(3)
+    stage.behind_s = 30.0
+    stage.silent = set(EVERYBODY)  # nothing newer has got here yet
+    assert [one.title for one in stage.run(20).tiles if one.level >= Level.WARNING] == ["VIEW"]
+
+
+def test_a_view_that_begins_after_the_recording_was_stopped_shows_it() -> None:
+    verdict = begun(health={"recorder": {"recording": wire.Recording(file="logs/a.mcap", stopped=True)}}).run(3)
+    assert (tile(verdict, "RECORDER").value, verdict.level) == ("STOPPED", Level.WARNING)
+    assert "lowfc ctl record start" in verdict.headline
+
+
+# What deserves green.
+
+
+@pytest.mark.parametrize(
+    ("better", "attained", "level"),
+    [
+        (1.5, None, Level.NEUTRAL),
+        (2.5, None, Level.GOOD),
+        (2.5, Attained(2.0, 1.9, 0.5), Level.GOOD),
+        (2.5, Attained(4.0, 1.9, 0.5), Level.NEUTRAL),  # other gains would leave half
+        (1.5, Attained(2.0, 1.9, 0.5), Level.NEUTRAL),
+        (5.0, Attained(2.0, 1.0, 8.0), Level.GOOD),  # within what is known of the noise
+    ],
+)
+def test_green_is_a_loop_that_corrects_and_does_what_it_could(
+    better: float, attained: Attained | None, level: Level
+) -> None:
+    assert merit(better, attained)[0] is level
+
+
+def test_noise_is_subtracted_before_a_measured_wavefront_is_judged() -> None:
+    found = Rms(5.0, 13.0, 0.0, 0.0)
+    assert factor(found, False, None) == pytest.approx(2.6)
+    assert factor(found, False, Attained(3.0, 3.0, 4.0)) == pytest.approx(np.sqrt(13**2 - 4**2) / 3)
+    assert factor(found, True, Attained(3.0, 3.0, 4.0)) == pytest.approx(2.6)
+
+
+def test_a_loop_that_corrects_little_is_grey_and_so_is_its_headline() -> None:
+    stage = begun(residual_nm=20.0, open_nm=30.0)
+    verdict = stage.run(3)
+    assert tile(verdict, "WAVEFRONT").detail.startswith("1.5 x better")
+    assert (tile(verdict, "WAVEFRONT").level, verdict.level) == (Level.NEUTRAL, Level.NEUTRAL)
+    assert "little is corrected" in verdict.headline
+    stage.residual_nm = 5.0
+    assert stage.run(2).level is Level.GOOD
+
+
+def test_what_the_gains_could_leave_is_computed_from_the_loop_itself(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(steady, "PERIOD_NS", 1_000_000_000)
+    night = Night(truth=False)
+    night.frames(6000)
+    accumulator, watcher = Accumulator(), Watcher()
+    for number, one in enumerate(night.samples, 1):
+        accumulator.add(topic_of(one.key), one.key, one.payload, one.publish_time_ns, one.sequence)
+        if number % 5000 == 0 or number == len(night.samples):
+            watcher.feed(accumulator.snapshot(one.publish_time_ns))
+    found = watcher.attainable.found
+    assert found is not None
+    assert 0 < found.best_nm <= 1.05 * found.left_nm
+    assert found.noise_nm > 0
+    assert tile(judge(watcher), "WAVEFRONT").detail.endswith("without noise")
+
+
+# What is set.
+
+
+def test_the_facts_are_run_host_law_offset_channels_and_note() -> None:
+    stage = begun(1, health={"controller": {"run_id": "night-7", "host": "bench"}})
+    shape = np.full(4, 2.0, "<f4").tobytes()
+    state = wire.ControllerState(
+        mode=LoopMode.CLOSED.value,
+        gain=[0.5, 0.5, 0.25],
+        leak=[0.0] * 3,
+        delay_frames=1,
+        offset_nm=[0.0, 0.0, 5.0],
+        channels=[wire.Channel(name="dark-hole", actuators=shape, reached=shape)],
+    )
+    stage.send(CONTROLLER_STATE, state)
+    for at_s, text in ((5, "later"), (1, "earlier")):  # a note from before the view began comes after a newer one
+        stage.send(EVENT, EVENTS["NOTE"].log("controller", (START + at_s) * 10**9, text=text))
+    found = stage.run(1).facts
+    assert found["RUN"] == "night-7 on bench"
+    assert found["CONTROL LAW"] == "integrator, gain 0.5 (2 modes), 0.25 (1 mode); delay 1 frame"
+    assert found["OFFSET AND CHANNELS"].endswith("5 nm; channel dark-hole 2 nm")
+    assert found["LAST NOTE"].endswith("later")
+    state.law.name, state.law_frames, state.offset_nm[:] = "lqg", 10**6, [0.0] * 3
+    stage.send(CONTROLLER_STATE, state)
+    found = stage.run(1).facts
+    assert found["CONTROL LAW"] == "lqg; delay 1 frame"
+    assert found["OFFSET AND CHANNELS"] == "no offset; channel dark-hole 2 nm"
+    assert set(facts(Watcher()).values()) == {"not known", "none known"}

@@ -1,0 +1,1 @@
+"""What makes the documentation's tables, pictures and layouts: `python -m tools.measure`."""

@@ -1,0 +1,142 @@
+"""Tables that the code itself decides: topics, messages, keys, requests, and the limits that the commands keep."""
+
+import ast
+from collections.abc import Callable, Iterable
+from functools import partial
+from importlib.resources import files
+
+from google.protobuf.descriptor_pb2 import FileDescriptorSet
+
+from lowfc.client import requests, stream
+from lowfc.contract.codecs.codec import MOST_BYTES
+from lowfc.contract.configuration import Acceptance, Mirror, keys
+from lowfc.contract.messages import CAMERA_STATE, COMMAND, EVENT, FRAME, HEALTH, MIRROR_STATE, SURFACE, Role, Topic
+from lowfc.control.calibration import linearity
+from lowfc.control.laws import transfer_function
+from lowfc.control.laws.stability import LEAST_GAIN_MARGIN, LEAST_PHASE_MARGIN_DEG, LOWEST_GAIN
+from lowfc.control.laws.vibration import FEWEST
+from lowfc.control.loop.state import FADING_FRAMES, SETTLING_FRAMES
+from lowfc.programs.commissioning.acceptance import capture as acceptance_capture
+from lowfc.programs.commissioning.acceptance import linearity as acceptance_linearity
+from lowfc.programs.commissioning.acceptance import rejection as acceptance_rejection
+from lowfc.programs.commissioning.conformance.agreement import AGREEMENTS
+from lowfc.programs.commissioning.tune.figures import OPTICAL_GAIN_MAS
+from tools.shared import ROOT, markdown
+
+_MESSAGES = 4  # numbers of the fields of the descriptors, which the places of comments are made of
+_FIELDS = 2
+_TAKEOVER = (
+    ("frames for which a new law follows before it drives", SETTLING_FRAMES),
+    ("frames in which it then takes over", FADING_FRAMES),
+)
+_TUNING = (
+    ("frames in a row that a law is tuned from, at least", FEWEST),
+    ("tilt of an open loop above which it is flagged, mas rms per axis", OPTICAL_GAIN_MAS),
+    ("gain margin of an integrator, at least", LEAST_GAIN_MARGIN),
+    ("phase margin of an integrator, at least, deg", LEAST_PHASE_MARGIN_DEG),
+    ("integrator gain, at least", LOWEST_GAIN),
+    *_TAKEOVER,
+)
+_ACCEPTANCE = (
+    ("rejection: standard errors that must fit into the tolerance, for a line to be judged", transfer_function.SURE),
+    ("rejection: part of a mode's lines that must be judged for its rejection", acceptance_rejection.LEAST_JUDGED),
+    ("linearity: amplitudes, times `linear_nm`", *acceptance_linearity.AMPLITUDES),
+    ("linearity: standard errors beyond the limit at which a value is beyond it", linearity.SURE),
+    ("capture-range: sizes, times what is required", *acceptance_capture.SIZES),
+    ("capture-range: part of a shape that may be left over", linearity.MISSED),
+)
+_OPERATING = (
+    *_TAKEOVER,
+    ("frames or steps that wait for a Python program, at most", stream.WAITING),
+    ("size of a request, at most, MB", MOST_BYTES / 1e6),
+)
+
+
+def packages() -> str:
+    """The packages, each with the first line of its docstring."""
+    folder = ROOT / "lowfc"
+    rows = []
+    for path in sorted(folder.rglob("*/__init__.py")):
+        text = ast.get_docstring(ast.parse(path.read_text())) or ""
+        rows.append((f"`{'.'.join(path.relative_to(ROOT).parent.parts)}`", text.splitlines()[0]))
+    return markdown(("package", "holds"), rows)
+
+
+def limits(rows: Iterable[tuple[str, *tuple[float, ...]]]) -> str:
+    """What is limited, and the values."""
+    return markdown(("what", "value"), ((what, ", ".join(f"{one:g}" for one in values)) for what, *values in rows))
+
+
+def requirements() -> str:
+    """What an acceptance run requires."""
+    rows = ((f"`{key}`", f"{info.default:g}", sentence(info.description)) for key, info in keys(Acceptance).items())
+    return markdown(("key", "default", "what must be"), rows)
+
+
+def mirror_keys() -> str:
+    """The keys of a mirror."""
+    rows = []
+    for name, info in keys(Mirror, "mirror.").items():
+        default = info.get_default(call_default_factory=True)
+        rows.append((f"`{name}`", f"`{default!r}`", sentence(info.description)))
+    return markdown(("key", "default", ""), rows)
+
+
+def agreement() -> str:
+    """What a camera's settings and the configuration must say alike."""
+    head = ("the camera's", "the configuration's", "may differ by", "needed", "used for")
+    rows = []
+    for one in AGREEMENTS:
+        needed, apart = "yes" if one.needed else "no", f"{one.apart:.0%}" if one.apart else "nothing"
+        rows.append((f"`{one.field}`", f"`{one.key}`", apart, needed, one.use))
+    return markdown(head, rows)
+
+
+def topics(role: Role, *own: Topic) -> str:
+    """What a role publishes and subscribes."""
+    rows = []
+    for topic in (*own, EVENT, HEALTH):
+        when = f"{topic.rate:g} Hz" if isinstance(topic.rate, float) else str(topic.rate)
+        does = "publish" if role in topic.publisher else "subscribe"
+        answers = "; answer who asks for the last" if topic.queryable else ""
+        name = topic.message.DESCRIPTOR.full_name
+        rows.append((f"`{topic.key}`", f"`{name}`", when, does, topic.sentence.rstrip(".") + answers))
+    return markdown(("topic", "message", "when", "you", ""), rows)
+
+
+def fields(message: str) -> str:
+    """Number, type and sentence of every field of one of our messages."""
+    every = FileDescriptorSet.FromString((files("lowfc.contract.wire") / "lowfc.desc").read_bytes())
+    file = next(file for file in every.file if file.package == "lowfc.v1")
+    comments = {
+        tuple(location.path): sentence(location.leading_comments) for location in file.source_code_info.location
+    }
+    index = [one.name for one in file.message_type].index(message)
+    rows = []
+    for place, field in enumerate(file.message_type[index].field):
+        kind = field.type_name.rpartition(".")[2] or type(field).Type.Name(field.type).removeprefix("TYPE_").lower()
+        many = "repeated " if field.label == type(field).LABEL_REPEATED else ""
+        comment = comments.get((_MESSAGES, index, _FIELDS, place)) or "Time of the reported quantity"
+        rows.append((f"`{field.name}`", many + kind, field.number, comment))
+    return markdown(("field", "type", "number", ""), rows)
+
+
+def sentence(text: str | None) -> str:
+    """On one line, without the full stop."""
+    return " ".join((text or "").split()).removesuffix(".")
+
+
+DECLARED: dict[str, Callable[[], str]] = {
+    "requests": requests.table,
+    "packages": packages,
+    "requirements": requirements,
+    "tuning limits": partial(limits, _TUNING),
+    "acceptance limits": partial(limits, _ACCEPTANCE),
+    "operating limits": partial(limits, _OPERATING),
+    "camera topics": partial(topics, Role.CAMERA, FRAME, CAMERA_STATE),
+    "mirror topics": partial(topics, Role.MIRROR, COMMAND, MIRROR_STATE, SURFACE),
+    **{name: partial(fields, name) for name in ("CameraState", "MirrorCommand", "MirrorState")},
+    "mirror keys": mirror_keys,
+    "agreement": agreement,
+}
+"""The tables by the names that the pages call them."""

@@ -1,0 +1,146 @@
+"""The simulated loop without processes: sensor images, the live loop's own `advance`, the mirror, true residuals."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from lowfc.adapters.files import factory
+from lowfc.arrays import Array
+from lowfc.contract.configuration import Configuration, load, sensor_keys
+from lowfc.control.calibration.calibration import Calibration
+from lowfc.control.laws.linear_law import LinearLaw
+from lowfc.control.laws.spectra import Pieces
+from lowfc.control.laws.stability import delay_weights
+from lowfc.control.laws.tuning import Tuned, best_gains, identified, tune_integrator, tune_lqg, tune_pi_notch
+from lowfc.control.loop.advance import advance
+from lowfc.control.loop.inputs import Frame, Load, Request, Step
+from lowfc.control.loop.state import State
+from lowfc.optics.detector.photometry import tilt_nm_per_mas
+from sim_camera.bench import Bench as Scene
+from sim_camera.bench import Truth
+from sim_camera.disturbance import LINES_HZ, Disturbance
+from sim_camera.process import disturbance_of, ignore
+from sim_dm.device import Command, apply_command, initial
+from sim_dm.process import device
+
+RATE_HZ = 1000.0
+
+
+def configured(
+    sensor: str = "sam27d10_bal14", seed: int = 1, delay_frames: float = 1.0, **changed: Any
+) -> Configuration:
+    """The reaction wheel's 14 mas rms per axis before a star of V = 0, at 1 kHz; `changed` are more keys."""
+    keys: dict[str, Any] = {f"sensor.{key}": value for key, value in sensor_keys(sensor).items()}
+    keys |= {"camera.rate_hz": RATE_HZ, "camera.delay_frames": delay_frames, "star.magnitude": 0.0, "seed": seed}
+    return load(None, keys | {"disturbance.preset": "reaction-wheel"} | changed)
+
+
+def calibrated(config: Configuration) -> Calibration:
+    """The analytic calibration of a configuration."""
+    optics = factory.twin(config, None, ignore)
+    return factory.analytic_calibration(config, optics, factory.mirror_on_twin(config, optics, ignore))
+
+
+def with_lines_moved(shaken: Disturbance, factor: float) -> Disturbance:
+    """The same disturbance with its lines at other frequencies."""
+    lines = np.isin(shaken.frequency_hz, LINES_HZ)
+    return replace(shaken, frequency_hz=np.where(lines, factor * shaken.frequency_hz, shaken.frequency_hz))
+
+
+class Bench:
+    """A loop in one process, its mirror flat to begin with; what it did is kept until `forget`.
+
+    Attributes:
+        config: the instrument's.
+        nm_per_mas: of tilt.
+        refused: frames that the controller did not use.
+    """
+
+    def __init__(self, config: Configuration, calibration: Calibration, shaken: Disturbance | None = None) -> None:
+        """Build the optics; `shaken` is another disturbance than the configuration's."""
+        self.config = config
+        self.nm_per_mas = tilt_nm_per_mas(config.star.diameter_m)
+        self.refused = 0
+        optics = factory.twin(config, None, ignore)
+        self._scene = Scene(
+            optics,
+            factory.true_mirror_on_twin(config, optics, ignore),
+            factory.detector(config),
+            factory.electrons_per_exposure(config),
+            disturbance_of(config) if shaken is None else shaken,
+            config.camera.rate_hz,
+            config.seed,
+            config.camera.noise,
+        )
+        self._settings = factory.settings(config)
+        self._state = advance(self._settings, State(), Load(0, calibration, "bench"))[0]
+        self._mirror = device(config)
+        self._status = initial(self._mirror)
+        self._weights = delay_weights(config.camera.delay_frames).astype(np.float32)
+        self._shapes = [self._status.surface_nm] * len(self._weights)
+        self._index = 0
+        self.forget()
+
+    def forget(self) -> None:
+        """Begin a new record."""
+        self.steps: list[Step] = []
+        self.truths: list[Truth] = []
+
+    def ask(self, name: str, **fields: Any) -> None:
+        """An operator's request; ValueError where it is refused."""
+        request = Request(self._index * self.config.period_ns, name, **fields)
+        self._state, outputs = advance(self._settings, self._state, request)
+        if outputs.reply is None or not outputs.reply.accepted:
+            raise ValueError(f"{name}: {outputs.reply}")
+
+    def load(self, law: LinearLaw) -> None:
+        """Let a law drive the mirror."""
+        self.ask("law", law=law)
+
+    def run(self, frames: int) -> None:
+        """Expose, control, move the mirror."""
+        for _ in range(frames):
+            pixels, truth = self._scene.expose(self._index, np.tensordot(self._weights, np.array(self._shapes), 1))
+            time_ns = 10**18 + self._index * self.config.period_ns
+            frame = Frame((1 << 32) + self._index, time_ns, 0, pixels)
+            self._index += 1
+            self._state, outputs = advance(self._settings, self._state, frame)
+            if outputs.step is not None and outputs.step.pol_nm is not None:
+                self.steps.append(outputs.step)
+                self.truths.append(truth)
+            else:
+                self.refused += 1
+            if outputs.command is not None:
+                command = outputs.command
+                told = Command("lowfc", frame.sequence, time_ns, 10**9, command.actuators_nm, command.command_nm)
+                self._status, refused = apply_command(self._mirror, self._status, told, time_ns)
+                if refused is not None:
+                    raise ValueError(f"the mirror refused a command: {refused.name}")
+            self._shapes = [self._status.surface_nm, *self._shapes[:-1]]
+
+    def pol(self) -> Pieces:
+        """Pseudo-open-loop modes (frames, modes) of the record."""
+        return Pieces((np.array([step.pol_nm for step in self.steps], np.float64),), 0)
+
+    def residual_nm(self) -> Array:
+        """True residual (frames, modes) of the record."""
+        return np.array([truth.residual_nm for truth in self.truths], np.float64)
+
+    def tilt_mas(self, last: int) -> float:
+        """True tilt, rms per axis over the last frames."""
+        return float(np.sqrt(np.mean(self.residual_nm()[-last:, :2] ** 2)) / self.nm_per_mas)
+
+
+def tuned(run: Pieces, config: Configuration, kinds: Sequence[str] = ("lqg",)) -> dict[str, Tuned]:
+    """Laws of these kinds for pseudo-open-loop modes (frames, modes), of all modes or the first few."""
+    noll = config.noll[: run.values[0].shape[1]]
+    rate_hz, delay, none = config.camera.rate_hz, config.camera.delay_frames, np.zeros(len(noll))
+    gains, models = best_gains(run, rate_hz, delay, none), identified(run, rate_hz)
+    makers: dict[str, Callable[[], Tuned]] = {
+        "integrator": lambda: tune_integrator(models, gains, noll, none, delay),
+        "pi-notch": lambda: tune_pi_notch(models, gains, noll, none, delay),
+        "lqg": lambda: tune_lqg(run, models, gains, noll, none, delay),
+    }
+    return {kind: makers[kind]() for kind in kinds}

@@ -1,0 +1,163 @@
+"""Measurements of the loop as a user starts it: its residual and latency, and its logs."""
+
+import json
+import os
+import subprocess
+import sys
+import tempfile
+from pathlib import Path
+
+from lowfc.contract.configuration import load
+from sim_camera.prediction import tilt_residual_mas
+from tools.shared import Figures, columns, json_of
+
+LOOP = "lowfc sim-loop --disturbance reaction-wheel --star-magnitude 2 --sensor sam27d10_bal14 --duration 20"
+KEYS = {"disturbance.preset": "reaction-wheel", "star.magnitude": 2.0, "sensor.sam": "sam27d10_bal14"}
+"""The configuration behind `LOOP`."""
+NORMAL = "[realtime]\npriority = 0\nlock_memory = false\nstay_awake = false\n"
+RUNS = (
+    ("250 Hz, SCHED_FIFO", 250, "", ""),
+    ("250 Hz, normal scheduling", 250, "", NORMAL),
+    ("500 Hz, SCHED_FIFO", 500, "", ""),
+    ("1000 Hz, SCHED_FIFO", 1000, "", ""),
+    ("1000 Hz, normal scheduling", 1000, "", NORMAL),
+    ("1000 Hz of simulated time, in lockstep", 1000, " --lockstep", ""),
+)
+RECORDED_S = (60, 600)
+RECORDED = "lowfc sim-loop --rate 1000 --disturbance reaction-wheel --duration"
+LOG_COMMANDS = (*(f"{RECORDED} {seconds}" for seconds in RECORDED_S), "lowfc replay", "lowfc bench record")
+
+
+def measure() -> Figures:
+    """Run the loop once at each rate and in each scheduling class."""
+    runs = {}
+    for name, rate_hz, more, toml in RUNS:
+        with tempfile.TemporaryDirectory() as folder:
+            file = Path(folder) / "run.toml"
+            file.write_text(toml)
+            run = json_of(f"{LOOP} --rate {rate_hz}{more} --config run.toml", folder) | {"log": None, "logs": []}
+            # One frame of delay, two where commands were late.
+            delay = 1 + run["commands_late"] / run["frames_published"]
+            config = load(file, KEYS | {"camera.rate_hz": float(rate_hz)})
+            runs[name] = run | {"tilt_predicted_mas": round(tilt_residual_mas(config, delay), 4)}
+    return {"runs": runs}
+
+
+LOOP_COLUMNS = {
+    "loop": "{name}",
+    "rate": "{rate_hz:.1f} Hz",
+    "tilt per axis, mas rms": "{tilt_residual_mas:.2f} of {tilt_disturbance_mas:.1f}",
+    "predicted": "{tilt_predicted_mas:.2f}",
+    **{
+        f"{title}, us": " / ".join(f"{{latency_us[{stage}][{p}]:.0f}}" for p in ("p50", "p99", "p99_9"))
+        for title, stage in (("frame to command", "frame_to_command"), ("frame to mirror", "frame_to_mirror"))
+    },
+    "frames skipped or missing": "{dropped} of {frames_published}",
+    "messages lost": "{messages_lost} of {messages}",
+}
+
+
+SHORT_COLUMNS = {
+    "simulated loop under a reaction wheel": "{rate_hz:.0f} frames per second",
+    "latency, frame to command, p50 / p99": "{latency_us[frame_to_command][p50]:.0f} / "
+    "{latency_us[frame_to_command][p99]:.0f} us",
+    "residual tilt per axis, of the disturbance": "{tilt_residual_mas:.1f} of {tilt_disturbance_mas:.1f} mas rms",
+}
+
+
+def short(figures: Figures) -> str:
+    """Rate, latency and residual of the runs with real-time scheduling."""
+    rows = (run for name, run in figures["runs"].items() if "SCHED_FIFO" in name)
+    pointer = "[Performance](docs/performance.md) has all runs, and how they were measured."
+    return f"{columns(SHORT_COLUMNS, rows)}\n{pointer}\n"
+
+
+def render(figures: Figures) -> str:
+    """A line for each run."""
+    rows = (
+        run
+        | {"name": name, "dropped": run["frames_skipped"] + run["frames_missing"]}
+        | {"messages": run["messages_lost"] + run["messages_recorded"]}
+        for name, run in figures["runs"].items()
+    )
+    return (
+        f"{columns(LOOP_COLUMNS, rows)}\nLatencies are p50 / p99 / p99.9; predicted is for the delay as measured, "
+        "without the frames that were lost; the rate is that of the host's clock."
+    )
+
+
+def measure_logs() -> Figures:
+    """Record at several rates; record a minute and ten, replay them in one process and on all processors.
+
+    It takes a quarter of an hour and 10 GB.
+    """
+    logs: Figures = {}
+    with tempfile.TemporaryDirectory() as folder:
+        recording = json_of("lowfc bench record", folder)
+        for seconds in RECORDED_S:
+            run = json_of(f"{RECORDED} {seconds}", folder)
+            files = " ".join(run["logs"])
+            alone, most_bytes = _with_memory(folder, f"replay --jobs 1 --json {files}")
+            paths = [Path(folder) / log for log in run["logs"]]
+            logs[str(seconds)] = {
+                "log_bytes": sum(log.stat().st_size for log in paths),
+                **{key: run[key] for key in ("messages_recorded", "messages_lost", "frames_processed")},
+                **{key: alone[key] for key in ("frames", "commands", "states", "unchecked", "identical")},
+                "largest_difference_nm": alone["largest_difference_nm"],
+                "replay_bytes": most_bytes,
+                "speed_one": alone["speed"],
+                "speed_all": json_of(f"lowfc replay {files}", folder)["speed"],
+            }
+            for log in paths:
+                log.unlink()
+    return {"recording": recording, "logs": logs}
+
+
+def _with_memory(folder: str, words: str) -> tuple[Figures, int]:
+    """What a command prints with --json, and the most memory that it used, bytes."""
+    process = subprocess.Popen(
+        [sys.executable, "-m", "lowfc", *words.split()], cwd=folder, stdout=subprocess.PIPE, text=True
+    )
+    printed = process.stdout.read() if process.stdout else ""
+    _, status, used = os.wait4(process.pid, 0)
+    if status:
+        raise RuntimeError(f"`lowfc {words}` failed")
+    return json.loads(printed), used.ru_maxrss * 1024
+
+
+LOG_COLUMNS = {
+    "recorded at 1 kHz": "{seconds} s",
+    "log": "{log_mb:.0f} MB",
+    "messages": "{messages_recorded}",
+    "lost": "{messages_lost}",
+    "steps replayed": "{frames} of {frames_processed}",
+    "unchecked": "{unchecked}",
+    "largest difference": "{largest_difference_nm:g} nm",
+    "replayed, one process": "{speed_one:.1f} x",
+    "all processors": "{speed_all:.1f} x",
+    "memory, one process": "{replay_mb:.0f} MB",
+}
+RECORDER_COLUMNS = {
+    "recorder at": "{offered_hz:.0f} Hz",
+    "processor": "{cpu_percent:.0f} %",
+    "of copying the payloads": "{ratio:.0f} x",
+    "messages": "{messages_published}",
+    "lost": "{messages_lost}",
+    "longest wait": "{longest_wait_ms:.0f} ms",
+    "until flushed": "{longest_unflushed_ms:.0f} ms",
+    "longest write": "{longest_write_ms:.1f} ms",
+}
+
+
+def render_logs(figures: Figures) -> str:
+    """A line for each log, and one for each rate that the recorder was offered."""
+    logs = (
+        log | {"seconds": seconds, "log_mb": log["log_bytes"] / 1e6, "replay_mb": log["replay_bytes"] / 1e6}
+        for seconds, log in figures["logs"].items()
+    )
+    rates = (rate | {"cpu_percent": 100 * rate["cpu_share"]} for rate in figures["recording"]["rates"])
+    return (
+        f"{columns(LOG_COLUMNS, logs)}\n{columns(RECORDER_COLUMNS, rates)}\n"
+        "Replay is in times as fast as it was. The recorder's share is of one processor, all its threads; waits are "
+        "from a message's arrival to its being written, and to its surviving a kill."
+    )

@@ -1,0 +1,143 @@
+"""Make every generated part of the documentation: what is measured, and what the code declares.
+
+A page says between `[[[cog` and `[[[end]]]` which table stands there. Measured tables come from the JSON files in
+`tools/measured`, the others from the code itself; a test compares every page with them.
+
+Example:
+    python -m tools.measure                # the pages again, from what was measured and from the code
+    python -m tools.measure laws sensors   # measures these anew, then the pages
+    python -m tools.measure pictures       # the pictures of the views, with real processes
+    python -m tools.measure layouts        # the viewer's layouts in deploy/layouts
+"""
+
+import argparse
+import json
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
+from typing import NamedTuple
+
+from benchmarks import curves, step, throughput
+from benchmarks.peers import contest
+from benchmarks.runner import Benchmark, said
+from lowfc.programs.measure.latency import text as latency_text
+from lowfc.programs.view.layout import APPLICATION, layout
+from lowfc.programs.view.message_layout import message_layout
+from tools import dark_hole, laws, loop, pictures, reliability, sensors, slow_modes
+from tools.declared import DECLARED
+from tools.shared import ROOT, Figures, host, json_of, where
+
+MEASURED = ROOT / "tools" / "measured"
+PAGES = (ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md")))
+LAYOUTS = ROOT / "deploy" / "layouts"
+SHORT = "loop in short"
+COST_CURVES = ROOT / "docs" / "pictures" / "cost_curves.png"
+
+
+class Measurement(NamedTuple):
+    """One table of the documentation.
+
+    Attributes:
+        commands: what it runs besides its own code.
+        measure: makes its figures.
+        render: makes the table of them.
+        signed: whether the table says itself when, where and how it was measured.
+    """
+
+    commands: tuple[str, ...]
+    measure: Callable[[], Figures]
+    render: Callable[[Figures], str]
+    signed: bool = False
+
+
+def _of(command: str, render: Callable[[Figures], str], signed: bool = False) -> Measurement:
+    """What one command measures."""
+    return Measurement((command,), partial(json_of, command), render, signed)
+
+
+def _latency(command: str) -> Measurement:
+    return _of(command, lambda figures: f"```\n$ {command}\n{latency_text.table(figures)}\n```\n", signed=True)
+
+
+def _bench(command: str, benchmark: Benchmark) -> Measurement:
+    return _of(command, lambda figures: said(benchmark, figures, markdown=True) + "\n", signed=True)
+
+
+MEASUREMENTS = {
+    "loop": Measurement((loop.LOOP,), loop.measure, loop.render),
+    "logs": Measurement(loop.LOG_COMMANDS, loop.measure_logs, loop.render_logs),
+    "sensors": Measurement((sensors.COMMAND,), sensors.measure, sensors.render),
+    "laws": Measurement((), laws.measure, laws.render),
+    "slow_modes": Measurement((), slow_modes.measure, slow_modes.render),
+    "zero_point": Measurement((dark_hole.COMMAND,), dark_hole.measure, dark_hole.render),
+    "chaos": Measurement((reliability.CHAOS,), reliability.chaos, reliability.render_chaos),
+    "soak": _of("lowfc soak --hours 0.5", reliability.render_soak),
+    "fuzz": _of("python -m tests.support.fuzzing --inputs 1000000", reliability.render_fuzz),
+    "latency": _latency("lowfc latency --duration 10 --repeats 5"),
+    "watched": _latency("lowfc latency --duration 60 --record --view"),
+    "step": _bench("python -m benchmarks step", step),
+    "peers": _bench("python -m benchmarks peers --seconds 4", contest),
+    "curves": _bench("python -m benchmarks curves --seconds 1 --repeats 2", curves),
+    "throughput": _bench("python -m benchmarks throughput --seconds 6", throughput),
+}
+
+
+def table(name: str) -> str:
+    """A table of the documentation by its name."""
+    if name in DECLARED:
+        return DECLARED[name]()
+    if name == SHORT:
+        return loop.short(measured("loop"))
+    one, figures = MEASUREMENTS[name], measured(name)
+    text = one.render(figures)
+    if one.signed:
+        return text
+    between = "" if text.endswith("\n") else " "
+    return f"{text}{between}{where(name, figures)}\n"
+
+
+def measured(name: str) -> Figures:
+    """The figures of the last measurement."""
+    figures: Figures = json.loads((MEASURED / f"{name}.json").read_text())
+    return figures
+
+
+def generated(page: Path) -> str:
+    """A page with its tables as they are now."""
+    from cogapp import Cog
+
+    cog = Cog()
+    cog.options.prologue = "from tools.measure import table"
+    text: str = cog.process_string(page.read_text(), str(page))
+    return text
+
+
+def write_layouts() -> None:
+    """Write the layouts for rerun, whose bytes differ each time."""
+    layout().save(APPLICATION, LAYOUTS / "lowfc.rbl")
+    message_layout().save(APPLICATION, LAYOUTS / "log.rbl")
+
+
+def main() -> None:
+    """The command line."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    made = {"pictures": pictures.make, "layouts": write_layouts}
+    known = (*MEASUREMENTS, *made)
+    parser.add_argument("names", nargs="*", metavar="NAME", help=f"any of {', '.join(known)}")
+    names = parser.parse_args().names
+    if unknown := [name for name in names if name not in known]:
+        parser.error(f"there is no {unknown[0]!r}; there are {', '.join(known)}")
+    for name in names:
+        if name in made:
+            made[name]()
+        else:
+            about = {"host": host(), "commands": MEASUREMENTS[name].commands}
+            figures = about | MEASUREMENTS[name].measure()
+            (MEASURED / f"{name}.json").write_text(json.dumps(figures, indent=1) + "\n")
+    for page in PAGES:
+        page.write_text(generated(page))
+    COST_CURVES.write_bytes(curves.picture(measured("curves")))
+
+
+if __name__ == "__main__":
+    main()

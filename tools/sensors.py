@@ -1,0 +1,122 @@
+"""Every sensor, alone and in the simulated loop: the table of docs/sensors.md."""
+
+import statistics
+import sys
+import tempfile
+import time
+from typing import Any
+
+import numpy as np
+from rich.progress import track
+from threadpoolctl import threadpool_limits
+
+from lowfc.adapters.files import factory
+from lowfc.contract.configuration import SENSORS, Configuration, load, sensor_keys
+from lowfc.control.calibration.calibration import Calibration, normalise_flux
+from lowfc.optics.chain.sensor import light_budget, pupil_radii, reference, response, shear_response
+from lowfc.optics.chain.zernike import zernikes
+from lowfc.optics.detector.photometry import tilt_nm_per_mas
+from lowfc.optics.twin.twin import Evaluator
+from tools.shared import Figures, json_of, markdown
+
+LAYOUTS = ("sam18_sized", "sam27d07_bal14", "sam27d10_bal14", "sam27_crb20")
+NAMES = (*(name for name in SENSORS if name != "open"), *LAYOUTS, "open")
+RATE_HZ = 1000
+DURATION_S = 2
+COMMAND = f"lowfc sim-loop --sensor NAME --rate {RATE_HZ} --duration {DURATION_S} --lockstep --no-record"
+PRESETS = ("bench", "reaction-wheel")
+SHEAR = 1e-3
+"""Pupil diameters."""
+
+
+def configured(name: str, **changed: Any) -> Configuration:
+    """The configuration behind `--sensor name` at the loop's rate."""
+    keys = {f"sensor.{key}": value for key, value in sensor_keys(name).items()}
+    return load(None, keys | {"camera.rate_hz": RATE_HZ} | changed)
+
+
+def measure() -> Figures:
+    """Figures of every sensor."""
+    with threadpool_limits(1):
+        found = {name: alone(name) for name in track(NAMES, "sensors alone")}
+    for name in track(NAMES, "sensors in the loop"):
+        found[name]["loop"] = {} if name == "open" else {preset: in_the_loop(name, preset) for preset in PRESETS}
+    return {"sensors": found}
+
+
+def alone(name: str) -> Figures:
+    """Light, condition and noise of a sensor, and the speed of its twin."""
+    config = configured(name)
+    optics = factory.sensor(config, sys.exit)
+    budget = light_budget(optics)
+    twin = factory.twin(config, None, sys.exit)
+    evaluator, flat = Evaluator(twin), np.zeros(twin.used.size, np.float32)
+    times_s = []
+    for _ in range(300):
+        begin = time.perf_counter()
+        evaluator.image(flat)
+        times_s.append(time.perf_counter() - begin)
+    figures: Figures = {
+        "light": budget.total,
+        "peak": budget.peak,
+        "cond14": float(np.linalg.cond(response(optics, zernikes(config.noll, *pupil_radii(optics))))),
+        "twin_us": 1e6 * statistics.median(times_s),
+    }
+    if name != "open":
+        on_nodes = factory.mirror_on_twin(config, twin, sys.exit)
+        plain = factory.analytic_calibration(config, twin, on_nodes)
+        beside_shear = configured(name, **{"control.nuisance": ["shear"]})
+        figures["noise_mas"] = tilt_noise_mas(config, plain)
+        figures["noise_with_shear_mas"] = tilt_noise_mas(
+            beside_shear, factory.analytic_calibration(beside_shear, twin, on_nodes)
+        )
+        light = reference(optics).ravel()
+        slopes = normalise_flux(light, shear_response(optics), np.ones(light.size))[1]
+        taken_nm = SHEAR * np.linalg.norm(plain.reconstructor @ slopes, axis=0)
+        figures["shear_taken_for_nm"] = float(np.sqrt(np.mean(taken_nm**2)))
+    return figures
+
+
+def tilt_noise_mas(config: Configuration, calibration: Calibration) -> float:
+    """Noise of one frame's tip and tilt, rms of both axes, fitted with all modes."""
+    noise_nm = factory.frame_noise_nm(config, calibration)[:2]
+    return float(np.sqrt(np.mean(noise_nm**2)) / tilt_nm_per_mas(config.star.diameter_m))
+
+
+def in_the_loop(name: str, preset: str) -> dict[str, float]:
+    """What the real processes leave of a disturbance."""
+    with tempfile.TemporaryDirectory() as folder:
+        run = json_of(f"{COMMAND.replace('NAME', name)} --disturbance {preset}", folder)
+    wanted = ("disturbance_rms_nm", "residual_rms_nm", "tilt_disturbance_mas", "tilt_residual_mas")
+    return {key: run[key] for key in wanted}
+
+
+def render(figures: Figures) -> str:
+    """A line for each sensor."""
+    head = [
+        *("`--sensor`", "light, %", "peak, %", "cond14", "tilt noise, mas", "with shear", "shear, nm", "twin, us"),
+        *(column for preset in PRESETS for column in (f"`{preset}`: nm rms", "mas per axis")),
+    ]
+    rows = []
+    for name, sensor in figures["sensors"].items():
+        keys = ("noise_mas", "noise_with_shear_mas", "shear_taken_for_nm")
+        cells = [name, f"{100 * sensor['light']:.2f}", f"{100 * sensor['peak']:.2f}"]
+        cells.append(f"{sensor['cond14']:.0f}" if sensor["cond14"] < 1e6 else f"{sensor['cond14']:.0e}")
+        cells += [f"{sensor[key]:.2f}" if key in sensor else "-" for key in keys]
+        cells.append(f"{sensor['twin_us']:.0f}")
+        for preset in PRESETS:
+            run = sensor["loop"].get(preset)
+            cells.append(f"{run['disturbance_rms_nm']:.1f} -> {run['residual_rms_nm']:.2f}" if run else "-")
+            cells.append(f"{run['tilt_disturbance_mas']:.2f} -> {run['tilt_residual_mas']:.2f}" if run else "-")
+        rows.append(cells)
+    star = configured("sam")
+    return (
+        f"{markdown(head, rows)}\nLight is what falls on the detector, of all that enters the open circle; peak is the "
+        "brightest pixel's share of it; cond14 is the condition number of H for Z2 to Z15. The noise is that of tip "
+        f"and tilt, rms of both axes, in one frame of {star.exposure_ns / 1e6:g} ms of a star of V = "
+        f"{star.star.magnitude:g}, all {len(star.noll)} modes fitted; then with the shear of the beam fitted along; "
+        f"then the wavefront, nm rms over the circle, for which a shear of {100 * SHEAR:g} % of the diameter is taken "
+        "otherwise. The twin's time is one frame's, on one thread. The loop's columns are open -> closed: the true "
+        f"wavefront over the open pupil and the true tilt, in the second half of {DURATION_S} simulated seconds at "
+        f"{RATE_HZ} Hz with the default gains."
+    )

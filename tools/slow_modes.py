@@ -1,0 +1,116 @@
+"""How well the simulated loop holds slow drifts, mode by mode: the second table of docs/tuning.md."""
+
+from typing import Any
+
+import numpy as np
+from rich.progress import track
+from threadpoolctl import threadpool_limits
+
+from lowfc.adapters.files.factory import frame_noise_nm
+from lowfc.arrays import Array
+from lowfc.contract.configuration import Configuration
+from lowfc.control.calibration.calibration import Calibration
+from lowfc.design.fisher import cramer_rao, variance_e
+from lowfc.optics.chain.zernike import mode_name
+from tools.law_bench import Bench, calibrated, configured
+from tools.shared import Figures, markdown
+
+WINDOWS, WINDOW_S, SETTLE_S = 10, 100.0, 20.0
+WANTED_PM = 20.0
+RATE_HZ = 250.0
+"""The configuration's own; photons per second are what counts, and the drift is a thousand times slower."""
+EXPOSED = (0.5, 0.9)
+"""Parts of a frame in which light is collected: the configuration's own, and what the loop's latency leaves of 4 ms."""
+KEYS: dict[str, Any] = {
+    "camera.rate_hz": RATE_HZ,
+    "camera.read_noise_e": 1.0,
+    "star.magnitude": 2.0,
+    "disturbance.preset": "thermal",
+    "control.start_mode": "closed",
+}
+
+
+def measure() -> Figures:
+    """Figures of every case."""
+    configurations = {f"{part:g}": configured(**KEYS | {"camera.exposure_fraction": part}) for part in EXPOSED}
+    with threadpool_limits(1):
+        return {"cases": {name: case(config) for name, config in configurations.items()}}
+
+
+def case(config: Configuration) -> Figures:
+    """What is left of each mode in the means over windows, rms over the windows, and what light and camera allow."""
+    calibration = calibrated(config)
+    bench = Bench(config, calibration)
+    frames = round(WINDOW_S * RATE_HZ)
+    left_nm, drift_nm, other_nm = (np.zeros((WINDOWS, len(config.noll))) for _ in range(3))
+    bench.run(round(SETTLE_S * RATE_HZ))
+    for window in track(range(WINDOWS), f"exposed for {config.camera.exposure_fraction:g} of a frame"):
+        bench.forget()
+        bench.run(frames)
+        left_nm[window] = bench.residual_nm().mean(axis=0)
+        drift_nm[window] = np.mean([truth.disturbance_nm for truth in bench.truths], axis=0, dtype=np.float64)
+        command_nm = np.mean([step.command_nm for step in bench.steps], axis=0, dtype=np.float64)
+        other_nm[window] = left_nm[window] - drift_nm[window] - command_nm
+    light_e = calibration.flux_dn * config.camera.gain_e_per_dn
+    bound_nm = photon_bound_nm(calibration, light_e * frames)
+    noise_nm = frame_noise_nm(config, calibration) / np.sqrt(frames)
+    columns = {
+        "drift_nm": _rms(drift_nm),
+        "left_pm": 1e3 * _rms(left_nm),
+        "photon_bound_pm": 1e3 * bound_nm,
+        "noise_pm": 1e3 * noise_nm,
+        "mirror_pm": 1e3 * _rms(other_nm),
+    }
+    return {
+        "light_e_per_s": light_e * RATE_HZ,
+        "gain": config.control.gain,
+        "tilt_gain": config.control.tilt_gain,
+        "frames_refused": bench.refused,
+        "modes": {
+            f"{noll} {mode_name(noll)}": {name: float(values[place]) for name, values in columns.items()}
+            for place, noll in enumerate(config.noll)
+        },
+    }
+
+
+def photon_bound_nm(calibration: Calibration, light_e: float) -> Array:
+    """The least standard deviation (modes,) that any unbiased estimate from so many electrons can have, nm."""
+    H, I0 = calibration.response.astype(np.float64) * light_e, calibration.reference.astype(np.float64) * light_e
+    return np.asarray(np.sqrt(np.diag(cramer_rao(H, variance_e(I0, 0.0)))))
+
+
+def _rms(windows: Array) -> Array:
+    """Rms (modes,) about zero of (windows, modes)."""
+    return np.asarray(np.sqrt(np.mean(windows**2, axis=0)))
+
+
+def render(figures: Figures) -> str:
+    """A line for each mode."""
+    cases = figures["cases"]
+    first, *_ = cases.values()
+    head = ["mode", "drift, nm rms"]
+    for name in cases:
+        head += [f"light for {name} of a frame: left, pm rms", "photon-noise bound, pm"]
+        head += ["photon and read noise through R, pm", f"below {WANTED_PM:g} pm"]
+    head.append("the mirror's part, pm rms")
+    rows = []
+    for mode, one in first["modes"].items():
+        cells = [mode, f"{one['drift_nm']:.2f}"]
+        for of in (found["modes"][mode] for found in cases.values()):
+            verdict = "yes" if of["left_pm"] < WANTED_PM else "no"
+            cells += [f"**{of['left_pm']:.1f}**", f"{of['photon_bound_pm']:.1f}", f"{of['noise_pm']:.1f}", verdict]
+        rows.append([*cells, f"{one['mirror_pm']:.1f}"])
+    passed = ". ".join(
+        f"Light for {name} of a frame, {found['light_e_per_s']:.3g} electrons a second: "
+        f"{sum(one['left_pm'] < WANTED_PM for one in found['modes'].values())} of {len(found['modes'])} modes below "
+        f"{WANTED_PM:g} pm, {found['frames_refused']} frames refused"
+        for name, found in cases.items()
+    )
+    return (
+        f"{markdown(head, rows)}\n{passed}. Disturbance `thermal`, `sam27d10_bal14`, "
+        f"V = {KEYS['star.magnitude']:g}, {KEYS['camera.read_noise_e']:g} e- of read noise, {RATE_HZ:g} Hz; sensor "
+        "images through the live loop's own `advance` and the simulated mirror, as in lockstep; integrator with gains "
+        f"of {first['tilt_gain']:g} (tilt) and {first['gain']:g}. Means of the true residual over windows of "
+        f"{WINDOW_S:g} s, rms about zero over {WINDOWS} windows after {SETTLE_S:g} s; drift is the same of the "
+        "disturbance."
+    )
