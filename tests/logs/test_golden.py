@@ -1,6 +1,9 @@
 """What released versions wrote stays readable, and a replay of their logs is identical."""
 
 import json
+import os
+import subprocess
+import sys
 import tomllib
 from pathlib import Path
 from typing import Any
@@ -43,6 +46,17 @@ def test_a_replay_is_identical(log: Path, frames: int) -> None:
     assert (figures["frames"], figures["different"], figures["unchecked"]) == (frames, 0, 0)
     if not {"blas", "cpu_features", "numpy"} & figures["host_differs"].keys():
         assert (figures["identical"], figures["largest_difference_nm"]) == (True, 0.0)
+
+
+def test_another_linear_algebra_differs_by_rounding_alone() -> None:
+    words = [sys.executable, "-m", "lowfc", "replay", str(NIGHT), "--json", "--tolerance", "1e-3"]
+    environment = os.environ | {"OPENBLAS_CORETYPE": "Prescott"}  # SSE3: every processor has it
+    done = subprocess.run(words, capture_output=True, text=True, env=environment, check=False)
+    figures = json.loads(done.stdout)
+    assert (done.returncode, figures["different"], figures["first_difference"]) == (0, 0, None)
+    if "blas" in figures["host_differs"]:
+        assert 0 < figures["largest_difference_nm"] < 1e-4
+    assert sorted(figures["rules_changed"].values()) == [1, 1]
 
 
 def test_rules_that_changed_on_purpose_are_said_and_counted() -> None:

@@ -56,9 +56,11 @@ class Account:
         if steps:
             self.unchecked[why] = self.unchecked.get(why, 0) + steps
 
-    def enter(self, found: Difference, tolerance_nm: float) -> None:
-        """Account for two messages that are not the same bytes."""
+    def enter(self, found: Difference | None, tolerance_nm: float) -> None:
+        """Account for two messages that are not the same bytes, and for what differs in them."""
+        if found is None:
+            return
         self.largest_nm = max(self.largest_nm, found.largest_nm)
-        if not tolerance_nm or found.otherwise or found.largest_nm > tolerance_nm:
+        if not found.within(tolerance_nm):
             self.different += 1
             self.first = self.first or found

@@ -2,6 +2,7 @@
 
 import contextlib
 from collections import deque
+from copy import deepcopy
 from dataclasses import dataclass
 
 from google.protobuf.message import Message
@@ -308,7 +309,8 @@ class ControllerReplay:
         assert self._state is not None  # noqa: S101
         state, _ = advance(self._settings, self._state, taken)
         again = controller_state(state, self._settings, from_timestamp(logged.timestamp))
-        if self._same(again, logged):
+        found = self._difference(state, logged, again)
+        if found is None or found.within(self._tolerance_nm):
             self._account.states += 1
         else:
             self._account.changed[rule] = self._account.changed.get(rule, 0) + 1
@@ -322,18 +324,18 @@ class ControllerReplay:
         self._past.append(state)
         self.done = state.input_number == self._last
 
-    def _same(self, replayed: Message, logged: Message) -> bool:
-        """Whether they are the same in all that is compared."""
-        if self._former is None or type(replayed) is not type(logged):
-            return replayed == logged
-        if isinstance(logged, wire.ControllerState):
-            logged = self._in_todays_form(logged)
-        elif isinstance(logged, wire.Request) and logged.HasField("state"):
-            again = wire.Request()
-            again.CopyFrom(logged)
-            again.state.CopyFrom(self._in_todays_form(logged.state))
-            logged = again
-        return self._former.compared(replayed) == self._former.compared(logged)
+    def _difference(self, state: State, logged: Message, replayed: Message | None) -> Difference | None:
+        """What differs in all that is compared; None where nothing does."""
+        if self._former is not None and type(replayed) is type(logged):
+            logged = deepcopy(logged)
+            if isinstance(logged, wire.ControllerState):
+                logged = self._in_todays_form(logged)
+            elif isinstance(logged, wire.Request) and logged.HasField("state"):
+                logged.state.CopyFrom(self._in_todays_form(logged.state))
+            logged, replayed = self._former.compared(logged), self._former.compared(replayed)
+        if replayed == logged and (self._former is not None or isinstance(logged, wire.ControllerState)):
+            return None  # of other messages the bytes differ
+        return difference(state.input_number, state.frame_sequence, logged, replayed)
 
     def _in_todays_form(self, logged: wire.ControllerState) -> wire.ControllerState:
         """A state with the same content; one that cannot be decoded as it is."""
@@ -381,9 +383,10 @@ class ControllerReplay:
         self._account.states += 1
         self.done = state.input_number == self._last
         replayed = controller_state(state, self._settings, from_timestamp(logged.timestamp))
-        if self._same(replayed, logged):
+        found = self._difference(state, logged, replayed)
+        if found is None:
             return
-        self._account.enter(difference(state.input_number, state.frame_sequence, logged, replayed), self._tolerance_nm)
+        self._account.enter(found, self._tolerance_nm)
         if self._state is state and not self.done:  # or what differs here would differ for the rest of the log
             self._states[state.input_number] = logged
             self._lose("")
@@ -394,7 +397,4 @@ class ControllerReplay:
             return
         assert self._state is not None  # noqa: S101
         body = None if replayed is None else type(logged).FromString(replayed)
-        if self._former is not None and body is not None and self._same(body, logged):
-            return
-        found = difference(self._state.input_number, self._state.frame_sequence, logged, body)
-        self._account.enter(found, self._tolerance_nm)
+        self._account.enter(self._difference(self._state, logged, body), self._tolerance_nm)

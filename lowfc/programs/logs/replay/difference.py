@@ -33,6 +33,10 @@ class Difference:
     largest_nm: float = 0.0
     otherwise: bool = False
 
+    def within(self, tolerance_nm: float) -> bool:
+        """Whether only numbers in nm differ, by no more than this; nothing is within 0."""
+        return tolerance_nm > 0 and not self.otherwise and self.largest_nm <= tolerance_nm
+
 
 def difference(taken: int, frame_sequence: int, logged: Message, replayed: Message | None) -> Difference:
     """Compare a message of the log with the replayed one, which is None where the replay sent nothing."""
