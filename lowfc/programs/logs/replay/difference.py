@@ -10,6 +10,8 @@ from google.protobuf.message import Message
 
 _FLOAT32_FIELDS = ("actuators", "offset")
 """Bytes that hold little-endian float32, nm."""
+_IN_NM = ("_nm", "actuators", "law_state")
+"""Ends of the names of fields in nm; a law's state has the unit that its author gave it, which for ours is nm."""
 _SHOWN = 4
 
 
@@ -61,7 +63,7 @@ def _compare(found: Difference, prefix: str, logged: Message, replayed: Message)
             _compare(found, f"{prefix}{name}.", was, now)
             continue
         before, after = _numbers(descriptor, was), _numbers(descriptor, now)
-        if not _alike(before, after) or not name.endswith(("_nm", "actuators")):
+        if not _alike(before, after) or not name.endswith(_IN_NM):
             found.fields.append(f"{prefix}{name}: log {_short(was)}, replay {_short(now)}")
             found.otherwise = True
         else:
