@@ -39,6 +39,8 @@ __all__ = [
 
 TAKEN_S = 0.5
 """How long the router, or who has one's place already, may take to answer."""
+FLUSH_S = 2.0
+"""How long a session waits at its end for peers that have not received everything yet."""
 
 
 def receive_in_one_thread() -> None:
@@ -271,7 +273,13 @@ class ZenohBus:
 
         self._session.declare_queryable(key_expression, Callback(asked, indirect=False))
 
-    def get(self, key: str, payload: bytes = b"", timeout_s: float = 1.0) -> list[Sample]:
+    def get(
+        self,
+        key: str,
+        payload: bytes = b"",
+        timeout_s: float = 1.0,
+        priority: zenoh.Priority = zenoh.Priority.DATA,
+    ) -> list[Sample]:
         """See `Bus.get`."""
         answers: list[Sample] = []
         done = threading.Event()
@@ -289,6 +297,7 @@ class ZenohBus:
             Callback(answered, done.set, indirect=False),
             payload=payload,
             timeout=timeout_s,
+            priority=priority,
             target=zenoh.QueryTarget.ALL,
             consolidation=zenoh.ConsolidationMode.NONE,
             # An operator's question waits for room, or a large one is lost; those of late joiners are empty.
@@ -302,7 +311,14 @@ class ZenohBus:
         return len(self._session.info.peers_zid()) + len(self._session.info.routers_zid())
 
     def close(self) -> None:
-        """Leave the run."""
+        """Leave the run, when what was put has been received or the peers have not answered in time.
+
+        Zenoh interrupts the write of a message when its session closes; to a slow reader that leaves half a message,
+        and the rest of the stream is lost. Messages of the lowest priority are sent last, and so is this question.
+        """
+        if self.role in self._links.ports:
+            with contextlib.suppress(zenoh.ZError):  # it is closed already
+                self.get(HEALTH.at(ALL), timeout_s=FLUSH_S, priority=zenoh.Priority.BACKGROUND)
         for close in self._closers:
             close()
         with contextlib.suppress(zenoh.ZError):

@@ -66,11 +66,17 @@ def summary(watch: Watch, record: bool) -> dict[str, Any]:
         "logs": [],
     }
     if record:
-        recording = watch.of(Role.RECORDER).recording
+        recorder = watch.of(Role.RECORDER)
+        recording, counted = recorder.recording, topic_count(recorder, FRAME.key)
+        lost = {topic.topic: topic.missing for topic in recorder.topics if topic.missing}
+        # Frames after the last one that it received are unknown to a recorder that the camera's last word did not reach.
+        unknown = figures["frames_published"] - counted.received - counted.missing
+        if counted.received and unknown > 0:
+            lost[FRAME.key] = counted.missing + unknown
         figures |= {
             "messages_recorded": recording.messages,
-            "messages_lost": recording.lost,
-            "lost": {topic.topic: topic.missing for topic in watch.of(Role.RECORDER).topics if topic.missing},
+            "messages_lost": max(recording.lost, sum(lost.values())),
+            "lost": lost,
             "recording_failure": recording.failure or None,
             "log": recording.file,
             "logs": list(recording.files),
