@@ -69,7 +69,7 @@ def summary(watch: Watch, record: bool) -> dict[str, Any]:
         recorder = watch.of(Role.RECORDER)
         recording, counted = recorder.recording, topic_count(recorder, FRAME.key)
         lost = {topic.topic: topic.missing for topic in recorder.topics if topic.missing}
-        # Frames after the last one that it received are unknown to a recorder that the camera's last word did not reach.
+        # A recorder that did not receive the camera's last Health knows of no frames after the last one it has.
         unknown = figures["frames_published"] - counted.received - counted.missing
         if counted.received and unknown > 0:
             lost[FRAME.key] = counted.missing + unknown
