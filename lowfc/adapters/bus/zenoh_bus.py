@@ -52,12 +52,12 @@ def receive_in_one_thread() -> None:
     os.environ.setdefault("ZENOH_RUNTIME", "(rx: (handover: net))")
 
 
-def declare_publisher(session: zenoh.Session, topic: Topic, key: str) -> zenoh.Publisher:
-    """Return zenoh's own publisher of a topic, with the settings of the loop."""
+def declare_publisher(session: zenoh.Session, topic: Topic, key: str, *, lockstep: bool = False) -> zenoh.Publisher:
+    """Return zenoh's own publisher of a topic, with the settings of the loop; in lockstep it waits for slow readers."""
     return session.declare_publisher(
         key,
         encoding=f"application/protobuf;{topic.message.DESCRIPTOR.full_name}",
-        congestion_control=zenoh.CongestionControl.DROP,
+        congestion_control=zenoh.CongestionControl.BLOCK if lockstep else zenoh.CongestionControl.DROP,
         priority=zenoh.Priority.REAL_TIME if topic.in_loop else zenoh.Priority.DATA,
         # Express gives every message a batch of its own, so that a burst of 16 fills the queue and the rest is lost;
         # without it the latency is the same, for messages are batched under back-pressure only.
@@ -79,13 +79,13 @@ class ZenohPublisher:
         self._start_s = bus.start_s
         self._offset = bus.offset
         self._replying = bus.replying
-        self._publisher = declare_publisher(session, topic, key)
+        self._publisher = declare_publisher(session, topic, key, lockstep=bus.clock.lockstep)
         self._shortcut = None if shortcut is None else DirectWriter(shortcut)
         if self._keeps:
             session.declare_queryable(key, Callback(self._answer, indirect=False))
 
     def put(self, payload: bytes, publish_time_ns: int | None = None, sequence: int | None = None) -> Envelope:
-        """Send `payload`; waits at most 1 ms for a reader that does not keep up, then loses the message to it."""
+        """Send `payload`; a slow reader delays it by at most 1 ms and loses it, or in lockstep is waited for."""
         envelope = Envelope(
             sequence_of(self._start_s, self.published) if sequence is None else sequence,
             self._host_ns() if publish_time_ns is None else publish_time_ns,
