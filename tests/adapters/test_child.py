@@ -38,7 +38,6 @@ def command_line(pid: int) -> bytes:
 
 def test_a_child_dies_with_a_parent_that_was_killed(tmp_path: Path) -> None:
     parent = subprocess.Popen([sys.executable, "-c", PARENT, tmp_path / "said"], stdout=subprocess.PIPE, text=True)
-    assert parent.stdout is not None
     pid = int(parent.stdout.readline())
     until(lambda: b"SIG_IGN" in command_line(pid) and b"prctl" not in command_line(pid))
     parent.kill()
@@ -50,7 +49,6 @@ def test_a_child_is_the_program_itself_in_a_session_of_its_own(tmp_path: Path) -
     program = "import os, sys, time; sys.stderr.write(repr((os.getpid(), os.getsid(0), os.environ['WORD'])))"
     child = Child("one", [sys.executable, "-c", program], tmp_path / "said", {**os.environ, "WORD": "heard"})
     child.start()
-    assert child.process is not None
     child.process.wait(PATIENCE_S)
     assert (child.status, child.stderr_tail()) == (0, repr((child.process.pid, child.process.pid, "heard")))
     child.stop(PATIENCE_S)
@@ -60,7 +58,6 @@ def test_a_child_is_the_program_itself_in_a_session_of_its_own(tmp_path: Path) -
 def test_how_a_child_ended_is_its_own_end(tmp_path: Path, number: signal.Signals) -> None:
     child = Child("one", ["sleep", "600"], tmp_path / "said")
     child.start()
-    assert child.process is not None
     child.process.send_signal(number)
     child.process.wait(PATIENCE_S)
     assert child.how_it_ended() == f"one was killed by {number.name}"

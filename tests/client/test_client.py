@@ -322,7 +322,6 @@ def test_a_loop_that_is_not_seen_from_here_is_told_of(tmp_path: Path, monkeypatc
     ):
         environment = os.environ | {"XDG_RUNTIME_DIR": there}
         with subprocess.Popen(words, stdin=subprocess.PIPE, stdout=subprocess.PIPE, env=environment) as process:
-            assert process.stdout is not None
             process.stdout.readline()
             said = list(other_loops())
             process.communicate(b"\n")
@@ -509,7 +508,6 @@ def test_a_step_comes_as_it_was_sent() -> None:
     for name in Step._fields:
         assert np.array_equal(getattr(got, name), getattr(sent, name)), name
     held = step_of(Sample(STEP.key, codec.encode_step(sent._replace(error_nm=None, pol_nm=None), 1), 0, 0, 0))
-    assert held is not None
     assert (held.error_nm, held.pol_nm) == (None, None)
     assert step_of(Sample(STEP.key, b"\xff", 0, 0, 0)) is None
 

@@ -74,14 +74,12 @@ def played(
             target = "offset" if basis is None else "mirror"
             asked = Request(0, "play", text=target, table=table, actuators_nm=shape)
             state, outputs = advance(settings, state, asked)
-            assert outputs.reply is not None
             assert outputs.reply.accepted, outputs.reply.text
         seen = np.zeros(GRID, np.float32)
         for weight, shape in zip(weights, shapes, strict=True):
             seen += weight * shape
         pixels, _ = scene.expose(count, seen)
         state, outputs = advance(settings, state, Frame(start | count, count * config.period_ns, 0, pixels))
-        assert outputs.command is not None
         shapes = [outputs.command.actuators_nm, *shapes[:-1]]
         if count >= first:
             found.append(outputs.step)

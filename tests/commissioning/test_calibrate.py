@@ -64,7 +64,6 @@ def taken_of(loop: FoldedLoop, method: str, cycles: int = 4, **wanted: Any) -> t
 
 def mode_of(loop: FoldedLoop) -> int:
     state = loop.status().state
-    assert state is not None
     return state.mode
 
 

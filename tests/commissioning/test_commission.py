@@ -91,7 +91,6 @@ def test_frames_of_another_size_come_to_a_closed_loop(commissioned: tuple[Bench,
     assert figures["recommended"]
     assert figures["measured_error_nm"] == pytest.approx(figures["predicted_error_nm"], rel=0.15)
     state = bench.loop.status().state
-    assert state is not None
     assert state.mode == wire.LOOP_MODE_CLOSED
     made = calibration_file.load(bench.out)
     assert made.shape == (64, 64)
@@ -178,7 +177,6 @@ def test_who_opens_the_loop_at_the_end_is_named_and_the_calibration_stays(tmp_pa
         bench.commission()
     assert "the calibration is good" in bench.shown
     state = bench.loop.status().state
-    assert state is not None
     assert (state.mode, state.calibration_id) == (wire.LOOP_MODE_OPEN, calibration_file.load(bench.out).id)
 
 

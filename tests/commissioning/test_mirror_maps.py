@@ -187,14 +187,12 @@ def begun(config: Configuration, calibration: Calibration, shape: MirrorShape | 
     requests = StartUp(config).requests(state, 0)
     for request in requests:
         state, outputs = advance(settings, state, request)
-        assert outputs.reply is not None
         assert outputs.reply.accepted, outputs.reply.text
     return state, requests
 
 
 def commands(config: Configuration, state: State, frames: int) -> tuple[list[Single], list[str]]:
     """What is commanded over some frames of any light, for which the loop is open, and the channels at their end."""
-    assert state.drive is not None
     settings, shape = (
         replace(factory.settings(config), min_flux_fraction=0.0, max_identical_frames=0),
         state.drive.calibration.shape,
@@ -203,9 +201,7 @@ def commands(config: Configuration, state: State, frames: int) -> tuple[list[Sin
     sent = []
     for index in range(frames):
         state, outputs = advance(settings, state, Frame(1 + index, index, 0, dark))
-        assert outputs.command is not None
         sent.append(outputs.command.actuators_nm)
-    assert state.drive is not None
     return sent, [one.name for one in state.drive.added().channels]
 
 
@@ -253,8 +249,6 @@ def test_the_configured_law_takes_over(tmp_path: Path, calibration: Calibration)
     state, requests = begun(config, calibration, None)
     assert [one.name for one in requests] == ["law"]
     assert state.mode is LoopMode.OPEN
-    assert state.drive is not None
-    assert state.drive.following is not None
     assert state.drive.following.law.name == "leaky"
     with pytest.raises(ConfigurationError, match="the law is of the modes"):
         StartUp(config).refused(requests[0], "the law is of the modes 2 to 15, the loop of 2 to 9")

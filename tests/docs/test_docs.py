@@ -206,7 +206,6 @@ def test_the_views(tmp_path: Path) -> None:
 def look(folder: Path, command: str) -> None:
     """Run a view until it says where it is to be seen, then Ctrl-C."""
     process = start(folder, *command.split()[1:])
-    assert process.stderr is not None
     said = process.stderr.readline()
     assert "127.0.0.1" in said
     _, complaints = interrupt(process)

@@ -77,7 +77,6 @@ def test_a_running_loop_is_calibrated_interrupted_and_gone_on_with(tmp_path: Pat
             client.close_loop()
             time.sleep(0.5)
             state = client.status().state
-            assert state is not None
             assert np.abs(np.array(state.command_history_nm)).max() < 5
     finally:
         interrupt(loop)
@@ -112,5 +111,4 @@ def test_the_promise_is_kept_over_the_bus(method: str, tmp_path: Path) -> None:
 def flat(client: Client) -> bool:
     """Whether nothing is played, nor anything commanded."""
     state = client.status().state
-    assert state is not None
     return not np.frombuffer(state.actuators, np.float32).any()

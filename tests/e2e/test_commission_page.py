@@ -65,7 +65,6 @@ def test_a_camera_of_another_size_comes_to_a_closed_loop(bench: Path) -> None:
         assert figures["measured_error_nm"] == pytest.approx(figures["predicted_error_nm"], rel=0.15)
         with Client("bench") as client:
             state = client.status().state
-            assert state is not None
             assert state.mode_cause == "operator asked to close"
         assert calibration_file.load(bench / "calibration.fits").shape == (64, 64)
     with running(bench, *DEVICES, LATER):

@@ -279,7 +279,6 @@ def test_without_the_desks_link_the_loop_goes_on(bench: Bench) -> None:
 def test_the_router_may_die_and_come_back(bench: Bench) -> None:
     bench.settled()
     router = bench.lab.middle.children.pop("router")
-    assert router.process is not None
     router.process.kill()
     router.stop(5.0)
     bench.begin(bench.lab.middle, "router")
@@ -451,7 +450,6 @@ def test_hosts_are_gone_however_the_test_ends(tmp_path: Path, how: signal.Signal
     environment = os.environ | {"PYTHONPATH": str(SUPPORT.parents[1])}
     words = [sys.executable, "-c", HELD, str(tmp_path)]
     with subprocess.Popen(words, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, env=environment) as holder:
-        assert holder.stdout is not None
         pids = [int(pid) for pid in holder.stdout.readline().split()]
         assert len(pids) == 4
         assert all(Path(f"/proc/{pid}").exists() for pid in pids)

@@ -95,7 +95,6 @@ def _ready(night: Night) -> None:
         loop.steps(1, patience_s=20)
         until(lambda: loop.processes()["controller"].last_second.frames)
         calibration, status = loop.calibration(), loop.status().state
-    assert status is not None
     calibration_file.save(calibration, night.folder / "calibration.fits")
     delay = status.settings.delay_frames
     blocks = [integrator_block(0.2, 0.001, "pol", delay)] * len(calibration.noll)

@@ -70,7 +70,6 @@ def test_every_panel_of_every_tab_shows_the_live_loop(live: str, artefacts: Path
     try:
         summary = bridge.run(5.0)
         viewer = bridge.viewer
-        assert viewer is not None
         assert summary.renewals == 0
         for number, tab in enumerate(Tab):
             blueprint = layout(tab)
@@ -92,9 +91,7 @@ def test_every_panel_of_every_tab_shows_the_live_loop(live: str, artefacts: Path
 def test_the_page_shows_the_live_loop_and_nobody_else_can_see_it(live: str, artefacts: Path) -> None:
     page_of = subprocess.Popen([*LOWFC, "view", "--web", "--run", live], stderr=subprocess.PIPE, text=True)
     try:
-        assert page_of.stderr is not None
         address = re.search(r"http://127\.0\.0\.1:\S+", page_of.stderr.readline())
-        assert address is not None
         picture = artefacts / "live-browser.png"
         good = FILL[Level.GOOD]
         page = browser_screenshot(address.group(), picture, 60, lambda shown: share_of(shown, good) > 0.01, (1000, 625))

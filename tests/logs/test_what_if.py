@@ -200,7 +200,6 @@ def test_another_reconstructor_measures_the_same_frames(logs: dict[str, Path], t
     np.testing.assert_allclose(column(by_name, "open")[:2], column(figures_of(logs["usual"]), "open")[:2], rtol=0.1)
 
     calibration = read_history(LogReader(logs["usual"])).calibration
-    assert calibration is not None
     I0, H, good = (array.astype(float) for array in (calibration.reference, calibration.response, calibration.good))
     R = reconstructor(I0, H, good, 1.0, 0.0, "pinv").astype(np.float32)
     path = tmp_path / "pinv.fits"
@@ -226,7 +225,6 @@ def test_frames_that_are_not_in_the_log_are_counted(logs: dict[str, Path], monke
 def test_modes_of_another_size_shape_the_mirror_alike(logs: dict[str, Path], tmp_path: Path) -> None:
     """A calibration in which every mode is twice as large measures half of everything."""
     calibration = read_history(LogReader(logs["usual"])).calibration
-    assert calibration is not None
     twice = replace(
         calibration,
         response=calibration.response * 2,

@@ -88,7 +88,6 @@ class Host:
     def close(self) -> None:
         for child in self.children.values():
             child.stop(5.0)
-        assert self.holder.stdin is not None
         self.holder.stdin.close()
         self.holder.wait()
 

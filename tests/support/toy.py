@@ -131,7 +131,6 @@ def names(every: list[Outputs]) -> list[str]:
 
 def answered(outputs: Outputs, accepted: bool, *words: str) -> None:
     """Assert that a request was accepted, or refused, in a sentence with these words."""
-    assert outputs.reply is not None
     assert outputs.reply.accepted is accepted, outputs.reply.text
     for word in words:
         assert word in outputs.reply.text

@@ -205,7 +205,6 @@ def test_a_window_that_was_closed_ends_the_view(scenes: Scenes) -> None:
     scene = scenes(Show.NATIVE)
     scene.screens[0].alive = False
     scene.thread.join(PATIENCE_S)
-    assert scene.summary is not None
     assert scene.summary.renewals == 0
 
 

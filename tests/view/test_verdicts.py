@@ -423,7 +423,6 @@ def test_what_the_gains_could_leave_is_computed_from_the_loop_itself(monkeypatch
         if number % 5000 == 0 or number == len(night.samples):
             watcher.feed(accumulator.snapshot(one.publish_time_ns))
     found = watcher.attainable.found
-    assert found is not None
     assert 0 < found.best_nm <= 1.05 * found.left_nm
     assert found.noise_nm > 0
     assert tile(judge(watcher), "WAVEFRONT").detail.endswith("without noise")
