@@ -35,6 +35,7 @@ from lowfc.contract.messages import (
     Topic,
 )
 from lowfc.programs.cli.main import app
+from tests.support.loops import until
 
 certificates = pytest.importorskip("lowfc.adapters.bus.certificates", reason="needs the package cryptography")
 ROLES = roles(["mirror-dm"])
@@ -141,13 +142,6 @@ def hosts(tmp_path: Path) -> Iterator[Hosts]:
     yield made
     for bus in reversed(made.buses):
         bus.close()
-
-
-def until(condition: Callable[[], object]) -> None:
-    deadline_s = time.monotonic() + 20
-    while not condition():
-        assert time.monotonic() < deadline_s
-        time.sleep(0.01)
 
 
 def test_what_the_table_allows_arrives_and_nothing_else(hosts: Hosts) -> None:

@@ -23,6 +23,7 @@ from lowfc.adapters.process.clock import HostClock
 from lowfc.contract.envelope import count_of, start_of
 from lowfc.contract.errors import BusError
 from lowfc.contract.messages import CALIBRATION, COMMAND, FRAME, HEALTH, REQUEST_KEY, TRUTH, Topic
+from tests.support.loops import until
 
 pytestmark = pytest.mark.exclusive
 
@@ -89,13 +90,6 @@ class Toy:
     def kill(self) -> None:
         self.process.kill()
         self.process.communicate()
-
-
-def until(condition: Callable[[], bool]) -> None:
-    deadline = time.monotonic() + PATIENCE_S
-    while not condition():
-        assert time.monotonic() < deadline
-        time.sleep(0.01)
 
 
 @pytest.fixture(autouse=True)

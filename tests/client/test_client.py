@@ -49,7 +49,8 @@ from lowfc.programs.cli.ctl.command import SIMPLE, ctl_app
 from lowfc.programs.cli.ctl.status import figures, text
 from lowfc.programs.cli.modes import noll_of
 from lowfc.testing.memory_bus import MemoryBus, MemoryHub, MemoryRing
-from tests.support.recording import Bench, bodies_of, put, until
+from tests.support.loops import until
+from tests.support.recording import Bench, bodies_of, put
 from tests.support.toy import NOLL, calibration
 
 pytestmark = pytest.mark.exclusive

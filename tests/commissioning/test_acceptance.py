@@ -31,6 +31,7 @@ from lowfc.programs.commissioning.acceptance.judged import AcceptanceResult
 from lowfc.programs.commissioning.acceptance.played import AcceptanceError, Loop, Played, _announced, chosen
 from sim_camera.bench import Bench
 from sim_camera.process import bench
+from tools.law_bench import calibrated
 
 Single = npt.NDArray[np.float32]
 
@@ -48,8 +49,7 @@ def configured(**changes: object) -> Configuration:
 @pytest.fixture(scope="module")
 def calibration() -> Calibration:
     config = configured()
-    optics = factory.twin(config, None, print)
-    return factory.analytic_calibration(config, optics, factory.mirror_on_twin(config, optics, print))
+    return calibrated(config)
 
 
 def played(

@@ -24,6 +24,7 @@ from lowfc.programs.core.start_up import StartUp, check_files
 from sim_camera.process import bench
 from tests.support.fold import fold
 from tests.support.loops import run
+from tools.law_bench import calibrated
 
 Single = npt.NDArray[np.float32]
 GRID = (34, 34)
@@ -33,8 +34,7 @@ QUIET = {"disturbance.preset": "quiet", "star.magnitude": -2.0}
 @pytest.fixture(scope="module")
 def calibration() -> Calibration:
     config = load(None, QUIET)
-    optics = factory.twin(config, None, print)
-    return factory.analytic_calibration(config, optics, factory.mirror_on_twin(config, optics, print))
+    return calibrated(config)
 
 
 def wavy(height_nm: float = 30.0) -> Single:
@@ -139,8 +139,7 @@ def test_inactive_actuators_are_not_commanded_and_the_modes_are_measured_as_they
     active = np.ones(GRID)
     active.flat[dead] = 0
     config = load(None, QUIET | {"mirror.active": saved(tmp_path, "a.fits", active), "mirror.dead": dead})
-    optics = factory.twin(config, None, print)
-    made = factory.analytic_calibration(config, optics, factory.mirror_on_twin(config, optics, print))
+    made = calibrated(config)
     assert not made.modes_to_actuators[dead].any()
     assert not made.actuators_to_modes[:, dead].any()
     assert np.abs(calibration.modes_to_actuators[dead]).max() > 0.01
@@ -155,8 +154,7 @@ def test_inactive_actuators_are_not_commanded_and_the_modes_are_measured_as_they
 def test_a_registration_error_is_the_mirrors_and_not_the_calibrations(calibration: Calibration) -> None:
     wrong = {"mirror.magnification": 1.01, "mirror.shift_pitches": 0.31}
     config = load(None, QUIET | wrong)
-    optics = factory.twin(config, None, print)
-    believed = factory.analytic_calibration(config, optics, factory.mirror_on_twin(config, optics, print))
+    believed = calibrated(config)
     np.testing.assert_array_equal(believed.modes_to_actuators, calibration.modes_to_actuators)
     poked = (20.0 * calibration.modes_to_actuators[:, 2]).reshape(GRID)  # defocus
     straight = bench(load(None, QUIET)).expose(0, poked)[1].residual_nm

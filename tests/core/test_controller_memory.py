@@ -50,6 +50,7 @@ from lowfc.testing.memory_bus import MemoryBus, MemoryHub
 from sim_camera.bench import Bench, Truth
 from sim_camera.process import bench
 from sim_dm.process import MirrorProcess
+from tools.law_bench import calibrated
 
 Single = npt.NDArray[np.float32]
 
@@ -163,8 +164,7 @@ class Rig:
 
 @pytest.fixture(scope="module")
 def calibration() -> Calibration:
-    optics = factory.twin(CONFIG, None, print)
-    return factory.analytic_calibration(CONFIG, optics, factory.mirror_on_twin(CONFIG, optics, print))
+    return calibrated(CONFIG)
 
 
 @pytest.fixture(scope="module")

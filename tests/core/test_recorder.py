@@ -38,7 +38,8 @@ from lowfc.contract.messages import (
 )
 from lowfc.programs.core.recording.recorder import Recorder
 from lowfc.testing.memory_bus import MemoryBus
-from tests.support.recording import PATIENCE_S, Bench, bodies_of, logged, put, until
+from tests.support.loops import until
+from tests.support.recording import PATIENCE_S, Bench, bodies_of, logged, put
 
 pytestmark = pytest.mark.exclusive
 

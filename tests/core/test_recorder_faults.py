@@ -26,7 +26,8 @@ from lowfc.programs.core.recording.recorder import Recorder
 from lowfc.programs.core.recording.summary import Summary
 from lowfc.testing.clock import FakeClock
 from lowfc.testing.memory_bus import MemoryBus, MemoryHub
-from tests.support.recording import PATIENCE_S, Bench, bodies_of, logged, put, until
+from tests.support.loops import until
+from tests.support.recording import PATIENCE_S, Bench, bodies_of, logged, put
 
 pytestmark = pytest.mark.exclusive
 

@@ -25,8 +25,9 @@ from lowfc.adapters.process.service import Service
 from lowfc.contract.envelope import count_of
 from lowfc.contract.messages import FRAME, STEP
 from lowfc.programs.cli.ctl.command import ctl_app
+from tests.support.loops import until
 from tests.support.other_readers import foxglove, rerun
-from tests.support.recording import PATIENCE_S, bodies_of, until
+from tests.support.recording import PATIENCE_S, bodies_of
 
 pytestmark = pytest.mark.exclusive
 

@@ -18,10 +18,11 @@ import pytest
 
 from lowfc.adapters.bus.access import ROUTER, roles
 from lowfc.adapters.bus.certificates import make_certificates
-from lowfc.adapters.files import calibration_file, factory
+from lowfc.adapters.files import calibration_file
 from lowfc.contract.configuration import load
 from tests.support import networks
 from tests.support.networks import ROUTER_ADDRESS, Host, Lab
+from tools.law_bench import calibrated
 
 pytestmark = [
     pytest.mark.slow,
@@ -75,8 +76,7 @@ class Bench:
         make_certificates(self.authority, (ROUTER, *ROLES), [ROUTER_ADDRESS])
         (folder / "lowfc.toml").write_text(TOML)
         config = load(folder / "lowfc.toml")
-        optics = factory.twin(config, None, print)
-        calibration = factory.analytic_calibration(config, optics, factory.mirror_on_twin(config, optics, print))
+        calibration = calibrated(config)
         self.lab = Lab(folder, SHIFTS_NS)
         for host in self.lab.hosts.values():
             (host.folder / "lowfc.toml").write_text(TOML.replace("CERTIFICATES", str(host.folder / "certs")))

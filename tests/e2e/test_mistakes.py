@@ -16,11 +16,12 @@ from typing import Any
 import pytest
 
 from lowfc.adapters.bus.run import open_run
-from lowfc.adapters.files import calibration_file, factory
+from lowfc.adapters.files import calibration_file
 from lowfc.adapters.logs.writer import LogWriter
 from lowfc.contract.configuration import load
 from lowfc.programs.cli.main import main
 from tests.support.loops import LOWFC, run
+from tools.law_bench import calibrated
 
 SHORT = ["sim-loop", "--duration", "0.1"]
 
@@ -76,8 +77,7 @@ def test_a_calibration(tmp_path: Path) -> None:
     missing = ["controller", "--run", "mistakes", "--calibration", "none.fits"]
     _refused(tmp_path, *missing, expected="there is no such calibration file", by=run)
     config = load(None)
-    optics = factory.twin(config, None, print)
-    found = factory.analytic_calibration(config, optics, factory.mirror_on_twin(config, optics, print))
+    found = calibrated(config)
     whole = calibration_file.to_bytes(found)
     for name, content in (("cut", whole[: len(whole) // 2]), ("text", b"hello"), ("flipped", _flip(whole))):
         (tmp_path / f"{name}.fits").write_bytes(content)

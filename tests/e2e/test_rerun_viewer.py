@@ -4,7 +4,6 @@ import os
 import signal
 import subprocess
 import sys
-import time
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -13,6 +12,7 @@ import numpy as np
 import pytest
 
 from lowfc.adapters.viewer.rerun_viewer import RerunViewer, Show, ViewerError
+from tests.support.loops import until
 from tests.support.viewers import CHROMIUM, browser_screenshot, needs_chromium, needs_vulkan, pixels, share_of
 
 pytestmark = pytest.mark.exclusive
@@ -81,7 +81,7 @@ def test_a_viewer_that_hangs_or_dies_is_noticed(web: RerunViewer) -> None:
     assert web.answers()
     assert web.resident_bytes() > 1 << 20
     os.kill(web.pid, signal.SIGSTOP)
-    _until_stopped(web.pid)
+    until(lambda: _state(web.pid) == "T")
     assert web.alive
     assert not web.answers(0.3)
     os.kill(web.pid, signal.SIGCONT)
@@ -123,7 +123,7 @@ def test_it_dies_with_its_parent(hangs: bool) -> None:
     )
     parent = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=60, check=False)
     assert parent.returncode == -signal.SIGKILL, parent.stderr
-    _until(lambda: not _runs(int(parent.stdout)), "the viewer outlives its parent")
+    until(lambda: not _runs(int(parent.stdout)))
 
 
 def test_without_a_screen_one_line_says_what_to_do(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -216,14 +216,3 @@ def _state(pid: int) -> str:
 
 def _runs(pid: int) -> bool:
     return Path(f"/proc/{pid}").exists() and _state(pid) != "Z"
-
-
-def _until_stopped(pid: int) -> None:
-    _until(lambda: _state(pid) == "T", "it does not stop")
-
-
-def _until(true: Any, what: str) -> None:
-    deadline_s = time.monotonic() + 10
-    while not true():
-        assert time.monotonic() < deadline_s, what
-        time.sleep(0.02)

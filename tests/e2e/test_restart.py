@@ -15,10 +15,11 @@ import pytest
 from lowfc.adapters.bus.bus import Sample
 from lowfc.adapters.bus.run import new_run_id, open_run
 from lowfc.adapters.bus.zenoh_bus import ZenohBus
-from lowfc.adapters.files import calibration_file, factory
+from lowfc.adapters.files import calibration_file
 from lowfc.adapters.process.clock import HostClock
 from lowfc.contract.configuration import load
 from lowfc.contract.messages import MIRROR_STATE, STEP, wire
+from tools.law_bench import calibrated
 
 pytestmark = pytest.mark.exclusive
 
@@ -99,8 +100,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     path = tmp_path_factory.mktemp("by-hand")
     (path / "test.toml").write_text(TOML)
     config = load(path / "test.toml")
-    optics = factory.twin(config, None, print)
-    calibration = factory.analytic_calibration(config, optics, factory.mirror_on_twin(config, optics, print))
+    calibration = calibrated(config)
     calibration_file.save(calibration, path / "calibration.fits")
     return path
 

@@ -15,7 +15,6 @@ import typer
 from typer.testing import CliRunner
 
 from lowfc.adapters.bus.run import runtime_base
-from lowfc.adapters.files import factory
 from lowfc.adapters.process.clock import HostClock
 from lowfc.contract.configuration import load
 from lowfc.contract.errors import DataFileError
@@ -38,6 +37,7 @@ from lowfc.programs.measure.latency.figures import (
 from lowfc.programs.measure.latency.summary import compare, ratio, together
 from lowfc.programs.measure.latency.text import compared, sparkline, table
 from tests.support.loops import until
+from tools.law_bench import calibrated
 
 pytestmark = pytest.mark.exclusive
 
@@ -221,8 +221,7 @@ def test_the_figures_of_a_release_can_be_compared_with_todays(file: Path) -> Non
 
 def test_a_step_alone_takes_every_frame_as_the_controller_does() -> None:
     config = load(None, {"control.start_mode": "closed", "control.tilt_leak": 0.01, "control.leak": 0.01})
-    optics = factory.twin(config, None, lambda _: None)
-    calibration = factory.analytic_calibration(config, optics, factory.mirror_on_twin(config, optics, lambda _: None))
+    calibration = calibrated(config)
     pixels = prepared_frames(config)
     assert len({frame.tobytes() for frame in pixels}) == len(pixels)
     payloads = Payloads(pixels)

@@ -31,6 +31,7 @@ from lowfc.testing.memory_bus import MemoryBus, MemoryHub, MemoryRing
 from sim_camera.process import bench
 from sim_dm.device import Command, apply_command, initial
 from sim_dm.process import device
+from tools.law_bench import calibrated
 
 FIRST = 1 << 32
 
@@ -39,8 +40,7 @@ FIRST = 1 << 32
 def computed(toml: str) -> Calibration:
     """The computed calibration of a configuration."""
     config = Configuration.model_validate(tomllib.loads(toml))
-    optics = factory.twin(config, None, print)
-    return factory.analytic_calibration(config, optics, factory.mirror_on_twin(config, optics, print))
+    return calibrated(config)
 
 
 class Given(NamedTuple):

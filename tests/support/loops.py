@@ -82,7 +82,7 @@ def until(condition: Callable[[], object], timeout_s: float = 30.0) -> None:
     deadline_s = time.monotonic() + timeout_s
     while not condition():
         assert time.monotonic() < deadline_s, "waited in vain"
-        time.sleep(0.05)
+        time.sleep(0.01)
 
 
 def recorded_bytes(folder: Path) -> int:

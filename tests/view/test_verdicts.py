@@ -11,7 +11,6 @@ import numpy as np
 import pytest
 
 from lowfc.adapters.bus.bus import Sample
-from lowfc.adapters.files import factory
 from lowfc.adapters.process.clock import SimulatedClock
 from lowfc.adapters.process.latch import Latch
 from lowfc.adapters.process.service import Service
@@ -34,6 +33,7 @@ from sim_dm.process import MirrorProcess
 from tests.support.report_log import Night
 from tests.support.stage import MAS, Stage, tile
 from tests.support.toy import FLUX_DN, NOLL, START, TOY
+from tools.law_bench import calibrated
 
 CALM = {Level.NEUTRAL, Level.GOOD}
 
@@ -53,9 +53,8 @@ def recorded(config: Configuration, camera: Configuration, latch: Path, frames: 
         observer.subscribe(topic, received.append)
     clocks = {name: SimulatedClock() for name in ("controller", "mirror-dm", "camera")}
     services = [Service(name, "run", clock, MemoryBus(hub, name, clock)) for name, clock in clocks.items()]
-    optics = factory.twin(config, None, print)
-    calibrated = factory.analytic_calibration(config, optics, factory.mirror_on_twin(config, optics, print))
-    controller = Controller(config, services[0], calibrated, "a test", Latch([latch]))
+    calibration = calibrated(config)
+    controller = Controller(config, services[0], calibration, "a test", Latch([latch]))
     services[0].fill = controller.fill
     mirror = MirrorProcess(config, services[1])
     eye = CameraProcess(camera, services[2], bench(camera), frames)
