@@ -11,11 +11,10 @@ from pathlib import Path
 import pytest
 
 from tests.e2e.test_bench_day import COMMANDS as BENCH_DAY
-from tests.e2e.test_commission_page import COMMANDS as COMMISSIONING
 from tests.e2e.test_operator import COMMANDS as OPERATING
-from tests.e2e.test_own_hardware import DOCUMENTED
+from tests.e2e.test_own_hardware import COMMISSIONING, DOCUMENTED
 from tests.support.loops import children, interrupt, recorded_bytes, start, until
-from tests.support.viewers import needs_vulkan
+from tests.support.viewers import on_screen
 
 pytestmark = pytest.mark.exclusive
 
@@ -27,7 +26,7 @@ ELSEWHERE = {
     "make sim-loop": ".ci/run",
     "make test": ".ci/run",
     "lowfc doctor": "tests/commissioning/test_doctor.py",
-    "rerun $(ls -t logs/*.mcap | head -1)": "tests/e2e/test_viewer.py",
+    "rerun $(ls -t logs/*.mcap | head -1)": "tests/e2e/test_rerun_viewer.py",
     ROUTE: "tests/design/test_layout_files.py",
 }
 SHORTER = {
@@ -184,8 +183,7 @@ def test_the_bench(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.viewer
-@needs_vulkan
+@on_screen
 def test_the_views(tmp_path: Path) -> None:
     loop = start(tmp_path, *STAYING[0].split()[1:], "--rate", "100")
     try:

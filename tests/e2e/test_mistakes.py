@@ -14,12 +14,15 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from typer.testing import CliRunner
 
-from lowfc.adapters.bus.run import open_run
+from lowfc.adapters.bus.run import Run, open_run
 from lowfc.adapters.files import calibration_file
 from lowfc.adapters.logs.writer import LogWriter
-from lowfc.contract.configuration import load
-from lowfc.programs.cli.main import main
+from lowfc.contract.configuration import Configuration, load
+from lowfc.contract.errors import BusError
+from lowfc.programs.cli.main import app, main
+from lowfc.programs.launch import sim_loop
 from tests.support.loops import LOWFC, run
 from tools.law_bench import calibrated
 
@@ -189,3 +192,30 @@ def test_logs(tmp_path: Path, words: tuple[str, ...], expected: str) -> None:
     assert expected in done.stderr
     assert len(done.stderr.splitlines()) == 1
     assert sorted(path.name for path in tmp_path.iterdir()) == before
+
+
+def test_a_loop_that_is_starting_is_there_for_others(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """So that an unnamed request does not reach the only other one."""
+    monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
+    found: list[object] = []
+
+    def meanwhile(config: Configuration, run: Run, console: object) -> None:
+        with socket.create_server(("127.0.0.1", open_run("other").links.ports["controller"])):
+            done = CliRunner().invoke(app, ["ctl", "open"])
+            listed = json.loads(CliRunner().invoke(app, ["runs", "--json"]).stdout)["runs"]
+            found.extend([str(done.exception), [(one["run"], one["mode"]) for one in listed]])
+        with pytest.raises(BusError, match="run 'night' is running already"):
+            sim_loop.sim_loop(config, 1.0, record=False, name="night")
+        raise BusError("enough")
+
+    monkeypatch.setattr(sim_loop, "prepare", meanwhile)
+    with pytest.raises(BusError, match="enough"):
+        sim_loop.sim_loop(load(None), 1.0, record=False, name="night")
+    refusal, listed = found
+    assert refusal == (
+        "choose a run with --run, the beginning of its name is enough: there are night (no controller yet), other"
+    )
+    assert listed == [("night", "starting"), ("other", "starting")]
+    assert not (tmp_path / "lowfc" / "night").exists()
+    with pytest.raises(BusError, match="made by processes that were started by hand"):
+        sim_loop.sim_loop(load(None), 1.0, record=False, name="other")

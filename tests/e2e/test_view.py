@@ -30,9 +30,7 @@ from lowfc.programs.view.panels.tiles import FILL
 from lowfc.programs.view.verdicts.tile import Level
 from tests.support.loops import LOWFC, children, interrupt, run, start, until
 from tests.support.report_log import Night
-from tests.support.viewers import browser_screenshot, needs_chromium, needs_vulkan, pixels, share_of
-
-pytestmark = pytest.mark.exclusive
+from tests.support.viewers import browser_screenshot, needs_chromium, on_screen, pixels, share_of
 
 LEAST_SHADES = 8  # of a panel with something in it; an empty one has its ground and the letters of its title
 TITLE_ROWS = 30
@@ -51,8 +49,7 @@ def live(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
 
 
 @pytest.mark.slow
-@pytest.mark.viewer
-@needs_vulkan
+@on_screen
 def test_every_panel_of_every_tab_shows_the_live_loop(live: str, artefacts: Path) -> None:
     joined = open_run(live)
     config = load(joined.path / "config.toml")
@@ -86,6 +83,7 @@ def test_every_panel_of_every_tab_shows_the_live_loop(live: str, artefacts: Path
         bus.close()
 
 
+@pytest.mark.exclusive
 @pytest.mark.browser
 @needs_chromium
 def test_the_page_shows_the_live_loop_and_nobody_else_can_see_it(live: str, artefacts: Path) -> None:
@@ -103,6 +101,7 @@ def test_the_page_shows_the_live_loop_and_nobody_else_can_see_it(live: str, arte
         assert page_of.returncode == 0, rest
 
 
+@pytest.mark.exclusive
 @pytest.mark.slow
 def test_the_loop_goes_on_whatever_happens_to_its_view(tmp_path: Path) -> None:
     process = start(tmp_path, "sim-loop", "--web", "--rate", "200", "--duration", "4", "--json")
