@@ -22,10 +22,7 @@ from lowfc.contract.messages import REQUEST_KEY, Role, wire
 from lowfc.programs.cli.main import app
 from tests.support.loops import until
 
-
-@pytest.fixture(autouse=True)
-def runtime(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
+pytestmark = pytest.mark.usefixtures("own_runtime")
 
 
 def test_a_run_has_ports_a_secret_and_closed_doors() -> None:

@@ -33,17 +33,13 @@ from lowfc.programs.cli.main import app
 from lowfc.programs.core.recording.volume import bytes_per_s, outlook, selected
 from lowfc.programs.logs.survey import survey
 from lowfc.programs.logs.what_if.compare import WhatIf, wanted, what_if
+from tests.support.loops import until
 from tests.support.recording import Bench, bodies_of, logged, put
 from tests.support.report_log import Night
 
-pytestmark = pytest.mark.exclusive
+pytestmark = pytest.mark.usefixtures("own_runtime")
 
 EVERY = 10
-
-
-@pytest.fixture(autouse=True)
-def runtime(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
 
 
 @pytest.fixture(scope="module")
@@ -118,8 +114,7 @@ def test_a_disk_that_refuses_does_not_lose_what_was_left_out(tmp_path: Path) -> 
     frames = bench.camera.publisher(FRAME)
     bench.start(selection=Selection(EVERY))
     put(frames, 45)
-    while len(bench.recorder._backlog):
-        pass
+    until(lambda: not bench.recorder._backlog)
     bench.recorder._series.flush = lambda: (_ for _ in ()).throw(DataFileError("full"))
     put(frames, 5)
     summary = bench.stop()
@@ -134,8 +129,7 @@ def test_the_next_file_says_it_too(tmp_path: Path) -> None:
     for number in range(2):
         before = len(bench.recorder._series.files)
         frames.put(np.random.default_rng(number).bytes(30_000), sequence=2 * number)
-        while not number and len(bench.recorder._series.files) == before:
-            pass
+        until(lambda before=before, number=number: number or len(bench.recorder._series.files) > before)
     summary = bench.stop()
     assert len(summary.files) >= 2
     assert all(survey(path)["selection"] for path in summary.files)

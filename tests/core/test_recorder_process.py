@@ -29,8 +29,6 @@ from tests.support.loops import until
 from tests.support.other_readers import foxglove, rerun
 from tests.support.recording import PATIENCE_S, bodies_of
 
-pytestmark = pytest.mark.exclusive
-
 SAFE_NS = 600_000_000
 """What a kill may cost: the messages published in this time before it."""
 
@@ -115,6 +113,7 @@ def benches(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[list[Ben
             os.killpg(parent.pid, signal.SIGKILL)
 
 
+@pytest.mark.exclusive
 @pytest.mark.node
 @pytest.mark.parametrize("benches", [10], indirect=True)
 @pytest.mark.parametrize("seed", [1, 2])
@@ -166,6 +165,7 @@ SIGNALS = (
 )
 
 
+@pytest.mark.exclusive
 @pytest.mark.parametrize("benches", [len(SIGNALS)], indirect=True)
 def test_however_it_is_told_to_stop_the_log_is_finished(benches: list[Bench], tmp_path: Path) -> None:
     parent = started(benches, tmp_path)
@@ -194,6 +194,7 @@ def lowfc(*arguments: object) -> "subprocess.Popen[str]":
     )
 
 
+@pytest.mark.exclusive
 def test_the_command_rotates_and_says_what_it_did(tmp_path: Path) -> None:
     bench = Bench(tmp_path)
     process = lowfc("record", "--run", bench.run.run_id, "--folder", tmp_path / "logs", "--longest-s", 1, "--json")
@@ -227,8 +228,8 @@ def test_the_command_rotates_and_says_what_it_did(tmp_path: Path) -> None:
     assert done["longest_unflushed_ms"] >= done["longest_wait_ms"] > 0
 
 
-def test_a_recording_is_ended_where_the_controller_has_died(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
+@pytest.mark.exclusive
+def test_a_recording_is_ended_where_the_controller_has_died(tmp_path: Path, own_runtime: Path) -> None:
     bench = Bench(tmp_path)
     process = lowfc("record", "--run", bench.run.run_id, "--folder", tmp_path / "logs")
     until(lambda: bench.recorder_is("ready"))
