@@ -22,10 +22,9 @@ WAY = Network(router="tls/127.0.0.1:7447", certificates="/etc/lowfc/certs")
 
 
 @pytest.fixture
-def toml(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+def toml(own_runtime: Path) -> Path:
     """A configuration with a router, and no run at all."""
-    monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
-    file = tmp_path / "lowfc.toml"
+    file = own_runtime / "lowfc.toml"
     file.write_text(f'[network]\nrouter = "{WAY.router}"\ncertificates = "{WAY.certificates}"\n')
     return file
 

@@ -20,8 +20,6 @@ from lowfc.programs.view.renderer import Renderer
 from tests.support.report_log import Night
 from tests.support.tape import Tape
 
-pytestmark = pytest.mark.exclusive
-
 OTHER = "[camera]\nrate_hz = 300.0\nshutter = 'rolling'\n[control]\nleak = 7.0\n[weather]\nwind = 3\n"
 """Two keys that this version does not know, and a value that it refuses."""
 REMARKS = [

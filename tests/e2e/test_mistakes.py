@@ -194,9 +194,8 @@ def test_logs(tmp_path: Path, words: tuple[str, ...], expected: str) -> None:
     assert sorted(path.name for path in tmp_path.iterdir()) == before
 
 
-def test_a_loop_that_is_starting_is_there_for_others(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_loop_that_is_starting_is_there_for_others(own_runtime: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """So that an unnamed request does not reach the only other one."""
-    monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
     found: list[object] = []
 
     def meanwhile(config: Configuration, run: Run, console: object) -> None:
@@ -216,6 +215,6 @@ def test_a_loop_that_is_starting_is_there_for_others(tmp_path: Path, monkeypatch
         "choose a run with --run, the beginning of its name is enough: there are night (no controller yet), other"
     )
     assert listed == [("night", "starting"), ("other", "starting")]
-    assert not (tmp_path / "lowfc" / "night").exists()
+    assert not (own_runtime / "lowfc" / "night").exists()
     with pytest.raises(BusError, match="made by processes that were started by hand"):
         sim_loop.sim_loop(load(None), 1.0, record=False, name="other")
