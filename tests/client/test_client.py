@@ -11,12 +11,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 import typer
-from astropy.io import fits
 
 from lowfc.adapters.bus.bus import Query, Sample
 from lowfc.adapters.bus.other_loops import other_loops
 from lowfc.adapters.bus.run import open_run
-from lowfc.adapters.files.mirror_maps import read_shape
 from lowfc.adapters.logs.reader import LogReader
 from lowfc.adapters.process.clock import HostClock
 from lowfc.client import Answer, Client, Frame, Stream, client, configuration_of, running, the_run
@@ -530,7 +528,14 @@ def test_every_command_has_help_with_an_example() -> None:
 
 @pytest.mark.parametrize(
     ("words", "noll"),
-    [(None, ()), (["2,3"], (2, 3)), (["2", "3"], (2, 3)), (["4-7, 11"], (4, 5, 6, 7, 11)), (["3,2-4"], (3, 2, 4))],
+    [
+        (None, ()),
+        (["2,3"], (2, 3)),
+        (["2", "3"], (2, 3)),
+        (["4-7, 11"], (4, 5, 6, 7, 11)),
+        (["3,2-4"], (3, 2, 4)),
+        (["2,4-6, 5"], (2, 4, 5, 6)),
+    ],
 )
 def test_modes_are_read_as_people_write_them(words: list[str] | None, noll: tuple[int, ...]) -> None:
     assert noll_of(words) == noll
@@ -541,30 +546,6 @@ def test_modes_that_are_none_are_refused(word: str) -> None:
     with pytest.raises(ConfigurationError, match="as in 2,3 or 4-11") as caught:
         noll_of([word])
     assert "\n" not in str(caught.value)
-
-
-def test_shapes_are_read_from_fits_and_numpy(tmp_path: Path) -> None:
-    np.save(tmp_path / "shape.npy", SHAPE)
-    fits.HDUList([fits.PrimaryHDU(), fits.ImageHDU(SHAPE)]).writeto(tmp_path / "shape.fits")
-    for name in ("shape.npy", "shape.fits"):
-        read = read_shape(tmp_path / name)
-        assert (read.dtype, read.tolist()) == (np.float32, SHAPE.tolist())
-
-
-def test_files_that_hold_no_shape_are_refused(tmp_path: Path) -> None:
-    np.save(tmp_path / "cube.npy", np.zeros((2, 3, 4)))
-    np.save(tmp_path / "pickled.npy", np.array([{}], object), allow_pickle=True)
-    (tmp_path / "text.fits").write_text("no")
-    fits.PrimaryHDU().writeto(tmp_path / "empty.fits")
-    for name, why in {
-        "none.fits": "there is no such file",
-        "cube.npy": r"\(2, 3, 4\) of float64",
-        "pickled.npy": "neither",
-        "text.fits": "neither",
-        "empty.fits": "there is no image",
-    }.items():
-        with pytest.raises(DataFileError, match=why):
-            read_shape(tmp_path / name)
 
 
 def test_the_status_says_everything() -> None:

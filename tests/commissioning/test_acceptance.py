@@ -21,7 +21,6 @@ from lowfc.control.loop.advance import advance
 from lowfc.control.loop.inputs import Frame, Load, Request
 from lowfc.control.loop.safety import LoopMode, Reason
 from lowfc.control.loop.state import State
-from lowfc.programs.cli.modes import noll_of
 from lowfc.programs.commissioning.acceptance import capture as acceptance_capture
 from lowfc.programs.commissioning.acceptance import linearity as acceptance_linearity
 from lowfc.programs.commissioning.acceptance import noise as acceptance_noise
@@ -48,8 +47,7 @@ def configured(**changes: object) -> Configuration:
 
 @pytest.fixture(scope="module")
 def calibration() -> Calibration:
-    config = configured()
-    return calibrated(config)
+    return calibrated(configured())
 
 
 def played(
@@ -257,7 +255,6 @@ def test_a_test_is_found_by_its_note() -> None:
 
 
 def test_modes_are_chosen_by_their_noll_indices() -> None:
-    assert noll_of(["2,4-6, 5"]) == (2, 4, 5, 6)
     assert chosen((), (2, 3)) == (2, 3)
     with pytest.raises(AcceptanceError, match="99"):
         chosen((99,), (2, 3))

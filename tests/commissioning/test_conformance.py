@@ -498,12 +498,7 @@ def test_the_report_says_what_to_do_of_what_is_not_right() -> None:
     assert {"name": "encoding", "status": "wrong"}.items() <= printed["checks"][5].items()
 
 
-@pytest.fixture
-def runtime(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
-
-
-@pytest.mark.usefixtures("runtime")
+@pytest.mark.usefixtures("own_runtime")
 @pytest.mark.parametrize("name", ["camera", "mirror"])
 def test_without_a_device_it_says_how_to_start_one(name: str) -> None:
     done = CliRunner().invoke(conformance_app, [name])
@@ -513,7 +508,7 @@ def test_without_a_device_it_says_how_to_start_one(name: str) -> None:
     assert "there is no run 'bench'" in str(done.exception)
 
 
-@pytest.mark.usefixtures("runtime")
+@pytest.mark.usefixtures("own_runtime")
 def test_a_mirror_that_a_controller_commands_is_left_alone() -> None:
     links = open_run("bench").links
     with socket.create_server(("127.0.0.1", links.ports[Role.CONTROLLER])):
@@ -521,7 +516,7 @@ def test_a_mirror_that_a_controller_commands_is_left_alone() -> None:
     assert "has a controller" in str(done.exception)
 
 
-@pytest.mark.usefixtures("runtime")
+@pytest.mark.usefixtures("own_runtime")
 def test_a_camera_that_is_not_there_is_what_is_wrong(monkeypatch: pytest.MonkeyPatch) -> None:
     open_run("bench")
     monkeypatch.setattr(conformance, "CONNECT_S", 0.0)
@@ -532,7 +527,7 @@ def test_a_camera_that_is_not_there_is_what_is_wrong(monkeypatch: pytest.MonkeyP
     assert "received: nothing" in checks["frames"]["got"]
 
 
-@pytest.mark.usefixtures("runtime")
+@pytest.mark.usefixtures("own_runtime")
 def test_lockstep_has_no_dead_man_to_try(tmp_path: Path) -> None:
     (tmp_path / "lockstep.toml").write_text("lockstep = true\n")
     done = CliRunner().invoke(conformance_app, ["mirror", "--config", str(tmp_path / "lockstep.toml")])
@@ -546,7 +541,7 @@ def test_every_command_of_the_document_is_run_by_the_test_of_the_examples() -> N
     assert sorted(lines) == sorted(test_own_hardware.DOCUMENTED)
 
 
-@pytest.mark.usefixtures("runtime")
+@pytest.mark.usefixtures("own_runtime")
 def test_a_line_hears_what_has_no_envelope_and_asks() -> None:
     links = open_run("bench").links
     with zenoh.open(zenoh.Config.from_json5(json.dumps(session_config(links, Role.CAMERA)))) as session:
@@ -568,7 +563,7 @@ def test_a_line_hears_what_has_no_envelope_and_asks() -> None:
             line.close()
 
 
-@pytest.mark.usefixtures("runtime")
+@pytest.mark.usefixtures("own_runtime")
 def test_the_controllers_place_is_taken_by_one_at_a_time() -> None:
     links = open_run("bench").links
     line = Line(links, Role.CONTROLLER)
@@ -579,7 +574,7 @@ def test_the_controllers_place_is_taken_by_one_at_a_time() -> None:
         line.close()
 
 
-@pytest.mark.usefixtures("runtime")
+@pytest.mark.usefixtures("own_runtime")
 def test_a_run_on_several_hosts_has_another_clock() -> None:
     open_run("bench", network=Network(router="tls/127.0.0.1:7447", certificates="."))
     done = CliRunner().invoke(conformance_app, ["camera", "--run", "bench"])

@@ -27,8 +27,6 @@ from lowfc.programs.commissioning.doctor import command, room, timing
 from lowfc.programs.commissioning.doctor.facts import Facts, gather, ranges
 from lowfc.programs.core.recording.volume import bytes_per_s
 
-pytestmark = pytest.mark.exclusive
-
 DOCUMENT = Path(__file__).parents[2] / "docs" / "doctor.md"
 LOOKS = {**timing.CHECKS.looks, **room.CHECKS.looks}
 NO_RIGHTS = [
@@ -274,19 +272,16 @@ def test_the_disk_is_judged_by_what_the_loop_writes(tmp_path: Path, monkeypatch:
 
 
 @pytest.mark.parametrize(("behind_ms", "status"), [(50, "ok"), (1000, "warning"), (-1000, "warning")])
-def test_a_boots_clock_that_was_set_wrong_is_a_warning(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, behind_ms: int, status: str
-) -> None:
-    monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
-    assert examine(facts(tmp_path))["boot's clock"][:2] == ok("not set yet: the first process of a run does it")[:2]
-    assert not (tmp_path / "lowfc").exists(), "looking changes nothing"
+def test_a_boots_clock_that_was_set_wrong_is_a_warning(own_runtime: Path, behind_ms: int, status: str) -> None:
+    assert examine(facts(own_runtime))["boot's clock"][:2] == ok("not set yet: the first process of a run does it")[:2]
+    assert not (own_runtime / "lowfc").exists(), "looking changes nothing"
     file = boot_file(runtime_base())
     file.write_text(str(time.time_ns() - time.monotonic_ns() - behind_ms * 1_000_000))
-    finding = examine(facts(tmp_path))["boot's clock"]
+    finding = examine(facts(own_runtime))["boot's clock"]
     assert finding.status == status
     assert (status == "warning") == (f"remove {file}" in finding.advice)
     file.write_text("noon")
-    assert "not known" in examine(facts(tmp_path))["boot's clock"].got
+    assert "not known" in examine(facts(own_runtime))["boot's clock"].got
 
 
 def test_certificates_that_end_are_a_warning(tmp_path: Path) -> None:

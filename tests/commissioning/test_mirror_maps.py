@@ -33,8 +33,7 @@ QUIET = {"disturbance.preset": "quiet", "star.magnitude": -2.0}
 
 @pytest.fixture(scope="module")
 def calibration() -> Calibration:
-    config = load(None, QUIET)
-    return calibrated(config)
+    return calibrated(load(None, QUIET))
 
 
 def wavy(height_nm: float = 30.0) -> Single:
@@ -85,12 +84,19 @@ def test_what_is_no_map_is_named_in_one_line(tmp_path: Path) -> None:
     saved(tmp_path, "nothing.npy", np.zeros((0, 34)))
     fits.HDUList([fits.PrimaryHDU()]).writeto(tmp_path / "empty.fits")
     saved(tmp_path, "line.npy", np.zeros(9))
+    saved(tmp_path, "cube.npy", np.zeros((2, 3, 4)))
     saved(tmp_path, "words.npy", np.array([["flat"]]))
     np.save(tmp_path / "pickle.npy", np.array([[{}]], dtype=object))
     (tmp_path / "folder.fits").mkdir()
-    of_numpy = ("text.npy", "line.npy", "words.npy", "pickle.npy", "archive.npy", "half.npy", "cut.npy", "nothing.npy")
-    for file in ("short.fits", "empty.fits", "folder.fits", "none", *of_numpy):
-        with pytest.raises(DataFileError, match=file) as caught:
+    neither = ("short.fits", "text.npy", "pickle.npy", "archive.npy", "half.npy", "cut.npy")
+    for file, why in {
+        **dict.fromkeys(neither, "neither"),
+        **dict.fromkeys(("folder.fits", "line.npy", "words.npy", "nothing.npy"), ""),
+        "cube.npy": r"\(2, 3, 4\) of float64",
+        "none.fits": "there is no such file",
+        "empty.fits": "there is no image",
+    }.items():
+        with pytest.raises(DataFileError, match=f"{file}.*{why}") as caught:
             read_shape(tmp_path / file)
         assert "\n" not in str(caught.value)
 

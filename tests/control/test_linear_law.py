@@ -77,11 +77,6 @@ def test_a_delay_below_one_frame_is_refused(delay: float) -> None:
         delay_weights(delay)
 
 
-@pytest.mark.parametrize("delay", [1, 2, 3])
-def test_the_limiting_gain_of_whole_delays(delay: int) -> None:
-    assert limiting_gain(delay) == pytest.approx(2 * np.sin(np.pi / (2 * (2 * delay - 1))), abs=1e-6)
-
-
 def spectral_radius(gain: float, leak: float, delay: float) -> float:
     """Largest pole of the loop, from its state matrix: an independent way to its stability."""
     weights = delay_weights(delay)

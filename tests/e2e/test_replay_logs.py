@@ -248,15 +248,6 @@ def test_a_log_cut_short_and_a_log_with_a_hole(tmp_path: Path) -> None:
     assert replayed(tmp_path, tmp_path / "forged.mcap", "--tolerance", "0.001")["identical"]
 
 
-def test_what_cannot_be_replayed_is_said_in_one_line(tmp_path: Path) -> None:
-    (tmp_path / "text.mcap").write_text("this is not a log")
-    for name, complaint in (("text.mcap", "is not an MCAP file"), ("gone.mcap", "cannot be read")):
-        done = run(tmp_path, "replay", name)
-        assert done.returncode == 2
-        assert complaint in done.stderr
-        assert len(done.stderr.splitlines()) == 1
-
-
 @pytest.mark.slow
 def test_a_minute_at_a_kilohertz_is_lossless_and_identical(tmp_path: Path) -> None:
     words = ("--rate", "1000", "--duration", "60", "--disturbance", "reaction-wheel")

@@ -19,8 +19,6 @@ from lowfc.control.loop.inputs import Load, Request
 from lowfc.control.loop.state import State
 from lowfc.programs.cli.main import app
 
-pytestmark = pytest.mark.exclusive
-
 WIRE = Path(__file__).parents[2] / "lowfc" / "contract" / "wire"
 FOLDER = Path(__file__).parents[1] / "golden" / "0.1"
 FORMER_KEY = next(old for old, new in former_names.KEYS.items() if new.endswith("frame_timeout_ms")).partition(".")[2]
@@ -131,6 +129,7 @@ def test_former_keys_of_a_configuration_are_warned_of() -> None:
     remarks: list[str] = []
     config = configuration.load(FOLDER / "lowfc.toml", remark=remarks.append)
     former = tomllib.loads((FOLDER / "lowfc.toml").read_text())
+    assert config.sensor.modes == 2
     assert config.control.frame_timeout_ms == former["control"][FORMER_KEY]
     assert any(f"control.{FORMER_KEY} is now called control.frame_timeout_ms" in remark for remark in remarks)
     assert set(former_names.KEYS.values()) <= set(configuration.keys())
@@ -171,7 +170,3 @@ def test_a_calibration_and_a_law_of_0_1_are_taken_by_a_loop() -> None:
     state, _ = advance(settings, State(), Load(0, calibration_file.load(FOLDER / "calibration.fits"), "golden"))
     _, outputs = advance(settings, state, Request(0, "law", law=law_file.load(FOLDER / "law.fits")))
     assert outputs.reply.accepted, outputs.reply.text
-
-
-def test_a_configuration_is_read() -> None:
-    assert configuration.load(FOLDER / "lowfc.toml").sensor.modes == 2

@@ -192,7 +192,7 @@ def test_several_logs_are_taken_in_turn(folder: Path, words: list[str]) -> None:
         assert f"name one log, not 2 ({Path(first).name}, {Path(second).name})" in str(done.exception)
 
 
-@pytest.mark.parametrize("words", [*IN_TURN, ["what-if", "--set", "gain=1"]], ids=lambda words: words[0])
+@pytest.mark.parametrize("words", [*IN_TURN, ["replay"], ["what-if", "--set", "gain=1"]], ids=lambda words: words[0])
 def test_what_is_no_log_is_an_error(tmp_path: Path, words: list[str]) -> None:
     (tmp_path / "text").write_text("this is not an MCAP file, by far")
     for name, said in (("text", "is not an MCAP file"), ("gone", "cannot be read: No such file")):

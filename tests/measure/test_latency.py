@@ -39,8 +39,6 @@ from lowfc.programs.measure.latency.text import compared, sparkline, table
 from tests.support.loops import until
 from tools.law_bench import calibrated
 
-pytestmark = pytest.mark.exclusive
-
 START = 1_700_000_000 << 32
 MS = 1_000_000
 RATE_HZ, SECONDS = 200, 0.5
@@ -219,6 +217,7 @@ def test_the_figures_of_a_release_can_be_compared_with_todays(file: Path) -> Non
     assert "skipped by the controller: a 0, b 4" in compared({"a": "a.json", "b": "b.json"} | found)
 
 
+@pytest.mark.exclusive
 def test_a_step_alone_takes_every_frame_as_the_controller_does() -> None:
     config = load(None, {"control.start_mode": "closed", "control.tilt_leak": 0.01, "control.leak": 0.01})
     calibration = calibrated(config)
@@ -268,6 +267,7 @@ def measured(tmp_path_factory: pytest.TempPathFactory) -> tuple[dict[str, Any], 
     return json.loads(done.stdout), folder
 
 
+@pytest.mark.exclusive
 def test_every_frame_of_a_real_loop_is_in_the_account(measured: tuple[dict[str, Any], Path]) -> None:
     figures, _ = measured
     sent = round(RATE_HZ * (SECONDS + WARM_UP_S))
@@ -290,6 +290,7 @@ def test_every_frame_of_a_real_loop_is_in_the_account(measured: tuple[dict[str, 
     assert any("garbage collector off" in measure for measure in figures["host"]["granted"])
 
 
+@pytest.mark.exclusive
 def test_the_log_of_the_run_says_the_same(measured: tuple[dict[str, Any], Path]) -> None:
     live, folder = measured
     assert live["messages_lost"] == 0
@@ -311,6 +312,7 @@ def test_the_log_of_the_run_says_the_same(measured: tuple[dict[str, Any], Path])
     assert "frame to mirror" in done.stdout
 
 
+@pytest.mark.exclusive
 def test_a_person_reads_a_table_and_a_picture(measured: tuple[dict[str, Any], Path]) -> None:
     figures, folder = measured
     text = table(figures)
@@ -348,6 +350,7 @@ def child(launcher: int, program: str) -> int:
     return 0
 
 
+@pytest.mark.exclusive
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("victim", "number", "status", "said"),

@@ -48,8 +48,6 @@ from lowfc.testing.clock import FakeClock
 from lowfc.testing.memory_bus import MemoryBus, MemoryHub
 from tests.support.loops import until
 
-pytestmark = pytest.mark.exclusive
-
 pytest.importorskip("foxglove")
 
 PATIENCE_S = 10.0
@@ -235,6 +233,7 @@ def test_a_taken_port_and_a_missing_library_are_said_in_one_line(
     assert "\n" not in f"{taken.value}{missing.value}"
 
 
+@pytest.mark.exclusive
 def test_a_process_of_a_real_run() -> None:
     run = open_run(new_run_id())
     program = (
