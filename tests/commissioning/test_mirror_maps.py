@@ -22,7 +22,7 @@ from lowfc.control.loop.safety import LoopMode
 from lowfc.control.loop.state import State
 from lowfc.programs.core.start_up import StartUp, check_files
 from sim_camera.process import bench
-from tests.support.fold import fold
+from tests.support.folded_loop import fold
 from tests.support.loops import run
 from tools.law_bench import calibrated
 

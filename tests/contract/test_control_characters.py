@@ -26,7 +26,7 @@ from lowfc.testing.clock import FakeClock
 from lowfc.testing.memory_bus import MemoryBus, MemoryHub
 from tests.support import report_log
 from tests.support.report_log import Night
-from tests.support.tape import Tape
+from tests.support.stage import Tape
 
 HOSTILE = "clouds\x1b[2J\x07 \x9b31mred \u202egnorts \u2028 caf\u00e9 5\u2009nm\r\nerror: fine"
 SHOWN = r"clouds\x1b[2J\x07 \x9b31mred \u202egnorts \u2028 café 5" + "\u2009" + r"nm\r\nerror: fine"

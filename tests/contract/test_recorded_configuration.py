@@ -18,7 +18,7 @@ from lowfc.programs.commissioning.acceptance.played import SAID
 from lowfc.programs.view.recorded import draw_logs
 from lowfc.programs.view.renderer import Renderer
 from tests.support.report_log import Night
-from tests.support.tape import Tape
+from tests.support.stage import Tape
 
 OTHER = "[camera]\nrate_hz = 300.0\nshutter = 'rolling'\n[control]\nleak = 7.0\n[weather]\nwind = 3\n"
 """Two keys that this version does not know, and a value that it refuses."""

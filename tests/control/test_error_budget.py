@@ -11,7 +11,7 @@ from lowfc.control.calibration.calibration import noise_nm
 from lowfc.control.laws.error_budget import Term, lag, lag_under_noise, measurement_error, sensor_noise, white_noise
 from lowfc.control.laws.linear_law import LinearLaw, integrator
 from lowfc.control.laws.spectra import Pieces, spectrum
-from tests.support.fold import fold
+from tests.support.folded_loop import fold
 from tests.support.theory import rejection
 from tools.law_bench import calibrated
 

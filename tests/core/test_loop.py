@@ -6,7 +6,7 @@ import pytest
 from lowfc.contract.configuration import Configuration, load
 from lowfc.control.laws.stability import limiting_gain
 from lowfc.optics.detector.photometry import tilt_nm_per_mas
-from tests.support.fold import fold
+from tests.support.folded_loop import fold
 
 QUIET = {
     "camera.rate_hz": 1000,

@@ -27,7 +27,7 @@ from lowfc.programs.logs.what_if.compare import LINEAR_WAVES, WhatIf, compared, 
 from lowfc.programs.logs.what_if.options import user_controller
 from lowfc.programs.logs.what_if.run import LoggedRun
 from tests.support import toy
-from tests.support.fold import Fold, fold
+from tests.support.folded_loop import Fold, fold
 from tests.support.loops import loop
 
 RATE_HZ = 250

@@ -1,9 +1,10 @@
-"""A loop in one process behind the interface of `lowfc.client`: frames are exposed when the next one is asked for."""
+"""A loop in one process: behind the interface of `lowfc.client`, and folded over a run of the configured bench."""
 
 import contextlib
 import tomllib
 from collections import deque
 from collections.abc import Callable, Iterator
+from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any, NamedTuple
 
@@ -31,7 +32,7 @@ from lowfc.testing.memory_bus import MemoryBus, MemoryHub, MemoryRing
 from sim_camera.process import bench
 from sim_dm.device import Command, apply_command, initial
 from sim_dm.process import device
-from tools.law_bench import calibrated
+from tools.law_bench import Bench, calibrated
 
 FIRST = 1 << 32
 
@@ -243,3 +244,37 @@ class FoldedLoop:
                 self._listeners = [one for one in self._listeners if one is not listener]
 
         return each()
+
+
+Array = npt.NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Fold:
+    """Modes (frames, modes) and rms over the open pupil (frames,) of a run, nm of wavefront."""
+
+    disturbance_nm: Array
+    residual_nm: Array
+    error_nm: Array
+    pol_nm: Array
+    command_nm: Array
+    disturbance_rms_nm: Array
+    residual_rms_nm: Array
+
+
+def fold(config: Configuration, frames: int) -> Fold:
+    """Run the loop of a configuration, of which every frame must be used."""
+    bench = Bench(config, calibrated(config))
+    bench.run(frames)
+    assert not bench.refused
+
+    def of_all(rows: list, name: str) -> Array:
+        return np.array([getattr(row, name) for row in rows], dtype=np.float64)
+
+    return Fold(
+        **{name: of_all(bench.steps, name) for name in ("error_nm", "pol_nm", "command_nm")},
+        **{
+            name: of_all(bench.truths, name)
+            for name in ("disturbance_nm", "residual_nm", "disturbance_rms_nm", "residual_rms_nm")
+        },
+    )

@@ -23,7 +23,7 @@ from lowfc.programs.view.snapshot import Snapshot
 from lowfc.testing.memory_bus import MemoryBus, MemoryHub
 from tests.support.loops import until
 from tests.support.report_log import Night
-from tests.support.tape import Tape
+from tests.support.stage import Tape
 
 PATIENCE_S = 10.0
 

@@ -21,8 +21,7 @@ from lowfc.programs.view.verdicts.course import Course, round_125
 from lowfc.programs.view.verdicts.tile import Level, Verdict
 from tests.support import report_log
 from tests.support.report_log import Night
-from tests.support.stage import accumulated, snapshot_of, tile
-from tests.support.tape import Tape, values_of
+from tests.support.stage import Tape, accumulated, snapshot_of, tile, values_of
 
 Shown = list[Verdict]
 

@@ -17,8 +17,7 @@ from lowfc.programs.view.panels import loop, mirror, sensor, wavefront
 from lowfc.programs.view.renderer import RETRY_NS, Renderer
 from lowfc.programs.view.snapshot import Accumulator, Snapshot
 from tests.support.report_log import Night
-from tests.support.stage import accumulated, snapshot_of
-from tests.support.tape import Tape, pixels, values_of
+from tests.support.stage import Tape, accumulated, pixels, snapshot_of, values_of
 from tests.support.toy import FLUX_DN, NOLL
 
 FRAMES = 120

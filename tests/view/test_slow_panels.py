@@ -18,7 +18,7 @@ from lowfc.programs.view.panels import latency, science, spectra
 from lowfc.programs.view.panels.panel import Panel
 from lowfc.programs.view.snapshot import Accumulator, LastHealth
 from lowfc.programs.view.verdicts import steady
-from tests.support.tape import Tape, pixels, values_of
+from tests.support.stage import Tape, pixels, values_of
 from tests.support.theory import rejection
 from tests.support.toy import calibration
 

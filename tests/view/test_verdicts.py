@@ -35,8 +35,7 @@ from lowfc.testing.memory_bus import MemoryBus, MemoryHub
 from sim_camera.process import CameraProcess, bench
 from sim_dm.process import MirrorProcess
 from tests.support.report_log import Night
-from tests.support.stage import MAS, Stage, tile
-from tests.support.tape import Tape
+from tests.support.stage import MAS, Stage, Tape, tile
 from tests.support.toy import FLUX_DN, NOLL, START, TOY
 from tools.law_bench import calibrated
 
