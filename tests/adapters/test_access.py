@@ -9,7 +9,6 @@ from pathlib import Path
 
 import pytest
 import zenoh
-from typer.testing import CliRunner
 
 from lowfc.adapters.bus.access import CLOCK_KEY, ROUTER, access_control, grant, roles
 from lowfc.adapters.bus.bus import Sample
@@ -34,8 +33,7 @@ from lowfc.contract.messages import (
     Role,
     Topic,
 )
-from lowfc.programs.cli.main import app
-from tests.support.loops import until
+from tests.support.loops import lowfc, until
 
 certificates = pytest.importorskip("lowfc.adapters.bus.certificates", reason="needs the package cryptography")
 ROLES = roles(["mirror-dm"])
@@ -231,7 +229,7 @@ def test_hosts_warns_of_a_certificate_that_ends(hosts: Hosts, monkeypatch: pytes
     beating = threading.Thread(target=beat)
     beating.start()
     try:
-        done = CliRunner().invoke(app, ["hosts", "--config", str(toml), "--run", "hosts"])
+        done = lowfc("hosts", "--config", toml, "--run", "hosts")
     finally:
         stop.set()
         beating.join()

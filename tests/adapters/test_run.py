@@ -8,7 +8,6 @@ import sys
 from pathlib import Path
 
 import pytest
-from typer.testing import CliRunner
 
 from lowfc.adapters.bus.bus import ALL, Query
 from lowfc.adapters.bus.run import Run, free_ports, mirror_role, new_run_id, open_run, own_directory, runtime_base
@@ -19,8 +18,7 @@ from lowfc.adapters.process.clock import HostClock
 from lowfc.adapters.process.latch import Latch, latch_files
 from lowfc.contract.errors import BusError, DataFileError
 from lowfc.contract.messages import REQUEST_KEY, Role, wire
-from lowfc.programs.cli.main import app
-from tests.support.loops import until
+from tests.support.loops import lowfc, until
 
 pytestmark = pytest.mark.usefixtures("own_runtime")
 
@@ -174,7 +172,7 @@ def test_safe_is_asked_for_where_the_directory_cannot_be_written() -> None:
     try:
         with pytest.raises(OSError, match="Read-only"):
             (run.path / "start-operator").write_text("")
-        done = CliRunner().invoke(app, ["ctl", "safe", "--run", "night"])
+        done = lowfc("ctl", "safe", "--run", "night")
     finally:
         subprocess.run(["umount", "--lazy", run.path], check=True)
         bus.close()

@@ -4,12 +4,12 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 import pytest
 from typer.testing import CliRunner
 
 from lowfc.adapters.files import factory
 from lowfc.adapters.files.drawing import figure_class, png
+from lowfc.arrays import Single
 from lowfc.contract.configuration import Acceptance, Configuration, load
 from lowfc.contract.errors import ConfigurationError
 from lowfc.contract.messages import wire
@@ -31,8 +31,6 @@ from lowfc.programs.commissioning.acceptance.played import AcceptanceError, Loop
 from sim_camera.bench import Bench
 from sim_camera.process import bench
 from tools.law_bench import calibrated
-
-Single = npt.NDArray[np.float32]
 
 REQUIRED = Acceptance(lowest_hz=2.0)
 RATE_HZ = 250.0

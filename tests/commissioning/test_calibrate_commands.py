@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 import pytest
 from astropy.io import fits
 from rich.console import Console
@@ -15,6 +14,7 @@ from typer.testing import CliRunner
 
 from lowfc.adapters.files import calibration_file, factory
 from lowfc.adapters.process.progress import spoken
+from lowfc.arrays import Array
 from lowfc.contract.codecs.calibration_codec import identified
 from lowfc.contract.configuration import Configuration, load
 from lowfc.contract.errors import CalibrationError, ConfigurationError, DataFileError
@@ -361,8 +361,6 @@ def test_calibrations_of_different_sensors_are_not_compared(loop: Connected) -> 
     with pytest.raises(DataFileError, match="there is no directory"):
         told("--method", "hadamard", "--out", "nowhere/night.fits")
 
-
-Array = npt.NDArray[np.float64]
 
 BRIGHT = {"sensor.sam": "sam27d10_bal14", "star.magnitude": 0.0, "disturbance.preset": "quiet"}
 THERE = "4=20,7=-20"

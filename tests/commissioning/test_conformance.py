@@ -11,7 +11,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 import pytest
 import zenoh
 from google.protobuf.message import DecodeError, Message
@@ -21,6 +20,7 @@ from typer.testing import CliRunner
 from lowfc.adapters.bus.run import open_run
 from lowfc.adapters.bus.zenoh_bus import session_config
 from lowfc.adapters.files.factory import camera_state
+from lowfc.arrays import Single
 from lowfc.contract.configuration import Configuration, Network, load
 from lowfc.contract.envelope import Envelope, sequence_of
 from lowfc.contract.errors import BusError, ConfigurationError
@@ -50,8 +50,6 @@ from sim_dm.device import Command, Status, apply_command, initial, tick
 from sim_dm.process import _told, device
 from tests.e2e import test_own_hardware
 from tests.support.loops import until
-
-Array = npt.NDArray[np.float32]
 
 MS = 1_000_000
 LATENCY_NS = 100_000
@@ -339,7 +337,7 @@ def test_a_cameras_mistake_is_found(mistake: str) -> None:
     assert of_camera(**changes) == expected
 
 
-def shaped(function: Callable[[Array], Array]) -> Callable[[wire.MirrorState], wire.MirrorState]:
+def shaped(function: Callable[[Single], Single]) -> Callable[[wire.MirrorState], wire.MirrorState]:
     """A state with another shape."""
 
     def change(state: wire.MirrorState) -> wire.MirrorState:
@@ -350,7 +348,7 @@ def shaped(function: Callable[[Array], Array]) -> Callable[[wire.MirrorState], w
     return change
 
 
-def one_dead(shape: Array, height_nm: float = 0.0) -> Array:
+def one_dead(shape: Single, height_nm: float = 0.0) -> Single:
     return np.where(np.arange(shape.size).reshape(shape.shape) == 9, np.float32(height_nm), shape)
 
 

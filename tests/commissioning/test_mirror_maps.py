@@ -11,6 +11,7 @@ from astropy.io import fits
 
 from lowfc.adapters.files import factory, law_file
 from lowfc.adapters.files.mirror_maps import active_actuators, flat_nm, read_shape
+from lowfc.arrays import Single
 from lowfc.contract.configuration import Configuration, load
 from lowfc.contract.errors import ConfigurationError, DataFileError
 from lowfc.control.calibration.calibration import Calibration
@@ -26,7 +27,6 @@ from tests.support.folded_loop import fold
 from tests.support.loops import run
 from tools.law_bench import calibrated
 
-Single = npt.NDArray[np.float32]
 GRID = (34, 34)
 QUIET = {"disturbance.preset": "quiet", "star.magnitude": -2.0}
 

@@ -7,7 +7,6 @@ from pathlib import Path
 
 import pytest
 from rich.console import Console
-from typer.testing import CliRunner
 
 from lowfc.adapters.process.service import Service
 from lowfc.adapters.process.terminal import new_app, run_app
@@ -15,7 +14,6 @@ from lowfc.contract.configuration import Configuration, load
 from lowfc.contract.errors import ConfigurationError, RequestRefusedError
 from lowfc.contract.messages import EVENT, REQUEST, Log, wire
 from lowfc.contract.printable import LINES, printable
-from lowfc.programs.cli.main import app
 from lowfc.programs.cli.output import put
 from lowfc.programs.launch.status import screen
 from lowfc.programs.launch.watch import Watch
@@ -25,6 +23,7 @@ from lowfc.programs.view.renderer import Renderer
 from lowfc.testing.clock import FakeClock
 from lowfc.testing.memory_bus import MemoryBus, MemoryHub
 from tests.support import report_log
+from tests.support.loops import lowfc
 from tests.support.report_log import Night
 from tests.support.stage import Tape
 
@@ -103,7 +102,7 @@ def log(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 @pytest.mark.parametrize("command", ["info", "report", "replay"])
 def test_readers_of_a_log_print_them_so(log: Path, command: str) -> None:
-    done = CliRunner().invoke(app, [command, str(log)])
+    done = lowfc(command, log)
     assert done.exit_code == 0, done.output
     check(done.output)
     if command == "report":

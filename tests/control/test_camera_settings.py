@@ -3,9 +3,9 @@
 from dataclasses import replace
 
 import numpy as np
-import numpy.typing as npt
 import pytest
 
+from lowfc.arrays import Single
 from lowfc.contract.codecs.calibration_codec import decode_calibration, encode_calibration, identified
 from lowfc.contract.codecs.state_codec import controller_state, decode_state
 from lowfc.contract.messages import wire
@@ -191,13 +191,13 @@ def idle(frames: int = 3, shape_nm: float = 0.0) -> State:
     return feed(USUAL, state, *(odd(count) for count in range(1, frames + 1)))[0]
 
 
-def play(state: State, table: npt.NDArray[np.float32], basis: npt.NDArray[np.float32] = BASIS) -> State:
+def play(state: State, table: Single, basis: Single = BASIS) -> State:
     state, outputs = advance(USUAL, state, Request(0, "play", text=MIRROR, actuators_nm=basis, table=table))
     answered(outputs, True)
     return state
 
 
-def surfaces(every: list[Outputs]) -> npt.NDArray[np.float32]:
+def surfaces(every: list[Outputs]) -> Single:
     """(frames, actuators) of the commands."""
     return np.array([one.command.actuators_nm.reshape(-1) for one in every if one.command is not None])
 

@@ -3,9 +3,9 @@
 from dataclasses import replace
 
 import numpy as np
-import numpy.typing as npt
 import pytest
 
+from lowfc.arrays import Array
 from lowfc.control.laws.law import Law, integrate
 from lowfc.control.laws.linear_law import LinearLaw, Signal, at_rest, coast, follow, respond
 from lowfc.control.laws.margins import (
@@ -146,7 +146,6 @@ def test_pseudo_open_loop_is_the_disturbance_while_the_loop_settles(delay: float
 NOLL = (2, 3, 4)
 GAIN, LEAK = np.array([0.5, 0.3, 0.1]), np.array([0.0, 0.01, 0.1])
 PLAIN = law_of(GAIN, LEAK, 1e9)
-Array = npt.NDArray[np.float64]
 
 
 def pi(gain: Array, proportional: Array, leak: Array) -> LinearLaw:

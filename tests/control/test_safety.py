@@ -8,17 +8,15 @@ from types import ModuleType
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 import pytest
 from hypothesis import assume, example, given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
+from lowfc.arrays import Single
 from lowfc.control.loop import safety
 from lowfc.control.loop.safety import Limits, LoopMode, Reason, expired, limit, neighbour_difference_nm, request_mode
 from tests.support.safety_checks import CASES, LIMITS, Case, check_kept, violations
-
-Array = npt.NDArray[np.float32]
 
 GRID = (4, 5)
 
@@ -39,15 +37,15 @@ finite = st.one_of(st.sampled_from(EDGES), st.floats(-2000, 2000, width=32))
 anything = st.one_of(finite, st.floats(width=32), st.sampled_from([np.inf, -np.inf, np.nan, 1e38, -3.4e38]))
 
 
-def within(limits: Limits, actuators_nm: Array) -> bool:
+def within(limits: Limits, actuators_nm: Single) -> bool:
     stroke = np.abs(actuators_nm.astype(np.float64)).max() <= limits.stroke_nm
     return bool(stroke) and neighbour_difference_nm(actuators_nm.astype(np.float64)) <= limits.neighbour_nm
 
 
-def allowed_shapes(limits: Limits = LIMITS) -> st.SearchStrategy[Array]:
+def allowed_shapes(limits: Limits = LIMITS) -> st.SearchStrategy[Single]:
     """Shapes within the limits, many of them exactly at one."""
 
-    def bring_in(shape: Array) -> Array:
+    def bring_in(shape: Single) -> Single:
         shape = np.clip(shape, -np.float32(limits.stroke_nm), np.float32(limits.stroke_nm))
         apart = neighbour_difference_nm(shape.astype(np.float64))
         while apart > limits.neighbour_nm:
@@ -60,7 +58,7 @@ def allowed_shapes(limits: Limits = LIMITS) -> st.SearchStrategy[Array]:
 
 @settings(max_examples=400, deadline=None, derandomize=True)
 @given(previous=allowed_shapes(), wanted=hnp.arrays(np.float32, GRID, elements=anything.map(np.float32)))
-def test_whatever_is_wanted_the_limits_hold(previous: Array, wanted: Array) -> None:
+def test_whatever_is_wanted_the_limits_hold(previous: Single, wanted: Single) -> None:
     assert within(LIMITS, previous)
     limited = limit(LIMITS, previous, wanted)
     assert violations(LIMITS, previous, limited.actuators_nm) == []
@@ -92,7 +90,7 @@ def test_cases_by_hand(case: Case) -> None:
 
 @settings(max_examples=200, deadline=None, derandomize=True)
 @given(previous=allowed_shapes(), fraction=st.floats(0, 1))
-def test_what_is_allowed_goes_through_unchanged(previous: Array, fraction: float) -> None:
+def test_what_is_allowed_goes_through_unchanged(previous: Single, fraction: float) -> None:
     """A move well within every limit is carried out as it was wanted, and nothing is said about it."""
     wanted = (previous * np.float32(fraction)).astype(np.float32)
     assume(np.abs(wanted.astype(np.float64) - previous).max() < LIMITS.slew_nm - 0.01)
@@ -148,7 +146,7 @@ def test_nothing_given_is_changed() -> None:
     previous=hnp.arrays(np.float32, GRID, elements=st.floats(-3000, 3000, width=32)),
     wanted=hnp.arrays(np.float32, GRID, elements=finite.map(np.float32)),
 )
-def test_a_shape_outside_the_limits_comes_back(previous: Array, wanted: Array) -> None:
+def test_a_shape_outside_the_limits_comes_back(previous: Single, wanted: Single) -> None:
     """What is outside never goes further out, comes in at no more than the slew limit, and gets there."""
     shape, steps = previous, 0
     while not within(LIMITS, shape):
@@ -168,7 +166,7 @@ def test_a_shape_outside_the_limits_comes_back(previous: Array, wanted: Array) -
 
 @settings(max_examples=200, deadline=None, derandomize=True)
 @given(previous=st.one_of(allowed_shapes(), hnp.arrays(np.float32, GRID, elements=st.floats(-3000, 3000, width=32))))
-def test_relaxing_reaches_flat(previous: Array) -> None:
+def test_relaxing_reaches_flat(previous: Single) -> None:
     shape, steps = previous, 0
     while shape.any():
         after = limit(LIMITS, shape, np.zeros(GRID, np.float32)).actuators_nm
@@ -180,7 +178,7 @@ def test_relaxing_reaches_flat(previous: Array) -> None:
 
 @settings(max_examples=100, deadline=None, derandomize=True)
 @given(shape=allowed_shapes(), seed=st.integers(0, 2**32 - 1))
-def test_a_mirror_pressed_against_the_neighbour_limit_stays_there(shape: Array, seed: int) -> None:
+def test_a_mirror_pressed_against_the_neighbour_limit_stays_there(shape: Single, seed: int) -> None:
     """It does not fall back towards flat and it does not shake: repeated wishes for too much change nothing much."""
     rng = np.random.default_rng(seed)
     wanted = (5000 * rng.standard_normal(GRID)).astype(np.float32)

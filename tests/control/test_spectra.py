@@ -4,9 +4,9 @@ from collections.abc import Iterable
 from dataclasses import replace
 
 import numpy as np
-import numpy.typing as npt
 import pytest
 
+from lowfc.arrays import Array
 from lowfc.control.calibration.excitation import FEWEST_CYCLES, climb, led_in, lines, multisine
 from lowfc.control.calibration.linearity import captured, gains, levels
 from lowfc.control.laws import margins
@@ -146,8 +146,6 @@ def test_closed_over_open_is_the_rejection(gain: float, leak: float, delay: int)
     expected = rejection(frequency_hz[above], RATE_HZ, gain, leak, delay)
     assert np.sqrt(after / before)[above] == pytest.approx(expected, rel=0.08)
 
-
-Array = npt.NDArray[np.float64]
 
 PERIOD = 3000
 GAIN = (0.4, 0.1)

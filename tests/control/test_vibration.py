@@ -3,10 +3,10 @@
 from dataclasses import replace
 
 import numpy as np
-import numpy.typing as npt
 import pytest
 from scipy.fft import fft, ifft, irfft
 
+from lowfc.arrays import Array
 from lowfc.control.laws.kalman import covariance_nm2, lqg
 from lowfc.control.laws.margins import check_stable, margins, rejection
 from lowfc.control.laws.spectra import Pieces
@@ -16,7 +16,6 @@ from lowfc.optics.detector.photometry import tilt_nm_per_mas
 from sim_camera.disturbance import LINES_HZ, disturbance, modes_nm
 from tests.support.theory import integrators, realised, run
 
-Array = npt.NDArray[np.float64]
 RATE_HZ = 1000.0
 NM_PER_MAS = tilt_nm_per_mas(2.0)
 

@@ -17,6 +17,7 @@ from lowfc.adapters.files import factory
 from lowfc.adapters.process.clock import HostClock, SimulatedClock
 from lowfc.adapters.process.latch import Latch
 from lowfc.adapters.process.service import Service
+from lowfc.arrays import Array, Pixels
 from lowfc.contract.codecs.codec import actuators
 from lowfc.contract.codecs.law_codec import wire_law
 from lowfc.contract.configuration import Configuration, load
@@ -52,8 +53,6 @@ from sim_camera.process import bench
 from sim_dm.process import MirrorProcess
 from tests.support.loops import until
 from tools.law_bench import calibrated
-
-Single = npt.NDArray[np.float32]
 
 PATIENCE_S = 20.0
 START_NS = 1_767_225_600_000_000_000
@@ -109,7 +108,7 @@ class Rig:
         with self._newest:
             assert self._newest.wait_for(met, PATIENCE_S), f"{what} did not happen"
 
-    def put(self, pixels: npt.NDArray[np.uint16], publish_time_ns: int | None = None) -> int:
+    def put(self, pixels: Pixels, publish_time_ns: int | None = None) -> int:
         """Publish a frame, and wait until the mirror has answered the command made from it."""
         time_ns = START_NS + (self._index + 1) * self.config.period_ns
         self._index += 1
@@ -184,7 +183,7 @@ def rig(calibration: Calibration, scene: Bench) -> Iterator[Rig]:
         yield one
 
 
-def errors_of(steps: list[wire.ControlStep]) -> npt.NDArray[np.float64]:
+def errors_of(steps: list[wire.ControlStep]) -> Array:
     return np.array([step.error_nm for step in steps], float)
 
 

@@ -14,16 +14,15 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from typer.testing import CliRunner
 
 from lowfc.adapters.bus.run import Run, open_run
 from lowfc.adapters.files import calibration_file
 from lowfc.adapters.logs.writer import LogWriter
 from lowfc.contract.configuration import Configuration, load
 from lowfc.contract.errors import BusError
-from lowfc.programs.cli.main import app, main
+from lowfc.programs.cli.main import main
 from lowfc.programs.launch import sim_loop
-from tests.support.loops import LOWFC, run
+from tests.support.loops import LOWFC, lowfc, run
 from tools.law_bench import calibrated
 
 SHORT = ["sim-loop", "--duration", "0.1"]
@@ -200,8 +199,8 @@ def test_a_loop_that_is_starting_is_there_for_others(own_runtime: Path, monkeypa
 
     def meanwhile(config: Configuration, run: Run, console: object) -> None:
         with socket.create_server(("127.0.0.1", open_run("other").links.ports["controller"])):
-            done = CliRunner().invoke(app, ["ctl", "open"])
-            listed = json.loads(CliRunner().invoke(app, ["runs", "--json"]).stdout)["runs"]
+            done = lowfc("ctl", "open")
+            listed = json.loads(lowfc("runs", "--json").stdout)["runs"]
             found.extend([str(done.exception), [(one["run"], one["mode"]) for one in listed]])
         with pytest.raises(BusError, match="run 'night' is running already"):
             sim_loop.sim_loop(config, 1.0, record=False, name="night")

@@ -19,6 +19,7 @@ from rich.console import Console
 from typer.testing import CliRunner
 
 from lowfc.adapters.process.terminal import new_app
+from lowfc.arrays import Array
 from lowfc.contract.codecs.calibration_codec import identified
 from lowfc.contract.codecs.codec import decode_frame
 from lowfc.contract.configuration import Configuration
@@ -44,7 +45,6 @@ MODES, ACTUATORS = len(toy.NOLL), toy.GRID[0] * toy.GRID[1]
 QUIET = Console(quiet=True)
 GOOD = np.arange(toy.SHAPE[0] * toy.SHAPE[1]) != 10
 CALIBRATED = identified(replace(toy.calibration(), good=GOOD.astype(np.float32)))
-Double = npt.NDArray[np.float64]
 
 
 def a_night() -> Night:
@@ -75,7 +75,7 @@ TIMES_NS = [from_timestamp(step.timestamp) for step in STEPS_SENT]  # type: igno
 FRAMES = np.array([decode_frame(payload, 0, 0).pixels for payload in of(NIGHT, FRAME)])
 
 
-def sent(topic: Topic, name: str, width: int = MODES) -> Double:
+def sent(topic: Topic, name: str, width: int = MODES) -> Array:
     """A quantity of each step, as float32; NaN where it was not sent."""
     rows = np.full((STEPS, width), np.nan, np.float32)
     for payload in reversed(of(NIGHT, topic)):

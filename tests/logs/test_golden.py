@@ -18,6 +18,7 @@ from lowfc.control.loop.advance import advance
 from lowfc.control.loop.inputs import Load, Request
 from lowfc.control.loop.state import State
 from lowfc.programs.cli.main import app
+from tests.support.loops import lowfc
 
 WIRE = Path(__file__).parents[2] / "lowfc" / "contract" / "wire"
 FOLDER = Path(__file__).parents[1] / "golden" / "0.1"
@@ -28,7 +29,7 @@ LAW_ID = "15560553d408bce3394be8a5123a916a091b94f0a6f0d423cc89d546b4e967f3"
 
 
 def asked(*words: object, status: int = 0) -> dict[str, Any]:
-    done = CliRunner().invoke(app, [*map(str, words), "--json"])
+    done = lowfc(*words, "--json")
     assert done.exit_code == status, (done.output, done.exception)
     found: dict[str, Any] = json.loads(done.stdout)
     return found
@@ -76,7 +77,7 @@ def test_a_killed_recorders_log_is_recovered_and_replays_as_before(tmp_path: Pat
 
 def test_it_is_looked_at(tmp_path: Path) -> None:
     out = tmp_path / "night.rrd"
-    done = CliRunner().invoke(app, ["view", str(NIGHT), "--save", str(out)])
+    done = lowfc("view", NIGHT, "--save", out)
     assert done.exit_code == 0, (done.output, done.exception)
     assert out.stat().st_size > 100_000
 

@@ -6,7 +6,6 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from typer.testing import CliRunner
 
 from lowfc.adapters.logs.recovery import recover
 from lowfc.adapters.logs.series import Limits, LogSeries
@@ -14,8 +13,8 @@ from lowfc.adapters.logs.writer import LogWriter
 from lowfc.adapters.process.clock import HostClock
 from lowfc.contract.configuration import load
 from lowfc.contract.errors import ConfigurationError
-from lowfc.programs.cli.main import app
 from lowfc.programs.core.recording.summary import Summary
+from tests.support.loops import lowfc
 from tests.support.mutated_logs import small_log
 
 
@@ -63,7 +62,7 @@ def test_the_recorder_is_given_the_key(own_runtime: Path, monkeypatch: pytest.Mo
 
     monkeypatch.setattr("lowfc.programs.core.recording.process.record", record)
     (own_runtime / "lowfc.toml").write_text('[recorder]\nfile_mode = "0604"\n')
-    done = CliRunner().invoke(app, ["record", "--config", str(own_runtime / "lowfc.toml")])
+    done = lowfc("record", "--config", own_runtime / "lowfc.toml")
     assert done.exit_code == 0, done.output
     assert given["limits"].file_mode == 0o604
 

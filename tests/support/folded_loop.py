@@ -14,6 +14,7 @@ import numpy.typing as npt
 from lowfc.adapters.bus.bus import Publisher
 from lowfc.adapters.files import factory
 from lowfc.adapters.process.clock import HostClock
+from lowfc.arrays import Array, Single
 from lowfc.client import Frame as Image
 from lowfc.client import MirrorWatch
 from lowfc.contract.codecs.state_codec import controller_state
@@ -116,8 +117,8 @@ class FoldedLoop:
         self._index = 0
         self._lose = lose
         self._listeners: list[tuple[str, deque[Any]]] = []
-        self.surfaces_nm: list[npt.NDArray[np.float32]] = []
-        self.residual_nm: list[npt.NDArray[np.float32]] = []
+        self.surfaces_nm: list[Single] = []
+        self.residual_nm: list[Single] = []
         self.stops = self.lease_id = 0
         self.first = FIRST
 
@@ -244,9 +245,6 @@ class FoldedLoop:
                 self._listeners = [one for one in self._listeners if one is not listener]
 
         return each()
-
-
-Array = npt.NDArray[np.float64]
 
 
 @dataclass(frozen=True)

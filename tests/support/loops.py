@@ -11,7 +11,11 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+from click.testing import Result
 from mcap.reader import make_reader
+from typer.testing import CliRunner
+
+from lowfc.programs.cli.main import app
 
 LOWFC = [sys.executable, "-m", "lowfc"]
 
@@ -23,6 +27,11 @@ def run(folder: Path, *arguments: str, config: str = "", timeout_s: float = 120)
         (folder / "test.toml").write_text(config)
         words += ["--config", "test.toml"]
     return subprocess.run(words, cwd=folder, capture_output=True, text=True, timeout=timeout_s, check=False)
+
+
+def lowfc(*words: object) -> Result:
+    """`lowfc` with these words, in this process; the error that ended it is its `exception`."""
+    return CliRunner().invoke(app, [*map(str, words)])
 
 
 def loop(folder: Path, *arguments: str, config: str = "", timeout_s: float = 120) -> dict[str, Any]:

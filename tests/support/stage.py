@@ -8,6 +8,7 @@ import numpy as np
 import numpy.typing as npt
 
 from lowfc.adapters.bus.bus import Sample
+from lowfc.arrays import Array
 from lowfc.contract.codecs.calibration_codec import encode_calibration, identified
 from lowfc.contract.envelope import sequence_of
 from lowfc.contract.messages import (
@@ -151,7 +152,7 @@ class Tape:
     def __init__(self) -> None:
         self.now_ns: int | None = None
         self.logged: dict[str, list[tuple[int | None, tuple[Any, ...]]]] = defaultdict(list)
-        self.rows: dict[str, list[tuple[npt.NDArray[np.int64], npt.NDArray[np.float64]]]] = defaultdict(list)
+        self.rows: dict[str, list[tuple[npt.NDArray[np.int64], Array]]] = defaultdict(list)
 
     def set_time(self, timeline: str, *, timestamp: np.datetime64) -> None:
         assert timeline == "time"
@@ -175,7 +176,7 @@ class Tape:
         moving = {path for path, found in self.logged.items() if any(at is not None for at, _ in found)}
         return moving | set(self.rows)
 
-    def column(self, path: str) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.float64]]:
+    def column(self, path: str) -> tuple[npt.NDArray[np.int64], Array]:
         """All rows of a path."""
         times, values = zip(*self.rows[path], strict=True)
         return np.concatenate(times), np.concatenate(values)

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
+from lowfc.arrays import Array, Pixels
 from lowfc.control.calibration.calibration import Calibration, normalise_flux, reconstructor
 from lowfc.control.laws.stability import delay_weights
 from lowfc.control.loop.advance import advance
@@ -13,8 +14,6 @@ from lowfc.control.loop.camera import CameraSettings
 from lowfc.control.loop.inputs import Frame, Input, Load, Outputs, Step
 from lowfc.control.loop.safety import Limits, LoopMode
 from lowfc.control.loop.state import Settings, State
-
-Array = npt.NDArray[np.float64]
 
 SHAPE, GRID, NOLL = (6, 7), (4, 5), (2, 3, 4)
 FLUX_DN, DARK_DN, SATURATION_DN = 200_000.0, 100.0, 60_000.0
@@ -37,7 +36,7 @@ class Toy:
     response: Array
     modes_to_actuators: Array
 
-    def pixels(self, modes_nm: npt.ArrayLike, flux_dn: float = FLUX_DN) -> npt.NDArray[np.uint16]:
+    def pixels(self, modes_nm: npt.ArrayLike, flux_dn: float = FLUX_DN) -> Pixels:
         """Frame (rows, columns) of a wavefront, exactly linear up to the rounding to DN."""
         image = self.reference + self.response @ np.asarray(modes_nm, float)
         return np.rint(DARK_DN + flux_dn * image.reshape(SHAPE) / self.reference.sum()).astype(np.uint16)
