@@ -75,8 +75,6 @@ KEYS = {"camera": FRAME.key, "controller": COMMAND.at("dm"), "mirror-dm": "lowfc
 
 
 class Toy:
-    """One such process."""
-
     def __init__(self) -> None:
         self.process = subprocess.Popen(
             [sys.executable, "-c", TOY], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True

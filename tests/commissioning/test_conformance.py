@@ -338,8 +338,6 @@ def test_a_cameras_mistake_is_found(mistake: str) -> None:
 
 
 def shaped(function: Callable[[Single], Single]) -> Callable[[wire.MirrorState], wire.MirrorState]:
-    """A state with another shape."""
-
     def change(state: wire.MirrorState) -> wire.MirrorState:
         shape = np.frombuffer(state.actuators, np.float32).reshape(state.rows, state.columns)
         state.actuators = np.ascontiguousarray(function(shape), np.float32).tobytes()

@@ -152,7 +152,6 @@ def fractions_of(frames: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def known(seed: int = 1) -> Initial:
-    """The reconstructor of the computed H."""
     return Initial(reconstructor(*truth(seed), GOOD, FLUX_E, 0.0), "weighted")
 
 

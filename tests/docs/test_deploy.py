@@ -272,8 +272,6 @@ main()
 
 
 class Supervised:
-    """One of the units' processes."""
-
     def __init__(self, name: str, folder: Path, run: str) -> None:
         self.name = name
         self.manager = Manager(folder / f"{name}.notify", WAIT_S)

@@ -48,7 +48,6 @@ class Night:
     logs: list[Path] = field(default_factory=list)
 
     def ctl(self, command: str) -> str:
-        """A command line, in this process: what it says."""
         words = [str(self.folder / word) if (self.folder / word).is_file() else word for word in shlex.split(command)]
         done = CliRunner().invoke(ctl_app, [*words[2:], "--run", self.name], catch_exceptions=False)
         assert done.exit_code == 0, done.output

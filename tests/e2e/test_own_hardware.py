@@ -67,7 +67,6 @@ def bench(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 
 def started(folder: Path, command: str) -> "subprocess.Popen[str]":
-    """A documented command, as it stands."""
     program, *rest = shlex.split(command)
     return subprocess.Popen(
         [Path(sys.executable).parent / program, *rest],
@@ -184,7 +183,6 @@ def block(language: str) -> str:
 
 
 def closed(folder: Path) -> bool:
-    """Whether the loop could be closed."""
     process = started(folder, "lowfc ctl close --run bench")
     process.communicate(timeout=20)
     return process.returncode == 0

@@ -78,7 +78,6 @@ def forged(log: Path, path: Path) -> None:
 
 
 def replayed(folder: Path, *logs: Path | str, status: int = 0) -> dict[str, Any]:
-    """Figures of `lowfc replay`."""
     done = run(folder, "replay", "--json", *map(str, logs))
     assert done.returncode == status, done.stdout + done.stderr
     figures: dict[str, Any] = json.loads(done.stdout)

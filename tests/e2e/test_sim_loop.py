@@ -24,7 +24,6 @@ FRAMES = 1500
 
 @pytest.fixture(scope="module")
 def live(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
-    """One run in real time, on which several tests look."""
     folder = tmp_path_factory.mktemp("live")
     return loop(folder, "--duration", "3", "--rate", "500", "--star-magnitude", "0", "--seed", "3")
 

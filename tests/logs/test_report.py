@@ -181,7 +181,6 @@ def test_the_verdict_names_what_was_wrong(eventful: dict[str, Any]) -> None:
 
 
 def quiet(night: Night, number: int = 700) -> Night:
-    """A run in which nothing went wrong."""
     night.frames(number)
     night.health("camera", state="stopped")
     return night
@@ -189,7 +188,6 @@ def quiet(night: Night, number: int = 700) -> Night:
 
 @pytest.fixture(scope="module")
 def good(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A log of a run in which nothing went wrong."""
     return quiet(Night(), 1500).write(tmp_path_factory.mktemp("good") / "x.mcap")
 
 

@@ -1,4 +1,4 @@
-"""Latencies: figures of made-up frames, a real loop with its log, and two results compared."""
+"""Latencies of made-up frames and of a real loop with its log, two results compared, and what recording costs."""
 
 import json
 import os
@@ -19,6 +19,8 @@ from lowfc.adapters.process.clock import HostClock
 from lowfc.contract.configuration import load
 from lowfc.contract.errors import DataFileError
 from lowfc.contract.messages import RawImage, image
+from lowfc.programs.measure.bench import record as bench_module
+from lowfc.programs.measure.bench.record import bench_record, render
 from lowfc.programs.measure.control_step import ControlStep, time_alone
 from lowfc.programs.measure.frame_source import Payloads, prepared_frames
 from lowfc.programs.measure.latency.command import Camera, _configuration, latency
@@ -370,3 +372,44 @@ def test_an_end_before_the_end_leaves_nothing(victim: str, number: int, status: 
         _, error = process.communicate(timeout=30)
     assert (process.returncode, error.strip().splitlines()[-1].removeprefix("error: ")[: len(said)]) == (status, said)
     assert runs() == before
+
+
+RATES_HZ = (100, 200)
+
+
+@pytest.fixture(scope="module")
+def figures(tmp_path_factory: pytest.TempPathFactory) -> dict[str, object]:
+    folder = tmp_path_factory.mktemp("disk")
+    app = typer.Typer()
+    app.command()(bench_record)
+    rates = [word for rate in RATES_HZ for word in ("--rate", str(rate))]
+    done = CliRunner().invoke(app, ["--seconds", "0.5", *rates, "--folder", str(folder), "--json"])
+    assert done.exit_code == 0, done.output
+    assert list(folder.iterdir()) == []
+    return json.loads(done.stdout)
+
+
+@pytest.mark.exclusive
+def test_everything_that_was_sent_is_in_the_account(figures: dict[str, object]) -> None:
+    assert [rate["rate_hz"] for rate in figures["rates"]] == list(RATES_HZ)
+    for rate in figures["rates"]:
+        frames = rate["rate_hz"] * (bench_module._WARM_UP_S + 0.5)
+        assert rate["messages_lost"] == 0
+        assert rate["messages_published"] >= 5 * frames
+        assert rate["messages_recorded"] >= 5 * frames
+        assert rate["log_bytes"] > 0.5 * frames * figures["payload_bytes_per_frame"]
+        assert rate["cpu_share"] > 0
+        assert rate["ratio"] == pytest.approx(
+            rate["cpu_share"] / (figures["copy_us_per_frame"] * rate["offered_hz"] / 1e6)
+        )
+        assert rate["longest_unflushed_ms"] >= rate["longest_wait_ms"] > 0
+        assert rate["longest_write_ms"] > 0
+    assert figures["payload_bytes_per_frame"] > 80 * 80 * 2 + 2 * 34 * 34 * 4
+
+
+@pytest.mark.exclusive
+def test_a_person_reads_one_line_for_each_rate(figures: dict[str, object]) -> None:
+    title, *lines, note = render(figures).splitlines()
+    assert "processor" in title
+    assert "kill -9" in note
+    assert [line.split()[1] for line in lines] == ["Hz"] * len(RATES_HZ)

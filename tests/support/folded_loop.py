@@ -40,14 +40,11 @@ FIRST = 1 << 32
 
 @lru_cache(maxsize=4)
 def computed(toml: str) -> Calibration:
-    """The computed calibration of a configuration."""
     config = Configuration.model_validate(tomllib.loads(toml))
     return calibrated(config)
 
 
 class Given(NamedTuple):
-    """An answer."""
-
     frame_sequence: int
     state: wire.ControllerState | None
     text: str
@@ -129,7 +126,6 @@ class FoldedLoop:
         self._states: Publisher = self.mirror_bus.publisher(MIRROR_STATE, "dm")
 
     def expose(self) -> None:
-        """One frame."""
         self._shapes = [self._status.surface_nm, *self._shapes[:-1]]
         seen = np.tensordot(self._weights, np.array(self._shapes), 1)
         whole, truth = self._scene.expose(self._index, seen)

@@ -87,7 +87,6 @@ def interrupt(process: "subprocess.Popen[str]", timeout_s: float = 20) -> tuple[
 
 
 def until(condition: Callable[[], object], timeout_s: float = 30.0) -> None:
-    """Wait for something to be true."""
     deadline_s = time.monotonic() + timeout_s
     while not condition():
         assert time.monotonic() < deadline_s, "waited in vain"

@@ -111,7 +111,6 @@ class Night:
                 self._take(advance(self.settings, self._state, taken), DELAY_NS + 1000 * (self._count % 50))
 
     def request(self, name: str, values: tuple[float, ...] = (), modes: tuple[int, ...] = (), **fields: Any) -> None:
-        """What an operator asks."""
         asked = Request(self.now_ns, name, modes, values, **fields)
         before = self._state
         after, outputs = advance(self.settings, before, asked)

@@ -177,20 +177,16 @@ class Tape:
         return moving | set(self.rows)
 
     def column(self, path: str) -> tuple[npt.NDArray[np.int64], Array]:
-        """All rows of a path."""
         times, values = zip(*self.rows[path], strict=True)
         return np.concatenate(times), np.concatenate(values)
 
     def names(self, path: str) -> list[str]:
-        """Names of the curves at a path, as they were given last."""
         return values_of(self.last(path).names)
 
     def texts(self, path: str) -> list[str]:
-        """Lines of a log at a path."""
         return [values_of(line.text)[0] for _, (line,) in list(self.logged[path])]
 
     def last(self, path: str) -> Any:
-        """What was logged last at a path."""
         return self.logged[path][-1][1][0]
 
 

@@ -142,12 +142,10 @@ class Processes:
         self._live()
 
     def command(self, data: bytes) -> None:
-        """Commands of anybody."""
         self.commands.put(data)
         self._live()
 
     def settings(self, data: bytes) -> None:
-        """Settings of a camera."""
         self.settings_of.put(data)
         self._live()
 

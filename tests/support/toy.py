@@ -99,7 +99,6 @@ def settings(**changes: object) -> Settings:
 
 
 def loaded(what: Settings) -> State:
-    """State with the toy's calibration loaded."""
     return advance(what, State(), Load(0, calibration(), "test"))[0]
 
 
@@ -124,7 +123,6 @@ def feed(what: Settings, state: State, *inputs: Input) -> tuple[State, list[Outp
 
 
 def names(every: list[Outputs]) -> list[str]:
-    """Of the events."""
     return [event.name for outputs in every for event in outputs.events]
 
 

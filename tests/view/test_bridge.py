@@ -93,7 +93,6 @@ class Scene:
         until(lambda: self.tapes)
 
     def publish(self) -> None:
-        """Send the run's messages."""
         for sample in self.night.samples:
             self.publishers[sample.key].put(sample.payload)
 

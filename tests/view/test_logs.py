@@ -146,7 +146,6 @@ def test_every_view_of_the_layout_has_something_and_the_plots_show_all_of_a_log(
 
 
 def views(part: rrb.Container | rrb.View) -> list[rrb.View]:
-    """Every view of a part of a layout."""
     return [part] if isinstance(part, rrb.View) else [view for one in part.contents for view in views(one)]
 
 
