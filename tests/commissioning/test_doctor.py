@@ -11,8 +11,6 @@ from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
-import typer
-from typer.testing import CliRunner
 
 from lowfc.adapters.bus.run import runtime_base
 from lowfc.adapters.logs.selection import EVERYTHING
@@ -26,6 +24,7 @@ from lowfc.programs.commissioning.checks import Check, note, ok
 from lowfc.programs.commissioning.doctor import command, room, timing
 from lowfc.programs.commissioning.doctor.facts import Facts, gather, ranges
 from lowfc.programs.core.recording.volume import bytes_per_s
+from tests.support.loops import lowfc
 
 DOCUMENT = Path(__file__).parents[2] / "docs" / "doctor.md"
 LOOKS = {**timing.CHECKS.looks, **room.CHECKS.looks}
@@ -115,16 +114,9 @@ def examine(facts: Facts) -> dict[str, Check]:
 
 
 @pytest.fixture
-def alone(monkeypatch: pytest.MonkeyPatch) -> CliRunner:
-    """The command alone, measuring for a moment."""
+def briefly(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The command measures for a moment."""
     monkeypatch.setattr(command, "TRIAL_S", 0.02)
-    return CliRunner()
-
-
-def app() -> typer.Typer:
-    found = typer.Typer()
-    found.command()(command.doctor)
-    return found
 
 
 def test_a_fit_host_has_no_warning(tmp_path: Path) -> None:
@@ -367,8 +359,8 @@ def test_processors_are_written_as_the_kernel_writes_them() -> None:
     assert ranges({3, 0, 1, 8}) == "0-1,3,8"
 
 
-def test_this_host_is_looked_at(alone: CliRunner) -> None:
-    done = alone.invoke(app(), ["--json"])
+def test_this_host_is_looked_at(briefly: None) -> None:
+    done = lowfc("doctor", "--json")
     assert done.exit_code == 0, done.output
     (line,) = done.stdout.splitlines()
     found = json.loads(line)
@@ -381,20 +373,20 @@ def test_this_host_is_looked_at(alone: CliRunner) -> None:
     assert "sleeping 1000 times a second" in done.stderr
 
 
-def test_strict_is_about_warnings(alone: CliRunner, tmp_path: Path) -> None:
+def test_strict_is_about_warnings(briefly: None, tmp_path: Path) -> None:
     config = tmp_path / "lowfc.toml"
     config.write_text("[realtime]\ncamera_cpus = [8000]\n")
-    done = alone.invoke(app(), ["--config", str(config)])
+    done = lowfc("doctor", "--config", config)
     assert done.exit_code == 0, done.output
     row = next(line for line in done.stdout.splitlines() if " processors " in line)
     assert row.startswith("warning")
     assert re.search(r"\d+ warnings, \d+ notes, \d+ ok", done.stdout)
-    assert alone.invoke(app(), ["--config", str(config), "--strict"]).exit_code == 1
+    assert lowfc("doctor", "--config", config, "--strict").exit_code == 1
 
 
-def test_strict_is_content_with_notes(alone: CliRunner, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_strict_is_content_with_notes(briefly: None, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(command, "examine", lambda _: [ok("fine"), note("odd")])
-    assert alone.invoke(app(), ["--strict"]).exit_code == 0
+    assert lowfc("doctor", "--strict").exit_code == 0
 
 
 def test_the_document_has_every_check_in_its_own_words() -> None:

@@ -11,8 +11,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-import typer
-from typer.testing import CliRunner
 
 from lowfc.adapters.bus.run import runtime_base
 from lowfc.adapters.process.clock import HostClock
@@ -20,10 +18,10 @@ from lowfc.contract.configuration import load
 from lowfc.contract.errors import DataFileError
 from lowfc.contract.messages import RawImage, image
 from lowfc.programs.measure.bench import record as bench_module
-from lowfc.programs.measure.bench.record import bench_record, render
+from lowfc.programs.measure.bench.record import render
 from lowfc.programs.measure.control_step import ControlStep, time_alone
 from lowfc.programs.measure.frame_source import Payloads, prepared_frames
-from lowfc.programs.measure.latency.command import Camera, _configuration, latency
+from lowfc.programs.measure.latency.command import Camera, _configuration
 from lowfc.programs.measure.latency.figures import (
     LOOP_SPANS,
     SPANS,
@@ -38,7 +36,7 @@ from lowfc.programs.measure.latency.figures import (
 )
 from lowfc.programs.measure.latency.summary import compare, ratio, together
 from lowfc.programs.measure.latency.text import compared, sparkline, table
-from tests.support.loops import until
+from tests.support.loops import lowfc, until
 from tools.law_bench import calibrated
 
 START = 1_700_000_000 << 32
@@ -245,12 +243,6 @@ def test_plain_scheduling_leaves_nothing_of_the_set_up() -> None:
     )
 
 
-def invoke(*words: str | Path) -> Any:
-    app = typer.Typer()
-    app.command()(latency)
-    return CliRunner().invoke(app, [str(word) for word in words])
-
-
 def runs() -> set[Path]:
     """Directories of runs that are there: those of other tests, and what a run has left behind."""
     return {path for path in runtime_base().iterdir() if path.is_dir()}
@@ -262,7 +254,7 @@ def measured(tmp_path_factory: pytest.TempPathFactory) -> tuple[dict[str, Any], 
     (folder / "loop.toml").write_text(f'[recorder]\nfolder = "{folder}"\nmin_free_mb = 0\n')
     words = ("--duration", str(SECONDS), "--rate", str(RATE_HZ), "--record", "--config", folder / "loop.toml")
     before = runs()
-    done = invoke(*words, "--plot", folder / "latency.png", "--json")
+    done = lowfc("latency", *words, "--plot", folder / "latency.png", "--json")
     assert done.exit_code == 0, (done.output, done.exception)
     assert runs() == before
     (folder / "a.json").write_text(done.stdout)
@@ -296,7 +288,7 @@ def test_every_frame_of_a_real_loop_is_in_the_account(measured: tuple[dict[str, 
 def test_the_log_of_the_run_says_the_same(measured: tuple[dict[str, Any], Path]) -> None:
     live, folder = measured
     assert live["messages_lost"] == 0
-    done = invoke(live["logs"][0], "--json")
+    done = lowfc("latency", live["logs"][0], "--json")
     assert done.exit_code == 0, done.output
     logged = json.loads(done.stdout)
     assert (logged["frames"], logged["warm_up_frames"]) == (live["frames"], live["warm_up_frames"])
@@ -306,10 +298,10 @@ def test_the_log_of_the_run_says_the_same(measured: tuple[dict[str, Any], Path])
         assert logged["latency_us"][span] == live["latency_us"][span]
     assert "due_to_command" not in logged["latency_us"]
     assert logged["host"]["processor"] == live["host"]["processor"]
-    done = invoke("--compare", folder / "a.json", folder / "a.json", "--json")
+    done = lowfc("latency", "--compare", folder / "a.json", folder / "a.json", "--json")
     assert {row["better"] for row in json.loads(done.stdout)["rows"]} == {"same"}
     (folder / "log.json").write_text(json.dumps(logged))
-    done = invoke("--compare", folder / "a.json", folder / "log.json")
+    done = lowfc("latency", "--compare", folder / "a.json", folder / "log.json")
     assert done.exit_code == 0, done.output
     assert "frame to mirror" in done.stdout
 
@@ -331,11 +323,11 @@ def test_what_is_no_result_and_no_log_is_said(tmp_path: Path) -> None:
     other = tmp_path / "other.json"
     for content, expected in (("{", "no JSON"), ("[]", "no latency_us"), ('{"latency_us": {}}', "ratio")):
         other.write_text(content)
-        fault = invoke("--compare", other, other).exception
+        fault = lowfc("latency", "--compare", other, other).exception
         assert isinstance(fault, DataFileError)
         assert expected in str(fault)
-    assert isinstance(invoke(tmp_path / "none.mcap").exception, DataFileError)
-    assert "schedule" in str(invoke("--camera", "simulated", "--free-running").exception)
+    assert isinstance(lowfc("latency", tmp_path / "none.mcap").exception, DataFileError)
+    assert "schedule" in str(lowfc("latency", "--camera", "simulated", "--free-running").exception)
 
 
 STARTED = (
@@ -380,10 +372,8 @@ RATES_HZ = (100, 200)
 @pytest.fixture(scope="module")
 def figures(tmp_path_factory: pytest.TempPathFactory) -> dict[str, object]:
     folder = tmp_path_factory.mktemp("disk")
-    app = typer.Typer()
-    app.command()(bench_record)
     rates = [word for rate in RATES_HZ for word in ("--rate", str(rate))]
-    done = CliRunner().invoke(app, ["--seconds", "0.5", *rates, "--folder", str(folder), "--json"])
+    done = lowfc("bench", "record", "--seconds", "0.5", *rates, "--folder", folder, "--json")
     assert done.exit_code == 0, done.output
     assert list(folder.iterdir()) == []
     return json.loads(done.stdout)
