@@ -5,7 +5,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from typer.testing import CliRunner
 
 from lowfc.adapters.files import factory
 from lowfc.adapters.files.drawing import figure_class, png
@@ -25,11 +24,11 @@ from lowfc.programs.commissioning.acceptance import capture as acceptance_captur
 from lowfc.programs.commissioning.acceptance import linearity as acceptance_linearity
 from lowfc.programs.commissioning.acceptance import noise as acceptance_noise
 from lowfc.programs.commissioning.acceptance import rejection as acceptance_rejection
-from lowfc.programs.commissioning.acceptance.command import acceptance_app
 from lowfc.programs.commissioning.acceptance.judged import AcceptanceResult
 from lowfc.programs.commissioning.acceptance.played import AcceptanceError, Loop, Played, _announced, chosen
 from sim_camera.bench import Bench
 from sim_camera.process import bench
+from tests.support.loops import lowfc
 from tools.law_bench import calibrated
 
 REQUIRED = Acceptance(lowest_hz=2.0)
@@ -260,6 +259,6 @@ def test_modes_are_chosen_by_their_noll_indices() -> None:
 
 @pytest.mark.parametrize("test", ["rejection", "linearity", "capture-range"])
 def test_modes_that_are_none_are_refused_and_are_not_all(test: str) -> None:
-    done = CliRunner().invoke(acceptance_app, [test, "--modes", "11-4"])
+    done = lowfc("acceptance", test, "--modes", "11-4")
     assert isinstance(done.exception, ConfigurationError)
     assert str(done.exception) == "--modes takes Noll indices, as in 2,3 or 4-11; got '11-4'"
