@@ -23,7 +23,7 @@ from lowfc.adapters.process.provenance import provenance
 from lowfc.adapters.process.service import Service
 from lowfc.contract.envelope import count_of
 from lowfc.contract.messages import FRAME, STEP
-from tests.support.loops import lowfc, until
+from tests.support.loops import lowfc, start, until
 from tests.support.other_readers import foxglove, rerun
 from tests.support.recording import PATIENCE_S, bodies_of
 
@@ -183,19 +183,12 @@ def test_however_it_is_told_to_stop_the_log_is_finished(benches: list[Bench], tm
         assert reader.metadata["recording"]["messages_lost"] == "0"
 
 
-def popen(*arguments: object) -> "subprocess.Popen[str]":
-    return subprocess.Popen(
-        [sys.executable, "-m", "lowfc", *map(str, arguments)],
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
-    )
-
-
 @pytest.mark.exclusive
 def test_the_command_rotates_and_says_what_it_did(tmp_path: Path) -> None:
     bench = Bench(tmp_path)
-    process = popen("record", "--run", bench.run.run_id, "--folder", tmp_path / "logs", "--longest-s", 1, "--json")
+    process = start(
+        tmp_path, "record", "--run", bench.run.run_id, "--folder", tmp_path / "logs", "--longest-s", 1, "--json"
+    )
     until(lambda: bench.recorder_is("ready"))
 
     def put_until_rotated() -> bool:
@@ -229,7 +222,7 @@ def test_the_command_rotates_and_says_what_it_did(tmp_path: Path) -> None:
 @pytest.mark.exclusive
 def test_a_recording_is_ended_where_the_controller_has_died(tmp_path: Path, own_runtime: Path) -> None:
     bench = Bench(tmp_path)
-    process = popen("record", "--run", bench.run.run_id, "--folder", tmp_path / "logs")
+    process = start(tmp_path, "record", "--run", bench.run.run_id, "--folder", tmp_path / "logs")
     until(lambda: bench.recorder_is("ready"))
     for _ in range(20):
         bench.put()
@@ -258,7 +251,8 @@ def test_a_recording_is_ended_where_the_controller_has_died(tmp_path: Path, own_
 def test_what_cannot_be_recorded_is_refused_before_anything_is_made(
     options: tuple[object, ...], complaint: str, tmp_path: Path
 ) -> None:
-    process = popen("record", "--run", new_run_id(), *(str(option).format(tmp_path) for option in options))
+    said = (str(option).format(tmp_path) for option in options)
+    process = start(tmp_path, "record", "--run", new_run_id(), *said)
     out, wrong = process.communicate(timeout=PATIENCE_S)
     assert (process.returncode, out) == (2, "")
     *_, line = wrong.strip().splitlines()

@@ -68,10 +68,10 @@ def children(launcher: int) -> dict[str, int]:
     return found
 
 
-def start(folder: Path, *arguments: str) -> "subprocess.Popen[str]":
+def start(folder: Path, *arguments: object) -> "subprocess.Popen[str]":
     """A `lowfc` that goes on while the test does something."""
     return subprocess.Popen(
-        [*LOWFC, *arguments],
+        [*LOWFC, *map(str, arguments)],
         cwd=folder,
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
