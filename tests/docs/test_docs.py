@@ -5,7 +5,6 @@ import re
 import shlex
 import subprocess
 import sys
-import time
 from pathlib import Path
 
 import pytest
@@ -13,7 +12,7 @@ import pytest
 from tests.e2e.test_bench_day import COMMANDS as BENCH_DAY
 from tests.e2e.test_operator import COMMANDS as OPERATING
 from tests.e2e.test_own_hardware import COMMISSIONING, DOCUMENTED
-from tests.support.loops import children, interrupt, recorded_bytes, start, until
+from tests.support.loops import interrupt, recorded_bytes, start, until
 from tests.support.viewers import on_screen
 
 ROOT = Path(__file__).parents[2]
@@ -136,11 +135,13 @@ def test_the_loops(tmp_path: Path, command: str) -> None:
 
 @pytest.mark.exclusive
 @pytest.mark.slow
-def test_the_requests(tmp_path: Path) -> None:
+def test_the_requests(tmp_path: Path, own_runtime: Path) -> None:
     loop = start(tmp_path, "sim-loop", "--rate", "100", "--no-record")
     try:
-        until(lambda: "controller" in children(loop.pid))
-        time.sleep(3)
+        status = [sys.executable, "-m", "lowfc", "ctl", "status"]
+        until(
+            lambda: "closed · residual " in subprocess.run(status, capture_output=True, text=True, check=False).stdout
+        )
         said = [run(tmp_path, command) for command in REQUESTS]
     finally:
         out, complaints = interrupt(loop)
