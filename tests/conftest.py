@@ -24,6 +24,13 @@ def _private_cache(pytestconfig: pytest.Config) -> None:
     os.environ["XDG_CACHE_HOME"] = str(pytestconfig.cache.mkdir("home"))
 
 
+@pytest.fixture
+def own_runtime(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """Give a test a runtime directory of its own, in which there is no run yet."""
+    monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
+    return tmp_path
+
+
 def pytest_runtest_logreport(report: pytest.TestReport) -> None:
     if NO_SKIPS and report.skipped and not hasattr(report, "wasxfail"):
         report.outcome = "failed"

@@ -157,7 +157,6 @@ os.kill(os.getpid(), 9)
 
 
 def chunks_of(path: Path) -> list[tuple[int, int]]:
-    """Where the chunks of a log begin and end."""
     starts = boundaries(data := path.read_bytes())
     return [(a, b) for a, b in pairwise(starts) if data[a] == Opcode.CHUNK]
 

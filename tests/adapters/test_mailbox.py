@@ -1,14 +1,24 @@
-import threading
+"""Messages that wait, are handed over where they arrive, or never came: each is handled, skipped or missing."""
 
+import threading
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
 from lowfc.adapters.bus.bus import Sample
+from lowfc.adapters.bus.dispatch import LONG_AGO_NS, Handover
 from lowfc.adapters.bus.mailbox import Mailbox
-from lowfc.contract.envelope import sequence_of
-
-pytestmark = pytest.mark.exclusive
+from lowfc.adapters.bus.run import open_run
+from lowfc.adapters.bus.zenoh_bus import ZenohBus
+from lowfc.adapters.logs.sequence_gaps import REMEMBERED, Gaps
+from lowfc.adapters.process.clock import HostClock
+from lowfc.contract.envelope import count_of, sequence_of
+from lowfc.contract.messages import FRAME
 
 PATIENCE_S = 30.0
 
@@ -113,3 +123,172 @@ def test_two_threads_lose_nothing_between_them() -> None:
     taken += box.take(0.0) is not None
     assert taken + box.skipped == box.received == 20_000
     assert box.missing == 0
+
+
+PERIOD_NS = 1_000_000
+
+
+class Bench:
+    """A handover whose handler takes a given time, and messages that come as soon as they are due."""
+
+    def __init__(self, period_ns: int | None = PERIOD_NS, *, told: bool = False) -> None:
+        self.now_ns, self.work_ns = 10**9, 100_000
+        self.handled: list[int] = []
+        self.superseded: list[int] = []
+        superseded = self._hear(self.superseded) if told else None
+        self.handover = Handover(FRAME.key, self._hear(self.handled), lambda: self.now_ns, period_ns, superseded)
+
+    def _hear(self, where: list[int]) -> Callable[[Sample], None]:
+        def hear(sample: Sample) -> None:
+            where.append(count_of(sample.sequence))
+            self.now_ns += self.work_ns
+
+        return hear
+
+    def come(self, count: int, put_ns: int) -> None:
+        self.now_ns = max(self.now_ns + 10_000, put_ns)  # it takes the bus a moment to hand over the next one
+        self.handover.put(Sample(FRAME.key, b"", sequence_of(7, count), put_ns, self.now_ns))
+
+
+def test_of_what_waited_only_the_newest_is_as_good_as_ever() -> None:
+    """The reader stood still for ten periods, while ten messages came."""
+    bench = Bench(told=True)
+    bench.work_ns = 20_000
+    begun_ns = bench.now_ns + 10**8
+    bench.come(0, begun_ns)
+    bench.now_ns = begun_ns + 10 * PERIOD_NS + 1000
+    for count in range(1, 11):
+        bench.come(count, begun_ns + count * PERIOD_NS)
+    assert (bench.handled, bench.superseded) == ([0, 10], list(range(1, 10)))
+    assert (bench.handover.received, bench.handover.skipped, bench.handover.missing) == (11, 0, 0)
+
+
+def test_who_does_not_want_what_was_superseded_skips_it() -> None:
+    bench = Bench()
+    begun_ns = bench.now_ns + 10**8
+    bench.now_ns = begun_ns + 9 * PERIOD_NS + PERIOD_NS // 2
+    for count in range(10):
+        bench.come(count, begun_ns + count * PERIOD_NS)
+    assert len(bench.handled) + bench.handover.skipped == 10
+    assert bench.handled == [9]
+
+
+def test_an_old_message_alone_was_superseded_too() -> None:
+    bench = Bench()
+    bench.come(0, bench.now_ns + 10**8)
+    bench.now_ns += 10**9
+    bench.come(1, bench.now_ns - LONG_AGO_NS)
+    bench.now_ns += 10**9
+    bench.come(2, bench.now_ns - PERIOD_NS)  # late by a period, and nothing suggests that there is a newer one
+    assert bench.handled == [0, 2]
+
+
+def test_where_each_waits_for_the_last_nothing_is_superseded() -> None:
+    bench = Bench(None)
+    for count in range(50):
+        bench.come(count, 0)
+    assert bench.handled == list(range(50))
+    assert bench.handover.skipped == 0
+
+
+def test_a_slow_handler_is_never_far_behind() -> None:
+    bench = Bench(told=True)
+    bench.work_ns = 3 * PERIOD_NS
+    begun_ns, behind = bench.now_ns + 10**8, []
+    for count in range(500):
+        put_ns = begun_ns + count * PERIOD_NS
+        before = len(bench.handled)
+        bench.come(count, put_ns)
+        if len(bench.handled) > before:
+            behind.append((bench.now_ns - bench.work_ns - put_ns) / PERIOD_NS)
+    assert max(behind) < 5
+    assert len(bench.handled) > 5
+    assert len(bench.handled) + len(bench.superseded) + bench.handover.skipped == bench.handover.received == 500
+
+
+@pytest.mark.exclusive
+def test_frames_faster_than_their_handler_are_skipped_on_the_real_bus(tmp_path: Path) -> None:
+    links = open_run("handover", base=tmp_path).links
+    camera, controller = (ZenohBus(links, role, HostClock(tmp_path)) for role in ("camera", "controller"))
+    number = 300
+    handover = Handover(FRAME.key, lambda _: time.sleep(2e-3), controller.clock.host_ns, 500_000)
+    controller.subscribe(FRAME, handover.put)
+    publisher = camera.publisher(FRAME)
+    until_s = time.monotonic() + PATIENCE_S
+    while not handover.received:
+        assert time.monotonic() < until_s
+        publisher.put(b"")
+        time.sleep(0.01)
+    for _ in range(number):
+        publisher.put(bytes(1000))
+        time.sleep(5e-4)
+    while handover.last_sequence + 1 != sequence_of(camera.start_s, publisher.published):
+        assert time.monotonic() < until_s
+        time.sleep(0.01)
+    assert handover.received + handover.missing >= number
+    assert 0 < handover.skipped < handover.received
+    for bus in (camera, controller):
+        bus.close()
+
+
+def test_two_threads_that_receive_take_turns() -> None:
+    """Each link of the bus has a thread of its own, and so has the direct way beside it."""
+    inside, together, entered = 0, 0, threading.Barrier(2)
+
+    def handle(_: Sample) -> None:
+        nonlocal inside, together
+        inside += 1
+        time.sleep(0)  # gives the other thread every chance
+        together = max(together, inside)
+        inside -= 1
+
+    handover = Handover(FRAME.key, handle, time.monotonic_ns)
+
+    def receive(start_s: int) -> None:
+        entered.wait(PATIENCE_S)
+        for count in range(5000):
+            handover.put(Sample(FRAME.key, b"", sequence_of(start_s, count), 0, 0))
+
+    threads = [threading.Thread(target=receive, args=(start_s,)) for start_s in (1, 2)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join(PATIENCE_S)
+    assert (handover.received, together) == (10_000, 1)
+
+
+def test_a_gap_is_closed_by_a_late_message_and_by_no_repeated_one() -> None:
+    gaps = Gaps(5)
+    told = [(count, gaps.came(count), gaps.missing) for count in (5, 8, 8, 6, 6, 9, 7, 4)]
+    assert told == [
+        (5, True, 0),
+        (8, True, 2),
+        (8, False, 2),
+        (6, True, 1),
+        (6, False, 1),
+        (9, True, 1),
+        (7, True, 0),
+        (4, False, 0),
+    ]
+    assert (gaps.first, gaps.next) == (5, 10)
+
+
+def test_whatever_the_order_only_what_never_came_is_missing() -> None:
+    rng = np.random.default_rng(5)
+    there = [0, *rng.permutation(rng.choice(np.arange(1, 1000), 800, replace=False)).tolist()]
+    gaps, seen = Gaps(0), set()
+    for count in [*there, *there[:50]]:
+        assert gaps.came(count) == (count not in seen)
+        seen.add(count)
+        assert gaps.missing == max(seen) + 1 - len(seen)
+
+
+def test_a_gap_of_any_size_takes_no_room() -> None:
+    gaps = Gaps(0)
+    far = 1 << 31
+    for count in (0, far, far + 3 * REMEMBERED, far + 6 * REMEMBERED):
+        gaps.came(count)
+    assert gaps.missing == far + 6 * REMEMBERED - 3
+    assert len(gaps._open) <= 2 * REMEMBERED
+    assert gaps.came(far + 6 * REMEMBERED - 1)
+    assert not gaps.came(7), "too long ago to be known"

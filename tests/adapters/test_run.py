@@ -1,3 +1,6 @@
+"""A run's directory: links, secret, starts, the latch of safe mode, and files that are replaced as a whole."""
+
+import errno
 import os
 import socket
 import subprocess
@@ -5,22 +8,19 @@ import sys
 from pathlib import Path
 
 import pytest
-from typer.testing import CliRunner
 
 from lowfc.adapters.bus.bus import ALL, Query
 from lowfc.adapters.bus.run import Run, free_ports, mirror_role, new_run_id, open_run, own_directory, runtime_base
 from lowfc.adapters.bus.zenoh_bus import ZenohBus
+from lowfc.adapters.files.whole_file import write_whole
+from lowfc.adapters.process import latch as latch_module
 from lowfc.adapters.process.clock import HostClock
+from lowfc.adapters.process.latch import Latch, latch_files
 from lowfc.contract.errors import BusError, DataFileError
-from lowfc.contract.messages import REQUEST_KEY, wire
-from lowfc.programs.cli.main import app
+from lowfc.contract.messages import REQUEST_KEY, Role, wire
+from tests.support.loops import lowfc, until
 
-pytestmark = pytest.mark.exclusive
-
-
-@pytest.fixture(autouse=True)
-def runtime(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
+pytestmark = pytest.mark.usefixtures("own_runtime")
 
 
 def test_a_run_has_ports_a_secret_and_closed_doors() -> None:
@@ -172,8 +172,143 @@ def test_safe_is_asked_for_where_the_directory_cannot_be_written() -> None:
     try:
         with pytest.raises(OSError, match="Read-only"):
             (run.path / "start-operator").write_text("")
-        done = CliRunner().invoke(app, ["ctl", "safe", "--run", "night"])
+        done = lowfc("ctl", "safe", "--run", "night")
     finally:
         subprocess.run(["umount", "--lazy", run.path], check=True)
         bus.close()
     assert (done.exit_code, asked) == (0, ["safe"]), done.output
+
+
+@pytest.fixture
+def files(tmp_path: Path) -> tuple[Path, Path]:
+    (tmp_path / "run").mkdir()
+    (tmp_path / "state" / "lowfc").mkdir(parents=True)
+    return tmp_path / "run" / "safe", tmp_path / "state" / "lowfc" / "night.safe"
+
+
+def test_it_is_kept_in_both_places_and_either_is_enough(files: tuple[Path, Path]) -> None:
+    first = Latch(files)
+    assert (first.safe, first.kept) == (False, True)
+    first.set(True)
+    until(lambda: all(file.exists() for file in files))
+    first.close()
+    for lost in files:
+        lost.unlink()
+        again = Latch(files)
+        assert again.safe
+        again.close()
+        lost.touch()
+    last = Latch(files)
+    last.set(False)
+    until(lambda: not any(file.exists() for file in files))
+    last.close()
+    assert not Latch(files).safe
+
+
+def test_the_former_name_counts(files: tuple[Path, Path]) -> None:
+    files[0].with_name("safed").touch()
+    latch = Latch(files)
+    assert latch.safe
+    latch.set(True)
+    latch.set(False)
+    latch.close()
+    assert not files[0].with_name("safed").exists(), "cleared under either name"
+
+
+def test_a_directory_that_is_gone_harms_nobody_and_comes_back(
+    files: tuple[Path, Path], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(latch_module, "RETRY_S", 0.01)
+    said: list[str] = []
+    latch = Latch(files, said.append)
+    files[0].parent.rmdir()
+    files[0].parent.touch()  # a file where the run's directory was
+    latch.set(True)
+    until(files[1].exists)
+    until(lambda: bool(said))
+    assert str(files[0]) in said[0]
+    files[0].parent.unlink()
+    files[0].parent.mkdir()
+    until(files[0].exists)
+    latch.close()
+    assert len(said) == 1, "said once, however often it was tried"
+
+
+def test_what_cannot_be_read_is_safe_and_what_cannot_be_written_is_not_kept(tmp_path: Path) -> None:
+    said: list[str] = []
+    loop = tmp_path / "loop"
+    loop.symlink_to(loop)
+    latch = Latch([loop / "safe"], said.append)
+    assert (latch.safe, latch.kept) == (True, False)
+    assert "cannot be read" in said[0]
+    latch.close()
+    (tmp_path / "file").touch()
+    nowhere = Latch([tmp_path / "file" / "safe"], said.append)
+    assert (nowhere.safe, nowhere.kept) == (False, False)
+    nowhere.set(True)
+    nowhere.close()
+    assert "cannot be written" in said[-1]
+
+
+def test_a_run_of_a_launcher_needs_its_directory_alone(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delenv("STATE_DIRECTORY", raising=False)
+    monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path / "home"))
+    by_hand = open_run("night", base=tmp_path)
+    assert latch_files(by_hand) == (tmp_path / "night" / "safe", tmp_path / "home" / "lowfc" / "night.safe")
+    monkeypatch.setenv("STATE_DIRECTORY", f"{tmp_path}/var{os.pathsep}/elsewhere")
+    assert latch_files(by_hand)[1] == tmp_path / "var" / "night.safe"
+    launched = open_run("launched", base=tmp_path, listeners=(Role.LAUNCHER,))
+    assert latch_files(launched) == (tmp_path / "launched" / "safe",)
+
+
+def test_a_start_that_finds_one_place_writes_the_other(files: tuple[Path, Path]) -> None:
+    files[0].touch()
+    latch = Latch(files)
+    until(files[1].exists)
+    latch.close()
+
+
+def test_what_was_written_in_part_is_cleared_whole(files: tuple[Path, Path], monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(latch_module, "RETRY_S", 0.01)
+    files[1].parent.rmdir()
+    files[1].parent.touch()
+    said: list[str] = []
+
+    def failed(why: str) -> None:
+        said.append(why)
+        raise OSError("the disk is full")
+
+    latch = Latch(files, failed)
+    latch.set(True)
+    until(files[0].exists)
+    latch.set(False)
+    until(lambda: not files[0].exists())
+    latch.close()
+    assert len(said) == 1, "said once, and who is told cannot end it"
+
+
+def test_a_file_is_replaced_as_a_whole(tmp_path: Path) -> None:
+    path = tmp_path / "file"
+    write_whole(path, b"first")
+    write_whole(path, b"second")
+    assert path.read_bytes() == b"second"
+    assert list(tmp_path.iterdir()) == [path]
+
+
+def test_what_cannot_be_written_leaves_the_old_file_and_nothing_else(tmp_path: Path, monkeypatch) -> None:
+    path = tmp_path / "file"
+    write_whole(path, b"first")
+
+    def full(self: Path, target: Path) -> None:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(Path, "replace", full)
+    with pytest.raises(DataFileError, match=r"file cannot be written: No space left on device"):
+        write_whole(path, b"second")
+    assert path.read_bytes() == b"first"
+    assert list(tmp_path.iterdir()) == [path]
+
+
+def test_a_folder_that_is_not_there_is_named(tmp_path: Path) -> None:
+    with pytest.raises(DataFileError, match="nowhere/file cannot be written: No such file"):
+        write_whole(tmp_path / "nowhere" / "file", b"")

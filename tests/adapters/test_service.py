@@ -13,8 +13,6 @@ from lowfc.contract.messages import COMMAND, EVENT, FRAME, HEALTH, Log, from_tim
 from lowfc.testing.clock import FakeClock
 from lowfc.testing.memory_bus import MemoryBus, MemoryHub
 
-pytestmark = pytest.mark.exclusive
-
 PATIENCE_S = 30.0
 
 

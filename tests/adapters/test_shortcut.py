@@ -17,17 +17,11 @@ from lowfc.adapters.process.clock import HostClock
 from lowfc.contract.configuration import Network
 from lowfc.contract.envelope import Envelope, count_of, sequence_of
 from lowfc.contract.messages import COMMAND, FRAME
+from tests.support.loops import until
 
 pytestmark = pytest.mark.exclusive
 
 PATIENCE_S = 30.0
-
-
-def until(what: str, met: Callable[[], object]) -> None:
-    deadline_s = time.monotonic() + PATIENCE_S
-    while not met():
-        assert time.monotonic() < deadline_s, f"{what} did not happen"
-        time.sleep(0.002)
 
 
 class Ends:
@@ -64,7 +58,7 @@ class Ends:
             publisher.put(b"")
             return self.threads[-5:] == ["shortcut"] * 5 and len(self.threads) > 20
 
-        until("the short way", only)
+        until(only)
         del self.got[:-1], self.threads[:], self.sizes[:]
 
     def close(self) -> None:
@@ -87,7 +81,7 @@ def test_the_reader_gets_everything_by_the_short_way_and_others_by_the_bus(ends:
     frames = camera.publisher(FRAME)
     ends.meet(frames)
     ends.publish(frames, 300)
-    until("the last frame", lambda: recorded[-1:] == [frames.published - 1] == ends.got[-1:])
+    until(lambda: recorded[-1:] == [frames.published - 1] == ends.got[-1:])
     assert ends.got == list(range(ends.got[0], frames.published))
     assert set(ends.threads) == {"shortcut"}
     assert recorded[-300:] == ends.got[-300:]
@@ -98,9 +92,9 @@ def test_the_switch_loses_and_repeats_nothing(ends: Ends) -> None:
     frames = camera.publisher(FRAME)
     controller = ends.bus("controller")
     controller.subscribe(FRAME, ends.hear)
-    until("a link", lambda: controller.peers() and camera.peers())
+    until(lambda: controller.peers() and camera.peers())
     ends.publish(frames, 400)
-    until("the last frame", lambda: ends.got[-1:] == [frames.published - 1])
+    until(lambda: ends.got[-1:] == [frames.published - 1])
     assert ends.got == sorted(set(ends.got))
     assert ends.got == list(range(ends.got[0], frames.published))
     assert "shortcut" in ends.threads
@@ -157,7 +151,7 @@ def test_without_its_writer_the_reader_hears_the_bus(ends: Ends, monkeypatch: py
         frames.put(b"")
         return bool(ends.threads) and ends.threads[-1] != "shortcut"
 
-    until("a frame by the bus", heard)
+    until(heard)
 
 
 def test_a_message_that_a_socket_does_not_take_comes_by_the_bus(ends: Ends) -> None:
@@ -171,7 +165,7 @@ def test_a_message_that_a_socket_does_not_take_comes_by_the_bus(ends: Ends) -> N
         time.sleep(0.05)
         return ends.sizes[-1:] == [large]
 
-    until("a large frame", heard)
+    until(heard)
     assert ends.threads[-1] != "shortcut"
 
 
@@ -202,7 +196,7 @@ def test_a_message_that_makes_no_sense_is_counted_and_the_next_is_heard(
     writer.send(b"short", b"")
     writer.send(b"\xff" * 16, b"from the end of time")
     writer.send(Envelope(7, 0).encode(), b"fine")
-    until("the second message", lambda: ends.got == [7])
+    until(lambda: ends.got == [7])
     (found,) = controller.faults.take_unreadable().items()
     assert (found[0], found[1][0]) == (FRAME.key, 2)
     assert "Traceback" not in capfd.readouterr().err
@@ -241,7 +235,7 @@ class Commanded:
             time.sleep(0.01)
             return "shortcut" in self.threads and any(one.payload == b"operator" for one in self.got)
 
-        until("both ways", both)
+        until(both)
 
 
 def test_a_mirror_gets_each_command_once_and_the_controllers_by_the_short_way(ends: Ends) -> None:
@@ -260,7 +254,7 @@ def test_a_mirror_gets_each_command_once_and_the_controllers_by_the_short_way(en
             (b"operator", last[1]),
         }
 
-    until("the last commands", all_came)
+    until(all_came)
     time.sleep(0.1)  # in which a copy by the bus would come
     by_whom = list(zip(mirror.got, mirror.threads, strict=True))[begun:]
     for payload, last_count in zip((b"controller", b"operator"), last, strict=True):
@@ -278,7 +272,7 @@ def test_a_command_with_anothers_sequence_is_no_copy(ends: Ends) -> None:
     newest = mirror.got[[one.payload for one in mirror.got].index(b"controller")]
     mirror.operator.put(b"a copy", publish_time_ns=newest.publish_time_ns, sequence=newest.sequence)
     mirror.operator.put(b"another", sequence=newest.sequence)
-    until("the other's", lambda: mirror.got[-1].payload == b"another")
+    until(lambda: mirror.got[-1].payload == b"another")
     assert all(one.payload != b"a copy" for one in mirror.got)
 
 
@@ -341,7 +335,7 @@ def test_after_a_stall_in_which_the_bus_was_quicker_nothing_comes_twice(shared: 
         shared.bus(count)
     for count in range(number + 1):
         shared.socket(count)
-    until("the last one", lambda: shared.got[-1] == number)
+    until(lambda: shared.got[-1] == number)
     assert shared.got == list(range(number + 1))
 
 

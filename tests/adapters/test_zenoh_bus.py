@@ -23,6 +23,7 @@ from lowfc.adapters.process.clock import HostClock
 from lowfc.contract.envelope import count_of, start_of
 from lowfc.contract.errors import BusError
 from lowfc.contract.messages import CALIBRATION, COMMAND, FRAME, HEALTH, REQUEST_KEY, TRUTH, Topic
+from tests.support.loops import until
 
 pytestmark = pytest.mark.exclusive
 
@@ -74,8 +75,6 @@ KEYS = {"camera": FRAME.key, "controller": COMMAND.at("dm"), "mirror-dm": "lowfc
 
 
 class Toy:
-    """One such process."""
-
     def __init__(self) -> None:
         self.process = subprocess.Popen(
             [sys.executable, "-c", TOY], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
@@ -89,13 +88,6 @@ class Toy:
     def kill(self) -> None:
         self.process.kill()
         self.process.communicate()
-
-
-def until(condition: Callable[[], bool]) -> None:
-    deadline = time.monotonic() + PATIENCE_S
-    while not condition():
-        assert time.monotonic() < deadline
-        time.sleep(0.01)
 
 
 @pytest.fixture(autouse=True)

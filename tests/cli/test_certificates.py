@@ -10,14 +10,13 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
-from typer.testing import CliRunner
 
 from lowfc.adapters.bus.access import ROUTER
 from lowfc.adapters.bus.own_certificate import WARN_DAYS, read_certificate
 from lowfc.adapters.bus.routed import ending_certificates, router_trouble
 from lowfc.contract.configuration import Network
 from lowfc.contract.errors import ConfigurationError, DataFileError
-from lowfc.programs.cli.main import app
+from tests.support.loops import lowfc
 
 make = pytest.importorskip("lowfc.adapters.bus.certificates", reason="needs the package cryptography").make_certificates
 
@@ -216,7 +215,7 @@ def test_mistakes_are_said(tmp_path: Path) -> None:
 
 def test_the_command_makes_all_roles(tmp_path: Path) -> None:
     words = ["certs", str(tmp_path / "certs"), "--router", "localhost", "--mirror", "dm", "--mirror", "tip"]
-    done = CliRunner().invoke(app, words)
+    done = lowfc(*words)
     assert done.exit_code == 0, done.output
     roles = {"router", "camera", "controller", "mirror-dm", "mirror-tip", "operator", "recorder", "viewer"}
     assert {file.stem for file in (tmp_path / "certs").glob("*.pem")} == roles | {"ca"}

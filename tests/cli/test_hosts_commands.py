@@ -6,7 +6,6 @@ import re
 from pathlib import Path
 
 import pytest
-from typer.testing import CliRunner
 
 from lowfc.adapters.bus import certificates, routed
 from lowfc.adapters.bus.run import open_run, runtime_base
@@ -14,18 +13,17 @@ from lowfc.adapters.process.clock_offset import AT_ONCE, PERIOD_S, RECENT
 from lowfc.contract.configuration import Network, load
 from lowfc.contract.errors import BusError
 from lowfc.programs.cli.hosts import certs, joined
-from lowfc.programs.cli.main import app
 from tests.e2e.test_hosts import SHIFTS_NS
+from tests.support.loops import lowfc
 
 DOCUMENT = Path(__file__).parents[2] / "docs" / "hosts.md"
 WAY = Network(router="tls/127.0.0.1:7447", certificates="/etc/lowfc/certs")
 
 
 @pytest.fixture
-def toml(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+def toml(own_runtime: Path) -> Path:
     """A configuration with a router, and no run at all."""
-    monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
-    file = tmp_path / "lowfc.toml"
+    file = own_runtime / "lowfc.toml"
     file.write_text(f'[network]\nrouter = "{WAY.router}"\ncertificates = "{WAY.certificates}"\n')
     return file
 
@@ -36,7 +34,7 @@ def runs() -> list[str]:
 
 @pytest.mark.usefixtures("toml")
 def test_a_run_that_is_not_there_is_not_made_by_asking() -> None:
-    done = CliRunner().invoke(app, ["hosts", "--run", "tpyo"])
+    done = lowfc("hosts", "--run", "tpyo")
     assert isinstance(done.exception, BusError)
     assert "there is no run 'tpyo'" in str(done.exception)
     assert runs() == []
@@ -45,18 +43,18 @@ def test_a_run_that_is_not_there_is_not_made_by_asking() -> None:
 @pytest.mark.usefixtures("toml")
 def test_a_session_is_of_a_run_that_is_there_or_is_to_be_made() -> None:
     words = ["config", "zenoh", "--role", "camera", "--run", "tpyo"]
-    done = CliRunner().invoke(app, words)
+    done = lowfc(*words)
     assert isinstance(done.exception, BusError)
     assert "there is no run 'tpyo'" in str(done.exception)
     assert runs() == []
-    made = CliRunner().invoke(app, [*words, "--make"])
+    made = lowfc(*words, "--make")
     assert made.exit_code == 0
     assert runs() == ["tpyo"]
-    assert CliRunner().invoke(app, words).stdout == made.stdout
+    assert lowfc(*words).stdout == made.stdout
 
 
 def test_the_routers_configuration_is_shown_without_making_its_run(toml: Path) -> None:
-    done = CliRunner().invoke(app, ["router", "--show", "--config", str(toml), "--run", "bench"])
+    done = lowfc("router", "--show", "--config", toml, "--run", "bench")
     assert done.exit_code == 0
     assert json.loads(done.stdout)["listen"]["endpoints"] == [WAY.router]
     assert runs() == []

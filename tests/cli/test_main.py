@@ -9,6 +9,7 @@ from typer.testing import CliRunner
 
 from lowfc.programs.cli.main import COMMANDS, PARTS, app
 from lowfc.programs.cli.result import Result, figure
+from tests.support.loops import lowfc
 
 
 def test_every_command_is_listed_under_its_purpose_with_a_whole_sentence() -> None:
@@ -22,9 +23,9 @@ def test_every_command_is_listed_under_its_purpose_with_a_whole_sentence() -> No
 
 @pytest.mark.parametrize("name", [row.name for rows in (*COMMANDS.values(), PARTS) for row in rows])
 def test_every_command_has_help_with_an_example(name: str) -> None:
-    done = CliRunner().invoke(app, [*name.split(), "--help"])
+    done = lowfc(*name.split(), "--help")
     assert done.exit_code == 0, done.output
-    assert "Example: " in done.stdout
+    assert "Example: lowfc " in done.stdout
 
 
 def test_a_command_is_imported_when_it_is_used() -> None:

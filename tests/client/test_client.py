@@ -11,12 +11,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 import typer
-from astropy.io import fits
 
 from lowfc.adapters.bus.bus import Query, Sample
 from lowfc.adapters.bus.other_loops import other_loops
 from lowfc.adapters.bus.run import open_run
-from lowfc.adapters.files.mirror_maps import read_shape
 from lowfc.adapters.logs.reader import LogReader
 from lowfc.adapters.process.clock import HostClock
 from lowfc.client import Answer, Client, Frame, Stream, client, configuration_of, running, the_run
@@ -41,7 +39,7 @@ from lowfc.contract.messages import (
     image,
     wire,
 )
-from lowfc.control.laws.linear_law import LinearLaw, integrator_block, of_blocks
+from lowfc.control.laws.linear_law import integrator_block, of_blocks
 from lowfc.control.loop.inputs import Reply, Request, Step
 from lowfc.control.loop.requests import REQUESTS
 from lowfc.control.loop.safety import LoopMode, Reason
@@ -49,10 +47,9 @@ from lowfc.programs.cli.ctl.command import SIMPLE, ctl_app
 from lowfc.programs.cli.ctl.status import figures, text
 from lowfc.programs.cli.modes import noll_of
 from lowfc.testing.memory_bus import MemoryBus, MemoryHub, MemoryRing
-from tests.support.recording import Bench, bodies_of, put, until
+from tests.support.loops import until
+from tests.support.recording import Bench, bodies_of, put
 from tests.support.toy import NOLL, calibration
-
-pytestmark = pytest.mark.exclusive
 
 DOCUMENT = Path(__file__).parents[2] / "docs" / "operating.md"
 KNOWN = identified(calibration())
@@ -202,17 +199,7 @@ def test_arrays_arrive_as_they_were(controller: FakeController, loop: Client) ->
     assert np.array_equal(played.actuators_nm, [*SHAPE.ravel(), *-SHAPE.ravel()])
     assert np.array_equal(played.table, [[1, 2], [3, 4], [5, 6]])
     assert (offset.text, offset.table.tolist()) == ("offset", np.ones((4, 3)).tolist())
-    assert law.law is not None
-    assert same_law(law.law, LAW)
-
-
-def same_law(one: LinearLaw, other: LinearLaw) -> bool:
-    arrays = all(
-        np.array_equal(getattr(one, name), getattr(other, name))
-        for name in ("transition", "measurement_gain", "command_gain", "predict_only", "output")
-    )
-    plain = all(getattr(one, name) == getattr(other, name) for name in ("name", "signal", "noll", "rate_hz"))
-    return arrays and plain and one.delay_frames == other.delay_frames
+    assert law.law.id == LAW.id
 
 
 def test_a_refusal_is_an_error_with_the_controllers_sentence(controller: FakeController, loop: Client) -> None:
@@ -276,9 +263,8 @@ def listening(name: str, *roles: str) -> list[socket.socket]:
     return [socket.create_server(("127.0.0.1", ports[role])) for role in roles]
 
 
-def test_a_run_is_found_by_who_is_there(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
-    where = rf"no loop of user \S+ is running here: {tmp_path}/lowfc was searched \(from XDG_RUNTIME_DIR\)"
+def test_a_run_is_found_by_who_is_there(own_runtime: Path) -> None:
+    where = rf"no loop of user \S+ is running here: {own_runtime}/lowfc was searched \(from XDG_RUNTIME_DIR\)"
     with pytest.raises(BusError, match=where):
         the_run(None)
     open_run("empty")
@@ -299,8 +285,7 @@ def test_a_run_is_found_by_who_is_there(tmp_path: Path, monkeypatch: pytest.Monk
             the_run("damaged")
 
 
-def test_the_beginning_of_a_runs_name_is_enough(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
+def test_the_beginning_of_a_runs_name_is_enough(own_runtime: Path) -> None:
     with contextlib.ExitStack() as held:
         for name in ("night", "night-2", "noon"):
             for server in listening(name, "controller"):
@@ -312,26 +297,24 @@ def test_the_beginning_of_a_runs_name_is_enough(tmp_path: Path, monkeypatch: pyt
             the_run("day")
 
 
-def test_a_loop_that_is_not_seen_from_here_is_told_of(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_loop_that_is_not_seen_from_here_is_told_of(own_runtime: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Its owner, its process and its runtime directory, where the system tells."""
-    monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
     words = [sys.executable, "-c", "print(flush=True); input()", "lowfc", "controller", "--run", "night"]
     for there, told in (
         ("/run/elsewhere", ", with XDG_RUNTIME_DIR=/run/elsewhere"),
-        (str(tmp_path), ", still starting"),
+        (str(own_runtime), ", still starting"),
     ):
         environment = os.environ | {"XDG_RUNTIME_DIR": there}
         with subprocess.Popen(words, stdin=subprocess.PIPE, stdout=subprocess.PIPE, env=environment) as process:
-            assert process.stdout is not None
             process.stdout.readline()
             said = list(other_loops())
             process.communicate(b"\n")
         assert f"you run `lowfc controller --run night` (process {process.pid}{told})" in said
-    stranger = tmp_path / "proc" / "77"
+    stranger = own_runtime / "proc" / "77"
     stranger.mkdir(parents=True)
     (stranger / "cmdline").write_text("python\0/opt/lowfc/bin/lowfc\0controller\0")
     monkeypatch.setattr(os, "geteuid", lambda: 4_000_000_000)
-    assert list(other_loops(tmp_path / "proc")) == [f"user {stranger.owner()} runs `lowfc controller` (process 77)"]
+    assert list(other_loops(own_runtime / "proc")) == [f"user {stranger.owner()} runs `lowfc controller` (process 77)"]
 
 
 # The mirror.
@@ -443,11 +426,22 @@ def test_a_closed_stream_has_ended() -> None:
     assert list(frames) == []
 
 
-def test_a_stream_that_has_ended_is_sent_nothing_more(
-    controller: FakeController, loop: Client, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    publisher, ring, before = controller.bus.publisher(FRAME), loop._bus.ring, list(loop._bus._subscriptions)
-    monkeypatch.setattr(loop._bus, "ring", lambda topic, capacity: _fed(ring(topic, capacity), publisher.put))
+@pytest.fixture
+def three_frames(controller: FakeController, loop: Client, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Publish three frames as soon as somebody listens."""
+    publisher, begin = controller.bus.publisher(FRAME), loop._bus.ring
+
+    def ring(topic: Topic, capacity: int) -> MemoryRing:
+        made = begin(topic, capacity)
+        for count in range(3):
+            publisher.put(frame_sample(count).payload)
+        return made
+
+    monkeypatch.setattr(loop._bus, "ring", ring)
+
+
+def test_a_stream_that_has_ended_is_sent_nothing_more(loop: Client, three_frames: None) -> None:
+    before = list(loop._bus._subscriptions)
     assert len(list(loop.frames(2))) == 2
     assert loop._bus._subscriptions == before
     frames = loop.frames(patience_s=0.02)
@@ -472,18 +466,9 @@ def test_a_slow_reader_loses_the_oldest_and_knows(controller: FakeController, lo
     assert frames.lost == 0, "what came before the first one was not asked for"
 
 
-def test_the_frames_of_a_bus(controller: FakeController, loop: Client, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_frames_of_a_bus(loop: Client, three_frames: None) -> None:
     """From the moment `frames` returns, none is missed."""
-    publisher = controller.bus.publisher(FRAME)
-    ring = loop._bus.ring
-    monkeypatch.setattr(loop._bus, "ring", lambda topic, capacity: _fed(ring(topic, capacity), publisher.put))
     assert [frame.pixels[0, 0] for frame in loop.frames(3)] == [0, 1, 2]
-
-
-def _fed(ring: object, put: Callable[[bytes], object]) -> object:
-    for count in range(3):
-        put(frame_sample(count).payload)
-    return ring
 
 
 def test_an_answer_that_is_none_is_an_error_with_a_sentence() -> None:
@@ -509,7 +494,6 @@ def test_a_step_comes_as_it_was_sent() -> None:
     for name in Step._fields:
         assert np.array_equal(getattr(got, name), getattr(sent, name)), name
     held = step_of(Sample(STEP.key, codec.encode_step(sent._replace(error_nm=None, pol_nm=None), 1), 0, 0, 0))
-    assert held is not None
     assert (held.error_nm, held.pol_nm) == (None, None)
     assert step_of(Sample(STEP.key, b"\xff", 0, 0, 0)) is None
 
@@ -544,7 +528,14 @@ def test_every_command_has_help_with_an_example() -> None:
 
 @pytest.mark.parametrize(
     ("words", "noll"),
-    [(None, ()), (["2,3"], (2, 3)), (["2", "3"], (2, 3)), (["4-7, 11"], (4, 5, 6, 7, 11)), (["3,2-4"], (3, 2, 4))],
+    [
+        (None, ()),
+        (["2,3"], (2, 3)),
+        (["2", "3"], (2, 3)),
+        (["4-7, 11"], (4, 5, 6, 7, 11)),
+        (["3,2-4"], (3, 2, 4)),
+        (["2,4-6, 5"], (2, 4, 5, 6)),
+    ],
 )
 def test_modes_are_read_as_people_write_them(words: list[str] | None, noll: tuple[int, ...]) -> None:
     assert noll_of(words) == noll
@@ -555,30 +546,6 @@ def test_modes_that_are_none_are_refused(word: str) -> None:
     with pytest.raises(ConfigurationError, match="as in 2,3 or 4-11") as caught:
         noll_of([word])
     assert "\n" not in str(caught.value)
-
-
-def test_shapes_are_read_from_fits_and_numpy(tmp_path: Path) -> None:
-    np.save(tmp_path / "shape.npy", SHAPE)
-    fits.HDUList([fits.PrimaryHDU(), fits.ImageHDU(SHAPE)]).writeto(tmp_path / "shape.fits")
-    for name in ("shape.npy", "shape.fits"):
-        read = read_shape(tmp_path / name)
-        assert (read.dtype, read.tolist()) == (np.float32, SHAPE.tolist())
-
-
-def test_files_that_hold_no_shape_are_refused(tmp_path: Path) -> None:
-    np.save(tmp_path / "cube.npy", np.zeros((2, 3, 4)))
-    np.save(tmp_path / "pickled.npy", np.array([{}], object), allow_pickle=True)
-    (tmp_path / "text.fits").write_text("no")
-    fits.PrimaryHDU().writeto(tmp_path / "empty.fits")
-    for name, why in {
-        "none.fits": "there is no such file",
-        "cube.npy": r"\(2, 3, 4\) of float64",
-        "pickled.npy": "neither",
-        "text.fits": "neither",
-        "empty.fits": "there is no image",
-    }.items():
-        with pytest.raises(DataFileError, match=why):
-            read_shape(tmp_path / name)
 
 
 def test_the_status_says_everything() -> None:
@@ -628,10 +595,9 @@ def test_the_status_says_everything() -> None:
 
 
 @pytest.fixture
-def bench(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Bench:
-    monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
+def bench(own_runtime: Path, monkeypatch: pytest.MonkeyPatch) -> Bench:
     monkeypatch.setattr(client, "SLOW_ANSWER_S", 10.0)
-    return Bench(tmp_path / "logs")
+    return Bench(own_runtime / "logs")
 
 
 def operator(bench: Bench) -> Client:

@@ -4,12 +4,11 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 import pytest
-from typer.testing import CliRunner
 
 from lowfc.adapters.files import factory
 from lowfc.adapters.files.drawing import figure_class, png
+from lowfc.arrays import Single
 from lowfc.contract.configuration import Acceptance, Configuration, load
 from lowfc.contract.errors import ConfigurationError
 from lowfc.contract.messages import wire
@@ -21,18 +20,16 @@ from lowfc.control.loop.advance import advance
 from lowfc.control.loop.inputs import Frame, Load, Request
 from lowfc.control.loop.safety import LoopMode, Reason
 from lowfc.control.loop.state import State
-from lowfc.programs.cli.modes import noll_of
 from lowfc.programs.commissioning.acceptance import capture as acceptance_capture
 from lowfc.programs.commissioning.acceptance import linearity as acceptance_linearity
 from lowfc.programs.commissioning.acceptance import noise as acceptance_noise
 from lowfc.programs.commissioning.acceptance import rejection as acceptance_rejection
-from lowfc.programs.commissioning.acceptance.command import acceptance_app
 from lowfc.programs.commissioning.acceptance.judged import AcceptanceResult
 from lowfc.programs.commissioning.acceptance.played import AcceptanceError, Loop, Played, _announced, chosen
 from sim_camera.bench import Bench
 from sim_camera.process import bench
-
-Single = npt.NDArray[np.float32]
+from tests.support.loops import lowfc
+from tools.law_bench import calibrated
 
 REQUIRED = Acceptance(lowest_hz=2.0)
 RATE_HZ = 250.0
@@ -47,9 +44,7 @@ def configured(**changes: object) -> Configuration:
 
 @pytest.fixture(scope="module")
 def calibration() -> Calibration:
-    config = configured()
-    optics = factory.twin(config, None, print)
-    return factory.analytic_calibration(config, optics, factory.mirror_on_twin(config, optics, print))
+    return calibrated(configured())
 
 
 def played(
@@ -74,14 +69,12 @@ def played(
             target = "offset" if basis is None else "mirror"
             asked = Request(0, "play", text=target, table=table, actuators_nm=shape)
             state, outputs = advance(settings, state, asked)
-            assert outputs.reply is not None
             assert outputs.reply.accepted, outputs.reply.text
         seen = np.zeros(GRID, np.float32)
         for weight, shape in zip(weights, shapes, strict=True):
             seen += weight * shape
         pixels, _ = scene.expose(count, seen)
         state, outputs = advance(settings, state, Frame(start | count, count * config.period_ns, 0, pixels))
-        assert outputs.command is not None
         shapes = [outputs.command.actuators_nm, *shapes[:-1]]
         if count >= first:
             found.append(outputs.step)
@@ -259,7 +252,6 @@ def test_a_test_is_found_by_its_note() -> None:
 
 
 def test_modes_are_chosen_by_their_noll_indices() -> None:
-    assert noll_of(["2,4-6, 5"]) == (2, 4, 5, 6)
     assert chosen((), (2, 3)) == (2, 3)
     with pytest.raises(AcceptanceError, match="99"):
         chosen((99,), (2, 3))
@@ -267,6 +259,6 @@ def test_modes_are_chosen_by_their_noll_indices() -> None:
 
 @pytest.mark.parametrize("test", ["rejection", "linearity", "capture-range"])
 def test_modes_that_are_none_are_refused_and_are_not_all(test: str) -> None:
-    done = CliRunner().invoke(acceptance_app, [test, "--modes", "11-4"])
+    done = lowfc("acceptance", test, "--modes", "11-4")
     assert isinstance(done.exception, ConfigurationError)
     assert str(done.exception) == "--modes takes Noll indices, as in 2,3 or 4-11; got '11-4'"

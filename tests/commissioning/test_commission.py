@@ -1,4 +1,4 @@
-"""`lowfc commission` step by step, on a loop in one process."""
+"""`lowfc commission` step by step on a loop in one process, and what camera and configuration must agree on."""
 
 import tomllib
 from collections.abc import Callable
@@ -9,11 +9,14 @@ import numpy as np
 import pytest
 
 from lowfc.adapters.files import calibration_file
+from lowfc.adapters.files.factory import camera_state
 from lowfc.contract.configuration import Camera, Configuration, Control
 from lowfc.contract.errors import CalibrationError, RequestRefusedError
 from lowfc.contract.messages import wire
 from lowfc.programs.commissioning.calibrate.run import partial_of
+from lowfc.programs.commissioning.checks import Status
 from lowfc.programs.commissioning.commission.commissioning import Commission, Commissioning, first_of
+from lowfc.programs.commissioning.conformance.agreement import AGREEMENTS, agreement_checks
 from tests.support.folded_loop import FoldedLoop, computed
 
 TOML = """
@@ -91,7 +94,6 @@ def test_frames_of_another_size_come_to_a_closed_loop(commissioned: tuple[Bench,
     assert figures["recommended"]
     assert figures["measured_error_nm"] == pytest.approx(figures["predicted_error_nm"], rel=0.15)
     state = bench.loop.status().state
-    assert state is not None
     assert state.mode == wire.LOOP_MODE_CLOSED
     made = calibration_file.load(bench.out)
     assert made.shape == (64, 64)
@@ -178,7 +180,6 @@ def test_who_opens_the_loop_at_the_end_is_named_and_the_calibration_stays(tmp_pa
         bench.commission()
     assert "the calibration is good" in bench.shown
     state = bench.loop.status().state
-    assert state is not None
     assert (state.mode, state.calibration_id) == (wire.LOOP_MODE_OPEN, calibration_file.load(bench.out).id)
 
 
@@ -210,3 +211,55 @@ def test_in_safe_mode_nothing_begins(tmp_path: Path) -> None:
     bench.loop.ask("safe")
     with pytest.raises(RequestRefusedError, match="safe mode"):
         bench.commission()
+
+
+def changed(**fields: float) -> wire.CameraState:
+    state = camera_state(Configuration(), (80, 80), 1)
+    for name, value in fields.items():
+        setattr(state, name, value)
+    return state
+
+
+def faults(config: Configuration, state: wire.CameraState) -> dict[str, Status]:
+    checks = agreement_checks(config, state)
+    return {check.name.split(" ")[0]: check.status for check in checks if check.status is not Status.OK}
+
+
+@pytest.mark.parametrize("em_gain", [1.0, 300.0])
+@pytest.mark.parametrize("bits", [12, 16])
+def test_the_simulated_camera_agrees_with_its_configuration(em_gain: float, bits: int) -> None:
+    config = Configuration(camera=Camera(em_gain=em_gain, bit_depth=bits, full_well_e=2_000.0))
+    assert faults(config, camera_state(config, (80, 80), 1)) == {}
+
+
+@pytest.mark.parametrize("one", AGREEMENTS, ids=lambda one: one.field)
+def test_a_value_that_differs_is_found(one: object) -> None:
+    field, needed = one.field, one.needed  # type: ignore[attr-defined]
+    found = faults(Configuration(), changed(**{field: getattr(changed(), field) * 2}))
+    assert found[field] is (Status.WRONG if needed else Status.WARNING)
+
+
+def test_a_camera_of_100_hz_and_14_bits_on_the_default_configuration() -> None:
+    state = changed(period_ns=10_000_000, exposure_ns=5_000_000, bit_depth=14, saturation_dn=16383)
+    assert faults(Configuration(), state) == {
+        "period_ns": Status.WRONG,
+        "exposure_ns": Status.WARNING,
+        "bit_depth": Status.WARNING,
+        "saturation_dn": Status.WARNING,
+    }
+
+
+@pytest.mark.parametrize(
+    ("rate_hz", "max_frame_age_ms", "frame_timeout_ms"),
+    [(1000, 20, 50), (250, 20, 50), (100, 20, 50), (50, 40, 100), (5, 400, 1000)],
+)
+def test_the_times_follow_the_rate(rate_hz: float, max_frame_age_ms: float, frame_timeout_ms: float) -> None:
+    config = Configuration(camera=Camera(rate_hz=rate_hz))
+    assert (config.max_frame_age_ns, config.frame_timeout_ns) == (max_frame_age_ms * 1e6, frame_timeout_ms * 1e6)
+    assert "control.frame_timeout_ms" not in faults(config, camera_state(config, (80, 80), 1))
+
+
+def test_what_was_chosen_holds_and_is_checked() -> None:
+    config = Configuration(camera=Camera(rate_hz=20.0), control=Control(max_frame_age_ms=7.0, frame_timeout_ms=50.0))
+    assert (config.max_frame_age_ns, config.frame_timeout_ns) == (7_000_000, 50_000_000)
+    assert faults(config, camera_state(config, (80, 80), 1)) == {"control.frame_timeout_ms": Status.WRONG}

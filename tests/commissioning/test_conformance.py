@@ -11,16 +11,15 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 import pytest
 import zenoh
 from google.protobuf.message import DecodeError, Message
 from rich.console import Console
-from typer.testing import CliRunner
 
 from lowfc.adapters.bus.run import open_run
 from lowfc.adapters.bus.zenoh_bus import session_config
 from lowfc.adapters.files.factory import camera_state
+from lowfc.arrays import Single
 from lowfc.contract.configuration import Configuration, Network, load
 from lowfc.contract.envelope import Envelope, sequence_of
 from lowfc.contract.errors import BusError, ConfigurationError
@@ -40,7 +39,7 @@ from lowfc.control.loop.safety import Limits
 from lowfc.programs.commissioning.checks import Check, figures, table
 from lowfc.programs.commissioning.conformance import command as conformance
 from lowfc.programs.commissioning.conformance.camera import watch
-from lowfc.programs.commissioning.conformance.command import FIELDS, STATUSES, conformance_app
+from lowfc.programs.commissioning.conformance.command import FIELDS, STATUSES
 from lowfc.programs.commissioning.conformance.dialogue import Dialogue, expected_of
 from lowfc.programs.commissioning.conformance.frames import camera_checks
 from lowfc.programs.commissioning.conformance.line import Line, Received
@@ -49,9 +48,7 @@ from lowfc.testing.clock import FakeClock
 from sim_dm.device import Command, Status, apply_command, initial, tick
 from sim_dm.process import _told, device
 from tests.e2e import test_own_hardware
-from tests.support.loops import until
-
-Array = npt.NDArray[np.float32]
+from tests.support.loops import lowfc, until
 
 MS = 1_000_000
 LATENCY_NS = 100_000
@@ -339,9 +336,7 @@ def test_a_cameras_mistake_is_found(mistake: str) -> None:
     assert of_camera(**changes) == expected
 
 
-def shaped(function: Callable[[Array], Array]) -> Callable[[wire.MirrorState], wire.MirrorState]:
-    """A state with another shape."""
-
+def shaped(function: Callable[[Single], Single]) -> Callable[[wire.MirrorState], wire.MirrorState]:
     def change(state: wire.MirrorState) -> wire.MirrorState:
         shape = np.frombuffer(state.actuators, np.float32).reshape(state.rows, state.columns)
         state.actuators = np.ascontiguousarray(function(shape), np.float32).tobytes()
@@ -350,7 +345,7 @@ def shaped(function: Callable[[Array], Array]) -> Callable[[wire.MirrorState], w
     return change
 
 
-def one_dead(shape: Array, height_nm: float = 0.0) -> Array:
+def one_dead(shape: Single, height_nm: float = 0.0) -> Single:
     return np.where(np.arange(shape.size).reshape(shape.shape) == 9, np.float32(height_nm), shape)
 
 
@@ -498,44 +493,39 @@ def test_the_report_says_what_to_do_of_what_is_not_right() -> None:
     assert {"name": "encoding", "status": "wrong"}.items() <= printed["checks"][5].items()
 
 
-@pytest.fixture
-def runtime(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
-
-
-@pytest.mark.usefixtures("runtime")
+@pytest.mark.usefixtures("own_runtime")
 @pytest.mark.parametrize("name", ["camera", "mirror"])
 def test_without_a_device_it_says_how_to_start_one(name: str) -> None:
-    done = CliRunner().invoke(conformance_app, [name])
+    done = lowfc("conformance", name)
     assert isinstance(done.exception, BusError)
     assert "lowfc config zenoh --role" in str(done.exception)
-    done = CliRunner().invoke(conformance_app, [name, "--run", "bench"])
+    done = lowfc("conformance", name, "--run", "bench")
     assert "there is no run 'bench'" in str(done.exception)
 
 
-@pytest.mark.usefixtures("runtime")
+@pytest.mark.usefixtures("own_runtime")
 def test_a_mirror_that_a_controller_commands_is_left_alone() -> None:
     links = open_run("bench").links
     with socket.create_server(("127.0.0.1", links.ports[Role.CONTROLLER])):
-        done = CliRunner().invoke(conformance_app, ["mirror", "--run", "bench"])
+        done = lowfc("conformance", "mirror", "--run", "bench")
     assert "has a controller" in str(done.exception)
 
 
-@pytest.mark.usefixtures("runtime")
+@pytest.mark.usefixtures("own_runtime")
 def test_a_camera_that_is_not_there_is_what_is_wrong(monkeypatch: pytest.MonkeyPatch) -> None:
     open_run("bench")
     monkeypatch.setattr(conformance, "CONNECT_S", 0.0)
-    done = CliRunner().invoke(conformance_app, ["camera", "--run", "bench", "--duration", "0.2", "--json"])
+    done = lowfc("conformance", "camera", "--run", "bench", "--duration", "0.2", "--json")
     assert done.exit_code == 1
     checks = {check["name"]: check for check in json.loads(done.stdout)["checks"]}
     assert checks["frames"]["status"] == "wrong"
     assert "received: nothing" in checks["frames"]["got"]
 
 
-@pytest.mark.usefixtures("runtime")
+@pytest.mark.usefixtures("own_runtime")
 def test_lockstep_has_no_dead_man_to_try(tmp_path: Path) -> None:
     (tmp_path / "lockstep.toml").write_text("lockstep = true\n")
-    done = CliRunner().invoke(conformance_app, ["mirror", "--config", str(tmp_path / "lockstep.toml")])
+    done = lowfc("conformance", "mirror", "--config", tmp_path / "lockstep.toml")
     assert isinstance(done.exception, ConfigurationError)
 
 
@@ -546,7 +536,7 @@ def test_every_command_of_the_document_is_run_by_the_test_of_the_examples() -> N
     assert sorted(lines) == sorted(test_own_hardware.DOCUMENTED)
 
 
-@pytest.mark.usefixtures("runtime")
+@pytest.mark.usefixtures("own_runtime")
 def test_a_line_hears_what_has_no_envelope_and_asks() -> None:
     links = open_run("bench").links
     with zenoh.open(zenoh.Config.from_json5(json.dumps(session_config(links, Role.CAMERA)))) as session:
@@ -568,7 +558,7 @@ def test_a_line_hears_what_has_no_envelope_and_asks() -> None:
             line.close()
 
 
-@pytest.mark.usefixtures("runtime")
+@pytest.mark.usefixtures("own_runtime")
 def test_the_controllers_place_is_taken_by_one_at_a_time() -> None:
     links = open_run("bench").links
     line = Line(links, Role.CONTROLLER)
@@ -579,8 +569,8 @@ def test_the_controllers_place_is_taken_by_one_at_a_time() -> None:
         line.close()
 
 
-@pytest.mark.usefixtures("runtime")
+@pytest.mark.usefixtures("own_runtime")
 def test_a_run_on_several_hosts_has_another_clock() -> None:
     open_run("bench", network=Network(router="tls/127.0.0.1:7447", certificates="."))
-    done = CliRunner().invoke(conformance_app, ["camera", "--run", "bench"])
+    done = lowfc("conformance", "camera", "--run", "bench")
     assert "goes by a router" in str(done.exception)

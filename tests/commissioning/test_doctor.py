@@ -11,8 +11,6 @@ from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
-import typer
-from typer.testing import CliRunner
 
 from lowfc.adapters.bus.run import runtime_base
 from lowfc.adapters.logs.selection import EVERYTHING
@@ -26,8 +24,7 @@ from lowfc.programs.commissioning.checks import Check, note, ok
 from lowfc.programs.commissioning.doctor import command, room, timing
 from lowfc.programs.commissioning.doctor.facts import Facts, gather, ranges
 from lowfc.programs.core.recording.volume import bytes_per_s
-
-pytestmark = pytest.mark.exclusive
+from tests.support.loops import lowfc
 
 DOCUMENT = Path(__file__).parents[2] / "docs" / "doctor.md"
 LOOKS = {**timing.CHECKS.looks, **room.CHECKS.looks}
@@ -117,16 +114,9 @@ def examine(facts: Facts) -> dict[str, Check]:
 
 
 @pytest.fixture
-def alone(monkeypatch: pytest.MonkeyPatch) -> CliRunner:
-    """The command alone, measuring for a moment."""
+def briefly(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The command measures for a moment."""
     monkeypatch.setattr(command, "TRIAL_S", 0.02)
-    return CliRunner()
-
-
-def app() -> typer.Typer:
-    found = typer.Typer()
-    found.command()(command.doctor)
-    return found
 
 
 def test_a_fit_host_has_no_warning(tmp_path: Path) -> None:
@@ -274,19 +264,16 @@ def test_the_disk_is_judged_by_what_the_loop_writes(tmp_path: Path, monkeypatch:
 
 
 @pytest.mark.parametrize(("behind_ms", "status"), [(50, "ok"), (1000, "warning"), (-1000, "warning")])
-def test_a_boots_clock_that_was_set_wrong_is_a_warning(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, behind_ms: int, status: str
-) -> None:
-    monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
-    assert examine(facts(tmp_path))["boot's clock"][:2] == ok("not set yet: the first process of a run does it")[:2]
-    assert not (tmp_path / "lowfc").exists(), "looking changes nothing"
+def test_a_boots_clock_that_was_set_wrong_is_a_warning(own_runtime: Path, behind_ms: int, status: str) -> None:
+    assert examine(facts(own_runtime))["boot's clock"][:2] == ok("not set yet: the first process of a run does it")[:2]
+    assert not (own_runtime / "lowfc").exists(), "looking changes nothing"
     file = boot_file(runtime_base())
     file.write_text(str(time.time_ns() - time.monotonic_ns() - behind_ms * 1_000_000))
-    finding = examine(facts(tmp_path))["boot's clock"]
+    finding = examine(facts(own_runtime))["boot's clock"]
     assert finding.status == status
     assert (status == "warning") == (f"remove {file}" in finding.advice)
     file.write_text("noon")
-    assert "not known" in examine(facts(tmp_path))["boot's clock"].got
+    assert "not known" in examine(facts(own_runtime))["boot's clock"].got
 
 
 def test_certificates_that_end_are_a_warning(tmp_path: Path) -> None:
@@ -372,8 +359,8 @@ def test_processors_are_written_as_the_kernel_writes_them() -> None:
     assert ranges({3, 0, 1, 8}) == "0-1,3,8"
 
 
-def test_this_host_is_looked_at(alone: CliRunner) -> None:
-    done = alone.invoke(app(), ["--json"])
+def test_this_host_is_looked_at(briefly: None) -> None:
+    done = lowfc("doctor", "--json")
     assert done.exit_code == 0, done.output
     (line,) = done.stdout.splitlines()
     found = json.loads(line)
@@ -386,20 +373,20 @@ def test_this_host_is_looked_at(alone: CliRunner) -> None:
     assert "sleeping 1000 times a second" in done.stderr
 
 
-def test_strict_is_about_warnings(alone: CliRunner, tmp_path: Path) -> None:
+def test_strict_is_about_warnings(briefly: None, tmp_path: Path) -> None:
     config = tmp_path / "lowfc.toml"
     config.write_text("[realtime]\ncamera_cpus = [8000]\n")
-    done = alone.invoke(app(), ["--config", str(config)])
+    done = lowfc("doctor", "--config", config)
     assert done.exit_code == 0, done.output
     row = next(line for line in done.stdout.splitlines() if " processors " in line)
     assert row.startswith("warning")
     assert re.search(r"\d+ warnings, \d+ notes, \d+ ok", done.stdout)
-    assert alone.invoke(app(), ["--config", str(config), "--strict"]).exit_code == 1
+    assert lowfc("doctor", "--config", config, "--strict").exit_code == 1
 
 
-def test_strict_is_content_with_notes(alone: CliRunner, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_strict_is_content_with_notes(briefly: None, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(command, "examine", lambda _: [ok("fine"), note("odd")])
-    assert alone.invoke(app(), ["--strict"]).exit_code == 0
+    assert lowfc("doctor", "--strict").exit_code == 0
 
 
 def test_the_document_has_every_check_in_its_own_words() -> None:

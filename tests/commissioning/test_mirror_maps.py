@@ -11,6 +11,7 @@ from astropy.io import fits
 
 from lowfc.adapters.files import factory, law_file
 from lowfc.adapters.files.mirror_maps import active_actuators, flat_nm, read_shape
+from lowfc.arrays import Single
 from lowfc.contract.configuration import Configuration, load
 from lowfc.contract.errors import ConfigurationError, DataFileError
 from lowfc.control.calibration.calibration import Calibration
@@ -22,19 +23,17 @@ from lowfc.control.loop.safety import LoopMode
 from lowfc.control.loop.state import State
 from lowfc.programs.core.start_up import StartUp, check_files
 from sim_camera.process import bench
-from tests.support.fold import fold
+from tests.support.folded_loop import fold
 from tests.support.loops import run
+from tools.law_bench import calibrated
 
-Single = npt.NDArray[np.float32]
 GRID = (34, 34)
 QUIET = {"disturbance.preset": "quiet", "star.magnitude": -2.0}
 
 
 @pytest.fixture(scope="module")
 def calibration() -> Calibration:
-    config = load(None, QUIET)
-    optics = factory.twin(config, None, print)
-    return factory.analytic_calibration(config, optics, factory.mirror_on_twin(config, optics, print))
+    return calibrated(load(None, QUIET))
 
 
 def wavy(height_nm: float = 30.0) -> Single:
@@ -85,12 +84,19 @@ def test_what_is_no_map_is_named_in_one_line(tmp_path: Path) -> None:
     saved(tmp_path, "nothing.npy", np.zeros((0, 34)))
     fits.HDUList([fits.PrimaryHDU()]).writeto(tmp_path / "empty.fits")
     saved(tmp_path, "line.npy", np.zeros(9))
+    saved(tmp_path, "cube.npy", np.zeros((2, 3, 4)))
     saved(tmp_path, "words.npy", np.array([["flat"]]))
     np.save(tmp_path / "pickle.npy", np.array([[{}]], dtype=object))
     (tmp_path / "folder.fits").mkdir()
-    of_numpy = ("text.npy", "line.npy", "words.npy", "pickle.npy", "archive.npy", "half.npy", "cut.npy", "nothing.npy")
-    for file in ("short.fits", "empty.fits", "folder.fits", "none", *of_numpy):
-        with pytest.raises(DataFileError, match=file) as caught:
+    neither = ("short.fits", "text.npy", "pickle.npy", "archive.npy", "half.npy", "cut.npy")
+    for file, why in {
+        **dict.fromkeys(neither, "neither"),
+        **dict.fromkeys(("folder.fits", "line.npy", "words.npy", "nothing.npy"), ""),
+        "cube.npy": r"\(2, 3, 4\) of float64",
+        "none.fits": "there is no such file",
+        "empty.fits": "there is no image",
+    }.items():
+        with pytest.raises(DataFileError, match=f"{file}.*{why}") as caught:
             read_shape(tmp_path / file)
         assert "\n" not in str(caught.value)
 
@@ -139,8 +145,7 @@ def test_inactive_actuators_are_not_commanded_and_the_modes_are_measured_as_they
     active = np.ones(GRID)
     active.flat[dead] = 0
     config = load(None, QUIET | {"mirror.active": saved(tmp_path, "a.fits", active), "mirror.dead": dead})
-    optics = factory.twin(config, None, print)
-    made = factory.analytic_calibration(config, optics, factory.mirror_on_twin(config, optics, print))
+    made = calibrated(config)
     assert not made.modes_to_actuators[dead].any()
     assert not made.actuators_to_modes[:, dead].any()
     assert np.abs(calibration.modes_to_actuators[dead]).max() > 0.01
@@ -155,8 +160,7 @@ def test_inactive_actuators_are_not_commanded_and_the_modes_are_measured_as_they
 def test_a_registration_error_is_the_mirrors_and_not_the_calibrations(calibration: Calibration) -> None:
     wrong = {"mirror.magnification": 1.01, "mirror.shift_pitches": 0.31}
     config = load(None, QUIET | wrong)
-    optics = factory.twin(config, None, print)
-    believed = factory.analytic_calibration(config, optics, factory.mirror_on_twin(config, optics, print))
+    believed = calibrated(config)
     np.testing.assert_array_equal(believed.modes_to_actuators, calibration.modes_to_actuators)
     poked = (20.0 * calibration.modes_to_actuators[:, 2]).reshape(GRID)  # defocus
     straight = bench(load(None, QUIET)).expose(0, poked)[1].residual_nm
@@ -187,14 +191,12 @@ def begun(config: Configuration, calibration: Calibration, shape: MirrorShape | 
     requests = StartUp(config).requests(state, 0)
     for request in requests:
         state, outputs = advance(settings, state, request)
-        assert outputs.reply is not None
         assert outputs.reply.accepted, outputs.reply.text
     return state, requests
 
 
 def commands(config: Configuration, state: State, frames: int) -> tuple[list[Single], list[str]]:
     """What is commanded over some frames of any light, for which the loop is open, and the channels at their end."""
-    assert state.drive is not None
     settings, shape = (
         replace(factory.settings(config), min_flux_fraction=0.0, max_identical_frames=0),
         state.drive.calibration.shape,
@@ -203,9 +205,7 @@ def commands(config: Configuration, state: State, frames: int) -> tuple[list[Sin
     sent = []
     for index in range(frames):
         state, outputs = advance(settings, state, Frame(1 + index, index, 0, dark))
-        assert outputs.command is not None
         sent.append(outputs.command.actuators_nm)
-    assert state.drive is not None
     return sent, [one.name for one in state.drive.added().channels]
 
 
@@ -253,8 +253,6 @@ def test_the_configured_law_takes_over(tmp_path: Path, calibration: Calibration)
     state, requests = begun(config, calibration, None)
     assert [one.name for one in requests] == ["law"]
     assert state.mode is LoopMode.OPEN
-    assert state.drive is not None
-    assert state.drive.following is not None
     assert state.drive.following.law.name == "leaky"
     with pytest.raises(ConfigurationError, match="the law is of the modes"):
         StartUp(config).refused(requests[0], "the law is of the modes 2 to 15, the loop of 2 to 9")

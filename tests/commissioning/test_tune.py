@@ -185,7 +185,6 @@ class Steered:
         if len(self.asked) in self.deaf:
             raise BusError("the controller did not answer")
         self.state, outputs = advance(self.settings, self.state, request)
-        assert outputs.reply is not None
         if not outputs.reply.accepted:
             raise RequestRefusedError(f"{request.name} refused: {outputs.reply.text}")
         return Answer(True, outputs.reply.text, frame_sequence(7))
@@ -202,7 +201,6 @@ class Steered:
     def known(self) -> tuple[str | None, list[float]]:
         state = self.status().state
         law = driving(state, self.laws())
-        assert state is not None
         return (None if law is None else law.name), [round(gain, 6) for gain in state.gain]
 
 

@@ -7,16 +7,13 @@ from pathlib import Path
 
 import pytest
 from rich.console import Console
-from typer.testing import CliRunner
 
 from lowfc.adapters.process.service import Service
 from lowfc.adapters.process.terminal import new_app, run_app
 from lowfc.contract.configuration import Configuration, load
 from lowfc.contract.errors import ConfigurationError, RequestRefusedError
-from lowfc.contract.events import EVENTS
 from lowfc.contract.messages import EVENT, REQUEST, Log, wire
 from lowfc.contract.printable import LINES, printable
-from lowfc.programs.cli.main import app
 from lowfc.programs.cli.output import put
 from lowfc.programs.launch.status import screen
 from lowfc.programs.launch.watch import Watch
@@ -26,10 +23,9 @@ from lowfc.programs.view.renderer import Renderer
 from lowfc.testing.clock import FakeClock
 from lowfc.testing.memory_bus import MemoryBus, MemoryHub
 from tests.support import report_log
+from tests.support.loops import lowfc
 from tests.support.report_log import Night
-from tests.support.tape import Tape
-
-pytestmark = pytest.mark.exclusive
+from tests.support.stage import Tape
 
 HOSTILE = "clouds\x1b[2J\x07 \x9b31mred \u202egnorts \u2028 caf\u00e9 5\u2009nm\r\nerror: fine"
 SHOWN = r"clouds\x1b[2J\x07 \x9b31mred \u202egnorts \u2028 café 5" + "\u2009" + r"nm\r\nerror: fine"
@@ -47,10 +43,6 @@ def test_control_characters_are_shown_and_nothing_else_is_changed() -> None:
     usual = "R = 3 µm, \u00a0 ±2 \\n 日本 🔭 \u2009"
     assert printable(usual) == usual
     assert printable("a\udc80b") == r"a\udc80b"
-
-
-def test_an_event_is_one_line() -> None:
-    assert EVENTS["NOTE"].log("controller", 0, text=HOSTILE).message == f"NOTE {SHOWN}"
 
 
 def test_a_process_prints_its_events_so(capsys: pytest.CaptureFixture[str]) -> None:
@@ -110,17 +102,14 @@ def log(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 @pytest.mark.parametrize("command", ["info", "report", "replay"])
 def test_readers_of_a_log_print_them_so(log: Path, command: str) -> None:
-    done = CliRunner().invoke(app, [command, str(log)])
+    done = lowfc(command, log)
     assert done.exit_code == 0, done.output
     check(done.output)
-
-
-def test_a_report_page_shows_them(log: Path) -> None:
-    assert CliRunner().invoke(app, ["report", str(log)]).exit_code == 0
-    page = log.with_suffix(".html").read_text()
-    check(page.replace("\u2028", ""), keep=LINES)
-    assert page.count("clouds\\x1b[2J") >= 6, "events, requests, what ran"
-    assert page.count("<svg") > 3, "drawings are left as they are"
+    if command == "report":
+        page = log.with_suffix(".html").read_text()
+        check(page.replace("\u2028", ""), keep=LINES)
+        assert page.count("clouds\\x1b[2J") >= 6, "events, requests, what ran"
+        assert page.count("<svg") > 3, "drawings are left as they are"
 
 
 def test_a_view_shows_them(log: Path) -> None:

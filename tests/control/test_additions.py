@@ -6,6 +6,7 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
+from lowfc.arrays import Array, Single
 from lowfc.contract.codecs.codec import decode_request, encode_request
 from lowfc.control.laws.linear_law import LinearLaw, Signal
 from lowfc.control.loop.additions import ADOPTED, FLAT, MIRROR, MOST_CHANNELS, OFFSET
@@ -21,8 +22,6 @@ DISTURBED = np.array([10.0, -5.0, 3.0])
 ACTUATORS = GRID[0] * GRID[1]
 STEP_NM = USUAL.limits.kept_slew_nm / 2
 
-Single = npt.NDArray[np.float32]
-
 
 class Night:
     """A loop on the toy's sensor and mirror: what is commanded is seen in the next frame."""
@@ -32,7 +31,7 @@ class Night:
         self.state = loaded(self.what)
         self.count = 0
         self.surfaces: list[Single] = [np.zeros(GRID, np.float32)]
-        self.wavefronts: list[npt.NDArray[np.float64]] = []
+        self.wavefronts: list[Array] = []
         self.outputs: list[Outputs] = []
         self.to_modes = np.linalg.pinv(TOY.modes_to_actuators)
 
@@ -252,9 +251,7 @@ def test_a_play_that_does_not_fit_is_refused(fields: dict[str, object], why: str
         ("a", np.indices(GRID).sum(axis=0) % 2 * 500.0, "neighbours"),
     ],
 )
-def test_a_channel_that_the_mirror_cannot_take_is_refused(
-    text: str, shape_nm: npt.NDArray[np.float64], why: str
-) -> None:
+def test_a_channel_that_the_mirror_cannot_take_is_refused(text: str, shape_nm: Array, why: str) -> None:
     night = Night()
     reply = night.ask("channel", text=text, actuators_nm=shape_nm.astype(np.float32).reshape(-1))
     assert not reply.accepted

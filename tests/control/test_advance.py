@@ -2,7 +2,6 @@
 
 from collections.abc import Callable
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 import pytest
@@ -41,11 +40,6 @@ def running(what: Settings = USUAL, frames: int = 5) -> State:
     return feed(what, loaded(what), *(frame(count, SOME) for count in range(1, frames + 1)))[0]
 
 
-def drive_of(state: State) -> Any:
-    assert state.drive is not None
-    return state.drive
-
-
 def ask(name: str, *values: float, modes: tuple[int, ...] = ()) -> Request:
     return Request(0, name, modes, values)
 
@@ -66,7 +60,7 @@ BAD: dict[Reason, Callable[[int], Frame]] = {
 def test_a_bad_frame_is_refused_counted_and_named_and_the_command_holds(reason: Reason) -> None:
     before = running()
     state, every = feed(USUAL, before, *(BAD[reason](count) for count in range(6, 9)))
-    held = drive_of(before)
+    held = before.drive
     for outputs in every:
         assert outputs.step.reasons == (reason,)
         assert outputs.step.error_nm is None
@@ -88,12 +82,11 @@ def test_a_camera_that_is_stuck_is_refused_until_its_image_changes() -> None:
     state, every = feed(what, loaded(what), *(frame(count, SOME) for count in range(1, 8)))
     reasons = [outputs.step.reasons for outputs in every if outputs.step is not None]
     assert reasons == [()] * 4 + [(Reason.STUCK,)] * 3
-    used = drive_of(feed(what, loaded(what), *(frame(count, SOME) for count in range(1, 5)))[0])
-    assert np.array_equal(drive_of(state).actuators_nm, used.actuators_nm)
-    changed = frame(8, SOME)
-    pixels = changed.pixels.copy()
+    used = feed(what, loaded(what), *(frame(count, SOME) for count in range(1, 5)))[0].drive
+    assert np.array_equal(state.drive.actuators_nm, used.actuators_nm)
+    pixels = frame(8, SOME).pixels.copy()
     pixels.flat[0] += 1
-    state, back = feed(what, state, changed._replace(pixels=pixels), frame(9, SOME))
+    state, back = feed(what, state, frame(8, pixels=pixels), frame(9, SOME))
     assert names(every + back) == ["FRAMES_REFUSED", "FRAMES_ACCEPTED"]
     assert state.counts == {Reason.STUCK: 3}
     assert state.frames_used == 6
@@ -131,8 +124,7 @@ def test_late_means_later_than_allowed(good: Frame, bad: Frame) -> None:
 
 @pytest.mark.parametrize(("pixels", "used"), [(0, True), (1, True), (8, True), (9, False)])
 def test_a_few_hot_pixels_do_not_stop_the_loop(pixels: int, used: bool) -> None:
-    image = frame(6, SOME).pixels
-    image = image.copy()
+    image = frame(6, SOME).pixels.copy()
     image.flat[:pixels] = SATURATION_DN
     _, (outputs,) = feed(USUAL, running(), frame(6, pixels=image))
     assert outputs.step.saturated_pixels == (pixels if used else 0)
@@ -154,21 +146,21 @@ def test_missing_and_refused_frames_move_the_history_on(delay: float) -> None:
     """After a gap, pseudo-open-loop still knows which command the exposure saw: the held one."""
     what = settings(delay_frames=delay)
     before = running(what)
-    held = drive_of(before).history_nm[0]
+    held = before.drive.history_nm[0]
     missing, every = feed(what, before, frame(12, SOME))
     assert names(every) == ["FRAMES_MISSING"]
     assert every[0].events[0].details == {"count": 6, "number": 12}
     assert every[0].step.error_nm is not None
     assert np.array_equal(every[0].step.pol_nm, every[0].step.error_nm - held)
     refused, _ = feed(what, before, *(BAD[Reason.LATE](count) for count in range(6, 12)))
-    assert all(np.array_equal(command, held) for command in drive_of(refused).history_nm)
-    assert drive_of(missing).history_nm[0] is not held
+    assert all(np.array_equal(command, held) for command in refused.drive.history_nm)
+    assert missing.drive.history_nm[0] is not held
 
 
 def test_one_missing_frame_moves_the_history_by_one() -> None:
     what = settings(delay_frames=3.0)
     before = running(what)
-    newest, middle, _ = drive_of(before).history_nm
+    newest, middle, _ = before.drive.history_nm
     _, (outputs,) = feed(what, before, frame(7, SOME))  # frame 6 is missing: exposure 7 sees the command of frame 4
     assert outputs.step.error_nm is not None
     assert np.array_equal(outputs.step.pol_nm, outputs.step.error_nm - middle)
@@ -198,7 +190,7 @@ def test_silence_is_named_once_at_its_start_and_once_at_its_end() -> None:
     assert [name for name in names(every) if name != "FRAMES_REFUSED"] == ["NO_FRAMES"]
     assert all(outputs.command is not None for outputs in every)
     for outputs in every:
-        assert np.array_equal(outputs.command.actuators_nm, drive_of(before).actuators_nm)
+        assert np.array_equal(outputs.command.actuators_nm, before.drive.actuators_nm)
         assert outputs.command.frame_sequence == before.frame_sequence
     state, back = feed(USUAL, state, frame(500, SOME), frame(501, SOME))
     assert names(back) == ["FRAMES_BACK", "FRAMES_MISSING", "FRAMES_ACCEPTED"]
@@ -209,11 +201,11 @@ def test_in_silence_the_mirror_relaxes_to_flat_where_that_is_configured() -> Non
     what = settings(on_frame_timeout="flat")
     state = running(what)
     for _ in range(20):
-        before = drive_of(state).actuators_nm
+        before = state.drive.actuators_nm
         state, (outputs,) = feed(what, state, Tick(0, what.frame_timeout_ns + 1))
         assert violations(what.limits, before, outputs.command.actuators_nm) == []
-    assert not drive_of(state).actuators_nm.any()
-    assert not any(command.any() for command in drive_of(state).history_nm)
+    assert not state.drive.actuators_nm.any()
+    assert not any(command.any() for command in state.drive.history_nm)
     state, (outputs,) = feed(what, state, frame(400, SOME))
     assert outputs.command.actuators_nm.any()
 
@@ -249,15 +241,15 @@ def test_safe_latches_from_every_mode(mode: LoopMode) -> None:
 def test_safed_relaxes_the_mirror_frame_by_frame_within_the_limits() -> None:
     what = settings(limits=replace(USUAL.limits, slew_nm=1.0))
     state, _ = feed(what, running(what, 30), ask("safe"))
-    largest = np.abs(drive_of(state).actuators_nm).max()
+    largest = np.abs(state.drive.actuators_nm).max()
     for count in range(31, 70):
-        before = drive_of(state).actuators_nm
+        before = state.drive.actuators_nm
         taken = BAD[Reason.DARK](count) if count % 3 == 0 else frame(count, SOME)
         state, (outputs,) = feed(what, state, taken)
         assert violations(what.limits, before, outputs.command.actuators_nm) == []
         assert np.abs(outputs.command.actuators_nm).max() <= np.abs(before).max()
     assert largest > 2
-    assert not drive_of(state).actuators_nm.any()
+    assert not state.drive.actuators_nm.any()
 
 
 @pytest.mark.parametrize("reason", [Reason.OUT_OF_ORDER, Reason.REPEATED])
@@ -268,7 +260,7 @@ def test_safe_flattens_the_mirror_under_a_stuck_camera(reason: Reason) -> None:
     for _ in range(200):
         state, (outputs,) = feed(USUAL, state, BAD[reason](6))
         assert outputs.command.frame_sequence == newest
-    assert not drive_of(state).actuators_nm.any()
+    assert not state.drive.actuators_nm.any()
 
 
 def test_clear_opens_the_loop_and_close_closes_it() -> None:
@@ -301,8 +293,7 @@ def test_an_unknown_request_names_the_known_ones() -> None:
 @pytest.mark.parametrize("name", ["gain", "leak"])
 def test_gain_and_leak_for_all_modes_for_some_and_for_each(name: str) -> None:
     def now(state: State) -> list[float]:
-        values: list[float] = getattr(drive_of(state).law, name).tolist()
-        return values
+        return getattr(state.drive.law, name).tolist()
 
     state, _ = feed(USUAL, running(), ask(name, 0.25))
     assert now(state) == [0.25, 0.25, 0.25]
@@ -335,7 +326,7 @@ def test_a_bad_value_is_refused_and_changes_nothing(request_: Request, message: 
     after, (outputs,) = feed(USUAL, state, request_)
     answered(outputs, False, message)
     assert not outputs.changed
-    assert drive_of(after).law is drive_of(state).law
+    assert after.drive.law is state.drive.law
 
 
 @pytest.mark.parametrize("delay", [1.0, 1.5, 2.0, 3.0])
@@ -352,7 +343,7 @@ def test_an_unstable_gain_is_refused_for_the_delay_there_is(delay: float) -> Non
 
 def test_the_first_step_after_closing_moves_by_gain_times_error_only() -> None:
     state, _ = feed(USUAL, running(), ask("open"), *(frame(count, SOME) for count in range(6, 20)), ask("close"))
-    before = drive_of(state).history_nm[0]
+    before = state.drive.history_nm[0]
     _, (outputs,) = feed(USUAL, state, frame(20, (1.0, 0, 0)))
     assert outputs.step.command_nm - before == pytest.approx([-0.5, 0, 0], abs=0.02)
 
@@ -360,7 +351,7 @@ def test_the_first_step_after_closing_moves_by_gain_times_error_only() -> None:
 def test_in_open_loop_the_command_holds() -> None:
     state, _ = feed(USUAL, running(), ask("open"))
     after, every = feed(USUAL, state, *(frame(count, SOME) for count in range(6, 12)))
-    assert drive_of(after).actuators_nm is drive_of(state).actuators_nm
+    assert after.drive.actuators_nm is state.drive.actuators_nm
     assert all(outputs.step is not None and outputs.step.error_nm is not None for outputs in every)
 
 
@@ -370,18 +361,18 @@ def test_a_loaded_calibration_does_not_make_the_mirror_jump(noll: tuple[int, ...
     state, (outputs,) = feed(USUAL, before, Load(0, calibration(noll, scale=2.0), "another"))
     beyond = [] if noll == NOLL else ["SHAPE_ADOPTED"]  # what the other modes cannot make
     assert names([outputs]) == ["CALIBRATION_LOADED", *beyond]
-    assert np.array_equal(drive_of(state).actuators_nm, drive_of(before).actuators_nm)
+    assert np.array_equal(state.drive.actuators_nm, before.drive.actuators_nm)
     _, (outputs,) = feed(USUAL, state, Tick(0, 0))
-    assert np.array_equal(outputs.command.actuators_nm, drive_of(before).actuators_nm)
+    assert np.array_equal(outputs.command.actuators_nm, before.drive.actuators_nm)
     if noll == NOLL:
-        assert drive_of(state).history_nm[0] == pytest.approx(drive_of(before).history_nm[0], abs=1e-3)
+        assert state.drive.history_nm[0] == pytest.approx(before.drive.history_nm[0], abs=1e-3)
         _, (outputs,) = feed(USUAL, state, frame(6))
-        assert np.abs(outputs.command.actuators_nm - drive_of(before).actuators_nm).max() < 0.01
+        assert np.abs(outputs.command.actuators_nm - before.drive.actuators_nm).max() < 0.01
 
 
 @pytest.mark.parametrize("with_modes", [True, False])
 def test_a_restarted_controller_goes_on_from_the_mirrors_shape(with_modes: bool) -> None:
-    before = drive_of(running())
+    before = running().drive
     modes = before.history_nm[0] if with_modes else np.zeros(0, np.float32)
     shape = MirrorShape(0, before.actuators_nm, modes)
     state, (outputs,) = feed(USUAL, loaded(USUAL), shape)
@@ -395,10 +386,10 @@ def test_a_restarted_controller_goes_on_from_the_mirrors_shape(with_modes: bool)
 
 @pytest.mark.parametrize("told_nm", [np.nan, np.inf, 1e30, -200.0])
 def test_a_modal_command_that_cannot_be_is_not_believed(told_nm: float) -> None:
-    before = drive_of(running())
+    before = running().drive
     shape = MirrorShape(0, before.actuators_nm, np.full(3, told_nm, np.float32))
     state, _ = feed(USUAL, loaded(USUAL), shape)
-    assert drive_of(state).history_nm[0] == pytest.approx(before.history_nm[0], abs=1e-3)
+    assert state.drive.history_nm[0] == pytest.approx(before.history_nm[0], abs=1e-3)
 
 
 @pytest.mark.parametrize("shape", [np.zeros((5, 4), np.float32), np.full(GRID, np.nan, np.float32)])
@@ -461,7 +452,7 @@ def test_after_the_mirror_saturates_the_stored_command_is_what_it_was_given() ->
     for count in range(1, 61):
         state, (outputs,) = feed(what, state, frame(count, (60, 0, 0)))
         events += names([outputs])
-    drive = drive_of(state)
+    drive = state.drive
     assert state.limits_hit == (Reason.STROKE,)
     assert events.count("LIMIT_HIT") == len(set(events) & {"LIMIT_HIT"}) == 1
     assert np.abs(drive.actuators_nm).max() <= 5

@@ -1,17 +1,20 @@
-"""A lease: the loop reserved for one client, which safe, open, pause and stop of anybody end."""
+"""Reservations of the loop, remarks on foolish values, and the sentences of replies and events."""
 
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
+from lowfc.contract.events import EVENTS
+from lowfc.control.laws.stability import highest_gain
 from lowfc.control.loop.additions import MIRROR
 from lowfc.control.loop.advance import advance
-from lowfc.control.loop.inputs import Outputs, Request, Tick
+from lowfc.control.loop.inputs import Outputs, Reply, Request, Tick
 from lowfc.control.loop.lease import MAX_S
 from lowfc.control.loop.safety import LoopMode
 from lowfc.control.loop.state import State
-from tests.support.toy import GRID, SOME, answered, feed, frame, frame_sequence, loaded, names, settings
+from lowfc.control.loop.wording import counted
+from tests.support.toy import GRID, NOLL, SOME, answered, feed, frame, frame_sequence, loaded, names, settings
 
 USUAL = settings(rate_hz=1000.0)
 HOLDER = "lowfc calibrate (anna, pid 7)"
@@ -170,3 +173,76 @@ def test_it_is_gone_by_the_time_of_the_next_request() -> None:
 def test_it_outlives_a_camera_that_restarts() -> None:
     state, _ = feed(USUAL, held(1.0), frame(1, SOME, sequence=frame_sequence(1, start=1_800_000_000)))
     assert not state.conditions.lease.ended
+
+
+def replied(
+    state: State, name: str, *values: float, modes: tuple[int, ...] = (), text: str = ""
+) -> tuple[State, Reply]:
+    after, outputs = asked(state, Request(1, name, modes, values, text))
+    return after, outputs.reply
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "said"),
+    [
+        ("gain", 0.5, ""),
+        ("gain", 1.2, "margins are below the 1.8 in gain and 45 degrees in phase that `lowfc tune` keeps"),
+        ("gain", 0.0, "a mode with a gain of 0 is not corrected"),
+        ("gain", 0.001, "below 0.01, the least that `lowfc tune` chooses"),
+        ("limit", 100.0, ""),
+        ("limit", 0.0, "a mode with a limit of 0 nm is not corrected"),
+        ("limit", 1e9, "nm the stroke of 700 nm limits mode 3 first"),
+        ("leak", 0.0, ""),
+    ],
+)
+def test_a_foolish_value_is_granted_and_said_so(name: str, value: float, said: str) -> None:
+    after, reply = replied(loaded(USUAL), name, value, modes=(3,))
+    assert reply.accepted
+    attribute = {"gain": "gain", "limit": "limit_nm", "leak": "leak"}[name]
+    assert getattr(after.drive.law, attribute)[NOLL.index(3)] == np.float32(value)
+    assert reply.text.startswith(f"{name} is now ")
+    assert said in reply.text
+    assert (":" in reply.text) == bool(said)
+
+
+def test_the_remark_begins_where_tune_ends() -> None:
+    highest = highest_gain(USUAL.delay_frames)
+    texts = [replied(loaded(USUAL), "gain", factor * highest)[1].text for factor in (0.999, 1.001)]
+    assert ["lowfc tune" in text for text in texts] == [False, True]
+
+
+def test_a_channel_that_is_not_there_is_said_so_and_one_that_is_there_is_removed() -> None:
+    state = loaded(USUAL)
+    after, reply = replied(state, "channel", text="dark-hole")
+    assert (reply.accepted, reply.text) == (True, "there is no channel 'dark-hole' to remove; there are none")
+    assert after.drive.additions is None
+    shape = Request(1, "channel", text="dark-hole", actuators_nm=np.full(GRID, 2.0, np.float32).reshape(-1))
+    state, _ = advance(USUAL, state, shape)
+    assert replied(state, "channel", text="hole")[1].text == "there is no channel 'hole' to remove; there are dark-hole"
+    assert replied(state, "channel", text="dark-hole")[1].text == "channel dark-hole: 0 nm rms of surface"
+    assert "letter first" in replied(state, "channel", text="Dark Hole")[1].text
+
+
+def test_an_offset_beyond_its_limit_names_its_mode() -> None:
+    _, reply = replied(loaded(USUAL), "offset", 80.0, modes=(4,))
+    assert (reply.accepted, reply.text) == (False, "offset of mode 4: at most its limit, 50 nm; asked for 80 nm")
+
+
+@pytest.mark.parametrize(
+    ("words", "expected"),
+    [
+        ((0, "frame"), "0 frames"),
+        ((1.0, "frame"), "1 frame"),
+        ((1.5, "frame"), "1.5 frames"),
+        ((1234567, "message"), "1234567 messages"),
+        ((2, "process", "processes"), "2 processes"),
+    ],
+)
+def test_a_number_goes_with_its_noun(words: tuple[float, str], expected: str) -> None:
+    assert counted(*words) == expected
+
+
+def test_events_keep_singular_and_plural() -> None:
+    event = EVENTS["FRAMES_MISSING"]
+    assert "1 frame missing" in event.log("controller", 0, count=1, number=7).message
+    assert "2 frames missing" in event.log("controller", 0, count=np.int64(2), number=7).message

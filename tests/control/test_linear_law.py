@@ -1,20 +1,151 @@
-"""Linear laws: what the loop's integrator does, bumpless closing, no wind-up, and shapes that are checked."""
+"""Laws, their margins and their stability: against figures by hand, theory, and loops that are run."""
 
 from dataclasses import replace
 
 import numpy as np
-import numpy.typing as npt
 import pytest
 
-from lowfc.control.laws.law import integrate
-from lowfc.control.laws.linear_law import LinearLaw, at_rest, coast, follow, respond
+from lowfc.arrays import Array
+from lowfc.control.laws.law import Law, integrate
+from lowfc.control.laws.linear_law import LinearLaw, Signal, at_rest, coast, follow, respond
+from lowfc.control.laws.margins import (
+    MOST_COUPLED,
+    check_stable,
+    margins,
+    noise_gain,
+    noise_transfer,
+    rejection,
+    sentence,
+)
 from lowfc.control.laws.pi_notch import Notch, pi_notch
+from lowfc.control.laws.stability import delay_weights, limiting_gain
+from lowfc.control.loop.safety import Limits
+from lowfc.control.loop.state import Settings
+from tests.support import theory
 from tests.support.theory import LAWS, integrators, law_of, linear, run
+from tests.support.toy import live, settings
 
-NOLL, RATE_HZ = (2, 3, 4), 1000.0
+RATE_HZ = 1000.0
+WIDE = {"limits": Limits(7000.0, 7000.0, 7000.0), "limit_nm": (5000.0, 5000.0)}
+
+
+def test_the_integrator_is_what_the_design_says() -> None:
+    command, error = np.array([10, -20, 0], np.float32), np.array([4, 4, -8], np.float32)
+    after, cut = integrate(law_of(leak=0.1), command, error)
+    assert after.tolist() == pytest.approx([7, -20, 4], abs=1e-5)
+    assert cut is False
+    assert after.dtype == np.float32
+
+
+def test_each_mode_is_cut_at_its_own_limit() -> None:
+    uneven = law_of(1.0, 0.0, [5, 50, 500])
+    after, cut = integrate(uneven, np.zeros(3, np.float32), np.array([-60, 60, -60], np.float32))
+    assert after.tolist() == [5, -50, 60]
+    assert cut is True
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"gain": -0.1}, "gain"),
+        ({"gain": np.nan}, "gain"),
+        ({"leak": 1.1}, "leak"),
+        ({"leak": -0.1}, "leak"),
+        ({"limit_nm": -1.0}, "limit_nm"),
+    ],
+)
+def test_a_law_out_of_range_is_refused(change: dict[str, float], message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        law_of(**change)
+
+
+def test_a_law_of_uneven_lengths_is_refused() -> None:
+    with pytest.raises(ValueError, match="as long as each other"):
+        Law(np.zeros(3, np.float32), np.zeros(2, np.float32), np.zeros(3, np.float32))
+
+
+@pytest.mark.parametrize(
+    ("delay", "expected"), [(1, [1]), (2, [0, 1]), (3, [0, 0, 1]), (1.25, [0.75, 0.25]), (2.5, [0, 0.5, 0.5])]
+)
+def test_delay_weights(delay: float, expected: list[float]) -> None:
+    assert delay_weights(delay).tolist() == pytest.approx(expected)
+
+
+@pytest.mark.parametrize("delay", [0.99, 0, -1, np.nan, np.inf])
+def test_a_delay_below_one_frame_is_refused(delay: float) -> None:
+    with pytest.raises(ValueError, match="at least 1 frame"):
+        delay_weights(delay)
+
+
+def spectral_radius(gain: float, leak: float, delay: float) -> float:
+    """Largest pole of the loop, from its state matrix: an independent way to its stability."""
+    weights = delay_weights(delay)
+    matrix = np.zeros((len(weights), len(weights)))
+    matrix[0] = -gain * weights
+    matrix[0, 0] += 1 - leak
+    matrix[1:, :-1] += np.eye(len(weights) - 1)
+    return float(np.abs(np.linalg.eigvals(matrix)).max())
+
+
+@pytest.mark.parametrize("delay", [1, 1.3, 1.5, 1.9, 2, 2.5, 3])
+@pytest.mark.parametrize("leak", [0.0, 0.01, 0.3])
+def test_the_limiting_gain_is_where_a_pole_leaves_the_unit_circle(delay: float, leak: float) -> None:
+    highest = limiting_gain(delay, leak)
+    assert spectral_radius(highest * (1 - 1e-6), leak, delay) < 1
+    assert spectral_radius(highest * (1 + 1e-6), leak, delay) > 1
+
+
+def residual_of(what: Settings, disturbance_nm: np.ndarray, noise_nm: np.ndarray | float = 0.0) -> np.ndarray:
+    """Residual (frames, modes) of the loop closed through `advance`, of which nothing but the law makes the command."""
+    steps, residual_nm, _ = live(what, disturbance_nm, noise_nm)
+    assert all(step.reasons == () for step in steps)
+    return residual_nm
+
+
+@pytest.mark.parametrize("delay", [1.0, 1.5, 2.0])
+@pytest.mark.parametrize("frequency_hz", [5.0, 40.0, 125.0])
+def test_a_sine_wave_is_rejected_as_predicted(delay: float, frequency_hz: float) -> None:
+    gain, leak, frames = 0.4, 0.01, 800
+    phase = 2 * np.pi * frequency_hz / RATE_HZ * np.arange(frames)
+    disturbance = np.zeros((frames, 3))
+    disturbance[:, 0] = 20 * np.sin(phase)
+    what = settings(delay_frames=delay, gain=(gain, 0.0), leak=(leak, 0.0), **WIDE)
+    settled = slice(200, None)  # a whole number of periods
+    measured = 2 * np.abs(np.mean(residual_of(what, disturbance)[settled, 0] * np.exp(-1j * phase[settled]))) / 20
+    assert measured == pytest.approx(
+        theory.rejection(np.array([frequency_hz]), RATE_HZ, gain, leak, delay)[0], rel=0.01
+    )
+
+
+@pytest.mark.parametrize(("gain", "delay"), [(0.1, 1.0), (0.5, 1.0), (0.3, 2.0)])
+def test_measurement_noise_is_passed_on_as_predicted(gain: float, delay: float) -> None:
+    rng = np.random.default_rng(2)
+    noise = 10 * rng.standard_normal((4000, 3))
+    what = settings(delay_frames=delay, gain=(gain, gain), **WIDE)
+    residual = residual_of(what, np.zeros_like(noise), noise)[200:]
+    # Three modes with some 3800 gain / 2 independent values each: about 5 % at the lowest gain, 4 standard errors.
+    assert np.mean(residual**2) / 100 == pytest.approx(theory.noise_gain(gain, 0.0, delay), rel=0.2)
+
+
+def test_the_noise_gain_of_the_shortest_delay_is_known_in_closed_form() -> None:
+    for gain in (0.05, 0.5, 1.0, 1.5):
+        assert theory.noise_gain(gain, 0.0, 1.0) == pytest.approx(gain / (2 - gain), rel=1e-3)
+    assert theory.noise_gain(0.0, 0.0, 1.0) == 0
+
+
+@pytest.mark.parametrize("delay", [1.0, 1.5, 2.0, 3.0])
+def test_pseudo_open_loop_is_the_disturbance_while_the_loop_settles(delay: float) -> None:
+    what = settings(delay_frames=delay, gain=(0.3, 0.2), leak=(0.01, 0.0))
+    still = np.array([12.0, -7.0, 5.0])
+    steps, _, _ = live(what, np.tile(still, (60, 1)))
+    for step in steps:
+        assert np.abs(step.pol_nm - still).max() < 0.05
+    assert np.abs(steps[-1].command_nm + still * [0.3 / 0.31, 0.3 / 0.31, 1]).max() < 0.05
+
+
+NOLL = (2, 3, 4)
 GAIN, LEAK = np.array([0.5, 0.3, 0.1]), np.array([0.0, 0.01, 0.1])
 PLAIN = law_of(GAIN, LEAK, 1e9)
-Array = npt.NDArray[np.float64]
 
 
 def pi(gain: Array, proportional: Array, leak: Array) -> LinearLaw:
@@ -123,3 +254,124 @@ def test_an_impossible_notch_is_refused(notch: Notch) -> None:
 def test_gains_of_another_number_of_modes_are_refused() -> None:
     with pytest.raises(ValueError, match="proportional must be given for each of 3 modes, got 2"):
         pi(GAIN, GAIN[:2], LEAK)
+
+
+FREQUENCY_HZ = np.geomspace(0.1, 499, 200)
+
+
+def one(gain: float, delay_frames: float, leak: float = 0.0) -> LinearLaw:
+    return linear(law_of(gain, leak, modes=1), (4,), delay_frames)
+
+
+@pytest.mark.parametrize("delay_frames", [1.0, 1.5, 2.0, 3.0])
+@pytest.mark.parametrize("leak", [0.0, 0.05])
+def test_the_integrator_has_the_transfer_functions_of_stability(delay_frames: float, leak: float) -> None:
+    law, gain = one(0.3, delay_frames, leak), float(np.float32(0.3))
+    expected = theory.rejection(FREQUENCY_HZ, RATE_HZ, gain, leak, delay_frames)
+    np.testing.assert_allclose(rejection(law, FREQUENCY_HZ, delay_frames)[:, 0], expected, rtol=1e-5)
+    expected = theory.noise_transfer(FREQUENCY_HZ, RATE_HZ, gain, leak, delay_frames)
+    np.testing.assert_allclose(noise_transfer(law, FREQUENCY_HZ, delay_frames)[:, 0], expected, rtol=1e-5)
+    assert noise_gain(law, delay_frames)[0] == pytest.approx(theory.noise_gain(gain, leak, delay_frames), rel=1e-3)
+
+
+@pytest.mark.parametrize("delay_frames", [1.0, 1.3, 1.5, 2.0, 3.0])
+def test_the_gain_margin_leads_to_the_limiting_gain(delay_frames: float) -> None:
+    found = margins(one(0.2, delay_frames), delay_frames)
+    assert 0.2 * found.gain_margin[0] == pytest.approx(limiting_gain(delay_frames), rel=1e-4)
+    assert found.gain_reduction[0] == 0
+    highest = limiting_gain(delay_frames)
+    assert margins(one(0.99 * highest, delay_frames), delay_frames).stable
+    assert not margins(one(1.01 * highest, delay_frames), delay_frames).stable
+
+
+def test_margins_of_half_a_gain_and_one_frame() -> None:
+    """By hand: L = g / (z - 1), |L| = 1 at 2 sin(w/2) = g; L is never nearer to -1 than at pi, 1 - g/2."""
+    found = margins(one(0.5, 1.0), 1.0)
+    omega = 2 * np.arcsin(0.25)
+    assert found.phase_margin_deg[0] == pytest.approx(np.degrees(np.pi / 2 - omega / 2), abs=0.05)
+    assert found.peak[0] == pytest.approx(1 / (1 - 0.25), rel=1e-4)
+    assert found.radius[0] == pytest.approx(0.5)
+    assert sentence(found) == "gain margin 4, phase margin 76 deg, max |S| 1.33"
+
+
+def test_the_true_delay_may_differ_from_the_law_s() -> None:
+    """A law of pseudo-open-loop modes reckons with its own delay; the loop it closes has the true one."""
+    law = integrators([(0.6, 0.0)], "pol", 1.0)
+    assert margins(law, 1.0).gain_margin[0] == pytest.approx(2 / 0.6, rel=1e-3)
+    # y[k] = c[k-2] - c[k-1], so that c[k] = 0.4 c[k-1] - 0.6 (c[k-2] - c[k-1]) = c[k-1] - 0.6 c[k-2]
+    assert margins(law, 2.0).radius[0] == pytest.approx(np.abs(np.roots([1, -1, 0.6])).max(), rel=1e-6)
+
+
+@pytest.mark.parametrize("gain", [0.3, 0.6, 0.9, 1.2])
+@pytest.mark.parametrize("true_frames", [1.0, 1.5, 2.0, 3.0])
+@pytest.mark.parametrize("signal", ["error", "pol"])
+def test_stable_is_what_settles(gain: float, true_frames: float, signal: Signal) -> None:
+    """Of a step, where the loop sees another delay than the law reckons with."""
+    law = integrators([(gain, 0.0)], signal, 1.0)
+    found = margins(law, true_frames)
+    if abs(found.radius[0] - 1) > 0.03:
+        left = run(law, np.ones((400, 1)), true_frames, limit_nm=1e6)[0][-1, 0]
+        assert found.stable == (abs(left) < 0.01)
+
+
+def test_rejection_is_what_a_loop_leaves_of_a_line() -> None:
+    law = LAWS["notch"]
+    for frequency_hz in (30.0, 71.0, 150.0):
+        line = np.repeat(np.sin(2 * np.pi * frequency_hz * np.arange(8000) / RATE_HZ)[:, None], 3, axis=1)
+        left = run(law, line, 1.0)[0][4000:].std(axis=0) / line.std(axis=0)
+        np.testing.assert_allclose(left, rejection(law, np.array([frequency_hz]), 1.0)[0], rtol=0.02)
+
+
+def test_a_notch_is_as_deep_and_as_wide_as_it_says() -> None:
+    made = pi_notch((4,), np.array([0.3]), np.zeros(1), np.zeros(1), [(Notch(60, 6, 10),)], 1.0, RATE_HZ)
+    bare = pi_notch((4,), np.array([0.3]), np.zeros(1), np.zeros(1), [()], 1.0, RATE_HZ)
+    at = np.array([57.0, 60.0, 63.0])
+    ratio = (rejection(made, at, 1.0) / rejection(bare, at, 1.0))[:, 0]
+    assert ratio[1] == pytest.approx(0.1, rel=0.01)
+    np.testing.assert_allclose(ratio[[0, 2]], np.sqrt(0.5), rtol=0.25)
+
+
+def test_modes_of_which_none_moves_count_as_stable() -> None:
+    law = one(0.0, 1.0)
+    check_stable(law, 1.0)
+    found = margins(law, 1.0)
+    assert found.stable
+    assert found.gain_margin[0] == np.inf
+    assert found.phase_margin_deg[0] == 180
+
+
+def test_an_unstable_law_is_refused_in_a_sentence() -> None:
+    with pytest.raises(
+        ValueError, match=r"unstable with a delay of 2 frames: closed, Z4 has a pole at 1\.\d+.*made for 1 frames"
+    ):
+        check_stable(one(1.2, 1.0), 2.0)
+
+
+def test_a_law_that_runs_away_while_open_is_refused() -> None:
+    law = one(0.5, 1.0)
+    with pytest.raises(ValueError, match=r"without frames, Z4 has a pole at 1.0100"):
+        check_stable(replace(law, predict_only=np.full((1, 1), 1.01)), 1.0)
+    growing = replace(law, transition=np.full((1, 1), 1.01), command_gain=law.command_gain - np.float32(1.01))
+    with pytest.raises(ValueError, match=r"open, Z4 has a pole at 1\.0100"):
+        check_stable(growing, 1.0)
+
+
+def test_modes_that_a_law_couples_are_taken_with_the_others_closed() -> None:
+    """Turning the modes into each other and back is the same loop: poles and |S| of a turned law are known."""
+    law = linear(law_of(modes=2), (4, 5))
+    turn = np.array([[0.8, -0.6], [0.6, 0.8]], np.float32)
+    turned = replace(
+        law, measurement_gain=turn @ law.measurement_gain @ turn.T, command_gain=turn @ law.command_gain @ turn.T
+    )
+    found = margins(turned, 1.0)
+    np.testing.assert_allclose(found.radius, 0.5, rtol=1e-5)
+    np.testing.assert_allclose(found.gain_margin, 4, rtol=1e-3)
+    np.testing.assert_allclose(rejection(turned, FREQUENCY_HZ, 1.0), rejection(law, FREQUENCY_HZ, 1.0), rtol=1e-4)
+
+
+def test_a_law_that_is_one_large_system_is_refused_at_once() -> None:
+    states, ones = MOST_COUPLED + 1, np.ones((MOST_COUPLED + 1, 1), np.float32)
+    dense = np.full((states, states), 1e-3, np.float32)
+    law = LinearLaw("error", dense, ones, 0 * ones, dense, -ones.T, "dense", (4,), 1.0, RATE_HZ)
+    with pytest.raises(ValueError, match="have to do with each other"):
+        check_stable(law, 1.0)

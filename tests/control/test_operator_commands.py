@@ -5,12 +5,12 @@ from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
-import numpy.typing as npt
 import pytest
 from hypothesis import Phase, given
 from hypothesis import settings as effort
 from hypothesis import strategies as st
 
+from lowfc.arrays import Single
 from lowfc.contract.codecs import codec
 from lowfc.contract.codecs.calibration_codec import encode_calibration, identified
 from lowfc.contract.codecs.law_codec import wire_law
@@ -37,8 +37,6 @@ from tests.support.toy import (
     frame_sequence,
     settings,
 )
-
-Single = npt.NDArray[np.float32]
 
 COMMANDS = 40
 """In each example."""

@@ -1,19 +1,22 @@
-"""The limits of the mirror hold for any wanted shape, exactly, in float64 and without tolerance."""
+"""The limits of the mirror hold for any wanted shape, exactly, in float64; each mutation of their source is caught."""
 
+import importlib.util
 import re
+import sys
 from pathlib import Path
+from types import ModuleType
+from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 import pytest
 from hypothesis import assume, example, given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
+from lowfc.arrays import Single
+from lowfc.control.loop import safety
 from lowfc.control.loop.safety import Limits, LoopMode, Reason, expired, limit, neighbour_difference_nm, request_mode
 from tests.support.safety_checks import CASES, LIMITS, Case, check_kept, violations
-
-Array = npt.NDArray[np.float32]
 
 GRID = (4, 5)
 
@@ -34,15 +37,15 @@ finite = st.one_of(st.sampled_from(EDGES), st.floats(-2000, 2000, width=32))
 anything = st.one_of(finite, st.floats(width=32), st.sampled_from([np.inf, -np.inf, np.nan, 1e38, -3.4e38]))
 
 
-def within(limits: Limits, actuators_nm: Array) -> bool:
+def within(limits: Limits, actuators_nm: Single) -> bool:
     stroke = np.abs(actuators_nm.astype(np.float64)).max() <= limits.stroke_nm
     return bool(stroke) and neighbour_difference_nm(actuators_nm.astype(np.float64)) <= limits.neighbour_nm
 
 
-def allowed_shapes(limits: Limits = LIMITS) -> st.SearchStrategy[Array]:
+def allowed_shapes(limits: Limits = LIMITS) -> st.SearchStrategy[Single]:
     """Shapes within the limits, many of them exactly at one."""
 
-    def bring_in(shape: Array) -> Array:
+    def bring_in(shape: Single) -> Single:
         shape = np.clip(shape, -np.float32(limits.stroke_nm), np.float32(limits.stroke_nm))
         apart = neighbour_difference_nm(shape.astype(np.float64))
         while apart > limits.neighbour_nm:
@@ -55,7 +58,7 @@ def allowed_shapes(limits: Limits = LIMITS) -> st.SearchStrategy[Array]:
 
 @settings(max_examples=400, deadline=None, derandomize=True)
 @given(previous=allowed_shapes(), wanted=hnp.arrays(np.float32, GRID, elements=anything.map(np.float32)))
-def test_whatever_is_wanted_the_limits_hold(previous: Array, wanted: Array) -> None:
+def test_whatever_is_wanted_the_limits_hold(previous: Single, wanted: Single) -> None:
     assert within(LIMITS, previous)
     limited = limit(LIMITS, previous, wanted)
     assert violations(LIMITS, previous, limited.actuators_nm) == []
@@ -87,7 +90,7 @@ def test_cases_by_hand(case: Case) -> None:
 
 @settings(max_examples=200, deadline=None, derandomize=True)
 @given(previous=allowed_shapes(), fraction=st.floats(0, 1))
-def test_what_is_allowed_goes_through_unchanged(previous: Array, fraction: float) -> None:
+def test_what_is_allowed_goes_through_unchanged(previous: Single, fraction: float) -> None:
     """A move well within every limit is carried out as it was wanted, and nothing is said about it."""
     wanted = (previous * np.float32(fraction)).astype(np.float32)
     assume(np.abs(wanted.astype(np.float64) - previous).max() < LIMITS.slew_nm - 0.01)
@@ -143,7 +146,7 @@ def test_nothing_given_is_changed() -> None:
     previous=hnp.arrays(np.float32, GRID, elements=st.floats(-3000, 3000, width=32)),
     wanted=hnp.arrays(np.float32, GRID, elements=finite.map(np.float32)),
 )
-def test_a_shape_outside_the_limits_comes_back(previous: Array, wanted: Array) -> None:
+def test_a_shape_outside_the_limits_comes_back(previous: Single, wanted: Single) -> None:
     """What is outside never goes further out, comes in at no more than the slew limit, and gets there."""
     shape, steps = previous, 0
     while not within(LIMITS, shape):
@@ -163,7 +166,7 @@ def test_a_shape_outside_the_limits_comes_back(previous: Array, wanted: Array) -
 
 @settings(max_examples=200, deadline=None, derandomize=True)
 @given(previous=st.one_of(allowed_shapes(), hnp.arrays(np.float32, GRID, elements=st.floats(-3000, 3000, width=32))))
-def test_relaxing_reaches_flat(previous: Array) -> None:
+def test_relaxing_reaches_flat(previous: Single) -> None:
     shape, steps = previous, 0
     while shape.any():
         after = limit(LIMITS, shape, np.zeros(GRID, np.float32)).actuators_nm
@@ -175,7 +178,7 @@ def test_relaxing_reaches_flat(previous: Array) -> None:
 
 @settings(max_examples=100, deadline=None, derandomize=True)
 @given(shape=allowed_shapes(), seed=st.integers(0, 2**32 - 1))
-def test_a_mirror_pressed_against_the_neighbour_limit_stays_there(shape: Array, seed: int) -> None:
+def test_a_mirror_pressed_against_the_neighbour_limit_stays_there(shape: Single, seed: int) -> None:
     """It does not fall back towards flat and it does not shake: repeated wishes for too much change nothing much."""
     rng = np.random.default_rng(seed)
     wanted = (5000 * rng.standard_normal(GRID)).astype(np.float32)
@@ -231,3 +234,137 @@ def test_the_document_on_safety_names_tests_that_exist() -> None:
     every = "\n".join(path.read_text(encoding="utf-8") for path in (root / "tests").rglob("test_*.py"))
     assert len(named) > 30
     assert {name for name in named if f"def {name}(" not in every} == set()
+
+
+SOURCE = Path(safety.__file__).read_text(encoding="utf-8")
+
+MUTATIONS = {
+    "stroke never looked at": ("if max(highest_nm, -lowest_nm) > stroke:", "if False:"),
+    "stroke cut on one side": ("np.clip(kept, -stroke, stroke)", "np.clip(kept, None, stroke)"),
+    "stroke cut on the other side": ("np.clip(kept, -stroke, stroke)", "np.clip(kept, -stroke, None)"),
+    "stroke without a sign": ("if max(highest_nm, -lowest_nm) > stroke:", "if highest_nm > stroke:"),
+    "stroke without a margin": ("np.float32(self.stroke_nm - margin_nm)", "np.float32(self.stroke_nm + margin_nm)"),
+    "slew never looked at": ("if max(highest_move, -lowest_move) > slew:", "if False:"),
+    "slew without a sign": ("if max(highest_move, -lowest_move) > slew:", "if highest_move > slew:"),
+    "slew cut on one side": ("np.clip(move, -slew, slew)", "np.clip(move, None, slew)"),
+    "slew cut on the other side": ("np.clip(move, -slew, slew)", "np.clip(move, -slew, None)"),
+    "slew from flat": ("kept = previous_nm + move", "kept = move"),
+    "slew the wrong way": ("kept = previous_nm + move", "kept = previous_nm - move"),
+    "slew without a margin": ("np.float32(self.slew_nm - margin_nm)", "np.float32(self.slew_nm + margin_nm)"),
+    "stroke limit for slew": ("np.float32(self.slew_nm - margin_nm)", "np.float32(self.stroke_nm - margin_nm)"),
+    "neighbours never looked at": ("if highest_nm - lowest_nm > apart_nm and", "if False and"),
+    "neighbours looked at where twice as far apart": (
+        "if highest_nm - lowest_nm > apart_nm and",
+        "if highest_nm - lowest_nm > 2 * apart_nm and",
+    ),
+    "neighbours without a margin": (
+        "apart_nm = limits.neighbour_nm - limits.margin_nm / 2",
+        "apart_nm = limits.neighbour_nm + limits.margin_nm",
+    ),
+    "neighbours in a column only": ("float(max(rows, columns))", "float(rows)"),
+    "neighbours in a row only": ("float(max(rows, columns))", "float(columns)"),
+    "neighbours without a sign": (
+        "np.abs(actuators_nm[1:] - actuators_nm[:-1])",
+        "(actuators_nm[1:] - actuators_nm[:-1])",
+    ),
+    "shortened along one axis": ("for axis in (0, 1):", "for axis in (0,):"),
+    "shortened along the other axis": ("for axis in (0, 1):", "for axis in (1,):"),
+    "shortened too little": ("fraction = min(fraction, float(", "fraction = max(fraction, float("),
+    "shortened without a sign": ("np.sign(after[over]) * before[over]", "before[over]"),
+    "not shortened": ("kept = _shorten(limits, previous_nm, kept)", "pass"),
+    "apart, shrunk at once": ("max(enough, slowest)", "enough"),
+    "apart, never shrunk": ("max(enough, slowest)", "1"),
+    "apart, not noticed": ("if apart_nm > neighbour_nm or largest_nm > limits.stroke_nm:", "if False:"),
+    "not finite let through": ("if not (isfinite(lowest_nm) and isfinite(highest_nm)):", "if False:"),
+    "only one value finite": (
+        "if not (isfinite(lowest_nm) and isfinite(highest_nm)):",
+        "if not (isfinite(lowest_nm) or isfinite(highest_nm)):",
+    ),
+    "not finite becomes flat": (
+        "Limited(previous_nm, (Reason.NOT_FINITE,))",
+        "Limited(0 * previous_nm, (Reason.NOT_FINITE,))",
+    ),
+    "another grid let through": ("if wanted_nm.shape != previous_nm.shape:", "if False:"),
+    "not said: stroke": ("reasons.append(Reason.STROKE)", "pass"),
+    "not said: slew": ("reasons.append(Reason.SLEW)", "pass"),
+    "not said: neighbours": ("reasons.append(Reason.NEIGHBOUR)", "pass"),
+    "limits of nothing": ("if not 2 * self.margin_nm < value < np.inf:", "if False:"),
+    "margin for short strokes only": ("max(MARGIN_NM, ldexp", "min(MARGIN_NM, ldexp"),
+    "dead-man one early": ("not 0 <= age_ns <= valid_for_ns", "not 0 <= age_ns < valid_for_ns"),
+    "dead-man asleep": ("not 0 <= age_ns <= valid_for_ns", "False"),
+    "dead-man trusts the clock": ("not 0 <= age_ns <= valid_for_ns", "age_ns > valid_for_ns"),
+    "clear closes": ("(LoopMode.OPEN if calibrated", "(LoopMode.CLOSED if calibrated"),
+    "clear in any mode": ('case "clear" if mode is LoopMode.SAFE:', 'case "clear" if True:'),
+    "safed is not latched": ('case "open" | "close" if mode is LoopMode.SAFE:', 'case "open" | "close" if False:'),
+    "close without calibration": ('case "close" if not calibrated:', 'case "close" if False:'),
+    "safe can be refused": ('return LoopMode.SAFE, ""', 'return (LoopMode.SAFE if calibrated else mode), ""'),
+}
+
+
+def module_of(source: str) -> ModuleType:
+    """The safety module from this source, beside the real one."""
+    spec = importlib.util.spec_from_loader("mutated_safety", loader=None)
+    module = importlib.util.module_from_spec(spec)
+    sys.modules[module.__name__] = module  # dataclasses look their module up
+    try:
+        exec(compile(source, "mutated_safety.py", "exec"), module.__dict__)  # noqa: S102  # our own source
+    finally:
+        del sys.modules[module.__name__]
+    return module
+
+
+def check(module: Any) -> None:
+    """AssertionError, or whatever the mutation raises, where the module does not do what it must."""
+    for case in CASES:
+        check_kept(module.limit, case)
+    _check_random_walks(module)
+    for bad in (0.0, -1.0, np.nan, np.inf):
+        for limits in ((bad, 100.0, 400.0), (700.0, bad, 400.0), (700.0, 100.0, bad)):
+            try:
+                module.Limits(*limits)
+            except ValueError:
+                continue
+            raise AssertionError(f"{limits} taken")
+    assert not module.expired(0, 0)
+    assert not module.expired(200, 200)
+    assert module.expired(201, 200)
+    assert module.expired(-1, 200)
+    _check_modes(module)
+
+
+def _check_random_walks(module: Any) -> None:
+    """Towards random shapes at the edge of what is allowed, step after step; far strokes need a wider margin."""
+    rng = np.random.default_rng(7)
+    usual, far, free = (LIMITS.stroke_nm, LIMITS.slew_nm, LIMITS.neighbour_nm), (2e5, 1.5e5, 1.5e5), (700.0, 500.0, 2e3)
+    for bounds in (usual, far, free):  # in the last, neighbours may be anywhere
+        limits, shape = module.Limits(*bounds), np.zeros((3, 4), np.float32)
+        for _ in range(60):
+            wanted = (rng.choice([0.3, 1, 3]) * limits.stroke_nm * rng.standard_normal((3, 4))).astype(np.float32)
+            after = module.limit(limits, shape, wanted).actuators_nm
+            assert violations(limits, shape, after) == []
+            shape = after
+
+
+def _check_modes(module: Any) -> None:
+    mode, ask = module.LoopMode, module.request_mode
+    for now in mode:
+        for calibrated in (True, False):
+            assert ask(now, "safe", calibrated)[0] is mode.SAFE
+            cleared = (mode.OPEN if calibrated else mode.IDLE) if now is mode.SAFE else now
+            assert ask(now, "clear", calibrated)[0] is cleared
+            free = calibrated and now is not mode.SAFE
+            opened = mode.SAFE if now is mode.SAFE else mode.OPEN if calibrated else mode.IDLE
+            assert ask(now, "open", calibrated)[0] is opened
+            assert ask(now, "close", calibrated)[0] is (mode.CLOSED if free else now)
+
+
+def test_the_checks_pass_on_the_real_source() -> None:
+    check(module_of(SOURCE))
+
+
+@pytest.mark.parametrize("name", MUTATIONS)
+def test_a_mutation_is_caught(name: str) -> None:
+    before, after = MUTATIONS[name]
+    assert SOURCE.count(before) == 1, f"{before!r} is {SOURCE.count(before)} times in the source: rewrite this mutation"
+    with np.errstate(all="ignore"), pytest.raises((AssertionError, ArithmeticError, ValueError)):
+        check(module_of(SOURCE.replace(before, after)))

@@ -21,8 +21,6 @@ from lowfc.programs.launch.status import screen, status_line, summary_text
 from lowfc.programs.launch.watch import Watch, summary
 from tests.support.toy import DARK_DN, SATURATION_DN, SHAPE, START, frame, loaded, settings
 
-pytestmark = pytest.mark.exclusive
-
 USUAL = settings()
 CAMERA = CameraSettings(START * 10**9, SHAPE, DARK_DN, SATURATION_DN)
 SECOND = 10**9

@@ -6,7 +6,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from typer.testing import CliRunner
 
 from lowfc.adapters.logs.history import read_history
 from lowfc.adapters.logs.parts import WholeLog
@@ -29,21 +28,16 @@ from lowfc.contract.messages import (
     Topic,
     wire,
 )
-from lowfc.programs.cli.main import app
 from lowfc.programs.core.recording.volume import bytes_per_s, outlook, selected
 from lowfc.programs.logs.survey import survey
 from lowfc.programs.logs.what_if.compare import WhatIf, wanted, what_if
+from tests.support.loops import lowfc, until
 from tests.support.recording import Bench, bodies_of, logged, put
 from tests.support.report_log import Night
 
-pytestmark = pytest.mark.exclusive
+pytestmark = pytest.mark.usefixtures("own_runtime")
 
 EVERY = 10
-
-
-@pytest.fixture(autouse=True)
-def runtime(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
 
 
 @pytest.fixture(scope="module")
@@ -118,8 +112,7 @@ def test_a_disk_that_refuses_does_not_lose_what_was_left_out(tmp_path: Path) -> 
     frames = bench.camera.publisher(FRAME)
     bench.start(selection=Selection(EVERY))
     put(frames, 45)
-    while len(bench.recorder._backlog):
-        pass
+    until(lambda: not bench.recorder._backlog)
     bench.recorder._series.flush = lambda: (_ for _ in ()).throw(DataFileError("full"))
     put(frames, 5)
     summary = bench.stop()
@@ -134,8 +127,7 @@ def test_the_next_file_says_it_too(tmp_path: Path) -> None:
     for number in range(2):
         before = len(bench.recorder._series.files)
         frames.put(np.random.default_rng(number).bytes(30_000), sequence=2 * number)
-        while not number and len(bench.recorder._series.files) == before:
-            pass
+        until(lambda before=before, number=number: number or len(bench.recorder._series.files) > before)
     summary = bench.stop()
     assert len(summary.files) >= 2
     assert all(survey(path)["selection"] for path in summary.files)
@@ -162,7 +154,7 @@ def test_a_smaller_copy_has_the_same_steps(whole: Path, small: Path) -> None:
 
 def test_replay_refuses_it_in_one_sentence(small: Path) -> None:
     for words in (["--jobs", "1"], ["--jobs", "2"]):
-        done = CliRunner().invoke(app, ["replay", str(small), *words])
+        done = lowfc("replay", small, *words)
         assert isinstance(done.exception, LowfcError)
         assert "\n" not in str(done.exception)
         assert "1 in 10 frames and mirror states" in str(done.exception)
@@ -171,7 +163,7 @@ def test_replay_refuses_it_in_one_sentence(small: Path) -> None:
 def test_replay_needs_frames_and_nothing_else_that_may_be_left_out(whole: Path) -> None:
     out = whole.with_name("frames.mcap")
     thin((whole,), out, selection(1, [FRAME.key]))
-    done = CliRunner().invoke(app, ["replay", str(out), "--json"])
+    done = lowfc("replay", out, "--json")
     assert done.exit_code == 0, done.exception
     assert json.loads(done.stdout)["frames"] == 2500
 
@@ -194,7 +186,7 @@ def _estimator(log: Path) -> str:
 def test_a_report_is_of_the_same_run(whole: Path, small: Path) -> None:
     found: list[dict[str, Any]] = []
     for log in (whole, small):
-        done = CliRunner().invoke(app, ["report", str(log), "--json", "--out", str(log.with_suffix(".html"))])
+        done = lowfc("report", log, "--json", "--out", log.with_suffix(".html"))
         assert done.exit_code == 0, done.exception
         found.append(json.loads(done.stdout))
     for part in ("residual", "spectra", "error_budget", "closed_stretch", "light", "laws", "requests"):
@@ -208,7 +200,7 @@ def test_a_report_is_of_the_same_run(whole: Path, small: Path) -> None:
 
 def test_an_export_joins_what_is_there(small: Path, tmp_path: Path) -> None:
     out = tmp_path / "small.npz"
-    done = CliRunner().invoke(app, ["export", str(small), "--to", "npz", "--frames", "--out", str(out), "--json"])
+    done = lowfc("export", small, "--to", "npz", "--frames", "--out", out, "--json")
     assert done.exit_code == 0, done.exception
     assert json.loads(done.stdout)["selection"] == "1 in 10 frames and mirror states"
     with np.load(out) as found:
@@ -223,7 +215,7 @@ def test_an_export_joins_what_is_there(small: Path, tmp_path: Path) -> None:
     [["--to", "csv", "--decimate", "3"], [], ["--decimate", "3", "--frames"], ["--to", "csv", "--topics", FRAME.key]],
 )
 def test_an_export_is_one_thing(whole: Path, words: list[str]) -> None:
-    done = CliRunner().invoke(app, ["export", str(whole), *words])
+    done = lowfc("export", whole, *words)
     assert isinstance(done.exception, ConfigurationError)
     assert "choose one" in str(done.exception)
 
@@ -242,7 +234,7 @@ def test_what_it_will_take_is_said_before(tmp_path: Path) -> None:
 
 
 def test_record_start_names_the_request(tmp_path: Path) -> None:
-    done = CliRunner().invoke(app, ["record", "start"])
+    done = lowfc("record", "start")
     assert isinstance(done.exception, ConfigurationError)
     assert "`lowfc ctl record start`" in str(done.exception)
 

@@ -38,14 +38,10 @@ from lowfc.contract.messages import (
 )
 from lowfc.programs.core.recording.recorder import Recorder
 from lowfc.testing.memory_bus import MemoryBus
-from tests.support.recording import PATIENCE_S, Bench, bodies_of, logged, put, until
+from tests.support.loops import until
+from tests.support.recording import PATIENCE_S, Bench, bodies_of, logged, put
 
-pytestmark = pytest.mark.exclusive
-
-
-@pytest.fixture(autouse=True)
-def runtime(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
+pytestmark = pytest.mark.usefixtures("own_runtime")
 
 
 @pytest.fixture
@@ -333,6 +329,7 @@ def recording(camera: Camera, tmp_path: Path) -> Iterator[subprocess.Popen[str]]
     process.communicate()
 
 
+@pytest.mark.exclusive
 def test_a_recorder_process_loses_nothing_from_the_first_frame_on(
     camera: Camera, recording: subprocess.Popen[str], tmp_path: Path
 ) -> None:
@@ -360,6 +357,7 @@ def test_a_recorder_process_loses_nothing_from_the_first_frame_on(
     assert all(described[key] for key in ("host", "kernel", "processor", "python", "numpy", "eclipse-zenoh", "run"))
 
 
+@pytest.mark.exclusive
 def test_a_killed_recorder_leaves_a_readable_log_and_a_loop_that_goes_on(
     camera: Camera, recording: subprocess.Popen[str], tmp_path: Path
 ) -> None:

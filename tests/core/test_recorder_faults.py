@@ -19,16 +19,15 @@ from lowfc.adapters.logs import writer
 from lowfc.adapters.logs.reader import LogReader
 from lowfc.adapters.logs.series import Limits
 from lowfc.adapters.logs.writer import UNFINISHED, Attachment
-from lowfc.contract.envelope import Envelope, count_of, sequence_of
+from lowfc.contract.envelope import count_of, sequence_of
 from lowfc.contract.messages import CALIBRATION, COMMAND, EVENT, FRAME, HEALTH, RECORD_KEY, STEP, Topic, wire
 from lowfc.programs.core.recording import recorder as recorder_module
 from lowfc.programs.core.recording.recorder import Recorder
 from lowfc.programs.core.recording.summary import Summary
 from lowfc.testing.clock import FakeClock
 from lowfc.testing.memory_bus import MemoryBus, MemoryHub
-from tests.support.recording import PATIENCE_S, Bench, bodies_of, logged, put, until
-
-pytestmark = pytest.mark.exclusive
+from tests.support.loops import until
+from tests.support.recording import PATIENCE_S, Bench, bodies_of, logged, put
 
 
 @pytest.fixture
@@ -149,6 +148,7 @@ def test_a_folder_that_vanishes_ends_the_recording_only(bench: Bench) -> None:
     assert not bench.folder.exists()
 
 
+@pytest.mark.exclusive
 def test_a_disk_that_stalls_costs_messages_and_they_are_counted(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(recorder_module, "QUEUE_MESSAGES", 100)
     monkeypatch.setattr(recorder_module, "_SLOW_NS", 50_000_000)
@@ -185,23 +185,29 @@ def test_a_disk_that_stalls_costs_messages_and_they_are_counted(bench: Bench, mo
     assert summary.longest_unflushed_ns > 100_000_000
 
 
-@pytest.mark.parametrize("refused", [False, True])
-def test_the_loop_of_a_recorder_goes_on_while_the_disk_takes_a_stopped_log(
-    bench: Bench, monkeypatch: pytest.MonkeyPatch, refused: bool
-) -> None:
-    reached, release, answers = threading.Event(), threading.Event(), list[Sample]()
-    sync = os.fsync
+def slow_disk(monkeypatch: pytest.MonkeyPatch, *, refuses: bool) -> tuple[threading.Event, threading.Event]:
+    """Hold a log up while it is flushed: whether that has begun, and when it may go on."""
+    reached, release, sync = threading.Event(), threading.Event(), os.fsync
 
     def slow(descriptor: int) -> None:
         reached.set()
         assert release.wait(PATIENCE_S)
-        if refused:
+        if refuses:
             raise OSError(5, "Input/output error")
         sync(descriptor)
 
+    monkeypatch.setattr(writer.os, "fsync", slow)
+    return reached, release
+
+
+@pytest.mark.parametrize("refused", [False, True])
+def test_the_loop_of_a_recorder_goes_on_while_the_disk_takes_a_stopped_log(
+    bench: Bench, monkeypatch: pytest.MonkeyPatch, refused: bool
+) -> None:
     bench.start()
     put(bench.camera.publisher(FRAME), 10)
-    monkeypatch.setattr(writer.os, "fsync", slow)
+    reached, release = slow_disk(monkeypatch, refuses=refused)
+    answers: list[Sample] = []
     operator = MemoryBus(bench.hub, "operator", bench.clock)
     asking = threading.Thread(
         target=lambda: answers.extend(operator.get(RECORD_KEY.format(name="stop"), timeout_s=PATIENCE_S))
@@ -232,16 +238,8 @@ def test_the_loop_of_a_recorder_goes_on_while_the_disk_takes_a_stopped_log(
 def test_a_recorder_told_to_end_while_a_log_is_being_stopped_ends_with_it(
     bench: Bench, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    reached, release = threading.Event(), threading.Event()
-    sync = os.fsync
-
-    def slow(descriptor: int) -> None:
-        reached.set()
-        assert release.wait(PATIENCE_S)
-        sync(descriptor)
-
     bench.start()
-    monkeypatch.setattr(writer.os, "fsync", slow)
+    reached, release = slow_disk(monkeypatch, refuses=False)
     operator = MemoryBus(bench.hub, "operator", bench.clock)
     operator.get(RECORD_KEY.format(name="stop"), timeout_s=0)
     assert reached.wait(PATIENCE_S)
@@ -279,10 +277,8 @@ def test_each_log_of_a_run_can_be_read_by_itself(bench: Bench) -> None:
     calibrations, frames = bench.controller.publisher(CALIBRATION), bench.camera.publisher(FRAME)
     put(calibrations, 1)
 
-    def lose(role: str, key: str, envelope: Envelope) -> bool:
-        return (role, key, count_of(envelope.sequence)) == ("recorder", CALIBRATION.key, 1)
-
-    bench.hub.lose = lose
+    lost = ("recorder", CALIBRATION.key, 1)
+    bench.hub.lose = lambda role, key, envelope: (role, key, count_of(envelope.sequence)) == lost
     bench.start(
         limits=Limits(longest_s=0.6, min_free_bytes=0), attachments=[Attachment("a.toml", "application/toml", b"[a]")]
     )

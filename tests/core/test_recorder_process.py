@@ -12,7 +12,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from typer.testing import CliRunner
 
 from lowfc.adapters.bus.run import new_run_id, open_run
 from lowfc.adapters.bus.zenoh_bus import ZenohBus
@@ -24,11 +23,9 @@ from lowfc.adapters.process.provenance import provenance
 from lowfc.adapters.process.service import Service
 from lowfc.contract.envelope import count_of
 from lowfc.contract.messages import FRAME, STEP
-from lowfc.programs.cli.ctl.command import ctl_app
+from tests.support.loops import lowfc, start, until
 from tests.support.other_readers import foxglove, rerun
-from tests.support.recording import PATIENCE_S, bodies_of, until
-
-pytestmark = pytest.mark.exclusive
+from tests.support.recording import PATIENCE_S, bodies_of
 
 SAFE_NS = 600_000_000
 """What a kill may cost: the messages published in this time before it."""
@@ -114,6 +111,7 @@ def benches(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[list[Ben
             os.killpg(parent.pid, signal.SIGKILL)
 
 
+@pytest.mark.exclusive
 @pytest.mark.node
 @pytest.mark.parametrize("benches", [10], indirect=True)
 @pytest.mark.parametrize("seed", [1, 2])
@@ -165,6 +163,7 @@ SIGNALS = (
 )
 
 
+@pytest.mark.exclusive
 @pytest.mark.parametrize("benches", [len(SIGNALS)], indirect=True)
 def test_however_it_is_told_to_stop_the_log_is_finished(benches: list[Bench], tmp_path: Path) -> None:
     parent = started(benches, tmp_path)
@@ -184,18 +183,12 @@ def test_however_it_is_told_to_stop_the_log_is_finished(benches: list[Bench], tm
         assert reader.metadata["recording"]["messages_lost"] == "0"
 
 
-def lowfc(*arguments: object) -> "subprocess.Popen[str]":
-    return subprocess.Popen(
-        [sys.executable, "-m", "lowfc", *map(str, arguments)],
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
-    )
-
-
+@pytest.mark.exclusive
 def test_the_command_rotates_and_says_what_it_did(tmp_path: Path) -> None:
     bench = Bench(tmp_path)
-    process = lowfc("record", "--run", bench.run.run_id, "--folder", tmp_path / "logs", "--longest-s", 1, "--json")
+    process = start(
+        tmp_path, "record", "--run", bench.run.run_id, "--folder", tmp_path / "logs", "--longest-s", 1, "--json"
+    )
     until(lambda: bench.recorder_is("ready"))
 
     def put_until_rotated() -> bool:
@@ -226,18 +219,18 @@ def test_the_command_rotates_and_says_what_it_did(tmp_path: Path) -> None:
     assert done["longest_unflushed_ms"] >= done["longest_wait_ms"] > 0
 
 
-def test_a_recording_is_ended_where_the_controller_has_died(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
+@pytest.mark.exclusive
+def test_a_recording_is_ended_where_the_controller_has_died(tmp_path: Path, own_runtime: Path) -> None:
     bench = Bench(tmp_path)
-    process = lowfc("record", "--run", bench.run.run_id, "--folder", tmp_path / "logs")
+    process = start(tmp_path, "record", "--run", bench.run.run_id, "--folder", tmp_path / "logs")
     until(lambda: bench.recorder_is("ready"))
     for _ in range(20):
         bench.put()
-    stopped = CliRunner().invoke(ctl_app, ["record", "stop", "--json"], catch_exceptions=False)
+    stopped = lowfc("ctl", "record", "stop", "--json")
     reader = LogReader(Path(json.loads(stopped.stdout)["log"]))
     assert len(bodies_of(list(reader), FRAME)) == 20
     assert reader.complete
-    refused = CliRunner().invoke(ctl_app, ["status", "--run", bench.run.run_id])
+    refused = lowfc("ctl", "status", "--run", bench.run.run_id)
     assert f"no controller is there in run '{bench.run.run_id}'" in str(refused.exception)
     process.send_signal(signal.SIGTERM)
     until(lambda: bench.recorder_is("stopping"))
@@ -258,7 +251,8 @@ def test_a_recording_is_ended_where_the_controller_has_died(tmp_path: Path, monk
 def test_what_cannot_be_recorded_is_refused_before_anything_is_made(
     options: tuple[object, ...], complaint: str, tmp_path: Path
 ) -> None:
-    process = lowfc("record", "--run", new_run_id(), *(str(option).format(tmp_path) for option in options))
+    said = (str(option).format(tmp_path) for option in options)
+    process = start(tmp_path, "record", "--run", new_run_id(), *said)
     out, wrong = process.communicate(timeout=PATIENCE_S)
     assert (process.returncode, out) == (2, "")
     *_, line = wrong.strip().splitlines()

@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 from scipy.optimize import linprog
 from scipy.special import j0, j1
-from typer.testing import CliRunner
 
 from lowfc.adapters.files.sensors import load_pupil
 from lowfc.contract.errors import ConfigurationError, DataFileError
@@ -27,7 +26,7 @@ from lowfc.design.shaped_pupil import (
 from lowfc.optics.chain.fourier import to_image
 from lowfc.optics.chain.grid import OPEN_AREA, SAMPLES, image_axis, pupil_axis
 from lowfc.optics.chain.pupil import circle, from_quarter
-from lowfc.programs.design.command import design_app
+from tests.support.loops import lowfc
 
 SMALL = Request(outer=8.0, cells=16)
 SHIPPED = resources.files("lowfc") / "data" / "spc_quarter128.npz"
@@ -98,7 +97,7 @@ def test_the_command_writes_a_mask_that_keeps_its_promise_between_the_points(tmp
     path, picture = tmp_path / "spc.npz", tmp_path / "spc.png"
     pytest.importorskip("matplotlib")
     arguments = ["spc", "--outer", "8", "--cells", "64", "--out", str(path), "--plot", str(picture), "--json"]
-    answer = CliRunner().invoke(design_app, arguments)
+    answer = lowfc("design", *arguments)
     assert answer.exit_code == 0, answer.output
     result = json.loads(answer.stdout)
     assert result["open_area_fraction"] == pytest.approx(0.5317, abs=5e-4)
@@ -141,7 +140,7 @@ def test_the_shortest_type_that_keeps_the_promise():
 def test_an_infeasible_request_names_the_nearest_that_is_feasible(tmp_path):
     path = tmp_path / "spc.npz"
     arguments = ["spc", "--inner", "2.5", "--outer", "8", "--cells", "16", "--out", str(path)]
-    error = CliRunner().invoke(design_app, arguments).exception
+    error = lowfc("design", *arguments).exception
     assert isinstance(error, ConfigurationError)
     assert "inner angle 2.5 lambda/D at 1e-09 is infeasible" in str(error)
     nearest = r"nearest feasible inner angle is (\S+) \(contrast kept\), or contrast is (\S+) \(angle kept\)"
@@ -175,7 +174,7 @@ def test_impossible_requests_are_refused(values, message):
 
 def test_too_few_rounds_say_what_to_do(tmp_path):
     arguments = ["spc", "--outer", "8", "--cells", "16", "--rounds", "1", "--out", str(tmp_path / "spc.npz")]
-    error = CliRunner().invoke(design_app, arguments).exception
+    error = lowfc("design", *arguments).exception
     assert isinstance(error, ConfigurationError)
     assert "after 1 programs with 16 cells the contrast is" in str(error)
     assert list(tmp_path.iterdir()) == []
@@ -189,13 +188,13 @@ def test_only_the_solver_that_gives_up_is_the_users_affair(tmp_path, monkeypatch
         raise failure
 
     monkeypatch.setattr(shaped_pupil, "maximise", fail)
-    error = CliRunner().invoke(design_app, ["spc", "--out", str(tmp_path / "spc.npz")]).exception
+    error = lowfc("design", "spc", "--out", tmp_path / "spc.npz").exception
     assert type(error) is seen
     assert str(error) == str(failure)
 
 
 def test_a_file_that_cannot_be_written_is_said_first(tmp_path):
-    error = CliRunner().invoke(design_app, ["spc", "--out", str(tmp_path / "nowhere" / "spc.npz")]).exception
+    error = lowfc("design", "spc", "--out", tmp_path / "nowhere" / "spc.npz").exception
     assert isinstance(error, DataFileError)
     assert "there is no directory" in str(error)
 

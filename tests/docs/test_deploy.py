@@ -32,8 +32,6 @@ from lowfc.programs.core.controller import MIRROR_PATIENCE_S
 from sim_camera.process import PATIENCE_S
 from tests.support.loops import until
 
-pytestmark = pytest.mark.exclusive
-
 DEPLOY = Path(__file__).parents[2] / "deploy"
 UNITS = sorted(path.name for path in (DEPLOY / "systemd").glob("*.service"))
 LOOP = ("lowfc-controller.service", "lowfc-sim-camera.service", "lowfc-sim-mirror.service")
@@ -274,8 +272,6 @@ main()
 
 
 class Supervised:
-    """One of the units' processes."""
-
     def __init__(self, name: str, folder: Path, run: str) -> None:
         self.name = name
         self.manager = Manager(folder / f"{name}.notify", WAIT_S)
@@ -325,6 +321,7 @@ def told_to_stop(those: list[Supervised]) -> None:
         assert one.manager.status().startswith("stopped")
 
 
+@pytest.mark.exclusive
 def test_processes_are_ready_alive_and_stopping(tmp_path: Path) -> None:
     with supervised(tmp_path, "recorder", "sim-mirror", "controller", "sim-camera") as found:
         until(lambda: all(ready_and_alive(one) for one in found.values()))
@@ -355,6 +352,7 @@ def test_processes_are_ready_alive_and_stopping(tmp_path: Path) -> None:
         told_to_stop([one for one in found.values() if one is not controller])
 
 
+@pytest.mark.exclusive
 @pytest.mark.slow
 def test_a_viewer_is_ready_alive_and_stopping(tmp_path: Path) -> None:
     with supervised(tmp_path, "controller") as found:

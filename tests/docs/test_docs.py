@@ -5,19 +5,15 @@ import re
 import shlex
 import subprocess
 import sys
-import time
 from pathlib import Path
 
 import pytest
 
 from tests.e2e.test_bench_day import COMMANDS as BENCH_DAY
-from tests.e2e.test_commission_page import COMMANDS as COMMISSIONING
 from tests.e2e.test_operator import COMMANDS as OPERATING
-from tests.e2e.test_own_hardware import DOCUMENTED
-from tests.support.loops import children, interrupt, recorded_bytes, start, until
-from tests.support.viewers import needs_vulkan
-
-pytestmark = pytest.mark.exclusive
+from tests.e2e.test_own_hardware import COMMISSIONING, DOCUMENTED
+from tests.support.loops import interrupt, recorded_bytes, start, until
+from tests.support.viewers import on_screen
 
 ROOT = Path(__file__).parents[2]
 README = ROOT / "README.md"
@@ -27,7 +23,7 @@ ELSEWHERE = {
     "make sim-loop": ".ci/run",
     "make test": ".ci/run",
     "lowfc doctor": "tests/commissioning/test_doctor.py",
-    "rerun $(ls -t logs/*.mcap | head -1)": "tests/e2e/test_viewer.py",
+    "rerun $(ls -t logs/*.mcap | head -1)": "tests/e2e/test_rerun_viewer.py",
     ROUTE: "tests/design/test_layout_files.py",
 }
 SHORTER = {
@@ -130,18 +126,22 @@ LOGS = (
 )
 
 
+@pytest.mark.exclusive
 @pytest.mark.parametrize("command", [LOOPS[0], *(pytest.param(one, marks=pytest.mark.slow) for one in LOOPS[1:])])
 def test_the_loops(tmp_path: Path, command: str) -> None:
     assert "frame to command" in run(tmp_path, command)
     assert len(list((tmp_path / "logs").glob("*.mcap"))) == 1
 
 
+@pytest.mark.exclusive
 @pytest.mark.slow
-def test_the_requests(tmp_path: Path) -> None:
+def test_the_requests(tmp_path: Path, own_runtime: Path) -> None:
     loop = start(tmp_path, "sim-loop", "--rate", "100", "--no-record")
     try:
-        until(lambda: "controller" in children(loop.pid))
-        time.sleep(3)
+        status = [sys.executable, "-m", "lowfc", "ctl", "status"]
+        until(
+            lambda: "closed · residual " in subprocess.run(status, capture_output=True, text=True, check=False).stdout
+        )
         said = [run(tmp_path, command) for command in REQUESTS]
     finally:
         out, complaints = interrupt(loop)
@@ -154,6 +154,7 @@ def test_the_requests(tmp_path: Path) -> None:
     assert "frame to command" in out
 
 
+@pytest.mark.exclusive
 @pytest.mark.parametrize("recorder", [BY_HAND[3], pytest.param(FEWER, marks=pytest.mark.slow)])
 def test_the_processes_by_hand(tmp_path: Path, recorder: str) -> None:
     program = Path(sys.executable).parent
@@ -177,6 +178,7 @@ def test_the_processes_by_hand(tmp_path: Path, recorder: str) -> None:
     assert len(list((tmp_path / "logs").glob("*.mcap"))) == 1
 
 
+@pytest.mark.exclusive
 @pytest.mark.slow
 def test_the_bench(tmp_path: Path) -> None:
     assert "rank" in run(tmp_path, BENCH[0])
@@ -184,8 +186,7 @@ def test_the_bench(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.viewer
-@needs_vulkan
+@on_screen
 def test_the_views(tmp_path: Path) -> None:
     loop = start(tmp_path, *STAYING[0].split()[1:], "--rate", "100")
     try:
@@ -206,8 +207,42 @@ def test_the_views(tmp_path: Path) -> None:
 def look(folder: Path, command: str) -> None:
     """Run a view until it says where it is to be seen, then Ctrl-C."""
     process = start(folder, *command.split()[1:])
-    assert process.stderr is not None
     said = process.stderr.readline()
     assert "127.0.0.1" in said
     _, complaints = interrupt(process)
     assert process.returncode == 0, complaints
+
+
+@pytest.mark.slow
+def test_the_validation(tmp_path: Path) -> None:
+    said = run(tmp_path, VALIDATE[0])
+    assert "tilt" in said
+    assert "peak" in said
+
+
+@pytest.mark.slow
+def test_the_designs_are_taken_by_the_loop(tmp_path: Path) -> None:
+    for command in DESIGN:
+        run(tmp_path, command)
+    (tmp_path / "own.toml").write_text('[sensor]\npupil = "pupil.npz"\nsam = "mask.json"\n')
+    run(tmp_path, "lowfc sim-loop --config own.toml --lockstep --duration 0.2")
+
+
+@pytest.mark.slow
+def test_the_logs(tmp_path: Path) -> None:
+    run(tmp_path, "lowfc sim-loop --lockstep --rate 200 --duration 2 --json")
+    said = [run(tmp_path, command) for command in LOGS]
+    assert "lowfc/camera/frame" in said[0]
+    assert "400 frames, commands identical, largest difference 0 nm" in said[1]
+    assert "what if" in said[2]
+    assert "played" in said[3]
+    assert "is whole" in said[4]
+    assert "1 in 10 frames and mirror states" in said[7]
+    assert "digest " in said[8]
+    assert "-every-10.mcap" not in said[8], "the newest log is the one that was recorded"
+    assert {path.suffix for path in (tmp_path / "logs").iterdir()} == {".mcap", ".html", ".fits"}
+
+
+def test_the_configuration(tmp_path: Path) -> None:
+    for command in FILES:
+        run(tmp_path, command)

@@ -64,7 +64,6 @@ def run(folder: Path, command: str) -> str:
 
 @contextmanager
 def loop(folder: Path, *arguments: str) -> Iterator[None]:
-    """A running loop."""
     process = start(folder, "sim-loop", "--config", "lowfc.toml", *arguments)
     try:
         until(lambda: "controller" in children(process.pid))

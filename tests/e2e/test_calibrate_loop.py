@@ -1,4 +1,4 @@
-"""`lowfc calibrate` on the real processes: pokes through the bus, Ctrl-C in the middle, and going on after it."""
+"""A running loop is calibrated, tuned and accepted: through the bus, interrupted and gone on with."""
 
 import json
 import time
@@ -10,9 +10,7 @@ import pytest
 from lowfc.adapters.files import calibration_file
 from lowfc.client import Client, running
 from lowfc.control.calibration.response_fit import cross_talk
-from tests.support.loops import interrupt, run, start, until
-
-pytestmark = pytest.mark.exclusive
+from tests.support.loops import interrupt, recorded_bytes, run, start, until
 
 CONFIG = """
 [sensor]
@@ -77,7 +75,6 @@ def test_a_running_loop_is_calibrated_interrupted_and_gone_on_with(tmp_path: Pat
             client.close_loop()
             time.sleep(0.5)
             state = client.status().state
-            assert state is not None
             assert np.abs(np.array(state.command_history_nm)).max() < 5
     finally:
         interrupt(loop)
@@ -112,5 +109,95 @@ def test_the_promise_is_kept_over_the_bus(method: str, tmp_path: Path) -> None:
 def flat(client: Client) -> bool:
     """Whether nothing is played, nor anything commanded."""
     state = client.status().state
-    assert state is not None
     return not np.frombuffer(state.actuators, np.float32).any()
+
+
+MISTUNED = 0.03
+DRIFTING = f"""
+[star]
+magnitude = -1.0
+[sensor]
+modes = 4
+[camera]
+rate_hz = 250
+[disturbance]
+preset = "bench"
+[control]
+tilt_gain = {MISTUNED}
+gain = {MISTUNED}
+"""
+SETTLING, MEASURED = 500, 2500
+
+
+def left_nm() -> float:
+    """What the loop leaves of tip and tilt, rms per axis, as it measures it."""
+    with Client() as loop:
+        steps = list(loop.steps(SETTLING + MEASURED, patience_s=30))[SETTLING:]
+    tilts_nm = np.array([step.error_nm[:2] for step in steps if step.error_nm is not None])
+    assert len(tilts_nm) > MEASURED / 2
+    return float(np.sqrt(np.mean(tilts_nm**2)))
+
+
+@pytest.mark.slow
+def test_a_mistuned_loop_is_tuned_while_it_runs(tmp_path: Path) -> None:
+    (tmp_path / "loop.toml").write_text(DRIFTING)
+    words = ("sim-loop", "--config", "loop.toml", "--lockstep", "--no-record")  # nothing is late on a busy host
+    process = start(tmp_path, *words)
+    try:
+        until(running)
+        before_nm = left_nm()
+        done = run(tmp_path, "tune", "--live", "20", "--apply", "--json")
+        status = run(tmp_path, "ctl", "status", "--json")
+        after_nm = left_nm()
+    finally:
+        _, said = interrupt(process)
+    assert done.returncode == 0, done.stderr + said
+    found, now = json.loads(done.stdout), json.loads(status.stdout)
+    assert found["closed"]
+    assert [mode["gain_now"] for mode in found["modes"]] == pytest.approx([MISTUNED] * 4)
+    best = [mode["gain_best"] for mode in found["modes"]]
+    assert min(best[:2]) > 5 * MISTUNED
+    assert found["applied"].startswith("gain is now ")
+    assert now["gain"] == pytest.approx(best, abs=1e-4)
+    assert (now["mode"], now["law"]["name"]) == ("closed", "integrator")
+    assert after_nm < 0.7 * before_nm
+
+
+TOML = """
+[star]
+magnitude = -1.0
+[sensor]
+modes = 4
+[camera]
+rate_hz = 250
+[disturbance]
+preset = "quiet"
+[control]
+gain = 0.3
+[acceptance]
+lowest_hz = 1.5
+"""
+
+
+@pytest.mark.slow
+def test_rejection_of_a_running_loop_and_of_its_log(tmp_path: Path) -> None:
+    (tmp_path / "loop.toml").write_text(TOML)
+    words = ("--duration", "4", "--lines", "8", "--json", "--plot", "live.png")
+    running = start(tmp_path, "sim-loop", "--config", "loop.toml", "--lockstep")  # nothing is late on a busy host
+    try:
+        until(lambda: recorded_bytes(tmp_path) > 4_000_000)
+        done = run(tmp_path, "acceptance", "rejection", *words)
+    finally:
+        _, said = interrupt(running)
+    assert done.returncode == 0, done.stdout + done.stderr + said
+    live = json.loads(done.stdout)
+    assert live["passed"]
+    assert live["rate_hz"] == pytest.approx(250, rel=0.01)
+    assert live["lowest_hz"] >= 1.5
+    assert live["largest_departure_db"] <= 1.0
+    assert (tmp_path / "live.png").read_bytes().startswith(b"\x89PNG")
+
+    (log,) = (tmp_path / "logs").glob("*.mcap")
+    again = run(tmp_path, "acceptance", "rejection", "--json", str(log))
+    assert again.returncode == 0, again.stderr
+    assert json.loads(again.stdout) == live

@@ -3,9 +3,9 @@
 import json
 
 import numpy as np
-import numpy.typing as npt
 import pytest
 
+from lowfc.arrays import Array
 from lowfc.contract.codecs.calibration_codec import decode_calibration
 from lowfc.contract.messages import CALIBRATION, COMMAND, OFFLOAD, STEP, wire
 from tests.support.loops import payloads, run
@@ -16,7 +16,7 @@ DEAD = (352, 561, 595, 757)
 EACH_NM = 2.0
 
 
-def flat_nm() -> npt.NDArray[np.float64]:
+def flat_nm() -> Array:
     """Small, for the simulated mirror is flat without it."""
     rows, columns = np.indices(GRID)
     return np.asarray(np.sin(rows / 2) * np.cos(columns / 3))

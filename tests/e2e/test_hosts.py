@@ -18,10 +18,11 @@ import pytest
 
 from lowfc.adapters.bus.access import ROUTER, roles
 from lowfc.adapters.bus.certificates import make_certificates
-from lowfc.adapters.files import calibration_file, factory
+from lowfc.adapters.files import calibration_file
 from lowfc.contract.configuration import load
 from tests.support import networks
 from tests.support.networks import ROUTER_ADDRESS, Host, Lab
+from tools.law_bench import calibrated
 
 pytestmark = [
     pytest.mark.slow,
@@ -75,8 +76,7 @@ class Bench:
         make_certificates(self.authority, (ROUTER, *ROLES), [ROUTER_ADDRESS])
         (folder / "lowfc.toml").write_text(TOML)
         config = load(folder / "lowfc.toml")
-        optics = factory.twin(config, None, print)
-        calibration = factory.analytic_calibration(config, optics, factory.mirror_on_twin(config, optics, print))
+        calibration = calibrated(config)
         self.lab = Lab(folder, SHIFTS_NS)
         for host in self.lab.hosts.values():
             (host.folder / "lowfc.toml").write_text(TOML.replace("CERTIFICATES", str(host.folder / "certs")))
@@ -279,7 +279,6 @@ def test_without_the_desks_link_the_loop_goes_on(bench: Bench) -> None:
 def test_the_router_may_die_and_come_back(bench: Bench) -> None:
     bench.settled()
     router = bench.lab.middle.children.pop("router")
-    assert router.process is not None
     router.process.kill()
     router.stop(5.0)
     bench.begin(bench.lab.middle, "router")
@@ -451,7 +450,6 @@ def test_hosts_are_gone_however_the_test_ends(tmp_path: Path, how: signal.Signal
     environment = os.environ | {"PYTHONPATH": str(SUPPORT.parents[1])}
     words = [sys.executable, "-c", HELD, str(tmp_path)]
     with subprocess.Popen(words, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, env=environment) as holder:
-        assert holder.stdout is not None
         pids = [int(pid) for pid in holder.stdout.readline().split()]
         assert len(pids) == 4
         assert all(Path(f"/proc/{pid}").exists() for pid in pids)

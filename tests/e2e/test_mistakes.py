@@ -15,12 +15,15 @@ from typing import Any
 
 import pytest
 
-from lowfc.adapters.bus.run import open_run
-from lowfc.adapters.files import calibration_file, factory
+from lowfc.adapters.bus.run import Run, open_run
+from lowfc.adapters.files import calibration_file
 from lowfc.adapters.logs.writer import LogWriter
-from lowfc.contract.configuration import load
+from lowfc.contract.configuration import Configuration, load
+from lowfc.contract.errors import BusError
 from lowfc.programs.cli.main import main
-from tests.support.loops import LOWFC, run
+from lowfc.programs.launch import sim_loop
+from tests.support.loops import LOWFC, lowfc, run
+from tools.law_bench import calibrated
 
 SHORT = ["sim-loop", "--duration", "0.1"]
 
@@ -76,8 +79,7 @@ def test_a_calibration(tmp_path: Path) -> None:
     missing = ["controller", "--run", "mistakes", "--calibration", "none.fits"]
     _refused(tmp_path, *missing, expected="there is no such calibration file", by=run)
     config = load(None)
-    optics = factory.twin(config, None, print)
-    found = factory.analytic_calibration(config, optics, factory.mirror_on_twin(config, optics, print))
+    found = calibrated(config)
     whole = calibration_file.to_bytes(found)
     for name, content in (("cut", whole[: len(whole) // 2]), ("text", b"hello"), ("flipped", _flip(whole))):
         (tmp_path / f"{name}.fits").write_bytes(content)
@@ -189,3 +191,29 @@ def test_logs(tmp_path: Path, words: tuple[str, ...], expected: str) -> None:
     assert expected in done.stderr
     assert len(done.stderr.splitlines()) == 1
     assert sorted(path.name for path in tmp_path.iterdir()) == before
+
+
+def test_a_loop_that_is_starting_is_there_for_others(own_runtime: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """So that an unnamed request does not reach the only other one."""
+    found: list[object] = []
+
+    def meanwhile(config: Configuration, run: Run, console: object) -> None:
+        with socket.create_server(("127.0.0.1", open_run("other").links.ports["controller"])):
+            done = lowfc("ctl", "open")
+            listed = json.loads(lowfc("runs", "--json").stdout)["runs"]
+            found.extend([str(done.exception), [(one["run"], one["mode"]) for one in listed]])
+        with pytest.raises(BusError, match="run 'night' is running already"):
+            sim_loop.sim_loop(config, 1.0, record=False, name="night")
+        raise BusError("enough")
+
+    monkeypatch.setattr(sim_loop, "prepare", meanwhile)
+    with pytest.raises(BusError, match="enough"):
+        sim_loop.sim_loop(load(None), 1.0, record=False, name="night")
+    refusal, listed = found
+    assert refusal == (
+        "choose a run with --run, the beginning of its name is enough: there are night (no controller yet), other"
+    )
+    assert listed == [("night", "starting"), ("other", "starting")]
+    assert not (own_runtime / "lowfc" / "night").exists()
+    with pytest.raises(BusError, match="made by processes that were started by hand"):
+        sim_loop.sim_loop(load(None), 1.0, record=False, name="other")

@@ -1,7 +1,9 @@
-"""The examples of docs/hardware.md, as real processes: a camera and a mirror that are not of this library."""
+"""The examples of docs/hardware.md and docs/commissioning.md as real processes: devices that are not of ours."""
 
 import json
+import re
 import shlex
+import shutil
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -14,7 +16,9 @@ import pytest
 from lowfc.adapters.bus.bus import Sample
 from lowfc.adapters.bus.run import open_run
 from lowfc.adapters.bus.zenoh_bus import ZenohBus
+from lowfc.adapters.files import calibration_file
 from lowfc.adapters.process.clock import HostClock
+from lowfc.client import Client
 from lowfc.contract.messages import FRAME, MIRROR_STATE, STEP, Role, wire
 from tests.support.loops import until
 
@@ -57,13 +61,12 @@ def bench(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     runtime = tmp_path / "run"
     runtime.mkdir(mode=0o700)
     monkeypatch.setenv("XDG_RUNTIME_DIR", str(runtime))
-    (tmp_path / "examples").symlink_to(ROOT / "examples")
+    shutil.copytree(ROOT / "examples", tmp_path / "examples")
     (tmp_path / "bench.toml").write_text(BENCH)
     return tmp_path
 
 
 def started(folder: Path, command: str) -> "subprocess.Popen[str]":
-    """A documented command, as it stands."""
     program, *rest = shlex.split(command)
     return subprocess.Popen(
         [Path(sys.executable).parent / program, *rest],
@@ -166,3 +169,46 @@ def test_the_simulated_devices_and_a_camera_in_plain_zenoh_keep_the_contract(ben
         with listening() as bus:
             heard(bus)
         conformance(bench, *CONFORMANCE, CONFORMANCE[0].partition(" --config")[0].replace("bench", "plain"))
+
+
+TEXT = (ROOT / "docs/commissioning.md").read_text()
+COMMISSIONING = re.findall(r"^    ((?:python|lowfc) .*)$", TEXT, flags=re.MULTILINE)
+*PAGE_DEVICES, CONTROLLER, COMMISSION, LATER = COMMISSIONING
+
+
+def block(language: str) -> str:
+    """The page's listing in this language."""
+    (found,) = re.findall(rf"^```{language}\n(.*?)^```$", TEXT, flags=re.MULTILINE | re.DOTALL)
+    return str(found)
+
+
+def closed(folder: Path) -> bool:
+    process = started(folder, "lowfc ctl close --run bench")
+    process.communicate(timeout=20)
+    return process.returncode == 0
+
+
+@pytest.mark.slow
+def test_a_camera_of_another_size_comes_to_a_closed_loop(bench: Path) -> None:
+    """docs/commissioning.md, as it stands: a camera of 64 x 64 pixels at 100 Hz with 14 bits."""
+    assert len(COMMISSIONING) == 5
+    (bench / "examples/small_camera.py").write_text(block("python"))
+    (bench / "bench.toml").write_text(block("toml"))
+    with running(bench, *PAGE_DEVICES, CONTROLLER):
+        with listening() as bus:
+            heard(bus)
+        process = started(bench, f"{COMMISSION} --json")
+        out, shown = process.communicate(timeout=400)
+        assert process.returncode == 0, shown
+        for number in range(1, 11):
+            assert f"[{number}/10]" in shown
+        figures = json.loads(out)
+        assert figures["recommended"]
+        assert figures["delay_frames"] == pytest.approx(1, abs=0.1)
+        assert figures["measured_error_nm"] == pytest.approx(figures["predicted_error_nm"], rel=0.15)
+        with Client("bench") as client:
+            state = client.status().state
+            assert state.mode_cause == "operator asked to close"
+        assert calibration_file.load(bench / "calibration.fits").shape == (64, 64)
+    with running(bench, *PAGE_DEVICES, LATER):
+        until(lambda: closed(bench), 60)

@@ -78,7 +78,6 @@ def forged(log: Path, path: Path) -> None:
 
 
 def replayed(folder: Path, *logs: Path | str, status: int = 0) -> dict[str, Any]:
-    """Figures of `lowfc replay`."""
     done = run(folder, "replay", "--json", *map(str, logs))
     assert done.returncode == status, done.stdout + done.stderr
     figures: dict[str, Any] = json.loads(done.stdout)
@@ -246,15 +245,6 @@ def test_a_log_cut_short_and_a_log_with_a_hole(tmp_path: Path) -> None:
     assert "numpy              1.0 in the log" in done.stdout
     assert "cpu_features       abacus in the log, none here" in done.stdout
     assert replayed(tmp_path, tmp_path / "forged.mcap", "--tolerance", "0.001")["identical"]
-
-
-def test_what_cannot_be_replayed_is_said_in_one_line(tmp_path: Path) -> None:
-    (tmp_path / "text.mcap").write_text("this is not a log")
-    for name, complaint in (("text.mcap", "is not an MCAP file"), ("gone.mcap", "cannot be read")):
-        done = run(tmp_path, "replay", name)
-        assert done.returncode == 2
-        assert complaint in done.stderr
-        assert len(done.stderr.splitlines()) == 1
 
 
 @pytest.mark.slow

@@ -45,7 +45,6 @@ def log(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def logged(log: Path) -> dict[str, list[Logged]]:
-    """Messages of the log by key."""
     found = defaultdict(list)
     for message in LogReader(log):
         found[message.key].append(message)

@@ -5,8 +5,7 @@ import os
 import signal
 import subprocess
 import sys
-import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -15,10 +14,12 @@ import pytest
 from lowfc.adapters.bus.bus import Sample
 from lowfc.adapters.bus.run import new_run_id, open_run
 from lowfc.adapters.bus.zenoh_bus import ZenohBus
-from lowfc.adapters.files import calibration_file, factory
+from lowfc.adapters.files import calibration_file
 from lowfc.adapters.process.clock import HostClock
 from lowfc.contract.configuration import load
 from lowfc.contract.messages import MIRROR_STATE, STEP, wire
+from tests.support.loops import until
+from tools.law_bench import calibrated
 
 pytestmark = pytest.mark.exclusive
 
@@ -74,16 +75,10 @@ class Bench:
         os.kill(self.running[name].pid, signal.SIGKILL)
         self.running.pop(name).wait()
 
-    def wait(self, condition: Callable[[], bool], what: str, timeout_s: float = 40) -> None:
-        deadline_s = time.monotonic() + timeout_s
-        while not condition():
-            assert time.monotonic() < deadline_s, f"waited in vain for {what}"
-            time.sleep(0.02)
-
     def settled(self) -> None:
         """Twenty good frames in a row, from now on, with the loop closed and the disturbance held."""
         self.closed = 0
-        self.wait(lambda: self.closed > 20, "a closed loop")
+        until(lambda: self.closed > 20)
 
     def stop(self) -> None:
         for process in self.running.values():
@@ -99,8 +94,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     path = tmp_path_factory.mktemp("by-hand")
     (path / "test.toml").write_text(TOML)
     config = load(path / "test.toml")
-    optics = factory.twin(config, None, print)
-    calibration = factory.analytic_calibration(config, optics, factory.mirror_on_twin(config, optics, print))
+    calibration = calibrated(config)
     calibration_file.save(calibration, path / "calibration.fits")
     return path
 
@@ -122,7 +116,7 @@ def test_any_start_order(bench: Bench, order: tuple[str, ...]) -> None:
     for name in order:
         bench.start(name)
         heard = [*bench.running]
-        bench.wait(lambda: all(_alive(bench, process) for process in heard), f"{name}'s health", 20)  # noqa: B023
+        until(lambda: all(_alive(bench, process) for process in heard))  # noqa: B023
     bench.settled()
 
 
@@ -135,7 +129,7 @@ def test_kill_and_restart_of_each(bench: Bench) -> None:
         bench.kill(name)
         bench.shapes.clear()
         bench.start(name)
-        bench.wait(lambda: len(bench.shapes) > 20, "the mirror's states")
+        until(lambda: len(bench.shapes) > 20)
         bench.settled()
         shapes = np.array(bench.shapes.copy())
         moves = np.abs(np.diff(shapes, axis=0)).max()

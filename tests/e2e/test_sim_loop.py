@@ -4,35 +4,28 @@ import json
 import os
 import re
 import resource
-import shutil
 import signal
-import socket
 import subprocess
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-from typer.testing import CliRunner
 
-from lowfc.adapters.bus.run import Run, open_run
-from lowfc.contract.configuration import Configuration, load
-from lowfc.contract.errors import BusError
 from lowfc.contract.messages import RawImage, from_timestamp, topic_of, wire
-from lowfc.programs.cli.main import app
-from lowfc.programs.launch import sim_loop
+from lowfc.programs.cli.ctl.command import SIGNAL
 from tests.support.loops import LOWFC, children, interrupt, loop, payloads, recorded_bytes, run, start, until
+from tests.support.other_readers import foxglove
 
 pytestmark = pytest.mark.exclusive
 
-FRAMES = 3000
+FRAMES = 1500
 
 
 @pytest.fixture(scope="module")
 def live(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
-    """One run in real time, on which several tests look."""
     folder = tmp_path_factory.mktemp("live")
-    return loop(folder, "--duration", "6", "--rate", "500", "--star-magnitude", "0", "--seed", "3")
+    return loop(folder, "--duration", "3", "--rate", "500", "--star-magnitude", "0", "--seed", "3")
 
 
 @pytest.fixture(scope="module")
@@ -103,42 +96,11 @@ def test_frame_step_command_and_state_join(topics: dict[str, list[bytes]]) -> No
 
 def test_an_independent_reader_agrees(live: dict[str, Any], topics: dict[str, list[bytes]]) -> None:
     """npm's @mcap/core: same counts, CRCs right, attachments there."""
-    import json
-
-    node = Path(__file__).parent.parent / "node"
-    if shutil.which("node") is None or not (node / "node_modules").is_dir():
-        pytest.skip("node or its packages are missing: make node")
-    done = subprocess.run(
-        ["node", "count.mjs", str(live["log"])], cwd=node, capture_output=True, text=True, timeout=60, check=False
-    )
-    assert done.returncode == 0, done.stderr
-    found = json.loads(done.stdout)
+    (found,) = foxglove([live["log"]])
     assert found["messages"] == found["counted"] == live["messages_recorded"]
     assert found["counts"] == {topic: len(values) for topic, values in topics.items()}
     assert set(found["attachments"]) == {"config.toml", "calibration.fits"}
     assert "lowfc" in found["metadata"]
-
-
-def test_a_configuration_that_was_shown_does_not_open_the_loop(tmp_path: Path) -> None:
-    shown = run(tmp_path, "config", "show").stdout
-    short = ("sim-loop", "--lockstep", "--duration", "0.2", "--no-record")
-    done = run(tmp_path, *short, config=shown)
-    assert done.stdout.splitlines()[0].split() == ["loop", "closed"], done.stderr
-    assert "starts open" not in done.stderr
-    done = run(tmp_path, *short, config=shown.replace('#start_mode = "open"', 'start_mode = "open"'))
-    assert re.match(r"loop +open for 0\.\d s", done.stdout), done.stderr
-    assert "the loop starts open (control.start_mode of test.toml): `lowfc ctl close` closes it" in done.stderr
-
-
-def test_ctrl_c_ends_with_a_summary(tmp_path: Path) -> None:
-    process = start(tmp_path, "sim-loop", "--rate", "200", "--disturbance", "quiet")
-    until(lambda: recorded_bytes(tmp_path) > 4e6)
-    said, complaints = interrupt(process)
-    assert process.returncode == 0, complaints
-    assert "frame to command" in said
-    logs = list((tmp_path / "logs").glob("*.mcap"))
-    assert len(logs) == 1
-    assert payloads(logs[0])["/lowfc/camera/frame"]
 
 
 def test_a_process_that_dies_is_named(tmp_path: Path) -> None:
@@ -169,40 +131,6 @@ def test_two_loops_on_one_host_do_not_mix(tmp_path: Path) -> None:
     assert '"frames_published": 400' in said
 
 
-def test_a_loop_that_is_starting_is_there_for_others(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """So that an unnamed request does not reach the only other one."""
-    monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
-    found: list[object] = []
-
-    def meanwhile(config: Configuration, run: Run, console: object) -> None:
-        with socket.create_server(("127.0.0.1", open_run("other").links.ports["controller"])):
-            done = CliRunner().invoke(app, ["ctl", "open"])
-            listed = json.loads(CliRunner().invoke(app, ["runs", "--json"]).stdout)["runs"]
-            found.extend([str(done.exception), [(one["run"], one["mode"]) for one in listed]])
-        with pytest.raises(BusError, match="run 'night' is running already"):
-            sim_loop.sim_loop(config, 1.0, record=False, name="night")
-        raise BusError("enough")
-
-    monkeypatch.setattr(sim_loop, "prepare", meanwhile)
-    with pytest.raises(BusError, match="enough"):
-        sim_loop.sim_loop(load(None), 1.0, record=False, name="night")
-    refusal, listed = found
-    assert refusal == (
-        "choose a run with --run, the beginning of its name is enough: there are night (no controller yet), other"
-    )
-    assert listed == [("night", "starting"), ("other", "starting")]
-    assert not (tmp_path / "lowfc" / "night").exists()
-    with pytest.raises(BusError, match="made by processes that were started by hand"):
-        sim_loop.sim_loop(load(None), 1.0, record=False, name="other")
-
-
-def test_help_has_examples(tmp_path: Path) -> None:
-    for command in (["sim-loop"], ["controller"], ["record"], ["ctl", "gain"], ["config", "zenoh"], ["bench", "twin"]):
-        done = run(tmp_path, *command, "--help")
-        assert done.returncode == 0
-        assert "Example: lowfc" in done.stdout
-
-
 @pytest.mark.slow
 def test_a_disk_that_refuses_ends_the_recording_and_nothing_else(tmp_path: Path) -> None:
     words = [*LOWFC, "sim-loop", "--rate", "200", "--duration", "1", "--json"]
@@ -222,3 +150,26 @@ def test_a_disk_that_refuses_ends_the_recording_and_nothing_else(tmp_path: Path)
     assert figures["frames_published"] == 200
     assert figures["frames_processed"] + figures["frames_skipped"] == 200
     assert sum(figures["lost"].values()) == figures["messages_lost"] > 100
+
+
+def test_a_signal_makes_the_loop_safe_where_nobody_can_ask_any_more(tmp_path: Path) -> None:
+    """The documented pattern finds the controller, the log has the signal as a request; Ctrl-C ends with a summary."""
+    pattern = re.search(r"pkill -USR1 -f '(.*)'", SIGNAL)
+    process = start(tmp_path, "sim-loop", "--disturbance", "quiet")
+    try:
+        until(lambda: recorded_bytes(tmp_path) > 4e6)
+        controller = children(process.pid)["controller"]
+        command = Path(f"/proc/{controller}/cmdline").read_text().replace("\0", " ")
+        assert re.search(pattern[1], command)
+        assert not re.search(pattern[1], f"bash -c {command}")
+        os.kill(controller, signal.SIGUSR1)
+        until(lambda: "in safe mode" in run(tmp_path, "ctl", "status").stdout)
+    finally:
+        said, complaints = interrupt(process)
+    assert process.returncode == 0, complaints
+    assert "frame to command" in said
+    (log,) = (tmp_path / "logs").glob("*.mcap")
+    recorded = payloads(log)
+    assert recorded["/lowfc/camera/frame"]
+    asked = [wire.Request.FromString(payload) for payload in recorded["/lowfc/control/request"]]
+    assert [(one.name, one.text, one.accepted) for one in asked if one.name == "safe"] == [("safe", "SIGUSR1", True)]

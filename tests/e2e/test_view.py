@@ -30,9 +30,7 @@ from lowfc.programs.view.panels.tiles import FILL
 from lowfc.programs.view.verdicts.tile import Level
 from tests.support.loops import LOWFC, children, interrupt, run, start, until
 from tests.support.report_log import Night
-from tests.support.viewers import browser_screenshot, needs_chromium, needs_vulkan, pixels, share_of
-
-pytestmark = pytest.mark.exclusive
+from tests.support.viewers import browser_screenshot, needs_chromium, on_screen, pixels, share_of
 
 LEAST_SHADES = 8  # of a panel with something in it; an empty one has its ground and the letters of its title
 TITLE_ROWS = 30
@@ -51,8 +49,7 @@ def live(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
 
 
 @pytest.mark.slow
-@pytest.mark.viewer
-@needs_vulkan
+@on_screen
 def test_every_panel_of_every_tab_shows_the_live_loop(live: str, artefacts: Path) -> None:
     joined = open_run(live)
     config = load(joined.path / "config.toml")
@@ -70,7 +67,6 @@ def test_every_panel_of_every_tab_shows_the_live_loop(live: str, artefacts: Path
     try:
         summary = bridge.run(5.0)
         viewer = bridge.viewer
-        assert viewer is not None
         assert summary.renewals == 0
         for number, tab in enumerate(Tab):
             blueprint = layout(tab)
@@ -87,14 +83,13 @@ def test_every_panel_of_every_tab_shows_the_live_loop(live: str, artefacts: Path
         bus.close()
 
 
+@pytest.mark.exclusive
 @pytest.mark.browser
 @needs_chromium
 def test_the_page_shows_the_live_loop_and_nobody_else_can_see_it(live: str, artefacts: Path) -> None:
     page_of = subprocess.Popen([*LOWFC, "view", "--web", "--run", live], stderr=subprocess.PIPE, text=True)
     try:
-        assert page_of.stderr is not None
         address = re.search(r"http://127\.0\.0\.1:\S+", page_of.stderr.readline())
-        assert address is not None
         picture = artefacts / "live-browser.png"
         good = FILL[Level.GOOD]
         page = browser_screenshot(address.group(), picture, 60, lambda shown: share_of(shown, good) > 0.01, (1000, 625))
@@ -106,6 +101,7 @@ def test_the_page_shows_the_live_loop_and_nobody_else_can_see_it(live: str, arte
         assert page_of.returncode == 0, rest
 
 
+@pytest.mark.exclusive
 @pytest.mark.slow
 def test_the_loop_goes_on_whatever_happens_to_its_view(tmp_path: Path) -> None:
     process = start(tmp_path, "sim-loop", "--web", "--rate", "200", "--duration", "4", "--json")

@@ -17,31 +17,6 @@ IDENTIFIERS = {
     *("late_ms", "hold_ms", "valid_ms", "most_alike", "most_saturated", "least_flux"),
 }
 FOLDERS = ("lowfc", "sim_camera", "sim_dm", "tests", "benchmarks", "tools", "examples")
-SENTENCES = (
-    "Nobody asks for who is not there",
-    "Who waits for its messages receives",
-    "It has the place of the last one taken",
-    "When that was which it tells",
-    "Do harm to a simulated loop",
-    "Say how a run was",
-    "Hold your own camera or mirror against",
-    "The night back on the bus",
-    "Get the same bytes twice",
-    "takes nothing away where",
-    "kept from where it was to go",
-    "To which the noisiest mode shall be known",
-    "How the sensor lies to",
-    "stop it first, so that this one can",
-    "its path is the answer",
-    "loop safed",
-    "acting: none",
-    "an offset may be as large as",
-    "It follows for a while before it drives",
-    "Who only looks on",
-    "found on the road",
-    "Run the loop again from it",
-)
-"""Of which `docs/glossary.md` and the present sentences say the same in the field's words."""
 SOURCES = [path for folder in FOLDERS for path in (ROOT / folder).rglob("*.py") if path != Path(__file__)]
 
 
@@ -59,12 +34,6 @@ def test_no_source_has_a_former_identifier() -> None:
     found = {path: identifiers(path.read_text(encoding="utf-8")) & IDENTIFIERS for path in SOURCES}
     assert {str(path.relative_to(ROOT)): names for path, names in found.items() if names} == {}
     assert len(SOURCES) > 400
-
-
-def test_no_text_has_a_former_sentence() -> None:
-    pages = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *(ROOT / "docs").glob("*.md")]
-    texts = {path: " ".join(path.read_text(encoding="utf-8").split()) for path in [*SOURCES, *pages]}
-    assert {str(path): one for path, text in texts.items() for one in SENTENCES if one in text} == {}
 
 
 def test_no_message_has_a_former_field() -> None:

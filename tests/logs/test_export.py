@@ -16,9 +16,8 @@ from aotpy.io.fits import AOTFITSErrorLevel
 from astropy.io import fits
 from astropy.table import Table
 from rich.console import Console
-from typer.testing import CliRunner
 
-from lowfc.adapters.process.terminal import new_app
+from lowfc.arrays import Array
 from lowfc.contract.codecs.calibration_codec import identified
 from lowfc.contract.codecs.codec import decode_frame
 from lowfc.contract.configuration import Configuration
@@ -35,8 +34,9 @@ from lowfc.contract.messages import (
     from_timestamp,
     image,
 )
-from lowfc.programs.logs.export.command import Format, export, export_log, render
+from lowfc.programs.logs.export.command import Format, export_log, render
 from tests.support import toy
+from tests.support.loops import lowfc
 from tests.support.report_log import METADATA, Night
 
 STEPS, REFUSED, UNSENT, UNTRUE = 30, 4, 7, 9
@@ -44,7 +44,6 @@ MODES, ACTUATORS = len(toy.NOLL), toy.GRID[0] * toy.GRID[1]
 QUIET = Console(quiet=True)
 GOOD = np.arange(toy.SHAPE[0] * toy.SHAPE[1]) != 10
 CALIBRATED = identified(replace(toy.calibration(), good=GOOD.astype(np.float32)))
-Double = npt.NDArray[np.float64]
 
 
 def a_night() -> Night:
@@ -75,7 +74,7 @@ TIMES_NS = [from_timestamp(step.timestamp) for step in STEPS_SENT]  # type: igno
 FRAMES = np.array([decode_frame(payload, 0, 0).pixels for payload in of(NIGHT, FRAME)])
 
 
-def sent(topic: Topic, name: str, width: int = MODES) -> Double:
+def sent(topic: Topic, name: str, width: int = MODES) -> Array:
     """A quantity of each step, as float32; NaN where it was not sent."""
     rows = np.full((STEPS, width), np.nan, np.float32)
     for payload in reversed(of(NIGHT, topic)):
@@ -254,19 +253,13 @@ def test_mistakes(log: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) ->
         export_log(log, Format.AOT, console=QUIET)
 
 
-def command(*words: object) -> Any:
-    app = new_app("Test.")
-    app.command()(export)
-    return CliRunner().invoke(app, list(map(str, words)))
-
-
 def test_nothing_is_replaced_unless_forced(log: Path, tmp_path: Path) -> None:
     out = tmp_path / "out.csv"
     out.write_text("mine")
     with pytest.raises(DataFileError, match="--force"):
         export_log(log, Format.CSV, out, console=QUIET)
     assert out.read_text() == "mine"
-    done = command(log, "--to", "csv", "--out", out, "--force", "--json")
+    done = lowfc("export", log, "--to", "csv", "--out", out, "--force", "--json")
     assert done.exit_code == 0
     assert json.loads(done.stdout)["steps"] == STEPS
     assert out.read_text().startswith("sequence,")

@@ -21,8 +21,7 @@ from lowfc.control.loop.advance import advance
 from lowfc.control.loop.inputs import Load, Request
 from lowfc.control.loop.state import State
 from lowfc.programs.cli.main import app
-
-pytestmark = pytest.mark.exclusive
+from tests.support.loops import lowfc
 
 WIRE = Path(__file__).parents[2] / "lowfc" / "contract" / "wire"
 FOLDER = Path(__file__).parents[1] / "golden" / "0.1"
@@ -33,7 +32,7 @@ LAW_ID = "15560553d408bce3394be8a5123a916a091b94f0a6f0d423cc89d546b4e967f3"
 
 
 def asked(*words: object, status: int = 0) -> dict[str, Any]:
-    done = CliRunner().invoke(app, [*map(str, words), "--json"])
+    done = lowfc(*words, "--json")
     assert done.exit_code == status, (done.output, done.exception)
     found: dict[str, Any] = json.loads(done.stdout)
     return found
@@ -92,7 +91,7 @@ def test_a_killed_recorders_log_is_recovered_and_replays_as_before(tmp_path: Pat
 
 def test_it_is_looked_at(tmp_path: Path) -> None:
     out = tmp_path / "night.rrd"
-    done = CliRunner().invoke(app, ["view", str(NIGHT), "--save", str(out)])
+    done = lowfc("view", NIGHT, "--save", out)
     assert done.exit_code == 0, (done.output, done.exception)
     assert out.stat().st_size > 100_000
 
@@ -145,6 +144,7 @@ def test_former_keys_of_a_configuration_are_warned_of() -> None:
     remarks: list[str] = []
     config = configuration.load(FOLDER / "lowfc.toml", remark=remarks.append)
     former = tomllib.loads((FOLDER / "lowfc.toml").read_text())
+    assert config.sensor.modes == 2
     assert config.control.frame_timeout_ms == former["control"][FORMER_KEY]
     assert any(f"control.{FORMER_KEY} is now called control.frame_timeout_ms" in remark for remark in remarks)
     assert set(former_names.KEYS.values()) <= set(configuration.keys())
@@ -184,9 +184,4 @@ def test_a_calibration_and_a_law_of_0_1_are_taken_by_a_loop() -> None:
     settings = factory.settings(config)
     state, _ = advance(settings, State(), Load(0, calibration_file.load(FOLDER / "calibration.fits"), "golden"))
     _, outputs = advance(settings, state, Request(0, "law", law=law_file.load(FOLDER / "law.fits")))
-    assert outputs.reply is not None
     assert outputs.reply.accepted, outputs.reply.text
-
-
-def test_a_configuration_is_read() -> None:
-    assert configuration.load(FOLDER / "lowfc.toml").sensor.modes == 2

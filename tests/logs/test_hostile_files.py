@@ -20,8 +20,6 @@ from lowfc.programs.core.start_up import check_files
 from lowfc.programs.design.sam_files import read_state
 from lowfc.programs.logs.replay.workers import replay_files
 
-pytestmark = pytest.mark.exclusive
-
 LONGEST = 500
 """Characters of a sentence."""
 

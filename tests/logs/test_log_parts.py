@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from typer.testing import CliRunner
 
 from lowfc.adapters.bus.bus import Sample
 from lowfc.adapters.logs.parts import LAST, WholeLog, in_order, one_by_one, the_one
@@ -19,7 +18,7 @@ from lowfc.adapters.process.clock import HostClock
 from lowfc.contract.configuration import Configuration
 from lowfc.contract.errors import ConfigurationError, DataFileError, LowfcError
 from lowfc.contract.messages import CALIBRATION, CONTROLLER_STATE, FRAME, topic_of
-from lowfc.programs.cli.main import app
+from tests.support.loops import lowfc
 from tests.support.report_log import METADATA, Night
 
 FRAMES = 2600
@@ -152,7 +151,7 @@ def test_every_command_reads_ten_files_as_it_reads_one(folder: Path, samples: li
     figures = []
     for log in (LAST, f"one/{LAST}"):
         words = COMMANDS[command]
-        done = CliRunner().invoke(app, [words[0], log, *words[1:], "--json"])
+        done = lowfc(words[0], log, *words[1:], "--json")
         assert done.exit_code == 0, (done.output, done.exception)
         figures.append(without_files(json.loads(done.stdout)))
     assert figures[0] == figures[1]
@@ -162,14 +161,14 @@ def test_acceptance_takes_several_files(folder: Path, samples: list[Sample]) -> 
     """Nothing was tested in this one, which it says of the log and not of a file."""
     files = recorded(folder, samples, 3)
     for words in ([LAST], [str(path) for path in files]):
-        done = CliRunner().invoke(app, ["acceptance", "rejection", *words])
+        done = lowfc("acceptance", "rejection", *words)
         assert isinstance(done.exception, LowfcError)
         assert "no `lowfc acceptance rejection` was carried out" in str(done.exception)
 
 
 def test_recover_takes_the_files_one_by_one(folder: Path, samples: list[Sample]) -> None:
     files = recorded(folder, samples[:3000], 3, finish=False)
-    done = CliRunner().invoke(app, ["recover", LAST])
+    done = lowfc("recover", LAST)
     assert done.exit_code == 0, done.exception
     assert done.stdout.count("there is nothing to recover") == 2
     assert in_order([Path(LAST)])[:2] == files[:2]
@@ -182,21 +181,21 @@ IN_TURN = [["info"], ["report"], ["export", "--to", "csv", "--force"], ["recover
 def test_several_logs_are_taken_in_turn(folder: Path, words: list[str]) -> None:
     (night := Night()).frames(3)
     first, second = (str(night.write(Path(f"{name}.mcap"))) for name in "ab")
-    several = CliRunner().invoke(app, [*words, first, second])
-    alone = [CliRunner().invoke(app, [*words, log]).stdout for log in (first, second)]
+    several = lowfc(*words, first, second)
+    alone = [lowfc(*words, log).stdout for log in (first, second)]
     assert several.exit_code == 0, several.exception
     assert several.stdout.replace("\n", "") == "".join(alone).replace("\n", "")
     for more in [["--json"], *([["--out", "c"]] if words != ["info"] else [])]:
-        done = CliRunner().invoke(app, [*words, first, second, *more])
+        done = lowfc(*words, first, second, *more)
         assert isinstance(done.exception, ConfigurationError)
         assert f"name one log, not 2 ({Path(first).name}, {Path(second).name})" in str(done.exception)
 
 
-@pytest.mark.parametrize("words", [*IN_TURN, ["what-if", "--set", "gain=1"]], ids=lambda words: words[0])
+@pytest.mark.parametrize("words", [*IN_TURN, ["replay"], ["what-if", "--set", "gain=1"]], ids=lambda words: words[0])
 def test_what_is_no_log_is_an_error(tmp_path: Path, words: list[str]) -> None:
     (tmp_path / "text").write_text("this is not an MCAP file, by far")
     for name, said in (("text", "is not an MCAP file"), ("gone", "cannot be read: No such file")):
-        done = CliRunner().invoke(app, [*words, str(tmp_path / name)])
+        done = lowfc(*words, tmp_path / name)
         assert isinstance(done.exception, DataFileError)
         assert said in str(done.exception)
         assert done.stdout == ""

@@ -6,7 +6,6 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from typer.testing import CliRunner
 
 from lowfc.adapters.logs.recovery import recover
 from lowfc.adapters.logs.series import Limits, LogSeries
@@ -14,11 +13,9 @@ from lowfc.adapters.logs.writer import LogWriter
 from lowfc.adapters.process.clock import HostClock
 from lowfc.contract.configuration import load
 from lowfc.contract.errors import ConfigurationError
-from lowfc.programs.cli.main import app
 from lowfc.programs.core.recording.summary import Summary
+from tests.support.loops import lowfc
 from tests.support.mutated_logs import small_log
-
-pytestmark = pytest.mark.exclusive
 
 
 @pytest.fixture(autouse=True, params=[0o000, 0o022, 0o027, 0o077])
@@ -56,17 +53,16 @@ def test_what_is_recovered_has_the_mode_of_its_source(tmp_path: Path) -> None:
         assert mode_of(out) == mode
 
 
-def test_the_recorder_is_given_the_key(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_recorder_is_given_the_key(own_runtime: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     given: dict[str, Any] = {}
 
     def record(*words: object, **options: object) -> Summary:
         given.update(options)
         return Summary((), 0, {}, "", 0, 0, 0)
 
-    monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
     monkeypatch.setattr("lowfc.programs.core.recording.process.record", record)
-    (tmp_path / "lowfc.toml").write_text('[recorder]\nfile_mode = "0604"\n')
-    done = CliRunner().invoke(app, ["record", "--config", str(tmp_path / "lowfc.toml")])
+    (own_runtime / "lowfc.toml").write_text('[recorder]\nfile_mode = "0604"\n')
+    done = lowfc("record", "--config", own_runtime / "lowfc.toml")
     assert done.exit_code == 0, done.output
     assert given["limits"].file_mode == 0o604
 

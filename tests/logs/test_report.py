@@ -10,21 +10,20 @@ from typing import Any
 
 import numpy as np
 import pytest
-import typer.testing
 
 from lowfc.adapters.logs.recovery import recover
 from lowfc.adapters.logs.writer import LogWriter
-from lowfc.adapters.process.terminal import new_app
 from lowfc.contract.errors import DataFileError
 from lowfc.contract.messages import CONTROLLER_STATE, EVENT, FRAME, REQUEST, Log, wire
 from lowfc.control.laws.error_budget import sensor_noise
 from lowfc.optics.detector.photometry import tilt_nm_per_mas
 from lowfc.programs.logs.report import closed_loop
-from lowfc.programs.logs.report.command import beside, report
+from lowfc.programs.logs.report.command import beside
 from lowfc.programs.logs.report.figures import report_of
 from lowfc.programs.logs.report.page import NOT_HERE, fixed, number, page
 from lowfc.programs.logs.report.source import read_run
 from tests.support import report_log
+from tests.support.loops import lowfc
 from tests.support.report_log import READ_NOISE_E, Night
 from tests.support.theory import noise_gain, rejection
 
@@ -35,12 +34,6 @@ def figures(log: Path) -> dict[str, Any]:
     found = report_of(read_run(log)).figures
     json.dumps(found, allow_nan=False)
     return found
-
-
-def command(*words: str) -> typer.testing.Result:
-    app = new_app("Reports.")
-    app.command()(report)
-    return typer.testing.CliRunner().invoke(app, list(words))
 
 
 @pytest.fixture(scope="module")
@@ -181,7 +174,6 @@ def test_the_verdict_names_what_was_wrong(eventful: dict[str, Any]) -> None:
 
 
 def quiet(night: Night, number: int = 700) -> Night:
-    """A run in which nothing went wrong."""
     night.frames(number)
     night.health("camera", state="stopped")
     return night
@@ -189,7 +181,6 @@ def quiet(night: Night, number: int = 700) -> Night:
 
 @pytest.fixture(scope="module")
 def good(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A log of a run in which nothing went wrong."""
     return quiet(Night(), 1500).write(tmp_path_factory.mktemp("good") / "x.mcap")
 
 
@@ -343,7 +334,7 @@ def test_the_last_frames_may_have_their_command_after_the_log(
 
 def test_the_command_prints_one_object_or_writes_one_page(tmp_path: Path) -> None:
     log = quiet(Night(), 3).write(tmp_path / "night.mcap")
-    printed = command(str(log), "--json")
+    printed = lowfc("report", str(log), "--json")
     assert printed.exit_code == 0, printed.output
     found = json.loads(printed.stdout)
     assert found["run"]["steps"] == 3
@@ -352,7 +343,7 @@ def test_the_command_prints_one_object_or_writes_one_page(tmp_path: Path) -> Non
     assert not beside(log).exists()
 
     out = tmp_path / "told.html"
-    written = command(str(log), "--out", str(out))
+    written = lowfc("report", str(log), "--out", str(out))
     assert written.exit_code == 0, written.output
     assert written.stdout.splitlines() == ["A good run", str(out)]
     text = out.read_text()
@@ -392,7 +383,7 @@ def test_a_figure_that_is_no_number_is_none(tmp_path: Path) -> None:
     night = quiet(Night(), 30)
     night.put(REQUEST, wire.Request(name="gain", values=[np.nan, np.inf, 0.5]))
     log = night.write(tmp_path / "x.mcap")
-    printed = command(str(log), "--json", "--out", str(tmp_path / "x.html"))
+    printed = lowfc("report", str(log), "--json", "--out", str(tmp_path / "x.html"))
     assert printed.exit_code == 0, printed.output
     assert json.loads(printed.stdout)["requests"][-1]["values"] == [None, None, 0.5]
     assert "gain nan inf" in (tmp_path / "x.html").read_text()
@@ -403,7 +394,7 @@ def test_a_report_never_overwrites_a_log(tmp_path: Path, name: str) -> None:
     log = quiet(Night(), 3).write(tmp_path / "night.mcap")
     before = log.read_bytes()
     (tmp_path / "link.html").hardlink_to(log)
-    done = command(str(log), "--out", str(tmp_path / name))
+    done = lowfc("report", str(log), "--out", str(tmp_path / name))
     assert isinstance(done.exception, DataFileError)
     assert log.read_bytes() == before
     assert not (tmp_path / "other.mcap.part").exists()

@@ -24,8 +24,6 @@ from lowfc.control.loop import advance
 from lowfc.programs.measure.control_step import ControlStep
 from lowfc.programs.measure.frame_source import Payloads
 
-pytestmark = pytest.mark.exclusive
-
 ROOT = Path(__file__).parents[2]
 SMALL = Size(side=32, modes=5, mirror_side=10)
 HOST = {"processors": 2, "processor": "P", "kernel": "6.1", "clock_source": "tsc", "python": "3.11"}
@@ -96,6 +94,7 @@ def test_a_step_that_holds_its_command_is_no_measurement(monkeypatch: pytest.Mon
         curves.step_figures(SMALL, 0.01)
 
 
+@pytest.mark.exclusive
 @pytest.mark.slow
 def test_a_loop_of_sizes_without_an_optical_model_is_run() -> None:
     found = curves.loop_figures(Size(side=32, modes=40, mirror_side=16), 500.0, 0.5)
@@ -250,6 +249,7 @@ def test_a_way_has_its_highest_rate_and_why_it_goes_no_faster(monkeypatch: pytes
     assert f"{len(way['runs']) + len(none['runs'])} runs on a grid of 8 rates" in throughput.about(result)
 
 
+@pytest.mark.exclusive
 @pytest.mark.slow
 def test_a_loop_with_the_simulated_camera_is_measured_for_real() -> None:
     one = throughput.run_once(throughput.WAYS["simulated camera, recorder"], 100.0, 1.5)
@@ -289,6 +289,7 @@ def test_processes_are_known_by_what_python_was_told_to_run() -> None:
     assert load.role_of(["python", "-m"]) is load.role_of([]) is None
 
 
+@pytest.mark.exclusive
 def test_real_processes_below_this_one_are_watched() -> None:
     busy, idle = "while True: pass", "import time; time.sleep(60)"
     programs = {busy: ["sim_camera"], idle: ["lowfc", "controller"], f"{idle} ": ["sim_dm"]}
@@ -332,6 +333,7 @@ def test_what_a_view_costs_is_a_ratio_pair_by_pair(monkeypatch: pytest.MonkeyPat
     assert "25.0 (25.0 to 25.0) % of one processor and 200 (200 to 200) MB" in view.about(found)
 
 
+@pytest.mark.exclusive
 @pytest.mark.slow
 def test_the_view_that_is_measured_is_a_real_one() -> None:
     found = view.measure(Namespace(repeats=1, rate=200.0, seconds=3.0), lambda _: None)
@@ -435,6 +437,7 @@ def test_a_ring_hands_over_the_newest_and_wakes(tmp_path: Path) -> None:
     later.join()
 
 
+@pytest.mark.exclusive
 @pytest.mark.parametrize("name", ["shared memory, semaphore", "zenoh", pytest.param("lowfc", marks=pytest.mark.slow)])
 def test_a_contestant_is_really_run(name: str) -> None:
     (chosen,) = (one for one in CONTESTANTS if one.name == name)

@@ -1,4 +1,4 @@
-"""Latencies: figures of made-up frames, a real loop with its log, and two results compared."""
+"""Latencies of made-up frames and of a real loop with its log, two results compared, and what recording costs."""
 
 import json
 import os
@@ -11,18 +11,17 @@ from typing import Any
 
 import numpy as np
 import pytest
-import typer
-from typer.testing import CliRunner
 
 from lowfc.adapters.bus.run import runtime_base
-from lowfc.adapters.files import factory
 from lowfc.adapters.process.clock import HostClock
 from lowfc.contract.configuration import load
 from lowfc.contract.errors import DataFileError
 from lowfc.contract.messages import RawImage, image
+from lowfc.programs.measure.bench import record as bench_module
+from lowfc.programs.measure.bench.record import render
 from lowfc.programs.measure.control_step import ControlStep, time_alone
 from lowfc.programs.measure.frame_source import Payloads, prepared_frames
-from lowfc.programs.measure.latency.command import Camera, _configuration, latency
+from lowfc.programs.measure.latency.command import Camera, _configuration
 from lowfc.programs.measure.latency.figures import (
     LOOP_SPANS,
     SPANS,
@@ -37,9 +36,8 @@ from lowfc.programs.measure.latency.figures import (
 )
 from lowfc.programs.measure.latency.summary import compare, ratio, together
 from lowfc.programs.measure.latency.text import compared, sparkline, table
-from tests.support.loops import until
-
-pytestmark = pytest.mark.exclusive
+from tests.support.loops import lowfc, until
+from tools.law_bench import calibrated
 
 START = 1_700_000_000 << 32
 MS = 1_000_000
@@ -219,10 +217,10 @@ def test_the_figures_of_a_release_can_be_compared_with_todays(file: Path) -> Non
     assert "skipped by the controller: a 0, b 4" in compared({"a": "a.json", "b": "b.json"} | found)
 
 
+@pytest.mark.exclusive
 def test_a_step_alone_takes_every_frame_as_the_controller_does() -> None:
     config = load(None, {"control.start_mode": "closed", "control.tilt_leak": 0.01, "control.leak": 0.01})
-    optics = factory.twin(config, None, lambda _: None)
-    calibration = factory.analytic_calibration(config, optics, factory.mirror_on_twin(config, optics, lambda _: None))
+    calibration = calibrated(config)
     pixels = prepared_frames(config)
     assert len({frame.tobytes() for frame in pixels}) == len(pixels)
     payloads = Payloads(pixels)
@@ -245,12 +243,6 @@ def test_plain_scheduling_leaves_nothing_of_the_set_up() -> None:
     )
 
 
-def invoke(*words: str | Path) -> Any:
-    app = typer.Typer()
-    app.command()(latency)
-    return CliRunner().invoke(app, [str(word) for word in words])
-
-
 def runs() -> set[Path]:
     """Directories of runs that are there: those of other tests, and what a run has left behind."""
     return {path for path in runtime_base().iterdir() if path.is_dir()}
@@ -262,13 +254,14 @@ def measured(tmp_path_factory: pytest.TempPathFactory) -> tuple[dict[str, Any], 
     (folder / "loop.toml").write_text(f'[recorder]\nfolder = "{folder}"\nmin_free_mb = 0\n')
     words = ("--duration", str(SECONDS), "--rate", str(RATE_HZ), "--record", "--config", folder / "loop.toml")
     before = runs()
-    done = invoke(*words, "--plot", folder / "latency.png", "--json")
+    done = lowfc("latency", *words, "--plot", folder / "latency.png", "--json")
     assert done.exit_code == 0, (done.output, done.exception)
     assert runs() == before
     (folder / "a.json").write_text(done.stdout)
     return json.loads(done.stdout), folder
 
 
+@pytest.mark.exclusive
 def test_every_frame_of_a_real_loop_is_in_the_account(measured: tuple[dict[str, Any], Path]) -> None:
     figures, _ = measured
     sent = round(RATE_HZ * (SECONDS + WARM_UP_S))
@@ -291,10 +284,11 @@ def test_every_frame_of_a_real_loop_is_in_the_account(measured: tuple[dict[str, 
     assert any("garbage collector off" in measure for measure in figures["host"]["granted"])
 
 
+@pytest.mark.exclusive
 def test_the_log_of_the_run_says_the_same(measured: tuple[dict[str, Any], Path]) -> None:
     live, folder = measured
     assert live["messages_lost"] == 0
-    done = invoke(live["logs"][0], "--json")
+    done = lowfc("latency", live["logs"][0], "--json")
     assert done.exit_code == 0, done.output
     logged = json.loads(done.stdout)
     assert (logged["frames"], logged["warm_up_frames"]) == (live["frames"], live["warm_up_frames"])
@@ -304,14 +298,15 @@ def test_the_log_of_the_run_says_the_same(measured: tuple[dict[str, Any], Path])
         assert logged["latency_us"][span] == live["latency_us"][span]
     assert "due_to_command" not in logged["latency_us"]
     assert logged["host"]["processor"] == live["host"]["processor"]
-    done = invoke("--compare", folder / "a.json", folder / "a.json", "--json")
+    done = lowfc("latency", "--compare", folder / "a.json", folder / "a.json", "--json")
     assert {row["better"] for row in json.loads(done.stdout)["rows"]} == {"same"}
     (folder / "log.json").write_text(json.dumps(logged))
-    done = invoke("--compare", folder / "a.json", folder / "log.json")
+    done = lowfc("latency", "--compare", folder / "a.json", folder / "log.json")
     assert done.exit_code == 0, done.output
     assert "frame to mirror" in done.stdout
 
 
+@pytest.mark.exclusive
 def test_a_person_reads_a_table_and_a_picture(measured: tuple[dict[str, Any], Path]) -> None:
     figures, folder = measured
     text = table(figures)
@@ -328,11 +323,11 @@ def test_what_is_no_result_and_no_log_is_said(tmp_path: Path) -> None:
     other = tmp_path / "other.json"
     for content, expected in (("{", "no JSON"), ("[]", "no latency_us"), ('{"latency_us": {}}', "ratio")):
         other.write_text(content)
-        fault = invoke("--compare", other, other).exception
+        fault = lowfc("latency", "--compare", other, other).exception
         assert isinstance(fault, DataFileError)
         assert expected in str(fault)
-    assert isinstance(invoke(tmp_path / "none.mcap").exception, DataFileError)
-    assert "schedule" in str(invoke("--camera", "simulated", "--free-running").exception)
+    assert isinstance(lowfc("latency", tmp_path / "none.mcap").exception, DataFileError)
+    assert "schedule" in str(lowfc("latency", "--camera", "simulated", "--free-running").exception)
 
 
 STARTED = (
@@ -349,6 +344,7 @@ def child(launcher: int, program: str) -> int:
     return 0
 
 
+@pytest.mark.exclusive
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("victim", "number", "status", "said"),
@@ -368,3 +364,42 @@ def test_an_end_before_the_end_leaves_nothing(victim: str, number: int, status: 
         _, error = process.communicate(timeout=30)
     assert (process.returncode, error.strip().splitlines()[-1].removeprefix("error: ")[: len(said)]) == (status, said)
     assert runs() == before
+
+
+RATES_HZ = (100, 200)
+
+
+@pytest.fixture(scope="module")
+def figures(tmp_path_factory: pytest.TempPathFactory) -> dict[str, object]:
+    folder = tmp_path_factory.mktemp("disk")
+    rates = [word for rate in RATES_HZ for word in ("--rate", str(rate))]
+    done = lowfc("bench", "record", "--seconds", "0.5", *rates, "--folder", folder, "--json")
+    assert done.exit_code == 0, done.output
+    assert list(folder.iterdir()) == []
+    return json.loads(done.stdout)
+
+
+@pytest.mark.exclusive
+def test_everything_that_was_sent_is_in_the_account(figures: dict[str, object]) -> None:
+    assert [rate["rate_hz"] for rate in figures["rates"]] == list(RATES_HZ)
+    for rate in figures["rates"]:
+        frames = rate["rate_hz"] * (bench_module._WARM_UP_S + 0.5)
+        assert rate["messages_lost"] == 0
+        assert rate["messages_published"] >= 5 * frames
+        assert rate["messages_recorded"] >= 5 * frames
+        assert rate["log_bytes"] > 0.5 * frames * figures["payload_bytes_per_frame"]
+        assert rate["cpu_share"] > 0
+        assert rate["ratio"] == pytest.approx(
+            rate["cpu_share"] / (figures["copy_us_per_frame"] * rate["offered_hz"] / 1e6)
+        )
+        assert rate["longest_unflushed_ms"] >= rate["longest_wait_ms"] > 0
+        assert rate["longest_write_ms"] > 0
+    assert figures["payload_bytes_per_frame"] > 80 * 80 * 2 + 2 * 34 * 34 * 4
+
+
+@pytest.mark.exclusive
+def test_a_person_reads_one_line_for_each_rate(figures: dict[str, object]) -> None:
+    title, *lines, note = render(figures).splitlines()
+    assert "processor" in title
+    assert "kill -9" in note
+    assert [line.split()[1] for line in lines] == ["Hz"] * len(RATES_HZ)

@@ -1,4 +1,4 @@
-"""Pupils and focal-plane masks against their closed forms."""
+"""Conventions of the grids, Zernike modes, pupils and focal-plane masks against their closed forms."""
 
 import numpy as np
 import pytest
@@ -8,8 +8,124 @@ from lowfc.contract.configuration import SensorSection
 from lowfc.contract.errors import ConfigurationError, DataFileError
 from lowfc.optics.chain.focal_mask import disk, phase_spot
 from lowfc.optics.chain.fourier import to_image, to_pupil
-from lowfc.optics.chain.grid import SAMPLES, image_axis, pupil_axis
-from lowfc.optics.chain.pupil import circle, prolate, with_bar
+from lowfc.optics.chain.grid import OPEN_AREA, SAMPLES, image_axis, pupil_axis
+from lowfc.optics.chain.pupil import circle, from_quarter, prolate, with_bar
+from lowfc.optics.chain.relay import ApertureMask
+from lowfc.optics.chain.sensor import Sensor, image
+from lowfc.optics.chain.zernike import NOLLS_20, mode_name, noll_to_nm, zernike, zernikes
+
+
+def blob(samples, x0, y0, width=0.08):
+    u = pupil_axis(samples)
+    return np.exp(-((u - x0) ** 2 + (u[:, None] - y0) ** 2) / width**2).astype(complex)
+
+
+def test_samples_lie_at_half_integer_offsets():
+    np.testing.assert_allclose(pupil_axis(4), [-0.375, -0.125, 0.125, 0.375])
+    np.testing.assert_allclose(image_axis(4, 8), np.array([-1.5, -0.5, 0.5, 1.5]) / 8)
+
+
+def test_a_tilt_along_x_moves_the_star_along_columns_by_its_cycles():
+    u = pupil_axis(256)
+    tilted = circle(256) * np.exp(2j * np.pi * (3.0 * u - 1.5 * u[:, None]))
+    intensity = np.abs(to_image(tilted, 128, 8, 1.0)) ** 2
+    x = image_axis(128, 8)
+    row, column = np.unravel_index(intensity.argmax(), intensity.shape)
+    assert x[column] == pytest.approx(3.0, abs=1 / 8)
+    assert x[row] == pytest.approx(-1.5, abs=1 / 8)
+
+
+@pytest.mark.parametrize("scale", [1.0, 0.9, 1.1])
+def test_the_relay_pupil_is_upright_and_energy_is_kept(scale):
+    pupil = blob(128, 0.2, -0.1)
+    focal = to_image(pupil, 360, 8, scale)
+    np.testing.assert_allclose(to_pupil(focal, 128, 8, scale), pupil, atol=1e-6)
+    assert np.sum(np.abs(focal) ** 2) / 8**2 == pytest.approx(np.sum(np.abs(pupil) ** 2) / 128**2, rel=1e-9)
+
+
+def test_longer_waves_make_a_larger_image():
+    x = image_axis(240, 8)
+    focal = np.abs(to_image(blob(128, 0, 0), 240, 8, 1.0)) ** 2
+    longer = np.abs(to_image(blob(128, 0, 0), 240, 8, 1 / 1.25)) ** 2
+    widths = [np.sqrt((each.sum(axis=0) * x**2).sum() / each.sum()) for each in (focal, longer)]
+    assert widths[1] / widths[0] == pytest.approx(1.25, rel=1e-6)
+
+
+def test_an_image_is_the_fraction_of_the_light_in_the_open_circle():
+    open_circle = Sensor(circle(512), np.ones((480, 480)), ApertureMask(np.ones((512, 512))))
+    total = image(open_circle, np.zeros((512, 512))).sum()
+    assert 0.97 < total < 1.0  # what diffraction throws beyond the pixels is missing
+    half = Sensor(0.5 * circle(512), np.ones((480, 480)), ApertureMask(np.ones((512, 512))))
+    assert image(half, np.zeros((512, 512))).sum() == pytest.approx(0.25 * total)
+    assert circle(512).mean() == pytest.approx(OPEN_AREA, rel=1e-3)
+
+
+def test_a_quadrant_starts_at_the_centre_with_rows_along_y():
+    quarter = np.zeros((2, 2))
+    quarter[1, 0] = 1.0  # y far, x near
+    expected = np.array([[0, 1, 1, 0], [0, 0, 0, 0], [0, 0, 0, 0], [0, 1, 1, 0]])
+    np.testing.assert_array_equal(from_quarter(quarter, 4), expected)
+    np.testing.assert_array_equal(from_quarter(quarter, 8), np.kron(expected, np.ones((2, 2))))
+
+
+@pytest.mark.parametrize(
+    ("quarter", "samples", "message"),
+    [
+        (np.zeros((2, 3)), 4, "square"),
+        (np.full((2, 2), 1.5), 4, "between 0 and 1"),
+        (np.full((2, 2), np.nan), 4, "between 0 and 1"),
+        (np.zeros((2, 2)), 6, "multiple of 4"),
+    ],
+)
+def test_bad_quadrants_are_refused(quarter, samples, message):
+    with pytest.raises(ValueError, match=message):
+        from_quarter(quarter, samples)
+
+
+def test_every_mode_agrees_with_hcipy(hcipy):
+    grid = hcipy.make_pupil_grid(128, 1.0)
+    x, y = 2 * np.asarray(grid.x), 2 * np.asarray(grid.y)
+    inside = np.hypot(x, y) <= 1
+    for noll in range(1, 67):
+        assert tuple(hcipy.noll_to_zernike(noll)) == noll_to_nm(noll)
+        theirs = np.asarray(hcipy.zernike_noll(noll, 1.0, grid))[inside]
+        np.testing.assert_allclose(zernike(noll, x, y)[inside], theirs, rtol=0, atol=1e-12 * np.abs(theirs).max())
+
+
+def test_modes_are_orthonormal_over_the_circle():
+    u = 2 * pupil_axis(512)
+    inside = np.hypot(u[:, None], u) <= 1
+    modes = zernikes((1, *NOLLS_20), u, u[:, None])[:, inside]
+    np.testing.assert_allclose(modes @ modes.T / modes.shape[1], np.eye(21), atol=2e-3)
+
+
+def test_polynomials_continue_outside_the_circle():
+    assert zernike(2, 3.0, 1.0) == pytest.approx(6.0)
+    assert zernike(3, 3.0, 1.0) == pytest.approx(2.0)
+    assert zernike(4, 2.0, 0.0) == pytest.approx(np.sqrt(3) * 7.0)
+    assert zernike(11, 0.0, 2.0) == pytest.approx(np.sqrt(5) * (6 * 16 - 6 * 4 + 1))
+
+
+def test_names_say_which_axis_a_mode_follows():
+    assert [mode_name(noll) for noll in (2, 3, 4, 7, 8, 11)] == [
+        "tilt x",
+        "tilt y",
+        "focus",
+        "coma y",
+        "coma x",
+        "spherical",
+    ]
+    assert len({mode_name(noll) for noll in range(1, 30)}) == 29
+    # "x" modes change sign with x and not with y
+    for noll in range(2, 22):
+        if mode_name(noll).endswith(" x"):
+            assert zernike(noll, -0.3, 0.2) == pytest.approx(-zernike(noll, 0.3, 0.2))
+            assert zernike(noll, 0.3, -0.2) == pytest.approx(zernike(noll, 0.3, 0.2))
+
+
+def test_indices_below_one_are_refused():
+    with pytest.raises(ValueError, match="start at 1"):
+        zernike(0, 0.0, 0.0)
 
 
 @pytest.mark.parametrize("angle_deg", [0.0, 20.0, 135.0, 300.0])

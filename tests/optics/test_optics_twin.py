@@ -1,5 +1,6 @@
-"""The twin against the full chain that it was made from."""
+"""The twin against the full chain that it was made from, and what its benchmark reports."""
 
+import json
 from dataclasses import replace
 
 import numpy as np
@@ -18,6 +19,7 @@ from lowfc.optics.twin.twin import reference as twin_reference
 from lowfc.optics.twin.twin import response as twin_response
 from lowfc.optics.twin.twin_build import build
 from lowfc.optics.twin.twin_mirror import twin_mirror, wavefront_nm
+from lowfc.programs.measure.bench.twin import bench_twin, render
 
 
 def relative_l2(ours, truth):
@@ -191,3 +193,20 @@ def test_wavefronts_that_are_not_at_the_used_nodes_are_refused(fast):
         Evaluator(fast).image(np.zeros(1444, np.float32))
     with pytest.raises(ValueError, match="at the used nodes"):
         twin_response(fast, np.zeros((2, 1444)))
+
+
+def test_the_bench_reports_all_three_twins(cache_dir, fast, accurate, broadband):
+    names = []
+    result = bench_twin(seconds=0.05, progress=names.append, cache_dir=cache_dir)
+    assert json.loads(json.dumps(result)) == result
+    cases = result["cases"]
+    assert [case["name"] for case in cases] == names
+    assert [(case["rank"], case["wavelengths"]) for case in cases] == [(60, 1), (80, 1), (60, 3)]
+    for key in ("twin_us", "full_us", "ratio", "relative_l2", "rank"):
+        assert result[key] == cases[0][key]
+    for case, limit in zip(cases, (1e-4, 2e-6, 1e-4), strict=True):
+        assert 0 < case["relative_l2"] < limit
+        assert case["ratio"] == case["full_us"] / case["twin_us"]
+    table = render(result)
+    assert all(name in table for name in names)
+    assert "sensor sam" in table

@@ -6,8 +6,6 @@ from itertools import product
 from pathlib import Path
 
 import pytest
-import typer
-from typer.testing import CliRunner
 
 from lowfc.contract.errors import ConfigurationError, DataFileError
 from lowfc.programs.paper import commands, report
@@ -31,6 +29,7 @@ from lowfc.programs.paper.report import (
 from lowfc.programs.paper.rows import Row, plain
 from lowfc.programs.paper.tables.reconstruction import ESTIMATORS, WITH_NUISANCES
 from lowfc.programs.paper.tables.tables import TABLES
+from tests.support.loops import lowfc
 
 DOCS = Path(__file__).parents[2] / "docs"
 SAM = "sam27d07_bal14"
@@ -167,26 +166,19 @@ def test_another_seed_is_another_draw(few):
     compare(again, few["table4"])
 
 
-@pytest.fixture
-def lowfc():
-    app = typer.Typer()
-    app.command()(commands.validate)
-    return lambda *words: CliRunner().invoke(app, words)
-
-
-def test_the_command_prints_one_json_object(lowfc):
-    one = lowfc("table1", "--json", "--trials", "7", "--seed", "3")
+def test_the_command_prints_one_json_object():
+    one = lowfc("validate", "table1", "--json", "--trials", "7", "--seed", "3")
     assert one.exit_code == 0, one.output
     table = json.loads(one.stdout)
     assert (table["table"], table["trials"], table["seed"]) == ("table1", 7, 3)
     assert set(table["rows"][0]) >= {"name", "modes", "estimator", "quantity", "unit"}
     assert set(table["rows"][0]) >= {"paper", "measured", "error", "predicted", "limit", "assumption"}
-    several = json.loads(lowfc("table2", "table1", "--sensor", SAM, "--json").stdout)
+    several = json.loads(lowfc("validate", "table2", "table1", "--sensor", SAM, "--json").stdout)
     assert [table["table"] for table in several["tables"]] == ["table1", "table2"]
 
 
-def test_the_command_prints_a_table(lowfc):
-    done = lowfc("table1")
+def test_the_command_prints_a_table():
+    done = lowfc("validate", "table1")
     assert "pupil diameters" in done.stdout
     assert "[1] The model knows focal lengths and diameters only by their ratio." in done.stdout
 
@@ -206,8 +198,8 @@ def test_the_command_prints_a_table(lowfc):
         (("all", "--docs", ".", "--sensor", "sam"), "use it with all"),
     ],
 )
-def test_mistakes_are_one_line(lowfc, words, said):
-    error = lowfc(*words).exception
+def test_mistakes_are_one_line(words, said):
+    error = lowfc("validate", *words).exception
     assert isinstance(error, ConfigurationError)
     assert said in str(error)
     assert "\n" not in str(error)
@@ -222,11 +214,11 @@ def test_a_fault_of_ours_is_not_called_a_users_mistake(monkeypatch):
         run(["table1"], Context())
 
 
-def test_who_names_a_sensor_is_told_where_it_changes_nothing(lowfc):
+def test_who_names_a_sensor_is_told_where_it_changes_nothing():
     told = "of the paper's own sensors, --sensor changes nothing there"
-    assert lowfc("table1", "--sensor", SAM).stderr.startswith(f"table1: {told}\n")
-    assert told not in lowfc("table1").stderr
-    assert told not in lowfc("fig3", "--sensor", SAM).stderr
+    assert lowfc("validate", "table1", "--sensor", SAM).stderr.startswith(f"table1: {told}\n")
+    assert told not in lowfc("validate", "table1").stderr
+    assert told not in lowfc("validate", "fig3", "--sensor", SAM).stderr
 
 
 def test_without_matplotlib_nothing_is_worked_out_in_vain(monkeypatch, tmp_path):

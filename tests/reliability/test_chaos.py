@@ -213,7 +213,6 @@ def test_every_case_can_be_run(tmp_path: Path) -> None:
         assert {text.partition(" ")[0] for text in (*case.expected, *case.allowed)} <= names
     assert {case.fault for case in CASES.values() if case.fault} == set(Kind)
     first = next(case for case in CASES.values() if case.bad is not None).bad
-    assert first is not None
     assert [first(number) for number in (FIRST - 1, FIRST, FIRST + STRUCK - 1, FIRST + STRUCK)] == [
         *(False, True, True, False)
     ]
@@ -222,7 +221,6 @@ def test_every_case_can_be_run(tmp_path: Path) -> None:
 
 def test_a_stuck_image_may_be_used_no_longer_than_the_loop_lets_it() -> None:
     bad = CASES["frames-stuck"].bad
-    assert bad is not None
     assert [bad(number) for number in (FIRST, FIRST + 2, FIRST + 3, FIRST + STRUCK)] == [False, False, True, False]
 
 

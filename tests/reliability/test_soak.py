@@ -13,8 +13,6 @@ from lowfc.contract.messages import STEP, TRUTH
 from lowfc.programs.reliability.soak.figures import Usage, of_latency, of_process, render, slope, too_short
 from lowfc.programs.reliability.soak.run import LogChecker
 
-pytestmark = pytest.mark.exclusive
-
 SECONDS = 1800
 START_S = 1_800_000_000
 COUNTS = {

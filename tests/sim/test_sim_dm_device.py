@@ -3,18 +3,16 @@
 from dataclasses import replace
 
 import numpy as np
-import numpy.typing as npt
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
+from lowfc.arrays import Single
 from lowfc.contract.configuration import load
 from lowfc.control.loop.safety import Limits, Reason, neighbour_difference_nm
 from sim_dm.device import LONGEST_VALID_NS, Command, Device, Status, apply_command, initial, tick
 from sim_dm.process import device as device_of
-
-Array = npt.NDArray[np.float32]
 
 GRID = (4, 5)
 LIMITS = Limits(750.0, 150.0, 500.0)
@@ -28,12 +26,12 @@ def mirror(**changes: object) -> Device:
     return replace(Device(GRID, LIMITS, STEP_NM, 0.0, free, flatten=True), **changes)
 
 
-def told(actuators_nm: Array | None, index: int = 1, **changes: object) -> Command:
+def told(actuators_nm: Single | None, index: int = 1, **changes: object) -> Command:
     usual = Command("lowfc", index, START_NS + index * MS, 200 * MS, actuators_nm, np.array([1, 2], np.float32))
     return replace(usual, **changes)
 
 
-def even(height_nm: float) -> Array:
+def even(height_nm: float) -> Single:
     return np.full(GRID, height_nm, np.float32)
 
 
@@ -45,7 +43,7 @@ def follow(device: Device, status: Status, *heights_nm: float) -> Status:
     return status
 
 
-def broken(before: Array, after: Array) -> list[str]:
+def broken(before: Single, after: Single) -> list[str]:
     """Limits that the driver's output breaks, by float64 and without tolerance."""
     now, then = after.astype(np.float64), before.astype(np.float64)
     figures = (

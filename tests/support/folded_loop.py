@@ -1,9 +1,10 @@
-"""A loop in one process behind the interface of `lowfc.client`: frames are exposed when the next one is asked for."""
+"""A loop in one process: behind the interface of `lowfc.client`, and folded over a run of the configured bench."""
 
 import contextlib
 import tomllib
 from collections import deque
 from collections.abc import Callable, Iterator
+from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any, NamedTuple
 
@@ -13,6 +14,7 @@ import numpy.typing as npt
 from lowfc.adapters.bus.bus import Publisher
 from lowfc.adapters.files import factory
 from lowfc.adapters.process.clock import HostClock
+from lowfc.arrays import Array, Single
 from lowfc.client import Frame as Image
 from lowfc.client import MirrorWatch
 from lowfc.contract.codecs.state_codec import controller_state
@@ -31,21 +33,18 @@ from lowfc.testing.memory_bus import MemoryBus, MemoryHub, MemoryRing
 from sim_camera.process import bench
 from sim_dm.device import Command, apply_command, initial
 from sim_dm.process import device
+from tools.law_bench import Bench, calibrated
 
 FIRST = 1 << 32
 
 
 @lru_cache(maxsize=4)
 def computed(toml: str) -> Calibration:
-    """The computed calibration of a configuration."""
     config = Configuration.model_validate(tomllib.loads(toml))
-    optics = factory.twin(config, None, print)
-    return factory.analytic_calibration(config, optics, factory.mirror_on_twin(config, optics, print))
+    return calibrated(config)
 
 
 class Given(NamedTuple):
-    """An answer."""
-
     frame_sequence: int
     state: wire.ControllerState | None
     text: str
@@ -115,8 +114,8 @@ class FoldedLoop:
         self._index = 0
         self._lose = lose
         self._listeners: list[tuple[str, deque[Any]]] = []
-        self.surfaces_nm: list[npt.NDArray[np.float32]] = []
-        self.residual_nm: list[npt.NDArray[np.float32]] = []
+        self.surfaces_nm: list[Single] = []
+        self.residual_nm: list[Single] = []
         self.stops = self.lease_id = 0
         self.first = FIRST
 
@@ -127,7 +126,6 @@ class FoldedLoop:
         self._states: Publisher = self.mirror_bus.publisher(MIRROR_STATE, "dm")
 
     def expose(self) -> None:
-        """One frame."""
         self._shapes = [self._status.surface_nm, *self._shapes[:-1]]
         seen = np.tensordot(self._weights, np.array(self._shapes), 1)
         whole, truth = self._scene.expose(self._index, seen)
@@ -243,3 +241,34 @@ class FoldedLoop:
                 self._listeners = [one for one in self._listeners if one is not listener]
 
         return each()
+
+
+@dataclass(frozen=True)
+class Fold:
+    """Modes (frames, modes) and rms over the open pupil (frames,) of a run, nm of wavefront."""
+
+    disturbance_nm: Array
+    residual_nm: Array
+    error_nm: Array
+    pol_nm: Array
+    command_nm: Array
+    disturbance_rms_nm: Array
+    residual_rms_nm: Array
+
+
+def fold(config: Configuration, frames: int) -> Fold:
+    """Run the loop of a configuration, of which every frame must be used."""
+    bench = Bench(config, calibrated(config))
+    bench.run(frames)
+    assert not bench.refused
+
+    def of_all(rows: list, name: str) -> Array:
+        return np.array([getattr(row, name) for row in rows], dtype=np.float64)
+
+    return Fold(
+        **{name: of_all(bench.steps, name) for name in ("error_nm", "pol_nm", "command_nm")},
+        **{
+            name: of_all(bench.truths, name)
+            for name in ("disturbance_nm", "residual_nm", "disturbance_rms_nm", "residual_rms_nm")
+        },
+    )

@@ -85,7 +85,6 @@ def _peak_bytes() -> int:
 
 
 def main() -> int:
-    """The command line."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--inputs", type=int, default=1_000_000, help="for all targets together")
     parser.add_argument("--first", type=int, default=0, help="number of the first input of each target")

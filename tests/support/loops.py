@@ -11,7 +11,11 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+from click.testing import Result
 from mcap.reader import make_reader
+from typer.testing import CliRunner
+
+from lowfc.programs.cli.main import app
 
 LOWFC = [sys.executable, "-m", "lowfc"]
 
@@ -23,6 +27,11 @@ def run(folder: Path, *arguments: str, config: str = "", timeout_s: float = 120)
         (folder / "test.toml").write_text(config)
         words += ["--config", "test.toml"]
     return subprocess.run(words, cwd=folder, capture_output=True, text=True, timeout=timeout_s, check=False)
+
+
+def lowfc(*words: object) -> Result:
+    """`lowfc` with these words, in this process; the error that ended it is its `exception`."""
+    return CliRunner().invoke(app, [*map(str, words)])
 
 
 def loop(folder: Path, *arguments: str, config: str = "", timeout_s: float = 120) -> dict[str, Any]:
@@ -59,10 +68,10 @@ def children(launcher: int) -> dict[str, int]:
     return found
 
 
-def start(folder: Path, *arguments: str) -> "subprocess.Popen[str]":
+def start(folder: Path, *arguments: object) -> "subprocess.Popen[str]":
     """A `lowfc` that goes on while the test does something."""
     return subprocess.Popen(
-        [*LOWFC, *arguments],
+        [*LOWFC, *map(str, arguments)],
         cwd=folder,
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
@@ -78,11 +87,10 @@ def interrupt(process: "subprocess.Popen[str]", timeout_s: float = 20) -> tuple[
 
 
 def until(condition: Callable[[], object], timeout_s: float = 30.0) -> None:
-    """Wait for something to be true."""
     deadline_s = time.monotonic() + timeout_s
     while not condition():
         assert time.monotonic() < deadline_s, "waited in vain"
-        time.sleep(0.05)
+        time.sleep(0.01)
 
 
 def recorded_bytes(folder: Path) -> int:

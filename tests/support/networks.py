@@ -51,7 +51,6 @@ class Host:
         return os.environ | {"XDG_RUNTIME_DIR": str(self.folder / "runtime"), "OMP_NUM_THREADS": "1"}
 
     def inside(self, *words: str) -> list[str]:
-        """A command line that runs here."""
         return ["nsenter", f"--net=/proc/{self.holder.pid}/ns/net", *words]
 
     def ip(self, *words: str) -> None:
@@ -88,7 +87,6 @@ class Host:
     def close(self) -> None:
         for child in self.children.values():
             child.stop(5.0)
-        assert self.holder.stdin is not None
         self.holder.stdin.close()
         self.holder.wait()
 

@@ -1,8 +1,6 @@
 """A recorder, a camera and a controller on a bus in memory."""
 
 import threading
-import time
-from collections.abc import Callable
 from pathlib import Path
 
 from lowfc.adapters.bus.bus import Publisher
@@ -13,15 +11,9 @@ from lowfc.contract.messages import EVENT, Log, Topic
 from lowfc.programs.core.recording.recorder import Recorder
 from lowfc.programs.core.recording.summary import Summary
 from lowfc.testing.memory_bus import MemoryBus, MemoryHub
+from tests.support.loops import until
 
 PATIENCE_S = 20.0
-
-
-def until(condition: Callable[[], bool]) -> None:
-    deadline = time.monotonic() + PATIENCE_S
-    while not condition():
-        assert time.monotonic() < deadline
-        time.sleep(0.005)
 
 
 class Bench:

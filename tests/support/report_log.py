@@ -5,10 +5,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
 from lowfc.adapters.bus.bus import Sample
 from lowfc.adapters.logs.writer import Attachment, LogWriter
+from lowfc.arrays import Pixels, Single
 from lowfc.contract.codecs import codec
 from lowfc.contract.codecs.calibration_codec import encode_calibration, identified
 from lowfc.contract.codecs.state_codec import controller_state
@@ -111,7 +111,6 @@ class Night:
                 self._take(advance(self.settings, self._state, taken), DELAY_NS + 1000 * (self._count % 50))
 
     def request(self, name: str, values: tuple[float, ...] = (), modes: tuple[int, ...] = (), **fields: Any) -> None:
-        """What an operator asks."""
         asked = Request(self.now_ns, name, modes, values, **fields)
         before = self._state
         after, outputs = advance(self.settings, before, asked)
@@ -181,11 +180,11 @@ class Night:
             state_now = controller_state(self._state, self.settings, self.now_ns)
             self.put(CONTROLLER_STATE, state_now, late_ns=late_ns)
 
-    def _disturbance_nm(self) -> npt.NDArray[np.float32]:
+    def _disturbance_nm(self) -> Single:
         time_s = self._frames * PERIOD_NS * 1e-9
         return np.array([12 * np.sin(2 * np.pi * 7 * time_s), 3.0, -2.0], np.float32)
 
-    def _pixels(self, residual_nm: npt.NDArray[np.float32], flux_dn: float) -> npt.NDArray[np.uint16]:
+    def _pixels(self, residual_nm: Single, flux_dn: float) -> Pixels:
         """Photons are drawn, and read-out adds its noise."""
         mean_dn = TOY.pixels(residual_nm, flux_dn).astype(float)
         dark_dn = self.calibration.dark.reshape(SHAPE).astype(float)

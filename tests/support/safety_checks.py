@@ -4,11 +4,9 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 
+from lowfc.arrays import Single
 from lowfc.control.loop.safety import Limited, Limits
-
-Array = npt.NDArray[np.float32]
 
 LIMITS = Limits(stroke_nm=700.0, slew_nm=100.0, neighbour_nm=400.0)
 
@@ -18,19 +16,19 @@ class Case:
     """From `previous_nm`, `wanted_nm` is asked `steps` times; the end is `expected_nm` to 0.01 nm where it is given."""
 
     name: str
-    previous_nm: Array
-    wanted_nm: Array
+    previous_nm: Single
+    wanted_nm: Single
     reasons: tuple[str, ...]
-    expected_nm: Array | None = None
+    expected_nm: Single | None = None
     steps: int = 1
 
 
-def rows(*values: float) -> Array:
+def rows(*values: float) -> Single:
     """A shape of three columns whose rows have these heights."""
     return np.repeat(np.array(values, np.float32)[:, None], 3, axis=1)
 
 
-def columns(*values: float) -> Array:
+def columns(*values: float) -> Single:
     """A shape of three rows whose columns have these heights."""
     return np.ascontiguousarray(rows(*values).T)
 
@@ -80,7 +78,7 @@ CASES = (
 )
 
 
-def violations(limits: Limits, previous_nm: Array, actuators_nm: Array) -> list[str]:
+def violations(limits: Limits, previous_nm: Single, actuators_nm: Single) -> list[str]:
     """Limits that a command breaks after one that kept them; exact, by float64 and without tolerance."""
     now, before = actuators_nm.astype(np.float64), previous_nm.astype(np.float64)
     if now.shape != before.shape or not np.isfinite(now).all():
@@ -95,13 +93,13 @@ def violations(limits: Limits, previous_nm: Array, actuators_nm: Array) -> list[
     return [f"{name}: {value} > {bound}" for name, (value, bound) in figures.items() if not value <= bound]
 
 
-def check_kept(limit: Callable[[Limits, Array, Array], Limited], case: Case) -> None:
+def check_kept(limit: Callable[[Limits, Single, Single], Limited], case: Case) -> None:
     """AssertionError where `limit` does not do with a case what it must."""
     shape = case.previous_nm
     outside = bool(violations(LIMITS, shape, shape))
     for _ in range(case.steps):
         limited = limit(LIMITS, shape, case.wanted_nm)
-        after: Array = limited.actuators_nm
+        after: Single = limited.actuators_nm
         broken = violations(LIMITS, shape, after)
         if outside:
             broken = [one for one in broken if one.startswith(("slew", "finite"))]

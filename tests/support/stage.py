@@ -1,10 +1,14 @@
-"""A run of the toy, state by state, and the verdict on it; for tests of what an operator is shown."""
+"""What an operator is shown: a run of the toy state by state, and a stream that keeps what is drawn on it."""
 
+from collections import defaultdict
 from collections.abc import Callable, Iterable
+from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 
 from lowfc.adapters.bus.bus import Sample
+from lowfc.arrays import Array
 from lowfc.contract.codecs.calibration_codec import encode_calibration, identified
 from lowfc.contract.envelope import sequence_of
 from lowfc.contract.messages import (
@@ -134,3 +138,70 @@ class Stage:
             whole_ns = (1000 * self.latency_us,)
             sequence = (frame["frame_sequence"],)
             self.send(TIMING, wire.ControlTiming(frame_sequence=sequence, frame_to_command_ns=whole_ns, **stages))
+
+
+class Tape:
+    """In place of a RecordingStream.
+
+    Attributes:
+        now_ns: time of what is logged next.
+        logged: (time in ns, archetypes) by entity path; the time is None for what holds for ever.
+        rows: (times in ns, values (rows, series)) of columns of scalars, by entity path.
+    """
+
+    def __init__(self) -> None:
+        self.now_ns: int | None = None
+        self.logged: dict[str, list[tuple[int | None, tuple[Any, ...]]]] = defaultdict(list)
+        self.rows: dict[str, list[tuple[npt.NDArray[np.int64], Array]]] = defaultdict(list)
+
+    def set_time(self, timeline: str, *, timestamp: np.datetime64) -> None:
+        assert timeline == "time"
+        self.now_ns = int(timestamp.astype("datetime64[ns]").astype(np.int64))
+
+    def log(self, path: str, *archetypes: Any, static: bool = False) -> None:
+        self.logged[path].append((None if static else self.now_ns, archetypes))
+
+    def send_columns(self, path: str, indexes: list[Any], columns: Any) -> None:
+        (index,) = indexes
+        assert index.timeline_name() == "time"
+        times_ns = np.array(index.as_arrow_array().cast("int64"))
+        self.rows[path].append((times_ns, np.array(values_of(next(iter(columns))), float)))
+
+    def disconnect(self) -> None:
+        pass
+
+    @property
+    def paths(self) -> set[str]:
+        """Where something was drawn that is not style alone."""
+        moving = {path for path, found in self.logged.items() if any(at is not None for at, _ in found)}
+        return moving | set(self.rows)
+
+    def column(self, path: str) -> tuple[npt.NDArray[np.int64], Array]:
+        times, values = zip(*self.rows[path], strict=True)
+        return np.concatenate(times), np.concatenate(values)
+
+    def names(self, path: str) -> list[str]:
+        return values_of(self.last(path).names)
+
+    def texts(self, path: str) -> list[str]:
+        return [values_of(line.text)[0] for _, (line,) in list(self.logged[path])]
+
+    def last(self, path: str) -> Any:
+        return self.logged[path][-1][1][0]
+
+
+def values_of(component: Any) -> list[Any]:
+    return list(component.as_arrow_array().to_pylist())
+
+
+def pixels(tape: Tape, path: str) -> npt.NDArray[np.uint8]:
+    """Colours (rows, columns, 3) of the last picture at a path; its format may have come before it."""
+
+    def last(component: str) -> Any:
+        logged = [batches for _, (batches, *_) in tape.logged[path]]
+        parts = [part for one in logged for part in (one if isinstance(one, list) else one.as_component_batches())]
+        named = [part for part in parts if part.component_descriptor().component == f"Image:{component}"]
+        return values_of(named[-1])[0]
+
+    shape = last("format")
+    return np.array(last("buffer"), np.uint8).reshape(shape["height"], shape["width"], -1)

@@ -43,8 +43,7 @@ from lowfc.testing.memory_bus import MemoryBus, MemoryHub
 from sim_dm import process
 from sim_dm.device import Device, apply_command, initial, tick
 from sim_dm.process import MirrorProcess
-from tests.support.damage import damaged, rewritten
-from tests.support.mutated_logs import mutated, small_log
+from tests.support.mutated_logs import damaged, mutated, rewritten, small_log
 from tests.support.report_log import Night
 from tests.support.safety_checks import violations
 from tests.support.toy import GRID, NOLL, calibration, frame, loaded, settings
@@ -143,12 +142,10 @@ class Processes:
         self._live()
 
     def command(self, data: bytes) -> None:
-        """Commands of anybody."""
         self.commands.put(data)
         self._live()
 
     def settings(self, data: bytes) -> None:
-        """Settings of a camera."""
         self.settings_of.put(data)
         self._live()
 

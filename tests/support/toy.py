@@ -6,6 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
+from lowfc.arrays import Array, Pixels
 from lowfc.control.calibration.calibration import Calibration, normalise_flux, reconstructor
 from lowfc.control.laws.stability import delay_weights
 from lowfc.control.loop.advance import advance
@@ -13,8 +14,6 @@ from lowfc.control.loop.camera import CameraSettings
 from lowfc.control.loop.inputs import Frame, Input, Load, Outputs, Step
 from lowfc.control.loop.safety import Limits, LoopMode
 from lowfc.control.loop.state import Settings, State
-
-Array = npt.NDArray[np.float64]
 
 SHAPE, GRID, NOLL = (6, 7), (4, 5), (2, 3, 4)
 FLUX_DN, DARK_DN, SATURATION_DN = 200_000.0, 100.0, 60_000.0
@@ -37,7 +36,7 @@ class Toy:
     response: Array
     modes_to_actuators: Array
 
-    def pixels(self, modes_nm: npt.ArrayLike, flux_dn: float = FLUX_DN) -> npt.NDArray[np.uint16]:
+    def pixels(self, modes_nm: npt.ArrayLike, flux_dn: float = FLUX_DN) -> Pixels:
         """Frame (rows, columns) of a wavefront, exactly linear up to the rounding to DN."""
         image = self.reference + self.response @ np.asarray(modes_nm, float)
         return np.rint(DARK_DN + flux_dn * image.reshape(SHAPE) / self.reference.sum()).astype(np.uint16)
@@ -100,7 +99,6 @@ def settings(**changes: object) -> Settings:
 
 
 def loaded(what: Settings) -> State:
-    """State with the toy's calibration loaded."""
     return advance(what, State(), Load(0, calibration(), "test"))[0]
 
 
@@ -125,13 +123,11 @@ def feed(what: Settings, state: State, *inputs: Input) -> tuple[State, list[Outp
 
 
 def names(every: list[Outputs]) -> list[str]:
-    """Of the events."""
     return [event.name for outputs in every for event in outputs.events]
 
 
 def answered(outputs: Outputs, accepted: bool, *words: str) -> None:
     """Assert that a request was accepted, or refused, in a sentence with these words."""
-    assert outputs.reply is not None
     assert outputs.reply.accepted is accepted, outputs.reply.text
     for word in words:
         assert word in outputs.reply.text

@@ -31,6 +31,12 @@ needs_vulkan = pytest.mark.skipif(
 )
 needs_chromium = pytest.mark.skipif(CHROMIUM is None, reason="no browser is installed: apt install chromium")
 
+
+def on_screen(test: Callable[..., None]) -> Callable[..., None]:
+    """Mark a test of what rerun's viewer draws: it needs a Vulkan driver, and the host to itself."""
+    return pytest.mark.exclusive(pytest.mark.viewer(needs_vulkan(test)))
+
+
 Pixels = npt.NDArray[np.uint8]
 
 

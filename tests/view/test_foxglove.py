@@ -48,8 +48,6 @@ from lowfc.testing.clock import FakeClock
 from lowfc.testing.memory_bus import MemoryBus, MemoryHub
 from tests.support.loops import until
 
-pytestmark = pytest.mark.exclusive
-
 pytest.importorskip("foxglove")
 
 PATIENCE_S = 10.0
@@ -209,7 +207,6 @@ def test_a_client_that_does_not_read_loses_messages_and_holds_up_nobody(bridge: 
         got = [0]
         while got[-1] < count:
             message = frozen.next()
-            assert message is not None
             got.append(message[1])
     assert got == sorted(got)
     assert 1000 < len(got) < count, "it has a bounded number of the newest"
@@ -236,6 +233,7 @@ def test_a_taken_port_and_a_missing_library_are_said_in_one_line(
     assert "\n" not in f"{taken.value}{missing.value}"
 
 
+@pytest.mark.exclusive
 def test_a_process_of_a_real_run() -> None:
     run = open_run(new_run_id())
     program = (
@@ -252,7 +250,6 @@ def test_a_process_of_a_real_run() -> None:
         text=True,
         env=os.environ | {"PYTHONUNBUFFERED": "1"},
     )
-    assert process.stderr is not None
     bus = ZenohBus(run.links, Role.CONTROLLER, HostClock())
     try:
         address = process.stderr.readline().split()[4]
@@ -273,7 +270,6 @@ def test_a_process_of_a_real_run() -> None:
             got = {"/" + FRAME.key: 0, "/" + STEP.key: 0}
             while got["/" + STEP.key] < COUNT:
                 message = client.next()
-                assert message is not None
                 if message[0] == "/" + CALIBRATION.key:
                     continue  # once more, for it was asked for meanwhile
                 assert message[2] == (FRAME_BYTES if message[0] == "/" + FRAME.key else STEP_BYTES)

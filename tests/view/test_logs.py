@@ -21,8 +21,7 @@ from lowfc.programs.view.verdicts.course import Course, round_125
 from lowfc.programs.view.verdicts.tile import Level, Verdict
 from tests.support import report_log
 from tests.support.report_log import Night
-from tests.support.stage import accumulated, snapshot_of, tile
-from tests.support.tape import Tape, values_of
+from tests.support.stage import Tape, accumulated, snapshot_of, tile, values_of
 
 Shown = list[Verdict]
 
@@ -136,7 +135,6 @@ def test_every_view_of_the_layout_has_something_and_the_plots_show_all_of_a_log(
     flat, residual = values_of(tape.last(f"{trend.TREND}/lines").strips)  # the residual on top
     assert np.mean([y for _, y in flat]) < np.mean([y for _, y in residual])  # upwards is less
     assert len(residual) == len(flat) > 1
-    assert done.span_ns is not None
     begin_ns, end_ns = done.span_ns
     assert (end_ns - begin_ns) * 1e-9 == pytest.approx(done.log_s, abs=0.1)
     blueprint = layout(window_s=None, span_ns=done.span_ns, still=True)
@@ -148,7 +146,6 @@ def test_every_view_of_the_layout_has_something_and_the_plots_show_all_of_a_log(
 
 
 def views(part: rrb.Container | rrb.View) -> list[rrb.View]:
-    """Every view of a part of a layout."""
     return [part] if isinstance(part, rrb.View) else [view for one in part.contents for view in views(one)]
 
 

@@ -1,25 +1,43 @@
-"""What is drawn of a run: the right numbers under the right names, and nothing of what cannot be read."""
+"""What is drawn of a run, at once or once a second: the right numbers under the right names."""
 
 import dataclasses
+from typing import Any
 
 import numpy as np
 import pytest
 
+from lowfc.adapters.files.sensors import load_pupil
+from lowfc.adapters.logs.columns import STAGES, Steps, Truths
 from lowfc.contract.codecs.codec import actuators
 from lowfc.contract.configuration import Configuration
-from lowfc.contract.messages import CONTROLLER_STATE, EVENT, FRAME, MIRROR_STATE, STEP, TRUTH, Log, timestamp, wire
+from lowfc.contract.messages import (
+    CONTROLLER_STATE,
+    EVENT,
+    FRAME,
+    MIRROR_STATE,
+    STEP,
+    TRUTH,
+    Log,
+    Role,
+    timestamp,
+    wire,
+)
 from lowfc.control.loop.safety import LoopMode
-from lowfc.optics.chain.zernike import mode_name
+from lowfc.optics.chain.coronagraph import mean_contrast
+from lowfc.optics.chain.grid import pupil_axis
+from lowfc.optics.chain.zernike import mode_name, zernikes
 from lowfc.optics.detector.photometry import tilt_nm_per_mas
 from lowfc.programs.view.draw.pictures import Scale, round_up
-from lowfc.programs.view.draw.plots import Plot
-from lowfc.programs.view.panels import loop, mirror, sensor, wavefront
+from lowfc.programs.view.draw.plots import BOX_HEIGHT, Plot
+from lowfc.programs.view.panels import latency, loop, mirror, science, sensor, spectra, wavefront
+from lowfc.programs.view.panels.panel import Panel
 from lowfc.programs.view.renderer import RETRY_NS, Renderer
-from lowfc.programs.view.snapshot import Accumulator, Snapshot
+from lowfc.programs.view.snapshot import Accumulator, LastHealth, Snapshot
+from lowfc.programs.view.verdicts import steady
 from tests.support.report_log import Night
-from tests.support.stage import accumulated, snapshot_of
-from tests.support.tape import Tape, pixels, values_of
-from tests.support.toy import FLUX_DN, NOLL
+from tests.support.stage import Tape, accumulated, pixels, snapshot_of, values_of
+from tests.support.theory import rejection
+from tests.support.toy import FLUX_DN, NOLL, calibration
 
 FRAMES = 120
 
@@ -220,3 +238,222 @@ def test_a_scale_grows_at_once_and_shrinks_after_a_while() -> None:
 )
 def test_scales_are_round(value: float, limit: float) -> None:
     assert round_up(value) == pytest.approx(limit)
+
+
+START_NS = 1_795_000_000_000_000_000
+NM = 550.0
+RATE_HZ = 500.0
+CALIBRATION = calibration()
+MODES = len(NOLL)
+TICK_NS = 33_333_333
+
+
+def steps(first: int, error_nm: Any, pol_nm: Any, mode: int = LoopMode.CLOSED) -> Steps:
+    rows = len(error_nm)
+    sequence = np.arange(first, first + rows, dtype=np.uint64)
+    zeros = np.zeros(rows, np.int64)
+    return Steps(
+        sequence=sequence,
+        time_ns=START_NS + (sequence * 1e9 / RATE_HZ).astype(np.int64),
+        mode=np.full(rows, mode, np.uint8),
+        reasons=zeros,
+        error_nm=np.asarray(error_nm, np.float32),
+        pol_nm=np.asarray(pol_nm, np.float32),
+        command_nm=np.zeros((rows, MODES), np.float32),
+        flux_dn=np.ones(rows, np.float32),
+        saturated_pixels=zeros,
+    )
+
+
+def truths(residual_nm: Any, disturbance_nm: Any) -> Truths:
+    rows = len(residual_nm)
+    modes = (np.asarray(one, np.float32) for one in (disturbance_nm, residual_nm))
+    return Truths(np.arange(rows, dtype=np.uint64), np.full(rows, START_NS), *modes, *np.zeros((2, rows), np.float32))
+
+
+def drawn(panel: Panel, tape: Tape, after_ns: int, **changes: Any) -> None:
+    """Draw a snapshot with nothing new but the changes."""
+    empty = Accumulator().snapshot(0)
+    nothing = {"steps": steps(0, *np.zeros((2, 0, MODES))), "truths": truths(*np.zeros((2, 0, MODES)))}
+    given = {"time_ns": START_NS + after_ns, "calibration": CALIBRATION} | nothing | changes
+    panel.draw(tape, dataclasses.replace(empty, **given))
+
+
+def mean_of(pupil: Any, modes_nm: Any) -> float:
+    radii = 2 * pupil_axis(len(pupil))
+    return mean_contrast(pupil, np.tensordot(modes_nm, zernikes(NOLL, radii, radii[:, None]), 1), NM, science.WEDGE)
+
+
+def test_contrast_is_that_of_the_newest_wavefronts() -> None:
+    pupil, rng = load_pupil(), np.random.default_rng(3)
+    left_nm, open_nm = rng.normal(0, 30.0, (4, MODES)), rng.normal(0, 80.0, (4, MODES))
+    refused = np.full((1, MODES), np.nan)
+    tape, panel = Tape(), science.Science(pupil, NM)
+    panel.begin(tape)
+    measured = steps(0, np.vstack([left_nm[:2], refused]), np.vstack([open_nm[:2], refused]))
+    drawn(panel, tape, 0, steps=measured, calibration=None)
+    assert not tape.rows
+    drawn(panel, tape, 0, steps=measured)  # the first snapshot is drawn at once
+    drawn(panel, tape, TICK_NS, steps=measured, truths=truths(left_nm[2:3], open_nm[2:3]))
+    drawn(panel, tape, science.PERIOD_NS, truths=truths(left_nm[3:4], open_nm[3:4]))
+    times_ns, found = tape.column(science.CONTRAST.path)
+    np.testing.assert_array_equal(times_ns - START_NS, [0, science.PERIOD_NS])
+    flat = mean_of(pupil, np.zeros(MODES))
+    expected = [
+        [mean_of(pupil, open_nm[1]), mean_of(pupil, left_nm[1]), flat],  # the last row was refused
+        [*(np.mean([mean_of(pupil, modes_nm[row]) for row in (2, 3)]) for modes_nm in (open_nm, left_nm)), flat],
+    ]
+    np.testing.assert_allclose(10**found, expected, rtol=3e-3)
+    assert np.ptp(np.unique(found)) > 1
+    names = [values_of(style.names) for _, (style,) in tape.logged[science.CONTRAST.path]]
+    assert [("measured" in now, "true" in as_open) for as_open, now, _ in names] == [(True, False), (False, True)]
+
+
+def test_a_brighter_dark_zone_is_brighter_in_the_picture() -> None:
+    tape, panel = Tape(), science.Science(load_pupil(), NM)
+    open_nm = np.full((1, MODES), 90.0)
+    drawn(panel, tape, 0, truths=truths(0 * open_nm, open_nm))
+    shown = pixels(tape, f"{science.IMAGE}/contrast").astype(float).sum(axis=2)
+    rows = slice(44, 52)  # about the x axis, from 5 to 11 lambda/D right of each star; the second begins at 102
+    now, as_open = (shown[rows, start + 68 : start + 92].mean() for start in (0, 102))
+    assert as_open > 2 * now
+    assert shown[48, 48] == shown[48, 102 + 48] == shown.max()  # both stars
+    drawn(panel, tape, science.PERIOD_NS)  # nothing new, nothing drawn
+    assert len(tape.rows[science.CONTRAST.path]) == 1
+
+
+TONE_HZ, TONE_NM = 20.0, 3.0
+LAW = {"gain": [0.4] * MODES, "leak": [0.01] * MODES, "delay_frames": 2.0}
+CAMERA = wire.CameraState(period_ns=round(1e9 / RATE_HZ))
+
+
+@pytest.fixture(autouse=True)
+def _every_second(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(spectra, "PERIOD_NS", 1_000_000_000)
+
+
+def run_spectra(tape: Tape, mode: int = LoopMode.CLOSED, frames: int = 3000, **law: Any) -> spectra.Spectra:
+    """A tone in the first mode and white noise in all, as it would be open and as this law leaves it."""
+    rng = np.random.default_rng(1)
+    pol_nm = rng.normal(0, 0.2, (frames, MODES))
+    pol_nm[:, 0] += TONE_NM * np.sqrt(2) * np.sin(2 * np.pi * TONE_HZ / RATE_HZ * np.arange(frames))
+    error_nm, command_nm = np.zeros((frames, MODES)), np.zeros((frames + 1, MODES))
+    for k in range(frames):  # a delay of two frames: the command of the frame before is seen
+        error_nm[k] = pol_nm[k] + command_nm[max(k - 1, 0)]
+        command_nm[k + 1] = 0.99 * command_nm[k] - 0.4 * error_nm[k]
+    panel, controller = spectra.Spectra(), wire.ControllerState(**LAW, **law)
+    panel.begin(tape)
+    for first in range(0, frames, 50):
+        new = steps(first, error_nm[first : first + 50], pol_nm[first : first + 50], mode)
+        drawn(panel, tape, round((first + 50) * 1e9 / RATE_HZ), steps=new, camera=CAMERA, controller=controller)
+    return panel
+
+
+def strips_of(tape: Tape, path: str) -> list[Any]:
+    return [np.array(strip) for strip in values_of(tape.last(f"{path}/curves").strips)]
+
+
+def curves_of(tape: Tape, path: str) -> list[Any]:
+    """Frequency and power of each curve, read off the plot by its own ticks."""
+    ticks = tape.last(f"{path}/ticks")
+    places = dict(zip(values_of(ticks.labels), values_of(ticks.positions), strict=True))
+    hz = {float(label.removesuffix(" Hz")): x for label, (x, _) in places.items() if label.endswith(" Hz")}
+    grid = [np.array(line) for line in values_of(tape.last(f"{path}/grid").strips)]
+    on_y = [line[0, 1] for line in grid[1:] if line[0, 1] == line[1, 1]]
+    power = [float(label) for label in places if not label.endswith(" Hz")]
+    x, y = np.polyfit(list(hz.values()), np.log10(list(hz)), 1), np.polyfit(on_y, np.log10(power), 1)
+    strips = strips_of(tape, path)
+    for strip in strips:
+        assert (strip >= -0.01).all(), "outside the box"
+        assert (strip <= [spectra.WIDTH + 0.01, BOX_HEIGHT + 0.01]).all(), "outside the box"
+    return [(10 ** np.polyval(x, strip[:, 0]), 10 ** np.polyval(y, strip[:, 1])) for strip in strips]
+
+
+def test_a_tone_stands_at_its_frequency_with_its_power() -> None:
+    tape = Tape()
+    run_spectra(tape)
+    (hz, as_open), (_, error), (_, theory) = curves_of(tape, spectra.TILTS)
+    tone = int(as_open.argmax())
+    assert hz[tone] == pytest.approx(TONE_HZ, rel=0.05)
+    noise = 2 * 0.2**2 * 2 / RATE_HZ  # of two modes, one-sided
+    widths_hz = np.diff(np.sqrt(hz[1:] * hz[:-1]))[tone - 3 : tone + 2]
+    assert np.sum((as_open[tone - 2 : tone + 3] - noise) * widths_hz) == pytest.approx(TONE_NM**2, rel=0.15)
+    expected = rejection(np.array([TONE_HZ]), RATE_HZ, 0.4, 0.01, 2.0)[0] ** 2
+    assert error[tone] / as_open[tone] == pytest.approx(expected, rel=0.1)
+    np.testing.assert_allclose(np.log10(error[2:]), np.log10(theory[2:]), atol=0.15)
+    (_, others), _, left = curves_of(tape, spectra.OTHERS)
+    assert np.median(others[hz > 50]) == pytest.approx(noise / 2 * (MODES - 2), rel=0.1)
+    high = hz > 50
+    passed = rejection(hz[high], RATE_HZ, 0.4, 0.01, 2.0) ** 2
+    np.testing.assert_allclose(left[1][high] / others[high], passed, rtol=0.15)
+
+
+def test_without_a_closed_loop_there_is_no_theory_and_after_a_change_no_past() -> None:
+    tape = Tape()
+    panel = run_spectra(tape, LoopMode.OPEN, 1000)
+    assert len(curves_of(tape, spectra.TILTS)) == 2
+    drawn(panel, tape, round(8e9), controller=wire.ControllerState(gain=[0.1] * MODES))
+    few = np.ones((20, MODES))
+    drawn(panel, tape, round(9e9), steps=steps(1000, few, few), camera=CAMERA)
+    assert not strips_of(tape, spectra.TILTS)
+    (text,) = values_of(tape.last(f"{spectra.TILTS}/state").labels)
+    assert text.startswith("loop closed: too few frames")
+
+
+def test_the_integrators_rejection_is_not_drawn_for_another_law() -> None:
+    tape = Tape()
+    run_spectra(tape, law=wire.LinearLaw(name="lqg"))
+    assert len(strips_of(tape, spectra.TILTS)) == 2
+
+
+def test_a_wavefront_that_stands_still_has_no_spectrum() -> None:
+    tape, still = Tape(), np.zeros((200, MODES))
+    drawn(spectra.Spectra(), tape, 0, steps=steps(0, still, still))
+    assert not strips_of(tape, spectra.OTHERS)
+
+
+def test_memory_of_the_spectra_is_bounded() -> None:
+    tape, panel, some = Tape(), spectra.Spectra(), np.ones((500, MODES))
+    for first in range(0, 2 * steady.FRAMES, 500):
+        drawn(panel, tape, first, steps=steps(first, some, some))
+    kept = len(panel._steady.rows()[0])
+    assert steady.FRAMES <= kept < steady.FRAMES + 500
+
+
+def test_latencies_are_those_of_the_last_second() -> None:
+    rng = np.random.default_rng(2)
+    tape, panel = Tape(), latency.Latency()
+    panel.begin(tape)
+    batches = [
+        {stage: rng.integers(100_000, 900_000, 100) * (1 + number) for number, stage in enumerate(STAGES)}
+        for _ in range(16)
+    ]
+    controller = wire.Health(topics=[wire.TopicCount(topic=FRAME.key, received=90, skipped=7, missing=3)])
+    recorder = wire.Health(recording=wire.Recording(lost=5))
+    health = {Role.CONTROLLER: LastHealth(0, controller), Role.RECORDER: LastHealth(0, recorder)}
+    for number, timings in enumerate(batches):
+        drawn(panel, tape, number * 100_000_000, timings=timings, health=health)
+    times_ns, found = tape.column(latency.WHOLE.path)
+    np.testing.assert_array_equal(times_ns - START_NS, np.arange(4) * latency.PERIOD_NS)
+    last_us = {stage: np.concatenate([one[stage] for one in batches[6:]]) / 1e3 for stage in STAGES}
+    whole_us = last_us["frame_to_command"]
+    np.testing.assert_allclose(found[-1], [*np.percentile(whole_us, [50, 99]), whole_us.max()])
+    stages_us = [np.percentile(last_us[stage], 99) for stage in tape.names(latency.PARTS.path)]
+    np.testing.assert_allclose(tape.column(latency.PARTS.path)[1][-1], stages_us)
+    bars = tape.last(latency.HISTOGRAM)
+    counts, middles = (np.array(values_of(one)[0]["buffer"]) for one in (bars.values, bars.abscissa))
+    widths = np.array(values_of(bars.widths)).ravel()
+    assert counts.sum() == 1000
+    assert np.average(middles, weights=counts) == pytest.approx(whole_us.mean(), abs=widths[0] / 2)
+    np.testing.assert_allclose(np.diff(middles), widths[1:], rtol=1e-6)
+    assert tape.column(latency.COUNTS.path)[1][-1].tolist() == [7, 3]
+    assert tape.column(latency.LOST.path)[1][-1].tolist() == [5]
+
+
+def test_a_silent_controller_has_no_latency() -> None:
+    tape, panel = Tape(), latency.Latency()
+    drawn(panel, tape, 0, timings={stage: np.full(10, 400_000) for stage in STAGES})
+    drawn(panel, tape, 5_000_000_000)
+    assert len(tape.rows[latency.WHOLE.path]) == 1
+    assert not any(values_of(tape.last(latency.HISTOGRAM).values)[0]["buffer"])
+    assert not tape.rows[latency.COUNTS.path], "no Health has arrived"

@@ -1,5 +1,6 @@
-"""The verdict on a run in words and levels: of real runs, and of each state by itself."""
+"""The verdict on a run in words, levels and a picture: of real runs, and of each state by itself."""
 
+import io
 import re
 import threading
 from collections import Counter
@@ -8,10 +9,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 import pytest
+from PIL import Image
 
 from lowfc.adapters.bus.bus import Sample
-from lowfc.adapters.files import factory
 from lowfc.adapters.process.clock import SimulatedClock
 from lowfc.adapters.process.latch import Latch
 from lowfc.adapters.process.service import Service
@@ -20,11 +22,12 @@ from lowfc.contract.events import EVENTS
 from lowfc.contract.messages import CONTROLLER_STATE, EVENT, FRAME, HEALTH, STEP, topic_of, wire
 from lowfc.control.loop.safety import LoopMode, Reason
 from lowfc.programs.core.controller import Controller
+from lowfc.programs.view.panels.tiles import FILL, GROUND, HEIGHT, TILES, WIDTH, Tiles, picture, places, png
 from lowfc.programs.view.snapshot import SHOWN, Accumulator
 from lowfc.programs.view.verdicts import steady
 from lowfc.programs.view.verdicts.facts import facts
 from lowfc.programs.view.verdicts.steady import Attained
-from lowfc.programs.view.verdicts.tile import Level, Verdict
+from lowfc.programs.view.verdicts.tile import Level, Tile, Verdict
 from lowfc.programs.view.verdicts.verdict import judge
 from lowfc.programs.view.verdicts.watcher import Rms, Watcher
 from lowfc.programs.view.verdicts.wavefront_verdict import factor, merit
@@ -32,8 +35,9 @@ from lowfc.testing.memory_bus import MemoryBus, MemoryHub
 from sim_camera.process import CameraProcess, bench
 from sim_dm.process import MirrorProcess
 from tests.support.report_log import Night
-from tests.support.stage import MAS, Stage, tile
+from tests.support.stage import MAS, Stage, Tape, tile
 from tests.support.toy import FLUX_DN, NOLL, START, TOY
+from tools.law_bench import calibrated
 
 CALM = {Level.NEUTRAL, Level.GOOD}
 
@@ -53,9 +57,8 @@ def recorded(config: Configuration, camera: Configuration, latch: Path, frames: 
         observer.subscribe(topic, received.append)
     clocks = {name: SimulatedClock() for name in ("controller", "mirror-dm", "camera")}
     services = [Service(name, "run", clock, MemoryBus(hub, name, clock)) for name, clock in clocks.items()]
-    optics = factory.twin(config, None, print)
-    calibrated = factory.analytic_calibration(config, optics, factory.mirror_on_twin(config, optics, print))
-    controller = Controller(config, services[0], calibrated, "a test", Latch([latch]))
+    calibration = calibrated(config)
+    controller = Controller(config, services[0], calibration, "a test", Latch([latch]))
     services[0].fill = controller.fill
     mirror = MirrorProcess(config, services[1])
     eye = CameraProcess(camera, services[2], bench(camera), frames)
@@ -423,7 +426,6 @@ def test_what_the_gains_could_leave_is_computed_from_the_loop_itself(monkeypatch
         if number % 5000 == 0 or number == len(night.samples):
             watcher.feed(accumulator.snapshot(one.publish_time_ns))
     found = watcher.attainable.found
-    assert found is not None
     assert 0 < found.best_nm <= 1.05 * found.left_nm
     assert found.noise_nm > 0
     assert tile(judge(watcher), "WAVEFRONT").detail.endswith("without noise")
@@ -457,3 +459,69 @@ def test_the_facts_are_run_host_law_offset_channels_and_note() -> None:
     assert found["CONTROL LAW"] == "lqg; delay 1 frame"
     assert found["OFFSET AND CHANNELS"] == "no offset; channel dark-hole 2 nm"
     assert set(facts(Watcher()).values()) == {"not known", "none known"}
+
+
+NOON_NS = 43_200 * 10**9
+LONG = "neighbouring/actuators/in/a/very/long/path/without/any/blank " + "and more words than a tile has room for " * 3
+
+
+def picture_of(verdict: Verdict, time_ns: int = NOON_NS) -> npt.NDArray[np.uint8]:
+    with Image.open(io.BytesIO(png(picture(verdict, time_ns)))) as shown:
+        return np.asarray(shown.convert("RGB"))
+
+
+def seven(tile: Tile, level: Level = Level.GOOD) -> Verdict:
+    return Verdict(LONG, level, (tile,) * 7)
+
+
+@pytest.mark.parametrize("tiles", [7, 8])
+@pytest.mark.parametrize("level", Level)
+def test_all_words_are_within_their_tile_and_nothing_is_on_its_border(level: Level, tiles: int) -> None:
+    verdict = Verdict(LONG, level, tuple(Tile("RECORDER", "NOTHING HEARD OF IT", LONG, level) for _ in range(tiles)))
+    shown = picture_of(verdict)
+    assert shown.shape == (HEIGHT, WIDTH, 3)
+    rest = np.ones((HEIGHT, WIDTH), bool)
+    for x0, y0, x1, y1 in places(tiles):
+        inside = shown[y0:y1, x0:x1]
+        border = np.ones(inside.shape[:2], bool)
+        border[2:-2, 2:-2] = False
+        assert (inside[border] == FILL[level]).all()
+        assert (inside != FILL[level]).any(axis=2).mean() > 0.03  # there are words
+        rest[y0:y1, x0:x1] = False
+    assert (shown[rest] == GROUND).all()
+
+
+def test_longer_words_are_smaller_words_not_fewer() -> None:
+    """A letter more changes the picture, at the end of a text too."""
+    shorter, longer = (picture_of(seven(Tile("A", "B", LONG + end, Level.BAD))) for end in ("a", "ab"))
+    assert (shorter != longer).any()
+
+
+def test_the_time_of_day_is_at_the_right_end_of_the_headline_and_nowhere_else() -> None:
+    verdict = seven(Tile("A", "B", LONG, Level.GOOD))
+    noon, next_second, next_day = (picture_of(verdict, NOON_NS + 10**9 * later) for later in (0, 1, 86_400))
+    differs = np.argwhere((noon != next_second).any(axis=2))
+    (top, left), (bottom, right) = differs.min(axis=0), differs.max(axis=0)
+    assert 0 < top < bottom < places(7)[0][3]
+    assert WIDTH - 190 < left < right < WIDTH
+    assert (noon == next_day).all()
+
+
+def test_levels_differ_in_lightness_too() -> None:
+    light = sorted(float(np.dot(FILL[level], (0.2126, 0.7152, 0.0722))) for level in Level)
+    assert min(np.diff(light)) > 8
+    assert len({picture(Verdict("", level, ()), NOON_NS).tobytes() for level in Level}) == len(Level)
+
+
+def test_the_clock_is_drawn_each_second_and_more_only_when_something_changes() -> None:
+    tape, panel, stage = Tape(), Tiles(MAS), Stage()
+    stage.each = lambda snapshot: panel.draw(tape, snapshot)
+    stage.begin()
+    stage.run(3)
+    assert 1 <= len(tape.logged[TILES]) <= 4 * 3
+    tape.logged.clear()
+    stage.run(3)
+    assert len(tape.logged[TILES]) == 3
+    stage.mode = LoopMode.SAFE
+    stage.run(0.5)
+    assert len(tape.logged[TILES]) > 3

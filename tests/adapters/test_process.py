@@ -1,0 +1,313 @@
+"""What a process needs of its host: clocks, children that die with it, real time, and advice on packages."""
+
+import json
+import os
+import resource
+import signal
+import subprocess
+import sys
+import time
+from importlib import metadata
+from pathlib import Path
+
+import pytest
+import zenoh
+
+from lowfc.adapters.bus.run import write_once
+from lowfc.adapters.bus.zenoh_fault import plain
+from lowfc.adapters.process.child import Child
+from lowfc.adapters.process.clock import SIMULATED_START_NS, HostClock, SimulatedClock, boot_offset_ns
+from lowfc.adapters.process.extras import install_advice
+from lowfc.adapters.process.realtime import spread
+from lowfc.contract.errors import DataFileError
+from lowfc.testing.clock import FakeClock
+from tests.support.loops import until
+
+
+def test_all_processes_of_a_boot_have_one_offset(tmp_path: Path) -> None:
+    ask = (
+        "from lowfc.adapters.process.clock import *; import pathlib; "
+        f"print(boot_offset_ns(pathlib.Path({str(tmp_path)!r})))"
+    )
+    asked = [subprocess.Popen([sys.executable, "-c", ask], stdout=subprocess.PIPE, text=True) for _ in range(4)]
+    answers = {process.communicate()[0] for process in asked}
+    assert answers == {f"{boot_offset_ns(tmp_path)}\n"}
+    (file,) = tmp_path.iterdir()
+    assert file.stat().st_mode & 0o777 == 0o600
+
+
+def test_the_clock_is_the_hosts_and_does_not_step_with_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    clock = HostClock(tmp_path)
+    before = clock.now_ns()
+    monkeypatch.setattr(time, "time_ns", lambda: 0)  # somebody sets the wall clock back to 1970
+    assert HostClock(tmp_path).now_ns() >= before
+    assert clock.host_ns() >= before
+    assert clock.start_s == before // 1_000_000_000 or clock.start_s + 1 == before // 1_000_000_000
+    assert clock.now_ns() - time.monotonic_ns() <= clock.offset_ns
+
+
+def test_it_knows_how_far_it_is_from_the_wall_clock(tmp_path: Path) -> None:
+    clock = HostClock(tmp_path)
+    assert abs(clock.ahead_ns()) < 1_000_000_000
+    (file,) = tmp_path.iterdir()
+    file.write_text(str(clock.offset_ns - 3600 * 10**9))  # as fixed before NTP was there
+    late = HostClock(tmp_path)
+    assert abs(late.ahead_ns() + 3600 * 10**9) < 1_000_000_000
+    assert abs(SimulatedClock(base=tmp_path).ahead_ns() + 3600 * 10**9) < 1_000_000_000
+
+
+def test_sleep_ends_after_its_deadline_and_not_before(tmp_path: Path) -> None:
+    clock = HostClock(tmp_path)
+    deadline = clock.now_ns() + 3_000_000
+    clock.sleep_until_ns(deadline)
+    assert clock.now_ns() >= deadline
+    clock.sleep_until_ns(deadline)  # passed: no wait, no error
+
+
+def test_a_damaged_offset_is_an_error(tmp_path: Path) -> None:
+    boot_offset_ns(tmp_path)
+    (file,) = tmp_path.iterdir()
+    file.write_text("noon")
+    with pytest.raises(DataFileError, match="offset in ns, got 'noon'"):
+        boot_offset_ns(tmp_path)
+
+
+def test_what_is_written_once_stays(tmp_path: Path) -> None:
+    assert [write_once(tmp_path / "file", text) for text in ("first", "second")] == ["first", "first"]
+    assert [path.name for path in tmp_path.iterdir()] == ["file"]
+
+
+def test_simulated_time_moves_by_hand_and_host_time_by_itself(tmp_path: Path) -> None:
+    host = HostClock(tmp_path)
+    clock = SimulatedClock(base=tmp_path)
+    assert (clock.now_ns(), clock.start_s, clock.lockstep) == (SIMULATED_START_NS, SIMULATED_START_NS // 10**9, True)
+    clock.set_ns(SIMULATED_START_NS + 7)
+    clock.sleep_until_ns(SIMULATED_START_NS + 9)
+    clock.sleep_until_ns(SIMULATED_START_NS + 8)
+    assert clock.now_ns() == SIMULATED_START_NS + 9
+    assert host.now_ns() <= clock.host_ns() <= host.now_ns()
+
+
+def test_the_fake_clock_stands_still() -> None:
+    clock = FakeClock(5)
+    clock.advance(2)
+    clock.sleep_until_ns(6)
+    assert (clock.now_ns(), clock.host_ns()) == (7, 7)
+    clock.sleep_until_ns(10)
+    assert clock.now_ns() == 10
+
+
+PATIENCE_S = 30.0
+
+# Starts a child that ignores SIGTERM, and says its number.
+PARENT = """
+import signal, sys, time
+from pathlib import Path
+from lowfc.adapters.process.child import Child
+program = "import signal, time; signal.signal(signal.SIGTERM, signal.SIG_IGN); print(1, flush=True); time.sleep(600)"
+child = Child("one", [sys.executable, "-c", program], Path(sys.argv[1]), death_signal=signal.SIGKILL)
+child.start()
+print(child.process.pid, flush=True)
+time.sleep(600)
+"""
+
+
+def command_line(pid: int) -> bytes:
+    """Of a process; empty once it is gone, or nobody has waited for it."""
+    try:
+        return Path(f"/proc/{pid}/cmdline").read_bytes()
+    except OSError:
+        return b""
+
+
+def test_a_child_dies_with_a_parent_that_was_killed(tmp_path: Path) -> None:
+    parent = subprocess.Popen([sys.executable, "-c", PARENT, tmp_path / "said"], stdout=subprocess.PIPE, text=True)
+    pid = int(parent.stdout.readline())
+    until(lambda: b"SIG_IGN" in command_line(pid) and b"prctl" not in command_line(pid))
+    parent.kill()
+    parent.communicate()
+    until(lambda: not command_line(pid))
+
+
+def test_a_child_is_the_program_itself_in_a_session_of_its_own(tmp_path: Path) -> None:
+    program = "import os, sys, time; sys.stderr.write(repr((os.getpid(), os.getsid(0), os.environ['WORD'])))"
+    child = Child("one", [sys.executable, "-c", program], tmp_path / "said", {**os.environ, "WORD": "heard"})
+    child.start()
+    child.process.wait(PATIENCE_S)
+    assert (child.status, child.stderr_tail()) == (0, repr((child.process.pid, child.process.pid, "heard")))
+    child.stop(PATIENCE_S)
+
+
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGKILL])
+def test_how_a_child_ended_is_its_own_end(tmp_path: Path, number: signal.Signals) -> None:
+    child = Child("one", ["sleep", "600"], tmp_path / "said")
+    child.start()
+    child.process.send_signal(number)
+    child.process.wait(PATIENCE_S)
+    assert child.how_it_ended() == f"one was killed by {number.name}"
+    child.stop(PATIENCE_S)
+
+
+def test_a_program_that_is_not_there_is_said_at_once(tmp_path: Path) -> None:
+    with pytest.raises(FileNotFoundError, match="no-such-program"):
+        Child("one", ["no-such-program"], tmp_path / "said").start()
+
+
+LATENCY_DEVICE = "/dev/cpu_dma_latency"
+REPORT = """
+import gc, json, os, sys
+import numpy
+from threadpoolctl import threadpool_info
+{limits}
+from lowfc.adapters.process.realtime import set_up, step_back
+granted = {call}
+print(json.dumps({{
+    "granted": granted.granted, "refused": granted.refused,
+    "policy": os.sched_getscheduler(0), "priority": os.sched_getparam(0).sched_priority,
+    "cpus": sorted(os.sched_getaffinity(0)), "collects": gc.isenabled(), "frozen": gc.get_freeze_count(),
+    "blas": [pool["num_threads"] for pool in threadpool_info() if pool["user_api"] == "blas"],
+    "locked_kb": [int(line.split()[1]) for line in open("/proc/self/status") if line.startswith("VmLck")][0],
+    "open": [os.readlink(f"/proc/self/fd/{{number}}") for number in os.listdir("/proc/self/fd")[:-1]],
+    "slack_ns": int(open("/proc/self/timerslack_ns").read()) if os.path.exists("/proc/self/timerslack_ns") else 1,
+}}))
+"""
+
+# What a host without privileges refuses; the process gives its own up first.
+UNPRIVILEGED = """
+import ctypes, resource
+resource.setrlimit(resource.RLIMIT_RTPRIO, (0, 0))
+resource.setrlimit(resource.RLIMIT_MEMLOCK, (65536, 65536))
+version_3, no_capabilities = (ctypes.c_uint32 * 2)(0x20080522, 0), (ctypes.c_uint32 * 6)()
+assert ctypes.CDLL(None).capset(version_3, no_capabilities) == 0
+"""
+
+NO_DEVICE = """
+import lowfc.adapters.process.realtime
+lowfc.adapters.process.realtime._LATENCY_DEVICE = "/there/is/none"
+"""
+
+
+def report(call: str, limits: str = "") -> dict[str, object]:
+    done = subprocess.run(
+        [sys.executable, "-c", REPORT.format(call=call, limits=limits)], capture_output=True, text=True, check=True
+    )
+    return json.loads(done.stdout)
+
+
+def test_the_interpreter_is_quiet_and_nothing_unasked_is_changed() -> None:
+    found = report("set_up(None, None, lock_memory=False, disable_cpu_idle=False)")
+    assert found["granted"] == ["memory kept", "one BLAS thread", "garbage collector off", "timer slack 1 ns"]
+    assert found["refused"] == []
+    assert (found["policy"], found["cpus"]) == (os.SCHED_OTHER, sorted(os.sched_getaffinity(0)))
+    assert (found["collects"], found["slack_ns"], found["locked_kb"]) == (False, 1, 0)
+    assert found["frozen"] > 0
+    assert set(found["blas"]) == {1}
+
+
+def test_what_the_host_refuses_is_named_with_its_cost() -> None:
+    found = report("set_up(50, {4096}, lock_memory=True, disable_cpu_idle=True)", UNPRIVILEGED + NO_DEVICE)
+    measures = [measure for measure, _ in found["refused"]]
+    assert [measure.split(" (")[0] for measure in measures] == [
+        "processors [4096]",
+        "locked memory",
+        "processors awake",
+        "SCHED_FIFO priority 50",
+    ]
+    assert "64 kB" in measures[1]
+    assert all(len(cost) > 30 for _, cost in found["refused"])
+    assert (found["policy"], found["locked_kb"]) == (os.SCHED_OTHER, 0)
+    assert found["granted"] == ["memory kept", "one BLAS thread", "garbage collector off", "timer slack 1 ns"]
+
+
+def may_be_real_time() -> bool:
+    limit = resource.getrlimit(resource.RLIMIT_RTPRIO)[1]
+    return os.geteuid() == 0 or limit == resource.RLIM_INFINITY or limit >= 10
+
+
+@pytest.mark.skipif(not may_be_real_time(), reason="this user may not have SCHED_FIFO")
+def test_a_host_that_allows_it_grants_real_time() -> None:
+    cpu = min(os.sched_getaffinity(0))
+    found = report(f"set_up(10, {{{cpu}}}, lock_memory=False, disable_cpu_idle=False)")
+    if found["refused"]:  # a container's root may not have CAP_SYS_NICE
+        pytest.skip(str(found["refused"]))
+    assert (found["policy"], found["priority"], found["cpus"]) == (os.SCHED_FIFO, 10, [cpu])
+    assert found["granted"][-2:] == [f"processors [{cpu}]", "SCHED_FIFO priority 10"]
+
+
+@pytest.mark.skipif(not os.access(LATENCY_DEVICE, os.W_OK), reason="this user may not keep processors awake")
+def test_processors_are_kept_awake_as_long_as_the_process_lives() -> None:
+    twice = "[set_up(None, None, lock_memory=False, disable_cpu_idle=True) for _ in range(2)][-1]"
+    found = report(twice)
+    assert (found["granted"][-1], found["open"].count(LATENCY_DEVICE)) == ("processors awake", 1)
+
+
+def test_the_recorder_steps_back_out_of_its_parents_class() -> None:
+    limits = "os.sched_setscheduler(0, os.SCHED_RR, os.sched_param(1))" if may_be_real_time() else ""
+    found = report("step_back(None)", limits)
+    assert (found["policy"], found["granted"]) == (os.SCHED_OTHER, ["memory kept", "normal scheduling class"])
+    cpu = min(os.sched_getaffinity(0))
+    found = report(f"step_back(None, {{{cpu}}})")
+    assert (found["cpus"], found["granted"][1]) == ([cpu], f"processors [{cpu}]")
+    found = report("step_back(None, {4096})")
+    assert [measure.split(" (")[0] for measure, _ in found["refused"]] == ["processors [4096]"]
+
+
+def test_processes_are_kept_apart_as_far_as_there_are_processors() -> None:
+    def of(*cpus: int, simulated: bool = True) -> list[list[int]]:
+        return list(spread(cpus, simulated=simulated).values())
+
+    assert of(3) == []
+    assert of(5, 1) == [[1], [5], [5], []]
+    assert of(5, 1, simulated=False) == [[1], [5], [1], [1]]
+    assert of(0, 1, 2) == [[0], [1], [2], [0, 2]]
+    assert of(0, 1, 2, 3) == [[0], [1], [2], [0, 2, 3]]
+
+
+EDITABLE = {"dir_info": {"editable": True}, "url": "file:///home/a%20b/lowfc"}
+WHEEL = {"archive_info": {}, "url": "file:///dist/lowfc-0.2.0-py3-none-any.whl"}
+GIT = {"vcs_info": {"vcs": "git", "commit_id": "0"}, "url": "https://example.org/lowfc.git"}
+
+
+@pytest.mark.parametrize(
+    ("origin", "expected"),
+    [
+        (EDITABLE, "pip install -e '/home/a b/lowfc[plots]'"),
+        (WHEEL, "pip install '/dist/lowfc-0.2.0-py3-none-any.whl[plots]'"),
+        (GIT, "pip install 'lowfc[plots] @ git+https://example.org/lowfc.git'"),
+        (None, "pip install 'lowfc[plots]'"),
+    ],
+)
+def test_the_advice_names_where_lowfc_came_from(
+    monkeypatch: pytest.MonkeyPatch, origin: dict[str, object] | None, expected: str
+) -> None:
+    class Installed:
+        def read_text(self, name: str) -> str | None:
+            assert name == "direct_url.json"
+            return None if origin is None else json.dumps(origin)
+
+    monkeypatch.setattr(metadata, "distribution", lambda _: Installed())
+    assert install_advice("plots") == expected
+
+
+def test_a_checkout_that_is_not_installed_has_an_advice_too(monkeypatch: pytest.MonkeyPatch) -> None:
+    def missing(name: str) -> metadata.Distribution:
+        raise metadata.PackageNotFoundError(name)
+
+    monkeypatch.setattr(metadata, "distribution", missing)
+    assert install_advice("plots") == "pip install -e '.[plots]' in its checkout"
+
+
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [
+        (
+            "Can not create a new TCP listener bound to tcp/127.0.0.1:4: [127.0.0.1:4: Address already in use "
+            "(os error 98) at /root/.cargo/git/zenoh/io/tcp.rs:61.] at /root/.cargo/git/zenoh/unicast.rs:338.",
+            "127.0.0.1:4: Address already in use (os error 98)",
+        ),
+        ("invalid configuration at zenoh/src/api/session.rs:12.\nmore", "invalid configuration"),
+        ("look at the key", "look at the key"),
+    ],
+)
+def test_the_cause_of_zenohs_fault_is_without_its_sources(text: str, expected: str) -> None:
+    assert plain(zenoh.ZError(text)) == expected
