@@ -14,7 +14,7 @@ from lowfc import __version__
 
 LIBRARIES = ("numpy", "scipy", "eclipse-zenoh", "mcap", "protobuf", "foxglove-schemas-protobuf", "lz4")
 
-_NUMPY = Path(np.__file__).parents[1]
+_NUMPY = Path(np.__file__).resolve().parents[1]
 _SIMD = ("sse", "ssse", "avx", "fma", "f16c", "amx", "neon", "asimd", "sve", "fphp")
 
 
