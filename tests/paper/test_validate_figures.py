@@ -17,6 +17,8 @@ from lowfc.programs.paper.figures.figures import FIGURES
 from lowfc.programs.paper.figures.modes import AMPLITUDES, deviations, linear_range
 from lowfc.programs.paper.tables.pointing import NM_PER_MAS
 
+pytestmark = pytest.mark.xdist_group("validate_figures")  # one process makes what its tests share
+
 FEW = Context(trials=4, seed=1, sensors=("sam",))
 
 
