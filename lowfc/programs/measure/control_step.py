@@ -3,10 +3,10 @@
 from typing import NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 
 from lowfc.adapters.files.factory import settings
 from lowfc.adapters.process.clock import HostClock
+from lowfc.arrays import Long
 from lowfc.contract.codecs import codec
 from lowfc.contract.configuration import Configuration
 from lowfc.control.calibration.calibration import Calibration
@@ -15,8 +15,6 @@ from lowfc.control.loop.inputs import Load
 from lowfc.control.loop.state import State
 from lowfc.programs.core.controller import CHANNEL
 from lowfc.programs.measure.frame_source import Payloads
-
-Whole = npt.NDArray[np.int64]
 
 
 class ControlStep:
@@ -48,8 +46,8 @@ class Alone(NamedTuple):
         step_ns: of the control step.
     """
 
-    timer_ns: Whole
-    step_ns: Whole
+    timer_ns: Long
+    step_ns: Long
 
 
 def time_alone(step: ControlStep, payloads: Payloads, clock: HostClock, seconds: float, period_ns: int | None) -> Alone:

@@ -5,6 +5,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from lowfc.arrays import Single
 from lowfc.contract.configuration import Acceptance
 from lowfc.control.calibration.excitation import climb
 from lowfc.control.calibration.linearity import captured
@@ -14,7 +15,7 @@ from lowfc.optics.chain.zernike import mode_name
 from lowfc.programs.cli.result import figure
 from lowfc.programs.commissioning.acceptance.judged import AcceptanceResult, ModeResult
 from lowfc.programs.commissioning.acceptance.live import Live
-from lowfc.programs.commissioning.acceptance.played import AcceptanceError, Kind, Played, Single, chosen
+from lowfc.programs.commissioning.acceptance.played import AcceptanceError, Kind, Played, chosen
 
 KIND: Kind = "capture-range"
 SIZES = (0.5, 1.0, 1.5)

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from lowfc.arrays import Single
 from lowfc.client import Client, Step, configuration_of
 from lowfc.contract.messages import wire
 from lowfc.control.laws.linear_law import LinearLaw
@@ -19,7 +20,6 @@ from lowfc.programs.commissioning.acceptance.played import (
     AcceptanceError,
     Kind,
     Played,
-    Single,
     loop_of,
     played,
 )

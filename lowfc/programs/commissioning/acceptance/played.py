@@ -12,6 +12,7 @@ import numpy as np
 import numpy.typing as npt
 
 from lowfc.adapters.logs.history import History
+from lowfc.arrays import Array, Long, Single
 from lowfc.contract.codecs import codec
 from lowfc.contract.codecs.law_codec import law_of
 from lowfc.contract.errors import DataFileError, LowfcError
@@ -24,8 +25,6 @@ from lowfc.control.laws.stability import settling_frames
 from lowfc.control.loop.safety import LoopMode, Reason
 
 Kind = Literal["rejection", "linearity", "capture-range", "noise-floor"]
-Single = npt.NDArray[np.float32]
-Double = npt.NDArray[np.float64]
 
 LIMITS = (Reason.MODAL_LIMIT, Reason.STROKE, Reason.SLEW, Reason.NEIGHBOUR)
 MOST_MISSING = 0.01
@@ -58,15 +57,15 @@ class Loop:
             return self.law
         return integrator(self.law.gain, self.law.leak, self.noll, self.delay_frames, self.rate_hz)
 
-    def rejection(self, frequency_hz: Double) -> Double:
+    def rejection(self, frequency_hz: Array) -> Array:
         """|S| (frequencies, modes) in theory."""
         return margins.rejection(self.linear, frequency_hz, self.delay_frames)
 
-    def noise_transfer(self, frequency_hz: Double) -> Double:
+    def noise_transfer(self, frequency_hz: Array) -> Array:
         """|T| (frequencies, modes) in theory."""
         return margins.noise_transfer(self.linear, frequency_hz, self.delay_frames)
 
-    def noise_gain(self) -> Double:
+    def noise_gain(self) -> Array:
         """Variance (modes,) of the residual per variance of white noise of a frame, in theory."""
         return margins.noise_gain(self.linear, self.delay_frames)
 
@@ -103,11 +102,11 @@ class Played:
     target: str
     table: Single
     basis: Single
-    error_nm: Double
-    pol_nm: Double
-    command_nm: Double
+    error_nm: Array
+    pol_nm: Array
+    command_nm: Array
     mode: npt.NDArray[np.uint8]
-    reasons: npt.NDArray[np.int64]
+    reasons: Long
 
     @property
     def limits_hit(self) -> list[str]:
@@ -142,7 +141,7 @@ class Played:
                 f"{MOST_MISSING:.0%} may: `lowfc info` and `lowfc ctl status` say why"
             )
 
-    def filled(self, values: Double) -> Double:
+    def filled(self, values: Array) -> Array:
         """(frames, modes) with what is missing interpolated."""
         there = np.isfinite(values).all(axis=1)
         if there.all():
@@ -233,10 +232,10 @@ def played(
     target: str,
     table: Single,
     basis: Single,
-    places: npt.NDArray[np.int64],
-    time_ns: npt.NDArray[np.int64],
+    places: Long,
+    time_ns: Long,
     mode: npt.NDArray[np.uint8],
-    reasons: npt.NDArray[np.int64],
+    reasons: Long,
     *columns: Single,
 ) -> Played:
     """Steps at some places of a play as one row for each of its frames; the rate is that of these steps."""

@@ -5,12 +5,12 @@ from dataclasses import asdict, replace
 from pathlib import Path
 
 import numpy as np
-import numpy.typing as npt
 from rich.console import Console
 
 from lowfc.adapters.files import calibration_file, factory
 from lowfc.adapters.files.whole_file import require_folder
 from lowfc.adapters.process.terminal import configuration
+from lowfc.arrays import Array, Single
 from lowfc.client import Client, configuration_of
 from lowfc.contract.codecs.calibration_codec import identified
 from lowfc.contract.configuration import Configuration
@@ -23,8 +23,6 @@ from lowfc.programs.commissioning.calibrate.pokes import AMPLITUDE_NM, sequence
 from lowfc.programs.commissioning.calibrate.recording import Player, watch
 from lowfc.programs.commissioning.calibrate.result import reconstructed
 from lowfc.programs.commissioning.calibrate.tasks import images, sayer
-
-Array = npt.NDArray[np.float64]
 
 
 class AlignResult(Result):
@@ -141,7 +139,7 @@ def on_sensor(
     except (ValueError, CalibrationError) as error:
         raise CalibrationError(f"too little of the image falls on the sensor: {error}") from None
 
-    def single(array: Array) -> npt.NDArray[np.float32]:
+    def single(array: Array) -> Single:
         return np.ascontiguousarray(array, dtype=np.float32)
 
     return identified(

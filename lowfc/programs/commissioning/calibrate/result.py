@@ -6,9 +6,9 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 
 from lowfc.adapters.files import calibration_file, factory
+from lowfc.arrays import Array, Single
 from lowfc.contract.codecs.calibration_codec import identified
 from lowfc.contract.configuration import Configuration
 from lowfc.contract.errors import CalibrationError
@@ -22,9 +22,6 @@ from lowfc.optics.twin.twin_mirror import wavefront_nm
 from lowfc.programs.cli.result import Result, figure
 from lowfc.programs.commissioning.calibrate.pokes import CalibrationRequest, cycles_for
 from lowfc.programs.commissioning.calibrate.run import CalibrationData, Calibrator
-
-Array = npt.NDArray[np.float64]
-Single = npt.NDArray[np.float32]
 
 MOST_NOISE = 1.5
 """Times the noise of the computed reconstructor on the same light; farther from flat the sensor sees less."""

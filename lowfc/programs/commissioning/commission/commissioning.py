@@ -7,10 +7,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
 from lowfc.adapters.files import calibration_file, factory
 from lowfc.adapters.process.progress import Counted
+from lowfc.arrays import Pixels
 from lowfc.client import Client
 from lowfc.contract.configuration import Configuration
 from lowfc.contract.errors import CalibrationError, LowfcError
@@ -244,7 +244,7 @@ class Commissioning:
         return first.calibration
 
     def _reference(self, sensor: Sensor) -> Calibration:
-        frames: npt.NDArray[np.uint16] = watch(self._loop, self._asked.frames)
+        frames: Pixels = watch(self._loop, self._asked.frames)
         return referenced(sensor, frames, self._computed, self._say)
 
     def _close(self, law: Law, delay_frames: float) -> str:

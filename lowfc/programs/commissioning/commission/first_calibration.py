@@ -4,7 +4,6 @@ from dataclasses import replace
 from typing import Any, NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 
 from lowfc.client import Client
 from lowfc.contract.codecs.calibration_codec import identified
@@ -19,8 +18,6 @@ from lowfc.programs.commissioning.calibrate.align import computed_scale, in_word
 from lowfc.programs.commissioning.calibrate.pokes import AMPLITUDE_NM, HOLD, SETTLE, largest_nm, sequence
 from lowfc.programs.commissioning.calibrate.recording import AFTERWARDS, Player, PokesNotSeenError, Say
 from lowfc.programs.commissioning.calibrate.result import reconstructed
-
-Array = npt.NDArray[np.float64]
 
 FIRST_NM = AMPLITUDE_NM["poke"]
 MAX_FIRST_NM = 32.0

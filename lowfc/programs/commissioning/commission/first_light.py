@@ -7,6 +7,7 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
+from lowfc.arrays import Array
 from lowfc.client import Frame
 from lowfc.contract.codecs.calibration_codec import camera_settings
 from lowfc.contract.configuration import Configuration
@@ -18,8 +19,6 @@ from lowfc.control.loop.camera import CameraSettings
 from lowfc.programs.commissioning.calibrate.recording import Say
 from lowfc.programs.commissioning.checks import Status
 from lowfc.programs.commissioning.conformance.agreement import agreement_checks
-
-Array = npt.NDArray[np.float64]
 
 RATE_APART = 0.05
 """Part by which the rate of the frames' times may differ from what the camera says."""

@@ -3,17 +3,15 @@
 from collections.abc import Sequence
 
 import numpy as np
-import numpy.typing as npt
 
+from lowfc.arrays import Array, Sequences, Single
 from lowfc.control.laws.law import Law
 from lowfc.control.laws.stability import delay_weights, settling_frames
 from lowfc.control.laws.what_if import as_logged, counterfactual, missing_before, rms
 from lowfc.control.loop.inputs import Step
 
-Double = npt.NDArray[np.float64]
 
-
-def predicted_nm(steps: Sequence[Step], law: Law, delay_frames: float, rate_hz: float) -> Double:
+def predicted_nm(steps: Sequence[Step], law: Law, delay_frames: float, rate_hz: float) -> Array:
     """Measured modal error (modes,), nm rms, that this law would have left of the disturbance in some steps.
 
     Its noise is in it, as it is in the measured one.
@@ -27,7 +25,7 @@ def predicted_nm(steps: Sequence[Step], law: Law, delay_frames: float, rate_hz: 
     return _rms(error_nm, settling_frames(law.gain, law.leak, rate_hz))
 
 
-def measured_nm(steps: Sequence[Step], law: Law, rate_hz: float) -> Double:
+def measured_nm(steps: Sequence[Step], law: Law, rate_hz: float) -> Array:
     """Measured modal error (modes,), nm rms, of steps that begin when the loop is closed.
 
     Raises:
@@ -37,9 +35,7 @@ def measured_nm(steps: Sequence[Step], law: Law, rate_hz: float) -> Double:
     return _rms(error_nm, settling_frames(law.gain, law.leak, rate_hz))
 
 
-def _rows(
-    steps: Sequence[Step], values: Sequence[npt.NDArray[np.float32] | None]
-) -> tuple[npt.NDArray[np.uint64], npt.NDArray[np.float32]]:
+def _rows(steps: Sequence[Step], values: Sequence[Single | None]) -> tuple[Sequences, Single]:
     modes = max((value.size for value in values if value is not None), default=0)
     if not modes:
         raise ValueError("no frame was used")
@@ -47,7 +43,7 @@ def _rows(
     return np.array([step.frame_sequence for step in steps], np.uint64), np.array(rows)
 
 
-def _rms(error_nm: npt.NDArray[np.float32], settling: int) -> Double:
+def _rms(error_nm: Single, settling: int) -> Array:
     used = np.isfinite(error_nm).all(axis=1) & (np.arange(len(error_nm)) >= settling)
     if used.sum() < settling:
         raise ValueError(f"{int(used.sum())} frames after {settling} of settling are too few to tell a residual")

@@ -3,11 +3,11 @@
 from collections.abc import Iterator
 
 import numpy as np
-import numpy.typing as npt
 
+from lowfc.arrays import Mask, Single
 from lowfc.contract.messages import wire
 from lowfc.programs.commissioning.checks import Check, ok, warning, wrong
-from lowfc.programs.commissioning.conformance.dialogue import Dialogue, Single
+from lowfc.programs.commissioning.conformance.dialogue import Dialogue
 
 _NEAR, _BEYOND, _FAR = 0.9, 1.05, 2.0
 
@@ -61,7 +61,7 @@ def _rises(mirror: Dialogue) -> bool:
     return where_nm is not None and _highest_nm(mirror, where_nm) >= (_NEAR - 0.05) * stroke_nm
 
 
-def _peak(moving: npt.NDArray[np.bool_]) -> tuple[Single, tuple[int, list[int]]]:
+def _peak(moving: Mask) -> tuple[Single, tuple[int, list[int]]]:
     """One actuator half up and all others half down; where it and its two neighbours in its row are.
 
     It moves, between two that do, as near to the middle as there is one.

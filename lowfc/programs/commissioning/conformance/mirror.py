@@ -5,9 +5,10 @@ from itertools import pairwise
 
 import numpy as np
 
+from lowfc.arrays import Single
 from lowfc.contract.messages import from_timestamp, wire
 from lowfc.programs.commissioning.checks import Check, Status, ok, warning, wrong
-from lowfc.programs.commissioning.conformance.dialogue import ANSWER_S, MODAL_NM, Dialogue, Single, Tell
+from lowfc.programs.commissioning.conformance.dialogue import ANSWER_S, MODAL_NM, Dialogue, Tell
 from lowfc.programs.commissioning.conformance.limits import limit_checks
 from lowfc.programs.commissioning.conformance.line import NS
 from lowfc.programs.commissioning.conformance.publisher import PROCESS, PUBLISHER

@@ -9,6 +9,7 @@ import numpy.typing as npt
 
 from lowfc.adapters.logs.history import read_history
 from lowfc.adapters.logs.reader import LogReader
+from lowfc.arrays import Array, Mask, Sequences, Single
 from lowfc.client import Client, configuration_of
 from lowfc.contract.codecs.law_codec import law_of
 from lowfc.contract.errors import DataFileError
@@ -21,10 +22,6 @@ from lowfc.control.loop.inputs import Step
 from lowfc.control.loop.safety import LoopMode
 from lowfc.optics.detector.photometry import tilt_nm_per_mas
 from lowfc.programs.logs.what_if.run import LoggedRun
-
-Single = npt.NDArray[np.float32]
-Double = npt.NDArray[np.float64]
-Rows = npt.NDArray[np.bool_]
 
 _SETTLING_S = 0.5  # after the loop was closed
 
@@ -55,7 +52,7 @@ class Telemetry:
     closed: bool
     pol: Pieces
     error: Pieces
-    true_nm: Double | None
+    true_nm: Array | None
     nm_per_mas: float | None
     warnings: tuple[str, ...]
 
@@ -156,7 +153,7 @@ def _telemetry(
     rate_hz: float,
     delay_frames: float,
     laws: tuple[Law, LinearLaw | None],
-    frames: tuple[npt.NDArray[np.uint64], npt.NDArray[np.uint8], Rows],
+    frames: tuple[Sequences, npt.NDArray[np.uint8], Mask],
     modes_nm: tuple[Single, Single, Single | None],
     nm_per_mas: float | None,
     warnings: Sequence[str],
@@ -197,7 +194,7 @@ def driving(state: wire.ControllerState | None, laws: Mapping[str, LinearLaw]) -
     return law_of(state.law, laws) if state is not None and state.HasField("law") else None
 
 
-def _cut(sequence: npt.NDArray[np.uint64], values: Single, rows: Rows) -> Pieces:
+def _cut(sequence: Sequences, values: Single, rows: Mask) -> Pieces:
     return pieces(sequence[rows], values[rows])
 
 

@@ -4,9 +4,10 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 from google.protobuf.descriptor import FieldDescriptor
 from google.protobuf.message import Message
+
+from lowfc.arrays import Array
 
 _FLOAT32_FIELDS = ("actuators", "offset")
 """Bytes that hold little-endian float32, nm."""
@@ -72,16 +73,14 @@ def _compare(found: Difference, prefix: str, logged: Message, replayed: Message)
             _numbers_differ(found, prefix + name, before, after)
 
 
-def _alike(before: npt.NDArray[np.float64] | None, after: npt.NDArray[np.float64] | None) -> bool:
+def _alike(before: Array | None, after: Array | None) -> bool:
     """Whether these are numbers that can be subtracted from each other."""
     if before is None or after is None or before.shape != after.shape:
         return False
     return bool(np.isfinite(before).all() and np.isfinite(after).all())
 
 
-def _numbers_differ(
-    found: Difference, name: str, before: npt.NDArray[np.float64], after: npt.NDArray[np.float64]
-) -> None:
+def _numbers_differ(found: Difference, name: str, before: Array, after: Array) -> None:
     apart = np.abs(after - before)
     places = np.flatnonzero(apart)
     shown = ", ".join(f"[{place}] log {before[place]:.9g}, replay {after[place]:.9g}" for place in places[:_SHOWN])
@@ -90,7 +89,7 @@ def _numbers_differ(
     found.largest_nm = max(found.largest_nm, float(apart.max()))
 
 
-def _numbers(descriptor: Any, value: Any) -> npt.NDArray[np.float64] | None:
+def _numbers(descriptor: Any, value: Any) -> Array | None:
     """Numbers of a field as an array; None where it holds none."""
     if descriptor.name in _FLOAT32_FIELDS:
         return np.frombuffer(value, "<f4").astype(float) if len(value) % 4 == 0 else None

@@ -3,8 +3,8 @@
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
+from lowfc.arrays import Array, Mask
 from lowfc.control.laws.error_budget import SensorNoise, Term, lag, lag_under_noise, measurement_error, white_noise
 from lowfc.control.laws.spectra import Pieces
 from lowfc.programs.logs.report.closed_loop import (
@@ -19,8 +19,7 @@ from lowfc.programs.logs.report.closed_loop import (
 )
 from lowfc.programs.logs.report.source import Run
 
-Double = npt.NDArray[np.float64]
-Masks = dict[str, npt.NDArray[np.bool_]]
+Masks = dict[str, Mask]
 Figures = dict[str, Any]
 
 Entry = tuple[Term | None, str]
@@ -114,7 +113,7 @@ def _difference(one: Pieces, other: Pieces) -> Pieces:
     return Pieces(tuple(a - b for a, b in zip(one.values, other.values, strict=True)), one.bridged)
 
 
-def _mean_square(values: Double) -> Term:
+def _mean_square(values: Array) -> Term:
     return Term(np.mean(values**2, axis=0))
 
 

@@ -4,9 +4,9 @@ from collections import Counter
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
 from lowfc.adapters.logs.history import History
+from lowfc.arrays import Long, Single
 from lowfc.contract.events import Level
 from lowfc.contract.messages import wire
 from lowfc.control.loop.safety import LoopMode, Reason
@@ -122,17 +122,17 @@ def mirror_figures(history: History) -> Figures:
     }
 
 
-def actuator_extremes_nm(history: History) -> npt.NDArray[np.float32]:
+def actuator_extremes_nm(history: History) -> Single:
     """Largest deviation from flat of each actuator (rows, columns) over the run."""
     return np.maximum(np.abs(history.mirror.highest_nm), np.abs(history.mirror.lowest_nm))
 
 
-def _limits(reasons: npt.NDArray[np.int64]) -> dict[str, int]:
+def _limits(reasons: Long) -> dict[str, int]:
     counted = {reason.name.lower(): _given(reasons, reason) for reason in Reason if reason >= _FIRST_LIMIT}
     return {reason: count for reason, count in counted.items() if count}
 
 
-def _given(reasons: npt.NDArray[np.int64], reason: Reason) -> int:
+def _given(reasons: Long, reason: Reason) -> int:
     return int(np.count_nonzero(reasons >> int(reason) & 1))
 
 

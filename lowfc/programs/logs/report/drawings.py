@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import numpy.typing as npt
 
+from lowfc.arrays import Array, Long
 from lowfc.contract.printable import printable
 from lowfc.programs.logs.report.course import actuator_extremes_nm
 from lowfc.programs.logs.report.figures import Report
@@ -17,7 +18,6 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-Double = npt.NDArray[np.float64]
 
 INK, FAINT, OPEN, CLOSED = (COLOURS[name] for name in ("ink", "faint", "open", "closed"))
 _MODES = {"open": OPEN, "closed": CLOSED, "safe": COLOURS["safe"], "idle": FAINT}
@@ -122,7 +122,7 @@ def _intervals(figure: "Figure", report: Report) -> bool:
     return True
 
 
-def _spread(size: int, most: int = 400) -> npt.NDArray[np.int64]:
+def _spread(size: int, most: int = 400) -> Long:
     """Places in an ordered column, ever closer towards its end."""
     return size - 1 - np.unique(np.geomspace(1, size, min(most, size)).astype(np.int64) - 1)
 
@@ -201,7 +201,7 @@ def _spectra(figure: "Figure", report: Report) -> bool:
     return True
 
 
-def _over(one: Double, other: Double) -> Double:
+def _over(one: Array, other: Array) -> Array:
     return np.divide(one, other, out=np.full_like(one, np.nan), where=other > 0)
 
 
@@ -320,7 +320,7 @@ def _stroke(figure: "Figure", report: Report) -> bool:
     return True
 
 
-def _envelope(axes: "Axes", time_s: Double, values: npt.NDArray[np.floating], starts: Any, colour: str) -> None:
+def _envelope(axes: "Axes", time_s: Array, values: npt.NDArray[np.floating], starts: Any, colour: str) -> None:
     """Least and largest of each bin as an area, and a line through the middle."""
     least, most = np.fmin.reduceat(values, starts), np.fmax.reduceat(values, starts)
     axes.fill_between(time_s, least, most, color=colour, alpha=0.25, linewidth=0)

@@ -9,10 +9,8 @@ import numpy.typing as npt
 from lowfc.adapters.logs.columns import rows_of
 from lowfc.adapters.logs.history import History, read_history
 from lowfc.adapters.logs.parts import LogFiles, WholeLog
+from lowfc.arrays import Array, Long
 from lowfc.contract.messages import from_timestamp
-
-Whole = npt.NDArray[np.int64]
-Double = npt.NDArray[np.float64]
 
 
 @dataclass(frozen=True, slots=True)
@@ -36,12 +34,12 @@ class Run:
     history: History
     laws: tuple[InForce, ...]
 
-    def law_rows(self) -> Whole:
+    def law_rows(self) -> Long:
         """Index of the law of each step; -1 where it is not known."""
         firsts = np.array([law.first for law in self.laws])
         return np.searchsorted(firsts, np.arange(self.history.steps.sequence.size), side="right").astype(np.int64) - 1
 
-    def seconds(self, host_ns: npt.ArrayLike) -> Double:
+    def seconds(self, host_ns: npt.ArrayLike) -> Array:
         """Host times as seconds of frame time since the first step, by the frames that were published then.
 
         In lockstep frame time is simulated; otherwise this only takes off the beginning.
@@ -63,7 +61,7 @@ class Run:
         return int(self.history.steps.time_ns[0]) if self.history.steps.time_ns.size else 0
 
     @property
-    def step_s(self) -> Double:
+    def step_s(self) -> Array:
         """Time of each step since the first one."""
         return np.asarray((self.history.steps.time_ns - self.begun_ns) * 1e-9)
 

@@ -4,11 +4,11 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
 from lowfc.adapters.files.factory import detector, equivalent_read_noise_e
 from lowfc.adapters.logs.history import read_history
 from lowfc.adapters.logs.reader import LogReader
+from lowfc.arrays import Array, Single
 from lowfc.contract.codecs.calibration_codec import identified
 from lowfc.contract.configuration import Configuration, load
 from lowfc.contract.errors import CalibrationError, ConfigurationError
@@ -25,8 +25,6 @@ from lowfc.programs.logs.what_if.run import LoggedRun
 
 __all__ = ["WhatIf", "render", "wanted", "what_if"]
 
-Single = npt.NDArray[np.float32]
-Double = npt.NDArray[np.float64]
 
 LINEAR_WAVES = 5 * tilt_nm_per_mas(2.0) / 550
 """Rms of a mode up to which the sensor is taken as linear: 5 mas of tilt with 2 m at 550 nm, 0.022 waves."""
@@ -204,7 +202,7 @@ def _one(every: Law, row: int, suffix: str = "") -> dict[str, float]:
     return {f"{key}{suffix}": round(float(getattr(every, key)[row]), 6) for key in LAW_KEYS}
 
 
-def _tilt_mas(run: LoggedRun, columns: dict[str, Double]) -> dict[str, float]:
+def _tilt_mas(run: LoggedRun, columns: dict[str, Array]) -> dict[str, float]:
     """Tilt per axis on the sky, where the log says how large the telescope is."""
     tilts = np.isin(run.calibration.noll, TILTS)
     if run.history.configuration is None or not tilts.any():
@@ -251,7 +249,7 @@ def _doubts_of_log(run: LoggedRun) -> list[str]:
     return found
 
 
-def _doubts_of_range(calibration: Calibration, columns: dict[str, Double]) -> list[str]:
+def _doubts_of_range(calibration: Calibration, columns: dict[str, Array]) -> list[str]:
     limit_nm = LINEAR_WAVES * calibration.wavelength_nm
     largest = np.max([columns[name] for name in ("open", "was", "what_if")], axis=0)
     beyond = [

@@ -14,6 +14,7 @@ from threadpoolctl import threadpool_limits
 
 from lowfc.adapters.files.sensors import sensor_named
 from lowfc.adapters.files.twin_cache import load_or_build
+from lowfc.arrays import Array
 from lowfc.optics.chain.band import gauss_legendre, monochromatic
 from lowfc.optics.chain.sensor import image, pupil_radii
 from lowfc.optics.chain.zernike import NOLLS_20, zernikes
@@ -81,7 +82,7 @@ def bench_twin(
     return {**top, "sensor": sensor, "wavefronts": WAVEFRONTS, "cases": results, "host": host}
 
 
-def random_coefficients_waves(rng: np.random.Generator, count: int) -> NDArray[np.float64]:
+def random_coefficients_waves(rng: np.random.Generator, count: int) -> Array:
     """Random wavefronts (count, 20), Noll 2 to 21, uniform within 0.04 waves rms for n = 1, 2 and 0.016 above."""
     bounds = np.where(np.array(NOLLS_20) <= 6, 0.04, 0.016)
     return np.asarray(rng.uniform(-1.0, 1.0, (count, bounds.size)) * bounds)

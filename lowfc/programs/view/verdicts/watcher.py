@@ -6,10 +6,9 @@ from enum import Enum, auto
 from typing import NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 
 from lowfc.adapters.bus.run import mirror_role
-from lowfc.adapters.logs.columns import Single, Whole
+from lowfc.arrays import Array, Long, Sequences, Single
 from lowfc.contract.codecs.codec import actuators
 from lowfc.contract.envelope import start_of
 from lowfc.contract.messages import (
@@ -58,7 +57,6 @@ _TOPICS = {Role.CONTROLLER: (STEP, CONTROLLER_STATE), Role.CAMERA: (FRAME,)}
 """Topics that are signs of life, too."""
 
 Counts = Counter[Reason | str]
-Double = npt.NDArray[np.float64]
 
 
 class Liveness(Enum):
@@ -92,11 +90,11 @@ class _Sample(NamedTuple):
 
     host_ns: int
     counts: Counts
-    truth: Double
-    measured: Double
-    sequence: npt.NDArray[np.uint64]
-    time_ns: Whole
-    durations_ns: Whole
+    truth: Array
+    measured: Array
+    sequence: Sequences
+    time_ns: Long
+    durations_ns: Long
 
 
 class Watcher:
@@ -187,7 +185,7 @@ class Watcher:
         """Of the last second, or the last with a step in it, and whether it is the truth; None without any."""
         samples = self._last_worked if ended else self._last(span_s)
         for true in (True, False):
-            total: Double = sum((one.truth if true else one.measured for one in samples), np.zeros(5))
+            total: Array = sum((one.truth if true else one.measured for one in samples), np.zeros(5))
             if total[0]:
                 return Rms(*np.sqrt(total[1:] / total[0]).tolist()), true
         return None, False
@@ -329,7 +327,7 @@ class Watcher:
         return grown
 
 
-def _reasons(bits: Whole) -> dict[Reason | str, int]:
+def _reasons(bits: Long) -> dict[Reason | str, int]:
     if not bits.any():
         return {}
     return {reason: int(np.count_nonzero(bits & (1 << reason))) for reason in Reason}
@@ -337,7 +335,7 @@ def _reasons(bits: Whole) -> dict[Reason | str, int]:
 
 def _squares(
     snapshot: Snapshot, residual_modes_nm: Single, open_modes_nm: Single, residual_nm: Single, open_nm: Single
-) -> Double:
+) -> Array:
     """Count of rows, and the sums of squares of `Rms`; tip and tilt where the calibration is for so many modes."""
     noll = snapshot.calibration.noll if snapshot.calibration is not None else ()
     tilts = [column for column, index in enumerate(noll) if index in (2, 3)]
