@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from lowfc.adapters.logs.columns import of_steps
 from lowfc.arrays import Single
 from lowfc.client import Client, Step, configuration_of
 from lowfc.contract.messages import wire
@@ -132,26 +133,9 @@ class Live:
         after = self._state()
         if [getattr(before, name) for name in _LAW] != [getattr(after, name) for name in _LAW]:
             raise AcceptanceError("gains, or the law, were changed while the loop was measured: measure again")
-        nothing = np.full(modes, np.nan, np.float32)
-        return played(
-            what,
-            loop_of(before, self.calibration, self.loop.rate_hz, self.client.laws()),
-            "" if not table.shape[1] else MIRROR if basis.size else OFFSET,
-            table,
-            basis,
-            np.array([step.frame_sequence - first for step in kept], np.int64),
-            np.array([step.time_ns for step in kept], np.int64),
-            np.array([step.mode for step in kept], np.uint8),
-            np.array([sum(1 << reason for reason in step.reasons) for step in kept], np.int64),
-            *(
-                np.array(rows, np.float32).reshape(len(kept), modes)
-                for rows in (
-                    [nothing if step.error_nm is None else step.error_nm for step in kept],
-                    [nothing if step.pol_nm is None else step.pol_nm for step in kept],
-                    [step.command_nm for step in kept],
-                )
-            ),
-        )
+        loop = loop_of(before, self.calibration, self.loop.rate_hz, self.client.laws())
+        target = "" if not table.shape[1] else MIRROR if basis.size else OFFSET
+        return played(what, loop, target, table, basis, first, of_steps(kept, modes))
 
     def _state(self) -> wire.ControllerState:
         state = self.client.status().state

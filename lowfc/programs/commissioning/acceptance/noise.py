@@ -13,9 +13,8 @@ from lowfc.control.laws.spectra import SHORTEST, Pieces, floor_nm2_hz, spectrum
 from lowfc.control.loop.safety import LoopMode
 from lowfc.optics.chain.zernike import mode_name
 from lowfc.programs.cli.result import figure
-from lowfc.programs.commissioning.acceptance.judged import AcceptanceResult, ModeResult
 from lowfc.programs.commissioning.acceptance.live import Live
-from lowfc.programs.commissioning.acceptance.played import AcceptanceError, Kind, Played
+from lowfc.programs.commissioning.acceptance.played import AcceptanceError, AcceptanceResult, Kind, ModeResult, Played
 
 KIND: Kind = "noise-floor"
 _LOOPS = {"open": LoopMode.OPEN, "closed": LoopMode.CLOSED}

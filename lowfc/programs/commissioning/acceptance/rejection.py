@@ -16,9 +16,15 @@ from lowfc.control.loop.additions import MIRROR, OFFSET
 from lowfc.control.loop.safety import LoopMode
 from lowfc.optics.chain.zernike import mode_name
 from lowfc.programs.cli.result import Result, figure
-from lowfc.programs.commissioning.acceptance.judged import AcceptanceResult, ModeResult
 from lowfc.programs.commissioning.acceptance.live import Live
-from lowfc.programs.commissioning.acceptance.played import AcceptanceError, Kind, Played, chosen
+from lowfc.programs.commissioning.acceptance.played import (
+    AcceptanceError,
+    AcceptanceResult,
+    Kind,
+    ModeResult,
+    Played,
+    chosen,
+)
 
 KIND: Kind = "rejection"
 LEAST_JUDGED = 0.5

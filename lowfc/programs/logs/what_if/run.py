@@ -1,15 +1,14 @@
 """The logged run as a what-if needs it: exposures, the delay as measured, what each of them saw of the commands."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import fields
 
 import numpy as np
 
 from lowfc.adapters.files.factory import settings
-from lowfc.adapters.logs.columns import Steps
 from lowfc.adapters.logs.history import History
 from lowfc.arrays import Mask, Sequences, Single
 from lowfc.contract.codecs.codec import decode_frame
+from lowfc.contract.codecs.law_codec import gains_of
 from lowfc.contract.errors import DataFileError
 from lowfc.contract.messages import FRAME, floats, wire
 from lowfc.control.calibration.calibration import Calibration
@@ -63,7 +62,7 @@ class LoggedRun:
             raise DataFileError(f"{history.log.path}: too few frames that a calibrated controller used are in it")
         rows[: int(np.argmax(used))] = False  # of the disturbance before nothing is known
         self.calibration = history.calibration
-        self.steps = Steps(*(getattr(history.steps, part.name)[rows] for part in fields(Steps)))
+        self.steps = history.steps.at(rows)
         true = history.true
         self.true_nm = None if true is None else (true.disturbance_nm[rows], true.residual_nm[rows])
         self.used: Mask = used[rows]
@@ -160,8 +159,7 @@ def _played(sequence: Sequences, requests: Sequence[wire.Request], plays: Mappin
 def _law_and_delay(history: History, calibration: Calibration) -> tuple[Law, float]:
     state = history.controller
     if state is not None and len(state.gain) == len(calibration.noll):
-        law = Law(*(np.array(values, np.float32) for values in (state.gain, state.leak, state.limit_nm)))
-        return law, state.delay_frames
+        return gains_of(state), state.delay_frames
     if history.configuration is None:
         raise DataFileError(
             f"{history.log.path}: its gains and delay are not known: no state of the controller is there"
