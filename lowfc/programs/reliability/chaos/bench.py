@@ -169,8 +169,7 @@ class ChaosBench:
     def view(self) -> None:
         """Start a viewer that writes into a file."""
         words = ["-m", "lowfc", "view", "--run", self.run.run_id, "--save", str(self.folder / "view.rrd")]
-        self._start(program(Role.VIEWER, words, self.folder / f"{Role.VIEWER}.stderr"))
-        self.ready(Role.VIEWER)
+        self._start(program(Role.VIEWER, words, self.folder / f"{Role.VIEWER}.stderr"), ready=True)
 
     def kill(self, name: str) -> None:
         """Kill -9."""
@@ -196,16 +195,10 @@ class ChaosBench:
         assert process is not None  # noqa: S101  # it was started
         process.send_signal(number)
 
-    def restart(self, name: str, command: list[str] | None = None) -> None:
-        """Start a process that has ended anew, with its command line or another."""
+    def restart(self, name: str, command: list[str] | None = None, *, ready: bool = True) -> None:
+        """Start a process that has ended anew, with its command line or another; wait until it reports to be ready."""
         stderr = self.folder / f"{name}-{next(self._numbers)}.stderr"
-        self._start(Child(name, command or self.children[name].command, stderr))
-
-    def ready(self, name: str) -> None:
-        """Wait until a process that was started anew reports that it is ready."""
-        self.wait(
-            lambda: name in self.health and self.health[name].state in ("ready", "running"), f"{name} started anew"
-        )
+        self._start(Child(name, command or self.children[name].command, stderr), ready=ready)
 
     def ends(self, name: str, status: int) -> str:
         """Wait until a process ends by itself, as the case means it to; return the last that it wrote.
@@ -240,11 +233,14 @@ class ChaosBench:
             self.left.alive = _alive({child.process.pid for child in self._started if child.process is not None})
             self.run.remove()
 
-    def _start(self, child: Child) -> None:
-        self.children[child.name] = child
-        self.health.pop(child.name, None)
+    def _start(self, child: Child, *, ready: bool) -> None:
+        name = child.name
+        self.children[name] = child
+        self.health.pop(name, None)
         child.start()
         self._started.append(child)
+        if ready:
+            self.wait(lambda: name in self.health and self.health[name].state in ("ready", "running"), f"a new {name}")
 
     def _note_end(self, child: Child, after_s: float, *, meant: bool) -> None:
         """Note how a process ended, once."""
