@@ -6,7 +6,7 @@ from lowfc.adapters.files.factory import camera_state
 from lowfc.contract.configuration import Camera, Configuration, Control
 from lowfc.contract.messages import wire
 from lowfc.programs.commissioning.checks import Status
-from lowfc.programs.commissioning.conformance.agreement import AGREEMENTS, agreement_checks
+from lowfc.programs.commissioning.conformance.settings import AGREEMENTS, agreement_checks
 
 
 def changed(**fields: float) -> wire.CameraState:

@@ -4,13 +4,13 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import rerun as rr
+import rerun.blueprint as rrb
 
 from lowfc.adapters.bus.run import free_ports
 from lowfc.adapters.viewer.rerun_viewer import RerunViewer, Show, has_screen
 from lowfc.contract.errors import ConfigurationError
-from lowfc.programs.view.draw.stream import to_file, to_viewer
 from lowfc.programs.view.draw.tabs import Tab
-from lowfc.programs.view.layout import layout
+from lowfc.programs.view.layout import APPLICATION, layout
 
 
 @dataclass(slots=True)
@@ -96,3 +96,26 @@ class Target:
     def show_all(self, stream: rr.RecordingStream, span_ns: tuple[int, int] | None) -> None:
         """Let the plots show all of a log that was drawn; a picture has nothing of its last instant alone."""
         stream.send_blueprint(layout(self.tab, None, span_ns=span_ns, still=self.picture is not None))
+
+
+def to_viewer(url: str, recording: str, blueprint: rrb.Blueprint) -> rr.RecordingStream:
+    """Stream of that name to a viewer that listens at `url`; what it does not take waits, and then holds up."""
+    stream = _stream(recording)
+    stream.connect_grpc(url)
+    stream.send_blueprint(blueprint)
+    return stream
+
+
+def to_file(path: Path, recording: str, blueprint: rrb.Blueprint) -> rr.RecordingStream:
+    """Stream of that name into a file that rerun opens."""
+    stream = _stream(recording)
+    stream.save(str(path))
+    stream.send_blueprint(blueprint)
+    return stream
+
+
+def _stream(recording: str) -> rr.RecordingStream:
+    stream = rr.RecordingStream(APPLICATION, recording_id=recording)
+    stream.set_log_time_enabled(False)  # one timeline, that of the data
+    stream.set_log_tick_enabled(False)
+    return stream

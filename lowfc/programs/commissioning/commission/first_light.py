@@ -18,7 +18,7 @@ from lowfc.control.calibration.dark_frames import check_dark, dark_of
 from lowfc.control.loop.camera import CameraSettings
 from lowfc.programs.commissioning.calibrate.recording import Say
 from lowfc.programs.commissioning.checks import Status
-from lowfc.programs.commissioning.conformance.agreement import agreement_checks
+from lowfc.programs.commissioning.conformance.settings import agreement_checks
 
 RATE_APART = 0.05
 """Part by which the rate of the frames' times may differ from what the camera says."""

@@ -44,9 +44,9 @@ def camera(
     Example: lowfc conformance camera --run bench --config bench.toml
     """
     from lowfc.contract.messages import Role
-    from lowfc.programs.commissioning.conformance.agreement import agreement_checks
     from lowfc.programs.commissioning.conformance.camera import watch
     from lowfc.programs.commissioning.conformance.frames import camera_checks
+    from lowfc.programs.commissioning.conformance.settings import agreement_checks
 
     settings = None if config is None else configuration(config)
     found = _run_with(Role.CAMERA, run)
