@@ -194,5 +194,4 @@ def joined(settings: "Configuration", run: str) -> Iterator["Links"]:
 
 
 def _short_lists(text: str) -> str:
-    """JSON with each list of plain values on one line."""
     return re.sub(r"\[\s+([^][{}]*?)\s+\]", lambda found: f"[{' '.join(found[1].split())}]", text)

@@ -210,7 +210,6 @@ class Controller:
             self._camera.wake()  # the warm-up does what else is to be done now, and then knows when to
 
     def _rest_ns(self) -> int:
-        """How long the main thread may wait."""
         rest_ns = None if self._warmup is None else self._warmup.rest_ns(self._service.clock.host_ns())
         return TICK_NS if rest_ns is None else min(rest_ns, TICK_NS)
 

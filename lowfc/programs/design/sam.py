@@ -288,7 +288,6 @@ def _described(found: Sequence[Hole]) -> str:
 
 @contextmanager
 def _progress(search: Search, chains: list[Chain], console: Console) -> Iterator[Callable[[], None]]:
-    """A progress bar with the best merit so far."""
     columns = (TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn(), TimeRemainingColumn())
     with passing_bar(console, *columns) as bar:
         task = bar.add_task(search.goal.merit, total=search.chains * search.steps)

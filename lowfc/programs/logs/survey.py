@@ -112,8 +112,6 @@ class _Line:
 
 
 class _Account:
-    """What the messages of a log say."""
-
     def __init__(self, selection: Selection = EVERYTHING) -> None:
         """Nothing so far, of a log that holds this selection."""
         self._selection = selection

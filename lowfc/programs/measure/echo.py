@@ -144,7 +144,6 @@ def _ask(config: Configuration, run: Run, payloads: Payloads, seconds: float, *,
 
 
 def _answer(config: Configuration, run: Run, command: bytes) -> None:
-    """Answer every frame with these bytes until an empty one comes."""
     done = threading.Event()
     session = _session(run, Role.CONTROLLER)
     publisher = declare_publisher(session, COMMAND, COMMAND.at(config.mirror.name))

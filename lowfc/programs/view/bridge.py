@@ -157,7 +157,6 @@ class Bridge:
         self._add_earlier(self._render)
 
     def _end_render(self) -> None:
-        """End the render thread, as far as it can be ended."""
         if self._render is not None:
             self._render.abandon()
             self._render.join(3.0)
@@ -181,7 +180,6 @@ class Bridge:
         return now_s - self._began_s > _RECORDER_S
 
     def _check(self, now_s: float) -> None:
-        """Look whether everything is well, and begin anew where it is not."""
         render, viewer = self._render, self.viewer
         assert render is not None  # noqa: S101  # `_begin` made it
         if self.service.newcomers() or (not self._past_known and self._recorder_absent(now_s)):

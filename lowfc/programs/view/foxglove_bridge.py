@@ -121,7 +121,6 @@ class FoxgloveBridge:
                 self._take(topic, sample)
 
     def _take(self, topic: Topic, sample: Sample) -> None:
-        """Pass a message on; on the bus's threads."""
         self._names.admit(topic, sample.key)
         if topic.queryable:
             self.kept[sample.key] = sample

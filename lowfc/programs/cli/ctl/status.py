@@ -184,7 +184,6 @@ def _in_short(known: dict[str, Any]) -> str:
 
 
 def _last_warning(state: wire.ControllerState, processes: Mapping[str, wire.Health]) -> dict[str, Any] | None:
-    """The newest warning of any process."""
     found = [
         (from_timestamp(one.last_warning_timestamp), name, one.last_warning)
         for name, one in processes.items()

@@ -222,7 +222,6 @@ def logged(history: History, kind: Kind) -> list[Played]:
 
 
 def _announced(requests: Sequence[wire.Request], kind: Kind) -> list[tuple[dict[str, Any], wire.Request]]:
-    """Parameters and request of each play of a test; the note itself where nothing is played."""
     found: list[tuple[dict[str, Any], wire.Request]] = []
     what: dict[str, Any] | None = None
     for request in requests:

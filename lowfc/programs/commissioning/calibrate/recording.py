@@ -217,7 +217,6 @@ def _commanded(step: Step) -> bool:
 
 
 def _check_refused(made: list[Step]) -> None:
-    """Raise where no frame at all has been used for a while."""
     last = made[-MOST_REFUSED:]
     if len(last) == MOST_REFUSED and not any(_commanded(step) for step in last):
         reasons = sorted({reason.name for step in last for reason in step.reasons})

@@ -218,7 +218,6 @@ class Commissioning:
         return self._loop.calibration() if state.calibration_id and state.mode != wire.LOOP_MODE_IDLE else None
 
     def _first(self) -> Calibration:
-        """The steps before there is any calibration."""
         self._step("camera")
         seen = list(self._loop.frames(LOOKED_AT))
         camera = camera_fits(self._config, self._loop.camera_state(), seen, self._say)

@@ -161,5 +161,4 @@ def _say_time(config: Configuration, modes: int, cycles: int, say: Say) -> None:
 
 
 def _poke_cycle(modes: int, amplitude_nm: float, number: int) -> poke_plan.Plan:
-    """Pokes of each mode by itself; every other cycle backwards."""
     return poke_plan.cycle(poke_plan.poke_patterns(modes, amplitude_nm), HOLD, SETTLE, 16, backwards=number % 2 == 1)

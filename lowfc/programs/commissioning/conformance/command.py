@@ -125,7 +125,6 @@ def _run_with(role: str, name: str | None) -> "Run":
 
 @contextmanager
 def _line(run: "Run", role: str) -> "Iterator[Line]":
-    """A line to a run, once somebody is connected."""
     import time
 
     from lowfc.programs.commissioning.conformance.line import Line
@@ -155,7 +154,6 @@ def _bar(text: str, total: float | None) -> Iterator[Callable[..., None]]:
 
 
 def _end(device: str, run_id: str, checks: list[Check], as_json: bool) -> None:
-    """Print what was found; exit status 1 where something is wrong."""
     put(checks, STATUSES, FIELDS, {"device": device, "run": run_id} if as_json else None)
     if any(check.status is Status.WRONG for check in checks):
         raise typer.Exit(1)

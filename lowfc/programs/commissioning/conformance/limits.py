@@ -41,7 +41,6 @@ def limit_checks(mirror: Dialogue) -> Iterator[Check]:
 
 
 def _kept(state: wire.MirrorState, reason: wire.Reason, found_nm: float, most_nm: float) -> Check:
-    """Whether the mirror kept the limit, and says so."""
     got = f"{found_nm:.4f} nm"
     if found_nm > most_nm:
         return wrong(got, "cut it in the driver's program, whatever is asked: do not rely on the controller's limits")

@@ -72,7 +72,6 @@ def _bad(found: list[Check], *names: str) -> bool:
 
 
 def _idle(mirror: Dialogue) -> Iterator[Check]:
-    """Before the first command: does it report where it is?"""
     states = mirror.listen(IDLE_S)
     expected = f"{mirror.key}: lowfc.v1.MirrorState ten times a second without commands"
     if mirror.unreadable:
@@ -105,7 +104,6 @@ def _grid(mirror: Dialogue, state: wire.MirrorState) -> Check:
 
 
 def _next_command(mirror: Dialogue, base_nm: Single, seconds: float) -> Iterator[Check]:
-    """Small commands, one after the other: are they answered, and followed?"""
     line, period_ns = mirror.line, mirror.expected.period_ns
     answers: list[wire.MirrorState] = []
     commanded_nm = base_nm
@@ -260,7 +258,6 @@ def _refusals(mirror: Dialogue, base_nm: Single) -> Iterator[Check]:
 
 
 def _timeout(mirror: Dialogue, base_nm: Single) -> Iterator[Check]:
-    """Does a command expire, in its time, and does the mirror follow again?"""
     mirror.ask(base_nm, EXPIRES_NS)
     sent_ns = mirror.line.now_ns()
     mirror.listen(EXPIRES_NS / 2e9)
@@ -302,6 +299,5 @@ def _timeout(mirror: Dialogue, base_nm: Single) -> Iterator[Check]:
 
 
 def _expired_ns(mirror: Dialogue, since_ns: int) -> int | None:
-    """When the first state that says EXPIRED came."""
     arrivals = (message.receive_time_ns for message, state in mirror.since(since_ns) if state.status == _EXPIRED)
     return next(arrivals, None)

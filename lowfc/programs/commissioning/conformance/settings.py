@@ -36,7 +36,6 @@ def _settings(seen: Camera) -> Check:
 
 @SETTINGS.check("settings' values", "a timestamp; period, gain, saturation, rows, columns and bit depth above 0")
 def _values(seen: Camera) -> Check | None:
-    """Values that a camera can have."""
     if (state := seen.settings) is None:
         return None
     values, highest = {field: float(getattr(state, field)) for field in _FIELDS}, 2.0**state.bit_depth - 1

@@ -252,7 +252,6 @@ def _browser(facts: Facts) -> Check:
 
 
 def _blas_threads() -> dict[str, int]:
-    """How many threads each loaded linear algebra takes, by its name."""
     return {
         f"{library['internal_api']} {library['version']}": library["num_threads"]
         for library in threadpool_info()

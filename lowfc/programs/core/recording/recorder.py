@@ -192,7 +192,6 @@ class Recorder:
         return self._failure
 
     def _resume(self) -> str:
-        """Begin the next log; return why not, if so."""
         if self._failure:
             return f"{self._failure}; start another recorder"
         if not self._paused or not self.service.running:

@@ -214,7 +214,6 @@ class _System:
 
 
 def _copy_commands(path: Path, image: fits.ImageHDU, history: History, calibration: Calibration) -> None:
-    """The command made from each step's frame, (steps, actuators) in m, into a new extension."""
     sequence = history.steps.sequence
     shape = (len(sequence), calibration.grid[0] * calibration.grid[1])
     there = {int(one): row for row, one in reversed(list(enumerate(sequence)))}

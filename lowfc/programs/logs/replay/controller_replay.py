@@ -260,7 +260,6 @@ class ControllerReplay:
         return decode_state(message, known.calibrations.get(message.calibration_id), known.laws, known.plays)
 
     def _leave_out(self, upto: int) -> None:
-        """Forget the inputs up to a number, and count their steps as unchecked."""
         for number in [number for number in self._entries if number <= upto]:
             taken = self._entries.pop(number).taken
             self._forgotten += taken is not None

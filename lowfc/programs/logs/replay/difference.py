@@ -74,7 +74,6 @@ def _compare(found: Difference, prefix: str, logged: Message, replayed: Message)
 
 
 def _alike(before: Array | None, after: Array | None) -> bool:
-    """Whether these are numbers that can be subtracted from each other."""
     if before is None or after is None or before.shape != after.shape:
         return False
     return bool(np.isfinite(before).all() and np.isfinite(after).all())

@@ -1,7 +1,5 @@
 """The error budget of a run's longest closed stretch, each term with the way it was obtained."""
 
-from typing import Any
-
 import numpy as np
 
 from lowfc.arrays import Array, Mask
@@ -17,10 +15,9 @@ from lowfc.programs.logs.report.closed_loop import (
     noise_of,
     why_none,
 )
-from lowfc.programs.logs.report.source import Run
+from lowfc.programs.logs.report.source import Figures, Run
 
 Masks = dict[str, Mask]
-Figures = dict[str, Any]
 
 Entry = tuple[Term | None, str]
 """A term and how it was obtained; or none, and what it would take."""
@@ -129,7 +126,6 @@ def _columns(term: Term | None, masks: Masks) -> Figures:
 
 
 def _over(total: Term | None, true: Term | None, masks: Masks) -> dict[str, float | None]:
-    """Sum over true residual, rms over rms."""
     if total is None or true is None:
         return dict.fromkeys(masks)
     ratios = {}

@@ -2,7 +2,6 @@
 
 from dataclasses import dataclass
 from itertools import pairwise
-from typing import Any
 
 import numpy as np
 
@@ -14,9 +13,7 @@ from lowfc.control.laws.margins import noise_transfer, rejection
 from lowfc.control.laws.spectra import SHORTEST, Pieces, Spectrum, in_bins, pieces, spectrum
 from lowfc.control.laws.stability import settling_frames
 from lowfc.control.loop.safety import LoopMode
-from lowfc.programs.logs.report.source import InForce, Run
-
-Figures = dict[str, Any]
+from lowfc.programs.logs.report.source import Figures, InForce, Run
 
 MOST_STEPS = 200_000
 """Of a longer stretch only the last ones are looked at: memory does not grow with the night."""

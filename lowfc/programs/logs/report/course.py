@@ -1,7 +1,6 @@
 """The course of a run: loop modes, events, requests, light, refused frames, the mirror's stroke."""
 
 from collections import Counter
-from typing import Any
 
 import numpy as np
 
@@ -10,9 +9,7 @@ from lowfc.arrays import Long, Single
 from lowfc.contract.events import Level
 from lowfc.contract.messages import wire
 from lowfc.control.loop.safety import LoopMode, Reason
-from lowfc.programs.logs.report.source import Run
-
-Figures = dict[str, Any]
+from lowfc.programs.logs.report.source import Figures, Run
 
 _FIRST_LIMIT = Reason.MODAL_LIMIT
 _LEVELS = {level.value: level.name.lower() for level in Level}

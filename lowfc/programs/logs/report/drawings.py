@@ -49,7 +49,6 @@ def drawings(report: Report, progress: Callable[[str], None] = lambda name: None
 
 
 def _overview(figure: "Figure", report: Report) -> bool:
-    """Loop mode as a band, and before and after over time."""
     run = report.run
     if not run.history.steps.sequence.size:
         return False
@@ -94,7 +93,6 @@ def _mode_band(axes: "Axes", report: Report) -> None:
 
 
 def _intervals(figure: "Figure", report: Report) -> bool:
-    """Histograms of the intervals, and how slow the slowest are."""
     found = {name: values * 1e-3 for name, values in intervals_ns(report.run).items() if values.size}
     stages = {name: values * 1e-3 for name, values in latencies_ns(report.run.history).items() if values.size}
     if not found and not stages:
@@ -160,7 +158,6 @@ def _residual(figure: "Figure", report: Report) -> bool:
 
 
 def _spectra(figure: "Figure", report: Report) -> bool:
-    """Power above, and below it the ratio closed over open with the theory."""
     groups = report.figures["spectra"].get("groups")
     if not groups:
         return False
@@ -206,7 +203,6 @@ def _over(one: Array, other: Array) -> Array:
 
 
 def _budget(figure: "Figure", report: Report) -> bool:
-    """Bars of the terms, their sum and what it should be, by group of modes."""
     budget = report.figures["error_budget"]
     if "why_not" in budget:
         return False
@@ -237,7 +233,6 @@ def _budget(figure: "Figure", report: Report) -> bool:
 
 
 def _light(figure: "Figure", report: Report) -> bool:
-    """Flux and saturated pixels over time, refused frames as marks."""
     steps, time_s = report.run.history.steps, report.run.step_s
     if not time_s.size:
         return False
@@ -264,7 +259,6 @@ def _light(figure: "Figure", report: Report) -> bool:
 
 
 def _timeline(figure: "Figure", report: Report) -> bool:
-    """Loop modes, requests and events by level."""
     events, requests = report.figures["events"], report.figures["requests"]
     if not events and not report.figures["mode_spans"]:
         return False
@@ -293,7 +287,6 @@ def _timeline(figure: "Figure", report: Report) -> bool:
 
 
 def _stroke(figure: "Figure", report: Report) -> bool:
-    """Largest actuator over time, and where on the mirror it was."""
     history = report.run.history
     mirror = history.mirror
     if not mirror.sequence.size:
@@ -321,7 +314,6 @@ def _stroke(figure: "Figure", report: Report) -> bool:
 
 
 def _envelope(axes: "Axes", time_s: Array, values: npt.NDArray[np.floating], starts: Any, colour: str) -> None:
-    """Least and largest of each bin as an area, and a line through the middle."""
     least, most = np.fmin.reduceat(values, starts), np.fmax.reduceat(values, starts)
     axes.fill_between(time_s, least, most, color=colour, alpha=0.25, linewidth=0)
     axes.plot(time_s, (least + most) / 2, color=colour, linewidth=1.0)

@@ -1,7 +1,5 @@
 """How much of the wavefront is left: rms of each mode, and of tip and tilt on the sky."""
 
-from typing import Any
-
 import numpy as np
 
 from lowfc.adapters.logs.columns import TruthRows
@@ -11,9 +9,7 @@ from lowfc.control.loop.safety import LoopMode
 from lowfc.optics.chain.zernike import mode_name
 from lowfc.optics.detector.photometry import tilt_nm_per_mas
 from lowfc.programs.logs.report.closed_loop import Stretch, noise_of
-from lowfc.programs.logs.report.source import Run
-
-Figures = dict[str, Any]
+from lowfc.programs.logs.report.source import Figures, Run
 
 
 def residual_figures(run: Run, stretch: Stretch | None) -> Figures:
@@ -89,7 +85,6 @@ def bin_starts(rows: int, most: int) -> Whole:
 
 
 def _rms(values: Single, rows: Whole) -> Array | None:
-    """Root mean square (modes,) of those rows that hold values; None where none does, or there are none at all."""
     found = values[rows] if values.size else values
     known = found[np.isfinite(found).all(axis=1)].astype(float)
     return np.sqrt(np.mean(known**2, axis=0)) if len(known) else None

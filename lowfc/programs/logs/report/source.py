@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -11,6 +12,9 @@ from lowfc.adapters.logs.history import History, read_history
 from lowfc.adapters.logs.parts import LogFiles, WholeLog
 from lowfc.arrays import Array, Long
 from lowfc.contract.messages import from_timestamp
+
+Figures = dict[str, Any]
+"""As JSON has them."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,7 +1,5 @@
 """Rates, jitter and latency of a run, and the frames that got no command."""
 
-from typing import Any
-
 import numpy as np
 
 from lowfc.adapters.logs.columns import STAGES, rows_of
@@ -9,9 +7,7 @@ from lowfc.adapters.logs.history import History
 from lowfc.arrays import Long
 from lowfc.contract.envelope import start_of
 from lowfc.contract.messages import FRAME, Role
-from lowfc.programs.logs.report.source import Run
-
-Figures = dict[str, Any]
+from lowfc.programs.logs.report.source import Figures, Run
 
 _END_NS = 50_000_000
 """Before the last frame, in which a command may still be on its way when the log ends."""

@@ -171,7 +171,6 @@ def _calibration(what: WhatIf, config: Configuration | None, run: LoggedRun) -> 
 
 
 def _reconstructed(calibration: Calibration, estimator: str, run: LoggedRun) -> Calibration:
-    """The same I0 and H with another R."""
     path, configuration = run.history.log.path, run.history.configuration
     if configuration is None:
         raise ConfigurationError(f"{path}: has no configuration, so that the noise of a pixel is not known")
@@ -212,7 +211,6 @@ def _tilt_mas(run: LoggedRun, columns: dict[str, Array]) -> dict[str, float]:
 
 
 def _doubts_of_log(run: LoggedRun) -> list[str]:
-    """What of the log makes the figures less sure."""
     found, log = list(run.history.remarks), run.history.log
     if log.damage:
         parts = ", ".join(f"byte {one.position}, {one.why}" for one in log.damage)

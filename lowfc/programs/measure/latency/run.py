@@ -187,7 +187,6 @@ def _children(asked: Asked, run: Run) -> list[Child]:
 
 
 def _alone(asked: Asked, run: Run) -> dict[str, Any]:
-    """One repeat of what the loop is set against."""
     words = [*_shared(run), "--seconds", str(asked.duration_s / 2), *["--free-running"] * asked.free_running]
     children = [
         program(f"echo ({verb})", ["-m", echo.__name__, verb, *words], run.path / f"echo-{verb}.stderr")

@@ -175,7 +175,6 @@ def linear_range(deviation: Array) -> float:
 
 @lru_cache(maxsize=8)
 def _one_wavefront(context: Context, name: str, literal: bool) -> tuple[Array, dict[str, Array]]:
-    """A random wavefront (modes,) in waves, and its estimates."""
     ready = context.prepared(name)
     wavelength_nm, matched = ready.sensor.wavelength_nm, _matched(ready)
     low, high = LITERAL_WAVES if literal else (matched.low, matched.high)

@@ -243,7 +243,6 @@ class ChaosBench:
             self.wait(lambda: name in self.health and self.health[name].state in ("ready", "running"), f"a new {name}")
 
     def _note_end(self, child: Child, after_s: float, *, meant: bool) -> None:
-        """Note how a process ended, once."""
         if id(child) not in self._noted:
             self._noted.add(id(child))
             self.left.ended.append(Ended(child.name, child.status or 0, after_s, meant))

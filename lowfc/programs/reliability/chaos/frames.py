@@ -35,7 +35,6 @@ _KINDS = (
 
 
 def _through(bench: ChaosBench) -> None:
-    """Wait until the camera's fault is over."""
     last = FIRST + STRUCK + LATEST
     bench.wait(lambda: bench.newest_frame & 0xFFFFFFFF >= last, f"frame {last}")
 

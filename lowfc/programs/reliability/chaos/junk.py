@@ -77,7 +77,6 @@ def _flood(bench: ChaosBench) -> None:
 
 
 def _commands(bench: ChaosBench, rng: np.random.Generator) -> Iterator[wire.MirrorCommand]:
-    """Commands of anything at all, in good form."""
     rows, columns = bench.config.mirror.rows, bench.config.mirror.columns
     for number in range(FORGED):
         amplitude = float(rng.choice([1.0, 1e2, 1e4, 1e38]))

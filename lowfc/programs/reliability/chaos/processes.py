@@ -32,7 +32,6 @@ _EVENTS: dict[Role, tuple[tuple[str, ...], tuple[str, ...]]] = {
 
 
 def _name(bench: ChaosBench, role: Role) -> str:
-    """The process of a role; a viewer is started."""
     if role is Role.VIEWER:
         bench.view()
     return bench.mirror if role is Role.MIRROR else str(role)

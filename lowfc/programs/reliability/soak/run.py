@@ -74,8 +74,6 @@ class LogChecker:
 
 
 class _Soak:
-    """The processes of a soak, and what is seen of them."""
-
     def __init__(self, config: Configuration, folder: Path) -> None:
         self.checker = LogChecker(folder)
         self.watch = Watch({}, [])

@@ -37,7 +37,6 @@ class Mirror(Panel):
             self._surface.show_values(stream, snapshot.time_ns, snapshot.surface)
 
     def _mark(self, stream: rr.RecordingStream, snapshot: Snapshot, surface_nm: Single) -> None:
-        """Draw a ring round each actuator at its stroke."""
         stroke_nm = snapshot.stroke_nm
         if not stroke_nm:
             return

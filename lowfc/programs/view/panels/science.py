@@ -94,7 +94,6 @@ class Science(Panel):
         return self._camera
 
     def _keep(self, source: str, now_nm: Single, open_nm: Single) -> None:
-        """Keep the newest row; a refused frame has no wavefront."""
         if now_nm.shape[1] != len(self._noll):
             return
         finite = np.flatnonzero(np.isfinite(now_nm).all(axis=1) & np.isfinite(open_nm).all(axis=1))

@@ -75,7 +75,6 @@ class Trend(Panel):
         self._axes.fit(stream, (0.0, span_s), (log10(low), log10(high)), x_ticks, y_ticks)
 
     def _show(self, stream: rr.RecordingStream, after_s: Array, rms_nm: Array, there: Mask) -> None:
-        """Draw both lines, broken where nothing was measured."""
         edges = np.flatnonzero(np.diff(there.astype(int), prepend=0, append=0))
         strips: list[tuple[Array, Colour, float]] = []
         for values, colour, width in zip(rms_nm.T[::-1], _COLOURS, _WIDTHS, strict=True):

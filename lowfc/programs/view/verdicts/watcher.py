@@ -239,7 +239,6 @@ class Watcher:
         return silent_s if silent_s > max(FRAMES_SILENT_S, PERIODS * self.period_ns * 1e-9) else None
 
     def _total(self, span_s: float) -> Counts:
-        """Counts of the last snapshots, added up once."""
         if span_s not in self._sums:
             total: Counts = Counter()
             for one in self._last(span_s):
