@@ -220,13 +220,8 @@ def summary(point: Point) -> dict[str, Any]:
         "purpose": point.layout.purpose,
         "merit": point.merit,
         "holes": len(point.layout.holes),
-        "focal_masks": layout_figures(point.layout),
+        "focal_masks": {name: _figures(name, point.layout.holes) for name in FOCAL_MASKS},
     }
-
-
-def layout_figures(layout: Layout) -> dict[str, Any]:
-    """What Tables 3 and 4 would show of a layout, for each focal-plane mask."""
-    return {name: _figures(name, layout.holes) for name in FOCAL_MASKS}
 
 
 def render(result: dict[str, Any]) -> str:

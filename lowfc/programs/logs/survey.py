@@ -151,17 +151,15 @@ class _Account:
             "messages": sum(line.messages for line in self._lines.values()),
             "messages_missing": sum(missing.values()),
             "topics": {
-                key: line.figures(missing.get(key, 0) if self._counts(key) else None)
+                key: line.figures(
+                    missing.get(key, 0) if (topic := _topic(key)) is None or self._selection.counts(topic) else None
+                )
                 for key, line in sorted(self._lines.items())
             },
             "missing_topics": {key: count for key, count in missing.items() if key not in self._lines},
             "loop_modes": self._modes,
             "events": dict(self._events.most_common()),
         }
-
-    def _counts(self, key: str) -> bool:
-        topic = _topic(key)
-        return topic is None or self._selection.counts(topic)
 
     def _author(self, topic: Topic, sample: Sample) -> str:
         """Take account of what a message says; return who of several publishers sent it, on a topic that has them."""

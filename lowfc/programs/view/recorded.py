@@ -65,7 +65,11 @@ def draw_logs(
                 first_ns = message.log_time_ns
             if number == 0:
                 recorded = reader.metadata.get("lowfc", {})
-                run, host = _same_run(run, recorded.get("run", ""), log), host or recorded.get("host", "")
+                before, run, host = run, recorded.get("run", "") or run, host or recorded.get("host", "")
+                if before not in ("", run):
+                    raise DataFileError(
+                        f"{log} is of run {run!r}, and the log before it of {before!r}: look at one at a time"
+                    )
             last_ns, topic = message.log_time_ns, topic_of(message.key)
             accumulator.add(topic, message.key, message.payload, message.publish_time_ns, message.sequence)
             if last_ns >= due_ns:
@@ -90,12 +94,6 @@ def draw_logs(
         drawn.remarks.append(f"{accumulator.unreadable} messages could not be read")
     drawn.log_s = (last_ns - first_ns) * 1e-9
     return drawn
-
-
-def _same_run(before: str, run: str, log: Path) -> str:
-    if before and run and run != before:
-        raise DataFileError(f"{log} is of run {run!r}, and the log before it of {before!r}: look at one at a time")
-    return run or before
 
 
 def _own(reader: LogReader, drawn: Drawn) -> Configuration:

@@ -90,8 +90,10 @@ class Target:
         blueprint = layout(self.tab, window_s)
         if viewer is not None:
             return to_viewer(viewer.url, recording, blueprint)
-        assert part is not None  # noqa: S101  # there is a viewer or a file
-        return to_file(part, recording, blueprint)
+        stream = _stream(recording)
+        stream.save(str(part))
+        stream.send_blueprint(blueprint)
+        return stream
 
     def show_all(self, stream: rr.RecordingStream, span_ns: tuple[int, int] | None) -> None:
         """Let the plots show all of a log that was drawn; a picture has nothing of its last instant alone."""
@@ -102,14 +104,6 @@ def to_viewer(url: str, recording: str, blueprint: rrb.Blueprint) -> rr.Recordin
     """Stream of that name to a viewer that listens at `url`; what it does not take waits, and then holds up."""
     stream = _stream(recording)
     stream.connect_grpc(url)
-    stream.send_blueprint(blueprint)
-    return stream
-
-
-def to_file(path: Path, recording: str, blueprint: rrb.Blueprint) -> rr.RecordingStream:
-    """Stream of that name into a file that rerun opens."""
-    stream = _stream(recording)
-    stream.save(str(path))
     stream.send_blueprint(blueprint)
     return stream
 

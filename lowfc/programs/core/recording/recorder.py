@@ -40,7 +40,6 @@ _FLUSH_NS = 250_000_000
 _SETTLE_S = (0.3, 1.5)
 _DRAIN_S = 1.0
 _SLOW_NS = 1_000_000_000
-_LARGEST_ATTACHMENT_BYTES = 1 << 28
 
 
 class Recorder:

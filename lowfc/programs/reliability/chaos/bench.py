@@ -25,7 +25,7 @@ from lowfc.adapters.process.clock import HostClock
 from lowfc.client import Client
 from lowfc.contract.configuration import Configuration
 from lowfc.contract.errors import LowfcError
-from lowfc.contract.messages import HEALTH, STEP, TRUTH, Role, wire
+from lowfc.contract.messages import HEALTH, STEP, TRUTH, Role, topic_of, wire
 from lowfc.programs.launch.processes import program, start_all
 from lowfc.programs.launch.sim_loop import children_of, prepare
 
@@ -126,8 +126,8 @@ class ChaosBench:
         self._started += self.children.values()
         start_all(self._started)
         self.bus = ZenohBus(self.run.links, Role.LAUNCHER, HostClock())
-        for topic, receive in ((HEALTH, self._health), (STEP, self._step), (TRUTH, self._truth)):
-            self.bus.subscribe(topic, receive)
+        for topic in (HEALTH, STEP, TRUTH):
+            self.bus.subscribe(topic, self._receive)
         self.wait(lambda: self._steps > 0, "the first frame", START_S)
         self.settled(_QUIET_FRAMES)
         self.mark("quiet")
@@ -247,25 +247,21 @@ class ChaosBench:
             self._noted.add(id(child))
             self.left.ended.append(Ended(child.name, child.status or 0, after_s, meant))
 
-    def _health(self, sample: Sample) -> None:
+    def _receive(self, sample: Sample) -> None:
+        topic = topic_of(sample.key)
         with contextlib.suppress(DecodeError):  # some cases send junk
-            health = wire.Health.FromString(sample.payload)
-            self.health[health.process] = health
-
-    def _step(self, sample: Sample) -> None:
-        with contextlib.suppress(DecodeError):
-            step = wire.ControlStep.FromString(sample.payload)
-            self._steps += 1
-            self.newest_frame = step.frame_sequence
-            self.left.mode = step.mode
-            if step.mode != wire.LOOP_MODE_CLOSED:
-                self._good = 0
-            elif step.error_nm:
-                self._good += 1
-
-    def _truth(self, sample: Sample) -> None:
-        with contextlib.suppress(DecodeError):
-            self.left.residuals_nm.append(wire.Truth.FromString(sample.payload).residual_rms_nm)
+            message: Any = topic.message.FromString(sample.payload)
+            if topic is HEALTH:
+                self.health[message.process] = message
+            elif topic is TRUTH:
+                self.left.residuals_nm.append(message.residual_rms_nm)
+            else:
+                self._steps += 1
+                self.newest_frame, self.left.mode = message.frame_sequence, message.mode
+                if message.mode != wire.LOOP_MODE_CLOSED:
+                    self._good = 0
+                elif message.error_nm:
+                    self._good += 1
 
 
 def _alive(sessions: set[int]) -> list[str]:
