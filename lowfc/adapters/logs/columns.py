@@ -11,6 +11,7 @@ import numpy.typing as npt
 
 from lowfc.contract.messages import from_timestamp, wire
 from lowfc.control.loop.inputs import Step
+from lowfc.control.loop.safety import Reason
 
 Single = npt.NDArray[np.float32]
 Double = npt.NDArray[np.float64]
@@ -177,6 +178,12 @@ def of_steps(steps: Sequence[Step], modes: int) -> Steps:
         np.array([step.flux_dn for step in steps], np.float32),
         np.array([step.saturated_pixels for step in steps], np.int64),
     )
+
+
+def reason_counts(bits: Whole) -> dict[Reason, int]:
+    """How often each reason was given, of those that were."""
+    counts = {reason: int(np.count_nonzero(bits & (1 << reason))) for reason in Reason} if bits.any() else {}
+    return {reason: count for reason, count in counts.items() if count}
 
 
 class TruthRows(_Rows[Truths]):

@@ -4,6 +4,7 @@ from collections import Counter
 
 import numpy as np
 
+from lowfc.adapters.logs.columns import reason_counts
 from lowfc.adapters.logs.history import History
 from lowfc.arrays import Long, Single
 from lowfc.contract.events import Level
@@ -91,7 +92,8 @@ def light_figures(history: History) -> Figures:
     """Flux, saturation, and frames refused by reason."""
     steps = history.steps
     flux = steps.flux_dn[steps.flux_dn > 0]
-    refused = {reason.name.lower(): _given(steps.reasons, reason) for reason in Reason if reason < _FIRST_LIMIT}
+    counts = reason_counts(steps.reasons).items()
+    refused = {reason.name.lower(): count for reason, count in counts if reason < _FIRST_LIMIT}
     return {
         "flux_expected_dn": history.calibration.flux_dn if history.calibration is not None else None,
         "flux_mean_dn": float(flux.mean()) if flux.size else None,
@@ -100,7 +102,7 @@ def light_figures(history: History) -> Figures:
         "frames_saturated": int((steps.saturated_pixels > 0).sum()),
         "saturated_pixels_most": int(steps.saturated_pixels.max(initial=0)),
         "frames_refused": sum(refused.values()),
-        "refused": {reason: count for reason, count in refused.items() if count},
+        "refused": refused,
     }
 
 
@@ -125,12 +127,8 @@ def actuator_extremes_nm(history: History) -> Single:
 
 
 def _limits(reasons: Long) -> dict[str, int]:
-    counted = {reason.name.lower(): _given(reasons, reason) for reason in Reason if reason >= _FIRST_LIMIT}
-    return {reason: count for reason, count in counted.items() if count}
-
-
-def _given(reasons: Long, reason: Reason) -> int:
-    return int(np.count_nonzero(reasons >> int(reason) & 1))
+    counts = reason_counts(reasons).items()
+    return {reason.name.lower(): count for reason, count in counts if reason >= _FIRST_LIMIT}
 
 
 def _when(run: Run, request: wire.Request) -> float:

@@ -8,6 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from lowfc.adapters.bus.run import mirror_role
+from lowfc.adapters.logs.columns import reason_counts
 from lowfc.arrays import Array, Long, Sequences, Single
 from lowfc.contract.codecs.codec import actuators
 from lowfc.contract.envelope import start_of
@@ -306,14 +307,15 @@ class Watcher:
         truth = _squares(
             snapshot, truths.residual_nm, truths.disturbance_nm, truths.residual_rms_nm, truths.disturbance_rms_nm
         )
-        counts = Counter({"steps": len(steps.mode), **_reasons(steps.reasons), **self._grown(snapshot)})
+        counts = Counts(reason_counts(steps.reasons))
+        counts.update(steps=len(steps.mode), **self._grown(snapshot))
         durations_ns = snapshot.timings["frame_to_command"]
         measured = _squares(snapshot, error_nm, pol_nm, error_nm, pol_nm)
         return _Sample(snapshot.host_ns, counts, truth, measured, steps.sequence, steps.time_ns, durations_ns)
 
-    def _grown(self, snapshot: Snapshot) -> dict[Reason | str, int]:
+    def _grown(self, snapshot: Snapshot) -> dict[str, int]:
         """By how much what the processes count has grown since the last snapshot; a restarted one begins anew."""
-        grown: dict[Reason | str, int] = {}
+        grown: dict[str, int] = {}
         for name, (role, count_in) in _COUNTED.items():
             last = snapshot.health.get(role)
             if last is None:
@@ -324,12 +326,6 @@ class Watcher:
                 grown[name] = count - before
             self._counted[name] = (last.health.pid, count)
         return grown
-
-
-def _reasons(bits: Long) -> dict[Reason | str, int]:
-    if not bits.any():
-        return {}
-    return {reason: int(np.count_nonzero(bits & (1 << reason))) for reason in Reason}
 
 
 def _squares(
