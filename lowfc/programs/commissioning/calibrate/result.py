@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from lowfc.adapters.files import calibration_file, factory
-from lowfc.arrays import Array, Single
+from lowfc.arrays import Array, single
 from lowfc.contract.codecs.calibration_codec import identified
 from lowfc.contract.configuration import Configuration
 from lowfc.contract.errors import CalibrationError
@@ -186,13 +186,13 @@ def measured_calibration(
     names = dict.fromkeys([*taken.initial.estimator.split("+"), wanted.method])
     calibration = replace(
         before,
-        reference=_single(I0),
-        response=_single(taken.response),
-        reconstructor=_single(made.matrix),
+        reference=single(I0),
+        response=single(taken.response),
+        reconstructor=single(made.matrix),
         flux_dn=taken.flux_dn,
         estimator="+".join(names),
         operator_hash="",
-        actuators_to_modes=_single(_seen_of_actuators(config, before, made.matrix)),
+        actuators_to_modes=single(_seen_of_actuators(config, before, made.matrix)),
     )
     return identified(calibration), made
 
@@ -352,7 +352,3 @@ def _seen_of_actuators(config: Configuration, before: Calibration, matrix: Array
 
 def _span(calibration: Calibration) -> str:
     return f"Z{calibration.noll[0]} to Z{calibration.noll[-1]}"
-
-
-def _single(array: Array) -> Single:
-    return np.ascontiguousarray(array, dtype=np.float32)

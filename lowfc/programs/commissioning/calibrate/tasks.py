@@ -16,7 +16,7 @@ from lowfc.adapters.files.mirror_maps import shape_of
 from lowfc.adapters.files.whole_file import require_folder
 from lowfc.adapters.process.progress import Counted, counting_bar, spoken
 from lowfc.adapters.process.terminal import configuration
-from lowfc.arrays import Array
+from lowfc.arrays import Array, single
 from lowfc.client import Client, configuration_of
 from lowfc.contract.codecs.calibration_codec import identified
 from lowfc.contract.configuration import Configuration
@@ -144,8 +144,7 @@ def computed(
     if there is not None:
         made = replace(made, estimator=f"{made.estimator}+at {there.name}")
     if wanted.truncate or wanted.tikhonov:
-        matrix = np.ascontiguousarray(quality.matrix, dtype=np.float32)
-        made = replace(made, reconstructor=matrix, estimator=f"{made.estimator}+regularised")
+        made = replace(made, reconstructor=single(quality.matrix), estimator=f"{made.estimator}+regularised")
     made = identified(made)
     calibration_file.save(made, wanted.out)
     if load:

@@ -5,6 +5,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from lowfc.arrays import single
 from lowfc.client import Client
 from lowfc.contract.codecs.calibration_codec import identified
 from lowfc.contract.configuration import Configuration
@@ -119,8 +120,8 @@ def poked(loop: Client, config: Configuration, before: Calibration, poke: Delay,
     say(f"{CYCLES} pokes of each mode by {amplitude_nm:.3g} nm")
     made = replace(
         before,
-        response=response.astype(np.float32),
-        reconstructor=np.ascontiguousarray(matrix, np.float32),
+        response=single(response),
+        reconstructor=single(matrix),
         estimator=f"{config.control.estimator}+poke{FIRST}",
     )
     return First(identified(made), {})
