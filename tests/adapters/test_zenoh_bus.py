@@ -443,3 +443,56 @@ def test_who_looks_on_gets_every_row_and_no_more_pictures_than_it_draws(
     until(got_the_last)
     assert len(seen[TRUTH]) - first[TRUTH] >= 500
     assert 5 < len(seen[FRAME]) - first[FRAME] < 250
+
+
+SLOW_READER = """
+import sys, time
+from lowfc.adapters.bus.run import open_run
+from lowfc.adapters.bus.zenoh_bus import ZenohBus
+from lowfc.adapters.process.clock import HostClock
+from lowfc.contract.messages import FRAME, HEALTH
+
+received = []
+bus = ZenohBus(open_run(sys.argv[1]).links, "recorder", HostClock())
+ring = bus.ring(FRAME, 4096)
+bus.publisher(HEALTH, "recorder").put(b"")
+while sys.stdin.readline():
+    received += [sample.payload for sample in ring.drain()]
+    whole = [payload for payload in received if payload == payload[:8] * 1600]
+    print(len(received), len(whole), int(whole[-1][:8]) if whole else -1, flush=True)
+"""
+
+
+def test_a_session_that_ends_leaves_no_half_message_with_a_slow_reader(
+    run: Run, join: Callable[[Run, str], ZenohBus]
+) -> None:
+    bus = join(run, "camera")
+    frames = bus.publisher(FRAME)
+    reader = subprocess.Popen(
+        [sys.executable, "-c", SLOW_READER, run.run_id], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
+    )
+
+    def look() -> list[int]:
+        reader.stdin.write("\n")
+        reader.stdin.flush()
+        return [int(word) for word in reader.stdout.readline().split()]
+
+    try:
+        number = itertools.count()
+
+        def heard() -> bool:
+            frames.put(b"%08d" % next(number) * 1600)
+            return look()[0] > 0
+
+        until(heard)
+        reader.send_signal(signal.SIGSTOP)
+        for _ in range(1000):  # more than the socket takes
+            frames.put(b"%08d" % next(number) * 1600)
+        threading.Timer(0.5, reader.send_signal, [signal.SIGCONT]).start()
+        bus.close()
+        received, whole, _ = look()
+        assert received == whole
+        assert whole > 15  # what the queue and the socket held
+    finally:
+        reader.kill()
+        reader.communicate()

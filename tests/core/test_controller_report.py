@@ -138,3 +138,14 @@ def test_the_status_line_is_of_the_last_seconds_and_says_nothing_before_the_firs
     with Console(width=120, file=io.StringIO(), record=True) as console:
         console.print(screen(watch, Configuration(), None, 10.0))
     assert "2.20 nm rms left of 30.00 nm" in console.export_text()
+
+
+@pytest.mark.parametrize(("received", "missing", "lost"), [(500, 0, 0), (371, 129, 129), (309, 0, 191), (0, 0, 0)])
+def test_frames_after_the_last_that_a_recorder_received_are_lost_too(received: int, missing: int, lost: int) -> None:
+    recorder = wire.Health(
+        recording=wire.Recording(lost=missing),
+        topics=[wire.TopicCount(topic=FRAME.key, received=received, missing=missing)],
+    )
+    camera = wire.Health(topics=[wire.TopicCount(topic=FRAME.key, published=500)])
+    figures = summary(Watch({"recorder": recorder, "camera": camera}, []), record=True)
+    assert (figures["messages_lost"], figures["lost"].get(FRAME.key, 0)) == (lost, lost)

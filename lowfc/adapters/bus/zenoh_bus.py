@@ -39,6 +39,8 @@ __all__ = [
 
 TAKEN_S = 0.5
 """How long the router, or who has one's place already, may take to answer."""
+FLUSH_S = 2.0
+"""How long a session waits at its end for peers that have not received everything yet."""
 
 
 def receive_in_one_thread() -> None:
@@ -50,12 +52,12 @@ def receive_in_one_thread() -> None:
     os.environ.setdefault("ZENOH_RUNTIME", "(rx: (handover: net))")
 
 
-def declare_publisher(session: zenoh.Session, topic: Topic, key: str) -> zenoh.Publisher:
-    """Return zenoh's own publisher of a topic, with the settings of the loop."""
+def declare_publisher(session: zenoh.Session, topic: Topic, key: str, *, lockstep: bool = False) -> zenoh.Publisher:
+    """Return zenoh's own publisher of a topic, with the settings of the loop; in lockstep it waits for slow readers."""
     return session.declare_publisher(
         key,
         encoding=f"application/protobuf;{topic.message.DESCRIPTOR.full_name}",
-        congestion_control=zenoh.CongestionControl.DROP,
+        congestion_control=zenoh.CongestionControl.BLOCK if lockstep else zenoh.CongestionControl.DROP,
         priority=zenoh.Priority.REAL_TIME if topic.in_loop else zenoh.Priority.DATA,
         # Express gives every message a batch of its own, so that a burst of 16 fills the queue and the rest is lost;
         # without it the latency is the same, for messages are batched under back-pressure only.
@@ -77,13 +79,13 @@ class ZenohPublisher:
         self._start_s = bus.start_s
         self._offset = bus.offset
         self._replying = bus.replying
-        self._publisher = declare_publisher(session, topic, key)
+        self._publisher = declare_publisher(session, topic, key, lockstep=bus.clock.lockstep)
         self._shortcut = None if shortcut is None else DirectWriter(shortcut)
         if self._keeps:
             session.declare_queryable(key, Callback(self._answer, indirect=False))
 
     def put(self, payload: bytes, publish_time_ns: int | None = None, sequence: int | None = None) -> Envelope:
-        """Send `payload`; waits at most 1 ms for a reader that does not keep up, then loses the message to it."""
+        """Send `payload`; a slow reader delays it by at most 1 ms and loses it, or in lockstep is waited for."""
         envelope = Envelope(
             sequence_of(self._start_s, self.published) if sequence is None else sequence,
             self._host_ns() if publish_time_ns is None else publish_time_ns,
@@ -271,7 +273,13 @@ class ZenohBus:
 
         self._session.declare_queryable(key_expression, Callback(asked, indirect=False))
 
-    def get(self, key: str, payload: bytes = b"", timeout_s: float = 1.0) -> list[Sample]:
+    def get(
+        self,
+        key: str,
+        payload: bytes = b"",
+        timeout_s: float = 1.0,
+        priority: zenoh.Priority = zenoh.Priority.DATA,
+    ) -> list[Sample]:
         """See `Bus.get`."""
         answers: list[Sample] = []
         done = threading.Event()
@@ -289,6 +297,7 @@ class ZenohBus:
             Callback(answered, done.set, indirect=False),
             payload=payload,
             timeout=timeout_s,
+            priority=priority,
             target=zenoh.QueryTarget.ALL,
             consolidation=zenoh.ConsolidationMode.NONE,
             # An operator's question waits for room, or a large one is lost; those of late joiners are empty.
@@ -302,7 +311,14 @@ class ZenohBus:
         return len(self._session.info.peers_zid()) + len(self._session.info.routers_zid())
 
     def close(self) -> None:
-        """Leave the run."""
+        """Leave the run, when what was put has been received or the peers have not answered in time.
+
+        Zenoh interrupts the write of a message when its session closes; to a slow reader that leaves half a message,
+        and the rest of the stream is lost. Messages of the lowest priority are sent last, and so is this question.
+        """
+        if self.role in self._links.ports:
+            with contextlib.suppress(zenoh.ZError):  # it is closed already
+                self.get(HEALTH.at(ALL), timeout_s=FLUSH_S, priority=zenoh.Priority.BACKGROUND)
         for close in self._closers:
             close()
         with contextlib.suppress(zenoh.ZError):

@@ -66,11 +66,17 @@ def summary(watch: Watch, record: bool) -> dict[str, Any]:
         "logs": [],
     }
     if record:
-        recording = watch.of(Role.RECORDER).recording
+        recorder = watch.of(Role.RECORDER)
+        recording, counted = recorder.recording, topic_count(recorder, FRAME.key)
+        lost = {topic.topic: topic.missing for topic in recorder.topics if topic.missing}
+        # A recorder that did not receive the camera's last Health knows of no frames after the last one it has.
+        unknown = figures["frames_published"] - counted.received - counted.missing
+        if counted.received and unknown > 0:
+            lost[FRAME.key] = counted.missing + unknown
         figures |= {
             "messages_recorded": recording.messages,
-            "messages_lost": recording.lost,
-            "lost": {topic.topic: topic.missing for topic in watch.of(Role.RECORDER).topics if topic.missing},
+            "messages_lost": max(recording.lost, sum(lost.values())),
+            "lost": lost,
             "recording_failure": recording.failure or None,
             "log": recording.file,
             "logs": list(recording.files),
