@@ -312,7 +312,7 @@ class ControllerReplay:
         if found is None or found.within(self._tolerance_nm):
             self._account.states += 1
         else:
-            self._account.changed[rule] = self._account.changed.get(rule, 0) + 1
+            self._account.changed[rule] += 1
             try:
                 self._settings, state = self._decoded(logged)
             except ValueError as error:

@@ -64,37 +64,26 @@ def _compare(found: Difference, prefix: str, logged: Message, replayed: Message)
             _compare(found, f"{prefix}{name}.", was, now)
             continue
         before, after = _numbers(descriptor, was), _numbers(descriptor, now)
-        if not _alike(before, after) or not name.endswith(_IN_NM):
+        if before is None or after is None or before.shape != after.shape or not name.endswith(_IN_NM):
             found.fields.append(f"{prefix}{name}: log {_short(was)}, replay {_short(now)}")
             found.otherwise = True
-        else:
-            assert before is not None  # noqa: S101  # for the type checker
-            assert after is not None  # noqa: S101
-            _numbers_differ(found, prefix + name, before, after)
-
-
-def _alike(before: Array | None, after: Array | None) -> bool:
-    if before is None or after is None or before.shape != after.shape:
-        return False
-    return bool(np.isfinite(before).all() and np.isfinite(after).all())
-
-
-def _numbers_differ(found: Difference, name: str, before: Array, after: Array) -> None:
-    apart = np.abs(after - before)
-    places = np.flatnonzero(apart)
-    shown = ", ".join(f"[{place}] log {before[place]:.9g}, replay {after[place]:.9g}" for place in places[:_SHOWN])
-    more = f" and {len(places) - _SHOWN} more" if len(places) > _SHOWN else ""
-    found.fields.append(f"{name}: {shown}{more}; at most {apart.max():.3g} nm apart")
-    found.largest_nm = max(found.largest_nm, float(apart.max()))
+            continue
+        apart = np.abs(after - before)
+        places = np.flatnonzero(apart)
+        shown = ", ".join(f"[{place}] log {before[place]:.9g}, replay {after[place]:.9g}" for place in places[:_SHOWN])
+        more = f" and {len(places) - _SHOWN} more" if len(places) > _SHOWN else ""
+        found.fields.append(f"{prefix}{name}: {shown}{more}; at most {apart.max():.3g} nm apart")
+        found.largest_nm = max(found.largest_nm, float(apart.max()))
 
 
 def _numbers(descriptor: Any, value: Any) -> Array | None:
-    """Numbers of a field as an array; None where it holds none."""
+    """Numbers of a field as an array; None where it holds none, or not finite ones."""
+    found = None
     if descriptor.name in _FLOAT32_FIELDS:
-        return np.frombuffer(value, "<f4").astype(float) if len(value) % 4 == 0 else None
-    if descriptor.type in (FieldDescriptor.TYPE_FLOAT, FieldDescriptor.TYPE_DOUBLE):
-        return np.atleast_1d(np.array(value, float))
-    return None
+        found = np.frombuffer(value, "<f4").astype(float) if len(value) % 4 == 0 else None
+    elif descriptor.type in (FieldDescriptor.TYPE_FLOAT, FieldDescriptor.TYPE_DOUBLE):
+        found = np.atleast_1d(np.array(value, float))
+    return found if found is not None and np.isfinite(found).all() else None
 
 
 def _short(value: object) -> str:
