@@ -151,14 +151,7 @@ _NOTHING = f"no chain had finished its first {BLOCK} steps: nothing was found, n
 
 
 def run_chains(search: Search, chains: list[Chain], executor: Executor, on_block: Callable[[], None]) -> None:
-    """Bring every chain to its end, in place, block by block.
-
-    Args:
-        search: What to look for.
-        chains: Where each stands.
-        executor: Where the blocks run.
-        on_block: Called after each.
-    """
+    """Bring every chain to its end, in place, block by block."""
     running: dict[Future[Chain], int] = {}
     pupil = pupil_digest()
     try:
@@ -180,11 +173,6 @@ def run_chains(search: Search, chains: list[Chain], executor: Executor, on_block
 
 def advance_block(search: Search, chain: Chain, pupil: str) -> Chain:
     """One block of one chain, on whatever machine this runs.
-
-    Args:
-        search: What to look for.
-        chain: Where it stands.
-        pupil: Digest of the shaped pupil that the search is for.
 
     Raises:
         ConfigurationError: This machine has another shaped pupil.

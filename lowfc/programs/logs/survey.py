@@ -184,12 +184,7 @@ class _Account:
 def survey(
     log: LogFiles, progress: Callable[[int, int], None] | None = None, *, digest: bool = False
 ) -> dict[str, Any]:
-    """Figures of a log, from all of its messages.
-
-    Args:
-        log: finished or not, damaged or whole.
-        progress: is told how many bytes of how many are done.
-        digest: add the `Digest`, of the log and of each topic.
+    """Figures of a log, whole or not, from all of its messages; with its `Digest`, and that of each topic, if asked.
 
     Raises:
         DataFileError: it is no log.

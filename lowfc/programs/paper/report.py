@@ -140,11 +140,6 @@ def run(
 def run_into(folder: Path, names: Sequence[str], context: Context) -> list[Table]:
     """The same, written as the document with its drawings: all of it at the end, or nothing.
 
-    Args:
-        folder: Of the document.
-        names: Keys of `CASES`.
-        context: Trials, seed, threads.
-
     Raises:
         DataFileError: The folder cannot be written.
         ConfigurationError: As `run`.

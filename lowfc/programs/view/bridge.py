@@ -106,11 +106,7 @@ class Bridge:
         self.service = Service(Role.VIEWER, run_id, clock, bus)
 
     def run(self, until_s: float | None = None, ready: Callable[[], None] | None = None) -> Summary:
-        """Show the run until told to stop, until a window is closed, or for a time.
-
-        Args:
-            until_s: for so long; None for ever.
-            ready: called once the viewer is there.
+        """Show the run until told to stop, until a window is closed, or for a time; `ready` once the viewer is there.
 
         Raises:
             ViewerError: no viewer can be started.
@@ -234,10 +230,6 @@ def earlier_events(recorder: wire.Health | None, now_ns: int) -> list[Sample]:
     """The newest events in a recorder's logs; where they cannot be read, a line that says so.
 
     Only the chunks that hold events are read: a second for a log of 4 GB.
-
-    Args:
-        recorder: its last Health; None where there is no recorder.
-        now_ns: time of that line, ns since the epoch.
     """
     if recorder is None:
         return [_line("earlier events are not shown: no recorder has kept them", now_ns)]

@@ -149,11 +149,6 @@ class FoxgloveBridge:
 def serve_foxglove(run: Run, clock: Clock, port: int = DEFAULT_PORT) -> Summary:
     """Serve a run to Foxglove and Lichtblick until SIGTERM or SIGINT; the process of `lowfc view --foxglove`.
 
-    Args:
-        run: the run to join.
-        clock: the run's.
-        port: on loopback, for the apps; 0 for a free one.
-
     Raises:
         BusError: the port is taken.
         ConfigurationError: foxglove-sdk is not installed.

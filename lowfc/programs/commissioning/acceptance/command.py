@@ -120,17 +120,7 @@ def _carry_out(
     as_json: bool,
     play: "Callable[[Live, Acceptance], list[Played]]",
 ) -> None:
-    """Judge what was played in a log, or play it now; draw and print the result, and end with the verdict.
-
-    Args:
-        test: its module.
-        logs: one log; empty for a running loop.
-        run: the loop's; None for the only one.
-        config: file with the requirements; None for the loop's own.
-        plot: file to draw into, if any.
-        as_json: print one JSON object.
-        play: plays the test to a loop.
-    """
+    """Judge what was played in a log, or play it now; draw and print the result, and end with the verdict."""
     from rich.console import Console
     from rich.progress import TimeRemainingColumn
 

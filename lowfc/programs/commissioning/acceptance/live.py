@@ -33,12 +33,7 @@ class Live:
     """The live loop, left in the mode in which it was found, with nothing more being played."""
 
     def __init__(self, client: Client, heard: Callable[[int, int], None]) -> None:
-        """Take hold of the loop.
-
-        Args:
-            client: that has joined the run.
-            heard: told of frames that have passed, and of all that are expected.
-        """
+        """Take hold of the loop."""
         self.client = client
         self.calibration = client.calibration()
         self.configuration = configuration_of(client)

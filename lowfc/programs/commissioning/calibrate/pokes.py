@@ -82,13 +82,7 @@ class Pokes:
     def __init__(
         self, config: Configuration, calibration: Calibration, noise_nm: Array, wanted: CalibrationRequest
     ) -> None:
-        """Choose the amplitude.
-
-        Args:
-            config: The loop's.
-            calibration: In use; it has the commands.
-            noise_nm: (modes,) of one frame.
-            wanted: What is asked for.
+        """Choose the amplitude; `noise_nm` is that of one frame (modes,).
 
         Raises:
             CalibrationError: the amplitude asked for is too large.

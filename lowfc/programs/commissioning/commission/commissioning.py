@@ -92,17 +92,7 @@ class Commissioning:
         progress: Counted,
         confirm: Callable[[str], None],
     ) -> None:
-        """Take what it is made with.
-
-        Args:
-            loop: A connection to it.
-            config: The loop's.
-            computed: Of the optical model: its modes and the mirror's commands, and its image where it is alike.
-            asked: What is asked for.
-            say: For people.
-            progress: For people: frames so far, and of how many.
-            confirm: Ask a person to do something, and wait until it is done.
-        """
+        """Take what it is made with."""
         self._loop, self._config, self._computed, self._asked = loop, config, computed, asked
         self._say, self._progress, self._confirm = say, progress, confirm
         self._figures: dict[str, Any] = {}

@@ -64,15 +64,7 @@ def first_delay(loop: Client, config: Configuration, before: Calibration, say: S
 
 
 def aligned(config: Configuration, computed: Calibration, before: Calibration, poke: Delay, say: Say) -> First | None:
-    """The computed calibration on the sensor's pixels, with the sign that the poke shows; None for another sensor.
-
-    Args:
-        config: The loop's.
-        computed: Of the optical model.
-        before: Has dark, good pixels and reference.
-        poke: Of the first mode.
-        say: For people.
-    """
+    """The computed calibration on the sensor's pixels, with the sign that the poke shows; None for another sensor."""
     image = (before.reference * before.flux_dn).reshape(before.shape).astype(np.float64)
     model = computed.reference.astype(np.float64).reshape(computed.shape)
     try:

@@ -45,12 +45,6 @@ class Sensor(NamedTuple):
 def camera_fits(config: Configuration, state: wire.CameraState, images: Sequence[Frame], say: Say) -> CameraSettings:
     """The camera's settings, once its frames and the configuration agree with them.
 
-    Args:
-        config: The loop's.
-        state: The camera's settings.
-        images: Some frames.
-        say: For people.
-
     Raises:
         CalibrationError: they do not agree, or the frames are saturated.
     """

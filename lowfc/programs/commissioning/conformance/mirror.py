@@ -27,14 +27,7 @@ _SETTLE_S = 0.05  # of actuators that are reported where they are, not where the
 
 
 def mirror_checks(mirror: Dialogue, seconds: float, tell: Tell, *, gentle: bool = False) -> list[Check]:
-    """What is right and wrong with a mirror; it ends where it was.
-
-    Args:
-        mirror: nobody else commands it.
-        seconds: for how long it is given ordinary commands.
-        tell: called with what is being tried.
-        gentle: do not try its limits.
-    """
+    """What is right and wrong with a mirror; it ends where it was."""
     found: list[Check] = []
     base_nm = np.zeros(mirror.expected.grid, np.float32)
     begun_ns = mirror.line.now_ns()

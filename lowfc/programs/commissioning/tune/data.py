@@ -98,11 +98,6 @@ def of_log(log: LogReader) -> Telemetry:
 def of_run(loop: Client, seconds: float, progress: Callable[[float], None] | None = None) -> Telemetry:
     """The steps that a running loop makes in the next seconds.
 
-    Args:
-        loop: a client of it.
-        seconds: how long to listen.
-        progress: called now and then with the seconds that have passed.
-
     Raises:
         BusError: the loop does not answer, or makes no steps.
         DataFileError: there are too few frames in a row.

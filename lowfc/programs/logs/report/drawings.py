@@ -32,10 +32,6 @@ _SECONDS = "seconds since the first step"
 def drawings(report: Report, progress: Callable[[str], None] = lambda name: None) -> dict[str, str]:
     """SVG of every drawing that the log has something for, by name.
 
-    Args:
-        report: What is drawn.
-        progress: Called with the name of each drawing before it is drawn.
-
     Raises:
         ConfigurationError: matplotlib is not installed.
     """

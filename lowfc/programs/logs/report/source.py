@@ -73,10 +73,6 @@ class Run:
 def read_run(files: LogFiles, progress: Callable[[int, int], None] | None = None) -> Run:
     """Read a log, whole or not, to its end; what is damaged is left out and told by the history's reader.
 
-    Args:
-        files: of the log.
-        progress: is told now and then how many bytes of how many are read.
-
     Raises:
         DataFileError: this is no log, or it has a calibration that cannot be read.
     """

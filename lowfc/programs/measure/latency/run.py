@@ -87,11 +87,6 @@ def prepared(config: Configuration, fill: Callable[[Configuration, Run], None] =
 def run_repeats(asked: Asked, run: Run, progress: Callable[[str], None]) -> list[dict[str, Any]]:
     """Measure; figures of each repeat.
 
-    Args:
-        asked: what to measure.
-        run: of `prepared`.
-        progress: told what begins now, twice a repeat.
-
     Returns:
         For each repeat `repeat_figures` and `controllers_account`; granted, refused, logs, messages_lost and
         commands_late; echo_us, step_us, hot_step_us and timer_us (percentiles; timer_us None without a schedule) and

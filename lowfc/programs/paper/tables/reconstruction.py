@@ -119,15 +119,7 @@ def fits(sensor: Prepared, modes: int, nuisances: bool = False) -> dict[str, Fit
 
 
 def ensemble(context: Context, name: str, modes: int, wavefronts: Input, nuisances: bool = False) -> Ensemble:
-    """Draw the wavefronts, image them with the full chain and noise, and estimate them in every way.
-
-    Args:
-        context: Trials, seed, threads.
-        name: Of the sensor.
-        modes: In the wavefronts and in the fit.
-        wavefronts: How large they are.
-        nuisances: Whether flux and shear are fitted along, too.
-    """
+    """Draw the wavefronts, image them with the full chain and noise, and estimate them in every way."""
     sensor = context.prepared(name)
     linear, light_e, wavelength_nm = fits(sensor, modes, nuisances), scale_e(sensor), sensor.sensor.wavelength_nm
     rng = context.rng("table3", modes, wavefronts.name)
