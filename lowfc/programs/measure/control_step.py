@@ -18,11 +18,7 @@ from lowfc.programs.measure.frame_source import Payloads
 
 
 class ControlStep:
-    """The controller's arithmetic: a frame's bytes in, a command's bytes out.
-
-    Attributes:
-        state: after the last frame.
-    """
+    """The controller's arithmetic: a frame's bytes in, a command's bytes out."""
 
     def __init__(self, config: Configuration, calibration: Calibration, now_ns: int) -> None:
         """Load the calibration."""

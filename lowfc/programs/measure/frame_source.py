@@ -62,11 +62,7 @@ def prepared_frames(config: Configuration) -> Pixels:
 
 
 class Payloads:
-    """Frames as messages: encoded once, only the time put before each.
-
-    Attributes:
-        shape: rows and columns.
-    """
+    """Frames as messages: encoded once, only the time put before each."""
 
     def __init__(self, pixels: Pixels) -> None:
         """Encode frames (frames, rows, columns)."""

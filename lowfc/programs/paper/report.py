@@ -15,10 +15,14 @@ from lowfc.adapters.files.drawing import figure_class
 from lowfc.adapters.files.whole_file import write_whole
 from lowfc.adapters.process.progress import passing_bar
 from lowfc.contract.errors import ConfigurationError, DataFileError
-from lowfc.programs.paper.cases import Case, Context
-from lowfc.programs.paper.figures.figures import FIGURES
-from lowfc.programs.paper.rows import plain
+from lowfc.programs.paper.cases import Case, Context, plain
+from lowfc.programs.paper.figures import aberration, light, modes, screens
 from lowfc.programs.paper.tables.tables import TABLES
+
+_ALL = {**aberration.CASES, **light.CASES, **modes.CASES, **screens.CASES}
+
+FIGURES: dict[str, Case] = {name: _ALL[name] for name in sorted(_ALL, key=lambda name: int(name.removeprefix("fig")))}
+
 
 CASES: dict[str, Case] = {**TABLES, **FIGURES}
 

@@ -15,16 +15,7 @@ from lowfc.programs.view.layout import APPLICATION, layout
 
 @dataclass(slots=True)
 class Target:
-    """At most one of window, page, file and picture; by default a window, or a page where there is no screen.
-
-    Attributes:
-        native, web: in a window, on a page.
-        save: file (RRD), or None.
-        picture: file (PNG) of a headless viewer, or None.
-        tab: that is opened.
-        memory_mb: what a viewer keeps of the past.
-        port, web_port: of the viewer, each time it is started; 0 for a free one.
-    """
+    """At most one of window, page, file and picture; by default a window, or a page where there is no screen."""
 
     native: bool = False
     web: bool = False

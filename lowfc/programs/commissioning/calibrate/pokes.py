@@ -73,11 +73,7 @@ class CalibrationRequest:
 
 
 class Pokes:
-    """The plans of one calibration.
-
-    Attributes:
-        amplitude_nm: of a mode, wavefront rms.
-    """
+    """The plans of one calibration, at an amplitude `amplitude_nm` of a mode, wavefront rms."""
 
     def __init__(
         self, config: Configuration, calibration: Calibration, noise_nm: Array, wanted: CalibrationRequest

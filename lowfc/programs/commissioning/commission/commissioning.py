@@ -51,18 +51,7 @@ STEPS = (
 
 @dataclass(frozen=True, slots=True)
 class Commission:
-    """What is asked for.
-
-    Attributes:
-        out: The file to be written; what is done so far is kept beside it.
-        frames: For the dark and for the reference image.
-        dark: File of dark frames; None to take them now.
-        no_dark: Take the camera's bias for the dark, and all pixels for good.
-        snr: Signal-to-noise ratio to reach in the noisiest mode.
-        cycles: Of the response; None for as many as that takes.
-        resume: Go on with one that was interrupted.
-        close: Close the loop at the end.
-    """
+    """What is asked for: the options of `lowfc commission`."""
 
     out: Path
     frames: int

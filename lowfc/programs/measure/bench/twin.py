@@ -14,13 +14,24 @@ from threadpoolctl import threadpool_limits
 
 from lowfc.adapters.files.sensors import sensor_named
 from lowfc.adapters.files.twin_cache import load_or_build
+from lowfc.adapters.process.terminal import Json
 from lowfc.arrays import Array
 from lowfc.optics.chain.band import gauss_legendre, monochromatic
 from lowfc.optics.chain.sensor import image, pupil_radii
 from lowfc.optics.chain.zernike import NOLLS_20, zernikes
 from lowfc.optics.twin.twin import ACCURATE, FAST, Evaluator, node_radii
+from lowfc.programs.cli.output import put
 
 WAVEFRONTS = 20
+
+
+def twin(as_json: Json = False) -> None:
+    """Time the real-time twin against the full optical chain, both on one thread, in the same run.
+
+    Example: lowfc bench twin --json
+    """
+    figures = bench_twin()
+    put(figures, render(figures), as_json=as_json)
 
 
 def bench_twin(

@@ -45,17 +45,7 @@ _LAST_WORDS_S = 0.1
 
 @dataclass(frozen=True, slots=True)
 class Asked:
-    """What to run.
-
-    Attributes:
-        config: of the loop; its camera.rate_hz is the schedule's.
-        duration_s: of each repeat of the loop, after the warm-up; what it is set against takes half as long each.
-        repeats: number of them.
-        free_running: without a schedule.
-        simulated: with the simulated camera instead of frames made beforehand.
-        record: with the recorder.
-        view: with a view served for a browser.
-    """
+    """What to run: the options of `lowfc latency`.."""
 
     config: Configuration
     duration_s: float

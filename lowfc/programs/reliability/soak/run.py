@@ -39,12 +39,7 @@ _NONE_OF = (
 
 
 class LogChecker:
-    """Reads each log once it is finished, and removes it: a night's would not fit on a disk.
-
-    Attributes:
-        logs: how many there were.
-        messages: in all of them.
-    """
+    """Reads each log once it is finished, and removes it: a night's would not fit on a disk."""
 
     def __init__(self, folder: Path) -> None:
         """Check the logs of a folder."""
