@@ -69,15 +69,7 @@ def design_sam(
 ) -> dict[str, Any]:
     """Search, write the best layout or the front, and say what they would show; Ctrl-C writes the best so far.
 
-    Args:
-        search: What to look for.
-        chains: Where each chain stands; brought forward in place.
-        out: Layout file.
-        state: File to resume from, written now and then and removed at the end.
-        executor: Where the chains run.
-        front_file: Table of every chain's best (CSV).
-        plot_file: The same drawn (PNG).
-        console: Where progress is shown.
+    The chains are brought forward in place, and kept in the file `state` until the end.
 
     Raises:
         DataFileError: A file cannot be written.

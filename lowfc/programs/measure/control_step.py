@@ -47,15 +47,7 @@ class Alone(NamedTuple):
 
 
 def time_alone(step: ControlStep, payloads: Payloads, clock: HostClock, seconds: float, period_ns: int | None) -> Alone:
-    """Sleep to the next moment of a schedule, then do one control step, over and over.
-
-    Args:
-        step: to be timed.
-        payloads: its frames.
-        clock: the host's.
-        seconds: for how long.
-        period_ns: of the schedule; None for one step after the other.
-    """
+    """Sleep to the next moment of a schedule, then do one control step, over and over; or without one, step by step."""
     timer_ns: list[int] = []
     step_ns: list[int] = []
     due_ns = clock.host_ns()

@@ -87,13 +87,6 @@ Panel = Picture | Curves | Bars
 def draw(path: Path, panels: Sequence[Panel], caption: str, columns: int = 3, wide: bool = False) -> None:
     """Draw panels in rows with a caption beneath, as a PNG file.
 
-    Args:
-        path: Of the file.
-        panels: In rows, from the left.
-        caption: What it is and what was assumed.
-        columns: Panels in a row.
-        wide: Whether a panel is half again as wide.
-
     Raises:
         ConfigurationError: matplotlib is not installed.
         DataFileError: The file cannot be written.

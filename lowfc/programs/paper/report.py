@@ -91,12 +91,6 @@ def run(
 ) -> list[Table]:
     """The tables of these names, in the paper's units, and their drawings.
 
-    Args:
-        names: Keys of `CASES`.
-        context: Trials, seed, threads.
-        plots: Folder for PNG files, one for each figure that is drawn; none are drawn when None.
-        console: Where progress is shown.
-
     Raises:
         DataFileError: The folder cannot be written.
         ConfigurationError: A sensor or a layout is not known, a sensor cannot tell the modes of a table apart, or

@@ -81,14 +81,7 @@ class Bridge:
     ) -> None:
         """Subscribe to everything that is shown; drawing starts with `run`.
 
-        Args:
-            config: of the run.
-            run_id: of the run.
-            clock: the run's.
-            bus: of the role viewer.
-            open_viewer: starts a viewer, on the same ports each time; returns None where a file is written.
-            make_stream: stream to that viewer, or into the file.
-            viewer_bytes: what the viewer may keep of the stream.
+        `open_viewer` starts a viewer, on the same ports each time, or returns None where a file is written.
         """
         self._config = config
         self._clock = clock

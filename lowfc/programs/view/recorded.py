@@ -42,12 +42,6 @@ def draw_logs(
 ) -> Drawn:
     """Draw logs that follow each other.
 
-    Args:
-        logs: finished or not, damaged or complete.
-        config: of the run; None takes the first log's own.
-        make_renderer: makes the renderer, once the configuration is known.
-        progress: gets the number of bytes that are done.
-
     Raises:
         DataFileError: one is no log, they are of several runs, or there is nothing to see in any of them.
     """

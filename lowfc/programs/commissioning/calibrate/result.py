@@ -146,10 +146,7 @@ def reconstructed(
     initial: Array | None,
     good: Array,
     flux_dn: float,
-    *,
-    estimator: str = "weighted",
-    truncate: float = 0.0,
-    tikhonov: float = 0.0,
+    **how: Any,
 ) -> Reconstruction:
     """R of H on the camera of a configuration; the arguments are those of `reconstruct`, the light is in DN.
 
@@ -159,7 +156,7 @@ def reconstructed(
     camera = factory.detector(config)
     flux_e, read_noise_e = flux_dn * camera.gain_e_per_dn / camera.em_gain, factory.equivalent_read_noise_e(camera)
     try:
-        return reconstruct(reference, response, initial, good, flux_e, read_noise_e, estimator, truncate, tikhonov)
+        return reconstruct(reference, response, initial, good, flux_e, read_noise_e, **how)
     except ValueError as error:
         raise CalibrationError(str(error)) from None
 

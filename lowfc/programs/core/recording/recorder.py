@@ -59,20 +59,7 @@ class Recorder:
         selection: Selection = EVERYTHING,
         expected_bytes_per_s: float = 0.0,
     ) -> None:
-        """Subscribe to everything; recording starts with `run`.
-
-        Args:
-            bus: of the run.
-            clock: of the run.
-            run_id: name of the run.
-            folder: where the logs go.
-            metadata: for the start of each log, by name.
-            attachments: files for the start of each log.
-            limits: when a log is finished and the next begun, and when there is no room for one.
-            granted: what the host granted this process.
-            selection: what is recorded.
-            expected_bytes_per_s: growth of the logs, until it has been measured; 0 where nobody knows.
-        """
+        """Subscribe to everything; `run` begins to record, each log with `metadata` and `attachments` first."""
         self._bus = bus
         self._clock = clock
         self._backlog = Backlog(QUEUE_MESSAGES, QUEUE_BYTES)

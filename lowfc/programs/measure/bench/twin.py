@@ -44,12 +44,6 @@ def bench_twin(
 
     Times are medians of one frame, from the phase to the binned image, the two models in turn. `relative_l2` is the
     worst of 20 random wavefronts: radial degrees 1 to 5 within the literal bounds of Sect. 3.1.
-
-    Args:
-        sensor: Its name, or that of a layout.
-        seconds: For how long each model is timed.
-        progress: Called with the name of each case.
-        cache_dir: Of the twins; the usual one when None.
     """
     optics = sensor_named(sensor)
     nm = optics.wavelength_nm

@@ -138,11 +138,6 @@ class _Soak:
 def soak_loop(config: Configuration, seconds: float, progress: Callable[[float], None]) -> dict[str, Any]:
     """Run the loop for so long; the figures that `lowfc soak --json` prints.
 
-    Args:
-        config: of the loop; its logs go elsewhere.
-        seconds: of looking, from the first frame on.
-        progress: called with how many have passed.
-
     Raises:
         ProcessDiedError: a process ended by itself.
         DataFileError: a log is damaged.
