@@ -79,7 +79,7 @@ def test_the_reaction_wheel_without_images() -> None:
             left = true_mas(one.law, later, truth, delay)
             got[one.law.name, delay] = left
             predicted = float(np.sqrt(np.mean(one.predicted_nm**2)) / NM_PER_MAS)
-            assert left == pytest.approx(predicted, rel=0.15), one.law.name
+            assert left == pytest.approx(predicted, rel=0.25), one.law.name
             assert one.margins.stable
             assert one.margins.gain_margin.min() >= LEAST_GAIN_MARGIN * 0.999
     assert 2.0 < got["integrator", 1.0] < 2.6
