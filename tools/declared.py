@@ -19,7 +19,7 @@ from lowfc.control.loop.state import FADING_FRAMES, SETTLING_FRAMES
 from lowfc.programs.commissioning.acceptance import capture as acceptance_capture
 from lowfc.programs.commissioning.acceptance import linearity as acceptance_linearity
 from lowfc.programs.commissioning.acceptance import rejection as acceptance_rejection
-from lowfc.programs.commissioning.conformance.agreement import AGREEMENTS
+from lowfc.programs.commissioning.conformance.settings import AGREEMENTS
 from lowfc.programs.commissioning.tune.figures import OPTICAL_GAIN_MAS
 from tools.shared import ROOT, markdown
 

@@ -24,8 +24,14 @@ from lowfc.programs.commissioning.acceptance import capture as acceptance_captur
 from lowfc.programs.commissioning.acceptance import linearity as acceptance_linearity
 from lowfc.programs.commissioning.acceptance import noise as acceptance_noise
 from lowfc.programs.commissioning.acceptance import rejection as acceptance_rejection
-from lowfc.programs.commissioning.acceptance.judged import AcceptanceResult
-from lowfc.programs.commissioning.acceptance.played import AcceptanceError, Loop, Played, _announced, chosen
+from lowfc.programs.commissioning.acceptance.played import (
+    AcceptanceError,
+    AcceptanceResult,
+    Loop,
+    Played,
+    _announced,
+    chosen,
+)
 from sim_camera.bench import Bench
 from sim_camera.process import bench
 from tests.support.loops import lowfc

@@ -16,7 +16,7 @@ from lowfc.contract.messages import wire
 from lowfc.programs.commissioning.calibrate.run import partial_of
 from lowfc.programs.commissioning.checks import Status
 from lowfc.programs.commissioning.commission.commissioning import Commission, Commissioning, first_of
-from lowfc.programs.commissioning.conformance.agreement import AGREEMENTS, agreement_checks
+from lowfc.programs.commissioning.conformance.settings import AGREEMENTS, agreement_checks
 from tests.support.folded_loop import FoldedLoop, computed
 
 pytestmark = pytest.mark.xdist_group("commission")  # one process makes what its tests share

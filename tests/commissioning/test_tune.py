@@ -13,6 +13,7 @@ from rich.console import Console
 from lowfc.adapters.files import law_file
 from lowfc.adapters.logs.reader import LogReader
 from lowfc.client import Answer
+from lowfc.contract.codecs.law_codec import driving
 from lowfc.contract.codecs.state_codec import controller_state
 from lowfc.contract.configuration import Configuration
 from lowfc.contract.errors import BusError, ConfigurationError, DataFileError, RequestRefusedError
@@ -25,7 +26,7 @@ from lowfc.control.loop.inputs import Load, Request, Step
 from lowfc.control.loop.safety import LoopMode
 from lowfc.control.loop.state import State
 from lowfc.programs.commissioning.tune.command import integrate, tune, tune_run
-from lowfc.programs.commissioning.tune.data import driving, of_log, of_run
+from lowfc.programs.commissioning.tune.data import of_log, of_run
 from lowfc.programs.commissioning.tune.figures import figures, render, tuned
 from tests.support.report_log import Night
 from tests.support.theory import LAWS

@@ -23,10 +23,10 @@ from lowfc.contract.errors import LowfcError
 from lowfc.contract.messages import Role
 from lowfc.programs.view.bridge import Bridge
 from lowfc.programs.view.command import view
-from lowfc.programs.view.draw.stream import to_viewer
 from lowfc.programs.view.draw.tabs import Tab
 from lowfc.programs.view.layout import layout
 from lowfc.programs.view.panels.tiles import FILL
+from lowfc.programs.view.target import to_viewer
 from lowfc.programs.view.verdicts.tile import Level
 from tests.support.loops import LOWFC, children, interrupt, run, start, until
 from tests.support.report_log import Night

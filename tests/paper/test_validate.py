@@ -9,13 +9,13 @@ import pytest
 
 from lowfc.contract.errors import ConfigurationError, DataFileError
 from lowfc.programs.paper import commands, report
-from lowfc.programs.paper.cases import DEFAULT_SAM, Case, Context, sparse_apertures
+from lowfc.programs.paper.cases import DEFAULT_SAM, Case, Context, Row, plain, sparse_apertures
 from lowfc.programs.paper.figures.aberration import REALISATIONS
-from lowfc.programs.paper.figures.figures import FIGURES
 from lowfc.programs.paper.figures.screens import SCREENS
 from lowfc.programs.paper.report import (
     CASES,
     DOCUMENT,
+    FIGURES,
     GLANCE,
     PICTURES,
     RESULTS,
@@ -26,7 +26,6 @@ from lowfc.programs.paper.report import (
     to_text,
     write_document,
 )
-from lowfc.programs.paper.rows import Row, plain
 from lowfc.programs.paper.tables.reconstruction import ESTIMATORS, WITH_NUISANCES
 from lowfc.programs.paper.tables.tables import TABLES
 from tests.support.loops import lowfc

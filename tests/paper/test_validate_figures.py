@@ -13,8 +13,8 @@ from lowfc.optics.chain.grid import pupil_axis
 from lowfc.optics.detector.photometry import electrons
 from lowfc.programs.paper.cases import Context
 from lowfc.programs.paper.figures.exposure import ESTIMATORS
-from lowfc.programs.paper.figures.figures import FIGURES
 from lowfc.programs.paper.figures.modes import AMPLITUDES, deviations, linear_range
+from lowfc.programs.paper.report import FIGURES
 from lowfc.programs.paper.tables.pointing import NM_PER_MAS
 
 pytestmark = pytest.mark.xdist_group("validate_figures")  # one process makes what its tests share

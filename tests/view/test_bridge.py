@@ -15,10 +15,10 @@ from lowfc.adapters.viewer.rerun_viewer import Show
 from lowfc.contract.configuration import Configuration
 from lowfc.contract.messages import CALIBRATION, EVENT, FRAME, HEALTH, STEP, Log, topic_of, wire
 from lowfc.programs.view import bridge as bridges
-from lowfc.programs.view import render_thread as render_threads
+from lowfc.programs.view import renderer as render_threads
 from lowfc.programs.view.bridge import Bridge, Summary, ViewError
 from lowfc.programs.view.panels import wavefront
-from lowfc.programs.view.render_thread import RenderThread
+from lowfc.programs.view.renderer import RenderThread
 from lowfc.programs.view.snapshot import Snapshot
 from lowfc.testing.memory_bus import MemoryBus, MemoryHub
 from tests.support.loops import until

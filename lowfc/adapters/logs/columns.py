@@ -1,8 +1,8 @@
 """Messages of the loop as columns, a row for each: what reports, exports, what-ifs, tuning and views read of them."""
 
 from array import array
-from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, fields
 from types import MappingProxyType
 from typing import Any, Generic, TypeVar
 
@@ -10,6 +10,8 @@ import numpy as np
 import numpy.typing as npt
 
 from lowfc.contract.messages import from_timestamp, wire
+from lowfc.control.loop.inputs import Step
+from lowfc.control.loop.safety import Reason
 
 Single = npt.NDArray[np.float32]
 Double = npt.NDArray[np.float64]
@@ -46,6 +48,10 @@ class Steps:
     command_nm: Single
     flux_dn: Single
     saturated_pixels: Whole
+
+    def at(self, rows: npt.NDArray[Any]) -> "Steps":
+        """The steps at some rows, by index or by whether each is one."""
+        return Steps(*(getattr(self, part.name)[rows] for part in fields(self)))
 
 
 @dataclass(frozen=True, slots=True)
@@ -151,6 +157,33 @@ class StepRows(_Rows[Steps]):
             flux_dn=step.flux_dn,
             saturated_pixels=step.saturated_pixels,
         )
+
+
+def of_steps(steps: Sequence[Step], modes: int) -> Steps:
+    """Steps of a running loop, as a log's."""
+    nothing = np.full(modes, np.nan, np.float32)
+
+    def of_modes(name: str) -> Single:
+        values = [getattr(step, name) for step in steps]
+        return np.array([nothing if one is None else one for one in values], np.float32).reshape(-1, modes)
+
+    return Steps(
+        np.array([step.frame_sequence for step in steps], np.uint64),
+        np.array([step.time_ns for step in steps], np.int64),
+        np.array([step.mode for step in steps], np.uint8),
+        np.array([bits_of(step.reasons) for step in steps], np.int64),
+        of_modes("error_nm"),
+        of_modes("pol_nm"),
+        of_modes("command_nm"),
+        np.array([step.flux_dn for step in steps], np.float32),
+        np.array([step.saturated_pixels for step in steps], np.int64),
+    )
+
+
+def reason_counts(bits: Whole) -> dict[Reason, int]:
+    """How often each reason was given, of those that were."""
+    counts = {reason: int(np.count_nonzero(bits & (1 << reason))) for reason in Reason} if bits.any() else {}
+    return {reason: count for reason, count in counts.items() if count}
 
 
 class TruthRows(_Rows[Truths]):

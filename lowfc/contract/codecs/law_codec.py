@@ -8,6 +8,7 @@ import numpy as np
 
 from lowfc.arrays import Single
 from lowfc.contract.messages import fields_of, floats, timestamp, wire
+from lowfc.control.laws.law import Law
 from lowfc.control.laws.linear_law import LinearLaw, matrix_shapes
 from lowfc.control.loop.additions import Channel, CommandChannels, Play, PlayTable, play_table
 
@@ -42,6 +43,16 @@ def law_of(message: wire.LinearLaw, known: Mapping[str, LinearLaw] = MappingProx
     shapes = matrix_shapes(message.states, len(message.noll))
     matrices: dict[str, Any] = {name: floats(getattr(message, name), *shape) for name, shape in shapes.items()}
     return LinearLaw(noll=tuple(message.noll), **fields_of(message, _PLAIN), **matrices)
+
+
+def driving(state: wire.ControllerState | None, laws: Mapping[str, LinearLaw]) -> LinearLaw | None:
+    """The law that drives the mirror of a controller, or will; None for the integrator."""
+    return law_of(state.law, laws) if state is not None and state.HasField("law") else None
+
+
+def gains_of(state: wire.ControllerState) -> Law:
+    """The integrator of a controller's state."""
+    return Law(*(np.array(values, np.float32) for values in (state.gain, state.leak, state.limit_nm)))
 
 
 def wire_play(table: PlayTable, time_ns: int) -> wire.Play:

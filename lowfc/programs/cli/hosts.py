@@ -109,7 +109,10 @@ def router(
         )
     if show:
         with joined(settings, run) as links:
-            sys.stdout.write(_short_lists(json.dumps(session_config(links, ROUTER), indent=2)) + "\n")
+            text = json.dumps(session_config(links, ROUTER), indent=2)
+            # each list of plain values on one line
+            text = re.sub(r"\[\s+([^][{}]*?)\s+\]", lambda found: f"[{' '.join(found[1].split())}]", text)
+            sys.stdout.write(text + "\n")
         return
     service = join(settings, run, ROUTER, [])
     service.catch_signals()
@@ -191,8 +194,3 @@ def joined(settings: "Configuration", run: str) -> Iterator["Links"]:
     with tempfile.TemporaryDirectory(prefix="lowfc-") as elsewhere:
         base = None if (runtime_base() / run).is_dir() else Path(elsewhere)
         yield open_run(run, (settings.mirror.name,), base, network=settings.network).links
-
-
-def _short_lists(text: str) -> str:
-    """JSON with each list of plain values on one line."""
-    return re.sub(r"\[\s+([^][{}]*?)\s+\]", lambda found: f"[{' '.join(found[1].split())}]", text)

@@ -57,7 +57,7 @@ PARTS = (
     Row("config show", "cli.config:config_show", "Print every key with its value and its sentence, as TOML."),
     Row("config check", "cli.config:config_check", "Check a configuration file and the files it names."),
     Row("config zenoh", "cli.config:config_zenoh", "Print the zenoh configuration for a program of your own."),
-    Row("bench twin", "measure.bench.command:bench_twin", "Time the real-time optical model against the full one."),
+    Row("bench twin", "measure.bench.twin:twin", "Time the real-time optical model against the full one."),
     Row("bench record", "measure.bench.record:bench_record", "Measure what recording costs."),
 )
 

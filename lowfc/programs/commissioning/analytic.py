@@ -3,18 +3,18 @@
 from collections.abc import Callable
 
 import numpy as np
-import numpy.typing as npt
 from rich.console import Console
 from rich.progress import TimeElapsedColumn
 
 from lowfc.adapters.files import factory
 from lowfc.adapters.process.progress import counting_bar
+from lowfc.arrays import Array
 from lowfc.contract.configuration import Configuration
 from lowfc.control.calibration.calibration import Calibration
 from lowfc.optics.twin.twin import Twin
 from lowfc.optics.twin.twin_mirror import TwinMirror
 
-Wavefront = Callable[[Twin, TwinMirror], npt.NDArray[np.float64]]
+Wavefront = Callable[[Twin, TwinMirror], Array]
 """In nm at the used nodes of a twin, with the mirror on these."""
 
 

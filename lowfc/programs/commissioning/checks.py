@@ -58,7 +58,7 @@ def note(got: str, advice: str = "", cost: str = "") -> Check:
     return Check(Status.NOTE, got, advice, cost)
 
 
-def warning(got: str, advice: str, cost: str = "") -> Check:
+def warning(got: str, advice: str = "", cost: str = "") -> Check:
     """Something that costs, or could not be tried."""
     return Check(Status.WARNING, got, advice, cost)
 
@@ -72,26 +72,37 @@ class Table(Generic[S]):
     """Checks by name, in the order of the report; each looks at the same thing."""
 
     def __init__(self) -> None:
-        self.looks: dict[str, tuple[str, Callable[[S], Check | None]]] = {}
+        self.looks: dict[str, tuple[Check, Callable[[S], Check | None]]] = {}
 
-    def check(self, name: str, expected: str = "") -> Callable[[Callable[[S], Check | None]], Callable[[S], object]]:
-        """Enter a function that looks; it returns None where there is nothing to look at."""
+    def check(
+        self, name: str, expected: str = "", advice: str = "", cost: str = ""
+    ) -> Callable[[Callable[[S], Check | None]], Callable[[S], object]]:
+        """Enter a function that looks; it returns None where there is nothing to look at.
+
+        Args:
+            name: of the check.
+            expected: what the contract says.
+            advice: what to do, for a warning that does not say it itself.
+            cost: what it costs otherwise.
+        """
 
         def enter(look: Callable[[S], Check | None]) -> Callable[[S], object]:
-            self.looks[name] = (expected, look)
+            self.looks[name] = Check(Status.WARNING, "", advice, cost, name, expected), look
             return look
 
         return enter
 
     def of(self, seen: S, unknown: tuple[type[Exception], ...] = ()) -> Iterator[Check]:
         """What every check finds; a note where one of these exceptions keeps it from finding anything."""
-        for name, (expected, look) in self.looks.items():
+        for usual, look in self.looks.values():
             try:
                 found = look(seen)
             except unknown as fault:
                 found = note(f"not known: {fault}")
-            if found is not None:
-                yield found._replace(name=name, expected=expected)
+            if found is not None and found.status is Status.WARNING and not found.advice:
+                yield usual._replace(got=found.got)
+            elif found is not None:
+                yield found._replace(name=usual.name, expected=usual.expected)
 
 
 def counts(checks: Iterable[Check], statuses: Iterable[Status]) -> dict[str, int]:

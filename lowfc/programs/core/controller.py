@@ -133,7 +133,8 @@ class Controller:
             if self._early is not None:
                 self._frame(self._early)
         while self._service.running:
-            camera = self._camera.take(self._rest_ns() * 1e-9)
+            rest_ns = None if self._warmup is None else self._warmup.rest_ns(self._service.clock.host_ns())
+            camera = self._camera.take(min(TICK_NS if rest_ns is None else rest_ns, TICK_NS) * 1e-9)
             if self._warmup is not None and self._warmup.begins(self._service.clock.host_ns()):
                 self._warm_up()
                 continue  # the rest can wait until the frame has come
@@ -208,11 +209,6 @@ class Controller:
             self._last = sample
             self._warmup.came(sample.receive_time_ns)
             self._camera.wake()  # the warm-up does what else is to be done now, and then knows when to
-
-    def _rest_ns(self) -> int:
-        """How long the main thread may wait."""
-        rest_ns = None if self._warmup is None else self._warmup.rest_ns(self._service.clock.host_ns())
-        return TICK_NS if rest_ns is None else min(rest_ns, TICK_NS)
 
     def _warm_up(self) -> None:
         """Do the last step once more, and forget what came of it: code and data are in the caches for the next frame.

@@ -29,7 +29,7 @@ def check_files(config: Configuration) -> None:
         ConfigurationError: one line for each that is missing, damaged or does not fit.
     """
     checks: tuple[Callable[[Configuration], object], ...] = (
-        _sensor,
+        lambda config: factory.sensor(config, lambda _: None),
         active_actuators,
         _flat_within_limits,
         _law_of_modes,
@@ -144,10 +144,6 @@ def _law_of_modes(config: Configuration) -> None:
             f"control.law = {config.control.law!r}: it is of the modes {_modes(found.noll)}, the sensor's "
             f"{config.sensor.modes} are {_modes(config.noll)}"
         )
-
-
-def _sensor(config: Configuration) -> object:
-    return factory.sensor(config, lambda _: None)
 
 
 def _modes(noll: tuple[int, ...]) -> str:

@@ -69,15 +69,7 @@ def design_sam(
 ) -> dict[str, Any]:
     """Search, write the best layout or the front, and say what they would show; Ctrl-C writes the best so far.
 
-    Args:
-        search: What to look for.
-        chains: Where each chain stands; brought forward in place.
-        out: Layout file.
-        state: File to resume from, written now and then and removed at the end.
-        executor: Where the chains run.
-        front_file: Table of every chain's best (CSV).
-        plot_file: The same drawn (PNG).
-        console: Where progress is shown.
+    The chains are brought forward in place, and kept in the file `state` until the end.
 
     Raises:
         DataFileError: A file cannot be written.
@@ -151,14 +143,7 @@ _NOTHING = f"no chain had finished its first {BLOCK} steps: nothing was found, n
 
 
 def run_chains(search: Search, chains: list[Chain], executor: Executor, on_block: Callable[[], None]) -> None:
-    """Bring every chain to its end, in place, block by block.
-
-    Args:
-        search: What to look for.
-        chains: Where each stands.
-        executor: Where the blocks run.
-        on_block: Called after each.
-    """
+    """Bring every chain to its end, in place, block by block."""
     running: dict[Future[Chain], int] = {}
     pupil = pupil_digest()
     try:
@@ -180,11 +165,6 @@ def run_chains(search: Search, chains: list[Chain], executor: Executor, on_block
 
 def advance_block(search: Search, chain: Chain, pupil: str) -> Chain:
     """One block of one chain, on whatever machine this runs.
-
-    Args:
-        search: What to look for.
-        chain: Where it stands.
-        pupil: Digest of the shaped pupil that the search is for.
 
     Raises:
         ConfigurationError: This machine has another shaped pupil.
@@ -220,13 +200,8 @@ def summary(point: Point) -> dict[str, Any]:
         "purpose": point.layout.purpose,
         "merit": point.merit,
         "holes": len(point.layout.holes),
-        "focal_masks": layout_figures(point.layout),
+        "focal_masks": {name: _figures(name, point.layout.holes) for name in FOCAL_MASKS},
     }
-
-
-def layout_figures(layout: Layout) -> dict[str, Any]:
-    """What Tables 3 and 4 would show of a layout, for each focal-plane mask."""
-    return {name: _figures(name, layout.holes) for name in FOCAL_MASKS}
 
 
 def render(result: dict[str, Any]) -> str:
@@ -288,7 +263,6 @@ def _described(found: Sequence[Hole]) -> str:
 
 @contextmanager
 def _progress(search: Search, chains: list[Chain], console: Console) -> Iterator[Callable[[], None]]:
-    """A progress bar with the best merit so far."""
     columns = (TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn(), TimeRemainingColumn())
     with passing_bar(console, *columns) as bar:
         task = bar.add_task(search.goal.merit, total=search.chains * search.steps)

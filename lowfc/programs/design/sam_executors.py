@@ -32,10 +32,6 @@ class Here(Executor):
 def open_executor(jobs: int, scheduler: str | None) -> Iterator[Executor]:
     """Where the chains run.
 
-    Args:
-        jobs: Processes of this machine; 1 is this one.
-        scheduler: Address of a Dask scheduler, to use its workers.
-
     Raises:
         ConfigurationError: The scheduler does not answer, or the package for it is missing.
     """

@@ -62,14 +62,7 @@ def check_files(out: Path, resume: Path | None, *others: Path | None) -> Path:
 
 
 def write_state(path: Path, search: Search, pupil: str, chains: Sequence[Chain]) -> None:
-    """Write all that a search needs to go on.
-
-    Args:
-        path: The file.
-        search: What is searched for.
-        pupil: Digest of the shaped pupil.
-        chains: Where each stands.
-    """
+    """Write all that a search needs to go on."""
     state = {"search": asdict(search), "pupil": pupil, "chains": [asdict(chain) for chain in chains]}
     write_whole(path, json.dumps(state).encode())
 

@@ -117,7 +117,6 @@ def render(result: dict[str, Any]) -> str:
 
 
 def _rounds(wanted: Request, console: Console) -> list[Round]:
-    """All programs, each with a line of progress."""
     rounds: list[Round] = []
     for found in exchange(wanted):
         rounds.append(found)

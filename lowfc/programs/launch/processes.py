@@ -7,13 +7,7 @@ from lowfc.adapters.process.child import Child
 
 
 def program(name: str, arguments: list[str], said: Path) -> Child:
-    """One of our own programs as a child, not started yet.
-
-    Args:
-        name: as in its Health.
-        arguments: of the Python interpreter.
-        said: file for its standard error.
-    """
+    """One of our own programs as a child, not started yet."""
     # -P: a folder called lowfc where the user stands is not ours
     return Child(name, [sys.executable, "-P", *arguments], said)
 

@@ -138,7 +138,6 @@ def _supervise(
     console: Console,
     duration_s: float | None,
 ) -> None:
-    """Until the camera has exposed its frames, Ctrl-C, or the death of a process."""
     camera = children[0]
     viewless = False
     with held_back() as interrupted, _display(console) as show:
@@ -212,7 +211,6 @@ def held_back() -> Iterator[Callable[[], bool]]:
 
 @contextlib.contextmanager
 def _display(console: Console) -> Iterator[Callable[..., None]]:
-    """A live screen on a terminal, a line every few seconds elsewhere."""
     if console.is_terminal:
         with Live(console=console, refresh_per_second=4, transient=True) as live:
             yield lambda *what: live.update(screen(*what))

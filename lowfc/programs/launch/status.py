@@ -89,7 +89,6 @@ def recording(recorder: wire.Health) -> str:
 
 
 def _loop(figures: dict[str, Any]) -> str:
-    """Loop mode at the end, and for how long it was not closed."""
     seconds, cause = f"{figures['not_closed_s']:.1f} s", figures["not_closed_cause"]
     match figures["mode"]:
         case None:

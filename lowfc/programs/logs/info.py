@@ -74,7 +74,6 @@ def report(found: Mapping[str, Any], console: "Console") -> None:
 
 
 def _summary(found: Mapping[str, Any]) -> dict[str, str]:
-    """All but the topics, a line each."""
     from lowfc.adapters.logs.selection import SELECTION
     from lowfc.adapters.logs.writer import PART
     from lowfc.programs.logs.survey import recovery_in_words

@@ -1,6 +1,7 @@
 """What a log holds: what ran and when, how much of each topic, and what is missing."""
 
 import dataclasses
+import hashlib
 from collections import Counter
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
@@ -20,11 +21,71 @@ from lowfc.adapters.logs.selection import EVERYTHING, Selection
 from lowfc.contract.envelope import start_of
 from lowfc.contract.errors import BadMessageError
 from lowfc.contract.events import Level
-from lowfc.contract.messages import CONTROLLER_STATE, EVENT, HEALTH, Log, Topic, topic_of, wire
+from lowfc.contract.messages import (
+    CONTROLLER_STATE,
+    EVENT,
+    FRAME,
+    HEALTH,
+    Log,
+    RawImage,
+    Topic,
+    from_timestamp,
+    topic_of,
+    wire,
+)
 from lowfc.control.loop.safety import LoopMode
-from lowfc.programs.logs.digest import Digest
 
 _MODES = {int(mode): mode.name.lower() for mode in LoopMode}
+
+
+class Digest:
+    """SHA-256 over the payloads of the topics that are `deterministic`, key by key.
+
+    A key's digest is over the SHA-256 of each of its payloads in order, the log's over the lines "KEY DIGEST", sorted.
+    A state that was answered to the recorder may stand in the log before an older one: states are taken in the order of
+    their sequences, and of those from before the first frame the newest, for how many there are depends on who was
+    ready first.
+    """
+
+    def __init__(self) -> None:
+        self._keys: dict[str, Any] = {}
+        self._states: dict[str, dict[int, tuple[int, bytes]]] = {}
+        self._first_frame_ns: int | None = None
+
+    def enter(self, topic: Topic, message: Logged) -> None:
+        """Take the next message of a log."""
+        if not topic.deterministic:
+            return
+        if topic is FRAME and self._first_frame_ns is None:
+            self._first_frame_ns = _time_ns(RawImage, message.payload)
+        digest = hashlib.sha256(message.payload).digest()
+        if topic.queryable:
+            states = self._states.setdefault(message.key, {})
+            states[message.sequence] = _time_ns(topic.message, message.payload), digest
+        else:
+            self._keys.setdefault(message.key, hashlib.sha256()).update(digest)
+
+    def by_key(self) -> dict[str, str]:
+        """Hexadecimal digest of each key."""
+        found = {key: state.hexdigest() for key, state in self._keys.items()}
+        for key, states in self._states.items():
+            ordered = [states[sequence] for sequence in sorted(states)]
+            early = [digest for time_ns, digest in ordered if time_ns < (self._first_frame_ns or 0)]
+            later = [digest for time_ns, digest in ordered if time_ns >= (self._first_frame_ns or 0)]
+            found[key] = hashlib.sha256(b"".join([*early[-1:], *later])).hexdigest()
+        return dict(sorted(found.items()))
+
+    def of_log(self) -> str:
+        """Hexadecimal digest of the log."""
+        lines = [f"{key} {digest}\n" for key, digest in self.by_key().items()]
+        return hashlib.sha256("".join(lines).encode()).hexdigest()
+
+
+def _time_ns(kind: Any, payload: bytes) -> int:
+    try:
+        return from_timestamp(kind.FromString(payload).timestamp)
+    except DecodeError:
+        return 0
 
 
 @dataclass(slots=True)
@@ -51,8 +112,6 @@ class _Line:
 
 
 class _Account:
-    """What the messages of a log say."""
-
     def __init__(self, selection: Selection = EVERYTHING) -> None:
         """Nothing so far, of a log that holds this selection."""
         self._selection = selection
@@ -92,17 +151,15 @@ class _Account:
             "messages": sum(line.messages for line in self._lines.values()),
             "messages_missing": sum(missing.values()),
             "topics": {
-                key: line.figures(missing.get(key, 0) if self._counts(key) else None)
+                key: line.figures(
+                    missing.get(key, 0) if (topic := _topic(key)) is None or self._selection.counts(topic) else None
+                )
                 for key, line in sorted(self._lines.items())
             },
             "missing_topics": {key: count for key, count in missing.items() if key not in self._lines},
             "loop_modes": self._modes,
             "events": dict(self._events.most_common()),
         }
-
-    def _counts(self, key: str) -> bool:
-        topic = _topic(key)
-        return topic is None or self._selection.counts(topic)
 
     def _author(self, topic: Topic, sample: Sample) -> str:
         """Take account of what a message says; return who of several publishers sent it, on a topic that has them."""
@@ -127,12 +184,7 @@ class _Account:
 def survey(
     log: LogFiles, progress: Callable[[int, int], None] | None = None, *, digest: bool = False
 ) -> dict[str, Any]:
-    """Figures of a log, from all of its messages.
-
-    Args:
-        log: finished or not, damaged or whole.
-        progress: is told how many bytes of how many are done.
-        digest: add the `Digest`, of the log and of each topic.
+    """Figures of a log, whole or not, from all of its messages; with its `Digest`, and that of each topic, if asked.
 
     Raises:
         DataFileError: it is no log.

@@ -3,10 +3,10 @@
 from typing import NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 
 from lowfc.adapters.files.factory import settings
 from lowfc.adapters.process.clock import HostClock
+from lowfc.arrays import Long
 from lowfc.contract.codecs import codec
 from lowfc.contract.configuration import Configuration
 from lowfc.control.calibration.calibration import Calibration
@@ -16,15 +16,9 @@ from lowfc.control.loop.state import State
 from lowfc.programs.core.controller import CHANNEL
 from lowfc.programs.measure.frame_source import Payloads
 
-Whole = npt.NDArray[np.int64]
-
 
 class ControlStep:
-    """The controller's arithmetic: a frame's bytes in, a command's bytes out.
-
-    Attributes:
-        state: after the last frame.
-    """
+    """The controller's arithmetic: a frame's bytes in, a command's bytes out."""
 
     def __init__(self, config: Configuration, calibration: Calibration, now_ns: int) -> None:
         """Load the calibration."""
@@ -48,20 +42,12 @@ class Alone(NamedTuple):
         step_ns: of the control step.
     """
 
-    timer_ns: Whole
-    step_ns: Whole
+    timer_ns: Long
+    step_ns: Long
 
 
 def time_alone(step: ControlStep, payloads: Payloads, clock: HostClock, seconds: float, period_ns: int | None) -> Alone:
-    """Sleep to the next moment of a schedule, then do one control step, over and over.
-
-    Args:
-        step: to be timed.
-        payloads: its frames.
-        clock: the host's.
-        seconds: for how long.
-        period_ns: of the schedule; None for one step after the other.
-    """
+    """Sleep to the next moment of a schedule, then do one control step, over and over; or without one, step by step."""
     timer_ns: list[int] = []
     step_ns: list[int] = []
     due_ns = clock.host_ns()

@@ -12,7 +12,6 @@ import time
 from typing import Annotated
 
 import numpy as np
-import numpy.typing as npt
 import typer
 import zenoh
 from zenoh.handlers import Callback
@@ -24,6 +23,7 @@ from lowfc.adapters.process.clock import HostClock
 from lowfc.adapters.process.join import prepare
 from lowfc.adapters.process.realtime import let_send
 from lowfc.adapters.process.terminal import DEFAULT_RUN, ConfigFile, RunId, configuration, new_app, run_app
+from lowfc.arrays import Long
 from lowfc.contract.configuration import Configuration
 from lowfc.contract.envelope import Envelope
 from lowfc.contract.errors import BusError
@@ -88,9 +88,7 @@ def answer(
         np.savez(file, timer_ns=alone.timer_ns, step_ns=alone.step_ns, hot_step_ns=hot.step_ns)
 
 
-def _ask(
-    config: Configuration, run: Run, payloads: Payloads, seconds: float, *, free_running: bool
-) -> npt.NDArray[np.int64]:
+def _ask(config: Configuration, run: Run, payloads: Payloads, seconds: float, *, free_running: bool) -> Long:
     """Send frames for a time, after the warm-up's, then an empty one.
 
     Returns:
@@ -146,7 +144,6 @@ def _ask(
 
 
 def _answer(config: Configuration, run: Run, command: bytes) -> None:
-    """Answer every frame with these bytes until an empty one comes."""
     done = threading.Event()
     session = _session(run, Role.CONTROLLER)
     publisher = declare_publisher(session, COMMAND, COMMAND.at(config.mirror.name))

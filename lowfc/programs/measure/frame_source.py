@@ -11,7 +11,6 @@ from pathlib import Path
 from typing import Annotated
 
 import numpy as np
-import numpy.typing as npt
 import typer
 
 from lowfc.adapters.bus.mailbox import Mailbox
@@ -22,6 +21,7 @@ from lowfc.adapters.process.join import join
 from lowfc.adapters.process.realtime import let_send
 from lowfc.adapters.process.service import Service
 from lowfc.adapters.process.terminal import DEFAULT_RUN, ConfigFile, RunId, configuration, new_app, run_app
+from lowfc.arrays import Pixels
 from lowfc.contract.configuration import Configuration
 from lowfc.contract.errors import BusError
 from lowfc.contract.messages import CAMERA_STATE, COMMAND, FRAME, RawImage, Role, image, timestamp, wire
@@ -47,7 +47,7 @@ app = new_app(
 )
 
 
-def prepared_frames(config: Configuration) -> npt.NDArray[np.uint16]:
+def prepared_frames(config: Configuration) -> Pixels:
     """Noisy frames (frames, rows, columns) of a wavefront that moves by a few nm and returns, from the instrument."""
     optics = factory.twin(config, None, lambda _: None)
     evaluator, detector = Evaluator(optics), factory.detector(config)
@@ -62,13 +62,9 @@ def prepared_frames(config: Configuration) -> npt.NDArray[np.uint16]:
 
 
 class Payloads:
-    """Frames as messages: encoded once, only the time put before each.
+    """Frames as messages: encoded once, only the time put before each."""
 
-    Attributes:
-        shape: rows and columns.
-    """
-
-    def __init__(self, pixels: npt.NDArray[np.uint16]) -> None:
+    def __init__(self, pixels: Pixels) -> None:
         """Encode frames (frames, rows, columns)."""
         self.shape: tuple[int, int] = (pixels.shape[1], pixels.shape[2])
         self._bodies = []

@@ -37,12 +37,7 @@ _WAIT_S = 0.05
 
 
 class Traffic:
-    """Three roles of a run, and their messages of one frame after the other.
-
-    Attributes:
-        frames: sent so far.
-        messages: sent so far, those of the services too.
-    """
+    """Three roles of a run, and their messages of one frame after the other."""
 
     def __init__(self, run: Run, rate_hz: float) -> None:
         """Join `run` as camera, controller and mirror of a loop of `rate_hz`."""

@@ -4,10 +4,11 @@ import threading
 import zlib
 from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass, replace
 from functools import cached_property, lru_cache
+from math import isfinite
 from pathlib import Path
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 
@@ -24,7 +25,6 @@ from lowfc.optics.chain.grid import pupil_axis
 from lowfc.optics.chain.sensor import LightBudget, Sensor, image, light_budget, reference, response, shear_response
 from lowfc.optics.chain.zernike import NOLLS_20, zernikes
 from lowfc.optics.twin.twin import ACCURATE, Evaluator, Twin, node_radii
-from lowfc.programs.paper.rows import Row
 
 DEFAULT_SAM = SensorSection().sam
 Item = TypeVar("Item")
@@ -36,12 +36,7 @@ def no_progress(what: str, done: int, total: int) -> None:
 
 
 class Prepared:
-    """A sensor at the paper's sampling with everything the tables ask of it, made when first asked for.
-
-    Attributes:
-        name: What the command line calls it.
-        sensor: Its optics.
-    """
+    """A sensor at the paper's sampling with everything the tables ask of it, made when first asked for."""
 
     def __init__(self, name: str, sensor: Sensor) -> None:
         self.name, self.sensor = name, sensor
@@ -175,6 +170,65 @@ def prepared(name: str) -> Prepared:
 
 
 @dataclass(frozen=True)
+class Row:
+    """One figure.
+
+    Attributes:
+        name: What was measured: a sensor, a mode, an element.
+        quantity: Which figure of it.
+        unit: Of all numbers; "" where they have none.
+        measured: Ours.
+        paper: The paper's; None where it has none.
+        error: Standard error of `measured`, a mean or a scatter over trials; None where no chance is involved.
+        predicted: What theory gives for `measured`; None where it was not asked.
+        limit: The Cramer-Rao bound, or another limit that the assumption names; None where there is none.
+        modes: Number of modes fitted; None where nothing is fitted.
+        estimator: How; None where nothing is estimated.
+        assumption: What the paper does not say, or contradicts; one to a line.
+    """
+
+    name: str
+    quantity: str
+    unit: str
+    measured: float | str | None
+    paper: float | str | None = None
+    error: float | None = None
+    predicted: float | None = None
+    limit: float | None = None
+    modes: int | None = None
+    estimator: str | None = None
+    assumption: str | None = None
+
+    @property
+    def key(self) -> tuple[str, int | None, str | None, str]:
+        """What tells a row from the others of its table."""
+        return self.name, self.modes, self.estimator, self.quantity
+
+
+ORDER = (
+    *("name", "modes", "estimator", "quantity", "unit"),
+    *("paper", "measured", "error", "predicted", "limit", "assumption"),
+)
+
+
+def plain(row: Row) -> dict[str, Any]:
+    """The row as JSON has it; figures have six digits."""
+    values = asdict(row)
+    return {key: _plain(values[key]) for key in ORDER}
+
+
+def _plain(value: float | str | None) -> float | str | None:
+    if not isinstance(value, float):
+        return value
+    return float(f"{value:.6g}") if isfinite(value) else str(value)  # JSON has no infinity
+
+
+def assuming(rows: Sequence[Row], assumption: str) -> list[Row]:
+    """The rows, each with an assumption more."""
+    return [replace(each, assumption="\n".join(filter(None, (each.assumption, assumption)))) for each in rows]
+
+
+@dataclass(frozen=True)
 class Context:
     """What a table is given to work with.
 
@@ -218,13 +272,7 @@ class Context:
 
 @dataclass(frozen=True)
 class Case:
-    """A table or a figure of the paper.
-
-    Attributes:
-        title: What it shows, one line.
-        run: Makes its rows.
-        plot: Draws it into a PNG file, as the paper does; None where there is nothing to draw.
-    """
+    """A table or a figure of the paper: what it shows, its rows, and its drawing where there is one."""
 
     title: str
     run: Callable[[Context], list[Row]]

@@ -35,17 +35,7 @@ _DPI = 110
 
 @dataclass(frozen=True, eq=False)
 class Picture:
-    """An image with its colour bar.
-
-    Attributes:
-        values: (rows, columns); NaN is left grey.
-        title: Above it.
-        axes: Labels of x and y.
-        half_width: Of the square image, in the axes' unit.
-        bounds: Of the colours.
-        unit: Beside the colour bar.
-        scale: Logarithmic, linear, or linear with two colours about zero.
-    """
+    """An image (rows, columns) with its colour bar; NaN is left grey. `half_width` is in the axes' unit."""
 
     values: Array
     title: str
@@ -68,19 +58,7 @@ class Line:
 
 @dataclass(frozen=True, eq=False)
 class Curves:
-    """Lines over one pair of axes.
-
-    Attributes:
-        lines: What is drawn.
-        title: Above it.
-        x_label: Of the x axis.
-        y_label: Of the y axis.
-        scale: Of the y axis.
-        y_bounds: Of the y axis; chosen when None.
-        ticks: Names of the whole numbers on the x axis, where it counts things.
-        diagonal: Whether y = x is drawn.
-        legend: Where the names are.
-    """
+    """Lines over one pair of axes; `ticks` name the whole numbers on an x axis that counts things."""
 
     lines: Sequence[Line]
     title: str
@@ -95,14 +73,7 @@ class Curves:
 
 @dataclass(frozen=True, eq=False)
 class Bars:
-    """Groups of bars, side by side.
-
-    Attributes:
-        heights: Of each name, (groups,).
-        groups: Their names.
-        title: Above it.
-        y_label: Of the y axis.
-    """
+    """Groups of bars, side by side: the heights (groups,) of each name."""
 
     heights: dict[str, Array]
     groups: Sequence[str]
@@ -115,13 +86,6 @@ Panel = Picture | Curves | Bars
 
 def draw(path: Path, panels: Sequence[Panel], caption: str, columns: int = 3, wide: bool = False) -> None:
     """Draw panels in rows with a caption beneath, as a PNG file.
-
-    Args:
-        path: Of the file.
-        panels: In rows, from the left.
-        caption: What it is and what was assumed.
-        columns: Panels in a row.
-        wide: Whether a panel is half again as wide.
 
     Raises:
         ConfigurationError: matplotlib is not installed.

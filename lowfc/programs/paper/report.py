@@ -15,10 +15,14 @@ from lowfc.adapters.files.drawing import figure_class
 from lowfc.adapters.files.whole_file import write_whole
 from lowfc.adapters.process.progress import passing_bar
 from lowfc.contract.errors import ConfigurationError, DataFileError
-from lowfc.programs.paper.cases import Case, Context
-from lowfc.programs.paper.figures.figures import FIGURES
-from lowfc.programs.paper.rows import plain
+from lowfc.programs.paper.cases import Case, Context, plain
+from lowfc.programs.paper.figures import aberration, light, modes, screens
 from lowfc.programs.paper.tables.tables import TABLES
+
+_ALL = {**aberration.CASES, **light.CASES, **modes.CASES, **screens.CASES}
+
+FIGURES: dict[str, Case] = {name: _ALL[name] for name in sorted(_ALL, key=lambda name: int(name.removeprefix("fig")))}
+
 
 CASES: dict[str, Case] = {**TABLES, **FIGURES}
 
@@ -87,12 +91,6 @@ def run(
 ) -> list[Table]:
     """The tables of these names, in the paper's units, and their drawings.
 
-    Args:
-        names: Keys of `CASES`.
-        context: Trials, seed, threads.
-        plots: Folder for PNG files, one for each figure that is drawn; none are drawn when None.
-        console: Where progress is shown.
-
     Raises:
         DataFileError: The folder cannot be written.
         ConfigurationError: A sensor or a layout is not known, a sensor cannot tell the modes of a table apart, or
@@ -139,11 +137,6 @@ def run(
 
 def run_into(folder: Path, names: Sequence[str], context: Context) -> list[Table]:
     """The same, written as the document with its drawings: all of it at the end, or nothing.
-
-    Args:
-        folder: Of the document.
-        names: Keys of `CASES`.
-        context: Trials, seed, threads.
 
     Raises:
         DataFileError: The folder cannot be written.

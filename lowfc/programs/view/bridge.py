@@ -4,24 +4,28 @@ Messages wait in rings that keep the newest, a render thread draws from them, an
 the viewer's process and the memory of both. After a failure the view begins anew, with an event that says why.
 """
 
+import platform
 import threading
 import time
 from collections import deque
 from collections.abc import Callable
+from pathlib import Path
 from typing import NamedTuple
 
 import rerun as rr
 
-from lowfc.adapters.bus.bus import Bus, states
+from lowfc.adapters.bus.bus import Bus, Sample, states
+from lowfc.adapters.logs.reader import LogReader
+from lowfc.adapters.logs.writer import UNFINISHED
 from lowfc.adapters.process.clock import Clock
 from lowfc.adapters.process.service import Service
 from lowfc.adapters.process.usage import resident_bytes
 from lowfc.adapters.viewer.rerun_viewer import RerunViewer, Show, ViewerError
 from lowfc.contract.configuration import Configuration
-from lowfc.contract.errors import LowfcError
-from lowfc.contract.messages import EVENT, STEP, TRUTH, Role
-from lowfc.programs.view.earlier import earlier_events
-from lowfc.programs.view.render_thread import RenderThread
+from lowfc.contract.errors import DataFileError, LowfcError
+from lowfc.contract.events import Level
+from lowfc.contract.messages import EVENT, STEP, TRUTH, Log, Role, timestamp, wire
+from lowfc.programs.view.renderer import RenderThread
 from lowfc.programs.view.snapshot import SHOWN
 
 WAITING = {topic: 1 if topic.latest_only else 100 for topic in SHOWN} | {STEP: 2000, TRUTH: 2000}
@@ -32,6 +36,8 @@ VIEWER_SPARE_BYTES = 1_500_000_000
 """Memory of a viewer beyond what it may keep of the stream: its textures, plots and window are not in that limit."""
 STUCK_S = 10.0
 """Without a snapshot drawn, the viewer is taken for hung."""
+MOST_EARLIER = 1000
+"""Events that are shown from before the view began, the newest."""
 
 _RECORDER_S = 3.0  # after which a recorder that has sent no Health is absent
 _TURN_S = 0.1
@@ -75,14 +81,7 @@ class Bridge:
     ) -> None:
         """Subscribe to everything that is shown; drawing starts with `run`.
 
-        Args:
-            config: of the run.
-            run_id: of the run.
-            clock: the run's.
-            bus: of the role viewer.
-            open_viewer: starts a viewer, on the same ports each time; returns None where a file is written.
-            make_stream: stream to that viewer, or into the file.
-            viewer_bytes: what the viewer may keep of the stream.
+        `open_viewer` starts a viewer, on the same ports each time, or returns None where a file is written.
         """
         self._config = config
         self._clock = clock
@@ -100,11 +99,7 @@ class Bridge:
         self.service = Service(Role.VIEWER, run_id, clock, bus)
 
     def run(self, until_s: float | None = None, ready: Callable[[], None] | None = None) -> Summary:
-        """Show the run until told to stop, until a window is closed, or for a time.
-
-        Args:
-            until_s: for so long; None for ever.
-            ready: called once the viewer is there.
+        """Show the run until told to stop, until a window is closed, or for a time; `ready` once the viewer is there.
 
         Raises:
             ViewerError: no viewer can be started.
@@ -151,7 +146,6 @@ class Bridge:
         self._add_earlier(self._render)
 
     def _end_render(self) -> None:
-        """End the render thread, as far as it can be ended."""
         if self._render is not None:
             self._render.abandon()
             self._render.join(3.0)
@@ -175,7 +169,6 @@ class Bridge:
         return now_s - self._began_s > _RECORDER_S
 
     def _check(self, now_s: float) -> None:
-        """Look whether everything is well, and begin anew where it is not."""
         render, viewer = self._render, self.viewer
         assert render is not None  # noqa: S101  # `_begin` made it
         if self.service.newcomers() or (not self._past_known and self._recorder_absent(now_s)):
@@ -224,3 +217,39 @@ class Bridge:
                 return
             except ViewerError as error:
                 why = str(error)
+
+
+def earlier_events(recorder: wire.Health | None, now_ns: int) -> list[Sample]:
+    """The newest events in a recorder's logs; where they cannot be read, a line that says so.
+
+    Only the chunks that hold events are read: a second for a log of 4 GB.
+    """
+    if recorder is None:
+        return [_line("earlier events are not shown: no recorder has kept them", now_ns)]
+    if recorder.host and recorder.host != platform.node():
+        return [_line(f"earlier events are not shown: they are in the log on {recorder.host}", now_ns)]
+    found: list[Sample] = []
+    missing = []
+    for name in reversed(recorder.recording.files):
+        path = _present(Path(recorder.recording.folder, name))
+        try:
+            log = list(LogReader(path, topics=(EVENT,), skip_damaged=True, sparse=True))
+        except DataFileError as fault:
+            missing.append(_line(f"earlier events are missing here: {fault}", now_ns))
+            continue
+        found[:0] = [Sample(one.key, one.payload, one.sequence, one.publish_time_ns, one.log_time_ns) for one in log]
+        if len(found) >= MOST_EARLIER:
+            break
+    return [*found[-MOST_EARLIER:], *missing]
+
+
+def _present(path: Path) -> Path:
+    """A log under the name that it has now: it may be finished meanwhile, or not yet."""
+    finished = path.with_name(path.name.removesuffix(UNFINISHED))
+    part = path.with_name(finished.name + UNFINISHED)
+    return finished if finished.exists() or not part.exists() else part
+
+
+def _line(text: str, now_ns: int) -> Sample:
+    log = Log(timestamp=timestamp(now_ns), level=Level.INFO.value, name="view", message=text)  # type: ignore[arg-type]
+    return Sample(EVENT.key, log.SerializeToString(), 0, now_ns, now_ns)

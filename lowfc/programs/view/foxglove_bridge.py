@@ -121,7 +121,6 @@ class FoxgloveBridge:
                 self._take(topic, sample)
 
     def _take(self, topic: Topic, sample: Sample) -> None:
-        """Pass a message on; on the bus's threads."""
         self._names.admit(topic, sample.key)
         if topic.queryable:
             self.kept[sample.key] = sample
@@ -149,11 +148,6 @@ class FoxgloveBridge:
 
 def serve_foxglove(run: Run, clock: Clock, port: int = DEFAULT_PORT) -> Summary:
     """Serve a run to Foxglove and Lichtblick until SIGTERM or SIGINT; the process of `lowfc view --foxglove`.
-
-    Args:
-        run: the run to join.
-        clock: the run's.
-        port: on loopback, for the apps; 0 for a free one.
 
     Raises:
         BusError: the port is taken.

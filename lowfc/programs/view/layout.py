@@ -88,7 +88,6 @@ def _operator() -> rrb.Container:
 
 
 def _night() -> rrb.Container:
-    """Everything against time, and the events."""
     courses = rrb.Horizontal(_picture(trend.TREND), wavefront.TILT.view(), _contrast())
     rates = rrb.Horizontal(loop.FLUX.view(), mirror.STROKE.view(), latency.WHOLE.view(), _losses())
     below = rrb.Horizontal(_mode(), _events(worst=True), column_shares=[3, 5])
@@ -138,7 +137,6 @@ def _mode() -> rrb.View:
 
 
 def _events(*, worst: bool = False) -> rrb.View:
-    """Events; or the warnings and errors among them."""
     shown = [rr.TextLogLevel.WARN, rr.TextLogLevel.ERROR, rr.TextLogLevel.CRITICAL]
     return rrb.TextLogView(
         origin=loop.LOG,

@@ -89,7 +89,6 @@ def _plot(topic: Topic, name: str, series: Mapping[str, Sequence[str]], *, legen
 
 
 def _field(topic: Topic, target: str, selector: str) -> VisualizerComponentMapping:
-    """What a view takes from a message."""
     return VisualizerComponentMapping(
         target,
         ComponentSourceKind.SourceComponent,

@@ -42,12 +42,6 @@ def draw_logs(
 ) -> Drawn:
     """Draw logs that follow each other.
 
-    Args:
-        logs: finished or not, damaged or complete.
-        config: of the run; None takes the first log's own.
-        make_renderer: makes the renderer, once the configuration is known.
-        progress: gets the number of bytes that are done.
-
     Raises:
         DataFileError: one is no log, they are of several runs, or there is nothing to see in any of them.
     """
@@ -65,7 +59,11 @@ def draw_logs(
                 first_ns = message.log_time_ns
             if number == 0:
                 recorded = reader.metadata.get("lowfc", {})
-                run, host = _same_run(run, recorded.get("run", ""), log), host or recorded.get("host", "")
+                before, run, host = run, recorded.get("run", "") or run, host or recorded.get("host", "")
+                if before not in ("", run):
+                    raise DataFileError(
+                        f"{log} is of run {run!r}, and the log before it of {before!r}: look at one at a time"
+                    )
             last_ns, topic = message.log_time_ns, topic_of(message.key)
             accumulator.add(topic, message.key, message.payload, message.publish_time_ns, message.sequence)
             if last_ns >= due_ns:
@@ -90,12 +88,6 @@ def draw_logs(
         drawn.remarks.append(f"{accumulator.unreadable} messages could not be read")
     drawn.log_s = (last_ns - first_ns) * 1e-9
     return drawn
-
-
-def _same_run(before: str, run: str, log: Path) -> str:
-    if before and run and run != before:
-        raise DataFileError(f"{log} is of run {run!r}, and the log before it of {before!r}: look at one at a time")
-    return run or before
 
 
 def _own(reader: LogReader, drawn: Drawn) -> Configuration:

@@ -5,11 +5,11 @@ from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 from google.protobuf.message import DecodeError
 
 from lowfc.adapters.bus.names import Names
 from lowfc.adapters.logs.columns import StepRows, Steps, TimingRows, TruthRows, Truths
+from lowfc.arrays import Long, Pixels, Single
 from lowfc.contract.codecs.calibration_codec import decode_calibration
 from lowfc.contract.codecs.codec import decode_frame
 from lowfc.contract.errors import BadMessageError
@@ -106,11 +106,11 @@ class Snapshot:
     host_ns: int
     steps: Steps
     truths: Truths
-    timings: dict[str, npt.NDArray[np.int64]]
-    frame: npt.NDArray[np.uint16] | None
+    timings: dict[str, Long]
+    frame: Pixels | None
     frame_ns: int
     mirror: wire.MirrorState | None
-    surface: npt.NDArray[np.float32] | None
+    surface: Single | None
     events: list[Log]
     calibration: Calibration | None
     camera: wire.CameraState | None
@@ -269,7 +269,7 @@ def _frame(payload: bytes) -> Frame:
     return frame
 
 
-def _surface(payload: bytes) -> npt.NDArray[np.float32]:
+def _surface(payload: bytes) -> Single:
     image = RawImage.FromString(payload)
     if image.encoding != FLOAT32:
         raise ValueError(f"a surface is {FLOAT32}, got {image.encoding!r}")

@@ -4,27 +4,18 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import rerun as rr
+import rerun.blueprint as rrb
 
 from lowfc.adapters.bus.run import free_ports
 from lowfc.adapters.viewer.rerun_viewer import RerunViewer, Show, has_screen
 from lowfc.contract.errors import ConfigurationError
-from lowfc.programs.view.draw.stream import to_file, to_viewer
 from lowfc.programs.view.draw.tabs import Tab
-from lowfc.programs.view.layout import layout
+from lowfc.programs.view.layout import APPLICATION, layout
 
 
 @dataclass(slots=True)
 class Target:
-    """At most one of window, page, file and picture; by default a window, or a page where there is no screen.
-
-    Attributes:
-        native, web: in a window, on a page.
-        save: file (RRD), or None.
-        picture: file (PNG) of a headless viewer, or None.
-        tab: that is opened.
-        memory_mb: what a viewer keeps of the past.
-        port, web_port: of the viewer, each time it is started; 0 for a free one.
-    """
+    """At most one of window, page, file and picture; by default a window, or a page where there is no screen."""
 
     native: bool = False
     web: bool = False
@@ -90,9 +81,26 @@ class Target:
         blueprint = layout(self.tab, window_s)
         if viewer is not None:
             return to_viewer(viewer.url, recording, blueprint)
-        assert part is not None  # noqa: S101  # there is a viewer or a file
-        return to_file(part, recording, blueprint)
+        stream = _stream(recording)
+        stream.save(str(part))
+        stream.send_blueprint(blueprint)
+        return stream
 
     def show_all(self, stream: rr.RecordingStream, span_ns: tuple[int, int] | None) -> None:
         """Let the plots show all of a log that was drawn; a picture has nothing of its last instant alone."""
         stream.send_blueprint(layout(self.tab, None, span_ns=span_ns, still=self.picture is not None))
+
+
+def to_viewer(url: str, recording: str, blueprint: rrb.Blueprint) -> rr.RecordingStream:
+    """Stream of that name to a viewer that listens at `url`; what it does not take waits, and then holds up."""
+    stream = _stream(recording)
+    stream.connect_grpc(url)
+    stream.send_blueprint(blueprint)
+    return stream
+
+
+def _stream(recording: str) -> rr.RecordingStream:
+    stream = rr.RecordingStream(APPLICATION, recording_id=recording)
+    stream.set_log_time_enabled(False)  # one timeline, that of the data
+    stream.set_log_tick_enabled(False)
+    return stream

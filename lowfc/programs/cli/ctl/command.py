@@ -210,7 +210,6 @@ def _joined(run: str | None) -> "Client":
 
 
 def _say(run: str | None, as_json: bool, ask: "Callable[[Client], Answer]") -> None:
-    """Ask, and print what was answered."""
     with _joined(run) as loop:
         answer = ask(loop)
     said = {"run": answer.run, "accepted": answer.accepted, "reply": answer.reply}

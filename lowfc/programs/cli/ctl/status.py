@@ -21,13 +21,7 @@ _NO_PROCESSES: Mapping[str, wire.Health] = MappingProxyType({})
 def figures(
     state: wire.ControllerState, processes: Mapping[str, wire.Health] = _NO_PROCESSES, run: str = ""
 ) -> dict[str, Any]:
-    """The state as `lowfc ctl status --json` prints it; modes in the calibration's order, nm rms of wavefront.
-
-    Args:
-        state: of the controller.
-        processes: what each process of the run reports of itself, by its name.
-        run: name of the run.
-    """
+    """The state as `lowfc ctl status --json` prints it; modes in the calibration's order, nm rms of wavefront."""
     playing = None
     if state.HasField("play"):
         play = state.play
@@ -184,7 +178,6 @@ def _in_short(known: dict[str, Any]) -> str:
 
 
 def _last_warning(state: wire.ControllerState, processes: Mapping[str, wire.Health]) -> dict[str, Any] | None:
-    """The newest warning of any process."""
     found = [
         (from_timestamp(one.last_warning_timestamp), name, one.last_warning)
         for name, one in processes.items()

@@ -5,6 +5,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from lowfc.arrays import Single
 from lowfc.contract.configuration import Acceptance
 from lowfc.control.calibration.excitation import climb
 from lowfc.control.calibration.linearity import captured
@@ -12,9 +13,15 @@ from lowfc.control.laws.law import Law
 from lowfc.control.loop.safety import LoopMode
 from lowfc.optics.chain.zernike import mode_name
 from lowfc.programs.cli.result import figure
-from lowfc.programs.commissioning.acceptance.judged import AcceptanceResult, ModeResult
 from lowfc.programs.commissioning.acceptance.live import Live
-from lowfc.programs.commissioning.acceptance.played import AcceptanceError, Kind, Played, Single, chosen
+from lowfc.programs.commissioning.acceptance.played import (
+    AcceptanceError,
+    AcceptanceResult,
+    Kind,
+    ModeResult,
+    Played,
+    chosen,
+)
 
 KIND: Kind = "capture-range"
 SIZES = (0.5, 1.0, 1.5)

@@ -4,7 +4,7 @@ import sys
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -14,11 +14,9 @@ from lowfc.programs.cli.modes import Modes, noll_of
 from lowfc.programs.cli.result import put
 
 if TYPE_CHECKING:
-    from lowfc.contract.configuration import Acceptance, Configuration
-    from lowfc.control.calibration.calibration import Calibration
-    from lowfc.programs.commissioning.acceptance.judged import AcceptanceResult
+    from lowfc.contract.configuration import Acceptance
     from lowfc.programs.commissioning.acceptance.live import Live
-    from lowfc.programs.commissioning.acceptance.played import Kind, Played
+    from lowfc.programs.commissioning.acceptance.played import Played
 
 acceptance_app = new_app(
     "Measure whether a loop does what it must: live, or again from the log of it.\n\n"
@@ -52,8 +50,7 @@ def rejection(
     from lowfc.programs.commissioning.acceptance import rejection as test
 
     how = test.Excitation(duration, rms_nm, lines, noll_of(modes), seed)
-    of = _measured(test.KIND, Where(logs, run, config, plot), lambda live, must: test.play(live, how, must))
-    _say(test.judge(of.every, of.required), test.draw, plot, as_json)
+    _carry_out(test, logs, run, config, plot, as_json, lambda live, must: test.play(live, how, must))
 
 
 @acceptance_app.command()
@@ -74,8 +71,7 @@ def linearity(
     from lowfc.programs.commissioning.acceptance import linearity as test
 
     how = test.Staircase(hold, cycles, noll_of(modes))
-    of = _measured(test.KIND, Where(logs, run, config, plot), lambda live, must: test.play(live, how, must))
-    _say(test.judge(of.every, of.required), test.draw, plot, as_json)
+    _carry_out(test, logs, run, config, plot, as_json, lambda live, must: test.play(live, how, must))
 
 
 @acceptance_app.command("capture-range")
@@ -94,8 +90,7 @@ def capture_range(
     from lowfc.programs.commissioning.acceptance import capture as test
 
     wanted = noll_of(modes)
-    of = _measured(test.KIND, Where(logs, run, config, plot), lambda live, must: test.play(live, wanted, must))
-    _say(test.judge(of.every, of.required), test.draw, plot, as_json)
+    _carry_out(test, logs, run, config, plot, as_json, lambda live, must: test.play(live, wanted, must))
 
 
 @acceptance_app.command("noise-floor")
@@ -113,35 +108,24 @@ def noise_floor(
     """
     from lowfc.programs.commissioning.acceptance import noise as test
 
-    of = _measured(test.KIND, Where(logs, run, config, plot), lambda live, must: test.play(live, duration))
-    _say(test.judge(of.every, of.required, of.configuration, of.calibration), test.draw, plot, as_json)
+    _carry_out(test, logs, run, config, plot, as_json, lambda live, must: test.play(live, duration))
 
 
-class Where(NamedTuple):
-    """The log, or the run, that is measured; the configuration with the requirements; what is drawn into."""
-
-    logs: list[Path] | None
-    run: str | None
-    config: Path | None
-    plot: Path | None
-
-
-class Measured(NamedTuple):
-    """What was played, what is required of it, and of which instrument."""
-
-    every: "list[Played]"
-    required: "Acceptance"
-    configuration: "Configuration"
-    calibration: "Calibration"
-
-
-def _measured(kind: "Kind", where: Where, play: "Callable[[Live, Acceptance], list[Played]]") -> Measured:
-    """What was played: in a log, or now."""
+def _carry_out(
+    test: Any,
+    logs: list[Path] | None,
+    run: str | None,
+    config: Path | None,
+    plot: Path | None,
+    as_json: bool,
+    play: "Callable[[Live, Acceptance], list[Played]]",
+) -> None:
+    """Judge what was played in a log, or play it now; draw and print the result, and end with the verdict."""
     from rich.console import Console
     from rich.progress import TimeRemainingColumn
 
-    from lowfc.adapters.files.drawing import figure_class
-    from lowfc.adapters.files.whole_file import require_folder
+    from lowfc.adapters.files.drawing import figure_class, png
+    from lowfc.adapters.files.whole_file import require_folder, write_whole
     from lowfc.adapters.logs.history import read_history
     from lowfc.adapters.logs.parts import WholeLog, the_one
     from lowfc.adapters.process.progress import counting_bar
@@ -150,11 +134,9 @@ def _measured(kind: "Kind", where: Where, play: "Callable[[Live, Acceptance], li
     from lowfc.programs.commissioning.acceptance.played import logged
     from lowfc.programs.logs.guard import refuse_log
 
-    logs, run, config, plot = where
     required = configuration(config).acceptance if config is not None else None
     require_folder(plot)
-    if plot is not None:
-        figure_class()  # says before the measurement that it could not be drawn
+    figure = None if plot is None else figure_class()(figsize=(10, 5), layout="constrained")  # or it says why not, now
     if logs:
         if run is not None:
             raise ConfigurationError("a log, or a running loop (--run): choose one")
@@ -164,28 +146,20 @@ def _measured(kind: "Kind", where: Where, play: "Callable[[Live, Acceptance], li
         history = read_history(log)
         for remark in history.remarks:
             sys.stderr.write(f"warning: {remark}\n")
-        every = logged(history, kind)
-        known, calibration = history.configuration, history.calibration
-        if known is None or calibration is None:
+        every = logged(history, test.KIND)
+        if history.configuration is None or history.calibration is None:
             raise DataFileError(f"{log.path}: has no configuration, which says what is required")
-        return Measured(every, required or known.acceptance, known, calibration)
-    with Client(run) as client, counting_bar(Console(stderr=True), TimeRemainingColumn()) as count:
-        live = Live(client, partial(count, kind))
-        required = required or live.configuration.acceptance
-        with client.reserved("lowfc acceptance"), live.kept():
-            return Measured(play(live, required), required, live.configuration, live.calibration)
-
-
-def _say(
-    result: "AcceptanceResult", draw: Callable[[dict[str, Any], Any], None], plot: Path | None, as_json: bool
-) -> None:
-    """Draw the result, print it, and end with the verdict."""
-    from lowfc.adapters.files.drawing import figure_class, png
-    from lowfc.adapters.files.whole_file import write_whole
-
-    if plot is not None:
-        figure = figure_class()(figsize=(10, 5), layout="constrained")
-        draw(result.figures(), figure)
+        known, calibration = history.configuration, history.calibration
+    else:
+        with Client(run) as client, counting_bar(Console(stderr=True), TimeRemainingColumn()) as count:
+            live = Live(client, partial(count, test.KIND))
+            known, calibration = live.configuration, live.calibration
+            with client.reserved("lowfc acceptance"), live.kept():
+                every = play(live, required or known.acceptance)
+    instrument = (known, calibration) if test.KIND == "noise-floor" else ()
+    result = test.judge(every, required or known.acceptance, *instrument)
+    if plot is not None and figure is not None:
+        test.draw(result.figures(), figure)
         figure.suptitle(result.verdict)
         write_whole(plot, png(figure))
     put(result, as_json=as_json)

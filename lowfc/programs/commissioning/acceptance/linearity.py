@@ -12,9 +12,15 @@ from lowfc.control.calibration.linearity import SURE, gains, levels
 from lowfc.control.loop.safety import LoopMode
 from lowfc.optics.chain.zernike import mode_name
 from lowfc.programs.cli.result import Result, figure
-from lowfc.programs.commissioning.acceptance.judged import AcceptanceResult, ModeResult
 from lowfc.programs.commissioning.acceptance.live import Live
-from lowfc.programs.commissioning.acceptance.played import AcceptanceError, Kind, Played, chosen
+from lowfc.programs.commissioning.acceptance.played import (
+    AcceptanceError,
+    AcceptanceResult,
+    Kind,
+    ModeResult,
+    Played,
+    chosen,
+)
 
 KIND: Kind = "linearity"
 AMPLITUDES = (0.5, 1.0, 2.0)

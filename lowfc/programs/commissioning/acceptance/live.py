@@ -7,6 +7,8 @@ from typing import Any
 
 import numpy as np
 
+from lowfc.adapters.logs.columns import of_steps
+from lowfc.arrays import Single
 from lowfc.client import Client, Step, configuration_of
 from lowfc.contract.messages import wire
 from lowfc.control.laws.linear_law import LinearLaw
@@ -19,7 +21,6 @@ from lowfc.programs.commissioning.acceptance.played import (
     AcceptanceError,
     Kind,
     Played,
-    Single,
     loop_of,
     played,
 )
@@ -32,12 +33,7 @@ class Live:
     """The live loop, left in the mode in which it was found, with nothing more being played."""
 
     def __init__(self, client: Client, heard: Callable[[int, int], None]) -> None:
-        """Take hold of the loop.
-
-        Args:
-            client: that has joined the run.
-            heard: told of frames that have passed, and of all that are expected.
-        """
+        """Take hold of the loop."""
         self.client = client
         self.calibration = client.calibration()
         self.configuration = configuration_of(client)
@@ -132,26 +128,9 @@ class Live:
         after = self._state()
         if [getattr(before, name) for name in _LAW] != [getattr(after, name) for name in _LAW]:
             raise AcceptanceError("gains, or the law, were changed while the loop was measured: measure again")
-        nothing = np.full(modes, np.nan, np.float32)
-        return played(
-            what,
-            loop_of(before, self.calibration, self.loop.rate_hz, self.client.laws()),
-            "" if not table.shape[1] else MIRROR if basis.size else OFFSET,
-            table,
-            basis,
-            np.array([step.frame_sequence - first for step in kept], np.int64),
-            np.array([step.time_ns for step in kept], np.int64),
-            np.array([step.mode for step in kept], np.uint8),
-            np.array([sum(1 << reason for reason in step.reasons) for step in kept], np.int64),
-            *(
-                np.array(rows, np.float32).reshape(len(kept), modes)
-                for rows in (
-                    [nothing if step.error_nm is None else step.error_nm for step in kept],
-                    [nothing if step.pol_nm is None else step.pol_nm for step in kept],
-                    [step.command_nm for step in kept],
-                )
-            ),
-        )
+        loop = loop_of(before, self.calibration, self.loop.rate_hz, self.client.laws())
+        target = "" if not table.shape[1] else MIRROR if basis.size else OFFSET
+        return played(what, loop, target, table, basis, first, of_steps(kept, modes))
 
     def _state(self) -> wire.ControllerState:
         state = self.client.status().state

@@ -4,20 +4,17 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
 from lowfc.adapters.files.factory import frame_noise_nm
+from lowfc.arrays import Array
 from lowfc.contract.configuration import Acceptance, Configuration
 from lowfc.control.calibration.calibration import Calibration
 from lowfc.control.laws.spectra import SHORTEST, Pieces, floor_nm2_hz, spectrum
 from lowfc.control.loop.safety import LoopMode
 from lowfc.optics.chain.zernike import mode_name
 from lowfc.programs.cli.result import figure
-from lowfc.programs.commissioning.acceptance.judged import AcceptanceResult, ModeResult
 from lowfc.programs.commissioning.acceptance.live import Live
-from lowfc.programs.commissioning.acceptance.played import AcceptanceError, Kind, Played
-
-Double = npt.NDArray[np.float64]
+from lowfc.programs.commissioning.acceptance.played import AcceptanceError, AcceptanceResult, Kind, ModeResult, Played
 
 KIND: Kind = "noise-floor"
 _LOOPS = {"open": LoopMode.OPEN, "closed": LoopMode.CLOSED}
@@ -106,7 +103,7 @@ def draw(found: dict[str, Any], figure: Any) -> None:
     ax.legend()
 
 
-def _floor_nm(played: Played) -> Double:
+def _floor_nm(played: Played) -> Array:
     """White noise (modes,) of a frame: of pseudo-open-loop modes, which the loop does not filter."""
     made = spectrum(Pieces((played.filled(played.pol_nm),), 0), played.loop.rate_hz)
     if made is None:

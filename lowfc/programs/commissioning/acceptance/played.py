@@ -1,19 +1,21 @@
-"""What was played to a loop and what it did meanwhile, for the tests to judge; from a log.
+"""What was played to a loop and what it did meanwhile, for the tests to judge, and the form of their results.
 
 Each play is announced by a note that says what it is for, so that a log can be judged as the live loop was.
 """
 
 import json
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Literal
 
 import numpy as np
 import numpy.typing as npt
 
+from lowfc.adapters.logs.columns import Steps, reason_counts
 from lowfc.adapters.logs.history import History
+from lowfc.arrays import Array, Long, Single
 from lowfc.contract.codecs import codec
-from lowfc.contract.codecs.law_codec import law_of
+from lowfc.contract.codecs.law_codec import driving, gains_of
 from lowfc.contract.errors import DataFileError, LowfcError
 from lowfc.contract.messages import wire
 from lowfc.control.calibration.calibration import Calibration
@@ -22,10 +24,9 @@ from lowfc.control.laws.law import Law
 from lowfc.control.laws.linear_law import LinearLaw, integrator
 from lowfc.control.laws.stability import settling_frames
 from lowfc.control.loop.safety import LoopMode, Reason
+from lowfc.programs.cli.result import Result, figure
 
 Kind = Literal["rejection", "linearity", "capture-range", "noise-floor"]
-Single = npt.NDArray[np.float32]
-Double = npt.NDArray[np.float64]
 
 LIMITS = (Reason.MODAL_LIMIT, Reason.STROKE, Reason.SLEW, Reason.NEIGHBOUR)
 MOST_MISSING = 0.01
@@ -40,6 +41,35 @@ _CHANGES = ("gain", "leak", "limit", "law", "load", "offset", "channel", "reset"
 
 class AcceptanceError(LowfcError):
     """A loop could not be measured: it was disturbed, or is in no state for it."""
+
+
+class ModeResult(Result):
+    """A mode, and whether it does what is required of it."""
+
+    noll: int = figure("mode")
+    name: str = figure("name")
+    passed: bool = figure()
+    too_noisy: bool = figure(default=False)
+
+    def remarks(self) -> Sequence[str]:
+        """What stands behind its row: the verdict, where it is not good."""
+        return [] if self.passed else ["too noisy" if self.too_noisy else "FAILED"]
+
+
+class AcceptanceResult(Result):
+    """What a test found; it passed where every mode did."""
+
+    test: str = figure()
+    passed: bool = figure()
+
+    @property
+    def verdict(self) -> str:
+        """In a few words."""
+        return f"{self.test}: {'passed' if self.passed else 'FAILED'}"
+
+    def remarks(self) -> Sequence[str]:
+        """The verdict at the end."""
+        return ["", self.verdict]
 
 
 @dataclass(frozen=True, slots=True)
@@ -58,15 +88,15 @@ class Loop:
             return self.law
         return integrator(self.law.gain, self.law.leak, self.noll, self.delay_frames, self.rate_hz)
 
-    def rejection(self, frequency_hz: Double) -> Double:
+    def rejection(self, frequency_hz: Array) -> Array:
         """|S| (frequencies, modes) in theory."""
         return margins.rejection(self.linear, frequency_hz, self.delay_frames)
 
-    def noise_transfer(self, frequency_hz: Double) -> Double:
+    def noise_transfer(self, frequency_hz: Array) -> Array:
         """|T| (frequencies, modes) in theory."""
         return margins.noise_transfer(self.linear, frequency_hz, self.delay_frames)
 
-    def noise_gain(self) -> Double:
+    def noise_gain(self) -> Array:
         """Variance (modes,) of the residual per variance of white noise of a frame, in theory."""
         return margins.noise_gain(self.linear, self.delay_frames)
 
@@ -103,16 +133,16 @@ class Played:
     target: str
     table: Single
     basis: Single
-    error_nm: Double
-    pol_nm: Double
-    command_nm: Double
+    error_nm: Array
+    pol_nm: Array
+    command_nm: Array
     mode: npt.NDArray[np.uint8]
-    reasons: npt.NDArray[np.int64]
+    reasons: Long
 
     @property
     def limits_hit(self) -> list[str]:
         """Names of the limits that acted, which ended the play."""
-        return [one.name for one in LIMITS if np.any(self.reasons & (1 << one))]
+        return [reason.name for reason in reason_counts(self.reasons) if reason in LIMITS]
 
     @property
     def missing(self) -> int:
@@ -142,7 +172,7 @@ class Played:
                 f"{MOST_MISSING:.0%} may: `lowfc info` and `lowfc ctl status` say why"
             )
 
-    def filled(self, values: Double) -> Double:
+    def filled(self, values: Array) -> Array:
         """(frames, modes) with what is missing interpolated."""
         there = np.isfinite(values).all(axis=1)
         if there.all():
@@ -183,30 +213,15 @@ def logged(history: History, kind: Kind) -> list[Played]:
         before = [one for one in history.controllers if one.frame_sequence < first and len(one.gain) == modes]
         if not before:
             raise DataFileError(f"{path}: the state of the controller before the test is not in it")
-        steps = history.steps
-        rows = np.flatnonzero((steps.sequence >= first) & (steps.sequence < first + frames))
         asked = codec.request(request, request.name, 0, plays=history.published.plays)
         basis = asked.actuators_nm.reshape(-1, calibration.grid[0] * calibration.grid[1])
-        one = played(
-            what,
-            loop_of(before[-1], calibration, history.rate_hz, history.published.laws),
-            request.text if play else "",
-            asked.table if play else np.zeros((frames, 0), np.float32),
-            basis,
-            (steps.sequence[rows] - np.uint64(first)).astype(np.int64),
-            steps.time_ns[rows],
-            steps.mode[rows],
-            steps.reasons[rows],
-            steps.error_nm[rows],
-            steps.pol_nm[rows],
-            steps.command_nm[rows],
-        )
-        found.append(one)
+        loop = loop_of(before[-1], calibration, history.rate_hz, history.published.laws)
+        table = asked.table if play else np.zeros((frames, 0), np.float32)
+        found.append(played(what, loop, request.text if play else "", table, basis, first, history.steps))
     return found
 
 
 def _announced(requests: Sequence[wire.Request], kind: Kind) -> list[tuple[dict[str, Any], wire.Request]]:
-    """Parameters and request of each play of a test; the note itself where nothing is played."""
     found: list[tuple[dict[str, Any], wire.Request]] = []
     what: dict[str, Any] | None = None
     for request in requests:
@@ -233,35 +248,26 @@ def played(
     target: str,
     table: Single,
     basis: Single,
-    places: npt.NDArray[np.int64],
-    time_ns: npt.NDArray[np.int64],
-    mode: npt.NDArray[np.uint8],
-    reasons: npt.NDArray[np.int64],
-    *columns: Single,
+    first: int,
+    steps: Steps,
 ) -> Played:
-    """Steps at some places of a play as one row for each of its frames; the rate is that of these steps."""
-    frames, modes = len(table), columns[0].shape[1]
-    own = (reasons & (1 << Reason.REPEATED | 1 << Reason.OUT_OF_ORDER)) == 0  # the others are of a frame seen before
-    places, time_ns, mode, reasons = places[own], time_ns[own], mode[own], reasons[own]
-    columns = tuple(column[own] for column in columns)
+    """The steps of a play from frame `first` on, one row for each of its frames; the rate is that of these steps."""
+    frames = len(table)
+    own = (steps.reasons & (1 << Reason.REPEATED | 1 << Reason.OUT_OF_ORDER)) == 0  # others are of a frame seen before
+    steps = steps.at(own & (steps.sequence >= first) & (steps.sequence < first + frames))
+    places = (steps.sequence - np.uint64(first)).astype(np.int64)
     if len(places) > 1:
-        rate_hz = float((places[-1] - places[0]) * 1e9 / (time_ns[-1] - time_ns[0]))
-        loop = Loop(loop.law, loop.noll, loop.delay_frames, rate_hz)
-    full = np.full((len(columns), frames, modes), np.nan)
-    for filled, column in zip(full, columns, strict=True):
-        filled[places] = column
-    modes_of, reasons_of = np.zeros(frames, np.uint8), np.zeros(frames, np.int64)
-    modes_of[places], reasons_of[places] = mode, reasons
-    return Played(what, loop, target, table, basis, full[0], full[1], full[2], modes_of, reasons_of)
+        rate_hz = float((places[-1] - places[0]) * 1e9 / (steps.time_ns[-1] - steps.time_ns[0]))
+        loop = replace(loop, rate_hz=rate_hz)
+    error_nm, pol_nm, command_nm = (np.full((frames, steps.error_nm.shape[1]), np.nan) for _ in range(3))
+    mode, reasons = np.zeros(frames, np.uint8), np.zeros(frames, np.int64)
+    error_nm[places], pol_nm[places], command_nm[places] = steps.error_nm, steps.pol_nm, steps.command_nm
+    mode[places], reasons[places] = steps.mode, steps.reasons
+    return Played(what, loop, target, table, basis, error_nm, pol_nm, command_nm, mode, reasons)
 
 
 def loop_of(
     state: wire.ControllerState, calibration: Calibration, rate_hz: float, laws: Mapping[str, LinearLaw]
 ) -> Loop:
     """The loop of a controller's state, whose law is one of these."""
-    law: Law | LinearLaw
-    if state.HasField("law"):
-        law = law_of(state.law, laws)
-    else:
-        law = Law(*(np.array(values, np.float32) for values in (state.gain, state.leak, state.limit_nm)))
-    return Loop(law, calibration.noll, state.delay_frames, rate_hz)
+    return Loop(driving(state, laws) or gains_of(state), calibration.noll, state.delay_frames, rate_hz)

@@ -5,8 +5,8 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
+from lowfc.arrays import Array, Whole
 from lowfc.contract.configuration import Acceptance
 from lowfc.control.calibration.excitation import led_in, lines, multisine
 from lowfc.control.laws.linear_law import LinearLaw
@@ -16,11 +16,15 @@ from lowfc.control.loop.additions import MIRROR, OFFSET
 from lowfc.control.loop.safety import LoopMode
 from lowfc.optics.chain.zernike import mode_name
 from lowfc.programs.cli.result import Result, figure
-from lowfc.programs.commissioning.acceptance.judged import AcceptanceResult, ModeResult
 from lowfc.programs.commissioning.acceptance.live import Live
-from lowfc.programs.commissioning.acceptance.played import AcceptanceError, Kind, Played, chosen
-
-Double = npt.NDArray[np.float64]
+from lowfc.programs.commissioning.acceptance.played import (
+    AcceptanceError,
+    AcceptanceResult,
+    Kind,
+    ModeResult,
+    Played,
+    chosen,
+)
 
 KIND: Kind = "rejection"
 LEAST_JUDGED = 0.5
@@ -233,7 +237,7 @@ def draw(found: dict[str, Any], figure: Any) -> None:
     axes[1].legend(fontsize=6, ncols=2)
 
 
-def _part(of: Departure, rows: npt.NDArray[np.intp], frequency_hz: Double) -> Part:
+def _part(of: Departure, rows: Whole, frequency_hz: Array) -> Part:
     judged = rows[of.judged[rows]]
     worst = float(of.db[judged][np.argmax(np.abs(of.db[judged]))]) if judged.size else None
     return Part(

@@ -5,12 +5,12 @@ from dataclasses import asdict, replace
 from pathlib import Path
 
 import numpy as np
-import numpy.typing as npt
 from rich.console import Console
 
 from lowfc.adapters.files import calibration_file, factory
 from lowfc.adapters.files.whole_file import require_folder
 from lowfc.adapters.process.terminal import configuration
+from lowfc.arrays import Array, single
 from lowfc.client import Client, configuration_of
 from lowfc.contract.codecs.calibration_codec import identified
 from lowfc.contract.configuration import Configuration
@@ -23,8 +23,6 @@ from lowfc.programs.commissioning.calibrate.pokes import AMPLITUDE_NM, sequence
 from lowfc.programs.commissioning.calibrate.recording import Player, watch
 from lowfc.programs.commissioning.calibrate.result import reconstructed
 from lowfc.programs.commissioning.calibrate.tasks import images, sayer
-
-Array = npt.NDArray[np.float64]
 
 
 class AlignResult(Result):
@@ -77,7 +75,7 @@ def aligned(
     if image is not None:
         config = configuration(file)
         picture, told = images(image).mean(axis=0), False
-        computed = _computed(config)
+        computed = analytic(config, Console(stderr=True))
         found = _fit(computed, picture, half_turn)
         made = on_sensor(config, computed, found.geometry, found.flux, picture.shape, None)
         calibration_file.save(made, out)
@@ -92,7 +90,7 @@ def aligned(
                     "measures one for these frames"
                 )
             dark = before.dark.reshape(before.shape).astype(np.float64)
-            computed = _computed(config)
+            computed = analytic(config, Console(stderr=True))
             found = _fit(computed, pixels.mean(axis=0) - dark, half_turn)
             made = on_sensor(config, computed, found.geometry, found.flux, before.shape, before)
             told = True
@@ -140,10 +138,6 @@ def on_sensor(
         made = reconstructed(config, I0, H, None, good, flux, estimator=config.control.estimator)
     except (ValueError, CalibrationError) as error:
         raise CalibrationError(f"too little of the image falls on the sensor: {error}") from None
-
-    def single(array: Array) -> npt.NDArray[np.float32]:
-        return np.ascontiguousarray(array, dtype=np.float32)
-
     return identified(
         replace(
             computed,
@@ -166,10 +160,6 @@ def computed_scale(config: Configuration) -> float:
     """Pixels per lambda/D of the computed image; per pupil diameter where the sensor sees the pupil."""
     optics = factory.sensor(config, lambda _: None)
     return 1 / (optics.pitch * optics.binning)
-
-
-def _computed(config: Configuration) -> Calibration:
-    return analytic(config, Console(stderr=True))
 
 
 def _fit(computed: Calibration, image: Array, half_turn: bool) -> Alignment:

@@ -16,6 +16,8 @@ calibrate_app = new_app(
 Method = Literal["analytic", "poke", "hadamard", "in-loop"]
 Out = Annotated[Path, typer.Option("--out", help="File to be written (FITS).")]
 Load = Annotated[bool, typer.Option("--load", help="Use it at once; the loop must be open.")]
+Snr = Annotated[float, typer.Option(min=1, max=1e4, help="Signal-to-noise ratio to reach in the noisiest mode.")]
+Resume = Annotated[bool, typer.Option("--resume", help="Go on with one that was interrupted.")]
 Frames = Annotated[int, typer.Option(min=16, max=100_000, help="How many frames are averaged.")]
 
 
@@ -26,9 +28,7 @@ def calibrate(
     out: Out = Path("calibration.fits"),
     run: AnyRun = None,
     config: ConfigFile = None,
-    snr: Annotated[
-        float, typer.Option(min=1, max=1e4, help="Signal-to-noise ratio to reach in the noisiest mode.")
-    ] = 70.0,
+    snr: Snr = 70.0,
     amplitude: Annotated[
         float | None,
         typer.Option(
@@ -37,7 +37,7 @@ def calibrate(
         ),
     ] = None,
     cycles: Annotated[int | None, typer.Option(min=1, help="How many; --snr then judges them, default 20.")] = None,
-    resume: Annotated[bool, typer.Option("--resume", help="Go on with one that was interrupted.")] = False,
+    resume: Resume = False,
     truncate: Annotated[
         float, typer.Option(min=0, max=0.99, help="Leave out singular values below this part of the largest.")
     ] = 0.0,

@@ -5,16 +5,14 @@ from math import ceil, log
 from pathlib import Path
 
 import numpy as np
-import numpy.typing as npt
 
+from lowfc.arrays import Array
 from lowfc.contract.configuration import Configuration
 from lowfc.contract.errors import CalibrationError
 from lowfc.control.calibration import poke_plan
 from lowfc.control.calibration.calibration import Calibration
 from lowfc.control.calibration.response_fit import LEAST_CYCLES
 from lowfc.programs.commissioning.calibrate.recording import AFTERWARDS
-
-Array = npt.NDArray[np.float64]
 
 AMPLITUDE_NM = {"poke": 8.0, "hadamard": 3.0, "in-loop": 2.0}
 LEAST_SNR = 20.0
@@ -75,22 +73,12 @@ class CalibrationRequest:
 
 
 class Pokes:
-    """The plans of one calibration.
-
-    Attributes:
-        amplitude_nm: of a mode, wavefront rms.
-    """
+    """The plans of one calibration, at an amplitude `amplitude_nm` of a mode, wavefront rms."""
 
     def __init__(
         self, config: Configuration, calibration: Calibration, noise_nm: Array, wanted: CalibrationRequest
     ) -> None:
-        """Choose the amplitude.
-
-        Args:
-            config: The loop's.
-            calibration: In use; it has the commands.
-            noise_nm: (modes,) of one frame.
-            wanted: What is asked for.
+        """Choose the amplitude; `noise_nm` is that of one frame (modes,).
 
         Raises:
             CalibrationError: the amplitude asked for is too large.

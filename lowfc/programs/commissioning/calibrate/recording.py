@@ -9,6 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from lowfc.adapters.process.progress import Counted
+from lowfc.arrays import Array, Long, Mask, Pixels, Whole
 from lowfc.client import Client, Frame, MirrorWatch
 from lowfc.contract.envelope import start_of
 from lowfc.contract.errors import BusError, CalibrationError, LowfcError
@@ -21,7 +22,6 @@ from lowfc.control.loop.advance import UNMEASURED
 from lowfc.control.loop.inputs import Step
 from lowfc.control.loop.safety import LoopMode, Reason
 
-Array = npt.NDArray[np.float64]
 Say = Callable[[str], None]
 T = TypeVar("T")
 
@@ -61,10 +61,10 @@ class Recording(NamedTuple):
         command_nm: (steps, modes) the loop's own modal command.
     """
 
-    sequence: npt.NDArray[np.int64]
-    pixels: npt.NDArray[np.uint16]
-    steps: npt.NDArray[np.int64]
-    commanded: npt.NDArray[np.bool_]
+    sequence: Long
+    pixels: Pixels
+    steps: Long
+    commanded: Mask
     command_nm: Array
 
     def played(self, table: Array, delay_frames: float) -> Array:
@@ -78,11 +78,11 @@ class Recording(NamedTuple):
         all_of_them = np.ones(len(self.steps), np.bool_)
         return seen(self.command_nm[newest], _weights(delay_frames), self.steps, all_of_them)[self._steps_of_frames]
 
-    def usable(self, plan: Plan, delay_frames: float) -> npt.NDArray[np.bool_]:
+    def usable(self, plan: Plan, delay_frames: float) -> Mask:
         """(frames,) whether each frame may be used."""
         return usable(plan, self.steps, self.commanded, _lag(delay_frames))[self._steps_of_frames]
 
-    def blocks(self, plan: Plan, delay_frames: float) -> npt.NDArray[np.intp]:
+    def blocks(self, plan: Plan, delay_frames: float) -> Whole:
         """(frames,) the block of a plan that each frame sees."""
         return plan.block[np.clip(self.sequence - _lag(delay_frames), 0, len(plan) - 1)]
 
@@ -92,7 +92,7 @@ class Recording(NamedTuple):
         return bool(self.commanded.all()) and len(self.sequence) == len(self.steps) == self.steps[-1] + 1
 
     @property
-    def _steps_of_frames(self) -> npt.NDArray[np.intp]:
+    def _steps_of_frames(self) -> Whole:
         return np.searchsorted(self.steps, self.sequence)
 
 
@@ -163,7 +163,7 @@ def play(
     return _recording(images, made, first)
 
 
-def watch(loop: Client, count: int) -> npt.NDArray[np.uint16]:
+def watch(loop: Client, count: int) -> Pixels:
     """The next `count` frames (count, rows, columns), DN.
 
     Raises:
@@ -217,7 +217,6 @@ def _commanded(step: Step) -> bool:
 
 
 def _check_refused(made: list[Step]) -> None:
-    """Raise where no frame at all has been used for a while."""
     last = made[-MOST_REFUSED:]
     if len(last) == MOST_REFUSED and not any(_commanded(step) for step in last):
         reasons = sorted({reason.name for step in last for reason in step.reasons})

@@ -6,9 +6,9 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 
 from lowfc.adapters.files import calibration_file, factory
+from lowfc.arrays import Array, single
 from lowfc.contract.codecs.calibration_codec import identified
 from lowfc.contract.configuration import Configuration
 from lowfc.contract.errors import CalibrationError
@@ -22,9 +22,6 @@ from lowfc.optics.twin.twin_mirror import wavefront_nm
 from lowfc.programs.cli.result import Result, figure
 from lowfc.programs.commissioning.calibrate.pokes import CalibrationRequest, cycles_for
 from lowfc.programs.commissioning.calibrate.run import CalibrationData, Calibrator
-
-Array = npt.NDArray[np.float64]
-Single = npt.NDArray[np.float32]
 
 MOST_NOISE = 1.5
 """Times the noise of the computed reconstructor on the same light; farther from flat the sensor sees less."""
@@ -149,10 +146,7 @@ def reconstructed(
     initial: Array | None,
     good: Array,
     flux_dn: float,
-    *,
-    estimator: str = "weighted",
-    truncate: float = 0.0,
-    tikhonov: float = 0.0,
+    **how: Any,
 ) -> Reconstruction:
     """R of H on the camera of a configuration; the arguments are those of `reconstruct`, the light is in DN.
 
@@ -162,7 +156,7 @@ def reconstructed(
     camera = factory.detector(config)
     flux_e, read_noise_e = flux_dn * camera.gain_e_per_dn / camera.em_gain, factory.equivalent_read_noise_e(camera)
     try:
-        return reconstruct(reference, response, initial, good, flux_e, read_noise_e, estimator, truncate, tikhonov)
+        return reconstruct(reference, response, initial, good, flux_e, read_noise_e, **how)
     except ValueError as error:
         raise CalibrationError(str(error)) from None
 
@@ -189,13 +183,13 @@ def measured_calibration(
     names = dict.fromkeys([*taken.initial.estimator.split("+"), wanted.method])
     calibration = replace(
         before,
-        reference=_single(I0),
-        response=_single(taken.response),
-        reconstructor=_single(made.matrix),
+        reference=single(I0),
+        response=single(taken.response),
+        reconstructor=single(made.matrix),
         flux_dn=taken.flux_dn,
         estimator="+".join(names),
         operator_hash="",
-        actuators_to_modes=_single(_seen_of_actuators(config, before, made.matrix)),
+        actuators_to_modes=single(_seen_of_actuators(config, before, made.matrix)),
     )
     return identified(calibration), made
 
@@ -355,7 +349,3 @@ def _seen_of_actuators(config: Configuration, before: Calibration, matrix: Array
 
 def _span(calibration: Calibration) -> str:
     return f"Z{calibration.noll[0]} to Z{calibration.noll[-1]}"
-
-
-def _single(array: Array) -> Single:
-    return np.ascontiguousarray(array, dtype=np.float32)

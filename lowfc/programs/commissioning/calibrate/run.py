@@ -13,11 +13,11 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 
 from lowfc.adapters.files import factory, fits_file
 from lowfc.adapters.files.whole_file import write_whole
 from lowfc.adapters.process.progress import Counted
+from lowfc.arrays import Array
 from lowfc.client import Client, configuration_of
 from lowfc.contract.errors import CalibrationError, DataFileError, LowfcError
 from lowfc.contract.messages import wire
@@ -37,8 +37,6 @@ from lowfc.control.calibration.response_fit import (
 )
 from lowfc.programs.commissioning.calibrate.pokes import CalibrationRequest, Pokes, checks
 from lowfc.programs.commissioning.calibrate.recording import FrameCount, Player, Say
-
-Array = npt.NDArray[np.float64]
 
 _LIKE = 0.3
 """Likeness of the first pokes' picture to the calibration in use below which something is said."""

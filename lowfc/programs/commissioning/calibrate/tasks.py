@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import NamedTuple, TypeVar
 
 import numpy as np
-import numpy.typing as npt
 from rich.console import Console
 from rich.progress import TextColumn, TimeRemainingColumn
 
@@ -17,6 +16,7 @@ from lowfc.adapters.files.mirror_maps import shape_of
 from lowfc.adapters.files.whole_file import require_folder
 from lowfc.adapters.process.progress import Counted, counting_bar, spoken
 from lowfc.adapters.process.terminal import configuration
+from lowfc.arrays import Array, single
 from lowfc.client import Client, configuration_of
 from lowfc.contract.codecs.calibration_codec import identified
 from lowfc.contract.configuration import Configuration
@@ -144,8 +144,7 @@ def computed(
     if there is not None:
         made = replace(made, estimator=f"{made.estimator}+at {there.name}")
     if wanted.truncate or wanted.tikhonov:
-        matrix = np.ascontiguousarray(quality.matrix, dtype=np.float32)
-        made = replace(made, reconstructor=matrix, estimator=f"{made.estimator}+regularised")
+        made = replace(made, reconstructor=single(quality.matrix), estimator=f"{made.estimator}+regularised")
     made = identified(made)
     calibration_file.save(made, wanted.out)
     if load:
@@ -172,7 +171,7 @@ def zero_point(config: Configuration, text: str) -> ZeroPoint:
         return ZeroPoint("a shape", lambda _, mirror: wavefront_nm(mirror, shape).astype(np.float64))
     modes_nm = _modes(text)
 
-    def of_modes(optics: Twin, _: TwinMirror) -> npt.NDArray[np.float64]:
+    def of_modes(optics: Twin, _: TwinMirror) -> Array:
         return np.array(list(modes_nm.values())) @ zernikes(list(modes_nm), *node_radii(optics))
 
     return ZeroPoint(",".join(f"{mode}={amplitude_nm:g}" for mode, amplitude_nm in modes_nm.items()), of_modes)
@@ -281,7 +280,7 @@ def _adapted(
     return result
 
 
-def images(file: Path) -> npt.NDArray[np.float64]:
+def images(file: Path) -> Array:
     """Frames (frames, rows, columns) of a file's image or cube.
 
     Raises:

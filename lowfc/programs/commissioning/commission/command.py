@@ -9,24 +9,23 @@ import typer
 from lowfc.adapters.process.terminal import AnyRun, Json
 from lowfc.contract.errors import ConfigurationError
 from lowfc.programs.cli.output import put
+from lowfc.programs.commissioning.calibrate.command import Out, Resume, Snr
 
 
 def commission(
-    out: Annotated[Path, typer.Option("--out", help="File to be written (FITS).")] = Path("calibration.fits"),
+    out: Out = Path("calibration.fits"),
     run: AnyRun = None,
     frames: Annotated[int, typer.Option(min=16, max=100_000, help="For the dark and for the reference image.")] = 400,
     dark: Annotated[Path | None, typer.Option(help="Dark frames: a FITS or .npy cube (frames, rows, columns).")] = None,
     no_dark: Annotated[
         bool, typer.Option("--no-dark", help="Take the camera's bias for the dark, and all pixels for good.")
     ] = False,
-    snr: Annotated[
-        float, typer.Option(min=1, max=1e4, help="Signal-to-noise ratio to reach in the noisiest mode.")
-    ] = 50.0,
+    snr: Snr = 50.0,
     cycles: Annotated[
         int | None,
         typer.Option(min=1, help="How many of the response, at least 4, in place of --snr, which is 20 then."),
     ] = None,
-    resume: Annotated[bool, typer.Option("--resume", help="Go on with one that was interrupted.")] = False,
+    resume: Resume = False,
     close: Annotated[bool, typer.Option("--close", help="Close the loop at the end.")] = False,
     as_json: Json = False,
 ) -> None:

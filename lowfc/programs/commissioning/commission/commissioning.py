@@ -7,10 +7,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
 from lowfc.adapters.files import calibration_file, factory
+from lowfc.adapters.logs.columns import Steps, of_steps
 from lowfc.adapters.process.progress import Counted
+from lowfc.arrays import Single
 from lowfc.client import Client
 from lowfc.contract.configuration import Configuration
 from lowfc.contract.errors import CalibrationError, LowfcError
@@ -18,7 +19,8 @@ from lowfc.contract.messages import wire
 from lowfc.control.calibration.calibration import Calibration
 from lowfc.control.calibration.delay_fit import Delay
 from lowfc.control.laws.law import Law
-from lowfc.control.laws.stability import settling_frames
+from lowfc.control.laws.stability import delay_weights, settling_frames
+from lowfc.control.laws.what_if import as_logged, counterfactual, missing_before, rms
 from lowfc.control.loop.inputs import Step
 from lowfc.control.loop.safety import LoopMode
 from lowfc.programs.commissioning.calibrate.pokes import LEAST_SNR, CalibrationRequest, Pokes
@@ -28,13 +30,11 @@ from lowfc.programs.commissioning.calibrate.run import Calibrator, begun, partia
 from lowfc.programs.commissioning.calibrate.tasks import images
 from lowfc.programs.commissioning.commission.first_calibration import aligned, first_delay, linear_nm, poked
 from lowfc.programs.commissioning.commission.first_light import (
-    Sensor,
     camera_fits,
     darkened,
     referenced,
     without_dark,
 )
-from lowfc.programs.commissioning.commission.prediction import measured_nm, predicted_nm
 
 METHOD = "hadamard"
 LOOKED_AT = 32
@@ -51,18 +51,7 @@ STEPS = (
 
 @dataclass(frozen=True, slots=True)
 class Commission:
-    """What is asked for.
-
-    Attributes:
-        out: The file to be written; what is done so far is kept beside it.
-        frames: For the dark and for the reference image.
-        dark: File of dark frames; None to take them now.
-        no_dark: Take the camera's bias for the dark, and all pixels for good.
-        snr: Signal-to-noise ratio to reach in the noisiest mode.
-        cycles: Of the response; None for as many as that takes.
-        resume: Go on with one that was interrupted.
-        close: Close the loop at the end.
-    """
+    """What is asked for: the options of `lowfc commission`."""
 
     out: Path
     frames: int
@@ -92,17 +81,7 @@ class Commissioning:
         progress: Counted,
         confirm: Callable[[str], None],
     ) -> None:
-        """Take what it is made with.
-
-        Args:
-            loop: A connection to it.
-            config: The loop's.
-            computed: Of the optical model: its modes and the mirror's commands, and its image where it is alike.
-            asked: What is asked for.
-            say: For people.
-            progress: For people: frames so far, and of how many.
-            confirm: Ask a person to do something, and wait until it is done.
-        """
+        """Take what it is made with."""
         self._loop, self._config, self._computed, self._asked = loop, config, computed, asked
         self._say, self._progress, self._confirm = say, progress, confirm
         self._figures: dict[str, Any] = {}
@@ -218,7 +197,6 @@ class Commissioning:
         return self._loop.calibration() if state.calibration_id and state.mode != wire.LOOP_MODE_IDLE else None
 
     def _first(self) -> Calibration:
-        """The steps before there is any calibration."""
         self._step("camera")
         seen = list(self._loop.frames(LOOKED_AT))
         camera = camera_fits(self._config, self._loop.camera_state(), seen, self._say)
@@ -233,7 +211,7 @@ class Commissioning:
             sensor = darkened(camera, watch(self._loop, asked.frames), self._say)
             self._confirm("unblock the star; is it there?")
         self._step("reference image")
-        before = self._reference(sensor)
+        before = referenced(sensor, watch(self._loop, asked.frames), self._computed, self._say)
         self._step("delay")
         self._delay = delay = first_delay(self._loop, self._config, before, self._say)
         self._step("orientation and sign")
@@ -243,10 +221,6 @@ class Commissioning:
         self._figures |= first.figures
         return first.calibration
 
-    def _reference(self, sensor: Sensor) -> Calibration:
-        frames: npt.NDArray[np.uint16] = watch(self._loop, self._asked.frames)
-        return referenced(sensor, frames, self._computed, self._say)
-
     def _close(self, law: Law, delay_frames: float) -> str:
         """Predict the residual; close the loop where that was asked for, and compare."""
         rate_hz = self._config.camera.rate_hz
@@ -254,10 +228,12 @@ class Commissioning:
         frames = settling + max(MIN_PREDICTED, settling)
         self._step("prediction")
         try:
-            expected_nm = predicted_nm(self._steps(frames), law, delay_frames, rate_hz)
+            opened = self._steps(frames)
+            weights = delay_weights(max(delay_frames, 1.0)).astype(np.float32)
+            missing = missing_before(opened.sequence)
+            predicted = _rms_nm(counterfactual(as_logged(law), weights, opened.pol_nm, missing)[0], settling)
         except ValueError as error:
             raise CalibrationError(f"the residual is not predicted: {error}") from None
-        predicted = float(np.sqrt((expected_nm**2).sum()))
         self._figures["predicted_error_nm"] = predicted
         text = f"the closed loop leaves {predicted:.3g} nm rms of measured error, predicted from {frames} open frames"
         if not self._asked.close:
@@ -265,8 +241,7 @@ class Commissioning:
         self._step("closed loop")
         self._loop.close_loop()
         try:
-            found_nm = measured_nm(self._steps(frames, LoopMode.CLOSED), law, rate_hz)
-            measured = float(np.sqrt((found_nm**2).sum()))
+            measured = _rms_nm(self._steps(frames, LoopMode.CLOSED).error_nm, settling)
             self._figures["measured_error_nm"] = measured
             if measured > MAX_OF_PREDICTED * predicted:
                 raise CalibrationError(
@@ -282,7 +257,7 @@ class Commissioning:
             raise
         return f"{text}\nmeasured in the closed loop: {measured:.3g} nm rms, {measured / predicted:.2f} times that"
 
-    def _steps(self, frames: int, mode: LoopMode = LoopMode.OPEN) -> list[Step]:
+    def _steps(self, frames: int, mode: LoopMode = LoopMode.OPEN) -> Steps:
         steps: list[Step] = []
         self._say(f"watching {frames} frames, {frames / self._config.camera.rate_hz:.0f} s")
         for step in self._loop.steps():
@@ -295,4 +270,12 @@ class Commissioning:
                 break
             if len(steps) % CHECKED == 0:
                 self._loop.check_lease()
-        return steps
+        return of_steps(steps, len(self._computed.noll))
+
+
+def _rms_nm(error_nm: Single, settling: int) -> float:
+    """Root mean square of all modes' measured errors, which have the sensor's noise, after so many frames."""
+    used = np.isfinite(error_nm).all(axis=1) & (np.arange(len(error_nm)) >= settling)
+    if used.sum() < settling:
+        raise ValueError(f"{int(used.sum())} frames after {settling} of settling are too few to tell a residual")
+    return float(np.linalg.norm(rms(error_nm, used)))

@@ -4,8 +4,8 @@ from dataclasses import replace
 from typing import Any, NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 
+from lowfc.arrays import single
 from lowfc.client import Client
 from lowfc.contract.codecs.calibration_codec import identified
 from lowfc.contract.configuration import Configuration
@@ -19,8 +19,6 @@ from lowfc.programs.commissioning.calibrate.align import computed_scale, in_word
 from lowfc.programs.commissioning.calibrate.pokes import AMPLITUDE_NM, HOLD, SETTLE, largest_nm, sequence
 from lowfc.programs.commissioning.calibrate.recording import AFTERWARDS, Player, PokesNotSeenError, Say
 from lowfc.programs.commissioning.calibrate.result import reconstructed
-
-Array = npt.NDArray[np.float64]
 
 FIRST_NM = AMPLITUDE_NM["poke"]
 MAX_FIRST_NM = 32.0
@@ -66,15 +64,7 @@ def first_delay(loop: Client, config: Configuration, before: Calibration, say: S
 
 
 def aligned(config: Configuration, computed: Calibration, before: Calibration, poke: Delay, say: Say) -> First | None:
-    """The computed calibration on the sensor's pixels, with the sign that the poke shows; None for another sensor.
-
-    Args:
-        config: The loop's.
-        computed: Of the optical model.
-        before: Has dark, good pixels and reference.
-        poke: Of the first mode.
-        say: For people.
-    """
+    """The computed calibration on the sensor's pixels, with the sign that the poke shows; None for another sensor."""
     image = (before.reference * before.flux_dn).reshape(before.shape).astype(np.float64)
     model = computed.reference.astype(np.float64).reshape(computed.shape)
     try:
@@ -122,8 +112,8 @@ def poked(loop: Client, config: Configuration, before: Calibration, poke: Delay,
     say(f"{CYCLES} pokes of each mode by {amplitude_nm:.3g} nm")
     made = replace(
         before,
-        response=response.astype(np.float32),
-        reconstructor=np.ascontiguousarray(matrix, np.float32),
+        response=single(response),
+        reconstructor=single(matrix),
         estimator=f"{config.control.estimator}+poke{FIRST}",
     )
     return First(identified(made), {})
@@ -164,5 +154,4 @@ def _say_time(config: Configuration, modes: int, cycles: int, say: Say) -> None:
 
 
 def _poke_cycle(modes: int, amplitude_nm: float, number: int) -> poke_plan.Plan:
-    """Pokes of each mode by itself; every other cycle backwards."""
     return poke_plan.cycle(poke_plan.poke_patterns(modes, amplitude_nm), HOLD, SETTLE, 16, backwards=number % 2 == 1)

@@ -7,6 +7,7 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
+from lowfc.arrays import Array
 from lowfc.client import Frame
 from lowfc.contract.codecs.calibration_codec import camera_settings
 from lowfc.contract.configuration import Configuration
@@ -17,9 +18,7 @@ from lowfc.control.calibration.dark_frames import check_dark, dark_of
 from lowfc.control.loop.camera import CameraSettings
 from lowfc.programs.commissioning.calibrate.recording import Say
 from lowfc.programs.commissioning.checks import Status
-from lowfc.programs.commissioning.conformance.agreement import agreement_checks
-
-Array = npt.NDArray[np.float64]
+from lowfc.programs.commissioning.conformance.settings import agreement_checks
 
 RATE_APART = 0.05
 """Part by which the rate of the frames' times may differ from what the camera says."""
@@ -45,12 +44,6 @@ class Sensor(NamedTuple):
 
 def camera_fits(config: Configuration, state: wire.CameraState, images: Sequence[Frame], say: Say) -> CameraSettings:
     """The camera's settings, once its frames and the configuration agree with them.
-
-    Args:
-        config: The loop's.
-        state: The camera's settings.
-        images: Some frames.
-        say: For people.
 
     Raises:
         CalibrationError: they do not agree, or the frames are saturated.

@@ -7,9 +7,9 @@ from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 from google.protobuf.message import DecodeError
 
+from lowfc.arrays import Pixels
 from lowfc.contract.messages import CAMERA_STATE, FRAME, RawImage, Role, from_timestamp, wire
 from lowfc.programs.commissioning.conformance.line import NS, Collected, Line, Received
 from lowfc.programs.commissioning.conformance.publisher import LATE_NS
@@ -55,7 +55,7 @@ class Camera(Collected):
         super().__init__(line, FRAME.key, Role.CAMERA)
         self.frames: list[Picture] = []
         self.unreadable = 0
-        self.pixels: list[npt.NDArray[np.uint16]] = []
+        self.pixels: list[Pixels] = []
         self.states: list[wire.CameraState | None] = []
         self.answers: list[Received] = []
 

@@ -44,9 +44,9 @@ def camera(
     Example: lowfc conformance camera --run bench --config bench.toml
     """
     from lowfc.contract.messages import Role
-    from lowfc.programs.commissioning.conformance.agreement import agreement_checks
     from lowfc.programs.commissioning.conformance.camera import watch
     from lowfc.programs.commissioning.conformance.frames import camera_checks
+    from lowfc.programs.commissioning.conformance.settings import agreement_checks
 
     settings = None if config is None else configuration(config)
     found = _run_with(Role.CAMERA, run)
@@ -125,7 +125,6 @@ def _run_with(role: str, name: str | None) -> "Run":
 
 @contextmanager
 def _line(run: "Run", role: str) -> "Iterator[Line]":
-    """A line to a run, once somebody is connected."""
     import time
 
     from lowfc.programs.commissioning.conformance.line import Line
@@ -155,7 +154,6 @@ def _bar(text: str, total: float | None) -> Iterator[Callable[..., None]]:
 
 
 def _end(device: str, run_id: str, checks: list[Check], as_json: bool) -> None:
-    """Print what was found; exit status 1 where something is wrong."""
     put(checks, STATUSES, FIELDS, {"device": device, "run": run_id} if as_json else None)
     if any(check.status is Status.WRONG for check in checks):
         raise typer.Exit(1)

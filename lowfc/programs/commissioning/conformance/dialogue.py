@@ -4,18 +4,16 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 from google.protobuf.message import DecodeError
 
 from lowfc.adapters.bus.run import mirror_role
 from lowfc.adapters.files.factory import mirror_limits
+from lowfc.arrays import Mask, Single
 from lowfc.contract.codecs.codec import actuators
 from lowfc.contract.configuration import Configuration
 from lowfc.contract.messages import COMMAND, MIRROR_STATE, timestamp, wire
 from lowfc.control.loop.safety import Limits
 from lowfc.programs.commissioning.conformance.line import NS, Collected, Line, Received
-
-Single = npt.NDArray[np.float32]
 
 ANSWER_S = 0.5
 """A mirror that takes longer cannot be in a loop."""
@@ -50,7 +48,7 @@ class Expected:
     grid: tuple[int, int]
     limits: Limits
     step_nm: float
-    moving: npt.NDArray[np.bool_]
+    moving: Mask
     period_ns: int
 
     @property

@@ -4,8 +4,8 @@ from collections.abc import Iterator, Sequence
 from itertools import pairwise
 
 import numpy as np
-import numpy.typing as npt
 
+from lowfc.arrays import Pixels
 from lowfc.contract.messages import FRAME, MONO16, wire
 from lowfc.programs.commissioning.checks import Check, Table, ok, warning, wrong
 from lowfc.programs.commissioning.conformance.camera import Camera
@@ -172,7 +172,7 @@ def _byte_order(seen: Camera) -> Check | None:
     return ok("neighbouring pixels are alike as they are")
 
 
-def _roughness(picture: npt.NDArray[np.uint16]) -> float:
+def _roughness(picture: Pixels) -> float:
     """Mean difference of neighbours, as a fraction of the scatter of all pixels."""
     values = picture.astype(np.float64)
     if values.size < 4 or not values.std():

@@ -3,11 +3,11 @@
 from collections.abc import Iterator
 
 import numpy as np
-import numpy.typing as npt
 
+from lowfc.arrays import Mask, Single
 from lowfc.contract.messages import wire
 from lowfc.programs.commissioning.checks import Check, ok, warning, wrong
-from lowfc.programs.commissioning.conformance.dialogue import Dialogue, Single
+from lowfc.programs.commissioning.conformance.dialogue import Dialogue
 
 _NEAR, _BEYOND, _FAR = 0.9, 1.05, 2.0
 
@@ -41,7 +41,6 @@ def limit_checks(mirror: Dialogue) -> Iterator[Check]:
 
 
 def _kept(state: wire.MirrorState, reason: wire.Reason, found_nm: float, most_nm: float) -> Check:
-    """Whether the mirror kept the limit, and says so."""
     got = f"{found_nm:.4f} nm"
     if found_nm > most_nm:
         return wrong(got, "cut it in the driver's program, whatever is asked: do not rely on the controller's limits")
@@ -61,7 +60,7 @@ def _rises(mirror: Dialogue) -> bool:
     return where_nm is not None and _highest_nm(mirror, where_nm) >= (_NEAR - 0.05) * stroke_nm
 
 
-def _peak(moving: npt.NDArray[np.bool_]) -> tuple[Single, tuple[int, list[int]]]:
+def _peak(moving: Mask) -> tuple[Single, tuple[int, list[int]]]:
     """One actuator half up and all others half down; where it and its two neighbours in its row are.
 
     It moves, between two that do, as near to the middle as there is one.

@@ -5,9 +5,10 @@ from itertools import pairwise
 
 import numpy as np
 
+from lowfc.arrays import Single
 from lowfc.contract.messages import from_timestamp, wire
 from lowfc.programs.commissioning.checks import Check, Status, ok, warning, wrong
-from lowfc.programs.commissioning.conformance.dialogue import ANSWER_S, MODAL_NM, Dialogue, Single, Tell
+from lowfc.programs.commissioning.conformance.dialogue import ANSWER_S, MODAL_NM, Dialogue, Tell
 from lowfc.programs.commissioning.conformance.limits import limit_checks
 from lowfc.programs.commissioning.conformance.line import NS
 from lowfc.programs.commissioning.conformance.publisher import PROCESS, PUBLISHER
@@ -26,14 +27,7 @@ _SETTLE_S = 0.05  # of actuators that are reported where they are, not where the
 
 
 def mirror_checks(mirror: Dialogue, seconds: float, tell: Tell, *, gentle: bool = False) -> list[Check]:
-    """What is right and wrong with a mirror; it ends where it was.
-
-    Args:
-        mirror: nobody else commands it.
-        seconds: for how long it is given ordinary commands.
-        tell: called with what is being tried.
-        gentle: do not try its limits.
-    """
+    """What is right and wrong with a mirror; it ends where it was."""
     found: list[Check] = []
     base_nm = np.zeros(mirror.expected.grid, np.float32)
     begun_ns = mirror.line.now_ns()
@@ -71,7 +65,6 @@ def _bad(found: list[Check], *names: str) -> bool:
 
 
 def _idle(mirror: Dialogue) -> Iterator[Check]:
-    """Before the first command: does it report where it is?"""
     states = mirror.listen(IDLE_S)
     expected = f"{mirror.key}: lowfc.v1.MirrorState ten times a second without commands"
     if mirror.unreadable:
@@ -104,7 +97,6 @@ def _grid(mirror: Dialogue, state: wire.MirrorState) -> Check:
 
 
 def _next_command(mirror: Dialogue, base_nm: Single, seconds: float) -> Iterator[Check]:
-    """Small commands, one after the other: are they answered, and followed?"""
     line, period_ns = mirror.line, mirror.expected.period_ns
     answers: list[wire.MirrorState] = []
     commanded_nm = base_nm
@@ -259,7 +251,6 @@ def _refusals(mirror: Dialogue, base_nm: Single) -> Iterator[Check]:
 
 
 def _timeout(mirror: Dialogue, base_nm: Single) -> Iterator[Check]:
-    """Does a command expire, in its time, and does the mirror follow again?"""
     mirror.ask(base_nm, EXPIRES_NS)
     sent_ns = mirror.line.now_ns()
     mirror.listen(EXPIRES_NS / 2e9)
@@ -301,6 +292,5 @@ def _timeout(mirror: Dialogue, base_nm: Single) -> Iterator[Check]:
 
 
 def _expired_ns(mirror: Dialogue, since_ns: int) -> int | None:
-    """When the first state that says EXPIRED came."""
     arrivals = (message.receive_time_ns for message, state in mirror.since(since_ns) if state.status == _EXPIRED)
     return next(arrivals, None)

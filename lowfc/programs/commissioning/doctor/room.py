@@ -59,23 +59,25 @@ def _swap(facts: Facts) -> Check:
     )
 
 
-@CHECKS.check("huge pages")
+@CHECKS.check(
+    "huge pages",
+    advice="echo madvise > /sys/kernel/mm/transparent_hugepage/enabled, or boot with transparent_hugepage=madvise",
+    cost="a page fault may clear or gather 2 MB in the middle of a frame",
+)
 def _huge_pages(facts: Facts) -> Check:
     """When the kernel takes huge pages by itself: `transparent_hugepage/enabled`.
 
     Always.
     """
     when = facts.host.huge_pages()
-    if when != "always":
-        return ok(when)
-    return warning(
-        when,
-        "echo madvise > /sys/kernel/mm/transparent_hugepage/enabled, or boot with transparent_hugepage=madvise",
-        "a page fault may clear or gather 2 MB in the middle of a frame",
-    )
+    return ok(when) if when != "always" else warning(when)
 
 
-@CHECKS.check("BLAS")
+@CHECKS.check(
+    "BLAS",
+    advice="start the loop with OMP_NUM_THREADS=1, OPENBLAS_NUM_THREADS=1 and MKL_NUM_THREADS=1",
+    cost="threads of a small product wait for each other on the loop's processors",
+)
 def _blas(facts: Facts) -> Check:
     """Linear algebra of numpy, and whether it can be held to one thread, as the loop does.
 
@@ -86,11 +88,7 @@ def _blas(facts: Facts) -> Check:
         held = _blas_threads()
     if held and max(held.values()) == 1:
         return ok(f"{names}; the loop holds it to one")
-    return warning(
-        names or f"none that threadpoolctl knows, in numpy {np.__version__}",
-        "start the loop with OMP_NUM_THREADS=1, OPENBLAS_NUM_THREADS=1 and MKL_NUM_THREADS=1",
-        "threads of a small product wait for each other on the loop's processors",
-    )
+    return warning(names or f"none that threadpoolctl knows, in numpy {np.__version__}")
 
 
 @CHECKS.check("socket buffers")
@@ -158,7 +156,9 @@ def _disk(facts: Facts) -> Check:
     )
 
 
-@CHECKS.check("open files")
+@CHECKS.check(
+    "open files", advice="ulimit -n 1024, or LimitNOFILE=1024 of the service", cost="a process may fail to join the bus"
+)
 def _open_files(facts: Facts) -> Check:
     """How many files and sockets a process may have open.
 
@@ -166,12 +166,14 @@ def _open_files(facts: Facts) -> Check:
     """
     limit = facts.host.open_files()
     detail = "no limit" if limit is None else f"{limit}"
-    if limit is None or limit >= _OPEN_FILES:
-        return ok(detail)
-    return warning(detail, "ulimit -n 1024, or LimitNOFILE=1024 of the service", "a process may fail to join the bus")
+    return ok(detail) if limit is None or limit >= _OPEN_FILES else warning(detail)
 
 
-@CHECKS.check("certificates")
+@CHECKS.check(
+    "certificates",
+    advice="lowfc certs --renew where the authority's key is, and copy each ROLE.pem here",
+    cost="a link that is up stays up; a process or a router that starts after the end is not let in",
+)
 def _certificates(facts: Facts) -> Check:
     """Certificates in this host's folder, `network.certificates`, where the loop goes by a router.
 
@@ -183,14 +185,10 @@ def _certificates(facts: Facts) -> Check:
     said = ending_certificates(network, datetime.datetime.now(datetime.UTC))
     if not said:
         return ok(f"all in {network.certificates} are valid for more than {WARN_DAYS} days")
-    return warning(
-        "; ".join(said),
-        "lowfc certs --renew where the authority's key is, and copy each ROLE.pem here",
-        "a link that is up stays up; a process or a router that starts after the end is not let in",
-    )
+    return warning("; ".join(said))
 
 
-@CHECKS.check("python")
+@CHECKS.check("python", advice="run the loop without", cost="every line of the loop takes longer")
 def _python(facts: Facts) -> Check:
     """The Python that runs the loop.
 
@@ -205,7 +203,7 @@ def _python(facts: Facts) -> Check:
     if not any(slow.values()):
         return ok(detail)
     why = ", ".join(name for name, there in slow.items() if there)
-    return warning(f"{detail}, {why}", "run the loop without", "every line of the loop takes longer")
+    return warning(f"{detail}, {why}")
 
 
 @CHECKS.check("viewer")
@@ -223,20 +221,18 @@ def _viewer(facts: Facts) -> Check:
     return note(f"{binary}; no screen for a window", "lowfc view --web", "`lowfc view` opens no window here")
 
 
-@CHECKS.check("graphics driver")
+@CHECKS.check(
+    "graphics driver",
+    advice="apt install mesa-vulkan-drivers libvulkan1",
+    cost="`lowfc view --headless-screenshot` makes no picture; --web needs none",
+)
 def _graphics_driver(facts: Facts) -> Check:
     """Vulkan drivers, with which the viewer draws a window, or a picture without a screen.
 
     There is none.
     """
     drivers = vulkan_drivers()
-    if drivers:
-        return ok(", ".join(path.name for path in drivers))
-    return warning(
-        "no Vulkan driver",
-        "apt install mesa-vulkan-drivers libvulkan1",
-        "`lowfc view --headless-screenshot` makes no picture; --web needs none",
-    )
+    return ok(", ".join(path.name for path in drivers)) if drivers else warning("no Vulkan driver")
 
 
 @CHECKS.check("browser")
@@ -252,7 +248,6 @@ def _browser(facts: Facts) -> Check:
 
 
 def _blas_threads() -> dict[str, int]:
-    """How many threads each loaded linear algebra takes, by its name."""
     return {
         f"{library['internal_api']} {library['version']}": library["num_threads"]
         for library in threadpool_info()

@@ -110,23 +110,25 @@ def _isolation(facts: Facts) -> Check:
     )
 
 
-@CHECKS.check("quota")
+@CHECKS.check(
+    "quota",
+    advice="lift it: CPUQuota= of the service, --cpus of the container",
+    cost="once it is used up every process stands still until the quota is renewed",
+)
 def _quota(facts: Facts) -> Check:
     """Limits of processor time on this process's control groups, such as a container's.
 
     There is one.
     """
     cpus = facts.host.quota_cpus()
-    if cpus is None:
-        return ok("none")
-    return warning(
-        f"{cpus:g} processors' worth of time",
-        "lift it: CPUQuota= of the service, --cpus of the container",
-        "once it is used up every process stands still until the quota is renewed",
-    )
+    return ok("none") if cpus is None else warning(f"{cpus:g} processors' worth of time")
 
 
-@CHECKS.check("frequency")
+@CHECKS.check(
+    "frequency",
+    advice="cpupower frequency-set --governor performance",
+    cost="a processor slows down while it waits for a frame, and computes the next one slowly",
+)
 def _frequency(facts: Facts) -> Check:
     """Frequency governor of the usable processors, and turbo.
 
@@ -137,13 +139,7 @@ def _frequency(facts: Facts) -> Check:
         return note("not shown; in a virtual machine the hypervisor decides")
     turbo = {True: ", turbo on", False: ", turbo off", None: ""}[facts.host.turbo()]
     detail = f"{', '.join(sorted(governors))}{turbo}"
-    if governors == {"performance"}:
-        return ok(detail)
-    return warning(
-        detail,
-        "cpupower frequency-set --governor performance",
-        "a processor slows down while it waits for a frame, and computes the next one slowly",
-    )
+    return ok(detail) if governors == {"performance"} else warning(detail)
 
 
 @CHECKS.check("idle states")
@@ -199,7 +195,11 @@ def _kernel(facts: Facts) -> Check:
     return warning(f"{release}, no preemption of the kernel", advice, cost)
 
 
-@CHECKS.check("virtualisation")
+@CHECKS.check(
+    "virtualisation",
+    advice="the machine itself, or processors that the hypervisor gives to nobody else",
+    cost="the hypervisor stops a processor without saying so, whatever the scheduling class",
+)
 def _virtualisation(facts: Facts) -> Check:
     """Hypervisor, and the processor time that it gave to others since boot.
 
@@ -209,14 +209,14 @@ def _virtualisation(facts: Facts) -> Check:
     if not name:
         return ok("none")
     much = "; that is much" if stolen > _STOLEN else ""
-    return warning(
-        f"a virtual machine ({name}); {100 * stolen:.2f} % of its time went to others since boot{much}",
-        "the machine itself, or processors that the hypervisor gives to nobody else",
-        "the hypervisor stops a processor without saying so, whatever the scheduling class",
-    )
+    return warning(f"a virtual machine ({name}); {100 * stolen:.2f} % of its time went to others since boot{much}")
 
 
-@CHECKS.check("clock source")
+@CHECKS.check(
+    "clock source",
+    advice="boot with clocksource=tsc, on x86 with tsc=reliable where the processor's counter is sound",
+    cost="every process reads the time several times a frame",
+)
 def _clock_source(facts: Facts) -> Check:
     """What the kernel reads the time from, and what a reading takes.
 
@@ -228,16 +228,15 @@ def _clock_source(facts: Facts) -> Check:
         time.monotonic_ns()
     reading_ns = (time.perf_counter_ns() - begun_ns) / _READINGS
     detail = f"{source}, {reading_ns:.0f} ns for a reading"
-    if source not in _SLOW_SOURCES and reading_ns <= _SLOW_READING_NS:
-        return ok(detail)
-    return warning(
-        detail,
-        "boot with clocksource=tsc, on x86 with tsc=reliable where the processor's counter is sound",
-        "every process reads the time several times a frame",
-    )
+    return ok(detail) if source not in _SLOW_SOURCES and reading_ns <= _SLOW_READING_NS else warning(detail)
 
 
-@CHECKS.check("synchronisation")
+@CHECKS.check(
+    "synchronisation",
+    advice="run chronyd (with rtcsync), ntpd, systemd-timesyncd or phc2sys before the first run after a boot",
+    cost="no loop notices a step, but the times in a log are as wrong as the clock was at the first run since the "
+    "boot, and those of two hosts cannot be compared",
+)
 def _synchronisation(facts: Facts) -> Check:
     """Whether a daemon keeps CLOCK_REALTIME, and how well, by the kernel's account.
 
@@ -246,12 +245,7 @@ def _synchronisation(facts: Facts) -> Check:
     kept = facts.host.synchronisation()
     if kept.synchronised:
         return ok(f"kept; {kept.offset_s * 1e6:.0f} us to correct, error at most {kept.error_s * 1e3:.1f} ms")
-    return warning(
-        "not kept: CLOCK_REALTIME may be wrong, and step when somebody sets it",
-        "run chronyd (with rtcsync), ntpd, systemd-timesyncd or phc2sys before the first run after a boot",
-        "no loop notices a step, but the times in a log are as wrong as the clock was at the first run since the boot, "
-        "and those of two hosts cannot be compared",
-    )
+    return warning("not kept: CLOCK_REALTIME may be wrong, and step when somebody sets it")
 
 
 @CHECKS.check("boot's clock")
@@ -274,7 +268,11 @@ def _boot_clock(facts: Facts) -> Check:
     )
 
 
-@CHECKS.check("wake-up")
+@CHECKS.check(
+    "wake-up",
+    advice="see scheduling class, processors, idle states, virtualisation and load",
+    cost="frames wait so long before they are looked at, however fast the loop computes",
+)
 def _wake_up(facts: Facts) -> Check:
     """How late a process wakes that sleeps until a time, 1000 times in one second, in both scheduling classes.
 
@@ -289,11 +287,7 @@ def _wake_up(facts: Facts) -> Check:
     period_us = facts.config.period_ns / 1e3
     if best["p99"] <= _PART_OF_PERIOD * period_us and best["max"] <= period_us:
         return ok(detail)
-    return warning(
-        f"{detail}; a frame period is {period_us:.0f} us",
-        "see scheduling class, processors, idle states, virtualisation and load",
-        "frames wait so long before they are looked at, however fast the loop computes",
-    )
+    return warning(f"{detail}; a frame period is {period_us:.0f} us")
 
 
 def wake_up_us(trial: Trial) -> dict[str, dict[str, float]]:
@@ -306,7 +300,11 @@ def wake_up_us(trial: Trial) -> dict[str, dict[str, float]]:
     }
 
 
-@CHECKS.check("load")
+@CHECKS.check(
+    "load",
+    advice="end them, or keep them off the loop's processors",
+    cost="in the normal class the loop takes turns with them; under SCHED_FIFO they still empty its caches",
+)
 def _load(facts: Facts) -> Check:
     """Load average, and which other processes were busy during the measurement.
 
@@ -316,10 +314,4 @@ def _load(facts: Facts) -> Check:
     busy = [(name, share) for name, share in facts.busy if share > _BUSY]
     who = ", ".join(f"{name} {100 * share:.0f} %" for name, share in busy[:_BUSY_SHOWN]) or "nobody"
     detail = f"{load:.2f} in the last minute, {cpus} processors; busy now: {who}"
-    if not busy and load <= cpus:
-        return ok(detail)
-    return warning(
-        detail,
-        "end them, or keep them off the loop's processors",
-        "in the normal class the loop takes turns with them; under SCHED_FIFO they still empty its caches",
-    )
+    return ok(detail) if not busy and load <= cpus else warning(detail)

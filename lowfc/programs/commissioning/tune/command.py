@@ -123,7 +123,7 @@ def integrate(loop: "Client", gains: list[float], noll: tuple[int, ...]) -> "Ans
         RequestRefusedError: the gains were refused.
         BusError: the controller did not answer.
     """
-    from lowfc.programs.commissioning.tune.data import driving
+    from lowfc.contract.codecs.law_codec import driving
 
     before = driving(loop.status().state, loop.laws())
     if before is None:

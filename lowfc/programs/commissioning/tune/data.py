@@ -1,18 +1,18 @@
 """What a law is tuned from: pseudo-open-loop modes of a log, or of a loop that is running."""
 
 import time
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
-import numpy.typing as npt
 
+from lowfc.adapters.logs.columns import Steps, of_steps
 from lowfc.adapters.logs.history import read_history
 from lowfc.adapters.logs.reader import LogReader
+from lowfc.arrays import Array, Mask, Single
 from lowfc.client import Client, configuration_of
-from lowfc.contract.codecs.law_codec import law_of
+from lowfc.contract.codecs.law_codec import driving, gains_of
 from lowfc.contract.errors import DataFileError
-from lowfc.contract.messages import wire
 from lowfc.control.laws.law import Law
 from lowfc.control.laws.linear_law import LinearLaw
 from lowfc.control.laws.spectra import Pieces, pieces
@@ -21,10 +21,6 @@ from lowfc.control.loop.inputs import Step
 from lowfc.control.loop.safety import LoopMode
 from lowfc.optics.detector.photometry import tilt_nm_per_mas
 from lowfc.programs.logs.what_if.run import LoggedRun
-
-Single = npt.NDArray[np.float32]
-Double = npt.NDArray[np.float64]
-Rows = npt.NDArray[np.bool_]
 
 _SETTLING_S = 0.5  # after the loop was closed
 
@@ -55,7 +51,7 @@ class Telemetry:
     closed: bool
     pol: Pieces
     error: Pieces
-    true_nm: Double | None
+    true_nm: Array | None
     nm_per_mas: float | None
     warnings: tuple[str, ...]
 
@@ -71,13 +67,10 @@ def of_log(log: LogReader) -> Telemetry:
     history = read_history(log)
     run = LoggedRun(history)
     steps = run.steps
-    rate_hz = history.rate_hz
     same = run.delay_frames == run.controller_delay
     pol_nm = steps.pol_nm if same else steps.error_nm - run.seen_nm
     usable = run.used & np.isfinite(pol_nm).all(axis=1) & ~run.torn & ~run.played & (steps.saturated_pixels == 0)
     mode = np.where(run.played, np.uint8(0), steps.mode)  # it settles after a play as after it was closed
-    true_nm = None if run.true_nm is None else run.true_nm[1]
-    state = history.controller
     warnings = list(history.remarks)
     if not same:
         warnings.append(
@@ -91,11 +84,12 @@ def of_log(log: LogReader) -> Telemetry:
     return _telemetry(
         str(log.path),
         run.calibration.noll,
-        rate_hz,
+        history.rate_hz,
         run.delay_frames,
-        (run.law, driving(state, history.published.laws)),
-        (steps.sequence, mode, usable),
-        (pol_nm, steps.error_nm, true_nm),
+        (run.law, driving(history.controller, history.published.laws)),
+        replace(steps, pol_nm=pol_nm, mode=mode),
+        usable,
+        None if run.true_nm is None else run.true_nm[1],
         tilt_nm_per_mas(config.star.diameter_m) if config is not None else None,
         warnings,
     )
@@ -103,11 +97,6 @@ def of_log(log: LogReader) -> Telemetry:
 
 def of_run(loop: Client, seconds: float, progress: Callable[[float], None] | None = None) -> Telemetry:
     """The steps that a running loop makes in the next seconds.
-
-    Args:
-        loop: a client of it.
-        seconds: how long to listen.
-        progress: called now and then with the seconds that have passed.
 
     Raises:
         BusError: the loop does not answer, or makes no steps.
@@ -129,22 +118,17 @@ def of_run(loop: Client, seconds: float, progress: Callable[[float], None] | Non
     stream.close()
     if state is None or not state.gain:
         raise DataFileError(f"run {loop.run_id!r} has no calibration yet: `lowfc ctl load` gives it one")
-    period_s = float(np.median(np.diff([step.time_ns for step in steps]))) * 1e-9 if len(steps) > 1 else 0.0
-    usable = np.array([step.pol_nm is not None and step.saturated_pixels == 0 for step in steps])
-    none = np.full(len(noll), np.nan, np.float32)
-    law = Law(*(np.array(values, np.float32) for values in (state.gain, state.leak, state.limit_nm)))
+    made = of_steps(steps, len(noll))
+    period_s = float(np.median(np.diff(made.time_ns))) * 1e-9 if len(steps) > 1 else 0.0
     return _telemetry(
         loop.run_id,
         noll,
         1 / period_s if period_s > 0 else config.camera.rate_hz,
         float(state.delay_frames),
-        (law, driving(state, loop.laws())),
-        (
-            np.array([step.frame_sequence for step in steps], np.uint64),
-            np.array([step.mode for step in steps], np.uint8),
-            usable,
-        ),
-        (_rows([step.pol_nm for step in steps], none), _rows([step.error_nm for step in steps], none), None),
+        (gains_of(state), driving(state, loop.laws())),
+        made,
+        np.isfinite(made.pol_nm).all(axis=1) & (made.saturated_pixels == 0),
+        None,
         tilt_nm_per_mas(config.star.diameter_m),
         [f"{stream.lost} steps did not get here in time"] if stream.lost else [],
     )
@@ -156,20 +140,20 @@ def _telemetry(
     rate_hz: float,
     delay_frames: float,
     laws: tuple[Law, LinearLaw | None],
-    frames: tuple[npt.NDArray[np.uint64], npt.NDArray[np.uint8], Rows],
-    modes_nm: tuple[Single, Single, Single | None],
+    steps: Steps,
+    usable: Mask,
+    true_nm: Single | None,
     nm_per_mas: float | None,
     warnings: Sequence[str],
 ) -> Telemetry:
-    sequence, mode, usable = frames
-    pol_nm, error_nm, true_nm = modes_nm
-    was_closed = mode == LoopMode.CLOSED
+    was_closed, places = steps.mode == LoopMode.CLOSED, np.arange(len(steps.mode))
     opened = np.flatnonzero(~was_closed)
-    since = np.arange(len(mode)) - np.concatenate([[-1], opened])[np.searchsorted(opened, np.arange(len(mode)))]
-    settled = usable & was_closed & (since > _SETTLING_S * rate_hz)
-    pol, closed, rows = _cut(sequence, pol_nm, settled), True, settled
+    since = places - np.concatenate([[-1], opened])[np.searchsorted(opened, places)]
+    closed, rows = True, usable & was_closed & (since > _SETTLING_S * rate_hz)
+    pol = pieces(steps.sequence[rows], steps.pol_nm[rows])
     if _longest(pol) < FEWEST:
-        pol, closed, rows = _cut(sequence, pol_nm, usable), False, usable
+        closed, rows = False, usable
+        pol = pieces(steps.sequence[rows], steps.pol_nm[rows])
     if _longest(pol) < FEWEST:
         raise DataFileError(
             f"{source}: a law is tuned from at least {FEWEST} frames in a row, {FEWEST / rate_hz:.2g} s; the longest "
@@ -185,25 +169,12 @@ def _telemetry(
         driving=laws[1],
         closed=closed,
         pol=pol,
-        error=_cut(sequence, error_nm, rows),
+        error=pieces(steps.sequence[rows], steps.error_nm[rows]),
         true_nm=np.sqrt(np.mean(true_nm[rows].astype(float) ** 2, axis=0)) if known and true_nm is not None else None,
         nm_per_mas=nm_per_mas,
         warnings=tuple(warnings),
     )
 
 
-def driving(state: wire.ControllerState | None, laws: Mapping[str, LinearLaw]) -> LinearLaw | None:
-    """The law that drives the mirror of a controller, or will; None for the integrator."""
-    return law_of(state.law, laws) if state is not None and state.HasField("law") else None
-
-
-def _cut(sequence: npt.NDArray[np.uint64], values: Single, rows: Rows) -> Pieces:
-    return pieces(sequence[rows], values[rows])
-
-
 def _longest(run: Pieces) -> int:
     return max((len(piece) for piece in run.values), default=0)
-
-
-def _rows(values: Sequence[Single | None], none: Single) -> Single:
-    return np.array([none if value is None else value for value in values], np.float32).reshape(-1, none.size)

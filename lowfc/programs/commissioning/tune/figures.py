@@ -3,8 +3,8 @@
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
+from lowfc.arrays import Array
 from lowfc.control.laws import margins
 from lowfc.control.laws.linear_law import LinearLaw, integrator
 from lowfc.control.laws.spectra import in_bins, spectrum
@@ -22,8 +22,6 @@ from lowfc.control.laws.vibration import Model
 from lowfc.control.loop.wording import counted
 from lowfc.optics.chain.zernike import mode_name
 from lowfc.programs.commissioning.tune.data import Telemetry
-
-Double = npt.NDArray[np.float64]
 
 CONTROLLERS = ("integrator", "pi-notch", "lqg")
 OPTICAL_GAIN_MAS = 10.0
@@ -171,7 +169,7 @@ def picture(run: Telemetry, best: Tuned) -> bytes:
     return png(figure)
 
 
-def _achieved_nm(run: Telemetry, noise_nm: Double) -> Double | None:
+def _achieved_nm(run: Telemetry, noise_nm: Array) -> Array | None:
     """Rms (modes,) of the residual: the true one where it is known, or the error's less the noise's."""
     if not run.closed:
         return None
@@ -192,7 +190,7 @@ def _lines(model: Model) -> list[dict[str, float]]:
     ]
 
 
-def _tilt_mas(run: Telemetry, rms_nm: Double | None) -> float | None:
+def _tilt_mas(run: Telemetry, rms_nm: Array | None) -> float | None:
     tilts = np.isin(run.noll, TILTS)
     if rms_nm is None or run.nm_per_mas is None or not tilts.any():
         return None

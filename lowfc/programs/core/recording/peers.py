@@ -58,10 +58,7 @@ class Others:
         self._newcomers = True
 
     def ask_meanwhile(self, *, more: bool) -> list[Sample]:
-        """Ask when somebody is new, on a thread of its own: one who is frozen answers late, and the rest goes on.
-
-        Args:
-            more: whether to ask anew.
+        """Ask, if there is `more` to come, when somebody is new: in a thread, for one who is frozen answers late.
 
         Returns:
             What was answered since the last call and not heard.

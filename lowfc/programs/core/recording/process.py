@@ -37,19 +37,7 @@ def record(
 ) -> Summary:
     """Record a run into `folder` until SIGTERM or SIGINT; the process of `lowfc record`.
 
-    Args:
-        run: the run to join.
-        folder: where the logs go.
-        configuration: TOML file to put into the log.
-        calibration: FITS file to put into the log.
-        seed: of a simulated run.
-        limits: when a log is finished and the next begun, and when there is no room for one.
-        clock: the run's; the host's when None.
-        priority: of SCHED_FIFO, below the loop's; None leaves the normal class.
-        cpus: processors to stay on; None leaves all.
-        selection: what is recorded.
-        expected_bytes_per_s: growth of the logs, by the configuration.
-        begins: called once there is room for a log.
+    The files `configuration` (TOML) and `calibration` (FITS) go into each log; `begins` is called once there is room.
 
     Raises:
         BusError: another recorder has this run.

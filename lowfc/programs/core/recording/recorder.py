@@ -40,7 +40,6 @@ _FLUSH_NS = 250_000_000
 _SETTLE_S = (0.3, 1.5)
 _DRAIN_S = 1.0
 _SLOW_NS = 1_000_000_000
-_LARGEST_ATTACHMENT_BYTES = 1 << 28
 
 
 class Recorder:
@@ -60,20 +59,7 @@ class Recorder:
         selection: Selection = EVERYTHING,
         expected_bytes_per_s: float = 0.0,
     ) -> None:
-        """Subscribe to everything; recording starts with `run`.
-
-        Args:
-            bus: of the run.
-            clock: of the run.
-            run_id: name of the run.
-            folder: where the logs go.
-            metadata: for the start of each log, by name.
-            attachments: files for the start of each log.
-            limits: when a log is finished and the next begun, and when there is no room for one.
-            granted: what the host granted this process.
-            selection: what is recorded.
-            expected_bytes_per_s: growth of the logs, until it has been measured; 0 where nobody knows.
-        """
+        """Subscribe to everything; `run` begins to record, each log with `metadata` and `attachments` first."""
         self._bus = bus
         self._clock = clock
         self._backlog = Backlog(QUEUE_MESSAGES, QUEUE_BYTES)
@@ -192,7 +178,6 @@ class Recorder:
         return self._failure
 
     def _resume(self) -> str:
-        """Begin the next log; return why not, if so."""
         if self._failure:
             return f"{self._failure}; start another recorder"
         if not self._paused or not self.service.running:

@@ -32,13 +32,13 @@ from typing import Any
 
 import aotpy
 import numpy as np
-import numpy.typing as npt
 from aotpy.io.fits import AOTFITSErrorLevel, AOTFITSReader, AOTFITSWriter
 from astropy.io import fits
 from google.protobuf.message import DecodeError
 
 from lowfc.adapters.bus.bus import name_in
 from lowfc.adapters.logs.history import History
+from lowfc.arrays import Single
 from lowfc.contract.codecs.codec import actuators
 from lowfc.contract.envelope import count_of
 from lowfc.contract.errors import DataFileError
@@ -214,7 +214,6 @@ class _System:
 
 
 def _copy_commands(path: Path, image: fits.ImageHDU, history: History, calibration: Calibration) -> None:
-    """The command made from each step's frame, (steps, actuators) in m, into a new extension."""
     sequence = history.steps.sequence
     shape = (len(sequence), calibration.grid[0] * calibration.grid[1])
     there = {int(one): row for row, one in reversed(list(enumerate(sequence)))}
@@ -231,7 +230,7 @@ def _copy_commands(path: Path, image: fits.ImageHDU, history: History, calibrati
             rows[row] = surface_nm.ravel() * np.float32(_NM)
 
 
-def _modes(noll: tuple[int, ...]) -> npt.NDArray[np.float32]:
+def _modes(noll: tuple[int, ...]) -> Single:
     """Zernike polynomials (modes, rows, columns) over the circle, 0 outside."""
     axis = (np.arange(_MODES_PIXELS) + 0.5) / (_MODES_PIXELS / 2) - 1
     x, y = np.meshgrid(axis, axis)

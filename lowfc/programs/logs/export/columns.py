@@ -51,13 +51,17 @@ def step_columns(history: History) -> list[Column]:
     if not steps.sequence.size:
         others = f" that fit its calibration ({history.left_out} do not)" if history.left_out else ""
         raise DataFileError(f"{history.log.path} has no steps{others}: there is nothing to export")
+
+    def reasons(bits: int) -> str:
+        return " ".join(reason.name.lower() for reason in Reason if bits >> reason & 1)
+
     columns = [
         Column("sequence", steps.sequence, "", "of the frame: start of the camera in unix seconds << 32 | count"),
         Column("count", np.array([count_of(int(one)) for one in steps.sequence]), "", "of the frame"),
         Column("time_ns", steps.time_ns, "ns", "end of the frame's exposure, since 1970-01-01 UTC"),
         Column("time_utc", steps.time_ns.astype("datetime64[ns]"), "", "the same as a date"),
         Column("mode", _named(steps.mode, lambda mode: LoopMode(mode).name.lower()), "", "of the loop"),
-        Column("reasons", _named(steps.reasons, _reasons), "", "why the frame was refused, or which limits acted"),
+        Column("reasons", _named(steps.reasons, reasons), "", "why the frame was refused, or which limits acted"),
         Column("flux_dn", steps.flux_dn, "adu", "sum of the good pixels, dark subtracted"),
         Column("saturated_pixels", steps.saturated_pixels, "pix", "good pixels at full well"),
         Column("error_nm", steps.error_nm, "nm", "measured modal error, wavefront rms"),
@@ -128,7 +132,3 @@ def _durations(history: History) -> list[Column]:
 def _named(codes: npt.NDArray[Any], name: Callable[[int], str]) -> npt.NDArray[np.str_]:
     different, places = np.unique(codes, return_inverse=True)
     return np.array([name(int(code)) for code in different])[places]
-
-
-def _reasons(bits: int) -> str:
-    return " ".join(reason.name.lower() for reason in Reason if bits >> reason & 1)

@@ -94,14 +94,6 @@ def export_log(
 ) -> dict[str, Any]:
     """Export a log; return the figures that `--json` prints.
 
-    Args:
-        log: finished or not.
-        to: what it becomes.
-        out: file to write; the log's name with another ending, beside it, when None.
-        frames: export the frames too.
-        force: replace a file that is there, unless it is a log.
-        console: for the progress.
-
     Raises:
         ConfigurationError: this format has no place for frames, or needs a library that is not there.
         DataFileError: the log cannot be read or has no steps, or the file is there already or cannot be written.

@@ -11,6 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 from lowfc.adapters.logs.history import History
+from lowfc.arrays import Pixels
 from lowfc.contract.codecs.codec import decode_frame
 from lowfc.contract.errors import DataFileError
 from lowfc.contract.messages import FRAME
@@ -72,7 +73,7 @@ def _mapped(path: Path, shape: tuple[int, ...], kind: str, block: int = 1) -> np
 def _copy_frames(
     history: History,
     make: Callable[[tuple[int, ...]], npt.NDArray[Any]],
-    stored: Callable[[npt.NDArray[np.uint16]], npt.NDArray[Any]],
+    stored: Callable[[Pixels], npt.NDArray[Any]],
 ) -> tuple[npt.NDArray[Any], ...]:
     """Copy frames from a run's log into an array (frames, rows, columns), which `make` makes, as they are `stored`.
 

@@ -100,7 +100,6 @@ def _noll(history: History) -> tuple[int, ...]:
 
 
 def _cells(values: npt.NDArray[Any]) -> npt.NDArray[np.str_]:
-    """Text of some rows, (rows, columns)."""
     text = values.astype(str).reshape(len(values), -1)
     if values.dtype.kind == "f":
         text[~np.isfinite(values).reshape(text.shape)] = ""

@@ -164,7 +164,6 @@ class Player:
                 bar.update(task, completed=log.position, total=log.size, description=_utc(message.log_time_ns))
 
     def _send(self, publisher: Publisher, message: Logged) -> None:
-        """Wait for a message's time and send it."""
         self._last_log_ns = max(self._last_log_ns, message.log_time_ns)
         if not self._begun_ns:
             self._first_log_ns = self._last_log_ns

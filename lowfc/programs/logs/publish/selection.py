@@ -120,7 +120,6 @@ def _in_loop(role: str) -> bool:
 
 
 def _keys(links: Links) -> Iterator[str]:
-    """Every key that a run has."""
     for topic in TOPICS:
         for name in _names(topic, links):
             yield topic.at(name)

@@ -1,5 +1,6 @@
 """The account of a replay: what was checked, what differed, what could not be checked."""
 
+from collections import Counter
 from dataclasses import dataclass, field
 
 from lowfc.programs.logs.replay.difference import Difference
@@ -25,14 +26,14 @@ class Account:
     commands: int = 0
     states: int = 0
     requests: int = 0
-    unchecked: dict[str, int] = field(default_factory=dict)
+    unchecked: Counter[str] = field(default_factory=Counter)
     missing: int = 0
     commands_missing: int = 0
     steps: int = 0
     different: int = 0
     first: Difference | None = None
     largest_nm: float = 0.0
-    changed: dict[str, int] = field(default_factory=dict)
+    changed: Counter[str] = field(default_factory=Counter)
 
     @property
     def identical(self) -> bool:
@@ -44,17 +45,15 @@ class Account:
         counts = ("frames", "commands", "states", "requests", "missing", "commands_missing", "steps", "different")
         for count in counts:
             setattr(self, count, getattr(self, count) + getattr(other, count))
-        for why, steps in other.unchecked.items():
-            self.leave_out(why, steps)
-        for rule, inputs in other.changed.items():
-            self.changed[rule] = self.changed.get(rule, 0) + inputs
+        self.unchecked += other.unchecked
+        self.changed += other.changed
         self.largest_nm = max(self.largest_nm, other.largest_nm)
         self.first = self.first or other.first
 
     def leave_out(self, why: str, steps: int) -> None:
         """Count steps that cannot be checked."""
         if steps:
-            self.unchecked[why] = self.unchecked.get(why, 0) + steps
+            self.unchecked[why] += steps
 
     def enter(self, found: Difference | None, tolerance_nm: float) -> None:
         """Account for two messages that are not the same bytes, and for what differs in them."""

@@ -13,7 +13,6 @@ from lowfc.adapters.process.progress import reading_bar
 from lowfc.adapters.process.provenance import provenance
 from lowfc.adapters.process.terminal import Json, Logs
 from lowfc.contract.envelope import count_of
-from lowfc.contract.errors import ConfigurationError
 from lowfc.programs.cli.output import put
 from lowfc.programs.logs.replay.account import Account
 
@@ -133,11 +132,6 @@ def replay_log(
         int | None, typer.Option(min=1, help="Processes, at most; default: one on every processor.")
     ] = None,
     as_json: Json = False,
-    other_loop: Annotated[
-        str | None, typer.Option("--what-if", "--config", "--calibration", "--controller", hidden=True)
-    ] = None,
-    on_the_bus: Annotated[bool, typer.Option("--publish", "--allow-commands", hidden=True)] = False,
-    how: Annotated[list[str] | None, typer.Option("--run", "--speed", "--topics", "--wait-for", hidden=True)] = None,
 ) -> None:
     """Run the loop again on what it took in, and compare every step and command with the log, to the bit.
 
@@ -145,10 +139,6 @@ def replay_log(
 
     Example: lowfc replay last
     """
-    if other_loop is not None:
-        raise ConfigurationError("a what-if is a command of its own: lowfc what-if LOG --set gain=0.3")
-    if on_the_bus or how:
-        raise ConfigurationError("a log is put on the bus by a command of its own: lowfc publish LOG --run NAME")
     figures = verify(in_order(logs), tolerance, jobs or 0, Console(stderr=True))
     put(figures, render(figures), as_json=as_json)
     if not figures["identical"]:

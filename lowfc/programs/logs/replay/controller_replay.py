@@ -260,7 +260,6 @@ class ControllerReplay:
         return decode_state(message, known.calibrations.get(message.calibration_id), known.laws, known.plays)
 
     def _leave_out(self, upto: int) -> None:
-        """Forget the inputs up to a number, and count their steps as unchecked."""
         for number in [number for number in self._entries if number <= upto]:
             taken = self._entries.pop(number).taken
             self._forgotten += taken is not None
@@ -313,7 +312,7 @@ class ControllerReplay:
         if found is None or found.within(self._tolerance_nm):
             self._account.states += 1
         else:
-            self._account.changed[rule] = self._account.changed.get(rule, 0) + 1
+            self._account.changed[rule] += 1
             try:
                 self._settings, state = self._decoded(logged)
             except ValueError as error:

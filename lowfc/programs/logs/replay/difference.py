@@ -4,9 +4,10 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 from google.protobuf.descriptor import FieldDescriptor
 from google.protobuf.message import Message
+
+from lowfc.arrays import Array
 
 _FLOAT32_FIELDS = ("actuators", "offset")
 """Bytes that hold little-endian float32, nm."""
@@ -63,40 +64,26 @@ def _compare(found: Difference, prefix: str, logged: Message, replayed: Message)
             _compare(found, f"{prefix}{name}.", was, now)
             continue
         before, after = _numbers(descriptor, was), _numbers(descriptor, now)
-        if not _alike(before, after) or not name.endswith(_IN_NM):
+        if before is None or after is None or before.shape != after.shape or not name.endswith(_IN_NM):
             found.fields.append(f"{prefix}{name}: log {_short(was)}, replay {_short(now)}")
             found.otherwise = True
-        else:
-            assert before is not None  # noqa: S101  # for the type checker
-            assert after is not None  # noqa: S101
-            _numbers_differ(found, prefix + name, before, after)
+            continue
+        apart = np.abs(after - before)
+        places = np.flatnonzero(apart)
+        shown = ", ".join(f"[{place}] log {before[place]:.9g}, replay {after[place]:.9g}" for place in places[:_SHOWN])
+        more = f" and {len(places) - _SHOWN} more" if len(places) > _SHOWN else ""
+        found.fields.append(f"{prefix}{name}: {shown}{more}; at most {apart.max():.3g} nm apart")
+        found.largest_nm = max(found.largest_nm, float(apart.max()))
 
 
-def _alike(before: npt.NDArray[np.float64] | None, after: npt.NDArray[np.float64] | None) -> bool:
-    """Whether these are numbers that can be subtracted from each other."""
-    if before is None or after is None or before.shape != after.shape:
-        return False
-    return bool(np.isfinite(before).all() and np.isfinite(after).all())
-
-
-def _numbers_differ(
-    found: Difference, name: str, before: npt.NDArray[np.float64], after: npt.NDArray[np.float64]
-) -> None:
-    apart = np.abs(after - before)
-    places = np.flatnonzero(apart)
-    shown = ", ".join(f"[{place}] log {before[place]:.9g}, replay {after[place]:.9g}" for place in places[:_SHOWN])
-    more = f" and {len(places) - _SHOWN} more" if len(places) > _SHOWN else ""
-    found.fields.append(f"{name}: {shown}{more}; at most {apart.max():.3g} nm apart")
-    found.largest_nm = max(found.largest_nm, float(apart.max()))
-
-
-def _numbers(descriptor: Any, value: Any) -> npt.NDArray[np.float64] | None:
-    """Numbers of a field as an array; None where it holds none."""
+def _numbers(descriptor: Any, value: Any) -> Array | None:
+    """Numbers of a field as an array; None where it holds none, or not finite ones."""
+    found = None
     if descriptor.name in _FLOAT32_FIELDS:
-        return np.frombuffer(value, "<f4").astype(float) if len(value) % 4 == 0 else None
-    if descriptor.type in (FieldDescriptor.TYPE_FLOAT, FieldDescriptor.TYPE_DOUBLE):
-        return np.atleast_1d(np.array(value, float))
-    return None
+        found = np.frombuffer(value, "<f4").astype(float) if len(value) % 4 == 0 else None
+    elif descriptor.type in (FieldDescriptor.TYPE_FLOAT, FieldDescriptor.TYPE_DOUBLE):
+        found = np.atleast_1d(np.array(value, float))
+    return found if found is not None and np.isfinite(found).all() else None
 
 
 def _short(value: object) -> str:

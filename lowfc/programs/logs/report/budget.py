@@ -1,10 +1,8 @@
 """The error budget of a run's longest closed stretch, each term with the way it was obtained."""
 
-from typing import Any
-
 import numpy as np
-import numpy.typing as npt
 
+from lowfc.arrays import Array, Mask
 from lowfc.control.laws.error_budget import SensorNoise, Term, lag, lag_under_noise, measurement_error, white_noise
 from lowfc.control.laws.spectra import Pieces
 from lowfc.programs.logs.report.closed_loop import (
@@ -17,11 +15,9 @@ from lowfc.programs.logs.report.closed_loop import (
     noise_of,
     why_none,
 )
-from lowfc.programs.logs.report.source import Run
+from lowfc.programs.logs.report.source import Figures, Run
 
-Double = npt.NDArray[np.float64]
-Masks = dict[str, npt.NDArray[np.bool_]]
-Figures = dict[str, Any]
+Masks = dict[str, Mask]
 
 Entry = tuple[Term | None, str]
 """A term and how it was obtained; or none, and what it would take."""
@@ -114,7 +110,7 @@ def _difference(one: Pieces, other: Pieces) -> Pieces:
     return Pieces(tuple(a - b for a, b in zip(one.values, other.values, strict=True)), one.bridged)
 
 
-def _mean_square(values: Double) -> Term:
+def _mean_square(values: Array) -> Term:
     return Term(np.mean(values**2, axis=0))
 
 
@@ -130,7 +126,6 @@ def _columns(term: Term | None, masks: Masks) -> Figures:
 
 
 def _over(total: Term | None, true: Term | None, masks: Masks) -> dict[str, float | None]:
-    """Sum over true residual, rms over rms."""
     if total is None or true is None:
         return dict.fromkeys(masks)
     ratios = {}

@@ -2,22 +2,18 @@
 
 from dataclasses import dataclass
 from itertools import pairwise
-from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
 from lowfc.adapters.logs.history import History
+from lowfc.arrays import Array, Mask
 from lowfc.control.laws.error_budget import SensorNoise, sensor_noise
 from lowfc.control.laws.linear_law import LinearLaw, integrator
 from lowfc.control.laws.margins import noise_transfer, rejection
 from lowfc.control.laws.spectra import SHORTEST, Pieces, Spectrum, in_bins, pieces, spectrum
 from lowfc.control.laws.stability import settling_frames
 from lowfc.control.loop.safety import LoopMode
-from lowfc.programs.logs.report.source import InForce, Run
-
-Double = npt.NDArray[np.float64]
-Figures = dict[str, Any]
+from lowfc.programs.logs.report.source import Figures, InForce, Run
 
 MOST_STEPS = 200_000
 """Of a longer stretch only the last ones are looked at: memory does not grow with the night."""
@@ -110,7 +106,7 @@ def stretch_figures(run: Run, stretch: Stretch | None) -> Figures | None:
     }
 
 
-def groups_of(noll: tuple[int, ...]) -> dict[str, npt.NDArray[np.bool_]]:
+def groups_of(noll: tuple[int, ...]) -> dict[str, Mask]:
     """Tip, tilt and the others as masks (modes,); only groups that have modes."""
     index = np.array(noll, dtype=int)
     masks = {"tilt x": index == _TIP, "tilt y": index == _TILT, "other modes": index > _TILT}
@@ -153,12 +149,10 @@ def spectra_figures(run: Run, stretch: Stretch | None, found: Spectra | None) ->
     }
 
 
-def _group(
-    name: str, modes: npt.NDArray[np.bool_], law: LinearLaw, found: Spectra, noise_nm2_hz: Double | None
-) -> Figures:
+def _group(name: str, modes: Mask, law: LinearLaw, found: Spectra, noise_nm2_hz: Array | None) -> Figures:
     """One group's spectra; what is summed over modes is summed in power."""
 
-    def total(one: Spectrum) -> Double:
+    def total(one: Spectrum) -> Array:
         return np.asarray(one.power_nm2_hz[:, modes].sum(axis=1))
 
     error, pol = found.measured
@@ -197,7 +191,7 @@ def _group(
     }
 
 
-def _ratio(measured: Double, theory: Double) -> Figures:
+def _ratio(measured: Array, theory: Array) -> Figures:
     """Amplitude of the measured over the theory's, over all bins: the middle, and where nine tenths of them lie."""
     there = (theory > 0) & (measured > 0)
     if not there.any():
@@ -206,7 +200,7 @@ def _ratio(measured: Double, theory: Double) -> Figures:
     return {"median": float(median), "p5": float(p5), "p95": float(p95)}
 
 
-def _band_rms(frequency_hz: Double, power: Double, low_hz: float, high_hz: float) -> float:
+def _band_rms(frequency_hz: Array, power: Array, low_hz: float, high_hz: float) -> float:
     inside = (frequency_hz >= low_hz) & ((frequency_hz < high_hz) | (high_hz == frequency_hz[-1]))
     return float(np.sqrt(power[inside].sum() * frequency_hz[1]))
 
@@ -236,6 +230,6 @@ def noise_of(history: History, rows: slice) -> SensorNoise | None:
     )
 
 
-def _noise_floor(run: Run, stretch: Stretch) -> Double | None:
+def _noise_floor(run: Run, stretch: Stretch) -> Array | None:
     noise = noise_of(run.history, stretch.rows)
     return None if noise is None else 2 * noise.total_nm**2 / stretch.law.rate_hz

@@ -42,7 +42,6 @@ def report(
 
 
 def _report(log: "Parts", out: Path | None, as_json: bool) -> None:
-    """Report one log."""
     from rich.console import Console
     from rich.progress import TimeElapsedColumn
 

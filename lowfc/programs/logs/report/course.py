@@ -1,18 +1,16 @@
 """The course of a run: loop modes, events, requests, light, refused frames, the mirror's stroke."""
 
 from collections import Counter
-from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
+from lowfc.adapters.logs.columns import reason_counts
 from lowfc.adapters.logs.history import History
+from lowfc.arrays import Long, Single
 from lowfc.contract.events import Level
 from lowfc.contract.messages import wire
 from lowfc.control.loop.safety import LoopMode, Reason
-from lowfc.programs.logs.report.source import Run
-
-Figures = dict[str, Any]
+from lowfc.programs.logs.report.source import Figures, Run
 
 _FIRST_LIMIT = Reason.MODAL_LIMIT
 _LEVELS = {level.value: level.name.lower() for level in Level}
@@ -94,7 +92,8 @@ def light_figures(history: History) -> Figures:
     """Flux, saturation, and frames refused by reason."""
     steps = history.steps
     flux = steps.flux_dn[steps.flux_dn > 0]
-    refused = {reason.name.lower(): _given(steps.reasons, reason) for reason in Reason if reason < _FIRST_LIMIT}
+    counts = reason_counts(steps.reasons).items()
+    refused = {reason.name.lower(): count for reason, count in counts if reason < _FIRST_LIMIT}
     return {
         "flux_expected_dn": history.calibration.flux_dn if history.calibration is not None else None,
         "flux_mean_dn": float(flux.mean()) if flux.size else None,
@@ -103,7 +102,7 @@ def light_figures(history: History) -> Figures:
         "frames_saturated": int((steps.saturated_pixels > 0).sum()),
         "saturated_pixels_most": int(steps.saturated_pixels.max(initial=0)),
         "frames_refused": sum(refused.values()),
-        "refused": {reason: count for reason, count in refused.items() if count},
+        "refused": refused,
     }
 
 
@@ -122,18 +121,14 @@ def mirror_figures(history: History) -> Figures:
     }
 
 
-def actuator_extremes_nm(history: History) -> npt.NDArray[np.float32]:
+def actuator_extremes_nm(history: History) -> Single:
     """Largest deviation from flat of each actuator (rows, columns) over the run."""
     return np.maximum(np.abs(history.mirror.highest_nm), np.abs(history.mirror.lowest_nm))
 
 
-def _limits(reasons: npt.NDArray[np.int64]) -> dict[str, int]:
-    counted = {reason.name.lower(): _given(reasons, reason) for reason in Reason if reason >= _FIRST_LIMIT}
-    return {reason: count for reason, count in counted.items() if count}
-
-
-def _given(reasons: npt.NDArray[np.int64], reason: Reason) -> int:
-    return int(np.count_nonzero(reasons >> int(reason) & 1))
+def _limits(reasons: Long) -> dict[str, int]:
+    counts = reason_counts(reasons).items()
+    return {reason.name.lower(): count for reason, count in counts if reason >= _FIRST_LIMIT}
 
 
 def _when(run: Run, request: wire.Request) -> float:

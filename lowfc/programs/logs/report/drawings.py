@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import numpy.typing as npt
 
+from lowfc.arrays import Array, Long
 from lowfc.contract.printable import printable
 from lowfc.programs.logs.report.course import actuator_extremes_nm
 from lowfc.programs.logs.report.figures import Report
@@ -17,7 +18,6 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-Double = npt.NDArray[np.float64]
 
 INK, FAINT, OPEN, CLOSED = (COLOURS[name] for name in ("ink", "faint", "open", "closed"))
 _MODES = {"open": OPEN, "closed": CLOSED, "safe": COLOURS["safe"], "idle": FAINT}
@@ -32,10 +32,6 @@ _SECONDS = "seconds since the first step"
 def drawings(report: Report, progress: Callable[[str], None] = lambda name: None) -> dict[str, str]:
     """SVG of every drawing that the log has something for, by name.
 
-    Args:
-        report: What is drawn.
-        progress: Called with the name of each drawing before it is drawn.
-
     Raises:
         ConfigurationError: matplotlib is not installed.
     """
@@ -49,7 +45,6 @@ def drawings(report: Report, progress: Callable[[str], None] = lambda name: None
 
 
 def _overview(figure: "Figure", report: Report) -> bool:
-    """Loop mode as a band, and before and after over time."""
     run = report.run
     if not run.history.steps.sequence.size:
         return False
@@ -94,7 +89,6 @@ def _mode_band(axes: "Axes", report: Report) -> None:
 
 
 def _intervals(figure: "Figure", report: Report) -> bool:
-    """Histograms of the intervals, and how slow the slowest are."""
     found = {name: values * 1e-3 for name, values in intervals_ns(report.run).items() if values.size}
     stages = {name: values * 1e-3 for name, values in latencies_ns(report.run.history).items() if values.size}
     if not found and not stages:
@@ -122,7 +116,7 @@ def _intervals(figure: "Figure", report: Report) -> bool:
     return True
 
 
-def _spread(size: int, most: int = 400) -> npt.NDArray[np.int64]:
+def _spread(size: int, most: int = 400) -> Long:
     """Places in an ordered column, ever closer towards its end."""
     return size - 1 - np.unique(np.geomspace(1, size, min(most, size)).astype(np.int64) - 1)
 
@@ -160,7 +154,6 @@ def _residual(figure: "Figure", report: Report) -> bool:
 
 
 def _spectra(figure: "Figure", report: Report) -> bool:
-    """Power above, and below it the ratio closed over open with the theory."""
     groups = report.figures["spectra"].get("groups")
     if not groups:
         return False
@@ -201,12 +194,11 @@ def _spectra(figure: "Figure", report: Report) -> bool:
     return True
 
 
-def _over(one: Double, other: Double) -> Double:
+def _over(one: Array, other: Array) -> Array:
     return np.divide(one, other, out=np.full_like(one, np.nan), where=other > 0)
 
 
 def _budget(figure: "Figure", report: Report) -> bool:
-    """Bars of the terms, their sum and what it should be, by group of modes."""
     budget = report.figures["error_budget"]
     if "why_not" in budget:
         return False
@@ -237,7 +229,6 @@ def _budget(figure: "Figure", report: Report) -> bool:
 
 
 def _light(figure: "Figure", report: Report) -> bool:
-    """Flux and saturated pixels over time, refused frames as marks."""
     steps, time_s = report.run.history.steps, report.run.step_s
     if not time_s.size:
         return False
@@ -264,7 +255,6 @@ def _light(figure: "Figure", report: Report) -> bool:
 
 
 def _timeline(figure: "Figure", report: Report) -> bool:
-    """Loop modes, requests and events by level."""
     events, requests = report.figures["events"], report.figures["requests"]
     if not events and not report.figures["mode_spans"]:
         return False
@@ -293,7 +283,6 @@ def _timeline(figure: "Figure", report: Report) -> bool:
 
 
 def _stroke(figure: "Figure", report: Report) -> bool:
-    """Largest actuator over time, and where on the mirror it was."""
     history = report.run.history
     mirror = history.mirror
     if not mirror.sequence.size:
@@ -320,8 +309,7 @@ def _stroke(figure: "Figure", report: Report) -> bool:
     return True
 
 
-def _envelope(axes: "Axes", time_s: Double, values: npt.NDArray[np.floating], starts: Any, colour: str) -> None:
-    """Least and largest of each bin as an area, and a line through the middle."""
+def _envelope(axes: "Axes", time_s: Array, values: npt.NDArray[np.floating], starts: Any, colour: str) -> None:
     least, most = np.fmin.reduceat(values, starts), np.fmax.reduceat(values, starts)
     axes.fill_between(time_s, least, most, color=colour, alpha=0.25, linewidth=0)
     axes.plot(time_s, (least + most) / 2, color=colour, linewidth=1.0)

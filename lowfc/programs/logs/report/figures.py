@@ -3,7 +3,6 @@
 import re
 from dataclasses import dataclass
 from datetime import UTC, datetime
-from typing import Any
 
 import numpy as np
 
@@ -19,12 +18,10 @@ from lowfc.programs.logs.report.closed_loop import (
     stretch_figures,
 )
 from lowfc.programs.logs.report.residual import residual_figures
-from lowfc.programs.logs.report.source import Run
+from lowfc.programs.logs.report.source import Figures, Run
 from lowfc.programs.logs.report.timing import timing_figures
 from lowfc.programs.logs.report.verdict import verdict
 from lowfc.programs.logs.survey import recovery_in_words
-
-Figures = dict[str, Any]
 
 _NOT_VERSIONS = ("host", "kernel", "processor", "processors", "cpu_features", "blas", "run", "seed", "git")
 

@@ -19,10 +19,6 @@ NOT_HERE = "not in this log"
 def page(report: Report, progress: Callable[[str], None] = lambda name: None) -> str:
     """HTML that needs no other file and no network.
 
-    Args:
-        report: What it shows.
-        progress: Called with the name of each part before it is made.
-
     Raises:
         ConfigurationError: jinja2 or matplotlib is not installed.
     """

@@ -1,20 +1,15 @@
 """How much of the wavefront is left: rms of each mode, and of tip and tilt on the sky."""
 
-from typing import Any
-
 import numpy as np
-import numpy.typing as npt
 
 from lowfc.adapters.logs.columns import TruthRows
+from lowfc.arrays import Array, Single, Whole
 from lowfc.contract.configuration import Configuration
 from lowfc.control.loop.safety import LoopMode
 from lowfc.optics.chain.zernike import mode_name
 from lowfc.optics.detector.photometry import tilt_nm_per_mas
 from lowfc.programs.logs.report.closed_loop import Stretch, noise_of
-from lowfc.programs.logs.report.source import Run
-
-Figures = dict[str, Any]
-Rows = npt.NDArray[np.intp]
+from lowfc.programs.logs.report.source import Figures, Run
 
 
 def residual_figures(run: Run, stretch: Stretch | None) -> Figures:
@@ -66,7 +61,7 @@ def residual_figures(run: Run, stretch: Stretch | None) -> Figures:
     }
 
 
-def binned_rms(run: Run, most: int = 300) -> dict[str, npt.NDArray[np.float64]]:
+def binned_rms(run: Run, most: int = 300) -> dict[str, Array]:
     """Over time, at most so many bins: `time_s`, and rms of all modes in nm of what the log has of before and after."""
     steps, true = run.history.steps, run.history.true
     columns = {"pseudo_open_loop": steps.pol_nm, "error": steps.error_nm}
@@ -84,25 +79,22 @@ def binned_rms(run: Run, most: int = 300) -> dict[str, npt.NDArray[np.float64]]:
     return found
 
 
-def bin_starts(rows: int, most: int) -> Rows:
+def bin_starts(rows: int, most: int) -> Whole:
     """First row of each of at most so many bins of even width."""
     return np.arange(0, rows, max(1, -(-rows // most)))
 
 
-def _rms(values: npt.NDArray[np.float32], rows: Rows) -> npt.NDArray[np.float64] | None:
-    """Root mean square (modes,) of those rows that hold values; None where none does, or there are none at all."""
+def _rms(values: Single, rows: Whole) -> Array | None:
     found = values[rows] if values.size else values
     known = found[np.isfinite(found).all(axis=1)].astype(float)
     return np.sqrt(np.mean(known**2, axis=0)) if len(known) else None
 
 
-def _at(values: npt.NDArray[np.float64] | None, place: int) -> float | None:
+def _at(values: Array | None, place: int) -> float | None:
     return float(values[place]) if values is not None else None
 
 
-def _tilt_mas(
-    values: npt.NDArray[np.float64] | None, noll: tuple[int, ...], configuration: Configuration | None
-) -> Figures | None:
+def _tilt_mas(values: Array | None, noll: tuple[int, ...], configuration: Configuration | None) -> Figures | None:
     """Tip, tilt and both per axis, sqrt((x^2 + y^2) / 2); None without telescope or without the two modes."""
     if values is None or configuration is None or not {2, 3} <= set(noll):
         return None

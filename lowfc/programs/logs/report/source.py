@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -9,10 +10,11 @@ import numpy.typing as npt
 from lowfc.adapters.logs.columns import rows_of
 from lowfc.adapters.logs.history import History, read_history
 from lowfc.adapters.logs.parts import LogFiles, WholeLog
+from lowfc.arrays import Array, Long
 from lowfc.contract.messages import from_timestamp
 
-Whole = npt.NDArray[np.int64]
-Double = npt.NDArray[np.float64]
+Figures = dict[str, Any]
+"""As JSON has them."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -36,12 +38,12 @@ class Run:
     history: History
     laws: tuple[InForce, ...]
 
-    def law_rows(self) -> Whole:
+    def law_rows(self) -> Long:
         """Index of the law of each step; -1 where it is not known."""
         firsts = np.array([law.first for law in self.laws])
         return np.searchsorted(firsts, np.arange(self.history.steps.sequence.size), side="right").astype(np.int64) - 1
 
-    def seconds(self, host_ns: npt.ArrayLike) -> Double:
+    def seconds(self, host_ns: npt.ArrayLike) -> Array:
         """Host times as seconds of frame time since the first step, by the frames that were published then.
 
         In lockstep frame time is simulated; otherwise this only takes off the beginning.
@@ -63,17 +65,13 @@ class Run:
         return int(self.history.steps.time_ns[0]) if self.history.steps.time_ns.size else 0
 
     @property
-    def step_s(self) -> Double:
+    def step_s(self) -> Array:
         """Time of each step since the first one."""
         return np.asarray((self.history.steps.time_ns - self.begun_ns) * 1e-9)
 
 
 def read_run(files: LogFiles, progress: Callable[[int, int], None] | None = None) -> Run:
     """Read a log, whole or not, to its end; what is damaged is left out and told by the history's reader.
-
-    Args:
-        files: of the log.
-        progress: is told now and then how many bytes of how many are read.
 
     Raises:
         DataFileError: this is no log, or it has a calibration that cannot be read.

@@ -1,18 +1,13 @@
 """Rates, jitter and latency of a run, and the frames that got no command."""
 
-from typing import Any
-
 import numpy as np
-import numpy.typing as npt
 
 from lowfc.adapters.logs.columns import STAGES, rows_of
 from lowfc.adapters.logs.history import History
+from lowfc.arrays import Long
 from lowfc.contract.envelope import start_of
 from lowfc.contract.messages import FRAME, Role
-from lowfc.programs.logs.report.source import Run
-
-Whole = npt.NDArray[np.int64]
-Figures = dict[str, Any]
+from lowfc.programs.logs.report.source import Figures, Run
 
 _END_NS = 50_000_000
 """Before the last frame, in which a command may still be on its way when the log ends."""
@@ -32,7 +27,7 @@ def timing_figures(run: Run) -> Figures:
     }
 
 
-def intervals_ns(run: Run) -> dict[str, Whole]:
+def intervals_ns(run: Run) -> dict[str, Long]:
     """Times between frames and between commands, as they were sent; not across a restart of the camera.
 
     There is none between frames where frames were left out of the log.
@@ -44,7 +39,7 @@ def intervals_ns(run: Run) -> dict[str, Whole]:
     return {"frames": frames, "commands": np.diff(run.history.command_publish_ns)}
 
 
-def latencies_ns(history: History) -> dict[str, Whole]:
+def latencies_ns(history: History) -> dict[str, Long]:
     """Durations of the controller's stages, and from the camera's put to the first state of the mirror under it."""
     rows = rows_of(history.frame_sequence, history.mirror.sequence)
     followed = rows >= 0
@@ -52,7 +47,7 @@ def latencies_ns(history: History) -> dict[str, Whole]:
     return {**{stage: history.stages_ns[stage] for stage in STAGES}, FRAME_TO_MIRROR: to_mirror}
 
 
-def percentiles_us(durations_ns: Whole) -> Figures:
+def percentiles_us(durations_ns: Long) -> Figures:
     """Count, percentiles and the longest; None for each where there are no durations."""
     if not durations_ns.size:
         return {"count": 0, **dict.fromkeys([*PERCENTILES, "max"])}

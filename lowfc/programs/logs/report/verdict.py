@@ -1,8 +1,7 @@
 """Whether a run was good, in a few lines that can be read within seconds."""
 
-from typing import Any
-
-Figures = dict[str, Any]
+from lowfc.control.loop.wording import counted
+from lowfc.programs.logs.report.source import Figures
 
 GOOD, LOOK, BAD, UNKNOWN = "good", "look", "bad", "unknown"
 
@@ -36,16 +35,16 @@ def _record(figures: Figures) -> Figures:
     log = figures["log"]
     faults = [f"recording stopped: {log['stopped']}"] if log["stopped"] else []
     if log["damage"]:
-        faults.append(f"{plural(len(log['damage']), 'damaged part')} left out")
+        faults.append(f"{counted(len(log['damage']), 'damaged part')} left out")
     if not log["finished"]:
         faults.append("its end is missing: the recorder did not finish it")
     if log["recovery"]:
         faults.append(log["recovery"])
     if log["messages_lost"]:
-        faults.append(f"{plural(log['messages_lost'], 'message')} lost")
+        faults.append(f"{counted(log['messages_lost'], 'message')} lost")
     if log["steps_left_out"]:
         what = "of another calibration's modes, or with impossible values"
-        faults.append(f"{plural(log['steps_left_out'], 'step')} {what}, left out")
+        faults.append(f"{counted(log['steps_left_out'], 'step')} {what}, left out")
     if faults:
         return _check("log", BAD if log["stopped"] else LOOK, "; ".join(faults))
     if log["messages_lost"] is None:
@@ -105,7 +104,7 @@ def _delay(figures: Figures) -> Figures:
     if late is None or not steps:
         return _check("delay", UNKNOWN, "whether commands came in time is not in this log")
     if late < _MANY_LATE * steps:
-        return _check("delay", GOOD, f"{plural(late, 'command')} late")
+        return _check("delay", GOOD, f"{counted(late, 'command')} late")
     text = f"{late} commands came after the next exposure had begun, and acted a frame later than the law expects"
     return _check("delay", LOOK, text)
 
@@ -114,9 +113,9 @@ def _frames(figures: Figures) -> Figures:
     light = figures["light"]
     faults = []
     if light["frames_refused"]:
-        faults.append(f"{plural(light['frames_refused'], 'frame')} refused ({_listed(light['refused'])})")
+        faults.append(f"{counted(light['frames_refused'], 'frame')} refused ({_listed(light['refused'])})")
     if light["frames_saturated"]:
-        faults.append(f"{plural(light['frames_saturated'], 'frame')} with saturated pixels")
+        faults.append(f"{counted(light['frames_saturated'], 'frame')} with saturated pixels")
     return _check("light", LOOK if faults else GOOD, "; ".join(faults) or "no frame refused, none saturated")
 
 
@@ -140,12 +139,7 @@ def _events(figures: Figures) -> Figures:
         return _check("events", GOOD, "no warning, no error")
     names = _listed({name: sum(one["name"] == name for one in worst) for name in {one["name"] for one in worst}})
     what = "error" if grave else "warning"
-    return _check("events", BAD if grave else LOOK, f"{plural(len(worst), what)}: {names}")
-
-
-def plural(number: int, noun: str) -> str:
-    """Such as "1 frame" and "2 frames"."""
-    return f"{number} {noun}" if number == 1 else f"{number} {noun}s"
+    return _check("events", BAD if grave else LOOK, f"{counted(len(worst), what)}: {names}")
 
 
 def _listed(counts: dict[str, int]) -> str:

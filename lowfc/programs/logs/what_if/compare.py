@@ -4,11 +4,12 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
 from lowfc.adapters.files.factory import detector, equivalent_read_noise_e
+from lowfc.adapters.logs.columns import reason_counts
 from lowfc.adapters.logs.history import read_history
 from lowfc.adapters.logs.reader import LogReader
+from lowfc.arrays import Array, Single
 from lowfc.contract.codecs.calibration_codec import identified
 from lowfc.contract.configuration import Configuration, load
 from lowfc.contract.errors import CalibrationError, ConfigurationError
@@ -25,8 +26,6 @@ from lowfc.programs.logs.what_if.run import LoggedRun
 
 __all__ = ["WhatIf", "render", "wanted", "what_if"]
 
-Single = npt.NDArray[np.float32]
-Double = npt.NDArray[np.float64]
 
 LINEAR_WAVES = 5 * tilt_nm_per_mas(2.0) / 550
 """Rms of a mode up to which the sensor is taken as linear: 5 mas of tilt with 2 m at 550 nm, 0.022 waves."""
@@ -173,7 +172,6 @@ def _calibration(what: WhatIf, config: Configuration | None, run: LoggedRun) -> 
 
 
 def _reconstructed(calibration: Calibration, estimator: str, run: LoggedRun) -> Calibration:
-    """The same I0 and H with another R."""
     path, configuration = run.history.log.path, run.history.configuration
     if configuration is None:
         raise ConfigurationError(f"{path}: has no configuration, so that the noise of a pixel is not known")
@@ -204,7 +202,7 @@ def _one(every: Law, row: int, suffix: str = "") -> dict[str, float]:
     return {f"{key}{suffix}": round(float(getattr(every, key)[row]), 6) for key in LAW_KEYS}
 
 
-def _tilt_mas(run: LoggedRun, columns: dict[str, Double]) -> dict[str, float]:
+def _tilt_mas(run: LoggedRun, columns: dict[str, Array]) -> dict[str, float]:
     """Tilt per axis on the sky, where the log says how large the telescope is."""
     tilts = np.isin(run.calibration.noll, TILTS)
     if run.history.configuration is None or not tilts.any():
@@ -214,7 +212,6 @@ def _tilt_mas(run: LoggedRun, columns: dict[str, Double]) -> dict[str, float]:
 
 
 def _doubts_of_log(run: LoggedRun) -> list[str]:
-    """What of the log makes the figures less sure."""
     found, log = list(run.history.remarks), run.history.log
     if log.damage:
         parts = ", ".join(f"byte {one.position}, {one.why}" for one in log.damage)
@@ -231,11 +228,8 @@ def _doubts_of_log(run: LoggedRun) -> list[str]:
             f"{run.measured_from} it is {run.measured_delay:.2f} in the mean: pseudo-open-loop modes were computed "
             "again with that for every frame"
         )
-    hit = [
-        f"{reason.name.lower()} at {count} frames"
-        for reason in _LIMITS
-        if (count := np.count_nonzero(run.steps.reasons & (1 << reason)))
-    ]
+    counts = reason_counts(run.steps.reasons).items()
+    hit = [f"{reason.name.lower()} at {count} frames" for reason, count in counts if reason in _LIMITS]
     if hit:
         found.append(f"limits acted in the logged run, {', '.join(hit)}; in the what-if only modal limits do")
     cut = np.count_nonzero(run.history.mirror.limits)
@@ -251,7 +245,7 @@ def _doubts_of_log(run: LoggedRun) -> list[str]:
     return found
 
 
-def _doubts_of_range(calibration: Calibration, columns: dict[str, Double]) -> list[str]:
+def _doubts_of_range(calibration: Calibration, columns: dict[str, Array]) -> list[str]:
     limit_nm = LINEAR_WAVES * calibration.wavelength_nm
     largest = np.max([columns[name] for name in ("open", "was", "what_if")], axis=0)
     beyond = [

@@ -9,16 +9,14 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
 from lowfc.adapters.files.factory import settings
+from lowfc.arrays import Single
 from lowfc.contract.configuration import Configuration
 from lowfc.contract.errors import ConfigurationError, nearest
 from lowfc.control.calibration.calibration import ESTIMATORS
 from lowfc.control.laws.law import Law
 from lowfc.control.laws.what_if import Controller
-
-Single = npt.NDArray[np.float32]
 
 TILTS = (2, 3)
 LAW_KEYS = ("gain", "leak", "limit_nm")

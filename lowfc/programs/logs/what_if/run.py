@@ -1,15 +1,14 @@
 """The logged run as a what-if needs it: exposures, the delay as measured, what each of them saw of the commands."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import fields
 
 import numpy as np
-import numpy.typing as npt
 
 from lowfc.adapters.files.factory import settings
-from lowfc.adapters.logs.columns import Sequences, Steps
 from lowfc.adapters.logs.history import History
+from lowfc.arrays import Mask, Sequences, Single
 from lowfc.contract.codecs.codec import decode_frame
+from lowfc.contract.codecs.law_codec import gains_of
 from lowfc.contract.errors import DataFileError
 from lowfc.contract.messages import FRAME, floats, wire
 from lowfc.control.calibration.calibration import Calibration
@@ -27,10 +26,6 @@ from lowfc.control.laws.what_if import (
 from lowfc.control.loop.additions import PlayTable
 from lowfc.control.loop.estimator import Estimator
 from lowfc.control.loop.safety import LoopMode
-
-Single = npt.NDArray[np.float32]
-Double = npt.NDArray[np.float64]
-Rows = npt.NDArray[np.bool_]
 
 DELAY_DIFFERS = 0.05
 """Frames by which a measured delay must differ from the controller's, or a whole number, to be another one."""
@@ -67,10 +62,10 @@ class LoggedRun:
             raise DataFileError(f"{history.log.path}: too few frames that a calibrated controller used are in it")
         rows[: int(np.argmax(used))] = False  # of the disturbance before nothing is known
         self.calibration = history.calibration
-        self.steps = Steps(*(getattr(history.steps, part.name)[rows] for part in fields(Steps)))
+        self.steps = history.steps.at(rows)
         true = history.true
         self.true_nm = None if true is None else (true.disturbance_nm[rows], true.residual_nm[rows])
-        self.used: Rows = used[rows]
+        self.used: Mask = used[rows]
         self.missing = missing_before(self.steps.sequence)
         self.played = _played(self.steps.sequence, history.requests, history.published.plays)
         self.law, self.controller_delay = _law_and_delay(history, self.calibration)
@@ -78,7 +73,7 @@ class LoggedRun:
         weights = delay_weights(self.controller_delay).astype(np.float32)
         believed_nm = self.steps.error_nm - self.steps.pol_nm
         reckoned_nm = seen_nm(weights, self.steps.command_nm, self.missing, believed_nm[0])
-        self.torn: Rows = np.abs(reckoned_nm - believed_nm).max(axis=1) > _TORN_NM
+        self.torn: Mask = np.abs(reckoned_nm - believed_nm).max(axis=1) > _TORN_NM
 
         self.measured_delay, self.measured_from = self._measured_delay()
         self.delay_frames, self.weights, self.seen_nm = self.controller_delay, weights, believed_nm
@@ -89,7 +84,7 @@ class LoggedRun:
             self.weights = delay_weights(self.delay_frames).astype(np.float32)
             self.seen_nm = seen_nm(self.weights, self.steps.command_nm, self.missing, believed_nm[0])
 
-    def rows_to_compare(self, laws: list[Law], usable: Rows) -> tuple[Rows, int, str]:
+    def rows_to_compare(self, laws: list[Law], usable: Mask) -> tuple[Mask, int, str]:
         """Which of the usable steps to compare runs at, the frames in which these laws settle, and in words.
 
         Raises:
@@ -149,7 +144,7 @@ class LoggedRun:
         return delay, "the times of frames and mirror"
 
 
-def _played(sequence: Sequences, requests: Sequence[wire.Request], plays: Mapping[str, PlayTable]) -> Rows:
+def _played(sequence: Sequences, requests: Sequence[wire.Request], plays: Mapping[str, PlayTable]) -> Mask:
     rows = np.zeros(sequence.shape, np.bool_)
     for request in requests:
         if request.name == "play" and request.accepted:
@@ -164,8 +159,7 @@ def _played(sequence: Sequences, requests: Sequence[wire.Request], plays: Mappin
 def _law_and_delay(history: History, calibration: Calibration) -> tuple[Law, float]:
     state = history.controller
     if state is not None and len(state.gain) == len(calibration.noll):
-        law = Law(*(np.array(values, np.float32) for values in (state.gain, state.leak, state.limit_nm)))
-        return law, state.delay_frames
+        return gains_of(state), state.delay_frames
     if history.configuration is None:
         raise DataFileError(
             f"{history.log.path}: its gains and delay are not known: no state of the controller is there"

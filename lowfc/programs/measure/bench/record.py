@@ -120,7 +120,6 @@ def render(figures: dict[str, Any]) -> str:
 
 
 def _one_rate(rate_hz: float, seconds: float, folder: Path) -> dict[str, Any]:
-    """Figures of one recorder process at one rate."""
     from lowfc.adapters.bus.run import new_run_id, open_run
     from lowfc.programs.measure.traffic import Traffic
 
@@ -166,7 +165,6 @@ def _one_rate(rate_hz: float, seconds: float, folder: Path) -> dict[str, Any]:
 
 @contextlib.contextmanager
 def _recorder(run: "Run", folder: Path) -> Iterator["subprocess.Popen[str]"]:
-    """The process of `lowfc record`; it ends with this one."""
     words = ["record", "--run", run.run_id, "--folder", str(folder), "--json"]
     process = subprocess.Popen(  # noqa: S603  # our own program
         [sys.executable, "-P", "-m", "lowfc", *words],

@@ -14,12 +14,24 @@ from threadpoolctl import threadpool_limits
 
 from lowfc.adapters.files.sensors import sensor_named
 from lowfc.adapters.files.twin_cache import load_or_build
+from lowfc.adapters.process.terminal import Json
+from lowfc.arrays import Array
 from lowfc.optics.chain.band import gauss_legendre, monochromatic
 from lowfc.optics.chain.sensor import image, pupil_radii
 from lowfc.optics.chain.zernike import NOLLS_20, zernikes
 from lowfc.optics.twin.twin import ACCURATE, FAST, Evaluator, node_radii
+from lowfc.programs.cli.output import put
 
 WAVEFRONTS = 20
+
+
+def twin(as_json: Json = False) -> None:
+    """Time the real-time twin against the full optical chain, both on one thread, in the same run.
+
+    Example: lowfc bench twin --json
+    """
+    figures = bench_twin()
+    put(figures, render(figures), as_json=as_json)
 
 
 def bench_twin(
@@ -32,12 +44,6 @@ def bench_twin(
 
     Times are medians of one frame, from the phase to the binned image, the two models in turn. `relative_l2` is the
     worst of 20 random wavefronts: radial degrees 1 to 5 within the literal bounds of Sect. 3.1.
-
-    Args:
-        sensor: Its name, or that of a layout.
-        seconds: For how long each model is timed.
-        progress: Called with the name of each case.
-        cache_dir: Of the twins; the usual one when None.
     """
     optics = sensor_named(sensor)
     nm = optics.wavelength_nm
@@ -81,7 +87,7 @@ def bench_twin(
     return {**top, "sensor": sensor, "wavefronts": WAVEFRONTS, "cases": results, "host": host}
 
 
-def random_coefficients_waves(rng: np.random.Generator, count: int) -> NDArray[np.float64]:
+def random_coefficients_waves(rng: np.random.Generator, count: int) -> Array:
     """Random wavefronts (count, 20), Noll 2 to 21, uniform within 0.04 waves rms for n = 1, 2 and 0.016 above."""
     bounds = np.where(np.array(NOLLS_20) <= 6, 0.04, 0.016)
     return np.asarray(rng.uniform(-1.0, 1.0, (count, bounds.size)) * bounds)

@@ -105,7 +105,6 @@ def _configuration(file: Path | None, rate: float | None, camera: Camera, *, pla
 
 
 def _measure(asked: "Asked") -> dict[str, Any]:
-    """Run the loop and what it is set against."""
     from rich.console import Console
 
     from lowfc.adapters.process.clock import sharpen_sleep
@@ -142,7 +141,6 @@ def _measure(asked: "Asked") -> dict[str, Any]:
 
 
 def _of_log(names: list[Path]) -> dict[str, Any]:
-    """The same figures of a log."""
     from rich.console import Console
 
     from lowfc.adapters.logs.parts import the_one, titled

@@ -9,14 +9,10 @@ import numpy.typing as npt
 
 from lowfc.adapters.logs.columns import STAGES as TIMED
 from lowfc.adapters.logs.columns import rows_of
+from lowfc.arrays import Array, Long, Mask, Sequences
 from lowfc.contract.messages import FRAME, wire
 from lowfc.control.loop.safety import Reason
 from lowfc.programs.launch.watch import topic_count
-
-Whole = npt.NDArray[np.int64]
-Sequences = npt.NDArray[np.uint64]
-Double = npt.NDArray[np.float64]
-Flags = npt.NDArray[np.bool_]
 
 WARM_UP_S = 0.5
 """Frames put so soon after the first one are left out."""
@@ -82,17 +78,17 @@ class Frames:
         spans_us: of `SPANS`, NaN where it is not known; those from the moment due only where there was a schedule.
     """
 
-    put_ns: Whole
-    commanded: Flags
-    spans_us: Mapping[str, Double]
+    put_ns: Long
+    commanded: Mask
+    spans_us: Mapping[str, Array]
 
 
 def join(
     sequence: Sequences,
-    put_ns: Whole,
-    due_ns: Whole | None,
-    timing: tuple[Sequences, Mapping[str, Whole]],
-    mirror: tuple[Sequences, Whole],
+    put_ns: Long,
+    due_ns: Long | None,
+    timing: tuple[Sequences, Mapping[str, Long]],
+    mirror: tuple[Sequences, Long],
     commanded: Sequences | None = None,
 ) -> Frames:
     """Frames that were sent, and what is known of each.
@@ -137,12 +133,12 @@ def percentiles(values: npt.NDArray[Any]) -> dict[str, float] | None:
     return {name: round(float(known[place]), 3) for name, place in places.items()}
 
 
-def edges_us() -> Double:
+def edges_us() -> Array:
     """Edges of the histograms' bins; what lies beyond them is in the outermost bins."""
     return np.asarray(_LOWEST_US * 2.0 ** (np.arange(_OCTAVES * _BINS_PER_OCTAVE + 1) / _BINS_PER_OCTAVE))
 
 
-def histogram(values_us: Double) -> Whole:
+def histogram(values_us: Array) -> Long:
     """Counts in the bins of `edges_us`."""
     edges = edges_us()
     known = values_us[np.isfinite(values_us)]
@@ -192,7 +188,7 @@ def controllers_account(health: wire.Health) -> dict[str, Any]:
     }
 
 
-def _over_time(put_ns: Whole, command_us: Double) -> dict[str, list[float]]:
+def _over_time(put_ns: Long, command_us: Array) -> dict[str, list[float]]:
     """Median and largest in each of up to `_MOMENTS` equal parts, by the time of the first frame of each."""
     known = np.flatnonzero(np.isfinite(command_us))
     parts = np.array_split(known, min(_MOMENTS, known.size)) if known.size else []

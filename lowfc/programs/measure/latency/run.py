@@ -45,17 +45,7 @@ _LAST_WORDS_S = 0.1
 
 @dataclass(frozen=True, slots=True)
 class Asked:
-    """What to run.
-
-    Attributes:
-        config: of the loop; its camera.rate_hz is the schedule's.
-        duration_s: of each repeat of the loop, after the warm-up; what it is set against takes half as long each.
-        repeats: number of them.
-        free_running: without a schedule.
-        simulated: with the simulated camera instead of frames made beforehand.
-        record: with the recorder.
-        view: with a view served for a browser.
-    """
+    """What to run: the options of `lowfc latency`.."""
 
     config: Configuration
     duration_s: float
@@ -86,11 +76,6 @@ def prepared(config: Configuration, fill: Callable[[Configuration, Run], None] =
 
 def run_repeats(asked: Asked, run: Run, progress: Callable[[str], None]) -> list[dict[str, Any]]:
     """Measure; figures of each repeat.
-
-    Args:
-        asked: what to measure.
-        run: of `prepared`.
-        progress: told what begins now, twice a repeat.
 
     Returns:
         For each repeat `repeat_figures` and `controllers_account`; granted, refused, logs, messages_lost and
@@ -187,7 +172,6 @@ def _children(asked: Asked, run: Run) -> list[Child]:
 
 
 def _alone(asked: Asked, run: Run) -> dict[str, Any]:
-    """One repeat of what the loop is set against."""
     words = [*_shared(run), "--seconds", str(asked.duration_s / 2), *["--free-running"] * asked.free_running]
     children = [
         program(f"echo ({verb})", ["-m", echo.__name__, verb, *words], run.path / f"echo-{verb}.stderr")

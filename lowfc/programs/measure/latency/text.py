@@ -119,7 +119,6 @@ def _remarks(figures: Mapping[str, Any]) -> list[str]:
 
 
 def _what(figures: Mapping[str, Any]) -> str:
-    """One line about the run."""
     settings, count = figures["settings"], len(figures["repeats"])
     if settings.get("log"):
         return f"{Path(settings['log']).name}, {figures['rate_hz']:.1f} Hz"

@@ -11,7 +11,7 @@ from lowfc.design.trials import residual_pv
 from lowfc.optics.chain.coronagraph import Wedge, contrast, contrast_curve, mean_contrast
 from lowfc.optics.chain.zernike import NOLLS_14
 from lowfc.programs.paper import plots
-from lowfc.programs.paper.cases import Case, Context, Prepared
+from lowfc.programs.paper.cases import Case, Context, Prepared, Row, assuming
 from lowfc.programs.paper.figures.exposure import (
     BRIGHT,
     ESTIMATORS,
@@ -24,7 +24,6 @@ from lowfc.programs.paper.figures.exposure import (
     estimates_nm,
     exposed_e,
 )
-from lowfc.programs.paper.rows import Row, assuming
 from lowfc.programs.paper.tables.reconstruction import fits, mean_and_error
 
 COMAS = (7, 8)
@@ -41,13 +40,7 @@ _PAPER_PV_WAVES = 6e-3
 
 @dataclass(frozen=True, eq=False)
 class _Aberrated:
-    """One aberration, and what the estimators leave of it.
-
-    Attributes:
-        ready: The sensor.
-        truth_nm: (modes,) what was put in.
-        residuals_nm: (realisations, modes) of each estimator.
-    """
+    """One aberration (modes,), and what each estimator leaves of it (realisations, modes)."""
 
     ready: Prepared
     truth_nm: Array

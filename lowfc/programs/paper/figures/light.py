@@ -13,8 +13,7 @@ from lowfc.optics.chain.relay import ApertureMask, PupilImage
 from lowfc.optics.chain.zernike import mode_name
 from lowfc.optics.detector.photometry import electrons
 from lowfc.programs.paper import plots
-from lowfc.programs.paper.cases import Case, Context, Prepared
-from lowfc.programs.paper.rows import Row, assuming
+from lowfc.programs.paper.cases import Case, Context, Prepared, Row, assuming
 from lowfc.programs.paper.tables.photometry import PAPER_PEAK, PAPER_SIGNAL, differential, tilt_signal
 from lowfc.programs.paper.tables.pointing import PAPER_FOCAL_MASK, PAPER_PUPIL, PAPER_RELAY_MASK
 from lowfc.programs.paper.tables.tables import PAPER_TABLE2

@@ -11,7 +11,7 @@ from lowfc.design.estimators import iterated
 from lowfc.design.trials import LITERAL_WAVES, bounds_waves, expected_r_squared, r_squared, random_wavefronts
 from lowfc.optics.chain.zernike import NOLLS_14, noll_to_nm
 from lowfc.programs.paper import plots
-from lowfc.programs.paper.cases import Case, Context, Prepared
+from lowfc.programs.paper.cases import Case, Context, Prepared, Row, assuming
 from lowfc.programs.paper.figures.exposure import (
     BRIGHT,
     FULL_CHAIN,
@@ -22,7 +22,6 @@ from lowfc.programs.paper.figures.exposure import (
     estimates_nm,
     exposed_e,
 )
-from lowfc.programs.paper.rows import Row, assuming
 from lowfc.programs.paper.tables.reconstruction import ITERATIONS, Ensemble, Input, ensemble, fits, inputs, label
 
 DEGREES = np.array([noll_to_nm(noll)[0] for noll in NOLLS_14])
@@ -175,7 +174,6 @@ def linear_range(deviation: Array) -> float:
 
 @lru_cache(maxsize=8)
 def _one_wavefront(context: Context, name: str, literal: bool) -> tuple[Array, dict[str, Array]]:
-    """A random wavefront (modes,) in waves, and its estimates."""
     ready = context.prepared(name)
     wavelength_nm, matched = ready.sensor.wavelength_nm, _matched(ready)
     low, high = LITERAL_WAVES if literal else (matched.low, matched.high)

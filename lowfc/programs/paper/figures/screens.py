@@ -10,7 +10,7 @@ from lowfc.optics.chain.pupil import circle
 from lowfc.optics.chain.screen import kolmogorov
 from lowfc.optics.chain.sensor import image
 from lowfc.programs.paper import plots
-from lowfc.programs.paper.cases import Case, Context, Prepared
+from lowfc.programs.paper.cases import Case, Context, Prepared, Row, assuming
 from lowfc.programs.paper.figures.exposure import (
     BRIGHT,
     FULL_CHAIN,
@@ -21,7 +21,6 @@ from lowfc.programs.paper.figures.exposure import (
     estimates_nm,
     exposed_e,
 )
-from lowfc.programs.paper.rows import Row, assuming
 from lowfc.programs.paper.tables.reconstruction import fits, mean_and_error
 
 SCREENS = 12

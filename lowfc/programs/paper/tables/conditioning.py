@@ -14,8 +14,7 @@ from lowfc.optics.chain import sam as sams
 from lowfc.optics.chain.relay import ApertureMask
 from lowfc.optics.chain.sensor import Sensor
 from lowfc.optics.detector.photometry import electrons
-from lowfc.programs.paper.cases import Context, Prepared, sparse_apertures
-from lowfc.programs.paper.rows import Row
+from lowfc.programs.paper.cases import Context, Prepared, Row, sparse_apertures
 from lowfc.programs.paper.tables.pointing import NM_PER_MAS
 
 OTHERS = ("clowfs", "zwfs")

@@ -15,8 +15,7 @@ from lowfc.optics.chain.relay import Defocus, fresnel_distance
 from lowfc.optics.chain.sensor import reference
 from lowfc.optics.chain.zernike import NOLLS_14
 from lowfc.optics.detector.photometry import electrons
-from lowfc.programs.paper.cases import Context, Prepared
-from lowfc.programs.paper.rows import Row
+from lowfc.programs.paper.cases import Context, Prepared, Row
 from lowfc.programs.paper.tables import reconstruction
 from lowfc.programs.paper.tables.pointing import (
     NM_PER_MAS,

@@ -14,8 +14,7 @@ from lowfc.design.paper import STAR, TABLE4_EXPOSURE_S, TABLE4_MAS, TABLE4_READ_
 from lowfc.design.trials import noisy_e
 from lowfc.optics.chain.relay import ApertureMask
 from lowfc.optics.detector.photometry import electrons, tilt_nm_per_mas
-from lowfc.programs.paper.cases import Context, Prepared, sparse_apertures
-from lowfc.programs.paper.rows import Row
+from lowfc.programs.paper.cases import Context, Prepared, Row, sparse_apertures
 
 OTHERS = ("clowfs", "clowfs:1", "zwfs")
 """Sensors besides the shipped sparse apertures."""
@@ -39,13 +38,7 @@ CENTRED = "paper: 'the estimate distribution is centered on the true value'; pre
 
 @dataclass(frozen=True)
 class Exposure:
-    """How much light the sensor gets.
-
-    Attributes:
-        name: Whose figure it is.
-        scale_e: Electrons of the open circle's light.
-        assumption: Where it comes from.
-    """
+    """Electrons of the open circle's light that the sensor gets, whose figure it is, and where it comes from."""
 
     name: str
     scale_e: float

@@ -11,8 +11,7 @@ from lowfc.design.estimators import KINDS, Fit, estimate, iterated
 from lowfc.design.fisher import cramer_rao, variance_e
 from lowfc.design.paper import MODES, PEAK_E, TABLE3_READ_NOISE_E, TABLE3_WAVES
 from lowfc.optics.chain.zernike import NOLLS_20
-from lowfc.programs.paper.cases import DEFAULT_SAM, Context, Prepared, sparse_apertures
-from lowfc.programs.paper.rows import Row
+from lowfc.programs.paper.cases import DEFAULT_SAM, Context, Prepared, Row, sparse_apertures
 
 OTHERS = ("bowtie", f"bowtie:{DEFAULT_SAM}", "clowfs", "zwfs", "bar", "lyot", "aplc")
 """Sensors besides the shipped sparse apertures."""
@@ -50,14 +49,7 @@ ESTIMATORS = ("pinv", *(label("weighted", iterations) for iterations in ITERATIO
 
 @dataclass(frozen=True)
 class Input:
-    """How large the random wavefronts are.
-
-    Attributes:
-        name: Of the reading of Sect. 3.1.
-        low: Bound for radial degrees 1 and 2, in waves rms.
-        high: Bound above.
-        assumption: The reading in words.
-    """
+    """A reading of Sect. 3.1: bounds of random wavefronts for radial degrees 1 and 2, and above, in waves rms."""
 
     name: str
     low: float
@@ -119,15 +111,7 @@ def fits(sensor: Prepared, modes: int, nuisances: bool = False) -> dict[str, Fit
 
 
 def ensemble(context: Context, name: str, modes: int, wavefronts: Input, nuisances: bool = False) -> Ensemble:
-    """Draw the wavefronts, image them with the full chain and noise, and estimate them in every way.
-
-    Args:
-        context: Trials, seed, threads.
-        name: Of the sensor.
-        modes: In the wavefronts and in the fit.
-        wavefronts: How large they are.
-        nuisances: Whether flux and shear are fitted along, too.
-    """
+    """Draw the wavefronts, image them with the full chain and noise, and estimate them in every way."""
     sensor = context.prepared(name)
     linear, light_e, wavelength_nm = fits(sensor, modes, nuisances), scale_e(sensor), sensor.sensor.wavelength_nm
     rng = context.rng("table3", modes, wavefronts.name)

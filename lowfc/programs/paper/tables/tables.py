@@ -7,8 +7,7 @@ import numpy as np
 from lowfc.adapters.files.layouts import load_layout
 from lowfc.contract.configuration import SensorSection
 from lowfc.optics.chain.zernike import NOLLS_14, mode_name
-from lowfc.programs.paper.cases import Case, Context
-from lowfc.programs.paper.rows import Row
+from lowfc.programs.paper.cases import Case, Context, Row
 from lowfc.programs.paper.tables.conditioning import conditioning
 from lowfc.programs.paper.tables.photometry import defocus_waves, differential, photometry
 from lowfc.programs.paper.tables.pointing import table4

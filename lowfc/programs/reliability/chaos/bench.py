@@ -25,7 +25,7 @@ from lowfc.adapters.process.clock import HostClock
 from lowfc.client import Client
 from lowfc.contract.configuration import Configuration
 from lowfc.contract.errors import LowfcError
-from lowfc.contract.messages import HEALTH, STEP, TRUTH, Role, wire
+from lowfc.contract.messages import HEALTH, STEP, TRUTH, Role, topic_of, wire
 from lowfc.programs.launch.processes import program, start_all
 from lowfc.programs.launch.sim_loop import children_of, prepare
 
@@ -126,8 +126,8 @@ class ChaosBench:
         self._started += self.children.values()
         start_all(self._started)
         self.bus = ZenohBus(self.run.links, Role.LAUNCHER, HostClock())
-        for topic, receive in ((HEALTH, self._health), (STEP, self._step), (TRUTH, self._truth)):
-            self.bus.subscribe(topic, receive)
+        for topic in (HEALTH, STEP, TRUTH):
+            self.bus.subscribe(topic, self._receive)
         self.wait(lambda: self._steps > 0, "the first frame", START_S)
         self.settled(_QUIET_FRAMES)
         self.mark("quiet")
@@ -169,8 +169,7 @@ class ChaosBench:
     def view(self) -> None:
         """Start a viewer that writes into a file."""
         words = ["-m", "lowfc", "view", "--run", self.run.run_id, "--save", str(self.folder / "view.rrd")]
-        self._start(program(Role.VIEWER, words, self.folder / f"{Role.VIEWER}.stderr"))
-        self.ready(Role.VIEWER)
+        self._start(program(Role.VIEWER, words, self.folder / f"{Role.VIEWER}.stderr"), ready=True)
 
     def kill(self, name: str) -> None:
         """Kill -9."""
@@ -196,16 +195,10 @@ class ChaosBench:
         assert process is not None  # noqa: S101  # it was started
         process.send_signal(number)
 
-    def restart(self, name: str, command: list[str] | None = None) -> None:
-        """Start a process that has ended anew, with its command line or another."""
+    def restart(self, name: str, command: list[str] | None = None, *, ready: bool = True) -> None:
+        """Start a process that has ended anew, with its command line or another; wait until it reports to be ready."""
         stderr = self.folder / f"{name}-{next(self._numbers)}.stderr"
-        self._start(Child(name, command or self.children[name].command, stderr))
-
-    def ready(self, name: str) -> None:
-        """Wait until a process that was started anew reports that it is ready."""
-        self.wait(
-            lambda: name in self.health and self.health[name].state in ("ready", "running"), f"{name} started anew"
-        )
+        self._start(Child(name, command or self.children[name].command, stderr), ready=ready)
 
     def ends(self, name: str, status: int) -> str:
         """Wait until a process ends by itself, as the case means it to; return the last that it wrote.
@@ -240,37 +233,35 @@ class ChaosBench:
             self.left.alive = _alive({child.process.pid for child in self._started if child.process is not None})
             self.run.remove()
 
-    def _start(self, child: Child) -> None:
-        self.children[child.name] = child
-        self.health.pop(child.name, None)
+    def _start(self, child: Child, *, ready: bool) -> None:
+        name = child.name
+        self.children[name] = child
+        self.health.pop(name, None)
         child.start()
         self._started.append(child)
+        if ready:
+            self.wait(lambda: name in self.health and self.health[name].state in ("ready", "running"), f"a new {name}")
 
     def _note_end(self, child: Child, after_s: float, *, meant: bool) -> None:
-        """Note how a process ended, once."""
         if id(child) not in self._noted:
             self._noted.add(id(child))
             self.left.ended.append(Ended(child.name, child.status or 0, after_s, meant))
 
-    def _health(self, sample: Sample) -> None:
+    def _receive(self, sample: Sample) -> None:
+        topic = topic_of(sample.key)
         with contextlib.suppress(DecodeError):  # some cases send junk
-            health = wire.Health.FromString(sample.payload)
-            self.health[health.process] = health
-
-    def _step(self, sample: Sample) -> None:
-        with contextlib.suppress(DecodeError):
-            step = wire.ControlStep.FromString(sample.payload)
-            self._steps += 1
-            self.newest_frame = step.frame_sequence
-            self.left.mode = step.mode
-            if step.mode != wire.LOOP_MODE_CLOSED:
-                self._good = 0
-            elif step.error_nm:
-                self._good += 1
-
-    def _truth(self, sample: Sample) -> None:
-        with contextlib.suppress(DecodeError):
-            self.left.residuals_nm.append(wire.Truth.FromString(sample.payload).residual_rms_nm)
+            message: Any = topic.message.FromString(sample.payload)
+            if topic is HEALTH:
+                self.health[message.process] = message
+            elif topic is TRUTH:
+                self.left.residuals_nm.append(message.residual_rms_nm)
+            else:
+                self._steps += 1
+                self.newest_frame, self.left.mode = message.frame_sequence, message.mode
+                if message.mode != wire.LOOP_MODE_CLOSED:
+                    self._good = 0
+                elif message.error_nm:
+                    self._good += 1
 
 
 def _alive(sessions: set[int]) -> list[str]:

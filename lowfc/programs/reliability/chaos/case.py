@@ -70,7 +70,7 @@ class Case:
 REGISTERED: dict[str, Case] = {}
 
 
-def case(name: str, group: str, sentence: str, **more: Any) -> Callable[[Act], Act]:
+def case(group: str, name: str, sentence: str, **more: Any) -> Callable[[Act], Act]:
     """Register a function as what a case does; `more` are the case's other attributes."""
 
     def register(act: Act) -> Act:

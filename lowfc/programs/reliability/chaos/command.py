@@ -71,13 +71,7 @@ def chaos(
 
 
 def run_case(case: "Case", seed: int, keep: Path | None) -> dict[str, Any]:
-    """Run one case in a folder of its own, and judge it.
-
-    Args:
-        case: what is done.
-        seed: of everything that is random.
-        keep: folder for its log; None to keep only that of a case that fails.
-    """
+    """Run one case in a folder of its own, and judge it; without `keep` only the log of one that fails stays."""
     row: dict[str, Any] = {"name": case.name, "group": case.group, "sentence": case.sentence, "seconds": 0.0}
     row |= {"passed": False, "skipped": case.lacks() or None, "findings": {}, "figures": {}}
     if row["skipped"]:

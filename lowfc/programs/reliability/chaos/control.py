@@ -17,11 +17,13 @@ from lowfc.programs.reliability.chaos.bench import CaseFailedError, ChaosBench
 from lowfc.programs.reliability.chaos.case import LOST, WHILE_FRAMES, End, case, no_mounts, no_other_clock, read_only
 from lowfc.programs.reliability.chaos.processes import kill_and_restart
 
+control_case = partial(case, "control")
+
 JUST_BELOW = 0.9
 _UNKEPT = ("SAFED", "LATCH_FAILED")
 
 
-@case("gain", "control", "the highest gain that is granted, then one above, refused")
+@control_case("gain", "the highest gain that is granted, then one above, refused")
 def _highest_gain(bench: ChaosBench) -> None:
     client, limiting = bench.client(), limiting_gain(settings(bench.config).delay_frames)
     try:
@@ -45,12 +47,10 @@ def _load_and_close(client: Client, calibration: Calibration) -> None:
     client.close_loop()
 
 
-@case(
+@control_case(
     "reversed-calibration",
-    "control",
     "a calibration of the right shape that drives the loop away; the operator ends it by `safe`",
     expected=("SAFED",),
-    allowed=("SAFED",),
 )
 def _reversed_calibration(bench: ChaosBench) -> None:
     client, good = bench.client(), _good(bench)
@@ -63,9 +63,8 @@ def _reversed_calibration(bench: ChaosBench) -> None:
     _load_and_close(client, good)
 
 
-@case(
+@control_case(
     "foreign-calibration",
-    "control",
     "a calibration for frames of another size",
     expected=("FRAMES_REFUSED frames refused: WRONG_SIZE",),
 )
@@ -88,9 +87,8 @@ def _foreign_calibration(bench: ChaosBench) -> None:
     _load_and_close(client, good)
 
 
-@case(
+@control_case(
     "damaged-calibration",
-    "control",
     "the controller is started with NaN in its file, which it refuses, then with a good one",
     expected=("STARTED controller",),
     statuses={Role.CONTROLLER: 2},
@@ -103,20 +101,17 @@ def _damaged_calibration(bench: ChaosBench) -> None:
     path.write_bytes(content)
     bench.kill(Role.CONTROLLER)
     good = bench.children[Role.CONTROLLER].command
-    bench.restart(Role.CONTROLLER, [*good[:-1], str(path)])
+    bench.restart(Role.CONTROLLER, [*good[:-1], str(path)], ready=False)
     stderr_tail = bench.ends(Role.CONTROLLER, 2)
     if "damaged" not in stderr_tail:
         raise CaseFailedError(f"the controller should have named the damaged calibration, got: {stderr_tail}")
     bench.restart(Role.CONTROLLER, good)
-    bench.ready(Role.CONTROLLER)
 
 
-@case(
+@control_case(
     "safed-restart",
-    "control",
     "safe mode, then the controller is killed and started anew",
     expected=("SAFED",),
-    allowed=("SAFED",),
     end=End.SAFE,
 )
 def _restart_in_safe_mode(bench: ChaosBench) -> None:
@@ -131,17 +126,10 @@ def _safe_and_kill(bench: ChaosBench, client: Client) -> None:
     bench.kill(Role.CONTROLLER)
 
 
-def _start_anew(bench: ChaosBench) -> None:
-    bench.restart(Role.CONTROLLER)
-    bench.ready(Role.CONTROLLER)
-
-
-@case(
+@control_case(
     "safe-without-directory",
-    "control",
     "safe while the run's directory is gone; then the controller is killed and started anew",
     expected=_UNKEPT,
-    allowed=_UNKEPT,
     end=End.SAFE,
 )
 def _safe_without_directory(bench: ChaosBench) -> None:
@@ -151,22 +139,20 @@ def _safe_without_directory(bench: ChaosBench) -> None:
         _safe_and_kill(bench, client)
     finally:
         aside.rename(path)
-    _start_anew(bench)
+    bench.restart(Role.CONTROLLER)
 
 
-@case(
+@control_case(
     "safe-read-only",
-    "control",
     "safe while the run's directory cannot be written; then the controller is killed and started anew",
     expected=_UNKEPT,
-    allowed=_UNKEPT,
     end=End.SAFE,
     lacks=no_mounts,
 )
 def _safe_in_read_only_directory(bench: ChaosBench) -> None:
     with read_only(bench.run.path):
         _safe_and_kill(bench, bench.client())
-    _start_anew(bench)
+    bench.restart(Role.CONTROLLER)
 
 
 def _other_clock(bench: ChaosBench, seconds: int) -> None:
@@ -175,22 +161,19 @@ def _other_clock(bench: ChaosBench, seconds: int) -> None:
     for command in (["unshare", "--time", "--monotonic", str(seconds), *usual], usual):
         bench.kill(Role.CAMERA)
         bench.restart(Role.CAMERA, command)
-        bench.ready(Role.CAMERA)
         if command is not usual:
             bench.frames(WHILE_FRAMES)
 
 
-case(
+control_case(
     "clock-ahead",
-    "control",
     "a camera whose clock is an hour ahead takes the place of the camera",
     expected=("CAMERA_RESTARTED",),
     allowed=LOST,
     lacks=no_other_clock,
 )(partial(_other_clock, seconds=3600))
-case(
+control_case(
     "clock-behind",
-    "control",
     "a camera whose clock is an hour behind, until the camera is back",
     allowed=LOST,
     lacks=no_other_clock,

@@ -4,6 +4,7 @@ import contextlib
 import resource
 import signal
 from collections.abc import Iterator
+from functools import partial
 
 from lowfc.contract.messages import Role
 from lowfc.programs.reliability.chaos.bench import CaseFailedError, ChaosBench
@@ -13,6 +14,8 @@ from lowfc.programs.reliability.chaos.processes import STALL_S, compare
 ROOM_BYTES = 3_000_000
 """What the log may still grow before its disk is full: about a second of the loop."""
 SLOW_S = 3.0
+
+disk_case = partial(case, "disk")
 
 # The recorder itself, with a file that takes its time, and reports it as a slow one would.
 _SLOW = """
@@ -35,9 +38,8 @@ main()
 """
 
 
-@case(
+@disk_case(
     "disk-full",
-    "disk",
     "the disk fills up",
     allowed=("RECORDING_FAILED", "MESSAGES_LOST"),
     statuses={Role.RECORDER: 1},
@@ -51,9 +53,8 @@ def _full(bench: ChaosBench) -> None:
     bench.wait(lambda: bool(bench.health[Role.RECORDER].recording.failure), "the recorder to report that it failed")
 
 
-@case(
+@disk_case(
     "disk-read-only",
-    "disk",
     "a recorder on a read-only disk refuses, another one records",
     statuses={Role.RECORDER: 2},
     lacks=no_mounts,
@@ -63,22 +64,21 @@ def _read_only(bench: ChaosBench) -> None:
     locked.mkdir()
     with read_only(locked):
         usual = bench.children[Role.RECORDER].command
-        _instead(bench, [*usual, "--folder", str(locked)])
+        _instead(bench, [*usual, "--folder", str(locked)], ready=False)
         stderr_tail = bench.ends(Role.RECORDER, 2)
         if "error:" not in stderr_tail or "Traceback" in stderr_tail:
             raise CaseFailedError(f"the recorder should have named what is wrong in one line, got: {stderr_tail}")
     bench.restart(Role.RECORDER, [*usual, "--folder", str(bench.folder)])  # the last one wrote its own into the run's
-    bench.ready(Role.RECORDER)
 
 
-@case("disk-slow", "disk", "the disk takes 3 s for each write", expected=("DISK_SLOW",), allowed=LOST)
+@disk_case("disk-slow", "the disk takes 3 s for each write", expected=("DISK_SLOW",), allowed=LOST)
 def _slow(bench: ChaosBench) -> None:
     _on_slow_disk(bench, SLOW_S, 8, 2)
     bench.wait(lambda: bench.health[Role.RECORDER].recording.messages > 0, "a recording")
     bench.frames(1000)  # of which two writes take the most
 
 
-@case("stall-disk", "disk", "the disk takes nothing for 10 s", allowed=LOST)
+@disk_case("stall-disk", "the disk takes nothing for 10 s", allowed=LOST)
 def _stalled(bench: ChaosBench) -> None:
     @contextlib.contextmanager
     def stall() -> Iterator[None]:
@@ -93,11 +93,10 @@ def _on_slow_disk(bench: ChaosBench, seconds: float, after: int, times: int) -> 
     words = bench.children[Role.RECORDER].command
     at = words.index("-m")
     _instead(bench, [*words[:at], "-c", _SLOW, str(seconds), str(after), str(times), *words[at + 2 :]])
-    bench.ready(Role.RECORDER)
 
 
-def _instead(bench: ChaosBench, command: list[str]) -> None:
+def _instead(bench: ChaosBench, command: list[str], *, ready: bool = True) -> None:
     """Stop the recorder, and start one with another command line."""
     bench.signal(Role.RECORDER, signal.SIGTERM)
     bench.ends(Role.RECORDER, 0)
-    bench.restart(Role.RECORDER, command)
+    bench.restart(Role.RECORDER, command, ready=ready)

@@ -6,11 +6,11 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 from google.protobuf.message import DecodeError
 
 from lowfc.adapters.logs.reader import Logged, LogReader
 from lowfc.adapters.logs.sequence_gaps import Gaps
+from lowfc.arrays import Array, Long, Single
 from lowfc.contract.codecs.codec import actuators
 from lowfc.contract.envelope import count_of, start_of
 from lowfc.contract.errors import DataFileError
@@ -28,7 +28,7 @@ class Entry(NamedTuple):
     sequence: int
     log_time_ns: int
     message: Any
-    actuators_nm: npt.NDArray[np.float32] = _NONE
+    actuators_nm: Single = _NONE
 
     @property
     def start_s(self) -> int:
@@ -59,7 +59,7 @@ class Evidence:
     last_ns: list[tuple[int, bool]] = field(default_factory=list)
     messages: int = 0
 
-    def residuals_nm(self) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.float64]]:
+    def residuals_nm(self) -> tuple[Long, Array]:
         """When each true residual was recorded, and the residual, nm rms over the pupil."""
         truths = self.entries[TRUTH]
         times_ns = np.array([truth.log_time_ns for truth in truths], np.int64)

@@ -1,8 +1,13 @@
 """Chaos cases: faults of the camera's frames, and of the mirror."""
 
+from functools import partial
+
 from lowfc.contract.configuration import Control
 from lowfc.programs.reliability.chaos.bench import ChaosBench
 from lowfc.programs.reliability.chaos.case import LOST, case
+
+frames_case = partial(case, "frames")
+mirror_case = partial(case, "mirror")
 
 FIRST = 600
 """Index of the first frame that a camera's fault befalls: the loop has settled and been quiet for a second."""
@@ -30,31 +35,27 @@ _KINDS = (
 
 
 def _through(bench: ChaosBench) -> None:
-    """Wait until the camera's fault is over."""
     last = FIRST + STRUCK + LATEST
     bench.wait(lambda: bench.newest_frame & 0xFFFFFFFF >= last, f"frame {last}")
 
 
 for _kind, _sentence, _reason, _used, _lost in _KINDS:
     _event = _reason if _reason in ("", "FRAMES_MISSING") else f"FRAMES_REFUSED frames refused: {_reason}"
-    case(
+    frames_case(
         f"frames-{_kind}",
-        "frames",
         _sentence,
         fault=_kind,
         expected=(_event,) if _event else (),
         allowed=LOST if _lost else (),
         bad=range(FIRST + _used, FIRST + STRUCK).__contains__ if _used < STRUCK else None,
     )(_through)
-case(
+mirror_case(
     "stuck-actuators",
-    "mirror",
     "dead and stuck actuators",
     config={"mirror.dead": [500, 501], "mirror.stuck_nm": {"600": 80.0}},
 )(_through)
-case(
+mirror_case(
     "saturating",
-    "mirror",
     "a disturbance beyond what the modes may do",
     config={"disturbance.preset": "step", "disturbance.scale": 6.0, "control.tilt_limit_nm": 20.0},
     expected=("LIMIT_HIT",),

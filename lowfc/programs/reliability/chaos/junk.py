@@ -4,6 +4,7 @@ import itertools
 import threading
 import time
 from collections.abc import Iterator
+from functools import partial
 
 import numpy as np
 
@@ -16,6 +17,9 @@ from lowfc.contract.messages import COMMAND, FRAME, REQUEST_KEY, TOPICS, Role, T
 from lowfc.programs.reliability.chaos.bench import CaseFailedError, ChaosBench
 from lowfc.programs.reliability.chaos.case import LOST, case
 from lowfc.programs.reliability.chaos.evidence import FORGED_S
+
+bus_case = partial(case, "bus")
+operator_case = partial(case, "operator")
 
 FLOOD_HZ = 2000
 FLOOD_S = 2.0
@@ -59,7 +63,7 @@ class Intruder:
         return len(self._bus.get(REQUEST_KEY.format(name=name), payload, patience_s))
 
 
-@case("junk", "bus", "random bytes on every topic, 2,000 a second", allowed=LOST, noisy=True)
+@bus_case("junk", "random bytes on every topic, 2,000 a second", allowed=LOST, noisy=True)
 def _flood(bench: ChaosBench) -> None:
     with Intruder(bench) as intruder:
         begun_s = time.monotonic()
@@ -73,7 +77,6 @@ def _flood(bench: ChaosBench) -> None:
 
 
 def _commands(bench: ChaosBench, rng: np.random.Generator) -> Iterator[wire.MirrorCommand]:
-    """Commands of anything at all, in good form."""
     rows, columns = bench.config.mirror.rows, bench.config.mirror.columns
     for number in range(FORGED):
         amplitude = float(rng.choice([1.0, 1e2, 1e4, 1e38]))
@@ -91,9 +94,8 @@ def _commands(bench: ChaosBench, rng: np.random.Generator) -> Iterator[wire.Mirr
         yield command
 
 
-@case(
+@bus_case(
     "forged-commands",
-    "bus",
     "commands of anything at all by who has the run's secret",
     expected=("COMMAND_REFUSED command refused: NOT_FINITE", "LIMIT_HIT"),
     allowed=LOST,
@@ -106,7 +108,7 @@ def _forged_commands(bench: ChaosBench) -> None:
             time.sleep(_TURN_S)
 
 
-@case("forged-frames", "bus", "frames with numbers of the past, and with none", allowed=LOST, noisy=True)
+@bus_case("forged-frames", "frames with numbers of the past, and with none", allowed=LOST, noisy=True)
 def _forged_frames(bench: ChaosBench) -> None:
     with Intruder(bench) as intruder:
         for _ in range(FORGED):
@@ -115,7 +117,7 @@ def _forged_frames(bench: ChaosBench) -> None:
             time.sleep(_TURN_S)
 
 
-@case("malformed-requests", "operator", "requests of random bytes")
+@operator_case("malformed-requests", "requests of random bytes")
 def _malformed_requests(bench: ChaosBench) -> None:
     """Each is answered."""
     with Intruder(bench) as intruder:
@@ -128,7 +130,7 @@ def _malformed_requests(bench: ChaosBench) -> None:
                 raise CaseFailedError(f"request {number}, {name!r} of {len(body)} random bytes, was not answered")
 
 
-@case("huge-requests", "operator", "requests of up to 64 MB", allowed=LOST)
+@operator_case("huge-requests", "requests of up to 64 MB", allowed=LOST)
 def _huge_requests(bench: ChaosBench) -> None:
     """They are refused, or lost by the bus; the loop goes on."""
     with Intruder(bench) as intruder:
@@ -137,7 +139,7 @@ def _huge_requests(bench: ChaosBench) -> None:
             intruder.ask("channel", message.SerializeToString(), 10.0)
 
 
-@case("concurrent-requests", "operator", "eight operators at once")
+@operator_case("concurrent-requests", "eight operators at once")
 def _concurrent_requests(bench: ChaosBench) -> None:
     """Each has a connection of its own, and every request is answered."""
     failed: list[str] = []

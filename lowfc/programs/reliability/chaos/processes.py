@@ -12,6 +12,8 @@ from lowfc.contract.messages import TIMING, Role, wire
 from lowfc.programs.reliability.chaos.bench import ChaosBench
 from lowfc.programs.reliability.chaos.case import LOST, case
 
+process_case = partial(case, "processes")
+
 STALL_S = 10.0
 CALM_S = STALL_S / 2
 """Before a stall, and after it: together as many frames as during it."""
@@ -30,7 +32,6 @@ _EVENTS: dict[Role, tuple[tuple[str, ...], tuple[str, ...]]] = {
 
 
 def _name(bench: ChaosBench, role: Role) -> str:
-    """The process of a role; a viewer is started."""
     if role is Role.VIEWER:
         bench.view()
     return bench.mirror if role is Role.MIRROR else str(role)
@@ -42,7 +43,6 @@ def kill_and_restart(bench: ChaosBench, name: str) -> None:
     bench.kill(name)
     bench.pause(0.1, 1.0)
     bench.restart(name)
-    bench.ready(name)
 
 
 def _killed(bench: ChaosBench, role: Role) -> None:
@@ -58,15 +58,14 @@ def _frozen(bench: ChaosBench, role: Role) -> None:
 
 for _role, (_seen, _missed) in _EVENTS.items():
     _sentence = f"kill -9 of the {_role}, started anew up to 1 s later"
-    case(f"kill-{_role}", "processes", _sentence, expected=_seen, allowed=LOST)(partial(_killed, role=_role))
+    process_case(f"kill-{_role}", _sentence, expected=_seen, allowed=LOST)(partial(_killed, role=_role))
 for _role, (_seen, _missed) in _EVENTS.items():
     _sentence = f"SIGSTOP of the {_role}, SIGCONT 0.5 to 2 s later"
-    case(f"freeze-{_role}", "processes", _sentence, expected=_missed, allowed=LOST)(partial(_frozen, role=_role))
+    process_case(f"freeze-{_role}", _sentence, expected=_missed, allowed=LOST)(partial(_frozen, role=_role))
 
 
-@case(
+@process_case(
     "silent-camera",
-    "processes",
     "kill -9 of the camera, with the mirror to be relaxed meanwhile; started anew after a second",
     config={"control.on_frame_timeout": "flat", "disturbance.static_nm": {"4": 40.0}},
     expected=("NO_FRAMES", "CAMERA_RESTARTED"),
@@ -78,7 +77,7 @@ def _silenced(bench: ChaosBench) -> None:
     bench.restart(Role.CAMERA)
 
 
-@case("random", "processes", "six kills or stops of any of them, at random times", allowed=LOST)
+@process_case("random", "six kills or stops of any of them, at random times", allowed=LOST)
 def _at_random(bench: ChaosBench) -> None:
     names = [str(Role.CAMERA), str(Role.CONTROLLER), bench.mirror, str(Role.RECORDER)]
     for _ in range(STRIKES):
@@ -91,12 +90,12 @@ def _at_random(bench: ChaosBench) -> None:
         bench.pause(0.0, 1.0)
 
 
-@case("stall-recorder", "processes", "the recorder stands still for 10 s", allowed=LOST)
+@process_case("stall-recorder", "the recorder stands still for 10 s", allowed=LOST)
 def _stalled_recorder(bench: ChaosBench) -> None:
     compare(bench, partial(bench.stopped, Role.RECORDER))
 
 
-@case("stall-viewer", "processes", "the viewer stands still for 10 s", allowed=LOST)
+@process_case("stall-viewer", "the viewer stands still for 10 s", allowed=LOST)
 def _stalled_viewer(bench: ChaosBench) -> None:
     bench.view()
     bench.settled()

@@ -6,9 +6,9 @@ from collections.abc import Iterator
 from typing import NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 
 from lowfc.adapters.files.factory import mirror_limits, settings
+from lowfc.arrays import Mask
 from lowfc.contract.events import Level
 from lowfc.contract.messages import COMMAND, EVENT, FRAME, MIRROR_STATE, STEP, Role, wire
 from lowfc.control.loop.safety import Limits
@@ -74,7 +74,7 @@ def _limits(left: Left, evidence: Evidence) -> Finding:
     return _found("limits", wrong if states else [count], count)
 
 
-def _broken(what: str, limits: Limits, shapes: list[Entry], moving: npt.NDArray[np.bool_]) -> Iterator[str]:
+def _broken(what: str, limits: Limits, shapes: list[Entry], moving: Mask) -> Iterator[str]:
     """Limits that shapes break; a gap in their counts allows as many moves. Fixed actuators are left out."""
     if not shapes:
         return

@@ -39,12 +39,7 @@ _NONE_OF = (
 
 
 class LogChecker:
-    """Reads each log once it is finished, and removes it: a night's would not fit on a disk.
-
-    Attributes:
-        logs: how many there were.
-        messages: in all of them.
-    """
+    """Reads each log once it is finished, and removes it: a night's would not fit on a disk."""
 
     def __init__(self, folder: Path) -> None:
         """Check the logs of a folder."""
@@ -74,8 +69,6 @@ class LogChecker:
 
 
 class _Soak:
-    """The processes of a soak, and what is seen of them."""
-
     def __init__(self, config: Configuration, folder: Path) -> None:
         self.checker = LogChecker(folder)
         self.watch = Watch({}, [])
@@ -144,11 +137,6 @@ class _Soak:
 
 def soak_loop(config: Configuration, seconds: float, progress: Callable[[float], None]) -> dict[str, Any]:
     """Run the loop for so long; the figures that `lowfc soak --json` prints.
-
-    Args:
-        config: of the loop; its logs go elsewhere.
-        seconds: of looking, from the first frame on.
-        progress: called with how many have passed.
 
     Raises:
         ProcessDiedError: a process ended by itself.

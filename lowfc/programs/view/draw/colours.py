@@ -25,7 +25,6 @@ WHITE: Colour = (235, 235, 240)
 
 
 def _table(*anchors: Colour) -> Rgb:
-    """Colours (levels, 3) through anchors that are evenly spaced."""
     places = np.linspace(0, 1, len(anchors))
     levels = np.linspace(0, 1, _LEVELS)
     return np.stack([np.interp(levels, places, channel) for channel in zip(*anchors, strict=True)], axis=1).astype(

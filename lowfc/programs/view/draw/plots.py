@@ -10,6 +10,7 @@ import rerun as rr
 import rerun.blueprint as rrb
 from rerun.components import AggregationPolicy
 
+from lowfc.arrays import Array, Long
 from lowfc.programs.view.draw.colours import WHITE, Colour
 
 TIMELINE = "time"
@@ -18,7 +19,6 @@ BOX_HEIGHT = 90.0
 LABEL = 5.0
 """By which the viewer sets a label below its place, for a box of this height."""
 
-Double = npt.NDArray[np.float64]
 Ticks = Sequence[tuple[float, str]]
 """Values and their labels."""
 
@@ -62,9 +62,7 @@ class Plot:
         )
         stream.log(self.path, style, static=True)
 
-    def add(
-        self, stream: rr.RecordingStream, times_ns: npt.NDArray[np.int64], values: npt.NDArray[np.floating]
-    ) -> None:
+    def add(self, stream: rr.RecordingStream, times_ns: Long, values: npt.NDArray[np.floating]) -> None:
         """Add (rows,) or (rows, curves) values in one message; of rows that are not finite one is left, as a gap."""
         if not len(times_ns):
             return
@@ -119,13 +117,13 @@ class Axes:
         places = [(at_x, height + 1) for at_x in columns] + [(-11.0, at_y - LABEL) for at_y in rows]
         stream.log(f"{self.path}/ticks", words(places, [label for _, label in (*x_ticks, *y_ticks)]))
 
-    def places(self, x: npt.ArrayLike, y: npt.ArrayLike) -> Double:
+    def places(self, x: npt.ArrayLike, y: npt.ArrayLike) -> Array:
         """Places of values (points, 2) on the view, whose y axis points down."""
         share_x = (np.asarray(x, np.float64) - self._x[0]) / (self._x[1] - self._x[0])
         share_y = (np.asarray(y, np.float64) - self._y[0]) / (self._y[1] - self._y[0])
         return np.stack([self._width * share_x, BOX_HEIGHT * (1 - share_y)], axis=1)
 
 
-def lines(strips: Sequence[Double], colours: Sequence[Colour], widths: Sequence[float]) -> rr.LineStrips2D:
+def lines(strips: Sequence[Array], colours: Sequence[Colour], widths: Sequence[float]) -> rr.LineStrips2D:
     """Lines (points, 2) of these colours and widths, points."""
     return rr.LineStrips2D(strips, colors=list(colours), radii=rr.Radius.ui_points(list(widths)))

@@ -3,10 +3,10 @@
 from collections import deque
 
 import numpy as np
-import numpy.typing as npt
 import rerun as rr
 
 from lowfc.adapters.logs.columns import STAGES
+from lowfc.arrays import Array
 from lowfc.contract.messages import FRAME, Role
 from lowfc.programs.launch.watch import topic_count
 from lowfc.programs.view.draw.colours import BLUE, GREEN, GREY, ORANGE, RED, distinct
@@ -38,8 +38,6 @@ _LEAST_US = 100.0
 _BODY = 99.0
 """Percentile that the histogram's axis has to hold: a single late frame does not squeeze all others into one bar."""
 
-Double = npt.NDArray[np.float64]
-
 
 class Latency(Panel):
     """From a frame to its command, and the stages of it."""
@@ -47,7 +45,7 @@ class Latency(Panel):
     plots = (WHOLE, PARTS, COUNTS, LOST)
 
     def __init__(self) -> None:
-        self._recent: deque[tuple[int, Double]] = deque()
+        self._recent: deque[tuple[int, Array]] = deque()
         self._scale = Scale(_LEAST_US)
         self._drawn_ns = 0
 
@@ -73,7 +71,7 @@ class Latency(Panel):
         if (recorder := snapshot.health.get(Role.RECORDER)) is not None:
             LOST.add_one(stream, now_ns, recorder.health.recording.lost)
 
-    def _draw_histogram(self, stream: rr.RecordingStream, time_ns: int, us: Double) -> None:
+    def _draw_histogram(self, stream: rr.RecordingStream, time_ns: int, us: Array) -> None:
         """Draw bars of even width from 0 to the axis' end, which changes seldom."""
         if us.size:
             self._scale.fit(np.percentile(us, [_BODY]), time_ns)

@@ -1,9 +1,9 @@
 """The mirror's pictures: the surface at each actuator, which of them are at a limit, and the surface over the pupil."""
 
 import numpy as np
-import numpy.typing as npt
 import rerun as rr
 
+from lowfc.arrays import Single
 from lowfc.contract.codecs.codec import actuators
 from lowfc.programs.view.draw.colours import YELLOW
 from lowfc.programs.view.draw.pictures import SignedPicture
@@ -36,8 +36,7 @@ class Mirror(Panel):
         if snapshot.surface is not None:
             self._surface.show_values(stream, snapshot.time_ns, snapshot.surface)
 
-    def _mark(self, stream: rr.RecordingStream, snapshot: Snapshot, surface_nm: npt.NDArray[np.float32]) -> None:
-        """Draw a ring round each actuator at its stroke."""
+    def _mark(self, stream: rr.RecordingStream, snapshot: Snapshot, surface_nm: Single) -> None:
         stroke_nm = snapshot.stroke_nm
         if not stroke_nm:
             return

@@ -7,6 +7,7 @@ import numpy.typing as npt
 import rerun as rr
 import rerun.blueprint as rrb
 
+from lowfc.arrays import Long
 from lowfc.programs.view.draw.colours import BLUE, GREY, YELLOW
 from lowfc.programs.view.draw.pictures import Scale
 from lowfc.programs.view.draw.plots import at, words
@@ -31,7 +32,7 @@ class Pointing(Panel):
     def __init__(self, nm_per_mas: float) -> None:
         self._nm_per_mas = nm_per_mas
         self._scale = Scale(_LEAST_MAS)
-        self._pieces: deque[tuple[npt.NDArray[np.int64], Points]] = deque()
+        self._pieces: deque[tuple[Long, Points]] = deque()
 
     def draw(self, stream: rr.RecordingStream, snapshot: Snapshot) -> None:
         """Move the trail on."""

@@ -7,6 +7,7 @@ import numpy.typing as npt
 import rerun as rr
 import rerun.blueprint as rrb
 
+from lowfc.arrays import Array, Single
 from lowfc.optics.chain.coronagraph import DARK_ZONE, Wedge
 from lowfc.optics.chain.science_camera import ScienceCamera
 from lowfc.programs.view.draw.colours import BLUE, GREEN, GREY, Rgb, sequential
@@ -40,13 +41,11 @@ _NAMES = {
 }
 """What the wavefronts are, those of a simulation first: they are taken where there are any."""
 
-Single = npt.NDArray[np.float32]
-
 
 class Science(Panel):
     """Two images side by side and the mean contrast, once a second."""
 
-    def __init__(self, pupil: npt.NDArray[np.float64], wavelength_nm: float) -> None:
+    def __init__(self, pupil: Array, wavelength_nm: float) -> None:
         self._pupil = pupil
         self._wavelength_nm = wavelength_nm
         self._noll: tuple[int, ...] = ()
@@ -95,7 +94,6 @@ class Science(Panel):
         return self._camera
 
     def _keep(self, source: str, now_nm: Single, open_nm: Single) -> None:
-        """Keep the newest row; a refused frame has no wavefront."""
         if now_nm.shape[1] != len(self._noll):
             return
         finite = np.flatnonzero(np.isfinite(now_nm).all(axis=1) & np.isfinite(open_nm).all(axis=1))
@@ -131,7 +129,7 @@ def _side_by_side(now: Single, as_open: Single) -> Rgb:
     return sequential(shares)
 
 
-def _outlines() -> list[npt.NDArray[np.float64]]:
+def _outlines() -> list[Array]:
     """Lines (points, 2) in pixels of one image: the mask's edge, and the wedge on either side of the star."""
     turn = np.linspace(0, 2 * np.pi, 97)
     opening = np.deg2rad(WEDGE.half_opening_deg) * np.linspace(-1, 1, 33)
@@ -140,5 +138,5 @@ def _outlines() -> list[npt.NDArray[np.float64]]:
     return [_SAMPLES / 2 + _SAMPLES_PER * line for line in (DARK_ZONE.inner * _directions(turn), right, -right)]
 
 
-def _directions(angle: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
+def _directions(angle: Array) -> Array:
     return np.stack([np.cos(angle), np.sin(angle)], axis=1)

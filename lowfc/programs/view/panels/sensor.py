@@ -1,9 +1,9 @@
 """The sensor's pictures: the frame, its difference from the reference, and the reference itself."""
 
 import numpy as np
-import numpy.typing as npt
 import rerun as rr
 
+from lowfc.arrays import Pixels, Single
 from lowfc.control.calibration.calibration import Calibration
 from lowfc.control.loop.estimator import difference
 from lowfc.programs.view.draw.colours import Rgb, sequential
@@ -13,8 +13,6 @@ from lowfc.programs.view.snapshot import Snapshot
 
 FRAME, DIFFERENCE, REFERENCE, RAW = "sensor/frame", "sensor/difference", "sensor/reference", "sensor/raw"
 _RAW_PERIOD_NS = 500_000_000
-
-Single = npt.NDArray[np.float32]
 
 
 class Sensor(Panel):
@@ -55,9 +53,7 @@ class Sensor(Panel):
             self._raw_due_ns = time_ns + _RAW_PERIOD_NS
             stream.log(RAW, rr.Image(frame, color_model="L"))
 
-    def _show_frame(
-        self, stream: rr.RecordingStream, frame: npt.NDArray[np.uint16], dark_dn: int, time_ns: int
-    ) -> None:
+    def _show_frame(self, stream: rr.RecordingStream, frame: Pixels, dark_dn: int, time_ns: int) -> None:
         changed = self._brightest.fit(np.array([max(0, int(frame.max()) - dark_dn)]), time_ns)
         limit = round(self._brightest.limit)
         if changed:  # a colour for each DN: looking up is cheaper than a logarithm of every pixel

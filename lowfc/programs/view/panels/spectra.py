@@ -3,17 +3,17 @@
 from math import ceil, floor, log10
 
 import numpy as np
-import numpy.typing as npt
 import rerun as rr
 import rerun.blueprint as rrb
 
 from lowfc.adapters.logs.columns import frame_rate_hz
+from lowfc.arrays import Array, Mask
 from lowfc.control.laws.linear_law import integrator
 from lowfc.control.laws.margins import rejection
 from lowfc.control.laws.spectra import Spectrum, in_bins, pieces, spectrum
 from lowfc.control.loop.safety import LoopMode
 from lowfc.programs.view.draw.colours import GREEN, GREY, YELLOW
-from lowfc.programs.view.draw.plots import BOX_HEIGHT, LABEL, Axes, Double, at, lines, words
+from lowfc.programs.view.draw.plots import BOX_HEIGHT, LABEL, Axes, at, lines, words
 from lowfc.programs.view.panels.loop import MODE_NAMES
 from lowfc.programs.view.panels.panel import Panel
 from lowfc.programs.view.snapshot import Snapshot
@@ -45,7 +45,7 @@ class _LogAxes(Axes):
         super().__init__(path, WIDTH)
         self._decades = (0, 0)
 
-    def draw(self, stream: rr.RecordingStream, frequency_hz: Double, powers: list[Double], rate_hz: float) -> None:
+    def draw(self, stream: rr.RecordingStream, frequency_hz: Array, powers: list[Array], rate_hz: float) -> None:
         """Draw curves of power; none where there are none."""
         strips = []
         if powers:
@@ -53,7 +53,7 @@ class _LogAxes(Axes):
             strips = [self.places(np.log10(frequency_hz), np.log10(power)) for power in powers]
         stream.log(f"{self.path}/curves", lines(strips, _COLOURS[: len(strips)], _WIDTHS[: len(strips)]))
 
-    def _fit(self, stream: rr.RecordingStream, rate_hz: float, power: Double) -> None:
+    def _fit(self, stream: rr.RecordingStream, rate_hz: float, power: Array) -> None:
         low, high = floor(log10(power.min())), ceil(log10(power.max()) + 1e-9)
         taller = (self._decades[1] - self._decades[0]) - (high - low)
         if not (self._decades[0] <= low and high <= self._decades[1] and taller <= _MOST_DECADES):
@@ -96,7 +96,7 @@ class Spectra(Panel):
         for axes, modes in zip(self._axes, (index <= _HIGHEST_TILT, index > _HIGHEST_TILT), strict=True):
             columns = [] if found is None or not modes.any() else self._columns(found, modes, rate_hz)
             state = f"last {run.frames / rate_hz:.1f} s" if columns else "too few frames yet"
-            frequency_hz, powers = np.zeros(0), list[Double]()
+            frequency_hz, powers = np.zeros(0), list[Array]()
             if found is not None and any(column[1:].any() for column in columns):
                 frequency_hz, means = in_bins(found.frequency_hz, columns)
                 least = _LEAST * max(float(mean.max()) for mean in means)
@@ -106,7 +106,7 @@ class Spectra(Panel):
             text = f"loop {_MODES.get(self._steady.mode, 'unknown')}{separator} {state}"
             stream.log(f"{axes.path}/state", words([_STATE], [text]))
 
-    def _columns(self, found: Spectrum, modes: npt.NDArray[np.bool_], rate_hz: float) -> list[Double]:
+    def _columns(self, found: Spectrum, modes: Mask, rate_hz: float) -> list[Array]:
         """Power (frequencies,) of some of the modes: open, measured and, with the loop closed, in theory.
 
         An error is measured with noise, and so is the pseudo-open-loop: both are in the theory.

@@ -144,7 +144,6 @@ def _put(colours: Shades, box: Box, level: Level, shades: Shades) -> None:
 
 @lru_cache(maxsize=8)
 def _headline(word: str, sentence: str) -> Shades:
-    """Words of the headline, left of the clock."""
     page = _Page(WIDTH, _BAND)
     right, bottom = WIDTH - _CLOCK - _INSET, _BAND - _INSET // 2
     left = _INSET + page.line((_INSET, _INSET // 2, _INSET + 130, bottom), word, 30)
@@ -153,7 +152,6 @@ def _headline(word: str, sentence: str) -> Shades:
 
 
 def _clock(seconds: int) -> Shades:
-    """Time of day."""
     page = _Page(_CLOCK, _BAND)
     time = f"{datetime.fromtimestamp(seconds, UTC):%H:%M:%S} UTC"
     page.line((_INSET, _INSET // 2, _CLOCK - _INSET, _BAND - _INSET // 2), time, 27)
@@ -175,7 +173,6 @@ def _tile(tile: Tile, width: int, height: int) -> Shades:
 
 @lru_cache(maxsize=16)
 def _fact(title: str, text: str, width: int, height: int) -> Shades:
-    """Title and words of a fact."""
     page = _Page(width, height)
     page.line((_INSET, 2, width - _INSET, 17), title, 13)
     page.write((_INSET, 18, width - _INSET, height - 3), text, 18)
@@ -183,8 +180,6 @@ def _fact(title: str, text: str, width: int, height: int) -> Shades:
 
 
 class _Page:
-    """White words on black."""
-
     def __init__(self, width: int, height: int) -> None:
         self._image = Image.new("L", (width, height))
         self._pen = ImageDraw.Draw(self._image)
@@ -252,5 +247,4 @@ def _palette() -> list[int]:
 
 @lru_cache
 def _font(size: int) -> ImageFont.FreeTypeFont | ImageFont.ImageFont:
-    """Pillow's own."""
     return ImageFont.load_default(size)

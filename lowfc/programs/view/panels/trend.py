@@ -8,12 +8,12 @@ from itertools import pairwise
 from math import log10
 
 import numpy as np
-import numpy.typing as npt
 import rerun as rr
 import rerun.blueprint as rrb
 
+from lowfc.arrays import Array, Mask
 from lowfc.programs.view.draw.colours import GREEN, GREY, Colour
-from lowfc.programs.view.draw.plots import BOX_HEIGHT, LABEL, Axes, Double, at, lines, words
+from lowfc.programs.view.draw.plots import BOX_HEIGHT, LABEL, Axes, at, lines, words
 from lowfc.programs.view.panels.panel import Panel
 from lowfc.programs.view.snapshot import Snapshot
 from lowfc.programs.view.verdicts.course import Course, round_125
@@ -56,7 +56,7 @@ class Trend(Panel):
         self._fit(stream, self._course.begin_ns, max(span_s, 1.0), rms_nm[there])
         self._show(stream, after_ns * 1e-9, rms_nm, there)
 
-    def _fit(self, stream: rr.RecordingStream, begin_ns: int, span_s: float, rms_nm: Double) -> None:
+    def _fit(self, stream: rr.RecordingStream, begin_ns: int, span_s: float, rms_nm: Array) -> None:
         low, high = round_125(float(rms_nm.min()), up=False), round_125(float(rms_nm.max()), up=True)
         high = max(high, round_125(1.9 * low, up=True))
         y_ticks = [(log10(low), f"{low:g}")]
@@ -74,10 +74,9 @@ class Trend(Panel):
         ]
         self._axes.fit(stream, (0.0, span_s), (log10(low), log10(high)), x_ticks, y_ticks)
 
-    def _show(self, stream: rr.RecordingStream, after_s: Double, rms_nm: Double, there: npt.NDArray[np.bool_]) -> None:
-        """Draw both lines, broken where nothing was measured."""
+    def _show(self, stream: rr.RecordingStream, after_s: Array, rms_nm: Array, there: Mask) -> None:
         edges = np.flatnonzero(np.diff(there.astype(int), prepend=0, append=0))
-        strips: list[tuple[Double, Colour, float]] = []
+        strips: list[tuple[Array, Colour, float]] = []
         for values, colour, width in zip(rms_nm.T[::-1], _COLOURS, _WIDTHS, strict=True):
             logarithms = np.log10(np.where(there, values, 1.0))
             for begin, end in list(pairwise(edges))[::2]:

@@ -5,6 +5,7 @@ import numpy.typing as npt
 import rerun as rr
 import rerun.blueprint as rrb
 
+from lowfc.arrays import Long, Whole
 from lowfc.optics.chain.zernike import mode_name, noll_to_nm
 from lowfc.programs.view.draw.colours import BLUE, GREEN, GREY, ORANGE, PINK, RED, YELLOW, distinct
 from lowfc.programs.view.draw.plots import Plot
@@ -35,7 +36,7 @@ class Wavefront(Panel):
         self._nm_per_mas = nm_per_mas
         self._noll: tuple[int, ...] = ()
         self._true = False
-        self._groups: list[npt.NDArray[np.intp]] = []
+        self._groups: list[Whole] = []
         self._tilts: list[int] = []
 
     def draw(self, stream: rr.RecordingStream, snapshot: Snapshot) -> None:
@@ -58,9 +59,7 @@ class Wavefront(Panel):
             rms_nm = np.stack([truths.disturbance_rms_nm, truths.residual_rms_nm], axis=1)
             self._sum_up(stream, truths.time_ns, truths.residual_nm, rms_nm)
 
-    def _sum_up(
-        self, stream: rr.RecordingStream, times_ns: npt.NDArray[np.int64], modes_nm: Values, rms_nm: Values
-    ) -> None:
+    def _sum_up(self, stream: rr.RecordingStream, times_ns: Long, modes_nm: Values, rms_nm: Values) -> None:
         RMS.add(stream, times_ns, rms_nm)
         GROUPS.add(stream, times_ns, np.stack([_rss(modes_nm[:, group]) for group in self._groups], axis=1))
         if self._tilts:

@@ -2,7 +2,8 @@
 
 from lowfc.contract.messages import FRAME, Role
 from lowfc.control.loop.safety import Reason
-from lowfc.programs.view.verdicts.tile import Level, Tile, ago, counted, worst_of
+from lowfc.control.loop.wording import counted
+from lowfc.programs.view.verdicts.tile import Level, Tile, ago, worst_of
 from lowfc.programs.view.verdicts.watcher import GRACE_S, RECENT_S, SILENT_S, Liveness, Watcher
 
 SLOW = 0.9

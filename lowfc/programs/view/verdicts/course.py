@@ -5,6 +5,7 @@ from math import floor, isfinite, log10
 import numpy as np
 import numpy.typing as npt
 
+from lowfc.arrays import Array, Long
 from lowfc.programs.view.snapshot import Snapshot
 
 MOST = 600
@@ -13,8 +14,6 @@ _FIRST_NS = 1_000_000_000
 _FARTHEST_NS = 7 * 86_400 * 10**9  # a camera's clock that jumps farther is wrong
 _TRUE, _MEASURED, _LIGHT = slice(0, 3), slice(3, 6), slice(6, 8)  # columns: a count, then sums
 _COLUMNS = 8
-
-Double = npt.NDArray[np.float64]
 
 
 class Course:
@@ -43,7 +42,7 @@ class Course:
         if snapshot.calibration is not None:
             self._add(steps.time_ns[used], _LIGHT, steps.flux_dn[used] / snapshot.calibration.flux_dn)
 
-    def wavefront(self) -> tuple[Double, Double]:
+    def wavefront(self) -> tuple[Array, Array]:
         """Middle of each span (spans,), ns after `begin_ns`, and rms nm (spans, 2): residual, with a flat mirror.
 
         A span without a frame that was used is NaN.
@@ -51,11 +50,11 @@ class Course:
         sums = self._sums[:, _TRUE if self.true else _MEASURED]
         return np.asarray((np.arange(len(sums)) + 0.5) * self.span_ns, np.float64), np.asarray(np.sqrt(_means(sums)))
 
-    def light(self) -> Double:
+    def light(self) -> Array:
         """Light (spans,) on used frames, of what the calibration expects; NaN in a span without one."""
         return _means(self._sums[:, _LIGHT])[:, 0]
 
-    def _add(self, time_ns: npt.NDArray[np.int64], where: slice, *values: npt.NDArray[np.floating]) -> None:
+    def _add(self, time_ns: Long, where: slice, *values: npt.NDArray[np.floating]) -> None:
         if not time_ns.size:
             return
         if self.begin_ns is None:
@@ -90,7 +89,7 @@ def round_125(value: float, *, up: bool) -> float:
     return next(step for step in reversed(steps) if step <= value * (1 + 1e-9))
 
 
-def _means(sums: Double) -> Double:
+def _means(sums: Array) -> Array:
     """Sums (spans, columns) over counts, the first column."""
     with np.errstate(invalid="ignore", divide="ignore"):
         return np.asarray(sums[:, 1:] / sums[:, :1])

@@ -8,8 +8,9 @@ import numpy as np
 from lowfc.contract.messages import from_timestamp, wire
 from lowfc.contract.printable import printable
 from lowfc.control.loop.state import FADING_FRAMES, SETTLING_FRAMES
+from lowfc.control.loop.wording import counted
 from lowfc.optics.chain.zernike import mode_name
-from lowfc.programs.view.verdicts.tile import counted, short
+from lowfc.programs.view.verdicts.tile import short
 from lowfc.programs.view.verdicts.watcher import Watcher
 
 _MOST = 3

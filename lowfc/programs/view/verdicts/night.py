@@ -8,11 +8,12 @@ import numpy as np
 from lowfc.adapters.logs.columns import Steps
 from lowfc.control.loop.durations import Durations
 from lowfc.control.loop.safety import LoopMode
+from lowfc.control.loop.wording import counted
 from lowfc.programs.view.snapshot import LogEnd, Snapshot
 from lowfc.programs.view.verdicts.camera_verdict import DIM, FEW, REFUSED
 from lowfc.programs.view.verdicts.course import Course
 from lowfc.programs.view.verdicts.facts import facts
-from lowfc.programs.view.verdicts.tile import Level, Tile, Verdict, counted, figure, long_time, worst_of
+from lowfc.programs.view.verdicts.tile import Level, Tile, Verdict, figure, long_time, worst_of
 from lowfc.programs.view.verdicts.verdict import LIMITS, stroke
 from lowfc.programs.view.verdicts.watcher import Watcher
 from lowfc.programs.view.verdicts.wavefront_verdict import GOOD_FACTOR

@@ -4,9 +4,9 @@ from collections import deque
 from typing import NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 
 from lowfc.adapters.logs.columns import frame_rate_hz
+from lowfc.arrays import Sequences, Single
 from lowfc.contract.messages import wire
 from lowfc.control.laws.spectra import pieces
 from lowfc.control.laws.stability import settling_frames
@@ -18,8 +18,6 @@ FRAMES = 6144
 """Frames kept: for spectra eleven segments of 1024."""
 PERIOD_NS = 10_000_000_000
 """Between two computations of the best gains, which take some 50 ms for 14 modes."""
-
-Single = npt.NDArray[np.float32]
 
 
 class LawInForce(NamedTuple):
@@ -43,7 +41,7 @@ class Steady:
         self.mode = 0
         self.law: LawInForce | None = None
         self._settling = 0
-        self._kept: deque[tuple[npt.NDArray[np.uint64], Single]] = deque()
+        self._kept: deque[tuple[Sequences, Single]] = deque()
 
     def feed(self, snapshot: Snapshot) -> bool:
         """Add the steps of a snapshot; False where it has none that belong to its calibration."""
@@ -68,7 +66,7 @@ class Steady:
             kept -= len(self._kept.popleft()[0])
         return True
 
-    def rows(self) -> tuple[npt.NDArray[np.uint64], Single]:
+    def rows(self) -> tuple[Sequences, Single]:
         """Sequence of each frame, and error and pseudo-open-loop (frames, 2 x modes); after the first `feed`."""
         sequence, signals = (np.concatenate(column) for column in zip(*self._kept, strict=True))
         return sequence, signals

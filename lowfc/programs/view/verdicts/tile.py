@@ -57,11 +57,6 @@ def figure(value: float) -> str:
     return f"{value:.1f}" if value >= 1 else f"{value:.2f}"
 
 
-def counted(count: int, noun: str) -> str:
-    """So many of something: "1 frame", "2 frames"."""
-    return f"{count} {noun}" if count == 1 else f"{count} {noun}s"
-
-
 def ago(seconds: float) -> str:
     """A span of time in words."""
     return f"{seconds:.0f} s" if seconds < 120 else f"{seconds / 60:.0f} min"

@@ -6,9 +6,10 @@ from pathlib import PurePath
 from lowfc.contract.messages import FRAME, STEP, Role, from_timestamp, wire
 from lowfc.contract.printable import printable
 from lowfc.control.loop.safety import LoopMode, Reason
+from lowfc.control.loop.wording import counted
 from lowfc.programs.view.verdicts.camera_verdict import all_refused, frames, star
 from lowfc.programs.view.verdicts.facts import facts
-from lowfc.programs.view.verdicts.tile import Level, Tile, Verdict, ago, counted, figure, short, worst_of
+from lowfc.programs.view.verdicts.tile import Level, Tile, Verdict, ago, figure, short, worst_of
 from lowfc.programs.view.verdicts.watcher import GRACE_S, RECENT_S, Liveness, Watcher
 from lowfc.programs.view.verdicts.wavefront_verdict import WORSE, wavefront
 
@@ -108,7 +109,6 @@ def _loop(watcher: Watcher) -> Tile:
 
 
 def _since(watcher: Watcher) -> str:
-    """Since when the loop mode is as it is, where the controller reports it."""
     state = watcher.snapshot.controller
     if state is None or not state.HasField("mode_timestamp") or state.mode != wire.LOOP_MODE_CLOSED:
         return ""
@@ -207,7 +207,6 @@ def _latency(watcher: Watcher) -> Tile:
 
 
 def _recorder(watcher: Watcher) -> Tile:
-    """Whether the run is recorded, and if not, why."""
     title, recorder = "RECORDER", watcher.process(Role.RECORDER)
     last = watcher.snapshot.health.get(Role.RECORDER)
     if last is None:

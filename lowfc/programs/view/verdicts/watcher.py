@@ -6,10 +6,10 @@ from enum import Enum, auto
 from typing import NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 
 from lowfc.adapters.bus.run import mirror_role
-from lowfc.adapters.logs.columns import Single, Whole
+from lowfc.adapters.logs.columns import reason_counts
+from lowfc.arrays import Array, Long, Sequences, Single
 from lowfc.contract.codecs.codec import actuators
 from lowfc.contract.envelope import start_of
 from lowfc.contract.messages import (
@@ -58,7 +58,6 @@ _TOPICS = {Role.CONTROLLER: (STEP, CONTROLLER_STATE), Role.CAMERA: (FRAME,)}
 """Topics that are signs of life, too."""
 
 Counts = Counter[Reason | str]
-Double = npt.NDArray[np.float64]
 
 
 class Liveness(Enum):
@@ -92,11 +91,11 @@ class _Sample(NamedTuple):
 
     host_ns: int
     counts: Counts
-    truth: Double
-    measured: Double
-    sequence: npt.NDArray[np.uint64]
-    time_ns: Whole
-    durations_ns: Whole
+    truth: Array
+    measured: Array
+    sequence: Sequences
+    time_ns: Long
+    durations_ns: Long
 
 
 class Watcher:
@@ -187,7 +186,7 @@ class Watcher:
         """Of the last second, or the last with a step in it, and whether it is the truth; None without any."""
         samples = self._last_worked if ended else self._last(span_s)
         for true in (True, False):
-            total: Double = sum((one.truth if true else one.measured for one in samples), np.zeros(5))
+            total: Array = sum((one.truth if true else one.measured for one in samples), np.zeros(5))
             if total[0]:
                 return Rms(*np.sqrt(total[1:] / total[0]).tolist()), true
         return None, False
@@ -241,7 +240,6 @@ class Watcher:
         return silent_s if silent_s > max(FRAMES_SILENT_S, PERIODS * self.period_ns * 1e-9) else None
 
     def _total(self, span_s: float) -> Counts:
-        """Counts of the last snapshots, added up once."""
         if span_s not in self._sums:
             total: Counts = Counter()
             for one in self._last(span_s):
@@ -309,14 +307,15 @@ class Watcher:
         truth = _squares(
             snapshot, truths.residual_nm, truths.disturbance_nm, truths.residual_rms_nm, truths.disturbance_rms_nm
         )
-        counts = Counter({"steps": len(steps.mode), **_reasons(steps.reasons), **self._grown(snapshot)})
+        counts = Counts(reason_counts(steps.reasons))
+        counts.update(steps=len(steps.mode), **self._grown(snapshot))
         durations_ns = snapshot.timings["frame_to_command"]
         measured = _squares(snapshot, error_nm, pol_nm, error_nm, pol_nm)
         return _Sample(snapshot.host_ns, counts, truth, measured, steps.sequence, steps.time_ns, durations_ns)
 
-    def _grown(self, snapshot: Snapshot) -> dict[Reason | str, int]:
+    def _grown(self, snapshot: Snapshot) -> dict[str, int]:
         """By how much what the processes count has grown since the last snapshot; a restarted one begins anew."""
-        grown: dict[Reason | str, int] = {}
+        grown: dict[str, int] = {}
         for name, (role, count_in) in _COUNTED.items():
             last = snapshot.health.get(role)
             if last is None:
@@ -329,15 +328,9 @@ class Watcher:
         return grown
 
 
-def _reasons(bits: Whole) -> dict[Reason | str, int]:
-    if not bits.any():
-        return {}
-    return {reason: int(np.count_nonzero(bits & (1 << reason))) for reason in Reason}
-
-
 def _squares(
     snapshot: Snapshot, residual_modes_nm: Single, open_modes_nm: Single, residual_nm: Single, open_nm: Single
-) -> Double:
+) -> Array:
     """Count of rows, and the sums of squares of `Rms`; tip and tilt where the calibration is for so many modes."""
     noll = snapshot.calibration.noll if snapshot.calibration is not None else ()
     tilts = [column for column, index in enumerate(noll) if index in (2, 3)]
