@@ -14,7 +14,7 @@ import numpy as np
 import numpy.typing as npt
 
 from lowfc.control.loop.additions import LONGEST_NAME, MOST_CHANNELS
-from lowfc.control.loop.safety import Limits, Reason, expired, limit
+from lowfc.control.loop.safety import Limit, Limits, Reason, Rejection, expired, limit
 
 Single = npt.NDArray[np.float32]
 
@@ -170,17 +170,17 @@ def tick(device: Device, status: Status, now_ns: int) -> Status:
 
 def _refusal(device: Device, status: Status, told: Command) -> Reason | None:
     if told.actuators_nm is None or told.actuators_nm.shape != device.grid:
-        return Reason.WRONG_GRID
+        return Limit.WRONG_GRID
     if not (np.isfinite(told.actuators_nm).all() and np.isfinite(told.command_nm).all()):
-        return Reason.NOT_FINITE
+        return Limit.NOT_FINITE
     if told.ahead:
-        return Reason.AHEAD
+        return Rejection.AHEAD
     cleared = told.clear_id and told.clear_id != status.clear_id
     if told.frame_sequence < status.frame_sequence and not cleared:
-        return Reason.OUT_OF_ORDER
+        return Rejection.OUT_OF_ORDER
     full = len(status.channels) >= MOST_CHANNELS and told.channel not in status.channels
     if full or len(told.channel) > LONGEST_NAME:
-        return Reason.CHANNEL
+        return Limit.CHANNEL
     return None
 
 

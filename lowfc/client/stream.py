@@ -16,7 +16,7 @@ from lowfc.contract.envelope import count_of, start_of
 from lowfc.contract.errors import BusError
 from lowfc.contract.messages import from_timestamp, wire
 from lowfc.control.loop.inputs import Step
-from lowfc.control.loop.safety import LoopMode, Reason
+from lowfc.control.loop.safety import LoopMode, reason_of
 
 T = TypeVar("T")
 
@@ -128,7 +128,7 @@ def step_of(sample: Sample) -> Step | None:
             from_timestamp(message.timestamp),
             LoopMode(message.mode),
             np.array(message.command_nm, np.float32),
-            tuple(Reason(reason) for reason in message.reasons),
+            tuple(reason_of(reason) for reason in message.reasons),
             np.array(message.error_nm, np.float32) if message.error_nm else None,
             np.array(message.pol_nm, np.float32) if message.pol_nm else None,
             message.flux_dn,

@@ -42,7 +42,7 @@ from lowfc.contract.messages import (
 from lowfc.control.laws.linear_law import integrator_block, of_blocks
 from lowfc.control.loop.inputs import Reply, Request, Step
 from lowfc.control.loop.requests import REQUESTS
-from lowfc.control.loop.safety import LoopMode, Reason
+from lowfc.control.loop.safety import Limit, LoopMode
 from lowfc.programs.cli.ctl.command import SIMPLE, ctl_app
 from lowfc.programs.cli.ctl.status import figures, text
 from lowfc.programs.cli.modes import noll_of
@@ -488,7 +488,7 @@ def test_an_answer_that_is_none_is_an_error_with_a_sentence() -> None:
 
 def test_a_step_comes_as_it_was_sent() -> None:
     three = np.array([1.5, -2.0, 0.25], np.float32)
-    sent = Step(9, 5_000, LoopMode.CLOSED, three, (Reason.SLEW,), three + 1, three + 2, 1234.5, 3)
+    sent = Step(9, 5_000, LoopMode.CLOSED, three, (Limit.SLEW,), three + 1, three + 2, 1234.5, 3)
     got = step_of(Sample(STEP.key, codec.encode_step(sent, 1), 0, 0, 0))
     assert got is not None
     for name in Step._fields:

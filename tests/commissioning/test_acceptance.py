@@ -18,7 +18,7 @@ from lowfc.control.calibration.linearity import levels
 from lowfc.control.laws.stability import delay_weights
 from lowfc.control.loop.advance import advance
 from lowfc.control.loop.inputs import Frame, Load, Request
-from lowfc.control.loop.safety import LoopMode, Reason
+from lowfc.control.loop.safety import Limit, LoopMode
 from lowfc.control.loop.state import State
 from lowfc.programs.commissioning.acceptance import capture as acceptance_capture
 from lowfc.programs.commissioning.acceptance import linearity as acceptance_linearity
@@ -147,7 +147,7 @@ def test_what_was_disturbed_is_not_judged(calibration: Calibration) -> None:
     other = one.mode.copy()
     other[50] = LoopMode.OPEN
     limited = one.reasons.copy()
-    limited[70] = 1 << Reason.SLEW
+    limited[70] = 1 << Limit.SLEW
     missing = one.error_nm.copy()
     missing[100:110] = np.nan
     for changed, why in (

@@ -12,7 +12,7 @@ from lowfc.control.laws.linear_law import LinearLaw, Signal
 from lowfc.control.loop.additions import ADOPTED, FLAT, MIRROR, MOST_CHANNELS, OFFSET
 from lowfc.control.loop.advance import advance
 from lowfc.control.loop.inputs import Frame, Input, Load, MirrorShape, Outputs, Reply, Request
-from lowfc.control.loop.safety import Limits, LoopMode, Reason
+from lowfc.control.loop.safety import Limit, Limits, LoopMode
 from lowfc.control.loop.state import FADING_FRAMES, SETTLING_FRAMES, Settings, State
 from tests.support.theory import law_of, linear
 from tests.support.toy import GRID, NOLL, START, TOY, calibration, frame, frame_sequence, loaded, settings
@@ -441,5 +441,5 @@ def test_a_note_is_an_event_and_changes_nothing() -> None:
     assert night.outputs[-1].events[0].details == {"text": "clouds"}
     assert not night.ask("note", text="  ").accepted
     assert night.state.drive is before
-    assert Reason.STROKE not in night.state.counts
+    assert Limit.STROKE not in night.state.counts
     assert State().drive is None

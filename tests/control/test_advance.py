@@ -9,7 +9,7 @@ import pytest
 from lowfc.control.laws.stability import limiting_gain
 from lowfc.control.loop.inputs import CameraSettings, Frame, Load, MirrorShape, Outputs, Request, Tick
 from lowfc.control.loop.requests import REQUESTS
-from lowfc.control.loop.safety import LoopMode, Reason
+from lowfc.control.loop.safety import Limit, LoopMode, Reason, Rejection
 from lowfc.control.loop.state import Settings, State
 from tests.support.safety_checks import violations
 from tests.support.toy import (
@@ -47,12 +47,12 @@ def ask(name: str, *values: float, modes: tuple[int, ...] = ()) -> Request:
 # Frames that cannot be used.
 
 BAD: dict[Reason, Callable[[int], Frame]] = {
-    Reason.WRONG_SIZE: lambda count: frame(count, pixels=np.full((7, 6), 5000, np.uint16)),
-    Reason.LATE: lambda count: frame(count, SOME, age_ns=USUAL.max_frame_age_ns + 1),
-    Reason.SATURATED: lambda count: frame(count, pixels=np.full(SHAPE, SATURATION_DN, np.uint16)),
-    Reason.DARK: lambda count: frame(count, pixels=np.full(SHAPE, DARK_DN + 10, np.uint16)),
-    Reason.OUT_OF_ORDER: lambda count: frame(count, SOME, sequence=frame_sequence(3)),
-    Reason.REPEATED: lambda count: frame(count, SOME, sequence=frame_sequence(5)),
+    Rejection.WRONG_SIZE: lambda count: frame(count, pixels=np.full((7, 6), 5000, np.uint16)),
+    Rejection.LATE: lambda count: frame(count, SOME, age_ns=USUAL.max_frame_age_ns + 1),
+    Rejection.SATURATED: lambda count: frame(count, pixels=np.full(SHAPE, SATURATION_DN, np.uint16)),
+    Rejection.DARK: lambda count: frame(count, pixels=np.full(SHAPE, DARK_DN + 10, np.uint16)),
+    Rejection.OUT_OF_ORDER: lambda count: frame(count, SOME, sequence=frame_sequence(3)),
+    Rejection.REPEATED: lambda count: frame(count, SOME, sequence=frame_sequence(5)),
 }
 
 
@@ -69,7 +69,7 @@ def test_a_bad_frame_is_refused_counted_and_named_and_the_command_holds(reason: 
         assert np.array_equal(outputs.command.actuators_nm, held.actuators_nm)
     assert state.counts == {reason: 3}
     assert state.frames_used == before.frames_used
-    follows = 6 if reason in (Reason.OUT_OF_ORDER, Reason.REPEATED) else 9
+    follows = 6 if reason in (Rejection.OUT_OF_ORDER, Rejection.REPEATED) else 9
     state, back = feed(USUAL, state, frame(follows, SOME), frame(follows + 1, SOME))
     assert names(every + back) == ["FRAMES_REFUSED", "FRAMES_ACCEPTED"]
     assert every[0].events[0].details == {"reason": reason.name}
@@ -81,32 +81,32 @@ def test_a_camera_that_is_stuck_is_refused_until_its_image_changes() -> None:
     what = settings(max_identical_frames=3)
     state, every = feed(what, loaded(what), *(frame(count, SOME) for count in range(1, 8)))
     reasons = [outputs.step.reasons for outputs in every if outputs.step is not None]
-    assert reasons == [()] * 4 + [(Reason.STUCK,)] * 3
+    assert reasons == [()] * 4 + [(Rejection.STUCK,)] * 3
     used = feed(what, loaded(what), *(frame(count, SOME) for count in range(1, 5)))[0].drive
     assert np.array_equal(state.drive.actuators_nm, used.actuators_nm)
     pixels = frame(8, SOME).pixels.copy()
     pixels.flat[0] += 1
     state, back = feed(what, state, frame(8, pixels=pixels), frame(9, SOME))
     assert names(every + back) == ["FRAMES_REFUSED", "FRAMES_ACCEPTED"]
-    assert state.counts == {Reason.STUCK: 3}
+    assert state.counts == {Rejection.STUCK: 3}
     assert state.frames_used == 6
 
 
 def test_a_message_without_an_image_is_of_the_wrong_size() -> None:
     _, every = feed(USUAL, running(), frame(6, pixels=None))
-    assert every[0].step.reasons == (Reason.WRONG_SIZE,)
+    assert every[0].step.reasons == (Rejection.WRONG_SIZE,)
 
 
 def test_without_a_calibration_a_frame_gives_a_step_and_no_command() -> None:
     state, every = feed(USUAL, State(), frame(1), frame(2))
     for outputs in every:
         assert outputs.command is None
-        assert outputs.step.reasons == (Reason.NO_CALIBRATION,)
+        assert outputs.step.reasons == (Rejection.NO_CALIBRATION,)
         assert outputs.step.command_nm.size == 0
     assert names(every) == ["FRAMES_REFUSED"]
     state, every = feed(USUAL, state, Load(0, calibration(), "test"), frame(3))
     assert names(every) == ["CALIBRATION_LOADED", "MODE_CHANGED", "FRAMES_ACCEPTED"]
-    assert state.counts == {Reason.NO_CALIBRATION: 2}
+    assert state.counts == {Rejection.NO_CALIBRATION: 2}
 
 
 @pytest.mark.parametrize(
@@ -128,14 +128,15 @@ def test_a_few_hot_pixels_do_not_stop_the_loop(pixels: int, used: bool) -> None:
     image.flat[:pixels] = SATURATION_DN
     _, (outputs,) = feed(USUAL, running(), frame(6, pixels=image))
     assert outputs.step.saturated_pixels == (pixels if used else 0)
-    assert (outputs.step.reasons != (Reason.SATURATED,)) is used
+    assert (outputs.step.reasons != (Rejection.SATURATED,)) is used
 
 
 def test_each_kind_of_refusal_in_a_row_is_named_once() -> None:
-    inputs = [BAD[reason](count) for count, reason in enumerate((Reason.LATE, Reason.LATE, Reason.DARK), start=6)]
+    reasons = Rejection.LATE, Rejection.LATE, Rejection.DARK
+    inputs = [BAD[reason](count) for count, reason in enumerate(reasons, start=6)]
     state, every = feed(USUAL, running(), *inputs, frame(9, SOME))
     assert names(every) == ["FRAMES_REFUSED", "FRAMES_REFUSED", "FRAMES_ACCEPTED"]
-    assert state.counts == {Reason.LATE: 2, Reason.DARK: 1}
+    assert state.counts == {Rejection.LATE: 2, Rejection.DARK: 1}
 
 
 # Frames that never came.
@@ -152,7 +153,7 @@ def test_missing_and_refused_frames_move_the_history_on(delay: float) -> None:
     assert every[0].events[0].details == {"count": 6, "number": 12}
     assert every[0].step.error_nm is not None
     assert np.array_equal(every[0].step.pol_nm, every[0].step.error_nm - held)
-    refused, _ = feed(what, before, *(BAD[Reason.LATE](count) for count in range(6, 12)))
+    refused, _ = feed(what, before, *(BAD[Rejection.LATE](count) for count in range(6, 12)))
     assert all(np.array_equal(command, held) for command in refused.drive.history_nm)
     assert missing.drive.history_nm[0] is not held
 
@@ -174,7 +175,7 @@ def test_a_camera_that_restarts_is_followed_and_named() -> None:
     assert names(every) == ["CAMERA_RESTARTED"]
     assert state.frames_used == before.frames_used + 1
     _, every = feed(USUAL, state, frame(6, SOME))
-    assert every[0].step.reasons == (Reason.OUT_OF_ORDER,)
+    assert every[0].step.reasons == (Rejection.OUT_OF_ORDER,)
 
 
 # Silence.
@@ -185,7 +186,7 @@ def test_silence_is_named_once_at_its_start_and_once_at_its_end() -> None:
     short = Tick(0, USUAL.frame_timeout_ns)
     long = Tick(0, USUAL.frame_timeout_ns + 1)
     state, every = feed(
-        USUAL, before, short, long, Tick(0, 10 * USUAL.frame_timeout_ns), BAD[Reason.REPEATED](5), short, long
+        USUAL, before, short, long, Tick(0, 10 * USUAL.frame_timeout_ns), BAD[Rejection.REPEATED](5), short, long
     )
     assert [name for name in names(every) if name != "FRAMES_REFUSED"] == ["NO_FRAMES"]
     assert all(outputs.command is not None for outputs in every)
@@ -194,7 +195,7 @@ def test_silence_is_named_once_at_its_start_and_once_at_its_end() -> None:
         assert outputs.command.frame_sequence == before.frame_sequence
     state, back = feed(USUAL, state, frame(500, SOME), frame(501, SOME))
     assert names(back) == ["FRAMES_BACK", "FRAMES_MISSING", "FRAMES_ACCEPTED"]
-    assert state.counts[Reason.NO_FRAME] == 1
+    assert state.counts[Rejection.NO_FRAME] == 1
 
 
 def test_in_silence_the_mirror_relaxes_to_flat_where_that_is_configured() -> None:
@@ -244,7 +245,7 @@ def test_safed_relaxes_the_mirror_frame_by_frame_within_the_limits() -> None:
     largest = np.abs(state.drive.actuators_nm).max()
     for count in range(31, 70):
         before = state.drive.actuators_nm
-        taken = BAD[Reason.DARK](count) if count % 3 == 0 else frame(count, SOME)
+        taken = BAD[Rejection.DARK](count) if count % 3 == 0 else frame(count, SOME)
         state, (outputs,) = feed(what, state, taken)
         assert violations(what.limits, before, outputs.command.actuators_nm) == []
         assert np.abs(outputs.command.actuators_nm).max() <= np.abs(before).max()
@@ -252,7 +253,7 @@ def test_safed_relaxes_the_mirror_frame_by_frame_within_the_limits() -> None:
     assert not state.drive.actuators_nm.any()
 
 
-@pytest.mark.parametrize("reason", [Reason.OUT_OF_ORDER, Reason.REPEATED])
+@pytest.mark.parametrize("reason", [Rejection.OUT_OF_ORDER, Rejection.REPEATED])
 def test_safe_flattens_the_mirror_under_a_stuck_camera(reason: Reason) -> None:
     """Its frames are refused, the commands go out under the newest sequence, so that the mirror takes them."""
     state, _ = feed(USUAL, running(), ask("safe"))
@@ -439,7 +440,7 @@ def test_the_modal_limit_holds_for_each_mode_and_does_not_wind_up() -> None:
     for count in range(1, 101):  # a hundred frames of an error far beyond what the limits allow to correct
         state, (outputs,) = feed(what, state, frame(count, (60, -60, 60)))
         assert (np.abs(outputs.step.command_nm) <= [20, 20, 5]).all()
-    assert outputs.step.reasons == (Reason.MODAL_LIMIT,)
+    assert outputs.step.reasons == (Limit.MODAL_LIMIT,)
     assert outputs.step.command_nm.tolist() == [-20, 20, -5]
     state, (outputs,) = feed(what, state, frame(101, (-10, 10, -10)))
     assert outputs.step.command_nm == pytest.approx([-15, 15, -2], abs=0.1)
@@ -453,7 +454,7 @@ def test_after_the_mirror_saturates_the_stored_command_is_what_it_was_given() ->
         state, (outputs,) = feed(what, state, frame(count, (60, 0, 0)))
         events += names([outputs])
     drive = state.drive
-    assert state.limits_hit == (Reason.STROKE,)
+    assert state.limits_hit == (Limit.STROKE,)
     assert events.count("LIMIT_HIT") == len(set(events) & {"LIMIT_HIT"}) == 1
     assert np.abs(drive.actuators_nm).max() <= 5
     fitted = np.linalg.lstsq(drive.calibration.modes_to_actuators, drive.actuators_nm.reshape(-1), rcond=None)[0]

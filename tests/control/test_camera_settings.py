@@ -13,7 +13,7 @@ from lowfc.control.loop.additions import MIRROR
 from lowfc.control.loop.advance import advance
 from lowfc.control.loop.camera import CameraSettings, changes
 from lowfc.control.loop.inputs import Frame, Input, Load, MirrorShape, Outputs, Reply, Request, Tick
-from lowfc.control.loop.safety import LoopMode, Reason
+from lowfc.control.loop.safety import Limit, LoopMode, Rejection
 from lowfc.control.loop.state import State
 from tests.support.safety_checks import violations
 from tests.support.theory import linear
@@ -108,7 +108,7 @@ def test_after_a_restart_nothing_is_integrated_before_the_cameras_settings_came(
     anew = [frame(1, (20, 0, 0), sequence=frame_sequence(count, START + 9)) for count in range(4)]
     before_nm = state.drive.history_nm[0] if state.drive is not None else None
     state, every = feed(USUAL, state, *anew)
-    assert [outputs.step.reasons for outputs in every if outputs.step] == [(Reason.CAMERA_UNKNOWN,)] * 4
+    assert [outputs.step.reasons for outputs in every if outputs.step] == [(Rejection.CAMERA_UNKNOWN,)] * 4
     assert (state.drive.history_nm[0] == before_nm).all()
     assert not answer(answer(state, "open")[0], "close")[1].accepted
     state, every = feed(
@@ -139,7 +139,7 @@ def test_clear_forgets_the_newest_frame() -> None:
         USUAL, loaded(USUAL), CAMERA, frame(1), frame(1, sequence=frame_sequence(1, START + 86_000)), CAMERA
     )
     state, (late,) = feed(USUAL, state, frame(2))
-    assert late.step.reasons == (Reason.OUT_OF_ORDER,)
+    assert late.step.reasons == (Rejection.OUT_OF_ORDER,)
     state, _ = answer(state, "safe")
     state, reply = answer(state, "clear")
     assert reply.accepted
@@ -151,7 +151,7 @@ def test_clear_forgets_the_newest_frame() -> None:
 def test_a_frame_from_far_ahead_changes_no_number() -> None:
     state, _ = feed(USUAL, loaded(USUAL), CAMERA, frame(1))
     state, (outputs, after) = feed(USUAL, state, frame(1, sequence=(1 << 64) - (1 << 40), ahead=True), frame(2))
-    assert outputs.step.reasons == (Reason.AHEAD,)
+    assert outputs.step.reasons == (Rejection.AHEAD,)
     assert after.step.reasons == ()
 
 
@@ -172,7 +172,7 @@ def test_after_a_clear_another_start_of_the_camera_is_waited_for_too() -> None:
     for name in ("safe", "clear"):
         state, _ = answer(state, name)
     state, (outputs,) = feed(USUAL, state, frame(1, sequence=frame_sequence(0, START + 9)))
-    assert outputs.step.reasons == (Reason.CAMERA_UNKNOWN,)
+    assert outputs.step.reasons == (Rejection.CAMERA_UNKNOWN,)
 
 
 ODD = np.full((8, 9), 5000, np.uint16)
@@ -218,7 +218,7 @@ def test_a_probe_sequence_is_on_the_mirror_frame_by_frame(begin: object) -> None
     assert np.allclose(surfaces(every), np.vstack([table * BASIS, 0 * BASIS, 0 * BASIS]))
     for outputs in every:
         assert outputs.step.error_nm is None
-        assert outputs.step.reasons[0] in (Reason.NO_CALIBRATION, Reason.WRONG_SIZE)
+        assert outputs.step.reasons[0] in (Rejection.NO_CALIBRATION, Rejection.WRONG_SIZE)
 
 
 def test_a_limit_ends_it() -> None:
@@ -237,7 +237,7 @@ def test_a_limit_ends_it() -> None:
     state = play(state, table, steep.reshape(-1))
     _, every = feed(USUAL, state, odd(40))
     assert "PLAY_ENDED" in names(every)
-    assert Reason.SLEW in every[0].step.reasons
+    assert Limit.SLEW in every[0].step.reasons
 
 
 def test_the_mirror_stays_where_it_was_and_safe_relaxes_it() -> None:

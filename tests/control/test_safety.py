@@ -15,7 +15,7 @@ from hypothesis.extra import numpy as hnp
 
 from lowfc.arrays import Single
 from lowfc.control.loop import safety
-from lowfc.control.loop.safety import Limits, LoopMode, Reason, expired, limit, neighbour_difference_nm, request_mode
+from lowfc.control.loop.safety import Limit, Limits, LoopMode, expired, limit, neighbour_difference_nm, request_mode
 from tests.support.safety_checks import CASES, LIMITS, Case, check_kept, violations
 
 GRID = (4, 5)
@@ -64,7 +64,7 @@ def test_whatever_is_wanted_the_limits_hold(previous: Single, wanted: Single) ->
     assert violations(LIMITS, previous, limited.actuators_nm) == []
     assert limited.actuators_nm.dtype == np.float32
     if not np.isfinite(wanted).all():
-        assert limited.reasons == (Reason.NOT_FINITE,)
+        assert limited.reasons == (Limit.NOT_FINITE,)
         assert np.array_equal(limited.actuators_nm, previous)
 
 
@@ -111,7 +111,7 @@ def test_diagonal_actuators_are_not_neighbours() -> None:
 def test_another_grid_is_refused(shape: tuple[int, ...]) -> None:
     previous = np.full(GRID, 7, np.float32)
     limited = limit(LIMITS, previous, np.zeros(shape, np.float32))
-    assert limited.reasons == (Reason.WRONG_GRID,)
+    assert limited.reasons == (Limit.WRONG_GRID,)
     assert np.array_equal(limited.actuators_nm, previous)
 
 
@@ -281,13 +281,13 @@ MUTATIONS = {
         "if not (isfinite(lowest_nm) or isfinite(highest_nm)):",
     ),
     "not finite becomes flat": (
-        "Limited(previous_nm, (Reason.NOT_FINITE,))",
-        "Limited(0 * previous_nm, (Reason.NOT_FINITE,))",
+        "Limited(previous_nm, (Limit.NOT_FINITE,))",
+        "Limited(0 * previous_nm, (Limit.NOT_FINITE,))",
     ),
     "another grid let through": ("if wanted_nm.shape != previous_nm.shape:", "if False:"),
-    "not said: stroke": ("reasons.append(Reason.STROKE)", "pass"),
-    "not said: slew": ("reasons.append(Reason.SLEW)", "pass"),
-    "not said: neighbours": ("reasons.append(Reason.NEIGHBOUR)", "pass"),
+    "not said: stroke": ("reasons.append(Limit.STROKE)", "pass"),
+    "not said: slew": ("reasons.append(Limit.SLEW)", "pass"),
+    "not said: neighbours": ("reasons.append(Limit.NEIGHBOUR)", "pass"),
     "limits of nothing": ("if not 2 * self.margin_nm < value < np.inf:", "if False:"),
     "margin for short strokes only": ("max(MARGIN_NM, ldexp", "min(MARGIN_NM, ldexp"),
     "dead-man one early": ("not 0 <= age_ns <= valid_for_ns", "not 0 <= age_ns < valid_for_ns"),

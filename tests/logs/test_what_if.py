@@ -21,7 +21,7 @@ from lowfc.contract.messages import wire
 from lowfc.control.calibration.calibration import reconstructor
 from lowfc.control.laws.stability import delay_weights, limiting_gain
 from lowfc.control.laws.what_if import as_logged, counterfactual, rms
-from lowfc.control.loop.safety import LoopMode, Reason
+from lowfc.control.loop.safety import Limit, LoopMode
 from lowfc.optics.detector.photometry import tilt_nm_per_mas
 from lowfc.programs.logs.what_if.compare import LINEAR_WAVES, WhatIf, compared, render, wanted, what_if
 from lowfc.programs.logs.what_if.options import user_controller
@@ -363,7 +363,7 @@ def test_the_table_of_another_controller_has_no_gains() -> None:
 
 def test_doubts_are_said() -> None:
     reasons = np.zeros(40, np.int64)
-    reasons[3:7] = 1 << Reason.STROKE | 1 << Reason.SLEW
+    reasons[3:7] = 1 << Limit.STROKE | 1 << Limit.SLEW
     known = replace(history(reasons=reasons), requests=[wire.Request(name="gain", accepted=True)])
     known.mirror.limits = np.array([0, 1, 1])
     known.log.finished = False

@@ -10,7 +10,7 @@ from hypothesis.extra import numpy as hnp
 
 from lowfc.arrays import Single
 from lowfc.contract.configuration import load
-from lowfc.control.loop.safety import Limits, Reason, neighbour_difference_nm
+from lowfc.control.loop.safety import Limit, Limits, Reason, Rejection, neighbour_difference_nm
 from sim_dm.device import LONGEST_VALID_NS, Command, Device, Status, apply_command, initial, tick
 from sim_dm.process import device as device_of
 
@@ -59,10 +59,10 @@ def test_clear_makes_the_mirror_forget_the_newest_command() -> None:
     device = mirror()
     status, _ = apply_command(device, initial(device), told(even(5.0), (1 << 63)), START_NS)
     late, refused = apply_command(device, status, told(even(9.0), 3), START_NS)
-    assert (refused, late) == (Reason.OUT_OF_ORDER, status)
+    assert (refused, late) == (Rejection.OUT_OF_ORDER, status)
     status, refused = apply_command(device, status, told(even(9.0), 3, clear_id=77), START_NS)
     assert (refused, status.frame_sequence) == (None, 3)
-    assert apply_command(device, status, told(even(9.0), 2, clear_id=77), START_NS)[1] is Reason.OUT_OF_ORDER, (
+    assert apply_command(device, status, told(even(9.0), 2, clear_id=77), START_NS)[1] is Rejection.OUT_OF_ORDER, (
         "once for each clear"
     )
     assert apply_command(device, status, told(even(9.0), 2, clear_id=78), START_NS)[1] is None
@@ -73,9 +73,9 @@ def test_the_mirror_has_room_for_sixteen_channels() -> None:
     for number in range(16):
         status, refused = apply_command(device, status, told(even(1.0), channel=f"c{number}"), START_NS)
         assert refused is None
-    assert apply_command(device, status, told(even(1.0), channel="another"), START_NS) == (status, Reason.CHANNEL)
+    assert apply_command(device, status, told(even(1.0), channel="another"), START_NS) == (status, Limit.CHANNEL)
     assert apply_command(device, status, told(even(1.0), channel="c3"), START_NS)[1] is None
-    assert apply_command(device, initial(device), told(even(1.0), channel="x" * 33), START_NS)[1] is Reason.CHANNEL
+    assert apply_command(device, initial(device), told(even(1.0), channel="x" * 33), START_NS)[1] is Limit.CHANNEL
 
 
 def test_a_command_of_safe_mode_is_remembered_by_its_channel() -> None:
@@ -161,7 +161,7 @@ def test_its_own_limits_are_named_and_the_modal_command_is_forgotten() -> None:
     assert status.limits_hit == ()
     assert status.command_nm.tolist() == [1, 2]
     status, _ = apply_command(device, status, told(even(900), 2), START_NS + MS)
-    assert status.limits_hit == (Reason.STROKE, Reason.SLEW)
+    assert status.limits_hit == (Limit.STROKE, Limit.SLEW)
     assert status.command_nm.size == 0
     status, _ = apply_command(device, status, told(even(300), 3), START_NS + 2 * MS)
     assert status.limits_hit == ()
@@ -170,12 +170,12 @@ def test_its_own_limits_are_named_and_the_modal_command_is_forgotten() -> None:
 @pytest.mark.parametrize(
     ("what", "reason"),
     [
-        (told(None, 6), Reason.WRONG_GRID),
-        (told(np.zeros((5, 4), np.float32), 6), Reason.WRONG_GRID),
-        (told(even(np.nan), 6), Reason.NOT_FINITE),
-        (told(even(-np.inf), 6), Reason.NOT_FINITE),
-        (told(even(5), 6, command_nm=np.array([np.nan], np.float32)), Reason.NOT_FINITE),
-        (told(even(5), 4), Reason.OUT_OF_ORDER),
+        (told(None, 6), Limit.WRONG_GRID),
+        (told(np.zeros((5, 4), np.float32), 6), Limit.WRONG_GRID),
+        (told(even(np.nan), 6), Limit.NOT_FINITE),
+        (told(even(-np.inf), 6), Limit.NOT_FINITE),
+        (told(even(5), 6, command_nm=np.array([np.nan], np.float32)), Limit.NOT_FINITE),
+        (told(even(5), 4), Rejection.OUT_OF_ORDER),
     ],
 )
 def test_a_bad_command_changes_nothing_and_does_not_feed_the_dead_man(what: Command, reason: Reason) -> None:
@@ -259,7 +259,7 @@ def test_channels_are_summed_and_the_sum_is_limited() -> None:
     assert sorted(status.channels) == ["lowfc", "offset"]
     status, _ = apply_command(device, status, told(even(3e38), 4, channel="lowfc"), START_NS + 4 * MS)
     status, _ = apply_command(device, status, told(even(3e38), 5, channel="offset"), START_NS + 5 * MS)
-    assert status.limits_hit == (Reason.NOT_FINITE,)
+    assert status.limits_hit == (Limit.NOT_FINITE,)
     assert np.abs(status.surface_nm).max() <= LIMITS.stroke_nm
 
 

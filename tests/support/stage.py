@@ -28,7 +28,7 @@ from lowfc.contract.messages import (
     topic_of,
     wire,
 )
-from lowfc.control.loop.safety import LoopMode, Reason
+from lowfc.control.loop.safety import LoopMode, Rejection
 from lowfc.optics.detector.photometry import tilt_nm_per_mas
 from lowfc.programs.view.snapshot import Accumulator, Snapshot
 from lowfc.programs.view.verdicts.tile import Tile, Verdict
@@ -130,7 +130,7 @@ class Stage:
         if self._runs("camera") and self._runs("controller"):
             step = wire.ControlStep(**frame, mode=self.mode.value, command_nm=[0.0] * 3)
             step.reasons.extend(reason.value for reason in self.reasons)
-            if not any(reason <= Reason.DARK for reason in self.reasons):
+            if not any(reason <= Rejection.DARK for reason in self.reasons):
                 step.error_nm.extend(residual_nm)
                 step.pol_nm.extend(open_nm)
             self.send(STEP, step)

@@ -20,7 +20,7 @@ from lowfc.adapters.process.service import Service
 from lowfc.contract.configuration import Configuration, load
 from lowfc.contract.events import EVENTS
 from lowfc.contract.messages import CONTROLLER_STATE, EVENT, FRAME, HEALTH, STEP, topic_of, wire
-from lowfc.control.loop.safety import LoopMode, Reason
+from lowfc.control.loop.safety import Limit, LoopMode, Rejection
 from lowfc.programs.core.controller import Controller
 from lowfc.programs.view.panels.tiles import FILL, GROUND, HEIGHT, TILES, WIDTH, Tiles, picture, places, png
 from lowfc.programs.view.snapshot import SHOWN, Accumulator
@@ -214,7 +214,7 @@ STATES: dict[str, tuple[Callable[[Stage], object], str, str]] = {
     "open, worse than flat": (setting(mode=LoopMode.OPEN, residual_nm=60.0), "LOOP OPEN NEUTRAL", HARMFUL),
     "camera changed": (opened_by_itself, "LOOP OPEN WARNING", "opened by itself"),
     "safed": (setting(mode=LoopMode.SAFE), "LOOP SAFE BAD", "lowfc ctl clear"),
-    "idle": (setting(mode=LoopMode.IDLE, reasons=(Reason.NO_CALIBRATION,)), "FRAMES REFUSED BAD", "no calibration"),
+    "idle": (setting(mode=LoopMode.IDLE, reasons=(Rejection.NO_CALIBRATION,)), "FRAMES REFUSED BAD", "no calibration"),
     "controller dead": (silence("controller"), "LOOP DEAD BAD", "Controller silent for 4 s"),
     "camera dead": (silence("camera"), "FRAMES NO FRAMES BAD", "No frame for 4 s, camera silent"),
     "mirror dead": (silence("mirror-dm"), "MIRROR DEAD BAD", "Mirror silent for 4 s"),
@@ -225,18 +225,18 @@ STATES: dict[str, tuple[Callable[[Stage], object], str, str]] = {
     "camera stopped": (stop("camera"), "LOOP HOLDING NEUTRAL", "The camera was stopped"),
     "skipped": (counting(skipped=12), "FRAMES 12 LOST WARNING", "12 skipped (controller busy)"),
     "missing": (counting(missing=90), "FRAMES 90 LOST BAD", "90 never arrived"),
-    "late frames": (setting(reasons=(Reason.LATE,)), "FRAMES REFUSED BAD", "too late"),
-    "wrong size": (setting(reasons=(Reason.WRONG_SIZE,)), "FRAMES REFUSED BAD", "wrong size"),
+    "late frames": (setting(reasons=(Rejection.LATE,)), "FRAMES REFUSED BAD", "too late"),
+    "wrong size": (setting(reasons=(Rejection.WRONG_SIZE,)), "FRAMES REFUSED BAD", "wrong size"),
     "saturated": (
-        setting(reasons=(Reason.SATURATED,), full=20),
+        setting(reasons=(Rejection.SATURATED,), full=20),
         "STAR SATURATED BAD",
         "Every frame is refused, detector saturated",
     ),
     "nearly saturated": (setting(full=3), f"STAR {brightened(3)} WARNING", "3 pixels at full well"),
-    "star gone": (setting(reasons=(Reason.DARK,), flux=0.01), "STAR GONE BAD", "the star is gone"),
+    "star gone": (setting(reasons=(Rejection.DARK,), flux=0.01), "STAR GONE BAD", "the star is gone"),
     "dim": (setting(flux=0.4), "STAR 40 % WARNING", "The star is dim"),
-    "stroke": (setting(reasons=(Reason.STROKE,)), "MIRROR AT LIMIT BAD", "actuator stroke"),
-    "modal limit": (setting(reasons=(Reason.MODAL_LIMIT,)), "MIRROR AT LIMIT BAD", "modal limit"),
+    "stroke": (setting(reasons=(Limit.STROKE,)), "MIRROR AT LIMIT BAD", "actuator stroke"),
+    "modal limit": (setting(reasons=(Limit.MODAL_LIMIT,)), "MIRROR AT LIMIT BAD", "modal limit"),
     "little stroke left": (setting(stroke_nm=650.0), "MIRROR 93 % WARNING", "little is left"),
     "expired": (setting(status=wire.MIRROR_STATUS_EXPIRED), "MIRROR EXPIRED BAD", "receives no commands"),
     "harmful": (setting(residual_nm=60.0), "WAVEFRONT 60.0 nm rms WARNING", "The loop does harm"),
@@ -303,7 +303,7 @@ def test_few_unused_frames_are_reported_and_are_no_alarm() -> None:
     assert (tile(verdict, "FRAMES").value, verdict.level) == ("2 LOST", Level.WARNING)
     assert verdict.headline.startswith("2 frames lost in the last 5 s")
     stage = begun(3)
-    stage.reasons = (Reason.LATE,)
+    stage.reasons = (Rejection.LATE,)
     stage.run(0.02)
     stage.reasons = ()
     frames = tile(stage.run(0.98), "FRAMES")

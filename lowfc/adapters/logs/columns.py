@@ -11,7 +11,7 @@ import numpy.typing as npt
 
 from lowfc.contract.messages import from_timestamp, wire
 from lowfc.control.loop.inputs import Step
-from lowfc.control.loop.safety import Reason
+from lowfc.control.loop.safety import REASONS, Reason
 
 Single = npt.NDArray[np.float32]
 Double = npt.NDArray[np.float64]
@@ -182,7 +182,7 @@ def of_steps(steps: Sequence[Step], modes: int) -> Steps:
 
 def reason_counts(bits: Whole) -> dict[Reason, int]:
     """How often each reason was given, of those that were."""
-    counts = {reason: int(np.count_nonzero(bits & (1 << reason))) for reason in Reason} if bits.any() else {}
+    counts = {reason: int(np.count_nonzero(bits & (1 << reason))) for reason in REASONS} if bits.any() else {}
     return {reason: count for reason, count in counts.items() if count}
 
 

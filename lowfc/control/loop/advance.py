@@ -31,10 +31,10 @@ from lowfc.control.loop.inputs import (
 from lowfc.control.loop.loading import camera_reported, in_mode, loaded, mirror_reported, mode_event
 from lowfc.control.loop.requests import answer
 from lowfc.control.loop.reservation import lease_checked
-from lowfc.control.loop.safety import LoopMode, Reason, limit
+from lowfc.control.loop.safety import Limit, LoopMode, Reason, Rejection, limit
 from lowfc.control.loop.state import ActiveLoop, Settings, State
 
-UNMEASURED = frozenset({Reason.NO_CALIBRATION, Reason.WRONG_SIZE})
+UNMEASURED = frozenset({Rejection.NO_CALIBRATION, Rejection.WRONG_SIZE})
 """Without a calibration of its size, a frame is an exposure all the same: probe sequences go on where no law acts."""
 STEPPED = "its last step is done"
 
@@ -55,18 +55,18 @@ def advance(settings: Settings, state: State, taken: Input) -> tuple[State, Outp
 def _frame(settings: Settings, state: State, frame: Frame) -> tuple[State, Outputs]:
     events: list[PendingEvent] = []
     if frame.ahead:
-        return _refuse(settings, state, frame, Reason.AHEAD, events)
+        return _refuse(settings, state, frame, Rejection.AHEAD, events)
     if frame.sequence <= state.frame_sequence:
-        stale = Reason.REPEATED if frame.sequence == state.frame_sequence else Reason.OUT_OF_ORDER
+        stale = Rejection.REPEATED if frame.sequence == state.frame_sequence else Rejection.OUT_OF_ORDER
         return _refuse(settings, state, frame, stale, events)
     state, drive = _arrive(state, frame, events)
     freed = False
     if state.conditions.lease is not None:
         state, drive, freed = _lease_on_frame(state, drive, frame.sequence, events)
     if drive is None or not drive.calibration.noll:
-        return _refuse(settings, _newest(state, drive, frame), frame, Reason.NO_CALIBRATION, events)
+        return _refuse(settings, _newest(state, drive, frame), frame, Rejection.NO_CALIBRATION, events)
     if state.conditions.camera_awaited:
-        return _refuse(settings, _newest(state, drive, frame), frame, Reason.CAMERA_UNKNOWN, events)
+        return _refuse(settings, _newest(state, drive, frame), frame, Rejection.CAMERA_UNKNOWN, events)
     measured = _measure(settings, drive, frame)
     if isinstance(measured, Reason):
         return _refuse(settings, _newest(state, drive, frame), frame, measured, events)
@@ -74,7 +74,7 @@ def _frame(settings: Settings, state: State, frame: Frame) -> tuple[State, Outpu
     alike = state.identical_frames + 1 if estimate.same(state.estimate) else 0
     if 0 < settings.max_identical_frames < alike:
         stuck = _newest(state, drive, frame)._replace(identical_frames=alike)
-        return _refuse(settings, stuck, frame, Reason.STUCK, events)
+        return _refuse(settings, stuck, frame, Rejection.STUCK, events)
     error_nm, pol_nm, drive = _pseudo_open_loop(drive, estimate.error_nm, frame.sequence)
     drive, reasons, homing = _next_command(settings, state, drive, error_nm, frame.sequence)
     if reasons:
@@ -165,17 +165,17 @@ def _measure(settings: Settings, drive: ActiveLoop, frame: Frame) -> tuple[Estim
     """Modal errors of a frame and its saturated pixels, or why it cannot be used."""
     calibration = drive.calibration
     if frame.pixels is None or frame.pixels.shape != calibration.shape:
-        return Reason.WRONG_SIZE
+        return Rejection.WRONG_SIZE
     if frame.age_ns > settings.max_frame_age_ns:
-        return Reason.LATE
+        return Rejection.LATE
     pixels = frame.pixels.ravel()
     saturated = saturated_pixels(calibration, pixels)
     if saturated > settings.max_saturated_pixels:
-        return Reason.SATURATED
+        return Rejection.SATURATED
     if saturated:
         pixels = filled(calibration, pixels)
     estimate = drive.estimator.estimate(pixels, settings.min_flux_fraction * calibration.flux_dn)
-    return Reason.DARK if estimate is None else (estimate, saturated)
+    return Rejection.DARK if estimate is None else (estimate, saturated)
 
 
 def _pseudo_open_loop(drive: ActiveLoop, measured_nm: Single, sequence: int) -> tuple[Single, Single, ActiveLoop]:
@@ -226,7 +226,7 @@ def _next_command(
         if extra_nm is not None:
             kept_nm = np.subtract(kept_nm, extra_nm)
         command_nm = drive.inverse @ kept_nm.reshape(-1)
-    reasons = (Reason.MODAL_LIMIT, *limited.reasons) if cut else limited.reasons
+    reasons = (Limit.MODAL_LIMIT, *limited.reasons) if cut else limited.reasons
     homing = homing and bool(limited.reasons) and not np.array_equal(limited.actuators_nm, drive.actuators_nm)
     return drive.pushed(command_nm, limited.actuators_nm), reasons, homing
 
@@ -286,7 +286,7 @@ def _refuse(
                 drive = _end_probe(drive, frame.sequence, _acted(hit), events)
             _limit_events(state.limits_hit, hit, events)
             reasons = (reason, *hit)
-        elif reason not in (Reason.REPEATED, Reason.OUT_OF_ORDER, Reason.AHEAD):  # those are no new exposure
+        elif reason not in (Rejection.REPEATED, Rejection.OUT_OF_ORDER, Rejection.AHEAD):  # those are no new exposure
             drive = drive.missed(1)
         held = drive.history_nm[0]
     state = state._replace(
@@ -322,7 +322,7 @@ def _tick(settings: Settings, state: State, tick: Tick) -> tuple[State, Outputs]
     if silent and not state.frame_timeout:
         action = "relaxing the mirror to flat" if flatten else "holding the command"
         events.append(PendingEvent("NO_FRAMES", {"silent_ms": tick.silent_ns / 1e6, "action": action}))
-        counts = _counted(counts, (Reason.NO_FRAME,))
+        counts = _counted(counts, (Rejection.NO_FRAME,))
         drive = _end_probe(drive, state.frame_sequence, f"no frame for {tick.silent_ns / 1e6:.0f} ms", events)
     if flatten or safe:
         drive = _step_to_flat(settings, drive)

@@ -33,8 +33,8 @@ class LoopMode(IntEnum):
         return mode_word(self.name.lower())
 
 
-class Reason(IntEnum):
-    """Why a frame or a command was not used as it came; numbered as on the wire."""
+class Rejection(IntEnum):
+    """Why a frame was not used; numbered as on the wire."""
 
     NO_CALIBRATION = 1
     WRONG_SIZE = 2
@@ -47,6 +47,11 @@ class Reason(IntEnum):
     STUCK = 9
     AHEAD = 10
     CAMERA_UNKNOWN = 11
+
+
+class Limit(IntEnum):
+    """What kept a command from being followed as it came; numbered as on the wire."""
+
     MODAL_LIMIT = 20
     STROKE = 21
     SLEW = 22
@@ -54,6 +59,19 @@ class Reason(IntEnum):
     NOT_FINITE = 24
     WRONG_GRID = 25
     CHANNEL = 26
+
+
+Reason = Rejection | Limit
+REASONS: tuple[Reason, ...] = (*Rejection, *Limit)
+
+
+def reason_of(number: int) -> Reason:
+    """The reason with this number on the wire.
+
+    Raises:
+        ValueError: there is none.
+    """
+    return Rejection(number) if number < Limit.MODAL_LIMIT else Limit(number)
 
 
 @dataclass(frozen=True, slots=True)
@@ -103,27 +121,27 @@ def limit(limits: Limits, previous_nm: Actuators, wanted_nm: Actuators) -> Limit
     so does the result; if it does not, it comes back to them at the slew limit.
     """
     if wanted_nm.shape != previous_nm.shape:
-        return Limited(previous_nm, (Reason.WRONG_GRID,))
+        return Limited(previous_nm, (Limit.WRONG_GRID,))
     lowest_nm, highest_nm = _range_nm(wanted_nm)
     if not (isfinite(lowest_nm) and isfinite(highest_nm)):
-        return Limited(previous_nm, (Reason.NOT_FINITE,))
+        return Limited(previous_nm, (Limit.NOT_FINITE,))
     reasons: list[Reason] = []
     stroke, slew = limits.kept_stroke_nm, limits.kept_slew_nm
     kept = wanted_nm
     if max(highest_nm, -lowest_nm) > stroke:
-        reasons.append(Reason.STROKE)
+        reasons.append(Limit.STROKE)
         kept = np.clip(kept, -stroke, stroke)
     move = kept - previous_nm
     lowest_move, highest_move = _range_nm(move)
     if max(highest_move, -lowest_move) > slew:
-        reasons.append(Reason.SLEW)
+        reasons.append(Limit.SLEW)
         move = np.clip(move, -slew, slew)
         kept = previous_nm + move
         lowest_nm, highest_nm = _range_nm(kept)
     apart_nm = limits.neighbour_nm - limits.margin_nm / 2
     # Where no two actuators at all are that far apart, no neighbours are; it costs a fraction of looking at each pair.
     if highest_nm - lowest_nm > apart_nm and neighbour_difference_nm(kept) > apart_nm:
-        reasons.append(Reason.NEIGHBOUR)
+        reasons.append(Limit.NEIGHBOUR)
         kept = _shorten(limits, previous_nm, kept)
     return Limited(kept if kept.dtype == np.float32 else kept.astype(np.float32), tuple(reasons))
 

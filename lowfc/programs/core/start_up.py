@@ -15,7 +15,7 @@ from lowfc.control.laws.margins import check_law
 from lowfc.control.loop.additions import ADOPTED, FLAT
 from lowfc.control.loop.inputs import Request
 from lowfc.control.loop.loading import ADOPTED_NM
-from lowfc.control.loop.safety import Reason, limit
+from lowfc.control.loop.safety import Limit, limit
 from lowfc.control.loop.state import State
 
 LIKENESS = 0.5
@@ -128,7 +128,7 @@ def _flat_within_limits(config: Configuration) -> Single | None:
     found = flat_nm(config)
     if found is not None:
         acting = limit(factory.settings(config).limits, found, found).reasons
-        reasons = [reason for reason in acting if reason is not Reason.SLEW]  # the mirror takes its time
+        reasons = [reason for reason in acting if reason is not Limit.SLEW]  # the mirror takes its time
         if reasons:
             raise ConfigurationError(
                 f"mirror.flat = {config.mirror.flat!r}: beyond the limits of [safety]: "

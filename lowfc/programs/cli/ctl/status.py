@@ -9,7 +9,7 @@ import numpy.typing as npt
 
 from lowfc.contract.envelope import count_of
 from lowfc.contract.messages import FRAME, Role, from_timestamp, wire
-from lowfc.control.loop.safety import Reason
+from lowfc.control.loop.safety import REASONS, Rejection, reason_of
 from lowfc.control.loop.state import FADING_FRAMES, SETTLING_FRAMES
 from lowfc.control.loop.wording import PAUSED, counted, mode_word
 from lowfc.programs.launch.watch import mode_name, topic_count
@@ -92,9 +92,9 @@ def figures(
         ],
         "playing": playing,
         "reserved_for": state.lease.holder if state.lease.id and not state.lease.ended else None,
-        "limits_hit": [Reason(reason).name for reason in state.limits_hit],
-        "refused": Reason(state.refused).name if state.refused else None,
-        "counts": {Reason(line.reason).name: line.count for line in state.counts},
+        "limits_hit": [reason_of(reason).name for reason in state.limits_hit],
+        "refused": reason_of(state.refused).name if state.refused else None,
+        "counts": {reason_of(line.reason).name: line.count for line in state.counts},
         "stroke_nm": settings.stroke_nm,
         "slew_nm": settings.slew_nm,
         "neighbour_nm": settings.neighbour_nm,
@@ -196,7 +196,7 @@ def _mode(known: dict[str, Any]) -> str:
 
 def _reason(number: int) -> str:
     """Its name; of a mirror of a later version, its number."""
-    return Reason(number).name if number in Reason._value2member_map_ else str(number)
+    return next((reason.name for reason in REASONS if reason == number), str(number))
 
 
 def _of_mirror(mirror: dict[str, Any]) -> str:
@@ -212,9 +212,9 @@ def _acting(limits: list[str]) -> str:
 
 def _counted(reason: str, count: int) -> str:
     """How often a frame was refused for a reason, or a limit acted."""
-    if Reason[reason] is Reason.NO_FRAME:
+    if reason == Rejection.NO_FRAME.name:
         return f"no frame {counted(count, 'time')}"
-    if Reason[reason] < Reason.MODAL_LIMIT:
+    if reason in Rejection.__members__:
         return f"{counted(count, 'frame')} refused as {_spoken(reason)}"
     return f"{_spoken(reason)} acted on {counted(count, 'command')}"
 

@@ -23,12 +23,12 @@ from lowfc.control.laws import margins
 from lowfc.control.laws.law import Law
 from lowfc.control.laws.linear_law import LinearLaw, integrator
 from lowfc.control.laws.stability import settling_frames
-from lowfc.control.loop.safety import LoopMode, Reason
+from lowfc.control.loop.safety import Limit, LoopMode, Rejection
 from lowfc.programs.cli.result import Result, figure
 
 Kind = Literal["rejection", "linearity", "capture-range", "noise-floor"]
 
-LIMITS = (Reason.MODAL_LIMIT, Reason.STROKE, Reason.SLEW, Reason.NEIGHBOUR)
+LIMITS = (Limit.MODAL_LIMIT, Limit.STROKE, Limit.SLEW, Limit.NEIGHBOUR)
 MOST_MISSING = 0.01
 """Part of the frames that may be missing or refused."""
 LONGEST_SETTLING = 4000
@@ -253,7 +253,7 @@ def played(
 ) -> Played:
     """The steps of a play from frame `first` on, one row for each of its frames; the rate is that of these steps."""
     frames = len(table)
-    own = (steps.reasons & (1 << Reason.REPEATED | 1 << Reason.OUT_OF_ORDER)) == 0  # others are of a frame seen before
+    own = (steps.reasons & (1 << Rejection.REPEATED | 1 << Rejection.OUT_OF_ORDER)) == 0  # not of a frame seen before
     steps = steps.at(own & (steps.sequence >= first) & (steps.sequence < first + frames))
     places = (steps.sequence - np.uint64(first)).astype(np.int64)
     if len(places) > 1:

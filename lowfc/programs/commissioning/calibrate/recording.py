@@ -20,7 +20,7 @@ from lowfc.control.calibration.response_fit import Cycle, LinearRange, cycle_res
 from lowfc.control.laws.stability import delay_weights
 from lowfc.control.loop.advance import UNMEASURED
 from lowfc.control.loop.inputs import Step
-from lowfc.control.loop.safety import LoopMode, Reason
+from lowfc.control.loop.safety import Limit, LoopMode
 
 Say = Callable[[str], None]
 T = TypeVar("T")
@@ -39,7 +39,7 @@ DITHER_SLOWEST = 1 / 16
 """Cycles per frame below which a dither is not used."""
 _EVERY = 20
 """Frames between two reports of progress."""
-_LIMITS = frozenset(reason for reason in Reason if reason >= Reason.MODAL_LIMIT)
+_LIMITS = frozenset(Limit)
 
 
 class PlayInterruptedError(CalibrationError):
@@ -202,7 +202,7 @@ def _check(loop: Client, step: Step, before: LoopMode | None, *, over: bool) -> 
             f"the loop went from {before.name.lower()} to {step.mode.name.lower()} while pokes were played, which "
             "ended them; leave it alone during a calibration"
         )
-    limits = [reason.name for reason in step.reasons if reason in _LIMITS and reason is not Reason.MODAL_LIMIT]
+    limits = [reason.name for reason in step.reasons if reason in _LIMITS and reason is not Limit.MODAL_LIMIT]
     if limits and not over:
         raise CalibrationError(
             f"a limit of the mirror acted on the pokes ({', '.join(limits)}), which ended them: take a smaller "

@@ -12,7 +12,7 @@ from lowfc.adapters.logs.history import History
 from lowfc.contract.envelope import count_of
 from lowfc.contract.errors import DataFileError
 from lowfc.control.calibration.calibration import Calibration
-from lowfc.control.loop.safety import LoopMode, Reason
+from lowfc.control.loop.safety import REASONS, LoopMode
 
 
 @dataclass(frozen=True, slots=True)
@@ -53,7 +53,7 @@ def step_columns(history: History) -> list[Column]:
         raise DataFileError(f"{history.log.path} has no steps{others}: there is nothing to export")
 
     def reasons(bits: int) -> str:
-        return " ".join(reason.name.lower() for reason in Reason if bits >> reason & 1)
+        return " ".join(reason.name.lower() for reason in REASONS if bits >> reason & 1)
 
     columns = [
         Column("sequence", steps.sequence, "", "of the frame: start of the camera in unix seconds << 32 | count"),

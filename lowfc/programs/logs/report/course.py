@@ -9,10 +9,10 @@ from lowfc.adapters.logs.history import History
 from lowfc.arrays import Long, Single
 from lowfc.contract.events import Level
 from lowfc.contract.messages import wire
-from lowfc.control.loop.safety import LoopMode, Reason
+from lowfc.control.loop.safety import Limit, LoopMode
 from lowfc.programs.logs.report.source import Figures, Run
 
-_FIRST_LIMIT = Reason.MODAL_LIMIT
+_FIRST_LIMIT = Limit.MODAL_LIMIT
 _LEVELS = {level.value: level.name.lower() for level in Level}
 
 

@@ -18,7 +18,7 @@ from lowfc.control.calibration.calibration import ESTIMATORS, Calibration, recon
 from lowfc.control.laws.law import Law
 from lowfc.control.laws.stability import limiting_gain
 from lowfc.control.laws.what_if import Controller, as_logged, counterfactual, rms
-from lowfc.control.loop.safety import Reason
+from lowfc.control.loop.safety import Limit
 from lowfc.optics.chain.zernike import mode_name
 from lowfc.optics.detector.photometry import tilt_nm_per_mas
 from lowfc.programs.logs.what_if.options import LAW_KEYS, TILTS, WhatIf, law, user_controller, wanted
@@ -30,7 +30,7 @@ __all__ = ["WhatIf", "render", "wanted", "what_if"]
 LINEAR_WAVES = 5 * tilt_nm_per_mas(2.0) / 550
 """Rms of a mode up to which the sensor is taken as linear: 5 mas of tilt with 2 m at 550 nm, 0.022 waves."""
 
-_LIMITS = (Reason.MODAL_LIMIT, Reason.STROKE, Reason.SLEW, Reason.NEIGHBOUR)
+_LIMITS = (Limit.MODAL_LIMIT, Limit.STROKE, Limit.SLEW, Limit.NEIGHBOUR)
 _TITLES = {
     "open": "open loop",
     "was": "as it was",

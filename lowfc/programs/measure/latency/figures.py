@@ -11,7 +11,7 @@ from lowfc.adapters.logs.columns import STAGES as TIMED
 from lowfc.adapters.logs.columns import rows_of
 from lowfc.arrays import Array, Long, Mask, Sequences
 from lowfc.contract.messages import FRAME, wire
-from lowfc.control.loop.safety import Reason
+from lowfc.control.loop.safety import Rejection, reason_of
 from lowfc.programs.launch.watch import topic_count
 
 WARM_UP_S = 0.5
@@ -180,11 +180,11 @@ def repeat_figures(frames: Frames) -> dict[str, Any]:
 def controllers_account(health: wire.Health) -> dict[str, Any]:
     """Of the whole run, by the controller: frames_skipped, frames_missing, and reasons given for a frame, counted."""
     frames = topic_count(health, FRAME.key)
-    reasons = {Reason(one.reason): one.count for one in health.counts}
+    reasons = {reason_of(one.reason): one.count for one in health.counts}
     return {
         "frames_skipped": frames.skipped,
         "frames_missing": frames.missing,
-        "reasons": {reason.name: count for reason, count in reasons.items() if reason is not Reason.NO_FRAME},
+        "reasons": {reason.name: count for reason, count in reasons.items() if reason is not Rejection.NO_FRAME},
     }
 
 

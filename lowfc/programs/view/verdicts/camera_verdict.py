@@ -1,7 +1,7 @@
 """Judgement on what comes from the camera: do frames arrive, are they used, is there light on them."""
 
 from lowfc.contract.messages import FRAME, Role
-from lowfc.control.loop.safety import Reason
+from lowfc.control.loop.safety import Reason, Rejection
 from lowfc.control.loop.wording import counted
 from lowfc.programs.view.verdicts.tile import Level, Tile, ago, worst_of
 from lowfc.programs.view.verdicts.watcher import GRACE_S, RECENT_S, SILENT_S, Liveness, Watcher
@@ -17,14 +17,14 @@ DARK, DIM, BRIGHT = 0.2, 0.5, 2.0
 noise; twice the light is not the star that was calibrated."""
 
 REFUSED: dict[Reason, tuple[str, str]] = {
-    Reason.DARK: ("too dark", "the star is gone; look at pointing, shutter and clouds"),
-    Reason.SATURATED: ("detector saturated", "there is too much light; shorten the exposure or dim the star"),
-    Reason.WRONG_SIZE: ("wrong size", "they are not what was calibrated; set the camera back or calibrate again"),
-    Reason.LATE: ("too late", "host or link is too slow; look at the latency, lower the rate"),
-    Reason.NO_CALIBRATION: ("no calibration", "load a calibration"),
-    Reason.STUCK: ("stuck", "the camera sends one image again and again; restart it"),
-    Reason.REPEATED: ("repeated", "the camera sends a frame twice; restart it"),
-    Reason.OUT_OF_ORDER: ("out of order", "there may be a second camera on the bus; stop one"),
+    Rejection.DARK: ("too dark", "the star is gone; look at pointing, shutter and clouds"),
+    Rejection.SATURATED: ("detector saturated", "there is too much light; shorten the exposure or dim the star"),
+    Rejection.WRONG_SIZE: ("wrong size", "they are not what was calibrated; set the camera back or calibrate again"),
+    Rejection.LATE: ("too late", "host or link is too slow; look at the latency, lower the rate"),
+    Rejection.NO_CALIBRATION: ("no calibration", "load a calibration"),
+    Rejection.STUCK: ("stuck", "the camera sends one image again and again; restart it"),
+    Rejection.REPEATED: ("repeated", "the camera sends a frame twice; restart it"),
+    Rejection.OUT_OF_ORDER: ("out of order", "there may be a second camera on the bus; stop one"),
 }
 """The reasons for which a frame is refused: in words, and what to do."""
 
@@ -110,10 +110,10 @@ def star(watcher: Watcher) -> Tile:
         return Tile(title, f"last: {value}", detail, Level.NEUTRAL)
     full = f"{counted(watcher.saturated, 'pixel')} at full well"
     steps = watcher.now("steps")
-    if watcher.now(Reason.SATURATED) > steps / 2 and watcher.saturated:
+    if watcher.now(Rejection.SATURATED) > steps / 2 and watcher.saturated:
         advice = f"The detector is saturated, {full}: shorten the exposure or dim the star."
         return Tile(title, "SATURATED", f"{full}; {value} {detail}", Level.BAD, advice)
-    if (watcher.now(Reason.DARK) > steps / 2 and flux < DIM) or (not steps and flux < DARK):
+    if (watcher.now(Rejection.DARK) > steps / 2 and flux < DIM) or (not steps and flux < DARK):
         advice = f"The star is gone, {value} of its light: look at pointing, shutter and clouds. The mirror holds."
         return Tile(title, "GONE", f"{value} {detail}", Level.BAD, advice)
     if watcher.saturated:

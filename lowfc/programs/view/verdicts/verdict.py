@@ -5,7 +5,7 @@ from pathlib import PurePath
 
 from lowfc.contract.messages import FRAME, STEP, Role, from_timestamp, wire
 from lowfc.contract.printable import printable
-from lowfc.control.loop.safety import LoopMode, Reason
+from lowfc.control.loop.safety import Limit, LoopMode, Reason
 from lowfc.control.loop.wording import counted
 from lowfc.programs.view.verdicts.camera_verdict import all_refused, frames, star
 from lowfc.programs.view.verdicts.facts import facts
@@ -24,12 +24,12 @@ BEHIND_S, FAR_BEHIND_S = 1.0, 5.0
 
 
 LIMITS: dict[Reason, str] = {
-    Reason.MODAL_LIMIT: "modal limit",
-    Reason.STROKE: "actuator stroke",
-    Reason.SLEW: "actuator slew",
-    Reason.NEIGHBOUR: "neighbouring actuators",
-    Reason.NOT_FINITE: "command not finite",
-    Reason.WRONG_GRID: "wrong grid",
+    Limit.MODAL_LIMIT: "modal limit",
+    Limit.STROKE: "actuator stroke",
+    Limit.SLEW: "actuator slew",
+    Limit.NEIGHBOUR: "neighbouring actuators",
+    Limit.NOT_FINITE: "command not finite",
+    Limit.WRONG_GRID: "wrong grid",
 }
 
 
