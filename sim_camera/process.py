@@ -239,7 +239,7 @@ class CameraProcess:
         now_ns = self._service.clock.host_ns()
         silent = [
             name
-            for name, health in sorted(self._service.heard.items())
+            for name, health in sorted(self._service.last_health.items())
             if name != self._service.name and now_ns - health.timestamp.ToNanoseconds() > PATIENCE_S * 0.4e9
         ]
         who = f"nothing was heard of {', '.join(silent)}" if silent else "all processes are alive"

@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from lowfc.control.loop.additions import LONGEST_NAME, MOST_CHANNELS
+from lowfc.control.loop.command_channels import LONGEST_NAME, MOST_CHANNELS
 from lowfc.control.loop.safety import Limit, Limits, Reason, Rejection, expired, limit
 
 Single = npt.NDArray[np.float32]

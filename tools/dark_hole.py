@@ -19,7 +19,7 @@ from rich.progress import track
 from lowfc.arrays import Array, Mask
 from lowfc.client import Client, running
 from lowfc.contract.messages import STEP, TRUTH, wire
-from lowfc.control.loop.additions import FLAT
+from lowfc.control.loop.command_channels import FLAT
 from tools.shared import Figures, markdown
 
 STEPS = 20

@@ -43,8 +43,8 @@ from lowfc.contract.messages import (
 from lowfc.contract.published import Published
 from lowfc.control.calibration.calibration import Calibration
 from lowfc.control.laws.linear_law import LinearLaw
-from lowfc.control.loop.additions import MIRROR, OFFSET
 from lowfc.control.loop.camera import CameraSettings
+from lowfc.control.loop.command_channels import MIRROR, OFFSET
 from lowfc.control.loop.inputs import Step
 
 Single = npt.NDArray[np.float32]

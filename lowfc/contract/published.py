@@ -10,7 +10,7 @@ from lowfc.contract.codecs.law_codec import law_of, table_of
 from lowfc.contract.messages import CALIBRATION, LAW, PLAY, Topic, wire
 from lowfc.control.calibration.calibration import Calibration
 from lowfc.control.laws.linear_law import LinearLaw
-from lowfc.control.loop.additions import PlayTable
+from lowfc.control.loop.command_channels import PlayTable
 
 TOPICS = (CALIBRATION, LAW, PLAY)
 

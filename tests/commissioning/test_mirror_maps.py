@@ -16,8 +16,8 @@ from lowfc.contract.configuration import Configuration, load
 from lowfc.contract.errors import ConfigurationError, DataFileError
 from lowfc.control.calibration.calibration import Calibration
 from lowfc.control.laws.linear_law import LinearLaw, Signal, integrator_block, of_blocks
-from lowfc.control.loop.additions import ADOPTED, FLAT
 from lowfc.control.loop.advance import advance
+from lowfc.control.loop.command_channels import ADOPTED, FLAT
 from lowfc.control.loop.inputs import Frame, Load, MirrorShape, Request
 from lowfc.control.loop.safety import LoopMode
 from lowfc.control.loop.state import State

@@ -9,9 +9,9 @@ from lowfc.arrays import Single
 from lowfc.contract.codecs.calibration_codec import decode_calibration, encode_calibration, identified
 from lowfc.contract.codecs.state_codec import controller_state, decode_state
 from lowfc.contract.messages import wire
-from lowfc.control.loop.additions import MIRROR
 from lowfc.control.loop.advance import advance
 from lowfc.control.loop.camera import CameraSettings, changes
+from lowfc.control.loop.command_channels import MIRROR
 from lowfc.control.loop.inputs import Frame, Input, Load, MirrorShape, Outputs, Reply, Request, Tick
 from lowfc.control.loop.safety import Limit, LoopMode, Rejection
 from lowfc.control.loop.state import State
@@ -316,7 +316,7 @@ def test_stop_says_what_it_ended() -> None:
 
 def test_a_state_in_the_log_goes_on_alike() -> None:
     state = play(idle(shape_nm=30.0), np.ones((5, 1), np.float32))
-    table = state.drive.additions.play.table
+    table = state.drive.command_channels.play.table
     message = controller_state(state, USUAL, 0)
     _, again = decode_state(message, None, {}, {table.id: table})
     rest = [odd(count) for count in range(4, 12)]

@@ -7,8 +7,8 @@ import pytest
 
 from lowfc.contract.events import EVENTS
 from lowfc.control.laws.stability import highest_gain
-from lowfc.control.loop.additions import MIRROR
 from lowfc.control.loop.advance import advance
+from lowfc.control.loop.command_channels import MIRROR
 from lowfc.control.loop.inputs import Outputs, Reply, Request, Tick
 from lowfc.control.loop.lease import MAX_S
 from lowfc.control.loop.safety import LoopMode
@@ -45,7 +45,7 @@ def played(state: State, frames: int = 500, lease_id: int = MINE) -> State:
 
 
 def left(state: State) -> int:
-    added = state.drive.additions
+    added = state.drive.command_channels
     return 0 if added is None or added.play is None else added.play.left(state.frame_sequence + 1)
 
 
@@ -215,7 +215,7 @@ def test_a_channel_that_is_not_there_is_said_so_and_one_that_is_there_is_removed
     state = loaded(USUAL)
     after, reply = replied(state, "channel", text="dark-hole")
     assert (reply.accepted, reply.text) == (True, "there is no channel 'dark-hole' to remove; there are none")
-    assert after.drive.additions is None
+    assert after.drive.command_channels is None
     shape = Request(1, "channel", text="dark-hole", actuators_nm=np.full(GRID, 2.0, np.float32).reshape(-1))
     state, _ = advance(USUAL, state, shape)
     assert replied(state, "channel", text="hole")[1].text == "there is no channel 'hole' to remove; there are dark-hole"

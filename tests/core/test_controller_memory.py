@@ -436,7 +436,7 @@ def test_another_mirror_than_the_calibrations_is_refused(calibration: Calibratio
 def test_a_warm_up_changes_nothing_and_says_nothing(
     calibration: Calibration, scene: Bench, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    rehearsed: list[bool] = []
+    warmed_up: list[bool] = []
     original = Controller._warm_up
 
     monkeypatch.setattr(cache_warmup, "LEAD_NS", 30_000_000)  # a host with other tests on it is late now and then
@@ -448,7 +448,7 @@ def test_a_warm_up_changes_nothing_and_says_nothing(
         def watched(self: Controller) -> None:
             before, said_before = self._state, said()
             original(self)
-            rehearsed.append(self._state is before and said() == said_before)
+            warmed_up.append(self._state is before and said() == said_before)
 
         monkeypatch.setattr(Controller, "_warm_up", watched)
         for index in range(5):
@@ -456,8 +456,8 @@ def test_a_warm_up_changes_nothing_and_says_nothing(
             rig.put(pixels)
             time.sleep(0.1)  # two periods
         assert [list(step.reasons) for step in rig.steps(5)] == [[]] * 5
-    assert len(rehearsed) >= 3
-    assert all(rehearsed)
+    assert len(warmed_up) >= 3
+    assert all(warmed_up)
 
 
 def test_a_frame_that_cannot_be_dealt_with_ends_the_controller(

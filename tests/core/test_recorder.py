@@ -340,7 +340,7 @@ def test_a_recorder_process_loses_nothing_from_the_first_frame_on(
         camera.service.beat()
         time.sleep(0.001)
     recording.send_signal(signal.SIGTERM)
-    until(lambda: camera.service.heard["recorder"].state == "stopping")
+    until(lambda: camera.service.last_health["recorder"].state == "stopping")
     camera.frames.put(b"the last one, after the signal")
     camera.service.finish()
     out, _ = recording.communicate(timeout=PATIENCE_S)

@@ -72,7 +72,7 @@ class Bench:
 
     def recorder_is(self, state: str) -> bool:
         self.service.beat()
-        return "recorder" in self.service.heard and self.service.heard["recorder"].state == state
+        return "recorder" in self.service.last_health and self.service.last_health["recorder"].state == state
 
     def read(self) -> LogReader:
         (path,) = self.folder.iterdir()

@@ -41,17 +41,17 @@ class Lossy:
         if not lost(attachment):
             self.publisher.put(payload, attachment=attachment)
 
-class LossyShortcut:
-    def __init__(self, shortcut):
-        self.shortcut, self.close = shortcut, shortcut.close
+class LossyDirectLink:
+    def __init__(self, direct_link):
+        self.direct_link, self.close = direct_link, direct_link.close
     def send(self, attachment, payload):
-        return not lost(attachment) and self.shortcut.send(attachment, payload)
+        return not lost(attachment) and self.direct_link.send(attachment, payload)
 
 made = ZenohPublisher.__init__
-def lossy(self, bus, session, topic, key, shortcut):
-    made(self, bus, session, topic, key, shortcut)
+def lossy(self, bus, session, topic, key, direct_link):
+    made(self, bus, session, topic, key, direct_link)
     if topic is FRAME:
-        self._publisher, self._shortcut = Lossy(self._publisher), LossyShortcut(self._shortcut)
+        self._publisher, self._direct_link = Lossy(self._publisher), LossyDirectLink(self._direct_link)
 
 ZenohPublisher.__init__ = lossy
 main()

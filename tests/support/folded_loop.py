@@ -24,9 +24,9 @@ from lowfc.contract.messages import MIRROR_STATE, Topic, wire
 from lowfc.control.calibration.calibration import Calibration
 from lowfc.control.laws.linear_law import LinearLaw
 from lowfc.control.laws.stability import delay_weights
-from lowfc.control.loop.additions import MIRROR
 from lowfc.control.loop.advance import advance
 from lowfc.control.loop.camera import CameraSettings
+from lowfc.control.loop.command_channels import MIRROR
 from lowfc.control.loop.inputs import Frame, Input, Load, MirrorShape, Request, Step
 from lowfc.control.loop.state import State
 from lowfc.testing.memory_bus import MemoryBus, MemoryHub, MemoryRing

@@ -30,9 +30,9 @@ from lowfc.contract.errors import LowfcError
 from lowfc.contract.messages import CAMERA_STATE, COMMAND, FRAME, image, wire
 from lowfc.control.laws.law import Law
 from lowfc.control.laws.linear_law import LinearLaw, integrator
-from lowfc.control.loop.additions import PlayTable
 from lowfc.control.loop.advance import advance
 from lowfc.control.loop.camera import CameraSettings
+from lowfc.control.loop.command_channels import PlayTable
 from lowfc.control.loop.inputs import Input, Load, MirrorShape, Tick
 from lowfc.control.loop.requests import prepared
 from lowfc.control.loop.state import State

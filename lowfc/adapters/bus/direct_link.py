@@ -111,7 +111,7 @@ class _Receiver:
         self._listener = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET)
         self._listener.bind(os.fspath(path))
         self._listener.listen(1)
-        self._accepting = threading.Thread(target=self._accept, name="shortcut-accept", daemon=True)
+        self._accepting = threading.Thread(target=self._accept, name="direct-link-accept", daemon=True)
         self._accepting.start()
 
     def close(self) -> None:
@@ -158,7 +158,7 @@ class _Receiver:
                 if coming is None:
                     return
                 connection = coming
-                served = threading.Thread(target=self._serve, args=(connection,), name="shortcut", daemon=True)
+                served = threading.Thread(target=self._serve, args=(connection,), name="direct-link", daemon=True)
                 served.start()
 
     def _serve(self, connection: socket.socket) -> None:

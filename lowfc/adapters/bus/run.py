@@ -73,7 +73,7 @@ class Links:
         """Unix socket of a role, beside its port; None where the directory's name is too long for one."""
         return self._beside(f"{role}.sock") if role in self.ports else None
 
-    def shortcut(self, role: str) -> Path | None:
+    def direct_link(self, role: str) -> Path | None:
         """Socket at which a role gets what it waits for; None where the directory's name is too long for one.
 
         None by a router: who may put what is the router's to say, and no process shall get round it.

@@ -68,7 +68,9 @@ def declare_publisher(session: zenoh.Session, topic: Topic, key: str, *, lockste
 class ZenohPublisher:
     """Publishes one topic; see `Publisher`."""
 
-    def __init__(self, bus: "ZenohBus", session: zenoh.Session, topic: Topic, key: str, shortcut: Path | None) -> None:
+    def __init__(
+        self, bus: "ZenohBus", session: zenoh.Session, topic: Topic, key: str, direct_link: Path | None
+    ) -> None:
         self.topic = topic
         self.key = key
         self.published = 0
@@ -80,7 +82,7 @@ class ZenohPublisher:
         self._offset = bus.offset
         self._replying = bus.replying
         self._publisher = declare_publisher(session, topic, key, lockstep=bus.clock.lockstep)
-        self._shortcut = None if shortcut is None else DirectWriter(shortcut)
+        self._direct_link = None if direct_link is None else DirectWriter(direct_link)
         if self._keeps:
             session.declare_queryable(key, Callback(self._answer, indirect=False))
 
@@ -93,7 +95,7 @@ class ZenohPublisher:
         self.published += 1
         if self._keeps:
             self.last = (payload, envelope)
-        handed = self._shortcut is not None and self._shortcut.send(envelope.encode(), payload)
+        handed = self._direct_link is not None and self._direct_link.send(envelope.encode(), payload)
         if handed:
             self.handed_ns = self._host_ns()
         self._publisher.put(payload, attachment=self._sent(envelope))
@@ -103,8 +105,8 @@ class ZenohPublisher:
 
     def close(self) -> None:
         """Let go of what is not zenoh's."""
-        if self._shortcut is not None:
-            self._shortcut.close()
+        if self._direct_link is not None:
+            self._direct_link.close()
 
     def _answer(self, query: zenoh.Query) -> None:
         with self._replying(query):
@@ -219,14 +221,14 @@ class ZenohBus:
     def publisher(self, topic: Topic, name: str = "") -> ZenohPublisher:
         """See `Bus.publisher`."""
         by_table = self.role.partition("-")[0] in topic.publisher
-        path = self._shortcut(topic, name) if by_table else None
+        path = self._direct_link(topic, name) if by_table else None
         publisher = ZenohPublisher(self, self._session, topic, topic.at(name), path)
         self._closers.append(publisher.close)
         return publisher
 
     def subscribe(self, topic: Topic, handler: Callable[[Sample], None], name: str = ALL) -> Callable[[], None]:
         """See `Bus.subscribe`; `handler` runs on a thread that receives, on one at a time."""
-        if _reader(topic, name) != self.role or (path := self._shortcut(topic, name)) is None:
+        if _reader(topic, name) != self.role or (path := self._direct_link(topic, name)) is None:
             return self._subscribe(topic, handler, name)
         key = topic.at(name)
         reader = (SharedDirectReader if topic.multiple_publishers else DirectReader)(
@@ -324,9 +326,9 @@ class ZenohBus:
         with contextlib.suppress(zenoh.ZError):
             self._session.close()  # type: ignore[no-untyped-call]
 
-    def _shortcut(self, topic: Topic, name: str) -> Path | None:
+    def _direct_link(self, topic: Topic, name: str) -> Path | None:
         reader = _reader(topic, name)
-        return None if reader is None else self._links.shortcut(reader)
+        return None if reader is None else self._links.direct_link(reader)
 
     @contextlib.contextmanager
     def replying(self, query: zenoh.Query) -> Iterator[None]:

@@ -61,7 +61,7 @@ class Service:
         self.running = True
         self.why = "finished"
         self.work = 0
-        self.heard: dict[str, wire.Health] = {}
+        self.last_health: dict[str, wire.Health] = {}
         self.publishers: list[Publisher] = []
         self.arrivals: list[Arrivals] = []
         self.run_id = run_id
@@ -144,7 +144,7 @@ class Service:
 
     def newcomers(self) -> bool:
         """Whether somebody is heard whom the last call did not know: who answers what is asked, or answers anew."""
-        there = {(name, health.pid) for name, health in list(self.heard.items())}
+        there = {(name, health.pid) for name, health in list(self.last_health.items())}
         new = not there <= self._known
         self._known = there
         return new
@@ -266,7 +266,7 @@ class Service:
             version=__version__,
             memory_bytes=resident_bytes(),
             rate_hz=(self.work - self._worked) / span_s,
-            peers_alive=sorted(self.heard),
+            peers_alive=sorted(self.last_health),
             realtime_granted=self._granted.granted,
             realtime_refused=[f"{measure}: {cost}" for measure, cost in self._granted.refused],
             clock_offset_ns=self.clock.offset_ns,
@@ -302,13 +302,13 @@ class Service:
         name, health = self._names.health(sample.key, sample.payload)
         if name == self.name:
             return
-        known = self.heard.get(name)
-        self.heard[name] = health
+        known = self.last_health.get(name)
+        self.last_health[name] = health
         if known is None or known.pid != health.pid:
             self._due_ns = 0  # answer a newcomer at the next beat, so that it need not wait for us
 
     def _meets(self, name: str) -> bool:
-        health = self.heard.get(name)
+        health = self.last_health.get(name)
         return health is not None and health.state in ("ready", "running") and self.name in health.peers_alive
 
     def _caught(self, number: int, frame: FrameType | None) -> None:

@@ -22,8 +22,8 @@ from lowfc.contract.messages import (
 )
 from lowfc.control.calibration.calibration import Calibration
 from lowfc.control.laws.linear_law import LinearLaw
-from lowfc.control.loop.additions import PlayTable
 from lowfc.control.loop.camera import CameraSettings
+from lowfc.control.loop.command_channels import PlayTable
 from lowfc.control.loop.durations import Durations
 from lowfc.control.loop.inputs import Command, Frame, Input, Load, MirrorShape, Reply, Request, Step, Tick
 from lowfc.control.loop.safety import LoopMode, Reason

@@ -10,7 +10,7 @@ from lowfc.arrays import Single
 from lowfc.contract.messages import fields_of, floats, timestamp, wire
 from lowfc.control.laws.law import Law
 from lowfc.control.laws.linear_law import LinearLaw, matrix_shapes
-from lowfc.control.loop.additions import Channel, CommandChannels, Play, PlayTable, play_table
+from lowfc.control.loop.command_channels import Channel, CommandChannels, Play, PlayTable, play_table
 
 _PLAIN = ("name", "signal", "delay_frames", "rate_hz")  # of the same name in law and message
 
@@ -77,14 +77,14 @@ def table_of(message: wire.Play) -> PlayTable:
     return play_table(message.target, floats(message.table, -1, message.columns or 1), floats(message.basis, -1))
 
 
-def put_additions(message: wire.ControllerState, additions: CommandChannels) -> None:
+def put_command_channels(message: wire.ControllerState, command_channels: CommandChannels) -> None:
     """What is added to the law's command, into a state."""
-    message.offset_nm.extend(additions.offset_nm.tolist())
-    message.shift_history_nm.extend(np.concatenate(additions.shifts_nm).tolist())
-    for one in additions.channels:
+    message.offset_nm.extend(command_channels.offset_nm.tolist())
+    message.shift_history_nm.extend(np.concatenate(command_channels.shifts_nm).tolist())
+    for one in command_channels.channels:
         wanted, reached = one.wanted_nm.tobytes(), one.reached_nm.tobytes()
         message.channels.add(name=one.name, actuators=wanted, shifts=one.shifts, reached=reached)
-    play = additions.play
+    play = command_channels.play
     if play is not None:
         message.play.target = play.target
         message.play.first_sequence = play.first_sequence
@@ -93,7 +93,7 @@ def put_additions(message: wire.ControllerState, additions: CommandChannels) -> 
         message.play.id = play.table.id
 
 
-def additions_of(
+def command_channels_of(
     message: wire.ControllerState, none: CommandChannels, to_modes: Single, plays: Mapping[str, PlayTable]
 ) -> CommandChannels | None:
     """What is added, of a state; `none` has its shapes. None where the state has nothing of it.

@@ -8,13 +8,13 @@ import numpy as np
 
 from lowfc.contract.codecs.calibration_codec import camera_settings, wire_camera
 from lowfc.contract.codecs.codec import wire_mode, wire_reasons
-from lowfc.contract.codecs.law_codec import additions_of, law_header, law_of, put_additions
+from lowfc.contract.codecs.law_codec import command_channels_of, law_header, law_of, put_command_channels
 from lowfc.contract.messages import fields_of, floats, from_timestamp, timestamp, wire
 from lowfc.control.calibration.calibration import Calibration
 from lowfc.control.laws import linear_law
 from lowfc.control.laws.law import Law
 from lowfc.control.laws.linear_law import LinearLaw
-from lowfc.control.loop.additions import PlayTable
+from lowfc.control.loop.command_channels import PlayTable
 from lowfc.control.loop.estimator import Estimate
 from lowfc.control.loop.lease import Lease
 from lowfc.control.loop.safety import Limits, LoopMode, reason_of
@@ -68,8 +68,8 @@ def controller_state(state: State, settings: Settings, time_ns: int) -> wire.Con
         message.measured_nm.extend(state.estimate.error_nm.tolist())
         message.flux_dn = state.estimate.flux_dn
     if state.drive is not None:
-        if state.drive.additions is not None:
-            put_additions(message, state.drive.additions)
+        if state.drive.command_channels is not None:
+            put_command_channels(message, state.drive.command_channels)
         if state.drive.camera is not None:
             message.camera_expected.CopyFrom(wire_camera(state.drive.camera))
         following = state.drive.following
@@ -122,7 +122,7 @@ def decode_state(
             law=law,
             camera=camera_settings(message.camera_expected) if message.HasField("camera_expected") else drive.camera,
             following=following,
-            additions=additions_of(message, drive.added(), drive.to_modes, plays),
+            command_channels=command_channels_of(message, drive.added(), drive.to_modes, plays),
             history_nm=tuple(history),
             actuators_nm=actuators,
         )

@@ -132,8 +132,10 @@ def _arrive(state: State, frame: Frame, events: list[PendingEvent]) -> tuple[Sta
     elif state.frame_sequence:
         events.append(PendingEvent("CAMERA_RESTARTED", {}))
         state = _awaiting_camera(state, frame)
-        if drive is not None and drive.additions is not None and drive.additions.play is not None:
-            drive = drive._replace(additions=drive.additions.stopped(0))  # its frames were the former camera's
+        if drive is not None and drive.command_channels is not None and drive.command_channels.play is not None:
+            drive = drive._replace(
+                command_channels=drive.command_channels.stopped(0)
+            )  # its frames were the former camera's
             events.append(PendingEvent("PLAY_ENDED", {"why": "the camera restarted"}))
     else:  # after a clear, this may be another start of the camera
         state = _awaiting_camera(state, frame)
@@ -184,7 +186,7 @@ def _pseudo_open_loop(drive: ActiveLoop, measured_nm: Single, sequence: int) -> 
     Channels are taken out of both, as far as the exposure saw them; what the loop is to aim at is taken out of the
     error.
     """
-    added, error_nm = drive.additions, measured_nm
+    added, error_nm = drive.command_channels, measured_nm
     if added is not None:
         error_nm = measured_nm - added.seen_nm(drive.weights)
     pol_nm = to_undo_nm = error_nm - drive.seen_nm()
@@ -202,7 +204,7 @@ def _next_command(
     """The command after an error (modes,), the limits that acted, and whether it is still on its way to zero."""
     if state.mode is LoopMode.SAFE:
         return _step_to_flat(settings, drive), (), False
-    added, homing = drive.additions, state.returning_to_zero
+    added, homing = drive.command_channels, state.returning_to_zero
     closed = state.mode is LoopMode.CLOSED
     # A limit that acted on the last command has kept the mirror from where it was to go.
     if not closed and not homing and (added is None or not (added.moving or state.limits_hit)):
@@ -216,7 +218,7 @@ def _next_command(
     extra_nm: Single | None = None
     if added is not None:
         added = added.moved(sequence, settings.limits.kept_slew_nm / 2, drive.to_modes)
-        drive = drive._replace(additions=added)
+        drive = drive._replace(command_channels=added)
         played_nm = added.played_nm(sequence)
         extra_nm = added.sum_nm if played_nm is None else added.sum_nm + played_nm
         wanted_nm += extra_nm
@@ -253,18 +255,18 @@ def _acted(limits: tuple[Reason, ...]) -> str:
 
 def _end_probe(drive: ActiveLoop, sequence: int, why: str, events: list[PendingEvent]) -> ActiveLoop:
     """The drive with nothing more to play after this frame."""
-    added = drive.additions
+    added = drive.command_channels
     if added is None or added.play is None or added.play.over(sequence):
         return drive
     events.append(PendingEvent("PLAY_ENDED", {"why": why}))
-    return drive._replace(additions=added.stopped(sequence))
+    return drive._replace(command_channels=added.stopped(sequence))
 
 
 def _step_to_flat(settings: Settings, drive: ActiveLoop) -> ActiveLoop:
     """One frame towards flat, within the slew limit."""
     flat = limit(settings.limits, drive.actuators_nm, np.zeros_like(drive.actuators_nm)).actuators_nm
-    if drive.additions is not None:
-        drive = drive._replace(additions=drive.additions.lowered(drive.to_modes))
+    if drive.command_channels is not None:
+        drive = drive._replace(command_channels=drive.command_channels.lowered(drive.to_modes))
     return drive.pushed(drive.inverse @ flat.reshape(-1), flat)
 
 

@@ -9,8 +9,8 @@ import numpy as np
 from lowfc.arrays import Pixels, Single
 from lowfc.control.calibration.calibration import Calibration
 from lowfc.control.laws.linear_law import LinearLaw
-from lowfc.control.loop.additions import PlayTable
 from lowfc.control.loop.camera import CameraSettings
+from lowfc.control.loop.command_channels import PlayTable
 from lowfc.control.loop.safety import LoopMode, Reason
 
 COUNT_BITS = 32

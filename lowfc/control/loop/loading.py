@@ -6,8 +6,8 @@ import numpy as np
 
 from lowfc.arrays import Single
 from lowfc.control.calibration.calibration import Calibration
-from lowfc.control.loop.additions import ADOPTED, Channel
 from lowfc.control.loop.camera import CameraSettings, changes
+from lowfc.control.loop.command_channels import ADOPTED, Channel
 from lowfc.control.loop.inputs import MirrorShape, Outputs, PendingEvent
 from lowfc.control.loop.safety import LoopMode
 from lowfc.control.loop.state import ActiveLoop, Conditions, Settings, State
@@ -38,12 +38,12 @@ def loaded(
     if before is not None and before.actuators_nm.shape == calibration.grid:
         shape_nm = before.actuators_nm
         same = before.calibration.noll == calibration.noll
-        if before.additions is not None:
-            shape_nm = shape_nm - before.additions.sum_nm
-            additions = drive.added().at(before.additions.channels, drive.to_modes)
+        if before.command_channels is not None:
+            shape_nm = shape_nm - before.command_channels.sum_nm
+            command_channels = drive.added().at(before.command_channels.channels, drive.to_modes)
             if same:
-                additions = additions._replace(offset_nm=before.additions.offset_nm)
-            drive = drive._replace(additions=additions.settled())
+                command_channels = command_channels._replace(offset_nm=before.command_channels.offset_nm)
+            drive = drive._replace(command_channels=command_channels.settled())
         command_nm = drive.inverse @ shape_nm.reshape(-1)
         drive = drive._replace(
             law=before.law if same else drive.law,
@@ -176,7 +176,7 @@ def adopted(drive: ActiveLoop, shape_nm: Single) -> tuple[ActiveLoop, list[Pendi
     there_nm = rest_nm if before is None else before.wanted_nm + rest_nm
     added = added.having(Channel(ADOPTED, there_nm, there_nm), drive.to_modes).settled()
     rms_nm = float(np.sqrt(np.mean(np.square(rest_nm))))
-    drive = drive._replace(additions=added)
+    drive = drive._replace(command_channels=added)
     return drive, [PendingEvent("SHAPE_ADOPTED", {"rms_nm": rms_nm})]
 
 
@@ -184,10 +184,12 @@ def in_mode(state: State, mode: LoopMode, time_ns: int, cause: str) -> State:
     """Nothing of the last mode goes on in the next one."""
     drive = state.drive
     if drive is not None and mode is not state.mode:
-        if drive.additions is not None:
+        if drive.command_channels is not None:
             only_flat = mode is LoopMode.SAFE
-            added = drive.additions.stopped(state.frame_sequence)
-            drive = drive._replace(additions=added.lowered(drive.to_modes, only_flat=True) if only_flat else added)
+            added = drive.command_channels.stopped(state.frame_sequence)
+            drive = drive._replace(
+                command_channels=added.lowered(drive.to_modes, only_flat=True) if only_flat else added
+            )
         if drive.following is not None and mode is LoopMode.CLOSED:
             drive = drive._replace(following=drive.following.taking_over())
     same = mode is state.mode

@@ -13,7 +13,7 @@ from lowfc.arrays import Single
 from lowfc.control.laws.law import Law
 from lowfc.control.laws.margins import check_law
 from lowfc.control.laws.stability import highest_gain, limiting_gain
-from lowfc.control.loop.additions import FLAT, MIRROR, CommandChannels, Play, play_table
+from lowfc.control.loop.command_channels import FLAT, MIRROR, CommandChannels, Play, play_table
 from lowfc.control.loop.inputs import PendingEvent, Request
 from lowfc.control.loop.lease import ENDED_BY, refusal
 from lowfc.control.loop.loading import in_mode, loaded, misfit, mode_event, uncalibrated
@@ -258,12 +258,12 @@ def _play(settings: Settings, state: State, request: Request) -> Handled:
 
 def _stop(settings: Settings, state: State, request: Request) -> Handled:
     drive = state.drive
-    play = drive.additions.play if drive is not None and drive.additions is not None else None
+    play = drive.command_channels.play if drive is not None and drive.command_channels is not None else None
     left = 0 if play is None else play.left(state.frame_sequence + 1)
-    if drive is None or drive.additions is None or play is None or not left:
+    if drive is None or drive.command_channels is None or play is None or not left:
         return state, "nothing is being played"
     text = f"stopped on the {play.target}: {left} of {play.frames} frames were left"
-    return _with(state, drive, drive.additions.stopped(state.frame_sequence)), text
+    return _with(state, drive, drive.command_channels.stopped(state.frame_sequence)), text
 
 
 def _law(settings: Settings, state: State, request: Request) -> Handled:
@@ -314,8 +314,8 @@ def _drive(state: State) -> ActiveLoop:
     return state.drive
 
 
-def _with(state: State, drive: ActiveLoop, additions: CommandChannels) -> State:
-    return state._replace(drive=drive._replace(additions=additions))
+def _with(state: State, drive: ActiveLoop, command_channels: CommandChannels) -> State:
+    return state._replace(drive=drive._replace(command_channels=command_channels))
 
 
 def _check_shape(limits: Limits, wanted_nm: Single) -> None:

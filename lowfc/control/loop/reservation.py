@@ -60,8 +60,8 @@ def lease_ended(state: State, why: str) -> tuple[State, list[PendingEvent]]:
     held, drive = state.conditions.lease, state.drive
     if held is None or held.ended:
         return state, []
-    if drive is not None and drive.additions is not None:
-        drive = drive._replace(additions=drive.additions.stopped(state.frame_sequence))
+    if drive is not None and drive.command_channels is not None:
+        drive = drive._replace(command_channels=drive.command_channels.stopped(state.frame_sequence))
     after = _with(state, held._replace(ended=why))._replace(drive=drive)
     return after, [PendingEvent("LEASE_ENDED", {"holder": held.holder, "why": why})]
 

@@ -13,8 +13,8 @@ from lowfc.control.laws import linear_law
 from lowfc.control.laws.law import Law
 from lowfc.control.laws.linear_law import LinearLaw
 from lowfc.control.laws.stability import delay_weights
-from lowfc.control.loop.additions import CommandChannels
 from lowfc.control.loop.camera import CameraSettings
+from lowfc.control.loop.command_channels import CommandChannels
 from lowfc.control.loop.estimator import Estimate, Estimator
 from lowfc.control.loop.lease import Lease
 from lowfc.control.loop.safety import Limits, LoopMode, Reason
@@ -118,7 +118,7 @@ class ActiveLoop(NamedTuple):
         camera: settings that the calibration goes with: its own, or the first received after it was loaded; None until
             then.
         following: a law in place of the integrator's.
-        additions: to what the law commands; None for nothing at all.
+        command_channels: to what the law commands; None for nothing at all.
         history_nm: modal commands, newest first.
         actuators_nm: (rows, columns), the last command.
     """
@@ -132,7 +132,7 @@ class ActiveLoop(NamedTuple):
     weights: tuple[tuple[int, np.float32], ...]
     camera: CameraSettings | None
     following: LawRunner | None
-    additions: CommandChannels | None
+    command_channels: CommandChannels | None
     history_nm: tuple[Single, ...]
     actuators_nm: Single
 
@@ -167,23 +167,23 @@ class ActiveLoop(NamedTuple):
 
     def added(self) -> CommandChannels:
         """What is added, though it be nothing."""
-        if self.additions is not None:
-            return self.additions
+        if self.command_channels is not None:
+            return self.command_channels
         return CommandChannels.none(self.calibration.grid, len(self.calibration.noll), len(self.history_nm))
 
     def pushed(self, command_nm: Single, actuators_nm: Single) -> "ActiveLoop":
         """One frame later, under this command."""
         fixed = self[:-3]  # `_replace` takes four times as long
-        additions = None if self.additions is None else self.additions.passed()
-        return ActiveLoop(*fixed, additions, (command_nm, *self.history_nm[:-1]), actuators_nm)
+        command_channels = None if self.command_channels is None else self.command_channels.passed()
+        return ActiveLoop(*fixed, command_channels, (command_nm, *self.history_nm[:-1]), actuators_nm)
 
     def stayed(self, frames: int) -> "ActiveLoop":
         """Some frames later, the command held under each of them."""
         held = min(frames, len(self.history_nm))
         history_nm = (self.history_nm[:1] * held + self.history_nm)[: len(self.history_nm)]
-        if self.additions is None:
+        if self.command_channels is None:
             return self._replace(history_nm=history_nm)
-        return self._replace(history_nm=history_nm, additions=self.additions.passed(frames))
+        return self._replace(history_nm=history_nm, command_channels=self.command_channels.passed(frames))
 
     def missed(self, frames: int) -> "ActiveLoop":
         """Some frames later, of which nothing was measured."""

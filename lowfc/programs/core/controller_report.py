@@ -111,7 +111,7 @@ class Arrays:
         drive = state.drive
         if drive is None:
             return
-        play = drive.additions.play if drive.additions is not None else None
+        play = drive.command_channels.play if drive.command_channels is not None else None
         in_use = Request(
             refused.time_ns,
             refused.name,

@@ -12,7 +12,7 @@ from lowfc.contract.configuration import Configuration
 from lowfc.contract.errors import ConfigurationError, DataFileError, LowfcError
 from lowfc.control.laws.linear_law import LinearLaw
 from lowfc.control.laws.margins import check_law
-from lowfc.control.loop.additions import ADOPTED, FLAT
+from lowfc.control.loop.command_channels import ADOPTED, FLAT
 from lowfc.control.loop.inputs import Request
 from lowfc.control.loop.loading import ADOPTED_NM
 from lowfc.control.loop.safety import Limit, limit
@@ -112,9 +112,9 @@ class StartUp:
 def _adopted_nm(state: State, flat_nm: Single) -> Single | None:
     """The shape (rows, columns) adopted from the mirror if the flat map is in it; what modes can make is left aside."""
     drive = state.drive
-    if drive is None or drive.additions is None:
+    if drive is None or drive.command_channels is None:
         return None
-    shapes = [one.wanted_nm for one in drive.additions.channels if one.name == ADOPTED]
+    shapes = [one.wanted_nm for one in drive.command_channels.channels if one.name == ADOPTED]
     if not shapes:
         return None
     beside = [

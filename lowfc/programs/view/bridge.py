@@ -154,7 +154,7 @@ class Bridge:
 
     def _add_earlier(self, render: RenderThread) -> None:
         """Add what was sent before this view received anything; in a thread, for a peer that is frozen answers late."""
-        recorder = self.service.heard.get(Role.RECORDER)
+        recorder = self.service.last_health.get(Role.RECORDER)
         events_due = not self._past_known and (recorder is not None or self._recorder_absent(time.monotonic()))
         self._past_known |= events_due
 

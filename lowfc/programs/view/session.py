@@ -56,7 +56,7 @@ def show_run(run_id: str, config: Configuration | None, target: Target, seconds:
         stack.callback(bridge.close)
         bridge.service.catch_signals()
         bridge.service.announces = True
-        bridge.service.awaited = lambda: "" if bridge.service.heard else "any other process"
+        bridge.service.awaited = lambda: "" if bridge.service.last_health else "any other process"
         until_s = seconds if seconds is not None or target.picture is None else PICTURE_AFTER_S
         try:
             summary = bridge.run(until_s, lambda: _print_address(target, bridge.viewer))
@@ -66,7 +66,7 @@ def show_run(run_id: str, config: Configuration | None, target: Target, seconds:
             rest = Path(f"{target.save}.part")
             part.replace(rest)
             raise ViewError(f"{error}; what there is of it is in {rest}") from error
-        if not bridge.service.heard and target.show in (None, Show.HEADLESS):
+        if not bridge.service.last_health and target.show in (None, Show.HEADLESS):
             raise ViewError(f"no message of run {run_id!r} has arrived: nothing is written")
         if target.picture is not None and bridge.viewer is not None:
             bridge.viewer.screenshot(target.picture)

@@ -12,7 +12,7 @@ from lowfc.arrays import Single
 from lowfc.client import Client, Step, configuration_of
 from lowfc.contract.messages import wire
 from lowfc.control.laws.linear_law import LinearLaw
-from lowfc.control.loop.additions import MIRROR, OFFSET
+from lowfc.control.loop.command_channels import MIRROR, OFFSET
 from lowfc.control.loop.safety import LoopMode
 from lowfc.control.loop.state import FADING_FRAMES, SETTLING_FRAMES
 from lowfc.programs.commissioning.acceptance.played import (

@@ -12,7 +12,7 @@ from lowfc.control.calibration.excitation import led_in, lines, multisine
 from lowfc.control.laws.linear_law import LinearLaw
 from lowfc.control.laws.stability import delay_weights
 from lowfc.control.laws.transfer_function import Departure, Lines, departure, measured, seen_of_mirror
-from lowfc.control.loop.additions import MIRROR, OFFSET
+from lowfc.control.loop.command_channels import MIRROR, OFFSET
 from lowfc.control.loop.safety import LoopMode
 from lowfc.optics.chain.zernike import mode_name
 from lowfc.programs.cli.result import Result, figure

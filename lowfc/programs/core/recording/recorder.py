@@ -103,7 +103,7 @@ class Recorder:
             self._write(sample)
         self._begin()
         self._begun_ns = self._clock.host_ns()
-        self.service.awaited = lambda: "" if self.service.heard else "any other process"
+        self.service.awaited = lambda: "" if self.service.last_health else "any other process"
         self.service.state = "ready"
         while self.service.running:
             self._turn()
@@ -126,7 +126,7 @@ class Recorder:
             self.service.beat()
             time.sleep(_TURN_S)
             age_s = time.monotonic() - begun_s
-            if age_s >= longest_s or (age_s >= shortest_s and len(self.service.heard) >= self._bus.peers()):
+            if age_s >= longest_s or (age_s >= shortest_s and len(self.service.last_health) >= self._bus.peers()):
                 return
 
     def _begin(self, *, anew: bool = True) -> None:

@@ -23,7 +23,7 @@ from lowfc.control.laws.what_if import (
     missing_before,
     seen_nm,
 )
-from lowfc.control.loop.additions import PlayTable
+from lowfc.control.loop.command_channels import PlayTable
 from lowfc.control.loop.estimator import Estimator
 from lowfc.control.loop.safety import LoopMode
 

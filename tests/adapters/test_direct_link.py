@@ -1,4 +1,4 @@
-"""The short way beside the real bus: every message once and in order, whoever comes, goes, stalls or is too large."""
+"""The direct link beside the real bus: every message once and in order, whoever comes, goes, stalls or is too large."""
 
 import socket
 import threading
@@ -28,7 +28,7 @@ class Ends:
     """A run with a camera and a controller that notes what it gets, from which thread."""
 
     def __init__(self, base: Path) -> None:
-        self.run: Run = open_run("shortcut", base=base)
+        self.run: Run = open_run("direct-link", base=base)
         self.clock = HostClock(base)
         self.buses: list[ZenohBus] = []
         self.got: list[int] = []
@@ -52,11 +52,11 @@ class Ends:
             time.sleep(pause_s)
 
     def meet(self, publisher: ZenohPublisher) -> None:
-        """Publish until the short way is the only one."""
+        """Publish until the direct link is the only one."""
 
         def only() -> bool:
             publisher.put(b"")
-            return self.threads[-5:] == ["shortcut"] * 5 and len(self.threads) > 20
+            return self.threads[-5:] == ["direct-link"] * 5 and len(self.threads) > 20
 
         until(only)
         del self.got[:-1], self.threads[:], self.sizes[:]
@@ -83,7 +83,7 @@ def test_the_reader_gets_everything_by_the_short_way_and_others_by_the_bus(ends:
     ends.publish(frames, 300)
     until(lambda: recorded[-1:] == [frames.published - 1] == ends.got[-1:])
     assert ends.got == list(range(ends.got[0], frames.published))
-    assert set(ends.threads) == {"shortcut"}
+    assert set(ends.threads) == {"direct-link"}
     assert recorded[-300:] == ends.got[-300:]
 
 
@@ -97,7 +97,7 @@ def test_the_switch_loses_and_repeats_nothing(ends: Ends) -> None:
     until(lambda: ends.got[-1:] == [frames.published - 1])
     assert ends.got == sorted(set(ends.got))
     assert ends.got == list(range(ends.got[0], frames.published))
-    assert "shortcut" in ends.threads
+    assert "direct-link" in ends.threads
 
 
 def test_a_message_under_way_while_the_bus_is_left_comes_once(tmp_path: Path) -> None:
@@ -149,7 +149,7 @@ def test_without_its_writer_the_reader_hears_the_bus(ends: Ends, monkeypatch: py
 
     def heard() -> bool:
         frames.put(b"")
-        return bool(ends.threads) and ends.threads[-1] != "shortcut"
+        return bool(ends.threads) and ends.threads[-1] != "direct-link"
 
     until(heard)
 
@@ -166,7 +166,7 @@ def test_a_message_that_a_socket_does_not_take_comes_by_the_bus(ends: Ends) -> N
         return ends.sizes[-1:] == [large]
 
     until(heard)
-    assert ends.threads[-1] != "shortcut"
+    assert ends.threads[-1] != "direct-link"
 
 
 def test_a_reader_that_stalls_never_holds_the_writer(tmp_path: Path) -> None:
@@ -190,7 +190,7 @@ def test_a_message_that_makes_no_sense_is_counted_and_the_next_is_heard(
 ) -> None:
     controller = ends.bus("controller")
     controller.subscribe(FRAME, ends.hear)
-    path = ends.run.links.shortcut("controller")
+    path = ends.run.links.direct_link("controller")
     assert path is not None
     writer = direct_link.DirectWriter(path)
     writer.send(b"short", b"")
@@ -233,7 +233,7 @@ class Commanded:
             self.controller.put(b"controller")
             self.operator.put(b"operator")
             time.sleep(0.01)
-            return "shortcut" in self.threads and any(one.payload == b"operator" for one in self.got)
+            return "direct-link" in self.threads and any(one.payload == b"operator" for one in self.got)
 
         until(both)
 
@@ -261,9 +261,9 @@ def test_a_mirror_gets_each_command_once_and_the_controllers_by_the_short_way(en
         counts = [count_of(one.sequence) for one, _ in by_whom if one.payload == payload]
         assert counts[-200:] == list(range(last_count - 199, last_count + 1))
         assert len(counts) == len(set(counts))
-    ways = [name == "shortcut" for one, name in by_whom if one.payload == b"controller"]
+    ways = [name == "direct-link" for one, name in by_whom if one.payload == b"controller"]
     assert sum(ways) > 0.5 * len(ways)  # the bus can be quicker now and then
-    assert all(name != "shortcut" for one, name in by_whom if one.payload == b"operator")
+    assert all(name != "direct-link" for one, name in by_whom if one.payload == b"operator")
 
 
 def test_a_command_with_anothers_sequence_is_no_copy(ends: Ends) -> None:
@@ -340,7 +340,7 @@ def test_after_a_stall_in_which_the_bus_was_quicker_nothing_comes_twice(shared: 
 
 
 def test_by_a_router_there_is_no_short_way_round_its_access_control(ends: Ends) -> None:
-    assert ends.run.links.shortcut("mirror-dm") is not None
+    assert ends.run.links.direct_link("mirror-dm") is not None
     across = replace(ends.run.links, network=Network(router="tls/localhost:7447", certificates="certs"))
-    assert across.shortcut("mirror-dm") is None
-    assert across.shortcut("controller") is None
+    assert across.direct_link("mirror-dm") is None
+    assert across.direct_link("controller") is None

@@ -9,8 +9,8 @@ import pytest
 from lowfc.arrays import Array, Single
 from lowfc.contract.codecs.codec import decode_request, encode_request
 from lowfc.control.laws.linear_law import LinearLaw, Signal
-from lowfc.control.loop.additions import ADOPTED, FLAT, MIRROR, MOST_CHANNELS, OFFSET
 from lowfc.control.loop.advance import advance
+from lowfc.control.loop.command_channels import ADOPTED, FLAT, MIRROR, MOST_CHANNELS, OFFSET
 from lowfc.control.loop.inputs import Frame, Input, Load, MirrorShape, Outputs, Reply, Request
 from lowfc.control.loop.safety import Limit, Limits, LoopMode
 from lowfc.control.loop.state import FADING_FRAMES, SETTLING_FRAMES, Settings, State
@@ -81,7 +81,7 @@ def test_a_channel_goes_to_the_mirror_within_the_slew_and_the_loop_does_not_undo
     night.ask("channel", text="dark-hole")
     night.run(60)
     assert np.allclose(night.surfaces[-1], before, atol=0.02)
-    assert night.state.drive.additions.channels == ()
+    assert night.state.drive.command_channels.channels == ()
 
 
 @pytest.mark.parametrize("delay_frames", [1.0, 1.5, 2.0])
@@ -176,7 +176,7 @@ def test_the_last_step_ends_a_play() -> None:
     night.ask("step", values=(5,))
     night.ask("play", text=MIRROR, table=np.ones((50, 1), np.float32), actuators_nm=dark_hole(5.0).reshape(-1))
     night.run(8, np.zeros(3))
-    assert night.state.drive.additions.play is None
+    assert night.state.drive.command_channels.play is None
 
 
 def test_two_channels_that_are_too_much_together_are_refused() -> None:
@@ -209,7 +209,7 @@ def test_what_ends_a_play(end: str) -> None:
         assert night.ask(end).accepted
     night.run(1 if end == "restart" else 12, np.zeros(3))
     assert ("PLAY_ENDED" in night.events) is (end in ("limit", "restart"))
-    assert night.state.drive.additions.play is None
+    assert night.state.drive.command_channels.play is None
     if end != "close":
         assert np.allclose(night.surfaces[-1], 0, atol=1e-3)
 
@@ -327,7 +327,7 @@ def test_a_mirror_with_somebody_elses_shape_keeps_it() -> None:
     seen = night.to_modes @ there.reshape(-1)
     night.run(40, -seen + DISTURBED)  # it was well corrected, but for this
     assert np.abs(np.diff(night.surfaces, axis=0)).max() < 20
-    assert [one.name for one in night.state.drive.additions.channels] == [ADOPTED]
+    assert [one.name for one in night.state.drive.command_channels.channels] == [ADOPTED]
     rest = night.surfaces[-1] - there
     outside = rest.reshape(-1) - TOY.modes_to_actuators @ (night.to_modes @ rest.reshape(-1))
     assert np.abs(outside).max() < 0.01
@@ -425,7 +425,7 @@ def test_another_calibration_moves_nothing() -> None:
 def test_nothing_added_costs_nothing_and_changes_nothing() -> None:
     night = Night()
     night.run(20)
-    assert night.state.drive.additions is None
+    assert night.state.drive.command_channels is None
     night.ask("offset", values=(0.0,))
     plain = Night()
     plain.run(20)
