@@ -19,8 +19,6 @@ from lowfc.programs.commissioning.commission.commissioning import Commission, Co
 from lowfc.programs.commissioning.conformance.settings import AGREEMENTS, agreement_checks
 from tests.support.folded_loop import FoldedLoop, computed
 
-pytestmark = pytest.mark.xdist_group("commission")  # one process makes what its tests share
-
 TOML = """
 [star]
 magnitude = 0

@@ -24,8 +24,6 @@ from lowfc.programs.design.sam_executors import Here, open_executor
 from lowfc.programs.design.sam_files import front, read_state
 from lowfc.programs.design.sam_request import Search
 
-pytestmark = pytest.mark.xdist_group("sam_command")  # one process makes what its tests share
-
 RECORDED = {
     name: entry["command"] for name, entry in json.loads(SHIPPED.read_text())["layouts"].items() if "command" in entry
 }

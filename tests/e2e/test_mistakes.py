@@ -172,8 +172,6 @@ def test_ctrl_c_while_it_loads_is_quiet(tmp_path: Path) -> None:
         (("replay", "circle"), "circle cannot be read: Too many levels of symbolic links"),
         (("config", "check", "/dev/zero"), "/dev/zero: not a readable TOML file: not a regular file"),
         (("config", "check", "brackets.toml"), "nested too deeply"),
-        (("replay", "night.mcap", "--speed", "2"), "lowfc publish LOG --run NAME"),
-        (("replay", "night.mcap", "--what-if", "gain=1"), "lowfc what-if LOG --set gain=0.3"),
         (("recover", "night.mcap", "header.mcap", "--json"), "name one"),
         (("bench", "record", "--folder", "nowhere"), "nowhere cannot be written"),
     ],

@@ -20,8 +20,6 @@ import pytest
 import lowfc
 from lowfc.contract.configuration import Configuration
 
-pytestmark = pytest.mark.xdist_group("wheel")  # one process makes what its tests share
-
 ROOT = Path(__file__).parents[2]
 PACKAGES = ("lowfc", "sim_camera", "sim_dm")
 PIP = [sys.executable, "-m", "pip", "--quiet", "--disable-pip-version-check", "--no-input"]

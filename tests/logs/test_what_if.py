@@ -30,8 +30,6 @@ from tests.support import toy
 from tests.support.folded_loop import Fold, fold
 from tests.support.loops import loop
 
-pytestmark = pytest.mark.xdist_group("what_if")  # one process makes what its tests share
-
 RATE_HZ = 250
 Gains = tuple[float, float, float]
 """Gain of tip and tilt and gain of the others, in parts of the highest stable one; leak of all."""

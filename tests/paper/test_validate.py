@@ -30,8 +30,6 @@ from lowfc.programs.paper.tables.reconstruction import ESTIMATORS, WITH_NUISANCE
 from lowfc.programs.paper.tables.tables import TABLES
 from tests.support.loops import lowfc
 
-pytestmark = pytest.mark.xdist_group("validate")  # one process makes what its tests share
-
 DOCS = Path(__file__).parents[2] / "docs"
 SAM = "sam27d07_bal14"
 FEW = 4

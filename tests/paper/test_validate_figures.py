@@ -17,8 +17,6 @@ from lowfc.programs.paper.figures.modes import AMPLITUDES, deviations, linear_ra
 from lowfc.programs.paper.report import FIGURES
 from lowfc.programs.paper.tables.pointing import NM_PER_MAS
 
-pytestmark = pytest.mark.xdist_group("validate_figures")  # one process makes what its tests share
-
 FEW = Context(trials=4, seed=1, sensors=("sam",))
 
 

@@ -39,8 +39,6 @@ from tests.support.stage import MAS, Stage, Tape, tile
 from tests.support.toy import FLUX_DN, NOLL, START, TOY
 from tools.law_bench import calibrated
 
-pytestmark = pytest.mark.xdist_group("verdicts")  # one process makes what its tests share
-
 CALM = {Level.NEUTRAL, Level.GOOD}
 
 
