@@ -261,8 +261,8 @@ def test_forged_names_fill_no_process_and_are_one_event(hub: MemoryHub, forge: C
     forge()
     Service("controller", "night", FakeClock(), MemoryBus(hub, "controller", FakeClock())).beat()
     camera.beat()
-    assert len(camera.heard) == MOST_NAMES + 1
-    assert "controller" in camera.heard
+    assert len(camera.last_health) == MOST_NAMES + 1
+    assert "controller" in camera.last_health
     (event,) = (event for event in events if "BAD_MESSAGE" in event)
     assert event.startswith(f"BAD_MESSAGE {FORGED - MOST_NAMES} on lowfc/health/* could not be read")
 

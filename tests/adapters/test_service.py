@@ -128,7 +128,7 @@ def test_processes_meet_when_each_has_heard_the_other(hub: MemoryHub, clock: Fak
     mirror = service(hub, clock, "mirror-dm")
     mirror.beat()  # there, and not ready
     assert camera.wait_for(["mirror-dm"], 0.0) == ("mirror-dm",)
-    assert camera.heard["mirror-dm"].state == "starting"
+    assert camera.last_health["mirror-dm"].state == "starting"
 
 
 def test_a_newcomer_is_answered_before_the_next_health_is_due(hub: MemoryHub, clock: FakeClock) -> None:

@@ -402,19 +402,20 @@ def test_states_carry_the_identity_of_a_law_and_of_a_play(rig: Rig) -> None:
 
 def test_safed_outlives_the_controller(rig: Rig, tmp_path: Path) -> None:
     """The latch is a file of the run: only an operator's clear removes it."""
-    latch = tmp_path / "safe"
+    file = tmp_path / "safe"
     closed = configured(control__start_mode="closed")
 
     def mode() -> LoopMode:
         service = Service("controller", "test", rig.clock(), MemoryBus(MemoryHub(), "controller", rig.clock()))
-        health = wire.Health()
-        Controller(closed, service, rig.calibration, "a test", Latch([latch])).fill(health)
+        health, latch = wire.Health(), Latch([file])
+        Controller(closed, service, rig.calibration, "a test", latch).fill(health)
+        latch.close()  # or it writes the file again
         return LoopMode(health.mode)
 
     assert mode() is LoopMode.CLOSED
-    latch.touch()
+    file.touch()
     assert mode() is LoopMode.SAFE
-    latch.unlink()
+    file.unlink()
     assert mode() is LoopMode.CLOSED
 
 

@@ -75,7 +75,7 @@ def test_everything_is_recorded_verbatim(bench: Bench) -> None:
     }
     final = [wire.Health.FromString(m.payload) for m in messages if m.key == HEALTH.at("camera")][-1]
     assert final.state == "stopped"
-    assert bench.camera.heard["recorder"].recording == wire.Recording(
+    assert bench.camera.last_health["recorder"].recording == wire.Recording(
         file=str(path),
         messages=len(messages),
         bytes=path.stat().st_size,
@@ -139,7 +139,7 @@ def test_every_lost_message_is_counted(bench: Bench) -> None:
         _, count, *_, topic = event.split()
         counts[topic] += int(count)
     assert counts == summary.lost
-    missing = {count.topic: count.missing for count in bench.camera.heard["recorder"].topics if count.missing}
+    missing = {count.topic: count.missing for count in bench.camera.last_health["recorder"].topics if count.missing}
     assert missing == summary.lost
     (path,) = summary.files
     reader = LogReader(path)
@@ -202,7 +202,7 @@ def test_a_full_disk_ends_the_recording_and_nothing_else(bench: Bench, small_dis
     assert [found.name for found in bench.folder.iterdir()] == [path.name]
     assert len(read) == summary.messages
     assert summary.lost[FRAME.key] == 50 - len(bodies_of(read, FRAME))  # to the last one, the unflushed ones too
-    assert bench.camera.heard["recorder"].recording.lost == sum(summary.lost.values())
+    assert bench.camera.last_health["recorder"].recording.lost == sum(summary.lost.values())
 
 
 def test_a_folder_that_cannot_be_written_is_an_error(bench: Bench) -> None:

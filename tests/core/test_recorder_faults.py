@@ -67,7 +67,7 @@ def check_account(bench: Bench, summary: Summary, frames: Publisher) -> int:
     lost = frames.published - recorded
     assert summary.messages == len(messages)
     assert summary.lost.get(FRAME.key, 0) == lost
-    health = bench.camera.heard["recorder"]
+    health = bench.camera.last_health["recorder"]
     assert (health.state, health.recording.lost) == ("stopped", sum(summary.lost.values()))
     (count,) = (count for count in health.topics if count.topic == FRAME.key)
     assert (count.received, count.missing) == (recorded, lost)
@@ -224,8 +224,8 @@ def test_the_loop_of_a_recorder_goes_on_while_the_disk_takes_a_stopped_log(
     (answer,) = answers
     request = wire.Request.FromString(answer.payload)
     assert (request.accepted, "Input/output error" in request.reply) == (not refused, refused)
-    until(lambda: bool(bench.camera.heard["recorder"].recording.failure) is refused)
-    until(lambda: bench.camera.heard["recorder"].recording.stopped is not refused)
+    until(lambda: bool(bench.camera.last_health["recorder"].recording.failure) is refused)
+    until(lambda: bench.camera.last_health["recorder"].recording.stopped is not refused)
     monkeypatch.undo()
     summary = bench.stop()
     (log,) = summary.files

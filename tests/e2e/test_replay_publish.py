@@ -63,10 +63,10 @@ class Tool:
     """A user's own program: it is a role without a port, and has no health."""
 
     def __init__(self, run: Run, *topics: Topic) -> None:
-        self.last_health: dict[str, list[Sample]] = defaultdict(list)
+        self.heard: dict[str, list[Sample]] = defaultdict(list)
         self.bus = ZenohBus(run.links, "operator", HostClock())
         for topic in topics:
-            self.bus.subscribe(topic, lambda sample: self.last_health[sample.key].append(sample))
+            self.bus.subscribe(topic, lambda sample: self.heard[sample.key].append(sample))
 
 
 @pytest.fixture
