@@ -415,6 +415,14 @@ MIRRORS: dict[str, tuple[dict[str, Any], dict[str, str]]] = {
         {"tick": lambda one: lambda device, status, now_ns: one(device, status._replace(valid_for_ns=MS), now_ns)},
         {"dead-man": WRONG} | UNTRIED,
     ),
+    "a command named while it relaxes": (
+        {
+            "state": lambda one: (
+                one if one.status != wire.MIRROR_STATUS_EXPIRED else one.command_nm.extend([1.0, 2.0]) or one
+            )
+        },
+        {"relaxing": WRONG} | UNTRIED,
+    ),
     "no limits": ({"device": {"limits": WIDE}}, {"stroke": WRONG, "slew": WRONG, "neighbours": WRONG}),
     "no stroke limit": ({"device": {"limits": Limits(10_000.0, 150.0, 500.0)}}, {"stroke": WRONG}),
     "no neighbour limit": ({"device": {"limits": Limits(750.0, 150.0, 10_000.0)}}, {"neighbours": WRONG}),

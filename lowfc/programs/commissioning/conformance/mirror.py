@@ -22,6 +22,7 @@ LONGEST_NS = 2_000_000_000
 _FOLLOWING, _EXPIRED = wire.MIRROR_STATUS_FOLLOWING, wire.MIRROR_STATUS_EXPIRED
 _LONG_NS = 60 * NS
 _REFUSED_EVERY_NS = 50_000_000
+_RAISED_NM = 10.0  # above where it relaxes to
 _REFUSAL_S = 0.15
 _SETTLE_S = 0.05  # of actuators that are reported where they are, not where they are going
 
@@ -44,7 +45,7 @@ def mirror_checks(mirror: Dialogue, seconds: float, tell: Tell, *, gentle: bool 
             tell("commands that must be refused")
             found += _refusals(mirror, base_nm)
             tell("the command timeout")
-            found += _timeout(mirror, base_nm)
+            found += _timeout(mirror, base_nm, 0.0 if gentle else min(_RAISED_NM, mirror.expected.move_nm))
         if gentle or _bad(found):
             untried = warning("not tried: something above is wrong", "put that right first")
             if gentle:
@@ -250,8 +251,9 @@ def _refusals(mirror: Dialogue, base_nm: Single) -> Iterator[Check]:
     yield check._replace(name="clear", expected=expected)
 
 
-def _timeout(mirror: Dialogue, base_nm: Single) -> Iterator[Check]:
-    mirror.ask(base_nm, EXPIRES_NS)
+def _timeout(mirror: Dialogue, base_nm: Single, raised_by_nm: float) -> Iterator[Check]:
+    raised_nm = base_nm + np.float32(raised_by_nm)
+    mirror.ask(raised_nm, EXPIRES_NS)
     sent_ns = mirror.line.now_ns()
     mirror.listen(EXPIRES_NS / 2e9)
     nan_nm = np.full(mirror.expected.grid, np.nan, np.float32)
@@ -268,6 +270,12 @@ def _timeout(mirror: Dialogue, base_nm: Single) -> Iterator[Check]:
             check = wrong(check.got, "hold the command for as long as it is valid")
     expected = f"EXPIRED after valid_for_ns, {EXPIRES_NS / 1e6:.0f} ms here; refused commands in between renew nothing"
     yield check._replace(name="dead-man", expected=expected)
+    expired = [state for _, state in mirror.since(sent_ns) if state.status == _EXPIRED]
+    check = ok("it is")
+    if any(mirror.moved(raised_nm, state) and state.command_nm for state in expired):
+        advice = "clear command_nm when you relax: a controller that starts takes the difference for a shape to keep"
+        check = wrong("a modal command is named while the mirror relaxes", advice)
+    yield check._replace(name="relaxing", expected="command_nm is empty in the state of a mirror that relaxes")
     mirror.go(base_nm)
     state, _, _ = mirror.ask(base_nm, _LONG_NS)
     sent_ns, check = mirror.line.now_ns(), ok("it is")
