@@ -29,8 +29,11 @@ def apply(actuators_nm: Single, nm_per_unit: float) -> Single:
     return (units * nm_per_unit).astype(np.float32)
 
 
-def good(payload: bytes, last_sequence: int) -> tuple[wire.MirrorCommand, Single] | None:
-    """The command in `payload` and its actuators; None for one that must not be followed."""
+def good(payload: bytes, last_sequence: int, clear_id: int) -> tuple[wire.MirrorCommand, Single] | None:
+    """The command in `payload` and its actuators; None for one that must not be followed.
+
+    `clear_id` is that of the last command with one: an operator's new `clear` begins the sequences anew.
+    """
     try:
         told = wire.MirrorCommand.FromString(payload)
     except DecodeError:
@@ -38,7 +41,8 @@ def good(payload: bytes, last_sequence: int) -> tuple[wire.MirrorCommand, Single
     wanted_nm = actuators(told)  # None where the bytes are not rows x columns float32
     if wanted_nm is None or wanted_nm.shape != GRID or not np.isfinite(wanted_nm).all():
         return None
-    return (told, wanted_nm) if told.frame_sequence >= last_sequence else None
+    cleared = told.clear_id not in (0, clear_id)
+    return (told, wanted_nm) if cleared or told.frame_sequence >= last_sequence else None
 
 
 def main(run: RunId = DEFAULT_RUN, config: ConfigFile = None) -> None:
@@ -51,12 +55,12 @@ def main(run: RunId = DEFAULT_RUN, config: ConfigFile = None) -> None:
     moved = partial(apply, nm_per_unit=settings.mirror.nm_per_unit)
     where_nm = moved(np.zeros(GRID, np.float32))
     state = wire.MirrorState(rows=GRID[0], columns=GRID[1], status=wire.MIRROR_STATUS_WAITING)
-    obeyed_ns = valid_ns = due_ns = 0
+    obeyed_ns = valid_ns = due_ns = clear_id = 0
     service.state = "running"
     with closing(service.bus):
         while service.running:
             sample, now_ns = commands.take(0.01), service.clock.now_ns()
-            followed = good(sample.payload, state.frame_sequence) if sample is not None else None
+            followed = good(sample.payload, state.frame_sequence, clear_id) if sample is not None else None
             time_ns = now_ns
             if followed is not None:
                 told, wanted_nm = followed
@@ -64,6 +68,7 @@ def main(run: RunId = DEFAULT_RUN, config: ConfigFile = None) -> None:
                 kept_nm, hit = limit(LIMITS, where_nm, wanted_nm)
                 where_nm, obeyed_ns, valid_ns = moved(kept_nm), now_ns, min(told.valid_for_ns, LONGEST_VALID_NS)
                 state.frame_sequence, state.status = told.frame_sequence, wire.MIRROR_STATUS_FOLLOWING
+                state.safe, clear_id = told.safe, told.clear_id or clear_id
                 state.command_nm[:] = [] if hit else told.command_nm
                 state.limits_hit[:] = [one.value for one in hit]  # type: ignore[misc]  # numbered alike
                 service.work += 1

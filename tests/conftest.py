@@ -25,10 +25,11 @@ def _private_cache(pytestconfig: pytest.Config) -> None:
 
 
 @pytest.fixture
-def own_runtime(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+def own_runtime(tmp_path_factory: pytest.TempPathFactory, monkeypatch: pytest.MonkeyPatch) -> Path:
     """Give a test a runtime directory of its own, in which there is no run yet."""
-    monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
-    return tmp_path
+    path = tmp_path_factory.mktemp("own")  # not `tmp_path`: a folder `lowfc` there would hide the package
+    monkeypatch.setenv("XDG_RUNTIME_DIR", str(path))
+    return path
 
 
 def pytest_runtest_logreport(report: pytest.TestReport) -> None:

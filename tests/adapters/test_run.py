@@ -36,11 +36,11 @@ def test_a_run_has_ports_a_secret_and_closed_doors() -> None:
     assert not run.path.exists()
 
 
-def test_all_who_open_a_run_at_once_get_the_same(tmp_path: Path) -> None:
+def test_all_who_open_a_run_at_once_get_the_same(own_runtime: Path) -> None:
     ask = "import lowfc.adapters.bus.run as r; l = r.open_run('one').links; print(sorted(l.ports.items()), l.secret)"
     asked = [subprocess.Popen([sys.executable, "-c", ask], stdout=subprocess.PIPE, text=True) for _ in range(5)]
     assert len({process.communicate()[0] for process in asked}) == 1
-    assert [path.name for path in (tmp_path / "lowfc").iterdir()] == ["one"]
+    assert [path.name for path in (own_runtime / "lowfc").iterdir()] == ["one"]
 
 
 def test_two_runs_share_nothing() -> None:
@@ -86,14 +86,16 @@ def test_damaged_credentials_are_an_error(text: str | None) -> None:
         _ = run.links.secret
 
 
-def test_links_of_another_run_are_refused(tmp_path: Path) -> None:
-    open_run("one").path.rename(tmp_path / "lowfc" / "two")
+def test_links_of_another_run_are_refused(own_runtime: Path) -> None:
+    open_run("one").path.rename(own_runtime / "lowfc" / "two")
     with pytest.raises(DataFileError, match="another run's"):
         open_run("two")
 
 
-def test_directories_of_others_open_ones_and_links_are_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    base = tmp_path / "lowfc"
+def test_directories_of_others_open_ones_and_links_are_refused(
+    own_runtime: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    base = own_runtime / "lowfc"
     base.mkdir(mode=0o755)
     with pytest.raises(DataFileError, match="mode 700"):
         runtime_base()
@@ -103,17 +105,17 @@ def test_directories_of_others_open_ones_and_links_are_refused(tmp_path: Path, m
     with pytest.raises(DataFileError, match="mode 700"):
         own_directory(base)
     monkeypatch.undo()
-    (tmp_path / "real").mkdir(mode=0o700)
-    (tmp_path / "link").symlink_to(tmp_path / "real")
+    (own_runtime / "real").mkdir(mode=0o700)
+    (own_runtime / "link").symlink_to(own_runtime / "real")
     with pytest.raises(DataFileError, match="mode 700"):
-        own_directory(tmp_path / "link")
+        own_directory(own_runtime / "link")
 
 
-def test_a_runtime_directory_that_is_none_is_an_error(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    (tmp_path / "lowfc").write_text("")
+def test_a_runtime_directory_that_is_none_is_an_error(own_runtime: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (own_runtime / "lowfc").write_text("")
     with pytest.raises(DataFileError, match="should be a directory"):
         runtime_base()
-    monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path / "gone"))
+    monkeypatch.setenv("XDG_RUNTIME_DIR", str(own_runtime / "gone"))
     with pytest.raises(DataFileError, match="XDG_RUNTIME_DIR"):
         runtime_base()
     monkeypatch.delenv("XDG_RUNTIME_DIR")

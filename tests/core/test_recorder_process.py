@@ -22,7 +22,8 @@ from lowfc.adapters.process.clock import HostClock
 from lowfc.adapters.process.provenance import provenance
 from lowfc.adapters.process.service import Service
 from lowfc.contract.envelope import count_of
-from lowfc.contract.messages import FRAME, STEP
+from lowfc.contract.messages import FRAME, STEP, Topic
+from lowfc.programs.launch.watch import topic_count
 from tests.support.loops import lowfc, start, until
 from tests.support.other_readers import foxglove, rerun
 from tests.support.recording import PATIENCE_S, bodies_of
@@ -69,6 +70,16 @@ class Bench:
         self.frames.put(number.to_bytes(8) * 1600)
         self.steps.put(number.to_bytes(8) * 30)
         self.service.beat()
+
+    def put_many(self, count: int) -> None:
+        """Put so many frames and steps, at a pace that a loaded host keeps, until the recorder has counted them."""
+        for _ in range(count):
+            self.put()
+            time.sleep(0.002)
+        until(lambda: self.recorder_is("ready") and self.recorded(FRAME) == self.recorded(STEP) == count)
+
+    def recorded(self, topic: Topic) -> int:
+        return topic_count(self.service.last_health["recorder"], topic.key).received
 
     def recorder_is(self, state: str) -> bool:
         self.service.beat()
@@ -168,8 +179,7 @@ SIGNALS = (
 def test_however_it_is_told_to_stop_the_log_is_finished(benches: list[Bench], tmp_path: Path) -> None:
     parent = started(benches, tmp_path)
     for bench, signals in zip(benches, SIGNALS, strict=True):
-        for _ in range(50):
-            bench.put()
+        bench.put_many(50)
         for number in signals:
             os.kill(bench.pid, number)
             time.sleep(0.05)  # it waits for the camera's last words by now
@@ -224,8 +234,7 @@ def test_a_recording_is_ended_where_the_controller_has_died(tmp_path: Path, own_
     bench = Bench(tmp_path)
     process = start(tmp_path, "record", "--run", bench.run.run_id, "--folder", tmp_path / "logs")
     until(lambda: bench.recorder_is("ready"))
-    for _ in range(20):
-        bench.put()
+    bench.put_many(20)
     stopped = lowfc("ctl", "record", "stop", "--json")
     reader = LogReader(Path(json.loads(stopped.stdout)["log"]))
     assert len(bodies_of(list(reader), FRAME)) == 20

@@ -128,6 +128,7 @@ def conformance(folder: Path, *commands: str) -> None:
         assert f"--run {figures['run']}" in command
         assert figures["device"] in command or figures["device"] == "mirror-dm"
         assert figures["counts"]["wrong"] == 0
+        assert {"clear", "relaxing"}.isdisjoint(one["name"] for one in figures["checks"] if one["status"] != "ok")
         assert figures["counts"]["ok"] >= len(figures["checks"]) - 5  # of a busy host: warnings
 
 

@@ -8,6 +8,7 @@ import typer
 
 from lowfc.adapters.process.terminal import AnyRun, Json
 from lowfc.contract.errors import ConfigurationError
+from lowfc.control.calibration.response_fit import LEAST_CYCLES
 from lowfc.programs.cli.output import put
 from lowfc.programs.commissioning.calibrate.command import Out, Resume, Snr
 
@@ -23,7 +24,7 @@ def commission(
     snr: Snr = 50.0,
     cycles: Annotated[
         int | None,
-        typer.Option(min=1, help="How many of the response, at least 4, in place of --snr, which is 20 then."),
+        typer.Option(min=LEAST_CYCLES, help="How many of the response, in place of --snr, which is 20 then."),
     ] = None,
     resume: Resume = False,
     close: Annotated[bool, typer.Option("--close", help="Close the loop at the end.")] = False,
