@@ -17,7 +17,7 @@ from lowfc.control.laws.linear_law import LinearLaw
 from lowfc.control.loop.command_channels import PlayTable
 from lowfc.control.loop.estimator import Estimate
 from lowfc.control.loop.lease import Lease
-from lowfc.control.loop.safety import Limits, LoopMode, reason_of
+from lowfc.control.loop.safety import Limits, LoopMode, Rejection, reason_of
 from lowfc.control.loop.state import ActiveLoop, Conditions, LawRunner, Settings, State
 
 # What has the same name in the values and in the messages.
@@ -130,7 +130,7 @@ def decode_state(
         mode=LoopMode(message.mode),
         drive=drive,
         frame_time_ns=from_timestamp(message.frame_timestamp),
-        refused=reason_of(message.refused) if message.refused else None,
+        refused=Rejection(message.refused) if message.refused else None,
         limits_hit=tuple(reason_of(reason) for reason in message.limits_hit),
         counts={reason_of(line.reason): line.count for line in message.counts},
         estimate=Estimate(np.array(message.measured_nm, np.float32), message.flux_dn) if message.measured_nm else None,

@@ -68,7 +68,7 @@ def _frame(settings: Settings, state: State, frame: Frame) -> tuple[State, Outpu
     if state.conditions.camera_awaited:
         return _refuse(settings, _newest(state, drive, frame), frame, Rejection.CAMERA_UNKNOWN, events)
     measured = _measure(settings, drive, frame)
-    if isinstance(measured, Reason):
+    if isinstance(measured, Rejection):
         return _refuse(settings, _newest(state, drive, frame), frame, measured, events)
     estimate, saturated = measured
     alike = state.identical_frames + 1 if estimate.same(state.estimate) else 0
@@ -163,7 +163,7 @@ def _newest(state: State, drive: ActiveLoop | None, frame: Frame) -> State:
     return state._replace(drive=drive, frame_timeout=False, frame_sequence=frame.sequence, frame_time_ns=frame.time_ns)
 
 
-def _measure(settings: Settings, drive: ActiveLoop, frame: Frame) -> tuple[Estimate, int] | Reason:
+def _measure(settings: Settings, drive: ActiveLoop, frame: Frame) -> tuple[Estimate, int] | Rejection:
     """Modal errors of a frame and its saturated pixels, or why it cannot be used."""
     calibration = drive.calibration
     if frame.pixels is None or frame.pixels.shape != calibration.shape:
@@ -271,7 +271,7 @@ def _step_to_flat(settings: Settings, drive: ActiveLoop) -> ActiveLoop:
 
 
 def _refuse(
-    settings: Settings, state: State, frame: Frame, reason: Reason, events: list[PendingEvent]
+    settings: Settings, state: State, frame: Frame, reason: Rejection, events: list[PendingEvent]
 ) -> tuple[State, Outputs]:
     """Hold the command: a frame that cannot be used still yields a step and a command."""
     if reason is not state.refused:

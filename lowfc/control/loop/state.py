@@ -17,7 +17,7 @@ from lowfc.control.loop.camera import CameraSettings
 from lowfc.control.loop.command_channels import CommandChannels
 from lowfc.control.loop.estimator import Estimate, Estimator
 from lowfc.control.loop.lease import Lease
-from lowfc.control.loop.safety import Limits, LoopMode, Reason
+from lowfc.control.loop.safety import Limits, LoopMode, Reason, Rejection
 
 SETTLING_FRAMES = 100
 """For which a new law only follows."""
@@ -235,7 +235,7 @@ class State(NamedTuple):
     frame_sequence: int = 0
     frame_time_ns: int = 0
     frames_used: int = 0
-    refused: Reason | None = None
+    refused: Rejection | None = None
     refused_count: int = 0
     limits_hit: tuple[Reason, ...] = ()
     frame_timeout: bool = False
