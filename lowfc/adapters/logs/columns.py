@@ -180,7 +180,7 @@ def of_steps(steps: Sequence[Step], modes: int) -> Steps:
     )
 
 
-def reason_counts(bits: Whole) -> dict[Reason, int]:
+def count_reasons(bits: Whole) -> dict[Reason, int]:
     """How often each reason was given, of those that were."""
     counts = {reason: int(np.count_nonzero(bits & (1 << reason))) for reason in REASONS} if bits.any() else {}
     return {reason: count for reason, count in counts.items() if count}

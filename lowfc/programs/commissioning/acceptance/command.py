@@ -108,7 +108,7 @@ def noise_floor(
     """
     from lowfc.programs.commissioning.acceptance import noise as test
 
-    _carry_out(test, logs, run, config, plot, as_json, lambda live, must: test.play(live, duration))
+    _carry_out(test, logs, run, config, plot, as_json, lambda live, must: test.play(live, duration), by_instrument=True)
 
 
 def _carry_out(
@@ -119,6 +119,8 @@ def _carry_out(
     plot: Path | None,
     as_json: bool,
     play: "Callable[[Live, Acceptance], list[Played]]",
+    *,
+    by_instrument: bool = False,
 ) -> None:
     """Judge what was played in a log, or play it now; draw and print the result, and end with the verdict."""
     from rich.console import Console
@@ -156,7 +158,7 @@ def _carry_out(
             known, calibration = live.configuration, live.calibration
             with client.reserved("lowfc acceptance"), live.kept():
                 every = play(live, required or known.acceptance)
-    instrument = (known, calibration) if test.KIND == "noise-floor" else ()
+    instrument = (known, calibration) if by_instrument else ()
     result = test.judge(every, required or known.acceptance, *instrument)
     if plot is not None and figure is not None:
         test.draw(result.figures(), figure)

@@ -11,7 +11,7 @@ from typing import Any, Literal
 import numpy as np
 import numpy.typing as npt
 
-from lowfc.adapters.logs.columns import Steps, reason_counts
+from lowfc.adapters.logs.columns import Steps, count_reasons
 from lowfc.adapters.logs.history import History
 from lowfc.arrays import Array, Long, Single
 from lowfc.contract.codecs import codec
@@ -142,7 +142,7 @@ class Played:
     @property
     def limits_hit(self) -> list[str]:
         """Names of the limits that acted, which ended the play."""
-        return [reason.name for reason in reason_counts(self.reasons) if reason in LIMITS]
+        return [reason.name for reason in count_reasons(self.reasons) if reason in LIMITS]
 
     @property
     def missing(self) -> int:

@@ -326,10 +326,10 @@ class ControllerReplay:
     def _difference(self, state: State, logged: Message, replayed: Message | None) -> Difference | None:
         """What differs in all that is compared; None where nothing does."""
         if self._former is not None and type(replayed) is type(logged):
-            logged = deepcopy(logged)
             if isinstance(logged, wire.ControllerState):
                 logged = self._in_todays_form(logged)
             elif isinstance(logged, wire.Request) and logged.HasField("state"):
+                logged = deepcopy(logged)
                 logged.state.CopyFrom(self._in_todays_form(logged.state))
             logged, replayed = self._former.compared(logged), self._former.compared(replayed)
         if replayed == logged and (self._former is not None or isinstance(logged, wire.ControllerState)):

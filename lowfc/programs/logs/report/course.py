@@ -4,7 +4,7 @@ from collections import Counter
 
 import numpy as np
 
-from lowfc.adapters.logs.columns import reason_counts
+from lowfc.adapters.logs.columns import count_reasons
 from lowfc.adapters.logs.history import History
 from lowfc.arrays import Long, Single
 from lowfc.contract.events import Level
@@ -92,7 +92,7 @@ def light_figures(history: History) -> Figures:
     """Flux, saturation, and frames refused by reason."""
     steps = history.steps
     flux = steps.flux_dn[steps.flux_dn > 0]
-    counts = reason_counts(steps.reasons).items()
+    counts = count_reasons(steps.reasons).items()
     refused = {reason.name.lower(): count for reason, count in counts if reason < _FIRST_LIMIT}
     return {
         "flux_expected_dn": history.calibration.flux_dn if history.calibration is not None else None,
@@ -127,7 +127,7 @@ def actuator_extremes_nm(history: History) -> Single:
 
 
 def _limits(reasons: Long) -> dict[str, int]:
-    counts = reason_counts(reasons).items()
+    counts = count_reasons(reasons).items()
     return {reason.name.lower(): count for reason, count in counts if reason >= _FIRST_LIMIT}
 
 

@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 
 from lowfc.adapters.files.factory import detector, equivalent_read_noise_e
-from lowfc.adapters.logs.columns import reason_counts
+from lowfc.adapters.logs.columns import count_reasons
 from lowfc.adapters.logs.history import read_history
 from lowfc.adapters.logs.reader import LogReader
 from lowfc.arrays import Array, Single
@@ -228,7 +228,7 @@ def _doubts_of_log(run: LoggedRun) -> list[str]:
             f"{run.measured_from} it is {run.measured_delay:.2f} in the mean: pseudo-open-loop modes were computed "
             "again with that for every frame"
         )
-    counts = reason_counts(run.steps.reasons).items()
+    counts = count_reasons(run.steps.reasons).items()
     hit = [f"{reason.name.lower()} at {count} frames" for reason, count in counts if reason in _LIMITS]
     if hit:
         found.append(f"limits acted in the logged run, {', '.join(hit)}; in the what-if only modal limits do")

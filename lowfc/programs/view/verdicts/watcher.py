@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from lowfc.adapters.bus.run import mirror_role
-from lowfc.adapters.logs.columns import reason_counts
+from lowfc.adapters.logs.columns import count_reasons
 from lowfc.arrays import Array, Long, Sequences, Single
 from lowfc.contract.codecs.codec import actuators
 from lowfc.contract.envelope import start_of
@@ -307,7 +307,7 @@ class Watcher:
         truth = _squares(
             snapshot, truths.residual_nm, truths.disturbance_nm, truths.residual_rms_nm, truths.disturbance_rms_nm
         )
-        counts = Counts(reason_counts(steps.reasons))
+        counts = Counts(count_reasons(steps.reasons))
         counts.update(steps=len(steps.mode), **self._grown(snapshot))
         durations_ns = snapshot.timings["frame_to_command"]
         measured = _squares(snapshot, error_nm, pol_nm, error_nm, pol_nm)
