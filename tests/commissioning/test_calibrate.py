@@ -472,6 +472,7 @@ def test_a_few_cycles_keep_the_promise(method: str, preset: str, tmp_path: Path)
 
 
 @pytest.mark.slow
+@pytest.mark.timeout(1200)
 @pytest.mark.parametrize("first", range(1, SEEDS + 1, BLOCK))
 @pytest.mark.parametrize("preset", STILL)
 @pytest.mark.parametrize("method", ["hadamard", "poke", "in-loop"])

@@ -10,7 +10,7 @@ from lowfc.contract.codecs.calibration_codec import decode_calibration, encode_c
 from lowfc.contract.codecs.state_codec import controller_state, decode_state
 from lowfc.contract.messages import wire
 from lowfc.control.loop.advance import advance
-from lowfc.control.loop.inputs import CameraSettings, Load, MirrorShape, Tick
+from lowfc.control.loop.inputs import CameraSettings, Load, MirrorReport, MirrorShape, Report, Tick
 from lowfc.control.loop.state import State
 from tests.support.happenings import CALIBRATION
 from tests.support.toy import frame, loaded, settings
@@ -41,11 +41,12 @@ def test_a_state_of_another_calibration_is_refused() -> None:
         Tick(5, 7),
         CameraSettings(5, (3, 4), 100.0, 65535.0),
         MirrorShape(5, np.arange(6, dtype=np.float32).reshape(2, 3), np.ones(2, np.float32)),
+        MirrorReport(5, "does not answer"),
         Load(5, CALIBRATION, "a file"),
     ],
     ids=lambda one: type(one).__name__,
 )
-def test_an_input_survives(taken: MirrorShape | CameraSettings | Load | Tick) -> None:
+def test_an_input_survives(taken: Report) -> None:
     message = wire.ControlInput.FromString(codec.encode_input(taken, 9))
     assert message.input_number == 9
     found = codec.decode_input(message, {CALIBRATION.id: CALIBRATION})

@@ -214,7 +214,7 @@ def test_in_silence_the_mirror_relaxes_to_flat_where_that_is_configured() -> Non
 def test_before_the_first_command_a_tick_does_nothing_unless_the_loop_is_safed() -> None:
     state = loaded(USUAL)
     after, (outputs,) = feed(USUAL, state, Tick(0, 10**12))
-    assert after is state
+    assert after == state._replace(frame_timeout=True, input_number=after.input_number)
     assert outputs == Outputs()
     safed, (_, outputs) = feed(USUAL, state, ask("safe"), Tick(0, 0))
     assert not outputs.command.actuators_nm.any()

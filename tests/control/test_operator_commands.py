@@ -19,7 +19,18 @@ from lowfc.contract.events import EVENTS
 from lowfc.contract.messages import wire
 from lowfc.control.laws.linear_law import LinearLaw
 from lowfc.control.loop.advance import advance
-from lowfc.control.loop.inputs import CameraSettings, Frame, Input, Load, MirrorShape, Outputs, Reply, Request, Tick
+from lowfc.control.loop.inputs import (
+    CameraSettings,
+    Frame,
+    Input,
+    Load,
+    MirrorReport,
+    MirrorShape,
+    Outputs,
+    Reply,
+    Request,
+    Tick,
+)
 from lowfc.control.loop.requests import REQUESTS, prepared
 from lowfc.control.loop.safety import LoopMode
 from lowfc.control.loop.state import Settings, State
@@ -176,7 +187,9 @@ class Script:
                 return frame(0, sequence=frame_sequence(0, self.start))
             case 4:
                 shape = np.full(GRID, rng.choice([0.0, 30.0, 650.0, np.nan]), np.float32)
-                return MirrorShape(0, shape, rng.choice([0.0, 20.0, -1e30, np.nan], 3).astype(np.float32))
+                reported = MirrorShape(0, shape, rng.choice([0.0, 20.0, -1e30, np.nan], 3).astype(np.float32))
+                fault = rng.choice(["", "", "", "does not answer"])
+                return reported if rng.random() < 0.5 else MirrorReport(0, str(fault), reported)
             case 5 | 6:
                 bias_dn = rng.choice([DARK_DN] * 14 + [0.0, np.nan])
                 return CameraSettings(0, SHAPE, bias_dn, SATURATION_DN, start_s=self.start)
@@ -351,7 +364,7 @@ def test_the_random_commands_are_what_they_should_be() -> None:
     """Of every kind some are accepted and some are refused: otherwise the tests above would show little."""
     rng = np.random.default_rng(5)
     counts: Counter[tuple[str, bool]] = Counter()
-    for seed in range(16):
+    for seed in range(24):
         some: list[str] = rng.choice([*NAMES, *NAMES, "safe"], COMMANDS).tolist()
         counts += check(some, rng.choice([0, 1, 2, 5, 12], COMMANDS).tolist(), seed, 1.0, False, "hold").counts
     accepted = {name for name, good in counts if good}

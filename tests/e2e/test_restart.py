@@ -16,8 +16,10 @@ from lowfc.adapters.bus.run import new_run_id, open_run
 from lowfc.adapters.bus.zenoh_bus import ZenohBus
 from lowfc.adapters.files import calibration_file
 from lowfc.adapters.process.clock import HostClock
+from lowfc.client import Client
 from lowfc.contract.configuration import load
-from lowfc.contract.messages import MIRROR_STATE, STEP, wire
+from lowfc.contract.errors import RequestRefusedError
+from lowfc.contract.messages import MIRROR_STATE, STEP, Role, wire
 from tests.support.loops import until
 from tools.law_bench import calibrated
 
@@ -48,6 +50,7 @@ class Bench:
         self.running: dict[str, subprocess.Popen[bytes]] = {}
         self.steps = 0
         self.closed = 0
+        self.reasons: list[wire.Reason] = []
         self.shapes: list[np.ndarray] = []
         shared = ["--run", self.run_id, "--config", str(folder / "test.toml")]
         self.commands = {
@@ -62,6 +65,7 @@ class Bench:
     def _step(self, sample: Sample) -> None:
         step = wire.ControlStep.FromString(sample.payload)
         self.steps += 1
+        self.reasons = list(step.reasons)
         good = step.mode == wire.LOOP_MODE_CLOSED and not step.reasons
         self.closed = self.closed + 1 if good and np.abs(step.error_nm).max() < 3 else 0
 
@@ -142,3 +146,22 @@ def test_kill_and_restart_of_each(bench: Bench) -> None:
 def _alive(bench: Bench, name: str) -> bool:
     process = {"mirror": "mirror-dm"}.get(name, name)
     return bool(bench.bus.get(f"lowfc/health/{process}", timeout_s=0.5))
+
+
+def test_a_mirror_that_dies_is_missed_and_taken_back(bench: Bench) -> None:
+    for name in ("mirror", "controller", "camera"):
+        bench.start(name)
+    bench.settled()
+    before = bench.shapes[-1]
+    bench.kill("mirror")
+    with Client(bench.run_id) as loop:
+        until(lambda: loop.processes()[Role.CONTROLLER].holding == "the mirror does not answer")
+        until(lambda: bench.reasons == [wire.REASON_NO_MIRROR])
+        loop.ask("open")
+        with pytest.raises(RequestRefusedError, match="the mirror does not answer"):
+            loop.ask("close")
+        bench.start("mirror")
+        until(lambda: not loop.ask("status").state.mirror_fault)
+        loop.ask("close")
+    bench.settled()
+    np.testing.assert_allclose(bench.shapes[-1], before, atol=5)

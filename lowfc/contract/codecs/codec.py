@@ -25,7 +25,19 @@ from lowfc.control.laws.linear_law import LinearLaw
 from lowfc.control.loop.camera import CameraSettings
 from lowfc.control.loop.command_channels import PlayTable
 from lowfc.control.loop.durations import Durations
-from lowfc.control.loop.inputs import Command, Frame, Input, Load, MirrorShape, Reply, Request, Step, Tick
+from lowfc.control.loop.inputs import (
+    Command,
+    Frame,
+    Input,
+    Load,
+    MirrorReport,
+    MirrorShape,
+    Reply,
+    Report,
+    Request,
+    Step,
+    Tick,
+)
 from lowfc.control.loop.safety import LoopMode, Reason
 from lowfc.control.loop.wording import MOST_TEXT
 
@@ -125,17 +137,17 @@ def decode_camera(payload: bytes, start_s: int) -> CameraSettings:
     return found
 
 
-def encode_input(taken: MirrorShape | CameraSettings | Load | Tick, number: int) -> bytes:
+def encode_input(taken: Report, number: int) -> bytes:
     """ControlInput of what the controller took in as its input `number`."""
     time = timestamp(taken.time_ns)
     message = wire.ControlInput(timestamp=time, input_number=number)
     match taken:
         case MirrorShape():
-            rows, columns = taken.actuators_nm.shape
-            mirror = wire.MirrorState(timestamp=time, rows=rows, columns=columns, command_nm=taken.command_nm.tolist())
-            mirror.actuators = taken.actuators_nm.tobytes()
-            mirror.safe = taken.safe
-            message.mirror.CopyFrom(mirror)
+            message.mirror.CopyFrom(_wire_shape(taken))
+        case MirrorReport():
+            message.mirror_report.CopyFrom(wire.MirrorReport(timestamp=time, fault=taken.fault))
+            if taken.shape is not None:
+                message.mirror_report.mirror.CopyFrom(_wire_shape(taken.shape))
         case CameraSettings():
             message.camera.CopyFrom(wire_camera(taken))
         case Load():
@@ -156,6 +168,10 @@ def decode_input(message: wire.ControlInput, calibrations: Mapping[str, Calibrat
             shape = _mirror_shape(message.mirror)
             if shape is not None:
                 return shape
+        case "mirror_report":
+            report = message.mirror_report
+            shape = _mirror_shape(report.mirror) if report.HasField("mirror") else None
+            return MirrorReport(from_timestamp(report.timestamp), report.fault, shape)
         case "camera":
             return camera_settings(message.camera)
         case "tick":
@@ -164,6 +180,18 @@ def decode_input(message: wire.ControlInput, calibrations: Mapping[str, Calibrat
             calibration = calibrations[message.load.calibration_id]
             return Load(from_timestamp(message.timestamp), calibration, message.load.source)
     raise ValueError(f"input {message.input_number} of the controller cannot be read")
+
+
+def _wire_shape(shape: MirrorShape) -> wire.MirrorState:
+    rows, columns = shape.actuators_nm.shape
+    return wire.MirrorState(
+        timestamp=timestamp(shape.time_ns),
+        rows=rows,
+        columns=columns,
+        command_nm=shape.command_nm.tolist(),
+        actuators=shape.actuators_nm.tobytes(),
+        safe=shape.safe,
+    )
 
 
 def _mirror_shape(state: wire.MirrorState) -> MirrorShape | None:

@@ -31,7 +31,7 @@ _STATE = (
     *("frame_sequence", "frames_used", "refused_count", "frame_timeout", "commanded"),
     *("input_number", "steps_left", "returning_to_zero", "identical_frames"),
 )
-_CONDITIONS = ("camera_awaited", "clear_id", "mode_cause")
+_CONDITIONS = ("camera_awaited", "clear_id", "mode_cause", "mirror_fault")
 
 
 def controller_state(state: State, settings: Settings, time_ns: int) -> wire.ControllerState:

@@ -32,6 +32,7 @@ class Reason(int, metaclass=_enum_type_wrapper.EnumTypeWrapper):
     REASON_STUCK: _ClassVar[Reason]
     REASON_AHEAD: _ClassVar[Reason]
     REASON_CAMERA_UNKNOWN: _ClassVar[Reason]
+    REASON_NO_MIRROR: _ClassVar[Reason]
     REASON_MODAL_LIMIT: _ClassVar[Reason]
     REASON_STROKE: _ClassVar[Reason]
     REASON_SLEW: _ClassVar[Reason]
@@ -63,6 +64,7 @@ REASON_NO_FRAME: Reason
 REASON_STUCK: Reason
 REASON_AHEAD: Reason
 REASON_CAMERA_UNKNOWN: Reason
+REASON_NO_MIRROR: Reason
 REASON_MODAL_LIMIT: Reason
 REASON_STROKE: Reason
 REASON_SLEW: Reason
@@ -149,21 +151,33 @@ class Load(_message.Message):
     source: str
     def __init__(self, timestamp: _Optional[_Union[datetime.datetime, _timestamp_pb2.Timestamp, _Mapping]] = ..., calibration_id: _Optional[str] = ..., source: _Optional[str] = ...) -> None: ...
 
+class MirrorReport(_message.Message):
+    __slots__ = ("timestamp", "fault", "mirror")
+    TIMESTAMP_FIELD_NUMBER: _ClassVar[int]
+    FAULT_FIELD_NUMBER: _ClassVar[int]
+    MIRROR_FIELD_NUMBER: _ClassVar[int]
+    timestamp: _timestamp_pb2.Timestamp
+    fault: str
+    mirror: MirrorState
+    def __init__(self, timestamp: _Optional[_Union[datetime.datetime, _timestamp_pb2.Timestamp, _Mapping]] = ..., fault: _Optional[str] = ..., mirror: _Optional[_Union[MirrorState, _Mapping]] = ...) -> None: ...
+
 class ControlInput(_message.Message):
-    __slots__ = ("timestamp", "input_number", "load", "mirror", "camera", "tick")
+    __slots__ = ("timestamp", "input_number", "load", "mirror", "camera", "tick", "mirror_report")
     TIMESTAMP_FIELD_NUMBER: _ClassVar[int]
     INPUT_NUMBER_FIELD_NUMBER: _ClassVar[int]
     LOAD_FIELD_NUMBER: _ClassVar[int]
     MIRROR_FIELD_NUMBER: _ClassVar[int]
     CAMERA_FIELD_NUMBER: _ClassVar[int]
     TICK_FIELD_NUMBER: _ClassVar[int]
+    MIRROR_REPORT_FIELD_NUMBER: _ClassVar[int]
     timestamp: _timestamp_pb2.Timestamp
     input_number: int
     load: Load
     mirror: MirrorState
     camera: CameraState
     tick: Tick
-    def __init__(self, timestamp: _Optional[_Union[datetime.datetime, _timestamp_pb2.Timestamp, _Mapping]] = ..., input_number: _Optional[int] = ..., load: _Optional[_Union[Load, _Mapping]] = ..., mirror: _Optional[_Union[MirrorState, _Mapping]] = ..., camera: _Optional[_Union[CameraState, _Mapping]] = ..., tick: _Optional[_Union[Tick, _Mapping]] = ...) -> None: ...
+    mirror_report: MirrorReport
+    def __init__(self, timestamp: _Optional[_Union[datetime.datetime, _timestamp_pb2.Timestamp, _Mapping]] = ..., input_number: _Optional[int] = ..., load: _Optional[_Union[Load, _Mapping]] = ..., mirror: _Optional[_Union[MirrorState, _Mapping]] = ..., camera: _Optional[_Union[CameraState, _Mapping]] = ..., tick: _Optional[_Union[Tick, _Mapping]] = ..., mirror_report: _Optional[_Union[MirrorReport, _Mapping]] = ...) -> None: ...
 
 class ControlTiming(_message.Message):
     __slots__ = ("timestamp", "frame_sequence", "transport_ns", "wakeup_ns", "compute_ns", "publish_ns", "frame_to_command_ns")
@@ -288,7 +302,7 @@ class LinearLaw(_message.Message):
     def __init__(self, name: _Optional[str] = ..., signal: _Optional[str] = ..., noll: _Optional[_Iterable[int]] = ..., delay_frames: _Optional[float] = ..., rate_hz: _Optional[float] = ..., states: _Optional[int] = ..., transition: _Optional[bytes] = ..., measurement_gain: _Optional[bytes] = ..., command_gain: _Optional[bytes] = ..., predict_only: _Optional[bytes] = ..., output: _Optional[bytes] = ..., id: _Optional[str] = ..., timestamp: _Optional[_Union[datetime.datetime, _timestamp_pb2.Timestamp, _Mapping]] = ...) -> None: ...
 
 class ControllerState(_message.Message):
-    __slots__ = ("timestamp", "frame_sequence", "mode", "calibration_id", "gain", "leak", "limit_nm", "delay_frames", "command_history_nm", "actuators", "offset", "counts", "frames_used", "frame_timestamp", "refused", "refused_count", "limits_hit", "frame_timeout", "commanded", "input_number", "settings", "offset_nm", "channels", "shift_history_nm", "law", "law_state", "law_frames", "play", "steps_left", "returning_to_zero", "measured_nm", "flux_dn", "identical_frames", "camera", "camera_expected", "camera_awaited", "clear_id", "mode_timestamp", "mode_cause", "lease", "mirror_rows", "mirror_columns")
+    __slots__ = ("timestamp", "frame_sequence", "mode", "calibration_id", "gain", "leak", "limit_nm", "delay_frames", "command_history_nm", "actuators", "offset", "counts", "frames_used", "frame_timestamp", "refused", "refused_count", "limits_hit", "frame_timeout", "commanded", "input_number", "settings", "offset_nm", "channels", "shift_history_nm", "law", "law_state", "law_frames", "play", "steps_left", "returning_to_zero", "measured_nm", "flux_dn", "identical_frames", "camera", "camera_expected", "camera_awaited", "clear_id", "mode_timestamp", "mode_cause", "lease", "mirror_rows", "mirror_columns", "mirror_fault")
     TIMESTAMP_FIELD_NUMBER: _ClassVar[int]
     FRAME_SEQUENCE_FIELD_NUMBER: _ClassVar[int]
     MODE_FIELD_NUMBER: _ClassVar[int]
@@ -331,6 +345,7 @@ class ControllerState(_message.Message):
     LEASE_FIELD_NUMBER: _ClassVar[int]
     MIRROR_ROWS_FIELD_NUMBER: _ClassVar[int]
     MIRROR_COLUMNS_FIELD_NUMBER: _ClassVar[int]
+    MIRROR_FAULT_FIELD_NUMBER: _ClassVar[int]
     timestamp: _timestamp_pb2.Timestamp
     frame_sequence: int
     mode: LoopMode
@@ -373,7 +388,8 @@ class ControllerState(_message.Message):
     lease: Lease
     mirror_rows: int
     mirror_columns: int
-    def __init__(self, timestamp: _Optional[_Union[datetime.datetime, _timestamp_pb2.Timestamp, _Mapping]] = ..., frame_sequence: _Optional[int] = ..., mode: _Optional[_Union[LoopMode, str]] = ..., calibration_id: _Optional[str] = ..., gain: _Optional[_Iterable[float]] = ..., leak: _Optional[_Iterable[float]] = ..., limit_nm: _Optional[_Iterable[float]] = ..., delay_frames: _Optional[float] = ..., command_history_nm: _Optional[_Iterable[float]] = ..., actuators: _Optional[bytes] = ..., offset: _Optional[bytes] = ..., counts: _Optional[_Iterable[_Union[ReasonCount, _Mapping]]] = ..., frames_used: _Optional[int] = ..., frame_timestamp: _Optional[_Union[datetime.datetime, _timestamp_pb2.Timestamp, _Mapping]] = ..., refused: _Optional[_Union[Reason, str]] = ..., refused_count: _Optional[int] = ..., limits_hit: _Optional[_Iterable[_Union[Reason, str]]] = ..., frame_timeout: _Optional[bool] = ..., commanded: _Optional[bool] = ..., input_number: _Optional[int] = ..., settings: _Optional[_Union[ControllerSettings, _Mapping]] = ..., offset_nm: _Optional[_Iterable[float]] = ..., channels: _Optional[_Iterable[_Union[Channel, _Mapping]]] = ..., shift_history_nm: _Optional[_Iterable[float]] = ..., law: _Optional[_Union[LinearLaw, _Mapping]] = ..., law_state: _Optional[_Iterable[float]] = ..., law_frames: _Optional[int] = ..., play: _Optional[_Union[Play, _Mapping]] = ..., steps_left: _Optional[int] = ..., returning_to_zero: _Optional[bool] = ..., measured_nm: _Optional[_Iterable[float]] = ..., flux_dn: _Optional[float] = ..., identical_frames: _Optional[int] = ..., camera: _Optional[_Union[CameraState, _Mapping]] = ..., camera_expected: _Optional[_Union[CameraState, _Mapping]] = ..., camera_awaited: _Optional[bool] = ..., clear_id: _Optional[int] = ..., mode_timestamp: _Optional[_Union[datetime.datetime, _timestamp_pb2.Timestamp, _Mapping]] = ..., mode_cause: _Optional[str] = ..., lease: _Optional[_Union[Lease, _Mapping]] = ..., mirror_rows: _Optional[int] = ..., mirror_columns: _Optional[int] = ...) -> None: ...
+    mirror_fault: str
+    def __init__(self, timestamp: _Optional[_Union[datetime.datetime, _timestamp_pb2.Timestamp, _Mapping]] = ..., frame_sequence: _Optional[int] = ..., mode: _Optional[_Union[LoopMode, str]] = ..., calibration_id: _Optional[str] = ..., gain: _Optional[_Iterable[float]] = ..., leak: _Optional[_Iterable[float]] = ..., limit_nm: _Optional[_Iterable[float]] = ..., delay_frames: _Optional[float] = ..., command_history_nm: _Optional[_Iterable[float]] = ..., actuators: _Optional[bytes] = ..., offset: _Optional[bytes] = ..., counts: _Optional[_Iterable[_Union[ReasonCount, _Mapping]]] = ..., frames_used: _Optional[int] = ..., frame_timestamp: _Optional[_Union[datetime.datetime, _timestamp_pb2.Timestamp, _Mapping]] = ..., refused: _Optional[_Union[Reason, str]] = ..., refused_count: _Optional[int] = ..., limits_hit: _Optional[_Iterable[_Union[Reason, str]]] = ..., frame_timeout: _Optional[bool] = ..., commanded: _Optional[bool] = ..., input_number: _Optional[int] = ..., settings: _Optional[_Union[ControllerSettings, _Mapping]] = ..., offset_nm: _Optional[_Iterable[float]] = ..., channels: _Optional[_Iterable[_Union[Channel, _Mapping]]] = ..., shift_history_nm: _Optional[_Iterable[float]] = ..., law: _Optional[_Union[LinearLaw, _Mapping]] = ..., law_state: _Optional[_Iterable[float]] = ..., law_frames: _Optional[int] = ..., play: _Optional[_Union[Play, _Mapping]] = ..., steps_left: _Optional[int] = ..., returning_to_zero: _Optional[bool] = ..., measured_nm: _Optional[_Iterable[float]] = ..., flux_dn: _Optional[float] = ..., identical_frames: _Optional[int] = ..., camera: _Optional[_Union[CameraState, _Mapping]] = ..., camera_expected: _Optional[_Union[CameraState, _Mapping]] = ..., camera_awaited: _Optional[bool] = ..., clear_id: _Optional[int] = ..., mode_timestamp: _Optional[_Union[datetime.datetime, _timestamp_pb2.Timestamp, _Mapping]] = ..., mode_cause: _Optional[str] = ..., lease: _Optional[_Union[Lease, _Mapping]] = ..., mirror_rows: _Optional[int] = ..., mirror_columns: _Optional[int] = ..., mirror_fault: _Optional[str] = ...) -> None: ...
 
 class Lease(_message.Message):
     __slots__ = ("id", "holder", "until", "last_sequence", "ended")
@@ -628,7 +644,7 @@ class LoopFigures(_message.Message):
     def __init__(self, frames: _Optional[int] = ..., residual_rms_nm: _Optional[float] = ..., flux_fraction: _Optional[float] = ...) -> None: ...
 
 class Health(_message.Message):
-    __slots__ = ("timestamp", "process", "state", "run_id", "pid", "version", "memory_bytes", "rate_hz", "peers_alive", "topics", "realtime_granted", "realtime_refused", "clock_offset_ns", "uptime_ns", "frame_to_command", "frame_to_mirror", "wavefront", "recording", "mode", "counts", "commands_late", "mean_rate_hz", "router_offset_ns", "router_round_trip_ns", "not_closed_ns", "not_closed_cause", "command_refused", "command_expired", "limits_hit", "recent_wavefront", "last_second", "last_warning", "last_warning_timestamp", "host")
+    __slots__ = ("timestamp", "process", "state", "run_id", "pid", "version", "memory_bytes", "rate_hz", "peers_alive", "topics", "realtime_granted", "realtime_refused", "clock_offset_ns", "uptime_ns", "frame_to_command", "frame_to_mirror", "wavefront", "recording", "mode", "counts", "commands_late", "mean_rate_hz", "router_offset_ns", "router_round_trip_ns", "not_closed_ns", "not_closed_cause", "command_refused", "command_expired", "limits_hit", "recent_wavefront", "last_second", "last_warning", "last_warning_timestamp", "host", "holding")
     TIMESTAMP_FIELD_NUMBER: _ClassVar[int]
     PROCESS_FIELD_NUMBER: _ClassVar[int]
     STATE_FIELD_NUMBER: _ClassVar[int]
@@ -663,6 +679,7 @@ class Health(_message.Message):
     LAST_WARNING_FIELD_NUMBER: _ClassVar[int]
     LAST_WARNING_TIMESTAMP_FIELD_NUMBER: _ClassVar[int]
     HOST_FIELD_NUMBER: _ClassVar[int]
+    HOLDING_FIELD_NUMBER: _ClassVar[int]
     timestamp: _timestamp_pb2.Timestamp
     process: str
     state: str
@@ -697,4 +714,5 @@ class Health(_message.Message):
     last_warning: str
     last_warning_timestamp: _timestamp_pb2.Timestamp
     host: str
-    def __init__(self, timestamp: _Optional[_Union[datetime.datetime, _timestamp_pb2.Timestamp, _Mapping]] = ..., process: _Optional[str] = ..., state: _Optional[str] = ..., run_id: _Optional[str] = ..., pid: _Optional[int] = ..., version: _Optional[str] = ..., memory_bytes: _Optional[int] = ..., rate_hz: _Optional[float] = ..., peers_alive: _Optional[_Iterable[str]] = ..., topics: _Optional[_Iterable[_Union[TopicCount, _Mapping]]] = ..., realtime_granted: _Optional[_Iterable[str]] = ..., realtime_refused: _Optional[_Iterable[str]] = ..., clock_offset_ns: _Optional[int] = ..., uptime_ns: _Optional[int] = ..., frame_to_command: _Optional[_Union[Latency, _Mapping]] = ..., frame_to_mirror: _Optional[_Union[Latency, _Mapping]] = ..., wavefront: _Optional[_Union[WavefrontFigures, _Mapping]] = ..., recording: _Optional[_Union[Recording, _Mapping]] = ..., mode: _Optional[_Union[LoopMode, str]] = ..., counts: _Optional[_Iterable[_Union[ReasonCount, _Mapping]]] = ..., commands_late: _Optional[int] = ..., mean_rate_hz: _Optional[float] = ..., router_offset_ns: _Optional[int] = ..., router_round_trip_ns: _Optional[int] = ..., not_closed_ns: _Optional[int] = ..., not_closed_cause: _Optional[str] = ..., command_refused: _Optional[_Union[Reason, str]] = ..., command_expired: _Optional[bool] = ..., limits_hit: _Optional[_Iterable[_Union[Reason, str]]] = ..., recent_wavefront: _Optional[_Union[WavefrontFigures, _Mapping]] = ..., last_second: _Optional[_Union[LoopFigures, _Mapping]] = ..., last_warning: _Optional[str] = ..., last_warning_timestamp: _Optional[_Union[datetime.datetime, _timestamp_pb2.Timestamp, _Mapping]] = ..., host: _Optional[str] = ...) -> None: ...
+    holding: str
+    def __init__(self, timestamp: _Optional[_Union[datetime.datetime, _timestamp_pb2.Timestamp, _Mapping]] = ..., process: _Optional[str] = ..., state: _Optional[str] = ..., run_id: _Optional[str] = ..., pid: _Optional[int] = ..., version: _Optional[str] = ..., memory_bytes: _Optional[int] = ..., rate_hz: _Optional[float] = ..., peers_alive: _Optional[_Iterable[str]] = ..., topics: _Optional[_Iterable[_Union[TopicCount, _Mapping]]] = ..., realtime_granted: _Optional[_Iterable[str]] = ..., realtime_refused: _Optional[_Iterable[str]] = ..., clock_offset_ns: _Optional[int] = ..., uptime_ns: _Optional[int] = ..., frame_to_command: _Optional[_Union[Latency, _Mapping]] = ..., frame_to_mirror: _Optional[_Union[Latency, _Mapping]] = ..., wavefront: _Optional[_Union[WavefrontFigures, _Mapping]] = ..., recording: _Optional[_Union[Recording, _Mapping]] = ..., mode: _Optional[_Union[LoopMode, str]] = ..., counts: _Optional[_Iterable[_Union[ReasonCount, _Mapping]]] = ..., commands_late: _Optional[int] = ..., mean_rate_hz: _Optional[float] = ..., router_offset_ns: _Optional[int] = ..., router_round_trip_ns: _Optional[int] = ..., not_closed_ns: _Optional[int] = ..., not_closed_cause: _Optional[str] = ..., command_refused: _Optional[_Union[Reason, str]] = ..., command_expired: _Optional[bool] = ..., limits_hit: _Optional[_Iterable[_Union[Reason, str]]] = ..., recent_wavefront: _Optional[_Union[WavefrontFigures, _Mapping]] = ..., last_second: _Optional[_Union[LoopFigures, _Mapping]] = ..., last_warning: _Optional[str] = ..., last_warning_timestamp: _Optional[_Union[datetime.datetime, _timestamp_pb2.Timestamp, _Mapping]] = ..., host: _Optional[str] = ..., holding: _Optional[str] = ...) -> None: ...

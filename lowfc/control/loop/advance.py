@@ -20,6 +20,7 @@ from lowfc.control.loop.inputs import (
     Frame,
     Input,
     Load,
+    MirrorReport,
     MirrorShape,
     Outputs,
     PendingEvent,
@@ -28,7 +29,15 @@ from lowfc.control.loop.inputs import (
     Step,
     Tick,
 )
-from lowfc.control.loop.loading import camera_reported, in_mode, loaded, mirror_reported, mode_event
+from lowfc.control.loop.loading import (
+    camera_reported,
+    end_probe,
+    in_mode,
+    loaded,
+    mirror_judged,
+    mirror_reported,
+    mode_event,
+)
 from lowfc.control.loop.requests import answer
 from lowfc.control.loop.reservation import lease_checked
 from lowfc.control.loop.safety import Limit, LoopMode, Reason, Rejection, limit
@@ -67,6 +76,8 @@ def _frame(settings: Settings, state: State, frame: Frame) -> tuple[State, Outpu
         return _refuse(settings, _newest(state, drive, frame), frame, Rejection.NO_CALIBRATION, events)
     if state.conditions.camera_awaited:
         return _refuse(settings, _newest(state, drive, frame), frame, Rejection.CAMERA_UNKNOWN, events)
+    if state.conditions.mirror_fault and state.mode is LoopMode.CLOSED:
+        return _refuse(settings, _newest(state, drive, frame), frame, Rejection.NO_MIRROR, events)
     measured = _measure(settings, drive, frame)
     if isinstance(measured, Rejection):
         return _refuse(settings, _newest(state, drive, frame), frame, measured, events)
@@ -78,13 +89,13 @@ def _frame(settings: Settings, state: State, frame: Frame) -> tuple[State, Outpu
     error_nm, pol_nm, drive = _pseudo_open_loop(drive, estimate.error_nm, frame.sequence)
     drive, reasons, homing = _next_command(settings, state, drive, error_nm, frame.sequence)
     if reasons:
-        drive = _end_probe(drive, frame.sequence, _acted(reasons), events)
+        drive = end_probe(drive, frame.sequence, _acted(reasons), events)
     if state.refused is not None:
         details: dict[str, object] = {"refused": state.refused_count, "reason": state.refused.name}
         events.append(PendingEvent("FRAMES_ACCEPTED", details))
     if reasons != state.limits_hit:
         _limit_events(state.limits_hit, reasons, events)
-    mode, command_nm = state.mode, drive.history_nm[0]
+    mode, command_nm, commanded = state.mode, drive.history_nm[0], _commands(state)
     steps_left, ended = max(state.steps_left - 1, 0), state.steps_left == 1
     if ended:
         events += [PendingEvent("LOOP_STEPPED", {}), mode_event(mode, LoopMode.OPEN, STEPPED)]
@@ -95,7 +106,7 @@ def _frame(settings: Settings, state: State, frame: Frame) -> tuple[State, Outpu
         frame.time_ns,
         state.frames_used + 1,
         limits_hit=reasons,
-        commanded=True,
+        commanded=commanded,
         counts=_counted(state.counts, reasons),
         steps_left=steps_left,
         returning_to_zero=homing,
@@ -107,7 +118,7 @@ def _frame(settings: Settings, state: State, frame: Frame) -> tuple[State, Outpu
     if ended:
         state = in_mode(state, LoopMode.OPEN, frame.time_ns, STEPPED)
     step = Step(frame.sequence, frame.time_ns, mode, command_nm, reasons, error_nm, pol_nm, estimate.flux_dn, saturated)
-    command = _command(state, drive, command_nm)
+    command = _command(state, drive, command_nm) if commanded else None
     return state, Outputs(step, command, None, events, changed=ended or freed)
 
 
@@ -118,9 +129,14 @@ def _command(state: State, drive: ActiveLoop, command_nm: Single) -> Command:
     return Command(*newest, drive.actuators_nm, command_nm, safe, state.conditions.clear_id)
 
 
+def _commands(state: State) -> bool:
+    """Whether commands go out: a mirror that has not said where it is would jump, unless in safe mode."""
+    return state.commanded or not state.conditions.mirror_fault or state.mode is LoopMode.SAFE
+
+
 def _arrive(state: State, frame: Frame, events: list[PendingEvent]) -> tuple[State, ActiveLoop | None]:
     """The state, and the drive after the frames that never came before this one."""
-    if state.frame_timeout:
+    if state.frame_timeout and state.frame_time_ns:
         events.append(PendingEvent("FRAMES_BACK", {"silent_ms": (frame.time_ns - state.frame_time_ns) / 1e6}))
     drive = state.drive
     if frame.sequence >> COUNT_BITS == state.frame_sequence >> COUNT_BITS:
@@ -253,15 +269,6 @@ def _acted(limits: tuple[Reason, ...]) -> str:
     return f"a limit acted: {', '.join(reason.name for reason in limits)}"
 
 
-def _end_probe(drive: ActiveLoop, sequence: int, why: str, events: list[PendingEvent]) -> ActiveLoop:
-    """The drive with nothing more to play after this frame."""
-    added = drive.command_channels
-    if added is None or added.play is None or added.play.over(sequence):
-        return drive
-    events.append(PendingEvent("PLAY_ENDED", {"why": why}))
-    return drive._replace(command_channels=added.stopped(sequence))
-
-
 def _step_to_flat(settings: Settings, drive: ActiveLoop) -> ActiveLoop:
     """One frame towards flat, within the slew limit."""
     flat = limit(settings.limits, drive.actuators_nm, np.zeros_like(drive.actuators_nm)).actuators_nm
@@ -285,7 +292,7 @@ def _refuse(
         elif reason in UNMEASURED and state.mode is not LoopMode.CLOSED:
             drive, hit, homing = _next_command(settings, state, drive.coasted(1), drive.history_nm[0], frame.sequence)
             if hit:
-                drive = _end_probe(drive, frame.sequence, _acted(hit), events)
+                drive = end_probe(drive, frame.sequence, _acted(hit), events)
             _limit_events(state.limits_hit, hit, events)
             reasons = (reason, *hit)
         elif reason not in (Rejection.REPEATED, Rejection.OUT_OF_ORDER, Rejection.AHEAD):  # those are no new exposure
@@ -297,12 +304,12 @@ def _refuse(
         refused_count=state.refused_count + 1,
         limits_hit=hit,
         returning_to_zero=homing,
-        commanded=state.commanded or drive is not None,
+        commanded=drive is not None and _commands(state),
         counts=_counted(state.counts, reasons),
         input_number=state.input_number + 1,
     )
     step = Step(frame.sequence, frame.time_ns, state.mode, held, reasons)
-    if drive is None:
+    if drive is None or not state.commanded:
         return state, Outputs(step=step, events=events)
     # Under the newest frame's sequence even where an older frame came: the mirror refuses older commands.
     return state, Outputs(step=step, command=_command(state, drive, held), events=events)
@@ -314,18 +321,18 @@ def _tick(settings: Settings, state: State, tick: Tick) -> tuple[State, Outputs]
     freed = bool(events)
     drive = state.drive
     safe = state.mode is LoopMode.SAFE
+    silent = state.frame_timeout or tick.silent_ns > settings.frame_timeout_ns  # until a newer frame comes
     if drive is None or not (state.commanded or safe):
+        if silent is not state.frame_timeout:
+            state = state._replace(frame_timeout=silent)
         return state, Outputs(events=tuple(events), changed=freed)
-    silent = (
-        state.frame_timeout or tick.silent_ns > settings.frame_timeout_ns
-    )  # until a newer frame comes, whatever else comes
     flatten = silent and settings.on_frame_timeout == "flat"
     counts = state.counts
     if silent and not state.frame_timeout:
         action = "relaxing the mirror to flat" if flatten else "holding the command"
         events.append(PendingEvent("NO_FRAMES", {"silent_ms": tick.silent_ns / 1e6, "action": action}))
         counts = _counted(counts, (Rejection.NO_FRAME,))
-        drive = _end_probe(drive, state.frame_sequence, f"no frame for {tick.silent_ns / 1e6:.0f} ms", events)
+        drive = end_probe(drive, state.frame_sequence, f"no frame for {tick.silent_ns / 1e6:.0f} ms", events)
     if flatten or safe:
         drive = _step_to_flat(settings, drive)
     state = state._replace(drive=drive, frame_timeout=silent, commanded=True, counts=counts)
@@ -360,6 +367,7 @@ def _counted(counts: Mapping[Reason, int], reasons: tuple[Reason, ...]) -> Mappi
 _HANDLERS: dict[type, Callable[..., tuple[State, Outputs]]] = {
     Request: _request,
     MirrorShape: mirror_reported,
+    MirrorReport: mirror_judged,
     CameraSettings: camera_reported,
     Load: _load,
     Tick: _tick,

@@ -80,6 +80,20 @@ class MirrorShape:
 
 
 @dataclass(frozen=True, slots=True)
+class MirrorReport:
+    """Whether the mirror follows commands (a clock's verdict).
+
+    Attributes:
+        fault: what is wrong, to be read after "the mirror"; empty where it follows.
+        shape: where it last was; None where that is not known.
+    """
+
+    time_ns: int
+    fault: str
+    shape: MirrorShape | None = None
+
+
+@dataclass(frozen=True, slots=True)
 class Load:
     """A calibration to use from now on, and where it came from."""
 
@@ -96,7 +110,9 @@ class Tick:
     silent_ns: int
 
 
-Input = Frame | Request | MirrorShape | CameraSettings | Load | Tick
+Report = MirrorShape | MirrorReport | CameraSettings | Load | Tick
+"""What is neither a frame nor a request."""
+Input = Frame | Request | Report
 
 
 class Step(NamedTuple):

@@ -8,12 +8,14 @@ from lowfc.arrays import Single
 from lowfc.control.calibration.calibration import Calibration
 from lowfc.control.loop.camera import CameraSettings, changes
 from lowfc.control.loop.command_channels import ADOPTED, Channel
-from lowfc.control.loop.inputs import MirrorShape, Outputs, PendingEvent
-from lowfc.control.loop.safety import LoopMode
-from lowfc.control.loop.state import ActiveLoop, Conditions, Settings, State
+from lowfc.control.loop.inputs import MirrorReport, MirrorShape, Outputs, PendingEvent
+from lowfc.control.loop.safety import LoopMode, limit
+from lowfc.control.loop.state import ActiveLoop, Conditions, LawRunner, Settings, State
 
 ADOPTED_NM = 1.0
 """Of an actuator beyond the modal command, above which a mirror's shape is adopted as a channel."""
+REFUSED_IN_A_ROW = 3
+"""Frames refused in a row from which on the loop counts as holding; fewer may be a hiccup."""
 LATCHED = "it was in safe mode before the controller started"
 WITNESSED = "the mirror's last command was sent in safe mode"
 
@@ -89,6 +91,17 @@ def uncalibrated(state: State) -> str:
     return f"the computed calibration is for frames of {rows} x {columns} pixels, the camera's are {frames}{hint}"
 
 
+def holding(state: State) -> str:
+    """Why a closed loop would hold its command for now; empty where it would correct."""
+    if state.conditions.mirror_fault:
+        return f"the mirror {state.conditions.mirror_fault}"
+    if state.frame_timeout:
+        return "no frame comes"
+    if state.refused is not None and state.refused_count >= REFUSED_IN_A_ROW:
+        return f"frames are refused as {state.refused.name}"
+    return ""
+
+
 def mirror_reported(settings: Settings, state: State, shape: MirrorShape) -> tuple[State, Outputs]:
     """Start from where the mirror is, so that it does not jump; later shapes change nothing."""
     if state.commanded:
@@ -113,9 +126,54 @@ def mirror_reported(settings: Settings, state: State, shape: MirrorShape) -> tup
     if command_nm.any():
         events.append(PendingEvent("MIRROR_ADOPTED", {"rms_nm": float(np.sqrt(command_nm @ command_nm))}))
     if state.mode is not LoopMode.SAFE:  # then it is on its way to flat, and shall stay there
-        drive, rest = adopted(drive, shape.actuators_nm)
+        added = drive.command_channels  # of a mirror that reported late
+        drive, rest = adopted(drive, shape.actuators_nm if added is None else shape.actuators_nm - added.sum_nm)
         events += rest
     return state._replace(drive=drive), Outputs(events=events, changed=True)
+
+
+def mirror_judged(settings: Settings, state: State, report: MirrorReport) -> tuple[State, Outputs]:
+    """Hold while the mirror does not follow; a closed loop goes back to where the mirror last was, against wind-up.
+
+    Far back, it takes several reports: each step keeps the slew limit.
+    """
+    fault, drive = report.fault, state.drive
+    news = fault != state.conditions.mirror_fault
+    events: list[PendingEvent] = []
+    if news:
+        events.append(PendingEvent("MIRROR_LOST", {"fault": fault}) if fault else PendingEvent("MIRROR_BACK", {}))
+    if drive is not None and fault:
+        if news:
+            drive = end_probe(drive, state.frame_sequence, f"the mirror {fault}", events)
+        if news and drive.following is not None:
+            drive = drive._replace(following=LawRunner.at_rest(drive.following.law))
+        if state.mode is LoopMode.CLOSED and report.shape is not None:
+            drive = _gone_back(settings, drive, report.shape.actuators_nm)
+    if not news and drive is state.drive:
+        return state, Outputs()
+    conditions = state.conditions._replace(mirror_fault=fault)
+    return state._replace(drive=drive, conditions=conditions), Outputs(events=events, changed=True)
+
+
+def _gone_back(settings: Settings, drive: ActiveLoop, shape_nm: Single) -> ActiveLoop:
+    """The drive with a command nearer to a shape (rows, columns) of the mirror."""
+    if shape_nm.shape != drive.calibration.grid:
+        return drive
+    kept_nm = limit(settings.limits, drive.actuators_nm, shape_nm).actuators_nm
+    if np.array_equal(kept_nm, drive.actuators_nm):
+        return drive
+    modal_nm: Single = kept_nm if drive.command_channels is None else kept_nm - drive.command_channels.sum_nm
+    command_nm = drive.inverse @ modal_nm.reshape(-1)
+    return drive._replace(actuators_nm=kept_nm, history_nm=(command_nm,) * len(drive.history_nm))
+
+
+def end_probe(drive: ActiveLoop, sequence: int, why: str, events: list[PendingEvent]) -> ActiveLoop:
+    """The drive with nothing more to play after this frame."""
+    added = drive.command_channels
+    if added is None or added.play is None or added.play.over(sequence):
+        return drive
+    events.append(PendingEvent("PLAY_ENDED", {"why": why}))
+    return drive._replace(command_channels=added.stopped(sequence))
 
 
 def camera_reported(settings: Settings, state: State, camera: CameraSettings) -> tuple[State, Outputs]:

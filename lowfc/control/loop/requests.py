@@ -16,18 +16,16 @@ from lowfc.control.laws.stability import highest_gain, limiting_gain
 from lowfc.control.loop.command_channels import FLAT, MIRROR, CommandChannels, Play, play_table
 from lowfc.control.loop.inputs import PendingEvent, Request
 from lowfc.control.loop.lease import ENDED_BY, refusal
-from lowfc.control.loop.loading import in_mode, loaded, misfit, mode_event, uncalibrated
+from lowfc.control.loop.loading import holding, in_mode, loaded, misfit, mode_event, uncalibrated
 from lowfc.control.loop.remarks import check_offset, remark
 from lowfc.control.loop.reservation import lease, lease_checked, lease_ended, release, renew
-from lowfc.control.loop.safety import Limits, LoopMode, neighbour_difference_nm, request_mode
+from lowfc.control.loop.safety import Limits, LoopMode, Rejection, neighbour_difference_nm, request_mode
 from lowfc.control.loop.state import ActiveLoop, LawRunner, Settings, State
 from lowfc.control.loop.wording import MOST_TEXT, PAUSED, counted
 
 MOST_STEPS = 1 << 32
 MOST_REPLY = 1000
 """Characters of a reply."""
-REFUSED_IN_A_ROW = 3
-"""Frames refused in a row from which on the loop is not closed; fewer may be a hiccup."""
 
 
 class Answer(NamedTuple):
@@ -144,13 +142,13 @@ _REPLIES = {
 
 
 def _check_closable(state: State) -> None:
-    """Refuse to close the loop on a camera that is known to be wrong, or none of whose frames can be used."""
+    """Refuse to close a loop that would only hold its command."""
     _check_camera(state)
-    if state.refused is not None and state.refused_count >= REFUSED_IN_A_ROW:
-        raise ValueError(
-            f"the last {state.refused_count} frames were refused as {state.refused.name}: correct this first; if the "
-            "frame sequences are wrong, `lowfc ctl safe` and then `lowfc ctl clear` reset the newest sequence"
-        )
+    why = holding(state)
+    if why and state.refused in (Rejection.OUT_OF_ORDER, Rejection.REPEATED):
+        why += " (`lowfc ctl safe` and then `lowfc ctl clear` reset the newest sequence)"
+    if why:
+        raise ValueError(f"{why}: correct this first, the loop would only hold its command")
 
 
 def _check_camera(state: State) -> None:
@@ -232,6 +230,8 @@ def _play(settings: Settings, state: State, request: Request) -> Handled:
         raise ValueError("the loop is in safe mode: `lowfc ctl clear` first, when it is safe")
     if not state.frame_sequence:
         raise ValueError("no frame has come yet, from which to count those of a play")
+    if state.conditions.mirror_fault:
+        raise ValueError(f"the mirror {state.conditions.mirror_fault}: it would follow no play")
     added = drive.added()
     if added.play is not None and not added.play.over(state.frame_sequence + 1):
         raise ValueError("something is being played already: `lowfc ctl stop` ends it")

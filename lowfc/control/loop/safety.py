@@ -47,6 +47,7 @@ class Rejection(IntEnum):
     STUCK = 9
     AHEAD = 10
     CAMERA_UNKNOWN = 11
+    NO_MIRROR = 12
 
 
 class Limit(IntEnum):

@@ -205,6 +205,7 @@ class Conditions(NamedTuple):
         clear_id: identity of the operator's last clear; 0 without one.
         mode_since_ns: time of the change to this loop mode, and `mode_cause` its cause.
         lease: the reservation of the loop, or the last one that ended; None before the first.
+        mirror_fault: why the mirror does not follow commands; empty where it does.
     """
 
     camera: CameraSettings | None = None
@@ -213,6 +214,7 @@ class Conditions(NamedTuple):
     mode_since_ns: int = 0
     mode_cause: str = ""
     lease: Lease | None = None
+    mirror_fault: str = ""
 
 
 class State(NamedTuple):

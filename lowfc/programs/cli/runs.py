@@ -35,6 +35,7 @@ def _row(name: str, roles: set[str]) -> dict[str, Any]:
     return {
         "run": name,
         "mode": mode_name(controller.mode) or ("starting" if {Role.LAUNCHER, Role.CONTROLLER} & roles else None),
+        "holding": controller.holding or None,
         "rate_hz": controller.rate_hz if controller.mode else None,
         "uptime_s": controller.uptime_ns * 1e-9 if controller.mode else None,
         "processes": sorted(processes + starting, key=lambda one: str(one["process"])),
@@ -49,6 +50,8 @@ def _lines(rows: list[dict[str, Any]]) -> list[str]:
     lines = []
     for row in rows:
         mode = "no controller" if row["mode"] is None else mode_word(row["mode"])
+        if row["holding"]:
+            mode += f", but holding: {row['holding']};"
         rate = "" if row["rate_hz"] is None else f" at {row['rate_hz']:.0f} Hz for {row['uptime_s']:.0f} s"
         log = {"recording": f"recording {row['log']}", "none": "not recording"}
         processes = ", ".join(one["process"] for one in row["processes"]) or "no process yet"

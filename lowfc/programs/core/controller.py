@@ -7,7 +7,6 @@ from dataclasses import replace
 from functools import partial
 
 from lowfc.adapters.bus.bus import ALL, Query, Sample
-from lowfc.adapters.bus.mailbox import Mailbox
 from lowfc.adapters.bus.start_check import StartCheck
 from lowfc.adapters.files.factory import settings
 from lowfc.adapters.process.clock import SimulatedClock
@@ -27,7 +26,6 @@ from lowfc.contract.messages import (
     CONTROLLER_STATE,
     FRAME,
     LAW,
-    MIRROR_STATE,
     OFFLOAD,
     PLAY,
     REQUEST,
@@ -39,15 +37,15 @@ from lowfc.contract.messages import (
 )
 from lowfc.control.calibration.calibration import Calibration
 from lowfc.control.loop.advance import advance
-from lowfc.control.loop.camera import CameraSettings
 from lowfc.control.loop.durations import Durations
-from lowfc.control.loop.inputs import Input, Load, MirrorShape, Outputs, Reply, Request, Tick
-from lowfc.control.loop.loading import misfit
+from lowfc.control.loop.inputs import Input, Load, MirrorReport, Outputs, Reply, Report, Request, Tick
+from lowfc.control.loop.loading import holding, misfit
 from lowfc.control.loop.requests import CONFIGURATION, MOST_REPLY, prepared
 from lowfc.control.loop.safety import LoopMode
 from lowfc.control.loop.state import State
 from lowfc.programs.core.cache_warmup import CacheWarmup
 from lowfc.programs.core.controller_report import Arrays, LastSecond, NotClosed, Offload, StageTiming
+from lowfc.programs.core.mirror_signs import MirrorSigns
 from lowfc.programs.core.start_up import StartUp
 
 TICK_NS = 10_000_000
@@ -97,8 +95,7 @@ class Controller:
         self._leave_camera = service.handover(
             FRAME, self._arrived, period_ns=config.period_ns, superseded=partial(self._arrived, superseded=True)
         )
-        self._mirror = Mailbox(MIRROR_STATE.at(name))
-        self._leave_mirror = service.bus.subscribe(MIRROR_STATE, self._mirror.put, name)
+        self._mirror = MirrorSigns(service.bus, service.clock.host_ns)
         self._camera = service.mailbox(CAMERA_STATE)
         self._commands = service.publisher(COMMAND, name)
         self._steps = service.publisher(STEP)
@@ -160,6 +157,8 @@ class Controller:
         health.counts.extend(reason_counts(self._state))
         now_ns = self._service.clock.now_ns()
         health.not_closed_ns, health.not_closed_cause = self._not_closed.note(self._state, now_ns)
+        if self._state.mode is LoopMode.CLOSED:
+            health.holding = holding(self._state)
         health.last_second.CopyFrom(self._last_second.figures(self._state, self._service.clock.host_ns()))
         if self._frame_to_command.count:
             health.frame_to_command.CopyFrom(codec.latency(self._frame_to_command))
@@ -227,6 +226,8 @@ class Controller:
         """Apply what the camera says of itself; without frames, hold."""
         if camera is not None:
             self._take_camera(camera)
+        if self._mirror.due:
+            self._judge_mirror()
         silent_ns = self._service.clock.host_ns() - self._last_frame_ns
         if silent_ns >= TICK_NS and not self._service.clock.lockstep:
             self._take(Tick(self._service.clock.now_ns(), silent_ns))
@@ -312,26 +313,34 @@ class Controller:
 
     def _adopt_mirror(self) -> None:
         """Learn where the mirror is before the first command, so that it does not jump."""
-        if self._service.clock.lockstep and self._state.drive is not None:  # every lockstep run starts from flat
-            self._leave_mirror()
+        lockstep = self._service.clock.lockstep
+        if lockstep and self._state.drive is not None:  # every lockstep run starts from flat
+            self._mirror.close()
             return
-        sample = self._mirror.take(MIRROR_PATIENCE_S)
-        self._leave_mirror()  # from here its states would only cost time
-        try:
-            shape = codec.decode_mirror(sample.payload) if sample is not None else None
-        except BadMessageError as fault:
-            self._service.unreadable(MIRROR_STATE.key, fault)
-            shape = None
-        if shape is not None:
-            grid = self._state.drive.calibration.grid if self._state.drive is not None else shape.actuators_nm.shape
+        shape = self._mirror.first(MIRROR_PATIENCE_S, self._service)
+        if shape is not None and self._state.drive is not None:
+            grid = self._state.drive.calibration.grid
             if shape.actuators_nm.shape != grid:
                 raise CalibrationError(
                     f"the mirror has {shape.actuators_nm.shape} actuators, the calibration is for {grid}; use the "
                     "mirror's own calibration"
                 )
+        if shape is not None:
             self._take(shape)
-        elif self._service.running:
-            self._service.event("MIRROR_SILENT", patience_s=MIRROR_PATIENCE_S)
+        if lockstep:
+            self._mirror.close()
+        else:
+            self._judge_mirror()
+
+    def _judge_mirror(self) -> None:
+        """Take in whether the mirror follows, while it does not or where that has changed."""
+        fault = self._mirror.fault(commanded=self._state.commanded)
+        if not fault and not self._state.conditions.mirror_fault:
+            return
+        shape, now_ns = self._mirror.shape(), self._service.clock.now_ns()
+        if shape is not None and not fault:  # before the first command, it is where the loop starts from
+            self._take(shape)
+        self._take(MirrorReport(now_ns, fault, shape))
 
     def _begin(self) -> None:
         """Ask for what the configuration puts on the mirror, and for its law, as an operator would."""
@@ -353,7 +362,7 @@ class Controller:
         self._state, outputs = advance(self._settings, self._state, taken)
         return outputs
 
-    def _take(self, taken: MirrorShape | CameraSettings | Load | Tick) -> None:
+    def _take(self, taken: Report) -> None:
         """Advance by what is neither a frame nor a request, and log it where it made a difference."""
         before = self._state
         outputs = self._advance(taken)

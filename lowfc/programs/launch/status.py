@@ -68,8 +68,9 @@ def wavefront(camera: wire.Health) -> str:
 
 
 def mode(controller: wire.Health) -> str:
-    """Loop mode in words."""
-    return mode_word(mode_name(controller.mode) or "starting")
+    """Loop mode in words, and why a closed loop holds its command."""
+    word = mode_word(mode_name(controller.mode) or "starting")
+    return f"{word}, but holding: {controller.holding}" if controller.holding else word
 
 
 def latency(durations: wire.Latency) -> str:

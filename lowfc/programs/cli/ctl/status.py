@@ -59,6 +59,7 @@ def figures(
         if state.HasField("mode_timestamp")
         else None,
         "mode_cause": state.mode_cause,
+        "holding": controller.holding or None,
         "mirrors": {
             name: {
                 "refused": _reason(one.command_refused) if one.command_refused else None,
@@ -191,7 +192,8 @@ def _last_warning(state: wire.ControllerState, processes: Mapping[str, wire.Heal
 
 
 def _mode(known: dict[str, Any]) -> str:
-    return "paused" if known["paused"] else mode_word(known["mode"])
+    word = "paused" if known["paused"] else mode_word(known["mode"])
+    return f"{word}, but holding: {known['holding']}" if known["holding"] else word
 
 
 def _reason(number: int) -> str:

@@ -13,7 +13,7 @@ from lowfc.programs.reliability.chaos.bench import ChaosBench
 
 Act = Callable[[ChaosBench], None]
 
-LOST = ("MESSAGES_LOST",)
+LOST = ("MESSAGES_LOST", "MIRROR_LOST")
 WHILE_FRAMES = 250
 
 

@@ -77,6 +77,19 @@ def _silenced(bench: ChaosBench) -> None:
     bench.restart(Role.CAMERA)
 
 
+@process_case(
+    "lost-mirror",
+    "kill -9 of the mirror under a disturbance that stays; started anew after 3 s",
+    config={"disturbance.static_nm": {"4": 40.0}},
+    expected=("MIRROR_LOST", "MIRROR_BACK"),
+    allowed=LOST,
+)
+def _lost_mirror(bench: ChaosBench) -> None:
+    bench.kill(bench.mirror)
+    time.sleep(3 * SILENT_S)
+    bench.restart(bench.mirror)
+
+
 @process_case("random", "six kills or stops of any of them, at random times", allowed=LOST)
 def _at_random(bench: ChaosBench) -> None:
     names = [str(Role.CAMERA), str(Role.CONTROLLER), bench.mirror, str(Role.RECORDER)]

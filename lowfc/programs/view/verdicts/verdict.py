@@ -93,7 +93,10 @@ def _loop(watcher: Watcher) -> Tile:
         return _open(watcher)
     if Liveness.STARTING in (controller.life, camera.life) or camera.life is Liveness.NEVER:
         return Tile(title, "WAITING", "closed, no frame yet", Level.NEUTRAL, "Waiting for the first frame.")
-    if mirror.life is Liveness.SILENT:
+    fault = watcher.snapshot.controller.mirror_fault if watcher.snapshot.controller is not None else ""
+    if fault:
+        return Tile(title, "HOLDING", f"closed, but the mirror {fault}: command held", Level.WARNING)
+    if mirror.life is Liveness.SILENT:  # in logs of version 0.1 it is not missed
         return Tile(title, "CLOSED", "but the mirror is silent", Level.WARNING)
     if camera.life is Liveness.STOPPED:
         advice = "The camera was stopped: the loop is closed and holds its command."
