@@ -95,7 +95,7 @@ class Controller:
         self._leave_camera = service.handover(
             FRAME, self._arrived, period_ns=config.period_ns, superseded=partial(self._arrived, superseded=True)
         )
-        self._mirror = MirrorSigns(service.bus, service.clock.host_ns)
+        self._mirror = MirrorSigns(service, name)
         self._camera = service.mailbox(CAMERA_STATE)
         self._commands = service.publisher(COMMAND, name)
         self._steps = service.publisher(STEP)
@@ -226,7 +226,7 @@ class Controller:
         """Apply what the camera says of itself; without frames, hold."""
         if camera is not None:
             self._take_camera(camera)
-        if self._mirror.due:
+        if not self._service.clock.lockstep and self._mirror.due:
             self._judge_mirror()
         silent_ns = self._service.clock.host_ns() - self._last_frame_ns
         if silent_ns >= TICK_NS and not self._service.clock.lockstep:
@@ -317,30 +317,28 @@ class Controller:
         if lockstep and self._state.drive is not None:  # every lockstep run starts from flat
             self._mirror.close()
             return
-        shape = self._mirror.first(MIRROR_PATIENCE_S, self._service)
-        if shape is not None and self._state.drive is not None:
-            grid = self._state.drive.calibration.grid
-            if shape.actuators_nm.shape != grid:
+        shape = self._mirror.first(MIRROR_PATIENCE_S)
+        if shape is not None:
+            drive, grid = self._state.drive, shape.actuators_nm.shape
+            if drive is not None and grid != drive.calibration.grid:
                 raise CalibrationError(
-                    f"the mirror has {shape.actuators_nm.shape} actuators, the calibration is for {grid}; use the "
+                    f"the mirror has {grid} actuators, the calibration is for {drive.calibration.grid}; use the "
                     "mirror's own calibration"
                 )
-        if shape is not None:
             self._take(shape)
         if lockstep:
             self._mirror.close()
-        else:
+        elif self._service.running:
             self._judge_mirror()
 
     def _judge_mirror(self) -> None:
         """Take in whether the mirror follows, while it does not or where that has changed."""
-        fault = self._mirror.fault(commanded=self._state.commanded)
-        if not fault and not self._state.conditions.mirror_fault:
-            return
-        shape, now_ns = self._mirror.shape(), self._service.clock.now_ns()
-        if shape is not None and not fault:  # before the first command, it is where the loop starts from
-            self._take(shape)
-        self._take(MirrorReport(now_ns, fault, shape))
+        late = self._mirror.first()
+        if late is not None:  # before the first command, it is where the loop starts from
+            self._take(late)
+        fault = self._mirror.fault(self._state)
+        if fault or self._state.conditions.mirror_fault:
+            self._take(MirrorReport(self._service.clock.now_ns(), fault, self._mirror.last()))
 
     def _begin(self) -> None:
         """Ask for what the configuration puts on the mirror, and for its law, as an operator would."""

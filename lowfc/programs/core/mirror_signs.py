@@ -1,89 +1,97 @@
-"""Signs of life of the mirror, looked at now and then: its states wait in a ring, at no cost to the frames."""
+"""Signs of life of the mirror: its Health, for its states would cost every frame time."""
 
-import time
-from collections.abc import Callable
+from collections import deque
 
 from google.protobuf.message import DecodeError
 
-from lowfc.adapters.bus.bus import Bus, Sample
+from lowfc.adapters.bus.bus import Sample
+from lowfc.adapters.bus.mailbox import Mailbox
+from lowfc.adapters.bus.run import mirror_role
 from lowfc.adapters.process.service import Service
 from lowfc.contract.codecs import codec
 from lowfc.contract.errors import BadMessageError
-from lowfc.contract.messages import MIRROR_STATE, wire
+from lowfc.contract.messages import HEALTH, MIRROR_STATE, wire
 from lowfc.control.loop.inputs import MirrorShape
+from lowfc.control.loop.state import State
 
 LOOK_NS = 100_000_000
-SILENT_NS = 500_000_000
-"""Without a state from a mirror, which publishes one every 0.1 s at least."""
-_POLL_S = 0.01
+SILENT_NS = 1_600_000_000
+"""Without a Health, of which there are two a second: three may be late."""
 
 
 class MirrorSigns:
-    """What the mirror says of itself, and since when it has said nothing."""
+    """What the mirror says of itself, and since when it has said nothing.
 
-    def __init__(self, bus: Bus, host_ns: Callable[[], int]) -> None:
-        self._ring = bus.ring(MIRROR_STATE, 1)
-        self._host_ns = host_ns
-        self._last: Sample | None = None
-        self._heard_ns = self._due_ns = host_ns()
+    A mirror that never sent a Health is not missed.
+    """
+
+    def __init__(self, service: Service, name: str) -> None:
+        self._service = service
+        self._states = Mailbox(MIRROR_STATE.at(name))
+        self._leave_states = service.bus.subscribe(MIRROR_STATE, self._states.put, name)
+        self._leave_health = service.bus.subscribe(HEALTH, self._told, mirror_role(name))
+        self._told_of: deque[wire.Health] = deque(maxlen=1)
+        self._heard_ns = self._due_ns = 0
+        self._reported = False
         self._fault = self._wrong = ""
-        self._closed = False
+        self._commanded: deque[MirrorShape] = deque(maxlen=2)
 
     @property
     def due(self) -> bool:
         """Whether it is time to look."""
-        return not self._closed and self._host_ns() >= self._due_ns
+        return self._service.clock.host_ns() >= self._due_ns
 
-    def first(self, patience_s: float, service: Service) -> MirrorShape | None:
-        """The shape that the mirror reports first; None without one, or where the process is to end."""
-        deadline_s = time.monotonic() + patience_s
-        while service.running and self._news() is None and time.monotonic() < deadline_s:
-            time.sleep(_POLL_S)
-        return self.shape()
+    def first(self, patience_s: float = 0.0) -> MirrorShape | None:
+        """The shape that the mirror reports first; None without one."""
+        sample = None if self._reported else self._states.take(patience_s)
+        try:
+            shape = codec.decode_mirror(sample.payload) if sample is not None else None
+        except BadMessageError as fault:
+            self._service.unreadable(MIRROR_STATE.key, fault)
+            return None
+        if shape is not None:
+            self._reported = True
+            self._leave_states()  # from here they would only cost time
+        return shape
 
-    def fault(self, *, commanded: bool) -> str:
+    def fault(self, state: State) -> str:
         """What is wrong with the mirror, to be read after "the mirror"; empty where it follows.
 
-        A state in which it does not follow may be older than the last command, so two in a row are needed.
+        By its own account it must be wrong twice: the first may be from before the last command.
         """
-        state, now_ns = self._news(), self._host_ns()
+        now_ns = self._service.clock.host_ns()
         self._due_ns = now_ns + LOOK_NS
-        if self._last is None:
-            self._fault = "has not reported yet"
-        elif state is not None:
-            before, self._wrong = self._wrong, _wrong(state) if commanded else ""
+        if self._told_of:
+            self._heard_ns = now_ns
+            before, self._wrong = self._wrong, _wrong(self._told_of.popleft()) if state.commanded else ""
             if self._wrong == before or not self._wrong:
                 self._fault = self._wrong
-        elif now_ns - self._heard_ns > SILENT_NS:
+            if not self._fault and state.drive is not None:
+                shape = MirrorShape(now_ns, state.drive.actuators_nm, state.drive.history_nm[0])
+                self._commanded.append(shape)
+        elif self._heard_ns and now_ns - self._heard_ns > SILENT_NS:
             self._fault = "does not answer"
-        return self._fault
+        return self._fault if self._reported else "has not reported yet"
 
-    def shape(self) -> MirrorShape | None:
-        """Where it last was."""
-        try:
-            return None if self._last is None else codec.decode_mirror(self._last.payload)
-        except BadMessageError:
-            return None
+    def last(self) -> MirrorShape | None:
+        """What was commanded at the last but one sign that it follows, since when it may not have followed."""
+        return self._commanded[0] if self._commanded else None
 
     def close(self) -> None:
         """Look no more."""
-        self._closed = True
-        self._ring.close()
+        self._leave_health()
+        if not self._reported:
+            self._leave_states()
 
-    def _news(self) -> wire.MirrorState | None:
-        """The newest state that has come since the last look."""
-        for sample in self._ring.drain():
-            try:
-                state = wire.MirrorState.FromString(sample.payload)
-            except DecodeError:
-                continue
-            self._last, self._heard_ns = sample, self._host_ns()
-            return state
-        return None
+    def _told(self, sample: Sample) -> None:
+        try:
+            self._told_of.append(wire.Health.FromString(sample.payload))
+        except DecodeError:
+            return
 
 
-def _wrong(state: wire.MirrorState) -> str:
+def _wrong(health: wire.Health) -> str:
     """Why the mirror does not follow, by its own account."""
-    if state.refused:
-        return f"refuses commands: {wire.Reason.Name(state.refused).removeprefix('REASON_')}"
-    return "" if state.status == wire.MIRROR_STATUS_FOLLOWING else "gets no commands"
+    if health.command_refused:
+        return f"refuses commands: {wire.Reason.Name(health.command_refused).removeprefix('REASON_')}"
+    return "gets no commands" if health.command_expired else ""
