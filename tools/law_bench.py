@@ -10,6 +10,7 @@ from lowfc.adapters.files import factory
 from lowfc.arrays import Array
 from lowfc.contract.configuration import Configuration, load, sensor_keys
 from lowfc.control.calibration.calibration import Calibration
+from lowfc.control.laws.continuous import Timing
 from lowfc.control.laws.linear_law import LinearLaw
 from lowfc.control.laws.spectra import Pieces
 from lowfc.control.laws.stability import delay_weights
@@ -136,11 +137,12 @@ class Bench:
 def tuned(run: Pieces, config: Configuration, kinds: Sequence[str] = ("lqg",)) -> dict[str, Tuned]:
     """Laws of these kinds for pseudo-open-loop modes (frames, modes), of all modes or the first few."""
     noll = config.noll[: run.values[0].shape[1]]
-    rate_hz, delay, none = config.camera.rate_hz, config.camera.delay_frames, np.zeros(len(noll))
-    gains, models = best_gains(run, rate_hz, delay, none), identified(run, rate_hz)
+    rate_hz, none = config.camera.rate_hz, np.zeros(len(noll))
+    timing = Timing.of(config.camera.delay_frames, 0.0)  # its images are of an instant
+    gains, models = best_gains(run, rate_hz, timing, none), identified(run, rate_hz)
     makers: dict[str, Callable[[], Tuned]] = {
-        "integrator": lambda: tune_integrator(models, gains, noll, none, delay),
-        "pi-notch": lambda: tune_pi_notch(models, gains, noll, none, delay),
-        "lqg": lambda: tune_lqg(run, models, gains, noll, none, delay),
+        "integrator": lambda: tune_integrator(models, gains, noll, none, timing),
+        "pi-notch": lambda: tune_pi_notch(models, gains, noll, none, timing),
+        "lqg": lambda: tune_lqg(run, models, gains, noll, none, timing),
     }
     return {kind: makers[kind]() for kind in kinds}

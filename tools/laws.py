@@ -10,9 +10,10 @@ from threadpoolctl import threadpool_limits
 from lowfc.adapters.files.factory import frame_noise_nm
 from lowfc.contract.configuration import Configuration
 from lowfc.control.calibration.calibration import Calibration
+from lowfc.control.laws.continuous import Timing, left_power
 from lowfc.control.laws.kalman import lqg
 from lowfc.control.laws.linear_law import LinearLaw
-from lowfc.control.laws.margins import noise_gain, rejection
+from lowfc.control.laws.margins import noise_gain
 from lowfc.control.laws.spectra import Pieces
 from lowfc.control.laws.vibration import Line, Model
 from lowfc.optics.detector.photometry import tilt_nm_per_mas
@@ -102,8 +103,8 @@ def moved(config: Configuration, calibration: Calibration, law: LinearLaw) -> di
 def theory_mas(config: Configuration, calibration: Calibration, law: LinearLaw) -> tuple[float, float]:
     """What a law leaves of the disturbance's known sine waves, and what it makes of noise; rms of both axes, mas."""
     shaken, delay = disturbance_of(config), config.camera.delay_frames
-    S = rejection(law, shaken.frequency_hz, delay)[:, :2]
-    waves = np.mean(np.sum(np.abs(shaken.amplitude_nm[:, :2]) ** 2 / 2 * S**2, axis=0))
+    left = left_power(law, 2 * np.pi * shaken.frequency_hz / RATE_HZ, Timing.of(delay, 0.0))[:, :2]
+    waves = np.mean(np.sum(np.abs(shaken.amplitude_nm[:, :2]) ** 2 / 2 * left, axis=0))
     noise = np.mean(frame_noise_nm(config, calibration)[:2] ** 2 * noise_gain(law, delay)[:2])
     nm_per_mas = tilt_nm_per_mas(config.star.diameter_m)
     return float(np.sqrt(waves) / nm_per_mas), float(np.sqrt(noise) / nm_per_mas)
@@ -129,9 +130,10 @@ def optimum_mas(config: Configuration, calibration: Calibration) -> float:
             drift: Any, axis: int = axis, power: Any = power, known: Any = known, variance: float = variance
         ) -> float:
             step, cutoff_hz = 10.0 ** np.asarray(drift)
-            law = lqg([Model(step, cutoff_hz, known, variance, RATE_HZ)], (2 + axis,), delay)
-            S = rejection(law, shaken.frequency_hz, delay)[:, 0]
-            return float(power @ S**2 + variance * noise_gain(law, delay)[0])
+            timing = Timing.of(delay, 0.0)  # its images are of an instant
+            law = lqg([Model(step, cutoff_hz, known, variance, RATE_HZ)], (2 + axis,), timing)
+            left = left_power(law, 2 * np.pi * shaken.frequency_hz / RATE_HZ, timing)[:, 0]
+            return float(power @ left + variance * noise_gain(law, delay)[0])
 
         found = minimize(left, (-2.0, 0.7), method="Nelder-Mead", bounds=_DRIFT_BOUNDS, options={"xatol": 0.02})
         if any(min(x - low, high - x) < 0.05 for x, (low, high) in zip(found.x, _DRIFT_BOUNDS, strict=True)):

@@ -7,6 +7,7 @@ import pytest
 from scipy.fft import fft, ifft, irfft
 
 from lowfc.arrays import Array
+from lowfc.control.laws.continuous import Timing
 from lowfc.control.laws.kalman import covariance_nm2, lqg
 from lowfc.control.laws.margins import check_stable, margins, rejection
 from lowfc.control.laws.spectra import Pieces
@@ -89,10 +90,15 @@ def test_where_drift_explains_all_there_is_some_noise_and_a_filter(lines: tuple[
     truth = Model(1.0, 50.0, tuple(Line(hz, 1e-3, 100.0) for hz in lines), 1e-12, RATE_HZ)
     model = identify(Pieces((realised(truth, 4096, seed),), 0), RATE_HZ)
     assert model.noise_nm2 > 1e-8
-    check_stable(lqg([model], (2,), 1.0), 1.0)
+    check_stable(lqg([model], (2,), SAMPLED), 1.0)
 
 
+SAMPLED = Timing.sampled(1.0)
 MODEL = Model(0.02, 5.0, (Line(18, 0.3, 60.0), Line(71, 0.5, 20.0)), 0.7, RATE_HZ)
+
+
+def predicted(timing: Timing) -> float:
+    return float(predicted_nm(lqg([MODEL], (2,), timing), [MODEL], timing)[0])
 
 
 def residual_nm2(model: Model, whole_frames: int) -> float:
@@ -125,7 +131,9 @@ def minimum_variance_nm2(spectrum_nm2: Array, noise_nm2: float, whole_frames: in
 def test_what_is_predicted_is_the_same_by_three_roads(delay: int) -> None:
     """Riccati's covariance, the law's own transfer functions, and the factor of the spectrum."""
     riccati = residual_nm2(MODEL, delay)
-    assert predicted_nm(lqg([MODEL], (2,), delay), [MODEL], delay)[0] ** 2 == pytest.approx(riccati, rel=0.01)
+    assert predicted_nm(lqg([MODEL], (2,), Timing.sampled(delay)), [MODEL], Timing.sampled(delay))[
+        0
+    ] ** 2 == pytest.approx(riccati, rel=0.01)
     omega = np.linspace(0, np.pi, (1 << 18) + 1)
     spectrum = MODEL.spectrum_nm2(np.maximum(omega, omega[1] / 2))
     assert minimum_variance_nm2(spectrum, MODEL.noise_nm2, delay) == pytest.approx(riccati, rel=0.02)
@@ -133,19 +141,21 @@ def test_what_is_predicted_is_the_same_by_three_roads(delay: int) -> None:
 
 @pytest.mark.parametrize("delay_frames", [1.0, 1.3, 1.5, 1.8, 2.0])
 def test_a_loop_leaves_what_is_predicted(delay_frames: float) -> None:
-    law = lqg([MODEL], (2,), delay_frames)
+    law = lqg([MODEL], (2,), Timing.sampled(delay_frames))
     check_stable(law, delay_frames)
     frames = 30_000
     noisy = realised(MODEL, frames, seed=4)
     noise = np.sqrt(MODEL.noise_nm2)
     errors, _ = run(law, noisy, delay_frames)
     left = np.mean(errors[2000:] ** 2) - noise**2
-    assert np.sqrt(left) == pytest.approx(predicted_nm(law, [MODEL], delay_frames)[0], rel=0.1)
+    assert np.sqrt(left) == pytest.approx(predicted_nm(law, [MODEL], Timing.sampled(delay_frames))[0], rel=0.1)
 
 
 def test_a_fraction_of_a_frame_costs_something_in_between() -> None:
     delays = [1.0, 1.25, 1.5, 1.75, 2.0]
-    left = [predicted_nm(lqg([MODEL], (2,), delay), [MODEL], delay)[0] for delay in delays]
+    left = [
+        predicted_nm(lqg([MODEL], (2,), Timing.sampled(delay)), [MODEL], Timing.sampled(delay))[0] for delay in delays
+    ]
     assert left[0] * 0.999 < left[1]
     assert left == sorted(left) or max(np.diff(left)) > 0
     assert left[2] < left[4] * 1.001
@@ -153,12 +163,14 @@ def test_a_fraction_of_a_frame_costs_something_in_between() -> None:
 
 
 def test_no_integrator_comes_near() -> None:
-    best = min(predicted_nm(integrators([(g, 0.0)], "error", 1.0), [MODEL], 1.0)[0] for g in np.arange(0.1, 1.5, 0.1))
+    best = min(
+        predicted_nm(integrators([(g, 0.0)], "error", 1.0), [MODEL], SAMPLED)[0] for g in np.arange(0.1, 1.5, 0.1)
+    )
     assert np.sqrt(residual_nm2(MODEL, 1)) < 0.5 * best
 
 
 def test_a_constant_is_taken_out_whatever_the_noise() -> None:
-    law = lqg([replace(MODEL, drift_nm2=1e-6)], (2,), 1.0)
+    law = lqg([replace(MODEL, drift_nm2=1e-6)], (2,), SAMPLED)
     assert rejection(law, np.array([1e-4]), 1.0)[0, 0] < 0.01
 
 
@@ -178,7 +190,7 @@ def test_the_covariance_solves_riccatis_equation(width_hz: float, noise_nm2: flo
 
 def test_lines_all_but_undamped_have_a_filter_within_the_unit_circle() -> None:
     lines = tuple(Line(frequency, 1e-6, 100.0) for frequency in (6, 18, 37, 71, 117))
-    law = lqg([replace(MODEL, lines=lines)], (2,), 2.0)
+    law = lqg([replace(MODEL, lines=lines)], (2,), Timing.sampled(2.0))
     found = margins(law, 2.0)
     assert found.stable
     assert found.gain_margin[0] > 2
@@ -187,7 +199,7 @@ def test_lines_all_but_undamped_have_a_filter_within_the_unit_circle() -> None:
 
 def test_models_of_two_rates_are_refused() -> None:
     with pytest.raises(ValueError, match=r"one frame rate, got \[500.0, 1000.0\]"):
-        lqg([MODEL, replace(MODEL, rate_hz=500.0)], (2, 3), 1.0)
+        lqg([MODEL, replace(MODEL, rate_hz=500.0)], (2, 3), SAMPLED)
 
 
 def test_the_least_variance_of_white_noise_is_its_own() -> None:

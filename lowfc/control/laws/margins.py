@@ -132,12 +132,12 @@ def sentence(found: Margins) -> str:
 
 def rejection(law: LinearLaw, frequency_hz: Array, delay_frames: float | None = None) -> Array:
     """|S| (frequencies, modes): true residual over disturbance; with the delay of the law where none is given."""
-    return np.abs(_sensitivity(law, frequency_hz, delay_frames))
+    return np.abs(sensitivity(law, 2 * np.pi * np.asarray(frequency_hz, float) / law.rate_hz, delay_frames))
 
 
 def noise_transfer(law: LinearLaw, frequency_hz: Array, delay_frames: float | None = None) -> Array:
     """|T| (frequencies, modes): true residual over measurement noise of the same mode."""
-    return np.abs(_sensitivity(law, frequency_hz, delay_frames) - 1)
+    return np.abs(sensitivity(law, 2 * np.pi * np.asarray(frequency_hz, float) / law.rate_hz, delay_frames) - 1)
 
 
 def noise_gain(law: LinearLaw, delay_frames: float | None = None) -> Array:
@@ -157,10 +157,9 @@ def _weights(law: LinearLaw, delay_frames: float | None) -> Array:
     return delay_weights(law.delay_frames if delay_frames is None else delay_frames)
 
 
-def _sensitivity(law: LinearLaw, frequency_hz: Array, delay_frames: float | None) -> Complex:
-    """S (frequencies, modes) of each mode."""
-    weights = _weights(law, delay_frames)
-    omega = np.maximum(2 * np.pi * np.asarray(frequency_hz, dtype=float) / law.rate_hz, _LOWEST)
+def sensitivity(law: LinearLaw, omega: Array, delay_frames: float | None = None) -> Complex:
+    """S (frequencies, modes) of each mode, complex, at rad per frame."""
+    weights, omega = _weights(law, delay_frames), np.maximum(omega, _LOWEST)
     found = np.ones((omega.size, len(law.noll)), complex)
     for part in _parts(law):
         S = part.sensitivity(omega, weights)

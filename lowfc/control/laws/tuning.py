@@ -1,7 +1,7 @@
 """The best law for a log: integrator gains after Gendron and Lena, PI with notches, LQG, each with its margins.
 
-All start from pseudo-open-loop modes, pol = disturbance + white noise. A loop leaves error = S pol, and since a frame's
-noise is not in the command that it sees, the true residual has the variance of the error less the noise's.
+All start from pseudo-open-loop modes, pol = disturbance + white noise, and minimise what is left of the wavefront at
+every moment, which is more than the sensor sees: its exposures take a mean, and the star moves while the mirror holds.
 """
 
 from collections.abc import Sequence
@@ -13,8 +13,10 @@ from scipy.signal import periodogram
 
 from lowfc.arrays import Array
 from lowfc.control.laws import margins
+from lowfc.control.laws.continuous import Timing, held_left_nm2, spectrum_left
 from lowfc.control.laws.kalman import lqg_block
 from lowfc.control.laws.linear_law import Block, LinearLaw, integrator, integrator_block, of_blocks
+from lowfc.control.laws.margins import sensitivity
 from lowfc.control.laws.pi_notch import Notch, pi_notch
 from lowfc.control.laws.spectra import Pieces, Spectrum, floor_nm2_hz, spectrum
 from lowfc.control.laws.stability import (
@@ -23,7 +25,6 @@ from lowfc.control.laws.stability import (
     LOWEST_GAIN,
     delay_weights,
     highest_gain,
-    open_loop,
 )
 from lowfc.control.laws.vibration import FEWEST, Model, identify, resolution_hz
 from lowfc.control.laws.what_if import counterfactual, driven_by
@@ -55,20 +56,28 @@ class Tuned:
 
 @dataclass(frozen=True, slots=True)
 class Gains:
-    """Integrator gains (modes,): the best ones, what they leave (nm rms) and one frame's noise (nm rms)."""
+    """Integrator gains (modes,) and what they leave, nm rms.
+
+    Attributes:
+        gain: the best ones.
+        predicted_nm: left by them, at every moment.
+        sensed_nm: of the means over the exposures.
+        noise_nm: of one frame.
+    """
 
     gain: Array
     predicted_nm: Array
+    sensed_nm: Array
     noise_nm: Array
 
 
-def best_gains(run: Pieces, rate_hz: float, delay_frames: float, leak: Array) -> Gains:
-    """The gain of each mode at which an integrator leaves least of pseudo-open-loop modes (Gendron and Lena 1994).
+def best_gains(run: Pieces, rate_hz: float, timing: Timing, leak: Array) -> Gains:
+    """The gain of each mode at which an integrator leaves least of the wavefront (after Gendron and Lena 1994).
 
     Args:
-        run: (frames, modes) in pieces.
+        run: (frames, modes) of pseudo-open-loop modes, in pieces.
         rate_hz: Frame rate.
-        delay_frames: The true delay.
+        timing: The true one.
         leak: (modes,) of the integrators.
 
     Raises:
@@ -79,18 +88,25 @@ def best_gains(run: Pieces, rate_hz: float, delay_frames: float, leak: Array) ->
         longest = max((len(piece) for piece in run.values), default=0)
         raise ValueError(f"a law is tuned from at least {FEWEST} frames in a row, the longest run has {longest}")
     noise_nm2 = floor_nm2_hz(coarse) * rate_hz / 2
-    gains, left_nm2 = np.zeros(len(leak)), np.zeros(len(leak))
+    omega = 2 * np.pi * fine.frequency_hz[1:] / rate_hz  # an integrator without leak has no value at 0 Hz
+    gains, left_nm2, sensed_nm2 = np.zeros(len(leak)), np.zeros(len(leak)), np.zeros(len(leak))
     for mode, lost in enumerate(leak.tolist()):
-        power = fine.power_nm2_hz[1:, mode]  # an integrator without leak has no value at 0 Hz
+        measured = fine.power_nm2_hz[1:, mode : mode + 1] * rate_hz / 2
 
-        def error_nm2(gain: float, lost: float = lost, power: Array = power) -> float:
-            loop = open_loop(2 * np.pi * fine.frequency_hz[1:] / rate_hz, gain, lost, delay_frames)
-            return float(power @ np.abs(1 / (1 + loop)) ** 2) * fine.spacing_hz
+        def of(gain: float, lost: float = lost) -> LinearLaw:
+            return integrator([gain], [lost], (2,), timing.delay, rate_hz)  # or any other mode
 
-        bounds = (LOWEST_GAIN, highest_gain(delay_frames, lost))
-        found = minimize_scalar(error_nm2, bounds=bounds, method="bounded", options={"xatol": 1e-3})
-        gains[mode], left_nm2[mode] = found.x, found.fun - noise_nm2[mode]
-    return Gains(gains, np.sqrt(np.maximum(left_nm2, 0.0)), np.sqrt(noise_nm2))
+        def left(gain: float, measured: Array = measured, mode: int = mode, lost: float = lost) -> float:
+            power = spectrum_left(of(gain, lost), omega, measured, noise_nm2[mode : mode + 1], timing)
+            return float(power.sum()) * fine.spacing_hz * 2 / rate_hz
+
+        bounds = (LOWEST_GAIN, highest_gain(timing.delay, lost))
+        found = minimize_scalar(left, bounds=bounds, method="bounded", options={"xatol": 1e-3})
+        gains[mode], left_nm2[mode] = found.x, found.fun
+        error = np.abs(sensitivity(of(found.x), omega, timing.delay)) ** 2 * measured
+        sensed_nm2[mode] = error.sum() * fine.spacing_hz * 2 / rate_hz - noise_nm2[mode]
+    rms = (np.sqrt(np.maximum(each, 0.0)) for each in (left_nm2, sensed_nm2, noise_nm2))
+    return Gains(gains, *rms)
 
 
 def identified(run: Pieces, rate_hz: float) -> list[Model]:
@@ -108,14 +124,14 @@ def identified(run: Pieces, rate_hz: float) -> list[Model]:
     return found
 
 
-def tune_integrator(models: Sequence[Model], gains: Gains, noll: tuple[int, ...], leak: Array, delay: float) -> Tuned:
+def tune_integrator(models: Sequence[Model], gains: Gains, noll: tuple[int, ...], leak: Array, timing: Timing) -> Tuned:
     """The loop's own integrator with these gains."""
-    law = integrator(gains.gain, leak, noll, delay, models[0].rate_hz)
-    return _tuned(law, delay, predicted_nm(law, models, delay), ("integrator",) * len(noll), models)
+    law = integrator(gains.gain, leak, noll, timing.delay, models[0].rate_hz)
+    return _tuned(law, timing, ("integrator",) * len(noll), models)
 
 
 def tune_lqg(
-    run: Pieces, models: Sequence[Model], gains: Gains, noll: tuple[int, ...], leak: Array, delay: float
+    run: Pieces, models: Sequence[Model], gains: Gains, noll: tuple[int, ...], leak: Array, timing: Timing
 ) -> Tuned:
     """LQG for the modes for which it beats the best integrator on this very run, that integrator for the others.
 
@@ -125,51 +141,53 @@ def tune_lqg(
         ValueError: no filter, or an unstable law.
     """
     rate_hz, finest_hz = models[0].rate_hz, resolution_hz(run, models[0].rate_hz)
+    noise_nm2 = np.array([model.noise_nm2 for model in models])
 
     def law_of(blocks: Sequence[Block]) -> LinearLaw:
-        return of_blocks(blocks, "pol", "lqg", noll, delay, rate_hz)
+        return of_blocks(blocks, "pol", "lqg", noll, timing.delay, rate_hz)
+
+    def left(blocks: Sequence[Block]) -> Array:
+        return left_of(law_of(blocks), run, noise_nm2, timing)
 
     scaled = ([_scaled(model, factor, finest_hz) for model in models] for factor in (*_NARROWER, *_FASTER))
     tried = [models, *scaled]
-    robust = [[_within_margins(model, delay) for model in candidates] for candidates in tried]
-    steady = [integrator_block(g, lost, "pol", delay) for g, lost in zip(gains.gain, leak, strict=True)]
-    error_nm2 = np.nan_to_num([left_of(law_of(blocks), run, delay) for blocks in robust], nan=np.inf)
-    best = error_nm2.argmin(axis=0)
-    wins = error_nm2.min(axis=0) < left_of(law_of(steady), run, delay)
+    robust = [[_within_margins(model, timing) for model in candidates] for candidates in tried]
+    steady = [integrator_block(g, lost, "pol", timing.delay) for g, lost in zip(gains.gain, leak, strict=True)]
+    left_nm2 = np.nan_to_num([left(blocks) for blocks in robust], nan=np.inf)
+    best = left_nm2.argmin(axis=0)
+    wins = left_nm2.min(axis=0) < left(steady)
     modes = range(len(noll))
     chosen = [tried[best[mode]][mode] for mode in modes]
     law = law_of([robust[best[mode]][mode] if wins[mode] else steady[mode] for mode in modes])
-    kinds = ["lqg" if better else "integrator" for better in wins]
-    return _tuned(law, delay, predicted_nm(law, chosen, delay), kinds, chosen)
+    return _tuned(law, timing, ["lqg" if better else "integrator" for better in wins], chosen)
 
 
-def tune_pi_notch(models: Sequence[Model], gains: Gains, noll: tuple[int, ...], leak: Array, delay: float) -> Tuned:
+def tune_pi_notch(models: Sequence[Model], gains: Gains, noll: tuple[int, ...], leak: Array, timing: Timing) -> Tuned:
     """An integrator with a notch for each line that one makes smaller within the margins, the strongest line first."""
     rate_hz = models[0].rate_hz
-    found = [_notched(*mode, delay) for mode in zip(models, gains.gain.tolist(), leak.tolist(), strict=True)]
+    found = [_notched(*mode, timing) for mode in zip(models, gains.gain.tolist(), leak.tolist(), strict=True)]
     gain, notches = np.array([g for g, _ in found]), [of_mode for _, of_mode in found]
-    law = pi_notch(noll, gain, np.zeros(len(noll)), leak, notches, delay, rate_hz)
-    kinds = ["pi-notch" if of_mode else "integrator" for of_mode in notches]
-    return _tuned(law, delay, predicted_nm(law, models, delay), kinds, models)
+    law = pi_notch(noll, gain, np.zeros(len(noll)), leak, notches, timing.delay, rate_hz)
+    return _tuned(law, timing, ["pi-notch" if of_mode else "integrator" for of_mode in notches], models)
 
 
-def _notched(model: Model, gain: float, leak: float, delay: float) -> tuple[float, tuple[Notch, ...]]:
+def _notched(model: Model, gain: float, leak: float, timing: Timing) -> tuple[float, tuple[Notch, ...]]:
     """Gain and notches of one mode."""
 
     def made(notches: Sequence[Notch], g: float) -> LinearLaw:
-        return pi_notch((2,), np.array([g]), np.zeros(1), np.array([leak]), [notches], delay, model.rate_hz)
+        return pi_notch((2,), np.array([g]), np.zeros(1), np.array([leak]), [notches], timing.delay, model.rate_hz)
 
     tried: list[tuple[float, float, tuple[Notch, ...]]] = []
     for share in (1.0, 0.7, 0.5, 0.35):  # less gain leaves room for notches
         g, notches = share * gain, tuple[Notch, ...]()
-        least = float(predicted_nm(made(notches, g), [model], delay)[0])
+        least = float(predicted_nm(made(notches, g), [model], timing)[0])
         for line in sorted(model.lines, key=lambda line: -line.variance_nm2):
             width_hz = min(max(4 * line.width_hz, 0.2 * line.frequency_hz), 0.02 * model.rate_hz)
             for depth in (30.0, 10.0, 4.0):
                 more = (*notches, Notch(line.frequency_hz, width_hz, depth))
                 law = made(more, g)
-                left = float(predicted_nm(law, [model], delay)[0])
-                if left < least and _holds(margins.margins(law, delay)):
+                left = float(predicted_nm(law, [model], timing)[0])
+                if left < least and _holds(margins.margins(law, timing.delay)):
                     notches, least = more, left
                     break
         tried.append((least, g, notches))
@@ -177,38 +195,41 @@ def _notched(model: Model, gain: float, leak: float, delay: float) -> tuple[floa
     return g, notches
 
 
-def _tuned(law: LinearLaw, delay: float, predicted: Array, kinds: Sequence[str], models: Sequence[Model]) -> Tuned:
-    margins.check_stable(law, delay)
-    return Tuned(law, margins.margins(law, delay), predicted, tuple(kinds), tuple(models))
+def _tuned(law: LinearLaw, timing: Timing, kinds: Sequence[str], models: Sequence[Model]) -> Tuned:
+    margins.check_stable(law, timing.delay)
+    found = margins.margins(law, timing.delay)
+    return Tuned(law, found, predicted_nm(law, models, timing), tuple(kinds), tuple(models))
 
 
-def predicted_nm(law: LinearLaw, models: Sequence[Model], delay_frames: float) -> Array:
-    """Rms (modes,) of the true residual of modes with these models: |S|^2 of the disturbance and |T|^2 of the noise."""
+def predicted_nm(law: LinearLaw, models: Sequence[Model], timing: Timing) -> Array:
+    """Rms (modes,) over all time of the true residual of modes with these models."""
     found = np.zeros(len(models))
     for mode, model in enumerate(models):
         omega = _fine_frequencies(model)
-        hz = omega * model.rate_hz / (2 * np.pi)
-        S = margins.rejection(law, hz, delay_frames)[:, mode] ** 2
-        T = margins.noise_transfer(law, hz, delay_frames)[:, mode] ** 2
-        power = S * model.spectrum_nm2(omega) + T * model.noise_nm2
+        measured = model.spectrum_nm2(omega)[:, None] + model.noise_nm2
+        noise_nm2 = np.full(len(models), model.noise_nm2)
+        power = spectrum_left(law, omega, measured, noise_nm2, timing)[:, mode]
         found[mode] = np.trapezoid(power, omega) / np.pi
     return np.sqrt(found)
 
 
-def left_of(law: LinearLaw, run: Pieces, delay_frames: float) -> Array:
-    """Mean square (modes,) of the measured error that a law would have left of pseudo-open-loop modes (frames, modes).
+def left_of(law: LinearLaw, run: Pieces, noise_nm2: Array, timing: Timing) -> Array:
+    """Mean square (modes,) of what a law would have left of the means that its commands are to null.
 
-    Every piece begins with a law at rest and a flat mirror; the frames until it has settled do not count.
+    What changes within a period of a command, and no law takes out, is not in it. Every piece of the run, (frames,
+    modes) of pseudo-open-loop modes with noise (modes,), begins with a law at rest and a flat mirror; the frames until
+    it has settled do not count.
     """
-    weights = delay_weights(delay_frames).astype(np.float32)
+    weights = delay_weights(timing.delay).astype(np.float32)
     squares, frames = np.zeros(len(law.noll)), 0
     for piece in run.values:
         skipped = min(_SETTLING_FRAMES, len(piece) // 3)
         every = np.zeros(len(piece), np.int64)
-        errors = counterfactual(driven_by(law), weights, piece.astype(np.float32), every)[0][skipped:]
-        squares += np.sum(errors.astype(np.float64) ** 2, axis=0)
-        frames += len(errors)
-    return squares / max(frames, 1)
+        command_nm = counterfactual(driven_by(law), weights, piece.astype(np.float32), every)[1]
+        measured_nm, commanded_nm = piece[skipped:].astype(np.float64), command_nm[skipped:].astype(np.float64)
+        more, counted = held_left_nm2(law, measured_nm, commanded_nm, noise_nm2, timing)
+        squares, frames = squares + more, frames + counted
+    return np.asarray(squares / max(frames, 1))
 
 
 def _whole_spectrum(run: Pieces, rate_hz: float) -> Spectrum | None:
@@ -228,12 +249,12 @@ def _scaled(model: Model, factor: float, finest_hz: float) -> Model:
     return replace(model, lines=tuple(lines))
 
 
-def _within_margins(model: Model, delay_frames: float) -> Block:
+def _within_margins(model: Model, timing: Timing) -> Block:
     """The filter of a model, its noise taken for higher until the margins hold."""
     for factor in _QUIETER.tolist():
-        block = lqg_block(replace(model, noise_nm2=factor * model.noise_nm2), delay_frames)
-        law = of_blocks([block], "pol", "lqg", (2,), delay_frames, model.rate_hz)  # or any other mode
-        if _holds(margins.margins(law, delay_frames)):
+        block = lqg_block(replace(model, noise_nm2=factor * model.noise_nm2), timing)
+        law = of_blocks([block], "pol", "lqg", (2,), timing.delay, model.rate_hz)  # or any other mode
+        if _holds(margins.margins(law, timing.delay)):
             break
     return block
 

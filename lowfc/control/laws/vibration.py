@@ -83,6 +83,24 @@ class Model:
             seen += [1.0, 0.0]
         return block_diag(*blocks), block_diag(*parts), np.array(seen)
 
+    def mean_over(self, start: float, length: float) -> Array:
+        """Mean (states, states) of A^u over u in [start, start + length] frames: what the states will be meanwhile."""
+
+        def mean_of(turned: complex) -> complex:
+            if not length or not turned:
+                return complex(np.exp(turned * start))
+            return complex(np.exp(turned * start) * np.expm1(turned * length) / (turned * length))
+
+        blocks = [np.ones((1, 1))]
+        if np.isfinite(self.cutoff_hz):
+            kept = mean_of(-2 * np.pi * self.cutoff_hz / self.rate_hz).real
+            blocks = [np.array([[1.0, 0.0], [1 - kept, kept]])]
+        for line in self.lines:
+            omega, left, _ = _per_frame(line, self.rate_hz)
+            mean = mean_of(complex(np.log(left), omega))
+            blocks.append(np.array([[mean.real, -mean.imag], [mean.imag, mean.real]]))
+        return np.asarray(block_diag(*blocks))
+
 
 def identify(run: Pieces, rate_hz: float) -> Model | None:
     """The model of a mode, from its pseudo-open-loop values (frames, 1) in pieces; None where they are too few.

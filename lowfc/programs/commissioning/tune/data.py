@@ -12,7 +12,9 @@ from lowfc.adapters.logs.reader import LogReader
 from lowfc.arrays import Array, Mask, Single
 from lowfc.client import Client, configuration_of
 from lowfc.contract.codecs.law_codec import driving, gains_of
+from lowfc.contract.configuration import Configuration
 from lowfc.contract.errors import DataFileError
+from lowfc.control.laws.continuous import Timing
 from lowfc.control.laws.law import Law
 from lowfc.control.laws.linear_law import LinearLaw
 from lowfc.control.laws.spectra import Pieces, pieces
@@ -32,7 +34,7 @@ class Telemetry:
     Attributes:
         source: path of the log, or name of the run.
         noll: Noll index of each mode.
-        delay_frames: the true one, as far as it is known.
+        timing: the true one, as far as it is known.
         law: the integrator's gains; `driving` is the linear law in its place, where there was one.
         closed: whether the rows are of a closed loop.
         pol: (frames, modes) pseudo-open-loop, in pieces.
@@ -45,7 +47,7 @@ class Telemetry:
     source: str
     noll: tuple[int, ...]
     rate_hz: float
-    delay_frames: float
+    timing: Timing
     law: Law
     driving: LinearLaw | None
     closed: bool
@@ -85,7 +87,7 @@ def of_log(log: LogReader) -> Telemetry:
         str(log.path),
         run.calibration.noll,
         history.rate_hz,
-        run.delay_frames,
+        Timing.of(run.delay_frames, (config or Configuration()).camera.exposure_fraction),
         (run.law, driving(history.controller, history.published.laws)),
         replace(steps, pol_nm=pol_nm, mode=mode),
         usable,
@@ -124,7 +126,7 @@ def of_run(loop: Client, seconds: float, progress: Callable[[float], None] | Non
         loop.run_id,
         noll,
         1 / period_s if period_s > 0 else config.camera.rate_hz,
-        float(state.delay_frames),
+        Timing.of(float(state.delay_frames), config.camera.exposure_fraction),
         (gains_of(state), driving(state, loop.laws())),
         made,
         np.isfinite(made.pol_nm).all(axis=1) & (made.saturated_pixels == 0),
@@ -138,7 +140,7 @@ def _telemetry(
     source: str,
     noll: tuple[int, ...],
     rate_hz: float,
-    delay_frames: float,
+    timing: Timing,
     laws: tuple[Law, LinearLaw | None],
     steps: Steps,
     usable: Mask,
@@ -164,7 +166,7 @@ def _telemetry(
         source=source,
         noll=noll,
         rate_hz=rate_hz,
-        delay_frames=delay_frames,
+        timing=timing,
         law=laws[0],
         driving=laws[1],
         closed=closed,

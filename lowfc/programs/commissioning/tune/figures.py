@@ -6,6 +6,7 @@ import numpy as np
 
 from lowfc.arrays import Array
 from lowfc.control.laws import margins
+from lowfc.control.laws.continuous import spectrum_left
 from lowfc.control.laws.linear_law import LinearLaw, integrator
 from lowfc.control.laws.spectra import in_bins, spectrum
 from lowfc.control.laws.tuning import (
@@ -36,20 +37,20 @@ def tuned(run: Telemetry, controller: str) -> tuple[Tuned, Gains]:
         ValueError: there are too few frames, or no law of this kind is stable.
     """
     leak = run.law.leak.astype(np.float64)
-    gains = best_gains(run.pol, run.rate_hz, run.delay_frames, leak)
+    gains = best_gains(run.pol, run.rate_hz, run.timing, leak)
     models = identified(run.pol, run.rate_hz)
     match controller:
         case "integrator":
-            return tune_integrator(models, gains, run.noll, leak, run.delay_frames), gains
+            return tune_integrator(models, gains, run.noll, leak, run.timing), gains
         case "pi-notch":
-            return tune_pi_notch(models, gains, run.noll, leak, run.delay_frames), gains
+            return tune_pi_notch(models, gains, run.noll, leak, run.timing), gains
         case _:
-            return tune_lqg(run.pol, models, gains, run.noll, leak, run.delay_frames), gains
+            return tune_lqg(run.pol, models, gains, run.noll, leak, run.timing), gains
 
 
 def law_now(run: Telemetry) -> LinearLaw:
     """The law that the run ended with."""
-    return run.driving or integrator(run.law.gain, run.law.leak, run.noll, run.delay_frames, run.rate_hz)
+    return run.driving or integrator(run.law.gain, run.law.leak, run.noll, run.timing.delay, run.rate_hz)
 
 
 def figures(run: Telemetry, best: Tuned, gains: Gains, controller: str) -> dict[str, Any]:
@@ -57,8 +58,8 @@ def figures(run: Telemetry, best: Tuned, gains: Gains, controller: str) -> dict[
     now = law_now(run)
     achieved_nm = _achieved_nm(run, gains.noise_nm)
     leak = run.law.leak.astype(np.float64)
-    integrator_nm = tune_integrator(best.models, gains, run.noll, leak, run.delay_frames).predicted_nm
-    now_nm = predicted_nm(now, best.models, run.delay_frames) if margins.margins(now, run.delay_frames).stable else None
+    integrator_nm = tune_integrator(best.models, gains, run.noll, leak, run.timing).predicted_nm
+    now_nm = predicted_nm(now, best.models, run.timing) if margins.margins(now, run.timing.delay).stable else None
     modes: list[dict[str, Any]] = []
     for place, index in enumerate(run.noll):
         model = best.models[place]
@@ -92,7 +93,7 @@ def figures(run: Telemetry, best: Tuned, gains: Gains, controller: str) -> dict[
         "controller": controller,
         "law_now": now.name,
         "rate_hz": run.rate_hz,
-        "delay_frames": run.delay_frames,
+        "delay_frames": run.timing.delay,
         "closed": run.closed,
         "frames": run.pol.frames,
         "achieved_from": None if achieved_nm is None else ("truth" if run.true_nm is not None else "error less noise"),
@@ -153,9 +154,9 @@ def picture(run: Telemetry, best: Tuned) -> bytes:
         omega = 2 * np.pi * found.frequency_hz[1:] / run.rate_hz
         one_sided = 2 / run.rate_hz
         modelled = one_sided * (model.spectrum_nm2(omega) + model.noise_nm2)
-        S = margins.rejection(best.law, found.frequency_hz[1:], run.delay_frames)[:, place]
-        T = margins.noise_transfer(best.law, found.frequency_hz[1:], run.delay_frames)[:, place]
-        left = one_sided * (S**2 * model.spectrum_nm2(omega) + T**2 * model.noise_nm2)
+        noise_nm2 = np.array([one.noise_nm2 for one in best.models])
+        measured = np.repeat((model.spectrum_nm2(omega) + model.noise_nm2)[:, None], len(noise_nm2), axis=1)
+        left = one_sided * spectrum_left(best.law, omega, measured, noise_nm2, run.timing)[:, place]
         axes.loglog(found.frequency_hz[1:], found.power_nm2_hz[1:, place], color="0.6", label="pseudo-open-loop")
         closed = spectrum(run.error, run.rate_hz) if run.closed else None
         if closed is not None:

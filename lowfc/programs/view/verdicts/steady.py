@@ -8,6 +8,7 @@ import numpy as np
 from lowfc.adapters.logs.columns import frame_rate_hz
 from lowfc.arrays import Sequences, Single
 from lowfc.contract.messages import wire
+from lowfc.control.laws.continuous import Timing
 from lowfc.control.laws.spectra import pieces
 from lowfc.control.laws.stability import settling_frames
 from lowfc.control.laws.tuning import best_gains
@@ -73,11 +74,11 @@ class Steady:
 
 
 class Attained(NamedTuple):
-    """Rms over the circle of all modes of the last frames under one law, nm; the sensor's noise is subtracted.
+    """Rms over the circle of all modes of the last frames under one law, as the sensor sees it, nm, without its noise.
 
     Attributes:
         left_nm: what the loop leaves.
-        best_nm: what integrators with the best gains would leave, as `lowfc tune` predicts it.
+        best_nm: what integrators with the best gains would leave.
         noise_nm: the sensor's noise in one frame.
     """
 
@@ -103,22 +104,24 @@ class Attainable:
             self.found, self._computed_ns = None, snapshot.time_ns  # of another law
         if snapshot.time_ns - self._computed_ns >= PERIOD_NS:
             self._computed_ns = snapshot.time_ns
-            self.found = self._compute(frame_rate_hz(snapshot.camera, snapshot.steps))
+            self.found = self._compute(frame_rate_hz(snapshot.camera, snapshot.steps), snapshot.camera)
 
-    def _compute(self, rate_hz: float) -> Attained | None:
+    def _compute(self, rate_hz: float, camera: wire.CameraState | None) -> Attained | None:
         law = self._steady.law
         if law is None or self._steady.mode != LoopMode.CLOSED or not rate_hz:
             return None
         sequence, signals = self._steady.rows()
         modes = len(law.gain)
+        exposure = camera.exposure_ns / camera.period_ns if camera is not None and camera.period_ns else 0.0
         try:
-            best = best_gains(pieces(sequence, signals[:, modes:]), rate_hz, law.delay_frames, np.array(law.leak))
+            pol, timing = pieces(sequence, signals[:, modes:]), Timing.of(law.delay_frames, exposure)
+            best = best_gains(pol, rate_hz, timing, np.array(law.leak))
         except ValueError:
             return None  # too few frames in a row
         error_nm = signals[np.isfinite(signals).all(axis=1), :modes].astype(np.float64)
         noise_nm2 = float(np.sum(best.noise_nm**2))
         left_nm2 = max(float(np.mean(np.sum(error_nm**2, axis=1))) - noise_nm2, 0.0)
-        return Attained(left_nm2**0.5, float(np.linalg.norm(best.predicted_nm)), noise_nm2**0.5)
+        return Attained(left_nm2**0.5, float(np.linalg.norm(best.sensed_nm)), noise_nm2**0.5)
 
 
 def _law_of(state: wire.ControllerState | None, modes: int) -> LawInForce | None:

@@ -1,0 +1,133 @@
+"""What a loop leaves of the wavefront at every moment, not only at one instant of each frame.
+
+The star moves while the mirror holds. A wave e^(i w t) is measured as m e^(i w t_k), its mean over the exposure; the
+command made of it is in force from a to a + 1 periods after t_k, where the wave has the mean h e^(i w (t_k + a)). The
+sampled loop says what the command is; what is left has a floor, 1 - |h|^2, that no command takes out.
+
+Frequencies are in rad per frame, and may lie above pi: the sampled loop takes such a wave for its alias.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from lowfc.arrays import Array, Complex
+from lowfc.control.laws.linear_law import LinearLaw
+from lowfc.control.laws.margins import sensitivity
+from lowfc.control.laws.stability import delay_weights
+
+_FILTER_POINTS = 4096
+_FILTER_OMEGA = np.linspace(0, np.pi, _FILTER_POINTS // 2 + 1)
+_FILTER_REACH = 48
+"""Frames before and after by which a mean between measurements is told."""
+
+
+class Timing(NamedTuple):
+    """When a loop exposes and moves its mirror, in frame periods.
+
+    Attributes:
+        delay: from the frame a command is made from to the first exposed wholly under it.
+        applied: from the start of an exposure until the command made from it is in force.
+        exposure: its length; 0 for an instant.
+        held: for how long what a command leaves counts: a period, or 0 for the moment at which it is applied alone.
+    """
+
+    delay: float
+    applied: float
+    exposure: float
+    held: float = 1.0
+
+    @classmethod
+    def of(cls, delay: float, exposure: float) -> "Timing":
+        """A command is in force when the first exposure wholly under it begins."""
+        return cls(delay, delay, exposure)
+
+    @classmethod
+    def sampled(cls, delay: float) -> "Timing":
+        """Nothing counts but one instant of each frame: what a loop leaves between them is not in its figures."""
+        return cls(delay, delay, 0.0, 0.0)
+
+
+def mean_over(omega: Array, length: float) -> Complex:
+    """Mean (frequencies,) of e^(i w u) over u in [0, length]."""
+    turned = 1j * np.asarray(omega, float) * length
+    small = np.abs(turned) < 1e-9
+    return np.where(small, 1 + turned / 2, np.expm1(turned) / np.where(small, 1, turned))
+
+
+def hold_floor(omega: Array, held: float = 1.0) -> Array:
+    """Power (frequencies,) that is left of a wave of power 1 by the best command that is held."""
+    return np.asarray(1 - np.abs(mean_over(omega, held)) ** 2)
+
+
+def left_power(law: LinearLaw, omega: Array, timing: Timing) -> Array:
+    """Mean over time (frequencies, modes) of what the loop leaves of a wave of power 1."""
+    command = commanded(law, omega, timing.delay) * mean_over(omega, timing.exposure)[:, None]
+    return np.asarray(hold_floor(omega, timing.held)[:, None] + np.abs(_ahead(omega, timing)[:, None] + command) ** 2)
+
+
+def _ahead(omega: Array, timing: Timing) -> Complex:
+    """Mean (frequencies,) of a wave over the time for which a command counts, beside the wave at t_k."""
+    return np.asarray(mean_over(omega, timing.held) * np.exp(1j * timing.applied * omega))
+
+
+def spectrum_left(law: LinearLaw, omega: Array, measured: Array, noise_nm2: Array, timing: Timing) -> Array:
+    """Spectrum (frequencies, modes) of what a loop leaves, by the spectrum of what it measures.
+
+    Args:
+        law: of the loop.
+        omega: (frequencies,) rad per frame, up to pi.
+        measured: (frequencies, modes) of pseudo-open-loop modes with their noise.
+        noise_nm2: (modes,) variance of one frame's white noise.
+        timing: of the loop.
+    """
+    of_wave = left_power(law, omega, timing) / np.abs(mean_over(omega, timing.exposure))[:, None] ** 2
+    of_noise = np.abs(commanded(law, omega, timing.delay)) ** 2
+    return np.asarray((measured - noise_nm2) * of_wave + noise_nm2 * of_noise)
+
+
+def commanded(law: LinearLaw, omega: Array, delay: float) -> Complex:
+    """Command (frequencies, modes) made of a frame that measures e^(i w t_k), beside that wave at t_k."""
+    S = sensitivity(law, omega, delay)
+    seen = np.polynomial.polynomial.polyval(np.exp(-1j * omega), delay_weights(delay)) * np.exp(-1j * omega)
+    return np.asarray((S - 1) / seen[:, None])
+
+
+def ahead_of(measured_nm: Array, timing: Timing) -> tuple[Array, Array]:
+    """Mean of each mode over the period in which a command is in force, from what was measured before and after.
+
+    Args:
+        measured_nm: (frames, modes), exposure by exposure.
+        timing: of the loop.
+
+    Returns:
+        (frames, modes), NaN where there are too few neighbours; and the filter's answer (frequencies,) at
+        `_FILTER_OMEGA`, by which noise passes it.
+    """
+    answer = _ahead(_FILTER_OMEGA, timing) / mean_over(_FILTER_OMEGA, timing.exposure)
+    full = np.fft.irfft(answer, _FILTER_POINTS)
+    centre = round(timing.applied + (timing.held - timing.exposure) / 2)
+    lags = np.arange(-_FILTER_REACH, _FILTER_REACH + 1) + centre  # in frames ahead
+    taps = full[-lags % _FILTER_POINTS] * np.hanning(lags.size + 2)[1:-1]
+    taps /= taps.sum()
+    found = np.full(measured_nm.shape, np.nan)
+    rows = np.arange(max(0, -lags[0]), len(measured_nm) - max(0, lags[-1]))
+    if rows.size:
+        found[rows] = sum(tap * measured_nm[rows + lag] for tap, lag in zip(taps, lags, strict=True))
+    return found, np.asarray(np.exp(1j * np.outer(_FILTER_OMEGA, lags)) @ taps)
+
+
+def held_left_nm2(
+    law: LinearLaw, measured_nm: Array, command_nm: Array, noise_nm2: Array, timing: Timing
+) -> tuple[Array, int]:
+    """Sum of squares (modes,) of what commands left of the means that they were to null, and of how many frames.
+
+    The means are those of `ahead_of`; what the measurements' noise (modes,) does to the sum is taken off.
+    """
+    ahead_nm, answer = ahead_of(measured_nm, timing)
+    rows = np.isfinite(ahead_nm).all(axis=1)
+    own = commanded(law, np.maximum(_FILTER_OMEGA, 1e-6), timing.delay)
+    passed = np.abs(answer)[:, None] ** 2 + 2 * np.real(answer[:, None] * own.conj())
+    by_noise_nm2 = noise_nm2 * np.trapezoid(passed, _FILTER_OMEGA, axis=0) / np.pi
+    squares = np.sum((ahead_nm[rows] + command_nm[rows]) ** 2, axis=0)
+    return squares - rows.sum() * by_noise_nm2, int(rows.sum())
