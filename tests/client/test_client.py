@@ -272,7 +272,7 @@ def test_a_run_is_found_by_who_is_there(own_runtime: Path) -> None:
         for server in listening("left", "camera", "recorder"):
             held.enter_context(server)
         assert the_run(None) == the_run("left") == "left"
-        with pytest.raises(BusError, match=r"there is no run 'empty': there are left \(no controller yet\)$"):
+        with pytest.raises(BusError, match=r"there is no run 'empty': there is left \(no controller yet\)$"):
             the_run("empty")
         for server in listening("whole", "camera", "controller"):
             held.enter_context(server)

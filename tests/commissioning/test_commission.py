@@ -135,7 +135,7 @@ def test_it_goes_on_where_it_was_interrupted(tmp_path: Path) -> None:
     bench.loop.ask = lost  # type: ignore[method-assign]
     bench.loop.ask("release", lease_id=1)
     assert first_of(bench.out).exists()
-    assert "nobody has judged" in bench.shown
+    assert "without a verdict" in bench.shown
     assert "nobody has judged its calibration" in bench.loop.ask("close", lease_id=0).text
     bench.loop.ask("open", lease_id=0)
     bench.said.clear()

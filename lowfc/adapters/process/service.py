@@ -27,7 +27,7 @@ from lowfc.control.loop.wording import counted
 HEALTH_PERIOD_NS = 500_000_000
 WAITING_NS = 2_000_000_000
 """After it is ready a process that still waits for others says for whom."""
-WORK = {Role.CAMERA: "frame", Role.CONTROLLER: "frame", Role.MIRROR: "command"}
+WORK: dict[str, str] = {Role.CAMERA: "frame", Role.CONTROLLER: "frame", Role.MIRROR: "command"}
 """What the processes of the loop count; others have a summary of their own."""
 STATES = ("starting", "ready", "running", "stopping", "stopped")
 

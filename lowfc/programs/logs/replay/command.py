@@ -13,6 +13,7 @@ from lowfc.adapters.process.progress import reading_bar
 from lowfc.adapters.process.provenance import provenance
 from lowfc.adapters.process.terminal import Json, Logs
 from lowfc.contract.envelope import count_of
+from lowfc.control.loop.wording import counted
 from lowfc.programs.cli.output import put
 from lowfc.programs.logs.replay.account import Account
 
@@ -67,10 +68,10 @@ def render(figures: dict[str, Any]) -> str:
     for rule, count in figures["rules_changed"].items():
         lines.append(f"answered otherwise {count} since {figures['version']}: {rule}")
     for why, count in figures["unchecked_because"].items():
-        lines.append(f"not checked        {count} steps {why}")
-    for name, what in (("inputs_missing", "inputs of the controller"), ("commands_missing", "commands that it sent")):
+        lines.append(f"unchecked          {counted(count, 'step')} {why}")
+    for name, what in (("inputs_missing", "input"), ("commands_missing", "command")):
         if figures[name]:
-            lines.append(f"not in the log     {figures[name]} {what}")
+            lines.append(f"missing            the log lacks {counted(figures[name], what)} of the controller")
     lines += faults(figures["damaged"], finished=figures["complete"])
     lines += [f"recording stopped  {why}" for why in figures["stopped"]]
     if len(figures["runs"]) > 1:
