@@ -19,6 +19,7 @@ from lowfc.adapters.logs.reader import LogReader
 from lowfc.adapters.process.clock import HostClock
 from lowfc.client import Answer, Client, Frame, Stream, client, configuration_of, running, the_run
 from lowfc.client.requests import ASKED
+from lowfc.client.runs import nobody_yet
 from lowfc.client.stream import WAITING, frame_of, step_of
 from lowfc.contract.codecs import codec
 from lowfc.contract.codecs.calibration_codec import encode_calibration, identified
@@ -283,6 +284,17 @@ def test_a_run_is_found_by_who_is_there(own_runtime: Path) -> None:
             the_run(None)  # the other one may be starting
         with pytest.raises(DataFileError, match=r"links\.json"):
             the_run("damaged")
+
+
+def test_who_waits_for_a_run_that_nobody_is_in_is_told_the_others(own_runtime: Path) -> None:
+    assert nobody_yet("bnch").endswith("and one is waited for; no other loop of yours is running")
+    with contextlib.ExitStack() as held:
+        for server in listening("bench", "camera", "controller"):
+            held.enter_context(server)
+        assert nobody_yet("bench") == ""
+        open_run("bnch")  # as the recorder itself does
+        waits = "no process of run 'bnch' is on this host, and one is waited for; "
+        assert nobody_yet("bnch") == f"{waits}running: bench (did you mean 'bench'?)"
 
 
 def test_the_beginning_of_a_runs_name_is_enough(own_runtime: Path) -> None:

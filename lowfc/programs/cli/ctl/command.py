@@ -33,7 +33,16 @@ SIGNAL = (
 _SIGNED = {"ignore_unknown_options": True}
 """So that -5 is a value and no option."""
 
-Values = Annotated[list[float], typer.Argument(help="One value for all modes, or one for each.")]
+
+def number(word: str) -> float:
+    """A number as it was typed; one that is none is shown."""
+    try:
+        return float(word)
+    except ValueError:
+        raise typer.BadParameter(f"{word!r} is not a number: write 0.3, and several as 0.3 0.2") from None
+
+
+Values = Annotated[list[float], typer.Argument(help="One value for all modes, or one for each.", parser=number)]
 Zero = Annotated[bool, typer.Option(ZERO, help="Take it away.")]
 
 
@@ -110,7 +119,9 @@ def step(
 
 @ctl_app.command(context_settings=_SIGNED)
 def offset(
-    values: Annotated[list[float] | None, typer.Argument(help="One for all modes, or one for each; nm rms.")] = None,
+    values: Annotated[
+        list[float] | None, typer.Argument(help="One for all modes, or one for each; nm rms.", parser=number)
+    ] = None,
     modes: Modes = None,
     zero: Zero = False,
     run: AnyRun = None,

@@ -101,6 +101,7 @@ def export_log(
     from lowfc.adapters.files.whole_file import being_written
     from lowfc.adapters.logs.history import read_history
     from lowfc.adapters.logs.parts import WholeLog
+    from lowfc.adapters.logs.recovery import no_end
     from lowfc.adapters.process.progress import reading_bar
     from lowfc.programs.logs.guard import refuse_log
 
@@ -132,6 +133,7 @@ def export_log(
         "steps_left_out": history.left_out,
         "selection": reader.selection.sentence,
         "finished": reader.finished,
+        "no_end": no_end(reader.paths, finished=reader.finished),
         "damaged": [f"byte {one.position}, {one.why}" for one in reader.damage],
         "remarks": history.remarks,
     }
@@ -146,7 +148,7 @@ def render(figures: dict[str, Any]) -> str:
     lines += [f"{', '.join(figures['files'])}: {figures['steps']} steps of {figures['modes']} modes{frames}"]
     if figures["steps_left_out"]:
         lines.append(f"left out           {figures['steps_left_out']} steps with another calibration's modes")
-    lines += faults(figures["damaged"], finished=figures["finished"])
+    lines += faults(figures["damaged"], figures["no_end"])
     lines += [f"configuration      {remark}" for remark in figures["remarks"]]
     return "\n".join(lines)
 
