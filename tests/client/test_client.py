@@ -6,6 +6,7 @@ import socket
 import subprocess
 import sys
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -40,15 +41,16 @@ from lowfc.contract.messages import (
     image,
     wire,
 )
+from lowfc.control.calibration.calibration import FIRST
 from lowfc.control.laws.linear_law import integrator_block, of_blocks
 from lowfc.control.loop.inputs import Reply, Request, Step
 from lowfc.control.loop.requests import REQUESTS
 from lowfc.control.loop.safety import Limit, LoopMode
 from lowfc.programs.cli.ctl.command import SIMPLE, ctl_app
-from lowfc.programs.cli.ctl.status import figures, text
+from lowfc.programs.cli.ctl.status import figures, provisional, text
 from lowfc.programs.cli.modes import noll_of
 from lowfc.testing.memory_bus import MemoryBus, MemoryHub, MemoryRing
-from tests.support.loops import until
+from tests.support.loops import lowfc, until
 from tests.support.recording import Bench, bodies_of, put
 from tests.support.toy import NOLL, calibration
 
@@ -65,7 +67,8 @@ class FakeController:
         self.hub = MemoryHub()
         self.bus = MemoryBus(self.hub, "controller", HostClock())
         self.bus.queryable(REQUEST_KEY.format(name="*"), self._ask)
-        self.bus.publisher(CALIBRATION).put(encode_calibration(KNOWN, 0))
+        self.calibrations = self.bus.publisher(CALIBRATION)
+        self.calibrations.put(encode_calibration(KNOWN, 0))
         self.asked: list[Request] = []
         self.reply = Reply(True, "done", 77)
         self.silent = False
@@ -560,6 +563,13 @@ def test_modes_that_are_none_are_refused(word: str) -> None:
     assert "\n" not in str(caught.value)
 
 
+@pytest.mark.parametrize("words", [["gain", "0,3"], ["limit", "60", "0,3"], ["offset", "-5", "0,3"]])
+def test_a_number_that_is_none_is_shown(words: list[str]) -> None:
+    done = lowfc("ctl", *words)
+    assert done.exit_code == 2
+    assert "'0,3' is not a number: write 0.3" in done.output
+
+
 def test_the_status_says_everything() -> None:
     state = wire.ControllerState(
         mode=wire.LOOP_MODE_CLOSED,
@@ -601,6 +611,21 @@ def test_the_status_says_everything() -> None:
         assert words in text(state)
     assert figures(wire.ControllerState())["mode"] == "starting"
     assert "none" in text(wire.ControllerState())
+
+
+def test_the_status_says_of_a_first_calibration_that_it_has_no_verdict(
+    controller: FakeController, loop: Client
+) -> None:
+    first = identified(replace(KNOWN, estimator=f"{KNOWN.estimator}{FIRST}"))
+    assert not provisional(loop, KNOWN.id)
+    controller.calibrations.put(encode_calibration(first, 1))
+    assert provisional(loop, first.id)
+    assert not provisional(loop, KNOWN.id), "another one is in use by now"
+    state = wire.ControllerState(calibration_id=first.id)
+    line = text(state, first=True).splitlines()[-1]
+    assert line == f"calibration    {first.id[:12]}, the first of a commissioning: without a verdict"
+    assert figures(state, first=True)["calibration_provisional"]
+    assert "without a verdict" not in text(state)
 
 
 # The recorder's switch.

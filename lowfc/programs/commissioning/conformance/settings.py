@@ -146,9 +146,10 @@ class Agreement(NamedTuple):
 
 
 _WEIGHTS = "the weights of the pixels in R, the predicted noise"
+_RATES = "laws, margins, spectra, the duration of probe sequences"
 _SATURATED = "where a computed calibration takes a pixel for saturated"
 AGREEMENTS = (
-    Agreement("period_ns", "camera.rate_hz", "ms", 0.01, True, "laws, margins, spectra, lengths of probe sequences"),
+    Agreement("period_ns", "camera.rate_hz", "ms", 0.01, True, _RATES),
     Agreement("gain_e_per_dn", "camera.gain_e_per_dn", "e-/DN", 0.02, True, _WEIGHTS),
     Agreement("em_gain", "camera.em_gain", "", 0.02, True, _WEIGHTS),
     Agreement("read_noise_e", "camera.read_noise_e", "e-", 0.2, True, _WEIGHTS),
