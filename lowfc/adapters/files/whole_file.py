@@ -20,7 +20,7 @@ def being_written(path: Path, source: Path | None = None) -> Iterator[Path]:
         DataFileError: it cannot be written.
     """
     try:
-        most = 0o666 if source is None else source.stat().st_mode & 0o666
+        most = source.stat().st_mode & 0o666 if source is not None and source.exists() else 0o666
         part = path.with_name(f".{path.name}.{secrets.token_hex(4)}")
         descriptor = os.open(part, os.O_WRONLY | os.O_CREAT | os.O_EXCL, most)
         mode = stat.S_IMODE(os.fstat(descriptor).st_mode)
