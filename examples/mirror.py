@@ -29,20 +29,23 @@ def apply(actuators_nm: Single, nm_per_unit: float) -> Single:
     return (units * nm_per_unit).astype(np.float32)
 
 
-def good(payload: bytes, last_sequence: int, clear_id: int) -> tuple[wire.MirrorCommand, Single] | None:
-    """The command in `payload` and its actuators; None for one that must not be followed.
+def good(payload: bytes, last_sequence: int, clear_id: int) -> tuple[wire.MirrorCommand, Single]:
+    """The command in `payload` and its actuators; ValueError says why one must not be followed.
 
     `clear_id` is that of the last command with one: an operator's new `clear` begins the sequences anew.
     """
     try:
         told = wire.MirrorCommand.FromString(payload)
     except DecodeError:
-        return None
+        raise ValueError("no MirrorCommand") from None
     wanted_nm = actuators(told)  # None where the bytes are not rows x columns float32
-    if wanted_nm is None or wanted_nm.shape != GRID or not np.isfinite(wanted_nm).all():
-        return None
-    cleared = told.clear_id not in (0, clear_id)
-    return (told, wanted_nm) if cleared or told.frame_sequence >= last_sequence else None
+    if wanted_nm is None or wanted_nm.shape != GRID:
+        raise ValueError(f"{told.rows} x {told.columns} actuators in {len(told.actuators)} bytes, not {GRID}")
+    if not np.isfinite(wanted_nm).all():
+        raise ValueError("an actuator is not finite")
+    if told.clear_id in (0, clear_id) and told.frame_sequence < last_sequence:
+        raise ValueError(f"frame_sequence {told.frame_sequence} is below the last, {last_sequence}")
+    return told, wanted_nm
 
 
 def main(run: RunId = DEFAULT_RUN, config: ConfigFile = None) -> None:
@@ -60,8 +63,11 @@ def main(run: RunId = DEFAULT_RUN, config: ConfigFile = None) -> None:
     with closing(service.bus):
         while service.running:
             sample, now_ns = commands.take(0.01), service.clock.now_ns()
-            followed = good(sample.payload, state.frame_sequence, clear_id) if sample is not None else None
-            time_ns = now_ns
+            followed, time_ns = None, now_ns
+            try:
+                followed = good(sample.payload, state.frame_sequence, clear_id) if sample is not None else None
+            except ValueError as why:
+                service.event("COMMAND_REFUSED", reason=why)
             if followed is not None:
                 told, wanted_nm = followed
                 time_ns = told.timestamp.ToNanoseconds()
@@ -72,8 +78,6 @@ def main(run: RunId = DEFAULT_RUN, config: ConfigFile = None) -> None:
                 state.command_nm[:] = [] if hit else told.command_nm
                 state.limits_hit[:] = [one.value for one in hit]  # type: ignore[misc]  # numbered alike
                 service.work += 1
-            elif sample is not None:
-                service.event("COMMAND_REFUSED", reason="out of order, not finite, or for another grid")
             if state.status == wire.MIRROR_STATUS_FOLLOWING and now_ns - obeyed_ns > valid_ns:  # the dead-man
                 state.status = wire.MIRROR_STATUS_EXPIRED
                 service.event("COMMAND_EXPIRED", command_timeout_ms=valid_ns / 1e6, action="relaxing to flat")

@@ -216,9 +216,9 @@ class CameraProcess:
             self._latched = shape
             if state.frame_sequence > self._newest_state:
                 self._newest_state = state.frame_sequence
-                self._count_late(state.frame_sequence < self._last_frame)
                 sequence, put_ns = self._put_ns[state.frame_sequence % _REMEMBERED]
-                if sequence == state.frame_sequence:
+                if sequence == state.frame_sequence:  # else no controller made it of a frame: somebody tries the mirror
+                    self._count_late(state.frame_sequence < self._last_frame)
                     self._frame_to_mirror.add(sample.publish_time_ns - put_ns)
 
     def _count_late(self, late: bool) -> None:

@@ -2,7 +2,7 @@
 
 from lowfc.adapters.bus.other_loops import none_here
 from lowfc.adapters.bus.run import open_run, runtime_base
-from lowfc.contract.errors import BusError, DataFileError
+from lowfc.contract.errors import BusError, DataFileError, nearest
 from lowfc.contract.messages import Role
 
 
@@ -29,7 +29,16 @@ def the_run(name: str | None) -> str:
         raise BusError(f"choose a run with --run, the beginning of its name is enough: there are {_listed(runs)}")
     if found:
         raise BusError(f"{name!r} is the beginning of several runs: {', '.join(found)}")
-    raise BusError(f"there is no run {name!r}: there are {_listed(runs)}")
+    raise BusError(f"there is no run {name!r}: there {'is' if len(runs) == 1 else 'are'} {_listed(runs)}")
+
+
+def nobody_yet(name: str) -> str:
+    """Sentence for who waits for a run of which no process is on this host; empty where one is."""
+    runs = living()
+    if name in runs:
+        return ""
+    there = f"running: {_listed(runs)}{nearest(name, runs)}" if runs else "no other loop of yours is running"
+    return f"no process of run {name!r} is on this host, and one is waited for; {there}"
 
 
 def living(wanted: str | None = None) -> dict[str, set[str]]:

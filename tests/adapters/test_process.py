@@ -286,7 +286,7 @@ def test_the_advice_names_where_lowfc_came_from(
             return None if origin is None else json.dumps(origin)
 
     monkeypatch.setattr(metadata, "distribution", lambda _: Installed())
-    assert install_advice("plots") == expected
+    assert install_advice("plots") == f"{sys.executable} -m {expected}"
 
 
 def test_a_checkout_that_is_not_installed_has_an_advice_too(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -294,7 +294,7 @@ def test_a_checkout_that_is_not_installed_has_an_advice_too(monkeypatch: pytest.
         raise metadata.PackageNotFoundError(name)
 
     monkeypatch.setattr(metadata, "distribution", missing)
-    assert install_advice("plots") == "pip install -e '.[plots]' in its checkout"
+    assert install_advice("plots") == f"{sys.executable} -m pip install -e '.[plots]' in its checkout"
 
 
 @pytest.mark.parametrize(

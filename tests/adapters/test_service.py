@@ -292,3 +292,11 @@ def test_a_process_says_once_that_it_is_ready_and_once_for_whom_it_waits(
     shown = capsys.readouterr().err.splitlines()
     assert shown[:2] == ["camera: ready (run night)", "controller: ready (run night)"]
     assert shown[2:] == ["camera: waiting for recorder (run night)", "controller: waiting for a camera (run night)"]
+    camera.work = 1
+    controller.stop("SIGINT")
+    for process in (camera, controller, quiet):
+        process.finish()
+    assert capsys.readouterr().err.splitlines() == [
+        "camera: stopped after 1 frame: finished (run night)",
+        "controller: stopped after 0 frames: SIGINT (run night)",
+    ]

@@ -6,6 +6,7 @@ import socket
 import subprocess
 import sys
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -19,6 +20,7 @@ from lowfc.adapters.logs.reader import LogReader
 from lowfc.adapters.process.clock import HostClock
 from lowfc.client import Answer, Client, Frame, Stream, client, configuration_of, running, the_run
 from lowfc.client.requests import ASKED
+from lowfc.client.runs import nobody_yet
 from lowfc.client.stream import WAITING, frame_of, step_of
 from lowfc.contract.codecs import codec
 from lowfc.contract.codecs.calibration_codec import encode_calibration, identified
@@ -39,15 +41,16 @@ from lowfc.contract.messages import (
     image,
     wire,
 )
+from lowfc.control.calibration.calibration import FIRST
 from lowfc.control.laws.linear_law import integrator_block, of_blocks
 from lowfc.control.loop.inputs import Reply, Request, Step
 from lowfc.control.loop.requests import REQUESTS
 from lowfc.control.loop.safety import Limit, LoopMode
 from lowfc.programs.cli.ctl.command import SIMPLE, ctl_app
-from lowfc.programs.cli.ctl.status import figures, text
+from lowfc.programs.cli.ctl.status import figures, provisional, text
 from lowfc.programs.cli.modes import noll_of
 from lowfc.testing.memory_bus import MemoryBus, MemoryHub, MemoryRing
-from tests.support.loops import until
+from tests.support.loops import lowfc, until
 from tests.support.recording import Bench, bodies_of, put
 from tests.support.toy import NOLL, calibration
 
@@ -64,7 +67,8 @@ class FakeController:
         self.hub = MemoryHub()
         self.bus = MemoryBus(self.hub, "controller", HostClock())
         self.bus.queryable(REQUEST_KEY.format(name="*"), self._ask)
-        self.bus.publisher(CALIBRATION).put(encode_calibration(KNOWN, 0))
+        self.calibrations = self.bus.publisher(CALIBRATION)
+        self.calibrations.put(encode_calibration(KNOWN, 0))
         self.asked: list[Request] = []
         self.reply = Reply(True, "done", 77)
         self.silent = False
@@ -272,7 +276,7 @@ def test_a_run_is_found_by_who_is_there(own_runtime: Path) -> None:
         for server in listening("left", "camera", "recorder"):
             held.enter_context(server)
         assert the_run(None) == the_run("left") == "left"
-        with pytest.raises(BusError, match=r"there is no run 'empty': there are left \(no controller yet\)$"):
+        with pytest.raises(BusError, match=r"there is no run 'empty': there is left \(no controller yet\)$"):
             the_run("empty")
         for server in listening("whole", "camera", "controller"):
             held.enter_context(server)
@@ -283,6 +287,17 @@ def test_a_run_is_found_by_who_is_there(own_runtime: Path) -> None:
             the_run(None)  # the other one may be starting
         with pytest.raises(DataFileError, match=r"links\.json"):
             the_run("damaged")
+
+
+def test_who_waits_for_a_run_that_nobody_is_in_is_told_the_others(own_runtime: Path) -> None:
+    assert nobody_yet("bnch").endswith("and one is waited for; no other loop of yours is running")
+    with contextlib.ExitStack() as held:
+        for server in listening("bench", "camera", "controller"):
+            held.enter_context(server)
+        assert nobody_yet("bench") == ""
+        open_run("bnch")  # as the recorder itself does
+        waits = "no process of run 'bnch' is on this host, and one is waited for; "
+        assert nobody_yet("bnch") == f"{waits}running: bench (did you mean 'bench'?)"
 
 
 def test_the_beginning_of_a_runs_name_is_enough(own_runtime: Path) -> None:
@@ -548,6 +563,13 @@ def test_modes_that_are_none_are_refused(word: str) -> None:
     assert "\n" not in str(caught.value)
 
 
+@pytest.mark.parametrize("words", [["gain", "0,3"], ["limit", "60", "0,3"], ["offset", "-5", "0,3"]])
+def test_a_number_that_is_none_is_shown(words: list[str]) -> None:
+    done = lowfc("ctl", *words)
+    assert done.exit_code == 2
+    assert "'0,3' is not a number: write 0.3" in done.output
+
+
 def test_the_status_says_everything() -> None:
     state = wire.ControllerState(
         mode=wire.LOOP_MODE_CLOSED,
@@ -589,6 +611,21 @@ def test_the_status_says_everything() -> None:
         assert words in text(state)
     assert figures(wire.ControllerState())["mode"] == "starting"
     assert "none" in text(wire.ControllerState())
+
+
+def test_the_status_says_of_a_first_calibration_that_it_has_no_verdict(
+    controller: FakeController, loop: Client
+) -> None:
+    first = identified(replace(KNOWN, estimator=f"{KNOWN.estimator}{FIRST}"))
+    assert not provisional(loop, KNOWN.id)
+    controller.calibrations.put(encode_calibration(first, 1))
+    assert provisional(loop, first.id)
+    assert not provisional(loop, KNOWN.id), "another one is in use by now"
+    state = wire.ControllerState(calibration_id=first.id)
+    line = text(state, first=True).splitlines()[-1]
+    assert line == f"calibration    {first.id[:12]}, the first of a commissioning: without a verdict"
+    assert figures(state, first=True)["calibration_provisional"]
+    assert "without a verdict" not in text(state)
 
 
 # The recorder's switch.

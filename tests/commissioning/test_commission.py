@@ -11,13 +11,14 @@ import pytest
 from lowfc.adapters.files import calibration_file
 from lowfc.adapters.files.factory import camera_state
 from lowfc.contract.configuration import Camera, Configuration, Control
-from lowfc.contract.errors import CalibrationError, RequestRefusedError
+from lowfc.contract.errors import BusError, CalibrationError, DataFileError, RequestRefusedError
 from lowfc.contract.messages import wire
 from lowfc.programs.commissioning.calibrate.run import partial_of
 from lowfc.programs.commissioning.checks import Status
 from lowfc.programs.commissioning.commission.commissioning import Commission, Commissioning, first_of
 from lowfc.programs.commissioning.conformance.settings import AGREEMENTS, agreement_checks
 from tests.support.folded_loop import FoldedLoop, computed
+from tests.support.loops import lowfc
 
 TOML = """
 [star]
@@ -135,7 +136,7 @@ def test_it_goes_on_where_it_was_interrupted(tmp_path: Path) -> None:
     bench.loop.ask = lost  # type: ignore[method-assign]
     bench.loop.ask("release", lease_id=1)
     assert first_of(bench.out).exists()
-    assert "nobody has judged" in bench.shown
+    assert "without a verdict" in bench.shown
     assert "nobody has judged its calibration" in bench.loop.ask("close", lease_id=0).text
     bench.loop.ask("open", lease_id=0)
     bench.said.clear()
@@ -237,6 +238,27 @@ def test_a_value_that_differs_is_found(one: object) -> None:
     field, needed = one.field, one.needed  # type: ignore[attr-defined]
     found = faults(Configuration(), changed(**{field: getattr(changed(), field) * 2}))
     assert found[field] is (Status.WRONG if needed else Status.WARNING)
+
+
+def test_what_is_compared_has_its_unit() -> None:
+    config = Configuration(camera=Camera(rate_hz=100.0, bit_depth=14))
+    checks = agreement_checks(config, changed())
+    shown = {check.name.split(" ")[0]: (check.got, check.expected) for check in checks}
+    assert shown["period_ns"] == ("4 ms", "10 ms, as configured")
+    assert shown["bit_depth"] == ("16 bits", "14 bits, as configured")
+    assert shown["em_gain"] == ("1", "1")
+
+
+def test_a_calibration_that_is_there_is_not_replaced_unasked(own_runtime: Path) -> None:
+    out = own_runtime / "calibration.fits"
+    out.write_text("mine")
+    done = lowfc("commission", "--no-dark", "--out", out)
+    assert isinstance(done.exception, DataFileError)
+    assert "exists already" in str(done.exception)
+    for way in ("--force", "--resume"):
+        done = lowfc("commission", "--no-dark", "--out", out, way)
+        assert isinstance(done.exception, BusError), "it goes on to the loop, of which there is none"
+    assert out.read_text() == "mine"
 
 
 def test_a_camera_of_100_hz_and_14_bits_on_the_default_configuration() -> None:

@@ -97,6 +97,11 @@ def test_an_unknown_key_is_refused_with_the_nearest_known_one(
         ("camera.exposure_fraction", 1.5),
         ("camera.bit_depth", 17),
         ("camera.bit_depth", 12.5),
+        ("camera.bit_depth", "14"),
+        ("camera.bit_depth", 14.0),
+        ("camera.rate_hz", "250"),
+        ("camera.noise", 1),
+        ("seed", True),
         ("control.leak", 1.1),
         ("control.gain", -0.1),
         ("control.estimator", "best"),
@@ -167,6 +172,12 @@ def test_values_that_do_not_go_together_are_refused(overrides: dict[str, Any], w
     said = complaint(None, overrides)
     assert all(word in said for word in words), said
     assert "\n" not in said
+
+
+def test_an_integer_will_do_for_a_float() -> None:
+    config = load(None, {"camera.rate_hz": 500, "mirror.stuck_nm": {"3": 25}})
+    assert (config.camera.rate_hz, config.mirror.stuck_nm["3"]) == (500.0, 25.0)
+    assert isinstance(config.camera.rate_hz, float)
 
 
 def test_the_stroke_may_be_all_that_the_mirror_has() -> None:

@@ -55,6 +55,24 @@ def test_the_time_not_closed_and_its_cause_add_up() -> None:
     assert (total_ns, "bias_dn is 400" in cause) == (3 * SECOND, True)
 
 
+def test_every_cause_of_a_loop_that_was_not_closed_is_named() -> None:
+    account, state = NotClosed(), loaded(USUAL)
+    for one in (CAMERA, frame(1)):
+        state, _ = advance(USUAL, state, one)
+    account.note(state, 0)
+    for number, name in enumerate(("open", "close", "pause", "close", "open", "close"), 1):
+        state, _ = advance(USUAL, state, Request(number * SECOND, name))
+        account.note(state, number * SECOND)
+        cause = account.note(state, number * SECOND + 1)[1]
+    assert cause == "operator asked to open (2 times); operator asked to pause (1 time)"
+    for number in range(50):
+        conditions = state.conditions._replace(mode_cause=f"cause {number}")
+        account.note(state._replace(mode=LoopMode.OPEN, conditions=conditions), (10 + number) * SECOND)
+    cause = account.note(state, 100 * SECOND)[1]
+    assert cause.startswith("operator asked to open (2 times); operator asked to pause (1 time); cause 0 (1 time); ")
+    assert cause.endswith("; other causes (48 times)")
+
+
 def test_the_summary_and_the_status_say_it() -> None:
     def first(**health: Any) -> str:
         watch = Watch({"controller": wire.Health(**health)}, [])

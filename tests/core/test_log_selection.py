@@ -212,7 +212,12 @@ def test_an_export_joins_what_is_there(small: Path, tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(
     "words",
-    [["--to", "csv", "--decimate", "3"], [], ["--decimate", "3", "--frames"], ["--to", "csv", "--topics", FRAME.key]],
+    [
+        ["--to", "csv", "--decimate", "3"],
+        ["--topics", FRAME.key],
+        ["--decimate", "3", "--frames"],
+        ["--to", "csv", "--topics", FRAME.key],
+    ],
 )
 def test_an_export_is_one_thing(whole: Path, words: list[str]) -> None:
     done = lowfc("export", whole, *words)

@@ -4,6 +4,7 @@ import resource
 import signal
 import subprocess
 import sys
+import threading
 import time
 from collections import Counter
 from collections.abc import Iterator
@@ -37,7 +38,7 @@ from lowfc.contract.messages import (
     wire,
 )
 from lowfc.programs.core.recording.recorder import Recorder
-from lowfc.testing.memory_bus import MemoryBus
+from lowfc.testing.memory_bus import MemoryBus, MemoryHub
 from tests.support.loops import until
 from tests.support.recording import PATIENCE_S, Bench, bodies_of, logged, put
 
@@ -82,6 +83,21 @@ def test_everything_is_recorded_verbatim(bench: Bench) -> None:
         files=[str(path)],
         folder=str(Path.cwd()),
     )
+
+
+@pytest.mark.parametrize("there", [False, True])
+def test_a_log_of_a_run_in_which_nobody_was_is_not_kept(tmp_path: Path, there: bool) -> None:
+    hub, clock = MemoryHub(), HostClock()
+    recorder = Recorder(MemoryBus(hub, "recorder", clock), clock, "bnch", tmp_path / "logs", metadata={})
+    thread = threading.Thread(target=recorder.run, daemon=True)
+    thread.start()
+    until(lambda: list((tmp_path / "logs").glob("*.part")))
+    if there:  # a camera without Health, which comes after the recorder
+        MemoryBus(hub, "camera", clock).publisher(FRAME).put(b"a frame")
+    recorder.service.stop("told")
+    thread.join(PATIENCE_S)
+    assert len(list((tmp_path / "logs").iterdir())) == there
+    assert len(recorder.service.health().recording.files) == there
 
 
 def test_what_came_before_the_recorder_comes_first_and_once(bench: Bench) -> None:

@@ -120,7 +120,7 @@ LOGS = (
     "lowfc publish last --speed 2",
     "lowfc recover last",
     "lowfc report last",
-    "lowfc export last --to fits",
+    "lowfc export last",
     "lowfc export last --decimate 10",
     "lowfc info last --digest",
 )

@@ -105,7 +105,7 @@ def test_a_port_in_use(tmp_path: Path) -> None:
 def test_nobody_is_there(tmp_path: Path) -> None:
     _refused(tmp_path, "ctl", "status", expected="lowfc was searched")
     _refused(tmp_path, "ctl", "status", "--run", "none-such", expected="there is no run 'none-such': no loop of user")
-    _refused(tmp_path, "ctl", "gain", "often", expected="valid number")
+    _refused(tmp_path, "ctl", "gain", "often", expected="'often' is not a number")
     _refused(tmp_path, "config", "check", "none.toml", expected="none.toml")
     _refused(tmp_path, "sim-lop", expected="sim-lop")
 

@@ -253,6 +253,18 @@ def test_mistakes(log: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) ->
         export_log(log, Format.AOT, console=QUIET)
 
 
+def test_without_a_format_fits_is_written_beside_the_log_for_nobody_who_may_not_read_that(tmp_path: Path) -> None:
+    log = NIGHT.write(tmp_path / "night.mcap")
+    log.chmod(0o600)
+    done = lowfc("export", log)
+    assert done.exit_code == 0, done.output
+    out = tmp_path / "night.fits"
+    assert done.output.startswith(f"{out}: {STEPS} steps")
+    assert out.stat().st_mode & 0o777 == 0o600
+    with pytest.raises(DataFileError, match="--force"):
+        raise lowfc("export", log).exception or AssertionError
+
+
 def test_nothing_is_replaced_unless_forced(log: Path, tmp_path: Path) -> None:
     out = tmp_path / "out.csv"
     out.write_text("mine")

@@ -8,9 +8,10 @@ from click.testing import Result
 from typer.testing import CliRunner
 
 from lowfc.adapters.bus.bus import Sample
-from lowfc.adapters.logs.recovery import recover
+from lowfc.adapters.logs.recovery import no_end, recover, recovered_path
 from lowfc.adapters.logs.writer import Attachment, LogWriter
 from lowfc.contract.envelope import sequence_of
+from lowfc.contract.errors import DataFileError
 from lowfc.contract.events import EVENTS
 from lowfc.contract.messages import CALIBRATION, CONTROLLER_STATE, EVENT, FRAME, HEALTH, STEP, Message, wire
 from lowfc.programs.cli.main import app
@@ -144,6 +145,21 @@ def test_an_unfinished_and_a_damaged_log_say_so(log: Path) -> None:
     assert "the checksum of an attachment is wrong" in said.stdout
     found = json.loads(lowfc(log, "--json").stdout)
     assert (found["state"], len(found["damage"]), found["attachments"]) == ("damaged", 1, {})
+
+
+def test_a_log_that_is_being_recorded_says_so_and_is_not_recovered(tmp_path: Path) -> None:
+    log = LogWriter(tmp_path / "20270101T000000Z.mcap", START_NS, {"lowfc": {"run": "night"}})
+    said = lowfc(log.part)
+    assert "being recorded; `lowfc ctl record stop` finishes it" in said.stdout
+    assert json.loads(lowfc(log.part, "--json").stdout)["state"] == "recording"
+    assert "it is being recorded" in no_end([log.part], finished=False)
+    with pytest.raises(DataFileError, match="is being recorded, and nothing is lost: `lowfc ctl record stop`"):
+        recover(log.part, recovered_path(log.part))
+    assert list(tmp_path.iterdir()) == [log.part]
+    log.abandon()  # as when it is killed
+    assert json.loads(lowfc(log.part, "--json").stdout)["state"] == "truncated"
+    assert "it was cut off" in no_end([log.part], finished=False)
+    assert recover(log.part, recovered_path(log.part)).recovered == recovered_path(log.part)
 
 
 def test_an_empty_log_is_a_log(tmp_path: Path) -> None:

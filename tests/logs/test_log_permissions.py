@@ -7,6 +7,7 @@ from typing import Any
 
 import pytest
 
+from lowfc.adapters.files.whole_file import write_whole
 from lowfc.adapters.logs.recovery import recover
 from lowfc.adapters.logs.series import Limits, LogSeries
 from lowfc.adapters.logs.writer import LogWriter
@@ -51,6 +52,15 @@ def test_what_is_recovered_has_the_mode_of_its_source(tmp_path: Path) -> None:
         out = tmp_path / f"{mode:o}.mcap"
         recover(source, out)
         assert mode_of(out) == mode
+
+
+def test_what_is_written_has_what_the_umask_leaves_and_at_most_its_source_s_mode(tmp_path: Path, umask: int) -> None:
+    source = small_log(tmp_path / "night.mcap", finished=True)
+    source.chmod(0o640)
+    write_whole(tmp_path / "plot.png", b"")
+    write_whole(tmp_path / "night.html", b"", source)
+    assert mode_of(tmp_path / "plot.png") == 0o666 & ~umask
+    assert mode_of(tmp_path / "night.html") == 0o640 & ~umask
 
 
 def test_the_recorder_is_given_the_key(own_runtime: Path, monkeypatch: pytest.MonkeyPatch) -> None:

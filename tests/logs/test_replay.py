@@ -243,7 +243,7 @@ def test_a_log_that_begins_in_the_middle_is_replayed_from_its_first_state() -> N
     cut += made.messages[len(made.messages) // 2 :]
     account = replay(cut)
     assert account.identical
-    assert 0 < account.unchecked["before the first complete state"] <= STATE_EVERY
+    assert 0 < account.unchecked["recorded before the first complete state of the controller"] <= STATE_EVERY
     assert account.frames + sum(account.unchecked.values()) == sum(message.key == STEP.key for message in cut)
 
 

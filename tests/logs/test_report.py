@@ -13,7 +13,7 @@ import pytest
 
 from lowfc.adapters.logs.recovery import recover
 from lowfc.adapters.logs.writer import LogWriter
-from lowfc.contract.errors import DataFileError
+from lowfc.contract.errors import ConfigurationError, DataFileError
 from lowfc.contract.messages import CONTROLLER_STATE, EVENT, FRAME, REQUEST, Log, wire
 from lowfc.control.laws.error_budget import sensor_noise
 from lowfc.optics.detector.photometry import tilt_nm_per_mas
@@ -377,6 +377,17 @@ def test_text_of_a_log_is_no_markup(tmp_path: Path, monkeypatch: pytest.MonkeyPa
     for name in ("host", "kernel", "processor", "lowfc"):
         assert f"{name} &lt;script&gt;" in text
     assert text.count("3 $x^2$") == 2, "in the drawing and in the table"
+
+
+@pytest.mark.parametrize("module", ["jinja2", "matplotlib.figure"])
+def test_what_a_page_needs_is_missed_before_the_log_is_read(
+    good: Path, monkeypatch: pytest.MonkeyPatch, module: str
+) -> None:
+    monkeypatch.setitem(sys.modules, module, None)
+    monkeypatch.setattr("lowfc.programs.logs.report.source.read_run", lambda *_: pytest.fail("the log was read"))
+    done = lowfc("report", good)
+    assert isinstance(done.exception, ConfigurationError)
+    assert re.search(r"-m pip install .*\[plots\]'", str(done.exception))
 
 
 def test_a_figure_that_is_no_number_is_none(tmp_path: Path) -> None:

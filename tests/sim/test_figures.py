@@ -83,17 +83,24 @@ def test_the_camera_reports_the_habit_each_time() -> None:
     camera = CameraProcess(config, service, cast("Bench", SimpleNamespace(shape=(80, 80))), None)
     states = MemoryBus(hub, "mirror-dm", clock).publisher(MIRROR_STATE, config.mirror.name)
     shape = np.zeros((config.mirror.rows, config.mirror.columns), np.float32)
-    sequence = 0
+
+    def put(sequence: int) -> None:
+        state = wire.MirrorState(frame_sequence=sequence, rows=shape.shape[0], columns=shape.shape[1])
+        state.actuators = shape.tobytes()
+        states.put(state.SerializeToString())
+        camera._drain()
+
+    camera._last_frame = 1 << 32
+    for sequence in range(1, 2 * WINDOW):
+        put(sequence)  # as conformance commands a mirror, where there is no controller
+    assert (camera._lateness.total, events[1:]) == (0, [])
+    camera._newest_state = sequence = 0
     for late in (False, True, False, True):
         for _ in range(2 * WINDOW):
             sequence += 1
             camera._last_frame = sequence + late
-            states.put(
-                wire.MirrorState(
-                    frame_sequence=sequence, rows=shape.shape[0], columns=shape.shape[1], actuators=shape.tobytes()
-                ).SerializeToString()
-            )
-            camera._drain()
+            camera._put_ns[sequence % len(camera._put_ns)] = sequence, 0
+            put(sequence)
     said = [event.split()[0] for event in events if event.startswith("COMMANDS_")]
     assert said == ["COMMANDS_LATE", "COMMANDS_IN_TIME", "COMMANDS_LATE"]
     assert camera._lateness.total == 4 * WINDOW

@@ -1,7 +1,9 @@
 """Files that are whole or not there."""
 
 import contextlib
-import tempfile
+import os
+import secrets
+import stat
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -9,18 +11,23 @@ from lowfc.contract.errors import DataFileError
 
 
 @contextlib.contextmanager
-def being_written(path: Path) -> Iterator[Path]:
+def being_written(path: Path, source: Path | None = None) -> Iterator[Path]:
     """A file to write that gets the name `path` when all went well, and is gone when not.
+
+    Its permissions are those that the umask leaves, and no more than those of `source`, which it is made from.
 
     Raises:
         DataFileError: it cannot be written.
     """
     try:
-        with tempfile.NamedTemporaryFile(dir=path.parent, prefix=f".{path.name}.", delete=False) as stream:
-            part = Path(stream.name)
+        most = source.stat().st_mode & 0o666 if source is not None and source.exists() else 0o666
+        part = path.with_name(f".{path.name}.{secrets.token_hex(4)}")
+        descriptor = os.open(part, os.O_WRONLY | os.O_CREAT | os.O_EXCL, most)
+        mode = stat.S_IMODE(os.fstat(descriptor).st_mode)
+        os.close(descriptor)
         try:
             yield part
-            part.chmod(0o644)
+            part.chmod(mode)  # who writes it may have replaced it
             part.replace(path)
         finally:
             part.unlink(missing_ok=True)
@@ -28,13 +35,13 @@ def being_written(path: Path) -> Iterator[Path]:
         raise DataFileError(f"{path} cannot be written: {error.strerror or error}") from error
 
 
-def write_whole(path: Path, content: bytes) -> None:
-    """Write beside, then rename: neither a reader nor a second writer ever sees half a file.
+def write_whole(path: Path, content: bytes, source: Path | None = None) -> None:
+    """Write beside, then rename: neither a reader nor a second writer ever sees half a file; see `being_written`.
 
     Raises:
         DataFileError: The file cannot be written.
     """
-    with being_written(path) as part:
+    with being_written(path, source) as part:
         part.write_bytes(content)
 
 

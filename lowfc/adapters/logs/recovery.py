@@ -9,7 +9,7 @@ from typing import Any
 from lowfc.adapters.logs.log_copy import LogCopy, new_log
 from lowfc.adapters.logs.reader import LogReader
 from lowfc.adapters.logs.records import Damage
-from lowfc.adapters.logs.writer import UNFINISHED
+from lowfc.adapters.logs.writer import UNFINISHED, being_recorded
 from lowfc.contract.errors import DataFileError
 
 RECOVERY = "recovery"
@@ -75,8 +75,10 @@ def recover(source: Path, out: Path, progress: Callable[[int, int], None] | None
         progress: is told how many bytes of how many are done.
 
     Raises:
-        DataFileError: `source` is no log, `out` is there already, or the disk refuses.
+        DataFileError: `source` is no log or is being recorded, `out` is there already, or the disk refuses.
     """
+    if being_recorded(source):
+        raise DataFileError(f"{source} is being recorded, and nothing is lost: `lowfc ctl record stop` finishes it")
     if out.exists():
         raise DataFileError(f"{out} exists already; a log is never overwritten; name another one with --out")
     reader = LogReader(source, topics=(), skip_damaged=True)
@@ -117,7 +119,16 @@ def in_words(damage: Damage) -> str:
     return f"{place}; {(damage.before_ns - damage.after_ns) / 1e9:.3f} s between the messages around it"
 
 
-def faults(damaged: Sequence[str], *, finished: bool) -> list[str]:
+def no_end(paths: Sequence[Path], *, finished: bool) -> str:
+    """Sentence for a person on files without an end; empty for those that are `finished`."""
+    if finished:
+        return ""
+    if any(map(being_recorded, paths)):
+        return "the log has no end: it is being recorded, and `lowfc ctl record stop` finishes it"
+    return "the log has no end: it was cut off, as when its recorder is killed"
+
+
+def faults(damaged: Sequence[str], no_end: str) -> list[str]:
     """Lines for a person on what is not as it should be in a log that was read."""
-    lines = [] if finished else ["truncated          the log has no end: its recorder was killed, or is still writing"]
+    lines = [f"truncated          {no_end}"] if no_end else []
     return lines + [f"damaged            left out: {part}" for part in damaged]

@@ -155,6 +155,20 @@ class LogSeries:
         if wait:
             self._finished()
 
+    def remove(self) -> None:
+        """Remove the finished logs, in which there is nothing.
+
+        Raises:
+            DataFileError: the disk refuses.
+        """
+        while self.files:
+            try:
+                self.files[-1].unlink(missing_ok=True)
+            except OSError as fault:
+                raise DataFileError(f"{self.files[-1]} is empty and cannot be removed: {fault.strerror}") from fault
+            self.files.pop()
+        self._messages = self._bytes = 0
+
     def give_up(self) -> None:
         """Leave the log as it was when it was flushed last."""
         if self._log is not None:

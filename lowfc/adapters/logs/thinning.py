@@ -9,7 +9,7 @@ from mcap.records import Attachment, Metadata
 from lowfc.adapters.logs.log_copy import LogCopy, new_log
 from lowfc.adapters.logs.parts import Parts, Repeated, metadata_at_start
 from lowfc.adapters.logs.reader import Logged, LogReader
-from lowfc.adapters.logs.recovery import RECOVERY, account, faults, in_words
+from lowfc.adapters.logs.recovery import RECOVERY, account, faults, in_words, no_end
 from lowfc.adapters.logs.selection import SELECTION, Selection
 from lowfc.adapters.logs.writer import PART, UNFINISHED
 from lowfc.contract.messages import topic_of
@@ -23,7 +23,7 @@ class Thinned:
         file: the copy.
         selection: what it has, in words.
         messages, bytes: of the copy; of the log `messages_before` and `bytes_before`.
-        finished: the log had been finished.
+        finished: the log had been finished; `no_end` says why not.
         damaged: what of the log could not be read, a sentence each.
     """
 
@@ -34,6 +34,7 @@ class Thinned:
     messages_before: int
     bytes_before: int
     finished: bool
+    no_end: str
     damaged: list[str]
 
     def __str__(self) -> str:
@@ -42,7 +43,7 @@ class Thinned:
             f"{self.file}: {self.messages} of {self.messages_before} messages, "
             f"{self.bytes / 1e6:.1f} of {self.bytes_before / 1e6:.1f} MB; {self.selection or 'nothing was left out'}"
         ]
-        return "\n".join([*lines, *faults(self.damaged, finished=self.finished)])
+        return "\n".join([*lines, *faults(self.damaged, self.no_end)])
 
 
 def thinned_path(source: Path, asked: Selection) -> Path:
@@ -79,6 +80,7 @@ def thin(log: Parts, out: Path, asked: Selection, progress: Callable[[int, int],
             if not reader.complete or reader.damage or reader.unreadable:
                 copy.note(RECOVERY, account(reader, copy.messages))
         copy.finish()
+    finished = all(reader.finished for reader in readers)
     return Thinned(
         str(out),
         made.sentence,
@@ -86,7 +88,8 @@ def thin(log: Parts, out: Path, asked: Selection, progress: Callable[[int, int],
         out.stat().st_size,
         messages,
         sum(reader.size for reader in readers),
-        all(reader.finished for reader in readers),
+        finished,
+        no_end(log, finished=finished),
         [f"{reader.path.name}, {in_words(one)}" for reader in readers for one in reader.damage],
     )
 

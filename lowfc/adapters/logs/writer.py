@@ -9,6 +9,7 @@ only a finished log, when it has its name, is known to be on the disk itself.
 """
 
 import contextlib
+import fcntl
 import itertools
 import os
 import time
@@ -60,6 +61,8 @@ class _File(FileIO):
 
     def __init__(self, path: Path, mode: int) -> None:
         super().__init__(path, "x", opener=lambda name, flags: os.open(name, flags, mode))
+        with contextlib.suppress(OSError):  # not every file system has locks
+            fcntl.flock(self, fcntl.LOCK_EX | fcntl.LOCK_NB)
         self.size = 0
         self.longest_write_ns = 0
 
@@ -238,6 +241,18 @@ class LogWriter:
                 name=name, encoding="protobuf", data=declaration(topic.message).SerializeToString()
             )
         return self._schemas[name]
+
+
+def being_recorded(path: Path) -> bool:
+    """Whether a recorder is writing this log: it holds a lock on the file until it ends, in whatever way."""
+    try:
+        with path.open("rb") as file:
+            fcntl.flock(file, fcntl.LOCK_SH | fcntl.LOCK_NB)
+    except BlockingIOError:
+        return True
+    except OSError:  # who reads it says what is wrong
+        return False
+    return False
 
 
 def log_path(folder: Path, time_ns: int) -> Path:

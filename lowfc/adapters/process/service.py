@@ -21,11 +21,14 @@ from lowfc.adapters.process.realtime import NOTHING, Granted
 from lowfc.adapters.process.supervision import Supervisor
 from lowfc.adapters.process.usage import resident_bytes
 from lowfc.contract.events import EVENTS, Level
-from lowfc.contract.messages import EVENT, HEALTH, Log, Topic, timestamp, wire
+from lowfc.contract.messages import EVENT, HEALTH, Log, Role, Topic, timestamp, wire
+from lowfc.control.loop.wording import counted
 
 HEALTH_PERIOD_NS = 500_000_000
 WAITING_NS = 2_000_000_000
 """After it is ready a process that still waits for others says for whom."""
+WORK: dict[str, str] = {Role.CAMERA: "frame", Role.CONTROLLER: "frame", Role.MIRROR: "command"}
+"""What the processes of the loop count; others have a summary of their own."""
 STATES = ("starting", "ready", "running", "stopping", "stopped")
 
 _MET_PERIOD_S = 0.02
@@ -210,6 +213,8 @@ class Service:
             raise self._fault
         self._tell_unreadable()
         self.event("STOPPED", process=self.name, why=self.why)
+        if noun := WORK.get(self.name.partition("-")[0]):
+            self._announce(f"stopped after {counted(self.work, noun)}: {self.why}")
         self.state = "stopped"
 
     def event(self, event: str, **details: object) -> None:

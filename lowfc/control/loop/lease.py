@@ -46,7 +46,7 @@ class Lease(NamedTuple):
     def reserved(self, time_ns: int) -> str:
         """The sentence for people."""
         left_s = ceil(max(0, self.until_ns - time_ns) * 1e-9)
-        return f"the loop is reserved for {self.holder} (for {left_s} s unless it is renewed)"
+        return f"the loop is reserved for {self.holder} (while that runs, and for at most {left_s} s after it)"
 
 
 def refusal(lease: Lease | None, name: str, lease_id: int, time_ns: int) -> str:

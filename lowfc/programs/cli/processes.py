@@ -86,6 +86,7 @@ def record(
     from lowfc.adapters.files.whole_file import write_whole
     from lowfc.adapters.logs.series import Limits
     from lowfc.adapters.process.join import clock_of
+    from lowfc.client.runs import nobody_yet
     from lowfc.programs.core.recording.process import record as run_recorder
     from lowfc.programs.core.recording.summary import figures, report
     from lowfc.programs.core.recording.volume import bytes_per_s, outlook, selected
@@ -106,6 +107,8 @@ def record(
     joined = open_run(run, (settings.mirror.name,), network=settings.network)
     complete = joined.path / "config.toml"  # a file may name only what was chosen; the log names every value
     write_whole(complete, settings.to_toml().encode())
+    if not joined.links.network.router and (nobody := nobody_yet(run)):
+        typer.echo(nobody, err=True)
     done = run_recorder(
         joined,
         Path(log.folder),

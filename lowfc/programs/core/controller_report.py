@@ -1,6 +1,7 @@
 """What the controller reports beside its steps: stage durations, mean commands to offload, time not closed."""
 
 import threading
+from collections import Counter
 
 import numpy as np
 
@@ -12,9 +13,14 @@ from lowfc.contract.messages import timestamp, wire
 from lowfc.control.loop.inputs import Request, Step
 from lowfc.control.loop.safety import LoopMode
 from lowfc.control.loop.state import State
+from lowfc.control.loop.wording import counted
 
 TIMING_PERIOD_NS = 100_000_000
 SECOND_NS = 1_000_000_000
+CAUSES_NAMED = 4
+"""Causes of a loop that was not closed, which are named with how often they were."""
+MOST_CAUSES = 20
+"""Causes that are told apart: a cause may have figures in it, and no two be alike."""
 
 
 class StageTiming:
@@ -123,25 +129,40 @@ class Arrays:
 
 
 class NotClosed:
-    """For how long the loop has not been closed since its first frame, and the cause of its last opening."""
+    """For how long the loop has not been closed since its first frame, and the causes."""
 
     def __init__(self) -> None:
         self._turn = threading.Lock()
         self._total_ns = 0
         self._since_ns: int | None = None
         self._cause = ""
+        self._causes: Counter[str] = Counter()
+        self._times = 0
 
     def note(self, state: State, now_ns: int) -> tuple[int, str]:
-        """Take note of the loop mode; return the time in ns and the cause."""
+        """Take note of the loop mode; return the time in ns and the causes, the most frequent first."""
         with self._turn:  # a step that ends is noted on the frames' thread
             if not state.frame_sequence:
-                return self._total_ns, self._cause
-            if self._since_ns is not None:
-                self._total_ns += max(0, now_ns - self._since_ns)
-            self._since_ns = None
+                return self._total_ns, self._listed()
+            before_ns, self._since_ns = self._since_ns, None
+            if before_ns is not None:
+                self._total_ns += max(0, now_ns - before_ns)
             if state.mode is not LoopMode.CLOSED:
-                self._since_ns, self._cause = now_ns, state.conditions.mode_cause
-            return self._total_ns, self._cause
+                cause, self._since_ns = state.conditions.mode_cause, now_ns
+                if cause and (before_ns is None or cause != self._cause):
+                    self._times += 1
+                    if cause in self._causes or len(self._causes) < MOST_CAUSES:
+                        self._causes[cause] += 1
+                self._cause = cause
+            return self._total_ns, self._listed()
+
+    def _listed(self) -> str:
+        if len(self._causes) < 2:
+            return "".join(self._causes)
+        named = dict(self._causes.most_common(CAUSES_NAMED))
+        if others := self._times - sum(named.values()):
+            named["other causes"] = others
+        return "; ".join(f"{cause} ({counted(times, 'time')})" for cause, times in named.items())
 
 
 def _column(duration_ns: int) -> int:

@@ -17,7 +17,8 @@ if TYPE_CHECKING:
 _WIDTH = 120  # of the report, where there is no terminal
 _STATES = {
     "complete": "complete",
-    "truncated": "truncated: its recorder was killed, or is still writing; `lowfc recover` makes it complete",
+    "recording": "being recorded; `lowfc ctl record stop` finishes it",
+    "truncated": "truncated: it was cut off, as when its recorder is killed; `lowfc recover` makes it complete",
     "damaged": "damaged; `lowfc recover` saves what is whole",
 }
 

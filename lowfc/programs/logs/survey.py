@@ -18,6 +18,7 @@ from lowfc.adapters.logs.parts import LogFiles, WholeLog
 from lowfc.adapters.logs.reader import Logged
 from lowfc.adapters.logs.recovery import RECOVERY
 from lowfc.adapters.logs.selection import EVERYTHING, Selection
+from lowfc.adapters.logs.writer import being_recorded
 from lowfc.contract.envelope import start_of
 from lowfc.contract.errors import BadMessageError
 from lowfc.contract.events import Level
@@ -209,7 +210,7 @@ def survey(
         "lockstep": configuration.lockstep if configuration is not None else None,
         "selection": reader.selection.sentence,
         "bytes": reader.size,
-        "state": "damaged" if reader.damage or reader.unreadable else "complete" if reader.complete else "truncated",
+        "state": _state(reader),
         **figures,
         "unreadable": reader.unreadable,
         "damage": [dataclasses.asdict(damage) for damage in reader.damage],
@@ -217,6 +218,14 @@ def survey(
         "attachments": {name: len(data) for name, data in reader.attachments.items()},
         "remarks": remarks,
     }
+
+
+def _state(reader: WholeLog) -> str:
+    if reader.damage or reader.unreadable:
+        return "damaged"
+    if reader.complete:
+        return "complete"
+    return "recording" if any(map(being_recorded, reader.paths)) else "truncated"
 
 
 def recovery_in_words(metadata: Mapping[str, Mapping[str, str]]) -> str:

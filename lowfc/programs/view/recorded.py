@@ -6,6 +6,7 @@ from pathlib import Path
 
 from lowfc.adapters.logs.history import attached_configuration
 from lowfc.adapters.logs.reader import LogReader
+from lowfc.adapters.logs.recovery import no_end
 from lowfc.adapters.process.clock import SimulatedClock
 from lowfc.contract.configuration import Configuration
 from lowfc.contract.errors import DataFileError
@@ -79,10 +80,10 @@ def draw_logs(
         complete &= reader.complete
         drawn.remarks += [f"{log.name}: {damage}" for damage in reader.damage]
         if not reader.complete and not reader.damage:
-            drawn.remarks.append(f"{log.name} has no end: its recorder was killed, or is still writing")
+            drawn.remarks.append(f"{log.name}: {no_end([log], finished=False)}")
     if renderer is None:
         raise DataFileError(f"there is nothing to see in {', '.join(map(str, logs))}: no message that a view shows")
-    ended = LogEnd(logs[-1].name.partition(".")[0], complete, run, host)
+    ended = LogEnd(logs[-1].name.partition(".")[0], complete, run, host, no_end(logs, finished=complete))
     renderer.draw(accumulator.snapshot(last_ns, ended=ended))
     if accumulator.unreadable:
         drawn.remarks.append(f"{accumulator.unreadable} messages could not be read")

@@ -89,7 +89,7 @@ def show_logs(logs: list[Path], config: Configuration | None, target: Target) ->
     require_folder(target.save, target.picture)
     drawn = Drawn()
     with contextlib.ExitStack() as stack:
-        part = stack.enter_context(being_written(target.save)) if target.save is not None else None
+        part = stack.enter_context(being_written(target.save, logs[0])) if target.save is not None else None
         viewer = target.viewer()
         if viewer is not None:
             stack.callback(viewer.stop)

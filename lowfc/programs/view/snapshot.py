@@ -74,12 +74,14 @@ class LogEnd:
         name: of the last one.
         complete: it was finished, and all of it is there.
         run, host: of the run; empty where the log does not say.
+        no_end: sentence about a log that was not finished.
     """
 
     name: str
     complete: bool
     run: str
     host: str
+    no_end: str = "the log has no end"
 
 
 @dataclass(frozen=True, slots=True)

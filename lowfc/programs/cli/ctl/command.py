@@ -33,7 +33,16 @@ SIGNAL = (
 _SIGNED = {"ignore_unknown_options": True}
 """So that -5 is a value and no option."""
 
-Values = Annotated[list[float], typer.Argument(help="One value for all modes, or one for each.")]
+
+def number(word: str) -> float:
+    """A number as it was typed; one that is none is shown."""
+    try:
+        return float(word)
+    except ValueError:
+        raise typer.BadParameter(f"{word!r} is not a number: write 0.3, and several as 0.3 0.2") from None
+
+
+Values = Annotated[list[float], typer.Argument(help="One value for all modes, or one for each.", parser=number)]
 Zero = Annotated[bool, typer.Option(ZERO, help="Take it away.")]
 
 
@@ -43,12 +52,14 @@ def status(run: AnyRun = None, as_json: Json = False) -> None:
 
     Example: lowfc ctl status --json
     """
-    from lowfc.programs.cli.ctl.status import figures, text
+    from lowfc.programs.cli.ctl.status import figures, provisional, text
 
     with _joined(run) as loop:
         state, processes = loop.status().state, loop.processes()
-    assert state is not None  # noqa: S101  # that is what it answers with
-    put(figures(state, processes, loop.run_id), text(state, processes, loop.run_id), as_json=as_json)
+        assert state is not None  # noqa: S101  # that is what it answers with
+        first = bool(state.calibration_id) and provisional(loop, state.calibration_id)
+    known = state, processes, loop.run_id
+    put(figures(*known, first=first), text(*known, first=first), as_json=as_json)
 
 
 def _simple(name: str) -> Callable[..., None]:
@@ -110,7 +121,9 @@ def step(
 
 @ctl_app.command(context_settings=_SIGNED)
 def offset(
-    values: Annotated[list[float] | None, typer.Argument(help="One for all modes, or one for each; nm rms.")] = None,
+    values: Annotated[
+        list[float] | None, typer.Argument(help="One for all modes, or one for each; nm rms.", parser=number)
+    ] = None,
     modes: Modes = None,
     zero: Zero = False,
     run: AnyRun = None,

@@ -35,6 +35,7 @@ from lowfc.control.calibration.response_fit import (
     likeness,
     measured,
 )
+from lowfc.control.loop.wording import counted
 from lowfc.programs.commissioning.calibrate.pokes import CalibrationRequest, Pokes, checks
 from lowfc.programs.commissioning.calibrate.recording import FrameCount, Player, Say
 
@@ -201,7 +202,7 @@ class Calibrator:
         if wanted.resume:
             sums = go_on(path, what)
             self.kept = sums.cycles
-            self._say(f"going on after {sums.cycles} cycles")
+            self._say(f"going on after {counted(sums.cycles, 'cycle')}")
         else:
             sums = Sums.none(self._initial(delay))
         needed = max(pokes.cycles(), sums.cycles)

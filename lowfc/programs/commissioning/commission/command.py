@@ -7,7 +7,7 @@ from typing import Annotated
 import typer
 
 from lowfc.adapters.process.terminal import AnyRun, Json
-from lowfc.contract.errors import ConfigurationError
+from lowfc.contract.errors import ConfigurationError, DataFileError
 from lowfc.control.calibration.response_fit import LEAST_CYCLES
 from lowfc.programs.cli.output import put
 from lowfc.programs.commissioning.calibrate.command import Out, Resume, Snr
@@ -27,6 +27,7 @@ def commission(
         typer.Option(min=LEAST_CYCLES, help="How many of the response, in place of --snr, which is 20 then."),
     ] = None,
     resume: Resume = False,
+    force: Annotated[bool, typer.Option("--force", help="Replace a file that is there already.")] = False,
     close: Annotated[bool, typer.Option("--close", help="Close the loop at the end.")] = False,
     as_json: Json = False,
 ) -> None:
@@ -53,6 +54,8 @@ def commission(
             "a dark needs somebody to block the star, and there is no terminal to ask at: give dark frames with --dark "
             "FILE, or take the camera's bias with --no-dark"
         )
+    if out.exists() and not (resume or force):
+        raise DataFileError(f"{out} exists already; choose another name (--out), or --force replaces it")
     require_folder(out)
     console = Console(stderr=True)
     say = sayer(console)

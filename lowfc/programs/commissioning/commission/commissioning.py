@@ -122,8 +122,8 @@ class Commissioning:
                 self._loop.load(before)
                 return f"{text}; the calibration from before is in use again"
         return (
-            f"{text}; until then a first calibration is in use, which nobody has judged: `lowfc ctl load FILE` puts "
-            "another one in use"
+            f"{text}; until then the first calibration of this commissioning is in use, without a verdict: "
+            "`lowfc ctl load FILE` puts another one in use"
         )
 
     def _steps_of(self, kept: Path) -> tuple[dict[str, Any], str]:

@@ -16,6 +16,7 @@ from lowfc.programs.commissioning.conformance.camera import Camera
 _FIELDS = tuple(field.name for field in wire.CameraState.DESCRIPTOR.fields if field.name != "timestamp")
 _ABOVE_ZERO = ("exposure_ns", "period_ns", "gain_e_per_dn", "saturation_dn", "rows", "columns", "bit_depth")
 _MOST_BITS = 16
+_NS_PER_MS = 1e6
 
 SETTINGS: Table[Camera] = Table()
 
@@ -130,6 +131,7 @@ class Agreement(NamedTuple):
     Attributes:
         field: of lowfc.v1.CameraState.
         key: of the configuration, from which the same field is made.
+        unit: in which both are printed.
         apart: part of the configured value by which they may differ.
         needed: whether the loop is wrong where they differ; otherwise only what is computed is.
         use: what is computed from it.
@@ -137,21 +139,23 @@ class Agreement(NamedTuple):
 
     field: str
     key: str
+    unit: str
     apart: float
     needed: bool
     use: str
 
 
 _WEIGHTS = "the weights of the pixels in R, the predicted noise"
+_RATES = "laws, margins, spectra, the duration of probe sequences"
 _SATURATED = "where a computed calibration takes a pixel for saturated"
 AGREEMENTS = (
-    Agreement("period_ns", "camera.rate_hz", 0.01, True, "laws, margins, spectra, the duration of probe sequences"),
-    Agreement("gain_e_per_dn", "camera.gain_e_per_dn", 0.02, True, _WEIGHTS),
-    Agreement("em_gain", "camera.em_gain", 0.02, True, _WEIGHTS),
-    Agreement("read_noise_e", "camera.read_noise_e", 0.2, True, _WEIGHTS),
-    Agreement("exposure_ns", "camera.exposure_fraction", 0.05, False, "the light of a computed calibration"),
-    Agreement("bit_depth", "camera.bit_depth", 0.0, False, _SATURATED),
-    Agreement("saturation_dn", "camera.full_well_e", 0.01, False, _SATURATED),
+    Agreement("period_ns", "camera.rate_hz", "ms", 0.01, True, _RATES),
+    Agreement("gain_e_per_dn", "camera.gain_e_per_dn", "e-/DN", 0.02, True, _WEIGHTS),
+    Agreement("em_gain", "camera.em_gain", "", 0.02, True, _WEIGHTS),
+    Agreement("read_noise_e", "camera.read_noise_e", "e-", 0.2, True, _WEIGHTS),
+    Agreement("exposure_ns", "camera.exposure_fraction", "ms", 0.05, False, "the light of a computed calibration"),
+    Agreement("bit_depth", "camera.bit_depth", "bits", 0.0, False, _SATURATED),
+    Agreement("saturation_dn", "camera.full_well_e", "DN", 0.01, False, _SATURATED),
 )
 PERIODS_OF_TIMEOUT = 1.5
 """Frame periods below which `control.frame_timeout_ms` takes every frame for a silence."""
@@ -164,10 +168,12 @@ def agreement_checks(config: Configuration, state: wire.CameraState) -> Iterator
         configured, found = float(getattr(ours, one.field)), float(getattr(state, one.field))
         if one.field == "em_gain":
             found = max(found, 1.0)  # 0 from a camera that has none
-        check, expected = ok(f"{found:.6g}"), f"{configured:.6g}"
+        shown = _NS_PER_MS if one.unit == "ms" else 1.0
+        got, expected = (f"{value / shown:.6g} {one.unit}".rstrip() for value in (found, configured))
+        check = ok(got)
         if abs(found - configured) > one.apart * abs(configured):
             advice = f"set {one.key}, or the camera; it is used for: {one.use}"
-            check, expected = (wrong if one.needed else warning)(check.got, advice), f"{expected}, as configured"
+            check, expected = (wrong if one.needed else warning)(got, advice), f"{expected}, as configured"
         yield check._replace(name=f"{one.field} and {one.key}", expected=expected)
     frame_timeout_ms, period_ms = config.frame_timeout_ns * 1e-6, state.period_ns * 1e-6
     check = ok(f"{frame_timeout_ms:g} ms, the period is {period_ms:g} ms")

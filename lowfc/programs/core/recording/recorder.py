@@ -22,7 +22,7 @@ from lowfc.adapters.process.clock import Clock
 from lowfc.adapters.process.realtime import NOTHING, Granted
 from lowfc.adapters.process.service import Service
 from lowfc.contract.errors import BadMessageError, DataFileError
-from lowfc.contract.messages import HEALTH, TOPICS, Role, Topic, wire
+from lowfc.contract.messages import EVENT, HEALTH, TOPICS, Role, Topic, wire
 from lowfc.programs.core.recording.peers import Others
 from lowfc.programs.core.recording.summary import Summary
 from lowfc.programs.core.recording.switch import RecordingSwitch
@@ -296,6 +296,11 @@ class Recorder:
                 return
             time.sleep(_TURN_S)
 
+    def _others_heard(self) -> bool:
+        """Whether a message of another process was recorded."""
+        own = {EVENT.key, HEALTH.at(self.service.name)}
+        return bool(self.service.last_health or self._others.kept or set(self._ledger.recorded()) - own)
+
     def _close(self) -> Summary:
         while self._ending is not None:
             self._turn()
@@ -305,6 +310,8 @@ class Recorder:
         self._flush()
         try:
             self._series.end(self._figures())
+            if not (self._failure or self._others_heard()):
+                self._series.remove()
         except DataFileError as fault:
             self._fail(fault)
         return Summary(

@@ -44,6 +44,8 @@ def figures(summary: Summary) -> dict[str, Any]:
 
 def report(summary: Summary) -> str:
     """The same for a person."""
+    if not summary.files and not summary.failure:
+        return "no process of this run was there: no log is kept"
     logs = ", ".join(map(str, summary.files))
     lines = [f"{summary.messages} messages in {logs}; {sum(summary.lost.values())} lost"]
     lines += [f"lost {count} of {topic}" for topic, count in sorted(summary.lost.items())]

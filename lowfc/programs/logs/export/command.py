@@ -38,7 +38,7 @@ _ENDINGS = {Format.CSV: ".csv", Format.NPZ: ".npz", Format.FITS: ".fits", Format
 def export(
     logs: Logs,
     to: Annotated[
-        Format | None, typer.Option("--to", help="csv, npz, fits, or aot: Adaptive Optics Telemetry.")
+        Format | None, typer.Option("--to", help="csv, npz, fits (default), or aot: Adaptive Optics Telemetry.")
     ] = None,
     decimate: Annotated[
         int | None,
@@ -66,7 +66,7 @@ def export(
     from lowfc.adapters.process.progress import reading_bar
 
     of_table, of_log = bool(frames or force), bool(topics)
-    if (to is None) == (decimate is None) or (of_log if decimate is None else of_table):
+    if of_log if decimate is None else (to is not None or of_table):
         raise ConfigurationError(
             "an export is a table (--to FORMAT, with --frames and --force) or a smaller log (--decimate N, with "
             "--topics): choose one"
@@ -78,8 +78,8 @@ def export(
             with reading_bar(console) as count:
                 done = thin(log, out or thinned_path(log[0], wanted), wanted, partial(count, "copying"))
             put(dataclasses.asdict(done), str(done), as_json=as_json)
-        elif to is not None:
-            figures = export_log(log, to, out, frames=frames, force=force, console=console)
+        else:
+            figures = export_log(log, to or Format.FITS, out, frames=frames, force=force, console=console)
             put(figures, render(figures), as_json=as_json)
 
 
@@ -101,6 +101,7 @@ def export_log(
     from lowfc.adapters.files.whole_file import being_written
     from lowfc.adapters.logs.history import read_history
     from lowfc.adapters.logs.parts import WholeLog
+    from lowfc.adapters.logs.recovery import no_end
     from lowfc.adapters.process.progress import reading_bar
     from lowfc.programs.logs.guard import refuse_log
 
@@ -122,7 +123,7 @@ def export_log(
         if frames and not history.frame_sequence.size:
             raise DataFileError(f"{reader.path} has no frames; export without --frames")
         reader.progress = partial(count, "writing")
-        write([held.enter_context(being_written(file)) for file in files], history)
+        write([held.enter_context(being_written(file, reader.path)) for file in files], history)
     return {
         "format": str(to),
         "files": [str(file) for file in files],
@@ -132,6 +133,7 @@ def export_log(
         "steps_left_out": history.left_out,
         "selection": reader.selection.sentence,
         "finished": reader.finished,
+        "no_end": no_end(reader.paths, finished=reader.finished),
         "damaged": [f"byte {one.position}, {one.why}" for one in reader.damage],
         "remarks": history.remarks,
     }
@@ -146,7 +148,7 @@ def render(figures: dict[str, Any]) -> str:
     lines += [f"{', '.join(figures['files'])}: {figures['steps']} steps of {figures['modes']} modes{frames}"]
     if figures["steps_left_out"]:
         lines.append(f"left out           {figures['steps_left_out']} steps with another calibration's modes")
-    lines += faults(figures["damaged"], finished=figures["finished"])
+    lines += faults(figures["damaged"], figures["no_end"])
     lines += [f"configuration      {remark}" for remark in figures["remarks"]]
     return "\n".join(lines)
 

@@ -18,7 +18,7 @@ from lowfc.adapters.bus.bus import Publisher, name_in
 from lowfc.adapters.bus.run import Run, open_run
 from lowfc.adapters.bus.zenoh_bus import ZenohBus
 from lowfc.adapters.logs.reader import Logged, LogReader
-from lowfc.adapters.logs.recovery import faults
+from lowfc.adapters.logs.recovery import faults, no_end
 from lowfc.adapters.process.clock import HostClock
 from lowfc.adapters.process.progress import passing_bar
 from lowfc.adapters.process.realtime import Granted, set_up
@@ -132,6 +132,7 @@ class Player:
             "interval_error_us": _microseconds(self._interval_errors),
             "messages_behind": self._behind,
             "finished": all(log.finished for log in self._logs),
+            "no_end": next((no_end(log.paths, finished=False) for log in self._logs if not log.finished), ""),
             "damaged": [f"{log.path}: byte {one.position}, {one.why}" for log in self._logs for one in log.damage],
             "selection": sorted({one for log in self._logs if (one := log.selection.sentence)}),
             "interrupted": not self._service.running,
@@ -226,7 +227,7 @@ def render(figures: dict[str, Any]) -> str:
         f"intervals          off by {interval}",
         f"behind             {figures['messages_behind']} messages by more than {BEHIND_NS / 1e6:g} ms",
     ]
-    lines += faults(figures["damaged"], finished=figures["finished"])
+    lines += faults(figures["damaged"], figures["no_end"])
     lines += [f"the log has        {selection}" for selection in figures["selection"]]
     lines += [f"left out           {key}: {why}" for key, why in figures["left_out"].items()]
     return "\n".join(lines)

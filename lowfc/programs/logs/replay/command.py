@@ -8,11 +8,12 @@ import typer
 from rich.console import Console
 
 from lowfc.adapters.logs.parts import in_order
-from lowfc.adapters.logs.recovery import faults
+from lowfc.adapters.logs.recovery import faults, no_end
 from lowfc.adapters.process.progress import reading_bar
 from lowfc.adapters.process.provenance import provenance
 from lowfc.adapters.process.terminal import Json, Logs
 from lowfc.contract.envelope import count_of
+from lowfc.control.loop.wording import counted
 from lowfc.programs.cli.output import put
 from lowfc.programs.logs.replay.account import Account
 
@@ -40,6 +41,7 @@ def verify(logs: list[Path], tolerance_nm: float, jobs: int, console: Console) -
         "log_s": round(outcome.log_s, 3),
         "speed": round(outcome.log_s / elapsed_s, 2),
         "complete": outcome.complete,
+        "no_end": no_end(logs, finished=outcome.complete),
         "damaged": outcome.damage,
         "runs": outcome.runs,
         "stopped": outcome.stopped,
@@ -67,11 +69,11 @@ def render(figures: dict[str, Any]) -> str:
     for rule, count in figures["rules_changed"].items():
         lines.append(f"answered otherwise {count} since {figures['version']}: {rule}")
     for why, count in figures["unchecked_because"].items():
-        lines.append(f"not checked        {count} steps {why}")
-    for name, what in (("inputs_missing", "inputs of the controller"), ("commands_missing", "commands that it sent")):
+        lines.append(f"unchecked          {counted(count, 'step')} {why}")
+    for name, what in (("inputs_missing", "input"), ("commands_missing", "command")):
         if figures[name]:
-            lines.append(f"not in the log     {figures[name]} {what}")
-    lines += faults(figures["damaged"], finished=figures["complete"])
+            lines.append(f"missing            the log lacks {counted(figures[name], what)} of the controller")
+    lines += faults(figures["damaged"], figures["no_end"])
     lines += [f"recording stopped  {why}" for why in figures["stopped"]]
     if len(figures["runs"]) > 1:
         lines.append(f"of several runs    {', '.join(figures['runs'])}")

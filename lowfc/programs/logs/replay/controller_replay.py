@@ -26,7 +26,7 @@ PATIENCE_NS = 2_000_000_000
 FRAMES_BYTES = 64 << 20
 _STATES_KEPT = 256
 _STEPS_KEPT = 10_000  # of which it is known from which frame they were made
-_BEFORE = "before the first complete state"
+_BEFORE = "recorded before the first complete state of the controller"
 
 
 @dataclass(slots=True)
@@ -241,7 +241,7 @@ class ControllerReplay:
             try:
                 settings, state = self._decoded(message)
             except ValueError as error:
-                self._why = self._why and f"as {error}"
+                self._why = self._why and f"not replayed: {error}"
                 continue
             self._states = {later: state for later, state in self._states.items() if later > number}
             self._settings, self._state, self._began = settings, state, number
@@ -316,7 +316,7 @@ class ControllerReplay:
             try:
                 self._settings, state = self._decoded(logged)
             except ValueError as error:
-                self._lose(f"as {error}")
+                self._lose(f"not replayed: {error}")
                 return
         self._account.requests += isinstance(taken, Request)
         self._state = state

@@ -50,19 +50,20 @@ def _report(log: "Parts", out: Path | None, as_json: bool) -> None:
     from lowfc.adapters.process.progress import counting_bar
     from lowfc.programs.logs.guard import refuse_log
     from lowfc.programs.logs.report.figures import report_of
-    from lowfc.programs.logs.report.page import page
+    from lowfc.programs.logs.report.page import page, require_page
     from lowfc.programs.logs.report.source import read_run
 
     target = out if out is not None or as_json else beside(log[0])
     require_folder(target)
     if target is not None:
         refuse_log(target, log[0])
+        require_page()
     with counting_bar(Console(stderr=True), TimeElapsedColumn()) as count:
         run = read_run(log, partial(count, f"reading {titled(log)}"))
         found = report_of(run)
         if target is not None:
             made = page(found, lambda name: count(f"drawing {name}", 1, 1))
-            write_whole(target, made.encode())
+            write_whole(target, made.encode(), log[0])
     for remark in run.history.remarks:
         sys.stderr.write(f"warning: {remark}\n")
     if as_json:

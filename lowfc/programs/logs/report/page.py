@@ -6,6 +6,7 @@ from typing import Any
 
 import tomli_w
 
+from lowfc.adapters.files.drawing import figure_class
 from lowfc.adapters.process.extras import install_advice
 from lowfc.contract.errors import ConfigurationError
 from lowfc.contract.printable import LINES, printable
@@ -31,6 +32,16 @@ def page(report: Report, progress: Callable[[str], None] = lambda name: None) ->
         toml=tomli_w.dumps(configuration) if configuration is not None else None,
     )
     return text
+
+
+def require_page() -> None:
+    """Find before the work that a page cannot be made after it.
+
+    Raises:
+        ConfigurationError: jinja2 or matplotlib is not installed.
+    """
+    _environment()
+    figure_class()
 
 
 def number(value: float | str | None, digits: int = 3) -> str:

@@ -9,6 +9,7 @@ from lowfc.adapters.files.factory import detector, equivalent_read_noise_e
 from lowfc.adapters.logs.columns import count_reasons
 from lowfc.adapters.logs.history import read_history
 from lowfc.adapters.logs.reader import LogReader
+from lowfc.adapters.logs.recovery import no_end
 from lowfc.arrays import Array, Single
 from lowfc.contract.codecs.calibration_codec import identified
 from lowfc.contract.configuration import Configuration, load
@@ -217,7 +218,7 @@ def _doubts_of_log(run: LoggedRun) -> list[str]:
         parts = ", ".join(f"byte {one.position}, {one.why}" for one in log.damage)
         found.append(f"the log is damaged, and these parts are left out: {parts}")
     if not log.finished:
-        found.append("the log has no end: its recorder was killed, or is still writing")
+        found.append(no_end(log.paths, finished=False))
     if log.metadata.get("recording", {}).get("stopped"):
         found.append(f"recording stopped: {log.metadata['recording']['stopped']}")
     if run.measured_delay is None:

@@ -159,7 +159,7 @@ class Night:
         lost = counted(self._lost, "message")
         detail = f"{ended.name}, {f'{lost} lost' if self._lost else 'nothing lost'}"
         if not ended.complete:
-            advice = "The log has no end: its recorder was killed, or is still writing."
+            advice = f"{ended.no_end.capitalize()}."
             return Tile("LOG", "NO END", f"{detail} up to here", Level.WARNING, advice)
         if self._lost:
             advice = f"The recorder lost {lost}: disk or processor was too slow for it."
