@@ -6,7 +6,6 @@ import socket
 import subprocess
 import sys
 from collections.abc import Callable
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -41,13 +40,12 @@ from lowfc.contract.messages import (
     image,
     wire,
 )
-from lowfc.control.calibration.calibration import FIRST
 from lowfc.control.laws.linear_law import integrator_block, of_blocks
 from lowfc.control.loop.inputs import Reply, Request, Step
 from lowfc.control.loop.requests import REQUESTS
 from lowfc.control.loop.safety import Limit, LoopMode
 from lowfc.programs.cli.ctl.command import SIMPLE, ctl_app
-from lowfc.programs.cli.ctl.status import figures, provisional, text
+from lowfc.programs.cli.ctl.status import figures, text
 from lowfc.programs.cli.modes import noll_of
 from lowfc.testing.memory_bus import MemoryBus, MemoryHub, MemoryRing
 from tests.support.loops import lowfc, until
@@ -613,19 +611,11 @@ def test_the_status_says_everything() -> None:
     assert "none" in text(wire.ControllerState())
 
 
-def test_the_status_says_of_a_first_calibration_that_it_has_no_verdict(
-    controller: FakeController, loop: Client
-) -> None:
-    first = identified(replace(KNOWN, estimator=f"{KNOWN.estimator}{FIRST}"))
-    assert not provisional(loop, KNOWN.id)
-    controller.calibrations.put(encode_calibration(first, 1))
-    assert provisional(loop, first.id)
-    assert not provisional(loop, KNOWN.id), "another one is in use by now"
-    state = wire.ControllerState(calibration_id=first.id)
-    line = text(state, first=True).splitlines()[-1]
-    assert line == f"calibration    {first.id[:12]}, the first of a commissioning: without a verdict"
-    assert figures(state, first=True)["calibration_provisional"]
-    assert "without a verdict" not in text(state)
+def test_the_status_says_of_a_first_calibration_that_it_has_no_verdict() -> None:
+    state = wire.ControllerState(calibration_id="abc", calibration_provisional=True)
+    assert text(state).splitlines()[-1] == "calibration    abc, the first of a commissioning: without a verdict"
+    assert figures(state)["calibration_provisional"]
+    assert "without a verdict" not in text(wire.ControllerState(calibration_id="abc"))
 
 
 # The recorder's switch.

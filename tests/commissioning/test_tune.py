@@ -19,6 +19,7 @@ from lowfc.contract.configuration import Configuration
 from lowfc.contract.errors import BusError, ConfigurationError, DataFileError, RequestRefusedError
 from lowfc.contract.messages import wire
 from lowfc.control.calibration.calibration import Calibration
+from lowfc.control.laws.continuous import Timing
 from lowfc.control.laws.linear_law import LinearLaw
 from lowfc.control.laws.margins import check_stable
 from lowfc.control.loop.advance import advance
@@ -160,7 +161,7 @@ def test_a_running_loop_is_listened_to() -> None:
     """Missing and refused frames are bridged; the first half second after closing does not count."""
     run = of_run(Loop(), 60.0)  # type: ignore[arg-type]
     assert run.closed
-    assert (run.source, run.noll, run.delay_frames) == ("bench", (2, 3, 4), 1.0)
+    assert (run.source, run.noll, run.timing) == ("bench", (2, 3, 4), Timing.of(1.0, 0.5))
     assert run.rate_hz == pytest.approx(1000)
     assert run.warnings == ("4 steps did not get here in time",)
     assert run.pol.frames == pytest.approx(5500, abs=5)

@@ -78,6 +78,7 @@ def controller_state(state: State, settings: Settings, time_ns: int) -> wire.Con
             message.law_state.extend(following.x.tolist())
             message.law_frames = following.frames
         message.calibration_id = state.drive.calibration.id
+        message.calibration_provisional = state.drive.calibration.provisional
         if not message.calibration_id:
             message.mirror_rows, message.mirror_columns = state.drive.calibration.grid
         message.gain.extend(state.drive.law.gain.tolist())

@@ -9,7 +9,7 @@ else.
 from math import ceil
 from typing import NamedTuple
 
-from lowfc.control.loop.inputs import COUNT_BITS
+from lowfc.control.loop.inputs import COUNT_BITS, Request
 
 MAX_S = 60.0
 MAX_HOLDER = 200
@@ -72,3 +72,10 @@ def refusal(lease: Lease | None, name: str, lease_id: int, time_ns: int) -> str:
     if lease is None or lease.id != lease_id:
         return "the reservation that it is asked under is not in force: did the controller restart?"
     return f"the reservation that it is asked under ended: {lease.ended}"
+
+
+def asked_by(held: Lease | None, request: Request) -> str:
+    """What a change of the loop is put down to: a request, and what it was for where its sender holds the loop."""
+    if held is not None and request.lease_id and request.lease_id == held.id:
+        return f"asked to {request.name} for {held.holder.partition(' by ')[0]}"
+    return f"operator asked to {request.name}"

@@ -15,7 +15,7 @@ from lowfc.control.laws.margins import check_law
 from lowfc.control.laws.stability import highest_gain, limiting_gain
 from lowfc.control.loop.command_channels import FLAT, MIRROR, CommandChannels, Play, play_table
 from lowfc.control.loop.inputs import PendingEvent, Request
-from lowfc.control.loop.lease import ENDED_BY, refusal
+from lowfc.control.loop.lease import ENDED_BY, asked_by, refusal
 from lowfc.control.loop.loading import holding, in_mode, loaded, misfit, mode_event, uncalibrated
 from lowfc.control.loop.remarks import check_offset, remark
 from lowfc.control.loop.reservation import lease, lease_checked, lease_ended, release, renew
@@ -53,11 +53,11 @@ def answer(settings: Settings, state: State, request: Request) -> Answer:
     except ValueError as error:
         return Answer(state, False, _short(str(error)))
     if request.name == "safe" or (request.name in ENDED_BY and held is not None and held.id != request.lease_id):
-        after, others = lease_ended(after, _asked(request))
+        after, others = lease_ended(after, asked_by(held, request))
         events += others
         text += "".join(f"; this ended the reservation for {event.details['holder']}" for event in others)
     if after.mode is not state.mode:
-        why = _asked(request)
+        why = asked_by(held, request)
         events.append(mode_event(state.mode, after.mode, why))
         if after.mode is LoopMode.SAFE:
             events.append(PendingEvent("SAFED", {"why": why}))
@@ -83,10 +83,6 @@ def prepared(settings: Settings, request: Request) -> Request:
     return replace(request, prepared=True)
 
 
-def _asked(request: Request) -> str:
-    return f"operator asked to {request.name}"
-
-
 def _short(text: str) -> str:
     return text if len(text) <= MOST_REPLY else f"{text[: MOST_REPLY - 3]}..."
 
@@ -107,18 +103,19 @@ def _mode(settings: Settings, state: State, request: Request) -> Handled:
         conditions = state.conditions._replace(clear_id=request.time_ns)
         state = state._replace(frame_sequence=0, conditions=conditions)
     reply, paused = _REPLIES[request.name], state.conditions.mode_cause == PAUSED
+    cause = asked_by(state.conditions.lease, request)
     if request.name == "pause" and state.mode is LoopMode.OPEN and not paused:
         reply = "the loop is open already, and holds the command"
     if request.name == "open" and paused:
-        state = state._replace(conditions=state.conditions._replace(mode_cause=_asked(request)))
+        state = state._replace(conditions=state.conditions._replace(mode_cause=cause))
     if after is LoopMode.CLOSED and state.drive is not None and state.drive.calibration.provisional:
         reply += (
-            "; nobody has judged its calibration, the first one of a commissioning: `lowfc commission --resume` makes "
-            "the next, `lowfc ctl load FILE` puts another one in use"
+            "; its calibration is the first one of a commissioning and has no verdict: `lowfc commission --resume` "
+            "makes the next, `lowfc ctl load FILE` puts another one in use"
         )
     if after is LoopMode.IDLE:
         reply = f"loop idle: {uncalibrated(state)}"
-    return in_mode(state, after, request.time_ns, _asked(request)), reply
+    return in_mode(state, after, request.time_ns, cause), reply
 
 
 def _granted(state: State, asked: str) -> LoopMode:
@@ -165,7 +162,12 @@ def _step(settings: Settings, state: State, request: Request) -> Handled:
     frames = request.values[0] if len(request.values) == 1 else 0.0
     if not (1 <= frames <= MOST_STEPS and frames == int(frames)):
         raise ValueError(f"step takes one whole number of frames, 1 or more; got {list(request.values)}")
-    state = in_mode(state, _granted(state, "close"), request.time_ns, _asked(request))
+    state = in_mode(
+        state,
+        _granted(state, "close"),
+        request.time_ns,
+        asked_by(state.conditions.lease, request),
+    )
     return state._replace(steps_left=int(frames)), f"loop closed for {counted(int(frames), 'frame')}"
 
 

@@ -52,14 +52,13 @@ def status(run: AnyRun = None, as_json: Json = False) -> None:
 
     Example: lowfc ctl status --json
     """
-    from lowfc.programs.cli.ctl.status import figures, provisional, text
+    from lowfc.programs.cli.ctl.status import figures, text
 
     with _joined(run) as loop:
         state, processes = loop.status().state, loop.processes()
         assert state is not None  # noqa: S101  # that is what it answers with
-        first = bool(state.calibration_id) and provisional(loop, state.calibration_id)
     known = state, processes, loop.run_id
-    put(figures(*known, first=first), text(*known, first=first), as_json=as_json)
+    put(figures(*known), text(*known), as_json=as_json)
 
 
 def _simple(name: str) -> Callable[..., None]:

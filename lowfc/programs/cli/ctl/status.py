@@ -7,9 +7,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from lowfc.client import Client
 from lowfc.contract.envelope import count_of
-from lowfc.contract.errors import BusError
 from lowfc.contract.messages import FRAME, Role, from_timestamp, wire
 from lowfc.control.loop.safety import REASONS, Rejection, reason_of
 from lowfc.control.loop.state import FADING_FRAMES, SETTLING_FRAMES
@@ -20,21 +18,10 @@ NOBODY = wire.Health()
 _NO_PROCESSES: Mapping[str, wire.Health] = MappingProxyType({})
 
 
-def provisional(loop: Client, calibration_id: str) -> bool:
-    """Whether this calibration, which is in use, is a first one without a verdict; False where it cannot be had."""
-    try:
-        found = loop.calibration()
-    except BusError:
-        return False
-    return found.id == calibration_id and found.provisional
-
-
 def figures(
     state: wire.ControllerState,
     processes: Mapping[str, wire.Health] = _NO_PROCESSES,
     run: str = "",
-    *,
-    first: bool = False,
 ) -> dict[str, Any]:
     """The state as `lowfc ctl status --json` prints it; modes in the calibration's order, nm rms of wavefront."""
     playing = None
@@ -116,7 +103,7 @@ def figures(
         "neighbour_nm": settings.neighbour_nm,
         "delay_frames": settings.delay_frames,
         "calibration_id": state.calibration_id,
-        "calibration_provisional": first,
+        "calibration_provisional": state.calibration_provisional,
     }
 
 
@@ -124,11 +111,9 @@ def text(
     state: wire.ControllerState,
     processes: Mapping[str, wire.Health] = _NO_PROCESSES,
     run: str = "",
-    *,
-    first: bool = False,
 ) -> str:
     """The same for a person: whether all is well in the first line."""
-    known = figures(state, processes, run, first=first)
+    known = figures(state, processes, run)
     since = "" if known["mode_s"] is None else f" for {known['mode_s']:.0f} s ({known['mode_cause']})"
     mode = _mode(known) + (f", opens after {counted(known['steps_left'], 'frame')}" if known["steps_left"] else "")
     law = known["law"]["name"]
@@ -161,7 +146,7 @@ def text(
         "counted": ", ".join(_counted(name, count) for name, count in known["counts"].items()) or "nothing refused",
         "delay": counted(float(known["delay_frames"]), "frame"),
         "calibration": (known["calibration_id"][:12] or "none")
-        + (", the first of a commissioning: without a verdict" if first else ""),
+        + (", the first of a commissioning: without a verdict" if known["calibration_provisional"] else ""),
     }
     return "\n".join([_in_short(known), *(f"{name:14} {value}" for name, value in rows.items())])
 

@@ -6,7 +6,7 @@ import numpy as np
 
 from lowfc.arrays import Array
 from lowfc.control.laws import margins
-from lowfc.control.laws.continuous import spectrum_left
+from lowfc.control.laws.continuous import Timing, spectrum_left
 from lowfc.control.laws.linear_law import LinearLaw, integrator
 from lowfc.control.laws.spectra import in_bins, spectrum
 from lowfc.control.laws.tuning import (
@@ -56,10 +56,13 @@ def law_now(run: Telemetry) -> LinearLaw:
 def figures(run: Telemetry, best: Tuned, gains: Gains, controller: str) -> dict[str, Any]:
     """What `--json` prints."""
     now = law_now(run)
-    achieved_nm = _achieved_nm(run, gains.noise_nm)
     leak = run.law.leak.astype(np.float64)
     integrator_nm = tune_integrator(best.models, gains, run.noll, leak, run.timing).predicted_nm
     now_nm = predicted_nm(now, best.models, run.timing) if margins.margins(now, run.timing.delay).stable else None
+    achieved_nm = _achieved_nm(run, gains.noise_nm)
+    if achieved_nm is not None and now_nm is not None:  # nobody has looked between two frames
+        sampled_nm = predicted_nm(now, best.models, Timing.sampled(run.timing.delay))
+        achieved_nm = np.sqrt(np.maximum(achieved_nm**2 + now_nm**2 - sampled_nm**2, 0.0))
     modes: list[dict[str, Any]] = []
     for place, index in enumerate(run.noll):
         model = best.models[place]
@@ -171,7 +174,7 @@ def picture(run: Telemetry, best: Tuned) -> bytes:
 
 
 def _achieved_nm(run: Telemetry, noise_nm: Array) -> Array | None:
-    """Rms (modes,) of the residual: the true one where it is known, or the error's less the noise's."""
+    """Rms (modes,) of the residual in the frames: the true one where it is known, or the error's less the noise's."""
     if not run.closed:
         return None
     if run.true_nm is not None:
