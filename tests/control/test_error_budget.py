@@ -8,6 +8,7 @@ import pytest
 from lowfc.adapters.files import factory
 from lowfc.contract.configuration import load
 from lowfc.control.calibration.calibration import noise_nm
+from lowfc.control.laws.continuous import Timing, left_power
 from lowfc.control.laws.error_budget import Term, lag, lag_under_noise, measurement_error, sensor_noise, white_noise
 from lowfc.control.laws.linear_law import LinearLaw, integrator
 from lowfc.control.laws.spectra import Pieces, spectrum
@@ -17,6 +18,7 @@ from tools.law_bench import calibrated
 
 RATE_HZ = 1000.0
 BOTH = np.ones(2, bool)
+SAMPLED = Timing.sampled(1.0)
 
 
 def loop(gain: tuple[float, ...] = (0.5, 0.1), leak: tuple[float, ...] = (0.0, 0.0)) -> LinearLaw:
@@ -36,7 +38,7 @@ def test_a_mode_without_gain_has_all_of_the_lag_and_no_noise() -> None:
     made = loop((0.5, 0.0))
     assert white_noise(made, np.ones(2)).variance_nm2[1] == 0
     drift = spectrum(whole(np.random.default_rng(1).standard_normal((4000, 2))), RATE_HZ)
-    assert lag(made, drift, np.array([0.0, 3.0])).variance_nm2[1] == pytest.approx(9 + drift.variance_nm2()[1])
+    assert lag(made, drift, np.array([0.0, 3.0]), SAMPLED).variance_nm2[1] == pytest.approx(9 + drift.variance_nm2()[1])
 
 
 def test_sensor_noise_is_split_in_squares() -> None:
@@ -58,17 +60,29 @@ def test_the_lag_of_a_sine_is_its_rejected_amplitude() -> None:
     found = spectrum(whole(waves), RATE_HZ)
     passed = [rejection(np.array([f]), RATE_HZ, *law, 1.0)[0] for f, law in ((31.0, (0.5, 0.0)), (7.0, (0.1, 0.02)))]
     expected = np.array([18, 2]) * np.square(passed)
-    assert lag(made, found, np.zeros(2)).variance_nm2 == pytest.approx(expected, rel=0.02)
-    steady = lag(made, found, np.array([30.0, 30.0])).variance_nm2 - lag(made, found, np.zeros(2)).variance_nm2
+    assert lag(made, found, np.zeros(2), SAMPLED).variance_nm2 == pytest.approx(expected, rel=0.02)
+    whole_time = lag(made, found, np.zeros(2), Timing.of(1.0, 0.0)).variance_nm2
+    omega = 2 * np.pi * np.array([31.0, 7.0]) / RATE_HZ
+    assert whole_time == pytest.approx(
+        np.array([18, 2]) * left_power(made, omega, Timing.of(1.0, 0.0)).diagonal(), rel=0.02
+    )
+    steady = (
+        lag(made, found, np.array([30.0, 30.0]), SAMPLED).variance_nm2
+        - lag(made, found, np.zeros(2), SAMPLED).variance_nm2
+    )
     assert steady == pytest.approx([0, (30 * 0.02 / 0.12) ** 2], abs=1e-3)  # an integrator leaves nothing of a mean
 
 
-def test_the_lag_is_found_under_noise() -> None:
+@pytest.mark.parametrize("timing", [SAMPLED, Timing.of(1.0, 0.0)])
+def test_the_lag_is_found_under_noise(timing: Timing) -> None:
     time_s = np.arange(20_000) / RATE_HZ
     waves = 6 * np.sin(2 * np.pi * 31 * time_s)[:, None].repeat(2, axis=1)
     noisy = waves + 4 * np.random.default_rng(3).standard_normal(waves.shape)
     clear, measured = spectrum(whole(waves), RATE_HZ), spectrum(whole(noisy), RATE_HZ)
-    expected, found = lag(loop(), clear, np.zeros(2)), lag_under_noise(loop(), measured, np.zeros(2))
+    expected, found = (
+        lag(loop(), clear, np.zeros(2), timing),
+        lag_under_noise(loop(), measured, np.zeros(2), timing),
+    )
     assert np.abs(found.variance_nm2 - expected.variance_nm2).max() < 3 * np.max(found.error_nm2)
     assert found.variance_nm2[0] == pytest.approx(expected.variance_nm2[0], rel=0.25)
 
@@ -173,7 +187,7 @@ def test_the_terms_add_up_to_the_residual_of_a_loop_that_ran() -> None:
     terms = [
         white_noise(made, noise.photon_nm),
         white_noise(made, noise.read_nm),
-        lag(made, shaken, signals["disturbance_nm"].mean(axis=0)),
+        lag(made, shaken, signals["disturbance_nm"].mean(axis=0), SAMPLED),
         split.crosstalk,
         split.nonlinearity,
     ]

@@ -62,6 +62,8 @@ def hold_floor(omega: Array, held: float = 1.0) -> Array:
 
 def left_power(law: LinearLaw, omega: Array, timing: Timing) -> Array:
     """Mean over time (frequencies, modes) of what the loop leaves of a wave of power 1."""
+    if not timing.held:  # at an instant, of a command what an exposure sees of it
+        return np.asarray(np.abs(sensitivity(law, omega, timing.delay)) ** 2)
     command = commanded(law, omega, timing.delay) * mean_over(omega, timing.exposure)[:, None]
     return np.asarray(hold_floor(omega, timing.held)[:, None] + np.abs(_ahead(omega, timing)[:, None] + command) ** 2)
 

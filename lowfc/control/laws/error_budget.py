@@ -11,6 +11,7 @@ import numpy as np
 
 from lowfc.arrays import Array, Mask
 from lowfc.control.calibration.calibration import noise_nm
+from lowfc.control.laws.continuous import Timing, left_power, mean_over
 from lowfc.control.laws.linear_law import LinearLaw
 from lowfc.control.laws.margins import noise_gain, noise_transfer, rejection
 from lowfc.control.laws.spectra import Pieces, Spectrum, floor_nm2_hz, spectrum
@@ -74,19 +75,34 @@ def white_noise(law: LinearLaw, noise_nm: Array) -> Term:
     return Term(noise_nm**2 * noise_gain(law))
 
 
-def lag(law: LinearLaw, disturbance: Spectrum, mean_nm: Array) -> Term:
-    """What the loop leaves of a disturbance that is known, by its spectrum and its mean (modes,)."""
-    steady = (mean_nm * rejection(law, np.zeros(1))[0]) ** 2
-    return Term(disturbance.variance_nm2(rejection(law, disturbance.frequency_hz) ** 2) + steady)
+def lag(law: LinearLaw, disturbance: Spectrum, mean_nm: Array, timing: Timing) -> Term:
+    """What the loop leaves of a disturbance that is known at the start of each exposure, by its spectrum and mean.
+
+    With a `timing` that counts whole periods this is what is left at every moment.
+    """
+    return Term(disturbance.variance_nm2(_passed(law, disturbance, timing)) + _steady_nm2(law, mean_nm))
 
 
-def lag_under_noise(law: LinearLaw, measured: Spectrum, mean_nm: Array) -> Term:
+def lag_under_noise(law: LinearLaw, measured: Spectrum, mean_nm: Array, timing: Timing) -> Term:
     """The same of a disturbance that was measured with noise: the floor of its spectrum is taken off."""
-    passed = rejection(law, measured.frequency_hz) ** 2
+    exposed = np.abs(mean_over(_omega(law, measured), timing.exposure)) ** 2
+    passed = _passed(law, measured, timing) / exposed[:, None]
     floor = floor_nm2_hz(measured)
-    steady = (mean_nm * rejection(law, np.zeros(1))[0]) ** 2
     above = measured.variance_nm2(passed) - floor * passed.sum(axis=0) * measured.spacing_hz
-    return Term(above + steady, measured.error_nm2(passed))
+    return Term(above + _steady_nm2(law, mean_nm), measured.error_nm2(passed))
+
+
+def _omega(law: LinearLaw, found: Spectrum) -> Array:
+    return np.asarray(2 * np.pi * found.frequency_hz / law.rate_hz)
+
+
+def _passed(law: LinearLaw, found: Spectrum, timing: Timing) -> Array:
+    """(frequencies, modes) of a spectrum that is left."""
+    return left_power(law, _omega(law, found), timing)
+
+
+def _steady_nm2(law: LinearLaw, mean_nm: Array) -> Array:
+    return np.asarray((mean_nm * rejection(law, np.zeros(1))[0]) ** 2)
 
 
 @dataclass(frozen=True, slots=True)

@@ -3,6 +3,7 @@
 import numpy as np
 
 from lowfc.arrays import Array, Mask
+from lowfc.control.laws.continuous import Timing
 from lowfc.control.laws.error_budget import SensorNoise, Term, lag, lag_under_noise, measurement_error, white_noise
 from lowfc.control.laws.spectra import Pieces
 from lowfc.programs.logs.report.closed_loop import (
@@ -62,7 +63,7 @@ def budget_figures(run: Run, stretch: Stretch | None, spectra: Spectra | None, m
 
 def _terms(stretch: Stretch, spectra: Spectra | None, noise: SensorNoise | None) -> dict[str, Entry]:
     """Each term, or None, and how it was obtained, or what it would take."""
-    law = stretch.law
+    law, timing = stretch.law, Timing.sampled(stretch.law.delay_frames)
     found: dict[str, Entry] = {}
     if noise is None:
         found = dict.fromkeys(("photon noise", "read noise"), (None, f"it takes {_NO_CAMERA}"))
@@ -77,11 +78,14 @@ def _terms(stretch: Stretch, spectra: Spectra | None, noise: SensorNoise | None)
         found["lag"] = (None, f"it takes {_TOO_SHORT}")
     elif spectra.true is not None:
         mean_nm = stretch.signal(DISTURBANCE).joined().mean(axis=0)
-        found["lag"] = (lag(law, spectra.true[0], mean_nm), "spectrum of the true disturbance times the rejection")
+        found["lag"] = (
+            lag(law, spectra.true[0], mean_nm, timing),
+            "spectrum of the true disturbance times the rejection",
+        )
     else:
         mean_nm = stretch.signal(POL).joined().mean(axis=0)
         how = "pseudo-open-loop spectrum, its noise floor taken off, times the rejection"
-        found["lag"] = (lag_under_noise(law, spectra.measured[1], mean_nm), how)
+        found["lag"] = (lag_under_noise(law, spectra.measured[1], mean_nm, timing), how)
     crosstalk, nonlinearity = _measurement_terms(stretch, noise)
     found["cross-talk and aliasing"] = crosstalk
     found["nonlinearity"] = nonlinearity
