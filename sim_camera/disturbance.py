@@ -17,7 +17,7 @@ BLOCK = 32
 # The reaction wheel: rms of each line per axis, mas. Falling with frequency as a telescope's structure damps it;
 # with the drift they add up to 14 mas.
 LINES_HZ = (6.0, 18.0, 37.0, 71.0, 117.0)
-_LINES_MAS = (9.0, 8.3, 5.0, 3.0, 2.0)
+LINES_MAS = (9.0, 8.3, 5.0, 3.0, 2.0)
 _DRIFT_MAS = 3.0
 _JITTER_HZ = (0.7, 1.9, 4.3, 9.1)
 _JITTER_MAS = 1.5
@@ -90,7 +90,7 @@ def disturbance(
             waves = [
                 _drift(rng, scale * _thermal_nm(noll) * ~tilt, _THERMAL_HZ),
                 _drift(rng, _DRIFT_MAS * tilt_nm, _DRIFT_HZ),
-                _lines(rng, np.array(_LINES_MAS), LINES_HZ, tilt_nm),
+                _lines(rng, np.array(LINES_MAS), LINES_HZ, tilt_nm),
             ]
         case "step":
             step = _STEP_MAS * tilt_nm

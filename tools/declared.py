@@ -21,6 +21,7 @@ from lowfc.programs.commissioning.acceptance import linearity as acceptance_line
 from lowfc.programs.commissioning.acceptance import rejection as acceptance_rejection
 from lowfc.programs.commissioning.conformance.settings import AGREEMENTS
 from lowfc.programs.commissioning.tune.figures import OPTICAL_GAIN_MAS
+from tools import continuous
 from tools.shared import ROOT, markdown
 
 _MESSAGES = 4  # numbers of the fields of the descriptors, which the places of comments are made of
@@ -130,6 +131,7 @@ DECLARED: dict[str, Callable[[], str]] = {
     "requests": requests.table,
     "packages": packages,
     "requirements": requirements,
+    "continuous": continuous.table,
     "tuning limits": partial(limits, _TUNING),
     "acceptance limits": partial(limits, _ACCEPTANCE),
     "operating limits": partial(limits, _OPERATING),

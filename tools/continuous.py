@@ -1,0 +1,59 @@
+"""What laws leave of the wheel's five lines at every moment, in theory: a table of docs/tuning.md."""
+
+from dataclasses import replace
+
+import numpy as np
+
+from lowfc.arrays import Array
+from lowfc.control.laws.continuous import Timing, hold_floor, left_power
+from lowfc.control.laws.kalman import lqg
+from lowfc.control.laws.linear_law import LinearLaw, integrator
+from lowfc.control.laws.stability import highest_gain
+from lowfc.control.laws.vibration import Line, Model
+from sim_camera.disturbance import LINES_HZ, LINES_MAS
+from tools.shared import markdown
+
+RATE_HZ = 1000.0
+_NO_WIDTH_HZ, _NO_NOISE_NM2, _NO_DRIFT_NM2 = 1e-6, 1e-6, 1e-9
+_CASES = (Timing.of(1, 0.5), Timing.of(1, 0.9), Timing.of(2, 0.5))
+
+
+def table() -> str:
+    """A row for each law, a column for each timing; mas rms per axis."""
+    laws = {
+        "integrator, its highest gain": [_integrator(timing) for timing in _CASES],
+        "Kalman filter, an instant nulled": [_filter(timing, timing.applied, 0.0) for timing in _CASES],
+        "Kalman filter, the next exposure's mean nulled": [
+            _filter(timing, timing.applied, timing.exposure) for timing in _CASES
+        ],
+        "Kalman filter, the mean over the command's period nulled (`lqg`)": [
+            _filter(timing, timing.applied, timing.held) for timing in _CASES
+        ],
+    }
+    rows = [
+        (name, *(f"{_left(law, t):.3f}" for law, t in zip(made, _CASES, strict=True))) for name, made in laws.items()
+    ]
+    floor = float(np.sqrt(np.square(LINES_MAS) @ hold_floor(_omega())))
+    rows.append(("the least that a held command can leave", *(f"{floor:.3f}" for _ in _CASES)))
+    head = "left of 14 mas, mas rms per axis, at every moment"
+    return markdown((head, *(f"delay {t.delay:g}, exposure {t.exposure:g}" for t in _CASES)), rows)
+
+
+def _omega() -> Array:
+    return 2 * np.pi * np.array(LINES_HZ) / RATE_HZ
+
+
+def _integrator(timing: Timing) -> LinearLaw:
+    return integrator([highest_gain(timing.delay)], [0.0], (2,), timing.delay, RATE_HZ)
+
+
+def _filter(timing: Timing, start: float, length: float) -> LinearLaw:
+    """The filter that knows the lines, its command nulling the mean over [start, start + length] periods."""
+    lines = tuple(Line(hz, _NO_WIDTH_HZ, mas**2) for hz, mas in zip(LINES_HZ, LINES_MAS, strict=True))
+    model = Model(_NO_DRIFT_NM2, np.inf, lines, _NO_NOISE_NM2, RATE_HZ)
+    foreseen = model.mean_over(start, length) @ np.linalg.inv(model.mean_over(0.0, timing.exposure))
+    return replace(lqg([model], (2,), timing), output=(-model.states()[2] @ foreseen)[None].astype(np.float32))
+
+
+def _left(law: LinearLaw, timing: Timing) -> float:
+    return float(np.sqrt(np.square(LINES_MAS) @ left_power(law, _omega(), timing)[:, 0]))
