@@ -4,7 +4,16 @@ import numpy as np
 import pytest
 
 from lowfc.arrays import Array
-from lowfc.control.laws.continuous import Timing, ahead_of, commanded, held_left_nm2, hold_floor, left_power, mean_over
+from lowfc.control.laws.continuous import (
+    Timing,
+    ahead_of,
+    commanded,
+    held_left_nm2,
+    hold_floor,
+    left_all_the_time_nm2,
+    left_power,
+    mean_over,
+)
 from lowfc.control.laws.kalman import lqg
 from lowfc.control.laws.linear_law import LinearLaw, at_rest, follow, integrator, respond
 from lowfc.control.laws.stability import delay_weights
@@ -117,6 +126,20 @@ def test_means_between_measurements(timing: Timing) -> None:
         assert there.sum() > 290
         np.testing.assert_allclose(found[there, 0], ahead.real[there], atol=2e-3)
         assert answer[0] == pytest.approx(1)
+
+
+def test_what_is_left_all_the_time_is_told_from_instants() -> None:
+    """Of a wave under a mirror that holds; what it leaves of the instants alone is much less."""
+    timing, law, k, omega = Timing.of(1, 0.0), steady(0.5, 1), np.arange(3000), 0.3
+    wave = np.sqrt(2) * np.cos(omega * k + 1)
+    mirror, c = np.zeros_like(wave), 0.0
+    for frame in range(len(k)):
+        mirror[frame] = c
+        c -= 0.5 * (wave[frame] + c)
+    found = left_all_the_time_nm2(wave[:, None], mirror[:, None])[500:-100]
+    assert np.isfinite(found).all()
+    assert found.mean() == pytest.approx(left_power(law, np.array([omega]), timing)[0, 0], rel=0.01)
+    assert np.mean((wave + mirror)[500:-100] ** 2) < 0.8 * found.mean()
 
 
 def test_what_commands_left_is_told_from_noisy_measurements() -> None:

@@ -21,6 +21,8 @@ _FILTER_OMEGA = np.linspace(0, np.pi, _FILTER_POINTS // 2 + 1)
 _FILTER_REACH = 48
 """Frames before and after by which a mean between measurements is told."""
 
+_MOMENTS = 8
+
 
 class Timing(NamedTuple):
     """When a loop exposes and moves its mirror, in frame periods.
@@ -133,3 +135,14 @@ def held_left_nm2(
     by_noise_nm2 = noise_nm2 * np.trapezoid(passed, _FILTER_OMEGA, axis=0) / np.pi
     squares = np.sum((ahead_nm[rows] + command_nm[rows]) ** 2, axis=0)
     return squares - rows.sum() * by_noise_nm2, int(rows.sum())
+
+
+def left_all_the_time_nm2(disturbance_nm: Array, mirror_nm: Array) -> Array:
+    """Mean square over each period (frames, modes) of what is left, from its state at the start of each exposure.
+
+    The disturbance (frames, modes) between those instants is told from the ones before and after, and the mirror
+    (frames, modes) holds for the period; NaN where there are too few neighbours.
+    """
+    moments = (np.arange(_MOMENTS) + 0.5) / _MOMENTS
+    between = (ahead_of(disturbance_nm, Timing(1.0, moment, 0.0, 0.0))[0] for moment in moments.tolist())
+    return np.asarray(sum((one_nm + mirror_nm) ** 2 for one_nm in between) / _MOMENTS)

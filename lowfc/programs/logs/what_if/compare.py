@@ -10,12 +10,13 @@ from lowfc.adapters.logs.columns import count_reasons
 from lowfc.adapters.logs.history import read_history
 from lowfc.adapters.logs.reader import LogReader
 from lowfc.adapters.logs.recovery import no_end
-from lowfc.arrays import Array, Single
+from lowfc.arrays import Array, Mask, Single
 from lowfc.contract.codecs.calibration_codec import identified
 from lowfc.contract.configuration import Configuration, load
 from lowfc.contract.errors import CalibrationError, ConfigurationError
 from lowfc.contract.messages import MIRROR_STATE
 from lowfc.control.calibration.calibration import ESTIMATORS, Calibration, reconstructor
+from lowfc.control.laws.continuous import left_all_the_time_nm2
 from lowfc.control.laws.law import Law
 from lowfc.control.laws.stability import limiting_gain
 from lowfc.control.laws.what_if import Controller, as_logged, counterfactual, rms
@@ -38,6 +39,8 @@ _TITLES = {
     "what_if": "what if",
     "true_was": "true as it was",
     "true_what_if": "true what if",
+    "continuous_was": "all the time",
+    "continuous_what_if": "what if",
 }
 
 
@@ -84,11 +87,7 @@ def compared(run: LoggedRun, what: WhatIf, config: Configuration | None, own: Co
     rows, settling, over = run.rows_to_compare([run.law, after], usable)
     columns = {"open": rms(pol_nm, rows), "was": rms(was_nm, rows), "what_if": rms(what_if_nm, rows)}
     if run.true_nm is not None:
-        _, residual_nm = run.true_nm
-        known = rows & np.isfinite(residual_nm).all(axis=1)
-        if known.any():
-            columns["true_was"] = rms(residual_nm, known)
-            columns["true_what_if"] = rms(residual_nm + (what_if_nm - pol_nm - seen_nm), known)
+        columns |= _true(run, rows, what_if_nm - pol_nm - seen_nm)
     return {
         "log": str(run.history.log.path),
         "complete": run.history.log.complete,
@@ -122,6 +121,30 @@ def compared(run: LoggedRun, what: WhatIf, config: Configuration | None, own: Co
     }
 
 
+def _true(run: LoggedRun, rows: Mask, moved_nm: Single) -> dict[str, Array]:
+    """Rms (modes,) of the true residual, in the frames and all the time, as it was and with the mirror moved by that.
+
+    Args:
+        run: of which the truth is known.
+        rows: (steps,) which are compared.
+        moved_nm: (steps, modes).
+    """
+    assert run.true_nm is not None  # noqa: S101  # see above
+    disturbance_nm, residual_nm = (values.astype(np.float64) for values in run.true_nm)
+    found: dict[str, Array] = {}
+    known = rows & np.isfinite(residual_nm).all(axis=1)
+    for name, left_nm in (("was", residual_nm), ("what_if", residual_nm + moved_nm)):
+        if known.any():
+            found[f"true_{name}"] = rms(left_nm, known)
+        squares = np.full(left_nm.shape, np.nan)
+        for piece in np.split(np.arange(len(rows)), np.flatnonzero(run.missing)):
+            squares[piece] = left_all_the_time_nm2(disturbance_nm[piece], (left_nm - disturbance_nm)[piece])
+        there = rows & np.isfinite(squares).all(axis=1)
+        if there.any():
+            found[f"continuous_{name}"] = np.sqrt(squares[there].mean(axis=0))
+    return {name: found[name] for name in _TITLES if name in found}
+
+
 def render(figures: dict[str, Any]) -> str:
     """The figures of `what_if` as a table."""
     columns = [name for name in _TITLES if f"{name}_nm" in figures]
@@ -144,7 +167,11 @@ def render(figures: dict[str, Any]) -> str:
     if "tilt_was_mas" in figures:
         values = "".join(f"{figures[f'tilt_{name}_mas']:>16.2f}" for name in columns)
         lines.append(f"{'tilt per axis, mas':<28}{values}")
-    lines += ["", "measured with the sensor's noise where it does not say true; a linear sensor, no actuator limits"]
+    lines += [
+        "",
+        "measured with the sensor's noise where it does not say true; true: at the start of each exposure; all the "
+        "time: between these instants too, while the mirror holds; a linear sensor, no actuator limits",
+    ]
     lines += [f"warning: {warning}" for warning in figures["warnings"]]
     return "\n".join(lines)
 
