@@ -488,6 +488,7 @@ def test_the_promise_is_kept(method: str, preset: str, first: int, tmp_path: Pat
 
 
 @pytest.mark.slow
+@pytest.mark.timeout(1200)
 @pytest.mark.parametrize("snr", [70.0, 100.0])
 def test_the_promise_is_kept_at_the_default_and_with_halved_amplitudes(snr: float, tmp_path: Path) -> None:
     found = outcome("hadamard", "bench", 1, snr, tmp_path)
