@@ -192,15 +192,10 @@ def test_the_commands_say_what_they_did(night: Night) -> None:
     assert (status["run"], status["paused"], status["recording"]) == (night.name, False, "recording")
     paused, stopped = json.loads(said["while paused"]), json.loads(said["while stopped"])
     assert (paused["mode"], paused["paused"], stopped["recording"]) == ("open", True, "stopped")
-    assert json.loads(said["runs"])["runs"] == [
-        {
-            "run": night.name,
-            "mode": "closed",
-            "recording": "recording",
-            **{key: json.loads(said["runs"])["runs"][0][key] for key in ("rate_hz", "uptime_s", "processes", "log")},
-        }
-    ]
-    processes = [(one["process"], one["state"]) for one in json.loads(said["runs"])["runs"][0]["processes"]]
+    (run,) = json.loads(said["runs"])["runs"]
+    assert (run["run"], run["mode"], run["holding"], run["recording"]) == (night.name, "closed", None, "recording")
+    assert run.keys() == {"run", "mode", "holding", "rate_hz", "uptime_s", "processes", "recording", "log"}
+    processes = [(one["process"], one["state"]) for one in run["processes"]]
     names = ("camera", "controller", "mirror-dm", "recorder")
     assert [name for name, _ in processes] == list(names)
     assert all(name in said["hosts"] for name in names)
