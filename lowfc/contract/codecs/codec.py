@@ -6,7 +6,7 @@ from types import MappingProxyType
 import numpy as np
 from google.protobuf.message import DecodeError
 
-from lowfc.arrays import Array, Single
+from lowfc.arrays import Single
 from lowfc.contract.codecs.calibration_codec import camera_settings, decode_calibration, wire_camera
 from lowfc.contract.codecs.law_codec import law_header, law_of, wire_law
 from lowfc.contract.errors import BadMessageError
@@ -205,11 +205,9 @@ def _mirror_shape(state: wire.MirrorState) -> MirrorShape | None:
 MOST_BYTES = 16_000_000
 """Of any request; the bus loses one that is far larger."""
 _SMALL_BYTES = 8_000
-_OF_CHANNEL_BYTES = 4 * 128 * 128 + _SMALL_BYTES
-_NOTE_BYTES = 4 * MOST_TEXT + _SMALL_BYTES
 _MOST_BYTES = {
-    "channel": _OF_CHANNEL_BYTES,
-    "note": _NOTE_BYTES,
+    "channel": 4 * 128 * 128 + _SMALL_BYTES,
+    "note": 4 * MOST_TEXT + _SMALL_BYTES,
     "play": MOST_BYTES,
     "law": MOST_BYTES,
     "load": MOST_BYTES,
@@ -297,18 +295,6 @@ def encode_request(request: Request, reply: Reply, taken: int, state: wire.Contr
         play_id="" if played is None else played.id,
         lease_id=request.lease_id,
         calibration=None if request.calibration is None else wire.Calibration(id=request.calibration.id),
-    )
-    return message.SerializeToString()
-
-
-def encode_offload(step: Step, noll: tuple[int, ...], mean_nm: Array, frames: int) -> bytes:
-    """ModalOffload of the mean modal command (modes,) over some frames, of which the last one made `step`."""
-    message = wire.ModalOffload(
-        timestamp=timestamp(step.time_ns),
-        frame_sequence=step.frame_sequence,
-        noll=noll,
-        command_nm=mean_nm.tolist(),
-        frames=frames,
     )
     return message.SerializeToString()
 

@@ -24,7 +24,6 @@ from lowfc.control.loop.inputs import (
     MirrorShape,
     Outputs,
     PendingEvent,
-    Reply,
     Request,
     Step,
     Tick,
@@ -71,14 +70,11 @@ def _frame(settings: Settings, state: State, frame: Frame) -> tuple[State, Outpu
     state, drive = _arrive(state, frame, events)
     freed = False
     if state.conditions.lease is not None:
-        state, drive, freed = _lease_on_frame(state, drive, frame.sequence, events)
-    if drive is None or not drive.calibration.noll:
+        state, ended = lease_checked(state._replace(drive=drive), 0, frame.sequence)
+        events, drive, freed = [*events, *ended], state.drive, bool(ended)
+    if drive is None:
         return _refuse(settings, _newest(state, drive, frame), frame, Rejection.NO_CALIBRATION, events)
-    if state.conditions.camera_awaited:
-        return _refuse(settings, _newest(state, drive, frame), frame, Rejection.CAMERA_UNKNOWN, events)
-    if state.conditions.mirror_fault and state.mode is LoopMode.CLOSED:
-        return _refuse(settings, _newest(state, drive, frame), frame, Rejection.NO_MIRROR, events)
-    measured = _measure(settings, drive, frame)
+    measured = _measure(settings, state, drive, frame)
     if isinstance(measured, Rejection):
         return _refuse(settings, _newest(state, drive, frame), frame, measured, events)
     estimate, saturated = measured
@@ -96,8 +92,8 @@ def _frame(settings: Settings, state: State, frame: Frame) -> tuple[State, Outpu
     if reasons != state.limits_hit:
         _limit_events(state.limits_hit, reasons, events)
     mode, command_nm, commanded = state.mode, drive.history_nm[0], _commands(state)
-    steps_left, ended = max(state.steps_left - 1, 0), state.steps_left == 1
-    if ended:
+    steps_left, stepped = max(state.steps_left - 1, 0), state.steps_left == 1
+    if stepped:
         events += [PendingEvent("LOOP_STEPPED", {}), mode_event(mode, LoopMode.OPEN, STEPPED)]
     state = State(  # made anew: `_replace` takes four times as long
         mode,
@@ -115,11 +111,11 @@ def _frame(settings: Settings, state: State, frame: Frame) -> tuple[State, Outpu
         identical_frames=alike,
         conditions=state.conditions,
     )
-    if ended:
+    if stepped:
         state = in_mode(state, LoopMode.OPEN, frame.time_ns, STEPPED)
     step = Step(frame.sequence, frame.time_ns, mode, command_nm, reasons, error_nm, pol_nm, estimate.flux_dn, saturated)
     command = _command(state, drive, command_nm) if commanded else None
-    return state, Outputs(step, command, None, events, changed=ended or freed)
+    return state, Outputs(step, command, None, events, changed=stepped or freed)
 
 
 def _command(state: State, drive: ActiveLoop, command_nm: Single) -> Command:
@@ -158,15 +154,6 @@ def _arrive(state: State, frame: Frame, events: list[PendingEvent]) -> tuple[Sta
     return state, drive
 
 
-def _lease_on_frame(
-    state: State, drive: ActiveLoop | None, sequence: int, events: list[PendingEvent]
-) -> tuple[State, ActiveLoop | None, bool]:
-    """The state and the drive, without a lease and its probe sequence where it was not renewed in time; whether so."""
-    after, ended = lease_checked(state._replace(drive=drive), 0, sequence)
-    events += ended
-    return after, after.drive, bool(ended)
-
-
 def _awaiting_camera(state: State, frame: Frame) -> State:
     """The state, in which settings are awaited unless those that are known may be of the camera's present start."""
     camera = state.conditions.camera
@@ -179,9 +166,15 @@ def _newest(state: State, drive: ActiveLoop | None, frame: Frame) -> State:
     return state._replace(drive=drive, frame_timeout=False, frame_sequence=frame.sequence, frame_time_ns=frame.time_ns)
 
 
-def _measure(settings: Settings, drive: ActiveLoop, frame: Frame) -> tuple[Estimate, int] | Rejection:
+def _measure(settings: Settings, state: State, drive: ActiveLoop, frame: Frame) -> tuple[Estimate, int] | Rejection:
     """Modal errors of a frame and its saturated pixels, or why it cannot be used."""
     calibration = drive.calibration
+    if not calibration.noll:
+        return Rejection.NO_CALIBRATION
+    if state.conditions.camera_awaited:
+        return Rejection.CAMERA_UNKNOWN
+    if state.conditions.mirror_fault and state.mode is LoopMode.CLOSED:
+        return Rejection.NO_MIRROR
     if frame.pixels is None or frame.pixels.shape != calibration.shape:
         return Rejection.WRONG_SIZE
     if frame.age_ns > settings.max_frame_age_ns:
@@ -344,15 +337,6 @@ def _load(settings: Settings, state: State, load: Load) -> tuple[State, Outputs]
     return state, Outputs(events=events, changed=True)
 
 
-def _request(settings: Settings, state: State, request: Request) -> tuple[State, Outputs]:
-    answered = answer(settings, state, request)
-    reply = Reply(answered.accepted, answered.text, state.frame_sequence + 1)
-    changed = answered.state is not state
-    # Every request is counted, for its answer is in the log.
-    after = answered.state if changed else state._replace()
-    return after, Outputs(reply=reply, events=answered.events, changed=changed)
-
-
 def _limit_events(before: tuple[Reason, ...], now: tuple[Reason, ...], events: list[PendingEvent]) -> None:
     events.extend(PendingEvent("LIMIT_HIT", {"reason": reason.name}) for reason in now if reason not in before)
     events.extend(PendingEvent("LIMIT_CLEARED", {"reason": reason.name}) for reason in before if reason not in now)
@@ -365,7 +349,7 @@ def _counted(counts: Mapping[Reason, int], reasons: tuple[Reason, ...]) -> Mappi
 
 
 _HANDLERS: dict[type, Callable[..., tuple[State, Outputs]]] = {
-    Request: _request,
+    Request: answer,
     MirrorShape: mirror_reported,
     MirrorReport: mirror_judged,
     CameraSettings: camera_reported,

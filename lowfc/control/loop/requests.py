@@ -5,7 +5,6 @@ Each is applied whole, between two frames, or refused with a sentence and nothin
 
 from collections.abc import Callable
 from dataclasses import replace
-from typing import NamedTuple
 
 import numpy as np
 
@@ -14,8 +13,8 @@ from lowfc.control.laws.law import Law
 from lowfc.control.laws.margins import check_law
 from lowfc.control.laws.stability import highest_gain, limiting_gain
 from lowfc.control.loop.command_channels import FLAT, MIRROR, CommandChannels, Play, play_table
-from lowfc.control.loop.inputs import PendingEvent, Request
-from lowfc.control.loop.lease import ENDED_BY, asked_by, refusal
+from lowfc.control.loop.inputs import Outputs, PendingEvent, Reply, Request
+from lowfc.control.loop.lease import ENDED_BY, Lease, asked_by, refusal
 from lowfc.control.loop.loading import holding, in_mode, loaded, misfit, mode_event, uncalibrated
 from lowfc.control.loop.remarks import check_offset, remark
 from lowfc.control.loop.reservation import lease, lease_checked, lease_ended, release, renew
@@ -28,30 +27,15 @@ MOST_REPLY = 1000
 """Characters of a reply."""
 
 
-class Answer(NamedTuple):
-    """State after a request, whether it was accepted, the sentence about it, and the events it gave rise to."""
-
-    state: State
-    accepted: bool
-    text: str
-    events: tuple[PendingEvent, ...] = ()
-
-
-def answer(settings: Settings, state: State, request: Request) -> Answer:
-    """What a request does; a refused one changes nothing."""
-    handler = _HANDLERS.get(request.name)
-    if handler is None:
-        return Answer(state, False, _short(f"unknown request {request.name[:40]!r}; there are {', '.join(REQUESTS)}"))
+def answer(settings: Settings, state: State, request: Request) -> tuple[State, Outputs]:
+    """The state after a request, and its reply; a refused request changes nothing, and is counted all the same."""
     request = prepared(settings, request)
     now, ended = lease_checked(state, request.time_ns, 0)
     held = now.conditions.lease
-    refused = refusal(held, request.name, request.lease_id, request.time_ns) or request.refusal
-    if refused:
-        return Answer(state, False, _short(refused))
     try:
-        after, text, *events = handler(settings, now, request)
+        after, text, *events = _handler(request, held)(settings, now, request)
     except ValueError as error:
-        return Answer(state, False, _short(str(error)))
+        return state._replace(), Outputs(reply=Reply(False, _short(str(error)), state.frame_sequence + 1))
     if request.name == "safe" or (request.name in ENDED_BY and held is not None and held.id != request.lease_id):
         after, others = lease_ended(after, asked_by(held, request))
         events += others
@@ -61,7 +45,19 @@ def answer(settings: Settings, state: State, request: Request) -> Answer:
         events.append(mode_event(state.mode, after.mode, why))
         if after.mode is LoopMode.SAFE:
             events.append(PendingEvent("SAFED", {"why": why}))
-    return Answer(after, True, text, (*ended, *events))
+    changed = after is not state
+    reply = Reply(True, text, state.frame_sequence + 1)
+    return after if changed else state._replace(), Outputs(reply=reply, events=(*ended, *events), changed=changed)
+
+
+def _handler(request: Request, held: Lease | None) -> "Handler":
+    """What carries a request out; ValueError says why it is refused whatever the state of the loop."""
+    if request.name not in _HANDLERS:
+        raise ValueError(f"unknown request {request.name[:40]!r}; there are {', '.join(REQUESTS)}")
+    refused = refusal(held, request.name, request.lease_id, request.time_ns) or request.refusal
+    if refused:
+        raise ValueError(refused)
+    return _HANDLERS[request.name]
 
 
 def prepared(settings: Settings, request: Request) -> Request:

@@ -6,7 +6,6 @@ from collections import Counter
 import numpy as np
 
 from lowfc.adapters.bus.bus import Publisher
-from lowfc.contract.codecs import codec
 from lowfc.contract.codecs.calibration_codec import encode_calibration
 from lowfc.contract.codecs.law_codec import wire_law, wire_play
 from lowfc.contract.messages import timestamp, wire
@@ -69,7 +68,14 @@ class Offload:
         self._sum_nm += step.command_nm
         self._count += 1
         if self._count >= self._frames:
-            self._publisher.put(codec.encode_offload(step, noll, self._sum_nm / self._count, self._count))
+            message = wire.ModalOffload(
+                timestamp=timestamp(step.time_ns),
+                frame_sequence=step.frame_sequence,
+                noll=noll,
+                command_nm=(self._sum_nm / self._count).tolist(),
+                frames=self._count,
+            )
+            self._publisher.put(message.SerializeToString())
             self._sum_nm[:] = self._count = 0
 
 
