@@ -8,11 +8,10 @@ import numpy as np
 
 from lowfc.contract.codecs.calibration_codec import camera_settings, wire_camera
 from lowfc.contract.codecs.codec import wire_mode, wire_reasons
-from lowfc.contract.codecs.law_codec import command_channels_of, law_header, law_of, put_command_channels
+from lowfc.contract.codecs.law_codec import command_channels_of, gains_of, law_header, law_of, put_command_channels
 from lowfc.contract.messages import fields_of, floats, from_timestamp, timestamp, wire
 from lowfc.control.calibration.calibration import Calibration
 from lowfc.control.laws import linear_law
-from lowfc.control.laws.law import Law
 from lowfc.control.laws.linear_law import LinearLaw
 from lowfc.control.loop.command_channels import PlayTable
 from lowfc.control.loop.estimator import Estimate
@@ -32,10 +31,12 @@ _STATE = (
     *("input_number", "steps_left", "returning_to_zero", "identical_frames"),
 )
 _CONDITIONS = ("camera_awaited", "clear_id", "mode_cause", "mirror_fault")
+_LEASE = ("id", "holder", "last_sequence", "ended")
 
 
 def controller_state(state: State, settings: Settings, time_ns: int) -> wire.ControllerState:
     """Everything the next command depends on, besides the calibration."""
+    conditions, drive, estimate, lease = state.conditions, state.drive, state.estimate, state.conditions.lease
     message = wire.ControllerState(
         timestamp=timestamp(time_ns),
         frame_timestamp=timestamp(state.frame_time_ns),
@@ -45,47 +46,33 @@ def controller_state(state: State, settings: Settings, time_ns: int) -> wire.Con
         refused=wire_reasons((state.refused,))[0] if state.refused is not None else wire.REASON_UNSPECIFIED,
         limits_hit=wire_reasons(state.limits_hit),
         settings=_encode_settings(settings),
+        mode_timestamp=timestamp(conditions.mode_since_ns) if conditions.mode_since_ns else None,
+        camera=None if conditions.camera is None else wire_camera(conditions.camera),
+        lease=None if lease is None else wire.Lease(until=timestamp(lease.until_ns), **fields_of(lease, _LEASE)),
+        measured_nm=() if estimate is None else estimate.error_nm.tolist(),
+        flux_dn=0.0 if estimate is None else estimate.flux_dn,
         **fields_of(state, _STATE),
-        **fields_of(state.conditions, _CONDITIONS),
+        **fields_of(conditions, _CONDITIONS),
     )
-    conditions = state.conditions
-    if conditions.mode_since_ns:
-        message.mode_timestamp.CopyFrom(timestamp(conditions.mode_since_ns))
-    if conditions.camera is not None:
-        message.camera.CopyFrom(wire_camera(conditions.camera))
-    lease = conditions.lease
-    if lease is not None:
-        message.lease.CopyFrom(
-            wire.Lease(
-                id=lease.id,
-                holder=lease.holder,
-                until=timestamp(lease.until_ns),
-                last_sequence=lease.last_sequence,
-                ended=lease.ended,
-            )
-        )
-    if state.estimate is not None:
-        message.measured_nm.extend(state.estimate.error_nm.tolist())
-        message.flux_dn = state.estimate.flux_dn
-    if state.drive is not None:
-        if state.drive.command_channels is not None:
-            put_command_channels(message, state.drive.command_channels)
-        if state.drive.camera is not None:
-            message.camera_expected.CopyFrom(wire_camera(state.drive.camera))
-        following = state.drive.following
+    if drive is not None:
+        if drive.command_channels is not None:
+            put_command_channels(message, drive.command_channels)
+        if drive.camera is not None:
+            message.camera_expected.CopyFrom(wire_camera(drive.camera))
+        following = drive.following
         if following is not None:
             message.law.CopyFrom(law_header(following.law))
             message.law_state.extend(following.x.tolist())
             message.law_frames = following.frames
-        message.calibration_id = state.drive.calibration.id
-        message.calibration_provisional = state.drive.calibration.provisional
+        message.calibration_id = drive.calibration.id
+        message.calibration_provisional = drive.calibration.provisional
         if not message.calibration_id:
-            message.mirror_rows, message.mirror_columns = state.drive.calibration.grid
-        message.gain.extend(state.drive.law.gain.tolist())
-        message.leak.extend(state.drive.law.leak.tolist())
-        message.limit_nm.extend(state.drive.law.limit_nm.tolist())
-        message.command_history_nm.extend(np.concatenate(state.drive.history_nm).tolist())
-        message.actuators = state.drive.actuators_nm.tobytes()
+            message.mirror_rows, message.mirror_columns = drive.calibration.grid
+        message.gain.extend(drive.law.gain.tolist())
+        message.leak.extend(drive.law.leak.tolist())
+        message.limit_nm.extend(drive.law.limit_nm.tolist())
+        message.command_history_nm.extend(np.concatenate(drive.history_nm).tolist())
+        message.actuators = drive.actuators_nm.tobytes()
     return message
 
 
@@ -108,7 +95,7 @@ def decode_state(
         if calibration is None or calibration.id != message.calibration_id:
             raise ValueError(f"calibration {message.calibration_id[:12]} of the controller's state is not there")
         drive = ActiveLoop.at_rest(settings, calibration)
-        law = Law(*(np.array(values, np.float32) for values in (message.gain, message.leak, message.limit_nm)))
+        law = gains_of(message)
         history = np.array(message.command_history_nm, np.float32).reshape(len(drive.history_nm), -1)
         actuators = floats(message.actuators, *calibration.grid)
         if law.gain.shape != drive.law.gain.shape or history.shape[1] != len(calibration.noll):
@@ -138,17 +125,14 @@ def decode_state(
         conditions=Conditions(
             camera=camera_settings(message.camera) if message.HasField("camera") else None,
             mode_since_ns=from_timestamp(message.mode_timestamp),
-            lease=_lease(message.lease) if message.HasField("lease") else None,
+            lease=Lease(until_ns=from_timestamp(message.lease.until), **fields_of(message.lease, _LEASE))
+            if message.HasField("lease")
+            else None,
             **fields_of(message, _CONDITIONS),
         ),
         **fields_of(message, _STATE),
     )
     return settings, state
-
-
-def _lease(message: wire.Lease) -> Lease:
-    until_ns = from_timestamp(message.until)
-    return Lease(message.id, message.holder, until_ns, message.last_sequence, message.ended)
 
 
 def reason_counts(state: State) -> list[wire.ReasonCount]:
