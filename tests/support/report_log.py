@@ -49,12 +49,13 @@ METADATA = {"lowfc": {"lowfc": "0.1.0", "numpy": "2.0", "host": "bench", "run": 
 class Night:
     """Messages of a run, appended as it goes on; the disturbance of tip is a sine of 12 nm at 7 Hz."""
 
-    def __init__(self, *, truth: bool = True, calibration: Calibration = TOYS) -> None:
+    def __init__(self, *, truth: bool = True, calibration: Calibration = TOYS, **changes: object) -> None:
+        """A loop whose settings have some `changes`."""
         self.samples: list[Sample] = []
         self.truth = truth
         self.now_ns = START * 10**9
         self.calibration = calibration
-        self.settings = settings(gain=(0.4, 0.2))
+        self.settings = settings(**({"gain": (0.4, 0.2)} | changes))
         self._rng = np.random.default_rng(8)
         self._counts: dict[tuple[str, int], int] = {}
         self._camera_start = START
@@ -136,8 +137,10 @@ class Night:
         sent_ns = self.now_ns + late_ns
         self.samples.append(Sample(key, payload, sequence, sent_ns, sent_ns + 50_000))
 
-    def write(self, path: Path, *, finish: bool = True, config: bool = True, toml: str | None = None) -> Path:
-        """Write the log, finished or as a recorder that died leaves it; return where it is."""
+    def write(
+        self, path: Path, *, finish: bool = True, config: bool = True, toml: str | None = None, **more: str
+    ) -> Path:
+        """Write the log, finished (with `more` in the recorder's account) or as a recorder that died leaves it."""
         content = (Configuration().to_toml() if toml is None else toml).encode()
         attached = [Attachment("config.toml", "application/toml", content)] if config else []
         log = LogWriter(path, START * 10**9, METADATA, attached)
@@ -146,7 +149,7 @@ class Night:
             if not finish and number % 100 == 99:
                 log.flush()
         if finish:
-            return log.finish({"recording": {"messages": str(len(self.samples)), "messages_lost": "0"}})
+            return log.finish({"recording": {"messages": str(len(self.samples)), "messages_lost": "0"} | more})
         log.flush()
         log.abandon()
         return log.part

@@ -1,11 +1,12 @@
 """The error budget of a run's longest closed stretch, each term with the way it was obtained."""
 
+from dataclasses import replace
+
 import numpy as np
 
 from lowfc.arrays import Array, Mask
 from lowfc.control.laws.continuous import Timing
 from lowfc.control.laws.error_budget import SensorNoise, Term, lag, lag_under_noise, measurement_error, white_noise
-from lowfc.control.laws.spectra import Pieces
 from lowfc.programs.logs.report.closed_loop import (
     DISTURBANCE,
     ERROR,
@@ -76,16 +77,14 @@ def _terms(stretch: Stretch, spectra: Spectra | None, noise: SensorNoise | None)
             found[name] = (white_noise(law, one_nm), how if noise.total_nm.any() else "the simulation has no noise")
     if spectra is None:
         found["lag"] = (None, f"it takes {_TOO_SHORT}")
-    elif spectra.true is not None:
+    elif stretch.true:
         mean_nm = stretch.signal(DISTURBANCE).joined().mean(axis=0)
-        found["lag"] = (
-            lag(law, spectra.true[0], mean_nm, timing),
-            "spectrum of the true disturbance times the rejection",
-        )
+        how = "spectrum of the true disturbance times the rejection"
+        found["lag"] = (lag(law, spectra[DISTURBANCE], mean_nm, timing), how)
     else:
         mean_nm = stretch.signal(POL).joined().mean(axis=0)
         how = "pseudo-open-loop spectrum, its noise floor taken off, times the rejection"
-        found["lag"] = (lag_under_noise(law, spectra.measured[1], mean_nm, timing), how)
+        found["lag"] = (lag_under_noise(law, spectra[POL], mean_nm, timing), how)
     crosstalk, nonlinearity = _measurement_terms(stretch, noise)
     found["cross-talk and aliasing"] = crosstalk
     found["nonlinearity"] = nonlinearity
@@ -99,8 +98,8 @@ def _measurement_terms(stretch: Stretch, noise: SensorNoise | None) -> tuple[Ent
     elif noise is None:
         missing = _NO_CAMERA
     else:
-        error = stretch.signal(ERROR)
-        seen = _difference(error, stretch.signal(POL))
+        error, pol = stretch.signal(ERROR), stretch.signal(POL)
+        seen = replace(error, values=tuple(a - b for a, b in zip(error.values, pol.values, strict=True)))
         split = measurement_error(stretch.law, error, stretch.signal(RESIDUAL), seen, noise.total_nm)
     if split is None:
         nothing = (None, f"it takes {missing}")
@@ -108,10 +107,6 @@ def _measurement_terms(stretch: Stretch, noise: SensorNoise | None) -> tuple[Ent
     linear = "what of error less true residual follows linearly from a constant, the residual and the command"
     rest = "what is left of error less true residual, beyond the noise of a frame"
     return (split.crosstalk, f"{linear}, {_THROUGH}"), (split.nonlinearity, f"{rest}, {_THROUGH}")
-
-
-def _difference(one: Pieces, other: Pieces) -> Pieces:
-    return Pieces(tuple(a - b for a, b in zip(one.values, other.values, strict=True)), one.bridged)
 
 
 def _mean_square(values: Array) -> Term:

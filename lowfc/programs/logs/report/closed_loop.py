@@ -113,12 +113,8 @@ def groups_of(noll: tuple[int, ...]) -> dict[str, Mask]:
     return {name: mask for name, mask in masks.items() if mask.any()}
 
 
-@dataclass(frozen=True, slots=True)
-class Spectra:
-    """Spectra of all signals of a stretch; of disturbance and residual where the log has truth."""
-
-    measured: tuple[Spectrum, Spectrum]
-    true: tuple[Spectrum, Spectrum] | None
+Spectra = list[Spectrum]
+"""Of the signals of a stretch: error, pseudo-open-loop and, where the log has truth, disturbance and residual."""
 
 
 def spectra_of(stretch: Stretch | None) -> Spectra | None:
@@ -126,10 +122,7 @@ def spectra_of(stretch: Stretch | None) -> Spectra | None:
     if stretch is None:
         return None
     found = [spectrum(stretch.signal(number), stretch.law.rate_hz) for number in range(4 if stretch.true else 2)]
-    whole = [one for one in found if one is not None]
-    if len(whole) < len(found):
-        return None
-    return Spectra((whole[0], whole[1]), (whole[2], whole[3]) if stretch.true else None)
+    return [one for one in found if one is not None] or None  # all signals are equally long
 
 
 def spectra_figures(run: Run, stretch: Stretch | None, found: Spectra | None) -> Figures:
@@ -143,8 +136,8 @@ def spectra_figures(run: Run, stretch: Stretch | None, found: Spectra | None) ->
     groups = groups_of(calibration.noll if calibration is not None else ())
     noise = _noise_floor(run, stretch)
     return {
-        "segments": found.measured[0].segments,
-        "resolution_hz": found.measured[0].spacing_hz,
+        "segments": found[ERROR].segments,
+        "resolution_hz": found[ERROR].spacing_hz,
         "groups": [_group(name, mask, stretch.law, found, noise) for name, mask in groups.items()],
     }
 
@@ -155,7 +148,7 @@ def _group(name: str, modes: Mask, law: LinearLaw, found: Spectra, noise_nm2_hz:
     def total(one: Spectrum) -> Array:
         return np.asarray(one.power_nm2_hz[:, modes].sum(axis=1))
 
-    error, pol = found.measured
+    error, pol, *true = found
     frequency_hz = pol.frequency_hz
     passed = rejection(law, frequency_hz)[:, modes] ** 2
     columns = {
@@ -163,8 +156,8 @@ def _group(name: str, modes: Mask, law: LinearLaw, found: Spectra, noise_nm2_hz:
         "error": total(error),
         "error_predicted": (passed * pol.power_nm2_hz[:, modes]).sum(axis=1),
     }
-    if found.true is not None:
-        disturbance, residual = found.true
+    if true:
+        disturbance, residual = true
         left = (passed * disturbance.power_nm2_hz[:, modes]).sum(axis=1)
         columns |= {"disturbance": total(disturbance), "residual": total(residual), "disturbance_left": left}
         if noise_nm2_hz is not None:

@@ -9,8 +9,6 @@ import numpy as np
 from lowfc.programs.logs.report import course
 from lowfc.programs.logs.report.budget import budget_figures
 from lowfc.programs.logs.report.closed_loop import (
-    Spectra,
-    Stretch,
     groups_of,
     longest_stretch,
     spectra_figures,
@@ -28,11 +26,9 @@ _NOT_VERSIONS = ("host", "kernel", "processor", "processors", "cpu_features", "b
 
 @dataclass(frozen=True, slots=True)
 class Report:
-    """A run, what was worked out of it for drawings, and its figures."""
+    """A run and its figures."""
 
     run: Run
-    stretch: Stretch | None
-    spectra: Spectra | None
     figures: Figures
 
 
@@ -59,7 +55,7 @@ def report_of(run: Run) -> Report:
         "events": course.events(run),
         "requests": course.requests(run),
     }
-    return Report(run, stretch, spectra, {"verdict": verdict(figures)} | figures)
+    return Report(run, {"verdict": verdict(figures)} | figures)
 
 
 def _log(run: Run) -> Figures:

@@ -31,8 +31,9 @@ def what_if(
 
     from lowfc.adapters.logs.parts import WholeLog, the_one, titled
     from lowfc.adapters.process.progress import reading_bar
-    from lowfc.programs.logs.what_if.compare import render, wanted
+    from lowfc.programs.logs.what_if.compare import render
     from lowfc.programs.logs.what_if.compare import what_if as run
+    from lowfc.programs.logs.what_if.options import wanted
 
     asked = wanted(changes, config, calibration, controller)
     reader = WholeLog(log := the_one(logs), skip_damaged=True)

@@ -12,22 +12,19 @@ from lowfc.adapters.logs.reader import LogReader
 from lowfc.adapters.logs.recovery import no_end
 from lowfc.arrays import Array, Mask, Single
 from lowfc.contract.codecs.calibration_codec import identified
-from lowfc.contract.configuration import Configuration, load
 from lowfc.contract.errors import CalibrationError, ConfigurationError
 from lowfc.contract.messages import MIRROR_STATE
 from lowfc.control.calibration.calibration import ESTIMATORS, Calibration, reconstructor
 from lowfc.control.laws.continuous import left_all_the_time_nm2
 from lowfc.control.laws.law import Law
 from lowfc.control.laws.stability import limiting_gain
-from lowfc.control.laws.what_if import Controller, as_logged, counterfactual, rms
+from lowfc.control.laws.what_if import as_logged, counterfactual, rms
 from lowfc.control.loop.safety import Limit
 from lowfc.optics.chain.zernike import mode_name
 from lowfc.optics.detector.photometry import tilt_nm_per_mas
-from lowfc.programs.logs.what_if.options import LAW_KEYS, TILTS, WhatIf, law, user_controller, wanted
+from lowfc.programs.cli.result import table
+from lowfc.programs.logs.what_if.options import LAW_KEYS, TILTS, WhatIf, law
 from lowfc.programs.logs.what_if.run import LoggedRun
-
-__all__ = ["WhatIf", "render", "wanted", "what_if"]
-
 
 LINEAR_WAVES = 5 * tilt_nm_per_mas(2.0) / 550
 """Rms of a mode up to which the sensor is taken as linear: 5 mas of tilt with 2 m at 550 nm, 0.022 waves."""
@@ -59,19 +56,17 @@ def what_if(log: LogReader, what: WhatIf) -> dict[str, Any]:
 
     Raises:
         DataFileError: the log cannot be read, or has too little in it.
-        ConfigurationError: what shall be different makes no sense.
+        ConfigurationError: a figure is out of range, or an estimator needs more than the log has.
         CalibrationError: the other calibration does not fit the log, or the reconstructor cannot be made.
     """
-    config = load(what.config) if what.config is not None else None
-    own = user_controller(what.controller) if what.controller is not None else None
-    return compared(LoggedRun(read_history(log)), what, config, own)
+    return compared(LoggedRun(read_history(log)), what)
 
 
-def compared(run: LoggedRun, what: WhatIf, config: Configuration | None, own: Controller | None) -> dict[str, Any]:
-    """As `what_if`, for a run that has been read, with the configuration and the controller that are asked for."""
-    noll = run.calibration.noll
-    after = law(what, config, noll, run.law)
-    calibration = _calibration(what, config, run)
+def compared(run: LoggedRun, what: WhatIf) -> dict[str, Any]:
+    """As `what_if`, for a run that has been read."""
+    own, noll = what.step, run.calibration.noll
+    after = law(what, noll, run.law)
+    calibration = _calibration(what, run)
 
     was_nm, seen_nm = run.steps.error_nm, run.seen_nm
     if calibration is run.calibration:
@@ -148,35 +143,35 @@ def _true(run: LoggedRun, rows: Mask, moved_nm: Single) -> dict[str, Array]:
 def render(figures: dict[str, Any]) -> str:
     """The figures of `what_if` as a table."""
     columns = [name for name in _TITLES if f"{name}_nm" in figures]
-    gains = all("gain" in mode for mode in figures["modes"])  # a controller of one's own has none
+
+    def row(title: str, values: dict[str, Any], key: str, gain: str = "") -> list[str]:
+        return [title, *(f"{values[key.format(name)]:.2f}" for name in columns), gain]
+
+    modes = [
+        row(f"{mode['noll']:>3} {mode['name']}", mode, "{}_nm", "{gain_was:.3g} -> {gain:.3g}".format(**mode))
+        if "gain" in mode  # a controller of one's own has none
+        else row(f"{mode['noll']:>3} {mode['name']}", mode, "{}_nm")
+        for mode in figures["modes"]
+    ]
+    rows = [*modes, row("all modes", figures, "{}_nm")]
+    if "tilt_was_mas" in figures:
+        rows.append(row("tilt per axis, mas", figures, "tilt_{}_mas"))
     lines = [
         f"{figures['frames_compared']} of {figures['frames']} frames compared: {figures['compared']}, after "
         f"{figures['settling_s']:.2g} s to settle; {figures['frames_refused']} were refused, "
         f"{figures['frames_saturated']} saturated, {figures['frames_missing']} missing",
         f"delay {figures['delay_frames']:.2f} frames, {figures['estimator']} reconstructor, {figures['controller']}",
         "",
-        f"{'residual, nm rms':<28}"
-        + "".join(f"{_TITLES[name]:>16}" for name in columns)
-        + (f"{'gain':>16}" if gains else ""),
-    ]
-    for mode in figures["modes"]:
-        gain = f"{mode['gain_was']:.3g} -> {mode['gain']:.3g}" if gains else ""
-        values = "".join(f"{mode[f'{name}_nm']:>16.2f}" for name in columns)
-        lines.append(f"{mode['noll']:>3} {mode['name']:<24}{values}" + (f"{gain:>16}" if gains else ""))
-    lines.append(f"{'all modes':<28}" + "".join(f"{figures[f'{name}_nm']:>16.2f}" for name in columns))
-    if "tilt_was_mas" in figures:
-        values = "".join(f"{figures[f'tilt_{name}_mas']:>16.2f}" for name in columns)
-        lines.append(f"{'tilt per axis, mas':<28}{values}")
-    lines += [
+        *table(["residual, nm rms", *(_TITLES[name] for name in columns), "gain"], rows),
         "",
         "measured with the sensor's noise where it does not say true; true: at the start of each exposure; all the "
         "time: between these instants too, while the mirror holds; a linear sensor, no actuator limits",
+        *(f"warning: {warning}" for warning in figures["warnings"]),
     ]
-    lines += [f"warning: {warning}" for warning in figures["warnings"]]
     return "\n".join(lines)
 
 
-def _calibration(what: WhatIf, config: Configuration | None, run: LoggedRun) -> Calibration:
+def _calibration(what: WhatIf, run: LoggedRun) -> Calibration:
     """The calibration of the what-if; the very one of the log where it is no other."""
     calibration, estimator = run.calibration, what.estimator
     if what.calibration is not None:
@@ -187,13 +182,13 @@ def _calibration(what: WhatIf, config: Configuration | None, run: LoggedRun) -> 
             got, expected = getattr(calibration, name), getattr(run.calibration, name)
             if got != expected:
                 raise CalibrationError(f"{what.calibration}: its {name} is {got}, in the log it is {expected}")
-    elif estimator is None and config is not None:
-        estimator = "+".join((config.control.estimator, *config.control.nuisance))
+    elif estimator is None and what.config is not None:
+        estimator = "+".join((what.config.control.estimator, *what.config.control.nuisance))
     if estimator in (None, calibration.estimator):
         return run.calibration if calibration.id == run.calibration.id else calibration
     if estimator not in ESTIMATORS:
         raise ConfigurationError(
-            f"{what.config}: {estimator}: what is fitted along with the modes needs the sensor's optics; leave out "
+            f"--config: {estimator}: what is fitted along with the modes needs the sensor's optics; leave out "
             "control.nuisance, or make that calibration and name it with --calibration"
         )
     return _reconstructed(calibration, estimator, run)
