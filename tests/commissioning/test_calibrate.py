@@ -12,7 +12,7 @@ import numpy.typing as npt
 import pytest
 
 from lowfc.adapters.files import factory
-from lowfc.client import mirror_watch
+from lowfc.client import Answer, mirror_watch
 from lowfc.contract.configuration import Configuration, load
 from lowfc.contract.errors import BusError, CalibrationError, DataFileError
 from lowfc.contract.events import EVENTS
@@ -25,7 +25,7 @@ from lowfc.programs.commissioning.calibrate import recording
 from lowfc.programs.commissioning.calibrate.pokes import CalibrationRequest
 from lowfc.programs.commissioning.calibrate.result import Verdict, computed_noise_nm, judge, measured_calibration
 from lowfc.programs.commissioning.calibrate.run import CalibrationData, Calibrator, go_on, keep, partial_of
-from tests.support.folded_loop import FoldedLoop, Given
+from tests.support.folded_loop import FoldedLoop
 
 OUT = Path("night.fits")
 BRIGHT = {
@@ -158,7 +158,7 @@ class Interrupting(FoldedLoop):
 
     plays = 0
 
-    def play(self, basis_nm: npt.ArrayLike, table: npt.ArrayLike) -> Given:
+    def play(self, basis_nm: npt.ArrayLike, table: npt.ArrayLike) -> Answer:
         given = super().play(basis_nm, table)
         self.plays += 1
         if self.plays == 3:
@@ -214,14 +214,14 @@ class Meddled(FoldedLoop):
         super().__init__(configured(**FEW))
         self._name, self._fields, self._mute = name, fields, mute
 
-    def play(self, basis_nm: npt.ArrayLike, table: npt.ArrayLike) -> Given:
+    def play(self, basis_nm: npt.ArrayLike, table: npt.ArrayLike) -> Answer:
         given = super().play(basis_nm, table)
         self.run(50)
         self.ask(self._name, **self._fields)
         return given
 
-    def stop(self) -> Given:
-        given = super().stop()
+    def stop(self) -> Answer:
+        given = self.ask("stop")
         if self._mute:
             raise BusError("no answer")
         return given
@@ -309,7 +309,7 @@ class Struck(FoldedLoop):
         self._play, self._strike, self._heal = play, strike, heal
         super().__init__(configured(**FEW))
 
-    def play(self, basis_nm: npt.ArrayLike, table: npt.ArrayLike) -> Given:
+    def play(self, basis_nm: npt.ArrayLike, table: npt.ArrayLike) -> Answer:
         given = super().play(basis_nm, table)
         self.begun.append(len(self.surfaces_nm))
         if len(self.begun) == self._play:

@@ -46,25 +46,15 @@ CONFIG = {
 }
 
 
-class Connected(FoldedLoop):
-    """A loop that commands connect to."""
-
-    def __enter__(self) -> "Connected":
-        return self
-
-    def __exit__(self, *what: object) -> None:
-        pass
-
-
 @pytest.fixture
-def loop(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Connected:
+def loop(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> FoldedLoop:
     monkeypatch.chdir(tmp_path)
-    made = Connected(load(None, CONFIG), world=load(None, CONFIG | {"disturbance.static_nm": {"4": 6.0}}))
+    made = FoldedLoop(load(None, CONFIG), world=load(None, CONFIG | {"disturbance.static_nm": {"4": 6.0}}))
     connect(made, monkeypatch)
     return made
 
 
-def connect(loop: Connected, monkeypatch: pytest.MonkeyPatch) -> None:
+def connect(loop: FoldedLoop, monkeypatch: pytest.MonkeyPatch) -> None:
     for module in (calibrate_commands, calibrate_align):
         monkeypatch.setattr(module, "Client", lambda run: loop)
 
@@ -77,7 +67,7 @@ def told(*words: str) -> dict[str, Any]:
     return found
 
 
-class OfAnotherVersion(Connected):
+class OfAnotherVersion(FoldedLoop):
     """Its controller has a key that this version does not know."""
 
     def configuration(self) -> str:
@@ -103,7 +93,7 @@ def toml(config: Configuration) -> str:
 
 
 def test_a_calibration_is_written_once_it_is_whole_and_used_and_its_figures_are_told(
-    loop: Connected, monkeypatch: pytest.MonkeyPatch
+    loop: FoldedLoop, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def fail(*what: object) -> None:
         raise CalibrationError("a limit of the mirror acted on the pokes")
@@ -137,7 +127,7 @@ def test_a_calibration_is_written_once_it_is_whole_and_used_and_its_figures_are_
     assert "largest cross-talk" in done.stdout
 
 
-def test_what_is_kept_is_named_where_a_calibration_ends_badly(loop: Connected, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_what_is_kept_is_named_where_a_calibration_ends_badly(loop: FoldedLoop, monkeypatch: pytest.MonkeyPatch) -> None:
     def stop(*what: object) -> None:
         raise KeyboardInterrupt
 
@@ -153,7 +143,7 @@ def test_what_is_kept_is_named_where_a_calibration_ends_badly(loop: Connected, m
 def test_a_bad_calibration_is_written_not_loaded_and_told(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.chdir(tmp_path)
     faint = load(None, CONFIG | {"star.magnitude": 5.0})
-    loop = Connected(faint)
+    loop = FoldedLoop(faint)
     connect(loop, monkeypatch)
     before = loop.calibration()
     words = ["--cycles", "4", "--out", "night.fits", "--no-linear-range", "--load"]
@@ -173,7 +163,7 @@ def test_a_bad_calibration_is_written_not_loaded_and_told(monkeypatch: pytest.Mo
     assert done.stdout.endswith("it is not loaded\n")
 
 
-def test_frames_that_changed_meanwhile_show_in_the_verdict(loop: Connected, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_frames_that_changed_meanwhile_show_in_the_verdict(loop: FoldedLoop, monkeypatch: pytest.MonkeyPatch) -> None:
     own, expose = Calibrator.check, loop._scene.expose
 
     def shifted(index: int, surface_nm: np.ndarray) -> Any:
@@ -190,7 +180,7 @@ def test_frames_that_changed_meanwhile_show_in_the_verdict(loop: Connected, monk
     assert "cross-talk on frames that were not used for it" in json.loads(done.stdout)["faults"][0]
 
 
-def test_the_time_to_go_has_everything_in_it(loop: Connected) -> None:
+def test_the_time_to_go_has_everything_in_it(loop: FoldedLoop) -> None:
     done = CliRunner().invoke(calibrate_app, ["--method", "poke", "--cycles", "4", "--out", "night.fits"])
     assert done.exit_code == 0, done.output
     said = next(line for line in done.stderr.splitlines() if "to go" in line)
@@ -219,7 +209,7 @@ def test_without_a_terminal_a_line_every_10_s() -> None:
     assert len(said) == 4
 
 
-def test_the_reference_is_the_present_state(loop: Connected) -> None:
+def test_the_reference_is_the_present_state(loop: FoldedLoop) -> None:
     found = told("reference", "--frames", "200", "--out", "there.fits")
     shift = dict(zip(found["noll"], found["reference_shift_nm"], strict=True))
     assert shift[4] == pytest.approx(6.0, abs=0.6)
@@ -228,7 +218,7 @@ def test_the_reference_is_the_present_state(loop: Connected) -> None:
     assert np.array_equal(made.response, loop.calibration().response)
 
 
-def test_a_dark_finds_bad_pixels_and_is_not_taken_in_light(loop: Connected, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_dark_finds_bad_pixels_and_is_not_taken_in_light(loop: FoldedLoop, monkeypatch: pytest.MonkeyPatch) -> None:
     with pytest.raises(CalibrationError, match=r"not dark: .*; block the star|not dark"):
         told("dark", "--dark-taken", "--frames", "50")
     rng = np.random.default_rng(5)
@@ -259,14 +249,14 @@ def test_a_dark_finds_bad_pixels_and_is_not_taken_in_light(loop: Connected, monk
             with pytest.raises(DataFileError, match=f"^{file}: .*{why}") as caught:
                 told(command, "--file", file)
             assert "\n" not in str(caught.value)
-    dark = Connected(load(None, CONFIG), world=load(None, CONFIG | {"star.magnitude": 20.0}))
+    dark = FoldedLoop(load(None, CONFIG), world=load(None, CONFIG | {"star.magnitude": 20.0}))
     connect(dark, monkeypatch)
     found = told("dark", "--dark-taken", "--frames", "50", "--out", "night.fits")
     assert found["dark_dn"] == pytest.approx(100, abs=0.5)
     assert found["hot"] < 5
 
 
-def test_a_sensor_that_lies_otherwise_gets_the_computed_calibration_on_its_pixels(loop: Connected) -> None:
+def test_a_sensor_that_lies_otherwise_gets_the_computed_calibration_on_its_pixels(loop: FoldedLoop) -> None:
     before = loop.calibration()
     geometry = Geometry(1.08, 44.0, 47.5, 12.0, -1)
     light = 3e5 * onto(before.reference.astype(float).reshape(80, 80), geometry, (90, 96)) + 3
@@ -285,14 +275,14 @@ def test_a_sensor_that_lies_otherwise_gets_the_computed_calibration_on_its_pixel
     assert np.diag(turned.reconstructor.astype(float) @ H).max() < -0.9
 
 
-def test_pokes_tell_the_half_turn(loop: Connected) -> None:
+def test_pokes_tell_the_half_turn(loop: FoldedLoop) -> None:
     found = told("align", "--out", "aligned.fits", "--frames", "200")
     assert found["half_turn_known"]
     made = calibration_file.load(Path("aligned.fits"))
     assert np.abs(cross_talk(made.reconstructor, loop.calibration().response)).max() < 0.05
 
 
-def test_a_computed_calibration_may_leave_combinations_out(loop: Connected) -> None:
+def test_a_computed_calibration_may_leave_combinations_out(loop: FoldedLoop) -> None:
     config = toml(loop.config)
     found = told("--method", "analytic", "--config", config, "--out", "all.fits")
     assert found["kept"] == [1.0] * 6
@@ -306,7 +296,7 @@ def test_a_computed_calibration_may_leave_combinations_out(loop: Connected) -> N
     assert "no regularisation needed" in done.stdout
 
 
-def test_a_computed_calibration_may_be_of_another_wavefront(loop: Connected) -> None:
+def test_a_computed_calibration_may_be_of_another_wavefront(loop: FoldedLoop) -> None:
     config = toml(loop.config)
     told("--method", "analytic", "--config", config, "--out", "flat.fits")
     told("--method", "analytic", "--config", config, "--out", "there.fits", "--at", "4=15,7=-10")
@@ -329,7 +319,7 @@ def test_a_computed_calibration_may_be_of_another_wavefront(loop: Connected) -> 
         ("--at 4=15", "--at goes with --method analytic"),
     ],
 )
-def test_an_option_that_would_be_of_no_effect_is_refused(loop: Connected, words: str, why: str) -> None:
+def test_an_option_that_would_be_of_no_effect_is_refused(loop: FoldedLoop, words: str, why: str) -> None:
     before = {path.name for path in Path().iterdir()}
     with pytest.raises(ConfigurationError, match=why):
         CliRunner().invoke(calibrate_app, words.split(), catch_exceptions=False)
@@ -344,7 +334,7 @@ def test_the_help_says_how_large_pokes_are() -> None:
     assert f"within {100 * tolerance:g} % of 1" in said
 
 
-def test_calibrations_of_different_sensors_are_not_compared(loop: Connected) -> None:
+def test_calibrations_of_different_sensors_are_not_compared(loop: FoldedLoop) -> None:
     one = loop.calibration()
     calibration_file.save(one, Path("one.fits"))
     other = replace(

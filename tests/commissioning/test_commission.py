@@ -137,7 +137,7 @@ def test_it_goes_on_where_it_was_interrupted(tmp_path: Path) -> None:
     bench.loop.ask("release", lease_id=1)
     assert first_of(bench.out).exists()
     assert "without a verdict" in bench.shown
-    assert "has no verdict" in bench.loop.ask("close", lease_id=0).text
+    assert "has no verdict" in bench.loop.ask("close", lease_id=0).reply
     bench.loop.ask("open", lease_id=0)
     bench.said.clear()
     bench.commission(resume=True, close=False)

@@ -6,7 +6,7 @@ from collections import deque
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -15,8 +15,8 @@ from lowfc.adapters.bus.bus import Publisher
 from lowfc.adapters.files import factory
 from lowfc.adapters.process.clock import HostClock
 from lowfc.arrays import Array, Single
+from lowfc.client import Answer, Client, MirrorWatch
 from lowfc.client import Frame as Image
-from lowfc.client import MirrorWatch
 from lowfc.contract.codecs.state_codec import controller_state
 from lowfc.contract.configuration import Configuration
 from lowfc.contract.errors import CalibrationError, RequestRefusedError
@@ -26,7 +26,6 @@ from lowfc.control.laws.linear_law import LinearLaw
 from lowfc.control.laws.stability import delay_weights
 from lowfc.control.loop.advance import advance
 from lowfc.control.loop.camera import CameraSettings
-from lowfc.control.loop.command_channels import MIRROR
 from lowfc.control.loop.inputs import Frame, Input, Load, MirrorShape, Request, Step
 from lowfc.control.loop.state import State
 from lowfc.testing.memory_bus import MemoryBus, MemoryHub, MemoryRing
@@ -42,12 +41,6 @@ FIRST = 1 << 32
 def computed(toml: str) -> Calibration:
     config = Configuration.model_validate(tomllib.loads(toml))
     return calibrated(config)
-
-
-class Given(NamedTuple):
-    frame_sequence: int
-    state: wire.ControllerState | None
-    text: str
 
 
 class Reservation:
@@ -70,8 +63,8 @@ class OperatorBus(MemoryBus):
         return ring
 
 
-class FoldedLoop:
-    """Camera, controller and mirror, one frame after the other.
+class FoldedLoop(Client):
+    """Camera, controller and mirror, one frame after the other, as a client of theirs sees them.
 
     Attributes:
         hub: on which the mirror's process reports.
@@ -151,24 +144,32 @@ class FoldedLoop:
         for _ in range(frames):
             self.expose()
 
-    def ask(self, name: str, **fields: Any) -> Given:
+    def ask(self, name: str, modes: Any = (), values: Any = (), **fields: Any) -> Answer:
         """A request, carried out before the next frame."""
-        fields = {"lease_id": self.lease_id, **fields}
-        self._state, outputs = advance(self._settings, self._state, Request(0, name, **fields))
+        fields = {"lease_id": self.lease_id} | {key: value for key, value in fields.items() if value is not None}
+        if "actuators_nm" in fields:
+            fields["actuators_nm"] = fields["actuators_nm"].reshape(-1)
+        if name == "stop":
+            self.stops += 1
+        numbers = tuple(np.atleast_1d(np.asarray(values, float)).tolist())
+        asked = Request(0, name, tuple(np.atleast_1d(modes).tolist()) if np.size(modes) else (), numbers, **fields)
+        self._state, outputs = advance(self._settings, self._state, asked)
         if not outputs.reply.accepted:
             raise RequestRefusedError(f"{name} refused: {outputs.reply.text}")
         state = controller_state(self._state, self._settings, 0) if name == "status" else None
-        return Given(outputs.reply.frame_sequence, state, outputs.reply.text)
+        return Answer(True, outputs.reply.text, outputs.reply.frame_sequence, state=state)
 
-    def play(self, basis_nm: npt.ArrayLike, table: npt.ArrayLike) -> Given:
+    def play(self, basis_nm: npt.ArrayLike, table: npt.ArrayLike) -> Answer:
         self.expose()  # time goes on while somebody asks
-        basis = np.asarray(basis_nm, np.float32)
-        return self.ask("play", text=MIRROR, actuators_nm=basis.reshape(-1), table=np.asarray(table, np.float32))
+        return super().play(basis_nm, table)
+
+    def disconnect(self) -> None:
+        """It goes on."""
 
     @contextlib.contextmanager
     def reserved(self, purpose: str, duration_s: float | None = None) -> Iterator[Reservation]:
         self.lease_id = 1
-        self.ask("lease", values=(60.0,), text=purpose)
+        self.ask("lease", values=60.0, text=purpose)
         try:
             yield Reservation()
         finally:
@@ -178,25 +179,9 @@ class FoldedLoop:
     def check_lease(self) -> None:
         if self.lease_id:
             try:
-                self.ask("renew", values=(60.0,), text="a test")
+                self.ask("renew", values=60.0, text="a test")
             except RequestRefusedError as fault:
                 raise CalibrationError(str(fault)) from None
-
-    def status(self) -> Given:
-        return self.ask("status")
-
-    def open_loop(self) -> Given:
-        return self.ask("open")
-
-    def close_loop(self) -> Given:
-        return self.ask("close")
-
-    def stop(self) -> Given:
-        self.stops += 1
-        return self.ask("stop")
-
-    def load(self, calibration: Calibration) -> Given:
-        return self.ask("load", calibration=calibration)
 
     def calibration(self) -> Calibration:
         return self._state.drive.calibration
