@@ -1,4 +1,4 @@
-"""The acceptance tests on the simulated optics without a bus: what passes, what does not, and what is said of it."""
+"""The acceptance tests on a loop in one process: what passes, what does not, and what is said of it."""
 
 from dataclasses import replace
 from typing import Any
@@ -6,41 +6,26 @@ from typing import Any
 import numpy as np
 import pytest
 
-from lowfc.adapters.files import factory
 from lowfc.adapters.files.drawing import figure_class, png
-from lowfc.arrays import Single
 from lowfc.contract.configuration import Acceptance, Configuration, load
 from lowfc.contract.errors import ConfigurationError
 from lowfc.contract.messages import wire
-from lowfc.control.calibration.calibration import Calibration
-from lowfc.control.calibration.excitation import climb, led_in, lines, multisine
-from lowfc.control.calibration.linearity import levels
-from lowfc.control.laws.stability import delay_weights
-from lowfc.control.loop.advance import advance
-from lowfc.control.loop.inputs import Frame, Load, Request
+from lowfc.control.laws.linear_law import integrator_block, of_blocks
 from lowfc.control.loop.safety import Limit, LoopMode
-from lowfc.control.loop.state import State
-from lowfc.programs.commissioning.acceptance import capture as acceptance_capture
-from lowfc.programs.commissioning.acceptance import linearity as acceptance_linearity
-from lowfc.programs.commissioning.acceptance import noise as acceptance_noise
-from lowfc.programs.commissioning.acceptance import rejection as acceptance_rejection
+from lowfc.programs.commissioning.acceptance import capture, linearity, noise, rejection
+from lowfc.programs.commissioning.acceptance.live import Live
 from lowfc.programs.commissioning.acceptance.played import (
     AcceptanceError,
     AcceptanceResult,
-    Loop,
     Played,
     _announced,
     chosen,
 )
-from sim_camera.bench import Bench
-from sim_camera.process import bench
+from tests.support.folded_loop import FoldedLoop
 from tests.support.loops import lowfc
-from tools.law_bench import calibrated
 
 REQUIRED = Acceptance(lowest_hz=2.0)
-RATE_HZ = 250.0
-GRID = (34, 34)
-LEAD, PERIOD = 60, 750
+MULTISINE = rejection.Excitation(duration_s=3.0, rms_nm=3.0, lines_per_mode=8, modes=(), seed=1)
 
 
 def configured(**changes: object) -> Configuration:
@@ -48,65 +33,14 @@ def configured(**changes: object) -> Configuration:
     return load(None, usual | {key.replace("__", "."): value for key, value in changes.items()})
 
 
-@pytest.fixture(scope="module")
-def calibration() -> Calibration:
-    return calibrated(configured())
-
-
-def played(
-    config: Configuration,
-    calibration: Calibration,
-    mode: LoopMode,
-    what: dict[str, Any],
-    table: Single,
-    basis: Single | None = None,
-) -> Played:
-    """What the simulated loop did while a table was played, on the offset or with the shapes in `basis`."""
-    settings = replace(factory.settings(config), start_mode=mode)
-    state, _ = advance(settings, State(), Load(0, calibration, "test"))
-    scene: Bench = bench(config)
-    weights = delay_weights(settings.delay_frames).astype(np.float32)
-    shapes = [np.zeros(GRID, np.float32)] * len(weights)
-    start, first = 1_700_000_000 << 32, 2
-    found = []
-    for count in range(1, first + len(table)):
-        if count == first:
-            shape = np.zeros(0, np.float32) if basis is None else basis.reshape(-1)
-            target = "offset" if basis is None else "mirror"
-            asked = Request(0, "play", text=target, table=table, actuators_nm=shape)
-            state, outputs = advance(settings, state, asked)
-            assert outputs.reply.accepted, outputs.reply.text
-        seen = np.zeros(GRID, np.float32)
-        for weight, shape in zip(weights, shapes, strict=True):
-            seen += weight * shape
-        pixels, _ = scene.expose(count, seen)
-        state, outputs = advance(settings, state, Frame(start | count, count * config.period_ns, 0, pixels))
-        shapes = [outputs.command.actuators_nm, *shapes[:-1]]
-        if count >= first:
-            found.append(outputs.step)
-    steps = [step for step in found if step is not None]
-    loop = Loop(settings.law(calibration.noll), calibration.noll, settings.delay_frames, RATE_HZ)
-    error_nm, pol_nm, command_nm = (
-        np.array([getattr(step, name) for step in steps], float) for name in ("error_nm", "pol_nm", "command_nm")
-    )
-    return Played(
-        what,
-        loop,
-        "offset" if basis is None else "mirror",
-        table,
-        np.zeros((0, 0), np.float32) if basis is None else basis,
-        error_nm,
-        pol_nm,
-        command_nm,
-        np.array([step.mode for step in steps], np.uint8),
-        np.array([sum(1 << reason for reason in step.reasons) for step in steps], np.int64),
-    )
-
-
-def rejection_of(config: Configuration, calibration: Calibration, basis: Single | None = None) -> Played:
-    places = lines(PERIOD, 3, 8, REQUIRED.lowest_hz / RATE_HZ, REQUIRED.highest_of_rate)
-    table = led_in(multisine(PERIOD, places, 3.0, 1), LEAD)
-    return played(config, calibration, LoopMode.CLOSED, {"period_frames": PERIOD}, table, basis)
+def played(loop: FoldedLoop, test: Any, *how: Any) -> list[Played]:
+    """What a loop did while a test was carried out on it; it is left as it was."""
+    live = Live(loop, lambda *_: None)
+    found = loop.status().state.mode
+    with loop.reserved("a test"), live.kept():
+        every = test.play(live, *how)
+    assert loop.status().state.mode == found
+    return every
 
 
 def drawn(module: Any, result: AcceptanceResult) -> bytes:
@@ -116,34 +50,38 @@ def drawn(module: Any, result: AcceptanceResult) -> bytes:
 
 
 @pytest.mark.parametrize("delay_frames", [1.0, 1.5, 2.0])
-def test_the_rejection_of_the_simulated_bench_is_the_theorys(calibration: Calibration, delay_frames: float) -> None:
-    config = configured(camera__delay_frames=delay_frames)
-    one = rejection_of(config, calibration)
-    found = acceptance_rejection.judge([one], REQUIRED)
+def test_the_rejection_of_the_simulated_bench_is_the_theorys(delay_frames: float) -> None:
+    (one,) = played(FoldedLoop(configured(camera__delay_frames=delay_frames)), rejection, MULTISINE, REQUIRED)
+    found = rejection.judge([one], REQUIRED)
     assert found.passed, found.text()
+    assert found.injected == "offset"
     assert found.largest_departure_db < 1.0
     assert found.lines_judged > 0.7 * found.lines == 0.7 * 24
     assert found.lowest_hz >= 2.0
     assert found.highest_hz == pytest.approx(75, rel=0.05)
     wrong = replace(one, loop=replace(one.loop, delay_frames=delay_frames + 1))
-    failed = acceptance_rejection.judge([wrong], REQUIRED)
+    failed = rejection.judge([wrong], REQUIRED)
     assert not failed.passed
     assert "FAILED" in failed.text()
-    strict = acceptance_rejection.judge([one], Acceptance(rejection_db=1e-4))
+    strict = rejection.judge([one], Acceptance(rejection_db=1e-4))
     assert not strict.passed
     assert "too noisy" in strict.text()
 
 
-def test_a_multisine_on_the_mirror_measures_the_same(calibration: Calibration) -> None:
-    basis = np.ascontiguousarray(calibration.modes_to_actuators.T)
-    found = acceptance_rejection.judge([rejection_of(configured(), calibration, basis)], REQUIRED)
-    assert found.injected == "mirror"
+def test_under_a_law_of_pseudo_open_loop_modes_the_multisine_is_on_the_mirror() -> None:
+    loop = FoldedLoop(configured())
+    loop.law(of_blocks([integrator_block(0.3, 0.001, "pol", 1.0)] * 3, "pol", "leaky", (2, 3, 4), 1.0, 250.0))
+    found = rejection.judge(played(loop, rejection, MULTISINE, REQUIRED), REQUIRED)
+    assert (found.injected, found.law) == ("mirror", "leaky")
     assert found.passed, found.text()
-    assert drawn(acceptance_rejection, found).startswith(b"\x89PNG")
+    assert drawn(rejection, found).startswith(b"\x89PNG")
 
 
-def test_what_was_disturbed_is_not_judged(calibration: Calibration) -> None:
-    one = rejection_of(configured(), calibration)
+def test_what_was_disturbed_is_not_judged() -> None:
+    loop = FoldedLoop(configured())
+    with pytest.raises(AcceptanceError, match=r"2 modes|3 modes"):
+        played(loop, rejection, replace(MULTISINE, duration_s=0.1), REQUIRED)
+    (one,) = played(loop, rejection, MULTISINE, REQUIRED)
     other = one.mode.copy()
     other[50] = LoopMode.OPEN
     limited = one.reasons.copy()
@@ -153,88 +91,83 @@ def test_what_was_disturbed_is_not_judged(calibration: Calibration) -> None:
     for changed, why in (
         (replace(one, mode=other), "became open"),
         (replace(one, reasons=limited), "SLEW"),
-        (replace(one, error_nm=missing), "10 of 810"),
+        (replace(one, error_nm=missing), f"10 of {len(one.table)}"),
     ):
         with pytest.raises(AcceptanceError, match=why):
-            acceptance_rejection.judge([changed], REQUIRED)
+            rejection.judge([changed], REQUIRED)
     few = one.error_nm.copy()
     few[400] = np.nan
-    found = acceptance_rejection.judge([replace(one, error_nm=few)], REQUIRED)
+    found = rejection.judge([replace(one, error_nm=few)], REQUIRED)
     assert found.frames_missing == 1
     assert "interpolated" in found.text()
+    loop.ask("safe")
+    with pytest.raises(AcceptanceError, match="it must be open or closed to be measured"):
+        Live(loop, lambda *_: None)
 
 
-def staircase(calibration: Calibration, **changes: object) -> Played:
-    levels_nm = levels(np.array(acceptance_linearity.AMPLITUDES) * REQUIRED.linear_nm, 3)
-    stairs, starts = climb(levels_nm, 7, 60.0)
-    what = {"noll": 2, "levels_nm": levels_nm.tolist(), "starts": (starts + 3).tolist(), "averaged": 4}
-    basis = np.ascontiguousarray(calibration.modes_to_actuators[:, :1].T)
-    table = stairs.astype(np.float32)[:, None]
-    return played(configured(**changes), calibration, LoopMode.OPEN, what, table, basis)
-
-
-def test_the_sensor_is_linear_where_it_is(calibration: Calibration) -> None:
-    one = staircase(calibration)
-    found = acceptance_linearity.judge([one], REQUIRED)
+def test_the_sensor_is_linear_where_it_is() -> None:
+    loop = FoldedLoop(configured())
+    with pytest.raises(AcceptanceError, match="2 frames at each level are too few: 3 pass"):
+        played(loop, linearity, linearity.Staircase(2, 3, (2,)), REQUIRED)
+    (one,) = played(loop, linearity, linearity.Staircase(7, 3, (2,)), REQUIRED)
+    found = linearity.judge([one], REQUIRED)
     assert found.passed, found.text()
     (mode,) = found.modes
     assert mode.levels[1].gain == pytest.approx(1.0, abs=0.03)
     assert [row.amplitude_nm for row in mode.levels] == pytest.approx([6, 12, 24])
     noise_nm = np.random.default_rng(8).normal(0.0, 50.0, one.error_nm.shape)
-    assert acceptance_linearity.judge([replace(one, error_nm=one.error_nm + noise_nm)], REQUIRED).modes[0].too_noisy
-    halved = acceptance_linearity.judge([replace(one, error_nm=0.5 * one.error_nm)], REQUIRED)
+    assert linearity.judge([replace(one, error_nm=one.error_nm + noise_nm)], REQUIRED).modes[0].too_noisy
+    halved = linearity.judge([replace(one, error_nm=0.5 * one.error_nm)], REQUIRED)
     assert not halved.passed
     assert "FAILED" in halved.text()
-    assert drawn(acceptance_linearity, found).startswith(b"\x89PNG")
+    assert drawn(linearity, found).startswith(b"\x89PNG")
 
 
-def trial(calibration: Calibration, level_nm: float, **changes: object) -> Played:
-    stairs, starts = climb([0.0, level_nm], 40, 300.0)
-    there = int(starts[1])
-    what = {"noll": 2, "level_nm": level_nm, "before": [20, 40], "after": [there + 30, there + 40]}
-    basis = np.ascontiguousarray(calibration.modes_to_actuators[:, :1].T)
-    table = stairs.astype(np.float32)[:, None]
-    return played(configured(**changes), calibration, LoopMode.CLOSED, what, table, basis)
+@pytest.mark.parametrize(
+    ("changes", "tilt_nm", "captured_nm", "lost_nm", "limits"),
+    [
+        ({}, 34.0, 51.0, None, []),
+        ({"control__tilt_limit_nm": 1e3, "control__limit_nm": 1e3, "safety__slew_nm": 300.0}, 250.0, 250.0, 375.0, []),
+        ({"control__tilt_limit_nm": 20.0}, 34.0, 17.0, 34.0, ["MODAL_LIMIT"]),
+    ],
+    ids=["good", "far", "limited"],
+)
+def test_the_loop_captures_what_it_can(
+    changes: dict[str, Any], tilt_nm: float, captured_nm: float, lost_nm: float | None, limits: list[str]
+) -> None:
+    required = Acceptance(capture_tilt_nm=tilt_nm)
+    trials = played(FoldedLoop(configured(**changes)), capture, (2,), required)
+    found = capture.judge(trials, required)
+    (mode,) = found.modes
+    assert (mode.captured_nm, mode.lost_nm, mode.limits) == (captured_nm, lost_nm, limits)
+    assert found.passed == (captured_nm >= tilt_nm)
+    assert all(name in found.text() for name in limits)
+    assert drawn(capture, found).startswith(b"\x89PNG")
+    assert not capture.judge(trials[:1], required).passed
 
 
-def test_the_loop_captures_what_it_can(calibration: Calibration) -> None:
-    good = [trial(calibration, sign * 34.0) for sign in (1, -1)]
-    far = trial(calibration, 250.0, control__tilt_limit_nm=1000.0, safety__slew_nm=300.0)
-    limited = trial(calibration, 51.0, control__tilt_limit_nm=20.0)
-    found = acceptance_capture.judge(good, REQUIRED)
-    assert found.passed
-    assert found.modes[0].captured_nm == 34.0
-    assert not acceptance_capture.closed(far)
-    lost = acceptance_capture.judge([*good, limited], REQUIRED)
-    assert lost.modes[0].lost_nm == 51.0
-    assert lost.modes[0].limits == ["MODAL_LIMIT"]
-    assert "MODAL_LIMIT" in lost.text()
-    assert not acceptance_capture.judge(good[:1], REQUIRED).passed
-    assert drawn(acceptance_capture, found).startswith(b"\x89PNG")
+def test_without_gains_nothing_is_captured() -> None:
     with pytest.raises(AcceptanceError, match="gain"):
-        acceptance_capture.judge([], REQUIRED)
+        capture.judge(played(FoldedLoop(configured(control__gain=0.0)), capture, (4,), REQUIRED), REQUIRED)
 
 
-def test_the_noise_floor_is_that_of_photons_and_read_out(calibration: Calibration) -> None:
+def test_the_noise_floor_is_that_of_photons_and_read_out() -> None:
     config = configured(disturbance__preset="bench")
-    nothing = np.zeros((1000, 3), np.float32)
-    every = [
-        played(config, calibration, mode, {"loop": name}, nothing)
-        for name, mode in (("open", LoopMode.OPEN), ("closed", LoopMode.CLOSED))
-    ]
-    found = acceptance_noise.judge(every, REQUIRED, config, calibration)
+    loop = FoldedLoop(config)
+    every, calibration = played(loop, noise, 4.0), loop.calibration()
+    found = noise.judge(every, REQUIRED, config, calibration)
     assert found.passed, found.text()
     for mode in found.modes:
         assert mode.open_nm == pytest.approx(mode.expected_nm, rel=0.2)
         assert mode.closed_nm == pytest.approx(mode.expected_nm, rel=0.2)
         assert 0 < mode.residual_floor_nm < mode.closed_nm
     fainter = configured(star__magnitude=-2.0)
-    failed = acceptance_noise.judge(every, REQUIRED, fainter, replace(calibration, flux_dn=4 * calibration.flux_dn))
+    failed = noise.judge(every, REQUIRED, fainter, replace(calibration, flux_dn=4 * calibration.flux_dn))
     assert not failed.passed
     assert "FAILED" in failed.text()
-    assert drawn(acceptance_noise, found).startswith(b"\x89PNG")
+    assert drawn(noise, found).startswith(b"\x89PNG")
     with pytest.raises(AcceptanceError, match="closed stretch"):
-        acceptance_noise.judge(every[:1], REQUIRED, config, calibration)
+        noise.judge(every[:1], REQUIRED, config, calibration)
 
 
 def test_a_test_is_found_by_its_note() -> None:
