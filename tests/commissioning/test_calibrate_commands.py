@@ -127,7 +127,9 @@ def test_a_calibration_is_written_once_it_is_whole_and_used_and_its_figures_are_
     assert "largest cross-talk" in done.stdout
 
 
-def test_what_is_kept_is_named_where_a_calibration_ends_badly(loop: FoldedLoop, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_what_is_kept_is_named_where_a_calibration_ends_badly(
+    loop: FoldedLoop, monkeypatch: pytest.MonkeyPatch
+) -> None:
     def stop(*what: object) -> None:
         raise KeyboardInterrupt
 

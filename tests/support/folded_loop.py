@@ -87,7 +87,7 @@ class FoldedLoop(Client):
         Where `cut` is given, frames lack so many pixels at each edge, and the loop begins without a calibration.
         """
         world = config if world is None else world
-        self.config = config
+        self.config, self.run_id = config, "folded"
         self._cut = cut or 0
         self._settings = factory.settings(config)
         if cut is None:
