@@ -1,7 +1,7 @@
 """`lowfc acceptance capture-range`: from how large a wavefront the loop closes."""
 
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
@@ -45,14 +45,6 @@ class CaptureResult(AcceptanceResult):
     modes: list[CaptureMode] = figure("modes")
 
 
-class Trial(NamedTuple):
-    """A shape of one mode: what is announced of it, its staircase (frames, 1), its surface (1, actuators)."""
-
-    what: dict[str, Any]
-    table: Single
-    shape: Single
-
-
 def play(live: Live, modes: Sequence[int], required: Acceptance) -> list[Played]:
     """Put growing shapes of each mode on the mirror under the closed loop, until it does not take one away.
 
@@ -63,21 +55,21 @@ def play(live: Live, modes: Sequence[int], required: Acceptance) -> list[Played]
         AcceptanceError: the loop was changed meanwhile, or does not close any more on what it was closed on before.
     """
     plan = [trials for noll in chosen(modes, live.loop.noll) if (trials := _trials(live, noll, required))]
-    live.expect(sum(len(trial.table) for trials in plan for trial in trials))
+    live.expect(sum(len(table) for trials in plan for _, table, _ in trials))
     found = []
     for trials in plan:
-        for place, trial in enumerate(trials):
-            found.append(live.play(KIND, trial.what, LoopMode.CLOSED, trial.table, trial.shape))
+        for place, (what, table, shape) in enumerate(trials):
+            found.append(live.play(KIND, what, LoopMode.CLOSED, table, shape))
             if not closed(found[-1]):
-                live.left_out(sum(len(trial.table) for trial in trials[place + 1 :]))
+                live.left_out(sum(len(table) for _, table, _ in trials[place + 1 :]))
                 live.rest()
                 live.into(LoopMode.CLOSED)
                 break
     return found
 
 
-def _trials(live: Live, noll: int, required: Acceptance) -> list[Trial]:
-    """Every shape of a mode, the smallest first; none where nobody asks the loop for it."""
+def _trials(live: Live, noll: int, required: Acceptance) -> list[tuple[dict[str, Any], Single, Single]]:
+    """Shapes of a mode, the smallest first, each with its announcement and its staircase; none without a gain."""
     place, law = live.loop.noll.index(noll), live.loop.law
     if isinstance(law, Law) and not law.gain[place]:
         return []
@@ -97,7 +89,7 @@ def _trials(live: Live, noll: int, required: Acceptance) -> list[Trial]:
             "after": [there + hold - hold // 4, there + hold],
         }
         back = len(stairs) - (hold - 1)  # the next one begins with a rest of its own
-        trials.append(Trial(what, stairs[:back].astype(np.float32)[:, None], shape))
+        trials.append((what, stairs[:back].astype(np.float32)[:, None], shape))
     return trials
 
 

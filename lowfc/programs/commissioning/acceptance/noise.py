@@ -9,6 +9,7 @@ from lowfc.adapters.files.factory import frame_noise_nm
 from lowfc.arrays import Array
 from lowfc.contract.configuration import Acceptance, Configuration
 from lowfc.control.calibration.calibration import Calibration
+from lowfc.control.laws import margins
 from lowfc.control.laws.spectra import SHORTEST, Pieces, floor_nm2_hz, spectrum
 from lowfc.control.loop.safety import LoopMode
 from lowfc.optics.chain.zernike import mode_name
@@ -65,7 +66,8 @@ def judge(
         floors[name] = _floor_nm(played)
         rms[name] = np.nanstd(played.error_nm, axis=0)
     loop = stretches["closed"].loop
-    expected, gain = frame_noise_nm(configuration, calibration), np.sqrt(loop.noise_gain())
+    expected = frame_noise_nm(configuration, calibration)
+    gain = np.sqrt(margins.noise_gain(loop.linear, loop.delay_frames))
     modes = [
         NoiseMode(
             noll=noll,

@@ -88,18 +88,6 @@ class Loop:
             return self.law
         return integrator(self.law.gain, self.law.leak, self.noll, self.delay_frames, self.rate_hz)
 
-    def rejection(self, frequency_hz: Array) -> Array:
-        """|S| (frequencies, modes) in theory."""
-        return margins.rejection(self.linear, frequency_hz, self.delay_frames)
-
-    def noise_transfer(self, frequency_hz: Array) -> Array:
-        """|T| (frequencies, modes) in theory."""
-        return margins.noise_transfer(self.linear, frequency_hz, self.delay_frames)
-
-    def noise_gain(self) -> Array:
-        """Variance (modes,) of the residual per variance of white noise of a frame, in theory."""
-        return margins.noise_gain(self.linear, self.delay_frames)
-
     def settling_frames(self) -> int:
         """Frames in which it settles."""
         if isinstance(self.law, Law):

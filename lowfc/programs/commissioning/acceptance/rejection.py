@@ -9,6 +9,7 @@ import numpy as np
 from lowfc.arrays import Array, Whole
 from lowfc.contract.configuration import Acceptance
 from lowfc.control.calibration.excitation import led_in, lines, multisine
+from lowfc.control.laws import margins
 from lowfc.control.laws.linear_law import LinearLaw
 from lowfc.control.laws.stability import delay_weights
 from lowfc.control.laws.transfer_function import Departure, Lines, departure, measured, seen_of_mirror
@@ -152,8 +153,9 @@ def judge(every: Sequence[Played], required: Acceptance) -> RejectionResult:
     tolerance_db = required.rejection_db
     frequency_hz = found.frequency * rate_hz
     places = np.arange(found.mode.size)
-    theory_s = played.loop.rejection(frequency_hz)[places, found.mode]
-    theory_t = played.loop.noise_transfer(frequency_hz)[places, found.mode]
+    law, delay_frames = played.loop.linear, played.loop.delay_frames
+    theory_s = margins.rejection(law, frequency_hz, delay_frames)[places, found.mode]
+    theory_t = margins.noise_transfer(law, frequency_hz, delay_frames)[places, found.mode]
     of_s = departure(found.rejection, theory_s, found.error, tolerance_db)
     of_t = departure(found.noise_transfer, theory_t, found.error, tolerance_db)
     modes = []
@@ -178,7 +180,7 @@ def judge(every: Sequence[Played], required: Acceptance) -> RejectionResult:
         passed=bool(modes) and all(mode.passed for mode in modes),
         law=played.loop.name,
         rate_hz=rate_hz,
-        delay_frames=played.loop.delay_frames,
+        delay_frames=delay_frames,
         injected=MIRROR if played.target == MIRROR else OFFSET,
         frames=len(played.table),
         frames_missing=played.missing,
