@@ -7,7 +7,7 @@ Beside them stand what the step cannot do without: reading every byte of its mat
 limit that memory sets, and its two matrix-vector products.
 
 Example:
-    python -m benchmarks curves --markdown --plot curves.png
+    python -m benchmarks curves
     python -m benchmarks curves --pixels 80 256 --modes --actuators --no-loop
 """
 
@@ -17,7 +17,6 @@ import time
 from collections.abc import Callable, Sequence
 from dataclasses import asdict
 from itertools import cycle
-from pathlib import Path
 from statistics import median
 from typing import Any
 
@@ -26,7 +25,6 @@ import numpy as np
 from benchmarks.load import shares, watched
 from benchmarks.runner import Lines, Result, Tell, add_times, ranged, us
 from benchmarks.sizes import FRAMES, Size, configuration, made_up, run_loop
-from lowfc.adapters.files.whole_file import require_folder, write_whole
 from lowfc.adapters.process.clock import HostClock
 from lowfc.adapters.process.realtime import set_up
 from lowfc.contract.errors import ConfigurationError, LowfcError
@@ -130,10 +128,9 @@ def options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--loop", action=argparse.BooleanOptionalAction, default=True, help="the loop too")
     for name, (sizes, _, what) in AXES.items():
         parser.add_argument(f"--{name}", type=int, nargs="*", default=sizes, metavar="N", help=f"{what} (%(default)s)")
-    parser.add_argument("--plot", type=Path, metavar="FILE.png", help="draw the curves")
 
 
-def measure(asked: argparse.Namespace, tell: Tell) -> Result:
+def measure(options: argparse.Namespace, tell: Tell) -> Result:
     """Measure every point of every curve, the repeats around all of them.
 
     Returns:
@@ -141,42 +138,35 @@ def measure(asked: argparse.Namespace, tell: Tell) -> Result:
         medians over the repeats, `spread` with the lowest and highest p50; default, seconds, repeats, rate_hz (None
         without the loop) and failed.
     """
-    curves = {name: [Size(**{field: n}) for n in getattr(asked, name)] for name, (_, field, _) in AXES.items()}
+    curves = {name: [Size(**{field: n}) for n in getattr(options, name)] for name, (_, field, _) in AXES.items()}
     sizes = list(dict.fromkeys(size for curve in curves.values() for size in curve))
     if not sizes:
         raise ConfigurationError("nothing to measure: name sizes of --pixels, --modes or --actuators")
-    require_folder(asked.plot)
     set_up(None, None, lock_memory=False, disable_cpu_idle=False)
     found: dict[Size, list[Result]] = {size: [] for size in sizes}
-    for number in range(1, asked.repeats + 1):
+    for number in range(1, options.repeats + 1):
         for size in sizes:
-            tell(f"{number} of {asked.repeats}: {size.pixels} pixels, {size.modes} modes, {size.actuators} actuators")
-            figures = step_figures(size, asked.seconds)
-            found[size].append(figures | (loop_figures(size, asked.rate, asked.seconds) if asked.loop else {}))
-    result = {
+            tell(f"{number} of {options.repeats}: {size.pixels} pixels, {size.modes} modes, {size.actuators} actuators")
+            figures = step_figures(size, options.seconds)
+            found[size].append(figures | (loop_figures(size, options.rate, options.seconds) if options.loop else {}))
+    return {
         "curves": {name: [point(size, found[size]) for size in curve] for name, curve in curves.items()},
         "default": asdict(Size()),
-        "seconds": asked.seconds,
-        "repeats": asked.repeats,
-        "rate_hz": asked.rate if asked.loop else None,
+        "seconds": options.seconds,
+        "repeats": options.repeats,
+        "rate_hz": options.rate if options.loop else None,
         "failed": [f"{size}: {one['failure']}" for size in sizes for one in found[size] if "failure" in one],
     }
-    if asked.plot is not None:
-        write_whole(asked.plot, picture(result))
-    return result
 
 
 def point(size: Size, repeats: Sequence[Result]) -> Result:
     """One point of a curve from its repeats."""
-    made: Result = {name: getattr(size, name) for name in ("pixels", "modes", "actuators", "bytes")}
-    made |= asdict(size)
+    made: Result = {name: getattr(size, name) for name in ("pixels", "modes", "actuators", "bytes")} | asdict(size)
     for name in (*_STEP, *_LOOP):
-        each = [repeat[name] for repeat in repeats if name in repeat]
-        if each:
-            kinds = [kind for kind in each[0] if all(kind in one for one in each)]
-            made[name] = {kind: round(median(one[kind] for one in each), 2) for kind in kinds}
-            p50 = [one["p50"] for one in each]
-            made[name]["spread"] = [round(min(p50), 2), round(max(p50), 2)]
+        if each := [repeat[name] for repeat in repeats if name in repeat]:
+            kinds = set.intersection(*map(set, each))
+            made[name] = {kind: round(median(one[kind] for one in each), 2) for kind in sorted(kinds)}
+            made[name]["spread"] = [round(end(one["p50"] for one in each), 2) for end in (min, max)]
     for name in ("frames", "frames_without_command"):
         if any(name in repeat for repeat in repeats):
             made[name] = sum(repeat.get(name, 0) for repeat in repeats)

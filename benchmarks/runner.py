@@ -1,21 +1,17 @@
-"""What the benchmarks share: options, where and when something is measured, ranges, tables, JSON."""
+"""What the benchmarks share: their command line, ranges over repeats, and the tables as text."""
 
 import argparse
 import json
-import os
-import shlex
 import sys
-import time
 from collections.abc import Callable, Sequence
-from pathlib import Path
 from statistics import median
 from typing import Any, Protocol
 
 from rich.console import Console
 
-from lowfc.adapters.process.host import Host
 from lowfc.adapters.process.progress import passing_bar
-from lowfc.adapters.process.provenance import provenance
+from lowfc.programs.cli.result import table
+from tools.shared import host, markdown
 
 Result = dict[str, Any]
 Lines = Sequence[Sequence[str]]
@@ -30,14 +26,14 @@ class Benchmark(Protocol):
     def options(self, parser: argparse.ArgumentParser) -> None:
         """Add its own options."""
 
-    def measure(self, asked: argparse.Namespace, tell: Tell) -> Result:
+    def measure(self, options: argparse.Namespace, tell: Tell) -> Result:
         """Measure; what `--json` prints. A `failed` in it that is not empty makes the exit status 1."""
 
     def tables(self, result: Result) -> Sequence[Lines]:
         """Lay the figures out."""
 
     def about(self, result: Result) -> str:
-        """What the tables do not say; without where and when."""
+        """What the tables do not say."""
 
 
 def run(name: str, benchmark: Benchmark, words: Sequence[str]) -> int:
@@ -49,18 +45,20 @@ def run(name: str, benchmark: Benchmark, words: Sequence[str]) -> int:
     )
     benchmark.options(parser)
     parser.add_argument("--json", action="store_true", help="print one JSON object")
-    parser.add_argument("--markdown", action="store_true", help="print the tables in Markdown")
-    parser.add_argument("--render", type=Path, metavar="FILE.json", help="measure nothing: print what this file has")
-    asked = parser.parse_args(words)
-    if asked.render:
-        result = json.loads(asked.render.read_text())
-    else:
-        begun = occasion(["python", "-m", "benchmarks", name, *words])
-        with passing_bar(Console(stderr=True)) as bar:
-            task = bar.add_task(name, total=None)
-            result = begun | benchmark.measure(asked, lambda what: bar.update(task, description=what))
-    sys.stdout.write((json.dumps(result) if asked.json else said(benchmark, result, markdown=asked.markdown)) + "\n")
+    options = parser.parse_args(words)
+    where = host()
+    with passing_bar(Console(stderr=True)) as bar:
+        task = bar.add_task(name, total=None)
+        result = benchmark.measure(options, lambda what: bar.update(task, description=what))
+    text = ["\n".join(table(head, rows)) for head, *rows in benchmark.tables(result)]
+    printed = json.dumps({"host": where} | result) if options.json else "\n\n".join([*text, benchmark.about(result)])
+    sys.stdout.write(printed + "\n")
     return 1 if result.get("failed") else 0
+
+
+def in_markdown(benchmark: Benchmark, result: Result) -> str:
+    """The whole result for a document."""
+    return "\n".join([*(markdown(head, rows) for head, *rows in benchmark.tables(result)), benchmark.about(result)])
 
 
 def add_times(parser: argparse.ArgumentParser, seconds: float, repeats: int | None = None) -> None:
@@ -68,61 +66,6 @@ def add_times(parser: argparse.ArgumentParser, seconds: float, repeats: int | No
     parser.add_argument("--seconds", type=float, default=seconds, help="of each measurement (%(default)g)")
     if repeats is not None:
         parser.add_argument("--repeats", type=int, default=repeats, help="of everything (%(default)s)")
-
-
-def occasion(command: Sequence[str]) -> Result:
-    """Where, when and by which command something is measured; to be asked for before."""
-    return {
-        "host": host(),
-        "load_before": round(os.getloadavg()[0], 2),
-        "date": time.strftime("%Y-%m-%d", time.gmtime()),
-        "command": shlex.join(command),
-    }
-
-
-def host() -> Result:
-    """What figures of time depend on."""
-    known = provenance()
-    try:
-        clock_source = Host().clock_source()
-    except OSError:
-        clock_source = "not known"
-    found = {name: known[name] for name in ("processor", "kernel", "python")}
-    return found | {"processors": int(known["processors"]), "clock_source": clock_source}
-
-
-def said(benchmark: Benchmark, result: Result, *, markdown: bool) -> str:
-    """The whole result for a document or a terminal."""
-    form = in_markdown if markdown else in_columns
-    parts = [*map(form, benchmark.tables(result)), benchmark.about(result)]
-    if "date" in result:
-        where = result["host"]
-        parts[-1] += (
-            f" Measured {result['date']} on {where['processors']} processors of {where['processor']}, Linux "
-            f"{where['kernel']}, clock source {where['clock_source']}, Python {where['python']}, load "
-            f"{result['load_before']:g} before, by `{result['command']}`."
-        )
-    return "\n\n".join(parts)
-
-
-def in_columns(lines: Lines) -> str:
-    """A table for a terminal: the first column and words to the left, figures to the right."""
-    columns = list(zip(*lines, strict=True))
-    widths = [max(map(len, column)) for column in columns]
-    figures = [any(cell[:1].isdigit() for cell in column[1:]) for column in columns]
-    return "\n".join(
-        "  ".join(
-            cell.rjust(width) if column and figures[column] else cell.ljust(width)
-            for column, (cell, width) in enumerate(zip(line, widths, strict=True))
-        ).rstrip()
-        for line in lines
-    )
-
-
-def in_markdown(lines: Lines) -> str:
-    """The same for a document; a bar within a cell becomes a slash."""
-    first, *others = (f"| {' | '.join(cell.replace('|', '/') for cell in line)} |" for line in lines)
-    return "\n".join([first, "|---" * len(lines[0]) + "|", *others])
 
 
 def us(value: float) -> str:

@@ -5,7 +5,7 @@ back to back and as in the loop, after a rest as long as a frame's period; it ta
 After that it is timed stage by stage, which takes a little longer.
 
 Example:
-    python -m benchmarks step --seconds 5 --markdown
+    python -m benchmarks step --seconds 5
 """
 
 import argparse
@@ -53,7 +53,7 @@ def options(parser: argparse.ArgumentParser) -> None:
     add_times(parser, seconds=5.0)
 
 
-def measure(asked: argparse.Namespace, tell: Tell) -> Result:
+def measure(options: argparse.Namespace, tell: Tell) -> Result:
     """Time the stages.
 
     Returns:
@@ -71,7 +71,7 @@ def measure(asked: argparse.Namespace, tell: Tell) -> Result:
     found: Result = {}
     for name, period_s in (("hot_us", None), ("paced_us", 1 / RATE_HZ)):
         tell(name)
-        durations = _timed(step, payloads, lambda: calibration.reconstructor @ x, asked.seconds, period_s)
+        durations = _timed(step, payloads, lambda: calibration.reconstructor @ x, options.seconds, period_s)
         found[name] = {stage: percentiles(np.array(each) / 1e3) for stage, each in durations.items()}
     if step.state.mode is not LoopMode.CLOSED or step.state.counts:
         raise ValueError(f"frames were refused or limits acted: {dict(step.state.counts)}; this is not the usual step")

@@ -4,7 +4,7 @@
 order changes from pair to pair. Each pair is compared with itself. The start of the view is part of the run.
 
 Example:
-    python -m benchmarks view --seconds 10 --repeats 9 --markdown
+    python -m benchmarks view --seconds 10 --repeats 9
 """
 
 import argparse
@@ -24,7 +24,7 @@ def options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--rate", type=float, default=1000.0, help="frames per second (%(default)g)")
 
 
-def measure(asked: argparse.Namespace, tell: Tell) -> Result:
+def measure(options: argparse.Namespace, tell: Tell) -> Result:
     """Run all pairs.
 
     Returns:
@@ -32,16 +32,16 @@ def measure(asked: argparse.Namespace, tell: Tell) -> Result:
         rate_hz and seconds.
     """
     pairs = []
-    for number in range(asked.repeats):
+    for number in range(options.repeats):
         pair = {}
         for side in sorted(SIDES, reverse=number % 2 == 0):
-            tell(f"pair {number + 1} of {asked.repeats}: {side} a view")
-            found = run_lowfc(["sim-loop", "--rate", f"{asked.rate:g}", *SIDES[side]], asked.seconds)
+            tell(f"pair {number + 1} of {options.repeats}: {side} a view")
+            found = run_lowfc(["sim-loop", "--rate", f"{options.rate:g}", *SIDES[side]], options.seconds)
             if "failure" in found:
                 raise BusError(f"the loop {side} a view failed: {found['failure']}")
             pair[side] = {name: found[name] for name in ("frames_published", *_LOST, "latency_us", "usage")}
         pairs.append(pair)
-    return {"pairs": pairs, "rate_hz": asked.rate, "seconds": asked.seconds}
+    return {"pairs": pairs, "rate_hz": options.rate, "seconds": options.seconds}
 
 
 def tables(result: Result) -> list[Lines]:

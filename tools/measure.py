@@ -19,7 +19,7 @@ from typing import NamedTuple
 
 from benchmarks import curves, step, throughput
 from benchmarks.peers import contest
-from benchmarks.runner import Benchmark, said
+from benchmarks.runner import Benchmark, in_markdown
 from lowfc.programs.measure.latency import text as latency_text
 from lowfc.programs.view.layout import APPLICATION, layout
 from lowfc.programs.view.message_layout import message_layout
@@ -60,7 +60,7 @@ def _latency(command: str) -> Measurement:
 
 
 def _bench(command: str, benchmark: Benchmark) -> Measurement:
-    return _of(command, lambda figures: said(benchmark, figures, markdown=True) + "\n", signed=True)
+    return _of(command, partial(in_markdown, benchmark))
 
 
 MEASUREMENTS = {

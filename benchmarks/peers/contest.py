@@ -3,7 +3,7 @@
 The contestants take turns within every repeat, once in the normal scheduling class and once under SCHED_FIFO.
 
 Example:
-    python -m benchmarks peers --pyrtcao DIR/bin/python --markdown
+    python -m benchmarks peers --pyrtcao DIR/bin/python
 """
 
 import argparse
@@ -14,8 +14,8 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from statistics import median
 from typing import Any
@@ -52,7 +52,7 @@ class Contestant:
         name: in the table.
         what: it is, in a sentence.
         roles: its processes in the order in which they start; the source's end is the end of a run. None: lowfc itself.
-        options: of its processes.
+        transport: of its messages, in plain Python.
         module: whose roles its processes play.
         package: that must be installed in the interpreter of its processes, beside what lowfc needs.
     """
@@ -60,18 +60,12 @@ class Contestant:
     name: str
     what: str
     roles: tuple[str, ...] = ()
-    options: Mapping[str, Any] = field(default_factory=dict)
+    transport: str = ""
     module: str = "benchmarks.peers.plain"
     package: str = ""
 
-    @property
-    def pacer(self) -> str:
-        """The role that waits for the start and ends by itself."""
-        return "source" if "source" in self.roles else self.roles[0]
-
 
 TIMER, BARE = "timer wake-up of this host", "zenoh"
-_PYRTCAO = {"module": "benchmarks.peers.pyrtcao_loop", "package": "pyrtcao"}
 CONTESTANTS = (
     Contestant(
         TIMER,
@@ -82,13 +76,13 @@ CONTESTANTS = (
         "shared memory, semaphore",
         "a ring in shared memory each way, the step in numpy, on a thread that waits for a POSIX semaphore",
         PAIR,
-        {"transport": "ring"},
+        "ring",
     ),
     Contestant(
         BARE,
         "zenoh as it comes, in sessions set up as lowfc's, the step in numpy, in the subscriber's callback",
         PAIR,
-        {"transport": "zenoh"},
+        "zenoh",
     ),
     Contestant(
         "lowfc",
@@ -99,16 +93,8 @@ CONTESTANTS = (
         "WavefrontSensor, one component of one's own with all of the step compiled, and WavefrontCorrector, each a "
         "process; in the normal class it sets nice -20 where it may",
         ("mirror", "source", "controller"),
-        {"fused": True},
-        **_PYRTCAO,
-    ),
-    Contestant(
-        "pyrtcao, stock",
-        "WavefrontSensor, a component that makes a signal of the pixels, Loop.standard_integrator, WavefrontCorrector, "
-        "each a process; its command is modes, and the actuators are made after it",
-        ("mirror", "source", "signal", "controller"),
-        {"fused": False},
-        **_PYRTCAO,
+        module="benchmarks.peers.pyrtcao_loop",
+        package="pyrtcao",
     ),
 )
 
@@ -123,7 +109,7 @@ DEFINITIONS = {
     "none is left out",
     "cells": "us, median (lowest to highest) over the repeats; contestants and classes take turns within every repeat",
     "without a command": "measured frames that no command was made from: median over the repeats, of how many",
-    "pinning": "source and mirror on the first processor, controller (pyrtcao: and signal) on the second",
+    "pinning": "source and mirror on the first processor, controller on the second",
     "threads": "BLAS and numba 1; garbage collection off everywhere",
     "FIFO": f"SCHED_FIFO {PRIORITY} for all, idle processors kept awake",
 }
@@ -138,15 +124,15 @@ def options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--pyrtcao", default=sys.executable, metavar="PYTHON", help="an interpreter that has pyrtcao")
 
 
-def measure(asked: argparse.Namespace, tell: Tell) -> Result:
+def measure(options: argparse.Namespace, tell: Tell) -> Result:
     """Hold the contest.
 
     Returns:
         rows, one for each contestant and class: contestant, what, scheduling, repeats (figures of each run that came to
         its end, see `figures`), failures (what is said of the others), and missing where it could not take part;
-        rules, notes, pinned_to, versions, command and failed.
+        rules, notes, pinned_to, versions and failed.
     """
-    chosen = [one for one in CONTESTANTS if any(word in one.name for word in asked.only or [""])]
+    chosen = [one for one in CONTESTANTS if any(word in one.name for word in options.only or [""])]
     if not chosen:
         raise ConfigurationError(f"--only: none of {'; '.join(one.name for one in CONTESTANTS)}")
     classes, notes = list(SCHEDULING), []
@@ -158,25 +144,23 @@ def measure(asked: argparse.Namespace, tell: Tell) -> Result:
         for name in classes
         for one in chosen
     ]
-    missing = {one.name: _missing(one, asked.pyrtcao) for one in chosen}
-    for repeat in range(asked.repeats):
+    missing = {one.name: _missing(one, options.pyrtcao) for one in chosen}
+    for repeat in range(options.repeats):
         for row, one in zip(rows, [*chosen] * len(classes), strict=True):
             if missing[one.name]:
                 row["missing"] = missing[one.name]
                 continue
-            tell(f"repeat {repeat + 1} of {asked.repeats}: {one.name}, {row['scheduling']}")
+            tell(f"repeat {repeat + 1} of {options.repeats}: {one.name}, {row['scheduling']}")
             try:
-                row["repeats"].append(one_run(one, asked, SCHEDULING[row["scheduling"]]))
+                row["repeats"].append(one_run(one, options, SCHEDULING[row["scheduling"]]))
             except (ContestError, LowfcError) as fault:
                 row["failures"].append(f"{one.name}: {fault}")
-    words = " ".join(sys.argv[1:]).replace(asked.pyrtcao, "PYTHON")  # its path is nobody's business
     return {
         "rows": rows,
-        "rules": {name: getattr(asked, name) for name in ("repeats", "seconds", "warm_up", "rate_hz")},
+        "rules": {name: getattr(options, name) for name in ("repeats", "seconds", "warm_up", "rate_hz")},
         "notes": notes,
         "pinned_to": list(processors()),
-        "versions": _versions(asked.pyrtcao),
-        "command": f"python -m benchmarks {words}",
+        "versions": _versions(options.pyrtcao),
         "failed": [fault for row in rows for fault in row["failures"]],
     }
 
@@ -195,10 +179,10 @@ def one_run(contestant: Contestant, rules: argparse.Namespace, priority: int) ->
     plan = Plan(
         rate_hz=rules.rate_hz,
         frames=frames,
-        cpus={role: second if role in ("controller", "signal", "timer") else first for role in contestant.roles},
+        cpus={role: second if role in ("controller", "timer") else first for role in contestant.roles},
         priority=dict.fromkeys(contestant.roles, priority),
         ports=dict(zip(PAIR, free_ports(len(PAIR)), strict=True)),
-        options=dict(contestant.options),
+        transport=contestant.transport,
     )
     with tempfile.TemporaryDirectory(prefix="lowfc-peers-", dir=_MEMORY) as name:
         folder = Path(name)
@@ -207,7 +191,7 @@ def one_run(contestant: Contestant, rules: argparse.Namespace, priority: int) ->
         with _awake(priority), _processes(contestant, rules.pyrtcao, folder) as children:
             time.sleep(_SETTLE_S)
             go(folder)
-            pacer = children[contestant.pacer]
+            pacer = children.get("source") or children["timer"]
             deadline_s = time.monotonic() + frames / rules.rate_hz + _LATER_S
             while pacer.status is None and time.monotonic() < deadline_s:
                 time.sleep(_LOOK_S)
@@ -274,10 +258,12 @@ def may_run_first() -> bool:
 @contextlib.contextmanager
 def _awake(priority: int) -> Iterator[None]:
     """Idle processors kept awake for everybody under FIFO, where this user may."""
-    with contextlib.ExitStack() as held:
-        if priority:
-            with contextlib.suppress(OSError):
-                held.enter_context(Path("/dev/cpu_dma_latency").open("wb", buffering=0)).write(bytes(4))
+    latency = Path("/dev/cpu_dma_latency")
+    if priority and os.access(latency, os.W_OK):
+        with latency.open("wb", buffering=0) as held:
+            held.write(bytes(4))
+            yield
+    else:
         yield
 
 

@@ -161,7 +161,7 @@ def timer(part: Part) -> None:
 
 def _join(part: Part, take: Message) -> Message:
     frame = Problem().frames[0].tobytes()
-    return TRANSPORTS[part.plan.options["transport"]](part, len(frame), len(NumpyStep(Problem()).command(frame)), take)
+    return TRANSPORTS[part.plan.transport](part, len(frame), len(NumpyStep(Problem()).command(frame)), take)
 
 
 if __name__ == "__main__":

@@ -1,11 +1,8 @@
 """The same loop in pyrtcao, each component a process: python -m benchmarks.peers.pyrtcao_loop ROLE FOLDER.
 
-Stock, as its users build it: a `WavefrontSensor`, a component of one's own that makes a signal of the pixels,
-`Loop.standard_integrator`, a `WavefrontCorrector`. Fused: one component of one's own between sensor and corrector does
-all of it in one compiled function, which is the best that pyrtcao can do. It runs in an interpreter that has pyrtcao,
-and needs nothing of lowfc's. Where pyrtcao may, it sets nice -20 in the normal class by itself.
-
-The corrector makes actuators of modes only when the command is out: in stock, their 144 are no part of the time to it.
+A component of one's own between its `WavefrontSensor` and its `WavefrontCorrector` does the whole step in one compiled
+function, which is the best that pyrtcao can do. It runs in an interpreter that has pyrtcao, and needs nothing of
+lowfc's. Where pyrtcao may, it sets nice -20 in the normal class by itself.
 """
 
 import os
@@ -19,8 +16,7 @@ import numpy as np
 import numpy.typing as npt
 from numba import jit
 from pyrtc.component import Component
-from pyrtc.loop import Loop
-from pyrtc.streams import clear_shms, create_stream, open_stream
+from pyrtc.streams import clear_shms, open_stream
 from pyrtc.utils import set_affinity_and_priority
 from pyrtc.wavefront_corrector import WavefrontCorrector
 from pyrtc.wavefront_sensor import WavefrontSensor
@@ -29,7 +25,7 @@ from benchmarks.peers.shared import ACTUATORS, DIFFERENT, GAIN, LEAK, LIMIT_NM, 
 
 Array = npt.NDArray[np.float32]
 
-_STREAMS = ("wfs_raw", "wfs", "signal", "wfc")
+_STREAMS = ("wfs_raw", "wfs", "wfc")
 _PIXELS = SHAPE[0] * SHAPE[1]
 
 
@@ -47,35 +43,6 @@ class Sensor(WavefrontSensor):
             self.expose()  # it numbers them from 1, too
         clear(self.part)
         os._exit(0)
-
-
-class PixelSignal(Component):
-    """The signal is the pixels without those of the reference image."""
-
-    def __init__(self, conf: dict[str, Any]) -> None:
-        super().__init__(conf)
-        self._reference = Problem().I0.reshape(SHAPE)
-        self._image = np.empty(SHAPE, np.int32)
-        self._signal = np.empty(SHAPE, np.float32)
-        self.register_input_stream("wfs", open_stream(self.input_stream_name("wfs")))
-        self.register_output_stream("signal", create_stream(self.output_stream_name("signal"), (_PIXELS,), np.float32))
-
-    def compute_signal(self) -> None:
-        """One frame."""
-        image = self.read_stream("wfs", out=self._image)
-        np.subtract(image, self._reference, out=self._signal, dtype=np.float32, casting="unsafe")
-        self.write_stream("signal", self._signal.reshape(-1))
-
-
-class StockLoop(Loop):
-    """Its own loop, with the moment noted when a command is out."""
-
-    commanded: memoryview
-
-    def send_to_wfc(self, correction: Array, slopes: Array | None = None) -> None:
-        """Its own, then the time."""
-        super().send_to_wfc(correction, slopes=slopes)
-        self.commanded[self.frame_id] = time.monotonic_ns()
 
 
 class FusedLoop(Component):
@@ -153,33 +120,21 @@ def _source(part: Part) -> Component:
 
 
 def _mirror(part: Part) -> Component:
-    fused = part.plan.options["fused"]
-    modes = ACTUATORS if fused else MODES  # of the command: fused, its actuators are made already
     matrix = part.folder / "m2c.npy"
-    np.save(matrix, np.eye(ACTUATORS, dtype=np.float32) if fused else Problem().to_actuators)
-    of_its_own = {"name": "wfc", "num_actuators": ACTUATORS, "num_modes": modes, "m2c_file": str(matrix)}
+    np.save(matrix, np.eye(ACTUATORS, dtype=np.float32))  # a command's actuators are made already
+    of_its_own = {"name": "wfc", "num_actuators": ACTUATORS, "num_modes": ACTUATORS, "m2c_file": str(matrix)}
     corrector = Corrector(_configuration(part, "send_to_hardware") | of_its_own)
     corrector.received = part.marks("received")
     return corrector
 
 
-def _signal(part: Part) -> Component:
-    return PixelSignal(_configuration(part, "compute_signal"))
-
-
 def _controller(part: Part) -> Component:
-    if part.plan.options["fused"]:
-        fused = FusedLoop(_configuration(part, "step"))
-        fused.commanded = part.marks("commanded")
-        return fused
-    loop = StockLoop(_configuration(part, "standard_integrator"))
-    loop.cm = Problem().R.copy()
-    loop.gain = GAIN
+    loop = FusedLoop(_configuration(part, "step"))
     loop.commanded = part.marks("commanded")
     return loop
 
 
-_ROLES = {"source": _source, "mirror": _mirror, "signal": _signal, "controller": _controller}
+_ROLES = {"source": _source, "mirror": _mirror, "controller": _controller}
 
 
 if __name__ == "__main__":

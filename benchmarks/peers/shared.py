@@ -13,7 +13,6 @@ import time
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -50,7 +49,7 @@ class Plan:
         cpus: processor of each role.
         priority: SCHED_FIFO priority of each role; 0 is the normal class.
         ports: loopback TCP port of each role that listens.
-        options: of the contestant.
+        transport: of its messages, in plain Python.
     """
 
     rate_hz: float
@@ -58,7 +57,7 @@ class Plan:
     cpus: dict[str, int]
     priority: dict[str, int]
     ports: dict[str, int] = field(default_factory=dict)
-    options: dict[str, Any] = field(default_factory=dict)
+    transport: str = ""
 
     def write(self, folder: Path) -> None:
         """Lay out a run in its folder."""

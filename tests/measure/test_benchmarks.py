@@ -26,8 +26,6 @@ from lowfc.programs.measure.frame_source import Payloads
 
 ROOT = Path(__file__).parents[2]
 SMALL = Size(side=32, modes=5, mirror_side=10)
-HOST = {"processors": 2, "processor": "P", "kernel": "6.1", "clock_source": "tsc", "python": "3.11"}
-ABOUT = {"host": HOST, "load_before": 0.1, "date": "2026-01-01", "command": "python -m benchmarks it"}
 
 
 def run(*words: str | Path) -> "subprocess.CompletedProcess[str]":
@@ -38,13 +36,6 @@ def run(*words: str | Path) -> "subprocess.CompletedProcess[str]":
 def by_heading(lines: runner.Lines) -> list[dict[str, str]]:
     assert len({len(line) for line in lines}) == 1
     return [dict(reversed(list(zip(lines[0], line, strict=True)))) for line in lines[1:]]
-
-
-def test_both_kinds_of_table_have_every_cell() -> None:
-    lines = [["a", "bb", "ff"], ["ccc", "1", "d|e"]]
-    assert runner.in_columns(lines) == "a    bb  ff\nccc   1  d|e"
-    assert runner.in_markdown(lines) == "| a | bb | ff |\n|---|---|---|\n| ccc | 1 | d/e |"
-    assert runner.ranged([30.0, 20.0, 125.0]) == "30.0 (20.0 to 125)"
 
 
 # The control step
@@ -119,7 +110,7 @@ def curves_result() -> dict[str, Any]:
         curves.point(Size(side=32), [repeat(30.0), repeat(20.0, 2), repeat(25.0)]),
         curves.point(Size(side=48), [repeat(50.0, failure="the mirror ended")]),
     ]
-    return ABOUT | {
+    return {
         "curves": {"pixels": points, "modes": points[:1], "actuators": []},
         "default": {"side": 80, "modes": 20, "mirror_side": 34},
         "seconds": 1.0,
@@ -141,15 +132,12 @@ def test_a_point_is_the_median_of_its_repeats_and_says_what_the_limit_is() -> No
     assert first["frames without a command"] == "2 of 300"
     assert second["loop p50, us"] == "failed"
     assert curves.picture(result).startswith(b"\x89PNG")
-    for markdown in (True, False):
-        text = runner.said(curves, result, markdown=markdown)
-        assert "Failed, 48: the mirror ended." in text
-        assert "Measured 2026-01-01 on 2 processors of P, Linux 6.1, clock source tsc" in text
+    assert "Failed, 48: the mirror ended." in curves.about(result)
 
 
-def test_the_curves_of_a_few_sizes_from_the_command_line(tmp_path: Path) -> None:
+def test_the_curves_of_a_few_sizes_from_the_command_line() -> None:
     sizes = ("--pixels", "32", "--modes", "20", "--actuators", "--no-loop")
-    done = run("curves", *sizes, "--seconds", "0.02", "--repeats", "2", "--json", "--plot", tmp_path / "curves.png")
+    done = run("curves", *sizes, "--seconds", "0.02", "--repeats", "2", "--json")
     assert done.returncode == 0, done.stderr
     found = json.loads(done.stdout)
     assert [one["pixels"] for one in found["curves"]["pixels"]] == [1024]
@@ -159,10 +147,6 @@ def test_the_curves_of_a_few_sizes_from_the_command_line(tmp_path: Path) -> None
         figures = found["curves"]["pixels"][0][name]
         assert 0 < figures["p50"] <= figures["p99"]
         assert figures["cpu"] > 0
-    assert (tmp_path / "curves.png").read_bytes().startswith(b"\x89PNG")
-    (tmp_path / "curves.json").write_text(done.stdout)
-    again = run("curves", "--render", tmp_path / "curves.json", "--markdown")
-    assert again.stdout == runner.said(curves, found, markdown=True) + "\n"
     nothing = run("curves", "--pixels", "--modes", "--actuators")
     assert (nothing.returncode, nothing.stderr.split(":")[0]) == (2, "error")
 
@@ -176,29 +160,18 @@ def test_a_grid_is_geometric_and_has_both_ends() -> None:
     assert throughput.grid(700, 700, 1.1) == [700]
 
 
-@pytest.mark.parametrize("edge", range(-1, 32))
-def test_the_search_finds_the_last_rate_that_holds(edge: int) -> None:
-    asked: list[int] = []
+@pytest.mark.parametrize("edge", range(-1, 32, 3))
+@pytest.mark.parametrize("wrong", [None, 7, 15, 30])
+def test_the_search_finds_the_last_rate_that_holds_in_spite_of_one_wrong_verdict(edge: int, wrong: int | None) -> None:
+    tried: list[int] = []
 
-    def sustains(place: int) -> bool:
-        asked.append(place)
-        return place <= edge
+    def sustains(index: int) -> bool:
+        tried.append(index)
+        mistaken = index == wrong and tried.count(index) == 1
+        return (index <= edge) != mistaken
 
     assert throughput.search(sustains, 32) == edge
-    assert all(asked.count(place) == 2 for place in (edge, edge + 1) if 0 <= place < 32)
-    assert len(asked) <= 6 + 2
-
-
-@pytest.mark.parametrize("wrong", [7, 15, 11, 12, 13])
-def test_the_search_is_not_misled_by_one_wrong_verdict(wrong: int) -> None:
-    asked: set[int] = set()
-
-    def sustains(place: int) -> bool:
-        mistaken = place == wrong and place not in asked
-        asked.add(place)
-        return (place <= 11) != mistaken
-
-    assert throughput.search(sustains, 16) == 11
+    assert len(tried) <= 2 * 6 + 1
 
 
 def good(**changed: Any) -> dict[str, Any]:
@@ -233,12 +206,12 @@ def test_a_way_has_its_highest_rate_and_why_it_goes_no_faster(monkeypatch: pytes
     monkeypatch.setattr(throughput, "run_once", run_once)
     rates = throughput.grid(1000, 2000, 1.1)
     way = throughput.find([], rates, 1.0, lambda _: None)
-    assert way["highest_hz"] == 1210
+    assert (way["highest_hz"], way["run"]["rate_hz"], way["above"]["asked_hz"]) == (1210, 1210, 1331)
     none = throughput.find([], [1400.0], 1.0, lambda _: None)
     assert none["highest_hz"] is None
-    free = {"free": good(asked_hz=None, rate_hz=2345.6), "fallen": {"asked_hz": None, "failure": "it fell"}}
-    ways = {"simulated": way, "none": none}
-    result = ABOUT | {"ways": ways, "free_running": free, "seconds": 1.0, "rates_hz": rates}
+    free = {"run": good(asked_hz=None, rate_hz=2345.6)}
+    loops = {"simulated": way, "none": none, "free": free, "fallen": {"run": {"asked_hz": None, "failure": "it fell"}}}
+    result = {"loops": loops, "seconds": 1.0, "rates_hz": rates}
     speeds, use = throughput.tables(json.loads(json.dumps(result)))
     assert speeds[1] == ["simulated", "1210", "200", "400", "25 %", "1331 Hz: 7 messages lost"]
     assert speeds[2] == ["none", "none", "", "", "", "1400 Hz: 7 messages lost"]
@@ -252,7 +225,7 @@ def test_a_way_has_its_highest_rate_and_why_it_goes_no_faster(monkeypatch: pytes
 @pytest.mark.exclusive
 @pytest.mark.slow
 def test_a_loop_with_the_simulated_camera_is_measured_for_real() -> None:
-    one = throughput.run_once(throughput.WAYS["simulated camera, recorder"], 100.0, 1.5)
+    one = throughput.run_once(throughput.LOOPS["simulated camera, recorder"], 100.0, 1.5)
     assert 0 < one["frames"] <= 151
     assert one["messages_lost"] is not None
     assert 0 <= one["commands_late"] <= 1
@@ -380,18 +353,12 @@ def test_the_table_has_ranges_and_ratios_within_a_class_and_who_is_not_there() -
         row("other", one(55, 440, 3), one(66, 110, 9), one(40, 120, 1)),
         row(BARE, one(1000, 1000), scheduling="FIFO"),
         row("other", one(500, 100), scheduling="FIFO"),
-        row("pyrtcao, stock", missing="not installed in python: get it"),
+        row("pyrtcao", missing="not installed in python: get it"),
         row("pyrtcao, fused", failures=["it fell"]),
         row("deaf", one(1, 1, 1000, frame_to_command=None)),
     ]
     rules = {"repeats": 1, "seconds": 1.0, "rate_hz": 1000.0, "warm_up": 5}
-    result = ABOUT | {
-        "rows": rows,
-        "rules": rules,
-        "notes": ["a note"],
-        "pinned_to": [0, 1],
-        "versions": {"lowfc": "1"},
-    }
+    result = {"rows": rows, "rules": rules, "notes": ["a note"], "pinned_to": [0, 1], "versions": {"lowfc": "1"}}
     (lines,) = contest.tables(result)
     timer, bare, other, _, fifo, absent, failed, deaf = by_heading(lines)
     assert bare["p50"] == "110 (100 to 150)"
@@ -408,11 +375,10 @@ def test_the_table_has_ranges_and_ratios_within_a_class_and_who_is_not_there() -
 
 
 def test_pyrtcao_is_said_to_be_missing_and_how_to_get_it() -> None:
-    done = run("peers", "--only", "pyrtcao, stock", "--pyrtcao", "/no/such/python", "--repeats", "1", "--json")
+    done = run("peers", "--only", "pyrtcao", "--pyrtcao", "/no/such/python", "--repeats", "1", "--json")
     assert done.returncode == 0, done.stderr
     found = json.loads(done.stdout)
     assert all("/no/such/python" in one["missing"] for one in found["rows"])
-    assert "--pyrtcao PYTHON" in found["command"]
 
 
 def test_the_step_is_an_integrator_with_a_leak() -> None:
@@ -449,6 +415,3 @@ def test_a_contestant_is_really_run(name: str) -> None:
     there, back = found["frame_to_command"], found["frame_to_mirror"]
     assert 0 < there["p50"] <= there["p99"] <= there["max"]
     assert back["max"] > there["p50"]
-
-
-# The document
