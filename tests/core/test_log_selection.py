@@ -30,7 +30,8 @@ from lowfc.contract.messages import (
 )
 from lowfc.programs.core.recording.volume import bytes_per_s, outlook, selected
 from lowfc.programs.logs.survey import survey
-from lowfc.programs.logs.what_if.compare import WhatIf, wanted, what_if
+from lowfc.programs.logs.what_if.compare import what_if
+from lowfc.programs.logs.what_if.options import WhatIf, wanted
 from tests.support.loops import lowfc, until
 from tests.support.recording import Bench, bodies_of, logged, put
 from tests.support.report_log import Night
