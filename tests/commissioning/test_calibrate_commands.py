@@ -20,7 +20,7 @@ from lowfc.contract.configuration import Configuration, load
 from lowfc.contract.errors import CalibrationError, ConfigurationError, DataFileError
 from lowfc.control.calibration.alignment import Geometry, onto
 from lowfc.control.calibration.calibration import Calibration
-from lowfc.control.calibration.response_fit import cross_talk, linear_range
+from lowfc.control.calibration.response_fit import cross_talk
 from lowfc.optics.chain.zernike import zernikes
 from lowfc.optics.twin.twin import Evaluator, Twin, node_radii, reference, response
 from lowfc.programs.commissioning.analytic import analytic
@@ -98,14 +98,16 @@ def test_a_calibration_is_written_once_it_is_whole_and_used_and_its_figures_are_
     def fail(*what: object) -> None:
         raise CalibrationError("a limit of the mirror acted on the pokes")
 
-    monkeypatch.setattr(Calibrator, "linear_range", fail)
+    check = Calibrator.check
+    monkeypatch.setattr(Calibrator, "check", fail)
     before = loop.calibration()
     words = ("--method", "hadamard", "--cycles", "4", "--out", "night.fits", "--load")
     with pytest.raises(CalibrationError, match="a limit of the mirror"):
         told(*words)
     assert not Path("night.fits").exists()
     assert loop.calibration().id == before.id
-    found = told(*words, "--resume", "--no-linear-range")
+    monkeypatch.setattr(Calibrator, "check", check)
+    found = told(*words, "--resume")
     made = calibration_file.load(Path("night.fits"))
     assert (found["method"], found["cycles"]) == ("hadamard", 4)
     assert found["modes"] == 6
@@ -148,7 +150,7 @@ def test_a_bad_calibration_is_written_not_loaded_and_told(monkeypatch: pytest.Mo
     loop = FoldedLoop(faint)
     connect(loop, monkeypatch)
     before = loop.calibration()
-    words = ["--cycles", "4", "--out", "night.fits", "--no-linear-range", "--load"]
+    words = ["--cycles", "4", "--out", "night.fits", "--load"]
     done = CliRunner().invoke(calibrate_app, [*words, "--json"])
     assert done.exit_code == 1
     found = json.loads(done.stdout)
@@ -177,7 +179,7 @@ def test_frames_that_changed_meanwhile_show_in_the_verdict(loop: FoldedLoop, mon
         return own(self, *what)
 
     monkeypatch.setattr(Calibrator, "check", moved)
-    done = CliRunner().invoke(calibrate_app, ["--cycles", "4", "--out", "night.fits", "--no-linear-range", "--json"])
+    done = CliRunner().invoke(calibrate_app, ["--cycles", "4", "--out", "night.fits", "--json"])
     assert done.exit_code == 1
     assert "cross-talk on frames that were not used for it" in json.loads(done.stdout)["faults"][0]
 
@@ -190,7 +192,7 @@ def test_the_time_to_go_has_everything_in_it(loop: FoldedLoop) -> None:
     begun = 600 + 2 * 8  # what was played before it was said
     assert seconds * 250 == pytest.approx(len(loop.surfaces_nm) - begun, abs=0.6 * 250)  # it is said in whole seconds
     assert "4 cycles of" in said
-    assert "3 to check them, then the linear range" in said
+    assert "3 to check them" in said
 
 
 def test_a_calibration_by_default_takes_less_than_three_minutes() -> None:
@@ -331,9 +333,7 @@ def test_an_option_that_would_be_of_no_effect_is_refused(loop: FoldedLoop, words
 def test_the_help_says_how_large_pokes_are() -> None:
     said = " ".join(CliRunner().invoke(calibrate_app, ["--help"]).stdout.split())
     usual = ", ".join(f"{amplitude_nm:g} {method}" for method, amplitude_nm in AMPLITUDE_NM.items())
-    tolerance = inspect.signature(linear_range).parameters["tolerance"].default
     assert f"default: {usual}, half of it above --snr {FULL_AMPLITUDE_SNR:g}." in said
-    assert f"within {100 * tolerance:g} % of 1" in said
 
 
 def test_calibrations_of_different_sensors_are_not_compared(loop: FoldedLoop) -> None:

@@ -10,13 +10,11 @@ from lowfc.control.calibration.calibration import normalise_flux, reconstructor
 from lowfc.control.calibration.dark_frames import dark_of, light_in
 from lowfc.control.calibration.delay_fit import measure_delay
 from lowfc.control.calibration.poke_plan import (
-    REST,
     SIGNS,
     cycle,
     dither,
     frames_for,
     hadamard_patterns,
-    ladder,
     poke_patterns,
     seen,
     usable,
@@ -30,7 +28,6 @@ from lowfc.control.calibration.response_fit import (
     cross_talk,
     cycle_response,
     initial_of,
-    linear_range,
     measured,
     normalised,
     row_error,
@@ -61,8 +58,8 @@ def test_a_cycle_tells_the_modes_apart_and_drift_up_to_the_second_order_cancels(
 def test_a_cycle_has_rest_pushes_and_pulls_with_their_settling() -> None:
     plan = cycle(poke_patterns(2, 8.0), hold=3, settle=2, rest=4)
     assert len(plan) == 4 + 2 + 2 * SIGNS.size * 5
-    assert np.count_nonzero(plan.used[plan.block == REST]) == 4
-    assert not plan.table[plan.block == REST].any()
+    assert np.count_nonzero(plan.used[:6]) == 4
+    assert not plan.table[:6].any()
     changed = np.flatnonzero(np.diff(plan.table, axis=0).any(axis=1)) + 1
     for late in (0, 1):
         assert not plan.used[changed + late].any()
@@ -82,14 +79,6 @@ def test_a_dither_is_another_one_with_another_seed() -> None:
     assert not np.array_equal(one.table, other.table)
     assert np.all(np.abs(one.table) == 2.0)
     assert one.per_column == 100
-
-
-def test_a_ladder_pushes_and_pulls_each_mode_at_each_level() -> None:
-    plan = ladder(np.array([[1.0, 2.0], [3.0, 4.0]]), hold=2, settle=1)
-    for column, levels in ((0, {1.0, 3.0}), (1, {2.0, 4.0})):
-        values = plan.table[:, column]
-        assert set(np.abs(values)) == levels | {0.0}
-        assert abs(values.sum()) < 1e-12
 
 
 def test_the_frames_for_a_signal_to_noise_grow_with_its_square() -> None:
@@ -324,17 +313,6 @@ def test_an_answer_that_comes_too_late_is_said() -> None:
         measure_delay(fractions, I0, poke)
 
 
-def test_the_linear_range_is_where_the_gain_leaves_the_tolerance() -> None:
-    amplitudes = np.outer([10.0, 20.0, 40.0], [1.0, 2.0])
-    plan = ladder(amplitudes, hold=1, settle=0)
-    answers = plan.table - np.array([1e-4, 0.0]) * plan.table**3
-    found = linear_range(answers, plan.table, plan.block)
-    assert found.gain[:, 0] == pytest.approx([0.99, 0.96, 0.84])
-    assert found.range_nm == pytest.approx([30.0, 80.0])
-    with pytest.raises(ValueError, match="pushed and pulled"):
-        linear_range(answers[:2], plan.table[:2], plan.block[:2])
-
-
 def test_bad_pixels_are_found_and_good_ones_are_not() -> None:
     rng = np.random.default_rng(2)
     frames = np.rint(100 + 2 * rng.standard_normal((200, 6400)))
@@ -390,7 +368,7 @@ def test_too_few_usable_frames_are_said() -> None:
     frames = exposed(plan.table, 1)
     fractions, flux = fractions_of(frames)
     with pytest.raises(ValueError, match="do not tell the 4 modes apart"):
-        cycle_response(fractions, flux, plan.table, plan.table, (plan.block < 2).astype(float))
+        cycle_response(fractions, flux, plan.table, plan.table, (np.arange(len(plan)) < 2 * SIGNS.size).astype(float))
     with pytest.raises(ValueError, match="no frame with a poke"):
         cycle_response(fractions, flux, plan.table, plan.table, np.zeros(len(plan)))
     with pytest.raises(ValueError, match="no light"):

@@ -54,9 +54,7 @@ def test_a_running_loop_is_calibrated_interrupted_and_gone_on_with(tmp_path: Pat
         assert "kept in night.fits.part.npz: the same command with --resume goes on with them" in said
         with Client() as client:
             until(lambda: flat(client))
-        done = run(
-            tmp_path, "calibrate", "--cycles", "5", "--resume", "--no-linear-range", "--out", "night.fits", "--json"
-        )
+        done = run(tmp_path, "calibrate", "--cycles", "5", "--resume", "--out", "night.fits", "--json")
         assert done.returncode == 0, done.stderr
         assert "going on after" in done.stderr
         found = json.loads(done.stdout)
@@ -88,7 +86,7 @@ def test_the_promise_is_kept_over_the_bus(method: str, tmp_path: Path) -> None:
     loop = start(tmp_path, "sim-loop", "--config", "test.toml", "--no-record", "--lockstep", *opened)
     try:
         until(running)
-        words = ("--method", method, "--snr", "20", "--no-linear-range", "--out", "night.fits", "--json")
+        words = ("--method", method, "--snr", "20", "--out", "night.fits", "--json")
         done = run(tmp_path, "calibrate", *words)
         assert done.returncode == 0, done.stderr
         found = json.loads(done.stdout)

@@ -10,13 +10,10 @@ import numpy as np
 import numpy.typing as npt
 from scipy.linalg import hadamard
 
-from lowfc.arrays import Array, Mask, Whole
+from lowfc.arrays import Array, Mask
 
 SIGNS = np.array([1, -1, -1, 1, -1, 1, 1, -1], dtype=np.float64)
 """Of the pushes and pulls of one pattern."""
-
-REST = -1
-"""Block of the frames without a poke."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -27,13 +24,11 @@ class Plan:
         table: (frames, columns) amplitudes of each frame's command, in the unit of its shapes: nm rms of wavefront for
             modes, nm of surface for single actuators.
         used: (frames,) whether the exposure that sees this row, and nothing else, may be used.
-        block: (frames,) which pattern a frame belongs to, `REST` for none; a drift cancels over a whole block only.
         per_column: frames of the cycle that measure each column.
     """
 
     table: Array
     used: Mask
-    block: Whole
     per_column: int
 
     def __len__(self) -> int:
@@ -69,14 +64,12 @@ def cycle(patterns: Array, hold: int, settle: int, rest: int, *, backwards: bool
         raise ValueError(f"a poke is held for 1 frame or more, after none or more; got {hold}, {settle} and {rest}")
     order = np.arange(len(patterns))[:: -1 if backwards else 1]
     states = (patterns[order, None, :] * SIGNS[:, None]).reshape(-1, patterns.shape[1])
-    blocks = np.repeat(order, SIGNS.size)
     resting = rest + settle if rest else 0
     table = np.vstack([np.zeros((resting, patterns.shape[1])), np.repeat(states, hold + settle, axis=0)])
-    block = np.concatenate([np.full(resting, REST), np.repeat(blocks, hold + settle)])
     poked = np.tile(np.arange(hold + settle) >= settle, len(states))
     used = np.concatenate([np.arange(resting) >= settle, poked])
     per_column = int(np.count_nonzero(table[used], axis=0).min())
-    return Plan(table, used, block, per_column)
+    return Plan(table, used, per_column)
 
 
 def dither(columns: int, amplitude: float, frames: int, hold: int, seed: int) -> Plan:
@@ -92,25 +85,7 @@ def dither(columns: int, amplitude: float, frames: int, hold: int, seed: int) ->
     rng = np.random.Generator(np.random.SFC64(np.random.SeedSequence([seed, 7])))
     states = rng.integers(0, 2, (-(-frames // hold), columns)) * 2.0 - 1.0
     table = amplitude * np.repeat(states, hold, axis=0)[:frames]
-    return Plan(table, np.ones(frames, np.bool_), np.zeros(frames, np.intp), frames)
-
-
-def ladder(amplitudes: Array, hold: int, settle: int) -> Plan:
-    """Push and pull of every mode at several amplitudes, for its linear range; one block for each pair.
-
-    Args:
-        amplitudes: (levels, modes) nm rms of wavefront.
-        hold: Frames of each push or pull that are used.
-        settle: Frames after each change that are left out.
-    """
-    levels, modes = amplitudes.shape
-    patterns = (amplitudes[:, :, None] * np.eye(modes)).reshape(-1, modes)
-    signs = np.array([1.0, -1.0])
-    states = (patterns[:, None, :] * signs[:, None]).reshape(-1, modes)
-    table = np.repeat(states, hold + settle, axis=0)
-    used = np.tile(np.arange(hold + settle) >= settle, len(states))
-    block = np.repeat(np.arange(len(patterns)), signs.size * (hold + settle))
-    return Plan(table, used, block, levels * signs.size * hold)
+    return Plan(table, np.ones(frames, np.bool_), frames)
 
 
 def frames_for(snr: float, noise_nm: float, amplitude_nm: float) -> int:

@@ -52,9 +52,6 @@ def calibrate(
             show_default=False,
         ),
     ] = None,
-    linear_range: Annotated[
-        bool, typer.Option(help="Measure up to which amplitude each mode's gain is within 10 % of 1.")
-    ] = True,
     load: Load = False,
     compare: Annotated[
         tuple[Path, Path] | None, typer.Option(help="Say how two calibration files differ, and do nothing else.")
@@ -90,7 +87,7 @@ def calibrate(
         return
     if cycles is not None and "--snr" not in given:
         snr = LEAST_SNR
-    wanted = CalibrationRequest(method, out, snr, cycles, amplitude, resume, linear_range, truncate, tikhonov)
+    wanted = CalibrationRequest(method, out, snr, cycles, amplitude, resume, truncate, tikhonov)
     if method == "analytic":
         put(tasks.computed(config, wanted, at, run if load else None, load=load), as_json=as_json)
         return

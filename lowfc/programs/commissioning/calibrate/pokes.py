@@ -28,9 +28,6 @@ DITHER_HOLD = 2
 """Frames between the changes of a dither: the longer, the more of it the loop works against."""
 PIECE = 1024
 """Frames of a piece of a dither."""
-RANGE_LEVELS = (0.25, 0.5, 0.75, 1.0)
-RANGE_ERROR = 0.03
-MOST_RANGE_NM = 60.0
 MARGIN = 0.9
 """Part of the promised error that is aimed at, so that the scatter of the cycles seldom asks for more."""
 MOST_TIMES = 4
@@ -54,7 +51,6 @@ class CalibrationRequest:
         cycles: how many; None where `snr` says.
         amplitude_nm: of a mode, wavefront rms; None for the usual.
         resume: go on from the cycles done.
-        range: measure the linear range.
         truncate: leave out singular values below this part of the largest.
         tikhonov: damp singular values of about this part of the largest.
         seed: of a dither.
@@ -66,7 +62,6 @@ class CalibrationRequest:
     cycles: int | None = None
     amplitude_nm: float | None = None
     resume: bool = False
-    range: bool = True
     truncate: float = 0.0
     tikhonov: float = 0.0
     seed: int = 1
@@ -101,13 +96,6 @@ class Pokes:
         amplitude = self.amplitude_nm * float(np.sqrt(self._modes)) if closed else AMPLITUDE_NM["poke"]
         return sequence(min(amplitude, float(self._largest_nm[mode])), self._wanted.seed)
 
-    def ladder(self) -> poke_plan.Plan:
-        """For the linear range."""
-        top = np.minimum(MOST_RANGE_NM, self._largest_nm)
-        amplitudes = np.outer(RANGE_LEVELS, top)
-        noise = float(self._noise_nm.max()) / (RANGE_ERROR * float(amplitudes[0].min()))
-        return poke_plan.ladder(amplitudes, int(np.clip(np.ceil(noise**2 / 2), 2, 200)), SETTLE)
-
     def cycles(self) -> int:
         """How many are needed, as far as photons and read-out say."""
         wanted = self._wanted
@@ -123,14 +111,8 @@ class Pokes:
         return needed if reachable and error * self._wanted.snr > 1 else cycles
 
     def frames(self, cycles: int, done: int = 0) -> int:
-        """Of so many cycles, less those done, of those that check them, and of the linear range."""
-        frames = (cycles + checks(cycles) - done) * (len(self.cycle(0)) + AFTERWARDS)
-        return frames + (len(self.ladder()) + AFTERWARDS if self.ranged else 0)
-
-    @property
-    def ranged(self) -> bool:
-        """Whether the linear range is measured: not under a closed loop, which would work against it."""
-        return self._wanted.range and self._wanted.method != "in-loop"
+        """Of so many cycles, less those done, and of those that check them."""
+        return (cycles + checks(cycles) - done) * (len(self.cycle(0)) + AFTERWARDS)
 
     def _cycle(self, number: int, amplitude_nm: float) -> poke_plan.Plan:
         wanted = self._wanted

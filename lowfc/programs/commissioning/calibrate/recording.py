@@ -16,7 +16,7 @@ from lowfc.contract.errors import BusError, CalibrationError, LowfcError
 from lowfc.control.calibration.calibration import Calibration
 from lowfc.control.calibration.delay_fit import Delay, NotSeenError, measure_delay
 from lowfc.control.calibration.poke_plan import Plan, seen, usable
-from lowfc.control.calibration.response_fit import Cycle, LinearRange, cycle_response, linear_range, normalised
+from lowfc.control.calibration.response_fit import Cycle, cycle_response, normalised
 from lowfc.control.laws.stability import delay_weights
 from lowfc.control.loop.advance import UNMEASURED
 from lowfc.control.loop.inputs import Step
@@ -81,10 +81,6 @@ class Recording(NamedTuple):
     def usable(self, plan: Plan, delay_frames: float) -> Mask:
         """(frames,) whether each frame may be used."""
         return usable(plan, self.steps, self.commanded, _lag(delay_frames))[self._steps_of_frames]
-
-    def blocks(self, plan: Plan, delay_frames: float) -> Whole:
-        """(frames,) the block of a plan that each frame sees."""
-        return plan.block[np.clip(self.sequence - _lag(delay_frames), 0, len(plan) - 1)]
 
     @property
     def whole(self) -> bool:
@@ -339,28 +335,6 @@ class Player:
             return cycle_response(fractions, flux, moved, poked, used, DITHER_SLOWEST if self.closed else 0.0)
 
         return self._repeated(attempt, "a cycle is repeated", "no cycle was of use")
-
-    def linear_range(self, made: Calibration, plan: Plan, delay_frames: float) -> LinearRange:
-        """How far each mode is linear, seen with a new calibration; the loop is open.
-
-        Raises:
-            CalibrationError: frames were lost, or a limit acts.
-        """
-
-        def attempt() -> LinearRange:
-            recording = self._play(plan)
-            fractions, _ = self._normalised(recording)
-            modes_nm = (fractions - made.reference) @ made.reconstructor.T.astype(np.float64)
-            use = recording.usable(plan, delay_frames)
-            poked = recording.played(plan.table, delay_frames)
-            return linear_range(modes_nm[use], poked[use], recording.blocks(plan, delay_frames)[use])
-
-        return self._repeated(
-            attempt,
-            "once more",
-            "the linear range was not measured: `lowfc doctor` looks for why frames are lost; the cycles are kept, "
-            "--resume --no-linear-range makes the calibration of them",
-        )
 
     def _play(self, plan: Plan, modes: slice = slice(None)) -> Recording:
         return play(self.loop, self.before.modes_to_actuators.T[modes], plan.table, self.came)

@@ -15,7 +15,7 @@ from lowfc.contract.errors import CalibrationError
 from lowfc.control.calibration.actuator_response import actuators_to_modes, of_commands
 from lowfc.control.calibration.calibration import Calibration, comparable
 from lowfc.control.calibration.regularised import Reconstruction, advice, reconstruct
-from lowfc.control.calibration.response_fit import MOST_LARGEST, MOST_RMS, Check, LinearRange, Measured, cross_talk
+from lowfc.control.calibration.response_fit import MOST_LARGEST, MOST_RMS, Check, Measured, cross_talk
 from lowfc.optics.twin.twin import reference as twin_reference
 from lowfc.optics.twin.twin import response as twin_response
 from lowfc.optics.twin.twin_mirror import wavefront_nm
@@ -58,7 +58,6 @@ class Figures(Result):
     frame_to_effect_ms: float = figure("frame to effect", "ms", ".3g")
     noise_gain_nm: list[float] = figure("noise of a frame", "nm", ".3g", column=True)
     computed_noise_nm: list[float] | None = figure("computed", "nm", ".3g", column=True, default=None)
-    linear_range_nm: list[float] | None = figure("linear up to", "nm", ".1f", column=True, default=None)
     bad_pixels: int = figure("bad pixels")
     flux_dn: float = figure("light", "DN", ".4g")
     cycles: int = figure("cycles")
@@ -123,12 +122,11 @@ def finished(
     config = calibrator.config
     made, quality = measured_calibration(config, calibrator.before, data.measured, wanted)
     check = calibrator.check(made, data)
-    linear = calibrator.linear_range(made, data.delay) if calibrator.pokes.ranged else None
     noise = computed_noise_nm(config, made, computed)
     ratio = None if noise is None else factory.frame_noise_nm(config, made) / noise
     verdict = judge(wanted.snr, data.measured.cycles, data.measured.error, check, ratio, made.noll)
     file = rejected_of(wanted.out) if verdict.faults else wanted.out
-    found = result_of(config, made, quality, wanted.method, file, data, linear, computed, verdict)
+    found = result_of(config, made, quality, wanted.method, file, data, computed, verdict)
     calibration_file.save(made, file)
     counted = configured_delay(config)
     if abs(data.delay.delay_frames - counted) > DELAY_APART:
@@ -208,7 +206,6 @@ def result_of(
     method: str,
     file: Path,
     data: CalibrationData | None = None,
-    linear: LinearRange | None = None,
     computed: Calibration | None = None,
     verdict: Verdict | None = None,
 ) -> CalibrationResult:
@@ -220,8 +217,6 @@ def result_of(
         found["cross_talk"] = float(np.abs(cross_talk(calibration.reconstructor, computed.response)).max())
         found["cross_talk_error"] = float(data.measured.error.max())
         found["computed_noise_nm"] = noise.tolist()
-    if linear is not None:
-        found["linear_range_nm"] = linear.range_nm.tolist()
     return CalibrationResult.model_construct(
         method=method,
         modes=len(calibration.noll),

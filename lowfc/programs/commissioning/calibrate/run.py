@@ -27,7 +27,6 @@ from lowfc.control.calibration.regularised import pixel_variance
 from lowfc.control.calibration.response_fit import (
     Check,
     Initial,
-    LinearRange,
     Measured,
     Sums,
     check,
@@ -143,16 +142,6 @@ class Calibrator:
             answers.append(R @ self._player.cycle(plan, taken.delay.delay_frames).response)
         return check(np.array(answers), R @ taken.measured.response, taken.measured.error * np.sqrt(cycles))
 
-    def linear_range(self, made: Calibration, delay: Delay) -> LinearRange:
-        """How far each mode is linear, seen with a new calibration; the loop is open.
-
-        Raises:
-            CalibrationError: frames were lost, or a limit acts.
-        """
-        plan = self.pokes.ladder()
-        self._count.begin("linear range", len(plan))
-        return self._player.linear_range(made, plan, delay.delay_frames)
-
     @property
     def _best(self) -> int:
         """Place of the mode that is measured best; tip and tilt, which are shaken most, only without others."""
@@ -207,8 +196,7 @@ class Calibrator:
             sums = Sums.none(self._initial(delay))
         needed = max(pokes.cycles(), sums.cycles)
         self._say(
-            f"{needed} cycles of {len(pokes.cycle(0))} frames and {checks(needed)} to check them"
-            + (", then the linear range; " if pokes.ranged else "; ")
+            f"{needed} cycles of {len(pokes.cycle(0))} frames and {checks(needed)} to check them; "
             + self._to_go(needed, sums.cycles)
         )
         while True:

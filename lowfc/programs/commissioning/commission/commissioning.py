@@ -173,7 +173,7 @@ class Commissioning:
     def _wanted(self, amplitude_nm: float | None = None, *, resume: bool = False) -> CalibrationRequest:
         asked = self._asked
         snr = asked.snr if asked.cycles is None else LEAST_SNR
-        return CalibrationRequest(METHOD, asked.out, snr, asked.cycles, amplitude_nm, resume, range=False)
+        return CalibrationRequest(METHOD, asked.out, snr, asked.cycles, amplitude_nm, resume)
 
     def _step(self, name: str) -> None:
         self._say(f"[{STEPS.index(name) + 1}/{len(STEPS)}] {name}")
