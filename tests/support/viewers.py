@@ -16,7 +16,9 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
+import psutil
 import pytest
+from PIL import Image
 from websockets.sync.client import ClientConnection, connect
 
 from lowfc.adapters.viewer.rerun_viewer import vulkan_drivers
@@ -42,8 +44,6 @@ Pixels = npt.NDArray[np.uint8]
 
 def pixels(png: bytes) -> Pixels:
     """(rows, columns, 3) of a PNG."""
-    from PIL import Image
-
     with Image.open(io.BytesIO(png)) as picture:
         return np.asarray(picture.convert("RGB"))
 
@@ -51,6 +51,12 @@ def pixels(png: bytes) -> Pixels:
 def share_of(picture: Pixels, colour: tuple[int, int, int], tolerance: int = 12) -> float:
     """Which part of a picture has a colour, 0 to 1."""
     return float(np.all(np.abs(picture.astype(int) - colour) <= tolerance, axis=2).mean())
+
+
+def listening(pid: int) -> set[tuple[str, int]]:
+    """Address and port of every socket on which a process listens, of IPv4 and IPv6."""
+    sockets = psutil.Process(pid).net_connections("inet")
+    return {(one.laddr.ip, one.laddr.port) for one in sockets if one.status == "LISTEN"}
 
 
 class Page:

@@ -189,15 +189,48 @@ def test_without_a_recorder_a_line_says_that_earlier_events_are_missing(
     until(lambda: scene.tapes[0].logged["log/view"])
 
 
-def test_a_viewer_that_died_is_started_again_and_shows_everything(scenes: Scenes) -> None:
-    scene = scenes()
-    scene.publish()
-    until(lambda: scene.drawn(1))
+def dies(scene: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
     scene.screens[0].alive = False
+
+
+def takes_nothing(scene: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(bridges, "STUCK_S", 0.3)
+
+
+def grows(scene: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
+    scene.screens[0].held_bytes = 100_000_000 + bridges.VIEWER_SPARE_BYTES - 1
+    time.sleep(0.2)
+    assert len(scene.screens) == 1
+    scene.screens[0].held_bytes += 2
+
+
+def makes_the_bridge_grow(scene: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
+    held = [bridges.OWN_BYTES + 1]
+    monkeypatch.setattr(bridges, "resident_bytes", lambda: held.pop() if held else 0)
+
+
+@pytest.mark.parametrize(
+    ("harm", "stuck", "why"),
+    [
+        (dies, 0, "the viewer was killed"),
+        (takes_nothing, 1, "took nothing for"),
+        (grows, 0, "the viewer holds 16"),
+        (makes_the_bridge_grow, 0, "the bridge holds 512 MB"),
+    ],
+)
+def test_a_viewer_that_fails_is_started_again_and_shows_everything(
+    scenes: Scenes, monkeypatch: pytest.MonkeyPatch, harm: Callable[..., None], stuck: int, why: str
+) -> None:
+    scene = scenes(stuck=stuck)
+    scene.publish()
+    until(lambda: stuck or scene.drawn(1))
+    harm(scene, monkeypatch)
     until(lambda: len(scene.tapes) == 2)
+    assert scene.screens[0].stopped.is_set()
     scene.publish()
     until(lambda: scene.drawn(2))
-    assert any("VIEW_RENEWED" in event and "killed" in event for event in scene.events)
+    assert any("VIEW_RENEWED" in event and why in event for event in scene.events)
+    assert scene.failure is None
 
 
 def test_a_window_that_was_closed_ends_the_view(scenes: Scenes) -> None:
@@ -207,43 +240,23 @@ def test_a_window_that_was_closed_ends_the_view(scenes: Scenes) -> None:
     assert scene.summary.renewals == 0
 
 
-def test_a_server_that_takes_nothing_is_started_again(scenes: Scenes, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(bridges, "STUCK_S", 0.3)
-    scene = scenes(stuck=1)
-    scene.publish()
-    until(lambda: len(scene.tapes) == 2)
-    assert scene.screens[0].stopped.is_set()
-    scene.publish()
-    until(lambda: scene.drawn(2))
-
-
-def test_a_window_that_takes_nothing_is_waited_for(scenes: Scenes, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_window_that_takes_nothing_is_waited_for_in_bounded_memory(
+    scenes: Scenes, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(bridges, "STUCK_S", 0.3)
     scene = scenes(Show.NATIVE, stuck=1)
-    scene.publish()
+    until(lambda: scene.screens[0].holds_up.is_set())
+    for _ in range(100):
+        scene.publish()
+    waiting = {topic: len(ring.waiting) for topic, ring in scene.bridge._rings.items()}
+    assert (waiting[STEP], waiting[FRAME]) == (bridges.WAITING[STEP], 1)
+    assert all(count <= bridges.WAITING[topic] for topic, count in waiting.items())
     until(lambda: any("VIEW_STUCK" in event for event in scene.events))
     time.sleep(0.4)
     assert sum("VIEW_STUCK" in event for event in scene.events) == 1
     assert len(scene.screens) == 1
     scene.screens[0].stopped.set()
     until(lambda: scene.drawn(1))
-
-
-def test_memory_of_the_viewer_is_watched(scenes: Scenes) -> None:
-    scene = scenes()
-    scene.screens[0].held_bytes = 100_000_000 + bridges.VIEWER_SPARE_BYTES - 1
-    time.sleep(0.3)
-    assert len(scene.screens) == 1
-    scene.screens[0].held_bytes += 2
-    until(lambda: len(scene.screens) == 2)
-
-
-def test_memory_of_the_bridge_is_watched(scenes: Scenes, monkeypatch: pytest.MonkeyPatch) -> None:
-    scene, held = scenes(), [bridges.OWN_BYTES + 1, 0]
-    monkeypatch.setattr(bridges, "resident_bytes", lambda: held.pop(0) if held else 0)
-    until(lambda: len(scene.screens) == 2)
-    assert scene.screens[0].stopped.is_set()
-    assert scene.failure is None
 
 
 def test_memory_that_stays_ends_the_view(scenes: Scenes, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -261,18 +274,6 @@ def test_a_view_into_a_file_is_not_begun_anew(scenes: Scenes, monkeypatch: pytes
     scene = scenes(None)
     monkeypatch.setattr(Tape, "set_time", None)
     assert "the view into a file ended: drawing failed" in failed(scene)
-
-
-def test_a_viewer_that_is_stuck_costs_bounded_memory_and_no_publisher(scenes: Scenes) -> None:
-    scene = scenes(Show.NATIVE, stuck=1)
-    until(lambda: scene.screens[0].holds_up.is_set())
-    for _ in range(100):
-        scene.publish()
-    waiting = {topic: len(ring.waiting) for topic, ring in scene.bridge._rings.items()}
-    assert waiting[STEP] == bridges.WAITING[STEP]
-    assert waiting[FRAME] == 1
-    assert all(count <= bridges.WAITING[topic] for topic, count in waiting.items())
-    scene.screens[0].stopped.set()
 
 
 @pytest.mark.parametrize(("pause_s", "every_one"), [(0.3, True), (0.0, False)])
