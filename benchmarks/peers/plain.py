@@ -19,7 +19,7 @@ from zenoh.handlers import Callback
 
 from benchmarks.peers.shared import DIFFERENT, NumpyStep, Part, Problem
 from lowfc.adapters.bus.run import Links
-from lowfc.adapters.bus.zenoh_bus import receive_in_one_thread, session_config
+from lowfc.adapters.bus.zenoh_bus import session_config
 from lowfc.contract.messages import COMMAND, FRAME, Role
 
 _NUMBER = struct.Struct("<QQ")  # as long as what lowfc sends with every message
@@ -167,7 +167,5 @@ def _join(part: Part, take: Message) -> Message:
 if __name__ == "__main__":
     role, folder = sys.argv[1:]
     own = Part(role, Path(folder))
-    if role != "source":  # as a process of lowfc's that waits for what it receives
-        receive_in_one_thread()
     own.settle()
     {"source": source, "controller": controller, "timer": timer}[role](own)

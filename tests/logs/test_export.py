@@ -249,7 +249,7 @@ def test_mistakes(log: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) ->
         export_log(log, Format.CSV, tmp_path / "nowhere" / "out.csv", console=QUIET)
     monkeypatch.setitem(sys.modules, "aotpy", None)
     monkeypatch.delitem(sys.modules, "lowfc.programs.logs.export.aot", raising=False)
-    with pytest.raises(ConfigurationError, match=r"pip install .*\[aot\]'"):
+    with pytest.raises(ConfigurationError, match=r"pip install .*'aotpy"):
         export_log(log, Format.AOT, console=QUIET)
 
 

@@ -367,7 +367,7 @@ def test_what_a_page_needs_is_missed_before_the_log_is_read(
     monkeypatch.setattr("lowfc.programs.logs.report.source.read_run", lambda *_: pytest.fail("the log was read"))
     done = lowfc("report", good)
     assert isinstance(done.exception, ConfigurationError)
-    assert re.search(r"-m pip install .*\[plots\]'", str(done.exception))
+    assert re.search(r"-m pip install .*'jinja2", str(done.exception))
     monkeypatch.undo()
     monkeypatch.setitem(sys.modules, module, None)
     assert json.loads(lowfc("report", good, "--json").stdout)["log"]["file"] == "x.mcap", "figures need neither"

@@ -220,7 +220,7 @@ def test_a_taken_port_and_a_missing_library_are_said_in_one_line(
     with pytest.raises(BusError, match=f"127.0.0.1:{bridge.port} .*--port") as taken:
         FoxgloveBridge(bus, bus.clock, "test", bridge.port)
     monkeypatch.setitem(sys.modules, "foxglove", None)
-    with pytest.raises(ConfigurationError, match=r"pip install .*\[foxglove\]'") as missing:
+    with pytest.raises(ConfigurationError, match=r"pip install .*'foxglove-sdk") as missing:
         FoxgloveBridge(bus, bus.clock, "test", 0)
     assert "\n" not in f"{taken.value}{missing.value}"
 

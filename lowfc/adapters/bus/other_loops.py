@@ -5,14 +5,14 @@ import itertools
 import os
 import pwd
 from collections.abc import Iterator, Sequence
-from pathlib import Path
+
+import psutil
 
 from lowfc.adapters.bus.run import runtime_path
 
 _PROGRAMS = ("controller", "sim-loop")
 _MOST = 3
 _LONGEST = 48  # characters of a run's name
-_PROC = Path("/proc")
 _FOLDER = "XDG_RUNTIME_DIR"
 
 
@@ -28,17 +28,15 @@ def none_here() -> str:
     return "; ".join([sentence, *found[:_MOST], *more])
 
 
-def other_loops(proc: Path = _PROC) -> Iterator[str]:
+def other_loops() -> Iterator[str]:
     """A sentence for each controller or simulated loop on this host, whoever runs it."""
-    for folder in sorted(proc.glob("[0-9]*"), key=lambda one: int(one.name)):
-        if folder.name == str(os.getpid()):
-            continue
-        with contextlib.suppress(OSError):  # it has ended, or the system does not tell
-            program = _program((folder / "cmdline").read_bytes().decode(errors="replace").split("\0"))
-            if program:
-                owner = folder.stat().st_uid
+    for process in psutil.process_iter():
+        with contextlib.suppress(psutil.Error):  # it has ended, or the system does not tell
+            program = _program(process.cmdline())
+            if program and process.pid != os.getpid():
+                owner = process.uids().effective
                 who = "you run" if owner == os.geteuid() else f"user {_name(owner)} runs"
-                yield f"{who} `{program}` (process {folder.name}{_where(folder)})"
+                yield f"{who} `{program}` (process {process.pid}{_where(process)})"
 
 
 def _program(words: Sequence[str]) -> str:
@@ -50,13 +48,12 @@ def _program(words: Sequence[str]) -> str:
     return ""
 
 
-def _where(folder: Path) -> str:
+def _where(process: psutil.Process) -> str:
     """The runtime directory of a process; nothing for that of another user, which the kernel does not tell."""
     try:
-        words = (folder / "environ").read_bytes().decode(errors="replace").split("\0")
-    except OSError:
+        there = process.environ().get(_FOLDER, "")
+    except psutil.Error:
         return ""
-    there = dict(word.partition("=")[::2] for word in words).get(_FOLDER, "")
     if there == os.environ.get(_FOLDER, ""):
         return ", still starting"
     return f", with {_FOLDER}={there}" if there else f", without {_FOLDER}"

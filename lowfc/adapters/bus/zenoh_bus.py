@@ -33,7 +33,6 @@ __all__ = [
     "ZenohBus",
     "ZenohPublisher",
     "declare_publisher",
-    "receive_in_one_thread",
     "session_config",
 ]
 
@@ -41,15 +40,6 @@ TAKEN_S = 0.5
 """How long the router, or who has one's place already, may take to answer."""
 FLUSH_S = 2.0
 """How long a session waits at its end for peers that have not received everything yet."""
-
-
-def receive_in_one_thread() -> None:
-    """Let zenoh's thread that waits for messages read them too, instead of waking another; before the first session.
-
-    Right for a process that waits for what it receives; one that computes meanwhile would hold it up. Its children
-    inherit it.
-    """
-    os.environ.setdefault("ZENOH_RUNTIME", "(rx: (handover: net))")
 
 
 def declare_publisher(session: zenoh.Session, topic: Topic, key: str, *, lockstep: bool = False) -> zenoh.Publisher:
@@ -181,7 +171,8 @@ class ZenohBus:
         self.read = _sample
         self.start_s = links.claim_start(role, clock.start_s)
         if looks_on:
-            receive_in_one_thread()
+            # zenoh's thread that waits for messages reads them too, instead of waking another
+            os.environ.setdefault("ZENOH_RUNTIME", "(rx: (handover: net))")
         if links.network.router:
             require_certificate(links.network, role)
         config = zenoh.Config.from_json5(json.dumps(session_config(links, role, looks_on=looks_on)))

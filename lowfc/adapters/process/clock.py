@@ -5,8 +5,6 @@ kept in the per-user runtime directory in a file named after the boot. In lockst
 simulated; envelopes keep the host's time, so that latencies stay measurable.
 """
 
-import contextlib
-import ctypes
 import time
 from pathlib import Path
 from typing import Protocol
@@ -21,7 +19,6 @@ WALL_TOLERANCE_NS = 100_000_000
 """Difference from the wall clock above which it is reported: it was wrong when the offset of this boot was fixed."""
 
 _BOOT_ID = Path("/proc/sys/kernel/random/boot_id")
-_PR_SET_TIMERSLACK = 29
 _NS = 1_000_000_000
 
 
@@ -123,9 +120,3 @@ def boot_offset_ns(base: Path) -> int:
             f"{path} should hold this boot's clock offset in ns, got {text[:40]!r}; stop all lowfc processes, remove "
             "it and start them again"
         ) from None
-
-
-def sharpen_sleep() -> None:
-    """Let this thread, and those it starts, wake from a sleep within 1 ns of the deadline rather than 50 us."""
-    with contextlib.suppress(AttributeError):  # no prctl: not Linux
-        ctypes.CDLL(None, use_errno=True).prctl(_PR_SET_TIMERSLACK, 1, 0, 0, 0)

@@ -1,24 +1,16 @@
-"""How packages that only some commands need are installed, in the way in which lowfc itself was."""
+"""How packages that only some commands need are installed."""
 
-import json
+import re
 import sys
 from importlib import metadata
-from urllib.parse import unquote, urlsplit
-
-_NAME = "lowfc"
 
 
 def install_advice(extra: str) -> str:
-    """Command line for an extra, for this interpreter: from where lowfc came from, else from the package index."""
-    install = f"{sys.executable or 'python'} -m pip install"
+    """Command line that installs what an extra of lowfc needs, for this interpreter; right wherever lowfc came from."""
+    pip = f"{sys.executable or 'python'} -m pip install"
     try:
-        found = json.loads(metadata.distribution(_NAME).read_text("direct_url.json") or "{}")
+        needed = metadata.requires("lowfc") or []
     except metadata.PackageNotFoundError:  # a checkout that is on the path and not installed
-        return f"{install} -e '.[{extra}]' in its checkout"
-    url = str(found.get("url", ""))
-    if not url:
-        return f"{install} '{_NAME}[{extra}]'"
-    if "vcs_info" in found:
-        return f"{install} '{_NAME}[{extra}] @ {found['vcs_info']['vcs']}+{url}'"
-    path = unquote(urlsplit(url).path)
-    return f"{install} {'-e ' if found.get('dir_info', {}).get('editable') else ''}'{path}[{extra}]'"
+        return f"{pip} -e '.[{extra}]' in its checkout"
+    names = [one.partition(";")[0].strip() for one in needed if re.search(rf"extra == .{extra}.", one)]
+    return " ".join([pip, *(f"'{name}'" for name in names)])

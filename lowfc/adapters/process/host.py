@@ -231,6 +231,11 @@ class Host:
         return [int(words[0]) / int(words[1])] if words[0] not in ("", "max", "-1") else []
 
 
+def resident_bytes(process: int | None = None) -> int:
+    """Resident memory of a process, of this one when None; psutil.NoSuchProcess where there is none."""
+    return int(psutil.Process(process).memory_info().rss)
+
+
 def _cpu_list(text: str) -> set[int]:
     """Processors of a list such as 0-3,8."""
     found: set[int] = set()

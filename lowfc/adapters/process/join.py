@@ -1,12 +1,11 @@
 """How a process of the loop joins a run: real-time set-up first, then clock, bus and service."""
 
 from lowfc.adapters.bus.run import open_run
-from lowfc.adapters.bus.zenoh_bus import ZenohBus, receive_in_one_thread
+from lowfc.adapters.bus.zenoh_bus import ZenohBus
 from lowfc.adapters.process.clock import Clock, HostClock, SimulatedClock
 from lowfc.adapters.process.realtime import Granted, set_up
 from lowfc.adapters.process.service import Service
 from lowfc.contract.configuration import Configuration
-from lowfc.contract.messages import Role
 
 
 def clock_of(config: Configuration) -> Clock:
@@ -14,32 +13,24 @@ def clock_of(config: Configuration) -> Clock:
     return SimulatedClock() if config.lockstep else HostClock()
 
 
-def prepare(config: Configuration, role: str, cpus: list[int]) -> Granted:
-    """Set this process up for a role in the loop, before its first session, whose threads keep what they are born with.
+def prepare(config: Configuration, cpus: list[int]) -> Granted:
+    """Set this process up for the loop, before its first session, whose threads keep what they are born with.
 
     All have the same priority: where the mirror shares a processor with the controller, which yields after its put, a
-    command is applied before the controller tells of it.
+    command is applied before the controller publishes its step.
     """
     realtime = config.realtime
-    granted = set_up(
+    return set_up(
         realtime.priority or None,
         set(cpus) or None,
         lock_memory=realtime.lock_memory,
         disable_cpu_idle=realtime.disable_cpu_idle,
     )
-    if role != Role.CAMERA:  # which computes while the mirror's states come
-        receive_in_one_thread()
-    return granted
 
 
-def join(
-    config: Configuration,
-    run_id: str,
-    role: str,
-    cpus: list[int],
-) -> Service:
+def join(config: Configuration, run_id: str, role: str, cpus: list[int]) -> Service:
     """Set this process up for the loop and join a run."""
-    granted = prepare(config, role, cpus)
+    granted = prepare(config, cpus)
     run = open_run(run_id, (config.mirror.name,), network=config.network)
     clock = clock_of(config)
     return Service(role, run_id, clock, ZenohBus(run.links, role, clock), granted=granted, announces=True)

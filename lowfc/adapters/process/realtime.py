@@ -8,7 +8,6 @@ import gc
 import os
 import resource
 import struct
-import sys
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from functools import partial
@@ -16,17 +15,13 @@ from pathlib import Path
 
 from threadpoolctl import threadpool_limits
 
-from lowfc.adapters.process.clock import sharpen_sleep
-
-_SWITCH_INTERVAL_S = 5e-3
 _MCL_CURRENT, _MCL_FUTURE, _MCL_ONFAULT = 1, 2, 4
-_M_TRIM_THRESHOLD, _M_TOP_PAD, _M_MMAP_THRESHOLD = -1, -2, -3
 _CAP_IPC_LOCK = 1 << 14
-_LOOKING_ON = 5  # of nice's 19
+_MONITOR_NICE = 5  # of 19
 _LATENCY_DEVICE = "/dev/cpu_dma_latency"
 
-_Wish = tuple[Callable[[], str], str, str]
-"""A measure, how it is called where it is refused, and what that costs."""
+_Measure = tuple[str, Callable[[], object], str]
+"""Name of a measure, what asks the host for it, and the cost of its refusal."""
 
 _held: list[int] = []
 
@@ -63,36 +58,25 @@ def set_up(priority: int | None, cpus: set[int] | None, *, lock_memory: bool, di
     Returns:
         What was granted; a refusal is no error, for the loop runs without, only less evenly.
     """
-    wishes: list[_Wish] = []
-    if cpus is not None:
-        cost = "the kernel moves the loop between processors; expect a longer tail"
-        wishes.append((partial(_stay_on, cpus), f"processors {sorted(cpus)}", cost))
+    threadpool_limits(limits=1)
+    gc.collect()
+    gc.freeze()
+    gc.disable()
+    measures = _processors(cpus, "the kernel moves the loop between processors; expect a longer tail")
     if lock_memory:
-        wishes.append((_lock_memory, "locked memory", "a page that was swapped out stalls the loop for milliseconds"))
+        cost = "a page that was swapped out stalls the loop for milliseconds"
+        measures.append(("locked memory", _lock_memory, cost))
     if disable_cpu_idle:
         cost = (
             "a processor that sleeps between frames takes tens of microseconds longer to wake, several times a "
             f"frame; let this user write to {_LATENCY_DEVICE}"
         )
-        wishes.append((_stay_awake, "processors awake", cost))
-    if priority is not None:
-        cost = (
-            "other programs may run first, and one frame in a thousand comes milliseconds late on a busy host; "
-            "allow it with LimitRTPRIO= or CAP_SYS_NICE"
-        )
-        wishes.append((partial(_run_first, priority), f"SCHED_FIFO priority {priority}", cost))
-    return _ask(_quiet_interpreter(), wishes)
-
-
-def _ask(in_force: Iterable[str], wishes: Iterable[_Wish]) -> Granted:
-    """Ask the host for measures, beside those in force."""
-    granted, refused = [*in_force], []
-    for measure, what, cost in wishes:
-        try:
-            granted.append(measure())
-        except (_RefusedError, OSError, ValueError) as fault:
-            refused.append((f"{what} ({getattr(fault, 'strerror', None) or fault})", cost))
-    return Granted(tuple(granted), tuple(refused))
+        measures.append(("processors awake", _stay_awake, cost))
+    cost = (
+        "other programs may run first, and one frame in a thousand comes milliseconds late on a busy host; "
+        "allow it with LimitRTPRIO= or CAP_SYS_NICE"
+    )
+    return _ask(["one BLAS thread", "garbage collector off"], measures + _scheduling(priority, cost))
 
 
 def spread(cpus: Iterable[int], *, simulated: bool = True) -> dict[str, list[int]]:
@@ -127,14 +111,9 @@ def step_back(priority: int | None, cpus: set[int] | None = None) -> Granted:
     class, beside other work, a recorder loses messages of a 1 kHz loop.
     """
     os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))  # not the class of a parent that is in the loop
-    wishes: list[_Wish] = []
-    if cpus is not None:
-        cost = "the recorder may get in the loop's way"
-        wishes.append((partial(_stay_on, cpus), f"processors {sorted(cpus)}", cost))
-    if priority is not None:
-        wishes.append((partial(_run_first, priority), "SCHED_FIFO", "on a busy host the recorder loses messages"))
-    found = _ask([_keep_memory()], wishes)
-    return found if priority is not None else Granted((*found.granted, "normal scheduling class"), found.refused)
+    measures = _processors(cpus, "the recorder may get in the loop's way")
+    measures += _scheduling(priority, "on a busy host the recorder loses messages")
+    return _ask([] if priority is not None else ["normal scheduling class"], measures)
 
 
 def let_send() -> None:
@@ -150,42 +129,37 @@ def let_send() -> None:
 
 
 def give_way() -> None:
-    """Let the loop and its recorder run first: for a process that only looks on. It may be late, and loses nothing."""
+    """Let the loop and its recorder run first: for a monitor, which may be late and loses nothing."""
     os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))  # not the class of a parent that is in the loop
-    os.nice(_LOOKING_ON)
+    os.nice(_MONITOR_NICE)
     threadpool_limits(limits=1)
 
 
-def _quiet_interpreter() -> tuple[str, ...]:
-    """One BLAS thread, no garbage collection, quick hand-over between threads, sharp sleeps."""
-    threadpool_limits(limits=1)
-    gc.collect()
-    gc.freeze()
-    gc.disable()
-    sys.setswitchinterval(_SWITCH_INTERVAL_S)
-    sharpen_sleep()
-    return _keep_memory(), "one BLAS thread", "garbage collector off", "timer slack 1 ns"
+def _ask(in_force: list[str], measures: Iterable[_Measure]) -> Granted:
+    """Ask the host for measures, beside those in force."""
+    refused = []
+    for name, measure, cost in measures:
+        try:
+            measure()
+        except (_RefusedError, OSError, ValueError) as fault:
+            refused.append((f"{name} ({getattr(fault, 'strerror', None) or fault})", cost))
+        else:
+            in_force.append(name)
+    return Granted(tuple(in_force), tuple(refused))
 
 
-def _keep_memory() -> str:
-    """Never give freed memory back to the kernel: fetching it again costs a page fault in the middle of a frame."""
-    libc = ctypes.CDLL(None)
-    for option, value in ((_M_MMAP_THRESHOLD, 32 << 20), (_M_TRIM_THRESHOLD, 1 << 30), (_M_TOP_PAD, 4 << 20)):
-        libc.mallopt(option, value)
-    return "memory kept"
+def _processors(cpus: set[int] | None, cost: str) -> list[_Measure]:
+    return [] if cpus is None else [(f"processors {sorted(cpus)}", partial(os.sched_setaffinity, 0, cpus), cost)]
 
 
-def _run_first(priority: int) -> str:
-    os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(priority))
-    return f"SCHED_FIFO priority {priority}"
+def _scheduling(priority: int | None, cost: str) -> list[_Measure]:
+    if priority is None:
+        return []
+    first = partial(os.sched_setscheduler, 0, os.SCHED_FIFO, os.sched_param(priority))
+    return [(f"SCHED_FIFO priority {priority}", first, cost)]
 
 
-def _stay_on(cpus: set[int]) -> str:
-    os.sched_setaffinity(0, cpus)
-    return f"processors {sorted(cpus)}"
-
-
-def _stay_awake() -> str:
+def _stay_awake() -> None:
     """Ask the kernel for processors that wake at once; it holds as long as the device is open."""
     if not _held:
         device = os.open(_LATENCY_DEVICE, os.O_WRONLY)
@@ -195,10 +169,9 @@ def _stay_awake() -> str:
             os.close(device)
             raise
         _held.append(device)
-    return "processors awake"
 
 
-def _lock_memory() -> str:
+def _lock_memory() -> None:
     """Lock what is there, and every later page once it is touched.
 
     Under a limit, later allocations would fail instead of being slow, so nothing is locked then.
@@ -210,7 +183,6 @@ def _lock_memory() -> str:
     for flags in (_MCL_CURRENT, _MCL_FUTURE | _MCL_ONFAULT):
         if libc.mlockall(flags) != 0:
             raise _RefusedError(os.strerror(ctypes.get_errno()))
-    return "locked memory"
 
 
 def _capabilities() -> int:

@@ -17,9 +17,9 @@ from lowfc.adapters.bus.mailbox import Mailbox
 from lowfc.adapters.bus.names import Names
 from lowfc.adapters.logs.sequence_gaps import Arrivals
 from lowfc.adapters.process.clock import WALL_TOLERANCE_NS, Clock
+from lowfc.adapters.process.host import resident_bytes
 from lowfc.adapters.process.realtime import NOTHING, Granted
 from lowfc.adapters.process.supervision import Supervisor
-from lowfc.adapters.process.usage import resident_bytes
 from lowfc.contract.events import EVENTS, Level
 from lowfc.contract.messages import EVENT, HEALTH, Log, Role, Topic, timestamp, wire
 from lowfc.control.loop.wording import counted

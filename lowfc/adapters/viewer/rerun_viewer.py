@@ -32,10 +32,12 @@ from pathlib import Path
 from typing import TYPE_CHECKING, TypeVar
 from urllib.parse import quote
 
+import psutil
+
 from lowfc.adapters.bus.run import free_ports
 from lowfc.adapters.files.whole_file import being_written
 from lowfc.adapters.process.child import Child
-from lowfc.adapters.process.usage import resident_bytes
+from lowfc.adapters.process.host import resident_bytes
 from lowfc.adapters.viewer.viewer_page import ViewerPage
 from lowfc.contract.errors import LowfcError
 
@@ -157,7 +159,7 @@ class RerunViewer:
         """Memory of its process; 0 when it is gone."""
         try:
             return resident_bytes(self.pid)
-        except (OSError, IndexError):
+        except psutil.NoSuchProcess:
             return 0
 
     def how_it_ended(self) -> str:

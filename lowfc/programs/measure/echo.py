@@ -162,7 +162,7 @@ def _answer(config: Configuration, run: Run, command: bytes) -> None:
 
 def _joined(config: Configuration, run_id: str, role: str, cpus: list[int]) -> Run:
     """The run, its links only those of the two, for a process that is set up as the role's in the loop."""
-    prepare(config, role, cpus)
+    prepare(config, cpus)
     run = open_run(run_id, (config.mirror.name,))
     ports = {str(role): run.links.ports[role] for role in (Role.CAMERA, Role.CONTROLLER)}
     return dataclasses.replace(run, links=dataclasses.replace(run.links, ports=ports))

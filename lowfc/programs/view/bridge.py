@@ -18,8 +18,8 @@ from lowfc.adapters.bus.bus import Bus, Sample, states
 from lowfc.adapters.logs.reader import LogReader
 from lowfc.adapters.logs.writer import UNFINISHED
 from lowfc.adapters.process.clock import Clock
+from lowfc.adapters.process.host import resident_bytes
 from lowfc.adapters.process.service import Service
-from lowfc.adapters.process.usage import resident_bytes
 from lowfc.adapters.viewer.rerun_viewer import RerunViewer, Show, ViewerError
 from lowfc.contract.configuration import Configuration
 from lowfc.contract.errors import DataFileError, LowfcError

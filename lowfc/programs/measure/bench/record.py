@@ -13,10 +13,10 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
+import psutil
 import typer
 
 from lowfc.adapters.process.terminal import Json
-from lowfc.adapters.process.usage import processor_s
 from lowfc.contract.errors import BusError, DataFileError
 from lowfc.programs.cli.output import put
 
@@ -75,10 +75,8 @@ def measure(rates_hz: tuple[float, ...], seconds: float, folder: Path | None = N
     """
     from rich.console import Console
 
-    from lowfc.adapters.process.clock import sharpen_sleep
     from lowfc.adapters.process.progress import passing_bar
 
-    sharpen_sleep()
     rates: list[dict[str, Any]] = []
     with tempfile.TemporaryDirectory(prefix="lowfc-bench-", dir=folder) as name:
         copy_us, frame_bytes = _copying(Path(name))
@@ -133,10 +131,11 @@ def _one_rate(rate_hz: float, seconds: float, folder: Path) -> dict[str, Any]:
                     raise BusError(f"the recorder did not get ready: {process.communicate()[1].strip()[-500:]}")
             traffic.run(_WARM_UP_S)
             begun_s, frames = time.monotonic(), traffic.frames
-            own_s, others_s = time.process_time(), processor_s(process.pid)
+            own_s, before = time.process_time(), psutil.Process(process.pid).cpu_times()
             traffic.run(seconds)
             elapsed_s = time.monotonic() - begun_s
-            own_s, others_s = time.process_time() - own_s, processor_s(process.pid) - others_s
+            own_s, after = time.process_time() - own_s, psutil.Process(process.pid).cpu_times()
+            others_s = after.user + after.system - before.user - before.system
             traffic.finish()
             process.send_signal(signal.SIGTERM)
             out, error = process.communicate()

@@ -107,14 +107,12 @@ def _configuration(file: Path | None, rate: float | None, camera: Camera, *, pla
 def _measure(asked: "Asked") -> dict[str, Any]:
     from rich.console import Console
 
-    from lowfc.adapters.process.clock import sharpen_sleep
     from lowfc.adapters.process.host import Host
     from lowfc.adapters.process.progress import passing_bar
     from lowfc.adapters.process.provenance import provenance
     from lowfc.programs.measure.latency.run import prepared, run_repeats
     from lowfc.programs.measure.latency.summary import together
 
-    sharpen_sleep()
     host: dict[str, Any] = {**provenance(), "clock_source": "", "load": os.getloadavg()[0]}
     with contextlib.suppress(OSError):
         host["clock_source"] = Host().clock_source()
