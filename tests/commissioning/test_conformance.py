@@ -1,6 +1,5 @@
 """What `lowfc conformance` says of good publishers, and of those with one mistake: that mistake, and nothing else."""
 
-import io
 import json
 import re
 import socket
@@ -14,7 +13,6 @@ import numpy as np
 import pytest
 import zenoh
 from google.protobuf.message import DecodeError, Message
-from rich.console import Console
 
 from lowfc.adapters.bus.run import open_run
 from lowfc.adapters.bus.zenoh_bus import session_config
@@ -36,7 +34,7 @@ from lowfc.contract.messages import (
     wire,
 )
 from lowfc.control.loop.safety import Limits
-from lowfc.programs.commissioning.checks import Check, figures, table
+from lowfc.programs.commissioning.checks import Check, put
 from lowfc.programs.commissioning.conformance import command as conformance
 from lowfc.programs.commissioning.conformance.camera import watch
 from lowfc.programs.commissioning.conformance.command import FIELDS, STATUSES
@@ -488,16 +486,16 @@ def test_dead_and_stuck_actuators_of_the_configuration_are_no_mistake() -> None:
     assert found(mirror_checks(Dialogue(free, expected_of(config)), 0.2, lambda _: None)) == {}
 
 
-def test_the_report_says_what_to_do_of_what_is_not_right() -> None:
+def test_the_report_says_what_to_do_of_what_is_not_right(capsys: pytest.CaptureFixture[str]) -> None:
     checks = list(camera_checks(watch(Camera(frame=setting(encoding="16UC1")), 1.0, lambda _: None)))
-    console = Console(width=120, record=True, file=io.StringIO())
-    table(checks, STATUSES, console)
-    text = console.export_text()
+    put(checks, STATUSES, FIELDS, None)
+    text = capsys.readouterr().out
     assert "'16UC1'" in text
     assert "call it mono16" in text
     assert text.splitlines()[-1].startswith("1 wrong, 0 warnings")
-    printed = json.loads(json.dumps(figures(checks, STATUSES, FIELDS)))
-    assert printed["counts"] == {"ok": len(checks) - 1, "warning": 0, "wrong": 1}
+    put(checks, STATUSES, FIELDS, {"run": "bench"})
+    printed = json.loads(capsys.readouterr().out)
+    assert (printed["run"], printed["counts"]) == ("bench", {"ok": len(checks) - 1, "warning": 0, "wrong": 1})
     assert {"name": "encoding", "status": "wrong"}.items() <= printed["checks"][5].items()
 
 

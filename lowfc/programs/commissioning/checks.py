@@ -2,14 +2,12 @@
 
 import json
 import sys
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections import Counter
+from collections.abc import Callable, Iterator, Mapping
 from enum import StrEnum
-from typing import TYPE_CHECKING, Any, Generic, NamedTuple, TypeVar
+from typing import Any, Generic, NamedTuple, TypeVar
 
 from lowfc.control.loop.wording import counted
-
-if TYPE_CHECKING:
-    from rich.console import Console
 
 S = TypeVar("S")
 
@@ -105,12 +103,6 @@ class Table(Generic[S]):
                 yield found._replace(name=usual.name, expected=usual.expected)
 
 
-def counts(checks: Iterable[Check], statuses: Iterable[Status]) -> dict[str, int]:
-    """How many checks ended in which way."""
-    ended = [check.status for check in checks]
-    return {str(status): ended.count(status) for status in statuses}
-
-
 def put(
     checks: list[Check], worst_first: tuple[Status, ...], fields: Mapping[str, str], about: dict[str, Any] | None
 ) -> None:
@@ -118,26 +110,17 @@ def put(
 
     Args:
         checks: in their order.
-        worst_first: statuses that the last line counts.
+        worst_first: statuses that are counted.
         fields: attribute of a check by its key in JSON.
         about: the rest of the JSON object; None for a table.
     """
+    ended = Counter(check.status for check in checks)
     if about is not None:
-        sys.stdout.write(json.dumps(figures(checks, worst_first, fields) | about) + "\n")
+        rows = [{key: getattr(check, attribute) for key, attribute in fields.items()} for check in checks]
+        counts = {str(status): ended[status] for status in reversed(worst_first)}
+        sys.stdout.write(json.dumps({"checks": rows, "counts": counts} | about) + "\n")
         return
     from rich.console import Console
-
-    table(checks, worst_first, Console(width=None if sys.stdout.isatty() else _WIDTH, highlight=False))
-
-
-def figures(checks: list[Check], worst_first: tuple[Status, ...], fields: Mapping[str, str]) -> dict[str, Any]:
-    """Checks and counts as JSON has them."""
-    rows = [{key: getattr(check, attribute) for key, attribute in fields.items()} for check in checks]
-    return {"checks": rows, "counts": counts(checks, reversed(worst_first))}
-
-
-def table(checks: list[Check], worst_first: tuple[Status, ...], console: "Console") -> None:
-    """Print checks for a person: a line of what is ok, of the rest also what was expected and what to do."""
     from rich.table import Table as Grid
     from rich.text import Text
 
@@ -149,9 +132,10 @@ def table(checks: list[Check], worst_first: tuple[Status, ...], console: "Consol
                 if text:
                     style = "" if label == "to do" else "dim"
                     grid.add_row("", Text(label, style="dim", justify="right"), Text(text, style=style))
+    console = Console(width=None if sys.stdout.isatty() else _WIDTH, highlight=False)
     console.print(grid)
-    ended = counts(checks, worst_first)
     words = [
-        f"{count} {status}" if status in ("ok", "wrong") else counted(count, status) for status, count in ended.items()
+        f"{ended[status]} {status}" if status in (Status.OK, Status.WRONG) else counted(ended[status], status)
+        for status in worst_first
     ]
     console.print(f"\n{', '.join(words)}")

@@ -1,9 +1,7 @@
 """What the checks of `lowfc doctor` look at."""
 
-import os
-import time
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from lowfc.adapters.process.host import Host
 from lowfc.adapters.process.trial import Trial, try_out
@@ -20,8 +18,7 @@ class Facts:
         host: the kernel's account of it.
         config: of the loop that is to run.
         trial: what was granted and measured; why not, where it could not be tried.
-        busy: other processes while that was measured, the busiest first: name with number, and share of one
-            processor.
+        busy: other processes while that was measured, as `Host.busy`.
     """
 
     host: Host
@@ -47,33 +44,22 @@ class Facts:
         return {*asked.camera_cpus, *asked.controller_cpus, *asked.mirror_cpus, *asked.recorder_cpus}
 
     @property
-    def bytes_per_frame(self) -> int:
-        """Of a frame, its command and the mirror's state; all else that is sent for a frame is small."""
-        sizes = payload_bytes(self.config)
-        return sizes[FRAME] + sizes[COMMAND] + sizes[MIRROR_STATE]
-
-    @property
     def bytes_per_s(self) -> float:
-        """Of the loop's traffic."""
-        return self.bytes_per_frame * self.config.camera.rate_hz
+        """Of frames, commands and the mirror's states; all else that is sent for a frame is small."""
+        sizes = payload_bytes(self.config)
+        return (sizes[FRAME] + sizes[COMMAND] + sizes[MIRROR_STATE]) * self.config.camera.rate_hz
 
 
 def gather(host: Host, config: Configuration, seconds: float) -> Facts:
     """Try what the loop asks for and measure wake-ups for so long in each class; note who else is busy meanwhile."""
-    before, begun_s = host.used_s(), time.monotonic()
     facts = Facts(host, config, OSError("not tried"), ())
+    host.busy()
     trial: Trial | OSError
     try:
         trial = try_out(config.realtime, facts.asked_cpus, seconds)
     except OSError as fault:
         trial = fault
-    elapsed_s = time.monotonic() - begun_s
-    shares = [
-        (f"{name} ({one[0]})", (used_s - before.get(one, ("", 0.0))[1]) / elapsed_s)
-        for one, (name, used_s) in host.used_s().items()
-        if one[0] != os.getpid()
-    ]
-    return Facts(host, config, trial, tuple(sorted(shares, key=lambda one: -one[1])))
+    return replace(facts, trial=trial, busy=tuple(host.busy()))
 
 
 def ranges(cpus: Iterable[int]) -> str:

@@ -1,9 +1,6 @@
 """Checks of what a process of the loop may keep and use: memory, sockets, files, disk, libraries, the viewer."""
 
 import datetime
-import platform
-import shutil
-import sys
 from pathlib import Path
 
 import numpy as np
@@ -22,7 +19,6 @@ CHECKS: Table[Facts] = Table()
 _STALL_S = 0.1
 _SHARED_BYTES = 64e6
 _OPEN_FILES = 256
-_BROWSERS = ("chromium", "chromium-browser", "google-chrome", "firefox", "firefox-esr")
 _LIMITS = "give the user memlock unlimited in /etc/security/limits.d, or the service LimitMEMLOCK=infinity"
 
 
@@ -69,7 +65,8 @@ def _huge_pages(facts: Facts) -> Check:
 
     Always.
     """
-    when = facts.host.huge_pages()
+    text = facts.host.text("sys/kernel/mm/transparent_hugepage/enabled")
+    when = text[text.index("[") + 1 : text.index("]")]
     return ok(when) if when != "always" else warning(when)
 
 
@@ -97,7 +94,11 @@ def _socket_buffers(facts: Facts) -> Check:
 
     TCP, by which the processes talk, holds less than 100 ms of the loop's frames, commands and mirror states.
     """
-    default_bytes, largest_bytes, tcp_bytes = facts.host.socket_buffers()
+    net, read = "proc/sys/net", facts.host.text
+    default_bytes, largest_bytes = (
+        min(int(read(f"{net}/core/{way}mem_{which}")) for way in "rw") for which in ("default", "max")
+    )
+    tcp_bytes = min(int(read(f"{net}/ipv4/tcp_{way}mem").split()[2]) for way in "rw")
     held_s = tcp_bytes / facts.bytes_per_s
     detail = (
         f"TCP up to {tcp_bytes / 1e3:.0f} kB, {held_s * 1e3:.0f} ms of the loop's traffic; other sockets "
@@ -120,9 +121,10 @@ def _shared_memory(facts: Facts) -> Check:
     There is none, it cannot be written, or less than 64 MB is free, which is all that a container gets by default.
     """
     cost = "`lowfc replay` cannot start its workers, and a browser with the view may die"
-    found = facts.host.shared_memory()
-    if found is None:
+    folder = Path("/dev/shm")  # noqa: S108  # looked at
+    if not (facts.host.root / "dev/shm").is_dir():
         return warning("there is no /dev/shm", "mount a tmpfs on /dev/shm", cost)
+    found = facts.host.disk(folder)
     detail = f"{found.free_bytes / 1e6:.0f} MB free of {found.total_bytes / 1e6:.0f} MB"
     if found.writable and found.free_bytes >= _SHARED_BYTES:
         return ok(detail)
@@ -188,24 +190,6 @@ def _certificates(facts: Facts) -> Check:
     return warning("; ".join(said))
 
 
-@CHECKS.check("python", advice="run the loop without", cost="every line of the loop takes longer")
-def _python(facts: Facts) -> Check:
-    """The Python that runs the loop.
-
-    A debug build, development mode, or a tracer.
-    """
-    detail = f"{platform.python_implementation()} {platform.python_version()}"
-    slow = {
-        "a debug build": hasattr(sys, "gettotalrefcount"),
-        "development mode": sys.flags.dev_mode,
-        "a tracer or profiler": sys.gettrace() is not None or sys.getprofile() is not None,
-    }
-    if not any(slow.values()):
-        return ok(detail)
-    why = ", ".join(name for name, there in slow.items() if there)
-    return warning(f"{detail}, {why}")
-
-
 @CHECKS.check("viewer")
 def _viewer(facts: Facts) -> Check:
     """The rerun viewer, and a screen for its window.
@@ -233,18 +217,6 @@ def _graphics_driver(facts: Facts) -> Check:
     """
     drivers = vulkan_drivers()
     return ok(", ".join(path.name for path in drivers)) if drivers else warning("no Vulkan driver")
-
-
-@CHECKS.check("browser")
-def _browser(facts: Facts) -> Check:
-    """A browser for `lowfc view --web`.
-
-    Never; without one it is a note.
-    """
-    found = [name for name in _BROWSERS if shutil.which(name)]
-    if found:
-        return ok(", ".join(found))
-    return note("none found", "apt install chromium, or look from another host through ssh -L", "no `lowfc view --web`")
 
 
 def _blas_threads() -> dict[str, int]:

@@ -1,10 +1,12 @@
 """Checks of what decides when a process of the loop runs: processors, kernel, clocks, other processes."""
 
+import re
 import time
 
 import numpy as np
 
 from lowfc.adapters.process.clock import WALL_TOLERANCE_NS, HostClock, boot_file
+from lowfc.adapters.process.host import CPUS
 from lowfc.adapters.process.trial import Trial
 from lowfc.programs.commissioning.checks import Check, Table, note, ok, warning
 from lowfc.programs.commissioning.doctor.facts import Facts, ranges
@@ -47,7 +49,8 @@ def _realtime_share(facts: Facts) -> Check:
 
     None of it. Less than all is a note where camera, controller and mirror must share processors.
     """
-    runtime_us, period_us = facts.host.realtime_share()
+    share = "proc/sys/kernel/sched_rt_{}_us"
+    runtime_us, period_us = (int(facts.host.text(share.format(name))) for name in ("runtime", "period"))
     if runtime_us < 0:
         return ok("real-time processes may use all of a processor")
     detail = f"real-time processes may use {runtime_us / 1e3:g} ms of every {period_us / 1e3:g} ms"
@@ -66,7 +69,7 @@ def _processors(facts: Facts) -> Check:
 
     Fewer than one for each of camera, controller, mirror and recorder; or one is named that may not be used.
     """
-    usable, online = facts.host.usable_cpus(), facts.host.online_cpus()
+    usable, online = facts.host.usable_cpus(), facts.host.cpus("online")
     detail = f"{len(usable)} usable ({ranges(usable)}) of {len(online)}"
     asked = facts.asked_cpus
     if missing := asked and asked - facts.tried.cpus:
@@ -91,7 +94,7 @@ def _isolation(facts: Facts) -> Check:
     There are enough processors to isolate some and none is; or those isolated are not the ones that the configuration
     names.
     """
-    isolated, online = facts.host.isolated_cpus(), facts.host.online_cpus()
+    isolated, online = facts.host.cpus("isolated"), facts.host.cpus("online")
     cost = "other programs and the kernel's own work share the loop's processors; expect a longer tail"
     if not isolated:
         if len(online) <= len(PROCESSES):
@@ -99,7 +102,7 @@ def _isolation(facts: Facts) -> Check:
         spare = ranges(sorted(online)[-_IN_LOOP:])
         advice = f"boot with isolcpus={spare} nohz_full={spare} and name them in realtime.*_cpus"
         return warning("none", advice, cost)
-    without_tick = ranges(isolated & facts.host.tickless_cpus()) or "none"
+    without_tick = ranges(isolated & facts.host.cpus("nohz_full")) or "none"
     detail = f"{ranges(isolated)}; of these without a timer tick: {without_tick}"
     asked = facts.asked_cpus
     if asked and asked <= isolated:
@@ -134,11 +137,13 @@ def _frequency(facts: Facts) -> Check:
 
     A governor other than `performance`.
     """
-    governors = set(facts.host.governors().values())
+    read, cpus = facts.host.text_or_nothing, facts.host.usable_cpus()
+    governors = {read(f"{CPUS}/cpu{cpu}/cpufreq/scaling_governor") for cpu in cpus} - {""}
     if not governors:
         return note("not shown; in a virtual machine the hypervisor decides")
-    turbo = {True: ", turbo on", False: ", turbo off", None: ""}[facts.host.turbo()]
-    detail = f"{', '.join(sorted(governors))}{turbo}"
+    turbo = {"0": "on", "1": "off"}.get(read(f"{CPUS}/intel_pstate/no_turbo"))
+    turbo = turbo or {"0": "off", "1": "on"}.get(read(f"{CPUS}/cpufreq/boost"))
+    detail = ", ".join(sorted(governors)) + (f", turbo {turbo}" if turbo else "")
     return ok(detail) if governors == {"performance"} else warning(detail)
 
 
@@ -148,12 +153,14 @@ def _idle_states(facts: Facts) -> Check:
 
     The loop is not allowed to keep processors awake, or is not asked to and waking one takes more than 50 us.
     """
-    driver = facts.host.idle_driver()
-    used = [state for state in facts.host.idle_states() if state.enabled]
+    host, folder = facts.host, f"{CPUS}/cpu{min(facts.host.usable_cpus())}/cpuidle"
+    driver, states = host.text(f"{CPUS}/cpuidle/current_driver"), sorted((host.root / folder).glob("state*"))
+    read = [[host.text(f"{folder}/{state.name}/{key}") for key in ("latency", "name", "disable")] for state in states]
+    used = [(int(exit_us), name) for exit_us, name, disabled in read if disabled == "0"]
     if driver == "none" or not used:
         return note(f"driver {driver}, no states shown; in a virtual machine the hypervisor decides")
-    deepest = max(used, key=lambda state: state.exit_us)
-    detail = f"driver {driver}, deepest state {deepest.name} with {deepest.exit_us} us to wake"
+    exit_us, deepest = max(used)
+    detail = f"driver {driver}, deepest state {deepest} with {exit_us} us to wake"
     if facts.config.realtime.disable_cpu_idle:
         if refused := facts.tried.refused.get("disable_cpu_idle"):
             what, cost = refused
@@ -163,12 +170,12 @@ def _idle_states(facts: Facts) -> Check:
                 cost,
             )
         return ok(f"{detail}; kept awake while the loop runs")
-    if deepest.exit_us <= _SLOW_EXIT_US:
+    if exit_us <= _SLOW_EXIT_US:
         return ok(detail)
     return warning(
         detail,
         f"cpupower idle-set --disable-by-latency {_SLOW_EXIT_US}, or boot with processor.max_cstate=1",
-        f"a frame that wakes a processor may wait {deepest.exit_us} us for it",
+        f"a frame that wakes a processor may wait {exit_us} us for it",
     )
 
 
@@ -178,18 +185,19 @@ def _kernel(facts: Facts) -> Check:
 
     Neither PREEMPT_RT nor full preemption.
     """
-    words = facts.host.kernel().split()
+    words = facts.host.text("proc/version").split()
     release = words[2]
     advice = "boot with preempt=full, or a kernel with PREEMPT_RT"
     cost = "a system call of another program delays a frame until it is done"
     if "PREEMPT_RT" in words:
         return ok(f"{release}, PREEMPT_RT")
     if "PREEMPT_DYNAMIC" in words:
-        model = facts.host.preemption()
-        if not model:
+        model = re.search(r"\((\w+)\)", facts.host.text_or_nothing("sys/kernel/debug/sched/preempt"))
+        model = model or re.search(r"(?:^| )preempt=(\w+)", facts.host.text("proc/cmdline"))
+        if model is None:
             return note(f"{release}, PREEMPT_DYNAMIC; which model is in force is hidden", advice, cost)
-        detail = f"{release}, PREEMPT_DYNAMIC, {model}"
-        return ok(detail) if model == "full" else warning(detail, advice, cost)
+        detail = f"{release}, PREEMPT_DYNAMIC, {model[1]}"
+        return ok(detail) if model[1] == "full" else warning(detail, advice, cost)
     if "PREEMPT" in words:
         return ok(f"{release}, PREEMPT")
     return warning(f"{release}, no preemption of the kernel", advice, cost)
@@ -205,9 +213,15 @@ def _virtualisation(facts: Facts) -> Check:
 
     There is one.
     """
-    name, stolen = facts.host.hypervisor(), facts.host.stolen_share()
-    if not name:
+    read = facts.host.text_or_nothing
+    flags = re.search(r"^flags\s*:(.*)$", facts.host.text("proc/cpuinfo"), re.MULTILINE)
+    kind, stolen = read("sys/hypervisor/type"), facts.host.stolen_share()
+    if not kind and flags is None:
+        raise ValueError("this processor's /proc/cpuinfo does not say whether there is a hypervisor")
+    if not kind and flags is not None and "hypervisor" not in flags[1].split():
         return ok("none")
+    machine = [read(f"sys/class/dmi/id/{name}") for name in ("sys_vendor", "product_name")]
+    name = " ".join(filter(None, [kind, *machine])) or "it does not say which"
     much = "; that is much" if stolen > _STOLEN else ""
     return warning(f"a virtual machine ({name}); {100 * stolen:.2f} % of its time went to others since boot{much}")
 
