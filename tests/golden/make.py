@@ -1,4 +1,4 @@
-"""Make the golden files of the version at hand: `python tests/golden/make.py FOLDER`.
+"""Make the golden files of the version at hand: `python -m tests.golden.make FOLDER`.
 
 A short loop on the bus in memory, whose camera exposes frame by frame and whose clock is moved by hand, so that every
 kind of input of the controller is in its log. What a released version has written is never written again.
@@ -9,6 +9,7 @@ import sys
 import threading
 import time
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -27,7 +28,6 @@ from lowfc.contract.configuration import Configuration, load
 from lowfc.contract.errors import RequestRefusedError
 from lowfc.contract.messages import CAMERA_STATE, FRAME, MIRROR_STATE, STEP, TRUTH, image, timestamp, wire
 from lowfc.control.calibration.calibration import Calibration
-from lowfc.control.laws.law import Law
 from lowfc.control.laws.linear_law import LinearLaw, integrator_block, of_blocks
 from lowfc.programs.core.controller import Controller
 from lowfc.programs.core.recording.recorder import Recorder
@@ -35,6 +35,7 @@ from lowfc.testing.clock import FakeClock
 from lowfc.testing.memory_bus import MemoryBus, MemoryHub
 from sim_camera.process import bench
 from sim_dm.process import MirrorProcess
+from tests.support.loops import until
 
 ROOT = Path(__file__).parents[2]
 START_NS = 1_767_225_600_000_000_000
@@ -50,7 +51,7 @@ CONFIGURATION = {
     "camera.gain_e_per_dn": 10.0,  # small differences between pixels, so that the log is small
     "disturbance.preset": "bench",
     "control.delay_frames": 1.5,
-    "control.hold_ms": 40.0,
+    "control.frame_timeout_ms": 40.0,
     "control.start_mode": "open",
     "seed": 7,
 }
@@ -62,44 +63,37 @@ class Night:
     def __init__(self, config: Configuration, calibration: Calibration, folder: Path) -> None:
         self.config, self.calibration = config, calibration
         self.hub, self.clock = MemoryHub(), FakeClock(START_NS)
-        self.index = 0
+        self.index = self.answered = 0
         self.shape_nm = np.zeros((config.mirror.rows, config.mirror.columns), np.float32)
         self.scene = bench(config)
-        self.answered: dict[str, int] = {}
         operator = self.bus("operator")
-        operator.subscribe(STEP, self._hear_step)
-        operator.subscribe(MIRROR_STATE, self._hear_mirror)
+        operator.subscribe(STEP, self._take_step)
+        operator.subscribe(MIRROR_STATE, self._take_mirror)
         self.client = Client("golden", bus=operator)
         self.start_camera()
         (folder / "run").mkdir(parents=True)
-        self.mirror = MirrorProcess(config, self.service("mirror-dm"))
         attached = [
             Attachment("config.toml", "application/toml", config.to_toml().encode()),
             Attachment("calibration.fits", "application/fits", calibration_file.to_bytes(calibration)),
         ]
-        self.recorder = Recorder(
-            self.bus("recorder"),
-            self.clock,
-            "golden",
-            folder / "logs",
-            metadata={"lowfc": provenance("golden", config.seed) | {"host": "bench"}},
-            attachments=attached,
+        about = {"lowfc": provenance("golden", config.seed) | {"host": "bench"}}
+        recorder = Recorder(
+            self.bus("recorder"), self.clock, "golden", folder / "logs", metadata=about, attachments=attached
         )
-        self.controller = Controller(
-            config, self.service("controller"), calibration, "calibration.fits", Latch([folder / "run" / "safe"])
-        )
-        self.threads = [threading.Thread(target=one.run) for one in (self.mirror, self.controller, self.recorder)]
+        services = [Service(role, "golden", self.clock, self.bus(role)) for role in ("controller", "mirror-dm")]
+        latch = Latch([folder / "run" / "safe"])
+        self.processes = [
+            (Controller(config, services[0], calibration, "calibration.fits", latch), services[0]),
+            (MirrorProcess(config, services[1]), services[1]),
+            (recorder, recorder.service),
+        ]
+        self.threads = [threading.Thread(target=process.run) for process, _ in self.processes]
         for thread in self.threads:
             thread.start()
-        self.until(lambda: self.recorder.service.state == "ready")
+        until(lambda: recorder.service.state == "ready")
 
     def bus(self, role: str) -> MemoryBus:
         return MemoryBus(self.hub, role, self.clock)
-
-    def service(self, role: str) -> Service:
-        made = Service(role, "golden", self.clock, self.bus(role))
-        setattr(self, f"{role.partition('-')[0]}_service", made)
-        return made
 
     def start_camera(self, **changes: float) -> None:
         """Start the camera, or start it again with other settings."""
@@ -111,19 +105,11 @@ class Night:
             setattr(state, name, value)
         self.settings.put(state.SerializeToString())
 
-    def _hear_step(self, sample: Sample) -> None:
-        self.answered["step"] = wire.ControlStep.FromString(sample.payload).frame_sequence
+    def _take_step(self, sample: Sample) -> None:
+        self.answered = wire.ControlStep.FromString(sample.payload).frame_sequence
 
-    def _hear_mirror(self, sample: Sample) -> None:
-        found = actuators(wire.MirrorState.FromString(sample.payload))
-        assert found is not None
-        self.shape_nm = found
-
-    def until(self, met: Callable[[], bool]) -> None:
-        deadline_s = time.monotonic() + PATIENCE_S
-        while not met():
-            assert time.monotonic() < deadline_s, "waited in vain"
-            time.sleep(0.002)
+    def _take_mirror(self, sample: Sample) -> None:
+        self.shape_nm = actuators(wire.MirrorState.FromString(sample.payload))
 
     def expose(self, frames: int, change: Callable[[Any], Any] = lambda pixels: pixels, late_ns: int = 0) -> None:
         """Some frames, each waiting for its step; `change` does something to their pixels."""
@@ -132,52 +118,48 @@ class Night:
             self.index += 1
             self.clock.advance(self.config.period_ns)
             time_ns = self.clock.now_ns()
-            sent = self.frames.put(image(change(pixels), time_ns, "camera").SerializeToString(), time_ns - late_ns)
+            sequence = self.frames.put(
+                image(change(pixels), time_ns, "camera").SerializeToString(), time_ns - late_ns
+            ).sequence
             message = wire.Truth(
                 timestamp=timestamp(time_ns),
-                frame_sequence=sent.sequence,
+                frame_sequence=sequence,
                 disturbance_nm=truth.disturbance_nm.tolist(),
                 residual_nm=truth.residual_nm.tolist(),
                 disturbance_rms_nm=truth.disturbance_rms_nm,
                 residual_rms_nm=truth.residual_rms_nm,
             )
             self.truths.put(message.SerializeToString())
-            self.until(lambda: self.answered.get("step") == sent.sequence)  # noqa: B023  # called at once
-
-    def refused(self, ask: Callable[[], object]) -> None:
-        """A request that is refused."""
-        try:
-            ask()
-        except RequestRefusedError:
-            return
-        raise AssertionError("the request was granted")
+            until(lambda: self.answered == sequence)  # noqa: B023  # called at once
 
     def silence(self) -> None:
         """No frame for a while: the command is repeated, and NO_FRAMES."""
         for _ in range(3):
             self.clock.advance(20_000_000)
-            self.until(lambda: self.controller._service.clock.now_ns() == self.clock.now_ns())
             time.sleep(0.05)
 
     def finish(self) -> None:
-        for thread, service in (
-            (self.threads[1], self.controller_service),
-            (self.threads[0], self.mirror_service),
-            (self.threads[2], self.recorder.service),
-        ):
+        for thread, (_, service) in zip(self.threads, self.processes, strict=True):
             service.stop("done")
             thread.join(PATIENCE_S)
             assert not thread.is_alive()
 
 
+def refused(ask: Callable[..., object], *words: object) -> None:
+    """A request that is refused."""
+    try:
+        ask(*words)
+    except RequestRefusedError:
+        return
+    raise AssertionError("the request was granted")
+
+
 def law(config: Configuration) -> LinearLaw:
     """An integrator of the pseudo-open-loop modes, which remembers commands."""
     settings = factory.settings(config)
-    of_modes: Law = settings.law(config.noll)
-    blocks = [
-        integrator_block(gain, 0.01, "pol", settings.delay_frames) for gain in of_modes.gain.astype(float).tolist()
-    ]
-    return of_blocks(blocks, "pol", "golden integrator", config.noll, settings.delay_frames, config.camera.rate_hz)
+    delay, gains = settings.delay_frames, settings.law(config.noll).gain.astype(float).tolist()
+    blocks = [integrator_block(gain, 0.01, "pol", delay) for gain in gains]
+    return of_blocks(blocks, "pol", "golden integrator", config.noll, delay, config.camera.rate_hz)
 
 
 def main(folder: Path) -> None:
@@ -205,8 +187,8 @@ def main(folder: Path) -> None:
     loop.gain(0.4, (2, 3))
     loop.leak(0.01)
     loop.limit([120.0, 110.0], (2, 3))
-    night.refused(lambda: loop.gain(3.0))
-    night.refused(lambda: loop.ask("dance"))
+    refused(loop.gain, 3.0)
+    refused(loop.ask, "dance")
     night.expose(3)
     loop.offset([2.0, -1.0], (2, 3))
     ramp_nm = np.linspace(-40, 40, 144, dtype=np.float32).reshape(12, 12)
@@ -217,12 +199,12 @@ def main(folder: Path) -> None:
     night.expose(4)
     loop.play(np.stack([ramp_nm / 20, ramp_nm.T / 20]), [[1.0, 0.0], [0.0, 1.0], [-1.0, 0.5], [0.0, 0.0]])
     night.expose(2)
-    night.refused(lambda: loop.play_offset(np.ones((2, 2))))
+    refused(loop.play_offset, np.ones((2, 2)))
     night.expose(3)
     part = next((work / "logs").glob("*.part"))
     before = part.stat().st_size
     night.clock.advance(250_000_000)  # so that the recorder flushes
-    night.until(lambda: part.stat().st_size > before)
+    until(lambda: part.stat().st_size > before)
     killed = part.read_bytes()
     (folder / "killed.mcap").write_bytes(killed[: len(killed) - 300])
     loop.play_offset(np.full((4, 2), 3.0))
@@ -246,13 +228,7 @@ def main(folder: Path) -> None:
     night.expose(3)
     loop.reset()
     night.expose(2)
-    other = identified(
-        Calibration(
-            **{name: getattr(calibration, name) for name in calibration.__slots__}
-            | {"reconstructor": calibration.reconstructor * np.float32(0.9)}
-        )
-    )
-    loop.load(other)
+    loop.load(identified(replace(calibration, reconstructor=calibration.reconstructor * np.float32(0.9))))
     loop.close_loop()
     night.expose(2)
     night.clock.advance(1_000_000_000)
@@ -260,7 +236,7 @@ def main(folder: Path) -> None:
     night.expose(3)
     loop.safe()
     night.expose(2)
-    night.refused(loop.close_loop)
+    refused(loop.close_loop)
     loop.clear()
     night.expose(1)
     night.finish()
