@@ -133,35 +133,19 @@ def mutations(data: bytes, numbers: range) -> Iterator[tuple[int, str, bytes]]:
         yield number, *mutated(data, number)
 
 
-ODD_BYTES = (
-    b"",
-    b"\0",
-    b"\xff" * 8,
-    b"\x7f" * 4,
-    b"\x80" + b"\xff" * 9,
-    b"\x00\x00\xc0\x7f",
-    b"\x00\x00\x80\x7f",
-    b"\n",
-)
-ODD_WHOLE = (
-    0,
-    1,
-    2,
-    3,
-    127,
-    128,
-    255,
-    256,
-    65535,
-    65536,
-    (1 << 31) - 1,
-    1 << 31,
-    (1 << 32) - 1,
-    1 << 40,
-    (1 << 64) - 1,
-)
-ODD_FLOATS = (0.0, -0.0, 1.0, -1.0, 1e-45, 1e38, -1e38, 1e308, float("inf"), float("-inf"), float("nan"))
+ODD_BYTES = (b"", b"\0", b"\xff" * 8, b"\x80" + b"\xff" * 9, b"\x00\x00\xc0\x7f", b"\x00\x00\x80\x7f", b"\n")
+ODD_WHOLE = (0, 1, 3, 127, 128, 255, 256, 65535, 65536, (1 << 31) - 1, 1 << 31, (1 << 32) - 1, 1 << 40, (1 << 64) - 1)
+ODD_FLOATS = (0.0, -0.0, 1.0, -1.0, 1e-45, 3e38, -3e38, 12.3, float("inf"), float("-inf"), float("nan"))
+ODD_TEXTS = ("", "a", "dm", "mirror", "offset", "é", "\0", "x" * 5000, "../..", "{}", "%s", "status")
 MOST_BYTES = 1 << 16
+_BITS = {
+    FieldDescriptor.CPPTYPE_INT32: 31,
+    FieldDescriptor.CPPTYPE_ENUM: 31,
+    FieldDescriptor.CPPTYPE_UINT32: 32,
+    FieldDescriptor.CPPTYPE_INT64: 63,
+    FieldDescriptor.CPPTYPE_UINT64: 64,
+}
+"""Of a whole number but for its sign."""
 
 
 def damaged(data: bytes, others: Sequence[bytes], rng: Random) -> bytes:
@@ -200,45 +184,35 @@ def rewritten(message: Message, rng: Random) -> bytes:
 
 def _alter(message: Message, rng: Random, depth: int) -> None:
     field = rng.choice(message.DESCRIPTOR.fields)
-    many = field.is_repeated
+    inner = getattr(message, field.name)
     if rng.random() < 0.1:
         message.ClearField(field.name)
     elif field.type == FieldDescriptor.TYPE_MESSAGE:
-        if not depth:
-            return
-        if many:
-            inner = getattr(message, field.name)
+        if depth and field.is_repeated:
             _alter(inner.add() if not inner or rng.random() < 0.3 else rng.choice(inner), rng, depth - 1)
-        else:
-            inner = getattr(message, field.name)
+        elif depth:
             inner.SetInParent()
             _alter(inner, rng, depth - 1)
-    elif many:
-        values = [_odd(field, rng) for _ in range(rng.choice((0, 1, 2, 3, 14, 100)))]
-        del getattr(message, field.name)[:]
-        getattr(message, field.name).extend(values)
+    elif field.is_repeated:
+        del inner[:]
+        inner.extend(_odd(field, rng) for _ in range(rng.choice((0, 1, 2, 3, 14, 100))))
     elif field.type == FieldDescriptor.TYPE_BYTES:
-        before = bytes(getattr(message, field.name)) or b"\0" * 64
+        before = bytes(inner) or b"\0" * 64
         setattr(message, field.name, damaged(before, [before, *ODD_BYTES], rng)[:MOST_BYTES])
     else:
         setattr(message, field.name, _odd(field, rng))
 
 
 def _odd(field: FieldDescriptor, rng: Random) -> object:
+    if field.type == FieldDescriptor.TYPE_BYTES:
+        return rng.randbytes(rng.randrange(65))
     match field.cpp_type:
         case FieldDescriptor.CPPTYPE_FLOAT | FieldDescriptor.CPPTYPE_DOUBLE:
-            value = rng.choice((*ODD_FLOATS, rng.gauss(0, 100)))
-            return value if field.cpp_type == FieldDescriptor.CPPTYPE_DOUBLE else max(min(value, 3e38), -3e38)
+            return rng.choice(ODD_FLOATS)
         case FieldDescriptor.CPPTYPE_BOOL:
             return rng.random() < 0.5
         case FieldDescriptor.CPPTYPE_STRING:
-            if field.type == FieldDescriptor.TYPE_BYTES:
-                return rng.randbytes(rng.randrange(65))
-            return rng.choice(("", "a", "dm", "mirror", "offset", "é", "\0", "x" * 5000, "../..", "{}", "%s", "status"))
-    bits = 32 if field.cpp_type in (FieldDescriptor.CPPTYPE_INT32, FieldDescriptor.CPPTYPE_UINT32) else 64
-    whole = rng.choice(ODD_WHOLE) % (1 << bits)
-    if field.cpp_type == FieldDescriptor.CPPTYPE_ENUM:
-        return whole % (1 << 31)
-    if field.cpp_type in (FieldDescriptor.CPPTYPE_INT32, FieldDescriptor.CPPTYPE_INT64):
-        return whole - (1 << bits) if whole >> (bits - 1) else whole
-    return whole
+            return rng.choice(ODD_TEXTS)
+    whole = rng.choice(ODD_WHOLE) % (1 << _BITS[field.cpp_type])
+    signed = field.cpp_type in (FieldDescriptor.CPPTYPE_INT32, FieldDescriptor.CPPTYPE_INT64)
+    return -whole if signed and rng.random() < 0.5 else whole

@@ -99,9 +99,8 @@ class Player:
         self._speed = speed
         self._publishers: dict[str, Publisher | None] = {}
         self._left_out: dict[str, str] = {}
-        self._errors, self._interval_errors = Durations(), Durations()
+        self._errors = Durations()
         self._behind = 0
-        self._late_ns = 0
         self._first_log_ns = self._last_log_ns = 0
         self._begun_ns = self._sent_ns = 0
         self._show_ns = 0
@@ -122,14 +121,14 @@ class Player:
 
     def figures(self) -> dict[str, Any]:
         """What was played, and how well its times were kept."""
+        p50_ns, p99_ns = self._errors.percentiles_ns(0.5, 0.99)
         return {
             "messages": self._errors.count + self._at_once.total(),
             "published": {key: one.published for key, one in sorted(self._publishers.items()) if one is not None},
             "left_out": dict(sorted(self._left_out.items())),
             "span_s": (self._last_log_ns - self._first_log_ns) * 1e-9,
             "took_s": (self._sent_ns - self._begun_ns) * 1e-9,
-            "timing_error_us": _microseconds(self._errors),
-            "interval_error_us": _microseconds(self._interval_errors),
+            "timing_error_us": {"p50": p50_ns / 1e3, "p99": p99_ns / 1e3, "max": self._errors.max_ns / 1e3},
             "messages_behind": self._behind,
             "finished": all(log.finished for log in self._logs),
             "no_end": next((no_end(log.paths, finished=False) for log in self._logs if not log.finished), ""),
@@ -144,7 +143,9 @@ class Player:
         for message in log:
             if not self._service.running:
                 return
-            publisher = self._publisher(message.key)
+            if message.key not in self._publishers:
+                self._publishers[message.key] = self._publisher(message.key)
+            publisher = self._publishers[message.key]
             if publisher is None:
                 continue
             if publisher.last is not None and publisher.last[1].sequence == message.sequence:
@@ -157,7 +158,11 @@ class Player:
                     publisher.put(message.payload, None, message.sequence)
                     self._at_once[message.key] += 1
                     continue
-                self._check_order(log, message)
+                if message.log_time_ns < self._last_log_ns - _ORDER_NS:
+                    raise DataFileError(
+                        f"{log.path} begins before the log given before it ends; give logs in the order of their "
+                        "recording"
+                    )
             self._send(publisher, message)
             if self._sent_ns >= self._show_ns:
                 self._show_ns = self._sent_ns + _SHOW_NS
@@ -175,11 +180,8 @@ class Player:
             return
         self._sent_ns = publisher.put(message.payload, None, message.sequence).publish_time_ns
         late_ns = self._sent_ns - due_ns
-        if self._errors.count:
-            self._interval_errors.add(abs(late_ns - self._late_ns))
         self._errors.add(abs(late_ns))
         self._behind += late_ns > BEHIND_NS
-        self._late_ns = late_ns
 
     def _sleep_until(self, due_ns: int) -> None:
         while (left_ns := due_ns - self._clock.host_ns()) > 0 and self._service.running:
@@ -187,19 +189,8 @@ class Player:
             if left_ns > _SLICE_NS:
                 self._service.beat()
 
-    def _check_order(self, log: LogReader, message: Logged) -> None:
-        if message.log_time_ns < self._last_log_ns - _ORDER_NS:
-            raise DataFileError(
-                f"{log.path} begins before the log given before it ends; give logs in the order of their recording"
-            )
-
     def _publisher(self, key: str) -> Publisher | None:
         """Publisher of a key in its role's place; None where it is not played."""
-        if key not in self._publishers:
-            self._publishers[key] = self._new_publisher(key)
-        return self._publishers[key]
-
-    def _new_publisher(self, key: str) -> Publisher | None:
         try:
             topic = topic_of(key)
         except KeyError:
@@ -216,15 +207,11 @@ class Player:
 
 def render(figures: dict[str, Any]) -> str:
     """The summary for a person."""
-    error, interval = (
-        ", ".join(f"{name} {value:.0f} us" for name, value in figures[which].items())
-        for which in ("timing_error_us", "interval_error_us")
-    )
+    error = ", ".join(f"{name} {value:.0f} us" for name, value in figures["timing_error_us"].items())
     lines = [
         f"played             {figures['messages']} messages into run {figures['run']!r}: {figures['span_s']:.1f} s of "
         f"log in {figures['took_s']:.1f} s" + (", interrupted" if figures["interrupted"] else ""),
         f"times              off by {error}",
-        f"intervals          off by {interval}",
         f"behind             {figures['messages_behind']} messages by more than {BEHIND_NS / 1e6:g} ms",
     ]
     lines += faults(figures["damaged"], figures["no_end"])
@@ -265,16 +252,11 @@ def _linked(service: Service, live: Collection[str], wait_for: Collection[str], 
 
 def _mirrors(log: Path) -> tuple[str, ...]:
     """Names of the mirrors in a log, for a run that is yet to be made; an unfinished log tells the first one's."""
-    reader = LogReader(log, topics=(MIRROR_STATE, COMMAND), skip_damaged=True)
-    next(iter(reader), None)
     topics = MIRROR_STATE, COMMAND
+    reader = LogReader(log, topics=topics, skip_damaged=True)
+    next(iter(reader), None)
     names = {name_in(topic, key) for key, _ in reader.channels for topic in topics if topic.matches(key)}
     return tuple(sorted(names)) or ("dm",)
-
-
-def _microseconds(durations: Durations) -> dict[str, float]:
-    p50_ns, p99_ns = durations.percentiles_ns(0.5, 0.99)
-    return {"p50": p50_ns / 1e3, "p99": p99_ns / 1e3, "max": durations.max_ns / 1e3}
 
 
 def _utc(time_ns: int) -> str:
