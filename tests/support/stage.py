@@ -107,7 +107,7 @@ class Stage:
                 self.watcher.feed(snapshot)
                 self.each(snapshot)
         assert not self.accumulator.unreadable
-        return judge(self.watcher, MAS)
+        return judge(self.watcher.state(), MAS)
 
     def _runs(self, name: str) -> bool:
         return name not in self.silent and self.states.get(name) == "running"

@@ -97,7 +97,7 @@ def test_the_trend_holds_a_night_in_so_many_spans() -> None:
     _, rms_nm = kept.wavefront()
     squares = np.stack([snapshot.truths.residual_rms_nm, snapshot.truths.disturbance_rms_nm], axis=1).astype(float) ** 2
     np.testing.assert_allclose(rms_nm[0], np.sqrt(squares.mean(axis=0)), rtol=1e-6)
-    kept._add(np.array([snapshot.truths.time_ns[0] + 10 * 3600 * 10**9]), slice(0, 3), np.ones(1), np.ones(1))
+    kept.add(np.array([snapshot.truths.time_ns[0] + 10 * 3600 * 10**9]), slice(0, 3), np.ones((1, 2)))
     after_ns, rms_nm = kept.wavefront()
     assert course.MOST / 2 <= len(after_ns) <= course.MOST
     np.testing.assert_allclose(rms_nm[0], np.sqrt(squares.mean(axis=0)), rtol=1e-6)

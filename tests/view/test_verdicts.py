@@ -14,12 +14,12 @@ from lowfc.contract.messages import CONTROLLER_STATE, EVENT, FRAME, topic_of, wi
 from lowfc.control.loop.safety import Limit, LoopMode, Rejection
 from lowfc.programs.view.panels.tiles import FILL, GROUND, HEIGHT, TILES, WIDTH, Tiles, picture, places, png
 from lowfc.programs.view.snapshot import Accumulator
-from lowfc.programs.view.verdicts import steady
 from lowfc.programs.view.verdicts.facts import facts
+from lowfc.programs.view.verdicts.run_state import RunState
 from lowfc.programs.view.verdicts.steady import Attained
 from lowfc.programs.view.verdicts.tile import Level, Tile, Verdict
 from lowfc.programs.view.verdicts.verdict import judge
-from lowfc.programs.view.verdicts.watcher import Rms, Watcher
+from lowfc.programs.view.verdicts.watcher import Watcher
 from lowfc.programs.view.verdicts.wavefront_verdict import factor, merit
 from tests.support.report_log import Night
 from tests.support.stage import MAS, Stage, Tape, tile
@@ -224,7 +224,7 @@ def test_simulated_time_is_neither_silence_nor_latency() -> None:
 def test_a_run_that_starts_is_waited_for_and_missed_only_later() -> None:
     watcher = Watcher()
     watcher.feed(Accumulator().snapshot(START * 10**9))
-    nothing = judge(watcher)
+    nothing = judge(watcher.state())
     assert (nothing.level, nothing.headline) == (Level.NEUTRAL, "Waiting for the run to start.")
     stage = begun(silent={"camera", "mirror-dm", "recorder"}, states={"controller": "ready"})
     assert stage.run(5).level is Level.NEUTRAL
@@ -274,10 +274,8 @@ def test_green_is_a_loop_that_corrects_and_does_what_it_could(
 
 
 def test_noise_is_subtracted_before_a_measured_wavefront_is_judged() -> None:
-    found = Rms(5.0, 13.0, 0.0, 0.0)
-    assert factor(found, False, None) == pytest.approx(2.6)
-    assert factor(found, False, Attained(3.0, 3.0, 4.0)) == pytest.approx(np.sqrt(13**2 - 4**2) / 3)
-    assert factor(found, True, Attained(3.0, 3.0, 4.0)) == pytest.approx(2.6)
+    assert factor(5.0, 13.0, 0.0) == pytest.approx(2.6)
+    assert factor(5.0, 13.0, 4.0) == pytest.approx(np.sqrt(13**2 - 4**2) / 3)
 
 
 def test_a_loop_that_corrects_little_is_grey_and_so_is_its_headline() -> None:
@@ -291,7 +289,7 @@ def test_a_loop_that_corrects_little_is_grey_and_so_is_its_headline() -> None:
 
 
 def test_what_the_gains_could_leave_is_computed_from_the_loop_itself(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(steady, "PERIOD_NS", 1_000_000_000)
+    monkeypatch.setattr("lowfc.programs.view.verdicts.watcher.ATTAINED_NS", 1_000_000_000)
     night = Night(truth=False)
     night.frames(6000)
     accumulator, watcher = Accumulator(), Watcher()
@@ -299,10 +297,10 @@ def test_what_the_gains_could_leave_is_computed_from_the_loop_itself(monkeypatch
         accumulator.add(topic_of(one.key), one.key, one.payload, one.publish_time_ns, one.sequence)
         if number % 5000 == 0 or number == len(night.samples):
             watcher.feed(accumulator.snapshot(one.publish_time_ns))
-    found = watcher.attainable.found
+    found = watcher.state().attained
     assert 0 < found.best_nm <= 1.05 * found.left_nm
     assert found.noise_nm > 0
-    assert tile(judge(watcher), "WAVEFRONT").detail.endswith("without noise")
+    assert tile(judge(watcher.state()), "WAVEFRONT").detail.endswith("without noise")
 
 
 # What is set.
@@ -332,7 +330,7 @@ def test_the_facts_are_run_host_law_offset_channels_and_note() -> None:
     found = stage.run(1).facts
     assert found["CONTROL LAW"] == "lqg; delay 1 frame"
     assert found["OFFSET AND CHANNELS"] == "no offset; channel dark-hole 2 nm"
-    assert set(facts(Watcher()).values()) == {"not known", "none known"}
+    assert set(facts(RunState()).values()) == {"not known", "none known"}
 
 
 NOON_NS = 43_200 * 10**9

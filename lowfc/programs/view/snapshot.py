@@ -9,7 +9,7 @@ from google.protobuf.message import DecodeError
 
 from lowfc.adapters.bus.names import Names
 from lowfc.adapters.logs.columns import StepRows, Steps, TimingRows, TruthRows, Truths
-from lowfc.arrays import Long, Pixels, Single
+from lowfc.arrays import Long, Mask, Pixels, Sequences, Single
 from lowfc.contract.codecs.calibration_codec import decode_calibration
 from lowfc.contract.codecs.codec import decode_frame
 from lowfc.contract.errors import BadMessageError
@@ -57,6 +57,21 @@ PICTURES_PER_COMPLETE = 8
 _KNOWN_EVENTS = 5000
 _NO_STEPS, _NO_TRUTHS, _NO_TIMINGS = StepRows(0).taken(), TruthRows(0).taken(), TimingRows().taken()[1]
 _UNREADABLE = (BadMessageError, DecodeError, OverflowError, ValueError)
+
+
+class Waves(NamedTuple):
+    """The wavefront of some frames, nm, each with the mirror as it was and with a flat one.
+
+    Attributes:
+        left_nm, open_nm: of the modes, (frames, modes).
+        rms_nm: of both, (frames, 2).
+    """
+
+    sequence: Sequences
+    time_ns: Long
+    left_nm: Single
+    open_nm: Single
+    rms_nm: Single
 
 
 class LastHealth(NamedTuple):
@@ -127,6 +142,23 @@ class Snapshot:
     def stroke_nm(self) -> float:
         """Limit of an actuator's deviation from flat; 0 where the controller has not reported it."""
         return self.controller.settings.stroke_nm if self.controller is not None else 0.0
+
+    @property
+    def used(self) -> Mask:
+        """Whether the frame of each step was used."""
+        error_nm = self.steps.error_nm
+        return np.asarray(np.isfinite(error_nm).all(axis=1) & (error_nm.shape[1] > 0))
+
+    def waves(self, *, true: bool) -> Waves:
+        """The new wavefronts that a simulation knows, or those that were measured on the frames that were used."""
+        if true:
+            new = self.truths
+            rms_nm = np.stack([new.residual_rms_nm, new.disturbance_rms_nm], axis=1)
+            return Waves(new.sequence, new.time_ns, new.residual_nm, new.disturbance_nm, rms_nm)
+        steps, used = self.steps, self.used
+        modes_nm = steps.error_nm[used], steps.pol_nm[used]
+        rms_nm = np.stack([np.linalg.norm(one, axis=1) for one in modes_nm], axis=1)
+        return Waves(steps.sequence[used], steps.time_ns[used], *modes_nm, rms_nm)
 
 
 class Accumulator:

@@ -1,6 +1,6 @@
 """The wavefront and the light of a whole run, in at most some hundreds of spans of even length."""
 
-from math import floor, isfinite, log10
+from math import floor, log10
 
 import numpy as np
 import numpy.typing as npt
@@ -33,14 +33,13 @@ class Course:
 
     def feed(self, snapshot: Snapshot) -> None:
         """Add the steps and truths of a snapshot."""
-        steps, truths = snapshot.steps, snapshot.truths
-        self.true |= truths.time_ns.size > 0
-        self._add(truths.time_ns, _TRUE, truths.residual_rms_nm**2.0, truths.disturbance_rms_nm**2.0)
-        used = np.isfinite(steps.error_nm).all(axis=1) & (steps.error_nm.shape[1] > 0)
-        error_nm, pol_nm = (values[used].astype(np.float64) for values in (steps.error_nm, steps.pol_nm))
-        self._add(steps.time_ns[used], _MEASURED, np.sum(error_nm**2, axis=1), np.sum(pol_nm**2, axis=1))
+        for true, columns in ((True, _TRUE), (False, _MEASURED)):
+            waves = snapshot.waves(true=true)
+            self.true |= true and waves.time_ns.size > 0
+            self.add(waves.time_ns, columns, waves.rms_nm.astype(float) ** 2)
         if snapshot.calibration is not None:
-            self._add(steps.time_ns[used], _LIGHT, steps.flux_dn[used] / snapshot.calibration.flux_dn)
+            steps, used = snapshot.steps, snapshot.used
+            self.add(steps.time_ns[used], _LIGHT, steps.flux_dn[used, None] / snapshot.calibration.flux_dn)
 
     def wavefront(self) -> tuple[Array, Array]:
         """Middle of each span (spans,), ns after `begin_ns`, and rms nm (spans, 2): residual, with a flat mirror.
@@ -54,34 +53,26 @@ class Course:
         """Light (spans,) on used frames, of what the calibration expects; NaN in a span without one."""
         return _means(self._sums[:, _LIGHT])[:, 0]
 
-    def _add(self, time_ns: Long, where: slice, *values: npt.NDArray[np.floating]) -> None:
-        if not time_ns.size:
-            return
-        if self.begin_ns is None:
+    def add(self, time_ns: Long, where: slice, values: npt.NDArray[np.floating]) -> None:
+        """Add rows (rows, columns) at their times to some of the sums."""
+        if self.begin_ns is None and time_ns.size:
             self.begin_ns = int(time_ns.min())
-        after_ns = time_ns - self.begin_ns
+        after_ns = time_ns - (self.begin_ns or 0)
         right = (after_ns >= 0) & (after_ns < _FARTHEST_NS)
-        after_ns, values = after_ns[right], tuple(column[right] for column in values)
+        after_ns, values = after_ns[right], values[right]
         if not after_ns.size:
             return
         while (last := int(after_ns.max()) // self.span_ns) >= MOST:
-            self._halve()
+            self.span_ns *= 2
+            self._sums = np.pad(self._sums, ((0, len(self._sums) % 2), (0, 0)))
+            self._sums = self._sums[0::2] + self._sums[1::2]
         if last >= len(self._sums):
-            self._sums = np.concatenate([self._sums, np.zeros((last + 1 - len(self._sums), _COLUMNS))])
-        rows = np.stack([np.ones(len(after_ns)), *values], axis=1)
-        np.add.at(self._sums[:, where], after_ns // self.span_ns, rows)
-
-    def _halve(self) -> None:
-        self.span_ns *= 2
-        if len(self._sums) % 2:
-            self._sums = np.concatenate([self._sums, np.zeros((1, _COLUMNS))])
-        self._sums = self._sums[0::2] + self._sums[1::2]
+            self._sums = np.pad(self._sums, ((0, last + 1 - len(self._sums)), (0, 0)))
+        np.add.at(self._sums[:, where], after_ns // self.span_ns, np.pad(values, ((0, 0), (1, 0)), constant_values=1))
 
 
 def round_125(value: float, *, up: bool) -> float:
     """The next 1, 2 or 5 times a power of ten, above or below a positive value."""
-    if not (isfinite(value) and value > 0):
-        return 1.0
     decade = 10.0 ** floor(log10(value))
     steps = [step * decade for step in (1.0, 2.0, 5.0, 10.0)]
     if up:

@@ -1,6 +1,7 @@
 """What is set, in words: run and host, control law and gains, offset and channels, the last note."""
 
 from collections import Counter
+from collections.abc import Sequence
 from datetime import UTC, datetime
 
 import numpy as np
@@ -10,39 +11,40 @@ from lowfc.contract.printable import printable
 from lowfc.control.loop.state import FADING_FRAMES, SETTLING_FRAMES
 from lowfc.control.loop.wording import counted
 from lowfc.optics.chain.zernike import mode_name
+from lowfc.programs.view.verdicts.run_state import RunState
 from lowfc.programs.view.verdicts.tile import short
-from lowfc.programs.view.verdicts.watcher import Watcher
 
 _MOST = 3
 """Different values, modes or channels that are named one by one."""
 
 
-def facts(watcher: Watcher) -> dict[str, str]:
+def facts(state: RunState) -> dict[str, str]:
     """The facts of a run by title, as far as they are known."""
-    state, calibration = watcher.snapshot.controller, watcher.snapshot.calibration
-    noll = calibration.noll if calibration is not None else ()
-    run, host = watcher.run_and_host()
-    return {
-        "RUN": (f"{run} on {host}" if host else run) or "not known",
-        "CONTROL LAW": "not known" if state is None else _law(state),
-        "OFFSET AND CHANNELS": "not known" if state is None else f"{_offset(state, noll)}; {_channels(state)}",
-        "LAST NOTE": _note(watcher),
-    }
+    controller, note = state.controller_state, "none known"
+    if state.note is not None:
+        clock = datetime.fromtimestamp(from_timestamp(state.note.timestamp) * 1e-9, UTC)
+        note = f"{clock:%H:%M} {short(printable(state.note.message.partition(' ')[2]))}"
+    law = shapes = "not known"
+    if controller is not None:
+        law, shapes = _law(controller), f"{_offset(controller, state.noll)}; {_channels(controller)}"
+    run = (f"{state.run} on {state.host}" if state.host else state.run) or "not known"
+    return {"RUN": run, "CONTROL LAW": law, "OFFSET AND CHANNELS": shapes, "LAST NOTE": note}
 
 
 def _law(state: wire.ControllerState) -> str:
-    delay = f"delay {state.delay_frames:g} {'frame' if state.delay_frames == 1 else 'frames'}"
     if state.HasField("law"):
         weight = min(max(state.law_frames - SETTLING_FRAMES, 0) / FADING_FRAMES, 1.0)
-        drives = "" if weight == 1 else f", taking over from the integrator ({100 * weight:.0f} %)"
-        return f"{short(printable(state.law.name))}{drives}; {delay}"
-    if not state.gain:
-        return f"integrator, no calibration; {delay}"
-    leak = f", leak {_values(list(state.leak))}" if any(state.leak) else ""
-    return f"integrator, gain {_values(list(state.gain))}{leak}; {delay}"
+        fading = "" if weight == 1 else f", taking over from the integrator ({100 * weight:.0f} %)"
+        law = f"{short(printable(state.law.name))}{fading}"
+    elif state.gain:
+        leak = f", leak {_values(state.leak)}" if any(state.leak) else ""
+        law = f"integrator, gain {_values(state.gain)}{leak}"
+    else:
+        law = "integrator, no calibration"
+    return f"{law}; delay {counted(state.delay_frames, 'frame')}"
 
 
-def _values(values: list[float]) -> str:
+def _values(values: Sequence[float]) -> str:
     """Each value with the number of its modes, where there are few; the range where there are many."""
     counts = Counter(values)
     if len(counts) == 1:
@@ -72,10 +74,3 @@ def _channels(state: wire.ControllerState) -> str:
         named.append(f"{len(state.channels) - _MOST} more")
     text = f"{'channel' if len(state.channels) == 1 else 'channels'} {', '.join(named)}" if named else "no channels"
     return f"{text}; probe sequence on the {printable(state.play.target)}" if state.HasField("play") else text
-
-
-def _note(watcher: Watcher) -> str:
-    if watcher.note is None:
-        return "none known"
-    clock = datetime.fromtimestamp(from_timestamp(watcher.note.timestamp) * 1e-9, UTC)
-    return f"{clock:%H:%M} {short(printable(watcher.note.message.partition(' ')[2]))}"

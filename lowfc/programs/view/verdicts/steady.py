@@ -5,7 +5,6 @@ from typing import NamedTuple
 
 import numpy as np
 
-from lowfc.adapters.logs.columns import frame_rate_hz
 from lowfc.arrays import Sequences, Single
 from lowfc.contract.messages import wire
 from lowfc.control.laws.continuous import Timing
@@ -17,8 +16,6 @@ from lowfc.programs.view.snapshot import Snapshot
 
 FRAMES = 6144
 """Frames kept: for spectra eleven segments of 1024."""
-PERIOD_NS = 10_000_000_000
-"""Between two computations of the best gains, which take some 50 ms for 14 modes."""
 
 
 class LawInForce(NamedTuple):
@@ -87,41 +84,22 @@ class Attained(NamedTuple):
     noise_nm: float
 
 
-class Attainable:
-    """Computes `found` every ten seconds of a closed loop; None while there are too few frames under one law."""
-
-    def __init__(self) -> None:
-        self.found: Attained | None = None
-        self._steady = Steady()
-        self._computed_ns = 0
-
-    def feed(self, snapshot: Snapshot) -> None:
-        """Add what is new."""
-        before = self._steady.mode, self._steady.law
-        if not self._steady.feed(snapshot):
-            return
-        if before != (self._steady.mode, self._steady.law):
-            self.found, self._computed_ns = None, snapshot.time_ns  # of another law
-        if snapshot.time_ns - self._computed_ns >= PERIOD_NS:
-            self._computed_ns = snapshot.time_ns
-            self.found = self._compute(frame_rate_hz(snapshot.camera, snapshot.steps), snapshot.camera)
-
-    def _compute(self, rate_hz: float, camera: wire.CameraState | None) -> Attained | None:
-        law = self._steady.law
-        if law is None or self._steady.mode != LoopMode.CLOSED or not rate_hz:
-            return None
-        sequence, signals = self._steady.rows()
-        modes = len(law.gain)
-        exposure = camera.exposure_ns / camera.period_ns if camera is not None and camera.period_ns else 0.0
-        try:
-            pol, timing = pieces(sequence, signals[:, modes:]), Timing.of(law.delay_frames, exposure)
-            best = best_gains(pol, rate_hz, timing, np.array(law.leak))
-        except ValueError:
-            return None  # too few frames in a row
-        error_nm = signals[np.isfinite(signals).all(axis=1), :modes].astype(np.float64)
-        noise_nm2 = float(np.sum(best.noise_nm**2))
-        left_nm2 = max(float(np.mean(np.sum(error_nm**2, axis=1))) - noise_nm2, 0.0)
-        return Attained(left_nm2**0.5, float(np.linalg.norm(best.sensed_nm)), noise_nm2**0.5)
+def attained(steady: Steady, rate_hz: float, camera: wire.CameraState | None) -> Attained | None:
+    """The loop of the last frames; None where it is open, not known, or there are too few frames under one law."""
+    law, modes = steady.law, len(steady.law.gain) if steady.law is not None else 0
+    if law is None or steady.mode != LoopMode.CLOSED or not rate_hz:
+        return None
+    sequence, signals = steady.rows()
+    exposure = camera.exposure_ns / camera.period_ns if camera is not None and camera.period_ns else 0.0
+    try:
+        pol, timing = pieces(sequence, signals[:, modes:]), Timing.of(law.delay_frames, exposure)
+        best = best_gains(pol, rate_hz, timing, np.array(law.leak))
+    except ValueError:
+        return None  # too few frames in a row
+    error_nm = signals[np.isfinite(signals).all(axis=1), :modes].astype(np.float64)
+    noise_nm2 = float(np.sum(best.noise_nm**2))
+    left_nm2 = max(float(np.mean(np.sum(error_nm**2, axis=1))) - noise_nm2, 0.0)
+    return Attained(left_nm2**0.5, float(np.linalg.norm(best.sensed_nm)), noise_nm2**0.5)
 
 
 def _law_of(state: wire.ControllerState | None, modes: int) -> LawInForce | None:

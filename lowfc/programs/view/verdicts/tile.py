@@ -31,7 +31,7 @@ class Tile:
     title: str
     value: str
     detail: str
-    level: Level
+    level: Level = Level.NEUTRAL
     advice: str = ""
 
 
@@ -52,18 +52,11 @@ def worst_of(tiles: Sequence[Tile]) -> Tile:
 
 def figure(value: float) -> str:
     """In two or three digits: nobody reads more at a glance."""
-    if value >= 100:
-        return f"{value:.0f}"
-    return f"{value:.1f}" if value >= 1 else f"{value:.2f}"
+    return f"{value:.0f}" if value >= 100 else f"{value:.1f}" if value >= 1 else f"{value:.2f}"
 
 
-def ago(seconds: float) -> str:
-    """A span of time in words."""
-    return f"{seconds:.0f} s" if seconds < 120 else f"{seconds / 60:.0f} min"
-
-
-def long_time(seconds: float) -> str:
-    """A span of time that may be a night."""
+def duration(seconds: float) -> str:
+    """A span of time in words, up to a night."""
     if seconds < 120:
         return f"{seconds:.0f} s" if seconds >= 10 else f"{seconds:.2g} s"
     minutes = round(seconds / 60)
