@@ -2,7 +2,6 @@
 
 import json
 import socket
-import threading
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -17,7 +16,6 @@ from lowfc.adapters.bus.zenoh_bus import ZenohBus
 from lowfc.adapters.bus.zenoh_session import session_config
 from lowfc.adapters.process.clock import HostClock
 from lowfc.adapters.process.clock_offset import RECENT, ClockOffset
-from lowfc.adapters.process.service import Service
 from lowfc.contract.configuration import Network
 from lowfc.contract.errors import BusError, DataFileError
 from lowfc.contract.messages import (
@@ -33,14 +31,10 @@ from lowfc.contract.messages import (
     Role,
     Topic,
 )
-from tests.support.loops import lowfc, until
+from tests.support.loops import until
 
 certificates = pytest.importorskip("lowfc.adapters.bus.certificates", reason="needs the package cryptography")
 ROLES = roles(["mirror-dm"])
-
-
-def test_the_roles_are_those_of_a_run_on_several_hosts() -> None:
-    assert ROLES == ("camera", "controller", "mirror-dm", "operator", "recorder", "viewer")
 
 
 @pytest.mark.parametrize("topic", TOPICS, ids=lambda topic: topic.key)
@@ -62,19 +56,11 @@ def _covers(keys: tuple[str, ...], key: str) -> bool:
     )
 
 
-def test_a_process_speaks_in_its_own_name_only() -> None:
-    assert grant("mirror-dm").publishes == (
-        "lowfc/mirror/dm/state",
-        "lowfc/mirror/dm/surface",
-        "lowfc/event",
-        "lowfc/health/mirror-dm",
-    )
-    assert "lowfc/mirror/dm/command" in grant("mirror-dm").receives
-    assert not any("*" in key for role in ROLES if role != "controller" for key in grant(role).publishes)
-
-
-def test_only_an_operator_makes_requests() -> None:
+def test_a_process_publishes_in_its_own_name_only_and_requests_are_an_operators() -> None:
+    own = {"lowfc/mirror/dm/state", "lowfc/mirror/dm/surface", "lowfc/event", "lowfc/health/mirror-dm"}
+    assert set(grant("mirror-dm").publishes) == own
     for role in ROLES:
+        assert role == "controller" or not any("*" in key for key in grant(role).publishes)
         asks = {key for key in grant(role).asks if "request" in key or "record" in key}
         assert asks == ({"lowfc/request/*", "lowfc/record/*"} if role == "operator" else set())
         assert CLOCK_KEY in grant(role).asks
@@ -213,32 +199,6 @@ def test_times_are_those_of_the_host_that_receives(hosts: Hosts) -> None:
     assert all(abs(sample.receive_time_ns - sample.publish_time_ns) < second_ns for sample in arrived)
 
 
-def test_hosts_warns_of_a_certificate_that_ends(hosts: Hosts, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("XDG_RUNTIME_DIR", str(hosts.folder))
-    toml = hosts.folder / "lowfc.toml"
-    toml.write_text(f'[network]\nrouter = "{hosts.network().router}"\ncertificates = "{hosts.folder / "certs"}"\n')
-    certificates.make_certificates(hosts.folder / "certs", ("operator",), [], 20, renew=True)
-    Service(ROUTER, "hosts", HostClock(), hosts.join(ROUTER))
-    camera = Service("camera", "hosts", HostClock(), hosts.join("camera"))
-    stop = threading.Event()
-
-    def beat() -> None:
-        while not stop.wait(0.1):
-            camera.beat()
-
-    beating = threading.Thread(target=beat)
-    beating.start()
-    try:
-        done = lowfc("hosts", "--config", toml, "--run", "hosts")
-    finally:
-        stop.set()
-        beating.join()
-    assert done.exit_code == 0, done.output
-    assert "camera" in done.stdout
-    (line,) = (line for line in done.stderr.splitlines() if line.startswith("warning: "))
-    assert line.startswith("warning: the certificate of operator ends in 19 days, on ")
-
-
 def test_there_is_one_of_each_role(hosts: Hosts) -> None:
     hosts.join(ROUTER)
     hosts.join("camera").publisher(HEALTH, "camera").put(b"here")
@@ -259,7 +219,10 @@ def test_a_foreign_certificate_is_told_so(hosts: Hosts) -> None:
         hosts.join("camera", network=hosts.network("foreign"))
 
 
-def test_a_certificate_of_another_role_is_told_so_before_a_session_is_opened(hosts: Hosts) -> None:
+def test_a_wrong_or_missing_certificate_is_named_before_a_session_is_opened(hosts: Hosts) -> None:
+    (hosts.folder / "certs" / "viewer.key").unlink()
+    with pytest.raises(DataFileError, match=r"viewer\.key cannot be read .No such file.*lowfc certs"):
+        hosts.join("viewer")
     for kind in ("pem", "key"):
         (hosts.folder / "certs" / f"recorder.{kind}").replace(hosts.folder / "certs" / f"camera.{kind}")
     with pytest.raises(DataFileError, match=r"camera\.pem is the certificate of 'recorder'.*this process is 'camera'"):
@@ -320,12 +283,6 @@ def test_a_role_does_not_pass_for_the_router(hosts: Hosts, monkeypatch: pytest.M
         hosts.join("recorder")
 
 
-def test_a_certificate_that_is_not_there_is_named(hosts: Hosts) -> None:
-    (hosts.folder / "certs" / "camera.key").unlink()
-    with pytest.raises(DataFileError, match=r"camera\.key cannot be read .No such file.*lowfc certs"):
-        hosts.join("camera")
-
-
 def test_a_run_remembers_its_way(tmp_path: Path) -> None:
     way = Network(router="tls/bench:7447", certificates=str(tmp_path))
     made = open_run("hosts", base=tmp_path, network=way)
@@ -338,21 +295,14 @@ def test_a_run_remembers_its_way(tmp_path: Path) -> None:
     assert open_run("alone", base=tmp_path).links.network == Network()
     with pytest.raises(BusError, match="run 'alone' is on this host alone"):
         open_run("alone", base=tmp_path, network=way)
-
-
-def test_a_launchers_run_stays_on_its_host(tmp_path: Path) -> None:
-    open_run("launched", base=tmp_path, listeners=(Role.LAUNCHER,))
-    way = Network(router="tls/bench:7447", certificates=str(tmp_path))
+    open_run("launched", base=tmp_path, listeners=(Role.LAUNCHER,))  # stays on its host
     assert open_run("launched", base=tmp_path, network=way).links.network == Network()
 
 
 @pytest.mark.parametrize("router", ["tcp/bench:7447", "tls/bench", "bench:7447", "tls/:7447x"])
-def test_a_router_is_a_tls_endpoint(router: str) -> None:
+def test_a_router_is_a_tls_endpoint_with_certificates(router: str) -> None:
     with pytest.raises(ValueError, match="router"):
         Network(router=router, certificates="certs")
-
-
-def test_a_router_needs_certificates() -> None:
     with pytest.raises(ValueError, match="certificates: a folder is needed"):
         Network(router="tls/bench:7447")
     assert Network(router="tls/[fe80::1]:7447", certificates="certs").address == ("fe80::1", 7447)

@@ -3,20 +3,15 @@
 import threading
 import time
 from collections.abc import Callable
-from pathlib import Path
 
 import numpy as np
-import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
 from lowfc.adapters.bus.bus import Sample
 from lowfc.adapters.bus.dispatch import LONG_AGO_NS, Handover
 from lowfc.adapters.bus.mailbox import Mailbox
-from lowfc.adapters.bus.run import open_run
-from lowfc.adapters.bus.zenoh_bus import ZenohBus
 from lowfc.adapters.logs.sequence_gaps import REMEMBERED, Gaps
-from lowfc.adapters.process.clock import HostClock
 from lowfc.contract.envelope import count_of, sequence_of
 from lowfc.contract.messages import FRAME
 
@@ -25,16 +20,6 @@ PATIENCE_S = 30.0
 
 def sample(count: int, start_s: int = 100) -> Sample:
     return Sample("lowfc/camera/frame", b"", sequence_of(start_s, count), 0, 0)
-
-
-def test_the_newest_message_is_taken_once() -> None:
-    box = Mailbox("key")
-    assert box.take(0.0) is None
-    box.put(sample(0))
-    box.put(sample(1))
-    assert box.take(PATIENCE_S) == sample(1)
-    assert box.take(0.0) is None
-    assert (box.received, box.skipped, box.missing, box.restarts) == (2, 1, 0, 0)
 
 
 def test_a_gap_is_missing_and_a_new_start_is_none() -> None:
@@ -103,26 +88,6 @@ def test_every_message_is_taken_skipped_missing_or_waiting(actions: list[str]) -
         trailing += 1
     waiting = box.take(0.0) is not None
     assert sent - trailing == taken + waiting + box.skipped + box.missing
-
-
-def test_two_threads_lose_nothing_between_them() -> None:
-    box = Mailbox()
-    done = threading.Event()
-
-    def flood() -> None:
-        for count in range(20_000):
-            box.put(sample(count))
-        done.set()
-
-    thread = threading.Thread(target=flood)
-    thread.start()
-    taken = 0
-    while not done.is_set():
-        taken += box.take(0.001) is not None
-    thread.join()
-    taken += box.take(0.0) is not None
-    assert taken + box.skipped == box.received == 20_000
-    assert box.missing == 0
 
 
 PERIOD_NS = 1_000_000
@@ -204,31 +169,6 @@ def test_a_slow_handler_is_never_far_behind() -> None:
     assert max(behind) < 5
     assert len(bench.handled) > 5
     assert len(bench.handled) + len(bench.superseded) + bench.handover.skipped == bench.handover.received == 500
-
-
-@pytest.mark.exclusive
-def test_frames_faster_than_their_handler_are_skipped_on_the_real_bus(tmp_path: Path) -> None:
-    links = open_run("handover", base=tmp_path).links
-    camera, controller = (ZenohBus(links, role, HostClock(tmp_path)) for role in ("camera", "controller"))
-    number = 300
-    handover = Handover(FRAME.key, lambda _: time.sleep(2e-3), controller.clock.host_ns, 500_000)
-    controller.subscribe(FRAME, handover.put)
-    publisher = camera.publisher(FRAME)
-    until_s = time.monotonic() + PATIENCE_S
-    while not handover.received:
-        assert time.monotonic() < until_s
-        publisher.put(b"")
-        time.sleep(0.01)
-    for _ in range(number):
-        publisher.put(bytes(1000))
-        time.sleep(5e-4)
-    while handover.last_sequence + 1 != sequence_of(camera.start_s, publisher.published):
-        assert time.monotonic() < until_s
-        time.sleep(0.01)
-    assert handover.received + handover.missing >= number
-    assert 0 < handover.skipped < handover.received
-    for bus in (camera, controller):
-        bus.close()
 
 
 def test_two_threads_that_receive_take_turns() -> None:

@@ -1,6 +1,3 @@
-import importlib
-import subprocess
-import sys
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
@@ -8,13 +5,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from lowfc.adapters.files import twin_cache
 from lowfc.adapters.files.twin_cache import (
     default_cache_dir,
     load_or_build,
     load_or_fit_mirror,
     operator_hash,
-    source_hash,
-    sources,
 )
 from lowfc.optics.chain.band import gauss_legendre, monochromatic
 from lowfc.optics.chain.mirror import Mirror
@@ -23,11 +19,6 @@ from lowfc.optics.twin.twin import FAST, Evaluator, TwinSpec, reference
 
 SMALL = TwinSpec(nodes=16, order=4, rank=40, guards=4)  # the real optics, coarser, for tests of the file
 HASH_OF_ONES = "a4449a9f81f26403e8a1f5dda2c0cbe7385184dc0b31b34b2b78eb5a92ba3eec"
-IMPORTED_BY_THE_BUILDERS = """
-import sys, lowfc.optics.twin.twin_build, lowfc.optics.twin.twin_mirror
-modules = sys.modules.items()
-print(*(name for name, module in modules if name.startswith("lowfc.optics.") and not hasattr(module, "__path__")))
-"""
 
 
 @pytest.fixture
@@ -94,47 +85,21 @@ def test_the_operator_hash_is_that_of_the_first_release(sensor):
     assert operator_hash(plain, SMALL, monochromatic(550.0)) == HASH_OF_ONES
 
 
-def test_the_sources_are_the_modules_that_building_a_twin_imports():
-    imported = subprocess.run(
-        [sys.executable, "-c", IMPORTED_BY_THE_BUILDERS], capture_output=True, text=True, check=True
-    ).stdout.split()
-    assert set(sources()) == {"lowfc.adapters.files.twin_cache", *imported}
-    assert len(imported) > 8
-
-
-@pytest.mark.parametrize(
-    ("module", "again"),
-    [
-        ("lowfc.optics.chain.fourier", True),
-        ("lowfc.adapters.files.twin_cache", True),
-        ("lowfc.optics.chain.screen", False),
-    ],
-)
-def test_a_changed_source_builds_again(module, again, sensor, stored, tmp_path, monkeypatch):
+def test_a_changed_source_builds_again(sensor, stored, tmp_path, monkeypatch):
     twin, mirror = stored[0], Mirror(rows=6, columns=5, pitches_per_pupil=4.0)
     load_or_fit_mirror(sensor, twin, mirror, tmp_path)
     before = set(tmp_path.iterdir())
-    changed = tmp_path / "changed"
-    changed.mkdir()
-    loaded = importlib.import_module(module)
-    source = changed / "source.py"
-    source.write_bytes(Path(loaded.__file__).read_bytes() + b"\nCHANGED = 1\n")
-    monkeypatch.setattr(loaded, "__file__", str(source))
-    source_hash.cache_clear()
-    try:
-        same(twin, load_or_build(sensor, SMALL, cache_dir=tmp_path))
-        load_or_fit_mirror(sensor, twin, mirror, tmp_path)
-    finally:
-        source_hash.cache_clear()
-    new = [path.name.partition("-")[0] for path in set(tmp_path.iterdir()) - before - {changed}]
-    assert sorted(new) == (["mirror", "twin"] if again else [])
+    monkeypatch.setattr(twin_cache, "source_hash", lambda: "of another version")
+    same(twin, load_or_build(sensor, SMALL, cache_dir=tmp_path))
+    load_or_fit_mirror(sensor, twin, mirror, tmp_path)
+    assert sorted(path.name.partition("-")[0] for path in set(tmp_path.iterdir()) - before) == ["mirror", "twin"]
 
 
 def test_the_tests_have_a_cache_of_their_own():
     assert default_cache_dir().is_relative_to(Path(__file__).parents[2] / ".pytest_cache")
 
 
-@pytest.mark.parametrize("damage", ["truncated", "empty", "one bit", "other content", "another twin"])
+@pytest.mark.parametrize("damage", ["truncated", "empty", "one bit", "another twin"])
 def test_a_damaged_file_is_noticed_and_built_again(damage, sensor, stored, tmp_path):
     twin, path = stored
     content = bytearray(path.read_bytes())
@@ -145,11 +110,6 @@ def test_a_damaged_file_is_noticed_and_built_again(damage, sensor, stored, tmp_p
     elif damage == "one bit":
         content[len(content) // 3] ^= 1
         path.write_bytes(content)
-    elif damage == "other content":
-        with np.load(path) as arrays:
-            changed = {name: arrays[name] for name in arrays.files}
-        changed["to_modes_0"] = changed["to_modes_0"] * 1.001
-        np.savez(path, **changed)
     else:
         load_or_build(sensor, replace(SMALL, rank=41), cache_dir=tmp_path / "other")
         path.write_bytes(next((tmp_path / "other").iterdir()).read_bytes())

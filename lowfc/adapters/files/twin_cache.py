@@ -1,16 +1,14 @@
 """The twin's cache: twin and mirror are built once, then read from files named by a hash of all they depend on.
 
-That includes the source of the modules that build them, so that no other version's file is ever read.
+That includes the source of the optics, so that no other version's file is ever read.
 """
 
-import ast
 import functools
 import hashlib
 import io
 import logging
 import os
-import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import astuple, fields
 from pathlib import Path
 from typing import Any, TypeVar
@@ -18,6 +16,7 @@ from typing import Any, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
+import lowfc.optics
 from lowfc.adapters.files.whole_file import write_whole
 from lowfc.contract.errors import DataFileError
 from lowfc.optics.chain.band import Band, monochromatic
@@ -30,6 +29,9 @@ from lowfc.optics.twin.twin_mirror import TwinMirror, twin_mirror
 
 _HASHED_AS = 3
 """Part of every operator hash, and so of the identity of every computed calibration: it stays as it is."""
+
+_OF_TWIN = ("operator_hash", "axis", "used", "area_weights", "to_pixels")
+_OF_OPERATOR = ("modes", "to_modes", "to_coefficients", "basis")
 
 _Kept = TypeVar("_Kept", Twin, TwinMirror)
 
@@ -48,36 +50,13 @@ def operator_hash(sensor: Sensor, spec: TwinSpec, band: Band) -> str:
     return _digest(arrays, repr((numbers, relay, astuple(spec), astuple(band))))
 
 
-def sources() -> dict[str, Path]:
-    """Modules that determine what is kept, and their files: this one, and all of `lowfc.optics` that it imports."""
-    found: dict[str, Path] = {}
-    pending = [__name__]
-    while pending:
-        name = pending.pop()
-        if name not in found and (path := getattr(sys.modules.get(name), "__file__", None)) is not None:
-            found[name] = Path(path)
-            pending += (one for one in _imports(found[name]) if one.startswith("lowfc.optics."))
-    return found
-
-
 @functools.cache
 def source_hash() -> str:
-    """SHA-256, hexadecimal, of the modules in `sources`."""
-    digest = hashlib.sha256()
-    for name, path in sorted(sources().items()):
-        content = path.read_bytes()
-        digest.update(f"{name} {len(content)}".encode() + content)
+    """SHA-256, hexadecimal, of the source of `lowfc.optics` and of this module."""
+    digest = hashlib.sha256(Path(__file__).read_bytes())
+    for path in sorted(Path(lowfc.optics.__file__).parent.rglob("*.py")):
+        digest.update(path.read_bytes())
     return digest.hexdigest()
-
-
-def _imports(path: Path) -> Iterator[str]:
-    """Names that may be modules among those that a file imports."""
-    for node in ast.walk(ast.parse(path.read_bytes())):
-        if isinstance(node, ast.Import):
-            yield from (alias.name for alias in node.names)
-        elif isinstance(node, ast.ImportFrom) and node.module:
-            yield node.module
-            yield from (f"{node.module}.{alias.name}" for alias in node.names)
 
 
 def default_cache_dir() -> Path:
@@ -170,36 +149,22 @@ def _digest(arrays: dict[str, NDArray[Any]], extra: str = "") -> str:
 
 
 def _pack(twin: Twin) -> bytes:
-    arrays: dict[str, NDArray[Any]] = {
-        "operator_hash": np.array(twin.operator_hash),
-        "axis": twin.axis,
-        "used": twin.used,
-        "area_weights": twin.area_weights,
-        "to_pixels": twin.to_pixels,
-        "band": np.array([(operator.wavelength_nm, operator.weight) for operator in twin.operators]),
-    }
+    arrays: dict[str, NDArray[Any]] = {name: np.array(getattr(twin, name)) for name in _OF_TWIN}
+    arrays["band"] = np.array([(operator.wavelength_nm, operator.weight) for operator in twin.operators])
     for i, operator in enumerate(twin.operators):
-        arrays |= {
-            f"modes_{i}": operator.modes,
-            f"to_modes_{i}": operator.to_modes,
-            f"to_coefficients_{i}": operator.to_coefficients,
-            f"basis_{i}": operator.basis,
-        }
+        arrays |= {f"{name}_{i}": getattr(operator, name) for name in _OF_OPERATOR}
     return _packed(arrays)
 
 
 def _packed(arrays: dict[str, NDArray[Any]]) -> bytes:
     stream = io.BytesIO()
-    np.savez(stream, allow_pickle=False, checksum=np.array(_digest(arrays)), **arrays)
+    np.savez(stream, allow_pickle=False, **arrays)
     return stream.getvalue()
 
 
 def _arrays(content: bytes) -> dict[str, NDArray[Any]]:
-    with np.load(io.BytesIO(content), allow_pickle=False) as stored:
-        arrays = {name: stored[name] for name in stored.files}
-    if str(arrays.pop("checksum")) != _digest(arrays):
-        raise ValueError("the checksum does not match the content")
-    return arrays
+    with np.load(io.BytesIO(content), allow_pickle=False) as stored:  # each array has a checksum in the archive
+        return {name: stored[name] for name in stored.files}
 
 
 def _unpack(content: bytes, key: str, spec: TwinSpec) -> Twin:
@@ -207,14 +172,7 @@ def _unpack(content: bytes, key: str, spec: TwinSpec) -> Twin:
     if str(arrays["operator_hash"]) != key:
         raise ValueError("it was made from other optics")
     operators = tuple(
-        Operator(
-            nm,
-            weight,
-            arrays[f"modes_{i}"],
-            arrays[f"to_modes_{i}"],
-            arrays[f"to_coefficients_{i}"],
-            arrays[f"basis_{i}"],
-        )
+        Operator(nm, weight, *(arrays[f"{name}_{i}"] for name in _OF_OPERATOR))
         for i, (nm, weight) in enumerate(arrays["band"].tolist())
     )
     return Twin(spec, arrays["axis"], arrays["used"], arrays["area_weights"], operators, arrays["to_pixels"], key)
