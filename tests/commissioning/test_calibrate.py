@@ -153,45 +153,6 @@ def test_a_reference_that_is_not_flat_is_held() -> None:
     assert np.abs(off).max() < 0.02 * 20.0
 
 
-class Interrupting(FoldedLoop):
-    """Ctrl-C during the second play."""
-
-    plays = 0
-
-    def play(self, basis_nm: npt.ArrayLike, table: npt.ArrayLike) -> Answer:
-        given = super().play(basis_nm, table)
-        self.plays += 1
-        if self.plays == 3:
-            self.run(100)
-            raise KeyboardInterrupt
-        return given
-
-
-def test_after_ctrl_c_the_mirror_is_where_it_was_and_the_cycles_done_are_kept() -> None:
-    loop = Interrupting(configured(**FEW, disturbance__static_nm={"4": 5.0}))
-    loop.close_loop()
-    loop.run(50)
-    loop.open_loop()
-    loop.run(5)
-    held = loop.surfaces_nm[-1]
-    assert np.abs(held).max() > 1
-    with pytest.raises(KeyboardInterrupt):
-        taken_of(loop, "hadamard", 4)
-    assert np.abs(loop.surfaces_nm[-1] - held).max() > 1
-    loop.run(5)
-    assert np.array_equal(loop.surfaces_nm[-1], held)
-    assert loop.stops == 1
-    kept = go_on(partial_of(OUT), {"method": "hadamard"})
-    assert kept.cycles == 1
-    _, taken = taken_of(loop, "hadamard", 4, resume=True)
-    assert taken.measured.cycles == 4
-    assert np.array_equal(loop.surfaces_nm[-1], held)
-    with pytest.raises(DataFileError, match="its method is hadamard, now it is poke"):
-        taken_of(loop, "poke", 4, resume=True)
-    with pytest.raises(DataFileError, match="nothing to go on from"):
-        taken_of(loop, "poke", 4, out=Path("other.fits"), resume=True)
-
-
 def test_a_closed_loop_is_opened_for_pokes_and_closed_again() -> None:
     loop = FoldedLoop(configured(**FEW))
     with pytest.raises(CalibrationError, match="the loop is open: `lowfc ctl close` first"):
@@ -302,12 +263,12 @@ class Struck(FoldedLoop):
         begun: frame at which each play began.
     """
 
-    def __init__(self, play: int, strike: Callable[[FoldedLoop], None], heal: Callable[[FoldedLoop], None]) -> None:
+    def __init__(self, play: int, strike: Callable[[Any], None], heal: Callable[[Any], None], **changes: Any) -> None:
         self.begun: list[int] = []
         self.before_the_end: int | None = None
         self.struck_at = self.healed_at = -1
         self._play, self._strike, self._heal = play, strike, heal
-        super().__init__(configured(**FEW))
+        super().__init__(configured(**FEW, **changes))
 
     def play(self, basis_nm: npt.ArrayLike, table: npt.ArrayLike) -> Answer:
         given = super().play(basis_nm, table)
@@ -360,6 +321,34 @@ def test_what_is_played_while_a_device_restarts_is_given_up_at_once_and_played_a
     assert (len(loop.begun), loop.stops) == (1 + 4 + 1, 1)
     assert loop.begun[play] < loop.healed_at + 10, "it went on to its end"
     assert np.abs(cross_talk(loop.calibration().reconstructor, taken.measured.response)).max() < 0.05
+
+
+def test_after_ctrl_c_the_mirror_is_where_it_was_and_the_cycles_done_are_kept() -> None:
+    def interrupt(_: FoldedLoop) -> None:
+        raise KeyboardInterrupt
+
+    loop = Struck(3, interrupt, ignore, disturbance__static_nm={"4": 5.0})
+    loop.close_loop()
+    loop.run(50)
+    loop.open_loop()
+    loop.run(5)
+    held = loop.surfaces_nm[-1]
+    assert np.abs(held).max() > 1
+    with pytest.raises(KeyboardInterrupt):
+        taken_of(loop, "hadamard", 4)
+    assert np.abs(loop.surfaces_nm[-1] - held).max() > 1
+    loop.run(5)
+    assert np.array_equal(loop.surfaces_nm[-1], held)
+    assert loop.stops == 1
+    kept = go_on(partial_of(OUT), {"method": "hadamard"})
+    assert kept.cycles == 1
+    _, taken = taken_of(loop, "hadamard", 4, resume=True)
+    assert taken.measured.cycles == 4
+    assert np.array_equal(loop.surfaces_nm[-1], held)
+    with pytest.raises(DataFileError, match="its method is hadamard, now it is poke"):
+        taken_of(loop, "poke", 4, resume=True)
+    with pytest.raises(DataFileError, match="nothing to go on from"):
+        taken_of(loop, "poke", 4, out=Path("other.fits"), resume=True)
 
 
 @pytest.mark.parametrize("before_the_end", [None, 3])
@@ -449,10 +438,6 @@ def test_a_few_cycles_keep_the_promise(method: str, preset: str, tmp_path: Path)
 def test_the_promise_is_kept(method: str, preset: str, first: int, tmp_path: Path) -> None:
     for seed in range(first, first + BLOCK):
         found = outcome(method, preset, seed, 30.0, tmp_path)
-        print(
-            f"PROMISE {method} {preset} {seed}: rms {30 * np.sqrt((found.talk**2).mean()):.2f} largest "
-            f"{30 * np.abs(found.talk).max():.2f} noise {found.noise_ratio.max():.2f} {found.verdict}"
-        )
         assert not found.verdict.faults
         assert_kept(found, 30.0)
 

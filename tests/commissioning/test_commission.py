@@ -240,15 +240,6 @@ def test_a_value_that_differs_is_found(one: object) -> None:
     assert found[field] is (Status.WRONG if needed else Status.WARNING)
 
 
-def test_what_is_compared_has_its_unit() -> None:
-    config = Configuration(camera=Camera(rate_hz=100.0, bit_depth=14))
-    checks = agreement_checks(config, changed())
-    shown = {check.name.split(" ")[0]: (check.got, check.expected) for check in checks}
-    assert shown["period_ns"] == ("4 ms", "10 ms, as configured")
-    assert shown["bit_depth"] == ("16 bits", "14 bits, as configured")
-    assert shown["em_gain"] == ("1", "1")
-
-
 def test_a_calibration_that_is_there_is_not_replaced_unasked(own_runtime: Path) -> None:
     out = own_runtime / "calibration.fits"
     out.write_text("mine")
@@ -259,16 +250,6 @@ def test_a_calibration_that_is_there_is_not_replaced_unasked(own_runtime: Path) 
         done = lowfc("commission", "--no-dark", "--out", out, way)
         assert isinstance(done.exception, BusError), "it goes on to the loop, of which there is none"
     assert out.read_text() == "mine"
-
-
-def test_a_camera_of_100_hz_and_14_bits_on_the_default_configuration() -> None:
-    state = changed(period_ns=10_000_000, exposure_ns=5_000_000, bit_depth=14, saturation_dn=16383)
-    assert faults(Configuration(), state) == {
-        "period_ns": Status.WRONG,
-        "exposure_ns": Status.WARNING,
-        "bit_depth": Status.WARNING,
-        "saturation_dn": Status.WARNING,
-    }
 
 
 @pytest.mark.parametrize(

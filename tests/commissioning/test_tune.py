@@ -239,19 +239,13 @@ def test_damage_of_a_law_file_is_found(tmp_path: Path) -> None:
     with pytest.raises(DataFileError, match="there is no such law file: make one with `lowfc tune"):
         law_file.load(path)
     law_file.save(LAWS["notch"], path)
-    whole = path.read_bytes()
-    path.write_bytes(whole[: len(whole) // 2])
-    with pytest.raises(DataFileError, match="not a whole law file"):
-        law_file.load(path)
-    path.write_bytes(whole)
     with fits.open(path, mode="update") as units:
         units["MEASUREMENT_GAIN"].data[0, 0] += 1
     with pytest.raises(DataFileError, match="damaged: its content has identity"):
         law_file.load(path)
-    path.write_bytes(b"SIMPLE")
-    with pytest.raises(DataFileError, match=r"law\.fits: not a whole law file") as caught:
+    path.write_bytes(path.read_bytes()[:5000])
+    with pytest.raises(DataFileError, match=r"law\.fits: not a whole law file"):
         law_file.load(path)
-    assert "\n" not in str(caught.value)
     fits.PrimaryHDU().writeto(path, overwrite=True)
     with pytest.raises(DataFileError, match="its header should say KIND = 'lowfc law 2'"):
         law_file.load(path)

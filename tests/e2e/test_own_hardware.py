@@ -49,6 +49,7 @@ PLAIN = (
     "lowfc config zenoh --run bench --role camera --make > camera.json5",
     "python examples/plain_camera.py camera.json5 frames.npy",
 )
+
 DOCUMENTED = (*DEVICES, *CONFORMANCE, *LOOP, *PLAIN)
 """Commands of docs/hardware.md; all are run here."""
 
