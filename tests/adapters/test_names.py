@@ -4,16 +4,13 @@ from collections.abc import Callable
 
 import pytest
 
-from lowfc.adapters.bus.bus import Sample
 from lowfc.adapters.bus.names import LARGEST_HEALTH_BYTES, LONGEST_NAME, MOST_NAMES, Names
 from lowfc.adapters.bus.start_check import StartCheck
-from lowfc.adapters.logs.loss_account import MOST_STARTS, LossAccount
 from lowfc.adapters.process.clock import SIMULATED_START_NS
 from lowfc.adapters.process.service import Service
 from lowfc.contract.envelope import Envelope, count_of, sequence_of, start_of
 from lowfc.contract.errors import BadMessageError, BusError
 from lowfc.contract.messages import (
-    COMMAND,
     EVENT,
     FRAME,
     HEALTH,
@@ -188,33 +185,3 @@ def test_a_launcher_and_a_view_are_not_filled_either(hub: MemoryHub) -> None:
         launcher.publisher(HEALTH, f"forged-{number}").put(health(number))
     assert len(watch.health) == len(view.snapshot(1).health) == MOST_NAMES
     assert view.unreadable == launcher.faults.unreadable[HEALTH.at("*")][0] == FORGED - MOST_NAMES
-
-
-def entry(start_s: int, count: int, payload: bytes = b"") -> Sample:
-    return Sample(FRAME.key, payload, sequence_of(start_s, count), 0, 0)
-
-
-def test_the_ledger_keeps_the_newest_starts_apart_and_the_sum_of_all() -> None:
-    ledger = LossAccount()
-    for start_s in range(FORGED):
-        ledger.enter(FRAME, entry(start_s, 0), recorded=True)
-        ledger.enter(FRAME, entry(start_s, 3), recorded=start_s != 5)  # 1 and 2 are missing, in one 3 too
-    assert len(ledger._tallies[FRAME.key, ""]) == MOST_STARTS + 1
-    assert ledger.recorded() == {FRAME.key: 2 * FORGED - 1}
-    assert ledger.lost() == ledger.news() == {FRAME.key: 2 * FORGED + 1}
-    assert ledger.news() == {}
-    assert ledger.starts == FORGED
-    ledger.revert()
-    assert ledger.recorded() == {FRAME.key: 0}, "nothing had been flushed"
-
-
-def test_the_ledger_takes_no_number_of_names_from_messages() -> None:
-    ledger = LossAccount()
-    for number in range(FORGED):
-        ledger.enter(EVENT, entry(1, 0, Log(name=f"forged-{number}").SerializeToString()), recorded=True)
-    forged = wire.Health(process="controller", state="stopped")
-    for number in range(FORGED):
-        forged.topics.add(topic=COMMAND.at(f"forged-{number}"), published=9)
-    with pytest.raises(BadMessageError):
-        ledger.believe(entry(1, 0), forged)
-    assert len(ledger._tallies) == MOST_NAMES + 1 + MOST_NAMES

@@ -45,7 +45,7 @@ from lowfc.control.laws.linear_law import integrator_block, of_blocks
 from lowfc.control.loop.inputs import Reply, Request, Step
 from lowfc.control.loop.requests import REQUESTS
 from lowfc.control.loop.safety import Limit, LoopMode
-from lowfc.programs.cli.ctl.command import SIMPLE, ctl_app
+from lowfc.programs.cli.ctl.command import ctl_app
 from lowfc.programs.cli.ctl.status import figures, text
 from lowfc.programs.cli.modes import noll_of
 from lowfc.testing.memory_bus import MemoryBus, MemoryHub, MemoryRing
@@ -98,6 +98,7 @@ def short_patience(monkeypatch: pytest.MonkeyPatch) -> None:
         monkeypatch.setattr(client, name, 0.05)
 
 
+SIMPLE = ("open", "close", "pause", "safe", "clear", "reset", "stop")
 METHODS = {"open": Client.open_loop, "close": Client.close_loop}
 ASKS: tuple[tuple[Callable[[Client], object], Request], ...] = (
     *((METHODS.get(name) or getattr(Client, name), Request(0, name)) for name in ("status", *SIMPLE)),
