@@ -1,20 +1,15 @@
 """The command `lowfc info`: what a log holds, whether it is whole, and what is missing from it."""
 
-import sys
 from collections.abc import Mapping
 from functools import partial
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated, Any
 
 import typer
 
 from lowfc.adapters.process.terminal import Json, Logs
-from lowfc.contract.printable import LINES, printable
 from lowfc.programs.cli.output import put
+from lowfc.programs.cli.result import table
 
-if TYPE_CHECKING:
-    from rich.console import Console
-
-_WIDTH = 120  # of the report, where there is no terminal
 _STATES = {
     "complete": "complete",
     "recording": "being recorded; `lowfc ctl record stop` finishes it",
@@ -43,35 +38,27 @@ def info(
     for number, log in enumerate(one_by_one(logs, as_json=as_json)):
         with reading_bar(Console(stderr=True)) as count:
             found = survey(log, partial(count, f"reading {titled(log)}"), digest=digest)
-        if as_json:
-            put(found, "", as_json=True)
-        else:
-            sys.stdout.write("\n" if number else "")
-            report(found, Console(width=None if sys.stdout.isatty() else _WIDTH, highlight=False))
+        put(found, ("\n" if number else "") + render(found), as_json=as_json)
 
 
-def report(found: Mapping[str, Any], console: "Console") -> None:
-    """Print the figures of a log for a person."""
-    from rich.table import Table
-    from rich.text import Text
-
-    lines = Table.grid(padding=(0, 2))
-    for name, value in _summary(found).items():
-        lines.add_row(Text(printable(name), style="dim"), Text(printable(value, keep=LINES)))
-    console.print(lines)
-    topics = Table(box=None, padding=(0, 2, 0, 0))
-    topics.add_column("topic", no_wrap=True)
-    for name in ("messages", "Hz", "MB", "restarts", "missing"):
-        topics.add_column(name, justify="right", no_wrap=True)
-    topics.add_column("schema")
-    for key, line in found["topics"].items():
-        rate_hz = "" if line["rate_hz"] is None else f"{line['rate_hz']:.1f}"
-        counts = str(line["messages"]), rate_hz, f"{line['bytes'] / 1e6:.2f}", str(line["restarts"])
-        missing = "?" if line["missing"] is None else str(line["missing"])
-        topics.add_row(Text(printable(key)), *counts, missing, Text(printable(line["schema"])))
-    if found["topics"]:
-        console.print()
-        console.print(topics)
+def render(found: Mapping[str, Any]) -> str:
+    """The figures of a log for a person."""
+    lines = [f"{name:14}" + value.replace("\n", "\n" + " " * 14) for name, value in _summary(found).items()]
+    rows = [
+        [
+            key,
+            str(line["messages"]),
+            "" if line["rate_hz"] is None else f"{line['rate_hz']:.1f}",
+            f"{line['bytes'] / 1e6:.2f}",
+            str(line["restarts"]),
+            "?" if line["missing"] is None else str(line["missing"]),
+            line["schema"],
+        ]
+        for key, line in found["topics"].items()
+    ]
+    if rows:
+        lines += ["", *table(["topic", "messages", "Hz", "MB", "restarts", "missing", "schema"], rows)]
+    return "\n".join(lines)
 
 
 def _summary(found: Mapping[str, Any]) -> dict[str, str]:
