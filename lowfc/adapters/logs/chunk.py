@@ -12,9 +12,6 @@ import zstandard
 LARGEST_BYTES = 1 << 28
 """Of a record, compressed or not: a damaged length must not take all memory."""
 
-LONGEST_HEAD_BYTES = 64
-"""More than any chunk's head has."""
-
 CHUNK_HERE = re.compile(
     rb"\x06(?=.{36}(?:\x03\x00{3}lz4.{8}\x04\x22\x4d\x18|\x04\x00{3}zstd.{8}\x28\xb5\x2f\xfd|\x00{4}.{8}[\x03-\x05].{4}\x00{4}))",
     re.DOTALL,
@@ -23,6 +20,8 @@ CHUNK_HERE = re.compile(
 
 _FIXED = struct.Struct("<QQQII")  # times of first and last message, size, CRC, length of the compression's name
 _COMPRESSED = struct.Struct("<Q")
+_RECORD_HEAD_BYTES = 9  # opcode and length
+_LONGEST_NAME = 40
 
 
 class UnsoundError(Exception):
@@ -53,22 +52,6 @@ class Chunk(NamedTuple):
     content: bytes
 
 
-class ChunkHead(NamedTuple):
-    """What a chunk's head says of it.
-
-    Attributes:
-        size: bytes of its content.
-        crc: of its content; 0 where none was computed.
-        compression: name of what compressed it; empty for none.
-        begin: bytes before its compressed content.
-    """
-
-    size: int
-    crc: int
-    compression: bytes
-    begin: int
-
-
 def _lz4(data: memoryview, size: int) -> bytes:
     found: bytes = lz4.frame.LZ4FrameDecompressor().decompress(data, max_length=size)
     return found
@@ -91,47 +74,36 @@ _COMPRESSIONS: dict[bytes, tuple[Callable[[memoryview, int], bytes], int]] = {
 }
 
 
-def read_head(head: bytes, length: int) -> ChunkHead:
-    """The head of a chunk of `length` bytes.
-
-    Raises:
-        UnsoundError: it cannot be one.
-    """
-    if length < _FIXED.size + _COMPRESSED.size:
-        raise UnsoundError("a chunk is too short")
-    _, _, size, crc, named = _FIXED.unpack_from(head)
-    begin = _FIXED.size + named + _COMPRESSED.size
-    if begin > min(length, LONGEST_HEAD_BYTES):
-        raise UnsoundError("the head of a chunk is damaged")
-    name = head[_FIXED.size : _FIXED.size + named]
-    (compressed,) = _COMPRESSED.unpack_from(head, _FIXED.size + named)
-    if compressed != length - begin:
-        raise UnsoundError("the head of a chunk is damaged")
-    if name not in _COMPRESSIONS:
-        raise CompressionError(name.decode(errors="backslashreplace"))
-    if not 0 < size <= min(LARGEST_BYTES, _COMPRESSIONS[name][1] * compressed):
-        raise UnsoundError("a chunk says that it has a size that it cannot have")
-    return ChunkHead(size, crc, name, begin)
-
-
-def read_chunk(body: bytes, at: int, record_bytes: int, *, may_lack_crc: bool = False) -> Chunk:
-    """The chunk whose record, of `record_bytes` with its own head, has this body and begins at `at`.
+def read_chunk(body: bytes, at: int, *, may_lack_crc: bool = False) -> Chunk:
+    """The chunk whose record begins at `at` in the file and has this body.
 
     Args:
-        body: of the record.
+        body: of the record, behind its opcode and length.
         at: position of the record in the file.
-        record_bytes: length of the record there.
         may_lack_crc: accept one that says that no checksum was computed.
 
     Raises:
         UnsoundError: it is not as it was written.
     """
-    head = read_head(body, len(body))
     try:
-        content = _COMPRESSIONS[head.compression][0](memoryview(body)[head.begin :], head.size)
+        _, _, size, crc, named = _FIXED.unpack_from(body)
+        (compressed,) = _COMPRESSED.unpack_from(body, _FIXED.size + named)
+    except struct.error as fault:
+        raise UnsoundError("a chunk is too short") from fault
+    begin = _FIXED.size + named + _COMPRESSED.size
+    if compressed != len(body) - begin:
+        raise UnsoundError("the head of a chunk is damaged")
+    name = body[_FIXED.size : _FIXED.size + named]
+    if name not in _COMPRESSIONS:
+        raise CompressionError(name[:_LONGEST_NAME].decode(errors="backslashreplace"))
+    decompressed, largest_ratio = _COMPRESSIONS[name]
+    if not 0 < size <= min(LARGEST_BYTES, largest_ratio * compressed):
+        raise UnsoundError("a chunk says that it has a size that it cannot have")
+    try:
+        content = decompressed(memoryview(body)[begin:], size)
     except (RuntimeError, EOFError, zstandard.ZstdError) as fault:
         raise UnsoundError("a chunk cannot be decompressed") from fault
-    crc = zlib.crc32(content)
-    if crc != head.crc and not (may_lack_crc and head.crc == 0 and len(content) == head.size):
+    found = zlib.crc32(content)
+    if found != crc and not (may_lack_crc and crc == 0 and len(content) == size):
         raise UnsoundError("the checksum of a chunk is wrong")
-    return Chunk(at, record_bytes, crc, content)
+    return Chunk(at, _RECORD_HEAD_BYTES + len(body), found, content)

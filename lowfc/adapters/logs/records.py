@@ -23,12 +23,10 @@ from mcap.writer import MCAP0_MAGIC as MAGIC
 from lowfc.adapters.logs.chunk import (
     CHUNK_HERE,
     LARGEST_BYTES,
-    LONGEST_HEAD_BYTES,
     Chunk,
     CompressionError,
     UnsoundError,
     read_chunk,
-    read_head,
 )
 from lowfc.adapters.logs.writer import UNFINISHED
 from lowfc.contract.codecs import input_file
@@ -110,20 +108,13 @@ class LogFile:
         """What the summary declares, schemas and channels, like a chunk; None unless the summary is sound."""
         if self._summary is None:
             return None
-        end = self._summary
-        while end + HEAD.size <= self.size:
-            opcode, length = HEAD.unpack(self._read(end, HEAD.size))
-            if opcode not in (Opcode.SCHEMA, Opcode.CHANNEL):
-                break
-            end += HEAD.size + length
-        length = min(end, self.size) - self._summary
-        content = self._read(self._summary, length)
-        return Chunk(self._summary, length, zlib.crc32(content), content)
+        content = b"".join(self._in_summary(Opcode.SCHEMA, Opcode.CHANNEL))
+        return Chunk(self._summary, len(content), zlib.crc32(content), content)
 
     def index(self) -> Iterator[ChunkIndex]:
         """What the summary says of each chunk, in the order of the file; nothing unless it is sound."""
-        for body in self._in_summary(Opcode.CHUNK_INDEX):
-            yield parsed(ChunkIndex, body)
+        for record in self._in_summary(Opcode.CHUNK_INDEX):
+            yield parsed(ChunkIndex, record[HEAD.size :])
 
     def parts(
         self, needed: Callable[[int, Collection[int]], bool] | None = None
@@ -234,9 +225,8 @@ class LogFile:
         if at + length > self.size or length > min(LARGEST_BYTES, self._bytes_to_try):
             return False
         try:
-            read_head(self._read(at, min(LONGEST_HEAD_BYTES, length)), length)
             self._bytes_to_try -= length
-            read_chunk(self._read(at, length), at, length, may_lack_crc=not self._ours)
+            read_chunk(self._read(at, length), at, may_lack_crc=not self._ours)
         except UnsoundError:
             return False
         return True
@@ -250,7 +240,7 @@ class LogFile:
         match opcode:
             case Opcode.CHUNK:
                 try:
-                    return read_chunk(body, at, HEAD.size + len(body), may_lack_crc=not self._ours)
+                    return read_chunk(body, at, may_lack_crc=not self._ours)
                 except CompressionError as fault:
                     self.unread = fault.name
                     raise
@@ -287,7 +277,7 @@ class LogFile:
     @cached_property
     def _unchunked(self) -> bool:
         """Whether messages may stand outside of chunks."""
-        statistics = (parsed(Statistics, body) for body in self._in_summary(Opcode.STATISTICS))
+        statistics = (parsed(Statistics, one[HEAD.size :]) for one in self._in_summary(Opcode.STATISTICS))
         return not self._ours or any(not one.chunk_count for one in statistics)
 
     def _loose(self, at: int) -> bytes:
@@ -300,13 +290,13 @@ class LogFile:
             end += HEAD.size + length
         return self._read(at, end - at)
 
-    def _in_summary(self, opcode: Opcode) -> Iterator[bytes]:
-        """Records of one kind in the summary; none unless it is sound."""
+    def _in_summary(self, *opcodes: Opcode) -> Iterator[bytes]:
+        """Records of some kinds in the summary; none unless it is sound."""
         at = self.size if self._summary is None else self._summary
         while at < self.size - _FOOTER_BYTES:
-            found, length = HEAD.unpack(self._read(at, HEAD.size))
-            if found == opcode:
-                yield self._read(at + HEAD.size, length)
+            opcode, length = HEAD.unpack(self._read(at, HEAD.size))
+            if opcode in opcodes:
+                yield self._read(at, HEAD.size + length)
             at += HEAD.size + length
 
     def _read(self, at: int, length: int) -> bytes:
