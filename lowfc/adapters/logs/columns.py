@@ -117,16 +117,30 @@ T = TypeVar("T")
 
 
 class _Rows(Generic[T]):
-    """Messages with one number of modes as columns of `T`."""
+    """Messages with one number of modes as columns of `T`, whose fields are called as the message's."""
 
     def __init__(self, made: type[T], wide: Iterable[str], modes: int) -> None:
         self.modes = modes
         self._made = made
         kinds = {name: _KINDS.get(name, "f") for name in made.__annotations__}
         self._columns = Columns(dict.fromkeys(wide, modes), **kinds)
+        self._alike = [name for name in kinds if name not in ("sequence", "time_ns")]
 
     def __len__(self) -> int:
         return len(self._columns)
+
+    def add(self, message: Any) -> bool:
+        """Add a message; False where it has another number of modes.
+
+        Raises:
+            OverflowError: a value that nobody of the loop sends.
+        """
+        row = {name: getattr(message, name) for name in self._alike} | self._special(message)
+        return self._columns.add(sequence=message.frame_sequence, time_ns=from_timestamp(message.timestamp), **row)
+
+    def _special(self, message: Any) -> dict[str, Any]:
+        """Values that are not as in the message."""
+        return {}
 
     def taken(self) -> T:
         """All of them."""
@@ -140,23 +154,16 @@ class StepRows(_Rows[Steps]):
         super().__init__(Steps, ("error_nm", "pol_nm", "command_nm"), modes)
         self._nothing = [np.nan] * modes
 
-    def add(self, step: wire.ControlStep) -> bool:
-        """Add a step; False where it has another number of modes.
+    def _special(self, message: wire.ControlStep) -> dict[str, Any]:
+        measured = {"error_nm": message.error_nm or self._nothing, "pol_nm": message.pol_nm or self._nothing}
+        return measured | {"reasons": bits_of(message.reasons)}
 
-        Raises:
-            OverflowError: a value that nobody of the loop sends.
-        """
-        return self._columns.add(
-            sequence=step.frame_sequence,
-            time_ns=from_timestamp(step.timestamp),
-            mode=step.mode,
-            reasons=bits_of(step.reasons),
-            error_nm=step.error_nm or self._nothing,
-            pol_nm=step.pol_nm or self._nothing,
-            command_nm=step.command_nm,
-            flux_dn=step.flux_dn,
-            saturated_pixels=step.saturated_pixels,
-        )
+
+class TruthRows(_Rows[Truths]):
+    """What the simulation knew, with one number of modes."""
+
+    def __init__(self, modes: int) -> None:
+        super().__init__(Truths, ("disturbance_nm", "residual_nm"), modes)
 
 
 def of_steps(steps: Sequence[Step], modes: int) -> Steps:
@@ -184,28 +191,6 @@ def count_reasons(bits: Whole) -> dict[Reason, int]:
     """How often each reason was given, of those that were."""
     counts = {reason: int(np.count_nonzero(bits & (1 << reason))) for reason in REASONS} if bits.any() else {}
     return {reason: count for reason, count in counts.items() if count}
-
-
-class TruthRows(_Rows[Truths]):
-    """What the simulation knew, with one number of modes."""
-
-    def __init__(self, modes: int) -> None:
-        super().__init__(Truths, ("disturbance_nm", "residual_nm"), modes)
-
-    def add(self, truth: wire.Truth) -> bool:
-        """Add a truth; False where it has another number of modes.
-
-        Raises:
-            OverflowError: a value that nobody of the loop sends.
-        """
-        return self._columns.add(
-            sequence=truth.frame_sequence,
-            time_ns=from_timestamp(truth.timestamp),
-            disturbance_nm=truth.disturbance_nm,
-            residual_nm=truth.residual_nm,
-            disturbance_rms_nm=truth.disturbance_rms_nm,
-            residual_rms_nm=truth.residual_rms_nm,
-        )
 
 
 class TimingRows:
