@@ -16,7 +16,6 @@ from lowfc.contract.messages import CONTROLLER_STATE, EVENT, FRAME, REQUEST, Log
 from lowfc.control.laws.error_budget import sensor_noise
 from lowfc.optics.detector.photometry import tilt_nm_per_mas
 from lowfc.programs.logs.report import closed_loop
-from lowfc.programs.logs.report.command import beside
 from lowfc.programs.logs.report.figures import report_of
 from lowfc.programs.logs.report.page import NOT_HERE, page
 from lowfc.programs.logs.report.source import read_run
@@ -320,7 +319,7 @@ def test_the_command_prints_one_object_or_writes_one_page(tmp_path: Path) -> Non
     assert found["run"]["steps"] == 3
     assert "has 3 frames" in found["spectra"]["why_not"]
     assert [term["missing"] for term in found["error_budget"]["terms"]] == [False, False, True, True, True]
-    assert not beside(log).exists()
+    assert not log.with_name("night.html").exists()
 
     out = tmp_path / "told.html"
     written = lowfc("report", str(log), "--out", str(out))
@@ -392,11 +391,3 @@ def test_a_report_never_overwrites_a_log(tmp_path: Path, name: str) -> None:
     assert isinstance(done.exception, DataFileError)
     assert log.read_bytes() == before
     assert not (tmp_path / "other.mcap.part").exists()
-
-
-@pytest.mark.parametrize(
-    ("log", "expected"),
-    [("a/n.mcap", "a/n.html"), ("n.mcap.part", "n.html"), ("n.recovered.mcap", "n.recovered.html"), ("n", "n.html")],
-)
-def test_the_page_is_beside_the_log(log: str, expected: str) -> None:
-    assert beside(Path(log)) == Path(expected)

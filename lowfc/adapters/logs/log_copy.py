@@ -2,7 +2,6 @@
 
 import contextlib
 import os
-import tempfile
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import IO
@@ -11,6 +10,7 @@ from mcap.records import Attachment, Metadata
 from mcap.writer import CompressionType, Writer
 
 from lowfc import __version__
+from lowfc.adapters.files.whole_file import being_written
 from lowfc.adapters.logs.reader import Logged, LogReader
 from lowfc.adapters.logs.writer import CHUNK_BYTES
 from lowfc.contract.envelope import count_of, start_of
@@ -101,22 +101,13 @@ def new_log(path: Path, source: Path) -> Iterator[IO[bytes]]:
     Raises:
         DataFileError: there is such a file, or the disk refuses.
     """
+    never = f"{path} exists already; a log is never overwritten; name another one with --out"
     if path.exists():
-        raise DataFileError(f"{path} exists already; a log is never overwritten; name another one with --out")
-    try:
-        mode = source.stat().st_mode & 0o666
-        with tempfile.NamedTemporaryFile(dir=path.parent, prefix=f".{path.name}.", delete=False) as file:
-            part = Path(file.name)
-            try:
-                yield file
-                file.flush()
-                os.fsync(file.fileno())
-                part.chmod(mode)
-                if path.exists():
-                    raise DataFileError(f"{path} has come into being meanwhile; a log is never overwritten")
-                part.rename(path)
-            except BaseException:
-                part.unlink(missing_ok=True)
-                raise
-    except OSError as fault:
-        raise DataFileError(f"{path} cannot be written: {fault.strerror or fault}") from fault
+        raise DataFileError(never)
+    with being_written(path, source) as part, part.open("wb") as file:
+        yield file
+        file.flush()
+        os.fsync(file.fileno())
+        if path.exists():  # it has come into being meanwhile
+            raise DataFileError(never)
+    path.chmod(source.stat().st_mode & 0o666)

@@ -9,7 +9,7 @@ from typing import Any
 from lowfc.adapters.logs.log_copy import LogCopy, new_log
 from lowfc.adapters.logs.reader import LogReader
 from lowfc.adapters.logs.records import Damage
-from lowfc.adapters.logs.writer import UNFINISHED, being_recorded
+from lowfc.adapters.logs.writer import UNFINISHED, being_recorded, stem_of
 from lowfc.contract.errors import DataFileError
 
 RECOVERY = "recovery"
@@ -60,8 +60,7 @@ class Recovery:
 
 def recovered_path(source: Path) -> Path:
     """Name for what is recovered from a log, beside it."""
-    stem = source.name.removesuffix(UNFINISHED).removesuffix(".mcap")
-    return source.with_name(f"{stem}-recovered.mcap")
+    return source.with_name(f"{stem_of(source)}-recovered.mcap")
 
 
 def recover(source: Path, out: Path, progress: Callable[[int, int], None] | None = None) -> Recovery:

@@ -11,7 +11,7 @@ from lowfc.adapters.logs.parts import Parts, Repeated, metadata_at_start
 from lowfc.adapters.logs.reader import Logged, LogReader
 from lowfc.adapters.logs.recovery import RECOVERY, account, faults, in_words, no_end
 from lowfc.adapters.logs.selection import SELECTION, Selection
-from lowfc.adapters.logs.writer import PART, UNFINISHED
+from lowfc.adapters.logs.writer import PART, stem_of
 from lowfc.contract.messages import topic_of
 
 
@@ -48,8 +48,7 @@ class Thinned:
 
 def thinned_path(source: Path, asked: Selection) -> Path:
     """Name for a smaller copy of a log, beside it."""
-    stem = source.name.removesuffix(UNFINISHED).removesuffix(".mcap")
-    return source.with_name(f"{stem}-every-{asked.every}.mcap")
+    return source.with_name(f"{stem_of(source)}-every-{asked.every}.mcap")
 
 
 def thin(log: Parts, out: Path, asked: Selection, progress: Callable[[int, int], None] | None = None) -> Thinned:

@@ -255,6 +255,11 @@ def being_recorded(path: Path) -> bool:
     return False
 
 
+def stem_of(log: Path) -> str:
+    """Name of a log without the endings that say that it is one."""
+    return log.name.removesuffix(UNFINISHED).removesuffix(".mcap")
+
+
 def log_path(folder: Path, time_ns: int) -> Path:
     """Name for a log begun at `time_ns`, UTC, that no log in the folder has, finished or not."""
     stamp = time.strftime("%Y%m%dT%H%M%S", time.gmtime(time_ns // 1_000_000_000))

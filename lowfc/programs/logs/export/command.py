@@ -102,6 +102,7 @@ def export_log(
     from lowfc.adapters.logs.history import read_history
     from lowfc.adapters.logs.parts import WholeLog
     from lowfc.adapters.logs.recovery import no_end
+    from lowfc.adapters.logs.writer import stem_of
     from lowfc.adapters.process.progress import reading_bar
     from lowfc.programs.logs.guard import refuse_log
 
@@ -109,8 +110,7 @@ def export_log(
         raise ConfigurationError("a CSV file has no place for frames: use --to npz, fits or aot, or leave out --frames")
     write = _writer(to, with_frames=frames)
     reader = WholeLog(log, skip_damaged=True)
-    stem = reader.path.name.removesuffix(".part").removesuffix(".mcap")
-    out = out if out is not None else reader.path.parent / (stem + _ENDINGS[to])
+    out = out if out is not None else reader.path.parent / (stem_of(reader.path) + _ENDINGS[to])
     files = [out] + ([out.with_suffix(".frames.npy")] if frames and to is Format.NPZ else [])
     for file in files:
         refuse_log(file, reader.path)

@@ -47,13 +47,14 @@ def _report(log: "Parts", out: Path | None, as_json: bool) -> None:
 
     from lowfc.adapters.files.whole_file import require_folder, write_whole
     from lowfc.adapters.logs.parts import titled
+    from lowfc.adapters.logs.writer import stem_of
     from lowfc.adapters.process.progress import counting_bar
     from lowfc.programs.logs.guard import refuse_log
     from lowfc.programs.logs.report.figures import report_of
     from lowfc.programs.logs.report.page import page, require_page
     from lowfc.programs.logs.report.source import read_run
 
-    target = out if out is not None or as_json else beside(log[0])
+    target = out if out is not None or as_json else log[0].with_name(f"{stem_of(log[0])}.html")
     require_folder(target)
     if target is not None:
         refuse_log(target, log[0])
@@ -84,11 +85,3 @@ def _finite(figures: Any) -> Any:
         case float() if not math.isfinite(figures):
             return None
     return figures
-
-
-def beside(log: Path) -> Path:
-    """Where a log's page is written: its folder, its name without what says that it is a log."""
-    name = log.name
-    for suffix in reversed(_LOGS):
-        name = name.removesuffix(suffix)
-    return log.parent / f"{name}.html"
