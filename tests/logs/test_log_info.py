@@ -4,8 +4,6 @@ import json
 from pathlib import Path
 
 import pytest
-from click.testing import Result
-from typer.testing import CliRunner
 
 from lowfc.adapters.bus.bus import Sample
 from lowfc.adapters.logs.recovery import no_end, recover, recovered_path
@@ -14,7 +12,7 @@ from lowfc.contract.envelope import sequence_of
 from lowfc.contract.errors import DataFileError
 from lowfc.contract.events import EVENTS
 from lowfc.contract.messages import CALIBRATION, CONTROLLER_STATE, EVENT, FRAME, HEALTH, STEP, Message, wire
-from lowfc.programs.cli.main import app
+from tests.support.loops import lowfc
 
 START_S = 1_767_225_600  # 2026-01-01T00:00:00Z
 START_NS = START_S * 10**9
@@ -28,10 +26,6 @@ def sample(key: str, message: Message, count: int, time_ns: int, start_s: int = 
 def event(name: str, process: str, start_s: int, number: int, **details: object) -> Sample:
     now_ns = START_NS + 2 * SECOND
     return sample(EVENT.key, EVENTS[name].log(process, now_ns, **details), number, now_ns, start_s)
-
-
-def lowfc(*words: object) -> Result:
-    return CliRunner().invoke(app, ["info", *map(str, words)])
 
 
 @pytest.fixture
@@ -66,7 +60,7 @@ def log(tmp_path: Path) -> Path:
 
 
 def test_what_was_written_is_said(log: Path) -> None:
-    done = lowfc(log, "--json")
+    done = lowfc("info", log, "--json")
     assert done.exit_code == 0, done.output
     found = json.loads(done.stdout)
     frame = found["topics"].pop(FRAME.key)
@@ -112,7 +106,7 @@ def test_what_was_written_is_said(log: Path) -> None:
 
 
 def test_a_person_reads_the_same(log: Path) -> None:
-    said = lowfc(log).stdout
+    said = lowfc("info", log).stdout
     for words in (
         "complete",
         "2026-01-01T00:00:00.000+00:00, 10.000 s",
@@ -131,39 +125,39 @@ def test_an_unfinished_and_a_damaged_log_say_so(log: Path) -> None:
     data = bytearray(log.read_bytes())
     log.write_bytes(data[:-500])
     recover(log, recovered := log.with_name("recovered.mcap"))
-    said = lowfc(recovered).stdout
+    said = lowfc("info", recovered).stdout
     assert "recovered from night.mcap, which had not been finished; left out: damaged parts 0" in said
-    said = lowfc(log)
+    said = lowfc("info", log)
     assert said.exit_code == 0
     assert "truncated" in said.stdout
-    assert json.loads(lowfc(log, "--json").stdout)["state"] == "truncated"
+    assert json.loads(lowfc("info", log, "--json").stdout)["state"] == "truncated"
     data[data.index(b"[loop]")] ^= 1
     log.write_bytes(data)
-    said = lowfc(log)
+    said = lowfc("info", log)
     assert said.exit_code == 0
     assert "damaged; `lowfc recover` saves what is whole" in said.stdout
     assert "the checksum of an attachment is wrong" in said.stdout
-    found = json.loads(lowfc(log, "--json").stdout)
+    found = json.loads(lowfc("info", log, "--json").stdout)
     assert (found["state"], len(found["damage"]), found["attachments"]) == ("damaged", 1, {})
 
 
 def test_a_log_that_is_being_recorded_says_so_and_is_not_recovered(tmp_path: Path) -> None:
     log = LogWriter(tmp_path / "20270101T000000Z.mcap", START_NS, {"lowfc": {"run": "night"}})
-    said = lowfc(log.part)
+    said = lowfc("info", log.part)
     assert "being recorded; `lowfc ctl record stop` finishes it" in said.stdout
-    assert json.loads(lowfc(log.part, "--json").stdout)["state"] == "recording"
+    assert json.loads(lowfc("info", log.part, "--json").stdout)["state"] == "recording"
     assert "it is being recorded" in no_end([log.part], finished=False)
     with pytest.raises(DataFileError, match="is being recorded, and nothing is lost: `lowfc ctl record stop`"):
         recover(log.part, recovered_path(log.part))
     assert list(tmp_path.iterdir()) == [log.part]
     log.abandon()  # as when it is killed
-    assert json.loads(lowfc(log.part, "--json").stdout)["state"] == "truncated"
+    assert json.loads(lowfc("info", log.part, "--json").stdout)["state"] == "truncated"
     assert "it was cut off" in no_end([log.part], finished=False)
     assert recover(log.part, recovered_path(log.part)).recovered == recovered_path(log.part)
 
 
 def test_an_empty_log_is_a_log(tmp_path: Path) -> None:
     path = LogWriter(tmp_path / "a.mcap", START_NS, {}).finish({"recording": {"stopped": "the disk is full"}})
-    assert "recording stopped: the disk is full" in lowfc(path).stdout
-    found = json.loads(lowfc(path, "--json").stdout)
+    assert "recording stopped: the disk is full" in lowfc("info", path).stdout
+    found = json.loads(lowfc("info", path, "--json").stdout)
     assert (found["start"], found["duration_s"], found["messages"], found["state"]) == (None, None, 0, "complete")

@@ -10,7 +10,6 @@ import pytest
 from lowfc.adapters.files.whole_file import write_whole
 from lowfc.adapters.logs.recovery import recover
 from lowfc.adapters.logs.series import Limits, LogSeries
-from lowfc.adapters.logs.writer import LogWriter
 from lowfc.adapters.process.clock import HostClock
 from lowfc.contract.configuration import load
 from lowfc.contract.errors import ConfigurationError
@@ -30,19 +29,16 @@ def mode_of(path: Path) -> int:
     return path.stat().st_mode & 0o777
 
 
-def test_a_log_is_not_for_others(tmp_path: Path, umask: int) -> None:
-    log = LogWriter(tmp_path / "night.mcap", 1, {})
-    assert mode_of(log.part) == 0o640 & ~umask
-    assert mode_of(log.finish({})) == 0o640 & ~umask
-
-
-@pytest.mark.parametrize("mode", [0o600, 0o644, 0o664])
-def test_every_log_of_a_series_has_the_configured_mode(tmp_path: Path, umask: int, mode: int) -> None:
-    series = LogSeries(tmp_path / "logs", HostClock(), {}, [], Limits(min_free_bytes=0, file_mode=mode))
+@pytest.mark.parametrize("mode", [None, 0o600, 0o644, 0o664])
+def test_every_log_of_a_series_has_the_configured_mode(tmp_path: Path, umask: int, mode: int | None) -> None:
+    limits = Limits() if mode is None else Limits(file_mode=mode)
+    series = LogSeries(tmp_path / "logs", HostClock(), {}, [], limits)
     for _ in range(2):
         series.begin([])
+        (part,) = series.files[0].parent.glob("*.part")
+        assert mode_of(part) == (mode or 0o640) & ~umask, "0640 where nothing else is configured"
         series.end({})
-    assert [mode_of(path) for path in series.files] == [mode & ~umask] * 2
+    assert [mode_of(path) for path in series.files] == [(mode or 0o640) & ~umask] * 2
 
 
 def test_what_is_recovered_has_the_mode_of_its_source(tmp_path: Path) -> None:
