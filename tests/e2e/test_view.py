@@ -16,7 +16,7 @@ import rerun.blueprint as rrb
 from lowfc.adapters.bus.run import open_run
 from lowfc.adapters.bus.zenoh_bus import ZenohBus
 from lowfc.adapters.process.join import clock_of
-from lowfc.adapters.viewer.rerun_viewer import RerunViewer, Show
+from lowfc.adapters.viewer.rerun_viewer import RerunViewer
 from lowfc.client import running
 from lowfc.contract.configuration import load
 from lowfc.contract.errors import LowfcError
@@ -24,9 +24,9 @@ from lowfc.contract.messages import Role
 from lowfc.programs.view.bridge import Bridge
 from lowfc.programs.view.command import view
 from lowfc.programs.view.draw.tabs import Tab
-from lowfc.programs.view.layout import layout
+from lowfc.programs.view.layout import LIVE_WINDOW_S, layout
 from lowfc.programs.view.panels.tiles import FILL
-from lowfc.programs.view.target import to_viewer
+from lowfc.programs.view.target import Target
 from lowfc.programs.view.verdicts.tile import Level
 from tests.support.loops import LOWFC, children, interrupt, run, start, until
 from tests.support.report_log import Night
@@ -55,25 +55,19 @@ def test_every_panel_of_every_tab_shows_the_live_loop(live: str, artefacts: Path
     config = load(joined.path / "config.toml")
     clock = clock_of(config)
     bus = ZenohBus(joined.links, Role.VIEWER, clock)
-    bridge = Bridge(
-        config,
-        live,
-        clock,
-        bus,
-        lambda: RerunViewer(Show.HEADLESS, size_px=(1280, 800)),
-        lambda viewer: to_viewer(viewer.url, live, layout()) if viewer is not None else None,  # type: ignore[arg-type,return-value]
-        10**9,
-    )
+    target = Target(picture=Path("a.png"))
+    bridge = Bridge(config, live, clock, bus, target)
     try:
-        summary = bridge.run(5.0)
+        bridge.run(5.0)
+        assert bridge.renewals == 0
         viewer = bridge.viewer
-        assert summary.renewals == 0
         for number, tab in enumerate(Tab):
             blueprint = layout(tab)
-            stream = to_viewer(viewer.url, live, blueprint)
+            stream = target.stream(viewer, live, LIVE_WINDOW_S)
+            stream.send_blueprint(blueprint)
             stream.disconnect()
             picture = viewer.screenshot(artefacts / f"live-{tab}.png", patience_s=6)
-            assert pixels(picture).shape == (800, 1280, 3)
+            assert pixels(picture).shape == (1000, 1600, 3)
             shown = {view.name: _shades(viewer, view.id) for view in _views(blueprint.root_container.contents[number])}
             assert len(shown) > 4
             assert {name: shades for name, shades in shown.items() if shades < LEAST_SHADES} == {}, tab

@@ -5,6 +5,7 @@ import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -16,7 +17,7 @@ from lowfc.contract.configuration import Configuration
 from lowfc.contract.messages import CALIBRATION, EVENT, FRAME, HEALTH, STEP, Log, topic_of, wire
 from lowfc.programs.view import bridge as bridges
 from lowfc.programs.view import renderer as render_threads
-from lowfc.programs.view.bridge import Bridge, Summary, ViewError
+from lowfc.programs.view.bridge import Bridge, ViewError
 from lowfc.programs.view.panels import wavefront
 from lowfc.programs.view.renderer import RenderThread
 from lowfc.programs.view.snapshot import Snapshot
@@ -85,8 +86,8 @@ class Scene:
         self.tapes: list[Tape] = []
         self.show, self.stuck = show, stuck
         bus = MemoryBus(self.hub, "viewer", self.clock)
-        self.bridge = Bridge(Configuration(), "night", self.clock, bus, self._screen, self._tape, 100_000_000)
-        self.summary: Summary | None = None
+        target = SimpleNamespace(viewer=self._screen, stream=self._tape, memory_mb=100.0)
+        self.bridge = Bridge(Configuration(), "night", self.clock, bus, target)
         self.failure: Exception | None = None
         self.thread = threading.Thread(target=self._run, daemon=True)
         self.thread.start()
@@ -112,13 +113,13 @@ class Scene:
         self.screens.append(Screen(self.show))
         return self.screens[-1]
 
-    def _tape(self, screen: Screen) -> Tape:
+    def _tape(self, screen: Screen, recording: str, window_s: float) -> Tape:
         self.tapes.append(Stuck(screen) if len(self.tapes) < self.stuck else Tape())
         return self.tapes[-1]
 
     def _run(self) -> None:
         try:
-            self.summary = self.bridge.run()
+            self.bridge.run()
         except Exception as failure:
             self.failure = failure
 
@@ -237,7 +238,7 @@ def test_a_window_that_was_closed_ends_the_view(scenes: Scenes) -> None:
     scene = scenes(Show.NATIVE)
     scene.screens[0].alive = False
     scene.thread.join(PATIENCE_S)
-    assert scene.summary.renewals == 0
+    assert (scene.failure, scene.bridge.renewals) == (None, 0)
 
 
 def test_a_window_that_takes_nothing_is_waited_for_in_bounded_memory(

@@ -116,7 +116,7 @@ def test_every_view_of_the_layout_has_something_and_the_plots_show_all_of_a_log(
     assert np.all(np.diff(times_ns) > 0)
     origins = {str(view.origin) for view in views(layout().root_container)}
     assert not [origin for origin in origins if not any(path.startswith(origin) for path in tape.paths)]
-    flat, residual = values_of(tape.last(f"{trend.TREND}/lines").strips)  # the residual on top
+    flat, residual = values_of(tape.last(f"{trend.TREND}/curves").strips)  # the residual on top
     assert np.mean([y for _, y in flat]) < np.mean([y for _, y in residual])  # upwards is less
     assert len(residual) == len(flat) > 1
     begin_ns, end_ns = done.span_ns

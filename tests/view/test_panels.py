@@ -27,8 +27,8 @@ from lowfc.optics.chain.coronagraph import mean_contrast
 from lowfc.optics.chain.grid import pupil_axis
 from lowfc.optics.chain.zernike import mode_name, zernikes
 from lowfc.optics.detector.photometry import tilt_nm_per_mas
-from lowfc.programs.view.draw.pictures import Scale, round_up
-from lowfc.programs.view.draw.plots import BOX_HEIGHT, Plot
+from lowfc.programs.view.draw.pictures import Scale
+from lowfc.programs.view.draw.plots import BOX_HEIGHT, Axes, Plot
 from lowfc.programs.view.panels import latency, loop, mirror, science, sensor, spectra, wavefront
 from lowfc.programs.view.panels.panel import Panel
 from lowfc.programs.view.renderer import RETRY_NS, Renderer
@@ -227,17 +227,10 @@ def test_rows_that_are_not_finite_are_a_gap() -> None:
 
 def test_a_scale_grows_at_once_and_shrinks_after_a_while() -> None:
     scale = Scale(1.0)
-    steps = [(0.1, 0, True, 1.0), (-33.0, 1, True, 50.0), (3.0, 10**9, False, 50.0), (3.0, 3 * 10**9, True, 3.0)]
+    steps = [(0.1, 0, True, 1.0), (-33.0, 1, True, 50.0), (1.1, 10**9, False, 50.0), (1.1, 3 * 10**9, True, 1.5)]
     for value, time_ns, changed, limit in steps:
         assert scale.fit(np.array([value, np.nan]), time_ns) == changed
         assert scale.limit == limit
-
-
-@pytest.mark.parametrize(
-    ("value", "limit"), [(1.0, 1.0), (1.1, 1.5), (2.0, 2.0), (0.021, 0.03), (999.0, 1000.0), (0.2, 0.2)]
-)
-def test_scales_are_round(value: float, limit: float) -> None:
-    assert round_up(value) == pytest.approx(limit)
 
 
 START_NS = 1_795_000_000_000_000_000
@@ -295,9 +288,9 @@ def test_contrast_is_that_of_the_newest_wavefronts() -> None:
     assert not tape.rows
     drawn(panel, tape, 0, steps=measured)  # the first snapshot is drawn at once
     drawn(panel, tape, TICK_NS, steps=measured, truths=truths(left_nm[2:3], open_nm[2:3]))
-    drawn(panel, tape, science.PERIOD_NS, truths=truths(left_nm[3:4], open_nm[3:4]))
+    drawn(panel, tape, science.Science.period_ns, truths=truths(left_nm[3:4], open_nm[3:4]))
     times_ns, found = tape.column(science.CONTRAST.path)
-    np.testing.assert_array_equal(times_ns - START_NS, [0, science.PERIOD_NS])
+    np.testing.assert_array_equal(times_ns - START_NS, [0, science.Science.period_ns])
     flat = mean_of(pupil, np.zeros(MODES))
     expected = [
         [mean_of(pupil, open_nm[1]), mean_of(pupil, left_nm[1]), flat],  # the last row was refused
@@ -318,7 +311,7 @@ def test_a_brighter_dark_zone_is_brighter_in_the_picture() -> None:
     now, as_open = (shown[rows, start + 68 : start + 92].mean() for start in (0, 102))
     assert as_open > 2 * now
     assert shown[48, 48] == shown[48, 102 + 48] == shown.max()  # both stars
-    drawn(panel, tape, science.PERIOD_NS)  # nothing new, nothing drawn
+    drawn(panel, tape, science.Science.period_ns)  # nothing new, nothing drawn
     assert len(tape.rows[science.CONTRAST.path]) == 1
 
 
@@ -327,9 +320,20 @@ LAW = {"gain": [0.4] * MODES, "leak": [0.01] * MODES, "delay_frames": 2.0}
 CAMERA = wire.CameraState(period_ns=round(1e9 / RATE_HZ))
 
 
-@pytest.fixture(autouse=True)
-def _every_second(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(spectra, "PERIOD_NS", 1_000_000_000)
+@pytest.fixture
+def curves(monkeypatch: pytest.MonkeyPatch) -> dict[str, list[Any]]:
+    """Frequency and power of each curve that was drawn last, by path; spectra are drawn every second."""
+    monkeypatch.setattr(spectra.Spectra, "period_ns", 1_000_000_000)
+    found, draw = {}, Axes.draw
+
+    def keep(axes: Axes, stream: Tape, x: Any, ys: Any, *style: Any) -> None:
+        found[axes.path] = [(10**x, 10**y) for y in ys]
+        draw(axes, stream, x, ys, *style)
+        for strip in map(np.array, values_of(stream.last(f"{axes.path}/curves").strips)):
+            assert ((strip > -0.01) & (strip < [spectra.WIDTH + 0.01, BOX_HEIGHT + 0.01])).all(), "outside the box"
+
+    monkeypatch.setattr(Axes, "draw", keep)
+    return found
 
 
 def run_spectra(tape: Tape, mode: int = LoopMode.CLOSED, frames: int = 3000, **law: Any) -> spectra.Spectra:
@@ -349,30 +353,10 @@ def run_spectra(tape: Tape, mode: int = LoopMode.CLOSED, frames: int = 3000, **l
     return panel
 
 
-def strips_of(tape: Tape, path: str) -> list[Any]:
-    return [np.array(strip) for strip in values_of(tape.last(f"{path}/curves").strips)]
-
-
-def curves_of(tape: Tape, path: str) -> list[Any]:
-    """Frequency and power of each curve, read off the plot by its own ticks."""
-    ticks = tape.last(f"{path}/ticks")
-    places = dict(zip(values_of(ticks.labels), values_of(ticks.positions), strict=True))
-    hz = {float(label.removesuffix(" Hz")): x for label, (x, _) in places.items() if label.endswith(" Hz")}
-    grid = [np.array(line) for line in values_of(tape.last(f"{path}/grid").strips)]
-    on_y = [line[0, 1] for line in grid[1:] if line[0, 1] == line[1, 1]]
-    power = [float(label) for label in places if not label.endswith(" Hz")]
-    x, y = np.polyfit(list(hz.values()), np.log10(list(hz)), 1), np.polyfit(on_y, np.log10(power), 1)
-    strips = strips_of(tape, path)
-    for strip in strips:
-        assert (strip >= -0.01).all(), "outside the box"
-        assert (strip <= [spectra.WIDTH + 0.01, BOX_HEIGHT + 0.01]).all(), "outside the box"
-    return [(10 ** np.polyval(x, strip[:, 0]), 10 ** np.polyval(y, strip[:, 1])) for strip in strips]
-
-
-def test_a_tone_stands_at_its_frequency_with_its_power() -> None:
+def test_a_tone_stands_at_its_frequency_with_its_power(curves: dict[str, list[Any]]) -> None:
     tape = Tape()
     run_spectra(tape)
-    (hz, as_open), (_, error), (_, theory) = curves_of(tape, spectra.TILTS)
+    (hz, as_open), (_, error), (_, theory) = curves[spectra.TILTS]
     tone = int(as_open.argmax())
     assert hz[tone] == pytest.approx(TONE_HZ, rel=0.05)
     noise = 2 * 0.2**2 * 2 / RATE_HZ  # of two modes, one-sided
@@ -381,35 +365,35 @@ def test_a_tone_stands_at_its_frequency_with_its_power() -> None:
     expected = rejection(np.array([TONE_HZ]), RATE_HZ, 0.4, 0.01, 2.0)[0] ** 2
     assert error[tone] / as_open[tone] == pytest.approx(expected, rel=0.1)
     np.testing.assert_allclose(np.log10(error[2:]), np.log10(theory[2:]), atol=0.15)
-    (_, others), _, left = curves_of(tape, spectra.OTHERS)
+    (_, others), _, left = curves[spectra.OTHERS]
     assert np.median(others[hz > 50]) == pytest.approx(noise / 2 * (MODES - 2), rel=0.1)
     high = hz > 50
     passed = rejection(hz[high], RATE_HZ, 0.4, 0.01, 2.0) ** 2
     np.testing.assert_allclose(left[1][high] / others[high], passed, rtol=0.15)
 
 
-def test_without_a_closed_loop_there_is_no_theory_and_after_a_change_no_past() -> None:
+def test_without_a_closed_loop_there_is_no_theory_and_after_a_change_no_past(curves: dict[str, list[Any]]) -> None:
     tape = Tape()
     panel = run_spectra(tape, LoopMode.OPEN, 1000)
-    assert len(curves_of(tape, spectra.TILTS)) == 2
+    assert len(curves[spectra.TILTS]) == 2
     drawn(panel, tape, round(8e9), controller=wire.ControllerState(gain=[0.1] * MODES))
     few = np.ones((20, MODES))
     drawn(panel, tape, round(9e9), steps=steps(1000, few, few), camera=CAMERA)
-    assert not strips_of(tape, spectra.TILTS)
+    assert not curves[spectra.TILTS]
     (text,) = values_of(tape.last(f"{spectra.TILTS}/state").labels)
     assert text.startswith("loop closed: too few frames")
 
 
-def test_the_integrators_rejection_is_not_drawn_for_another_law() -> None:
+def test_the_integrators_rejection_is_not_drawn_for_another_law(curves: dict[str, list[Any]]) -> None:
     tape = Tape()
     run_spectra(tape, law=wire.LinearLaw(name="lqg"))
-    assert len(strips_of(tape, spectra.TILTS)) == 2
+    assert len(curves[spectra.TILTS]) == 2
 
 
-def test_a_wavefront_that_stands_still_has_no_spectrum() -> None:
+def test_a_wavefront_that_stands_still_has_no_spectrum(curves: dict[str, list[Any]]) -> None:
     tape, still = Tape(), np.zeros((200, MODES))
     drawn(spectra.Spectra(), tape, 0, steps=steps(0, still, still))
-    assert not strips_of(tape, spectra.OTHERS)
+    assert not curves[spectra.OTHERS]
 
 
 def test_memory_of_the_spectra_is_bounded() -> None:
@@ -434,7 +418,7 @@ def test_latencies_are_those_of_the_last_second() -> None:
     for number, timings in enumerate(batches):
         drawn(panel, tape, number * 100_000_000, timings=timings, health=health)
     times_ns, found = tape.column(latency.WHOLE.path)
-    np.testing.assert_array_equal(times_ns - START_NS, np.arange(4) * latency.PERIOD_NS)
+    np.testing.assert_array_equal(times_ns - START_NS, np.arange(4) * latency.Latency.period_ns)
     last_us = {stage: np.concatenate([one[stage] for one in batches[6:]]) / 1e3 for stage in STAGES}
     whole_us = last_us["frame_to_command"]
     np.testing.assert_allclose(found[-1], [*np.percentile(whole_us, [50, 99]), whole_us.max()])

@@ -10,9 +10,6 @@ import time
 from collections import deque
 from collections.abc import Callable
 from pathlib import Path
-from typing import NamedTuple
-
-import rerun as rr
 
 from lowfc.adapters.bus.bus import Bus, Sample, states
 from lowfc.adapters.logs.reader import LogReader
@@ -25,8 +22,10 @@ from lowfc.contract.configuration import Configuration
 from lowfc.contract.errors import DataFileError, LowfcError
 from lowfc.contract.events import Level
 from lowfc.contract.messages import EVENT, STEP, TRUTH, Log, Role, timestamp, wire
+from lowfc.programs.view.layout import LIVE_WINDOW_S
 from lowfc.programs.view.renderer import RenderThread
 from lowfc.programs.view.snapshot import SHOWN
+from lowfc.programs.view.target import Target
 
 WAITING = {topic: 1 if topic.latest_only else 100 for topic in SHOWN} | {STEP: 2000, TRUTH: 2000}
 """Messages that wait, by topic: of pictures the newest, of rows two seconds at 1 kHz; each may hold 16 kB."""
@@ -53,52 +52,32 @@ class ViewError(LowfcError):
     exit_status = 1
 
 
-class Summary(NamedTuple):
-    """What a view did: snapshots drawn, times it began anew, most memory of this process."""
-
-    snapshots: int
-    renewals: int
-    most_bytes: int
-
-
 class Bridge:
     """One live view of a run.
 
     Attributes:
         service: this process as the others of the run see it.
         viewer: once it runs; None where a file is written.
+        renewals: how often the view began anew.
+        most_bytes: most memory of this process.
     """
 
-    def __init__(
-        self,
-        config: Configuration,
-        run_id: str,
-        clock: Clock,
-        bus: Bus,
-        open_viewer: Callable[[], RerunViewer | None],
-        make_stream: Callable[[RerunViewer | None], rr.RecordingStream],
-        viewer_bytes: int,
-    ) -> None:
-        """Subscribe to everything that is shown; drawing starts with `run`.
-
-        `open_viewer` starts a viewer, on the same ports each time, or returns None where a file is written.
-        """
+    def __init__(self, config: Configuration, run_id: str, clock: Clock, bus: Bus, target: Target) -> None:
+        """Subscribe to everything that is shown; drawing starts with `run`."""
         self._config = config
         self._clock = clock
         self._bus = bus
-        self._open_viewer = open_viewer
-        self._make_stream = make_stream
-        self._viewer_bytes = viewer_bytes
+        self._target = target
         self.viewer: RerunViewer | None = None
         self._render: RenderThread | None = None
-        self._drawn = self._renewals = self._most_bytes = 0
+        self._drawn = self.renewals = self.most_bytes = 0
         self._renewed_s: deque[float] = deque(maxlen=_MOST_RENEWALS)
         self._stuck = self._past_known = False
         self._awake_s = self._began_s = time.monotonic()
         self._rings = {topic: bus.ring(topic, WAITING[topic]) for topic in SHOWN}
         self.service = Service(Role.VIEWER, run_id, clock, bus)
 
-    def run(self, until_s: float | None = None, ready: Callable[[], None] | None = None) -> Summary:
+    def run(self, until_s: float | None = None, ready: Callable[[], None] = lambda: None) -> None:
         """Show the run until told to stop, until a window is closed, or for a time; `ready` once the viewer is there.
 
         Raises:
@@ -107,12 +86,11 @@ class Bridge:
         """
         try:
             self._begin()
-            if ready is not None:
-                ready()
+            ready()
             self.service.state = "ready"
             began_s = checked_s = time.monotonic()
             while self.service.running and (until_s is None or time.monotonic() - began_s < until_s):
-                self.service.work = self._snapshots
+                self.service.work = self.snapshots
                 self.service.beat()
                 time.sleep(_TURN_S)
                 now_s = time.monotonic()
@@ -121,7 +99,6 @@ class Bridge:
                         self._awake_s = now_s  # this process stood still, and so did the render thread
                     checked_s = now_s
                     self._check(now_s)
-            return Summary(self._snapshots, self._renewals, self._most_bytes)
         finally:
             self.service.finish()
             if self.viewer is not None and not self.viewer.answers():
@@ -134,12 +111,14 @@ class Bridge:
             self.viewer.stop()
 
     @property
-    def _snapshots(self) -> int:
+    def snapshots(self) -> int:
+        """Snapshots drawn so far."""
         return self._drawn + (self._render.snapshots if self._render is not None else 0)
 
     def _begin(self) -> None:
-        self.viewer = viewer = self._open_viewer()
-        self._render = RenderThread(self._config, self._clock, self._rings, lambda: self._make_stream(viewer))
+        self.viewer = viewer = self._target.viewer()
+        make_stream = lambda: self._target.stream(viewer, self.service.run_id, LIVE_WINDOW_S)  # noqa: E731
+        self._render = RenderThread(self._config, self._clock, self._rings, make_stream)
         self._render.start()
         self._began_s = time.monotonic()
         self._past_known = self._stuck = False
@@ -174,9 +153,10 @@ class Bridge:
         if self.service.newcomers() or (not self._past_known and self._recorder_absent(now_s)):
             self._add_earlier(render)
         own_bytes, stuck_s = resident_bytes(), now_s - max(render.drawn_s, self._awake_s)
-        self._most_bytes = max(self._most_bytes, own_bytes)
+        viewer_bytes = viewer.resident_bytes() if viewer is not None else 0
+        self.most_bytes = max(self.most_bytes, own_bytes)
         native = viewer is not None and viewer.show is Show.NATIVE
-        stuck, self._stuck = self._stuck, False
+        stuck, self._stuck = self._stuck, native and stuck_s > STUCK_S
         if viewer is not None and not viewer.alive:
             if native:
                 self.service.stop("the viewer was closed")
@@ -184,8 +164,7 @@ class Bridge:
                 self._renew(viewer.how_it_ended())
         elif render.fault is not None:
             self._renew(f"drawing failed: {render.fault!r}")
-        elif stuck_s > STUCK_S and native:  # a window belongs to the person at it: it is waited for
-            self._stuck = True
+        elif self._stuck:  # a window belongs to the person at it: it is waited for
             if not stuck:
                 self.service.event("VIEW_STUCK", stuck_s=stuck_s)
         elif stuck_s > STUCK_S:
@@ -194,8 +173,8 @@ class Bridge:
             self._renew(f"the bridge holds {own_bytes / 1e6:.0f} MB, more than {OWN_BYTES / 1e6:.0f} MB")
             if resident_bytes() > OWN_BYTES:
                 raise ViewError(f"the view holds more than {OWN_BYTES / 1e6:.0f} MB even when new; start it again")
-        elif viewer is not None and viewer.resident_bytes() > self._viewer_bytes + VIEWER_SPARE_BYTES:
-            self._renew(f"the viewer holds {viewer.resident_bytes() / 1e6:.0f} MB")
+        elif viewer_bytes > self._target.memory_mb * 1e6 + VIEWER_SPARE_BYTES:
+            self._renew(f"the viewer holds {viewer_bytes / 1e6:.0f} MB")
 
     def _renew(self, why: str) -> None:
         """Begin anew, with a new viewer on the same ports; a file cannot be begun anew, and is kept as far as it is."""
@@ -209,7 +188,7 @@ class Bridge:
                 )
             self._renewed_s.append(now_s)
             self.service.event("VIEW_RENEWED", why=why)
-            self._renewals += 1
+            self.renewals += 1
             self.viewer.stop()
             self._end_render()
             try:
@@ -231,23 +210,18 @@ def earlier_events(recorder: wire.Health | None, now_ns: int) -> list[Sample]:
     found: list[Sample] = []
     missing = []
     for name in reversed(recorder.recording.files):
-        path = _present(Path(recorder.recording.folder, name))
+        path = Path(recorder.recording.folder, name.removesuffix(UNFINISHED))
+        part = path.with_name(path.name + UNFINISHED)
         try:
-            log = list(LogReader(path, topics=(EVENT,), skip_damaged=True, sparse=True))
+            log = LogReader(
+                path if path.exists() or not part.exists() else part, topics=(EVENT,), skip_damaged=True, sparse=True
+            )
+            found[:0] = [Sample(one.key, *one[2:]) for one in log]
         except DataFileError as fault:
             missing.append(_line(f"earlier events are missing here: {fault}", now_ns))
-            continue
-        found[:0] = [Sample(one.key, one.payload, one.sequence, one.publish_time_ns, one.log_time_ns) for one in log]
         if len(found) >= MOST_EARLIER:
             break
     return [*found[-MOST_EARLIER:], *missing]
-
-
-def _present(path: Path) -> Path:
-    """A log under the name that it has now: it may be finished meanwhile, or not yet."""
-    finished = path.with_name(path.name.removesuffix(UNFINISHED))
-    part = path.with_name(finished.name + UNFINISHED)
-    return finished if finished.exists() or not part.exists() else part
 
 
 def _line(text: str, now_ns: int) -> Sample:

@@ -5,7 +5,7 @@ from collections.abc import Iterable
 import rerun as rr
 import rerun.blueprint as rrb
 
-from lowfc.programs.view.draw.plots import TIMELINE
+from lowfc.programs.view.draw.plots import TIMELINE, bounds
 from lowfc.programs.view.draw.tabs import Tab
 from lowfc.programs.view.panels import (
     latency,
@@ -34,9 +34,9 @@ _PICTURES: dict[str, tuple[str, rrb.VisualBounds2D | None]] = {
     mirror.SURFACE: ("Mirror over the pupil, nm", None),
     pointing.TRAIL: ("Residual pointing, mas", pointing.BOUNDS),
     science.IMAGE: ("Science camera: contrast, mean in the wedge from 4 to 6 λ/D", science.BOUNDS),
-    trend.TREND: ("Trend of the residual wavefront, nm rms", trend.BOUNDS),
-    spectra.TILTS: ("Power spectrum of tip and tilt, nm²/Hz", spectra.BOUNDS),
-    spectra.OTHERS: ("Power spectrum of the other modes, nm²/Hz", spectra.BOUNDS),
+    trend.TREND: ("Trend of the residual wavefront, nm rms", bounds(trend.WIDTH)),
+    spectra.TILTS: ("Power spectrum of tip and tilt, nm²/Hz", bounds(spectra.WIDTH)),
+    spectra.OTHERS: ("Power spectrum of the other modes, nm²/Hz", bounds(spectra.WIDTH)),
 }
 """Title and bounds of each picture, by its path."""
 
@@ -120,8 +120,8 @@ def _engineering() -> rrb.Container:
 
 
 def _picture(path: str) -> rrb.View:
-    title, bounds = _PICTURES[path]
-    return rrb.Spatial2DView(origin=path, name=title, visual_bounds=bounds)
+    title, shown = _PICTURES[path]
+    return rrb.Spatial2DView(origin=path, name=title, visual_bounds=shown)
 
 
 def _contrast() -> rrb.View:

@@ -14,11 +14,10 @@ from lowfc.adapters.bus.zenoh_bus import ZenohBus
 from lowfc.adapters.files.whole_file import being_written, require_folder
 from lowfc.adapters.process.join import clock_of
 from lowfc.adapters.process.progress import passing_bar
-from lowfc.adapters.viewer.rerun_viewer import RerunViewer, Show
+from lowfc.adapters.viewer.rerun_viewer import RerunViewer
 from lowfc.contract.configuration import Configuration, load
 from lowfc.contract.messages import Role
 from lowfc.programs.view.bridge import Bridge, ViewError
-from lowfc.programs.view.layout import LIVE_WINDOW_S
 from lowfc.programs.view.recorded import Drawn, draw_logs
 from lowfc.programs.view.renderer import Renderer
 from lowfc.programs.view.target import Target
@@ -35,46 +34,38 @@ def show_run(run_id: str, config: Configuration | None, target: Target, seconds:
         ViewerError, ViewError: there is no viewer, or it fails again and again.
         DataFileError: a file cannot be written.
     """
-    require_folder(target.save, target.picture)
+    require_folder(target.written)
     run = open_run(run_id, ())
     own = run.path / "config.toml"
     config = config or load(own if own.exists() else None)
     clock = clock_of(config)
     with contextlib.ExitStack() as stack:
-        part = stack.enter_context(being_written(target.save)) if target.save is not None else None
+        if target.save is not None:
+            target.part = stack.enter_context(being_written(target.save))
         bus = ZenohBus(run.links, Role.VIEWER, clock, looks_on=True)
         stack.callback(bus.close)
-        bridge = Bridge(
-            config,
-            run_id,
-            clock,
-            bus,
-            target.viewer,
-            lambda viewer: target.stream(viewer, part, run_id, LIVE_WINDOW_S),
-            round(target.memory_mb * 1e6),
-        )
+        bridge = Bridge(config, run_id, clock, bus, target)
         stack.callback(bridge.close)
         bridge.service.catch_signals()
         bridge.service.announces = True
         bridge.service.awaited = lambda: "" if bridge.service.last_health else "any other process"
         until_s = seconds if seconds is not None or target.picture is None else PICTURE_AFTER_S
         try:
-            summary = bridge.run(until_s, lambda: _print_address(target, bridge.viewer))
+            bridge.run(until_s, lambda: target.print_address(bridge.viewer))
         except ViewError as error:
-            if part is None:
+            if target.part is None:
                 raise
-            rest = Path(f"{target.save}.part")
-            part.replace(rest)
+            rest = target.part.replace(f"{target.save}.part")
             raise ViewError(f"{error}; what there is of it is in {rest}") from error
-        if not bridge.service.last_health and target.show in (None, Show.HEADLESS):
+        if not bridge.service.last_health and target.written is not None:
             raise ViewError(f"no message of run {run_id!r} has arrived: nothing is written")
         if target.picture is not None and bridge.viewer is not None:
             bridge.viewer.screenshot(target.picture)
     return {
         "run": run_id,
-        "moments": summary.snapshots,
-        "renewals": summary.renewals,
-        "memory_mb": round(summary.most_bytes / 1e6, 1),
+        "moments": bridge.snapshots,
+        "renewals": bridge.renewals,
+        "memory_mb": round(bridge.most_bytes / 1e6, 1),
         "file": _written(target),
     }
 
@@ -86,23 +77,24 @@ def show_logs(logs: list[Path], config: Configuration | None, target: Target) ->
         ViewerError: there is no viewer, or it ended while it was drawn on.
         DataFileError: a file cannot be read or written.
     """
-    require_folder(target.save, target.picture)
+    require_folder(target.written)
     drawn = Drawn()
     with contextlib.ExitStack() as stack:
-        part = stack.enter_context(being_written(target.save, logs[0])) if target.save is not None else None
+        if target.save is not None:
+            target.part = stack.enter_context(being_written(target.save, logs[0]))
         viewer = target.viewer()
         if viewer is not None:
             stack.callback(viewer.stop)
-        stream = target.stream(viewer, part, logs[0].stem, None)
+        stream = target.stream(viewer, logs[0].stem, None)
         stack.callback(_end, stream, viewer)
-        watched = viewer if target.written is None else None
-        # Ctrl-C is the way to end what is watched, whether everything is drawn yet or not.
-        with contextlib.suppress(KeyboardInterrupt) if watched is not None else contextlib.nullcontext():
-            _print_address(target, viewer)
+        if target.written is None:  # Ctrl-C ends what is watched, whether everything is drawn yet or not
+            with contextlib.suppress(KeyboardInterrupt):
+                target.print_address(viewer)
+                drawn = _draw(logs, config, stream, target)
+                while viewer is not None and viewer.alive:
+                    time.sleep(_POLL_S)
+        else:
             drawn = _draw(logs, config, stream, target)
-            while watched is not None and watched.alive:
-                time.sleep(_POLL_S)
-        if watched is None:
             stream.disconnect()  # a viewer keeps what it has
             if viewer is not None:
                 viewer.screenshot(target.picture)
@@ -133,11 +125,6 @@ def _end(stream: rr.RecordingStream, viewer: RerunViewer | None) -> None:
     if viewer is not None and not viewer.answers():
         viewer.stop()
     stream.disconnect()
-
-
-def _print_address(target: Target, viewer: RerunViewer | None) -> None:
-    if viewer is not None and target.show is Show.WEB:
-        sys.stderr.write(f"look at {viewer.web_address}\nCtrl-C ends the view\n")
 
 
 def _written(target: Target) -> str | None:

@@ -27,6 +27,7 @@ from lowfc.contract.messages import (
     TIMING,
     TRUTH,
     Log,
+    Message,
     RawImage,
     Topic,
     from_timestamp,
@@ -35,19 +36,7 @@ from lowfc.contract.messages import (
 from lowfc.control.calibration.calibration import Calibration
 from lowfc.control.loop.inputs import Frame
 
-SHOWN: tuple[Topic, ...] = (
-    FRAME,
-    STEP,
-    TRUTH,
-    TIMING,
-    MIRROR_STATE,
-    SURFACE,
-    CALIBRATION,
-    CAMERA_STATE,
-    CONTROLLER_STATE,
-    EVENT,
-    HEALTH,
-)
+SHOWN = (FRAME, STEP, TRUTH, TIMING, MIRROR_STATE, SURFACE, CALIBRATION, CAMERA_STATE, CONTROLLER_STATE, EVENT, HEALTH)
 """Topics that a view shows."""
 
 PICTURES_HZ = 30.0
@@ -55,7 +44,6 @@ PICTURES_PER_COMPLETE = 8
 """Snapshots for each that is complete: curves grow four times a second, for many rows cost hardly more than one."""
 
 _KNOWN_EVENTS = 5000
-_NO_STEPS, _NO_TRUTHS, _NO_TIMINGS = StepRows(0).taken(), TruthRows(0).taken(), TimingRows().taken()[1]
 _UNREADABLE = (BadMessageError, DecodeError, OverflowError, ValueError)
 
 
@@ -177,8 +165,7 @@ class Accumulator:
         self._health: dict[str, LastHealth] = {}
         self._sent_ns: dict[Topic, int] = {}
         self._sequences: dict[str, int] = {}
-        self._data_ns = 0
-        self._data_host_ns = 0
+        self._data_ns = self._data_host_ns = 0
 
     def add(self, topic: Topic, key: str, payload: bytes, publish_time_ns: int, sequence: int = 0) -> None:
         """Add one message of one of `SHOWN`; a state that is older than the last one is left out."""
@@ -212,18 +199,18 @@ class Accumulator:
         frame: Frame | None = self._newest_of(FRAME, _frame)
         if frame is not None:
             self._date(frame.time_ns, self._sent_ns[FRAME])
-        steps, truths, timings, events = _NO_STEPS, _NO_TRUTHS, _NO_TIMINGS, list[Log]()
+        new = StepRows(0), TruthRows(0), TimingRows(), list[Log]()
         if complete:
-            steps, truths, timings = self._steps.taken(), self._truths.taken(), self._timings.taken()[1]
+            new = self._steps, self._truths, self._timings, self._events
             self._steps, self._truths = StepRows(self._steps.modes), TruthRows(self._truths.modes)
-            self._timings = TimingRows()
-            events, self._events = self._events, events
+            self._timings, self._events = TimingRows(), []
+        steps, truths, timings, events = new
         return Snapshot(
             time_ns=self._time_ns(host_ns),
             host_ns=host_ns,
-            steps=steps,
-            truths=truths,
-            timings=timings,
+            steps=steps.taken(),
+            truths=truths.taken(),
+            timings=timings.taken()[1],
             frame=frame.pixels if frame is not None else None,
             frame_ns=frame.time_ns if frame is not None else 0,
             mirror=self._newest_of(MIRROR_STATE, wire.MirrorState.FromString),
@@ -266,7 +253,7 @@ class Accumulator:
             if not self._truths.add(truth):
                 self._truths = _begun(TruthRows(len(truth.residual_nm)), truth)
         elif topic is TIMING:
-            self.unreadable += not self._timings.add(wire.ControlTiming.FromString(payload))
+            _begun(self._timings, wire.ControlTiming.FromString(payload))
         elif topic is HEALTH:
             name, health = self._names.health(key, payload)
             self._health[name] = LastHealth(publish_time_ns, health)
@@ -290,9 +277,9 @@ class Accumulator:
             return None
 
 
-def _begun(rows: Any, message: wire.ControlStep | wire.Truth) -> Any:
+def _begun(rows: Any, message: Message) -> Any:
     if not rows.add(message):
-        raise ValueError("a message whose modes differ in number")
+        raise ValueError("a message whose columns or modes differ in number")
     return rows
 
 

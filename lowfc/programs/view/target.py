@@ -1,10 +1,10 @@
 """Where a view is shown: a window, a page for the browser, a picture or a file."""
 
+import sys
 from dataclasses import dataclass
 from pathlib import Path
 
 import rerun as rr
-import rerun.blueprint as rrb
 
 from lowfc.adapters.bus.run import free_ports
 from lowfc.adapters.viewer.rerun_viewer import RerunViewer, Show, has_screen
@@ -15,7 +15,11 @@ from lowfc.programs.view.layout import APPLICATION, layout
 
 @dataclass(slots=True)
 class Target:
-    """At most one of window, page, file and picture; by default a window, or a page where there is no screen."""
+    """At most one of window, page, file and picture; by default a window, or a page where there is no screen.
+
+    Attributes:
+        part: where the file is written until it is whole.
+    """
 
     native: bool = False
     web: bool = False
@@ -25,6 +29,7 @@ class Target:
     memory_mb: float = 512.0
     port: int = 0
     web_port: int = 0
+    part: Path | None = None
 
     def __post_init__(self) -> None:
         """Check it, and choose the ports.
@@ -32,16 +37,12 @@ class Target:
         Raises:
             ConfigurationError: two are named, or one that cannot be.
         """
-        named = {
-            "--native": self.native,
-            "--web": self.web,
-            "--save": self.save,
-            "--headless-screenshot": self.picture,
-        }
+        files = {"--save": (self.save, ".rrd"), "--headless-screenshot": (self.picture, ".png")}
+        named = {"--native": self.native, "--web": self.web} | {option: file for option, (file, _) in files.items()}
         chosen = [name for name, wanted in named.items() if wanted]
         if len(chosen) > 1:
             raise ConfigurationError(f"a view is in one place; got {' and '.join(chosen)}: choose one")
-        for option, file, suffix in (("--save", self.save, ".rrd"), ("--headless-screenshot", self.picture, ".png")):
+        for option, (file, suffix) in files.items():
             if file is not None and file.suffix != suffix:
                 raise ConfigurationError(f"{option} writes a file that ends in {suffix}; got {file}")
         if self.port and self.port == self.web_port:
@@ -74,33 +75,26 @@ class Target:
         memory = f"{self.memory_mb:.0f}MB"
         return RerunViewer(self.show, memory_limit=memory, port=self.port, web_port=self.web_port)
 
-    def stream(
-        self, viewer: RerunViewer | None, part: Path | None, recording: str, window_s: float | None
-    ) -> rr.RecordingStream:
-        """Stream to the viewer, or into a file; plots show the last `window_s` seconds, or as `show_all` sets."""
-        blueprint = layout(self.tab, window_s)
+    def stream(self, viewer: RerunViewer | None, recording: str, window_s: float | None) -> rr.RecordingStream:
+        """Stream to the viewer, or into the file; plots show the last `window_s` seconds, or as `show_all` sets.
+
+        What a viewer does not take waits, and then holds up.
+        """
+        stream = rr.RecordingStream(APPLICATION, recording_id=recording)
+        stream.set_log_time_enabled(False)  # one timeline, that of the data
+        stream.set_log_tick_enabled(False)
         if viewer is not None:
-            return to_viewer(viewer.url, recording, blueprint)
-        stream = _stream(recording)
-        stream.save(str(part))
-        stream.send_blueprint(blueprint)
+            stream.connect_grpc(viewer.url)
+        else:
+            stream.save(str(self.part))
+        stream.send_blueprint(layout(self.tab, window_s))
         return stream
 
     def show_all(self, stream: rr.RecordingStream, span_ns: tuple[int, int] | None) -> None:
         """Let the plots show all of a log that was drawn; a picture has nothing of its last instant alone."""
         stream.send_blueprint(layout(self.tab, None, span_ns=span_ns, still=self.picture is not None))
 
-
-def to_viewer(url: str, recording: str, blueprint: rrb.Blueprint) -> rr.RecordingStream:
-    """Stream of that name to a viewer that listens at `url`; what it does not take waits, and then holds up."""
-    stream = _stream(recording)
-    stream.connect_grpc(url)
-    stream.send_blueprint(blueprint)
-    return stream
-
-
-def _stream(recording: str) -> rr.RecordingStream:
-    stream = rr.RecordingStream(APPLICATION, recording_id=recording)
-    stream.set_log_time_enabled(False)  # one timeline, that of the data
-    stream.set_log_tick_enabled(False)
-    return stream
+    def print_address(self, viewer: RerunViewer | None) -> None:
+        """Print where a browser finds the page."""
+        if viewer is not None and viewer.web_address is not None:
+            sys.stderr.write(f"look at {viewer.web_address}\nCtrl-C ends the view\n")

@@ -87,25 +87,23 @@ class Plot:
 
 
 class Axes:
-    """A box whose axes are linear in what is given; the grid is drawn when it changes.
-
-    rerun's own plots have no logarithmic axis, and forget the oldest points.
-    """
+    """A box with axes of its own, linear in what is given: rerun's plots are never logarithmic, and forget."""
 
     def __init__(self, path: str, width: float) -> None:
         self.path = path
         self._width = width
         self._x, self._y = (0.0, 1.0), (0.0, 1.0)
-        self._drawn: object = None
+        self._fitted: object = None
+        self._named: object = None
 
     def fit(
         self, stream: rr.RecordingStream, x: tuple[float, float], y: tuple[float, float], x_ticks: Ticks, y_ticks: Ticks
     ) -> None:
-        """Span from the first to the second value of each axis."""
+        """Span from the first to the second value of each axis; the grid is drawn when it changes."""
         wanted = x, y, tuple(x_ticks), tuple(y_ticks)
-        if wanted == self._drawn:
+        if wanted == self._fitted:
             return
-        self._x, self._y, self._drawn = x, y, wanted
+        self._x, self._y, self._fitted = x, y, wanted
         width, height = self._width, BOX_HEIGHT
         columns = [float(self.places([value], [y[0]])[0, 0]) for value, _ in x_ticks]
         rows = [float(self.places([x[0]], [value])[0, 1]) for value, _ in y_ticks]
@@ -117,6 +115,31 @@ class Axes:
         places = [(at_x, height + 1) for at_x in columns] + [(-11.0, at_y - LABEL) for at_y in rows]
         stream.log(f"{self.path}/ticks", words(places, [label for _, label in (*x_ticks, *y_ticks)]))
 
+    def name(self, stream: rr.RecordingStream, names: Sequence[str], colours: Sequence[Colour]) -> None:
+        """Names of the curves above the box, drawn when they change."""
+        if names != self._named:
+            self._named = names
+            places = [(self._width * (number + 0.5) / len(names), -LABEL - 7) for number in range(len(names))]
+            stream.log(f"{self.path}/names", words(places, names, colours))
+
+    def draw(
+        self,
+        stream: rr.RecordingStream,
+        x: Array,
+        curves: Sequence[Array],
+        colours: Sequence[Colour],
+        widths: Sequence[float],
+    ) -> None:
+        """Draw curves over x, the last one on top, with gaps where they are not finite."""
+        strips: list[tuple[Array, Colour, float]] = []
+        for y, colour, width in zip(curves, colours, widths, strict=False):
+            for piece in np.ma.clump_unmasked(np.ma.masked_invalid(y)):  # type: ignore[no-untyped-call]
+                points = self.places(x[piece], y[piece])
+                strips.append((points if len(points) > 1 else np.repeat(points, 2, axis=0), colour, width))
+        places, shades, points_wide = zip(*strips, strict=True) if strips else ((), (), ())
+        radii = rr.Radius.ui_points(list(points_wide))
+        stream.log(f"{self.path}/curves", rr.LineStrips2D(places, colors=list(shades), radii=radii))
+
     def places(self, x: npt.ArrayLike, y: npt.ArrayLike) -> Array:
         """Places of values (points, 2) on the view, whose y axis points down."""
         share_x = (np.asarray(x, np.float64) - self._x[0]) / (self._x[1] - self._x[0])
@@ -124,6 +147,6 @@ class Axes:
         return np.stack([self._width * share_x, BOX_HEIGHT * (1 - share_y)], axis=1)
 
 
-def lines(strips: Sequence[Array], colours: Sequence[Colour], widths: Sequence[float]) -> rr.LineStrips2D:
-    """Lines (points, 2) of these colours and widths, points."""
-    return rr.LineStrips2D(strips, colors=list(colours), radii=rr.Radius.ui_points(list(widths)))
+def bounds(width: float) -> rrb.VisualBounds2D:
+    """Room for a box of this width with its labels and names."""
+    return rrb.VisualBounds2D(x_range=[-20, width + 8], y_range=[-17, BOX_HEIGHT + 11])

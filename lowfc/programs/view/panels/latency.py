@@ -29,7 +29,6 @@ COUNTS = Plot(
 )
 LOST = Plot("latency/lost", curves={"messages lost by the recorder": GREY})
 """Beside `COUNTS`, in one view."""
-PERIOD_NS = 500_000_000
 WINDOW_NS = 1_000_000_000
 BINS = 40
 """Bars of the histogram; whatever took longer than its axis is in the last."""
@@ -43,11 +42,11 @@ class Latency(Panel):
     """From a frame to its command, and the stages of it."""
 
     plots = (WHOLE, PARTS, COUNTS, LOST)
+    period_ns = 500_000_000
 
     def __init__(self) -> None:
         self._recent: deque[tuple[int, Array]] = deque()
         self._scale = Scale(_LEAST_US)
-        self._drawn_ns = 0
 
     def draw(self, stream: rr.RecordingStream, snapshot: Snapshot) -> None:
         """Keep a second; twice in it, draw."""
@@ -57,13 +56,13 @@ class Latency(Panel):
             self._recent.append((now_ns, stages_us))
         while self._recent and not 0 <= now_ns - self._recent[0][0] < WINDOW_NS:
             self._recent.popleft()
-        if 0 <= now_ns - self._drawn_ns < PERIOD_NS:
+        if not self.due(snapshot):
             return
-        self._drawn_ns = now_ns
         us = np.concatenate([stages_us for _, stages_us in self._recent] or [np.zeros((0, len(STAGES)))])
         if len(us):
             WHOLE.add_one(stream, now_ns, *np.percentile(us[:, -1], [50, 99, 100]))
             PARTS.add_one(stream, now_ns, *np.percentile(us[:, :-1], 99, axis=0))
+            self._scale.fit(np.percentile(us[:, -1], [_BODY]), now_ns)
         self._draw_histogram(stream, now_ns, us[:, -1])
         if (controller := snapshot.health.get(Role.CONTROLLER)) is not None:
             frames = topic_count(controller.health, FRAME.key)
@@ -73,8 +72,6 @@ class Latency(Panel):
 
     def _draw_histogram(self, stream: rr.RecordingStream, time_ns: int, us: Array) -> None:
         """Draw bars of even width from 0 to the axis' end, which changes seldom."""
-        if us.size:
-            self._scale.fit(np.percentile(us, [_BODY]), time_ns)
         width_us = max(self._scale.limit, _LEAST_US) / BINS
         counts = np.bincount(np.minimum(us // width_us, BINS - 1).astype(int), minlength=BINS)
         middles_us = (np.arange(BINS) + 0.5) * width_us

@@ -62,10 +62,9 @@ class Loop(Panel):
         for row in np.flatnonzero(np.diff(steps.mode.astype(int), prepend=self._mode)):
             self._change(stream, int(steps.mode[row]), int(steps.time_ns[row]))
         if snapshot.calibration is not None:
-            refused = ~np.isfinite(steps.error_nm).all(axis=1)  # of those neither is measured
             percent = 100 * steps.flux_dn / snapshot.calibration.flux_dn
             for plot, values in ((FLUX, percent), (SATURATED, steps.saturated_pixels)):
-                plot.add(stream, steps.time_ns, np.where(refused, np.nan, values))
+                plot.add(stream, steps.time_ns, np.where(snapshot.used, values, np.nan))
         for event in snapshot.events:
             time_ns = from_timestamp(event.timestamp)
             clock = datetime.fromtimestamp(time_ns * 1e-9, UTC).strftime("%H:%M:%S")  # rerun's own column is cut

@@ -27,7 +27,7 @@ Points = npt.NDArray[np.floating]
 
 
 class Pointing(Panel):
-    """The trail of the last two seconds; the outer ring follows it."""
+    """The trail of the last two seconds; the outer ring grows with it."""
 
     def __init__(self, nm_per_mas: float) -> None:
         self._nm_per_mas = nm_per_mas
@@ -38,15 +38,13 @@ class Pointing(Panel):
         """Move the trail on."""
         if snapshot.calibration is None or not set(TIP_TILT) <= set(snapshot.calibration.noll):
             return
-        columns = [snapshot.calibration.noll.index(index) for index in TIP_TILT]
-        times_ns, modes_nm = snapshot.truths.time_ns, snapshot.truths.residual_nm
-        if not times_ns.size:
-            times_ns, modes_nm = snapshot.steps.time_ns, snapshot.steps.error_nm
-        if not times_ns.size or modes_nm.shape[1] != len(snapshot.calibration.noll):
+        noll = snapshot.calibration.noll
+        waves = snapshot.waves(true=snapshot.truths.time_ns.size > 0)
+        if not waves.time_ns.size or waves.left_nm.shape[1] != len(noll):
             return
-        mas = modes_nm[:, columns] / self._nm_per_mas
+        mas = waves.left_nm[:, [noll.index(index) for index in TIP_TILT]] / self._nm_per_mas
         finite = np.isfinite(mas).all(axis=1)
-        self._pieces.append((times_ns[finite], mas[finite]))
+        self._pieces.append((waves.time_ns[finite], mas[finite]))
         while self._pieces and self._pieces[0][0].max(initial=0) < snapshot.time_ns - _TRAIL_NS:
             self._pieces.popleft()
         mas = np.concatenate([piece for _, piece in self._pieces] or [mas[:0]])

@@ -18,7 +18,6 @@ from lowfc.programs.view.snapshot import Snapshot
 
 IMAGE = "science/image"
 CONTRAST = Plot("science/contrast", "Mean contrast from 4 to 6 λ/D, log10", width=1.6)
-PERIOD_NS = 1_000_000_000
 WEDGE = Wedge(4.0, 6.0)
 """Where contrast is averaged."""
 
@@ -45,6 +44,8 @@ _NAMES = {
 class Science(Panel):
     """Two images side by side and the mean contrast, once a second."""
 
+    period_ns = 1_000_000_000
+
     def __init__(self, pupil: Array, wavelength_nm: float) -> None:
         self._pupil = pupil
         self._wavelength_nm = wavelength_nm
@@ -54,7 +55,6 @@ class Science(Panel):
         self._waves: dict[str, deque[tuple[Single, Single]]] = {source: deque(maxlen=_MEAN_OF) for source in _NAMES}
         self._picture = Picture(f"{IMAGE}/contrast")
         self._named = ""
-        self._drawn_ns = 0
 
     def begin(self, stream: rr.RecordingStream) -> None:
         """Draw what stays: where the mask ends and contrast is averaged, and the scale of the colours."""
@@ -70,18 +70,15 @@ class Science(Panel):
         if snapshot.calibration is None:
             return
         camera = self._prepared(snapshot.calibration.noll)
-        truths, steps = snapshot.truths, snapshot.steps
-        self._keep("true", truths.residual_nm, truths.disturbance_nm)
-        self._keep("measured", steps.error_nm, steps.pol_nm)
-        if 0 <= snapshot.time_ns - self._drawn_ns < PERIOD_NS:
-            return
-        source = next((name for name, waves in self._waves.items() if waves), None)
-        if source is None:
-            return
-        self._drawn_ns = snapshot.time_ns
-        self._show(stream, snapshot.time_ns, camera, source)
-        for waves in self._waves.values():
-            waves.clear()
+        for source, waves in self._waves.items():
+            new = snapshot.waves(true=source == "true")
+            if new.time_ns.size and new.left_nm.shape[1] == len(self._noll):
+                waves.append((new.left_nm[-1], new.open_nm[-1]))
+        source = next((name for name, waves in self._waves.items() if waves), "")
+        if source and self.due(snapshot):
+            self._show(stream, snapshot.time_ns, camera, source)
+            for waves in self._waves.values():
+                waves.clear()
 
     def _prepared(self, noll: tuple[int, ...]) -> ScienceCamera:
         """The camera for these modes; wavefronts of others are forgotten."""
@@ -92,13 +89,6 @@ class Science(Panel):
             for waves in self._waves.values():
                 waves.clear()
         return self._camera
-
-    def _keep(self, source: str, now_nm: Single, open_nm: Single) -> None:
-        if now_nm.shape[1] != len(self._noll):
-            return
-        finite = np.flatnonzero(np.isfinite(now_nm).all(axis=1) & np.isfinite(open_nm).all(axis=1))
-        if finite.size:
-            self._waves[source].append((now_nm[finite[-1]], open_nm[finite[-1]]))
 
     def _show(self, stream: rr.RecordingStream, time_ns: int, camera: ScienceCamera, source: str) -> None:
         waves = self._waves[source]

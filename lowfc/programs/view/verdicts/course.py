@@ -1,7 +1,5 @@
 """The wavefront and the light of a whole run, in at most some hundreds of spans of even length."""
 
-from math import floor, log10
-
 import numpy as np
 import numpy.typing as npt
 
@@ -69,15 +67,6 @@ class Course:
         if last >= len(self._sums):
             self._sums = np.pad(self._sums, ((0, last + 1 - len(self._sums)), (0, 0)))
         np.add.at(self._sums[:, where], after_ns // self.span_ns, np.pad(values, ((0, 0), (1, 0)), constant_values=1))
-
-
-def round_125(value: float, *, up: bool) -> float:
-    """The next 1, 2 or 5 times a power of ten, above or below a positive value."""
-    decade = 10.0 ** floor(log10(value))
-    steps = [step * decade for step in (1.0, 2.0, 5.0, 10.0)]
-    if up:
-        return next(step for step in steps if step >= value * (1 - 1e-9))
-    return next(step for step in reversed(steps) if step <= value * (1 + 1e-9))
 
 
 def _means(sums: Array) -> Array:
