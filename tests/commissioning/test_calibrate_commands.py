@@ -27,7 +27,7 @@ from lowfc.programs.commissioning.calibrate import align as calibrate_align
 from lowfc.programs.commissioning.calibrate import tasks as calibrate_commands
 from lowfc.programs.commissioning.calibrate.command import calibrate_app
 from lowfc.programs.commissioning.calibrate.run import Calibrator
-from lowfc.programs.commissioning.calibrate.tasks import compared, zero_point
+from lowfc.programs.commissioning.calibrate.tasks import zero_point
 from tests.support.folded_loop import FoldedLoop
 
 CONFIG = {
@@ -278,7 +278,7 @@ def test_calibrations_of_different_sensors_are_not_compared(loop: FoldedLoop) ->
     )
     calibration_file.save(identified(other), Path("other.fits"))
     with pytest.raises(CalibrationError, match="cannot be compared"):
-        compared(Path("one.fits"), Path("other.fits"))
+        told("--compare", "one.fits", "other.fits")
     with pytest.raises(DataFileError, match="there is no directory"):
         told("--method", "hadamard", "--out", "nowhere/night.fits")
 
@@ -300,7 +300,7 @@ def optics(config: Configuration) -> Twin:
 
 @pytest.fixture(scope="module")
 def there(config: Configuration) -> Calibration:
-    return analytic(config, SILENT, zero_point(config, THERE).wavefront)
+    return analytic(config, SILENT, zero_point(config, THERE)[1])
 
 
 def seen(calibration: Calibration, optics: Twin, I0: Array, state_nm: Array, step_nm: float) -> Array:
@@ -347,7 +347,7 @@ def test_a_shape_of_the_mirror_is_the_wavefront_that_it_makes(
     command_nm = np.zeros(len(flat.noll))
     command_nm[[flat.noll.index(4), flat.noll.index(7)]] = 20.0, -20.0
     np.save(tmp_path / "shape.npy", (flat.modes_to_actuators @ command_nm).reshape(flat.grid))
-    shaped = analytic(config, SILENT, zero_point(config, str(tmp_path / "shape.npy")).wavefront)
+    shaped = analytic(config, SILENT, zero_point(config, str(tmp_path / "shape.npy"))[1])
     moved = there.reference - flat.reference
     assert np.linalg.norm(shaped.reference - there.reference) < 0.1 * np.linalg.norm(moved)
     changed = there.response - flat.response
@@ -357,7 +357,7 @@ def test_a_shape_of_the_mirror_is_the_wavefront_that_it_makes(
 def test_a_loop_on_it_goes_to_that_wavefront_and_holds_it() -> None:
     few = load(None, BRIGHT | {"sensor.modes": 6})
     world = load(None, BRIGHT | {"sensor.modes": 6, "disturbance.static_nm": {"4": 35.0, "6": 20.0}})
-    made = analytic(few, SILENT, zero_point(few, "4=15,7=-10").wavefront)
+    made = analytic(few, SILENT, zero_point(few, "4=15,7=-10")[1])
     loop = FoldedLoop(few, made, world)
     loop.close_loop()
     loop.run(400)
@@ -366,7 +366,7 @@ def test_a_loop_on_it_goes_to_that_wavefront_and_holds_it() -> None:
 
 
 def test_what_is_no_wavefront_is_said(config: Configuration, tmp_path: Path) -> None:
-    assert zero_point(config, " 4=15, 7 = -1e1").name == "4=15,7=-10"
+    assert zero_point(config, " 4=15, 7 = -1e1")[0] == "4=15,7=-10"
     for text, why in {
         "4=": "as in 4=15,7=-10, or a file; got '4='",
         "4=15,": "or a file; got ''",
@@ -383,4 +383,4 @@ def test_what_is_no_wavefront_is_said(config: Configuration, tmp_path: Path) -> 
         zero_point(config, str(tmp_path / "small.npy"))
     sheared = load(None, BRIGHT | {"control.nuisance": ["shear"]})
     with pytest.raises(CalibrationError, match="known at a flat wavefront only"):
-        analytic(sheared, SILENT, zero_point(config, THERE).wavefront)
+        analytic(sheared, SILENT, zero_point(config, THERE)[1])

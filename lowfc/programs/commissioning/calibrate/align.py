@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 from rich.console import Console
 
-from lowfc.adapters.files import calibration_file, factory
+from lowfc.adapters.files import factory
 from lowfc.adapters.files.whole_file import require_folder
 from lowfc.adapters.process.terminal import configuration
 from lowfc.arrays import Array, single
@@ -22,7 +22,7 @@ from lowfc.programs.commissioning.analytic import analytic
 from lowfc.programs.commissioning.calibrate.pokes import AMPLITUDE_NM, sequence
 from lowfc.programs.commissioning.calibrate.recording import Player, watch
 from lowfc.programs.commissioning.calibrate.result import reconstructed
-from lowfc.programs.commissioning.calibrate.tasks import images, sayer
+from lowfc.programs.commissioning.calibrate.tasks import images, sayer, written
 
 
 class AlignResult(Result):
@@ -78,7 +78,7 @@ def aligned(
         computed = analytic(config, Console(stderr=True))
         found = _fit(computed, picture, half_turn)
         made = on_sensor(config, computed, found.geometry, found.flux, picture.shape, None)
-        calibration_file.save(made, out)
+        written(made, out, None)
     else:
         with Client(run) as loop, loop.reserved("lowfc calibrate align"):
             config, before = configuration_of(loop), replace(loop.calibration(), camera=loop.camera())
@@ -99,9 +99,7 @@ def aligned(
             if seen.picture @ made.response[:, mode] < 0:
                 found = replace(found, geometry=found.geometry.turned())
                 made = on_sensor(config, computed, found.geometry, found.flux, before.shape, before)
-            calibration_file.save(made, out)
-            if load:
-                loop.load(made)
+            written(made, out, loop if load else None)
     return AlignResult(
         **asdict(found.geometry),
         pixels_per_lambda_d=found.geometry.scale * computed_scale(config),

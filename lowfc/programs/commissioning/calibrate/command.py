@@ -79,11 +79,13 @@ def calibrate(
                 "after it"
             )
         return
+    from lowfc.adapters.files.calibration_file import load as read
     from lowfc.programs.commissioning.calibrate import tasks
     from lowfc.programs.commissioning.calibrate.pokes import LEAST_SNR, CalibrationRequest
+    from lowfc.programs.commissioning.calibrate.result import comparison
 
     if compare is not None:
-        put(tasks.compared(*compare), as_json=as_json)
+        put(comparison(*map(read, compare)), as_json=as_json)
         return
     if cycles is not None and "--snr" not in given:
         snr = LEAST_SNR

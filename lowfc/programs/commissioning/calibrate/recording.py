@@ -8,7 +8,6 @@ from typing import NamedTuple, TypeVar
 import numpy as np
 import numpy.typing as npt
 
-from lowfc.adapters.process.progress import Counted
 from lowfc.arrays import Array, Long, Mask, Pixels, Whole
 from lowfc.client import Client, Frame, MirrorWatch
 from lowfc.contract.envelope import start_of
@@ -37,8 +36,6 @@ ATTEMPTS = 5
 """So often a sequence is played, where frames are lost or a device restarts."""
 DITHER_SLOWEST = 1 / 16
 """Cycles per frame below which a dither is not used."""
-_EVERY = 20
-"""Frames between two reports of progress."""
 _LIMITS = frozenset(Limit)
 
 
@@ -102,23 +99,13 @@ def _weights(delay_frames: float) -> Array:
     return np.concatenate([[0.0], delay_weights(max(delay_frames, 1.0))])
 
 
-def nothing() -> None:
-    """Count no frames."""
-
-
-def play(
-    loop: Client,
-    basis_nm: npt.NDArray[np.floating],
-    table: npt.NDArray[np.floating],
-    came: Callable[[], None] = nothing,
-) -> Recording:
+def play(loop: Client, basis_nm: npt.NDArray[np.floating], table: npt.NDArray[np.floating]) -> Recording:
     """Play a table on the mirror and record until its last row has been seen.
 
     Args:
         loop: A connection to the controller.
         basis_nm: (shapes, actuators) nm of surface.
         table: (frames, shapes).
-        came: Called for each frame.
 
     Raises:
         CalibrationError: the loop ended the play, or too little of it came through.
@@ -142,7 +129,6 @@ def play(
                     if first <= image.sequence:
                         images.append(image)
                     image = next(frames)
-                    came()
                 else:
                     if first <= step.frame_sequence:
                         mode = _check(loop, step, mode, over=step.frame_sequence > last)
@@ -254,25 +240,6 @@ def _recording(images: list[Frame], made: list[Step], first: int) -> Recording:
     )
 
 
-class FrameCount:
-    """Frames received so far, in however many plays."""
-
-    def __init__(self, progress: Counted) -> None:
-        """Report to `progress`."""
-        self._progress, self._doing, self._done, self._total = progress, "", 0, 0
-
-    def begin(self, doing: str, left: int) -> None:
-        """A play begins; `left` frames are to come until the end of the calibration, its own included."""
-        self._doing, self._total = doing, self._done + left
-        self._progress(doing, self._done, self._total)
-
-    def came(self) -> None:
-        """One frame."""
-        self._done += 1
-        if self._done % _EVERY == 0:
-            self._progress(self._doing, min(self._done, self._total), self._total)
-
-
 @dataclass(frozen=True, slots=True)
 class Player:
     """Sequences of pokes on the mirror of a loop, played again where frames were lost or a device restarted.
@@ -282,14 +249,12 @@ class Player:
         before: has dark, good pixels, reference and the mirror's commands.
         say: for people: why a sequence is played again.
         closed: the loop works against the pokes.
-        came: called for each frame.
     """
 
     loop: Client
     before: Calibration
     say: Say
     closed: bool = False
-    came: Callable[[], None] = nothing
 
     def first_poke(self, mode: int, plan: Plan) -> Delay:
         """Poke the mode at one place in a pseudo-random sequence: the delay, and the image of the poke.
@@ -337,7 +302,7 @@ class Player:
         return self._repeated(attempt, "a cycle is repeated", "no cycle was of use")
 
     def _play(self, plan: Plan, modes: slice = slice(None)) -> Recording:
-        return play(self.loop, self.before.modes_to_actuators.T[modes], plan.table, self.came)
+        return play(self.loop, self.before.modes_to_actuators.T[modes], plan.table)
 
     def _normalised(self, recording: Recording) -> tuple[Array, Array]:
         return normalised(recording.pixels, self.before.dark.astype(float), self.before.good.astype(float))

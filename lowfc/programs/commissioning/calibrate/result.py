@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
@@ -98,13 +98,6 @@ class Comparison(Result):
     same_commands: bool = figure("same commands")
 
 
-class Finished(NamedTuple):
-    """A calibration that was written, and its figures."""
-
-    calibration: Calibration
-    result: CalibrationResult
-
-
 def rejected_of(out: Path) -> Path:
     """Where a calibration is written that is not recommended: what may be a good one stays."""
     return out.with_name(f"{out.stem}.rejected{out.suffix}")
@@ -112,7 +105,7 @@ def rejected_of(out: Path) -> Path:
 
 def finished(
     calibrator: Calibrator, wanted: CalibrationRequest, data: CalibrationData, computed: Calibration
-) -> Finished:
+) -> tuple[Calibration, CalibrationResult]:
     """Make R, check it on other frames, write the file: under another name where it is not recommended.
 
     Raises:
@@ -134,7 +127,7 @@ def finished(
             f"warning: the loop counts with a delay of {counted:g} frames; set control.delay_frames = "
             f"{max(data.delay.delay_frames, 1):.2f}"
         )
-    return Finished(made, found)
+    return made, found
 
 
 def reconstructed(

@@ -36,7 +36,7 @@ from lowfc.control.calibration.response_fit import (
 )
 from lowfc.control.loop.wording import counted
 from lowfc.programs.commissioning.calibrate.pokes import CalibrationRequest, Pokes, checks
-from lowfc.programs.commissioning.calibrate.recording import FrameCount, Player, Say
+from lowfc.programs.commissioning.calibrate.recording import Player, Say
 
 _LIKE = 0.3
 """Likeness of the first pokes' picture to the calibration in use below which something is said."""
@@ -81,8 +81,8 @@ class Calibrator:
         self.noise_nm = factory.frame_noise_nm(self.config, self.before)
         self._closed = wanted.method == "in-loop"
         self.pokes = Pokes(self.config, self.before, self.noise_nm, wanted)
-        self._count = FrameCount(progress)
-        self._player = Player(loop, self.before, say, self._closed, self._count.came)
+        self._progress = progress
+        self._player = Player(loop, self.before, say, self._closed)
         self.kept = 0
 
     @contextlib.contextmanager
@@ -136,8 +136,7 @@ class Calibrator:
         count = checks(cycles)
         answers = []
         for number in range(count):
-            left = self.pokes.frames(cycles, cycles + number)
-            self._count.begin(f"check {number + 1} of {count}", left)
+            self._show(f"check {number + 1} of {count}", cycles, cycles + number)
             plan = self.pokes.cycle(cycles + number)
             answers.append(R @ self._player.cycle(plan, taken.delay.delay_frames).response)
         return check(np.array(answers), R @ taken.measured.response, taken.measured.error * np.sqrt(cycles))
@@ -156,7 +155,7 @@ class Calibrator:
         """
         mode = self._best
         plan = self.pokes.delay(mode)
-        self._count.begin("looking for pokes", len(plan) + self.pokes.frames(self.pokes.cycles()))
+        self._show("looking for pokes", self.pokes.cycles(), 0)
         found = self._player.first_poke(mode, plan)
         self._compare_picture(found.picture, mode)
         self._say(
@@ -202,8 +201,7 @@ class Calibrator:
         while True:
             while sums.cycles < needed:
                 done = sums.cycles
-                left = pokes.frames(needed, done)
-                self._count.begin(f"{wanted.method} cycle {done + 1} of {needed}", left)
+                self._show(f"{wanted.method} cycle {done + 1} of {needed}", needed, done)
                 sums = sums.plus(self._player.cycle(pokes.cycle(done), delay.delay_frames))
                 keep(path, sums, what)
                 self.kept = sums.cycles
@@ -216,6 +214,10 @@ class Calibrator:
                 + self._to_go(more, needed)
             )
             needed = more
+
+    def _show(self, doing: str, needed: int, done: int) -> None:
+        total = self.pokes.frames(needed)
+        self._progress(doing, total - self.pokes.frames(needed, done), total)
 
     def _to_go(self, needed: int, done: int) -> str:
         return f"about {self.pokes.frames(needed, done) / self.config.camera.rate_hz:.0f} s to go"

@@ -4,7 +4,6 @@ import contextlib
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
-from typing import NamedTuple, TypeVar
 
 import numpy as np
 from rich.console import Console
@@ -35,15 +34,11 @@ from lowfc.programs.commissioning.calibrate.pokes import CalibrationRequest
 from lowfc.programs.commissioning.calibrate.recording import Say, watch
 from lowfc.programs.commissioning.calibrate.result import (
     CalibrationResult,
-    Comparison,
-    comparison,
     finished,
     reconstructed,
     result_of,
 )
 from lowfc.programs.commissioning.calibrate.run import Calibrator, partial_of
-
-R = TypeVar("R", bound=Result)
 
 
 class DarkResult(Result):
@@ -88,11 +83,11 @@ def poked(wanted: CalibrationRequest, run: str | None, *, load: bool) -> Calibra
         calibrator = Calibrator(loop, wanted, say, progress, computed)
         try:
             with calibrator.holding():
-                done = finished(calibrator, wanted, calibrator.run(), computed)
-                if done.result.recommended:
+                made, result = finished(calibrator, wanted, calibrator.run(), computed)
+                if result.recommended:
                     partial_of(wanted.out).unlink(missing_ok=True)
                     if load:
-                        loop.load(done.calibration)
+                        loop.load(made)
         except BaseException:
             if calibrator.kept:
                 kept_cycles = counted(calibrator.kept, "cycle")
@@ -101,9 +96,8 @@ def poked(wanted: CalibrationRequest, run: str | None, *, load: bool) -> Calibra
                     "on"
                 )
             raise
-    if load and not done.result.recommended:
-        done.result.not_loaded = True
-    return done.result
+    result.not_loaded = load and not result.recommended
+    return result
 
 
 @contextlib.contextmanager
@@ -128,8 +122,8 @@ def computed(
     """
     require_folder(wanted.out)
     config = configuration(file)
-    there = None if at is None else zero_point(config, at)
-    made = analytic(config, Console(stderr=True), None if there is None else there.wavefront)
+    name, wavefront = ("", None) if at is None else zero_point(config, at)
+    made = analytic(config, Console(stderr=True), wavefront)
     quality = reconstructed(
         config,
         made.reference.astype(np.float64),
@@ -141,40 +135,33 @@ def computed(
         truncate=wanted.truncate,
         tikhonov=wanted.tikhonov,
     )
-    if there is not None:
-        made = replace(made, estimator=f"{made.estimator}+at {there.name}")
+    if name:
+        made = replace(made, estimator=f"{made.estimator}+at {name}")
     if wanted.truncate or wanted.tikhonov:
         made = replace(made, reconstructor=single(quality.matrix), estimator=f"{made.estimator}+regularised")
-    made = identified(made)
-    calibration_file.save(made, wanted.out)
-    if load:
-        with Client(run) as loop:
-            loop.load(made)
+    with Client(run) if load else contextlib.nullcontext() as loop:
+        made = written(made, wanted.out, loop)
     return result_of(config, made, quality, "analytic", wanted.out)
 
 
-class ZeroPoint(NamedTuple):
-    """A wavefront that is not flat, and its name in a calibration."""
-
-    name: str
-    wavefront: Wavefront
-
-
-def zero_point(config: Configuration, text: str) -> ZeroPoint:
+def zero_point(config: Configuration, text: str) -> tuple[str, Wavefront]:
     """What --at asks for: modes as in 4=15,7=-10, Noll index = nm rms, or a file as `lowfc ctl channel` takes it.
+
+    Returns:
+        Its name in a calibration, and the wavefront.
 
     Raises:
         ConfigurationError: it is neither, or the shape does not fit the mirror.
     """
     if "=" not in text:
         shape = shape_of(config, "--at", text)
-        return ZeroPoint("a shape", lambda _, mirror: wavefront_nm(mirror, shape).astype(np.float64))
+        return ("a shape", lambda _, mirror: wavefront_nm(mirror, shape).astype(np.float64))
     modes_nm = _modes(text)
 
     def of_modes(optics: Twin, _: TwinMirror) -> Array:
         return np.array(list(modes_nm.values())) @ zernikes(list(modes_nm), *node_radii(optics))
 
-    return ZeroPoint(",".join(f"{mode}={amplitude_nm:g}" for mode, amplitude_nm in modes_nm.items()), of_modes)
+    return ",".join(f"{mode}={amplitude_nm:g}" for mode, amplitude_nm in modes_nm.items()), of_modes
 
 
 def _modes(text: str) -> dict[int, float]:
@@ -193,18 +180,6 @@ def _modes(text: str) -> dict[int, float]:
     return found
 
 
-def compared(one: Path, other: Path) -> Comparison:
-    """How two calibration files differ."""
-    return comparison(calibration_file.load(one), calibration_file.load(other))
-
-
-class Camera(NamedTuple):
-    """What a reconstructor needs to know of a camera: the noise of a pixel, electrons per DN."""
-
-    read_noise_e: float
-    gain_e: float
-
-
 def darkened(out: Path, run: str | None, frames: int, file: Path | None, *, load: bool) -> DarkResult:
     """The calibration in use with a dark and a mask, from the loop's frames or a cube of them.
 
@@ -212,23 +187,18 @@ def darkened(out: Path, run: str | None, frames: int, file: Path | None, *, load
         CalibrationError: the frames are not dark.
         DataFileError: the cube cannot be read, or the file not be written.
     """
-
-    def adapted(loop: Client, before: Calibration, camera: Camera) -> tuple[Calibration, DarkResult]:
+    require_folder(out)
+    with Client(run) as loop, _in_use(loop) as (before, noise):
         cube, whose = (watch(loop, frames), "the camera") if file is None else (images(file), str(file))
         if cube.shape[1:] != before.shape:
             raise DataFileError(f"{whose}: frames of {cube.shape[1:]}, the calibration has {before.shape}")
-        try:
-            found = dark_of(cube.reshape(len(cube), -1))
-        except ValueError as error:
-            raise CalibrationError(f"{whose}: {error}") from None
+        found = dark_of(cube.reshape(len(cube), -1))
         if file is None:
             check_dark(found.dark_dn, before.reference.astype(np.float64), before.flux_dn)
-        made = with_dark(before, found.dark_dn, found.good, camera.read_noise_e, camera.gain_e)
-        counts = {name: int(np.count_nonzero(getattr(found, name))) for name in ("hot", "noisy", "dead")}
-        level, noise = float(np.median(found.dark_dn)), float(np.median(found.noise_dn))
-        return made, DarkResult(frames=len(cube), dark_dn=level, noise_dn=noise, **counts, file=str(out))
-
-    return _adapted(out, run, adapted, load=load)
+        written(with_dark(before, found.dark_dn, found.good, *noise), out, loop if load else None)
+    counts = {name: int(np.count_nonzero(getattr(found, name))) for name in ("hot", "noisy", "dead")}
+    level, noise_dn = float(np.median(found.dark_dn)), float(np.median(found.noise_dn))
+    return DarkResult(frames=len(cube), dark_dn=level, noise_dn=noise_dn, **counts, file=str(out))
 
 
 def referenced(out: Path, run: str | None, frames: int, *, load: bool) -> ReferenceResult:
@@ -238,46 +208,39 @@ def referenced(out: Path, run: str | None, frames: int, *, load: bool) -> Refere
         CalibrationError: there is no light.
         DataFileError: the file cannot be written.
     """
-
-    def adapted(loop: Client, before: Calibration, camera: Camera) -> tuple[Calibration, ReferenceResult]:
+    require_folder(out)
+    with Client(run) as loop, _in_use(loop) as (before, noise):
         pixels = watch(loop, frames).reshape(frames, -1)
         light, flux = normalised(pixels, before.dark.astype(np.float64), before.good.astype(np.float64))
         image = light.mean(axis=0)
-        made = with_reference(before, image, float(flux.mean()), camera.read_noise_e, camera.gain_e)
-        moved = before.reconstructor.astype(np.float64) @ (image - before.reference)
-        return made, ReferenceResult(
-            frames=frames,
-            noll=list(made.noll),
-            reference_shift_nm=moved.tolist(),
-            flux_dn=made.flux_dn,
-            file=str(out),
-        )
-
-    return _adapted(out, run, adapted, load=load)
+        made = written(with_reference(before, image, float(flux.mean()), *noise), out, loop if load else None)
+    moved = before.reconstructor.astype(np.float64) @ (image - before.reference)
+    shift_nm, noll = moved.tolist(), list(made.noll)
+    return ReferenceResult(frames=frames, noll=noll, reference_shift_nm=shift_nm, flux_dn=made.flux_dn, file=str(out))
 
 
-def _adapted(
-    out: Path,
-    run: str | None,
-    adapted: Callable[[Client, Calibration, Camera], tuple[Calibration, R]],
-    *,
-    load: bool,
-) -> R:
-    """Write the calibration in use with something else in it, and use it if asked."""
-    require_folder(out)
-    with Client(run) as loop:
-        before, config = replace(loop.calibration(), camera=loop.camera()), configuration_of(loop)
-        camera = factory.detector(config)
-        of = Camera(factory.equivalent_read_noise_e(camera), camera.gain_e_per_dn / camera.em_gain)
-        try:
-            made, result = adapted(loop, before, of)
-        except ValueError as error:
-            raise CalibrationError(str(error)) from None
-        made = identified(made)
-        calibration_file.save(made, out)
-        if load:
-            loop.load(made)
-    return result
+@contextlib.contextmanager
+def _in_use(loop: Client) -> Iterator[tuple[Calibration, tuple[float, float]]]:
+    """The calibration in use, and of the camera the read noise of a pixel, e-, and electrons per DN.
+
+    Raises:
+        CalibrationError: what is made of it is none.
+    """
+    camera = factory.detector(configuration_of(loop))
+    noise = factory.equivalent_read_noise_e(camera), camera.gain_e_per_dn / camera.em_gain
+    try:
+        yield replace(loop.calibration(), camera=loop.camera()), noise
+    except ValueError as error:
+        raise CalibrationError(str(error)) from None
+
+
+def written(made: Calibration, out: Path, loop: Client | None) -> Calibration:
+    """Write a calibration under its identity; a loop, where there is one, uses it at once."""
+    made = identified(made)
+    calibration_file.save(made, out)
+    if loop is not None:
+        loop.load(made)
+    return made
 
 
 def images(file: Path) -> Array:

@@ -155,19 +155,19 @@ class Commissioning:
         calibrator = Calibrator(self._loop, wanted, self._say, self._progress, self._computed)
         taken = calibrator.run(delay)
         self._step("verdict")
-        done = finished(calibrator, wanted, taken, self._computed)
-        self._figures |= done.result.figures()
-        if not done.result.recommended:
+        made, result = finished(calibrator, wanted, taken, self._computed)
+        self._figures |= result.figures()
+        if not result.recommended:
             raise CalibrationError(
-                f"{done.result.text()}\nit is not used: correct this, then the same command again; with --resume it "
+                f"{result.text()}\nit is not used: correct this, then the same command again; with --resume it "
                 "goes on with these cycles, as for more of them (--cycles)"
             )
-        self._loop.load(done.calibration)
+        self._loop.load(made)
         self._judged = True
         for path in (kept, partial_of(asked.out)):
             path.unlink(missing_ok=True)
-        self._say(done.result.text())
-        law = factory.settings(config).law(done.calibration.noll)
+        self._say(result.text())
+        law = factory.settings(config).law(made.noll)
         return self._figures, self._close(law, delay.delay_frames)
 
     def _wanted(self, amplitude_nm: float | None = None, *, resume: bool = False) -> CalibrationRequest:
@@ -215,11 +215,8 @@ class Commissioning:
         self._step("delay")
         self._delay = delay = first_delay(self._loop, self._config, before, self._say)
         self._step("orientation and sign")
-        first = aligned(self._config, self._computed, before, delay, self._say)
-        if first is None:
-            first = poked(self._loop, self._config, before, delay, self._say)
-        self._figures |= first.figures
-        return first.calibration
+        first = aligned(self._config, self._computed, before, delay, self._say, self._figures)
+        return poked(self._loop, self._config, before, delay, self._say) if first is None else first
 
     def _close(self, law: Law, delay_frames: float) -> str:
         """Predict the residual; close the loop where that was asked for, and compare."""

@@ -1,7 +1,7 @@
 """A first calibration, from the image of one poke and the computed response, or from pokes of all modes."""
 
 from dataclasses import replace
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
@@ -32,13 +32,6 @@ MAX_NOT_LINEAR = 0.1
 _SURE = 3.0
 
 
-class First(NamedTuple):
-    """A calibration to begin with, and how it was found."""
-
-    calibration: Calibration
-    figures: dict[str, Any]
-
-
 def first_delay(loop: Client, config: Configuration, before: Calibration, say: Say) -> Delay:
     """The delay, and the image of a poke of the first mode: pokes that grow until they are seen.
 
@@ -63,8 +56,13 @@ def first_delay(loop: Client, config: Configuration, before: Calibration, say: S
     return found
 
 
-def aligned(config: Configuration, computed: Calibration, before: Calibration, poke: Delay, say: Say) -> First | None:
-    """The computed calibration on the sensor's pixels, with the sign that the poke shows; None for another sensor."""
+def aligned(
+    config: Configuration, computed: Calibration, before: Calibration, poke: Delay, say: Say, figures: dict[str, Any]
+) -> Calibration | None:
+    """The computed calibration on the sensor's pixels, with the sign that the poke shows; None for another sensor.
+
+    How the sensor is placed is added to `figures`.
+    """
     image = (before.reference * before.flux_dn).reshape(before.shape).astype(np.float64)
     model = computed.reference.astype(np.float64).reshape(computed.shape)
     try:
@@ -83,7 +81,7 @@ def aligned(config: Configuration, computed: Calibration, before: Calibration, p
     if found.residual > MAX_MISFIT or like < MIN_LIKENESS:
         say("this is not the configured sensor: the response is measured without the optical model")
         return None
-    found_figures = {
+    figures |= {
         "pixels_per_lambda_d": scale,
         "rotation_deg": found.geometry.rotation_deg,
         "parity": found.geometry.parity,
@@ -91,10 +89,10 @@ def aligned(config: Configuration, computed: Calibration, before: Calibration, p
         "poke_correlation": like,
     }
     made = replace(made, reference=before.reference, estimator=f"{made.estimator}{FIRST}")
-    return First(identified(made), found_figures)
+    return identified(made)
 
 
-def poked(loop: Client, config: Configuration, before: Calibration, poke: Delay, say: Say) -> First:
+def poked(loop: Client, config: Configuration, before: Calibration, poke: Delay, say: Say) -> Calibration:
     """A calibration of each mode's own pokes, without an optical model.
 
     Raises:
@@ -116,7 +114,7 @@ def poked(loop: Client, config: Configuration, before: Calibration, poke: Delay,
         reconstructor=single(matrix),
         estimator=f"{config.control.estimator}+poke{FIRST}",
     )
-    return First(identified(made), {})
+    return identified(made)
 
 
 def linear_nm(

@@ -98,29 +98,28 @@ def _run_with(role: str, name: str | None) -> "Run":
     Raises:
         BusError: there is no such run, or none or several to choose from.
     """
-    from lowfc.adapters.bus.run import open_run, runtime_base
+    from lowfc.adapters.bus.run import open_run
+    from lowfc.client.runs import living
     from lowfc.contract.errors import BusError
     from lowfc.programs.cli.ctl.which_run import the_known_run
 
-    if name is not None:
-        named = open_run(the_known_run(name), ())
-        if named.links.network.router:
+    if name is None:
+        found = [run for run, roles in living().items() if role in roles]
+        if len(found) > 1:
+            raise BusError(f"say which run with --run: {role} is in {', '.join(found)}")
+        if not found:
             raise BusError(
-                f"run {name!r} goes by a router, whose clock its times are of: try the device on its own host, in a "
-                "run of that host alone"
+                f"no {role} listens in any run of this host: start yours with the session file of "
+                f"`lowfc config zenoh --role {role} --run NAME --make`, and name the run with --run"
             )
-        return named
-    runs = sorted(path.parent.name for path in runtime_base().glob("*/links.json"))
-    links = [open_run(run, ()).links for run in runs]
-    found = [one.run_id for one in links if not one.network.router and role in one.live()]
-    if len(found) == 1:
-        return open_run(found[0], ())
-    if found:
-        raise BusError(f"say which run with --run: {role} is in {', '.join(found)}")
-    raise BusError(
-        f"no {role} listens in any run of this host: start yours with the session file of "
-        f"`lowfc config zenoh --role {role} --run NAME --make`, and name the run with --run"
-    )
+        name = found[0]
+    run = open_run(the_known_run(name), ())
+    if run.links.network.router:
+        raise BusError(
+            f"run {name!r} goes by a router, whose clock its times are of: try the device on its own host, in a run "
+            "of that host alone"
+        )
+    return run
 
 
 @contextmanager
