@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from lowfc.adapters.bus.bus import ALL, Query
-from lowfc.adapters.bus.run import Run, free_ports, mirror_role, new_run_id, open_run, own_directory, runtime_base
+from lowfc.adapters.bus.run import free_ports, mirror_role, new_run_id, open_run, own_directory, runtime_base
 from lowfc.adapters.bus.zenoh_bus import ZenohBus
 from lowfc.adapters.files.whole_file import write_whole
 from lowfc.adapters.process import latch as latch_module
@@ -32,6 +32,10 @@ def test_a_run_has_ports_a_secret_and_closed_doors() -> None:
     assert {path.stat().st_mode & 0o777 for path in run.path.iterdir()} == {0o600}
     assert run.links.secret_file.read_text() == f"lowfc:{run.links.secret}\n"
     assert run.links.secret not in repr(run)
+    other = open_run(new_run_id())
+    assert other.path != run.path
+    assert other.links.secret != run.links.secret
+    assert not set(other.links.ports.values()) & set(run.links.ports.values())
     run.remove()
     assert not run.path.exists()
 
@@ -41,13 +45,6 @@ def test_all_who_open_a_run_at_once_get_the_same(own_runtime: Path) -> None:
     asked = [subprocess.Popen([sys.executable, "-c", ask], stdout=subprocess.PIPE, text=True) for _ in range(5)]
     assert len({process.communicate()[0] for process in asked}) == 1
     assert [path.name for path in (own_runtime / "lowfc").iterdir()] == ["one"]
-
-
-def test_two_runs_share_nothing() -> None:
-    one, other = (open_run(new_run_id()) for _ in range(2))
-    assert one.path != other.path
-    assert one.links.secret != other.links.secret
-    assert not set(one.links.ports.values()) & set(other.links.ports.values())
 
 
 @pytest.mark.parametrize("name", ["", "../up", "a/b", ".hidden", "Night", "x" * 49, "a b"])
@@ -63,27 +60,20 @@ def test_a_mirror_that_the_run_does_not_have_is_refused() -> None:
     assert mirror_role("tip") == "mirror-tip"
 
 
-def damaged(run: Run, name: str, text: str | None) -> None:
-    if text is None:
-        (run.path / name).unlink()
-    else:
-        (run.path / name).write_text(text)
-
-
-@pytest.mark.parametrize("text", [None, "", "{}", "[]", '{"run_id": "night", "user": "lowfc", "ports": {"camera": 0}}'])
-def test_damaged_links_are_an_error(text: str | None) -> None:
-    run = open_run("night")
-    damaged(run, "links.json", text)
-    with pytest.raises(DataFileError, match=r"links\.json should hold"):
-        open_run("night")
-
-
-@pytest.mark.parametrize("text", [None, "", "lowfc", "somebody:else"])
-def test_damaged_credentials_are_an_error(text: str | None) -> None:
-    run = open_run("night")
-    damaged(run, "credentials", text)
-    with pytest.raises(DataFileError, match="credentials"):
-        _ = run.links.secret
+@pytest.mark.parametrize(
+    ("name", "text"),
+    [
+        *(("links.json", text) for text in (None, "", "{}", "[]", '{"run_id": "night", "ports": {"camera": 0}}')),
+        *(("credentials", text) for text in (None, "", "lowfc", "somebody:else")),
+    ],
+)
+def test_damaged_files_of_a_run_are_an_error(name: str, text: str | None) -> None:
+    file = open_run("night").path / name
+    file.unlink()
+    if text is not None:
+        file.write_text(text)
+    with pytest.raises(DataFileError, match=name):
+        _ = open_run("night").links.secret
 
 
 def test_links_of_another_run_are_refused(own_runtime: Path) -> None:
@@ -147,13 +137,11 @@ def test_a_start_is_claimed_once() -> None:
 @pytest.mark.parametrize("text", ["", "9" * 5000, str(2**32), "\u00b2", "-7", "later"])
 def test_a_start_that_is_none_is_not_believed(text: str) -> None:
     links = open_run("night").links
-    (links.secret_file.parent / "start-camera").write_text(text)
+    file = links.secret_file.parent / "start-camera"
+    file.write_text(text)
     assert [links.claim_start("camera", 100), links.claim_start("camera", 100)] == [100, 101]
-
-
-def test_a_start_is_given_where_the_directory_cannot_be_written() -> None:
-    links = open_run("night").links
-    (links.secret_file.parent / "start-camera").mkdir()  # which root cannot write either
+    file.unlink()
+    file.mkdir()  # which root cannot write either
     assert links.claim_start("camera", 100) == 100
 
 
@@ -289,17 +277,12 @@ def test_what_was_written_in_part_is_cleared_whole(files: tuple[Path, Path], mon
     assert len(said) == 1, "said once, and who is told cannot end it"
 
 
-def test_a_file_is_replaced_as_a_whole(tmp_path: Path) -> None:
-    path = tmp_path / "file"
-    write_whole(path, b"first")
-    write_whole(path, b"second")
-    assert path.read_bytes() == b"second"
-    assert list(tmp_path.iterdir()) == [path]
-
-
 def test_what_cannot_be_written_leaves_the_old_file_and_nothing_else(tmp_path: Path, monkeypatch) -> None:
     path = tmp_path / "file"
-    write_whole(path, b"first")
+    for content in (b"former", b"first"):
+        write_whole(path, content)
+    with pytest.raises(DataFileError, match="nowhere/file cannot be written: No such file"):
+        write_whole(tmp_path / "nowhere" / "file", b"")
 
     def full(self: Path, target: Path) -> None:
         raise OSError(errno.ENOSPC, "No space left on device")
@@ -309,8 +292,3 @@ def test_what_cannot_be_written_leaves_the_old_file_and_nothing_else(tmp_path: P
         write_whole(path, b"second")
     assert path.read_bytes() == b"first"
     assert list(tmp_path.iterdir()) == [path]
-
-
-def test_a_folder_that_is_not_there_is_named(tmp_path: Path) -> None:
-    with pytest.raises(DataFileError, match="nowhere/file cannot be written: No such file"):
-        write_whole(tmp_path / "nowhere" / "file", b"")

@@ -67,27 +67,6 @@ def test_nobody_takes_another_authoritys(tmp_path: Path) -> None:
         handshake(tmp_path / "theirs", tmp_path / "ours", "camera")
 
 
-def test_a_role_is_no_server(tmp_path: Path) -> None:
-    make(tmp_path, (ROUTER, "camera"), ["localhost"])
-    for kind in ("pem", "key"):
-        (tmp_path / f"router.{kind}").write_bytes((tmp_path / f"camera.{kind}").read_bytes())
-    with pytest.raises(ssl.SSLCertVerificationError, match=r"unsupported certificate purpose|unsuitable"):
-        handshake(tmp_path, tmp_path, "camera")
-
-
-def test_keys_are_closed_to_others(tmp_path: Path) -> None:
-    folder = tmp_path / "authority"
-    make(folder, (ROUTER, "camera"), ["localhost"])
-    modes = {file.name: stat.S_IMODE(file.stat().st_mode) for file in folder.iterdir()}
-    assert {name: mode for name, mode in modes.items() if name.endswith(".key")} == {
-        "ca.key": 0o600,
-        "camera.key": 0o600,
-        "router.key": 0o600,
-    }
-    assert set(modes) == {f"{name}.{kind}" for name in ("ca", "camera", "router") for kind in ("pem", "key")}
-    assert stat.S_IMODE(folder.stat().st_mode) == 0o700
-
-
 def test_what_is_there_stays_unless_it_is_renewed(tmp_path: Path) -> None:
     make(tmp_path, (ROUTER, "camera"), ["localhost"])
     before = {file.name: file.read_bytes() for file in tmp_path.iterdir()}
@@ -218,5 +197,10 @@ def test_the_command_makes_all_roles(tmp_path: Path) -> None:
     done = lowfc(*words)
     assert done.exit_code == 0, done.output
     roles = {"router", "camera", "controller", "mirror-dm", "mirror-tip", "operator", "recorder", "viewer"}
-    assert {file.stem for file in (tmp_path / "certs").glob("*.pem")} == roles | {"ca"}
-    handshake(tmp_path / "certs", tmp_path / "certs", "mirror-tip")
+    folder = tmp_path / "certs"
+    assert (
+        {file.stem for file in folder.glob("*.pem")} == {file.stem for file in folder.glob("*.key")} == roles | {"ca"}
+    )
+    assert {stat.S_IMODE(file.stat().st_mode) for file in folder.glob("*.key")} == {0o600}, "keys are closed to others"
+    assert stat.S_IMODE(folder.stat().st_mode) == 0o700
+    handshake(folder, folder, "mirror-tip")

@@ -175,73 +175,42 @@ def test_every_folder_of_modules_is_a_package_of_at_most_sixteen() -> None:
 
 
 @pytest.mark.parametrize(
-    ("module", "source"),
+    ("module", "source", "fine"),
     [
-        ("lowfc.control.laws.law", "from lowfc.contract import codec"),
-        ("lowfc.control.laws.law", "from lowfc.optics.twin.twin import Twin"),
-        ("lowfc.optics.twin.twin", "import lowfc.control.laws.law"),
-        ("lowfc.contract.codecs.codec", "def later():\n    from lowfc.adapters.process.clock import HostClock"),
-        ("lowfc.adapters.bus.bus", "from lowfc.programs import controller"),
-        ("lowfc.adapters.bus.bus", "import sim_dm.device"),
-        ("lowfc.programs.launch.sim_loop", "from sim_camera.bench import Bench"),
-        ("lowfc.client.client", "from lowfc.programs.cli.ctl import which_run"),
-        ("lowfc.adapters.bus.bus", "from lowfc.client import Client"),
-        ("sim_camera.process", "import lowfc.programs.core.controller"),
-        ("sim_dm.process", "from sim_camera import bench"),
-        ("lowfc.adapters.bus.bus", "from . import clock"),
+        ("lowfc.control.laws.law", "from lowfc.contract import codec", False),
+        ("lowfc.control.laws.law", "from lowfc.optics.twin.twin import Twin", False),
+        ("lowfc.contract.codecs.codec", "def later():\n    from lowfc.adapters.process.clock import HostClock", False),
+        ("lowfc.adapters.bus.bus", "import sim_dm.device", False),
+        ("lowfc.client.client", "from lowfc.programs.cli.ctl import which_run", False),
+        ("sim_dm.process", "from sim_camera import bench", False),
+        ("lowfc.adapters.bus.bus", "from . import clock", False),
+        ("lowfc.contract.codecs.codec", "from lowfc.control.laws.law import Law\nimport lowfc.optics.zernike", True),
+        ("lowfc.programs.core.controller", "import lowfc.adapters.bus.bus\nfrom lowfc import __version__", True),
     ],
 )
-def test_an_import_upward_is_found(module: str, source: str) -> None:
-    assert layer_faults(module, source) != []
+def test_an_import_upward_is_found(module: str, source: str, fine: bool) -> None:
+    assert (layer_faults(module, source) == []) is fine
 
 
 @pytest.mark.parametrize(
-    ("module", "source"),
+    ("source", "fine"),
     [
-        ("lowfc.contract.codecs.codec", "from lowfc.control.laws.law import Law\nfrom lowfc.optics import zernike"),
-        ("lowfc.programs.core.controller", "import lowfc.adapters.bus.bus\nfrom lowfc import __version__"),
-        ("sim_dm.process", "from lowfc.adapters.process.service import Service\nimport time"),
+        ("import time", False),
+        ("from pathlib import Path", False),
+        ("def later():\n    import pydantic", False),
+        ("from lowfc.contract.errors import LowfcError", False),
+        ("import numpy as np\nnp.random.seed(1)", False),
+        ("import numpy\nx = numpy.random.rand(3)", False),
+        ("from numpy.random import rand", False),
+        ("from numpy import random\nrandom.default_rng()", False),
+        ("import numpy as np\nseeds = np.random.SeedSequence()", False),
+        ("import numpy as np\nx = np.load('file')", False),
+        ("x = open('file')", False),
+        ("def f():\n    global x\n    x = 1", False),
+        ("import numpy.typing as npt\nfrom scipy.optimize import brentq\nfrom dataclasses import dataclass", True),
+        ("import numpy as np\nrng = np.random.default_rng([1, 2])\ndef f(rng: np.random.Generator): ...", True),
+        ("from lowfc.control.loop.safety import limit", True),
     ],
 )
-def test_an_import_downward_is_fine(module: str, source: str) -> None:
-    assert layer_faults(module, source) == []
-
-
-@pytest.mark.parametrize(
-    "source",
-    [
-        "import time",
-        "import os",
-        "from pathlib import Path",
-        "from datetime import datetime",
-        "import random",
-        "import pydantic",
-        "def later():\n    import time",
-        "from lowfc.contract.errors import LowfcError",
-        "import numpy as np\nnp.random.seed(1)",
-        "import numpy as np\nx = np.random.standard_normal(3)",
-        "import numpy\nx = numpy.random.rand(3)",
-        "from numpy.random import rand",
-        "from numpy import random\nrandom.default_rng()",
-        "import numpy as np\nrng = np.random.default_rng()",
-        "import numpy as np\nseeds = np.random.SeedSequence()",
-        "import numpy as np\nx = np.load('file')",
-        "x = open('file')",
-        "def f():\n    global x\n    x = 1",
-        "print('x')",
-    ],
-)
-def test_an_impurity_is_found(source: str) -> None:
-    assert purity_faults("lowfc.control.laws.law", source) != []
-
-
-@pytest.mark.parametrize(
-    "source",
-    [
-        "import numpy as np\nimport numpy.typing as npt\nfrom scipy.optimize import brentq",
-        "import numpy as np\nrng = np.random.default_rng([1, 2])\ndef f(rng: np.random.Generator): ...",
-        "from lowfc.control.loop.safety import limit\nfrom dataclasses import dataclass",
-    ],
-)
-def test_pure_source_is_fine(source: str) -> None:
-    assert purity_faults("lowfc.control.laws.law", source) == []
+def test_an_impurity_is_found(source: str, fine: bool) -> None:
+    assert (purity_faults("lowfc.control.laws.law", source) == []) is fine

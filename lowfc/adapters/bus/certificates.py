@@ -7,8 +7,6 @@ role that it has ROLE.pem and ROLE.key.
 import contextlib
 import datetime
 import ipaddress
-import os
-import tempfile
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 
@@ -81,7 +79,7 @@ def _authority(folder: Path) -> tuple[EllipticCurvePrivateKey, x509.Certificate]
     if len(missing) == 2:
         own = generate_private_key(SECP256R1())
         builder = _builder("lowfc authority", own, CA_DAYS, authority=True).issuer_name(_name("lowfc authority"))
-        _write_secret(key_file, _pem(own))
+        write_whole(key_file, _pem(own), mode=0o600)
         write_whole(certificate_file, builder.sign(own, SHA256()).public_bytes(Encoding.PEM))
     elif missing:
         raise DataFileError(
@@ -104,7 +102,7 @@ def _own_key(folder: Path, role: str) -> EllipticCurvePrivateKey:
     if not file.exists():
         (folder / f"{role}.pem").unlink(missing_ok=True)  # of a key that is not here
         own = generate_private_key(SECP256R1())
-        _write_secret(file, _pem(own))
+        write_whole(file, _pem(own), mode=0o600)
         return own
     with contextlib.suppress(ValueError, TypeError):
         found = load_pem_private_key(file.read_bytes(), password=None)
@@ -159,15 +157,3 @@ _IN_A_NAME = set("abcdefghijklmnopqrstuvwxyzABCDEFGHIJKLMNOPQRSTUVWXYZ0123456789
 
 def _pem(key: EllipticCurvePrivateKey) -> bytes:
     return key.private_bytes(Encoding.PEM, PrivateFormat.PKCS8, NoEncryption())
-
-
-def _write_secret(file: Path, content: bytes) -> None:
-    """Write a whole file that nobody else can read, from its first byte on."""
-    descriptor, name = tempfile.mkstemp(prefix=f".{file.name}-", dir=file.parent)  # mode 0600
-    draft = Path(name)
-    try:
-        with os.fdopen(descriptor, "wb") as stream:
-            stream.write(content)
-        draft.replace(file)
-    finally:
-        draft.unlink(missing_ok=True)

@@ -110,12 +110,9 @@ class Links:
             file.seek(0)
             last = file.read(_LONGEST_START).strip()
             claimed = max(start_s, int(last) + 1) if last.isdecimal() else start_s
-            if claimed > _LATEST_START_S:
-                claimed = start_s
-            file.seek(0)
-            file.truncate()
-            file.write(str(claimed))
-            file.flush()
+            claimed = claimed if claimed <= _LATEST_START_S else start_s
+            file.truncate(0)
+            file.write(str(claimed))  # at the end of the file, which is its beginning now
             return claimed
         return start_s
 
@@ -248,18 +245,12 @@ def write_once(path: Path, text: str) -> str:
     """Write a file unless there is one; return what it holds. Two writers at once agree on one text."""
     with contextlib.suppress(FileNotFoundError):
         return path.read_text()
-    draft = _draft(path, text)
-    with contextlib.suppress(FileExistsError):
-        os.link(draft, path)
-    draft.unlink()
+    with tempfile.NamedTemporaryFile("w", prefix=f".{path.name}-", dir=path.parent) as draft:  # mode 0600
+        draft.write(text)
+        draft.flush()
+        with contextlib.suppress(FileExistsError):
+            os.link(draft.name, path)
     return path.read_text()
-
-
-def _draft(path: Path, text: str) -> Path:
-    descriptor, name = tempfile.mkstemp(prefix=f".{path.name}-", dir=path.parent)  # mode 0600
-    with os.fdopen(descriptor, "w") as file:
-        file.write(text)
-    return Path(name)
 
 
 def _absolute(network: Network) -> Network:
@@ -281,7 +272,8 @@ def _make(path: Path, mirrors: tuple[str, ...], listeners: tuple[str, ...], netw
         **({"network": network.model_dump()} if network.router else {}),
     }
     for name, text in ((_LINKS, json.dumps(links, indent=2)), (_CREDENTIALS, f"{_USER}:{secrets.token_hex(32)}\n")):
-        _draft(draft / name, text).rename(draft / name)
+        (draft / name).touch(mode=0o600)
+        (draft / name).write_text(text)
     try:
         draft.rename(path)
     except OSError:

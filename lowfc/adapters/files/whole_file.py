@@ -11,16 +11,16 @@ from lowfc.contract.errors import DataFileError
 
 
 @contextlib.contextmanager
-def being_written(path: Path, source: Path | None = None) -> Iterator[Path]:
+def being_written(path: Path, source: Path | None = None, mode: int = 0o666) -> Iterator[Path]:
     """A file to write that gets the name `path` when all went well, and is gone when not.
 
-    Its permissions are those that the umask leaves, and no more than those of `source`, which it is made from.
+    Its permissions are those of `mode` that the umask leaves, and no more than those of `source`, its origin.
 
     Raises:
         DataFileError: it cannot be written.
     """
     try:
-        most = source.stat().st_mode & 0o666 if source is not None and source.exists() else 0o666
+        most = source.stat().st_mode & mode if source is not None and source.exists() else mode
         part = path.with_name(f".{path.name}.{secrets.token_hex(4)}")
         descriptor = os.open(part, os.O_WRONLY | os.O_CREAT | os.O_EXCL, most)
         mode = stat.S_IMODE(os.fstat(descriptor).st_mode)
@@ -35,13 +35,13 @@ def being_written(path: Path, source: Path | None = None) -> Iterator[Path]:
         raise DataFileError(f"{path} cannot be written: {error.strerror or error}") from error
 
 
-def write_whole(path: Path, content: bytes, source: Path | None = None) -> None:
+def write_whole(path: Path, content: bytes, source: Path | None = None, mode: int = 0o666) -> None:
     """Write beside, then rename: neither a reader nor a second writer ever sees half a file; see `being_written`.
 
     Raises:
         DataFileError: The file cannot be written.
     """
-    with being_written(path, source) as part:
+    with being_written(path, source, mode) as part:
         part.write_bytes(content)
 
 
