@@ -2,7 +2,6 @@
 
 import json
 import re
-import shlex
 import subprocess
 import sys
 from pathlib import Path
@@ -12,7 +11,7 @@ import pytest
 from tests.e2e.test_bench_day import COMMANDS as BENCH_DAY
 from tests.e2e.test_operator import COMMANDS as OPERATING
 from tests.e2e.test_own_hardware import COMMISSIONING, DOCUMENTED
-from tests.support.loops import interrupt, recorded_bytes, start, until
+from tests.support.loops import command, going_on, interrupt, recorded_bytes, start, until
 from tests.support.viewers import on_screen
 
 ROOT = Path(__file__).parents[2]
@@ -42,22 +41,11 @@ def commands(document: Path) -> list[str]:
     return [line for line in bare if line.split()[0] in PROGRAMS]
 
 
-def run(folder: Path, command: str) -> str:
+def run(folder: Path, line: str) -> str:
     """Run a documented command as it stands, only shorter."""
-    shorter = command
     for long, short in SHORTER.items():
-        shorter = shorter.replace(long, short)
-    words = shlex.split(shorter, comments=True)
-    output = None
-    if ">" in words:
-        output = folder / words[words.index(">") + 1]
-        words = words[: words.index(">")]
-    program = Path(sys.executable).parent / words[0]
-    done = subprocess.run([program, *words[1:]], cwd=folder, capture_output=True, text=True, timeout=120, check=False)
-    assert done.returncode == 0, f"{command}: {done.stderr}"
-    if output is not None:
-        output.write_text(done.stdout)
-    return done.stdout
+        line = line.replace(long, short)
+    return command(folder, line)
 
 
 def test_every_command_of_the_documents_is_known() -> None:
@@ -68,8 +56,8 @@ def test_every_command_of_the_documents_is_known() -> None:
     tested = {*ELSEWHERE, *LOOPS, *LOGS, *REQUESTS, *FILES, *BY_HAND, *SESSION, *BENCH, *VALIDATE, *DESIGN, *LOOKING}
     tested |= {FEWER, *STAYING, *DOCUMENTED, *OPERATING, *BENCH_DAY, *COMMISSIONING}
     assert set(found) == tested
-    for command, where in ELSEWHERE.items():
-        assert command.split()[0] in (ROOT / where).read_text()
+    for line, where in ELSEWHERE.items():
+        assert line.split()[0] in (ROOT / where).read_text()
 
 
 LOOPS = (
@@ -127,9 +115,9 @@ LOGS = (
 
 
 @pytest.mark.exclusive
-@pytest.mark.parametrize("command", [LOOPS[0], *(pytest.param(one, marks=pytest.mark.slow) for one in LOOPS[1:])])
-def test_the_loops(tmp_path: Path, command: str) -> None:
-    assert "frame to command" in run(tmp_path, command)
+@pytest.mark.parametrize("line", [LOOPS[0], *(pytest.param(one, marks=pytest.mark.slow) for one in LOOPS[1:])])
+def test_the_loops(tmp_path: Path, line: str) -> None:
+    assert "frame to command" in run(tmp_path, line)
     assert len(list((tmp_path / "logs").glob("*.mcap"))) == 1
 
 
@@ -142,7 +130,7 @@ def test_the_requests(tmp_path: Path, own_runtime: Path) -> None:
         until(
             lambda: "closed · residual " in subprocess.run(status, capture_output=True, text=True, check=False).stdout
         )
-        said = [run(tmp_path, command) for command in REQUESTS]
+        said = [run(tmp_path, line) for line in REQUESTS]
     finally:
         out, complaints = interrupt(loop)
     assert loop.returncode == 0, complaints
@@ -157,22 +145,12 @@ def test_the_requests(tmp_path: Path, own_runtime: Path) -> None:
 @pytest.mark.exclusive
 @pytest.mark.parametrize("recorder", [BY_HAND[3], pytest.param(FEWER, marks=pytest.mark.slow)])
 def test_the_processes_by_hand(tmp_path: Path, recorder: str) -> None:
-    program = Path(sys.executable).parent
-    started = [
-        subprocess.Popen([program / words[0], *words[1:]], cwd=tmp_path, stderr=subprocess.PIPE, text=True)
-        for words in map(shlex.split, [*BY_HAND[:3], recorder])
-    ]
-    try:
+    with going_on(tmp_path, *BY_HAND[:3], recorder) as complaints:
         status = [sys.executable, "-m", "lowfc", "ctl", "status", "--run", "bench"]
         until(lambda: subprocess.run(status, cwd=tmp_path, capture_output=True, check=False).returncode == 0, 120)
         until(lambda: recorded_bytes(tmp_path) > 4e6)
         session = json.loads(run(tmp_path, SESSION[0]))
         assert session["listen"]["endpoints"][0].startswith("tcp/127.0.0.1:")
-    finally:
-        for process in started:
-            process.terminate()
-        complaints = [process.communicate(timeout=20)[1] for process in started]
-    assert [process.returncode for process in started] == [0] * 4, complaints
     for name, said in zip(("camera", "mirror-dm", "controller", "recorder"), complaints, strict=True):
         assert f"{name}: ready (run bench)\n" in said
     assert len(list((tmp_path / "logs").glob("*.mcap"))) == 1
@@ -191,10 +169,10 @@ def test_the_views(tmp_path: Path) -> None:
     loop = start(tmp_path, *STAYING[0].split()[1:], "--rate", "100")
     try:
         until(lambda: recorded_bytes(tmp_path) > 4e6)
-        for command in STAYING[1:4]:
-            look(tmp_path, command)
-        for command in LOOKING[:2]:
-            run(tmp_path, command.replace("--seconds 60", "--seconds 1").replace("now.png", "now.png --seconds 2"))
+        for line in STAYING[1:4]:
+            look(tmp_path, line)
+        for line in LOOKING[:2]:
+            run(tmp_path, line.replace("--seconds 60", "--seconds 1").replace("now.png", "now.png --seconds 2"))
     finally:
         _, complaints = interrupt(loop)
     assert loop.returncode == 0, complaints
@@ -204,9 +182,9 @@ def test_the_views(tmp_path: Path) -> None:
     assert {path.name for path in tmp_path.iterdir()} >= {"now.png", "night.rrd", "log.png"}
 
 
-def look(folder: Path, command: str) -> None:
+def look(folder: Path, line: str) -> None:
     """Run a view until it says where it is to be seen, then Ctrl-C."""
-    process = start(folder, *command.split()[1:])
+    process = start(folder, *line.split()[1:])
     said = process.stderr.readline()
     assert "127.0.0.1" in said
     _, complaints = interrupt(process)
@@ -222,8 +200,8 @@ def test_the_validation(tmp_path: Path) -> None:
 
 @pytest.mark.slow
 def test_the_designs_are_taken_by_the_loop(tmp_path: Path) -> None:
-    for command in DESIGN:
-        run(tmp_path, command)
+    for line in DESIGN:
+        run(tmp_path, line)
     (tmp_path / "own.toml").write_text('[sensor]\npupil = "pupil.npz"\nsam = "mask.json"\n')
     run(tmp_path, "lowfc sim-loop --config own.toml --lockstep --duration 0.2")
 
@@ -231,7 +209,7 @@ def test_the_designs_are_taken_by_the_loop(tmp_path: Path) -> None:
 @pytest.mark.slow
 def test_the_logs(tmp_path: Path) -> None:
     run(tmp_path, "lowfc sim-loop --lockstep --rate 200 --duration 2 --json")
-    said = [run(tmp_path, command) for command in LOGS]
+    said = [run(tmp_path, line) for line in LOGS]
     assert "lowfc/camera/frame" in said[0]
     assert "400 frames, commands identical, largest difference 0 nm" in said[1]
     assert "what if" in said[2]
@@ -244,5 +222,5 @@ def test_the_logs(tmp_path: Path) -> None:
 
 
 def test_the_configuration(tmp_path: Path) -> None:
-    for command in FILES:
-        run(tmp_path, command)
+    for line in FILES:
+        run(tmp_path, line)

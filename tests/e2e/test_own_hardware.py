@@ -5,7 +5,6 @@ import re
 import shlex
 import shutil
 import subprocess
-import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -20,7 +19,7 @@ from lowfc.adapters.files import calibration_file
 from lowfc.adapters.process.clock import HostClock
 from lowfc.client import Client
 from lowfc.contract.messages import FRAME, MIRROR_STATE, STEP, Role, wire
-from tests.support.loops import until
+from tests.support.loops import PROGRAMS, command, going_on, until
 
 pytestmark = pytest.mark.exclusive
 
@@ -67,39 +66,15 @@ def bench(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return tmp_path
 
 
-def started(folder: Path, command: str) -> "subprocess.Popen[str]":
-    program, *rest = shlex.split(command)
+def started(folder: Path, line: str) -> "subprocess.Popen[str]":
+    program, *rest = shlex.split(line)
     return subprocess.Popen(
-        [Path(sys.executable).parent / program, *rest],
+        [PROGRAMS / program, *rest],
         cwd=folder,
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
         text=True,
     )
-
-
-def said(folder: Path, command: str) -> str:
-    """What a documented command prints; where it is told to, into a file, too."""
-    words, _, output = command.partition(" > ")
-    process = started(folder, words)
-    out, complaints = process.communicate(timeout=60)
-    assert process.returncode == 0, f"{command}: {out} {complaints}"
-    if output:
-        (folder / output).write_text(out)
-    return out
-
-
-@contextmanager
-def running(folder: Path, *commands: str) -> Iterator[list["subprocess.Popen[str]"]]:
-    """Commands that go on until told to stop; they must end cleanly then."""
-    processes = [started(folder, command) for command in commands]
-    try:
-        yield processes
-    finally:
-        for process in processes:
-            process.terminate()
-        complaints = [process.communicate(timeout=20)[1] for process in processes]
-    assert all(process.returncode in (0, -15) for process in processes), complaints
 
 
 @contextmanager
@@ -121,20 +96,20 @@ def heard(bus: ZenohBus) -> None:
 
 def conformance(folder: Path, *commands: str) -> None:
     """Nothing is wrong with the devices; all are looked at at once."""
-    checking = [started(folder, f"{command} --json --duration 0.6") for command in commands]
-    for command, process in zip(commands, checking, strict=True):
+    checking = [started(folder, f"{line} --json --duration 0.6") for line in commands]
+    for line, process in zip(commands, checking, strict=True):
         out, complaints = process.communicate(timeout=60)
-        assert process.returncode == 0, f"{command}: {out} {complaints}"
+        assert process.returncode == 0, f"{line}: {out} {complaints}"
         figures = json.loads(out)
-        assert f"--run {figures['run']}" in command
-        assert figures["device"] in command or figures["device"] == "mirror-dm"
+        assert f"--run {figures['run']}" in line
+        assert figures["device"] in line or figures["device"] == "mirror-dm"
         assert figures["counts"]["wrong"] == 0
         assert {"clear", "relaxing"}.isdisjoint(one["name"] for one in figures["checks"] if one["status"] != "ok")
         assert figures["counts"]["ok"] >= len(figures["checks"]) - 5  # of a busy host: warnings
 
 
 def test_the_loop_closes_on_a_camera_and_a_mirror_of_ones_own(bench: Path) -> None:
-    with running(bench, *DEVICES), listening() as bus:
+    with going_on(bench, *DEVICES), listening() as bus:
         heard(bus)
         conformance(bench, *CONFORMANCE)
         errors_nm: list[list[float]] = []
@@ -148,10 +123,10 @@ def test_the_loop_closes_on_a_camera_and_a_mirror_of_ones_own(bench: Path) -> No
             return float(np.linalg.norm(np.mean(measured, axis=0))) if len(measured) == 100 else np.nan
 
         bus.subscribe(STEP, note)
-        with running(bench, LOOP[0]):
+        with going_on(bench, LOOP[0]):
             until(lambda: np.isfinite(rms_nm()))
             before_nm = rms_nm()
-            assert "loop closed" in said(bench, LOOP[1])
+            assert "loop closed" in command(bench, LOOP[1])
             until(lambda: rms_nm() < 0.1 * before_nm)
         states: list[wire.MirrorState] = []
         bus.subscribe(MIRROR_STATE, lambda sample: states.append(wire.MirrorState.FromString(sample.payload)))
@@ -166,8 +141,8 @@ def test_the_simulated_devices_and_a_camera_in_plain_zenoh_keep_the_contract(ben
     spot = 100 + 2000 * np.exp(-((y - 40) ** 2 + (x - 30) ** 2) / 50)
     np.save(bench / "frames.npy", np.random.default_rng(1).poisson(spot, (50, 80, 80)).astype(np.uint16))
     HostClock()  # this boot's clock, for a program that does not make it
-    said(bench, PLAIN[0].replace("bench", "plain"))
-    with running(bench, *SIMULATED, PLAIN[1]):
+    command(bench, PLAIN[0].replace("bench", "plain"))
+    with going_on(bench, *SIMULATED, PLAIN[1]):
         with listening() as bus:
             heard(bus)
         conformance(bench, *CONFORMANCE, CONFORMANCE[0].partition(" --config")[0].replace("bench", "plain"))
@@ -196,7 +171,7 @@ def test_a_camera_of_another_size_comes_to_a_closed_loop(bench: Path) -> None:
     assert len(COMMISSIONING) == 5
     (bench / "examples/small_camera.py").write_text(block("python"))
     (bench / "bench.toml").write_text(block("toml"))
-    with running(bench, *PAGE_DEVICES, CONTROLLER):
+    with going_on(bench, *PAGE_DEVICES, CONTROLLER):
         with listening() as bus:
             heard(bus)
         process = started(bench, f"{COMMISSION} --json")
@@ -212,5 +187,5 @@ def test_a_camera_of_another_size_comes_to_a_closed_loop(bench: Path) -> None:
             state = client.status().state
             assert state.mode_cause == "operator asked to close"
         assert calibration_file.load(bench / "calibration.fits").shape == (64, 64)
-    with running(bench, *PAGE_DEVICES, LATER):
+    with going_on(bench, *PAGE_DEVICES, LATER):
         until(lambda: closed(bench), 60)

@@ -1,13 +1,15 @@
 """Runs of the real processes, and what their logs hold."""
 
+import contextlib
 import json
 import os
+import shlex
 import signal
 import subprocess
 import sys
 import time
 from collections import defaultdict
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +20,7 @@ from typer.testing import CliRunner
 from lowfc.programs.cli.main import app
 
 LOWFC = [sys.executable, "-m", "lowfc"]
+PROGRAMS = Path(sys.executable).parent
 
 
 def run(folder: Path, *arguments: str, config: str = "", timeout_s: float = 120) -> "subprocess.CompletedProcess[str]":
@@ -78,6 +81,37 @@ def start(folder: Path, *arguments: object) -> "subprocess.Popen[str]":
         text=True,
         env=os.environ | {"PYTHONUNBUFFERED": "1"},
     )
+
+
+def command(folder: Path, line: str, timeout_s: float = 120, good: tuple[int, ...] = (0,)) -> str:
+    """What a documented command prints; what it redirects is left in the file."""
+    words, _, output = line.partition(" > ")
+    program, *rest = shlex.split(words, comments=True)
+    done = subprocess.run(
+        [PROGRAMS / program, *rest], cwd=folder, capture_output=True, text=True, timeout=timeout_s, check=False
+    )
+    assert done.returncode in good, f"{line}: {done.stdout} {done.stderr}"
+    assert "Traceback" not in done.stderr, done.stderr
+    if output:
+        (folder / output).write_text(done.stdout)
+    return done.stdout
+
+
+@contextlib.contextmanager
+def going_on(folder: Path, *lines: str) -> Iterator[list[str]]:
+    """Documented commands that go on until told to stop, and end cleanly then; their standard error is in the list."""
+    processes = [
+        subprocess.Popen([PROGRAMS / program, *rest], cwd=folder, stderr=subprocess.PIPE, text=True)
+        for program, *rest in map(shlex.split, lines)
+    ]
+    complaints: list[str] = []
+    try:
+        yield complaints
+    finally:
+        for process in processes:
+            process.terminate()
+        complaints += [process.communicate(timeout=20)[1] for process in processes]
+    assert all(process.returncode in (0, -signal.SIGTERM, 130) for process in processes), complaints
 
 
 def interrupt(process: "subprocess.Popen[str]", timeout_s: float = 20) -> tuple[str, str]:
