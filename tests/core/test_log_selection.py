@@ -11,7 +11,6 @@ from lowfc.adapters.logs.history import read_history
 from lowfc.adapters.logs.parts import WholeLog
 from lowfc.adapters.logs.reader import Logged, LogReader
 from lowfc.adapters.logs.selection import EVERYTHING, Selection, selection
-from lowfc.adapters.logs.series import Limits
 from lowfc.adapters.logs.thinning import thin
 from lowfc.contract.configuration import load
 from lowfc.contract.envelope import count_of
@@ -119,19 +118,6 @@ def test_a_disk_that_refuses_does_not_lose_what_was_left_out(tmp_path: Path) -> 
     summary = bench.stop()
     assert summary.failure == "full"
     assert summary.lost.get(FRAME.key, 0) <= 5
-
-
-def test_the_next_file_says_it_too(tmp_path: Path) -> None:
-    bench = Bench(tmp_path / "logs")
-    frames = bench.camera.publisher(FRAME)
-    bench.start(selection=Selection(2), limits=Limits(largest_bytes=20_000))
-    for number in range(2):
-        before = len(bench.recorder._series.files)
-        frames.put(np.random.default_rng(number).bytes(30_000), sequence=2 * number)
-        until(lambda before=before, number=number: number or len(bench.recorder._series.files) > before)
-    summary = bench.stop()
-    assert len(summary.files) >= 2
-    assert all(survey(path)["selection"] for path in summary.files)
 
 
 def test_a_smaller_copy_has_the_same_steps(whole: Path, small: Path) -> None:

@@ -1,28 +1,15 @@
 """The recorder: everything on the bus is in the log, or the log says what is missing."""
 
-import resource
-import signal
-import subprocess
-import sys
 import threading
-import time
 from collections import Counter
-from collections.abc import Iterator
 from pathlib import Path
 
-import numpy as np
 import pytest
 
-from lowfc import __version__
 from lowfc.adapters.bus.bus import Sample
-from lowfc.adapters.bus.run import Run, new_run_id, open_run
-from lowfc.adapters.bus.zenoh_bus import ZenohBus
 from lowfc.adapters.logs.loss_account import LossAccount
 from lowfc.adapters.logs.reader import LogReader
-from lowfc.adapters.logs.series import Limits
-from lowfc.adapters.logs.writer import UNFINISHED
 from lowfc.adapters.process.clock import HostClock
-from lowfc.adapters.process.service import Service
 from lowfc.contract.envelope import Envelope, count_of, sequence_of
 from lowfc.contract.errors import DataFileError
 from lowfc.contract.messages import (
@@ -48,14 +35,6 @@ pytestmark = pytest.mark.usefixtures("own_runtime")
 @pytest.fixture
 def bench(tmp_path: Path) -> Bench:
     return Bench(tmp_path / "logs")
-
-
-@pytest.fixture
-def small_disk() -> Iterator[None]:
-    before = resource.getrlimit(resource.RLIMIT_FSIZE)
-    resource.setrlimit(resource.RLIMIT_FSIZE, (300_000, before[1]))
-    yield
-    resource.setrlimit(resource.RLIMIT_FSIZE, before)
 
 
 def test_everything_is_recorded_verbatim(bench: Bench) -> None:
@@ -169,58 +148,6 @@ def test_every_lost_message_is_counted(bench: Bench) -> None:
     }
 
 
-def test_what_comes_twice_or_out_of_order_is_not_lost(bench: Bench) -> None:
-    frames = bench.camera.publisher(FRAME)
-    bench.start()
-    first = frames.put(b"0").sequence
-    for number in (1, 1, 3, 2, 4, 4):
-        frames.put(b"%d" % number, sequence=first + number)
-    summary = bench.stop()
-    assert bodies_of(logged(summary), FRAME) == [b"0", b"1", b"1", b"3", b"2", b"4", b"4"]
-    assert (summary.lost, bench.recorder._ledger.recorded()[FRAME.key]) == ({}, 7)
-    assert not any(event.startswith("MESSAGES_LOST") for event in bench.events)
-
-
-def test_logs_are_rotated_and_each_begins_with_the_calibration(bench: Bench) -> None:
-    put(bench.controller.publisher(CALIBRATION), 1)
-    frames = bench.camera.publisher(FRAME)
-    bench.start(limits=Limits(largest_bytes=20_000))
-    sent = []
-    for number in range(4):
-        before = len(bench.recorder._series.files)
-        sent.append(np.random.default_rng(number).bytes(30_000))
-        frames.put(sent[-1])
-        until(lambda before=before: len(bench.recorder._series.files) > before)
-    summary = bench.stop()
-    assert len(summary.files) == 5
-    for path in summary.files:
-        messages = list(LogReader(path))
-        assert messages[0].key == CALIBRATION.key
-        assert len(bodies_of(messages, CALIBRATION)) == 1
-    assert bodies_of(logged(summary), FRAME) == sent
-    assert summary.lost == {}
-    assert len(set(summary.files)) == 5
-
-
-def test_a_full_disk_ends_the_recording_and_nothing_else(bench: Bench, small_disk: None) -> None:
-    frames = bench.camera.publisher(FRAME)
-    bench.start()
-    for number in range(40):
-        frames.put(np.random.default_rng(number).bytes(20_000))
-    until(lambda: any(event.startswith("RECORDING_FAILED") for event in bench.events))
-    put(frames, 10)
-    assert bench.thread.is_alive()
-    summary = bench.stop()
-    assert "cannot be written" in summary.failure
-    (path,) = summary.files
-    read = list(LogReader(path))
-    assert path.suffix == UNFINISHED
-    assert [found.name for found in bench.folder.iterdir()] == [path.name]
-    assert len(read) == summary.messages
-    assert summary.lost[FRAME.key] == 50 - len(bodies_of(read, FRAME))  # to the last one, the unflushed ones too
-    assert bench.camera.last_health["recorder"].recording.lost == sum(summary.lost.values())
-
-
 def test_a_folder_that_cannot_be_written_is_an_error(bench: Bench) -> None:
     bench.folder.write_text("a file")
     bus = MemoryBus(bench.hub, "recorder", bench.clock)
@@ -299,98 +226,3 @@ def test_the_ledger_tells_apart_who_shares_a_topic() -> None:
         ledger.enter(*entry(EVENT, count, payload=Log(name=name).SerializeToString()), recorded=True)
     ledger.enter(*entry(EVENT, 0, payload=b"\xff"), recorded=True)
     assert ledger.lost() == {EVENT.key: 1}
-
-
-RECORD = """
-import sys
-from pathlib import Path
-from lowfc.adapters.bus.run import open_run
-from lowfc.programs.core.recording.process import record
-run, logs, toml = sys.argv[1:]
-summary = record(open_run(run), Path(logs), configuration=Path(toml), seed=7)
-print(summary.messages, sum(summary.lost.values()), summary.failure)
-"""
-
-
-class Camera:
-    """A camera on the real bus, in this process."""
-
-    def __init__(self, run: Run) -> None:
-        clock = HostClock()
-        self.bus = ZenohBus(run.links, "camera", clock)
-        self.service = Service("camera", run.run_id, clock, self.bus)
-        self.frames = self.service.publisher(FRAME)
-        self.service.state = "ready"
-
-
-@pytest.fixture
-def camera() -> Iterator[Camera]:
-    found = Camera(open_run(new_run_id()))
-    yield found
-    found.bus.close()
-
-
-@pytest.fixture
-def recording(camera: Camera, tmp_path: Path) -> Iterator[subprocess.Popen[str]]:
-    (tmp_path / "lowfc.toml").write_text("[loop]\n")
-    run_id = camera.service.health().run_id
-    process = subprocess.Popen(
-        [sys.executable, "-c", RECORD, run_id, tmp_path / "logs", tmp_path / "lowfc.toml"],
-        stdout=subprocess.PIPE,
-        text=True,
-    )
-    assert camera.service.wait_for(["recorder"], PATIENCE_S) == ()
-    yield process
-    process.kill()
-    process.communicate()
-
-
-@pytest.mark.exclusive
-def test_a_recorder_process_loses_nothing_from_the_first_frame_on(
-    camera: Camera, recording: subprocess.Popen[str], tmp_path: Path
-) -> None:
-    sent = []
-    for number in range(300):
-        sent.append(number.to_bytes(2) * 6400)
-        camera.frames.put(sent[-1])
-        camera.service.beat()
-        time.sleep(0.001)
-    recording.send_signal(signal.SIGTERM)
-    until(lambda: camera.service.last_health["recorder"].state == "stopping")
-    camera.frames.put(b"the last one, after the signal")
-    camera.service.finish()
-    out, _ = recording.communicate(timeout=PATIENCE_S)
-    (path,) = (tmp_path / "logs").iterdir()
-    reader = LogReader(path)
-    messages = list(reader)
-    assert bodies_of(messages, FRAME) == [*sent, b"the last one, after the signal"]
-    assert (recording.returncode, out) == (0, f"{len(messages)} 0 \n")
-    assert reader.complete
-    assert reader.attachments == {"lowfc.toml": b"[loop]\n"}
-    described = reader.metadata["lowfc"]
-    assert abs(float(described["clock_ahead_ms"])) < 1000
-    assert (described["seed"], described["lowfc"]) == ("7", __version__)
-    assert all(described[key] for key in ("host", "kernel", "processor", "python", "numpy", "eclipse-zenoh", "run"))
-
-
-@pytest.mark.exclusive
-def test_a_killed_recorder_leaves_a_readable_log_and_a_loop_that_goes_on(
-    camera: Camera, recording: subprocess.Popen[str], tmp_path: Path
-) -> None:
-    def on_disk() -> int:
-        return sum(len(bodies_of(list(LogReader(path)), FRAME)) for path in (tmp_path / "logs").iterdir())
-
-    def put_until_there() -> bool:
-        camera.frames.put(bytes(12_800))
-        camera.service.beat()
-        return on_disk() >= 20
-
-    until(put_until_there)
-    recording.kill()
-    recording.wait()
-    before = on_disk()
-    put(camera.frames, 100)
-    (path,) = (tmp_path / "logs").iterdir()
-    reader = LogReader(path)
-    assert len(bodies_of(list(reader), FRAME)) == before
-    assert (path.suffix, reader.complete, list(reader.attachments)) == (UNFINISHED, False, ["lowfc.toml"])

@@ -109,17 +109,6 @@ def test_a_disk_that_refuses_ends_the_recording_only(bench: Bench, device: Calla
     assert 10 <= check_account(bench, summary, frames) < frames.published - 10
 
 
-def test_a_real_disk_that_fills_up_ends_the_recording_only(bench: Bench, small_disk: Path) -> None:
-    bench.folder = small_disk
-    bench.start(limits=Limits(min_free_bytes=0))
-    frames = bench.camera.publisher(FRAME)
-    put_until(frames, lambda: told(bench, "RECORDING_FAILED"))
-    summary = bench.stop()
-    assert "No space left on device" in summary.failure
-    assert summary.files[0].suffix == UNFINISHED
-    assert 10 <= check_account(bench, summary, frames) < frames.published - 10
-
-
 def test_a_disk_that_is_nearly_full_leaves_a_complete_log(bench: Bench, small_disk: Path) -> None:
     bench.folder = small_disk / "logs"
     bench.start(limits=Limits(min_free_bytes=1_500_000))

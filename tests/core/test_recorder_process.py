@@ -16,7 +16,6 @@ import pytest
 from lowfc.adapters.bus.run import new_run_id, open_run
 from lowfc.adapters.bus.zenoh_bus import ZenohBus
 from lowfc.adapters.logs.reader import LogReader
-from lowfc.adapters.logs.recovery import recover
 from lowfc.adapters.logs.writer import UNFINISHED
 from lowfc.adapters.process.clock import HostClock
 from lowfc.adapters.process.provenance import provenance
@@ -25,7 +24,6 @@ from lowfc.contract.envelope import count_of
 from lowfc.contract.messages import FRAME, STEP, Topic
 from lowfc.programs.launch.watch import topic_count
 from tests.support.loops import lowfc, start, until
-from tests.support.other_readers import foxglove, rerun
 from tests.support.recording import PATIENCE_S, bodies_of
 
 SAFE_NS = 600_000_000
@@ -123,15 +121,11 @@ def benches(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[list[Ben
 
 
 @pytest.mark.exclusive
-@pytest.mark.node
 @pytest.mark.parametrize("benches", [10], indirect=True)
-@pytest.mark.parametrize("seed", [1, 2])
-def test_a_recorder_killed_at_any_moment_leaves_all_but_the_last_moment(
-    benches: list[Bench], seed: int, tmp_path: Path
-) -> None:
+def test_a_recorder_killed_at_any_moment_leaves_all_but_the_last_moment(benches: list[Bench], tmp_path: Path) -> None:
     """Ten recorders, each killed at a random moment of its own, while 200 frames a second go on."""
     parent = started(benches, tmp_path)
-    moments_s = np.random.default_rng(seed).uniform(0.3, 1.5, len(benches)) + time.monotonic()
+    moments_s = np.random.default_rng(1).uniform(0.3, 1.5, len(benches)) + time.monotonic()
     due_s = time.monotonic()
     while not all(bench.killed_ns for bench in benches):
         for bench, moment_s in zip(benches, moments_s, strict=True):
@@ -142,7 +136,6 @@ def test_a_recorder_killed_at_any_moment_leaves_all_but_the_last_moment(
         due_s += 0.005
         time.sleep(max(0.0, due_s - time.monotonic()))
     assert [int(line.split()[1]) for line in parent.communicate(timeout=PATIENCE_S)[0].splitlines()] == [9] * 10
-    made: dict[Path, int] = {}
     for bench in benches:
         reader = bench.read()
         messages = list(reader)
@@ -156,14 +149,6 @@ def test_a_recorder_killed_at_any_moment_leaves_all_but_the_last_moment(
             assert [int.from_bytes(message.payload[:8]) for message in found] == counts
             assert found[-1].publish_time_ns >= bench.killed_ns - SAFE_NS
         bench.put()  # the loop goes on
-        recovered = bench.folder / "recovered.mcap"
-        recover(reader.path, recovered)
-        made[recovered] = len(messages)
-    assert [one["counted"] for one in foxglove(made)] == list(made.values())
-    for path, count in made.items():
-        reader = LogReader(path)
-        assert (len(list(reader)), reader.complete, list(reader.attachments)) == (count, True, ["lowfc.toml"])
-        assert all(topic.key in rerun("check", path) for topic in (FRAME, STEP))
 
 
 SIGNALS = (
@@ -191,6 +176,7 @@ def test_however_it_is_told_to_stop_the_log_is_finished(benches: list[Bench], tm
         assert reader.complete
         assert len(bodies_of(messages, FRAME)) == len(bodies_of(messages, STEP)) == 50
         assert reader.metadata["recording"]["messages_lost"] == "0"
+        assert abs(float(reader.metadata["lowfc"]["clock_ahead_ms"])) < 1000
 
 
 @pytest.mark.exclusive
