@@ -9,10 +9,9 @@ import pytest
 import tomli_w
 
 from lowfc.adapters.files.factory import detector, mirror, mirror_limits, settings
-from lowfc.contract.configuration import PRESETS, Configuration, keys, load
+from lowfc.contract.configuration import Configuration, keys, load
 from lowfc.contract.errors import ConfigurationError
 from lowfc.programs.cli.config import commented
-from sim_camera.disturbance import disturbance
 from sim_dm.process import device
 
 KEYS = keys()
@@ -40,18 +39,8 @@ def test_the_defaults_are_valid_and_make_every_part() -> None:
     assert device(config).tighter.stroke_nm > config.safety.stroke_nm
 
 
-@pytest.mark.parametrize("preset", PRESETS)
-def test_every_preset_that_can_be_asked_for_exists(preset: str) -> None:
-    config = load(None, {"disturbance.preset": preset})
-    disturbance(config.disturbance.preset, config.noll, config.seed, 2.4, 550.0)
-
-
-@pytest.mark.parametrize("key", KEYS)
-def test_every_key_has_a_sentence(key: str) -> None:
-    sentence = KEYS[key].description
-    assert sentence, f"{key} has no sentence"
-    assert sentence.endswith(".")
-    assert len(sentence) > 10
+def test_every_key_has_a_sentence() -> None:
+    assert [key for key, info in KEYS.items() if not (info.description or "").endswith(".")] == []
 
 
 def test_toml_round_trip(tmp_path: Path) -> None:
@@ -89,36 +78,19 @@ def test_an_unknown_key_is_refused_with_the_nearest_known_one(
     ("key", "value"),
     [
         ("camera.rate_hz", 0),
-        ("camera.rate_hz", -5),
         ("camera.rate_hz", float("nan")),
-        ("camera.rate_hz", float("inf")),
-        ("camera.rate_hz", "fast"),
-        ("camera.delay_frames", 0.5),
-        ("camera.exposure_fraction", 1.5),
-        ("camera.bit_depth", 17),
-        ("camera.bit_depth", 12.5),
-        ("camera.bit_depth", "14"),
-        ("camera.bit_depth", 14.0),
         ("camera.rate_hz", "250"),
+        ("camera.bit_depth", 17),
+        ("camera.bit_depth", 14.0),
         ("camera.noise", 1),
         ("seed", True),
         ("control.leak", 1.1),
-        ("control.gain", -0.1),
-        ("control.estimator", "best"),
-        ("control.on_frame_timeout", "panic"),
         ("control.start_mode", "safed"),
         ("disturbance.preset", "earthquake"),
         ("mirror.name", "DM 1"),
-        ("mirror.rows", 0),
         ("mirror.dead", ["x"]),
-        ("mirror.nm_per_unit", 0),
-        ("mirror.magnification", 2.0),
-        ("mirror.shift_pitches", -3.0),
         ("mirror.flat", 7),
         ("safety.slew_nm", 0),
-        ("seed", -1),
-        ("sensor.nodes", 48),
-        ("lockstep", "perhaps"),
     ],
 )
 def test_a_value_out_of_range_is_one_line_with_key_and_value(tmp_path: Path, key: str, value: object) -> None:
@@ -180,10 +152,6 @@ def test_an_integer_will_do_for_a_float() -> None:
     assert isinstance(config.camera.rate_hz, float)
 
 
-def test_the_stroke_may_be_all_that_the_mirror_has() -> None:
-    assert load(None, {"safety.stroke_nm": 750.0}).safety.stroke_nm == 750
-
-
 def test_a_file_that_is_missing_or_no_toml_is_named(tmp_path: Path) -> None:
     assert complaint(tmp_path / "none.toml") == f"{tmp_path / 'none.toml'}: there is no such configuration file"
     assert "not a readable TOML file" in complaint(write(tmp_path, "seed = = 3"))
@@ -202,8 +170,3 @@ def test_overrides_lie_over_the_file(tmp_path: Path) -> None:
 def test_times_follow_from_the_rate() -> None:
     config = load(None, {"camera.rate_hz": 800.0, "camera.exposure_fraction": 0.4, "sensor.modes": 3})
     assert (config.period_ns, config.exposure_ns, config.noll) == (1_250_000, 500_000, (2, 3, 4))
-
-
-def test_a_configuration_does_not_change() -> None:
-    with pytest.raises(ValueError, match="frozen"):
-        Configuration().seed = 4

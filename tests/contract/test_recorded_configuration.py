@@ -5,18 +5,16 @@ import tempfile
 from pathlib import Path
 
 import pytest
-from click.testing import Result
-from typer.testing import CliRunner
 
 from lowfc.adapters.logs.history import attached_configuration, read_history
 from lowfc.adapters.logs.reader import LogReader
 from lowfc.contract.configuration import MOST_FAULTS, Configuration, load
 from lowfc.contract.errors import ConfigurationError, DataFileError
 from lowfc.contract.recorded_configuration import recorded
-from lowfc.programs.cli.main import app
 from lowfc.programs.commissioning.acceptance.played import SAID
 from lowfc.programs.view.recorded import draw_logs
 from lowfc.programs.view.renderer import Renderer
+from tests.support.loops import lowfc
 from tests.support.report_log import Night
 from tests.support.stage import Tape
 
@@ -113,26 +111,15 @@ def log(tmp_path: Path, night: Night) -> Path:
     return night.write(tmp_path / "night.mcap", toml=OTHER)
 
 
-def lowfc(*words: object) -> Result:
-    return CliRunner().invoke(app, [str(word) for word in words])
-
-
 @pytest.mark.parametrize(
     "words",
     [
-        ("info",),
         ("info", "--json"),
         ("report",),
-        ("report", "--json"),
-        ("export", "--to", "csv"),
         ("export", "--to", "npz", "--json"),
         ("tune",),
-        ("tune", "--json"),
-        ("what-if", "--set", "gain=0.3"),
         ("what-if", "--set", "gain=0.3", "--json"),
-        ("what-if", "--set", "estimator=pinv"),
         ("acceptance", "noise-floor"),
-        ("acceptance", "noise-floor", "--json"),
     ],
     ids=" ".join,
 )
