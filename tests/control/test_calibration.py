@@ -80,11 +80,6 @@ def test_with_read_noise_it_stays_at_the_bound_within_a_percent() -> None:
     assert (ratio < 1.01).all()
 
 
-def test_the_plain_estimator_is_noisier() -> None:
-    plain = np.diag(covariance("pinv", 1e5, 0.0)) / np.diag(cramer_rao(1e5, 0.0))
-    assert (plain > 1.01).all()
-
-
 @pytest.mark.parametrize("estimator", ESTIMATORS)
 def test_the_predicted_noise_is_that_of_a_monte_carlo(estimator: str) -> None:
     flux_e, read_noise_e, trials = 50_000.0, 3.0, 4000
@@ -136,11 +131,6 @@ def test_a_nuisance_that_is_a_mode_or_nothing_is_refused(nuisance: np.ndarray) -
         reconstructor(I0, H, GOOD, 1e5, 1.0, nuisance=beside)
 
 
-def test_nothing_of_the_flux_is_left_by_the_normalisation() -> None:
-    left = normalise_flux(TOY.reference, TOY.reference[:, None], GOOD)[1]
-    assert np.abs(left).max() < 1e-15
-
-
 def test_an_unknown_estimator_is_refused() -> None:
     with pytest.raises(ValueError, match="'best'"):
         reconstructor(TOY.reference, RESPONSE, GOOD, 1e5, 1.0, "best")
@@ -151,18 +141,6 @@ def test_condition_number_of_a_missing_mode_is_infinite() -> None:
     assert condition_number(np.column_stack([np.ones(4), np.zeros(4)])) == np.inf
 
 
-def test_an_estimate_is_right_at_any_flux_and_overwrites_only_its_scratch() -> None:
-    estimator = Estimator.of(calibration())
-    for flux_dn in (100_000.0, 200_000.0, 400_000.0):
-        pixels = TOY.pixels((3, -4, 5), flux_dn).reshape(-1)
-        before = pixels.copy()
-        found = estimator.estimate(pixels, 1000.0)
-        assert np.abs(found.error_nm - (3, -4, 5)).max() < 0.1
-        assert found.error_nm.dtype == np.float32
-        assert found.flux_dn == pytest.approx(flux_dn, rel=1e-4)
-        assert np.array_equal(pixels, before)
-
-
 def test_an_estimate_is_the_reconstructor_times_the_difference_from_the_reference() -> None:
     rng = np.random.default_rng(3)
     shifted = rng.uniform(0.5, 1.5, PIXELS) * calibration().reference  # so that R I0 is not zero
@@ -170,7 +148,9 @@ def test_an_estimate_is_the_reconstructor_times_the_difference_from_the_referenc
     out = np.empty(PIXELS, np.float32)
     for flux_dn in (30_000.0, 300_000.0):
         pixels = rng.poisson(TOY.pixels((3, -4, 5), flux_dn).reshape(-1)).astype(np.uint16)
+        before = pixels.copy()
         found = Estimator.of(known).estimate(pixels, 0.0)
+        assert (found.error_nm.dtype, pixels.tolist()) == (np.float32, before.tolist())
         assert found.flux_dn == pytest.approx(difference(known, pixels, 0.0, out), rel=1e-6)
         expected_nm = known.reconstructor.astype(np.float64) @ out
         assert np.abs(expected_nm).max() > 1

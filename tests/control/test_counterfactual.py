@@ -12,7 +12,6 @@ from lowfc.control.laws.what_if import (
     exposed,
     frames_since,
     missing_before,
-    rms,
     seen_nm,
 )
 from lowfc.control.loop.inputs import Step
@@ -95,22 +94,6 @@ def test_an_integrator_of_half_on_a_step_by_hand(delay: float, errors: list[floa
     assert command[:, 0].tolist() == np.cumsum([-0.5 * value for value in errors]).tolist()
 
 
-def test_under_refused_and_missing_frames_the_command_is_held() -> None:
-    pol, missing = single(8, np.nan, 8, 8), np.array([0, 0, 0, 2])
-    error, command = counterfactual(HALF, weights(2.0), pol, missing)
-    # frame 0 commands -4; 1 is refused, so that 2 sees -4; it commands -6; after two missing frames 5 sees -6
-    np.testing.assert_array_equal(error[:, 0], [8, np.nan, 4, 2])
-    assert command[:, 0].tolist() == [-4, -4, -6, -7]
-
-
-def test_modal_limits_act() -> None:
-    error, command = counterfactual(
-        as_logged(law_of(limit_nm=5.0, modes=1)), weights(1.0), single(8, 8, 8), NOTHING_MISSING[:3]
-    )
-    assert command[:, 0].tolist() == [-4, -5, -5]
-    assert error[:, 0].tolist() == [8, 4, 3]
-
-
 def test_any_function_of_state_and_error_is_a_controller() -> None:
     def every_other(state: int | None, error_nm: np.ndarray, pol_nm: np.ndarray) -> tuple[int, np.ndarray]:
         count = state or 0
@@ -133,11 +116,6 @@ def test_frames_that_came_again_or_late_are_no_exposures() -> None:
     rows = exposed(sequence)
     assert rows.tolist() == [True, True, False, False, True, False, True]
     assert missing_before(sequence[rows]).tolist() == [0, 0, 2, 0]
-
-
-def test_nothing_is_no_exposure() -> None:
-    assert exposed(np.zeros(0, np.uint64)).tolist() == []
-    assert missing_before(np.zeros(0, np.uint64)).tolist() == []
 
 
 @pytest.mark.parametrize("delay", [1.0, 1.4, 2.0, 2.7, 3.0])
@@ -187,8 +165,3 @@ def test_frames_are_counted_from_where_the_loop_begins_to_run() -> None:
     begins = np.array([0, 0, 0, 0, 0, 0, 1, 0], bool)
     missing = np.array([0, 0, 3, 0, 0, 0, 0, 0])
     assert frames_since(begins, running, missing).tolist() == [-1, 0, 4, 5, -1, 0, 0, 1]
-
-
-def test_rms_is_about_zero_and_over_the_rows_asked_for() -> None:
-    values = np.array([[3, 1], [4, 1], [np.nan, 9]], np.float32)
-    assert rms(values, np.array([True, True, False])).tolist() == pytest.approx([np.sqrt(12.5), 1.0])

@@ -168,13 +168,6 @@ def test_r_is_found_within_its_standard_error(patterns: np.ndarray) -> None:
     assert np.abs(made.matrix @ (found.reference - I0)).max() < 0.5
 
 
-def test_a_drift_does_not_get_into_h() -> None:
-    still, drifting = (calibrated(hadamard_patterns(MODES, 3.0), 4, drift) for drift in (0.0, 20.0))
-    matrix = still.initial.matrix
-    # Same photon noise but for the drifting light: a drift of 80 nm that got in would be of the order of one.
-    assert np.abs(matrix @ (drifting.response - still.response)).max() < 8 * still.error.max() + 0.02
-
-
 @pytest.mark.parametrize("seed", range(3))
 def test_the_noise_of_h_neither_makes_modes_small_nor_gets_into_r(seed: int) -> None:
     """H is measured so shortly that its pixels' noise is as strong as the modes."""

@@ -16,11 +16,11 @@ from lowfc.control.laws.spectra import LONGEST, MOST_BRIDGED, SHORTEST, Pieces, 
 from lowfc.control.laws.stability import delay_weights, settling_frames
 from lowfc.control.laws.transfer_function import departure, measured, seen_of_mirror
 from lowfc.control.loop.advance import advance
-from lowfc.control.loop.inputs import Frame, Request
+from lowfc.control.loop.inputs import Request
 from lowfc.control.loop.safety import LoopMode
 from lowfc.control.loop.state import FADING_FRAMES, SETTLING_FRAMES, Settings, State
-from tests.support.theory import linear, rejection
-from tests.support.toy import NOLL, TOY, calibration, frame, frame_sequence, live, loaded, settings
+from tests.support.theory import linear
+from tests.support.toy import NOLL, calibration, frame, live, loaded, settings
 
 RATE_HZ = 500.0
 
@@ -130,21 +130,6 @@ def test_bins_are_even_in_the_logarithm_and_keep_a_straight_line() -> None:
     assert (np.diff(centres_hz) > 0).all()
     steps = np.diff(np.log10(centres_hz[centres_hz > 5]))
     assert steps == pytest.approx(0.1, abs=0.03)
-
-
-@pytest.mark.parametrize(("gain", "leak", "delay"), [(0.5, 0.0, 1), (0.3, 0.02, 2)])
-def test_closed_over_open_is_the_rejection(gain: float, leak: float, delay: int) -> None:
-    disturbance = np.random.default_rng(5).standard_normal(60_000)
-    residual = np.empty_like(disturbance)
-    commands = [0.0] * delay
-    for index, wave_nm in enumerate(disturbance):
-        residual[index] = wave_nm + commands[-1]
-        commands = [(1 - leak) * commands[0] - gain * residual[index], *commands[:-1]]
-    found = spectrum(whole(np.stack([disturbance, residual], axis=1)), RATE_HZ)
-    frequency_hz, (before, after) = in_bins(found.frequency_hz, list(found.power_nm2_hz.T), per_decade=10)
-    above = frequency_hz > 2
-    expected = rejection(frequency_hz[above], RATE_HZ, gain, leak, delay)
-    assert np.sqrt(after / before)[above] == pytest.approx(expected, rel=0.08)
 
 
 PERIOD = 3000
@@ -328,12 +313,3 @@ def test_a_shape_is_captured_where_the_loop_takes_it_away(gain: tuple[float, flo
     before, after = slice(20, 40), slice(int(starts[1]) + 30, int(starts[1]) + 40)
     assert captured(error_nm, command_nm, 1, 30.0, before, after) is expected
     assert not captured(np.zeros_like(error_nm), np.zeros_like(command_nm), 1, 30.0, before, after)
-
-
-def test_a_frame_of_the_play_is_the_one_it_was_answered_with() -> None:
-    what = settings()
-    state, _ = advance(what, loaded(what), frame(1))
-    state, outputs = advance(what, state, Request(0, "play", text="offset", table=np.full((3, 3), 5.0, np.float32)))
-    assert outputs.reply.frame_sequence == frame_sequence(2)
-    _, outputs = advance(what, state, Frame(frame_sequence(2), 0, 0, TOY.pixels((0, 0, 0))))
-    assert outputs.step.error_nm == pytest.approx(-5.0, abs=0.05)

@@ -15,7 +15,7 @@ from lowfc.control.laws.tuning import predicted_nm
 from lowfc.control.laws.vibration import FEWEST, Line, Model, identify, resolution_hz
 from lowfc.optics.detector.photometry import tilt_nm_per_mas
 from sim_camera.disturbance import LINES_HZ, disturbance, modes_nm
-from tests.support.theory import integrators, realised, run
+from tests.support.theory import realised, run
 
 RATE_HZ = 1000.0
 NM_PER_MAS = tilt_nm_per_mas(2.0)
@@ -97,10 +97,6 @@ SAMPLED = Timing.sampled(1.0)
 MODEL = Model(0.02, 5.0, (Line(18, 0.3, 60.0), Line(71, 0.5, 20.0)), 0.7, RATE_HZ)
 
 
-def predicted(timing: Timing) -> float:
-    return float(predicted_nm(lqg([MODEL], (2,), timing), [MODEL], timing)[0])
-
-
 def residual_nm2(model: Model, whole_frames: int) -> float:
     """Variance that the law leaves, if the model is true, for a delay of whole frames: Riccati's, that far ahead."""
     A, Q, C = model.states()
@@ -151,24 +147,6 @@ def test_a_loop_leaves_what_is_predicted(delay_frames: float) -> None:
     assert np.sqrt(left) == pytest.approx(predicted_nm(law, [MODEL], Timing.sampled(delay_frames))[0], rel=0.1)
 
 
-def test_a_fraction_of_a_frame_costs_something_in_between() -> None:
-    delays = [1.0, 1.25, 1.5, 1.75, 2.0]
-    left = [
-        predicted_nm(lqg([MODEL], (2,), Timing.sampled(delay)), [MODEL], Timing.sampled(delay))[0] for delay in delays
-    ]
-    assert left[0] * 0.999 < left[1]
-    assert left == sorted(left) or max(np.diff(left)) > 0
-    assert left[2] < left[4] * 1.001
-    assert left[3] < left[4] * 1.2
-
-
-def test_no_integrator_comes_near() -> None:
-    best = min(
-        predicted_nm(integrators([(g, 0.0)], "error", 1.0), [MODEL], SAMPLED)[0] for g in np.arange(0.1, 1.5, 0.1)
-    )
-    assert np.sqrt(residual_nm2(MODEL, 1)) < 0.5 * best
-
-
 def test_a_constant_is_taken_out_whatever_the_noise() -> None:
     law = lqg([replace(MODEL, drift_nm2=1e-6)], (2,), SAMPLED)
     assert rejection(law, np.array([1e-4]), 1.0)[0, 0] < 0.01
@@ -200,12 +178,3 @@ def test_lines_all_but_undamped_have_a_filter_within_the_unit_circle() -> None:
 def test_models_of_two_rates_are_refused() -> None:
     with pytest.raises(ValueError, match=r"one frame rate, got \[500.0, 1000.0\]"):
         lqg([MODEL, replace(MODEL, rate_hz=500.0)], (2, 3), SAMPLED)
-
-
-def test_the_least_variance_of_white_noise_is_its_own() -> None:
-    """Nothing of it can be foreseen; of a random walk with little noise, one frame ahead, its own step is lost."""
-    assert minimum_variance_nm2(np.full(4097, 4.0), 1.0, 1) == pytest.approx(4.0)
-    omega = np.linspace(0, np.pi, (1 << 16) + 1)
-    walk = 0.01 / (4 * np.sin(np.maximum(omega, omega[1] / 2) / 2) ** 2)
-    assert minimum_variance_nm2(walk, 1e-9, 1) == pytest.approx(0.01, rel=0.05)
-    assert minimum_variance_nm2(walk, 1e-9, 3) == pytest.approx(0.03, rel=0.05)

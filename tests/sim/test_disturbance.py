@@ -77,15 +77,6 @@ def test_the_reaction_wheel_is_14_mas_per_axis_with_its_five_lines() -> None:
         assert (np.diff(power[lines]) < 0).all()
 
 
-def test_its_lines_are_in_the_frames_too() -> None:
-    """A spectrum of frames, independent of the table of waves: ten seconds, so that lines fall on whole bins."""
-    tilt_mas = modes_nm(preset("reaction-wheel"), 12_345, 10_000, RATE_HZ)[:, 0] / NM_PER_MAS
-    amplitude = np.abs(np.fft.rfft(tilt_mas - tilt_mas.mean())) / 5000
-    frequency = np.fft.rfftfreq(10_000, 1 / RATE_HZ)
-    strong = frequency[(amplitude > 1.5) & (frequency > 5.5)]
-    assert strong == pytest.approx(LINES_HZ)
-
-
 def test_the_lines_phases_of_the_two_axes_differ() -> None:
     shaken = preset("reaction-wheel")
     tilts = shaken.amplitude_nm[np.isin(shaken.frequency_hz, LINES_HZ), :2]
@@ -119,10 +110,6 @@ def test_quiet_is_nothing_but_what_is_asked() -> None:
     assert (still == still[0]).all()
     assert still[0][[0, 9]].tolist() == [4, -7]
     assert np.count_nonzero(still[0]) == 2
-
-
-def test_kolmogorov_is_a_screen_of_a_twentieth_of_a_wave() -> None:
-    assert preset("kolmogorov").screen_nm == pytest.approx(0.05 * 550)
 
 
 def test_the_screen_has_kolmogorovs_spectrum_and_comes_from_the_seed() -> None:
@@ -176,12 +163,6 @@ def test_a_tenth_of_the_frames_is_lost_as_the_seed_says() -> None:
     assert lost <= set(range(FIRST, FIRST + FRAMES))
     assert len(lost) == pytest.approx(LOST_SHARE * FRAMES, rel=0.5)
     assert order(Kind.LOST) == order(Kind.LOST) != order(Kind.LOST, seed=6)
-
-
-def test_duplicated_frames_come_twice_in_their_order() -> None:
-    found = order(Kind.DUPLICATED)
-    assert found == sorted(found)
-    assert {frame for frame, count in Counter(found).items() if count == 2} == set(range(FIRST, FIRST + FRAMES))
 
 
 def test_reordered_frames_come_in_pairs_the_second_one_first() -> None:

@@ -13,6 +13,7 @@ from lowfc.contract.configuration import load
 from lowfc.control.loop.safety import Limit, Limits, Reason, Rejection, neighbour_difference_nm
 from sim_dm.device import LONGEST_VALID_NS, Command, Device, Status, apply_command, initial, tick
 from sim_dm.process import device as device_of
+from tests.support.safety_checks import violations
 
 GRID = (4, 5)
 LIMITS = Limits(750.0, 150.0, 500.0)
@@ -41,18 +42,6 @@ def follow(device: Device, status: Status, *heights_nm: float) -> Status:
         status, refused = apply_command(device, status, told(even(height_nm), index), START_NS + index * MS)
         assert refused is None
     return status
-
-
-def broken(before: Single, after: Single) -> list[str]:
-    """Limits that the driver's output breaks, by float64 and without tolerance."""
-    now, then = after.astype(np.float64), before.astype(np.float64)
-    figures = (
-        ("finite", 0 if np.isfinite(now).all() else 1, 0),
-        ("stroke", np.abs(now).max(), LIMITS.stroke_nm),
-        ("slew", np.abs(now - then).max(), LIMITS.slew_nm),
-        ("neighbours", neighbour_difference_nm(after.astype(np.float64)), LIMITS.neighbour_nm),
-    )
-    return [name for name, value, bound in figures if not value <= bound]
 
 
 def test_clear_makes_the_mirror_forget_the_newest_command() -> None:
@@ -125,7 +114,7 @@ def test_whatever_it_is_told_the_surface_keeps_the_limits(script: list[object], 
             after = tick(device, status, now_ns)
         else:
             after, _ = apply_command(device, status, told(what, index + 1), now_ns)
-        assert broken(status.surface_nm, after.surface_nm) == []
+        assert violations(LIMITS, status.surface_nm, after.surface_nm) == []
         status = after
 
 
