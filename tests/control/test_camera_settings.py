@@ -49,11 +49,15 @@ def opened(*inputs: Input) -> State:
     return feed(USUAL, state, *inputs)[0]
 
 
-def test_a_bias_below_the_dark_is_no_reason_not_to_close() -> None:
-    state, reply = answer(opened(CAMERA, frame(1)), "close")
-    assert reply.accepted
-    state, _ = feed(USUAL, state, replace(CAMERA, time_ns=9), frame(2))
-    assert state.mode is LoopMode.CLOSED
+def test_a_camera_that_no_longer_fits_opens_the_loop() -> None:
+    """A bias below the dark is no reason: clock-induced charge and dark current lie between them."""
+    state, every = feed(USUAL, loaded(USUAL), frame(1), CAMERA)
+    assert (state.mode, names(every)) == (LoopMode.CLOSED, [])
+    assert feed(USUAL, state, replace(CAMERA, time_ns=9)) == (state, [Outputs()])
+    state, every = feed(USUAL, state, WRONG)
+    assert (state.mode, names(every)) == (LoopMode.OPEN, ["CAMERA_CHANGED", "MODE_CHANGED"])
+    assert "bias_dn" in str(every[0].events[0].details["what"])
+    assert state.conditions.mode_cause.startswith("the camera does not fit the calibration")
 
 
 @pytest.mark.parametrize("name", ["close", "step", "law"])
@@ -91,6 +95,8 @@ def test_settings_of_a_calibration_belong_to_its_identity_only_where_there_are_s
     [
         (replace(CAMERA, bias_dn=CAMERA.bias_dn + 2.9), []),
         (replace(CAMERA, bias_dn=CAMERA.bias_dn + 3.1), ["bias_dn"]),
+        (replace(CAMERA, shape=(7, 8)), ["rows", "columns"]),
+        (replace(CAMERA, saturation_dn=4095.0), ["saturation_dn"]),
         (replace(CAMERA, em_gain=300.0), ["em_gain"]),
         (replace(CAMERA, gain_e_per_dn=1.005), []),
         (replace(CAMERA, gain_e_per_dn=2.0), ["gain_e_per_dn"]),

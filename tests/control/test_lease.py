@@ -13,7 +13,6 @@ from lowfc.control.loop.inputs import Outputs, Reply, Request, Tick
 from lowfc.control.loop.lease import MAX_S
 from lowfc.control.loop.safety import LoopMode
 from lowfc.control.loop.state import State
-from lowfc.control.loop.wording import counted
 from tests.support.toy import GRID, NOLL, SOME, answered, feed, frame, frame_sequence, loaded, names, settings
 
 USUAL = settings(rate_hz=1000.0)
@@ -226,20 +225,6 @@ def test_a_channel_that_is_not_there_is_said_so_and_one_that_is_there_is_removed
 def test_an_offset_beyond_its_limit_names_its_mode() -> None:
     _, reply = replied(loaded(USUAL), "offset", 80.0, modes=(4,))
     assert (reply.accepted, reply.text) == (False, "offset of mode 4: at most its limit, 50 nm; asked for 80 nm")
-
-
-@pytest.mark.parametrize(
-    ("words", "expected"),
-    [
-        ((0, "frame"), "0 frames"),
-        ((1.0, "frame"), "1 frame"),
-        ((1.5, "frame"), "1.5 frames"),
-        ((1234567, "message"), "1234567 messages"),
-        ((2, "process", "processes"), "2 processes"),
-    ],
-)
-def test_a_number_goes_with_its_noun(words: tuple[float, str], expected: str) -> None:
-    assert counted(*words) == expected
 
 
 def test_events_keep_singular_and_plural() -> None:

@@ -74,14 +74,6 @@ def test_a_law_begins_anew() -> None:
     np.testing.assert_array_equal(state.drive.following.x, LawRunner.at_rest(law).x)
 
 
-def test_the_same_report_again_is_no_news() -> None:
-    state, _ = feed(USUAL, running(), LOST)
-    after, every = feed(USUAL, state, MirrorReport(9, LOST.fault))
-    assert after is state
-    assert names(every) == []
-    assert feed(USUAL, running(), BACK)[1][0].events == ()
-
-
 def test_an_open_loop_measures_without_a_mirror_and_is_not_closed() -> None:
     state, every = feed(USUAL, running(), Request(0, "open"), LOST, *frames(6), Request(0, "close"))
     assert every[2].step.error_nm is not None
