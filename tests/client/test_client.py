@@ -654,5 +654,5 @@ def test_a_recorder_is_told_nothing_else(bench: Bench) -> None:
     bus = MemoryBus(bench.hub, "operator", bench.clock)
     (answer,) = bus.get("lowfc/record/dance", timeout_s=10)
     message = wire.Request.FromString(answer.payload)
-    assert (message.accepted, message.reply) == (False, "a recorder is told to start or to stop, not to dance")
+    assert (message.accepted, message.reply) == (False, "a recorder can start and stop, not dance")
     bench.stop()

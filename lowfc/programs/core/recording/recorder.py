@@ -6,6 +6,7 @@ are counted, and never time in the loop. A disk that refuses ends the recording 
 
 import signal
 import time
+from collections import deque
 from collections.abc import Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from functools import partial
@@ -13,7 +14,7 @@ from pathlib import Path
 from types import FrameType
 
 from lowfc.adapters.bus.backlog import Backlog
-from lowfc.adapters.bus.bus import UNREADABLE, Bus, Sample
+from lowfc.adapters.bus.bus import ALL, UNREADABLE, Bus, Query, Sample
 from lowfc.adapters.logs.loss_account import LossAccount
 from lowfc.adapters.logs.selection import EVERYTHING, Selection
 from lowfc.adapters.logs.series import STANDARD, Limits, LogSeries
@@ -22,10 +23,9 @@ from lowfc.adapters.process.clock import Clock
 from lowfc.adapters.process.realtime import NOTHING, Granted
 from lowfc.adapters.process.service import Service
 from lowfc.contract.errors import BadMessageError, DataFileError
-from lowfc.contract.messages import EVENT, HEALTH, TOPICS, Role, Topic, wire
+from lowfc.contract.messages import EVENT, HEALTH, RECORD_KEY, TOPICS, Role, Topic, timestamp, wire
 from lowfc.programs.core.recording.peers import Others
 from lowfc.programs.core.recording.summary import Summary
-from lowfc.programs.core.recording.switch import RecordingSwitch
 from lowfc.programs.core.recording.volume import in_words
 
 QUEUE_MESSAGES = 20_000
@@ -81,7 +81,8 @@ class Recorder:
         for topic in TOPICS:
             bus.subscribe(topic, partial(self._backlog.put, topic))
         self.service = Service(Role.RECORDER, run_id, clock, bus, granted=granted, fill=self._fill)
-        self._switch = RecordingSwitch(bus, clock, {"start": self._resume, "stop": self._pause}, self._outlook)
+        self._queries: deque[Query] = deque()
+        bus.queryable(RECORD_KEY.format(name=ALL), self._queries.append)
 
     def catch_signals(self) -> None:
         """Finish the log at SIGTERM, Ctrl-C or a lost terminal; a second one does not wait for the others' last words.
@@ -142,7 +143,7 @@ class Recorder:
             self._write(sample)
         if self._clock.host_ns() >= self._flush_due_ns:
             self._look_after()
-        self._switch.serve(self._series.files)
+        self._answer_operator()
         self.service.beat()
 
     def _write_waiting(self) -> None:
@@ -153,6 +154,28 @@ class Recorder:
             self._longest_wait_ns = max(self._longest_wait_ns, now_ns - self._arrival_ns(sample))
             if now_ns >= self._flush_due_ns:
                 self._look_after()
+
+    def _answer_operator(self) -> None:
+        """Start and stop as asked, and answer with the log; a stop is answered once the disk has the log."""
+        while self._queries:
+            query = self._queries[0]
+            if query.name not in ("start", "stop"):
+                refusal: str | None = f"a recorder can start and stop, not {query.name}"
+            else:
+                refusal = self._resume() if query.name == "start" else self._pause()
+            if refusal is None:
+                return
+            self._queries.popleft()
+            path = str(self._series.files[-1].absolute()) if self._series.files else ""
+            outlook = self._outlook() if query.name == "start" else ""
+            answer = wire.Request(
+                timestamp=timestamp(self._clock.now_ns()),
+                name=query.name,
+                text=path,
+                accepted=not refusal,
+                reply=refusal or "; ".join(filter(None, (f"{query.name}: {path}", outlook))),
+            )
+            query.reply(answer.SerializeToString())
 
     def _pause(self) -> str | None:
         """Finish the log with all that has arrived; return why not, if so, and None until the disk has it."""
