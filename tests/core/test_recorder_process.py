@@ -1,16 +1,12 @@
-"""The recorder as a process: killed at any moment, told to stop in any way, refused where there is no room."""
+"""The recorder as a process: killed, told to stop in any way, refused where there is no room."""
 
-import contextlib
 import json
 import os
 import signal
-import subprocess
-import sys
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from pathlib import Path
 
-import numpy as np
 import pytest
 
 from lowfc.adapters.bus.run import new_run_id, open_run
@@ -20,48 +16,28 @@ from lowfc.adapters.logs.writer import UNFINISHED
 from lowfc.adapters.process.clock import HostClock
 from lowfc.adapters.process.provenance import provenance
 from lowfc.adapters.process.service import Service
-from lowfc.contract.envelope import count_of
+from lowfc.contract.errors import LowfcError
 from lowfc.contract.messages import FRAME, STEP, Topic
 from lowfc.programs.launch.watch import topic_count
 from tests.support.loops import lowfc, start, until
 from tests.support.recording import PATIENCE_S, bodies_of
 
-SAFE_NS = 600_000_000
+SAFE_S = 0.6
 """What a kill may cost: the messages published in this time before it."""
-
-# One process imports everything, and a copy of it becomes the recorder of each run.
-RECORDERS = """
-import os, signal, sys
-from pathlib import Path
-from lowfc.adapters.bus.run import open_run
-from lowfc.programs.core.recording.process import record
-signal.signal(signal.SIGHUP, signal.SIG_DFL)  # tests under nohup would leave it ignored
-folder, *runs = sys.argv[1:]
-for run in runs:
-    pid = os.fork()
-    if not pid:
-        done = record(open_run(run), Path(folder) / run, configuration=Path(folder) / "lowfc.toml")
-        os._exit(1 if done.failure else 0)
-    print(pid, flush=True)
-for _ in runs:
-    print(*os.waitpid(-1, 0), flush=True)
-"""
 
 
 class Bench:
     """A run with a camera in this process and a recorder in another."""
 
-    def __init__(self, folder: Path) -> None:
+    def __init__(self, folder: Path, *options: object) -> None:
         self.run = open_run(new_run_id())
         self.folder = folder / self.run.run_id
-        self.clock = HostClock()
-        self.bus = ZenohBus(self.run.links, "camera", self.clock)
-        self.service = Service("camera", self.run.run_id, self.clock, self.bus)
+        clock = HostClock()
+        self.bus = ZenohBus(self.run.links, "camera", clock)
+        self.service = Service("camera", self.run.run_id, clock, self.bus)
         self.frames, self.steps = self.service.publisher(FRAME), self.service.publisher(STEP)
-        self.pid = 0
-        self.parent: subprocess.Popen[str] | None = None
-        self.killed_ns = 0
         self.service.state = "ready"
+        self.recorder = start(folder, "record", "--run", self.run.run_id, "--folder", self.folder, *options)
 
     def put(self) -> None:
         number = self.frames.published
@@ -83,127 +59,79 @@ class Bench:
         self.service.beat()
         return "recorder" in self.service.last_health and self.service.last_health["recorder"].state == state
 
-    def read(self) -> LogReader:
-        (path,) = self.folder.iterdir()
-        return LogReader(path)
+    def stop(self, *signals: int) -> tuple[str, str]:
+        """End the recorder by these signals, a moment apart; return what it printed."""
+        for number in signals:
+            self.recorder.send_signal(number)
+            time.sleep(0.05)  # it waits for the camera's last Health by now
+        if len(signals) == 1 and signals[0] != signal.SIGKILL:
+            until(lambda: self.recorder_is("stopping"))
+            self.service.finish()
+        return self.recorder.communicate(timeout=PATIENCE_S)
 
     def close(self) -> None:
+        self.recorder.kill()
+        self.recorder.communicate()
         self.bus.close()
         self.run.remove()
 
 
-def started(benches: Sequence[Bench], folder: Path) -> "subprocess.Popen[str]":
-    """Start the recorders of all runs; return their parent, which says how each ended."""
-    (folder / "lowfc.toml").write_text("[camera]\n")
-    parent = subprocess.Popen(
-        [sys.executable, "-c", RECORDERS, folder, *(bench.run.run_id for bench in benches)],
-        stdout=subprocess.PIPE,
-        text=True,
-        env={**os.environ, "OPENBLAS_NUM_THREADS": "1"},
-        start_new_session=True,
-    )
-    for bench in benches:
-        bench.parent = parent
-        bench.pid = int(parent.stdout.readline())
-    until(lambda: sum(bench.recorder_is("ready") for bench in benches) == len(benches))  # all of them beat
-    return parent
-
-
 @pytest.fixture
-def benches(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[list[Bench]]:
-    found = [Bench(tmp_path) for _ in range(request.param)]
-    yield found
-    for bench in found:
-        bench.close()
-    for parent in {bench.parent for bench in found if bench.parent is not None}:
-        with parent, contextlib.suppress(ProcessLookupError):  # where all went well, none of them is left
-            os.killpg(parent.pid, signal.SIGKILL)
+def bench(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[Bench]:
+    hang_up = signal.signal(signal.SIGHUP, signal.SIG_DFL)  # tests under nohup would leave it ignored
+    found = Bench(tmp_path, *getattr(request, "param", ()))
+    signal.signal(signal.SIGHUP, hang_up)
+    try:
+        until(lambda: found.recorder_is("ready"))
+        yield found
+    finally:
+        found.close()
 
 
 @pytest.mark.exclusive
-@pytest.mark.parametrize("benches", [10], indirect=True)
-def test_a_recorder_killed_at_any_moment_leaves_all_but_the_last_moment(benches: list[Bench], tmp_path: Path) -> None:
-    """Ten recorders, each killed at a random moment of its own, while 200 frames a second go on."""
-    parent = started(benches, tmp_path)
-    moments_s = np.random.default_rng(1).uniform(0.3, 1.5, len(benches)) + time.monotonic()
-    due_s = time.monotonic()
-    while not all(bench.killed_ns for bench in benches):
-        for bench, moment_s in zip(benches, moments_s, strict=True):
-            bench.put()
-            if not bench.killed_ns and time.monotonic() >= moment_s:
-                bench.killed_ns = bench.clock.host_ns()
-                os.kill(bench.pid, signal.SIGKILL)
-        due_s += 0.005
-        time.sleep(max(0.0, due_s - time.monotonic()))
-    assert [int(line.split()[1]) for line in parent.communicate(timeout=PATIENCE_S)[0].splitlines()] == [9] * 10
-    for bench in benches:
-        reader = bench.read()
-        messages = list(reader)
-        assert reader.path.suffix == UNFINISHED
-        assert (reader.complete, list(reader.attachments)) == (False, ["lowfc.toml"])
-        assert reader.metadata["lowfc"]["run"] == bench.run.run_id
-        for topic in (FRAME, STEP):
-            found = [message for message in messages if message.key == topic.key]
-            counts = [count_of(message.sequence) for message in found]
-            assert counts == list(range(counts[0], counts[0] + len(counts)))
-            assert [int.from_bytes(message.payload[:8]) for message in found] == counts
-            assert found[-1].publish_time_ns >= bench.killed_ns - SAFE_NS
-        bench.put()  # the loop goes on
-
-
-SIGNALS = (
-    (signal.SIGTERM, signal.SIGTERM),
-    (signal.SIGINT, signal.SIGINT),
-    (signal.SIGHUP,),
-    (signal.SIGINT, signal.SIGTERM),
+@pytest.mark.parametrize(
+    "signals",
+    [
+        (signal.SIGTERM, signal.SIGTERM),
+        (signal.SIGHUP,),
+        (signal.SIGINT, signal.SIGTERM),
+        (signal.SIGKILL,),
+    ],
 )
+def test_however_it_ends_the_log_has_all(bench: Bench, signals: tuple[signal.Signals, ...]) -> None:
+    bench.put_many(50)
+    killed = signal.SIGKILL in signals
+    if killed:
+        time.sleep(SAFE_S)
+    bench.stop(*signals)
+    assert bench.recorder.returncode == (-signal.SIGKILL if killed else 0)
+    (log,) = bench.folder.iterdir()
+    reader = LogReader(log)
+    messages = list(reader)
+    assert (reader.complete, log.suffix == UNFINISHED) == (not killed, killed)
+    assert list(reader.attachments) == ["config.toml"]
+    assert abs(float(reader.metadata["lowfc"]["clock_ahead_ms"])) < 1000
+    for topic in (FRAME, STEP):
+        assert [int.from_bytes(body[:8]) for body in bodies_of(messages, topic)] == list(range(50))
+    assert killed or reader.metadata["recording"]["messages_lost"] == "0"
 
 
 @pytest.mark.exclusive
-@pytest.mark.parametrize("benches", [len(SIGNALS)], indirect=True)
-def test_however_it_is_told_to_stop_the_log_is_finished(benches: list[Bench], tmp_path: Path) -> None:
-    parent = started(benches, tmp_path)
-    for bench, signals in zip(benches, SIGNALS, strict=True):
-        bench.put_many(50)
-        for number in signals:
-            os.kill(bench.pid, number)
-            time.sleep(0.05)  # it waits for the camera's last words by now
-    ends = [int(line.split()[1]) for line in parent.communicate(timeout=PATIENCE_S)[0].splitlines()]
-    assert ends == [0] * len(SIGNALS)
-    for bench in benches:
-        reader = bench.read()
-        messages = list(reader)
-        assert reader.complete
-        assert len(bodies_of(messages, FRAME)) == len(bodies_of(messages, STEP)) == 50
-        assert reader.metadata["recording"]["messages_lost"] == "0"
-        assert abs(float(reader.metadata["lowfc"]["clock_ahead_ms"])) < 1000
-
-
-@pytest.mark.exclusive
-def test_the_command_rotates_and_says_what_it_did(tmp_path: Path) -> None:
-    bench = Bench(tmp_path)
-    process = start(
-        tmp_path, "record", "--run", bench.run.run_id, "--folder", tmp_path / "logs", "--longest-s", 1, "--json"
-    )
-    until(lambda: bench.recorder_is("ready"))
-
+@pytest.mark.parametrize("bench", [("--longest-s", 1, "--json")], indirect=True)
+def test_the_command_rotates_and_says_what_it_did(bench: Bench) -> None:
     def put_until_rotated() -> bool:
         bench.put()
-        return len(list((tmp_path / "logs").iterdir())) > 1
+        return len(list(bench.folder.iterdir())) > 1
 
     until(put_until_rotated)
     bench.frames.published += 3  # of these nobody hears
     bench.put()
-    process.send_signal(signal.SIGTERM)
-    until(lambda: bench.recorder_is("stopping"))
-    bench.service.finish()
-    out, wrong = process.communicate(timeout=PATIENCE_S)
+    out, wrong = bench.stop(signal.SIGTERM)
     published = bench.frames.published - 3
-    bench.close()
     done = json.loads(out)
     logs = [Path(log) for log in done["logs"]]
-    assert (process.returncode, done["failure"]) == (0, None)
-    assert sorted((tmp_path / "logs").iterdir()) == sorted(logs)
+    assert (bench.recorder.returncode, done["failure"]) == (0, None)
+    assert sorted(bench.folder.iterdir()) == sorted(logs)
     assert len(logs) > 1
     assert (done["messages_lost"], done["lost"]) == (3, {FRAME.key: 3})
     assert f"MESSAGES_LOST 3 messages lost on {FRAME.key}" in wrong
@@ -216,23 +144,11 @@ def test_the_command_rotates_and_says_what_it_did(tmp_path: Path) -> None:
 
 
 @pytest.mark.exclusive
-def test_a_recording_is_ended_where_the_controller_has_died(tmp_path: Path, own_runtime: Path) -> None:
-    bench = Bench(tmp_path)
-    process = start(tmp_path, "record", "--run", bench.run.run_id, "--folder", tmp_path / "logs")
-    until(lambda: bench.recorder_is("ready"))
-    bench.put_many(20)
+def test_a_recording_is_ended_where_the_controller_has_died(own_runtime: Path, bench: Bench) -> None:
     stopped = lowfc("ctl", "record", "stop", "--json")
-    reader = LogReader(Path(json.loads(stopped.stdout)["log"]))
-    assert len(bodies_of(list(reader), FRAME)) == 20
-    assert reader.complete
+    assert LogReader(Path(json.loads(stopped.stdout)["log"])).complete
     refused = lowfc("ctl", "status", "--run", bench.run.run_id)
     assert f"no controller is there in run '{bench.run.run_id}'" in str(refused.exception)
-    process.send_signal(signal.SIGTERM)
-    until(lambda: bench.recorder_is("stopping"))
-    bench.service.finish()
-    _, wrong = process.communicate(timeout=PATIENCE_S)
-    bench.close()
-    assert process.returncode == 0, wrong
 
 
 @pytest.mark.parametrize(
@@ -246,13 +162,9 @@ def test_a_recording_is_ended_where_the_controller_has_died(tmp_path: Path, own_
 def test_what_cannot_be_recorded_is_refused_before_anything_is_made(
     options: tuple[object, ...], complaint: str, tmp_path: Path
 ) -> None:
-    said = (str(option).format(tmp_path) for option in options)
-    process = start(tmp_path, "record", "--run", new_run_id(), *said)
-    out, wrong = process.communicate(timeout=PATIENCE_S)
-    assert (process.returncode, out) == (2, "")
-    *_, line = wrong.strip().splitlines()
-    assert line.startswith("error: ")
-    assert complaint in line
+    done = lowfc("record", "--run", new_run_id(), *(str(option).format(tmp_path) for option in options))
+    assert isinstance(done.exception, LowfcError)
+    assert complaint in str(done.exception)
     assert list(tmp_path.iterdir()) == []
 
 
