@@ -86,14 +86,6 @@ def test_what_is_no_configuration_is_a_remark_too(tmp_path: Path, toml: str) -> 
     assert remark.startswith(f"{log}: its config.toml cannot be used: not a readable TOML file")
 
 
-def test_a_file_that_a_person_passes_is_still_refused(tmp_path: Path) -> None:
-    path = tmp_path / "other.toml"
-    path.write_text(OTHER)
-    with pytest.raises(ConfigurationError) as caught:
-        load(path)
-    assert len(str(caught.value).splitlines()) == len(REMARKS)
-
-
 @pytest.fixture(scope="module")
 def night() -> Night:
     """A loop that was open, then closed, with an acceptance test of its noise."""

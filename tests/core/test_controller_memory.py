@@ -42,7 +42,7 @@ from lowfc.contract.messages import (
     wire,
 )
 from lowfc.contract.published import Published
-from lowfc.control.calibration.calibration import Calibration, noise_nm
+from lowfc.control.calibration.calibration import Calibration
 from lowfc.control.laws.linear_law import integrator
 from lowfc.control.loop.safety import LoopMode
 from lowfc.programs.core import cache_warmup
@@ -187,22 +187,6 @@ def errors_of(steps: list[wire.ControlStep]) -> Array:
     return np.array([step.error_nm for step in steps], float)
 
 
-def test_a_quiet_open_loop_measures_nothing_with_the_noise_that_is_predicted(rig: Rig) -> None:
-    rig.expose(400)
-    errors = errors_of(rig.steps(400))
-    known = rig.calibration
-    camera = rig.config.camera
-    predicted = noise_nm(
-        known.reconstructor.astype(float),
-        known.reference.astype(float),
-        known.flux_dn * camera.gain_e_per_dn,
-        float(np.hypot(camera.read_noise_e, camera.gain_e_per_dn / np.sqrt(12))),  # and the rounding to DN
-    )
-    assert (np.abs(errors.mean(axis=0)) < 4 * errors.std(axis=0) / np.sqrt(400)).all()
-    # The standard deviation of a standard deviation is 1 / sqrt(2 * 400): four of them are 14 %.
-    assert np.abs(errors.std(axis=0) / predicted - 1).max() < 0.15
-
-
 def test_closing_the_loop_corrects_every_mode(rig: Rig) -> None:
     injected = 12.0 * np.array([1, -1] * 7)
     rig.inject(injected)
@@ -260,28 +244,6 @@ def test_safe_flattens_the_mirror_and_stays(rig: Rig) -> None:
     until(lambda: not rig.latch.exists())
     assert rig.steps(1)[0].mode == wire.LOOP_MODE_OPEN
     assert {"SAFED", "MODE_CHANGED"} <= set(rig.events())
-
-
-def test_every_frame_yields_one_step_and_one_command(rig: Rig) -> None:
-    size = rig.scene.shape[0]
-    dark, odd = np.full((size, size), 100, np.uint16), np.zeros((3, 3), np.uint16)
-    full = np.full((size, size), 65535, np.uint16)
-    good = rig.scene.expose(0, rig.offset_nm)[0]
-    sequences = [rig.put(pixels) for pixels in (good, odd, good, dark, full, good)]
-    steps = rig.steps(6)
-    assert [step.frame_sequence for step in steps] == sequences
-    assert [one.frame_sequence for one in rig.said[COMMAND.key]] == sequences
-    assert [list(step.reasons) for step in steps] == [
-        [],
-        [wire.REASON_WRONG_SIZE],
-        [],
-        [wire.REASON_DARK],
-        [wire.REASON_SATURATED],
-        [],
-    ]
-    for step, command in zip(steps, rig.said[COMMAND.key], strict=True):
-        assert step.timestamp == command.timestamp
-        assert step.command_nm == command.command_nm
 
 
 def test_a_camera_that_changes_opens_the_loop(rig: Rig) -> None:
