@@ -151,7 +151,7 @@ def test_whatever_happens_is_replayed_to_the_bit(
     for one in of_another_camera(after):
         made.take(one)
     account, sent = replay(made.messages), Counter(message.key for message in made.messages)
-    assert (account.different, account.largest_nm, account.unchecked) == (0, 0.0, {})
+    assert (account.different, account.largest_difference_nm, account.unchecked_because) == (0, 0.0, {})
     assert account.frames == sent[STEP.key]
     assert account.commands == sent[COMMAND.at("dm")]
     assert account.requests == sent[REQUEST.key]
@@ -168,8 +168,8 @@ def test_lost_messages_are_never_a_difference_and_every_step_is_accounted_for(
     for _ in range(losses):
         kept.pop(random.randrange(len(kept)))  # type: ignore[attr-defined]
     account = replay(kept)
-    assert (account.different, account.largest_nm) == (0, 0.0)
-    assert account.frames + sum(account.unchecked.values()) == sum(message.key == STEP.key for message in kept)
+    assert (account.different, account.largest_difference_nm) == (0, 0.0)
+    assert account.frames + account.unchecked == sum(message.key == STEP.key for message in kept)
 
 
 @effort(deadline=None)
@@ -224,37 +224,28 @@ def test_shares_are_together_what_the_whole_is(
     parts = [replay(messages, share=Share(begin, end)) for begin, end in pairwise([0, *edges, 1 << 63])]
     steps = sum(message.key == STEP.key for message in messages)
     assert sum(part.steps for part in parts) == whole.steps == steps
-    assert whole.frames + sum(whole.unchecked.values()) == steps
+    assert whole.frames + whole.unchecked == steps
     for count in ("frames", "commands", "requests", "different", "commands_missing"):
         assert sum(getattr(part, count) for part in parts) == getattr(whole, count), count
-    unchecked = sum(sum(part.unchecked.values()) for part in parts)
-    assert unchecked >= sum(whole.unchecked.values())  # where states are missing, two shares may count the same step
+    unchecked = sum(part.unchecked for part in parts)
+    assert unchecked >= whole.unchecked  # where states are missing, two shares may count the same step
     if not holes:
         assert unchecked == 0
-
-
-def test_a_log_that_begins_in_the_middle_is_replayed_from_its_first_state() -> None:
-    made = night(frames(100))
-    cut = [message for message in made.messages if message.key == CALIBRATION.key]
-    cut += made.messages[len(made.messages) // 2 :]
-    account = replay(cut)
-    assert account.identical
-    assert 0 < account.unchecked["recorded before the first complete state of the controller"] <= STATE_EVERY
-    assert account.frames + sum(account.unchecked.values()) == sum(message.key == STEP.key for message in cut)
 
 
 def test_after_a_hole_it_goes_on_at_the_next_state_and_says_what_it_could_not_check() -> None:
     made = night(frames(100))
     steps = [index for index, message in enumerate(made.messages) if message.key == STEP.key]
-    hole = [message for index, message in enumerate(made.messages) if not steps[30] <= index < steps[40]]
-    account = replay(hole)
+    account = replay([*made.messages[: steps[30]], *made.messages[steps[40] :]])
     assert account.identical
-    assert list(account.unchecked) == ["after an input that the log does not have"]
-    assert account.frames + sum(account.unchecked.values()) == 90
+    assert list(account.unchecked_because) == ["after an input that the log does not have"]
+    assert account.frames + account.unchecked == 90
     without = [message for message in made.messages if message.key != FRAME.key or message.sequence % 100 != 50]
-    account = replay(without)
+    assert replay(without).unchecked_because["after a frame that the log does not have"] >= 1
+    head = [message for message in made.messages if message.key == CALIBRATION.key]
+    account = replay([*head, *made.messages[len(made.messages) // 2 :]])
     assert account.identical
-    assert account.unchecked["after a frame that the log does not have"] >= 1
+    assert 0 < account.unchecked_because["recorded before the first complete state of the controller"] <= STATE_EVERY
 
 
 def tampered(made: Night, topic: Topic, number: int, how: str, tolerance_nm: float = 0.0) -> Account:
@@ -291,11 +282,15 @@ def tampered(made: Night, topic: Topic, number: int, how: str, tolerance_nm: flo
 def test_the_smallest_difference_is_found_and_named(topic: Topic, how: str, said: str) -> None:
     account = tampered(night(frames(60)), topic, 2, how)
     assert not account.identical
-    assert account.first.what == topic.message.DESCRIPTOR.name
-    assert any(line.startswith(said) for line in account.first.fields), account.first.fields
+    assert account.first_difference.message == topic.message.DESCRIPTOR.name
+    assert any(line.startswith(said) for line in account.first_difference.fields), account.first_difference.fields
     if how == "actuators":
-        assert 0 < account.largest_nm < 1e-5
-        assert (account.different, account.first.taken, account.first.frame_sequence & 0xFF) == (1, 4, 2)
+        assert 0 < account.largest_difference_nm < 1e-5
+        assert (account.different, account.first_difference.taken, account.first_difference.frame_sequence & 0xFF) == (
+            1,
+            4,
+            2,
+        )
 
 
 def test_a_second_message_for_one_input_differs() -> None:
@@ -303,7 +298,7 @@ def test_a_second_message_for_one_input_differs() -> None:
     place = [index for index, message in enumerate(made.messages) if message.key == STEP.key][20]
     account = replay([*made.messages, made.messages[place]])
     assert account.different == 1
-    assert account.first.fields == ["a second one of input 22"]
+    assert account.first_difference.fields == ["a second one of input 22"]
 
 
 def test_commands_that_are_not_in_the_log_are_counted() -> None:
@@ -323,7 +318,7 @@ def test_a_tolerance_lets_small_differences_pass() -> None:
     assert not tampered(made, STEP, 5, nudge).identical
     account = tampered(made, STEP, 5, nudge, tolerance_nm=1e-3)
     assert account.identical
-    assert 0 < account.largest_nm < 1e-3
+    assert 0 < account.largest_difference_nm < 1e-3
 
 
 def test_a_log_from_before_inputs_were_numbered_is_refused() -> None:
@@ -376,8 +371,8 @@ def test_a_log_with_a_hole_is_replayed_but_for_the_hole(log: Path, tmp_path: Pat
     there = len(list(LogReader(tmp_path / "hole.mcap", topics=[STEP], skip_damaged=True)))
     assert found.account.identical
     assert len(found.damage) == 1
-    assert found.account.frames + sum(found.account.unchecked.values()) == there < STEPS
-    assert found.account.missing == STEPS - there
+    assert found.account.frames + sum(found.account.unchecked_because.values()) == there < STEPS
+    assert found.account.inputs_missing == STEPS - there
     text = lowfc("replay", tmp_path / "hole.mcap").stdout
     assert "unchecked" in text
     assert "damaged" in text

@@ -15,7 +15,6 @@ from lowfc.adapters.process.terminal import Json, Logs
 from lowfc.contract.envelope import count_of
 from lowfc.control.loop.wording import counted
 from lowfc.programs.cli.output import put
-from lowfc.programs.logs.replay.account import Account
 
 _HOST = ("lowfc", "git", "python", "numpy", "scipy", "blas", "processor", "cpu_features")
 """What the same bytes may depend on; of the processor's features, those that only one of the two has."""
@@ -35,7 +34,7 @@ def verify(logs: list[Path], tolerance_nm: float, jobs: int, console: Console) -
         outcome = replay_files(logs, tolerance_nm, jobs, lambda done: count("replaying", done, total))
     elapsed_s = time.monotonic() - begun_s
     return {
-        **_figures(outcome.account),
+        **outcome.account.figures(),
         "version": outcome.recorded_on.get("lowfc", ""),
         "tolerance_nm": tolerance_nm,
         "log_s": round(outcome.log_s, 3),
@@ -88,31 +87,6 @@ def render(figures: dict[str, Any]) -> str:
         lines.append(f"{key:18} {there or 'none'} in the log, {here or 'none'} here")
     lines.append(f"speed              {figures['log_s']:.1f} s of log, {figures['speed']:.1f} times as fast as it was")
     return "\n".join(lines)
-
-
-def _figures(account: Account) -> dict[str, Any]:
-    first = account.first
-    return {
-        "frames": account.frames,
-        "commands": account.commands,
-        "unchecked": sum(account.unchecked.values()),
-        "identical": account.identical,
-        "largest_difference_nm": account.largest_nm,
-        "first_difference": first
-        and {
-            "message": first.what,
-            "frame_sequence": first.frame_sequence,
-            "taken": first.taken,
-            "fields": first.fields,
-        },
-        "different": account.different,
-        "states": account.states,
-        "requests": account.requests,
-        "unchecked_because": account.unchecked,
-        "rules_changed": account.changed,
-        "inputs_missing": account.missing,
-        "commands_missing": account.commands_missing,
-    }
 
 
 def _host_differs(there: dict[str, str]) -> dict[str, tuple[str, str]]:

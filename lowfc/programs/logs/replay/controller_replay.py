@@ -249,7 +249,7 @@ class ControllerReplay:
             self._counts = bool(self._why)
             self._leave_out(number)
             if self._lost_at is not None:
-                self._account.missing += number - self._lost_at - self._forgotten
+                self._account.inputs_missing += number - self._lost_at - self._forgotten
                 self._lost_at = None
             self.done = number == self._last
             return not self.done
@@ -312,7 +312,7 @@ class ControllerReplay:
         if found is None or found.within(self._tolerance_nm):
             self._account.states += 1
         else:
-            self._account.changed[rule] += 1
+            self._account.rules_changed[rule] += 1
             try:
                 self._settings, state = self._decoded(logged)
             except ValueError as error:

@@ -21,7 +21,7 @@ class Difference:
     """The log's message and the replayed one.
 
     Attributes:
-        what: kind of the message, such as ControlStep.
+        message: kind of it, such as ControlStep.
         taken: which input of the controller it belongs to.
         frame_sequence: of the newest frame then.
         fields: sentences, one for each field that differs.
@@ -29,7 +29,7 @@ class Difference:
         otherwise: something else than numbers in nm differs.
     """
 
-    what: str
+    message: str
     taken: int
     frame_sequence: int
     fields: list[str] = field(default_factory=list)

@@ -84,7 +84,7 @@ def replay_files(paths: Sequence[Path], tolerance_nm: float, jobs: int, progress
         whole.damage = sorted({*whole.damage, *outcome.damage})
     last = outcomes[-1]  # its worker has read the logs to their end
     whole.complete, whole.runs, whole.stopped = last.complete, sorted(set(last.runs)), last.stopped
-    unaccounted = whole.account.steps - whole.account.frames - sum(whole.account.unchecked.values())
+    unaccounted = whole.account.steps - whole.account.frames - sum(whole.account.unchecked_because.values())
     whole.account.leave_out("without a state of the controller before them", max(0, unaccounted))
     return whole
 
