@@ -9,14 +9,10 @@ from typing import Any, Generic, TypeVar
 import numpy as np
 import numpy.typing as npt
 
+from lowfc.arrays import Long, Sequences, Single
 from lowfc.contract.messages import from_timestamp, wire
 from lowfc.control.loop.inputs import Step
 from lowfc.control.loop.safety import REASONS, Reason
-
-Single = npt.NDArray[np.float32]
-Double = npt.NDArray[np.float64]
-Whole = npt.NDArray[np.int64]
-Sequences = npt.NDArray[np.uint64]
 
 STAGES = ("transport", "wakeup", "compute", "publish", "frame_to_command")
 """Durations of the controller, as in ControlTiming."""
@@ -40,14 +36,14 @@ class Steps:
     """
 
     sequence: Sequences
-    time_ns: Whole
+    time_ns: Long
     mode: npt.NDArray[np.uint8]
-    reasons: Whole
+    reasons: Long
     error_nm: Single
     pol_nm: Single
     command_nm: Single
     flux_dn: Single
-    saturated_pixels: Whole
+    saturated_pixels: Long
 
     def at(self, rows: npt.NDArray[Any]) -> "Steps":
         """The steps at some rows, by index or by whether each is one."""
@@ -59,7 +55,7 @@ class Truths:
     """What the simulation knew, one row per frame; empty for a log of real devices."""
 
     sequence: Sequences
-    time_ns: Whole
+    time_ns: Long
     disturbance_nm: Single
     residual_nm: Single
     disturbance_rms_nm: Single
@@ -187,7 +183,7 @@ def of_steps(steps: Sequence[Step], modes: int) -> Steps:
     )
 
 
-def count_reasons(bits: Whole) -> dict[Reason, int]:
+def count_reasons(bits: Long) -> dict[Reason, int]:
     """How often each reason was given, of those that were."""
     counts = {reason: int(np.count_nonzero(bits & (1 << reason))) for reason in REASONS} if bits.any() else {}
     return {reason: count for reason, count in counts.items() if count}
@@ -207,7 +203,7 @@ class TimingRows:
         stages = {stage: getattr(timing, f"{stage}_ns") for stage in STAGES}
         return self._columns.add(sequence=timing.frame_sequence, **stages)
 
-    def taken(self) -> tuple[Sequences, dict[str, Whole]]:
+    def taken(self) -> tuple[Sequences, dict[str, Long]]:
         """Sequence (frames,) of each frame, and each of `STAGES` in ns."""
         return self._columns.taken("sequence"), {stage: self._columns.taken(stage) for stage in STAGES}
 
@@ -226,7 +222,7 @@ def bits_of(reasons: Iterable[int]) -> int:
     return bits
 
 
-def rows_of(sequence: Sequences, among: Sequences) -> Whole:
+def rows_of(sequence: Sequences, among: Sequences) -> Long:
     """Row in `among` of each sequence, the first one where there are several; -1 where there is none."""
     if not among.size:
         return np.full(sequence.shape, -1, np.int64)
@@ -236,7 +232,7 @@ def rows_of(sequence: Sequences, among: Sequences) -> Whole:
     return np.where(among[rows] == sequence, rows, -1).astype(np.int64)
 
 
-def joined(values: npt.NDArray[Any], rows: Whole) -> npt.NDArray[Any]:
+def joined(values: npt.NDArray[Any], rows: Long) -> npt.NDArray[Any]:
     """These rows of `values`; NaN for row -1."""
     found = values[rows] if values.size else np.zeros((rows.size, *values.shape[1:]), np.float32)
     found[rows < 0] = np.nan

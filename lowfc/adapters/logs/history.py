@@ -15,14 +15,11 @@ from google.protobuf.message import DecodeError
 from lowfc.adapters.bus.bus import name_in
 from lowfc.adapters.logs.columns import (
     Columns,
-    Sequences,
-    Single,
     StepRows,
     Steps,
     TimingRows,
     TruthRows,
     Truths,
-    Whole,
     bits_of,
     frame_rate_hz,
     joined,
@@ -30,6 +27,7 @@ from lowfc.adapters.logs.columns import (
 )
 from lowfc.adapters.logs.parts import WholeLog
 from lowfc.adapters.logs.reader import Logged, LogReader
+from lowfc.arrays import Long, Sequences, Single
 from lowfc.contract.codecs.calibration_codec import decode_calibration
 from lowfc.contract.codecs.codec import actuators
 from lowfc.contract.configuration import Configuration
@@ -81,9 +79,9 @@ class MirrorStates:
     """
 
     sequence: Sequences = field(default_factory=_SEQUENCES)
-    publish_time_ns: Whole = field(default_factory=_WHOLE)
+    publish_time_ns: Long = field(default_factory=_WHOLE)
     stroke_nm: Single = field(default_factory=_SINGLE)
-    limits: Whole = field(default_factory=_WHOLE)
+    limits: Long = field(default_factory=_WHOLE)
     highest_nm: Single = field(default_factory=_NOWHERE)
     lowest_nm: Single = field(default_factory=_NOWHERE)
 
@@ -116,13 +114,13 @@ class History:
     controllers: list[wire.ControllerState] = field(default_factory=list)
     camera: wire.CameraState | None = None
     frame_sequence: Sequences = field(default_factory=_SEQUENCES)
-    frame_publish_ns: Whole = field(default_factory=_WHOLE)
-    command_publish_ns: Whole = field(default_factory=_WHOLE)
+    frame_publish_ns: Long = field(default_factory=_WHOLE)
+    command_publish_ns: Long = field(default_factory=_WHOLE)
     steps: Steps = field(default_factory=lambda: StepRows(0).taken())
     truths: Truths = field(default_factory=lambda: TruthRows(0).taken())
     mirror: MirrorStates = field(default_factory=MirrorStates)
     timed_sequence: Sequences = field(default_factory=_SEQUENCES)
-    stages_ns: dict[str, Whole] = field(default_factory=dict)
+    stages_ns: dict[str, Long] = field(default_factory=dict)
     left_out: int = 0
     requests: list[wire.Request] = field(default_factory=list)
     events: list[tuple[int, Log]] = field(default_factory=list)

@@ -47,13 +47,12 @@ class Arrivals:
     Attributes:
         key: what they are.
         received: how many arrived.
-        restarts: how often the publisher began anew.
         last_sequence: of the newest message.
     """
 
     def __init__(self, key: str = "") -> None:
         self.key = key
-        self.received = self.restarts = self.last_sequence = 0
+        self.received = self.last_sequence = 0
         self._gaps = Gaps(0)
 
     @property
@@ -76,7 +75,6 @@ class Arrivals:
             return
         count, start_s, newest_s = count_of(sequence), start_of(sequence), start_of(self.last_sequence)
         if start_s > newest_s or not self.received:
-            self.restarts += self.received > 0
             self._gaps, newest_s = Gaps(count, self._gaps.missing), start_s
         if start_s == newest_s:
             self._gaps.came(count)
