@@ -38,11 +38,6 @@ def fits(optics):
     return {kind: fit(NOLLS, *optics, SCALE_E, READ_NOISE_E, kind) for kind in KINDS}
 
 
-def test_the_bound_of_one_mode_in_two_pixels():
-    H, variance = np.array([[3.0], [4.0]]), np.array([9.0, 4.0])
-    np.testing.assert_allclose(cramer_rao(H, variance), [[1.0 / (9 / 9 + 16 / 4)]])
-
-
 def test_a_pixel_without_noise_or_light_tells_nothing():
     H, variance = np.array([[3.0], [0.0]]), np.array([9.0, 0.0])
     np.testing.assert_allclose(cramer_rao(H, variance), [[1.0]])
@@ -121,10 +116,6 @@ def test_noise_is_photons_read_noise_and_whole_numbers():
         assert part.var() == pytest.approx(variance, rel=0.04)
 
 
-def test_no_light_is_no_error():
-    assert noisy_e(np.random.default_rng(3), np.array([-1e-9]), 0.0).tolist() == [0.0]
-
-
 def test_wavefronts_fill_their_bounds_evenly_and_come_from_the_seed():
     drawn = random_wavefronts(np.random.default_rng(4), 50, NOLLS_20, 0.04, 0.016)
     bounds = bounds_waves(NOLLS_20, 0.04, 0.016)
@@ -151,11 +142,6 @@ def test_residuals_over_the_circle_are_those_of_zernike_polynomials(circle_modes
     pv = residual_pv(circle_modes, residuals)
     assert pv[0] == pytest.approx(0.5 * 4.0, rel=0.01)  # a tilt's peak to valley is four times its rms
     assert pv[1] == pytest.approx(np.ptp(residuals[1] @ circle_modes))
-
-
-def test_a_piston_is_no_residual():
-    basis = np.array([[1.0, 1.0, 1.0], [3.0, 4.0, 5.0]])
-    np.testing.assert_allclose(residual_rms(gram(basis), np.array([[7.0, 1.0]])), [np.sqrt(2 / 3)])
 
 
 def test_the_expected_rms_is_that_of_many_draws(circle_modes):

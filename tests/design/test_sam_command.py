@@ -16,12 +16,11 @@ from lowfc.adapters.files.layouts import SHIPPED, load_layout
 from lowfc.adapters.process.terminal import new_app
 from lowfc.contract.errors import ConfigurationError, DataFileError, LowfcError
 from lowfc.design.sam_search import BLOCK
-from lowfc.optics.chain.sam import Layout
 from lowfc.programs.design import sam as program
 from lowfc.programs.design import sam_executors as executors
 from lowfc.programs.design.command import design_app
 from lowfc.programs.design.sam_executors import Here, open_executor
-from lowfc.programs.design.sam_files import front, read_state
+from lowfc.programs.design.sam_files import read_state
 from lowfc.programs.design.sam_request import Search
 
 RECORDED = {
@@ -200,12 +199,6 @@ def test_a_front_is_written_and_drawn(tmp_path):
     assert picture.read_bytes().startswith(b"\x89PNG")
     for shown in result["layouts"]:
         assert len(load_layout(f"{out}:{shown['name']}").holes) == 4
-
-
-def test_a_front_is_what_nothing_beats():
-    at = [(1.0, 3.0), (2.0, 2.0), (2.0, 3.0), (3.0, 1.0), (3.0, 2.5), (1.0, 3.0)]
-    points = [program.Point(Layout(str(i), "", ()), 0.0, *xy, 0.0) for i, xy in enumerate(at)]
-    assert [point.layout.name for point in front(points)] == ["0", "1", "3", "5"]
 
 
 def cli(*words):

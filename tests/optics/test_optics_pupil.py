@@ -5,34 +5,19 @@ import pytest
 
 from lowfc.adapters.files.sensors import load_pupil, sensor_from, sensor_named
 from lowfc.contract.configuration import SensorSection
-from lowfc.contract.errors import ConfigurationError, DataFileError
+from lowfc.contract.errors import ConfigurationError
 from lowfc.optics.chain.focal_mask import disk, phase_spot
 from lowfc.optics.chain.fourier import to_image, to_pupil
 from lowfc.optics.chain.grid import OPEN_AREA, SAMPLES, image_axis, pupil_axis
 from lowfc.optics.chain.pupil import circle, from_quarter, prolate, with_bar
 from lowfc.optics.chain.relay import ApertureMask
 from lowfc.optics.chain.sensor import Sensor, image
-from lowfc.optics.chain.zernike import NOLLS_20, mode_name, noll_to_nm, zernike, zernikes
+from lowfc.optics.chain.zernike import mode_name, noll_to_nm, zernike
 
 
 def blob(samples, x0, y0, width=0.08):
     u = pupil_axis(samples)
     return np.exp(-((u - x0) ** 2 + (u[:, None] - y0) ** 2) / width**2).astype(complex)
-
-
-def test_samples_lie_at_half_integer_offsets():
-    np.testing.assert_allclose(pupil_axis(4), [-0.375, -0.125, 0.125, 0.375])
-    np.testing.assert_allclose(image_axis(4, 8), np.array([-1.5, -0.5, 0.5, 1.5]) / 8)
-
-
-def test_a_tilt_along_x_moves_the_star_along_columns_by_its_cycles():
-    u = pupil_axis(256)
-    tilted = circle(256) * np.exp(2j * np.pi * (3.0 * u - 1.5 * u[:, None]))
-    intensity = np.abs(to_image(tilted, 128, 8, 1.0)) ** 2
-    x = image_axis(128, 8)
-    row, column = np.unravel_index(intensity.argmax(), intensity.shape)
-    assert x[column] == pytest.approx(3.0, abs=1 / 8)
-    assert x[row] == pytest.approx(-1.5, abs=1 / 8)
 
 
 @pytest.mark.parametrize("scale", [1.0, 0.9, 1.1])
@@ -92,13 +77,6 @@ def test_every_mode_agrees_with_hcipy(hcipy):
         np.testing.assert_allclose(zernike(noll, x, y)[inside], theirs, rtol=0, atol=1e-12 * np.abs(theirs).max())
 
 
-def test_modes_are_orthonormal_over_the_circle():
-    u = 2 * pupil_axis(512)
-    inside = np.hypot(u[:, None], u) <= 1
-    modes = zernikes((1, *NOLLS_20), u, u[:, None])[:, inside]
-    np.testing.assert_allclose(modes @ modes.T / modes.shape[1], np.eye(21), atol=2e-3)
-
-
 def test_polynomials_continue_outside_the_circle():
     assert zernike(2, 3.0, 1.0) == pytest.approx(6.0)
     assert zernike(3, 3.0, 1.0) == pytest.approx(2.0)
@@ -107,7 +85,9 @@ def test_polynomials_continue_outside_the_circle():
 
 
 def test_names_say_which_axis_a_mode_follows():
-    assert [mode_name(noll) for noll in (2, 3, 4, 7, 8, 11)] == [
+    names = {noll: mode_name(noll) for noll in range(1, 30)}
+    assert len(set(names.values())) == 29
+    assert [names[noll] for noll in (2, 3, 4, 7, 8, 11)] == [
         "tilt x",
         "tilt y",
         "focus",
@@ -115,12 +95,9 @@ def test_names_say_which_axis_a_mode_follows():
         "coma x",
         "spherical",
     ]
-    assert len({mode_name(noll) for noll in range(1, 30)}) == 29
-    # "x" modes change sign with x and not with y
-    for noll in range(2, 22):
-        if mode_name(noll).endswith(" x"):
-            assert zernike(noll, -0.3, 0.2) == pytest.approx(-zernike(noll, 0.3, 0.2))
-            assert zernike(noll, 0.3, -0.2) == pytest.approx(zernike(noll, 0.3, 0.2))
+    for noll in (noll for noll, name in names.items() if name.endswith(" x")):  # they change sign with x and not with y
+        assert zernike(noll, -0.3, 0.2) == pytest.approx(-zernike(noll, 0.3, 0.2))
+        assert zernike(noll, 0.3, -0.2) == pytest.approx(zernike(noll, 0.3, 0.2))
 
 
 def test_indices_below_one_are_refused():
@@ -203,12 +180,6 @@ def test_the_phase_spot_has_the_area_of_its_circle_and_a_soft_edge(radius, spot)
     np.testing.assert_array_equal(mask, mask.T)
 
 
-def test_an_annulus_lacks_its_middle():
-    annulus = disk(32, 4.0, 1.5)
-    assert annulus.sum() / 32**2 == pytest.approx(np.pi * (16 - 2.25), rel=2e-3)
-    assert not annulus[112:144, 112:144].any()
-
-
 def test_a_pupil_of_ones_own_comes_from_its_file(tmp_path):
     quarter = np.linspace(1.0, 0.5, 64 * 64).reshape(64, 64)
     np.savez(tmp_path / "mine.npz", quarter=quarter)
@@ -217,10 +188,6 @@ def test_a_pupil_of_ones_own_comes_from_its_file(tmp_path):
     np.testing.assert_array_equal(pupil[256::4, 256::4], quarter)
     np.testing.assert_array_equal(pupil, pupil[::-1, ::-1])
     assert not np.array_equal(pupil, load_pupil())
-    with pytest.raises(DataFileError, match="no pupil file"):
-        sensor_from(SensorSection(pupil="missing.npz"))
-    with pytest.raises(ConfigurationError, match="did you mean"):
-        sensor_from(SensorSection(pupil="prolat"))
 
 
 def test_a_slip_in_the_name_of_a_sensor_is_named():

@@ -68,15 +68,6 @@ def test_the_chain_agrees_with_prysm(prysm, sensor, opd_nm):
     assert relative_l2(ours / ours.sum(), theirs / theirs.sum()) < 1e-12
 
 
-def test_response_is_the_slope_of_the_image(sensor, modes):
-    step_nm = 0.01
-    H = response(sensor, modes)
-    assert H.shape == (6400, 20)
-    for k in (0, 1, 2, 5, 9, 19):
-        slope = (image(sensor, step_nm * modes[k]) - image(sensor, -step_nm * modes[k])) / (2 * step_nm)
-        assert relative_l2(H[:, k], slope.ravel()) < 1e-6
-
-
 def test_broadband_images_and_responses_are_weighted_sums(sensor, modes, opd_nm):
     band = gauss_legendre(550.0)
     each = [monochromatic(nm) for nm in band.wavelengths_nm]
@@ -266,6 +257,7 @@ def test_the_response_of_every_sensor_is_the_slope_of_its_image(name, modes):
     optics, step_nm = sensor_named(name), 0.02
     chosen = modes[[0, 5]] if name == "open" else modes[[0, 2, 9]]  # it has no slope along even modes
     H = response(optics, chosen)
+    assert H.shape == (optics.pixels**2, len(chosen))
     for k, mode in enumerate(chosen):
         slope = (image(optics, step_nm * mode) - image(optics, -step_nm * mode)) / (2 * step_nm)
         assert relative_l2(H[:, k], slope.ravel()) < 1e-6
