@@ -1,4 +1,3 @@
-import sys
 from dataclasses import replace
 from itertools import pairwise
 
@@ -6,12 +5,11 @@ import numpy as np
 import pytest
 from matplotlib.image import imread
 
-from lowfc.contract.errors import LowfcError
 from lowfc.design.fisher import cramer_rao, variance_e
 from lowfc.design.paper import STAR, TABLE4_EXPOSURE_S
 from lowfc.optics.chain.grid import pupil_axis
 from lowfc.optics.detector.photometry import electrons
-from lowfc.programs.paper.cases import Context
+from lowfc.programs.paper.cases import Context, prepared
 from lowfc.programs.paper.figures.exposure import ESTIMATORS
 from lowfc.programs.paper.figures.modes import AMPLITUDES, deviations, linear_range
 from lowfc.programs.paper.report import FIGURES
@@ -34,11 +32,6 @@ def values(rows, quantity, estimator=None, name=""):
     ]
     assert found
     return found
-
-
-def test_all_ten_figures_are_there():
-    assert list(FIGURES) == [f"fig{i}" for i in range(1, 11)]
-    assert all(case.title and case.plot for case in FIGURES.values())
 
 
 @pytest.mark.parametrize("figure", FIGURES)
@@ -124,7 +117,7 @@ def test_screens_lose_what_fourteen_modes_can_take(tables):
 
 def test_a_milliarcsecond_is_as_large_as_the_slope_of_the_image(tables):
     rows = tables["fig10"]
-    ready = FEW.prepared("sam")
+    ready = prepared("sam")
     u = 2 * pupil_axis(512)
     tilt_nm = 1e-3 / 3600 * np.pi / 180 * 2.0 / 4 * 1e9 * 2 * np.broadcast_to(u, (512, 512))  # 2 m; Z2 = 2 u
     np.testing.assert_allclose(ready.opd_nm(np.array([2.4241, 0.0])), tilt_nm, atol=1e-3)
@@ -133,7 +126,7 @@ def test_a_milliarcsecond_is_as_large_as_the_slope_of_the_image(tables):
 
 
 def test_the_signal_over_noise_of_an_image_is_what_the_bound_of_its_tilt_says(tables):
-    rows, ready = tables["fig10"], FEW.prepared("sam")
+    rows, ready = tables["fig10"], prepared("sam")
     light_e = electrons(STAR, TABLE4_EXPOSURE_S)
     slope_e, noise_e2 = light_e * NM_PER_MAS * ready.band_H[:, 1:2], variance_e(light_e * ready.band_I0, 1.0)
     least_mas = np.sqrt(cramer_rao(slope_e, noise_e2)[0, 0])
@@ -153,13 +146,6 @@ def test_rows_depend_on_the_seed_and_not_on_the_threads():
     assert once != FIGURES["fig7"].run(replace(few, seed=2))
 
 
-def test_a_figure_drawn_again_is_the_same_file(tmp_path):
-    paths = [tmp_path / "once.png", tmp_path / "again.png"]
-    for path in paths:
-        FIGURES["fig10"].plot(FEW, path)
-    assert paths[0].read_bytes() == paths[1].read_bytes()
-
-
 def test_the_linear_range_ends_where_the_deviation_passes_a_tenth():
     estimates = np.stack([AMPLITUDES * (1 - 2 * AMPLITUDES), AMPLITUDES * 1.05, AMPLITUDES * (1 - 50 * AMPLITUDES)])
     off = deviations(estimates)
@@ -167,13 +153,6 @@ def test_the_linear_range_ends_where_the_deviation_passes_a_tenth():
     assert linear_range(off[0]) == pytest.approx(0.05)
     assert linear_range(off[1]) == np.inf
     assert linear_range(off[2]) == pytest.approx(0.002)
-
-
-def test_without_matplotlib_the_user_is_told_what_to_install(monkeypatch, tmp_path):
-    monkeypatch.setitem(sys.modules, "matplotlib.figure", None)
-    with pytest.raises(LowfcError, match=r"pip install .*'matplotlib"):
-        FIGURES["fig3"].plot(FEW, tmp_path / "fig3.png")
-    assert list(tmp_path.iterdir()) == []
 
 
 @pytest.mark.slow

@@ -156,7 +156,14 @@ def sparse_apertures() -> tuple[str, ...]:
 
 @lru_cache(maxsize=64)
 def prepared(name: str) -> Prepared:
-    """A sensor by the name of `lowfc.adapters.files.sensors.sensor_named`; clowfs:MM, its defocus; or bowtie:LAYOUT."""
+    """A sensor by its name, made ready once in a process.
+
+    Args:
+        name: as of `lowfc.adapters.files.sensors.sensor_named`; clowfs:MM with its defocus; or bowtie:LAYOUT.
+
+    Raises:
+        ConfigurationError: There is no such sensor.
+    """
     kind, _, detail = name.partition(":")
     if kind == "clowfs" and detail:
         try:
@@ -249,10 +256,6 @@ class Context:
     def names(self, *own: str) -> tuple[str, ...]:
         """The sensors that are asked for, or else a table's own."""
         return self.sensors or own
-
-    def prepared(self, name: str) -> Prepared:
-        """A sensor by name, made ready once in a process."""
-        return prepared(name)
 
     def rng(self, *key: str | int) -> np.random.Generator:
         """A generator that depends on the seed and the key alone, so that no trial depends on another's."""

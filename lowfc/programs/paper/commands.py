@@ -58,11 +58,13 @@ def validate(
         raise ConfigurationError("--docs writes the whole document: use it with all, without --sensor and --plots")
 
     from lowfc.programs.paper.cases import Context
-    from lowfc.programs.paper.report import run, run_into, to_json, to_text
+    from lowfc.programs.paper.report import PICTURES, run, to_json, to_text, write_document
 
     context = Context(trials, seed, jobs or len(os.sched_getaffinity(0)), tuple(sensor) if sensor else None)
     fixed = [name for name in wanted if name in OF_THE_PAPER]
     if sensor and fixed:
         typer.echo(f"{', '.join(fixed)}: of the paper's own sensors, --sensor changes nothing there", err=True)
-    found = run(wanted, context, plots) if docs is None else run_into(docs, wanted, context)
+    found = run(wanted, context, plots if docs is None else docs / PICTURES)
+    if docs is not None:
+        write_document(docs, found)
     sys.stdout.write((to_json(found) if as_json else "\n\n".join(map(to_text, found))) + "\n")

@@ -1,12 +1,11 @@
 """Drawings of the figures as PNG files; matplotlib is loaded only here, and only when something is drawn."""
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
 from importlib import import_module
 from math import ceil
 from pathlib import Path
 from textwrap import fill
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
 import numpy as np
 
@@ -33,21 +32,7 @@ _PANEL_IN = (3.6, 3.3)
 _DPI = 110
 
 
-@dataclass(frozen=True, eq=False)
-class Picture:
-    """An image (rows, columns) with its colour bar; NaN is left grey. `half_width` is in the axes' unit."""
-
-    values: Array
-    title: str
-    axes: tuple[str, str]
-    half_width: float
-    bounds: tuple[float, float]
-    unit: str
-    scale: Scale = "linear"
-
-
-@dataclass(frozen=True, eq=False)
-class Line:
+class Line(NamedTuple):
     """Points (n,) with a name, joined or single."""
 
     name: str
@@ -56,32 +41,8 @@ class Line:
     joined: bool = True
 
 
-@dataclass(frozen=True, eq=False)
-class Curves:
-    """Lines over one pair of axes; `ticks` name the whole numbers on an x axis that counts things."""
-
-    lines: Sequence[Line]
-    title: str
-    x_label: str
-    y_label: str
-    scale: Literal["log", "linear"] = "linear"
-    y_bounds: tuple[float, float] | None = None
-    ticks: Sequence[str] = ()
-    diagonal: bool = False
-    legend: Literal["upper right", "upper left", "lower left"] = "upper right"
-
-
-@dataclass(frozen=True, eq=False)
-class Bars:
-    """Groups of bars, side by side: the heights (groups,) of each name."""
-
-    heights: dict[str, Array]
-    groups: Sequence[str]
-    title: str
-    y_label: str
-
-
-Panel = Picture | Curves | Bars
+Panel = Callable[["Figure", "Axes"], None]
+"""Draws into its axes."""
 
 
 def draw(path: Path, panels: Sequence[Panel], caption: str, columns: int = 3, wide: bool = False) -> None:
@@ -102,71 +63,103 @@ def draw(path: Path, panels: Sequence[Panel], caption: str, columns: int = 3, wi
     figure.get_layout_engine().set(w_pad=0.1, rect=(0, below / (height + below), 1, height / (height + below)))
     for i, panel in enumerate(panels):
         axes = figure.add_subplot(rows, columns, i + 1)
-        axes.set_title(panel.title, fontsize=9)
         axes.tick_params(labelsize=8)
-        match panel:
-            case Picture():
-                _picture(figure, axes, panel)
-            case Curves():
-                _curves(axes, panel)
-            case Bars():
-                _bars(axes, panel)
+        panel(figure, axes)
     figure.text(0.01, 0.005, text, fontsize=8, va="bottom")
     write_whole(path, png(figure, _DPI))
 
 
-def _picture(figure: "Figure", axes: "Axes", panel: Picture) -> None:
-    low, high = panel.bounds
-    options: dict[str, Any] = {"vmin": low, "vmax": high}
-    values = panel.values
-    if panel.scale == "log":
-        options = {"norm": import_module("matplotlib.colors").LogNorm(low, high)}
-        values = np.maximum(values, low)
-    w = panel.half_width
-    shown = axes.imshow(
-        values, cmap=_MAPS[panel.scale], origin="lower", extent=(-w, w, -w, w), interpolation="nearest", **options
-    )
-    axes.set_facecolor("0.75")
-    axes.set_xlabel(panel.axes[0], fontsize=8)
-    axes.set_ylabel(panel.axes[1], fontsize=8)
-    bar = figure.colorbar(shown, ax=axes, shrink=0.85)
-    bar.set_label(panel.unit, fontsize=8)
-    bar.ax.tick_params(labelsize=7)
+def picture(
+    values: Array,
+    title: str,
+    labels: tuple[str, str],
+    half_width: float,
+    bounds: tuple[float, float],
+    unit: str,
+    scale: Scale = "linear",
+) -> Panel:
+    """An image (rows, columns) with its colour bar; NaN is left grey. `half_width` is in the axes' unit."""
+
+    def panel(figure: "Figure", axes: "Axes") -> None:
+        low, high, w = *bounds, half_width
+        options: dict[str, Any] = {"vmin": low, "vmax": high}
+        if scale == "log":
+            options = {"norm": import_module("matplotlib.colors").LogNorm(low, high)}
+        shown = axes.imshow(
+            np.maximum(values, low) if scale == "log" else values,
+            cmap=_MAPS[scale],
+            origin="lower",
+            extent=(-w, w, -w, w),
+            interpolation="nearest",
+            **options,
+        )
+        axes.set_facecolor("0.75")
+        _label(axes, title, *labels)
+        bar = figure.colorbar(shown, ax=axes, shrink=0.85)
+        bar.set_label(unit, fontsize=8)
+        bar.ax.tick_params(labelsize=7)
+
+    return panel
 
 
-def _curves(axes: "Axes", panel: Curves) -> None:
-    if panel.diagonal:
-        ends = [min(line.x.min() for line in panel.lines), max(line.x.max() for line in panel.lines)]
-        axes.plot(ends, ends, color="0.6", linewidth=1, zorder=0)
-    for i, line in enumerate(panel.lines):
-        colour, marker = _COLOURS[i % len(_COLOURS)], _MARKERS[i % len(_MARKERS)]
-        style = _STYLES[(i + i // len(_COLOURS)) % len(_STYLES)]
-        if line.joined:
-            axes.plot(line.x, line.y, style, color=colour, label=line.name, linewidth=1.3)
+def curves(
+    lines: Sequence[Line],
+    title: str,
+    x_label: str,
+    y_label: str,
+    scale: Literal["log", "linear"] = "linear",
+    y_bounds: tuple[float, float] | None = None,
+    ticks: Sequence[str] = (),
+    diagonal: bool = False,
+    legend: Literal["upper right", "upper left", "lower left"] = "upper right",
+) -> Panel:
+    """Lines over one pair of axes; `ticks` name the whole numbers on an x axis that counts things."""
+
+    def panel(_: "Figure", axes: "Axes") -> None:
+        if diagonal:
+            ends = [min(line.x.min() for line in lines), max(line.x.max() for line in lines)]
+            axes.plot(ends, ends, color="0.6", linewidth=1, zorder=0)
+        for i, line in enumerate(lines):
+            colour, marker = _COLOURS[i % len(_COLOURS)], _MARKERS[i % len(_MARKERS)]
+            style = _STYLES[(i + i // len(_COLOURS)) % len(_STYLES)]
+            if line.joined:
+                axes.plot(line.x, line.y, style, color=colour, label=line.name, linewidth=1.3)
+            else:
+                axes.plot(line.x, line.y, marker, color=colour, label=line.name, markersize=3, alpha=0.7)
+        axes.set_yscale(scale)
+        _label(axes, title, x_label, y_label)
+        axes.grid(alpha=0.3)
+        if y_bounds is not None:
+            axes.set_ylim(y_bounds)
+        if ticks:
+            axes.set_xticks(range(len(ticks)), ticks)
         else:
-            axes.plot(line.x, line.y, marker, color=colour, label=line.name, markersize=3, alpha=0.7)
-    axes.set_yscale(panel.scale)
-    axes.set_xlabel(panel.x_label, fontsize=8)
-    axes.set_ylabel(panel.y_label, fontsize=8)
-    axes.grid(alpha=0.3)
-    if panel.y_bounds is not None:
-        axes.set_ylim(panel.y_bounds)
-    if panel.ticks:
-        axes.set_xticks(range(len(panel.ticks)), panel.ticks)
-    else:
-        axes.locator_params(axis="x", nbins=4)
-    if len(panel.lines) > 1:
-        axes.legend(fontsize=7, loc=panel.legend, ncols=1 + len(panel.lines) // 8)
+            axes.locator_params(axis="x", nbins=4)
+        if len(lines) > 1:
+            axes.legend(fontsize=7, loc=legend, ncols=1 + len(lines) // 8)
+
+    return panel
 
 
-def _bars(axes: "Axes", panel: Bars) -> None:
-    width = 0.8 / len(panel.heights)
-    middle = np.arange(len(panel.groups))
-    for i, (name, heights) in enumerate(panel.heights.items()):
-        left = middle + (i - (len(panel.heights) - 1) / 2) * width
-        axes.bar(left, heights, width, label=name, color=_COLOURS[1 + i], edgecolor="black", linewidth=0.4)
-    axes.set_xticks(middle, panel.groups)
-    axes.set_ylabel(panel.y_label, fontsize=8)
-    axes.axhline(0, color="black", linewidth=0.8)
-    axes.grid(axis="y", alpha=0.3)
-    axes.legend(fontsize=7)
+def bars(heights: dict[str, Array], groups: Sequence[str], title: str, y_label: str) -> Panel:
+    """Groups of bars, side by side: the heights (groups,) of each name."""
+
+    def panel(_: "Figure", axes: "Axes") -> None:
+        width = 0.8 / len(heights)
+        middle = np.arange(len(groups))
+        for i, (name, each) in enumerate(heights.items()):
+            left = middle + (i - (len(heights) - 1) / 2) * width
+            axes.bar(left, each, width, label=name, color=_COLOURS[1 + i], edgecolor="black", linewidth=0.4)
+        axes.set_xticks(middle, groups)
+        _label(axes, title, "", y_label)
+        axes.axhline(0, color="black", linewidth=0.8)
+        axes.grid(axis="y", alpha=0.3)
+        axes.legend(fontsize=7)
+
+    return panel
+
+
+def _label(axes: "Axes", title: str, x: str, y: str) -> None:
+    axes.set_title(title, fontsize=9)
+    axes.set_xlabel(x, fontsize=8)
+    axes.set_ylabel(y, fontsize=8)

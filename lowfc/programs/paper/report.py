@@ -4,7 +4,6 @@ import json
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import Any
 
 from rich.console import Console
@@ -15,15 +14,14 @@ from lowfc.adapters.files.drawing import figure_class
 from lowfc.adapters.files.whole_file import write_whole
 from lowfc.adapters.process.progress import passing_bar
 from lowfc.contract.errors import ConfigurationError, DataFileError
-from lowfc.programs.paper.cases import Case, Context, plain
+from lowfc.programs.cli.result import table as text_table
+from lowfc.programs.paper.cases import Case, Context, plain, prepared
 from lowfc.programs.paper.figures import aberration, light, modes, screens
 from lowfc.programs.paper.tables.tables import TABLES
 
 _ALL = {**aberration.CASES, **light.CASES, **modes.CASES, **screens.CASES}
 
-FIGURES: dict[str, Case] = {name: _ALL[name] for name in sorted(_ALL, key=lambda name: int(name.removeprefix("fig")))}
-
-
+FIGURES: dict[str, Case] = {f"fig{number}": _ALL[f"fig{number}"] for number in range(1, len(_ALL) + 1)}
 CASES: dict[str, Case] = {**TABLES, **FIGURES}
 
 DOCUMENT, RESULTS, PICTURES = "paper.md", "paper.json", "pictures/paper"
@@ -86,9 +84,7 @@ paper's, *predicted* decides.
 """
 
 
-def run(
-    names: Sequence[str], context: Context, plots: Path | None = None, console: Console | None = None
-) -> list[Table]:
+def run(names: Sequence[str], context: Context, plots: Path | None = None) -> list[Table]:
     """The tables of these names, in the paper's units, and their drawings.
 
     Raises:
@@ -99,11 +95,14 @@ def run(
     columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
     tables = []
     for name in context.sensors or ():
-        context.prepared(name)  # a mistake is said before the work, not after it
+        prepared(name)  # a mistake is reported before the work, not after it
     if plots is not None:
         figure_class()
-        _make_folder(plots)
-    with passing_bar(console or Console(stderr=True), *columns) as shown, threadpool_limits(1):
+        try:
+            plots.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise DataFileError(f"the folder {plots} cannot be made: {error}") from error
+    with passing_bar(Console(stderr=True), *columns) as shown, threadpool_limits(1):
         all_of_them, this = shown.add_task("tables", total=len(names)), shown.add_task("")
 
         def progress(what: str, done: int, total: int) -> None:
@@ -113,55 +112,17 @@ def run(
         for name in names:
             progress(name, 0, 1)
             case = CASES[name]
-            drawn = None
+            table = {"table": name, "title": case.title, "trials": context.trials, "seed": context.seed, "plot": None}
             try:
                 rows = [plain(row) for row in case.run(context)]
                 if plots is not None and case.plot is not None:
-                    drawn = f"{name}.png"
-                    case.plot(context, plots / drawn)
+                    table["plot"] = f"{name}.png"
+                    case.plot(context, plots / f"{name}.png")
             except ConfigurationError as error:
                 raise ConfigurationError(f"{name}: {error}") from error
-            tables.append(
-                {
-                    "table": name,
-                    "title": case.title,
-                    "trials": context.trials,
-                    "seed": context.seed,
-                    "plot": drawn,
-                    "rows": rows,
-                }
-            )
+            tables.append(table | {"rows": rows})
             shown.advance(all_of_them)
     return tables
-
-
-def run_into(folder: Path, names: Sequence[str], context: Context) -> list[Table]:
-    """The same, written as the document with its drawings: all of it at the end, or nothing.
-
-    Raises:
-        DataFileError: The folder cannot be written.
-        ConfigurationError: As `run`.
-    """
-    pictures = folder / PICTURES
-    _make_folder(pictures)
-    try:
-        beside = TemporaryDirectory(dir=folder, prefix=".drawings.")
-    except OSError as error:
-        raise DataFileError(f"{folder} cannot be written: {error.strerror or error}") from error
-    with beside as drawn:
-        tables = run(names, context, Path(drawn))
-        for table in tables:
-            if table["plot"]:
-                write_whole(pictures / table["plot"], (Path(drawn) / table["plot"]).read_bytes())
-    write_document(folder, tables)
-    return tables
-
-
-def _make_folder(folder: Path) -> None:
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise DataFileError(f"the folder {folder} cannot be made: {error}") from error
 
 
 def to_json(tables: Sequence[Table]) -> str:
@@ -172,13 +133,7 @@ def to_json(tables: Sequence[Table]) -> str:
 def to_text(table: Table) -> str:
     """A table for a terminal."""
     header, body, notes = _cells(table["rows"])
-    widths = [max(len(line[k]) for line in (header, *body)) for k in range(len(header))]
-    lines = [
-        "  ".join(cell.ljust(width) for cell, width in zip(line, widths, strict=True)).rstrip()
-        for line in (header, *body)
-    ]
-    lines[1:1] = ["-" * max(map(len, lines))]
-    return "\n".join([f"{table['title']} ({_trials(table)})", *lines, *notes])
+    return "\n".join([f"{table['title']} ({_trials(table)})", *text_table(header, body), *notes])
 
 
 def to_markdown(tables: Sequence[Table]) -> str:
@@ -236,25 +191,17 @@ def _trials(table: Table) -> str:
 def _cells(rows: Sequence[dict[str, Any]]) -> tuple[list[str], list[list[str]], list[str]]:
     """Header and cells, without the columns that are empty, and the assumptions that the last column numbers."""
     notes = list(dict.fromkeys(line for row in rows for line in _lines(row["assumption"])))
-    body = []
-    for row in rows:
-        measured = _number(row["measured"])
+    body = [
+        [
+            *(_number(row[key]) for key in ("name", "modes", "estimator", "quantity", "paper", "measured")),
+            *(_number(row[key]) for key in ("predicted", "limit", "unit")),
+            "".join(f"[{notes.index(line) + 1}]" for line in _lines(row["assumption"])),
+        ]
+        for row in rows
+    ]
+    for cells, row in zip(body, rows, strict=True):
         if row["error"] is not None:
-            measured += f" ± {row['error']:.1g}"
-        body.append(
-            [
-                row["name"],
-                _number(row["modes"]),
-                row["estimator"] or "",
-                row["quantity"],
-                _number(row["paper"]),
-                measured,
-                _number(row["predicted"]),
-                _number(row["limit"]),
-                row["unit"],
-                "".join(f"[{notes.index(line) + 1}]" for line in _lines(row["assumption"])),
-            ]
-        )
+            cells[_HEADER.index("measured")] += f" ± {row['error']:.1g}"
     used = [k for k in range(len(_HEADER)) if any(line[k] for line in body)]
     return (
         [_HEADER[k] for k in used],

@@ -11,7 +11,7 @@ from lowfc.design.trials import residual_pv
 from lowfc.optics.chain.coronagraph import Wedge, contrast, contrast_curve, mean_contrast
 from lowfc.optics.chain.zernike import NOLLS_14
 from lowfc.programs.paper import plots
-from lowfc.programs.paper.cases import Case, Context, Prepared, Row, assuming
+from lowfc.programs.paper.cases import Case, Context, Prepared, Row, assuming, prepared
 from lowfc.programs.paper.figures.exposure import (
     BRIGHT,
     ESTIMATORS,
@@ -49,7 +49,7 @@ class _Aberrated:
 
 @lru_cache(maxsize=8)
 def _aberrated(context: Context, name: str, coma: int) -> _Aberrated:
-    ready = context.prepared(name)
+    ready = prepared(name)
     truth_nm = np.zeros(MODES)
     truth_nm[[NOLLS_14.index(4), NOLLS_14.index(coma)]] = ready.sensor.wavelength_nm / 30.0
     image, linear = ready.image(truth_nm), fits(ready, MODES)
@@ -102,13 +102,13 @@ def plot_fig1(context: Context, path: Path) -> None:
         for title, modes_nm in (("flat wavefront", flat_nm), (f"$\\lambda$/30 of Z4 and of Z{coma}", case.truth_nm)):
             opd_nm, columns = case.ready.opd_nm(modes_nm), 2 * _VIEW * _VIEW_SAMPLES_PER
             image = contrast(optics.pupil, opd_nm, optics.wavelength_nm, columns, samples_per=_VIEW_SAMPLES_PER)
-            panels.append(plots.Picture(image, title, plots.SKY, _VIEW, (1e-11, 1.0), "contrast", "log"))
+            panels.append(plots.picture(image, title, plots.SKY, _VIEW, (1e-11, 1.0), "contrast", "log"))
         middles = (_CURVE_EDGES[1:] + _CURVE_EDGES[:-1]) / 2.0
         shown = {"flat": flat_nm, "aberrated": case.truth_nm}
         shown |= {key: case.residuals_nm[key][0] for key in _CORRECTED}
         lines = [plots.Line(key, middles, _curve(case.ready, modes_nm)) for key, modes_nm in shown.items()]
         panels.append(
-            plots.Curves(lines, f"Z{coma}, corrected by {name}", f"radius, {plots.SKY_UNIT}", "contrast", "log")
+            plots.curves(lines, f"Z{coma}, corrected by {name}", f"radius, {plots.SKY_UNIT}", "contrast", "log")
         )
     plots.draw(
         path,
@@ -168,7 +168,7 @@ def plot_fig7(context: Context, path: Path) -> None:
             inside = waves[case.ready.open]
             shown = np.where(case.ready.open, waves - inside.mean(), np.nan)
             title = f"{title}\nP-V {np.ptp(inside):.2g} waves"
-            panels.append(plots.Picture(shown, title, plots.PUPIL, 0.5, (-bound, bound), "waves", "signed"))
+            panels.append(plots.picture(shown, title, plots.PUPIL, 0.5, (-bound, bound), "waves", "signed"))
     plots.draw(path, panels, f"Fig. 7. One estimate of {name}. {BRIGHT}", columns=4)
 
 

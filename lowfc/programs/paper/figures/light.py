@@ -13,7 +13,7 @@ from lowfc.optics.chain.relay import ApertureMask, PupilImage
 from lowfc.optics.chain.zernike import mode_name
 from lowfc.optics.detector.photometry import electrons
 from lowfc.programs.paper import plots
-from lowfc.programs.paper.cases import Case, Context, Prepared, Row, assuming
+from lowfc.programs.paper.cases import Case, Context, Prepared, Row, assuming, prepared
 from lowfc.programs.paper.tables.photometry import PAPER_PEAK, PAPER_SIGNAL, differential, tilt_signal
 from lowfc.programs.paper.tables.pointing import PAPER_FOCAL_MASK, PAPER_PUPIL, PAPER_RELAY_MASK
 from lowfc.programs.paper.tables.tables import PAPER_TABLE2
@@ -28,7 +28,7 @@ def fig2(context: Context) -> list[Row]:
     """What part of the light passes each plane, Fig. 2 and Sect. 3.3."""
     rows = []
     for name in context.names("sam"):
-        budget = context.prepared(name).budget
+        budget = prepared(name).budget
         relay = PAPER_RELAY_MASK if name.startswith("sam") else None
         rows += [
             Row(name, "shaped pupil, of the open circle's light", "", budget.pupil, PAPER_PUPIL),
@@ -44,19 +44,19 @@ def fig2(context: Context) -> list[Row]:
 
 def plot_fig2(context: Context, path: Path) -> None:
     """Draw Fig. 2: intensities in the focal plane, behind the aperture mask and on the sensor."""
-    ready = context.prepared(context.names("sam")[0])
+    ready = prepared(context.names("sam")[0])
     optics = ready.sensor
     pupil = optics.pupil.astype(np.complex128)
     sky = np.abs(to_image(pupil, 2 * _VIEW * _VIEW_SAMPLES_PER, _VIEW_SAMPLES_PER, 1.0)) ** 2
     panels: list[plots.Panel] = [
-        plots.Picture(sky / sky.max(), "focal plane", plots.SKY, _VIEW, (_FAINTEST["focal"], 1.0), "of peak", "log")
+        plots.picture(sky / sky.max(), "focal plane", plots.SKY, _VIEW, (_FAINTEST["focal"], 1.0), "of peak", "log")
     ]
     if isinstance(optics.relay, ApertureMask):
         focal = to_image(pupil, len(optics.focal_mask), optics.samples_per, 1.0) * optics.focal_mask
         relay = np.abs(to_pupil(focal, len(pupil), optics.samples_per, 1.0)) ** 2
         shown = relay / relay.max() * optics.relay.transmission**2
         bounds = (_FAINTEST["relay"], 1.0)
-        panels.append(plots.Picture(shown, "behind the aperture mask", plots.PUPIL, 0.5, bounds, "of peak", "log"))
+        panels.append(plots.picture(shown, "behind the aperture mask", plots.PUPIL, 0.5, bounds, "of peak", "log"))
     image, bounds = ready.I0 / ready.I0.max(), (_FAINTEST["sensor"], 1.0)
     panels.append(_on_sensor(ready, image, "sensor, $I_0$", bounds, "of peak", "log"))
     plots.draw(path, panels, f"Fig. 2. {ready.name}: flat wavefront at {optics.wavelength_nm:.0f} nm.")
@@ -66,7 +66,7 @@ def fig3(context: Context) -> list[Row]:
     """The focal-plane masks, Fig. 3: how large they are, and what they reflect."""
     rows = []
     for name in context.names("sam", "bowtie"):
-        ready = context.prepared(name)
+        ready = prepared(name)
         mask = np.abs(ready.sensor.focal_mask) ** 2
         radius = len(mask) / (2.0 * ready.sensor.samples_per)
         rows += [
@@ -85,14 +85,14 @@ def fig3(context: Context) -> list[Row]:
 
 def plot_fig3(context: Context, path: Path) -> None:
     """Draw Fig. 3: the disk and the bowtie."""
-    chosen = [context.prepared(name) for name in context.names("sam", "bowtie")]
+    chosen = [prepared(name) for name in context.names("sam", "bowtie")]
     widest = max(len(ready.sensor.focal_mask) for ready in chosen)
     panels: list[plots.Panel] = []
     for ready in chosen:
         mask = np.abs(ready.sensor.focal_mask) ** 2
         whole = np.pad(mask, (widest - len(mask)) // 2)
         half_width = widest / (2.0 * ready.sensor.samples_per)
-        panels.append(plots.Picture(whole, ready.name, plots.SKY, half_width, (0.0, 1.0), "reflectivity"))
+        panels.append(plots.picture(whole, ready.name, plots.SKY, half_width, (0.0, 1.0), "reflectivity"))
     plots.draw(path, panels, "Fig. 3. Focal-plane masks: bright is what goes to the sensor.")
 
 
@@ -100,7 +100,7 @@ def fig4(context: Context) -> list[Row]:
     """Largest change of the image by a thirtieth of a wave, Fig. 4 and Table 2."""
     rows = []
     for name in context.names("sam"):
-        ready = context.prepared(name)
+        ready = prepared(name)
         rows += [
             Row(
                 f"{name}, Z{noll} {mode_name(noll)}",
@@ -120,7 +120,7 @@ def fig4(context: Context) -> list[Row]:
 
 def plot_fig4(context: Context, path: Path) -> None:
     """Draw Fig. 4: differential images of focus, astigmatism and coma."""
-    ready = context.prepared(context.names("sam")[0])
+    ready = prepared(context.names("sam")[0])
     panels: list[plots.Panel] = []
     for noll in _DRAWN:
         change = differential(ready, noll)
@@ -141,7 +141,7 @@ def fig10(context: Context) -> list[Row]:
     """Signal of 1 mas of tilt in a short exposure, Fig. 10 and Sect. 3.3."""
     rows = []
     for name in context.names("sam", "clowfs"):
-        ready = context.prepared(name)
+        ready = prepared(name)
         for axis in (0, 1):
             what, (flat_e, change_e) = f"{name}, tilt {'xy'[axis]}", _tilted_e(ready, axis)
             signal_e = float(np.ptp(change_e))
@@ -164,7 +164,7 @@ def plot_fig10(context: Context, path: Path) -> None:
     """Draw Fig. 10: noisy differential images of 1 mas."""
     panels: list[plots.Panel] = []
     for name in context.names("sam", "clowfs"):
-        ready = context.prepared(name)
+        ready = prepared(name)
         flat_e, change_e = _tilted_e(ready, 0)
         image_e = noisy_e(context.rng("fig10", name), flat_e + change_e, TABLE4_READ_NOISE_E)
         for values, title in ((image_e - flat_e, name), (change_e, f"{name}, without noise")):
@@ -181,12 +181,12 @@ def plot_fig10(context: Context, path: Path) -> None:
 
 def _on_sensor(
     ready: Prepared, image: Array, title: str, bounds: tuple[float, float], unit: str, scale: plots.Scale
-) -> plots.Picture:
+) -> plots.Panel:
     optics = ready.sensor
     axes = plots.PUPIL if isinstance(optics.relay, PupilImage) else plots.SKY
     half_width = optics.samples * optics.pitch / 2.0
     shape = (optics.pixels, optics.pixels)
-    return plots.Picture(image.reshape(shape), title, axes, half_width, bounds, unit, scale)
+    return plots.picture(image.reshape(shape), title, axes, half_width, bounds, unit, scale)
 
 
 CASES = {

@@ -11,7 +11,7 @@ from lowfc.design.estimators import iterated
 from lowfc.design.trials import LITERAL_WAVES, bounds_waves, expected_r_squared, r_squared, random_wavefronts
 from lowfc.optics.chain.zernike import NOLLS_14, noll_to_nm
 from lowfc.programs.paper import plots
-from lowfc.programs.paper.cases import Case, Context, Prepared, Row, assuming
+from lowfc.programs.paper.cases import Case, Context, Prepared, Row, assuming, prepared
 from lowfc.programs.paper.figures.exposure import (
     BRIGHT,
     FULL_CHAIN,
@@ -40,14 +40,14 @@ def _matched(ready: Prepared) -> Input:
 
 @lru_cache(maxsize=8)
 def _ensemble(context: Context, name: str) -> Ensemble:
-    return ensemble(context, name, MODES, _matched(context.prepared(name)))
+    return ensemble(context, name, MODES, _matched(prepared(name)))
 
 
 def fig5(context: Context) -> list[Row]:
     """Line through estimated against true coefficients of each radial degree, Fig. 5."""
     rows = []
     for name in context.names("sam"):
-        ready, found = context.prepared(name), _ensemble(context, name)
+        ready, found = prepared(name), _ensemble(context, name)
         for degree in range(1, 5):
             truth, estimates = (values[:, degree == DEGREES].ravel() for values in _waves(ready, found))
             (slope, intercept), covariance = np.polyfit(truth, estimates, 1, cov=True)
@@ -68,7 +68,7 @@ def fig5(context: Context) -> list[Row]:
 def plot_fig5(context: Context, path: Path) -> None:
     """Draw Fig. 5: estimated against true coefficients, a panel for each radial degree."""
     name = context.names("sam")[0]
-    ready = context.prepared(name)
+    ready = prepared(name)
     truth, estimates = _waves(ready, _ensemble(context, name))
     panels = []
     for degree in range(1, 5):
@@ -77,7 +77,7 @@ def plot_fig5(context: Context, path: Path) -> None:
             for k in np.flatnonzero(degree == DEGREES)
         ]
         axes = ("true, waves rms", "estimated, waves rms")
-        panels.append(plots.Curves(lines, f"n = {degree}", *axes, diagonal=True, legend="upper left"))
+        panels.append(plots.curves(lines, f"n = {degree}", *axes, diagonal=True, legend="upper left"))
     plots.draw(path, panels, f"Fig. 5. {name}, {PINV}, {len(truth)} wavefronts of Table 3. {BRIGHT}", columns=2)
 
 
@@ -91,7 +91,7 @@ def fig6(context: Context) -> list[Row]:
     """Coefficient of determination of each mode, Fig. 6 and eq. (15)."""
     rows = []
     for name, values in _r_squared(context).items():
-        limits = _r_squared_limit(context.prepared(name))
+        limits = _r_squared_limit(prepared(name))
         fitted = partial(Row, unit="", modes=MODES, estimator=PINV)
         paper = _PAPER_R2.get(name, (None, None))
         rows += [
@@ -114,7 +114,7 @@ def plot_fig6(context: Context, path: Path) -> None:
     x = np.arange(MODES, dtype=float)
     lines = [plots.Line(name, x, values) for name, values in _r_squared(context).items()]
     lowest = min(float(line.y.min()) for line in lines)
-    panel = plots.Curves(
+    panel = plots.curves(
         lines,
         f"{PINV}, n = 1 to 4",
         "Noll index",
@@ -140,7 +140,7 @@ def _r_squared_limit(ready: Prepared) -> Array:
 @lru_cache(maxsize=8)
 def _pure_modes(context: Context, name: str) -> Array:
     """Estimates (iterations, modes, amplitudes) in waves of a pure mode by itself, without noise."""
-    ready = context.prepared(name)
+    ready = prepared(name)
     wavelength_nm, linear = ready.sensor.wavelength_nm, fits(ready, MODES)["pinv"]
     ready.model(np.zeros(MODES))  # the twin is built before the threads ask for it
 
@@ -174,7 +174,7 @@ def linear_range(deviation: Array) -> float:
 
 @lru_cache(maxsize=8)
 def _one_wavefront(context: Context, name: str, literal: bool) -> tuple[Array, dict[str, Array]]:
-    ready = context.prepared(name)
+    ready = prepared(name)
     wavelength_nm, matched = ready.sensor.wavelength_nm, _matched(ready)
     low, high = LITERAL_WAVES if literal else (matched.low, matched.high)
     truth = random_wavefronts(context.rng("fig8"), 1, NOLLS_14, low, high)[0]
@@ -247,14 +247,14 @@ def plot_fig8(context: Context, path: Path) -> None:
     x_label, fitted = "amplitude, waves rms", {"true": truth, PINV: estimates[PINV]}
     errors = {key: estimates[key] - truth for key in (PINV, WEIGHTED_2)}
     panels: list[plots.Panel] = [
-        plots.Curves(
+        plots.curves(
             modes, f"(a) {names[0]}, {PINV}", x_label, "estimate, waves rms", diagonal=True, legend="upper left"
         ),
-        plots.Curves(
+        plots.curves(
             means, "mean of 14 modes", x_label, "deviation from linear, %", y_bounds=(0.0, 40.0), legend="upper left"
         ),
-        plots.Bars(fitted, _MODE_TICKS, f"(b) {names[0]}, {PINV}", "waves rms"),
-        plots.Bars(errors, _MODE_TICKS, f"{names[0]}, errors of (b)", "waves rms"),
+        plots.bars(fitted, _MODE_TICKS, f"(b) {names[0]}, {PINV}", "waves rms"),
+        plots.bars(errors, _MODE_TICKS, f"{names[0]}, errors of (b)", "waves rms"),
     ]
     plots.draw(
         path,

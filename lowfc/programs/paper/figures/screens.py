@@ -10,7 +10,7 @@ from lowfc.optics.chain.pupil import circle
 from lowfc.optics.chain.screen import kolmogorov
 from lowfc.optics.chain.sensor import image
 from lowfc.programs.paper import plots
-from lowfc.programs.paper.cases import Case, Context, Prepared, Row, assuming
+from lowfc.programs.paper.cases import Case, Context, Prepared, Row, assuming, prepared
 from lowfc.programs.paper.figures.exposure import (
     BRIGHT,
     FULL_CHAIN,
@@ -45,7 +45,7 @@ def _screen_nm(context: Context, ready: Prepared, width: int, i: int) -> Array:
 
 @lru_cache(maxsize=4)
 def _screens(context: Context, name: str, width: int) -> list[_Screen]:
-    ready = context.prepared(name)
+    ready = prepared(name)
     linear = fits(ready, MODES)
     centred = ready.open_modes[:MODES] - ready.open_modes[:MODES].mean(axis=1, keepdims=True)
     ready.model(np.zeros(MODES))  # the twin is built before the threads ask for it
@@ -64,7 +64,7 @@ def fig9(context: Context) -> list[Row]:
     """Rms of estimate and residual of Kolmogorov screens, Fig. 9."""
     rows = []
     for name in context.names("sam"):
-        ready = context.prepared(name)
+        ready = prepared(name)
         for width, how in WIDTHS.items():
             screens = _screens(context, name, width)
             values = {
@@ -92,7 +92,7 @@ def fig9(context: Context) -> list[Row]:
 def plot_fig9(context: Context, path: Path) -> None:
     """Draw Fig. 9: the first screen, its estimate and what is left, in radians."""
     name, width = context.names("sam")[0], next(iter(WIDTHS))
-    ready = context.prepared(name)
+    ready = prepared(name)
     screen_nm, modes_nm = _screens(context, name, width)[0]
     left_nm = {key: screen_nm - ready.opd_nm(modes_nm[key]) for key in (PINV, _BEST)}
     panels: list[plots.Panel] = []
@@ -106,7 +106,7 @@ def plot_fig9(context: Context, path: Path) -> None:
         radians = (opd_nm - inside.mean()) * (2.0 * np.pi / ready.sensor.wavelength_nm)
         title = f"{title}\nrms {inside.std() / ready.sensor.wavelength_nm:.3f} waves"
         shown = np.where(circle(len(radians)) > 0, radians, np.nan)
-        panels.append(plots.Picture(shown, title, plots.PUPIL, 0.5, (-bound, bound), "radians", "signed"))
+        panels.append(plots.picture(shown, title, plots.PUPIL, 0.5, (-bound, bound), "radians", "signed"))
     plots.draw(
         path,
         panels,

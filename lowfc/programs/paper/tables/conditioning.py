@@ -14,7 +14,7 @@ from lowfc.optics.chain import sam as sams
 from lowfc.optics.chain.relay import ApertureMask
 from lowfc.optics.chain.sensor import Sensor
 from lowfc.optics.detector.photometry import electrons
-from lowfc.programs.paper.cases import Context, Prepared, Row, sparse_apertures
+from lowfc.programs.paper.cases import Context, Prepared, Row, prepared, sparse_apertures
 from lowfc.programs.paper.tables.pointing import NM_PER_MAS
 
 OTHERS = ("clowfs", "zwfs")
@@ -39,9 +39,9 @@ LIMITS = {"open": 1e12, "bar": 1000.0, "holes": None, "sensor": 100.0}
 
 def conditioning(context: Context) -> list[Row]:
     """Condition numbers, throughput and the tilt's Cramer-Rao bound of each mask in the relay pupil."""
-    masks = [("open", context.prepared("open"))]
+    masks = [("open", prepared("open"))]
     masks += [("bar", _bar(width, angle)) for width, angle in BARS]
-    masks += [("sensor", context.prepared(name)) for name in context.names(*sparse_apertures(), *OTHERS)]
+    masks += [("sensor", prepared(name)) for name in context.names(*sparse_apertures(), *OTHERS)]
     holes = [_with_holes(diameter) for diameter in HOLES]
     masks += [("holes", each) for each in holes if isinstance(each, Prepared)]
 

@@ -15,7 +15,7 @@ from lowfc.optics.chain.relay import Defocus, fresnel_distance
 from lowfc.optics.chain.sensor import reference
 from lowfc.optics.chain.zernike import NOLLS_14
 from lowfc.optics.detector.photometry import electrons
-from lowfc.programs.paper.cases import Context, Prepared, Row
+from lowfc.programs.paper.cases import Context, Prepared, Row, prepared
 from lowfc.programs.paper.tables import reconstruction
 from lowfc.programs.paper.tables.pointing import (
     NM_PER_MAS,
@@ -39,9 +39,9 @@ PAPER_R2 = 0.97
 
 def photometry(context: Context) -> list[Row]:
     """Throughputs, peaks, signals, ratios of the sensors, and the paper's inconsistencies."""
-    sam, clowfs = context.prepared("sam"), context.prepared("clowfs")
+    sam, clowfs = prepared("sam"), prepared("clowfs")
     rows = [*_throughputs(sam, clowfs)]
-    for sensor in (sam, clowfs, context.prepared("zwfs")):
+    for sensor in (sam, clowfs, prepared("zwfs")):
         rows += _signals(sensor)
     return [*rows, *_ratios(sam, clowfs), *_inconsistencies(sam, clowfs)]
 

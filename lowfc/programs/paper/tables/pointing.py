@@ -14,7 +14,7 @@ from lowfc.design.paper import STAR, TABLE4_EXPOSURE_S, TABLE4_MAS, TABLE4_READ_
 from lowfc.design.trials import noisy_e
 from lowfc.optics.chain.relay import ApertureMask
 from lowfc.optics.detector.photometry import electrons, tilt_nm_per_mas
-from lowfc.programs.paper.cases import Context, Prepared, Row, sparse_apertures
+from lowfc.programs.paper.cases import Context, Prepared, Row, prepared, sparse_apertures
 
 OTHERS = ("clowfs", "clowfs:1", "zwfs")
 """Sensors besides the shipped sparse apertures."""
@@ -101,7 +101,7 @@ def table4(context: Context) -> list[Row]:
     """Rows of Table 4: electrons, then scatter and mean error of the tilt by sensor, light, tilt, modes and kind."""
     rows: list[Row] = []
     for name in context.names(*sparse_apertures(), *OTHERS):
-        sensor = context.prepared(name)
+        sensor = prepared(name)
         images = {mas: sensor.image(np.array([mas * NM_PER_MAS]), sensor.band) for mas in FITTED}
         for exposure in exposures(sensor):
             quantity = f"electrons on the sensor, {exposure.name}"

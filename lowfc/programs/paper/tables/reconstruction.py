@@ -11,7 +11,7 @@ from lowfc.design.estimators import KINDS, Fit, estimate, iterated
 from lowfc.design.fisher import cramer_rao, variance_e
 from lowfc.design.paper import MODES, PEAK_E, TABLE3_READ_NOISE_E, TABLE3_WAVES
 from lowfc.optics.chain.zernike import NOLLS_20
-from lowfc.programs.paper.cases import DEFAULT_SAM, Context, Prepared, Row, sparse_apertures
+from lowfc.programs.paper.cases import DEFAULT_SAM, Context, Prepared, Row, prepared, sparse_apertures
 
 OTHERS = ("bowtie", f"bowtie:{DEFAULT_SAM}", "clowfs", "zwfs", "bar", "lyot", "aplc")
 """Sensors besides the shipped sparse apertures."""
@@ -112,7 +112,7 @@ def fits(sensor: Prepared, modes: int, nuisances: bool = False) -> dict[str, Fit
 
 def ensemble(context: Context, name: str, modes: int, wavefronts: Input, nuisances: bool = False) -> Ensemble:
     """Draw the wavefronts, image them with the full chain and noise, and estimate them in every way."""
-    sensor = context.prepared(name)
+    sensor = prepared(name)
     linear, light_e, wavelength_nm = fits(sensor, modes, nuisances), scale_e(sensor), sensor.sensor.wavelength_nm
     rng = context.rng("table3", modes, wavefronts.name)
     nolls = NOLLS_20[:modes]
@@ -142,7 +142,7 @@ def table3(context: Context) -> list[Row]:
     rows: list[Row] = []
     pupils: set[tuple[bytes, int, str]] = set()
     for name in context.names(*sparse_apertures(), *OTHERS):
-        sensor = context.prepared(name)
+        sensor = prepared(name)
         main = name in ("sam", "clowfs")
         for modes in MODES:
             for wavefronts in inputs(sensor, modes, literal=main):

@@ -7,7 +7,7 @@ import numpy as np
 from lowfc.adapters.files.layouts import load_layout
 from lowfc.contract.configuration import SensorSection
 from lowfc.optics.chain.zernike import NOLLS_14, mode_name
-from lowfc.programs.paper.cases import Case, Context, Row
+from lowfc.programs.paper.cases import Case, Context, Row, prepared
 from lowfc.programs.paper.tables.conditioning import conditioning
 from lowfc.programs.paper.tables.photometry import defocus_waves, differential, photometry
 from lowfc.programs.paper.tables.pointing import table4
@@ -29,7 +29,7 @@ TABLE2_SENSORS = ("sam", "sam27d07_bal14", "sam27d10_bal14", "bowtie", "clowfs",
 
 def table1(context: Context) -> list[Row]:
     """Rows of Table 1, and of the parameters that Sects. 2 and 3 give in their text."""
-    sensor, section, clowfs = context.prepared("sam").sensor, SensorSection(), SensorSection(kind="clowfs")
+    sensor, section, clowfs = prepared("sam").sensor, SensorSection(), SensorSection(kind="clowfs")
     layout = load_layout(section.sam)
     diameters = sorted({hole[2] for hole in layout.holes})
     scaled = "The model knows focal lengths and diameters only by their ratio."
@@ -61,7 +61,7 @@ def table2(context: Context) -> list[Row]:
 
 
 def _peaks(context: Context, name: str) -> Iterator[Row]:
-    sensor = context.prepared(name)
+    sensor = prepared(name)
 
     def peak(noll: int) -> float:
         return float(np.abs(differential(sensor, noll)).max())
