@@ -28,7 +28,7 @@ from lowfc.contract.messages import (
 from lowfc.control.loop.safety import Reason
 from lowfc.optics.chain.grid import pupil_axis
 from lowfc.optics.chain.mirror import influence_factors
-from sim_dm.device import Command, Device, apply_command, initial, tick
+from sim_dm.device import Command, Device, Status, apply_command, initial, tick
 
 Single = npt.NDArray[np.float32]
 
@@ -143,21 +143,10 @@ class MirrorProcess:
 
     def _publish(self, time_ns: int) -> None:
         """Publish the state, then, when it is due, a picture of the surface."""
-        status = self._status
-        following = wire.MIRROR_STATUS_FOLLOWING if status.following else wire.MIRROR_STATUS_EXPIRED
-        state = wire.MirrorState(
-            timestamp=timestamp(time_ns),
-            frame_sequence=status.frame_sequence,
-            status=following if status.received_ns else wire.MIRROR_STATUS_WAITING,
-            rows=self._device.grid[0],
-            columns=self._device.grid[1],
-            actuators=status.surface_nm.tobytes(),
-            command_nm=status.command_nm.tolist(),
-            limits_hit=[reason.value for reason in status.limits_hit],  # type: ignore[misc]  # numbered alike
-            channels=sorted(status.channels),
-            safe=bool(status.safe),
-            refused=self._refused.value if self._refused is not None else 0,  # type: ignore[arg-type]  # numbered alike
-        )
+        status, state = self._status, state_of(self._status, time_ns)
+        state.channels.extend(sorted(status.channels))
+        state.safe = bool(status.safe)
+        state.refused = self._refused.value if self._refused is not None else 0  # type: ignore[assignment]  # numbered alike
         self._states.put(state.SerializeToString())
         self._state_due_ns = self._service.clock.now_ns() + IDLE_STATE_NS
         now_ns = self._service.clock.now_ns()  # not by a command's time: that may be anything
@@ -172,6 +161,21 @@ class MirrorProcess:
         health.command_refused = self._refused.value if self._refused is not None else 0  # type: ignore[assignment]
         health.command_expired = bool(status.received_ns) and not status.following
         health.limits_hit.extend(reason.value for reason in status.limits_hit)  # type: ignore[misc]
+
+
+def state_of(status: Status, time_ns: int) -> wire.MirrorState:
+    """What a mirror publishes of itself, but for channels, safe mode and the last refusal."""
+    following = wire.MIRROR_STATUS_FOLLOWING if status.following else wire.MIRROR_STATUS_EXPIRED
+    return wire.MirrorState(
+        timestamp=timestamp(time_ns),
+        frame_sequence=status.frame_sequence,
+        status=following if status.received_ns else wire.MIRROR_STATUS_WAITING,
+        rows=status.surface_nm.shape[0],
+        columns=status.surface_nm.shape[1],
+        actuators=status.surface_nm.tobytes(),
+        command_nm=status.command_nm.tolist(),
+        limits_hit=[reason.value for reason in status.limits_hit],  # type: ignore[misc]  # numbered alike
+    )
 
 
 def _told(payload: bytes, start_check: StartCheck | None = None) -> Command:

@@ -163,60 +163,12 @@ def test_a_closed_loop_is_opened_for_pokes_and_closed_again() -> None:
     with calibrator.holding():
         modes.append(mode_of(loop))
     assert [*modes, mode_of(loop)] == [wire.LOOP_MODE_OPEN, wire.LOOP_MODE_CLOSED]
+    with pytest.raises(CalibrationError, match="failed"), calibrator.holding():
+        raise CalibrationError("failed")
+    assert mode_of(loop) == wire.LOOP_MODE_CLOSED
     loop.ask("safe")
     with pytest.raises(CalibrationError, match="must be open or closed"), calibrator.holding():
         pass
-
-
-class Meddled(FoldedLoop):
-    """Somebody asks for something in the middle of a play, and a play is then not to be stopped where it is mute."""
-
-    def __init__(self, name: str, *, mute: bool = False, **fields: Any) -> None:
-        super().__init__(configured(**FEW))
-        self._name, self._fields, self._mute = name, fields, mute
-
-    def play(self, basis_nm: npt.ArrayLike, table: npt.ArrayLike) -> Answer:
-        given = super().play(basis_nm, table)
-        self.run(50)
-        self.ask(self._name, **self._fields)
-        return given
-
-    def stop(self) -> Answer:
-        given = self.ask("stop")
-        if self._mute:
-            raise BusError("no answer")
-        return given
-
-
-@pytest.mark.parametrize(
-    ("asked", "why", "mode", "after"),
-    [
-        ({"name": "safe", "mute": True}, "the loop went from open to safe", wire.LOOP_MODE_SAFE, "close refused"),
-        ({"name": "open", "lease_id": 0}, "operator asked to open", wire.LOOP_MODE_OPEN, ""),
-    ],
-    ids=["safe", "open"],
-)
-def test_what_another_operator_asks_ends_a_calibration_and_has_the_last_word(
-    asked: dict[str, Any], why: str, mode: int, after: str
-) -> None:
-    loop = Meddled(**asked)
-    loop.close_loop()
-    said: list[str] = []
-    calibrator = of(loop, "poke", say=said.append)
-    reserved = loop.reserved("a test") if mode == wire.LOOP_MODE_OPEN else contextlib.nullcontext()
-    with reserved, pytest.raises(CalibrationError, match=why), calibrator.holding():
-        calibrator.run()
-    assert mode_of(loop) == mode
-    assert loop.stops == 1
-    assert said[-1].startswith(f"warning: the loop is not closed again: {after}")
-
-
-def test_a_loop_is_closed_again_after_a_failure() -> None:
-    loop = FoldedLoop(configured(**FEW))
-    loop.close_loop()
-    with pytest.raises(CalibrationError, match="failed"), of(loop, "poke", 4).holding():
-        raise CalibrationError("failed")
-    assert mode_of(loop) == wire.LOOP_MODE_CLOSED
 
 
 def test_cycles_that_cannot_be_read_are_a_line() -> None:
@@ -349,6 +301,28 @@ def test_after_ctrl_c_the_mirror_is_where_it_was_and_the_cycles_done_are_kept() 
         taken_of(loop, "poke", 4, resume=True)
     with pytest.raises(DataFileError, match="nothing to go on from"):
         taken_of(loop, "poke", 4, out=Path("other.fits"), resume=True)
+
+
+@pytest.mark.parametrize(
+    ("strike", "why", "mode", "after"),
+    [
+        (lambda loop: loop.ask("safe"), "the loop went from open to safe", wire.LOOP_MODE_SAFE, "close refused"),
+        (lambda loop: loop.ask("open", lease_id=0), "operator asked to open", wire.LOOP_MODE_OPEN, ""),
+    ],
+    ids=["safe", "open"],
+)
+def test_what_another_operator_asks_ends_a_calibration_and_has_the_last_word(
+    strike: Callable[[FoldedLoop], None], why: str, mode: int, after: str
+) -> None:
+    loop, said = Struck(1, strike, ignore), list[str]()
+    loop.close_loop()
+    calibrator = of(loop, "poke", say=said.append)
+    reserved = loop.reserved("a test") if mode == wire.LOOP_MODE_OPEN else contextlib.nullcontext()
+    with reserved, pytest.raises(CalibrationError, match=why), calibrator.holding():
+        calibrator.run()
+    assert mode_of(loop) == mode
+    assert loop.stops == 1
+    assert said[-1].startswith(f"warning: the loop is not closed again: {after}")
 
 
 @pytest.mark.parametrize("before_the_end", [None, 3])

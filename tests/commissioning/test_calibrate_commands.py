@@ -13,7 +13,6 @@ from typer.testing import CliRunner
 
 from lowfc.adapters.files import calibration_file, factory
 from lowfc.adapters.process.progress import spoken
-from lowfc.arrays import Array
 from lowfc.contract.codecs.calibration_codec import identified
 from lowfc.contract.configuration import Configuration, load
 from lowfc.contract.errors import CalibrationError, ConfigurationError, DataFileError
@@ -21,7 +20,7 @@ from lowfc.control.calibration.alignment import Geometry, onto
 from lowfc.control.calibration.calibration import Calibration
 from lowfc.control.calibration.response_fit import cross_talk
 from lowfc.optics.chain.zernike import zernikes
-from lowfc.optics.twin.twin import Evaluator, Twin, node_radii, reference, response
+from lowfc.optics.twin.twin import Twin, node_radii, reference, response
 from lowfc.programs.commissioning.analytic import analytic
 from lowfc.programs.commissioning.calibrate import align as calibrate_align
 from lowfc.programs.commissioning.calibrate import tasks as calibrate_commands
@@ -303,32 +302,6 @@ def there(config: Configuration) -> Calibration:
     return analytic(config, SILENT, zero_point(config, THERE)[1])
 
 
-def seen(calibration: Calibration, optics: Twin, I0: Array, state_nm: Array, step_nm: float) -> Array:
-    """(modes, modes): what R makes of a step of each mode about a state, by images with exp(i phi), over the step."""
-    evaluator, modes = Evaluator(optics), zernikes(calibration.noll, *node_radii(optics))
-    R = calibration.reconstructor.astype(np.float64)
-    found = []
-    for mode in modes:
-        image = evaluator.image((state_nm + step_nm * mode).astype(np.float32)).reshape(-1).astype(np.float64)
-        found.append(R @ (image / image.sum() - I0) / step_nm)
-    return np.array(found).T
-
-
-def test_steps_about_a_state_are_measured_where_those_about_a_flat_wavefront_are_not(
-    config: Configuration, optics: Twin, there: Calibration
-) -> None:
-    state_nm = 20.0 * zernikes((4,), *node_radii(optics))[0] - 20.0 * zernikes((7,), *node_radii(optics))[0]
-    flat = analytic(config, SILENT)
-    I0 = there.reference.astype(np.float64)
-    one = np.eye(len(flat.noll))
-    for step_nm in (1.0, -1.0):
-        assert np.abs(seen(there, optics, I0, state_nm, step_nm) - one).max() < 0.02
-        assert np.abs(seen(flat, optics, I0, state_nm, step_nm) - one).max() > 0.05
-    assert np.abs(there.actuators_to_modes @ there.modes_to_actuators - one).max() < 1e-4
-    assert there.id != flat.id
-    assert there.operator_hash == flat.operator_hash
-
-
 def test_the_slopes_are_the_derivatives_of_the_image(optics: Twin) -> None:
     modes = zernikes((2, 4, 11), *node_radii(optics))
     state_nm = 15.0 * modes[1] - 10.0 * modes[2]
@@ -350,6 +323,10 @@ def test_a_shape_of_the_mirror_is_the_wavefront_that_it_makes(
     shaped = analytic(config, SILENT, zero_point(config, str(tmp_path / "shape.npy"))[1])
     moved = there.reference - flat.reference
     assert np.linalg.norm(shaped.reference - there.reference) < 0.1 * np.linalg.norm(moved)
+    assert there.id != flat.id
+    assert there.operator_hash == flat.operator_hash
+    one = np.eye(len(flat.noll))
+    assert np.abs(there.actuators_to_modes @ there.modes_to_actuators - one).max() < 1e-4
     changed = there.response - flat.response
     assert np.linalg.norm(shaped.response - there.response) < 0.1 * np.linalg.norm(changed)
 

@@ -43,7 +43,7 @@ from lowfc.programs.commissioning.conformance.line import Line, Received
 from lowfc.programs.commissioning.conformance.mirror import mirror_checks
 from lowfc.testing.clock import FakeClock
 from sim_dm.device import Command, Status, apply_command, initial, tick
-from sim_dm.process import _told, device
+from sim_dm.process import _told, device, state_of
 from tests.support.loops import lowfc, until
 
 MS = 1_000_000
@@ -183,18 +183,7 @@ class Mirror(Device):
             self._publish(now_ns, now_ns)
 
     def _publish(self, time_ns: int, now_ns: int) -> None:
-        status = self.status
-        following = wire.MIRROR_STATUS_FOLLOWING if status.following else wire.MIRROR_STATUS_EXPIRED
-        state = wire.MirrorState(
-            timestamp=timestamp(time_ns),
-            frame_sequence=status.frame_sequence,
-            status=following if status.frame_sequence else wire.MIRROR_STATUS_WAITING,
-            rows=status.surface_nm.shape[0],
-            columns=status.surface_nm.shape[1],
-            actuators=status.surface_nm.tobytes(),
-            command_nm=status.command_nm.tolist(),
-            limits_hit=[reason.value for reason in status.limits_hit],  # type: ignore[misc]
-        )
+        state = state_of(self.status, time_ns)
         self.publish(MIRROR_STATE.at("dm"), self.changed("state", state), now_ns)
         self._published_ns = now_ns
 

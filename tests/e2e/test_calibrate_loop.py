@@ -29,17 +29,6 @@ disable_cpu_idle = false
 """
 
 
-SHAKEN = """
-[sensor]
-modes = 6
-[disturbance]
-preset = "bench"
-[realtime]
-priority = 0
-disable_cpu_idle = false
-"""
-
-
 @pytest.mark.slow
 def test_a_running_loop_is_calibrated_interrupted_and_gone_on_with(tmp_path: Path) -> None:
     (tmp_path / "test.toml").write_text(CONFIG)
@@ -74,32 +63,6 @@ def test_a_running_loop_is_calibrated_interrupted_and_gone_on_with(tmp_path: Pat
             time.sleep(0.5)
             state = client.status().state
             assert np.abs(np.array(state.command_history_nm)).max() < 5
-    finally:
-        interrupt(loop)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("method", ["hadamard", "poke", "in-loop"])
-def test_the_promise_is_kept_over_the_bus(method: str, tmp_path: Path) -> None:
-    (tmp_path / "test.toml").write_text(SHAKEN)
-    opened = [] if method == "in-loop" else ["--open"]
-    loop = start(tmp_path, "sim-loop", "--config", "test.toml", "--no-record", "--lockstep", *opened)
-    try:
-        until(running)
-        words = ("--method", method, "--snr", "20", "--out", "night.fits", "--json")
-        done = run(tmp_path, "calibrate", *words)
-        assert done.returncode == 0, done.stderr
-        found = json.loads(done.stdout)
-        assert found["recommended"]
-        assert found["snr_reached"] >= 20
-        made = calibration_file.load(tmp_path / "night.fits")
-        with Client() as client:
-            talk = cross_talk(made.reconstructor, client.calibration().response)
-        assert np.sqrt((talk**2).mean()) < 1.2 / 20
-        assert np.abs(talk).max() < 4 / 20
-        ratio = np.array(found["noise_gain_nm"]) / found["computed_noise_nm"]
-        assert ratio.max() < 1.2
-        assert not list(tmp_path.glob("*.part.npz"))
     finally:
         interrupt(loop)
 

@@ -36,6 +36,7 @@ CHECK_PART = 0.25
 """Cycles that check R, for each one that it is made from."""
 _LEAST_CHECKS = 3
 _OF_THE_SLEW = 0.8
+SEED = 1
 DELAY_FRAMES = 600
 """Of the sequence that the delay is measured with."""
 
@@ -53,7 +54,6 @@ class CalibrationRequest:
         resume: go on from the cycles done.
         truncate: leave out singular values below this part of the largest.
         tikhonov: damp singular values of about this part of the largest.
-        seed: of a dither.
     """
 
     method: str
@@ -64,7 +64,6 @@ class CalibrationRequest:
     resume: bool = False
     truncate: float = 0.0
     tikhonov: float = 0.0
-    seed: int = 1
 
 
 class Pokes:
@@ -94,7 +93,7 @@ class Pokes:
         """For the delay: one column, in a closed loop of the wavefront that all columns of a dither add up to."""
         closed = self._wanted.method == "in-loop"
         amplitude = self.amplitude_nm * float(np.sqrt(self._modes)) if closed else AMPLITUDE_NM["poke"]
-        return sequence(min(amplitude, float(self._largest_nm[mode])), self._wanted.seed)
+        return sequence(min(amplitude, float(self._largest_nm[mode])))
 
     def cycles(self) -> int:
         """How many are needed, as far as photons and read-out say."""
@@ -117,13 +116,13 @@ class Pokes:
     def _cycle(self, number: int, amplitude_nm: float) -> poke_plan.Plan:
         wanted = self._wanted
         if wanted.method == "in-loop":
-            seed = wanted.seed + 1000 * (number + 1)
+            seed = SEED + 1000 * (number + 1)
             return poke_plan.dither(self._modes, amplitude_nm, PIECE, DITHER_HOLD, seed)
         patterns = poke_plan.hadamard_patterns if wanted.method == "hadamard" else poke_plan.poke_patterns
         rest = max(16, len(poke_plan.SIGNS) * HOLD)
         shapes = patterns(self._modes, amplitude_nm)
         # in an order of its own, so that a vibration disturbs each pair of cycles otherwise, and their scatter shows it
-        shapes = np.random.default_rng([wanted.seed, number // 2]).permutation(shapes)
+        shapes = np.random.default_rng([SEED, number // 2]).permutation(shapes)
         return poke_plan.cycle(shapes, HOLD, SETTLE, rest, backwards=number % 2 == 1)
 
     def _amplitude(self) -> float:
@@ -147,9 +146,9 @@ class Pokes:
         return asked
 
 
-def sequence(amplitude_nm: float, seed: int = 1) -> poke_plan.Plan:
+def sequence(amplitude_nm: float) -> poke_plan.Plan:
     """The sequence of pokes of one mode, of this amplitude (wavefront rms), for `Player.first_poke`."""
-    return poke_plan.dither(1, amplitude_nm, DELAY_FRAMES, 1, seed)
+    return poke_plan.dither(1, amplitude_nm, DELAY_FRAMES, 1, SEED)
 
 
 def largest_nm(config: Configuration, calibration: Calibration) -> Array:

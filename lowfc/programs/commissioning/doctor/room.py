@@ -8,7 +8,6 @@ from threadpoolctl import threadpool_info, threadpool_limits
 
 from lowfc.adapters.bus.own_certificate import WARN_DAYS
 from lowfc.adapters.bus.routed import ending_certificates
-from lowfc.adapters.viewer.rerun_viewer import ViewerError, has_screen, viewer_binary, vulkan_drivers
 from lowfc.programs.commissioning.checks import Check, Table, note, ok, warning
 from lowfc.programs.commissioning.doctor.facts import Facts
 from lowfc.programs.core.recording.volume import bytes_per_s, selected
@@ -188,35 +187,6 @@ def _certificates(facts: Facts) -> Check:
     if not said:
         return ok(f"all in {network.certificates} are valid for more than {WARN_DAYS} days")
     return warning("; ".join(said))
-
-
-@CHECKS.check("viewer")
-def _viewer(facts: Facts) -> Check:
-    """The rerun viewer, and a screen for its window.
-
-    The viewer is missing.
-    """
-    try:
-        binary = viewer_binary()
-    except ViewerError as fault:
-        return warning("missing", str(fault), "`lowfc view` shows nothing; the loop does not need it")
-    if has_screen():
-        return ok(f"{binary}, and a screen")
-    return note(f"{binary}; no screen for a window", "lowfc view --web", "`lowfc view` opens no window here")
-
-
-@CHECKS.check(
-    "graphics driver",
-    advice="apt install mesa-vulkan-drivers libvulkan1",
-    cost="`lowfc view --headless-screenshot` makes no picture; --web needs none",
-)
-def _graphics_driver(facts: Facts) -> Check:
-    """Vulkan drivers, with which the viewer draws a window, or a picture without a screen.
-
-    There is none.
-    """
-    drivers = vulkan_drivers()
-    return ok(", ".join(path.name for path in drivers)) if drivers else warning("no Vulkan driver")
 
 
 def _blas_threads() -> dict[str, int]:

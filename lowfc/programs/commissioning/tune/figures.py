@@ -24,7 +24,6 @@ from lowfc.control.loop.wording import counted
 from lowfc.optics.chain.zernike import mode_name
 from lowfc.programs.commissioning.tune.data import Telemetry
 
-CONTROLLERS = ("integrator", "pi-notch", "lqg")
 OPTICAL_GAIN_MAS = 10.0
 """Tilt of an open loop, rms per axis, above which the sensor shows less than there is."""
 TILTS = (2, 3)
