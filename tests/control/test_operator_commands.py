@@ -3,6 +3,7 @@
 from collections import Counter
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -329,35 +330,27 @@ NAMES = [
     "clear",
     "dance",
 ]
-names = st.lists(st.sampled_from([*NAMES, *NAMES, "safe"]), min_size=COMMANDS, max_size=COMMANDS)
-pauses = st.lists(st.sampled_from([0, 1, 1, 2, 5, 12]), min_size=COMMANDS, max_size=COMMANDS)
 random_commands = given(
-    names,
-    pauses,
-    st.integers(0, 2**32 - 1),
-    st.sampled_from([1.0, 1.5, 3.0]),
-    st.booleans(),
-    st.sampled_from(["hold", "flat"]),
+    names=st.lists(st.sampled_from([*NAMES, *NAMES, "safe"]), min_size=COMMANDS, max_size=COMMANDS),
+    pauses=st.lists(st.sampled_from([0, 1, 1, 2, 5, 12]), min_size=COMMANDS, max_size=COMMANDS),
+    seed=st.integers(0, 2**32 - 1),
+    delay_frames=st.sampled_from([1.0, 1.5, 3.0]),
+    tight=st.booleans(),
+    silence=st.sampled_from(["hold", "flat"]),
 )
-quick = effort(max_examples=25, deadline=None, derandomize=True, phases=[Phase.explicit, Phase.generate])
-thorough = effort(max_examples=1000, deadline=None, phases=[Phase.explicit, Phase.generate, Phase.shrink])
 
 
-@quick
+@effort(max_examples=25, deadline=None, derandomize=True, phases=[Phase.explicit, Phase.generate])
 @random_commands
-def test_whatever_comes_in_it_is_pure_finite_and_within_the_limits(
-    names: list[str], pauses: list[int], seed: int, delay_frames: float, tight: bool, silence: str
-) -> None:
-    check(names, pauses, seed, delay_frames, tight, silence)
+def test_whatever_comes_in_it_is_pure_finite_and_within_the_limits(**commands: Any) -> None:
+    check(**commands)
 
 
 @pytest.mark.slow
-@thorough
+@effort(max_examples=1000, deadline=None, phases=[Phase.explicit, Phase.generate, Phase.shrink])
 @random_commands
-def test_whatever_comes_in_for_long(
-    names: list[str], pauses: list[int], seed: int, delay_frames: float, tight: bool, silence: str
-) -> None:
-    check(names, pauses, seed, delay_frames, tight, silence)
+def test_whatever_comes_in_for_long(**commands: Any) -> None:
+    check(**commands)
 
 
 def test_the_random_commands_are_what_they_should_be() -> None:

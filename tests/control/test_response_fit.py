@@ -244,35 +244,6 @@ def test_frames_of_their_own_show_a_wrong_reconstructor() -> None:
     assert not any(check(each, small, error).within(0.012, 0.04) for each in answers)
 
 
-def test_the_loops_reaction_does_not_bias_h() -> None:
-    R = reconstructor(I0, H, GOOD, FLUX_E, 0.0)
-    sums, biased = (Sums.none(known()) for _ in range(2))
-    rng = np.random.default_rng(7)
-    for piece in range(6):
-        plan = dither(MODES, 2.0, 1000, 2, piece)
-        command, wander = np.zeros(MODES), np.zeros(MODES)
-        frames, moved = [], []
-        before = np.zeros(MODES)
-        for row in plan.table:
-            wander = 0.99 * wander + 0.5 * rng.standard_normal(MODES)
-            seen = before + command  # one frame of delay
-            frame = exposed((seen + wander)[None], int(rng.integers(1 << 31)))[0]
-            frames.append(frame)
-            moved.append(seen)
-            command = command - 0.5 * (R @ (frame / frame.sum() - I0))
-            before = row
-        poked = np.vstack([np.zeros(MODES), plan.table[:-1]])
-        fractions, flux = fractions_of(np.array(frames))
-        used = np.ones(len(frames))
-        sums = sums.plus(cycle_response(fractions, flux, np.array(moved), poked, used))
-        biased = biased.plus(cycle_response(fractions, flux, np.array(moved), np.array(moved), used))
-    found = measured(sums)
-    talk, naive = cross_talk(R, found.response), cross_talk(R, measured(biased).response)
-    assert np.abs(np.diag(talk)).max() < 0.1
-    assert np.diag(naive).mean() < -0.15
-    assert abs(np.diag(talk).mean()) < 0.05
-
-
 @pytest.mark.parametrize("delay", [1.0, 1.3, 1.5, 2.0, 2.75])
 def test_the_delay_is_found(delay: float) -> None:
     poke = dither(1, 8.0, 600, 1, 3).table[:, 0]

@@ -18,7 +18,7 @@ from lowfc.control.laws.transfer_function import departure, measured, seen_of_mi
 from lowfc.control.loop.advance import advance
 from lowfc.control.loop.inputs import Request
 from lowfc.control.loop.safety import LoopMode
-from lowfc.control.loop.state import FADING_FRAMES, SETTLING_FRAMES, Settings, State
+from lowfc.control.loop.state import Settings, State
 from tests.support.theory import linear
 from tests.support.toy import NOLL, calibration, frame, live, loaded, settings
 
@@ -75,14 +75,6 @@ def test_short_gaps_are_bridged_and_long_ones_cut() -> None:
     assert found.frames == 20 - 1 - MOST_BRIDGED
 
 
-def test_a_row_without_a_value_is_a_missing_frame() -> None:
-    values = np.arange(10.0)[:, None].repeat(2, axis=1)
-    values[4, 1] = np.nan
-    found = pieces(numbers(10), values)
-    assert found.bridged == 1
-    assert np.array_equal(found.joined(), np.arange(10.0)[:, None].repeat(2, axis=1))
-
-
 def test_repeated_and_older_frames_are_left_out() -> None:
     order = [0, 1, 2, 2, 1, 3, 4]
     found = pieces(numbers(5)[order], np.array(order, float)[:, None])
@@ -97,13 +89,9 @@ def test_a_restart_of_the_camera_begins_a_piece() -> None:
 def test_nothing_gives_no_pieces() -> None:
     assert pieces(numbers(0), np.zeros((0, 2))) == Pieces((), 0)
     assert pieces(numbers(3), np.full((3, 2), np.nan)) == Pieces((), 0)
-    assert spectrum(Pieces((), 0), RATE_HZ) is None
-
-
-@pytest.mark.parametrize(("frames", "there"), [(SHORTEST - 1, False), (SHORTEST, True)])
-def test_what_is_too_short_has_no_spectrum(frames: int, there: bool) -> None:
-    found = spectrum(whole(np.random.default_rng(1).standard_normal((frames, 1))), RATE_HZ)
-    assert (found is not None) == there
+    noise = np.random.default_rng(1).standard_normal((SHORTEST, 1))
+    found = [spectrum(one, RATE_HZ) for one in (Pieces((), 0), whole(noise[1:]), whole(noise))]
+    assert [one is not None for one in found] == [False, False, True]
 
 
 def test_a_long_run_has_finer_and_more_segments() -> None:
@@ -195,21 +183,6 @@ def test_the_measured_rejection_is_the_theorys(delay_frames: float, target: str)
     wrong = margins.rejection(theory_of(law((0.6, 0.15)), delay_frames), found.frequency)[rows, found.mode]
     other = departure(found.rejection, wrong, found.error, TOLERANCE_DB)
     assert not other.within[other.judged].all()
-
-
-def test_a_linear_laws_too() -> None:
-    what = settings(gain=GAIN)
-    other = theory_of(law((0.3, 0.2)), 1.0)
-    places = lines(PERIOD, len(NOLL), 10, FEWEST_CYCLES / PERIOD, 0.3)
-    period = multisine(PERIOD, places, 3.0, 2)
-    lead = SETTLING_FRAMES + FADING_FRAMES + 200
-    requests = [Request(0, "law", law=other), Request(0, "play", text="offset", table=led_in(period, lead))]
-    error_nm, _, _ = through(what, requests, lead + PERIOD)
-    found = measured(error_nm[lead:], -period.astype(float))
-    theory = margins.rejection(other, found.frequency, 1.0)[np.arange(found.mode.size), found.mode]
-    of = departure(found.rejection, theory, found.error, TOLERANCE_DB)
-    assert of.judged.sum() > 0.8 * found.mode.size
-    assert of.within[of.judged].all()
 
 
 def test_lines_are_odd_ascending_and_of_one_mode_each() -> None:

@@ -110,27 +110,6 @@ def test_too_few_frames_are_refused() -> None:
 
 
 @pytest.mark.slow
-def test_lqg_in_images_from_a_closed_loop() -> None:
-    """The live loop's own steps: integrator, LQG identified from its closed loop, captured from 14 mas open loop."""
-    config = configured()
-    calibration = calibrated(config)
-    bench = Bench(config, calibration)
-    bench.ask("close")
-    bench.run(600)
-    bench.forget()
-    bench.run(6000)
-    assert bench.tilt_mas(5000) > 4  # with the gains of the configuration
-    law = tuned(bench.pol(), config)["lqg"].law
-
-    fresh = Bench(configured(seed=2), calibration)
-    fresh.load(law)
-    fresh.ask("close")
-    fresh.run(4000)
-    assert fresh.tilt_mas(2000) < 1.0
-    assert fresh.refused == 0
-
-
-@pytest.mark.slow
 @pytest.mark.parametrize("delay", [1.0, 2.0])
 def test_lqg_is_near_its_theory_and_follows_lines_that_moved(delay: float) -> None:
     """Within 15 % of this very law's theory, which is no optimum; below 1.3 mas after lines moved by 2 %."""
@@ -162,8 +141,7 @@ def test_lqg_is_near_its_theory_and_follows_lines_that_moved(delay: float) -> No
 
 
 @pytest.mark.slow
-@pytest.mark.timeout(1800)
-def test_capture_from_14_mas_on_100_seeds() -> None:
+def test_capture_from_14_mas_on_20_seeds() -> None:
     config = configured()
     calibration = calibrated(config)
     bench = Bench(config, calibration)
@@ -173,7 +151,7 @@ def test_capture_from_14_mas_on_100_seeds() -> None:
     bench.run(8192)
     law = tuned(bench.pol(), config)["lqg"].law
     left = {}
-    for seed in range(100):
+    for seed in range(20):
         fresh = Bench(configured(seed=seed + 100), calibration)
         fresh.load(law)
         fresh.run(300)
