@@ -8,11 +8,11 @@ from pathlib import Path
 import pytest
 
 from lowfc.adapters.bus import certificates, routed
-from lowfc.adapters.bus.run import open_run, runtime_base
+from lowfc.adapters.bus.run import runtime_base
 from lowfc.adapters.process.clock_offset import AT_ONCE, PERIOD_S, RECENT
-from lowfc.contract.configuration import Network, load
+from lowfc.contract.configuration import Network
 from lowfc.contract.errors import BusError
-from lowfc.programs.cli.hosts import certs, joined
+from lowfc.programs.cli.hosts import certs
 from tests.e2e.test_hosts import SHIFTS_NS
 from tests.support.loops import lowfc
 
@@ -34,19 +34,12 @@ def runs() -> list[str]:
 
 @pytest.mark.usefixtures("toml")
 def test_a_run_that_is_not_there_is_not_made_by_asking() -> None:
-    done = lowfc("hosts", "--run", "tpyo")
-    assert isinstance(done.exception, BusError)
-    assert "there is no run 'tpyo'" in str(done.exception)
-    assert runs() == []
-
-
-@pytest.mark.usefixtures("toml")
-def test_a_session_is_of_a_run_that_is_there_or_is_to_be_made() -> None:
     words = ["config", "zenoh", "--role", "camera", "--run", "tpyo"]
-    done = lowfc(*words)
-    assert isinstance(done.exception, BusError)
-    assert "there is no run 'tpyo'" in str(done.exception)
-    assert runs() == []
+    for asked in (["hosts", "--run", "tpyo"], words):
+        done = lowfc(*asked)
+        assert isinstance(done.exception, BusError)
+        assert "there is no run 'tpyo'" in str(done.exception)
+        assert runs() == []
     made = lowfc(*words, "--make")
     assert made.exit_code == 0
     assert runs() == ["tpyo"]
@@ -58,20 +51,6 @@ def test_the_routers_configuration_is_shown_without_making_its_run(toml: Path) -
     assert done.exit_code == 0
     assert json.loads(done.stdout)["listen"]["endpoints"] == [WAY.router]
     assert runs() == []
-
-
-def test_by_a_router_one_asks_without_a_run_and_in_one_that_is_there(toml: Path) -> None:
-    settings = load(toml)
-    with joined(settings, "tpyo") as links:
-        assert links.network == WAY
-        assert links.secret_file.exists()
-    assert not links.secret_file.exists()
-    assert runs() == []
-    there = open_run("bench", network=WAY)
-    for one in (settings, load(None)):  # once it is there, its folder knows the way
-        with joined(one, "bench") as links:
-            assert links == there.links
-    assert runs() == ["bench"]
 
 
 def test_the_documents_figures_are_the_codes() -> None:

@@ -1,17 +1,13 @@
 """A user's mistakes: one clear message, exit status 2, nothing half done; most by the command line in this process."""
 
 import contextlib
-import io
 import json
 import os
 import signal
 import socket
 import subprocess
-import sys
 import time
-from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import pytest
 
@@ -19,8 +15,7 @@ from lowfc.adapters.bus.run import Run, open_run
 from lowfc.adapters.files import calibration_file
 from lowfc.adapters.logs.writer import LogWriter
 from lowfc.contract.configuration import Configuration, load
-from lowfc.contract.errors import BusError
-from lowfc.programs.cli.main import main
+from lowfc.contract.errors import BusError, LowfcError
 from lowfc.programs.launch import sim_loop
 from tests.support.loops import LOWFC, lowfc, run
 from tools.law_bench import calibrated
@@ -68,16 +63,16 @@ def test_a_layout(tmp_path: Path, content: str, expected: str) -> None:
 
 def test_an_even_symmetric_layout_is_warned_about(tmp_path: Path) -> None:
     (tmp_path / "mask.json").write_text(layout(holes=[[0.3, 0.1], [-0.3, -0.1], [0.1, -0.3], [-0.1, 0.3]]))
-    complaints = _refused(
-        tmp_path, *SHORT, "--sensor", "mask.json:mine", expected="cannot tell the modes apart", by=run
-    )
-    assert "warning: " in complaints
-    assert "even" in complaints
+    done = run(tmp_path, *SHORT, "--sensor", "mask.json:mine")
+    assert (done.returncode, done.stdout) == (2, "")
+    assert "even" in done.stderr.partition("warning: ")[2]
+    assert "cannot tell the modes apart" in done.stderr.partition("error: ")[2]
+    assert "Traceback" not in done.stderr
 
 
 def test_a_calibration(tmp_path: Path) -> None:
     missing = ["controller", "--run", "mistakes", "--calibration", "none.fits"]
-    _refused(tmp_path, *missing, expected="there is no such calibration file", by=run)
+    _refused(tmp_path, *missing, expected="there is no such calibration file")
     config = load(None)
     found = calibrated(config)
     whole = calibration_file.to_bytes(found)
@@ -92,9 +87,8 @@ def test_a_port_in_use(tmp_path: Path) -> None:
         with socket.socket() as taken:
             taken.bind(("127.0.0.1", held.links.ports["recorder"]))
             taken.listen()
-            said = _refused(
-                tmp_path, "record", "--run", "mistakes-port", expected=str(held.links.ports["recorder"]), by=run
-            )
+            port = str(held.links.ports["recorder"])
+            said = _refused(tmp_path, "record", "--run", "mistakes-port", expected=port)
         assert "Address already in use" in said
         assert ".rs" not in said
         assert "cargo" not in said
@@ -115,33 +109,19 @@ def _flip(content: bytes) -> bytes:
     return content[:middle] + bytes([content[middle] ^ 0x10]) + content[middle + 1 :]
 
 
-def _here(folder: Path, *arguments: str, config: str = "") -> "subprocess.CompletedProcess[str]":
-    """As `run`, in this process, whose signals stay as they were."""
+def _refused(folder: Path, *words: str, expected: str, config: str = "") -> str:
     if config:
         (folder / "test.toml").write_text(config)
-        arguments = (*arguments, "--config", "test.toml")
-    handlers = {number: signal.getsignal(number) for number in (signal.SIGTERM, signal.SIGINT, signal.SIGUSR1)}
-    told, complained = io.StringIO(), io.StringIO()
-    with pytest.MonkeyPatch.context() as patch, contextlib.chdir(folder):
-        patch.setattr(sys, "argv", ["lowfc", *arguments])
-        with contextlib.redirect_stdout(told), contextlib.redirect_stderr(complained):
-            try:
-                with pytest.raises(SystemExit) as end:
-                    main()
-            finally:
-                for number, handler in handlers.items():
-                    signal.signal(number, handler)
-    return subprocess.CompletedProcess(arguments, int(end.value.code or 0), told.getvalue(), complained.getvalue())
-
-
-def _refused(folder: Path, *arguments: str, expected: str, config: str = "", by: Callable[..., Any] = _here) -> str:
-    done = by(folder, *arguments, config=config)
-    assert done.returncode == 2, done.stderr
-    assert expected in done.stderr
-    assert "Traceback" not in done.stderr
+        words = (*words, "--config", "test.toml")
+    with contextlib.chdir(folder):
+        done = lowfc(*words)
+    complaint = str(done.exception) if isinstance(done.exception, LowfcError) else done.stderr
+    assert isinstance(done.exception, LowfcError | SystemExit), done.exception
+    assert getattr(done.exception, "exit_status", 2) == 2
+    assert expected in complaint
     assert not done.stdout
     assert not (folder / "logs").exists()
-    return str(done.stderr)
+    return complaint
 
 
 def test_a_full_disk_on_standard_output_is_one_line(tmp_path: Path) -> None:
@@ -184,10 +164,7 @@ def test_logs(tmp_path: Path, words: tuple[str, ...], expected: str) -> None:
     (tmp_path / "circle").symlink_to("circle")
     (tmp_path / "brackets.toml").write_text("a = " + "[" * 100_000)
     before = sorted(path.name for path in tmp_path.iterdir())
-    done = _here(tmp_path, *words)
-    assert done.returncode == 2, done.stdout
-    assert expected in done.stderr
-    assert len(done.stderr.splitlines()) == 1
+    assert len(_refused(tmp_path, *words, expected=expected).splitlines()) == 1
     assert sorted(path.name for path in tmp_path.iterdir()) == before
 
 

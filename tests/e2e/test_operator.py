@@ -159,6 +159,8 @@ def _the_rest(night: Night) -> None:
     for command in ("lowfc ctl status --json", "lowfc ctl note once --json", "lowfc ctl configuration --json"):
         night.ctl(command)
     night.said["refused"] = str(lowfc("ctl", "gain", "-0.1", "--modes", "2", "--run", night.name).exception)
+    with Client(night.name) as loop:
+        list(loop.steps(500))  # so that the last log holds the controller's state, which comes once a second
 
 
 def test_every_request_is_made_by_a_command_of_the_document() -> None:

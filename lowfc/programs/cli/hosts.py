@@ -6,8 +6,6 @@ import re
 import sys
 import tempfile
 import time
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -19,12 +17,10 @@ from lowfc.contract.errors import BusError, ConfigurationError
 from lowfc.programs.cli.result import Result, figure, put
 
 if TYPE_CHECKING:
-    from lowfc.adapters.bus.run import Links
-    from lowfc.contract.configuration import Configuration
     from lowfc.contract.messages import wire
 
-LISTEN_S = 1.5
-"""Health comes twice a second."""
+LINKED_S = 0.5
+"""In this time a session has its links to all processes that are there."""
 
 _TURN_S = 0.1
 
@@ -98,6 +94,7 @@ def router(
     from contextlib import closing
 
     from lowfc.adapters.bus.access import ROUTER
+    from lowfc.adapters.bus.run import open_run
     from lowfc.adapters.bus.zenoh_session import session_config
     from lowfc.adapters.process.join import join
 
@@ -108,11 +105,12 @@ def router(
             "certificates in [network]"
         )
     if show:
-        with joined(settings, run) as links:
+        with tempfile.TemporaryDirectory(prefix="lowfc-") as elsewhere:  # no run is made by looking
+            links = open_run(run, (settings.mirror.name,), Path(elsewhere), network=settings.network).links
             text = json.dumps(session_config(links, ROUTER), indent=2)
-            # each list of plain values on one line
-            text = re.sub(r"\[\s+([^][{}]*?)\s+\]", lambda found: f"[{' '.join(found[1].split())}]", text)
-            sys.stdout.write(text + "\n")
+        # each list of plain values on one line
+        text = re.sub(r"\[\s+([^][{}]*?)\s+\]", lambda found: f"[{' '.join(found[1].split())}]", text)
+        sys.stdout.write(text + "\n")
         return
     service = join(settings, run, ROUTER, [])
     service.catch_signals()
@@ -136,37 +134,28 @@ def hosts(
     """
     from contextlib import closing
 
-    from lowfc.adapters.bus.bus import Sample
-    from lowfc.adapters.bus.names import Names
     from lowfc.adapters.bus.routed import ending_certificates
     from lowfc.adapters.bus.run import open_run
     from lowfc.adapters.bus.zenoh_bus import ZenohBus
     from lowfc.adapters.process.clock import HostClock
-    from lowfc.client import running
-    from lowfc.contract.messages import HEALTH, Role, wire
+    from lowfc.client import Client, running
+    from lowfc.contract.messages import Role
     from lowfc.programs.cli.ctl.which_run import the_known_run
 
     settings = configuration(config)
     if not settings.network.router or (run is None and running()):
         run = the_known_run(run)
     run = run or DEFAULT_RUN  # by a router there is a run, though nobody of it be on this host
-    heard: dict[str, wire.Health] = {}
-    names = Names()
-
-    def hear(sample: Sample) -> None:
-        name, health = names.health(sample.key, sample.payload)
-        heard[name] = health
-
-    with joined(settings, run) as links, closing(ZenohBus(links, Role.OPERATOR, HostClock())) as bus:
-        bus.subscribe(HEALTH, hear)
-        time.sleep(LISTEN_S)
-    if not heard:
-        raise BusError(f"nobody is heard in run {run!r} within {LISTEN_S:g} s")
-    known = open_run(run, (settings.mirror.name,), network=settings.network)  # from now on its folder knows the way
-    if known.links.network.router:
-        for said in ending_certificates(known.links.network, datetime.datetime.now(datetime.UTC)):
+    links = open_run(run, (settings.mirror.name,), network=settings.network).links
+    with closing(ZenohBus(links, Role.OPERATOR, HostClock())) as bus:
+        time.sleep(LINKED_S)
+        found = Client(run, bus=bus).processes()
+    if not found:
+        raise BusError(f"no process of run {run!r} reports its health")
+    if links.network.router:
+        for said in ending_certificates(links.network, datetime.datetime.now(datetime.UTC)):
             sys.stderr.write(f"warning: {said}; lowfc certs --renew\n")
-    put(HostsResult(run=run, processes=[_row(heard[name]) for name in sorted(heard)]), as_json=as_json)
+    put(HostsResult(run=run, processes=[_row(health) for _, health in sorted(found.items())]), as_json=as_json)
 
 
 def _row(health: "wire.Health") -> HostProcess:
@@ -177,20 +166,3 @@ def _row(health: "wire.Health") -> HostProcess:
         clock_offset_us=health.router_offset_ns / 1e3 if measured else None,
         clock_error_us=health.router_round_trip_ns / 2e3 if measured else None,
     )
-
-
-@contextmanager
-def joined(settings: "Configuration", run: str) -> Iterator["Links"]:
-    """Links of a run that is there, or by the configuration's router as if it were: nothing is left of having asked.
-
-    Raises:
-        BusError: there is no such run, and no router.
-    """
-    from lowfc.adapters.bus.run import open_run, runtime_base
-    from lowfc.programs.cli.ctl.which_run import the_known_run
-
-    if not settings.network.router:
-        the_known_run(run)
-    with tempfile.TemporaryDirectory(prefix="lowfc-") as elsewhere:
-        base = None if (runtime_base() / run).is_dir() else Path(elsewhere)
-        yield open_run(run, (settings.mirror.name,), base, network=settings.network).links
