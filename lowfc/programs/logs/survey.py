@@ -1,5 +1,6 @@
 """What a log holds: what ran and when, how much of each topic, and what is missing."""
 
+import contextlib
 import dataclasses
 import hashlib
 from collections import Counter
@@ -123,16 +124,13 @@ class _Account:
         self._begin_ns: int | None = None
         self._end_ns = 0
 
-    def enter(self, message: Logged) -> None:
+    def enter(self, topic: Topic | None, message: Logged) -> None:
         """Take account of one message."""
         now_ns = message.log_time_ns
-        line = self._lines.get(message.key)
-        if line is None:
-            line = self._lines[message.key] = _Line(message.schema, now_ns, now_ns)
+        line = self._lines.setdefault(message.key, _Line(message.schema, now_ns, now_ns))
         line.messages += 1
         line.size += len(message.payload)
         line.first_ns, line.last_ns = min(line.first_ns, now_ns), max(line.last_ns, now_ns)
-        topic = _topic(message.key)
         if topic is None:
             return
         self._end_ns = max(self._end_ns, now_ns)
@@ -140,31 +138,8 @@ class _Account:
             self._begin_ns = now_ns  # what was asked for at the log's beginning may be hours old
         sample = Sample(message.key, message.payload, message.sequence, message.publish_time_ns, now_ns)
         self._ledger.enter(topic, sample, recorded=True)
-        line.starts.add((self._author(topic, sample), start_of(message.sequence)))
-
-    def figures(self) -> dict[str, Any]:
-        """The account, for a program."""
-        missing = self._ledger.lost()
-        begin = None if self._begin_ns is None else datetime.fromtimestamp(self._begin_ns / 1e9, UTC)
-        return {
-            "start": None if begin is None else begin.isoformat(timespec="milliseconds"),
-            "duration_s": None if self._begin_ns is None else round((self._end_ns - self._begin_ns) / 1e9, 3),
-            "messages": sum(line.messages for line in self._lines.values()),
-            "messages_missing": sum(missing.values()),
-            "topics": {
-                key: line.figures(
-                    missing.get(key, 0) if (topic := _topic(key)) is None or self._selection.counts(topic) else None
-                )
-                for key, line in sorted(self._lines.items())
-            },
-            "missing_topics": {key: count for key, count in missing.items() if key not in self._lines},
-            "loop_modes": self._modes,
-            "events": dict(self._events.most_common()),
-        }
-
-    def _author(self, topic: Topic, sample: Sample) -> str:
-        """Take account of what a message says; return who of several publishers sent it, on a topic that has them."""
-        try:
+        author = ""
+        with contextlib.suppress(BadMessageError, DecodeError):  # it is in the log as it came
             if topic is HEALTH:
                 self._ledger.believe(sample, wire.Health.FromString(sample.payload))
             elif topic is CONTROLLER_STATE:
@@ -174,12 +149,29 @@ class _Account:
                     self._modes.append(mode)
             elif topic is EVENT:
                 event = Log.FromString(sample.payload)
+                author = event.name  # of several publishers
                 if event.level >= Level.WARNING:
                     self._events[event.message.partition(" ")[0]] += 1
-                return event.name
-        except (BadMessageError, DecodeError):
-            pass  # it is in the log as it came
-        return ""
+        line.starts.add((author, start_of(message.sequence)))
+
+    def figures(self) -> dict[str, Any]:
+        """The account, for a program."""
+        missing = self._ledger.lost()
+        begin = None if self._begin_ns is None else datetime.fromtimestamp(self._begin_ns / 1e9, UTC)
+        topics = {}
+        for key, line in sorted(self._lines.items()):
+            counted = (topic := _topic(key)) is None or self._selection.counts(topic)
+            topics[key] = line.figures(missing.get(key, 0) if counted else None)
+        return {
+            "start": None if begin is None else begin.isoformat(timespec="milliseconds"),
+            "duration_s": None if self._begin_ns is None else round((self._end_ns - self._begin_ns) / 1e9, 3),
+            "messages": sum(line.messages for line in self._lines.values()),
+            "messages_missing": sum(missing.values()),
+            "topics": topics,
+            "missing_topics": {key: count for key, count in missing.items() if key not in self._lines},
+            "loop_modes": self._modes,
+            "events": dict(self._events.most_common()),
+        }
 
 
 def survey(
@@ -195,9 +187,9 @@ def survey(
     for number, message in enumerate(reader):
         if not number:
             account = _Account(reader.selection)
-        account.enter(message)
-        topic = _topic(message.key) if digest else None
-        if topic is not None:
+        topic = _topic(message.key)
+        account.enter(topic, message)
+        if digest and topic is not None:
             found.enter(topic, message)
     configuration, remarks = attached_configuration(reader)
     figures = account.figures()

@@ -13,8 +13,8 @@ _NO_LOOP = "no step of the control law is in this log"
 
 def verdict(figures: Figures) -> Figures:
     """Checks with a level each, and a sentence; the level of the whole is the worst one."""
-    checks = [_record(figures), _modes(figures), _residual(figures), _commands(figures)]
-    checks += [_delay(figures), _frames(figures), _mirror(figures), _events(figures)]
+    parts = (_record, _modes, _residual, _commands, _delay, _frames, _mirror, _events)
+    checks = [part(figures) for part in parts]
     order = (GOOD, UNKNOWN, LOOK, BAD)
     level = max((check["level"] for check in checks), key=order.index)
     first = next((check["text"] for check in checks if check["level"] == level), "")
