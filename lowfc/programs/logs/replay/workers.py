@@ -6,8 +6,8 @@ import os
 import signal
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from itertools import pairwise
-from multiprocessing.sharedctypes import SynchronizedArray
 from pathlib import Path
 
 from threadpoolctl import threadpool_limits
@@ -25,7 +25,7 @@ from lowfc.programs.logs.replay.former import Former
 
 _WORTH_BYTES = 50_000_000
 """Of log, for another process: below that it costs more time than it saves."""
-_POLL_S = 0.1
+_SHARES_PER_JOB = 4  # so that progress is seen, and no process is idle for long at the end
 _NEWS_EVERY = 5000
 
 Progress = Callable[[int], None]
@@ -69,14 +69,21 @@ def replay_files(paths: Sequence[Path], tolerance_nm: float, jobs: int, progress
     ends_ns = [one for path in paths for one in _chunk_ends_ns(path)]
     if len({path.resolve() for path in paths}) < len(paths):
         raise ConfigurationError("a log is named twice; name each once, in the order they were recorded")
-    worth = sum(path.stat().st_size for path in paths) // _WORTH_BYTES if ends_ns else 1
-    count = max(1, min(jobs or len(os.sched_getaffinity(0)), worth))
-    edges = [0, *(ends_ns[len(ends_ns) * share // count] for share in range(1, count)), WHOLE.until_ns]
-    shares = [Share(from_ns, until_ns) for from_ns, until_ns in pairwise(edges)]
-    if count == 1:
-        outcomes = [_replay_share(paths, tolerance_nm, shares[0], progress)]
+    size = sum(path.stat().st_size for path in paths)
+    jobs = jobs or len(os.sched_getaffinity(0))
+    count = min(_SHARES_PER_JOB * jobs, size // _WORTH_BYTES) if ends_ns and jobs > 1 else 1
+    if count < 2:
+        outcomes = [_replay_share(paths, tolerance_nm, WHOLE, progress)]
     else:
-        outcomes = _in_processes(paths, tolerance_nm, shares, progress)
+        edges = [0, *(ends_ns[len(ends_ns) * share // count] for share in range(1, count)), WHOLE.until_ns]
+        shares = [Share(from_ns, until_ns) for from_ns, until_ns in pairwise(edges)]
+        outcomes = []
+        # Ctrl-C is for the parent, which ends its workers.
+        context = multiprocessing.get_context("spawn")
+        with context.Pool(min(jobs, count), signal.signal, (signal.SIGINT, signal.SIG_IGN)) as pool:
+            for outcome in pool.imap(partial(_replay_share, paths, tolerance_nm), shares):
+                outcomes.append(outcome)
+                progress(size * len(outcomes) // count)
     whole = outcomes[0]
     for outcome in outcomes[1:]:
         whole.account.add(outcome.account)
@@ -95,7 +102,9 @@ def _chunk_ends_ns(path: Path) -> list[int]:
         return [chunk.message_end_time for chunk in file.index()]
 
 
-def _replay_share(paths: Sequence[Path], tolerance_nm: float, share: Share, progress: Progress) -> Outcome:
+def _replay_share(
+    paths: Sequence[Path], tolerance_nm: float, share: Share, progress: Progress = lambda done: None
+) -> Outcome:
     """Replay a share, on one thread as the live loop: more threads sum in another order."""
     run = Replay(tolerance_nm, share)
     outcome = Outcome(run.account)
@@ -156,35 +165,3 @@ def _former(reader: LogReader) -> Former | None:
     if version == __version__:
         return None
     return Former(reader.schemas)
-
-
-def _in_processes(
-    paths: Sequence[Path], tolerance_nm: float, shares: Sequence[Share], progress: Progress
-) -> list[Outcome]:
-    context = multiprocessing.get_context("spawn")
-    progresses = context.Array("q", len(shares))
-    tasks = [(paths, tolerance_nm, share, number) for number, share in enumerate(shares)]
-    with context.Pool(len(shares), _begin, (progresses,)) as pool:
-        running = pool.starmap_async(_work, tasks, chunksize=1)
-        while not running.ready():
-            running.wait(_POLL_S)
-            progress(sum(progresses[:]) // len(shares))
-        return running.get()
-
-
-_progresses: "SynchronizedArray[int] | None" = None
-
-
-def _begin(progresses: "SynchronizedArray[int]") -> None:
-    """In a worker: Ctrl-C is for the parent, which ends its workers."""
-    global _progresses  # the only way into a pool's worker
-    _progresses = progresses
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
-
-
-def _work(paths: Sequence[Path], tolerance_nm: float, share: Share, number: int) -> Outcome:
-    def progress(done: int) -> None:
-        assert _progresses is not None  # noqa: S101  # `_begin` came first
-        _progresses[number] = done
-
-    return _replay_share(paths, tolerance_nm, share, progress)
