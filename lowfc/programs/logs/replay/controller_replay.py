@@ -3,7 +3,7 @@
 import contextlib
 from collections import deque
 from copy import deepcopy
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 from google.protobuf.message import Message
 
@@ -96,6 +96,23 @@ class Share:
 WHOLE = Share()
 
 
+@dataclass(slots=True)
+class Context:
+    """What the controllers of a replay have in common.
+
+    Attributes:
+        tolerance_nm: differences up to this are none.
+        former: what is compared of the log of another version; to be set before the first message.
+    """
+
+    tolerance_nm: float = 0.0
+    share: Share = WHOLE
+    frames: Frames = field(default_factory=Frames)
+    published: Published = field(default_factory=Published)
+    account: Account = field(default_factory=Account)
+    former: Former | None = None
+
+
 class ControllerReplay:
     """One start of a controller: its inputs in the order it took them, folded again.
 
@@ -104,28 +121,11 @@ class ControllerReplay:
         retry_pending: a state or a calibration has come since it was last tried to go on from one.
     """
 
-    def __init__(
-        self,
-        frames: Frames,
-        published: Published,
-        account: Account,
-        tolerance_nm: float,
-        share: Share,
-        begun_ns: int,
-        former: Former | None = None,
-    ) -> None:
-        """A lane whose first message has the log time `begun_ns`: of the share in which that is.
-
-        `former` says what of another version's messages is compared.
-        """
-        self.done = begun_ns >= share.until_ns
+    def __init__(self, context: Context, begun_ns: int) -> None:
+        """A controller whose first message has the log time `begun_ns`: of the share in which that is."""
+        self.done = begun_ns >= context.share.until_ns
         self.retry_pending = False
-        self._frames = frames
-        self._published = published
-        self._former = former
-        self._account = account
-        self._tolerance_nm = tolerance_nm
-        self._share = share
+        self._context, self._account = context, context.account
         self._last: int | None = None
         self._lost_at: int | None = None
         self._forgotten = 0
@@ -136,7 +136,7 @@ class ControllerReplay:
         self._settings: Settings | None = None
         self._state: State | None = None
         self._past: deque[State] = deque(maxlen=_STATES_KEPT)
-        self._why = _BEFORE if begun_ns >= share.from_ns else ""
+        self._why = _BEFORE if begun_ns >= context.share.from_ns else ""
         self._counts = bool(self._why)
 
     def take(self, message: Logged, kind: type[Message]) -> None:
@@ -148,8 +148,12 @@ class ControllerReplay:
             self._take_state(body, message.log_time_ns)
         else:
             number: int = body.input_number  # type: ignore[attr-defined]  # all others of the controller have it
-            if not number:
-                self._unnumbered(kind)
+            if not number:  # a request that could not be read, a command of somebody else
+                if kind is wire.ControlStep:
+                    raise DataFileError(
+                        "the steps in this log are not numbered: it was recorded by a version before replay, or by "
+                        "another controller; `lowfc what-if` and `lowfc report` read it"
+                    )
                 return
             if self._state is not None and number <= self._state.input_number:
                 self._come_late(number, body)
@@ -162,7 +166,7 @@ class ControllerReplay:
                 return
             entry.taken, entry.taken_bytes = body, message.payload  # type: ignore[assignment]  # one of the three
             if isinstance(body, wire.ControlStep):
-                self._frames.note_step(body)
+                self._context.frames.note_step(body)
         self.go_on(message.log_time_ns)
 
     def _come_late(self, number: int, body: Message) -> None:
@@ -174,16 +178,8 @@ class ControllerReplay:
             name = body.DESCRIPTOR.name
             second = Difference(name, number, self._state.frame_sequence, [f"a second one of input {number}"])
             second.otherwise = True
-            self._account.enter(second, self._tolerance_nm)
+            self._account.enter(second, self._context.tolerance_nm)
             self._account.frames += isinstance(body, wire.ControlStep)
-
-    def _unnumbered(self, kind: type[Message]) -> None:
-        """A request that could not be read, a command of somebody else; or a log too old to be replayed."""
-        if kind is wire.ControlStep:
-            raise DataFileError(
-                "the steps in this log are not numbered: it was recorded by a version before replay, or by another "
-                "controller; `lowfc what-if` and `lowfc report` read it"
-            )
 
     def go_on(self, now_ns: int, *, ended: bool = False) -> None:
         """Take every input that is complete, or too old to become so; all that is left when the log has `ended`."""
@@ -204,7 +200,7 @@ class ControllerReplay:
             late = ended or now_ns - entry.log_time_ns > PATIENCE_NS
             if not late and entry.command is None and entry.commands and self._state.drive is not None:
                 return
-            rule = changed_rule(entry.taken) if self._former is not None else ""
+            rule = changed_rule(entry.taken) if self._context.former is not None else ""
             if rule and number not in self._states and not late:
                 return  # the state after it is what may have to be gone on from
             taken = self._input(entry, late=late)
@@ -220,9 +216,9 @@ class ControllerReplay:
                 return
 
     def _take_state(self, message: wire.ControllerState, log_time_ns: int) -> None:
-        if log_time_ns < self._share.from_ns:
+        if log_time_ns < self._context.share.from_ns:
             return
-        if log_time_ns >= self._share.until_ns:
+        if log_time_ns >= self._context.share.until_ns:
             self._last = message.input_number if self._last is None else min(self._last, message.input_number)
         past = next((state for state in self._past if state.input_number == message.input_number), None)
         if past is not None:
@@ -256,7 +252,7 @@ class ControllerReplay:
         return False
 
     def _decoded(self, message: wire.ControllerState) -> tuple[Settings, State]:
-        known = self._published
+        known = self._context.published
         return decode_state(message, known.calibrations.get(message.calibration_id), known.laws, known.plays)
 
     def _leave_out(self, upto: int) -> None:
@@ -288,18 +284,20 @@ class ControllerReplay:
                 late_ns = 0 if self._settings is None else self._settings.max_frame_age_ns + 1
                 age_ns = late_ns if wire.REASON_LATE in step.reasons else 0
                 # With no other left, a frame of another time: then the step is wrong, which the comparison finds.
-                frame = self._frames.frame(step.frame_sequence, from_timestamp(step.timestamp), age_ns, last=late)
+                frame = self._context.frames.frame(
+                    step.frame_sequence, from_timestamp(step.timestamp), age_ns, last=late
+                )
                 if frame is not None and wire.REASON_AHEAD in step.reasons:
                     frame = frame._replace(ahead=True)
                 return frame
             case wire.Request() as request:
                 with contextlib.suppress(ValueError):
-                    time_ns, known = from_timestamp(request.timestamp), self._published
+                    time_ns, known = from_timestamp(request.timestamp), self._context.published
                     asked = codec.request(request, request.name, time_ns, known.calibrations, known.laws, known.plays)
                     return asked if self._settings is None else prepared(self._settings, asked)
             case wire.ControlInput() as other:
                 with contextlib.suppress(ValueError):
-                    return codec.decode_input(other, self._published.calibrations)
+                    return codec.decode_input(other, self._context.published.calibrations)
         return None
 
     def _go_on_by_rule(self, rule: str, taken: Input, logged: wire.ControllerState) -> None:
@@ -309,7 +307,7 @@ class ControllerReplay:
         state, _ = advance(self._settings, self._state, taken)
         again = controller_state(state, self._settings, from_timestamp(logged.timestamp))
         found = self._difference(state, logged, again)
-        if found is None or found.within(self._tolerance_nm):
+        if found is None or found.within(self._context.tolerance_nm):
             self._account.states += 1
         else:
             self._account.rules_changed[rule] += 1
@@ -325,14 +323,14 @@ class ControllerReplay:
 
     def _difference(self, state: State, logged: Message, replayed: Message | None) -> Difference | None:
         """What differs in all that is compared; None where nothing does."""
-        if self._former is not None and type(replayed) is type(logged):
+        if self._context.former is not None and type(replayed) is type(logged):
             if isinstance(logged, wire.ControllerState):
                 logged = self._in_todays_form(logged)
             elif isinstance(logged, wire.Request) and logged.HasField("state"):
                 logged = deepcopy(logged)
                 logged.state.CopyFrom(self._in_todays_form(logged.state))
-            logged, replayed = self._former.compared(logged), self._former.compared(replayed)
-        if replayed == logged and (self._former is not None or isinstance(logged, wire.ControllerState)):
+            logged, replayed = self._context.former.compared(logged), self._context.former.compared(replayed)
+        if replayed == logged and (self._context.former is not None or isinstance(logged, wire.ControllerState)):
             return None  # of other messages the bytes differ
         return difference(state.input_number, state.frame_sequence, logged, replayed)
 
@@ -385,7 +383,7 @@ class ControllerReplay:
         found = self._difference(state, logged, replayed)
         if found is None:
             return
-        self._account.enter(found, self._tolerance_nm)
+        self._account.enter(found, self._context.tolerance_nm)
         if self._state is state and not self.done:  # or what differs here would differ for the rest of the log
             self._states[state.input_number] = logged
             self._lose("")
@@ -396,4 +394,4 @@ class ControllerReplay:
             return
         assert self._state is not None  # noqa: S101
         body = None if replayed is None else type(logged).FromString(replayed)
-        self._account.enter(self._difference(self._state, logged, body), self._tolerance_nm)
+        self._account.enter(self._difference(self._state, logged, body), self._context.tolerance_nm)

@@ -15,8 +15,7 @@ from lowfc.contract import published
 from lowfc.contract.envelope import start_of
 from lowfc.contract.messages import COMMAND, CONTROL_INPUT, CONTROLLER_STATE, FRAME, REQUEST, STEP, topic_of
 from lowfc.programs.logs.replay.account import Account
-from lowfc.programs.logs.replay.controller_replay import PATIENCE_NS, WHOLE, ControllerReplay, Frames, Share
-from lowfc.programs.logs.replay.former import Former
+from lowfc.programs.logs.replay.controller_replay import PATIENCE_NS, WHOLE, Context, ControllerReplay, Share
 
 TOPICS = (FRAME, STEP, COMMAND, CONTROL_INPUT, CONTROLLER_STATE, REQUEST, *published.TOPICS)
 """What a replay reads of a log."""
@@ -26,19 +25,9 @@ class Replay:
     """Takes the messages of a log, or of several that follow each other, and keeps the account."""
 
     def __init__(self, tolerance_nm: float = 0.0, share: Share = WHOLE) -> None:
-        """Differences up to `tolerance_nm` are none: for a log of another kind of processor.
-
-        Attributes:
-            former: what is compared of the log of another version, to be set before the first message.
-        """
-        self.former: Former | None = None
-        self.account = Account()
-        self._tolerance_nm = tolerance_nm
-        self._share = share
-        self._from_ns = share.from_ns - PATIENCE_NS
-        self._frames = Frames()
-        self._published = published.Published()
-        self._lanes: dict[int, ControllerReplay] = {}
+        """Differences up to `tolerance_nm` are none: for a log of another kind of processor."""
+        self.context = Context(tolerance_nm, share)
+        self._controllers: dict[int, ControllerReplay] = {}
         self._last_ns = self._begun_ns = self._ended_ns = 0
 
     @property
@@ -52,46 +41,43 @@ class Replay:
         Raises:
             DataFileError: the log is from before the inputs of the controller were numbered.
         """
-        self._last_ns = message.log_time_ns
-        topic = topic_of(message.key)
-        if message.log_time_ns < self._from_ns and topic not in published.TOPICS:
+        context, topic = self.context, topic_of(message.key)
+        self._last_ns = now_ns = message.log_time_ns
+        if now_ns < context.share.from_ns - PATIENCE_NS and topic not in published.TOPICS:
             return
+        inside = context.share.from_ns <= now_ns < context.share.until_ns
         if topic is FRAME:
-            self._frames.add(message.sequence, message.payload)
-            if self._share.from_ns <= message.log_time_ns < self._share.until_ns:
-                self._begun_ns = self._begun_ns or message.log_time_ns
-                self._ended_ns = message.log_time_ns
+            context.frames.add(message.sequence, message.payload)
+            if inside:
+                self._begun_ns, self._ended_ns = self._begun_ns or now_ns, now_ns
         elif topic in published.TOPICS:
-            self._published.take(topic, message.payload)
-            for lane in self._lanes.values():
-                lane.retry_pending = True
+            context.published.take(topic, message.payload)
+            for controller in self._controllers.values():
+                controller.retry_pending = True
         elif topic in TOPICS:
-            if topic is STEP and self._share.from_ns <= message.log_time_ns < self._share.until_ns:
-                self.account.steps += 1
+            context.account.steps += topic is STEP and inside
             with contextlib.suppress(DecodeError):  # its number is missing then, which the fold will find
-                self._lane(message).take(message, topic.message)
+                self._controller(message).take(message, topic.message)
 
     @property
     def done(self) -> bool:
         """Whether the share has been replayed: no controller has anything more to say about it."""
-        if self._last_ns - self._share.until_ns <= PATIENCE_NS:
+        if self._last_ns - self.context.share.until_ns <= PATIENCE_NS:
             return False
-        newest = max(self._lanes, default=0)
-        return all(lane.done or start_s < newest for start_s, lane in self._lanes.items())
+        newest = max(self._controllers, default=0)
+        return all(controller.done or start_s < newest for start_s, controller in self._controllers.items())
 
     def finish(self) -> Account:
         """The log, or the share, has ended."""
-        for lane in self._lanes.values():
-            lane.go_on(self._last_ns, ended=True)
-        return self.account
+        for controller in self._controllers.values():
+            controller.go_on(self._last_ns, ended=True)
+        return self.context.account
 
-    def _lane(self, message: Logged) -> ControllerReplay:
+    def _controller(self, message: Logged) -> ControllerReplay:
         start_s = start_of(message.sequence)
-        lane = self._lanes.get(start_s)
-        if lane is None:
-            known = self._frames, self._published, self.account, self._tolerance_nm, self._share
-            lane = self._lanes[start_s] = ControllerReplay(*known, message.log_time_ns, self.former)
-        return lane
+        if start_s not in self._controllers:
+            self._controllers[start_s] = ControllerReplay(self.context, message.log_time_ns)
+        return self._controllers[start_s]
 
 
 def replay(messages: Iterable[Logged], tolerance_nm: float = 0.0, share: Share = WHOLE) -> Account:

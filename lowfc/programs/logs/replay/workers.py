@@ -107,7 +107,7 @@ def _replay_share(
 ) -> Outcome:
     """Replay a share, on one thread as the live loop: more threads sum in another order."""
     run = Replay(tolerance_nm, share)
-    outcome = Outcome(run.account)
+    outcome = Outcome(run.context.account)
     repeated = Repeated()
     done = number = 0
     gc.disable()
@@ -126,7 +126,7 @@ def _replay_share(
                 for message in reader:
                     if first:
                         _refuse_thinned(reader)
-                        run.former, first = _former(reader), False
+                        run.context.former, first = _former(reader), False
                     if not repeated(message):
                         run.take(message)
                     number += 1
