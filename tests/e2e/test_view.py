@@ -30,7 +30,7 @@ from lowfc.programs.view.target import Target
 from lowfc.programs.view.verdicts.tile import Level
 from tests.support.loops import LOWFC, children, interrupt, run, start, until
 from tests.support.report_log import Night
-from tests.support.viewers import browser_screenshot, needs_chromium, on_screen, pixels, share_of
+from tests.support.viewers import browser_screenshot, complaints, needs_chromium, on_screen, pixels, share_of
 
 LEAST_SHADES = 8  # of a panel with something in it; an empty one has its ground and the letters of its title
 TITLE_ROWS = 30
@@ -71,7 +71,7 @@ def test_every_panel_of_every_tab_shows_the_live_loop(live: str, artefacts: Path
             shown = {view.name: _shades(viewer, view.id) for view in _views(blueprint.root_container.contents[number])}
             assert len(shown) > 4
             assert {name: shades for name, shades in shown.items() if shades < LEAST_SHADES} == {}, tab
-        assert viewer.complaints() == []
+        assert complaints(viewer) == []
     finally:
         bridge.close()
         bus.close()

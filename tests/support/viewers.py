@@ -19,9 +19,10 @@ import numpy.typing as npt
 import psutil
 import pytest
 from PIL import Image
+from rerun.experimental import ViewerClient
 from websockets.sync.client import ClientConnection, connect
 
-from lowfc.adapters.viewer.rerun_viewer import vulkan_drivers
+from lowfc.adapters.viewer.rerun_viewer import RerunViewer, vulkan_drivers
 from tests.support.loops import until
 
 CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
@@ -51,6 +52,13 @@ def pixels(png: bytes) -> Pixels:
 def share_of(picture: Pixels, colour: tuple[int, int, int], tolerance: int = 12) -> float:
     """Which part of a picture has a colour, 0 to 1."""
     return float(np.all(np.abs(picture.astype(int) - colour) <= tolerance, axis=2).mean())
+
+
+def complaints(viewer: RerunViewer) -> list[str]:
+    """What its views could not draw, and its warnings and errors."""
+    reports = [report.summary for view in viewer.state().views for report in view.reports]
+    logs = ViewerClient.connect(viewer.url).get_logs()
+    return reports + [entry.message for entry in logs if entry.level != "INFO"]
 
 
 def listening(pid: int) -> set[tuple[str, int]]:

@@ -1,21 +1,19 @@
 """The rerun viewer as a child process: a window, a picture without a screen, or a page for the browser.
 
-It listens on loopback only, asks nobody on the network, and dies with us. rerun's own servers inside of a Python
-process (`serve_grpc`, `serve_web_viewer`) have no option for where to listen, and its `rerun` on the path is a script
-that starts the binary and leaves it behind when killed: hence the binary itself.
+It listens on loopback only, asks nobody on the network, and dies with us. It is the binary itself: rerun's own servers
+inside of a Python process have no option for where to listen, and its `rerun` on the path is a script that leaves the
+binary behind when it is killed.
 
-What was measured with rerun 0.41, and decides how it is used:
+Measured with rerun 0.41:
 
-- `RecordingStream.log` goes on into a viewer that hangs, our memory growing by some 150 MB, until about 100 MB are
-  unsent; then it blocks until the viewer goes on or is killed. Into one that is dead it neither blocks nor grows; the
-  stream does not come back, but a new one with the same ids to a new viewer on the same port does.
-- `disconnect`, `del`, and the end of the process (with `rerun.unregister_shutdown`, too) block as long as the viewer
-  hangs. Hence: stop() the viewer first, and all of them return.
-- A viewer or a browser's page whose server was restarted does not come back by itself; the page must be reloaded.
-- The memory limit is one for the data as rerun counts it. A stream far longer than that levelled off at 184 MB for
-  "100MB" (web, 33 MB at start) and at 545 MB for "200MB" (headless, 156 MB at start): whoever needs a bound watches
-  resident_bytes().
-- ViewerClient has no time limit of its own towards a viewer that hangs. All calls here run in a thread that is left.
+- `RecordingStream.log` into a viewer that hangs goes on until about 100 MB are unsent (our memory grows by 150 MB), and
+  then blocks. Into one that is dead it does neither; a new stream with the same ids to a new viewer on the same port
+  goes on.
+- `disconnect`, `del`, and the end of the process block as long as the viewer hangs: stop() it first.
+- A browser's page whose server was restarted must be reloaded.
+- The memory limit is one for the data as rerun counts it: a viewer levelled off at 184 MB for "100MB", a headless one
+  at 545 MB for "200MB".
+- ViewerClient has no time limit: all calls here run in a thread that may be left.
 """
 
 import http.client
@@ -111,19 +109,18 @@ class RerunViewer:
         self._source_port = free[2]
         self._stderr = tempfile.TemporaryFile()  # noqa: SIM115  # nameless: nothing is left if this process is killed
         self._output = ""
-        self._child = Child(
-            f"the viewer on port {self.port}",
-            [],
-            Path(f"/proc/self/fd/{self._stderr.fileno()}"),
-            death_signal=signal.SIGKILL,
-        )
+        stderr = Path(f"/proc/self/fd/{self._stderr.fileno()}")
+        self._child = Child(f"the viewer on port {self.port}", [], stderr, death_signal=signal.SIGKILL)
         try:
             self._child.environment = _environment(show)
             self._child.command = [str(viewer_binary()), "--bind", HOST, "--port", str(self.port)]
             self._child.command += _words(show, memory_limit, size_px, self._source_port)
             self._start()
             if self.web_port:
-                self._page = self._serve_page(self.web_port)
+                self._page = ViewerPage(HOST, self.web_port, self._source_port, self.port)
+        except OSError as fault:
+            self.stop()
+            raise ViewerError(f"the viewer cannot be started ({fault}): use another --port and --web-port") from fault
         except BaseException:
             self.stop()
             raise
@@ -185,9 +182,6 @@ class RerunViewer:
             path: PNG to write as well.
             patience_s: how long to wait for it to load, and then for it to stand still.
 
-        Returns:
-            The PNG.
-
         Raises:
             ViewerError: it does not answer, or nothing is loaded.
             DataFileError: the file cannot be written.
@@ -211,29 +205,12 @@ class RerunViewer:
                 part.write_bytes(picture)
         return picture
 
-    def complaints(self) -> list[str]:
-        """What its views could not draw, and its warnings and errors; one line each."""
-        reports = [
-            f"{view.name or view.origin}: {report.severity}: {report.summary}"
-            for view in self.state().views
-            for report in view.reports
-        ]
-        logs = self._ask(lambda client: client.get_logs())
-        return reports + [f"{entry.level}: {entry.message}" for entry in logs if entry.level != "INFO"]
-
     def state(self) -> "ViewerState":
-        """What it shows: recordings, views, what it is loading.
-
-        Raises:
-            ViewerError: it does not answer.
-        """
+        """Its recordings, its views, and what it is loading; ViewerError where it does not answer."""
         return self._ask(lambda client: client.get_state())
 
     def _start(self) -> None:
-        try:
-            self._child.start()
-        except OSError as fault:
-            raise ViewerError(f"{self._child.command[0]} cannot be started ({fault.strerror}); {_REINSTALL}") from fault
+        self._child.start()
         deadline_s = time.monotonic() + _START_S
         ready = self._page_is_there if self.show is Show.WEB else self._draws
         while not (ready() and self.alive):
@@ -265,24 +242,16 @@ class RerunViewer:
         finally:
             page.close()
 
-    def _serve_page(self, port: int) -> ViewerPage:
-        try:
-            return ViewerPage(HOST, port, self._source_port, self.port)
-        except OSError as fault:
-            raise ViewerError(f"the page cannot be served on port {port} ({fault.strerror}); use another") from fault
-
     def _draws(self) -> bool:
         """Whether the viewer, not only its server, is up: without a driver the server is, for a moment."""
-        if not self.answers():
-            return False
         try:
-            if self.show is Show.HEADLESS:
+            return self.answers() and bool(
                 self._ask(lambda client: client.take_screenshot(max_size=16))
-            else:
-                self.state()
+                if self.show is Show.HEADLESS
+                else self.state()
+            )
         except ViewerError:
             return False
-        return True
 
     def _ask(self, question: "Callable[[ViewerClient], Answer]") -> Answer:
         """Ask the viewer; a call to one that hangs would not return, so it is made by a thread that may be left."""
@@ -334,11 +303,7 @@ def has_screen(environment: Mapping[str, str] = os.environ) -> bool:
 
 
 def require_screen(show: Show | None, environment: Mapping[str, str] = os.environ) -> None:
-    """Check that what is to be shown in a window can be.
-
-    Raises:
-        ViewerError: there is no screen for it.
-    """
+    """Raise a ViewerError where something is to be shown in a window, and there is no screen for it."""
     if show is Show.NATIVE and not has_screen(environment):
         raise ViewerError(f"there is no screen for a window (neither DISPLAY nor WAYLAND_DISPLAY is set); {_NO_SCREEN}")
 
@@ -350,17 +315,11 @@ def vulkan_drivers() -> list[Path]:
 
 
 def viewer_binary() -> Path:
-    """The viewer's program, as rerun-sdk installs it.
-
-    Raises:
-        ViewerError: it is not there.
-    """
+    """The viewer's program, as rerun-sdk installs it; ViewerError where it is not there."""
     package = importlib.util.find_spec("rerun_cli")
-    if package is None or package.origin is None:
+    binary = Path(package.origin).parent / "rerun" if package is not None and package.origin is not None else None
+    if binary is None or not binary.is_file():
         raise ViewerError(f"the package rerun-sdk has no viewer here; {_REINSTALL}")
-    binary = Path(package.origin).parent / "rerun"
-    if not binary.is_file():
-        raise ViewerError(f"{binary} is missing; {_REINSTALL}")
     return binary
 
 
@@ -373,11 +332,7 @@ def _words(show: Show, memory_limit: str, size_px: tuple[int, int], source_port:
 
 
 def _environment(show: Show) -> dict[str, str]:
-    """Environment of the viewer: no usage statistics, no question to the network, no chatter.
-
-    Raises:
-        ViewerError: there is no screen, or no driver.
-    """
+    """Environment of the viewer: no usage statistics, no question to the network, no chatter."""
     environment = {name: value for name, value in os.environ.items() if name.lower() != "no_proxy"}
     require_screen(show, environment)
     if show is Show.HEADLESS and not any(environment.get(name) for name in _DRIVER_VARIABLES):

@@ -37,17 +37,21 @@ def view(
     Example: lowfc view --web
     """
     from lowfc.adapters.process.realtime import give_way
+    from lowfc.programs.cli.ctl.which_run import the_known_run
 
     give_way()
     if foxglove:
         if logs or native or web or save or headless_screenshot or seconds or config or as_json:
             raise ConfigurationError("--foxglove serves a running loop until Ctrl-C, with --run and --port alone")
-        _serve_foxglove(run, port)
+        from lowfc.adapters.bus.run import open_run
+        from lowfc.adapters.process.clock import HostClock
+        from lowfc.programs.view.foxglove_bridge import DEFAULT_PORT, serve_foxglove
+
+        serve_foxglove(open_run(the_known_run(run), ()), HostClock(), DEFAULT_PORT if port is None else port)
         return
     if logs and (seconds or run):
         raise ConfigurationError("--seconds and --run are for a running loop, not for logs")
     from lowfc.adapters.logs.parts import in_order
-    from lowfc.programs.cli.ctl.which_run import the_known_run
     from lowfc.programs.view.session import show_logs, show_run
     from lowfc.programs.view.target import Target
 
@@ -59,15 +63,3 @@ def view(
         figures = show_run(the_known_run(run), settings, target, seconds)
     if as_json:
         sys.stdout.write(json.dumps(figures) + "\n")
-
-
-def _serve_foxglove(run: str | None, port: int | None) -> None:
-    from lowfc.adapters.bus.run import open_run
-    from lowfc.adapters.process.clock import HostClock
-    from lowfc.programs.cli.ctl.which_run import the_known_run
-    from lowfc.programs.view.foxglove_bridge import DEFAULT_PORT, serve_foxglove
-
-    clients, messages = serve_foxglove(
-        open_run(the_known_run(run), ()), HostClock(), DEFAULT_PORT if port is None else port
-    )
-    sys.stderr.write(f"clients: {clients}, messages: {messages}\n")

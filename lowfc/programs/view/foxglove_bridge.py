@@ -10,7 +10,7 @@ import sys
 import threading
 import time
 from functools import partial
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING
 
 from lowfc.adapters.bus.bus import ALL, Bus, Sample, states
 from lowfc.adapters.bus.names import Names
@@ -37,13 +37,6 @@ _TURN_S = 0.05
 _PATIENCE_S = 0.2
 
 
-class Summary(NamedTuple):
-    """Clients that subscribed to something, and messages that were logged, received by a client or not."""
-
-    clients: int
-    messages: int
-
-
 class FoxgloveBridge:
     """Passes on the messages of a bus to the apps that connect.
 
@@ -52,6 +45,8 @@ class FoxgloveBridge:
         port: where apps connect, on loopback.
         subscriptions: client and topic of each that there is now.
         kept: the states in force, by key.
+        clients: numbers of those that subscribed to something.
+        messages: how many were logged, received by a client or not.
     """
 
     def __init__(self, bus: Bus, clock: Clock, run_id: str, port: int = DEFAULT_PORT) -> None:
@@ -61,16 +56,24 @@ class FoxgloveBridge:
             BusError: the port is taken.
             ConfigurationError: foxglove-sdk is not installed.
         """
-        self._foxglove = _foxglove()
+        try:
+            import foxglove
+        except ImportError as error:
+            raise ConfigurationError(
+                f"--foxglove needs foxglove-sdk, which is not there ({error}); install it with: "
+                f"{install_advice('foxglove')}"
+            ) from None
+        logging.getLogger("foxglove").setLevel(logging.CRITICAL)  # an app that is closed meanwhile is no error
+        self._foxglove = foxglove
         self._context = self._foxglove.Context()
         self._bus = bus
         self._names = Names()
         self._channels: dict[str, Channel] = {}
         self._channels_lock = threading.Lock()
-        self._seen: set[int] = set()
+        self.clients: set[int] = set()
         self.kept: dict[str, Sample] = {}
         self.subscriptions: set[tuple[int, str]] = set()
-        self._messages = 0
+        self.messages = 0
         for topic in SHOWN:
             if topic.key == topic.at(ALL):  # the names in the others' keys are not known yet
                 self._channel(topic, topic.key)
@@ -85,25 +88,27 @@ class FoxgloveBridge:
         self.port: int = self._server.port
         # Before the service, which subscribes to Health: a peer with that subscription has all others, too.
         for topic in SHOWN:
-            bus.subscribe(topic, partial(self._take, topic))
+            bus.subscribe(topic, partial(self._publish, topic))
         self.service = Service(Role.VIEWER, run_id, clock, bus)
 
-    def run(self) -> Summary:
+    def run(self) -> None:
         """Serve until told to stop."""
         self.service.state = "running"
         while self.service.running:
             if self.service.newcomers():
-                self._take_states()
-            self.service.work = self._messages
+                for topic, sample in states(self._bus, SHOWN, _PATIENCE_S):  # published before they were linked to this
+                    kept = self.kept.get(sample.key)
+                    if kept is None or kept.sequence < sample.sequence:
+                        self._publish(topic, sample)
+            self.service.work = self.messages
             self.service.beat()
             time.sleep(_TURN_S)
         self.service.finish()
         self._server.stop()
-        return Summary(len(self._seen), self._messages)
 
     def on_subscribe(self, client: "Client", channel: "ChannelView") -> None:
         """Give a client the state that is in force; called by the server."""
-        self._seen.add(client.id)
+        self.clients.add(client.id)
         self.subscriptions.add((client.id, channel.topic))
         kept = self.kept.get(channel.topic.removeprefix("/"))
         if kept is not None:
@@ -113,40 +118,31 @@ class FoxgloveBridge:
         """A client has unsubscribed; called by the server."""
         self.subscriptions.discard((client.id, channel.topic))
 
-    def _take_states(self) -> None:
-        """Get the states that a process published before it was linked to this one."""
-        for topic, sample in states(self._bus, SHOWN, _PATIENCE_S):
-            kept = self.kept.get(sample.key)
-            if kept is None or kept.sequence < sample.sequence:
-                self._take(topic, sample)
-
-    def _take(self, topic: Topic, sample: Sample) -> None:
+    def _publish(self, topic: Topic, sample: Sample) -> None:
         self._names.admit(topic, sample.key)
         if topic.queryable:
             self.kept[sample.key] = sample
-        self._messages += 1
+        self.messages += 1
         self._channel(topic, sample.key).log(sample.payload, log_time=sample.publish_time_ns)
 
     def _channel(self, topic: Topic, key: str) -> "Channel":
-        if key not in self._channels:
-            with self._channels_lock:  # two processes may be the first with an event
-                if key not in self._channels:
-                    schema = self._foxglove.Schema(
+        with self._channels_lock:  # two processes may be the first with an event
+            if key not in self._channels:
+                self._channels[key] = self._foxglove.Channel(
+                    "/" + key,
+                    schema=self._foxglove.Schema(
                         name=topic.message.DESCRIPTOR.full_name,
                         encoding="protobuf",
                         data=declaration(topic.message).SerializeToString(),
-                    )
-                    self._channels[key] = self._foxglove.Channel(
-                        "/" + key,
-                        schema=schema,
-                        message_encoding="protobuf",
-                        context=self._context,
-                        metadata={"description": topic.sentence},
-                    )
-        return self._channels[key]
+                    ),
+                    message_encoding="protobuf",
+                    context=self._context,
+                    metadata={"description": topic.sentence},
+                )
+            return self._channels[key]
 
 
-def serve_foxglove(run: Run, clock: Clock, port: int = DEFAULT_PORT) -> Summary:
+def serve_foxglove(run: Run, clock: Clock, port: int = DEFAULT_PORT) -> None:
     """Serve a run to Foxglove and Lichtblick until SIGTERM or SIGINT; the process of `lowfc view --foxglove`.
 
     Raises:
@@ -158,18 +154,7 @@ def serve_foxglove(run: Run, clock: Clock, port: int = DEFAULT_PORT) -> Summary:
         bridge = FoxgloveBridge(bus, clock, run.run_id, port)
         bridge.service.catch_signals()
         sys.stderr.write(f"serving run {run.run_id!r} at ws://{HOST}:{bridge.port}; Ctrl-C ends it\n")
-        return bridge.run()
+        bridge.run()
+        sys.stderr.write(f"clients: {len(bridge.clients)}, messages: {bridge.messages}\n")
     finally:
         bus.close()
-
-
-def _foxglove() -> Any:
-    try:
-        import foxglove
-    except ImportError as error:
-        raise ConfigurationError(
-            f"--foxglove needs foxglove-sdk, which is not there ({error}); install it with: "
-            f"{install_advice('foxglove')}"
-        ) from None
-    logging.getLogger("foxglove").setLevel(logging.CRITICAL)  # an app that is closed while it is sent to is no error
-    return foxglove

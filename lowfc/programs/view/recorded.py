@@ -54,7 +54,11 @@ def draw_logs(
         reader = LogReader(log, topics=SHOWN, skip_damaged=True)
         for number, message in enumerate(reader):
             if renderer is None:
-                own = config or _own(reader, drawn)
+                found, remarks = (config, []) if config else attached_configuration(reader)
+                if found is None:
+                    remarks.append("the default configuration is used for pupil and telescope, as the log has none")
+                drawn.remarks += remarks
+                own = found or Configuration()
                 renderer = make_renderer(own)
                 accumulator = Accumulator(SimulatedClock().now_ns() if own.lockstep else None)
                 first_ns = message.log_time_ns
@@ -89,12 +93,3 @@ def draw_logs(
         drawn.remarks.append(f"{accumulator.unreadable} messages could not be read")
     drawn.log_s = (last_ns - first_ns) * 1e-9
     return drawn
-
-
-def _own(reader: LogReader, drawn: Drawn) -> Configuration:
-    """The log's own configuration; the default one, with a remark, where it has none that can be read."""
-    found, remarks = attached_configuration(reader)
-    drawn.remarks += remarks
-    if found is None:
-        drawn.remarks.append("the default configuration is used for pupil and telescope, as the log has none")
-    return found or Configuration()

@@ -5,6 +5,7 @@ import time
 from collections import deque
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
+from functools import partial
 from itertools import chain
 
 import rerun as rr
@@ -55,11 +56,11 @@ class Renderer:
         self._remarks: list[str] = []
         nm_per_mas = tilt_nm_per_mas(config.star.diameter_m)
         made: list[Callable[[], Panel]] = [
-            lambda: Tiles(nm_per_mas),
+            partial(Tiles, nm_per_mas),
             Sensor,
             Mirror,
-            lambda: Wavefront(nm_per_mas),
-            lambda: Pointing(nm_per_mas),
+            partial(Wavefront, nm_per_mas),
+            partial(Pointing, nm_per_mas),
             Trend,
             Loop,
             Latency,
@@ -67,10 +68,10 @@ class Renderer:
         ]
         try:
             pupil = science_pupil(config.sensor)
-            if pupil is not None:
-                made.append(lambda: Science(pupil, config.star.wavelength_nm))
-            else:
+            if pupil is None:
                 self._remarks.append("no science camera: behind a Lyot stop its image is not modelled")
+            else:
+                made.append(partial(Science, pupil, config.star.wavelength_nm))
         except LowfcError as error:
             self._remarks.append(f"no science camera: {error}")
         self._slots = [_Slot(make) for make in made]

@@ -1,6 +1,6 @@
 """Pictures on a rerun stream, and the scale of their colours."""
 
-from math import floor, isfinite, log10
+from math import floor, log10
 
 import numpy as np
 import numpy.typing as npt
@@ -24,22 +24,17 @@ class Scale:
 
     def fit(self, values: npt.NDArray[np.floating], time_ns: int) -> bool:
         """Take values into account; True where the limit changed."""
-        largest = max(float(values.max(initial=0.0)), -float(values.min(initial=0.0)))
-        if not isfinite(largest):
-            return self.fit(np.nan_to_num(values, nan=0.0, posinf=0.0, neginf=0.0), time_ns)
-        wanted = round_up(max(largest, self.least))
+        largest = max(
+            self.least, float(np.abs(values, where=np.isfinite(values), out=np.zeros(values.shape)).max(initial=0.0))
+        )
+        decade = 10.0 ** floor(log10(largest))
+        wanted = next(step * decade for step in _STEPS if largest <= step * decade * (1 + 1e-9))
         if wanted >= self.limit:
             self._needed_ns = time_ns
         if wanted > self.limit or (wanted < self.limit and time_ns - self._needed_ns > _SHRINK_NS):
             self.limit, self._needed_ns = wanted, time_ns
             return True
         return False
-
-
-def round_up(value: float) -> float:
-    """The next round number at or above a positive value."""
-    decade = 10.0 ** floor(log10(value))
-    return next(step * decade for step in _STEPS if value <= step * decade * (1 + 1e-9))
 
 
 class Picture:
