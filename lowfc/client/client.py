@@ -10,7 +10,7 @@ from typing import TypeVar
 
 import numpy as np
 import numpy.typing as npt
-from google.protobuf.message import DecodeError
+from google.protobuf.message import DecodeError, Message
 
 from lowfc.adapters.bus.bus import ALL, UNREADABLE, Bus, Sample
 from lowfc.adapters.bus.names import Names
@@ -48,7 +48,7 @@ from lowfc.control.loop.command_channels import MIRROR, OFFSET
 from lowfc.control.loop.inputs import Step
 
 Single = npt.NDArray[np.float32]
-T = TypeVar("T")
+M = TypeVar("M", bound=Message)
 
 CONNECT_S = 1.0
 ANSWER_S = 2.0
@@ -188,15 +188,13 @@ class Client:
         """Reserve the loop: until the end of the block, requests of others that would change it are refused.
 
         `safe`, `open`, `pause` and `stop` are always granted, and end the reservation: see `check_lease`.
-
-        Args:
-            purpose: For people, such as "lowfc calibrate".
-            duration_s: How long it is going to take, where that is known.
-
-        Raises:
-            RequestRefusedError: somebody else has reserved it.
+        See `Lease`.
         """
-        lease = Lease(self._ask_for_lease, purpose, duration_s)
+        lease = Lease(
+            lambda name, lease_id, seconds, holder: self.ask(name, values=seconds, text=holder, lease_id=lease_id),
+            purpose,
+            duration_s,
+        )
         self._lease = lease
         try:
             yield lease
@@ -212,9 +210,6 @@ class Client:
         """
         if self._lease is not None:
             self._lease.check()
-
-    def _ask_for_lease(self, name: str, lease_id: int, seconds: float, holder: str) -> Answer:
-        return self.ask(name, values=seconds, text=holder, lease_id=lease_id)
 
     def note(self, text: str) -> Answer:
         """Leave a note in the log."""
@@ -235,11 +230,11 @@ class Client:
         Raises:
             BusError: nobody has one, or what was answered is none.
         """
-        sample = self._get(CALIBRATION.key, b"", ANSWER_S)
+        message = self._get_message(CALIBRATION, wire.Calibration, Role.CONTROLLER)
         try:
-            return decode_calibration(wire.Calibration.FromString(sample.payload))
-        except (DecodeError, ValueError) as fault:
-            raise BusError(f"{sample.key} was answered with what is no calibration: {fault}") from None
+            return decode_calibration(message)
+        except ValueError as fault:
+            raise BusError(f"{CALIBRATION.key} was answered with what is no calibration: {fault}") from None
 
     def camera(self) -> CameraSettings | None:
         """Settings of the camera as the controller last received them, to be kept with what is measured with it."""
@@ -249,16 +244,12 @@ class Client:
         return replace(camera_settings(state.camera), start_s=0)
 
     def camera_state(self) -> wire.CameraState:
-        """What the camera says of itself.
+        """Settings of the camera, as it publishes them.
 
         Raises:
             BusError: no camera answers.
         """
-        sample = self._get(CAMERA_STATE.key, b"", ANSWER_S, Role.CAMERA)
-        try:
-            return wire.CameraState.FromString(sample.payload)
-        except DecodeError as fault:
-            raise BusError(f"{sample.key} was answered with what is no lowfc.v1.CameraState: {fault}") from None
+        return self._get_message(CAMERA_STATE, wire.CameraState, Role.CAMERA)
 
     def processes(self) -> dict[str, wire.Health]:
         """What each process of the run reports of itself, by its name."""
@@ -282,18 +273,14 @@ class Client:
         Raises:
             BusError: none came.
         """
-        return self._stream(FRAME, frame_of, "frame", count, patience_s)
+        return Stream(self._bus.ring(FRAME, WAITING), frame_of, "frame", count, patience_s)
 
     def steps(self, count: int | None = None, patience_s: float = SILENT_S) -> Stream[Step]:
         """Steps of the control law from now on, `count` of them or without end; see `frames`."""
-        return self._stream(STEP, step_of, "step", count, patience_s)
+        return Stream(self._bus.ring(STEP, WAITING), step_of, "step", count, patience_s)
 
     def mirror_watch(self) -> MirrorWatch:
-        """What the mirror reports from now on, read without waiting.
-
-        Raises:
-            BusError: it reported nothing.
-        """
+        """What the mirror reports from now on, read without waiting; see `MirrorWatch`."""
         return MirrorWatch(self._bus)
 
     def ask(
@@ -344,8 +331,7 @@ class Client:
         deadline_s = time.monotonic() + CONNECT_S
         while True:
             begun_s = time.monotonic()
-            answers = self._bus.get(key, payload, answer_s)
-            if answers:
+            if answers := self._bus.get(key, payload, answer_s):
                 return answers[0]
             now_s = time.monotonic()
             if now_s - begun_s >= answer_s * 0.9:
@@ -357,6 +343,13 @@ class Client:
                 raise BusError(f"no {who} is there in run {self.run_id!r}: start one, as with `{_COMMANDS[who]}`")
             time.sleep(0.05)
 
+    def _get_message(self, topic: Topic, kind: type[M], who: Role) -> M:
+        """The state that a process published last."""
+        try:
+            return kind.FromString(self._get(topic.key, b"", ANSWER_S, who).payload)
+        except DecodeError as fault:
+            raise BusError(f"{topic.key} was answered with what is no {kind.DESCRIPTOR.full_name}: {fault}") from None
+
     def _answer(self, name: str, sample: Sample) -> Answer:
         try:
             message = wire.Request.FromString(sample.payload)
@@ -366,11 +359,6 @@ class Client:
             raise RequestRefusedError(f"{name} refused: {message.reply} (run {self.run_id})")
         state = message.state if message.HasField("state") else None
         return Answer(True, message.reply, message.frame_sequence, message.text, state, self.run_id)
-
-    def _stream(
-        self, topic: Topic, decode: Callable[[Sample], T | None], what: str, count: int | None, patience_s: float
-    ) -> Stream[T]:
-        return Stream(self._bus.ring(topic, WAITING), decode, what, count, patience_s)
 
     def _mirror_grid(self) -> tuple[int, int]:
         if self._grid is None:  # it does not change: another mirror is another run

@@ -2,7 +2,6 @@
 
 import contextlib
 import os
-import pwd
 import secrets
 import threading
 import time
@@ -44,13 +43,13 @@ class Lease:
         """
         self.id = secrets.randbits(63) | 1
         self._ask = ask
-        self._purpose = f"{purpose} by {_user()} (process {os.getpid()})"
-        self._end_s: float | None = None
+        import psutil
+
+        self._purpose = f"{purpose} by {psutil.Process().username()} (process {os.getpid()})"
+        self._end_s = None if duration_s is None else time.monotonic() + duration_s
         self._ended = ""
         self._turn = threading.Lock()
         self._done = threading.Event()
-        if duration_s is not None:
-            self.expect(duration_s)
         self._ask("lease", self.id, DURATION_S, self._holder())
         self._thread = threading.Thread(target=self._renew, name="lease", daemon=True)
         self._thread.start()
@@ -60,13 +59,13 @@ class Lease:
         self._end_s = time.monotonic() + duration_s
 
     def expecting(self, progress: "Counted", rate_hz: float) -> "Counted":
-        """Progress in frames, from which others are told how long it is going to take."""
+        """Progress in frames, from which others learn how long it is going to take."""
 
-        def told(what: str, done: int, total: int) -> None:
+        def count(what: str, done: int, total: int) -> None:
             self.expect((total - done) / rate_hz)
             progress(what, done, total)
 
-        return told
+        return count
 
     def check(self) -> None:
         """Renew it now.
@@ -103,10 +102,3 @@ class Lease:
         if self._end_s is None:
             return self._purpose
         return f"{self._purpose}, about {max(0.0, self._end_s - time.monotonic()):.0f} s to go"
-
-
-def _user() -> str:
-    try:
-        return pwd.getpwuid(os.getuid()).pw_name
-    except KeyError:
-        return f"user {os.getuid()}"

@@ -2,9 +2,11 @@
 
 import contextlib
 import threading
+import time
 from collections import deque
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass, field
+from typing import TypeVar
 
 from lowfc.adapters.bus.bus import ALL, Faults, Query, Sample
 from lowfc.adapters.process.clock import Clock
@@ -12,6 +14,8 @@ from lowfc.adapters.process.clock_offset import ClockOffset
 from lowfc.contract.envelope import Envelope, sequence_of
 from lowfc.contract.errors import BusError
 from lowfc.contract.messages import Topic
+
+T = TypeVar("T")
 
 
 @dataclass(slots=True)
@@ -84,15 +88,15 @@ class MemoryBus:
         self.offset: ClockOffset | None = None
         self.start_s = max(clock.start_s, hub.starts.get(role, -1) + 1)
         hub.starts[role] = self.start_s
-        self._publishers: list[MemoryPublisher] = []
+        self.publishers: list[MemoryPublisher] = []
         self._subscriptions: list[tuple[Topic, str, Callable[[Sample], None]]] = []
-        self._queryables: list[tuple[str, Callable[[Query], None]]] = []
+        self.queryables: list[tuple[str, Callable[[Query], None]]] = []
         hub.buses.append(self)
 
     def publisher(self, topic: Topic, name: str = "") -> MemoryPublisher:
         """See `Bus.publisher`."""
         publisher = MemoryPublisher(self, topic, topic.at(name))
-        self._publishers.append(publisher)
+        self.publishers.append(publisher)
         return publisher
 
     def subscribe(self, topic: Topic, handler: Callable[[Sample], None], name: str = ALL) -> Callable[[], None]:
@@ -107,22 +111,28 @@ class MemoryBus:
 
     def queryable(self, key_expression: str, handler: Callable[[Query], None]) -> None:
         """See `Bus.queryable`."""
-        self._queryables.append((key_expression, handler))
+        self.queryables.append((key_expression, handler))
 
     def get(self, key: str, payload: bytes = b"", timeout_s: float = 1.0) -> list[Sample]:
         """See `Bus.get`; returns once every handler asked has replied, or after `timeout_s`."""
         answers: list[Sample] = []
-        asked = threading.Semaphore(0)
-        handlers = 0
+        replied = threading.Semaphore(0)
+        asked = 0
         for bus in list(self.hub.buses):
-            for at, body, envelope in bus.kept(key):
-                answers.append(Sample(at, body, envelope.sequence, envelope.publish_time_ns, self.clock.host_ns()))
-            for handler in bus.handlers_of(key):
-                handlers += 1
-                bus.ask(handler, Query(key, payload, self._collector(bus, key, answers, asked)))
-        for _ in range(handlers):
-            if not asked.acquire(timeout=timeout_s):
-                break
+            kept = [one for one in bus.publishers if key in (one.key, one.topic.at(ALL))]
+            answers.extend(_sample(one.key, *one.last, self.clock) for one in kept if one.last)
+            start = Envelope(sequence_of(bus.start_s, 0), self.clock.host_ns())
+
+            def reply(body: bytes, envelope: Envelope = start) -> None:
+                answers.append(_sample(key, body, envelope, self.clock))
+                replied.release()
+
+            for handler in [one for expression, one in bus.queryables if _covers(expression, key)]:
+                asked += 1
+                bus.call("queryable of", key, handler, Query(key, payload, reply))
+        deadline_s = time.monotonic() + timeout_s
+        while asked and replied.acquire(timeout=max(0.0, deadline_s - time.monotonic())):
+            asked -= 1
         return answers
 
     def peers(self) -> int:
@@ -141,38 +151,18 @@ class MemoryBus:
             return
         for topic, wanted, handler in list(self._subscriptions):
             if key == wanted or (wanted == topic.at(ALL) and topic.matches(key)):
-                sample = Sample(key, payload, envelope.sequence, envelope.publish_time_ns, self.clock.host_ns())
-                try:
-                    handler(sample)
-                except Exception as fault:  # a handler's fault is its own process's, never the publisher's
-                    self.faults.add(f"{self.role}: handler of", wanted, fault)
+                self.call("handler of", wanted, handler, _sample(key, payload, envelope, self.clock))
 
-    def kept(self, key: str) -> Iterator[tuple[str, bytes, Envelope]]:
-        """Last messages of the queryable topics that a key expression asks for."""
-        for publisher in self._publishers:
-            if publisher.last and (publisher.key == key or key == publisher.topic.at(ALL)):
-                yield publisher.key, *publisher.last
-
-    def handlers_of(self, key: str) -> list[Callable[[Query], None]]:
-        """Handlers declared for a key."""
-        return [handler for wanted, handler in self._queryables if _covers(wanted, key)]
-
-    def ask(self, handler: Callable[[Query], None], query: Query) -> None:
-        """Hand a question to a handler."""
+    def call(self, what: str, key: str, handler: Callable[[T], None], argument: T) -> None:
+        """Call a handler; its fault is its own process's, never the publisher's."""
         try:
-            handler(query)
+            handler(argument)
         except Exception as fault:
-            self.faults.add(f"{self.role}: queryable of", query.key, fault)
+            self.faults.add(f"{self.role}: {what}", key, fault)
 
-    def _collector(
-        self, bus: "MemoryBus", key: str, answers: list[Sample], asked: threading.Semaphore
-    ) -> Callable[[bytes], None]:
-        def reply(body: bytes) -> None:
-            now_ns = self.clock.host_ns()
-            answers.append(Sample(key, body, sequence_of(bus.start_s, 0), now_ns, now_ns))
-            asked.release()
 
-        return reply
+def _sample(key: str, payload: bytes, envelope: Envelope, clock: Clock) -> Sample:
+    return Sample(key, payload, envelope.sequence, envelope.publish_time_ns, clock.host_ns())
 
 
 def _covers(expression: str, key: str) -> bool:

@@ -9,6 +9,7 @@ from collections import defaultdict
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
+from urllib.request import urlopen
 
 import numpy as np
 import pytest
@@ -19,7 +20,7 @@ from lowfc.adapters.viewer.rerun_viewer import RerunViewer, Show, ViewerError
 from lowfc.contract.messages import SURFACE, RawImage, image, topic_of, wire
 from tests.support.loops import payloads, until
 from tests.support.report_log import Night
-from tests.support.viewers import browser_screenshot, complaints, listening, needs_chromium, on_screen, pixels, share_of
+from tests.support.viewers import complaints, listening, on_screen, pixels, share_of
 
 ORANGE, BLUE = (214, 110, 20), (20, 90, 214)
 SHARE = 0.05  # of the viewer's pixels that an image of two colours gives each of them, at least
@@ -45,7 +46,7 @@ def test_an_image_that_was_logged_is_on_the_screen(headless: RerunViewer, tmp_pa
     assert path.read_bytes() == picture
     shown = pixels(picture)
     assert shown.shape == (400, 640, 3)
-    assert _both(shown)
+    assert min(share_of(shown, colour) for colour in (ORANGE, BLUE)) > SHARE
     assert _mean_row(shown, ORANGE) < _mean_row(shown, BLUE), "it is upside down"
     assert [view.origin for view in headless.state().views] == ["/image"]
     assert complaints(headless) == []
@@ -84,8 +85,9 @@ def test_a_viewer_that_hangs_or_dies_is_noticed(web: RerunViewer) -> None:
 
 def test_a_new_viewer_on_the_same_port_takes_a_new_stream(web: RerunViewer) -> None:
     before = _two_colours(web)
-    os.kill(web.pid, signal.SIGKILL)
-    os.waitid(os.P_PID, web.pid, os.WEXITED | os.WNOWAIT)
+    os.kill(web.pid, signal.SIGSTOP)
+    web.stop()
+    assert not Path(f"/proc/{web.pid}").exists()
     web.stop()
     with RerunViewer(Show.WEB, port=web.port, web_port=web.web_port) as again:
         assert (again.url, again.web_address) == (web.url, web.web_address)
@@ -93,21 +95,11 @@ def test_a_new_viewer_on_the_same_port_takes_a_new_stream(web: RerunViewer) -> N
     before.disconnect()
 
 
-def test_none_is_left_when_it_is_stopped_hanging() -> None:
-    viewer = RerunViewer(Show.WEB)
-    os.kill(viewer.pid, signal.SIGSTOP)
-    viewer.stop()
-    viewer.stop()
-    assert not viewer.alive
-    assert not Path(f"/proc/{viewer.pid}").exists()
-
-
-@pytest.mark.parametrize("hangs", [False, True])
-def test_it_dies_with_its_parent(hangs: bool) -> None:
+def test_it_dies_with_its_parent_though_it_hangs() -> None:
     program = (
         "import os, signal\nfrom lowfc.adapters.viewer.rerun_viewer import RerunViewer, Show\n"
         "viewer = RerunViewer(Show.WEB)\nprint(viewer.pid, flush=True)\n"
-        f"if {hangs}:\n    os.kill(viewer.pid, signal.SIGSTOP)\nos.kill(os.getpid(), signal.SIGKILL)"
+        "os.kill(viewer.pid, signal.SIGSTOP)\nos.kill(os.getpid(), signal.SIGKILL)"
     )
     parent = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=60, check=False)
     assert parent.returncode == -signal.SIGKILL, parent.stderr
@@ -139,20 +131,11 @@ def test_a_port_that_is_taken_is_one_line(web: RerunViewer) -> None:
     assert "\n" not in str(caught.value)
 
 
-@pytest.mark.slow  # the live loop's page is looked at anyway
-@pytest.mark.browser
-@needs_chromium
-def test_an_image_that_was_logged_is_on_the_page(web: RerunViewer, tmp_path: Path) -> None:
-    stream = _two_colours(web)
-    path = tmp_path / "page.png"
-    page = browser_screenshot(web.web_address, path, 90.0, _both, size_px=(800, 500))
-    assert _both(pixels(path.read_bytes())), page.complaints
-    assert any("ReadMessages" in address and str(web.port) in address for address in page.fetched.values())
-    refused = [line for line in page.complaints if "Content Security Policy" in line]
-    assert any("tel.rerun.io" in line for line in refused), "it no longer wants to call home; the page could go"
-    for address in page.fetched.values():
-        assert address.startswith(("http://127.0.0.1:", "data:", "blob:")), address
-    stream.disconnect()
+def test_the_page_may_ask_this_host_alone(web: RerunViewer) -> None:
+    with urlopen(web.web_address) as page:  # noqa: S310
+        policy = page.headers["Content-Security-Policy"]
+    addresses = set(re.findall(r"https?://\S+", policy))
+    assert addresses == {f"http://127.0.0.1:{web.port}"}, "without it, the page sends usage statistics"
 
 
 def _two_colours(viewer: RerunViewer) -> rr.RecordingStream:
@@ -165,10 +148,6 @@ def _two_colours(viewer: RerunViewer) -> rr.RecordingStream:
     stream.log("image", rr.Image(image))
     stream.flush(timeout_sec=10)
     return stream
-
-
-def _both(shown: Any) -> bool:
-    return share_of(shown, ORANGE) > SHARE and share_of(shown, BLUE) > SHARE
 
 
 def _mean_row(shown: Any, colour: tuple[int, int, int]) -> float:

@@ -79,7 +79,6 @@ class Page:
         self.fetched: dict[str, str] = {}
         self.complaints: list[str] = []
         self._connection = connection
-        self._loaded = False
         self._numbers = itertools.count(1)
         self._session: dict[str, str] = {}
         target = self.call("Target.createTarget", url="about:blank")["targetId"]
@@ -89,10 +88,9 @@ class Page:
 
     def open(self, address: str) -> None:
         """Go there and wait until the page has loaded, which the viewer in it has not yet."""
-        self._loaded = False
         self.call("Page.navigate", url=address)
-        while not self._loaded:
-            self._note(self._next())
+        while self._next().get("method") != "Page.loadEventFired":
+            pass
 
     def screenshot_when(self, shows: Callable[[Pixels], bool], seconds: float) -> bytes:
         """PNG of the page once it shows what is waited for, or at the end of the time."""
@@ -107,27 +105,22 @@ class Page:
         number = next(self._numbers)
         self._connection.send(json.dumps({"id": number, "method": method, "params": parameters} | self._session))
         while (answer := self._next()).get("id") != number:
-            self._note(answer)
+            pass
         assert "error" not in answer, (method, answer)
         return answer["result"]
 
     def _next(self) -> dict[str, Any]:
-        return dict(json.loads(self._connection.recv(timeout=CALL_S)))
-
-    def _note(self, message: dict[str, Any]) -> None:
+        message: dict[str, Any] = json.loads(self._connection.recv(timeout=CALL_S))
         event, about = message.get("method"), message.get("params", {})
-        if event == "Page.loadEventFired":
-            self._loaded = True
-        elif event == "Network.requestWillBeSent":
+        if event == "Network.requestWillBeSent":
             self.fetched[about["requestId"]] = about["request"]["url"]
         elif event == "Network.loadingFailed" and about.get("blockedReason") == "csp":
             self.fetched.pop(about["requestId"], None)
-        elif event == "Log.entryAdded" and about["entry"]["level"] in ("warning", "error"):
-            self.complaints.append(f"{about['entry']['text']} {about['entry'].get('url', '')}")
-        elif event == "Runtime.consoleAPICalled" and about["type"] in ("warning", "error"):
-            self.complaints.append(" ".join(str(one.get("value", "")) for one in about["args"]))
-        elif event == "Runtime.exceptionThrown":
-            self.complaints.append(str(about["exceptionDetails"].get("exception", about["exceptionDetails"])))
+        elif event in ("Log.entryAdded", "Runtime.consoleAPICalled", "Runtime.exceptionThrown"):
+            level = about.get("entry", {}).get("level") or about.get("type", "error")
+            if level in ("warning", "error"):
+                self.complaints.append(json.dumps(about))
+        return message
 
 
 @contextlib.contextmanager
@@ -155,24 +148,9 @@ def browser(folder: Path, size_px: tuple[int, int]) -> Iterator[Page]:
 
 
 def browser_screenshot(
-    address: str,
-    path: Path,
-    seconds: float,
-    shows: Callable[[Pixels], bool],
-    size_px: tuple[int, int] = (1600, 1000),
+    address: str, path: Path, seconds: float, shows: Callable[[Pixels], bool], size_px: tuple[int, int]
 ) -> Page:
-    """Picture of a page in a browser, once it shows what is waited for or after so many seconds.
-
-    Args:
-        address: of the page.
-        path: PNG to write; the browser's profile is beside it while it runs.
-        seconds: at most to wait.
-        shows: whether a picture is what is waited for.
-        size_px: width and height of the window; drawing takes time in proportion.
-
-    Returns:
-        What the page fetched and complained of.
-    """
+    """Write a PNG of a page in a browser, once it shows what is waited for or after so many seconds."""
     folder = path.parent / f"{path.stem}-browser"
     folder.mkdir()
     try:

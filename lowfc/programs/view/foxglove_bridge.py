@@ -10,7 +10,7 @@ import sys
 import threading
 import time
 from functools import partial
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from lowfc.adapters.bus.bus import ALL, Bus, Sample, states
 from lowfc.adapters.bus.names import Names
@@ -64,7 +64,7 @@ class FoxgloveBridge:
                 f"{install_advice('foxglove')}"
             ) from None
         logging.getLogger("foxglove").setLevel(logging.CRITICAL)  # an app that is closed meanwhile is no error
-        self._foxglove = foxglove
+        self._foxglove: Any = foxglove
         self._context = self._foxglove.Context()
         self._bus = bus
         self._names = Names()

@@ -4,9 +4,7 @@ import threading
 import time
 from collections import deque
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass
 from functools import partial
-from itertools import chain
 
 import rerun as rr
 
@@ -33,15 +31,6 @@ from lowfc.programs.view.snapshot import PICTURES_HZ, PICTURES_PER_COMPLETE, Acc
 
 RETRY_NS = 5_000_000_000
 """After which a panel that failed is made again."""
-
-
-@dataclass(slots=True)
-class _Slot:
-    """A panel's place: how to make it, the panel or None while it is left out, and when to try again."""
-
-    make: Callable[[], Panel]
-    panel: Panel | None = None
-    again_ns: int = 0
 
 
 class Renderer:
@@ -74,34 +63,35 @@ class Renderer:
                 made.append(partial(Science, pupil, config.star.wavelength_nm))
         except LowfcError as error:
             self._remarks.append(f"no science camera: {error}")
-        self._slots = [_Slot(make) for make in made]
-        for slot in self._slots:
-            self._make(slot)
+        self._makers = made
+        self._panels = [self._begun(make) for make in made]
+        self._again_ns = [0] * len(made)
 
     @property
     def panels(self) -> list[Panel]:
         """Those that are drawn."""
-        return [slot.panel for slot in self._slots if slot.panel is not None]
+        return [panel for panel in self._panels if panel is not None]
 
     def draw(self, snapshot: Snapshot) -> None:
         """Draw what is new."""
-        for slot in self._slots:
-            if slot.panel is None and snapshot.time_ns >= slot.again_ns:
-                self._make(slot)
-            if slot.panel is not None and (snapshot.complete or slot.panel.pictures):
+        for number, panel in enumerate(self._panels):
+            if panel is None and snapshot.time_ns >= self._again_ns[number]:
+                panel = self._panels[number] = self._begun(self._makers[number])
+            if panel is not None and (snapshot.complete or panel.pictures):
                 try:
-                    slot.panel.draw(self._stream, snapshot)
+                    panel.draw(self._stream, snapshot)
                 except Exception as fault:
-                    self._remarks.append(f"{type(slot.panel).__name__} is left out of the view for a while: {fault!r}")
-                    slot.panel, slot.again_ns = None, snapshot.time_ns + RETRY_NS
+                    self._remarks.append(f"{type(panel).__name__} is left out of the view for a while: {fault!r}")
+                    self._panels[number], self._again_ns[number] = None, snapshot.time_ns + RETRY_NS
         for remark in self._remarks:
             at(self._stream, snapshot.time_ns)
             self._stream.log(f"{LOG}/view", rr.TextLog(remark, level=rr.TextLogLevel.ERROR))
         self._remarks.clear()
 
-    def _make(self, slot: _Slot) -> None:
-        slot.panel = slot.make()
-        slot.panel.begin(self._stream)
+    def _begun(self, make: Callable[[], Panel]) -> Panel | None:
+        panel = make()
+        panel.begin(self._stream)
+        return panel
 
 
 class RenderThread(threading.Thread):
@@ -155,13 +145,13 @@ class RenderThread(threading.Thread):
         while not self._abandoned:
             now_s = time.monotonic()
             behind_s, began_s = max(0.0, now_s - began_s - 1 / PICTURES_HZ), now_s  # what arrived may be that old
-            complete = now_s >= complete_due_s
-            if complete:
+            if complete := now_s >= complete_due_s:
                 complete_due_s = now_s + (PICTURES_PER_COMPLETE - 0.5) / PICTURES_HZ  # by time: rings wait no longer
-            earlier = [self._earlier.popleft() for _ in range(len(self._earlier))]
-            rings = [(topic, ring) for topic, ring in self._rings.items() if complete or topic.latest_only]
-            arrived = ((topic, sample) for topic, ring in rings for sample in ring.drain())
-            for topic, sample in chain(earlier, arrived):  # many messages in a row cost less each
+            arrived = [self._earlier.popleft() for _ in range(len(self._earlier))]
+            for topic, ring in self._rings.items():
+                if complete or topic.latest_only:  # many messages in a row cost less each
+                    arrived += [(topic, sample) for sample in ring.drain()]
+            for topic, sample in arrived:
                 accumulator.add(topic, sample.key, sample.payload, sample.publish_time_ns, sample.sequence)
             renderer.draw(accumulator.snapshot(self._clock.host_ns(), complete=complete, behind_s=behind_s))
             self.snapshots += 1

@@ -24,9 +24,7 @@ class Scale:
 
     def fit(self, values: npt.NDArray[np.floating], time_ns: int) -> bool:
         """Take values into account; True where the limit changed."""
-        largest = max(
-            self.least, float(np.abs(values, where=np.isfinite(values), out=np.zeros(values.shape)).max(initial=0.0))
-        )
+        largest = max(self.least, float(np.abs(values[np.isfinite(values)]).max(initial=0.0)))
         decade = 10.0 ** floor(log10(largest))
         wanted = next(step * decade for step in _STEPS if largest <= step * decade * (1 + 1e-9))
         if wanted >= self.limit:
