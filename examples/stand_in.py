@@ -8,7 +8,7 @@ from lowfc.adapters.process.service import Service
 from lowfc.contract.codecs.codec import decode_mirror
 from lowfc.contract.configuration import Configuration
 from lowfc.contract.messages import MIRROR_STATE
-from sim_camera.process import bench
+from sim_camera.process import scene
 
 
 class Optics:
@@ -18,7 +18,7 @@ class Optics:
         """Listen to where the mirror is."""
         self._config = config
         self._clock = service.clock
-        self._bench = bench(config)
+        self._scene = scene(config)
         self._surface_nm = np.zeros((config.mirror.rows, config.mirror.columns), np.float32)
         self._index = 0
         self._start_ns = self._clock.now_ns()
@@ -28,7 +28,7 @@ class Optics:
         """Wait for the next frame; return it and when its exposure ended."""
         self._start_ns = max(self._start_ns + self._config.period_ns, self._clock.now_ns())
         self._clock.sleep_until_ns(self._start_ns)
-        frame, _ = self._bench.expose(self._index, self._surface_nm)
+        frame = self._scene.expose(self._index, self._surface_nm)
         self._index += 1
         end_ns = self._start_ns + self._config.exposure_ns
         self._clock.sleep_until_ns(end_ns)

@@ -10,7 +10,7 @@ from lowfc.adapters.process.join import join
 from lowfc.adapters.process.terminal import DEFAULT_RUN, ConfigFile, RunId, configuration, new_app, run_app
 from lowfc.contract.messages import Role
 from sim_camera.faulty import read_fault
-from sim_camera.process import CameraProcess, bench
+from sim_camera.process import CameraProcess, scene
 
 app = new_app("The simulated sensor camera.\n\nExample: sim-camera --run bench --config lowfc.toml")
 
@@ -28,7 +28,7 @@ def camera(
     Example: sim-camera --run bench --wait-for controller --wait-for mirror-dm
     """
     settings = configuration(config)
-    optics = bench(settings)
+    optics = scene(settings)
     service = join(settings, run, Role.CAMERA, settings.realtime.camera_cpus)
     process = CameraProcess(settings, service, optics, frames, None if fault is None else read_fault(fault))
     service.fill = process.fill

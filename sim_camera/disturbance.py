@@ -1,7 +1,8 @@
-"""What shakes the wavefront: a pure function of the seed and the frame index.
+"""The wavefront's disturbance: a pure function of the seed and of time.
 
 Every preset is a sum of sine waves with seeded phases (a spectral model of drift, jitter and lines), a square wave or
-a static screen, so that any frame can be computed by itself and its spectrum is known exactly.
+a static screen, so that any instant can be computed by itself and the spectrum is known exactly. A damped line is
+many waves, whose frequencies are spread as its resonance is wide.
 """
 
 from dataclasses import dataclass
@@ -10,9 +11,12 @@ import numpy as np
 import numpy.typing as npt
 
 Array = npt.NDArray[np.float64]
+Single = npt.NDArray[np.float32]
 
-BLOCK = 32
+BLOCK = 8
 """Frames computed at once: cheap, and short enough not to delay a frame."""
+LINE_WIDTH = 0.005
+"""Of a damped line, between its half-power points, as a fraction of its frequency."""
 
 # The reaction wheel: rms of each line per axis, mas. Falling with frequency as a telescope's structure damps it;
 # with the drift they add up to 14 mas.
@@ -28,6 +32,9 @@ _THERMAL_NM = {1: 4.0, 2: 5.0, 3: 2.5, 4: 1.5}
 _THERMAL_HZ = (0.003, 0.5)
 _DRIFT_HZ = (0.02, 5.0)
 _WAVES_PER_BAND = 24
+_WAVES_PER_LINE = 64
+FIRST_LINE = 2 * _WAVES_PER_BAND
+"""Of the reaction wheel's waves, the first that belongs to a line."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,8 +66,19 @@ def disturbance(
     wavelength_nm: float,
     scale: float = 1.0,
     static_nm: dict[int, float] | None = None,
+    line_width: float = LINE_WIDTH,
 ) -> Disturbance:
     """The disturbance of a preset for these modes.
+
+    Args:
+        preset: its name.
+        noll: Noll index of each mode.
+        seed: of all phases.
+        nm_per_mas: wavefront rms of a milliarcsecond of tilt.
+        wavelength_nm: of the light.
+        scale: multiplies the amplitude.
+        static_nm: constant wavefront, nm rms by Noll index.
+        line_width: of the reaction wheel's lines, between half-power points, as a fraction of their frequency.
 
     Raises:
         ValueError: unknown preset, or a static mode that is not among the modes.
@@ -86,12 +104,18 @@ def disturbance(
                 _drift(rng, scale * _thermal_nm(noll), _THERMAL_HZ),
                 _lines(rng, np.full(len(_JITTER_HZ), _JITTER_MAS / 2), _JITTER_HZ, tilt_nm),
             ]
-        case "reaction-wheel":
+        case "reaction-wheel" | "reaction-wheel-ideal":
             waves = [
                 _drift(rng, scale * _thermal_nm(noll) * ~tilt, _THERMAL_HZ),
                 _drift(rng, _DRIFT_MAS * tilt_nm, _DRIFT_HZ),
-                _lines(rng, np.array(LINES_MAS), LINES_HZ, tilt_nm),
             ]
+            if preset == "reaction-wheel" and line_width:
+                waves += [
+                    _damped(rng, rms_mas * tilt_nm, hz, line_width * hz)
+                    for rms_mas, hz in zip(LINES_MAS, LINES_HZ, strict=True)
+                ]
+            else:
+                waves.append(_lines(rng, np.array(LINES_MAS), LINES_HZ, tilt_nm))
         case "step":
             step = _STEP_MAS * tilt_nm
         case "kolmogorov":
@@ -104,12 +128,51 @@ def disturbance(
 
 
 def modes_nm(shaken: Disturbance, first: int, count: int, rate_hz: float) -> Array:
-    """Modes (count, modes) of the frames from `first` on, nm of wavefront rms."""
-    index = first + np.arange(count)
-    waves = np.exp(2j * np.pi * np.outer(np.arange(count) / rate_hz, shaken.frequency_hz))
-    start = shaken.amplitude_nm * np.exp(2j * np.pi * shaken.frequency_hz * (first / rate_hz))[:, None]
-    square = np.where(np.mod(index / rate_hz, _STEP_PERIOD_S) < _STEP_PERIOD_S / 2, -1.0, 1.0)
-    return np.asarray((waves @ start).real + square[:, None] * shaken.step_nm + shaken.static_nm)
+    """Modes (count, modes) at the starts of the exposures of the frames from `first` on, nm of wavefront rms."""
+    return modes_at_nm(shaken, (first + np.arange(count)) / rate_hz)
+
+
+def modes_at_nm(shaken: Disturbance, time_s: Array) -> Array:
+    """Modes (instants, modes) at these times, nm of wavefront rms."""
+    waves = np.exp(2j * np.pi * np.outer(time_s - time_s[0], shaken.frequency_hz)) @ _turned(shaken, time_s[0])
+    return waves.real + _square(time_s)[:, None] * shaken.step_nm + shaken.static_nm
+
+
+class Sampler:
+    """The disturbance at the same instants of every period, in single precision, some frames at once."""
+
+    def __init__(self, shaken: Disturbance, instants: Array, rate_hz: float) -> None:
+        """Prepare the waves; `instants` (instants,) are in periods after the start of an exposure."""
+        self._shaken = shaken
+        self._rate_hz = rate_hz
+        self._time_s = ((np.arange(BLOCK)[:, None] + instants) / rate_hz).ravel()
+        waves = np.exp(2j * np.pi * np.outer(self._time_s, shaken.frequency_hz))
+        self._waves = np.hstack([waves.real, -waves.imag]).astype(np.float32)
+        self._shape = (BLOCK, len(instants), len(shaken.noll))
+        self._block = np.zeros(self._shape, np.float32)
+        self._first = -1
+
+    def at(self, index: int) -> Single:
+        """Modes (instants, modes) in the period of a frame, nm of wavefront rms."""
+        first = index - index % BLOCK  # a frame is the same in whatever order
+        if first != self._first:
+            start_s = first / self._rate_hz
+            turned = _turned(self._shaken, start_s)
+            found = self._waves @ np.vstack([turned.real, turned.imag]).astype(np.float32)
+            square = _square(start_s + self._time_s)[:, None] * self._shaken.step_nm
+            found += (square + self._shaken.static_nm).astype(np.float32)
+            self._first, self._block = first, found.reshape(self._shape)
+        row: Single = self._block[index - first]
+        return row
+
+
+def _turned(shaken: Disturbance, time_s: float) -> npt.NDArray[np.complex128]:
+    """Amplitudes (waves, modes) with the phases of a time."""
+    return np.asarray(shaken.amplitude_nm * np.exp(2j * np.pi * shaken.frequency_hz * time_s)[:, None])
+
+
+def _square(time_s: Array) -> Array:
+    return np.where(np.mod(time_s, _STEP_PERIOD_S) < _STEP_PERIOD_S / 2, -1.0, 1.0)
 
 
 def screen(seed: int, samples: int, spacing: float) -> Array:
@@ -156,6 +219,16 @@ def _lines(
     """Sine waves at fixed frequencies; `rms` of each in units of `unit_nm` (modes,)."""
     amplitude = np.sqrt(2) * rms[:, None] * unit_nm
     return np.array(frequencies_hz), amplitude * _phases(rng, amplitude.shape)
+
+
+def _damped(
+    rng: np.random.Generator, rms_nm: Array, frequency_hz: float, width_hz: float
+) -> tuple[Array, npt.NDArray[np.complex128]]:
+    """A line of this rms (modes,): waves of one size, at the quantiles of a Lorentzian of this width."""
+    quantiles = (np.arange(_WAVES_PER_LINE) + rng.uniform(0.3, 0.7, _WAVES_PER_LINE)) / _WAVES_PER_LINE
+    frequencies = frequency_hz + width_hz / 2 * np.tan(np.pi * (quantiles - 0.5))
+    shape = (_WAVES_PER_LINE, len(rms_nm))
+    return np.abs(frequencies), np.sqrt(2 / _WAVES_PER_LINE) * rms_nm * _phases(rng, shape)
 
 
 def _phases(rng: np.random.Generator, shape: tuple[int, int]) -> npt.NDArray[np.complex128]:

@@ -1,11 +1,11 @@
 """The true wavefront's figures over the second half of a run of unknown length, and over its last frames."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
 import numpy as np
 import numpy.typing as npt
 
-from sim_camera.bench import Truth
+from sim_camera.scene import Truth, Wavefront
 
 BLOCK = 500
 """Frames summed together: the second half is right to this many frames."""
@@ -14,52 +14,65 @@ MOST_BLOCKS = 256
 
 
 @dataclass(frozen=True, slots=True)
-class Wavefront:
-    """Root mean squares over frames: nm over the open pupil, mas per axis."""
+class WavefrontFigures:
+    """Root mean squares over frames: nm over the open pupil, mas per axis.
+
+    The first four are at the instants at which exposures start, the continuous ones over all time, of so many instants
+    of each period; zero where these are not computed.
+    """
 
     disturbance_rms_nm: float
     residual_rms_nm: float
     tilt_disturbance_mas: float
     tilt_residual_mas: float
+    instants: int = 0
+    continuous_disturbance_rms_nm: float = 0.0
+    continuous_residual_rms_nm: float = 0.0
+    continuous_tilt_disturbance_mas: float = 0.0
+    continuous_tilt_residual_mas: float = 0.0
 
 
 class Figures:
     """Sums of squares, block by block."""
 
-    def __init__(self, noll: tuple[int, ...], nm_per_mas: float, recent: int = 1) -> None:
+    def __init__(self, noll: tuple[int, ...], nm_per_mas: float, recent: int = 1, instants: int = 0) -> None:
         """Begin without a frame.
 
         Args:
             noll: modes of the truths to come.
             nm_per_mas: wavefront rms of a milliarcsecond of tilt.
             recent: frames of the recent figures.
+            instants: of each period over which continuous truths are means; 0 where there are none.
         """
+        self._instants = instants
+        self._values = 8 if instants else 4
         self._tilts = slice(0, sum(index in (2, 3) for index in noll))  # they come first
         self._nm_per_mas = nm_per_mas
         self._blocks: list[list[float]] = []
-        self._sums = [0.0, 0.0, 0.0, 0.0]
+        self._sums = [0.0] * self._values
         self._count = 0
         self._block = BLOCK
-        self._recent = np.zeros((recent, 4))
+        self._recent = np.zeros((recent, self._values))
         self._frames = 0
 
     def add(self, truth: Truth) -> None:
         """Count the truth of one frame."""
-        tilt, left = truth.disturbance_nm[self._tilts], truth.residual_nm[self._tilts]
-        squares = (truth.disturbance_rms_nm**2, truth.residual_rms_nm**2, float(tilt @ tilt), float(left @ left))
+        squares = self._squares(truth.sampled)
+        if truth.continuous is not None:
+            squares += self._squares(truth.continuous)
         self._sums = [total + square for total, square in zip(self._sums, squares, strict=True)]
         self._recent[self._frames % len(self._recent)] = squares
         self._frames += 1
         self._count += 1
         if self._count == self._block:
             self._blocks.append(self._sums)
-            self._sums, self._count = [0.0, 0.0, 0.0, 0.0], 0
+            self._sums, self._count = [0.0] * self._values, 0
         if len(self._blocks) == MOST_BLOCKS:
             pairs = zip(self._blocks[::2], self._blocks[1::2], strict=True)
             self._blocks = [[one + other for one, other in zip(*pair, strict=True)] for pair in pairs]
             self._block *= 2
 
-    def wavefront(self) -> Wavefront | None:
+    def wavefront(self) -> WavefrontFigures | None:
         """Figures over the second half of the whole blocks, or of what there is; None before the first frame."""
         if self._blocks:
             half = self._blocks[len(self._blocks) // 2 :]
@@ -70,11 +83,17 @@ class Figures:
             return None
         return self._rms(mean)
 
-    def recent(self) -> Wavefront | None:
+    def recent(self) -> WavefrontFigures | None:
         """Figures over the most recent frames; None before the first frame."""
         found = self._recent[: self._frames]
         return self._rms(found.mean(axis=0)) if len(found) else None
 
-    def _rms(self, mean: npt.NDArray[np.float64]) -> Wavefront:
-        mean[2:] /= 2 * self._nm_per_mas**2
-        return Wavefront(*(float(value) for value in np.sqrt(mean)))
+    def _squares(self, wavefront: Wavefront) -> tuple[float, ...]:
+        tilt, left = wavefront.disturbance_nm[self._tilts], wavefront.residual_nm[self._tilts]
+        pupil_nm2 = wavefront.disturbance_rms_nm**2, wavefront.residual_rms_nm**2
+        return (*pupil_nm2, float(tilt @ tilt), float(left @ left))
+
+    def _rms(self, mean: npt.NDArray[np.float64]) -> WavefrontFigures:
+        rms = np.sqrt(mean.reshape(-1, 4) / np.array([1, 1, *[2 * self._nm_per_mas**2] * 2])).ravel().tolist()
+        names = [one.name for one in fields(WavefrontFigures) if one.name != "instants"]
+        return WavefrontFigures(instants=self._instants, **dict(zip(names, rms, strict=False)))

@@ -1,11 +1,12 @@
-"""What the control theory says that a simulated run must leave: |S|^2 P_d + |T|^2 P_n."""
+"""What the control theory says that a simulated run must leave at every moment, of its disturbance and its noise."""
 
 import numpy as np
 
 from lowfc.adapters.files import factory
 from lowfc.contract.configuration import Configuration
+from lowfc.control.laws.continuous import Timing, left_power
 from lowfc.control.laws.linear_law import integrator
-from lowfc.control.laws.margins import noise_gain, rejection
+from lowfc.control.laws.margins import noise_gain
 from lowfc.optics.detector.photometry import tilt_nm_per_mas
 from sim_camera.process import disturbance_of, ignore
 
@@ -17,7 +18,9 @@ def tilt_residual_mas(config: Configuration, delay_frames: float) -> float:
     """
     control, shaken = config.control, disturbance_of(config)
     law = integrator([control.tilt_gain], [control.tilt_leak], (2,), delay_frames, config.camera.rate_hz)
-    waves = np.sum(np.abs(shaken.amplitude_nm[:, :2]) ** 2 / 2 * rejection(law, shaken.frequency_hz) ** 2, axis=0)
+    timing = Timing.of(delay_frames, config.camera.exposure_fraction)
+    left = left_power(law, 2 * np.pi * shaken.frequency_hz / config.camera.rate_hz, timing)
+    waves = np.sum(np.abs(shaken.amplitude_nm[:, :2]) ** 2 / 2 * left, axis=0)
     optics = factory.twin(config, None, ignore)
     calibration = factory.analytic_calibration(config, optics, factory.mirror_on_twin(config, optics, ignore))
     noise = factory.frame_noise_nm(config, calibration)[:2] ** 2

@@ -4,6 +4,7 @@ import threading
 from collections import deque
 from dataclasses import asdict
 from itertools import count
+from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -21,12 +22,13 @@ from lowfc.control.laws.stability import delay_weights
 from lowfc.control.loop.durations import Durations
 from lowfc.optics.detector.detector import saturation_dn
 from lowfc.optics.detector.photometry import tilt_nm_per_mas
-from sim_camera.bench import Bench, Truth
 from sim_camera.disturbance import Disturbance, disturbance
 from sim_camera.faults import Fault
 from sim_camera.faulty import FaultyFrames
 from sim_camera.figures import Figures
 from sim_camera.lateness import Lateness
+from sim_camera.path import MirrorPath
+from sim_camera.scene import Scene
 
 Single = npt.NDArray[np.float32]
 
@@ -51,28 +53,41 @@ def disturbance_of(config: Configuration) -> Disturbance:
             config.star.wavelength_nm,
             section.scale,
             {int(index): amplitude for index, amplitude in section.static_nm.items()},
+            section.line_width,
         )
     except ValueError as error:
         raise ConfigurationError(f"disturbance: {error}") from None
 
 
-def bench(config: Configuration) -> Bench:
-    """The bench of a configuration; its twin comes from the cache."""
+def scene(config: Configuration, shaken: Disturbance | None = None) -> Scene:
+    """The optics of a configuration, its twin from the cache; `shaken` in place of the configured disturbance."""
     optics = factory.twin(config, None, ignore)
-    return Bench(
+    return Scene(
         optics,
         factory.true_mirror_on_twin(config, optics, ignore),
         factory.detector(config),
         factory.electrons_per_exposure(config),
-        disturbance_of(config),
+        disturbance_of(config) if shaken is None else shaken,
         config.camera.rate_hz,
         config.seed,
         config.camera.noise,
+        config.camera.exposure_fraction,
+        config.camera.instants,
     )
 
 
 def ignore(warning: str) -> None:
     """The launcher has told the user."""
+
+
+class _Exposed(NamedTuple):
+    """The frame exposed last: its number, -1 before the first, its sequence, and the mirror at the exposure's start."""
+
+    frame: int
+    start_ns: int
+    end_ns: int
+    sequence: int
+    actuators_nm: Single
 
 
 class CameraProcess:
@@ -82,14 +97,14 @@ class CameraProcess:
         self,
         config: Configuration,
         service: Service,
-        optics: Bench,
+        optics: Scene,
         frames: int | None,
         fault: Fault | None = None,
     ) -> None:
         """Declare everything on the bus; `fault` befalls the frames."""
         self._config = config
         self._service = service
-        self._bench = optics
+        self._scene = optics
         self._limit = frames
         self._frames = service.publisher(FRAME)
         highest = saturation_dn(factory.detector(config))
@@ -104,6 +119,11 @@ class CameraProcess:
         service.bus.subscribe(MIRROR_STATE, self._hear, config.mirror.name)
         service.on_stop(self._arrived.set)
         self._latched = flat
+        lockstep, settling_us = service.clock.lockstep, config.mirror.settling_us
+        # In lockstep a shape is in force from the start of an exposure on, and its settling is in the mirror's state.
+        settling = 0.0 if lockstep else settling_us * 1e3 / config.period_ns
+        self._path = MirrorPath(flat, config.camera.delay_frames - 1, settling)
+        self._exposed = _Exposed(-1, 0, 0, 0, flat)
         self._newest_state = 0
         self._put_ns = [(0, 0)] * _REMEMBERED
         self._last_frame = 0
@@ -111,7 +131,7 @@ class CameraProcess:
         self._lateness = Lateness()
         self._frame_to_mirror = Durations()
         recent = max(1, round(RECENT_S * config.camera.rate_hz))
-        self._figures = Figures(config.noll, tilt_nm_per_mas(config.star.diameter_m), recent)
+        self._figures = Figures(config.noll, tilt_nm_per_mas(config.star.diameter_m), recent, len(optics.instants))
         self._publish_settings(service.clock.now_ns())
         service.state = "ready"
 
@@ -140,13 +160,13 @@ class CameraProcess:
             end_ns = start_ns + exposure_ns
             if index % settings_every == 0:
                 self._publish_settings(end_ns)
-            truth = self._expose(index, end_ns)
-            self._figures.add(truth)
+            self._expose(index, start_ns, end_ns)
             self._service.work += 1
             if clock.lockstep:
                 self._wait_for_mirror()
             self._service.beat()
         self._drain()
+        self._publish_truth()
         self._service.finish()
 
     def fill(self, health: wire.Health) -> None:
@@ -162,15 +182,15 @@ class CameraProcess:
         if (recent := self._figures.recent()) is not None:
             health.recent_wavefront.CopyFrom(wire.WavefrontFigures(**asdict(recent)))
 
-    def _expose(self, index: int, end_ns: int) -> Truth:
-        """Latch the mirror, make the frame during the exposure, publish it at its end and the truth after it."""
+    def _expose(self, index: int, start_ns: int, end_ns: int) -> None:
+        """Latch the mirror, make the frame during the exposure, publish it at its end; then the truth of the last."""
         clock = self._service.clock
         self._drain()
         self._shapes.appendleft(self._latched)
         seen = self._latched
         if len(self._weights) > 1:
             seen = np.tensordot(self._weights, np.array(self._shapes), 1)
-        frame, truth = self._bench.expose(index, seen)
+        frame = self._scene.expose(index, seen)
         if self._faulty is None:
             payload = image(frame, end_ns, "lowfc_camera").SerializeToString()
         else:
@@ -184,16 +204,32 @@ class CameraProcess:
         self._put_ns[envelope.sequence % _REMEMBERED] = (envelope.sequence, envelope.publish_time_ns)
         self._last_frame = envelope.sequence
         self._first_put_ns = self._first_put_ns or envelope.publish_time_ns
+        self._publish_truth()
+        self._exposed = _Exposed(index, start_ns, end_ns, envelope.sequence, seen)
+
+    def _publish_truth(self) -> None:
+        """The truth of the frame exposed last: its period is over now, and where the mirror was in it is known."""
+        index, _, end_ns, sequence, seen = self._exposed
+        if index < 0:
+            return
+        truth = self._scene.truth(index, seen, self._path.over(index, self._scene.instants))
+        self._figures.add(truth)
+        sampled, continuous = truth.sampled, truth.continuous
         message = wire.Truth(
             timestamp=timestamp(end_ns),
-            frame_sequence=envelope.sequence,
-            disturbance_nm=truth.disturbance_nm.tolist(),
-            residual_nm=truth.residual_nm.tolist(),
-            disturbance_rms_nm=truth.disturbance_rms_nm,
-            residual_rms_nm=truth.residual_rms_nm,
+            frame_sequence=sequence,
+            disturbance_nm=sampled.disturbance_nm.tolist(),
+            residual_nm=sampled.residual_nm.tolist(),
+            disturbance_rms_nm=sampled.disturbance_rms_nm,
+            residual_rms_nm=sampled.residual_rms_nm,
         )
+        if continuous is not None:
+            message.instants = len(self._scene.instants)
+            message.continuous_disturbance_nm.extend(continuous.disturbance_nm.tolist())
+            message.continuous_residual_nm.extend(continuous.residual_nm.tolist())
+            message.continuous_disturbance_rms_nm = continuous.disturbance_rms_nm
+            message.continuous_residual_rms_nm = continuous.residual_rms_nm
         self._truths.put(message.SerializeToString())
-        return truth
 
     def _hear(self, sample: Sample) -> None:
         self._states.append(sample)
@@ -214,12 +250,20 @@ class CameraProcess:
                 self._service.unreadable(sample.key, why)
                 continue
             self._latched = shape
+            self._path.applied(self._moment(sample.publish_time_ns), shape)
             if state.frame_sequence > self._newest_state:
                 self._newest_state = state.frame_sequence
                 sequence, put_ns = self._put_ns[state.frame_sequence % _REMEMBERED]
                 if sequence == state.frame_sequence:  # else no controller made it of a frame: somebody tries the mirror
                     self._count_late(state.frame_sequence < self._last_frame)
                     self._frame_to_mirror.add(sample.publish_time_ns - put_ns)
+
+    def _moment(self, publish_time_ns: int) -> float:
+        """When the mirror reached a shape, in periods: in lockstep, as the next exposure starts."""
+        index, start_ns = self._exposed.frame, self._exposed.start_ns
+        if self._service.clock.lockstep or index < 0:
+            return index + 1
+        return index + (publish_time_ns - start_ns) / self._config.period_ns
 
     def _count_late(self, late: bool) -> None:
         """Report when commands become late habitually, and when they no longer are."""
@@ -248,5 +292,5 @@ class CameraProcess:
         )
 
     def _publish_settings(self, time_ns: int) -> None:
-        state = factory.camera_state(self._config, self._bench.shape, time_ns)
+        state = factory.camera_state(self._config, self._scene.shape, time_ns)
         self._settings.put(state.SerializeToString())

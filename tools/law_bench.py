@@ -19,10 +19,10 @@ from lowfc.control.loop.advance import advance
 from lowfc.control.loop.inputs import Frame, Load, Request, Step
 from lowfc.control.loop.state import State
 from lowfc.optics.detector.photometry import tilt_nm_per_mas
-from sim_camera.bench import Bench as Scene
-from sim_camera.bench import Truth
-from sim_camera.disturbance import LINES_HZ, Disturbance
-from sim_camera.process import disturbance_of, ignore
+from sim_camera.disturbance import FIRST_LINE, Disturbance
+from sim_camera.path import MirrorPath
+from sim_camera.process import ignore, scene
+from sim_camera.scene import Truth
 from sim_dm.device import Command, apply_command, initial
 from sim_dm.process import device
 
@@ -46,8 +46,9 @@ def calibrated(config: Configuration) -> Calibration:
 
 def with_lines_moved(shaken: Disturbance, factor: float) -> Disturbance:
     """The same disturbance with its lines at other frequencies."""
-    lines = np.isin(shaken.frequency_hz, LINES_HZ)
-    return replace(shaken, frequency_hz=np.where(lines, factor * shaken.frequency_hz, shaken.frequency_hz))
+    frequency_hz = shaken.frequency_hz.copy()
+    frequency_hz[FIRST_LINE:] *= factor
+    return replace(shaken, frequency_hz=frequency_hz)
 
 
 class Bench:
@@ -64,23 +65,14 @@ class Bench:
         self.config = config
         self.nm_per_mas = tilt_nm_per_mas(config.star.diameter_m)
         self.refused = 0
-        optics = factory.twin(config, None, ignore)
-        self._scene = Scene(
-            optics,
-            factory.true_mirror_on_twin(config, optics, ignore),
-            factory.detector(config),
-            factory.electrons_per_exposure(config),
-            disturbance_of(config) if shaken is None else shaken,
-            config.camera.rate_hz,
-            config.seed,
-            config.camera.noise,
-        )
+        self._scene = scene(config, shaken)
         self._settings = factory.settings(config)
         self._state = advance(self._settings, State(), Load(0, calibration, "bench"))[0]
         self._mirror = device(config)
         self._status = initial(self._mirror)
         self._weights = delay_weights(config.camera.delay_frames).astype(np.float32)
         self._shapes = [self._status.surface_nm] * len(self._weights)
+        self._path = MirrorPath(self._status.surface_nm, config.camera.delay_frames - 1)
         self._index = 0
         self.forget()
 
@@ -103,7 +95,10 @@ class Bench:
     def run(self, frames: int) -> None:
         """Expose, control, move the mirror."""
         for _ in range(frames):
-            pixels, truth = self._scene.expose(self._index, np.tensordot(self._weights, np.array(self._shapes), 1))
+            whole = len(self._weights) == 1
+            seen_nm = self._shapes[0] if whole else np.tensordot(self._weights, np.array(self._shapes), 1)
+            pixels = self._scene.expose(self._index, seen_nm)
+            truth = self._scene.truth(self._index, seen_nm, self._path.over(self._index, self._scene.instants))
             time_ns = 10**18 + self._index * self.config.period_ns
             frame = Frame((1 << 32) + self._index, time_ns, 0, pixels)
             self._index += 1
@@ -120,25 +115,29 @@ class Bench:
                 if refused is not None:
                     raise ValueError(f"the mirror refused a command: {refused.name}")
             self._shapes = [self._status.surface_nm, *self._shapes[:-1]]
+            self._path.applied(self._index, self._status.surface_nm)
 
     def pol(self) -> Pieces:
         """Pseudo-open-loop modes (frames, modes) of the record."""
         return Pieces((np.array([step.pol_nm for step in self.steps], np.float64),), 0)
 
-    def residual_nm(self) -> Array:
-        """True residual (frames, modes) of the record."""
-        return np.array([truth.residual_nm for truth in self.truths], np.float64)
+    def residual_nm(self, *, continuous: bool = True) -> Array:
+        """True residual (frames, modes) of the record: rms over each period, or at the start of each exposure."""
+        name = "continuous" if continuous else "sampled"
+        return np.array([getattr(truth, name).residual_nm for truth in self.truths], np.float64)
 
-    def tilt_mas(self, last: int) -> float:
-        """True tilt, rms per axis over the last frames."""
-        return float(np.sqrt(np.mean(self.residual_nm()[-last:, :2] ** 2)) / self.nm_per_mas)
+    def tilt_mas(self, last: int, *, continuous: bool = True) -> float:
+        """True tilt, rms per axis over the last frames: at every moment, or at the starts of the exposures."""
+        residual_nm = self.residual_nm(continuous=continuous)[-last:, :2]
+        return float(np.sqrt(np.mean(residual_nm**2)) / self.nm_per_mas)
 
 
 def tuned(run: Pieces, config: Configuration, kinds: Sequence[str] = ("lqg",)) -> dict[str, Tuned]:
     """Laws of these kinds for pseudo-open-loop modes (frames, modes), of all modes or the first few."""
     noll = config.noll[: run.values[0].shape[1]]
     rate_hz, none = config.camera.rate_hz, np.zeros(len(noll))
-    timing = Timing.of(config.camera.delay_frames, 0.0)  # its images are of an instant
+    exposure = config.camera.exposure_fraction if config.camera.instants > 1 else 0.0
+    timing = Timing.of(config.camera.delay_frames, exposure)
     gains, models = best_gains(run, rate_hz, timing, none), identified(run, rate_hz)
     makers: dict[str, Callable[[], Tuned]] = {
         "integrator": lambda: tune_integrator(models, gains, noll, none, timing),

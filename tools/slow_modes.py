@@ -47,8 +47,8 @@ def case(config: Configuration) -> Figures:
     for window in track(range(WINDOWS), f"exposed for {config.camera.exposure_fraction:g} of a frame"):
         bench.forget()
         bench.run(frames)
-        left_nm[window] = bench.residual_nm().mean(axis=0)
-        drift_nm[window] = np.mean([truth.disturbance_nm for truth in bench.truths], axis=0, dtype=np.float64)
+        left_nm[window] = bench.residual_nm(continuous=False).mean(axis=0)
+        drift_nm[window] = np.mean([truth.sampled.disturbance_nm for truth in bench.truths], axis=0, dtype=np.float64)
         command_nm = np.mean([step.command_nm for step in bench.steps], axis=0, dtype=np.float64)
         other_nm[window] = left_nm[window] - drift_nm[window] - command_nm
     light_e = calibration.flux_dn * config.camera.gain_e_per_dn

@@ -6,7 +6,7 @@ from pydantic import Field, model_validator
 
 from lowfc.contract.network import Section as Section
 
-Preset = Literal["quiet", "bench", "thermal", "reaction-wheel", "step", "kolmogorov"]
+Preset = Literal["quiet", "bench", "thermal", "reaction-wheel", "reaction-wheel-ideal", "step", "kolmogorov"]
 PRESETS: tuple[str, ...] = get_args(Preset)
 
 Positive = Annotated[float, Field(gt=0)]
@@ -108,6 +108,9 @@ class Camera(Section):
     """Spurious electrons per pixel and frame before multiplication."""
     delay_frames: float = Field(1.0, ge=1, le=3)
     """Frames from the one a command is made from to the first exposed wholly under it; 1 is the least."""
+    instants: int = Field(8, ge=1, le=64)
+    """Of the simulated camera: instants of each period over which the true wavefront is the mean. With 1 it is that of
+    the instant at which the exposure starts, and so is the image, which is not blurred."""
     noise: bool = True
     """Photon and read noise; off only for tests of the control law."""
     photon_noise: Literal["fast", "exact"] = "fast"
@@ -115,12 +118,14 @@ class Camera(Section):
 
 
 class Disturbance(Section):
-    """What shakes the wavefront: a function of the seed and the frame index."""
+    """The simulated disturbance: a function of the seed and of time."""
 
     preset: Preset = "bench"
-    """quiet, bench, thermal, reaction-wheel, step or kolmogorov."""
+    """quiet, bench, thermal, reaction-wheel, reaction-wheel-ideal (lines without a width), step or kolmogorov."""
     scale: NotNegative = 1.0
     """Multiplies the preset's amplitude."""
+    line_width: float = Field(0.005, ge=0, le=0.05)
+    """Of the reaction wheel's lines, between half-power points, as a fraction of their frequency."""
     static_nm: dict[str, float] = Field(default_factory=dict)
     """Constant wavefront added to it: Noll index = nm rms."""
 

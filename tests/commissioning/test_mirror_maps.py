@@ -22,7 +22,7 @@ from lowfc.control.loop.inputs import Frame, Load, MirrorShape, Request
 from lowfc.control.loop.safety import LoopMode
 from lowfc.control.loop.state import State
 from lowfc.programs.core.start_up import StartUp, check_files
-from sim_camera.process import bench
+from sim_camera.process import scene
 from tests.support.folded_loop import fold
 from tests.support.loops import run
 from tools.law_bench import calibrated
@@ -156,8 +156,8 @@ def test_a_registration_error_is_the_mirrors_and_not_the_calibrations(calibratio
     believed = calibrated(config)
     np.testing.assert_array_equal(believed.modes_to_actuators, calibration.modes_to_actuators)
     poked = (20.0 * calibration.modes_to_actuators[:, 2]).reshape(GRID)  # defocus
-    straight = bench(load(None, QUIET)).expose(0, poked)[1].residual_nm
-    moved = bench(config).expose(0, poked)[1].residual_nm
+    straight = scene(load(None, QUIET)).truth(0, poked).sampled.residual_nm
+    moved = scene(config).truth(0, poked).sampled.residual_nm
     assert straight[2] == pytest.approx(20, rel=0.01)
     assert abs(straight[0]) < 0.1
     assert 19 < moved[2] < 19.9, "a larger mirror has a gentler defocus"

@@ -48,8 +48,8 @@ from lowfc.control.loop.safety import LoopMode
 from lowfc.programs.core import cache_warmup
 from lowfc.programs.core.controller import Controller
 from lowfc.testing.memory_bus import MemoryBus, MemoryHub
-from sim_camera.bench import Bench, Truth
-from sim_camera.process import bench
+from sim_camera.process import scene as configured_scene
+from sim_camera.scene import Scene, Wavefront
 from sim_dm.process import MirrorProcess
 from tests.support.loops import until
 from tools.law_bench import calibrated
@@ -69,7 +69,7 @@ CONFIG = configured()
 class Rig:
     """A run in one process: two roles on threads of their own, and everything that was said."""
 
-    def __init__(self, config: Configuration, calibration: Calibration, scene: Bench) -> None:
+    def __init__(self, config: Configuration, calibration: Calibration, scene: Scene) -> None:
         self.config, self.calibration, self.scene, self.hub = config, calibration, scene, MemoryHub()
         self.said: dict[str, list[Any]] = {}
         self.offset_nm = np.zeros((34, 34), np.float32)
@@ -118,16 +118,16 @@ class Rig:
         self.until("the mirror's answer", lambda: key in self.said and self.said[key][-1].frame_sequence == sequence)
         return sequence
 
-    def expose(self, count: int) -> list[Truth]:
+    def expose(self, count: int) -> list[Wavefront]:
         """Frames of the scene through the mirror as it is, plus the offset."""
         truths = []
         for _ in range(count):
             states = self.said.get(MIRROR_STATE.key)
             shape = actuators(states[-1]) if states else None
             seen = self.offset_nm if shape is None else shape + self.offset_nm
-            pixels, truth = self.scene.expose(self._index, seen)
+            pixels = self.scene.expose(self._index, seen)
             self.put(pixels)
-            truths.append(truth)
+            truths.append(self.scene.truth(self._index - 1, seen).sampled)
         return truths
 
     def inject(self, modes_nm: npt.ArrayLike) -> None:
@@ -162,12 +162,12 @@ def calibration() -> Calibration:
 
 
 @pytest.fixture(scope="module")
-def scene() -> Bench:
-    return bench(CONFIG)
+def scene() -> Scene:
+    return configured_scene(CONFIG)
 
 
 @contextmanager
-def running(config: Configuration, calibration: Calibration, scene: Bench) -> Iterator[Rig]:
+def running(config: Configuration, calibration: Calibration, scene: Scene) -> Iterator[Rig]:
     rig = Rig(config, calibration, scene)
     try:
         if not config.lockstep:
@@ -178,7 +178,7 @@ def running(config: Configuration, calibration: Calibration, scene: Bench) -> It
 
 
 @pytest.fixture
-def rig(calibration: Calibration, scene: Bench) -> Iterator[Rig]:
+def rig(calibration: Calibration, scene: Scene) -> Iterator[Rig]:
     with running(CONFIG, calibration, scene) as one:
         yield one
 
@@ -257,11 +257,11 @@ def test_a_camera_that_changes_opens_the_loop(rig: Rig) -> None:
 
 
 def test_a_camera_with_a_wrong_clock_is_late_and_does_not_stop_the_controller(
-    calibration: Calibration, scene: Bench
+    calibration: Calibration, scene: Scene
 ) -> None:
     """Durations of years do not fit the columns of the timing; and without frames the command is repeated."""
     with running(configured(lockstep=False), calibration, scene) as rig:
-        pixels = scene.expose(0, rig.offset_nm)[0]
+        pixels = scene.expose(0, rig.offset_nm)
         rig.put(pixels, publish_time_ns=1)
         rig.put(pixels, publish_time_ns=2**62)
         rig.put(pixels)
@@ -373,7 +373,7 @@ def test_another_mirror_than_the_calibrations_is_refused(calibration: Calibratio
 
 
 def test_a_warm_up_changes_nothing_and_says_nothing(
-    calibration: Calibration, scene: Bench, monkeypatch: pytest.MonkeyPatch
+    calibration: Calibration, scene: Scene, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     warmed_up: list[bool] = []
     original = Controller._warm_up
@@ -391,7 +391,7 @@ def test_a_warm_up_changes_nothing_and_says_nothing(
 
         monkeypatch.setattr(Controller, "_warm_up", watched)
         for index in range(5):
-            pixels = scene.expose(index, rig.offset_nm)[0]
+            pixels = scene.expose(index, rig.offset_nm)
             rig.put(pixels)
             time.sleep(0.1)  # two periods
         assert [list(step.reasons) for step in rig.steps(5)] == [[]] * 5
@@ -418,12 +418,12 @@ def test_a_frame_that_cannot_be_dealt_with_ends_the_controller(
     late.join()
 
 
-def test_frames_that_waited_are_not_all_integrated(calibration: Calibration, scene: Bench) -> None:
+def test_frames_that_waited_are_not_all_integrated(calibration: Calibration, scene: Scene) -> None:
     """They saw one and the same mirror: together they may move the command by one gain, not by ten."""
     config = configured(lockstep=False, control__start_mode="closed")
     with running(config, calibration, scene) as rig:
         rig.inject(2.0 * np.eye(14)[3])
-        pixels = scene.expose(0, rig.offset_nm)[0]
+        pixels = scene.expose(0, rig.offset_nm)
         payload = image(pixels, 1, "camera").SerializeToString()
         handover = next(one for one in rig.services[0].arrivals if one.key == FRAME.key)
         until(lambda: rig.controller._adopted)
@@ -445,11 +445,11 @@ NOT_FINITE = np.full((34, 34), np.nan, np.float32).tobytes()
 
 @pytest.mark.parametrize("actuators", [b"", NOT_FINITE])
 def test_what_the_mirror_refuses_does_not_feed_its_dead_man(
-    calibration: Calibration, scene: Bench, actuators: bytes
+    calibration: Calibration, scene: Scene, actuators: bytes
 ) -> None:
     """However much of it comes."""
     with running(configured(lockstep=False, control__command_timeout_ms=50.0), calibration, scene) as rig:
-        rig.put(scene.expose(0, rig.offset_nm)[0])
+        rig.put(scene.expose(0, rig.offset_nm))
         rig.services[0].stop("the controller has died")
         rig.threads[1].join(PATIENCE_S)
         other = rig.bus("other").publisher(COMMAND, "dm")

@@ -33,7 +33,7 @@ from lowfc.programs.core.controller import Controller
 from lowfc.programs.core.recording.recorder import Recorder
 from lowfc.testing.clock import FakeClock
 from lowfc.testing.memory_bus import MemoryBus, MemoryHub
-from sim_camera.process import bench
+from sim_camera.process import scene
 from sim_dm.process import MirrorProcess
 from tests.support.loops import until
 
@@ -65,7 +65,7 @@ class Night:
         self.hub, self.clock = MemoryHub(), FakeClock(START_NS)
         self.index = self.answered = 0
         self.shape_nm = np.zeros((config.mirror.rows, config.mirror.columns), np.float32)
-        self.scene = bench(config)
+        self.scene = scene(config)
         operator = self.bus("operator")
         operator.subscribe(STEP, self._take_step)
         operator.subscribe(MIRROR_STATE, self._take_mirror)
@@ -114,7 +114,8 @@ class Night:
     def expose(self, frames: int, change: Callable[[Any], Any] = lambda pixels: pixels, late_ns: int = 0) -> None:
         """Some frames, each waiting for its step; `change` does something to their pixels."""
         for _ in range(frames):
-            pixels, truth = self.scene.expose(self.index, self.shape_nm)
+            pixels = self.scene.expose(self.index, self.shape_nm)
+            truth = self.scene.truth(self.index, self.shape_nm).sampled
             self.index += 1
             self.clock.advance(self.config.period_ns)
             time_ns = self.clock.now_ns()

@@ -38,7 +38,8 @@ BELOW_ALL = "lowfc.arrays"
 PURE_LAYERS = ("lowfc.arrays", "lowfc.optics", "lowfc.control", "lowfc.design")
 PURE_MODULES = (
     "sim_dm.device",
-    "sim_camera.bench",
+    "sim_camera.path",
+    "sim_camera.scene",
     "sim_camera.disturbance",
     "sim_camera.faults",
     "sim_camera.figures",

@@ -17,7 +17,18 @@ from lowfc.contract.errors import ConfigurationError
 from lowfc.contract.messages import FRAME, image
 from lowfc.testing.clock import FakeClock
 from lowfc.testing.memory_bus import MemoryBus, MemoryHub
-from sim_camera.disturbance import LINES_HZ, Disturbance, disturbance, modes_nm, screen
+from sim_camera.disturbance import (
+    BLOCK,
+    FIRST_LINE,
+    LINES_HZ,
+    LINES_MAS,
+    Disturbance,
+    Sampler,
+    disturbance,
+    modes_at_nm,
+    modes_nm,
+    screen,
+)
 from sim_camera.faults import LOST_SHARE, MOST_FRAMES_LATE, TRACK_PIXELS, Fault, Kind
 from sim_camera.faulty import EARLIER_S, FaultyFrames, read_fault
 
@@ -63,8 +74,8 @@ def test_the_scale_multiplies_it(name: str) -> None:
     assert thrice.screen_nm == pytest.approx(3 * one.screen_nm)
 
 
-def test_the_reaction_wheel_is_14_mas_per_axis_with_its_five_lines() -> None:
-    shaken = preset("reaction-wheel")
+def test_the_ideal_reaction_wheel_is_14_mas_per_axis_with_its_five_lines() -> None:
+    shaken = preset("reaction-wheel-ideal")
     per_axis_mas = rms_nm(shaken)[:2] / NM_PER_MAS
     assert np.abs(per_axis_mas / 14 - 1).max() < 0.05
     assert LINES_HZ == (6.0, 18.0, 37.0, 71.0, 117.0)
@@ -77,8 +88,51 @@ def test_the_reaction_wheel_is_14_mas_per_axis_with_its_five_lines() -> None:
         assert (np.diff(power[lines]) < 0).all()
 
 
+def test_a_damped_line_has_the_power_of_the_ideal_one_and_half_of_it_within_its_width() -> None:
+    ideal, shaken = preset("reaction-wheel-ideal"), preset("reaction-wheel", line_width=0.02)
+    assert rms_nm(shaken) == pytest.approx(rms_nm(ideal))
+    lines = np.abs(shaken.amplitude_nm[FIRST_LINE:, 0]) ** 2
+    hz = shaken.frequency_hz[FIRST_LINE:]
+    for line in LINES_HZ:
+        near = np.abs(hz - line) < 0.01 * line
+        assert lines[near].sum() == pytest.approx(0.5 * lines.sum() * share(line), rel=0.05)
+
+
+def share(line_hz: float) -> float:
+    """Of the power of all lines."""
+    return LINES_MAS[LINES_HZ.index(line_hz)] ** 2 / sum(one**2 for one in LINES_MAS)
+
+
+def test_a_damped_line_forgets_its_phase() -> None:
+    """Its autocorrelation falls as exp(-pi width t), averaged over seeds; the ideal one's does not."""
+    width, line = 0.01, LINES_HZ.index(37.0)
+    after_s = 1 / (np.pi * width * LINES_HZ[line])
+    kept = {"reaction-wheel": [], "reaction-wheel-ideal": []}
+    for name, found in kept.items():
+        for seed in range(40):
+            shaken = preset(name, seed, line_width=width)
+            many = (len(shaken.frequency_hz) - FIRST_LINE) // len(LINES_HZ)
+            own = slice(FIRST_LINE + line * many, FIRST_LINE + (line + 1) * many)
+            amplitude, hz = shaken.amplitude_nm[own, :2], shaken.frequency_hz[own]
+            times_s = np.linspace(0, 400, 300)
+            waves = np.exp(2j * np.pi * np.outer(np.concatenate([times_s, times_s + after_s]), hz)) @ amplitude
+            found.append(np.mean(waves[300:] * waves[:300].conj()) / np.mean(np.abs(waves) ** 2))
+    means = {name: abs(np.mean(found)) for name, found in kept.items()}
+    assert means["reaction-wheel"] == pytest.approx(np.exp(-1), abs=0.05)
+    assert means["reaction-wheel-ideal"] == pytest.approx(1)
+
+
+@pytest.mark.parametrize("name", PRESETS)
+def test_instants_of_a_period_are_those_of_continuous_time(name: str) -> None:
+    shaken, instants = preset(name, static_nm={4: 3.0}), np.array([0.0, 0.3, 0.95])
+    sampler = Sampler(shaken, instants, RATE_HZ)
+    for index in (0, BLOCK - 1, 5, 12_345 * BLOCK + 1):
+        expected = modes_at_nm(shaken, (index + instants) / RATE_HZ)
+        np.testing.assert_allclose(sampler.at(index), expected, atol=2e-4)
+
+
 def test_the_lines_phases_of_the_two_axes_differ() -> None:
-    shaken = preset("reaction-wheel")
+    shaken = preset("reaction-wheel-ideal")
     tilts = shaken.amplitude_nm[np.isin(shaken.frequency_hz, LINES_HZ), :2]
     assert np.abs(np.angle(tilts[:, 0] / tilts[:, 1])).max() > 0.5
 

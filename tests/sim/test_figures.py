@@ -11,10 +11,10 @@ from lowfc.contract.configuration import Configuration
 from lowfc.contract.messages import EVENT, MIRROR_STATE, Log, wire
 from lowfc.testing.clock import FakeClock
 from lowfc.testing.memory_bus import MemoryBus, MemoryHub
-from sim_camera.bench import Bench, Truth
-from sim_camera.figures import BLOCK, MOST_BLOCKS, Figures, Wavefront
+from sim_camera.figures import BLOCK, MOST_BLOCKS, Figures, WavefrontFigures
 from sim_camera.lateness import WINDOW, Lateness
 from sim_camera.process import CameraProcess
+from sim_camera.scene import Scene, Truth, Wavefront
 
 NOLL = (2, 3, 4)
 
@@ -24,7 +24,7 @@ def figures(*residuals_nm: float, nm_per_mas: float = 1.0, recent: int = 1) -> F
     found = Figures(NOLL, nm_per_mas, recent)
     for residual_nm in residuals_nm:
         modes = np.full(len(NOLL), residual_nm, np.float32)
-        found.add(Truth(2 * modes, modes, 2 * residual_nm, residual_nm))
+        found.add(Truth(Wavefront(2 * modes, modes, 2 * residual_nm, residual_nm), None))
     return found
 
 
@@ -43,7 +43,7 @@ def test_before_the_first_block_they_are_those_of_what_there_is() -> None:
     found = figures(*[3.0, 5.0] * (BLOCK // 4), nm_per_mas=2.0).wavefront()
     assert found is not None
     rms_nm = np.sqrt(17)
-    assert found == Wavefront(*(pytest.approx(value * rms_nm) for value in (2, 1, 1, 0.5))), "tilts per axis"
+    assert found == WavefrontFigures(*(pytest.approx(value * rms_nm) for value in (2, 1, 1, 0.5))), "tilts per axis"
 
 
 def test_the_recent_ones_forget_what_was_before() -> None:
@@ -80,7 +80,7 @@ def test_the_camera_reports_the_habit_each_time() -> None:
         EVENT, lambda sample: events.append(Log.FromString(sample.payload).message)
     )
     service = Service("camera", "night", clock, MemoryBus(hub, "camera", clock))
-    camera = CameraProcess(config, service, cast("Bench", SimpleNamespace(shape=(80, 80))), None)
+    camera = CameraProcess(config, service, cast("Scene", SimpleNamespace(shape=(80, 80), instants=())), None)
     states = MemoryBus(hub, "mirror-dm", clock).publisher(MIRROR_STATE, config.mirror.name)
     shape = np.zeros((config.mirror.rows, config.mirror.columns), np.float32)
 

@@ -29,7 +29,7 @@ from lowfc.control.loop.camera import CameraSettings
 from lowfc.control.loop.inputs import Frame, Input, Load, MirrorShape, Request, Step
 from lowfc.control.loop.state import State
 from lowfc.testing.memory_bus import MemoryBus, MemoryHub, MemoryRing
-from sim_camera.process import bench
+from sim_camera.process import scene
 from sim_dm.device import Command, apply_command, initial
 from sim_dm.process import device
 from tools.law_bench import Bench, calibrated
@@ -98,7 +98,7 @@ class FoldedLoop(Client):
             grid = (config.mirror.rows, config.mirror.columns)
             first = MirrorShape(0, np.zeros(grid, np.float32), np.zeros(0, np.float32))
         self._state, _ = advance(self._settings, State(), first)
-        self._scene, self._mirror = bench(world), device(world)
+        self._scene, self._mirror = scene(world), device(world)
         self.hub = MemoryHub()
         self._operator = OperatorBus(self)
         self.start_mirror()
@@ -121,10 +121,10 @@ class FoldedLoop(Client):
     def expose(self) -> None:
         self._shapes = [self._status.surface_nm, *self._shapes[:-1]]
         seen = np.tensordot(self._weights, np.array(self._shapes), 1)
-        whole, truth = self._scene.expose(self._index, seen)
+        whole = self._scene.expose(self._index, seen)
         pixels = whole[self._cut : whole.shape[0] - self._cut, self._cut : whole.shape[1] - self._cut]
         self.surfaces_nm.append(seen)
-        self.residual_nm.append(truth.residual_nm)
+        self.residual_nm.append(self._scene.truth(self._index, seen).sampled.residual_nm)
         sequence, time_ns = self.first + self._index, 10**18 + self._index * self.config.period_ns
         self._index += 1
         if self._lose(self._index - 1):
@@ -253,7 +253,7 @@ def fold(config: Configuration, frames: int) -> Fold:
     return Fold(
         **{name: of_all(bench.steps, name) for name in ("error_nm", "pol_nm", "command_nm")},
         **{
-            name: of_all(bench.truths, name)
+            name: of_all([truth.sampled for truth in bench.truths], name)
             for name in ("disturbance_nm", "residual_nm", "disturbance_rms_nm", "residual_rms_nm")
         },
     )

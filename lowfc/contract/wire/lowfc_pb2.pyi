@@ -498,20 +498,30 @@ class MirrorState(_message.Message):
     def __init__(self, timestamp: _Optional[_Union[datetime.datetime, _timestamp_pb2.Timestamp, _Mapping]] = ..., frame_sequence: _Optional[int] = ..., status: _Optional[_Union[MirrorStatus, str]] = ..., rows: _Optional[int] = ..., columns: _Optional[int] = ..., actuators: _Optional[bytes] = ..., command_nm: _Optional[_Iterable[float]] = ..., limits_hit: _Optional[_Iterable[_Union[Reason, str]]] = ..., channels: _Optional[_Iterable[str]] = ..., safe: _Optional[bool] = ..., refused: _Optional[_Union[Reason, str]] = ...) -> None: ...
 
 class Truth(_message.Message):
-    __slots__ = ("timestamp", "frame_sequence", "disturbance_nm", "residual_nm", "disturbance_rms_nm", "residual_rms_nm")
+    __slots__ = ("timestamp", "frame_sequence", "disturbance_nm", "residual_nm", "disturbance_rms_nm", "residual_rms_nm", "instants", "continuous_disturbance_nm", "continuous_residual_nm", "continuous_disturbance_rms_nm", "continuous_residual_rms_nm")
     TIMESTAMP_FIELD_NUMBER: _ClassVar[int]
     FRAME_SEQUENCE_FIELD_NUMBER: _ClassVar[int]
     DISTURBANCE_NM_FIELD_NUMBER: _ClassVar[int]
     RESIDUAL_NM_FIELD_NUMBER: _ClassVar[int]
     DISTURBANCE_RMS_NM_FIELD_NUMBER: _ClassVar[int]
     RESIDUAL_RMS_NM_FIELD_NUMBER: _ClassVar[int]
+    INSTANTS_FIELD_NUMBER: _ClassVar[int]
+    CONTINUOUS_DISTURBANCE_NM_FIELD_NUMBER: _ClassVar[int]
+    CONTINUOUS_RESIDUAL_NM_FIELD_NUMBER: _ClassVar[int]
+    CONTINUOUS_DISTURBANCE_RMS_NM_FIELD_NUMBER: _ClassVar[int]
+    CONTINUOUS_RESIDUAL_RMS_NM_FIELD_NUMBER: _ClassVar[int]
     timestamp: _timestamp_pb2.Timestamp
     frame_sequence: int
     disturbance_nm: _containers.RepeatedScalarFieldContainer[float]
     residual_nm: _containers.RepeatedScalarFieldContainer[float]
     disturbance_rms_nm: float
     residual_rms_nm: float
-    def __init__(self, timestamp: _Optional[_Union[datetime.datetime, _timestamp_pb2.Timestamp, _Mapping]] = ..., frame_sequence: _Optional[int] = ..., disturbance_nm: _Optional[_Iterable[float]] = ..., residual_nm: _Optional[_Iterable[float]] = ..., disturbance_rms_nm: _Optional[float] = ..., residual_rms_nm: _Optional[float] = ...) -> None: ...
+    instants: int
+    continuous_disturbance_nm: _containers.RepeatedScalarFieldContainer[float]
+    continuous_residual_nm: _containers.RepeatedScalarFieldContainer[float]
+    continuous_disturbance_rms_nm: float
+    continuous_residual_rms_nm: float
+    def __init__(self, timestamp: _Optional[_Union[datetime.datetime, _timestamp_pb2.Timestamp, _Mapping]] = ..., frame_sequence: _Optional[int] = ..., disturbance_nm: _Optional[_Iterable[float]] = ..., residual_nm: _Optional[_Iterable[float]] = ..., disturbance_rms_nm: _Optional[float] = ..., residual_rms_nm: _Optional[float] = ..., instants: _Optional[int] = ..., continuous_disturbance_nm: _Optional[_Iterable[float]] = ..., continuous_residual_nm: _Optional[_Iterable[float]] = ..., continuous_disturbance_rms_nm: _Optional[float] = ..., continuous_residual_rms_nm: _Optional[float] = ...) -> None: ...
 
 class Calibration(_message.Message):
     __slots__ = ("timestamp", "id", "operator_hash", "estimator", "noll", "mode_names", "wavelength_nm", "rows", "columns", "reference", "response", "reconstructor", "mask", "dark", "flux_dn", "saturation_dn", "mirror_rows", "mirror_columns", "modes_to_actuators", "actuators_to_modes", "camera")
@@ -604,16 +614,26 @@ class Latency(_message.Message):
     def __init__(self, count: _Optional[int] = ..., p50_ns: _Optional[int] = ..., p99_ns: _Optional[int] = ..., p99_9_ns: _Optional[int] = ..., max_ns: _Optional[int] = ...) -> None: ...
 
 class WavefrontFigures(_message.Message):
-    __slots__ = ("disturbance_rms_nm", "residual_rms_nm", "tilt_disturbance_mas", "tilt_residual_mas")
+    __slots__ = ("disturbance_rms_nm", "residual_rms_nm", "tilt_disturbance_mas", "tilt_residual_mas", "instants", "continuous_disturbance_rms_nm", "continuous_residual_rms_nm", "continuous_tilt_disturbance_mas", "continuous_tilt_residual_mas")
     DISTURBANCE_RMS_NM_FIELD_NUMBER: _ClassVar[int]
     RESIDUAL_RMS_NM_FIELD_NUMBER: _ClassVar[int]
     TILT_DISTURBANCE_MAS_FIELD_NUMBER: _ClassVar[int]
     TILT_RESIDUAL_MAS_FIELD_NUMBER: _ClassVar[int]
+    INSTANTS_FIELD_NUMBER: _ClassVar[int]
+    CONTINUOUS_DISTURBANCE_RMS_NM_FIELD_NUMBER: _ClassVar[int]
+    CONTINUOUS_RESIDUAL_RMS_NM_FIELD_NUMBER: _ClassVar[int]
+    CONTINUOUS_TILT_DISTURBANCE_MAS_FIELD_NUMBER: _ClassVar[int]
+    CONTINUOUS_TILT_RESIDUAL_MAS_FIELD_NUMBER: _ClassVar[int]
     disturbance_rms_nm: float
     residual_rms_nm: float
     tilt_disturbance_mas: float
     tilt_residual_mas: float
-    def __init__(self, disturbance_rms_nm: _Optional[float] = ..., residual_rms_nm: _Optional[float] = ..., tilt_disturbance_mas: _Optional[float] = ..., tilt_residual_mas: _Optional[float] = ...) -> None: ...
+    instants: int
+    continuous_disturbance_rms_nm: float
+    continuous_residual_rms_nm: float
+    continuous_tilt_disturbance_mas: float
+    continuous_tilt_residual_mas: float
+    def __init__(self, disturbance_rms_nm: _Optional[float] = ..., residual_rms_nm: _Optional[float] = ..., tilt_disturbance_mas: _Optional[float] = ..., tilt_residual_mas: _Optional[float] = ..., instants: _Optional[int] = ..., continuous_disturbance_rms_nm: _Optional[float] = ..., continuous_residual_rms_nm: _Optional[float] = ..., continuous_tilt_disturbance_mas: _Optional[float] = ..., continuous_tilt_residual_mas: _Optional[float] = ...) -> None: ...
 
 class Recording(_message.Message):
     __slots__ = ("file", "messages", "lost", "bytes", "failure", "files", "stopped", "folder")

@@ -1,0 +1,187 @@
+"""The simulated optics in front of the detector: mirror and disturbance in, frame and true wavefront out.
+
+Time is continuous: the star moves while the mirror holds. An image is the mean over its exposure; the truth is that of
+the instant at which the exposure starts, and the root mean square over the whole period.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from lowfc.optics.chain.zernike import zernikes
+from lowfc.optics.detector.detector import Detector, expose, laws_of, saturation_dn
+from lowfc.optics.twin.twin import Evaluator, Twin, node_radii, wavefront_rms_nm
+from lowfc.optics.twin.twin_mirror import TwinMirror, wavefront_nm
+from sim_camera.disturbance import Disturbance, Sampler, screen
+
+Single = npt.NDArray[np.float32]
+Array = npt.NDArray[np.float64]
+
+_GAUSS_LEGENDRE = (1 + np.array([-1, 1]) / np.sqrt(3)) / 2
+"""Instants of an exposure whose mean is that over it, to third order in time."""
+
+
+@dataclass(frozen=True, slots=True)
+class Wavefront:
+    """Modes (modes,) over the circle and rms over the open pupil, nm of wavefront."""
+
+    disturbance_nm: Single
+    residual_nm: Single
+    disturbance_rms_nm: float
+    residual_rms_nm: float
+
+
+@dataclass(frozen=True, slots=True)
+class Truth:
+    """What no sensor knows.
+
+    Attributes:
+        sampled: the wavefront at the instant at which the exposure starts.
+        continuous: root mean squares over the period, modes included; None where they are not computed.
+    """
+
+    sampled: Wavefront
+    continuous: Wavefront | None
+
+
+class Scene:
+    """Optics, star, detector and disturbance of one run; it draws noise from a generator of its own.
+
+    Attributes:
+        instants: (instants,) of each period over which the continuous truth is the mean, in periods after its start.
+    """
+
+    def __init__(
+        self,
+        optics: Twin,
+        mirror: TwinMirror,
+        detector: Detector,
+        electrons: float,
+        shaken: Disturbance,
+        rate_hz: float,
+        seed: int,
+        noise: bool = True,
+        exposure: float = 0.0,
+        instants: int = 1,
+    ) -> None:
+        """Prepare everything that does not change from frame to frame.
+
+        Args:
+            optics: the twin.
+            mirror: on its nodes.
+            detector: of the sensor.
+            electrons: of one exposure, through the open circle.
+            shaken: the disturbance.
+            rate_hz: frame rate.
+            seed: of noise and screen.
+            noise: photon and read noise.
+            exposure: its length, in periods.
+            instants: of each period at which the truth is computed; 1 for the start of the exposure alone, of which
+                the image is then one, too.
+        """
+        self._optics = optics
+        self._mirror = mirror
+        self._evaluator = Evaluator(optics)
+        self._detector = detector
+        self._electrons = np.float32(electrons)
+        self._rng = np.random.Generator(np.random.SFC64(np.random.SeedSequence([seed, 3])))
+        self._noise = noise
+        self._area = optics.area_weights.astype(np.float32)
+        self._basis = zernikes(shaken.noll, *node_radii(optics)).astype(np.float32)
+        self._screen = self._static_screen(shaken.screen_nm, seed)
+        self._screen_modes = np.asarray(self._project(self._screen), dtype=np.float32)
+        self._mirror_to_modes = self._mirror_projection()
+        self.instants = (np.arange(instants) + 0.5) / instants if instants > 1 else np.zeros(0)
+        self._images = 2 if instants > 1 else 1
+        self._wavefronts: list[tuple[Single, Single]] = []
+        seen = exposure * _GAUSS_LEGENDRE if instants > 1 else np.zeros(0)
+        self._sampler = Sampler(shaken, np.concatenate([[0.0], seen, self.instants]), rate_hz)
+        laws_of(detector)  # the first frame has no time for it
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """Rows and columns of a frame."""
+        pixels = len(self._optics.to_pixels)
+        return pixels, pixels
+
+    def expose(self, index: int, actuators_nm: Single) -> npt.NDArray[np.uint16]:
+        """Frame (rows, columns) with the mirror's actuators (rows, columns) during the exposure."""
+        modes = self._sampler.at(index)
+        static_nm = self._screen + self._mirror_nm(actuators_nm)
+        last = len(modes) - len(self.instants)
+        opds_nm = modes[last - self._images : last] @ self._basis
+        opds_nm += static_nm
+        share = self._electrons / np.float32(self._images)
+        electrons = self._evaluator.image(opds_nm[0]) * share
+        for opd_nm in opds_nm[1:]:
+            electrons += self._evaluator.image(opd_nm) * share
+        return expose(self._detector, electrons, self._rng) if self._noise else self._noiseless(electrons)
+
+    def truth(self, index: int, actuators_nm: Single, path: tuple[list[Single], Single] | None = None) -> Truth:
+        """The truth of a frame and of its period.
+
+        Args:
+            index: of the frame.
+            actuators_nm: (rows, columns) at the start of its exposure.
+            path: shapes (rows, columns) that the mirror has in the period, and how much of each it has at each of the
+                instants (instants, shapes); as at the start all the time when None.
+        """
+        modes = self._sampler.at(index)
+        shapes_nm, weights = [actuators_nm], np.ones((len(self.instants), 1), np.float32)
+        if path is not None and len(self.instants):
+            shapes_nm, weights = [actuators_nm, *path[0]], np.hstack([0 * weights, path[1]])
+        rows = np.concatenate([modes[:1], modes[len(modes) - len(self.instants) :]])
+        of_shapes = np.vstack([np.eye(1, len(shapes_nm), dtype=np.float32), weights])
+        opd_nm = rows @ self._basis
+        opd_nm += self._screen
+        moved_nm = of_shapes @ np.array([self._mirror_nm(shape) for shape in shapes_nm])
+        rows = rows + self._screen_modes
+        residual = rows + of_shapes @ (np.array(shapes_nm).reshape(len(shapes_nm), -1) @ self._mirror_to_modes.T)
+        flat, left = self._mean_squares_nm2(opd_nm), self._mean_squares_nm2(opd_nm + moved_nm)
+        sampled = Wavefront(rows[0], residual[0], float(np.sqrt(flat[0])), float(np.sqrt(left[0])))
+        if not len(self.instants):
+            return Truth(sampled, None)
+        over = (np.sqrt(np.square(of[1:]).mean(axis=0)) for of in (rows, residual))
+        return Truth(sampled, Wavefront(*over, *(float(np.sqrt(of[1:].mean())) for of in (flat, left))))
+
+    def _mirror_nm(self, actuators_nm: Single) -> Single:
+        """Wavefront (used,) of a shape, remembered for the last few."""
+        for shape_nm, opd_nm in self._wavefronts:
+            if shape_nm is actuators_nm:
+                return opd_nm
+        found = wavefront_nm(self._mirror, actuators_nm)
+        self._wavefronts = [(actuators_nm, found), *self._wavefronts[:2]]
+        return found
+
+    def _mean_squares_nm2(self, opd_nm: Single) -> Single:
+        """Mean square over the open pupil, piston removed, of wavefronts (many, used)."""
+        from_mean = opd_nm - (opd_nm @ self._area)[:, None]
+        return np.maximum(np.square(from_mean) @ self._area, 0)  # a few weights are negative
+
+    def _noiseless(self, electrons: Single) -> npt.NDArray[np.uint16]:
+        values = electrons / self._detector.gain_e_per_dn + self._detector.bias_dn
+        return np.asarray(np.rint(np.clip(values, 0, saturation_dn(self._detector))), dtype=np.uint16)
+
+    def _static_screen(self, rms_nm: float, seed: int) -> Single:
+        """The preset's screen at the nodes, of this rms over the open pupil, piston removed."""
+        axis = self._optics.axis
+        if not rms_nm:
+            return np.zeros(self._optics.used.size, np.float32)
+        opd = screen(seed, axis.size, float(axis[1] - axis[0])).reshape(-1)[self._optics.used]
+        opd -= self._optics.area_weights @ opd
+        return (opd * (rms_nm / wavefront_rms_nm(self._optics, opd))).astype(np.float32)
+
+    def _project(self, opd_nm: npt.NDArray[np.floating]) -> npt.NDArray[np.float64]:
+        """Modes over the circle, least squares with piston, of wavefronts (used,) or (used, many)."""
+        x, y = node_radii(self._optics)
+        inside = np.hypot(x, y) <= 1
+        basis = np.vstack([np.ones(inside.sum()), self._basis[:, inside]]).astype(np.float64)
+        return np.asarray(np.linalg.lstsq(basis.T, opd_nm[inside].astype(np.float64), rcond=None)[0][1:])
+
+    def _mirror_projection(self) -> Single:
+        """(modes, actuators): modes of the wavefront, twice the surface, per nm of each actuator."""
+        rows, columns = np.divmod(self._mirror.used, self._optics.axis.size)
+        factors = self._mirror.y_factors[rows][:, :, None] * self._mirror.x_factors[columns][:, None, :]
+        surface = factors.reshape(rows.size, -1) + self._mirror.expand @ self._mirror.reduce
+        return self._project(2 * surface).astype(np.float32)
