@@ -13,7 +13,7 @@ from lowfc.contract.events import Level
 from lowfc.contract.messages import COMMAND, FRAME, Role, wire
 from lowfc.contract.printable import printable
 from lowfc.control.loop.wording import counted, mode_word
-from lowfc.programs.launch.watch import Watch, mode_name, topic_count
+from lowfc.programs.launch.watch import Watch, mode_name, topic_count, wavefront
 
 _EVENTS_SHOWN = 4
 _STYLES = {Level.WARNING: "yellow", Level.ERROR: "red", Level.FATAL: "bold red"}
@@ -29,7 +29,7 @@ def screen(watch: Watch, config: Configuration, duration_s: float | None, elapse
     table.add_column(style="dim", justify="right")
     table.add_column()
     table.add_row("loop", f"{mode(controller)}, {camera.rate_hz:.0f} Hz of {config.camera.rate_hz:g} Hz")
-    table.add_row("wavefront", wavefront(camera))
+    table.add_row("wavefront", _wavefront(camera))
     table.add_row("frame to command", latency(controller.frame_to_command))
     table.add_row("frame to mirror", latency(camera.frame_to_mirror))
     table.add_row("frames", f"{frames.received} received, {frames.skipped} skipped, {frames.missing} missing")
@@ -47,23 +47,23 @@ def status_line(watch: Watch, elapsed_s: float) -> str:
     camera, controller = watch.of(Role.CAMERA), watch.of(Role.CONTROLLER)
     if not camera.HasField("recent_wavefront"):
         return f"{elapsed_s:5.0f} s  no frame yet"
-    frames, recent = topic_count(controller, FRAME.key), camera.recent_wavefront
+    frames, recent = topic_count(controller, FRAME.key), wavefront(camera.recent_wavefront)
     return (
         f"{elapsed_s:5.0f} s  {mode(controller)}  {camera.rate_hz:6.0f} Hz  "
-        f"residual {recent.residual_rms_nm:.2f} of {recent.disturbance_rms_nm:.2f} nm rms  "
+        f"residual {recent['residual_rms_nm']:.2f} of {recent['disturbance_rms_nm']:.2f} nm rms  "
         f"frame to command {latency(controller.frame_to_command)}  "
         f"skipped {frames.skipped} missing {frames.missing}  {recording(watch.of(Role.RECORDER))}"
     )
 
 
-def wavefront(camera: wire.Health) -> str:
+def _wavefront(camera: wire.Health) -> str:
     """The true wavefront over the last seconds."""
     if not camera.HasField("recent_wavefront"):
         return "no frame yet"
-    recent = camera.recent_wavefront
+    recent = wavefront(camera.recent_wavefront)
     return (
-        f"{recent.residual_rms_nm:.2f} nm rms left of {recent.disturbance_rms_nm:.2f} nm; "
-        f"tilt {recent.tilt_residual_mas:.2f} mas of {recent.tilt_disturbance_mas:.2f} mas per axis"
+        f"{recent['residual_rms_nm']:.2f} nm rms left of {recent['disturbance_rms_nm']:.2f} nm; "
+        f"tilt {recent['tilt_residual_mas']:.2f} mas of {recent['tilt_disturbance_mas']:.2f} mas per axis"
     )
 
 
@@ -102,6 +102,13 @@ def _loop(figures: dict[str, Any]) -> str:
             return f"{mode} for {seconds}" + (f": {cause}" if cause else "")
 
 
+def _when(figures: dict[str, Any], name: str, of: str = "") -> str:
+    """Of what moments a figure of the true wavefront is."""
+    if figures["instants_per_frame"] == 1:
+        return "sampled as exposures start"
+    return f"continuous ({of}{figures[f'sampled_{name}']:.2f} as exposures start)"
+
+
 def summary_text(figures: dict[str, Any]) -> str:
     """The summary of a run for a person."""
     command, mirror = (figures["latency_us"][name] for name in ("frame_to_command", "frame_to_mirror"))
@@ -116,9 +123,10 @@ def summary_text(figures: dict[str, Any]) -> str:
         f"{figures['frames_skipped']} skipped, {figures['frames_missing']} missing",
         f"commands           {figures['commands_applied']} applied, {figures['commands_late']} after the next exposure "
         "had begun",
-        f"wavefront          {figures['residual_rms_nm']:.2f} nm rms left of {figures['disturbance_rms_nm']:.2f} nm",
+        f"wavefront          {figures['residual_rms_nm']:.2f} nm rms left of {figures['disturbance_rms_nm']:.2f} nm, "
+        + _when(figures, "residual_rms_nm", f"{figures['instants_per_frame']} instants a frame; "),
         f"tilt per axis      {figures['tilt_residual_mas']:.2f} mas rms left of "
-        f"{figures['tilt_disturbance_mas']:.2f} mas",
+        f"{figures['tilt_disturbance_mas']:.2f} mas, " + _when(figures, "tilt_residual_mas"),
         f"frame to command   {percentiles(command)}",
         f"frame to mirror    {percentiles(mirror)}",
     ]

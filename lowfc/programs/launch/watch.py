@@ -36,7 +36,6 @@ def summary(watch: Watch, record: bool) -> dict[str, Any]:
     """Figures of a run, from the last Health of each process."""
     camera, controller = watch.of(Role.CAMERA), watch.of(Role.CONTROLLER)
     frames = topic_count(controller, FRAME.key)
-    wavefront = camera.wavefront
     figures: dict[str, Any] = {
         "rate_hz": round(camera.mean_rate_hz, 2),
         "frames_published": topic_count(camera, FRAME.key).published,
@@ -52,10 +51,7 @@ def summary(watch: Watch, record: bool) -> dict[str, Any]:
         "messages_lost": None,
         "lost": {},
         "recording_failure": None,
-        "disturbance_rms_nm": round(wavefront.disturbance_rms_nm, 4),
-        "residual_rms_nm": round(wavefront.residual_rms_nm, 4),
-        "tilt_disturbance_mas": round(wavefront.tilt_disturbance_mas, 4),
-        "tilt_residual_mas": round(wavefront.tilt_residual_mas, 4),
+        **wavefront(camera.wavefront),
         "latency_us": {
             "frame_to_command": _microseconds(controller.frame_to_command),
             "frame_to_mirror": _microseconds(camera.frame_to_mirror),
@@ -82,6 +78,18 @@ def summary(watch: Watch, record: bool) -> dict[str, Any]:
             "logs": list(recording.files),
         }
     return figures
+
+
+def wavefront(known: wire.WavefrontFigures) -> dict[str, Any]:
+    """The true wavefront's figures: at every moment where they were computed, and at the starts of the exposures."""
+    names = ("disturbance_rms_nm", "residual_rms_nm", "tilt_disturbance_mas", "tilt_residual_mas")
+    kind = "continuous_" if known.instants else ""
+    return {
+        **{name: round(getattr(known, kind + name), 4) for name in names},
+        "sampled_residual_rms_nm": round(known.residual_rms_nm, 4),
+        "sampled_tilt_residual_mas": round(known.tilt_residual_mas, 4),
+        "instants_per_frame": known.instants or 1,
+    }
 
 
 def mode_name(mode: wire.LoopMode) -> str | None:
