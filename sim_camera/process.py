@@ -229,6 +229,7 @@ class CameraProcess:
             message.continuous_residual_nm.extend(continuous.residual_nm.tolist())
             message.continuous_disturbance_rms_nm = continuous.disturbance_rms_nm
             message.continuous_residual_rms_nm = continuous.residual_rms_nm
+            message.sensed_residual_nm.extend(truth.sensed_nm.tolist())
         self._truths.put(message.SerializeToString())
 
     def _hear(self, sample: Sample) -> None:

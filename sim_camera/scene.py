@@ -39,10 +39,12 @@ class Truth:
     Attributes:
         sampled: the wavefront at the instant at which the exposure starts.
         continuous: root mean squares over the period, modes included; None where they are not computed.
+        sensed_nm: (modes,) of the residual's mean over the exposure, which is what the sensor sees.
     """
 
     sampled: Wavefront
     continuous: Wavefront | None
+    sensed_nm: Single
 
 
 class Scene:
@@ -141,9 +143,11 @@ class Scene:
         flat, left = self._mean_squares_nm2(opd_nm), self._mean_squares_nm2(opd_nm + moved_nm)
         sampled = Wavefront(rows[0], residual[0], float(np.sqrt(flat[0])), float(np.sqrt(left[0])))
         if not len(self.instants):
-            return Truth(sampled, None)
+            return Truth(sampled, None, sampled.residual_nm)
+        sensed_nm = modes[1 : 1 + self._images].mean(axis=0) - modes[0] + residual[0]
         over = (np.sqrt(np.square(of[1:]).mean(axis=0)) for of in (rows, residual))
-        return Truth(sampled, Wavefront(*over, *(float(np.sqrt(of[1:].mean())) for of in (flat, left))))
+        pupil = (float(np.sqrt(of[1:].mean())) for of in (flat, left))
+        return Truth(sampled, Wavefront(*over, *pupil), sensed_nm)
 
     def _mirror_nm(self, actuators_nm: Single) -> Single:
         """Wavefront (used,) of a shape, remembered for the last few."""

@@ -2,12 +2,12 @@
 
 import numpy as np
 import pytest
+from sim_camera.bench import Bench
 
 from lowfc.adapters.files.factory import analytic_calibration, mirror_on_twin, twin
 from lowfc.contract.configuration import Configuration, load
 from lowfc.control.calibration.calibration import Calibration
 from lowfc.control.loop.estimator import Estimator
-from sim_camera.bench import Bench
 from sim_camera.disturbance import BLOCK
 from sim_camera.process import bench
 

@@ -17,7 +17,7 @@ from lowfc.control.loop.safety import REASONS, Reason
 STAGES = ("transport", "wakeup", "compute", "publish", "frame_to_command")
 """Durations of the controller, as in ControlTiming."""
 
-_KINDS = {"sequence": "Q", "time_ns": "q", "mode": "B", "reasons": "q", "saturated_pixels": "q"}
+_KINDS = {"sequence": "Q", "time_ns": "q", "mode": "B", "reasons": "q", "saturated_pixels": "q", "instants": "q"}
 _BITS = 63  # of a column of whole numbers, but for the sign
 
 
@@ -52,14 +52,38 @@ class Steps:
 
 @dataclass(frozen=True, slots=True)
 class Truths:
-    """What the simulation knew, one row per frame; empty for a log of real devices."""
+    """What the simulation knew, one row per frame; empty for a log of real devices.
+
+    Rms are over the frame's whole period where `instants` is not 0: the star moves while the mirror holds. In older
+    logs, and where a simulation does not compute it, they are those at the instant at which the exposure starts.
+
+    Attributes:
+        sequence: of the frame.
+        time_ns: of that frame, nanoseconds since the epoch.
+        disturbance_nm: (frames, modes) at the start of the exposure; so is residual_nm.
+        sensed_nm: (frames, modes) mean of the residual over the exposure, as the sensor sees it.
+        modes_disturbance_rms_nm: (frames, modes) rms over the period; so is modes_residual_rms_nm.
+        disturbance_rms_nm: over the open pupil, rms over the period; so is residual_rms_nm.
+        sampled_residual_rms_nm: over the open pupil, at the start of the exposure.
+        instants: of the period, over which the rms are; 0 for the start of the exposure alone.
+    """
 
     sequence: Sequences
     time_ns: Long
     disturbance_nm: Single
     residual_nm: Single
+    sensed_nm: Single
+    modes_disturbance_rms_nm: Single
+    modes_residual_rms_nm: Single
     disturbance_rms_nm: Single
     residual_rms_nm: Single
+    sampled_residual_rms_nm: Single
+    instants: Whole
+
+    @property
+    def continuous(self) -> bool:
+        """Whether the rms are over whole periods."""
+        return bool(self.instants.any())
 
 
 class Columns:
@@ -131,7 +155,8 @@ class _Rows(Generic[T]):
         Raises:
             OverflowError: a value that nobody of the loop sends.
         """
-        row = {name: getattr(message, name) for name in self._alike} | self._special(message)
+        special = self._special(message)
+        row = {name: getattr(message, name) for name in self._alike if name not in special} | special
         return self._columns.add(sequence=message.frame_sequence, time_ns=from_timestamp(message.timestamp), **row)
 
     def _special(self, message: Any) -> dict[str, Any]:
@@ -159,7 +184,25 @@ class TruthRows(_Rows[Truths]):
     """What the simulation knew, with one number of modes."""
 
     def __init__(self, modes: int) -> None:
-        super().__init__(Truths, ("disturbance_nm", "residual_nm"), modes)
+        wide = ("disturbance_nm", "residual_nm", "sensed_nm", "modes_disturbance_rms_nm", "modes_residual_rms_nm")
+        super().__init__(Truths, wide, modes)
+
+    def _special(self, message: wire.Truth) -> dict[str, Any]:
+        if message.instants:
+            return {
+                "sensed_nm": message.sensed_residual_nm,
+                "modes_disturbance_rms_nm": message.continuous_disturbance_nm,
+                "modes_residual_rms_nm": message.continuous_residual_nm,
+                "disturbance_rms_nm": message.continuous_disturbance_rms_nm,
+                "residual_rms_nm": message.continuous_residual_rms_nm,
+                "sampled_residual_rms_nm": message.residual_rms_nm,
+            }
+        return {
+            "sensed_nm": message.residual_nm,
+            "modes_disturbance_rms_nm": map(abs, message.disturbance_nm),
+            "modes_residual_rms_nm": map(abs, message.residual_nm),
+            "sampled_residual_rms_nm": message.residual_rms_nm,
+        }
 
 
 def of_steps(steps: Sequence[Step], modes: int) -> Steps:

@@ -5,7 +5,7 @@ Frames are not in it (read them from the log); everything else that is known of 
 
 from collections import Counter
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from functools import cached_property, partial
 from typing import Any, cast
 
@@ -146,8 +146,13 @@ class History:
         if not (rows >= 0).any():
             return None
         known = self.truths
-        columns = known.disturbance_nm, known.residual_nm, known.disturbance_rms_nm, known.residual_rms_nm
-        return Truths(self.steps.sequence, self.steps.time_ns, *(joined(column, rows) for column in columns))
+        values = {
+            one.name: joined(getattr(known, one.name), rows)
+            for one in fields(Truths)
+            if one.name not in ("sequence", "time_ns", "instants")
+        }
+        instants = np.where(rows < 0, 0, known.instants[rows])
+        return Truths(self.steps.sequence, self.steps.time_ns, **values, instants=instants)
 
     def again(self, topic: Topic) -> WholeLog:
         """The log once more, for what the history does not hold: its messages of one topic."""

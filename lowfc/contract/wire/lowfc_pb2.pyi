@@ -498,7 +498,7 @@ class MirrorState(_message.Message):
     def __init__(self, timestamp: _Optional[_Union[datetime.datetime, _timestamp_pb2.Timestamp, _Mapping]] = ..., frame_sequence: _Optional[int] = ..., status: _Optional[_Union[MirrorStatus, str]] = ..., rows: _Optional[int] = ..., columns: _Optional[int] = ..., actuators: _Optional[bytes] = ..., command_nm: _Optional[_Iterable[float]] = ..., limits_hit: _Optional[_Iterable[_Union[Reason, str]]] = ..., channels: _Optional[_Iterable[str]] = ..., safe: _Optional[bool] = ..., refused: _Optional[_Union[Reason, str]] = ...) -> None: ...
 
 class Truth(_message.Message):
-    __slots__ = ("timestamp", "frame_sequence", "disturbance_nm", "residual_nm", "disturbance_rms_nm", "residual_rms_nm", "instants", "continuous_disturbance_nm", "continuous_residual_nm", "continuous_disturbance_rms_nm", "continuous_residual_rms_nm")
+    __slots__ = ("timestamp", "frame_sequence", "disturbance_nm", "residual_nm", "disturbance_rms_nm", "residual_rms_nm", "instants", "continuous_disturbance_nm", "continuous_residual_nm", "continuous_disturbance_rms_nm", "continuous_residual_rms_nm", "sensed_residual_nm")
     TIMESTAMP_FIELD_NUMBER: _ClassVar[int]
     FRAME_SEQUENCE_FIELD_NUMBER: _ClassVar[int]
     DISTURBANCE_NM_FIELD_NUMBER: _ClassVar[int]
@@ -510,6 +510,7 @@ class Truth(_message.Message):
     CONTINUOUS_RESIDUAL_NM_FIELD_NUMBER: _ClassVar[int]
     CONTINUOUS_DISTURBANCE_RMS_NM_FIELD_NUMBER: _ClassVar[int]
     CONTINUOUS_RESIDUAL_RMS_NM_FIELD_NUMBER: _ClassVar[int]
+    SENSED_RESIDUAL_NM_FIELD_NUMBER: _ClassVar[int]
     timestamp: _timestamp_pb2.Timestamp
     frame_sequence: int
     disturbance_nm: _containers.RepeatedScalarFieldContainer[float]
@@ -521,7 +522,8 @@ class Truth(_message.Message):
     continuous_residual_nm: _containers.RepeatedScalarFieldContainer[float]
     continuous_disturbance_rms_nm: float
     continuous_residual_rms_nm: float
-    def __init__(self, timestamp: _Optional[_Union[datetime.datetime, _timestamp_pb2.Timestamp, _Mapping]] = ..., frame_sequence: _Optional[int] = ..., disturbance_nm: _Optional[_Iterable[float]] = ..., residual_nm: _Optional[_Iterable[float]] = ..., disturbance_rms_nm: _Optional[float] = ..., residual_rms_nm: _Optional[float] = ..., instants: _Optional[int] = ..., continuous_disturbance_nm: _Optional[_Iterable[float]] = ..., continuous_residual_nm: _Optional[_Iterable[float]] = ..., continuous_disturbance_rms_nm: _Optional[float] = ..., continuous_residual_rms_nm: _Optional[float] = ...) -> None: ...
+    sensed_residual_nm: _containers.RepeatedScalarFieldContainer[float]
+    def __init__(self, timestamp: _Optional[_Union[datetime.datetime, _timestamp_pb2.Timestamp, _Mapping]] = ..., frame_sequence: _Optional[int] = ..., disturbance_nm: _Optional[_Iterable[float]] = ..., residual_nm: _Optional[_Iterable[float]] = ..., disturbance_rms_nm: _Optional[float] = ..., residual_rms_nm: _Optional[float] = ..., instants: _Optional[int] = ..., continuous_disturbance_nm: _Optional[_Iterable[float]] = ..., continuous_residual_nm: _Optional[_Iterable[float]] = ..., continuous_disturbance_rms_nm: _Optional[float] = ..., continuous_residual_rms_nm: _Optional[float] = ..., sensed_residual_nm: _Optional[_Iterable[float]] = ...) -> None: ...
 
 class Calibration(_message.Message):
     __slots__ = ("timestamp", "id", "operator_hash", "estimator", "noll", "mode_names", "wavelength_nm", "rows", "columns", "reference", "response", "reconstructor", "mask", "dark", "flux_dn", "saturation_dn", "mirror_rows", "mirror_columns", "modes_to_actuators", "actuators_to_modes", "camera")

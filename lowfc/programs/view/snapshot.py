@@ -51,14 +51,17 @@ class Waves(NamedTuple):
     """The wavefront of some frames, nm, each with the mirror as it was and with a flat one.
 
     Attributes:
-        left_nm, open_nm: of the modes, (frames, modes).
-        rms_nm: of both, (frames, 2).
+        left_nm, open_nm: of the modes, (frames, modes), at an instant of each frame.
+        left_rms_nm, open_rms_nm: of the modes, (frames, modes), rms over each frame where it is known.
+        rms_nm: of all modes or over the open pupil, both, (frames, 2).
     """
 
     sequence: Sequences
     time_ns: Long
     left_nm: Single
     open_nm: Single
+    left_rms_nm: Single
+    open_rms_nm: Single
     rms_nm: Single
 
 
@@ -142,11 +145,12 @@ class Snapshot:
         if true:
             new = self.truths
             rms_nm = np.stack([new.residual_rms_nm, new.disturbance_rms_nm], axis=1)
-            return Waves(new.sequence, new.time_ns, new.residual_nm, new.disturbance_nm, rms_nm)
+            over = new.modes_residual_rms_nm, new.modes_disturbance_rms_nm
+            return Waves(new.sequence, new.time_ns, new.residual_nm, new.disturbance_nm, *over, rms_nm)
         steps, used = self.steps, self.used
         modes_nm = steps.error_nm[used], steps.pol_nm[used]
         rms_nm = np.stack([np.linalg.norm(one, axis=1) for one in modes_nm], axis=1)
-        return Waves(steps.sequence[used], steps.time_ns[used], *modes_nm, rms_nm)
+        return Waves(steps.sequence[used], steps.time_ns[used], *modes_nm, *modes_nm, rms_nm)
 
 
 class Accumulator:

@@ -103,11 +103,13 @@ def _truth(history: History) -> list[Column]:
     true, modes, pupil = history.true, "of each mode, wavefront rms", "over the open pupil, no piston"
     if true is None:
         return []
+    when = "rms over the period" if true.continuous else "as the exposure starts"
     return [
-        Column("true_disturbance_nm", true.disturbance_nm, "nm", modes),
-        Column("true_residual_nm", true.residual_nm, "nm", modes),
-        Column("true_disturbance_rms_nm", true.disturbance_rms_nm, "nm", pupil),
-        Column("true_residual_rms_nm", true.residual_rms_nm, "nm", pupil),
+        Column("true_disturbance_nm", true.disturbance_nm, "nm", f"{modes}, as the exposure starts"),
+        Column("true_residual_nm", true.residual_nm, "nm", f"{modes}, as the exposure starts"),
+        Column("true_residual_mode_rms_nm", true.modes_residual_rms_nm, "nm", f"{modes}, {when}"),
+        Column("true_disturbance_rms_nm", true.disturbance_rms_nm, "nm", f"{pupil}, {when}"),
+        Column("true_residual_rms_nm", true.residual_rms_nm, "nm", f"{pupil}, {when}"),
     ]
 
 

@@ -5,13 +5,12 @@ from dataclasses import replace
 import numpy as np
 
 from lowfc.arrays import Array, Mask
-from lowfc.control.laws.continuous import Timing
 from lowfc.control.laws.error_budget import SensorNoise, Term, lag, lag_under_noise, measurement_error, white_noise
 from lowfc.programs.logs.report.closed_loop import (
     DISTURBANCE,
     ERROR,
     POL,
-    RESIDUAL,
+    SENSED,
     Spectra,
     Stretch,
     noise_of,
@@ -43,7 +42,7 @@ def budget_figures(run: Run, stretch: Stretch | None, spectra: Spectra | None, m
     found = [term for term, _ in terms.values() if term is not None]
     total = Term(np.sum([np.maximum(term.variance_nm2, 0) for term in found], axis=0)) if found else None
     left = [name for name, (term, _) in terms.items() if term is None]
-    true = _mean_square(stretch.signal(RESIDUAL).joined()) if stretch.true and stretch.frames.values else None
+    true = Term(stretch.left_nm2) if stretch.left_nm2 is not None and stretch.frames.values else None
     measured = _mean_square(stretch.signal(ERROR).joined()) if stretch.frames.values else None
     return {
         "terms": rows,
@@ -64,7 +63,7 @@ def budget_figures(run: Run, stretch: Stretch | None, spectra: Spectra | None, m
 
 def _terms(stretch: Stretch, spectra: Spectra | None, noise: SensorNoise | None) -> dict[str, Entry]:
     """Each term, or None, and how it was obtained, or what it would take."""
-    law, timing = stretch.law, Timing.sampled(stretch.law.delay_frames)
+    law, timing = stretch.law, stretch.timing
     found: dict[str, Entry] = {}
     if noise is None:
         found = dict.fromkeys(("photon noise", "read noise"), (None, f"it takes {_NO_CAMERA}"))
@@ -100,7 +99,7 @@ def _measurement_terms(stretch: Stretch, noise: SensorNoise | None) -> tuple[Ent
     else:
         error, pol = stretch.signal(ERROR), stretch.signal(POL)
         seen = replace(error, values=tuple(a - b for a, b in zip(error.values, pol.values, strict=True)))
-        split = measurement_error(stretch.law, error, stretch.signal(RESIDUAL), seen, noise.total_nm)
+        split = measurement_error(stretch.law, error, stretch.signal(SENSED), seen, noise.total_nm)
     if split is None:
         nothing = (None, f"it takes {missing}")
         return nothing, nothing

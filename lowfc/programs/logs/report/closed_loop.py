@@ -7,6 +7,7 @@ import numpy as np
 
 from lowfc.adapters.logs.history import History
 from lowfc.arrays import Array, Mask
+from lowfc.control.laws.continuous import Timing
 from lowfc.control.laws.error_budget import SensorNoise, sensor_noise
 from lowfc.control.laws.linear_law import LinearLaw, integrator
 from lowfc.control.laws.margins import noise_transfer, rejection
@@ -30,7 +31,11 @@ class Stretch:
     Attributes:
         rows: of the steps, settled.
         settling: steps before them that are left out, and `earlier` more of a long stretch.
-        frames: error, pseudo-open-loop and, where the log has truth, disturbance and residual, side by side.
+        timing: of the loop, as its truth is: sampled where the log's truth is.
+        frames: error, pseudo-open-loop and, where the log has truth, disturbance, residual and the residual's mean over
+            the exposure, side by side.
+        left_nm2: (modes,) mean square of the true residual over the frames, at all times where the truth is continuous;
+            None without any.
     """
 
     rows: slice
@@ -38,16 +43,22 @@ class Stretch:
     earlier: int
     in_force: InForce
     law: LinearLaw
+    timing: Timing
     frames: Pieces
-    true: bool
+    left_nm2: Array | None
+
+    @property
+    def true(self) -> bool:
+        """Whether the truth is known."""
+        return self.left_nm2 is not None
 
     def signal(self, number: int) -> Pieces:
-        """Error 0, pseudo-open-loop 1, disturbance 2, residual 3; (frames, modes) each."""
+        """One of `ERROR`, `POL`, `DISTURBANCE`, `RESIDUAL` and `SENSED`, (frames, modes)."""
         modes = len(self.law.noll)
         return self.frames.columns(slice(number * modes, (number + 1) * modes))
 
 
-ERROR, POL, DISTURBANCE, RESIDUAL = range(4)
+ERROR, POL, DISTURBANCE, RESIDUAL, SENSED = range(5)
 
 
 def longest_stretch(run: Run) -> Stretch | None:
@@ -66,14 +77,17 @@ def longest_stretch(run: Run) -> Stretch | None:
     rows = slice(max(first + settling, last - MOST_STEPS), last)
     earlier = rows.start - first - settling
     signals = [steps.error_nm[rows], steps.pol_nm[rows]]
-    true = history.true is not None and bool(np.isfinite(history.true.residual_nm[rows]).any())
-    if true and history.true is not None:
-        signals += [history.true.disturbance_nm[rows], history.true.residual_nm[rows]]
+    left_nm2, timing, true = None, Timing.sampled(in_force.delay_frames), history.true
+    if true is not None and np.isfinite(true.residual_nm[rows]).any():
+        signals += [true.disturbance_nm[rows], true.residual_nm[rows], true.sensed_nm[rows]]
+        left_nm2 = np.nanmean(true.modes_residual_rms_nm[rows].astype(float) ** 2, axis=0)
+        if true.continuous and history.camera is not None and history.camera.period_ns:
+            timing = Timing.of(in_force.delay_frames, history.camera.exposure_ns / history.camera.period_ns)
     found = pieces(steps.sequence[rows], np.hstack(signals))
     noll = tuple(range(2, 2 + gain.size))
     rate_hz = history.rate_hz or 1.0  # of one step alone none is known, and nothing is reckoned with it
     law = integrator(gain, leak, noll, in_force.delay_frames, rate_hz)
-    return Stretch(rows, settling, earlier, in_force, law, found, true)
+    return Stretch(rows, settling, earlier, in_force, law, timing, found, left_nm2)
 
 
 def why_none(run: Run) -> str:

@@ -26,11 +26,12 @@ def residual_figures(run: Run, stretch: Stretch | None) -> Figures:
     true = history.true or TruthRows(0).taken()
     values = {
         "open_error": _rms(steps.error_nm, opened),
-        "open_residual": _rms(true.residual_nm, opened),
+        "open_residual": _rms(true.modes_residual_rms_nm, opened),
         "pseudo_open_loop": _rms(steps.pol_nm, closed),
-        "disturbance": _rms(true.disturbance_nm, closed),
+        "disturbance": _rms(true.modes_disturbance_rms_nm, closed),
         "error": _rms(steps.error_nm, closed),
-        "residual": _rms(true.residual_nm, closed),
+        "residual": _rms(true.modes_residual_rms_nm, closed),
+        "sampled_residual": _rms(true.residual_nm, closed),
     }
     noise = noise_of(history, stretch.rows if stretch is not None else slice(None))
     modes = [
@@ -47,6 +48,7 @@ def residual_figures(run: Run, stretch: Stretch | None) -> Figures:
         for name, column, rows in (
             ("disturbance", true.disturbance_rms_nm, closed if closed.size else opened),
             ("residual", true.residual_rms_nm, closed),
+            ("sampled_residual", true.sampled_residual_rms_nm, closed),
         )
     }
     return {
@@ -56,6 +58,7 @@ def residual_figures(run: Run, stretch: Stretch | None) -> Figures:
             signal: float(np.sqrt(np.sum(found**2))) if found is not None else None for signal, found in values.items()
         },
         "open_pupil": open_pupil,
+        "truth": "none" if history.true is None else "continuous" if true.continuous else "sampled only",
         "steps_open": int(opened.size),
         "steps_closed": int(closed.size),
     }
@@ -66,7 +69,7 @@ def binned_rms(run: Run, most: int = 300) -> dict[str, Array]:
     steps, true = run.history.steps, run.history.true
     columns = {"pseudo_open_loop": steps.pol_nm, "error": steps.error_nm}
     if true is not None:
-        columns |= {"disturbance": true.disturbance_nm, "residual": true.residual_nm}
+        columns |= {"disturbance": true.modes_disturbance_rms_nm, "residual": true.modes_residual_rms_nm}
     starts = bin_starts(steps.sequence.size, most)
     found = {"time_s": run.step_s[starts]}
     for name, column in columns.items():

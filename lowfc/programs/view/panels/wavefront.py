@@ -53,17 +53,19 @@ class Wavefront(Panel):
                 plot.add(stream, steps.time_ns, values)
             if steps.sequence.size and not self._true:
                 rms_nm = np.stack([_rss(steps.pol_nm), _rss(steps.error_nm)], axis=1)
-                self._sum_up(stream, steps.time_ns, steps.error_nm, rms_nm)
+                self._sum_up(stream, steps.time_ns, steps.error_nm, rms_nm, steps.error_nm)
         if true:
             TRUTH.add(stream, truths.time_ns, truths.residual_nm)
             rms_nm = np.stack([truths.disturbance_rms_nm, truths.residual_rms_nm], axis=1)
-            self._sum_up(stream, truths.time_ns, truths.residual_nm, rms_nm)
+            self._sum_up(stream, truths.time_ns, truths.modes_residual_rms_nm, rms_nm, truths.residual_nm)
 
-    def _sum_up(self, stream: rr.RecordingStream, times_ns: Long, modes_nm: Values, rms_nm: Values) -> None:
+    def _sum_up(
+        self, stream: rr.RecordingStream, times_ns: Long, modes_nm: Values, rms_nm: Values, signed_nm: Values
+    ) -> None:
         RMS.add(stream, times_ns, rms_nm)
         GROUPS.add(stream, times_ns, np.stack([_rss(modes_nm[:, group]) for group in self._groups], axis=1))
         if self._tilts:
-            TILT.add(stream, times_ns, modes_nm[:, self._tilts] / self._nm_per_mas)
+            TILT.add(stream, times_ns, signed_nm[:, self._tilts] / self._nm_per_mas)
 
     def _name(self, stream: rr.RecordingStream, noll: tuple[int, ...], true: bool) -> None:
         self._noll, self._true = noll, true

@@ -299,6 +299,7 @@ def _squares(snapshot: Snapshot, waves: Waves) -> Array:
     noll = snapshot.calibration.noll if snapshot.calibration is not None else ()
     tilts = [place for place, index in enumerate(noll) if index in (2, 3) and len(noll) == waves.left_nm.shape[1]]
     tilt_nm2 = [
-        np.square(one[:, tilts], dtype=float).sum() / max(1, len(tilts)) for one in (waves.left_nm, waves.open_nm)
+        np.square(one[:, tilts], dtype=float).sum() / max(1, len(tilts))
+        for one in (waves.left_rms_nm, waves.open_rms_nm)
     ]
     return np.array([len(waves.rms_nm), *np.square(waves.rms_nm, dtype=float).sum(axis=0), *tilt_nm2])
