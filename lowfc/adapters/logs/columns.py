@@ -78,7 +78,7 @@ class Truths:
     disturbance_rms_nm: Single
     residual_rms_nm: Single
     sampled_residual_rms_nm: Single
-    instants: Whole
+    instants: Long
 
     @property
     def continuous(self) -> bool:
