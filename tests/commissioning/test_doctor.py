@@ -2,6 +2,7 @@
 
 import ctypes
 import json
+import multiprocessing.spawn
 import os
 import re
 import subprocess
@@ -311,15 +312,12 @@ print(*trial.refused["priority"], *trial.refused["lock_memory"], len(trial.norma
     assert (normal, first) == ("10", "0")
 
 
-def test_a_trial_that_fails_says_why(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    broken = tmp_path / "python"
-    broken.write_text("#!/bin/sh\necho no memory >&2\nexit 3\n")
-    broken.chmod(0o755)
-    monkeypatch.setattr(sys, "executable", str(broken))
-    with pytest.raises(OSError, match="exit status 3: no memory"):
+def test_a_trial_that_fails_says_why(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(multiprocessing.spawn, "get_executable", lambda: b"/bin/false")
+    with pytest.raises(OSError, match="the process that tries it ended"):
         try_out(Realtime(), set(), 0.01)
     found = examine(gather(Host(), Configuration(), 0.01))
-    assert "no memory" in found["wake-up"].got
+    assert "the process that tries it ended" in found["wake-up"].got
     assert found["wake-up"].status == "note"
 
 

@@ -12,7 +12,6 @@ import signal
 import socket
 import subprocess
 import sys
-import threading
 import time
 from collections import defaultdict
 from collections.abc import Iterator
@@ -225,34 +224,25 @@ class Manager:
 
     def __init__(self, path: Path, wait_s: float) -> None:
         self.environment = {"NOTIFY_SOCKET": str(path), "WATCHDOG_USEC": str(round(wait_s * 1e6))}
-        self.said: list[str] = []
-        self.times_s: list[float] = []  # of the signs of life
-        self._socket = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
-        self._socket.bind(str(path))
-        self._socket.settimeout(0.02)
-        self._open = True
-        self._thread = threading.Thread(target=self._listen)
-        self._thread.start()
+        self.begun_s = time.monotonic()
+        self._received: list[str] = []
+        self.socket = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
+        self.socket.bind(str(path))
+        self.socket.setblocking(False)
 
-    def _listen(self) -> None:
-        while self._open:
-            with contextlib.suppress(TimeoutError):
-                said = self._socket.recv(4096).decode()
-                self.said.append(said)
-                if said == "WATCHDOG=1":
-                    self.times_s.append(time.monotonic())
+    @property
+    def said(self) -> list[str]:
+        with contextlib.suppress(BlockingIOError):
+            while True:
+                self._received.append(self.socket.recv(4096).decode())
+        return self._received
 
     @property
     def beats(self) -> int:
-        return len(self.times_s)
+        return self.said.count("WATCHDOG=1")
 
     def status(self) -> str:
         return next((one.removeprefix("STATUS=") for one in reversed(self.said) if one.startswith("STATUS=")), "")
-
-    def close(self) -> None:
-        self._open = False
-        self._thread.join()
-        self._socket.close()
 
 
 WAIT_S = 0.2
@@ -302,32 +292,16 @@ def supervised(folder: Path, *names: str) -> Iterator[dict[str, Supervised]]:
         for one in started.values():
             one.process.kill()
             one.process.wait()
-            one.manager.close()
-
-
-def ready_and_alive(one: Supervised) -> bool:
-    assert one.process.poll() is None, one.words_file.read_text()
-    return "READY=1" in one.manager.said and one.manager.beats > 5
-
-
-def told_to_stop(those: list[Supervised]) -> None:
-    """They say that they stop, once, and how they were last."""
-    for one in those:
-        assert "STOPPING=1" not in one.manager.said
-        one.process.send_signal(signal.SIGTERM)
-    for one in those:
-        assert one.process.wait(20) == 0, one.words_file.read_text()
-        assert one.manager.said.count("READY=1") == one.manager.said.count("STOPPING=1") == 1
-        assert one.manager.status().startswith("stopped")
+            one.manager.socket.close()
 
 
 @pytest.mark.exclusive
 def test_processes_are_ready_alive_and_stopping(tmp_path: Path) -> None:
     with supervised(tmp_path, "recorder", "sim-mirror", "controller", "sim-camera") as found:
-        until(lambda: all(ready_and_alive(one) for one in found.values()))
-        for name, one in found.items():
-            span_s = one.manager.times_s[-1] - one.manager.times_s[0]
-            assert one.manager.beats - 1 <= span_s / (WAIT_S / 2) + 1, f"{name} says so too often"
+        for one in found.values():
+            until(lambda one=one: "READY=1" in one.manager.said and one.manager.beats > 5)
+            most = (time.monotonic() - one.manager.begun_s) / (WAIT_S / 2) + 2
+            assert one.manager.beats <= most, f"{one.name} says so too often"
         controller, mirror = found["controller"], found["sim-mirror"]
         until(lambda: re.fullmatch(r"running, open, \d+ Hz", controller.manager.status()))
 
@@ -349,7 +323,14 @@ def test_processes_are_ready_alive_and_stopping(tmp_path: Path) -> None:
         controller.process.send_signal(signal.SIGABRT)  # as systemd does then
         assert controller.process.wait(20) == -signal.SIGABRT
         assert "advance_or_hang" in controller.words_file.read_text()  # what hung is in the journal
-        told_to_stop([one for one in found.values() if one is not controller])
+        stopped = [one for one in found.values() if one is not controller]
+        for one in stopped:
+            assert "STOPPING=1" not in one.manager.said
+            one.process.send_signal(signal.SIGTERM)
+        for one in stopped:
+            assert one.process.wait(20) == 0, one.words_file.read_text()
+            assert one.manager.said.count("READY=1") == one.manager.said.count("STOPPING=1") == 1
+            assert one.manager.status().startswith("stopped")
 
 
 def test_a_managers_watchdog_is_not_a_parents_and_nobody_has_to_listen(tmp_path: Path) -> None:

@@ -4,22 +4,20 @@ That process ends, so nothing of what it was granted stays with the caller.
 """
 
 import os
-import subprocess
-import sys
 import time
-
-from pydantic import BaseModel
+from concurrent.futures import BrokenExecutor, ProcessPoolExecutor
+from multiprocessing import get_context
+from typing import NamedTuple
 
 from lowfc.adapters.process.realtime import set_up
 from lowfc.contract.configuration import Realtime
 
 RATE_HZ = 1000
 
-_STARTING_S = 60.0
 _CPUS = 8192  # as many as a kernel can have
 
 
-class Trial(BaseModel):
+class Trial(NamedTuple):
     """What the host granted.
 
     Attributes:
@@ -46,21 +44,11 @@ def try_out(asked: Realtime, cpus: set[int], seconds: float) -> Trial:
     Raises:
         OSError: the process that tries cannot be started, or fails.
     """
-    words = [asked.model_dump_json(), ",".join(map(str, cpus)), str(seconds)]
-    try:
-        done = subprocess.run(  # noqa: S603  # this module
-            [sys.executable, "-P", "-m", "lowfc.adapters.process.trial", *words],
-            capture_output=True,
-            text=True,
-            timeout=2 * seconds + _STARTING_S,
-            check=False,
-        )
-    except subprocess.TimeoutExpired as fault:
-        raise OSError(f"the process that tries it did not end within {fault.timeout:g} s") from fault
-    if done.returncode:
-        why = done.stderr.strip().splitlines()[-1:] or ["it said nothing"]
-        raise OSError(f"the process that tries it ended with exit status {done.returncode}: {why[0]}")
-    return Trial.model_validate_json(done.stdout)
+    with ProcessPoolExecutor(1, mp_context=get_context("spawn")) as pool:
+        try:
+            return pool.submit(_try, asked, cpus, seconds).result()
+        except BrokenExecutor as fault:
+            raise OSError(f"the process that tries it ended: {fault}") from fault
 
 
 def lateness_ns(wake_ups: int, period_ns: int = 1_000_000_000 // RATE_HZ) -> list[int]:
@@ -87,21 +75,14 @@ def _try(asked: Realtime, cpus: set[int], seconds: float) -> Trial:
     os.sched_setaffinity(0, (cpus & reachable) or inherited)
     refused: dict[str, tuple[str, str]] = {}
 
-    def ask(
-        name: str, priority: int | None = None, *, lock_memory: bool = False, disable_cpu_idle: bool = False
-    ) -> None:
-        found = set_up(priority, None, lock_memory=lock_memory, disable_cpu_idle=disable_cpu_idle).refused
-        refused.update({name: found[0]} if found else {})
+    def ask(name: str, priority: int | None = None, **measure: bool) -> None:
+        wanted = {"lock_memory": False, "disable_cpu_idle": False} | measure
+        if found := set_up(priority, None, **wanted).refused:
+            refused[name] = found[0]
 
     ask("lock_memory", lock_memory=asked.lock_memory)
     ask("disable_cpu_idle", disable_cpu_idle=asked.disable_cpu_idle)
     normal_ns = lateness_ns(wake_ups)
     ask("priority", asked.priority or None)
     first_ns = lateness_ns(wake_ups) if asked.priority and "priority" not in refused else []
-    return Trial(refused=refused, cpus=reachable, normal_ns=normal_ns, first_ns=first_ns)
-
-
-if __name__ == "__main__":
-    _asked, _cpus, _seconds = sys.argv[1:]
-    _named = {int(cpu) for cpu in _cpus.split(",") if cpu}
-    sys.stdout.write(_try(Realtime.model_validate_json(_asked), _named, float(_seconds)).model_dump_json())
+    return Trial(refused, reachable, normal_ns, first_ns)
