@@ -21,7 +21,6 @@ from lowfc.programs.measure.bench import record as bench_module
 from lowfc.programs.measure.bench.record import render
 from lowfc.programs.measure.control_step import ControlStep, time_alone
 from lowfc.programs.measure.frame_source import Payloads, prepared_frames
-from lowfc.programs.measure.latency.command import Camera, _configuration
 from lowfc.programs.measure.latency.figures import (
     LOOP_SPANS,
     SPANS,
@@ -135,15 +134,12 @@ def test_frames_of_a_burst_are_told_from_those_lost_alone() -> None:
     put_ns[801] = put_ns[802] - 1000
     command_us = np.full(1000, 100.0)
     command_us[[600, 800, 801]] = np.nan
-    found = repeat_figures(frames(put_ns, command_us, (put_ns - due_ns) / 1e3))
-    assert (found["frames_without_command"], found["frames_crowded_out"]) == (3, 2)
-    assert found["frames_sent_late"] == 1  # by 2 ms; the other one by less than its period
-
-
-def test_no_frames_are_no_latencies() -> None:
     nothing = repeat_figures(frames(0))
     assert (nothing["frames"], nothing["latency_us"]) == (0, {})
     assert repeat_figures(frames(1, scheduled=False))["frames_sent_late"] is None
+    found = repeat_figures(frames(put_ns, command_us, (put_ns - due_ns) / 1e3))
+    assert (found["frames_without_command"], found["frames_crowded_out"]) == (3, 2)
+    assert found["frames_sent_late"] == 1  # by 2 ms; the other one by less than its period
 
 
 def test_a_histogram_holds_every_value() -> None:
@@ -205,16 +201,14 @@ def test_a_difference_is_set_against_the_spread() -> None:
     assert "within the spread" in compared({"a": "a.json", "b": "b.json"} | compare(before, after))
 
 
-@pytest.mark.parametrize("file", sorted(HISTORY.glob("*.json")), ids=lambda file: file.stem)
-def test_the_figures_of_a_release_can_be_compared_with_todays(file: Path) -> None:
+def test_the_figures_of_every_release_can_be_compared_with_todays() -> None:
     today = together([repeat(100), repeat(130)])
-    found = compare(json.loads(file.read_text()), today)
-    assert {(row["name"], row["at"]) for row in found["rows"]} >= {
-        ("frame_to_mirror", "p99"),
-        ("over_echo_and_step", "p50"),
-    }
-    assert found["counts"]["frames"][1] == today["frames"]
-    assert "skipped by the controller: a 0, b 4" in compared({"a": "a.json", "b": "b.json"} | found)
+    for file in HISTORY.glob("*.json"):
+        found = compare(json.loads(file.read_text()), today)
+        compared_at = {(row["name"], row["at"]) for row in found["rows"]}
+        assert compared_at >= {("frame_to_mirror", "p99"), ("over_echo_and_step", "p50")}
+        assert found["counts"]["frames"][1] == today["frames"]
+        assert "skipped by the controller: a 0, b 4" in compared({"a": "a.json", "b": "b.json"} | found)
 
 
 @pytest.mark.exclusive
@@ -234,13 +228,6 @@ def test_a_step_alone_takes_every_frame_as_the_controller_does() -> None:
     assert paced.timer_ns.min() >= 0
     assert step.state.frames_used == paced.step_ns.size + hot.step_ns.size  # none was refused
     assert not step.state.counts
-
-
-def test_plain_scheduling_leaves_nothing_of_the_set_up() -> None:
-    plain = _configuration(None, None, Camera.PREPARED, plain=True).realtime
-    assert not any(
-        (plain.priority, plain.lock_memory, plain.disable_cpu_idle, plain.controller_cpus, plain.mirror_cpus)
-    )
 
 
 def runs() -> set[Path]:
@@ -263,7 +250,11 @@ def measured(tmp_path_factory: pytest.TempPathFactory) -> tuple[dict[str, Any], 
 
 @pytest.mark.exclusive
 def test_every_frame_of_a_real_loop_is_in_the_account(measured: tuple[dict[str, Any], Path]) -> None:
-    figures, _ = measured
+    figures, folder = measured
+    text = table(figures)
+    for words in ("frame to command", "due to command", "half a bare echo", "timer wake-up", "without a command"):
+        assert words in text
+    assert (folder / "latency.png").read_bytes().startswith(b"\x89PNG")
     sent = round(RATE_HZ * (SECONDS + WARM_UP_S))
     assert figures["frames"] + figures["warm_up_frames"] == sent
     assert figures["frames_untimed"] == figures["frames_missing"] == 0
@@ -304,19 +295,6 @@ def test_the_log_of_the_run_says_the_same(measured: tuple[dict[str, Any], Path])
     done = lowfc("latency", "--compare", folder / "a.json", folder / "log.json")
     assert done.exit_code == 0, done.output
     assert "frame to mirror" in done.stdout
-
-
-@pytest.mark.exclusive
-def test_a_person_reads_a_table_and_a_picture(measured: tuple[dict[str, Any], Path]) -> None:
-    figures, folder = measured
-    text = table(figures)
-    for words in ("frame to command", "due to command", "half a bare echo", "timer wake-up", "without a command"):
-        assert words in text
-    title, *_ = text.splitlines()
-    assert title.split()[:6] == ["us", "p50", "p90", "p99", "p99.9", "max"]
-    content = (folder / "latency.png").read_bytes()
-    assert content.startswith(b"\x89PNG")
-    assert len(content) > 10_000
 
 
 def test_what_is_no_result_and_no_log_is_said(tmp_path: Path) -> None:
@@ -366,40 +344,26 @@ def test_an_end_before_the_end_leaves_nothing(victim: str, number: int, status: 
     assert runs() == before
 
 
-RATES_HZ = (100, 200)
-
-
-@pytest.fixture(scope="module")
-def figures(tmp_path_factory: pytest.TempPathFactory) -> dict[str, object]:
-    folder = tmp_path_factory.mktemp("disk")
-    rates = [word for rate in RATES_HZ for word in ("--rate", str(rate))]
-    done = lowfc("bench", "record", "--seconds", "0.5", *rates, "--folder", folder, "--json")
-    assert done.exit_code == 0, done.output
-    assert list(folder.iterdir()) == []
-    return json.loads(done.stdout)
-
-
 @pytest.mark.exclusive
-def test_everything_that_was_sent_is_in_the_account(figures: dict[str, object]) -> None:
-    assert [rate["rate_hz"] for rate in figures["rates"]] == list(RATES_HZ)
+def test_recording_is_accounted_for_at_every_rate(tmp_path: Path) -> None:
+    rates_hz = (100, 200)
+    rates = [word for rate in rates_hz for word in ("--rate", str(rate))]
+    done = lowfc("bench", "record", "--seconds", "0.5", *rates, "--folder", tmp_path, "--json")
+    assert done.exit_code == 0, done.output
+    assert list(tmp_path.iterdir()) == []
+    figures = json.loads(done.stdout)
+    assert [rate["rate_hz"] for rate in figures["rates"]] == list(rates_hz)
     for rate in figures["rates"]:
         frames = rate["rate_hz"] * (bench_module._WARM_UP_S + 0.5)
         assert rate["messages_lost"] == 0
-        assert rate["messages_published"] >= 5 * frames
-        assert rate["messages_recorded"] >= 5 * frames
+        assert min(rate["messages_published"], rate["messages_recorded"]) >= 5 * frames
         assert rate["log_bytes"] > 0.5 * frames * figures["payload_bytes_per_frame"]
-        assert rate["cpu_share"] > 0
-        assert rate["ratio"] == pytest.approx(
-            rate["cpu_share"] / (figures["copy_us_per_frame"] * rate["offered_hz"] / 1e6)
-        )
+        copying = figures["copy_us_per_frame"] * rate["offered_hz"] / 1e6
+        assert 0 < rate["ratio"] == pytest.approx(rate["cpu_share"] / copying)
         assert rate["longest_unflushed_ms"] >= rate["longest_wait_ms"] > 0
         assert rate["longest_write_ms"] > 0
     assert figures["payload_bytes_per_frame"] > 80 * 80 * 2 + 2 * 34 * 34 * 4
-
-
-@pytest.mark.exclusive
-def test_a_person_reads_one_line_for_each_rate(figures: dict[str, object]) -> None:
     title, *lines, note = render(figures).splitlines()
     assert "processor" in title
     assert "kill -9" in note
-    assert [line.split()[1] for line in lines] == ["Hz"] * len(RATES_HZ)
+    assert [line.split()[1] for line in lines] == ["Hz"] * len(rates_hz)
