@@ -3,7 +3,7 @@
 from tempfile import TemporaryDirectory
 
 from lowfc.programs.reliability.chaos.command import counts
-from lowfc.programs.reliability.soak.figures import TOO_SHORT, told_latency, verdict
+from lowfc.programs.reliability.soak.figures import TOO_SHORT, latency_in_words, verdict
 from tools.shared import Figures, columns, json_of, markdown
 
 CHAOS = "lowfc chaos --all --seed N"
@@ -98,7 +98,7 @@ def render_soak(figures: Figures) -> str:
         f"{ended} {figures['hours']:g} h at {figures['rate_hz']:.0f} Hz: {figures['frames_published']} frames, "
         f"{figures['frames_skipped']} skipped, {figures['frames_missing']} missing; {figures['messages_recorded']} "
         f"messages in {figures['logs']} logs, {figures['messages_lost']} lost, {figures['gaps']} gaps. "
-        f"Frame to command: {told_latency(figures['latency'])}.\n\n{columns(SOAK_COLUMNS, rows)}\n"
+        f"Frame to command: {latency_in_words(figures['latency'])}.\n\n{columns(SOAK_COLUMNS, rows)}\n"
     )
 
 

@@ -67,13 +67,13 @@ def test_what_is_too_short_is_not_judged_and_has_not_passed() -> None:
     assert json.loads(json.dumps(figures, allow_nan=False)) == figures
     text = render(figures)
     assert "nan" not in text
-    assert text.splitlines()[2].split()[-10:-6] == ["too", "short", "to", "judge"]
+    assert "too short to judge" in text.splitlines()[2]
     assert "p50 too short to judge; p99 too short to judge" in text
-    assert text.endswith(f"too short to judge: {', '.join(short)}\n")
+    assert text.endswith(f"too short to judge: {', '.join(short)}")
     latency = of_latency([(one, 500 + 8 * one / 3600, 900.0) for one in map(float, range(SECONDS))])
     text = render(figures | {"latency": latency, "why": ["the camera's memory grow"]})
     assert "p50 502 us, +8.0 +- 0.0 us per hour" in text
-    assert text.endswith("FAILED: the camera's memory grow\n")
+    assert text.endswith("FAILED: the camera's memory grow")
 
 
 def log(folder: Path, name: str, counts: dict[str, list[int]]) -> None:

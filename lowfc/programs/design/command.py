@@ -1,8 +1,6 @@
 """The commands `lowfc design ...`: arguments only; the work is elsewhere."""
 
-import json
 import os
-import sys
 from dataclasses import fields
 from pathlib import Path
 from typing import Annotated
@@ -12,6 +10,7 @@ import typer
 from lowfc.adapters.process.terminal import INTERRUPTED, Json, new_app
 from lowfc.contract.errors import ConfigurationError
 from lowfc.design.shaped_pupil import Request
+from lowfc.programs.cli.output import put
 from lowfc.programs.design.options import flag, with_options_of
 from lowfc.programs.design.sam_request import Search
 
@@ -32,10 +31,10 @@ def spc(
     """
     from rich.console import Console
 
-    from lowfc.programs.design.spc import design_spc, render
+    from lowfc.programs.cli import result
+    from lowfc.programs.design.spc import design_spc
 
-    result = design_spc(request, out, plot, Console(stderr=True))
-    sys.stdout.write((json.dumps(result) if as_json else render(result)) + "\n")
+    result.put(design_spc(request, out, plot, Console(stderr=True)), as_json=as_json)
 
 
 @design_app.command()
@@ -74,6 +73,6 @@ def sam(
     processes = min(jobs or len(os.sched_getaffinity(0)), search.chains)
     with open_executor(processes, scheduler) as executor:
         result = design_sam(search, found, out, state, executor, front, plot)
-    sys.stdout.write((json.dumps(result) if as_json else render(result)) + "\n")
+    put(result, render(result), as_json=as_json)
     if result["interrupted"]:
         raise typer.Exit(INTERRUPTED)

@@ -96,17 +96,15 @@ def design_sam(
 
         try:
             run_chains(search, chains, executor, on_block)
-        except KeyboardInterrupt:
-            interrupted = True
-            if not _keep(state, search, pupil, chains):
+        except (KeyboardInterrupt, Exception) as error:
+            interrupted = isinstance(error, KeyboardInterrupt)
+            go_on = _kept(state, search, pupil, chains)
+            if is_lost(error):
+                raise LowfcError(f"the workers were lost ({error!r}); {go_on}") from error
+            if interrupted and go_on == _NOTHING:
                 console.print(_NOTHING, highlight=False)
+            if not interrupted or go_on == _NOTHING:
                 raise
-        except Exception as error:
-            kept = _keep(state, search, pupil, chains)
-            if not is_lost(error):
-                raise
-            go_on = f"go on with --resume {state}" if kept else _NOTHING
-            raise LowfcError(f"the workers were lost ({error!r}); {go_on}") from error
     points = [point_of(search, chain) for chain in chains if chain.step]
     best = front(points) if search.sweeps else [min(points, key=lambda point: point.merit)]
     command = command_line("lowfc design sam", search)
@@ -130,16 +128,16 @@ def design_sam(
     }
 
 
-def _keep(state: Path, search: Search, pupil: str, chains: list[Chain]) -> bool:
-    """Write the state if any chain has come forward, else remove it; say which."""
+_NOTHING = f"no chain had finished its first {BLOCK} steps: nothing was found, nothing is written"
+
+
+def _kept(state: Path, search: Search, pupil: str, chains: list[Chain]) -> str:
+    """Write the state if any chain has come forward, else remove it; what can be done now."""
     if not any(chain.step for chain in chains):
         state.unlink()
-        return False
+        return _NOTHING
     write_state(state, search, pupil, chains)
-    return True
-
-
-_NOTHING = f"no chain had finished its first {BLOCK} steps: nothing was found, nothing is written"
+    return f"go on with --resume {state}"
 
 
 def run_chains(search: Search, chains: list[Chain], executor: Executor, on_block: Callable[[], None]) -> None:

@@ -3,11 +3,11 @@
 import io
 import json
 from collections.abc import Callable
-from dataclasses import asdict, dataclass
+from concurrent.futures import Future
+from dataclasses import asdict
 from pathlib import Path
-from queue import SimpleQueue
 from threading import Thread
-from typing import Any, TypeVar
+from typing import TypeVar
 
 import numpy as np
 from rich.console import Console
@@ -31,12 +31,36 @@ from lowfc.design.shaped_pupil import (
     stored,
 )
 from lowfc.optics.chain.pupil import from_quarter
+from lowfc.programs.cli.result import Result, figure
 from lowfc.programs.design.options import command_line
 
-Result = TypeVar("Result")
+Value = TypeVar("Value")
 
 
-def design_spc(wanted: Request, out: Path, plot: Path | None, console: Console) -> dict[str, Any]:
+class ShapedPupil(Result):
+    """What was found.
+
+    `below_optimum_at_limit_fraction` is how much more of the circle a mask could leave open that keeps to `limit` times
+    the contrast; with the contrast promised it may be more.
+    """
+
+    open_area_fraction: float = figure("open area", "of the circle", ".2%")
+    energy_fraction: float = figure("energy", "of the circle's light", ".2%")
+    focal_mask_fraction: float = figure("on the focal mask", "of that", ".2%")
+    focal_mask_radius_lambda_d: float = figure("its radius", "lambda/D", "g")
+    max_contrast: float = figure("largest contrast", form=".2e")
+    mean_contrast: float = figure("mean contrast", form=".2e")
+    contrast_step_lambda_d: float = figure("looked at every", "lambda/D", "g")
+    grey_cells_fraction: float = figure("grey cells", form=".2%")
+    below_optimum_at_limit_fraction: float
+    rounds: int = figure("solved", "linear programs")
+    points: int = figure("the last one with", "points")
+    file: str = figure("written to")
+    dtype: str = figure("stored as")
+    command: str = figure("found again by")
+
+
+def design_spc(wanted: Request, out: Path, plot: Path | None, console: Console) -> ShapedPupil:
     """Design a mask and write it.
 
     Args:
@@ -44,10 +68,6 @@ def design_spc(wanted: Request, out: Path, plot: Path | None, console: Console) 
         out: An npz file with `quarter`, which `load_pupil` reads, and `made_by`, the request as JSON.
         plot: Picture to be drawn, or None.
         console: Where progress goes.
-
-    Returns:
-        What was found. "below_optimum_at_limit_fraction" is how much more of the circle a mask could leave open that
-        keeps to `limit` times the contrast; with the contrast promised it may be more.
 
     Raises:
         ConfigurationError: No mask does that, and which nearest request is feasible; or the rounds did not suffice,
@@ -76,44 +96,22 @@ def design_spc(wanted: Request, out: Path, plot: Path | None, console: Console) 
     found = figures(quarter.astype(np.float64), wanted)
     if plot is not None:
         write_whole(plot, _picture(quarter.astype(np.float64), wanted))
-    return {
-        "file": str(out),
-        "dtype": str(quarter.dtype),
-        "command": command_line("lowfc design spc", wanted),
-        "open_area_fraction": found.open_area,
-        "energy_fraction": found.energy,
-        "focal_mask_fraction": found.focal_mask,
-        "focal_mask_radius_lambda_d": FOCAL_MASK_RADIUS,
-        "max_contrast": found.max_contrast,
-        "mean_contrast": found.mean_contrast,
-        "contrast_step_lambda_d": FINE_STEP,
-        "grey_cells_fraction": found.grey,
-        "below_optimum_at_limit_fraction": last.bound - last.open_area,
-        "rounds": len(rounds),
-        "points": last.points,
-    }
-
-
-def render(result: dict[str, Any]) -> str:
-    """The result of `design_spc` as text."""
-    lines = (
-        ("open area", f"{result['open_area_fraction']:.2%} of the circle"),
-        ("energy", f"{result['energy_fraction']:.2%} of the circle's light"),
-        (
-            "in the focal-plane mask",
-            f"{result['focal_mask_fraction']:.2%} of that (disk, {result['focal_mask_radius_lambda_d']:g} lambda/D)",
-        ),
-        (
-            "contrast",
-            f"max {result['max_contrast']:.2e}, mean {result['mean_contrast']:.2e} "
-            f"(every {result['contrast_step_lambda_d']:g} lambda/D)",
-        ),
-        ("grey cells", f"{result['grey_cells_fraction']:.2%}"),
-        ("solved", f"{result['rounds']} programs, the last with {result['points']} points"),
-        ("written", f"{result['file']} ({result['dtype']})"),
-        ("again", result["command"]),
+    return ShapedPupil(
+        file=str(out),
+        dtype=str(quarter.dtype),
+        command=command_line("lowfc design spc", wanted),
+        open_area_fraction=found.open_area,
+        energy_fraction=found.energy,
+        focal_mask_fraction=found.focal_mask,
+        focal_mask_radius_lambda_d=FOCAL_MASK_RADIUS,
+        max_contrast=found.max_contrast,
+        mean_contrast=found.mean_contrast,
+        contrast_step_lambda_d=FINE_STEP,
+        grey_cells_fraction=found.grey,
+        below_optimum_at_limit_fraction=last.bound - last.open_area,
+        rounds=len(rounds),
+        points=last.points,
     )
-    return "\n".join(f"{name:<24} {value}" for name, value in lines)
 
 
 def _rounds(wanted: Request, console: Console) -> list[Round]:
@@ -141,41 +139,32 @@ def _infeasible(wanted: Request, inner: float | None, contrast: float | None) ->
     )
 
 
-@dataclass
-class _Outcome:
-    value: Any = None
-    error: BaseException | None = None
-
-
-def _interruptibly(work: Callable[[], Result]) -> Result:
+def _interruptibly(work: Callable[[], Value]) -> Value:
     """Do work in a thread, for Ctrl-C waits for the end of a program where the main thread solves it.
 
     Raises:
         ConfigurationError: The solver gave up.
     """
-    outcomes: SimpleQueue[_Outcome] = SimpleQueue()
+    future: Future[Value] = Future()
 
     def run() -> None:
         try:
             with threadpool_limits(1):
-                outcomes.put(_Outcome(work()))
+                future.set_result(work())
         except BaseException as error:
-            outcomes.put(_Outcome(error=error))
+            future.set_exception(error)
 
     Thread(target=run, daemon=True).start()
-    outcome = outcomes.get()
-    if isinstance(outcome.error, NotSolvedError):
-        raise ConfigurationError(str(outcome.error)) from outcome.error
-    if outcome.error is not None:
-        raise outcome.error
-    value: Result = outcome.value
-    return value
+    try:
+        return future.result()
+    except NotSolvedError as error:
+        raise ConfigurationError(str(error)) from error
 
 
 def _picture(quarter: Array, wanted: Request) -> bytes:
     """Mask, image on a log scale with the dark zone outlined, and contrast against angle (PNG)."""
-    figure = figure_class()(figsize=(15, 4.6), layout="constrained")
-    mask, image, curve = figure.subplots(1, 3)
+    drawing = figure_class()(figsize=(15, 4.6), layout="constrained")
+    mask, image, curve = drawing.subplots(1, 3)
     mask.imshow(from_quarter(quarter, 2 * len(quarter)), cmap="gray", extent=(-0.5, 0.5, -0.5, 0.5))
     mask.set(title="shaped pupil", xlabel="x (D)", ylabel="y (D)")
 
@@ -192,7 +181,7 @@ def _picture(quarter: Array, wanted: Request) -> bytes:
     for side in (-1.0, 1.0):
         image.plot(side * radii * np.cos(outline), radii * np.sin(outline), "c-", linewidth=0.8)
     image.set(title="image, log10 of contrast", xlabel="x (lambda/D)", ylabel="y (lambda/D)")
-    figure.colorbar(drawn, ax=image)
+    drawing.colorbar(drawn, ax=image)
 
     axis, zone = fine_grid(wanted.zone)
     contrast = relative_field(quarter, axis) ** 2
@@ -206,4 +195,4 @@ def _picture(quarter: Array, wanted: Request) -> bytes:
     curve.axhline(wanted.contrast, color="k", linestyle=":", label="promised")
     curve.set(title="contrast", xlabel="angle (lambda/D)", ylim=(10.0**floor, 1.0), xlim=(0.0, wanted.outer))
     curve.legend()
-    return png(figure)
+    return png(drawing)

@@ -166,10 +166,12 @@ class ChaosBench:
         """Wait for a random time."""
         time.sleep(self.rng.uniform(shortest_s, longest_s))
 
-    def view(self) -> None:
-        """Start a viewer that writes into a file."""
-        words = ["-m", "lowfc", "view", "--run", self.run.run_id, "--save", str(self.folder / "view.rrd")]
-        self._start(program(Role.VIEWER, words, self.folder / f"{Role.VIEWER}.stderr"), ready=True)
+    def process(self, role: Role) -> str:
+        """Name of the process with a role; a viewer, which writes into a file, is started first."""
+        if role is Role.VIEWER:
+            words = ["-m", "lowfc", "view", "--run", self.run.run_id, "--save", str(self.folder / "view.rrd")]
+            self._start(program(role, words, self.folder / f"{role}.stderr"), ready=True)
+        return self.mirror if role is Role.MIRROR else str(role)
 
     def kill(self, name: str) -> None:
         """Kill -9."""

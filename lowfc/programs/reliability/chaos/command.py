@@ -1,6 +1,5 @@
 """The command `lowfc chaos`: faults done to the real processes, and what came of it."""
 
-import json
 import os
 import random
 import shutil
@@ -15,9 +14,11 @@ import typer
 
 from lowfc.adapters.process.terminal import INTERRUPTED, Json
 from lowfc.contract.errors import ConfigurationError, LowfcError, nearest
+from lowfc.programs.cli.output import put
 
 if TYPE_CHECKING:
     from lowfc.contract.configuration import Configuration
+    from lowfc.programs.reliability.chaos.bench import Left
     from lowfc.programs.reliability.chaos.case import Case
 
 FAILED_LOGS = Path("chaos-logs")
@@ -63,7 +64,7 @@ def chaos(
     except KeyboardInterrupt:
         interrupted = True  # what is known is printed all the same
     figures = {"seed": seed, "asked": len(names), **counts(rows), "cases": rows}
-    sys.stdout.write(json.dumps(figures) + "\n" if as_json else render(figures))
+    put(figures, render(figures), as_json=as_json)
     if interrupted:
         raise typer.Exit(INTERRUPTED)
     if figures["failed"]:
@@ -78,7 +79,9 @@ def run_case(case: "Case", seed: int, keep: Path | None) -> dict[str, Any]:
         return row
     begun_s, folder = time.monotonic(), Path(tempfile.mkdtemp(prefix=f"lowfc-chaos-{case.name}-"))
     try:
-        row |= _judged(case, folder, random.Random(f"{seed} {case.name}"))  # noqa: S311  # nothing secret
+        row |= _judged(_run(case, folder, random.Random(f"{seed} {case.name}")), case)  # noqa: S311  # nothing secret
+    except Exception as error:  # a mistake of ours fails this case alone
+        row["findings"] = {"error": {"held": False, "found": _in_one_line(error, folder)}}
     finally:
         if keep is not None or (row["findings"] and not row["passed"]):
             kept = (keep or FAILED_LOGS) / f"{case.name}-{seed}"
@@ -89,22 +92,16 @@ def run_case(case: "Case", seed: int, keep: Path | None) -> dict[str, Any]:
     return row | {"seconds": time.monotonic() - begun_s}
 
 
-def _judged(case: "Case", folder: Path, rng: random.Random) -> dict[str, Any]:
-    """What came of a case; a mistake of ours on the way is a finding, with its traceback in the case's folder."""
+def _judged(left: "Left", case: "Case") -> dict[str, Any]:
     from lowfc.programs.reliability.chaos.evidence import read
     from lowfc.programs.reliability.chaos.rules import judge, recovered_s, restart_steps_nm
 
-    try:
-        left = _run(case, folder, rng)
-        evidence = read(folder)
-        findings = judge(case, left, evidence)
-        figures = dict(left.figures)
-        if steps_nm := restart_steps_nm(evidence):
-            figures["restart_step_nm"] = round(max(steps_nm), 3)
-        if (seconds := recovered_s(left, evidence)) is not None:
-            figures["recovered_s"] = round(seconds, 3)
-    except Exception as error:
-        return {"findings": {"error": {"held": False, "found": _told(error, folder)}}}
+    evidence = read(left.folder)
+    findings, figures = judge(case, left, evidence), dict(left.figures)
+    if steps_nm := restart_steps_nm(evidence):
+        figures["restart_step_nm"] = round(max(steps_nm), 3)
+    if (seconds := recovered_s(left, evidence)) is not None:
+        figures["recovered_s"] = round(seconds, 3)
     return {
         "passed": all(finding.held for finding in findings),
         "findings": {one.rule: {"held": one.held, "found": one.found} for one in findings},
@@ -112,14 +109,14 @@ def _judged(case: "Case", folder: Path, rng: random.Random) -> dict[str, Any]:
     }
 
 
-def _told(error: Exception, folder: Path) -> str:
-    """An error in one line; where it comes from is written into the case's folder."""
+def _in_one_line(error: Exception, folder: Path) -> str:
+    """An error in one line; its traceback is written into the case's folder."""
     with (folder / "error.txt").open("a") as file:
         traceback.print_exception(error, file=file)
     return str(error) if isinstance(error, LowfcError) else f"{type(error).__name__}: {error}"
 
 
-def _run(case: "Case", folder: Path, rng: random.Random) -> Any:
+def _run(case: "Case", folder: Path, rng: random.Random) -> "Left":
     """Run a case; what goes wrong on the way is noted, and the processes end whatever happens."""
     from lowfc.programs.reliability.chaos.bench import ChaosBench
     from lowfc.programs.reliability.chaos.frames import FIRST, STRUCK
@@ -130,7 +127,7 @@ def _run(case: "Case", folder: Path, rng: random.Random) -> Any:
         bench.begin()
         case.play(bench)
     except Exception as error:
-        bench.left.notes.append(_told(error, folder))
+        bench.left.notes.append(_in_one_line(error, folder))
     finally:
         bench.end()
     return bench.left
@@ -175,4 +172,4 @@ def render(figures: dict[str, Any]) -> str:
     if not_run := figures["asked"] - len(figures["cases"]):
         ended.append(f"{not_run} not run")
     lines.append(f"{', '.join(ended)}, seed {figures['seed']}")
-    return "\n".join(lines) + "\n"
+    return "\n".join(lines)

@@ -1,7 +1,10 @@
 """Chaos cases: gains, calibrations, safe mode and clocks."""
 
+import contextlib
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from functools import partial
+from pathlib import Path
 
 import numpy as np
 
@@ -15,12 +18,11 @@ from lowfc.control.calibration.calibration import Calibration
 from lowfc.control.laws.stability import limiting_gain
 from lowfc.programs.reliability.chaos.bench import CaseFailedError, ChaosBench
 from lowfc.programs.reliability.chaos.case import LOST, WHILE_FRAMES, End, case, no_mounts, no_other_clock, read_only
-from lowfc.programs.reliability.chaos.processes import kill_and_restart
+from lowfc.programs.reliability.chaos.processes import killed
 
 control_case = partial(case, "control")
 
 JUST_BELOW = 0.9
-_UNKEPT = ("SAFED", "LATCH_FAILED")
 
 
 @control_case("gain", "the highest gain that is granted, then one above, refused")
@@ -117,42 +119,38 @@ def _damaged_calibration(bench: ChaosBench) -> None:
 def _restart_in_safe_mode(bench: ChaosBench) -> None:
     bench.client().safe()
     bench.frames(WHILE_FRAMES)
-    kill_and_restart(bench, Role.CONTROLLER)
+    killed(Role.CONTROLLER)(bench)
 
 
-def _safe_and_kill(bench: ChaosBench, client: Client) -> None:
-    client.safe()
-    bench.frames(WHILE_FRAMES)
-    bench.kill(Role.CONTROLLER)
+@contextlib.contextmanager
+def _moved_away(folder: Path) -> Iterator[None]:
+    aside = folder.rename(folder.with_name(f"{folder.name}.aside"))
+    try:
+        yield
+    finally:
+        aside.rename(folder)
 
 
-@control_case(
+def _safe_while(unkept: Callable[[Path], contextlib.AbstractContextManager[None]], bench: ChaosBench) -> None:
+    """Enter safe mode and kill the controller while the run's directory cannot keep it; then start it anew."""
+    client = bench.client()
+    with unkept(bench.run.path):
+        client.safe()
+        bench.frames(WHILE_FRAMES)
+        bench.kill(Role.CONTROLLER)
+    bench.restart(Role.CONTROLLER)
+
+
+unkept_case = partial(control_case, expected=("SAFED", "LATCH_FAILED"), end=End.SAFE)
+unkept_case(
     "safe-without-directory",
     "safe while the run's directory is gone; then the controller is killed and started anew",
-    expected=_UNKEPT,
-    end=End.SAFE,
-)
-def _safe_without_directory(bench: ChaosBench) -> None:
-    path, client = bench.run.path, bench.client()
-    aside = path.rename(path.with_name(f"{path.name}.aside"))
-    try:
-        _safe_and_kill(bench, client)
-    finally:
-        aside.rename(path)
-    bench.restart(Role.CONTROLLER)
-
-
-@control_case(
+)(partial(_safe_while, _moved_away))
+unkept_case(
     "safe-read-only",
     "safe while the run's directory cannot be written; then the controller is killed and started anew",
-    expected=_UNKEPT,
-    end=End.SAFE,
     lacks=no_mounts,
-)
-def _safe_in_read_only_directory(bench: ChaosBench) -> None:
-    with read_only(bench.run.path):
-        _safe_and_kill(bench, bench.client())
-    bench.restart(Role.CONTROLLER)
+)(partial(_safe_while, read_only))
 
 
 def _other_clock(bench: ChaosBench, seconds: int) -> None:

@@ -10,16 +10,16 @@ import numpy as np
 from lowfc.adapters.bus.bus import Sample
 from lowfc.contract.messages import TIMING, Role, wire
 from lowfc.programs.reliability.chaos.bench import ChaosBench
-from lowfc.programs.reliability.chaos.case import LOST, case
+from lowfc.programs.reliability.chaos.case import LOST, Act, case
 
-process_case = partial(case, "processes")
+process_case = partial(case, "processes", allowed=LOST)
 
 STALL_S = 10.0
 CALM_S = STALL_S / 2
 """Before a stall, and after it: together as many frames as during it."""
 STRIKES = 6
-SILENT_S = 1.0
 _AFTER_S = 0.3
+_STATIC = {"disturbance.static_nm": {"4": 40.0}}
 
 # What the log must have of a process that was killed, and of one that stood still.
 _EVENTS: dict[Role, tuple[tuple[str, ...], tuple[str, ...]]] = {
@@ -31,88 +31,70 @@ _EVENTS: dict[Role, tuple[tuple[str, ...], tuple[str, ...]]] = {
 }
 
 
-def _name(bench: ChaosBench, role: Role) -> str:
-    if role is Role.VIEWER:
-        bench.view()
-    return bench.mirror if role is Role.MIRROR else str(role)
+def killed(role: Role, after_s: tuple[float, float] = (0.1, 1.0)) -> Act:
+    """Kill a process, and start it anew between so many seconds later."""
+
+    def act(bench: ChaosBench) -> None:
+        name = bench.process(role)
+        bench.pause(0.0, 0.5)
+        bench.kill(name)
+        bench.pause(*after_s)
+        bench.restart(name)
+
+    return act
 
 
-def kill_and_restart(bench: ChaosBench, name: str) -> None:
-    """Kill a process, and start it anew after a while."""
-    bench.pause(0.0, 0.5)
-    bench.kill(name)
-    bench.pause(0.1, 1.0)
-    bench.restart(name)
+def frozen(role: Role, for_s: tuple[float, float] = (0.5, 2.0)) -> Act:
+    """Stop a process by SIGSTOP, and let it go on between so many seconds later."""
+
+    def act(bench: ChaosBench) -> None:
+        name = bench.process(role)
+        bench.pause(0.0, 0.5)
+        with bench.stopped(name):
+            bench.pause(*for_s)
+
+    return act
 
 
-def _killed(bench: ChaosBench, role: Role) -> None:
-    kill_and_restart(bench, _name(bench, role))
-
-
-def _frozen(bench: ChaosBench, role: Role) -> None:
-    name = _name(bench, role)
-    bench.pause(0.0, 0.5)
-    with bench.stopped(name):
-        bench.pause(0.5, 2.0)
-
-
-for _role, (_seen, _missed) in _EVENTS.items():
-    _sentence = f"kill -9 of the {_role}, started anew up to 1 s later"
-    process_case(f"kill-{_role}", _sentence, expected=_seen, allowed=LOST)(partial(_killed, role=_role))
-for _role, (_seen, _missed) in _EVENTS.items():
-    _sentence = f"SIGSTOP of the {_role}, SIGCONT 0.5 to 2 s later"
-    process_case(f"freeze-{_role}", _sentence, expected=_missed, allowed=LOST)(partial(_frozen, role=_role))
-
-
-@process_case(
+for _role, (_seen, _) in _EVENTS.items():
+    process_case(f"kill-{_role}", f"kill -9 of the {_role}, started anew up to 1 s later", expected=_seen)(
+        killed(_role)
+    )
+for _role, (_, _seen) in _EVENTS.items():
+    process_case(f"freeze-{_role}", f"SIGSTOP of the {_role}, SIGCONT 0.5 to 2 s later", expected=_seen)(frozen(_role))
+process_case(
     "silent-camera",
     "kill -9 of the camera, with the mirror to be relaxed meanwhile; started anew after a second",
-    config={"control.on_frame_timeout": "flat", "disturbance.static_nm": {"4": 40.0}},
+    config={"control.on_frame_timeout": "flat", **_STATIC},
     expected=("NO_FRAMES", "CAMERA_RESTARTED"),
-    allowed=LOST,
-)
-def _silenced(bench: ChaosBench) -> None:
-    bench.kill(Role.CAMERA)
-    time.sleep(SILENT_S)
-    bench.restart(Role.CAMERA)
-
-
-@process_case(
+)(killed(Role.CAMERA, (1.0, 1.0)))
+process_case(
     "lost-mirror",
     "kill -9 of the mirror under a disturbance that stays; started anew after 3 s",
-    config={"disturbance.static_nm": {"4": 40.0}},
+    config=_STATIC,
     expected=("MIRROR_LOST", "MIRROR_BACK"),
-    allowed=LOST,
-)
-def _lost_mirror(bench: ChaosBench) -> None:
-    bench.kill(bench.mirror)
-    time.sleep(3 * SILENT_S)
-    bench.restart(bench.mirror)
+)(killed(Role.MIRROR, (3.0, 3.0)))
 
 
-@process_case("random", "six kills or stops of any of them, at random times", allowed=LOST)
+@process_case("random", "six kills or stops of any of them, at random times")
 def _at_random(bench: ChaosBench) -> None:
-    names = [str(Role.CAMERA), str(Role.CONTROLLER), bench.mirror, str(Role.RECORDER)]
     for _ in range(STRIKES):
-        name = bench.rng.choice(names)
-        if bench.rng.random() < 0.5:
-            kill_and_restart(bench, name)
-        else:
-            with bench.stopped(name):
-                bench.pause(0.1, 1.0)
+        role = bench.rng.choice((Role.CAMERA, Role.CONTROLLER, Role.MIRROR, Role.RECORDER))
+        act = killed(role) if bench.rng.random() < 0.5 else frozen(role, (0.1, 1.0))
+        act(bench)
         bench.pause(0.0, 1.0)
 
 
-@process_case("stall-recorder", "the recorder stands still for 10 s", allowed=LOST)
+@process_case("stall-recorder", "the recorder stands still for 10 s")
 def _stalled_recorder(bench: ChaosBench) -> None:
     compare(bench, partial(bench.stopped, Role.RECORDER))
 
 
-@process_case("stall-viewer", "the viewer stands still for 10 s", allowed=LOST)
+@process_case("stall-viewer", "the viewer stands still for 10 s")
 def _stalled_viewer(bench: ChaosBench) -> None:
-    bench.view()
+    name = bench.process(Role.VIEWER)
     bench.settled()
-    compare(bench, partial(bench.stopped, Role.VIEWER))
+    compare(bench, partial(bench.stopped, name))
 
 
 def compare(bench: ChaosBench, stall: Callable[[], contextlib.AbstractContextManager[None]]) -> None:
@@ -127,9 +109,9 @@ def compare(bench: ChaosBench, stall: Callable[[], contextlib.AbstractContextMan
         time.sleep(_AFTER_S)  # what is on its way belongs to the time before
         latencies_ns.clear()
         time.sleep(seconds)
-        if taken := list(latencies_ns):
-            p50, p99 = (np.percentile(taken, (50, 99)) / 1e3).round(1).tolist()
-            found[name] = {"frames": len(taken), "p50_us": p50, "p99_us": p99}
+        if latencies_ns:
+            p50, p99 = (np.percentile(latencies_ns, (50, 99)) / 1e3).round(1).tolist()
+            found[name] = {"frames": len(latencies_ns), "p50_us": p50, "p99_us": p99}
 
     assert bench.bus is not None  # noqa: S101  # it has begun
     bench.bus.subscribe(TIMING, receive)

@@ -1,12 +1,11 @@
 """The command `lowfc soak`: does anything grow, drift or get lost in hours?"""
 
-import json
-import sys
 from typing import Annotated
 
 import typer
 
 from lowfc.adapters.process.terminal import ConfigFile, Json, configuration
+from lowfc.programs.cli.output import put
 
 
 def soak(
@@ -36,6 +35,6 @@ def soak(
     with passing_bar(Console(stderr=True)) as bar:
         task = bar.add_task("soaking", total=hours * 3600)
         figures = soak_loop(settings, hours * 3600, lambda elapsed_s: bar.update(task, completed=elapsed_s))
-    sys.stdout.write(json.dumps(figures, allow_nan=False) + "\n" if as_json else render(figures))
+    put(figures, render(figures), as_json=as_json)
     if not figures["passed"]:
         raise typer.Exit(1)

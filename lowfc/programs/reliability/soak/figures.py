@@ -7,6 +7,7 @@ import numpy as np
 from scipy import stats
 
 from lowfc.control.loop.wording import counted
+from lowfc.programs.cli.result import table
 
 BLOCKS = 12
 """Means over which a slope is fitted: neighbouring samples are not independent, means of many nearly are."""
@@ -56,20 +57,13 @@ def of_process(samples: Sequence[Usage]) -> dict[str, Any]:
         leaks = memory[0] > SIGNIFICANT * memory[1] and memory[0] * counted_hours > LEAST_GROWTH_MB
         grown = {"memory": leaks, "handles": _more(handles), "threads": _more(threads)}
         grows, too_short = [name for name, grew in grown.items() if grew], []
-    return {
-        "memory_first_mb": round(memory_mb[0], 2),
-        "memory_last_mb": round(memory_mb[-1], 2),
-        "memory_most_mb": round(max(memory_mb), 2),
-        **_per_hour("memory_mb", memory),
-        "handles_first": handles[0],
-        "handles_most": max(handles),
-        "handles_last": handles[-1],
-        "threads_first": threads[0],
-        "threads_most": max(threads),
-        "threads_last": threads[-1],
-        "grows": grows,
-        "too_short": too_short,
+    measured = {"memory": [round(one, 2) for one in memory_mb], "handles": handles, "threads": threads}
+    ends = {
+        f"{what}_{at}{'_mb' * (what == 'memory')}": value
+        for what, values in measured.items()
+        for at, value in (("first", values[0]), ("most", max(values)), ("last", values[-1]))
     }
+    return {**ends, **_per_hour("memory_mb", memory), "grows": grows, "too_short": too_short}
 
 
 def of_latency(samples: Sequence[tuple[float, float, float]]) -> dict[str, float | None]:
@@ -101,34 +95,38 @@ def verdict(figures: Mapping[str, Any]) -> str:
     return f"{TOO_SHORT}: {', '.join(figures['too_short'])}" if figures["too_short"] else "passed"
 
 
-def told_latency(latency: Mapping[str, float | None]) -> str:
-    """The latencies and how they change, in words."""
+def latency_in_words(latency: Mapping[str, float | None]) -> str:
+    """The latencies and how they change."""
     words = []
     for name in ("p50", "p99"):
         value_us, per_hour, error = (latency[f"{name}_us{end}"] for end in ("", "_per_hour", "_per_hour_error"))
-        change = TOO_SHORT if per_hour is None else f"{per_hour:+.1f} +- {error:.1f} us per hour"
+        change = _change(per_hour, error, "+.1f", " us per hour")
         words.append(f"{name} {TOO_SHORT}" if value_us is None else f"{name} {value_us:.0f} us, {change}")
     return "; ".join(words)
 
 
+def _change(per_hour: float | None, error: float | None, form: str, unit: str = "") -> str:
+    return TOO_SHORT if per_hour is None else f"{per_hour:{form}} +- {error:{form.removeprefix('+')}}{unit}"
+
+
 def render(figures: dict[str, Any]) -> str:
     """For people."""
-    lines = [f"{'process':<11} {'memory, MB':>22} {'MB per hour':>20} {'handles':>14} {'threads':>10}"]
-    for name, one in figures["processes"].items():
-        slope_mb, error_mb = one["memory_mb_per_hour"], one["memory_mb_per_hour_error"]
-        change = f"{TOO_SHORT:>20}" if slope_mb is None else f"{slope_mb:>11.2f} +- {error_mb:<5.2f}"
-        lines.append(
-            f"{name:<11} {one['memory_first_mb']:>9.1f} -> {one['memory_last_mb']:>9.1f} {change} "
-            f"{one['handles_first']:>6} -> {one['handles_last']:<4} "
-            f"{one['threads_first']:>3} -> {one['threads_last']:<3}"
+    rows = [
+        (
+            name,
+            f"{one['memory_first_mb']:.1f} -> {one['memory_last_mb']:.1f}",
+            _change(one["memory_mb_per_hour"], one["memory_mb_per_hour_error"], ".2f"),
+            *(f"{one[f'{what}_first']} -> {one[f'{what}_last']}" for what in ("handles", "threads")),
         )
-    lines += [
-        f"frame to command: {told_latency(figures['latency'])}",
-        f"{counted(figures['frames_published'], 'frame')}, {figures['frames_skipped']} skipped, "
-        f"{figures['frames_missing']} missing; "
-        f"{counted(figures['messages_recorded'], 'message')} in {counted(figures['logs'], 'log')}, "
-        f"{figures['messages_lost']} lost, "
-        f"{figures['gaps']} gaps",
-        verdict(figures),
+        for name, one in figures["processes"].items()
     ]
-    return "\n".join(lines) + "\n"
+    return "\n".join(
+        [
+            *table(("process", "memory, MB", "MB per hour", "handles", "threads"), rows),
+            f"frame to command: {latency_in_words(figures['latency'])}",
+            f"{counted(figures['frames_published'], 'frame')}, {figures['frames_skipped']} skipped, "
+            f"{figures['frames_missing']} missing; {counted(figures['messages_recorded'], 'message')} in "
+            f"{counted(figures['logs'], 'log')}, {figures['messages_lost']} lost, {figures['gaps']} gaps",
+            verdict(figures),
+        ]
+    )
