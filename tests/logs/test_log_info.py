@@ -110,7 +110,7 @@ def test_a_person_reads_the_same(log: Path) -> None:
     for words in (
         "complete",
         "2026-01-01T00:00:00.000+00:00, 10.000 s",
-        "203; 7 missing by their counts, the recorder says that it lost 4",
+        "203; 7 missing by their counts, the recorder counted as lost 4",
         "open, closed",
         "CAMERA_RESTARTED 2, MESSAGES_LOST 1",
         "config.toml (7 bytes)",

@@ -1,4 +1,4 @@
-"""A chunk of a log: what its head says, and its content, checked, whatever tool compressed it."""
+"""A chunk of a log: its head and its content, checked, whatever tool compressed it."""
 
 import re
 import struct
@@ -25,7 +25,7 @@ _LONGEST_NAME = 40
 
 
 class UnsoundError(Exception):
-    """What stands here is not what was written; the text says why."""
+    """A part of a log is not as it was written; the text is why."""
 
 
 class CompressionError(UnsoundError):
@@ -80,7 +80,7 @@ def read_chunk(body: bytes, at: int, *, may_lack_crc: bool = False) -> Chunk:
     Args:
         body: of the record, behind its opcode and length.
         at: position of the record in the file.
-        may_lack_crc: accept one that says that no checksum was computed.
+        may_lack_crc: accept one without a checksum.
 
     Raises:
         UnsoundError: it is not as it was written.

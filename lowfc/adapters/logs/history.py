@@ -1,4 +1,4 @@
-"""The history of a run, as columns: what a log says of every step, for reports, exports and what-ifs.
+"""The history of a run, as columns: everything that a log has of every step, for reports, exports and what-ifs.
 
 Frames are not in it (read them from the log); everything else that is known of a frame is one row.
 """
@@ -72,7 +72,7 @@ class MirrorStates:
 
     Attributes:
         sequence: of the frame behind the command applied.
-        publish_time_ns: when the mirror said that it was there.
+        publish_time_ns: when the mirror reported it.
         stroke_nm: largest deviation of an actuator from flat.
         limits: bit `1 << reason` for each of the mirror's own limits that acted.
         highest_nm, lowest_nm: (rows, columns) extremes of each actuator over the run.
@@ -88,7 +88,7 @@ class MirrorStates:
 
 @dataclass
 class History:
-    """Everything a log says of a run, but the frames.
+    """Everything that a log has of a run, but the frames.
 
     Attributes:
         log: the reader, read to its end: metadata, attachments, whether the log is complete.

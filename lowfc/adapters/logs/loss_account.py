@@ -23,7 +23,7 @@ class _Tally:
     """Messages of one topic of one start of one publisher; counts as in their envelopes.
 
     Attributes:
-        published: by its own last word, in which one that it sent twice is two.
+        published: by its own last count, in which one that it sent twice is two.
         twice: of those recorded, messages that had come before.
         safe: recorded, and twice, flushed since.
     """
@@ -59,10 +59,10 @@ class _Tally:
 
 
 class LossAccount:
-    """Which messages there were: by the counts of those that arrived, and by what their publishers say they sent.
+    """Which messages there were: by the counts of those that arrived, and by their publishers' own counts.
 
     Attributes:
-        names: on the topics; who enters messages admits their names before.
+        names: on the topics; the caller admits a message's name before it enters the message.
         starts: how many starts of publishers have been counted, of each topic apart.
     """
 
@@ -86,7 +86,7 @@ class LossAccount:
         tally.enter(count, recorded=recorded or unwanted, unwanted=unwanted)
 
     def believe(self, sample: Sample, health: wire.Health) -> None:
-        """Take over what a publisher says it sent; what it sent before it was first heard does not count as lost.
+        """Take over a publisher's own counts; what it sent before its first message arrived does not count as lost.
 
         Raises:
             BadMessageError: it names what there is no room for; what comes after that is left out.

@@ -220,11 +220,11 @@ def _time(path: Path) -> str:
 
 
 def _place(path: Path) -> tuple[tuple[str, ...], int]:
-    """Recording that a file belongs to (nothing where it does not say, as before 0.2), and its number there."""
+    """Recording that a file belongs to (none in files of 0.1), and its number there."""
     try:
         metadata = metadata_at_start(path)
     except DataFileError:
-        return (), 1  # whoever reads it says what is wrong
+        return (), 1  # reading it raises this again
     entries = metadata.get(PART, {})
     number, of = entries.get("number", ""), entries.get("of", "")
     if not of or not re.fullmatch("[1-9][0-9]{0,8}", number):

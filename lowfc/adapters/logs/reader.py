@@ -55,10 +55,10 @@ class LogReader:
         schemas: those declared so far, by id.
         channels: those declared so far, by key and start of the publisher.
         damage: what was left out because it is damaged.
-        unreadable: messages left out because what declares them was in one of those.
+        unreadable: messages left out because their declaration was damaged.
         finished: it ends as a log that was finished ends, whatever is before; False for one whose recorder died.
         complete: the end was reached, and the summary there is sound; False while reading.
-        progress: is told now and then how many bytes of how many are read.
+        progress: called now and then with the bytes read and their total.
     """
 
     progress: Callable[[int, int], None] | None = None
@@ -221,7 +221,7 @@ class LogReader:
         if self._declared.setdefault(channel.id, channel) != channel:
             raise UnsoundError(f"channel {channel.id} is declared a second time, and not as before")
         if channel.schema_id not in self.schemas:
-            return  # its declaration was in a damaged chunk: what its messages are cannot be said
+            return  # the schema's declaration was in a damaged chunk: its messages are unreadable
         given = channel.metadata.get(START_KEY, "0")
         start_s = int(given) if re.fullmatch("[0-9]{1,10}", given) else -1
         if not 0 <= start_s < 1 << COUNT_BITS:

@@ -112,7 +112,7 @@ class LogFile:
         return Chunk(self._summary, len(content), zlib.crc32(content), content)
 
     def index(self) -> Iterator[ChunkIndex]:
-        """What the summary says of each chunk, in the order of the file; nothing unless it is sound."""
+        """The summary's index of each chunk, in the order of the file; none unless it is sound."""
         for record in self._in_summary(Opcode.CHUNK_INDEX):
             yield parsed(ChunkIndex, record[HEAD.size :])
 
@@ -263,7 +263,7 @@ class LogFile:
         return None
 
     def _is_ours(self) -> bool:
-        """Whether the recorder wrote this file, with every checksum; another tool says so in the header."""
+        """Whether the recorder wrote this file, with every checksum; another tool's name is in the header."""
         head = self._read(len(MAGIC), HEAD.size)
         opcode, length = HEAD.unpack(head) if len(head) == HEAD.size else (0, 0)
         if opcode != Opcode.HEADER or length > _BLOCK_BYTES:

@@ -13,7 +13,7 @@ from lowfc.adapters.logs.writer import UNFINISHED, being_recorded, stem_of
 from lowfc.contract.errors import DataFileError
 
 RECOVERY = "recovery"
-"""Name of the metadata that says what a recovered log was made from."""
+"""Name of the metadata with what a recovered log was made from."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -26,7 +26,7 @@ class Recovery:
         finished: it had been finished.
         recovered: the new log; None where the log is whole.
         messages: in the new log.
-        unreadable: messages left out because what declares them was in one of those.
+        unreadable: messages left out because their declaration was damaged.
         damage: what was left out.
     """
 
@@ -71,7 +71,7 @@ def recover(source: Path, out: Path, progress: Callable[[int, int], None] | None
     Args:
         source: a log, finished or not.
         out: a file that is not there yet.
-        progress: is told how many bytes of how many are done.
+        progress: called with the bytes done and their total.
 
     Raises:
         DataFileError: `source` is no log or is being recorded, `out` is there already, or the disk refuses.
@@ -98,7 +98,7 @@ def recover(source: Path, out: Path, progress: Callable[[int, int], None] | None
 
 
 def account(reader: LogReader, messages: int) -> dict[str, str]:
-    """What is said in a copy of a log that is not whole, of that log."""
+    """Metadata for a copy of a damaged or unfinished log."""
     return {
         "source": reader.path.name,
         "source_bytes": str(reader.size),
@@ -128,6 +128,6 @@ def no_end(paths: Sequence[Path], *, finished: bool) -> str:
 
 
 def faults(damaged: Sequence[str], no_end: str) -> list[str]:
-    """Lines for a person on what is not as it should be in a log that was read."""
+    """Lines for a person on what is missing in a log that was read."""
     lines = [f"truncated          {no_end}"] if no_end else []
     return lines + [f"damaged            left out: {part}" for part in damaged]

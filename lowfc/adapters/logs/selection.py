@@ -16,7 +16,7 @@ from lowfc.contract.errors import ConfigurationError, nearest
 from lowfc.contract.messages import FRAME, MIRROR_STATE, TOPICS, Topic, wire
 
 SELECTION = "selection"
-"""Name of the metadata that says what was left out; a log without it has everything."""
+"""Name of the metadata with what was left out; a log without it has everything."""
 
 _FEWER = {FRAME: "frames", MIRROR_STATE: "mirror states"}
 """Topics of which every Nth message is recorded."""
@@ -36,7 +36,7 @@ class Selection:
 
     @classmethod
     def of(cls, metadata: Mapping[str, Mapping[str, str]]) -> "Selection":
-        """Selection of a log, by the metadata at its start; everything where it says nothing that can be read."""
+        """Selection of a log, by the metadata at its start; everything where that cannot be read."""
         entries = metadata.get(SELECTION, {})
         every, keys = entries.get("every", ""), entries.get("left_out", "").split()
         return cls(

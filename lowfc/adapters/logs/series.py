@@ -31,7 +31,7 @@ class Limits:
 
 
 STANDARD = Limits()
-_TELLING_S = 10.0  # of a recording, after which its growth is that of the loop and not of its beginning
+_TELLING_S = 10.0  # after the start of a recording; then its growth is that of the loop
 
 
 class LogSeries:
@@ -123,7 +123,7 @@ class LogSeries:
         return True
 
     def flush(self) -> None:
-        """Flush the log, and hear how it went with the one before.
+        """Flush the log, and raise what went wrong with the one before.
 
         Raises:
             DataFileError: the disk refuses; see `give_up`.
@@ -134,7 +134,7 @@ class LogSeries:
             self._finished()
 
     def shortage(self) -> str:
-        """What to say where the disk is too full to go on; empty where it is not.
+        """Sentence for a person where the disk is too full to go on; empty where it is not.
 
         Raises:
             DataFileError: the folder is not there.
@@ -207,7 +207,7 @@ def _finish(log: LogWriter, figures: Mapping[str, str]) -> int:
 
 
 def shortage(folder: Path, min_free_bytes: int) -> str:
-    """What to say where a folder's disk has less room than it should; empty where it has enough.
+    """Sentence for a person where a folder's disk has too little room; empty where it has enough.
 
     Raises:
         DataFileError: the folder cannot be looked at.

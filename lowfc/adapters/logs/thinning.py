@@ -1,4 +1,4 @@
-"""Thinning logs: a smaller copy of one, by the same rules as a recorder's that was asked to leave something out."""
+"""Smaller copies of logs, by the rules of a recorder that leaves something out."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -23,7 +23,7 @@ class Thinned:
         file: the copy.
         selection: what it has, in words.
         messages, bytes: of the copy; of the log `messages_before` and `bytes_before`.
-        finished: the log had been finished; `no_end` says why not.
+        finished: the log had been finished; `no_end` is why not.
         damaged: what of the log could not be read, a sentence each.
     """
 
@@ -52,7 +52,7 @@ def thinned_path(source: Path, asked: Selection) -> Path:
 
 
 def thin(log: Parts, out: Path, asked: Selection, progress: Callable[[int, int], None] | None = None) -> Thinned:
-    """Write a smaller log of all files of a log; its metadata says what was left out.
+    """Write a smaller log of all files of a log; its metadata names what was left out.
 
     Raises:
         DataFileError: a file is no log, `out` is there already, or the disk refuses.
@@ -94,7 +94,7 @@ def thin(log: Parts, out: Path, asked: Selection, progress: Callable[[int, int],
 
 
 def _at_start(record: Metadata | Attachment) -> bool:
-    """Of the first file: all but what the copy says of itself."""
+    """Of the first file: all but what the copy has of its own."""
     return record.name not in (PART, SELECTION)
 
 

@@ -41,7 +41,7 @@ FILE_MODE = 0o640
 
 CHUNK_BYTES = 240 * 1024  # a chunk is closed by the message that passes this; with a frame it stays below 256 KiB
 PART = "part"
-"""Name of the metadata that says which recording a log belongs to, and where in it."""
+"""Name of the metadata with the recording that a log belongs to, and its number there."""
 
 START_KEY = "start_s"
 """Of a channel's metadata: the upper half of the sequences in it."""
@@ -250,13 +250,13 @@ def being_recorded(path: Path) -> bool:
             fcntl.flock(file, fcntl.LOCK_SH | fcntl.LOCK_NB)
     except BlockingIOError:
         return True
-    except OSError:  # who reads it says what is wrong
+    except OSError:  # reading it raises this again
         return False
     return False
 
 
 def stem_of(log: Path) -> str:
-    """Name of a log without the endings that say that it is one."""
+    """Name of a log without its endings."""
     return log.name.removesuffix(UNFINISHED).removesuffix(".mcap")
 
 

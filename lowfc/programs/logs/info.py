@@ -70,7 +70,7 @@ def _summary(found: Mapping[str, Any]) -> dict[str, str]:
     damage = [f"byte {one['position']}, {one['length']} bytes: {one['why']}" for one in found["damage"]]
     lost = [f"{found['messages_missing']} missing by their counts"]
     if "messages_lost" in recording:
-        lost.append(f"the recorder says that it lost {recording['messages_lost']}")
+        lost.append(f"the recorder counted as lost {recording['messages_lost']}")
     lost += [f"{count} of {key} (all)" for key, count in found["missing_topics"].items()]
     if found["unreadable"]:
         lost.append(f"{found['unreadable']} unreadable: what declares them was damaged")
@@ -98,6 +98,6 @@ def _summary(found: Mapping[str, Any]) -> dict[str, str]:
 
 
 def _digest(found: Mapping[str, Any]) -> str:
-    """The digest, and where it says nothing."""
+    """The digest; for a live run with a remark that it proves nothing."""
     digest = str(found.get("digest", ""))
     return digest if not digest or found["lockstep"] else f"{digest} (not a lockstep run: no other run has it)"

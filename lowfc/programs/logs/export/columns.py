@@ -1,4 +1,4 @@
-"""What an export says of every step and of the calibration: names with units, arrays, a sentence for each."""
+"""Columns of an export, of every step and of the calibration: names with units, arrays, a sentence for each."""
 
 from collections.abc import Callable
 from dataclasses import dataclass

@@ -91,7 +91,7 @@ class Player:
     """Puts the messages of logs on the bus, each at its time."""
 
     def __init__(self, service: Service, buses: dict[str, ZenohBus], selection: Selection, speed: float) -> None:
-        """Play `selection` as the roles of `buses`, and be told when to stop by `service`."""
+        """Play `selection` as the roles of `buses`, until `service` stops."""
         self._service = service
         self._clock = service.clock
         self._buses = buses
@@ -236,7 +236,7 @@ def _joined(run: Run, selection: Selection, granted: Granted) -> Iterator[tuple[
 
 
 def _linked(service: Service, live: Collection[str], wait_for: Collection[str], console: Console) -> bool:
-    """Wait for those who shall see the first message; False when told to stop."""
+    """Wait for the processes that receive the first message; False when stopped meanwhile."""
     service.state = "ready"
     missing = service.wait_for(wait_for, _PATIENCE_S)
     if missing and service.running:
@@ -251,7 +251,7 @@ def _linked(service: Service, live: Collection[str], wait_for: Collection[str], 
 
 
 def _mirrors(log: Path) -> tuple[str, ...]:
-    """Names of the mirrors in a log, for a run that is yet to be made; an unfinished log tells the first one's."""
+    """Names of the mirrors in a log, for a run that is yet to be made; of an unfinished log only the first one's."""
     topics = MIRROR_STATE, COMMAND
     reader = LogReader(log, topics=topics, skip_damaged=True)
     next(iter(reader), None)

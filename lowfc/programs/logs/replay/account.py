@@ -14,7 +14,7 @@ class Account:
     Attributes:
         frames: steps that were checked; `commands`, `states` and `requests` likewise.
         unchecked_because: steps of the log that could not be checked, by why.
-        inputs_missing: inputs of the controller that the log does not have, as far as a later state tells.
+        inputs_missing: inputs of the controller that the log does not have, by the input number of a later state.
         commands_missing: commands that the replay sends and the log does not have.
         steps: in the log.
         different: messages that differ by more than the tolerance, of them the first, and the largest difference of any

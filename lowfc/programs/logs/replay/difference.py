@@ -1,4 +1,4 @@
-"""What two messages of one kind say differently, field by field."""
+"""Differences of two messages of one kind, field by field."""
 
 from dataclasses import dataclass, field
 from typing import Any

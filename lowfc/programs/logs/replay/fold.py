@@ -61,7 +61,7 @@ class Replay:
 
     @property
     def done(self) -> bool:
-        """Whether the share has been replayed: no controller has anything more to say about it."""
+        """Whether the share has been replayed by every controller."""
         if self._last_ns - self.context.share.until_ns <= PATIENCE_NS:
             return False
         newest = max(self._controllers, default=0)

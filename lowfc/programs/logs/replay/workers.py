@@ -97,7 +97,7 @@ def replay_files(paths: Sequence[Path], tolerance_nm: float, jobs: int, progress
 
 
 def _chunk_ends_ns(path: Path) -> list[int]:
-    """Log times at which the chunks of a log end, as its summary says; none for one that is not finished."""
+    """Log times at which the chunks of a log end, by its summary; none for an unfinished log."""
     with LogFile(path) as file:
         return [chunk.message_end_time for chunk in file.index()]
 

@@ -37,7 +37,7 @@ def mode_steps(history: History) -> dict[str, int]:
 
 
 def mode_name(number: int) -> str:
-    """Name of a loop mode, as operators say it."""
+    """Name of a loop mode."""
     return LoopMode(number).name.lower() if number in list(LoopMode) else f"mode {number}"
 
 

@@ -54,7 +54,7 @@ def number(value: float | str | None, digits: int = 3) -> str:
 
 
 def fixed(value: float | str, decimals: int = 3) -> str:
-    """A figure of a column, its point under the others'; what would look like zero and is not is said to be less."""
+    """A figure of a column, with so many decimals; one that would round to zero is shown as less than the least."""
     if isinstance(value, str | int):
         return str(value)
     least = 10.0**-decimals

@@ -32,7 +32,7 @@ class Run:
     """A log that was read.
 
     Attributes:
-        laws: in order; the steps before the first one are under a law that the log does not tell.
+        laws: in order; steps before the first one are under an unknown law.
     """
 
     history: History
@@ -71,7 +71,7 @@ class Run:
 
 
 def read_run(files: LogFiles, progress: Callable[[int, int], None] | None = None) -> Run:
-    """Read a log, whole or not, to its end; what is damaged is left out and told by the history's reader.
+    """Read a log, whole or not, to its end; damaged parts are left out and listed by the history's reader.
 
     Raises:
         DataFileError: this is no log, or it has a calibration that cannot be read.

@@ -51,7 +51,7 @@ _WIDTH_IN = 10.0
 
 
 def svg(name: str, height_in: float, draw: Callable[["Figure", Report], bool], report: Report) -> str | None:
-    """Draw a figure of the page's width; None where `draw` says that there is nothing.
+    """Draw a figure of the page's width; None where `draw` has nothing to draw.
 
     No prologue, no metadata, no identifier that another drawing of the page has; colours are the page's.
 

@@ -20,7 +20,7 @@ def verdict(figures: Figures) -> Figures:
     first = next((check["text"] for check in checks if check["level"] == level), "")
     heading = {
         GOOD: "A good run",
-        UNKNOWN: "Nothing wrong, but not everything can be told",
+        UNKNOWN: "Nothing wrong, but not everything is known",
         LOOK: "Have a look",
         BAD: "Not a good run",
     }[level]

@@ -164,7 +164,7 @@ def render(figures: dict[str, Any]) -> str:
         "",
         *table(["residual, nm rms", *(_TITLES[name] for name in columns), "gain"], rows),
         "",
-        "measured with the sensor's noise where it does not say true; true: at the start of each exposure; all the "
+        "measured figures contain the sensor's noise; true: at the start of each exposure; all the "
         "time: between these instants too, while the mirror holds; a linear sensor, no actuator limits",
         *(f"warning: {warning}" for warning in figures["warnings"]),
     ]
@@ -226,7 +226,7 @@ def _one(every: Law, row: int, suffix: str = "") -> dict[str, float]:
 
 
 def _tilt_mas(run: LoggedRun, columns: dict[str, Array]) -> dict[str, float]:
-    """Tilt per axis on the sky, where the log says how large the telescope is."""
+    """Tilt per axis on the sky; nothing where the telescope's diameter is unknown."""
     tilts = np.isin(run.calibration.noll, TILTS)
     if run.history.configuration is None or not tilts.any():
         return {}

@@ -42,11 +42,11 @@ class LoggedRun:
         used: (steps,) whether the frame was used.
         law: the one that the run ended with.
         controller_delay: frames that the controller reckoned with; `measured_delay` is None where it cannot be
-            measured, `measured_from` says from what; `delay_frames` is the one to go by, and `weights` are its.
+            measured, from `measured_from`; the comparison uses `delay_frames`, of which `weights` are.
         seen_nm: (steps, modes) commands that the exposures saw; NaN where a frame was not used and the delay is the
             controller's.
         played: (steps,) where something was played, which moves the mirror beside the commands.
-        torn: (steps,) where the command before is not the one that the log has: something was not recorded.
+        torn: (steps,) where the command seen is not the one in the log: a message was not recorded.
     """
 
     def __init__(self, history: History) -> None:
