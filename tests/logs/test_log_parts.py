@@ -178,7 +178,8 @@ IN_TURN = [["info"], ["report"], ["export", "--to", "csv", "--force"], ["recover
 
 
 @pytest.mark.parametrize("words", IN_TURN, ids=lambda words: words[0])
-def test_several_logs_are_taken_in_turn(folder: Path, words: list[str]) -> None:
+def test_several_logs_are_taken_in_turn(folder: Path, words: list[str], monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("lowfc.programs.logs.report.drawings._DRAWINGS", {})  # they take their time
     (night := Night()).frames(3)
     first, second = (str(night.write(Path(f"{name}.mcap"))) for name in "ab")
     several = lowfc(*words, first, second)
