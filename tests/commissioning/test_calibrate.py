@@ -53,10 +53,10 @@ def ignore(*told: object) -> None:
 
 
 def of(
-    loop: FoldedLoop, method: str, cycles: int = 4, *, say: Callable[[str], None] = ignore, **more: Any
+    loop: FoldedLoop, method: str, cycles: int = 4, *, report: Callable[[str], None] = ignore, **more: Any
 ) -> Calibrator:
     wanted = CalibrationRequest(method, **{"out": OUT, "snr": 50.0, "cycles": cycles, **more})
-    return Calibrator(loop, wanted, say, ignore)
+    return Calibrator(loop, wanted, report, ignore)
 
 
 def taken_of(loop: FoldedLoop, method: str, cycles: int = 4, **wanted: Any) -> tuple[Calibrator, CalibrationData]:
@@ -265,7 +265,7 @@ def test_what_is_played_while_a_device_restarts_is_given_up_at_once_and_played_a
     strike: Callable[[FoldedLoop], None], heal: Callable[[FoldedLoop], None], why: str, play: int
 ) -> None:
     loop, said = Struck(play, strike, heal), list[str]()
-    calibrator = of(loop, "hadamard", say=said.append)
+    calibrator = of(loop, "hadamard", report=said.append)
     with calibrator.holding():
         taken = calibrator.run()
     (again,) = [one for one in said if re.match("once more|a cycle is repeated", one)]
@@ -316,7 +316,7 @@ def test_what_another_operator_asks_ends_a_calibration_and_has_the_last_word(
 ) -> None:
     loop, said = Struck(1, strike, ignore), list[str]()
     loop.close_loop()
-    calibrator = of(loop, "poke", say=said.append)
+    calibrator = of(loop, "poke", report=said.append)
     reserved = loop.reserved("a test") if mode == wire.LOOP_MODE_OPEN else contextlib.nullcontext()
     with reserved, pytest.raises(CalibrationError, match=why), calibrator.holding():
         calibrator.run()
@@ -330,7 +330,7 @@ def test_a_mirror_that_died_ends_the_calibration(monkeypatch: pytest.MonkeyPatch
     monkeypatch.setattr(mirror_watch, "SILENT_S", 0.0)
     loop, said = Struck(3, kill_mirror, ignore), list[str]()
     loop.before_the_end = before_the_end
-    calibrator = of(loop, "hadamard", say=said.append)
+    calibrator = of(loop, "hadamard", report=said.append)
     with pytest.raises(BusError, match=r"no mirror state came .* is the mirror's process running"):
         calibrator.run()
     assert said[-1].startswith("a cycle is repeated: the mirror has reported no command as followed for 101 frames")

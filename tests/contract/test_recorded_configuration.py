@@ -11,7 +11,7 @@ from lowfc.adapters.logs.reader import LogReader
 from lowfc.contract.configuration import MOST_FAULTS, Configuration, load
 from lowfc.contract.errors import ConfigurationError, DataFileError
 from lowfc.contract.recorded_configuration import recorded
-from lowfc.programs.commissioning.acceptance.played import SAID
+from lowfc.programs.commissioning.acceptance.played import ANNOUNCEMENT
 from lowfc.programs.view.recorded import draw_logs
 from lowfc.programs.view.renderer import Renderer
 from tests.support.loops import lowfc
@@ -93,7 +93,7 @@ def night() -> Night:
     for loop, frames in (("open", 1000), ("closed", 3000)):
         made.request({"open": "open", "closed": "close"}[loop])
         made.frames(200)
-        made.request("note", text=SAID + json.dumps({"test": "noise-floor", "loop": loop, "frames": 900}))
+        made.request("note", text=ANNOUNCEMENT + json.dumps({"test": "noise-floor", "loop": loop, "frames": 900}))
         made.frames(frames)
     return made
 

@@ -16,8 +16,8 @@ from lowfc.control.loop.command_channels import MIRROR, OFFSET
 from lowfc.control.loop.safety import LoopMode
 from lowfc.control.loop.state import FADING_FRAMES, SETTLING_FRAMES
 from lowfc.programs.commissioning.acceptance.played import (
+    ANNOUNCEMENT,
     LIMITS,
-    SAID,
     AcceptanceError,
     Kind,
     Played,
@@ -32,7 +32,7 @@ _LAW = ("gain", "leak", "limit_nm", "law", "calibration_id")
 class Live:
     """The live loop, left in the mode in which it was found, with nothing more being played."""
 
-    def __init__(self, client: Client, heard: Callable[[int, int], None]) -> None:
+    def __init__(self, client: Client, progress: Callable[[int, int], None]) -> None:
         """Take hold of the loop."""
         self.client = client
         self.calibration = client.calibration()
@@ -43,7 +43,7 @@ class Live:
                 f"the loop is {LoopMode(state.mode).in_words}: it must be open or closed to be measured"
             )
         self._found = LoopMode(state.mode)
-        self._heard = heard
+        self._progress = progress
         self._past = self._expected = 0
         first, *_, last = client.steps(_RATE_STEPS)
         rate_hz = (last.frame_sequence - first.frame_sequence) * 1e9 / (last.time_ns - first.time_ns)
@@ -108,7 +108,7 @@ class Live:
         self.into(mode)
         before, frames = self._state(), len(table)
         steps = self.client.steps()
-        first = self.client.note(SAID + json.dumps({"test": kind, **what, "frames": frames})).frame_sequence
+        first = self.client.note(ANNOUNCEMENT + json.dumps({"test": kind, **what, "frames": frames})).frame_sequence
         if table.shape[1]:
             answer = self.client.play(basis, table) if basis.size else self.client.play_offset(table)
             first = answer.frame_sequence
@@ -120,7 +120,7 @@ class Live:
                 break
             kept.append(step)
             passed = step.frame_sequence - first + 1
-            self._heard(self._past + passed, max(self._expected, self._past + frames))
+            self._progress(self._past + passed, max(self._expected, self._past + frames))
             if step.mode is not mode or set(step.reasons) & set(LIMITS):
                 break  # who looks at it says what is wrong
         steps.close()

@@ -34,7 +34,7 @@ MOST_MISSING = 0.01
 LONGEST_SETTLING = 4000
 """Frames that a linear law is given to settle, at the most."""
 
-SAID = "acceptance "
+ANNOUNCEMENT = "acceptance "
 """How a note begins that announces a test; its parameters follow as JSON."""
 _CHANGES = ("gain", "leak", "limit", "law", "load", "offset", "channel", "reset")
 
@@ -201,10 +201,10 @@ def logged(history: History, kind: Kind) -> list[Played]:
         before = [one for one in history.controllers if one.frame_sequence < first and len(one.gain) == modes]
         if not before:
             raise DataFileError(f"{path}: the state of the controller before the test is not in it")
-        asked = codec.request(request, request.name, 0, plays=history.published.plays)
-        basis = asked.actuators_nm.reshape(-1, calibration.grid[0] * calibration.grid[1])
+        decoded = codec.request(request, request.name, 0, plays=history.published.plays)
+        basis = decoded.actuators_nm.reshape(-1, calibration.grid[0] * calibration.grid[1])
         loop = loop_of(before[-1], calibration, history.rate_hz, history.published.laws)
-        table = asked.table if play else np.zeros((frames, 0), np.float32)
+        table = decoded.table if play else np.zeros((frames, 0), np.float32)
         found.append(played(what, loop, request.text if play else "", table, basis, first, history.steps))
     return found
 
@@ -215,9 +215,9 @@ def _announced(requests: Sequence[wire.Request], kind: Kind) -> list[tuple[dict[
     for request in requests:
         if not request.accepted:
             continue
-        if request.name == "note" and request.text.startswith(SAID):
+        if request.name == "note" and request.text.startswith(ANNOUNCEMENT):
             try:
-                what = json.loads(request.text.removeprefix(SAID))
+                what = json.loads(request.text.removeprefix(ANNOUNCEMENT))
             except (ValueError, RecursionError):
                 what = None  # somebody's own note that begins alike
             if not isinstance(what, dict) or what.pop("test", None) != kind or not isinstance(what.get("frames"), int):

@@ -22,7 +22,7 @@ from lowfc.programs.commissioning.analytic import analytic
 from lowfc.programs.commissioning.calibrate.pokes import AMPLITUDE_NM, sequence
 from lowfc.programs.commissioning.calibrate.recording import Player, watch
 from lowfc.programs.commissioning.calibrate.result import reconstructed
-from lowfc.programs.commissioning.calibrate.tasks import images, sayer, written
+from lowfc.programs.commissioning.calibrate.tasks import images, reporter, written
 
 
 class AlignResult(Result):
@@ -74,7 +74,7 @@ def aligned(
     require_folder(out)
     if image is not None:
         config = configuration(file)
-        picture, told = images(image).mean(axis=0), False
+        picture, sign_known = images(image).mean(axis=0), False
         computed = analytic(config, Console(stderr=True))
         found = _fit(computed, picture, half_turn)
         made = on_sensor(config, computed, found.geometry, found.flux, picture.shape, None)
@@ -93,9 +93,9 @@ def aligned(
             computed = analytic(config, Console(stderr=True))
             found = _fit(computed, pixels.mean(axis=0) - dark, half_turn)
             made = on_sensor(config, computed, found.geometry, found.flux, before.shape, before)
-            told = True
+            sign_known = True
             mode = int(np.argmax(np.linalg.norm(made.response, axis=0)))
-            seen = Player(loop, made, sayer(Console(stderr=True))).first_poke(mode, sequence(AMPLITUDE_NM["poke"]))
+            seen = Player(loop, made, reporter(Console(stderr=True))).first_poke(mode, sequence(AMPLITUDE_NM["poke"]))
             if seen.picture @ made.response[:, mode] < 0:
                 found = replace(found, geometry=found.geometry.turned())
                 made = on_sensor(config, computed, found.geometry, found.flux, before.shape, before)
@@ -107,7 +107,7 @@ def aligned(
         background_dn=found.background,
         residual=found.residual,
         other_parity_residual=found.other_parity,
-        half_turn_known=told,
+        half_turn_known=sign_known,
         file=str(out),
     )
 

@@ -89,9 +89,9 @@ def calibrate(
         return
     if cycles is not None and "--snr" not in given:
         snr = LEAST_SNR
-    wanted = CalibrationRequest(method, out, snr, cycles, amplitude, resume, truncate, tikhonov)
+    request = CalibrationRequest(method, out, snr, cycles, amplitude, resume, truncate, tikhonov)
     if method == "analytic":
-        put(tasks.computed(config, wanted, at, run if load else None, load=load), as_json=as_json)
+        put(tasks.computed(config, request, at, run if load else None, load=load), as_json=as_json)
         return
     for option in ("--config", "--at"):
         if option in given:
@@ -99,7 +99,7 @@ def calibrate(
                 f"{option} goes with --method analytic: a running loop is measured where it is, by its own "
                 "configuration"
             )
-    result = tasks.poked(wanted, run, load=load)
+    result = tasks.poked(request, run, load=load)
     put(result, as_json=as_json)
     if not result.recommended:
         raise typer.Exit(1)

@@ -70,14 +70,14 @@ class Pokes:
     """The plans of one calibration, at an amplitude `amplitude_nm` of a mode, wavefront rms."""
 
     def __init__(
-        self, config: Configuration, calibration: Calibration, noise_nm: Array, wanted: CalibrationRequest
+        self, config: Configuration, calibration: Calibration, noise_nm: Array, request: CalibrationRequest
     ) -> None:
         """Choose the amplitude; `noise_nm` is that of one frame (modes,).
 
         Raises:
             CalibrationError: the amplitude asked for is too large.
         """
-        self._wanted = wanted
+        self._request = request
         self._noise_nm = noise_nm
         self._modes = len(calibration.noll)
         self._basis = calibration.modes_to_actuators.T
@@ -91,34 +91,34 @@ class Pokes:
 
     def delay(self, mode: int) -> poke_plan.Plan:
         """For the delay: one column, in a closed loop of the wavefront that all columns of a dither add up to."""
-        closed = self._wanted.method == "in-loop"
+        closed = self._request.method == "in-loop"
         amplitude = self.amplitude_nm * float(np.sqrt(self._modes)) if closed else AMPLITUDE_NM["poke"]
         return sequence(min(amplitude, float(self._largest_nm[mode])))
 
     def cycles(self) -> int:
         """How many are needed, as far as photons and read-out say."""
-        wanted = self._wanted
-        if wanted.cycles is not None:
-            return max(wanted.cycles, LEAST_CYCLES)
-        frames = poke_plan.frames_for(wanted.snr / MARGIN, float(self._noise_nm.max()), self.amplitude_nm)
+        request = self._request
+        if request.cycles is not None:
+            return max(request.cycles, LEAST_CYCLES)
+        frames = poke_plan.frames_for(request.snr / MARGIN, float(self._noise_nm.max()), self.amplitude_nm)
         return max(-(-frames // self.cycle(0).per_column), LEAST_CYCLES)
 
     def more_cycles(self, cycles: int, error: float) -> int:
         """How many are needed where so many have left this standard error; no more where that is out of reach."""
-        needed = cycles_for(self._wanted.snr, cycles, error)
-        reachable = self._wanted.cycles is None and needed <= MOST_TIMES * self.cycles()
-        return needed if reachable and error * self._wanted.snr > 1 else cycles
+        needed = cycles_for(self._request.snr, cycles, error)
+        reachable = self._request.cycles is None and needed <= MOST_TIMES * self.cycles()
+        return needed if reachable and error * self._request.snr > 1 else cycles
 
     def frames(self, cycles: int, done: int = 0) -> int:
         """Of so many cycles, less those done, and of those that check them."""
         return (cycles + checks(cycles) - done) * (len(self.cycle(0)) + AFTERWARDS)
 
     def _cycle(self, number: int, amplitude_nm: float) -> poke_plan.Plan:
-        wanted = self._wanted
-        if wanted.method == "in-loop":
+        request = self._request
+        if request.method == "in-loop":
             seed = SEED + 1000 * (number + 1)
             return poke_plan.dither(self._modes, amplitude_nm, PIECE, DITHER_HOLD, seed)
-        patterns = poke_plan.hadamard_patterns if wanted.method == "hadamard" else poke_plan.poke_patterns
+        patterns = poke_plan.hadamard_patterns if request.method == "hadamard" else poke_plan.poke_patterns
         rest = max(16, len(poke_plan.SIGNS) * HOLD)
         shapes = patterns(self._modes, amplitude_nm)
         # in an order of its own, so that a vibration disturbs each pair of cycles otherwise, and their scatter shows it
@@ -127,23 +127,23 @@ class Pokes:
 
     def _amplitude(self) -> float:
         """What was asked for, or the usual, as far as the mirror's slew limit lets it."""
-        asked, method = self._wanted.amplitude_nm, self._wanted.method
-        if method == "hadamard" and asked is not None and asked > MOST_HADAMARD_NM:
+        requested, method = self._request.amplitude_nm, self._request.method
+        if method == "hadamard" and requested is not None and requested > MOST_HADAMARD_NM:
             raise CalibrationError(
-                f"--amplitude {asked:g} nm is too much for hadamard, which pokes all modes at once: at most "
+                f"--amplitude {requested:g} nm is too much for hadamard, which pokes all modes at once: at most "
                 f"{MOST_HADAMARD_NM:g} nm of each"
             )
         shapes = self._cycle(0, 1.0).table @ self._basis
         steepest = float(np.abs(np.diff(shapes, axis=0)).max())
         largest = _OF_THE_SLEW * self._slew_nm / max(steepest, 1e-9)
-        if asked is None:
-            return min(usual_nm(method, self._wanted.snr), largest)
-        if asked > largest:
+        if requested is None:
+            return min(usual_nm(method, self._request.snr), largest)
+        if requested > largest:
             raise CalibrationError(
-                f"--amplitude {asked:g} nm: from push to pull an actuator would move by more than {_OF_THE_SLEW:g} "
+                f"--amplitude {requested:g} nm: from push to pull an actuator would move by more than {_OF_THE_SLEW:g} "
                 f"of the slew limit; at most {largest:.3g} nm"
             )
-        return asked
+        return requested
 
 
 def sequence(amplitude_nm: float) -> poke_plan.Plan:

@@ -21,7 +21,7 @@ from lowfc.control.loop.advance import UNMEASURED
 from lowfc.control.loop.inputs import Step
 from lowfc.control.loop.safety import Limit, LoopMode
 
-Say = Callable[[str], None]
+Report = Callable[[str], None]
 T = TypeVar("T")
 
 AFTERWARDS = 8
@@ -152,10 +152,10 @@ def watch(loop: Client, count: int) -> Pixels:
         BusError: they stopped.
     """
     stream = loop.frames(count)
-    taken = [np.asarray(image.pixels) for image in stream]
-    if len(taken) < count:
-        raise BusError(f"the frames came to an end after {len(taken)} of {count}: is the camera still running?")
-    return np.array(taken)
+    received = [np.asarray(image.pixels) for image in stream]
+    if len(received) < count:
+        raise BusError(f"the frames came to an end after {len(received)} of {count}: is the camera still running?")
+    return np.array(received)
 
 
 @contextlib.contextmanager
@@ -172,7 +172,7 @@ def _streams(loop: Client) -> Iterator[tuple[Iterator[Frame], Iterator[Step]]]:
             if close is not None:
                 close()
         if not done:
-            with contextlib.suppress(LowfcError):  # what went wrong first is what is told
+            with contextlib.suppress(LowfcError):  # the first fault is the one that is raised
                 loop.stop()
 
 
@@ -247,13 +247,13 @@ class Player:
     Attributes:
         loop: to play on.
         before: has dark, good pixels, reference and the mirror's commands.
-        say: for people: why a sequence is played again.
+        report: for people: why a sequence is played again.
         closed: the loop works against the pokes.
     """
 
     loop: Client
     before: Calibration
-    say: Say
+    report: Report
     closed: bool = False
 
     def first_poke(self, mode: int, plan: Plan) -> Delay:
@@ -313,5 +313,5 @@ class Player:
                 return attempt()
             except (PlayInterruptedError, ValueError) as error:
                 why = error
-                self.say(f"{again}: {error}")
+                self.report(f"{again}: {error}")
         raise CalibrationError(f"in {ATTEMPTS} attempts {given_up}; the last: {why}")

@@ -104,7 +104,7 @@ def rejected_of(out: Path) -> Path:
 
 
 def finished(
-    calibrator: Calibrator, wanted: CalibrationRequest, data: CalibrationData, computed: Calibration
+    calibrator: Calibrator, request: CalibrationRequest, data: CalibrationData, computed: Calibration
 ) -> tuple[Calibration, CalibrationResult]:
     """Make R, check it on other frames, write the file: under another name where it is not recommended.
 
@@ -113,13 +113,13 @@ def finished(
         DataFileError: the file cannot be written.
     """
     config = calibrator.config
-    made, quality = measured_calibration(config, calibrator.before, data.measured, wanted)
+    made, quality = measured_calibration(config, calibrator.before, data.measured, request)
     check = calibrator.check(made, data)
     noise = computed_noise_nm(config, made, computed)
     ratio = None if noise is None else factory.frame_noise_nm(config, made) / noise
-    verdict = judge(wanted.snr, data.measured.cycles, data.measured.error, check, ratio, made.noll)
-    file = rejected_of(wanted.out) if verdict.faults else wanted.out
-    found = result_of(config, made, quality, wanted.method, file, data, computed, verdict)
+    verdict = judge(request.snr, data.measured.cycles, data.measured.error, check, ratio, made.noll)
+    file = rejected_of(request.out) if verdict.faults else request.out
+    found = result_of(config, made, quality, request.method, file, data, computed, verdict)
     calibration_file.save(made, file)
     counted = configured_delay(config)
     if abs(data.delay.delay_frames - counted) > DELAY_APART:
@@ -153,31 +153,31 @@ def reconstructed(
 
 
 def measured_calibration(
-    config: Configuration, before: Calibration, taken: Measured, wanted: CalibrationRequest
+    config: Configuration, before: Calibration, found: Measured, request: CalibrationRequest
 ) -> tuple[Calibration, Reconstruction]:
     """The calibration that cycles of pokes give, with the dark, the mask and the commands of the one before.
 
     Raises:
         CalibrationError: H is not above its noise.
     """
-    I0 = taken.reference if taken.reference is not None else before.reference.astype(np.float64)
+    I0 = found.reference if found.reference is not None else before.reference.astype(np.float64)
     made = reconstructed(
         config,
         I0,
-        taken.response,
-        taken.initial.matrix,
+        found.response,
+        found.initial.matrix,
         before.good.astype(np.float64),
-        taken.flux_dn,
-        truncate=wanted.truncate,
-        tikhonov=wanted.tikhonov,
+        found.flux_dn,
+        truncate=request.truncate,
+        tikhonov=request.tikhonov,
     )
-    names = dict.fromkeys([*taken.initial.estimator.split("+"), wanted.method])
+    names = dict.fromkeys([*found.initial.estimator.split("+"), request.method])
     calibration = replace(
         before,
         reference=single(I0),
-        response=single(taken.response),
+        response=single(found.response),
         reconstructor=single(made.matrix),
-        flux_dn=taken.flux_dn,
+        flux_dn=found.flux_dn,
         estimator="+".join(names),
         operator_hash="",
         actuators_to_modes=single(_seen_of_actuators(config, before, made.matrix)),

@@ -36,7 +36,7 @@ from lowfc.control.calibration.response_fit import (
 )
 from lowfc.control.loop.wording import counted
 from lowfc.programs.commissioning.calibrate.pokes import CalibrationRequest, Pokes, checks
-from lowfc.programs.commissioning.calibrate.recording import Player, Say
+from lowfc.programs.commissioning.calibrate.recording import Player, Report
 
 _LIKE = 0.3
 """Likeness of the first pokes' picture to the calibration in use below which something is said."""
@@ -61,28 +61,33 @@ class Calibrator:
     """
 
     def __init__(
-        self, loop: Client, wanted: CalibrationRequest, say: Say, progress: Counted, computed: Calibration | None = None
+        self,
+        loop: Client,
+        request: CalibrationRequest,
+        report: Report,
+        progress: Counted,
+        computed: Calibration | None = None,
     ) -> None:
         """Ask the controller what it has.
 
         Args:
             loop: A connection to it.
-            wanted: What is asked for.
-            say: For people.
+            request: What is asked for.
+            report: For people.
             progress: For people: frames so far, and of how many.
             computed: What the optical model says, of which R is made where its pixels are the loop's.
         """
         self._loop = loop
-        self._wanted = wanted
-        self._say = say
+        self._request = request
+        self._report = report
         self.config = configuration_of(loop)
         self.before = replace(loop.calibration(), camera=loop.camera())
         self._computed = computed
         self.noise_nm = factory.frame_noise_nm(self.config, self.before)
-        self._closed = wanted.method == "in-loop"
-        self.pokes = Pokes(self.config, self.before, self.noise_nm, wanted)
+        self._closed = request.method == "in-loop"
+        self.pokes = Pokes(self.config, self.before, self.noise_nm, request)
         self._progress = progress
-        self._player = Player(loop, self.before, say, self._closed)
+        self._player = Player(loop, self.before, report, self._closed)
         self.kept = 0
 
     @contextlib.contextmanager
@@ -103,7 +108,7 @@ class Calibrator:
         if self._closed or mode != wire.LOOP_MODE_CLOSED:
             yield
             return
-        self._say("the loop is opened for the calibration, and closed again after it")
+        self._report("the loop is opened for the calibration, and closed again after it")
         self._loop.open_loop()
         try:
             yield
@@ -111,8 +116,8 @@ class Calibrator:
             try:
                 self._loop.check_lease()  # whoever ended it has the last word on the loop
                 self._loop.close_loop()
-            except LowfcError as fault:  # what went wrong first is what is told
-                self._say(f"warning: the loop is not closed again: {fault}")
+            except LowfcError as fault:  # the first fault is the one that is raised
+                self._report(f"warning: the loop is not closed again: {fault}")
             raise
         self._loop.close_loop()
 
@@ -125,21 +130,21 @@ class Calibrator:
         delay = self.delay() if delay is None else delay
         return CalibrationData(self._cycles(delay), delay)
 
-    def check(self, made: Calibration, taken: CalibrationData) -> Check:
+    def check(self, made: Calibration, data: CalibrationData) -> Check:
         """The cross-talk of a new calibration at the present zero point, from cycles of its own.
 
         Raises:
             CalibrationError: frames were lost, or a limit acts.
         """
         R = made.reconstructor.astype(np.float64)
-        cycles = taken.measured.cycles
+        cycles = data.measured.cycles
         count = checks(cycles)
         answers = []
         for number in range(count):
             self._show(f"check {number + 1} of {count}", cycles, cycles + number)
             plan = self.pokes.cycle(cycles + number)
-            answers.append(R @ self._player.cycle(plan, taken.delay.delay_frames).response)
-        return check(np.array(answers), R @ taken.measured.response, taken.measured.error * np.sqrt(cycles))
+            answers.append(R @ self._player.cycle(plan, data.delay.delay_frames).response)
+        return check(np.array(answers), R @ data.measured.response, data.measured.error * np.sqrt(cycles))
 
     @property
     def _best(self) -> int:
@@ -158,7 +163,7 @@ class Calibrator:
         self._show("looking for pokes", self.pokes.cycles(), 0)
         found = self._player.first_poke(mode, plan)
         self._compare_picture(found.picture, mode)
-        self._say(
+        self._report(
             f"pokes of Z{self.before.noll[mode]} are seen after {found.delay_frames:.3f} +- {found.error_frames:.3f} "
             f"frames, {found.delay_frames * self.config.period_ns * 1e-6:.3g} ms from the end of one exposure to that "
             "of the one that sees what was made of it"
@@ -169,39 +174,39 @@ class Calibrator:
         known = self.before.response[:, mode].astype(np.float64)
         like = likeness(picture, known)
         if abs(like) < _LIKE:
-            self._say(
+            self._report(
                 f"warning: the picture of Z{self.before.noll[mode]} is not like that of the calibration in use (their "
                 f"correlation is {like:.2f}): is the sensor aligned (`lowfc calibrate align`)?"
             )
         elif like < 0:
-            self._say(
+            self._report(
                 f"warning: Z{self.before.noll[mode]} is seen with the opposite sign of the calibration in use: the "
                 "mirror or the camera is reflected or turned; do not close the loop on that one"
             )
 
     def _cycles(self, delay: Delay) -> Measured:
-        pokes, wanted = self.pokes, self._wanted
+        pokes, request = self.pokes, self._request
         what: dict[str, Any] = {
-            "method": wanted.method,
+            "method": request.method,
             "amplitude_nm": pokes.amplitude_nm,
             "calibration": self.before.id,
         }
-        path = partial_of(wanted.out)
-        if wanted.resume:
+        path = partial_of(request.out)
+        if request.resume:
             sums = go_on(path, what)
             self.kept = sums.cycles
-            self._say(f"going on after {counted(sums.cycles, 'cycle')}")
+            self._report(f"going on after {counted(sums.cycles, 'cycle')}")
         else:
             sums = Sums.none(self._initial(delay))
         needed = max(pokes.cycles(), sums.cycles)
-        self._say(
+        self._report(
             f"{needed} cycles of {len(pokes.cycle(0))} frames and {checks(needed)} to check them; "
             + self._to_go(needed, sums.cycles)
         )
         while True:
             while sums.cycles < needed:
                 done = sums.cycles
-                self._show(f"{wanted.method} cycle {done + 1} of {needed}", needed, done)
+                self._show(f"{request.method} cycle {done + 1} of {needed}", needed, done)
                 sums = sums.plus(self._player.cycle(pokes.cycle(done), delay.delay_frames))
                 keep(path, sums, what)
                 self.kept = sums.cycles
@@ -209,7 +214,7 @@ class Calibrator:
             more = pokes.more_cycles(needed, float(found.error.max()))
             if more <= needed:
                 return found
-            self._say(
+            self._report(
                 f"the cycles scatter by more than photons and read-out: {more} of them instead of {needed}; "
                 + self._to_go(more, needed)
             )

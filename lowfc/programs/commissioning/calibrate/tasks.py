@@ -31,7 +31,7 @@ from lowfc.optics.twin.twin_mirror import TwinMirror, wavefront_nm
 from lowfc.programs.cli.result import Result, figure
 from lowfc.programs.commissioning.analytic import Wavefront, analytic
 from lowfc.programs.commissioning.calibrate.pokes import CalibrationRequest
-from lowfc.programs.commissioning.calibrate.recording import Say, watch
+from lowfc.programs.commissioning.calibrate.recording import Report, watch
 from lowfc.programs.commissioning.calibrate.result import (
     CalibrationResult,
     finished,
@@ -63,7 +63,7 @@ class ReferenceResult(Result):
     file: str = figure("written")
 
 
-def poked(wanted: CalibrationRequest, run: str | None, *, load: bool) -> CalibrationResult:
+def poked(request: CalibrationRequest, run: str | None, *, load: bool) -> CalibrationResult:
     """Calibrate a running loop and write the file, once nothing else can go wrong.
 
     Raises:
@@ -71,28 +71,28 @@ def poked(wanted: CalibrationRequest, run: str | None, *, load: bool) -> Calibra
         BusError: there is no such loop.
         DataFileError: a file cannot be written, or there is nothing to go on from.
     """
-    require_folder(wanted.out)
+    require_folder(request.out)
     console = Console(stderr=True)
-    say = sayer(console)
+    report = reporter(console)
     with contextlib.ExitStack() as held:
         loop = held.enter_context(Client(run))
         computed = analytic(configuration_of(loop), console)
-        progress = held.enter_context(shown_progress(console, say))
-        lease = held.enter_context(loop.reserved(f"lowfc calibrate --method {wanted.method}"))
+        progress = held.enter_context(shown_progress(console, report))
+        lease = held.enter_context(loop.reserved(f"lowfc calibrate --method {request.method}"))
         progress = lease.expecting(progress, configuration_of(loop).camera.rate_hz)
-        calibrator = Calibrator(loop, wanted, say, progress, computed)
+        calibrator = Calibrator(loop, request, report, progress, computed)
         try:
             with calibrator.holding():
-                made, result = finished(calibrator, wanted, calibrator.run(), computed)
+                made, result = finished(calibrator, request, calibrator.run(), computed)
                 if result.recommended:
-                    partial_of(wanted.out).unlink(missing_ok=True)
+                    partial_of(request.out).unlink(missing_ok=True)
                     if load:
                         loop.load(made)
         except BaseException:
             if calibrator.kept:
                 kept_cycles = counted(calibrator.kept, "cycle")
-                say(
-                    f"kept in {partial_of(wanted.out)}: {kept_cycles}, with which the same command with --resume goes "
+                report(
+                    f"kept in {partial_of(request.out)}: {kept_cycles}, with which the same command with --resume goes "
                     "on"
                 )
             raise
@@ -101,17 +101,17 @@ def poked(wanted: CalibrationRequest, run: str | None, *, load: bool) -> Calibra
 
 
 @contextlib.contextmanager
-def shown_progress(console: Console, say: Callable[[str], None]) -> Iterator[Counted]:
+def shown_progress(console: Console, report: Callable[[str], None]) -> Iterator[Counted]:
     """A bar on a terminal, else a line every 10 s."""
     if not console.is_terminal:
-        yield spoken(say)
+        yield spoken(report)
         return
     with counting_bar(console, TextColumn("{task.percentage:.0f} %"), TimeRemainingColumn()) as count:
         yield count
 
 
 def computed(
-    file: Path | None, wanted: CalibrationRequest, at: str | None, run: str | None, *, load: bool
+    file: Path | None, request: CalibrationRequest, at: str | None, run: str | None, *, load: bool
 ) -> CalibrationResult:
     """Compute a calibration from a configuration, flat or at a wavefront, and write the file.
 
@@ -120,7 +120,7 @@ def computed(
         ConfigurationError: there is no such wavefront.
         DataFileError: the file cannot be written.
     """
-    require_folder(wanted.out)
+    require_folder(request.out)
     config = configuration(file)
     name, wavefront = ("", None) if at is None else zero_point(config, at)
     made = analytic(config, Console(stderr=True), wavefront)
@@ -132,16 +132,16 @@ def computed(
         made.good.astype(np.float64),
         made.flux_dn,
         estimator=config.control.estimator,
-        truncate=wanted.truncate,
-        tikhonov=wanted.tikhonov,
+        truncate=request.truncate,
+        tikhonov=request.tikhonov,
     )
     if name:
         made = replace(made, estimator=f"{made.estimator}+at {name}")
-    if wanted.truncate or wanted.tikhonov:
+    if request.truncate or request.tikhonov:
         made = replace(made, reconstructor=single(quality.matrix), estimator=f"{made.estimator}+regularised")
     with Client(run) if load else contextlib.nullcontext() as loop:
-        made = written(made, wanted.out, loop)
-    return result_of(config, made, quality, "analytic", wanted.out)
+        made = written(made, request.out, loop)
+    return result_of(config, made, quality, "analytic", request.out)
 
 
 def zero_point(config: Configuration, text: str) -> tuple[str, Wavefront]:
@@ -253,11 +253,11 @@ def images(file: Path) -> Array:
     return np.asarray(data, dtype=np.float64).reshape(-1, *data.shape[-2:])
 
 
-def sayer(console: Console) -> Say:
+def reporter(console: Console) -> Report:
     """A line for people, warnings in yellow."""
 
-    def say(text: str) -> None:
+    def report(text: str) -> None:
         style = "yellow" if text.startswith("warning") else None
         console.print(text, style=style, highlight=False, soft_wrap=True, markup=False)
 
-    return say
+    return report

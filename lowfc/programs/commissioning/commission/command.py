@@ -44,7 +44,7 @@ def commission(
     from lowfc.adapters.files.whole_file import require_folder
     from lowfc.client import Client, configuration_of
     from lowfc.programs.commissioning.analytic import analytic
-    from lowfc.programs.commissioning.calibrate.tasks import sayer, shown_progress
+    from lowfc.programs.commissioning.calibrate.tasks import reporter, shown_progress
     from lowfc.programs.commissioning.commission.commissioning import Commission, Commissioning
 
     if dark is not None and no_dark:
@@ -58,14 +58,14 @@ def commission(
         raise DataFileError(f"{out} exists already; choose another name (--out), or --force replaces it")
     require_folder(out)
     console = Console(stderr=True)
-    say = sayer(console)
-    asked = Commission(out, frames, dark, no_dark, snr, cycles, resume, close)
+    report = reporter(console)
+    options = Commission(out, frames, dark, no_dark, snr, cycles, resume, close)
 
     def confirm(what: str) -> None:
         typer.confirm(what, default=True, abort=True, err=True)
 
-    with Client(run) as loop, loop.reserved("lowfc commission") as lease, shown_progress(console, say) as shown:
+    with Client(run) as loop, loop.reserved("lowfc commission") as lease, shown_progress(console, report) as shown:
         config = configuration_of(loop)
         progress = lease.expecting(shown, config.camera.rate_hz)
-        found, text = Commissioning(loop, config, analytic(config, console), asked, say, progress, confirm).run()
+        found, text = Commissioning(loop, config, analytic(config, console), options, report, progress, confirm).run()
     put(found, text, as_json=as_json)

@@ -24,7 +24,7 @@ from lowfc.control.laws.what_if import as_logged, counterfactual, missing_before
 from lowfc.control.loop.inputs import Step
 from lowfc.control.loop.safety import LoopMode
 from lowfc.programs.commissioning.calibrate.pokes import LEAST_SNR, CalibrationRequest, Pokes
-from lowfc.programs.commissioning.calibrate.recording import CHECKED, Say, watch
+from lowfc.programs.commissioning.calibrate.recording import CHECKED, Player, Report, watch
 from lowfc.programs.commissioning.calibrate.result import finished
 from lowfc.programs.commissioning.calibrate.run import Calibrator, begun, partial_of
 from lowfc.programs.commissioning.calibrate.tasks import images
@@ -51,7 +51,7 @@ STEPS = (
 
 @dataclass(frozen=True, slots=True)
 class Commission:
-    """What is asked for: the options of `lowfc commission`."""
+    """What is options for: the options of `lowfc commission`."""
 
     out: Path
     frames: int
@@ -76,14 +76,14 @@ class Commissioning:
         loop: Client,
         config: Configuration,
         computed: Calibration,
-        asked: Commission,
-        say: Say,
+        options: Commission,
+        report: Report,
         progress: Counted,
         confirm: Callable[[str], None],
     ) -> None:
         """Take what it is made with."""
-        self._loop, self._config, self._computed, self._asked = loop, config, computed, asked
-        self._say, self._progress, self._confirm = say, progress, confirm
+        self._loop, self._config, self._computed, self._options = loop, config, computed, options
+        self._report, self._progress, self._confirm = report, progress, confirm
         self._figures: dict[str, Any] = {}
         self._delay: Delay | None = None
         self._judged = False
@@ -94,25 +94,25 @@ class Commissioning:
         Raises:
             CalibrationError: a step failed; the sentence says what to do.
         """
-        asked, kept = self._asked, first_of(self._asked.out)
-        if asked.resume and not kept.is_file():
-            if asked.out.is_file():
+        options, kept = self._options, first_of(self._options.out)
+        if options.resume and not kept.is_file():
+            if options.out.is_file():
                 raise CalibrationError(
-                    f"there is nothing to go on with: {asked.out} is finished; `lowfc ctl load {asked.out}` puts it in "
-                    "use, and without --resume a new one is begun"
+                    f"there is nothing to go on with: {options.out} is finished; `lowfc ctl load {options.out}` puts "
+                    "it in use, and without --resume a new one is begun"
                 )
-            self._say(f"there is nothing to go on with beside {asked.out}: this begins anew")
+            self._report(f"there is nothing to go on with beside {options.out}: this begins anew")
         before = self._open()
         try:
             return self._steps_of(kept)
         except BaseException:
-            self._say(self._left(before, kept))
+            self._report(self._left(before, kept))
             raise
 
     def _left(self, before: Calibration | None, kept: Path) -> str:
         """What is in use after a commissioning that did not come to its end, and how to go on."""
         if self._judged:
-            return f"the calibration is good, in {self._asked.out} and in use: `lowfc ctl close` closes the loop"
+            return f"the calibration is good, in {self._options.out} and in use: `lowfc ctl close` closes the loop"
         if not kept.is_file():
             return "no calibration was changed"
         text = f"what was done is kept in {kept}: the same command with --resume goes on with it"
@@ -127,8 +127,8 @@ class Commissioning:
         )
 
     def _steps_of(self, kept: Path) -> tuple[dict[str, Any], str]:
-        asked, config = self._asked, self._config
-        resumed = asked.resume and kept.is_file()
+        options, config = self._options, self._config
+        resumed = options.resume and kept.is_file()
         if resumed:
             first = calibration_file.load(kept)
             camera = self._loop.camera()
@@ -137,25 +137,26 @@ class Commissioning:
                     f"{kept} is for frames of {first.shape[0]} x {first.shape[1]} pixels, the camera's are "
                     f"{camera.shape[0]} x {camera.shape[1]}: leave --resume out"
                 )
-            self._say(f"going on from {kept}: the camera's steps, orientation and sign are done")
+            self._report(f"going on from {kept}: the camera's steps, orientation and sign are done")
         else:
             first = self._first()
             calibration_file.save(first, kept)
         self._loop.load(first)
-        delay = self._delay if self._delay is not None else first_delay(self._loop, config, first, self._say)
-        resume = resumed and partial_of(asked.out).is_file()
+        player = Player(self._loop, first, self._report)
+        delay = self._delay if self._delay is not None else first_delay(player, config)
+        resume = resumed and partial_of(options.out).is_file()
         if resume:
-            amplitude_nm = float(begun(partial_of(asked.out))[0]["amplitude_nm"])
+            amplitude_nm = float(begun(partial_of(options.out))[0]["amplitude_nm"])
         else:
             self._step("poke amplitude")
-            usual_nm = Pokes(config, first, factory.frame_noise_nm(config, first), self._wanted()).amplitude_nm
-            amplitude_nm = linear_nm(self._loop, config, first, delay, usual_nm, self._say)
+            usual_nm = Pokes(config, first, factory.frame_noise_nm(config, first), self._request()).amplitude_nm
+            amplitude_nm = linear_nm(player, config, delay, usual_nm)
         self._step("response")
-        wanted = self._wanted(amplitude_nm, resume=resume)
-        calibrator = Calibrator(self._loop, wanted, self._say, self._progress, self._computed)
-        taken = calibrator.run(delay)
+        request = self._request(amplitude_nm, resume=resume)
+        calibrator = Calibrator(self._loop, request, self._report, self._progress, self._computed)
+        data = calibrator.run(delay)
         self._step("verdict")
-        made, result = finished(calibrator, wanted, taken, self._computed)
+        made, result = finished(calibrator, request, data, self._computed)
         self._figures |= result.figures()
         if not result.recommended:
             raise CalibrationError(
@@ -164,25 +165,25 @@ class Commissioning:
             )
         self._loop.load(made)
         self._judged = True
-        for path in (kept, partial_of(asked.out)):
+        for path in (kept, partial_of(options.out)):
             path.unlink(missing_ok=True)
-        self._say(result.text())
+        self._report(result.text())
         law = factory.settings(config).law(made.noll)
         return self._figures, self._close(law, delay.delay_frames)
 
-    def _wanted(self, amplitude_nm: float | None = None, *, resume: bool = False) -> CalibrationRequest:
-        asked = self._asked
-        snr = asked.snr if asked.cycles is None else LEAST_SNR
-        return CalibrationRequest(METHOD, asked.out, snr, asked.cycles, amplitude_nm, resume)
+    def _request(self, amplitude_nm: float | None = None, *, resume: bool = False) -> CalibrationRequest:
+        options = self._options
+        snr = options.snr if options.cycles is None else LEAST_SNR
+        return CalibrationRequest(METHOD, options.out, snr, options.cycles, amplitude_nm, resume)
 
     def _step(self, name: str) -> None:
-        self._say(f"[{STEPS.index(name) + 1}/{len(STEPS)}] {name}")
+        self._report(f"[{STEPS.index(name) + 1}/{len(STEPS)}] {name}")
 
     def _open(self) -> Calibration | None:
         """The loop as it must be: open or idle, and a mirror as configured; the calibration in use, if there is one."""
         state = self._loop.status().state
         if state is None:
-            raise CalibrationError("the controller did not say how it is")
+            raise CalibrationError("the controller did not report its state")
         if state.mode == wire.LOOP_MODE_SAFE:
             raise CalibrationError("the loop is in safe mode: `lowfc ctl clear` first, when it is safe")
         grid = (state.mirror_rows, state.mirror_columns)
@@ -192,34 +193,35 @@ class Commissioning:
                 f"{self._computed.grid[1]}: set mirror.rows and mirror.columns"
             )
         if state.mode == wire.LOOP_MODE_CLOSED:
-            self._say("the loop is opened")
+            self._report("the loop is opened")
             self._loop.open_loop()
         return self._loop.calibration() if state.calibration_id and state.mode != wire.LOOP_MODE_IDLE else None
 
     def _first(self) -> Calibration:
         self._step("camera")
         seen = list(self._loop.frames(LOOKED_AT))
-        camera = camera_fits(self._config, self._loop.camera_state(), seen, self._say)
+        camera = camera_fits(self._config, self._loop.camera_state(), seen, self._report)
         self._step("dark and bad pixels")
-        asked, sensor = self._asked, without_dark(camera)
-        if asked.dark is not None:
-            sensor = darkened(camera, images(asked.dark), self._say)
-        elif asked.no_dark:
-            self._say(f"no dark: the camera's bias of {camera.bias_dn:g} DN everywhere, and all pixels good")
+        options, sensor = self._options, without_dark(camera)
+        if options.dark is not None:
+            sensor = darkened(camera, images(options.dark), self._report)
+        elif options.no_dark:
+            self._report(f"no dark: the camera's bias of {camera.bias_dn:g} DN everywhere, and all pixels good")
         else:
             self._confirm("block the star; is it dark?")
-            sensor = darkened(camera, watch(self._loop, asked.frames), self._say)
+            sensor = darkened(camera, watch(self._loop, options.frames), self._report)
             self._confirm("unblock the star; is it there?")
         self._step("reference image")
-        before = referenced(sensor, watch(self._loop, asked.frames), self._computed, self._say)
+        before = referenced(sensor, watch(self._loop, options.frames), self._computed, self._report)
         self._step("delay")
-        self._delay = delay = first_delay(self._loop, self._config, before, self._say)
+        player = Player(self._loop, before, self._report)
+        self._delay = delay = first_delay(player, self._config)
         self._step("orientation and sign")
-        first = aligned(self._config, self._computed, before, delay, self._say, self._figures)
-        return poked(self._loop, self._config, before, delay, self._say) if first is None else first
+        first = aligned(self._config, self._computed, before, delay, self._report, self._figures)
+        return poked(player, self._config, delay) if first is None else first
 
     def _close(self, law: Law, delay_frames: float) -> str:
-        """Predict the residual; close the loop where that was asked for, and compare."""
+        """Predict the residual; close the loop where that was options for, and compare."""
         rate_hz = self._config.camera.rate_hz
         settling = settling_frames(law.gain, law.leak, rate_hz)
         frames = settling + max(MIN_PREDICTED, settling)
@@ -233,7 +235,7 @@ class Commissioning:
             raise CalibrationError(f"the residual is not predicted: {error}") from None
         self._figures["predicted_error_nm"] = predicted
         text = f"the closed loop leaves {predicted:.3g} nm rms of measured error, predicted from {frames} open frames"
-        if not self._asked.close:
+        if not self._options.close:
             return f"{text}\n`lowfc ctl close` closes it"
         self._step("closed loop")
         self._loop.close_loop()
@@ -256,7 +258,7 @@ class Commissioning:
 
     def _steps(self, frames: int, mode: LoopMode = LoopMode.OPEN) -> Steps:
         steps: list[Step] = []
-        self._say(f"watching {frames} frames, {frames / self._config.camera.rate_hz:.0f} s")
+        self._report(f"watching {frames} frames, {frames / self._config.camera.rate_hz:.0f} s")
         for step in self._loop.steps():
             if step.mode is mode:
                 steps.append(step)

@@ -6,7 +6,6 @@ from typing import Any
 import numpy as np
 
 from lowfc.arrays import single
-from lowfc.client import Client
 from lowfc.contract.codecs.calibration_codec import identified
 from lowfc.contract.configuration import Configuration
 from lowfc.contract.errors import CalibrationError
@@ -17,7 +16,7 @@ from lowfc.control.calibration.delay_fit import Delay
 from lowfc.control.calibration.response_fit import likeness
 from lowfc.programs.commissioning.calibrate.align import computed_scale, in_words, on_sensor
 from lowfc.programs.commissioning.calibrate.pokes import AMPLITUDE_NM, HOLD, SETTLE, largest_nm, sequence
-from lowfc.programs.commissioning.calibrate.recording import AFTERWARDS, Player, PokesNotSeenError, Say
+from lowfc.programs.commissioning.calibrate.recording import AFTERWARDS, Player, PokesNotSeenError, Report
 from lowfc.programs.commissioning.calibrate.result import reconstructed
 
 FIRST_NM = AMPLITUDE_NM["poke"]
@@ -32,24 +31,25 @@ MAX_NOT_LINEAR = 0.1
 _SURE = 3.0
 
 
-def first_delay(loop: Client, config: Configuration, before: Calibration, say: Say) -> Delay:
+def first_delay(player: Player, config: Configuration) -> Delay:
     """The delay, and the image of a poke of the first mode: pokes that grow until they are seen.
 
     Raises:
         CalibrationError: no poke is seen, or frames are lost.
     """
+    before, report = player.before, player.report
     amplitude_nm, most_nm = FIRST_NM, float(largest_nm(config, before)[0])
     while True:
         amplitude_nm = min(amplitude_nm, most_nm)
         try:
-            found = Player(loop, before, say).first_poke(0, sequence(amplitude_nm))
+            found = player.first_poke(0, sequence(amplitude_nm))
             break
         except PokesNotSeenError:
             if amplitude_nm >= min(MAX_FIRST_NM, most_nm):
                 raise
-            say(f"pokes of {amplitude_nm:g} nm are not seen: twice as large")
+            report(f"pokes of {amplitude_nm:g} nm are not seen: twice as large")
             amplitude_nm *= 2
-    say(
+    report(
         f"pokes of Z{before.noll[0]} of {amplitude_nm:g} nm are seen after {found.delay_frames:.3f} +- "
         f"{found.error_frames:.3f} frames, {found.delay_frames * config.period_ns * 1e-6:.3g} ms"
     )
@@ -57,7 +57,12 @@ def first_delay(loop: Client, config: Configuration, before: Calibration, say: S
 
 
 def aligned(
-    config: Configuration, computed: Calibration, before: Calibration, poke: Delay, say: Say, figures: dict[str, Any]
+    config: Configuration,
+    computed: Calibration,
+    before: Calibration,
+    poke: Delay,
+    report: Report,
+    figures: dict[str, Any],
 ) -> Calibration | None:
     """The computed calibration on the sensor's pixels, with the sign that the poke shows; None for another sensor.
 
@@ -69,7 +74,7 @@ def aligned(
         found = align(image, model)
         made = on_sensor(config, computed, found.geometry, before.flux_dn, before.shape, before)
     except (ValueError, CalibrationError) as error:
-        say(f"the image is not compared with the computed one: {error}")
+        report(f"the image is not compared with the computed one: {error}")
         return None
     like = likeness(poke.picture, made.response[:, 0])
     if like < 0:
@@ -77,9 +82,9 @@ def aligned(
         made = on_sensor(config, computed, found.geometry, before.flux_dn, before.shape, before)
         like = likeness(poke.picture, made.response[:, 0])
     scale = found.geometry.scale * computed_scale(config)
-    say(f"{in_words(found, scale)}; the poke's image correlates by {like:.2f} with the computed one")
+    report(f"{in_words(found, scale)}; the poke's image correlates by {like:.2f} with the computed one")
     if found.residual > MAX_MISFIT or like < MIN_LIKENESS:
-        say("this is not the configured sensor: the response is measured without the optical model")
+        report("this is not the configured sensor: the response is measured without the optical model")
         return None
     figures |= {
         "pixels_per_lambda_d": scale,
@@ -92,22 +97,22 @@ def aligned(
     return identified(made)
 
 
-def poked(loop: Client, config: Configuration, before: Calibration, poke: Delay, say: Say) -> Calibration:
+def poked(player: Player, config: Configuration, poke: Delay) -> Calibration:
     """A calibration of each mode's own pokes, without an optical model.
 
     Raises:
         CalibrationError: frames are lost, or the sensor cannot tell the modes apart.
     """
-    modes = len(before.noll)
+    before, modes = player.before, len(player.before.noll)
     amplitude_nm = min(FIRST_NM, float(largest_nm(config, before).min()))
     response = np.zeros_like(before.response, dtype=np.float64)
-    _say_time(config, modes, CYCLES, say)
+    _report_time(player, config, CYCLES)
     for number in range(CYCLES):
         plan = _poke_cycle(modes, amplitude_nm, number)
-        response += Player(loop, before, say).cycle(plan, poke.delay_frames).response / CYCLES
+        response += player.cycle(plan, poke.delay_frames).response / CYCLES
     good, reference = before.good.astype(np.float64), before.reference.astype(np.float64)
     matrix = reconstructed(config, reference, response, None, good, before.flux_dn).matrix
-    say(f"{CYCLES} pokes of each mode by {amplitude_nm:.3g} nm")
+    player.report(f"{CYCLES} pokes of each mode by {amplitude_nm:.3g} nm")
     made = replace(
         before,
         response=single(response),
@@ -117,9 +122,7 @@ def poked(loop: Client, config: Configuration, before: Calibration, poke: Delay,
     return identified(made)
 
 
-def linear_nm(
-    loop: Client, config: Configuration, first: Calibration, delay: Delay, usual_nm: float, say: Say
-) -> float:
+def linear_nm(player: Player, config: Configuration, delay: Delay, usual_nm: float) -> float:
     """Amplitude at which all modes may be poked at once, nm rms of each.
 
     It is the usual one, halved where single pokes and those of half their amplitude show a sensor that is not linear.
@@ -127,10 +130,11 @@ def linear_nm(
     Raises:
         CalibrationError: frames are lost.
     """
+    first = player.before
     R, modes = first.reconstructor.astype(np.float64), len(first.noll)
     top_nm = min(FIRST_NM, float(largest_nm(config, first).min()))
-    gains, player = np.empty((2, 2, modes)), Player(loop, first, say)
-    _say_time(config, modes, gains[..., 0].size, say)
+    gains = np.empty((2, 2, modes))
+    _report_time(player, config, gains[..., 0].size)
     for level, amplitude_nm in enumerate((top_nm, top_nm / 2)):
         for again in range(2):
             plan = _poke_cycle(modes, amplitude_nm, again)
@@ -139,16 +143,16 @@ def linear_nm(
     error = float(np.sqrt(np.mean(np.diff(gains, axis=1) ** 2) / 2))  # of the mean of two, doubled: two amplitudes
     worst = int(off.argmax())
     chosen_nm = usual_nm / 2 if off[worst] > MAX_NOT_LINEAR + _SURE * error else usual_nm
-    say(
+    player.report(
         f"pokes of {top_nm:.3g} nm and of half of it answer alike within {off[worst]:.1%} (+- {error:.1%}; "
         f"Z{first.noll[worst]}): {chosen_nm:.3g} nm in each mode"
     )
     return chosen_nm
 
 
-def _say_time(config: Configuration, modes: int, cycles: int, say: Say) -> None:
-    frames = len(_poke_cycle(modes, 1.0, 0)) + AFTERWARDS
-    say(f"{cycles} cycles of {frames} frames; about {cycles * frames / config.camera.rate_hz:.0f} s to go")
+def _report_time(player: Player, config: Configuration, cycles: int) -> None:
+    frames = len(_poke_cycle(len(player.before.noll), 1.0, 0)) + AFTERWARDS
+    player.report(f"{cycles} cycles of {frames} frames; about {cycles * frames / config.camera.rate_hz:.0f} s to go")
 
 
 def _poke_cycle(modes: int, amplitude_nm: float, number: int) -> poke_plan.Plan:

@@ -16,7 +16,7 @@ from lowfc.contract.messages import wire
 from lowfc.control.calibration.calibration import Calibration
 from lowfc.control.calibration.dark_frames import check_dark, dark_of
 from lowfc.control.loop.camera import CameraSettings
-from lowfc.programs.commissioning.calibrate.recording import Say
+from lowfc.programs.commissioning.calibrate.recording import Report
 from lowfc.programs.commissioning.checks import Status
 from lowfc.programs.commissioning.conformance.settings import agreement_checks
 
@@ -33,16 +33,18 @@ class Sensor(NamedTuple):
         camera: its settings.
         dark_dn: (pixels,) mean.
         good: (pixels,) 1 where a pixel is used, else 0.
-        taken: Whether the dark was measured.
+        measured: Whether the dark was measured.
     """
 
     camera: CameraSettings
     dark_dn: Array
     good: Array
-    taken: bool
+    measured: bool
 
 
-def camera_fits(config: Configuration, state: wire.CameraState, images: Sequence[Frame], say: Say) -> CameraSettings:
+def camera_fits(
+    config: Configuration, state: wire.CameraState, images: Sequence[Frame], report: Report
+) -> CameraSettings:
     """The camera's settings, once its frames and the configuration agree with them.
 
     Raises:
@@ -77,8 +79,8 @@ def camera_fits(config: Configuration, state: wire.CameraState, images: Sequence
         raise CalibrationError("the camera cannot be used as it is:\n" + "\n".join(f"  {fault}" for fault in faults))
     for check in checks:
         if check.status is Status.WARNING:
-            say(f"remark: {check.name}: the camera has {check.got}, expected {check.expected}")
-    say(
+            report(f"remark: {check.name}: the camera has {check.got}, expected {check.expected}")
+    report(
         f"{state.rows} x {state.columns} pixels of {state.bit_depth} bits at {_NS / period_ns:.5g} Hz, brightest pixel "
         f"{brightest} of {state.saturation_dn:g} DN"
     )
@@ -86,12 +88,12 @@ def camera_fits(config: Configuration, state: wire.CameraState, images: Sequence
 
 
 def without_dark(camera: CameraSettings) -> Sensor:
-    """A sensor of which no dark is taken: its bias everywhere, and no bad pixel."""
+    """A sensor of which no dark is measured: its bias everywhere, and no bad pixel."""
     pixels = camera.shape[0] * camera.shape[1]
-    return Sensor(camera, np.full(pixels, float(camera.bias_dn)), np.ones(pixels), taken=False)
+    return Sensor(camera, np.full(pixels, float(camera.bias_dn)), np.ones(pixels), measured=False)
 
 
-def darkened(camera: CameraSettings, frames: npt.NDArray[np.number], say: Say) -> Sensor:
+def darkened(camera: CameraSettings, frames: npt.NDArray[np.number], report: Report) -> Sensor:
     """A sensor with a dark (frames, rows, columns) and what it shows of bad pixels.
 
     Raises:
@@ -103,11 +105,11 @@ def darkened(camera: CameraSettings, frames: npt.NDArray[np.number], say: Say) -
         found = dark_of(frames.reshape(len(frames), -1))
     except ValueError as error:
         raise CalibrationError(str(error)) from None
-    say(str(found))
-    return Sensor(camera, found.dark_dn, found.good, taken=True)
+    report(str(found))
+    return Sensor(camera, found.dark_dn, found.good, measured=True)
 
 
-def referenced(sensor: Sensor, frames: npt.NDArray[np.number], computed: Calibration, say: Say) -> Calibration:
+def referenced(sensor: Sensor, frames: npt.NDArray[np.number], computed: Calibration, report: Report) -> Calibration:
     """A calibration with the reference image of these frames (frames, rows, columns), and no response yet.
 
     Its modes and the mirror's commands are those of a computed calibration.
@@ -124,13 +126,13 @@ def referenced(sensor: Sensor, frames: npt.NDArray[np.number], computed: Calibra
             f"{noise_dn:.2g} DN; is the star blocked now, or was it not blocked for the dark?"
         )
     reference = image * sensor.good / flux_dn
-    if sensor.taken:
+    if sensor.measured:
         try:
             check_dark(sensor.dark_dn, reference, flux_dn)
         except ValueError as error:
             raise CalibrationError(str(error)) from None
     modes = len(computed.noll)
-    say(f"{flux_dn:.4g} DN of light in a frame, mean of {len(frames)} frames")
+    report(f"{flux_dn:.4g} DN of light in a frame, mean of {len(frames)} frames")
     return replace(
         computed,
         reference=reference.astype(np.float32),

@@ -24,7 +24,7 @@ CHANNEL = "lowfc"
 """The controller's, so that its next command takes the place of ours."""
 TURN_S = 0.002
 
-Tell = Callable[[str], None]
+Show = Callable[[str], None]
 
 _PATTERN_SEED = 5
 _GENTLE = 0.05

@@ -5,11 +5,10 @@ from itertools import pairwise
 
 import numpy as np
 
-from lowfc.arrays import Single
+from lowfc.arrays import Mask, Single
 from lowfc.contract.messages import from_timestamp, wire
 from lowfc.programs.commissioning.checks import Check, Status, ok, warning, wrong
-from lowfc.programs.commissioning.conformance.dialogue import ANSWER_S, MODAL_NM, Dialogue, Tell
-from lowfc.programs.commissioning.conformance.limits import limit_checks
+from lowfc.programs.commissioning.conformance.dialogue import ANSWER_S, MODAL_NM, Dialogue, Show
 from lowfc.programs.commissioning.conformance.line import NS
 from lowfc.programs.commissioning.conformance.publisher import PROCESS, PUBLISHER
 
@@ -24,27 +23,28 @@ _LONG_NS = 60 * NS
 _REFUSED_EVERY_NS = 50_000_000
 _RAISED_NM = 10.0  # above where it relaxes to
 _REFUSAL_S = 0.15
+_NEAR, _BEYOND, _FAR = 0.9, 1.05, 2.0  # of a limit
 _SETTLE_S = 0.05  # of actuators that are reported where they are, not where they are going
 
 
-def mirror_checks(mirror: Dialogue, seconds: float, tell: Tell, *, gentle: bool = False) -> list[Check]:
+def mirror_checks(mirror: Dialogue, seconds: float, show: Show, *, gentle: bool = False) -> list[Check]:
     """What is right and wrong with a mirror; it ends where it was."""
     found: list[Check] = []
     base_nm = np.zeros(mirror.expected.grid, np.float32)
     begun_ns = mirror.line.now_ns()
     try:
-        tell("idle")
+        show("idle")
         found += _idle(mirror)
         if (last := mirror.last) is not None:
             base_nm = base_nm if (where_nm := mirror.surface_nm(last)) is None else where_nm
         if not _bad(found, "grid", "state"):
             mirror.begin(base_nm, 0 if last is None else last.frame_sequence)
-            tell("ordinary commands")
+            show("ordinary commands")
             found += _next_command(mirror, base_nm, seconds)
         if not _bad(found, "grid", "state", "answers"):
-            tell("commands that must be refused")
+            show("commands that must be refused")
             found += _refusals(mirror, base_nm)
-            tell("the command timeout")
+            show("the command timeout")
             found += _timeout(mirror, base_nm, 0.0 if gentle else min(_RAISED_NM, mirror.expected.move_nm))
         if gentle or _bad(found):
             untried = warning("not tried: something above is wrong", "put that right first")
@@ -52,8 +52,8 @@ def mirror_checks(mirror: Dialogue, seconds: float, tell: Tell, *, gentle: bool 
                 untried = warning("not tried: --gentle", "try them before the loop is closed, without --gentle")
             found.append(untried._replace(name="limits", expected="its own stroke, slew and neighbour limits"))
         else:
-            tell("its limits")
-            found += limit_checks(mirror)
+            show("its limits")
+            found += _limit_checks(mirror)
     finally:
         if mirror.states and not _bad(found, "grid", "state"):
             mirror.go(base_nm)
@@ -180,7 +180,7 @@ def _applied(mirror: Dialogue, base_nm: Single, commanded_nm: Single, state: wir
 
 def _difference(base_nm: Single, commanded_nm: Single, where_nm: Single) -> str:
     """What kind of mistake turns the one shape into the other."""
-    asked, got = commanded_nm.astype(np.float64) - base_nm, where_nm.astype(np.float64) - base_nm
+    commanded, got = commanded_nm.astype(np.float64) - base_nm, where_nm.astype(np.float64) - base_nm
     turns = {
         "as commanded": got,
         "with rows and columns exchanged": got.T,
@@ -189,14 +189,14 @@ def _difference(base_nm: Single, commanded_nm: Single, where_nm: Single) -> str:
         "turned by 180 degrees": got[::-1, ::-1],
     }
     alike = {
-        how: float((asked * one).sum() / max(np.linalg.norm(asked) * np.linalg.norm(one), 1e-30))
+        how: float((commanded * one).sum() / max(np.linalg.norm(commanded) * np.linalg.norm(one), 1e-30))
         for how, one in turns.items()
-        if one.shape == asked.shape
+        if one.shape == commanded.shape
     }
     how = max(alike, key=lambda one: abs(alike[one]))
     if abs(alike[how]) < 0.9:
         return "it is another shape altogether: in which order does the driver take the actuators?"
-    scale = float((asked * turns[how]).sum() / (asked**2).sum())
+    scale = float((commanded * turns[how]).sum() / (commanded**2).sum())
     advice = f"it is the shape {how}, times {scale:.3g}"
     if abs(scale - 2) < 0.02:
         advice += ": report surface, not wavefront"
@@ -302,3 +302,69 @@ def _timeout(mirror: Dialogue, base_nm: Single, raised_by_nm: float) -> Iterator
 def _expired_ns(mirror: Dialogue, since_ns: int) -> int | None:
     arrivals = (message.receive_time_ns for message, state in mirror.since(since_ns) if state.status == _EXPIRED)
     return next(arrivals, None)
+
+
+def _limit_checks(mirror: Dialogue) -> Iterator[Check]:
+    """Try stroke, slew and neighbour limits, all actuators together where that will do; it ends flat."""
+    limits, flat_nm = mirror.expected.limits, np.zeros(mirror.expected.grid, np.float32)
+    even = np.ones_like(flat_nm)
+    peak, among = _peak(mirror.expected.moving)
+    stroke_nm, slew_nm, apart_nm = limits.stroke_nm, limits.slew_nm, limits.neighbour_nm
+    too_far_nm = min(_FAR * slew_nm, _NEAR * stroke_nm)
+    fits = _BEYOND * apart_nm / 2 <= _NEAR * stroke_nm and mirror.reachable(_BEYOND * apart_nm)
+    for name, words, reason, limit_nm, asked_nm, shape, possible in (
+        ("stroke", "no actuator above", wire.REASON_STROKE, stroke_nm, _BEYOND * stroke_nm, even, _rises(mirror)),
+        ("slew", "no move above", wire.REASON_SLEW, slew_nm, too_far_nm, even, too_far_nm >= _BEYOND * slew_nm),
+        ("neighbours", "no step above", wire.REASON_NEIGHBOUR, apart_nm, _BEYOND * apart_nm, peak, fits),
+    ):
+        expected = f"{words} {limit_nm:g} nm, when {asked_nm:.4g} nm are asked for"
+        check = warning("not tried: it cannot go there", "do mirror.stroke_nm (whole range) and the limits fit it?")
+        if possible:
+            wanted_nm = np.float32(asked_nm) * shape
+            state = mirror.ask(wanted_nm)[0] if name == "slew" else mirror.go(wanted_nm)
+            where_nm = mirror.surface_nm(state)
+            if state is None or where_nm is None:
+                check = wrong("no answer", "follow the command as far as it goes: a refusal stops the loop")
+            else:
+                found_nm = _highest_nm(mirror, where_nm) if shape is even else float(np.ptp(where_nm[among]))
+                check = _kept(state, reason, found_nm, limit_nm + mirror.expected.tolerance_nm)
+        yield check._replace(name=name, expected=expected)
+        mirror.go(flat_nm)
+
+
+def _kept(state: wire.MirrorState, reason: wire.Reason, found_nm: float, most_nm: float) -> Check:
+    got = f"{found_nm:.4f} nm"
+    if found_nm > most_nm:
+        return wrong(got, "cut it in the driver's program, whatever is asked: do not rely on the controller's limits")
+    if reason in state.limits_hit:
+        return ok(got)
+    advice = f"put {wire.Reason.Name(reason)} into limits_hit: an observer should know that the mirror was held"
+    return warning(f"{got}, but limits_hit does not say so", advice)
+
+
+def _rises(mirror: Dialogue) -> bool:
+    """Whether the mirror follows to nine tenths of its stroke, in moves of half the slew limit; it stays there."""
+    stroke_nm = mirror.expected.limits.stroke_nm
+    mirror.go(np.zeros(mirror.expected.grid, np.float32))
+    if not mirror.reachable(stroke_nm):
+        return False
+    where_nm = mirror.surface_nm(mirror.go(np.full(mirror.expected.grid, _NEAR * stroke_nm, np.float32)))
+    return where_nm is not None and _highest_nm(mirror, where_nm) >= (_NEAR - 0.05) * stroke_nm
+
+
+def _peak(moving: Mask) -> tuple[Single, tuple[int, list[int]]]:
+    """One actuator half up and all others half down; where it and its two neighbours in its row are.
+
+    It moves, between two that do, as near to the middle as there is one.
+    """
+    good = np.zeros_like(moving)
+    good[:, 1:-1] = moving[:, 1:-1] & moving[:, :-2] & moving[:, 2:]
+    places = np.argwhere(good if good.any() else np.ones_like(good))
+    row, column = map(int, places[np.argmin(((places - (np.array(moving.shape) - 1) / 2) ** 2).sum(axis=1))])
+    peak = np.full(moving.shape, -0.5, np.float32)
+    peak[row, column] = 0.5
+    return peak, (row, [column - 1, column, column + 1])
+
+
+def _highest_nm(mirror: Dialogue, surface_nm: Single) -> float:
+    return float(np.abs(surface_nm[mirror.expected.moving]).max())

@@ -38,10 +38,10 @@ class Facts:
         return self.trial
 
     @property
-    def asked_cpus(self) -> set[int]:
+    def named_cpus(self) -> set[int]:
         """Processors that the configuration names for camera, controller, mirror and recorder."""
-        asked = self.config.realtime
-        return {*asked.camera_cpus, *asked.controller_cpus, *asked.mirror_cpus, *asked.recorder_cpus}
+        section = self.config.realtime
+        return {*section.camera_cpus, *section.controller_cpus, *section.mirror_cpus, *section.recorder_cpus}
 
     @property
     def bytes_per_s(self) -> float:
@@ -56,7 +56,7 @@ def gather(host: Host, config: Configuration, seconds: float) -> Facts:
     host.busy()
     trial: Trial | OSError
     try:
-        trial = try_out(config.realtime, facts.asked_cpus, seconds)
+        trial = try_out(config.realtime, facts.named_cpus, seconds)
     except OSError as fault:
         trial = fault
     return replace(facts, trial=trial, busy=tuple(host.busy()))

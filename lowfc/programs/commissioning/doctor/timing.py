@@ -71,14 +71,14 @@ def _processors(facts: Facts) -> Check:
     """
     usable, online = facts.host.usable_cpus(), facts.host.cpus("online")
     detail = f"{len(usable)} usable ({ranges(usable)}) of {len(online)}"
-    asked = facts.asked_cpus
-    if missing := asked and asked - facts.tried.cpus:
+    named = facts.named_cpus
+    if missing := named and named - facts.tried.cpus:
         return warning(
             f"{detail}; the configuration names {ranges(missing)}",
             "correct realtime.camera_cpus, controller_cpus and mirror_cpus",
             "the kernel moves the loop between processors; expect a longer tail",
         )
-    if len(usable | asked) < len(PROCESSES):
+    if len(usable | named) < len(PROCESSES):
         return warning(
             f"{detail}, for {len(PROCESSES)} processes: {', '.join(PROCESSES)}",
             f"a host with {len(PROCESSES)} processors or more; where it has them, a wider affinity (taskset, cpuset)",
@@ -104,12 +104,13 @@ def _isolation(facts: Facts) -> Check:
         return warning("none", advice, cost)
     without_tick = ranges(isolated & facts.host.cpus("nohz_full")) or "none"
     detail = f"{ranges(isolated)}; of these without a timer tick: {without_tick}"
-    asked = facts.asked_cpus
-    if asked and asked <= isolated:
+    named = facts.named_cpus
+    if named and named <= isolated:
         return ok(detail)
-    named = ranges(asked) if asked else "none"
     return warning(
-        f"{detail}; the configuration names {named}", "name the isolated ones in realtime.*_cpus", f"unused; {cost}"
+        f"{detail}; the configuration names {ranges(named) or 'none'}",
+        "name the isolated ones in realtime.*_cpus",
+        f"unused; {cost}",
     )
 
 
