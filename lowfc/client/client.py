@@ -48,6 +48,7 @@ from lowfc.control.loop.command_channels import MIRROR, OFFSET
 from lowfc.control.loop.inputs import Step
 
 Single = npt.NDArray[np.float32]
+Modes = int | Sequence[int]
 M = TypeVar("M", bound=Message)
 
 CONNECT_S = 1.0
@@ -118,15 +119,15 @@ class Client:
     reset = _plain("reset")
     stop = _plain("stop")
 
-    def gain(self, values: npt.ArrayLike, modes: int | Sequence[int] = ()) -> Answer:
+    def gain(self, values: npt.ArrayLike, modes: Modes = ()) -> Answer:
         """Set integrator gains: one value, or one for each of `modes` (a Noll index or several, all when empty)."""
         return self.ask("gain", modes, values)
 
-    def leak(self, values: npt.ArrayLike, modes: int | Sequence[int] = ()) -> Answer:
+    def leak(self, values: npt.ArrayLike, modes: Modes = ()) -> Answer:
         """Set integrator leaks, as `gain`."""
         return self.ask("leak", modes, values)
 
-    def limit(self, values: npt.ArrayLike, modes: int | Sequence[int] = ()) -> Answer:
+    def limit(self, values: npt.ArrayLike, modes: Modes = ()) -> Answer:
         """Set the largest modal commands, nm rms of wavefront, as `gain`."""
         return self.ask("limit", modes, values)
 
@@ -134,7 +135,7 @@ class Client:
         """Close the loop for some frames; then it opens by itself."""
         return self.ask("step", values=frames)
 
-    def offset(self, values: npt.ArrayLike = (), modes: int | Sequence[int] = ()) -> Answer:
+    def offset(self, values: npt.ArrayLike = (), modes: Modes = ()) -> Answer:
         """Set the loop's target, nm rms of wavefront, as `gain`; zero without values."""
         return self.ask("offset", modes, values)
 
@@ -158,9 +159,8 @@ class Client:
             basis_nm: (shapes, actuators) or (shapes, rows, columns), nm of surface.
             table: (frames, shapes), a row of factors for each frame from the answered one on.
         """
-        basis = np.asarray(basis_nm, np.float32)
+        basis, factors = np.asarray(basis_nm, np.float32), np.asarray(table, np.float32)
         basis = basis.reshape(len(basis), -1) if basis.ndim == 3 else basis
-        factors = np.asarray(table, np.float32)
         if basis.ndim != 2 or factors.ndim != 2 or factors.shape[1] != len(basis):
             raise RequestRefusedError(
                 "play refused: it takes shapes (shapes, actuators) and a table (frames, shapes), got arrays of shape "
@@ -286,7 +286,7 @@ class Client:
     def ask(
         self,
         name: str,
-        modes: int | Sequence[int] = (),
+        modes: Modes = (),
         values: npt.ArrayLike = (),
         *,
         text: str = "",

@@ -44,10 +44,7 @@ ASKED: tuple[Asked, ...] = (
     _asked("close", "Let the control law drive the mirror.", "close"),
     _asked("pause", "Hold the command; `close` goes on from it.", "pause"),
     _asked(
-        "step",
-        "Close the loop for some frames; then it opens by itself.",
-        "step 100",
-        ("values", "number of frames"),
+        "step", "Close the loop for some frames; then it opens by itself.", "step 100", ("values", "number of frames")
     ),
     _asked("safe", "Relax the mirror to flat and latch it there, whatever else is asked.", "safe"),
     _asked("clear", "Leave the latched safe state; the loop is open afterwards.", "clear"),
@@ -100,12 +97,7 @@ ASKED: tuple[Asked, ...] = (
         "law lqg.fits",
         ("law", "none for the integrator"),
     ),
-    _asked(
-        "load",
-        "Use another calibration from now on; the loop must be open.",
-        "load calibration.fits",
-        ("calibration", "all of it"),
-    ),
+    _asked("load", "Use another calibration; the loop must be open.", "load calibration.fits", ("calibration", "all")),
     _asked("note", "Leave a note in the log.", 'note "new star"', ("text", "the note")),
     _asked(
         "lease",
@@ -126,12 +118,7 @@ ASKED: tuple[Asked, ...] = (
     ),
     _asked("release", "End a reservation.", "", ("lease_id", "as in `lease`")),
     _asked("configuration", "Answer with the configuration that the controller was started with.", "configuration"),
-    Asked(
-        RECORD_KEY.format(name="start"),
-        (),
-        "Start the next log and print its path.",
-        "record start",
-    ),
+    Asked(RECORD_KEY.format(name="start"), (), "Start the next log and print its path.", "record start"),
     Asked(
         RECORD_KEY.format(name="stop"),
         (),

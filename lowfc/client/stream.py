@@ -57,19 +57,19 @@ class Stream(Generic[T]):
         Raises:
             BusError: none came.
         """
-        self._ring: Ring | None = ring
+        self._ring = ring
         self._decode = decode
         self._what = what
-        self._left = count
+        self._left = -1 if count is None else count
         self._patience_s = patience_s
         self._gaps: dict[int, Gaps] = {}
         self._damaged = 0
         self._waiting: deque[Sample] = deque()
-        self._fill(ring)
+        self._fill()
 
     @property
     def lost(self) -> int:
-        """Messages that were sent and did not get here, because their reader was too slow, or that were none."""
+        """Messages that were sent and did not get here, because their reader was too slow, or that were damaged."""
         return self._damaged + sum(gaps.missing for gaps in self._gaps.values())
 
     def __iter__(self) -> "Stream[T]":
@@ -81,15 +81,14 @@ class Stream(Generic[T]):
         Raises:
             BusError: none came for too long.
         """
-        while self._ring is not None and self._left != 0:
-            if not self._waiting:
-                self._fill(self._ring)
+        while self._left:
+            self._fill()
             sample = self._waiting.popleft()
             count = count_of(sample.sequence)
             self._gaps.setdefault(start_of(sample.sequence), Gaps(count)).came(count)
             found = self._decode(sample)
             if found is not None:
-                self._left = None if self._left is None else self._left - 1
+                self._left -= 1
                 return found
             self._damaged += 1
         self.close()
@@ -97,15 +96,14 @@ class Stream(Generic[T]):
 
     def close(self) -> None:
         """Get no more."""
-        ring, self._ring = self._ring, None
-        if ring is not None:
-            ring.close()
+        self._left = 0
+        self._ring.close()
         self._waiting.clear()
 
-    def _fill(self, ring: Ring) -> None:
+    def _fill(self) -> None:
         deadline_s = time.monotonic() + self._patience_s
         while not self._waiting:
-            self._waiting.extend(ring.drain())
+            self._waiting.extend(self._ring.drain())
             if not self._waiting:
                 if time.monotonic() >= deadline_s:
                     self.close()

@@ -32,38 +32,31 @@ _STATES = rr.StateConfiguration(
 
 def message_layout() -> rrb.Blueprint:
     """Views of a log's images, events and messages, with the names of the default's modes and mirror."""
-    frame = rrb.Spatial2DView(origin=f"/{FRAME.key}", name="frame, DN")
-    surface = rrb.Spatial2DView(origin=f"/{SURFACE.at(_MIRROR)}", name="mirror surface, nm")
-    events = rrb.TextLogView(
-        origin=f"/{EVENT.key}",
-        name="events",
-        columns=rrb.TextLogColumns(timeline_columns=[TIMELINE], text_log_columns=["loglevel", "body"]),
-    )
-    loop_mode = rrb.StateTimelineView(
-        origin=f"/{STEP.key}",
-        name="loop mode",
-        overrides={f"/{STEP.key}": _STATES.visualizer(mappings=[_field(STEP, "StateChange:state", "mode.name")])},
-    )
-    rms = _plot(
-        TRUTH, "true wavefront rms, nm", {"disturbance_rms_nm": ["disturbance"], "residual_rms_nm": ["residual"]}
-    )
-    flux = _plot(STEP, "flux, DN", {"flux_dn": ["flux"]})
+    columns = rrb.TextLogColumns(timeline_columns=[TIMELINE], text_log_columns=["loglevel", "body"])
+    mode = _STATES.visualizer(mappings=[_field(STEP, "StateChange:state", "mode.name")])
+    truth = {f"{name}_rms_nm": [name] for name in ("disturbance", "residual")}
     stages = {f"{stage}_ns[0]": [stage.replace("_", " ")] for stage in STAGES}
-    timing = _plot(TIMING, "stages of one frame in each batch, ns", stages)
-    modes = [
-        _plot(topic, f"{name}, nm", {f"{field}[]": _MODE_NAMES}, legend=field == "error_nm")
-        for topic, field, name in (
-            (STEP, "error_nm", "measured error"),
-            (STEP, "command_nm", "command"),
-            (STEP, "pol_nm", "pseudo-open-loop"),
-            (TRUTH, "residual_nm", "true residual"),
-        )
-    ]
     return rrb.Blueprint(
         rrb.Horizontal(
-            rrb.Vertical(frame, surface, events),
-            rrb.Vertical(loop_mode, rms, flux, timing, row_shares=[1, 2, 2, 2]),
-            rrb.Vertical(*modes, row_shares=[3, 2, 2, 2]),
+            rrb.Vertical(
+                rrb.Spatial2DView(origin=f"/{FRAME.key}", name="frame, DN"),
+                rrb.Spatial2DView(origin=f"/{SURFACE.at(_MIRROR)}", name="mirror surface, nm"),
+                rrb.TextLogView(origin=f"/{EVENT.key}", name="events", columns=columns),
+            ),
+            rrb.Vertical(
+                rrb.StateTimelineView(origin=f"/{STEP.key}", name="loop mode", overrides={f"/{STEP.key}": mode}),
+                _plot(TRUTH, "true wavefront rms, nm", truth),
+                _plot(STEP, "flux, DN", {"flux_dn": ["flux"]}),
+                _plot(TIMING, "stages of one frame in each batch, ns", stages),
+                row_shares=[1, 2, 2, 2],
+            ),
+            rrb.Vertical(
+                _plot(STEP, "measured error, nm", {"error_nm[]": _MODE_NAMES}),
+                _plot(STEP, "command, nm", {"command_nm[]": _MODE_NAMES}, legend=False),
+                _plot(STEP, "pseudo-open-loop, nm", {"pol_nm[]": _MODE_NAMES}, legend=False),
+                _plot(TRUTH, "true residual, nm", {"residual_nm[]": _MODE_NAMES}, legend=False),
+                row_shares=[3, 2, 2, 2],
+            ),
             column_shares=[2, 3, 3],
         ),
         rrb.TimePanel(timeline=TIMELINE, state="collapsed"),

@@ -69,26 +69,24 @@ class Science(Panel):
         """Keep the newest wavefront; now and then, draw."""
         if snapshot.calibration is None:
             return
-        camera = self._prepared(snapshot.calibration.noll)
+        noll = snapshot.calibration.noll
+        if self._camera is None or noll != self._noll:  # wavefronts of other modes are forgotten
+            self._noll = noll
+            self._camera = ScienceCamera(self._pupil, noll, self._wavelength_nm, _HALF_WIDTH, _SAMPLES_PER)
+            self._flat = self._camera.mean_contrast(self._camera.image(np.zeros(len(noll))), WEDGE)
+            self._clear()
         for source, waves in self._waves.items():
             new = snapshot.waves(true=source == "true")
             if new.time_ns.size and new.left_nm.shape[1] == len(self._noll):
                 waves.append((new.left_nm[-1], new.open_nm[-1]))
         source = next((name for name, waves in self._waves.items() if waves), "")
         if source and self.due(snapshot):
-            self._show(stream, snapshot.time_ns, camera, source)
-            for waves in self._waves.values():
-                waves.clear()
+            self._show(stream, snapshot.time_ns, self._camera, source)
+            self._clear()
 
-    def _prepared(self, noll: tuple[int, ...]) -> ScienceCamera:
-        """The camera for these modes; wavefronts of others are forgotten."""
-        if self._camera is None or noll != self._noll:
-            self._noll = noll
-            self._camera = ScienceCamera(self._pupil, noll, self._wavelength_nm, _HALF_WIDTH, _SAMPLES_PER)
-            self._flat = self._camera.mean_contrast(self._camera.image(np.zeros(len(noll))), WEDGE)
-            for waves in self._waves.values():
-                waves.clear()
-        return self._camera
+    def _clear(self) -> None:
+        for waves in self._waves.values():
+            waves.clear()
 
     def _show(self, stream: rr.RecordingStream, time_ns: int, camera: ScienceCamera, source: str) -> None:
         waves = self._waves[source]
