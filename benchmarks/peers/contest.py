@@ -33,7 +33,6 @@ from lowfc.programs.measure.latency.figures import percentiles
 ROOT = Path(__file__).parents[2]
 PRIORITY = 50
 SCHEDULING = {"normal": 0, "FIFO": PRIORITY}
-PAIR = ("source", "controller")
 
 _MEMORY = Path("/dev/shm")  # noqa: S108  # a folder of one's own is made in it
 _READY_S, _SETTLE_S, _LATER_S, _LOOK_S, _PATIENCE_S = 60.0, 0.3, 10.0, 0.02, 0.5
@@ -52,7 +51,6 @@ class Contestant:
         name: in the table.
         what: it is, in a sentence.
         roles: its processes in the order in which they start; the source's end is the end of a run. None: lowfc itself.
-        transport: of its messages, in plain Python.
         module: whose roles its processes play.
         package: that must be installed in the interpreter of its processes, beside what lowfc needs.
     """
@@ -60,29 +58,16 @@ class Contestant:
     name: str
     what: str
     roles: tuple[str, ...] = ()
-    transport: str = ""
-    module: str = "benchmarks.peers.plain"
+    module: str = "benchmarks.peers.plain_zenoh"
     package: str = ""
 
 
-TIMER, BARE = "timer wake-up of this host", "zenoh"
+BARE = "zenoh"
 CONTESTANTS = (
-    Contestant(
-        TIMER,
-        "no loop: how late a sleep until an absolute time ends on the controller's processor, in turn with the rest",
-        ("timer",),
-    ),
-    Contestant(
-        "shared memory, semaphore",
-        "a ring in shared memory each way, the step in numpy, on a thread that waits for a POSIX semaphore",
-        PAIR,
-        "ring",
-    ),
     Contestant(
         BARE,
         "zenoh as it comes, in sessions set up as lowfc's, the step in numpy, in the subscriber's callback",
-        PAIR,
-        "zenoh",
+        ("source", "controller"),
     ),
     Contestant(
         "lowfc",
@@ -99,8 +84,8 @@ CONTESTANTS = (
 )
 
 DEFINITIONS = {
-    "t0": "just before the source sends a frame: before the put, the ring's put, or pyrtcao's WavefrontSensor.expose",
-    "t1": "just after the controller has sent the frame's command: after the put, the ring's put, or pyrtcao's "
+    "t0": "just before the source sends a frame: before the put, or pyrtcao's WavefrontSensor.expose",
+    "t1": "just after the controller has sent the frame's command: after the put, or pyrtcao's "
     "write_stream; for lowfc after its socket's send, before zenoh's",
     "to the mirror": "from t0 until the command is in the mirror's process: the source's own, on its receiving thread; "
     "for pyrtcao the corrector's process, its actuators made; for lowfc until just before the mirror's state is put",
@@ -179,10 +164,9 @@ def one_run(contestant: Contestant, rules: argparse.Namespace, priority: int) ->
     plan = Plan(
         rate_hz=rules.rate_hz,
         frames=frames,
-        cpus={role: second if role in ("controller", "timer") else first for role in contestant.roles},
+        cpus={role: second if role == "controller" else first for role in contestant.roles},
         priority=dict.fromkeys(contestant.roles, priority),
-        ports=dict(zip(PAIR, free_ports(len(PAIR)), strict=True)),
-        transport=contestant.transport,
+        ports=dict(zip(("source", "controller"), free_ports(2), strict=True)),
     )
     with tempfile.TemporaryDirectory(prefix="lowfc-peers-", dir=_MEMORY) as name:
         folder = Path(name)
@@ -191,13 +175,13 @@ def one_run(contestant: Contestant, rules: argparse.Namespace, priority: int) ->
         with _awake(priority), _processes(contestant, rules.pyrtcao, folder) as children:
             time.sleep(_SETTLE_S)
             go(folder)
-            pacer = children.get("source") or children["timer"]
+            pacer = children["source"]
             deadline_s = time.monotonic() + frames / rules.rate_hz + _LATER_S
             while pacer.status is None and time.monotonic() < deadline_s:
                 time.sleep(_LOOK_S)
             if pacer.status != 0:
                 raise ContestError(f"the frames did not come to an end: {pacer.stderr_tail()}")
-            words = children["controller"].stderr_tail() if "controller" in children else ""
+            words = children["controller"].stderr_tail()
         found = figures(folder, rules.warm_up)
         if found["frame_to_command"] is None:
             raise ContestError(f"no command came: {words}")
@@ -334,8 +318,6 @@ def _cells(row: Result, bare: Result | None) -> list[str]:
     if not runs:
         return [*head, "failed"]
     head += _span(runs, "frame_to_command", PERCENTILES)
-    if row["contestant"] == TIMER:
-        return head
     without, frames = (median(run[name] for run in runs) for name in ("without_command", "frames"))
     both = [_medians(runs), _medians(bare["repeats"] if bare else [])]
     head += [f"{both[0][at] / both[1][at]:.2f}" if all(both) else "" for at in ("p50", "p99")]

@@ -49,7 +49,6 @@ class Plan:
         cpus: processor of each role.
         priority: SCHED_FIFO priority of each role; 0 is the normal class.
         ports: loopback TCP port of each role that listens.
-        transport: of its messages, in plain Python.
     """
 
     rate_hz: float
@@ -57,7 +56,6 @@ class Plan:
     cpus: dict[str, int]
     priority: dict[str, int]
     ports: dict[str, int] = field(default_factory=dict)
-    transport: str = ""
 
     def write(self, folder: Path) -> None:
         """Lay out a run in its folder."""

@@ -4,7 +4,6 @@ import json
 import os
 import subprocess
 import sys
-import threading
 import time
 from argparse import Namespace
 from collections.abc import Sequence
@@ -15,8 +14,8 @@ import numpy as np
 import pytest
 
 from benchmarks import curves, load, runner, step, throughput, view
-from benchmarks.peers import contest, plain
-from benchmarks.peers.contest import BARE, CONTESTANTS, TIMER
+from benchmarks.peers import contest
+from benchmarks.peers.contest import BARE, CONTESTANTS
 from benchmarks.peers.shared import ACTUATORS, MARKS, NumpyStep, Plan, Problem
 from benchmarks.sizes import Size, configuration, made_up
 from lowfc.contract.configuration import Camera
@@ -348,7 +347,6 @@ def test_the_figures_of_a_run_are_those_of_its_times(tmp_path: Path) -> None:
 
 def test_the_table_has_ranges_and_ratios_within_a_class_and_who_is_not_there() -> None:
     rows = [
-        row(TIMER, one(50, 60)),
         row(BARE, one(100, 200), one(110, 230), one(150, 220)),
         row("other", one(55, 440, 3), one(66, 110, 9), one(40, 120, 1)),
         row(BARE, one(1000, 1000), scheduling="FIFO"),
@@ -360,13 +358,12 @@ def test_the_table_has_ranges_and_ratios_within_a_class_and_who_is_not_there() -
     rules = {"repeats": 1, "seconds": 1.0, "rate_hz": 1000.0, "warm_up": 5}
     result = {"rows": rows, "rules": rules, "notes": ["a note"], "pinned_to": [0, 1], "versions": {"lowfc": "1"}}
     (lines,) = contest.tables(result)
-    timer, bare, other, _, fifo, absent, failed, deaf = by_heading(lines)
+    bare, other, _, fifo, absent, failed, deaf = by_heading(lines)
     assert bare["p50"] == "110 (100 to 150)"
     assert bare["max"] == "660 (600 to 690)"
-    assert (other["p50 of zenoh's"], lines[3][7]) == ("0.50", "0.55")
+    assert (other["p50 of zenoh's"], lines[2][7]) == ("0.50", "0.55")
     assert other["without a command"] == "3 of 1000"
-    assert (fifo["p50 of zenoh's"], lines[5][7]) == ("0.50", "0.10")
-    assert timer["without a command"] == timer["p50 of zenoh's"] == ""
+    assert (fifo["p50 of zenoh's"], lines[4][7]) == ("0.50", "0.10")
     assert (absent["p50"], failed["p50"], deaf["p50"]) == ("not installed", "failed", "")
     assert deaf["without a command"] == "1000 of 1000"
     about = contest.about(result)
@@ -391,20 +388,8 @@ def test_the_step_is_an_integrator_with_a_leak() -> None:
         np.testing.assert_allclose(actuators, problem.to_actuators @ command_nm, rtol=1e-3, atol=1e-3)
 
 
-def test_a_ring_hands_over_the_newest_and_wakes(tmp_path: Path) -> None:
-    there = plain.Ring(tmp_path / "ring", 9, make=True)
-    here = plain.Ring(tmp_path / "ring", 9, make=False)
-    for number in range(1, 12):  # once around, and nobody takes
-        there.put(number, f"message{number:02}".encode())
-    assert here.take() == (11, b"message11")
-    later = threading.Timer(0.05, there.put, (12, b"message12"))
-    later.start()
-    assert here.take() == (12, b"message12")
-    later.join()
-
-
 @pytest.mark.exclusive
-@pytest.mark.parametrize("name", ["shared memory, semaphore", "zenoh", pytest.param("lowfc", marks=pytest.mark.slow)])
+@pytest.mark.parametrize("name", ["zenoh", pytest.param("lowfc", marks=pytest.mark.slow)])
 def test_a_contestant_is_really_run(name: str) -> None:
     (chosen,) = (one for one in CONTESTANTS if one.name == name)
     seconds, rate_hz = 0.5, 500.0

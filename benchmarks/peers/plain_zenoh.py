@@ -1,0 +1,83 @@
+"""The processes of a loop in plain Python and zenoh: python -m benchmarks.peers.plain_zenoh ROLE FOLDER.
+
+The source is the mirror as well: it notes when a command is back.
+"""
+
+import json
+import struct
+import sys
+import threading
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import zenoh
+from zenoh.handlers import Callback
+
+from benchmarks.peers.shared import DIFFERENT, NumpyStep, Part, Problem
+from lowfc.adapters.bus.run import Links
+from lowfc.adapters.bus.zenoh_bus import session_config
+from lowfc.contract.messages import COMMAND, FRAME, Role
+
+_NUMBER = struct.Struct("<QQ")  # as long as what lowfc sends with every message
+_ROLES = {"source": Role.CAMERA, "controller": Role.CONTROLLER}
+
+Message = Callable[[int, bytes], None]
+"""Receives or sends a message: number, payload."""
+
+
+def join(part: Part, receive: Message) -> Message:
+    """Join a run with a session set up as lowfc's are; returns what sends."""
+    ports = {str(_ROLES[role]): port for role, port in part.plan.ports.items()}
+    links = Links("contest", ports, "contest", part.folder / "credentials")
+    session = zenoh.open(zenoh.Config.from_json5(json.dumps(session_config(links, _ROLES[part.role]))))
+    keys = FRAME.key, COMMAND.at("dm")
+    sent, received = keys if part.role == "source" else keys[::-1]
+
+    def on_sample(sample: zenoh.Sample) -> None:
+        attachment = sample.attachment
+        receive(_NUMBER.unpack(b"" if attachment is None else attachment.to_bytes())[0], sample.payload.to_bytes())
+
+    session.declare_subscriber(received, Callback(on_sample, indirect=False))
+    publisher = session.declare_publisher(
+        sent, congestion_control=zenoh.CongestionControl.DROP, priority=zenoh.Priority.REAL_TIME, express=False
+    )
+
+    def put(number: int, payload: bytes, _kept: zenoh.Session = session) -> None:
+        publisher.put(payload, attachment=_NUMBER.pack(number, 0))
+
+    return put
+
+
+def source(part: Part) -> None:
+    """Send the frames, and note when commands come back."""
+    received, published, now_ns = part.marks("received"), part.marks("published"), time.monotonic_ns
+
+    def back(number: int, _payload: bytes) -> None:
+        received[number] = now_ns()
+
+    payloads = [pixels.tobytes() for pixels in Problem().frames]
+    put = join(part, back)
+    for number in part.frames():
+        published[number] = now_ns()
+        put(number, payloads[number % DIFFERENT])
+
+
+def controller(part: Part) -> None:
+    """Answer frames until it is killed."""
+    commanded, step = part.marks("commanded"), NumpyStep(Problem())
+
+    def answer(number: int, payload: bytes) -> None:
+        put(number, step.command(payload))
+        commanded[number] = time.monotonic_ns()
+
+    put = join(part, answer)
+    part.ready()
+    threading.Event().wait()
+
+
+if __name__ == "__main__":
+    role, folder = sys.argv[1:]
+    own = Part(role, Path(folder))
+    own.settle()
+    {"source": source, "controller": controller}[role](own)
