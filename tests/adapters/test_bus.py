@@ -18,7 +18,8 @@ import zenoh
 from lowfc.adapters.bus.bus import Bus, Query, Sample
 from lowfc.adapters.bus.mailbox import Mailbox
 from lowfc.adapters.bus.run import Run, new_run_id, open_run
-from lowfc.adapters.bus.zenoh_bus import ZenohBus, session_config
+from lowfc.adapters.bus.zenoh_bus import ZenohBus
+from lowfc.adapters.bus.zenoh_session import session_config
 from lowfc.adapters.process.clock import HostClock
 from lowfc.contract.envelope import Envelope, count_of, start_of
 from lowfc.contract.errors import BusError

@@ -17,7 +17,7 @@ PATIENCE_S = 30.0
 
 
 class Ear:
-    """Hears what a run says about itself."""
+    """What a run publishes about itself."""
 
     def __init__(self, hub: MemoryHub, clock: FakeClock) -> None:
         self.health: list[wire.Health] = []
@@ -25,6 +25,9 @@ class Ear:
         bus = MemoryBus(hub, "operator", clock)
         bus.subscribe(HEALTH, lambda sample: self.health.append(wire.Health.FromString(sample.payload)))
         bus.subscribe(EVENT, lambda sample: self.events.append(Log.FromString(sample.payload)))
+
+    def said(self, word: str) -> list[str]:
+        return [log.message for log in self.events if log.message.startswith(word)]
 
 
 @pytest.fixture
@@ -81,11 +84,8 @@ def test_a_clock_that_is_off_is_reported_at_the_start(
     ear = Ear(hub, clock)
     monkeypatch.setattr(clock, "ahead_ns", lambda: ahead_ms * 1_000_000)
     service(hub, clock, "camera")
-    found = [log.message for log in ear.events if log.message.startswith("CLOCK_OFF")]
-    sentence = (
-        f"CLOCK_OFF this boot's clock is {ahead_ms:+d} ms from the wall clock, and so are all times; see `lowfc doctor`"
-    )
-    assert found == [sentence] * said
+    found = ear.said(f"CLOCK_OFF this boot's clock is {ahead_ms:+d} ms from the wall clock")
+    assert len(found) == len(ear.said("CLOCK_OFF")) == said
 
 
 def test_what_a_mailbox_got_is_in_health(hub: MemoryHub, clock: FakeClock) -> None:
@@ -148,7 +148,9 @@ def test_a_newcomer_is_answered_before_the_next_health_is_due(hub: MemoryHub, cl
     assert [health.process for health in ear.health] == ["controller", "camera", "controller"]
 
 
-def test_a_flood_of_bad_messages_is_one_event_with_each_health(hub: MemoryHub, clock: FakeClock) -> None:
+def test_a_flood_of_bad_messages_is_one_event_and_the_last_health_has_all_counts(
+    hub: MemoryHub, clock: FakeClock
+) -> None:
     ear = Ear(hub, clock)
     mirror = service(hub, clock, "mirror-dm")
     for number in range(500):
@@ -158,53 +160,22 @@ def test_a_flood_of_bad_messages_is_one_event_with_each_health(hub: MemoryHub, c
     mirror.beat()  # no Health is due
     mirror.stop("enough")
     mirror.finish()
-    said = [log.message for log in ear.events if "BAD_MESSAGE" in log.message]
-    assert said == [
+    assert ear.said("BAD_MESSAGE") == [
         "BAD_MESSAGE 500 on lowfc/mirror/dm/command could not be read, the last because: reason 499",
         "BAD_MESSAGE 1 on lowfc/mirror/dm/command could not be read, the last because: too short",
     ]
-    assert "STOPPED" in ear.events[-1].message
-    assert {count.topic: count.published for count in ear.health[-1].topics}["lowfc/event"] == len(ear.events)
-
-
-def test_the_last_health_has_the_final_counts(hub: MemoryHub, clock: FakeClock) -> None:
-    ear = Ear(hub, clock)
-    camera = service(hub, clock, "camera")
-    camera.stop("enough")
-    camera.finish()
-    assert not camera.running
-    assert ear.events[-1].message == "STOPPED camera stopped: enough"
+    assert not mirror.running
+    assert ear.events[-1].message == "STOPPED mirror-dm stopped: enough"
     assert ear.health[-1].state == "stopped"
     assert {count.topic: count.published for count in ear.health[-1].topics} == {
         "lowfc/event": len(ear.events),
-        "lowfc/health/camera": len(ear.health),
+        "lowfc/health/mirror-dm": len(ear.health),
     }
 
 
-def test_only_known_states_and_events(hub: MemoryHub, clock: FakeClock) -> None:
-    camera = service(hub, clock, "camera")
-    with pytest.raises(ValueError, match="starting, ready, running, stopping, stopped; got 'happy'"):
-        camera.state = "happy"
-    with pytest.raises(KeyError):
-        camera.event("NOTHING_OF_THE_KIND")
-
-
-def test_a_broken_health_of_another_is_a_bad_message_without_a_traceback(
+def test_a_message_that_cannot_be_read_is_an_event_and_neither_a_traceback_nor_the_end(
     hub: MemoryHub, clock: FakeClock, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    ear = Ear(hub, clock)
-    camera = service(hub, clock, "camera")
-    MemoryBus(hub, "operator", clock).publisher(HEALTH, "stranger").put(b"\xff")
-    camera.beat()
-    assert [log.message for log in ear.events if "BAD_MESSAGE" in log.message] == [
-        "BAD_MESSAGE 1 on lowfc/health/* could not be read, the last because: "
-        "Error parsing message with type 'lowfc.v1.Health': Wire format was corrupt"
-    ]
-    assert not camera.bus.faults.counts
-    assert "Traceback" not in capsys.readouterr().err
-
-
-def test_a_message_that_its_handler_cannot_read_does_not_end_the_process(hub: MemoryHub, clock: FakeClock) -> None:
     ear = Ear(hub, clock)
     mirror = service(hub, clock, "mirror-dm")
     read: list[int] = []
@@ -214,12 +185,16 @@ def test_a_message_that_its_handler_cannot_read_does_not_end_the_process(hub: Me
         "dm",
         period_ns=10**6,
     )
+    MemoryBus(hub, "operator", clock).publisher(HEALTH, "stranger").put(b"\xff")
     commands = MemoryBus(hub, "controller", clock).publisher(COMMAND, "dm")
     commands.put(b"\xff")
     commands.put(wire.MirrorCommand(actuators=b"1234").SerializeToString())
     mirror.beat()
     assert (mirror.running, read) == (True, [4])
-    assert any("BAD_MESSAGE 1 on lowfc/mirror/dm/command" in log.message for log in ear.events)
+    assert ear.said("BAD_MESSAGE 1 on lowfc/mirror/dm/command")
+    assert ear.said("BAD_MESSAGE 1 on lowfc/health/*")
+    assert not mirror.bus.faults.counts
+    assert "Traceback" not in capsys.readouterr().err
 
 
 def test_a_stop_wakes_the_loop(hub: MemoryHub, clock: FakeClock) -> None:
@@ -252,26 +227,18 @@ if {stuck}:
 """
 
 
-@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
-def test_a_signal_ends_the_loop(number: signal.Signals) -> None:
-    with subprocess.Popen(
-        [sys.executable, "-c", LOOP.format(stuck=False)], stdout=subprocess.PIPE, text=True
-    ) as process:
+@pytest.mark.parametrize(
+    ("number", "stuck", "status"), [("SIGTERM", False, 0), ("SIGINT", False, 0), ("SIGINT", True, 128 + signal.SIGINT)]
+)
+def test_a_signal_ends_the_loop_and_a_second_interrupt_the_process(number: str, stuck: bool, status: int) -> None:
+    words = [sys.executable, "-c", LOOP.format(stuck=stuck)]
+    with subprocess.Popen(words, stdout=subprocess.PIPE, text=True) as process:
         assert process.stdout.readline() == "up\n"
-        process.send_signal(number)
-        assert process.communicate(timeout=PATIENCE_S)[0] == number.name + "\n"
-    assert process.returncode == 0
-
-
-def test_a_second_interrupt_ends_the_process() -> None:
-    with subprocess.Popen(
-        [sys.executable, "-c", LOOP.format(stuck=True)], stdout=subprocess.PIPE, text=True
-    ) as process:
-        assert process.stdout.readline() == "up\n"
-        process.send_signal(signal.SIGINT)
-        assert process.stdout.readline() == "SIGINT\n"
-        process.send_signal(signal.SIGINT)
-        assert process.wait(PATIENCE_S) == 128 + signal.SIGINT
+        process.send_signal(signal.Signals[number])
+        assert process.stdout.readline() == number + "\n"
+        if stuck:
+            process.send_signal(signal.SIGINT)
+        assert process.wait(PATIENCE_S) == status
 
 
 def test_a_process_says_once_that_it_is_ready_and_once_for_whom_it_waits(

@@ -14,7 +14,7 @@ import zenoh
 from google.protobuf.message import DecodeError, Message
 
 from lowfc.adapters.bus.run import open_run
-from lowfc.adapters.bus.zenoh_bus import session_config
+from lowfc.adapters.bus.zenoh_session import session_config
 from lowfc.adapters.files.factory import camera_state
 from lowfc.arrays import Single
 from lowfc.contract.configuration import Configuration, Network, load

@@ -29,13 +29,6 @@ from lowfc.contract.envelope import Envelope, sequence_of
 from lowfc.contract.errors import BusError
 from lowfc.contract.messages import HEALTH, Role, Topic
 
-__all__ = [
-    "ZenohBus",
-    "ZenohPublisher",
-    "declare_publisher",
-    "session_config",
-]
-
 TAKEN_S = 0.5
 """How long the router, or who has one's place already, may take to answer."""
 FLUSH_S = 2.0
@@ -69,7 +62,7 @@ class ZenohPublisher:
         self._keeps = topic.queryable
         self._host_ns = bus.clock.host_ns
         self._start_s = bus.start_s
-        self._offset = bus.offset
+        self._sent = bus.sent
         self._replying = bus.replying
         self._publisher = declare_publisher(session, topic, key, lockstep=bus.clock.lockstep)
         self._direct_link = None if direct_link is None else DirectWriter(direct_link)
@@ -103,12 +96,6 @@ class ZenohPublisher:
             if self.last is not None:
                 payload, envelope = self.last
                 query.reply(self.key, payload, attachment=self._sent(envelope))
-
-    def _sent(self, envelope: Envelope) -> bytes:
-        """What goes out: across hosts, by the router's clock."""
-        if self._offset is None:
-            return envelope.encode()
-        return Envelope(envelope.sequence, envelope.publish_time_ns + self._offset.offset_ns).encode()
 
 
 class ZenohRing:
@@ -299,6 +286,12 @@ class ZenohBus:
         done.wait(timeout_s + 1.0)
         return list(answers)
 
+    def sent(self, envelope: Envelope) -> bytes:
+        """An envelope as it goes out: across hosts, by the router's clock."""
+        if self.offset is None:
+            return envelope.encode()
+        return Envelope(envelope.sequence, envelope.publish_time_ns + self.offset.offset_ns).encode()
+
     def peers(self) -> int:
         """See `Bus.peers`; across hosts, the router alone."""
         return len(self._session.info.peers_zid()) + len(self._session.info.routers_zid())
@@ -334,9 +327,8 @@ class ZenohBus:
     def _replier(self, query: zenoh.Query, key: str) -> Callable[[bytes], None]:
         def reply(body: bytes) -> None:
             with self.replying(query):
-                shift_ns = 0 if self.offset is None else self.offset.offset_ns
-                envelope = Envelope(sequence_of(self.start_s, 0), self.clock.host_ns() + shift_ns)
-                query.reply(key, body, attachment=envelope.encode())
+                envelope = Envelope(sequence_of(self.start_s, 0), self.clock.host_ns())
+                query.reply(key, body, attachment=self.sent(envelope))
 
         return reply
 

@@ -9,6 +9,7 @@ import threading
 import time
 from collections.abc import Callable, Iterable
 from types import FrameType
+from typing import Literal
 
 from lowfc import __version__
 from lowfc.adapters.bus.bus import ALL, UNREADABLE, Bus, Publisher, Sample
@@ -29,7 +30,7 @@ WAITING_NS = 2_000_000_000
 """After it is ready a process that still waits for others says for whom."""
 WORK: dict[str, str] = {Role.CAMERA: "frame", Role.CONTROLLER: "frame", Role.MIRROR: "command"}
 """What the processes of the loop count; others have a summary of their own."""
-STATES = ("starting", "ready", "running", "stopping", "stopped")
+ProcessState = Literal["starting", "ready", "running", "stopping", "stopped"]
 
 _MET_PERIOD_S = 0.02
 
@@ -74,7 +75,7 @@ class Service:
         self.announces = announces
         self.awaited: Callable[[], str] = str
         self._check_waiting_ns: int | None = None
-        self._state = "starting"
+        self._state: ProcessState = "starting"
         self._fault: Exception | None = None
         self._names = Names()
         self._known: set[tuple[str, int]] = set()
@@ -171,14 +172,12 @@ class Service:
             waker()
 
     @property
-    def state(self) -> str:
-        """One of `STATES`; setting it sends Health at once."""
+    def state(self) -> ProcessState:
+        """Setting it sends Health at once."""
         return self._state
 
     @state.setter
-    def state(self, state: str) -> None:
-        if state not in STATES:
-            raise ValueError(f"a process's state is one of {', '.join(STATES)}; got {state!r}")
+    def state(self, state: ProcessState) -> None:
         self._state = state
         self._send_health(self.clock.host_ns())
         if state in ("ready", "running"):

@@ -10,7 +10,7 @@ import typer
 from pydantic import BaseModel
 
 from lowfc.adapters.bus.run import DEFAULT_RUN, open_run
-from lowfc.adapters.bus.zenoh_bus import session_config
+from lowfc.adapters.bus.zenoh_session import session_config
 from lowfc.adapters.process.clock import HostClock
 from lowfc.adapters.process.terminal import AnyRun, ConfigFile, configuration
 from lowfc.contract.configuration import Configuration

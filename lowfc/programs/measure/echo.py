@@ -17,7 +17,8 @@ import zenoh
 from zenoh.handlers import Callback
 
 from lowfc.adapters.bus.run import Run, open_run
-from lowfc.adapters.bus.zenoh_bus import declare_publisher, session_config
+from lowfc.adapters.bus.zenoh_bus import declare_publisher
+from lowfc.adapters.bus.zenoh_session import session_config
 from lowfc.adapters.files.whole_file import being_written
 from lowfc.adapters.process.clock import HostClock
 from lowfc.adapters.process.join import prepare

@@ -11,7 +11,7 @@ import zenoh
 from zenoh.handlers import Callback
 
 from lowfc.adapters.bus.run import Links
-from lowfc.adapters.bus.zenoh_bus import session_config
+from lowfc.adapters.bus.zenoh_session import session_config
 from lowfc.adapters.process.clock import HostClock
 from lowfc.contract.envelope import Envelope, sequence_of
 from lowfc.contract.errors import BusError
