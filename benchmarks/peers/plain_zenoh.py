@@ -16,7 +16,7 @@ from zenoh.handlers import Callback
 
 from benchmarks.peers.shared import DIFFERENT, NumpyStep, Part, Problem
 from lowfc.adapters.bus.run import Links
-from lowfc.adapters.bus.zenoh_bus import session_config
+from lowfc.adapters.bus.zenoh_session import session_config
 from lowfc.contract.messages import COMMAND, FRAME, Role
 
 _NUMBER = struct.Struct("<QQ")  # as long as what lowfc sends with every message

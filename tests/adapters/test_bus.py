@@ -254,8 +254,8 @@ def test_everybody_listens_on_its_own_port_and_socket_and_connects_to_all_others
         assert not config["scouting"]["multicast"]["enabled"]
         assert not config["scouting"]["gossip"]["enabled"]
         assert not config["transport"]["shared_memory"]["enabled"]
-    for role, how, wanted in (("operator", False, endpoints), ("viewer", True, sockets)):
-        config = session_config(run.links, role, looks_on=how)
+    for role, monitor, wanted in (("operator", False, endpoints), ("viewer", True, sockets)):
+        config = session_config(run.links, role, monitor=monitor)
         assert config["listen"]["endpoints"] == []
         assert set(config["connect"]["endpoints"]) == set(wanted.values())
 
@@ -266,12 +266,12 @@ def test_where_a_socket_has_too_long_a_name_a_port_serves_monitors(tmp_path: Pat
     links = open_run(new_run_id(), base=base).links
     endpoints = {f"tcp/127.0.0.1:{port}" for port in links.ports.values()}
     assert len(session_config(links, "camera")["listen"]["endpoints"]) == 1
-    assert set(session_config(links, "viewer", looks_on=True)["connect"]["endpoints"]) == endpoints
+    assert set(session_config(links, "viewer", monitor=True)["connect"]["endpoints"]) == endpoints
 
 
 @pytest.mark.exclusive
 def test_a_monitor_gets_every_row_and_no_more_pictures_than_it_draws(run: Run, join: Join) -> None:
-    camera, viewer, recorder = join(run, "camera"), join(run, "viewer", looks_on=True), join(run, "recorder")
+    camera, viewer, recorder = join(run, "camera"), join(run, "viewer", monitor=True), join(run, "recorder")
     frames, truths = camera.publisher(FRAME), camera.publisher(TRUTH)
     kept, rows, recorded = viewer.ring(FRAME, 5000), viewer.ring(TRUTH, 5000), Mailbox()
     recorder.subscribe(FRAME, recorded.put)

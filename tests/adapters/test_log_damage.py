@@ -202,7 +202,9 @@ def test_of_a_damaged_one_only_the_damaged_chunk_is_lost(
     assert identity(list(LogReader(done.recovered))) == read
 
 
-def test_messages_without_chunks_are_checked_by_the_checksum_of_the_whole(tmp_path: Path, source: Path) -> None:
+def test_messages_without_chunks_are_under_the_checksum_of_the_whole_and_read_up_to_the_end(
+    tmp_path: Path, source: Path
+) -> None:
     path = rewritten(source, tmp_path / "rewritten.mcap", use_chunking=False, enable_data_crcs=True)
     data = bytearray(path.read_bytes())
     data[len(data) // 2] ^= 1
@@ -210,11 +212,6 @@ def test_messages_without_chunks_are_checked_by_the_checksum_of_the_whole(tmp_pa
     reader = LogReader(path, skip_damaged=True)
     assert len(list(reader)) == len(SENT)
     assert [one.why.partition(",")[0] for one in reader.damage] == ["its parts are whole"]
-
-
-def test_a_truncated_one_without_chunks_is_read_up_to_its_end(tmp_path: Path, source: Path) -> None:
-    path = rewritten(source, tmp_path / "rewritten.mcap", use_chunking=False)
-    data = path.read_bytes()
     path.write_bytes(data[: len(data) // 2])
     reader = LogReader(path)
     read = identity(list(reader))

@@ -133,14 +133,14 @@ class ZenohBus:
         read: what a message of zenoh's says.
     """
 
-    def __init__(self, links: Links, role: str, clock: Clock, *, looks_on: bool = False) -> None:
+    def __init__(self, links: Links, role: str, clock: Clock, *, monitor: bool = False) -> None:
         """Join a run.
 
         Args:
             links: of the run.
             role: this process's.
             clock: the run's.
-            looks_on: this process takes no part in the loop: it looks at what it kept in a `Ring` now and then. It is
+            monitor: this process takes no part in the loop: it looks at what it kept in a `Ring` now and then. It is
                 sent the topics of which only the newest matters no faster than it looks, receives into spare buffers,
                 and in one thread: half the cost. To be set in a process's first bus.
 
@@ -157,12 +157,12 @@ class ZenohBus:
         self.offset: ClockOffset | None = None
         self.read = _sample
         self.start_s = links.claim_start(role, clock.start_s)
-        if looks_on:
+        if monitor:
             # zenoh's thread that waits for messages reads them too, instead of waking another
             os.environ.setdefault("ZENOH_RUNTIME", "(rx: (handover: net))")
         if links.network.router:
             require_certificate(links.network, role)
-        config = zenoh.Config.from_json5(json.dumps(session_config(links, role, looks_on=looks_on)))
+        config = zenoh.Config.from_json5(json.dumps(session_config(links, role, monitor=monitor)))
         if links.network.router and role != ROUTER:
             self._session = open_by_router(config, links.network, role)
             self._join_hosts()

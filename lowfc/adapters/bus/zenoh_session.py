@@ -16,7 +16,7 @@ _SPARE_BUFFERS = 1024  # without them it makes and clears one for every message
 _PRIORITIES = ("real_time", "interactive_high", "interactive_low", "data_high", "data", "data_low", "background")
 
 
-def session_config(links: Links, role: str, *, looks_on: bool = False) -> dict[str, Any]:
+def session_config(links: Links, role: str, *, monitor: bool = False) -> dict[str, Any]:
     """Return zenoh's configuration for a role of a run; a role without a port of its own only connects.
 
     A run on several hosts goes by its router: see `routed`.
@@ -24,9 +24,9 @@ def session_config(links: Links, role: str, *, looks_on: bool = False) -> dict[s
     Args:
         links: of the run.
         role: whose.
-        looks_on: it takes no part in the loop, see `ZenohBus`.
+        monitor: it takes no part in the loop, see `ZenohBus`.
     """
-    batch_bytes = _SMALL_BATCH_BYTES if looks_on else _BATCH_BYTES
+    batch_bytes = _SMALL_BATCH_BYTES if monitor else _BATCH_BYTES
     sending = {
         "batch_size": batch_bytes,  # of both directions: the smaller one of both ends holds
         # A full queue delays a put by at most 1 ms, then the message is dropped; at 0 bursts are lost.
@@ -51,7 +51,7 @@ def session_config(links: Links, role: str, *, looks_on: bool = False) -> dict[s
         "listen": {"endpoints": [one for one in listening if one], "exit_on_failure": True, "timeout_ms": 0},
         "connect": {
             "endpoints": [
-                (_socket(links, name) if looks_on else None) or _address(links, name)
+                (_socket(links, name) if monitor else None) or _address(links, name)
                 for name in sorted(links.ports)
                 if name != role
             ],
@@ -73,12 +73,12 @@ def session_config(links: Links, role: str, *, looks_on: bool = False) -> dict[s
             },
             "link": {
                 "tx": sending,
-                "rx": {"buffer_size": _SPARE_BUFFERS * batch_bytes if looks_on else batch_bytes},
+                "rx": {"buffer_size": _SPARE_BUFFERS * batch_bytes if monitor else batch_bytes},
             },
             # Gains nothing at these sizes, and a receiver descheduled for 100 ms loses messages silently.
             "shared_memory": {"enabled": False},
         },
-        # Who looks on comes by socket, and is sent no more pictures than it draws: writing them costs the loop, too.
+        # Monitors connect by socket, and are sent no more pictures than they draw: writing them costs the loop, too.
         "downsampling": [
             {
                 "id": "glances",

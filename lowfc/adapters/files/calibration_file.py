@@ -1,6 +1,7 @@
 """Calibrations as FITS: one named extension for each array, units in the headers."""
 
 from pathlib import Path
+from typing import Any
 
 from astropy.io import fits
 
@@ -22,6 +23,13 @@ _EXTENSIONS = (
     ("ACT2MODES", "actuators_to_modes", "", "nm rms of wavefront that R makes of a nm of surface"),
 )
 _MAY_LACK = "ACT2MODES"
+_CAMERA = (
+    ("CAMBIAS", "bias_dn", "[adu] bias of the camera when this was made"),
+    ("CAMFULL", "saturation_dn", "[adu] its highest value of a pixel"),
+    ("CAMGAIN", "gain_e_per_dn", "[e-/adu] its conversion gain"),
+    ("CAMEM", "em_gain", "its electron-multiplying gain"),
+    ("CAMNOISE", "read_noise_e", "[e-] its read noise"),
+)
 
 
 def to_bytes(calibration: Calibration) -> bytes:
@@ -40,11 +48,8 @@ def to_bytes(calibration: Calibration) -> bytes:
     header["FLUX"] = (calibration.flux_dn, "[adu] expected sum of the good pixels")
     header["SATURATE"] = (calibration.saturation_dn, "[adu] highest value of a pixel")
     if (camera := calibration.camera) is not None:
-        header["CAMBIAS"] = (camera.bias_dn, "[adu] bias of the camera when this was made")
-        header["CAMFULL"] = (camera.saturation_dn, "[adu] its highest value of a pixel")
-        header["CAMGAIN"] = (camera.gain_e_per_dn, "[e-/adu] its conversion gain")
-        header["CAMEM"] = (camera.em_gain, "its electron-multiplying gain")
-        header["CAMNOISE"] = (camera.read_noise_e, "[e-] its read noise")
+        for card, attribute, sentence in _CAMERA:
+            header[card] = (getattr(camera, attribute), sentence)
         header["CAMROW"] = (camera.region[0], "first row read")
         header["CAMCOL"] = (camera.region[1], "first column read")
     arrays = {name: getattr(calibration, attribute) for name, attribute, _, _ in _EXTENSIONS}
@@ -101,13 +106,6 @@ def _read(units: fits.HDUList) -> Calibration:
 
 
 def _camera(header: fits.Header) -> CameraSettings:
-    return CameraSettings(
-        0,
-        (int(header["ROWS"]), int(header["COLUMNS"])),
-        float(header["CAMBIAS"]),
-        float(header["CAMFULL"]),
-        float(header["CAMGAIN"]),
-        float(header["CAMEM"]),
-        float(header["CAMNOISE"]),
-        (int(header["CAMROW"]), int(header["CAMCOL"])),
-    )
+    values: dict[str, Any] = {attribute: float(header[card]) for card, attribute, _ in _CAMERA}
+    shape = int(header["ROWS"]), int(header["COLUMNS"])
+    return CameraSettings(0, shape, region=(int(header["CAMROW"]), int(header["CAMCOL"])), **values)

@@ -28,7 +28,7 @@ def active_actuators(config: Configuration) -> Mask | None:
     """
     if not config.mirror.active:
         return None
-    found = _map(config, "mirror.active", config.mirror.active)
+    found = shape_of(config, "mirror.active", config.mirror.active)
     if not np.isin(found, (0, 1)).all():
         raise ConfigurationError(f"mirror.active = {config.mirror.active!r}: every value must be 0 or 1")
     if not found.any():
@@ -55,13 +55,6 @@ def shape_of(config: Configuration, key: str, file: str) -> Single:
     Raises:
         ConfigurationError: the file is missing, damaged or does not fit the mirror.
     """
-    found = _map(config, key, file)
-    if not np.isfinite(found).all():
-        raise ConfigurationError(f"{key} = {file!r}: every value must be finite")
-    return found
-
-
-def _map(config: Configuration, key: str, file: str) -> Single:
     try:
         found = read_shape(Path(file).expanduser())
     except DataFileError as fault:
@@ -72,4 +65,6 @@ def _map(config: Configuration, key: str, file: str) -> Single:
             f"{key} = {file!r}: {found.shape[0]} x {found.shape[1]} values, the mirror has {grid[0]} x {grid[1]} "
             "actuators"
         )
+    if not np.isfinite(found).all():
+        raise ConfigurationError(f"{key} = {file!r}: every value must be finite")
     return found

@@ -149,7 +149,7 @@ def serve_foxglove(run: Run, clock: Clock, port: int = DEFAULT_PORT) -> None:
         BusError: the port is taken.
         ConfigurationError: foxglove-sdk is not installed.
     """
-    bus = ZenohBus(run.links, Role.VIEWER, clock, looks_on=True)
+    bus = ZenohBus(run.links, Role.VIEWER, clock, monitor=True)
     try:
         bridge = FoxgloveBridge(bus, clock, run.run_id, port)
         bridge.service.catch_signals()

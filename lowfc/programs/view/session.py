@@ -42,7 +42,7 @@ def show_run(run_id: str, config: Configuration | None, target: Target, seconds:
     with contextlib.ExitStack() as stack:
         if target.save is not None:
             target.part = stack.enter_context(being_written(target.save))
-        bus = ZenohBus(run.links, Role.VIEWER, clock, looks_on=True)
+        bus = ZenohBus(run.links, Role.VIEWER, clock, monitor=True)
         stack.callback(bus.close)
         bridge = Bridge(config, run_id, clock, bus, target)
         stack.callback(bridge.close)
