@@ -129,7 +129,7 @@ def test_a_mirror_with_dead_actuators_and_another_scale_calibrates_and_closes() 
     active[dead] = 0
     np.save("active.npy", active.reshape(34, 34))
     config = configured(**FEW, mirror__active="active.npy")
-    true = {"mirror__dead": dead, "mirror__magnification": 1.01}
+    true = {"mirror__dead": dead, "mirror__magnification": 1.01, "mirror__shift_pitches": 0.31}
     loop = FoldedLoop(config, world=configured(**FEW, **true))
     made, taken = calibrated(loop, "hadamard", 4)
     assert of(loop, "hadamard", 4).pokes.amplitude_nm <= 3

@@ -23,7 +23,6 @@ from lowfc.control.loop.safety import LoopMode
 from lowfc.control.loop.state import State
 from lowfc.programs.core.start_up import StartUp, check_files
 from sim_camera.process import scene
-from tests.support.folded_loop import fold
 from tests.support.loops import run
 from tools.law_bench import calibrated
 
@@ -166,15 +165,6 @@ def test_a_registration_error_is_the_mirrors_and_not_the_calibrations(calibratio
     assert moved[1] == pytest.approx(moved[0], rel=0.05)
 
 
-def test_a_loop_closes_on_a_mirror_that_lies_elsewhere() -> None:
-    wrong = {"mirror.magnification": 1.01, "mirror.shift_pitches": 0.31, "control.start_mode": "closed"}
-    closed = fold(
-        load(None, QUIET | wrong | {"disturbance.static_nm": {"4": 20.0, "7": -10.0}, "control.gain": 0.3}), 60
-    )
-    assert closed.disturbance_rms_nm[-1] > 10
-    assert closed.residual_rms_nm[-1] < 0.03 * closed.disturbance_rms_nm[-1]
-
-
 def begun(config: Configuration, calibration: Calibration, shape: MirrorShape | None) -> tuple[State, list[Request]]:
     """The controller's start: calibration, mirror, and what the configuration asks; all granted."""
     settings = factory.settings(config)
@@ -229,14 +219,6 @@ def test_a_restarted_controller_does_not_put_the_flat_map_on_twice(
         np.testing.assert_allclose(shape, there, atol=2e-3)
     # Where the mirror does not say, its modal command has the flat map's modes too, and a channel takes them out again.
     assert names == ([FLAT] if told else [ADOPTED, FLAT])
-
-
-def test_a_shape_without_the_flat_map_stays_beside_it(tmp_path: Path, calibration: Calibration) -> None:
-    config = load(None, {"mirror.flat": saved(tmp_path, "flat.npy", wavy(30.0))})
-    rows, columns = np.indices(GRID)
-    other = (20.0 * np.cos(rows * 1.1) * np.sin(columns * 0.9)).astype(np.float32)
-    _, requests = begun(config, calibration, MirrorShape(0, other, np.zeros(14, np.float32)))
-    assert [one.text for one in requests] == [FLAT]
 
 
 def test_the_configured_law_takes_over(tmp_path: Path, calibration: Calibration) -> None:

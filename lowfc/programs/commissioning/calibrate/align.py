@@ -9,12 +9,11 @@ from rich.console import Console
 
 from lowfc.adapters.files import factory
 from lowfc.adapters.files.whole_file import require_folder
-from lowfc.adapters.process.terminal import configuration
-from lowfc.arrays import Array, single
+from lowfc.arrays import single
 from lowfc.client import Client, configuration_of
 from lowfc.contract.codecs.calibration_codec import identified
 from lowfc.contract.configuration import Configuration
-from lowfc.contract.errors import CalibrationError, ConfigurationError
+from lowfc.contract.errors import CalibrationError
 from lowfc.control.calibration.alignment import Alignment, Geometry, align, onto
 from lowfc.control.calibration.calibration import Calibration, normalise_flux
 from lowfc.programs.cli.result import Result, figure
@@ -22,7 +21,7 @@ from lowfc.programs.commissioning.analytic import analytic
 from lowfc.programs.commissioning.calibrate.pokes import AMPLITUDE_NM, sequence
 from lowfc.programs.commissioning.calibrate.recording import Player, watch
 from lowfc.programs.commissioning.calibrate.result import reconstructed
-from lowfc.programs.commissioning.calibrate.tasks import images, reporter, written
+from lowfc.programs.commissioning.calibrate.tasks import reporter, written
 
 
 class AlignResult(Result):
@@ -38,68 +37,44 @@ class AlignResult(Result):
     background_dn: float = figure("background", "DN", ".3g")
     residual: float = figure("part of the image that is left", form=".1%")
     other_parity_residual: float = figure("left with the other parity", form=".1%")
-    half_turn_known: bool = figure()
     file: str = figure("written")
 
     def remarks(self) -> Sequence[str]:
-        """Whether the sign is known."""
-        if self.half_turn_known:
-            return ["pokes are seen with the right sign"]
-        return ["only a poke shows whether it is half a turn more: --half-turn is the other one"]
+        """The sign is known."""
+        return ["pokes are seen with the right sign"]
 
 
-def aligned(
-    file: Path | None,
-    out: Path,
-    run: str | None,
-    frames: int,
-    image: Path | None,
-    *,
-    half_turn: bool,
-    load: bool,
-) -> AlignResult:
+def aligned(out: Path, run: str | None, frames: int, *, load: bool) -> AlignResult:
     """Fit the geometry, resample the computed calibration, write it.
 
     Raises:
         CalibrationError: the image is not like the computed one, or pokes are not seen.
-        ConfigurationError: an option is of no meaning with the others.
-        DataFileError: a file cannot be read or written.
+        DataFileError: the file cannot be written.
     """
-    if image is None and file is not None:
-        raise ConfigurationError("--config goes with --file: a running loop is aligned by its own configuration")
-    if image is not None and load:
-        raise ConfigurationError(
-            "--load goes with the frames of a running loop: after --file, load what it wrote with `lowfc ctl load`"
-        )
     require_folder(out)
-    if image is not None:
-        config = configuration(file)
-        picture, sign_known = images(image).mean(axis=0), False
-        computed = analytic(config, Console(stderr=True))
-        found = _fit(computed, picture, half_turn)
-        made = on_sensor(config, computed, found.geometry, found.flux, picture.shape, None)
-        written(made, out, None)
-    else:
-        with Client(run) as loop, loop.reserved("lowfc calibrate align"):
-            config, before = configuration_of(loop), replace(loop.calibration(), camera=loop.camera())
-            pixels = watch(loop, frames)
-            if pixels.shape[1:] != before.shape:
-                raise CalibrationError(
-                    f"the frames have {pixels.shape[1]} x {pixels.shape[2]} pixels, the calibration in use is for "
-                    f"{before.shape[0]} x {before.shape[1]}, and so are its dark and bad pixels: `lowfc commission` "
-                    "measures one for these frames"
-                )
-            dark = before.dark.reshape(before.shape).astype(np.float64)
-            computed = analytic(config, Console(stderr=True))
-            found = _fit(computed, pixels.mean(axis=0) - dark, half_turn)
-            made = on_sensor(config, computed, found.geometry, found.flux, before.shape, before)
-            sign_known = True
-            mode = int(np.argmax(np.linalg.norm(made.response, axis=0)))
-            seen = Player(loop, made, reporter(Console(stderr=True))).first_poke(mode, sequence(AMPLITUDE_NM["poke"]))
-            if seen.picture @ made.response[:, mode] < 0:
-                found = replace(found, geometry=found.geometry.turned())
-                made = on_sensor(config, computed, found.geometry, found.flux, before.shape, before)
-            written(made, out, loop if load else None)
+    console = Console(stderr=True)
+    with Client(run) as loop, loop.reserved("lowfc calibrate align"):
+        config, before = configuration_of(loop), replace(loop.calibration(), camera=loop.camera())
+        pixels = watch(loop, frames)
+        if pixels.shape[1:] != before.shape:
+            raise CalibrationError(
+                f"the frames have {pixels.shape[1]} x {pixels.shape[2]} pixels, the calibration in use is for "
+                f"{before.shape[0]} x {before.shape[1]}, and so are its dark and bad pixels: `lowfc commission` "
+                "measures one for these frames"
+            )
+        dark = before.dark.reshape(before.shape).astype(np.float64)
+        computed = analytic(config, console)
+        try:
+            found = align(pixels.mean(axis=0) - dark, computed.reference.astype(np.float64).reshape(computed.shape))
+        except ValueError as error:
+            raise CalibrationError(str(error)) from None
+        made = on_sensor(config, computed, found.geometry, found.flux, before)
+        mode = int(np.argmax(np.linalg.norm(made.response, axis=0)))
+        seen = Player(loop, made, reporter(console)).first_poke(mode, sequence(AMPLITUDE_NM["poke"]))
+        if seen.picture @ made.response[:, mode] < 0:
+            found = replace(found, geometry=found.geometry.turned())
+            made = on_sensor(config, computed, found.geometry, found.flux, before)
+        written(made, out, loop if load else None)
     return AlignResult(
         **asdict(found.geometry),
         pixels_per_lambda_d=found.geometry.scale * computed_scale(config),
@@ -107,30 +82,22 @@ def aligned(
         background_dn=found.background,
         residual=found.residual,
         other_parity_residual=found.other_parity,
-        half_turn_known=sign_known,
         file=str(out),
     )
 
 
 def on_sensor(
-    config: Configuration,
-    computed: Calibration,
-    geometry: Geometry,
-    flux: float,
-    shape: tuple[int, ...],
-    before: Calibration | None,
+    config: Configuration, computed: Calibration, geometry: Geometry, flux: float, before: Calibration
 ) -> Calibration:
-    """A computed calibration on real pixels (rows, columns); dark and mask are those of `before`.
+    """A computed calibration on the pixels of a real sensor, with the dark and the mask of the one before.
 
     Raises:
         CalibrationError: too little of the image falls on the sensor.
     """
-    rows, columns = shape
-    own = (*computed.shape, -1)
-    I0 = onto(computed.reference.astype(np.float64).reshape(computed.shape), geometry, (rows, columns)).reshape(-1)
-    H = onto(computed.response.astype(np.float64).reshape(own), geometry, (rows, columns)).reshape(rows * columns, -1)
-    good = np.ones(I0.size) if before is None else before.good.astype(np.float64)
-    dark = np.zeros(I0.size, np.float32) if before is None else before.dark
+    own, pixels = (*computed.shape, -1), before.good.size
+    I0 = onto(computed.reference.astype(np.float64).reshape(computed.shape), geometry, before.shape).reshape(-1)
+    H = onto(computed.response.astype(np.float64).reshape(own), geometry, before.shape).reshape(pixels, -1)
+    good = before.good.astype(np.float64)
     try:
         I0, H = normalise_flux(np.maximum(I0, 0), H, good)
         made = reconstructed(config, I0, H, None, good, flux, estimator=config.control.estimator)
@@ -142,14 +109,14 @@ def on_sensor(
             reference=single(I0),
             response=single(H),
             reconstructor=single(made.matrix),
-            good=single(good),
-            dark=dark,
-            shape=(rows, columns),
+            good=before.good,
+            dark=before.dark,
+            shape=before.shape,
             flux_dn=flux,
-            saturation_dn=computed.saturation_dn if before is None else before.saturation_dn,
+            saturation_dn=before.saturation_dn,
             estimator=f"{config.control.estimator}+aligned",
             operator_hash="",
-            camera=None if before is None else before.camera,
+            camera=before.camera,
         )
     )
 
@@ -158,14 +125,6 @@ def computed_scale(config: Configuration) -> float:
     """Pixels per lambda/D of the computed image; per pupil diameter where the sensor sees the pupil."""
     optics = factory.sensor(config, lambda _: None)
     return 1 / (optics.pitch * optics.binning)
-
-
-def _fit(computed: Calibration, image: Array, half_turn: bool) -> Alignment:
-    try:
-        found = align(image, computed.reference.astype(np.float64).reshape(computed.shape))
-    except ValueError as error:
-        raise CalibrationError(str(error)) from None
-    return replace(found, geometry=found.geometry.turned()) if half_turn else found
 
 
 def in_words(found: Alignment, scale: float) -> str:

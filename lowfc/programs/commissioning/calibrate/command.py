@@ -156,23 +156,16 @@ def reference(
 def align(
     out: Out = Path("calibration.fits"),
     run: AnyRun = None,
-    config: ConfigFile = None,
     frames: Frames = 1000,
-    file: Annotated[
-        Path | None, typer.Option("--file", help="The reference image from a FITS file (rows, columns) instead.")
-    ] = None,
-    half_turn: Annotated[
-        bool, typer.Option("--half-turn", help="The other one of the two rotations that the image cannot tell apart.")
-    ] = False,
     load: Load = False,
     as_json: Json = False,
 ) -> None:
     """Fit how the sensor lies to the computed image; write the computed calibration for its pixels.
 
-    A half turn more or less leaves the image as it is and reverses every mode: pokes tell, where there is a loop.
+    A half turn more or less leaves the image as it is and reverses every mode: a poke shows which it is.
 
     Example: lowfc calibrate align --out aligned.fits
     """
     from lowfc.programs.commissioning.calibrate.align import aligned
 
-    put(aligned(config, out, run, frames, file, half_turn=half_turn, load=load), as_json=as_json)
+    put(aligned(out, run, frames, load=load), as_json=as_json)

@@ -72,14 +72,14 @@ def aligned(
     model = computed.reference.astype(np.float64).reshape(computed.shape)
     try:
         found = align(image, model)
-        made = on_sensor(config, computed, found.geometry, before.flux_dn, before.shape, before)
+        made = on_sensor(config, computed, found.geometry, before.flux_dn, before)
     except (ValueError, CalibrationError) as error:
         report(f"the image is not compared with the computed one: {error}")
         return None
     like = likeness(poke.picture, made.response[:, 0])
     if like < 0:
         found = replace(found, geometry=found.geometry.turned())
-        made = on_sensor(config, computed, found.geometry, before.flux_dn, before.shape, before)
+        made = on_sensor(config, computed, found.geometry, before.flux_dn, before)
         like = likeness(poke.picture, made.response[:, 0])
     scale = found.geometry.scale * computed_scale(config)
     report(f"{in_words(found, scale)}; the poke's image correlates by {like:.2f} with the computed one")
