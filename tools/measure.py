@@ -7,7 +7,6 @@ Example:
     python -m tools.measure                # the pages again, from what was measured and from the code
     python -m tools.measure laws sensors   # measures these anew, then the pages
     python -m tools.measure pictures       # the pictures of the views, with real processes
-    python -m tools.measure layouts        # the viewer's layouts in deploy/layouts
 """
 
 import argparse
@@ -21,15 +20,12 @@ from benchmarks import curves, step, throughput
 from benchmarks.peers import contest
 from benchmarks.runner import Benchmark, in_markdown
 from lowfc.programs.measure.latency import text as latency_text
-from lowfc.programs.view.layout import APPLICATION, layout
-from lowfc.programs.view.message_layout import message_layout
 from tools import dark_hole, laws, loop, pictures, reliability, sensors, slow_modes
 from tools.declared import DECLARED
 from tools.shared import ROOT, Figures, host, json_of, where
 
 MEASURED = ROOT / "tools" / "measured"
 PAGES = (ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md")))
-LAYOUTS = ROOT / "deploy" / "layouts"
 SHORT = "loop in short"
 COST_CURVES = ROOT / "docs" / "pictures" / "cost_curves.png"
 
@@ -112,16 +108,10 @@ def generated(page: Path) -> str:
     return text
 
 
-def write_layouts() -> None:
-    """Write the layouts for rerun, whose bytes differ each time."""
-    layout().save(APPLICATION, LAYOUTS / "lowfc.rbl")
-    message_layout().save(APPLICATION, LAYOUTS / "log.rbl")
-
-
 def main() -> None:
     """The command line."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    made = {"pictures": pictures.make, "layouts": write_layouts}
+    made = {"pictures": pictures.make}
     known = (*MEASUREMENTS, *made)
     parser.add_argument("names", nargs="*", metavar="NAME", help=f"any of {', '.join(known)}")
     names = parser.parse_args().names

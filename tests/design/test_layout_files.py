@@ -3,31 +3,19 @@
 A field or a topic that is renamed fails here, and not before somebody at night.
 """
 
-import contextlib
 import json
-import os
 import re
-import subprocess
-import time
 from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree
 
-import numpy as np
 import pytest
 from google.protobuf.descriptor import Descriptor, FieldDescriptor
-from rerun.chunk import RrdReader
 
-from lowfc.adapters.bus.run import free_ports
-from lowfc.adapters.viewer.rerun_viewer import vulkan_drivers
-from lowfc.contract.messages import EVENT, TRUTH, RawImage, Role, topic_of, wire
+from lowfc.contract.messages import EVENT, RawImage, Role, topic_of, wire
 from lowfc.optics.chain.zernike import NOLLS_14, mode_name
-from lowfc.programs.view.layout import APPLICATION, layout
-from lowfc.programs.view.message_layout import message_layout
-from tests.support.loops import loop, until
-from tests.support.viewers import Pixels, needs_vulkan, pixels
 
 LAYOUTS = Path(__file__).parents[2] / "deploy" / "layouts"
 FOXGLOVE = json.loads((LAYOUTS / "foxglove.json").read_text())
@@ -141,103 +129,3 @@ def test_the_curves_of_plotjuggler_are_numbers() -> None:
             assert plotjuggler_field(curve).cpp_type not in NOT_NUMBERS
     for splitter in PLOTJUGGLER.iter("DockSplitter"):  # PlotJuggler trusts these
         assert splitter.get("count") == str(len(splitter)) == str(len(splitter.get("sizes", "").split(";")))
-
-
-_SHOWN = {"ViewBlueprint:display_name", "ViewBlueprint:space_origin", "SeriesLines:names"}
-_TAKEN = "VisualizerInstruction:component_map"
-
-
-def of_rerun(path: Path) -> tuple[str, Counter[str], set[tuple[str, str]]]:
-    """Application id of a layout, its views and names, and what it takes of which message."""
-    reader = RrdReader(path)
-    (entry,) = reader.blueprints()
-    shown: Counter[str] = Counter()
-    taken: set[tuple[str, str]] = set()
-    for chunk in reader.store(store=entry).stream():
-        batch = chunk.to_record_batch()
-        for name in _SHOWN & set(batch.schema.names):
-            shown.update(f"{name} {value}" for value in batch.column(name)[0].as_py())
-        if _TAKEN in batch.schema.names:
-            taken |= {(one["source_component"], one["selector"]) for one in batch.column(_TAKEN)[0].as_py()}
-    return entry.application_id, shown, taken
-
-
-def test_the_layout_for_rerun_is_the_one_that_the_code_makes(tmp_path: Path) -> None:
-    message_layout().save(APPLICATION, tmp_path / "log.rbl")
-    layout().save(APPLICATION, tmp_path / "lowfc.rbl")
-    assert of_rerun(LAYOUTS / "lowfc.rbl") == of_rerun(tmp_path / "lowfc.rbl"), "python -m tools.measure layouts"
-    shipped = of_rerun(LAYOUTS / "log.rbl")
-    assert shipped == of_rerun(tmp_path / "log.rbl"), "python -m tools.measure layouts"
-    assert shipped[1][f"ViewBlueprint:space_origin /{TRUTH.key}"] == 2
-    assert len(shipped[2]) == 13
-    for component, selector in shipped[2]:
-        message = getattr(wire, component.removeprefix("lowfc.v1.").removesuffix(":message"))
-        first, *rest = selector.removeprefix(".").split(".")
-        field = message.DESCRIPTOR.fields_by_name[first.partition("[")[0]]
-        assert field.is_repeated == ("[" in first)
-        assert rest == (["name"] if field.enum_type is not None else [])
-
-
-def coloured(picture: Pixels) -> bool:
-    """Whether there are lines, bands or levels: all that a view has without data is grey."""
-    return float((np.ptp(picture, axis=2) > 60).mean()) > 0.003
-
-
-def shaded(picture: Pixels) -> bool:
-    """Whether there is an image: without one nearly all is of one grey."""
-    levels = np.bincount(picture.max(axis=2).ravel())
-    return float(levels.max() / levels.sum()) < 0.8
-
-
-@pytest.mark.slow
-@pytest.mark.viewer
-@needs_vulkan
-def test_the_plain_viewer_plots_a_log(tmp_path: Path, artefacts: Path) -> None:
-    import rerun_cli
-    from rerun.experimental import ViewerClient
-
-    log = loop(tmp_path, "--rate", "200", "--duration", "2", "--disturbance", "reaction-wheel")["log"]
-    rerun = Path(rerun_cli.__file__).parent / "rerun"
-    environment = os.environ | {"HOME": str(tmp_path), "XDG_CONFIG_HOME": str(tmp_path)}
-    for driver in vulkan_drivers():
-        if driver.name.startswith("lvp"):  # in software, the same everywhere
-            environment.setdefault("VK_ICD_FILENAMES", str(driver))
-    (port,) = free_ports(1)
-    show = [rerun, "--headless", "--bind", "127.0.0.1", "--port", str(port), "--window-size", "1600x1000"]
-    route = [rerun, "rrd", "route", "--application-id", log.stem, LAYOUTS / "log.rbl"]
-    with (tmp_path / "said.txt").open("w") as said:
-        subprocess.run([rerun, "analytics", "disable"], env=environment, stdout=said, stderr=said, check=True)
-        routed = subprocess.Popen(route, env=environment, stdout=subprocess.PIPE, stderr=said)
-        viewer = subprocess.Popen([*show, log, "-"], env=environment, stdin=routed.stdout, stdout=said, stderr=said)
-    client: Any = None
-    try:
-        shown = of_rerun(LAYOUTS / "log.rbl")[1]
-        names = {one.partition(" ")[2] for one in shown if one.startswith("ViewBlueprint:display_name")}
-
-        def ready() -> bool:
-            nonlocal client
-            assert viewer.poll() is None, (tmp_path / "said.txt").read_text()
-            with contextlib.suppress(RuntimeError, ConnectionError):
-                client = client or ViewerClient.connect(f"rerun+http://127.0.0.1:{port}/proxy")
-                state = client.get_state()
-                return not state.loading and {view.name for view in state.views} == names
-            return False
-
-        until(ready)
-        views = client.get_state().views
-        assert [view.reports for view in views if view.reports] == []
-
-        def is_empty(view: Any) -> bool:
-            drawn = pixels(client.take_screenshot(view.view_id))
-            return not (shaded(drawn) if view.view_class == "2D" else coloured(drawn))
-
-        deadline_s = time.monotonic() + 20
-        while missing := [view.name for view in views if is_empty(view)]:
-            assert time.monotonic() < deadline_s, f"nothing is shown in {missing}"
-    finally:
-        if client is not None:
-            (artefacts / "log-with-our-layout.png").write_bytes(client.take_screenshot())
-        viewer.kill()
-        viewer.wait()
-        routed.wait()
-        routed.stdout.close()

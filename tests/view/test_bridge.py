@@ -1,9 +1,9 @@
 """The bridge: it draws what the bus says, mends what goes wrong, and holds nobody up."""
 
+import contextlib
 import threading
 import time
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, field
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -29,15 +29,20 @@ from tests.support.stage import Tape
 PATIENCE_S = 10.0
 
 
-@dataclass
 class Screen:
-    """In place of the viewer's process."""
+    """In place of the viewer's process and of the stream to it, which takes nothing while the viewer hangs."""
 
-    show: Show
-    alive: bool = True
-    held_bytes: int = 0
-    stopped: threading.Event = field(default_factory=threading.Event)
-    holds_up: threading.Event = field(default_factory=threading.Event)
+    def __init__(self, show: Show | None, hangs: bool) -> None:
+        self.show, self.hangs, self.alive, self.held_bytes = show, hangs, True, 0
+        self.stopped, self.holds_up = threading.Event(), threading.Event()
+        self.tape = Tape()
+        self.tape.log, self._log = self.log, self.tape.log
+
+    def log(self, path: str, *archetypes: Any, static: bool = False) -> None:
+        if self.hangs and not static:
+            self.holds_up.set()
+            self.stopped.wait(PATIENCE_S)
+        self._log(path, *archetypes, static=static)
 
     def resident_bytes(self) -> int:
         return self.held_bytes
@@ -53,22 +58,10 @@ class Screen:
         self.stopped.set()
 
 
-class Stuck(Tape):
-    """A stream into a viewer that takes nothing until it is stopped."""
-
-    def __init__(self, screen: Screen) -> None:
-        super().__init__()
-        self.screen = screen
-
-    def log(self, path: str, *archetypes: Any, static: bool = False) -> None:
-        if not static:
-            self.screen.holds_up.set()
-            self.screen.stopped.wait(PATIENCE_S)
-        super().log(path, *archetypes, static=static)
-
-
 class Scene:
-    """A bridge on a bus in memory, running in a thread, and a run that was there before it."""
+    """A bridge on a bus in memory, running in a thread, and a run that was there before it; `stuck` viewers hang."""
+
+    memory_mb = 100.0
 
     def __init__(self, show: Show | None = Show.WEB, stuck: int = 0) -> None:
         self.hub, self.clock = MemoryHub(), HostClock()
@@ -83,15 +76,21 @@ class Scene:
         }
         self.publish()
         self.screens: list[Screen] = []
-        self.tapes: list[Tape] = []
         self.show, self.stuck = show, stuck
-        bus = MemoryBus(self.hub, "viewer", self.clock)
-        target = SimpleNamespace(viewer=self._screen, stream=self._tape, memory_mb=100.0)
-        self.bridge = Bridge(Configuration(), "night", self.clock, bus, target)
+        self.bridge = Bridge(Configuration(), "night", self.clock, MemoryBus(self.hub, "viewer", self.clock), self)
         self.failure: Exception | None = None
         self.thread = threading.Thread(target=self._run, daemon=True)
         self.thread.start()
-        until(lambda: self.tapes)
+        until(lambda: self.screens)
+
+    def viewer(self) -> Screen | None:
+        """Of the target: this."""
+        self.screens.append(Screen(self.show, len(self.screens) < self.stuck))
+        return self.screens[-1] if self.show is not None else None
+
+    def stream(self, screen: Screen | None, recording: str, window_s: float) -> Tape:
+        """Of the target: this."""
+        return self.screens[-1].tape
 
     def publish(self) -> None:
         for sample in self.night.samples:
@@ -99,23 +98,13 @@ class Scene:
 
     def drawn(self, number: int) -> bool:
         """Whether the newest view has this number, and shows steps with their calibration."""
-        return len(self.tapes) == number and wavefront.ERROR.path in self.tapes[-1].rows
+        return len(self.screens) == number and wavefront.ERROR.path in self.screens[-1].tape.rows
 
     def end(self) -> None:
         self.bridge.service.stop("the test is over")
         self.thread.join(PATIENCE_S)
         self.bridge.close()
         assert not self.thread.is_alive()
-
-    def _screen(self) -> Screen | None:
-        if self.show is None:
-            return None
-        self.screens.append(Screen(self.show))
-        return self.screens[-1]
-
-    def _tape(self, screen: Screen, recording: str, window_s: float) -> Tape:
-        self.tapes.append(Stuck(screen) if len(self.tapes) < self.stuck else Tape())
-        return self.tapes[-1]
 
     def _run(self) -> None:
         try:
@@ -136,15 +125,14 @@ Scenes = Callable[..., Scene]
 
 @pytest.fixture
 def scenes() -> Iterator[Scenes]:
-    made: list[Scene] = []
+    with contextlib.ExitStack() as made:
 
-    def make(show: Show | None = Show.WEB, stuck: int = 0) -> Scene:
-        made.append(Scene(show, stuck))
-        return made[-1]
+        def make(*given: Any, **more: Any) -> Scene:
+            scene = Scene(*given, **more)
+            made.callback(scene.end)
+            return scene
 
-    yield make
-    for scene in made:
-        scene.end()
+        yield make
 
 
 def failed(scene: Scene) -> str:
@@ -176,7 +164,7 @@ def test_a_view_that_comes_late_shows_the_events_from_before_once(scenes: Scenes
     MemoryBus(scene.hub, "recorder", scene.clock).publisher(HEALTH, "recorder").put(health.SerializeToString())
 
     def notes() -> list[str]:
-        return [text for tape in scene.tapes for text in tape.texts("log/controller") if "NOTE" in text]
+        return [text for screen in scene.screens for text in screen.tape.texts("log/controller") if "NOTE" in text]
 
     until(notes)
     assert len(notes()) == 1
@@ -187,7 +175,7 @@ def test_without_a_recorder_a_line_says_that_earlier_events_are_missing(
 ) -> None:
     monkeypatch.setattr(bridges, "_RECORDER_S", 0.1)
     scene = scenes()
-    until(lambda: scene.tapes[0].logged["log/view"])
+    until(lambda: scene.screens[0].tape.logged["log/view"])
 
 
 def dies(scene: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -226,7 +214,7 @@ def test_a_viewer_that_fails_is_started_again_and_shows_everything(
     scene.publish()
     until(lambda: stuck or scene.drawn(1))
     harm(scene, monkeypatch)
-    until(lambda: len(scene.tapes) == 2)
+    until(lambda: len(scene.screens) == 2)
     assert scene.screens[0].stopped.is_set()
     scene.publish()
     until(lambda: scene.drawn(2))
@@ -267,7 +255,7 @@ def test_memory_that_stays_ends_the_view(scenes: Scenes, monkeypatch: pytest.Mon
 
 
 def test_a_view_that_fails_again_and_again_ends(scenes: Scenes, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(Screen, "alive", property(lambda self: False, lambda self, value: None))
+    monkeypatch.setattr(Screen, "alive", property(lambda self: False, lambda self, value: None), raising=False)
     assert "5 times" in failed(scenes())
 
 
@@ -283,15 +271,11 @@ def test_rows_are_taken_by_time_however_slow_the_drawing_is(
 ) -> None:
     complete: list[bool] = []
 
-    class Drawn:
-        def __init__(self, *_: object) -> None:
-            pass
+    def draw(snapshot: Snapshot) -> None:
+        complete.append(snapshot.complete)
+        time.sleep(pause_s)
 
-        def draw(self, snapshot: Snapshot) -> None:
-            complete.append(snapshot.complete)
-            time.sleep(pause_s)
-
-    monkeypatch.setattr(render_threads, "Renderer", Drawn)
+    monkeypatch.setattr(render_threads, "Renderer", lambda *_: SimpleNamespace(draw=draw))
     thread = RenderThread(Configuration(), HostClock(), {}, Tape)
     thread.start()
     until(lambda: len(complete) >= 4)
