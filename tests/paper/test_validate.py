@@ -305,21 +305,6 @@ CHANCE = {
 """Figures that depend on the draw and have no standard error: how far ten trials may be from the committed ones."""
 
 
-@pytest.mark.slow
-def test_two_thousand_realisations_scatter_as_predicted():
-    (table,) = run(["table4"], Context(2000, jobs=2))
-    scatters = [row for row in table["rows"] if row["quantity"].startswith("std")]
-    off = [row for row in scatters if abs(row["measured"] / row["predicted"] - 1.0) > 0.05]
-    # 5 % is 3.2 standard errors: of so many scatters a few may be off by chance, but none by far.
-    assert len(off) < 0.02 * len(scatters)
-    assert all(abs(row["measured"] / row["predicted"] - 1.0) < 4.5 / (2 * 1999) ** 0.5 for row in scatters)
-    tilt = [
-        row for row in scatters if row["estimator"] == "weighted" and row["modes"] == 2 and " 1 mas" in row["quantity"]
-    ]
-    assert len(tilt) > 20
-    assert all(row["measured"] == pytest.approx(row["limit"], rel=0.05) for row in tilt)
-
-
 TABLE3 = {
     (SAM, "pinv"): (3.5e-4, 6.0e-4),
     (SAM, "weighted"): (3.0e-4, 5.0e-4),

@@ -131,19 +131,8 @@ def fig7(context: Context) -> list[Row]:
             paper = _PAPER_PV_WAVES if name.startswith("sam") else None
             for key, residuals_nm in case.residuals_nm.items():
                 mean, error = mean_and_error(residual_pv(basis, residuals_nm) / wavelength_nm)
-                rows.append(
-                    Row(
-                        f"{name}, coma Z{coma}",
-                        "P-V residual",
-                        "waves",
-                        mean,
-                        paper,
-                        error,
-                        limit=limit,
-                        modes=MODES,
-                        estimator=key,
-                    )
-                )
+                fitted = partial(Row, f"{name}, coma Z{coma}", modes=MODES, estimator=key)
+                rows.append(fitted("P-V residual", "waves", mean, paper, error, limit=limit))
     return assuming(
         rows,
         f"lambda/30 of Z4 and of one coma, which the paper does not name; mean of at most {REALISATIONS} exposures, "

@@ -67,18 +67,12 @@ def fig3(context: Context) -> list[Row]:
     rows = []
     for name in context.names("sam", "bowtie"):
         ready = prepared(name)
-        mask = np.abs(ready.sensor.focal_mask) ** 2
+        mask, reflected = np.abs(ready.sensor.focal_mask) ** 2, PAPER_FOCAL_MASK if name == "sam" else None
         radius = len(mask) / (2.0 * ready.sensor.samples_per)
         rows += [
             Row(name, "outer radius", "lambda/D", radius, {"sam": 4.0, "bowtie": 10.0}.get(name)),
             Row(name, "reflecting area", "(lambda/D)^2", float(mask.sum()) / ready.sensor.samples_per**2),
-            Row(
-                name,
-                "reflected, of the light on it",
-                "",
-                ready.budget.focal_mask,
-                PAPER_FOCAL_MASK if name == "sam" else None,
-            ),
+            Row(name, "reflected, of the light on it", "", ready.budget.focal_mask, reflected),
         ]
     return assuming(rows, "The paper gives the light of its own pupil on the disk only; the wedges open to 95 degrees.")
 

@@ -187,22 +187,14 @@ def fig8(context: Context) -> list[Row]:
     """Deviation from linear of pure modes, Fig. 8(a), and errors of one random wavefront, Fig. 8(b)."""
     names = context.names("sam", "clowfs", "zwfs")
     rows = [row for name in names for row in _range_rows(context, name)]
+    paper = _PAPER_ERROR_WAVES if names[0].startswith("sam") else None
+    one = partial(Row, names[0], modes=MODES, assumption=f"One wavefront and one exposure. {BRIGHT} {FULL_CHAIN}")
     for literal, bounds in ((False, "matched"), (True, "literal")):
         truth, estimates = _one_wavefront(context, names[0], literal)
         for key in (PINV, WEIGHTED_2):
             worst = float(np.abs(estimates[key] - truth).max())
-            rows.append(
-                Row(
-                    names[0],
-                    f"largest error of a random wavefront, {bounds} input",
-                    "waves",
-                    worst,
-                    _PAPER_ERROR_WAVES if names[0].startswith("sam") else None,
-                    modes=MODES,
-                    estimator=key,
-                    assumption=f"One wavefront and one exposure. {BRIGHT} {FULL_CHAIN}",
-                )
-            )
+            what = f"largest error of a random wavefront, {bounds} input"
+            rows.append(one(what, "waves", worst, paper, estimator=key))
     return rows
 
 

@@ -2,6 +2,7 @@
 
 from collections.abc import Iterator
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 from scipy.optimize import brentq
@@ -86,44 +87,26 @@ def _signals(sensor: Prepared) -> Iterator[Row]:
     in_band = float(sensor.band_I0.max() / sensor.band_I0.sum())
     yield Row(sensor.name, "brightest pixel / image, in the band", "", in_band, peak, assumption=band)
     for axis, direction in enumerate("xy"):
-        yield Row(
-            sensor.name,
-            f"P-V of the signal of 1 mas in {direction} / brightest pixel",
-            "",
-            float(np.ptp(tilt_signal(sensor, axis)) / sensor.band_I0.max()),
-            signal,
-            assumption=band,
-        )
+        what = f"P-V of the signal of 1 mas in {direction} / brightest pixel"
+        ratio = float(np.ptp(tilt_signal(sensor, axis)) / sensor.band_I0.max())
+        yield Row(sensor.name, what, "", ratio, signal, assumption=band)
 
 
 def _ratios(sam: Prepared, clowfs: Prepared) -> Iterator[Row]:
     own, paper = np.ptp(tilt_signal(clowfs)) / np.ptp(tilt_signal(sam)), PAPER_SIGNAL_RATIO
     for k, light in enumerate(("own photometry", "paper's electrons")):
         counts = [float(paper_count_e(each) / each.band_I0.sum()) if k else 1.0 for each in (clowfs, sam)]
-        yield Row(
-            "clowfs / sam",
-            f"P-V of the signal of 1 mas in electrons, {light}",
-            "",
-            float(own * counts[0] / counts[1]),
-            paper,
-            assumption="Band in five wavelengths, x tilt.",
-        )
+        what, ratio = f"P-V of the signal of 1 mas in electrons, {light}", float(own * counts[0] / counts[1])
+        yield Row("clowfs / sam", what, "", ratio, paper, assumption="Band in five wavelengths, x tilt.")
+    predicted = f"Predicted; the paper's own Table 4 has {TABLE4_MAS['sam'][1] / TABLE4_MAS['clowfs'][1]:.1f}."
     for k, light in enumerate(("paper's electrons", "own photometry")):
         scatter = []
         for sensor in (sam, clowfs):
             exposure = exposures(sensor)[k]
             linear = fits(sensor, exposure, 1)[2, "pinv"]
             scatter.append(float(predicted_mas(linear, linear.reference_e)[0]))
-        yield Row(
-            "sam / clowfs",
-            f"std of x tilt, {light}",
-            "",
-            scatter[0] / scatter[1],
-            PAPER_SCATTER_RATIO,
-            modes=2,
-            estimator="pinv",
-            assumption=f"Predicted; the paper's own Table 4 has {TABLE4_MAS['sam'][1] / TABLE4_MAS['clowfs'][1]:.1f}.",
-        )
+        fitted = partial(Row, "sam / clowfs", modes=2, estimator="pinv", assumption=predicted)
+        yield fitted(f"std of x tilt, {light}", "", scatter[0] / scatter[1], PAPER_SCATTER_RATIO)
 
 
 def _inconsistencies(sam: Prepared, clowfs: Prepared) -> Iterator[Row]:

@@ -169,16 +169,8 @@ def _rows(
 def _dimmed_rows(sensor: Prepared, exposure: Exposure, tilted: Array) -> Iterator[Row]:
     """What the throughput of our pupil contributes, by prediction alone."""
     linear = fits(sensor, exposure, 1)
+    what, paper = f"predicted std of x tilt, 1 mas, {exposure.name}", _paper_mas(sensor.name, 2, 1)
     for kind in KINDS:
-        mean_e = tilted * exposure.scale_e
-        yield Row(
-            sensor.name,
-            f"predicted std of x tilt, 1 mas, {exposure.name}",
-            "mas",
-            float(predicted_mas(linear[2, kind], mean_e)[0]),
-            _paper_mas(sensor.name, 2, 1),
-            limit=float(bound_mas(linear[2, kind])[0]),
-            modes=2,
-            estimator=kind,
-            assumption=exposure.assumption,
-        )
+        std, limit = predicted_mas(linear[2, kind], tilted * exposure.scale_e), bound_mas(linear[2, kind])
+        fitted = partial(Row, sensor.name, modes=2, estimator=kind, assumption=exposure.assumption)
+        yield fitted(what, "mas", float(std[0]), paper, limit=float(limit[0]))

@@ -2,6 +2,7 @@
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 
@@ -156,44 +157,27 @@ def table3(context: Context) -> list[Row]:
 
 
 def _input_rows(sensor: Prepared, modes: int, wavefronts: Input, found: Ensemble) -> Iterator[Row]:
-    for figure, unit_paper, (mean, error) in (
+    drawn = partial(Row, f"input, pupil of {sensor.name}", modes=modes, assumption=wavefronts.assumption)
+    for figure, paper, (mean, error) in (
         ("RMS", INPUT_RMS_WAVES, _rms(sensor, found.truth_nm)),
         ("P-V", INPUT_PV_WAVES, _pv(sensor, found.truth_nm)),
     ):
-        yield Row(
-            f"input, pupil of {sensor.name}",
-            f"{figure}, {wavefronts.name} input",
-            "waves",
-            mean,
-            unit_paper[modes],
-            error,
-            modes=modes,
-            assumption=wavefronts.assumption,
-        )
+        yield drawn(f"{figure}, {wavefronts.name} input", "waves", mean, paper[modes], error)
 
 
 def _residual_rows(sensor: Prepared, modes: int, wavefronts: Input, found: Ensemble) -> Iterator[Row]:
-    paper = PAPER_WAVES.get(sensor.name, TABLE3_WAVES["disk"] if sensor.name.startswith("sam") else {}).get(
-        modes, (None, None)
-    )
+    own = TABLE3_WAVES["disk"] if sensor.name.startswith("sam") else {}
+    paper = PAPER_WAVES.get(sensor.name, own).get(modes, (None, None))
     for estimator, estimates_nm in found.estimates_nm.items():
         residuals_nm = found.truth_nm - estimates_nm
-        for figure, value, limit_nm, (mean, error) in (
-            ("RMS", paper[0], found.bound_nm, _rms(sensor, residuals_nm)),
+        assumption = "\n".join((wavefronts.assumption, NOISE, *((EVEN,) if estimator == WITH_NUISANCES else ())))
+        fitted = partial(Row, sensor.name, unit="waves", modes=modes, estimator=estimator, assumption=assumption)
+        for figure, value, limit, (mean, error) in (
+            ("RMS", paper[0], found.bound_nm / sensor.sensor.wavelength_nm, _rms(sensor, residuals_nm)),
             ("P-V", paper[1], None, _pv(sensor, residuals_nm)),
         ):
-            yield Row(
-                sensor.name,
-                f"{figure} residual, {wavefronts.name} input",
-                "waves",
-                mean,
-                value,
-                error,
-                limit=None if limit_nm is None else limit_nm / sensor.sensor.wavelength_nm,
-                modes=modes,
-                estimator=estimator,
-                assumption="\n".join((wavefronts.assumption, NOISE, *((EVEN,) if estimator == WITH_NUISANCES else ()))),
-            )
+            what = f"{figure} residual, {wavefronts.name} input"
+            yield fitted(what, measured=mean, paper=value, error=error, limit=limit)
 
 
 def _rms(sensor: Prepared, coefficients_nm: Array) -> tuple[float, float]:

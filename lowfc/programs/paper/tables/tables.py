@@ -67,16 +67,13 @@ def _peaks(context: Context, name: str) -> Iterator[Row]:
         return float(np.abs(differential(sensor, noll)).max())
 
     found = context.map(f"table2 {name}", peak, NOLLS_14)
+    assumption = (
+        "lambda/30 rms with the full exp(i phi). (I - I0) / I0 is read as the peak of |I - I0| over the peak of I0: "
+        "pixel by pixel it has no bound, for I0 has dark pixels."
+    )
     for noll, value in zip(NOLLS_14, found, strict=True):
-        yield Row(
-            name,
-            f"peak differential intensity of Z{noll}, {mode_name(noll)}",
-            "",
-            value,
-            PAPER_TABLE2[noll] if name.startswith("sam") else None,
-            assumption="lambda/30 rms with the full exp(i phi). (I - I0) / I0 is read as the peak of |I - I0| over the "
-            "peak of I0: pixel by pixel it has no bound, for I0 has dark pixels.",
-        )
+        what, paper = f"peak differential intensity of Z{noll}, {mode_name(noll)}", PAPER_TABLE2[noll]
+        yield Row(name, what, "", value, paper if name.startswith("sam") else None, assumption=assumption)
 
 
 TABLES: dict[str, Case] = {
