@@ -9,7 +9,6 @@ from typing import Any
 import numpy as np
 import pytest
 from astropy.io import fits
-from rich.console import Console
 
 from lowfc.adapters.files import law_file
 from lowfc.adapters.logs.reader import LogReader
@@ -22,16 +21,25 @@ from lowfc.control.laws.linear_law import LinearLaw
 from lowfc.control.laws.margins import check_stable
 from lowfc.control.loop.inputs import Step
 from lowfc.control.loop.safety import LoopMode
-from lowfc.programs.commissioning.tune.command import integrate, tune, tune_run
+from lowfc.programs.commissioning.tune.command import integrate
 from lowfc.programs.commissioning.tune.data import of_log, of_run
 from lowfc.programs.commissioning.tune.figures import figures, render, tuned
 from tests.support.folded_loop import FoldedLoop
+from tests.support.loops import lowfc
 from tests.support.report_log import Night
 from tests.support.theory import LAWS
 from tests.support.toy import NOLL, PERIOD_NS, frame_sequence
 
-QUIET = Console(quiet=True)
 CONFIG = load(None, {"sensor.modes": 3, "camera.rate_hz": 1000, "control.tilt_gain": 0.4, "control.gain": 0.2})
+
+
+def tune(*words: object) -> dict[str, Any]:
+    """The JSON of a command that must succeed."""
+    done = lowfc("tune", *words, "--json")
+    if done.exception is not None:
+        raise done.exception
+    found: dict[str, Any] = json.loads(done.stdout)
+    return found
 
 
 @pytest.fixture(scope="module")
@@ -46,10 +54,9 @@ def log(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_each_law_is_tuned_from_a_closed_loop(log: Path, controller: str, tmp_path: Path) -> None:
     """Tip is a sine of 12 nm at 7 Hz under noise: it is found, and each law leaves less than the loop did."""
     out, plot = tmp_path / "law.fits", tmp_path / "law.png"
-    found = tune_run(log, controller, out=out, plot=plot, console=QUIET)
+    found = tune(log, "--controller", controller, "--out", out, "--plot", plot)
     assert found["files"] == [str(out), str(plot)]
     assert plot.read_bytes()[:4] == b"\x89PNG"
-    json.loads(json.dumps(found, allow_nan=False))
     tip = found["modes"][0]
     assert [line["frequency_hz"] for line in tip["lines"]] == pytest.approx([7.0], abs=0.05)
     assert tip["lines"][0]["rms_nm"] == pytest.approx(12 / np.sqrt(2), rel=0.1)
@@ -75,7 +82,7 @@ def test_what_was_played_is_neither_tuned_for_nor_taken_for_the_delay(tmp_path: 
     table = 20 * np.sin(2 * np.pi * 31 * np.arange(4000) * PERIOD_NS * 1e-9).astype(np.float32)[:, None]
     night.request("play", text="mirror", actuators_nm=shape, table=table)
     night.frames(7000)
-    found = tune_run(night.write(tmp_path / "played.mcap"), "integrator", console=QUIET)
+    found = tune(night.write(tmp_path / "played.mcap"))
     assert found["delay_frames"] == 1.0
     assert found["warnings"] == []
     assert found["frames"] < 4500
@@ -87,7 +94,7 @@ def test_an_open_loop_with_much_tilt_is_flagged(tmp_path: Path) -> None:
     night.request("open")
     night.frames(3000)
     path = night.write(tmp_path / "open.mcap")
-    found = tune_run(path, "integrator", console=QUIET)
+    found = tune(path)
     assert not found["closed"]
     assert found["modes"][0]["achieved_nm"] is None
     small = found["tilt_mas"]["open"]
@@ -211,19 +218,19 @@ def test_a_log_that_is_too_short_is_refused(tmp_path: Path) -> None:
     night.request("close")
     night.frames(700)
     with pytest.raises(DataFileError, match="tuned from at least 2048 frames in a row, 2 s; the longest run of good"):
-        tune_run(night.write(tmp_path / "short.mcap"), "lqg", console=QUIET)
+        tune(night.write(tmp_path / "short.mcap"))
 
 
 def test_what_is_written_is_never_a_log(log: Path) -> None:
     with pytest.raises(DataFileError, match="is a log, which is never overwritten"):
-        tune_run(log, "lqg", out=log, console=QUIET)
+        tune(log, "--out", log)
 
 
 def test_a_log_or_a_running_loop_is_named() -> None:
     with pytest.raises(ConfigurationError, match="name one LOG, or listen to a running loop"):
-        tune(None, live=None)
+        tune()
     with pytest.raises(ConfigurationError, match="name one LOG"):
-        tune(Path("x.mcap"), live=3.0)
+        tune("x.mcap", "--live", 3.0)
 
 
 @pytest.mark.parametrize("name", LAWS)
