@@ -1,22 +1,18 @@
 """Control characters in notes and other text of unknown origin: shown as escapes, never given to a terminal."""
 
-import io
 import signal
 import sys
 from pathlib import Path
 
 import pytest
-from rich.console import Console
 
 from lowfc.adapters.process.service import Service
 from lowfc.adapters.process.terminal import new_app, run_app
-from lowfc.contract.configuration import Configuration, load
+from lowfc.contract.configuration import load
 from lowfc.contract.errors import ConfigurationError, RequestRefusedError
 from lowfc.contract.messages import EVENT, REQUEST, Log, wire
 from lowfc.contract.printable import LINES, printable
 from lowfc.programs.cli.output import put
-from lowfc.programs.launch.status import screen
-from lowfc.programs.launch.watch import Watch
 from lowfc.programs.view.panels.loop import LOG
 from lowfc.programs.view.recorded import draw_logs
 from lowfc.programs.view.renderer import Renderer
@@ -77,14 +73,6 @@ def test_a_configuration_is_complained_of_so() -> None:
     with pytest.raises(ConfigurationError) as caught:
         load(None, {"mirror.stuck_nm": {HOSTILE: "high"}})
     check(str(caught.value))
-
-
-def test_the_screen_of_a_loop_shows_them() -> None:
-    watch = Watch({}, [Log(level=2, name=HOSTILE, message=f"NOTE {HOSTILE}")])
-    stream = io.StringIO()
-    Console(file=stream, width=300, color_system=None).print(screen(watch, Configuration(), None, 1.0))
-    check(stream.getvalue())
-    assert stream.getvalue().count("clouds") == 2
 
 
 @pytest.fixture

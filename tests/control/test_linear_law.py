@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from lowfc.arrays import Array
-from lowfc.control.laws.law import Law, integrate
+from lowfc.control.laws.law import integrate
 from lowfc.control.laws.linear_law import LinearLaw, Signal, at_rest, coast, follow, respond
 from lowfc.control.laws.margins import (
     MOST_COUPLED,
@@ -56,11 +56,6 @@ def test_each_mode_is_cut_at_its_own_limit() -> None:
 def test_a_law_out_of_range_is_refused(change: dict[str, float], message: str) -> None:
     with pytest.raises(ValueError, match=message):
         law_of(**change)
-
-
-def test_a_law_of_uneven_lengths_is_refused() -> None:
-    with pytest.raises(ValueError, match="as long as each other"):
-        Law(np.zeros(3, np.float32), np.zeros(2, np.float32), np.zeros(3, np.float32))
 
 
 @pytest.mark.parametrize(

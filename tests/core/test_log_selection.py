@@ -31,7 +31,7 @@ from lowfc.programs.core.recording.volume import bytes_per_s, outlook, selected
 from lowfc.programs.logs.survey import survey
 from lowfc.programs.logs.what_if.compare import what_if
 from lowfc.programs.logs.what_if.options import WhatIf, wanted
-from tests.support.loops import lowfc, until
+from tests.support.loops import lowfc
 from tests.support.recording import Bench, bodies_of, logged, put
 from tests.support.report_log import Night
 
@@ -105,19 +105,6 @@ def test_the_recorder_records_every_tenth_and_loses_none(tmp_path: Path) -> None
     assert found["topics"][FRAME.key]["missing"] is None
     assert found["metadata"]["recording"]["messages_lost"] == "2"
     assert found["metadata"]["selection"] == {"every": "10", "left_out": "lowfc/mirror/{name}/surface"}
-
-
-def test_a_disk_that_refuses_does_not_lose_what_was_left_out(tmp_path: Path) -> None:
-    bench = Bench(tmp_path / "logs")
-    frames = bench.camera.publisher(FRAME)
-    bench.start(selection=Selection(EVERY))
-    put(frames, 45)
-    until(lambda: not bench.recorder._backlog)
-    bench.recorder._series.flush = lambda: (_ for _ in ()).throw(DataFileError("full"))
-    put(frames, 5)
-    summary = bench.stop()
-    assert summary.failure == "full"
-    assert summary.lost.get(FRAME.key, 0) <= 5
 
 
 def test_a_smaller_copy_has_the_same_steps(whole: Path, small: Path) -> None:
@@ -202,8 +189,6 @@ def test_an_export_joins_what_is_there(small: Path, tmp_path: Path) -> None:
     [
         ["--to", "csv", "--decimate", "3"],
         ["--topics", FRAME.key],
-        ["--decimate", "3", "--frames"],
-        ["--to", "csv", "--topics", FRAME.key],
     ],
 )
 def test_an_export_is_one_thing(whole: Path, words: list[str]) -> None:

@@ -4,8 +4,8 @@ import contextlib
 import tomllib
 from collections import deque
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
 from functools import lru_cache
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -14,7 +14,7 @@ import numpy.typing as npt
 from lowfc.adapters.bus.bus import Publisher
 from lowfc.adapters.files import factory
 from lowfc.adapters.process.clock import HostClock
-from lowfc.arrays import Array, Single
+from lowfc.arrays import Single
 from lowfc.client import Answer, Client, MirrorWatch
 from lowfc.client import Frame as Image
 from lowfc.contract.codecs.state_codec import controller_state
@@ -228,32 +228,16 @@ class FoldedLoop(Client):
         return each()
 
 
-@dataclass(frozen=True)
-class Fold:
-    """Modes (frames, modes) and rms over the open pupil (frames,) of a run, nm of wavefront."""
+def fold(config: Configuration, frames: int) -> SimpleNamespace:
+    """The loop of a configuration, of which every frame must be used.
 
-    disturbance_nm: Array
-    residual_nm: Array
-    error_nm: Array
-    pol_nm: Array
-    command_nm: Array
-    disturbance_rms_nm: Array
-    residual_rms_nm: Array
-
-
-def fold(config: Configuration, frames: int) -> Fold:
-    """Run the loop of a configuration, of which every frame must be used."""
+    Of the steps, error_nm, pol_nm and command_nm (frames, modes); of the truth, disturbance_nm and residual_nm
+    (frames, modes), disturbance_rms_nm and residual_rms_nm (frames,) over the open pupil; nm of wavefront.
+    """
     bench = Bench(config, calibrated(config))
     bench.run(frames)
     assert not bench.refused
-
-    def of_all(rows: list, name: str) -> Array:
-        return np.array([getattr(row, name) for row in rows], dtype=np.float64)
-
-    return Fold(
-        **{name: of_all(bench.steps, name) for name in ("error_nm", "pol_nm", "command_nm")},
-        **{
-            name: of_all([truth.sampled for truth in bench.truths], name)
-            for name in ("disturbance_nm", "residual_nm", "disturbance_rms_nm", "residual_rms_nm")
-        },
-    )
+    found = {name: [getattr(step, name) for step in bench.steps] for name in ("error_nm", "pol_nm", "command_nm")}
+    for name in ("disturbance_nm", "residual_nm", "disturbance_rms_nm", "residual_rms_nm"):
+        found[name] = [getattr(truth.sampled, name) for truth in bench.truths]
+    return SimpleNamespace(**{name: np.array(rows, np.float64) for name, rows in found.items()})
