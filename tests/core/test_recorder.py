@@ -110,7 +110,7 @@ def test_a_controller_that_comes_later_is_asked(bench: Bench) -> None:
     late = bench.join("controller-2")
     late.publisher(CALIBRATION).put(b"late")  # before the link to the recorder is up
     late.beat()
-    until(lambda: CALIBRATION.key in bench.recorder._others.kept)
+    until(lambda: CALIBRATION.key in bench.recorder._peers.kept)
     late.finish()
     assert bodies_of(logged(bench.stop()), CALIBRATION) == [b"late"]
 

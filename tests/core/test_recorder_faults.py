@@ -251,7 +251,7 @@ def test_a_frozen_process_that_is_asked_does_not_hold_up_the_recorder(
     frames = bench.camera.publisher(FRAME)
     put_until(frames, asked.is_set)
     sent = frames.published
-    until(lambda: bench.recorder._ledger.recorded().get(FRAME.key, 0) == sent)
+    until(lambda: bench.recorder._account.recorded().get(FRAME.key, 0) == sent)
     (part,) = bench.folder.iterdir()
     until(lambda: len(bodies_of(list(LogReader(part)), FRAME)) == sent)
     thawed.set()
@@ -267,7 +267,7 @@ def test_each_log_of_a_run_can_be_read_by_itself(bench: Bench) -> None:
     bench.start(
         limits=Limits(longest_s=0.6, min_free_bytes=0), attachments=[Attachment("a.toml", "application/toml", b"[a]")]
     )
-    others = bench.recorder._others
+    others = bench.recorder._peers
     until(lambda: len(others._states) == 3 and not others._newcomers and others._answers is None)
     (second,) = put(calibrations, 1)
     put_until(frames, lambda: len(bench.recorder._series.files) == 3)
@@ -352,4 +352,4 @@ def test_forged_names_and_starts_fill_neither_the_recorder_nor_a_log(
     summary = bench.stop()
     keys = {message.key for log in summary.files for message in LogReader(log)}
     assert sum("forged" in key for key in keys) == 2 * MOST_NAMES
-    assert sum("forged" in key for key in bench.recorder._ledger.recorded()) == 2 * MOST_NAMES
+    assert sum("forged" in key for key in bench.recorder._account.recorded()) == 2 * MOST_NAMES

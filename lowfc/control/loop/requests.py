@@ -289,8 +289,8 @@ def _load(settings: Settings, state: State, request: Request) -> Handled:
         )
     settings = replace(settings, start_mode=LoopMode.OPEN)  # an idle loop is not closed by what may be a first try
     after, events = loaded(settings, state, request.calibration, "operator", request.time_ns)
-    said = (event for event in events if event.name != "MODE_CHANGED")  # which every request has
-    return after, f"calibration {request.calibration.id[:12]}", *said
+    others = (event for event in events if event.name != "MODE_CHANGED")  # which every request has
+    return after, f"calibration {request.calibration.id[:12]}", *others
 
 
 def _note(settings: Settings, state: State, request: Request) -> Handled:
@@ -317,7 +317,7 @@ def _with(state: State, drive: ActiveLoop, command_channels: CommandChannels) ->
 
 
 def _check_shape(limits: Limits, wanted_nm: Single) -> None:
-    """A channel that the mirror could not take by itself is refused here, where it can still be said."""
+    """A channel that the mirror could not take by itself is refused here, where the refusal has a reader."""
     if not np.isfinite(wanted_nm).all():
         raise ValueError("every actuator of a channel must be finite")
     largest, apart = float(np.abs(wanted_nm).max()), neighbour_difference_nm(wanted_nm)

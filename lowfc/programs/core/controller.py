@@ -61,7 +61,7 @@ CHANNEL = "lowfc"
 
 
 class Controller:
-    """Receives frames, sends commands, answers operators, until told to stop."""
+    """Receives frames, sends commands, answers operators, until stopped."""
 
     def __init__(
         self, config: Configuration, service: Service, calibration: Calibration | None, source: str, latch: Latch
@@ -138,7 +138,7 @@ class Controller:
             with self._turn:
                 self._between_frames(camera)
             if self._safe_signalled:
-                self._obey_signal()
+                self._make_safe()
             for _ in range(len(self._queries)):
                 self._answer(self._queries.popleft())
             self._keep_safe()
@@ -195,7 +195,7 @@ class Controller:
         self._send(outputs)
         sent_ns = self._commands.handed_ns if outputs.command is not None else clock.host_ns()
         let_send()
-        self._tell(outputs)
+        self._publish(outputs)
         if self._state.frame_sequence != newest:  # an old one is no sign of a live camera
             self._last_frame_ns = taken_ns
         self._service.work += 1
@@ -243,21 +243,21 @@ class Controller:
             request = Request(now_ns, query.name)
             reply, state, taken = Reply(False, str(error)[:MOST_REPLY], self._state.frame_sequence + 1), self._state, 0
         else:
-            reply, state, taken = self._asked(request)
+            reply, state, taken = self._carry_out(request)
         shown = controller_state(state, self._settings, now_ns) if request.name == "status" else None
         short = Request(request.time_ns, request.name, request.modes, request.values, request.text)
         query.reply(codec.encode_request(short, reply, taken, shown))  # who asked has the arrays
         self._requests.put(codec.encode_request(request, reply, taken, shown))
 
-    def _asked(self, request: Request) -> tuple[Reply, State, int]:
-        """The reply, the state that it tells of, and its number; 0 for one that is no input of the control law."""
+    def _carry_out(self, request: Request) -> tuple[Reply, State, int]:
+        """The reply, the state after it, and its number; 0 for one that is no input of the control law."""
         if request.name == CONFIGURATION:
             return Reply(True, self._configuration, self._state.frame_sequence + 1), self._state, 0
         self._arrays.publish(request)
         with self._turn:
             outputs = self._advance(request)
             state = self._state
-            self._tell(outputs)
+            self._publish(outputs)
         reply = outputs.reply
         assert reply is not None  # noqa: S101  # every request has an answer
         if not reply.accepted:
@@ -269,10 +269,10 @@ class Controller:
         self._safe_signalled = True
         self._camera.wake()
 
-    def _obey_signal(self) -> None:
+    def _make_safe(self) -> None:
         self._safe_signalled = False
         request = Request(self._service.clock.now_ns(), "safe", text="SIGUSR1")
-        reply, _, taken = self._asked(request)
+        reply, _, taken = self._carry_out(request)
         self._requests.put(codec.encode_request(request, reply, taken, None))
 
     def _keep_safe(self) -> None:
@@ -348,7 +348,7 @@ class Controller:
             outputs = self._advance(request)
             assert outputs.reply is not None  # noqa: S101  # every request has an answer
             self._requests.put(codec.encode_request(request, outputs.reply, self._state.input_number, None))
-            self._tell(outputs)
+            self._publish(outputs)
             if not outputs.reply.accepted and request.name == "law" and misfit(self._state):
                 self._service.event("LAW_NOT_IN_FORCE", why=outputs.reply.text)  # and the loop is open
                 continue
@@ -367,13 +367,13 @@ class Controller:
         self._send(outputs)
         if self._state is not before:
             self._inputs.put(codec.encode_input(taken, self._state.input_number))
-        self._tell(outputs)
+        self._publish(outputs)
 
     def _send(self, outputs: Outputs) -> None:
         if outputs.command is not None:
             self._commands.put(codec.encode_command(outputs.command, self._valid_ns, CHANNEL, self._state.input_number))
 
-    def _tell(self, outputs: Outputs) -> None:
+    def _publish(self, outputs: Outputs) -> None:
         """Publish the step and the events, and the state where more of it changed than the next frame shows."""
         if outputs.step is not None:
             self._steps.put(codec.encode_step(outputs.step, self._state.input_number))

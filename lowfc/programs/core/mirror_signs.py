@@ -20,7 +20,7 @@ SILENT_NS = 1_600_000_000
 
 
 class MirrorSigns:
-    """What the mirror says of itself, and since when it has said nothing.
+    """What the mirror reports of itself, and since when it has been silent.
 
     A mirror that never sent a Health is not missed.
     """
@@ -29,9 +29,9 @@ class MirrorSigns:
         self._service = service
         self._states = Mailbox(MIRROR_STATE.at(name))
         self._leave_states = service.bus.subscribe(MIRROR_STATE, self._states.put, name)
-        self._leave_health = service.bus.subscribe(HEALTH, self._told, mirror_role(name))
-        self._told_of: deque[wire.Health] = deque(maxlen=1)
-        self._heard_ns = self._due_ns = 0
+        self._leave_health = service.bus.subscribe(HEALTH, self._received, mirror_role(name))
+        self._reports: deque[wire.Health] = deque(maxlen=1)
+        self._received_ns = self._due_ns = 0
         self._reported = False
         self._fault = self._wrong = ""
         self._commanded: deque[MirrorShape] = deque(maxlen=2)
@@ -61,15 +61,15 @@ class MirrorSigns:
         """
         now_ns = self._service.clock.host_ns()
         self._due_ns = now_ns + LOOK_NS
-        if self._told_of:
-            self._heard_ns = now_ns
-            before, self._wrong = self._wrong, _wrong(self._told_of.popleft()) if state.commanded else ""
+        if self._reports:
+            self._received_ns = now_ns
+            before, self._wrong = self._wrong, _wrong(self._reports.popleft()) if state.commanded else ""
             if self._wrong == before or not self._wrong:
                 self._fault = self._wrong
             if not self._fault and state.drive is not None:
                 shape = MirrorShape(now_ns, state.drive.actuators_nm, state.drive.history_nm[0])
                 self._commanded.append(shape)
-        elif self._heard_ns and now_ns - self._heard_ns > SILENT_NS:
+        elif self._received_ns and now_ns - self._received_ns > SILENT_NS:
             self._fault = "does not answer"
         return self._fault if self._reported else "has not reported yet"
 
@@ -83,9 +83,9 @@ class MirrorSigns:
         if not self._reported:
             self._leave_states()
 
-    def _told(self, sample: Sample) -> None:
+    def _received(self, sample: Sample) -> None:
         try:
-            self._told_of.append(wire.Health.FromString(sample.payload))
+            self._reports.append(wire.Health.FromString(sample.payload))
         except DecodeError:
             return
 

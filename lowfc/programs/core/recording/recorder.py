@@ -24,7 +24,7 @@ from lowfc.adapters.process.realtime import NOTHING, Granted
 from lowfc.adapters.process.service import Service
 from lowfc.contract.errors import BadMessageError, DataFileError
 from lowfc.contract.messages import EVENT, HEALTH, RECORD_KEY, TOPICS, Role, Topic, timestamp, wire
-from lowfc.programs.core.recording.peers import Others
+from lowfc.programs.core.recording.peers import Peers
 from lowfc.programs.core.recording.summary import Summary
 from lowfc.programs.core.recording.volume import in_words
 
@@ -63,12 +63,12 @@ class Recorder:
         self._bus = bus
         self._clock = clock
         self._backlog = Backlog(QUEUE_MESSAGES, QUEUE_BYTES)
-        self._ledger = LossAccount()
+        self._account = LossAccount()
         self._selection = selection
         self._folder, self._min_free_bytes = folder, limits.min_free_bytes
         self._expected_bytes_per_s = expected_bytes_per_s
         self._series = LogSeries(folder, clock, {**metadata, **selection.metadata}, attachments, limits)
-        self._others = Others(bus)
+        self._peers = Peers(bus)
         self._paused = False
         self._ender = ThreadPoolExecutor(1, "end-log")
         self._ending: Future[None] | None = None
@@ -77,7 +77,7 @@ class Recorder:
         self._flush_due_ns = self._most_starts = 0
         self._begun_ns = self._oldest_ns = 0
         self._longest_wait_ns = self._longest_unflushed_ns = self._slowest_ns = 0
-        # Before the service, which subscribes to Health: who has heard of that has heard of all others.
+        # Before the service, which subscribes to Health: a process that received it has received all others.
         for topic in TOPICS:
             bus.subscribe(topic, partial(self._backlog.put, topic))
         self.service = Service(Role.RECORDER, run_id, clock, bus, granted=granted, fill=self._fill)
@@ -85,22 +85,22 @@ class Recorder:
         bus.queryable(RECORD_KEY.format(name=ALL), self._queries.append)
 
     def catch_signals(self) -> None:
-        """Finish the log at SIGTERM, Ctrl-C or a lost terminal; a second one does not wait for the others' last words.
+        """Finish the log at SIGTERM, Ctrl-C or a lost terminal; for the main thread.
 
-        For the main thread.
+        A second signal does not wait for the last Health of the others.
         """
         for number in (signal.SIGTERM, signal.SIGINT, signal.SIGHUP):
             if number != signal.SIGHUP or signal.getsignal(number) is not signal.SIG_IGN:  # as nohup leaves it
-                signal.signal(number, self._told)
+                signal.signal(number, self._signalled)
 
     def run(self) -> Summary:
-        """Record until told to stop.
+        """Record until stopped.
 
         Raises:
             DataFileError: the first log cannot be opened.
         """
         self._settle()
-        for sample in self._others.ask():
+        for sample in self._peers.query():
             self._write(sample)
         self._begin()
         self._begun_ns = self._clock.host_ns()
@@ -115,12 +115,12 @@ class Recorder:
         self.service.finish()
         return summary
 
-    def _told(self, number: int, frame: FrameType | None) -> None:
+    def _signalled(self, number: int, frame: FrameType | None) -> None:
         self._hurried = not self.service.running
         self.service.stop(signal.Signals(number).name)
 
     def _settle(self) -> None:
-        """Wait until those who are there already have been heard, so that they can be asked."""
+        """Wait for a Health of each process that is there already, so that it can be queried."""
         begun_s = time.monotonic()
         shortest_s, longest_s = _SETTLE_S
         while self.service.running:
@@ -132,14 +132,14 @@ class Recorder:
 
     def _begin(self, *, anew: bool = True) -> None:
         """Begin a log, or unless `anew` its next part, with what the messages in it depend on."""
-        self._series.begin(self._others.kept.values(), anew=anew)
-        self._most_starts = self._ledger.starts + MOST_CHANNELS
+        self._series.begin(self._peers.kept.values(), anew=anew)
+        self._most_starts = self._account.starts + MOST_CHANNELS
         self.service.event("RECORDING")
 
     def _turn(self) -> None:
         """Write what has arrived; now and then flush, report and rotate; do what an operator asks."""
         self._write_waiting()
-        for sample in self._others.ask_meanwhile(more=self.service.running):
+        for sample in self._peers.query_meanwhile(more=self.service.running):
             self._write(sample)
         if self._clock.host_ns() >= self._flush_due_ns:
             self._look_after()
@@ -214,11 +214,11 @@ class Recorder:
             return str(fault)
         self._paused = False
         self.service.state = "ready"
-        self._others.ask_again()
+        self._peers.query_soon()
         return ""
 
     def _look_after(self) -> None:
-        """Flush, begin the next log when it is time, say what was lost, be heard."""
+        """Flush, begin the next log when it is time, report losses, publish Health."""
         self._flush()
         self._flush_due_ns = self._clock.host_ns() + _FLUSH_NS
         self._say_losses()
@@ -228,29 +228,29 @@ class Recorder:
         self.service.beat()
 
     def _take(self, topic: Topic, sample: Sample) -> None:
-        """Record one message, unless it was recorded when it was asked for."""
+        """Record one message, unless a query brought it before."""
         try:
-            self._ledger.names.admit(topic, sample.key)
+            self._account.names.admit(topic, sample.key)
         except BadMessageError as fault:
             self.service.unreadable(topic.key, fault)
             return
-        asked = self._others.was_asked(sample)
+        queried = self._peers.already_received(sample)
         unwanted = self._paused or not self._selection.keeps(topic, sample.sequence, sample.payload)
-        recorded = not self._failure if asked else not unwanted and self._write(sample)
-        self._ledger.enter(topic, sample, recorded=recorded, unwanted=unwanted)
+        recorded = not self._failure if queried else not unwanted and self._write(sample)
+        self._account.enter(topic, sample, recorded=recorded, unwanted=unwanted)
         if topic is HEALTH:
-            self._hear(topic, sample)
+            self._take_health(topic, sample)
         elif topic.queryable:
-            self._others.keep(sample)
+            self._peers.keep(sample)
 
-    def _hear(self, topic: Topic, sample: Sample) -> None:
+    def _take_health(self, topic: Topic, sample: Sample) -> None:
         try:
-            _, health = self._ledger.names.health(sample.key, sample.payload)
+            _, health = self._account.names.health(sample.key, sample.payload)
         except UNREADABLE:
             return  # it is in the log as it came; the service counts it
-        self._others.hear(sample, health)
+        self._peers.note(sample, health)
         try:
-            self._ledger.believe(sample, health)
+            self._account.believe(sample, health)
         except BadMessageError as fault:
             self.service.unreadable(topic.key, fault)
 
@@ -280,10 +280,10 @@ class Recorder:
                 self._failure = short
                 self._series.end(self._figures() | {"stopped": short})
                 self.service.event("RECORDING_FAILED", why=f"{short}; the log is complete")
-            elif self._series.full or self._ledger.starts >= self._most_starts:
+            elif self._series.full or self._account.starts >= self._most_starts:
                 self._series.end(self._figures(), wait=False)
                 self._begin(anew=False)
-                self._others.ask_again()
+                self._peers.query_soon()
         except DataFileError as fault:
             self._fail(fault)
 
@@ -293,7 +293,7 @@ class Recorder:
         return in_words(growth, self._folder, self._min_free_bytes) if growth else ""
 
     def _flushed(self) -> None:
-        self._ledger.settle()
+        self._account.settle()
         if self._oldest_ns:
             age_ns = self._clock.host_ns() - self._oldest_ns
             self._longest_unflushed_ns = max(self._longest_unflushed_ns, age_ns)
@@ -302,12 +302,12 @@ class Recorder:
     def _fail(self, fault: DataFileError) -> None:
         """Give up recording, and nothing else: the process lives, and counts what is lost from here."""
         self._series.give_up()
-        self._ledger.revert()
+        self._account.revert()
         self._failure = str(fault)
         self.service.event("RECORDING_FAILED", why=fault)
 
     def _say_losses(self) -> None:
-        for topic, count in self._ledger.news().items():
+        for topic, count in self._account.news().items():
             self.service.event("MESSAGES_LOST", topic=topic, count=count)
 
     def _drain(self) -> None:
@@ -315,14 +315,14 @@ class Recorder:
         deadline_s = time.monotonic() + _DRAIN_S
         while not self._hurried:
             self._turn()
-            if self._others.stopped(but=self.service.name) or time.monotonic() >= deadline_s:
+            if self._peers.stopped(but=self.service.name) or time.monotonic() >= deadline_s:
                 return
             time.sleep(_TURN_S)
 
-    def _others_heard(self) -> bool:
+    def _peers_recorded(self) -> bool:
         """Whether a message of another process was recorded."""
         own = {EVENT.key, HEALTH.at(self.service.name)}
-        return bool(self.service.last_health or self._others.kept or set(self._ledger.recorded()) - own)
+        return bool(self.service.last_health or self._peers.kept or set(self._account.recorded()) - own)
 
     def _close(self) -> Summary:
         while self._ending is not None:
@@ -333,14 +333,14 @@ class Recorder:
         self._flush()
         try:
             self._series.end(self._figures())
-            if not (self._failure or self._others_heard()):
+            if not (self._failure or self._peers_recorded()):
                 self._series.remove()
         except DataFileError as fault:
             self._fail(fault)
         return Summary(
             tuple(self._series.files),
             self._series.messages,
-            self._ledger.lost(),
+            self._account.lost(),
             self._failure,
             self._longest_wait_ns,
             self._longest_unflushed_ns,
@@ -349,7 +349,7 @@ class Recorder:
 
     def _figures(self) -> dict[str, str]:
         """What a log says of its recording at its end: of all logs so far."""
-        lost = self._ledger.lost()
+        lost = self._account.lost()
         return {
             "messages": str(self._series.messages),
             "messages_lost": str(sum(lost.values())),
@@ -357,7 +357,7 @@ class Recorder:
         }
 
     def _fill(self, health: wire.Health) -> None:
-        lost = self._ledger.lost()
+        lost = self._account.lost()
         health.recording.files.extend(map(str, self._series.files))
         health.recording.file = health.recording.files[-1] if health.recording.files else ""
         health.recording.folder = str(Path.cwd())
@@ -367,6 +367,6 @@ class Recorder:
         health.recording.stopped = self._paused and not self._failure
         health.recording.bytes = self._series.bytes_written
         counts = {count.topic: count for count in health.topics}  # of its own, those that it sent
-        for key, recorded in self._ledger.recorded().items():
+        for key, recorded in self._account.recorded().items():
             count = counts[key] if key in counts else health.topics.add(topic=key)
             count.received, count.missing = recorded, lost.get(key, 0)
