@@ -3,6 +3,7 @@
 import json
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -26,7 +27,7 @@ from lowfc.programs.logs.what_if.compare import LINEAR_WAVES, compared, render, 
 from lowfc.programs.logs.what_if.options import WhatIf, user_controller, wanted
 from lowfc.programs.logs.what_if.run import LoggedRun
 from tests.support import toy
-from tests.support.folded_loop import Fold, fold
+from tests.support.folded_loop import fold
 from tests.support.report_log import Night
 
 RATE_HZ = 250
@@ -57,7 +58,7 @@ def settled_rms(values: np.ndarray) -> np.ndarray:
     return rms(values, np.arange(len(values)) >= RATE_HZ)
 
 
-def as_if(run: Fold, config: Configuration) -> np.ndarray:
+def as_if(run: SimpleNamespace, config: Configuration) -> np.ndarray:
     """Errors (frames, modes) that the run would have had under another configuration's law."""
     settings = factory.settings(config)
     weights = delay_weights(settings.delay_frames).astype(np.float32)
