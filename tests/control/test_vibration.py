@@ -29,7 +29,7 @@ def preset(name: str, frames: int, seed: int = 1, noise_nm: float = 0.8) -> Piec
 
 
 def test_the_lines_of_the_reaction_wheel_are_found() -> None:
-    model = identify(preset("reaction-wheel", 12_000), RATE_HZ)
+    model = identify(preset("reaction-wheel-ideal", 12_000), RATE_HZ)
     assert [line.frequency_hz for line in model.lines] == pytest.approx(LINES_HZ, abs=0.02)
     rms_mas = [np.sqrt(line.variance_nm2) / NM_PER_MAS for line in model.lines]
     assert rms_mas == pytest.approx([9.0, 8.3, 5.0, 3.0, 2.0], rel=0.06)
@@ -68,7 +68,7 @@ def test_a_spectrum_is_that_of_the_states() -> None:
 
 
 def test_pieces_count_like_one_run_and_too_short_ones_give_nothing() -> None:
-    whole = preset("reaction-wheel", 12_000).values[0]
+    whole = preset("reaction-wheel-ideal", 12_000).values[0]
     model = identify(Pieces((whole[:6000], whole[6000:]), 0), RATE_HZ)
     assert [round(line.frequency_hz) for line in model.lines] == [6, 18, 37, 71, 117]
     assert identify(Pieces((whole[: FEWEST - 1],), 0), RATE_HZ) is None
