@@ -82,16 +82,14 @@ def mutated(data: bytes, number: int) -> tuple[str, bytes]:
     rng = np.random.default_rng(number)
     starts = boundaries(data)
     records = [data[a:b] for a, b in pairwise(starts)]
-    end = data[starts[-1] :]
-
-    def span() -> tuple[int, int]:
-        begin = int(rng.integers(len(data)))
-        return begin, min(len(data), begin + int(rng.choice([1, 4, 8, 100, 5000])))
-
+    places = range(len(records))
     kinds = ("flipped", "flipped head", "cut", "zeroed", "random", "inserted", "deleted", *MISPLACED)
     kind = kinds[number % len(kinds)]
     changed = bytearray(data)
     first, second = (int(n) for n in sorted(rng.choice(len(records), 2, replace=False)))
+    begin = int(rng.integers(len(data)))
+    stop = min(len(data), begin + int(rng.choice([1, 4, 8, 100, 5000])))
+    noise = rng.bytes(stop - begin)
     match kind:
         case "flipped":
             for _ in range(rng.integers(1, 5)):
@@ -100,28 +98,19 @@ def mutated(data: bytes, number: int) -> tuple[str, bytes]:
             at = int(rng.choice(starts[:-1])) + int(rng.integers(48))
             changed[min(at, len(data) - 1)] ^= 1 << int(rng.integers(8))
         case "cut":
-            del changed[rng.integers(len(data)) :]
-        case "zeroed" | "random":
-            begin, stop = span()
-            changed[begin:stop] = bytes(stop - begin) if kind == "zeroed" else rng.bytes(stop - begin)
-        case "inserted":
-            begin, stop = span()
-            changed[begin:begin] = rng.bytes(stop - begin)
-        case "deleted":
-            begin, stop = span()
-            del changed[begin:stop]
-        case "shuffled":
-            order = rng.permutation(len(records))
-            changed = bytearray(MAGIC + b"".join(records[n] for n in order) + end)
-        case "repeated":
-            changed = bytearray(MAGIC + b"".join([*records[: second + 1], *records[first:]]) + end)
-        case "removed":
-            changed = bytearray(MAGIC + b"".join([*records[:first], *records[second:]]) + end)
-        case "swapped":
-            records[first], records[second] = records[second], records[first]
-            changed = bytearray(MAGIC + b"".join(records) + end)
-        case "doubled":
-            changed = bytearray(MAGIC + b"".join([*records[:first], records[first], *records[first:]]) + end)
+            del changed[begin:]
+        case "zeroed" | "random" | "inserted" | "deleted":
+            instead = {"zeroed": bytes(stop - begin), "random": noise, "inserted": noise + data[begin:stop]}
+            changed[begin:stop] = instead.get(kind, b"")
+        case _:
+            order = {
+                "shuffled": rng.permutation(len(records)),
+                "repeated": [*places[: second + 1], *places[first:]],
+                "removed": [*places[:first], *places[second:]],
+                "swapped": [*places[:first], second, *places[first + 1 : second], first, *places[second + 1 :]],
+                "doubled": [*places[:first], first, *places[first:]],
+            }[kind]
+            changed = bytearray(MAGIC + b"".join(records[place] for place in order) + data[starts[-1] :])
     if bytes(changed) == data:
         changed[number % len(data)] ^= 1
     return kind, bytes(changed)
