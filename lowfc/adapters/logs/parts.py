@@ -68,11 +68,13 @@ class WholeLog(LogReader):
         if len(self.paths) == 1:
             yield from super().__iter__()
             return
-        sizes = [_size(path) for path in self.paths]
-        self.size = sum(sizes)
+        with contextlib.ExitStack() as held:
+            files = [held.enter_context(LogFile(path)) for path in self.paths]
+        sizes = [file.size for file in files]
+        self.size, self.finished = sum(sizes), all(file.finished for file in files)
         described: list[Metadata | Attachment] = []
         repeated = Repeated()
-        finished = complete = True
+        complete = True
         for number, path in enumerate(self.paths):
             part = LogReader(path, topics=self._topics, skip_damaged=self._skip_damaged)
             behind = sum(sizes[:number])
@@ -92,9 +94,9 @@ class WholeLog(LogReader):
                 damage.why += f" ({path.name})"
             self.damage += part.damage
             self.unreadable += part.unreadable
-            finished, complete = finished and part.finished, complete and part.complete
+            complete = complete and part.complete
         self.position = self.size
-        self.finished, self.complete = finished, complete
+        self.complete = complete
 
 
 def one_by_one(names: Sequence[Path], out: Path | None = None, *, as_json: bool = False) -> list[Parts]:
@@ -230,8 +232,3 @@ def _place(path: Path) -> tuple[tuple[str, ...], int]:
     if not of or not re.fullmatch("[1-9][0-9]{0,8}", number):
         return (), 1
     return (metadata.get("lowfc", {}).get("run", ""), of), int(number)
-
-
-def _size(path: Path) -> int:
-    with LogFile(path) as file:
-        return file.size

@@ -6,17 +6,17 @@ publication is fresh, so that nothing passes for late. Deadlines are absolute: a
 
 import contextlib
 import time
-from collections import Counter
 from collections.abc import Collection, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
 from rich.console import Console
-from rich.progress import BarColumn, Progress, TaskID, TextColumn
+from rich.progress import BarColumn, TextColumn
 
 from lowfc.adapters.bus.bus import Publisher, name_in
 from lowfc.adapters.bus.run import Run, open_run
 from lowfc.adapters.bus.zenoh_bus import ZenohBus
+from lowfc.adapters.logs.parts import WholeLog, titled
 from lowfc.adapters.logs.reader import Logged, LogReader
 from lowfc.adapters.logs.recovery import faults, no_end
 from lowfc.adapters.process.clock import HostClock
@@ -83,8 +83,8 @@ def publish(
         player = Player(service, buses, selection, speed)
         if _linked(service, selection.live, wait_for, shown):
             service.state = "running"
-            player.play(logs, shown)
-        return {"run": run_id, "logs": [str(path) for path in logs], "speed": speed, **player.figures()}
+        found = player.play(logs, shown)
+        return {"run": run_id, "logs": [str(path) for path in logs], "speed": speed, **found}
 
 
 class Player:
@@ -103,71 +103,54 @@ class Player:
         self._behind = 0
         self._first_log_ns = self._last_log_ns = 0
         self._begun_ns = self._sent_ns = 0
-        self._show_ns = 0
-        self._logs: list[LogReader] = []
-        self._at_once: Counter[str] = Counter()
+        self._at_once: set[str] = set()
 
-    def play(self, logs: Sequence[Path], console: Console) -> None:
-        """Play logs, one after the other."""
+    def play(self, logs: Sequence[Path], console: Console) -> dict[str, Any]:
+        """Play logs, one after the other; return what was played, and how well its times were kept."""
+        log, show_ns = WholeLog(logs, skip_damaged=True), 0
         with passing_bar(console, TextColumn("{task.description}"), BarColumn()) as bar:
-            for path in logs:
-                log = LogReader(path, skip_damaged=True)
-                self._logs.append(log)
-                self._play(log, bar, bar.add_task(path.name))
+            task = bar.add_task(titled(log.paths))
+            for message in log:
                 if not self._service.running:
-                    return
-        if not self._at_once and not self._errors.count:
-            raise DataFileError(f"{', '.join(map(str, logs))}: there is no message of the topics to play")
-
-    def figures(self) -> dict[str, Any]:
-        """What was played, and how well its times were kept."""
+                    break
+                self._play(message)
+                if self._sent_ns >= show_ns:
+                    show_ns = self._sent_ns + _SHOW_NS
+                    self._service.beat()
+                    bar.update(task, completed=log.position, total=log.size, description=_utc(message.log_time_ns))
+        if self._service.running and not self._at_once and not self._errors.count:
+            raise DataFileError(f"{titled(log.paths)}: there is no message of the topics to play")
         p50_ns, p99_ns = self._errors.percentiles_ns(0.5, 0.99)
         return {
-            "messages": self._errors.count + self._at_once.total(),
+            "messages": self._errors.count + len(self._at_once),
             "published": {key: one.published for key, one in sorted(self._publishers.items()) if one is not None},
             "left_out": dict(sorted(self._left_out.items())),
             "span_s": (self._last_log_ns - self._first_log_ns) * 1e-9,
             "took_s": (self._sent_ns - self._begun_ns) * 1e-9,
             "timing_error_us": {"p50": p50_ns / 1e3, "p99": p99_ns / 1e3, "max": self._errors.max_ns / 1e3},
             "messages_behind": self._behind,
-            "finished": all(log.finished for log in self._logs),
-            "no_end": next((no_end(log.paths, finished=False) for log in self._logs if not log.finished), ""),
-            "damaged": [f"{log.path}: byte {one.position}, {one.why}" for log in self._logs for one in log.damage],
-            "selection": sorted({one for log in self._logs if (one := log.selection.sentence)}),
+            "finished": log.finished,
+            "no_end": no_end(log.paths, finished=log.finished),
+            "damaged": [f"byte {one.position}, {one.why}" for one in log.damage],
+            "selection": [log.selection.sentence] if log.selection.sentence else [],
             "interrupted": not self._service.running,
         }
 
-    def _play(self, log: LogReader, bar: Progress, task: TaskID) -> None:
-        opening = True
-        kept: set[str] = set()
-        for message in log:
-            if not self._service.running:
-                return
-            if message.key not in self._publishers:
-                self._publishers[message.key] = self._publisher(message.key)
-            publisher = self._publishers[message.key]
-            if publisher is None:
-                continue
-            if publisher.last is not None and publisher.last[1].sequence == message.sequence:
-                continue  # the next log of a series begins with what was valid at the end of the one before
-            if opening:
-                # A log begins with the calibration and states that were valid then, as old as they may be.
-                opening = publisher.topic.queryable and publisher.topic is not HEALTH and message.key not in kept
-                if opening:
-                    kept.add(message.key)
-                    publisher.put(message.payload, None, message.sequence)
-                    self._at_once[message.key] += 1
-                    continue
-                if message.log_time_ns < self._last_log_ns - _ORDER_NS:
-                    raise DataFileError(
-                        f"{log.path} begins before the log given before it ends; give logs in the order of their "
-                        "recording"
-                    )
+    def _play(self, message: Logged) -> None:
+        if message.key not in self._publishers:
+            self._publishers[message.key] = self._publisher(message.key)
+        publisher = self._publishers[message.key]
+        if publisher is None:
+            return
+        kept = publisher.topic.queryable and publisher.topic is not HEALTH
+        if kept and not self._begun_ns and message.key not in self._at_once:
+            # A log begins with the calibration and states that were valid then, as old as they may be.
+            self._at_once.add(message.key)
+            publisher.put(message.payload, None, message.sequence)
+        elif not kept and message.log_time_ns < self._last_log_ns - _ORDER_NS:
+            raise DataFileError("a log begins before the log given before it ends; give them in the order of recording")
+        else:
             self._send(publisher, message)
-            if self._sent_ns >= self._show_ns:
-                self._show_ns = self._sent_ns + _SHOW_NS
-                self._service.beat()
-                bar.update(task, completed=log.position, total=log.size, description=_utc(message.log_time_ns))
 
     def _send(self, publisher: Publisher, message: Logged) -> None:
         self._last_log_ns = max(self._last_log_ns, message.log_time_ns)
