@@ -51,7 +51,7 @@ STEPS = (
 
 @dataclass(frozen=True, slots=True)
 class Commission:
-    """What is options for: the options of `lowfc commission`."""
+    """The options of `lowfc commission`."""
 
     out: Path
     frames: int
@@ -221,7 +221,7 @@ class Commissioning:
         return poked(player, self._config, delay) if first is None else first
 
     def _close(self, law: Law, delay_frames: float) -> str:
-        """Predict the residual; close the loop where that was options for, and compare."""
+        """Predict the residual; close the loop where that is requested, and compare."""
         rate_hz = self._config.camera.rate_hz
         settling = settling_frames(law.gain, law.leak, rate_hz)
         frames = settling + max(MIN_PREDICTED, settling)

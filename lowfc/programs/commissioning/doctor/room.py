@@ -13,7 +13,7 @@ from lowfc.programs.commissioning.doctor.facts import Facts
 from lowfc.programs.core.recording.volume import bytes_per_s, selected
 
 CHECKS: Table[Facts] = Table()
-"""In a docstring, the first paragraph is what a check looks at, the second when it warns; docs/doctor.md has both."""
+"""The docstring of each says what it looks at; docs/doctor.md also says when it warns."""
 
 _STALL_S = 0.1
 _SHARED_BYTES = 64e6
@@ -23,10 +23,7 @@ _LIMITS = "give the user memlock unlimited in /etc/security/limits.d, or the ser
 
 @CHECKS.check("locked memory")
 def _locked_memory(facts: Facts) -> Check:
-    """Locking a process's memory, asked for as the loop asks for it.
-
-    Refused.
-    """
+    """Locking a process's memory, asked for as the loop asks for it."""
     if not facts.config.realtime.lock_memory:
         return note("the configuration does not ask for it: realtime.lock_memory = false")
     if refused := facts.tried.refused.get("lock_memory"):
@@ -37,10 +34,7 @@ def _locked_memory(facts: Facts) -> Check:
 
 @CHECKS.check("swap")
 def _swap(facts: Facts) -> Check:
-    """Swap space, and whether the loop's memory can go there.
-
-    There is some, and the memory is not locked.
-    """
+    """Swap space, and whether the loop's memory can go there."""
     total_bytes, used_bytes = facts.host.swap()
     if not total_bytes:
         return ok("none")
@@ -60,10 +54,7 @@ def _swap(facts: Facts) -> Check:
     cost="a page fault may clear or gather 2 MB in the middle of a frame",
 )
 def _huge_pages(facts: Facts) -> Check:
-    """When the kernel takes huge pages by itself: `transparent_hugepage/enabled`.
-
-    Always.
-    """
+    """When the kernel takes huge pages by itself: `transparent_hugepage/enabled`."""
     text = facts.host.text("sys/kernel/mm/transparent_hugepage/enabled")
     when = text[text.index("[") + 1 : text.index("]")]
     return ok(when) if when != "always" else warning(when)
@@ -75,10 +66,7 @@ def _huge_pages(facts: Facts) -> Check:
     cost="threads of a small product wait for each other on the loop's processors",
 )
 def _blas(facts: Facts) -> Check:
-    """Linear algebra of numpy, and whether it can be held to one thread, as the loop does.
-
-    It cannot.
-    """
+    """Linear algebra of numpy, and whether it can be held to one thread, as the loop does."""
     names = ", ".join(f"{name}, {threads} threads" for name, threads in sorted(_blas_threads().items()))
     with threadpool_limits(limits=1):
         held = _blas_threads()
@@ -89,10 +77,7 @@ def _blas(facts: Facts) -> Check:
 
 @CHECKS.check("socket buffers")
 def _socket_buffers(facts: Facts) -> Check:
-    """Bytes that sockets hold for a slow reader: `net.core.{r,w}mem_{default,max}` and `net.ipv4.tcp_{r,w}mem`.
-
-    TCP, by which the processes talk, holds less than 100 ms of the loop's frames, commands and mirror states.
-    """
+    """Bytes that sockets hold for a slow reader: `net.core.{r,w}mem_{default,max}` and `net.ipv4.tcp_{r,w}mem`."""
     net, read = "proc/sys/net", facts.host.text
     default_bytes, largest_bytes = (
         min(int(read(f"{net}/core/{way}mem_{which}")) for way in "rw") for which in ("default", "max")
@@ -115,10 +100,7 @@ def _socket_buffers(facts: Facts) -> Check:
 
 @CHECKS.check("shared memory")
 def _shared_memory(facts: Facts) -> Check:
-    """Size and free room of /dev/shm.
-
-    There is none, it cannot be written, or less than 64 MB is free, which is all that a container gets by default.
-    """
+    """Size and free room of /dev/shm."""
     cost = "`lowfc replay` cannot start its workers, and a browser with the view may die"
     folder = Path("/dev/shm")  # noqa: S108  # looked at
     if not (facts.host.root / "dev/shm").is_dir():
@@ -133,10 +115,7 @@ def _shared_memory(facts: Facts) -> Check:
 
 @CHECKS.check("disk")
 def _disk(facts: Facts) -> Check:
-    """Room for logs in `recorder.folder`, and how long it lasts at `camera.rate_hz`, as the recorder reckons.
-
-    Less than one log of `recorder.longest_s`, or nothing may be written there.
-    """
+    """Room for logs in `recorder.folder`, and how long it lasts at `camera.rate_hz`, as the recorder reckons."""
     section, rate_hz = facts.config.recorder, facts.config.camera.rate_hz
     folder = Path(section.folder)
     free_bytes, _, writable = facts.host.disk(folder)
@@ -161,10 +140,7 @@ def _disk(facts: Facts) -> Check:
     "open files", advice="ulimit -n 1024, or LimitNOFILE=1024 of the service", cost="a process may fail to join the bus"
 )
 def _open_files(facts: Facts) -> Check:
-    """How many files and sockets a process may have open.
-
-    Fewer than 256.
-    """
+    """How many files and sockets a process may have open."""
     limit = facts.host.open_files()
     detail = "no limit" if limit is None else f"{limit}"
     return ok(detail) if limit is None or limit >= _OPEN_FILES else warning(detail)
@@ -176,10 +152,7 @@ def _open_files(facts: Facts) -> Check:
     cost="a link that is up stays up; a process or a router that starts after the end is not let in",
 )
 def _certificates(facts: Facts) -> Check:
-    """Certificates in this host's folder, `network.certificates`, where the loop goes by a router.
-
-    One is not valid, or ends within 60 days.
-    """
+    """Certificates in this host's folder, `network.certificates`, where the loop goes by a router."""
     network = facts.config.network
     if not network.router:
         return ok("none needed: the configuration names no router")

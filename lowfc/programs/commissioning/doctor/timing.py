@@ -12,7 +12,7 @@ from lowfc.programs.commissioning.checks import Check, Table, note, ok, warning
 from lowfc.programs.commissioning.doctor.facts import Facts, ranges
 
 CHECKS: Table[Facts] = Table()
-"""In a docstring, the first paragraph is what a check looks at, the second when it warns; docs/doctor.md has both."""
+"""The docstring of each says what it looks at; docs/doctor.md also says when it warns."""
 
 PROCESSES = ("camera", "controller", "mirror", "recorder")
 
@@ -29,10 +29,7 @@ _BUSY_SHOWN = 3
 
 @CHECKS.check("scheduling class")
 def _scheduling_class(facts: Facts) -> Check:
-    """SCHED_FIFO at `realtime.priority`, asked for as the loop asks for it.
-
-    Refused.
-    """
+    """SCHED_FIFO at `realtime.priority`, asked for as the loop asks for it."""
     priority = facts.config.realtime.priority
     if not priority:
         return note("the configuration asks for the normal class: realtime.priority = 0")
@@ -45,10 +42,7 @@ def _scheduling_class(facts: Facts) -> Check:
 
 @CHECKS.check("real-time share")
 def _realtime_share(facts: Facts) -> Check:
-    """How much of a processor real-time processes may use: `kernel.sched_rt_runtime_us`.
-
-    None of it. Less than all is a note where camera, controller and mirror must share processors.
-    """
+    """How much of a processor real-time processes may use: `kernel.sched_rt_runtime_us`."""
     share = "proc/sys/kernel/sched_rt_{}_us"
     runtime_us, period_us = (int(facts.host.text(share.format(name))) for name in ("runtime", "period"))
     if runtime_us < 0:
@@ -65,10 +59,7 @@ def _realtime_share(facts: Facts) -> Check:
 
 @CHECKS.check("processors")
 def _processors(facts: Facts) -> Check:
-    """Processors that the loop's processes may use, and those that the configuration names.
-
-    Fewer than one for each of camera, controller, mirror and recorder; or one is named that may not be used.
-    """
+    """Processors that the loop's processes may use, and those that the configuration names."""
     usable, online = facts.host.usable_cpus(), facts.host.cpus("online")
     detail = f"{len(usable)} usable ({ranges(usable)}) of {len(online)}"
     named = facts.named_cpus
@@ -89,11 +80,7 @@ def _processors(facts: Facts) -> Check:
 
 @CHECKS.check("isolation")
 def _isolation(facts: Facts) -> Check:
-    """Processors kept free of other programs: `isolcpus` and `nohz_full`.
-
-    There are enough processors to isolate some and none is; or those isolated are not the ones that the configuration
-    names.
-    """
+    """Processors kept free of other programs: `isolcpus` and `nohz_full`."""
     isolated, online = facts.host.cpus("isolated"), facts.host.cpus("online")
     cost = "other programs and the kernel's own work share the loop's processors; expect a longer tail"
     if not isolated:
@@ -120,10 +107,7 @@ def _isolation(facts: Facts) -> Check:
     cost="once it is used up every process stands still until the quota is renewed",
 )
 def _quota(facts: Facts) -> Check:
-    """Limits of processor time on this process's control groups, such as a container's.
-
-    There is one.
-    """
+    """Limits of processor time on this process's control groups, such as a container's."""
     cpus = facts.host.quota_cpus()
     return ok("none") if cpus is None else warning(f"{cpus:g} processors' worth of time")
 
@@ -134,10 +118,7 @@ def _quota(facts: Facts) -> Check:
     cost="a processor slows down while it waits for a frame, and computes the next one slowly",
 )
 def _frequency(facts: Facts) -> Check:
-    """Frequency governor of the usable processors, and turbo.
-
-    A governor other than `performance`.
-    """
+    """Frequency governor of the usable processors, and turbo."""
     read, cpus = facts.host.text_or_nothing, facts.host.usable_cpus()
     governors = {read(f"{CPUS}/cpu{cpu}/cpufreq/scaling_governor") for cpu in cpus} - {""}
     if not governors:
@@ -150,10 +131,7 @@ def _frequency(facts: Facts) -> Check:
 
 @CHECKS.check("idle states")
 def _idle_states(facts: Facts) -> Check:
-    """How deeply an idle processor sleeps: the driver and the longest waking of the states in use.
-
-    The loop is not allowed to keep processors awake, or is not asked to and waking one takes more than 50 us.
-    """
+    """How deeply an idle processor sleeps: the driver and the longest waking of the states in use."""
     host, folder = facts.host, f"{CPUS}/cpu{min(facts.host.usable_cpus())}/cpuidle"
     driver, states = host.text(f"{CPUS}/cpuidle/current_driver"), sorted((host.root / folder).glob("state*"))
     read = [[host.text(f"{folder}/{state.name}/{key}") for key in ("latency", "name", "disable")] for state in states]
@@ -182,10 +160,7 @@ def _idle_states(facts: Facts) -> Check:
 
 @CHECKS.check("kernel")
 def _kernel(facts: Facts) -> Check:
-    """Preemption model of the kernel.
-
-    Neither PREEMPT_RT nor full preemption.
-    """
+    """Preemption model of the kernel."""
     words = facts.host.text("proc/version").split()
     release = words[2]
     advice = "boot with preempt=full, or a kernel with PREEMPT_RT"
@@ -210,10 +185,7 @@ def _kernel(facts: Facts) -> Check:
     cost="the hypervisor stops a processor without saying so, whatever the scheduling class",
 )
 def _virtualisation(facts: Facts) -> Check:
-    """Hypervisor, and the processor time that it gave to others since boot.
-
-    There is one.
-    """
+    """Hypervisor, and the processor time that it gave to others since boot."""
     read = facts.host.text_or_nothing
     flags = re.search(r"^flags\s*:(.*)$", facts.host.text("proc/cpuinfo"), re.MULTILINE)
     kind, stolen = read("sys/hypervisor/type"), facts.host.stolen_share()
@@ -233,10 +205,7 @@ def _virtualisation(facts: Facts) -> Check:
     cost="every process reads the time several times a frame",
 )
 def _clock_source(facts: Facts) -> Check:
-    """What the kernel reads the time from, and what a reading takes.
-
-    A slow source (hpet, acpi_pm, jiffies), or a reading of more than 1000 ns.
-    """
+    """What the kernel reads the time from, and what a reading takes."""
     source = facts.host.clock_source()
     begun_ns = time.perf_counter_ns()
     for _ in range(_READINGS):
@@ -253,10 +222,7 @@ def _clock_source(facts: Facts) -> Check:
     "boot, and those of two hosts cannot be compared",
 )
 def _synchronisation(facts: Facts) -> Check:
-    """Whether a daemon keeps CLOCK_REALTIME, and how well, by the kernel's account.
-
-    None does: it may step.
-    """
+    """Whether a daemon keeps CLOCK_REALTIME, and how well, by the kernel's account."""
     kept = facts.host.synchronisation()
     if kept.synchronised:
         return ok(f"kept; {kept.offset_s * 1e6:.0f} us to correct, error at most {kept.error_s * 1e3:.1f} ms")
@@ -265,10 +231,7 @@ def _synchronisation(facts: Facts) -> Check:
 
 @CHECKS.check("boot's clock")
 def _boot_clock(facts: Facts) -> Check:
-    """The clock of all runs since the boot, which the first one set by CLOCK_REALTIME, against CLOCK_REALTIME now.
-
-    They differ by more than 100 ms: CLOCK_REALTIME was wrong then, or is now.
-    """
+    """The clock of all runs since the boot, which the first one set by CLOCK_REALTIME, against CLOCK_REALTIME now."""
     file = boot_file()
     if not file.exists():
         return ok("not set yet: the first process of a run does it")
@@ -289,10 +252,7 @@ def _boot_clock(facts: Facts) -> Check:
     cost="frames wait so long before they are looked at, however fast the loop computes",
 )
 def _wake_up(facts: Facts) -> Check:
-    """How late a process wakes that sleeps until a time, 1000 times in one second, in both scheduling classes.
-
-    In the best class granted, p99 is above a tenth of the frame period, or the latest is above all of it.
-    """
+    """How late a process wakes that sleeps until a time, 1000 times in one second, in both scheduling classes."""
     figures = wake_up_us(facts.tried)
     detail = "; ".join(
         f"{name}: p50 {one['p50']:.0f} us, p99 {one['p99']:.0f} us, max {one['max']:.0f} us"
@@ -321,10 +281,7 @@ def wake_up_us(trial: Trial) -> dict[str, dict[str, float]]:
     cost="in the normal class the loop takes turns with them; under SCHED_FIFO they still empty its caches",
 )
 def _load(facts: Facts) -> Check:
-    """Load average, and which other processes were busy during the measurement.
-
-    The load is above the number of usable processors, or a process took more than a tenth of one.
-    """
+    """Load average, and which other processes were busy during the measurement."""
     load, cpus = facts.host.load(), len(facts.host.usable_cpus())
     busy = [(name, share) for name, share in facts.busy if share > _BUSY]
     who = ", ".join(f"{name} {100 * share:.0f} %" for name, share in busy[:_BUSY_SHOWN]) or "nobody"
