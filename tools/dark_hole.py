@@ -6,19 +6,17 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections import defaultdict
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import numpy.typing as npt
-from mcap.reader import make_reader
 from rich.progress import track
 
+from lowfc.adapters.logs.history import read_history
+from lowfc.adapters.logs.reader import LogReader
 from lowfc.arrays import Array, Mask
 from lowfc.client import Client, running
-from lowfc.contract.messages import STEP, TRUTH, wire
 from lowfc.control.loop.command_channels import FLAT
 from tools.shared import Figures, markdown
 
@@ -125,27 +123,25 @@ def _asked(run: str, each_nm: float, base_nm: Array) -> tuple[dict[str, list[int
 
 
 def _channels(log: Path, marks: dict[str, list[int]], seen_nm: Array) -> dict[str, Channel]:
-    said: dict[str, dict[int, Any]] = defaultdict(dict)
-    with log.open("rb") as stream:
-        for _, channel, message in make_reader(stream).iter_messages([f"/{STEP.key}", f"/{TRUTH.key}"]):
-            kind = wire.ControlStep if channel.topic == f"/{STEP.key}" else wire.Truth
-            body = kind.FromString(message.data)
-            said[channel.topic][body.frame_sequence] = body
-    steps, truths = said[f"/{STEP.key}"], said[f"/{TRUTH.key}"]
-    sequences = np.array(sorted(steps.keys() & truths.keys()))
-    command = np.array([steps[sequence].command_nm for sequence in sequences])
-    disturbance = np.array([truths[sequence].disturbance_nm for sequence in sequences])
-    residual = np.array([truths[sequence].residual_nm for sequence in sequences])
+    history = read_history(LogReader(log))
+    truths = history.true
+    if truths is None:
+        raise RuntimeError(f"{log} has no truth")
+    sequences, command = history.steps.sequence, history.steps.command_nm
+    known = np.isfinite(truths.disturbance_nm[:, 0])
 
     def until(end: int, frames: int) -> Mask:
-        return np.asarray((sequences < end) & (sequences >= end - frames))
+        return np.asarray(known & (sequences < end) & (sequences >= end - frames))
 
     found = {}
-    for name, asked in marks.items():
-        ends = [until(end, 3 * SETTLE // 4) for end in asked]
-        own = np.array([(command[end] + disturbance[end]).mean(axis=0) for end in ends])
-        left = [np.sqrt(residual[until(end, WINDOW)].var(axis=0).sum()) for end in (asked[0], asked[-1])]
-        found[name] = Channel(seen_nm[:: STEPS // (len(asked) - 1)], own, np.array(left))
+    for name, changed_at in marks.items():
+        ends = [until(end, 3 * SETTLE // 4) for end in changed_at]
+        own = np.array([(command[end] + truths.disturbance_nm[end]).mean(axis=0, dtype=np.float64) for end in ends])
+        left = [
+            np.sqrt(truths.residual_nm[until(end, WINDOW)].var(axis=0, dtype=np.float64).sum())
+            for end in (changed_at[0], changed_at[-1])
+        ]
+        found[name] = Channel(seen_nm[:: STEPS // (len(changed_at) - 1)], own, np.array(left))
     return found
 
 

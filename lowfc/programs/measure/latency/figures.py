@@ -74,7 +74,7 @@ class Frames:
 
     Attributes:
         put_ns: just before the camera's put.
-        commanded: whether there is a command made from it.
+        commanded: whether a command made from it was timed, or followed by the mirror.
         spans_us: of `SPANS`, NaN where it is not known; those from the moment due only where there was a schedule.
     """
 
@@ -89,7 +89,6 @@ def join(
     due_ns: Long | None,
     timing: tuple[Sequences, Mapping[str, Long]],
     mirror: tuple[Sequences, Long],
-    commanded: Sequences | None = None,
 ) -> Frames:
     """Frames that were sent, and what is known of each.
 
@@ -99,7 +98,6 @@ def join(
         due_ns: when it ought to have been put; None where there was no schedule.
         timing: sequences, and the controller's stages, ns, as in ControlTiming.
         mirror: frame sequence and time of each state; the first of a frame counts.
-        commanded: frame sequences of the commands; when None, what was timed or followed by the mirror had one.
     """
     row, mirror_row = rows_of(sequence, timing[0]), rows_of(sequence, mirror[0])
     stages_us = {stage: np.append(column / 1e3, np.nan)[row] for stage, column in timing[1].items()}
@@ -120,8 +118,7 @@ def join(
             "due_to_command": late_us + command_us,
             "due_to_mirror": late_us + mirror_us,
         }
-    known = (row >= 0) | (mirror_row >= 0) if commanded is None else rows_of(sequence, commanded) >= 0
-    return Frames(put_ns, known, spans_us)
+    return Frames(put_ns, (row >= 0) | (mirror_row >= 0), spans_us)
 
 
 def percentiles(values: npt.NDArray[Any]) -> dict[str, float] | None:
