@@ -61,9 +61,9 @@ def test_a_process_publishes_in_its_own_name_only_and_requests_are_an_operators(
     assert set(grant("mirror-dm").publishes) == own
     for role in ROLES:
         assert role == "controller" or not any("*" in key for key in grant(role).publishes)
-        asks = {key for key in grant(role).asks if "request" in key or "record" in key}
+        asks = {key for key in grant(role).queries if "request" in key or "record" in key}
         assert asks == ({"lowfc/request/*", "lowfc/record/*"} if role == "operator" else set())
-        assert CLOCK_KEY in grant(role).asks
+        assert CLOCK_KEY in grant(role).queries
     assert "lowfc/request/*" in grant("controller").answers
     assert "lowfc/record/*" in grant("recorder").answers
 

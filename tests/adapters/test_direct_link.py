@@ -114,7 +114,7 @@ def test_a_message_under_way_while_the_bus_is_left_comes_once(tmp_path: Path) ->
     one, other = (Sample(FRAME.key, b"", sequence, 1, 1) for sequence in (1, 2))
     reader._by_socket(one)
     reader._by_bus(one)
-    reader._heard()
+    reader._leave()
     assert left == [True]
     reader._by_bus(other)
     reader._by_socket(other)
@@ -299,7 +299,9 @@ class Shared:
         self.got: list[int] = []
         self.by_bus: Callable[[Sample], None] = lambda _: None
         path = folder / "mirror-dm.in"
-        self.reader = direct_link.SharedDirectReader(path, "k", self.hear, self.subscribe, lambda: 0, self.failed)
+        self.reader = direct_link.DirectReader(
+            path, "k", self.hear, self.subscribe, lambda: 0, self.failed, shared=True
+        )
         self.writer = direct_link.DirectWriter(path)
 
     def subscribe(self, handler: Callable[[Sample], None]) -> Callable[[], None]:

@@ -1,7 +1,7 @@
-"""Who may do what at the router: zenoh's access control, made from the table of topics; all else is denied.
+"""Access control at the router, made from the table of topics; all else is denied.
 
-A process is known by the common name of its certificate, which is its role: "camera", "mirror-dm". Rules are seen from
-the router: what comes in from a process, and what goes out to it.
+The common name of a process's certificate is its role: "camera", "mirror-dm". Directions are the router's: ingress is
+from a process, egress to it.
 """
 
 from collections.abc import Iterable
@@ -14,36 +14,36 @@ from lowfc.contract.messages import HEALTH, RECORD_KEY, REQUEST_KEY, TOPICS, Rol
 ROUTER = "router"
 """Role of the router itself: its common name, and its name in Health."""
 CLOCK_KEY = "lowfc/clock"
-"""Key of the router's queryable that everybody sets their envelopes' time by."""
+"""Key of the router's queryable for its time, by which all processes set that of their envelopes."""
 
-_LOCAL = frozenset({Role.LAUNCHER, Role.REPLAY})  # these have no part in a run on several hosts
+_LOCAL = frozenset({Role.LAUNCHER, Role.REPLAY})  # they are never part of a run on several hosts
 
 
 @dataclass(frozen=True, slots=True)
 class Grant:
-    """What a process may do; the keys of those who listen or ask have "*" for names, as theirs have.
+    """Rights of a process. Subscriptions and queries have "*" in place of a name.
 
     Attributes:
         role: common name of its certificate.
         publishes: keys that it may put, its own names only.
-        heard: the same for any name: what others may have asked the router for.
-        receives: keys that it may subscribe.
-        answers: keys that it may answer questions at, its own names only.
-        asked: the same for any name.
-        asks: keys that it may ask.
+        subscribed: the same keys as others subscribe to them.
+        receives: keys that it may subscribe to.
+        answers: keys at which it may answer queries, its own names only.
+        queried: the same keys as others query them.
+        queries: keys that it may query.
     """
 
     role: str
     publishes: tuple[str, ...]
-    heard: tuple[str, ...]
+    subscribed: tuple[str, ...]
     receives: tuple[str, ...]
     answers: tuple[str, ...]
-    asked: tuple[str, ...]
-    asks: tuple[str, ...]
+    queried: tuple[str, ...]
+    queries: tuple[str, ...]
 
 
 def roles(mirrors: Iterable[str]) -> tuple[str, ...]:
-    """Every role that has a certificate, but the router.
+    """Every role that has a certificate, without the router.
 
     Args:
         mirrors: roles of the mirrors, such as "mirror-dm".
@@ -53,29 +53,29 @@ def roles(mirrors: Iterable[str]) -> tuple[str, ...]:
 
 
 def grant(role: str) -> Grant:
-    """What the table of topics lets a role do."""
+    """Rights of a role by the table of topics."""
     part, _, name = role.partition("-")
     kind = Role(part)
     published = [topic for topic in TOPICS if kind in topic.publisher]
     received = [topic for topic in TOPICS if kind in _receivers(topic)]
     answered = [topic for topic in published if topic.queryable]
     answers = [_own(topic, role, name) for topic in answered]
-    asked = [topic.at(ALL) for topic in answered]
-    asks = [topic.at(ALL) for topic in received if topic.queryable]
+    queried = [topic.at(ALL) for topic in answered]
+    queries = [topic.at(ALL) for topic in received if topic.queryable]
     for key, answering in ((REQUEST_KEY, Role.CONTROLLER), (RECORD_KEY, Role.RECORDER)):
         if kind is answering:
             answers.append(key.format(name=ALL))
-            asked.append(key.format(name=ALL))
+            queried.append(key.format(name=ALL))
         if kind is Role.OPERATOR:
-            asks.append(key.format(name=ALL))
+            queries.append(key.format(name=ALL))
     return Grant(
         role,
         publishes=tuple(_own(topic, role, name) for topic in published),
-        heard=tuple(topic.at(ALL) for topic in published),
+        subscribed=tuple(topic.at(ALL) for topic in published),
         receives=tuple(_own(topic, role, name) if kind is Role.MIRROR else topic.at(ALL) for topic in received),
         answers=tuple(answers),
-        asked=tuple(asked),
-        asks=(*asks, CLOCK_KEY),
+        queried=tuple(queried),
+        queries=(*queries, CLOCK_KEY),
     )
 
 
@@ -97,21 +97,21 @@ def access_control(mirrors: Iterable[str]) -> dict[str, Any]:
     }
 
 
-def _rules(given: Grant) -> list[dict[str, Any]]:
+def _rules(rights: Grant) -> list[dict[str, Any]]:
     """The rules of one role: for each direction, which messages about which keys."""
     lines = (
-        ("publishes", "ingress", ["put"], given.publishes),
-        ("is listened to", "egress", ["declare_subscriber"], given.heard),
-        ("listens", "ingress", ["declare_subscriber"], given.receives),
-        ("receives", "egress", ["put"], given.receives),
-        ("answers", "ingress", ["declare_queryable", "reply"], given.answers),
-        ("is asked", "egress", ["query"], given.asked),
-        ("asks", "ingress", ["query"], given.asks),
-        ("is answered", "egress", ["declare_queryable", "reply"], given.asks),
+        ("publishes", "ingress", ["put"], rights.publishes),
+        ("is subscribed to", "egress", ["declare_subscriber"], rights.subscribed),
+        ("subscribes", "ingress", ["declare_subscriber"], rights.receives),
+        ("receives", "egress", ["put"], rights.receives),
+        ("answers", "ingress", ["declare_queryable", "reply"], rights.answers),
+        ("is queried", "egress", ["query"], rights.queried),
+        ("queries", "ingress", ["query"], rights.queries),
+        ("is answered", "egress", ["declare_queryable", "reply"], rights.queries),
     )
     return [
         {
-            "id": f"{given.role} {what}",
+            "id": f"{rights.role} {what}",
             "permission": "allow",
             "flows": [flow],
             "messages": messages,
@@ -123,10 +123,10 @@ def _rules(given: Grant) -> list[dict[str, Any]]:
 
 
 def _receivers(topic: Topic) -> frozenset[Role]:
-    """Who gets a topic: an operator's own programs see what a view sees."""
+    """Roles that may receive a topic: an operator's own programs see what a view sees."""
     return topic.subscribers | ({Role.OPERATOR} if Role.VIEWER in topic.subscribers else frozenset())
 
 
 def _own(topic: Topic, role: str, name: str) -> str:
-    """Key of a topic for the names that a role may use: its own, the mirror's it is, or any mirror's."""
+    """Key of a topic with the name that a role may use: its own, that of its mirror, or any mirror's."""
     return topic.at(role if topic is HEALTH else name or ALL)

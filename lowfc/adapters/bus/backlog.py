@@ -10,8 +10,8 @@ from lowfc.contract.messages import Rate, Topic
 class Backlog:
     """A queue from the bus's threads to one that writes.
 
-    What does not fit is left out; the account of sequences tells. States, requests and events are few, and the rest is
-    understood by them: they are always taken.
+    A message that does not fit is left out, and counted as lost by its sequence. States, requests and events are few
+    and needed to understand the rest: they always fit.
     """
 
     def __init__(self, most_messages: int, most_bytes: int) -> None:

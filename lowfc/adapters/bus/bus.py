@@ -1,7 +1,7 @@
-"""What the processes ask of a message bus: publish, subscribe, answer, ask.
+"""The message bus as processes use it: publish, subscribe, answer, query.
 
 `ZenohBus` carries the messages between processes; `MemoryBus` does the same within one, for tests. Handlers run on
-the thread that receives, one message after the other: what they take, the next one waits for.
+the thread that receives, one message after the other: a slow handler delays the next message.
 """
 
 import sys
@@ -19,7 +19,7 @@ from lowfc.contract.errors import BadMessageError
 from lowfc.contract.messages import HEALTH, Topic
 
 ALL = "*"
-"""In place of a name: every mirror, or every process."""
+"""Stands for the name of every mirror, or of every process."""
 
 
 class Sample(NamedTuple):
@@ -42,10 +42,10 @@ class Sample(NamedTuple):
 
 @dataclass(slots=True)
 class Query:
-    """A question that waits for its answer; `reply` may be called later and from any thread, once.
+    """A query that waits for its answer; `reply` may be called later and from any thread, once.
 
     Attributes:
-        key: what was asked.
+        key: that was queried.
         name: last part of the key, such as "gain" of "lowfc/request/gain".
         payload: protobuf bytes; may be empty.
         reply: sends the answer.
@@ -66,9 +66,8 @@ class Publisher(Protocol):
 
     Attributes:
         published: messages so far.
-        handed_ns: when the last one had been handed to the reader that waits for it, by the host's clock: by its short
-            way, or else by the bus.
-        last: message and envelope of a topic that can be asked for.
+        handed_ns: time at which the last one had been handed to its direct link, or else to the bus, host clock.
+        last: message and envelope, of a topic that can be queried.
     """
 
     topic: Topic
@@ -80,16 +79,16 @@ class Publisher(Protocol):
     def put(self, payload: bytes, publish_time_ns: int | None = None, sequence: int | None = None) -> Envelope:
         """Send `payload`, by default now and with the next sequence; never waits for a reader.
 
-        Whoever gives sequences (a replay, those of the log) gives them with every put.
+        A publisher that sets sequences (a replay: those of the log) sets them with every put.
         """
         ...
 
 
 class Ring(Protocol):
-    """Messages of one topic that wait to be looked at."""
+    """The newest messages of one topic, kept until they are drained."""
 
     def drain(self) -> list[Sample]:
-        """Those that arrived since the last call, in their order; `receive_time_ns` is that of this call."""
+        """Messages since the last call, in their order; `receive_time_ns` is that of this call."""
         ...
 
     def close(self) -> None:
@@ -117,19 +116,19 @@ class Bus(Protocol):
         ...
 
     def ring(self, topic: Topic, capacity: int) -> "Ring":
-        """Keep the newest `capacity` messages of a topic for who looks now and then, at no cost in between."""
+        """Keep the newest `capacity` messages of a topic for a monitor, at no cost until it drains them."""
         ...
 
     def queryable(self, key_expression: str, handler: Callable[[Query], None]) -> None:
-        """Call `handler` with every question asked under a key expression such as "lowfc/request/*"."""
+        """Call `handler` with every query of a key expression such as "lowfc/request/*"."""
         ...
 
     def get(self, key: str, payload: bytes = b"", timeout_s: float = 1.0) -> list[Sample]:
-        """Ask, and wait for the answers; nobody there is an empty list."""
+        """Query a key and return the answers; an empty list where no process answers."""
         ...
 
     def peers(self) -> int:
-        """How many other processes this one is connected to."""
+        """Number of other processes that this one is connected to."""
         ...
 
     def close(self) -> None:
@@ -138,9 +137,9 @@ class Bus(Protocol):
 
 
 def states(bus: Bus, topics: Iterable[Topic], timeout_s: float = 1.0) -> Iterator[tuple[Topic, Sample]]:
-    """Ask for the states among `topics`, each from everybody who publishes it, for who was not there to hear them.
+    """Query the states among `topics` from all of their publishers, for a process that joins late.
 
-    Health is none of them: it comes twice a second.
+    Health is none of them: it is published twice a second.
     """
     for topic in topics:
         if topic.queryable and topic is not HEALTH:
@@ -149,7 +148,7 @@ def states(bus: Bus, topics: Iterable[Topic], timeout_s: float = 1.0) -> Iterato
 
 
 UNREADABLE = (BadMessageError, DecodeError)
-"""Exceptions that a message raises, and no mistake of this program."""
+"""Exceptions that a bad message raises."""
 
 
 class Faults:
@@ -169,7 +168,7 @@ class Faults:
         self._lock = threading.Lock()
 
     def add(self, place: str, key: str, fault: Exception) -> None:
-        """Count a fault at a place (such as "camera: handler of") that deals with a key; what a message did is its."""
+        """Count a fault at a place (such as "camera: handler of") and a key; a bad message counts as unreadable."""
         if isinstance(fault, UNREADABLE):
             self.add_unreadable(key, fault)
             return

@@ -1,8 +1,8 @@
 """The direct link between two processes of one host that wait for each other: a Unix socket, beside the bus.
 
-The bus still carries every message to everybody. The one reader that a topic names (`Topic.reader`) gets it first by a
-socket in the run's directory: no thread of the bus is between the put and the reader. Whoever publishes from another
-host, or without this library, is heard by the bus as ever.
+The bus still carries every message to everybody. The one reader that a topic names (`Topic.direct_subscriber`) gets it
+first by a socket in the run's directory: no thread of the bus is between the put and the reader. Messages of a
+publisher on another host, or without this library, come by the bus as ever.
 """
 
 import contextlib
@@ -73,10 +73,13 @@ class DirectWriter:
             self._socket = made
 
 
-class _Receiver:
-    """The reader's end of the socket, and its place on the bus; what to make of both is for who inherits.
+class DirectReader:
+    """Hands on each message once, by the socket or by the bus, whichever was quicker.
 
-    `_by_bus` and `_by_socket` get each message, on the bus's thread and on one of this receiver's own.
+    A copy is known by its envelope; numbers alone would not do, for two publishers may have started in the same second.
+    The bus is left while a publisher that is alone on its topic uses the socket; a message of it that is still on the
+    bus when a newer one has come by the socket is too late, and left out. Where others may publish too, by the bus
+    alone, it is never left, and a message that only the bus carried may come after a newer one.
     """
 
     def __init__(
@@ -87,6 +90,8 @@ class _Receiver:
         subscribe: Callable[[Handler], Callable[[], None]],
         now_ns: Callable[[], int],
         failed: Callable[[Exception], None],
+        *,
+        shared: bool = False,
     ) -> None:
         """Listen, at once.
 
@@ -97,15 +102,19 @@ class _Receiver:
             subscribe: to the same topic on the bus; returns what ends that.
             now_ns: the host's clock.
             failed: told of what the handler raises.
+            shared: others may publish too.
         """
         self._handler = handler
         self._subscribe = subscribe
         self._now_ns = now_ns
         self._failed = failed
+        self._shared = shared
         self._turn = threading.Lock()
         self._key = key
         self._closed = False
-        self._begin()
+        self._lately: dict[tuple[int, int], None] = {}
+        self._first = self._newest = -1  # sequences: the first by the socket, and the newest by either way
+        self._both = False
         self._leave_bus: Callable[[], None] | None = subscribe(self._by_bus)
         path.unlink(missing_ok=True)  # of a process that was killed: there is one of each role
         self._listener = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET)
@@ -125,20 +134,43 @@ class _Receiver:
         if self._leave_bus is not None:
             self._leave_bus()
 
-    def _begin(self) -> None:
-        raise NotImplementedError
-
     def _by_bus(self, sample: Sample) -> None:
-        raise NotImplementedError
+        with self._turn:
+            handed = self._hand_on(sample)
+            if not handed and not self._shared and 0 <= self._first <= sample.sequence:
+                self._both = True  # it has come by both ways: the bus can be left
 
     def _by_socket(self, sample: Sample) -> None:
-        raise NotImplementedError
+        with self._turn:
+            if self._first < 0:
+                self._first = sample.sequence
+            self._hand_on(sample)
 
-    def _heard(self) -> None:
-        """Called after each message of the socket."""
+    def _hand_on(self, sample: Sample) -> bool:
+        """Hand a message on, unless it has come before or is too late."""
+        envelope = sample.sequence, sample.publish_time_ns
+        late = not self._shared and self._first >= 0 and sample.sequence <= self._newest
+        if self._closed or late or envelope in self._lately:
+            return False
+        self._lately[envelope] = None
+        if len(self._lately) > _LATELY:
+            del self._lately[next(iter(self._lately))]
+        self._newest = sample.sequence
+        self._handler(sample)
+        return True
 
-    def _left(self) -> None:
-        """Called when a writer has gone."""
+    def _leave(self) -> None:
+        """After each message of the socket: leave the bus, where messages come by both ways."""
+        if self._both and self._leave_bus is not None:
+            self._leave_bus()
+            self._leave_bus, self._both = None, False
+
+    def _return(self) -> None:
+        """A writer has gone: its messages, or those of the next one, come by the bus."""
+        with self._turn:
+            self._both, self._first, self._newest = False, -1, -1
+        if self._leave_bus is None and not self._closed:
+            self._leave_bus = self._subscribe(self._by_bus)
 
     def _accept(self) -> None:
         """Serve one writer after the other: who comes anew takes the place of the last."""
@@ -164,7 +196,7 @@ class _Receiver:
     def _serve(self, connection: socket.socket) -> None:
         with connection:
             self._receive(connection)
-        self._left()
+        self._return()
 
     def _receive(self, connection: socket.socket) -> None:
         buffer = memoryview(bytearray(2 * _BUFFER_BYTES))
@@ -182,75 +214,7 @@ class _Receiver:
                 self._by_socket(Sample(self._key, payload, *Envelope.unpack(envelope), now_ns))
             except Exception as fault:
                 self._failed(fault)
-            self._heard()
-
-
-class DirectReader(_Receiver):
-    """Hands on each message of one publisher once: by the socket while it has a writer, by the bus otherwise.
-
-    A message that is still on the bus when a newer one has come by the socket is too late, and left out.
-    """
-
-    def _begin(self) -> None:
-        self._first = self._newest = self._newest_by_bus = -1
-        self._both = False
-
-    def _by_bus(self, sample: Sample) -> None:
-        with self._turn:
-            if self._first >= 0 and sample.sequence <= self._newest:
-                self._both = self._both or sample.sequence >= self._first  # it has come by both: the bus can be left
-            elif not self._closed:
-                self._newest_by_bus = sample.sequence
-                self._handler(sample)
-
-    def _by_socket(self, sample: Sample) -> None:
-        with self._turn:
-            if self._closed:
-                return
-            if self._first < 0:
-                self._first = sample.sequence
-            if sample.sequence <= self._newest_by_bus:
-                return  # the bus was quicker, be it with a message that was under way while it was left
-            self._newest = sample.sequence
-            self._handler(sample)
-
-    def _heard(self) -> None:
-        if self._both and self._leave_bus is not None:
-            self._leave_bus()
-            self._leave_bus, self._both = None, False
-
-    def _left(self) -> None:
-        with self._turn:
-            self._both, self._first = False, -1
-        if self._leave_bus is None and not self._closed:
-            self._leave_bus = self._subscribe(self._by_bus)
-
-
-class SharedDirectReader(_Receiver):
-    """Hands on each message once where others may publish too, by the bus alone: it is never left.
-
-    A copy is known by its envelope; numbers alone would not do, for another publisher may have started in the same
-    second. A message that only the bus carried, because the socket was full, may come after a newer one.
-    """
-
-    def _begin(self) -> None:
-        self._lately: dict[tuple[int, int], None] = {}
-
-    def _by_bus(self, sample: Sample) -> None:
-        self._once(sample)
-
-    def _by_socket(self, sample: Sample) -> None:
-        self._once(sample)
-
-    def _once(self, sample: Sample) -> None:
-        envelope = sample.sequence, sample.publish_time_ns
-        with self._turn:
-            if self._closed or envelope in self._lately:
-                return
-            self._lately[envelope] = None
-            if len(self._lately) > _LATELY:
-                del self._lately[next(iter(self._lately))]
-            self._handler(sample)
+            self._leave()
 
 
 def _end(one: socket.socket) -> None:

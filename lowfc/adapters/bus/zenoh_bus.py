@@ -18,7 +18,7 @@ from zenoh.handlers import Callback, Handler, RingChannel
 
 from lowfc.adapters.bus.access import CLOCK_KEY, ROUTER
 from lowfc.adapters.bus.bus import ALL, Faults, Query, Sample
-from lowfc.adapters.bus.direct_link import DirectReader, DirectWriter, SharedDirectReader
+from lowfc.adapters.bus.direct_link import DirectReader, DirectWriter
 from lowfc.adapters.bus.routed import RouterWatch, open_by_router, require_certificate
 from lowfc.adapters.bus.run import Links, mirror_role
 from lowfc.adapters.bus.zenoh_fault import plain
@@ -209,13 +209,14 @@ class ZenohBus:
         if _reader(topic, name) != self.role or (path := self._direct_link(topic, name)) is None:
             return self._subscribe(topic, handler, name)
         key = topic.at(name)
-        reader = (SharedDirectReader if topic.multiple_publishers else DirectReader)(
+        reader = DirectReader(
             path,
             key,
             handler,
             lambda by_bus: self._subscribe(topic, by_bus, name),
             self.clock.host_ns,
             lambda fault: self.faults.add(f"{self.role}: handler of", key, fault),
+            shared=topic.multiple_publishers,
         )
         self._closers.append(reader.close)
         return reader.close

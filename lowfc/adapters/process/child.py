@@ -1,4 +1,4 @@
-"""A child process that dies with its parent, and what it said last."""
+"""A child process that dies with its parent, and the end of its standard error."""
 
 import contextlib
 import errno
@@ -12,7 +12,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import IO
 
-_LAST_WORDS = 6
+_TAIL_LINES = 6
 _DIES_WITH = """
 import ctypes, os, sys
 number, parent = map(int, sys.argv[1:3])
@@ -25,14 +25,14 @@ if os.getppid() == parent:  # it lives still
 
 @dataclass(slots=True)
 class Child:
-    """One process, what it says going to a file.
+    """One process, its standard error going to a file.
 
     Attributes:
-        name: as in its Health, or in what is told about it.
+        name: as in its Health, or in messages about it.
         command: the program and its arguments.
         stderr_path: file with its standard error.
         environment: of the process; None for ours.
-        death_signal: the signal it gets then; only SIGKILL ends one that is stopped.
+        death_signal: that it gets when its parent dies; only SIGKILL ends a process that is stopped.
     """
 
     name: str
@@ -70,7 +70,7 @@ class Child:
         return self.process.poll() if self.process is not None else None
 
     def stop(self, patience_s: float) -> None:
-        """Ask it to end, wait, and kill it where it does not."""
+        """Send SIGTERM, wait, and kill it where it does not end."""
         if self.process is None:
             return
         if self.status is None:
@@ -84,9 +84,9 @@ class Child:
             self._stream.close()
 
     def stderr_tail(self) -> str:
-        """The end of what it said on standard error."""
+        """Last lines of its standard error."""
         lines = self.stderr_path.read_text(errors="replace").strip().splitlines() if self.stderr_path.exists() else []
-        return "\n".join(lines[-_LAST_WORDS:])
+        return "\n".join(lines[-_TAIL_LINES:])
 
     def how_it_ended(self) -> str:
         """One line about a process that ended by itself."""

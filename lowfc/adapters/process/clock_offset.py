@@ -1,7 +1,7 @@
-"""How far two hosts' clocks are apart: asked and answered, as NTP does it, with the shortest of recent round trips.
+"""Offset between two hosts' clocks, measured as NTP does: by the shortest of recent round trips.
 
-The answer was made between question and receipt. Half-way is the best guess, and half the round trip the largest error,
-whatever the network does; so the shortest round trip is the one to believe.
+The other clock was read between query and receipt. Half-way is the best estimate, and half the round trip the largest
+error, whatever the network does; so the shortest round trip is the best.
 """
 
 import threading
@@ -17,11 +17,11 @@ PERIOD_S = 0.5
 
 
 class Exchange(NamedTuple):
-    """One question and its answer.
+    """One query and its answer.
 
     Attributes:
         offset_ns: to be added to this host's clock to have the other's.
-        round_trip_ns: between question and receipt; the offset is wrong by at most half of it.
+        round_trip_ns: between query and receipt; the offset is wrong by at most half of it.
     """
 
     offset_ns: int
@@ -32,7 +32,7 @@ class ClockOffset:
     """The other clock's offset, by the best of recent exchanges.
 
     Attributes:
-        best: None until there was one.
+        best: None before the first.
     """
 
     def __init__(self) -> None:
@@ -46,7 +46,7 @@ class ClockOffset:
         return 0 if best is None else best.offset_ns
 
     def exchanged(self, asked_ns: int, theirs_ns: int, answered_ns: int) -> None:
-        """Take in one exchange.
+        """Add one exchange.
 
         Args:
             asked_ns: this host's clock, just before the question.
@@ -58,16 +58,16 @@ class ClockOffset:
 
 
 class ClockAsker:
-    """Asks another host for its time, several times at once and then now and again, on a thread of its own."""
+    """Queries another host's time, several times at once and then periodically, on a thread of its own."""
 
     def __init__(
         self, offset: ClockOffset, ask: Callable[[], Sequence[tuple[int, int]]], host_ns: Callable[[], int]
     ) -> None:
-        """Know the offset, if the other answers, when this returns.
+        """Measure the offset, if the other host answers.
 
         Args:
-            offset: is told what comes of it.
-            ask: the other; returns its time when it answered, less the offset known, and this host's when that came.
+            offset: gets the exchanges.
+            ask: queries the other; returns its time at the answer, less the offset known, and this host's at receipt.
             host_ns: this host's clock.
         """
         self._offset = offset
@@ -81,7 +81,7 @@ class ClockAsker:
         self._thread.start()
 
     def close(self) -> None:
-        """Ask no more."""
+        """End the queries."""
         self._ended.set()
         self._thread.join()
 

@@ -1,4 +1,4 @@
-"""What every process of a run does alike: stop when told, say how it is, report events, hear the others."""
+"""What every process of a run does: stop at a signal, publish health and events, receive the health of the others."""
 
 import contextlib
 import os
@@ -27,7 +27,7 @@ from lowfc.control.loop.wording import counted
 
 HEALTH_PERIOD_NS = 500_000_000
 WAITING_NS = 2_000_000_000
-"""After it is ready a process that still waits for others says for whom."""
+"""A process that is ready and waits longer than this for others names them."""
 WORK: dict[str, str] = {Role.CAMERA: "frame", Role.CONTROLLER: "frame", Role.MIRROR: "command"}
 """What the processes of the loop count; others have a summary of their own."""
 ProcessState = Literal["starting", "ready", "running", "stopping", "stopped"]
@@ -42,9 +42,9 @@ class Service:
         name: of the process, such as "camera" or "mirror-dm".
         running: until SIGTERM, SIGINT or `stop`.
         work: units of work done (frames, commands, messages); `rate_hz` in Health is its rate.
-        heard: last Health of every other process heard.
-        announces: on standard error, that it is ready and for whom it waits.
-        awaited: for whom, in words; empty once it waits for nobody.
+        last_health: of every other process, by name.
+        announces: that it is ready and which processes it waits for, on standard error.
+        awaited: those processes, in words; empty once it waits for none.
     """
 
     def __init__(
@@ -88,7 +88,7 @@ class Service:
         self._due_ns = 0
         self._events = self.publisher(EVENT)
         self._health = self.publisher(HEALTH, name)
-        bus.subscribe(HEALTH, self._hear)
+        bus.subscribe(HEALTH, self._received_health)
         self.event("STARTED", process=name, version=__version__)
         if abs(ahead_ns := clock.ahead_ns()) > WALL_TOLERANCE_NS:
             self.event("CLOCK_OFF", ahead_ms=ahead_ns / 1e6)
@@ -147,7 +147,7 @@ class Service:
         return self.bus.subscribe(topic, handover.put, name or ALL)
 
     def newcomers(self) -> bool:
-        """Whether somebody is heard whom the last call did not know: who answers what is asked, or answers anew."""
+        """Whether a process has joined or restarted since the last call."""
         there = {(name, health.pid) for name, health in list(self.last_health.items())}
         new = not there <= self._known
         self._known = there
@@ -257,7 +257,7 @@ class Service:
         return ()
 
     def health(self) -> wire.Health:
-        """How the process is."""
+        """Health of the process, now."""
         now_ns = self.clock.host_ns()
         span_s = max(now_ns - self._beaten_ns, 1) * 1e-9
         message = wire.Health(
@@ -302,7 +302,7 @@ class Service:
         self._health.put(message.SerializeToString())
         self._supervisor.tell(message)
 
-    def _hear(self, sample: Sample) -> None:
+    def _received_health(self, sample: Sample) -> None:
         name, health = self._names.health(sample.key, sample.payload)
         if name == self.name:
             return

@@ -1,7 +1,7 @@
-"""What a process tells the service manager that started it: ready, alive, stopping, and one line of how it is.
+"""Notifications to the service manager that started a process: ready, alive, stopping, and one line of its state.
 
-The manager is systemd, or whoever else gives a datagram socket in NOTIFY_SOCKET (sd_notify(3)); without one nothing is
-said. The loop never waits for it: a manager that does not read misses what was said.
+The manager is systemd, or any other that sets NOTIFY_SOCKET to a datagram socket (sd_notify(3)); without one nothing is
+sent. The loop never waits for it: a manager that does not read misses notifications.
 """
 
 import contextlib
@@ -14,14 +14,14 @@ from lowfc.control.loop.safety import LoopMode
 
 
 class Supervisor:
-    """The service manager, or nobody.
+    """The service manager, where there is one.
 
     Attributes:
-        period_ns: how often it wants a sign of life, at most half of what it waits for one; None where it does not.
+        period_ns: between signs of life, half of the manager's timeout; None where it wants none.
     """
 
     def __init__(self, environment: Mapping[str, str] = os.environ) -> None:
-        """Take from the environment where it listens, and how long it waits for a sign of life."""
+        """Read the manager's socket and its timeout from the environment."""
         self.period_ns: int | None = None
         self._address = environment.get("NOTIFY_SOCKET", "").replace("@", "\0", 1)
         self._due_ns = 0
@@ -46,7 +46,7 @@ class Supervisor:
             self._say("WATCHDOG=1")
 
     def tell(self, health: wire.Health) -> None:
-        """How the process is, in the line that `systemctl status` shows."""
+        """State of the process, as the line that `systemctl status` shows."""
         if self._address:
             self._say(f"STATUS={status_line(health)}")
 
@@ -58,7 +58,7 @@ class Supervisor:
     def _say(self, what: str) -> None:
         if not self._address:
             return
-        # One that is gone, or does not keep up, is no reason to stop or to wait.
+        # a manager that is gone or does not keep up is no reason to stop or to wait
         with contextlib.suppress(OSError), socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as datagrams:
             datagrams.setblocking(False)
             datagrams.sendto(what.encode(), self._address)
