@@ -225,7 +225,7 @@ def test_a_run_that_starts_is_waited_for_and_missed_only_later() -> None:
     watcher = Watcher()
     watcher.feed(Accumulator().snapshot(START * 10**9))
     nothing = judge(watcher.state())
-    assert (nothing.level, nothing.headline) == (Level.NEUTRAL, "Waiting for the run to start.")
+    assert (nothing.level, nothing.headline) == (Level.NEUTRAL, "Waiting for the controller.")
     stage = begun(silent={"camera", "mirror-dm", "recorder"}, states={"controller": "ready"})
     assert stage.run(5).level is Level.NEUTRAL
     late = stage.run(10)

@@ -4,8 +4,8 @@ from functools import partial
 
 from lowfc.control.loop.safety import Reason, Rejection
 from lowfc.control.loop.wording import counted
-from lowfc.programs.view.verdicts.run_state import GRACE_S, RECENT_S, Liveness, RunState
-from lowfc.programs.view.verdicts.tile import Level, Tile, duration, worst_of
+from lowfc.programs.view.verdicts.run_state import RECENT_S, Liveness, RunState
+from lowfc.programs.view.verdicts.tile import Level, Tile, absent, duration, worst_of
 
 SLOW = 0.9
 """Frames at less than this share of the camera's own rate are a camera or host that does not keep up."""
@@ -36,12 +36,11 @@ REFUSED: dict[Reason, tuple[str, str]] = {
 def frames(state: RunState) -> Tile:
     """Whether frames arrive, at their rate, and are used."""
     tile, camera, silent_s = partial(Tile, "FRAMES"), state.camera, state.frame_silent_s
-    if camera.life is Liveness.NEVER:
-        if state.running_s > GRACE_S:
-            return tile("NO CAMERA", "no message", Level.WARNING, "There is no camera. Start it for this run.")
-        return tile("WAITING", "for the camera")
-    if camera.life in (Liveness.STOPPED, Liveness.STARTING):
-        return tile(camera.life.name, "the camera, on request")
+    gone = absent("FRAMES", "camera", camera, state.running_s, "the loop holds")
+    if gone is not None and camera.life is not Liveness.SILENT:
+        return gone
+    if camera.life is Liveness.STARTING:
+        return tile("STARTING", "the camera")
     if silent_s is not None:
         alive = camera.life is not Liveness.SILENT and silent_s > SURELY_S
         who = "the camera runs, but sends none" if alive else "camera silent"

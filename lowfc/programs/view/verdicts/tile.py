@@ -4,6 +4,8 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from enum import IntEnum
 
+from lowfc.programs.view.verdicts.run_state import GRACE_S, Liveness, Process
+
 _LONGEST = 110  # letters
 
 
@@ -66,3 +68,27 @@ def duration(seconds: float) -> str:
 def short(text: str) -> str:
     """A text from outside, as long as a tile has room for."""
     return text if len(text) <= _LONGEST else f"{text[: _LONGEST - 3]}..."
+
+
+def absent(title: str, name: str, process: Process, running_s: float, harm: str) -> Tile | None:
+    """Tile of a process that is silent, was stopped, or has not sent anything yet; None for one that runs.
+
+    Args:
+        title: of the tile.
+        name: of the process, for people.
+        process: how it is.
+        running_s: time since the first message of any process.
+        harm: what its silence means.
+    """
+    since = duration(process.silent_s)
+    if process.life is Liveness.SILENT:
+        advice = f"{name.capitalize()} silent for {since}: {harm}. See its last output, restart it."
+        return Tile(title, "DEAD", f"{name} silent for {since}", Level.BAD, advice)
+    if process.life is Liveness.STOPPED:
+        return Tile(title, "STOPPED", f"the {name}, on request", advice=f"The {name} was stopped.")
+    if process.life is Liveness.NEVER and running_s > GRACE_S:
+        advice = f"There is no {name}: {harm}. Start it for this run."
+        return Tile(title, f"NO {name.upper()}", "no message from it", Level.WARNING, advice)
+    if process.life is Liveness.NEVER:
+        return Tile(title, "WAITING", f"for the {name}", advice=f"Waiting for the {name}.")
+    return None

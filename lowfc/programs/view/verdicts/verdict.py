@@ -13,8 +13,8 @@ from lowfc.control.loop.safety import Limit, LoopMode, Reason
 from lowfc.control.loop.wording import counted
 from lowfc.programs.view.verdicts.camera_verdict import LATELY, all_refused, frames, star
 from lowfc.programs.view.verdicts.facts import facts
-from lowfc.programs.view.verdicts.run_state import GRACE_S, RECENT_S, Liveness, RunState
-from lowfc.programs.view.verdicts.tile import Level, Tile, Verdict, duration, figure, short, worst_of
+from lowfc.programs.view.verdicts.run_state import RECENT_S, Liveness, RunState
+from lowfc.programs.view.verdicts.tile import Level, Tile, Verdict, absent, duration, figure, short, worst_of
 from lowfc.programs.view.verdicts.wavefront_verdict import WORSE, wavefront
 
 NEAR_STROKE = 0.9
@@ -62,23 +62,16 @@ def _loop(state: RunState) -> Tile:
     tile, mode = partial(Tile, "LOOP"), state.mode
     controller, camera, mirror = state.controller, state.camera, state.mirror
     others = {camera.life, mirror.life}
-    if controller.life is Liveness.SILENT:
+    if controller.life is Liveness.SILENT and others <= {Liveness.SILENT, Liveness.NEVER}:
         since = duration(controller.silent_s)
-        if others <= {Liveness.SILENT, Liveness.NEVER}:
-            advice = f"No message from any process for {since}: the run was killed, or this view is cut off from it. "
-            advice += "Check that its processes run."
-            return tile("NO MESSAGES", f"from any process for {since}", Level.BAD, advice)
-        advice = f"Controller silent for {since}: nothing is corrected, the mirror holds or relaxes by itself. "
-        return tile("DEAD", f"controller silent for {since}", Level.BAD, f"{advice}See its last output, restart it.")
-    if controller.life is Liveness.STOPPED:
-        if others <= {Liveness.STOPPED, Liveness.NEVER}:
-            return tile("ENDED", "all processes stopped on request", advice="The run has ended.")
-        return tile("STOPPED", "controller stopped on request", advice="The controller was stopped: no loop runs.")
-    if controller.life is Liveness.NEVER or mode is None:
-        if state.running_s > GRACE_S:
-            advice = "There is no controller: nothing is corrected. Start `lowfc controller` for this run."
-            return tile("NO CONTROLLER", "no message from it", Level.WARNING, advice)
-        return tile("WAITING", "for the controller", advice="Waiting for the run to start.")
+        advice = f"No message from any process for {since}: the run was killed, or this view is cut off from it. "
+        return tile("NO MESSAGES", f"for {since}", Level.BAD, f"{advice}Check that its processes run.")
+    if controller.life is Liveness.STOPPED and others <= {Liveness.STOPPED, Liveness.NEVER}:
+        return tile("ENDED", "all processes stopped on request", advice="The run has ended.")
+    harm = "nothing is corrected, the mirror holds or relaxes by itself"
+    gone = absent("LOOP", "controller", controller, state.running_s, harm)
+    if gone is not None or mode is None:
+        return gone or tile("WAITING", "for the controller")
     if mode is LoopMode.SAFE:
         advice = "Loop in safe mode: the mirror stays flat until `lowfc ctl clear`; do that when it is safe."
         return tile("SAFE", state.why or "mirror flat, latched", Level.BAD, advice)
@@ -126,15 +119,10 @@ def _open(state: RunState) -> Tile:
 
 
 def _mirror(state: RunState) -> Tile:
-    tile, mirror, reported = partial(Tile, "MIRROR"), state.mirror, state.mirror_state
-    if mirror.life is Liveness.SILENT:
-        since = duration(mirror.silent_s)
-        advice = f"Mirror silent for {since}: commands go nowhere. See its last output, restart it."
-        return tile("DEAD", f"silent for {since}", Level.BAD, advice)
-    if mirror.life is Liveness.NEVER and state.running_s > GRACE_S:
-        return tile("NO MIRROR", "no message from it", Level.WARNING, "There is no mirror. Start it for this run.")
-    if mirror.life is Liveness.STOPPED:
-        return tile("STOPPED", "the mirror, on request")
+    tile, reported = partial(Tile, "MIRROR"), state.mirror_state
+    gone = absent("MIRROR", "mirror", state.mirror, state.running_s, "commands go nowhere")
+    if gone is not None:
+        return gone
     if reported is None or reported.status == wire.MIRROR_STATUS_WAITING:
         return tile("WAITING", "no command yet")
     if reported.status == wire.MIRROR_STATUS_EXPIRED and state.controller.life is not Liveness.STARTING:
@@ -194,18 +182,17 @@ def _recorder(state: RunState) -> Tile:
     tile, recorder, done = partial(Tile, "RECORDER"), state.recorder, state.recording
     if done is None:
         return tile("NONE", "there is no recorder: nothing is recorded")
-    log, again = short(PurePath(done.file).stem), "Start `lowfc record` again."
+    log = short(PurePath(done.file).stem)
     if done.failure:
         advice = f"Recording failed, the loop goes on: {short(done.failure)}. Make room and start `lowfc record` again."
         return tile("FAILED", short(done.failure), Level.BAD, advice)
-    if recorder.life is Liveness.SILENT:
-        since = duration(recorder.silent_s)
-        advice = f"Recorder silent for {since}: the run is not recorded, the loop goes on. {again}"
-        return tile("DEAD", f"silent for {since}: nothing is recorded", Level.BAD, advice)
+    gone = absent("RECORDER", "recorder", recorder, state.running_s, "nothing is recorded, the loop goes on")
+    if gone is not None and recorder.life is Liveness.SILENT:
+        return gone
     if recorder.life is Liveness.STOPPED:
         if state.controller.life not in (Liveness.RUNNING, Liveness.STARTING):
             return tile("STOPPED", f"{log} is complete")
-        advice = f"The recorder was stopped, the loop goes on: nothing is recorded. {again}"
+        advice = "The recorder was stopped, the loop goes on: nothing is recorded. Start `lowfc record` again."
         return tile("STOPPED", f"{log} is complete; nothing is recorded now", Level.WARNING, advice)
     if done.stopped:
         advice = "Recording was stopped by an operator: the night is not kept. `lowfc ctl record start` goes on."
