@@ -2,7 +2,6 @@
 
 import json
 import tempfile
-import tomllib
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cache, partial
@@ -37,7 +36,7 @@ from lowfc.control.loop.inputs import Input, Load, MirrorShape, Tick
 from lowfc.control.loop.requests import prepared
 from lowfc.control.loop.state import State
 from lowfc.programs.core.controller import Controller
-from lowfc.programs.view.snapshot import SHOWN
+from lowfc.programs.view.snapshot import SHOWN, Accumulator
 from lowfc.testing.clock import FakeClock
 from lowfc.testing.memory_bus import MemoryBus, MemoryHub
 from sim_dm import process
@@ -269,12 +268,11 @@ def _obey(data: bytes) -> None:
 
 
 def _shown(data: bytes) -> None:
-    """Whatever is called by the name of a topic that is looked at."""
+    """A message under the name of each topic that is looked at."""
+    accumulator = Accumulator()
     for topic in SHOWN:
-        try:
-            topic.message.FromString(data)
-        except codec.DecodeError:
-            continue
+        accumulator.add(topic, topic.at("dm"), data, 1)
+    accumulator.snapshot(2)
 
 
 def _asked() -> list[wire.Request]:
@@ -305,54 +303,41 @@ def _requests() -> list[Target]:
     return found
 
 
+def _by(read: Callable[[Path], object], path: Path) -> Callable[[bytes], object]:
+    """Reads input from a file at this path."""
+
+    def run(data: bytes) -> object:
+        path.write_bytes(data)
+        return read(path)
+
+    return run
+
+
+def _bytes_of(save: Callable[[Path], object], path: Path) -> tuple[bytes]:
+    save(path)
+    return (path.read_bytes(),)
+
+
 def _files(folder: Path) -> list[Target]:
-    def by(read: Callable[[Path], object], suffix: str) -> Callable[[bytes], object]:
-        def run(data: bytes) -> object:
-            path = folder / f"input{suffix}"
-            path.write_bytes(data)
-            return read(path)
-
-        return run
-
-    def bytes_of(save: Callable[[Path], None], suffix: str) -> bytes:
-        path = folder / f"whole{suffix}"
-        save(path)
-        return path.read_bytes()
-
     law = Law(*(np.full(len(NOLL), value, np.float32) for value in (0.4, 0.0, 50.0)))
     linear = integrator(law.gain, law.leak, NOLL, 1.0, 1000.0)
     with_modes = identified(replace(CALIBRATION, actuators_to_modes=np.ones((len(NOLL), 20), np.float32)))
     fits = tuple(calibration_file.to_bytes(each) for each in (CALIBRATION, with_modes))
+    laws = _bytes_of(partial(law_file.save, linear), folder / "law.fits")
+    pupils = _bytes_of(lambda path: np.savez(path, quarter=np.ones((4, 4))), folder / "pupil.npz")
     sam = json.loads(layouts.SHIPPED.read_text(encoding="utf-8"))["layouts"]["sam27d07"]
-    named = json.dumps({"layouts": {"a": sam}}).encode()
+    sams = tuple(json.dumps(one).encode() for one in (sam, {"layouts": {"a": sam}}))
     toml = Configuration().to_toml().encode()
-    assert tomllib.loads(toml.decode())
-    quarter = np.ones((4, 4))
-    wrong = (LowfcError,)
+    readers: dict[str, tuple[tuple[bytes, ...], Callable[[Path], object], str, int]] = {
+        "calibration file": (fits, calibration_file.load, "input.fits", 300),
+        "law file": (laws, law_file.load, "input.fits", 300),
+        "configuration file": ((toml,), configuration.load, "input.toml", 60),
+        "layout file": (sams, lambda path: layouts.load_layout(f"{path}"), "input.json", 20),
+        "pupil file": (pupils, lambda path: load_pupil(256, path), "input.npz", 30),
+    }
     return [
-        Target("calibration file", fits, by(calibration_file.load, ".fits"), wrong, cost=300),
-        Target(
-            "law file",
-            (bytes_of(partial(law_file.save, linear), ".fits"),),
-            by(law_file.load, ".fits"),
-            wrong,
-            cost=300,
-        ),
-        Target("configuration file", (toml,), by(configuration.load, ".toml"), wrong, cost=60),
-        Target(
-            "layout file",
-            (json.dumps(sam).encode(), named),
-            by(lambda path: layouts.load_layout(f"{path}"), ".json"),
-            wrong,
-            cost=20,
-        ),
-        Target(
-            "pupil file",
-            (bytes_of(lambda path: np.savez(path, quarter=quarter), ".npz"),),
-            by(lambda path: load_pupil(256, path), ".npz"),
-            wrong,
-            cost=30,
-        ),
+        Target(name, corpus, _by(read, folder / file), (LowfcError,), cost=cost)
+        for name, (corpus, read, file, cost) in readers.items()
     ]
 
 
@@ -366,25 +351,13 @@ def _logs(folder: Path) -> list[Target]:
     night.frames(20)
     run = (night.write(folder / "night.mcap").read_bytes(),)
 
-    def read(data: bytes) -> None:
-        path = folder / "read.mcap"
-        path.write_bytes(data)
-        for _ in LogReader(path, skip_damaged=True):
-            pass
-
-    def history(data: bytes) -> None:
-        path = folder / "history.mcap"
-        path.write_bytes(data)
-        read_history(LogReader(path))
-
-    def recovered(data: bytes) -> None:
-        path = folder / "recover.mcap"
-        path.write_bytes(data)
+    def recovered(path: Path) -> None:
         with tempfile.TemporaryDirectory(dir=folder) as out:
             recover(path, Path(out) / "out.mcap")
 
+    path, wrong = folder / "input.mcap", (LowfcError,)
     return [
-        Target("log, read", whole, read, (LowfcError,), cost=300),
-        Target("log, its history", run, history, (LowfcError,), cost=300),
-        Target("log, recovered", whole, recovered, (LowfcError,), cost=600),
+        Target("log, read", whole, _by(lambda path: list(LogReader(path, skip_damaged=True)), path), wrong, cost=300),
+        Target("log, its history", run, _by(lambda path: read_history(LogReader(path)), path), wrong, cost=300),
+        Target("log, recovered", whole, _by(recovered, path), wrong, cost=600),
     ]
