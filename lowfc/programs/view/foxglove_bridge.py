@@ -45,8 +45,6 @@ class FoxgloveBridge:
         port: where apps connect, on loopback.
         subscriptions: client and topic of each that there is now.
         kept: the states in force, by key.
-        clients: numbers of those that subscribed to something.
-        messages: how many were logged, received by a client or not.
     """
 
     def __init__(self, bus: Bus, clock: Clock, run_id: str, port: int = DEFAULT_PORT) -> None:
@@ -70,10 +68,9 @@ class FoxgloveBridge:
         self._names = Names()
         self._channels: dict[str, Channel] = {}
         self._channels_lock = threading.Lock()
-        self.clients: set[int] = set()
         self.kept: dict[str, Sample] = {}
         self.subscriptions: set[tuple[int, str]] = set()
-        self.messages = 0
+        self._messages = 0
         for topic in SHOWN:
             if topic.key == topic.at(ALL):  # the names in the others' keys are not known yet
                 self._channel(topic, topic.key)
@@ -100,7 +97,7 @@ class FoxgloveBridge:
                     kept = self.kept.get(sample.key)
                     if kept is None or kept.sequence < sample.sequence:
                         self._publish(topic, sample)
-            self.service.work = self.messages
+            self.service.work = self._messages
             self.service.beat()
             time.sleep(_TURN_S)
         self.service.finish()
@@ -108,7 +105,6 @@ class FoxgloveBridge:
 
     def on_subscribe(self, client: "Client", channel: "ChannelView") -> None:
         """Give a client the state that is in force; called by the server."""
-        self.clients.add(client.id)
         self.subscriptions.add((client.id, channel.topic))
         kept = self.kept.get(channel.topic.removeprefix("/"))
         if kept is not None:
@@ -122,7 +118,7 @@ class FoxgloveBridge:
         self._names.admit(topic, sample.key)
         if topic.queryable:
             self.kept[sample.key] = sample
-        self.messages += 1
+        self._messages += 1
         self._channel(topic, sample.key).log(sample.payload, log_time=sample.publish_time_ns)
 
     def _channel(self, topic: Topic, key: str) -> "Channel":
@@ -155,6 +151,5 @@ def serve_foxglove(run: Run, clock: Clock, port: int = DEFAULT_PORT) -> None:
         bridge.service.catch_signals()
         sys.stderr.write(f"serving run {run.run_id!r} at ws://{HOST}:{bridge.port}; Ctrl-C ends it\n")
         bridge.run()
-        sys.stderr.write(f"clients: {len(bridge.clients)}, messages: {bridge.messages}\n")
     finally:
         bus.close()

@@ -3,7 +3,7 @@
 import numpy as np
 import rerun as rr
 
-from lowfc.arrays import Pixels, Single
+from lowfc.arrays import Single
 from lowfc.control.calibration.calibration import Calibration
 from lowfc.control.loop.estimator import difference
 from lowfc.programs.view.draw.colours import Rgb, sequential
@@ -26,7 +26,6 @@ class Sensor(Panel):
         self._frame, self._reference = Picture(FRAME), Picture(REFERENCE)
         self._change = SignedPicture(DIFFERENCE, 1.0, "DN")
         self._brightest = Scale(10.0)
-        self._stretch = np.zeros((1, 3), np.uint8)
         self._raw_due_ns = 0
 
     def draw(self, stream: rr.RecordingStream, snapshot: Snapshot) -> None:
@@ -48,18 +47,14 @@ class Sensor(Panel):
             flux_dn = difference(calibration, frame.ravel(), 0.0, self._difference) or 0.0
             change_dn = self._difference * flux_dn * calibration.good if flux_dn else np.zeros(frame.size)
             self._change.show_values(stream, time_ns, change_dn.reshape(frame.shape))
-        self._show_frame(stream, frame, dark_dn, time_ns)
+        light_dn = np.maximum(frame, dark_dn) - np.float32(dark_dn)
+        self._brightest.fit(light_dn, time_ns)
+        limit_dn = self._brightest.limit
+        caption = f"0 to {limit_dn:g} DN, logarithmic"
+        self._frame.show(stream, time_ns, _log_stretched(light_dn, limit_dn), caption)
         if time_ns >= self._raw_due_ns:
             self._raw_due_ns = time_ns + _RAW_PERIOD_NS
             stream.log(RAW, rr.Image(frame, color_model="L"))
-
-    def _show_frame(self, stream: rr.RecordingStream, frame: Pixels, dark_dn: int, time_ns: int) -> None:
-        changed = self._brightest.fit(np.array([max(0, int(frame.max()) - dark_dn)]), time_ns)
-        limit = round(self._brightest.limit)
-        if changed:  # a colour for each DN: looking up is cheaper than a logarithm of every pixel
-            self._stretch = _log_stretched(np.arange(limit + 1, dtype=np.float32), limit)
-        light = np.clip(frame, dark_dn, dark_dn + limit) - np.uint16(dark_dn)
-        self._frame.show(stream, time_ns, np.take(self._stretch, light, axis=0), f"0 to {limit} DN, logarithmic")
 
 
 def _log_stretched(light_dn: Single, limit_dn: float) -> Rgb:

@@ -137,9 +137,7 @@ class Watcher:
             latest=_rms(self._last(LATEST_S))[0],
             true=true,
             attained=self._attained,
-            latency_us=(float(np.median(durations_us)), float(np.percentile(durations_us, 99)))
-            if durations_us.size
-            else None,
+            latency_us=tuple(np.percentile(durations_us, [50, 99]).tolist()) if durations_us.size else None,
             stroke_nm=float(np.abs(surface_nm).max(initial=0.0)) if surface_nm is not None else 0.0,
             stroke_limit_nm=snapshot.stroke_nm,
             mirror_state=self._mirror,
