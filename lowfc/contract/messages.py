@@ -36,6 +36,11 @@ class Role(StrEnum):
     REPLAY = "replay"
 
 
+EVERYBODY = frozenset(Role)
+_MONITORS = frozenset({Role.RECORDER, Role.VIEWER})
+_CAMERA, _MIRROR, _CONTROLLER = frozenset({Role.CAMERA}), frozenset({Role.MIRROR}), frozenset({Role.CONTROLLER})
+
+
 class Rate(StrEnum):
     """How often a topic is published, where it is not a number of hertz."""
 
@@ -52,6 +57,7 @@ class Topic:
         message: class of the payload.
         rate: loop, on event, or the number of hertz.
         publisher: whose it is to put; by a router, nobody else's messages get through.
+        sentence: what it is.
         subscribers: who gets it.
         simulated_only: there is no such topic on a bench with real devices.
         deterministic: in lockstep two runs with the same seed write the same payload bytes.
@@ -60,15 +66,14 @@ class Topic:
         direct_subscriber: who waits for it, and gets it by a way of its own from its publisher on the same host.
         multiple_publishers: on one host others may put it too, so that its reader hears the bus beside its own way.
         optional: a recording may leave it out; what the others say of the run needs none of it.
-        sentence: what it is.
     """
 
     key: str
     message: type[Message]
     rate: Rate | float
     publisher: frozenset[Role]
-    subscribers: frozenset[Role]
     sentence: str
+    subscribers: frozenset[Role] = _MONITORS
     simulated_only: bool = False
     deterministic: bool = True
     queryable: bool = False
@@ -94,31 +99,32 @@ class Topic:
         return key.startswith(before) and key.endswith(after) and len(key) > len(before) + len(after)
 
 
-EVERYBODY = frozenset(Role)
-_WATCHERS = frozenset({Role.RECORDER, Role.VIEWER})
-_CAMERA, _MIRROR, _CONTROLLER = frozenset({Role.CAMERA}), frozenset({Role.MIRROR}), frozenset({Role.CONTROLLER})
-
 FRAME = Topic(
     "lowfc/camera/frame",
     RawImage,
     Rate.LOOP,
     _CAMERA,
-    _CONTROLLER | _WATCHERS,
     "Sensor image, mono16, DN; its time is the end of the exposure.",
+    subscribers=_CONTROLLER | _MONITORS,
     latest_only=True,
     direct_subscriber=Role.CONTROLLER,
     optional=True,
 )
 CAMERA_STATE = Topic(
-    "lowfc/camera/state", wire.CameraState, 2.0, _CAMERA, EVERYBODY, "The camera's settings.", queryable=True
+    "lowfc/camera/state",
+    wire.CameraState,
+    2.0,
+    _CAMERA,
+    "The camera's settings.",
+    subscribers=EVERYBODY,
+    queryable=True,
 )
-STEP = Topic("lowfc/control/step", wire.ControlStep, Rate.LOOP, _CONTROLLER, _WATCHERS, "One step of the control law.")
+STEP = Topic("lowfc/control/step", wire.ControlStep, Rate.LOOP, _CONTROLLER, "One step of the control law.")
 CONTROL_INPUT = Topic(
     "lowfc/control/input",
     wire.ControlInput,
     Rate.EVENT,
     _CONTROLLER,
-    _WATCHERS,
     "What the controller took in other than frames and requests, with the verdicts of its clock.",
 )
 TIMING = Topic(
@@ -126,7 +132,6 @@ TIMING = Topic(
     wire.ControlTiming,
     10.0,
     _CONTROLLER,
-    _WATCHERS,
     "How long each stage of each step took.",
     deterministic=False,
     optional=True,
@@ -136,20 +141,19 @@ CONTROLLER_STATE = Topic(
     wire.ControllerState,
     1.0,
     _CONTROLLER,
-    _WATCHERS,
     "Everything the next command depends on, besides the calibration.",
     queryable=True,
 )
 REQUEST = Topic(
-    "lowfc/control/request", wire.Request, Rate.EVENT, _CONTROLLER, _WATCHERS, "What an operator asked, and the answer."
+    "lowfc/control/request", wire.Request, Rate.EVENT, _CONTROLLER, "What an operator asked, and the answer."
 )
 COMMAND = Topic(
     "lowfc/mirror/{name}/command",
     wire.MirrorCommand,
     Rate.LOOP,
     _CONTROLLER,
-    _MIRROR | {Role.RECORDER},
     "Where the mirror shall be.",
+    subscribers=_MIRROR | {Role.RECORDER},
     direct_subscriber=Role.MIRROR,
     multiple_publishers=True,
 )
@@ -158,8 +162,8 @@ MIRROR_STATE = Topic(
     wire.MirrorState,
     Rate.LOOP,
     _MIRROR,
-    _CONTROLLER | _CAMERA | _WATCHERS,
     "Where the mirror is.",
+    subscribers=_CONTROLLER | _CAMERA | _MONITORS,
     latest_only=True,
     optional=True,
 )
@@ -168,7 +172,6 @@ SURFACE = Topic(
     RawImage,
     30.0,
     _MIRROR,
-    _WATCHERS,
     "The mirror's surface over the pupil, 32FC1, nm: for eyes.",
     latest_only=True,
     optional=True,
@@ -178,7 +181,6 @@ TRUTH = Topic(
     wire.Truth,
     Rate.LOOP,
     _CAMERA,
-    _WATCHERS,
     "What the simulation knows and no sensor does.",
     simulated_only=True,
     optional=True,
@@ -188,7 +190,6 @@ OFFLOAD = Topic(
     wire.ModalOffload,
     1.0,
     _CONTROLLER,
-    _WATCHERS,
     "Mean modal command, for another adaptive-optics system to take over.",
 )
 LAW = Topic(
@@ -196,7 +197,6 @@ LAW = Topic(
     wire.LinearLaw,
     Rate.EVENT,
     _CONTROLLER,
-    _WATCHERS,
     "Control law in place of the integrator, with its matrices; states have its identity.",
     queryable=True,
 )
@@ -205,7 +205,6 @@ PLAY = Topic(
     wire.Play,
     Rate.EVENT,
     _CONTROLLER,
-    _WATCHERS,
     "Table that is being played, frame by frame; states have its identity.",
     queryable=True,
 )
@@ -214,7 +213,6 @@ CALIBRATION = Topic(
     wire.Calibration,
     Rate.EVENT,
     _CONTROLLER,
-    _WATCHERS,
     "What turns a frame into a command.",
     queryable=True,
 )
@@ -223,8 +221,8 @@ EVENT = Topic(
     Log,
     Rate.EVENT,
     EVERYBODY,
-    EVERYBODY,
     "A named event, from the table of events.",
+    subscribers=EVERYBODY,
     deterministic=False,
 )
 HEALTH = Topic(
@@ -232,8 +230,8 @@ HEALTH = Topic(
     wire.Health,
     2.0,
     EVERYBODY,
-    EVERYBODY,
     "How a process is.",
+    subscribers=EVERYBODY,
     deterministic=False,
     queryable=True,
 )
