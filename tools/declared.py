@@ -9,8 +9,9 @@ from google.protobuf.descriptor_pb2 import FileDescriptorSet
 
 from lowfc.client import requests, stream
 from lowfc.contract.codecs.codec import MOST_BYTES
-from lowfc.contract.configuration import Acceptance, Mirror, keys
+from lowfc.contract.configuration import Acceptance, keys
 from lowfc.contract.messages import CAMERA_STATE, COMMAND, EVENT, FRAME, HEALTH, MIRROR_STATE, SURFACE, Role, Topic
+from lowfc.contract.sections import Mirror
 from lowfc.control.calibration import linearity
 from lowfc.control.laws import transfer_function
 from lowfc.control.laws.stability import LEAST_GAIN_MARGIN, LEAST_PHASE_MARGIN_DEG, LOWEST_GAIN

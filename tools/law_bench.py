@@ -8,7 +8,8 @@ import numpy as np
 
 from lowfc.adapters.files import factory
 from lowfc.arrays import Array
-from lowfc.contract.configuration import Configuration, load, sensor_keys
+from lowfc.contract.configuration import Configuration, load
+from lowfc.contract.sections import sensor_keys
 from lowfc.control.calibration.calibration import Calibration
 from lowfc.control.laws.continuous import Timing
 from lowfc.control.laws.linear_law import LinearLaw

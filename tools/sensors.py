@@ -11,7 +11,8 @@ from rich.progress import track
 from threadpoolctl import threadpool_limits
 
 from lowfc.adapters.files import factory
-from lowfc.contract.configuration import SENSORS, Configuration, load, sensor_keys
+from lowfc.contract.configuration import Configuration, load
+from lowfc.contract.sections import SENSORS, sensor_keys
 from lowfc.control.calibration.calibration import Calibration, normalise_flux
 from lowfc.optics.chain.sensor import light_budget, pupil_radii, reference, response, shear_response
 from lowfc.optics.chain.zernike import zernikes

@@ -19,34 +19,7 @@ from lowfc.contract.errors import ConfigurationError, brief
 from lowfc.contract.former_names import renamed_keys
 from lowfc.contract.network import Network as Network
 from lowfc.contract.printable import printable
-from lowfc.contract.sections import (
-    PRESETS,
-    SENSORS,
-    Camera,
-    Disturbance,
-    Mirror,
-    NotNegative,
-    Positive,
-    Preset,
-    Section,
-    SensorSection,
-    Star,
-    sensor_keys,
-)
-
-__all__ = [
-    "PRESETS",
-    "SENSORS",
-    "Camera",
-    "Configuration",
-    "Disturbance",
-    "Mirror",
-    "Preset",
-    "SensorSection",
-    "keys",
-    "load",
-    "sensor_keys",
-]
+from lowfc.contract.sections import Camera, Disturbance, Mirror, NotNegative, Positive, Section, SensorSection, Star
 
 LATE_NS, HOLD_NS = 20_000_000, 50_000_000
 """Least age of a late frame and least silence of a camera, where the configuration leaves them open."""

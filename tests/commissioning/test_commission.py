@@ -10,9 +10,10 @@ import pytest
 
 from lowfc.adapters.files import calibration_file
 from lowfc.adapters.files.factory import camera_state
-from lowfc.contract.configuration import Camera, Configuration, Control
+from lowfc.contract.configuration import Configuration, Control
 from lowfc.contract.errors import BusError, CalibrationError, DataFileError, RequestRefusedError
 from lowfc.contract.messages import wire
+from lowfc.contract.sections import Camera
 from lowfc.programs.commissioning.calibrate.run import partial_of
 from lowfc.programs.commissioning.checks import Status
 from lowfc.programs.commissioning.commission.commissioning import Commission, Commissioning, first_of

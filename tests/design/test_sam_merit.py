@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from lowfc.adapters.files.layouts import load_layout
 from lowfc.adapters.files.sensors import load_pupil
-from lowfc.contract.configuration import SensorSection
+from lowfc.contract.sections import SensorSection
 from lowfc.design import sam_search
 from lowfc.design.sam_goal import MERITS, Goal, figures, merit, paper_ratios
 from lowfc.design.sam_merit import (

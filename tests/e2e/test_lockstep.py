@@ -11,8 +11,9 @@ import pytest
 
 from lowfc.adapters.files.sensors import sensor_named
 from lowfc.adapters.logs.selection import EVERYTHING
-from lowfc.contract.configuration import SENSORS, load
+from lowfc.contract.configuration import load
 from lowfc.contract.messages import topic_of, wire
+from lowfc.contract.sections import SENSORS
 from lowfc.optics.chain.sensor import light_budget
 from lowfc.programs.core.recording.volume import bytes_per_s
 from sim_camera.prediction import tilt_residual_mas

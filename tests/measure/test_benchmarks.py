@@ -18,7 +18,7 @@ from benchmarks.peers import contest
 from benchmarks.peers.contest import BARE, CONTESTANTS
 from benchmarks.peers.shared import ACTUATORS, MARKS, NumpyStep, Plan, Problem
 from benchmarks.sizes import Size, configuration, made_up
-from lowfc.contract.configuration import Camera
+from lowfc.contract.sections import Camera
 from lowfc.control.loop import advance
 from lowfc.programs.measure.control_step import ControlStep
 from lowfc.programs.measure.frame_source import Payloads

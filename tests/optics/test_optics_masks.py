@@ -6,8 +6,8 @@ import pytest
 
 from lowfc.adapters.files.layouts import layout_names, layout_warnings, load_layout
 from lowfc.adapters.files.sensors import load_pupil, sensor_from
-from lowfc.contract.configuration import SensorSection
 from lowfc.contract.errors import ConfigurationError, DataFileError
+from lowfc.contract.sections import SensorSection
 from lowfc.optics.chain.sam import Layout, check, equal_holes, is_even_symmetric, transmission
 
 TWO = {"purpose": "two holes", "hole_diameter": 0.1, "holes": [[0.1, 0.2], [-0.3, 0.0]]}

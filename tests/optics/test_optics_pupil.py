@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from lowfc.adapters.files.sensors import load_pupil, sensor_from, sensor_named
-from lowfc.contract.configuration import SensorSection
 from lowfc.contract.errors import ConfigurationError
+from lowfc.contract.sections import SensorSection
 from lowfc.optics.chain.focal_mask import disk, phase_spot
 from lowfc.optics.chain.fourier import to_image, to_pupil
 from lowfc.optics.chain.grid import OPEN_AREA, SAMPLES, image_axis, pupil_axis

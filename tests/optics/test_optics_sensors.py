@@ -7,8 +7,9 @@ import pytest
 
 from lowfc.adapters.files import factory
 from lowfc.adapters.files.sensors import sensor_from, sensor_named
-from lowfc.contract.configuration import SENSORS, SensorSection, load
+from lowfc.contract.configuration import load
 from lowfc.contract.errors import CalibrationError
+from lowfc.contract.sections import SENSORS, SensorSection
 from lowfc.optics.chain.band import Band, gauss_legendre, monochromatic, uniform
 from lowfc.optics.chain.fourier import kernel, to_image
 from lowfc.optics.chain.grid import image_axis

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from lowfc.adapters.files.sensors import sensor_from, sensor_named
-from lowfc.contract.configuration import SensorSection
+from lowfc.contract.sections import SensorSection
 from lowfc.optics.chain.band import gauss_legendre
 from lowfc.optics.chain.grid import pupil_axis
 from lowfc.optics.chain.mirror import Mirror, influence_factors, modes_to_actuators, surface_nm

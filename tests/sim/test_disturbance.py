@@ -11,10 +11,10 @@ from hypothesis import strategies as st
 
 from lowfc.adapters.bus.bus import Sample
 from lowfc.contract.codecs.codec import decode_frame
-from lowfc.contract.configuration import PRESETS
 from lowfc.contract.envelope import count_of, start_of
 from lowfc.contract.errors import ConfigurationError
 from lowfc.contract.messages import FRAME, image
+from lowfc.contract.sections import PRESETS
 from lowfc.testing.clock import FakeClock
 from lowfc.testing.memory_bus import MemoryBus, MemoryHub
 from sim_camera.disturbance import (

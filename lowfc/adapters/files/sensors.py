@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 from lowfc.adapters.files.layouts import layout_warnings, load_layout
 from lowfc.arrays import Array
 from lowfc.contract.codecs import input_file
-from lowfc.contract.configuration import SENSORS, SensorSection, sensor_keys
 from lowfc.contract.errors import ConfigurationError, DataFileError, nearest
+from lowfc.contract.sections import SENSORS, SensorSection, sensor_keys
 from lowfc.optics.chain import sam as sams
 from lowfc.optics.chain.focal_mask import bowtie, disk, phase_spot
 from lowfc.optics.chain.grid import SAMPLES

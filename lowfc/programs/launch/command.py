@@ -6,8 +6,8 @@ from typing import Annotated, Any
 import typer
 
 from lowfc.adapters.process.terminal import ConfigFile, Json, configuration
-from lowfc.contract.configuration import Preset
 from lowfc.contract.errors import ConfigurationError
+from lowfc.contract.sections import Preset
 from lowfc.programs.cli.output import put
 
 
@@ -38,7 +38,7 @@ def sim_loop(
     """
     from lowfc.adapters.process.realtime import spread
     from lowfc.adapters.viewer.rerun_viewer import Show, has_screen
-    from lowfc.contract.configuration import sensor_keys
+    from lowfc.contract.sections import sensor_keys
     from lowfc.programs.core.recording.volume import outlook
     from lowfc.programs.core.start_up import check_files
     from lowfc.programs.launch.sim_loop import sim_loop as run

@@ -16,8 +16,8 @@ from lowfc.adapters.files.layouts import layout_names
 from lowfc.adapters.files.sensors import sensor_from, sensor_named
 from lowfc.adapters.files.twin_cache import load_or_build
 from lowfc.arrays import Array, Mask
-from lowfc.contract.configuration import SensorSection
 from lowfc.contract.errors import ConfigurationError
+from lowfc.contract.sections import SensorSection
 from lowfc.design.estimators import Fit, fit
 from lowfc.design.trials import gram
 from lowfc.optics.chain.band import Band, uniform

@@ -6,7 +6,7 @@ import numpy as np
 
 from lowfc.adapters.files.layouts import load_layout
 from lowfc.adapters.files.sensors import sensor_from
-from lowfc.contract.configuration import SensorSection
+from lowfc.contract.sections import SensorSection
 from lowfc.control.calibration.calibration import condition_number
 from lowfc.design.fisher import cramer_rao, variance_e
 from lowfc.design.paper import STAR, TABLE4_EXPOSURE_S, TABLE4_READ_NOISE_E

@@ -8,7 +8,7 @@ import numpy as np
 from scipy.optimize import brentq
 
 from lowfc.arrays import Array
-from lowfc.contract.configuration import SensorSection
+from lowfc.contract.sections import SensorSection
 from lowfc.design.fisher import covariance, variance_e
 from lowfc.design.paper import STAR, TABLE3_READ_NOISE_E, TABLE3_WAVES, TABLE4_EXPOSURE_S, TABLE4_MAS
 from lowfc.design.trials import bounds_waves, expected_r_squared, expected_rms

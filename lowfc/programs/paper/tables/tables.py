@@ -5,7 +5,7 @@ from collections.abc import Iterator
 import numpy as np
 
 from lowfc.adapters.files.layouts import load_layout
-from lowfc.contract.configuration import SensorSection
+from lowfc.contract.sections import SensorSection
 from lowfc.optics.chain.zernike import NOLLS_14, mode_name
 from lowfc.programs.paper.cases import Case, Context, Row, prepared
 from lowfc.programs.paper.tables.conditioning import conditioning
