@@ -35,6 +35,7 @@ def configured(**changes: object) -> Configuration:
 
 def played(loop: FoldedLoop, test: Any, *how: Any) -> list[Played]:
     """What a loop did while a test was carried out on it; it is left as it was."""
+    loop.run(5)
     live = Live(loop, lambda *_: None)
     found = loop.status().state.mode
     with loop.reserved("a test"), live.kept():

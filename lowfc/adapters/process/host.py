@@ -15,14 +15,6 @@ CPUS = "sys/devices/system/cpu"
 _STA_UNSYNC, _STA_NANO, _TIME_ERROR = 0x40, 0x2000, 5
 
 
-class Disk(NamedTuple):
-    """Where something is kept; `writable` by this process."""
-
-    free_bytes: int
-    total_bytes: int
-    writable: bool
-
-
 class Synchronisation(NamedTuple):
     """How well CLOCK_REALTIME is kept, by the kernel's account: by a daemon, what is left to correct, largest error."""
 
@@ -102,13 +94,12 @@ class Host:
         ]
         return sorted(shares, key=lambda one: -one[1])
 
-    def disk(self, folder: Path) -> Disk:
-        """The disk that a folder is on, or will be once it is made."""
+    def disk(self, folder: Path) -> tuple[int, bool]:
+        """Free bytes of the disk that a folder is on, or will be once it is made, and whether it can be written."""
         there = self.root / folder.absolute().relative_to("/")
         while not there.exists():
             there = there.parent
-        usage = psutil.disk_usage(str(there))
-        return Disk(usage.free, usage.total, os.access(there, os.W_OK))
+        return psutil.disk_usage(str(there)).free, os.access(there, os.W_OK)
 
     def synchronisation(self) -> Synchronisation:
         """How CLOCK_REALTIME is kept; of the kernel that runs, whatever `root` is."""

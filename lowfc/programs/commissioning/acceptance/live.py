@@ -25,7 +25,6 @@ from lowfc.programs.commissioning.acceptance.played import (
     played,
 )
 
-_RATE_STEPS = 50
 _LAW = ("gain", "leak", "limit_nm", "law", "calibration_id")
 
 
@@ -45,9 +44,7 @@ class Live:
         self._found = LoopMode(state.mode)
         self._progress = progress
         self._past = self._expected = 0
-        first, *_, last = client.steps(_RATE_STEPS)
-        rate_hz = (last.frame_sequence - first.frame_sequence) * 1e9 / (last.time_ns - first.time_ns)
-        self.loop = loop_of(state, self.calibration, rate_hz, self.client.laws())
+        self.loop = loop_of(state, self.calibration, self.configuration.camera.rate_hz, self.client.laws())
 
     @contextmanager
     def kept(self) -> Iterator["Live"]:

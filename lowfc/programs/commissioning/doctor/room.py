@@ -16,7 +16,6 @@ CHECKS: Table[Facts] = Table()
 """The docstring of each says what it looks at; docs/doctor.md also says when it warns."""
 
 _STALL_S = 0.1
-_SHARED_BYTES = 64e6
 _OPEN_FILES = 256
 _LIMITS = "give the user memlock unlimited in /etc/security/limits.d, or the service LimitMEMLOCK=infinity"
 
@@ -98,27 +97,12 @@ def _socket_buffers(facts: Facts) -> Check:
     )
 
 
-@CHECKS.check("shared memory")
-def _shared_memory(facts: Facts) -> Check:
-    """Size and free room of /dev/shm."""
-    cost = "`lowfc replay` cannot start its workers, and a browser with the view may die"
-    folder = Path("/dev/shm")  # noqa: S108  # looked at
-    if not (facts.host.root / "dev/shm").is_dir():
-        return warning("there is no /dev/shm", "mount a tmpfs on /dev/shm", cost)
-    found = facts.host.disk(folder)
-    detail = f"{found.free_bytes / 1e6:.0f} MB free of {found.total_bytes / 1e6:.0f} MB"
-    if found.writable and found.free_bytes >= _SHARED_BYTES:
-        return ok(detail)
-    detail += "" if found.writable else ", not writable"
-    return warning(detail, "make it larger: mount -o remount,size=1G /dev/shm, or --shm-size of the container", cost)
-
-
 @CHECKS.check("disk")
 def _disk(facts: Facts) -> Check:
     """Room for logs in `recorder.folder`, and how long it lasts at `camera.rate_hz`, as the recorder reckons."""
     section, rate_hz = facts.config.recorder, facts.config.camera.rate_hz
     folder = Path(section.folder)
-    free_bytes, _, writable = facts.host.disk(folder)
+    free_bytes, writable = facts.host.disk(folder)
     grows = bytes_per_s(facts.config, selected(facts.config))
     lasts_s = max(0.0, free_bytes - section.min_free_mb * 1e6) / grows
     detail = (
