@@ -24,10 +24,8 @@ LOOPS = {
     "simulated camera": ["--camera", "simulated"],
     "prepared frames, recorder": ["--record"],
     "prepared frames": [],
-    "free-running, recorder": ["--free-running", "--record"],
-    "free-running": ["--free-running"],
 }
-"""Options of `lowfc latency` for each loop. Free-running, it finds its rate by itself: a frame for each command."""
+"""Options of `lowfc latency` for each loop."""
 MAX_WITHOUT_COMMAND = 0.001
 RATE_WITHIN = 0.01
 COMPARED_HZ = 1000.0
@@ -48,28 +46,24 @@ def measure(options: argparse.Namespace, tell: Tell) -> Result:
     """Look for the highest rate of each loop.
 
     Returns:
-        loops (of each what `find` returns, or, free-running, its `run`), seconds and rates_hz.
+        loops (of each what `find` returns), seconds and rates_hz.
     """
     if not (0 < options.lowest <= options.highest and options.step > 1):
         raise ConfigurationError("--lowest must be above 0 and at most --highest, and --step above 1")
     rates = grid(options.lowest, options.highest, options.step)
     loops = {}
     for name in options.loop or LOOPS:
-        words = LOOPS[name]
         tell(name)
-        if "--free-running" in words:
-            loops[name] = {"run": run_once(words, None, options.seconds)}
-        else:
-            loops[name] = find(words, rates, options.seconds, tell)
+        loops[name] = find(LOOPS[name], rates, options.seconds, tell)
     return {"loops": loops, "seconds": options.seconds, "rates_hz": rates}
 
 
-def run_once(words: Sequence[str], rate_hz: float | None, seconds: float) -> Result:
+def run_once(words: Sequence[str], rate_hz: float, seconds: float) -> Result:
     """Run a loop once.
 
     Args:
         words: options of `lowfc latency`; see `LOOPS`.
-        rate_hz: asked for; None where there is no schedule.
+        rate_hz: asked for.
         seconds: of frames.
 
     Returns:
@@ -77,8 +71,7 @@ def run_once(words: Sequence[str], rate_hz: float | None, seconds: float) -> Res
         p99), commands_late (part of them all, of a simulated camera), usage (see `shares`); or failure, the last that
         the command wrote.
     """
-    rate = [] if rate_hz is None else ["--rate", f"{rate_hz:g}"]
-    found = run_lowfc(["latency", *words, *rate], seconds)
+    found = run_lowfc(["latency", *words, "--rate", f"{rate_hz:g}"], seconds)
     if "failure" in found:
         return {"asked_hz": rate_hz, "failure": found["failure"]}
     own = {
@@ -100,7 +93,7 @@ def complaints(run: Result) -> list[str]:
     if "failure" in run:
         return [run["failure"]]
     found = []
-    if run["asked_hz"] and abs(run["rate_hz"] - run["asked_hz"]) > RATE_WITHIN * run["asked_hz"]:
+    if abs(run["rate_hz"] - run["asked_hz"]) > RATE_WITHIN * run["asked_hz"]:
         found.append(f"{run['rate_hz']:.0f} frames a second")
     if run["without_command"] > MAX_WITHOUT_COMMAND * run["frames"]:
         found.append(f"{100 * run['without_command'] / run['frames']:.2g} % of the frames without a command")
@@ -165,26 +158,22 @@ def tables(result: Result) -> list[Lines]:
     """Rates, and what the processes used."""
     rates, use = [list(HEADINGS)], [list(USE_HEADINGS)]
     for name, loop in result["loops"].items():
-        run, above, compared = loop["run"], loop.get("above"), loop.get("compared")
-        if "runs" in loop:
-            why = "not tried" if above is None else f"{above['asked_hz']:g} Hz: {', '.join(complaints(above))}"
-        else:
-            why = ", ".join(complaints(run))
-        highest = "none" if run is None or "failure" in run else f"{run['asked_hz'] or run['rate_hz']:.0f}"
-        rates.append([name, highest, *_latency(run), why])
-        use += [_use(name, one) for one in (run, compared) if one is not None]
+        run, above = loop["run"], loop["above"]
+        why = "not tried" if above is None else f"{above['asked_hz']:g} Hz: {', '.join(complaints(above))}"
+        rates.append([name, "none" if run is None else f"{loop['highest_hz']:g}", *_latency(run), why])
+        use += [_use(name, one) for one in (run, loop["compared"]) if one is not None]
     return [rates, use]
 
 
 def _latency(run: Result | None) -> list[str]:
-    if run is None or "failure" in run:
+    if run is None:
         return [""] * 3
     late = f"{100 * run['commands_late']:.3g} %" if "commands_late" in run else ""
     return [*(f"{run['frame_to_command_us'][name]:.0f}" for name in ("p50", "p99")), late]
 
 
 def _use(name: str, run: Result) -> list[str]:
-    used, rate_hz = run.get("usage", {}), run["asked_hz"] or run.get("rate_hz")
+    used = run.get("usage", {})
     together: dict[str, float] = {}
     for one in used.values():
         if one["processors"].isdecimal():
@@ -192,13 +181,13 @@ def _use(name: str, run: Result) -> list[str]:
     each = [used.get(role) for role in _ROLES]
     cells = [f"{100 * one['share']:.0f} % ({one['processors']})" if one else "" for one in each]
     sums = ", ".join(f"{where}: {share:.0f} %" for where, share in sorted(together.items()))
-    return [name, "" if rate_hz is None else f"{rate_hz:.0f}", *cells, sums]
+    return [name, f"{run['asked_hz']:.0f}", *cells, sums]
 
 
 def about(result: Result) -> str:
     """What the figures are."""
     rates = result["rates_hz"]
-    runs = sum(len(loop.get("runs", ())) for loop in result["loops"].values())
+    runs = sum(len(loop["runs"]) for loop in result["loops"].values())
     return (
         f"Sustained over {result['seconds']:g} s: at most {100 * MAX_WITHOUT_COMMAND:g} % of the frames without a "
         f"command, no message lost by the recorder, the rate within {100 * RATE_WITHIN:g} % of that asked for; {runs} "

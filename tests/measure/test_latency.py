@@ -303,7 +303,6 @@ def test_what_is_no_result_and_no_log_is_said(tmp_path: Path) -> None:
         assert isinstance(fault, DataFileError)
         assert expected in str(fault)
     assert isinstance(lowfc("latency", tmp_path / "none.mcap").exception, DataFileError)
-    assert "schedule" in str(lowfc("latency", "--camera", "simulated", "--free-running").exception)
 
 
 STARTED = (

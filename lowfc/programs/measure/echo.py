@@ -29,7 +29,7 @@ from lowfc.contract.configuration import Configuration
 from lowfc.contract.envelope import Envelope
 from lowfc.contract.errors import BusError
 from lowfc.contract.messages import COMMAND, FRAME, Role
-from lowfc.programs.measure.frame_source import ANSWER_S, FRAMES_FILE, Payloads
+from lowfc.programs.measure.frame_source import FRAMES_FILE, Payloads
 from lowfc.programs.measure.latency.figures import WARM_UP_S
 
 ECHO_FILE = "echo.npz"
@@ -44,15 +44,12 @@ _HOT_S = 0.3
 _LOST = -1
 
 Seconds = Annotated[float, typer.Option(help="For how long.")]
-FreeRunning = Annotated[bool, typer.Option("--free-running", help="Without a schedule: the next as soon as possible.")]
 
 app = new_app("A bare zenoh echo.\n\nExample: python -m lowfc.programs.measure.echo ask --run bench --seconds 5")
 
 
 @app.command()
-def ask(
-    run: RunId = DEFAULT_RUN, config: ConfigFile = None, seconds: Seconds = 10.0, free_running: FreeRunning = False
-) -> None:
+def ask(run: RunId = DEFAULT_RUN, config: ConfigFile = None, seconds: Seconds = 10.0) -> None:
     """Send frames at the camera's place, and time each until its answer is there.
 
     Example: python -m lowfc.programs.measure.echo ask --run bench --seconds 5
@@ -60,15 +57,13 @@ def ask(
     settings = configuration(config)
     joined = _joined(settings, run, Role.CAMERA, settings.realtime.camera_cpus)
     payloads = Payloads(np.load(joined.path / FRAMES_FILE))
-    round_trip_ns = _ask(settings, joined, payloads, seconds, free_running=free_running)
+    round_trip_ns = _ask(settings, joined, payloads, seconds)
     with being_written(joined.path / ECHO_FILE) as part, part.open("wb") as file:
         np.savez(file, round_trip_ns=round_trip_ns)
 
 
 @app.command()
-def answer(
-    run: RunId = DEFAULT_RUN, config: ConfigFile = None, seconds: Seconds = 10.0, free_running: FreeRunning = False
-) -> None:
+def answer(run: RunId = DEFAULT_RUN, config: ConfigFile = None, seconds: Seconds = 10.0) -> None:
     """Answer frames at the controller's place until told that there are no more; then time what it does alone.
 
     Example: python -m lowfc.programs.measure.echo answer --run bench --seconds 5
@@ -84,12 +79,12 @@ def answer(
     step = ControlStep(settings, calibration, clock.host_ns())
     _answer(settings, joined, step(payloads.at(0, clock.host_ns())))
     hot = time_alone(step, payloads, clock, _HOT_S, None)
-    alone = hot if free_running else time_alone(step, payloads, clock, seconds, settings.period_ns)
+    alone = time_alone(step, payloads, clock, seconds, settings.period_ns)
     with being_written(joined.path / ALONE_FILE) as part, part.open("wb") as file:
         np.savez(file, timer_ns=alone.timer_ns, step_ns=alone.step_ns, hot_step_ns=hot.step_ns)
 
 
-def _ask(config: Configuration, run: Run, payloads: Payloads, seconds: float, *, free_running: bool) -> Long:
+def _ask(config: Configuration, run: Run, payloads: Payloads, seconds: float) -> Long:
     """Send frames for a time, after the warm-up's, then an empty one.
 
     Returns:
@@ -98,7 +93,7 @@ def _ask(config: Configuration, run: Run, payloads: Payloads, seconds: float, *,
     Raises:
         BusError: nobody came to answer.
     """
-    clock, answered = HostClock(), threading.Event()
+    clock = HostClock()
     put_ns: list[int] = []
     round_trip_ns: list[int] = []
 
@@ -108,7 +103,6 @@ def _ask(config: Configuration, run: Run, payloads: Payloads, seconds: float, *,
         index, sent_ns = Envelope.unpack(sample.attachment.to_bytes())
         sample.payload.to_bytes()
         round_trip_ns[index] = now_ns - sent_ns
-        answered.set()
 
     session = _session(run, Role.CAMERA)
     try:
@@ -124,17 +118,12 @@ def _ask(config: Configuration, run: Run, payloads: Payloads, seconds: float, *,
         end_ns = due_ns + round((WARM_UP_S + seconds) * 1e9)
         while due_ns < end_ns:
             payload = payloads.at(len(put_ns), due_ns)
-            answered.clear()
             clock.sleep_until_ns(due_ns)
             round_trip_ns.append(_LOST)
             put_ns.append(clock.host_ns())
             publisher.put(payload, attachment=Envelope(len(put_ns) - 1, put_ns[-1]).encode())
             let_send()
-            if free_running:
-                answered.wait(ANSWER_S)
-                due_ns = clock.host_ns()
-            else:
-                due_ns += config.period_ns
+            due_ns += config.period_ns
         time.sleep(_SETTLE_S)
         session.put(FRAME.key, b"", congestion_control=zenoh.CongestionControl.BLOCK)
         subscriber.undeclare()  # type: ignore[no-untyped-call]

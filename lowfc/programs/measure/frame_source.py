@@ -1,4 +1,4 @@
-"""A camera that only sends: frames made beforehand, on an absolute schedule or as fast as commands come back.
+"""A camera that only sends: frames made beforehand, on an absolute schedule.
 
 It takes the simulated camera's place where the loop is timed, so that the arithmetic of the simulation is not in the
 measurement. What it put, and when each frame was due, is written to a file at its end.
@@ -13,7 +13,6 @@ from typing import Annotated
 import numpy as np
 import typer
 
-from lowfc.adapters.bus.mailbox import Mailbox
 from lowfc.adapters.bus.run import open_run
 from lowfc.adapters.files import factory
 from lowfc.adapters.files.whole_file import being_written
@@ -24,7 +23,7 @@ from lowfc.adapters.process.terminal import DEFAULT_RUN, ConfigFile, RunId, conf
 from lowfc.arrays import Pixels
 from lowfc.contract.configuration import Configuration
 from lowfc.contract.errors import BusError
-from lowfc.contract.messages import CAMERA_STATE, COMMAND, FRAME, RawImage, Role, image, timestamp, wire
+from lowfc.contract.messages import CAMERA_STATE, FRAME, RawImage, Role, image, timestamp
 from lowfc.optics.chain.zernike import zernikes
 from lowfc.optics.detector.detector import expose
 from lowfc.optics.twin.twin import Evaluator, node_radii
@@ -32,9 +31,7 @@ from lowfc.optics.twin.twin import Evaluator, node_radii
 FRAMES_FILE = "frames.npy"
 """In the run's directory: the frames, (frames, rows, columns) uint16."""
 SENT_FILE = "sent.npz"
-"""In the run's directory: sequence, put_ns and due_ns of every frame sent; due_ns is empty without a schedule."""
-ANSWER_S = 0.1
-"""Free-running, a frame whose command was not seen for so long is followed by the next one."""
+"""In the run's directory: sequence, put_ns and due_ns of every frame sent."""
 
 _COUNT = 32
 _TILT_NM, _OTHER_NM = 3.0, 1.0
@@ -84,7 +81,6 @@ def frame_source(
     run: RunId = DEFAULT_RUN,
     config: ConfigFile = None,
     seconds: Annotated[float, typer.Option(help="For how long.")] = 10.0,
-    free_running: Annotated[bool, typer.Option("--free-running", help="Next frame at the last one's command.")] = False,
     wait_for: Annotated[list[str] | None, typer.Option(help="Process that the first frame waits for; repeat.")] = None,
 ) -> None:
     """Send the frames in the run's directory as its camera, and write there when each was due and put.
@@ -97,7 +93,7 @@ def frame_source(
     service = join(settings, run, Role.CAMERA, settings.realtime.camera_cpus)
     service.catch_signals()
     with closing(service.bus):  # a callback on zenoh's threads must not outlive the interpreter
-        Source(settings, service, payloads).run(seconds, tuple(wait_for or ()), folder, free_running=free_running)
+        Source(settings, service, payloads).run(seconds, tuple(wait_for or ()), folder)
 
 
 class Source:
@@ -112,14 +108,13 @@ class Source:
         self._settings = service.publisher(CAMERA_STATE)
         self._sequence, self._put_ns, self._due_ns = array("Q"), array("q"), array("q")
 
-    def run(self, seconds: float, wait_for: tuple[str, ...], folder: Path, *, free_running: bool) -> None:
+    def run(self, seconds: float, wait_for: tuple[str, ...], folder: Path) -> None:
         """Wait for those named, send, and write what was sent into `folder`.
 
         Raises:
             BusError: somebody did not come.
         """
         service = self._service
-        commands = service.mailbox(COMMAND, self._config.mirror.name) if free_running else None
         service.state = "ready"
         missing = service.wait_for(wait_for, _WAIT_S)
         if missing and service.running:
@@ -127,10 +122,7 @@ class Source:
         state = factory.camera_state(self._config, self._payloads.shape, service.clock.now_ns())
         self._settings.put(state.SerializeToString())
         service.state = "running"
-        if commands is None:
-            self._on_schedule(math.ceil(seconds * self._config.camera.rate_hz))
-        else:
-            self._as_answered(seconds, commands)
+        self._on_schedule(math.ceil(seconds * self._config.camera.rate_hz))
         with being_written(folder / SENT_FILE) as part, part.open("wb") as file:
             put_ns, due_ns = np.array(self._put_ns), np.array(self._due_ns)
             np.savez(file, sequence=np.array(self._sequence), put_ns=put_ns, due_ns=due_ns)
@@ -148,18 +140,6 @@ class Source:
                 break
             self._due_ns.append(due_ns)
             self._put(payload)
-
-    def _as_answered(self, seconds: float, commands: Mailbox) -> None:
-        """The next frame as soon as the command for the last one was seen."""
-        clock = self._service.clock
-        end_ns = clock.now_ns() + round(seconds * 1e9)
-        while self._service.running and (now_ns := clock.now_ns()) < end_ns:
-            sequence = self._put(self._payloads.at(len(self._put_ns), now_ns))
-            patience_ns = now_ns + round(ANSWER_S * 1e9)
-            while (left_ns := patience_ns - clock.now_ns()) > 0:
-                sample = commands.take(left_ns * 1e-9)
-                if sample is None or wire.MirrorCommand.FromString(sample.payload).frame_sequence >= sequence:
-                    break
 
     def _put(self, payload: bytes) -> int:
         envelope = self._frames.put(payload)

@@ -15,7 +15,7 @@ import typer
 
 from lowfc.adapters.files.whole_file import require_folder, write_whole
 from lowfc.adapters.process.terminal import ConfigFile, Json, LogsIfAny, configuration
-from lowfc.contract.errors import ConfigurationError, DataFileError
+from lowfc.contract.errors import DataFileError
 from lowfc.programs.cli.output import put
 
 if TYPE_CHECKING:
@@ -37,9 +37,6 @@ def latency(
     logs: LogsIfAny = None,
     duration: Annotated[float, typer.Option(min=0.5, max=1e5, help="Seconds of each repeat.")] = 10.0,
     rate: Annotated[float | None, typer.Option(help="Frames per second; default: the file's, or 1000.")] = None,
-    free_running: Annotated[
-        bool, typer.Option("--free-running", help="Without a schedule: the next frame as soon as a command is back.")
-    ] = False,
     camera: Annotated[Camera, typer.Option(help="Frames made beforehand, or the simulated camera.")] = Camera.PREPARED,
     repeats: Annotated[int, typer.Option(min=1, max=1000, help="Loop and yardsticks in turns, so often.")] = 1,
     record: Annotated[bool, typer.Option("--record/--no-record", help="With the recorder beside.")] = False,
@@ -78,12 +75,10 @@ def latency(
         figures = _of_log(logs)
     else:
         settings = _configuration(config, rate, camera, plain=plain_scheduling)
-        if camera is Camera.SIMULATED and free_running:
-            raise ConfigurationError("the simulated camera has a schedule: leave out --free-running or --camera")
         from lowfc.programs.measure.latency.run import Asked
 
         simulated = camera is Camera.SIMULATED
-        figures = _measure(Asked(settings, duration, repeats, free_running, simulated, record, view))
+        figures = _measure(Asked(settings, duration, repeats, simulated, record, view))
     if plot is not None:
         write_whole(plot, picture(figures))
     put(figures, table(figures), as_json=as_json)
@@ -125,7 +120,6 @@ def _measure(asked: "Asked") -> dict[str, Any]:
             "rate_hz": asked.config.camera.rate_hz,
             "duration_s": asked.duration_s,
             "repeats": asked.repeats,
-            "free_running": asked.free_running,
             "camera": str(Camera.SIMULATED if asked.simulated else Camera.PREPARED),
             "record": asked.record,
             "view": asked.view,

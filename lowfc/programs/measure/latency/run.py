@@ -50,7 +50,6 @@ class Asked:
     config: Configuration
     duration_s: float
     repeats: int
-    free_running: bool = False
     simulated: bool = False
     record: bool = False
     view: bool = False
@@ -79,8 +78,7 @@ def run_repeats(asked: Asked, run: Run, progress: Callable[[str], None]) -> list
 
     Returns:
         For each repeat `repeat_figures` and `controllers_account`; granted, refused, logs, messages_lost and
-        commands_late; echo_us, step_us, hot_step_us and timer_us (percentiles; timer_us None without a schedule) and
-        echo_lost.
+        commands_late; echo_us, step_us, hot_step_us and timer_us (percentiles) and echo_lost.
 
     Raises:
         ProcessDiedError: a process ended by itself.
@@ -133,8 +131,7 @@ def _loop(asked: Asked, run: Run) -> dict[str, Any]:
         joined = join(frames.taken("sequence"), frames.taken("publish_ns"), None, *heard)
     else:
         with np.load(run.path / SENT_FILE) as sent:
-            due_ns = sent["due_ns"] if sent["due_ns"].size else None
-            joined = join(sent["sequence"], sent["put_ns"], due_ns, *heard)
+            joined = join(sent["sequence"], sent["put_ns"], sent["due_ns"], *heard)
     figures = repeat_figures(joined)
     if "frame_to_command" not in figures["latency_us"]:
         raise BusError("the controller told the timing of no frame after the warm-up; let the test last longer")
@@ -166,13 +163,12 @@ def _children(asked: Asked, run: Run) -> list[Child]:
         children[0].command += waits[-2:] if asked.view else []
     else:
         words = ["-m", "lowfc.programs.measure.frame_source", *_shared(run), "--seconds", str(seconds), *waits]
-        words += ["--free-running"] * asked.free_running
         children[0] = program(str(Role.CAMERA), words, run.path / f"{Role.CAMERA}.stderr")
     return children
 
 
 def _alone(asked: Asked, run: Run) -> dict[str, Any]:
-    words = [*_shared(run), "--seconds", str(asked.duration_s / 2), *["--free-running"] * asked.free_running]
+    words = [*_shared(run), "--seconds", str(asked.duration_s / 2)]
     children = [
         program(f"echo ({verb})", ["-m", echo.__name__, verb, *words], run.path / f"echo-{verb}.stderr")
         for verb in ("ask", "answer")

@@ -122,7 +122,7 @@ def _what(figures: Mapping[str, Any]) -> str:
     settings, count = figures["settings"], len(figures["repeats"])
     if settings.get("log"):
         return f"{Path(settings['log']).name}, {figures['rate_hz']:.1f} Hz"
-    pace = "free-running" if settings["free_running"] else f"{settings['rate_hz']:g} Hz"
     beside = "".join(f", {name} beside" for name in ("record", "view") if settings[name])
     times = f"medians over {count} times {settings['duration_s']:g} s" if count > 1 else f"{settings['duration_s']:g} s"
-    return f"{pace} ({figures['rate_hz']:.1f} Hz reached), {settings['camera']} frames{beside}, {times}"
+    reached = f"{settings['rate_hz']:g} Hz ({figures['rate_hz']:.1f} Hz reached)"
+    return f"{reached}, {settings['camera']} frames{beside}, {times}"
