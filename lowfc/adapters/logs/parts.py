@@ -50,7 +50,7 @@ class Repeated:
 class WholeLog(LogReader):
     """Reads the files of one log as one; what a file repeats at its start of the one before is delivered once.
 
-    `path` is the first file; the other attributes are of all files.
+    `path` is the first file; schemas and channels are those of the file being read, the other attributes of all files.
     """
 
     def __init__(self, log: LogFiles, *, topics: Collection[Topic] | None = None, skip_damaged: bool = False) -> None:
@@ -77,6 +77,7 @@ class WholeLog(LogReader):
         complete = True
         for number, path in enumerate(self.paths):
             part = LogReader(path, topics=self._topics, skip_damaged=self._skip_damaged)
+            self.schemas, self.channels = part.schemas, part.channels
             behind = sum(sizes[:number])
             repeated.next_file()
             for message in part:
@@ -89,7 +90,6 @@ class WholeLog(LogReader):
                 if not repeated(message):
                     yield message
             self.described = described = described + part.described
-            self.channels |= part.channels
             for damage in part.damage:
                 damage.why += f" ({path.name})"
             self.damage += part.damage

@@ -7,8 +7,8 @@ from pathlib import Path
 from mcap.records import Attachment, Metadata
 
 from lowfc.adapters.logs.log_copy import LogCopy, new_log
-from lowfc.adapters.logs.parts import Parts, Repeated, metadata_at_start
-from lowfc.adapters.logs.reader import Logged, LogReader
+from lowfc.adapters.logs.parts import Parts, WholeLog, metadata_at_start
+from lowfc.adapters.logs.reader import Logged
 from lowfc.adapters.logs.recovery import RECOVERY, account, faults, in_words, no_end
 from lowfc.adapters.logs.selection import SELECTION, Selection
 from lowfc.adapters.logs.writer import PART, stem_of
@@ -58,46 +58,37 @@ def thin(log: Parts, out: Path, asked: Selection, progress: Callable[[int, int],
         DataFileError: a file is no log, `out` is there already, or the disk refuses.
     """
     made = Selection.of(metadata_at_start(log[0])).within(asked)
-    repeated, messages = Repeated(), 0
+    reader, messages = WholeLog(log, skip_damaged=True), 0
+    reader.progress = progress
+    described: set[str] = {PART, SELECTION}  # the copy has its own
 
     def wanted(message: Logged) -> bool:
         nonlocal messages
-        if repeated(message):
-            return False
         messages += 1
         return made.keeps(topic_of(message.key), message.sequence, message.payload)
 
-    readers = [LogReader(path, skip_damaged=True) for path in log]
+    def new(record: Metadata | Attachment) -> bool:
+        """Of a later file only its account, which replaces that of the file before."""
+        known = record.name in described and record.name not in ("recording", RECOVERY)
+        described.add(record.name)
+        return not known
+
     with new_log(out, log[0]) as file:
         copy = LogCopy(file)
         for name, entries in made.metadata.items():
             copy.note(name, entries)
-        for reader in readers:
-            repeated.next_file()
-            reader.progress = progress
-            copy.take(reader, wanted=wanted, described=_at_start if reader is readers[0] else _at_end)
-            if not reader.complete or reader.damage or reader.unreadable:
-                copy.note(RECOVERY, account(reader, copy.messages))
+        copy.take(reader, wanted=wanted, described=new)
+        if not reader.complete or reader.damage or reader.unreadable:
+            copy.note(RECOVERY, account(reader, copy.messages))
         copy.finish()
-    finished = all(reader.finished for reader in readers)
     return Thinned(
         str(out),
         made.sentence,
         copy.messages,
         out.stat().st_size,
         messages,
-        sum(reader.size for reader in readers),
-        finished,
-        no_end(log, finished=finished),
-        [f"{reader.path.name}, {in_words(one)}" for reader in readers for one in reader.damage],
+        reader.size,
+        reader.finished,
+        no_end(log, finished=reader.finished),
+        [in_words(one) for one in reader.damage],
     )
-
-
-def _at_start(record: Metadata | Attachment) -> bool:
-    """Of the first file: all but what the copy has of its own."""
-    return record.name not in (PART, SELECTION)
-
-
-def _at_end(record: Metadata | Attachment) -> bool:
-    """Of a later file: its account, which replaces that of the file before."""
-    return record.name in ("recording", RECOVERY)
