@@ -2,8 +2,9 @@
 
 import contextlib
 import re
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Generator, Iterator, Sequence
 from pathlib import Path
+from typing import Any
 
 from mcap.records import Attachment, Metadata
 
@@ -13,7 +14,7 @@ from lowfc.adapters.logs.records import LogFile
 from lowfc.adapters.logs.writer import PART
 from lowfc.contract.configuration import Recorder
 from lowfc.contract.errors import ConfigurationError, DataFileError
-from lowfc.contract.messages import Topic, topic_of
+from lowfc.contract.messages import topic_of
 
 LAST = "last"
 """Stands for the newest log where a log is named."""
@@ -50,53 +51,59 @@ class Repeated:
 class WholeLog(LogReader):
     """Reads the files of one log as one; what a file repeats at its start of the one before is delivered once.
 
-    `path` is the first file; schemas and channels are those of the file being read, the other attributes of all files.
+    Attributes:
+        path: of the first file; schemas and channels are those of the file being read, all others of all files.
+        parts: readers of the files so far.
     """
 
-    def __init__(self, log: LogFiles, *, topics: Collection[Topic] | None = None, skip_damaged: bool = False) -> None:
-        """Read a log, of its messages only those of `topics`; see `LogReader`."""
+    def __init__(self, log: LogFiles, *, skip_damaged: bool = False, **options: Any) -> None:
+        """Read a log; `options` as those of `LogReader`."""
         paths = (log,) if isinstance(log, Path) else tuple(log)
-        super().__init__(paths[0], topics=topics, skip_damaged=skip_damaged)
+        super().__init__(paths[0], skip_damaged=skip_damaged, **options)
         self.paths = paths
+        self.parts: list[LogReader] = []
+        self._options = options
 
-    def __iter__(self) -> Iterator[Logged]:
+    def __iter__(self) -> Generator[Logged, None, None]:
         """Messages in the order they were recorded; a reader reads once.
 
         Raises:
             DataFileError: a file is no log, or a part of it is damaged.
         """
         if len(self.paths) == 1:
+            self.parts.append(self)
             yield from super().__iter__()
             return
         with contextlib.ExitStack() as held:
             files = [held.enter_context(LogFile(path)) for path in self.paths]
-        sizes = [file.size for file in files]
-        self.size, self.finished = sum(sizes), all(file.finished for file in files)
+        self.size, self.finished = sum(file.size for file in files), all(file.finished for file in files)
         described: list[Metadata | Attachment] = []
         repeated = Repeated()
-        complete = True
-        for number, path in enumerate(self.paths):
-            part = LogReader(path, topics=self._topics, skip_damaged=self._skip_damaged)
+        behind = 0
+        for path, file in zip(self.paths, files, strict=True):
+            part = LogReader(path, skip_damaged=self._skip_damaged, **self._options)
+            self.parts.append(part)
             self.schemas, self.channels = part.schemas, part.channels
-            behind = sum(sizes[:number])
             repeated.next_file()
-            for message in part:
-                if len(self.described) != len(described) + len(part.described):
-                    self.described = described + part.described
-                if self.position != behind + part.position:
-                    self.position = behind + part.position
-                    if self.progress is not None:
-                        self.progress(self.position, self.size)
-                if not repeated(message):
-                    yield message
-            self.described = described = described + part.described
-            for damage in part.damage:
-                damage.why += f" ({path.name})"
-            self.damage += part.damage
-            self.unreadable += part.unreadable
-            complete = complete and part.complete
+            try:
+                for message in part:
+                    if len(self.described) != len(described) + len(part.described):
+                        self.described = described + part.described
+                    if self.position != behind + part.position:
+                        self.position = behind + part.position
+                        if self.progress is not None:
+                            self.progress(self.position, self.size)
+                    if not repeated(message):
+                        yield message
+            finally:  # of what has been read, should that be all
+                self.described = described = described + part.described
+                for damage in part.damage:
+                    damage.why += f" ({path.name})"
+                self.damage += part.damage
+                self.unreadable += part.unreadable
+            behind += file.size
         self.position = self.size
-        self.complete = complete
+        self.complete = all(part.complete for part in self.parts)
 
 
 def one_by_one(names: Sequence[Path], out: Path | None = None, *, as_json: bool = False) -> list[Parts]:

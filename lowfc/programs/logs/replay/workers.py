@@ -1,5 +1,6 @@
 """Replaying log files, a long one in shares on several processors."""
 
+import contextlib
 import gc
 import multiprocessing
 import os
@@ -13,7 +14,7 @@ from pathlib import Path
 from threadpoolctl import threadpool_limits
 
 from lowfc import __version__
-from lowfc.adapters.logs.parts import Repeated
+from lowfc.adapters.logs.parts import WholeLog
 from lowfc.adapters.logs.reader import LogReader
 from lowfc.adapters.logs.records import LogFile
 from lowfc.contract import published
@@ -107,48 +108,40 @@ def _replay_share(
 ) -> Outcome:
     """Replay a share, on one thread as the live loop: more threads sum in another order."""
     run = Replay(tolerance_nm, share)
-    outcome = Outcome(run.context.account)
-    repeated = Repeated()
-    done = number = 0
+    log = WholeLog(
+        paths,
+        skip_damaged=True,
+        topics=TOPICS,
+        from_ns=max(0, share.from_ns - PATIENCE_NS),
+        always=published.TOPICS,
+    )
+    part = None
     gc.disable()
     try:
-        with threadpool_limits(1):
-            for path in paths:
-                reader = LogReader(
-                    path,
-                    topics=TOPICS,
-                    skip_damaged=True,
-                    from_ns=max(0, share.from_ns - PATIENCE_NS),
-                    always=published.TOPICS,
-                )
-                first = True
-                repeated.next_file()
-                for message in reader:
-                    if first:
-                        _refuse_thinned(reader)
-                        run.context.former, first = _former(reader), False
-                    if not repeated(message):
-                        run.take(message)
-                    number += 1
-                    if number % _NEWS_EVERY == 0:
-                        progress(done + reader.position)
-                    if run.done:
-                        break
-                done += reader.size
-                outcome.complete &= reader.complete
-                outcome.damage += [f"{path.name}, byte {one.position}: {one.why}" for one in reader.damage]
-                metadata = reader.metadata
-                outcome.recorded_on = outcome.recorded_on or metadata.get("lowfc", {})
-                outcome.runs.append(metadata.get("lowfc", {}).get("run", "?"))
-                if why := metadata.get("recording", {}).get("stopped"):
-                    outcome.stopped.append(f"{path.name}: {why}")
+        with threadpool_limits(1), contextlib.closing(iter(log)) as messages:
+            for number, message in enumerate(messages):
+                if part is not log.parts[-1]:
+                    part = log.parts[-1]
+                    _refuse_thinned(part)
+                    run.context.former = _former(part)
+                run.take(message)
+                if number % _NEWS_EVERY == 0:
+                    progress(log.position)
                 if run.done:
                     break
             run.finish()
     finally:
         gc.enable()
-    outcome.log_s = run.duration_s
-    return outcome
+    about = [(part.path.name, part.metadata) for part in log.parts]
+    return Outcome(
+        run.context.account,
+        log.complete,
+        [f"byte {one.position}: {one.why}" for one in log.damage],
+        about[0][1].get("lowfc", {}),
+        run.duration_s,
+        [metadata.get("lowfc", {}).get("run", "?") for _, metadata in about],
+        [f"{name}: {why}" for name, metadata in about if (why := metadata.get("recording", {}).get("stopped"))],
+    )
 
 
 def _refuse_thinned(reader: LogReader) -> None:
