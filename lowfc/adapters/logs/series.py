@@ -227,6 +227,4 @@ def shortage(folder: Path, min_free_bytes: int) -> str:
 def existing(folder: Path) -> Path:
     """A folder, or as long as it has not been made the one that it will be made in."""
     there = folder.absolute()
-    while not there.exists() and there != there.parent:
-        there = there.parent
-    return there
+    return next(one for one in (there, *there.parents) if one.exists())

@@ -1,11 +1,9 @@
 """The command `lowfc report`: arguments only; the work is elsewhere."""
 
-import json
-import math
 import sys
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -42,6 +40,7 @@ def report(
 
 
 def _report(log: "Parts", out: Path | None, as_json: bool) -> None:
+    from pydantic_core import to_json
     from rich.console import Console
     from rich.progress import TimeElapsedColumn
 
@@ -68,20 +67,9 @@ def _report(log: "Parts", out: Path | None, as_json: bool) -> None:
     for remark in run.history.remarks:
         sys.stderr.write(f"warning: {remark}\n")
     if as_json:
-        sys.stdout.write(json.dumps(_finite(found.figures), allow_nan=False) + "\n")
+        # A log may hold any value, and JSON has no number for some.
+        sys.stdout.write(to_json(found.figures, inf_nan_mode="null").decode() + "\n")
     else:
         verdict = found.figures["verdict"]
         because = f": {verdict['because']}" if verdict["because"] else ""
         sys.stdout.write(printable(f"{verdict['heading']}{because}\n{target}\n", keep=LINES))
-
-
-def _finite(figures: Any) -> Any:
-    """The figures with None for what JSON has no number for: a log may hold any value."""
-    match figures:
-        case dict():
-            return {key: _finite(value) for key, value in figures.items()}
-        case list() | tuple():
-            return [_finite(value) for value in figures]
-        case float() if not math.isfinite(figures):
-            return None
-    return figures
