@@ -22,18 +22,20 @@ from lowfc.contract.messages import (
     timestamp,
     wire,
 )
+from lowfc.control.laws.spectra import pieces, spectrum
 from lowfc.control.loop.safety import LoopMode
 from lowfc.optics.chain.coronagraph import mean_contrast
 from lowfc.optics.chain.grid import pupil_axis
 from lowfc.optics.chain.zernike import mode_name, zernikes
 from lowfc.optics.detector.photometry import tilt_nm_per_mas
 from lowfc.programs.view.draw.pictures import Scale
-from lowfc.programs.view.draw.plots import BOX_HEIGHT, Axes, Plot
+from lowfc.programs.view.draw.plots import BOX_HEIGHT, Plot
 from lowfc.programs.view.panels import latency, loop, mirror, science, sensor, spectra, wavefront
 from lowfc.programs.view.panels.panel import Panel
 from lowfc.programs.view.renderer import RETRY_NS, Renderer
 from lowfc.programs.view.snapshot import Accumulator, LastHealth, Snapshot
 from lowfc.programs.view.verdicts import steady
+from lowfc.programs.view.verdicts.steady import LawInForce
 from tests.support.report_log import Night
 from tests.support.stage import Tape, accumulated, pixels, snapshot_of, values_of
 from tests.support.theory import rejection
@@ -319,84 +321,69 @@ def test_a_brighter_dark_zone_is_brighter_in_the_picture() -> None:
 
 
 TONE_HZ, TONE_NM = 20.0, 3.0
-LAW = {"gain": [0.4] * MODES, "leak": [0.01] * MODES, "delay_frames": 2.0}
+LAW = LawInForce((0.4,) * MODES, (0.01,) * MODES, 2.0, "")
 CAMERA = wire.CameraState(period_ns=round(1e9 / RATE_HZ))
 
 
-@pytest.fixture
-def curves(monkeypatch: pytest.MonkeyPatch) -> dict[str, list[Any]]:
-    """Frequency and power of each curve that was drawn last, by path; spectra are drawn every second."""
-    monkeypatch.setattr(spectra.Spectra, "period_ns", 1_000_000_000)
-    found, draw = {}, Axes.draw
-
-    def keep(axes: Axes, stream: Tape, x: Any, ys: Any, *style: Any) -> None:
-        found[axes.path] = [(10**x, 10**y) for y in ys]
-        draw(axes, stream, x, ys, *style)
-        for strip in map(np.array, values_of(stream.last(f"{axes.path}/curves").strips)):
-            assert ((strip > -0.01) & (strip < [spectra.WIDTH + 0.01, BOX_HEIGHT + 0.01])).all(), "outside the box"
-
-    monkeypatch.setattr(Axes, "draw", keep)
-    return found
-
-
-def run_spectra(tape: Tape, mode: int = LoopMode.CLOSED, frames: int = 3000, **law: Any) -> spectra.Spectra:
-    """A tone in the first mode and white noise in all, as it would be open and as this law leaves it."""
-    rng = np.random.default_rng(1)
-    pol_nm = rng.normal(0, 0.2, (frames, MODES))
+@pytest.fixture(scope="module")
+def tone() -> tuple[Any, Any]:
+    """Pseudo-open-loop of a tone in the first mode and white noise in all, and the error that the law leaves of it."""
+    frames = 3000
+    pol_nm = np.random.default_rng(1).normal(0, 0.2, (frames, MODES))
     pol_nm[:, 0] += TONE_NM * np.sqrt(2) * np.sin(2 * np.pi * TONE_HZ / RATE_HZ * np.arange(frames))
     error_nm, command_nm = np.zeros((frames, MODES)), np.zeros((frames + 1, MODES))
     for k in range(frames):  # a delay of two frames: the command of the frame before is seen
         error_nm[k] = pol_nm[k] + command_nm[max(k - 1, 0)]
         command_nm[k + 1] = 0.99 * command_nm[k] - 0.4 * error_nm[k]
-    panel, controller = spectra.Spectra(), wire.ControllerState(**LAW, **law)
-    panel.begin(tape)
-    for first in range(0, frames, 50):
-        new = steps(first, error_nm[first : first + 50], pol_nm[first : first + 50], mode)
-        drawn(panel, tape, round((first + 50) * 1e9 / RATE_HZ), steps=new, camera=CAMERA, controller=controller)
-    return panel
+    return pol_nm, error_nm
 
 
-def test_a_tone_stands_at_its_frequency_with_its_power(curves: dict[str, list[Any]]) -> None:
-    tape = Tape()
-    run_spectra(tape)
-    (hz, as_open), (_, error), (_, theory) = curves[spectra.TILTS]
-    tone = int(as_open.argmax())
-    assert hz[tone] == pytest.approx(TONE_HZ, rel=0.05)
+def test_a_tone_stands_at_its_frequency_with_its_power(tone: tuple[Any, Any]) -> None:
+    pol_nm, error_nm = tone
+    signals = np.concatenate([error_nm, pol_nm], axis=1).astype(np.float32)
+    found = spectrum(pieces(np.arange(len(signals), dtype=np.uint64), signals), RATE_HZ)
+    tilts = np.array(NOLL) <= 3
+    hz, (as_open, error, theory) = spectra.power_curves(found, tilts, LAW, RATE_HZ)
+    tone_at = int(as_open.argmax())
+    assert hz[tone_at] == pytest.approx(TONE_HZ, rel=0.05)
     noise = 2 * 0.2**2 * 2 / RATE_HZ  # of two modes, one-sided
-    widths_hz = np.diff(np.sqrt(hz[1:] * hz[:-1]))[tone - 3 : tone + 2]
-    assert np.sum((as_open[tone - 2 : tone + 3] - noise) * widths_hz) == pytest.approx(TONE_NM**2, rel=0.15)
+    widths_hz = np.diff(np.sqrt(hz[1:] * hz[:-1]))[tone_at - 3 : tone_at + 2]
+    power = np.sum((as_open[tone_at - 2 : tone_at + 3] - noise) * widths_hz)
+    assert power == pytest.approx(TONE_NM**2, rel=0.15)
     expected = rejection(np.array([TONE_HZ]), RATE_HZ, 0.4, 0.01, 2.0)[0] ** 2
-    assert error[tone] / as_open[tone] == pytest.approx(expected, rel=0.1)
+    assert error[tone_at] / as_open[tone_at] == pytest.approx(expected, rel=0.1)
     np.testing.assert_allclose(np.log10(error[2:]), np.log10(theory[2:]), atol=0.15)
-    (_, others), _, left = curves[spectra.OTHERS]
-    assert np.median(others[hz > 50]) == pytest.approx(noise / 2 * (MODES - 2), rel=0.1)
+    hz, (others, _, left) = spectra.power_curves(found, ~tilts, LAW, RATE_HZ)
     high = hz > 50
-    passed = rejection(hz[high], RATE_HZ, 0.4, 0.01, 2.0) ** 2
-    np.testing.assert_allclose(left[1][high] / others[high], passed, rtol=0.15)
+    assert np.median(others[high]) == pytest.approx(noise / 2 * (MODES - 2), rel=0.1)
+    np.testing.assert_allclose(left[high] / others[high], rejection(hz[high], RATE_HZ, 0.4, 0.01, 2.0) ** 2, rtol=0.15)
+    for law in (None, LAW._replace(linear="lqg")):  # the theory is of the integrator that is in force
+        assert len(spectra.power_curves(found, tilts, law, RATE_HZ)[1]) == 2
 
 
-def test_without_a_closed_loop_there_is_no_theory_and_after_a_change_no_past(curves: dict[str, list[Any]]) -> None:
-    tape = Tape()
-    panel = run_spectra(tape, LoopMode.OPEN, 1000)
-    assert len(curves[spectra.TILTS]) == 2
-    drawn(panel, tape, round(8e9), controller=wire.ControllerState(gain=[0.1] * MODES))
+def test_spectra_are_in_their_box_and_after_a_change_there_is_no_past(tone: tuple[Any, Any]) -> None:
+    tape, panel = Tape(), spectra.Spectra()
+    panel.begin(tape)
+    controller = wire.ControllerState(gain=LAW.gain, leak=LAW.leak, delay_frames=LAW.delay_frames)
+    state, shown = f"{spectra.TILTS}/state", f"{spectra.TILTS}/curves"
+    for first in range(0, 3000, 50):
+        new = steps(first, *(one[first : first + 50] for one in reversed(tone)))
+        drawn(panel, tape, round((first + 50) * 1e9 / RATE_HZ), steps=new, camera=CAMERA, controller=controller)
+    strips = [np.array(strip) for strip in values_of(tape.last(shown).strips)]
+    assert len(strips) == 3
+    for strip in strips:
+        assert ((strip > -0.01) & (strip < [spectra.WIDTH + 0.01, BOX_HEIGHT + 0.01])).all()
+    assert values_of(tape.last(state).labels)[0].startswith("loop closed, last ")
     few = np.ones((20, MODES))
-    drawn(panel, tape, round(9e9), steps=steps(1000, few, few), camera=CAMERA)
-    assert not curves[spectra.TILTS]
-    (text,) = values_of(tape.last(f"{spectra.TILTS}/state").labels)
-    assert text.startswith("loop closed: too few frames")
+    drawn(panel, tape, round(9e9), steps=steps(3000, few, few, LoopMode.OPEN), camera=CAMERA, controller=controller)
+    assert not values_of(tape.last(shown).strips)
+    assert values_of(tape.last(state).labels) == ["loop open: too few frames yet"]
 
 
-def test_the_integrators_rejection_is_not_drawn_for_another_law(curves: dict[str, list[Any]]) -> None:
-    tape = Tape()
-    run_spectra(tape, law=wire.LinearLaw(name="lqg"))
-    assert len(curves[spectra.TILTS]) == 2
-
-
-def test_a_wavefront_that_stands_still_has_no_spectrum(curves: dict[str, list[Any]]) -> None:
-    tape, still = Tape(), np.zeros((200, MODES))
+def test_a_wavefront_that_stands_still_has_no_spectrum() -> None:
+    tape, still = Tape(), np.zeros((2000, MODES))
     drawn(spectra.Spectra(), tape, 0, steps=steps(0, still, still))
-    assert not curves[spectra.OTHERS]
+    assert not values_of(tape.last(f"{spectra.OTHERS}/curves").strips)
 
 
 def test_memory_of_the_spectra_is_bounded() -> None:
