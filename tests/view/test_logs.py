@@ -106,6 +106,7 @@ def test_the_trend_holds_a_night_in_so_many_spans() -> None:
 
 def test_every_view_of_the_layout_has_something_and_the_plots_show_all_of_a_log(tmp_path: Path) -> None:
     made = night(120)
+    made.health("controller")
     made.put(SURFACE, image(np.eye(8, dtype=np.float32), made.now_ns, "dm"))
     made.frames(2880)
     done, tape = drawn(made.write(tmp_path / "night.mcap"))

@@ -420,8 +420,7 @@ def test_latencies_are_those_of_the_last_second() -> None:
     assert counts.sum() == 1000
     assert np.average(middles, weights=counts) == pytest.approx(whole_us.mean(), abs=widths[0] / 2)
     np.testing.assert_allclose(np.diff(middles), widths[1:], rtol=1e-6)
-    assert tape.column(latency.COUNTS.path)[1][-1].tolist() == [7, 3]
-    assert tape.column(latency.LOST.path)[1][-1].tolist() == [5]
+    assert tape.column(latency.COUNTS.path)[1][-1].tolist() == [7, 3, 5]
 
 
 def test_a_silent_controller_has_no_latency() -> None:

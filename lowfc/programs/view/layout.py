@@ -89,7 +89,7 @@ def _operator() -> rrb.Container:
 
 def _night() -> rrb.Container:
     courses = rrb.Horizontal(_picture(trend.TREND), wavefront.TILT.view(), _contrast())
-    rates = rrb.Horizontal(loop.FLUX.view(), mirror.STROKE.view(), latency.WHOLE.view(), _losses())
+    rates = rrb.Horizontal(loop.FLUX.view(), mirror.STROKE.view(), latency.WHOLE.view(), latency.COUNTS.view())
     below = rrb.Horizontal(_mode(), _events(worst=True), column_shares=[3, 5])
     return rrb.Vertical(_picture(tiles.TILES), courses, rates, below, row_shares=[11, 10, 8, 9], name=Tab.OPERATOR)
 
@@ -113,7 +113,10 @@ def _engineering() -> rrb.Container:
         rrb.Vertical(*(plot.view() for plot in wavefront.MODES), row_shares=[5, 2, 2, 2]),  # room for the modes' names
         rrb.Vertical(wavefront.GROUPS.view(), *spectra_, mirror.STROKE.view(), row_shares=[2, 4, 4, 2]),
         rrb.Vertical(
-            histogram, latency.PARTS.view(), _losses(), rrb.Horizontal(loop.FLUX.view(), loop.SATURATED.view())
+            histogram,
+            latency.PARTS.view(),
+            latency.COUNTS.view(),
+            rrb.Horizontal(loop.FLUX.view(), loop.SATURATED.view()),
         ),
         name=Tab.ENGINEERING,
     )
@@ -126,10 +129,6 @@ def _picture(path: str) -> rrb.View:
 
 def _contrast() -> rrb.View:
     return science.CONTRAST.view(axis_y=science.CONTRAST_AXIS)
-
-
-def _losses() -> rrb.View:
-    return latency.COUNTS.view(origin="latency", contents=[latency.COUNTS.path, latency.LOST.path])
 
 
 def _mode() -> rrb.View:

@@ -25,10 +25,12 @@ PARTS = Plot(
 COUNTS = Plot(
     "latency/frames",
     "Frames skipped and missing, messages lost, since the start",
-    {"skipped: a newer one was there": ORANGE, "missing: never arrived": RED},
+    {
+        "skipped: a newer one was there": ORANGE,
+        "missing: never arrived": RED,
+        "messages lost by the recorder": GREY,
+    },
 )
-LOST = Plot("latency/lost", curves={"messages lost by the recorder": GREY})
-"""Beside `COUNTS`, in one view."""
 WINDOW_NS = 1_000_000_000
 BINS = 40
 """Bars of the histogram; whatever took longer than its axis is in the last."""
@@ -41,7 +43,7 @@ _BODY = 99.0
 class Latency(Panel):
     """From a frame to its command, and the stages of it."""
 
-    plots = (WHOLE, PARTS, COUNTS, LOST)
+    plots = (WHOLE, PARTS, COUNTS)
     period_ns = 500_000_000
 
     def __init__(self) -> None:
@@ -64,11 +66,11 @@ class Latency(Panel):
             PARTS.add_one(stream, now_ns, *np.percentile(us[:, :-1], 99, axis=0))
             self._scale.fit(np.percentile(us[:, -1], [_BODY]), now_ns)
         self._draw_histogram(stream, now_ns, us[:, -1])
-        if (controller := snapshot.health.get(Role.CONTROLLER)) is not None:
+        controller, recorder = (snapshot.health.get(role) for role in (Role.CONTROLLER, Role.RECORDER))
+        if controller is not None:
             frames = topic_count(controller.health, FRAME.key)
-            COUNTS.add_one(stream, now_ns, frames.skipped, frames.missing)
-        if (recorder := snapshot.health.get(Role.RECORDER)) is not None:
-            LOST.add_one(stream, now_ns, recorder.health.recording.lost)
+            lost = recorder.health.recording.lost if recorder is not None else 0
+            COUNTS.add_one(stream, now_ns, frames.skipped, frames.missing, lost)
 
     def _draw_histogram(self, stream: rr.RecordingStream, time_ns: int, us: Array) -> None:
         """Draw bars of even width from 0 to the axis' end, which changes seldom."""

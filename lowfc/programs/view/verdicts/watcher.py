@@ -81,7 +81,6 @@ class Watcher:
         self._attained: Attained | None = None
         self._samples: deque[_Sample] = deque(maxlen=_SAMPLES)
         self._counted: dict[str, tuple[int, int]] = {}
-        self._reported: dict[str, object] = {}
         self._last_worked: list[_Sample] = []
 
     def feed(self, snapshot: Snapshot) -> None:
@@ -201,14 +200,11 @@ class Watcher:
         return max(0.0, (self._snapshot.host_ns - time_ns) * 1e-9 - self._snapshot.behind_s)
 
     def _update_mode(self, snapshot: Snapshot) -> None:
-        """Keep the mode of the newest message about it: a step, or a state or Health that is new."""
+        """Keep the mode of the last step; without a new one that of the last state or, where there is none, Health."""
         last = snapshot.health.get(Role.CONTROLLER)
-        for name, report in (("health", last and last.health), ("state", snapshot.controller)):
-            if report is not None and report is not self._reported.get(name):
-                self._mode = _MODES.get(report.mode, self._mode)
-            self._reported[name] = report
-        if snapshot.steps.mode.size:
-            self._mode = _MODES.get(int(snapshot.steps.mode[-1]), self._mode)
+        report = snapshot.controller or (last.health if last is not None else None)
+        mode = snapshot.steps.mode[-1] if snapshot.steps.mode.size else report.mode if report is not None else 0
+        self._mode = _MODES.get(int(mode), self._mode)
 
     def _update_events(self, events: Iterable[Log]) -> None:
         """Keep the newest note and cause: events from before a view began come after those that it received itself."""
