@@ -144,24 +144,14 @@ def test_a_replay_does_not_depend_on_it(log: Path) -> None:
     assert "commands identical" in done.stdout
 
 
-def test_a_view_has_it(log: Path) -> None:
-    tape = Tape()
-    drawn = draw_logs([log], None, lambda config: Renderer(config, tape))  # type: ignore[arg-type]
-    assert drawn.remarks == attached_configuration_of(log)
-
-
-def test_a_view_of_a_log_with_an_unreadable_one_takes_the_default(tmp_path: Path, night: Night) -> None:
-    log = night.write(tmp_path / "night.mcap", toml="[camera")
-    taken: list[Configuration] = []
-    tape = Tape()
-
-    def painter(config: Configuration) -> Renderer:
-        taken.append(config)
-        return Renderer(config, tape)  # type: ignore[arg-type]
-
-    drawn = draw_logs([log], None, painter)
-    assert taken == [Configuration()]
-    assert [str(log) in remark for remark in drawn.remarks] == [True, False]
+@pytest.mark.parametrize(("toml", "rate_hz"), [(OTHER, 300.0), ("[camera", Configuration().camera.rate_hz)])
+def test_a_view_has_it_or_the_default(tmp_path: Path, night: Night, toml: str, rate_hz: float) -> None:
+    log, tape = night.write(tmp_path / "night.mcap", toml=toml), Tape()
+    used: list[Configuration] = []
+    drawn = draw_logs([log], None, lambda config: used.append(config) or Renderer(config, tape))  # type: ignore[arg-type]
+    assert [config.camera.rate_hz for config in used] == [rate_hz]
+    assert all(str(log) in remark for remark in drawn.remarks[:1])
+    assert toml != OTHER or drawn.remarks == attached_configuration_of(log)
 
 
 def test_what_needs_the_configuration_says_so(tmp_path: Path, night: Night) -> None:

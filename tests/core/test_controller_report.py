@@ -2,6 +2,7 @@
 
 import io
 from dataclasses import replace
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -16,7 +17,7 @@ from lowfc.control.loop.camera import CameraSettings
 from lowfc.control.loop.inputs import Request, Step
 from lowfc.control.loop.safety import LoopMode
 from lowfc.programs.cli.ctl import status
-from lowfc.programs.core.controller_report import LastSecond, NotClosed
+from lowfc.programs.core.controller_report import LastSecond, NotClosed, Offload
 from lowfc.programs.launch.status import screen, status_line, summary_text
 from lowfc.programs.launch.watch import Watch, summary
 from tests.support.toy import DARK_DN, SATURATION_DN, SHAPE, START, frame, loaded, settings
@@ -165,3 +166,12 @@ def test_frames_after_the_last_that_a_recorder_received_are_lost_too(received: i
     camera = wire.Health(topics=[wire.TopicCount(topic=FRAME.key, published=500)])
     figures = summary(Watch({"recorder": recorder, "camera": camera}, []), record=True)
     assert (figures["messages_lost"], figures["lost"].get(FRAME.key, 0)) == (lost, lost)
+
+
+def test_the_mean_modal_command_is_published_for_offload() -> None:
+    published: list[bytes] = []
+    offload = Offload(SimpleNamespace(put=published.append), frames=2)
+    for noll, command_nm in (((2, 3), 9.0), ((4, 5), 1.0), ((4, 5), 2.0), ((4, 5), 7.0)):
+        offload.add(Step(8, 77, LoopMode.CLOSED, np.full(2, command_nm, np.float32), ()), noll)
+    (message,) = map(wire.ModalOffload.FromString, published)
+    assert (list(message.noll), list(message.command_nm), message.frames) == ([4, 5], [1.5, 1.5], 2)

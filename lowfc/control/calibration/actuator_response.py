@@ -39,11 +39,3 @@ def actuators_to_modes(
         chunk = slice(start, start + CHUNK)
         seen[:, chunk] = reconstructor @ normalise_flux(reference, response(shapes[chunk]), good)[1]
     return np.asarray(seen @ wavefronts.T) if nodes < actuators else seen
-
-
-def of_commands(modes_to_actuators: npt.NDArray[np.floating]) -> Array:
-    """Z where nothing is known but the commands (actuators, modes): their pseudo-inverse (modes, actuators).
-
-    It says of an actuator how much of each command it is, so that shapes that are no commands pass for some.
-    """
-    return np.asarray(np.linalg.pinv(np.asarray(modes_to_actuators, dtype=np.float64)))
