@@ -14,14 +14,12 @@ import subprocess
 import sys
 import time
 from collections import defaultdict
-from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 import typer
 import yaml
 
-from lowfc.adapters.bus.run import free_ports
 from lowfc.adapters.process.realtime import _LATENCY_DEVICE
 from lowfc.adapters.process.supervision import Supervisor, status_line
 from lowfc.contract.configuration import Configuration, load
@@ -262,42 +260,33 @@ main()
 
 
 class Supervised:
-    def __init__(self, name: str, folder: Path, run: str) -> None:
+    """A process as its unit starts it, in a run of the test, with a stand-in for systemd."""
+
+    def __init__(self, name: str, folder: Path) -> None:
+        unit = f"lowfc-{name}.service"
         self.name = name
         self.manager = Manager(folder / f"{name}.notify", WAIT_S)
-        words = [str(DEPLOY / "lowfc.toml") if word == CONFIGURED else word for word in command(name)]
-        if "--run" in words:
-            words[words.index("--run") + 1] = run
-        else:
-            words += ["--run", run]
-        for port, free in zip(("9876", "9090"), free_ports(2), strict=True):
-            words = [str(free) if word == port else word for word in words]
-        start = [str(Path(sys.executable).parent / words[0])]
-        if name == "lowfc-controller.service":
+        program, *words = [str(DEPLOY / "lowfc.toml") if word == CONFIGURED else word for word in command(unit)]
+        words += ["--run", "supervised"]
+        start = [str(Path(sys.executable).parent / program)]
+        if name == "controller":
             start = [sys.executable, "-c", HANGING.replace("HANGS", repr(str(folder / "hang")))]
         self.words_file = folder / f"{name}.stderr"
         with self.words_file.open("wb") as said:
             environment = os.environ | self.manager.environment | {"PYTHONFAULTHANDLER": "1"}
-            self.process = subprocess.Popen([*start, *words[1:]], cwd=folder, stderr=said, env=environment)
+            self.process = subprocess.Popen([*start, *words], cwd=folder, stderr=said, env=environment)
 
-
-@contextlib.contextmanager
-def supervised(folder: Path, *names: str) -> Iterator[dict[str, Supervised]]:
-    started: dict[str, Supervised] = {}
-    try:
-        for name in names:
-            started[name] = Supervised(f"lowfc-{name}.service", folder, "supervised")
-        yield started
-    finally:
-        for one in started.values():
-            one.process.kill()
-            one.process.wait()
-            one.manager.socket.close()
+    def close(self) -> None:
+        self.process.kill()
+        self.process.wait()
+        self.manager.socket.close()
 
 
 @pytest.mark.exclusive
 def test_processes_are_ready_alive_and_stopping(tmp_path: Path) -> None:
-    with supervised(tmp_path, "recorder", "sim-mirror", "controller", "sim-camera") as found:
+    with contextlib.ExitStack() as stack:
+        names = ("recorder", "sim-mirror", "controller", "sim-camera")
+        found = {name: stack.enter_context(contextlib.closing(Supervised(name, tmp_path))) for name in names}
         for one in found.values():
             until(lambda one=one: "READY=1" in one.manager.said and one.manager.beats > 5)
             most = (time.monotonic() - one.manager.begun_s) / (WAIT_S / 2) + 2

@@ -139,13 +139,15 @@ def _supervise(
     duration_s: float | None,
 ) -> None:
     camera = children[0]
-    viewless = False
+    view = next((child for child in children if child.name == Role.VIEWER), None)
     with held_back() as interrupted, _display(console) as show:
         begun_s = time.monotonic()
         shown_s = 0.0
         while camera.status is None and watch.of(Role.CAMERA).state != "stopped" and not interrupted():
             check(children[1:])
-            viewless = viewless or _say_view_ended(children, console)
+            if view is not None and view.status is not None:
+                _say_view_ended(view, console)
+                view = None
             elapsed_s = time.monotonic() - begun_s
             if elapsed_s > shown_s + SHOW_S:
                 shown_s = elapsed_s
@@ -175,20 +177,13 @@ def check(children: list[Child]) -> None:
             raise ProcessDiedError(f"{child.how_it_ended()}; its last words:\n{child.stderr_tail()}")
 
 
-def _say_view_ended(children: list[Child], console: Console) -> bool:
-    """Whether the view has ended by itself; what it said last is shown, unless its window was just closed."""
-    for child in children:
-        if child.name == Role.VIEWER and child.status is not None:
-            if child.status != 0:
-                why = child.stderr_tail().splitlines()[-1:] if child.status > 0 else []
-                told = "; ".join([child.how_it_ended(), *why])
-                console.print(
-                    f"the loop goes on without its view ({told}); `lowfc view` starts another",
-                    markup=False,
-                    soft_wrap=True,
-                )
-            return True
-    return False
+def _say_view_ended(view: Child, console: Console) -> None:
+    """Print the end of the view's standard error, unless its window was just closed."""
+    if view.status != 0:
+        why = view.stderr_tail().splitlines()[-1:] if view.status is not None and view.status > 0 else []
+        ending = "; ".join([view.how_it_ended(), *why])
+        text = f"the loop goes on without its view ({ending}); `lowfc view` starts another"
+        console.print(text, markup=False, soft_wrap=True)
 
 
 @contextlib.contextmanager
