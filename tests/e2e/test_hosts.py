@@ -116,7 +116,7 @@ class Bench:
 
     def newest(self) -> dict[str, Any]:
         seen = self.seen()
-        return seen[-1] if seen else {"good": 0, "following": 0, "status": "", "events": {}, "health": {}}
+        return seen[-1] if seen else {"good": 0, "following": 0, "status": "", "events": {}}
 
     def events(self, name: str) -> int:
         return int(self.newest()["events"].get(name, 0))
@@ -160,31 +160,22 @@ def bench(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Bench]:
         made.lab.close()
 
 
-def test_the_loop_closes_and_clocks_are_known(bench: Bench) -> None:
-    bench.settled()
-    bench.wait(lambda: set(PLACES) <= set(bench.newest()["health"]), "everybody's health")
-    health = bench.newest()["health"]
-    for process, place in PLACES.items():
-        heard = health[process]
-        truth_ns = clock_offset_ns(bench.lab.middle) - clock_offset_ns(bench.lab[place])
-        assert heard["round_trip_ns"] > 0
-        assert abs(heard["offset_ns"] - truth_ns) <= heard["round_trip_ns"] / 2 + 1
-    # the camera's clock is 287 ms ahead of the controller's: by themselves, no latency would be right
-    assert 0 < health["controller"]["frame_to_command_ns"] < 100_000_000
-
-
 def clock_offset_ns(host: Host) -> int:
     """What a host takes for the difference of the epoch and the one monotonic clock that all have here."""
     return int(next((host.folder / "runtime" / "lowfc").glob("clock-*")).read_text())
 
 
-def test_the_operators_hand_and_a_view_reach_it_from_the_desk(bench: Bench) -> None:
+def test_clocks_are_known_and_the_operators_hand_and_a_view_reach_the_loop_from_the_desk(bench: Bench) -> None:
+    bench.settled()
     desk = bench.lab["desk"]
     told = desk.run("-m", "lowfc", "hosts", "--run", RUN, "--json")
     assert told.returncode == 0, told.stderr
     rows = {row["process"]: row for row in json.loads(told.stdout)["processes"]}
     assert {*PLACES, ROUTER} <= set(rows)
-    assert rows["mirror-dm"]["clock_offset_us"] == pytest.approx(-3e6, abs=2e5)
+    for process, place in PLACES.items():
+        truth_us = (clock_offset_ns(bench.lab.middle) - clock_offset_ns(bench.lab[place])) / 1e3
+        assert rows[process]["clock_error_us"] > 0
+        assert abs(rows[process]["clock_offset_us"] - truth_us) <= rows[process]["clock_error_us"] + 0.001
     done = desk.run("-m", "lowfc", "ctl", "open", "--run", RUN)
     assert done.returncode == 0, done.stderr
     bench.wait(lambda: bench.newest()["good"] == 0, "an open loop")

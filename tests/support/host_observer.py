@@ -1,4 +1,4 @@
-"""What is heard on one host of a run on several, ten times a second as a line of JSON on standard error."""
+"""What one host of a run on several receives, ten times a second as a line of JSON on standard error."""
 
 import json
 import sys
@@ -12,28 +12,19 @@ from lowfc.adapters.bus.run import open_run
 from lowfc.adapters.bus.zenoh_bus import ZenohBus
 from lowfc.adapters.process.clock import HostClock
 from lowfc.contract.configuration import load
-from lowfc.contract.messages import EVENT, HEALTH, MIRROR_STATE, STEP, Log, wire
+from lowfc.contract.messages import EVENT, MIRROR_STATE, STEP, Log, wire
 
 
 def main(run: str, config: str, role: str) -> None:
     links = open_run(run, network=load(Path(config)).network).links
     bus = ZenohBus(links, role, HostClock())
-    events, health = Counter[str](), dict[str, dict[str, object]]()
+    events = Counter[str]()
 
     def hear_event(sample: object) -> None:
         log = Log.FromString(sample.payload)  # type: ignore[attr-defined]
         events[f"{log.name} {log.message.split(' ')[0]}"] += 1
 
-    def hear_health(sample: object) -> None:
-        heard = wire.Health.FromString(sample.payload)  # type: ignore[attr-defined]
-        health[heard.process] = {
-            "offset_ns": heard.router_offset_ns,
-            "round_trip_ns": heard.router_round_trip_ns,
-            "frame_to_command_ns": heard.frame_to_command.p50_ns,
-        }
-
     bus.subscribe(EVENT, hear_event)
-    bus.subscribe(HEALTH, hear_health)
     steps, states = bus.ring(STEP, 1000), bus.ring(MIRROR_STATE, 1000)
     good = following = 0
     while True:
@@ -53,7 +44,6 @@ def main(run: str, config: str, role: str) -> None:
             "status": wire.MirrorStatus.Name(new_states[-1].status) if new_states else "",
             "highest_nm": float(max((np.abs(np.frombuffer(s.actuators, "<f4")).max() for s in new_states), default=0)),
             "events": events,
-            "health": health,
         }
         sys.stderr.write(json.dumps(line) + "\n")
         sys.stderr.flush()
