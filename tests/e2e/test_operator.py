@@ -153,6 +153,8 @@ def _the_rest(night: Night) -> None:
         loop.record(False)
         night.said["while stopped"] = night.ctl("lowfc ctl status --json")
         loop.record(True)
+        until(lambda: loop.processes()["controller"].mode == wire.LOOP_MODE_CLOSED)
+        until(lambda: not loop.processes()["recorder"].recording.stopped)
     words = (("ctl", "note", "here", "--run", night.name[:-1]), ("runs", "--json"), ("hosts",))
     for name, said in zip(("beginning", "runs", "hosts"), words, strict=True):
         night.said[name] = lowfc(*said).stdout

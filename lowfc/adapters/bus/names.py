@@ -1,4 +1,4 @@
-"""Names of processes and mirrors from the bus: bounded, because whoever has the run's secret can invent any number."""
+"""Names of processes and mirrors from the bus: bounded, for a program with the run's secret can invent any number."""
 
 from lowfc.adapters.bus.bus import name_in
 from lowfc.contract.errors import BadMessageError
@@ -8,7 +8,7 @@ MOST_NAMES = 64
 """Names on one topic, beside those of `Role`, which always have room."""
 LONGEST_NAME = 128
 LARGEST_HEALTH_BYTES = 256_000
-"""A recorder's names all of its logs: about 3000 of them."""
+"""That of a recorder names all of its logs, about 3000."""
 
 
 class Names:

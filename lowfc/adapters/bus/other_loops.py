@@ -1,4 +1,4 @@
-"""Loops whose runs are not in this user's runtime directory, as far as the kernel tells of their processes."""
+"""Loops on this host whose runs are not in this user's runtime directory, found among its processes."""
 
 import contextlib
 import itertools
@@ -17,7 +17,7 @@ _FOLDER = "XDG_RUNTIME_DIR"
 
 
 def none_here() -> str:
-    """Sentence for a user who has no loop here: which folder was searched, what is not seen from here, who runs one."""
+    """Sentence for a user without a loop here: the folder that was searched, and other loops on this host."""
     given = f"from {_FOLDER}" if os.environ.get(_FOLDER) else f"{_FOLDER} is not set"
     sentence = (
         f"no loop of user {_name(os.geteuid())} is running here: {runtime_path()} was searched ({given}); loops of "
@@ -31,7 +31,7 @@ def none_here() -> str:
 def other_loops() -> Iterator[str]:
     """A sentence for each controller or simulated loop on this host, whoever runs it."""
     for process in psutil.process_iter():
-        with contextlib.suppress(psutil.Error):  # it has ended, or the system does not tell
+        with contextlib.suppress(psutil.Error):  # it has ended, or may not be read
             program = _program(process.cmdline())
             if program and process.pid != os.getpid():
                 owner = process.uids().effective
@@ -49,7 +49,7 @@ def _program(words: Sequence[str]) -> str:
 
 
 def _where(process: psutil.Process) -> str:
-    """The runtime directory of a process; nothing for that of another user, which the kernel does not tell."""
+    """The runtime directory of a process; nothing for that of another user, which may not be read."""
     try:
         there = process.environ().get(_FOLDER, "")
     except psutil.Error:

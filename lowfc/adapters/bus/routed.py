@@ -1,4 +1,4 @@
-"""The bus across hosts: zenoh's configuration of the router, and of those who come to it by mutual TLS."""
+"""The bus across hosts: zenoh's configuration of the router and of its clients, by mutual TLS."""
 
 import contextlib
 import datetime
@@ -31,15 +31,15 @@ _NOT_THERE = {
     *(errno.EHOSTUNREACH, errno.EHOSTDOWN, errno.ENETUNREACH, errno.ENETDOWN),
     socket.EAI_AGAIN,
 }
-"""Faults of a router, or of a network, that is not there yet; with all others waiting is in vain."""
+"""Faults of a router or a network that is not there yet; after any other, waiting is pointless."""
 
 
 def client_session(network: Network, role: str, sending: dict[str, Any]) -> dict[str, Any]:
-    """What a role's session has across hosts in place of its links on one.
+    """Part of a role's session configuration across hosts that replaces its links on one.
 
     Args:
         network: where the router is, and the certificates.
-        role: whose.
+        role: of the process.
         sending: zenoh's `transport/link/tx`, as on one host.
     """
     ca, certificate, key = certificate_files(network, role)
@@ -48,7 +48,7 @@ def client_session(network: Network, role: str, sending: dict[str, Any]) -> dict
         "listen": {"endpoints": []},
         "connect": {
             "endpoints": [network.router],
-            # Opening a session without a router waits so long; a session that has lost it tries again for ever.
+            # time that opening a session waits for a router; a session that has lost it tries again for ever
             "timeout_ms": CONNECT_MS,
             "exit_on_failure": True,
             "retry": {"period_init_ms": 50, "period_max_ms": 1000, "period_increase_factor": 2},
@@ -67,7 +67,7 @@ def client_session(network: Network, role: str, sending: dict[str, Any]) -> dict
 
 
 def router_session(network: Network, mirrors: Iterable[str], sending: dict[str, Any]) -> dict[str, Any]:
-    """What the router's session has: it listens by TLS only, and lets nobody do what the table of topics does not.
+    """Part of the router's session configuration: TLS only, and the access control of the table of topics.
 
     Args:
         network: where it is, and its certificates.
@@ -93,11 +93,11 @@ def router_session(network: Network, mirrors: Iterable[str], sending: dict[str, 
 
 
 def open_by_router(config: zenoh.Config, network: Network, role: str) -> zenoh.Session:
-    """Session by the router, which is waited for while nobody listens there.
+    """Open a session by the router, and wait for the router while nothing listens there.
 
     Raises:
-        BusError: the router does not take this certificate, or is not who it should be; it cannot be reached for
-            another reason than that it is not there; or zenoh refuses the session though the router is there.
+        BusError: router and process do not accept each other's certificates; the router cannot be reached for another
+            reason than that it is not there; or zenoh refuses the session though the router is there.
     """
     said, refused = "", 0
     while True:
@@ -117,11 +117,11 @@ def open_by_router(config: zenoh.Config, network: Network, role: str) -> zenoh.S
 
 
 def router_trouble(network: Network, role: str) -> str:
-    """Why there is no link to the router: it is not there, or going down; empty where it is there.
+    """Reason for a missing link to the router: it is not there, or going down; empty where it is there.
 
     Raises:
-        BusError: it is there, and one of the two does not take the other's certificate; or it cannot be reached for
-            another reason, such as a name that nobody knows.
+        BusError: one of the two does not accept the other's certificate; or the router cannot be reached for another
+            reason, such as an unknown name.
     """
     ca, certificate, key = certificate_files(network, role)
     host, port = network.address
@@ -134,9 +134,9 @@ def router_trouble(network: Network, role: str) -> str:
         ):
             link.settimeout(_ALERT_S)
             with contextlib.suppress(TimeoutError):
-                link.recv(1)  # who is not taken is told so only now
+                link.recv(1)  # a refusal comes only now
     except ssl.SSLEOFError:
-        return "who answers there ends the connection in the midst of the handshake: it is going down, or no router"
+        return "the connection is ended in the midst of the handshake: the router is going down, or it is none"
     except ssl.SSLError as fault:
         raise BusError(
             f"the router at {network.router} and {certificate} do not take each other ({fault.reason or fault}): both "
@@ -154,7 +154,7 @@ def router_trouble(network: Network, role: str) -> str:
 
 
 class RouterWatch:
-    """Says why a process has lost its router, and when it is back."""
+    """Reports why a process has lost its router, and when it is back."""
 
     def __init__(self, network: Network, role: str) -> None:
         self._network = network
@@ -162,7 +162,7 @@ class RouterWatch:
         self._said = ""
 
     def look(self, *, linked: bool) -> None:
-        """Take note of whether there is a link now; to be called now and then."""
+        """Report a change of the link; to be called periodically."""
         if linked:
             why = ""
         else:
@@ -183,7 +183,7 @@ def certificate_files(network: Network, role: str) -> tuple[Path, Path, Path]:
 
 
 def require_certificate(network: Network, role: str) -> None:
-    """Say before a session is opened that it would not be let in, or let in and sent nothing.
+    """Refuse a certificate before a session is opened that would not be let in, or let in and sent nothing.
 
     Raises:
         DataFileError: a file is missing or cannot be read, or the certificate is not valid, or another role's.
@@ -228,8 +228,8 @@ def _transport(tls: dict[str, object], sending: dict[str, Any]) -> dict[str, Any
         "link": {
             "protocols": ["tls"],  # nothing else is connected to or listened for
             "tls": tls,
-            # A link that says nothing for so long is down: it is closed, and made anew as soon as that is possible.
-            # What is sent until then waits in it, and arrives stale.
+            # A link that is silent for so long is closed, and made anew as soon as possible. Messages sent until
+            # then wait in it, and arrive stale.
             "tx": {**sending, "lease": _LEASE_MS, "keep_alive": 4},
         },
         "shared_memory": {"enabled": False},

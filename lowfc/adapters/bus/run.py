@@ -1,6 +1,6 @@
 """A run: one loop's runtime directory, ports and secret, so that two loops on one host never mix.
 
-The directory is made complete under another name and renamed, so that whoever comes first makes it and all others
+The directory is made complete under another name and renamed, so that the first process makes it and all others
 read the same. It is the user's own (0700), under $XDG_RUNTIME_DIR, or /tmp where the host has none.
 """
 
@@ -38,14 +38,14 @@ _PORT_RANGE = Path("/proc/sys/net/ipv4/ip_local_port_range")
 
 @dataclass(frozen=True, slots=True)
 class Links:
-    """Who listens where, and the secret that lets them talk.
+    """Where the processes of a run listen, and the secret that they share.
 
     Attributes:
         run_id: the run they belong to.
         ports: loopback TCP port of each role that listens: "camera", "controller", "mirror-dm", "recorder".
         user: name for zenoh's user/password authentication.
         secret_file: zenoh's dictionary, one line "user:password".
-        network: the way by a router, where the run is on several hosts; ports and secret are then not used.
+        network: the router, where the run is on several hosts; ports and secret are then not used.
     """
 
     run_id: str
@@ -74,9 +74,9 @@ class Links:
         return self._beside(f"{role}.sock") if role in self.ports else None
 
     def direct_link(self, role: str) -> Path | None:
-        """Socket at which a role gets what it waits for; None where the directory's name is too long for one.
+        """Socket of a role's direct link; None where the directory's name is too long for one.
 
-        None by a router: who may put what is the router's to say, and no process shall get round it.
+        None by a router, whose access control applies to all messages.
         """
         return None if self.network.router else self._beside(f"{role}.in")
 
@@ -87,7 +87,7 @@ class Links:
     def live(self) -> set[str]:
         """Roles whose processes listen now; a run that was killed leaves its directory behind.
 
-        By a router, nobody else listens: while it does, any may be there.
+        By a router, only the router listens: while it does, any role may be there.
         """
         if self.network.router:
             return set(self.ports) if _listens(*self.network.address) else set()
@@ -126,7 +126,7 @@ class Run:
     links: Links
 
     def remove(self) -> None:
-        """Delete the directory; for whoever made the run, when all its processes have ended."""
+        """Delete the directory; for the process that made the run, when all others have ended."""
         shutil.rmtree(self.path, ignore_errors=True)
 
 
@@ -142,7 +142,7 @@ def _listens(host: str, port: int) -> bool:
 
 
 def new_run_id() -> str:
-    """Name for a run that nobody else has: UTC time and a random part."""
+    """Unused name for a run: UTC time and a random part."""
     return f"{time.strftime('%Y%m%d-%H%M%S', time.gmtime())}-{secrets.token_hex(3)}"
 
 
@@ -159,13 +159,13 @@ def open_run(
         run_id: its name.
         mirrors: that it has.
         base: directory of its directory; the user's runtime directory when None.
-        listeners: roles that get a port of their own beside the usual ones, where this makes the run: a launcher hears
-            a view, which only connects, if it listens.
-        network: the way to other hosts, where this makes the run; who gives none, or one without a router, takes the
-            run's. A launcher's run stays on its host.
+        listeners: roles that get a port of their own beside the usual ones, where this makes the run: a launcher
+            receives from a view, which only connects, if it listens.
+        network: the router, where this makes the run; without one, the run's applies. A launcher's run stays on its
+            host.
 
     Raises:
-        BusError: the name is not usable, or the run was made without one of `mirrors`, or goes another way.
+        BusError: the name is not usable, or the run was made without one of `mirrors`, or with another network.
         DataFileError: the run's directory is damaged.
     """
     if not _RUN_ID.fullmatch(run_id):

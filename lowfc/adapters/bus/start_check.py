@@ -28,14 +28,14 @@ class StartCheck:
 
     def ahead(self, sequence: int) -> bool:
         """Whether this sequence starts too far ahead."""
-        if sequence < self._allowed or not self._compares:  # time only goes on: what was allowed is
+        if sequence < self._allowed or not self._compares:  # time only goes on: what was allowed stays so
             return False
         now_s = self._clock.host_ns() // _NS
         self._allowed = sequence_of(now_s + self._ahead_s + 1, 0)
         if sequence < self._allowed:
             return False
         start_s = start_of(sequence)
-        if start_s != self._named_s and now_s != self._at_s:  # whoever invents starts does not fill the log
+        if start_s != self._named_s and now_s != self._at_s:  # invented starts must not fill the log
             self._named_s, self._at_s = start_s, now_s
             self._refused(_utc(start_s), _utc(now_s))
         return True

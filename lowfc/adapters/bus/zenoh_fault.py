@@ -1,4 +1,4 @@
-"""What zenoh says is wrong, for people."""
+"""Zenoh's errors, for people."""
 
 import re
 

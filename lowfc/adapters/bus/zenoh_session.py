@@ -11,7 +11,7 @@ from lowfc.contract.messages import TOPICS
 _SOCKET = "unixsock-stream"
 _GLANCES_HZ = 40.0  # a view draws 30 pictures a second; each finds a new one
 _BATCH_BYTES = 65535  # zenoh's own
-_SMALL_BATCH_BYTES = 16384  # of a reader that keeps messages: each holds the buffer that it came in
+_SMALL_BATCH_BYTES = 16384  # of a monitor, which keeps messages: each holds the buffer that it came in
 _SPARE_BUFFERS = 1024  # without them it makes and clears one for every message
 _PRIORITIES = ("real_time", "interactive_high", "interactive_low", "data_high", "data", "data_low", "background")
 
@@ -23,7 +23,7 @@ def session_config(links: Links, role: str, *, monitor: bool = False) -> dict[st
 
     Args:
         links: of the run.
-        role: whose.
+        role: of the process.
         monitor: it takes no part in the loop, see `ZenohBus`.
     """
     batch_bytes = _SMALL_BATCH_BYTES if monitor else _BATCH_BYTES
@@ -47,7 +47,7 @@ def session_config(links: Links, role: str, *, monitor: bool = False) -> dict[st
     glanced_at = [{"key_expr": topic.at(ALL), "freq": _GLANCES_HZ} for topic in TOPICS if topic.latest_only]
     return {
         "mode": "peer",
-        # Peers do not forward, so everybody connects to everybody; with a timeout of -1 any start order works.
+        # Peers do not forward, so each connects to all others; with a timeout of -1 any start order works.
         "listen": {"endpoints": [one for one in listening if one], "exit_on_failure": True, "timeout_ms": 0},
         "connect": {
             "endpoints": [
@@ -57,11 +57,11 @@ def session_config(links: Links, role: str, *, monitor: bool = False) -> dict[st
             ],
             "timeout_ms": -1,
             "exit_on_failure": False,
-            # A newcomer connects to all others itself. Who asks five times a second for somebody who is not there (a
-            # recorder, say) delays a frame each time.
+            # A newcomer connects to all others itself. Five attempts a second to reach an absent process (a recorder,
+            # say) made a frame late each time.
             "retry": {"period_init_ms": 50, "period_max_ms": 4000, "period_increase_factor": 2},
         },
-        # Opening waits `delay` ms for the links that are not there yet; whoever is up is connected within a few.
+        # Opening waits `delay` ms for the links that are not there yet; running processes are connected within a few.
         "scouting": scouting,
         "transport": {
             "auth": {

@@ -1,6 +1,6 @@
-"""The latch of safe mode: it outlives the controller, in places that fail apart, and never holds anybody up.
+"""The latch of safe mode: it outlives the controller, in places that fail independently, and never delays the loop.
 
-A file in each place means safe. A place that cannot be read means safe; it is written by a thread of its own, again and
+A file in any place means safe, and so does a place that cannot be read. A thread of its own writes the files, again and
 again until that works, so that neither a full disk nor a server that hangs delays the loop or an answer.
 """
 
@@ -31,7 +31,7 @@ def latch_files(run: Run) -> tuple[Path, ...]:
     state = os.environ.get("STATE_DIRECTORY", "").partition(":")[0]  # given by systemd
     if not state:
         state = str(Path(os.environ.get("XDG_STATE_HOME") or Path.home() / ".local/state") / "lowfc")
-    with contextlib.suppress(OSError):  # the latch says so when it needs it
+    with contextlib.suppress(OSError):  # the latch reports it when it needs the folder
         Path(state).mkdir(mode=0o700, parents=True, exist_ok=True)
     return (*files, Path(state) / f"{run.run_id}.{NAME}")
 
@@ -40,7 +40,7 @@ class Latch:
     """Whether the loop is in safe mode, kept in files."""
 
     def __init__(self, files: Sequence[Path], failed: Callable[[str], None] = lambda why: None) -> None:
-        """Read the files; `failed` is told why, once, whenever a file cannot be read or written.
+        """Read the files; `failed` gets the reason, once, whenever a file cannot be read or written.
 
         Attributes:
             safe: one of the files is there, or cannot be looked for.
@@ -52,7 +52,7 @@ class Latch:
         self.safe = True in [self._there(file) for file in self._files]
         self.kept = True in [self._try(_probe, file) for file in self._files]
         self._wanted = self.safe
-        self._done: bool | None = None if self.safe else False  # where one place says so, the others shall, too
+        self._done: bool | None = None if self.safe else False  # where one place is safe, the others shall be, too
         self._ended = False
         self._changed = threading.Condition()
         self._keeper = threading.Thread(target=self._keep, name="latch", daemon=True)
@@ -65,7 +65,7 @@ class Latch:
             self._changed.notify()
 
     def close(self) -> None:
-        """Write what is still to be written, once more at most, for up to a second."""
+        """Finish writing: one more attempt, for up to a second."""
         with self._changed:
             self._ended = True
             self._changed.notify()
@@ -83,7 +83,7 @@ class Latch:
         return False
 
     def _keep(self) -> None:
-        """On a thread of its own: make the files what is wanted, until that is done."""
+        """On a thread of its own: write or remove the files until all are as wanted."""
         while True:
             with self._changed:
                 self._changed.wait_for(lambda: self._ended or self._wanted is not self._done)
@@ -109,7 +109,7 @@ class Latch:
         return True
 
     def _name(self, file: Path, why: str) -> None:
-        """Say once what is wrong with a file, until it is right again; whoever is told cannot end this thread."""
+        """Report once that a file is wrong, until it is right again; a handler that fails does not end this thread."""
         if file not in self._named:
             self._named.add(file)
             with contextlib.suppress(Exception):

@@ -17,18 +17,18 @@ from rich.progress import (
 )
 
 Counted = Callable[[str, int, int], None]
-"""What is being done, how much of it is, and of how much."""
+"""Gets what is being done, how much of it is done, and of how much."""
 _EVERY_S = 10.0
 
 
 def passing_bar(console: Console, *columns: ProgressColumn) -> Progress:
-    """A bar that vanishes at its end, and is not there at all where nobody looks: it would leave an empty line."""
+    """A bar that vanishes at its end, and is not shown without a terminal, where it would leave an empty line."""
     return Progress(*columns, console=console, transient=True, disable=not console.is_terminal)
 
 
 @contextlib.contextmanager
 def counting_bar(console: Console, *columns: ProgressColumn) -> Iterator[Counted]:
-    """One bar for what is done one after the other; it appears with the first step.
+    """One bar for several things in turn; it appears with the first step.
 
     Args:
         console: where it is drawn.
@@ -51,7 +51,7 @@ def reading_bar(console: Console) -> contextlib.AbstractContextManager[Counted]:
 
 
 def spoken(say: Callable[[str], None], clock: Callable[[], float] = time.monotonic) -> Counted:
-    """Progress where nobody looks at a bar: a line every 10 s, with the time to go at the rate so far.
+    """Progress without a terminal: a line every 10 s, with the time to go at the rate so far.
 
     Args:
         say: What prints a line.

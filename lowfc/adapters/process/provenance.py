@@ -1,4 +1,4 @@
-"""Where figures come from: versions, host, processor and linear algebra, by which two runs can be told apart."""
+"""Origin of figures: versions, host, processor and linear algebra, by which two runs can be told apart."""
 
 import importlib.metadata
 import os
@@ -19,7 +19,7 @@ _SIMD = ("sse", "ssse", "avx", "fma", "f16c", "amx", "neon", "asimd", "sve", "fp
 
 
 def provenance(run_id: str = "", seed: int | None = None) -> dict[str, str]:
-    """What ran, and on what; nothing in it changes while a host and an installation stay the same.
+    """Versions and host of a run; they stay the same while host and installation do.
 
     Args:
         run_id: of the run; empty for none.

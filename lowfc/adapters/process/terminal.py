@@ -1,4 +1,4 @@
-"""Command lines: how a user's mistake looks, and the options that every process of a run has."""
+"""Command lines: how a user's mistake is shown, and the options that all processes of a run have."""
 
 import errno
 import os
@@ -50,7 +50,7 @@ def _warn(text: str) -> None:
 def run_app(app: Callable[[], object]) -> NoReturn:
     """Run a command line; a user's mistake is one clear message and exit status 2, never a traceback.
 
-    Being told to stop ends a command as Ctrl-C does; the processes of a loop catch both themselves.
+    SIGTERM ends a command as Ctrl-C does; the processes of a loop catch both themselves.
     """
     signal.signal(signal.SIGTERM, signal.default_int_handler)
     signal.signal(signal.SIGINT, signal.default_int_handler)
@@ -61,7 +61,7 @@ def run_app(app: Callable[[], object]) -> NoReturn:
         if fault.filename is not None or fault.errno not in (errno.ENOSPC, errno.EIO, errno.EPIPE):
             raise
         sys.stderr.write(f"error: standard output cannot be written: {fault.strerror}\n")
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # what is left of it cannot go anywhere
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # the rest of it cannot be written
         sys.exit(2)
     except LowfcError as error:
         sys.stderr.write(f"error: {printable(str(error), keep=LINES)}\n")
