@@ -72,7 +72,7 @@ def _plain(name: str) -> Callable[["Client"], Answer]:
 class Client:
     """A connection to a loop, for one thread (another renews a reservation); it stays until `disconnect`.
 
-    Of the run, only who is asked need be there.
+    Of the run, only the process that answers need be there.
 
     Every request is carried out between two frames or refused, and answered with the first frame for which it is in
     force. What is refused raises RequestRefusedError, what is not answered BusError.
@@ -153,7 +153,7 @@ class Client:
         return self.ask("channel", text=name, actuators_nm=shape)
 
     def play(self, basis_nm: npt.ArrayLike, table: npt.ArrayLike) -> Answer:
-        """Add shapes to the mirror frame by frame, without the loop being told; it ends by itself.
+        """Add shapes to the mirror frame by frame, unknown to the control law; it ends by itself.
 
         Args:
             basis_nm: (shapes, actuators) or (shapes, rows, columns), nm of surface.
@@ -300,7 +300,7 @@ class Client:
 
         Raises:
             BusError: no controller is there, or it is too slow.
-            RequestRefusedError: the controller refused, and says why.
+            RequestRefusedError: the controller refused, with its reason.
         """
         try:
             message = wire.Request(

@@ -55,7 +55,7 @@ class Lease:
         self._thread.start()
 
     def expect(self, duration_s: float) -> None:
-        """Say how long it is going to take from now on."""
+        """Set how long it is going to take from now on."""
         self._end_s = time.monotonic() + duration_s
 
     def expecting(self, progress: "Counted", rate_hz: float) -> "Counted":

@@ -17,7 +17,7 @@ class MirrorWatch:
     """What the mirrors of a run reported since it was made; it is there once a first mirror has reported.
 
     Attributes:
-        frame_sequence: of the newest command that every mirror heard of follows.
+        frame_sequence: of the newest command that every known mirror follows.
         interruption: what kept a mirror from following commands meanwhile, a sentence's subject and verb; else empty.
     """
 

@@ -1,4 +1,4 @@
-"""Every request, once: its key, the fields of `lowfc.v1.Request` that it takes, what it does, how `lowfc ctl` asks it.
+"""Every request, once: its key, the fields of `lowfc.v1.Request` that it takes, what it does, its `lowfc ctl`.
 
 The client's methods, the commands of `lowfc ctl` and the table in docs/operating.md are made of it; a test holds it
 against what the controller and the recorder know.
@@ -9,8 +9,8 @@ from typing import NamedTuple
 from lowfc.contract.messages import RECORD_KEY, REQUEST_KEY
 
 
-class Asked(NamedTuple):
-    """One kind of request.
+class Declaration(NamedTuple):
+    """Declaration of one kind of request.
 
     Attributes:
         key: of the query.
@@ -34,44 +34,44 @@ _MODES = ("modes", "Noll indices, none for all")
 _ONE_OR_EACH = "one, or one for each mode"
 
 
-def _asked(name: str, sentence: str, example: str, *fields: tuple[str, str]) -> Asked:
-    return Asked(REQUEST_KEY.format(name=name), fields, sentence, example)
+def _declared(name: str, sentence: str, example: str, *fields: tuple[str, str]) -> Declaration:
+    return Declaration(REQUEST_KEY.format(name=name), fields, sentence, example)
 
 
-ASKED: tuple[Asked, ...] = (
-    _asked("status", "Say what the controller is doing; the answer holds the whole state.", "status"),
-    _asked("open", "Stop driving the mirror, which holds its shape.", "open"),
-    _asked("close", "Let the control law drive the mirror.", "close"),
-    _asked("pause", "Hold the command; `close` goes on from it.", "pause"),
-    _asked(
+DECLARED: tuple[Declaration, ...] = (
+    _declared("status", "Report what the controller is doing; the answer holds the whole state.", "status"),
+    _declared("open", "Stop driving the mirror, which holds its shape.", "open"),
+    _declared("close", "Let the control law drive the mirror.", "close"),
+    _declared("pause", "Hold the command; `close` goes on from it.", "pause"),
+    _declared(
         "step", "Close the loop for some frames; then it opens by itself.", "step 100", ("values", "number of frames")
     ),
-    _asked("safe", "Relax the mirror to flat and latch it there, whatever else is asked.", "safe"),
-    _asked("clear", "Leave the latched safe state; the loop is open afterwards.", "clear"),
-    _asked("reset", "Take the modal command to zero within the slew limit, and clear the law's memory.", "reset"),
-    _asked(
+    _declared("safe", "Relax the mirror to flat and latch it there, whatever else is requested.", "safe"),
+    _declared("clear", "Leave the latched safe state; the loop is open afterwards.", "clear"),
+    _declared("reset", "Take the modal command to zero within the slew limit, and clear the law's memory.", "reset"),
+    _declared(
         "gain",
         "Set integrator gains; one at which the loop would be unstable is refused.",
         "gain 0.4 --modes 2,3",
         _MODES,
         ("values", _ONE_OR_EACH),
     ),
-    _asked("leak", "Set integrator leaks.", "leak 0.01", _MODES, ("values", _ONE_OR_EACH)),
-    _asked(
+    _declared("leak", "Set integrator leaks.", "leak 0.01", _MODES, ("values", _ONE_OR_EACH)),
+    _declared(
         "limit",
         "Set the largest modal commands.",
         "limit 100 --modes 2,3",
         _MODES,
         ("values", f"{_ONE_OR_EACH}, nm rms of wavefront"),
     ),
-    _asked(
+    _declared(
         "offset",
         "Set where the loop holds the wavefront; zero without values.",
         "offset 5 -3 --modes 4,11",
         _MODES,
         ("values", f"{_ONE_OR_EACH}, nm rms of wavefront"),
     ),
-    _asked(
+    _declared(
         "channel",
         "Add a shape to the mirror in place of the one of that name, and take the sensor's zero point along, so that "
         "the loop does not undo it; `flat` is added without.",
@@ -79,9 +79,9 @@ ASKED: tuple[Asked, ...] = (
         ("text", "name: up to 32 of a-z, 0-9 and -, a letter first"),
         ("actuators", "float32, nm of surface, rows x columns; empty removes the channel"),
     ),
-    _asked(
+    _declared(
         "play",
-        "Add a row of a table for each frame, from the answered frame on, without the loop being told; it ends by "
+        "Add a row of a table for each frame, from the answered frame on, unknown to the control law; it ends by "
         "itself.",
         "",
         ("text", "`mirror` or `offset`"),
@@ -89,17 +89,17 @@ ASKED: tuple[Asked, ...] = (
         ("columns", "of the table"),
         ("actuators", "of `mirror`: one shape for each column, float32, nm of surface"),
     ),
-    _asked("stop", "End what is being played.", "stop"),
-    _asked(
+    _declared("stop", "End what is being played.", "stop"),
+    _declared(
         "law",
         "Let a linear law drive the mirror: it observes for a while, then takes over in a cross-fade; refused where it "
         "is not stable.",
         "law lqg.fits",
         ("law", "none for the integrator"),
     ),
-    _asked("load", "Use another calibration; the loop must be open.", "load calibration.fits", ("calibration", "all")),
-    _asked("note", "Leave a note in the log.", 'note "new star"', ("text", "the note")),
-    _asked(
+    _declared("load", "Use another calibration in an open loop.", "load calibration.fits", ("calibration", "all")),
+    _declared("note", "Leave a note in the log.", 'note "new star"', ("text", "the note")),
+    _declared(
         "lease",
         "Reserve the loop: until that ends, requests of others that would change it are refused; `safe`, `open`, "
         "`pause` and `stop` are granted to anybody, and end it.",
@@ -108,7 +108,7 @@ ASKED: tuple[Asked, ...] = (
         ("values", "seconds for which it holds without being renewed, at most 60"),
         ("text", "the holder and its purpose, for people"),
     ),
-    _asked(
+    _declared(
         "renew",
         "Let a reservation that is in force hold longer; refused where it has ended, with the cause.",
         "",
@@ -116,10 +116,10 @@ ASKED: tuple[Asked, ...] = (
         ("values", "seconds"),
         ("text", "as in `lease`"),
     ),
-    _asked("release", "End a reservation.", "", ("lease_id", "as in `lease`")),
-    _asked("configuration", "Answer with the configuration that the controller was started with.", "configuration"),
-    Asked(RECORD_KEY.format(name="start"), (), "Start the next log and print its path.", "record start"),
-    Asked(
+    _declared("release", "End a reservation.", "", ("lease_id", "as in `lease`")),
+    _declared("configuration", "Answer with the configuration that the controller was started with.", "configuration"),
+    Declaration(RECORD_KEY.format(name="start"), (), "Start the next log and print its path.", "record start"),
+    Declaration(
         RECORD_KEY.format(name="stop"),
         (),
         "Finish the log and print its path; the file is complete when the answer comes.",
@@ -128,15 +128,15 @@ ASKED: tuple[Asked, ...] = (
 )
 
 
-BY_NAME = {asked.key.partition("/")[2].removeprefix("request/"): asked for asked in ASKED}
+BY_NAME = {one.key.partition("/")[2].removeprefix("request/"): one for one in DECLARED}
 """By name, as "gain" and "record/start"."""
 
 
 def table() -> str:
     """Markdown table of all requests."""
     lines = ["| query | fields of the request | what it does | `lowfc ctl` |", "|---|---|---|---|"]
-    for asked in ASKED:
-        fields = "; ".join(f"`{name}`: {what}" for name, what in asked.fields)
-        example = f"`{asked.example}`" if asked.example else ""
-        lines.append(f"| `{asked.key}` | {fields} | {asked.sentence} | {example} |")
+    for one in DECLARED:
+        fields = "; ".join(f"`{name}`: {what}" for name, what in one.fields)
+        example = f"`{one.example}`" if one.example else ""
+        lines.append(f"| `{one.key}` | {fields} | {one.sentence} | {example} |")
     return "\n".join(lines) + "\n"

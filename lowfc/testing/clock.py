@@ -16,7 +16,7 @@ class FakeClock:
         self.start_s = start_ns // _NS
 
     def now_ns(self) -> int:
-        """The time it was given."""
+        """Its time."""
         return self.time_ns
 
     host_ns = now_ns

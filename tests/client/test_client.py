@@ -21,7 +21,7 @@ from lowfc.adapters.bus.run import open_run
 from lowfc.adapters.logs.reader import LogReader
 from lowfc.adapters.process.clock import HostClock
 from lowfc.client import Answer, Client, Frame, Stream, client, configuration_of, running, the_run
-from lowfc.client.requests import ASKED
+from lowfc.client.requests import DECLARED
 from lowfc.client.runs import nobody_yet
 from lowfc.client.stream import WAITING, frame_of, step_of
 from lowfc.contract.codecs import codec
@@ -454,15 +454,15 @@ def test_a_step_comes_as_it_was_sent() -> None:
 
 
 def test_the_declared_requests_are_those_that_there_are() -> None:
-    by_key = {asked.key: asked for asked in ASKED}
-    assert len(by_key) == len(ASKED)
+    by_key = {asked.key: asked for asked in DECLARED}
+    assert len(by_key) == len(DECLARED)
     assert list(by_key) == [
         *(REQUEST_KEY.format(name=name) for name in REQUESTS),
         "lowfc/record/start",
         "lowfc/record/stop",
     ]
     fields = set(wire.Request.DESCRIPTOR.fields_by_name)
-    assert all({name for name, _ in asked.fields} <= fields for asked in ASKED)
+    assert all({name for name, _ in asked.fields} <= fields for asked in DECLARED)
     assert all(not by_key[REQUEST_KEY.format(name=name)].fields for name in SIMPLE)
 
 
@@ -472,7 +472,7 @@ def test_every_command_has_help_with_an_example() -> None:
         f"record {name}": each
         for name, each in group.commands["record"].commands.items()  # type: ignore[attr-defined]
     }
-    names = {asked.example.split()[0] for asked in ASKED if asked.example}
+    names = {asked.example.split()[0] for asked in DECLARED if asked.example}
     assert names | {"dark", "reference"} == {name.split()[0] for name in commands}
     for name, command in commands.items():
         assert f"Example: lowfc {'calibrate' if name in ('dark', 'reference') else 'ctl'}" in command.help, name

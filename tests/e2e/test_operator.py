@@ -19,7 +19,7 @@ from typer.testing import CliRunner
 
 from lowfc.adapters.files import calibration_file, law_file
 from lowfc.client import Client, running
-from lowfc.client.requests import ASKED
+from lowfc.client.requests import DECLARED
 from lowfc.contract.errors import CalibrationError, RequestRefusedError
 from lowfc.contract.messages import COMMAND, EVENT, REQUEST, Log, wire
 from lowfc.control.laws.linear_law import integrator_block, of_blocks
@@ -167,7 +167,7 @@ def _the_rest(night: Night) -> None:
 
 def test_every_request_is_made_by_a_command_of_the_document() -> None:
     names = {command.split()[2] for command in COMMANDS}
-    assert names == {asked.example.split()[0] for asked in ASKED if asked.example}
+    assert names == {asked.example.split()[0] for asked in DECLARED if asked.example}
 
 
 def test_the_commands_say_what_they_did(night: Night) -> None:

@@ -1,7 +1,7 @@
 """The bridge from a run to a viewer: it may start, hang, die and start again, and the loop never notices.
 
 Messages wait in rings that keep the newest, a render thread draws from them, and the main thread watches that thread,
-the viewer's process and the memory of both. After a failure the view begins anew, with an event that says why.
+the viewer's process and the memory of both. After a failure the view begins anew, with an event that has the reason.
 """
 
 import platform
@@ -34,7 +34,7 @@ OWN_BYTES = 512_000_000
 VIEWER_SPARE_BYTES = 1_500_000_000
 """Memory of a viewer beyond what it may keep of the stream: its textures, plots and window are not in that limit."""
 STUCK_S = 10.0
-"""Without a snapshot drawn, the viewer is taken for hung."""
+"""Without a snapshot drawn, the viewer counts as hung."""
 MOST_EARLIER = 1000
 """Events that are shown from before the view began, the newest."""
 
@@ -78,7 +78,7 @@ class Bridge:
         self.service = Service(Role.VIEWER, run_id, clock, bus)
 
     def run(self, until_s: float | None = None, ready: Callable[[], None] = lambda: None) -> None:
-        """Show the run until told to stop, until a window is closed, or for a time; `ready` once the viewer is there.
+        """Show the run until it is stopped, until a window is closed, or for a time; `ready` once the viewer is there.
 
         Raises:
             ViewerError: no viewer can be started.
@@ -199,7 +199,7 @@ class Bridge:
 
 
 def earlier_events(recorder: wire.Health | None, now_ns: int) -> list[Sample]:
-    """The newest events in a recorder's logs; where they cannot be read, a line that says so.
+    """The newest events in a recorder's logs; where they cannot be read, a line with the reason.
 
     Only the chunks that hold events are read: a second for a log of 4 GB.
     """

@@ -89,7 +89,7 @@ class FoxgloveBridge:
         self.service = Service(Role.VIEWER, run_id, clock, bus)
 
     def run(self) -> None:
-        """Serve until told to stop."""
+        """Serve until stopped."""
         self.service.state = "running"
         while self.service.running:
             if self.service.newcomers():

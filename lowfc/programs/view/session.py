@@ -28,7 +28,7 @@ _POLL_S = 0.1
 
 
 def show_run(run_id: str, config: Configuration | None, target: Target, seconds: float | None) -> dict[str, Any]:
-    """Show a running loop until told to stop, until the window is closed, or for some seconds.
+    """Show a running loop until it is stopped, until the window is closed, or for some seconds.
 
     Raises:
         ViewerError, ViewError: there is no viewer, or it fails again and again.

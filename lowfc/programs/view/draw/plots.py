@@ -87,7 +87,7 @@ class Plot:
 
 
 class Axes:
-    """A box with axes of its own, linear in what is given: rerun's plots are never logarithmic, and forget."""
+    """A box with linear axes of its own: rerun's plots are never logarithmic, and forget the oldest points."""
 
     def __init__(self, path: str, width: float) -> None:
         self.path = path

@@ -38,7 +38,7 @@ _NAMES = {
     "true": ("with a flat mirror, true wavefront", "now, true wavefront"),
     "measured": ("with a flat mirror, pseudo-open-loop", "now, measured error"),
 }
-"""What the wavefronts are, those of a simulation first: they are taken where there are any."""
+"""Names of the curves by kind of wavefront; those of a simulation are preferred."""
 
 
 class Science(Panel):

@@ -18,7 +18,7 @@ NEAR_BEST = 1.3
 NOISE_FLOOR = 0.2
 """Of the sensor's noise, which is subtracted: what is left is known no better than this share of it."""
 UNCORRECTED = ("OPEN", "SAFE", "DEAD")
-"""The loop as it is where nothing corrects; where it waits or has ended, that would say something else."""
+"""Values of the tile LOOP under which nothing is corrected."""
 
 
 def wavefront(state: RunState, nm_per_mas: float | None, loop: Tile) -> Tile:
