@@ -1,8 +1,8 @@
 """The wavefront's disturbance: a pure function of the seed and of time.
 
-Every preset is a sum of sine waves with seeded phases (a spectral model of drift, jitter and lines), a square wave or
-a static screen, so that any instant can be computed by itself and the spectrum is known exactly. A damped line is
-many waves, whose frequencies are spread as its resonance is wide.
+Every preset is a sum of sine waves with seeded phases (a spectral model of drift and jitter), damped lines, a square
+wave and a static screen, and its spectrum is known exactly. A damped line is a rotating vector whose length and phase
+wander (an Ornstein-Uhlenbeck process): it is drawn frame by frame, so that a late frame costs all before it.
 """
 
 from dataclasses import dataclass
@@ -32,9 +32,16 @@ _THERMAL_NM = {1: 4.0, 2: 5.0, 3: 2.5, 4: 1.5}
 _THERMAL_HZ = (0.003, 0.5)
 _DRIFT_HZ = (0.02, 5.0)
 _WAVES_PER_BAND = 24
-_WAVES_PER_LINE = 64
-FIRST_LINE = 2 * _WAVES_PER_BAND
-"""Of the reaction wheel's waves, the first that belongs to a line."""
+_FRAMES_AT_ONCE = 1 << 14
+
+
+@dataclass(frozen=True, eq=False)
+class DampedLine:
+    """A vibration of this rms (modes,), nm of wavefront, and this width between half-power points."""
+
+    frequency_hz: float
+    width_hz: float
+    rms_nm: Array
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,6 +55,8 @@ class Disturbance:
         step_nm: (modes,) half of the height of a square wave.
         static_nm: (modes,) constant.
         screen_nm: rms of a static Kolmogorov screen, 0 for none.
+        lines: damped ones.
+        seed: of the lines' course.
     """
 
     noll: tuple[int, ...]
@@ -56,6 +65,8 @@ class Disturbance:
     step_nm: Array
     static_nm: Array
     screen_nm: float
+    lines: tuple[DampedLine, ...] = ()
+    seed: int = 0
 
 
 def disturbance(
@@ -93,6 +104,7 @@ def disturbance(
     tilt = np.array([index in (2, 3) for index in noll])
     tilt_nm = scale * nm_per_mas * tilt
     step, screen = np.zeros(modes), 0.0
+    lines: tuple[DampedLine, ...] = ()
     waves: list[tuple[Array, npt.NDArray[np.complex128]]] = []
     match preset:
         case "quiet":
@@ -110,10 +122,10 @@ def disturbance(
                 _drift(rng, _DRIFT_MAS * tilt_nm, _DRIFT_HZ),
             ]
             if preset == "reaction-wheel" and line_width:
-                waves += [
-                    _damped(rng, rms_mas * tilt_nm, hz, line_width * hz)
+                lines = tuple(
+                    DampedLine(hz, line_width * hz, rms_mas * tilt_nm)
                     for rms_mas, hz in zip(LINES_MAS, LINES_HZ, strict=True)
-                ]
+                )
             else:
                 waves.append(_lines(rng, np.array(LINES_MAS), LINES_HZ, tilt_nm))
         case "step":
@@ -124,18 +136,78 @@ def disturbance(
             raise ValueError(f"unknown disturbance {preset!r}")
     frequencies = np.concatenate([np.zeros(0), *(frequency for frequency, _ in waves)])
     amplitudes = np.concatenate([np.zeros((0, modes), complex), *(amplitude for _, amplitude in waves)])
-    return Disturbance(noll, frequencies, amplitudes, step, static, screen)
+    return Disturbance(noll, frequencies, amplitudes, step, static, screen, lines, seed)
 
 
 def modes_nm(shaken: Disturbance, first: int, count: int, rate_hz: float) -> Array:
     """Modes (count, modes) at the starts of the exposures of the frames from `first` on, nm of wavefront rms."""
-    return modes_at_nm(shaken, (first + np.arange(count)) / rate_hz)
+    found = _sum_of_waves(shaken, (first + np.arange(count)) / rate_hz)
+    if shaken.lines:
+        lines = _Lines(shaken, rate_hz)
+        found[:, lines.modes] += lines.at(first, count)[:count].real.sum(axis=1)
+    return found
 
 
-def modes_at_nm(shaken: Disturbance, time_s: Array) -> Array:
-    """Modes (instants, modes) at these times, nm of wavefront rms."""
+def _sum_of_waves(shaken: Disturbance, time_s: Array) -> Array:
+    """Modes (instants, modes) at these times without the damped lines."""
     waves = np.exp(2j * np.pi * np.outer(time_s - time_s[0], shaken.frequency_hz)) @ _turned(shaken, time_s[0])
-    return waves.real + _square(time_s)[:, None] * shaken.step_nm + shaken.static_nm
+    return np.asarray(waves.real + _square(time_s)[:, None] * shaken.step_nm + shaken.static_nm)
+
+
+def variances_nm2(shaken: Disturbance, per_line: int = 401) -> tuple[Array, Array]:
+    """Frequencies (n,) in Hz and the variance at each (n, modes), nm^2; a damped line at the quantiles of its power."""
+    frequency_hz, variance_nm2 = [shaken.frequency_hz], [np.abs(shaken.amplitude_nm) ** 2 / 2]
+    quantiles = (np.arange(per_line) + 0.5) / per_line
+    for line in shaken.lines:
+        frequency_hz.append(np.abs(line.frequency_hz + line.width_hz / 2 * np.tan(np.pi * (quantiles - 0.5))))
+        variance_nm2.append(np.tile(line.rms_nm**2 / per_line, (per_line, 1)))
+    return np.concatenate(frequency_hz), np.concatenate(variance_nm2)
+
+
+class _Lines:
+    """The course of damped lines at the starts of exposures, as complex vectors; drawn in the order of the frames.
+
+    Attributes:
+        modes: (moved,) those that the lines move.
+    """
+
+    def __init__(self, shaken: Disturbance, rate_hz: float) -> None:
+        self._seed = shaken.seed
+        rms_nm = np.array([line.rms_nm for line in shaken.lines])
+        self.modes = np.flatnonzero(rms_nm.any(axis=0))
+        self._rms_nm = rms_nm[:, self.modes]
+        omega = 2 * np.pi * np.array([line.frequency_hz for line in shaken.lines]) / rate_hz
+        self._damping = np.pi * np.array([line.width_hz for line in shaken.lines]) / rate_hz
+        self._step = np.exp(1j * omega - self._damping)
+        self._restart()
+
+    def _restart(self) -> None:
+        self._rng = np.random.Generator(np.random.SFC64(np.random.SeedSequence([self._seed, 4])))
+        self._next, self._vector = 0, self._draw(1)[0]
+
+    def _draw(self, count: int) -> npt.NDArray[np.complex128]:
+        """(count, lines, moved) of the variance that a line has, both parts alike."""
+        parts = self._rng.standard_normal((count, *self._rms_nm.shape, 2))
+        return np.asarray((parts[..., 0] + 1j * parts[..., 1]) * self._rms_nm)
+
+    def at(self, first: int, count: int) -> npt.NDArray[np.complex128]:
+        """Vectors (count + 1, lines, moved) at the frames from `first` on."""
+        if first < self._next:
+            self._restart()
+        while self._next < first:
+            self._advance(min(first - self._next, _FRAMES_AT_ONCE))
+        return np.asarray(np.concatenate([self._advance(count), self._vector[None]]))
+
+    def _advance(self, count: int) -> npt.NDArray[np.complex128]:
+        """Vectors (count, lines, moved) from the next frame on."""
+        drawn = self._draw(count) * np.sqrt(1 - np.abs(self._step) ** 2)[:, None]
+        found: npt.NDArray[np.complex128] = np.empty_like(drawn)
+        vector, step = self._vector, self._step[:, None]
+        for row in range(count):
+            found[row] = vector
+            vector = step * vector + drawn[row]
+        self._next, self._vector = self._next + count, vector
+        return found
 
 
 class Sampler:
@@ -148,6 +220,8 @@ class Sampler:
         self._time_s = ((np.arange(BLOCK)[:, None] + instants) / rate_hz).ravel()
         waves = np.exp(2j * np.pi * np.outer(self._time_s, shaken.frequency_hz))
         self._waves = np.hstack([waves.real, -waves.imag]).astype(np.float32)
+        self._lines = _Lines(shaken, rate_hz) if shaken.lines else None
+        self._between = _between(shaken.lines, instants / rate_hz, 1 / rate_hz)
         self._shape = (BLOCK, len(instants), len(shaken.noll))
         self._block = np.zeros(self._shape, np.float32)
         self._first = -1
@@ -162,8 +236,23 @@ class Sampler:
             square = _square(start_s + self._time_s)[:, None] * self._shaken.step_nm
             found += (square + self._shaken.static_nm).astype(np.float32)
             self._first, self._block = first, found.reshape(self._shape)
+            if self._lines is not None:
+                vectors, (before, after) = self._lines.at(first, BLOCK), self._between
+                moved = np.einsum("il,flm->fim", before, vectors[:-1]) + np.einsum("il,flm->fim", after, vectors[1:])
+                self._block[:, :, self._lines.modes] += moved.real
         row: Single = self._block[index - first]
         return row
+
+
+def _between(lines: tuple[DampedLine, ...], time_s: Array, period_s: float) -> npt.NDArray[np.complex128]:
+    """How much (2, instants, lines) of a line's vectors at the starts of a period and of the next one is expected."""
+    omega = 2j * np.pi * np.array([line.frequency_hz for line in lines])
+    damping = np.pi * np.array([line.width_hz for line in lines])
+    whole = np.sinh(damping * period_s)
+    time_s = time_s[:, None]
+    before = np.sinh(damping * (period_s - time_s)) / whole * np.exp(omega * time_s)
+    after = np.sinh(damping * time_s) / whole * np.exp(omega * (time_s - period_s))
+    return np.array([before, after])
 
 
 def _turned(shaken: Disturbance, time_s: float) -> npt.NDArray[np.complex128]:
@@ -219,16 +308,6 @@ def _lines(
     """Sine waves at fixed frequencies; `rms` of each in units of `unit_nm` (modes,)."""
     amplitude = np.sqrt(2) * rms[:, None] * unit_nm
     return np.array(frequencies_hz), amplitude * _phases(rng, amplitude.shape)
-
-
-def _damped(
-    rng: np.random.Generator, rms_nm: Array, frequency_hz: float, width_hz: float
-) -> tuple[Array, npt.NDArray[np.complex128]]:
-    """A line of this rms (modes,): waves of one size, at the quantiles of a Lorentzian of this width."""
-    quantiles = (np.arange(_WAVES_PER_LINE) + rng.uniform(0.3, 0.7, _WAVES_PER_LINE)) / _WAVES_PER_LINE
-    frequencies = frequency_hz + width_hz / 2 * np.tan(np.pi * (quantiles - 0.5))
-    shape = (_WAVES_PER_LINE, len(rms_nm))
-    return np.abs(frequencies), np.sqrt(2 / _WAVES_PER_LINE) * rms_nm * _phases(rng, shape)
 
 
 def _phases(rng: np.random.Generator, shape: tuple[int, int]) -> npt.NDArray[np.complex128]:

@@ -8,6 +8,7 @@ from lowfc.control.laws.continuous import Timing, left_power
 from lowfc.control.laws.linear_law import integrator
 from lowfc.control.laws.margins import noise_gain
 from lowfc.optics.detector.photometry import tilt_nm_per_mas
+from sim_camera.disturbance import variances_nm2
 from sim_camera.process import disturbance_of, ignore
 
 
@@ -19,8 +20,9 @@ def tilt_residual_mas(config: Configuration, delay_frames: float) -> float:
     control, shaken = config.control, disturbance_of(config)
     law = integrator([control.tilt_gain], [control.tilt_leak], (2,), delay_frames, config.camera.rate_hz)
     timing = Timing.of(delay_frames, config.camera.exposure_fraction)
-    left = left_power(law, 2 * np.pi * shaken.frequency_hz / config.camera.rate_hz, timing)
-    waves = np.sum(np.abs(shaken.amplitude_nm[:, :2]) ** 2 / 2 * left, axis=0)
+    frequency_hz, variance_nm2 = variances_nm2(shaken)
+    left = left_power(law, 2 * np.pi * frequency_hz / config.camera.rate_hz, timing)
+    waves = np.sum(variance_nm2[:, :2] * left, axis=0)
     optics = factory.twin(config, None, ignore)
     calibration = factory.analytic_calibration(config, optics, factory.mirror_on_twin(config, optics, ignore))
     noise = factory.frame_noise_nm(config, calibration)[:2] ** 2

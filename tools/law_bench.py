@@ -20,7 +20,7 @@ from lowfc.control.loop.advance import advance
 from lowfc.control.loop.inputs import Frame, Load, Request, Step
 from lowfc.control.loop.state import State
 from lowfc.optics.detector.photometry import tilt_nm_per_mas
-from sim_camera.disturbance import FIRST_LINE, Disturbance
+from sim_camera.disturbance import LINES_HZ, Disturbance
 from sim_camera.path import MirrorPath
 from sim_camera.process import ignore, scene
 from sim_camera.scene import Truth
@@ -47,9 +47,12 @@ def calibrated(config: Configuration) -> Calibration:
 
 def with_lines_moved(shaken: Disturbance, factor: float) -> Disturbance:
     """The same disturbance with its lines at other frequencies."""
-    frequency_hz = shaken.frequency_hz.copy()
-    frequency_hz[FIRST_LINE:] *= factor
-    return replace(shaken, frequency_hz=frequency_hz)
+    ideal = np.isin(shaken.frequency_hz, LINES_HZ)
+    return replace(
+        shaken,
+        frequency_hz=np.where(ideal, factor, 1) * shaken.frequency_hz,
+        lines=tuple(replace(line, frequency_hz=factor * line.frequency_hz) for line in shaken.lines),
+    )
 
 
 class Bench:
@@ -133,12 +136,17 @@ class Bench:
         return float(np.sqrt(np.mean(residual_nm**2)) / self.nm_per_mas)
 
 
+def timing_of(config: Configuration) -> Timing:
+    """When the loop of a configuration exposes and moves its mirror."""
+    exposure = config.camera.exposure_fraction if config.camera.instants > 1 else 0.0
+    return Timing.of(config.camera.delay_frames, exposure)
+
+
 def tuned(run: Pieces, config: Configuration, kinds: Sequence[str] = ("lqg",)) -> dict[str, Tuned]:
     """Laws of these kinds for pseudo-open-loop modes (frames, modes), of all modes or the first few."""
     noll = config.noll[: run.values[0].shape[1]]
     rate_hz, none = config.camera.rate_hz, np.zeros(len(noll))
-    exposure = config.camera.exposure_fraction if config.camera.instants > 1 else 0.0
-    timing = Timing.of(config.camera.delay_frames, exposure)
+    timing = timing_of(config)
     gains, models = best_gains(run, rate_hz, timing, none), identified(run, rate_hz)
     makers: dict[str, Callable[[], Tuned]] = {
         "integrator": lambda: tune_integrator(models, gains, noll, none, timing),

@@ -10,16 +10,16 @@ from threadpoolctl import threadpool_limits
 from lowfc.adapters.files.factory import frame_noise_nm
 from lowfc.contract.configuration import Configuration
 from lowfc.control.calibration.calibration import Calibration
-from lowfc.control.laws.continuous import Timing, left_power
+from lowfc.control.laws.continuous import left_power
 from lowfc.control.laws.kalman import lqg
 from lowfc.control.laws.linear_law import LinearLaw
 from lowfc.control.laws.margins import noise_gain
 from lowfc.control.laws.spectra import Pieces
 from lowfc.control.laws.vibration import Line, Model
 from lowfc.optics.detector.photometry import tilt_nm_per_mas
-from sim_camera.disturbance import LINES_HZ
+from sim_camera.disturbance import variances_nm2
 from sim_camera.process import disturbance_of
-from tools.law_bench import RATE_HZ, Bench, calibrated, configured, tuned, with_lines_moved
+from tools.law_bench import RATE_HZ, Bench, calibrated, configured, timing_of, tuned, with_lines_moved
 from tools.shared import Figures, markdown
 
 CASES: dict[str, dict[str, Any]] = {
@@ -33,7 +33,6 @@ SHORTER = (8_000, 16_000)
 """Frames of the same loop, the last ones, from which an LQG law is made for comparison."""
 IDENTIFY, SETTLE, MEASURE = 48_000, 12_000, 12_000
 """Frames of the closed loop that a law is identified from, until a law has settled, and over which it is measured."""
-_NO_WIDTH_HZ = 1e-8
 _DRIFT_BOUNDS = ((-5.0, 2.0), (-1.0, 2.6))
 """Decades of the walk's step, nm^2, and of its corner, Hz, between which the optimum is looked for."""
 
@@ -101,39 +100,37 @@ def moved(config: Configuration, calibration: Calibration, law: LinearLaw) -> di
 
 
 def theory_mas(config: Configuration, calibration: Calibration, law: LinearLaw) -> tuple[float, float]:
-    """What a law leaves of the disturbance's known sine waves, and what it makes of noise; rms of both axes, mas."""
-    shaken, delay = disturbance_of(config), config.camera.delay_frames
-    left = left_power(law, 2 * np.pi * shaken.frequency_hz / RATE_HZ, Timing.of(delay, 0.0))[:, :2]
-    waves = np.mean(np.sum(np.abs(shaken.amplitude_nm[:, :2]) ** 2 / 2 * left, axis=0))
-    noise = np.mean(frame_noise_nm(config, calibration)[:2] ** 2 * noise_gain(law, delay)[:2])
+    """What a law leaves at every moment of the disturbance's known spectrum, and what it makes of noise; rms, mas."""
+    frequency_hz, variance_nm2 = variances_nm2(disturbance_of(config))
+    left = left_power(law, 2 * np.pi * frequency_hz / RATE_HZ, timing_of(config))[:, :2]
+    waves = np.mean(np.sum(variance_nm2[:, :2] * left, axis=0))
+    noise = np.mean(frame_noise_nm(config, calibration)[:2] ** 2 * noise_gain(law, config.camera.delay_frames)[:2])
     nm_per_mas = tilt_nm_per_mas(config.star.diameter_m)
     return float(np.sqrt(waves) / nm_per_mas), float(np.sqrt(noise) / nm_per_mas)
 
 
 def optimum_mas(config: Configuration, calibration: Calibration) -> float:
-    """The least that an LQG law leaves in theory which knows the wheel's lines: without width, noise, the best drift.
-
-    The simulated drift is a sum of sine waves, too: a log that is long enough to tell them apart leads below this.
+    """The least that an LQG law leaves in theory which knows the wheel's lines and the noise, and takes the best drift.
 
     Raises:
         RuntimeError: the search ended at its edge: what it found is no least.
     """
-    shaken, delay = disturbance_of(config), config.camera.delay_frames
+    shaken, timing = disturbance_of(config), timing_of(config)
+    frequency_hz, variance_nm2 = variances_nm2(shaken)
     noise_nm = frame_noise_nm(config, calibration)[:2]
     best = []
     for axis in (0, 1):
-        power = np.abs(shaken.amplitude_nm[:, axis]) ** 2 / 2
-        known = tuple(Line(hz, _NO_WIDTH_HZ, float(power[shaken.frequency_hz == hz].sum())) for hz in LINES_HZ)
+        power = variance_nm2[:, axis]
+        known = tuple(Line(line.frequency_hz, line.width_hz, float(line.rms_nm[axis] ** 2)) for line in shaken.lines)
         variance = float(noise_nm[axis] ** 2)
 
         def left(
             drift: Any, axis: int = axis, power: Any = power, known: Any = known, variance: float = variance
         ) -> float:
             step, cutoff_hz = 10.0 ** np.asarray(drift)
-            timing = Timing.of(delay, 0.0)  # its images are of an instant
             law = lqg([Model(step, cutoff_hz, known, variance, RATE_HZ)], (2 + axis,), timing)
-            left = left_power(law, 2 * np.pi * shaken.frequency_hz / RATE_HZ, timing)[:, 0]
-            return float(power @ left + variance * noise_gain(law, delay)[0])
+            left = left_power(law, 2 * np.pi * frequency_hz / RATE_HZ, timing)[:, 0]
+            return float(power @ left + variance * noise_gain(law, timing.delay)[0])
 
         found = minimize(left, (-2.0, 0.7), method="Nelder-Mead", bounds=_DRIFT_BOUNDS, options={"xatol": 0.02})
         if any(min(x - low, high - x) < 0.05 for x, (low, high) in zip(found.x, _DRIFT_BOUNDS, strict=True)):

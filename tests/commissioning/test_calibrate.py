@@ -358,7 +358,11 @@ def response_there(loop: FoldedLoop, *, closed: bool) -> np.ndarray:
     optics = factory.twin(config, None, lambda _: None)
     mirror = factory.mirror_on_twin(config, optics, lambda _: None)
     still = scene._screen + wavefront_nm(mirror, np.mean(loop.surfaces_nm, axis=0).astype(np.float32))
-    moving = [0.0] if closed else [scene._modes(i) @ scene._basis for i in np.linspace(0, loop._index, 32).astype(int)]
+    moving = (
+        [0.0]
+        if closed
+        else [scene._sampler.at(i)[0] @ scene._basis for i in np.linspace(0, loop._index, 32).astype(int)]
+    )
     shapes = np.array(
         [wavefront_nm(mirror, each.reshape(before.grid)) for each in before.modes_to_actuators.T], dtype=np.float64
     )

@@ -65,8 +65,8 @@ def test_the_best_gain_is_that_of_theory() -> None:
 
 def test_the_reaction_wheel_without_images() -> None:
     """Each law leaves what it predicts; LQG far less than a notch, a notch than the integrator; two frames of delay."""
-    pol, _ = wheel(9000)
-    later, truth = wheel(9000)
+    pol, _ = wheel(20_000)
+    later, truth = wheel(20_000)
     later = Pieces((truth + 0.8 * np.random.default_rng(99).standard_normal(truth.shape),), 0)
     models = identified(pol, RATE_HZ)
     got: dict[tuple[str, float], float] = {}
@@ -80,13 +80,13 @@ def test_the_reaction_wheel_without_images() -> None:
             left = true_mas(one.law, later, truth, delay)
             got[one.law.name, delay] = left
             predicted = float(np.sqrt(np.mean(one.predicted_nm**2)) / NM_PER_MAS)
-            assert left == pytest.approx(predicted, rel=0.2), one.law.name
+            assert left == pytest.approx(predicted, rel=0.05), one.law.name
             assert one.margins.stable
             assert one.margins.gain_margin.min() >= LEAST_GAIN_MARGIN * 0.999
     assert 2.0 < got["integrator", 1.0] < 2.6
-    assert got["pi-notch", 1.0] < 0.6
-    assert got["lqg", 1.0] < 0.3
-    assert got["lqg", 2.0] < 0.4
+    assert got["pi-notch", 1.0] < 0.8
+    assert got["lqg", 1.0] < 0.7
+    assert got["lqg", 2.0] < 0.8 * got["pi-notch", 2.0]
     assert got["integrator", 2.0] > 5
 
 
@@ -112,7 +112,7 @@ def test_too_few_frames_are_refused() -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize("delay", [1.0, 2.0])
 def test_lqg_is_near_its_theory_and_follows_lines_that_moved(delay: float) -> None:
-    """Within 15 % of this very law's theory, which is no optimum; below 1.3 mas after lines moved by 2 %."""
+    """Within 15 % of this very law's theory and of the best LQG law's; the same again after lines moved by 2 %."""
     config = configured(delay_frames=delay)
     calibration = calibrated(config)
     bench = Bench(config, calibration)
@@ -126,8 +126,8 @@ def test_lqg_is_near_its_theory_and_follows_lines_that_moved(delay: float) -> No
     bench.load(law)
     bench.run(10_000)
     got = bench.tilt_mas(5000)
-    assert got < (1.0 if delay == 1 else 2.0)
     assert got < 1.15 * float(np.hypot(*laws.theory_mas(config, calibration, law)))
+    assert got < 1.15 * laws.optimum_mas(config, calibration)
 
     moved = Bench(config, calibration, with_lines_moved(disturbance_of(config), 1.02))
     moved.load(law)
@@ -137,7 +137,7 @@ def test_lqg_is_near_its_theory_and_follows_lines_that_moved(delay: float) -> No
     moved.run(20_000)
     moved.load(tuned(moved.pol(), config)["lqg"].law)
     moved.run(10_000)
-    assert moved.tilt_mas(5000) < 1.3
+    assert moved.tilt_mas(5000) < 1.15 * got
 
 
 @pytest.mark.slow
@@ -158,4 +158,4 @@ def test_capture_from_14_mas_on_20_seeds() -> None:
         fresh.ask("close")
         fresh.run(3500)
         left[seed] = fresh.tilt_mas(500)
-    assert {seed: mas for seed, mas in left.items() if mas >= 1.0} == {}
+    assert {seed: mas for seed, mas in left.items() if mas >= 1.3} == {}

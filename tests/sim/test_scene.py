@@ -8,7 +8,7 @@ from lowfc.contract.configuration import Configuration, load
 from lowfc.control.calibration.calibration import Calibration
 from lowfc.control.loop.estimator import Estimator
 from lowfc.optics.twin.twin import Evaluator
-from sim_camera.disturbance import BLOCK, modes_at_nm
+from sim_camera.disturbance import BLOCK, _sum_of_waves
 from sim_camera.process import disturbance_of
 from sim_camera.process import scene as scene_of
 from sim_camera.scene import Scene
@@ -111,13 +111,17 @@ def test_a_frame_is_the_same_in_whatever_order_it_is_asked_for() -> None:
 @pytest.mark.parametrize("exposure", [0.5, 0.9])
 def test_an_image_is_the_mean_over_its_exposure(exposure: float) -> None:
     """Two instants against 64, while the star moves by 14 mas rms: to 1e-5 of the brightest pixel."""
-    keys = {"disturbance__preset": "reaction-wheel", "camera__rate_hz": 1000.0, "camera__exposure_fraction": exposure}
+    keys = {
+        "disturbance__preset": "reaction-wheel-ideal",
+        "camera__rate_hz": 1000.0,
+        "camera__exposure_fraction": exposure,
+    }
     config = configured(**FINE, **keys)
     blurred, shaken = scene_of(config), disturbance_of(config)
     instant, worst = Evaluator(blurred._optics), 0.0
     for index in (0, 40, 91, 333):
         instants = index + exposure * (np.arange(64) + 0.5) / 64
-        opds = modes_at_nm(shaken, instants / 1000).astype(np.float32) @ blurred._basis
+        opds = _sum_of_waves(shaken, instants / 1000).astype(np.float32) @ blurred._basis
         mean = np.mean([instant.image(opd).copy() for opd in opds], axis=0, dtype=np.float64) * blurred._electrons
         found = (blurred.expose(index, FLAT).astype(float) - 100) * 0.01
         worst = max(worst, float(np.abs(found - mean).max() / mean.max()))
@@ -133,7 +137,7 @@ def test_the_continuous_truth_is_the_rms_over_the_period_and_the_mirrors_path(ca
     found = scene.truth(7, shapes[0], (shapes, weights))
     squares, pupil = [], []
     for moment, weight in zip((0.125, 0.375, 0.625, 0.875), weights, strict=True):
-        modes = modes_at_nm(shaken, np.array([(7 + moment) / 20]))[0]
+        modes = _sum_of_waves(shaken, np.array([(7 + moment) / 20]))[0]
         still = scene_of(
             configured(disturbance__static_nm={str(n): v for n, v in zip(config.noll, modes, strict=True)})
         )
@@ -147,10 +151,10 @@ def test_the_continuous_truth_is_the_rms_over_the_period_and_the_mirrors_path(ca
 
 
 def test_one_instant_is_that_at_which_the_exposure_starts_and_blurs_nothing() -> None:
-    keys = {"camera__noise": False, "disturbance__preset": "reaction-wheel"}
+    keys = {"camera__noise": False, "disturbance__preset": "reaction-wheel-ideal"}
     config = configured(**keys, camera__instants=1)
     scene = scene_of(config)
-    still = modes_at_nm(disturbance_of(config), np.array([3 / config.camera.rate_hz]))[0]
+    still = _sum_of_waves(disturbance_of(config), np.array([3 / config.camera.rate_hz]))[0]
     static = {str(n): float(v) for n, v in zip(config.noll, still, strict=True)}
     assert (
         scene.expose(3, FLAT)
