@@ -252,21 +252,18 @@ def test_a_process_that_loses_its_router_says_why(hosts: Hosts, capfd: pytest.Ca
     until(told("camera: the router is back\n"))
 
 
-def test_a_router_that_cannot_be_found_is_not_waited_for(hosts: Hosts, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_router_is_not_waited_for_where_that_does_not_help(hosts: Hosts, monkeypatch: pytest.MonkeyPatch) -> None:
     def unknown(*_: object) -> None:
         raise socket.gaierror(socket.EAI_NONAME, "Name or service not known")
-
-    monkeypatch.setattr("lowfc.adapters.bus.routed.socket.create_connection", unknown)
-    with pytest.raises(BusError, match=r"nowhere\.invalid.*cannot be reached .*resolve it"):
-        hosts.join("camera", network=hosts.network(host="nowhere.invalid"))
-
-
-def test_a_session_that_zenoh_refuses_is_not_waited_for(hosts: Hosts, monkeypatch: pytest.MonkeyPatch) -> None:
-    hosts.join(ROUTER)
 
     def refuse(config: object) -> None:
         raise zenoh.ZError("this and that")
 
+    with monkeypatch.context() as patch:
+        patch.setattr("lowfc.adapters.bus.routed.socket.create_connection", unknown)
+        with pytest.raises(BusError, match=r"nowhere\.invalid.*cannot be reached .*resolve it"):
+            hosts.join("camera", network=hosts.network(host="nowhere.invalid"))
+    hosts.join(ROUTER)
     monkeypatch.setattr("lowfc.adapters.bus.routed.zenoh.open", refuse)
     with pytest.raises(BusError, match="takes camera's certificate, and zenoh opens no session: this and that"):
         hosts.join("camera")

@@ -197,22 +197,6 @@ def test_two_threads_that_receive_take_turns() -> None:
     assert (handover.received, together) == (10_000, 1)
 
 
-def test_a_gap_is_closed_by_a_late_message_and_by_no_repeated_one() -> None:
-    gaps = Gaps(5)
-    told = [(count, gaps.came(count), gaps.missing) for count in (5, 8, 8, 6, 6, 9, 7, 4)]
-    assert told == [
-        (5, True, 0),
-        (8, True, 2),
-        (8, False, 2),
-        (6, True, 1),
-        (6, False, 1),
-        (9, True, 1),
-        (7, True, 0),
-        (4, False, 0),
-    ]
-    assert (gaps.first, gaps.next) == (5, 10)
-
-
 def test_whatever_the_order_only_what_never_came_is_missing() -> None:
     rng = np.random.default_rng(5)
     there = [0, *rng.permutation(rng.choice(np.arange(1, 1000), 800, replace=False)).tolist()]

@@ -6,7 +6,6 @@ import socket
 import ssl
 import stat
 import threading
-from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
@@ -108,27 +107,20 @@ def test_wherever_it_is_interrupted_a_pair_is_whole_or_not_there(
     assert stat.S_IMODE((tmp_path / "camera.key").stat().st_mode) == 0o600
 
 
-@contextlib.contextmanager
-def answering(answer: Callable[[socket.socket], object]) -> Iterator[int]:
-    """Somebody who takes one connection, on a port of this host."""
+def test_a_connection_that_ends_in_the_handshake_is_no_refusal_of_the_certificate(tmp_path: Path) -> None:
+    make(tmp_path, (ROUTER, "camera"), ["127.0.0.1"])
     with socket.create_server(("127.0.0.1", 0)) as server:
 
         def serve() -> None:
             connection, _ = server.accept()
             with connection:
-                answer(connection)
+                connection.recv(4096)
 
         thread = threading.Thread(target=serve)
         thread.start()
-        yield server.getsockname()[1]
-        thread.join()
-
-
-def test_who_hangs_up_in_the_handshake_is_not_one_who_refuses_the_certificate(tmp_path: Path) -> None:
-    make(tmp_path, (ROUTER, "camera"), ["127.0.0.1"])
-    with answering(lambda connection: connection.recv(4096)) as port:
-        network = Network(router=f"tls/127.0.0.1:{port}", certificates=str(tmp_path))
+        network = Network(router=f"tls/127.0.0.1:{server.getsockname()[1]}", certificates=str(tmp_path))
         assert "is ended in the midst of the handshake" in router_trouble(network, "camera")
+        thread.join()
     assert "refused" in router_trouble(network, "camera")
 
 

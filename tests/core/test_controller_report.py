@@ -91,7 +91,7 @@ def test_the_summary_and_the_status_say_it() -> None:
         state, _ = advance(USUAL, state, one)
     message = controller_state(state, USUAL, (START + 12) * SECOND)
     mirror = wire.Health(command_refused=wire.REASON_OUT_OF_ORDER)
-    _, *lines = status.text(message, {"mirror-dm": mirror}).splitlines()
+    _, *lines = status.text(status.figures(message, {"mirror-dm": mirror})).splitlines()
     assert lines[0].split(maxsplit=1)[1].startswith("open for 12 s (the camera does not fit the calibration: bias_dn")
     assert lines[1].split(maxsplit=1)[1] == "refuses commands: OUT_OF_ORDER"
     assert status.figures(message, {"mirror-x": wire.Health(command_expired=True)})["mirrors"]["mirror-x"]["expired"]
@@ -104,7 +104,7 @@ def test_the_first_line_of_the_status_says_whether_all_is_well() -> None:
 
     def first(**changes: Any) -> str:
         message = controller_state(state, USUAL, (START + 12) * SECOND)
-        return status.text(message, PROCESSES | changes, "night").splitlines()[0]
+        return status.text(status.figures(message, PROCESSES | changes, "night")).splitlines()[0]
 
     well = "closed · residual 2.50 nm rms (true 2.00) · light 97 % · 3 frames lost · recording logs/a.mcap · run night"
     warned = "10 s ago camera: COMMANDS_LATE 9 % late"

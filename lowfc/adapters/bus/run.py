@@ -303,11 +303,7 @@ def free_ports(count: int) -> list[int]:
     A port of the ephemeral range may be taken by any outgoing connection before its role listens, and a connection
     retried to one without a listener may even be given that port and reach itself.
     """
-    try:
-        highest = int(_PORT_RANGE.read_text().split()[0])
-    except (OSError, ValueError, IndexError):
-        highest = 32768
-    candidates = range(_LOWEST_PORT, highest)
+    candidates = range(_LOWEST_PORT, int(_PORT_RANGE.read_text().split()[0]))
     chooser = random.SystemRandom()
     with contextlib.ExitStack() as held:
         ports: list[int] = []

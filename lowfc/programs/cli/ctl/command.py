@@ -75,8 +75,8 @@ def _status(run: AnyRun = None, as_json: Json = False) -> None:
     with _joined(run) as loop:
         state, processes = loop.status().state, loop.processes()
         assert state is not None  # noqa: S101  # that is what it answers with
-    known = state, processes, loop.run_id
-    put(figures(*known), text(*known), as_json=as_json)
+    known = figures(state, processes, loop.run_id)
+    put(known, text(known), as_json=as_json)
 
 
 def _configuration(run: AnyRun = None, as_json: Json = False) -> None:

@@ -107,13 +107,8 @@ def figures(
     }
 
 
-def text(
-    state: wire.ControllerState,
-    processes: Mapping[str, wire.Health] = _NO_PROCESSES,
-    run: str = "",
-) -> str:
-    """The same for a person: whether all is well in the first line."""
-    known = figures(state, processes, run)
+def text(known: dict[str, Any]) -> str:
+    """The same figures for a person: whether all is well in the first line."""
     since = "" if known["mode_s"] is None else f" for {known['mode_s']:.0f} s ({known['mode_cause']})"
     mode = _mode(known) + (f", opens after {counted(known['steps_left'], 'frame')}" if known["steps_left"] else "")
     law = known["law"]["name"]
