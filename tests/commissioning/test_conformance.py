@@ -37,7 +37,7 @@ from lowfc.programs.commissioning.checks import Check, put
 from lowfc.programs.commissioning.conformance import command as conformance
 from lowfc.programs.commissioning.conformance.camera import watch
 from lowfc.programs.commissioning.conformance.command import FIELDS, STATUSES
-from lowfc.programs.commissioning.conformance.dialogue import Dialogue, expected_of
+from lowfc.programs.commissioning.conformance.dialogue import Dialogue, Expected
 from lowfc.programs.commissioning.conformance.frames import camera_checks
 from lowfc.programs.commissioning.conformance.line import Line, Received
 from lowfc.programs.commissioning.conformance.mirror import mirror_checks
@@ -201,7 +201,7 @@ def of_camera(**changes: Any) -> dict[str, str]:
 
 
 def of_mirror(*, gentle: bool = False, config: Configuration = CONFIG, **changes: Any) -> dict[str, str]:
-    dialogue = Dialogue(Mirror(**changes), expected_of(config))
+    dialogue = Dialogue(Mirror(**changes), Expected(config))
     return found(mirror_checks(dialogue, 0.2, lambda _: None, gentle=gentle))
 
 
@@ -426,7 +426,7 @@ def test_a_good_mirror_has_nothing_wrong_and_ends_where_it_was() -> None:
     told = Command("lowfc", 5, mirror.device.settling_ns and 1, 10**10, start, np.zeros(2, np.float32))
     mirror.status, _ = apply_command(replace(mirror.device, flatten=False), mirror.status, told, mirror.now_ns())
     mirror.device = replace(mirror.device, flatten=False)
-    dialogue = Dialogue(mirror, expected_of(CONFIG))
+    dialogue = Dialogue(mirror, Expected(CONFIG))
     assert found(mirror_checks(dialogue, 0.2, lambda _: None)) == {}
     np.testing.assert_allclose(mirror.status.surface_nm, start, atol=0.03)
     assert 5 < mirror.status.frame_sequence < 5000  # a camera that ran before is not behind
@@ -442,7 +442,7 @@ def test_gently_the_limits_are_left_alone() -> None:
     mirror = Mirror()
     highest_nm: list[float] = []
     mirror.changes["state"] = shaped(lambda shape: highest_nm.append(float(np.abs(shape).max())) or shape)
-    assert found(mirror_checks(Dialogue(mirror, expected_of(CONFIG)), 0.2, lambda _: None, gentle=True)) == UNTRIED
+    assert found(mirror_checks(Dialogue(mirror, Expected(CONFIG)), 0.2, lambda _: None, gentle=True)) == UNTRIED
     assert 0 < max(highest_nm) < 0.051 * CONFIG.mirror.slew_nm
 
 
@@ -460,7 +460,7 @@ def test_however_it_ends_the_mirror_is_brought_back() -> None:
         return state
 
     with pytest.raises(KeyboardInterrupt):
-        list(mirror_checks(Dialogue(mirror, expected_of(CONFIG)), 0.2, interrupted))
+        list(mirror_checks(Dialogue(mirror, Expected(CONFIG)), 0.2, interrupted))
     assert mirror.status.following
     np.testing.assert_allclose(mirror.status.surface_nm, 0, atol=0.03)
 
@@ -470,7 +470,7 @@ def test_dead_and_stuck_actuators_of_the_configuration_are_no_mistake() -> None:
     free = Mirror()
     free.device = device(config)
     free.status = initial(free.device)
-    assert found(mirror_checks(Dialogue(free, expected_of(config)), 0.2, lambda _: None)) == {}
+    assert found(mirror_checks(Dialogue(free, Expected(config)), 0.2, lambda _: None)) == {}
 
 
 def test_the_report_says_what_to_do_of_what_is_not_right(capsys: pytest.CaptureFixture[str]) -> None:

@@ -15,7 +15,7 @@ from lowfc.optics.twin.twin import Twin
 from lowfc.optics.twin.twin_mirror import TwinMirror
 
 Wavefront = Callable[[Twin, TwinMirror], Array]
-"""In nm at the used nodes of a twin, with the mirror on these."""
+"""Wavefront, nm, at the used nodes of a twin, from the twin and the mirror on its nodes."""
 
 
 def analytic(config: Configuration, console: Console, at: Wavefront | None = None) -> Calibration:

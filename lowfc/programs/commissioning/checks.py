@@ -91,7 +91,7 @@ class Table(Generic[S]):
         return enter
 
     def of(self, seen: S, unknown: tuple[type[Exception], ...] = ()) -> Iterator[Check]:
-        """What every check finds; a note where one of these exceptions keeps it from finding anything."""
+        """The result of every check; a note where one raises one of these exceptions."""
         for usual, look in self.looks.values():
             try:
                 found = look(seen)

@@ -25,7 +25,7 @@ from lowfc.programs.commissioning.acceptance.played import (
 
 KIND: Kind = "capture-range"
 SIZES = (0.5, 1.0, 1.5)
-"""Of a shape, beside the one from which the loop must close."""
+"""Sizes that are played, as multiples of the one from which the loop must close."""
 _TILTS = (2, 3)
 
 
@@ -94,7 +94,7 @@ def _trials(live: Live, noll: int, required: Acceptance) -> list[tuple[dict[str,
 
 
 def closed(trial: Played) -> bool:
-    """Whether the loop took the shape of a trial away.
+    """Whether the loop removed the shape of a trial.
 
     Raises:
         AcceptanceError: somebody opened the loop meanwhile, or frames are missing.

@@ -24,13 +24,13 @@ from lowfc.programs.commissioning.acceptance.played import (
 
 KIND: Kind = "linearity"
 AMPLITUDES = (0.5, 1.0, 2.0)
-"""Of a mode, beside the one up to which it must be linear."""
+"""Amplitudes that are played, as multiples of the one up to which a mode must be linear."""
 _SPARE_FRAMES = 2  # beside the delay: a mirror that is still settling
 
 
 @dataclass(frozen=True, slots=True)
 class Staircase:
-    """What is played: frames at each level, cycles at each amplitude, Noll indices (empty for all)."""
+    """The probe sequence: frames at each level, cycles at each amplitude, Noll indices (empty for all)."""
 
     hold_frames: int
     cycles: int
@@ -50,7 +50,7 @@ class Level(Result):
 
 
 class LinearityMode(ModeResult):
-    """Up to which amplitude a mode is linear, nm rms of wavefront."""
+    """The amplitude up to which a mode is linear, nm rms of wavefront."""
 
     linear_nm: float = figure("linear to", "nm", ".3g")
     levels: list[Level] = figure()

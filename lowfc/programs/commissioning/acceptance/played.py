@@ -1,4 +1,4 @@
-"""What was played to a loop and what it did meanwhile, for the tests to judge, and the form of their results.
+"""Probe sequences of the acceptance tests, the steps of the loop under them, and the form of the tests' results.
 
 Each play is announced by a note that says what it is for, so that a log can be judged as the live loop was.
 """
@@ -30,9 +30,9 @@ Kind = Literal["rejection", "linearity", "capture-range", "noise-floor"]
 
 LIMITS = (Limit.MODAL_LIMIT, Limit.STROKE, Limit.SLEW, Limit.NEIGHBOUR)
 MOST_MISSING = 0.01
-"""Part of the frames that may be missing or refused."""
+"""Largest part of the frames that may be missing or refused."""
 LONGEST_SETTLING = 4000
-"""Frames that a linear law is given to settle, at the most."""
+"""Longest time for a linear law to settle, frames."""
 
 ANNOUNCEMENT = "acceptance "
 """How a note begins that announces a test; its parameters follow as JSON."""
@@ -52,19 +52,19 @@ class ModeResult(Result):
     too_noisy: bool = figure(default=False)
 
     def remarks(self) -> Sequence[str]:
-        """What stands behind its row: the verdict, where it is not good."""
+        """The verdict behind its row, where it is not good."""
         return [] if self.passed else ["too noisy" if self.too_noisy else "FAILED"]
 
 
 class AcceptanceResult(Result):
-    """What a test found; it passed where every mode did."""
+    """The result of a test; it passed where every mode did."""
 
     test: str = figure()
     passed: bool = figure()
 
     @property
     def verdict(self) -> str:
-        """In a few words."""
+        """The test and its verdict."""
         return f"{self.test}: {'passed' if self.passed else 'FAILED'}"
 
     def remarks(self) -> Sequence[str]:
@@ -89,7 +89,7 @@ class Loop:
         return integrator(self.law.gain, self.law.leak, self.noll, self.delay_frames, self.rate_hz)
 
     def settling_frames(self) -> int:
-        """Frames in which it settles."""
+        """Time to settle, frames."""
         if isinstance(self.law, Law):
             return settling_frames(self.law.gain, self.law.leak)
         radius = float(margins.margins(self.law, self.delay_frames).radius.max())
@@ -97,7 +97,7 @@ class Loop:
 
     @property
     def name(self) -> str:
-        """What kind of law it is."""
+        """Name of the law."""
         return self.law.name if isinstance(self.law, LinearLaw) else "integrator"
 
 
@@ -134,7 +134,7 @@ class Played:
 
     @property
     def missing(self) -> int:
-        """Frames of which nothing was measured."""
+        """Number of frames without a measurement."""
         return int(np.count_nonzero(~np.isfinite(self.error_nm).all(axis=1)))
 
     def check(self, mode: LoopMode) -> None:
@@ -182,7 +182,7 @@ def chosen(wanted: Sequence[int], noll: Sequence[int]) -> tuple[int, ...]:
 
 
 def logged(history: History, kind: Kind) -> list[Played]:
-    """What was played for a test while a log was written.
+    """The probe sequences of a test in a log.
 
     Raises:
         DataFileError: nothing was, or the loop was changed meanwhile.

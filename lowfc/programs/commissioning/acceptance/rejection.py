@@ -29,7 +29,7 @@ from lowfc.programs.commissioning.acceptance.played import (
 
 KIND: Kind = "rejection"
 LEAST_JUDGED = 0.5
-"""Part of a mode's lines at which its rejection must be certain enough to be judged.
+"""Least part of a mode's lines at which its rejection is certain enough to be judged.
 
 The noise transfer is judged where it can be: where it is small, nothing of it can be seen.
 """
@@ -38,7 +38,7 @@ _LEAD_FRAMES = 50  # beside the time to settle: what the bus takes to bring the 
 
 @dataclass(frozen=True, slots=True)
 class Excitation:
-    """What is played: seconds of a period, rms and lines of each mode, Noll indices (empty for all), and a seed."""
+    """The multisine: seconds of a period, rms and lines of each mode, Noll indices (empty for all), and a seed."""
 
     duration_s: float
     rms_nm: float
@@ -88,7 +88,7 @@ class RejectionResult(AcceptanceResult):
     points: list[dict[str, Any]] = figure()
 
     def remarks(self) -> Sequence[str]:
-        """What was too noisy, what was missing, and the verdict."""
+        """Lines too noisy to judge, missing frames, and the verdict."""
         lines = [
             f"Z{mode.noll}: rejection too noisy to be judged at "
             f"{', '.join(f'{frequency:.3g}' for frequency in mode.rejection.unsure_hz)} Hz"

@@ -1,4 +1,4 @@
-"""What a calibration plays: of which amplitude, how often, and in how many frames."""
+"""The probe sequences of a calibration: their amplitudes, cycles and frames."""
 
 from dataclasses import dataclass
 from math import ceil, log
@@ -16,11 +16,11 @@ from lowfc.programs.commissioning.calibrate.recording import AFTERWARDS
 
 AMPLITUDE_NM = {"poke": 8.0, "hadamard": 3.0, "in-loop": 2.0}
 LEAST_SNR = 20.0
-"""That a calibration of a given number of cycles must reach to be recommended."""
+"""Signal-to-noise ratio that a calibration of a given number of cycles must reach to be recommended."""
 FULL_AMPLITUDE_SNR = 70.0
-"""Up to which the usual amplitude does: the error of the third-order terms goes as its square."""
+"""Highest signal-to-noise ratio for the usual amplitude: the error of third-order terms goes as its square."""
 MOST_HADAMARD_NM = 3.0
-"""Of a mode: all modes at once add up to some four times that, and the sensor must stay linear."""
+"""Largest amplitude of a mode: all modes at once add up to some four times that, and the sensor must stay linear."""
 SETTLE = 2
 """Frames left out after each change: one for a delay that is a fraction, and one for a command that comes late."""
 HOLD = 4
@@ -31,19 +31,19 @@ PIECE = 1024
 MARGIN = 0.9
 """Part of the promised error that is aimed at, so that the scatter of the cycles seldom asks for more."""
 MOST_TIMES = 4
-"""So many times the cycles that photons and read-out call for are played at most: beyond, the operator decides."""
+"""Largest number of cycles over that for photons and read-out alone; beyond it the operator decides."""
 CHECK_PART = 0.25
 """Cycles that check R, for each one that it is made from."""
 _LEAST_CHECKS = 3
 _OF_THE_SLEW = 0.8
 SEED = 1
 DELAY_FRAMES = 600
-"""Of the sequence that the delay is measured with."""
+"""Length of the sequence that measures the delay."""
 
 
 @dataclass(frozen=True, slots=True)
 class CalibrationRequest:
-    """What a calibration shall be.
+    """A calibration as requested.
 
     Attributes:
         method: poke, hadamard or in-loop.
@@ -110,7 +110,7 @@ class Pokes:
         return needed if reachable and error * self._request.snr > 1 else cycles
 
     def frames(self, cycles: int, done: int = 0) -> int:
-        """Of so many cycles, less those done, and of those that check them."""
+        """Frames of so many cycles, less those done, and of those that check them."""
         return (cycles + checks(cycles) - done) * (len(self.cycle(0)) + AFTERWARDS)
 
     def _cycle(self, number: int, amplitude_nm: float) -> poke_plan.Plan:
@@ -126,7 +126,7 @@ class Pokes:
         return poke_plan.cycle(shapes, HOLD, SETTLE, rest, backwards=number % 2 == 1)
 
     def _amplitude(self) -> float:
-        """What was asked for, or the usual, as far as the mirror's slew limit lets it."""
+        """The requested amplitude or the usual one, within the mirror's slew limit."""
         requested, method = self._request.amplitude_nm, self._request.method
         if method == "hadamard" and requested is not None and requested > MOST_HADAMARD_NM:
             raise CalibrationError(

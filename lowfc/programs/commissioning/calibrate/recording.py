@@ -1,4 +1,4 @@
-"""What is played on the mirror of a running loop, the frames and steps that come of it, and what is fitted to them."""
+"""Probe sequences on the mirror of a running loop: played, recorded as frames and steps, and fitted."""
 
 import contextlib
 from collections.abc import Callable, Iterator
@@ -27,13 +27,13 @@ T = TypeVar("T")
 AFTERWARDS = 8
 """Frames recorded after the last of a play: the longest delay that can be measured is over by then."""
 MOST_BEHIND = 100
-"""Frames by which the mirror's reports may lag behind the controller's steps; then the mirror is taken for dead."""
+"""Frames by which the mirror's reports may lag behind the controller's steps; beyond it the mirror counts as dead."""
 CHECKED = 100
-"""Frames between two looks at whether the loop is still reserved."""
+"""Frames between two renewals of the lease."""
 MOST_REFUSED = 50
 """Frames refused in a row after which a probe sequence is given up."""
 ATTEMPTS = 5
-"""So often a sequence is played, where frames are lost or a device restarts."""
+"""Attempts at a sequence where frames are lost or a device restarts."""
 DITHER_SLOWEST = 1 / 16
 """Cycles per frame below which a dither is not used."""
 _LIMITS = frozenset(Limit)

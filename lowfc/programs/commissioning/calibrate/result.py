@@ -1,4 +1,4 @@
-"""What a calibration is: the file's content, its figures, and whether it is recommended."""
+"""The result of a calibration: the file's content, its figures, and whether it is recommended."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -24,13 +24,13 @@ from lowfc.programs.commissioning.calibrate.pokes import CalibrationRequest, cyc
 from lowfc.programs.commissioning.calibrate.run import CalibrationData, Calibrator
 
 MOST_NOISE = 1.5
-"""Times the noise of the computed reconstructor on the same light; farther from flat the sensor sees less."""
+"""Largest noise of R over that of the computed R on the same light; far from flat the sensor sees less."""
 DELAY_APART = 0.1
-"""Frames by which the delay that the loop counts with may be off before something is said."""
+"""Largest error of the configured delay without a warning, frames."""
 
 
 class Verdict(Result):
-    """What is wrong with a measured reconstructor: its cross-talk is on frames that were not used for it."""
+    """Verdict on a measured reconstructor; its cross-talk is that on frames that were not used for it."""
 
     snr: float = figure("signal-to-noise ratio requested", form=".3g")
     snr_reached: float = figure("signal-to-noise ratio reached", form=".3g")
@@ -124,7 +124,7 @@ def finished(
     counted = configured_delay(config)
     if abs(data.delay.delay_frames - counted) > DELAY_APART:
         found.advice.append(
-            f"warning: the loop counts with a delay of {counted:g} frames; set control.delay_frames = "
+            f"warning: the loop is configured for a delay of {counted:g} frames; set control.delay_frames = "
             f"{max(data.delay.delay_frames, 1):.2f}"
         )
     return made, found
@@ -232,7 +232,7 @@ def result_of(
 
 
 def configured_delay(config: Configuration) -> float:
-    """The delay that the loop counts with."""
+    """The delay that the loop is configured for, frames."""
     return config.control.delay_frames or config.camera.delay_frames
 
 

@@ -153,7 +153,7 @@ class Calibrator:
         return int(np.where(tilt & ~tilt.all(), np.inf, self.noise_nm).argmin())
 
     def delay(self) -> Delay:
-        """From poke to image, with the mode that is measured best.
+        """The delay from poke to image, measured with the mode of least noise.
 
         Raises:
             CalibrationError: no poke is seen, or frames are lost.
@@ -281,7 +281,7 @@ def go_on(path: Path, what: dict[str, Any]) -> Sums:
 
 
 def begun(path: Path) -> tuple[dict[str, Any], Sums]:
-    """What the cycles done are of, and these cycles.
+    """Method, amplitude and calibration of the cycles that were kept, and these cycles.
 
     Raises:
         DataFileError: there are none, or the file is damaged.

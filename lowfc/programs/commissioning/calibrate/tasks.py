@@ -1,4 +1,4 @@
-"""What `lowfc calibrate` does: a running loop, files, a progress bar; each returns its typed result."""
+"""The tasks of `lowfc calibrate` on a running loop and files; each returns its typed result."""
 
 import contextlib
 from collections.abc import Callable, Iterator
@@ -145,7 +145,7 @@ def computed(
 
 
 def zero_point(config: Configuration, text: str) -> tuple[str, Wavefront]:
-    """What --at asks for: modes as in 4=15,7=-10, Noll index = nm rms, or a file as `lowfc ctl channel` takes it.
+    """The wavefront of --at: modes as in 4=15,7=-10, Noll index = nm rms, or a file as `lowfc ctl channel` takes it.
 
     Returns:
         Its name in a calibration, and the wavefront.

@@ -38,7 +38,7 @@ from lowfc.programs.commissioning.commission.first_light import (
 
 METHOD = "hadamard"
 LOOKED_AT = 32
-"""Frames of which size, rate and light are seen."""
+"""Frames from which size, rate and light are read."""
 MAX_OF_PREDICTED = 1.5
 """Measured over predicted error beyond which the closed loop is not what was expected."""
 MIN_PREDICTED = 1000
@@ -110,7 +110,7 @@ class Commissioning:
             raise
 
     def _left(self, before: Calibration | None, kept: Path) -> str:
-        """What is in use after a commissioning that did not come to its end, and how to go on."""
+        """A sentence after a commissioning that ended early: which calibration is in use, and how to go on."""
         if self._judged:
             return f"the calibration is good, in {self._options.out} and in use: `lowfc ctl close` closes the loop"
         if not kept.is_file():

@@ -21,11 +21,11 @@ from lowfc.programs.commissioning.calibrate.result import reconstructed
 
 FIRST_NM = AMPLITUDE_NM["poke"]
 MAX_FIRST_NM = 32.0
-"""Up to which the amplitude of the first pokes is doubled until they are seen, wavefront rms."""
+"""Largest amplitude of the first pokes, which is doubled until they are seen, nm rms of wavefront."""
 MAX_MISFIT = 0.35
-"""Part of the image that the computed one may leave; more is another sensor."""
+"""Largest residual of the image after the fit of the computed one; above it the sensor is another one."""
 MIN_LIKENESS = 0.5
-"""Correlation of a poke's image with the computed one; less is another sensor."""
+"""Least correlation of a poke's image with the computed one; below it the sensor is another one."""
 CYCLES = 12
 MAX_NOT_LINEAR = 0.1
 _SURE = 3.0

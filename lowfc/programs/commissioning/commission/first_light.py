@@ -21,7 +21,7 @@ from lowfc.programs.commissioning.checks import Status
 from lowfc.programs.commissioning.conformance.settings import agreement_checks
 
 RATE_APART = 0.05
-"""Part by which the rate of the frames' times may differ from what the camera says."""
+"""Largest relative difference between the rate of the frames' times and that in the camera's settings."""
 _FULL = 0.9
 _NS = 1e9
 

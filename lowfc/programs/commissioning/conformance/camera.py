@@ -1,4 +1,4 @@
-"""What is received of a camera: its frames, its settings, its times, for a while."""
+"""A camera under test: its frames, settings and times, received for a while."""
 
 import zlib
 from collections.abc import Callable
@@ -41,7 +41,7 @@ class Picture(NamedTuple):
 
 
 class Camera(Collected):
-    """What was received of a camera.
+    """Messages of a camera.
 
     Attributes:
         frames: every frame, without its pixels.

@@ -1,4 +1,4 @@
-"""The command `lowfc conformance`: what a driver's author still has to put right."""
+"""The command `lowfc conformance`: options only."""
 
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -33,10 +33,10 @@ RunName = Annotated[
 def camera(
     run: RunName = None,
     config: ConfigFile = None,
-    duration: Annotated[float, typer.Option(min=0.2, max=3600, help="Seconds to look at it.")] = 5.0,
+    duration: Annotated[float, typer.Option(min=0.2, max=3600, help="Seconds of messages to check.")] = 5.0,
     as_json: Json = False,
 ) -> None:
-    """Look at a camera's messages for a while and say what is wrong with them; exit status 1 where something is.
+    """Check the messages of a camera driver against the contract; exit status 1 where something is wrong.
 
     The loop may be running meanwhile: nothing is published. With --config, the camera's settings are compared with the
     loop's configuration, too.
@@ -66,7 +66,7 @@ def mirror(
     gentle: Annotated[bool, typer.Option("--gentle", help="Do not try its limits.")] = False,
     as_json: Json = False,
 ) -> None:
-    """Command a mirror and say what is wrong with its answers; exit status 1 where something is.
+    """Command a mirror and check its answers against the contract; exit status 1 where something is wrong.
 
     It takes the controller's place, so none may be running. The commands are a twentieth of what the configuration
     allows in one move; only where all of them were answered rightly, and without --gentle, stroke, slew and neighbour
@@ -77,7 +77,7 @@ def mirror(
     from lowfc.adapters.bus.run import mirror_role
     from lowfc.contract.errors import BusError, ConfigurationError
     from lowfc.contract.messages import Role
-    from lowfc.programs.commissioning.conformance.dialogue import Dialogue, expected_of
+    from lowfc.programs.commissioning.conformance.dialogue import Dialogue, Expected
     from lowfc.programs.commissioning.conformance.mirror import mirror_checks
 
     settings = configuration(config)
@@ -87,7 +87,7 @@ def mirror(
     if Role.CONTROLLER in found.links.live():
         raise BusError(f"run {found.run_id!r} has a controller, and only one process may command the mirror: stop it")
     with _line(found, Role.CONTROLLER) as line, _bar("the mirror", None) as show:
-        dialogue = Dialogue(line, expected_of(settings))
+        dialogue = Dialogue(line, Expected(settings))
         checks = mirror_checks(dialogue, duration, lambda what: show(description=f"the mirror: {what}"), gentle=gentle)
     _end(f"mirror-{settings.mirror.name}", found.run_id, checks, as_json)
 

@@ -1,7 +1,6 @@
 """Commands to a mirror under test, small ones first, and what it answers."""
 
 from collections.abc import Callable
-from dataclasses import dataclass
 
 import numpy as np
 from google.protobuf.message import DecodeError
@@ -12,7 +11,6 @@ from lowfc.arrays import Mask, Single
 from lowfc.contract.codecs.codec import actuators
 from lowfc.contract.configuration import Configuration
 from lowfc.contract.messages import COMMAND, MIRROR_STATE, timestamp, wire
-from lowfc.control.loop.safety import Limits
 from lowfc.programs.commissioning.conformance.line import NS, Collected, Line, Received
 
 ANSWER_S = 0.5
@@ -31,9 +29,8 @@ _GENTLE = 0.05
 _MOST_MOVES = 400
 
 
-@dataclass(frozen=True, slots=True)
 class Expected:
-    """What the configuration says of the mirror.
+    """What a configuration says of its mirror; dead and stuck actuators do not move.
 
     Attributes:
         name: in its topics.
@@ -44,21 +41,23 @@ class Expected:
         period_ns: between two commands of the loop.
     """
 
-    name: str
-    grid: tuple[int, int]
-    limits: Limits
-    step_nm: float
-    moving: Mask
-    period_ns: int
+    def __init__(self, config: Configuration) -> None:
+        """Read the mirror's section."""
+        section = config.mirror
+        self.name, self.grid = section.name, (section.rows, section.columns)
+        self.limits, self.period_ns = mirror_limits(config), config.period_ns
+        self.step_nm: float = section.stroke_nm / 2**section.driver_bits
+        self.moving: Mask = np.ones(self.grid, bool)
+        self.moving.flat[[*section.dead, *map(int, section.stuck_nm)]] = False
 
     @property
     def tolerance_nm(self) -> float:
-        """Of an actuator: one step of the driver."""
+        """Largest error of an actuator: one step of the driver, nm of surface."""
         return self.step_nm + 1e-3
 
     @property
     def move_nm(self) -> float:
-        """Of one move on a long way: half the slew limit."""
+        """Largest move on a long way: half the slew limit, nm of surface."""
         return self.limits.slew_nm / 2
 
     @property
@@ -67,16 +66,6 @@ class Expected:
         largest = _GENTLE * min(self.limits.stroke_nm, self.limits.slew_nm, self.limits.neighbour_nm / 2)
         drawn = np.random.default_rng(_PATTERN_SEED).uniform(-largest, largest, self.grid)
         return np.where(self.moving, drawn, 0).astype(np.float32)
-
-
-def expected_of(config: Configuration) -> Expected:
-    """What a configuration says of its mirror; dead and stuck actuators do not move."""
-    section = config.mirror
-    moving = np.ones((section.rows, section.columns), bool)
-    moving.flat[[*section.dead, *map(int, section.stuck_nm)]] = False
-    step_nm = section.stroke_nm / 2**section.driver_bits
-    grid = (section.rows, section.columns)
-    return Expected(section.name, grid, mirror_limits(config), step_nm, moving, config.period_ns)
 
 
 class Dialogue(Collected):

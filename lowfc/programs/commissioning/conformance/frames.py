@@ -1,4 +1,4 @@
-"""What a camera gets wrong of its frames: form, time, rate and pixels."""
+"""Checks of a camera's frames: form, time, rate and pixels."""
 
 from collections.abc import Iterator, Sequence
 from itertools import pairwise
@@ -29,7 +29,7 @@ FRAMES: Table[Camera] = Table()
 
 
 def camera_checks(seen: Camera) -> Iterator[Check]:
-    """What is right and wrong with a camera."""
+    """All checks of a camera."""
     yield from ARRIVED.of(seen)
     yield from PUBLISHER.of(seen)
     if seen.frames:
@@ -155,7 +155,6 @@ def _light(seen: Camera) -> Check | None:
 
 @FRAMES.check("byte order", "little-endian, in DN from bit 0 on")
 def _byte_order(seen: Camera) -> Check | None:
-    """By what makes neighbouring pixels alike."""
     if not seen.pixels:
         return None
     picture = seen.pixels[-1]  # not their median: that of swapped bytes is nothing

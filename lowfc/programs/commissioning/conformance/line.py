@@ -81,7 +81,7 @@ class Line:
         time.sleep(seconds)
 
     def received(self) -> list[Received]:
-        """What arrived since the last call, on all keys."""
+        """Messages since the last call, on all keys."""
         return [self._waiting.popleft() for _ in range(len(self._waiting))]
 
     def put(self, topic: Topic, name: str, payload: bytes) -> None:
@@ -114,7 +114,7 @@ class Line:
 
 
 class Collected:
-    """What was received of a device, in the order of arrival.
+    """Messages of a device, in the order of arrival.
 
     Attributes:
         line: to the device.

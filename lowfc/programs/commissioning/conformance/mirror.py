@@ -1,4 +1,4 @@
-"""What a mirror's driver gets wrong: it is commanded, gently at first, and its states are held against the contract."""
+"""Checks of a mirror driver: it is commanded, gently at first, and its states are compared with the contract."""
 
 from collections.abc import Iterator
 from itertools import pairwise
@@ -16,7 +16,7 @@ IDLE_S = 1.0
 EXPIRES_NS = 300_000_000
 SLACK_NS = 400_000_000
 LONGEST_NS = 2_000_000_000
-"""However long a command says that it is valid, a mirror does not hold it longer."""
+"""Longest time that a mirror may hold a command, whatever its valid_for_ns."""
 
 _FOLLOWING, _EXPIRED = wire.MIRROR_STATUS_FOLLOWING, wire.MIRROR_STATUS_EXPIRED
 _LONG_NS = 60 * NS
@@ -28,7 +28,7 @@ _SETTLE_S = 0.05  # of actuators that are reported where they are, not where the
 
 
 def mirror_checks(mirror: Dialogue, seconds: float, show: Show, *, gentle: bool = False) -> list[Check]:
-    """What is right and wrong with a mirror; it ends where it was."""
+    """All checks of a mirror; it ends where it was."""
     found: list[Check] = []
     base_nm = np.zeros(mirror.expected.grid, np.float32)
     begun_ns = mirror.line.now_ns()
@@ -179,7 +179,7 @@ def _applied(mirror: Dialogue, base_nm: Single, commanded_nm: Single, state: wir
 
 
 def _difference(base_nm: Single, commanded_nm: Single, where_nm: Single) -> str:
-    """What kind of mistake turns the one shape into the other."""
+    """Advice: the mistake that turns the commanded shape into the reported one."""
     commanded, got = commanded_nm.astype(np.float64) - base_nm, where_nm.astype(np.float64) - base_nm
     turns = {
         "as commanded": got,

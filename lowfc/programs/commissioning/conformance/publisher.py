@@ -1,4 +1,4 @@
-"""What every publisher's messages have in common: envelope, sequence, time of the put, Health, keys."""
+"""Checks of every publisher: envelope, sequence, time of the put, Health, keys."""
 
 from itertools import pairwise
 

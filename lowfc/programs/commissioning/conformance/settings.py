@@ -1,4 +1,4 @@
-"""What a camera gets wrong of its settings: there, possible, unchanged, of its frames, on request, as configured."""
+"""Checks of a camera's settings: present, possible, unchanged, like its frames, on request, as configured."""
 
 from collections.abc import Iterator
 from math import isfinite

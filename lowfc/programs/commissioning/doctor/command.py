@@ -44,7 +44,7 @@ def doctor(
 
 
 def examine(facts: "Facts") -> list[Check]:
-    """What every check found; one that cannot read what it needs finds just that."""
+    """The result of every check; a note where a check cannot read what it needs."""
     from lowfc.contract.errors import LowfcError
     from lowfc.programs.commissioning.doctor import room, timing
 
