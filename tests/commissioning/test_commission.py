@@ -33,20 +33,6 @@ gain = 0.2
 CONFIG = Configuration.model_validate(tomllib.loads(TOML))
 
 
-class Talk(list[str]):
-    """What is said; something happens after some of it."""
-
-    def __init__(self, then: dict[str, Callable[[], None]]) -> None:
-        super().__init__()
-        self.then = then
-
-    def append(self, text: str) -> None:
-        super().append(text)
-        for begin, happens in self.then.items():
-            if text.startswith(begin):
-                happens()
-
-
 class Bench:
     """A loop without a calibration, and what is said while it is commissioned."""
 
@@ -56,6 +42,14 @@ class Bench:
         self.loop.run(5)
         self.said: list[str] = []
         self.asked: list[str] = []
+        self.then: dict[str, Callable[[], None]] = {}
+
+    def report(self, text: str) -> None:
+        """What is reported; something happens after some of it."""
+        self.said.append(text)
+        for begin, happens in self.then.items():
+            if text.startswith(begin):
+                happens()
 
     def commission(self, *, model: Configuration | None = None, **asked: Any) -> dict[str, Any]:
         usual = {
@@ -68,11 +62,11 @@ class Bench:
             "close": True,
         }
         made = Commissioning(
-            self.loop,  # type: ignore[arg-type]  # in the place of a client
+            self.loop,
             self.config,
             computed((model or self.config).to_toml()),
-            Commission(self.out, **{**usual, **asked}),
-            self.said.append,
+            Commission(self.out, **{**usual, "close": True, **asked}),
+            self.report,
             lambda what, done, total: None,
             self.asked.append,
         )
@@ -155,9 +149,11 @@ def test_the_calibration_from_before_is_in_use_again_after_a_failure(
     def give_up() -> None:
         raise KeyboardInterrupt
 
-    bench.said = Talk({"[7/10] response": give_up})
+    bench.said.clear()
+    bench.then = {"[7/10] response": give_up}
     with pytest.raises(KeyboardInterrupt):
         bench.commission()
+    bench.then.clear()
     assert bench.loop.calibration().id == before
     assert "the calibration from before is in use again" in bench.shown
 
@@ -177,7 +173,7 @@ def test_who_opens_the_loop_at_the_end_is_named_and_the_calibration_stays(tmp_pa
             bench.loop.run(20)
             bench.loop.ask("open", lease_id=0)
 
-    bench.said = Talk({"watching": somebody_opens})
+    bench.then = {"watching": somebody_opens}
     with pytest.raises(CalibrationError, match="the lease ended: operator asked to open"):
         bench.commission()
     assert "the calibration is good" in bench.shown
