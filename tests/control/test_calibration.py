@@ -70,14 +70,12 @@ def covariance(estimator: str, flux_e: float, read_noise_e: float) -> np.ndarray
     return result
 
 
-def test_the_weighted_estimator_reaches_the_cramer_rao_bound_of_photon_noise() -> None:
-    assert np.allclose(covariance("weighted", 1e5, 0.0), cramer_rao(1e5, 0.0), rtol=1e-9)
-
-
-def test_with_read_noise_it_stays_at_the_bound_within_a_percent() -> None:
-    ratio = np.diag(covariance("weighted", 1e4, 5.0)) / np.diag(cramer_rao(1e4, 5.0))
+@pytest.mark.parametrize(("flux_e", "read_noise_e", "above"), [(1e5, 0.0, 1e-9), (1e4, 5.0, 0.01)])
+def test_the_weighted_estimator_reaches_the_cramer_rao_bound(flux_e: float, read_noise_e: float, above: float) -> None:
+    """Of photon noise; with read noise it stays within a percent of it."""
+    ratio = np.diag(covariance("weighted", flux_e, read_noise_e)) / np.diag(cramer_rao(flux_e, read_noise_e))
     assert (ratio >= 1 - 1e-9).all()
-    assert (ratio < 1.01).all()
+    assert (ratio <= 1 + above).all()
 
 
 @pytest.mark.parametrize("estimator", ESTIMATORS)

@@ -104,17 +104,6 @@ def test_what_came_before_the_recorder_comes_first_and_once(bench: Bench) -> Non
     assert summary.lost == {}
 
 
-def test_a_controller_that_comes_later_is_asked(bench: Bench) -> None:
-    bench.hub.lose = lambda role, key, envelope: role == "recorder" and key == CALIBRATION.key
-    bench.start()
-    late = bench.join("controller-2")
-    late.publisher(CALIBRATION).put(b"late")  # before the link to the recorder is up
-    late.beat()
-    until(lambda: CALIBRATION.key in bench.recorder._peers.kept)
-    late.finish()
-    assert bodies_of(logged(bench.stop()), CALIBRATION) == [b"late"]
-
-
 def test_every_lost_message_is_counted(bench: Bench) -> None:
     frames, steps = bench.camera.publisher(FRAME), bench.controller.publisher(STEP)
 

@@ -22,10 +22,8 @@ from lowfc.adapters.logs.writer import UNFINISHED, Attachment
 from lowfc.contract.envelope import count_of, sequence_of
 from lowfc.contract.messages import CALIBRATION, COMMAND, EVENT, FRAME, HEALTH, RECORD_KEY, STEP, Topic, wire
 from lowfc.programs.core.recording import recorder as recorder_module
-from lowfc.programs.core.recording.recorder import Recorder
 from lowfc.programs.core.recording.summary import Summary
-from lowfc.testing.clock import FakeClock
-from lowfc.testing.memory_bus import MemoryBus, MemoryHub
+from lowfc.testing.memory_bus import MemoryBus
 from tests.support.loops import until
 from tests.support.recording import PATIENCE_S, Bench, bodies_of, logged, put
 
@@ -281,36 +279,6 @@ def test_each_log_of_a_run_can_be_read_by_itself(bench: Bench) -> None:
         assert messages[0].key == CALIBRATION.key
         # The second calibration was lost on its way, and asked for when the second log was begun.
         assert (second in bodies_of(messages, CALIBRATION)) == (number > 0)
-
-
-class Moving(FakeClock):
-    """A clock that goes on by a millisecond whenever it is looked at."""
-
-    def host_ns(self) -> int:
-        self.advance(1_000_000)
-        return self.time_ns
-
-
-def test_what_was_written_is_flushed_in_time_whether_many_messages_come_or_none(tmp_path: Path) -> None:
-    clock, hub = Moving(), MemoryHub()
-    recorder = Recorder(MemoryBus(hub, "recorder", clock), clock, "night", tmp_path, metadata={})
-    camera = MemoryBus(hub, "camera", clock).publisher(FRAME)
-    recorder._begin()
-    log = recorder._series._log
-    flushed: list[int] = []
-    flush = log.flush
-    log.flush = lambda: (flush(), flushed.append(log.messages))[0]  # type: ignore[method-assign]
-    put(camera, 1000)
-    recorder._turn()  # takes 1 s and more by that clock
-    gaps = np.diff(flushed)
-    assert len(gaps) >= 2
-    assert gaps.max() <= 250
-    put(camera, 1)
-    recorder._turn()
-    clock.advance(250_000_000)
-    recorder._turn()
-    assert bodies_of(list(LogReader(log.part)), FRAME)[-1] == b"%s 1000" % FRAME.key.encode()
-    log.abandon()
 
 
 def waiting(topic: Topic, size: int) -> tuple[Topic, Sample]:
