@@ -37,15 +37,15 @@ from tests.support.report_log import Night
 
 pytestmark = pytest.mark.usefixtures("own_runtime")
 
-EVERY = 10
+EVERY, FRAMES = 10, 1200
 
 
 @pytest.fixture(scope="module")
 def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
     night = Night()
     night.request("close")
-    night.frames(2500)
-    night.health("camera", topics=[wire.TopicCount(topic=FRAME.key, published=2500)], state="stopped")
+    night.frames(FRAMES)
+    night.health("camera", topics=[wire.TopicCount(topic=FRAME.key, published=FRAMES)], state="stopped")
     return night.write(tmp_path_factory.mktemp("night") / "night.mcap")
 
 
@@ -121,7 +121,7 @@ def test_a_smaller_copy_has_the_same_steps(whole: Path, small: Path) -> None:
     made = Selection(20, frozenset({MIRROR_STATE, SURFACE, TIMING, TRUTH}))
     assert again.selection == made.sentence
     assert Selection.of(survey(path := Path(again.file))["metadata"]) == made
-    assert len(of(list(LogReader(path)), FRAME)) == 2500 // 20
+    assert len(of(list(LogReader(path)), FRAME)) == FRAMES // 20
     with pytest.raises(DataFileError, match="exists already"):
         thin((whole,), small, Selection(2))
 
@@ -139,7 +139,7 @@ def test_replay_needs_frames_and_nothing_else_that_may_be_left_out(whole: Path) 
     thin((whole,), out, selection(1, [FRAME.key]))
     done = lowfc("replay", out, "--json")
     assert done.exit_code == 0, done.exception
-    assert json.loads(done.stdout)["frames"] == 2500
+    assert json.loads(done.stdout)["frames"] == FRAMES
 
 
 def test_a_what_if_is_the_same(whole: Path, small: Path, tmp_path: Path) -> None:
@@ -168,7 +168,7 @@ def test_a_report_is_of_the_same_run(whole: Path, small: Path) -> None:
     levels = [{check["name"]: check["level"] for check in one["verdict"]["checks"]} for one in found]
     assert levels[0] == levels[1]
     assert found[1]["timing"]["interval_us"]["frames"]["count"] == 0
-    assert found[1]["timing"]["latency_us"]["frame_to_mirror"]["count"] == 2500 // EVERY
+    assert found[1]["timing"]["latency_us"]["frame_to_mirror"]["count"] == FRAMES // EVERY
     assert "1 in 10 frames and mirror states" in small.with_suffix(".html").read_text()
 
 
@@ -179,9 +179,9 @@ def test_an_export_joins_what_is_there(small: Path, tmp_path: Path) -> None:
     assert json.loads(done.stdout)["selection"] == "1 in 10 frames and mirror states"
     with np.load(out) as found:
         arrays = dict(found)
-    assert (len(arrays["sequence"]), len(arrays["frame_sequence"])) == (2500, 250)
-    assert np.count_nonzero(np.isfinite(arrays["mirror_stroke_nm"])) == 250
-    assert len(np.load(out.with_suffix(".frames.npy"))) == 250
+    assert (len(arrays["sequence"]), len(arrays["frame_sequence"])) == (FRAMES, FRAMES // EVERY)
+    assert np.count_nonzero(np.isfinite(arrays["mirror_stroke_nm"])) == FRAMES // EVERY
+    assert len(np.load(out.with_suffix(".frames.npy"))) == FRAMES // EVERY
 
 
 @pytest.mark.parametrize(
