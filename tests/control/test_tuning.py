@@ -63,6 +63,18 @@ def test_the_best_gain_is_that_of_theory() -> None:
     np.testing.assert_allclose(found.noise_nm, 1, rtol=0.05)
 
 
+@pytest.mark.parametrize("leak", [0.001, 0.01])
+def test_what_a_leaky_integrator_leaves_is_of_what_the_log_shows(leak: float) -> None:
+    """A leak leaves a part of what is slow; a random walk extrapolated to days would be all of it."""
+    pol = Pieces((10 + np.hstack([realised(Model(1e-3, np.inf, (), 0.5, RATE_HZ), 6000, seed) for seed in (1, 2)]),), 0)
+    leaks = np.full(2, leak)
+    gains = best_gains(pol, RATE_HZ, Timing.sampled(1.0), leaks)
+    best = tune_integrator(identified(pol, RATE_HZ), gains, NOLL, leaks, Timing.sampled(1.0))
+    left_nm = np.sqrt(left_of(best.law, pol, gains.noise_nm**2, Timing.sampled(1.0)))
+    np.testing.assert_allclose(best.predicted_nm, left_nm, rtol=0.5)
+    np.testing.assert_allclose(gains.predicted_nm, left_nm, rtol=0.5)
+
+
 def test_the_reaction_wheel_without_images() -> None:
     """Each law leaves what it predicts; LQG far less than a notch, a notch than the integrator; two frames of delay."""
     pol, _ = wheel(20_000)

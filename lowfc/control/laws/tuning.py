@@ -90,21 +90,26 @@ def best_gains(run: Pieces, rate_hz: float, timing: Timing, leak: Array) -> Gain
     noise_nm2 = floor_nm2_hz(coarse) * rate_hz / 2
     omega = 2 * np.pi * fine.frequency_hz[1:] / rate_hz  # an integrator without leak has no value at 0 Hz
     gains, left_nm2, sensed_nm2 = np.zeros(len(leak)), np.zeros(len(leak)), np.zeros(len(leak))
+    longest_nm = max(run.values, key=len)
     for mode, lost in enumerate(leak.tolist()):
+        steady_nm2 = float(longest_nm[:, mode].mean()) ** 2  # of which a leak leaves a part: |S| at 0 Hz
         measured = fine.power_nm2_hz[1:, mode : mode + 1] * rate_hz / 2
 
         def of(gain: float, lost: float = lost) -> LinearLaw:
             return integrator([gain], [lost], (2,), timing.delay, rate_hz)  # or any other mode
 
+        def steady_left(gain: float, lost: float = lost, steady_nm2: float = steady_nm2) -> float:
+            return steady_nm2 * (lost / (lost + gain)) ** 2
+
         def left(gain: float, measured: Array = measured, mode: int = mode, lost: float = lost) -> float:
             power = spectrum_left(of(gain, lost), omega, measured, noise_nm2[mode : mode + 1], timing)
-            return float(power.sum()) * fine.spacing_hz * 2 / rate_hz
+            return float(power.sum()) * fine.spacing_hz * 2 / rate_hz + steady_left(gain)
 
         bounds = (LOWEST_GAIN, highest_gain(timing.delay, lost))
         found = minimize_scalar(left, bounds=bounds, method="bounded", options={"xatol": 1e-3})
         gains[mode], left_nm2[mode] = found.x, found.fun
         error = np.abs(sensitivity(of(found.x), omega, timing.delay)) ** 2 * measured
-        sensed_nm2[mode] = error.sum() * fine.spacing_hz * 2 / rate_hz - noise_nm2[mode]
+        sensed_nm2[mode] = error.sum() * fine.spacing_hz * 2 / rate_hz + steady_left(found.x) - noise_nm2[mode]
     rms = (np.sqrt(np.maximum(each, 0.0)) for each in (left_nm2, sensed_nm2, noise_nm2))
     return Gains(gains, *rms)
 

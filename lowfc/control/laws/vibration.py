@@ -49,6 +49,7 @@ class Model:
         lines: of frequency, width and variance each.
         noise_nm2: variance of one frame's white measurement noise.
         rate_hz: frame rate.
+        lowest_hz: below it the drift's spectrum is taken as level: a log does not show what is slower than itself.
     """
 
     drift_nm2: float
@@ -56,10 +57,12 @@ class Model:
     lines: tuple[Line, ...]
     noise_nm2: float
     rate_hz: float
+    lowest_hz: float = 0.0
 
     def spectrum_nm2(self, omega: Array) -> Array:
         """Spectrum of the disturbance at rad per frame, without noise: its mean over a turn is the variance."""
-        found = _drift(omega, self.drift_nm2, self.cutoff_hz / self.rate_hz)
+        shown = np.maximum(omega, 2 * np.pi * self.lowest_hz / self.rate_hz)
+        found = _drift(shown, self.drift_nm2, self.cutoff_hz / self.rate_hz)
         for line in self.lines:
             found = found + _line(omega, *_per_frame(line, self.rate_hz))
         return found
@@ -120,7 +123,8 @@ def identify(run: Pieces, rate_hz: float) -> Model | None:
     lines = tuple(sorted(model.lines, key=lambda line: line.frequency_hz))
     model = whittle.fit_all(replace(model, lines=lines))
     needed = whittle.needed(model)
-    return model if needed == model.lines else whittle.fit_all(replace(model, lines=needed))
+    model = model if needed == model.lines else whittle.fit_all(replace(model, lines=needed))
+    return replace(model, lowest_hz=rate_hz / max(map(len, run.values)))
 
 
 def resolution_hz(run: Pieces, rate_hz: float) -> float:
