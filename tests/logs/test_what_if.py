@@ -298,6 +298,20 @@ def rows_compared(run: LoggedRun) -> list[int]:
     return np.flatnonzero(run.rows_to_compare([run.law], run.used)[0]).tolist()
 
 
+def test_a_target_is_no_missing_command() -> None:
+    """Under an offset the error is less the target, which the state in the log has; the frames count."""
+    known = history(error_nm=np.r_[np.full((20, 3), 4, np.float32), np.full((20, 3), 1, np.float32)])
+    [ends] = known.controllers
+    states = [wire.ControllerState(), wire.ControllerState(), wire.ControllerState(offset_nm=[3] * 3), ends]
+    states[0].frame_sequence, states[1].frame_sequence = toy.frame_sequence(0), toy.frame_sequence(19)
+    states[1].offset_nm[:] = ends.offset_nm[:] = [3] * 3
+    ends.frame_sequence = toy.frame_sequence(39)
+    known.controllers = states
+    run = LoggedRun(known)
+    assert not run.torn.any()
+    np.testing.assert_array_equal(run.seen_nm, 0)
+
+
 def test_which_rows_are_compared() -> None:
     """Five time constants of a gain of 0.5 are 10 frames to settle."""
     error, saturated = np.full((40, 3), 4, np.float32), np.zeros(40, np.int64)
@@ -343,11 +357,11 @@ def test_doubts_are_said() -> None:
     for words in (
         "stroke at 4 frames, slew at 4 frames",
         "the mirror's own limits acted on 2 commands",
-        "changed 1 times",
+        "changed 1 time ",
         "could not be measured",
         "left out: byte 77, the checksum of a chunk is wrong",
         "the log has no end",
-        "does not have every command: 1 gaps",
+        "does not have every command: 1 frame that saw",
     ):
         assert words in doubts
 
@@ -363,7 +377,7 @@ def test_an_open_loop_far_out_is_warned_of() -> None:
     assert "12.1 nm rms" in linear
     assert "tilt x with " in linear
     assert "focus" not in linear
-    assert unstable.endswith("unstable with a delay of 1 frames: tilt x from 2.00 on, tilt y from 2.00 on")
+    assert unstable.endswith("unstable with a delay of 1 frame: tilt x from 2.00 on, tilt y from 2.00 on")
     assert "tilt x at" in limits
 
 

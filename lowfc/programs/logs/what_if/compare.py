@@ -20,6 +20,7 @@ from lowfc.control.laws.law import Law
 from lowfc.control.laws.stability import limiting_gain
 from lowfc.control.laws.what_if import as_logged, counterfactual, rms
 from lowfc.control.loop.safety import Limit
+from lowfc.control.loop.wording import counted
 from lowfc.optics.chain.zernike import mode_name
 from lowfc.optics.detector.photometry import tilt_nm_per_mas
 from lowfc.programs.cli.result import table
@@ -247,7 +248,7 @@ def _doubts_of_log(run: LoggedRun) -> list[str]:
         found.append(f"the delay could not be measured in this log; the controller's is {run.delay_frames:g}")
     elif run.delay_frames != run.controller_delay:
         found.append(
-            f"the controller reckoned with a delay of {run.controller_delay:g} frames, measured from "
+            f"the controller reckoned with a delay of {counted(float(run.controller_delay), 'frame')}, measured from "
             f"{run.measured_from} it is {run.measured_delay:.2f} in the mean: pseudo-open-loop modes were computed "
             "again with that for every frame"
         )
@@ -261,10 +262,13 @@ def _doubts_of_log(run: LoggedRun) -> list[str]:
         found.append(f"the mirror's own limits acted on {cut} commands{few}: pseudo-open-loop modes are wrong there")
     changes = sum(one.accepted and one.name in LAW_KEYS for one in run.history.requests)
     if changes:
-        found.append(f"gain or leak was changed {changes} times in the logged run; the last ones are shown")
+        found.append(f"gain or leak was changed {counted(changes, 'time')} in the logged run; the last ones are shown")
     torn = np.count_nonzero(run.torn)
     if torn:
-        found.append(f"the log does not have every command: {torn} gaps, each with the time to settle, are left out")
+        found.append(
+            f"the log does not have every command: {counted(int(torn), 'frame')} that saw a missing one, and the time "
+            "to settle after each, are left out"
+        )
     return found
 
 
@@ -297,7 +301,9 @@ def _doubts_of_law(run: LoggedRun, law: Law, command_nm: Single) -> list[str]:
         if gain >= highest[leak]
     ]
     if unstable:
-        found.append(f"the what-if is unstable with a delay of {delay_frames:g} frames: {', '.join(unstable)}")
+        found.append(
+            f"the what-if is unstable with a delay of {counted(float(delay_frames), 'frame')}: {', '.join(unstable)}"
+        )
     limited = [
         f"{mode_name(index)} at {count} frames"
         for index, count in zip(noll, np.count_nonzero(np.abs(command_nm) >= law.limit_nm, axis=0), strict=True)

@@ -71,7 +71,8 @@ class LoggedRun:
         self.law, self.controller_delay = _law_and_delay(history, self.calibration)
 
         weights = delay_weights(self.controller_delay).astype(np.float32)
-        believed_nm = self.steps.error_nm - self.steps.pol_nm
+        target_nm = _target_nm(history.controllers, self.steps.sequence, len(self.calibration.noll))
+        believed_nm = self.steps.error_nm + target_nm - self.steps.pol_nm
         reckoned_nm = seen_nm(weights, self.steps.command_nm, self.missing, believed_nm[0])
         self.torn: Mask = np.abs(reckoned_nm - believed_nm).max(axis=1) > _TORN_NM
 
@@ -154,6 +155,20 @@ def _played(sequence: Sequences, requests: Sequence[wire.Request], plays: Mappin
             last = first + len(table) + LONGEST_DELAY
             rows |= (sequence >= first) & (sequence < last)
     return rows
+
+
+def _target_nm(states: Sequence[wire.ControllerState], sequence: Sequences, modes: int) -> Single:
+    """Target (steps, modes) of the loop: the offset of the last state before each step, of the first one before that.
+
+    A state is logged at every change; that of a `clear` has no frame, for it forgets the newest one.
+    """
+    known = [(state.frame_sequence, state.offset_nm or [0.0] * modes) for state in states]
+    known = [(frame, offset_nm) for frame, offset_nm in known if len(offset_nm) == modes]
+    if not known:
+        return np.zeros((len(sequence), modes), np.float32)
+    frames = np.maximum.accumulate(np.array([frame for frame, _ in known], np.uint64))
+    rows = np.searchsorted(frames, sequence) - 1
+    return np.array([offset_nm for _, offset_nm in known], np.float32)[np.maximum(rows, 0)]
 
 
 def _law_and_delay(history: History, calibration: Calibration) -> tuple[Law, float]:
