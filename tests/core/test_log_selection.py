@@ -30,7 +30,7 @@ from lowfc.contract.messages import (
 from lowfc.programs.core.recording.volume import bytes_per_s, outlook, selected
 from lowfc.programs.logs.survey import survey
 from lowfc.programs.logs.what_if.compare import what_if
-from lowfc.programs.logs.what_if.options import WhatIf, wanted
+from lowfc.programs.logs.what_if.options import WhatIf, requested
 from tests.support.loops import lowfc
 from tests.support.recording import Bench, bodies_of, logged, put
 from tests.support.report_log import Night
@@ -143,7 +143,7 @@ def test_replay_needs_frames_and_nothing_else_that_may_be_left_out(whole: Path) 
 
 
 def test_a_what_if_is_the_same(whole: Path, small: Path, tmp_path: Path) -> None:
-    asked = wanted("gain=0.3", None, None, None)
+    asked = requested("gain=0.3", None, None, None)
     found = [what_if(LogReader(log), asked) for log in (whole, small)]
     for figures in found:
         del figures["log"]

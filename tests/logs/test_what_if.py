@@ -24,7 +24,7 @@ from lowfc.control.laws.what_if import as_logged, counterfactual, rms
 from lowfc.control.loop.safety import Limit, LoopMode
 from lowfc.optics.detector.photometry import tilt_nm_per_mas
 from lowfc.programs.logs.what_if.compare import LINEAR_WAVES, compared, render, what_if
-from lowfc.programs.logs.what_if.options import WhatIf, user_controller, wanted
+from lowfc.programs.logs.what_if.options import WhatIf, requested, user_controller
 from lowfc.programs.logs.what_if.run import LoggedRun
 from tests.support import toy
 from tests.support.folded_loop import fold
@@ -145,7 +145,7 @@ def test_the_gains_that_were_used_give_the_logged_run(logs: dict[str, Path]) -> 
 
 def test_a_log_says_what_other_gains_give(logs: dict[str, Path]) -> None:
     """Measured residual with measured residual, mode by mode, of two runs."""
-    guess, run = figures_of(logs["usual"], wanted(OTHER)), figures_of(logs["other"])
+    guess, run = figures_of(logs["usual"], requested(OTHER)), figures_of(logs["other"])
     np.testing.assert_allclose(column(guess, "what_if"), column(run, "was"), rtol=0.1)
     np.testing.assert_allclose(column(guess, "open"), column(run, "open"), rtol=0.1)
     assert np.abs(column(guess, "was") / column(run, "was") - 1).max() > 0.1
@@ -168,8 +168,8 @@ def test_a_wrong_idea_of_the_delay_is_found_and_put_right(logs: dict[str, Path])
 def test_a_configuration_says_the_same_as_the_words(logs: dict[str, Path], tmp_path: Path) -> None:
     path = tmp_path / "other.toml"
     path.write_text("[control]\ntilt_gain=0.2\ngain=0.9\nleak=0.01\ntilt_leak=0.01\n")
-    by_file = figures_of(logs["usual"], wanted("gain=0.3,tilt_gain=0.2,limit_nm=150,tilt_limit_nm=150", path))
-    assert by_file == figures_of(logs["usual"], wanted(OTHER + ",limit_nm=150"))
+    by_file = figures_of(logs["usual"], requested("gain=0.3,tilt_gain=0.2,limit_nm=150,tilt_limit_nm=150", path))
+    assert by_file == figures_of(logs["usual"], requested(OTHER + ",limit_nm=150"))
     table = render(by_file).splitlines()
     assert sum(" -> " in line for line in table) == len(by_file["modes"])
     assert any("0.4 -> 0.2" in line and "tilt x" in line for line in table)
@@ -178,7 +178,7 @@ def test_a_configuration_says_the_same_as_the_words(logs: dict[str, Path], tmp_p
 
 def test_another_reconstructor_measures_the_same_frames(logs: dict[str, Path], tmp_path: Path) -> None:
     """pinv by name and as a file are the same; and back from there to the logged one."""
-    by_name = figures_of(logs["usual"], wanted("estimator=pinv"))
+    by_name = figures_of(logs["usual"], requested("estimator=pinv"))
     assert by_name["estimator"] == "pinv"
     assert by_name["what_if_nm"] != pytest.approx(by_name["was_nm"], rel=1e-3)
     np.testing.assert_allclose(column(by_name, "open")[:2], column(figures_of(logs["usual"]), "open")[:2], rtol=0.1)
@@ -188,9 +188,9 @@ def test_another_reconstructor_measures_the_same_frames(logs: dict[str, Path], t
     R = reconstructor(I0, H, good, 1.0, 0.0, "pinv").astype(np.float32)
     path = tmp_path / "pinv.fits"
     calibration_file.save(identified(replace(calibration, reconstructor=R, estimator="pinv")), path)
-    by_file = figures_of(logs["usual"], wanted(calibration=path))
+    by_file = figures_of(logs["usual"], requested(calibration=path))
     np.testing.assert_allclose(column(by_file, "what_if"), column(by_name, "what_if"), rtol=1e-4)
-    back = figures_of(logs["usual"], wanted("estimator=weighted", calibration=path))
+    back = figures_of(logs["usual"], requested("estimator=weighted", calibration=path))
     np.testing.assert_allclose(column(back, "what_if"), column(back, "was"), rtol=1e-2)
 
 
@@ -201,7 +201,7 @@ def test_frames_that_are_not_in_the_log_are_counted(logs: dict[str, Path], monke
     np.testing.assert_allclose(found, run.steps.error_nm, atol=1e-4)
     found[1007::100] = np.nan
     monkeypatch.setattr(run, "measured_again", lambda *_: found)
-    figures = compared(run, wanted("estimator=pinv"))
+    figures = compared(run, requested("estimator=pinv"))
     assert figures["frames_compared"] == FRAMES - 1000 - 20
     assert "20 frames that were used are not in the log" in figures["warnings"][0]
 
@@ -216,7 +216,7 @@ def test_modes_of_another_size_shape_the_mirror_alike(logs: dict[str, Path], tmp
         modes_to_actuators=calibration.modes_to_actuators * 2,
     )
     calibration_file.save(identified(twice), tmp_path / "twice.fits")
-    figures = figures_of(logs["usual"], wanted(calibration=tmp_path / "twice.fits"))
+    figures = figures_of(logs["usual"], requested(calibration=tmp_path / "twice.fits"))
     np.testing.assert_allclose(column(figures, "what_if"), column(figures, "was") / 2, rtol=1e-4)
 
 
@@ -224,10 +224,10 @@ def test_calibrations_that_do_not_fit_are_refused(logs: dict[str, Path], tmp_pat
     path = tmp_path / "other.fits"
     calibration_file.save(identified(replace(toy.calibration(), noll=(2, 3, 11))), path)
     with pytest.raises(CalibrationError, match=r"its noll is \(2, 3, 11\), in the log it is \(2, 3, 4\)"):
-        figures_of(logs["usual"], wanted(calibration=path))
+        figures_of(logs["usual"], requested(calibration=path))
     (tmp_path / "shear.toml").write_text('[control]\nnuisance = ["shear"]\n')
     with pytest.raises(ConfigurationError, match=r"weighted\+shear: .* --calibration"):
-        figures_of(logs["usual"], wanted(config=tmp_path / "shear.toml"))
+        figures_of(logs["usual"], requested(config=tmp_path / "shear.toml"))
 
 
 INTEGRATOR = """
@@ -256,7 +256,7 @@ def test_a_controller_of_ones_own_is_folded_like_the_integrator(
 ) -> None:
     (tmp_path / "mine.py").write_text(INTEGRATOR)
     where = f"{tmp_path / 'mine.py'}:step"
-    own, ours = figures_of(logs["usual"], wanted(controller=where)), figures_of(logs["usual"], wanted(OTHER))
+    own, ours = figures_of(logs["usual"], requested(controller=where)), figures_of(logs["usual"], requested(OTHER))
     np.testing.assert_allclose(column(own, "what_if"), column(ours, "what_if"), rtol=1e-4)
     assert own["controller"] == where
     assert "gain" not in own["modes"][0]
@@ -369,7 +369,7 @@ def test_doubts_are_said() -> None:
 def test_an_open_loop_far_out_is_warned_of() -> None:
     far = np.full((40, 3), [20.0, -30.0, 12.0], np.float32)
     run = LoggedRun(history(error_nm=far, pol_nm=far.copy(), mode=np.full(40, LoopMode.OPEN, np.uint8)))
-    figures = compared(run, wanted("tilt_gain=2.5"))
+    figures = compared(run, requested("tilt_gain=2.5"))
     assert figures["compared"] == "the loop was never closed"
     assert column(figures, "was").tolist() == column(figures, "open").tolist() == [20, 30, 12]
     _, linear, unstable, limits = figures["warnings"]
@@ -407,7 +407,7 @@ def test_a_controllers_mistakes_are_made_plain(tmp_path: Path, body: str | None,
 
 
 def test_the_words_of_the_command_line() -> None:
-    asked = wanted(" gain=0.6, leak=0.01,tilt_limit_nm=80,estimator=pinv", controller=None)
+    asked = requested(" gain=0.6, leak=0.01,tilt_limit_nm=80,estimator=pinv", controller=None)
     assert asked == WhatIf({"gain": 0.6, "leak": 0.01, "tilt_limit_nm": 80.0}, "pinv")
 
 
@@ -425,6 +425,6 @@ def test_the_words_of_the_command_line() -> None:
 )
 def test_words_that_make_no_sense_are_refused(text: str, message: str) -> None:
     with pytest.raises(ConfigurationError, match=message):
-        compared(LoggedRun(history()), wanted(text))
+        compared(LoggedRun(history()), requested(text))
     with pytest.raises(ConfigurationError, match="gain are the integrator's"):
-        wanted("gain=0.3", controller="mine.py:step")
+        requested("gain=0.3", controller="mine.py:step")

@@ -33,11 +33,11 @@ def what_if(
     from lowfc.adapters.process.progress import reading_bar
     from lowfc.programs.logs.what_if.compare import render
     from lowfc.programs.logs.what_if.compare import what_if as run
-    from lowfc.programs.logs.what_if.options import wanted
+    from lowfc.programs.logs.what_if.options import requested
 
-    asked = wanted(changes, config, calibration, controller)
+    what = requested(changes, config, calibration, controller)
     reader = WholeLog(log := the_one(logs), skip_damaged=True)
     with reading_bar(Console(stderr=True)) as count:
         reader.progress = partial(count, f"reading {titled(log)}")
-        figures = run(reader, asked)
+        figures = run(reader, what)
     put(figures, render(figures), as_json=as_json)

@@ -44,7 +44,7 @@ class WhatIf:
     step: Controller | None = None
 
 
-def wanted(
+def requested(
     text: str | None = None,
     config: Path | None = None,
     calibration: Path | None = None,
