@@ -542,7 +542,7 @@ def test_the_status_says_everything() -> None:
         assert words in text(figures(state))
     assert text(figures(state)).splitlines()[-1].endswith("abc, the first of a commissioning: without a verdict")
     assert figures(wire.ControllerState())["mode"] == "starting"
-    assert "without a verdict" not in text(wire.ControllerState(calibration_id="abc"))
+    assert "without a verdict" not in text(figures(wire.ControllerState(calibration_id="abc")))
 
 
 # The recorder's switch.
