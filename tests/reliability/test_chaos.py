@@ -30,7 +30,7 @@ from sim_camera.faults import Kind
 START_S = 1_800_000_000
 SECOND_NS = 1_000_000_000
 FRAMES = 1000
-CASE = Case("nothing", "frames", "nothing", lambda bench: None)
+CASE = Case("nothing", "nothing", lambda bench: None)
 
 
 def ns(index: int) -> int:

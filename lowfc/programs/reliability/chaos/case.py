@@ -30,7 +30,6 @@ class Case:
 
     Attributes:
         name: on the command line.
-        group: in the table.
         sentence: what befalls the loop.
         act: does it, once the loop is quiet; then the loop is left to come to its end.
         fault: kind of the frames' fault, of the camera from the start.
@@ -45,7 +44,6 @@ class Case:
     """
 
     name: str
-    group: str
     sentence: str
     act: Act
     fault: str = ""
@@ -70,11 +68,11 @@ class Case:
 REGISTERED: dict[str, Case] = {}
 
 
-def case(group: str, name: str, sentence: str, **more: Any) -> Callable[[Act], Act]:
+def case(name: str, sentence: str, **more: Any) -> Callable[[Act], Act]:
     """Register a function as what a case does; `more` are the case's other attributes."""
 
     def register(act: Act) -> Act:
-        REGISTERED[name] = Case(name, group, sentence, act, **more)
+        REGISTERED[name] = Case(name, sentence, act, **more)
         return act
 
     return register

@@ -73,7 +73,7 @@ def chaos(
 
 def run_case(case: "Case", seed: int, keep: Path | None) -> dict[str, Any]:
     """Run one case in a folder of its own, and judge it; without `keep` only the log of one that fails stays."""
-    row: dict[str, Any] = {"name": case.name, "group": case.group, "sentence": case.sentence, "seconds": 0.0}
+    row: dict[str, Any] = {"name": case.name, "sentence": case.sentence, "seconds": 0.0}
     row |= {"passed": False, "skipped": case.lacks() or None, "findings": {}, "figures": {}}
     if row["skipped"]:
         return row

@@ -20,12 +20,10 @@ from lowfc.programs.reliability.chaos.bench import CaseFailedError, ChaosBench
 from lowfc.programs.reliability.chaos.case import LOST, WHILE_FRAMES, End, case, no_mounts, no_other_clock, read_only
 from lowfc.programs.reliability.chaos.processes import killed
 
-control_case = partial(case, "control")
-
 JUST_BELOW = 0.9
 
 
-@control_case("gain", "the highest gain that is granted, then one above, refused")
+@case("gain", "the highest gain that is granted, then one above, refused")
 def _highest_gain(bench: ChaosBench) -> None:
     client, limiting = bench.client(), limiting_gain(settings(bench.config).delay_frames)
     try:
@@ -49,7 +47,7 @@ def _load_and_close(client: Client, calibration: Calibration) -> None:
     client.close_loop()
 
 
-@control_case(
+@case(
     "reversed-calibration",
     "a calibration of the right shape that drives the loop away; the operator ends it by `safe`",
     expected=("SAFED",),
@@ -65,7 +63,7 @@ def _reversed_calibration(bench: ChaosBench) -> None:
     _load_and_close(client, good)
 
 
-@control_case(
+@case(
     "foreign-calibration",
     "a calibration for frames of another size",
     expected=("FRAMES_REFUSED frames refused: WRONG_SIZE",),
@@ -89,7 +87,7 @@ def _foreign_calibration(bench: ChaosBench) -> None:
     _load_and_close(client, good)
 
 
-@control_case(
+@case(
     "damaged-calibration",
     "the controller is started with NaN in its file, which it refuses, then with a good one",
     expected=("STARTED controller",),
@@ -110,7 +108,7 @@ def _damaged_calibration(bench: ChaosBench) -> None:
     bench.restart(Role.CONTROLLER, good)
 
 
-@control_case(
+@case(
     "safed-restart",
     "safe mode, then the controller is killed and started anew",
     expected=("SAFED",),
@@ -141,7 +139,7 @@ def _safe_while(unkept: Callable[[Path], contextlib.AbstractContextManager[None]
     bench.restart(Role.CONTROLLER)
 
 
-unkept_case = partial(control_case, expected=("SAFED", "LATCH_FAILED"), end=End.SAFE)
+unkept_case = partial(case, expected=("SAFED", "LATCH_FAILED"), end=End.SAFE)
 unkept_case(
     "safe-without-directory",
     "safe while the run's directory is gone; then the controller is killed and started anew",
@@ -163,14 +161,14 @@ def _other_clock(bench: ChaosBench, seconds: int) -> None:
             bench.frames(WHILE_FRAMES)
 
 
-control_case(
+case(
     "clock-ahead",
     "a camera whose clock is an hour ahead takes the place of the camera",
     expected=("CAMERA_RESTARTED",),
     allowed=LOST,
     lacks=no_other_clock,
 )(partial(_other_clock, seconds=3600))
-control_case(
+case(
     "clock-behind",
     "a camera whose clock is an hour behind, until the camera is back",
     allowed=LOST,

@@ -4,7 +4,6 @@ import contextlib
 import resource
 import signal
 from collections.abc import Iterator
-from functools import partial
 
 from lowfc.contract.messages import Role
 from lowfc.programs.reliability.chaos.bench import CaseFailedError, ChaosBench
@@ -15,7 +14,6 @@ ROOM_BYTES = 3_000_000
 """What the log may still grow before its disk is full: about a second of the loop."""
 SLOW_S = 3.0
 
-disk_case = partial(case, "disk")
 
 # The recorder itself, with a file that takes its time, and reports it as a slow one would.
 _SLOW = """
@@ -38,7 +36,7 @@ main()
 """
 
 
-@disk_case(
+@case(
     "disk-full",
     "the disk fills up",
     allowed=("RECORDING_FAILED", "MESSAGES_LOST"),
@@ -53,7 +51,7 @@ def _full(bench: ChaosBench) -> None:
     bench.wait(lambda: bool(bench.health[Role.RECORDER].recording.failure), "the recorder to report that it failed")
 
 
-@disk_case(
+@case(
     "disk-read-only",
     "a recorder on a read-only disk refuses, another one records",
     statuses={Role.RECORDER: 2},
@@ -71,14 +69,14 @@ def _read_only(bench: ChaosBench) -> None:
     bench.restart(Role.RECORDER, [*usual, "--folder", str(bench.folder)])  # the last one wrote its own into the run's
 
 
-@disk_case("disk-slow", "the disk takes 3 s for each write", expected=("DISK_SLOW",), allowed=LOST)
+@case("disk-slow", "the disk takes 3 s for each write", expected=("DISK_SLOW",), allowed=LOST)
 def _slow(bench: ChaosBench) -> None:
     _on_slow_disk(bench, SLOW_S, 8, 2)
     bench.wait(lambda: bench.health[Role.RECORDER].recording.messages > 0, "a recording")
     bench.frames(1000)  # of which two writes take the most
 
 
-@disk_case("stall-disk", "the disk takes nothing for 10 s", allowed=LOST)
+@case("stall-disk", "the disk takes nothing for 10 s", allowed=LOST)
 def _stalled(bench: ChaosBench) -> None:
     @contextlib.contextmanager
     def stall() -> Iterator[None]:

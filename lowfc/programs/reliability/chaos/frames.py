@@ -1,13 +1,8 @@
 """Chaos cases: faults of the camera's frames, and of the mirror."""
 
-from functools import partial
-
 from lowfc.contract.configuration import Control
 from lowfc.programs.reliability.chaos.bench import ChaosBench
 from lowfc.programs.reliability.chaos.case import LOST, case
-
-frames_case = partial(case, "frames")
-mirror_case = partial(case, "mirror")
 
 FIRST = 600
 """Index of the first frame that a camera's fault befalls: the loop has settled and been quiet for a second."""
@@ -41,7 +36,7 @@ def _through(bench: ChaosBench) -> None:
 
 for _kind, _sentence, _reason, _used, _lost in _KINDS:
     _event = _reason if _reason in ("", "FRAMES_MISSING") else f"FRAMES_REFUSED frames refused: {_reason}"
-    frames_case(
+    case(
         f"frames-{_kind}",
         _sentence,
         fault=_kind,
@@ -49,12 +44,12 @@ for _kind, _sentence, _reason, _used, _lost in _KINDS:
         allowed=LOST if _lost else (),
         bad=range(FIRST + _used, FIRST + STRUCK).__contains__ if _used < STRUCK else None,
     )(_through)
-mirror_case(
+case(
     "stuck-actuators",
     "dead and stuck actuators",
     config={"mirror.dead": [500, 501], "mirror.stuck_nm": {"600": 80.0}},
 )(_through)
-mirror_case(
+case(
     "saturating",
     "a disturbance beyond what the modes may do",
     config={"disturbance.preset": "step", "disturbance.scale": 6.0, "control.tilt_limit_nm": 20.0},

@@ -4,7 +4,6 @@ import itertools
 import threading
 import time
 from collections.abc import Iterator
-from functools import partial
 
 import numpy as np
 
@@ -17,9 +16,6 @@ from lowfc.contract.messages import COMMAND, FRAME, REQUEST_KEY, TOPICS, Role, T
 from lowfc.programs.reliability.chaos.bench import CaseFailedError, ChaosBench
 from lowfc.programs.reliability.chaos.case import LOST, case
 from lowfc.programs.reliability.chaos.evidence import FORGED_S
-
-bus_case = partial(case, "bus")
-operator_case = partial(case, "operator")
 
 FLOOD_HZ = 2000
 FLOOD_S = 2.0
@@ -63,7 +59,7 @@ class Intruder:
         return len(self._bus.get(REQUEST_KEY.format(name=name), payload, patience_s))
 
 
-@bus_case("junk", "random bytes on every topic, 2,000 a second", allowed=LOST, noisy=True)
+@case("junk", "random bytes on every topic, 2,000 a second", allowed=LOST, noisy=True)
 def _flood(bench: ChaosBench) -> None:
     with Intruder(bench) as intruder:
         begun_s = time.monotonic()
@@ -94,7 +90,7 @@ def _commands(bench: ChaosBench, rng: np.random.Generator) -> Iterator[wire.Mirr
         yield command
 
 
-@bus_case(
+@case(
     "forged-commands",
     "commands of anything at all by who has the run's secret",
     expected=("COMMAND_REFUSED command refused: NOT_FINITE", "LIMIT_HIT"),
@@ -108,7 +104,7 @@ def _forged_commands(bench: ChaosBench) -> None:
             time.sleep(_TURN_S)
 
 
-@bus_case("forged-frames", "frames with numbers of the past, and with none", allowed=LOST, noisy=True)
+@case("forged-frames", "frames with numbers of the past, and with none", allowed=LOST, noisy=True)
 def _forged_frames(bench: ChaosBench) -> None:
     with Intruder(bench) as intruder:
         for _ in range(FORGED):
@@ -117,7 +113,7 @@ def _forged_frames(bench: ChaosBench) -> None:
             time.sleep(_TURN_S)
 
 
-@operator_case("malformed-requests", "requests of random bytes")
+@case("malformed-requests", "requests of random bytes")
 def _malformed_requests(bench: ChaosBench) -> None:
     """Each is answered."""
     with Intruder(bench) as intruder:
@@ -130,7 +126,7 @@ def _malformed_requests(bench: ChaosBench) -> None:
                 raise CaseFailedError(f"request {number}, {name!r} of {len(body)} random bytes, was not answered")
 
 
-@operator_case("huge-requests", "requests of up to 64 MB", allowed=LOST)
+@case("huge-requests", "requests of up to 64 MB", allowed=LOST)
 def _huge_requests(bench: ChaosBench) -> None:
     """They are refused, or lost by the bus; the loop goes on."""
     with Intruder(bench) as intruder:
@@ -139,7 +135,7 @@ def _huge_requests(bench: ChaosBench) -> None:
             intruder.ask("channel", message.SerializeToString(), 10.0)
 
 
-@operator_case("concurrent-requests", "eight operators at once")
+@case("concurrent-requests", "eight operators at once")
 def _concurrent_requests(bench: ChaosBench) -> None:
     """Each has a connection of its own, and every request is answered."""
     failed: list[str] = []

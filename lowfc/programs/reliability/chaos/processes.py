@@ -12,7 +12,7 @@ from lowfc.contract.messages import TIMING, Role, wire
 from lowfc.programs.reliability.chaos.bench import ChaosBench
 from lowfc.programs.reliability.chaos.case import LOST, Act, case
 
-process_case = partial(case, "processes", allowed=LOST)
+process_case = partial(case, allowed=LOST)
 
 STALL_S = 10.0
 CALM_S = STALL_S / 2
