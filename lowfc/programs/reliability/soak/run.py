@@ -1,6 +1,7 @@
 """A soak: the simulated loop for hours, looked at once a second, its logs checked and removed as they are finished."""
 
 import contextlib
+import random
 import tempfile
 import time
 from collections.abc import Callable
@@ -10,27 +11,20 @@ from typing import Any
 import numpy as np
 import psutil
 from google.protobuf.message import DecodeError
-from rich.console import Console
 
 from lowfc.adapters.bus.bus import Sample
-from lowfc.adapters.bus.run import new_run_id, open_run
-from lowfc.adapters.bus.zenoh_bus import ZenohBus
 from lowfc.adapters.logs.reader import LogReader
 from lowfc.adapters.logs.sequence_gaps import Gaps
-from lowfc.adapters.process.clock import HostClock
 from lowfc.contract.configuration import Configuration
 from lowfc.contract.envelope import count_of, start_of
-from lowfc.contract.errors import DataFileError
-from lowfc.contract.messages import EVENT, FRAME, HEALTH, TIMING, Role, wire
-from lowfc.programs.launch.processes import start_all, stop_all
-from lowfc.programs.launch.sim_loop import check, children_of, prepare
-from lowfc.programs.launch.watch import Watch, topic_count
+from lowfc.contract.messages import EVENT, FRAME, TIMING, Role, wire
+from lowfc.programs.launch.sim_loop import check
+from lowfc.programs.launch.watch import topic_count
+from lowfc.programs.reliability.chaos.bench import ChaosBench
 from lowfc.programs.reliability.soak.figures import Usage, of_latency, of_process, too_short
 
 LOOK_S = 1.0
-_READY_S = 240.0
 _PATIENCE_S = 10.0
-_LAST_HEALTH_S = 0.2
 _NONE_OF = (
     ("messages_lost", "messages lost"),
     ("gaps", "messages missing in the logs"),
@@ -69,33 +63,22 @@ class LogChecker:
 
 
 class _Soak:
-    def __init__(self, config: Configuration, folder: Path) -> None:
-        self.checker = LogChecker(folder)
-        self.watch = Watch({}, [])
+    def __init__(self, bench: ChaosBench) -> None:
+        self.bench = bench
+        self.checker = LogChecker(bench.folder)
         self.usage: dict[str, list[Usage]] = {}
         self.latency: list[tuple[float, float, float]] = []
         self._latencies_ns: list[int] = []
-        self.run = open_run(new_run_id(), (config.mirror.name,), listeners=(Role.LAUNCHER,))
-        prepare(config, self.run, Console(stderr=True, quiet=True))
-        self.children = children_of(config, self.run, None, record=True)
 
     def receive_timing(self, sample: Sample) -> None:
         with contextlib.suppress(DecodeError):
             self._latencies_ns += wire.ControlTiming.FromString(sample.payload).frame_to_command_ns
 
-    def await_frames(self) -> None:
-        """Wait for the first frame."""
-        deadline_s = time.monotonic() + _READY_S
-        while not topic_count(self.watch.of(Role.CONTROLLER), FRAME.key).received:
-            check(self.children)
-            if time.monotonic() >= deadline_s:
-                raise DataFileError(f"no frame came within {_READY_S:g} s")
-            time.sleep(LOOK_S / 10)
-
     def look(self, now_s: float) -> None:
         """Sample processes and latency, and check finished logs."""
-        check(self.children)
-        for child in self.children:
+        children = list(self.bench.children.values())
+        check(children)
+        for child in children:
             assert child.process is not None  # noqa: S101  # it was started
             with contextlib.suppress(psutil.Error):  # one that has just ended: the next look says so
                 process = psutil.Process(child.process.pid)
@@ -109,8 +92,10 @@ class _Soak:
 
     def figures(self, seconds: float, stopped_s: float, unfinished: list[str]) -> dict[str, Any]:
         """What `lowfc soak --json` prints."""
-        frames = topic_count(self.watch.of(Role.CONTROLLER), FRAME.key)
-        recording, camera = self.watch.of(Role.RECORDER).recording, self.watch.of(Role.CAMERA)
+        controller, recorder, camera = (
+            self.bench.health.get(role, wire.Health()) for role in (Role.CONTROLLER, Role.RECORDER, Role.CAMERA)
+        )
+        frames, recording = topic_count(controller, FRAME.key), recorder.recording
         processes = {name: of_process(samples) for name, samples in self.usage.items()}
         found: dict[str, Any] = {
             "hours": seconds / 3600,
@@ -144,25 +129,19 @@ def soak_loop(config: Configuration, seconds: float, progress: Callable[[float],
     """
     with tempfile.TemporaryDirectory(prefix="lowfc-soak-") as name:
         logged = config.model_copy(update={"recorder": config.recorder.model_copy(update={"folder": name})})
-        soak = _Soak(logged, Path(name))
+        bench = ChaosBench(logged, Path(name), random.Random(), None)  # noqa: S311  # nothing secret
+        soak = _Soak(bench)
         try:
-            start_all(soak.children)
-            with contextlib.closing(ZenohBus(soak.run.links, Role.LAUNCHER, HostClock())) as bus:
-                bus.subscribe(HEALTH, soak.watch.hear)
-                bus.subscribe(TIMING, soak.receive_timing)
-                soak.await_frames()
-                begun_s = time.monotonic()
-                while (elapsed_s := time.monotonic() - begun_s) < seconds:
-                    soak.look(elapsed_s)
-                    progress(elapsed_s)
-                    time.sleep(max(0.0, LOOK_S - (time.monotonic() - begun_s - elapsed_s)))
-                begun_s = time.monotonic()
-                stop_all(soak.children, _PATIENCE_S)
-                stopped_s = time.monotonic() - begun_s
-                time.sleep(_LAST_HEALTH_S)
-            soak.checker.look()
-            unfinished = [path.name for path in Path(name).glob("*.part")]
+            bench.begin(TIMING, soak.receive_timing)
+            begun_s = time.monotonic()
+            while (elapsed_s := time.monotonic() - begun_s) < seconds:
+                soak.look(elapsed_s)
+                progress(elapsed_s)
+                time.sleep(max(0.0, LOOK_S - (time.monotonic() - begun_s - elapsed_s)))
         finally:
-            stop_all(soak.children)
-            soak.run.remove()
+            begun_s = time.monotonic()
+            bench.end(_PATIENCE_S)
+            stopped_s = time.monotonic() - begun_s
+        soak.checker.look()
+        unfinished = [path.name for path in Path(name).glob("*.part")]
     return soak.figures(seconds, stopped_s, unfinished)
