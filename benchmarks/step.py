@@ -1,8 +1,8 @@
 """Where the control step's time goes: each stage, beside one matrix-vector product of the same size in the same run.
 
 The step is the loop's own, from a frame's bytes to a command's, of a made-up calibration of the usual size. It is timed
-back to back and as in the loop, after a rest as long as a frame's period; it takes turns with the product R x alone.
-After that it is timed stage by stage, which takes a little longer.
+back to back and as in the loop, after a rest as long as a frame's period; so is the product R x alone. After that it is
+timed stage by stage, which takes a little longer.
 
 Example:
     python -m benchmarks step --seconds 5
@@ -13,21 +13,21 @@ import time
 import tracemalloc
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from functools import partial
-from itertools import count
 from typing import Any
 
 import numpy as np
 
 from benchmarks.runner import Lines, Result, Tell, add_times
 from benchmarks.sizes import Size, configuration, made_up
+from lowfc.adapters.process.clock import HostClock
 from lowfc.adapters.process.realtime import set_up
+from lowfc.arrays import Long
 from lowfc.contract.codecs import codec
 from lowfc.control.loop import advance
 from lowfc.control.loop.estimator import Estimator
 from lowfc.control.loop.safety import LoopMode
 from lowfc.control.loop.state import ActiveLoop
-from lowfc.programs.measure.control_step import ControlStep
+from lowfc.programs.measure.control_step import ControlStep, time_alone
 from lowfc.programs.measure.frame_source import Payloads
 from lowfc.programs.measure.latency.figures import percentiles
 
@@ -44,8 +44,6 @@ STAGES: dict[str, tuple[Any, str]] = {
 REST, STEP, PRODUCT = "modes to actuators, state, step", "the whole step", "one product R x"
 _WARM_UP = 200
 _TRACED = 1000
-
-Durations = dict[str, list[int]]
 
 
 def options(parser: argparse.ArgumentParser) -> None:
@@ -69,10 +67,10 @@ def measure(options: argparse.Namespace, tell: Tell) -> Result:
     memory = allocated(step, payloads)
     x = np.random.default_rng(1).standard_normal(size.pixels, np.float32)
     found: Result = {}
-    for name, period_s in (("hot_us", None), ("paced_us", 1 / RATE_HZ)):
+    for name, period_ns in (("hot_us", None), ("paced_us", config.period_ns)):
         tell(name)
-        durations = _timed(step, payloads, lambda: calibration.reconstructor @ x, options.seconds, period_s)
-        found[name] = {stage: percentiles(np.array(each) / 1e3) for stage, each in durations.items()}
+        durations = _timed(step, payloads, lambda _: calibration.reconstructor @ x, options.seconds, period_ns)
+        found[name] = {stage: percentiles(each / 1e3) for stage, each in durations.items()}
     if step.state.mode is not LoopMode.CLOSED or step.state.counts:
         raise ValueError(f"frames were refused or limits acted: {dict(step.state.counts)}; this is not the usual step")
     found["over_product"] = {name: found[name][STEP]["p50"] / found[name][PRODUCT]["p50"] for name in found}
@@ -128,43 +126,23 @@ def about(found: Result) -> str:
 
 
 def _timed(
-    step: ControlStep, payloads: Payloads, product: Callable[[], object], seconds: float, period_s: float | None
-) -> Durations:
-    durations: Durations = {stage: [] for stage in (*STAGES, REST, STEP, PRODUCT)}
-    for payload in _turns(payloads, 2 * seconds / 3, period_s):
-        if len(durations[STEP]) > len(durations[PRODUCT]):
-            durations[PRODUCT].append(_taken_ns(product))
-        else:
-            durations[STEP].append(_taken_ns(partial(step, payload)))
+    step: ControlStep, payloads: Payloads, product: Callable[[bytes], object], seconds: float, period_ns: int | None
+) -> dict[str, Long]:
+    """Durations of the step, of the product and of each stage, ns, a third of the time for each."""
+
+    def alone(work: Callable[[bytes], object]) -> Long:
+        return time_alone(work, payloads, HostClock(), seconds / 3, period_ns).step_ns
+
+    durations: dict[str, list[int]] = {stage: [] for stage in STAGES}
+    found = {STEP: alone(step), PRODUCT: alone(product)}
     with _clocked(durations):
-        for payload in _turns(payloads, seconds / 3, period_s):
-            whole_ns = _taken_ns(partial(step, payload))
-            durations[REST].append(whole_ns - sum(durations[stage][-1] for stage in STAGES))
-    return durations
-
-
-def _turns(payloads: Payloads, seconds: float, period_s: float | None) -> Iterator[bytes]:
-    """A frame for each turn, at its moment."""
-    due_s = time.monotonic()
-    end_s = due_s + seconds
-    for number in count():
-        due_s = time.monotonic() if period_s is None else due_s + period_s
-        if due_s > end_s:
-            return
-        payload = payloads.at(number, time.monotonic_ns())
-        if period_s is not None:
-            time.sleep(max(0.0, due_s - time.monotonic()))
-        yield payload
-
-
-def _taken_ns(what: Callable[[], object]) -> int:
-    begun_ns = time.perf_counter_ns()
-    what()
-    return time.perf_counter_ns() - begun_ns
+        whole = alone(step)
+    stages = {stage: np.array(each, np.int64) for stage, each in durations.items()}
+    return found | stages | {REST: whole - np.sum([*stages.values()], axis=0)}
 
 
 @contextmanager
-def _clocked(durations: Durations) -> Iterator[None]:
+def _clocked(durations: dict[str, list[int]]) -> Iterator[None]:
     """Each stage's function timed where the step calls it."""
     originals = [(owner, name, getattr(owner, name)) for owner, name in STAGES.values()]
     for stage, (owner, name, original) in zip(STAGES, originals, strict=True):

@@ -1,5 +1,6 @@
 """What a loop's latency is set against in one process: the control step without a bus, and the host's timer."""
 
+from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
@@ -46,7 +47,9 @@ class Alone(NamedTuple):
     step_ns: Long
 
 
-def time_alone(step: ControlStep, payloads: Payloads, clock: HostClock, seconds: float, period_ns: int | None) -> Alone:
+def time_alone(
+    step: Callable[[bytes], object], payloads: Payloads, clock: HostClock, seconds: float, period_ns: int | None
+) -> Alone:
     """Sleep to the next moment of a schedule, then do one control step, over and over; or without one, step by step."""
     timer_ns: list[int] = []
     step_ns: list[int] = []
