@@ -34,5 +34,5 @@ def main() -> int:
 
 
 if __name__ == "__main__":
-    signal.signal(signal.SIGTERM, signal.default_int_handler)  # told to end, it stops what runs first
+    signal.signal(signal.SIGTERM, signal.default_int_handler)  # it stops its processes before it ends
     sys.exit(main())

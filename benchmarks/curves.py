@@ -38,7 +38,7 @@ AXES = {
     "modes": ((5, 10, 20, 50, 100, 200, 500), "modes", "how many"),
     "actuators": ((10, 16, 23, 34, 48, 64), "mirror_side", "across the mirror"),
 }
-"""Of each curve its sizes, which of `Size` they are, and what that is."""
+"""Sizes of each curve, the field of `Size` that they are, and what that is."""
 RATE_HZ = 250.0
 
 _STEP = ("step_us", "stream_us", "products_us")
@@ -192,7 +192,7 @@ HEADINGS = (
 
 
 def tables(result: Result) -> list[Lines]:
-    """Of each curve its table."""
+    """A table for each curve."""
     return [
         [[name, *HEADINGS], *([_label(name, one), *_cells(one)] for one in points)]
         for name, points in result["curves"].items()

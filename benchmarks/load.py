@@ -23,7 +23,7 @@ MODULES = {
     "lowfc record": "recorder",
     "lowfc view": "view",
 }
-"""What Python was told to run, and the role that it has in the loop."""
+"""Modules that Python runs, and their roles in the loop."""
 LOOP = {"camera", "controller", "mirror"}
 
 _EVERY_S = 0.2
@@ -114,7 +114,7 @@ def run_lowfc(words: Sequence[str], seconds: float) -> dict[str, Any]:
     """Run `lowfc` with these words and `--json` for so long, in a folder of its own.
 
     Returns:
-        What it prints, and usage (`shares` of its processes); or failure, what it said last.
+        What it prints, and usage (`shares` of its processes); or failure, the last line that it wrote.
     """
     command = [sys.executable, "-P", "-m", "lowfc", *words, "--duration", f"{seconds:g}", "--json"]
     patience_s = _START_S + _SLOWEST * seconds

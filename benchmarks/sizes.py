@@ -45,12 +45,12 @@ class Size:
 
     @property
     def pixels(self) -> int:
-        """Of a frame."""
+        """Pixels of a frame."""
         return self.side**2
 
     @property
     def actuators(self) -> int:
-        """Of the mirror."""
+        """Actuators of the mirror."""
         return self.mirror_side**2
 
     @property
@@ -60,7 +60,7 @@ class Size:
 
 
 def configuration(size: Size, rate_hz: float, **realtime: Any) -> Configuration:
-    """Of a loop with a mirror of that size; keys of [realtime] as given."""
+    """Configuration of a loop with a mirror of that size; keys of [realtime] as given."""
     overrides = {
         "camera.rate_hz": rate_hz,
         "mirror.rows": size.mirror_side,
@@ -105,7 +105,7 @@ def run_loop(size: Size, config: Configuration, seconds: float) -> dict[str, Any
     """Run the loop of that size once, and then a bare echo of its messages; one repeat's figures of `run_repeats`.
 
     Raises:
-        LowfcError: a process of the loop ended by itself, or said nothing.
+        LowfcError: a process of the loop ended by itself, or reported nothing.
     """
 
     def fill(config: Configuration, run: Run) -> None:

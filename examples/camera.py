@@ -20,7 +20,7 @@ SETTINGS_PERIOD_NS = 500_000_000
 
 
 def main(run: RunId = DEFAULT_RUN, config: ConfigFile = None) -> None:
-    """Publish frames until told to stop."""
+    """Publish frames until it is stopped."""
     settings = configuration(config)
     service = join(settings, run, Role.CAMERA, settings.realtime.camera_cpus)  # real-time set-up, clock and bus
     service.catch_signals()

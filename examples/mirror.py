@@ -35,21 +35,21 @@ def good(payload: bytes, last_sequence: int, clear_id: int) -> tuple[wire.Mirror
     `clear_id` is that of the last command with one: an operator's new `clear` begins the sequences anew.
     """
     try:
-        told = wire.MirrorCommand.FromString(payload)
+        command = wire.MirrorCommand.FromString(payload)
     except DecodeError:
         raise ValueError("no MirrorCommand") from None
-    wanted_nm = actuators(told)  # None where the bytes are not rows x columns float32
+    wanted_nm = actuators(command)  # None where the bytes are not rows x columns float32
     if wanted_nm is None or wanted_nm.shape != GRID:
-        raise ValueError(f"{told.rows} x {told.columns} actuators in {len(told.actuators)} bytes, not {GRID}")
+        raise ValueError(f"{command.rows} x {command.columns} actuators in {len(command.actuators)} bytes, not {GRID}")
     if not np.isfinite(wanted_nm).all():
         raise ValueError("an actuator is not finite")
-    if told.clear_id in (0, clear_id) and told.frame_sequence < last_sequence:
-        raise ValueError(f"frame_sequence {told.frame_sequence} is below the last, {last_sequence}")
-    return told, wanted_nm
+    if command.clear_id in (0, clear_id) and command.frame_sequence < last_sequence:
+        raise ValueError(f"frame_sequence {command.frame_sequence} is below the last, {last_sequence}")
+    return command, wanted_nm
 
 
 def main(run: RunId = DEFAULT_RUN, config: ConfigFile = None) -> None:
-    """Follow commands until told to stop."""
+    """Follow commands until it is stopped."""
     settings = configuration(config)
     name = settings.mirror.name
     service = join(settings, run, mirror_role(name), settings.realtime.mirror_cpus)  # real-time set-up, clock and bus
@@ -69,13 +69,13 @@ def main(run: RunId = DEFAULT_RUN, config: ConfigFile = None) -> None:
             except ValueError as why:
                 service.event("COMMAND_REFUSED", reason=why)
             if followed is not None:
-                told, wanted_nm = followed
-                time_ns = told.timestamp.ToNanoseconds()
+                command, wanted_nm = followed
+                time_ns = command.timestamp.ToNanoseconds()
                 kept_nm, hit = limit(LIMITS, where_nm, wanted_nm)
-                where_nm, obeyed_ns, valid_ns = moved(kept_nm), now_ns, min(told.valid_for_ns, LONGEST_VALID_NS)
-                state.frame_sequence, state.status = told.frame_sequence, wire.MIRROR_STATUS_FOLLOWING
-                state.safe, clear_id = told.safe, told.clear_id or clear_id
-                state.command_nm[:] = [] if hit else told.command_nm
+                where_nm, obeyed_ns, valid_ns = moved(kept_nm), now_ns, min(command.valid_for_ns, LONGEST_VALID_NS)
+                state.frame_sequence, state.status = command.frame_sequence, wire.MIRROR_STATUS_FOLLOWING
+                state.safe, clear_id = command.safe, command.clear_id or clear_id
+                state.command_nm[:] = [] if hit else command.command_nm
                 state.limits_hit[:] = [one.value for one in hit]  # type: ignore[misc]  # numbered alike
                 service.work += 1
             if state.status == wire.MIRROR_STATUS_FOLLOWING and now_ns - obeyed_ns > valid_ns:  # the dead-man

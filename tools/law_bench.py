@@ -114,8 +114,8 @@ class Bench:
                 self.refused += 1
             if outputs.command is not None:
                 command = outputs.command
-                told = Command("lowfc", frame.sequence, time_ns, 10**9, command.actuators_nm, command.command_nm)
-                self._status, refused = apply_command(self._mirror, self._status, told, time_ns)
+                followed = Command("lowfc", frame.sequence, time_ns, 10**9, command.actuators_nm, command.command_nm)
+                self._status, refused = apply_command(self._mirror, self._status, followed, time_ns)
                 if refused is not None:
                     raise ValueError(f"the mirror refused a command: {refused.name}")
             self._shapes = [self._status.surface_nm, *self._shapes[:-1]]

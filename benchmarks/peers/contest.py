@@ -114,7 +114,7 @@ def measure(options: argparse.Namespace, tell: Tell) -> Result:
 
     Returns:
         rows, one for each contestant and class: contestant, what, scheduling, repeats (figures of each run that came to
-        its end, see `figures`), failures (what is said of the others), and missing where it could not take part;
+        its end, see `figures`), failures (why the others did not), and missing where it could not take part;
         rules, notes, pinned_to, versions and failed.
     """
     chosen = [one for one in CONTESTANTS if any(word in one.name for word in options.only or [""])]
@@ -289,7 +289,7 @@ def _missing(contestant: Contestant, python: str) -> str:
 
 
 def _versions(python: str) -> dict[str, str]:
-    """Of the packages in the contest; pyrtcao's where that interpreter has it."""
+    """Versions of the packages in the contest; pyrtcao's where that interpreter has it."""
     found = {name: importlib.metadata.version(name) for name in ("lowfc", "eclipse-zenoh", "numpy")}
     words = [python, "-c", "import importlib.metadata as m; print(m.version('pyrtcao'))"]
     with contextlib.suppress(OSError):

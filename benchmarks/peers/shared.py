@@ -36,7 +36,7 @@ _LOOK_S = 0.02
 _LAST_COMMAND_S = 0.05
 
 MARKS = ("due", "published", "commanded", "received")
-"""By frame: when it was due and sent, and when its command was out and back; ns."""
+"""Times of each frame, ns: when it was due and sent, and when its command was out and back."""
 
 
 @dataclass(frozen=True)

@@ -37,7 +37,7 @@ FOCAL_MASKS: dict[str, Callable[[int], Array]] = {"disk": disk, "bowtie": bowtie
 
 WAVELENGTH_NM = 550.0
 IMAGE_WIDTH = 20
-"""Of the sensor's image, in lambda0 / D (Table 1)."""
+"""Width of the sensor's image, in lambda0 / D (Table 1)."""
 PIXELS_PER = 4
 """Pixels in each lambda0 / D (Table 1)."""
 FOCAL_SAMPLES_PER = 8

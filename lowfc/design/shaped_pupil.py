@@ -24,7 +24,7 @@ from lowfc.optics.chain.grid import OPEN_AREA, SAMPLES, pupil_axis
 from lowfc.optics.chain.pupil import circle, from_quarter
 
 FOCAL_MASK_RADIUS = 4.0
-"""Of the disk whose share of the light is reported, in lambda / D (Sect. 2.1)."""
+"""Radius of the disk whose share of the light is reported, in lambda / D (Sect. 2.1)."""
 
 LEAST_OPEN = 0.01
 """A program whose best mask is less open than this part of the circle is called infeasible: a closed one is dark."""
@@ -32,7 +32,7 @@ LEAST_OPEN = 0.01
 SYMMETRIES = ("quarter", "octant")
 
 COARSEST_CELLS = 32
-"""In half the diameter, of the first programs: they find most of the points, and are soon solved."""
+"""Cells in half the diameter, in the first programs: they find most of the points, and are soon solved."""
 
 
 @dataclass(frozen=True)
@@ -114,7 +114,7 @@ class Round:
 
 @dataclass(frozen=True)
 class Figures:
-    """Of a mask: all are fractions; contrasts every `FINE_STEP` of the dark zone.
+    """Figures of a mask: all are fractions; contrasts every `FINE_STEP` of the dark zone.
 
     Attributes:
         open_area: Sum of the transmission, of the open circle.
@@ -181,7 +181,7 @@ def relative_field(quarter: Array, axis: Array) -> Array:
 
 
 def largest_contrast(quarter: Array, request: Request) -> float:
-    """Of a mask, on the fine grid of the dark zone and on its edges."""
+    """Largest contrast of a mask, on the fine grid of the dark zone and on its edges."""
     axis, zone = fine_grid(request.zone)
     on_grid = relative_field(quarter, axis)[zone]
     on_edge = _field_at(quarter, edge_points(request.zone, FINE_STEP))

@@ -62,7 +62,7 @@ def intensity_functions(sensor: Sensor, scale: float, guards: int) -> Array:
 
 
 def phases(sensor: Sensor, count: int) -> Complex:
-    """By what each of the functions must be multiplied on the sensor: an aperture mask makes the odd ones -i."""
+    """Factor of each of the functions on the sensor: an aperture mask multiplies the odd ones by -i."""
     odd = -1j if isinstance(sensor.relay, ApertureMask) else 1.0
     return np.resize(np.array([1.0, odd], dtype=np.complex128), count)
 

@@ -192,7 +192,7 @@ def point_of(search: Search, chain: Chain) -> Point:
 
 
 def summary(point: Point) -> dict[str, Any]:
-    """What is said of a layout."""
+    """A layout and its predicted figures, as JSON has them."""
     return {
         "name": point.layout.name,
         "purpose": point.layout.purpose,

@@ -70,7 +70,7 @@ class Search:
 
     @cached_property
     def focal_masks(self) -> tuple[str, ...]:
-        """Of Table 3; the first also of Table 4."""
+        """Focal-plane masks of Table 3; the first one is also that of Table 4."""
         return tuple(FOCAL_MASKS) if self.focal_mask == "both" else (str(self.focal_mask),)
 
     @cached_property

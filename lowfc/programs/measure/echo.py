@@ -64,7 +64,7 @@ def ask(run: RunId = DEFAULT_RUN, config: ConfigFile = None, seconds: Seconds = 
 
 @app.command()
 def answer(run: RunId = DEFAULT_RUN, config: ConfigFile = None, seconds: Seconds = 10.0) -> None:
-    """Answer frames at the controller's place until told that there are no more; then time what it does alone.
+    """Answer frames at the controller's place until an empty one; then time what it does alone.
 
     Example: python -m lowfc.programs.measure.echo answer --run bench --seconds 5
     """

@@ -97,7 +97,7 @@ def frame_source(
 
 
 class Source:
-    """Sends frame after frame for a time, or until told to stop."""
+    """Sends frame after frame for a time, or until it is stopped."""
 
     def __init__(self, config: Configuration, service: Service, payloads: Payloads) -> None:
         """Declare everything on the bus."""

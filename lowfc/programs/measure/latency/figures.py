@@ -35,7 +35,7 @@ SPANS = {
     "due_to_command": "  due to command",
     "due_to_mirror": "  due to mirror",
 }
-"""In latency_us, and what each is called; percentiles in us."""
+"""Names of the spans in latency_us, and their labels; percentiles in us."""
 ALONE = {
     "echo_us": "half a bare echo",
     "step_us": "control step alone",
@@ -44,7 +44,7 @@ ALONE = {
 }
 """What the host can do, likewise."""
 RATIOS = {"ratio": ("step_us", ""), "ratio_hot": ("hot_step_us", " of those back to back")}
-"""Of frame to command to half an echo and the step named here, and what is added to the step's name."""
+"""Ratios of frame to command to half an echo plus the step named here, and what is added to the step's label."""
 RATIOS_AT = ("p50", "p99")
 COUNTS = {
     "frames": "frames",
@@ -175,7 +175,7 @@ def repeat_figures(frames: Frames) -> dict[str, Any]:
 
 
 def controllers_account(health: wire.Health) -> dict[str, Any]:
-    """Of the whole run, by the controller: frames_skipped, frames_missing, and reasons given for a frame, counted."""
+    """The controller's counts of the whole run: frames_skipped, frames_missing, and reasons for frames."""
     frames = topic_count(health, FRAME.key)
     reasons = {reason_of(one.reason): one.count for one in health.counts}
     return {

@@ -82,7 +82,7 @@ def run_repeats(asked: Asked, run: Run, progress: Callable[[str], None]) -> list
 
     Raises:
         ProcessDiedError: a process ended by itself.
-        BusError: the controller said nothing of its timing.
+        BusError: the controller did not report its timing.
     """
     repeats = []
     for number in range(1, asked.repeats + 1):
@@ -126,15 +126,15 @@ def _loop(asked: Asked, run: Run) -> dict[str, Any]:
         time.sleep(_LAST_WORDS_S)
         drain()
         _check_ends(children)
-    heard = timings.taken(), (states.taken("sequence"), states.taken("publish_ns"))
+    received = timings.taken(), (states.taken("sequence"), states.taken("publish_ns"))
     if asked.simulated:
-        joined = join(frames.taken("sequence"), frames.taken("publish_ns"), None, *heard)
+        joined = join(frames.taken("sequence"), frames.taken("publish_ns"), None, *received)
     else:
         with np.load(run.path / SENT_FILE) as sent:
-            joined = join(sent["sequence"], sent["put_ns"], sent["due_ns"], *heard)
+            joined = join(sent["sequence"], sent["put_ns"], sent["due_ns"], *received)
     figures = repeat_figures(joined)
     if "frame_to_command" not in figures["latency_us"]:
-        raise BusError("the controller told the timing of no frame after the warm-up; let the test last longer")
+        raise BusError("the controller reported the timing of no frame after the warm-up; let the test last longer")
     controller, recording = watch.of(Role.CONTROLLER), watch.of(Role.RECORDER).recording
     if recording.failure:
         raise BusError(f"the recorder stopped: {recording.failure}")

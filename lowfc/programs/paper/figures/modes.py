@@ -26,7 +26,7 @@ from lowfc.programs.paper.tables.reconstruction import ITERATIONS, Ensemble, Inp
 
 DEGREES = np.array([noll_to_nm(noll)[0] for noll in NOLLS_14])
 AMPLITUDES = np.array([0.005 * step for step in range(1, 31)])
-"""In waves rms, of the pure modes of Fig. 8(a)."""
+"""Amplitudes of the pure modes of Fig. 8(a), waves rms."""
 _MODE_TICKS = [str(noll) for noll in NOLLS_14]
 _PAPER_R2 = {"sam": (0.95, 0.97), "clowfs": (0.79, 0.90)}
 _PAPER_LINEAR = {"sam": ("linear", 0.1), "clowfs": ("linear", 0.1), "zwfs": ("linear to 0.03 waves", None)}

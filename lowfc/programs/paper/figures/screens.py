@@ -25,7 +25,7 @@ from lowfc.programs.paper.tables.reconstruction import fits, mean_and_error
 
 SCREENS = 12
 WIDTHS = {4: "cut from four pupil diameters", 1: "periodic over one pupil diameter"}
-"""Of the screens that ours are cut from, in pupil diameters."""
+"""Widths of the screens that ours are cut from, in pupil diameters."""
 _INPUT_WAVES = 0.05
 _PAPER_WAVES = {"reconstructed": 0.038, "residual": 0.030}
 _ESTIMATORS = (PINV, WEIGHTED, WEIGHTED_2)

@@ -35,7 +35,7 @@ _LAST_HEALTH_S = 0.2
 SETTLED_FRAMES = 500
 """After a fault: two seconds, of which the last is judged."""
 PATIENCE_S = 5.0
-"""How long a process may take to end when it is told to."""
+"""How long a process may take to end after it was asked to."""
 START_S = 240.0
 WAIT_S = 60.0
 

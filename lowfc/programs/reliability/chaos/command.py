@@ -38,7 +38,7 @@ def chaos(
 
     Without a case, they are listed. Frames, processes, the bus, the mirror, the disk and the operator are spoilt in
     turn; the mirror must stay within its limits, the loop come back, and everything be named and counted in the log.
-    What this host cannot do is skipped, and said so.
+    A case that this host cannot run is skipped, and its reason is shown.
 
     Example: lowfc chaos --case frames-dark --case kill-controller --seed 3
     """

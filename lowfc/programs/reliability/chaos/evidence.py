@@ -60,7 +60,7 @@ class Evidence:
     messages: int = 0
 
     def residuals_nm(self) -> tuple[Long, Array]:
-        """When each true residual was recorded, and the residual, nm rms over the pupil."""
+        """Log times of the true residuals, and the residuals, nm rms over the pupil."""
         truths = self.entries[TRUTH]
         times_ns = np.array([truth.log_time_ns for truth in truths], np.int64)
         return times_ns, np.array([truth.message.residual_rms_nm for truth in truths], np.float64)

@@ -109,7 +109,7 @@ def restart_steps_nm(evidence: Evidence) -> list[float]:
 
 
 def recovered_s(left: Left, evidence: Evidence) -> float | None:
-    """From the first frame that a restarted controller used to a residual as before; None where there was none.
+    """Time from the first frame that a restarted controller used to a residual as before; None without a restart.
 
     A residual is that of the next 50 frames.
     """
