@@ -187,6 +187,7 @@ def replied(
         ("gain", 0.5, ""),
         ("gain", 1.2, "margins are below the 1.8 in gain and 45 degrees in phase that `lowfc tune` keeps"),
         ("gain", 0.0, "a mode with a gain of 0 is not corrected"),
+        ("gain", float(np.float32(0.01)), ""),  # as it is in a request
         ("gain", 0.001, "below 0.01, the least that `lowfc tune` chooses"),
         ("limit", 100.0, ""),
         ("limit", 0.0, "a mode with a limit of 0 nm is not corrected"),

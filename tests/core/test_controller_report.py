@@ -94,6 +94,9 @@ def test_the_summary_and_the_status_say_it() -> None:
     _, *lines = status.text(status.figures(message, {"mirror-dm": mirror})).splitlines()
     assert lines[0].split(maxsplit=1)[1].startswith("open for 12 s (the camera does not fit the calibration: bias_dn")
     assert lines[1].split(maxsplit=1)[1] == "refuses commands: OUT_OF_ORDER"
+    held = status.text(status.figures(message, {"controller": wire.Health(holding="no frame comes")})).splitlines()[1]
+    assert " open for 12 s (" in held
+    assert held.endswith("), but holding: no frame comes"), "not that none has come for 12 s"
     assert status.figures(message, {"mirror-x": wire.Health(command_expired=True)})["mirrors"]["mirror-x"]["expired"]
 
 
@@ -106,9 +109,9 @@ def test_the_first_line_of_the_status_says_whether_all_is_well() -> None:
         message = controller_state(state, USUAL, (START + 12) * SECOND)
         return status.text(status.figures(message, PROCESSES | changes, "night")).splitlines()[0]
 
-    well = "closed · residual 2.50 nm rms (true 2.00) · light 97 % · 3 frames lost · recording logs/a.mcap · run night"
+    well = "closed · residual 2.50 nm rms with noise (true 2.00) · light 97 % · 3 frames lost · recording logs/a.mcap"
     warned = "10 s ago camera: COMMANDS_LATE 9 % late"
-    assert first() == f"{well} · law integrator · {warned}"
+    assert first() == f"{well} · run night · law integrator · {warned}"
     stopped = wire.Health(state="ready", recording=wire.Recording(file="logs/a.mcap", stopped=True))
     assert "· recording stopped ·" in first(recorder=stopped)
     failed = wire.Health(state="ready", recording=wire.Recording(failure="full"))

@@ -136,7 +136,7 @@ def test_the_requests(tmp_path: Path, own_runtime: Path) -> None:
     assert "gain is now 0.3 0.3 0.05" in said[1]
     replies = [text.split(",")[0] for text in said[2:6]]
     assert replies == ["loop open", "loop closed", "loop in safe mode", "loop open"]
-    assert re.match(r"\S+  open at \d+ Hz for \d+ s; camera, controller, mirror-dm; not recording\n", said[6])
+    assert re.match(r"\S+  open at \d+ Hz, up \d+ s; camera, controller, mirror-dm; not recording\n", said[6])
     assert "frame to command" in out
 
 

@@ -172,7 +172,9 @@ def test_every_request_is_made_by_a_command_of_the_document() -> None:
 
 def test_the_commands_say_what_they_did(night: Night) -> None:
     said = night.said
-    well = r"closed · residual [\d.]+ nm rms( \(true [\d.]+\))? · light \d+ % · \d+ frames? lost · recording logs/"
+    well = (
+        r"closed · residual [\d.]+ nm rms with noise( \(true [\d.]+\))? · light \d+ % · \d+ frames? lost · recording "
+    )
     assert re.match(well, said["lowfc ctl status"])
     assert "loop           closed" in said["lowfc ctl status"]
     assert 'preset = "bench"' in said["lowfc ctl configuration"]

@@ -20,7 +20,7 @@ def remark(settings: Settings, drive: ActiveLoop, request: Request) -> str:
                 f": above {recommended:.3g} the margins are below the {LEAST_GAIN_MARGIN:g} in gain and "
                 f"{LEAST_PHASE_MARGIN_DEG:g} degrees in phase that `lowfc tune` keeps, and the loop may ring"
             )
-        if 0 < lowest < LOWEST_GAIN:
+        if 0 < lowest < np.float32(LOWEST_GAIN):  # as a request has it
             return f": below {LOWEST_GAIN:g}, the least that `lowfc tune` chooses, next to nothing is corrected"
     if request.name in ("gain", "limit") and lowest == 0:
         unit = " nm" if request.name == "limit" else ""

@@ -355,8 +355,8 @@ def _changed(law: Law, noll: tuple[int, ...], delay_frames: float, request: Requ
         limiting = limiting_gain(delay_frames)
         if not (lowest >= 0 and highest < limiting):
             raise ValueError(
-                f"gain must be at least 0 and below {limiting:.3g}, where a loop with a delay of {delay_frames:g} "
-                f"frames becomes unstable; got {max(request.values, key=abs):g}"
+                f"gain must be at least 0 and below {limiting:.3g}, where a loop with a delay of "
+                f"{counted(float(delay_frames), 'frame')} becomes unstable; got {max(request.values, key=abs):g}"
             )
     elif request.name == "leak" and not (lowest >= 0 and highest <= 1):
         raise ValueError(f"leak must be between 0 and 1, got {max(request.values, key=abs):g}")

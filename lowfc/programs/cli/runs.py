@@ -52,7 +52,7 @@ def _lines(rows: list[dict[str, Any]]) -> list[str]:
         mode = "no controller" if row["mode"] is None else mode_word(row["mode"])
         if row["holding"]:
             mode += f", but holding: {row['holding']};"
-        rate = "" if row["rate_hz"] is None else f" at {row['rate_hz']:.0f} Hz for {row['uptime_s']:.0f} s"
+        rate = "" if row["rate_hz"] is None else f" at {row['rate_hz']:.0f} Hz, up {row['uptime_s']:.0f} s"
         log = {"recording": f"recording {row['log']}", "none": "not recording"}
         processes = ", ".join(one["process"] for one in row["processes"]) or "no process yet"
         what = log.get(row["recording"], f"recording {row['recording']}")

@@ -110,7 +110,7 @@ def figures(
 def text(known: dict[str, Any]) -> str:
     """The same figures for a person: whether all is well in the first line."""
     since = "" if known["mode_s"] is None else f" for {known['mode_s']:.0f} s ({known['mode_cause']})"
-    mode = _mode(known) + (f", opens after {counted(known['steps_left'], 'frame')}" if known["steps_left"] else "")
+    opens = f", opens after {counted(known['steps_left'], 'frame')}" if known["steps_left"] else ""
     law = known["law"]["name"]
     if known["law"]["weight"] < 1:
         law += f", driving with a weight of {known['law']['weight']:.2f}; the integrator has the rest"
@@ -121,9 +121,9 @@ def text(known: dict[str, Any]) -> str:
     ]
     playing = known["playing"]
     rows = {
-        "loop": mode + since,
+        "loop": _mode(known, since) + opens,
         **{name: _of_mirror(one) for name, one in known["mirrors"].items()},
-        "frame": f"{known['frame']} ({known['frames_used']} used)"
+        "frame": f"{known['frame']} of the camera, {known['frames_used']} used by this controller"
         + (f"; the last was refused as {_spoken(known['refused'])}" if known["refused"] else ""),
         "command": f"{known['command_rms_nm']:.3f} nm rms" + (", on its way to zero" if known["homing"] else ""),
         "offset": f"{known['offset_rms_nm']:.3f} nm rms",
@@ -161,7 +161,8 @@ def _in_short(known: dict[str, Any]) -> str:
     if known["frames_used_last_second"]:
         true_nm = known["true_residual_rms_nm"]
         measured = [
-            f"residual {known['residual_rms_nm']:.2f} nm rms" + ("" if true_nm is None else f" (true {true_nm:.2f})"),
+            f"residual {known['residual_rms_nm']:.2f} nm rms with noise"
+            + ("" if true_nm is None else f" (true {true_nm:.2f})"),
             f"light {100 * known['flux_fraction']:.0f} %",
         ]
     recording = {"recording": f"recording {known['log']}", "none": "not recording"}
@@ -194,8 +195,8 @@ def _last_warning(state: wire.ControllerState, processes: Mapping[str, wire.Heal
     return {"process": process, "age_s": round(age_s, 3), "text": text}
 
 
-def _mode(known: dict[str, Any]) -> str:
-    word = "paused" if known["paused"] else mode_word(known["mode"])
+def _mode(known: dict[str, Any], since: str = "") -> str:
+    word = ("paused" if known["paused"] else mode_word(known["mode"])) + since
     return f"{word}, but holding: {known['holding']}" if known["holding"] else word
 
 
@@ -233,7 +234,7 @@ def _values(values: list[float], unit: str = "") -> str:
     if not values:
         return "none"
     same = len(set(values)) == 1
-    return (f"{values[0]:g} for all" if same else " ".join(f"{value:g}" for value in values)) + unit
+    return f"{values[0]:g}{unit} for all" if same else " ".join(f"{value:g}" for value in values) + unit
 
 
 def _rss(values: npt.ArrayLike) -> float:

@@ -271,16 +271,16 @@ def _timeout(mirror: Dialogue, base_nm: Single, raised_by_nm: float) -> Iterator
     expected = f"EXPIRED after valid_for_ns, {EXPIRES_NS / 1e6:.0f} ms here; refused commands in between renew nothing"
     yield check._replace(name="dead-man", expected=expected)
     expired = [state for _, state in mirror.since(sent_ns) if state.status == _EXPIRED]
-    check = ok("it is")
+    check = ok("no modal command is named")
     if any(mirror.moved(raised_nm, state) and state.command_nm for state in expired):
         advice = "clear command_nm when you relax: a controller that starts takes the difference for a shape to keep"
         check = wrong("a modal command is named while the mirror relaxes", advice)
     yield check._replace(name="relaxing", expected="command_nm is empty in the state of a mirror that relaxes")
     mirror.go(base_nm)
     state, _, _ = mirror.ask(base_nm, _LONG_NS)
-    sent_ns, check = mirror.line.now_ns(), ok("it is")
+    sent_ns, check = mirror.line.now_ns(), ok("followed")
     if state is None or state.status == _EXPIRED:
-        check = wrong("it is not", "let a new command take over")
+        check = wrong("not followed", "let a new command take over")
     yield check._replace(name="after the dead-man", expected="a good command is followed again")
     mirror.listen((LONGEST_NS + SLACK_NS) / NS)
     check = ok("EXPIRED")
