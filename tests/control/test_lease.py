@@ -11,6 +11,7 @@ from lowfc.control.loop.advance import advance
 from lowfc.control.loop.command_channels import MIRROR
 from lowfc.control.loop.inputs import Outputs, Reply, Request, Tick
 from lowfc.control.loop.lease import MAX_S
+from lowfc.control.loop.requests import REQUESTS
 from lowfc.control.loop.safety import LoopMode
 from lowfc.control.loop.state import State
 from tests.support.toy import GRID, NOLL, SOME, answered, feed, frame, frame_sequence, loaded, names, settings
@@ -48,26 +49,13 @@ def left(state: State) -> int:
     return 0 if added is None or added.play is None else added.play.left(state.frame_sequence + 1)
 
 
-REFUSED = {
-    "close": (),
-    "step": (5.0,),
-    "gain": (0.3,),
-    "leak": (0.01,),
-    "limit": (20.0,),
-    "offset": (1.0,),
-    "law": (),
-    "load": (),
-    "reset": (),
-    "channel": (),
-    "play": (),
-    "clear": (),
-}
+GRANTED = {"safe", "open", "pause", "stop", "status", "note", "lease", "renew", "release", "configuration"}
 
 
-@pytest.mark.parametrize("name", REFUSED)
+@pytest.mark.parametrize("name", sorted({*REQUESTS} - GRANTED))
 def test_requests_of_others_are_refused_and_name_the_holder(name: str) -> None:
     state = held()
-    after, outputs = asked(state, Request(4 * S, name, values=REFUSED[name]))
+    after, outputs = asked(state, Request(4 * S, name))
     answered(outputs, False, HOLDER, "6 s", "lowfc ctl open")
     assert all(now is was for now, was in zip(after[:-1], state[:-1], strict=True))
 
