@@ -127,8 +127,8 @@ class Watcher:
             recorder=self._process((Role.RECORDER,)),
             frame_silent_s=self._silent_s(FRAME),
             step_silent_s=self._silent_s(STEP),
-            recent=_total(self._last(RECENT_S)),
-            now=_total(now),
+            recent=sum((one.counts for one in self._last(RECENT_S)), Counts()),
+            now=sum((one.counts for one in now), Counts()),
             totals=self._totals,
             flux=self._flux,
             saturated=self._saturated,
@@ -259,13 +259,6 @@ class Watcher:
                 grown[name] = count - before
             self._counted[name] = (last.health.pid, count)
         return grown
-
-
-def _total(samples: list[_Sample]) -> Counts:
-    total: Counts = Counter()
-    for one in samples:
-        total.update(one.counts)
-    return total
 
 
 def _rms(samples: list[_Sample]) -> tuple[Rms | None, bool]:
