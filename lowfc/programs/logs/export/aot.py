@@ -217,7 +217,7 @@ def _copy_commands(path: Path, image: fits.ImageHDU, history: History, calibrati
     sequence = history.steps.sequence
     shape = (len(sequence), calibration.grid[0] * calibration.grid[1])
     there = {int(one): row for row, one in reversed(list(enumerate(sequence)))}
-    rows = fits_cube(path, image, shape, ">f4")
+    rows = fits_cube(path, image, shape)
     rows[:] = np.nan
     for message in history.again(COMMAND):
         try:
