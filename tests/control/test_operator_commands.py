@@ -150,16 +150,6 @@ class Script:
                 message.text = str(self.rng.choice(["seeing is better", "", "n" * 20_000]))
         return message
 
-    def payload(self, name: str) -> bytes:
-        """The message's bytes, sometimes damaged."""
-        whole = self.message(name).SerializeToString()
-        match self.rng.integers(20):
-            case 0:
-                return self.rng.bytes(12)
-            case 1:
-                return whole[: len(whole) // 2]
-        return whole
-
     def frame(self, state: State) -> Frame:
         """What the sensor sees: a disturbance, and the mirror as the last command left it."""
         self.count += 1 + int(self.rng.random() < 0.03) * 3
@@ -278,7 +268,7 @@ def between(script: Script, name: str, pause: int, run: Run) -> Iterator[Input]:
     if script.rng.random() < 0.2:
         yield script.happening()
     try:
-        yield codec.decode_request(script.payload(name), name, 7)
+        yield codec.decode_request(script.message(name).SerializeToString(), name, 7)
     except ValueError:  # the process answers it, before the loop hears of it
         run.counts[name, False] += 1
 

@@ -100,16 +100,6 @@ def test_a_long_run_has_finer_and_more_segments() -> None:
     assert spacings == [RATE_HZ / SHORTEST, RATE_HZ / 128, RATE_HZ / LONGEST]
 
 
-def test_gaps_leave_the_level_of_noise_as_it_is() -> None:
-    rng = np.random.default_rng(4)
-    kept = np.ones(20_000, bool)
-    for start in range(1500, 20_000, 1700):
-        kept[start : start + 10] = False
-    found = spectrum(pieces(numbers(20_000)[kept], rng.standard_normal((20_000, 1))[kept]), RATE_HZ)
-    assert found.segments > 50
-    assert float(found.variance_nm2()[0]) == pytest.approx(1.0, rel=0.04)
-
-
 def test_bins_are_even_in_the_logarithm_and_keep_a_straight_line() -> None:
     frequency_hz = np.linspace(0, 250, 1025)
     centres_hz, (same,) = in_bins(frequency_hz, [frequency_hz], per_decade=10)
