@@ -16,6 +16,7 @@ from lowfc.adapters.bus.zenoh_bus import ZenohBus
 from lowfc.adapters.bus.zenoh_session import session_config
 from lowfc.adapters.process.clock import HostClock
 from lowfc.adapters.process.clock_offset import RECENT, ClockOffset
+from lowfc.adapters.process.service import Service
 from lowfc.contract.configuration import Network
 from lowfc.contract.errors import BusError, DataFileError
 from lowfc.contract.messages import (
@@ -197,6 +198,7 @@ def test_times_are_those_of_the_host_that_receives(hosts: Hosts) -> None:
         assert bus.offset.best is not None
         assert abs(bus.offset.offset_ns + shift_ns) < second_ns  # exactly: tests/e2e/test_hosts.py
     assert all(abs(sample.receive_time_ns - sample.publish_time_ns) < second_ns for sample in arrived)
+    assert Service("camera", "hosts", camera.clock, camera).health().router_round_trip_ns > 0
 
 
 def test_there_is_one_of_each_role(hosts: Hosts) -> None:
