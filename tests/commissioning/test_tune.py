@@ -148,9 +148,15 @@ def test_a_running_loop_is_listened_to() -> None:
     assert run.rate_hz == pytest.approx(1000)
     assert run.warnings == ("4 steps did not get here in time",)
     assert run.pol.frames == pytest.approx(5500, abs=5)
+
     found = figures(run, *tuned(run, "lqg"), "lqg")
     assert found["modes"][0]["lines"][0]["frequency_hz"] == pytest.approx(20, abs=0.05)
     assert found["achieved_from"] == "error less noise"
+
+
+def test_too_short_a_time_to_listen_is_refused_before_it_has_passed() -> None:
+    with pytest.raises(DataFileError, match=r"2048 frames in a row, 2.05 s at 1000 Hz; .* for 2 s: --live 3"):
+        of_run(Watched(CONFIG), 2.0)
 
 
 class Steered(FoldedLoop):

@@ -248,6 +248,18 @@ def test_after_a_hole_it_goes_on_at_the_next_state_and_says_what_it_could_not_ch
     assert 0 < account.unchecked_because["recorded before the first complete state of the controller"] <= STATE_EVERY
 
 
+def test_a_recording_that_begins_in_the_middle_of_a_run_lacks_no_input() -> None:
+    """A recorder that starts is answered with the newest state; the inputs after it were before the recording."""
+    made = night(frames(100)).messages
+    head = [message for message in made if message.key == CALIBRATION.key]
+    later = made[len(made) // 2 :]
+    state = [message for message in made[: len(made) // 2] if message.key == CONTROLLER_STATE.key][-2]
+    account = replay([*head, state._replace(log_time_ns=later[0].log_time_ns), *later])
+    assert account.identical
+    assert list(account.unchecked_because) == ["recorded before the first complete state of the controller"]
+    assert account.inputs_missing == 0
+
+
 def tampered(made: Night, topic: Topic, number: int, how: str, tolerance_nm: float = 0.0) -> Account:
     """Change one message a little, and replay."""
     messages = list(made.messages)

@@ -124,5 +124,7 @@ def require_identity(path: Path, found: str, stated: str) -> None:
 
 def in_a_line(error: BaseException) -> str:
     """What an error says, whose text may have several lines, or more characters than a user reads."""
+    if "SIMPLE card" in str(error):
+        return "it is not a FITS file"
     text = error.strerror if isinstance(error, OSError) and error.strerror else str(error)
     return " ".join(text.split())[:300]

@@ -107,6 +107,12 @@ def of_run(loop: Client, seconds: float, progress: Callable[[float], None] | Non
     state = loop.status().state
     noll = loop.calibration().noll
     config = configuration_of(loop)
+    if seconds * config.camera.rate_hz < FEWEST:
+        needed_s = FEWEST / config.camera.rate_hz
+        raise DataFileError(
+            f"run {loop.run_id!r}: a law is tuned from at least {FEWEST} frames in a row, {needed_s:.3g} s at "
+            f"{config.camera.rate_hz:g} Hz; asked to listen for {seconds:g} s: --live {np.ceil(1.2 * needed_s):.0f}"
+        )
     begun_s = time.monotonic()
     steps: list[Step] = []
     stream = loop.steps()

@@ -130,6 +130,7 @@ class ControllerReplay:
         self._lost_at: int | None = None
         self._forgotten = 0
         self._began = 0
+        self._first: int | None = None  # of the inputs in the log
         self._form: tuple[int, str] | None = None
         self._entries: dict[int, _Entry] = {}
         self._states: dict[int, wire.ControllerState] = {}
@@ -155,6 +156,7 @@ class ControllerReplay:
                         "another controller; `lowfc what-if` and `lowfc report` read it"
                     )
                 return
+            self._first = number if self._first is None else min(number, self._first)
             if self._state is not None and number <= self._state.input_number:
                 self._come_late(number, body)
                 return
@@ -195,7 +197,8 @@ class ControllerReplay:
                 waiting = next(iter(self._entries.values()), None)
                 if waiting is None or not (ended or now_ns - waiting.log_time_ns > PATIENCE_NS):
                     return
-                self._lose("after an input that the log does not have")
+                earlier = self._first is not None and number < self._first  # than the recording
+                self._lose(_BEFORE if earlier else "after an input that the log does not have")
                 continue
             late = ended or now_ns - entry.log_time_ns > PATIENCE_NS
             if not late and entry.command is None and entry.commands and self._state.drive is not None:
@@ -271,7 +274,7 @@ class ControllerReplay:
 
     def _lose(self, why: str) -> None:
         self._why = why
-        self._lost_at = self._state.input_number if self._state is not None and why else None
+        self._lost_at = self._state.input_number if self._state is not None and why not in ("", _BEFORE) else None
         self._forgotten = 0
         self._state = None
         self.retry_pending = True
