@@ -24,7 +24,7 @@ NONE = np.zeros(2)
 
 def wheel(frames: int, seed: int = 1, noise_nm: float = 0.8) -> tuple[Pieces, np.ndarray]:
     """Pseudo-open-loop tilts of the reaction wheel, and the truth."""
-    truth = modes_nm(disturbance("reaction-wheel-ideal", NOLL, seed, NM_PER_MAS, 550.0), 0, frames, RATE_HZ)
+    truth = modes_nm(disturbance("reaction-wheel", NOLL, seed, NM_PER_MAS, 550.0), 0, frames, RATE_HZ)
     noise = noise_nm * np.random.default_rng(seed).standard_normal(truth.shape)
     return Pieces((truth + noise,), 0), truth
 
