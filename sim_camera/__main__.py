@@ -9,6 +9,7 @@ import typer
 from lowfc.adapters.process.join import join
 from lowfc.adapters.process.terminal import DEFAULT_RUN, ConfigFile, RunId, configuration, new_app, run_app
 from lowfc.contract.messages import Role
+from sim_camera.contrast import contrast_of
 from sim_camera.faulty import read_fault
 from sim_camera.process import CameraProcess, scene
 
@@ -30,7 +31,9 @@ def camera(
     settings = configuration(config)
     optics = scene(settings)
     service = join(settings, run, Role.CAMERA, settings.realtime.camera_cpus)
-    process = CameraProcess(settings, service, optics, frames, None if fault is None else read_fault(fault))
+    process = CameraProcess(
+        settings, service, optics, frames, None if fault is None else read_fault(fault), contrast_of(settings)
+    )
     service.fill = process.fill
     service.catch_signals()
     with closing(service.bus):  # a callback on zenoh's threads must not outlive the interpreter

@@ -1,6 +1,6 @@
 """The true wavefront's figures over the second half of a run of unknown length, and over its last frames."""
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
@@ -30,6 +30,8 @@ class WavefrontFigures:
     continuous_residual_rms_nm: float = 0.0
     continuous_tilt_disturbance_mas: float = 0.0
     continuous_tilt_residual_mas: float = 0.0
+    added_contrast_flat: float = 0.0
+    added_contrast: float = 0.0
 
 
 class Figures:
@@ -45,7 +47,7 @@ class Figures:
             instants: of each period over which continuous truths are means; 0 where there are none.
         """
         self._instants = instants
-        self._values = 8 if instants else 4
+        self._values = 10 if instants else 6
         self._tilts = slice(0, sum(index in (2, 3) for index in noll))  # they come first
         self._nm_per_mas = nm_per_mas
         self._blocks: list[list[float]] = []
@@ -55,9 +57,9 @@ class Figures:
         self._recent = np.zeros((recent, self._values))
         self._frames = 0
 
-    def add(self, truth: Truth) -> None:
-        """Count the truth of one frame."""
-        squares = self._squares(truth.sampled)
+    def add(self, truth: Truth, added_contrast: tuple[float, float] = (0.0, 0.0)) -> None:
+        """Count the truth of one frame, and the contrast that its disturbance and its residual add."""
+        squares = (*added_contrast, *self._squares(truth.sampled))
         if truth.continuous is not None:
             squares += self._squares(truth.continuous)
         self._sums = [total + square for total, square in zip(self._sums, squares, strict=True)]
@@ -94,6 +96,7 @@ class Figures:
         return (*pupil_nm2, float(tilt @ tilt), float(left @ left))
 
     def _rms(self, mean: npt.NDArray[np.float64]) -> WavefrontFigures:
-        rms = np.sqrt(mean.reshape(-1, 4) / np.array([1, 1, *[2 * self._nm_per_mas**2] * 2])).ravel().tolist()
-        names = [one.name for one in fields(WavefrontFigures) if one.name != "instants"]
-        return WavefrontFigures(instants=self._instants, **dict(zip(names, rms, strict=False)))
+        per = np.array([1, 1, *[2 * self._nm_per_mas**2] * 2])
+        rms = np.sqrt(mean[2:].reshape(-1, 4) / per).ravel().tolist()
+        figures = [*rms[:4], self._instants, *(rms[4:] or [0.0] * 4), *mean[:2].tolist()]
+        return WavefrontFigures(**dict(zip(WavefrontFigures.__annotations__, figures, strict=True)))

@@ -22,6 +22,7 @@ from lowfc.control.laws.stability import delay_weights
 from lowfc.control.loop.durations import Durations
 from lowfc.optics.detector.detector import saturation_dn
 from lowfc.optics.detector.photometry import tilt_nm_per_mas
+from sim_camera.contrast import AddedContrast, Contrast
 from sim_camera.disturbance import Disturbance, disturbance
 from sim_camera.faults import Fault
 from sim_camera.faulty import FaultyFrames
@@ -100,8 +101,9 @@ class CameraProcess:
         optics: Scene,
         frames: int | None,
         fault: Fault | None = None,
+        contrast: Contrast | None = None,
     ) -> None:
-        """Declare everything on the bus; `fault` befalls the frames."""
+        """Declare everything on the bus; `fault` befalls the frames, `contrast` is computed where it is given."""
         self._config = config
         self._service = service
         self._scene = optics
@@ -132,6 +134,8 @@ class CameraProcess:
         self._frame_to_mirror = Durations()
         recent = max(1, round(RECENT_S * config.camera.rate_hz))
         self._figures = Figures(config.noll, tilt_nm_per_mas(config.star.diameter_m), recent, len(optics.instants))
+        self._contrast = contrast
+        self._measured: AddedContrast | None = None
         self._publish_settings(service.clock.now_ns())
         service.state = "ready"
 
@@ -167,6 +171,7 @@ class CameraProcess:
             self._service.beat()
         self._drain()
         self._publish_truth()
+        self._measured = self._contrast.measure() if self._contrast is not None else None
         self._service.finish()
 
     def fill(self, health: wire.Health) -> None:
@@ -179,6 +184,11 @@ class CameraProcess:
             health.frame_to_mirror.CopyFrom(latency(self._frame_to_mirror))
         if (wavefront := self._figures.wavefront()) is not None:
             health.wavefront.CopyFrom(wire.WavefrontFigures(**asdict(wavefront)))
+            if (measured := self._measured) is not None:
+                health.wavefront.added_contrast_flat, health.wavefront.added_contrast = measured.flat, measured.left
+                health.wavefront.science_images = measured.instants
+                health.wavefront.quadratic_added_contrast = measured.quadratic_left
+                health.wavefront.dark_zone_contrast = measured.dark_zone
         if (recent := self._figures.recent()) is not None:
             health.recent_wavefront.CopyFrom(wire.WavefrontFigures(**asdict(recent)))
 
@@ -213,7 +223,12 @@ class CameraProcess:
         if index < 0:
             return
         truth = self._scene.truth(index, seen, self._path.over(index, self._scene.instants))
-        self._figures.add(truth)
+        added = (0.0, 0.0)
+        if self._contrast is not None:
+            flat, left = truth.instants_nm
+            self._contrast.add(flat[len(flat) // 2], left[len(left) // 2])
+            added = self._contrast.quadratic(flat), self._contrast.quadratic(left)
+        self._figures.add(truth, added)
         sampled, continuous = truth.sampled, truth.continuous
         message = wire.Truth(
             timestamp=timestamp(end_ns),
@@ -222,6 +237,8 @@ class CameraProcess:
             residual_nm=sampled.residual_nm.tolist(),
             disturbance_rms_nm=sampled.disturbance_rms_nm,
             residual_rms_nm=sampled.residual_rms_nm,
+            added_contrast_flat=added[0],
+            added_contrast=added[1],
         )
         if continuous is not None:
             message.instants = len(self._scene.instants)

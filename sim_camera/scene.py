@@ -40,11 +40,13 @@ class Truth:
         sampled: the wavefront at the instant at which the exposure starts.
         continuous: root mean squares over the period, modes included; None where they are not computed.
         sensed_nm: (modes,) of the residual's mean over the exposure, which is what the sensor sees.
+        instants_nm: (2, instants, modes) disturbance and residual at each instant.
     """
 
     sampled: Wavefront
     continuous: Wavefront | None
     sensed_nm: Single
+    instants_nm: Single
 
 
 class Scene:
@@ -143,11 +145,11 @@ class Scene:
         flat, left = self._mean_squares_nm2(opd_nm), self._mean_squares_nm2(opd_nm + moved_nm)
         sampled = Wavefront(rows[0], residual[0], float(np.sqrt(flat[0])), float(np.sqrt(left[0])))
         if not len(self.instants):
-            return Truth(sampled, None, sampled.residual_nm)
+            return Truth(sampled, None, sampled.residual_nm, np.array([rows, residual]))
         sensed_nm = modes[1 : 1 + self._images].mean(axis=0) - modes[0] + residual[0]
         over = (np.sqrt(np.square(of[1:]).mean(axis=0)) for of in (rows, residual))
         pupil = (float(np.sqrt(of[1:].mean())) for of in (flat, left))
-        return Truth(sampled, Wavefront(*over, *pupil), sensed_nm)
+        return Truth(sampled, Wavefront(*over, *pupil), sensed_nm, np.array([rows[1:], residual[1:]]))
 
     def _mirror_nm(self, actuators_nm: Single) -> Single:
         """Wavefront (used,) of a shape, remembered for the last few."""

@@ -77,7 +77,7 @@ def test_every_cause_of_a_loop_that_was_not_closed_is_named() -> None:
 def test_the_summary_and_the_status_say_it() -> None:
     def first(**health: Any) -> str:
         watch = Watch({"controller": wire.Health(**health)}, [])
-        return summary_text(summary(watch, record=False)).splitlines()[0].split(maxsplit=1)[1]
+        return summary_text(summary(watch, record=False, rate_hz=250.0)).splitlines()[0].split(maxsplit=1)[1]
 
     late = {"not_closed_ns": 3 * SECOND, "not_closed_cause": "the camera does not fit"}
     assert first(mode=wire.LOOP_MODE_CLOSED) == "closed"
@@ -167,7 +167,7 @@ def test_frames_after_the_last_that_a_recorder_received_are_lost_too(received: i
         topics=[wire.TopicCount(topic=FRAME.key, received=received, missing=missing)],
     )
     camera = wire.Health(topics=[wire.TopicCount(topic=FRAME.key, published=500)])
-    figures = summary(Watch({"recorder": recorder, "camera": camera}, []), record=True)
+    figures = summary(Watch({"recorder": recorder, "camera": camera}, []), record=True, rate_hz=250.0)
     assert (figures["messages_lost"], figures["lost"].get(FRAME.key, 0)) == (lost, lost)
 
 

@@ -24,7 +24,11 @@ def figures(*residuals_nm: float, nm_per_mas: float = 1.0, recent: int = 1) -> F
     found = Figures(NOLL, nm_per_mas, recent)
     for residual_nm in residuals_nm:
         modes = np.full(len(NOLL), residual_nm, np.float32)
-        found.add(Truth(Wavefront(2 * modes, modes, 2 * residual_nm, residual_nm), None, modes))
+        found.add(
+            Truth(
+                Wavefront(2 * modes, modes, 2 * residual_nm, residual_nm), None, modes, np.array([[2 * modes], [modes]])
+            )
+        )
     return found
 
 

@@ -498,7 +498,7 @@ class MirrorState(_message.Message):
     def __init__(self, timestamp: _Optional[_Union[datetime.datetime, _timestamp_pb2.Timestamp, _Mapping]] = ..., frame_sequence: _Optional[int] = ..., status: _Optional[_Union[MirrorStatus, str]] = ..., rows: _Optional[int] = ..., columns: _Optional[int] = ..., actuators: _Optional[bytes] = ..., command_nm: _Optional[_Iterable[float]] = ..., limits_hit: _Optional[_Iterable[_Union[Reason, str]]] = ..., channels: _Optional[_Iterable[str]] = ..., safe: _Optional[bool] = ..., refused: _Optional[_Union[Reason, str]] = ...) -> None: ...
 
 class Truth(_message.Message):
-    __slots__ = ("timestamp", "frame_sequence", "disturbance_nm", "residual_nm", "disturbance_rms_nm", "residual_rms_nm", "instants", "continuous_disturbance_nm", "continuous_residual_nm", "continuous_disturbance_rms_nm", "continuous_residual_rms_nm", "sensed_residual_nm")
+    __slots__ = ("timestamp", "frame_sequence", "disturbance_nm", "residual_nm", "disturbance_rms_nm", "residual_rms_nm", "instants", "continuous_disturbance_nm", "continuous_residual_nm", "continuous_disturbance_rms_nm", "continuous_residual_rms_nm", "sensed_residual_nm", "added_contrast_flat", "added_contrast")
     TIMESTAMP_FIELD_NUMBER: _ClassVar[int]
     FRAME_SEQUENCE_FIELD_NUMBER: _ClassVar[int]
     DISTURBANCE_NM_FIELD_NUMBER: _ClassVar[int]
@@ -511,6 +511,8 @@ class Truth(_message.Message):
     CONTINUOUS_DISTURBANCE_RMS_NM_FIELD_NUMBER: _ClassVar[int]
     CONTINUOUS_RESIDUAL_RMS_NM_FIELD_NUMBER: _ClassVar[int]
     SENSED_RESIDUAL_NM_FIELD_NUMBER: _ClassVar[int]
+    ADDED_CONTRAST_FLAT_FIELD_NUMBER: _ClassVar[int]
+    ADDED_CONTRAST_FIELD_NUMBER: _ClassVar[int]
     timestamp: _timestamp_pb2.Timestamp
     frame_sequence: int
     disturbance_nm: _containers.RepeatedScalarFieldContainer[float]
@@ -523,7 +525,9 @@ class Truth(_message.Message):
     continuous_disturbance_rms_nm: float
     continuous_residual_rms_nm: float
     sensed_residual_nm: _containers.RepeatedScalarFieldContainer[float]
-    def __init__(self, timestamp: _Optional[_Union[datetime.datetime, _timestamp_pb2.Timestamp, _Mapping]] = ..., frame_sequence: _Optional[int] = ..., disturbance_nm: _Optional[_Iterable[float]] = ..., residual_nm: _Optional[_Iterable[float]] = ..., disturbance_rms_nm: _Optional[float] = ..., residual_rms_nm: _Optional[float] = ..., instants: _Optional[int] = ..., continuous_disturbance_nm: _Optional[_Iterable[float]] = ..., continuous_residual_nm: _Optional[_Iterable[float]] = ..., continuous_disturbance_rms_nm: _Optional[float] = ..., continuous_residual_rms_nm: _Optional[float] = ..., sensed_residual_nm: _Optional[_Iterable[float]] = ...) -> None: ...
+    added_contrast_flat: float
+    added_contrast: float
+    def __init__(self, timestamp: _Optional[_Union[datetime.datetime, _timestamp_pb2.Timestamp, _Mapping]] = ..., frame_sequence: _Optional[int] = ..., disturbance_nm: _Optional[_Iterable[float]] = ..., residual_nm: _Optional[_Iterable[float]] = ..., disturbance_rms_nm: _Optional[float] = ..., residual_rms_nm: _Optional[float] = ..., instants: _Optional[int] = ..., continuous_disturbance_nm: _Optional[_Iterable[float]] = ..., continuous_residual_nm: _Optional[_Iterable[float]] = ..., continuous_disturbance_rms_nm: _Optional[float] = ..., continuous_residual_rms_nm: _Optional[float] = ..., sensed_residual_nm: _Optional[_Iterable[float]] = ..., added_contrast_flat: _Optional[float] = ..., added_contrast: _Optional[float] = ...) -> None: ...
 
 class Calibration(_message.Message):
     __slots__ = ("timestamp", "id", "operator_hash", "estimator", "noll", "mode_names", "wavelength_nm", "rows", "columns", "reference", "response", "reconstructor", "mask", "dark", "flux_dn", "saturation_dn", "mirror_rows", "mirror_columns", "modes_to_actuators", "actuators_to_modes", "camera")
@@ -616,7 +620,7 @@ class Latency(_message.Message):
     def __init__(self, count: _Optional[int] = ..., p50_ns: _Optional[int] = ..., p99_ns: _Optional[int] = ..., p99_9_ns: _Optional[int] = ..., max_ns: _Optional[int] = ...) -> None: ...
 
 class WavefrontFigures(_message.Message):
-    __slots__ = ("disturbance_rms_nm", "residual_rms_nm", "tilt_disturbance_mas", "tilt_residual_mas", "instants", "continuous_disturbance_rms_nm", "continuous_residual_rms_nm", "continuous_tilt_disturbance_mas", "continuous_tilt_residual_mas")
+    __slots__ = ("disturbance_rms_nm", "residual_rms_nm", "tilt_disturbance_mas", "tilt_residual_mas", "instants", "continuous_disturbance_rms_nm", "continuous_residual_rms_nm", "continuous_tilt_disturbance_mas", "continuous_tilt_residual_mas", "added_contrast_flat", "added_contrast", "science_images", "quadratic_added_contrast", "dark_zone_contrast")
     DISTURBANCE_RMS_NM_FIELD_NUMBER: _ClassVar[int]
     RESIDUAL_RMS_NM_FIELD_NUMBER: _ClassVar[int]
     TILT_DISTURBANCE_MAS_FIELD_NUMBER: _ClassVar[int]
@@ -626,6 +630,11 @@ class WavefrontFigures(_message.Message):
     CONTINUOUS_RESIDUAL_RMS_NM_FIELD_NUMBER: _ClassVar[int]
     CONTINUOUS_TILT_DISTURBANCE_MAS_FIELD_NUMBER: _ClassVar[int]
     CONTINUOUS_TILT_RESIDUAL_MAS_FIELD_NUMBER: _ClassVar[int]
+    ADDED_CONTRAST_FLAT_FIELD_NUMBER: _ClassVar[int]
+    ADDED_CONTRAST_FIELD_NUMBER: _ClassVar[int]
+    SCIENCE_IMAGES_FIELD_NUMBER: _ClassVar[int]
+    QUADRATIC_ADDED_CONTRAST_FIELD_NUMBER: _ClassVar[int]
+    DARK_ZONE_CONTRAST_FIELD_NUMBER: _ClassVar[int]
     disturbance_rms_nm: float
     residual_rms_nm: float
     tilt_disturbance_mas: float
@@ -635,7 +644,12 @@ class WavefrontFigures(_message.Message):
     continuous_residual_rms_nm: float
     continuous_tilt_disturbance_mas: float
     continuous_tilt_residual_mas: float
-    def __init__(self, disturbance_rms_nm: _Optional[float] = ..., residual_rms_nm: _Optional[float] = ..., tilt_disturbance_mas: _Optional[float] = ..., tilt_residual_mas: _Optional[float] = ..., instants: _Optional[int] = ..., continuous_disturbance_rms_nm: _Optional[float] = ..., continuous_residual_rms_nm: _Optional[float] = ..., continuous_tilt_disturbance_mas: _Optional[float] = ..., continuous_tilt_residual_mas: _Optional[float] = ...) -> None: ...
+    added_contrast_flat: float
+    added_contrast: float
+    science_images: int
+    quadratic_added_contrast: float
+    dark_zone_contrast: float
+    def __init__(self, disturbance_rms_nm: _Optional[float] = ..., residual_rms_nm: _Optional[float] = ..., tilt_disturbance_mas: _Optional[float] = ..., tilt_residual_mas: _Optional[float] = ..., instants: _Optional[int] = ..., continuous_disturbance_rms_nm: _Optional[float] = ..., continuous_residual_rms_nm: _Optional[float] = ..., continuous_tilt_disturbance_mas: _Optional[float] = ..., continuous_tilt_residual_mas: _Optional[float] = ..., added_contrast_flat: _Optional[float] = ..., added_contrast: _Optional[float] = ..., science_images: _Optional[int] = ..., quadratic_added_contrast: _Optional[float] = ..., dark_zone_contrast: _Optional[float] = ...) -> None: ...
 
 class Recording(_message.Message):
     __slots__ = ("file", "messages", "lost", "bytes", "failure", "files", "stopped", "folder")

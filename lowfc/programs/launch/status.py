@@ -50,10 +50,15 @@ def status_line(watch: Watch, elapsed_s: float) -> str:
     frames, recent = topic_count(controller, FRAME.key), wavefront(camera.recent_wavefront)
     return (
         f"{elapsed_s:5.0f} s  {mode(controller)}  {camera.rate_hz:6.0f} Hz  "
-        f"residual {recent['residual_rms_nm']:.2f} of {recent['disturbance_rms_nm']:.2f} nm rms  "
+        f"residual {recent['residual_rms_nm']:.2f} of {recent['disturbance_rms_nm']:.2f} nm rms  {_added(recent)}"
         f"frame to command {latency(controller.frame_to_command)}  "
         f"skipped {frames.skipped} missing {frames.missing}  {recording(watch.of(Role.RECORDER))}"
     )
+
+
+def _added(recent: dict[str, Any]) -> str:
+    added = recent["added_contrast"]
+    return "" if added is None else f"contrast +{added['closed']:.1e} of +{added['open']:.1e}  "
 
 
 def _wavefront(camera: wire.Health) -> str:
@@ -109,6 +114,19 @@ def _when(figures: dict[str, Any], name: str, of: str = "") -> str:
     return f"continuous ({of}{figures[f'sampled_{name}']:.2f} as exposures start)"
 
 
+def _contrast(figures: dict[str, Any]) -> list[str]:
+    """What the wavefront adds to the contrast of the dark zone; nothing where that is not known."""
+    added = figures["added_contrast"]
+    if added is None:
+        return []
+    own = (
+        ""
+        if figures["dark_zone_contrast"] is None
+        else f" (the coronagraph's own is {figures['dark_zone_contrast']:.1e})"
+    )
+    return [f"contrast           +{added['closed']:.2g} in the dark zone, +{added['open']:.2g} with a flat mirror{own}"]
+
+
 def summary_text(figures: dict[str, Any]) -> str:
     """The summary of a run for a person."""
     command, mirror = (figures["latency_us"][name] for name in ("frame_to_command", "frame_to_mirror"))
@@ -127,6 +145,7 @@ def summary_text(figures: dict[str, Any]) -> str:
         + _when(figures, "residual_rms_nm", f"{figures['instants_per_frame']} instants a frame; "),
         f"tilt per axis      {figures['tilt_residual_mas']:.2f} mas rms left of "
         f"{figures['tilt_disturbance_mas']:.2f} mas, " + _when(figures, "tilt_residual_mas"),
+        *_contrast(figures),
         f"frame to command   {percentiles(command)}",
         f"frame to mirror    {percentiles(mirror)}",
     ]

@@ -7,6 +7,7 @@ from lowfc.adapters.bus.bus import Sample
 from lowfc.adapters.bus.names import Names
 from lowfc.contract.messages import FRAME, Log, Role, wire
 from lowfc.control.loop.safety import LoopMode
+from lowfc.optics.chain.added_contrast import BEYOND_QUADRATIC
 
 
 @dataclass(slots=True)
@@ -32,8 +33,8 @@ class Watch:
         del self.events[:-100]
 
 
-def summary(watch: Watch, record: bool) -> dict[str, Any]:
-    """Figures of a run, from the last Health of each process."""
+def summary(watch: Watch, record: bool, rate_hz: float) -> dict[str, Any]:
+    """Figures of a run at this frame rate, from the last Health of each process."""
     camera, controller = watch.of(Role.CAMERA), watch.of(Role.CONTROLLER)
     frames = topic_count(controller, FRAME.key)
     figures: dict[str, Any] = {
@@ -45,6 +46,7 @@ def summary(watch: Watch, record: bool) -> dict[str, Any]:
         "commands_applied": camera.frame_to_mirror.count,
         "commands_late": camera.commands_late,
         "mode": mode_name(controller.mode),
+        "closed_fraction": _closed_fraction(controller.not_closed_ns * 1e-9, frames.received, rate_hz),
         "not_closed_s": round(controller.not_closed_ns * 1e-9, 3),
         "not_closed_cause": controller.not_closed_cause,
         "messages_recorded": None,
@@ -80,6 +82,11 @@ def summary(watch: Watch, record: bool) -> dict[str, Any]:
     return figures
 
 
+def _closed_fraction(not_closed_s: float, frames: int, rate_hz: float) -> float:
+    """Part of the time since the first frame used for which the loop was closed."""
+    return round(max(0.0, 1 - not_closed_s * rate_hz / frames), 4) if frames else 0.0
+
+
 def wavefront(known: wire.WavefrontFigures) -> dict[str, Any]:
     """The true wavefront's figures: at every moment where they were computed, and at the starts of the exposures."""
     names = ("disturbance_rms_nm", "residual_rms_nm", "tilt_disturbance_mas", "tilt_residual_mas")
@@ -89,6 +96,14 @@ def wavefront(known: wire.WavefrontFigures) -> dict[str, Any]:
         "sampled_residual_rms_nm": round(known.residual_rms_nm, 4),
         "sampled_tilt_residual_mas": round(known.tilt_residual_mas, 4),
         "instants_per_frame": known.instants or 1,
+        "added_contrast": {"open": known.added_contrast_flat, "closed": known.added_contrast}
+        if known.added_contrast_flat
+        else None,
+        "beyond_quadratic": abs(known.quadratic_added_contrast - known.added_contrast)
+        > BEYOND_QUADRATIC * abs(known.added_contrast)
+        if known.science_images
+        else None,
+        "dark_zone_contrast": known.dark_zone_contrast or None,
     }
 
 
