@@ -1,10 +1,8 @@
 """The benchmarks' own arithmetic, on made-up figures, and one small run of each for real."""
 
 import json
-import os
 import subprocess
 import sys
-import time
 from argparse import Namespace
 from collections.abc import Sequence
 from pathlib import Path
@@ -255,25 +253,6 @@ def test_processes_are_known_by_what_python_was_told_to_run() -> None:
     assert load.role_of(["python", "-m", "lowfc", "record"]) == "recorder"
     assert load.role_of(["python", "-m", "lowfc", "latency"]) is None
     assert load.role_of(["python", "-m"]) is load.role_of([]) is None
-
-
-@pytest.mark.exclusive
-def test_real_processes_below_this_one_are_watched() -> None:
-    busy, idle = "while True: pass", "import time; time.sleep(60)"
-    programs = {busy: ["sim_camera"], idle: ["lowfc", "controller"], f"{idle} ": ["sim_dm"]}
-    children = [subprocess.Popen([sys.executable, "-c", code, "-m", *words]) for code, words in programs.items()]
-    try:
-        with load.watched(os.getpid()) as moments:
-            time.sleep(1.2)
-    finally:
-        for child in children:
-            child.kill()
-            child.wait()
-    found = load.shares(moments, 1.0)
-    assert set(found) == load.LOOP
-    assert found["camera"]["share"] > 0.1 > found["controller"]["share"]
-    assert found["mirror"]["processors"] == found["camera"]["processors"] != ""
-    assert found["mirror"]["mb"] > 1
 
 
 # A view
