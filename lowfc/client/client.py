@@ -21,7 +21,7 @@ from lowfc.client.answer import Answer
 from lowfc.client.lease import Lease
 from lowfc.client.mirror_watch import MirrorWatch
 from lowfc.client.requests import BY_NAME
-from lowfc.client.runs import the_run
+from lowfc.client.runs import starting, the_run
 from lowfc.client.stream import SILENT_S, WAITING, Frame, Stream, frame_of, step_of
 from lowfc.contract.codecs.calibration_codec import camera_settings, decode_calibration, encode_calibration
 from lowfc.contract.codecs.codec import most_bytes
@@ -340,6 +340,8 @@ class Client:
                     "whether it did what was asked, the log and `lowfc ctl status` say"
                 )
             if now_s >= deadline_s:
+                if starting(self.run_id, who):
+                    raise BusError(f"run {self.run_id!r} is starting, and its {who} is not there yet: ask again")
                 raise BusError(f"no {who} is there in run {self.run_id!r}: start one, as with `{_COMMANDS[who]}`")
             time.sleep(0.05)
 

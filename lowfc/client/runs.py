@@ -41,6 +41,12 @@ def nobody_yet(name: str) -> str:
     return f"no process of run {name!r} is on this host, and one is waited for; {there}"
 
 
+def starting(name: str, role: Role) -> bool:
+    """Whether `lowfc sim-loop` has begun this run, and its process of this role does not listen yet."""
+    roles = living().get(name, set())
+    return Role.LAUNCHER in roles and role not in roles
+
+
 def living(wanted: str | None = None) -> dict[str, set[str]]:
     """Runs of which somebody listens, and who; a damaged one is left out, unless it is the one that is wanted.
 

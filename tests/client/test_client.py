@@ -22,7 +22,7 @@ from lowfc.adapters.logs.reader import LogReader
 from lowfc.adapters.process.clock import HostClock
 from lowfc.client import Answer, Client, Frame, Stream, client, configuration_of, running, the_run
 from lowfc.client.requests import DECLARED
-from lowfc.client.runs import nobody_yet
+from lowfc.client.runs import nobody_yet, starting
 from lowfc.client.stream import WAITING, frame_of, step_of
 from lowfc.contract.codecs import codec
 from lowfc.contract.codecs.calibration_codec import encode_calibration, identified
@@ -39,6 +39,7 @@ from lowfc.contract.messages import (
     REQUEST_KEY,
     STEP,
     Log,
+    Role,
     Topic,
     image,
     wire,
@@ -281,6 +282,16 @@ def test_who_waits_for_a_run_that_nobody_is_in_is_told_the_others(listen: Callab
     assert nobody_yet("bnch").endswith("one is waited for; running: bench (did you mean 'bench'?)")
 
 
+def test_a_run_that_sim_loop_has_begun_is_starting(listen: Callable[..., None]) -> None:
+    open_run("night", listeners=(Role.LAUNCHER,))
+    listen("night", "launcher", "recorder")
+    assert starting("night", Role.CONTROLLER)
+    assert not starting("night", Role.RECORDER)
+    listen("bench", "camera")
+    assert not starting("bench", Role.CONTROLLER), "it is to be started by hand"
+    assert not starting("noon", Role.CONTROLLER)
+
+
 def test_the_beginning_of_a_runs_name_is_enough(listen: Callable[..., None]) -> None:
     for name in ("night", "night-2", "noon"):
         listen(name, "controller")
@@ -505,6 +516,7 @@ def test_a_number_that_is_none_is_shown(words: list[str]) -> None:
     done = lowfc("ctl", *words)
     assert done.exit_code == 2
     assert "'0,3' is not a number: write 0.3" in done.output
+    assert "'1.5' is not a whole number" in lowfc("ctl", "step", "1.5").output
 
 
 def test_the_status_says_everything() -> None:

@@ -79,6 +79,8 @@ def test_the_summary_and_the_status_say_it() -> None:
         watch = Watch({"controller": wire.Health(**health)}, [])
         return summary_text(summary(watch, record=False, rate_hz=250.0)).splitlines()[0].split(maxsplit=1)[1]
 
+    figures = summary(Watch({}, []), record=False, rate_hz=250.0)
+    assert "over the open pupil, second half of the run" in summary_text(figures)
     late = {"not_closed_ns": 3 * SECOND, "not_closed_cause": "the camera does not fit"}
     assert first(mode=wire.LOOP_MODE_CLOSED) == "closed"
     before = "closed; before that not closed for 3.0 s: the camera does not fit"

@@ -141,10 +141,11 @@ def summary_text(figures: dict[str, Any]) -> str:
         f"{figures['frames_skipped']} skipped, {figures['frames_missing']} missing",
         f"commands           {figures['commands_applied']} applied, {figures['commands_late']} after the next exposure "
         "had begun",
-        f"wavefront          {figures['residual_rms_nm']:.2f} nm rms left of {figures['disturbance_rms_nm']:.2f} nm, "
+        f"wavefront          {figures['residual_rms_nm']:.2f} nm rms left of {figures['disturbance_rms_nm']:.2f} nm "
+        "over the open pupil, second half of the run, "
         + _when(figures, "residual_rms_nm", f"{figures['instants_per_frame']} instants a frame; "),
         f"tilt per axis      {figures['tilt_residual_mas']:.2f} mas rms left of "
-        f"{figures['tilt_disturbance_mas']:.2f} mas, " + _when(figures, "tilt_residual_mas"),
+        f"{figures['tilt_disturbance_mas']:.2f} mas, second half, " + _when(figures, "tilt_residual_mas"),
         *_contrast(figures),
         f"frame to command   {percentiles(command)}",
         f"frame to mirror    {percentiles(mirror)}",

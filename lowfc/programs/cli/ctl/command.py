@@ -36,11 +36,19 @@ def number(word: str) -> float:
         raise typer.BadParameter(f"{word!r} is not a number: write 0.3, and several as 0.3 0.2") from None
 
 
+def whole(word: str) -> int:
+    """A number of frames as it was typed."""
+    try:
+        return int(word)
+    except ValueError:
+        raise typer.BadParameter(f"{word!r} is not a whole number: write 50") from None
+
+
 _EACH = "One value for all modes, or one for each."
 Values = Annotated[list[float], typer.Argument(help=_EACH, parser=number)]
 ValuesIfAny = Annotated[list[float] | None, typer.Argument(help=f"{_EACH} nm rms of wavefront.", parser=number)]
 Zero = Annotated[bool, typer.Option(ZERO, help="Remove it.")]
-Frames = Annotated[int, typer.Argument(help="Frames for which the loop is closed.")]
+Frames = Annotated[int, typer.Argument(help="Frames for which the loop is closed.", parser=whole)]
 Text = Annotated[str, typer.Argument(help="What to remember.")]
 Channel = Annotated[str, typer.Argument(help="Of the channel; `flat` does not shift the sensor's zero point.")]
 Shape = Annotated[Path | None, typer.Argument(help="FITS or .npy array (rows, columns), nm of surface.")]
