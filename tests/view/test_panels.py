@@ -263,10 +263,9 @@ def steps(first: int, error_nm: Any, pol_nm: Any, mode: int = LoopMode.CLOSED) -
 def truths(residual_nm: Any, disturbance_nm: Any) -> Truths:
     rows = len(residual_nm)
     modes = [np.asarray(one, np.float32) for one in (disturbance_nm, residual_nm)]
-    none, zeros = np.zeros(rows, np.int64), np.zeros((3, rows), np.float32)
-    return Truths(
-        np.arange(rows, dtype=np.uint64), np.full(rows, START_NS), *modes, modes[1], *map(np.abs, modes), *zeros, none
-    )
+    none, zeros = np.zeros(rows, np.int64), [np.zeros(rows, np.float32)] * 5
+    each = *modes, modes[1], *map(np.abs, modes), *zeros[:3], none, *zeros[3:]
+    return Truths(np.arange(rows, dtype=np.uint64), np.full(rows, START_NS), *each)
 
 
 def drawn(panel: Panel, tape: Tape, after_ns: int, **changes: Any) -> None:

@@ -20,6 +20,7 @@ from lowfc.control.calibration.actuator_response import actuators_to_modes
 from lowfc.control.calibration.calibration import Calibration, noise_nm, normalise_flux, reconstructor
 from lowfc.control.loop.safety import Limits, LoopMode
 from lowfc.control.loop.state import Settings
+from lowfc.optics.chain.added_contrast import contrast_form
 from lowfc.optics.chain.band import Band, gauss_legendre, monochromatic, uniform
 from lowfc.optics.chain.mirror import Mirror, modes_to_actuators
 from lowfc.optics.chain.sensor import Sensor, shear_response
@@ -58,6 +59,13 @@ def twin(config: Configuration, progress: Progress | None, warn: Callable[[str],
         return load_or_build(sensor(config, warn), spec, band(config), progress, notice=warn)
     except ValueError as error:
         raise ConfigurationError(f"sensor: {error}") from None
+
+
+def contrast_form_of(config: Configuration, warn: Callable[[str], None]) -> Array | None:
+    """See `contrast_form`; None for a coronagraph of which there is no science image yet."""
+    if config.sensor.pupil in ("circle", "prolate"):
+        return None
+    return contrast_form(sensor(config, warn).pupil, config.noll, config.star.wavelength_nm)
 
 
 def electrons_per_exposure(config: Configuration) -> float:

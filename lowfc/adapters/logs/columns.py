@@ -66,6 +66,7 @@ class Truths:
         disturbance_rms_nm: over the open pupil, rms over the period; so is residual_rms_nm.
         sampled_residual_rms_nm: over the open pupil, at the start of the exposure.
         instants: of the period, over which the rms are; 0 for the start of the exposure alone.
+        added_contrast: of the residual, and `added_contrast_flat` of the disturbance; 0 where it was not computed.
     """
 
     sequence: Sequences
@@ -79,6 +80,8 @@ class Truths:
     residual_rms_nm: Single
     sampled_residual_rms_nm: Single
     instants: Long
+    added_contrast: Single
+    added_contrast_flat: Single
 
     @property
     def continuous(self) -> bool:

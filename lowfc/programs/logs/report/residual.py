@@ -2,7 +2,8 @@
 
 import numpy as np
 
-from lowfc.adapters.logs.columns import TruthRows
+from lowfc.adapters.files.factory import contrast_form_of
+from lowfc.adapters.logs.columns import TruthRows, Truths
 from lowfc.arrays import Array, Single, Whole
 from lowfc.contract.configuration import Configuration
 from lowfc.control.loop.safety import LoopMode
@@ -51,8 +52,13 @@ def residual_figures(run: Run, stretch: Stretch | None) -> Figures:
             ("sampled_residual", true.sampled_residual_rms_nm, closed),
         )
     }
+    contrast = _contrast(true, opened if not closed.size else closed, history.configuration)
+    for k, mode in enumerate(modes):
+        for name in ("open", "closed"):
+            mode[f"added_contrast_{name}"] = contrast[name]["modes"][k] if contrast is not None else None
     return {
         "modes": modes,
+        "added_contrast": contrast and {name: found["total"] for name, found in contrast.items()},
         "tilt_mas": {signal: _tilt_mas(found, noll, history.configuration) for signal, found in values.items()},
         "total_rms_nm": {
             signal: float(np.sqrt(np.sum(found**2))) if found is not None else None for signal, found in values.items()
@@ -85,6 +91,29 @@ def binned_rms(run: Run, most: int = 300) -> dict[str, Array]:
 def bin_starts(rows: int, most: int) -> Whole:
     """First row of each of at most so many bins of even width."""
     return np.arange(0, rows, max(1, -(-rows // most)))
+
+
+def _contrast(true: Truths, rows: Whole, configuration: Configuration | None) -> dict[str, Figures] | None:
+    """What disturbance (open) and residual (closed) add to the contrast of the dark zone: in all, and each mode alone.
+
+    None without a truth, or for a coronagraph of which there is no science image.
+    """
+    if configuration is None or not true.residual_nm.size:
+        return None
+    form = contrast_form_of(configuration, lambda _: None)
+    if form is None or len(form) != true.residual_nm.shape[1]:
+        return None
+    found = {}
+    for name, each_nm, total in (
+        ("open", _rms(true.modes_disturbance_rms_nm, rows), true.added_contrast_flat),
+        ("closed", _rms(true.modes_residual_rms_nm, rows), true.added_contrast),
+    ):
+        if each_nm is None:
+            return None
+        modes = each_nm**2 * np.diag(form)
+        mean = float(np.nanmean(total[rows]))
+        found[name] = {"total": mean or float(modes.sum()), "modes": modes.tolist()}
+    return found
 
 
 def _rms(values: Single, rows: Whole) -> Array | None:
