@@ -7,6 +7,7 @@ from lowfc.adapters.bus.bus import Sample
 from lowfc.adapters.process.service import Service
 from lowfc.contract.codecs.codec import decode_mirror
 from lowfc.contract.configuration import Configuration
+from lowfc.contract.errors import ConfigurationError
 from lowfc.contract.messages import MIRROR_STATE
 from sim_camera.process import scene
 
@@ -28,6 +29,9 @@ class Optics:
         """Wait for the next frame; return it and when its exposure ended."""
         self._start_ns = max(self._start_ns + self._config.period_ns, self._clock.now_ns())
         self._clock.sleep_until_ns(self._start_ns)
+        there, expected = self._surface_nm.shape, (self._config.mirror.rows, self._config.mirror.columns)
+        if there != expected:
+            raise ConfigurationError(f"the mirror has {there} actuators, mirror.rows and mirror.columns say {expected}")
         frame = self._scene.expose(self._index, self._surface_nm)
         self._index += 1
         end_ns = self._start_ns + self._config.exposure_ns

@@ -1,13 +1,21 @@
 """The simulated bench: its truth is what was put in, and its frames are what the calibration expects."""
 
+import importlib.util
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
 import numpy as np
 import pytest
 
 from lowfc.adapters.files.factory import analytic_calibration, mirror_on_twin, twin
 from lowfc.contract.configuration import Configuration, load
+from lowfc.contract.errors import ConfigurationError
+from lowfc.contract.messages import wire
 from lowfc.control.calibration.calibration import Calibration
 from lowfc.control.loop.estimator import Estimator
 from lowfc.optics.twin.twin import Evaluator
+from lowfc.testing.clock import FakeClock
 from sim_camera.disturbance import BLOCK, _sum_of_waves
 from sim_camera.process import disturbance_of
 from sim_camera.process import scene as scene_of
@@ -161,3 +169,20 @@ def test_one_instant_is_that_at_which_the_exposure_starts_and_blurs_nothing() ->
         == scene_of(configured(camera__noise=False, disturbance__static_nm=static)).expose(0, FLAT)
     ).all()
     assert scene.truth(3, FLAT).continuous is None
+
+
+def test_the_stand_in_of_the_examples_refuses_a_mirror_of_another_grid() -> None:
+    spec = importlib.util.spec_from_file_location("stand_in", Path(__file__).parents[2] / "examples" / "stand_in.py")
+    assert spec is not None
+    assert spec.loader is not None
+    spec.loader.exec_module(stand_in := importlib.util.module_from_spec(spec))
+    heard: list[Any] = []
+    service = SimpleNamespace(clock=FakeClock(), bus=SimpleNamespace(subscribe=lambda _, hear, __: heard.append(hear)))
+    optics = stand_in.Optics(Configuration(), service)
+    surface = np.zeros((24, 24), np.float32)
+    state = wire.MirrorState(rows=24, columns=24, actuators=surface.tobytes())
+    heard[0](SimpleNamespace(payload=state.SerializeToString()))
+    with pytest.raises(
+        ConfigurationError, match=r"\(24, 24\) actuators, mirror.rows and mirror.columns say \(34, 34\)"
+    ):
+        optics.expose()

@@ -16,6 +16,8 @@ from lowfc.programs.view.layout import layout
 from lowfc.programs.view.panels import mirror, pointing, sensor, tiles, trend, wavefront
 from lowfc.programs.view.recorded import Drawn, draw_logs
 from lowfc.programs.view.renderer import Renderer
+from lowfc.programs.view.session import forgotten
+from lowfc.programs.view.target import Target
 from lowfc.programs.view.verdicts import course
 from lowfc.programs.view.verdicts.course import Course
 from lowfc.programs.view.verdicts.tile import Level, Verdict
@@ -102,6 +104,15 @@ def test_the_trend_holds_a_night_in_so_many_spans() -> None:
     assert course.MOST / 2 <= len(after_ns) <= course.MOST
     np.testing.assert_allclose(rms_nm[0], np.sqrt(squares.mean(axis=0)), rtol=1e-6)
     assert np.isnan(rms_nm[1:-1]).all()  # nothing in between: a gap
+
+
+def test_a_log_of_which_the_viewer_forgets_a_part_is_said_so() -> None:
+    target = Target(picture=Path("night.png"))
+    assert forgotten(511_000_000, target) == []
+    [remark] = forgotten(1_652_000_000, target)
+    assert remark.startswith(
+        "the log has 1652 MB, the viewer keeps 512 MB (--memory-mb): curves of every frame may begin late"
+    )
 
 
 def test_every_view_of_the_layout_has_something_and_the_plots_show_all_of_a_log(tmp_path: Path) -> None:

@@ -107,6 +107,16 @@ def show_logs(logs: list[Path], config: Configuration | None, target: Target) ->
     }
 
 
+def forgotten(log_bytes: int, target: Target) -> list[str]:
+    """A remark where a viewer may not keep all of a log of this size; a file keeps it."""
+    if target.save is not None or log_bytes <= target.memory_mb * 1e6:
+        return []
+    return [
+        f"the log has {log_bytes / 1e6:.0f} MB, the viewer keeps {target.memory_mb:g} MB (--memory-mb): curves of "
+        "every frame may begin late; trend, tiles and mode are of the whole log"
+    ]
+
+
 def _draw(logs: list[Path], config: Configuration | None, stream: rr.RecordingStream, target: Target) -> Drawn:
     total = sum(log.stat().st_size for log in logs if log.exists())
     with passing_bar(Console(stderr=True)) as bar:
@@ -115,6 +125,7 @@ def _draw(logs: list[Path], config: Configuration | None, stream: rr.RecordingSt
             logs, config, lambda own: Renderer(own, stream), lambda done: bar.update(task, completed=done)
         )
     target.show_all(stream, drawn.span_ns)
+    drawn.remarks += forgotten(total, target)
     for remark in drawn.remarks:
         sys.stderr.write(f"{remark}\n")
     return drawn

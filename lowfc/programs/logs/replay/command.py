@@ -63,7 +63,7 @@ def render(figures: dict[str, Any]) -> str:
         verdict = f"{frames} frames, {figures['different']} messages differ"
     lines = [
         f"{verdict}, largest difference {largest_nm:.3g} nm",
-        f"with them          {figures['commands']} commands, {figures['states']} states, {figures['requests']} answers",
+        f"compared too       {figures['commands']} commands, {figures['states']} states, {figures['requests']} answers",
     ]
     for rule, count in figures["rules_changed"].items():
         lines.append(f"answered otherwise {count} since {figures['version']}: {rule}")
