@@ -24,8 +24,8 @@ class MirrorPath:
         self._settling = settling
 
     def applied(self, moment: float, shape_nm: Single) -> None:
-        """A shape (rows, columns) was applied; moments never decrease."""
-        self._moves.append((moment + self._delay, shape_nm))
+        """A shape (rows, columns) was applied; not before the last one, whatever a clock says."""
+        self._moves.append((max(moment + self._delay, self._moves[-1][0]), shape_nm))
 
     def over(self, start: float, instants: npt.NDArray[np.float64]) -> tuple[list[Single], Single]:
         """Shapes (rows, columns) in force from `start` on, and how much of each (instants, shapes) is there.

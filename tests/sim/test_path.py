@@ -51,3 +51,13 @@ def test_what_is_long_past_is_forgotten() -> None:
         path.applied(moment, ONE)
         path.over(moment, MOMENTS)
     assert len(path.over(1000, MOMENTS)[0]) < 5
+
+
+def test_a_moment_before_the_last_one_is_taken_for_that_one() -> None:
+    """As after a stall of the host, when frames begin anew: no shape is there more than once, none less than nothing."""
+    path = MirrorPath(FLAT, settling=0.01)
+    for moment, shape in ((0.7, ONE), (0.2, TWO), (0.75, ONE)):
+        path.applied(moment, shape)
+    _, weights = path.over(0, np.linspace(0, 1, 50))
+    assert weights.sum(axis=1) == pytest.approx(np.ones(50), abs=1e-5)
+    assert weights.min() >= 0

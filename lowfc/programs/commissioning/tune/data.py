@@ -12,7 +12,6 @@ from lowfc.adapters.logs.reader import LogReader
 from lowfc.arrays import Array, Mask, Single
 from lowfc.client import Client, configuration_of
 from lowfc.contract.codecs.law_codec import driving, gains_of
-from lowfc.contract.configuration import Configuration
 from lowfc.contract.errors import DataFileError
 from lowfc.control.laws.continuous import Timing
 from lowfc.control.laws.law import Law
@@ -87,7 +86,7 @@ def of_log(log: LogReader) -> Telemetry:
         str(log.path),
         run.calibration.noll,
         history.rate_hz,
-        Timing.of(run.delay_frames, (config or Configuration()).camera.exposure_fraction),
+        run.timing,
         (run.law, driving(history.controller, history.published.laws)),
         replace(steps, pol_nm=pol_nm, mode=mode),
         usable,

@@ -5,13 +5,16 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from lowfc.adapters.files.factory import settings
+from lowfc.adapters.logs.columns import rows_of
 from lowfc.adapters.logs.history import History
 from lowfc.arrays import Mask, Sequences, Single
 from lowfc.contract.codecs.codec import decode_frame
 from lowfc.contract.codecs.law_codec import gains_of
+from lowfc.contract.configuration import Configuration
 from lowfc.contract.errors import DataFileError
 from lowfc.contract.messages import FRAME, floats, wire
 from lowfc.control.calibration.calibration import Calibration
+from lowfc.control.laws.continuous import Timing
 from lowfc.control.laws.law import Law
 from lowfc.control.laws.stability import delay_weights, settling_frames
 from lowfc.control.laws.what_if import (
@@ -84,6 +87,27 @@ class LoggedRun:
             self.delay_frames = float(whole) if near else self.measured_delay
             self.weights = delay_weights(self.delay_frames).astype(np.float32)
             self.seen_nm = seen_nm(self.weights, self.steps.command_nm, self.missing, believed_nm[0])
+
+    @property
+    def timing(self) -> Timing:
+        """When the loop exposed and moved its mirror.
+
+        A log in lockstep does not say when a command was applied: then with the exposure that first saw it whole.
+        """
+        history, delay = self.history, self.delay_frames
+        config = history.configuration or Configuration()
+        exposure = config.camera.exposure_fraction
+        if history.camera is not None and history.camera.period_ns:
+            exposure = history.camera.exposure_ns / history.camera.period_ns
+        rows = rows_of(history.mirror.sequence, self.steps.sequence)
+        known = rows >= 0
+        if not known.any() or delay != round(delay):
+            return Timing.of(delay, exposure)
+        waited_ns = history.mirror.publish_time_ns[known] - self.steps.time_ns[rows[known]]
+        after = exposure + float(np.median(waited_ns)) * 1e-9 * history.rate_hz
+        if not exposure < after <= LONGEST_DELAY:  # simulated time
+            return Timing.of(delay, exposure)
+        return Timing(delay, delay + after - np.ceil(after), exposure)
 
     def rows_to_compare(self, laws: list[Law], usable: Mask) -> tuple[Mask, int, str]:
         """Which of the usable steps to compare runs at, the frames in which these laws settle, and in words.
