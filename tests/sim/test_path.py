@@ -54,7 +54,7 @@ def test_what_is_long_past_is_forgotten() -> None:
 
 
 def test_a_moment_before_the_last_one_is_taken_for_that_one() -> None:
-    """As after a stall of the host, when frames begin anew: no shape is there more than once, none less than nothing."""
+    """As after a stall of the host, when frames begin anew: the shares of the shapes stay whole."""
     path = MirrorPath(FLAT, settling=0.01)
     for moment, shape in ((0.7, ONE), (0.2, TWO), (0.75, ONE)):
         path.applied(moment, shape)
