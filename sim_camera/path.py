@@ -23,9 +23,9 @@ class MirrorPath:
         self._delay = delay
         self._settling = settling
 
-    def applied(self, moment: float, shape_nm: Single) -> None:
-        """A shape (rows, columns) was applied; not before the last one, whatever a clock says."""
-        self._moves.append((max(moment + self._delay, self._moves[-1][0]), shape_nm))
+    def applied(self, moment: float, shape_nm: Single, latest: float = np.inf) -> None:
+        """A shape (rows, columns) was applied, by the `latest` moment; not before the last one."""
+        self._moves.append((max(min(moment, latest) + self._delay, self._moves[-1][0]), shape_nm))
 
     def over(self, start: float, instants: npt.NDArray[np.float64]) -> tuple[list[Single], Single]:
         """Shapes (rows, columns) in force from `start` on, and how much of each (instants, shapes) is there.

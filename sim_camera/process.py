@@ -268,7 +268,8 @@ class CameraProcess:
                 self._service.unreadable(sample.key, why)
                 continue
             self._latched = shape
-            self._path.applied(self._moment(sample.publish_time_ns), shape)
+            latest = self._exposed.frame + 1  # though the host stood still: that exposure begins with it
+            self._path.applied(self._moment(sample.publish_time_ns), shape, latest)
             if state.frame_sequence > self._newest_state:
                 self._newest_state = state.frame_sequence
                 sequence, put_ns = self._put_ns[state.frame_sequence % _REMEMBERED]

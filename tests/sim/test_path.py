@@ -61,3 +61,11 @@ def test_a_moment_before_the_last_one_is_taken_for_that_one() -> None:
     _, weights = path.over(0, np.linspace(0, 1, 50))
     assert weights.sum(axis=1) == pytest.approx(np.ones(50), abs=1e-5)
     assert weights.min() >= 0
+
+
+def test_a_shape_from_while_the_host_stood_still_is_there_when_frames_begin_anew() -> None:
+    path = MirrorPath(FLAT, settling=0.01)
+    path.applied(1004.2, ONE, latest=5)
+    path.applied(5.2, TWO, latest=6)
+    assert heights(path, 5) == pytest.approx([1, 2, 2], abs=1e-3)
+    assert len(path.over(6, MOMENTS)[0]) == 1
