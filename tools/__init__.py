@@ -1,1 +1,1 @@
-"""What makes the documentation's tables and pictures: `python -m tools.measure`."""
+"""What makes the documentation's tables, pictures and layouts: `python -m tools.measure`."""

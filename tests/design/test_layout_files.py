@@ -13,9 +13,11 @@ from xml.etree import ElementTree
 
 import pytest
 from google.protobuf.descriptor import Descriptor, FieldDescriptor
+from rerun.chunk import RrdReader
 
-from lowfc.contract.messages import EVENT, RawImage, Role, topic_of, wire
+from lowfc.contract.messages import EVENT, TRUTH, RawImage, Role, topic_of, wire
 from lowfc.optics.chain.zernike import NOLLS_14, mode_name
+from tools import layouts
 
 LAYOUTS = Path(__file__).parents[2] / "deploy" / "layouts"
 FOXGLOVE = json.loads((LAYOUTS / "foxglove.json").read_text())
@@ -129,3 +131,37 @@ def test_the_curves_of_plotjuggler_are_numbers() -> None:
             assert plotjuggler_field(curve).cpp_type not in NOT_NUMBERS
     for splitter in PLOTJUGGLER.iter("DockSplitter"):  # PlotJuggler trusts these
         assert splitter.get("count") == str(len(splitter)) == str(len(splitter.get("sizes", "").split(";")))
+
+
+SHOWN = {"ViewBlueprint:display_name", "ViewBlueprint:space_origin", "SeriesLines:names"}
+MAPPED = "VisualizerInstruction:component_map"
+
+
+def of_rerun(path: Path) -> tuple[str, Counter[str], set[tuple[str, str]]]:
+    """Application id of a layout, its views and names, and the message and field of each mapping."""
+    reader = RrdReader(path)
+    (entry,) = reader.blueprints()
+    shown: Counter[str] = Counter()
+    mapped: set[tuple[str, str]] = set()
+    for chunk in reader.store(store=entry).stream():
+        batch = chunk.to_record_batch()
+        for name in SHOWN & set(batch.schema.names):
+            shown.update(f"{name} {value}" for value in batch.column(name)[0].as_py())
+        if MAPPED in batch.schema.names:
+            mapped |= {(one["source_component"], one["selector"]) for one in batch.column(MAPPED)[0].as_py()}
+    return entry.application_id, shown, mapped
+
+
+def test_the_layouts_for_rerun_are_those_that_the_code_makes(tmp_path: Path) -> None:
+    layouts.make(tmp_path)
+    for name in ("lowfc.rbl", "log.rbl"):
+        assert of_rerun(LAYOUTS / name) == of_rerun(tmp_path / name), "python -m tools.measure layouts"
+    _, shown, mapped = of_rerun(LAYOUTS / "log.rbl")
+    assert shown[f"ViewBlueprint:space_origin /{TRUTH.key}"] == 2
+    assert len(mapped) == 15
+    for component, selector in mapped:
+        message = getattr(wire, component.removeprefix("lowfc.v1.").removesuffix(":message"))
+        first, *rest = selector.removeprefix(".").split(".")
+        field = message.DESCRIPTOR.fields_by_name[first.partition("[")[0]]
+        assert field.is_repeated == ("[" in first)
+        assert rest == (["name"] if field.enum_type is not None else [])

@@ -16,12 +16,14 @@ from tests.support.viewers import on_screen
 
 ROOT = Path(__file__).parents[2]
 README = ROOT / "README.md"
-# Run by CI itself, which runs this test; and by the test of rerun.
+# Run by CI itself, which runs this test; and by the tests of rerun and of its layouts.
+ROUTE = "rerun rrd route --application-id $(basename $log .mcap) deploy/layouts/log.rbl | rerun $log -"
 ELSEWHERE = {
     "make sim-loop": ".ci/run",
     "make test": ".ci/run",
     "lowfc doctor": "tests/commissioning/test_doctor.py",
     "rerun $(ls -t logs/*.mcap | head -1)": "tests/e2e/test_rerun_viewer.py",
+    ROUTE: "tests/design/test_layout_files.py",
 }
 SHORTER = {
     "--duration 20": "--duration 2",
