@@ -167,7 +167,7 @@ def render(figures: Figures) -> str:
         )
     return (
         f"{markdown(head, rows)}\n{''.join(notes)}\nReaction wheel with damped lines, 14 mas rms per axis, V = 0, "
-        f"{RATE_HZ:g} Hz; what is left is the true tilt at every moment, 8 instants of each frame; blurred sensor images "
+        f"{RATE_HZ:g} Hz; what is left is the true tilt at every moment (8 instants of a frame); blurred sensor images "
         f"through the live loop's own `advance`; laws identified from {IDENTIFY / RATE_HZ:g} s of the closed "
         f"loop, measured over {MEASURE / RATE_HZ:g} s, {SETTLE / RATE_HZ:g} s after they were loaded."
     )
