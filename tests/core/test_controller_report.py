@@ -160,6 +160,12 @@ def test_the_status_line_is_of_the_last_seconds_and_says_nothing_before_the_firs
     with Console(width=120, file=io.StringIO(), record=True) as console:
         console.print(screen(watch, Configuration(), None, 10.0))
     assert "2.20 nm rms left of 30.00 nm" in console.export_text()
+    for health, seconds in ((watch.health["camera"], 10), (watch.health["controller"], 17)):
+        health.timestamp.FromSeconds(seconds)
+    assert status_line(watch, 17.0) == "   17 s  closed  the camera has been silent for 7 s"
+    with Console(width=120, file=io.StringIO(), record=True) as console:
+        console.print(screen(watch, Configuration(), None, 17.0))
+    assert "2.20" not in console.export_text(), "those figures are of seven seconds ago"
 
 
 @pytest.mark.parametrize(("received", "missing", "lost"), [(500, 0, 0), (371, 129, 129), (309, 0, 191), (0, 0, 0)])

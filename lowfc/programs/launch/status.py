@@ -15,6 +15,8 @@ from lowfc.contract.printable import printable
 from lowfc.control.loop.wording import counted, mode_word
 from lowfc.programs.launch.watch import Watch, mode_name, topic_count, wavefront
 
+SILENT_S = 2.0
+"""A process sends Health twice a second: after so long its last figures are no longer shown."""
 _EVENTS_SHOWN = 4
 _STYLES = {Level.WARNING: "yellow", Level.ERROR: "red", Level.FATAL: "bold red"}
 
@@ -28,8 +30,10 @@ def screen(watch: Watch, config: Configuration, duration_s: float | None, elapse
     table = Table.grid(padding=(0, 2))
     table.add_column(style="dim", justify="right")
     table.add_column()
-    table.add_row("loop", f"{mode(controller)}, {camera.rate_hz:.0f} Hz of {config.camera.rate_hz:g} Hz")
-    table.add_row("wavefront", _wavefront(camera))
+    silent_s = watch.silent_s(Role.CAMERA)
+    silent = f"the camera has been silent for {silent_s:.0f} s" if silent_s > SILENT_S and camera.process else ""
+    table.add_row("loop", f"{mode(controller)}, {silent or f'{camera.rate_hz:.0f} Hz of {config.camera.rate_hz:g} Hz'}")
+    table.add_row("wavefront", silent or _wavefront(camera))
     table.add_row("frame to command", latency(controller.frame_to_command))
     table.add_row("frame to mirror", latency(camera.frame_to_mirror))
     table.add_row("frames", f"{frames.received} received, {frames.skipped} skipped, {frames.missing} missing")
@@ -47,6 +51,8 @@ def status_line(watch: Watch, elapsed_s: float) -> str:
     camera, controller = watch.of(Role.CAMERA), watch.of(Role.CONTROLLER)
     if not camera.HasField("recent_wavefront"):
         return f"{elapsed_s:5.0f} s  no frame yet"
+    if (silent_s := watch.silent_s(Role.CAMERA)) > SILENT_S:
+        return f"{elapsed_s:5.0f} s  {mode(controller)}  the camera has been silent for {silent_s:.0f} s"
     frames, recent = topic_count(controller, FRAME.key), wavefront(camera.recent_wavefront)
     return (
         f"{elapsed_s:5.0f} s  {mode(controller)}  {camera.rate_hz:6.0f} Hz  "

@@ -22,6 +22,11 @@ class Watch:
         """Last Health of a process; an empty one before the first."""
         return self.health.get(name, wire.Health())
 
+    def silent_s(self, name: str) -> float:
+        """Time since a process's last Health, by the newest of all."""
+        newest_ns = max((health.timestamp.ToNanoseconds() for health in self.health.values()), default=0)
+        return (newest_ns - self.of(name).timestamp.ToNanoseconds()) * 1e-9
+
     def hear(self, sample: Sample) -> None:
         """Keep a Health."""
         name, health = self._names.health(sample.key, sample.payload)
