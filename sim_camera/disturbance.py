@@ -223,25 +223,31 @@ class Sampler:
         self._lines = _Lines(shaken, rate_hz) if shaken.lines else None
         self._between = _between(shaken.lines, instants / rate_hz, 1 / rate_hz)
         self._shape = (BLOCK, len(instants), len(shaken.noll))
-        self._block = np.zeros(self._shape, np.float32)
-        self._first = -1
+        self._blocks: dict[int, Single] = {}
 
     def at(self, index: int) -> Single:
         """Modes (instants, modes) in the period of a frame, nm of wavefront rms."""
         first = index - index % BLOCK  # a frame is the same in whatever order
-        if first != self._first:
-            start_s = first / self._rate_hz
-            turned = _turned(self._shaken, start_s)
-            found = self._waves @ np.vstack([turned.real, turned.imag]).astype(np.float32)
-            square = _square(start_s + self._time_s)[:, None] * self._shaken.step_nm
-            found += (square + self._shaken.static_nm).astype(np.float32)
-            self._first, self._block = first, found.reshape(self._shape)
-            if self._lines is not None:
-                vectors, (before, after) = self._lines.at(first, BLOCK), self._between
-                moved = np.einsum("il,flm->fim", before, vectors[:-1]) + np.einsum("il,flm->fim", after, vectors[1:])
-                self._block[:, :, self._lines.modes] += moved.real
-        row: Single = self._block[index - first]
+        if first not in self._blocks:
+            # The block before is kept: a frame's truth is computed when the next one has been exposed.
+            self._blocks = {before: block for before, block in self._blocks.items() if before == first - BLOCK}
+            self._blocks[first] = self._block(first)
+        row: Single = self._blocks[first][index - first]
         return row
+
+    def _block(self, first: int) -> Single:
+        """Modes (frames, instants, modes) in the periods of the frames from `first` on."""
+        start_s = first / self._rate_hz
+        turned = _turned(self._shaken, start_s)
+        found = self._waves @ np.vstack([turned.real, turned.imag]).astype(np.float32)
+        square = _square(start_s + self._time_s)[:, None] * self._shaken.step_nm
+        found += (square + self._shaken.static_nm).astype(np.float32)
+        block = found.reshape(self._shape)
+        if self._lines is not None:
+            vectors, (before, after) = self._lines.at(first, BLOCK), self._between
+            moved = np.einsum("il,flm->fim", before, vectors[:-1]) + np.einsum("il,flm->fim", after, vectors[1:])
+            block[:, :, self._lines.modes] += moved.real
+        return block
 
 
 def _between(lines: tuple[DampedLine, ...], time_s: Array, period_s: float) -> npt.NDArray[np.complex128]:

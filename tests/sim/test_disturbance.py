@@ -131,6 +131,16 @@ def test_between_two_frames_a_damped_line_goes_on_turning() -> None:
         np.testing.assert_allclose(sampler.at(index), expected.real, atol=1e-4)
 
 
+def test_the_truth_of_a_frame_is_there_when_the_next_block_has_begun(monkeypatch: pytest.MonkeyPatch) -> None:
+    """It is computed after the next exposure: damped lines must not be drawn again from the first frame on."""
+    sampler = Sampler(preset("reaction-wheel"), np.zeros(1), RATE_HZ)
+    monkeypatch.delattr(_Lines, "_restart")
+    for index in range(1, 4 * BLOCK):
+        before = sampler.at(index - 1)
+        sampler.at(index)
+        np.testing.assert_array_equal(sampler.at(index - 1), before)
+
+
 def test_the_lines_phases_of_the_two_axes_differ() -> None:
     shaken = preset(IDEAL)
     tilts = shaken.amplitude_nm[np.isin(shaken.frequency_hz, LINES_HZ), :2]
