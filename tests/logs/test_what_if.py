@@ -152,6 +152,9 @@ def test_a_log_says_what_other_gains_give(logs: dict[str, Path]) -> None:
     assert guess["what_if_nm"] == pytest.approx(run["was_nm"], rel=0.05)
     assert guess["true_what_if_nm"] == pytest.approx(run["true_was_nm"], rel=0.05)
     assert guess["tilt_what_if_mas"] == pytest.approx(run["tilt_was_mas"], rel=0.05)
+    predicted, left = guess["added_contrast_continuous_what_if"], run["added_contrast_continuous_was"]
+    assert predicted == pytest.approx(left, rel=0.1)
+    assert 0 < predicted < 1e-9
     tilt_nm = np.sqrt(np.mean(column(guess, "was")[:2] ** 2))
     assert guess["tilt_was_mas"] == pytest.approx(tilt_nm / tilt_nm_per_mas(2.0), rel=1e-6)
     laws = {key: guess["modes"][2][key] for key in ("name", "gain_was", "gain", "leak_was", "leak")}

@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 
-from lowfc.adapters.files.factory import detector, equivalent_read_noise_e
+from lowfc.adapters.files.factory import contrast_form_of, detector, equivalent_read_noise_e
 from lowfc.adapters.logs.columns import count_reasons
 from lowfc.adapters.logs.history import read_history
 from lowfc.adapters.logs.reader import LogReader
@@ -108,6 +108,7 @@ def compared(run: LoggedRun, what: WhatIf) -> dict[str, Any]:
         ],
         **{f"{name}_nm": float(np.sqrt(np.sum(values**2))) for name, values in columns.items()},
         **_tilt_mas(run, columns),
+        **_contrast(run, columns),
         "warnings": [
             *_doubts_of_log(run),
             *([f"{lost} frames that were used are not in the log: the what-if holds there"] if lost else []),
@@ -157,6 +158,9 @@ def render(figures: dict[str, Any]) -> str:
     rows = [*modes, row("all modes", figures, "{}_nm")]
     if "tilt_was_mas" in figures:
         rows.append(row("tilt per axis, mas", figures, "tilt_{}_mas"))
+    if any(f"added_contrast_{name}" in figures for name in columns):
+        added = (figures.get(f"added_contrast_{name}") for name in columns)
+        rows.append(["contrast, 1e-10", *("" if one is None else f"{1e10 * one:.2f}" for one in added), ""])
     lines = [
         f"{figures['frames_compared']} of {figures['frames']} frames compared: {figures['compared']}, after "
         f"{figures['settling_s']:.2g} s to settle; {figures['frames_refused']} were refused, "
@@ -166,7 +170,8 @@ def render(figures: dict[str, Any]) -> str:
         *table(["residual, nm rms", *(_TITLES[name] for name in columns), "gain"], rows),
         "",
         "measured figures contain the sensor's noise; true: at the start of each exposure; all the "
-        "time: between these instants too, while the mirror holds; a linear sensor, no actuator limits",
+        "time: between these instants too, while the mirror holds; a linear sensor, no actuator limits; contrast: what "
+        "the modes add to the dark zone, each for itself",
         *(f"warning: {warning}" for warning in figures["warnings"]),
     ]
     return "\n".join(lines)
@@ -233,6 +238,15 @@ def _tilt_mas(run: LoggedRun, columns: dict[str, Array]) -> dict[str, float]:
         return {}
     nm_per_mas = tilt_nm_per_mas(run.history.configuration.star.diameter_m)
     return {f"tilt_{name}_mas": float(np.sqrt(np.mean(rms[tilts] ** 2))) / nm_per_mas for name, rms in columns.items()}
+
+
+def _contrast(run: LoggedRun, columns: dict[str, Array]) -> dict[str, float]:
+    """What the true residual at all times adds to the contrast of the dark zone, each mode for itself."""
+    names = [name for name in columns if name.startswith("continuous")]
+    form = contrast_form_of(run.history.configuration, lambda _: None) if run.history.configuration and names else None
+    if form is None or len(form) != len(run.calibration.noll):
+        return {}
+    return {f"added_contrast_{name}": float(np.diag(form) @ columns[name] ** 2) for name in names}
 
 
 def _doubts_of_log(run: LoggedRun) -> list[str]:
