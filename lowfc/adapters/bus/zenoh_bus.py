@@ -124,6 +124,15 @@ class ZenohRing:
             self._subscriber.undeclare()  # type: ignore[no-untyped-call]
 
 
+def receive_in_one_thread() -> None:
+    """Let zenoh's thread that waits for messages read them too, instead of waking another; before the first session.
+
+    Right for a process that waits for what it receives; one that computes meanwhile would hold it up. Its children
+    inherit it.
+    """
+    os.environ.setdefault("ZENOH_RUNTIME", "(rx: (handover: net))")
+
+
 class ZenohBus:
     """One process's zenoh session; see `Bus`.
 
@@ -158,8 +167,7 @@ class ZenohBus:
         self.read = _sample
         self.start_s = links.claim_start(role, clock.start_s)
         if monitor:
-            # zenoh's thread that waits for messages reads them too, instead of waking another
-            os.environ.setdefault("ZENOH_RUNTIME", "(rx: (handover: net))")
+            receive_in_one_thread()
         if links.network.router:
             require_certificate(links.network, role)
         config = zenoh.Config.from_json5(json.dumps(session_config(links, role, monitor=monitor)))

@@ -1,11 +1,12 @@
 """How a process of the loop joins a run: real-time set-up first, then clock, bus and service."""
 
 from lowfc.adapters.bus.run import open_run
-from lowfc.adapters.bus.zenoh_bus import ZenohBus
+from lowfc.adapters.bus.zenoh_bus import ZenohBus, receive_in_one_thread
 from lowfc.adapters.process.clock import Clock, HostClock, SimulatedClock
 from lowfc.adapters.process.realtime import Granted, set_up
 from lowfc.adapters.process.service import Service
 from lowfc.contract.configuration import Configuration
+from lowfc.contract.messages import Role
 
 
 def clock_of(config: Configuration) -> Clock:
@@ -31,6 +32,8 @@ def prepare(config: Configuration, cpus: list[int]) -> Granted:
 def join(config: Configuration, run_id: str, role: str, cpus: list[int]) -> Service:
     """Set this process up for the loop and join a run."""
     granted = prepare(config, cpus)
+    if role != Role.CAMERA:  # which computes while the mirror's states come
+        receive_in_one_thread()
     run = open_run(run_id, (config.mirror.name,), network=config.network)
     clock = clock_of(config)
     return Service(role, run_id, clock, ZenohBus(run.links, role, clock), granted=granted, announces=True)
