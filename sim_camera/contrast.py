@@ -3,15 +3,13 @@
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 
 from lowfc.adapters.files import factory
+from lowfc.arrays import Array, Single
 from lowfc.contract.configuration import Configuration
 from lowfc.optics.chain.added_contrast import contrast_form
 from lowfc.optics.chain.coronagraph import DARK_ZONE
 from lowfc.optics.chain.science_camera import ScienceCamera
-
-Single = npt.NDArray[np.float32]
 
 IMAGES = 200
 """Full images of each that a figure is the mean of, where there were so many frames."""
@@ -43,7 +41,7 @@ class Contrast:
         form: (modes, modes) added contrast per nm^2.
     """
 
-    def __init__(self, pupil: npt.NDArray[np.float64], noll: tuple[int, ...], wavelength_nm: float) -> None:
+    def __init__(self, pupil: Array, noll: tuple[int, ...], wavelength_nm: float) -> None:
         """Prepare the images of a shaped pupil (n, n)."""
         self.form: Single = contrast_form(pupil, noll, wavelength_nm).astype(np.float32)
         half_width = int(np.ceil(DARK_ZONE.outer))
@@ -79,7 +77,6 @@ class Contrast:
 
 
 def contrast_of(config: Configuration) -> Contrast | None:
-    """The contrast of a configuration; None for a coronagraph of which there is no science image yet."""
-    if config.sensor.pupil in ("circle", "prolate"):
-        return None
-    return Contrast(factory.sensor(config, lambda _: None).pupil, config.noll, config.star.wavelength_nm)
+    """The contrast of a configuration; None without a science image."""
+    pupil = factory.science_pupil(config, lambda _: None)
+    return None if pupil is None else Contrast(pupil, config.noll, config.star.wavelength_nm)

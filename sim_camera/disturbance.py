@@ -8,10 +8,8 @@ wander (an Ornstein-Uhlenbeck process): it is drawn frame by frame, so that a la
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 
-Array = npt.NDArray[np.float64]
-Single = npt.NDArray[np.float32]
+from lowfc.arrays import Array, Complex, Single
 
 BLOCK = 8
 """Frames computed at once: cheap, and short enough not to delay a frame."""
@@ -61,7 +59,7 @@ class Disturbance:
 
     noll: tuple[int, ...]
     frequency_hz: Array
-    amplitude_nm: npt.NDArray[np.complex128]
+    amplitude_nm: Complex
     step_nm: Array
     static_nm: Array
     screen_nm: float
@@ -105,7 +103,7 @@ def disturbance(
     tilt_nm = scale * nm_per_mas * tilt
     step, screen = np.zeros(modes), 0.0
     lines: tuple[DampedLine, ...] = ()
-    waves: list[tuple[Array, npt.NDArray[np.complex128]]] = []
+    waves: list[tuple[Array, Complex]] = []
     match preset:
         case "quiet":
             pass
@@ -177,20 +175,20 @@ class _Lines:
         self.modes = np.flatnonzero(rms_nm.any(axis=0))
         self._rms_nm = rms_nm[:, self.modes]
         omega = 2 * np.pi * np.array([line.frequency_hz for line in shaken.lines]) / rate_hz
-        self._damping = np.pi * np.array([line.width_hz for line in shaken.lines]) / rate_hz
-        self._step = np.exp(1j * omega - self._damping)
+        damping = np.pi * np.array([line.width_hz for line in shaken.lines]) / rate_hz
+        self._step = np.exp(1j * omega - damping)
         self._restart()
 
     def _restart(self) -> None:
         self._rng = np.random.Generator(np.random.SFC64(np.random.SeedSequence([self._seed, 4])))
         self._next, self._vector = 0, self._draw(1)[0]
 
-    def _draw(self, count: int) -> npt.NDArray[np.complex128]:
+    def _draw(self, count: int) -> Complex:
         """(count, lines, moved) of the variance that a line has, both parts alike."""
         parts = self._rng.standard_normal((count, *self._rms_nm.shape, 2))
         return np.asarray((parts[..., 0] + 1j * parts[..., 1]) * self._rms_nm)
 
-    def at(self, first: int, count: int) -> npt.NDArray[np.complex128]:
+    def at(self, first: int, count: int) -> Complex:
         """Vectors (count + 1, lines, moved) at the frames from `first` on."""
         if first < self._next:
             self._restart()
@@ -198,10 +196,10 @@ class _Lines:
             self._advance(min(first - self._next, _FRAMES_AT_ONCE))
         return np.asarray(np.concatenate([self._advance(count), self._vector[None]]))
 
-    def _advance(self, count: int) -> npt.NDArray[np.complex128]:
+    def _advance(self, count: int) -> Complex:
         """Vectors (count, lines, moved) from the next frame on."""
         drawn = self._draw(count) * np.sqrt(1 - np.abs(self._step) ** 2)[:, None]
-        found: npt.NDArray[np.complex128] = np.empty_like(drawn)
+        found: Complex = np.empty_like(drawn)
         vector, step = self._vector, self._step[:, None]
         for row in range(count):
             found[row] = vector
@@ -250,7 +248,7 @@ class Sampler:
         return block
 
 
-def _between(lines: tuple[DampedLine, ...], time_s: Array, period_s: float) -> npt.NDArray[np.complex128]:
+def _between(lines: tuple[DampedLine, ...], time_s: Array, period_s: float) -> Complex:
     """How much (2, instants, lines) of a line's vectors at the starts of a period and of the next one is expected."""
     omega = 2j * np.pi * np.array([line.frequency_hz for line in lines])
     damping = np.pi * np.array([line.width_hz for line in lines])
@@ -261,7 +259,7 @@ def _between(lines: tuple[DampedLine, ...], time_s: Array, period_s: float) -> n
     return np.array([before, after])
 
 
-def _turned(shaken: Disturbance, time_s: float) -> npt.NDArray[np.complex128]:
+def _turned(shaken: Disturbance, time_s: float) -> Complex:
     """Amplitudes (waves, modes) with the phases of a time."""
     return np.asarray(shaken.amplitude_nm * np.exp(2j * np.pi * shaken.frequency_hz * time_s)[:, None])
 
@@ -298,9 +296,7 @@ def _radial_degree(noll: int) -> int:
     return int((np.sqrt(8 * noll - 7) - 1) / 2)
 
 
-def _drift(
-    rng: np.random.Generator, rms_nm: Array, band_hz: tuple[float, float]
-) -> tuple[Array, npt.NDArray[np.complex128]]:
+def _drift(rng: np.random.Generator, rms_nm: Array, band_hz: tuple[float, float]) -> tuple[Array, Complex]:
     """Sine waves, evenly spread in the logarithm of frequency, with a power that falls as 1/f^2 per hertz."""
     frequencies = np.geomspace(*band_hz, _WAVES_PER_BAND) * rng.uniform(0.95, 1.05, _WAVES_PER_BAND)
     weights = frequencies**-0.5
@@ -310,11 +306,11 @@ def _drift(
 
 def _lines(
     rng: np.random.Generator, rms: Array, frequencies_hz: tuple[float, ...], unit_nm: Array
-) -> tuple[Array, npt.NDArray[np.complex128]]:
+) -> tuple[Array, Complex]:
     """Sine waves at fixed frequencies; `rms` of each in units of `unit_nm` (modes,)."""
     amplitude = np.sqrt(2) * rms[:, None] * unit_nm
     return np.array(frequencies_hz), amplitude * _phases(rng, amplitude.shape)
 
 
-def _phases(rng: np.random.Generator, shape: tuple[int, int]) -> npt.NDArray[np.complex128]:
+def _phases(rng: np.random.Generator, shape: tuple[int, int]) -> Complex:
     return np.asarray(np.exp(2j * np.pi * rng.random(shape)))

@@ -3,9 +3,8 @@
 from collections import deque
 
 import numpy as np
-import numpy.typing as npt
 
-Single = npt.NDArray[np.float32]
+from lowfc.arrays import Array, Single
 
 
 class MirrorPath:
@@ -27,7 +26,7 @@ class MirrorPath:
         """A shape (rows, columns) was applied, by the `latest` moment; not before the last one."""
         self._moves.append((max(min(moment, latest) + self._delay, self._moves[-1][0]), shape_nm))
 
-    def over(self, start: float, instants: npt.NDArray[np.float64]) -> tuple[list[Single], Single]:
+    def over(self, start: float, instants: Array) -> tuple[list[Single], Single]:
         """Shapes (rows, columns) in force from `start` on, and how much of each (instants, shapes) is there.
 
         `instants` (instants,) are after the start. What came into force before is forgotten, but for the last.

@@ -9,14 +9,12 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
+from lowfc.arrays import Single
 from lowfc.optics.chain.zernike import zernikes
 from lowfc.optics.detector.detector import Detector, expose, laws_of, saturation_dn
 from lowfc.optics.twin.twin import Evaluator, Twin, node_radii, wavefront_rms_nm
 from lowfc.optics.twin.twin_mirror import TwinMirror, wavefront_nm
 from sim_camera.disturbance import Disturbance, Sampler, screen
-
-Single = npt.NDArray[np.float32]
-Array = npt.NDArray[np.float64]
 
 _GAUSS_LEGENDRE = (1 + np.array([-1, 1]) / np.sqrt(3)) / 2
 """Instants of an exposure whose mean is that over it, to third order in time."""

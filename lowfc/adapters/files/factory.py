@@ -61,11 +61,15 @@ def twin(config: Configuration, progress: Progress | None, warn: Callable[[str],
         raise ConfigurationError(f"sensor: {error}") from None
 
 
+def science_pupil(config: Configuration, warn: Callable[[str], None]) -> Array | None:
+    """The shaped pupil (n, n) of the science image; None for a coronagraph of which there is no science image yet."""
+    return None if config.sensor.pupil in ("circle", "prolate") else sensor(config, warn).pupil
+
+
 def contrast_form_of(config: Configuration, warn: Callable[[str], None]) -> Array | None:
-    """See `contrast_form`; None for a coronagraph of which there is no science image yet."""
-    if config.sensor.pupil in ("circle", "prolate"):
-        return None
-    return contrast_form(sensor(config, warn).pupil, config.noll, config.star.wavelength_nm)
+    """See `contrast_form`; None without a science image."""
+    pupil = science_pupil(config, warn)
+    return None if pupil is None else contrast_form(pupil, config.noll, config.star.wavelength_nm)
 
 
 def electrons_per_exposure(config: Configuration) -> float:

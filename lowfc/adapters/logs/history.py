@@ -139,6 +139,12 @@ class History:
         """See `frame_rate_hz`."""
         return frame_rate_hz(self.camera, self.steps)
 
+    @property
+    def exposure_fraction(self) -> float | None:
+        """Exposure over period, of the camera; None where they are not known."""
+        camera = self.camera
+        return camera.exposure_ns / camera.period_ns if camera is not None and camera.period_ns else None
+
     @cached_property
     def true(self) -> Truths | None:
         """The truths by step, NaN for one that has none; None without any."""

@@ -30,8 +30,7 @@ def screen(watch: Watch, config: Configuration, duration_s: float | None, elapse
     table = Table.grid(padding=(0, 2))
     table.add_column(style="dim", justify="right")
     table.add_column()
-    silent_s = watch.silent_s(Role.CAMERA)
-    silent = f"the camera has been silent for {silent_s:.0f} s" if silent_s > SILENT_S and camera.process else ""
+    silent = _silent(watch)
     table.add_row("loop", f"{mode(controller)}, {silent or f'{camera.rate_hz:.0f} Hz of {config.camera.rate_hz:g} Hz'}")
     table.add_row("wavefront", silent or _wavefront(camera))
     table.add_row("frame to command", latency(controller.frame_to_command))
@@ -51,8 +50,8 @@ def status_line(watch: Watch, elapsed_s: float) -> str:
     camera, controller = watch.of(Role.CAMERA), watch.of(Role.CONTROLLER)
     if not camera.HasField("recent_wavefront"):
         return f"{elapsed_s:5.0f} s  no frame yet"
-    if (silent_s := watch.silent_s(Role.CAMERA)) > SILENT_S:
-        return f"{elapsed_s:5.0f} s  {mode(controller)}  the camera has been silent for {silent_s:.0f} s"
+    if silent := _silent(watch):
+        return f"{elapsed_s:5.0f} s  {mode(controller)}  {silent}"
     frames, recent = topic_count(controller, FRAME.key), wavefront(camera.recent_wavefront)
     return (
         f"{elapsed_s:5.0f} s  {mode(controller)}  {camera.rate_hz:6.0f} Hz  "
@@ -60,6 +59,13 @@ def status_line(watch: Watch, elapsed_s: float) -> str:
         f"frame to command {latency(controller.frame_to_command)}  "
         f"skipped {frames.skipped} missing {frames.missing}  {recording(watch.of(Role.RECORDER))}"
     )
+
+
+def _silent(watch: Watch) -> str:
+    """That the camera no longer reports, so that its last figures are old; empty where it does or never did."""
+    silent_s = watch.silent_s(Role.CAMERA)
+    known = bool(watch.of(Role.CAMERA).process)
+    return f"the camera has been silent for {silent_s:.0f} s" if known and silent_s > SILENT_S else ""
 
 
 def _added(recent: dict[str, Any]) -> str:

@@ -81,8 +81,8 @@ def longest_stretch(run: Run) -> Stretch | None:
     if true is not None and np.isfinite(true.residual_nm[rows]).any():
         signals += [true.disturbance_nm[rows], true.residual_nm[rows], true.sensed_nm[rows]]
         left_nm2 = np.nanmean(true.modes_residual_rms_nm[rows].astype(float) ** 2, axis=0)
-        if true.continuous and history.camera is not None and history.camera.period_ns:
-            timing = Timing.of(in_force.delay_frames, history.camera.exposure_ns / history.camera.period_ns)
+        if true.continuous and history.exposure_fraction is not None:
+            timing = Timing.of(in_force.delay_frames, history.exposure_fraction)
     found = pieces(steps.sequence[rows], np.hstack(signals))
     noll = tuple(range(2, 2 + gain.size))
     rate_hz = history.rate_hz or 1.0  # of one step alone none is known, and nothing is reckoned with it

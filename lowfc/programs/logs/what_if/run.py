@@ -95,10 +95,9 @@ class LoggedRun:
         A log in lockstep does not say when a command was applied: then with the exposure that first saw it whole.
         """
         history, delay = self.history, self.delay_frames
-        config = history.configuration or Configuration()
-        exposure = config.camera.exposure_fraction
-        if history.camera is not None and history.camera.period_ns:
-            exposure = history.camera.exposure_ns / history.camera.period_ns
+        exposure = history.exposure_fraction
+        if exposure is None:
+            exposure = (history.configuration or Configuration()).camera.exposure_fraction
         rows = rows_of(history.mirror.sequence, self.steps.sequence)
         known = rows >= 0
         if not known.any() or delay != round(delay):
