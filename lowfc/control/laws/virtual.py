@@ -1,0 +1,51 @@
+"""Virtual integrators: what loops of other gains would leave of the same pseudo-open-loop modes."""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from lowfc.arrays import Single
+
+Weights = tuple[tuple[int, np.float32], ...]
+"""Lag in frames, and how much of that command an exposure sees."""
+
+
+class VirtualIntegrators(NamedTuple):
+    """Integrators beside the real loop, one for each row, that move no mirror.
+
+    A frame's noise is independent of the commands before it. So the difference between the squares of two rows' errors
+    of one frame has the mean of the difference between their true residuals squared, whatever the noise.
+
+    Attributes:
+        gain: (rows, modes); 0 is the open loop.
+        kept: (modes,) 1 - leak.
+        limit_nm: (modes,) largest command, wavefront rms.
+        weights: which commands are seen in an exposure, as those of the loop.
+        history_nm: commands (rows, modes), newest first.
+    """
+
+    gain: Single
+    kept: Single
+    limit_nm: Single
+    weights: Weights
+    history_nm: tuple[Single, ...]
+
+    @classmethod
+    def at_rest(cls, gain: Single, kept: Single, limit_nm: Single, weights: Weights) -> "VirtualIntegrators":
+        """With nothing commanded yet."""
+        lags = 1 + max(lag for lag, _ in weights)
+        return cls(gain, kept, limit_nm, weights, (np.zeros_like(gain),) * lags)
+
+    def followed(self, pol_nm: Single) -> tuple["VirtualIntegrators", Single]:
+        """One frame later; and the errors (rows, modes) that the frame would have shown, nm of wavefront rms."""
+        error_nm = np.broadcast_to(pol_nm, self.gain.shape)
+        for lag, weight in self.weights:
+            error_nm = error_nm + (self.history_nm[lag] if weight == 1 else weight * self.history_nm[lag])
+        wanted_nm = self.kept * self.history_nm[0] - self.gain * error_nm
+        np.clip(wanted_nm, -self.limit_nm, self.limit_nm, out=wanted_nm)
+        return self._replace(history_nm=(wanted_nm, *self.history_nm[:-1])), error_nm
+
+    def held(self, frames: int = 1) -> "VirtualIntegrators":
+        """Some frames later, of which nothing was measured: as the loop's, the commands stay."""
+        held = self.history_nm[:1] * min(frames, len(self.history_nm))
+        return self._replace(history_nm=(held + self.history_nm)[: len(self.history_nm)])

@@ -1,0 +1,50 @@
+"""Virtual integrators against the loop that they stand for."""
+
+import numpy as np
+
+from lowfc.control.laws.law import Law, integrate
+from lowfc.control.laws.stability import delay_weights
+from lowfc.control.laws.virtual import VirtualIntegrators
+
+
+def test_each_row_is_the_loop_of_its_gain() -> None:
+    rng = np.random.default_rng(1)
+    weights = tuple((lag, weight) for lag, weight in enumerate(delay_weights(1.5).astype(np.float32)) if weight)
+    gain = np.array([[0, 0], [0.1, 0.4], [0.3, 0.2]], np.float32)
+    leak, limit = np.array([0, 0.01], np.float32), np.array([2.0, 100], np.float32)
+    rows = VirtualIntegrators.at_rest(gain, 1 - leak, limit, weights)
+    laws, commands = [Law(row, leak, limit) for row in gain], [[np.zeros(2, np.float32)] * 2 for _ in gain]
+    for frame in range(200):
+        if frame % 50 == 7:  # missing: the command is held
+            rows = rows.held()
+            commands = [[newest, newest] for newest, _ in commands]
+            continue
+        pol = rng.normal(0, 3, 2).astype(np.float32)
+        rows, errors = rows.followed(pol)
+        for row, law in enumerate(laws):
+            newest, older = commands[row]
+            error = pol + np.float32(0.5) * newest + np.float32(0.5) * older
+            np.testing.assert_allclose(errors[row], error, atol=1e-4)
+            commands[row] = [integrate(law, newest, error)[0], newest]
+        np.testing.assert_allclose(rows.history_nm[0], [newest for newest, _ in commands], atol=1e-4)
+
+
+def test_the_difference_of_squares_is_that_of_the_true_residuals_whatever_the_noise() -> None:
+    """Of 20,000 frames of a slow drift under noise ten times its size."""
+    rng = np.random.default_rng(2)
+    gain = np.array([0, 0.02, 0.5], np.float32)[:, None] * np.ones((1, 40), np.float32)
+    ones = np.ones(40, np.float32)
+    weights = ((0, np.float32(1)),)
+    rows = VirtualIntegrators.at_rest(gain, ones, 1e9 * ones, weights)
+    drift = np.cumsum(rng.normal(0, 0.05, (20_000, 40)), axis=0).astype(np.float32)
+    measured, true = np.zeros((3, 40)), np.zeros((3, 40))
+    for disturbance in drift:
+        noise = rng.normal(0, 30, 40).astype(np.float32)
+        residual = disturbance + rows.history_nm[0]
+        rows, errors = rows.followed(disturbance + noise)
+        measured += errors**2 - errors[0] ** 2
+        true += residual**2 - residual[0] ** 2
+    difference = (measured - true)[1:].mean(axis=1) / len(drift)
+    spread = (measured - true)[1:].std(axis=1) / len(drift) / np.sqrt(40)
+    assert (np.abs(difference) < 4 * spread).all()
+    assert (true[1] < 0).mean() > 0.5 and (true[2] > 0).all()  # the low gain corrects, the high one adds noise
