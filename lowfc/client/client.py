@@ -17,6 +17,7 @@ from lowfc.adapters.bus.names import Names
 from lowfc.adapters.bus.run import DEFAULT_RUN, open_run
 from lowfc.adapters.bus.zenoh_bus import ZenohBus
 from lowfc.adapters.process.clock import HostClock
+from lowfc.adapters.process.host import by_this_process, program_name
 from lowfc.client.answer import Answer
 from lowfc.client.lease import Lease
 from lowfc.client.mirror_watch import MirrorWatch
@@ -89,6 +90,7 @@ class Client:
             BusError: there is no such run, none at all, or more than one to choose from.
         """
         self.run_id = the_run(run) if bus is None else run or DEFAULT_RUN
+        self._requester = by_this_process(program_name())
         self._own = None
         if bus is None:
             bus = self._own = ZenohBus(open_run(self.run_id, ()).links, Role.OPERATOR, HostClock())
@@ -313,6 +315,7 @@ class Client:
                 columns=0 if table is None else table.shape[1],
                 law=None if law is None else wire_law(law),
                 lease_id=(self._lease.id if self._lease is not None else 0) if lease_id is None else lease_id,
+                requester=self._requester,
             )
         except (ValueError, TypeError) as fault:
             raise RequestRefusedError(f"{name} refused: {fault}") from None

@@ -1,13 +1,13 @@
 """The loop reserved for one client, renewed by a thread of its own for as long as it is needed."""
 
 import contextlib
-import os
 import secrets
 import threading
 import time
 from collections.abc import Callable
 from typing import TYPE_CHECKING
 
+from lowfc.adapters.process.host import by_this_process
 from lowfc.contract.errors import BusError, CalibrationError, LowfcError, RequestRefusedError
 
 if TYPE_CHECKING:
@@ -43,9 +43,7 @@ class Lease:
         """
         self.id = secrets.randbits(63) | 1
         self._ask = ask
-        import psutil
-
-        self._purpose = f"{purpose} by {psutil.Process().username()} (process {os.getpid()})"
+        self._purpose = by_this_process(purpose)
         self._end_s = None if duration_s is None else time.monotonic() + duration_s
         self._ended = ""
         self._turn = threading.Lock()

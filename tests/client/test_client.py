@@ -139,6 +139,20 @@ def test_every_request_has_its_method() -> None:
     assert {wanted.name for _, wanted in ASKS} == set(REQUESTS)
 
 
+def test_every_request_names_its_sender(controller: FakeController, loop: Client) -> None:
+    loop.safe()
+    (asked,) = controller.asked
+    assert asked.requester.endswith(f"(process {os.getpid()})")
+    logged = wire.Request.FromString(codec.encode_request(asked, controller.reply, 1, None))
+    assert logged.requester == asked.requester
+    kept = codec.requester_alone(wire.Request(text="\0" * 5000, requester="ann").SerializeToString())
+    assert kept == wire.Request(requester="ann").SerializeToString()
+    assert codec.requester_alone(b"\xff" * 9000) == b""
+    assert codec.decode_request(wire.Request(requester="a\n" * 200).SerializeToString(), "open", 0).requester == (
+        "a\\n" * 50
+    )
+
+
 def test_a_reservation_is_renewed_and_every_request_of_its_holder_carries_it(controller: FakeController) -> None:
     loop = controller.join()
     with loop.reserved("a test", 30.0) as lease:

@@ -6,6 +6,7 @@ A reading raises OSError where there is nothing to read, and ValueError or Looku
 import ctypes
 import os
 import resource
+import sys
 from pathlib import Path
 from typing import NamedTuple
 
@@ -127,3 +128,15 @@ class Timex(ctypes.Structure):
         ("status", ctypes.c_int),
         ("rest", ctypes.c_long * 32),
     )
+
+
+def program_name() -> str:
+    """The program of this process as people know it: `lowfc ctl`, or the name of a script."""
+    program = Path(sys.argv[0])
+    name = program.parent.name if program.stem == "__main__" else program.name
+    return " ".join([name, *sys.argv[1:2]]) if name == "lowfc" else name or "python"
+
+
+def by_this_process(what: str) -> str:
+    """What is done, with the user and process that do it: `lowfc ctl by ann (process 12)`."""
+    return f"{what} by {psutil.Process().username()} (process {os.getpid()})"

@@ -20,6 +20,7 @@ from lowfc.contract.messages import (
     timestamp,
     wire,
 )
+from lowfc.contract.printable import printable
 from lowfc.control.calibration.calibration import Calibration
 from lowfc.control.laws.linear_law import LinearLaw
 from lowfc.control.loop.camera import CameraSettings
@@ -205,6 +206,8 @@ def _mirror_shape(state: wire.MirrorState) -> MirrorShape | None:
 MOST_BYTES = 16_000_000
 """Of any request; the bus loses one that is far larger."""
 _SMALL_BYTES = 8_000
+MOST_REQUESTER = 100
+"""Characters of a sender's name that are kept."""
 _MOST_BYTES = {
     "channel": 4 * 128 * 128 + _SMALL_BYTES,
     "note": 4 * MOST_TEXT + _SMALL_BYTES,
@@ -217,6 +220,14 @@ _MOST_BYTES = {
 def most_bytes(name: str) -> int:
     """Size that a request of this name may have; a larger one is refused before it is decoded."""
     return _MOST_BYTES.get(name, _SMALL_BYTES)
+
+
+def requester_alone(payload: bytes) -> bytes:
+    """A request of which nothing but its sender is kept, whatever it is."""
+    try:
+        return wire.Request(requester=wire.Request.FromString(payload[:_SMALL_BYTES]).requester).SerializeToString()
+    except DecodeError:
+        return b""
 
 
 def decode_request(payload: bytes, name: str, time_ns: int) -> Request:
@@ -268,6 +279,7 @@ def request(
         law_of(message.law, laws) if message.HasField("law") else None,
         calibration,
         lease_id=message.lease_id,
+        requester=printable(message.requester[:MOST_REQUESTER]),
     )
 
 
@@ -294,6 +306,7 @@ def encode_request(request: Request, reply: Reply, taken: int, state: wire.Contr
         law=None if request.law is None else (law_header if request.prepared else wire_law)(request.law),
         play_id="" if played is None else played.id,
         lease_id=request.lease_id,
+        requester=request.requester,
         calibration=None if request.calibration is None else wire.Calibration(id=request.calibration.id),
     )
     return message.SerializeToString()

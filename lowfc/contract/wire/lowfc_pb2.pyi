@@ -408,7 +408,7 @@ class Lease(_message.Message):
     def __init__(self, id: _Optional[int] = ..., holder: _Optional[str] = ..., until: _Optional[_Union[datetime.datetime, _timestamp_pb2.Timestamp, _Mapping]] = ..., last_sequence: _Optional[int] = ..., ended: _Optional[str] = ...) -> None: ...
 
 class Request(_message.Message):
-    __slots__ = ("timestamp", "name", "modes", "values", "text", "accepted", "reply", "frame_sequence", "state", "input_number", "actuators", "table", "columns", "law", "calibration", "play_id", "lease_id")
+    __slots__ = ("timestamp", "name", "modes", "values", "text", "accepted", "reply", "frame_sequence", "state", "input_number", "actuators", "table", "columns", "law", "calibration", "play_id", "lease_id", "requester")
     TIMESTAMP_FIELD_NUMBER: _ClassVar[int]
     NAME_FIELD_NUMBER: _ClassVar[int]
     MODES_FIELD_NUMBER: _ClassVar[int]
@@ -426,6 +426,7 @@ class Request(_message.Message):
     CALIBRATION_FIELD_NUMBER: _ClassVar[int]
     PLAY_ID_FIELD_NUMBER: _ClassVar[int]
     LEASE_ID_FIELD_NUMBER: _ClassVar[int]
+    REQUESTER_FIELD_NUMBER: _ClassVar[int]
     timestamp: _timestamp_pb2.Timestamp
     name: str
     modes: _containers.RepeatedScalarFieldContainer[int]
@@ -443,7 +444,8 @@ class Request(_message.Message):
     calibration: Calibration
     play_id: str
     lease_id: int
-    def __init__(self, timestamp: _Optional[_Union[datetime.datetime, _timestamp_pb2.Timestamp, _Mapping]] = ..., name: _Optional[str] = ..., modes: _Optional[_Iterable[int]] = ..., values: _Optional[_Iterable[float]] = ..., text: _Optional[str] = ..., accepted: _Optional[bool] = ..., reply: _Optional[str] = ..., frame_sequence: _Optional[int] = ..., state: _Optional[_Union[ControllerState, _Mapping]] = ..., input_number: _Optional[int] = ..., actuators: _Optional[bytes] = ..., table: _Optional[bytes] = ..., columns: _Optional[int] = ..., law: _Optional[_Union[LinearLaw, _Mapping]] = ..., calibration: _Optional[_Union[Calibration, _Mapping]] = ..., play_id: _Optional[str] = ..., lease_id: _Optional[int] = ...) -> None: ...
+    requester: str
+    def __init__(self, timestamp: _Optional[_Union[datetime.datetime, _timestamp_pb2.Timestamp, _Mapping]] = ..., name: _Optional[str] = ..., modes: _Optional[_Iterable[int]] = ..., values: _Optional[_Iterable[float]] = ..., text: _Optional[str] = ..., accepted: _Optional[bool] = ..., reply: _Optional[str] = ..., frame_sequence: _Optional[int] = ..., state: _Optional[_Union[ControllerState, _Mapping]] = ..., input_number: _Optional[int] = ..., actuators: _Optional[bytes] = ..., table: _Optional[bytes] = ..., columns: _Optional[int] = ..., law: _Optional[_Union[LinearLaw, _Mapping]] = ..., calibration: _Optional[_Union[Calibration, _Mapping]] = ..., play_id: _Optional[str] = ..., lease_id: _Optional[int] = ..., requester: _Optional[str] = ...) -> None: ...
 
 class MirrorCommand(_message.Message):
     __slots__ = ("timestamp", "frame_sequence", "channel", "valid_for_ns", "rows", "columns", "actuators", "command_nm", "input_number", "safe", "clear_id")

@@ -48,6 +48,7 @@ class Request:
         refusal: why it is refused whatever the state of the loop.
         prepared: it has been checked for what needs no state; see `lowfc.control.loop.requests.prepared`.
         lease_id: of the lease under which it is asked for, or that is asked for; 0 for none.
+        requester: user and program that ask, for people.
     """
 
     time_ns: int
@@ -63,6 +64,7 @@ class Request:
     refusal: str = ""
     prepared: bool = field(default=False, compare=False)
     lease_id: int = 0
+    requester: str = field(default="", compare=False)
 
 
 @dataclass(frozen=True, slots=True)
