@@ -99,6 +99,7 @@ def test_a_port_in_use(tmp_path: Path) -> None:
 def test_nobody_is_there(tmp_path: Path) -> None:
     _refused(tmp_path, "ctl", "status", expected="lowfc was searched")
     _refused(tmp_path, "ctl", "status", "--run", "none-such", expected="there is no run 'none-such': no loop of user")
+    _refused(tmp_path, "ctl", "--run", "none-such", "record", "stop", expected="there is no run 'none-such'")
     _refused(tmp_path, "ctl", "gain", "often", expected="'often' is not a number")
     _refused(tmp_path, "config", "check", "none.toml", expected="none.toml")
     _refused(tmp_path, "sim-lop", expected="sim-lop")
@@ -177,8 +178,9 @@ def test_a_loop_that_is_starting_is_there_for_others(own_runtime: Path, monkeypa
             done = lowfc("ctl", "open")
             listed = json.loads(lowfc("runs", "--json").stdout)["runs"]
             found.extend([str(done.exception), [(one["run"], one["mode"]) for one in listed]])
-        with pytest.raises(BusError, match="run 'night' is running already"):
-            sim_loop.sim_loop(config, 1.0, record=False, name="night")
+        done = lowfc("sim-loop", "--run", "night")
+        assert "run 'night' is running already" in str(done.exception)
+        assert "recording into" not in done.stderr
         raise BusError("enough")
 
     monkeypatch.setattr(sim_loop, "prepare", meanwhile)

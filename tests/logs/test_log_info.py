@@ -7,7 +7,7 @@ import pytest
 
 from lowfc.adapters.bus.bus import Sample
 from lowfc.adapters.logs.recovery import no_end, recover, recovered_path
-from lowfc.adapters.logs.writer import Attachment, LogWriter
+from lowfc.adapters.logs.writer import Attachment, LogWriter, being_recorded
 from lowfc.contract.envelope import sequence_of
 from lowfc.contract.errors import DataFileError
 from lowfc.contract.events import EVENTS
@@ -154,6 +154,13 @@ def test_a_log_that_is_being_recorded_says_so_and_is_not_recovered(tmp_path: Pat
     assert json.loads(lowfc("info", log.part, "--json").stdout)["state"] == "truncated"
     assert "it was cut off" in no_end([log.part], finished=False)
     assert recover(log.part, recovered_path(log.part)).recovered == recovered_path(log.part)
+
+
+def test_a_log_that_is_finished_while_it_is_read_was_not_cut_off(tmp_path: Path) -> None:
+    log = LogWriter(tmp_path / "20270101T000000Z.mcap", START_NS, {"lowfc": {"run": "night"}})
+    log.finish({})
+    assert "it was finished while it was read" in no_end([log.part], finished=False)
+    assert being_recorded(log.part), "for a summary of what had been read"
 
 
 def test_an_empty_log_is_a_log(tmp_path: Path) -> None:

@@ -12,8 +12,9 @@ import pytest
 
 from lowfc.adapters.logs.recovery import recover
 from lowfc.contract.errors import ConfigurationError, DataFileError
-from lowfc.contract.messages import CONTROLLER_STATE, EVENT, FRAME, REQUEST, Log, wire
+from lowfc.contract.messages import CALIBRATION, CONTROLLER_STATE, EVENT, FRAME, REQUEST, Log, wire
 from lowfc.control.laws.error_budget import sensor_noise
+from lowfc.control.loop.state import State
 from lowfc.optics.detector.photometry import tilt_nm_per_mas
 from lowfc.programs.logs.report import closed_loop
 from lowfc.programs.logs.report.figures import report_of
@@ -275,6 +276,17 @@ def test_a_log_of_an_open_loop_has_neither_spectra_nor_budget(tmp_path: Path) ->
     assert found["residual"]["total_rms_nm"]["open_error"] > 5
     assert found["residual"]["total_rms_nm"]["error"] is None
     assert found["verdict"]["level"] == "unknown"
+
+
+def test_a_loop_without_a_calibration_left_no_residual(tmp_path: Path) -> None:
+    night = Night()
+    night.samples = [sample for sample in night.samples if sample.key != CALIBRATION.key]
+    night._state = State()
+    night.frames(300)
+    found = figures(night.write(tmp_path / "x.mcap"))
+    assert found["mode_steps"] == {"idle": 300}
+    check = found["verdict"]["checks"][2]
+    assert (check["level"], check["text"]) == ("unknown", "the loop was not closed in this log")
 
 
 def test_a_loop_closed_under_an_unknown_law_is_not_called_open(tmp_path: Path) -> None:

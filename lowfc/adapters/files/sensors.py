@@ -112,8 +112,9 @@ def _layout(name: str) -> sams.Layout:
     try:
         return load_layout(name)
     except ConfigurationError as error:  # on the command line sensors and layouts share an option
-        slip = nearest(name, SENSORS)
-        raise ConfigurationError(f"{error}; nor is it a sensor{slip}" if slip else str(error)) from None
+        if name.partition(":")[0].endswith(".json"):
+            raise
+        raise ConfigurationError(f"{error}; nor is it a sensor{nearest(name, SENSORS)}; {', '.join(SENSORS)}") from None
 
 
 def _pupil(section: SensorSection) -> Array:

@@ -76,7 +76,7 @@ def recover(source: Path, out: Path, progress: Callable[[int, int], None] | None
     Raises:
         DataFileError: `source` is no log or is being recorded, `out` is there already, or the disk refuses.
     """
-    if being_recorded(source):
+    if source.exists() and being_recorded(source):
         raise DataFileError(f"{source} is being recorded, and nothing is lost: `lowfc ctl record stop` finishes it")
     if out.exists():
         raise DataFileError(f"{out} exists already; a log is never overwritten; name another one with --out")
@@ -123,7 +123,9 @@ def no_end(paths: Sequence[Path], *, finished: bool) -> str:
     if finished:
         return ""
     if any(map(being_recorded, paths)):
-        return "the log has no end: it is being recorded, and `lowfc ctl record stop` finishes it"
+        if all(path.exists() for path in paths):
+            return "the log has no end: it is being recorded, and `lowfc ctl record stop` finishes it"
+        return "the log has no end: it was finished while it was read; read it again"
     return "the log has no end: it was cut off, as when its recorder is killed"
 
 

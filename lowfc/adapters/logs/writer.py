@@ -183,8 +183,9 @@ class LogWriter:
             self._writer.finish()  # type: ignore[no-untyped-call]
             self._file.flush()
             os.fsync(self._raw.fileno())
-            self._file.close()
+            self.bytes_written = self._raw.size
             self.part.rename(self.path)
+            self._file.close()  # in this order: a file that is being recorded is locked until it has its name
         except OSError as fault:
             raise self._refused(fault) from fault
         with contextlib.suppress(OSError):  # not every file system has this for folders
@@ -244,12 +245,14 @@ class LogWriter:
 
 
 def being_recorded(path: Path) -> bool:
-    """Whether a recorder is writing this log: it holds a lock on the file until it ends, in whatever way."""
+    """Whether a recorder is writing this log, or was until now: it locks the file until it ends, in whatever way."""
     try:
         with path.open("rb") as file:
             fcntl.flock(file, fcntl.LOCK_SH | fcntl.LOCK_NB)
     except BlockingIOError:
         return True
+    except FileNotFoundError:  # finished since its name was looked up
+        return path.name.endswith(UNFINISHED) and path.with_name(path.name.removesuffix(UNFINISHED)).exists()
     except OSError:  # reading it raises this again
         return False
     return False

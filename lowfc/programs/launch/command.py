@@ -39,7 +39,6 @@ def sim_loop(
     from lowfc.adapters.process.realtime import spread
     from lowfc.adapters.viewer.rerun_viewer import Show, has_screen
     from lowfc.contract.sections import sensor_keys
-    from lowfc.programs.core.recording.volume import outlook
     from lowfc.programs.core.start_up import check_files
     from lowfc.programs.launch.sim_loop import sim_loop as run
     from lowfc.programs.launch.status import summary_text
@@ -62,8 +61,6 @@ def sim_loop(
         raise ConfigurationError("a view is in one place: choose --view or --web")
     if has_screen() and not (view_ or web):
         typer.echo("to look at it: lowfc view", err=True)
-    if not no_record:
-        typer.echo(outlook(settings), err=True)
     show = Show.NATIVE if view_ else Show.WEB if web else None
     figures = run(settings, duration, not no_record, show, name)
     put(figures, summary_text(figures), as_json=as_json)

@@ -171,6 +171,14 @@ ctl_app.command()(dark)
 ctl_app.command()(reference)
 
 
+@ctl_app.callback()
+def _of_run(context: typer.Context, run: AnyRun = None) -> None:
+    """Take --run before the request too."""
+    given = {"run": run}
+    names = [*BY_NAME, "record", dark.__name__, reference.__name__]
+    context.default_map = {key: {**given, "start": given, "stop": given} for key in names}
+
+
 def _joined(run: str | None) -> "Client":
     from lowfc.client import Client
 

@@ -76,7 +76,7 @@ def _residual(figures: Figures) -> Figures:
     if true and all(pupil_nm):
         before_nm, after_nm = pupil_nm
         over = "over the open pupil"
-    if before_nm is None or after_nm is None:
+    if before_nm is None or after_nm is None or not figures["mode_steps"].get("closed"):
         why = figures["error_budget"].get("why_not", "no good frame with the loop closed is in this log")
         return _check("residual", UNKNOWN, why)
     text = f"{before_nm:.3g} nm before, {after_nm:.3g} nm after {over}"
