@@ -1,0 +1,1 @@
+"""ImageStreamIO streams: images in shared memory, as milk and CACAO exchange them."""

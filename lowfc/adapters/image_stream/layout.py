@@ -1,0 +1,145 @@
+"""Layout of an ImageStreamIO stream, version 2.00: what lies where in its file.
+
+It is that of `ImageStruct.h` in milk-org/ImageStreamIO. Everything here is arithmetic on a copy of the header.
+"""
+
+from math import prod
+from typing import NamedTuple
+
+import numpy as np
+
+VERSION = "2.00"
+HEADER_BYTES = 384
+DAO_HEADER_BYTES = 4496
+"""Of a library that was built with DAO_COMPAT, under the same version."""
+SEMAPHORE_BYTES = 32
+_TIME = ("<i8", 2)  # seconds, nanoseconds
+
+HEADER = np.dtype(
+    {
+        "names": [
+            *("version", "name", "axes", "size", "elements", "type", "kind", "created", "accessed", "atime"),
+            *("writetime", "creator", "owner", "shared", "inode", "location", "semaphores", "traces", "cnt0", "cnt1"),
+            *("write", "keywords", "ring", "ring_index", "ring_cycle", "data_bytes"),
+        ],
+        "formats": [
+            *("S32", "S80", "u1", ("<u4", 3), "<u8", "u1", "<u8", _TIME, _TIME, _TIME),
+            *(_TIME, "<i4", "<i4", "u1", "<u8", "i1", "<u2", "<u2", "<u8", "<u8"),
+            *("u1", "<u2", "<u4", "<u4", "<u8", "<u8"),
+        ],
+        "offsets": [
+            *(0, 32, 112, 116, 128, 136, 144, 152, 168, 184),
+            *(200, 216, 220, 224, 232, 240, 258, 260, 264, 272),
+            *(288, 290, 292, 296, 304, 312),
+        ],
+        "itemsize": HEADER_BYTES,
+    }
+)
+KEYWORD = np.dtype(
+    {
+        "names": ["name", "type", "integer", "real", "text"],
+        "formats": ["S16", "S1", "<i8", "<f8", "S16"],
+        "offsets": [0, 16, 24, 24, 24],
+        "itemsize": 128,
+    }
+)
+TYPES = {
+    number: np.dtype(name)
+    for number, name in enumerate(("u1", "i1", "<u2", "<i2", "<u4", "<i4", "<u8", "<i8", "<f4", "<f8"), start=1)
+}
+NUMBERS = {dtype: number for number, dtype in TYPES.items()}
+MATRIX = 2
+"""Kind of a stream without a time axis, as the library's own function makes it."""
+_TIME_AXIS, _TIME_MASK = 0x20001, 0xF000F
+
+
+class Layout(NamedTuple):
+    """Where the parts of a stream are.
+
+    Attributes:
+        dtype: of a pixel.
+        shape: (planes, rows, columns); more than one plane only where each image goes to the next plane.
+        keywords: how many there are; `semaphores` likewise.
+        ring: images in the circular buffer beside the data.
+        starts: first byte of each part, by its name.
+        file_bytes: of the whole file.
+    """
+
+    dtype: np.dtype[np.generic]
+    shape: tuple[int, int, int]
+    keywords: int
+    semaphores: int
+    ring: int
+    starts: dict[str, int]
+    file_bytes: int
+
+    @classmethod
+    def of(cls, header: np.void, file_bytes: int) -> "Layout":
+        """The layout that a header declares, for a file of that size.
+
+        Raises:
+            ValueError: it is not this layout, with what was found in place of what.
+        """
+        version = header["version"].partition(b"\0")[0].decode("ascii", "backslashreplace")
+        if version != VERSION:
+            raise ValueError(f"has layout version {version!r}, expected {VERSION!r}")
+        axes, size = int(header["axes"]), [int(one) for one in header["size"]]
+        dtype = TYPES.get(int(header["type"]))
+        if dtype is None:
+            raise ValueError(f"has pixels of type {header['type']}, expected 1 to 10 (integer, float or double)")
+        if axes not in (2, 3) or not all(size[:axes]):
+            raise ValueError(f"has {axes} axes of {size}, expected columns x rows, or columns x rows x planes")
+        in_time = int(header["kind"]) & _TIME_MASK == _TIME_AXIS
+        columns, rows, planes = size[0], size[1], size[2] if axes == 3 else 1
+        if planes > 1 and not in_time:
+            raise ValueError(f"is a cube of {planes} planes, expected images one after the other")
+        if header["location"] != -1 or header["shared"] != 1:
+            raise ValueError(f"is in the memory of graphics card {header['location']}, expected shared memory")
+        elements, data_bytes = planes * rows * columns, planes * rows * columns * dtype.itemsize
+        if int(header["elements"]) != elements or int(header["data_bytes"]) != data_bytes:
+            raise ValueError(
+                f"declares {header['elements']} pixels in {header['data_bytes']} bytes, expected {elements} in "
+                f"{data_bytes}"
+            )
+        counts = (int(header[name]) for name in ("keywords", "semaphores", "traces", "ring"))
+        layout = cls.made(dtype, (planes, rows, columns), *counts, in_time=in_time and axes == 3)
+        if layout.file_bytes != file_bytes:
+            dao = file_bytes - layout.file_bytes == DAO_HEADER_BYTES - HEADER_BYTES
+            built = "a library built with DAO_COMPAT wrote it" if dao else "a library built with other options wrote it"
+            raise ValueError(f"has {file_bytes} bytes, expected {layout.file_bytes}: {built}")
+        return layout
+
+    @classmethod
+    def made(
+        cls,
+        dtype: np.dtype[np.generic],
+        shape: tuple[int, int, int],
+        keywords: int,
+        semaphores: int,
+        traces: int,
+        ring: int,
+        *,
+        in_time: bool = False,
+    ) -> "Layout":
+        """The layout of a stream with these numbers of everything."""
+        data_bytes, numbers = prod(shape) * dtype.itemsize, 4 * semaphores
+        parts = {
+            "header": HEADER_BYTES,
+            "data": data_bytes,
+            "keywords": KEYWORD.itemsize * keywords,
+            "semaphores": SEMAPHORE_BYTES * semaphores,
+            "log": SEMAPHORE_BYTES,
+            "readers": numbers,
+            "writers": numbers,
+            "control": numbers,
+            "status": numbers,
+            "traces": 64 * traces,
+            "times": (8 * (-(-16 * shape[0] // 8)) * 2 + 8 * shape[0]) if in_time else 0,
+            "ring_headers": 48 * ring,
+            "ring": data_bytes * ring,
+        }
+        starts, end = {}, 0
+        for name, length in parts.items():
+            starts[name] = end
+            end += -(-length // 8) * 8
+        return cls(dtype, shape, keywords, semaphores, ring, starts, end)

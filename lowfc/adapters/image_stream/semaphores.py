@@ -1,0 +1,67 @@
+"""POSIX semaphores inside a mapping, by the C library's own functions."""
+
+import ctypes
+import errno
+import mmap
+import time
+
+from lowfc.adapters.image_stream.layout import SEMAPHORE_BYTES
+
+MOST = 10
+"""Value from which on a semaphore is not posted: its reader is behind, or there is none."""
+
+_LIBC = ctypes.CDLL(None, use_errno=True)
+_FIXED = slice(8, 12)  # of a semaphore: shared between processes or not, which no wait and no post changes
+
+
+class _TimeSpec(ctypes.Structure):
+    _fields_ = (("seconds", ctypes.c_long), ("nanoseconds", ctypes.c_long))
+
+
+class Semaphores:
+    """Some semaphores side by side."""
+
+    def __init__(self, mapping: mmap.mmap, start: int, count: int) -> None:
+        """Those that begin at byte `start` of the mapping, which is kept for as long as this is."""
+        self._memory = (ctypes.c_char * (SEMAPHORE_BYTES * count)).from_buffer(mapping, start)
+        first = ctypes.addressof(self._memory)
+        self._addresses = [ctypes.c_void_p(first + SEMAPHORE_BYTES * index) for index in range(count)]
+        self._value = ctypes.c_int()
+        self._end = _TimeSpec()
+
+    def initialise(self) -> None:
+        """Make them, at zero, for all processes."""
+        for address in self._addresses:
+            _LIBC.sem_init(address, 1, 0)
+
+    def usable(self) -> bool:
+        """Whether they are as this C library makes them; it would end the process over others."""
+        fresh = ctypes.create_string_buffer(SEMAPHORE_BYTES)
+        _LIBC.sem_init(fresh, 1, 0)
+        memory = self._memory.raw
+        starts = range(0, len(memory), SEMAPHORE_BYTES)
+        return all(memory[start : start + SEMAPHORE_BYTES][_FIXED] == fresh.raw[_FIXED] for start in starts)
+
+    def value(self, index: int) -> int:
+        """How often it was posted and not waited for."""
+        _LIBC.sem_getvalue(self._addresses[index], ctypes.byref(self._value))
+        return self._value.value
+
+    def wait(self, index: int, timeout_s: float) -> bool:
+        """Wait for a post; False where none came in time, or a signal did."""
+        end_ns = time.monotonic_ns() + int(timeout_s * 1e9)
+        self._end.seconds, self._end.nanoseconds = divmod(end_ns, 1_000_000_000)
+        return bool(_LIBC.sem_clockwait(self._addresses[index], time.CLOCK_MONOTONIC, ctypes.byref(self._end)) == 0)
+
+    def drain(self, index: int) -> None:
+        """Take all posts that nobody has waited for."""
+        for _ in range(self.value(index)):
+            if _LIBC.sem_trywait(self._addresses[index]) and ctypes.get_errno() == errno.EAGAIN:
+                return
+
+    def post(self, index: int) -> bool:
+        """Post it, unless its reader is too far behind; returns whether it did."""
+        if self.value(index) >= MOST:
+            return False
+        _LIBC.sem_post(self._addresses[index])
+        return True

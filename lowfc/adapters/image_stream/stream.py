@@ -1,0 +1,273 @@
+"""One ImageStreamIO stream, mapped: opened or created, read and written within its bounds."""
+
+import mmap
+import os
+import stat
+import tempfile
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import psutil
+
+from lowfc.adapters.image_stream.layout import HEADER, HEADER_BYTES, KEYWORD, MATRIX, NUMBERS, VERSION, Layout
+from lowfc.adapters.image_stream.semaphores import Semaphores
+from lowfc.contract.errors import LowfcError
+
+SEMAPHORES = 10
+"""Of a stream that is created here; as the C library makes them, as are the numbers below."""
+TRACES = 10
+_LONGEST_NAME = 79
+_MODE = 0o666
+_NS = 1_000_000_000
+
+
+class StreamError(LowfcError):
+    """A stream that cannot be used."""
+
+
+class StreamAbsentError(StreamError):
+    """There is no such stream, or it is just being made."""
+
+
+def stream_path(name: str) -> Path:
+    """File of a stream: in $MILK_SHM_DIR, /milk/shm or /tmp, whichever is the first that is there."""
+    if not 0 < len(name) <= _LONGEST_NAME or not name.isprintable() or "/" in name:
+        raise StreamError(f"a stream's name has 1 to {_LONGEST_NAME} characters without '/', got {name!r}")
+    folders = (Path(one) for one in (os.environ.get("MILK_SHM_DIR"), "/milk/shm", "/tmp") if one)  # noqa: S108
+    return next(one for one in folders if one.is_dir() or one == Path("/tmp")) / f"{name}.im.shm"  # noqa: S108
+
+
+class Stream:
+    """A stream of images in shared memory.
+
+    Attributes:
+        layout: where its parts are, as its header declared them when it was opened.
+        data: (planes, rows, columns) view of the pixels.
+        semaphores: one for each reader.
+        readers: (semaphores,) view of the processes that wait for them; zero and less where none does.
+        writers: (semaphores,) view of the processes that posted them last.
+        identity: of the file, by which another one of the same name is known.
+    """
+
+    def __init__(self, path: Path) -> None:
+        """Map an existing stream.
+
+        Raises:
+            StreamAbsentError: there is none yet.
+            StreamError: it has another layout, or may not be opened.
+        """
+        self.path = path
+        self.name = path.name.removesuffix(".im.shm")
+        try:
+            with path.open("r+b", buffering=0) as file:
+                found = os.fstat(file.fileno())
+                if not stat.S_ISREG(found.st_mode):
+                    raise StreamError(f"stream {self.name!r} is no file: {path}")
+                if found.st_size < HEADER_BYTES:
+                    raise StreamAbsentError(f"stream {self.name!r} is just being made: {path} is too short yet")
+                self._mapping = mmap.mmap(file.fileno(), found.st_size)
+        except FileNotFoundError:
+            raise StreamAbsentError(f"there is no stream {self.name!r} ({path})") from None
+        except OSError as fault:
+            raise StreamError(f"stream {self.name!r} cannot be opened: {path}: {fault.strerror}") from None
+        self.identity = _identity(found)
+        self._header = np.frombuffer(self._mapping, HEADER, 1)
+        header = self._header.copy()[0]
+        if not header["version"]:
+            raise StreamAbsentError(f"stream {self.name!r} is just being made: its header has no version yet")
+        try:
+            self.layout = layout = Layout.of(header, found.st_size)
+        except ValueError as fault:
+            raise StreamError(f"stream {self.name!r} {fault} ({path})") from None
+        starts, count = layout.starts, layout.semaphores
+        self.data = np.ndarray(layout.shape, layout.dtype, self._mapping, starts["data"])
+        self.semaphores = Semaphores(self._mapping, starts["semaphores"], count)
+        self._log = Semaphores(self._mapping, starts["log"], 1)
+        self.readers = np.ndarray(count, "<i4", self._mapping, starts["readers"])
+        self.writers = np.ndarray(count, "<i4", self._mapping, starts["writers"])
+        self._cnt0, self._cnt1, self._write = (self._header[name] for name in ("cnt0", "cnt1", "write"))
+        if not self.semaphores.usable():
+            raise StreamError(f"stream {self.name!r} has semaphores of another C library ({path})")
+
+    @classmethod
+    def create(
+        cls, path: Path, shape: tuple[int, int], dtype: npt.DTypeLike, keywords: dict[str, float] | None = None
+    ) -> "Stream":
+        """Make a stream (rows, columns) where there is none; it appears complete, or not at all.
+
+        Raises:
+            StreamError: it is there already, or cannot be made.
+        """
+        rows, columns = shape
+        kind, keywords = np.dtype(dtype), keywords or {}
+        layout = Layout.made(kind, (1, rows, columns), len(keywords), SEMAPHORES, TRACES, 0)
+        header = np.zeros(1, HEADER)
+        fields: dict[str, Any] = {"version": VERSION.encode(), "name": path.name.removesuffix(".im.shm").encode()}
+        fields |= {"axes": 2, "size": (columns, rows, 0), "elements": rows * columns, "type": NUMBERS[kind]}
+        fields |= {"kind": MATRIX, "creator": os.getpid(), "shared": 1, "location": -1, "semaphores": SEMAPHORES}
+        fields |= {"traces": TRACES, "keywords": len(keywords), "data_bytes": rows * columns * kind.itemsize}
+        fields |= {"created": _now(), "accessed": _now()}
+        words = np.zeros(len(keywords), KEYWORD)
+        words["name"], words["type"], words["real"] = list(keywords), b"D", list(keywords.values())
+        try:
+            with tempfile.NamedTemporaryFile(dir=path.parent, prefix=f".{path.name}-") as file:
+                fields["inode"] = os.fstat(file.fileno()).st_ino
+                for name, value in fields.items():
+                    header[name] = value
+                file.truncate(layout.file_bytes)
+                for part, content in (("header", header), ("keywords", words)):
+                    file.seek(layout.starts[part])
+                    file.write(content.tobytes())
+                for part in ("readers", "writers"):
+                    file.seek(layout.starts[part])
+                    file.write(np.full(SEMAPHORES, -1, "<i4").tobytes())
+                file.flush()
+                with mmap.mmap(file.fileno(), layout.file_bytes) as mapping:
+                    for start, count in ((layout.starts["semaphores"], SEMAPHORES), (layout.starts["log"], 1)):
+                        Semaphores(mapping, start, count).initialise()
+                os.fchmod(file.fileno(), _MODE)
+                os.link(file.name, path)
+        except FileExistsError:
+            raise StreamError(f"stream {path.name.removesuffix('.im.shm')!r} is there already: {path}") from None
+        except OSError as fault:
+            raise StreamError(f"stream {path} cannot be made: {fault.strerror}") from None
+        return cls(path)
+
+    def current(self) -> bool:
+        """Whether its file is still the one of its name, whole; if not, nothing of it may be touched any more."""
+        try:
+            return _identity(self.path.stat()) == self.identity
+        except OSError:
+            return False
+
+    @property
+    def count(self) -> int:
+        """Images written so far."""
+        return int(self._cnt0[0])
+
+    @property
+    def writing(self) -> bool:
+        """Whether an image is being written, or its writer died in the middle."""
+        return bool(self._write[0])
+
+    @property
+    def plane(self) -> int:
+        """The plane of the newest image."""
+        return int(self._cnt1[0]) % self.layout.shape[0]
+
+    @property
+    def acquired_ns(self) -> int:
+        """When the newest image was acquired (`atime`), nanoseconds since the epoch."""
+        return self._time_ns("atime")
+
+    @property
+    def written_ns(self) -> int:
+        """When the newest image was written, nanoseconds since the epoch."""
+        return self._time_ns("writetime")
+
+    def keywords(self) -> dict[str, float | str]:
+        """Its keywords, by name."""
+        words = np.frombuffer(self._mapping, KEYWORD, self.layout.keywords, self.layout.starts["keywords"]).copy()
+        fields = {b"L": "integer", b"D": "real", b"S": "text"}
+        found = {}
+        for word in words:
+            field = fields.get(bytes(word["type"]))
+            if field is not None:
+                value = word[field].item()
+                found[_text(word["name"])] = _text(value) if isinstance(value, bytes) else value
+        return found
+
+    def put(self, image: npt.NDArray[np.generic], acquired_ns: int | None = None) -> None:
+        """Write an image (rows, columns) of its type into the first plane, and post every semaphore below its bound."""
+        self._write[0] = 1
+        np.copyto(self.data[0], image, casting="no")
+        if self.layout.ring:
+            self._put_in_ring()
+        self._header["writetime"] = now = _now()
+        self._header["atime"] = now if acquired_ns is None else divmod(acquired_ns + _tai_ahead_ns(), _NS)
+        self._cnt0[0] += 1
+        self._write[0] = 0
+        pid = os.getpid()
+        for index in range(self.layout.semaphores):
+            if self.semaphores.post(index):
+                self.writers[index] = pid
+        self._log.post(0)
+
+    def _put_in_ring(self) -> None:
+        """Copy the image into the circular buffer, as the C library does."""
+        after = int(self._header["ring_index"][0]) + 1
+        index = after if after < self.layout.ring else 0
+        image = self.data.reshape(-1).view(np.uint8)
+        start = self.layout.starts["ring"] + index * image.size
+        np.ndarray(image.size, np.uint8, self._mapping, start)[:] = image
+        self._header["ring_cycle"] += np.uint64(index != after)
+        self._header["ring_index"] = index
+
+    def take_semaphore(self) -> int:
+        """Reserve a semaphore for this process.
+
+        Raises:
+            StreamError: each is another living process's.
+        """
+        pid = os.getpid()
+        holders = self.readers.tolist()
+        free = (index for index, one in enumerate(holders) if one == pid or not alive(one))
+        index = holders.index(pid) if pid in holders else next(free, None)
+        if index is None:
+            raise StreamError(f"stream {self.name!r} has {len(holders)} semaphores, and processes {holders} hold them")
+        self.readers[index] = pid
+        self.semaphores.drain(index)
+        return index
+
+    def give_back(self, index: int) -> None:
+        """Let another process have the semaphore."""
+        if self.readers[index] == os.getpid():
+            self.readers[index] = 0
+
+    def other_writer(self) -> int:
+        """Another living process that has written this stream; zero where there is none."""
+        return next((pid for pid in set(self.writers.tolist()) - {os.getpid()} if self._wrote(pid)), 0)
+
+    def _wrote(self, pid: int) -> bool:
+        """Whether that process is the one that wrote, not a later one of the same number."""
+        try:
+            return alive(pid) and psutil.Process(pid).create_time() * _NS <= self.written_ns + _NS
+        except psutil.Error:
+            return alive(pid)
+
+    def _time_ns(self, name: str) -> int:
+        """A time of the header; the C library writes TAI, which is ahead where the host knows the leap seconds."""
+        seconds, nanoseconds = (int(one) for one in self._header[name][0])
+        time_ns, ahead_ns = seconds * _NS + nanoseconds, _tai_ahead_ns()
+        return time_ns - ahead_ns if ahead_ns and time_ns > time.time_ns() + ahead_ns // 2 else time_ns
+
+
+def alive(pid: int) -> bool:
+    """Whether there is a process of that number."""
+    try:
+        os.getpgid(pid if pid > 0 else -1)
+    except (ProcessLookupError, OverflowError):
+        return False
+    except OSError:  # it may not be asked
+        return True
+    return True
+
+
+def _identity(found: os.stat_result) -> tuple[int, int, int]:
+    return found.st_dev, found.st_ino, found.st_size
+
+
+def _text(raw: bytes) -> str:
+    return raw.partition(b"\0")[0].decode("ascii", "backslashreplace")
+
+
+def _now() -> tuple[int, int]:
+    return divmod(time.clock_gettime_ns(time.CLOCK_TAI), _NS)
+
+
+def _tai_ahead_ns() -> int:
+    """By how much TAI is ahead of the wall clock on this host, in whole seconds."""
+    return round((time.clock_gettime_ns(time.CLOCK_TAI) - time.time_ns()) / _NS) * _NS

@@ -1,0 +1,312 @@
+"""ImageStreamIO streams: the product against a reader and a writer that were made from the layout alone."""
+
+import contextlib
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from lowfc.adapters.image_stream.reader import StreamImage, StreamReader
+from lowfc.adapters.image_stream.stream import Stream, StreamAbsentError, StreamError, stream_path
+from tests.support.image_streams.plain import NUMPY_TYPES, PlainStream
+
+ROWS, COLUMNS = 6, 9
+UINT16, FLOAT32 = 3, 9
+
+
+@pytest.fixture
+def path(tmp_path: Path) -> Path:
+    return tmp_path / "camnsv.im.shm"
+
+
+def made(path: Path, number: int = UINT16, **options: object) -> PlainStream:
+    return PlainStream.make(path, COLUMNS, ROWS, number, **options)  # type: ignore[arg-type]
+
+
+def image(seed: int, number: int = UINT16) -> np.ndarray:
+    values = np.random.default_rng(seed).integers(0, 100, (ROWS, COLUMNS))
+    return values.astype(NUMPY_TYPES[number])
+
+
+def newest(reader: StreamReader) -> StreamImage:
+    got = reader.next(5)
+    assert got is not None
+    return got
+
+
+def dead_pid() -> int:
+    with subprocess.Popen([sys.executable, "-c", ""]) as child:
+        pass
+    return child.pid
+
+
+@pytest.mark.parametrize("number", NUMPY_TYPES)
+def test_images_of_every_type_are_read_and_written(path: Path, number: int) -> None:
+    writer = made(path, number)
+    reader = StreamReader(path)
+    writer.write(image(1, number), 1_700_000_000_123_456_789)
+    got = newest(reader)
+    assert got.number == 1
+    assert got.acquired_ns == 1_700_000_000_123_456_789
+    assert got.pixels.dtype == NUMPY_TYPES[number]
+    assert np.array_equal(got.pixels, image(1, number))
+    stream, other = Stream(path), PlainStream(path, COLUMNS, ROWS, number)
+    other.take(7)
+    before_ns = time.clock_gettime_ns(time.CLOCK_TAI)
+    stream.put(image(2, number))
+    assert other.wait(7, 1)
+    assert other.count == 2
+    assert np.array_equal(other.pixels[0], image(2, number))
+    assert [other.get("<i", other.writers + 4 * index) for index in range(10)] == [os.getpid()] * 10
+    assert 0 <= other.get("<q", 200) * 10**9 + other.get("<q", 208) - before_ns < 10**9
+    with pytest.raises(TypeError):
+        stream.put(image(2, number).astype("c8"))
+    assert other.count == 2
+
+
+def test_one_that_is_made_here_is_read_by_others(path: Path) -> None:
+    stream = Stream.create(path, (ROWS, COLUMNS), np.float32, {"gain": 2.5})
+    other = PlainStream(path, COLUMNS, ROWS, FLOAT32, keywords=1)
+    assert (path.stat().st_mode & 0o777, other.get("<Q", 232)) == (0o666, path.stat().st_ino)
+    assert [other.get("<I", 116), other.get("<I", 120), other.get("<Q", 128), other.get("B", 136)] == [9, 6, 54, 9]
+    other.take(3)
+    stream.put(image(1, FLOAT32), 1_700_000_000_000_000_000)
+    assert other.wait(3, 1)
+    assert np.array_equal(other.pixels[0], image(1, FLOAT32))
+    assert other.get("<q", 184) - 1_700_000_000 == round(time.clock_gettime(time.CLOCK_TAI) - time.time())
+    assert stream.keywords() == {"gain": 2.5}
+    with pytest.raises(StreamError, match="is there already"):
+        Stream.create(path, (ROWS, COLUMNS), np.float32)
+    assert [one.name for one in path.parent.iterdir()] == [path.name]
+
+
+def test_keywords_of_every_kind_are_read(path: Path) -> None:
+    made(path, keywords={"fps": 500, "tint": 1e-3, "camera": "nsv"})
+    assert Stream(path).keywords() == {"fps": 500, "tint": 1e-3, "camera": "nsv"}
+
+
+@pytest.mark.parametrize(
+    ("options", "found"),
+    [
+        ({"version": b"1.00"}, "layout version '1.00', expected '2.00'"),
+        ({"version": b"1.00\0\xff\n"}, "layout version '1.00'"),
+        ({"version": b"\x1b[2J"}, r"layout version '\\x1b\[2J'"),
+        ({"header_bytes": 4496}, "DAO_COMPAT"),
+        ({"header_bytes": 400}, "built with other options"),
+        ({"number": 12}, "pixels of type 12"),
+        ({"location": 0}, "graphics card 0"),
+        ({"planes": 3, "axes": 3}, "cube of 3 planes"),
+        ({"axes": 1}, "1 axes"),
+        ({"axes": 4}, "4 axes"),
+    ],
+)
+def test_other_layouts_are_refused_by_name(path: Path, options: dict[str, object], found: str) -> None:
+    made(path, **options)
+    with pytest.raises(StreamError, match=found) as fault:
+        Stream(path)
+    assert "camnsv" in str(fault.value)
+    assert not isinstance(fault.value, StreamAbsentError)
+
+
+def test_what_is_just_being_made_is_absent_yet(path: Path) -> None:
+    with pytest.raises(StreamAbsentError):
+        Stream(path)
+    path.write_bytes(b"")
+    with pytest.raises(StreamAbsentError):
+        Stream(path)
+    made(path, version=b"")
+    with pytest.raises(StreamAbsentError):
+        Stream(path)
+    path.unlink()
+    path.mkdir()
+    with pytest.raises(StreamError, match="Is a directory"):
+        Stream(path)
+
+
+def test_a_stream_of_planes_gives_the_newest_one(path: Path) -> None:
+    writer = made(path, planes=4, axes=3, kind=0x20001)
+    reader = StreamReader(path)
+    for number in range(1, 7):
+        writer.write(image(number), plane=number % 4)
+        got = newest(reader)
+        assert np.array_equal(got.pixels, image(number))
+    writer.pack("<Q", 272, 2**64 - 1)  # a plane that is none
+    writer.pack("<Q", 264, 7)
+    newest(reader)
+
+
+def test_an_image_that_is_being_written_is_waited_for(path: Path) -> None:
+    writer = made(path)
+    reader = StreamReader(path)
+    writer.write(image(1))
+    writer.begin(image(2))
+    assert reader.next(0.02) is None
+    assert reader.silence() == "its writer is silent, in the middle of an image"
+    writer.end()
+    got = newest(reader)
+    assert got.number == 2
+    assert np.array_equal(got.pixels, image(2))
+    assert reader.next(0.02) is None
+    assert reader.silence() == "its writer is silent"
+
+
+WRITER = """
+import sys, time, numpy as np
+from pathlib import Path
+from tests.support.image_streams.plain import PlainStream
+stream = PlainStream(Path(sys.argv[1]), 64, 64, 3)
+print(flush=True)
+for number in range(1, 1 << 30):
+    stream.write(np.full((64, 64), number % 65536))
+"""
+
+
+def test_no_torn_image_is_returned_and_a_writer_that_dies_is_named(path: Path) -> None:
+    stream = PlainStream.make(path, 64, 64, UINT16)
+    reader = StreamReader(path)
+    with subprocess.Popen([sys.executable, "-c", WRITER, str(path)], stdout=subprocess.PIPE) as writer:
+        assert writer.stdout is not None
+        assert writer.stdout.readline()
+        numbers = []
+        for _ in range(2000):
+            got = newest(reader)
+            assert (got.pixels == got.number % 65536).all()
+            numbers.append(got.number)
+        writer.send_signal(signal.SIGKILL)
+    assert numbers == sorted(set(numbers))
+    while reader.next(0.1) is not None:
+        pass
+    assert reader.silence().startswith(f"its writer (process {writer.pid}) has ended")
+    stream.write(np.full((64, 64), stream.count + 1))  # another one takes over
+    got = newest(reader)
+    assert (got.pixels == got.number % 65536).all()
+
+
+def test_a_stream_that_is_made_anew_is_followed(path: Path) -> None:
+    writer = made(path)
+    reader = StreamReader(path)
+    writer.write(image(1))
+    newest(reader)
+    made(path).write(image(2))
+    got = newest(reader)
+    assert (got.number, got.generation) == (1, 2)
+    assert np.array_equal(got.pixels, image(2))
+    PlainStream.make(path, 3, 2, FLOAT32).write(np.ones((2, 3)))
+    got = newest(reader)
+    assert got.generation == 3
+    assert got.pixels.shape == (2, 3)
+    path.unlink()
+    assert reader.next(0.02) is None
+    assert reader.silence() == "there is no stream 'camnsv'"
+    made(path).write(image(3))
+    got = newest(reader)
+    assert got.generation == 4
+    made(path, version=b"1.00")
+    with pytest.raises(StreamError, match="layout version"):
+        reader.next(0.02)
+    made(path).write(image(4))
+    newest(reader)
+
+
+def test_a_file_that_is_cut_short_is_not_touched_any_more(path: Path) -> None:
+    writer = made(path)
+    reader = StreamReader(path)
+    writer.write(image(1))
+    os.truncate(path, 100)
+    assert reader.next(0.02) is None
+    os.truncate(path, 0)
+    reader.close()
+
+
+def test_each_reader_has_a_semaphore_of_its_own(path: Path) -> None:
+    writer = made(path)
+    writer.take(0, os.getppid())
+    writer.take(1, dead_pid())
+    reader = StreamReader(path)
+    assert writer.get("<i", writer.readers + 4) == os.getpid()  # that of the dead one
+    writer.write(image(1))
+    newest(reader)
+    assert writer.value(0) == 1  # nobody's was taken
+    reader.close()
+    assert writer.get("<i", writer.readers + 4) == 0
+    for index in range(10):
+        writer.take(index, os.getppid())
+    with pytest.raises(StreamError, match=f"processes .*{os.getppid()}.* hold them"):
+        StreamReader(path)
+
+
+def test_semaphores_are_posted_below_ten_only_and_one_that_is_full_stops_nobody(path: Path) -> None:
+    writer = made(path)
+    reader = StreamReader(path)
+    stream = Stream(path)
+    for number in range(25):
+        stream.put(image(number))
+    assert [writer.value(index) for index in range(10)] == [10] * 10
+    got = newest(reader)
+    assert got.number == 25
+    assert np.array_equal(got.pixels, image(24))
+    assert reader.next(0.02) is None
+    stream.put(image(26))
+    got = newest(reader)
+    assert got.number == 26
+
+
+def test_who_else_writes_is_known(path: Path) -> None:
+    writer = made(path)
+    stream = Stream(path)
+    assert not stream.other_writer()
+    writer.write(image(1))
+    assert not stream.other_writer()  # this process itself
+    writer.pack("<i", writer.writers + 4 * 9, dead_pid())
+    assert not stream.other_writer()
+    writer.pack("<i", writer.writers + 4 * 9, os.getppid())
+    assert stream.other_writer() == os.getppid()
+    writer.pack("<q", 200, 1_000_000_000)  # written long before that process began: it has a dead one's number
+    assert not stream.other_writer()
+
+
+def test_the_folder_is_the_first_that_there_is(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("MILK_SHM_DIR", str(tmp_path))
+    assert stream_path("dm00disp03") == tmp_path / "dm00disp03.im.shm"
+    monkeypatch.setenv("MILK_SHM_DIR", str(tmp_path / "none"))
+    assert stream_path("dm00disp03").parent in (Path("/milk/shm"), Path("/tmp"))  # noqa: S108
+    for name in ("", "../shm", "a" * 80):
+        with pytest.raises(StreamError, match="a stream's name"):
+            stream_path(name)
+
+
+def test_ten_thousand_wrong_headers_do_no_harm(path: Path) -> None:
+    rng = np.random.default_rng(7)
+    writer = made(path, planes=2, axes=3, kind=0x20001, keywords={"tint": 1e-3})
+    good = bytes(writer.map)
+    rest = slice(writer.semaphores + 10 * 32 + 32 + 4 * 40, None)  # behind all that a reader and a writer may change
+    opened = 0
+    for _ in range(10_000):
+        writer.map[:] = good
+        for _ in range(rng.integers(1, 4)):
+            at = int(rng.integers(0, 384)) if rng.random() < 0.6 else int(rng.choice((112, 116, 128, 136, 258, 292)))
+            writer.map[at] = (
+                int(rng.integers(0, 256)) if rng.random() < 0.7 else writer.map[at] ^ (1 << rng.integers(8))
+            )
+        try:
+            stream = Stream(path)
+        except StreamError:
+            continue
+        opened += 1
+        for at in rng.integers(0, 384, 3):
+            writer.map[int(at)] = int(rng.integers(0, 256))
+        header = bytes(writer.map[:184])
+        with contextlib.suppress(StreamError):
+            StreamReader(path).next(0)
+        stream.keywords()
+        stream.put(np.zeros(stream.layout.shape[1:], stream.layout.dtype))
+        assert stream.data[stream.plane].shape == stream.layout.shape[1:]
+        assert isinstance(stream.acquired_ns, int)
+        assert bytes(writer.map[:184]) == header
+        assert bytes(writer.map[rest]) == good[rest]
+    assert 500 < opened < 9500

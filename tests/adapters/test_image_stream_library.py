@@ -1,0 +1,132 @@
+"""ImageStreamIO streams against the C library itself, where the loader finds libImageStreamIO.so."""
+
+import ctypes
+import multiprocessing
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from lowfc.adapters.image_stream.reader import StreamReader
+from lowfc.adapters.image_stream.stream import Stream
+
+ROWS, COLUMNS = 34, 31
+try:
+    LIBRARY = ctypes.CDLL("libImageStreamIO.so")
+except OSError:
+    pytest.skip("libImageStreamIO.so is not installed", allow_module_level=True)
+
+
+class Image:
+    """An IMAGE of the C library; `array` and `md` are at their offsets in it."""
+
+    def __init__(self, name: str) -> None:
+        self.memory = ctypes.create_string_buffer(512)
+        self.name = name.encode()
+
+    def create(self, number: int, keywords: int = 0, ring: int = 0) -> "Image":
+        sizes = (ctypes.c_uint32 * 2)(COLUMNS, ROWS)
+        assert not LIBRARY.ImageStreamIO_createIm(self.memory, self.name, 2, sizes, number, 1, keywords, ring)
+        return self
+
+    def open(self) -> "Image":
+        assert not LIBRARY.ImageStreamIO_openIm(self.memory, self.name)
+        return self
+
+    def pointer(self, offset: int) -> int:
+        return ctypes.c_void_p.from_buffer(self.memory, offset).value or 0
+
+    def pixels(self, dtype: str) -> np.ndarray:
+        length = ROWS * COLUMNS * np.dtype(dtype).itemsize
+        memory = (ctypes.c_char * length).from_address(self.pointer(128))
+        return np.frombuffer(memory, dtype).reshape(ROWS, COLUMNS)
+
+    def write(self, image: np.ndarray) -> None:
+        ctypes.c_uint8.from_address(self.pointer(120) + 288).value = 1
+        self.pixels(image.dtype.str)[:] = image
+        assert not LIBRARY.ImageStreamIO_UpdateIm(self.memory)
+
+
+@pytest.fixture
+def path(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """One folder for all tests of this module: the library asks for it once."""
+    folder = tmp_path.parent / "milk"
+    folder.mkdir(exist_ok=True)
+    monkeypatch.setenv("MILK_SHM_DIR", str(folder))
+    return folder / f"{tmp_path.name}.im.shm"
+
+
+def image(seed: int, dtype: str) -> np.ndarray:
+    return np.random.default_rng(seed).integers(0, 1000, (ROWS, COLUMNS)).astype(dtype)
+
+
+def test_its_images_are_read(path: Path) -> None:
+    library = Image(path.name.removesuffix(".im.shm")).create(3, keywords=4)
+    reader = StreamReader(path)
+    for number in range(1, 100):
+        library.write(image(number, "u2"))
+        got = reader.next(1)
+        assert got is not None
+        assert got.number == number
+        assert abs(got.acquired_ns - time.time_ns()) < 10**9
+        assert np.array_equal(got.pixels, image(number, "u2"))
+    assert LIBRARY.ImageStreamIO_semvalue(library.memory, 9) == 10
+    reader.close()
+    LIBRARY.ImageStreamIO_destroyIm(library.memory)
+    assert reader.next(0.02) is None
+
+
+def test_it_hands_out_no_semaphore_that_is_held_here(path: Path) -> None:
+    library = Image(path.name.removesuffix(".im.shm")).create(3)
+    reader = StreamReader(path)
+    queue = multiprocessing.get_context("fork").SimpleQueue()
+    ask = lambda: queue.put(LIBRARY.ImageStreamIO_getsemwaitindex(library.memory, 0))  # noqa: E731
+    child = multiprocessing.get_context("fork").Process(target=ask)
+    child.start()
+    child.join()
+    assert queue.get() == 1  # the first one is the reader's
+    reader.close()
+
+
+def _follow(name: str, images: int, started: object, queue: object) -> None:
+    library = Image(name).open()
+    index = LIBRARY.ImageStreamIO_getsemwaitindex(library.memory, 5)
+    started.set()  # type: ignore[attr-defined]
+    for _ in range(images):
+        assert not LIBRARY.ImageStreamIO_semwait(library.memory, index)
+        queue.put(library.pixels("f4").copy())  # type: ignore[attr-defined]
+
+
+@pytest.mark.parametrize("made_by", ["library", "here"])
+def test_it_is_woken_by_what_is_written_here(path: Path, made_by: str) -> None:
+    name = path.name.removesuffix(".im.shm")
+    if made_by == "library":
+        Image(name).create(9, ring=3)
+        stream = Stream(path)
+    else:
+        stream = Stream.create(path, (ROWS, COLUMNS), np.float32)
+    context = multiprocessing.get_context("fork")
+    queue, started = context.SimpleQueue(), context.Event()
+    child = context.Process(target=_follow, args=(name, 50, started, queue))
+    child.start()
+    assert started.wait(5)
+    for number in range(50):
+        stream.put(image(number, "f4"))
+        assert np.array_equal(queue.get(), image(number, "f4"))
+    child.join(5)
+    assert child.exitcode == 0
+
+
+def test_the_ring_is_kept_as_it_keeps_it(path: Path) -> None:
+    name = path.name.removesuffix(".im.shm")
+    kept = []
+    for by_library in (True, False):
+        library = Image(name).create(9, ring=3)
+        stream = Stream(path)
+        put = library.write if by_library else stream.put
+        for number in range(1, 6):
+            put(image(number, "f4"))
+        start = stream.layout.starts["ring"]
+        kept.append((path.read_bytes()[start : start + 3 * ROWS * COLUMNS * 4], path.read_bytes()[296:312]))
+    assert kept[0] == kept[1]
