@@ -10,7 +10,7 @@ from lowfc.arrays import Array, Single
 from lowfc.contract.codecs.codec import decode_request, encode_request
 from lowfc.control.laws.linear_law import LinearLaw, Signal
 from lowfc.control.loop.advance import advance
-from lowfc.control.loop.command_channels import ADOPTED, FLAT, MIRROR, MOST_CHANNELS, OFFSET
+from lowfc.control.loop.command_channels import ADOPTED, EXTERNAL, FLAT, MIRROR, MOST_CHANNELS, OFFSET
 from lowfc.control.loop.inputs import Frame, Input, Load, MirrorShape, Outputs, Reply, Request
 from lowfc.control.loop.safety import Limits, LoopMode
 from lowfc.control.loop.state import FADING_FRAMES, SETTLING_FRAMES, Settings
@@ -98,6 +98,32 @@ def test_the_zero_point_moves_when_the_mirror_is_seen_to_move(delay_frames: floa
         outputs = night.take(frame(night.count, night.to_modes @ np.asarray(seen).reshape(-1)))
         assert outputs.step.error_nm is not None
         assert np.abs(outputs.step.error_nm).max() < 0.05
+
+
+def test_what_others_have_on_the_mirror_is_neither_undone_nor_commanded() -> None:
+    """Nor does it count for the loop's own limits, nor end with safe mode: it is there, whatever the loop does."""
+    night, theirs = Night(), dark_hole(60.0)
+    unseen = dark_hole(2 * USUAL.limits.stroke_nm, seed=6)  # beyond the own limits
+    theirs += unseen - (TOY.modes_to_actuators @ (night.to_modes @ unseen.reshape(-1))).reshape(GRID)
+    night.run(40)
+    before = night.surfaces[-1]
+    assert night.ask("channel", text=EXTERNAL, actuators_nm=theirs.reshape(-1)).accepted
+    seen_nm = DISTURBED + night.to_modes @ theirs.reshape(-1)
+    night.run(20, seen_nm)
+    assert np.allclose(night.surfaces[-1], before, atol=0.02)
+    assert max(np.abs(surface - before).max() for surface in night.surfaces[-20:]) < 0.02  # not for a frame either
+    night.ask("safe")
+    night.run(40, seen_nm)
+    assert not night.surfaces[-1].any()
+    assert night.ask("channel", text=EXTERNAL, actuators_nm=2 * theirs.reshape(-1)).accepted
+    night.ask("clear")
+    night.ask("close")
+    night.run(60, seen_nm + night.to_modes @ theirs.reshape(-1))
+    assert np.allclose(night.surfaces[-1], before, atol=0.02)
+    assert night.ask("channel", text=EXTERNAL).accepted
+    night.run(60)
+    assert np.allclose(night.surfaces[-1], before, atol=0.02)
+    assert night.state.drive.command_channels.channels == ()
 
 
 def test_the_flat_map_does_not_move_the_zero_point() -> None:

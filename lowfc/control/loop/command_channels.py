@@ -16,6 +16,8 @@ FLAT = "flat"
 """The channel of the mirror's flat map: the reference image is taken with it, so that it shifts nothing."""
 ADOPTED = "adopted"
 """The channel of what a mirror already had, beyond the modes, when the controller started."""
+EXTERNAL = "external"
+"""The channel of what other programs have on the mirror: it is there already, so that nothing of it is commanded."""
 MOST_CHANNELS = 16
 MOST_PLAYED = 1 << 24
 """Numbers in the table of a play, and in its basis."""
@@ -42,6 +44,11 @@ class Channel(NamedTuple):
     def shifts(self) -> bool:
         """Whether the sensor's zero point is shifted along."""
         return self.name != FLAT
+
+    @property
+    def commanded(self) -> bool:
+        """Whether the loop sends it to the mirror."""
+        return self.name != EXTERNAL
 
     @property
     def moving(self) -> bool:
@@ -156,13 +163,14 @@ class CommandChannels(NamedTuple):
         """With these channels; those that are wanted flat and are flat are gone."""
         kept = tuple(one for one in channels if one.wanted_nm.any() or one.reached_nm.any())
         sums = [
-            sum((one.reached_nm for one in kept if one.shifts is shifts), np.zeros_like(self.sum_nm))
+            sum((one.reached_nm for one in kept if one.commanded and one.shifts is shifts), np.zeros_like(self.sum_nm))
             for shifts in (True, False)
         ]
-        return self._replace(channels=kept, sum_nm=sums[0] + sums[1], shift_nm=to_modes @ sums[0].reshape(-1))
+        seen_nm = sum((one.reached_nm for one in kept if not one.commanded), sums[0])
+        return self._replace(channels=kept, sum_nm=sums[0] + sums[1], shift_nm=to_modes @ seen_nm.reshape(-1))
 
     def with_channel(self, name: str, wanted_nm: Single, to_modes: Single) -> "CommandChannels":
-        """With a new shape for a channel, which the mirror goes to from where that channel is.
+        """With a new shape for a channel, which the mirror goes to from where that channel is; `EXTERNAL` is there.
 
         Raises:
             ValueError: the name is none, or there are too many.
@@ -173,6 +181,10 @@ class CommandChannels(NamedTuple):
         before = self.channel(name)
         if before is None and len(self.channels) >= MOST_CHANNELS:
             raise ValueError(f"there are {MOST_CHANNELS} channels already, which is the most: remove one")
+        if name == EXTERNAL:
+            after = self.having(Channel(name, wanted_nm, wanted_nm), to_modes)
+            more_nm = after.shift_nm - self.shift_nm
+            return after._replace(shifts_nm=tuple(one + more_nm for one in self.shifts_nm))
         reached_nm = np.zeros_like(wanted_nm) if before is None else before.reached_nm
         return self.having(Channel.of(name, wanted_nm, reached_nm), to_modes)
 
@@ -202,9 +214,13 @@ class CommandChannels(NamedTuple):
         return self.passed(len(self.shifts_nm))
 
     def lowered(self, to_modes: Single, *, only_flat: bool = False) -> "CommandChannels":
-        """The mirror goes to zero: no channel has reached anything, and nothing is played."""
+        """The loop's command goes to zero: none of its channels has reached anything, and nothing is played."""
         flat = np.zeros_like(self.sum_nm)
-        kept = (Channel.of(one.name, one.wanted_nm, flat) for one in self.channels if one.name == FLAT or not only_flat)
+        kept = (
+            Channel.of(one.name, one.wanted_nm, flat if one.commanded else one.wanted_nm)
+            for one in self.channels
+            if one.name in (FLAT, EXTERNAL) or not only_flat
+        )
         return self._replace(play=None).at(tuple(kept), to_modes)
 
 

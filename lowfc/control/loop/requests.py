@@ -12,7 +12,7 @@ from lowfc.arrays import Single
 from lowfc.control.laws.law import Law
 from lowfc.control.laws.margins import check_law
 from lowfc.control.laws.stability import highest_gain, limiting_gain
-from lowfc.control.loop.command_channels import FLAT, MIRROR, CommandChannels, Play, play_table
+from lowfc.control.loop.command_channels import EXTERNAL, FLAT, MIRROR, CommandChannels, Play, play_table
 from lowfc.control.loop.inputs import Outputs, PendingEvent, Reply, Request
 from lowfc.control.loop.lease import ENDED_BY, Lease, asked_by, refusal
 from lowfc.control.loop.loading import holding, in_mode, loaded, misfit, mode_event, uncalibrated
@@ -204,7 +204,7 @@ def _offset(settings: Settings, state: State, request: Request) -> Handled:
 
 def _channel(settings: Settings, state: State, request: Request) -> Handled:
     drive = _mirror(state)
-    if state.mode is LoopMode.SAFE and request.text != FLAT:
+    if state.mode is LoopMode.SAFE and request.text not in (FLAT, EXTERNAL):
         raise ValueError("the loop is in safe mode: `lowfc ctl clear` first, when it is safe")
     grid = drive.calibration.grid
     wanted_nm = np.zeros(grid, np.float32)
@@ -212,12 +212,13 @@ def _channel(settings: Settings, state: State, request: Request) -> Handled:
         if request.actuators_nm.size != wanted_nm.size:
             raise ValueError(f"a channel has {grid[0]} x {grid[1]} actuators, got {request.actuators_nm.size}")
         wanted_nm = request.actuators_nm.reshape(grid)
-    _check_shape(settings.limits, wanted_nm)
+    _check_shape(None if request.text == EXTERNAL else settings.limits, wanted_nm)
     added = drive.added().with_channel(request.text, wanted_nm, drive.to_modes)
     if not request.actuators_nm.size and drive.added().channel(request.text) is None:
         names = ", ".join(one.name for one in drive.added().channels)
         return state, f"there is no channel {request.text!r} to remove; there are {names or 'none'}"
-    _check_shape(settings.limits, sum((one.wanted_nm for one in added.channels), np.zeros(grid, np.float32)))
+    commanded = (one.wanted_nm for one in added.channels if one.commanded)
+    _check_shape(settings.limits, sum(commanded, np.zeros(grid, np.float32)))
     rms_nm = float(np.sqrt(np.mean(np.square(wanted_nm, dtype=np.float64))))
     return _with(state, drive, added), f"channel {request.text}: {rms_nm:.3g} nm rms of surface"
 
@@ -316,10 +317,12 @@ def _with(state: State, drive: ActiveLoop, command_channels: CommandChannels) ->
     return state._replace(drive=drive._replace(command_channels=command_channels))
 
 
-def _check_shape(limits: Limits, wanted_nm: Single) -> None:
+def _check_shape(limits: Limits | None, wanted_nm: Single) -> None:
     """A channel that the mirror could not take by itself is refused here, where the refusal has a reader."""
     if not np.isfinite(wanted_nm).all():
         raise ValueError("every actuator of a channel must be finite")
+    if limits is None:  # it is on the mirror already
+        return
     largest, apart = float(np.abs(wanted_nm).max()), neighbour_difference_nm(wanted_nm)
     if largest > limits.kept_stroke_nm:
         raise ValueError(f"an actuator is {largest:.4g} nm from flat, the limit is {limits.stroke_nm:g} nm")
