@@ -101,7 +101,7 @@ def test_frames_of_another_size_come_to_a_closed_loop(commissioned: tuple[Bench,
 def test_the_wavefront_is_held_where_the_reference_was_taken(commissioned: tuple[Bench, dict[str, Any]]) -> None:
     bench, figures = commissioned
     bench.loop.run(300)
-    true = np.array(bench.loop.residual_nm[-300:])
+    true = bench.loop.residual_nm(-300)
     assert float(np.sqrt(true.var(axis=0).sum())) < figures["measured_error_nm"]  # in which there is noise, too
 
 

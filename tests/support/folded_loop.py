@@ -71,7 +71,6 @@ class FoldedLoop(Client):
         mirror_bus: that process's connection; once it is closed, the mirror stays as it is.
         first: sequence of frame 0.
         surfaces_nm: shape of the mirror in each exposure.
-        residual_nm: true modes in each exposure.
     """
 
     def __init__(
@@ -108,7 +107,6 @@ class FoldedLoop(Client):
         self._lose = lose
         self._listeners: list[tuple[str, deque[Any]]] = []
         self.surfaces_nm: list[Single] = []
-        self.residual_nm: list[Single] = []
         self.stops = self.lease_id = 0
         self.first = FIRST
 
@@ -124,7 +122,6 @@ class FoldedLoop(Client):
         whole = self._scene.expose(self._index, seen)
         pixels = whole[self._cut : whole.shape[0] - self._cut, self._cut : whole.shape[1] - self._cut]
         self.surfaces_nm.append(seen)
-        self.residual_nm.append(self._scene.truth(self._index, seen).sampled.residual_nm)
         sequence, time_ns = self.first + self._index, 10**18 + self._index * self.config.period_ns
         self._index += 1
         if self._lose(self._index - 1):
@@ -138,6 +135,12 @@ class FoldedLoop(Client):
             self._states.put(wire.MirrorState(frame_sequence=sequence).SerializeToString())
         for kind, waiting in self._listeners:
             waiting.append(Image(sequence, time_ns, pixels) if kind == "frames" else step)
+
+    def residual_nm(self, first: int, last: int | None = None) -> npt.NDArray[np.float64]:
+        """True modes (frames, modes) in the exposures from `first` to before `last`, numbered as of a slice."""
+        frames = range(self._index)[first:last]
+        truths = [self._scene.truth(index, self.surfaces_nm[index]) for index in frames]
+        return np.array([truth.sampled.residual_nm for truth in truths], np.float64)
 
     def run(self, frames: int) -> None:
         """Some frames that nobody looks at."""

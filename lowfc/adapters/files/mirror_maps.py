@@ -4,7 +4,6 @@ from pathlib import Path
 
 import numpy as np
 
-from lowfc.adapters.files.array_file import read_array
 from lowfc.arrays import Mask, Single, single
 from lowfc.contract.configuration import Configuration
 from lowfc.contract.errors import ConfigurationError, DataFileError
@@ -16,6 +15,8 @@ def read_shape(path: Path) -> Single:
     Raises:
         DataFileError: the file is missing, damaged or holds something else.
     """
+    from lowfc.adapters.files.array_file import read_array  # astropy takes its time
+
     shape = read_array(path, "a mirror's shape is an array (rows, columns)", (2,))
     return single(shape)
 

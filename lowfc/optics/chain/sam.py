@@ -78,7 +78,8 @@ def is_even_symmetric(layout: Layout) -> bool:
 def transmission(layout: Layout, samples: int) -> Array:
     """The mask (samples, samples): 1 where the sample's centre is in a hole, else 0, eqs. (1) and (2)."""
     u = pupil_axis(samples)
-    mask = np.zeros((samples, samples))
+    mask = np.zeros((samples, samples), np.bool_)
     for x, y, diameter in layout.holes:
-        mask[np.hypot(u[:, None] - y, u - x) <= diameter / 2.0] = 1.0
-    return mask
+        box = np.ix_(*(np.flatnonzero(np.abs(u - centre) <= diameter / 2.0) for centre in (y, x)))
+        mask[box] += np.hypot(u[box[0]] - y, u[box[1]] - x) <= diameter / 2.0
+    return mask.astype(np.float64)
