@@ -78,7 +78,7 @@ def measure_delay(fractions: Array, reference: Array, poke: Array, command: Arra
     if snr < LEAST_SNR:
         raise NotSeenError(
             "the pokes are not seen in the frames: is the light on the sensor, does the mirror follow the commands, is "
-            "the amplitude too small?"
+            "the amplitude too small for what shakes the wavefront?"
         )
     pairs = factors[:-1] + factors[1:]
     whole = int(pairs.argmax())

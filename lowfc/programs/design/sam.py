@@ -218,7 +218,7 @@ def render(result: dict[str, Any]) -> str:
     lines.append(
         "predicted; the weighted estimator attains the Cramer-Rao bound of Table 4, 'bound' is that of Table 3"
     )
-    lines.append(f"written to {result['file']}; found again by: {result['command']}")
+    lines.append(f"written to {result['file']}; found again on a processor like this one by: {result['command']}")
     if result["interrupted"]:
         go_on = shlex.join(["lowfc", "design", "sam", "--resume", result["resume"], "--out", result["file"]])
         lines.append(f"interrupted after {result['steps']} steps; go on with: {go_on}")
