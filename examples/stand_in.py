@@ -9,7 +9,7 @@ from lowfc.contract.codecs.codec import decode_mirror
 from lowfc.contract.configuration import Configuration
 from lowfc.contract.errors import ConfigurationError
 from lowfc.contract.messages import MIRROR_STATE
-from sim_camera.process import scene
+from sim_camera.driver import scene
 
 
 class Optics:

@@ -2,12 +2,15 @@
 
 import json
 from collections import deque
+from collections.abc import Callable
 from pathlib import Path
+
+import numpy as np
 
 from lowfc.adapters.bus.bus import Publisher
 from lowfc.contract.envelope import Envelope, sequence_of, start_of
 from lowfc.contract.errors import ConfigurationError
-from lowfc.contract.messages import image
+from lowfc.contract.messages import RawImage, from_timestamp, image
 from sim_camera.faults import MOST_FRAMES_LATE, Fault, Frame, Kind
 
 EARLIER_S = 3600
@@ -28,27 +31,25 @@ def read_fault(file: Path) -> Fault:
 
 
 class FaultyFrames:
-    """Publishes frames, or what befell them."""
+    """A publisher of frames to which a fault happens; see `Publisher`."""
 
-    def __init__(self, fault: Fault, publisher: Publisher, dark: float, highest: int) -> None:
-        """Take the publisher of the frames; `dark` and `highest` are the detector's least and largest values, DN."""
+    def __init__(
+        self, fault: Fault, publisher: Publisher, dark: float, highest: int, now_ns: Callable[[], int]
+    ) -> None:
+        """Take the publisher of the frames, the detector's least and largest values in DN, and the host's clock."""
         self._fault = fault
         self._publisher = publisher
         self._dark, self._highest = round(dark), highest
+        self._now_ns = now_ns
         self._before: Frame | None = None
         self._made: deque[tuple[int, bytes, int]] = deque(maxlen=MOST_FRAMES_LATE + 1)
-        self._start_s = 0
+        self._index = self._start_s = 0
 
-    def message(self, index: int, frame: Frame, time_ns: int) -> bytes:
-        """Message of a frame (rows, columns)."""
-        before = frame if self._before is None else self._before
-        self._before = self._fault.pixels(index, frame, before, self._dark, self._highest)
-        sound = image(self._before, time_ns, "lowfc_camera")
-        message = sound.SerializeToString()
-        return self._fault.payload(index, message, message.index(sound.data) + len(sound.data))
-
-    def put(self, index: int, message: bytes, now_ns: int) -> Envelope:
+    def put(self, payload: bytes) -> Envelope:
         """Publish what is due at the end of an exposure; return the envelope that its frame has or should have."""
+        index, now_ns = self._index, self._now_ns()
+        self._index += 1
+        message = self._message(index, RawImage.FromString(payload))
         if not self._start_s:
             envelope = self._publisher.put(message)  # of frame 0, which is always good
             self._start_s = start_of(envelope.sequence)
@@ -61,3 +62,12 @@ class FaultyFrames:
                 earlier = EARLIER_S if self._fault.befalling(number) is Kind.OLD_SEQUENCE else 0  # a clock set back
                 self._publisher.put(*made[number], sequence_of(self._start_s - earlier, number))
         return Envelope(sequence_of(self._start_s, index), now_ns)
+
+    def _message(self, index: int, sound: RawImage) -> bytes:
+        """What becomes of a frame's message."""
+        frame = np.frombuffer(sound.data, "<u2").reshape(sound.height, sound.width)
+        before = frame if self._before is None else self._before
+        self._before = self._fault.pixels(index, frame, before, self._dark, self._highest)
+        struck = image(self._before, from_timestamp(sound.timestamp), sound.frame_id)
+        message = struck.SerializeToString()
+        return self._fault.payload(index, message, message.index(struck.data) + len(struck.data))

@@ -9,7 +9,7 @@ from lowfc.control.laws.linear_law import integrator
 from lowfc.control.laws.margins import noise_gain
 from lowfc.optics.detector.photometry import tilt_nm_per_mas
 from sim_camera.disturbance import variances_nm2
-from sim_camera.process import disturbance_of, ignore
+from sim_camera.driver import disturbance_of, ignore
 
 
 def tilt_residual_mas(config: Configuration, delay_frames: float) -> float:

@@ -19,13 +19,14 @@ from lowfc.control.laws.tuning import Tuned, best_gains, identified, tune_integr
 from lowfc.control.loop.advance import advance
 from lowfc.control.loop.inputs import Frame, Load, Request, Step
 from lowfc.control.loop.state import State
+from lowfc.device.guard import Command
 from lowfc.optics.detector.photometry import tilt_nm_per_mas
 from sim_camera.disturbance import LINES_HZ, Disturbance
+from sim_camera.driver import ignore, scene
 from sim_camera.path import MirrorPath
-from sim_camera.process import ignore, scene
 from sim_camera.scene import Truth
-from sim_dm.device import Command, apply_command, initial
-from sim_dm.process import device
+from sim_dm.device import apply_command, initial
+from sim_dm.driver import device
 
 RATE_HZ = 1000.0
 

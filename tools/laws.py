@@ -18,7 +18,7 @@ from lowfc.control.laws.spectra import Pieces
 from lowfc.control.laws.vibration import Line, Model
 from lowfc.optics.detector.photometry import tilt_nm_per_mas
 from sim_camera.disturbance import variances_nm2
-from sim_camera.process import disturbance_of
+from sim_camera.driver import disturbance_of
 from tools.law_bench import RATE_HZ, Bench, calibrated, configured, timing_of, tuned, with_lines_moved
 from tools.shared import Figures, markdown
 

@@ -167,6 +167,8 @@ class Configuration(Section):
     recorder: Recorder = Recorder()
     realtime: Realtime = Realtime()
     network: Network = Network()
+    drivers: dict[str, dict[str, Any]] = Field(default_factory=dict)
+    """Options of drivers of cameras and mirrors by the driver's name, as each driver declares them: [drivers.NAME]."""
 
     @model_validator(mode="after")
     def _consistent(self) -> "Configuration":

@@ -33,6 +33,8 @@ from lowfc.contract.messages import (
     wire,
 )
 from lowfc.control.loop.safety import Limits
+from lowfc.device.guard import Command, Status
+from lowfc.device.mirror_loop import command_of, state_of
 from lowfc.programs.commissioning.checks import Check, put
 from lowfc.programs.commissioning.conformance import command as conformance
 from lowfc.programs.commissioning.conformance.camera import watch
@@ -42,8 +44,8 @@ from lowfc.programs.commissioning.conformance.frames import camera_checks
 from lowfc.programs.commissioning.conformance.line import Line, Received
 from lowfc.programs.commissioning.conformance.mirror import mirror_checks
 from lowfc.testing.clock import FakeClock
-from sim_dm.device import Command, Status, apply_command, initial, tick
-from sim_dm.process import _told, device, state_of
+from sim_dm.device import apply_command, initial, tick
+from sim_dm.driver import device
 from tests.support.loops import lowfc, until
 
 MS = 1_000_000
@@ -169,7 +171,7 @@ class Mirror(Device):
             command = wire.MirrorCommand.FromString(payload)
         except DecodeError:
             return
-        told = self.changed("told", _told(payload), command, self.status)
+        told = self.changed("told", command_of(payload), command, self.status)
         self.status, refused = apply_command(self.device, self.status, told, now_ns)
         if refused is None:
             self._publish(self.status.time_ns, now_ns)

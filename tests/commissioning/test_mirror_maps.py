@@ -22,7 +22,7 @@ from lowfc.control.loop.inputs import Frame, Load, MirrorShape, Request
 from lowfc.control.loop.safety import LoopMode
 from lowfc.control.loop.state import State
 from lowfc.programs.core.start_up import StartUp, check_files
-from sim_camera.process import scene
+from sim_camera.driver import scene
 from tests.support.loops import run
 from tools.law_bench import calibrated
 

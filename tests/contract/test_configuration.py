@@ -12,7 +12,7 @@ from lowfc.adapters.files.factory import detector, mirror, mirror_limits, settin
 from lowfc.contract.configuration import Configuration, keys, load
 from lowfc.contract.errors import ConfigurationError
 from lowfc.programs.cli.config import commented
-from sim_dm.process import device
+from sim_dm.driver import device
 
 KEYS = keys()
 

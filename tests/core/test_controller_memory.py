@@ -45,12 +45,14 @@ from lowfc.contract.published import Published
 from lowfc.control.calibration.calibration import Calibration
 from lowfc.control.laws.linear_law import integrator
 from lowfc.control.loop.safety import LoopMode
+from lowfc.device import DriverOptions
+from lowfc.device.mirror_loop import MirrorLoop
 from lowfc.programs.core import cache_warmup
 from lowfc.programs.core.controller import Controller
 from lowfc.testing.memory_bus import MemoryBus, MemoryHub
-from sim_camera.process import scene as configured_scene
+from sim_camera.driver import scene as configured_scene
 from sim_camera.scene import Scene, Wavefront
-from sim_dm.process import MirrorProcess
+from sim_dm.driver import SimulatedMirror
 from tests.support.loops import until
 from tools.law_bench import calibrated
 
@@ -81,7 +83,7 @@ class Rig:
         camera = self.bus("camera")
         self.frames, self.settings = camera.publisher(FRAME), camera.publisher(CAMERA_STATE)
         self.services = [Service(role, "test", self.clock(), self.bus(role)) for role in ("controller", "mirror-dm")]
-        self.mirror = MirrorProcess(config, self.services[1])
+        self.mirror = MirrorLoop(SimulatedMirror(DriverOptions(), config), self.services[1], config)
         state = factory.camera_state(config, scene.shape, START_NS)
         self.settings.put(state.SerializeToString())
         self.latch = Path(tempfile.mkdtemp()) / "safe"

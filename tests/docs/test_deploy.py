@@ -26,7 +26,7 @@ from lowfc.contract.configuration import Configuration, load
 from lowfc.contract.messages import wire
 from lowfc.programs.cli.config import commented
 from lowfc.programs.core.controller import MIRROR_PATIENCE_S
-from sim_camera.process import PATIENCE_S
+from sim_camera.driver import PATIENCE_S
 from tests.support.loops import until
 
 DEPLOY = Path(__file__).parents[2] / "deploy"

@@ -29,12 +29,14 @@ from lowfc.contract.errors import RequestRefusedError
 from lowfc.contract.messages import CAMERA_STATE, FRAME, MIRROR_STATE, STEP, TRUTH, image, timestamp, wire
 from lowfc.control.calibration.calibration import Calibration
 from lowfc.control.laws.linear_law import LinearLaw, integrator_block, of_blocks
+from lowfc.device import DriverOptions
+from lowfc.device.mirror_loop import MirrorLoop
 from lowfc.programs.core.controller import Controller
 from lowfc.programs.core.recording.recorder import Recorder
 from lowfc.testing.clock import FakeClock
 from lowfc.testing.memory_bus import MemoryBus, MemoryHub
-from sim_camera.process import scene
-from sim_dm.process import MirrorProcess
+from sim_camera.driver import scene
+from sim_dm.driver import SimulatedMirror
 from tests.support.loops import until
 
 ROOT = Path(__file__).parents[2]
@@ -84,7 +86,7 @@ class Night:
         latch = Latch([folder / "run" / "safe"])
         self.processes = [
             (Controller(config, services[0], calibration, "calibration.fits", latch), services[0]),
-            (MirrorProcess(config, services[1]), services[1]),
+            (MirrorLoop(SimulatedMirror(DriverOptions(), config), services[1], config), services[1]),
             (recorder, recorder.service),
         ]
         self.threads = [threading.Thread(target=process.run) for process, _ in self.processes]

@@ -26,17 +26,20 @@ BELOW = {
     "lowfc.adapters": ("lowfc.optics", "lowfc.control", "lowfc.contract"),
     "lowfc.testing": ("lowfc.optics", "lowfc.control", "lowfc.contract", "lowfc.adapters"),
     "lowfc.client": ("lowfc.control", "lowfc.contract", "lowfc.adapters"),
+    "lowfc.device": ("lowfc.optics", "lowfc.control", "lowfc.contract", "lowfc.adapters"),
     "lowfc.programs": (
         *("lowfc.optics", "lowfc.control", "lowfc.design", "lowfc.contract", "lowfc.adapters", "lowfc.client"),
+        "lowfc.device",
     ),
-    "sim_camera": ("lowfc.optics", "lowfc.control", "lowfc.contract", "lowfc.adapters"),
-    "sim_dm": ("lowfc.optics", "lowfc.control", "lowfc.contract", "lowfc.adapters"),
+    "sim_camera": ("lowfc.optics", "lowfc.control", "lowfc.contract", "lowfc.adapters", "lowfc.device"),
+    "sim_dm": ("lowfc.optics", "lowfc.control", "lowfc.contract", "lowfc.adapters", "lowfc.device"),
 }
 LAYERS = tuple(BELOW)
 BELOW_ALL = "lowfc.arrays"
 
 PURE_LAYERS = ("lowfc.arrays", "lowfc.optics", "lowfc.control", "lowfc.design")
 PURE_MODULES = (
+    "lowfc.device.guard",
     "sim_dm.device",
     "sim_camera.path",
     "sim_camera.scene",
@@ -183,7 +186,7 @@ def test_every_folder_of_modules_is_a_package_of_at_most_sixteen() -> None:
         ("lowfc.contract.codecs.codec", "def later():\n    from lowfc.adapters.process.clock import HostClock", False),
         ("lowfc.adapters.bus.bus", "import sim_dm.device", False),
         ("lowfc.client.client", "from lowfc.programs.cli.ctl import which_run", False),
-        ("sim_dm.process", "from sim_camera import bench", False),
+        ("sim_dm.driver", "from sim_camera import bench", False),
         ("lowfc.adapters.bus.bus", "from . import clock", False),
         ("lowfc.contract.codecs.codec", "from lowfc.control.laws.law import Law\nimport lowfc.optics.zernike", True),
         ("lowfc.programs.core.controller", "import lowfc.adapters.bus.bus\nfrom lowfc import __version__", True),

@@ -271,9 +271,9 @@ def test_what_is_published(kind: Kind) -> None:
     camera, reader = MemoryBus(hub, "camera", clock), MemoryBus(hub, "controller", clock)
     got: list[Sample] = []
     reader.subscribe(FRAME, got.append)
-    faulty = FaultyFrames(Fault(kind, 10, 10), camera.publisher(FRAME), DARK, HIGHEST)
+    faulty = FaultyFrames(Fault(kind, 10, 10), camera.publisher(FRAME), DARK, HIGHEST, clock.host_ns)
     for index in range(90):
-        envelope = faulty.put(index, faulty.message(index, IMAGE + np.uint16(index), index), 1000 + index)
+        envelope = faulty.put(image(IMAGE + np.uint16(index), index, "camera").SerializeToString())
         assert count_of(envelope.sequence) == index
     start_s = start_of(got[0].sequence)
     for sample in got:

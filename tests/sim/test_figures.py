@@ -11,9 +11,9 @@ from lowfc.contract.configuration import Configuration
 from lowfc.contract.messages import EVENT, MIRROR_STATE, Log, wire
 from lowfc.testing.clock import FakeClock
 from lowfc.testing.memory_bus import MemoryBus, MemoryHub
+from sim_camera.driver import SimulatedCamera
 from sim_camera.figures import BLOCK, MOST_BLOCKS, Figures, WavefrontFigures
 from sim_camera.lateness import WINDOW, Lateness
-from sim_camera.process import CameraProcess
 from sim_camera.scene import Scene, Truth, Wavefront
 
 NOLL = (2, 3, 4)
@@ -84,7 +84,9 @@ def test_the_camera_reports_the_habit_each_time() -> None:
         EVENT, lambda sample: events.append(Log.FromString(sample.payload).message)
     )
     service = Service("camera", "night", clock, MemoryBus(hub, "camera", clock))
-    camera = CameraProcess(config, service, cast("Scene", SimpleNamespace(shape=(80, 80), instants=())), None)
+    optics = cast("Scene", SimpleNamespace(shape=(80, 80), instants=()))
+    camera = SimulatedCamera(SimulatedCamera.Options(), config, optics)
+    camera.join(service)
     states = MemoryBus(hub, "mirror-dm", clock).publisher(MIRROR_STATE, config.mirror.name)
     shape = np.zeros((config.mirror.rows, config.mirror.columns), np.float32)
 

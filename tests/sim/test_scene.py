@@ -17,8 +17,8 @@ from lowfc.control.loop.estimator import Estimator
 from lowfc.optics.twin.twin import Evaluator
 from lowfc.testing.clock import FakeClock
 from sim_camera.disturbance import BLOCK, _sum_of_waves
-from sim_camera.process import disturbance_of
-from sim_camera.process import scene as scene_of
+from sim_camera.driver import disturbance_of
+from sim_camera.driver import scene as scene_of
 from sim_camera.scene import Scene
 
 FLAT = np.zeros((34, 34), np.float32)

@@ -11,8 +11,9 @@ from hypothesis.extra import numpy as hnp
 from lowfc.arrays import Single
 from lowfc.contract.configuration import load
 from lowfc.control.loop.safety import Limit, Limits, Reason, Rejection, neighbour_difference_nm
-from sim_dm.device import LONGEST_VALID_NS, Command, Device, Status, apply_command, initial, tick
-from sim_dm.process import device as device_of
+from lowfc.device.guard import LONGEST_VALID_NS, Command, Status
+from sim_dm.device import Device, apply_command, initial, tick
+from sim_dm.driver import device as device_of
 from tests.support.safety_checks import violations
 
 GRID = (4, 5)
@@ -24,7 +25,7 @@ MS = 1_000_000
 
 def mirror(**changes: object) -> Device:
     free = np.full(GRID, np.nan, np.float32)
-    return replace(Device(GRID, LIMITS, STEP_NM, 0.0, free, flatten=True), **changes)
+    return replace(Device(GRID, LIMITS, STEP_NM, True, 0.0, free), **changes)
 
 
 def told(actuators_nm: Single | None, index: int = 1, **changes: object) -> Command:

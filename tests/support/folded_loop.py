@@ -28,10 +28,11 @@ from lowfc.control.loop.advance import advance
 from lowfc.control.loop.camera import CameraSettings
 from lowfc.control.loop.inputs import Frame, Input, Load, MirrorShape, Request, Step
 from lowfc.control.loop.state import State
+from lowfc.device.guard import Command
 from lowfc.testing.memory_bus import MemoryBus, MemoryHub, MemoryRing
-from sim_camera.process import scene
-from sim_dm.device import Command, apply_command, initial
-from sim_dm.process import device
+from sim_camera.driver import scene
+from sim_dm.device import apply_command, initial
+from sim_dm.driver import device
 from tools.law_bench import Bench, calibrated
 
 FIRST = 1 << 32

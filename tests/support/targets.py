@@ -35,13 +35,14 @@ from lowfc.control.loop.command_channels import PlayTable
 from lowfc.control.loop.inputs import Input, Load, MirrorShape, Tick
 from lowfc.control.loop.requests import prepared
 from lowfc.control.loop.state import State
+from lowfc.device import DriverOptions
+from lowfc.device.mirror_loop import MirrorLoop, command_of
 from lowfc.programs.core.controller import Controller
 from lowfc.programs.view.snapshot import SHOWN, Accumulator
 from lowfc.testing.clock import FakeClock
 from lowfc.testing.memory_bus import MemoryBus, MemoryHub
-from sim_dm import process
 from sim_dm.device import Device, apply_command, initial, tick
-from sim_dm.process import MirrorProcess
+from sim_dm.driver import SimulatedMirror
 from tests.support.mutated_logs import damaged, mutated, rewritten, small_log
 from tests.support.report_log import Night
 from tests.support.safety_checks import violations
@@ -126,7 +127,7 @@ class Processes:
         config = load(None, {"mirror.rows": GRID[0], "mirror.columns": GRID[1], "realtime.cache_warmup": False})
         self.hub, self.clock, self.number = MemoryHub(), FakeClock(), 0
         self.services = [Service(name, "fuzz", self.clock, MemoryBus(self.hub, name, self.clock)) for name in ROLES]
-        self.mirror = MirrorProcess(config, self.services[1])
+        self.mirror = MirrorLoop(SimulatedMirror(DriverOptions(), config), self.services[1], config)
         self.controller = Controller(config, self.services[0], CALIBRATION, "a test", Latch(()))
         self.controller._adopted = True
         camera = MemoryBus(self.hub, "camera", self.clock)
@@ -158,7 +159,7 @@ class Processes:
             service.health().SerializeToString()
         kept = self.mirror._status.driven_nm
         assert np.isfinite(kept).all()
-        assert violations(self.mirror._device.limits, kept, kept) == []
+        assert violations(self.mirror._guard.limits, kept, kept) == []
 
 
 ROLES = ("controller", "mirror-dm")
@@ -260,9 +261,9 @@ def _go_on(what: object, state: State) -> None:
 
 
 def _obey(data: bytes) -> None:
-    device = Device(GRID, USUAL.limits, 0.01, 5e4, np.full(GRID, np.nan, np.float32), True)
+    device = Device(GRID, USUAL.limits, 0.01, True, 5e4, np.full(GRID, np.nan, np.float32))
     status = initial(device)
-    after, _ = apply_command(device, status, process._told(data), 10)
+    after, _ = apply_command(device, status, command_of(data), 10)
     assert violations(device.limits, status.driven_nm, after.driven_nm) == []
     tick(device, after, 10**9)
 

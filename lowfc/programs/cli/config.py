@@ -48,10 +48,10 @@ def _lines(section: BaseModel, prefix: str = "") -> Iterator[str]:
 
 def _assignment(name: str, value: object) -> list[str]:
     """A key and its value; a table in one line, so that it can stand between other keys."""
-    if isinstance(value, dict):
-        items = ", ".join(tomli_w.dumps({key: one}).strip() for key, one in value.items())
-        return [f"{name} = {{{items}}}"]
-    return tomli_w.dumps({name: value}).splitlines()
+    if not isinstance(value, dict):
+        return tomli_w.dumps({name: value}).splitlines()
+    items = ", ".join(" ".join(_assignment(key, one)) for key, one in value.items())
+    return [f"{tomli_w.dumps({name: 0}).partition(' = ')[0]} = {{{items}}}"]
 
 
 def config_show(config: ConfigFile = None) -> None:

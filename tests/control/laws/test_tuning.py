@@ -12,7 +12,7 @@ from lowfc.control.laws.tuning import best_gains, identified, left_of, tune_inte
 from lowfc.control.laws.vibration import Model
 from lowfc.optics.detector.photometry import tilt_nm_per_mas
 from sim_camera.disturbance import disturbance, modes_nm
-from sim_camera.process import disturbance_of
+from sim_camera.driver import disturbance_of
 from tests.support.theory import integrators, noise_transfer, realised, rejection, run
 from tools import laws
 from tools.law_bench import Bench, calibrated, configured, tuned, with_lines_moved

@@ -1,20 +1,20 @@
-"""The simulated mirror's process: commands from the bus, state and picture to it."""
+"""A mirror's process: commands from the bus to its driver, state and picture to the bus."""
 
 import threading
 
 import numpy as np
-import numpy.typing as npt
 from google.protobuf.message import DecodeError
 
 from lowfc.adapters.bus.bus import Sample
 from lowfc.adapters.bus.mailbox import Mailbox
 from lowfc.adapters.bus.start_check import StartCheck
-from lowfc.adapters.files.factory import mirror_limits, true_mirror
+from lowfc.adapters.files.factory import true_mirror
 from lowfc.adapters.process.clock import SimulatedClock
 from lowfc.adapters.process.service import Service
+from lowfc.arrays import Single
 from lowfc.contract.codecs.codec import actuators
 from lowfc.contract.configuration import Configuration
-from lowfc.contract.errors import BadMessageError
+from lowfc.contract.errors import BadMessageError, ConfigurationError
 from lowfc.contract.messages import (
     COMMAND,
     MIRROR_STATE,
@@ -25,12 +25,11 @@ from lowfc.contract.messages import (
     timestamp,
     wire,
 )
-from lowfc.control.loop.safety import Reason
+from lowfc.control.loop.safety import Limits, Reason
+from lowfc.device.driver import Mirror, MirrorExtras, geometry
+from lowfc.device.guard import Command, Guard, Status, apply_command, tick
 from lowfc.optics.chain.grid import pupil_axis
 from lowfc.optics.chain.mirror import influence_factors
-from sim_dm.device import Command, Device, Status, apply_command, initial, tick
-
-Single = npt.NDArray[np.float32]
 
 TICK_NS = 10_000_000
 IDLE_STATE_NS = 100_000_000
@@ -38,32 +37,42 @@ IDLE_STATE_NS = 100_000_000
 PICTURE_PIXELS = 64
 
 
-def device(config: Configuration) -> Device:
-    """The mirror of a configuration."""
-    section = config.mirror
-    fixed_nm = np.full((section.rows, section.columns), np.nan, np.float32)
-    fixed_nm.flat[section.dead] = 0
-    for index, height_nm in section.stuck_nm.items():
-        fixed_nm.flat[int(index)] = height_nm
-    return Device(
-        fixed_nm.shape,
-        mirror_limits(config),
-        section.stroke_nm / 2**section.driver_bits,
-        section.settling_us * 1e3,
-        fixed_nm,
-        section.on_command_timeout == "flat",
+_IDLE = MirrorExtras()
+
+
+def guard_of(driver: Mirror, config: Configuration) -> Guard:
+    """What is kept of a mirror: of the limits of its driver and those of [mirror], the tighter.
+
+    Raises:
+        ConfigurationError: its grid is not that of [mirror].
+    """
+    own, configured = driver.geometry, geometry(config)
+    if (own.rows, own.columns) != (configured.rows, configured.columns):
+        raise ConfigurationError(
+            f"the mirror has {own.rows} x {own.columns} actuators; mirror.rows and mirror.columns say "
+            f"{configured.rows} x {configured.columns}"
+        )
+    limits = Limits(
+        min(own.stroke_nm, configured.stroke_nm),
+        min(own.slew_nm, configured.slew_nm),
+        min(own.neighbour_nm, configured.neighbour_nm),
     )
+    return Guard((own.rows, own.columns), limits, own.step_nm, config.mirror.on_command_timeout == "flat")
 
 
-class MirrorProcess:
+class MirrorLoop:
     """Follows commands until told to stop."""
 
-    def __init__(self, config: Configuration, service: Service) -> None:
-        """Declare everything on the bus."""
+    def __init__(self, driver: Mirror, service: Service, config: Configuration) -> None:
+        """Declare everything on the bus, and see where the mirror is."""
         name = config.mirror.name
+        self._driver = driver
         self._service = service
-        self._device = device(config)
-        self._status = initial(self._device)
+        self._guard = guard_of(driver, config)
+        self._settle = getattr(driver, "settle", None)
+        getattr(driver, "join", _IDLE.join)(service)
+        self._fill_extra = getattr(driver, "fill", _IDLE.fill)
+        self._status = self._start()
         self._turn = threading.Lock()
         self._pause = Mailbox()  # nothing comes there: a signal can end its wait, wherever it strikes
         service.on_stop(self._pause.wake)
@@ -86,6 +95,15 @@ class MirrorProcess:
         service.awaited = lambda: "" if self._status.received_ns else "a controller"
         service.state = "ready"
 
+    def _start(self) -> Status:
+        """Where the mirror is as the process starts: as the driver says, or driven to flat."""
+        position = getattr(self._driver, "position", None)
+        self._driven_nm: Single | None = None if position is None else position()
+        if self._driven_nm is not None:
+            return Status(self._driven_nm, self._driven_nm)
+        flat_nm = np.zeros(self._guard.grid, np.float32)
+        return Status(flat_nm, self._drive(flat_nm, np.inf))
+
     def run(self) -> None:
         """Do all but the commands, which are obeyed where they arrive: without one, the dead-man."""
         service = self._service
@@ -96,6 +114,7 @@ class MirrorProcess:
                     self._wait()
             service.beat()
         self._leave()
+        self._driver.close()
         service.finish()
 
     def _arrived(self, sample: Sample) -> None:
@@ -107,14 +126,14 @@ class MirrorProcess:
     def _next_command(self, sample: Sample) -> None:
         clock = self._service.clock
         try:
-            told = _told(sample.payload, self._start_check)
+            told = command_of(sample.payload, self._start_check)
         except (DecodeError, BadMessageError) as error:
             self._service.unreadable(sample.key, error)
             return
         if isinstance(clock, SimulatedClock):
             clock.set_ns(told.time_ns)
         before, refused_before = self._status, self._refused
-        self._status, self._refused = apply_command(self._device, before, told, clock.now_ns())
+        self._status, self._refused = apply_command(self._guard, before, told, clock.now_ns(), self._drive)
         refused = self._refused
         self._publish(self._status.time_ns or clock.now_ns())
         self._service.work += 1
@@ -128,12 +147,23 @@ class MirrorProcess:
             if reason not in before.limits_hit:
                 self._service.event("LIMIT_HIT", reason=reason.name)
 
+    def _drive(self, actuators_nm: Single, elapsed_ns: float) -> Single:
+        """Have the driver move; without a new command a real mirror is left alone."""
+        if self._settle is not None:
+            surface_nm: Single = self._settle(actuators_nm, elapsed_ns)
+            return surface_nm
+        if actuators_nm is self._driven_nm:
+            return self._status.surface_nm
+        reached_nm = self._driver.apply(actuators_nm)
+        self._driven_nm = actuators_nm
+        return actuators_nm if reached_nm is None else reached_nm
+
     def _wait(self) -> None:
         now_ns = self._service.clock.now_ns()
         before = self._status
-        self._status = tick(self._device, before, now_ns)
+        self._status = tick(self._guard, before, now_ns, self._drive)
         if before.following and not self._status.following:
-            action = "relaxing to flat" if self._device.flatten else "holding the shape"
+            action = "relaxing to flat" if self._guard.flatten else "holding the shape"
             self._service.event("COMMAND_EXPIRED", command_timeout_ms=before.valid_for_ns / 1e6, action=action)
         moved = (
             self._status.surface_nm is not before.surface_nm and (self._status.surface_nm != before.surface_nm).any()
@@ -161,6 +191,7 @@ class MirrorProcess:
         health.command_refused = self._refused.value if self._refused is not None else 0  # type: ignore[assignment]
         health.command_expired = bool(status.received_ns) and not status.following
         health.limits_hit.extend(reason.value for reason in status.limits_hit)  # type: ignore[misc]
+        self._fill_extra(health)
 
 
 def state_of(status: Status, time_ns: int) -> wire.MirrorState:
@@ -178,7 +209,13 @@ def state_of(status: Status, time_ns: int) -> wire.MirrorState:
     )
 
 
-def _told(payload: bytes, start_check: StartCheck | None = None) -> Command:
+def command_of(payload: bytes, start_check: StartCheck | None = None) -> Command:
+    """Command of a message.
+
+    Raises:
+        BadMessageError: its sequence or its time cannot be.
+        DecodeError: it is no MirrorCommand.
+    """
     message = wire.MirrorCommand.FromString(payload)
     return Command(
         message.channel,

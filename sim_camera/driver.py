@@ -1,45 +1,45 @@
-"""The simulated camera's process: mirror states from the bus, frames and truth to it."""
+"""The simulated camera as a driver: mirror states from the bus, frames to its loop, the truth to the bus."""
 
 import threading
 from collections import deque
 from dataclasses import asdict
-from itertools import count
+from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 from google.protobuf.message import DecodeError
 
-from lowfc.adapters.bus.bus import Sample
+from lowfc.adapters.bus.bus import Publisher, Sample
 from lowfc.adapters.files import factory
-from lowfc.adapters.process.realtime import let_send
 from lowfc.adapters.process.service import Service
+from lowfc.arrays import Single
 from lowfc.contract.codecs.codec import actuators, latency
 from lowfc.contract.configuration import Configuration
+from lowfc.contract.envelope import Envelope
 from lowfc.contract.errors import BusError, ConfigurationError
-from lowfc.contract.messages import CAMERA_STATE, FRAME, MIRROR_STATE, TRUTH, image, timestamp, wire
+from lowfc.contract.messages import MIRROR_STATE, TRUTH, fields_of, timestamp, wire
 from lowfc.control.laws.stability import delay_weights
 from lowfc.control.loop.durations import Durations
+from lowfc.device import CameraSettings, DriverOptions, Exposure, Puts
 from lowfc.optics.detector.detector import saturation_dn
 from lowfc.optics.detector.photometry import tilt_nm_per_mas
-from sim_camera.contrast import AddedContrast, Contrast
+from sim_camera.contrast import AddedContrast, contrast_of
 from sim_camera.disturbance import Disturbance, disturbance
-from sim_camera.faults import Fault
-from sim_camera.faulty import FaultyFrames
+from sim_camera.faulty import FaultyFrames, read_fault
 from sim_camera.figures import Figures
 from sim_camera.lateness import Lateness
 from sim_camera.path import MirrorPath
 from sim_camera.scene import Scene
 
-Single = npt.NDArray[np.float32]
-
 PATIENCE_S = 5.0
 """In lockstep, real time without progress after which the run is ended."""
-WAIT_S = 30.0
-"""How long the first frame waits for those who must not miss it."""
 RECENT_S = 2.0
 """Over which the wavefront is reported while the loop runs."""
 _REMEMBERED = 256
+_SETTINGS = (
+    *("exposure_ns", "period_ns", "gain_e_per_dn", "bias_dn", "read_noise_e", "saturation_dn", "rows", "columns"),
+    *("bit_depth", "em_gain"),
+)
 
 
 def disturbance_of(config: Configuration) -> Disturbance:
@@ -82,7 +82,7 @@ def ignore(warning: str) -> None:
 
 
 class _Exposed(NamedTuple):
-    """The frame exposed last: its number, -1 before the first, its sequence, and the mirror at the exposure's start."""
+    """A frame: its number, -1 before the first, its sequence, and the mirror at the exposure's start."""
 
     frame: int
     start_ns: int
@@ -91,95 +91,118 @@ class _Exposed(NamedTuple):
     actuators_nm: Single
 
 
-class CameraProcess:
-    """Exposes frame after frame until told to stop, or for a number of frames."""
+class SimulatedCamera:
+    """The optics, the star and the detector of a configuration, exposed frame after frame."""
 
-    def __init__(
-        self,
-        config: Configuration,
-        service: Service,
-        optics: Scene,
-        frames: int | None,
-        fault: Fault | None = None,
-        contrast: Contrast | None = None,
-    ) -> None:
-        """Declare everything on the bus; `fault` befalls the frames, `contrast` is computed where it is given."""
+    class Options(DriverOptions):
+        """Of tests."""
+
+        fault: str = ""
+        """File (JSON) of a fault that befalls the frames; empty for none."""
+
+    def __init__(self, options: Options, config: Configuration, optics: Scene | None = None) -> None:
+        """Build the optics, or take those that are given."""
         self._config = config
-        self._service = service
-        self._scene = optics
-        self._limit = frames
-        self._frames = service.publisher(FRAME)
-        highest = saturation_dn(factory.detector(config))
-        self._faulty = FaultyFrames(fault, self._frames, config.camera.bias_dn, highest) if fault else None
-        self._truths = service.publisher(TRUTH)
-        self._settings = service.publisher(CAMERA_STATE)
+        self._scene = scene(config) if optics is None else optics
+        self._contrast = contrast_of(config)
+        self._fault = read_fault(Path(options.fault)) if options.fault else None
+        state = factory.camera_state(config, self._scene.shape, 0)
+        self._settings = fields_of(state, _SETTINGS)
         self._weights = delay_weights(config.camera.delay_frames).astype(np.float32)
         flat = np.zeros((config.mirror.rows, config.mirror.columns), np.float32)
         self._shapes = deque([flat] * len(self._weights), maxlen=len(self._weights))
         self._states: deque[Sample] = deque(maxlen=_REMEMBERED)
         self._arrived = threading.Event()
-        service.bus.subscribe(MIRROR_STATE, self._hear, config.mirror.name)
-        service.on_stop(self._arrived.set)
         self._latched = flat
-        lockstep, settling_us = service.clock.lockstep, config.mirror.settling_us
         # In lockstep a shape is in force from the start of an exposure on, and its settling is in the mirror's state.
-        settling = 0.0 if lockstep else settling_us * 1e3 / config.period_ns
+        settling = 0.0 if config.lockstep else config.mirror.settling_us * 1e3 / config.period_ns
         self._path = MirrorPath(flat, config.camera.delay_frames - 1, settling)
-        self._exposed = _Exposed(-1, 0, 0, 0, flat)
+        self._index, self._origin_ns = 0, 0
+        self._exposing = self._exposed = _Exposed(-1, 0, 0, 0, flat)
         self._newest_state = 0
         self._put_ns = [(0, 0)] * _REMEMBERED
         self._last_frame = 0
-        self._first_put_ns = 0
         self._lateness = Lateness()
         self._frame_to_mirror = Durations()
         recent = max(1, round(RECENT_S * config.camera.rate_hz))
-        self._figures = Figures(config.noll, tilt_nm_per_mas(config.star.diameter_m), recent, len(optics.instants))
-        self._contrast = contrast
+        nm_per_mas = tilt_nm_per_mas(config.star.diameter_m)
+        self._figures = Figures(config.noll, nm_per_mas, recent, len(self._scene.instants))
         self._measured: AddedContrast | None = None
-        self._publish_settings(service.clock.now_ns())
-        service.state = "ready"
 
-    def run(self, wait_for: tuple[str, ...]) -> None:
-        """Expose, publish, wait; the first frame waits for those named.
+    def join(self, service: Service) -> None:
+        """Declare the truth, and listen to the mirror."""
+        self._service = service
+        self._truths = service.publisher(TRUTH)
+        service.bus.subscribe(MIRROR_STATE, self._hear, self._config.mirror.name)
+        service.on_stop(self._arrived.set)
+
+    def through(self, publisher: Publisher) -> Puts:
+        """The publisher, or one with the fault of the options."""
+        if self._fault is None:
+            return publisher
+        highest = saturation_dn(factory.detector(self._config))
+        return FaultyFrames(self._fault, publisher, self._config.camera.bias_dn, highest, self._service.clock.host_ns)
+
+    def start(self) -> None:
+        """The time of the first exposure."""
+        clock = self._service.clock
+        self._origin_ns = clock.now_ns() + (0 if clock.lockstep else 10 * self._config.period_ns)
+
+    def settings(self) -> CameraSettings:
+        """Those of the next exposure."""
+        time_ns = self._origin_ns and self._start_ns() + self._config.exposure_ns
+        return CameraSettings(clock="run", time_ns=time_ns or None, **self._settings)
+
+    def expose(self) -> Exposure | None:
+        """Latch the mirror as the next exposure starts, and make its frame before it ends."""
+        clock, period_ns = self._service.clock, self._config.period_ns
+        start_ns = self._start_ns()
+        clock.sleep_until_ns(start_ns)
+        behind_ns = clock.now_ns() - start_ns
+        if behind_ns > period_ns:  # the host stood still: go on from here rather than catch up in a burst
+            self._origin_ns += behind_ns
+            start_ns += behind_ns
+        if not self._service.running:
+            return None
+        self._drain()
+        self._shapes.appendleft(self._latched)
+        seen = self._latched
+        if len(self._weights) > 1:
+            seen = np.tensordot(self._weights, np.array(self._shapes), 1)
+        frame = self._scene.expose(self._index, seen)
+        end_ns = start_ns + self._config.exposure_ns
+        self._exposing = _Exposed(self._index, start_ns, end_ns, 0, seen)
+        self._index += 1
+        return Exposure(frame, end_ns)
+
+    def sent(self, envelope: Envelope) -> None:
+        """Remember when the frame was put, and publish the truth of the last one."""
+        self._put_ns[envelope.sequence % _REMEMBERED] = (envelope.sequence, envelope.publish_time_ns)
+        self._last_frame = envelope.sequence
+        self._publish_truth()
+        self._exposed = self._exposing._replace(sequence=envelope.sequence)
+
+    def step(self) -> None:
+        """Until the mirror has applied the command made from the last frame.
 
         Raises:
-            BusError: somebody did not come, or in lockstep did not answer.
+            BusError: it did not for so long.
         """
-        missing = self._service.wait_for(wait_for, WAIT_S)
-        if missing and self._service.running:
-            raise BusError(f"no sign of {', '.join(missing)} after {WAIT_S:g} s; the camera will not start without")
-        self._service.state = "running"
-        clock, period_ns, exposure_ns = self._service.clock, self._config.period_ns, self._config.exposure_ns
-        origin_ns = clock.now_ns() if clock.lockstep else clock.now_ns() + 10 * period_ns
-        settings_every = max(1, round(self._config.camera.rate_hz / float(CAMERA_STATE.rate)))
-        for index in count() if self._limit is None else range(self._limit):
-            start_ns = origin_ns + index * period_ns
-            clock.sleep_until_ns(start_ns)
-            behind_ns = clock.now_ns() - start_ns
-            if behind_ns > period_ns:  # the host stood still: go on from here rather than catch up in a burst
-                origin_ns += behind_ns
-                start_ns += behind_ns
-            if not self._service.running:
-                break
-            end_ns = start_ns + exposure_ns
-            if index % settings_every == 0:
-                self._publish_settings(end_ns)
-            self._expose(index, start_ns, end_ns)
-            self._service.work += 1
-            if clock.lockstep:
-                self._wait_for_mirror()
-            self._service.beat()
+        while self._newest_state < self._last_frame and self._service.running:
+            self._arrived.clear()
+            if not self._states and not self._arrived.wait(PATIENCE_S):
+                raise BusError(self._silent_ones())
+            self._drain()
+
+    def close(self) -> None:
+        """Publish the last truth, and compute the contrast of the run."""
         self._drain()
         self._publish_truth()
         self._measured = self._contrast.measure() if self._contrast is not None else None
-        self._service.finish()
 
     def fill(self, health: wire.Health) -> None:
         """Add latency and wavefront to a Health."""
         health.commands_late = self._lateness.total
-        if self._frames.published > 1:
-            elapsed_ns = self._put_ns[self._last_frame % _REMEMBERED][1] - self._first_put_ns
-            health.mean_rate_hz = (self._frames.published - 1) * 1e9 / elapsed_ns
         if self._frame_to_mirror.count:
             health.frame_to_mirror.CopyFrom(latency(self._frame_to_mirror))
         if (wavefront := self._figures.wavefront()) is not None:
@@ -192,30 +215,8 @@ class CameraProcess:
         if (recent := self._figures.recent()) is not None:
             health.recent_wavefront.CopyFrom(wire.WavefrontFigures(**asdict(recent)))
 
-    def _expose(self, index: int, start_ns: int, end_ns: int) -> None:
-        """Latch the mirror, make the frame during the exposure, publish it at its end; then the truth of the last."""
-        clock = self._service.clock
-        self._drain()
-        self._shapes.appendleft(self._latched)
-        seen = self._latched
-        if len(self._weights) > 1:
-            seen = np.tensordot(self._weights, np.array(self._shapes), 1)
-        frame = self._scene.expose(index, seen)
-        if self._faulty is None:
-            payload = image(frame, end_ns, "lowfc_camera").SerializeToString()
-        else:
-            payload = self._faulty.message(index, frame, end_ns)
-        clock.sleep_until_ns(end_ns)
-        if self._faulty is None:
-            envelope = self._frames.put(payload)
-        else:
-            envelope = self._faulty.put(index, payload, clock.host_ns())
-        let_send()
-        self._put_ns[envelope.sequence % _REMEMBERED] = (envelope.sequence, envelope.publish_time_ns)
-        self._last_frame = envelope.sequence
-        self._first_put_ns = self._first_put_ns or envelope.publish_time_ns
-        self._publish_truth()
-        self._exposed = _Exposed(index, start_ns, end_ns, envelope.sequence, seen)
+    def _start_ns(self) -> int:
+        return self._origin_ns + self._index * self._config.period_ns
 
     def _publish_truth(self) -> None:
         """The truth of the frame exposed last: its period is over now, and where the mirror was in it is known."""
@@ -290,14 +291,6 @@ class CameraProcess:
             event = "COMMANDS_LATE" if self._lateness.habitual else "COMMANDS_IN_TIME"
             self._service.event(event, percent=self._lateness.percent)
 
-    def _wait_for_mirror(self) -> None:
-        """In lockstep: until the mirror has applied the command made from the last frame."""
-        while self._newest_state < self._last_frame and self._service.running:
-            self._arrived.clear()
-            if not self._states and not self._arrived.wait(PATIENCE_S):
-                raise BusError(self._silent_ones())
-            self._drain()
-
     def _silent_ones(self) -> str:
         now_ns = self._service.clock.host_ns()
         silent = [
@@ -306,10 +299,4 @@ class CameraProcess:
             if name != self._service.name and now_ns - health.timestamp.ToNanoseconds() > PATIENCE_S * 0.4e9
         ]
         who = f"nothing was heard of {', '.join(silent)}" if silent else "all processes are alive"
-        return (
-            f"the mirror did not apply a command for frame {self._frames.published - 1} within {PATIENCE_S:g} s: {who}"
-        )
-
-    def _publish_settings(self, time_ns: int) -> None:
-        state = factory.camera_state(self._config, self._scene.shape, time_ns)
-        self._settings.put(state.SerializeToString())
+        return f"the mirror did not apply a command for frame {self._index - 1} within {PATIENCE_S:g} s: {who}"

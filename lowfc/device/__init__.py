@@ -1,0 +1,37 @@
+"""Drivers of cameras and mirrors: what one is, and the two loops that run it."""
+
+from lowfc.arrays import Pixels, Single
+from lowfc.contract.configuration import Configuration
+from lowfc.contract.errors import ConfigurationError
+from lowfc.device.driver import (
+    Camera,
+    CameraExtras,
+    CameraSettings,
+    DriverOptions,
+    Exposure,
+    Geometry,
+    Mirror,
+    MirrorExtras,
+    Puts,
+    geometry,
+)
+from lowfc.device.run import run_camera, run_mirror
+
+__all__ = [
+    "Camera",
+    "CameraExtras",
+    "CameraSettings",
+    "Configuration",
+    "ConfigurationError",
+    "DriverOptions",
+    "Exposure",
+    "Geometry",
+    "Mirror",
+    "MirrorExtras",
+    "Pixels",
+    "Puts",
+    "Single",
+    "geometry",
+    "run_camera",
+    "run_mirror",
+]

@@ -1,0 +1,104 @@
+"""Drivers by their names: entry points of installed packages, or "module:Class"."""
+
+import sys
+import tomllib
+from collections.abc import Sequence
+from importlib.metadata import EntryPoint, entry_points
+from pathlib import Path
+from typing import Any, Literal
+
+from pydantic import ValidationError
+
+from lowfc.contract.configuration import Configuration, explain
+from lowfc.contract.errors import ConfigurationError, brief, nearest
+from lowfc.device.driver import DriverOptions
+
+Kind = Literal["camera", "mirror"]
+KINDS: tuple[Kind, ...] = ("camera", "mirror")
+
+
+def installed(kind: Kind) -> dict[str, EntryPoint]:
+    """Entry points of the drivers that are installed, by name."""
+    return {point.name: point for point in entry_points(group=f"lowfc.{kind}s")}
+
+
+def load(kind: Kind, name: str) -> Any:
+    """Class of a driver.
+
+    Raises:
+        ConfigurationError: there is none of that name, or it cannot be imported.
+    """
+    if ":" in name:
+        sys.path.insert(0, str(Path.cwd()))  # `python -P` leaves out the folder in which the user stands
+        point = EntryPoint(name, name, f"lowfc.{kind}s")
+    elif name in (known := installed(kind)):
+        point = known[name]
+    else:
+        raise ConfigurationError(
+            f"no driver of a {kind} is called {name!r}{nearest(name, known)}; there are {', '.join(sorted(known))}, or "
+            "write module:Class"
+        )
+    try:
+        return point.load()
+    except (ImportError, AttributeError) as fault:
+        raise ConfigurationError(f"the driver {name!r} cannot be loaded: {fault}") from None
+
+
+def opened(kind: Kind, name: str, config: Configuration, words: Sequence[str] = (), driver: Any = None) -> Any:
+    """A driver with its options: of the configuration, and `words` of a command line over them.
+
+    Args:
+        kind: of the driver.
+        name: of the driver.
+        config: of the run.
+        words: "--key", "value" or "--key=value".
+        driver: its class, where that is known.
+    """
+    driver = load(kind, name) if driver is None else driver
+    return driver(options(driver, table(config, kind, name), words), config)
+
+
+def table(config: Configuration, kind: Kind, name: str) -> dict[str, Any]:
+    """Options of a driver in a configuration: [drivers.NAME], or its part for this kind."""
+    found = config.drivers.get(name.partition(":")[0], {})
+    if found and set(found) <= set(KINDS):
+        return dict(found.get(kind, {}))
+    return found
+
+
+def options(driver: Any, found: dict[str, Any], words: Sequence[str] = ()) -> DriverOptions:
+    """Options of a driver's class: those of a table, and words of a command line, `--key value`, over it.
+
+    Raises:
+        ConfigurationError: one is unknown or wrong.
+    """
+    model: type[DriverOptions] = getattr(driver, "Options", DriverOptions)
+    try:
+        model.model_validate(found)
+        return model.model_validate({**found, **_given(words)}, strict=False if words else None)
+    except ValidationError as error:
+        where = f"options of {driver.__name__}"
+        raise ConfigurationError("\n".join(f"{where}: {_explained(one, model)}" for one in error.errors())) from None
+
+
+def _explained(fault: Any, model: type[DriverOptions]) -> str:
+    """One of pydantic's errors as a line for a user."""
+    if fault["type"] == "extra_forbidden":
+        return f"there is no {brief(fault['loc'][0])}; there are {', '.join(model.model_fields) or 'none'}"
+    return explain(fault)
+
+
+def _given(words: Sequence[str]) -> dict[str, Any]:
+    """Values of a command line by the names of fields; lists in the way of TOML."""
+    found: dict[str, Any] = {}
+    rest = list(words)
+    while rest:
+        key, equals, value = rest.pop(0).partition("=")
+        if not key.startswith("--") or not (equals or rest):
+            raise ConfigurationError(f"options of a driver are --name value, got {' '.join([key, *rest])!r}")
+        value = value if equals else rest.pop(0)
+        try:
+            found[key[2:].replace("-", "_")] = tomllib.loads(f"x = {value}")["x"] if value[:1] in "[{" else value
+        except tomllib.TOMLDecodeError:
+            raise ConfigurationError(f"{key}: {value!r} is not a list or a table as in TOML") from None
+    return found

@@ -1,0 +1,55 @@
+"""A driver's process: how it joins a run, and its command line."""
+
+from contextlib import closing
+from typing import Annotated
+
+import typer
+
+from lowfc.adapters.bus.run import mirror_role
+from lowfc.adapters.process.join import join
+from lowfc.contract.configuration import Configuration
+from lowfc.contract.messages import Role
+from lowfc.device.camera_loop import CameraLoop
+from lowfc.device.driver import Camera, Mirror
+from lowfc.device.mirror_loop import MirrorLoop
+
+PASSED_ON = {"allow_extra_args": True, "ignore_unknown_options": True}
+"""Settings of a command that leaves words to the driver: its options."""
+Frames = Annotated[int | None, typer.Option(min=1, help="Stop after so many frames; default: when told to.")]
+WaitFor = Annotated[list[str] | None, typer.Option(help="Process that the first frame waits for; repeat.")]
+
+
+def run_camera(
+    driver: Camera, config: Configuration, run: str, frames: int | None = None, wait_for: tuple[str, ...] = ()
+) -> None:
+    """Join a run and publish the driver's frames until SIGTERM or Ctrl-C, or a number of them.
+
+    Args:
+        driver: of the camera.
+        config: of the run.
+        run: its name.
+        frames: after which it stops.
+        wait_for: processes that the first frame waits for.
+
+    Raises:
+        BusError: the run has a camera already, or one of `wait_for` did not come.
+    """
+    service = join(config, run, Role.CAMERA, config.realtime.camera_cpus)
+    loop = CameraLoop(driver, service, config, frames)
+    service.catch_signals()
+    with closing(service.bus):  # a callback on zenoh's threads must not outlive the interpreter
+        loop.run(wait_for)
+
+
+def run_mirror(driver: Mirror, config: Configuration, run: str) -> None:
+    """Join a run and have the driver follow its commands until SIGTERM or Ctrl-C; arguments as of `run_camera`.
+
+    Raises:
+        BusError: the run has this mirror already.
+        ConfigurationError: the driver's grid is not that of [mirror].
+    """
+    service = join(config, run, mirror_role(config.mirror.name), config.realtime.mirror_cpus)
+    loop = MirrorLoop(driver, service, config)
+    service.catch_signals()
+    with closing(service.bus):
+        loop.run()

@@ -1,0 +1,47 @@
+"""The commands `lowfc camera` and `lowfc mirror`: options only."""
+
+from typing import Annotated
+
+import typer
+
+from lowfc.adapters.process.terminal import DEFAULT_RUN, ConfigFile, RunId, configuration, new_app
+from lowfc.device import run_camera, run_mirror
+from lowfc.device.plugins import opened
+from lowfc.device.run import PASSED_ON, Frames, WaitFor
+
+Driver = Annotated[str, typer.Argument(help="Name of an installed driver, or module:Class.", show_default=False)]
+
+camera_app = new_app("")
+mirror_app = new_app("")
+
+
+@camera_app.command(context_settings=PASSED_ON)
+def camera(
+    context: typer.Context,
+    driver: Driver,
+    run: RunId = DEFAULT_RUN,
+    config: ConfigFile = None,
+    frames: Frames = None,
+    wait_for: WaitFor = None,
+) -> None:
+    """Run a camera: its driver's frames and settings go to the run.
+
+    The driver's own options are in [drivers.DRIVER] of the configuration; `--name value` here takes precedence.
+
+    Example: lowfc camera sim --run bench --config lowfc.toml
+    """
+    settings = configuration(config)
+    found = opened("camera", driver, settings, context.args)
+    run_camera(found, settings, run, frames, tuple(wait_for or ()))
+
+
+@mirror_app.command(context_settings=PASSED_ON)
+def mirror(context: typer.Context, driver: Driver, run: RunId = DEFAULT_RUN, config: ConfigFile = None) -> None:
+    """Run a mirror: its driver follows the commands of the run, within the mirror's own limits.
+
+    The driver's own options are in [drivers.DRIVER] of the configuration; `--name value` here takes precedence.
+
+    Example: lowfc mirror sim --run bench --config lowfc.toml
+    """
+    settings = configuration(config)
+    run_mirror(opened("mirror", driver, settings, context.args), settings, run)

@@ -1,0 +1,138 @@
+"""A driver as its author writes it: found by name, its options checked, run by the loops."""
+
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from lowfc.contract.configuration import load
+from lowfc.contract.errors import ConfigurationError
+from lowfc.contract.messages import CAMERA_STATE, COMMAND, FRAME, MIRROR_STATE, wire
+from lowfc.control.loop.safety import Limit
+from lowfc.device import CameraSettings, Configuration, DriverOptions, Exposure, Single, geometry, plugins
+from lowfc.device.camera_loop import CameraLoop
+from lowfc.device.mirror_loop import MirrorLoop, guard_of
+from lowfc.testing.clock import FakeClock
+from lowfc.testing.listener import Listener
+from lowfc.testing.memory_bus import MemoryBus, MemoryHub
+
+GRID = (4, 5)
+CONFIG = load(None, {"mirror.rows": GRID[0], "mirror.columns": GRID[1]})
+MS = 1_000_000
+
+
+class Ramp:
+    """A camera of 3 x 4 pixels that counts."""
+
+    class Options(DriverOptions):
+        level: int = 7
+        """Value of the first frame."""
+        ports: tuple[int, ...] = ()
+        """Some list."""
+
+    def __init__(self, options: Options, config: Configuration) -> None:
+        self.level, self.closed = options.level, False
+
+    def settings(self) -> CameraSettings:
+        return CameraSettings(3, 4, exposure_ns=2 * MS, period_ns=4 * MS, bit_depth=12)
+
+    def expose(self) -> Exposure | None:
+        self.level += 1
+        return Exposure(np.full((3, 4), self.level, np.uint16))
+
+    def close(self) -> None:
+        self.closed = True
+
+
+class Follower:
+    """A mirror that goes where it is told."""
+
+    def __init__(self, options: DriverOptions, config: Configuration) -> None:
+        self.geometry = geometry(config)
+        self.applied: list[Single] = []
+
+    def apply(self, actuators_nm: Single) -> None:
+        self.applied.append(actuators_nm)
+
+    def close(self) -> None:
+        self.applied.append(np.zeros(0, np.float32))
+
+
+def test_a_camera_publishes_what_its_driver_returns() -> None:
+    hub, clock = MemoryHub(), FakeClock()
+    heard = Listener(hub, clock, FRAME, CAMERA_STATE)
+    driver = Ramp(Ramp.Options(), CONFIG)
+    CameraLoop(driver, heard.service("camera"), CONFIG, frames=3).run()
+    frames = heard.messages(FRAME)
+    assert [frame.data for frame in frames] == [np.full((3, 4), level, np.uint16).tobytes() for level in (8, 9, 10)]
+    assert {frame.timestamp.ToNanoseconds() for frame in frames} == {clock.now_ns()}
+    state = heard.messages(CAMERA_STATE)[-1]
+    assert (state.rows, state.columns, state.saturation_dn, state.exposure_ns) == (3, 4, 4095, 2 * MS)
+    assert driver.closed
+    assert heard.events() == ["STARTED", "STOPPED"]
+
+
+def test_a_mirror_is_driven_within_its_limits_and_to_flat_once_the_commands_end() -> None:
+    hub, clock = MemoryHub(), FakeClock()
+    heard = Listener(hub, clock, MIRROR_STATE)
+    driver = Follower(DriverOptions(), CONFIG)
+    loop = MirrorLoop(driver, heard.service("mirror-dm"), CONFIG)
+    assert not driver.applied.pop().any(), "it begins flat, for nobody knows where it is"
+    commands = MemoryBus(hub, "controller", clock).publisher(COMMAND, "dm")
+
+    def command(height_nm: float, grid: tuple[int, int] = GRID) -> None:
+        told = wire.MirrorCommand(frame_sequence=5, rows=grid[0], columns=grid[1], valid_for_ns=100 * MS)
+        told.actuators = np.full(grid, height_nm, np.float32).tobytes()
+        commands.put(told.SerializeToString())
+
+    command(200.0)
+    assert driver.applied[-1].max() == pytest.approx(150.0, abs=0.1), "the slew limit of [mirror]"
+    command(200.0, (5, 4))
+    command(float("nan"))
+    assert len(driver.applied) == 1
+    assert [state.refused for state in heard.messages(MIRROR_STATE)] == [0, Limit.WRONG_GRID, Limit.NOT_FINITE]
+    clock.advance(101 * MS)
+    loop._wait()
+    assert not driver.applied[-1].any()
+    loop._wait()
+    assert len(driver.applied) == 2, "a mirror at rest is left alone"
+    assert heard.events()[-1] == "COMMAND_EXPIRED"
+
+
+def test_the_tighter_of_the_drivers_limits_and_the_configured_ones_count() -> None:
+    driver = Follower(DriverOptions(), load(None, {"mirror.rows": 4, "mirror.columns": 5, "mirror.slew_nm": 30.0}))
+    assert guard_of(driver, CONFIG).limits.slew_nm == 30.0
+    with pytest.raises(ConfigurationError, match=r"4 x 5 actuators; .* say 34 x 34"):
+        guard_of(driver, Configuration())
+
+
+def test_options_come_from_the_configuration_and_the_command_line() -> None:
+    config = load(None, {"drivers.ramp.level": 3, "drivers.both.camera": {"level": 4}, "drivers.both.mirror": {}})
+    assert plugins.opened("camera", "ramp", config, (), Ramp).level == 3
+    assert plugins.opened("camera", "both:Class", config, (), Ramp).level == 4
+    found = plugins.options(Ramp, {"level": 3}, ("--level", "5", "--ports=[1, 2]"))
+    assert (found.level, found.ports) == (5, (1, 2))
+    for table, words, why in [
+        ({"levle": 1}, (), "there is no 'levle'; there are level, ports"),
+        ({"level": "7"}, (), "level = '7'"),
+        ({}, ("--level", "x"), "level = 'x'"),
+        ({}, ("level",), "--name value"),
+        ({}, ("--level",), "--name value"),
+    ]:
+        with pytest.raises(ConfigurationError, match=why):
+            plugins.options(Ramp, table, words)
+
+
+def test_a_driver_is_found_by_entry_point_or_by_module_and_class(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    assert plugins.load("camera", "sim").__name__ == "SimulatedCamera"
+    assert plugins.load("mirror", "sim").__name__ == "SimulatedMirror"
+    (tmp_path / "beside_me.py").write_text("class Mine: ...\n")
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "path", list(sys.path))
+    assert plugins.load("camera", "beside_me:Mine").__name__ == "Mine"
+    for name, why in [("sin", "did you mean 'sim'"), ("beside_me:Other", "cannot be loaded"), ("nowhere:X", "nowhere")]:
+        with pytest.raises(ConfigurationError, match=why):
+            plugins.load("camera", name)
