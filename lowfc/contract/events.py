@@ -69,6 +69,8 @@ EVENTS: dict[str, Event] = {
         Event("NO_FRAMES", Level.WARNING, "no frame for {silent_ms:.0f} ms; {action}"),
         Event("FRAMES_BACK", Level.INFO, "frames are back after {silent_ms:.0f} ms"),
         Event("FRAMES_MISSING", Level.WARNING, "{count:frame} missing or skipped before frame {number}"),
+        Event("STREAM_SILENT", Level.WARNING, "no image comes in stream {stream}: {why}"),
+        Event("STREAM_RENEWED", Level.WARNING, "stream {stream} was made anew: {columns} x {rows} pixels"),
         Event("CAMERA_RESTARTED", Level.WARNING, "the camera restarted"),
         Event("MIRROR_ADOPTED", Level.INFO, "starting from the mirror's command, {rms_nm:.1f} nm rms of wavefront"),
         Event(

@@ -73,12 +73,19 @@ def options(driver: Any, found: dict[str, Any], words: Sequence[str] = ()) -> Dr
         ConfigurationError: one is unknown or wrong.
     """
     model: type[DriverOptions] = getattr(driver, "Options", DriverOptions)
+    given, faults = _given(words), []
     try:
-        model.model_validate(found)
-        return model.model_validate({**found, **_given(words)}, strict=False if words else None)
-    except ValidationError as error:
-        where = f"options of {driver.__name__}"
-        raise ConfigurationError("\n".join(f"{where}: {_explained(one, model)}" for one in error.errors())) from None
+        made = model.model_validate(found)
+    except ValidationError as error:  # what is missing there may be among the words
+        faults = [one for one in error.errors() if not (given and one["type"] == "missing")]
+    if given and not faults:
+        try:
+            made = model.model_validate({**found, **given}, strict=False)
+        except ValidationError as error:
+            faults = error.errors()
+    if faults:
+        raise ConfigurationError("\n".join(f"options of {driver.__name__}: {_explained(one, model)}" for one in faults))
+    return made
 
 
 def _explained(fault: Any, model: type[DriverOptions]) -> str:

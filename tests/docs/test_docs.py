@@ -8,6 +8,7 @@ from pathlib import Path
 
 import pytest
 
+from tests.device.test_isio_loop import DOCUMENTED as BESIDE_CACAO
 from tests.e2e.test_bench_day import COMMANDS as BENCH_DAY
 from tests.e2e.test_operator import COMMANDS as OPERATING
 from tests.e2e.test_own_hardware import COMMISSIONING, DOCUMENTED
@@ -54,7 +55,7 @@ def test_every_command_of_the_documents_is_known() -> None:
     ]
     assert len(found) > 15
     tested = {*ELSEWHERE, *LOOPS, *LOGS, *REQUESTS, *FILES, *BY_HAND, *SESSION, *BENCH, *VALIDATE, *DESIGN, *LOOKING}
-    tested |= {FEWER, *STAYING, *DOCUMENTED, *OPERATING, *BENCH_DAY, *COMMISSIONING}
+    tested |= {FEWER, *STAYING, *DOCUMENTED, *OPERATING, *BENCH_DAY, *BESIDE_CACAO, *COMMISSIONING}
     assert set(found) == tested
     for line, where in ELSEWHERE.items():
         assert line.split()[0] in (ROOT / where).read_text()

@@ -59,7 +59,7 @@ class Stream:
             StreamAbsentError: there is none yet.
             StreamError: it has another layout, or may not be opened.
         """
-        self.path = path
+        self.path, self._file = path, os.fspath(path)
         self.name = path.name.removesuffix(".im.shm")
         try:
             with path.open("r+b", buffering=0) as file:
@@ -139,7 +139,7 @@ class Stream:
     def current(self) -> bool:
         """Whether its file is still the one of its name, whole; if not, nothing of it may be touched any more."""
         try:
-            return _identity(self.path.stat()) == self.identity
+            return _identity(os.stat(self._file)) == self.identity  # noqa: PTH116  # half the time, before every image
         except OSError:
             return False
 

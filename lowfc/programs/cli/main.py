@@ -17,6 +17,7 @@ COMMANDS = {
         Row("camera", "cli.devices:camera_app", "Run a camera: the frames of its driver to a run."),
         Row("mirror", "cli.devices:mirror_app", "Run a mirror: its driver follows the commands of a run."),
         Row("record", "cli.processes:record", "Record the messages of a run in logs."),
+        Row("bridge", "", "Run a bridge to another control system."),
         Row("config", "", "Show and check the configuration."),
         Row("certs", "cli.hosts:certs", "Make the certificates of a run on several hosts."),
         Row("router", "cli.hosts:router", "Run the router of a run on several hosts."),
@@ -56,6 +57,7 @@ COMMANDS = {
 }
 """By purpose, in the order of `lowfc --help`; a row without a module is a group, whose commands are in `PARTS`."""
 PARTS = (
+    Row("bridge isio", "bridge.isio:bridge_isio", "Modes as ImageStreamIO streams, others' channels into the loop."),
     Row("config show", "cli.config:config_show", "Print every key with its value and its sentence, as TOML."),
     Row("config check", "cli.config:config_check", "Check a configuration file and the files it names."),
     Row("config zenoh", "cli.config:config_zenoh", "Print the zenoh configuration for a program of your own."),

@@ -1,0 +1,1 @@
+"""Drivers of the field's own interfaces, found by their entry points."""

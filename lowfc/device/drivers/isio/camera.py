@@ -1,0 +1,135 @@
+"""A camera whose images another program writes into an ImageStreamIO stream."""
+
+from dataclasses import replace
+from typing import Any, Literal
+
+import numpy as np
+import numpy.typing as npt
+from pydantic import Field
+
+from lowfc.adapters.files.factory import camera_state
+from lowfc.adapters.image_stream.reader import StreamReader
+from lowfc.adapters.image_stream.stream import Stream, StreamError, stream_path
+from lowfc.adapters.process.service import Service
+from lowfc.arrays import Pixels
+from lowfc.contract.configuration import Configuration
+from lowfc.contract.messages import fields_of
+from lowfc.device import CameraSettings, DriverOptions, Exposure
+
+Setting = Literal[
+    "exposure_s", "gain_e_per_dn", "bias_dn", "read_noise_e", "saturation_dn", "em_gain", "region_row", "region_column"
+]
+_CONFIGURED = (
+    *("exposure_ns", "period_ns", "gain_e_per_dn", "bias_dn", "read_noise_e", "saturation_dn", "rows", "columns"),
+    *("bit_depth", "em_gain"),
+)
+_WHOLE = ("region_row", "region_column")
+_WAIT_S = 0.5
+_FULL_DN = 65535
+
+
+class IsioCamera:
+    """Reads the stream of another program's camera."""
+
+    class Options(DriverOptions):
+        """Where the images are and how they were made; what is left out is as in [camera]."""
+
+        stream: str
+        """Name of the stream."""
+        atime: Literal["end", "start", "none"] = "end"
+        """What the stream's `atime` is of the exposure; none: a frame has the time at which it is read."""
+        scale_dn: float = 1.0
+        """DN for each unit of a pixel."""
+        zero_dn: float = 0.0
+        """DN of a pixel of zero."""
+        exposure_us: float | None = Field(default=None, gt=0)
+        """Exposure time."""
+        gain_e_per_dn: float | None = Field(default=None, gt=0)
+        """Conversion gain."""
+        bias_dn: float | None = None
+        """Level without light."""
+        read_noise_e: float | None = Field(default=None, ge=0)
+        """Read noise of one pixel."""
+        saturation_dn: float | None = Field(default=None, gt=0)
+        """Highest value of a pixel, bias included."""
+        bit_depth: int | None = Field(default=None, ge=1, le=16)
+        """Bits of the converter."""
+        em_gain: float | None = Field(default=None, ge=1)
+        """Electron-multiplying gain."""
+        region_row: int = Field(default=0, ge=0)
+        """First row of the region read."""
+        region_column: int = Field(default=0, ge=0)
+        """First column of the region read."""
+        keywords: dict[Setting, str] = Field(default_factory=dict)
+        """Keywords of the stream that say a setting, in the setting's unit: `{exposure_s = "tint"}`."""
+
+    def __init__(self, options: Options, config: Configuration) -> None:
+        """Open the stream."""
+        self._options = options
+        self._reader = StreamReader(stream_path(options.stream))
+        if self._reader.stream is None:
+            raise StreamError(
+                f"there is no stream {options.stream!r} ({stream_path(options.stream)}): start the camera's program, "
+                "or set MILK_SHM_DIR to its folder"
+            )
+        shape = self._reader.stream.layout.shape[1:]
+        configured = fields_of(camera_state(config, shape, 0), _CONFIGURED)
+        given = options.model_dump(include={*_CONFIGURED, "region_row", "region_column"}, exclude_none=True)
+        if options.exposure_us is not None:
+            given["exposure_ns"] = round(options.exposure_us * 1e3)
+        self._settings = CameraSettings(clock="realtime", **(configured | given))
+        self._generation = self._reader.generation
+        self._silent = False
+
+    def join(self, service: Service) -> None:
+        """Keep the process, for its events."""
+        self._service = service
+
+    def settings(self) -> CameraSettings:
+        """As configured; the size, and what keywords say, as in the stream."""
+        stream = self._reader.stream
+        if stream is not None and stream.current():
+            rows, columns = stream.layout.shape[1:]
+            said = self._said(stream) if self._options.keywords else {}
+            self._settings = replace(self._settings, rows=rows, columns=columns, **said)
+        return self._settings
+
+    def expose(self) -> Exposure | None:
+        """The next image of the stream."""
+        image = self._reader.next(_WAIT_S)
+        if image is None:
+            if not self._silent:
+                self._silent = True
+                self._service.event("STREAM_SILENT", stream=self._options.stream, why=self._reader.silence())
+            return None
+        self._silent = False
+        if image.generation != self._generation:
+            self._generation = image.generation
+            rows, columns = image.pixels.shape
+            self._service.event("STREAM_RENEWED", stream=self._options.stream, columns=columns, rows=rows)
+        start = self._options.atime == "start"
+        end_ns = image.acquired_ns + (self._settings.exposure_ns if start else 0)
+        return Exposure(self._in_dn(image.pixels), None if self._options.atime == "none" else end_ns, image.number)
+
+    def close(self) -> None:
+        """Give the semaphore back."""
+        self._reader.close()
+
+    def _said(self, stream: Stream) -> dict[str, Any]:
+        """Settings that keywords of the stream say."""
+        found, said = stream.keywords(), dict[str, Any]()
+        for setting, word in self._options.keywords.items():
+            if isinstance(value := found.get(word), str):
+                raise StreamError(f"keyword {word!r} of stream {stream.name!r} is {value!r}, expected a number")
+            if value is not None:
+                said[setting] = value
+        if "exposure_s" in said:
+            said["exposure_ns"] = round(said.pop("exposure_s") * 1e9)
+        return {name: int(value) if name in _WHOLE else value for name, value in said.items()}
+
+    def _in_dn(self, pixels: npt.NDArray[np.generic]) -> Pixels:
+        scale, zero = self._options.scale_dn, self._options.zero_dn
+        if pixels.dtype == np.uint16 and (scale, zero) == (1, 0):
+            return pixels  # type: ignore[return-value]
+        scaled = np.rint(pixels.astype(np.float64) * scale + zero)
+        return np.nan_to_num(scaled, nan=0).clip(0, _FULL_DN).astype(np.uint16)

@@ -1,0 +1,1 @@
+"""`lowfc bridge`: a run beside other control systems."""

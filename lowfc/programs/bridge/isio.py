@@ -1,0 +1,150 @@
+"""`lowfc bridge isio`: a run's modes as ImageStreamIO streams, and the other channels of its mirror into the loop."""
+
+import contextlib
+import sys
+import time
+from collections.abc import Sequence
+from typing import Annotated
+
+import numpy as np
+import typer
+from google.protobuf.message import DecodeError
+
+from lowfc.adapters.bus.bus import Bus
+from lowfc.adapters.bus.run import open_run
+from lowfc.adapters.bus.zenoh_bus import ZenohBus
+from lowfc.adapters.image_stream.channels import OtherChannels, channel_names
+from lowfc.adapters.image_stream.stream import Stream, StreamAbsentError, StreamError, stream_path
+from lowfc.adapters.process.clock import Clock, HostClock
+from lowfc.adapters.process.realtime import give_way
+from lowfc.arrays import Single
+from lowfc.client import Client
+from lowfc.client.stream import step_of
+from lowfc.contract.errors import ConfigurationError, LowfcError
+from lowfc.contract.messages import CONTROLLER_STATE, STEP, Role, wire
+from lowfc.contract.printable import printable
+from lowfc.control.loop.command_channels import EXTERNAL
+from lowfc.programs.cli.ctl.which_run import the_known_run
+
+WAITING = 2000
+"""Steps that wait while the bridge stands still: two seconds at 1 kHz."""
+_TURN_S = 0.005
+_REQUESTS_S = 0.1
+"""Between two requests of a channel that changes all the time."""
+
+
+def bridge_isio(
+    run: Annotated[str | None, typer.Option("--run", help="Name of the run; default: the only one.")] = None,
+    prefix: Annotated[str, typer.Option(help="First part of the streams' names.")] = "lowfc",
+    beside: Annotated[str, typer.Option(help="Channel of the loop: the mirror's others are left alone.")] = "",
+    external: Annotated[list[str] | None, typer.Option(help="Channel that is left alone; repeat.")] = None,
+    nm_per_unit: Annotated[float, typer.Option(min=1e-9, help="Surface that a unit of a channel makes.")] = 1000.0,
+) -> None:
+    """Publish modal error, command, residual and flux as ImageStreamIO streams, until Ctrl-C.
+
+    With --beside or --external it also tells the loop what other programs have on the mirror, so that it is not undone.
+
+    Example: lowfc bridge isio --run bench --beside dm00disp03
+    """
+    names = (*(external or ()), *channel_names(beside))
+    if beside and not channel_names(beside):
+        raise ConfigurationError(f"--beside is a channel as dm00disp03, got {beside!r}; name the others by --external")
+    give_way()
+    run_id, clock = the_known_run(run), HostClock()
+    bus = ZenohBus(open_run(run_id, ()).links, Role.OPERATOR, clock, monitor=True)
+    with contextlib.closing(bus), contextlib.suppress(KeyboardInterrupt):
+        steps = StepStreams(bus, clock, prefix)
+        others = ExternalChannels(Client(run_id, bus=bus), bus, names, nm_per_unit) if names else None
+        sys.stderr.write(f"run {run_id!r} as streams {prefix}_error, _command, _residual and _flux; Ctrl-C ends it\n")
+        while True:
+            steps.pass_on()
+            if others is not None:
+                others.pass_on()
+            time.sleep(_TURN_S)
+
+
+class StepStreams:
+    """Each step of the control law, written into streams."""
+
+    def __init__(self, bus: Bus, clock: Clock, prefix: str) -> None:
+        """Write into the streams PREFIX_error, PREFIX_command, PREFIX_residual and PREFIX_flux."""
+        self._ring = bus.ring(STEP, WAITING)
+        self._clock = clock
+        self._prefix = prefix
+        self._streams: dict[str, Stream] = {}
+
+    def pass_on(self) -> None:
+        """Write the steps that have come.
+
+        Raises:
+            StreamError: a stream of that name is another process's, or cannot be made.
+        """
+        for sample in self._ring.drain():
+            step = step_of(sample)
+            if step is None:
+                continue
+            values = {"command": step.command_nm, "flux": np.array([step.flux_dn], np.float32)}
+            if step.error_nm is not None:
+                values |= {"error": step.error_nm, "residual": np.linalg.norm(step.error_nm, axis=0, keepdims=True)}
+            wall_ns = step.time_ns - self._clock.ahead_ns()
+            for name, numbers in values.items():
+                if numbers.size:
+                    self._stream(f"{self._prefix}_{name}", numbers.size).put(numbers[np.newaxis], wall_ns)
+
+    def _stream(self, name: str, columns: int) -> Stream:
+        stream = self._streams.get(name)
+        if stream is None or not stream.current() or stream.layout.shape[2] != columns:
+            stream = self._streams[name] = _made(name, columns)
+        return stream
+
+
+class ExternalChannels:
+    """What others have on the mirror, told to the loop whenever it changes, and to a controller that starts."""
+
+    def __init__(self, client: Client, bus: Bus, names: Sequence[str], nm_per_unit: float) -> None:
+        """Watch these channels of the mirror; a unit of theirs is so many nm of surface."""
+        self._client = client
+        self._states = bus.ring(CONTROLLER_STATE, 1)
+        self._nm_per_unit = np.float32(nm_per_unit)
+        self._others = OtherChannels(names, client.calibration().grid)
+        self._shape: Single | None = None
+        self._wanted = b""
+        self._known: bytes | None = None  # of the controller, as far as this process was told
+        self._asked_s = -_REQUESTS_S
+        self._fault = ""
+
+    def pass_on(self) -> None:
+        """Ask for the channel `external` where it is another one than the controller has."""
+        for sample in self._states.drain():
+            with contextlib.suppress(DecodeError):
+                channels = wire.ControllerState.FromString(sample.payload).channels
+                self._known = next((one.actuators for one in channels if one.name == EXTERNAL), b"")
+        shape, now_s = self._others.sum(), time.monotonic()
+        if shape is not self._shape:
+            self._shape, self._wanted = shape, (shape * self._nm_per_unit).tobytes() if shape.any() else b""
+        if self._wanted == self._known or now_s - self._asked_s < _REQUESTS_S:
+            return
+        self._asked_s, fault = now_s, ""
+        wanted_nm = np.frombuffer(self._wanted, np.float32).reshape(shape.shape) if self._wanted else None
+        try:
+            self._client.channel(EXTERNAL, wanted_nm)
+            self._known = self._wanted
+        except LowfcError as error:
+            fault = str(error)
+        if fault and fault != self._fault:
+            names = ", ".join(self._others.names)
+            sys.stderr.write(f"the loop does not know of {names}: {printable(fault)}\n")
+        self._fault = fault
+
+
+def _made(name: str, columns: int) -> Stream:
+    """A stream of one row that is this process's to write: a former one of that size, or a new one."""
+    path = stream_path(name)
+    with contextlib.suppress(StreamAbsentError):
+        stream = Stream(path)
+        if pid := stream.other_writer():
+            raise StreamError(f"process {pid} writes stream {name!r}: stop it first, or choose another --prefix")
+        if stream.layout.shape == (1, 1, columns) and stream.layout.dtype == np.float32:
+            return stream
+        path.unlink(missing_ok=True)
+    return Stream.create(path, (1, columns), np.float32)

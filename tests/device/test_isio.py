@@ -1,0 +1,224 @@
+"""Camera and mirror by ImageStreamIO streams, against the plain reader and writer."""
+
+import os
+import threading
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from lowfc.adapters.image_stream.stream import StreamError
+from lowfc.contract.configuration import Configuration
+from lowfc.contract.errors import ConfigurationError
+from lowfc.device.drivers.isio import mirror as mirror_module
+from lowfc.device.drivers.isio.camera import IsioCamera
+from lowfc.device.drivers.isio.mirror import IsioMirror
+from lowfc.device.plugins import options
+from tests.support.image_streams.plain import PlainStream
+
+CONFIG = Configuration()
+ROWS, COLUMNS = 6, 8
+GRID = (CONFIG.mirror.rows, CONFIG.mirror.columns)
+UINT16, INT32, FLOAT32 = 3, 6, 9
+AT_NS = 1_700_000_000_000_000_000
+
+
+class Events(list[tuple[str, dict[str, object]]]):
+    """The service of a driver, as far as it uses it."""
+
+    def event(self, name: str, **details: object) -> None:
+        self.append((name, details))
+
+    @property
+    def names(self) -> list[str]:
+        return [name for name, _ in self]
+
+
+@pytest.fixture(autouse=True)
+def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    monkeypatch.setenv("MILK_SHM_DIR", str(tmp_path))
+    return tmp_path
+
+
+def camera(**options: Any) -> tuple[IsioCamera, Events]:
+    driver, events = IsioCamera(IsioCamera.Options(stream="camnsv", **options), CONFIG), Events()
+    driver.join(events)  # type: ignore[arg-type]
+    return driver, events
+
+
+def mirror(**options: Any) -> tuple[IsioMirror, Events]:
+    driver, events = IsioMirror(IsioMirror.Options(stream="dm00disp03", **options), CONFIG), Events()
+    driver.join(events)  # type: ignore[arg-type]
+    return driver, events
+
+
+def shape_nm(seed: int) -> np.ndarray:
+    return (20 * np.random.default_rng(seed).standard_normal(GRID)).astype(np.float32)
+
+
+def channel(folder: Path, name: str = "dm00disp03", *, make: bool = False) -> PlainStream:
+    made = PlainStream.make if make else PlainStream
+    return made(folder / f"{name}.im.shm", GRID[1], GRID[0], FLOAT32)
+
+
+@pytest.mark.parametrize(
+    ("number", "options", "pixels", "expected"),
+    [
+        (UINT16, {}, [0, 1, 65535], [0, 1, 65535]),
+        (INT32, {}, [-5, 70_000, 12], [0, 65535, 12]),
+        (FLOAT32, {"scale_dn": 2.0, "zero_dn": 100.0}, [np.nan, -10.2, 1e9], [0, 80, 65535]),
+        (FLOAT32, {"scale_dn": 0.1, "zero_dn": 1.0}, [np.inf, -np.inf, 94], [65535, 0, 10]),
+    ],
+)
+def test_pixels_of_any_type_become_dn(
+    folder: Path, number: int, options: dict[str, float], pixels: list[float], expected: list[int]
+) -> None:
+    writer = PlainStream.make(folder / "camnsv.im.shm", 3, 1, number)
+    driver, _ = camera(**options)
+    writer.write(np.array([pixels]))
+    exposure = driver.expose()
+    assert exposure is not None
+    assert exposure.number == 1
+    assert exposure.pixels.dtype == np.uint16
+    assert exposure.pixels.tolist() == [expected]
+
+
+@pytest.mark.parametrize(("atime", "expected"), [("end", AT_NS), ("start", AT_NS + 2_000_000), ("none", None)])
+def test_the_time_of_a_frame_is_the_end_of_its_exposure(folder: Path, atime: str, expected: int | None) -> None:
+    writer = PlainStream.make(folder / "camnsv.im.shm", COLUMNS, ROWS, UINT16)
+    driver, _ = camera(atime=atime, exposure_us=2000.0)
+    writer.write(np.zeros((ROWS, COLUMNS)), AT_NS)
+    exposure = driver.expose()
+    assert exposure is not None
+    assert exposure.end_ns == expected
+    assert driver.settings().clock == "realtime"
+
+
+def test_the_stream_is_named_on_the_command_line_or_in_the_configuration() -> None:
+    assert options(IsioCamera, {}, ("--stream", "camnsv", "--exposure-us", "500")).exposure_us == 500  # type: ignore[attr-defined]
+    assert options(IsioMirror, {"stream": "dm00disp03"}).stream == "dm00disp03"  # type: ignore[attr-defined]
+    for table, words in (({}, ()), ({}, ("--atime", "end"))):
+        with pytest.raises(ConfigurationError, match="stream"):
+            options(IsioCamera, table, words)
+
+
+def test_settings_are_of_the_options_the_keywords_and_the_configuration(folder: Path) -> None:
+    words: dict[str, float | str | int] = {"tint": 1.5e-3, "y0": 17, "name": "nsv"}
+    PlainStream.make(folder / "camnsv.im.shm", COLUMNS, ROWS, UINT16, keywords=words)
+    driver, _ = camera(gain_e_per_dn=2.5, keywords={"exposure_s": "tint", "region_row": "y0", "bias_dn": "absent"})
+    said = driver.settings()
+    assert (said.rows, said.columns, said.exposure_ns, said.region_row) == (ROWS, COLUMNS, 1_500_000, 17)
+    assert (said.gain_e_per_dn, said.bias_dn, said.period_ns) == (2.5, CONFIG.camera.bias_dn, CONFIG.period_ns)
+    driver, _ = camera(keywords={"gain_e_per_dn": "name"})
+    with pytest.raises(StreamError, match="keyword 'name' of stream 'camnsv' is 'nsv'"):
+        driver.settings()
+
+
+def test_silence_and_a_stream_made_anew_are_named_once(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("lowfc.device.drivers.isio.camera._WAIT_S", 0.01)
+    with pytest.raises(StreamError, match="there is no stream 'camnsv'"):
+        camera()
+    path = folder / "camnsv.im.shm"
+    writer = PlainStream.make(path, COLUMNS, ROWS, UINT16)
+    driver, events = camera()
+    assert driver.expose() is None
+    assert driver.expose() is None
+    writer.write(np.zeros((ROWS, COLUMNS)))
+    assert driver.expose() is not None
+    writer.begin(np.zeros((ROWS, COLUMNS)))
+    assert driver.expose() is None
+    PlainStream.make(path, COLUMNS, ROWS - 2, UINT16).write(np.zeros((ROWS - 2, COLUMNS)))
+    exposure = driver.expose()
+    assert exposure is not None
+    assert exposure.pixels.shape == (ROWS - 2, COLUMNS)
+    assert driver.settings().rows == ROWS - 2
+    assert events.names == ["STREAM_SILENT", "STREAM_SILENT", "STREAM_RENEWED"]
+    assert "in the middle of an image" in str(events[1][1]["why"])
+    driver.close()
+
+
+def test_the_channel_is_made_or_adopted_with_its_shape(folder: Path) -> None:
+    driver, _ = mirror()
+    assert not driver.position().any()
+    assert driver.apply(shape_nm(1)) is None
+    assert np.allclose(channel(folder).pixels[0] * 1000, shape_nm(1), atol=1e-4)
+    driver, _ = mirror(nm_per_unit=2000.0)
+    assert np.allclose(driver.position(), 2 * shape_nm(1), atol=1e-3)
+    driver.close()
+    assert channel(folder).count == 1
+    PlainStream.make(folder / "dm00disp03.im.shm", GRID[1] + 1, GRID[0], FLOAT32)
+    with pytest.raises(StreamError, match=f"{GRID[1] + 1} x {GRID[0]} pixels of float32, expected {GRID[1]} x"):
+        mirror()
+
+
+def test_it_writes_no_channel_that_another_process_writes(folder: Path) -> None:
+    other = channel(folder, make=True)
+    driver, _ = mirror()
+    driver.apply(shape_nm(1))
+    other.pack("<i", other.writers, os.getppid())
+    with pytest.raises(StreamError, match=f"process {os.getppid()} writes stream 'dm00disp03'"):
+        mirror()
+    other.write(np.zeros(GRID))
+    other.pack("<i", other.writers, os.getppid())
+    with pytest.raises(RuntimeError, match=f"process {os.getppid()} writes stream 'dm00disp03'"):
+        driver.apply(shape_nm(2))
+    driver.apply(shape_nm(2))  # nobody has written it since
+    assert np.allclose(other.pixels[0] * 1000, shape_nm(2), atol=1e-4)
+
+
+def test_a_channel_that_is_made_anew_is_adopted(folder: Path) -> None:
+    driver, events = mirror()
+    driver.apply(shape_nm(1))
+    again = channel(folder, make=True)
+    driver.apply(shape_nm(2))
+    assert again.count == 1
+    assert events.names == ["STREAM_RENEWED"]
+
+
+class Sum(threading.Thread):
+    """The process that sums the channels: it takes the mean away, and keeps to a limit."""
+
+    def __init__(self, folder: Path, limit: float) -> None:
+        super().__init__(daemon=True)
+        self.total = channel(folder, "dm00disp", make=True)
+        self.others = channel(folder, "dm00disp00", make=True)
+        self.own, self.limit, self.running = channel(folder), limit, True
+        self.own.take(4)
+        self.start()
+
+    def run(self) -> None:
+        while self.running:
+            if self.own.wait(4, 0.01):
+                total = np.clip(self.own.pixels[0] + self.others.pixels[0], -self.limit, self.limit)
+                self.total.write(total - total.mean())
+
+
+def test_the_sum_of_all_channels_says_what_was_reached(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(mirror_module, "SUM_WAIT_S", 2.0)
+    monkeypatch.setattr(mirror_module, "_LOOK_S", 0.0)
+    channel(folder, make=True)
+    summing = Sum(folder, 0.5)
+    driver, _ = mirror()
+    summing.others.write(shape_nm(3) / 1000 + 0.1)
+    assert driver.apply(shape_nm(1)) is None  # as it was written, but for piston
+    assert np.allclose(driver.others(), shape_nm(3) + 100, atol=1e-3)
+    too_far = shape_nm(2)
+    too_far[5, 7] = 600
+    reached = driver.apply(too_far)
+    assert reached is not None
+    assert reached[5, 7] == pytest.approx(500 - driver.others()[5, 7], abs=0.1)
+    assert np.abs(np.delete(reached - too_far, 5 * GRID[1] + 7)).max() < 0.1
+    summing.running = False
+    summing.join()
+    monkeypatch.setattr(mirror_module, "SUM_WAIT_S", 0.001)
+    monkeypatch.setattr(mirror_module, "SUM_SILENT_S", 0.01)
+    assert driver.apply(shape_nm(1)) is None  # for a while it may be late
+    time.sleep(0.02)
+    with pytest.raises(RuntimeError, match="'dm00disp' has not followed 'dm00disp03'"):
+        driver.apply(shape_nm(1))
+
+
+def test_without_others_there_is_nothing_beside(folder: Path) -> None:
+    assert not mirror()[0].others().any()

@@ -1,0 +1,153 @@
+"""A loop whose camera and mirror are ImageStreamIO streams, beside a bench as CACAO has one."""
+
+import json
+import subprocess
+import sys
+from collections.abc import Iterator
+from contextlib import closing, contextmanager
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from lowfc.adapters.bus.bus import Sample
+from lowfc.adapters.bus.run import open_run
+from lowfc.adapters.bus.zenoh_bus import ZenohBus
+from lowfc.adapters.process.clock import HostClock
+from lowfc.client import Client
+from lowfc.contract.messages import EVENT, STEP, Log, Role, wire
+from tests.support.image_streams.cacao import CAMERA, TOTAL, file_of
+from tests.support.image_streams.plain import PlainStream
+from tests.support.loops import going_on, run, until
+
+pytestmark = pytest.mark.exclusive
+
+ROOT = Path(__file__).parents[2]
+GRID = (34, 34)
+CHANNEL = f"{TOTAL}03"
+BENCH = """
+[camera]
+rate_hz = {rate_hz}
+
+[disturbance]
+preset = "{preset}"
+static_nm = {{ "2" = 15, "4" = 8 }}
+
+[control]
+start_mode = "closed"
+
+[drivers.isio.camera]
+stream = "camnsv"
+
+[drivers.isio.mirror]
+stream = "dm00disp03"
+"""
+MIRROR = "lowfc mirror isio --run bench --config bench.toml"
+CAMERA_DRIVER = "lowfc camera isio --run bench --config bench.toml"
+CONTROLLER = "lowfc controller --run bench --config bench.toml"
+BRIDGE = "lowfc bridge isio --run bench --beside dm00disp03"
+DOCUMENTED = (MIRROR, CAMERA_DRIVER, CONTROLLER, BRIDGE)
+"""Commands of docs/cacao.md; all are run here."""
+
+
+class Bench:
+    """The bench in a folder, its streams, and what the run says."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+        self.events: list[str] = []
+        self.errors_nm: list[list[float]] = []
+        self.start()
+
+    def start(self) -> None:
+        words = [sys.executable, "-m", "tests.support.image_streams.cacao", self.folder / "bench.toml", self.folder]
+        pipe = subprocess.PIPE
+        self.process = subprocess.Popen(words, cwd=ROOT, stdin=pipe, stdout=pipe, text=True)
+        until(lambda: file_of(self.folder, CAMERA).exists())
+
+    def tell(self, word: str) -> None:
+        assert self.process.stdin is not None
+        self.process.stdin.write(f"{word}\n")
+        self.process.stdin.flush()
+
+    def stopped(self) -> dict[str, float]:
+        """Figures of the bench, which ends."""
+        figures: dict[str, float] = json.loads(self.process.communicate("stop\n", timeout=60)[0])
+        return figures
+
+    def close(self) -> None:
+        self.process.kill()
+        self.process.communicate()
+
+    def stream(self, name: str) -> PlainStream:
+        return PlainStream(file_of(self.folder, name), GRID[1], GRID[0], 9)
+
+    @contextmanager
+    def listening(self) -> Iterator[None]:
+        """Note events and modal errors of the run."""
+        bus = ZenohBus(open_run("bench").links, Role.OPERATOR, HostClock())
+
+        def step(sample: Sample) -> None:
+            self.errors_nm.append(list(wire.ControlStep.FromString(sample.payload).error_nm))
+
+        bus.subscribe(EVENT, lambda sample: self.events.append(Log.FromString(sample.payload).message))
+        bus.subscribe(STEP, step)
+        try:
+            yield
+        finally:
+            bus.close()
+
+    def said(self, *words: str) -> bool:
+        """Whether there was an event with all these words."""
+        return any(all(word in event for word in words) for event in list(self.events))
+
+    def held(self) -> bool:
+        """Whether the last steps say that the loop holds the wavefront."""
+        newest = self.errors_nm[-100:]
+        return len(newest) == 100 and all(newest) and float(np.linalg.norm(np.mean(newest, axis=0))) < 2.0
+
+
+@pytest.fixture
+def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    runtime = tmp_path / "run"
+    runtime.mkdir(mode=0o700)
+    monkeypatch.setenv("XDG_RUNTIME_DIR", str(runtime))
+    monkeypatch.setenv("MILK_SHM_DIR", str(tmp_path))
+    return tmp_path
+
+
+def test_a_loop_runs_by_streams_and_each_fault_is_named(folder: Path) -> None:
+    (folder / "bench.toml").write_text(BENCH.format(rate_hz=200, preset="quiet"))
+    with closing(Bench(folder)) as bench, going_on(folder, MIRROR, CAMERA_DRIVER, CONTROLLER), bench.listening():
+        until(bench.held, 60)
+        _what_others_put_on_the_mirror_is_not_undone(bench)
+        bench.tell("renew")
+        until(lambda: bench.said("STREAM_RENEWED", "camnsv"))
+        bench.errors_nm.clear()
+        until(bench.held)
+        bench.tell("region")
+        until(lambda: bench.said("CAMERA_CHANGED") and bench.said("closed -> open"))
+        refused = run(folder, "mirror", "isio", "--run", "other", "--config", "bench.toml")
+        assert refused.returncode == 2
+        assert "writes stream 'dm00disp03'" in refused.stderr
+        assert bench.stream(CHANNEL).pixels.any()
+
+
+def _what_others_put_on_the_mirror_is_not_undone(bench: Bench) -> None:
+    with going_on(bench.folder, BRIDGE), Client("bench") as client:
+        calibration = client.calibration()
+        until(lambda: file_of(bench.folder, "lowfc_flux").exists())
+        error = PlainStream(file_of(bench.folder, "lowfc_error"), len(calibration.noll), 1, 9)
+        until(lambda: error.count > 20)
+        dark_hole = np.random.default_rng(3).standard_normal(GRID) * 0.02
+        before = bench.stream(CHANNEL).pixels[0].copy()
+        bench.stream(f"{TOTAL}00").write(dark_hole)
+        until(lambda: any(one.name == "external" for one in client.status().state.channels))
+        bench.errors_nm.clear()
+        until(bench.held)
+        undone = calibration.actuators_to_modes @ (bench.stream(CHANNEL).pixels[0] - before).reshape(-1)
+        seen = calibration.actuators_to_modes @ dark_hole.reshape(-1)
+        assert np.linalg.norm(undone) < 0.3 * np.linalg.norm(seen)  # noise; without the channel it would be all
+        state = client.status().state
+        (external,) = (one for one in state.channels if one.name == "external")
+        assert np.allclose(np.frombuffer(external.actuators, "f4"), dark_hole.reshape(-1) * 1000, atol=0.01)

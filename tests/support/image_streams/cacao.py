@@ -1,0 +1,136 @@
+"""A bench beside the loop, as CACAO has one: the simulated camera's frames in a stream, the mirror behind channels.
+
+A program, with a file of configuration and a folder of streams. It knows nothing of the run: frames go into `camnsv`,
+the channels dm00disp00 to dm00disp11 that there are are summed into `dm00disp`, without their mean, and the optics see
+that sum. A line on standard input is done between two frames: `renew` and `region` make the camera's stream anew,
+`die` ends it in the middle of an image, `stop` prints what was left of the wavefront and ends.
+"""
+
+import json
+import os
+import select
+import sys
+import threading
+import time
+from pathlib import Path
+
+import numpy as np
+
+from lowfc.adapters.process.clock import HostClock
+from lowfc.adapters.process.realtime import let_send, set_up
+from lowfc.adapters.process.service import Service
+from lowfc.contract.configuration import load
+from lowfc.contract.envelope import Envelope, sequence_of
+from lowfc.contract.messages import MIRROR_STATE, timestamp, wire
+from lowfc.testing.memory_bus import MemoryBus, MemoryHub
+from sim_camera.driver import SimulatedCamera
+from tests.support.image_streams.plain import PlainStream
+
+UINT16, FLOAT32 = 3, 9
+CAMERA, TOTAL = "camnsv", "dm00disp"
+REGION = 2
+"""Rows that a smaller region leaves out."""
+
+
+def file_of(folder: Path, name: str) -> Path:
+    """File of a stream."""
+    return folder / f"{name}.im.shm"
+
+
+class Comb:
+    """The process that sums the channels, in a thread."""
+
+    def __init__(self, folder: Path, rows: int, columns: int, publish: object) -> None:
+        """Make the sum and the first channel; the others are found once they are there."""
+        self.shape = (columns, rows)
+        self.folder, self.publish = folder, publish
+        self.total = PlainStream.make(file_of(folder, TOTAL), *self.shape, FLOAT32)
+        self.channels: dict[str, PlainStream] = {}
+        self.counts: dict[str, int] = {}
+        self.running = True
+        PlainStream.make(file_of(folder, f"{TOTAL}00"), *self.shape, FLOAT32)
+        threading.Thread(target=self.run, daemon=True).start()
+
+    def look(self) -> None:
+        """Open channels that came; hold a semaphore of each."""
+        for index in range(12):
+            path = file_of(self.folder, f"{TOTAL}{index:02d}")
+            if path.name not in self.channels and path.exists():
+                self.channels[path.name] = PlainStream(path, *self.shape, FLOAT32)
+                self.channels[path.name].take(0)
+
+    def run(self) -> None:
+        """Wait for the loop's channel; sum all whenever any was written."""
+        looked_s = 0.0
+        while self.running:
+            if time.monotonic() - looked_s > 0.2:
+                self.look()
+                looked_s = time.monotonic()
+            newest = max(
+                self.channels.values(), key=lambda one: one.count
+            )  # the loop's, for it is written all the time
+            newest.wait(0, 0.01)
+            counts = {name: one.count for name, one in self.channels.items()}
+            if counts != self.counts:
+                self.counts = counts
+                total = np.sum([one.pixels[0] for one in self.channels.values()], axis=0)
+                total -= total.mean()
+                self.total.write(total)
+                self.publish(total * 1000)  # type: ignore[operator]
+
+
+def main() -> None:
+    """Run the bench until it is told to stop."""
+    config, folder = load(Path(sys.argv[1])), Path(sys.argv[2])
+    sys.setswitchinterval(1e-4)
+    set_up(
+        config.realtime.priority or None,
+        set(config.realtime.camera_cpus) or None,
+        lock_memory=False,
+        disable_cpu_idle=True,
+    )
+    hub, clock = MemoryHub(), HostClock()
+    service = Service("camera", "cacao", clock, MemoryBus(hub, "camera", clock))
+    driver = SimulatedCamera(SimulatedCamera.Options(), config)
+    driver.join(service)
+    states = MemoryBus(hub, f"mirror-{config.mirror.name}", clock).publisher(MIRROR_STATE, config.mirror.name)
+
+    def moved(surface_nm: np.ndarray) -> None:
+        state = wire.MirrorState(timestamp=timestamp(clock.now_ns()), rows=surface_nm.shape[0])
+        state.columns, state.actuators = surface_nm.shape[1], surface_nm.astype("<f4").tobytes()
+        states.put(state.SerializeToString())
+
+    comb = Comb(folder, config.mirror.rows, config.mirror.columns, moved)
+    settings, rows = driver.settings(), driver.settings().rows
+    stream = PlainStream.make(file_of(folder, CAMERA), settings.columns, rows, UINT16)
+    driver.start()
+    count = 0
+    while True:
+        exposure = driver.expose()
+        clock.sleep_until_ns(exposure.end_ns)
+        stream.begin(exposure.pixels[:rows])
+        ahead_ns = round(clock.ahead_ns() - (time.clock_gettime(time.CLOCK_TAI) - time.time()) * 1e9)
+        stream.end(exposure.end_ns - ahead_ns)
+        let_send()  # the loop's processes run before this one computes the truth
+        driver.sent(Envelope(sequence_of(clock.start_s, count), clock.host_ns()))
+        count += 1
+        if not select.select([sys.stdin], [], [], 0)[0]:
+            continue
+        word = sys.stdin.readline().strip()
+        if word == "die":
+            stream.begin(exposure.pixels[:rows] // 2)
+            os._exit(9)
+        if word in ("renew", "region"):
+            rows = settings.rows - (REGION if word == "region" else 0)
+            stream = PlainStream.make(file_of(folder, CAMERA), settings.columns, rows, UINT16)
+        if word in ("stop", ""):
+            break
+    comb.running = False
+    driver.close()
+    health = wire.Health()
+    driver.fill(health)
+    print(json.dumps({"frames": count, "residual_rms_nm": health.wavefront.continuous_residual_rms_nm}))
+
+
+if __name__ == "__main__":
+    main()
