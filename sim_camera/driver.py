@@ -23,7 +23,7 @@ from lowfc.control.loop.durations import Durations
 from lowfc.device import CameraSettings, DriverOptions, Exposure, Puts
 from lowfc.optics.detector.detector import saturation_dn
 from lowfc.optics.detector.photometry import tilt_nm_per_mas
-from sim_camera.contrast import AddedContrast, contrast_of
+from sim_camera.contrast import AddedContrast, Contrast
 from sim_camera.disturbance import Disturbance, disturbance
 from sim_camera.faulty import FaultyFrames, read_fault
 from sim_camera.figures import Figures
@@ -104,7 +104,8 @@ class SimulatedCamera:
         """Build the optics, or take those that are given."""
         self._config = config
         self._scene = scene(config) if optics is None else optics
-        self._contrast = contrast_of(config)
+        modal = factory.contrast_of(config)
+        self._contrast = None if modal is None else Contrast(modal)
         self._fault = read_fault(Path(options.fault)) if options.fault else None
         state = factory.camera_state(config, self._scene.shape, 0)
         self._settings = fields_of(state, _SETTINGS)
@@ -224,12 +225,12 @@ class SimulatedCamera:
         if index < 0:
             return
         truth = self._scene.truth(index, seen, self._path.over(index, self._scene.instants))
-        added = (0.0, 0.0)
+        added_flat, added = 0.0, None
         if self._contrast is not None:
             flat, left = truth.instants_nm
             self._contrast.add(flat[len(flat) // 2], left[len(left) // 2])
-            added = self._contrast.quadratic(flat), self._contrast.quadratic(left)
-        self._figures.add(truth, added)
+            added_flat, added = float(self._contrast.quadratic(flat).sum()), self._contrast.quadratic(left)
+        self._figures.add(truth, added_flat, added)
         sampled, continuous = truth.sampled, truth.continuous
         message = wire.Truth(
             timestamp=timestamp(end_ns),
@@ -238,8 +239,8 @@ class SimulatedCamera:
             residual_nm=sampled.residual_nm.tolist(),
             disturbance_rms_nm=sampled.disturbance_rms_nm,
             residual_rms_nm=sampled.residual_rms_nm,
-            added_contrast_flat=added[0],
-            added_contrast=added[1],
+            added_contrast_flat=added_flat,
+            added_contrast=0.0 if added is None else float(added.sum()),
         )
         if continuous is not None:
             message.instants = len(self._scene.instants)

@@ -5,6 +5,8 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
+from lowfc.arrays import Single
+from lowfc.optics.chain.added_contrast import by_group, costliest
 from sim_camera.scene import Truth, Wavefront
 
 BLOCK = 500
@@ -32,10 +34,12 @@ class WavefrontFigures:
     continuous_tilt_residual_mas: float = 0.0
     added_contrast_flat: float = 0.0
     added_contrast: float = 0.0
+    costliest_modes: str = ""
+    costliest_share: float = 0.0
 
 
 class Figures:
-    """Sums of squares, block by block."""
+    """Sums over frames, block by block: what each mode adds to the contrast, and squares of the wavefront."""
 
     def __init__(self, noll: tuple[int, ...], nm_per_mas: float, recent: int = 1, instants: int = 0) -> None:
         """Begin without a frame.
@@ -46,8 +50,8 @@ class Figures:
             recent: frames of the recent figures.
             instants: of each period over which continuous truths are means; 0 where there are none.
         """
-        self._instants = instants
-        self._values = 10 if instants else 6
+        self._noll, self._instants = noll, instants
+        self._values = 1 + len(noll) + (8 if instants else 4)
         self._tilts = slice(0, sum(index in (2, 3) for index in noll))  # they come first
         self._nm_per_mas = nm_per_mas
         self._blocks: list[list[float]] = []
@@ -57,13 +61,14 @@ class Figures:
         self._recent = np.zeros((recent, self._values))
         self._frames = 0
 
-    def add(self, truth: Truth, added_contrast: tuple[float, float] = (0.0, 0.0)) -> None:
-        """Count the truth of one frame, and the contrast that its disturbance and its residual add."""
-        squares = (*added_contrast, *self._squares(truth.sampled))
+    def add(self, truth: Truth, added_flat: float = 0.0, added: Single | None = None) -> None:
+        """Count the truth of one frame, the contrast that its disturbance adds, and that of its residual by mode."""
+        contrasts = [added_flat, *([0.0] * len(self._noll) if added is None else added.tolist())]
+        values = (*contrasts, *self._squares(truth.sampled))
         if truth.continuous is not None:
-            squares += self._squares(truth.continuous)
-        self._sums = [total + square for total, square in zip(self._sums, squares, strict=True)]
-        self._recent[self._frames % len(self._recent)] = squares
+            values += self._squares(truth.continuous)
+        self._sums = [total + value for total, value in zip(self._sums, values, strict=True)]
+        self._recent[self._frames % len(self._recent)] = values
         self._frames += 1
         self._count += 1
         if self._count == self._block:
@@ -83,20 +88,22 @@ class Figures:
             mean = np.array(self._sums) / self._count
         else:
             return None
-        return self._rms(mean)
+        return self._figures(mean)
 
     def recent(self) -> WavefrontFigures | None:
         """Figures over the most recent frames; None before the first frame."""
         found = self._recent[: self._frames]
-        return self._rms(found.mean(axis=0)) if len(found) else None
+        return self._figures(found.mean(axis=0)) if len(found) else None
 
     def _squares(self, wavefront: Wavefront) -> tuple[float, ...]:
         tilt, left = wavefront.disturbance_nm[self._tilts], wavefront.residual_nm[self._tilts]
         pupil_nm2 = wavefront.disturbance_rms_nm**2, wavefront.residual_rms_nm**2
         return (*pupil_nm2, float(tilt @ tilt), float(left @ left))
 
-    def _rms(self, mean: npt.NDArray[np.float64]) -> WavefrontFigures:
+    def _figures(self, mean: npt.NDArray[np.float64]) -> WavefrontFigures:
+        flat, added, squares = mean[0], mean[1 : 1 + len(self._noll)], mean[1 + len(self._noll) :]
         per = np.array([1, 1, *[2 * self._nm_per_mas**2] * 2])
-        rms = np.sqrt(mean[2:].reshape(-1, 4) / per).ravel().tolist()
-        figures = [*rms[:4], self._instants, *(rms[4:] or [0.0] * 4), *mean[:2].tolist()]
+        rms = np.sqrt(squares.reshape(-1, 4) / per).ravel().tolist()
+        most = costliest(by_group(self._noll, added)) if flat else ("", 0.0)
+        figures = [*rms[:4], self._instants, *(rms[4:] or [0.0] * 4), float(flat), float(added.sum()), *most]
         return WavefrontFigures(**dict(zip(WavefrontFigures.__annotations__, figures, strict=True)))

@@ -152,6 +152,10 @@ def test_a_running_loop_is_listened_to() -> None:
     found = figures(run, *tuned(run, "lqg"), "lqg")
     assert found["modes"][0]["lines"][0]["frequency_hz"] == pytest.approx(20, abs=0.05)
     assert found["achieved_from"] == "error less noise"
+    added = found["added_contrast"]
+    assert 0 < added["predicted"] < added["open"]
+    assert set(added["by_group"]["predicted"]) == {"tilt", "focus"}
+    assert f"closed {added['closed']:+.1e}, predicted {added['predicted']:+.1e}; focus costs most (" in render(found)
 
 
 def test_too_short_a_time_to_listen_is_refused_before_it_has_passed() -> None:

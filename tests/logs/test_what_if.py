@@ -22,8 +22,10 @@ from lowfc.control.calibration.calibration import reconstructor
 from lowfc.control.laws.stability import delay_weights, limiting_gain
 from lowfc.control.laws.what_if import as_logged, counterfactual, rms
 from lowfc.control.loop.safety import Limit, LoopMode
+from lowfc.optics.chain.added_contrast import contrast_form
 from lowfc.optics.detector.photometry import tilt_nm_per_mas
-from lowfc.programs.logs.what_if.compare import LINEAR_WAVES, _contrast, compared, render, what_if
+from lowfc.programs.cli.contrast import added_contrast, sentence_of
+from lowfc.programs.logs.what_if.compare import LINEAR_WAVES, compared, render, what_if
 from lowfc.programs.logs.what_if.options import WhatIf, requested, user_controller
 from lowfc.programs.logs.what_if.run import LoggedRun
 from tests.support import toy
@@ -143,22 +145,24 @@ def test_the_gains_that_were_used_give_the_logged_run(logs: dict[str, Path]) -> 
     assert figures["warnings"] == []
 
 
-def test_contrast_is_of_the_true_residual_and_only_where_there_is_a_science_image() -> None:
-    """One nm of spherical in one run, none in the other; a classical Lyot coronagraph has no science image yet."""
-    spherical, modes = np.eye(14)[9], tuple(range(2, 16))
-    columns = {"was": spherical, "continuous_was": spherical, "continuous_what_if": 0 * spherical}
+def test_contrast_is_told_where_there_is_a_science_image() -> None:
+    """A tenth of a nm of spherical in one run, none in the other; a classical Lyot coronagraph has no image yet."""
+    spherical = np.diag(0.01 * np.eye(14)[9])
 
-    def found(**keys: object) -> dict[str, float]:
-        history = SimpleNamespace(configuration=load(None, {key.replace("__", "."): one for key, one in keys.items()}))
-        return _contrast(SimpleNamespace(history=history, calibration=SimpleNamespace(noll=modes)), columns)
+    def found(**keys: object) -> dict[str, Any] | None:
+        config = load(None, {key.replace("__", "."): one for key, one in keys.items()})
+        return added_contrast(factory.contrast_of(config), {"was": 0 * spherical, "what if": spherical, "other": None})
 
-    expected = factory.contrast_form_of(Configuration(), print)[9, 9]
-    assert found() == {
-        "added_contrast_continuous_was": pytest.approx(expected),
-        "added_contrast_continuous_what_if": 0.0,
-    }
-    assert found(sensor__modes=10) == {}
-    assert found(sensor__pupil="circle") == {}
+    contrast = found()
+    assert contrast is not None
+    expected = 0.01 * contrast_form(factory.sensor(Configuration(), print).pupil, (11,), 550.0).item()
+    assert (contrast["was"], contrast["what if"], contrast["other"]) == (0, pytest.approx(expected), None)
+    assert contrast["by_group"]["what if"]["spherical"] == pytest.approx(expected)
+    assert sentence_of(contrast) == (
+        f"added to the dark zone's contrast: was +0.0e+00, what if +{expected:.1e}; spherical costs most (100 %)"
+    )
+    assert found(sensor__modes=10) is None
+    assert found(sensor__pupil="circle") is None
 
 
 def test_a_log_says_what_other_gains_give(logs: dict[str, Path]) -> None:

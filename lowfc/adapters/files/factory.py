@@ -17,10 +17,10 @@ from lowfc.contract.configuration import Configuration
 from lowfc.contract.errors import CalibrationError, ConfigurationError
 from lowfc.contract.messages import timestamp, wire
 from lowfc.control.calibration.actuator_response import actuators_to_modes
-from lowfc.control.calibration.calibration import Calibration, noise_nm, normalise_flux, reconstructor
+from lowfc.control.calibration.calibration import Calibration, noise_nm2, normalise_flux, reconstructor
 from lowfc.control.loop.safety import Limits, LoopMode
 from lowfc.control.loop.state import Settings
-from lowfc.optics.chain.added_contrast import contrast_form
+from lowfc.optics.chain.added_contrast import ModalContrast
 from lowfc.optics.chain.band import Band, gauss_legendre, monochromatic, uniform
 from lowfc.optics.chain.mirror import Mirror, modes_to_actuators
 from lowfc.optics.chain.sensor import Sensor, shear_response
@@ -66,10 +66,10 @@ def science_pupil(config: Configuration, warn: Callable[[str], None]) -> Array |
     return None if config.sensor.pupil in ("circle", "prolate") else sensor(config, warn).pupil
 
 
-def contrast_form_of(config: Configuration, warn: Callable[[str], None]) -> Array | None:
-    """See `contrast_form`; None without a science image."""
-    pupil = science_pupil(config, warn)
-    return None if pupil is None else contrast_form(pupil, config.noll, config.star.wavelength_nm)
+def contrast_of(config: Configuration) -> ModalContrast | None:
+    """What the modes add to the dark zone's contrast; None without a science image. It takes a tenth of a second."""
+    pupil = science_pupil(config, lambda _: None)
+    return None if pupil is None else ModalContrast(pupil, config.noll, config.star.wavelength_nm)
 
 
 def electrons_per_exposure(config: Configuration) -> float:
@@ -251,11 +251,16 @@ def analytic_calibration(
 
 def frame_noise_nm(config: Configuration, calibration: Calibration) -> Array:
     """Standard deviation of each mode of one frame, nm of wavefront rms: photon and read noise through R."""
+    return np.asarray(np.sqrt(np.diag(frame_noise_nm2(config, calibration))))
+
+
+def frame_noise_nm2(config: Configuration, calibration: Calibration) -> Array:
+    """Covariance (modes, modes) of one frame's noise, nm^2 of wavefront."""
     camera = detector(config)
     flux_e = calibration.flux_dn * camera.gain_e_per_dn / camera.em_gain
     reference, matrix = calibration.reference.astype(float), calibration.reconstructor.astype(float)
-    excess = np.sqrt(2) if camera.em_gain > 1 else 1.0
-    return excess * noise_nm(matrix, reference, flux_e, equivalent_read_noise_e(camera))
+    excess = 2.0 if camera.em_gain > 1 else 1.0
+    return excess * noise_nm2(matrix, reference, flux_e, equivalent_read_noise_e(camera))
 
 
 def _check_exposure(config: Configuration, light: Array) -> None:

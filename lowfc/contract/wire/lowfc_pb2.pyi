@@ -622,7 +622,7 @@ class Latency(_message.Message):
     def __init__(self, count: _Optional[int] = ..., p50_ns: _Optional[int] = ..., p99_ns: _Optional[int] = ..., p99_9_ns: _Optional[int] = ..., max_ns: _Optional[int] = ...) -> None: ...
 
 class WavefrontFigures(_message.Message):
-    __slots__ = ("disturbance_rms_nm", "residual_rms_nm", "tilt_disturbance_mas", "tilt_residual_mas", "instants", "continuous_disturbance_rms_nm", "continuous_residual_rms_nm", "continuous_tilt_disturbance_mas", "continuous_tilt_residual_mas", "added_contrast_flat", "added_contrast", "science_images", "quadratic_added_contrast", "dark_zone_contrast")
+    __slots__ = ("disturbance_rms_nm", "residual_rms_nm", "tilt_disturbance_mas", "tilt_residual_mas", "instants", "continuous_disturbance_rms_nm", "continuous_residual_rms_nm", "continuous_tilt_disturbance_mas", "continuous_tilt_residual_mas", "added_contrast_flat", "added_contrast", "science_images", "quadratic_added_contrast", "dark_zone_contrast", "costliest_modes", "costliest_share")
     DISTURBANCE_RMS_NM_FIELD_NUMBER: _ClassVar[int]
     RESIDUAL_RMS_NM_FIELD_NUMBER: _ClassVar[int]
     TILT_DISTURBANCE_MAS_FIELD_NUMBER: _ClassVar[int]
@@ -637,6 +637,8 @@ class WavefrontFigures(_message.Message):
     SCIENCE_IMAGES_FIELD_NUMBER: _ClassVar[int]
     QUADRATIC_ADDED_CONTRAST_FIELD_NUMBER: _ClassVar[int]
     DARK_ZONE_CONTRAST_FIELD_NUMBER: _ClassVar[int]
+    COSTLIEST_MODES_FIELD_NUMBER: _ClassVar[int]
+    COSTLIEST_SHARE_FIELD_NUMBER: _ClassVar[int]
     disturbance_rms_nm: float
     residual_rms_nm: float
     tilt_disturbance_mas: float
@@ -651,7 +653,9 @@ class WavefrontFigures(_message.Message):
     science_images: int
     quadratic_added_contrast: float
     dark_zone_contrast: float
-    def __init__(self, disturbance_rms_nm: _Optional[float] = ..., residual_rms_nm: _Optional[float] = ..., tilt_disturbance_mas: _Optional[float] = ..., tilt_residual_mas: _Optional[float] = ..., instants: _Optional[int] = ..., continuous_disturbance_rms_nm: _Optional[float] = ..., continuous_residual_rms_nm: _Optional[float] = ..., continuous_tilt_disturbance_mas: _Optional[float] = ..., continuous_tilt_residual_mas: _Optional[float] = ..., added_contrast_flat: _Optional[float] = ..., added_contrast: _Optional[float] = ..., science_images: _Optional[int] = ..., quadratic_added_contrast: _Optional[float] = ..., dark_zone_contrast: _Optional[float] = ...) -> None: ...
+    costliest_modes: str
+    costliest_share: float
+    def __init__(self, disturbance_rms_nm: _Optional[float] = ..., residual_rms_nm: _Optional[float] = ..., tilt_disturbance_mas: _Optional[float] = ..., tilt_residual_mas: _Optional[float] = ..., instants: _Optional[int] = ..., continuous_disturbance_rms_nm: _Optional[float] = ..., continuous_residual_rms_nm: _Optional[float] = ..., continuous_tilt_disturbance_mas: _Optional[float] = ..., continuous_tilt_residual_mas: _Optional[float] = ..., added_contrast_flat: _Optional[float] = ..., added_contrast: _Optional[float] = ..., science_images: _Optional[int] = ..., quadratic_added_contrast: _Optional[float] = ..., dark_zone_contrast: _Optional[float] = ..., costliest_modes: _Optional[str] = ..., costliest_share: _Optional[float] = ...) -> None: ...
 
 class Recording(_message.Message):
     __slots__ = ("file", "messages", "lost", "bytes", "failure", "files", "stopped", "folder")

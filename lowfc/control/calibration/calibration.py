@@ -189,11 +189,16 @@ def condition_number(response: Array) -> float:
 
 
 def noise_nm(matrix: Array, reference: Array, flux_e: float, read_noise_e: float) -> Array:
-    """Standard deviation of each mode of one frame, in nm: photon and read noise through R (modes, pixels).
+    """Standard deviation (modes,) of the modes of one frame, in nm; as `noise_nm2`."""
+    return np.asarray(np.sqrt(np.diag(noise_nm2(matrix, reference, flux_e, read_noise_e))))
+
+
+def noise_nm2(matrix: Array, reference: Array, flux_e: float, read_noise_e: float) -> Array:
+    """Covariance (modes, modes) of the modes of one frame: photon and read noise through R (modes, pixels).
 
     The normalisation divides by the frame's own noisy flux, so that each pixel's noise n acts as n - I0 sum(n).
     """
     good = (np.abs(matrix).sum(axis=0) > 0).astype(float)
     variance = (np.maximum(reference, 0) * flux_e + read_noise_e**2) / flux_e**2
     effective = matrix - np.outer(matrix @ reference, good)
-    return np.asarray(np.sqrt(effective**2 @ (variance * good)))
+    return np.asarray(effective * (variance * good) @ effective.T)

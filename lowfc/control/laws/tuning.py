@@ -13,7 +13,7 @@ from scipy.signal import periodogram
 
 from lowfc.arrays import Array
 from lowfc.control.laws import margins
-from lowfc.control.laws.continuous import Timing, held_left_nm2, spectrum_left
+from lowfc.control.laws.continuous import Timing, commanded, held_left_nm2, spectrum_left
 from lowfc.control.laws.kalman import lqg_block
 from lowfc.control.laws.linear_law import Block, LinearLaw, integrator, integrator_block, of_blocks
 from lowfc.control.laws.margins import sensitivity
@@ -216,6 +216,28 @@ def predicted_nm(law: LinearLaw, models: Sequence[Model], timing: Timing) -> Arr
         power = spectrum_left(law, omega, measured, noise_nm2, timing)[:, mode]
         found[mode] = np.trapezoid(power, omega) / np.pi
     return np.sqrt(found)
+
+
+def predicted_nm2(law: LinearLaw, models: Sequence[Model], noise_nm2: Array, timing: Timing) -> Array:
+    """Covariance (modes, modes) over all time of the true residual, of modes that have nothing in common but noise.
+
+    Args:
+        law: of the loop.
+        models: of each mode.
+        noise_nm2: (modes, modes) covariance of one frame's noise; the models say how large it is.
+        timing: of the loop.
+    """
+    omega = np.linspace(0, np.pi, 2049)[1:]
+    passed = commanded(law, omega, timing.delay)
+    found = np.asarray((passed.T @ passed.conj()).real / len(omega) * frame_noise_nm2(models, noise_nm2))
+    np.fill_diagonal(found, predicted_nm(law, models, timing) ** 2)
+    return found
+
+
+def frame_noise_nm2(models: Sequence[Model], noise_nm2: Array) -> Array:
+    """Covariance (modes, modes) of one frame's noise, as large as these models have it."""
+    scale = np.sqrt([model.noise_nm2 for model in models] / np.diag(noise_nm2))
+    return np.asarray(noise_nm2 * np.outer(scale, scale))
 
 
 def left_of(law: LinearLaw, run: Pieces, noise_nm2: Array, timing: Timing) -> Array:

@@ -6,17 +6,67 @@ shaped pupil: without it tilt would cost 58 times too much. The first order has 
 of the star.
 """
 
+from collections.abc import Mapping, Sequence
+
 import numpy as np
 
-from lowfc.arrays import Array
+from lowfc.arrays import Array, Single
 from lowfc.optics.chain.coronagraph import DARK_ZONE, Wedge, wedge_samples
 from lowfc.optics.chain.fourier import kernel
 from lowfc.optics.chain.grid import pupil_axis
-from lowfc.optics.chain.zernike import zernikes
+from lowfc.optics.chain.science_camera import ScienceCamera
+from lowfc.optics.chain.zernike import mode_group, zernikes
 
 BEYOND_QUADRATIC = 0.1
 """By which the form may differ from the image before that is said."""
 _SAMPLES_PER = 2  # in each lambda / D: the intensity's band is 1 D to either side
+_DRAWS = 24
+
+
+class ModalContrast:
+    """What wavefronts, known by their modes, add to the contrast of a dark zone: by their form, and by full images.
+
+    Attributes:
+        noll: of the modes.
+        form: (modes, modes), see `contrast_form`.
+    """
+
+    def __init__(self, pupil: Array, noll: tuple[int, ...], wavelength_nm: float) -> None:
+        """Prepare form and images of a shaped pupil (n, n)."""
+        self.noll, self.form = noll, contrast_form(pupil, noll, wavelength_nm)
+        self._camera = ScienceCamera(pupil, noll, wavelength_nm, int(np.ceil(DARK_ZONE.outer)), _SAMPLES_PER)
+
+    def by_image(self, modes_nm: Array | Single) -> float:
+        """Contrast of the dark zone, the coronagraph's own with it, behind a wavefront (modes,)."""
+        return self._camera.mean_contrast(self._camera.image(modes_nm), DARK_ZONE)
+
+    def by_mode(self, covariance_nm2: Array) -> Array:
+        """What each mode adds (modes,), of wavefronts with a covariance (modes, modes); their sum is added in all."""
+        return np.asarray(np.sum(self.form * covariance_nm2, axis=1))
+
+    def is_beyond_quadratic(self, covariance_nm2: Array) -> bool:
+        """Whether full images of wavefronts with a covariance (modes, modes) differ too much from the form."""
+        values, vectors = np.linalg.eigh(covariance_nm2)
+        drawn = np.random.default_rng(1).standard_normal((_DRAWS, len(values)))
+        some_nm = drawn * np.sqrt(np.maximum(values, 0)) @ vectors.T
+        own = self.by_image(np.zeros(len(values)))
+        image = float(np.mean([self.by_image(one) - own for one in (*some_nm, *-some_nm)]))  # in pairs: no odd orders
+        form = float(np.einsum("nj,jl,nl->", some_nm, self.form, some_nm)) / _DRAWS
+        return abs(form - image) > BEYOND_QUADRATIC * abs(image)
+
+
+def by_group(noll: Sequence[int], each: Array) -> dict[str, float]:
+    """Sums of what each mode adds (modes,) over modes of one kind, such as both comas; the largest first."""
+    found: dict[str, float] = {}
+    for index, one in zip(noll, each.tolist(), strict=True):
+        found[mode_group(index)] = found.get(mode_group(index), 0.0) + one
+    return dict(sorted(found.items(), key=lambda pair: -pair[1]))
+
+
+def costliest(groups: Mapping[str, float]) -> tuple[str, float]:
+    """The kind of modes that adds most, and its share of all; groups as `by_group` sorts them."""
+    name, most = next(iter(groups.items()))
+    return name, most / (sum(groups.values()) or 1.0)
 
 
 def contrast_form(pupil: Array, noll: tuple[int, ...], wavelength_nm: float, wedge: Wedge = DARK_ZONE) -> Array:

@@ -45,6 +45,12 @@ def mode_name(noll: int) -> str:
     return _NAMES[noll - 1] if noll <= len(_NAMES) else f"Zernike {noll}"
 
 
+def mode_group(noll: int) -> str:
+    """The name without the mode's direction: "coma" of both."""
+    name = mode_name(noll)
+    return name.rsplit(" ", 1)[0] if name.endswith((" x", " y", " 0", " 45")) and noll <= len(_NAMES) else name
+
+
 def noll_to_nm(noll: int) -> tuple[int, int]:
     """Radial degree n and azimuthal order m of a Noll index; m < 0 is the sine.
 

@@ -13,6 +13,7 @@ from lowfc.contract.events import Level
 from lowfc.contract.messages import COMMAND, FRAME, Role, wire
 from lowfc.contract.printable import printable
 from lowfc.control.loop.wording import counted, mode_word
+from lowfc.programs.cli.contrast import most_of, sentence
 from lowfc.programs.launch.watch import Watch, mode_name, topic_count, wavefront
 
 SILENT_S = 2.0
@@ -131,12 +132,9 @@ def _contrast(figures: dict[str, Any]) -> list[str]:
     added = figures["added_contrast"]
     if added is None:
         return []
-    own = (
-        ""
-        if figures["dark_zone_contrast"] is None
-        else f" (the coronagraph's own is {figures['dark_zone_contrast']:.1e})"
-    )
-    return [f"contrast           +{added['closed']:.2g} in the dark zone, +{added['open']:.2g} with a flat mirror{own}"]
+    own = "" if figures["dark_zone_contrast"] is None else f"own {figures['dark_zone_contrast']:.1e}; "
+    beyond = ("closed",) if figures["beyond_quadratic"] else ()
+    return [f"contrast           {own}{sentence(added, most_of(figures), beyond)}"]
 
 
 def summary_text(figures: dict[str, Any]) -> str:

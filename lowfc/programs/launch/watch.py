@@ -104,6 +104,9 @@ def wavefront(known: wire.WavefrontFigures) -> dict[str, Any]:
         "added_contrast": {"open": known.added_contrast_flat, "closed": known.added_contrast}
         if known.added_contrast_flat
         else None,
+        "costliest_modes": {"modes": known.costliest_modes, "share": round(known.costliest_share, 3)}
+        if known.costliest_modes
+        else None,
         "beyond_quadratic": abs(known.quadratic_added_contrast - known.added_contrast)
         > BEYOND_QUADRATIC * abs(known.added_contrast)
         if known.science_images

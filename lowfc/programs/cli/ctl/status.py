@@ -12,7 +12,8 @@ from lowfc.contract.messages import FRAME, Role, from_timestamp, wire
 from lowfc.control.loop.safety import REASONS, Rejection, reason_of
 from lowfc.control.loop.state import FADING_FRAMES, SETTLING_FRAMES
 from lowfc.control.loop.wording import PAUSED, counted, mode_word
-from lowfc.programs.launch.watch import mode_name, topic_count
+from lowfc.programs.cli.contrast import most_of, sentence
+from lowfc.programs.launch.watch import mode_name, topic_count, wavefront
 
 NOBODY = wire.Health()
 _NO_PROCESSES: Mapping[str, wire.Health] = MappingProxyType({})
@@ -41,6 +42,7 @@ def figures(
     controller, recorder = processes.get(Role.CONTROLLER, NOBODY), processes.get(Role.RECORDER, NOBODY)
     lately, arrived = controller.last_second, topic_count(controller, FRAME.key)
     camera = processes.get(Role.CAMERA, NOBODY)
+    true = wavefront(camera.recent_wavefront) if camera.HasField("recent_wavefront") else None
     return {
         "run": run,
         "mode": mode_name(state.mode) or "starting",
@@ -48,9 +50,9 @@ def figures(
         "rate_hz": controller.rate_hz,
         "frames_used_last_second": lately.frames,
         "residual_rms_nm": lately.residual_rms_nm if lately.frames else None,
-        "true_residual_rms_nm": camera.recent_wavefront.residual_rms_nm
-        if camera.HasField("recent_wavefront")
-        else None,
+        "true_residual_rms_nm": None if true is None else true["residual_rms_nm"],
+        "added_contrast": true and true["added_contrast"],
+        "costliest_modes": true and true["costliest_modes"],
         "flux_fraction": lately.flux_fraction if lately.frames else None,
         "frames_skipped": arrived.skipped,
         "frames_missing": arrived.missing,
@@ -127,6 +129,7 @@ def text(known: dict[str, Any]) -> str:
         + (f"; the last was refused as {_spoken(known['refused'])}" if known["refused"] else ""),
         "command": f"{known['command_rms_nm']:.3f} nm rms" + (", on its way to zero" if known["homing"] else ""),
         "offset": f"{known['offset_rms_nm']:.3f} nm rms",
+        **({} if known["added_contrast"] is None else {"contrast": sentence(known["added_contrast"], most_of(known))}),
         "law": law,
         "gain": _values(known["gain"]),
         "leak": _values(known["leak"]),

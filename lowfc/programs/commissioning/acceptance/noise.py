@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 
-from lowfc.adapters.files.factory import frame_noise_nm
+from lowfc.adapters.files.factory import contrast_of, frame_noise_nm2
 from lowfc.arrays import Array
 from lowfc.contract.configuration import Acceptance, Configuration
 from lowfc.control.calibration.calibration import Calibration
@@ -13,6 +13,7 @@ from lowfc.control.laws import margins
 from lowfc.control.laws.spectra import SHORTEST, Pieces, floor_nm2_hz, spectrum
 from lowfc.control.loop.safety import LoopMode
 from lowfc.optics.chain.zernike import mode_name
+from lowfc.programs.cli.contrast import added_contrast, sentence_of
 from lowfc.programs.cli.result import figure
 from lowfc.programs.commissioning.acceptance.live import Live
 from lowfc.programs.commissioning.acceptance.played import AcceptanceError, AcceptanceResult, Kind, ModeResult, Played
@@ -38,7 +39,13 @@ class NoiseResult(AcceptanceResult):
     noise_ratio: float = figure("required ratio", form="g")
     law: str = figure("law")
     frames: dict[str, int] = figure()
+    added_contrast: dict[str, Any] | None = figure()
     modes: list[NoiseMode] = figure("modes")
+
+    def remarks(self) -> Sequence[str]:
+        """What the wavefront costs, and the verdict."""
+        contrast = [] if self.added_contrast is None else [sentence_of(self.added_contrast)]
+        return [*contrast, *super().remarks()]
 
 
 def play(live: Live, duration_s: float) -> list[Played]:
@@ -60,13 +67,17 @@ def judge(
     stretches = {played.what["loop"]: played for played in every}
     if set(stretches) != set(_LOOPS):
         raise AcceptanceError(f"there must be an open and a closed stretch, there is {', '.join(stretches) or 'none'}")
+    noise_nm2 = frame_noise_nm2(configuration, calibration)
     floors, rms = {}, {}
+    left_nm2: dict[str, Array | None] = {}
     for name, played in stretches.items():
         played.check(_LOOPS[name])
+        error_nm = played.filled(played.error_nm)
+        left_nm2[name] = error_nm.T @ error_nm / len(error_nm) - noise_nm2
         floors[name] = _floor_nm(played)
         rms[name] = np.nanstd(played.error_nm, axis=0)
     loop = stretches["closed"].loop
-    expected = frame_noise_nm(configuration, calibration)
+    expected = np.sqrt(np.diag(noise_nm2))
     gain = np.sqrt(margins.noise_gain(loop.linear, loop.delay_frames))
     modes = [
         NoiseMode(
@@ -88,6 +99,7 @@ def judge(
         noise_ratio=required.noise_ratio,
         law=loop.name,
         frames={name: len(played.error_nm) for name, played in stretches.items()},
+        added_contrast=added_contrast(contrast_of(configuration), left_nm2),
         modes=modes,
     )
 

@@ -6,13 +6,16 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from lowfc.adapters.files.factory import contrast_of, frame_noise_nm2
 from lowfc.adapters.logs.columns import Steps, of_steps
 from lowfc.adapters.logs.history import read_history
 from lowfc.adapters.logs.reader import LogReader
 from lowfc.arrays import Array, Mask, Single
 from lowfc.client import Client, configuration_of
 from lowfc.contract.codecs.law_codec import driving, gains_of
+from lowfc.contract.configuration import Configuration
 from lowfc.contract.errors import DataFileError
+from lowfc.control.calibration.calibration import Calibration
 from lowfc.control.laws.continuous import Timing
 from lowfc.control.laws.law import Law
 from lowfc.control.laws.linear_law import LinearLaw
@@ -20,6 +23,7 @@ from lowfc.control.laws.spectra import Pieces, pieces
 from lowfc.control.laws.vibration import FEWEST
 from lowfc.control.loop.inputs import Step
 from lowfc.control.loop.safety import LoopMode
+from lowfc.optics.chain.added_contrast import ModalContrast
 from lowfc.optics.detector.photometry import tilt_nm_per_mas
 from lowfc.programs.logs.what_if.run import LoggedRun
 
@@ -38,8 +42,10 @@ class Telemetry:
         closed: whether the rows are of a closed loop.
         pol: (frames, modes) pseudo-open-loop, in pieces.
         error: (frames, modes) of the same frames.
-        true_nm: (modes,) rms of the true residual over them; None where nobody knows it.
+        true_nm2: (modes, modes) mean products of the true residual over them; None where nobody knows it.
         nm_per_mas: of tilt; None where the telescope's size is not known.
+        contrast: what the modes cost, and `noise_nm2` the covariance (modes, modes) of one frame's noise as computed;
+            None without a science image.
         warnings: what makes the figures less sure.
     """
 
@@ -52,8 +58,10 @@ class Telemetry:
     closed: bool
     pol: Pieces
     error: Pieces
-    true_nm: Array | None
+    true_nm2: Array | None
     nm_per_mas: float | None
+    contrast: ModalContrast | None
+    noise_nm2: Array | None
     warnings: tuple[str, ...]
 
 
@@ -84,14 +92,14 @@ def of_log(log: LogReader) -> Telemetry:
     config = history.configuration
     return _telemetry(
         str(log.path),
-        run.calibration.noll,
         history.rate_hz,
         run.timing,
         (run.law, driving(history.controller, history.published.laws)),
         replace(steps, pol_nm=pol_nm, mode=mode),
         usable,
         None if run.true_nm is None else run.true_nm[1],
-        tilt_nm_per_mas(config.star.diameter_m) if config is not None else None,
+        config,
+        run.calibration,
         warnings,
     )
 
@@ -104,7 +112,7 @@ def of_run(loop: Client, seconds: float, progress: Callable[[float], None] | Non
         DataFileError: there are too few frames in a row.
     """
     state = loop.status().state
-    noll = loop.calibration().noll
+    calibration = loop.calibration()
     config = configuration_of(loop)
     if seconds * config.camera.rate_hz < FEWEST:
         needed_s = FEWEST / config.camera.rate_hz
@@ -125,32 +133,32 @@ def of_run(loop: Client, seconds: float, progress: Callable[[float], None] | Non
     stream.close()
     if state is None or not state.gain:
         raise DataFileError(f"run {loop.run_id!r} has no calibration yet: `lowfc ctl load` gives it one")
-    made = of_steps(steps, len(noll))
+    made = of_steps(steps, len(calibration.noll))
     period_s = float(np.median(np.diff(made.time_ns))) * 1e-9 if len(steps) > 1 else 0.0
     return _telemetry(
         loop.run_id,
-        noll,
         1 / period_s if period_s > 0 else config.camera.rate_hz,
         Timing.of(float(state.delay_frames), config.camera.exposure_fraction),
         (gains_of(state), driving(state, loop.laws())),
         made,
         np.isfinite(made.pol_nm).all(axis=1) & (made.saturated_pixels == 0),
         None,
-        tilt_nm_per_mas(config.star.diameter_m),
+        config,
+        calibration,
         [f"{stream.lost} steps did not get here in time"] if stream.lost else [],
     )
 
 
 def _telemetry(
     source: str,
-    noll: tuple[int, ...],
     rate_hz: float,
     timing: Timing,
     laws: tuple[Law, LinearLaw | None],
     steps: Steps,
     usable: Mask,
     true_nm: Single | None,
-    nm_per_mas: float | None,
+    config: Configuration | None,
+    calibration: Calibration,
     warnings: Sequence[str],
 ) -> Telemetry:
     was_closed, places = steps.mode == LoopMode.CLOSED, np.arange(len(steps.mode))
@@ -166,10 +174,11 @@ def _telemetry(
             f"{source}: a law is tuned from at least {FEWEST} frames in a row, {FEWEST / rate_hz:.2g} s; the longest "
             f"run of good ones has {_longest(pol)}"
         )
-    known = true_nm is not None and np.isfinite(true_nm[rows]).all()
+    contrast = contrast_of(config) if config is not None and config.noll == calibration.noll else None
+    there_nm = None if true_nm is None or not np.isfinite(true_nm[rows]).all() else true_nm[rows].astype(float)
     return Telemetry(
         source=source,
-        noll=noll,
+        noll=calibration.noll,
         rate_hz=rate_hz,
         timing=timing,
         law=laws[0],
@@ -177,8 +186,10 @@ def _telemetry(
         closed=closed,
         pol=pol,
         error=pieces(steps.sequence[rows], steps.error_nm[rows]),
-        true_nm=np.sqrt(np.mean(true_nm[rows].astype(float) ** 2, axis=0)) if known and true_nm is not None else None,
-        nm_per_mas=nm_per_mas,
+        true_nm2=None if there_nm is None else there_nm.T @ there_nm / len(there_nm),
+        nm_per_mas=tilt_nm_per_mas(config.star.diameter_m) if config is not None else None,
+        contrast=contrast,
+        noise_nm2=frame_noise_nm2(config, calibration) if config is not None and contrast is not None else None,
         warnings=tuple(warnings),
     )
 

@@ -13,8 +13,10 @@ from lowfc.control.laws.tuning import (
     Gains,
     Tuned,
     best_gains,
+    frame_noise_nm2,
     identified,
     predicted_nm,
+    predicted_nm2,
     tune_integrator,
     tune_lqg,
     tune_pi_notch,
@@ -22,6 +24,7 @@ from lowfc.control.laws.tuning import (
 from lowfc.control.laws.vibration import Model
 from lowfc.control.loop.wording import counted
 from lowfc.optics.chain.zernike import mode_name
+from lowfc.programs.cli.contrast import added_contrast, sentence_of, with_variances
 from lowfc.programs.commissioning.tune.data import Telemetry
 
 OPTICAL_GAIN_MAS = 10.0
@@ -98,8 +101,9 @@ def figures(run: Telemetry, best: Tuned, gains: Gains, controller: str) -> dict[
         "delay_frames": run.timing.delay,
         "closed": run.closed,
         "frames": run.pol.frames,
-        "achieved_from": None if achieved_nm is None else ("truth" if run.true_nm is not None else "error less noise"),
+        "achieved_from": None if achieved_nm is None else ("truth" if run.true_nm2 is not None else "error less noise"),
         "tilt_mas": tilt,
+        "added_contrast": _added_contrast(run, best, now, achieved_nm),
         "gain_margin": _finite(float(best.margins.gain_margin.min())),
         "phase_margin_deg": float(best.margins.phase_margin_deg.min()),
         "max_rejection": float(best.margins.peak.max()),
@@ -134,6 +138,8 @@ def render(found: dict[str, Any]) -> str:
             f"tilt per axis, mas rms: open {tilt['open']:.2f}{achieved}, predicted {tilt['predicted']:.2f} "
             f"({found['controller']}), {tilt['integrator_predicted']:.2f} (best integrator)",
         ]
+    if found["added_contrast"] is not None:
+        lines.append(sentence_of(found["added_contrast"]))
     lines += [f"warning: {warning}" for warning in found["warnings"]]
     return "\n".join(lines)
 
@@ -172,12 +178,32 @@ def picture(run: Telemetry, best: Tuned) -> bytes:
     return png(figure)
 
 
+def _added_contrast(run: Telemetry, best: Tuned, now: LinearLaw, closed_nm: Array | None) -> dict[str, Any] | None:
+    """What the wavefront adds to the dark zone's contrast: without a loop, as it was, and under the tuned law."""
+    if run.noise_nm2 is None:
+        return None
+    opened, closed = run.pol.joined(), None
+    if closed_nm is not None:
+        instants_nm2 = run.true_nm2
+        if instants_nm2 is None:  # the error's own has the sensor's noise, which may be more than all that is left
+            instants_nm2 = predicted_nm2(now, best.models, run.noise_nm2, run.timing)
+        closed = with_variances(instants_nm2, closed_nm)
+    return added_contrast(
+        run.contrast,
+        {
+            "open": opened.T @ opened / len(opened) - frame_noise_nm2(best.models, run.noise_nm2),
+            "closed": closed,
+            "predicted": predicted_nm2(best.law, best.models, run.noise_nm2, run.timing),
+        },
+    )
+
+
 def _achieved_nm(run: Telemetry, noise_nm: Array) -> Array | None:
     """Rms (modes,) of the residual in the frames: the true one where it is known, or the error's less the noise's."""
     if not run.closed:
         return None
-    if run.true_nm is not None:
-        return run.true_nm
+    if run.true_nm2 is not None:
+        return np.asarray(np.sqrt(np.diag(run.true_nm2)))
     squares = np.mean(run.error.joined() ** 2, axis=0)
     return np.asarray(np.sqrt(np.maximum(squares - noise_nm**2, 0.0)))
 

@@ -10,6 +10,7 @@ from lowfc.adapters.files.drawing import figure_class
 from lowfc.adapters.process.extras import install_advice
 from lowfc.contract.errors import ConfigurationError
 from lowfc.contract.printable import LINES, printable
+from lowfc.programs.cli.contrast import sentence_of
 from lowfc.programs.logs.report.drawings import drawings
 from lowfc.programs.logs.report.figures import Report
 
@@ -26,8 +27,10 @@ def page(report: Report, progress: Callable[[str], None] = lambda name: None) ->
     environment = _environment()
     template = environment.from_string((files("lowfc") / "data" / "report.html").read_text(encoding="utf-8"))
     configuration = report.figures["run"]["configuration"]
+    added = report.figures["residual"]["added_contrast"]
     text: str = template.render(
         **report.figures,
+        contrast_sentence=sentence_of(added) if added is not None else "",
         drawings=drawings(report, progress),
         toml=tomli_w.dumps(configuration) if configuration is not None else None,
     )

@@ -2,13 +2,14 @@
 
 import numpy as np
 
-from lowfc.adapters.files.factory import contrast_form_of
+from lowfc.adapters.files.factory import contrast_of
 from lowfc.adapters.logs.columns import TruthRows, Truths
 from lowfc.arrays import Array, Single, Whole
 from lowfc.contract.configuration import Configuration
 from lowfc.control.loop.safety import LoopMode
 from lowfc.optics.chain.zernike import mode_name
 from lowfc.optics.detector.photometry import tilt_nm_per_mas
+from lowfc.programs.cli.contrast import added_contrast, with_variances
 from lowfc.programs.logs.report.closed_loop import Stretch, noise_of
 from lowfc.programs.logs.report.source import Figures, Run
 
@@ -53,12 +54,9 @@ def residual_figures(run: Run, stretch: Stretch | None) -> Figures:
         )
     }
     contrast = _contrast(true, opened if not closed.size else closed, history.configuration)
-    for k, mode in enumerate(modes):
-        for name in ("open", "closed"):
-            mode[f"added_contrast_{name}"] = contrast[name]["modes"][k] if contrast is not None else None
     return {
         "modes": modes,
-        "added_contrast": contrast and {name: found["total"] for name, found in contrast.items()},
+        "added_contrast": contrast,
         "tilt_mas": {signal: _tilt_mas(found, noll, history.configuration) for signal, found in values.items()},
         "total_rms_nm": {
             signal: float(np.sqrt(np.sum(found**2))) if found is not None else None for signal, found in values.items()
@@ -93,27 +91,22 @@ def bin_starts(rows: int, most: int) -> Whole:
     return np.arange(0, rows, max(1, -(-rows // most)))
 
 
-def _contrast(true: Truths, rows: Whole, configuration: Configuration | None) -> dict[str, Figures] | None:
-    """What disturbance (open) and residual (closed) add to the contrast of the dark zone: in all, and each mode alone.
+def _contrast(true: Truths, rows: Whole, config: Configuration | None) -> Figures | None:
+    """What disturbance (open) and residual (closed) add to the contrast of the dark zone.
 
     None without a truth, or for a coronagraph of which there is no science image.
     """
-    if configuration is None or not true.residual_nm.size:
-        return None
-    form = contrast_form_of(configuration, lambda _: None)
-    if form is None or len(form) != true.residual_nm.shape[1]:
-        return None
-    found = {}
-    for name, each_nm, total in (
-        ("open", _rms(true.modes_disturbance_rms_nm, rows), true.added_contrast_flat),
-        ("closed", _rms(true.modes_residual_rms_nm, rows), true.added_contrast),
+    covariances = {}
+    for name, all_the_time, instants_nm in (
+        ("open", true.modes_disturbance_rms_nm, true.disturbance_nm),
+        ("closed", true.modes_residual_rms_nm, true.residual_nm),
     ):
+        each_nm = _rms(all_the_time, rows)
         if each_nm is None:
             return None
-        modes = each_nm**2 * np.diag(form)
-        mean = float(np.nanmean(total[rows]))
-        found[name] = {"total": mean or float(modes.sum()), "modes": modes.tolist()}
-    return found
+        some_nm = instants_nm[rows][np.isfinite(instants_nm[rows]).all(axis=1)].astype(float)
+        covariances[name] = with_variances(some_nm.T @ some_nm / len(some_nm), each_nm)
+    return added_contrast(contrast_of(config), covariances) if config is not None else None
 
 
 def _rms(values: Single, rows: Whole) -> Array | None:

@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 
-from lowfc.adapters.files.factory import contrast_form_of, detector, equivalent_read_noise_e
+from lowfc.adapters.files.factory import contrast_of, detector, equivalent_read_noise_e
 from lowfc.adapters.logs.columns import count_reasons
 from lowfc.adapters.logs.history import read_history
 from lowfc.adapters.logs.reader import LogReader
@@ -23,6 +23,7 @@ from lowfc.control.loop.safety import Limit
 from lowfc.control.loop.wording import counted
 from lowfc.optics.chain.zernike import mode_name
 from lowfc.optics.detector.photometry import tilt_nm_per_mas
+from lowfc.programs.cli.contrast import added_contrast, sentence_of, with_variances
 from lowfc.programs.cli.result import table
 from lowfc.programs.logs.what_if.options import LAW_KEYS, TILTS, WhatIf, law
 from lowfc.programs.logs.what_if.run import LoggedRun
@@ -81,9 +82,11 @@ def compared(run: LoggedRun, what: WhatIf) -> dict[str, Any]:
     usable = run.used & np.isfinite(what_if_nm).all(axis=1)
     lost = np.count_nonzero(run.used & ~usable)
     rows, settling, over = run.rows_to_compare([run.law, after], usable)
+    contrast = None
     columns = {"open": rms(pol_nm, rows), "was": rms(was_nm, rows), "what_if": rms(what_if_nm, rows)}
     if run.true_nm is not None:
-        columns |= _true(run, rows, what_if_nm - pol_nm - seen_nm)
+        true, contrast = _true(run, rows, what_if_nm - pol_nm - seen_nm)
+        columns |= true
     return {
         "log": str(run.history.log.path),
         "complete": run.history.log.complete,
@@ -108,7 +111,7 @@ def compared(run: LoggedRun, what: WhatIf) -> dict[str, Any]:
         ],
         **{f"{name}_nm": float(np.sqrt(np.sum(values**2))) for name, values in columns.items()},
         **_tilt_mas(run, columns),
-        **_contrast(run, columns),
+        "added_contrast": contrast,
         "warnings": [
             *_doubts_of_log(run),
             *([f"{lost} frames that were used are not in the log: the what-if holds there"] if lost else []),
@@ -118,8 +121,10 @@ def compared(run: LoggedRun, what: WhatIf) -> dict[str, Any]:
     }
 
 
-def _true(run: LoggedRun, rows: Mask, moved_nm: Single) -> dict[str, Array]:
+def _true(run: LoggedRun, rows: Mask, moved_nm: Single) -> tuple[dict[str, Array], dict[str, Any] | None]:
     """Rms (modes,) of the true residual, in the frames and all the time, as it was and with the mirror moved by that.
+
+    The second is what the residual at all times adds to the contrast of the dark zone, where that is known.
 
     Args:
         run: of which the truth is known.
@@ -128,7 +133,7 @@ def _true(run: LoggedRun, rows: Mask, moved_nm: Single) -> dict[str, Array]:
     """
     assert run.true_nm is not None  # noqa: S101  # see above
     disturbance_nm, residual_nm = (values.astype(np.float64) for values in run.true_nm)
-    found: dict[str, Array] = {}
+    found, covariances = dict[str, Array](), dict[str, Array | None]()
     known = rows & np.isfinite(residual_nm).all(axis=1)
     for name, left_nm in (("was", residual_nm), ("what_if", residual_nm + moved_nm)):
         if known.any():
@@ -139,7 +144,11 @@ def _true(run: LoggedRun, rows: Mask, moved_nm: Single) -> dict[str, Array]:
         there = rows & np.isfinite(squares).all(axis=1)
         if there.any():
             found[f"continuous_{name}"] = np.sqrt(squares[there].mean(axis=0))
-    return {name: found[name] for name in _TITLES if name in found}
+            instants_nm2 = left_nm[there].T @ left_nm[there] / np.count_nonzero(there)
+            covariances[name.replace("_", " ")] = with_variances(instants_nm2, found[f"continuous_{name}"])
+    config = run.history.configuration
+    contrast = added_contrast(contrast_of(config), covariances) if config is not None else None
+    return {name: found[name] for name in _TITLES if name in found}, contrast
 
 
 def render(figures: dict[str, Any]) -> str:
@@ -158,9 +167,6 @@ def render(figures: dict[str, Any]) -> str:
     rows = [*modes, row("all modes", figures, "{}_nm")]
     if "tilt_was_mas" in figures:
         rows.append(row("tilt per axis, mas", figures, "tilt_{}_mas"))
-    if any(f"added_contrast_{name}" in figures for name in columns):
-        added = (figures.get(f"added_contrast_{name}") for name in columns)
-        rows.append(["contrast, 1e-10", *("" if one is None else f"{1e10 * one:.2f}" for one in added), ""])
     lines = [
         f"{figures['frames_compared']} of {figures['frames']} frames compared: {figures['compared']}, after "
         f"{figures['settling_s']:.2g} s to settle; {figures['frames_refused']} were refused, "
@@ -170,8 +176,8 @@ def render(figures: dict[str, Any]) -> str:
         *table(["residual, nm rms", *(_TITLES[name] for name in columns), "gain"], rows),
         "",
         "measured figures contain the sensor's noise; true: at the start of each exposure; all the "
-        "time: between these instants too, while the mirror holds; a linear sensor, no actuator limits; contrast: what "
-        "the modes add to the dark zone, each for itself",
+        "time: between these instants too, while the mirror holds; a linear sensor, no actuator limits",
+        *([] if figures["added_contrast"] is None else [sentence_of(figures["added_contrast"])]),
         *(f"warning: {warning}" for warning in figures["warnings"]),
     ]
     return "\n".join(lines)
@@ -238,15 +244,6 @@ def _tilt_mas(run: LoggedRun, columns: dict[str, Array]) -> dict[str, float]:
         return {}
     nm_per_mas = tilt_nm_per_mas(run.history.configuration.star.diameter_m)
     return {f"tilt_{name}_mas": float(np.sqrt(np.mean(rms[tilts] ** 2))) / nm_per_mas for name, rms in columns.items()}
-
-
-def _contrast(run: LoggedRun, columns: dict[str, Array]) -> dict[str, float]:
-    """What the true residual at all times adds to the contrast of the dark zone, each mode for itself."""
-    names = [name for name in columns if name.startswith("continuous")]
-    form = contrast_form_of(run.history.configuration, lambda _: None) if run.history.configuration and names else None
-    if form is None or len(form) != len(run.calibration.noll):
-        return {}
-    return {f"added_contrast_{name}": float(np.diag(form) @ columns[name] ** 2) for name in names}
 
 
 def _doubts_of_log(run: LoggedRun) -> list[str]:

@@ -15,7 +15,7 @@ from lowfc.programs.view.verdicts.camera_verdict import LATELY, all_refused, fra
 from lowfc.programs.view.verdicts.facts import facts
 from lowfc.programs.view.verdicts.run_state import RECENT_S, Liveness, RunState
 from lowfc.programs.view.verdicts.tile import Level, Tile, Verdict, absent, duration, figure, short, worst_of
-from lowfc.programs.view.verdicts.wavefront_verdict import WORSE, wavefront
+from lowfc.programs.view.verdicts.wavefront_verdict import WORSE, contrast, wavefront
 
 NEAR_STROKE = 0.9
 """From here on a mirror has next to nothing left for what comes."""
@@ -46,6 +46,8 @@ def judge(state: RunState, nm_per_mas: float | None = None) -> Verdict:
     loop = _loop(state)
     left = wavefront(state, nm_per_mas, loop)
     tiles = [loop, left, frames(state), star(state), _mirror(state), _latency(state), _recorder(state)]
+    if state.truth is not None and state.truth.costliest_modes:
+        tiles.insert(2, contrast(state.truth))
     if state.behind_s > BEHIND_S:
         tiles.append(_view(state.behind_s))
     worst = worst_of(tiles)

@@ -111,7 +111,7 @@ class Watcher:
         worked = self._last_worked if stopped else now
         durations_us = np.concatenate([np.zeros(0), *(one.durations_ns / 1e3 for one in worked)])
         surface_nm = actuators(self._mirror) if self._mirror is not None else None
-        recorder = snapshot.health.get(Role.RECORDER)
+        camera, recorder = (snapshot.health.get(role) for role in (Role.CAMERA, Role.RECORDER))
         run, host = self._run_and_host()
         return RunState(
             mode=self._mode,
@@ -135,6 +135,9 @@ class Watcher:
             wavefront=wavefront,
             latest=_rms(self._last(LATEST_S))[0],
             true=true,
+            truth=camera.health.recent_wavefront
+            if camera is not None and camera.health.HasField("recent_wavefront")
+            else None,
             attained=self._attained,
             latency_us=tuple(np.percentile(durations_us, [50, 99]).tolist()) if durations_us.size else None,
             stroke_nm=float(np.abs(surface_nm).max(initial=0.0)) if surface_nm is not None else 0.0,

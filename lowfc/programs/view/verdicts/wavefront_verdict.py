@@ -3,6 +3,7 @@
 from functools import partial
 from math import hypot, sqrt
 
+from lowfc.contract.messages import wire
 from lowfc.programs.view.verdicts.run_state import RunState
 from lowfc.programs.view.verdicts.steady import Attained
 from lowfc.programs.view.verdicts.tile import Level, Tile, figure
@@ -46,6 +47,13 @@ def wavefront(state: RunState, nm_per_mas: float | None, loop: Tile) -> Tile:
     level, why = merit(factor(found.residual_nm, found.open_nm, noise_nm), attained)
     compared = f"{raw:.1f} x better than" if raw >= 1 else "of"
     return tile(value, f"{compared} {flat}; {more}", level, f"{value} of wavefront are left of {flat}{why}.")
+
+
+def contrast(known: wire.WavefrontFigures) -> Tile:
+    """What the wavefront adds to the contrast of the dark zone; a figure without a threshold, for nobody set one."""
+    share = f"{known.costliest_modes} costs most ({100 * known.costliest_share:.0f} %)"
+    flat = f"added to the dark zone; {known.added_contrast_flat:.1e} with a flat mirror"
+    return Tile("CONTRAST", f"{known.added_contrast:+.1e}", f"{flat}; {share}")
 
 
 def factor(left_nm: float, open_nm: float, noise_nm: float) -> float:

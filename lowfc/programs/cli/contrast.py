@@ -1,0 +1,55 @@
+"""What the wavefront adds to the contrast of the dark zone: the figures and the sentence that commands share."""
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from lowfc.arrays import Array
+from lowfc.optics.chain.added_contrast import ModalContrast, by_group, costliest
+
+
+def added_contrast(contrast: ModalContrast | None, covariance_nm2: Mapping[str, Array | None]) -> dict[str, Any] | None:
+    """What wavefronts with these covariances (modes, modes) add, by name; None without a science image.
+
+    Beside each name: `by_group`, what modes of a kind add of each; `beyond_quadratic`, the names of those for which
+    full images say something else.
+    """
+    known = {name: one for name, one in covariance_nm2.items() if one is not None}
+    if contrast is None or not known or any(len(one) != len(contrast.noll) for one in known.values()):
+        return None
+    each = {name: contrast.by_mode(one) for name, one in known.items()}
+    return {
+        **{name: float(each[name].sum()) if name in each else None for name in covariance_nm2},
+        "by_group": {name: by_group(contrast.noll, one) for name, one in each.items()},
+        "beyond_quadratic": [name for name, one in known.items() if contrast.is_beyond_quadratic(one)],
+    }
+
+
+def with_variances(covariance_nm2: Array, rms_nm: Array) -> Array:
+    """A covariance (modes, modes) at instants with the variances (modes,) at all times, which between them are larger.
+
+    What modes have in common is the noise in their commands, which stays for the period.
+    """
+    return np.asarray(covariance_nm2 + np.diag(rms_nm**2 - np.diag(covariance_nm2)))
+
+
+def most_of(figures: Mapping[str, Any]) -> tuple[str, float] | None:
+    """The costliest modes that a camera reported, among the figures of its wavefront."""
+    most = figures["costliest_modes"]
+    return None if most is None else (most["modes"], most["share"])
+
+
+def sentence(added: Mapping[str, float | None], most: tuple[str, float] | None, beyond: Sequence[str] = ()) -> str:
+    """What is added in each case, and which modes cost most in the last one."""
+    cases = ", ".join(f"{name} {one:+.1e}" for name, one in added.items() if one is not None)
+    which = "" if most is None else f"; {most[0]} costs most ({100 * most[1]:.0f} %)"
+    but = f"; beyond quadratic, full images differ by more than 10 %: {', '.join(beyond)}" if beyond else ""
+    return f"added to the dark zone's contrast: {cases}{which}{but}"
+
+
+def sentence_of(found: Mapping[str, Any]) -> str:
+    """The sentence of `added_contrast`."""
+    groups, beyond = found["by_group"], found["beyond_quadratic"]
+    added = {name: one for name, one in found.items() if name not in ("by_group", "beyond_quadratic")}
+    return sentence(added, costliest(next(reversed(groups.values()))), beyond)
