@@ -16,6 +16,7 @@ from lowfc.control.calibration import linearity
 from lowfc.control.laws import transfer_function
 from lowfc.control.laws.stability import LEAST_GAIN_MARGIN, LEAST_PHASE_MARGIN_DEG, LOWEST_GAIN
 from lowfc.control.laws.vibration import FEWEST
+from lowfc.control.loop import guard
 from lowfc.control.loop.state import FADING_FRAMES, SETTLING_FRAMES
 from lowfc.programs.commissioning.acceptance import capture as acceptance_capture
 from lowfc.programs.commissioning.acceptance import linearity as acceptance_linearity
@@ -38,6 +39,21 @@ _TUNING = (
     ("phase margin of an integrator, at least, deg", LEAST_PHASE_MARGIN_DEG),
     ("integrator gain, at least", LOWEST_GAIN),
     *_TAKEOVER,
+)
+_GUARD = (
+    ("duration of a block, s; never fewer frames than the next line", guard.BLOCK_S),
+    ("frames of a block, at least", guard.FEWEST),
+    ("blocks in a row in which the law is worse, until the integrator takes over", guard.WORSE_BLOCKS),
+    ("mean squared error of a law that is worse, over the integrator's, more than", guard.WORSE),
+    (
+        "mean squared error of a loop that amplifies, over the usual mean square, more than",
+        guard.AMPLIFIED,
+    ),
+    ("time constant of what is usual, s", guard.USUAL_S),
+    ("cross-fade from one to the other, s", guard.FADED_S),
+    ("mean squared error of a law that is far better, over the integrator's, less than", guard.BETTER),
+    ("for how long it must be, at first, s", guard.BETTER_S),
+    ("takeovers after which only an operator lets the law drive again", guard.MOST_TAKEOVERS),
 )
 _ACCEPTANCE = (
     ("rejection: standard errors that must fit into the tolerance, for a line to be judged", transfer_function.SURE),
@@ -134,6 +150,7 @@ DECLARED: dict[str, Callable[[], str]] = {
     "requirements": requirements,
     "continuous": continuous.table,
     "tuning limits": partial(limits, _TUNING),
+    "guard limits": partial(limits, _GUARD),
     "acceptance limits": partial(limits, _ACCEPTANCE),
     "operating limits": partial(limits, _OPERATING),
     "camera topics": partial(topics, Role.CAMERA, FRAME, CAMERA_STATE),

@@ -71,6 +71,8 @@ class Control(Section):
     """Frames in a row that may be the very image of the one before, as a stuck camera sends it; 0 for any number."""
     law: str = ""
     """File (FITS) of a law that `lowfc tune` wrote, which takes over from the integrator; empty for the integrator."""
+    guard: bool = True
+    """Guard every law: the integrator takes over where it would leave less, or where the law amplifies."""
 
 
 class Safety(Section):

@@ -80,6 +80,8 @@ EVENTS: dict[str, Event] = {
             "`lowfc ctl channel adopted --zero` takes it away",
         ),
         Event("LAW_NOT_IN_FORCE", Level.WARNING, "the law of the configuration is not in force: {why}"),
+        Event("LAW_OVERRULED", Level.WARNING, "the integrator takes over {modes} from the law {law!r}: {why}; {until}"),
+        Event("LAW_BACK", Level.INFO, "the law {law!r} drives {modes} again"),
         Event("NOTE", Level.INFO, "{text}"),
         Event("PLAY_ENDED", Level.WARNING, "what was being played ended: {why}"),
         Event("LEASE_TAKEN", Level.INFO, "the loop is reserved for {holder}"),

@@ -108,6 +108,7 @@ STATES: dict[str, tuple[Callable[[Stage], object], str, str]] = {
     "star gone": (setting(reasons=(Rejection.DARK,), flux=0.01), "STAR GONE BAD", "the star is gone"),
     "dim": (setting(flux=0.4), "STAR 40 % WARNING", "The star is dim"),
     "stroke": (setting(reasons=(Limit.STROKE,)), "MIRROR AT LIMIT BAD", "actuator stroke"),
+    "law overruled": (setting(reasons=(Limit.LAW_OVERRULED,)), "LOOP CLOSED WARNING", "Tune again"),
     "modal limit": (setting(reasons=(Limit.MODAL_LIMIT,)), "MIRROR AT LIMIT BAD", "modal limit"),
     "little stroke left": (setting(stroke_nm=650.0), "MIRROR 93 % WARNING", "little is left"),
     "expired": (setting(status=wire.MIRROR_STATUS_EXPIRED), "MIRROR EXPIRED BAD", "receives no commands"),

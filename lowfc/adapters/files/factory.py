@@ -168,6 +168,7 @@ def settings(config: Configuration) -> Settings:
         if config.camera.noise
         else 0,  # without noise images are alike
         rate_hz=config.camera.rate_hz,
+        guard=control.guard,
     )
 
 

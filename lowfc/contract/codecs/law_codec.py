@@ -11,6 +11,7 @@ from lowfc.contract.messages import fields_of, floats, timestamp, wire
 from lowfc.control.laws.law import Law
 from lowfc.control.laws.linear_law import LinearLaw, matrix_shapes
 from lowfc.control.loop.command_channels import Channel, CommandChannels, Play, PlayTable, play_table
+from lowfc.control.loop.guard import NAMES
 
 _PLAIN = ("name", "signal", "delay_frames", "rate_hz")  # of the same name in law and message
 
@@ -48,6 +49,12 @@ def law_of(message: wire.LinearLaw, known: Mapping[str, LinearLaw] = MappingProx
 def driving(state: wire.ControllerState | None, laws: Mapping[str, LinearLaw]) -> LinearLaw | None:
     """The law that drives the mirror of a controller, or will; None for the integrator."""
     return law_of(state.law, laws) if state is not None and state.HasField("law") else None
+
+
+def overruled(state: wire.ControllerState) -> list[str]:
+    """Groups of modes that the integrator drives in place of the law."""
+    groups = state.guard.groups
+    return [name for name, group in zip(NAMES, groups, strict=False) if group.overruled]
 
 
 def gains_of(state: wire.ControllerState) -> Law:

@@ -15,6 +15,7 @@ from lowfc.control.laws import linear_law
 from lowfc.control.laws.linear_law import LinearLaw
 from lowfc.control.loop.command_channels import PlayTable
 from lowfc.control.loop.estimator import Estimate
+from lowfc.control.loop.guard import Group, Guard
 from lowfc.control.loop.lease import Lease
 from lowfc.control.loop.safety import Limits, LoopMode, Rejection, reason_of
 from lowfc.control.loop.state import ActiveLoop, Conditions, LawRunner, Settings, State
@@ -23,7 +24,7 @@ from lowfc.control.loop.state import ActiveLoop, Conditions, LawRunner, Settings
 _LIMITS = ("stroke_nm", "slew_nm", "neighbour_nm")
 _PAIRS = ("gain", "leak", "limit_nm")
 _SETTINGS = (
-    *("delay_frames", "max_frame_age_ns", "frame_timeout_ns", "on_frame_timeout", "rate_hz"),
+    *("delay_frames", "max_frame_age_ns", "frame_timeout_ns", "on_frame_timeout", "rate_hz", "guard"),
     *("min_flux_fraction", "max_saturated_pixels", "max_identical_frames"),
 )
 _STATE = (
@@ -64,6 +65,8 @@ def controller_state(state: State, settings: Settings, time_ns: int) -> wire.Con
             message.law.CopyFrom(law_header(following.law))
             message.law_state.extend(following.x.tolist())
             message.law_frames = following.frames
+            if following.guard is not None:
+                _put_guard(message.guard, following.guard)
         message.calibration_id = drive.calibration.id
         message.calibration_provisional = drive.calibration.provisional
         if not message.calibration_id:
@@ -103,7 +106,9 @@ def decode_state(
         following = None
         if message.HasField("law"):
             x = np.array(message.law_state, np.float32)
-            following = LawRunner(law_of(message.law, laws), x, message.law_frames)
+            found = law_of(message.law, laws)
+            guard = _decode_guard(message.guard, found, len(history)) if message.HasField("guard") else None
+            following = LawRunner(found, x, message.law_frames, guard)
             if x.shape != linear_law.at_rest(following.law).shape or following.law.noll != calibration.noll:
                 raise ValueError("the law of the controller's state does not fit")
         drive = drive._replace(
@@ -133,6 +138,33 @@ def decode_state(
         **fields_of(message, _STATE),
     )
     return settings, state
+
+
+def _put_guard(message: wire.Guard, guard: Guard) -> None:
+    message.frames, message.void = guard.frames, guard.void
+    message.groups.extend(wire.GuardedGroup(**group._asdict()) for group in guard.groups)
+    message.sums_nm2.extend(guard.sums_nm2.ravel().tolist())
+    message.virtual_nm.extend(value for command_nm in guard.virtual_nm for value in command_nm.tolist())
+    if guard.x is not None:
+        message.law_state.extend(guard.x.tolist())
+
+
+def _decode_guard(message: wire.Guard, law: LinearLaw, commands: int) -> Guard:
+    rest = Guard.of(law, [Group(**fields_of(group, Group._fields)) for group in message.groups])
+    found = rest._replace(
+        **fields_of(message, ("frames", "void")),
+        sums_nm2=np.array(message.sums_nm2).reshape(rest.sums_nm2.shape),
+        virtual_nm=tuple(np.array(message.virtual_nm, np.float32).reshape(-1, len(law.noll))),
+        x=np.array(message.law_state, np.float32) if message.law_state else None,
+    )
+    if (
+        len(found.groups) != rest.sums_nm2.shape[1]
+        or any(group.overruled and not group.takeovers for group in found.groups)
+        or (found.virtual_nm and len(found.virtual_nm) != commands)
+        or (found.x is not None and found.x.shape != linear_law.at_rest(law).shape)
+    ):
+        raise ValueError("the guard of the controller's state does not fit its law")
+    return found
 
 
 def reason_counts(state: State) -> list[wire.ReasonCount]:

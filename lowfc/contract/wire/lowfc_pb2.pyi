@@ -40,6 +40,7 @@ class Reason(int, metaclass=_enum_type_wrapper.EnumTypeWrapper):
     REASON_NOT_FINITE: _ClassVar[Reason]
     REASON_WRONG_GRID: _ClassVar[Reason]
     REASON_CHANNEL: _ClassVar[Reason]
+    REASON_LAW_OVERRULED: _ClassVar[Reason]
 
 class MirrorStatus(int, metaclass=_enum_type_wrapper.EnumTypeWrapper):
     __slots__ = ()
@@ -72,6 +73,7 @@ REASON_NEIGHBOUR: Reason
 REASON_NOT_FINITE: Reason
 REASON_WRONG_GRID: Reason
 REASON_CHANNEL: Reason
+REASON_LAW_OVERRULED: Reason
 MIRROR_STATUS_UNSPECIFIED: MirrorStatus
 MIRROR_STATUS_WAITING: MirrorStatus
 MIRROR_STATUS_FOLLOWING: MirrorStatus
@@ -206,7 +208,7 @@ class ReasonCount(_message.Message):
     def __init__(self, reason: _Optional[_Union[Reason, str]] = ..., count: _Optional[int] = ...) -> None: ...
 
 class ControllerSettings(_message.Message):
-    __slots__ = ("stroke_nm", "slew_nm", "neighbour_nm", "delay_frames", "start_mode", "max_frame_age_ns", "frame_timeout_ns", "on_frame_timeout", "min_flux_fraction", "max_saturated_pixels", "gain", "leak", "limit_nm", "max_identical_frames", "rate_hz")
+    __slots__ = ("stroke_nm", "slew_nm", "neighbour_nm", "delay_frames", "start_mode", "max_frame_age_ns", "frame_timeout_ns", "on_frame_timeout", "min_flux_fraction", "max_saturated_pixels", "gain", "leak", "limit_nm", "max_identical_frames", "rate_hz", "guard")
     STROKE_NM_FIELD_NUMBER: _ClassVar[int]
     SLEW_NM_FIELD_NUMBER: _ClassVar[int]
     NEIGHBOUR_NM_FIELD_NUMBER: _ClassVar[int]
@@ -222,6 +224,7 @@ class ControllerSettings(_message.Message):
     LIMIT_NM_FIELD_NUMBER: _ClassVar[int]
     MAX_IDENTICAL_FRAMES_FIELD_NUMBER: _ClassVar[int]
     RATE_HZ_FIELD_NUMBER: _ClassVar[int]
+    GUARD_FIELD_NUMBER: _ClassVar[int]
     stroke_nm: float
     slew_nm: float
     neighbour_nm: float
@@ -237,7 +240,8 @@ class ControllerSettings(_message.Message):
     limit_nm: _containers.RepeatedScalarFieldContainer[float]
     max_identical_frames: int
     rate_hz: float
-    def __init__(self, stroke_nm: _Optional[float] = ..., slew_nm: _Optional[float] = ..., neighbour_nm: _Optional[float] = ..., delay_frames: _Optional[float] = ..., start_mode: _Optional[_Union[LoopMode, str]] = ..., max_frame_age_ns: _Optional[int] = ..., frame_timeout_ns: _Optional[int] = ..., on_frame_timeout: _Optional[str] = ..., min_flux_fraction: _Optional[float] = ..., max_saturated_pixels: _Optional[int] = ..., gain: _Optional[_Iterable[float]] = ..., leak: _Optional[_Iterable[float]] = ..., limit_nm: _Optional[_Iterable[float]] = ..., max_identical_frames: _Optional[int] = ..., rate_hz: _Optional[float] = ...) -> None: ...
+    guard: bool
+    def __init__(self, stroke_nm: _Optional[float] = ..., slew_nm: _Optional[float] = ..., neighbour_nm: _Optional[float] = ..., delay_frames: _Optional[float] = ..., start_mode: _Optional[_Union[LoopMode, str]] = ..., max_frame_age_ns: _Optional[int] = ..., frame_timeout_ns: _Optional[int] = ..., on_frame_timeout: _Optional[str] = ..., min_flux_fraction: _Optional[float] = ..., max_saturated_pixels: _Optional[int] = ..., gain: _Optional[_Iterable[float]] = ..., leak: _Optional[_Iterable[float]] = ..., limit_nm: _Optional[_Iterable[float]] = ..., max_identical_frames: _Optional[int] = ..., rate_hz: _Optional[float] = ..., guard: _Optional[bool] = ...) -> None: ...
 
 class Channel(_message.Message):
     __slots__ = ("name", "actuators", "shifts", "reached")
@@ -302,7 +306,7 @@ class LinearLaw(_message.Message):
     def __init__(self, name: _Optional[str] = ..., signal: _Optional[str] = ..., noll: _Optional[_Iterable[int]] = ..., delay_frames: _Optional[float] = ..., rate_hz: _Optional[float] = ..., states: _Optional[int] = ..., transition: _Optional[bytes] = ..., measurement_gain: _Optional[bytes] = ..., command_gain: _Optional[bytes] = ..., predict_only: _Optional[bytes] = ..., output: _Optional[bytes] = ..., id: _Optional[str] = ..., timestamp: _Optional[_Union[datetime.datetime, _timestamp_pb2.Timestamp, _Mapping]] = ...) -> None: ...
 
 class ControllerState(_message.Message):
-    __slots__ = ("timestamp", "frame_sequence", "mode", "calibration_id", "gain", "leak", "limit_nm", "delay_frames", "command_history_nm", "actuators", "offset", "counts", "frames_used", "frame_timestamp", "refused", "refused_count", "limits_hit", "frame_timeout", "commanded", "input_number", "settings", "offset_nm", "channels", "shift_history_nm", "law", "law_state", "law_frames", "play", "steps_left", "returning_to_zero", "measured_nm", "flux_dn", "identical_frames", "camera", "camera_expected", "camera_awaited", "clear_id", "mode_timestamp", "mode_cause", "lease", "mirror_rows", "mirror_columns", "mirror_fault", "calibration_provisional")
+    __slots__ = ("timestamp", "frame_sequence", "mode", "calibration_id", "gain", "leak", "limit_nm", "delay_frames", "command_history_nm", "actuators", "offset", "counts", "frames_used", "frame_timestamp", "refused", "refused_count", "limits_hit", "frame_timeout", "commanded", "input_number", "settings", "offset_nm", "channels", "shift_history_nm", "law", "law_state", "law_frames", "play", "steps_left", "returning_to_zero", "measured_nm", "flux_dn", "identical_frames", "camera", "camera_expected", "camera_awaited", "clear_id", "mode_timestamp", "mode_cause", "lease", "mirror_rows", "mirror_columns", "mirror_fault", "calibration_provisional", "guard")
     TIMESTAMP_FIELD_NUMBER: _ClassVar[int]
     FRAME_SEQUENCE_FIELD_NUMBER: _ClassVar[int]
     MODE_FIELD_NUMBER: _ClassVar[int]
@@ -347,6 +351,7 @@ class ControllerState(_message.Message):
     MIRROR_COLUMNS_FIELD_NUMBER: _ClassVar[int]
     MIRROR_FAULT_FIELD_NUMBER: _ClassVar[int]
     CALIBRATION_PROVISIONAL_FIELD_NUMBER: _ClassVar[int]
+    GUARD_FIELD_NUMBER: _ClassVar[int]
     timestamp: _timestamp_pb2.Timestamp
     frame_sequence: int
     mode: LoopMode
@@ -391,7 +396,38 @@ class ControllerState(_message.Message):
     mirror_columns: int
     mirror_fault: str
     calibration_provisional: bool
-    def __init__(self, timestamp: _Optional[_Union[datetime.datetime, _timestamp_pb2.Timestamp, _Mapping]] = ..., frame_sequence: _Optional[int] = ..., mode: _Optional[_Union[LoopMode, str]] = ..., calibration_id: _Optional[str] = ..., gain: _Optional[_Iterable[float]] = ..., leak: _Optional[_Iterable[float]] = ..., limit_nm: _Optional[_Iterable[float]] = ..., delay_frames: _Optional[float] = ..., command_history_nm: _Optional[_Iterable[float]] = ..., actuators: _Optional[bytes] = ..., offset: _Optional[bytes] = ..., counts: _Optional[_Iterable[_Union[ReasonCount, _Mapping]]] = ..., frames_used: _Optional[int] = ..., frame_timestamp: _Optional[_Union[datetime.datetime, _timestamp_pb2.Timestamp, _Mapping]] = ..., refused: _Optional[_Union[Reason, str]] = ..., refused_count: _Optional[int] = ..., limits_hit: _Optional[_Iterable[_Union[Reason, str]]] = ..., frame_timeout: _Optional[bool] = ..., commanded: _Optional[bool] = ..., input_number: _Optional[int] = ..., settings: _Optional[_Union[ControllerSettings, _Mapping]] = ..., offset_nm: _Optional[_Iterable[float]] = ..., channels: _Optional[_Iterable[_Union[Channel, _Mapping]]] = ..., shift_history_nm: _Optional[_Iterable[float]] = ..., law: _Optional[_Union[LinearLaw, _Mapping]] = ..., law_state: _Optional[_Iterable[float]] = ..., law_frames: _Optional[int] = ..., play: _Optional[_Union[Play, _Mapping]] = ..., steps_left: _Optional[int] = ..., returning_to_zero: _Optional[bool] = ..., measured_nm: _Optional[_Iterable[float]] = ..., flux_dn: _Optional[float] = ..., identical_frames: _Optional[int] = ..., camera: _Optional[_Union[CameraState, _Mapping]] = ..., camera_expected: _Optional[_Union[CameraState, _Mapping]] = ..., camera_awaited: _Optional[bool] = ..., clear_id: _Optional[int] = ..., mode_timestamp: _Optional[_Union[datetime.datetime, _timestamp_pb2.Timestamp, _Mapping]] = ..., mode_cause: _Optional[str] = ..., lease: _Optional[_Union[Lease, _Mapping]] = ..., mirror_rows: _Optional[int] = ..., mirror_columns: _Optional[int] = ..., mirror_fault: _Optional[str] = ..., calibration_provisional: _Optional[bool] = ...) -> None: ...
+    guard: Guard
+    def __init__(self, timestamp: _Optional[_Union[datetime.datetime, _timestamp_pb2.Timestamp, _Mapping]] = ..., frame_sequence: _Optional[int] = ..., mode: _Optional[_Union[LoopMode, str]] = ..., calibration_id: _Optional[str] = ..., gain: _Optional[_Iterable[float]] = ..., leak: _Optional[_Iterable[float]] = ..., limit_nm: _Optional[_Iterable[float]] = ..., delay_frames: _Optional[float] = ..., command_history_nm: _Optional[_Iterable[float]] = ..., actuators: _Optional[bytes] = ..., offset: _Optional[bytes] = ..., counts: _Optional[_Iterable[_Union[ReasonCount, _Mapping]]] = ..., frames_used: _Optional[int] = ..., frame_timestamp: _Optional[_Union[datetime.datetime, _timestamp_pb2.Timestamp, _Mapping]] = ..., refused: _Optional[_Union[Reason, str]] = ..., refused_count: _Optional[int] = ..., limits_hit: _Optional[_Iterable[_Union[Reason, str]]] = ..., frame_timeout: _Optional[bool] = ..., commanded: _Optional[bool] = ..., input_number: _Optional[int] = ..., settings: _Optional[_Union[ControllerSettings, _Mapping]] = ..., offset_nm: _Optional[_Iterable[float]] = ..., channels: _Optional[_Iterable[_Union[Channel, _Mapping]]] = ..., shift_history_nm: _Optional[_Iterable[float]] = ..., law: _Optional[_Union[LinearLaw, _Mapping]] = ..., law_state: _Optional[_Iterable[float]] = ..., law_frames: _Optional[int] = ..., play: _Optional[_Union[Play, _Mapping]] = ..., steps_left: _Optional[int] = ..., returning_to_zero: _Optional[bool] = ..., measured_nm: _Optional[_Iterable[float]] = ..., flux_dn: _Optional[float] = ..., identical_frames: _Optional[int] = ..., camera: _Optional[_Union[CameraState, _Mapping]] = ..., camera_expected: _Optional[_Union[CameraState, _Mapping]] = ..., camera_awaited: _Optional[bool] = ..., clear_id: _Optional[int] = ..., mode_timestamp: _Optional[_Union[datetime.datetime, _timestamp_pb2.Timestamp, _Mapping]] = ..., mode_cause: _Optional[str] = ..., lease: _Optional[_Union[Lease, _Mapping]] = ..., mirror_rows: _Optional[int] = ..., mirror_columns: _Optional[int] = ..., mirror_fault: _Optional[str] = ..., calibration_provisional: _Optional[bool] = ..., guard: _Optional[_Union[Guard, _Mapping]] = ...) -> None: ...
+
+class Guard(_message.Message):
+    __slots__ = ("groups", "frames", "sums_nm2", "void", "virtual_nm", "law_state")
+    GROUPS_FIELD_NUMBER: _ClassVar[int]
+    FRAMES_FIELD_NUMBER: _ClassVar[int]
+    SUMS_NM2_FIELD_NUMBER: _ClassVar[int]
+    VOID_FIELD_NUMBER: _ClassVar[int]
+    VIRTUAL_NM_FIELD_NUMBER: _ClassVar[int]
+    LAW_STATE_FIELD_NUMBER: _ClassVar[int]
+    groups: _containers.RepeatedCompositeFieldContainer[GuardedGroup]
+    frames: int
+    sums_nm2: _containers.RepeatedScalarFieldContainer[float]
+    void: bool
+    virtual_nm: _containers.RepeatedScalarFieldContainer[float]
+    law_state: _containers.RepeatedScalarFieldContainer[float]
+    def __init__(self, groups: _Optional[_Iterable[_Union[GuardedGroup, _Mapping]]] = ..., frames: _Optional[int] = ..., sums_nm2: _Optional[_Iterable[float]] = ..., void: _Optional[bool] = ..., virtual_nm: _Optional[_Iterable[float]] = ..., law_state: _Optional[_Iterable[float]] = ...) -> None: ...
+
+class GuardedGroup(_message.Message):
+    __slots__ = ("overruled", "faded", "takeovers", "blocks", "usual_nm2")
+    OVERRULED_FIELD_NUMBER: _ClassVar[int]
+    FADED_FIELD_NUMBER: _ClassVar[int]
+    TAKEOVERS_FIELD_NUMBER: _ClassVar[int]
+    BLOCKS_FIELD_NUMBER: _ClassVar[int]
+    USUAL_NM2_FIELD_NUMBER: _ClassVar[int]
+    overruled: bool
+    faded: int
+    takeovers: int
+    blocks: int
+    usual_nm2: float
+    def __init__(self, overruled: _Optional[bool] = ..., faded: _Optional[int] = ..., takeovers: _Optional[int] = ..., blocks: _Optional[int] = ..., usual_nm2: _Optional[float] = ...) -> None: ...
 
 class Lease(_message.Message):
     __slots__ = ("id", "holder", "until", "last_sequence", "ended")

@@ -14,6 +14,7 @@ from lowfc.control.laws import linear_law
 from lowfc.control.laws.law import integrate
 from lowfc.control.loop.camera import CameraSettings
 from lowfc.control.loop.estimator import Estimate, filled, saturated_pixels
+from lowfc.control.loop.guard import Guard
 from lowfc.control.loop.inputs import (
     COUNT_BITS,
     Command,
@@ -40,7 +41,7 @@ from lowfc.control.loop.loading import (
 from lowfc.control.loop.requests import answer
 from lowfc.control.loop.reservation import lease_checked
 from lowfc.control.loop.safety import Limit, LoopMode, Reason, Rejection, limit
-from lowfc.control.loop.state import ActiveLoop, Settings, State
+from lowfc.control.loop.state import FADING_FRAMES, SETTLING_FRAMES, ActiveLoop, LawRunner, Settings, State
 
 UNMEASURED = frozenset({Rejection.NO_CALIBRATION, Rejection.WRONG_SIZE})
 """Without a calibration of its size, a frame is an exposure all the same: probe sequences go on where no law acts."""
@@ -82,7 +83,7 @@ def _frame(settings: Settings, state: State, frame: Frame) -> tuple[State, Outpu
     if 0 < settings.max_identical_frames < alike:
         stuck = _newest(state, drive, frame)._replace(identical_frames=alike)
         return _refuse(settings, stuck, frame, Rejection.STUCK, events)
-    error_nm, pol_nm, drive = _pseudo_open_loop(drive, estimate.error_nm, frame.sequence)
+    error_nm, pol_nm, drive = _pseudo_open_loop(state, drive, estimate.error_nm, frame.sequence, events)
     drive, reasons, homing = _next_command(settings, state, drive, error_nm, frame.sequence)
     if reasons:
         drive = end_probe(drive, frame.sequence, _acted(reasons), events)
@@ -91,6 +92,7 @@ def _frame(settings: Settings, state: State, frame: Frame) -> tuple[State, Outpu
         events.append(PendingEvent("FRAMES_ACCEPTED", details))
     if reasons != state.limits_hit:
         _limit_events(state.limits_hit, reasons, events)
+    shown = (*reasons, Limit.LAW_OVERRULED) if _overruled(state, drive) else reasons
     mode, command_nm, commanded = state.mode, drive.history_nm[0], _commands(state)
     steps_left, stepped = max(state.steps_left - 1, 0), state.steps_left == 1
     if stepped:
@@ -103,7 +105,7 @@ def _frame(settings: Settings, state: State, frame: Frame) -> tuple[State, Outpu
         state.frames_used + 1,
         limits_hit=reasons,
         commanded=commanded,
-        counts=_counted(state.counts, reasons),
+        counts=_counted(state.counts, shown),
         steps_left=steps_left,
         returning_to_zero=homing,
         input_number=state.input_number + 1,
@@ -113,7 +115,7 @@ def _frame(settings: Settings, state: State, frame: Frame) -> tuple[State, Outpu
     )
     if stepped:
         state = in_mode(state, LoopMode.OPEN, frame.time_ns, STEPPED)
-    step = Step(frame.sequence, frame.time_ns, mode, command_nm, reasons, error_nm, pol_nm, estimate.flux_dn, saturated)
+    step = Step(frame.sequence, frame.time_ns, mode, command_nm, shown, error_nm, pol_nm, estimate.flux_dn, saturated)
     command = _command(state, drive, command_nm) if commanded else None
     return state, Outputs(step, command, None, events, changed=stepped or freed)
 
@@ -189,7 +191,9 @@ def _measure(settings: Settings, state: State, drive: ActiveLoop, frame: Frame) 
     return Rejection.DARK if estimate is None else (estimate, saturated)
 
 
-def _pseudo_open_loop(drive: ActiveLoop, measured_nm: Single, sequence: int) -> tuple[Single, Single, ActiveLoop]:
+def _pseudo_open_loop(
+    state: State, drive: ActiveLoop, measured_nm: Single, sequence: int, events: list[PendingEvent]
+) -> tuple[Single, Single, ActiveLoop]:
     """Error and pseudo-open-loop modes (modes,) of what the sensor measured, and the drive whose law has seen them.
 
     Channels are taken out of both, as far as the exposure saw them; what the loop is to aim at is taken out of the
@@ -203,8 +207,30 @@ def _pseudo_open_loop(drive: ActiveLoop, measured_nm: Single, sequence: int) -> 
         target_nm = added.target_nm(sequence)
         error_nm, to_undo_nm = error_nm - target_nm, pol_nm - target_nm
     if drive.following is not None:
-        drive = drive._replace(following=drive.following.followed(error_nm, to_undo_nm, drive.history_nm[0]))
+        followed = drive.following.followed(error_nm, to_undo_nm, drive.history_nm[0])
+        if followed.guard is not None:
+            guard, more = _guarded(state, drive, followed, followed.guard, error_nm, to_undo_nm)
+            followed = followed._replace(guard=guard)
+            events += more
+        drive = drive._replace(following=followed)
     return error_nm, pol_nm, drive
+
+
+def _guarded(
+    state: State, drive: ActiveLoop, law: LawRunner, guard: Guard, error_nm: Single, to_undo_nm: Single
+) -> tuple[Guard, list[PendingEvent]]:
+    """The guard of a law after a frame, and its events; both (modes,) without the loop's target."""
+    closed, added = state.mode is LoopMode.CLOSED, drive.command_channels
+    moved = state.returning_to_zero or (added is not None and added.moving)
+    if moved or not (closed or state.mode is LoopMode.OPEN):
+        return guard.at_rest(), []
+    if law.frames <= SETTLING_FRAMES or not closed:
+        return guard.observed(to_undo_nm, law.frames), []
+    if law.frames < SETTLING_FRAMES + FADING_FRAMES:
+        return guard.at_rest(), []
+    limited = any(reason is not Limit.MODAL_LIMIT for reason in state.limits_hit)  # virtual commands have that one, too
+    loop = drive.law, drive.weights, drive.history_nm
+    return guard.judged(law.law, law.x, *loop, error_nm, to_undo_nm, limited=limited)
 
 
 def _next_command(
@@ -245,16 +271,23 @@ def _next_command(
 def _law_output(drive: ActiveLoop, error_nm: Single) -> tuple[Single, bool]:
     """The law's modal command (modes,) in its limits, and whether one was cut."""
     following, held_nm = drive.following, drive.history_nm[0]
-    weight = following.weight if following is not None else np.float32(0)
-    if following is None or weight < 1:
+    alone = following is not None and following.alone
+    if following is None or not alone:
         integrated_nm, cut = integrate(drive.law, held_nm, error_nm)
-        if following is None or not weight:
+        if following is None or following.frames <= SETTLING_FRAMES:
             return integrated_nm, cut
     wanted_nm = linear_law.respond(following.law, following.x)
-    if weight < 1:
+    if not alone:
+        weight = following.weight
         wanted_nm = wanted_nm * weight + integrated_nm * (1 - weight)
     kept_nm = np.clip(wanted_nm, -drive.law.limit_nm, drive.law.limit_nm)
     return kept_nm, not np.array_equal(kept_nm, wanted_nm)
+
+
+def _overruled(state: State, drive: ActiveLoop) -> bool:
+    """Whether the integrator has a part of the command in place of a law that was worse."""
+    guard = drive.following.guard if drive.following is not None else None
+    return guard is not None and state.mode is LoopMode.CLOSED and guard.overruled
 
 
 def _acted(limits: tuple[Reason, ...]) -> str:

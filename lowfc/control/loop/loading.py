@@ -10,7 +10,7 @@ from lowfc.control.loop.camera import CameraSettings, changes
 from lowfc.control.loop.command_channels import ADOPTED, Channel
 from lowfc.control.loop.inputs import MirrorReport, MirrorShape, Outputs, PendingEvent
 from lowfc.control.loop.safety import LoopMode, limit
-from lowfc.control.loop.state import ActiveLoop, Conditions, LawRunner, Settings, State
+from lowfc.control.loop.state import ActiveLoop, Conditions, Settings, State
 
 ADOPTED_NM = 1.0
 """Of an actuator beyond the modal command, above which a mirror's shape is adopted as a channel."""
@@ -146,7 +146,7 @@ def mirror_judged(settings: Settings, state: State, report: MirrorReport) -> tup
         if news:
             drive = end_probe(drive, state.frame_sequence, f"the mirror {fault}", events)
         if news and drive.following is not None:
-            drive = drive._replace(following=LawRunner.at_rest(drive.following.law))
+            drive = drive._replace(following=drive.following.again())
         if state.mode is LoopMode.CLOSED and report.shape is not None:
             drive = _gone_back(settings, drive, report.shape.actuators_nm)
     if not news and drive is state.drive:

@@ -172,7 +172,7 @@ def _reset(settings: Settings, state: State, request: Request) -> Handled:
     if state.mode is LoopMode.SAFE:
         raise ValueError("the loop is in safe mode: the mirror is on its way to flat, or there")
     if drive.following is not None:
-        drive = drive._replace(following=LawRunner.at_rest(drive.following.law))
+        drive = drive._replace(following=drive.following.again())
     return state._replace(drive=drive, returning_to_zero=True), "the modal command goes to zero"
 
 
@@ -273,7 +273,7 @@ def _law(settings: Settings, state: State, request: Request) -> Handled:
     law = request.law
     if law.noll != drive.calibration.noll:
         raise ValueError(f"the law is of the modes {list(law.noll)}, the loop of {list(drive.calibration.noll)}")
-    drive = drive._replace(following=LawRunner.at_rest(law))
+    drive = drive._replace(following=LawRunner.at_rest(law, guarded=settings.guard))
     return state._replace(drive=drive), f"the law {law.name!r} takes over from the integrator"
 
 

@@ -60,6 +60,7 @@ class Limit(IntEnum):
     NOT_FINITE = 24
     WRONG_GRID = 25
     CHANNEL = 26
+    LAW_OVERRULED = 27
 
 
 Reason = Rejection | Limit

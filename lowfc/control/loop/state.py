@@ -16,6 +16,7 @@ from lowfc.control.laws.stability import delay_weights
 from lowfc.control.loop.camera import CameraSettings
 from lowfc.control.loop.command_channels import CommandChannels
 from lowfc.control.loop.estimator import Estimate, Estimator
+from lowfc.control.loop.guard import Guard
 from lowfc.control.loop.lease import Lease
 from lowfc.control.loop.safety import Limits, LoopMode, Reason, Rejection
 
@@ -43,6 +44,7 @@ class Settings:
         max_identical_frames: frames in a row that may be measured exactly as the one before; 0 for any number.
         gain: gain, leak and limit (nm) of tip and tilt, then of the other modes.
         rate_hz: of the frames; 0 where it is not known.
+        guard: laws are guarded.
     """
 
     limits: Limits
@@ -58,6 +60,7 @@ class Settings:
     limit_nm: tuple[float, float]
     max_identical_frames: int = 0
     rate_hz: float = 0.0
+    guard: bool = False
 
     def law(self, noll: tuple[int, ...]) -> Law:
         """The law for these modes: the first figure of each pair for tip and tilt, the second for the rest."""
@@ -72,38 +75,53 @@ class LawRunner(NamedTuple):
     """A linear law that follows the measurements: its x (states,), and the frames for which it has done so.
 
     It drives the mirror once it has followed for `SETTLING_FRAMES`; over the next `FADING_FRAMES` it takes over from
-    the integrator, so that the mirror does not jump.
+    the integrator, so that the mirror does not jump. A `guard` compares it with the integrator all the time.
     """
 
     law: LinearLaw
     x: Single
     frames: int = 0
+    guard: Guard | None = None
 
     @classmethod
-    def at_rest(cls, law: LinearLaw) -> "LawRunner":
+    def at_rest(cls, law: LinearLaw, *, guarded: bool) -> "LawRunner":
         """A law that has seen nothing yet."""
-        return cls(law, linear_law.at_rest(law))
+        return cls(law, linear_law.at_rest(law), 0, Guard.of(law) if guarded else None)
+
+    def again(self) -> "LawRunner":
+        """The same law at rest."""
+        return self.at_rest(self.law, guarded=self.guard is not None)
 
     def followed(self, error_nm: Single, pol_nm: Single, kept_nm: Single) -> "LawRunner":
         """One frame later; all (modes,): both without the loop's target, and the command kept of the last frame."""
         signal = error_nm if self.law.signal == "error" else pol_nm
-        return LawRunner(self.law, linear_law.follow(self.law, self.x, signal, kept_nm), self.frames + 1)
+        x = linear_law.follow(self.law, self.x, signal, kept_nm)
+        return LawRunner(self.law, x, self.frames + 1, self.guard)
 
     def coasted(self, frames: int, kept_nm: Single) -> "LawRunner":
         """Some frames later, which were missing or of no use."""
         x = self.x
         for _ in range(min(frames, MOST_COASTED)):
             x = linear_law.coast(self.law, x, kept_nm)
-        return LawRunner(self.law, x, self.frames if frames <= MOST_COASTED else 0)
+        if frames > MOST_COASTED:
+            return LawRunner(self.law, x, 0, self.guard)
+        return LawRunner(self.law, x, self.frames, None if self.guard is None else self.guard.held(frames, self.law))
 
     @property
-    def weight(self) -> np.float32:
-        """Its part of the command; the integrator's is the rest."""
-        return np.float32(min(max(self.frames - SETTLING_FRAMES, 0) / FADING_FRAMES, 1))
+    def weight(self) -> np.float32 | Single:
+        """Its part of the command, or of each mode's (modes,); the integrator's is the rest."""
+        weight = np.float32(min(max(self.frames - SETTLING_FRAMES, 0) / FADING_FRAMES, 1))
+        return weight if self.guard is None or not self.guard.overruled else weight * self.guard.weight
+
+    @property
+    def alone(self) -> bool:
+        """Whether all of the command is the law's."""
+        return self.frames >= SETTLING_FRAMES + FADING_FRAMES and (self.guard is None or not self.guard.overruled)
 
     def taking_over(self) -> "LawRunner":
         """The same where the loop was just closed: it fades in."""
-        return self._replace(frames=min(self.frames, SETTLING_FRAMES))
+        guard = None if self.guard is None else self.guard.anew()
+        return self._replace(frames=min(self.frames, SETTLING_FRAMES), guard=guard)
 
 
 class ActiveLoop(NamedTuple):

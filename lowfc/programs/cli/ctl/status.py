@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from lowfc.contract.codecs.law_codec import overruled
 from lowfc.contract.envelope import count_of
 from lowfc.contract.messages import FRAME, Role, from_timestamp, wire
 from lowfc.control.loop.safety import REASONS, Rejection, reason_of
@@ -31,11 +32,12 @@ def figures(
         frames = play.frames or (len(play.table) // (4 * play.columns) if play.columns else 0)
         left = play.first_sequence + frames - 1 - state.frame_sequence
         playing = {"target": play.target, "frames": frames, "frames_left": min(max(left, 0), frames)}
-    law = {"name": "integrator", "weight": 1.0}
+    law: dict[str, Any] = {"name": "integrator", "weight": 1.0, "overruled": []}
     if state.HasField("law"):
         law = {
             "name": state.law.name,
             "weight": min(max(state.law_frames - SETTLING_FRAMES, 0) / FADING_FRAMES, 1.0),
+            "overruled": overruled(state),
         }
     command_nm = list(state.command_history_nm)[: len(state.gain)]
     settings = state.settings
@@ -116,6 +118,8 @@ def text(known: dict[str, Any]) -> str:
     law = known["law"]["name"]
     if known["law"]["weight"] < 1:
         law += f", driving with a weight of {known['law']['weight']:.2f}; the integrator has the rest"
+    if known["law"]["overruled"]:
+        law += f", in whose place the integrator drives {' and '.join(known['law']['overruled'])}"
     channels = [
         f"{one['name']} {one['rms_nm']:.3g} nm rms of surface"
         f"{'' if one['reached'] else ', on its way'}{'' if one['shifts_zero_point'] else ', zero point not shifted'}"
@@ -177,7 +181,7 @@ def _in_short(known: dict[str, Any]) -> str:
             f"{counted(known['frames_skipped'] + known['frames_missing'], 'frame')} lost",
             recording.get(known["recording"], f"recording {known['recording']}"),
             f"run {known['run']}",
-            f"law {known['law']['name']}",
+            f"law {known['law']['name']}" + (", overruled" if known["law"]["overruled"] else ""),
             "no warning"
             if warning is None
             else f"{warning['age_s']:.0f} s ago {warning['process']}: {warning['text']}",

@@ -36,7 +36,7 @@ ATTEMPTS = 5
 """Attempts at a sequence where frames are lost or a device restarts."""
 DITHER_SLOWEST = 1 / 16
 """Cycles per frame below which a dither is not used."""
-_LIMITS = frozenset(Limit)
+_LIMITS = frozenset(Limit) - {Limit.MODAL_LIMIT, Limit.LAW_OVERRULED}
 
 
 class PlayInterruptedError(CalibrationError):
@@ -184,7 +184,7 @@ def _check(loop: Client, step: Step, before: LoopMode | None, *, over: bool) -> 
             f"the loop went from {before.name.lower()} to {step.mode.name.lower()} while pokes were played, which "
             "ended them; leave it alone during a calibration"
         )
-    limits = [reason.name for reason in step.reasons if reason in _LIMITS and reason is not Limit.MODAL_LIMIT]
+    limits = [reason.name for reason in step.reasons if reason in _LIMITS]
     if limits and not over:
         raise CalibrationError(
             f"a limit of the mirror acted on the pokes ({', '.join(limits)}), which ended them: take a smaller "

@@ -15,7 +15,10 @@ from lowfc.contract.codecs.calibration_codec import identified
 from lowfc.contract.errors import RequestRefusedError
 from lowfc.contract.messages import Role
 from lowfc.control.calibration.calibration import Calibration
+from lowfc.control.laws.linear_law import integrator
 from lowfc.control.laws.stability import limiting_gain
+from lowfc.control.loop.guard import FEWEST, WORSE_BLOCKS
+from lowfc.control.loop.state import FADING_FRAMES, SETTLING_FRAMES
 from lowfc.programs.reliability.chaos.bench import CaseFailedError, ChaosBench
 from lowfc.programs.reliability.chaos.case import LOST, WHILE_FRAMES, End, case, no_mounts, no_other_clock, read_only
 from lowfc.programs.reliability.chaos.processes import killed
@@ -36,6 +39,18 @@ def _highest_gain(bench: ChaosBench) -> None:
     bench.frames(WHILE_FRAMES)
     client.gain(bench.config.control.gain)
     client.gain(bench.config.control.tilt_gain, modes=[2, 3])
+
+
+@case(
+    "law-that-fails",
+    "a law that is stable and corrects next to nothing; the integrator takes over",
+    expected=("LAW_OVERRULED the integrator takes over tip and tilt",),
+)
+def _law_that_fails(bench: ChaosBench) -> None:
+    noll, known = bench.config.noll, settings(bench.config)
+    weak = integrator((0.002,) * len(noll), (0.0,) * len(noll), noll, known.delay_frames, known.rate_hz)
+    bench.client().law(weak)
+    bench.frames(SETTLING_FRAMES + FADING_FRAMES + (WORSE_BLOCKS + 2) * FEWEST)
 
 
 def _good(bench: ChaosBench) -> Calibration:

@@ -6,6 +6,7 @@ from datetime import UTC, datetime
 
 import numpy as np
 
+from lowfc.contract.codecs.law_codec import overruled
 from lowfc.contract.messages import from_timestamp, wire
 from lowfc.contract.printable import printable
 from lowfc.control.loop.state import FADING_FRAMES, SETTLING_FRAMES
@@ -35,7 +36,9 @@ def _law(state: wire.ControllerState) -> str:
     if state.HasField("law"):
         weight = min(max(state.law_frames - SETTLING_FRAMES, 0) / FADING_FRAMES, 1.0)
         fading = "" if weight == 1 else f", taking over from the integrator ({100 * weight:.0f} %)"
-        law = f"{short(printable(state.law.name))}{fading}"
+        modes = overruled(state)
+        instead = f", the integrator in its place for {' and '.join(modes)}" if modes else ""
+        law = f"{short(printable(state.law.name))}{fading}{instead}"
     elif state.gain:
         leak = f", leak {_values(state.leak)}" if any(state.leak) else ""
         law = f"integrator, gain {_values(state.gain)}{leak}"

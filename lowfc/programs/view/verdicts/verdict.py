@@ -99,6 +99,9 @@ def _loop(state: RunState) -> Tile:
         return tile("HOLDING", "closed, but no step in the last second", Level.WARNING, advice)
     if all_refused(state):
         return tile("HOLDING", "closed, but every frame is refused: command held", Level.WARNING)
+    if state.now[Limit.LAW_OVERRULED]:
+        advice = "The law leaves more than the integrator, which has taken over. Tune again: `lowfc tune --live`."
+        return tile("CLOSED", "the integrator in place of the law", Level.WARNING, advice)
     return tile("CLOSED", f"correcting{_since(state.controller_state)}", Level.GOOD, "Loop closed, nothing is wrong.")
 
 

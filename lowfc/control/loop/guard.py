@@ -1,0 +1,260 @@
+"""The guard of a linear law: an integrator beside it, of the same frames, which takes over where the law does worse.
+
+Tip and tilt are judged by themselves, and so are the other modes: the weight of one would hide the other. While the law
+drives a group, the integrator is virtual there; while the integrator drives it, the law is.
+
+Squared errors are compared in blocks of frames, some of which in a row decide: a step of the disturbance, for which a
+law may take longer than the integrator, spoils one or two blocks, and moved lines spoil all.
+"""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from lowfc.arrays import Array, Mask, Single
+from lowfc.control.laws import linear_law
+from lowfc.control.laws.law import Law, integrate
+from lowfc.control.laws.linear_law import LinearLaw
+from lowfc.control.loop.inputs import PendingEvent
+
+BLOCK_S, FEWEST = 0.1, 100
+"""Duration of a block, and its frames at least."""
+WORSE_BLOCKS = 3
+"""In a row after which the integrator takes over."""
+FADED_S = 0.1
+"""In which one takes over from the other."""
+BETTER_S = 10.0
+"""For how long the law must be better in every block before it drives again; twice as long each time."""
+MOST_TAKEOVERS = 4
+"""From this one on, only an operator lets the law drive again."""
+WORSE, BETTER = 1.2, 0.25
+"""Mean squared error of the law over the integrator's, above which it is worse, and below which it is better."""
+USUAL_S = 10.0
+"""Time constant of what is usual of the pseudo-open-loop modes."""
+AMPLIFIED = 4.0
+"""Mean squared error over the usual mean square of the pseudo-open-loop modes, above which the loop amplifies."""
+
+NAMES = ("tip and tilt", "the other modes")
+AGAIN = "again"
+_TILT = (2, 3)
+
+
+class Spans(NamedTuple):
+    """Durations at a frame rate: of a block and of the cross-fade in frames, of the others in blocks."""
+
+    block: int
+    faded: int
+    better: int
+    usual: int
+
+    @classmethod
+    def at(cls, rate_hz: float) -> "Spans":
+        """At this rate."""
+        block = max(FEWEST, round(BLOCK_S * rate_hz))
+        better, usual = (max(1, round(seconds * rate_hz / block)) for seconds in (BETTER_S, USUAL_S))
+        return cls(block, max(1, round(FADED_S * rate_hz)), better, usual)
+
+
+class Group(NamedTuple):
+    """What the guard knows of a group of modes.
+
+    Attributes:
+        overruled: the integrator drives it.
+        faded: frames of the cross-fade that the integrator has had, up to all of them.
+        takeovers: by the integrator.
+        blocks: in a row that speak for a change.
+        usual_nm2: sum of the mean squares of its pseudo-open-loop modes over a longer time.
+    """
+
+    overruled: bool = False
+    faded: int = 0
+    takeovers: int = 0
+    blocks: int = 0
+    usual_nm2: float = 0.0
+
+    @property
+    def final(self) -> bool:
+        """Whether only an operator lets the law drive it again."""
+        return self.takeovers >= MOST_TAKEOVERS
+
+    def judged(self, means_nm2: Sequence[float], spans: Spans, *, void: bool) -> tuple["Group", str]:
+        """After a block, and why the law is overruled, or `AGAIN`; mostly empty.
+
+        Args:
+            means_nm2: over the block, of the squares of errors, virtual errors and pseudo-open-loop modes.
+            spans: durations.
+            void: there is nothing to compare with. A loop that amplifies shows all the same; a wrong delay, for one,
+                spoils pseudo-open-loop modes, and with them the comparison.
+        """
+        error_nm2, virtual_nm2, pol_nm2 = means_nm2
+        after = self._replace(usual_nm2=self.usual_nm2 + (pol_nm2 - self.usual_nm2) / spans.usual)
+        if self.overruled:
+            better = not void and virtual_nm2 < BETTER * error_nm2
+            after = after._replace(blocks=self.blocks + 1 if better else 0)
+            if self.final or after.blocks < spans.better << (self.takeovers - 1):
+                return after, ""
+            return after._replace(overruled=False, blocks=0), AGAIN
+        worse, amplified = not void and error_nm2 > WORSE * virtual_nm2, error_nm2 > AMPLIFIED * self.usual_nm2
+        after = after._replace(blocks=self.blocks + 1 if worse or amplified else 0)
+        if after.blocks < WORSE_BLOCKS:
+            return after, ""
+        takeovers, rival_nm2 = self.takeovers + 1, virtual_nm2
+        what = "the integrator would leave"
+        if not worse:
+            takeovers, rival_nm2, what = MOST_TAKEOVERS, self.usual_nm2, "without correction there would be"
+        after = after._replace(overruled=True, takeovers=takeovers, blocks=0)
+        return after, f"it leaves {error_nm2**0.5:.3g} nm rms, {what} {rival_nm2**0.5:.3g}"
+
+
+class Guard(NamedTuple):
+    """What the guard knows, from one frame to the next.
+
+    Attributes:
+        spans: at the law's frame rate.
+        members: (modes, groups) 1 where a mode is one of the group.
+        groups: as in `members`.
+        frames: of the present block.
+        sums_nm2: (3, groups) squares of them: errors, virtual errors, pseudo-open-loop modes.
+        void: the virtual loop has not been there all the time.
+        virtual_nm: commands (modes,) of whichever does not drive a mode, newest first; empty before it begins from
+            where the loop is.
+        x: (states,) of the law as if it drove all modes; None while it does.
+    """
+
+    spans: Spans
+    members: Single
+    groups: tuple[Group, ...]
+    frames: int
+    sums_nm2: Array
+    void: bool = False
+    virtual_nm: tuple[Single, ...] = ()
+    x: Single | None = None
+
+    @classmethod
+    def of(cls, law: LinearLaw, groups: Sequence[Group] = ()) -> "Guard":
+        """The guard of a law, with these groups or new ones."""
+        tilt = np.isin(law.noll, _TILT)
+        members = np.array([tilt, ~tilt], np.float32).T
+        return cls(Spans.at(law.rate_hz), members, tuple(groups) or (Group(),) * len(NAMES), 0, np.zeros((3, 2)))
+
+    @property
+    def overruled(self) -> bool:
+        """Whether the integrator has, or is given, a part of the command."""
+        return any(group.faded or group.overruled for group in self.groups)
+
+    @property
+    def weight(self) -> Single:
+        """The law's part (modes,) of the command."""
+        left = np.array([1 - group.faded / self.spans.faded for group in self.groups], np.float32)
+        return self.members @ left
+
+    def with_groups(self, groups: Sequence[Group]) -> "Guard":
+        """At rest, as at the beginning of a block, with these groups."""
+        return Guard(self.spans, self.members, tuple(groups), 0, np.zeros_like(self.sums_nm2))
+
+    def anew(self) -> "Guard":
+        """Of a law that takes over from the integrator once more; what is usual is known."""
+        return self.with_groups([Group(usual_nm2=group.usual_nm2) for group in self.groups])
+
+    def at_rest(self) -> "Guard":
+        """While there is nothing to judge."""
+        return self.with_groups([group._replace(blocks=0) for group in self.groups])
+
+    def observed(self, pol_nm: Single, frames: int) -> "Guard":
+        """At rest, in one more of so many frames in which the law did not drive."""
+        part = 1 / min(frames, self.spans.usual * self.spans.block)
+        squares = np.square(pol_nm).dot(self.members).tolist()
+        return self.with_groups(
+            [
+                group._replace(blocks=0, usual_nm2=group.usual_nm2 + part * (pol_nm2 - group.usual_nm2))
+                for group, pol_nm2 in zip(self.groups, squares, strict=True)
+            ]
+        )
+
+    def held(self, frames: int, law: LinearLaw) -> "Guard":
+        """Some frames later, of which nothing was measured: commands are held, as those of the loop."""
+        if not self.virtual_nm:
+            return self
+        x = self.x
+        if x is not None:
+            for _ in range(frames):
+                x = linear_law.coast(law, x, self.virtual_nm[0])
+        held = self.virtual_nm[:1] * min(frames, len(self.virtual_nm))
+        return self._replace(virtual_nm=(held + self.virtual_nm)[: len(self.virtual_nm)], x=x)
+
+    def judged(
+        self,
+        law: LinearLaw,
+        x: Single,
+        integrator: Law,
+        weights: tuple[tuple[int, np.float32], ...],
+        history_nm: tuple[Single, ...],
+        error_nm: Single,
+        pol_nm: Single,
+        *,
+        limited: bool,
+    ) -> tuple["Guard", list[PendingEvent]]:
+        """One frame later, in a closed loop, and what there is to say of it.
+
+        Args:
+            law: that is guarded.
+            x: (states,) its state after this frame, in the real loop.
+            integrator: its rival.
+            weights: which commands an exposure sees.
+            history_nm: the loop's commands (modes,) before this frame's, newest first.
+            error_nm: (modes,) of this frame.
+            pol_nm: (modes,) pseudo-open-loop; both without the loop's target.
+            limited: a limit of the mirror has acted on the last command, which no virtual one is held to.
+        """
+        spans, groups = self.spans, self.groups
+        overruled = self.overruled
+        if overruled and any(group.faded != spans.faded * group.overruled for group in groups):
+            return self.with_groups([_faded(group, spans) for group in groups]), []
+        squares = np.empty((3, pol_nm.size), np.float32)
+        squares[0], squares[1], squares[2] = error_nm, error_nm, pol_nm
+        virtual_nm: tuple[Single, ...] = ()
+        virtual_x: Single | None = None
+        if not limited:
+            virtual_nm = self.virtual_nm or history_nm
+            other_nm = pol_nm
+            for lag, weight in weights:
+                other_nm = other_nm + (virtual_nm[lag] if weight == 1 else weight * virtual_nm[lag])
+            command_nm, _ = integrate(integrator, virtual_nm[0], other_nm)
+            if overruled:
+                out: Mask = self.weight < 1
+                virtual_x = x
+                if self.x is not None:
+                    y = pol_nm if law.signal == "pol" else np.where(out, other_nm, error_nm)
+                    virtual_x = linear_law.follow(law, self.x, y, np.where(out, virtual_nm[0], history_nm[0]))
+                wanted_nm = np.clip(linear_law.respond(law, virtual_x), -integrator.limit_nm, integrator.limit_nm)
+                command_nm = np.where(out, wanted_nm, command_nm)
+            virtual_nm, squares[1] = (command_nm, *virtual_nm[:-1]), other_nm
+        np.square(squares, out=squares)
+        frames, sums_nm2, void = self.frames + 1, self.sums_nm2 + squares.dot(self.members), self.void or limited
+        if frames < spans.block:
+            return Guard(spans, self.members, groups, frames, sums_nm2, void, virtual_nm, virtual_x), []
+        means_nm2 = (sums_nm2 / frames).T.tolist()
+        judged = [group.judged(means, spans, void=void) for group, means in zip(groups, means_nm2, strict=True)]
+        after, events = self.with_groups([group for group, _ in judged]), _events(law.name, judged)
+        if events:  # whoever drives now is compared once it drives alone
+            return after.at_rest(), events
+        return after._replace(virtual_nm=virtual_nm, x=virtual_x), []
+
+
+def _faded(group: Group, spans: Spans) -> Group:
+    """One frame nearer to whoever drives it."""
+    faded = min(group.faded + 1, spans.faded) if group.overruled else max(group.faded - 1, 0)
+    return group._replace(faded=faded, blocks=0)
+
+
+def _events(law: str, judged: Sequence[tuple[Group, str]]) -> list[PendingEvent]:
+    events = []
+    for modes, (group, why) in zip(NAMES, judged, strict=True):
+        if why == AGAIN:
+            events.append(PendingEvent("LAW_BACK", {"law": law, "modes": modes}))
+        elif why:
+            wait_s = BETTER_S * 2 ** (group.takeovers - 1)
+            until = "until it is loaded again" if group.final else f"until it would be far better for {wait_s:g} s"
+            events.append(PendingEvent("LAW_OVERRULED", {"law": law, "modes": modes, "why": why, "until": until}))
+    return events

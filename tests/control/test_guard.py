@@ -1,0 +1,257 @@
+"""The guard of a law: when the integrator takes over, when the law drives again, and what it is not misled by."""
+
+from dataclasses import replace
+from functools import lru_cache
+
+import numpy as np
+import pytest
+
+from lowfc.arrays import Array
+from lowfc.contract.codecs.state_codec import controller_state, decode_state
+from lowfc.control.laws.linear_law import LinearLaw, integrator
+from lowfc.control.loop.advance import advance
+from lowfc.control.loop.guard import AGAIN, BETTER_S, MOST_TAKEOVERS, WORSE_BLOCKS, Group, Spans
+from lowfc.control.loop.inputs import Request
+from lowfc.control.loop.safety import Limit
+from lowfc.control.loop.state import FADING_FRAMES, SETTLING_FRAMES, Settings, State
+from tests.support.toy import NOLL, calibration, feed, frame, live, loaded, names, settings
+from tools.guard import MOVED, SEEDS, Case, identified_law, known_law, moved, undisturbed
+from tools.law_bench import Bench, calibrated, configured
+from tools.modal_bench import ModalBench, noise_covariance_nm2
+
+RATE_HZ = 1000.0
+WHAT = settings(guard=True, gain=(0.5, 0.3), rate_hz=RATE_HZ)
+BEFORE = SETTLING_FRAMES + FADING_FRAMES - 1
+"""Frames before the first that is judged."""
+SPANS = Spans.at(RATE_HZ)
+RNG = np.random.default_rng(1)
+NOISE_NM = 2 * RNG.standard_normal((30_000, len(NOLL)))
+SWAY_NM = 20 * np.sin(2 * np.pi * 7 / RATE_HZ * np.arange(3_000)[:, None] + [0, 1, 2])
+
+
+def gains(*gain: float, leak: tuple[float, ...] = (0.0, 0.0, 0.0)) -> LinearLaw:
+    """A law that is an integrator with these gains, of tip, tilt and focus."""
+    return integrator(gain, leak, NOLL, 1.0, RATE_HZ)
+
+
+GOOD, BAD_TILT, BAD_FOCUS = gains(0.6, 0.6, 0.4), gains(0.05, 0.05, 0.3), gains(0.5, 0.5, 0.05)
+
+
+def with_law(law: LinearLaw, what: Settings = WHAT) -> State:
+    state, _ = advance(what, loaded(what), Request(0, "law", law=law))
+    return state
+
+
+def run(state: State, frames: int, first: int = 1, what: Settings = WHAT, **changes: object) -> tuple[list[str], State]:
+    """Reasons of the last step, as names, and the state after some frames of a slow wave."""
+    rows = slice(first, first + frames)
+    steps, _, state = live(what, SWAY_NM[rows], state=state, first=first, **changes)
+    return [reason.name for reason in steps[-1].reasons], state
+
+
+def overruled(state: State) -> list[bool]:
+    return [group.overruled for group in state.drive.following.guard.groups]
+
+
+@pytest.mark.parametrize(
+    ("law", "who"), [(GOOD, [False, False]), (BAD_TILT, [True, False]), (BAD_FOCUS, [False, True])]
+)
+def test_the_integrator_takes_over_the_group_for_which_the_law_is_worse(law: LinearLaw, who: list[bool]) -> None:
+    reasons, state = run(with_law(law), BEFORE + (WORSE_BLOCKS + 1) * SPANS.block)
+    assert overruled(state) == who
+    assert reasons == (["LAW_OVERRULED"] if any(who) else [])
+    assert state.counts.get(Limit.LAW_OVERRULED, 0) == (SPANS.block + 1 if any(who) else 0)
+    assert Limit.LAW_OVERRULED not in state.limits_hit
+
+
+def test_nothing_is_guarded_where_that_is_switched_off_or_the_integrator_drives() -> None:
+    what = replace(WHAT, guard=False)
+    reasons, state = run(with_law(BAD_TILT, what), 1000, what=what)
+    assert (reasons, state.drive.following.guard) == ([], None)
+    assert run(loaded(WHAT), 5)[1].drive.following is None
+
+
+def test_the_integrator_takes_over_without_a_jump_and_it_is_told() -> None:
+    state = with_law(BAD_TILT)
+    _, state = run(state, BEFORE + WORSE_BLOCKS * SPANS.block - 1)
+    assert not any(overruled(state))
+    first = BEFORE + WORSE_BLOCKS * SPANS.block
+    before = state.drive.history_nm[0]
+    state, every = feed(WHAT, state, frame(first, SWAY_NM[first] + before))
+    assert names(every) == ["LAW_OVERRULED"]
+    event = every[0].events[0].details
+    assert event["modes"] == "tip and tilt"
+    assert event["until"] == f"until it would be far better for {BETTER_S:g} s"
+    assert np.abs(state.drive.history_nm[0] - before).max() < 2  # a hundredth of the way to the integrator's command
+    _, state = run(state, SPANS.faded, first + 1)
+    weight = state.drive.following.weight
+    np.testing.assert_array_equal(weight, [0, 0, 1])
+
+
+def test_waiting_doubles_and_ends_with_the_operator() -> None:
+    group, waited = Group(usual_nm2=100.0), []
+    for _ in range(MOST_TAKEOVERS):
+        for _ in range(WORSE_BLOCKS):
+            group, why = group.judged((10.0, 5.0, 100.0), SPANS, void=False)
+        assert group.overruled
+        assert "leaves 3.16 nm rms, the integrator would leave 2.24" in why
+        for blocks in range(1, 10 * SPANS.better):
+            group, why = group.judged((10.0, 2.0, 100.0), SPANS, void=False)
+            if why == AGAIN:
+                waited.append(blocks)
+                break
+    assert waited == [SPANS.better, 2 * SPANS.better, 4 * SPANS.better]
+    assert group.overruled
+
+
+@pytest.mark.parametrize("between", [(10.0, 3.0, 100.0), (10.0, 2.0, 100.0)], ids=["not better", "void"])
+def test_a_block_between_makes_the_wait_begin_anew(between: tuple[float, ...]) -> None:
+    group = Group(overruled=True, takeovers=1, blocks=SPANS.better - 1, usual_nm2=100.0)
+    group, _ = group.judged(between, SPANS, void=between[1] == 2.0)
+    assert (group.overruled, group.blocks) == (True, 0)
+
+
+def test_the_law_drives_again_once_it_would_be_far_better() -> None:
+    """A law that does next to nothing is bad at first, and good where there is nothing but noise to correct."""
+    state = with_law(gains(0.01, 0.01, 0.3, leak=(0.05, 0.05, 0.0)))
+    frames = BEFORE + WORSE_BLOCKS * SPANS.block + SPANS.faded
+    _, state = run(state, frames)
+    assert overruled(state) == [True, False]
+    noisy = replace(state.drive.law, gain=np.array([1.9, 1.9, 0.3], np.float32))
+    state = state._replace(drive=state.drive._replace(law=noisy))
+    quiet = np.zeros(((SPANS.better + 3) * SPANS.block, len(NOLL)))
+    steps, _, state = live(WHAT, quiet, NOISE_NM[: len(quiet)], state, frames + 1)
+    assert [group.takeovers for group in state.drive.following.guard.groups] == [1, 0]
+    assert state.drive.following.alone
+    by_the_integrator = [step.reasons for step in steps].count((Limit.LAW_OVERRULED,))
+    assert SPANS.better * SPANS.block <= by_the_integrator < len(steps)
+
+
+def test_closing_and_loading_begin_anew() -> None:
+    _, state = run(with_law(BAD_TILT), BEFORE + (WORSE_BLOCKS + 2) * SPANS.block)
+    assert overruled(state)[0]
+    for requests in ([Request(0, "open"), Request(0, "close")], [Request(0, "law", law=BAD_TILT)]):
+        anew, _ = feed(WHAT, state, *requests)
+        assert [group.takeovers for group in anew.drive.following.guard.groups] == [0, 0]
+
+
+def test_missing_and_refused_frames_hold_the_virtual_loop_as_the_real_one() -> None:
+    frames, lost = BEFORE + 90, {"missing": {250, 251, 260}, "dark": {270}}
+    what = replace(WHAT, delay_frames=1.5)
+    law = replace(gains(0.2, 0.2, 0.2), delay_frames=1.5)
+    _, guarded = run(with_law(law, what), frames, what=what, **lost)
+    _, alone = run(loaded(what), frames, what=what, **lost)
+    virtual_nm = guarded.drive.following.guard.virtual_nm
+    np.testing.assert_allclose(virtual_nm, alone.drive.history_nm, atol=0.3)  # rounding to DN
+    assert np.abs(guarded.drive.history_nm[0] - alone.drive.history_nm[0]).max() > 1
+
+
+def test_a_virtual_law_is_what_it_would_be_if_it_drove() -> None:
+    frames = BEFORE + (WORSE_BLOCKS + 3) * SPANS.block
+    _, state = run(with_law(BAD_TILT), frames)
+    what = replace(WHAT, guard=False)
+    _, alone = run(with_law(BAD_TILT, what), frames, what=what)
+    virtual_nm = state.drive.following.guard.virtual_nm[0]
+    np.testing.assert_allclose(virtual_nm[:2], alone.drive.history_nm[0][:2], atol=0.3)
+
+
+def test_there_is_no_verdict_while_something_is_played_a_limit_acts_or_the_command_goes_to_zero() -> None:
+    _, state = run(with_law(BAD_TILT), BEFORE + SPANS.block + 50)
+    guard, first = state.drive.following.guard, BEFORE + SPANS.block + 51
+    assert (guard.frames, guard.groups[0].blocks) == (50, 1)
+    play = Request(0, "play", text="offset", table=np.zeros((5, len(NOLL)), np.float32))
+    for request in (play, Request(0, "reset")):
+        asked, _ = advance(WHAT, state, request)
+        after = run(asked, 1, first)[1].drive.following.guard
+        assert (after.frames, after.virtual_nm, after.groups[0].blocks) == (0, (), 0)
+    limited = state._replace(limits_hit=(Limit.SLEW,))
+    after = run(limited, 1, first)[1].drive.following.guard
+    assert (after.frames, after.void, after.virtual_nm) == (51, True, ())
+    bounded = state._replace(limits_hit=(Limit.MODAL_LIMIT,))
+    assert run(bounded, 1, first)[1].drive.following.guard.void is False
+
+
+def test_a_state_from_the_wire_goes_on_to_the_bit() -> None:
+    """In every phase: judged, in the cross-fade, overruled with a virtual law."""
+    state, done = with_law(BAD_TILT), 0
+    for until in (
+        BEFORE + 150,
+        BEFORE + WORSE_BLOCKS * SPANS.block + 50,
+        BEFORE + (WORSE_BLOCKS + 3) * SPANS.block + 7,
+    ):
+        _, state = run(state, until - done, done + 1)
+        done = until
+        message = controller_state(state, WHAT, 1)
+        again, resumed = decode_state(message, calibration(), {BAD_TILT.id: BAD_TILT})
+        assert again == WHAT
+        message.guard.groups[0].overruled, message.guard.groups[0].takeovers = True, 0
+        with pytest.raises(ValueError, match="the guard of the controller's state does not fit"):
+            decode_state(message, calibration(), {BAD_TILT.id: BAD_TILT})
+        ends = [controller_state(run(one, 130, done + 1)[1], WHAT, 1) for one in (state, resumed)]
+        assert ends[0] == ends[1]
+
+
+@lru_cache
+def case(preset: str, magnitude: float = 0.0, *, known: bool = False) -> Case:
+    return Case(preset, magnitude, known_law if known else identified_law)
+
+
+def test_noise_without_images_is_that_of_the_images() -> None:
+    """Modes of an open loop that nothing disturbs, and tilt that a law leaves of the wheel."""
+    config = configured(**{"disturbance.preset": "quiet"})
+    found = calibrated(config)
+    bench = Bench(config, found)
+    bench.run(1500)
+    expected = noise_covariance_nm2(config, found)
+    got = np.cov(np.array([step.error_nm for step in bench.steps]).T)
+    assert np.linalg.norm(got - expected) < 0.1 * np.linalg.norm(expected)
+    wheel = configured()
+    left: list[float] = []
+    for one in (Bench(wheel, found), ModalBench(wheel, expected)):
+        one.ask("close")
+        one.run(1000)
+        left.append(one.tilt_mas(800))
+    assert left[1] == pytest.approx(left[0], rel=0.03)
+
+
+def test_lines_that_move_leave_no_more_than_the_integrator() -> None:
+    preset, factor = MOVED[0]
+    got_mas, overruled_s = moved(case(preset, known=True), factor, 1)
+    assert len(overruled_s) == 1
+    assert got_mas < 1.1 * moved(case(preset, known=True), factor, 1, law=False)[0]
+
+
+def test_steps_are_no_failure_of_the_law() -> None:
+    assert undisturbed(case("reaction-wheel", known=True), 1, minutes=0.2) == 0
+
+
+def test_a_wrong_delay_is_noticed_though_it_spoils_what_is_compared() -> None:
+    """The law and the pseudo-open-loop modes reckon with one frame, the mirror acts after two."""
+    one = case("reaction-wheel", known=True)
+    config = one.configured(1, **{"control.delay_frames": 1.0, "camera.delay_frames": 2.0})
+    bench = ModalBench(config, one.covariance_nm2)
+    bench.ask("close")
+    bench.run(2000)
+    bench.forget()
+    bench.load(one.law)
+    bench.run(3000)
+    (_, event), *_ = [one for one in bench.events if one[1].name == "LAW_OVERRULED"]
+    assert "without correction there would be" in event.details["why"]
+    assert event.details["until"] == "until it is loaded again"
+    assert bench.tilt_mas(1500) < 10
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("preset", "factor"), MOVED)
+def test_lines_that_move_leave_no_more_than_the_integrator_whatever_the_seed(preset: str, factor: float) -> None:
+    ratios: Array = np.array(
+        [moved(case(preset), factor, seed)[0] / moved(case(preset), factor, seed, law=False)[0] for seed in SEEDS]
+    )
+    assert ratios.max() < 1.1
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("magnitude", [0.0, 2.0, 5.0])
+def test_a_good_law_is_never_overruled(magnitude: float) -> None:
+    """Ten minutes of it; `python -m tools.measure guard` has twenty seeds."""
+    assert undisturbed(case("reaction-wheel", magnitude), 21) == 0

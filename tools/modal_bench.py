@@ -1,0 +1,149 @@
+"""The simulated loop without images: the sensor is linear, its noise has the covariance of the twin's images.
+
+The live loop's own `advance` takes frames of a few pixels that hold the modes as measured, so that hours can be folded.
+What is left out: the sensor's curvature, the mirror's print-through and the steps of its driver.
+"""
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from lowfc.adapters.files import factory
+from lowfc.arrays import Array, Pixels, Single
+from lowfc.contract.configuration import Configuration
+from lowfc.control.calibration.calibration import Calibration
+from lowfc.control.laws.stability import delay_weights
+from lowfc.control.loop.advance import advance
+from lowfc.control.loop.inputs import Frame, Load, PendingEvent
+from lowfc.control.loop.state import State
+from lowfc.optics.detector.photometry import tilt_nm_per_mas
+from sim_camera.disturbance import BLOCK, Disturbance, Sampler
+from sim_camera.driver import disturbance_of
+from tools.law_bench import Bench, with_lines_moved
+
+_LEVEL_DN, _DN_PER_NM = 32_000.0, 80.0
+_SEEN = (1 + np.array([-1, 1]) / np.sqrt(3)) / 2
+_INSTANTS = (np.arange(8) + 0.5) / 8
+_DRAWN = 1024
+
+
+def noise_covariance_nm2(config: Configuration, calibration: Calibration) -> Array:
+    """Covariance (modes, modes) of one frame's noise; its diagonal is that of `factory.frame_noise_nm`."""
+    camera, R = factory.detector(config), calibration.reconstructor.astype(float)
+    flux_e, I0 = calibration.flux_dn * camera.gain_e_per_dn / camera.em_gain, calibration.reference.astype(float)
+    variance = (np.maximum(I0, 0) * flux_e + factory.equivalent_read_noise_e(camera) ** 2) / flux_e**2
+    effective = (R - np.outer(R @ I0, calibration.good)) * calibration.good
+    return np.asarray((effective * variance) @ effective.T)
+
+
+def _two_pixels_a_mode(noll: tuple[int, ...]) -> Calibration:
+    """A sensor with two pixels for each mode, one brighter and one darker, and a mirror with one actuator for each."""
+    modes = len(noll)
+    flux_dn, pixels = 2 * modes * _LEVEL_DN, 2 * modes
+    H = np.vstack([np.eye(modes), -np.eye(modes)]) * _DN_PER_NM / flux_dn
+    single: dict[str, Any] = {
+        "reference": np.full(pixels, 1 / pixels),
+        "response": H,
+        "reconstructor": np.linalg.pinv(H),
+        "good": np.ones(pixels),
+        "dark": np.zeros(pixels),
+        "modes_to_actuators": np.eye(modes) / 2,
+        "actuators_to_modes": 2 * np.eye(modes),
+    }
+    single = {name: array.astype(np.float32) for name, array in single.items()}
+    return Calibration(
+        noll=noll,
+        **single,
+        shape=(2, modes),
+        grid=(modes, 1),
+        flux_dn=flux_dn,
+        saturation_dn=65_535.0,
+        estimator="weighted",
+        wavelength_nm=550.0,
+        operator_hash="",
+        id="modal",
+    )
+
+
+class ModalBench(Bench):
+    """A loop of modes; what it did is kept until `forget`.
+
+    Attributes:
+        events: of the record, with the number of the frame.
+    """
+
+    def __init__(self, config: Configuration, covariance_nm2: Array, shaken: Disturbance | None = None) -> None:
+        """Noise of this covariance (modes, modes); `shaken` is another disturbance than the configuration's."""
+        self.config, self.refused = config, 0
+        self.nm_per_mas = tilt_nm_per_mas(config.star.diameter_m)
+        self._shaken = disturbance_of(config) if shaken is None else shaken
+        self._settings = factory.settings(config)
+        self._state = advance(self._settings, State(), Load(0, _two_pixels_a_mode(config.noll), "bench"))[0]
+        self._sampler = self._sampled()
+        self._mix = np.linalg.cholesky(covariance_nm2).T.astype(np.float32)
+        self._noise = np.random.Generator(np.random.SFC64(np.random.SeedSequence([config.seed, 3])))
+        self._weights = delay_weights(config.camera.delay_frames).astype(np.float32)
+        self._given = [np.zeros(len(config.noll), np.float32)] * len(self._weights)
+        self._index = 0
+        self.forget()
+
+    def forget(self) -> None:
+        """Begin a new record."""
+        super().forget()
+        self.events: list[tuple[int, PendingEvent]] = []
+        self._squares: list[Single] = []
+
+    def _sampled(self) -> Sampler:
+        instants = np.concatenate([self.config.camera.exposure_fraction * _SEEN, _INSTANTS])
+        return Sampler(self._shaken, instants, self.config.camera.rate_hz)
+
+    def move_lines(self, factor: float) -> None:
+        """Put the lines at other frequencies from here on, without a jump; at the beginning of a block of frames."""
+        if self._index % BLOCK:
+            raise ValueError(f"lines move at a frame that is a multiple of {BLOCK}, not at {self._index}")
+        moved = with_lines_moved(self._shaken, factor)
+        turns = (self._shaken.frequency_hz - moved.frequency_hz) * self._index / self.config.camera.rate_hz
+        amplitude_nm = self._shaken.amplitude_nm * np.exp(2j * np.pi * turns)[:, None]
+        self._shaken = replace(moved, amplitude_nm=amplitude_nm)
+        before, self._sampler = self._sampler, self._sampled()
+        was, now = vars(before)["_lines"], vars(self._sampler)["_lines"]
+        for name in ("_rng", "_next", "_vector") if now is not None else ():  # damped lines go on from where they are
+            setattr(now, name, getattr(was, name))
+
+    def run(self, frames: int, *, record: bool = True) -> None:
+        """Expose, control, move the mirror; events are recorded always."""
+        noise_nm = np.zeros((0, 0), np.float32)
+        for count in range(frames):
+            if not count % _DRAWN:
+                noise_nm = self._noise.standard_normal((_DRAWN, len(self._mix)), np.float32) @ self._mix
+            given_nm: Any = sum(weight * past for weight, past in zip(self._weights, self._given, strict=True))
+            modes_nm = self._sampler.at(self._index)
+            pixels = _encoded(modes_nm[:2].mean(axis=0) + given_nm + noise_nm[count % _DRAWN])
+            time_ns = 10**18 + self._index * self.config.period_ns
+            self._state, outputs = advance(
+                self._settings, self._state, Frame((1 << 32) + self._index, time_ns, 0, pixels)
+            )
+            self.events += [(self._index, event) for event in outputs.events]
+            self._index += 1
+            newest_nm = self._given[0]
+            if outputs.command is not None:
+                newest_nm = 2 * outputs.command.actuators_nm.ravel()
+            self._given = [newest_nm, *self._given[:-1]]
+            if outputs.step is None or outputs.step.pol_nm is None:
+                self.refused += 1
+            elif record:
+                self.steps.append(outputs.step)
+                self._squares.append(np.square(modes_nm[2:] + given_nm).mean(axis=0))
+
+    def residual_nm(self, *, continuous: bool = True) -> Array:
+        """True residual (frames, modes) of the record, rms over each period."""
+        if not continuous:
+            raise ValueError("a modal bench knows means over periods alone")
+        return np.sqrt(np.array(self._squares, np.float64))
+
+
+def _encoded(modes_nm: Single) -> Pixels:
+    change_dn = _DN_PER_NM * modes_nm
+    pixels = np.rint(_LEVEL_DN + np.array([change_dn, -change_dn]))
+    return np.asarray(np.clip(pixels, 0, 65_534), dtype=np.uint16)
