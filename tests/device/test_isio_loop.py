@@ -3,6 +3,7 @@
 import json
 import subprocess
 import sys
+import time
 from collections.abc import Iterator
 from contextlib import closing, contextmanager
 from pathlib import Path
@@ -18,7 +19,7 @@ from lowfc.client import Client
 from lowfc.contract.messages import EVENT, STEP, Log, Role, wire
 from tests.support.image_streams.cacao import CAMERA, TOTAL, file_of
 from tests.support.image_streams.plain import PlainStream
-from tests.support.loops import going_on, run, until
+from tests.support.loops import going_on, loop, run, until
 
 pytestmark = pytest.mark.exclusive
 
@@ -31,7 +32,7 @@ rate_hz = {rate_hz}
 
 [disturbance]
 preset = "{preset}"
-static_nm = {{ "2" = 15, "4" = 8 }}
+static_nm = {{ "2" = {tilt_nm} }}
 
 [control]
 start_mode = "closed"
@@ -117,7 +118,7 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 
 def test_a_loop_runs_by_streams_and_each_fault_is_named(folder: Path) -> None:
-    (folder / "bench.toml").write_text(BENCH.format(rate_hz=200, preset="quiet"))
+    (folder / "bench.toml").write_text(BENCH.format(rate_hz=200, preset="quiet", tilt_nm=15))
     with closing(Bench(folder)) as bench, going_on(folder, MIRROR, CAMERA_DRIVER, CONTROLLER), bench.listening():
         until(bench.held, 60)
         _what_others_put_on_the_mirror_is_not_undone(bench)
@@ -151,3 +152,21 @@ def _what_others_put_on_the_mirror_is_not_undone(bench: Bench) -> None:
         state = client.status().state
         (external,) = (one for one in state.channels if one.name == "external")
         assert np.allclose(np.frombuffer(external.actuators, "f4"), dark_hole.reshape(-1) * 1000, atol=0.01)
+
+
+@pytest.mark.slow
+def test_a_minute_at_500_hz_loses_nothing_and_is_as_good_as_the_direct_loop(folder: Path) -> None:
+    (folder / "bench.toml").write_text(BENCH.format(rate_hz=500, preset="bench", tilt_nm=0))
+    with going_on(folder, CONTROLLER), closing(Bench(folder)) as bench, going_on(folder, MIRROR, CAMERA_DRIVER):
+        until(lambda: file_of(folder, CHANNEL).exists() and bench.stream(CHANNEL).count > 100, 60)
+        with bench.listening():
+            time.sleep(62)
+            with Client("bench") as client:
+                state = client.status().state
+        assert not bench.said("FRAMES_MISSING")
+        assert not [one for one in state.counts if one.count > 5]
+        figures = bench.stopped()
+    direct = loop(
+        folder, "--no-record", "--rate", "500", "--duration", "60", config='[disturbance]\npreset = "bench"\n'
+    )
+    assert figures["residual_rms_nm"] == pytest.approx(direct["residual_rms_nm"], rel=0.05)
