@@ -13,7 +13,7 @@ from lowfc.adapters.bus.run import Run
 from lowfc.adapters.files import calibration_file, factory
 from lowfc.adapters.process.realtime import spread
 from lowfc.contract.codecs.calibration_codec import identified
-from lowfc.contract.configuration import Configuration, load
+from lowfc.contract.configuration import FIXED_GAINS, Configuration, load
 from lowfc.control.calibration.calibration import Calibration
 from lowfc.optics.detector.detector import saturation_dn
 from lowfc.programs.measure.frame_source import FRAMES_FILE
@@ -67,6 +67,7 @@ def configuration(size: Size, rate_hz: float, **realtime: Any) -> Configuration:
         "mirror.columns": size.mirror_side,
         "mirror.pitches_per_pupil": size.mirror_side - 3,
         "control.start_mode": "closed",
+        **FIXED_GAINS,
         "control.tilt_leak": _LEAK,
         "control.leak": _LEAK,
         **{f"realtime.{key}": value for key, value in realtime.items()},

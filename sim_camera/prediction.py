@@ -7,6 +7,7 @@ from lowfc.contract.configuration import Configuration
 from lowfc.control.laws.continuous import Timing, left_power
 from lowfc.control.laws.linear_law import integrator
 from lowfc.control.laws.margins import noise_gain
+from lowfc.control.laws.stability import highest_gain
 from lowfc.optics.detector.photometry import tilt_nm_per_mas
 from sim_camera.disturbance import variances_nm2
 from sim_camera.driver import disturbance_of, ignore
@@ -15,10 +16,12 @@ from sim_camera.driver import disturbance_of, ignore
 def tilt_residual_mas(config: Configuration, delay_frames: float) -> float:
     """Rms of tip and tilt per axis, for a loop closed with a delay; linear, so for residuals of a few mas only.
 
-    The disturbance's sine waves are known exactly; photon and read noise come through R.
+    The disturbance's sine waves are known exactly; photon and read noise come through R. An automatic gain is taken to
+    be the highest.
     """
     control, shaken = config.control, disturbance_of(config)
-    law = integrator([control.tilt_gain], [control.tilt_leak], (2,), delay_frames, config.camera.rate_hz)
+    gain = highest_gain(delay_frames) if control.tilt_gain == "auto" else control.tilt_gain
+    law = integrator([gain], [control.tilt_leak], (2,), delay_frames, config.camera.rate_hz)
     timing = Timing.of(delay_frames, config.camera.exposure_fraction)
     frequency_hz, variance_nm2 = variances_nm2(shaken)
     left = left_power(law, 2 * np.pi * frequency_hz / config.camera.rate_hz, timing)

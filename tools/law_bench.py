@@ -8,7 +8,7 @@ import numpy as np
 
 from lowfc.adapters.files import factory
 from lowfc.arrays import Array
-from lowfc.contract.configuration import Configuration, load
+from lowfc.contract.configuration import FIXED_GAINS, Configuration, load
 from lowfc.contract.sections import sensor_keys
 from lowfc.control.calibration.calibration import Calibration
 from lowfc.control.laws.continuous import Timing
@@ -17,10 +17,11 @@ from lowfc.control.laws.spectra import Pieces
 from lowfc.control.laws.stability import delay_weights
 from lowfc.control.laws.tuning import Tuned, best_gains, identified, tune_integrator, tune_lqg, tune_pi_notch
 from lowfc.control.loop.advance import advance
-from lowfc.control.loop.inputs import Frame, Load, Request, Step
-from lowfc.control.loop.state import State
+from lowfc.control.loop.inputs import Frame, Load, Outputs, PendingEvent, Request, Step
+from lowfc.control.loop.state import Settings, State
 from lowfc.device.guard import Command
 from lowfc.optics.detector.photometry import tilt_nm_per_mas
+from lowfc.programs.core.gain_watch import GainWatch
 from sim_camera.disturbance import LINES_HZ, Disturbance
 from sim_camera.driver import ignore, scene
 from sim_camera.path import MirrorPath
@@ -36,7 +37,12 @@ def configured(
 ) -> Configuration:
     """The reaction wheel's 14 mas rms per axis before a star of V = 0, at 1 kHz; `changed` are more keys."""
     keys: dict[str, Any] = {f"sensor.{key}": value for key, value in sensor_keys(sensor).items()}
-    keys |= {"camera.rate_hz": RATE_HZ, "camera.delay_frames": delay_frames, "star.magnitude": 0.0, "seed": seed}
+    keys |= FIXED_GAINS | {
+        "camera.rate_hz": RATE_HZ,
+        "camera.delay_frames": delay_frames,
+        "star.magnitude": 0.0,
+        "seed": seed,
+    }
     return load(None, keys | {"disturbance.preset": "reaction-wheel"} | changed)
 
 
@@ -63,6 +69,7 @@ class Bench:
         config: the instrument's.
         nm_per_mas: of tilt.
         refused: frames that the controller did not use.
+        events: of the controller since the beginning, with the number of the frame.
     """
 
     def __init__(self, config: Configuration, calibration: Calibration, shaken: Disturbance | None = None) -> None:
@@ -70,8 +77,11 @@ class Bench:
         self.config = config
         self.nm_per_mas = tilt_nm_per_mas(config.star.diameter_m)
         self.refused = 0
+        self._other = shaken
         self._scene = scene(config, shaken)
         self._settings = factory.settings(config)
+        self._watch = GainWatch(self._settings, config.control.on_harm)
+        self.events: list[tuple[int, PendingEvent]] = []
         self._state = advance(self._settings, State(), Load(0, calibration, "bench"))[0]
         self._mirror = device(config)
         self._status = initial(self._mirror)
@@ -85,6 +95,26 @@ class Bench:
         """Begin a new record."""
         self.steps: list[Step] = []
         self.truths: list[Truth] = []
+
+    @property
+    def state(self) -> State:
+        """The controller's."""
+        return self._state
+
+    @property
+    def settings(self) -> Settings:
+        """The controller's."""
+        return self._settings
+
+    @property
+    def closing_harm(self) -> str:
+        """What closing would add, in words; empty for nothing."""
+        return self._watch.closing_harm
+
+    def star(self, magnitude: float) -> None:
+        """Point at another star."""
+        star = self.config.star.model_copy(update={"magnitude": magnitude})
+        self._scene = scene(self.config.model_copy(update={"star": star}), self._other)
 
     def ask(self, name: str, **fields: Any) -> None:
         """An operator's request; ValueError where it is refused."""
@@ -108,6 +138,7 @@ class Bench:
             frame = Frame((1 << 32) + self._index, time_ns, 0, pixels)
             self._index += 1
             self._state, outputs = advance(self._settings, self._state, frame)
+            self._watched(outputs)
             if outputs.step is not None and outputs.step.pol_nm is not None:
                 self.steps.append(outputs.step)
                 self.truths.append(truth)
@@ -121,6 +152,17 @@ class Bench:
                     raise ValueError(f"the mirror refused a command: {refused.name}")
             self._shapes = [self._status.surface_nm, *self._shapes[:-1]]
             self._path.applied(self._index, self._status.surface_nm)
+
+    def _watched(self, outputs: Outputs) -> None:
+        """Enter what the watch over the gains asks for, as the controller does."""
+        events = list(outputs.events)
+        if outputs.step is not None:
+            found = self._watch.follow(outputs.step, self._state)
+            events += found.events
+            for request in found.requests:
+                self._state, others = advance(self._settings, self._state, request)
+                events += others.events
+        self.events += [(self._index - 1, event) for event in events]
 
     def pol(self) -> Pieces:
         """Pseudo-open-loop modes (frames, modes) of the record."""

@@ -15,9 +15,10 @@ from lowfc.contract.configuration import Configuration
 from lowfc.control.calibration.calibration import Calibration
 from lowfc.control.laws.stability import delay_weights
 from lowfc.control.loop.advance import advance
-from lowfc.control.loop.inputs import Frame, Load, PendingEvent
+from lowfc.control.loop.inputs import Frame, Load
 from lowfc.control.loop.state import State
 from lowfc.optics.detector.photometry import tilt_nm_per_mas
+from lowfc.programs.core.gain_watch import GainWatch
 from sim_camera.disturbance import BLOCK, Disturbance, Sampler
 from sim_camera.driver import disturbance_of
 from tools.law_bench import Bench, with_lines_moved
@@ -67,11 +68,7 @@ def _two_pixels_a_mode(noll: tuple[int, ...]) -> Calibration:
 
 
 class ModalBench(Bench):
-    """A loop of modes; what it did is kept until `forget`.
-
-    Attributes:
-        events: of the record, with the number of the frame.
-    """
+    """A loop of modes; what it did is kept until `forget`."""
 
     def __init__(self, config: Configuration, covariance_nm2: Array, shaken: Disturbance | None = None) -> None:
         """Noise of this covariance (modes, modes); `shaken` is another disturbance than the configuration's."""
@@ -79,6 +76,8 @@ class ModalBench(Bench):
         self.nm_per_mas = tilt_nm_per_mas(config.star.diameter_m)
         self._shaken = disturbance_of(config) if shaken is None else shaken
         self._settings = factory.settings(config)
+        self._watch = GainWatch(self._settings, config.control.on_harm)
+        self.events = []
         self._state = advance(self._settings, State(), Load(0, _two_pixels_a_mode(config.noll), "bench"))[0]
         self._sampler = self._sampled()
         self._mix = np.linalg.cholesky(covariance_nm2).T.astype(np.float32)
@@ -91,7 +90,6 @@ class ModalBench(Bench):
     def forget(self) -> None:
         """Begin a new record."""
         super().forget()
-        self.events: list[tuple[int, PendingEvent]] = []
         self._squares: list[Single] = []
 
     def _sampled(self) -> Sampler:
@@ -124,8 +122,8 @@ class ModalBench(Bench):
             self._state, outputs = advance(
                 self._settings, self._state, Frame((1 << 32) + self._index, time_ns, 0, pixels)
             )
-            self.events += [(self._index, event) for event in outputs.events]
             self._index += 1
+            self._watched(outputs)
             newest_nm = self._given[0]
             if outputs.command is not None:
                 newest_nm = 2 * outputs.command.actuators_nm.ravel()

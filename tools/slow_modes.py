@@ -8,7 +8,7 @@ from threadpoolctl import threadpool_limits
 
 from lowfc.adapters.files.factory import frame_noise_nm
 from lowfc.arrays import Array
-from lowfc.contract.configuration import Configuration
+from lowfc.contract.configuration import FIXED_GAINS, Configuration
 from lowfc.control.calibration.calibration import Calibration
 from lowfc.design.fisher import cramer_rao, variance_e
 from lowfc.optics.chain.zernike import mode_name
@@ -27,6 +27,7 @@ KEYS: dict[str, Any] = {
     "star.magnitude": 2.0,
     "disturbance.preset": "thermal",
     "control.start_mode": "closed",
+    **FIXED_GAINS,
 }
 
 

@@ -47,6 +47,7 @@ from lowfc.control.laws.linear_law import LinearLaw
 from lowfc.control.loop.camera import CameraSettings
 from lowfc.control.loop.command_channels import MIRROR, OFFSET
 from lowfc.control.loop.inputs import Step
+from lowfc.control.loop.wording import AUTO
 
 Single = npt.NDArray[np.float32]
 Modes = int | Sequence[int]
@@ -124,6 +125,10 @@ class Client:
     def gain(self, values: npt.ArrayLike, modes: Modes = ()) -> Answer:
         """Set integrator gains: one value, or one for each of `modes` (a Noll index or several, all when empty)."""
         return self.ask("gain", modes, values)
+
+    def automatic_gain(self, modes: Modes = ()) -> Answer:
+        """Let the controller choose integrator gains by what it measures (of Noll indices; of all when empty)."""
+        return self.ask("gain", modes, text=AUTO)
 
     def leak(self, values: npt.ArrayLike, modes: Modes = ()) -> Answer:
         """Set integrator leaks, as `gain`."""

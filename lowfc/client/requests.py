@@ -51,10 +51,11 @@ DECLARED: tuple[Declaration, ...] = (
     _declared("reset", "Take the modal command to zero within the slew limit, and clear the law's memory.", "reset"),
     _declared(
         "gain",
-        "Set integrator gains; one at which the loop would be unstable is refused.",
+        "Set integrator gains, or let them be automatic; one at which the loop would be unstable is refused.",
         "gain 0.4 --modes 2,3",
         _MODES,
-        ("values", _ONE_OR_EACH),
+        ("values", f"{_ONE_OR_EACH}; none for automatic gains"),
+        ("text", "`auto` for automatic gains"),
     ),
     _declared("leak", "Set integrator leaks.", "leak 0.01", _MODES, ("values", _ONE_OR_EACH)),
     _declared(

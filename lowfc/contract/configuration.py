@@ -7,7 +7,7 @@ the nearest known one. `lowfc config show` prints all keys with their sentences.
 import difflib
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 import tomli_w
 from pydantic import BaseModel, Field, ValidationError, model_validator
@@ -28,6 +28,11 @@ MOST_FAULTS = 20
 _LONGEST_KEY = 100  # characters of one that the nearest known key is looked for
 
 
+Gain = Annotated[float, Field(ge=0, le=4)]
+FIXED_GAINS = {"control.tilt_gain": 0.5, "control.gain": 0.05}
+"""Where a run shall not depend on what is measured in it, as one that measures times."""
+
+
 class Control(Section):
     """The control law."""
 
@@ -40,10 +45,13 @@ class Control(Section):
     """Noise-weighted or plain pseudo-inverse of H."""
     nuisance: list[Literal["background", "shear"]] = Field(default_factory=list)
     """What is fitted along with the modes so that it does not pass for them: uniform light, shear of the beam."""
-    tilt_gain: float = Field(0.5, ge=0, le=4)
-    """Integrator gain of tip and tilt."""
-    gain: float = Field(0.05, ge=0, le=4)
+    tilt_gain: Gain | Literal["auto"] = "auto"
+    """Integrator gain of tip and tilt; auto: the measured one that leaves least of a mode, 0 where any would harm."""
+    gain: Gain | Literal["auto"] = "auto"
     """Integrator gain of the other modes."""
+    on_harm: Literal["warn", "open", "integrator"] = "warn"
+    """What follows where the loop has left more than an open loop for long: an event; or the loop opens, too; or the
+    integrator takes over from a law, and where it drives already, the loop opens."""
     tilt_leak: float = Field(0.0, ge=0, le=1)
     """Integrator leak of tip and tilt."""
     leak: float = Field(0.0, ge=0, le=1)

@@ -83,6 +83,15 @@ EVENTS: dict[str, Event] = {
         Event("LAW_OVERRULED", Level.WARNING, "the integrator takes over {modes} from the law {law!r}: {why}; {until}"),
         Event("LAW_BACK", Level.INFO, "the law {law!r} drives {modes} again"),
         Event("NOTE", Level.INFO, "{text}"),
+        Event("CLOSING_HARMS", Level.WARNING, "{harm}"),
+        Event("GAINS_CHANGED", Level.INFO, "automatic gains: {gains}"),
+        Event("STAR_CHANGED", Level.WARNING, "the light is {ratio:.3g} times what it was: gains are measured anew"),
+        Event(
+            "LOOP_HARMS",
+            Level.WARNING,
+            "the loop makes it worse: {closed_nm:.3g} nm rms of {modes} are left, open it would be {open_nm:.3g}; "
+            "{action}",
+        ),
         Event("PLAY_ENDED", Level.WARNING, "what was being played ended: {why}"),
         Event("LEASE_TAKEN", Level.INFO, "the loop is reserved for {holder}"),
         Event("LEASE_RELEASED", Level.INFO, "the loop is no longer reserved for {holder}"),

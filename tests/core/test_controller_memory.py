@@ -20,7 +20,7 @@ from lowfc.adapters.process.service import Service
 from lowfc.arrays import Array, Pixels
 from lowfc.contract.codecs.codec import actuators
 from lowfc.contract.codecs.law_codec import wire_law
-from lowfc.contract.configuration import Configuration, load
+from lowfc.contract.configuration import FIXED_GAINS, Configuration, load
 from lowfc.contract.errors import CalibrationError
 from lowfc.contract.messages import (
     CALIBRATION,
@@ -62,7 +62,7 @@ START_NS = 1_767_225_600_000_000_000
 
 def configured(**overrides: object) -> Configuration:
     bright = {"disturbance.preset": "quiet", "star.magnitude": -2.0, "lockstep": True, "mirror.settling_us": 0.0}
-    return load(None, bright | {key.replace("__", "."): value for key, value in overrides.items()})
+    return load(None, FIXED_GAINS | bright | {key.replace("__", "."): value for key, value in overrides.items()})
 
 
 CONFIG = configured()

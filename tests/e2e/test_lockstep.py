@@ -20,6 +20,11 @@ from sim_camera.prediction import tilt_residual_mas
 from tests.support.loops import children, loop, payloads, recorded_bytes, run, start, until
 from tools.measure import measured
 
+FIXED = """
+[control]
+tilt_gain = 0.5
+gain = 0.05
+"""
 GENTLE = """
 [camera]
 rate_hz = 1000
@@ -28,6 +33,7 @@ preset = "reaction-wheel"
 scale = 0.3571428
 [control]
 tilt_gain = 1.0
+gain = 0.05
 """
 
 
@@ -38,7 +44,17 @@ def test_two_runs_with_one_seed_write_the_same_bytes_and_have_one_digest(tmp_pat
         folder.mkdir()
         seed = "8" if name == "other" else "7"
         figures = loop(
-            folder, "--lockstep", "--rate", "1000", "--duration", "0.5", "--seed", seed, "--disturbance", "bench"
+            folder,
+            "--lockstep",
+            "--rate",
+            "1000",
+            "--duration",
+            "0.5",
+            "--seed",
+            seed,
+            "--disturbance",
+            "bench",
+            config=FIXED,
         )
         assert figures["frames_published"] == figures["commands_applied"] == 500
         assert figures["messages_lost"] == 0
@@ -61,6 +77,21 @@ def test_two_runs_with_one_seed_write_the_same_bytes_and_have_one_digest(tmp_pat
     for topic, values in one.items():
         assert values == two[topic], topic
     assert one["/lowfc/camera/frame"] != other["/lowfc/camera/frame"]
+
+
+def test_automatic_gains_are_inputs_that_two_runs_and_a_replay_have_alike(tmp_path: Path) -> None:
+    logs = []
+    for name in ("one", "two"):
+        (tmp_path / name).mkdir()
+        figures = loop(tmp_path / name, "--lockstep", "--duration", "3", "--disturbance", "bench")
+        assert 0.3 < figures["closed_fraction"] < 0.35  # measured over two seconds first
+        logs.append(payloads(figures["log"]))
+    one, two = ({t: p for t, p in log.items() if topic_of(t[1:]).deterministic} for log in logs)
+    assert one == two
+    asked = [wire.Request.FromString(payload) for payload in one["/lowfc/control/request"]]
+    assert [(request.name, request.accepted) for request in asked[:2]] == [("gain", True), ("close", True)]
+    replayed = run(tmp_path / "one", "replay", "last", "--json")
+    assert json.loads(replayed.stdout)["identical"] is True
 
 
 @pytest.mark.parametrize("frames", [6_000, pytest.param(20_000, marks=pytest.mark.slow)])
@@ -101,6 +132,7 @@ rows = 12
 columns = 12
 pitches_per_pupil = 11
 [control]
+tilt_gain = 0.5
 gain = 0.2
 [disturbance]
 preset = "quiet"
@@ -130,7 +162,7 @@ def test_the_documents_table_is_of_the_sensors_as_they_are() -> None:
 
 def test_a_configuration_that_was_shown_does_not_open_the_loop(tmp_path: Path) -> None:
     shown = run(tmp_path, "config", "show").stdout
-    short = ("sim-loop", "--lockstep", "--duration", "0.2", "--no-record")
+    short = ("sim-loop", "--lockstep", "--duration", "2.4", "--no-record")
     done = run(tmp_path, *short, config=shown)
     assert done.stdout.splitlines()[0].split() == ["loop", "closed"], done.stderr
     assert "starts open" not in done.stderr

@@ -161,7 +161,11 @@ def settings(config: Configuration) -> Settings:
         on_frame_timeout=control.on_frame_timeout,
         min_flux_fraction=control.min_flux_fraction,
         max_saturated_pixels=control.max_saturated_pixels,
-        gain=(control.tilt_gain, control.gain),
+        gain=(
+            0.0 if control.tilt_gain == "auto" else control.tilt_gain,
+            0.0 if control.gain == "auto" else control.gain,
+        ),
+        auto_gain=(control.tilt_gain == "auto", control.gain == "auto"),
         leak=(control.tilt_leak, control.leak),
         limit_nm=(control.tilt_limit_nm, control.limit_nm),
         max_identical_frames=control.max_identical_frames

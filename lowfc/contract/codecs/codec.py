@@ -280,6 +280,8 @@ def request(
         calibration,
         lease_id=message.lease_id,
         requester=printable(message.requester[:MOST_REQUESTER]),
+        prior_nm2=tuple(message.prior_nm2),
+        flux_dn=message.flux_dn,
     )
 
 
@@ -307,6 +309,8 @@ def encode_request(request: Request, reply: Reply, taken: int, state: wire.Contr
         play_id="" if played is None else played.id,
         lease_id=request.lease_id,
         requester=request.requester,
+        prior_nm2=request.prior_nm2,
+        flux_dn=request.flux_dn,
         calibration=None if request.calibration is None else wire.Calibration(id=request.calibration.id),
     )
     return message.SerializeToString()

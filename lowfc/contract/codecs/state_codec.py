@@ -18,7 +18,7 @@ from lowfc.control.loop.estimator import Estimate
 from lowfc.control.loop.guard import Group, Guard
 from lowfc.control.loop.lease import Lease
 from lowfc.control.loop.safety import Limits, LoopMode, Rejection, reason_of
-from lowfc.control.loop.state import ActiveLoop, Conditions, LawRunner, Settings, State
+from lowfc.control.loop.state import ActiveLoop, Conditions, LawRunner, Settings, State, Weighting
 
 # What has the same name in the values and in the messages.
 _LIMITS = ("stroke_nm", "slew_nm", "neighbour_nm")
@@ -71,6 +71,11 @@ def controller_state(state: State, settings: Settings, time_ns: int) -> wire.Con
         message.calibration_provisional = drive.calibration.provisional
         if not message.calibration_id:
             message.mirror_rows, message.mirror_columns = drive.calibration.grid
+        if drive.automatic.any():
+            message.automatic.extend(drive.automatic.tolist())
+        if drive.weighting is not None:
+            message.prior_nm2.extend(drive.weighting.prior_nm2.tolist())
+            message.weighting_flux_dn = drive.weighting.flux_dn
         message.gain.extend(drive.law.gain.tolist())
         message.leak.extend(drive.law.leak.tolist())
         message.limit_nm.extend(drive.law.limit_nm.tolist())
@@ -118,7 +123,11 @@ def decode_state(
             command_channels=command_channels_of(message, drive.added(), drive.to_modes, plays),
             history_nm=tuple(history),
             actuators_nm=actuators,
+            automatic=np.array(message.automatic or [False] * len(calibration.noll), bool),
         )
+        if message.prior_nm2:
+            prior_nm2 = np.array(message.prior_nm2, np.float32)
+            drive = drive.weighted(Weighting(prior_nm2, message.weighting_flux_dn))
     state = State(
         mode=LoopMode(message.mode),
         drive=drive,
@@ -176,6 +185,7 @@ def reason_counts(state: State) -> list[wire.ReasonCount]:
 def _encode_settings(settings: Settings) -> wire.ControllerSettings:
     return wire.ControllerSettings(
         start_mode=wire_mode(settings.start_mode),
+        auto_gain=settings.auto_gain if any(settings.auto_gain) else (),
         **fields_of(settings.limits, _LIMITS),
         **fields_of(settings, (*_SETTINGS, *_PAIRS)),
     )
@@ -188,6 +198,7 @@ def _decode_settings(message: wire.ControllerSettings) -> Settings:
     return Settings(
         limits=Limits(*(getattr(message, name) for name in _LIMITS)),
         start_mode=LoopMode(message.start_mode),
+        auto_gain=tuple(message.auto_gain) or (False, False),  # type: ignore[arg-type]  # a pair
         **fields_of(message, _SETTINGS),
         **pairs,
     )

@@ -208,7 +208,7 @@ class ReasonCount(_message.Message):
     def __init__(self, reason: _Optional[_Union[Reason, str]] = ..., count: _Optional[int] = ...) -> None: ...
 
 class ControllerSettings(_message.Message):
-    __slots__ = ("stroke_nm", "slew_nm", "neighbour_nm", "delay_frames", "start_mode", "max_frame_age_ns", "frame_timeout_ns", "on_frame_timeout", "min_flux_fraction", "max_saturated_pixels", "gain", "leak", "limit_nm", "max_identical_frames", "rate_hz", "guard")
+    __slots__ = ("stroke_nm", "slew_nm", "neighbour_nm", "delay_frames", "start_mode", "max_frame_age_ns", "frame_timeout_ns", "on_frame_timeout", "min_flux_fraction", "max_saturated_pixels", "gain", "leak", "limit_nm", "max_identical_frames", "rate_hz", "auto_gain", "guard")
     STROKE_NM_FIELD_NUMBER: _ClassVar[int]
     SLEW_NM_FIELD_NUMBER: _ClassVar[int]
     NEIGHBOUR_NM_FIELD_NUMBER: _ClassVar[int]
@@ -224,6 +224,7 @@ class ControllerSettings(_message.Message):
     LIMIT_NM_FIELD_NUMBER: _ClassVar[int]
     MAX_IDENTICAL_FRAMES_FIELD_NUMBER: _ClassVar[int]
     RATE_HZ_FIELD_NUMBER: _ClassVar[int]
+    AUTO_GAIN_FIELD_NUMBER: _ClassVar[int]
     GUARD_FIELD_NUMBER: _ClassVar[int]
     stroke_nm: float
     slew_nm: float
@@ -240,8 +241,9 @@ class ControllerSettings(_message.Message):
     limit_nm: _containers.RepeatedScalarFieldContainer[float]
     max_identical_frames: int
     rate_hz: float
+    auto_gain: _containers.RepeatedScalarFieldContainer[bool]
     guard: bool
-    def __init__(self, stroke_nm: _Optional[float] = ..., slew_nm: _Optional[float] = ..., neighbour_nm: _Optional[float] = ..., delay_frames: _Optional[float] = ..., start_mode: _Optional[_Union[LoopMode, str]] = ..., max_frame_age_ns: _Optional[int] = ..., frame_timeout_ns: _Optional[int] = ..., on_frame_timeout: _Optional[str] = ..., min_flux_fraction: _Optional[float] = ..., max_saturated_pixels: _Optional[int] = ..., gain: _Optional[_Iterable[float]] = ..., leak: _Optional[_Iterable[float]] = ..., limit_nm: _Optional[_Iterable[float]] = ..., max_identical_frames: _Optional[int] = ..., rate_hz: _Optional[float] = ..., guard: _Optional[bool] = ...) -> None: ...
+    def __init__(self, stroke_nm: _Optional[float] = ..., slew_nm: _Optional[float] = ..., neighbour_nm: _Optional[float] = ..., delay_frames: _Optional[float] = ..., start_mode: _Optional[_Union[LoopMode, str]] = ..., max_frame_age_ns: _Optional[int] = ..., frame_timeout_ns: _Optional[int] = ..., on_frame_timeout: _Optional[str] = ..., min_flux_fraction: _Optional[float] = ..., max_saturated_pixels: _Optional[int] = ..., gain: _Optional[_Iterable[float]] = ..., leak: _Optional[_Iterable[float]] = ..., limit_nm: _Optional[_Iterable[float]] = ..., max_identical_frames: _Optional[int] = ..., rate_hz: _Optional[float] = ..., auto_gain: _Optional[_Iterable[bool]] = ..., guard: _Optional[bool] = ...) -> None: ...
 
 class Channel(_message.Message):
     __slots__ = ("name", "actuators", "shifts", "reached")
@@ -306,7 +308,7 @@ class LinearLaw(_message.Message):
     def __init__(self, name: _Optional[str] = ..., signal: _Optional[str] = ..., noll: _Optional[_Iterable[int]] = ..., delay_frames: _Optional[float] = ..., rate_hz: _Optional[float] = ..., states: _Optional[int] = ..., transition: _Optional[bytes] = ..., measurement_gain: _Optional[bytes] = ..., command_gain: _Optional[bytes] = ..., predict_only: _Optional[bytes] = ..., output: _Optional[bytes] = ..., id: _Optional[str] = ..., timestamp: _Optional[_Union[datetime.datetime, _timestamp_pb2.Timestamp, _Mapping]] = ...) -> None: ...
 
 class ControllerState(_message.Message):
-    __slots__ = ("timestamp", "frame_sequence", "mode", "calibration_id", "gain", "leak", "limit_nm", "delay_frames", "command_history_nm", "actuators", "offset", "counts", "frames_used", "frame_timestamp", "refused", "refused_count", "limits_hit", "frame_timeout", "commanded", "input_number", "settings", "offset_nm", "channels", "shift_history_nm", "law", "law_state", "law_frames", "play", "steps_left", "returning_to_zero", "measured_nm", "flux_dn", "identical_frames", "camera", "camera_expected", "camera_awaited", "clear_id", "mode_timestamp", "mode_cause", "lease", "mirror_rows", "mirror_columns", "mirror_fault", "calibration_provisional", "guard")
+    __slots__ = ("timestamp", "frame_sequence", "mode", "calibration_id", "gain", "leak", "limit_nm", "delay_frames", "command_history_nm", "actuators", "offset", "counts", "frames_used", "frame_timestamp", "refused", "refused_count", "limits_hit", "frame_timeout", "commanded", "input_number", "settings", "offset_nm", "channels", "shift_history_nm", "law", "law_state", "law_frames", "play", "steps_left", "returning_to_zero", "measured_nm", "flux_dn", "identical_frames", "camera", "camera_expected", "camera_awaited", "clear_id", "mode_timestamp", "mode_cause", "lease", "mirror_rows", "mirror_columns", "mirror_fault", "calibration_provisional", "automatic", "prior_nm2", "weighting_flux_dn", "guard")
     TIMESTAMP_FIELD_NUMBER: _ClassVar[int]
     FRAME_SEQUENCE_FIELD_NUMBER: _ClassVar[int]
     MODE_FIELD_NUMBER: _ClassVar[int]
@@ -351,6 +353,9 @@ class ControllerState(_message.Message):
     MIRROR_COLUMNS_FIELD_NUMBER: _ClassVar[int]
     MIRROR_FAULT_FIELD_NUMBER: _ClassVar[int]
     CALIBRATION_PROVISIONAL_FIELD_NUMBER: _ClassVar[int]
+    AUTOMATIC_FIELD_NUMBER: _ClassVar[int]
+    PRIOR_NM2_FIELD_NUMBER: _ClassVar[int]
+    WEIGHTING_FLUX_DN_FIELD_NUMBER: _ClassVar[int]
     GUARD_FIELD_NUMBER: _ClassVar[int]
     timestamp: _timestamp_pb2.Timestamp
     frame_sequence: int
@@ -396,8 +401,11 @@ class ControllerState(_message.Message):
     mirror_columns: int
     mirror_fault: str
     calibration_provisional: bool
+    automatic: _containers.RepeatedScalarFieldContainer[bool]
+    prior_nm2: _containers.RepeatedScalarFieldContainer[float]
+    weighting_flux_dn: float
     guard: Guard
-    def __init__(self, timestamp: _Optional[_Union[datetime.datetime, _timestamp_pb2.Timestamp, _Mapping]] = ..., frame_sequence: _Optional[int] = ..., mode: _Optional[_Union[LoopMode, str]] = ..., calibration_id: _Optional[str] = ..., gain: _Optional[_Iterable[float]] = ..., leak: _Optional[_Iterable[float]] = ..., limit_nm: _Optional[_Iterable[float]] = ..., delay_frames: _Optional[float] = ..., command_history_nm: _Optional[_Iterable[float]] = ..., actuators: _Optional[bytes] = ..., offset: _Optional[bytes] = ..., counts: _Optional[_Iterable[_Union[ReasonCount, _Mapping]]] = ..., frames_used: _Optional[int] = ..., frame_timestamp: _Optional[_Union[datetime.datetime, _timestamp_pb2.Timestamp, _Mapping]] = ..., refused: _Optional[_Union[Reason, str]] = ..., refused_count: _Optional[int] = ..., limits_hit: _Optional[_Iterable[_Union[Reason, str]]] = ..., frame_timeout: _Optional[bool] = ..., commanded: _Optional[bool] = ..., input_number: _Optional[int] = ..., settings: _Optional[_Union[ControllerSettings, _Mapping]] = ..., offset_nm: _Optional[_Iterable[float]] = ..., channels: _Optional[_Iterable[_Union[Channel, _Mapping]]] = ..., shift_history_nm: _Optional[_Iterable[float]] = ..., law: _Optional[_Union[LinearLaw, _Mapping]] = ..., law_state: _Optional[_Iterable[float]] = ..., law_frames: _Optional[int] = ..., play: _Optional[_Union[Play, _Mapping]] = ..., steps_left: _Optional[int] = ..., returning_to_zero: _Optional[bool] = ..., measured_nm: _Optional[_Iterable[float]] = ..., flux_dn: _Optional[float] = ..., identical_frames: _Optional[int] = ..., camera: _Optional[_Union[CameraState, _Mapping]] = ..., camera_expected: _Optional[_Union[CameraState, _Mapping]] = ..., camera_awaited: _Optional[bool] = ..., clear_id: _Optional[int] = ..., mode_timestamp: _Optional[_Union[datetime.datetime, _timestamp_pb2.Timestamp, _Mapping]] = ..., mode_cause: _Optional[str] = ..., lease: _Optional[_Union[Lease, _Mapping]] = ..., mirror_rows: _Optional[int] = ..., mirror_columns: _Optional[int] = ..., mirror_fault: _Optional[str] = ..., calibration_provisional: _Optional[bool] = ..., guard: _Optional[_Union[Guard, _Mapping]] = ...) -> None: ...
+    def __init__(self, timestamp: _Optional[_Union[datetime.datetime, _timestamp_pb2.Timestamp, _Mapping]] = ..., frame_sequence: _Optional[int] = ..., mode: _Optional[_Union[LoopMode, str]] = ..., calibration_id: _Optional[str] = ..., gain: _Optional[_Iterable[float]] = ..., leak: _Optional[_Iterable[float]] = ..., limit_nm: _Optional[_Iterable[float]] = ..., delay_frames: _Optional[float] = ..., command_history_nm: _Optional[_Iterable[float]] = ..., actuators: _Optional[bytes] = ..., offset: _Optional[bytes] = ..., counts: _Optional[_Iterable[_Union[ReasonCount, _Mapping]]] = ..., frames_used: _Optional[int] = ..., frame_timestamp: _Optional[_Union[datetime.datetime, _timestamp_pb2.Timestamp, _Mapping]] = ..., refused: _Optional[_Union[Reason, str]] = ..., refused_count: _Optional[int] = ..., limits_hit: _Optional[_Iterable[_Union[Reason, str]]] = ..., frame_timeout: _Optional[bool] = ..., commanded: _Optional[bool] = ..., input_number: _Optional[int] = ..., settings: _Optional[_Union[ControllerSettings, _Mapping]] = ..., offset_nm: _Optional[_Iterable[float]] = ..., channels: _Optional[_Iterable[_Union[Channel, _Mapping]]] = ..., shift_history_nm: _Optional[_Iterable[float]] = ..., law: _Optional[_Union[LinearLaw, _Mapping]] = ..., law_state: _Optional[_Iterable[float]] = ..., law_frames: _Optional[int] = ..., play: _Optional[_Union[Play, _Mapping]] = ..., steps_left: _Optional[int] = ..., returning_to_zero: _Optional[bool] = ..., measured_nm: _Optional[_Iterable[float]] = ..., flux_dn: _Optional[float] = ..., identical_frames: _Optional[int] = ..., camera: _Optional[_Union[CameraState, _Mapping]] = ..., camera_expected: _Optional[_Union[CameraState, _Mapping]] = ..., camera_awaited: _Optional[bool] = ..., clear_id: _Optional[int] = ..., mode_timestamp: _Optional[_Union[datetime.datetime, _timestamp_pb2.Timestamp, _Mapping]] = ..., mode_cause: _Optional[str] = ..., lease: _Optional[_Union[Lease, _Mapping]] = ..., mirror_rows: _Optional[int] = ..., mirror_columns: _Optional[int] = ..., mirror_fault: _Optional[str] = ..., calibration_provisional: _Optional[bool] = ..., automatic: _Optional[_Iterable[bool]] = ..., prior_nm2: _Optional[_Iterable[float]] = ..., weighting_flux_dn: _Optional[float] = ..., guard: _Optional[_Union[Guard, _Mapping]] = ...) -> None: ...
 
 class Guard(_message.Message):
     __slots__ = ("groups", "frames", "sums_nm2", "void", "virtual_nm", "law_state")
@@ -444,7 +452,7 @@ class Lease(_message.Message):
     def __init__(self, id: _Optional[int] = ..., holder: _Optional[str] = ..., until: _Optional[_Union[datetime.datetime, _timestamp_pb2.Timestamp, _Mapping]] = ..., last_sequence: _Optional[int] = ..., ended: _Optional[str] = ...) -> None: ...
 
 class Request(_message.Message):
-    __slots__ = ("timestamp", "name", "modes", "values", "text", "accepted", "reply", "frame_sequence", "state", "input_number", "actuators", "table", "columns", "law", "calibration", "play_id", "lease_id", "requester")
+    __slots__ = ("timestamp", "name", "modes", "values", "text", "accepted", "reply", "frame_sequence", "state", "input_number", "actuators", "table", "columns", "law", "calibration", "play_id", "lease_id", "requester", "prior_nm2", "flux_dn")
     TIMESTAMP_FIELD_NUMBER: _ClassVar[int]
     NAME_FIELD_NUMBER: _ClassVar[int]
     MODES_FIELD_NUMBER: _ClassVar[int]
@@ -463,6 +471,8 @@ class Request(_message.Message):
     PLAY_ID_FIELD_NUMBER: _ClassVar[int]
     LEASE_ID_FIELD_NUMBER: _ClassVar[int]
     REQUESTER_FIELD_NUMBER: _ClassVar[int]
+    PRIOR_NM2_FIELD_NUMBER: _ClassVar[int]
+    FLUX_DN_FIELD_NUMBER: _ClassVar[int]
     timestamp: _timestamp_pb2.Timestamp
     name: str
     modes: _containers.RepeatedScalarFieldContainer[int]
@@ -481,7 +491,9 @@ class Request(_message.Message):
     play_id: str
     lease_id: int
     requester: str
-    def __init__(self, timestamp: _Optional[_Union[datetime.datetime, _timestamp_pb2.Timestamp, _Mapping]] = ..., name: _Optional[str] = ..., modes: _Optional[_Iterable[int]] = ..., values: _Optional[_Iterable[float]] = ..., text: _Optional[str] = ..., accepted: _Optional[bool] = ..., reply: _Optional[str] = ..., frame_sequence: _Optional[int] = ..., state: _Optional[_Union[ControllerState, _Mapping]] = ..., input_number: _Optional[int] = ..., actuators: _Optional[bytes] = ..., table: _Optional[bytes] = ..., columns: _Optional[int] = ..., law: _Optional[_Union[LinearLaw, _Mapping]] = ..., calibration: _Optional[_Union[Calibration, _Mapping]] = ..., play_id: _Optional[str] = ..., lease_id: _Optional[int] = ..., requester: _Optional[str] = ...) -> None: ...
+    prior_nm2: _containers.RepeatedScalarFieldContainer[float]
+    flux_dn: float
+    def __init__(self, timestamp: _Optional[_Union[datetime.datetime, _timestamp_pb2.Timestamp, _Mapping]] = ..., name: _Optional[str] = ..., modes: _Optional[_Iterable[int]] = ..., values: _Optional[_Iterable[float]] = ..., text: _Optional[str] = ..., accepted: _Optional[bool] = ..., reply: _Optional[str] = ..., frame_sequence: _Optional[int] = ..., state: _Optional[_Union[ControllerState, _Mapping]] = ..., input_number: _Optional[int] = ..., actuators: _Optional[bytes] = ..., table: _Optional[bytes] = ..., columns: _Optional[int] = ..., law: _Optional[_Union[LinearLaw, _Mapping]] = ..., calibration: _Optional[_Union[Calibration, _Mapping]] = ..., play_id: _Optional[str] = ..., lease_id: _Optional[int] = ..., requester: _Optional[str] = ..., prior_nm2: _Optional[_Iterable[float]] = ..., flux_dn: _Optional[float] = ...) -> None: ...
 
 class MirrorCommand(_message.Message):
     __slots__ = ("timestamp", "frame_sequence", "channel", "valid_for_ns", "rows", "columns", "actuators", "command_nm", "input_number", "safe", "clear_id")
@@ -724,7 +736,7 @@ class LoopFigures(_message.Message):
     def __init__(self, frames: _Optional[int] = ..., residual_rms_nm: _Optional[float] = ..., flux_fraction: _Optional[float] = ...) -> None: ...
 
 class Health(_message.Message):
-    __slots__ = ("timestamp", "process", "state", "run_id", "pid", "version", "memory_bytes", "rate_hz", "peers_alive", "topics", "realtime_granted", "realtime_refused", "clock_offset_ns", "uptime_ns", "frame_to_command", "frame_to_mirror", "wavefront", "recording", "mode", "counts", "commands_late", "mean_rate_hz", "router_offset_ns", "router_round_trip_ns", "not_closed_ns", "not_closed_cause", "command_refused", "command_expired", "limits_hit", "recent_wavefront", "last_second", "last_warning", "last_warning_timestamp", "host", "holding")
+    __slots__ = ("timestamp", "process", "state", "run_id", "pid", "version", "memory_bytes", "rate_hz", "peers_alive", "topics", "realtime_granted", "realtime_refused", "clock_offset_ns", "uptime_ns", "frame_to_command", "frame_to_mirror", "wavefront", "recording", "mode", "counts", "commands_late", "mean_rate_hz", "router_offset_ns", "router_round_trip_ns", "not_closed_ns", "not_closed_cause", "command_refused", "command_expired", "limits_hit", "recent_wavefront", "last_second", "last_warning", "last_warning_timestamp", "host", "holding", "closing_harm")
     TIMESTAMP_FIELD_NUMBER: _ClassVar[int]
     PROCESS_FIELD_NUMBER: _ClassVar[int]
     STATE_FIELD_NUMBER: _ClassVar[int]
@@ -760,6 +772,7 @@ class Health(_message.Message):
     LAST_WARNING_TIMESTAMP_FIELD_NUMBER: _ClassVar[int]
     HOST_FIELD_NUMBER: _ClassVar[int]
     HOLDING_FIELD_NUMBER: _ClassVar[int]
+    CLOSING_HARM_FIELD_NUMBER: _ClassVar[int]
     timestamp: _timestamp_pb2.Timestamp
     process: str
     state: str
@@ -795,4 +808,5 @@ class Health(_message.Message):
     last_warning_timestamp: _timestamp_pb2.Timestamp
     host: str
     holding: str
-    def __init__(self, timestamp: _Optional[_Union[datetime.datetime, _timestamp_pb2.Timestamp, _Mapping]] = ..., process: _Optional[str] = ..., state: _Optional[str] = ..., run_id: _Optional[str] = ..., pid: _Optional[int] = ..., version: _Optional[str] = ..., memory_bytes: _Optional[int] = ..., rate_hz: _Optional[float] = ..., peers_alive: _Optional[_Iterable[str]] = ..., topics: _Optional[_Iterable[_Union[TopicCount, _Mapping]]] = ..., realtime_granted: _Optional[_Iterable[str]] = ..., realtime_refused: _Optional[_Iterable[str]] = ..., clock_offset_ns: _Optional[int] = ..., uptime_ns: _Optional[int] = ..., frame_to_command: _Optional[_Union[Latency, _Mapping]] = ..., frame_to_mirror: _Optional[_Union[Latency, _Mapping]] = ..., wavefront: _Optional[_Union[WavefrontFigures, _Mapping]] = ..., recording: _Optional[_Union[Recording, _Mapping]] = ..., mode: _Optional[_Union[LoopMode, str]] = ..., counts: _Optional[_Iterable[_Union[ReasonCount, _Mapping]]] = ..., commands_late: _Optional[int] = ..., mean_rate_hz: _Optional[float] = ..., router_offset_ns: _Optional[int] = ..., router_round_trip_ns: _Optional[int] = ..., not_closed_ns: _Optional[int] = ..., not_closed_cause: _Optional[str] = ..., command_refused: _Optional[_Union[Reason, str]] = ..., command_expired: _Optional[bool] = ..., limits_hit: _Optional[_Iterable[_Union[Reason, str]]] = ..., recent_wavefront: _Optional[_Union[WavefrontFigures, _Mapping]] = ..., last_second: _Optional[_Union[LoopFigures, _Mapping]] = ..., last_warning: _Optional[str] = ..., last_warning_timestamp: _Optional[_Union[datetime.datetime, _timestamp_pb2.Timestamp, _Mapping]] = ..., host: _Optional[str] = ..., holding: _Optional[str] = ...) -> None: ...
+    closing_harm: str
+    def __init__(self, timestamp: _Optional[_Union[datetime.datetime, _timestamp_pb2.Timestamp, _Mapping]] = ..., process: _Optional[str] = ..., state: _Optional[str] = ..., run_id: _Optional[str] = ..., pid: _Optional[int] = ..., version: _Optional[str] = ..., memory_bytes: _Optional[int] = ..., rate_hz: _Optional[float] = ..., peers_alive: _Optional[_Iterable[str]] = ..., topics: _Optional[_Iterable[_Union[TopicCount, _Mapping]]] = ..., realtime_granted: _Optional[_Iterable[str]] = ..., realtime_refused: _Optional[_Iterable[str]] = ..., clock_offset_ns: _Optional[int] = ..., uptime_ns: _Optional[int] = ..., frame_to_command: _Optional[_Union[Latency, _Mapping]] = ..., frame_to_mirror: _Optional[_Union[Latency, _Mapping]] = ..., wavefront: _Optional[_Union[WavefrontFigures, _Mapping]] = ..., recording: _Optional[_Union[Recording, _Mapping]] = ..., mode: _Optional[_Union[LoopMode, str]] = ..., counts: _Optional[_Iterable[_Union[ReasonCount, _Mapping]]] = ..., commands_late: _Optional[int] = ..., mean_rate_hz: _Optional[float] = ..., router_offset_ns: _Optional[int] = ..., router_round_trip_ns: _Optional[int] = ..., not_closed_ns: _Optional[int] = ..., not_closed_cause: _Optional[str] = ..., command_refused: _Optional[_Union[Reason, str]] = ..., command_expired: _Optional[bool] = ..., limits_hit: _Optional[_Iterable[_Union[Reason, str]]] = ..., recent_wavefront: _Optional[_Union[WavefrontFigures, _Mapping]] = ..., last_second: _Optional[_Union[LoopFigures, _Mapping]] = ..., last_warning: _Optional[str] = ..., last_warning_timestamp: _Optional[_Union[datetime.datetime, _timestamp_pb2.Timestamp, _Mapping]] = ..., host: _Optional[str] = ..., holding: _Optional[str] = ..., closing_harm: _Optional[str] = ...) -> None: ...

@@ -6,8 +6,8 @@ from typing import Any
 import numpy as np
 
 from lowfc.arrays import Array, Single
+from lowfc.control.identity import identity
 from lowfc.control.loop.camera import CameraSettings
-from lowfc.control.loop.identity import identity
 
 ESTIMATORS = ("weighted", "pinv")
 

@@ -7,8 +7,8 @@ from typing import Literal, NamedTuple
 import numpy as np
 
 from lowfc.arrays import Array, Single
+from lowfc.control.identity import identity
 from lowfc.control.laws.stability import delay_weights
-from lowfc.control.loop.identity import identity
 
 Signal = Literal["error", "pol"]
 

@@ -10,7 +10,7 @@ from typing import NamedTuple
 import numpy as np
 
 from lowfc.arrays import Array, Single
-from lowfc.control.loop.identity import identity
+from lowfc.control.identity import identity
 
 FLAT = "flat"
 """The channel of the mirror's flat map: the reference image is taken with it, so that it shifts nothing."""

@@ -49,6 +49,7 @@ class Request:
         prepared: it has been checked for what needs no state; see `lowfc.control.loop.requests.prepared`.
         lease_id: of the lease under which it is asked for, or that is asked for; 0 for none.
         requester: user and program that ask, for people.
+        prior_nm2: of automatic gains, as `lowfc.control.loop.state.Weighting`; with the light `flux_dn`.
     """
 
     time_ns: int
@@ -65,6 +66,8 @@ class Request:
     prepared: bool = field(default=False, compare=False)
     lease_id: int = 0
     requester: str = field(default="", compare=False)
+    prior_nm2: tuple[float, ...] = ()
+    flux_dn: float = 0.0
 
 
 @dataclass(frozen=True, slots=True)

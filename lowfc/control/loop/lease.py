@@ -10,6 +10,7 @@ from math import ceil
 from typing import NamedTuple
 
 from lowfc.control.loop.inputs import COUNT_BITS, Request
+from lowfc.control.loop.wording import AUTO
 
 MAX_S = 60.0
 MAX_HOLDER = 200
@@ -76,6 +77,8 @@ def refusal(lease: Lease | None, name: str, lease_id: int, time_ns: int) -> str:
 
 def asked_by(held: Lease | None, request: Request) -> str:
     """What a change of the loop is put down to: a request, and what it was for where its sender holds the loop."""
+    if request.text.startswith(f"{AUTO}: "):
+        return request.text
     if held is not None and request.lease_id and request.lease_id == held.id:
         return f"asked to {request.name} for {held.holder.partition(' by ')[0]}"
     return f"operator asked to {request.name}"

@@ -11,6 +11,7 @@ from lowfc.control.loop.command_channels import ADOPTED, Channel
 from lowfc.control.loop.inputs import MirrorReport, MirrorShape, Outputs, PendingEvent
 from lowfc.control.loop.safety import LoopMode, limit
 from lowfc.control.loop.state import ActiveLoop, Conditions, Settings, State
+from lowfc.control.loop.wording import MEASURED_FIRST
 
 ADOPTED_NM = 1.0
 """Of an actuator beyond the modal command, above which a mirror's shape is adopted as a channel."""
@@ -49,6 +50,7 @@ def loaded(
         command_nm = drive.inverse @ shape_nm.reshape(-1)
         drive = drive._replace(
             law=before.law if same else drive.law,
+            automatic=before.automatic if same else drive.automatic,
             following=before.following if same else None,
             actuators_nm=before.actuators_nm,
             history_nm=(command_nm,) * len(drive.history_nm),
@@ -59,6 +61,8 @@ def loaded(
     mode = settings.start_mode if before_mode is LoopMode.IDLE else before_mode
     if mode is LoopMode.SAFE:
         cause = LATCHED
+    elif before_mode is LoopMode.IDLE and mode is LoopMode.CLOSED and drive.automatic.any():
+        mode, cause = LoopMode.OPEN, MEASURED_FIRST
     state = state._replace(drive=drive)
     if mode is not LoopMode.SAFE and (wrong := uncalibrated(state)):
         mode, cause = LoopMode.IDLE, wrong

@@ -9,14 +9,14 @@ from dataclasses import replace
 import numpy as np
 
 from lowfc.arrays import Single
-from lowfc.control.laws.law import Law
 from lowfc.control.laws.margins import check_law
-from lowfc.control.laws.stability import highest_gain, limiting_gain
+from lowfc.control.laws.stability import highest_gain
 from lowfc.control.loop.command_channels import EXTERNAL, FLAT, MIRROR, CommandChannels, Play, play_table
+from lowfc.control.loop.gains import changed_law, per_mode
 from lowfc.control.loop.inputs import Outputs, PendingEvent, Reply, Request
 from lowfc.control.loop.lease import ENDED_BY, Lease, asked_by, refusal
 from lowfc.control.loop.loading import holding, in_mode, loaded, misfit, mode_event, uncalibrated
-from lowfc.control.loop.remarks import check_offset, remark
+from lowfc.control.loop.remarks import check_offset
 from lowfc.control.loop.reservation import lease, lease_checked, lease_ended, release, renew
 from lowfc.control.loop.safety import Limits, LoopMode, Rejection, neighbour_difference_nm, request_mode
 from lowfc.control.loop.state import ActiveLoop, LawRunner, Settings, State
@@ -178,25 +178,15 @@ def _reset(settings: Settings, state: State, request: Request) -> Handled:
 
 def _law_of_modes(settings: Settings, state: State, request: Request) -> Handled:
     """gain, leak and limit of the integrator."""
-    drive = _drive(state)
-    if drive.following is not None and request.name != "limit":
-        raise ValueError(
-            f"the law {drive.following.law.name!r} drives the mirror, and has no {request.name}: "
-            "`lowfc ctl law integrator` goes back to the one that has"
-        )
-    law = _changed(drive.law, drive.calibration.noll, settings.delay_frames, request)
-    attribute = _ATTRIBUTES[request.name]
-    values = " ".join(f"{value:g}" for value in getattr(law, attribute).tolist())
-    return state._replace(
-        drive=drive._replace(law=law)
-    ), f"{request.name} is now {values}{remark(settings, drive, request)}"
+    drive, text, *events = changed_law(settings, _drive(state), request)
+    return state._replace(drive=drive), text, *events
 
 
 def _offset(settings: Settings, state: State, request: Request) -> Handled:
     drive = _drive(state)
     added = drive.added()
     asked = request if request.values else replace(request, values=(0.0,))
-    values = _per_mode(drive.calibration.noll, asked, added.offset_nm)
+    values = per_mode(drive.calibration.noll, asked, added.offset_nm)
     check_offset(drive, np.abs(values))
     text = " ".join(f"{value:g}" for value in values.tolist())
     return _with(state, drive, added._replace(offset_nm=values)), f"offset is now {text} nm"
@@ -329,46 +319,6 @@ def _check_shape(limits: Limits | None, wanted_nm: Single) -> None:
     if apart > limits.neighbour_nm - limits.margin_nm:
         raise ValueError(f"neighbours differ by {apart:.4g} nm, the limit is {limits.neighbour_nm:g} nm")
 
-
-def _per_mode(noll: tuple[int, ...], request: Request, before: Single) -> Single:
-    """The values of all modes (modes,) with those of the request in their places.
-
-    Raises:
-        ValueError: what is wrong with the request.
-    """
-    modes = request.modes or noll
-    unknown = sorted(set(modes) - set(noll))
-    if unknown:
-        raise ValueError(f"Noll modes {unknown} are not controlled; there are {noll[0]} to {noll[-1]}")
-    if len(request.values) not in (1, len(modes)):
-        raise ValueError(f"give one value, or one for each of the {len(modes)} modes; got {len(request.values)}")
-    if not np.isfinite(request.values).all():
-        raise ValueError(f"{request.name} must be finite, got {list(request.values)}")
-    array = before.copy()
-    array[[noll.index(mode) for mode in modes]] = np.asarray(request.values, dtype=np.float32)
-    return array
-
-
-def _changed(law: Law, noll: tuple[int, ...], delay_frames: float, request: Request) -> Law:
-    """The law with new gains, leaks or limits; ValueError says what is wrong with the request."""
-    attribute = _ATTRIBUTES[request.name]
-    values = _per_mode(noll, request, getattr(law, attribute))
-    lowest, highest = min(request.values), max(request.values)
-    if request.name == "gain":
-        limiting = limiting_gain(delay_frames)
-        if not (lowest >= 0 and highest < limiting):
-            raise ValueError(
-                f"gain must be at least 0 and below {limiting:.3g}, where a loop with a delay of "
-                f"{counted(float(delay_frames), 'frame')} becomes unstable; got {max(request.values, key=abs):g}"
-            )
-    elif request.name == "leak" and not (lowest >= 0 and highest <= 1):
-        raise ValueError(f"leak must be between 0 and 1, got {max(request.values, key=abs):g}")
-    elif lowest < 0:
-        raise ValueError(f"limit must be at least 0 nm, got {lowest:g}")
-    return replace(law, **{attribute: values})
-
-
-_ATTRIBUTES = {"gain": "gain", "leak": "leak", "limit": "limit_nm"}
 
 _HANDLERS: dict[str, Handler] = {
     "status": _status,

@@ -1,14 +1,15 @@
 """What the controller knows: settings that stay, the state that changes."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from types import MappingProxyType
 from typing import NamedTuple
 
 import numpy as np
 
-from lowfc.arrays import Single
+from lowfc.arrays import Mask, Single
 from lowfc.control.calibration.calibration import Calibration
+from lowfc.control.calibration.granted import granted_rows
 from lowfc.control.laws import linear_law
 from lowfc.control.laws.law import Law
 from lowfc.control.laws.linear_law import LinearLaw
@@ -45,6 +46,7 @@ class Settings:
         gain: gain, leak and limit (nm) of tip and tilt, then of the other modes.
         rate_hz: of the frames; 0 where it is not known.
         guard: laws are guarded.
+        auto_gain: whether the gains of tip and tilt, and of the other modes, follow what is measured.
     """
 
     limits: Limits
@@ -61,6 +63,7 @@ class Settings:
     max_identical_frames: int = 0
     rate_hz: float = 0.0
     guard: bool = False
+    auto_gain: tuple[bool, bool] = (False, False)
 
     def law(self, noll: tuple[int, ...]) -> Law:
         """The law for these modes: the first figure of each pair for tip and tilt, the second for the rest."""
@@ -69,6 +72,10 @@ class Settings:
             return np.array([pair[0] if index in (2, 3) else pair[1] for index in noll], dtype=np.float32)
 
         return Law(per_mode(self.gain), per_mode(self.leak), per_mode(self.limit_nm))
+
+    def automatic(self, noll: tuple[int, ...]) -> Mask:
+        """The modes (modes,) whose gain is automatic to begin with."""
+        return np.array([self.auto_gain[index not in (2, 3)] for index in noll], dtype=bool)
 
 
 class LawRunner(NamedTuple):
@@ -124,6 +131,17 @@ class LawRunner(NamedTuple):
         return self._replace(frames=min(self.frames, SETTLING_FRAMES), guard=guard)
 
 
+class Weighting(NamedTuple):
+    """What R is made for: the mean squares (modes,) of the modes that are left alone, nm^2, and the light, DN.
+
+    Attributes:
+        prior_nm2: 0 for a mode that the loop corrects.
+    """
+
+    prior_nm2: Single
+    flux_dn: float
+
+
 class ActiveLoop(NamedTuple):
     """What there is once the mirror is known: by a calibration, or without one by what the mirror reported.
 
@@ -135,6 +153,8 @@ class ActiveLoop(NamedTuple):
         weights: which commands of the history are seen in an exposure, and how much of each.
         camera: settings that the calibration goes with: its own, or the first received after it was loaded; None until
             then.
+        automatic: (modes,) whether the gain of a mode is automatic.
+        weighting: what R is made for; None for the calibration's own.
         following: a law in place of the integrator's.
         command_channels: to what the law commands; None for nothing at all.
         history_nm: modal commands, newest first.
@@ -149,6 +169,8 @@ class ActiveLoop(NamedTuple):
     to_modes: Single
     weights: tuple[tuple[int, np.float32], ...]
     camera: CameraSettings | None
+    automatic: Mask
+    weighting: Weighting | None
     following: LawRunner | None
     command_channels: CommandChannels | None
     history_nm: tuple[Single, ...]
@@ -169,6 +191,8 @@ class ActiveLoop(NamedTuple):
             calibration.actuators_to_modes if calibration.actuators_to_modes.size else inverse,
             tuple((lag, weight) for lag, weight in enumerate(weights) if weight),
             calibration.camera,
+            settings.automatic(calibration.noll),
+            None,
             None,
             None,
             (np.zeros(modes, np.float32),) * len(weights),
@@ -182,6 +206,14 @@ class ActiveLoop(NamedTuple):
         for lag, weight in others:
             seen = seen + weight * self.history_nm[lag]
         return seen
+
+    def weighted(self, weighting: Weighting | None) -> "ActiveLoop":
+        """With R made for other modes, or another star."""
+        calibration = self.calibration
+        if weighting is not None:
+            rows = granted_rows(calibration, weighting.prior_nm2, weighting.flux_dn, self.camera)
+            calibration = replace(calibration, reconstructor=rows)
+        return self._replace(weighting=weighting, estimator=Estimator.of(calibration))
 
     def added(self) -> CommandChannels:
         """What is added, though it be nothing."""

@@ -2,6 +2,10 @@
 
 PAUSED = "operator asked to pause"
 """Cause of the open mode of a loop that is paused."""
+AUTO = "auto"
+"""Text of a request for automatic gains, and what the text of those begins with that no person made."""
+MEASURED_FIRST = "the gains are measured before the loop closes"
+"""Cause of the open mode in which a loop with automatic gains begins."""
 MOST_TEXT = 10_000
 """Characters of a note."""
 

@@ -1,8 +1,9 @@
 """The controller's process: `advance` folded over what the bus brings; the command first, then all the rest."""
 
+import contextlib
 import threading
-import time
 from collections import deque
+from contextlib import AbstractContextManager
 from dataclasses import replace
 from functools import partial
 
@@ -16,11 +17,9 @@ from lowfc.adapters.process.service import Service
 from lowfc.contract.codecs import codec
 from lowfc.contract.codecs.state_codec import controller_state, reason_counts
 from lowfc.contract.configuration import Configuration
-from lowfc.contract.envelope import start_of
 from lowfc.contract.errors import BadMessageError, CalibrationError
 from lowfc.contract.messages import (
     CALIBRATION,
-    CAMERA_STATE,
     COMMAND,
     CONTROL_INPUT,
     CONTROLLER_STATE,
@@ -44,7 +43,9 @@ from lowfc.control.loop.requests import CONFIGURATION, MOST_REPLY, prepared
 from lowfc.control.loop.safety import LoopMode
 from lowfc.control.loop.state import State
 from lowfc.programs.core.cache_warmup import CacheWarmup
+from lowfc.programs.core.camera_signs import CameraSigns
 from lowfc.programs.core.controller_report import Arrays, LastSecond, NotClosed, Offload, StageTiming
+from lowfc.programs.core.gain_watch import GainWatch
 from lowfc.programs.core.mirror_signs import MirrorSigns
 from lowfc.programs.core.start_up import StartUp
 
@@ -52,10 +53,6 @@ TICK_NS = 10_000_000
 """Without frames the held command is repeated this often."""
 MIRROR_PATIENCE_S = 1.0
 """How long the start waits to learn where the mirror is."""
-CAMERA_PATIENCE_NS = 20_000_000_000
-"""How long the start of a lockstep run waits for the camera's settings."""
-CAMERA_PERIOD_NS = 500_000_000
-"""How often a camera that restarted is asked for its settings."""
 STATE_PERIOD_NS = 1_000_000_000
 CHANNEL = "lowfc"
 
@@ -77,6 +74,8 @@ class Controller:
             self._settings = replace(self._settings, start_mode=LoopMode.SAFE)
         elif not latch.kept:  # safe could not be remembered: nothing is driven until somebody is there
             self._settings = replace(self._settings, start_mode=LoopMode.OPEN)
+        self._gain_watch = GainWatch(self._settings, config.control.on_harm)
+        self._measured: deque[Request] = deque()
         self._kept_safe = latch.safe
         self._safe_signalled = False
         self._start_check = StartCheck(
@@ -96,7 +95,7 @@ class Controller:
             FRAME, self._arrived, period_ns=config.period_ns, superseded=partial(self._arrived, superseded=True)
         )
         self._mirror = MirrorSigns(service, name)
-        self._camera = service.mailbox(CAMERA_STATE)
+        self._camera = CameraSigns(service, self._take)
         self._commands = service.publisher(COMMAND, name)
         self._steps = service.publisher(STEP)
         self._inputs = service.publisher(CONTROL_INPUT)
@@ -110,7 +109,7 @@ class Controller:
         self._queries: deque[Query] = deque()
         service.bus.queryable(REQUEST_KEY.format(name=ALL), self._ask)
         self._frame_to_command = Durations()
-        self._state_due_ns = self._camera_due_ns = 0
+        self._state_due_ns = 0
         self._last_frame_ns = service.clock.host_ns()
         now_ns = service.clock.now_ns()
         if calibration is not None:
@@ -121,7 +120,7 @@ class Controller:
 
     def run(self) -> None:
         """Do all but the frames: those are dealt with where they arrive, one turn each."""
-        self._await_camera()
+        self._camera.await_first()
         self._adopt_mirror()
         self._service.state = "running"
         with self._turn:
@@ -131,7 +130,7 @@ class Controller:
                 self._frame(self._early)
         while self._service.running:
             rest_ns = None if self._warmup is None else self._warmup.rest_ns(self._service.clock.host_ns())
-            camera = self._camera.take(min(TICK_NS if rest_ns is None else rest_ns, TICK_NS) * 1e-9)
+            camera = self._camera.wait(min(TICK_NS if rest_ns is None else rest_ns, TICK_NS) * 1e-9)
             if self._warmup is not None and self._warmup.begins(self._service.clock.host_ns()):
                 self._warm_up()
                 continue  # the rest can wait until the frame has come
@@ -141,9 +140,12 @@ class Controller:
                 self._make_safe()
             for _ in range(len(self._queries)):
                 self._answer(self._queries.popleft())
+            while self._measured:
+                self._enter(self._measured.popleft())
             self._keep_safe()
-            if self._state.conditions.camera_awaited:
-                self._ask_camera()
+            for sample in self._camera.asked() if self._state.conditions.camera_awaited else ():
+                with self._turn:
+                    self._camera.take(sample)
             self._service.beat()
         self._leave_camera()
         with self._turn:
@@ -159,6 +161,7 @@ class Controller:
         health.not_closed_ns, health.not_closed_cause = self._not_closed.note(self._state, now_ns)
         if self._state.mode is LoopMode.CLOSED:
             health.holding = holding(self._state)
+        health.closing_harm = self._gain_watch.closing_harm
         health.last_second.CopyFrom(self._last_second.figures(self._state, self._service.clock.host_ns()))
         if self._frame_to_command.count:
             health.frame_to_command.CopyFrom(codec.latency(self._frame_to_command))
@@ -196,6 +199,7 @@ class Controller:
         sent_ns = self._commands.handed_ns if outputs.command is not None else clock.host_ns()
         let_send()
         self._publish(outputs)
+        self._watch_gains(outputs)
         if self._state.frame_sequence != newest:  # an old one is no sign of a live camera
             self._last_frame_ns = taken_ns
         self._service.work += 1
@@ -225,7 +229,7 @@ class Controller:
     def _between_frames(self, camera: Sample | None) -> None:
         """Apply what the camera says of itself; without frames, hold."""
         if camera is not None:
-            self._take_camera(camera)
+            self._camera.take(camera)
         if not self._service.clock.lockstep and self._mirror.due:
             self._judge_mirror()
         silent_ns = self._service.clock.host_ns() - self._last_frame_ns
@@ -249,12 +253,14 @@ class Controller:
         query.reply(codec.encode_request(short, reply, taken, shown))  # who asked has the arrays
         self._requests.put(codec.encode_request(request, reply, taken, shown))
 
-    def _carry_out(self, request: Request) -> tuple[Reply, State, int]:
+    def _carry_out(
+        self, request: Request, turn: AbstractContextManager[object] | None = None
+    ) -> tuple[Reply, State, int]:
         """The reply, the state after it, and its number; 0 for one that is no input of the control law."""
         if request.name == CONFIGURATION:
             return Reply(True, self._configuration, self._state.frame_sequence + 1), self._state, 0
         self._arrays.publish(request)
-        with self._turn:
+        with self._turn if turn is None else turn:
             outputs = self._advance(request)
             state = self._state
             self._publish(outputs)
@@ -264,6 +270,25 @@ class Controller:
             self._arrays.publish_in_use(request, state)
         return reply, state, state.input_number
 
+    def _watch_gains(self, outputs: Outputs) -> None:
+        """After the command: what the loop is worth; in lockstep what follows is entered before the next frame."""
+        if outputs.step is None:
+            return
+        found = self._gain_watch.follow(outputs.step, self._state)
+        for event in found.events:
+            self._service.event(event.name, **event.details)
+        for request in found.requests:
+            if self._service.clock.lockstep:
+                self._enter(request, turn=contextlib.nullcontext())
+            else:
+                self._measured.append(request)
+                self._camera.wake()
+
+    def _enter(self, request: Request, turn: AbstractContextManager[object] | None = None) -> None:
+        """Carry out what no operator asked, and publish it as what they ask."""
+        reply, _, taken = self._carry_out(prepared(self._settings, request), turn)
+        self._requests.put(codec.encode_request(request, reply, taken, None))
+
     def safe_by_signal(self) -> None:
         """Make the loop safe as soon as the main thread gets there; to be called from a signal."""
         self._safe_signalled = True
@@ -271,9 +296,7 @@ class Controller:
 
     def _make_safe(self) -> None:
         self._safe_signalled = False
-        request = Request(self._service.clock.now_ns(), "safe", text="SIGUSR1")
-        reply, _, taken = self._carry_out(request)
-        self._requests.put(codec.encode_request(request, reply, taken, None))
+        self._enter(Request(self._service.clock.now_ns(), "safe", text="SIGUSR1"))
 
     def _keep_safe(self) -> None:
         """Let the latch follow the loop mode: after the answer, and by a thread of its own."""
@@ -281,35 +304,6 @@ class Controller:
         if safe is not self._kept_safe:
             self._kept_safe = safe
             self._latch.set(safe)
-
-    def _take_camera(self, sample: Sample) -> None:
-        try:
-            self._take(codec.decode_camera(sample.payload, start_of(sample.sequence)))
-        except BadMessageError as fault:
-            self._service.unreadable(sample.key, fault)
-
-    def _ask_camera(self) -> None:
-        """Ask for the settings that frames wait for: a camera may tell of them seldom."""
-        now_ns = self._service.clock.host_ns()
-        if now_ns < self._camera_due_ns:
-            return
-        self._camera_due_ns = now_ns + CAMERA_PERIOD_NS
-        for sample in self._service.bus.get(CAMERA_STATE.key, timeout_s=0.1):
-            with self._turn:
-                self._take_camera(sample)
-
-    def _await_camera(self) -> None:
-        """Take the camera's settings before its first frame; in lockstep wait for them, so that runs are the same."""
-        clock = self._service.clock
-        deadline_ns = clock.host_ns() + (CAMERA_PATIENCE_NS if clock.lockstep else 0)
-        while self._service.running:
-            for sample in self._service.bus.get(CAMERA_STATE.key, timeout_s=0.2):
-                self._take_camera(sample)
-                return
-            if clock.host_ns() >= deadline_ns:
-                return
-            self._service.beat()
-            time.sleep(0.02)
 
     def _adopt_mirror(self) -> None:
         """Learn where the mirror is before the first command, so that it does not jump."""

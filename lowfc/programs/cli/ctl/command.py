@@ -9,6 +9,7 @@ import typer
 from lowfc.adapters.process.terminal import AnyRun, Json, new_app
 from lowfc.client.requests import BY_NAME
 from lowfc.contract.errors import BusError, ConfigurationError, DataFileError
+from lowfc.contract.messages import Role, wire
 from lowfc.programs.cli.modes import Modes, noll_of
 from lowfc.programs.cli.output import put
 from lowfc.programs.commissioning.calibrate.command import dark, reference
@@ -22,6 +23,7 @@ ctl_app.add_typer(record_app, name="record")
 
 ZERO = "--zero"
 INTEGRATOR = "integrator"
+AUTOMATIC = "auto"
 SIGNAL = (
     "a controller that cannot be asked is made safe by a signal on its host: "
     "pkill -USR1 -f '^[^ ]*python.* (-m |[^ ]*/)lowfc controller'"
@@ -36,6 +38,11 @@ def number(word: str) -> float:
         raise typer.BadParameter(f"{word!r} is not a number: write 0.3, and several as 0.3 0.2") from None
 
 
+def gain_word(word: str) -> str:
+    """A gain as it was typed, or `auto`."""
+    return word if word == AUTOMATIC else str(number(word))
+
+
 def whole(word: str) -> int:
     """A number of frames as it was typed."""
     try:
@@ -46,6 +53,7 @@ def whole(word: str) -> int:
 
 _EACH = "One value for all modes, or one for each."
 Values = Annotated[list[float], typer.Argument(help=_EACH, parser=number)]
+Gains = Annotated[list[str], typer.Argument(help=f"{_EACH[:-1]}; or {AUTOMATIC}.", parser=gain_word)]
 ValuesIfAny = Annotated[list[float] | None, typer.Argument(help=f"{_EACH} nm rms of wavefront.", parser=number)]
 Zero = Annotated[bool, typer.Option(ZERO, help="Remove it.")]
 Frames = Annotated[int, typer.Argument(help="Frames for which the loop is closed.", parser=whole)]
@@ -75,6 +83,24 @@ def _of_modes(name: str) -> _Command:
         _ask(run, as_json, lambda loop: loop.ask(name, noll_of(modes), values))
 
     return ask
+
+
+def _gain(values: Gains, modes: Modes = None, run: AnyRun = None, as_json: Json = False) -> None:
+    def ask(loop: "Client") -> "Answer":
+        if values == [AUTOMATIC]:
+            return loop.automatic_gain(noll_of(modes))
+        return loop.gain([float(word) for word in values], noll_of(modes))
+
+    _ask(run, as_json, ask)
+
+
+def _close(run: AnyRun = None, as_json: Json = False) -> None:
+    def ask(loop: "Client") -> "Answer":
+        harm = loop.processes().get(Role.CONTROLLER, wire.Health()).closing_harm
+        answer = loop.close_loop()
+        return answer._replace(reply=f"{answer.reply}; {harm}") if harm else answer
+
+    _ask(run, as_json, ask)
 
 
 def _status(run: AnyRun = None, as_json: Json = False) -> None:
@@ -147,6 +173,8 @@ def _recording(name: str) -> _Command:
 _OWN: dict[str, _Command] = {
     "status": _status,
     "configuration": _configuration,
+    "close": _close,
+    "gain": _gain,
     "step": _step,
     "note": _note,
     "offset": _offset,

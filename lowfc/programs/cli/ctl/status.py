@@ -86,6 +86,8 @@ def figures(
         "offset_rms_nm": _rss(state.offset_nm),
         "law": law,
         "gain": list(state.gain),
+        "gain_automatic": list(state.automatic) or [False] * len(state.gain),
+        "closing_harm": controller.closing_harm or None,
         "leak": list(state.leak),
         "limit_nm": list(state.limit_nm),
         "channels": [
@@ -135,7 +137,7 @@ def text(known: dict[str, Any]) -> str:
         "offset": f"{known['offset_rms_nm']:.3f} nm rms",
         **({} if known["added_contrast"] is None else {"contrast": sentence(known["added_contrast"], most_of(known))}),
         "law": law,
-        "gain": _values(known["gain"]),
+        "gain": _values(known["gain"]) + _automatic(known["gain_automatic"]),
         "leak": _values(known["leak"]),
         "limit": _values(known["limit_nm"], " nm"),
         "channels": "; ".join(channels) or "none",
@@ -217,6 +219,12 @@ def _of_mirror(mirror: dict[str, Any]) -> str:
         return f"refuses commands: {mirror['refused']}"
     state = "its last command has expired" if mirror["expired"] else "follows"
     return f"{state}; {_acting(mirror['limits_hit'])}" if mirror["limits_hit"] else state
+
+
+def _automatic(modes: list[bool]) -> str:
+    if not any(modes):
+        return ""
+    return " (automatic)" if all(modes) else f" (automatic: {sum(modes)} of {len(modes)})"
 
 
 def _acting(limits: list[str]) -> str:

@@ -87,6 +87,7 @@ def latency(
 def _configuration(file: Path | None, rate: float | None, camera: Camera, *, plain: bool) -> "Configuration":
     """The loop's configuration: closed, in real time, and where nothing answers to the mirror with a leak."""
     from lowfc.adapters.process.realtime import spread
+    from lowfc.contract.configuration import FIXED_GAINS
 
     overrides: dict[str, Any] = {"camera.rate_hz": rate, "lockstep": False}
     if camera is Camera.PREPARED:  # the integrator would add up noise without end
@@ -95,7 +96,7 @@ def _configuration(file: Path | None, rate: float | None, camera: Camera, *, pla
         overrides |= {"realtime.priority": 0, "realtime.lock_memory": False, "realtime.disable_cpu_idle": False}
         overrides |= {f"realtime.{role}_cpus": [] for role in ("camera", "controller", "mirror", "recorder")}
     apart = spread(os.sched_getaffinity(0), simulated=camera is Camera.SIMULATED)
-    defaults = {"control.start_mode": "closed", "camera.rate_hz": _RATE_HZ, **apart}
+    defaults = {"control.start_mode": "closed", **FIXED_GAINS, "camera.rate_hz": _RATE_HZ, **apart}
     return configuration(file, overrides, defaults)
 
 

@@ -136,10 +136,11 @@ def _run(case: "Case", folder: Path, rng: random.Random) -> "Left":
 def configured(case: "Case", folder: Path) -> "Configuration":
     """The configuration of a case: the loop closed, at the default rate, its log in the case's folder."""
     from lowfc.adapters.process.realtime import spread
-    from lowfc.contract.configuration import load
+    from lowfc.contract.configuration import FIXED_GAINS, load
 
     usual = {
         "control.start_mode": "closed",
+        **FIXED_GAINS,
         "recorder.folder": str(folder),
         "recorder.min_free_mb": 50.0,
         **spread(os.sched_getaffinity(0)),

@@ -12,6 +12,7 @@ from lowfc.adapters.files import calibration_file
 from lowfc.adapters.files.factory import settings
 from lowfc.client import Client
 from lowfc.contract.codecs.calibration_codec import identified
+from lowfc.contract.configuration import FIXED_GAINS
 from lowfc.contract.errors import RequestRefusedError
 from lowfc.contract.messages import Role
 from lowfc.control.calibration.calibration import Calibration
@@ -37,8 +38,8 @@ def _highest_gain(bench: ChaosBench) -> None:
         raise CaseFailedError(f"a gain of {1.01 * limiting:.3g} was granted, where {limiting:.3g} is unstable")
     client.gain(JUST_BELOW * limiting)
     bench.frames(WHILE_FRAMES)
-    client.gain(bench.config.control.gain)
-    client.gain(bench.config.control.tilt_gain, modes=[2, 3])
+    client.gain(FIXED_GAINS["control.gain"])
+    client.gain(FIXED_GAINS["control.tilt_gain"], modes=[2, 3])
 
 
 @case(

@@ -1,0 +1,202 @@
+"""Gains that are measured: a bank of virtual integrators says what each gain would leave, and whether closing harms."""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from lowfc.arrays import Array, Mask, Single, Whole
+from lowfc.control.laws.stability import highest_gain
+from lowfc.control.laws.virtual import VirtualIntegrators, Weights
+
+LEAST_GAIN = 1e-3
+"""Of the rows, which are a factor of two apart from the highest gain with margins down to this one; and gain 0."""
+BLOCKS = 10
+"""Into which a window is cut, for the standard error of what it shows."""
+CONFIDENCE = 2.0
+"""Standard errors by which one gain must beat another; or it does so in `MOST_OF` of the blocks, for where the open
+loop wanders, one of them may outweigh all others."""
+MOST_OF = 9
+LONGEST = 16
+"""Times its first length, to which a window grows while it decides nothing."""
+LEAST_CORRECTED = 0.1
+"""Where no gain is shown to be better: injected noise over what is there to correct, below which the least is taken."""
+
+
+class Verdict(NamedTuple):
+    """What a window of frames has shown; all (modes,), nm^2 of wavefront.
+
+    Attributes:
+        gain: the gain that each mode should have from now on.
+        power_nm2: mean square of the open loop, with the noise of a frame.
+        change_nm2: mean square with the gain of now less that of the open loop: above 0, closing harms.
+        change_error_nm2: its standard error.
+        loop_nm2: the same of the loop itself, with whatever law drives it; None where it was not closed throughout.
+        loop_error_nm2: its standard error.
+        frames: of the window.
+    """
+
+    gain: Single
+    power_nm2: Array
+    change_nm2: Array
+    change_error_nm2: Array
+    loop_nm2: Array | None
+    loop_error_nm2: Array
+    frames: int
+
+
+class GainBank:
+    """Virtual integrators of a group of modes, and windows over which they are compared.
+
+    The first window after `restart` may choose any gain; later ones move a gain by at most a factor of two, unless the
+    open loop is better than the gain of now, or that is the least one.
+    """
+
+    def __init__(
+        self,
+        modes: int,
+        kept: Single,
+        limit_nm: Single,
+        weights: Weights,
+        delay_frames: float,
+        windows: tuple[int, int],
+    ) -> None:
+        """A bank of `modes` modes.
+
+        Args:
+            modes: Number of modes.
+            kept: (modes,) 1 - leak.
+            limit_nm: (modes,) largest command.
+            weights: Which commands an exposure sees.
+            delay_frames: Of the loop.
+            windows: Frames of the first window, and of those after it.
+        """
+        halvings = int(np.log2(highest_gain(delay_frames) / LEAST_GAIN))
+        rows = highest_gain(delay_frames) * 0.5 ** np.arange(halvings, -1.0, -1)
+        self.rows = np.concatenate([[0], rows]).astype(np.float32)
+        gain = np.repeat(self.rows[:, None], modes, axis=1)
+        self._at_rest = VirtualIntegrators.at_rest(gain, kept, limit_nm, weights)
+        self._windows = windows
+        self._closed = self._throughout = False
+        self.restart()
+
+    def restart(self) -> None:
+        """Begin anew, as for another star."""
+        self._loops = self._at_rest
+        self.begin_again()
+
+    def begin_again(self) -> None:
+        """Let the next window be a first one."""
+        self.first = True
+        self._clear(self._windows[0])
+
+    def followed(self, open_nm: Single, error_nm: Single, *, closed: bool) -> bool:
+        """Take the modes of one frame: of the open loop, and of the loop itself; whether a window is complete."""
+        self._loops, errors_nm = self._loops.followed(open_nm)
+        squares = np.square(errors_nm)
+        self._power += squares[0]
+        squares -= squares[0].copy()
+        self._sums[:-1] += squares
+        self._sums[-1] += np.square(error_nm) - np.square(open_nm)
+        if closed is not self._closed and not self.first:
+            self._clear(self._windows[1])
+        self._throughout = self._throughout and closed
+        self._closed = closed
+        self._frames += 1
+        if self._frames < self._block:
+            return False
+        self._blocks.append(self._sums / self._frames)
+        self._powers.append(self._power / self._frames)
+        self._begin_block()
+        return len(self._blocks) == BLOCKS
+
+    def held(self, frames: int) -> None:
+        """Frames of which nothing was measured."""
+        self._loops = self._loops.held(frames)
+
+    def verdict(self, gain: Single, noise_nm2: Array | None) -> Verdict:
+        """What the window has shown, at gains (modes,) and with the noise of one frame (modes,), None where unknown."""
+        blocks, power = np.array(self._blocks, float), np.mean(self._powers, axis=0, dtype=float)
+        now = self._row_of(gain)
+        modes = np.arange(gain.size)
+        frames = self._block * BLOCKS
+        mean, error = _mean(blocks)
+        chosen = self._chosen(blocks, now)
+        if self.first and noise_nm2 is not None:
+            injected = self.rows[1] / (2 - self.rows[1]) * noise_nm2
+            there = power - noise_nm2 * (1 + CONFIDENCE * np.sqrt(2 / frames))
+            chosen = np.where((chosen == 0) & (injected < LEAST_CORRECTED * there), 1, chosen)
+        found = Verdict(
+            np.where(chosen == now, gain, self.rows[chosen]).astype(np.float32),
+            power,
+            mean[now, modes],
+            error[now, modes],
+            mean[-1] if self._throughout else None,
+            error[-1],
+            frames,
+        )
+        if self.first or (chosen != now).any():
+            self.first = False
+            self._clear(self._windows[1])
+        else:
+            self._lengthen()
+        return found
+
+    def _chosen(self, blocks: Array, now: Whole) -> Whole:
+        """The row (modes,) for each mode whose row is `now`."""
+        rows, modes = blocks[:, :-1], np.arange(now.size)
+        beyond_now, better = _better(rows - rows[:, now, modes][:, None])
+        best = np.argmin(np.where(better, beyond_now, np.inf), axis=0)
+        best = np.where(better.any(axis=0), best, now)
+        if self.first:
+            beyond_open, better = _better(rows)
+            return np.where(better.any(axis=0), np.argmin(np.where(better, beyond_open, np.inf), axis=0), 0)
+        near = np.clip(best, np.maximum(now - 1, 0), now + 1)
+        return np.where((now <= 1) | better[0], best, near)
+
+    def _row_of(self, gain: Single) -> Whole:
+        """The row (modes,) that is nearest to each gain."""
+        nearest = np.argmin(np.abs(np.log(np.maximum(gain, 1e-9)) - np.log(self.rows[1:, None])), axis=0) + 1
+        return np.where(gain < self.rows[1] / 2, 0, nearest)
+
+    def _clear(self, window: int) -> None:
+        self._block = max(window // BLOCKS, 1)
+        self._longest = self._block * LONGEST
+        self._blocks: list[Array] = []
+        self._powers: list[Array] = []
+        self._throughout = True
+        self._begin_block()
+
+    def _begin_block(self) -> None:
+        self._frames = 0
+        self._sums = np.zeros((self.rows.size + 1, self._at_rest.kept.size))
+        self._power = np.zeros(self._at_rest.kept.size)
+
+    def _lengthen(self) -> None:
+        """Go on with blocks of twice the length; the longest window forgets its older half."""
+        if 2 * self._block > self._longest:
+            self._blocks, self._powers = self._blocks[BLOCKS // 2 :], self._powers[BLOCKS // 2 :]
+            return
+        self._block *= 2
+        pairs = (np.array(values).reshape(BLOCKS // 2, 2, *values[0].shape) for values in (self._blocks, self._powers))
+        self._blocks, self._powers = (list(pair.mean(axis=1)) for pair in pairs)
+
+
+def _mean(blocks: Array) -> tuple[Array, Array]:
+    """Mean over the blocks (the first axis), and its standard error."""
+    return blocks.mean(axis=0), blocks.std(axis=0, ddof=1) / np.sqrt(len(blocks))
+
+
+def _better(blocks: Array) -> tuple[Array, Mask]:
+    """Mean over the blocks, and whether it is below 0 beyond doubt."""
+    mean, error = _mean(blocks)
+    return mean, (mean < -CONFIDENCE * error) | ((mean < 0) & (np.sum(blocks < 0, axis=0) >= MOST_OF))
+
+
+def left_alone_nm2(verdict: Verdict, left: Mask, noise_nm2: Array) -> Single:
+    """Mean square (modes,) of the modes that are `left` alone, nm^2, as `Weighting.prior_nm2`: 0 for the others.
+
+    What is measured less the noise, and two standard errors of that noise.
+    """
+    uncertain = CONFIDENCE * noise_nm2 * np.sqrt(2 / verdict.frames)
+    prior = np.maximum(verdict.power_nm2 - noise_nm2, 0) + uncertain
+    return np.where(left, prior, 0).astype(np.float32)

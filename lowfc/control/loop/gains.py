@@ -1,0 +1,109 @@
+"""Gains, leaks and limits of the integrator, as they are asked for: by a person, or by what was measured."""
+
+from dataclasses import replace
+
+import numpy as np
+
+from lowfc.arrays import Mask, Single
+from lowfc.control.laws.law import Law
+from lowfc.control.laws.stability import limiting_gain
+from lowfc.control.loop.inputs import PendingEvent, Request
+from lowfc.control.loop.remarks import remark
+from lowfc.control.loop.state import ActiveLoop, Settings, Weighting
+from lowfc.control.loop.wording import AUTO, counted
+
+Changed = tuple[ActiveLoop, str, *tuple[PendingEvent, ...]]
+
+
+def changed_law(settings: Settings, drive: ActiveLoop, request: Request) -> Changed:
+    """The loop after a request for gain, leak or limit, and the reply; ValueError says why it is refused."""
+    if request.name == "gain" and request.text == AUTO:
+        return _automatic_gain(settings, drive, request)
+    if drive.following is not None and request.name != "limit":
+        raise ValueError(
+            f"the law {drive.following.law.name!r} drives the mirror, and has no {request.name}: "
+            "`lowfc ctl law integrator` goes back to the one that has"
+        )
+    law = _changed(drive.law, drive.calibration.noll, settings.delay_frames, request)
+    drive = drive._replace(law=law)
+    if request.name == "gain":  # what a person gave is not automatic, and is measured as a mode that is corrected
+        given = _chosen(drive, request)
+        weighting = drive.weighting
+        drive = drive._replace(automatic=drive.automatic & ~given)
+        if weighting is not None and (weighting.prior_nm2[given] > 0).any():
+            prior_nm2 = np.where(given, np.float32(0), weighting.prior_nm2)
+            drive = drive.weighted(weighting._replace(prior_nm2=prior_nm2))
+    text = f"{request.name} is now {_listed(getattr(law, _ATTRIBUTES[request.name]))}"
+    return drive, text + remark(settings, drive, request)
+
+
+def _automatic_gain(settings: Settings, drive: ActiveLoop, request: Request) -> Changed:
+    """Gains that follow what is measured: without values, from now on; with values, what they have become."""
+    chosen, noll = _chosen(drive, request), drive.calibration.noll
+    if not request.values:
+        drive = drive._replace(automatic=drive.automatic | chosen)
+        names = ", ".join(f"Z{index}" for index, one in zip(noll, chosen, strict=True) if one)
+        return drive, f"the gain of {names} is automatic"
+    changed = _changed(drive.law, noll, settings.delay_frames, request)
+    prior_nm2 = np.array(request.prior_nm2, np.float32)
+    if prior_nm2.size and not (
+        prior_nm2.shape == chosen.shape and np.isfinite(prior_nm2).all() and (prior_nm2 >= 0).all()
+    ):
+        raise ValueError(f"the mean squares of the modes must be {chosen.size}, finite and at least 0 nm^2")
+    mine = chosen & drive.automatic
+    gain = np.where(mine, changed.gain, drive.law.gain)
+    weighting = Weighting(prior_nm2, request.flux_dn) if prior_nm2.any() else None
+    drive = drive._replace(law=replace(drive.law, gain=gain)).weighted(weighting)
+    text = _listed(gain)
+    return drive, f"gain is now {text}", PendingEvent("GAINS_CHANGED", {"gains": text})
+
+
+def _listed(values: Single) -> str:
+    return " ".join(f"{value:.3g}" for value in values.tolist())
+
+
+def _chosen(drive: ActiveLoop, request: Request) -> Mask:
+    """The modes (modes,) that a request is for."""
+    noll = drive.calibration.noll
+    return np.isin(noll, request.modes or noll)
+
+
+def per_mode(noll: tuple[int, ...], request: Request, before: Single) -> Single:
+    """The values of all modes (modes,) with those of the request in their places.
+
+    Raises:
+        ValueError: what is wrong with the request.
+    """
+    modes = request.modes or noll
+    unknown = sorted(set(modes) - set(noll))
+    if unknown:
+        raise ValueError(f"Noll modes {unknown} are not controlled; there are {noll[0]} to {noll[-1]}")
+    if len(request.values) not in (1, len(modes)):
+        raise ValueError(f"give one value, or one for each of the {len(modes)} modes; got {len(request.values)}")
+    if not np.isfinite(request.values).all():
+        raise ValueError(f"{request.name} must be finite, got {list(request.values)}")
+    array = before.copy()
+    array[[noll.index(mode) for mode in modes]] = np.asarray(request.values, dtype=np.float32)
+    return array
+
+
+def _changed(law: Law, noll: tuple[int, ...], delay_frames: float, request: Request) -> Law:
+    """The law with new gains, leaks or limits; ValueError says what is wrong with the request."""
+    attribute = _ATTRIBUTES[request.name]
+    values = per_mode(noll, request, getattr(law, attribute))
+    lowest, highest = min(request.values), max(request.values)
+    if request.name == "gain":
+        limiting = limiting_gain(delay_frames)
+        if not (lowest >= 0 and highest < limiting):
+            raise ValueError(
+                f"gain must be at least 0 and below {limiting:.3g}, where a loop with a delay of "
+                f"{counted(float(delay_frames), 'frame')} becomes unstable; got {max(request.values, key=abs):g}"
+            )
+    elif request.name == "leak" and not (lowest >= 0 and highest <= 1):
+        raise ValueError(f"leak must be between 0 and 1, got {max(request.values, key=abs):g}")
+    elif lowest < 0:
+        raise ValueError(f"limit must be at least 0 nm, got {lowest:g}")
+    return replace(law, **{attribute: values})
+
+
+_ATTRIBUTES = {"gain": "gain", "leak": "leak", "limit": "limit_nm"}

@@ -1,0 +1,65 @@
+"""What the camera says of itself: its settings as they come, asked for where frames wait for them."""
+
+import time
+from collections.abc import Callable
+
+from lowfc.adapters.bus.bus import Sample
+from lowfc.adapters.process.service import Service
+from lowfc.contract.codecs import codec
+from lowfc.contract.envelope import start_of
+from lowfc.contract.errors import BadMessageError
+from lowfc.contract.messages import CAMERA_STATE
+from lowfc.control.loop.camera import CameraSettings
+
+PATIENCE_NS = 20_000_000_000
+"""How long the start of a lockstep run waits for the settings."""
+PERIOD_NS = 500_000_000
+"""How often a camera that restarted is asked for them."""
+
+
+class CameraSigns:
+    """The newest settings of the camera; each is given to `take`."""
+
+    def __init__(self, service: Service, take: Callable[[CameraSettings], None]) -> None:
+        """Subscribe."""
+        self._service, self._give = service, take
+        self._mailbox = service.mailbox(CAMERA_STATE)
+        self._due_ns = 0
+
+    def wait(self, timeout_s: float) -> Sample | None:
+        """A message of the camera, or None after a time or `wake`."""
+        return self._mailbox.take(timeout_s)
+
+    def wake(self) -> None:
+        """End a `wait`; from any thread."""
+        self._mailbox.wake()
+
+    def take(self, sample: Sample) -> None:
+        """Give the settings of a message on."""
+        try:
+            settings = codec.decode_camera(sample.payload, start_of(sample.sequence))
+        except BadMessageError as fault:
+            self._service.unreadable(sample.key, fault)
+            return
+        self._give(settings)
+
+    def asked(self) -> list[Sample]:
+        """Answers of the camera, which may publish its settings seldom; none where it was asked a moment ago."""
+        now_ns = self._service.clock.host_ns()
+        if now_ns < self._due_ns:
+            return []
+        self._due_ns = now_ns + PERIOD_NS
+        return list(self._service.bus.get(CAMERA_STATE.key, timeout_s=0.1))
+
+    def await_first(self) -> None:
+        """Take the settings before the first frame; in lockstep wait for them, so that runs are the same."""
+        clock = self._service.clock
+        deadline_ns = clock.host_ns() + (PATIENCE_NS if clock.lockstep else 0)
+        while self._service.running:
+            for sample in self._service.bus.get(CAMERA_STATE.key, timeout_s=0.2):
+                self.take(sample)
+                return
+            if clock.host_ns() >= deadline_ns:
+                return
+            self._service.beat()
+            time.sleep(0.02)

@@ -1,0 +1,251 @@
+"""Watches what the loop is worth, frame by frame: asks for gains that were measured, and says where the loop harms."""
+
+from dataclasses import replace
+from typing import NamedTuple
+
+import numpy as np
+
+from lowfc.arrays import Array, Mask, Single
+from lowfc.control.calibration.granted import noise_covariance_nm2
+from lowfc.control.laws.automatic_gain import CONFIDENCE, GainBank, Verdict, left_alone_nm2
+from lowfc.control.loop.inputs import COUNT_BITS, PendingEvent, Request, Step
+from lowfc.control.loop.safety import LoopMode
+from lowfc.control.loop.state import ActiveLoop, Settings, State
+from lowfc.control.loop.wording import AUTO, MEASURED_FIRST
+
+FIRST_S = 2.0
+"""Of the first window, of all modes."""
+TILT_S, OTHERS_S = 1.0, 10.0
+"""Of the windows after it."""
+LIGHT_S = 0.25
+STAR_STEP = 0.2
+"""Relative change of the light over two times `LIGHT_S` in a row that means another star."""
+HARMFUL = 3
+"""Windows in a row in which an open loop would have left less, before it is said."""
+CAUTIOUS = 0.05
+"""Highest gain of the other modes before tip and tilt are corrected, whose square looks like other modes."""
+LEAST_FRAMES = 50
+"""Of a window, however slow the loop."""
+
+
+class Remarks(NamedTuple):
+    """What is to be asked of the controller, and said."""
+
+    requests: tuple[Request, ...] = ()
+    events: tuple[PendingEvent, ...] = ()
+
+
+NOTHING = Remarks()
+
+
+class _Group:
+    """Modes that are judged together: tip and tilt, or the others."""
+
+    def __init__(self, mask: Mask, settings: Settings, drive: ActiveLoop, window_s: float) -> None:
+        rate_hz = settings.rate_hz or 1.0
+        frames = [max(round(seconds * rate_hz), LEAST_FRAMES) for seconds in (FIRST_S, window_s)]
+        self.mask = mask
+        self.bank = GainBank(
+            int(mask.sum()),
+            drive.law.kept[mask],
+            drive.law.limit_nm[mask],
+            drive.weights,
+            settings.delay_frames,
+            (frames[0], frames[1]),
+        )
+        self.verdict: Verdict | None = None
+        self.harmful = 0
+        self.calm = window_s == TILT_S
+
+
+class GainWatch:
+    """Follows the steps of one controller; no part of what a step depends on.
+
+    Attributes:
+        closing_harm: what closing at the present gains would add, as a sentence; empty where nothing, or once closed.
+    """
+
+    def __init__(self, settings: Settings, on_harm: str) -> None:
+        self._settings, self._on_harm = settings, on_harm
+        self._groups: list[_Group] = []
+        self._of: tuple[object, ...] = ()
+        self._newest = 0
+        self._light = self._frames = 0.0
+        self._light_was = 0.0
+        self._unlike = 0
+        self._mode = LoopMode.IDLE
+        self.closing_harm = ""
+
+    def follow(self, step: Step, state: State) -> Remarks:
+        """Take a step and the state after it."""
+        drive = state.drive
+        if drive is None or not drive.calibration.noll:
+            return NOTHING
+        self._begin(drive)
+        missing = step.frame_sequence - self._newest - 1
+        if missing < 0:  # an old frame
+            return NOTHING
+        same_camera = step.frame_sequence >> COUNT_BITS == self._newest >> COUNT_BITS
+        self._newest = step.frame_sequence
+        held = missing if same_camera else 0
+        added = drive.command_channels
+        if step.error_nm is None or step.pol_nm is None or (added is not None and added.play is not None):
+            held += 1
+        if held:
+            for group in self._groups:
+                group.bank.held(held)
+        if step.error_nm is None or step.pol_nm is None or state.mode not in (LoopMode.OPEN, LoopMode.CLOSED):
+            return NOTHING
+        if added is not None and added.play is not None:
+            return NOTHING
+        open_nm = step.pol_nm if added is None else step.pol_nm - added.offset_nm
+        closed = step.mode is LoopMode.CLOSED and not state.returning_to_zero
+        star = self._star(step.flux_dn)
+        if star:
+            return self._another_star(step, drive, star)
+        closing = step.mode is LoopMode.CLOSED and self._mode is LoopMode.OPEN and self.closing_harm
+        events = (PendingEvent("CLOSING_HARMS", {"harm": self.closing_harm}),) if closing else ()
+        self._mode = step.mode
+        if closed:
+            self.closing_harm = ""
+        judged = [
+            group
+            for group in self._groups
+            if group.bank.followed(open_nm[group.mask], step.error_nm[group.mask], closed=closed)
+        ]
+        if not judged:
+            return Remarks(events=events) if events else NOTHING
+        found = self._judge(judged, step, state, drive)
+        return found._replace(events=(*events, *found.events))
+
+    def _begin(self, drive: ActiveLoop) -> None:
+        """Begin anew under another calibration, leak or limit."""
+        of = drive.calibration.id, drive.law.kept.tobytes(), drive.law.limit_nm.tobytes()
+        if of == self._of:
+            return
+        self._of = of
+        tilt = np.isin(drive.calibration.noll, (2, 3))
+        self._groups = [
+            _Group(mask, self._settings, drive, window_s)
+            for mask, window_s in ((tilt, TILT_S), (~tilt, OTHERS_S))
+            if mask.any()
+        ]
+        self._light_was = 0.0
+
+    def _star(self, flux_dn: float) -> float:
+        """The light over what it was where that has changed for good; else 0."""
+        self._light += flux_dn
+        self._frames += 1
+        if self._frames < max(LIGHT_S * self._settings.rate_hz, 10):
+            return 0.0
+        mean, self._light, self._frames = self._light / self._frames, 0.0, 0.0
+        if not self._light_was:
+            self._light_was = mean
+        ratio = mean / self._light_was
+        self._unlike = self._unlike + 1 if abs(ratio - 1) > STAR_STEP else 0
+        if self._unlike < 2:
+            return 0.0
+        self._unlike, self._light_was = 0, mean
+        return ratio
+
+    def _another_star(self, step: Step, drive: ActiveLoop, ratio: float) -> Remarks:
+        """Lower gains until they have been measured: by a row at least, and by more the fainter the star."""
+        for group in self._groups:
+            group.bank.restart()
+        events = (PendingEvent("STAR_CHANGED", {"ratio": ratio}),)
+        if not drive.automatic.any():
+            return Remarks(events=events)
+        lowered = drive.law.gain * np.float32(min(ratio, 0.5))
+        return Remarks((self._gains(step, drive, np.where(drive.automatic, lowered, drive.law.gain)),), events)
+
+    def _judge(self, judged: list[_Group], step: Step, state: State, drive: ActiveLoop) -> Remarks:
+        noise_nm2 = self._noise_nm2(drive)
+        gain, initial, events = drive.law.gain.copy(), False, []
+        for group in judged:
+            initial |= group.bank.first
+            noise = None if noise_nm2 is None else noise_nm2[group.mask]
+            group.verdict = verdict = group.bank.verdict(drive.law.gain[group.mask], noise)
+            wanted = verdict.gain if group.calm else np.minimum(verdict.gain, CAUTIOUS)
+            gain[group.mask] = np.where(drive.automatic[group.mask], wanted, gain[group.mask])
+            if not group.calm:
+                group.calm = True
+                group.bank.begin_again()
+            events += self._harm(group, verdict, drive)
+        requests = []
+        if drive.automatic.any() and (initial or not np.array_equal(gain, drive.law.gain)):
+            requests.append(self._gains(step, drive, gain))
+        self.closing_harm = "" if state.mode is LoopMode.CLOSED else self._closing_harm(gain, drive)
+        waits = state.mode is LoopMode.OPEN and state.conditions.mode_cause == MEASURED_FIRST
+        if waits:
+            requests.append(Request(step.time_ns, "close", text=f"{AUTO}: the gains were measured"))
+        requests += [request for event in events for request in self._reaction(event, step, state)]
+        return Remarks(tuple(requests), tuple(events))
+
+    def _closing_harm(self, gain: Single, drive: ActiveLoop) -> str:
+        """What closing would add to the wavefront at gains that were judged as they are."""
+        noll, added_nm2, noise = np.array(drive.calibration.noll), 0.0, []
+        for group in self._groups:
+            one = group.verdict
+            if one is None or not np.array_equal(gain[group.mask], drive.law.gain[group.mask]):
+                continue
+            harmful = one.change_nm2 > CONFIDENCE * one.change_error_nm2
+            added_nm2 += float(one.change_nm2[harmful].sum())
+            noise += noll[group.mask][harmful].tolist()
+        if not noise:
+            return ""
+        names, indices = ", ".join(f"Z{index}" for index in noise), ",".join(map(str, noise))
+        return (
+            f"closing adds {added_nm2**0.5:.3g} nm rms at this star, for {names} measure more noise than there is to "
+            f"correct: `lowfc ctl gain auto --modes {indices}` chooses their gains, and 0 in place of auto leaves them"
+        )
+
+    def _noise_nm2(self, drive: ActiveLoop) -> Array | None:
+        """Noise of one frame (modes,), nm^2; None where the camera's gain is not known."""
+        covariance = noise_covariance_nm2(drive.calibration, self._light_was or drive.calibration.flux_dn, drive.camera)
+        return None if covariance is None else np.diag(covariance)
+
+    def _gains(self, step: Step, drive: ActiveLoop, gain: Single) -> Request:
+        """The request for gains (modes,), and for R of the modes that are corrected."""
+        noise_nm2, left = self._noise_nm2(drive), drive.automatic & (gain == 0)
+        prior_nm2: tuple[float, ...] = ()
+        if noise_nm2 is not None and all(group.verdict is not None for group in self._groups):
+            prior = np.zeros(gain.size, np.float32)
+            for group in self._groups:
+                assert group.verdict is not None  # noqa: S101  # as just asked
+                prior[group.mask] = left_alone_nm2(group.verdict, left[group.mask], noise_nm2[group.mask])
+            prior_nm2 = tuple(prior.tolist())
+        flux_dn = float(np.float32(self._light_was))
+        values = tuple(gain.astype(np.float32).tolist())
+        return Request(step.time_ns, "gain", (), values, AUTO, prior_nm2=prior_nm2, flux_dn=flux_dn)
+
+    def _harm(self, group: _Group, verdict: Verdict, drive: ActiveLoop) -> list[PendingEvent]:
+        """The event where an open loop would have left less for `HARMFUL` windows in a row."""
+        if verdict.loop_nm2 is None:
+            group.harmful = 0
+            return []
+        worse, error = verdict.loop_nm2.sum(), np.sqrt(np.square(verdict.loop_error_nm2).sum())
+        group.harmful = group.harmful + 1 if worse > 3 * error else 0
+        if group.harmful != HARMFUL:
+            return []
+        noise_nm2 = self._noise_nm2(drive)
+        noise = 0.0 if noise_nm2 is None else float(noise_nm2[group.mask].sum())
+        there = max(float(verdict.power_nm2.sum()) - noise, 0.0)
+        culprits = verdict.loop_nm2 > 2 * verdict.loop_error_nm2
+        noll = np.array(drive.calibration.noll)[group.mask]
+        details: dict[str, object] = {
+            "modes": ", ".join(f"Z{index}" for index in noll[culprits]),
+            "closed_nm": float(np.sqrt(there + worse)),
+            "open_nm": float(np.sqrt(there)),
+            "action": {"warn": "nothing is done", "open": "the loop opens"}.get(
+                self._on_harm, "the integrator takes over"
+            ),
+        }
+        return [PendingEvent("LOOP_HARMS", details)]
+
+    def _reaction(self, event: PendingEvent, step: Step, state: State) -> list[Request]:
+        """What `control.on_harm` wants."""
+        if event.name != "LOOP_HARMS" or self._on_harm == "warn":
+            return []
+        law = state.drive is not None and state.drive.following is not None
+        asked = Request(step.time_ns, "open", text=f"{AUTO}: the loop made it worse")
+        return [replace(asked, name="law")] if law and self._on_harm == "integrator" else [asked]

@@ -1,0 +1,134 @@
+"""Gains chosen by a bank of virtual integrators, and R for the modes that are corrected."""
+
+import numpy as np
+import pytest
+
+from lowfc.arrays import Array
+from lowfc.control.calibration.calibration import Calibration
+from lowfc.control.calibration.granted import granted_rows, noise_covariance_nm2
+from lowfc.control.calibration.regularised import pixel_variance, reconstruct
+from lowfc.control.laws.automatic_gain import GainBank, Verdict, left_alone_nm2
+from lowfc.control.laws.stability import delay_weights, highest_gain
+from lowfc.control.loop.camera import CameraSettings
+
+MODES = 30
+ONES = np.ones(MODES, np.float32)
+
+
+def bank(delay_frames: float = 1.0, windows: tuple[int, int] = (1000, 500)) -> GainBank:
+    weights = tuple(
+        (lag, weight) for lag, weight in enumerate(delay_weights(delay_frames).astype(np.float32)) if weight
+    )
+    return GainBank(MODES, ONES, 1e6 * ONES, weights, delay_frames, windows)
+
+
+def verdicts(made: GainBank, open_nm: Array, gain: Array, noise_nm2: float) -> list[Verdict]:
+    """Of a loop that is open, whose gains follow the verdicts."""
+    found = []
+    for one in open_nm.astype(np.float32):
+        if made.followed(one, one, closed=False):
+            found.append(made.verdict(gain, noise_nm2 * ONES.astype(float)))
+            gain = found[-1].gain
+    return found
+
+
+def drift(frames: int, step_nm: float, noise_nm: float, seed: int) -> Array:
+    rng = np.random.default_rng(seed)
+    return np.cumsum(rng.normal(0, step_nm, (frames, MODES)), axis=0) + rng.normal(0, noise_nm, (frames, MODES))
+
+
+def test_noise_alone_is_left_alone() -> None:
+    """Two standard errors let one mode in some tens through, and then with a low gain."""
+    found = verdicts(bank(), drift(1000, 0.0, 10.0, 1), np.zeros(MODES, np.float32), 100.0)
+    assert len(found) == 1
+    assert np.count_nonzero(found[0].gain) <= 3
+    assert found[0].gain.max() < 0.02
+
+
+@pytest.mark.parametrize(("step_nm", "delay_frames"), [(0.1, 1.0), (1.0, 1.0), (1.0, 2.0), (20.0, 1.0)])
+def test_a_drift_gets_the_gain_that_leaves_least(step_nm: float, delay_frames: float) -> None:
+    """Within 12 % rms of the best gain, in closed form for d = 1: drift s^2 / (g (2 - g)) and noise n^2 g / (2 - g)."""
+    made = bank(delay_frames, (1000, 2500))
+    found = verdicts(made, drift(8500, step_nm, 10.0, 2), np.zeros(MODES, np.float32), 100.0)
+    assert len(found) >= 4
+    gains = np.linspace(0.001, highest_gain(delay_frames), 2000)
+    if delay_frames == 1.0:
+        left = (step_nm**2 / gains + 100.0 * gains) / (2 - gains)
+        mine = np.interp(found[-1].gain, gains, left)
+        assert np.sqrt(mine.mean() / left.min()) < 1.12
+    else:
+        assert (found[-1].gain > 0).all()
+        assert (found[-1].gain <= highest_gain(2.0) * 1.001).all()
+
+
+def test_a_gain_moves_by_a_factor_of_two_and_falls_at_once_where_open_is_better() -> None:
+    made = bank()
+    verdicts(made, drift(1000, 1.0, 10.0, 3), np.zeros(MODES, np.float32), 100.0)
+    low, high = np.full(MODES, made.rows[3]), np.full(MODES, made.rows[-1])
+    up = verdicts(made, drift(500, 5.0, 10.0, 4), low, 100.0)[0]
+    assert set(np.unique(up.gain)) <= {made.rows[3], made.rows[4]}
+    assert (up.gain > low).mean() > 0.8
+    down = verdicts(made, drift(500, 0.0, 10.0, 5), high, 100.0)[0]
+    assert (down.change_nm2 > 2 * down.change_error_nm2).mean() > 0.9  # the gain of now adds to the open loop
+    assert (down.gain < high / 8).mean() > 0.9
+
+
+def test_a_window_that_decides_nothing_grows() -> None:
+    made, rng = bank(windows=(100, 100)), np.random.default_rng(6)
+    gain = np.zeros(MODES, np.float32)
+    lengths = []
+    for _ in range(2000):
+        one = rng.normal(0, 1, MODES).astype(np.float32)
+        if made.followed(one, one, closed=True):
+            lengths.append(made.verdict(gain, None).frames)  # its wishes are not followed
+    assert lengths[0] == 100
+    assert max(lengths) >= 200
+
+
+def _calibration(measured: bool) -> tuple[Calibration, CameraSettings]:
+    rng = np.random.default_rng(7)
+    pixels, modes = 400, 5
+    reference = rng.random(pixels)
+    reference /= reference.sum()
+    response = rng.normal(0, 1e-4, (pixels, modes))
+    response[:, 3] += response[:, 0]  # two that look alike
+    response -= reference[:, None] * response.sum(axis=0)
+    good = np.ones(pixels)
+    R = reconstruct(reference, response, None, good, 1e5, 2.0).matrix
+    camera = CameraSettings(0, (20, 20), 0.0, 65535.0, 2.0, 1.0, 2.0)
+    single = [one.astype(np.float32) for one in (reference, response, R, good, np.zeros(pixels))]
+    shapes = np.zeros((4, modes), np.float32)
+    name = "poke" if measured else "weighted"
+    rest = (shapes, (20, 20), (2, 2), 5e4, 65535.0, name, 550.0, "", "id")
+    return Calibration((2, 3, 4, 5, 6), *single, *rest), camera
+
+
+def test_rows_of_the_modes_that_are_corrected_are_the_estimate_that_knows_the_others_to_be_small() -> None:
+    """R_g of (H'WH + P^-1)^-1 H'W with no prior for those that are corrected; the other rows stay."""
+    calibration, camera = _calibration(measured=False)
+    prior = np.array([0, 0, 1e-3, 1e-4, 0])
+    rows = granted_rows(calibration, prior, 5e4, camera)
+    H, I0 = calibration.response.astype(float), calibration.reference.astype(float)
+    W = 1 / pixel_variance(I0, 1e5, 2.0)
+    inverse = np.diag(np.where(prior > 0, 1 / np.maximum(prior, 1e-12), 0))
+    expected = np.linalg.inv(H.T @ (W[:, None] * H) + inverse) @ (H.T * W)
+    np.testing.assert_allclose(rows[[0, 1, 4]], expected[[0, 1, 4]], rtol=2e-4, atol=2e-4 * np.abs(expected).max())
+    np.testing.assert_array_equal(rows[[2, 3]], calibration.reconstructor[[2, 3]])
+    np.testing.assert_allclose((rows @ calibration.response)[np.ix_([0, 1, 4], [0, 1, 4])], np.eye(3), atol=1e-3)
+    before = np.diag(noise_covariance_nm2(calibration, 5e4, camera))
+    assert (np.einsum("mp,p,mp->m", rows, 1 / W, rows)[[0, 1, 4]] <= 1.001 * before[[0, 1, 4]]).all()
+    assert np.einsum("p,p,p", rows[0], 1 / W, rows[0]) < 0.7 * before[0]  # of the one that another looks like
+
+
+def test_without_modes_to_leave_or_a_known_camera_the_reconstructor_stays() -> None:
+    calibration, camera = _calibration(measured=True)
+    for prior, seen_by in ((np.zeros(5), camera), (np.ones(5), camera), (np.array([1.0, 0, 0, 0, 0]), None)):
+        assert granted_rows(calibration, prior, 5e4, seen_by) is calibration.reconstructor
+
+
+def test_what_is_known_of_modes_that_are_left_is_what_is_measured_less_the_noise() -> None:
+    power, none = np.array([2.0, 1.0, 5.0]), np.zeros(3)
+    found = left_alone_nm2(
+        Verdict(none, power, none, none, None, none, 5000), np.array([True, True, False]), np.ones(3)
+    )
+    np.testing.assert_allclose(found, [1.04, 0.04, 0], rtol=1e-5)

@@ -1,0 +1,146 @@
+"""Automatic gains and the watch over what the loop is worth, on real diffraction and photons, folded in one process."""
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from lowfc.arrays import Single
+from lowfc.contract.codecs.state_codec import controller_state, decode_state
+from lowfc.contract.configuration import FIXED_GAINS
+from lowfc.control.calibration.granted import noise_covariance_nm2
+from lowfc.control.loop.safety import LoopMode
+from tools.law_bench import Bench, calibrated, configured
+
+AUTO = {"control.tilt_gain": "auto", "control.gain": "auto"}
+
+
+def bench(magnitude: float, preset: str = "bench", **changed: Any) -> Bench:
+    star = {
+        "camera.rate_hz": 250.0,
+        "star.magnitude": magnitude,
+        "disturbance.preset": preset,
+        "control.start_mode": "closed",
+    }
+    config = configured("sam", **AUTO | star | changed)
+    return Bench(config, calibrated(config))
+
+
+def named(loop: Bench, name: str) -> list[dict[str, object]]:
+    return [event.details for _, event in loop.events if event.name == name]
+
+
+def rms_nm(loop: Bench, frames: int) -> tuple[float, float]:
+    """True wavefront over the last frames: what is left, and what there would be without the loop."""
+    truths = [truth.continuous for truth in loop.truths[-frames:]]
+    return tuple(
+        float(np.sqrt(np.mean([np.sum(np.square(one)) for one in values])))
+        for values in ([truth.residual_nm for truth in truths], [truth.disturbance_nm for truth in truths])
+    )
+
+
+def gains(loop: Bench) -> Single:
+    assert loop.state.drive is not None
+    return loop.state.drive.law.gain
+
+
+@pytest.fixture(scope="module")
+def faint() -> Bench:
+    loop = bench(6.5)
+    loop.run(1500)
+    return loop
+
+
+def test_it_is_measured_first_and_closed_then(faint: Bench) -> None:
+    modes = [step.mode for step in faint.steps]
+    closed = modes.index(LoopMode.CLOSED)
+    assert closed == 500
+    assert set(modes[closed:]) == {LoopMode.CLOSED}
+    assert named(faint, "MODE_CHANGED")[-1]["why"] == "auto: the gains were measured"
+    assert len(named(faint, "GAINS_CHANGED")) >= 1
+
+
+def test_a_faint_star_is_better_closed_than_open(faint: Bench) -> None:
+    """Of a star of V = 6.5 at 250 Hz, gains of 0.5 and 0.05 leave 19 nm of 7."""
+    left_nm, open_nm = rms_nm(faint, 750)
+    assert left_nm < open_nm
+
+
+def test_modes_that_are_left_alone_bring_less_noise_to_the_others(faint: Bench) -> None:
+    drive = faint.state.drive
+    assert drive is not None
+    assert drive.weighting is not None
+    left = drive.weighting.prior_nm2 > 0
+    assert 0 < left.sum() < left.size
+    np.testing.assert_array_equal(left, drive.law.gain == 0)
+    own, made = (
+        np.diag(
+            noise_covariance_nm2(replace(drive.calibration, reconstructor=rows), faint.steps[-1].flux_dn, drive.camera)
+        )
+        for rows in (drive.calibration.reconstructor, drive.estimator.rows[:-1])
+    )
+    np.testing.assert_array_equal(made[left], own[left])
+    assert (made[~left] < 1.0001 * own[~left]).all()
+    assert (made[~left] < 0.9 * own[~left]).any()
+
+
+def test_whoever_reads_the_state_goes_on_with_the_same_reconstructor(faint: Bench) -> None:
+    drive = faint.state.drive
+    assert drive is not None
+    message = controller_state(faint.state, faint.settings, 1)
+    settings, again = decode_state(message, drive.calibration)
+    assert settings == faint.settings
+    assert again.drive is not None
+    np.testing.assert_array_equal(again.drive.estimator.rows, drive.estimator.rows)
+    np.testing.assert_array_equal(again.drive.automatic, drive.automatic)
+    assert controller_state(again, settings, 1) == message
+
+
+def test_gains_of_a_person_are_not_touched_and_harm_is_said_before_and_after() -> None:
+    loop = bench(6.5, **FIXED_GAINS | {"control.start_mode": "open"})
+    loop.run(500)
+    assert "closing adds" in loop.closing_harm
+    loop.ask("close")
+    loop.run(1000)
+    assert named(loop, "CLOSING_HARMS")[0]["harm"].startswith("closing adds")
+    assert named(loop, "LOOP_HARMS")[0]["action"] == "nothing is done"
+    drive = loop.state.drive
+    assert drive is not None
+    assert set(drive.law.gain.tolist()) == {np.float32(0.5), np.float32(0.05)}
+    assert not named(loop, "GAINS_CHANGED")
+    left_nm, open_nm = rms_nm(loop, 750)
+    assert left_nm > open_nm
+
+
+def test_a_loop_that_harms_opens_where_that_is_configured() -> None:
+    loop = bench(6.5, **FIXED_GAINS | {"control.on_harm": "open"})
+    loop.run(1500)
+    assert loop.steps[-1].mode is LoopMode.OPEN
+    assert named(loop, "MODE_CHANGED")[-1]["why"] == "auto: the loop made it worse"
+
+
+def test_a_mode_can_be_given_a_gain_and_be_made_automatic_again() -> None:
+    loop = bench(2.0)
+    loop.run(510)
+    loop.ask("gain", values=(0.3,), modes=(4,))
+    loop.run(600)
+    drive = loop.state.drive
+    assert drive is not None
+    assert drive.law.gain[2] == np.float32(0.3)
+    assert not drive.automatic[2]
+    loop.ask("gain", text="auto", modes=(4,))
+    assert loop.state.drive is not None
+    assert loop.state.drive.automatic.all()
+
+
+def test_another_star_lowers_the_gains_and_measures_them_anew() -> None:
+    loop = bench(1.5)
+    loop.run(750)
+    bright = gains(loop)
+    loop.star(3.0)
+    loop.run(150)
+    assert named(loop, "STAR_CHANGED")[0]["ratio"] == pytest.approx(0.25, rel=0.1)
+    assert (gains(loop) <= 0.5 * bright).all()
+    loop.run(600)
+    assert len(named(loop, "GAINS_CHANGED")) >= 2
