@@ -23,6 +23,7 @@ from lowfc.programs.commissioning.acceptance import linearity as acceptance_line
 from lowfc.programs.commissioning.acceptance import rejection as acceptance_rejection
 from lowfc.programs.commissioning.conformance.settings import AGREEMENTS
 from lowfc.programs.commissioning.tune.figures import OPTICAL_GAIN_MAS
+from lowfc.programs.console.actions import ACTIONS, SAFE
 from tools import continuous
 from tools.shared import ROOT, markdown
 
@@ -144,8 +145,15 @@ def sentence(text: str | None) -> str:
     return " ".join((text or "").split()).removesuffix(".")
 
 
+def buttons() -> str:
+    """The console's buttons."""
+    rows = [f"| `{one.key}` | {one.name} | {one.sentence} |" for one in (SAFE, *ACTIONS)]
+    return "\n".join(["| key | button | what it does |", "|---|---|---|", *rows]) + "\n"
+
+
 DECLARED: dict[str, Callable[[], str]] = {
     "requests": requests.table,
+    "buttons": buttons,
     "packages": packages,
     "requirements": requirements,
     "continuous": continuous.table,

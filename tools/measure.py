@@ -7,6 +7,7 @@ Example:
     python -m tools.measure                # the pages again, from what was measured and from the code
     python -m tools.measure laws sensors   # measures these anew, then the pages
     python -m tools.measure pictures       # the pictures of the views, with real processes
+    python -m tools.measure console        # the pictures of the console
     python -m tools.measure layouts        # the layouts for rerun in deploy/layouts
 """
 
@@ -21,7 +22,7 @@ from benchmarks import curves, step, throughput
 from benchmarks.peers import contest
 from benchmarks.runner import Benchmark, in_markdown
 from lowfc.programs.measure.latency import text as latency_text
-from tools import dark_hole, laws, layouts, loop, pictures, reliability, sensors, slow_modes
+from tools import console, dark_hole, laws, layouts, loop, pictures, reliability, sensors, slow_modes
 from tools.declared import DECLARED
 from tools.shared import ROOT, Figures, host, json_of, where
 
@@ -112,7 +113,7 @@ def generated(page: Path) -> str:
 def main() -> None:
     """The command line."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    made = {"pictures": pictures.make, "layouts": layouts.make}
+    made = {"pictures": pictures.make, "console": console.make, "layouts": layouts.make}
     known = (*MEASUREMENTS, *made)
     parser.add_argument("names", nargs="*", metavar="NAME", help=f"any of {', '.join(known)}")
     names = parser.parse_args().names

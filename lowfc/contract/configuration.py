@@ -134,6 +134,14 @@ class Recorder(Section):
     """Record every Nth frame and mirror state only; steps and commands are always whole. 1: all, as replay needs."""
     topics: list[str] = Field(default_factory=list)
     """Of frames, mirror state, mirror surface, truth and timing, the topics or patterns to record; empty for all."""
+    on_event: str = ""
+    """Shell command that the recorder runs on events, told which in the variables LOWFC_EVENT, LOWFC_TEXT, LOWFC_LEVEL,
+    LOWFC_PROCESS, LOWFC_TIME, LOWFC_RUN and LOWFC_OTHERS; empty for none."""
+    on_event_level: Literal["info", "warning", "error"] = "error"
+    """Least severe level of event that it is run for."""
+    on_event_every_s: float = Field(10.0, ge=0)
+    """Time from the end of one run of it to the next, which is for the worst event since; LOWFC_OTHERS counts the
+    others."""
 
 
 class Realtime(Section):

@@ -128,6 +128,7 @@ EVENTS: dict[str, Event] = {
         Event("MESSAGES_LOST", Level.ERROR, "{count:message} lost on {topic}"),
         Event("RECORDING_FAILED", Level.ERROR, "recording stopped: {why}"),
         Event("DISK_SLOW", Level.WARNING, "the disk took {stall_s:.1f} s for one write; {waiting:message} waited"),
+        Event("ON_EVENT_FAILED", Level.WARNING, "the command of recorder.on_event failed: {why}"),
         Event("VIEW_STUCK", Level.WARNING, "the viewer took nothing for {stuck_s:.0f} s; close its window if it hangs"),
         Event("VIEW_RENEWED", Level.WARNING, "the view began anew: {why}"),
         Event("BAD_MESSAGE", Level.WARNING, "{count} on {topic} could not be read, the last because: {why}"),

@@ -13,6 +13,7 @@ COMMANDS = {
     "Run": (
         Row("sim-loop", "launch.command:sim_loop", "Run the simulated loop: camera, mirror, controller, recorder."),
         Row("ctl", "cli.ctl.command:ctl_app", "Operate a running loop: status, open, close, gain, offset."),
+        Row("console", "console.command:console", "Operate a running loop from one screen, with buttons."),
         Row("controller", "cli.processes:controller", "Run the controller: frames in, mirror commands out."),
         Row("camera", "cli.devices:camera_app", "Run a camera: the frames of its driver to a run."),
         Row("mirror", "cli.devices:mirror_app", "Run a mirror: its driver follows the commands of a run."),

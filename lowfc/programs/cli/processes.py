@@ -87,6 +87,8 @@ def record(
     from lowfc.adapters.logs.series import Limits
     from lowfc.adapters.process.join import clock_of
     from lowfc.client.runs import nobody_yet
+    from lowfc.contract.events import Level
+    from lowfc.programs.core.recording.alarm import Alarm
     from lowfc.programs.core.recording.process import record as run_recorder
     from lowfc.programs.core.recording.summary import figures, report
     from lowfc.programs.core.recording.volume import bytes_per_s, outlook, selected
@@ -122,6 +124,11 @@ def record(
         selection=recorded,
         expected_bytes_per_s=bytes_per_s(settings, recorded),
         begins=lambda: typer.echo(outlook(settings), err=True),
+        alarm=lambda service: (
+            Alarm(service, log.on_event, Level[log.on_event_level.upper()], log.on_event_every_s)
+            if log.on_event
+            else None
+        ),
     )
     typer.echo(json.dumps(figures(done)) if as_json else report(done), err=not as_json)
     if done.failure:

@@ -11,6 +11,7 @@ from lowfc.adapters.logs.writer import Attachment
 from lowfc.adapters.process.clock import Clock, HostClock
 from lowfc.adapters.process.provenance import provenance
 from lowfc.adapters.process.realtime import step_back
+from lowfc.adapters.process.service import Service
 from lowfc.contract.codecs import input_file
 from lowfc.contract.errors import DataFileError
 from lowfc.contract.messages import Role
@@ -34,10 +35,12 @@ def record(
     selection: Selection = EVERYTHING,
     expected_bytes_per_s: float = 0.0,
     begins: Callable[[], None] = lambda: None,
+    alarm: Callable[[Service], object] = lambda service: None,
 ) -> Summary:
     """Record a run into `folder` until SIGTERM or SIGINT; the process of `lowfc record`.
 
-    The files `configuration` (TOML) and `calibration` (FITS) go into each log; `begins` is called once there is room.
+    The files `configuration` (TOML) and `calibration` (FITS) go into each log; `begins` is called once there is room,
+    and `alarm` with the service whose events it watches.
 
     Raises:
         BusError: another recorder has this run.
@@ -69,6 +72,7 @@ def record(
         )
         recorder.catch_signals()
         recorder.service.announces = True
+        alarm(recorder.service)
         return recorder.run()
     finally:
         bus.close()

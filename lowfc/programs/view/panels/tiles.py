@@ -17,7 +17,7 @@ from lowfc.programs.view.draw.plots import at
 from lowfc.programs.view.panels.panel import Panel
 from lowfc.programs.view.snapshot import Snapshot
 from lowfc.programs.view.verdicts.night import Night
-from lowfc.programs.view.verdicts.tile import Level, Tile, Verdict
+from lowfc.programs.view.verdicts.tile import FILL, INK, WORD, Level, Tile, Verdict
 from lowfc.programs.view.verdicts.verdict import judge
 from lowfc.programs.view.verdicts.watcher import Watcher
 
@@ -25,21 +25,6 @@ TILES = "status/tiles"
 WIDTH, HEIGHT = 1760, 256
 GROUND: Colour = (13, 16, 17)
 """Rerun's own, so that only the tiles are seen."""
-FILL: dict[Level, Colour] = {
-    Level.NEUTRAL: (38, 42, 52),
-    Level.GOOD: (0, 98, 80),
-    Level.WARNING: (240, 200, 40),
-    Level.BAD: (222, 80, 10),
-}
-"""They differ in lightness too: dark grey, green, orange red, bright yellow."""
-INK: dict[Level, Colour] = {
-    Level.NEUTRAL: (235, 235, 240),
-    Level.GOOD: (235, 245, 240),
-    Level.WARNING: (20, 16, 0),
-    Level.BAD: (255, 255, 255),
-}
-WORD: dict[Level, str] = {Level.NEUTRAL: "", Level.GOOD: "ok", Level.WARNING: "CHECK", Level.BAD: "ALARM"}
-"""Never colour alone."""
 SHORTEST_NS = 250_000_000
 """Between pictures with another word or colour. Where only figures differ, there is one for each second of the clock:
 nobody reads them faster, and each stays in the viewer's memory."""

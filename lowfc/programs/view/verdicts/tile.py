@@ -4,6 +4,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from enum import IntEnum
 
+from lowfc.programs.view.draw.colours import Colour
 from lowfc.programs.view.verdicts.run_state import GRACE_S, Liveness, Process
 
 _LONGEST = 110  # letters
@@ -16,6 +17,23 @@ class Level(IntEnum):
     GOOD = 1
     WARNING = 2
     BAD = 3
+
+
+FILL: dict[Level, Colour] = {
+    Level.NEUTRAL: (38, 42, 52),
+    Level.GOOD: (0, 98, 80),
+    Level.WARNING: (240, 200, 40),
+    Level.BAD: (222, 80, 10),
+}
+"""They differ in lightness too: dark grey, green, orange red, bright yellow."""
+INK: dict[Level, Colour] = {
+    Level.NEUTRAL: (235, 235, 240),
+    Level.GOOD: (235, 245, 240),
+    Level.WARNING: (20, 16, 0),
+    Level.BAD: (255, 255, 255),
+}
+WORD: dict[Level, str] = {Level.NEUTRAL: "", Level.GOOD: "ok", Level.WARNING: "CHECK", Level.BAD: "ALARM"}
+"""Never colour alone."""
 
 
 @dataclass(frozen=True, slots=True)

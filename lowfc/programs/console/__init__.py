@@ -1,0 +1,1 @@
+"""`lowfc console`: a running loop on one screen, with buttons."""

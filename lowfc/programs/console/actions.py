@@ -1,0 +1,172 @@
+"""Every button of the console: its key, and what it does. Requests are those of `lowfc.client.requests`."""
+
+from collections.abc import Callable, Mapping
+from contextlib import suppress
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from lowfc.adapters.files import calibration_file, law_file
+from lowfc.adapters.files.mirror_maps import read_shape
+from lowfc.client import Answer, Client
+from lowfc.client.requests import BY_NAME
+from lowfc.contract.errors import ConfigurationError, RequestRefusedError
+from lowfc.programs.cli.modes import noll_of
+
+Values = Mapping[str, str]
+"""What an operator typed, by field."""
+
+
+class Field(NamedTuple):
+    """One line of a form: its name, what is expected, and what stands there at first."""
+
+    name: str
+    label: str
+    usual: Callable[[], str] = str
+
+
+class Action(NamedTuple):
+    """One button.
+
+    Attributes:
+        key: that presses it.
+        name: on the button.
+        sentence: what it does.
+        fields: that are filled in first; with `confirm` alone there is a question.
+        ask: requests it of the loop; None for a task.
+        task: words of a `lowfc` command that is started as a process of its own; the fields are its options.
+        confirm: question before it.
+    """
+
+    key: str
+    name: str
+    sentence: str
+    fields: tuple[Field, ...] = ()
+    ask: Callable[[Client, Values], Answer] | None = None
+    task: tuple[str, ...] = ()
+    confirm: str = ""
+
+    def command(self, values: Values, run: str) -> list[str]:
+        """The words of a task's command."""
+        options = [word for name, value in values.items() if value and name != LOAD for word in (f"--{name}", value)]
+        load = ["--load"] if values.get(LOAD, "").lower() in ("y", "yes") else []
+        return [*self.task, *options, *load, "--run", run]
+
+
+LOAD = "load"
+_READERS: dict[str, tuple[str, Callable[[str], Any]]] = {
+    "modes": ("modes", lambda text: noll_of([text] if text else None)),
+    "values": ("values", lambda text: numbers(text)),
+    "text": ("text", str),
+    "actuators": ("actuators_nm", lambda text: read_shape(Path(text)) if text else None),
+    "law": ("law", lambda text: law_file.load(Path(text)) if text else None),
+    "calibration": ("calibration", lambda text: calibration_file.load(Path(text))),
+}
+"""The client's argument, and how it is read, of each field of a request."""
+_FILES = {
+    "actuators": "file (FITS or .npy), nm of surface; empty removes the channel",
+    "law": "file (FITS); empty for the integrator",
+    "calibration": "file (FITS)",
+}
+
+
+def numbers(text: str) -> list[float]:
+    """Numbers with spaces or commas between.
+
+    Raises:
+        ConfigurationError: something else is there.
+    """
+    try:
+        return [float(word) for word in text.replace(",", " ").split()]
+    except ValueError:
+        raise ConfigurationError(f"{text!r}: write numbers, as in 0.3 or 0.3 0.2") from None
+
+
+def requested(key: str, name: str, confirm: str = "") -> Action:
+    """A request as it is declared: its fields are a form."""
+    declared = BY_NAME[name]
+
+    def ask(loop: Client, values: Values) -> Answer:
+        read = {_READERS[field][0]: _READERS[field][1](text) for field, text in values.items()}
+        if name == "channel":  # the client knows the mirror's rows and columns
+            return loop.channel(read["text"], read["actuators_nm"])
+        return loop.ask(name, **read)
+
+    fields = tuple(Field(field, _FILES.get(field, what)) for field, what in declared.fields)
+    return Action(key, name, declared.sentence, fields, ask, confirm=confirm)
+
+
+def _integrator(loop: Client, values: Values) -> Answer:
+    return loop.law()
+
+
+def _record(loop: Client, values: Values) -> Answer:
+    with suppress(RequestRefusedError):  # nothing is being recorded
+        loop.record(False)
+    answer = loop.record(True)
+    if said := "; ".join(f"{name}: {value}" for name, value in values.items() if value):
+        loop.note(said)
+    return answer
+
+
+def _stop_recording(loop: Client, values: Values) -> Answer:
+    return loop.record(False)
+
+
+def _file() -> str:
+    return f"calibration-{datetime.now(UTC):%Y%m%dT%H%M%S}.fits"
+
+
+_OUT = Field("out", "file to be written (FITS)", _file)
+_LOAD = Field(LOAD, "use it at once (yes, no); the loop must be open", lambda: "yes")
+_TARGET = (Field("target", "target"), Field("observer", "observer"))
+
+SAFE = requested("s", "safe")
+ACTIONS = (
+    requested("c", "close"),
+    requested("o", "open"),
+    requested("p", "pause"),
+    requested("t", "step"),
+    requested("g", "gain"),
+    requested("l", "leak"),
+    requested("x", "limit"),
+    requested("w", "law"),
+    Action("i", "no law", "Go back from a linear law to the integrator.", ask=_integrator),
+    requested("f", "offset"),
+    requested("h", "channel"),
+    requested("z", "reset"),
+    requested("y", "stop"),
+    requested("k", "clear", confirm="Leave the safe state? The loop is open afterwards."),
+    Action(
+        "d",
+        "dark",
+        "Take a dark and find bad pixels. Block the star first: by starting it you say that it is dark.",
+        (Field("frames", "frames that are averaged", lambda: "400"), _OUT, _LOAD),
+        task=("calibrate", "dark", "--dark-taken"),
+    ),
+    Action(
+        "e",
+        "reference",
+        "Take the present state of the wavefront as the zero point.",
+        (Field("frames", "frames that are averaged", lambda: "1000"), _OUT, _LOAD),
+        task=("calibrate", "reference"),
+    ),
+    Action(
+        "b",
+        "calibrate",
+        "Measure a calibration with pokes of the mirror.",
+        (
+            Field("method", "poke, hadamard, in-loop", lambda: "hadamard"),
+            Field("snr", "signal-to-noise ratio to reach", lambda: "70"),
+            _OUT,
+            _LOAD,
+        ),
+        task=("calibrate",),
+    ),
+    requested("a", "load"),
+    Action("r", "record", "Begin a new log, with a note of target and observer.", _TARGET, _record),
+    Action("v", "end log", BY_NAME["record/stop"].sentence, ask=_stop_recording),
+    requested("n", "note"),
+)
+"""In their order on the screen."""
+EVERY = {one.name: one for one in (*ACTIONS, SAFE)}

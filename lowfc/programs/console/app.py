@@ -1,0 +1,273 @@
+"""The console's screen: what the run is like, five times a second, and its buttons."""
+
+import threading
+from collections import deque
+from collections.abc import Callable
+from typing import ClassVar
+
+from rich.text import Text
+from textual import on
+from textual.app import App, ComposeResult
+from textual.binding import Binding, BindingType
+from textual.color import Color
+from textual.containers import Grid, Horizontal, Vertical
+from textual.message import Message
+from textual.widgets import Button, Static
+
+from lowfc.adapters.bus.bus import Bus
+from lowfc.adapters.process.clock import Clock
+from lowfc.client import Client
+from lowfc.contract.errors import LowfcError
+from lowfc.contract.events import Level as Severity
+from lowfc.programs.console import panels
+from lowfc.programs.console.actions import ACTIONS, EVERY, SAFE, Action, Values
+from lowfc.programs.console.feed import Feed, Reading
+from lowfc.programs.console.form import Form, Help
+from lowfc.programs.console.gains import Gains
+from lowfc.programs.console.task import Task
+from lowfc.programs.view.verdicts.tile import FILL, INK, Level
+
+FIGURES_S = 0.2
+"""Between two readings; a picture is drawn from every other one or less."""
+PICTURES_EVERY = 3
+MOVED = "moved"
+"""What the application ends with where the run was begun anew, to be joined again."""
+_LEFT = 62
+_LINES = 200
+_MOVED_EVERY = 10
+_OTHERS = (
+    ("↑↓ ←→", "knobs", "Choose a gain knob and turn it, from 0 to 1.5 times the configured gain"),
+    ("m", "mute", "Ring the terminal's bell at errors, or do not"),
+    ("? q", "help, quit", "This help, and leave the console: nothing else ends"),
+)
+
+
+class Answered(Message):
+    """An action has come to its answer, good or not."""
+
+    def __init__(self, action: Action, sentence: str, *, good: bool) -> None:
+        super().__init__()
+        self.action, self.sentence, self.good = action, sentence, good
+
+
+class Console(App[str]):
+    """One run on one screen."""
+
+    CSS = f"""
+    Screen {{ layout: vertical; }}
+    #top {{ height: 2; }}
+    #verdict {{ width: 1fr; height: 2; padding: 0 1; text-style: bold; }}
+    #clock {{ width: 11; height: 2; padding: 0 1; text-style: bold; }}
+    #figures {{ height: 16; }}
+    #left {{ width: {_LEFT}; }}
+    #right {{ width: 1fr; padding: 0 0 0 1; }}
+    #tiles, #modes, #pictures {{ height: 7; }}
+    #tiles, #sparks, #modes, #gains, #log, #peers, #table {{ text-wrap: nowrap; text-overflow: ellipsis; }}
+    #sparks {{ height: 2; }}
+    #gains {{ height: 5; }}
+    #facts {{ height: 4; }}
+    .cut {{ visibility: hidden; }}
+    #log {{ height: 1fr; }}
+    #answer {{ height: 2; padding: 0 1; }}
+    #tasks {{ height: auto; padding: 0 1; display: none; }}
+    #keys {{ height: 3; }}
+    #buttons {{ width: 1fr; grid-size: 7 3; }}
+    #buttons Button {{ width: 100%; min-width: 6; padding: 0; text-align: left;
+                       content-align: left middle; text-wrap: nowrap; }}
+    Button.refused, #answer.refused, #refusal {{ color: $error; text-style: bold; }}
+    #safe {{ width: 15; height: 3; min-width: 10; background: #b00020; color: white; text-style: bold; border: none;
+             content-align: center middle; }}
+    #peers {{ height: 1; }}
+    Form, Help {{ align: center middle; }}
+    Form > Vertical {{ width: 80; height: auto; padding: 1 2; background: $surface; border: round $primary; }}
+    Form Input {{ margin: 0 0 1 0; background: $panel; }}
+    Form Horizontal, #refusal {{ height: auto; }}
+    Help > Vertical {{ width: 100%; height: 100%; background: $surface; padding: 0 1; overflow-y: auto; }}
+    Help Static {{ height: auto; margin: 0 0 1 0; }}
+    """
+    ENABLE_COMMAND_PALETTE = False
+    AUTO_FOCUS = None
+    BINDINGS: ClassVar[list[BindingType]] = [
+        *(Binding(f"{one.key},{one.key.upper()}", f"press({one.name!r})") for one in ACTIONS),
+        Binding("s,S", f"press({SAFE.name!r})"),
+        Binding("f12", f"press({SAFE.name!r})", priority=True),
+        *(Binding(key, f"choose({by})") for key, by in (("up", -1), ("down", 1))),
+        *(Binding(key, f"turn({by})") for key, by in (("left", -1), ("right", 1), ("minus", -1), ("plus", 1))),
+        Binding("m", "mute"),
+        Binding("question_mark", "help"),
+        Binding("q", "quit"),
+    ]
+
+    def __init__(self, bus: Bus, run_id: str, clock: Clock, moved: Callable[[], bool] = lambda: False) -> None:
+        """Look at a run; `moved` says whether it was begun anew, with other links."""
+        super().__init__()
+        self._bus, self._run_id, self._run_clock, self._moved = bus, run_id, clock, moved
+        self._feed = Feed(bus, run_id, clock)
+        self._lines: deque[Text] = deque(maxlen=_LINES)
+        self._shown: dict[str, Text] = {}
+        self._tasks: list[Task] = []
+        self._mute = False
+        self._readings = 0
+
+    def compose(self) -> ComposeResult:
+        """Lay it out."""
+        with Horizontal(id="top"):
+            yield Static(id="verdict", markup=False)
+            yield Static(id="clock", markup=False)
+        with Horizontal(id="figures"):
+            with Vertical(id="left"):
+                for name in ("tiles", "sparks", "modes"):
+                    yield Static(id=name)
+            with Vertical(id="right"):
+                yield Static(id="pictures")
+                yield Gains()
+                yield Static(id="facts")
+        yield Static(id="log")
+        yield Static("? shows what there is to press", id="answer", markup=False)
+        yield Static(id="tasks", markup=False)
+        with Horizontal(id="keys"):
+            with Grid(id="buttons"):
+                for one in ACTIONS:
+                    yield Button(Text(f"{one.key} {one.name}"), id=_id(one), compact=True)
+            yield Button("SAFE\nkey s or F12", id=_id(SAFE))
+        yield Static(id="peers")
+
+    def on_mount(self) -> None:
+        """Begin to read."""
+        self.set_interval(FIGURES_S, self._read)
+
+    def action_press(self, name: str) -> None:
+        """Do what a button does: at once, or with a form first."""
+        action = EVERY[name]
+        if action.fields or action.confirm:
+            self.push_screen(Form(action))
+        else:
+            self._do(action, {})
+
+    def action_choose(self, by: int) -> None:
+        """Choose a knob."""
+        self.query_one(Gains).choose(by)
+
+    def action_turn(self, steps: int) -> None:
+        """Turn the chosen knob."""
+        self.query_one(Gains).turn(steps)
+
+    def action_mute(self) -> None:
+        """Ring no bell, or ring it again."""
+        self._mute = not self._mute
+        self._answer(f"the bell is {'off' if self._mute else 'on'}", good=True)
+
+    def action_help(self) -> None:
+        """Show what there is to press."""
+        rows = [
+            ("s F12", "SAFE", f"At once, in a form with F12: {SAFE.sentence}"),
+            *((one.key, one.name, one.sentence) for one in ACTIONS),
+            *_OTHERS,
+        ]
+        self.push_screen(Help(rows))
+
+    @on(Button.Pressed)
+    def _pressed(self, event: Button.Pressed) -> None:
+        name = next((one.name for one in EVERY.values() if _id(one) == event.button.id), None)
+        if name is not None:
+            self.set_focus(None)
+            self.action_press(name)
+
+    @on(Form.Filled)
+    def _filled(self, event: Form.Filled) -> None:
+        self._do(event.action, event.values)
+
+    @on(Gains.Turned)
+    def _turned(self, event: Gains.Turned) -> None:
+        self._do(EVERY["gain"], {"modes": ",".join(map(str, event.modes)), "values": " ".join(map(str, event.values))})
+
+    def _do(self, action: Action, values: Values) -> None:
+        """Start a task, or ask in a thread of its own: nobody waits for an answer, least of all a later SAFE."""
+        self._answer(f"{action.name}: asked", good=True)
+
+        def ask() -> None:
+            try:
+                if action.ask is None:
+                    self._tasks.append(Task(action.name, action.command(values, self._run_id)))
+                    sentence = f"{action.name}: started"
+                else:
+                    answer = action.ask(Client(self._run_id, bus=self._bus), values)
+                    since = f", from frame {answer.frame} on" if answer.frame else ""
+                    sentence = f"{action.name}: {answer.reply}{since}"
+            except (LowfcError, OSError, ValueError) as fault:
+                self.post_message(Answered(action, str(fault), good=False))
+            else:
+                self.post_message(Answered(action, sentence, good=True))
+
+        threading.Thread(target=ask, name=action.name, daemon=True).start()
+
+    @on(Answered)
+    def _answered(self, event: Answered) -> None:
+        self._answer(event.sentence, good=event.good)
+        self.query_one(f"#{_id(event.action)}").set_class(not event.good, "refused")
+        if event.action.name == "gain" and not event.good:
+            self.query_one(Gains).forget()
+        form = self.screen
+        if isinstance(form, Form) and form.what is event.action:
+            if event.good:
+                form.dismiss()
+            else:
+                form.refuse(event.sentence)
+
+    def _answer(self, sentence: str, *, good: bool) -> None:
+        answer = self.screen_stack[0].query_one("#answer", Static)
+        answer.set_class(not good, "refused")
+        answer.update(sentence, layout=False)
+
+    def _read(self) -> None:
+        reading = self._feed.read()
+        self._readings += 1
+        self._show(reading)
+        self._watch_tasks()
+        if not reading.connected and self._readings % _MOVED_EVERY == 0 and self._moved():
+            self.exit(MOVED)
+
+    def _show(self, reading: Reading) -> None:
+        level, sentence = panels.verdict(reading, self._run_id)
+        self._colour(level)
+        self._put("verdict", Text(sentence))
+        self._put("clock", Text(f"{panels.clock(reading.host_ns)}\nUTC"))
+        self.screen_stack[0].query_one("#figures").set_class(not reading.connected, "cut")
+        if reading.connected:
+            self._put("tiles", panels.tiles(reading))
+            self._put("sparks", panels.sparks(reading))
+            self._put("modes", panels.modes(reading, _LEFT))
+            self._put("facts", panels.facts(reading))
+            if self._readings % PICTURES_EVERY == 0:
+                self._put("pictures", panels.pictures(reading))
+            self.screen_stack[0].query_one(Gains).show(reading)
+        self._put("peers", panels.peers(reading, self._run_id))
+        self._lines.extend([*map(panels.request_line, reading.requests), *map(panels.event_line, reading.events)])
+        shown = list(self._lines)[-max(1, self._main("#log").size.height) :]
+        self._put("log", Text("\n").join(shown))
+        if not self._mute and any(event.level >= Severity.ERROR for event in reading.events):
+            self.bell()
+
+    def _watch_tasks(self) -> None:
+        for task in [one for one in self._tasks if one.status is not None]:
+            self._tasks.remove(task)
+            self._answer(task.sentence, good=not task.status)
+        self._main("#tasks").display = bool(self._tasks)
+        self._put("tasks", Text("\n".join(task.sentence for task in self._tasks)))
+
+    def _colour(self, level: Level) -> None:
+        for name in ("#verdict", "#clock"):
+            styles = self._main(name).styles
+            styles.background, styles.color = Color(*FILL[level]), Color(*INK[level])
+
+    def _put(self, name: str, text: Text) -> None:
+        if self._shown.get(name) != text:
+            self._shown[name] = text
+            self._main(f"#{name}").update(text, layout=False)
+
+    def _main(self, name: str) -> Static:
+        return self.screen_stack[0].query_one(name, Static)
+
+
+def _id(action: Action) -> str:
+    return action.name.replace(" ", "-")

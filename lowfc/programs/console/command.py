@@ -1,0 +1,46 @@
+"""The command `lowfc console`."""
+
+import sys
+
+from lowfc.adapters.process.terminal import AnyRun
+from lowfc.contract.errors import ConfigurationError
+
+
+def console(run: AnyRun = None) -> None:
+    """Operate a running loop from one screen of a terminal, of 100 x 30 characters and more.
+
+    What it shows is the view's verdict and figures; what it asks, `lowfc ctl` can ask, too. Key ? shows the keys.
+
+    Example: lowfc console
+    """
+    if not (sys.stdin.isatty() and sys.stderr.isatty()):
+        raise ConfigurationError("the console needs a terminal; `lowfc ctl` operates a loop without one")
+    from lowfc.adapters.process.realtime import give_way
+
+    give_way()
+    from lowfc.client.runs import the_run
+
+    run_id = the_run(run)
+    while _operated(run_id):
+        pass
+
+
+def _operated(run_id: str) -> bool:
+    """Operate a run until the operator leaves; true where it was begun anew meanwhile, and is to be joined again."""
+    from lowfc.adapters.bus.run import open_run
+    from lowfc.adapters.bus.zenoh_bus import ZenohBus
+    from lowfc.adapters.process.join import clock_of
+    from lowfc.contract.configuration import load
+    from lowfc.contract.messages import Role
+    from lowfc.programs.console.app import MOVED, Console
+
+    joined = open_run(run_id, ())
+    links, own = joined.path / "links.json", joined.path / "config.toml"
+    made_ns = links.stat().st_ctime_ns
+    clock = clock_of(load(own if own.exists() else None))
+    bus = ZenohBus(joined.links, Role.OPERATOR, clock, monitor=True)
+    try:
+        app = Console(bus, run_id, clock, lambda: links.exists() and links.stat().st_ctime_ns != made_ns)
+        return app.run() == MOVED
+    finally:
+        bus.close()

@@ -1,0 +1,169 @@
+"""What arrives from the run, as one reading several times a second: the verdict of the view's tiles, and figures."""
+
+import threading
+import time
+from collections import deque
+from typing import NamedTuple
+
+import numpy as np
+from google.protobuf.message import DecodeError
+
+from lowfc.adapters.bus.bus import Bus, Sample, states
+from lowfc.adapters.process.clock import Clock
+from lowfc.arrays import Pixels, Single
+from lowfc.client import Client, configuration_of
+from lowfc.contract.codecs.codec import actuators
+from lowfc.contract.configuration import Configuration
+from lowfc.contract.errors import LowfcError
+from lowfc.contract.messages import EVENT, REQUEST, STEP, SURFACE, TRUTH, Log, Topic, wire
+from lowfc.optics.detector.photometry import tilt_nm_per_mas
+from lowfc.programs.view.snapshot import SHOWN, Accumulator, LastHealth
+from lowfc.programs.view.verdicts.run_state import RunState
+from lowfc.programs.view.verdicts.tile import Verdict
+from lowfc.programs.view.verdicts.verdict import judge
+from lowfc.programs.view.verdicts.watcher import Watcher
+
+CUT_S = 1.5
+"""Without a message of any process for so long the console is cut off: each sends Health twice a second."""
+TREND = 60
+"""Seconds that the sparklines show, one value each."""
+_WAITING = {EVENT: 200, REQUEST: 200, STEP: 4000, TRUTH: 4000}
+_TOPICS = (*(topic for topic in SHOWN if topic is not SURFACE), REQUEST)
+_POINT_NS = 1_000_000_000
+_UNSEEN = frozenset(("status", "configuration", "renew"))
+"""Requests that change nothing, and come by themselves."""
+
+
+class Reading(NamedTuple):
+    """The run as it is now.
+
+    Attributes:
+        silent_s: since the newest message was sent; None before the first.
+        frame, mirror_nm: the newest ones; None before the first.
+        command_nm: (modes,) of the last step.
+        events, requests: new ones.
+        residual_nm, light: a value for each second, NaN where there is none.
+        noll, base_gain: modes of the calibration, and the configured gain of each; empty before they are known.
+    """
+
+    host_ns: int
+    silent_s: float | None
+    state: RunState
+    verdict: Verdict
+    frame: Pixels | None
+    mirror_nm: Single | None
+    command_nm: Single
+    health: dict[str, LastHealth]
+    events: list[Log]
+    requests: list[wire.Request]
+    residual_nm: list[float]
+    light: list[float]
+    noll: tuple[int, ...]
+    base_gain: Single
+
+    @property
+    def connected(self) -> bool:
+        """Whether what is shown is new."""
+        return self.silent_s is not None and self.silent_s < CUT_S
+
+
+class Feed:
+    """Receives as a monitor does: messages wait in rings that keep the newest, and the loop waits for nobody."""
+
+    def __init__(self, bus: Bus, run_id: str, clock: Clock) -> None:
+        """Subscribe."""
+        self._bus, self._run_id, self._clock = bus, run_id, clock
+        waiting = {topic: _WAITING.get(topic, 1 if topic.latest_only else 100) for topic in _TOPICS}
+        self._rings = {topic: bus.ring(topic, waiting[topic]) for topic in _TOPICS}
+        self._earlier: deque[tuple[Topic, Sample]] = deque()
+        self._accumulator = Accumulator(clock.now_ns() if clock.lockstep else None)
+        self._watcher = Watcher()
+        self._config: Configuration | None = None
+        self._known: set[tuple[str, int]] = set()
+        self._frame: Pixels | None = None
+        self._mirror_nm: Single | None = None
+        self._command_nm = np.zeros(0, np.float32)
+        self._trend: deque[tuple[float, float]] = deque(maxlen=TREND)
+        self._point_ns = 0
+        self._read_s = time.monotonic()
+        self._catch_up()
+
+    def read(self) -> Reading:
+        """Take in what has come since the last call."""
+        now_s, host_ns = time.monotonic(), self._clock.host_ns()
+        behind_s, self._read_s = max(0.0, now_s - self._read_s - 0.5), now_s
+        requests = [_request(sample) for sample in self._rings[REQUEST].drain()]
+        arrived = [self._earlier.popleft() for _ in range(len(self._earlier))]
+        for topic, ring in self._rings.items():
+            if topic is not REQUEST:
+                arrived += [(topic, sample) for sample in ring.drain()]
+        for topic, sample in arrived:
+            self._accumulator.add(topic, sample.key, sample.payload, sample.publish_time_ns, sample.sequence)
+        snapshot = self._accumulator.snapshot(host_ns, behind_s=behind_s)
+        there = {(name, one.health.pid) for name, one in snapshot.health.items()}
+        if not there <= self._known:
+            self._known = there
+            self._catch_up()
+        self._watcher.feed(snapshot)
+        state = self._watcher.state()
+        self._frame = self._frame if snapshot.frame is None else snapshot.frame
+        if snapshot.mirror is not None:
+            self._mirror_nm = actuators(snapshot.mirror)
+        if snapshot.steps.mode.size:
+            self._command_nm = snapshot.steps.command_nm[-1]
+        self._extend_trend(state, host_ns)
+        newest_ns = max(snapshot.sent_ns.values(), default=0)
+        per_mas = None if self._config is None else tilt_nm_per_mas(self._config.star.diameter_m)
+        return Reading(
+            host_ns,
+            (host_ns - newest_ns) * 1e-9 if newest_ns else None,
+            state,
+            judge(state, per_mas),
+            self._frame,
+            self._mirror_nm,
+            self._command_nm,
+            dict(snapshot.health),
+            snapshot.events,
+            [one for one in requests if one is not None and one.name not in _UNSEEN],
+            [residual for residual, _ in self._trend],
+            [light for _, light in self._trend],
+            state.noll,
+            self._base_gain(state.noll),
+        )
+
+    def close(self) -> None:
+        """Get no more."""
+        for ring in self._rings.values():
+            ring.close()
+
+    def _extend_trend(self, state: RunState, host_ns: int) -> None:
+        if host_ns - self._point_ns >= _POINT_NS:
+            self._point_ns = host_ns
+            found = state.wavefront
+            light = float("nan") if state.flux is None or state.frame_silent_s is not None else state.flux
+            self._trend.append((float("nan") if found is None else found.residual_nm, light))
+
+    def _base_gain(self, noll: tuple[int, ...]) -> Single:
+        if self._config is None:
+            return np.zeros(0, np.float32)
+        control = self._config.control
+        return np.array([control.tilt_gain if mode in (2, 3) else control.gain for mode in noll], np.float32)
+
+    def _catch_up(self) -> None:
+        """Ask for what was sent before, in a thread: a process that is frozen answers late."""
+
+        def ask() -> None:
+            self._earlier.extend(states(self._bus, SHOWN))
+            try:
+                self._config = configuration_of(Client(self._run_id, bus=self._bus))
+            except LowfcError:  # there is no controller yet: it is asked again when one is
+                return
+
+        threading.Thread(target=ask, name="earlier", daemon=True).start()
+
+
+def _request(sample: Sample) -> wire.Request | None:
+    try:
+        return wire.Request.FromString(sample.payload)
+    except DecodeError:
+        return None

@@ -1,0 +1,89 @@
+"""What lies over the screen for a moment: the form of a button, and the help."""
+
+from collections.abc import Iterable
+from typing import ClassVar
+
+from rich.text import Text
+from textual import on
+from textual.app import ComposeResult
+from textual.binding import BindingType
+from textual.containers import Horizontal, Vertical
+from textual.message import Message
+from textual.screen import ModalScreen
+from textual.widgets import Button, Input, Label, Static
+
+from lowfc.programs.console.actions import Action
+
+HELP = (
+    "The top line says whether all is well, those below it why, as in `lowfc view`. Press a key or click a button. "
+    "In a form: Tab next line, Enter do it, Escape leave. The answer is above the buttons; red: refused. "
+    "When the console ends, the loop and what was started here go on."
+)
+
+
+class Form(ModalScreen[None]):
+    """The fields of an action, or its question; it stays until the answer is good, and shows one that is not."""
+
+    AUTO_FOCUS = "Input, #ok"
+    BINDINGS: ClassVar[list[BindingType]] = [("escape", "dismiss", "leave")]
+
+    class Filled(Message):
+        """Somebody pressed OK."""
+
+        def __init__(self, action: Action, values: dict[str, str]) -> None:
+            super().__init__()
+            self.action, self.values = action, values
+
+    def __init__(self, action: Action) -> None:
+        super().__init__()
+        self.what = action
+
+    def compose(self) -> ComposeResult:
+        """Lay it out."""
+        with Vertical():
+            yield Static(self.what.confirm or f"{self.what.name}: {self.what.sentence}", markup=False)
+            for field in self.what.fields:
+                yield Label(f"{field.name}: {field.label}", markup=False)
+                yield Input(field.usual(), name=field.name, compact=True)
+            yield Static("", id="refusal", markup=False)
+            with Horizontal():
+                yield Button("OK", id="ok", compact=True, variant="primary")
+                yield Button("leave", id="leave", compact=True)
+
+    def refuse(self, why: str) -> None:
+        """Show why it was refused."""
+        self.query_one("#refusal", Static).update(why)
+
+    @on(Input.Submitted)
+    @on(Button.Pressed, "#ok")
+    def _filled(self) -> None:
+        self.refuse("asked, waiting for the answer")
+        self.post_message(self.Filled(self.what, {one.name or "": one.value.strip() for one in self.query(Input)}))
+
+    @on(Button.Pressed, "#leave")
+    def _leave(self) -> None:
+        self.dismiss()
+
+
+class Help(ModalScreen[None]):
+    """What there is to press."""
+
+    BINDINGS: ClassVar[list[BindingType]] = [
+        (key, "dismiss", "leave") for key in ("escape", "question_mark", "q", "enter")
+    ]
+
+    def __init__(self, rows: Iterable[tuple[str, str, str]]) -> None:
+        super().__init__()
+        self._rows = list(rows)
+
+    def compose(self) -> ComposeResult:
+        """Lay it out."""
+        lines = [
+            Text.assemble(
+                (f"{key:6}", "bold"), f"{name:11}", sentence.partition(". ")[0].partition("; ")[0].rstrip(".")
+            )
+            for key, name, sentence in self._rows
+        ]
+        with Vertical():
+            yield Static(HELP, markup=False)
+            yield Static(Text("\n").join(lines), id="table")

@@ -1,0 +1,203 @@
+"""The parts of the screen as text: a reading in, lines out."""
+
+from collections.abc import Sequence
+from datetime import UTC, datetime
+from functools import lru_cache
+
+import numpy as np
+from rich.style import Style
+from rich.text import Text
+
+from lowfc.arrays import Array
+from lowfc.contract.envelope import count_of
+from lowfc.contract.events import Level as Severity
+from lowfc.contract.messages import Log, from_timestamp, wire
+from lowfc.contract.printable import printable
+from lowfc.programs.console.feed import Reading
+from lowfc.programs.view.draw.colours import GREY, ORANGE, RED, YELLOW, Colour, Rgb, diverging, sequential
+from lowfc.programs.view.verdicts.run_state import Liveness
+from lowfc.programs.view.verdicts.tile import FILL, INK, WORD, Level, duration, figure
+from lowfc.programs.view.verdicts.watcher import SILENT_S
+
+_PIXELS = 12
+"""Rows and columns of a picture; two rows share a line of text."""
+_MODE_LINES = 7
+_SPARKS = "▁▂▃▄▅▆▇█"
+_NEAR_LIMIT = 0.95
+
+
+@lru_cache(maxsize=4096)
+def style(ink: Colour | None = None, ground: Colour | None = None, *, bold: bool = False) -> Style:
+    """Style of these colours; None leaves the terminal's."""
+    red_green_blue = [None if one is None else "#{:02x}{:02x}{:02x}".format(*one) for one in (ink, ground)]
+    return Style(color=red_green_blue[0], bgcolor=red_green_blue[1], bold=bold or None)
+
+
+DIM, WARNED, WRONG, BOLD = style(GREY), style(YELLOW), style(RED, bold=True), style(bold=True)
+
+
+def verdict(reading: Reading, run: str) -> tuple[Level, str]:
+    """The verdict in words, or that there is no connection."""
+    if reading.silent_s is None:
+        return Level.WARNING, f"NOT CONNECTED  no message of run {run} has come yet"
+    if not reading.connected:
+        return Level.BAD, (
+            f"NOT CONNECTED  no message of run {run} for {duration(reading.silent_s)}: figures are hidden. The run was "
+            "killed, or this console is cut off; a loop that runs goes on by itself."
+        )
+    return reading.verdict.level, f"{WORD[reading.verdict.level]}  {reading.verdict.headline}".strip()
+
+
+def clock(host_ns: int) -> str:
+    """Wall clock of a time, UTC."""
+    return f"{datetime.fromtimestamp(host_ns * 1e-9, UTC):%H:%M:%S}"
+
+
+def tiles(reading: Reading) -> Text:
+    """A line for each tile: its title, word or figure, and what that means."""
+    lines = []
+    for tile in reading.verdict.tiles:
+        line = Text.assemble((f"{tile.title:10}", DIM), f"{WORD[tile.level]:5} ")
+        line.append(f" {tile.value:^12} ", style(INK[tile.level], FILL[tile.level], bold=tile.level > Level.GOOD))
+        line.append(f" {tile.detail}", style())
+        lines.append(line)
+    return Text("\n").join(lines)
+
+
+def pictures(reading: Reading) -> Text:
+    """The newest frame and the mirror, small."""
+    lines = [Text() for _ in range(_PIXELS // 2)]
+    captions = []
+    for array, signed in ((reading.frame, False), (reading.mirror_nm, True)):
+        if array is None:
+            drawn, caption = np.zeros((_PIXELS, _PIXELS, 3), np.uint8), "none yet"
+        else:
+            small = reduced(array.astype(np.float64))
+            largest, lowest = float(np.abs(array).max()), 0.0 if signed else float(small.min())
+            shares = (small - lowest) / max(float(np.abs(small - lowest).max()), 1e-9)
+            drawn = diverging(shares) if signed else sequential(shares)
+            caption = f"mirror ±{largest:.0f} nm" if signed else f"frame to {largest:.0f} DN"
+        for line, text in zip(lines, halves(drawn), strict=True):
+            line.append_text(text).append("      ")
+        captions.append(f"{caption:18}")
+    return Text("\n").join([*lines, Text("".join(captions), DIM)])
+
+
+def reduced(array: Array) -> Array:
+    """Means of an image over at most `_PIXELS` x `_PIXELS` parts."""
+    for axis in (0, 1):
+        edges = np.linspace(0, array.shape[axis], _PIXELS + 1).astype(int)[:-1]
+        sizes = np.diff([*edges, array.shape[axis]])
+        sums = np.add.reduceat(array, edges, axis=axis)  # where there are fewer pixels, one stands more than once
+        array = sums / np.maximum(sizes, 1).reshape((-1, 1) if axis == 0 else (1, -1))
+    return array
+
+
+def halves(colours: Rgb) -> list[Text]:
+    """Lines of text whose cells are two pixels, one above the other, (rows, columns, 3)."""
+    lines = []
+    for upper, lower in zip(colours[0::2].tolist(), colours[1::2].tolist(), strict=True):
+        line = Text()
+        for above, below in zip(upper, lower, strict=True):
+            line.append("▀", style(tuple(above), tuple(below)))
+        lines.append(line)
+    return lines
+
+
+def sparks(reading: Reading) -> Text:
+    """Residual and light of the last minute."""
+    found, flux = reading.state.wavefront, reading.state.flux
+    kind = "true" if reading.state.true else "measured"
+    residual = "?" if found is None else f"{figure(found.residual_nm)} nm {kind}"
+    light = "?" if flux is None else f"{100 * flux:.0f} %"
+    rows = ("residual", reading.residual_nm, residual), ("light", reading.light, light)
+    return Text("\n").join(
+        Text.assemble((f"{name:10}", DIM), (f"{sparkline(values, 34):>34}", style(ORANGE)), f" {last}")
+        for name, values, last in rows
+    )
+
+
+def sparkline(values: Sequence[float], width: int) -> str:
+    """The last values as bars from zero to the largest; a space where there is none."""
+    last = np.array(values[-width:])
+    largest = max(np.nanmax(last, initial=0.0), 1e-9) if last.size else 1.0
+    return "".join(" " if np.isnan(one) else _SPARKS[min(int(one / largest * 8), 7)] for one in last)
+
+
+def modes(reading: Reading, width: int) -> Text:
+    """The command of each mode as a bar between its limits, in columns."""
+    state, noll = reading.state.controller_state, reading.noll
+    if state is None or not noll or len(noll) != len(reading.command_nm):
+        return Text("no calibration, so no modes yet", DIM)
+    columns = -(-len(noll) // _MODE_LINES)
+    each = width // columns
+    cells = [
+        _mode(mode, float(command), float(limit), each - 1)
+        for mode, command, limit in zip(noll, reading.command_nm, state.limit_nm, strict=False)
+    ]
+    lines = []
+    for number in range(min(_MODE_LINES, len(cells))):
+        line = Text()
+        for cell in cells[number::_MODE_LINES]:
+            line.append_text(cell).append(" ")
+        lines.append(line)
+    return Text("\n").join(lines)
+
+
+def _mode(noll: int, command_nm: float, limit_nm: float, width: int) -> Text:
+    figures = f"{command_nm:+6.1f}/{limit_nm:.0f}" if width >= 22 else ""
+    half = max(1, (width - 4 - 11 * bool(figures)) // 2)
+    share = min(abs(command_nm) / limit_nm, 1.0) if limit_nm else 1.0
+    bar = "█" * round(share * half)
+    left, right = (f"{bar:>{half}}", " " * half) if command_nm < 0 else (" " * half, f"{bar:{half}}")
+    ink = WRONG if share >= _NEAR_LIMIT else style(ORANGE)
+    known = f"{figures:>11}" if figures else ""
+    return Text.assemble((f"Z{noll:<3}", DIM), (left, ink), ("│", DIM), (right, ink), known)
+
+
+def facts(reading: Reading) -> Text:
+    """What is set: law, offset and channels, who has reserved the loop, the last note."""
+    known, state = reading.verdict.facts, reading.state.controller_state
+    rows = {"law": known["CONTROL LAW"], "shapes": known["OFFSET AND CHANNELS"], "note": known["LAST NOTE"]}
+    if state is not None and state.lease.id and not state.lease.ended:
+        rows["note"] = f"reserved for {printable(state.lease.holder)}"
+    return Text("\n").join(Text.assemble((f"{name:7}", DIM), value) for name, value in rows.items())
+
+
+def peers(reading: Reading, run: str) -> Text:
+    """Who is alive, and at what rate; in red who is silent."""
+    line = Text(f"run {run} ", DIM)
+    for name, last in sorted(reading.health.items()):
+        silent_s, stopped = (reading.host_ns - last.time_ns) * 1e-9, last.health.state in ("stopping", "stopped")
+        if silent_s > SILENT_S and not stopped:
+            line.append(f" {name} silent {duration(silent_s)} ", WRONG)
+        else:
+            line.append(f" {name} {'stopped' if stopped else 'alive'} ", DIM if stopped else style())
+    rate_hz, camera = reading.state.rate_hz, reading.state.camera.life
+    if rate_hz is not None and camera is Liveness.RUNNING and reading.connected:
+        line.append(f" {rate_hz:.0f} Hz", BOLD)
+    return line
+
+
+def event_line(event: Log) -> Text:
+    """An event as it came."""
+    ink = WRONG if event.level >= Severity.ERROR else WARNED if event.level >= Severity.WARNING else style()
+    return Text.assemble(
+        (f"{clock(from_timestamp(event.timestamp))} ", DIM),
+        (f"{printable(event.name)}: ", DIM),
+        (printable(event.message), ink),
+    )
+
+
+def request_line(asked: wire.Request) -> Text:
+    """What was asked, by whom, the answer, and the frame from which it is in force."""
+    fields = [" ".join(f"{value:g}" for value in asked.values), printable(asked.text)]
+    if asked.modes:
+        fields.append(f"modes {','.join(map(str, asked.modes))}")
+    answer = f"{printable(asked.reply)}, from frame {count_of(asked.frame_sequence)} on"
+    return Text.assemble(
+        (f"{clock(from_timestamp(asked.timestamp))} ", DIM),
+        (" ".join(filter(None, [printable(asked.name), *fields])), BOLD),
+        (f" ({printable(asked.requester) or 'somebody'}): ", DIM),
+        (answer, style()) if asked.accepted else (f"refused: {printable(asked.reply)}", WRONG),
+    )

@@ -1,0 +1,59 @@
+"""A command that the console starts: a process of its own, which goes on when the console ends, however it ends."""
+
+import os
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Sequence
+from pathlib import Path
+
+_TAIL_BYTES = 4000
+
+
+class Task:
+    """One such process.
+
+    Attributes:
+        name: of the button.
+        output: file with everything that it writes.
+    """
+
+    def __init__(self, name: str, words: Sequence[str]) -> None:
+        """Start `lowfc` with these words, in a session of its own: neither Ctrl-C nor a lost terminal reaches it."""
+        self.name = name
+        self._began_s = time.monotonic()
+        number, path = tempfile.mkstemp(prefix=f"lowfc-{words[0]}-", suffix=".txt")
+        self.output = Path(path)
+        environment = {key: value for key, value in os.environ.items() if key != "ZENOH_RUNTIME"}  # this monitor's own
+        with os.fdopen(number, "wb") as stream:
+            self._process = subprocess.Popen(  # noqa: S603  # our own program
+                [sys.executable, "-m", "lowfc", *words],
+                stdin=subprocess.DEVNULL,
+                stdout=stream,
+                stderr=stream,
+                env=environment,
+                start_new_session=True,
+            )
+
+    @property
+    def status(self) -> int | None:
+        """Exit status; None while it runs."""
+        return self._process.poll()
+
+    @property
+    def sentence(self) -> str:
+        """How it is, in one line, with the last that it wrote."""
+        lines = [line.strip() for line in self._tail().splitlines() if line.strip()]
+        last = lines[-1] if lines else ""
+        if self.status is None:
+            return f"{self.name}: running for {time.monotonic() - self._began_s:.0f} s{f'; {last}' if last else ''}"
+        if self.status == 0:
+            return f"{self.name}: done; {last}"
+        wrong = next((line for line in reversed(lines) if line.startswith("error:")), last)
+        return f"{self.name} failed: {wrong.removeprefix('error: ')} (all of it: {self.output})"
+
+    def _tail(self) -> str:
+        with self.output.open("rb") as stream:
+            stream.seek(max(0, self.output.stat().st_size - _TAIL_BYTES))
+            return stream.read().decode(errors="replace")

@@ -1,0 +1,85 @@
+"""The command of `recorder.on_event`: what the user wants done when something happens.
+
+The recorder runs it: it is there once for each run, receives every event, and is not in the loop. A console may be
+closed, or open twice. A thread of its own in the normal scheduling class starts the command, which inherits that class;
+what happens meanwhile waits for its end, and then it is the worst of it that the command is run for.
+"""
+
+import contextlib
+import os
+import signal
+import subprocess
+import threading
+import time
+from collections import deque
+
+from lowfc.adapters.bus.bus import Sample
+from lowfc.adapters.process.realtime import give_way
+from lowfc.adapters.process.service import Service
+from lowfc.contract.events import EVENTS, Level
+from lowfc.contract.messages import EVENT, Log, from_timestamp
+from lowfc.contract.printable import printable
+
+PATIENCE_S = 60.0
+"""After which a command is killed."""
+_MOST_WAITING = 1000
+_LEVELS: dict[int, str] = {level.value: level.name.lower() for level in Level}
+_OWN = EVENTS["ON_EVENT_FAILED"].name
+
+
+class Alarm:
+    """Runs a shell command on events of a level, one at a time and not too often."""
+
+    def __init__(self, service: Service, command: str, level: Level, every_s: float) -> None:
+        """Begin with the next event; that the command failed is one, too."""
+        self._command, self._level, self._every_s, self._service = command, level, every_s, service
+        self._waiting: deque[Log] = deque(maxlen=_MOST_WAITING)
+        self._arrived = threading.Event()
+        service.bus.subscribe(EVENT, self._receive)
+        threading.Thread(target=self._work, name="on-event", daemon=True).start()
+
+    def _receive(self, sample: Sample) -> None:
+        event = Log.FromString(sample.payload)
+        if event.level >= self._level and not event.message.startswith(_OWN):
+            self._waiting.append(event)
+            self._arrived.set()
+
+    def _work(self) -> None:
+        give_way()  # this thread alone, and what it starts
+        while self._arrived.wait():
+            self._arrived.clear()
+            taken = [self._waiting.popleft() for _ in range(len(self._waiting))]
+            if taken:
+                self._run(max(taken, key=lambda event: event.level), len(taken) - 1)
+                time.sleep(self._every_s)
+
+    def _run(self, event: Log, others: int) -> None:
+        name, _, sentence = printable(event.message).partition(" ")
+        arguments = {
+            "LOWFC_RUN": self._service.run_id,
+            "LOWFC_EVENT": name,
+            "LOWFC_TEXT": sentence,
+            "LOWFC_LEVEL": _LEVELS.get(event.level, str(event.level)),
+            "LOWFC_PROCESS": printable(event.name),
+            "LOWFC_TIME": f"{from_timestamp(event.timestamp) * 1e-9:.3f}",
+            "LOWFC_OTHERS": str(others),
+        }
+        try:
+            command = subprocess.Popen(  # noqa: S603  # the user's own
+                ["/bin/sh", "-c", self._command],
+                stdin=subprocess.DEVNULL,
+                env={**os.environ, **arguments},
+                start_new_session=True,
+            )
+            if status := command.wait(PATIENCE_S):
+                self._fail(f"it ended with exit status {status}")
+        except subprocess.TimeoutExpired:
+            with contextlib.suppress(ProcessLookupError):
+                os.killpg(command.pid, signal.SIGKILL)
+            command.wait()
+            self._fail(f"it was killed after {PATIENCE_S:g} s")
+        except OSError as fault:
+            self._fail(f"it cannot be run: {fault.strerror}")
+
+    def _fail(self, why: str) -> None:
+        self._service.event(_OWN, why=why)

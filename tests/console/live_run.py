@@ -1,0 +1,98 @@
+"""A run in one process, in real time: controller and mirror as they are, the toy's frames, a recorder that answers."""
+
+import threading
+import time
+from pathlib import Path
+
+from lowfc.adapters.bus.bus import Query
+from lowfc.adapters.files import factory
+from lowfc.adapters.process.clock import HostClock
+from lowfc.adapters.process.latch import Latch
+from lowfc.adapters.process.service import Service
+from lowfc.contract.codecs.calibration_codec import identified
+from lowfc.contract.configuration import load
+from lowfc.contract.messages import CAMERA_STATE, FRAME, MIRROR_STATE, RECORD_KEY, REQUEST, image, wire
+from lowfc.device.driver import DriverOptions
+from lowfc.device.mirror_loop import MirrorLoop
+from lowfc.programs.core.controller import Controller
+from lowfc.testing.memory_bus import MemoryBus, MemoryHub
+from sim_dm.driver import SimulatedMirror
+from tests.support.loops import until
+from tests.support.toy import FLUX_DN, GRID, SATURATION_DN, SHAPE, TOY, calibration
+
+RUN = "toy"
+CONFIG = load(
+    None,
+    {
+        "mirror.rows": GRID[0],
+        "mirror.columns": GRID[1],
+        "camera.rate_hz": 50.0,
+        "control.start_mode": "closed",
+        "control.max_frame_age_ms": 5000.0,
+        "control.max_identical_frames": 0,
+        "control.command_timeout_ms": 5000.0,
+        "control.frame_timeout_ms": 5000.0,
+        "realtime.cache_warmup": False,
+    },
+)
+
+
+class LiveRun:
+    """The run.
+
+    Attributes:
+        asked: requests as the controller published them.
+        recorded: what was asked of the recorder.
+        flux: of the star, as the calibration expects it at 1.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        self.hub, self.clock = MemoryHub(), HostClock()
+        self.asked: list[wire.Request] = []
+        self.recorded: list[str] = []
+        self.flux = 1.0
+        observer = self.bus("observer")
+        observer.subscribe(REQUEST, lambda sample: self.asked.append(wire.Request.FromString(sample.payload)))
+        mirror_states: list[object] = []
+        observer.subscribe(MIRROR_STATE, mirror_states.append)
+        self.bus("recorder").queryable(RECORD_KEY.format(name="*"), self._record)
+        self.services = [
+            Service(name, RUN, self.clock, self.bus(name)) for name in ("controller", "mirror-dm", "camera")
+        ]
+        controller, mirror, self.camera = self.services
+        self.frames, settings = self.camera.publisher(FRAME), self.camera.publisher(CAMERA_STATE)
+        processes = [MirrorLoop(SimulatedMirror(DriverOptions(), CONFIG), mirror, CONFIG)]
+        processes.append(Controller(CONFIG, controller, identified(calibration()), "a test", Latch([folder / "safe"])))
+        self._threads = [threading.Thread(target=one.run, daemon=True) for one in processes]
+        self._threads.append(threading.Thread(target=self._expose, daemon=True))
+        camera = factory.camera_state(CONFIG, SHAPE, self.clock.now_ns())
+        camera.saturation_dn = SATURATION_DN
+        settings.put(camera.SerializeToString())
+        for thread in self._threads:
+            thread.start()
+        until(lambda: mirror_states)
+
+    def bus(self, role: str) -> MemoryBus:
+        return MemoryBus(self.hub, role, self.clock)
+
+    def stop(self) -> None:
+        for service in reversed(self.services):
+            service.stop("the test is over")
+        for thread in self._threads:
+            thread.join(10)
+        assert not any(thread.is_alive() for thread in self._threads)
+
+    def _expose(self) -> None:
+        self.camera.state = "running"
+        while self.camera.running:
+            pixels = TOY.pixels([5.0, -3.0, 2.0], self.flux * FLUX_DN)
+            self.frames.put(image(pixels, self.clock.now_ns(), "toy").SerializeToString())
+            self.camera.work += 1
+            self.camera.beat()
+            time.sleep(0.02)
+        self.camera.finish()
+
+    def _record(self, query: Query) -> None:
+        self.recorded.append(query.name)
+        answer = wire.Request(name=query.name, accepted=True, reply=f"{query.name}: night.mcap", text="night.mcap")
+        query.reply(answer.SerializeToString())

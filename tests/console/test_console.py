@@ -1,0 +1,329 @@
+"""The console: every button by its key against a running loop, what it shows, and what it says when it is cut off."""
+
+import asyncio
+import contextlib
+import os
+from collections.abc import AsyncIterator, Awaitable, Callable, Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from lowfc.adapters.files import calibration_file, law_file
+from lowfc.contract.codecs.calibration_codec import identified
+from lowfc.contract.events import EVENTS
+from lowfc.contract.messages import EVENT
+from lowfc.control.laws.linear_law import integrator_block, of_blocks
+from tests.console.live_run import RUN, LiveRun
+from tests.support.loops import until
+from tests.support.stage import Stage
+from tests.support.toy import GRID, NOLL, calibration
+
+LAW = of_blocks([integrator_block(0.2, 0.01, "pol", 1.0)] * 3, "pol", "leaky", NOLL, 1.0, 50.0)
+PATIENCE_S = 15.0
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory: pytest.TempPathFactory) -> Iterator[LiveRun]:
+    one = LiveRun(tmp_path_factory.mktemp("run"))
+    yield one
+    one.stop()
+
+
+@contextlib.asynccontextmanager
+async def console(run: LiveRun) -> AsyncIterator["Screen"]:
+    from lowfc.programs.console.app import Console
+
+    bus = run.bus("operator")
+    app = Console(bus, RUN, run.clock)
+    async with app.run_test(size=(100, 30)) as pilot:
+        screen = Screen(app, pilot)
+        await screen.until(lambda: screen.text("verdict") and "NOT CONNECTED" not in screen.text("verdict"))
+        await screen.until(lambda: "light" in screen.text("sparks"))
+        yield screen
+    bus.close()
+
+
+class Screen:
+    def __init__(self, app, pilot) -> None:
+        self.app, self.pilot = app, pilot
+
+    def text(self, name: str) -> str:
+        return str(self.app.screen_stack[0].query_one(f"#{name}").render())
+
+    async def until(self, met: Callable[[], object]) -> None:
+        for _ in range(round(PATIENCE_S / 0.05)):
+            if met():
+                return
+            await self.pilot.pause(0.05)
+        raise AssertionError(f"waited in vain; the answer is {self.text('answer')!r}")
+
+    async def fill(self, *values: str) -> None:
+        await self.until(lambda: len(self.app.screen_stack) == 2)
+        for field, value in zip(self.app.screen.query("Input"), values, strict=True):
+            field.value = value
+        await self.pilot.press("enter")
+
+
+def played(run: LiveRun, scenario: Callable[[Screen], Awaitable[None]]) -> None:
+    async def whole() -> None:
+        async with console(run) as screen:
+            await scenario(screen)
+
+    asyncio.run(whole())
+
+
+PRESSED: dict[str, tuple[tuple[str, ...], dict[str, object]]] = {
+    "open": ((), {"name": "open"}),
+    "close": ((), {"name": "close"}),
+    "pause": ((), {"name": "pause"}),
+    "step": (("7",), {"name": "step", "values": [7.0]}),
+    "gain": (("2,3", "0.25"), {"name": "gain", "modes": [2, 3], "values": [0.25]}),
+    "leak": (("", "0.01"), {"name": "leak", "modes": []}),
+    "limit": (("4", "40"), {"name": "limit", "modes": [4], "values": [40.0]}),
+    "law": (("law.fits",), {"name": "law"}),
+    "no law": ((), {"name": "law"}),
+    "offset": (("4", "5"), {"name": "offset", "modes": [4], "values": [5.0]}),
+    "channel": (("dark-hole", "shape.npy"), {"name": "channel", "text": "dark-hole"}),
+    "reset": ((), {"name": "reset"}),
+    "stop": ((), {"name": "stop"}),
+    "load": (("calibration.fits",), {"name": "load"}),
+    "note": (("seeing 0.8",), {"name": "note", "text": "seeing 0.8"}),
+    "record": (("HD 209458", "Ann"), {"name": "note", "text": "target: HD 209458; observer: Ann"}),
+    "end log": ((), {}),
+    "safe": ((), {"name": "safe"}),
+    "clear": ((), {"name": "clear"}),
+}
+"""What is typed for each button, and what the controller publishes then."""
+ORDER = ("open", *(name for name in PRESSED if name not in ("open", "close", "pause")), "close", "pause")
+TASKS = {
+    "dark": "calibrate dark --dark-taken --frames 400 --out",
+    "reference": "calibrate reference --frames 1000 --out",
+    "calibrate": "calibrate --method hadamard --snr 70 --out",
+}
+
+
+def test_every_button_by_its_key(run: LiveRun, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    from lowfc.programs.console.actions import EVERY
+
+    assert {*PRESSED, *TASKS} == set(EVERY)
+    monkeypatch.chdir(tmp_path)
+    np.save("shape.npy", np.full(GRID, 3.0))
+    law_file.save(LAW, Path("law.fits"))
+    calibration_file.save(identified(calibration()), Path("calibration.fits"))
+
+    async def scenario(screen: Screen) -> None:
+        for name in ORDER:
+            typed, wanted = PRESSED[name]
+            before = len(run.asked)
+            await screen.pilot.press(EVERY[name].key)
+            if typed:
+                await screen.fill(*typed)
+            elif EVERY[name].confirm:
+                await screen.until(lambda: len(screen.app.screen_stack) == 2)
+                assert len(run.asked) == before, "nothing is asked before the question is answered"
+                await screen.pilot.press("enter")
+            await screen.until(
+                lambda name=name: (
+                    screen.text("answer").startswith(f"{name}: ") and not screen.text("answer").endswith(": asked")
+                )
+            )
+            if wanted:
+                asked = run.asked[-1]
+                assert asked.accepted, asked.reply
+                assert {field: getattr(asked, field) for field in wanted} == wanted
+                assert asked.requester.endswith(f"(process {os.getpid()})")
+            assert len(screen.app.screen_stack) == 1, "a form that was answered closes"
+        laws = [asked for asked in run.asked if asked.name == "law"]
+        assert [one.HasField("law") for one in laws] == [True, False]
+        assert run.recorded == ["stop", "start", "stop"]
+        await screen.until(lambda: "pause (" in screen.text("log"))
+        line = next(line for line in screen.text("log").splitlines() if "pause (" in line)
+        assert f"(process {os.getpid()}))" in line
+        assert "loop paused" in line
+        await screen.pilot.press("c")
+        await screen.until(lambda: "CLOSED" in screen.text("tiles"))
+
+    played(run, scenario)
+
+
+def test_what_is_refused_says_why_in_the_form_and_at_the_button(run: LiveRun) -> None:
+    async def scenario(screen: Screen) -> None:
+        await screen.pilot.press("g")
+        await screen.fill("2", "much")
+        await screen.until(lambda: "write numbers" in str(screen.app.screen.query_one("#refusal").render()))
+        await screen.fill("2", "9")
+        await screen.until(lambda: "becomes unstable" in str(screen.app.screen.query_one("#refusal").render()))
+        assert not run.asked[-1].accepted
+        assert "becomes unstable" in screen.text("answer")
+        await screen.pilot.press("escape")
+        assert screen.app.screen.query_one("#gain").has_class("refused")
+        await screen.pilot.press("g")
+        await screen.fill("", "0.1")
+        await screen.until(lambda: not screen.app.screen_stack[0].query_one("#gain").has_class("refused"))
+
+    played(run, scenario)
+
+
+def test_safe_is_one_key_even_in_a_form_and_one_large_button(run: LiveRun) -> None:
+    async def scenario(screen: Screen) -> None:
+        for press in (lambda: screen.pilot.press("S"), lambda: screen.pilot.click("#safe")):
+            before = len(run.asked)
+            await press()
+            await screen.until(lambda before=before: [one.name for one in run.asked[before:]] == ["safe"])
+        await screen.pilot.press("n")
+        await screen.until(lambda: len(screen.app.screen_stack) == 2)
+        before = len(run.asked)
+        await screen.pilot.press("s", "f12")
+        await screen.until(lambda: [one.name for one in run.asked[before:]] == ["safe"])
+        assert screen.app.screen.query_one("Input").value == "s"
+        await screen.pilot.press("escape", "k", "enter")
+        await screen.until(lambda: run.asked[-1].name == "clear")
+        await screen.pilot.click("#close")
+        await screen.until(lambda: run.asked[-1].name == "close")
+
+    played(run, scenario)
+
+
+def test_the_knobs_turn_all_gains_or_those_of_an_order(run: LiveRun) -> None:
+    def gain() -> list[float]:
+        return list(run.asked[-1].values) if run.asked[-1].name == "gain" else []
+
+    async def scenario(screen: Screen) -> None:
+        await screen.pilot.press("g")
+        await screen.fill("2-4", "0.5 0.5 0.05")
+        await screen.until(lambda: "gain, all" in screen.text("gains") and "1.00 0.05-0.5" in screen.text("gains"))
+        await screen.pilot.press("right", "right")
+        await screen.until(lambda: gain() == pytest.approx([0.55, 0.55, 0.055]))
+        await screen.until(lambda: "1.10 0.055-0.55" in screen.text("gains"))
+        await screen.pilot.press("down", "left")
+        await screen.until(lambda: gain() == pytest.approx([0.525, 0.525]))
+        assert list(run.asked[-1].modes) == [2, 3]
+        await screen.pilot.click("#gains", offset=(11 + 10, 0))
+        await screen.until(lambda: gain() == pytest.approx([0.7483, 0.7483, 0.07839], rel=1e-3))
+
+    played(run, scenario)
+
+
+def test_tasks_are_commands_with_the_options_of_their_form(run: LiveRun, monkeypatch: pytest.MonkeyPatch) -> None:
+    from lowfc.programs.console import app
+    from lowfc.programs.console.actions import EVERY
+
+    started: list[list[str]] = []
+    monkeypatch.setattr(app, "Task", lambda name, words: started.append(words) or Ended(name))
+
+    async def scenario(screen: Screen) -> None:
+        for name, words in TASKS.items():
+            await screen.pilot.press(EVERY[name].key)
+            await screen.until(lambda: len(screen.app.screen_stack) == 2)
+            await screen.pilot.press("enter")
+            await screen.until(lambda name=name: screen.text("answer") == f"{name}: done")
+            said = " ".join(started[-1])
+            assert said.startswith(f"{words} calibration-")
+            assert said.endswith(f".fits --load --run {RUN}")
+
+    played(run, scenario)
+
+
+class Ended:
+    status = 0
+
+    def __init__(self, name: str) -> None:
+        self.sentence = f"{name}: done"
+
+
+@pytest.mark.parametrize(
+    ("words", "status", "sentence"),
+    [(["--version"], 0, "t: done; 0."), (["no-such"], 2, "t failed: ")],
+)
+def test_a_task_is_a_process_of_its_own(words: list[str], status: int, sentence: str) -> None:
+    from lowfc.programs.console.task import Task
+
+    task = Task("t", words)
+    assert os.getsid(task._process.pid) == task._process.pid, "neither Ctrl-C nor a lost terminal reaches it"
+    assert task.sentence.startswith("t: running for 0 s")
+    until(lambda: task.status is not None)
+    assert task.status == status
+    assert task.sentence.startswith(sentence)
+    task.output.unlink()
+
+
+def test_two_consoles_see_what_the_other_asked(run: LiveRun) -> None:
+    async def both() -> None:
+        async with console(run) as one, console(run) as other:
+            await one.pilot.press("n")
+            await one.fill("from the first")
+            for screen in (one, other):
+                await screen.until(lambda screen=screen: "note from the first (" in screen.text("log"))
+
+    asyncio.run(both())
+
+
+def test_errors_ring_the_bell_until_it_is_muted(run: LiveRun, monkeypatch: pytest.MonkeyPatch) -> None:
+    rung: list[str] = []
+
+    async def scenario(screen: Screen) -> None:
+        monkeypatch.setattr(screen.app, "bell", lambda: rung.append("bell"))
+        events = run.bus("recorder").publisher(EVENT)
+
+        async def happens(name: str, **details: object) -> None:
+            events.put(EVENTS[name].log("recorder", run.clock.now_ns(), **details).SerializeToString())
+            await screen.until(lambda: name in screen.text("log"))
+
+        await happens("DISK_SLOW", stall_s=2.0, waiting=3)
+        assert rung == []
+        await happens("RECORDING_FAILED", why="no space")
+        assert rung == ["bell"]
+        await screen.pilot.press("m")
+        await happens("MESSAGES_LOST", count=3, topic="lowfc/event")
+        assert rung == ["bell"]
+
+    played(run, scenario)
+
+
+def test_a_console_that_is_cut_off_says_so_and_shows_no_old_figures(tmp_path: Path) -> None:
+    run = LiveRun(tmp_path)
+
+    async def scenario(screen: Screen) -> None:
+        assert screen.text("verdict").startswith(("ok", "Loop", "The", "CHECK", "Waiting"))
+        run.hub.lose = lambda role, key, envelope: role == "operator"
+        await screen.until(lambda: screen.text("verdict").startswith("NOT CONNECTED"))
+        assert not screen.app.screen.query_one("#tiles").visible
+        assert not screen.app.screen.query_one("#gains").visible
+        run.hub.lose = lambda role, key, envelope: False
+        await screen.until(lambda: not screen.text("verdict").startswith("NOT CONNECTED"))
+        assert screen.app.screen.query_one("#tiles").visible
+
+    played(run, scenario)
+    run.stop()
+
+
+def test_the_words_are_those_of_the_tiles() -> None:
+    from lowfc.programs.console import panels
+    from lowfc.programs.console.feed import Reading
+
+    stage = Stage()
+    stage.begin()
+    stage.flux = 0.01
+    found = stage.run(2.0)
+    none = np.zeros(0, np.float32)
+    reading = Reading(
+        stage.host_ns, 0.1, stage.watcher.state(), found, None, None, none, {}, [], [], [], [], NOLL, none
+    )
+    assert panels.verdict(reading, RUN) == (found.level, f"CHECK  {found.headline}")
+    lines = panels.tiles(reading).plain.splitlines()
+    for line, tile in zip(lines, found.tiles, strict=True):
+        assert all(word in line for word in (tile.title, tile.value, tile.detail))
+
+
+def test_figures_of_any_size_fit_their_place() -> None:
+    from lowfc.programs.console.panels import _PIXELS, halves, reduced, sparkline
+
+    assert sparkline([1.0, float("nan"), 0.5, 0.0], 3) == " █▁"
+    assert sparkline([], 3) == ""
+    for shape in ((6, 7), (34, 34), (1, 300)):
+        small = reduced(np.full(shape, 4.0))
+        assert small.shape == (_PIXELS, _PIXELS)
+        assert np.allclose(small, 4.0)
+    lines = halves(np.zeros((4, 3, 3), np.uint8))
+    assert [line.plain for line in lines] == ["▀▀▀"] * 2

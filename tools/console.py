@@ -1,0 +1,58 @@
+"""Make the pictures of docs/console.md: `python -m tools.measure console`, about two minutes.
+
+Real processes are brought into each state by hand, and a console without a terminal looks at them.
+"""
+
+import asyncio
+import sys
+from collections.abc import Callable
+
+from lowfc.adapters.bus.zenoh_bus import ZenohBus
+from lowfc.adapters.process.clock import HostClock
+from lowfc.contract.messages import Role
+from lowfc.programs.console.app import Console
+from tools.pictures import BRIGHT, PICTURES, SMALL_WELL, Night, night
+
+LOOK_S = 6.0
+"""How long the console looks, before what happens meanwhile and after."""
+
+
+def picture(run: Night, name: str, meanwhile: Callable[[], object]) -> None:
+    """Look at a run, let something happen, look on, and keep the picture."""
+
+    async def look() -> None:
+        app = Console(bus, run.run.run_id, HostClock())
+        async with app.run_test(size=(100, 30)) as pilot:
+            await pilot.pause(LOOK_S)
+            await asyncio.to_thread(meanwhile)
+            await pilot.pause(LOOK_S)
+            shown = app.export_screenshot(title=f"lowfc console, {name.replace('-', ' ')}")
+            (PICTURES / f"console-{name}.svg").write_text(shown)
+
+    bus = ZenohBus(run.run.links, Role.OPERATOR, HostClock(), monitor=True)
+    try:
+        asyncio.run(look())
+    finally:
+        bus.close()
+    sys.stderr.write(f"{name}\n")
+
+
+def make() -> None:
+    """Every state."""
+    with night(BRIGHT) as run:
+        loop = run.client()
+        picture(run, "healthy", lambda: loop.note("HD 209458, seeing 0.8 arcsec"))
+        picture(run, "open", loop.open_loop)
+        loop.close_loop()
+        picture(run, "star-gone", lambda: run.other_camera(BRIGHT | {"star.magnitude": 9.0}))
+    with night(SMALL_WELL) as run:
+        picture(run, "saturated", lambda: run.other_camera(SMALL_WELL | {"star.magnitude": -2.0}))
+    with night(BRIGHT) as run:
+        picture(run, "camera-dead", lambda: run.kill(Role.CAMERA))
+        picture(run, "not-connected", lambda: kill_all(run))
+
+
+def kill_all(run: Night) -> None:
+    """Kill what is left of a run whose camera is dead."""
+    for name in (Role.CONTROLLER, run.mirror, Role.RECORDER):
+        run.kill(name)
