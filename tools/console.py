@@ -10,7 +10,6 @@ from collections.abc import Callable
 from lowfc.adapters.bus.zenoh_bus import ZenohBus
 from lowfc.adapters.process.clock import HostClock
 from lowfc.contract.messages import Role
-from lowfc.programs.console.app import Console
 from tools.pictures import BRIGHT, PICTURES, SMALL_WELL, Night, night
 
 LOOK_S = 6.0
@@ -19,6 +18,7 @@ LOOK_S = 6.0
 
 def picture(run: Night, name: str, meanwhile: Callable[[], object]) -> None:
     """Look at a run, let something happen, look on, and keep the picture."""
+    from lowfc.programs.console.app import Console
 
     async def look() -> None:
         app = Console(bus, run.run.run_id, HostClock())
