@@ -14,6 +14,7 @@ from lowfc.control.loop.guard import AGAIN, BETTER_S, MOST_TAKEOVERS, WORSE_BLOC
 from lowfc.control.loop.inputs import Request
 from lowfc.control.loop.safety import Limit
 from lowfc.control.loop.state import FADING_FRAMES, SETTLING_FRAMES, Settings, State
+from lowfc.programs.cli.ctl import status
 from tests.support.toy import NOLL, calibration, feed, frame, live, loaded, names, settings
 from tools.guard import MOVED, SEEDS, Case, identified_law, known_law, moved, undisturbed
 from tools.law_bench import Bench, calibrated, configured
@@ -84,6 +85,9 @@ def test_the_integrator_takes_over_without_a_jump_and_it_is_told() -> None:
     assert event["until"] == f"until it would be far better for {BETTER_S:g} s"
     assert np.abs(state.drive.history_nm[0] - before).max() < 2  # a hundredth of the way to the integrator's command
     _, state = run(state, SPANS.faded, first + 1)
+    known = status.figures(controller_state(state, WHAT, 1))
+    assert known["law"]["overruled"] == ["tip and tilt"]
+    assert "in whose place the integrator drives tip and tilt" in status.text(known)
     weight = state.drive.following.weight
     np.testing.assert_array_equal(weight, [0, 0, 1])
 
@@ -102,6 +106,15 @@ def test_waiting_doubles_and_ends_with_the_operator() -> None:
                 break
     assert waited == [SPANS.better, 2 * SPANS.better, 4 * SPANS.better]
     assert group.overruled
+
+
+@pytest.mark.parametrize(("pol_nm2", "final"), [(39.0, True), (41.0, False)], ids=["amplified", "grown"])
+def test_a_loop_amplifies_where_its_error_is_unusual_and_not_a_small_part_of_what_there_is(
+    pol_nm2: float, final: bool
+) -> None:
+    group = Group(usual_nm2=1.0, blocks=WORSE_BLOCKS - 1)
+    group, why = group.judged((10.0, 20.0, pol_nm2), SPANS, void=True)
+    assert (group.overruled, group.final, "without correction" in why) == (final, final, final)
 
 
 @pytest.mark.parametrize("between", [(10.0, 3.0, 100.0), (10.0, 2.0, 100.0)], ids=["not better", "void"])
@@ -201,16 +214,16 @@ def test_noise_without_images_is_that_of_the_images() -> None:
     config = configured(**{"disturbance.preset": "quiet"})
     found = calibrated(config)
     bench = Bench(config, found)
-    bench.run(1500)
+    bench.run(1000)
     expected = noise_covariance_nm2(config, found)
     got = np.cov(np.array([step.error_nm for step in bench.steps]).T)
-    assert np.linalg.norm(got - expected) < 0.1 * np.linalg.norm(expected)
+    assert np.linalg.norm(got - expected) < 0.15 * np.linalg.norm(expected)
     wheel = configured()
     left: list[float] = []
     for one in (Bench(wheel, found), ModalBench(wheel, expected)):
         one.ask("close")
-        one.run(1000)
-        left.append(one.tilt_mas(800))
+        one.run(700)
+        left.append(one.tilt_mas(500))
     assert left[1] == pytest.approx(left[0], rel=0.03)
 
 
@@ -222,7 +235,7 @@ def test_lines_that_move_leave_no_more_than_the_integrator() -> None:
 
 
 def test_steps_are_no_failure_of_the_law() -> None:
-    assert undisturbed(case("reaction-wheel", known=True), 1, minutes=0.2) == 0
+    assert undisturbed(case("reaction-wheel", known=True), 1, minutes=0.1) == 0
 
 
 def test_a_wrong_delay_is_noticed_though_it_spoils_what_is_compared() -> None:

@@ -34,9 +34,11 @@ from lowfc.contract.messages import (
     timestamp,
     wire,
 )
+from lowfc.control.laws.linear_law import integrator
 from lowfc.control.loop.advance import advance
 from lowfc.control.loop.inputs import Frame, Input, Load, Request
 from lowfc.control.loop.requests import prepared
+from lowfc.control.loop.safety import Limit
 from lowfc.control.loop.state import Settings, State
 from lowfc.programs.logs.replay import controller_replay, workers
 from lowfc.programs.logs.replay.account import Account
@@ -156,6 +158,25 @@ def test_whatever_happens_is_replayed_to_the_bit(
     assert account.commands == sent[COMMAND.at("dm")]
     assert account.requests == sent[REQUEST.key]
     assert account.states == sent[CONTROLLER_STATE.key] - 2  # each start is begun from one
+
+
+def test_a_law_that_is_overruled_is_replayed_to_the_bit_also_from_the_middle_of_it() -> None:
+    made = night([], guard=True, rate_hz=1000.0, limit_nm=(150.0, 150.0))
+    made.take(Request(made.now_ns, "law", law=integrator((0.05,) * len(NOLL), (0.0,) * len(NOLL), NOLL, 1.0, 1000.0)))
+    for count in range(760):
+        wave_nm = 20 * np.sin(0.04 * count + np.arange(len(NOLL)))
+        made.take(frame(count, wave_nm + made.state.drive.history_nm[0]))
+    told = [message for message in made.messages if message.key == STEP.key]
+    overruled = [Limit.LAW_OVERRULED in wire.ControlStep.FromString(message.payload).reasons for message in told]
+    assert overruled == [False] * 498 + [True] * 262
+    account = replay(made.messages)
+    assert account.identical
+    for first in (300, 540, 700):
+        cut = [message for message in made.messages if message.key in (CALIBRATION.key, LAW.key)]
+        cut += [message for message in made.messages if message.log_time_ns >= told[first].log_time_ns]
+        account = replay(cut)
+        assert account.identical
+        assert account.frames >= 760 - first - 2 * STATE_EVERY
 
 
 @effort(deadline=None)

@@ -221,8 +221,8 @@ def _guarded(
 ) -> tuple[Guard, list[PendingEvent]]:
     """The guard of a law after a frame, and its events; both (modes,) without the loop's target."""
     closed, added = state.mode is LoopMode.CLOSED, drive.command_channels
-    moved = state.returning_to_zero or (added is not None and added.moving)
-    if moved or not (closed or state.mode is LoopMode.OPEN):
+    probed = state.returning_to_zero or (added is not None and added.play is not None)
+    if probed or not (closed or state.mode is LoopMode.OPEN):
         return guard.at_rest(), []
     if law.frames <= SETTLING_FRAMES or not closed:
         return guard.observed(to_undo_nm, law.frames), []

@@ -32,8 +32,9 @@ WORSE, BETTER = 1.2, 0.25
 """Mean squared error of the law over the integrator's, above which it is worse, and below which it is better."""
 USUAL_S = 10.0
 """Time constant of what is usual of the pseudo-open-loop modes."""
-AMPLIFIED = 4.0
-"""Mean squared error over the usual mean square of the pseudo-open-loop modes, above which the loop amplifies."""
+AMPLIFIED = 2.5
+"""Mean squared error over the usual mean square of the pseudo-open-loop modes, above which the loop amplifies; below
+`BETTER` of the present mean square the disturbance has grown, and the loop corrects it."""
 
 NAMES = ("tip and tilt", "the other modes")
 AGAIN = "again"
@@ -95,7 +96,8 @@ class Group(NamedTuple):
             if self.final or after.blocks < spans.better << (self.takeovers - 1):
                 return after, ""
             return after._replace(overruled=False, blocks=0), AGAIN
-        worse, amplified = not void and error_nm2 > WORSE * virtual_nm2, error_nm2 > AMPLIFIED * self.usual_nm2
+        worse = not void and error_nm2 > WORSE * virtual_nm2
+        amplified = error_nm2 > max(AMPLIFIED * self.usual_nm2, BETTER * pol_nm2)
         after = after._replace(blocks=self.blocks + 1 if worse or amplified else 0)
         if after.blocks < WORSE_BLOCKS:
             return after, ""

@@ -6,6 +6,7 @@ from typing import NamedTuple
 import numpy as np
 
 from lowfc.arrays import Sequences, Single
+from lowfc.contract.codecs.law_codec import overruled
 from lowfc.contract.messages import wire
 from lowfc.control.laws.continuous import Timing
 from lowfc.control.laws.spectra import pieces
@@ -19,7 +20,10 @@ FRAMES = 6144
 
 
 class LawInForce(NamedTuple):
-    """Gain and leak of each mode of the integrator, the delay in frames, and the linear law in its place, if any."""
+    """Gain and leak of each mode of the integrator, the delay in frames, and the linear law in its place, if any.
+
+    A law that is overruled is another one than before.
+    """
 
     gain: tuple[float, ...]
     leak: tuple[float, ...]
@@ -105,5 +109,5 @@ def attained(steady: Steady, rate_hz: float, camera: wire.CameraState | None) ->
 def _law_of(state: wire.ControllerState | None, modes: int) -> LawInForce | None:
     if state is None or not len(state.gain) == len(state.leak) == modes or not state.delay_frames >= 1:
         return None
-    linear = (state.law.id or state.law.name) if state.HasField("law") else ""
+    linear = " ".join((state.law.id or state.law.name, *overruled(state))) if state.HasField("law") else ""
     return LawInForce(tuple(state.gain), tuple(state.leak), state.delay_frames, linear)
