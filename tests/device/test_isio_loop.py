@@ -1,6 +1,8 @@
 """A loop whose camera and mirror are ImageStreamIO streams, beside a bench as CACAO has one."""
 
 import json
+import os
+import signal
 import subprocess
 import sys
 import time
@@ -117,21 +119,60 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return tmp_path
 
 
-def test_a_loop_runs_by_streams_and_each_fault_is_named(folder: Path) -> None:
+def test_a_loop_runs_by_streams_beside_others(folder: Path) -> None:
+    (folder / "bench.toml").write_text(BENCH.format(rate_hz=200, preset="quiet", tilt_nm=15))
+    with closing(Bench(folder)) as bench, going_on(folder, MIRROR, CAMERA_DRIVER), bench.listening():
+        with going_on(folder, CONTROLLER):
+            until(bench.held, 60)
+            refused = run(folder, "mirror", "isio", "--run", "other", "--config", "bench.toml")
+            assert refused.returncode == 2
+            assert "writes stream 'dm00disp03'" in refused.stderr
+            _what_others_put_on_the_mirror_is_not_undone(bench)
+            theirs = bench.stream(f"{TOTAL}00")
+        until(lambda: bench.said("COMMAND_EXPIRED") and not bench.stream(CHANNEL).pixels.any())
+        assert theirs.pixels.any()
+
+
+@pytest.mark.slow
+def test_each_fault_of_a_stream_is_named_and_recovered_from(folder: Path) -> None:
     (folder / "bench.toml").write_text(BENCH.format(rate_hz=200, preset="quiet", tilt_nm=15))
     with closing(Bench(folder)) as bench, going_on(folder, MIRROR, CAMERA_DRIVER, CONTROLLER), bench.listening():
         until(bench.held, 60)
-        _what_others_put_on_the_mirror_is_not_undone(bench)
+        _a_reader_that_stands_still_goes_on_with_the_newest_image(bench)
         bench.tell("renew")
-        until(lambda: bench.said("STREAM_RENEWED", "camnsv"))
+        until(lambda: bench.said("STREAM_RENEWED", CAMERA))
+        until(lambda: bench.said("CAMERA_RESTARTED"))
         bench.errors_nm.clear()
         until(bench.held)
         bench.tell("region")
         until(lambda: bench.said("CAMERA_CHANGED") and bench.said("closed -> open"))
-        refused = run(folder, "mirror", "isio", "--run", "other", "--config", "bench.toml")
-        assert refused.returncode == 2
-        assert "writes stream 'dm00disp03'" in refused.stderr
-        assert bench.stream(CHANNEL).pixels.any()
+        bench.tell("die")
+        until(lambda: bench.said("STREAM_SILENT", "in the middle of an image"))
+        until(lambda: bench.said("DRIVER_FAILED", f"'{TOTAL}' has not followed") and bench.said("MIRROR_LOST"))
+        bench.process.communicate()
+        bench.start()
+        until(lambda: bench.said("FRAMES_BACK") and bench.said("DRIVER_BACK") and bench.said("MIRROR_BACK"))
+        with Client("bench") as client:
+            until(lambda: not client.status().state.mirror_fault)
+            client.close_loop()
+        bench.errors_nm.clear()
+        until(bench.held)
+
+
+def _a_reader_that_stands_still_goes_on_with_the_newest_image(bench: Bench) -> None:
+    stream = PlainStream(file_of(bench.folder, CAMERA), 80, 80, 3)
+    with Client("bench") as client:
+        pid = client.processes()["camera"].pid
+    os.kill(pid, signal.SIGSTOP)
+    try:
+        until(lambda: min(stream.value(index) for index in range(10)) == 10)
+        count = stream.count
+        until(lambda: stream.count > count + 5)
+    finally:
+        os.kill(pid, signal.SIGCONT)
+    until(lambda: bench.said("FRAMES_LOST") or bench.said("FRAMES_MISSING"))
+    bench.errors_nm.clear()
+    until(bench.held)
 
 
 def _what_others_put_on_the_mirror_is_not_undone(bench: Bench) -> None:
