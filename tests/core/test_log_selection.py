@@ -160,7 +160,7 @@ def _estimator(log: Path) -> str:
 def test_a_report_is_of_the_same_run(whole: Path, small: Path) -> None:
     found: list[dict[str, Any]] = []
     for log in (whole, small):
-        done = lowfc("report", log, "--json", "--out", log.with_suffix(".html"))
+        done = lowfc("report", log, "--json", *(["--out", log.with_suffix(".html")] if log is small else []))
         assert done.exit_code == 0, done.exception
         found.append(json.loads(done.stdout))
     for part in ("residual", "spectra", "error_budget", "closed_stretch", "light", "laws", "requests"):
