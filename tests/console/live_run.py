@@ -28,6 +28,8 @@ CONFIG = load(
         "mirror.columns": GRID[1],
         "camera.rate_hz": 50.0,
         "control.start_mode": "closed",
+        "control.tilt_gain": 0.5,
+        "control.gain": 0.05,
         "control.max_frame_age_ms": 5000.0,
         "control.max_identical_frames": 0,
         "control.command_timeout_ms": 5000.0,

@@ -78,7 +78,7 @@ PRESSED: dict[str, tuple[tuple[str, ...], dict[str, object]]] = {
     "close": ((), {"name": "close"}),
     "pause": ((), {"name": "pause"}),
     "step": (("7",), {"name": "step", "values": [7.0]}),
-    "gain": (("2,3", "0.25"), {"name": "gain", "modes": [2, 3], "values": [0.25]}),
+    "gain": (("2,3", "0.25", ""), {"name": "gain", "modes": [2, 3], "values": [0.25]}),
     "leak": (("", "0.01"), {"name": "leak", "modes": []}),
     "limit": (("4", "40"), {"name": "limit", "modes": [4], "values": [40.0]}),
     "law": (("law.fits",), {"name": "law"}),
@@ -150,16 +150,16 @@ def test_every_button_by_its_key(run: LiveRun, tmp_path: Path, monkeypatch: pyte
 def test_what_is_refused_says_why_in_the_form_and_at_the_button(run: LiveRun) -> None:
     async def scenario(screen: Screen) -> None:
         await screen.pilot.press("g")
-        await screen.fill("2", "much")
+        await screen.fill("2", "much", "")
         await screen.until(lambda: "write numbers" in str(screen.app.screen.query_one("#refusal").render()))
-        await screen.fill("2", "9")
+        await screen.fill("2", "9", "")
         await screen.until(lambda: "becomes unstable" in str(screen.app.screen.query_one("#refusal").render()))
         assert not run.asked[-1].accepted
         assert "becomes unstable" in screen.text("answer")
         await screen.pilot.press("escape")
         assert screen.app.screen.query_one("#gain").has_class("refused")
         await screen.pilot.press("g")
-        await screen.fill("", "0.1")
+        await screen.fill("", "0.1", "")
         await screen.until(lambda: not screen.app.screen_stack[0].query_one("#gain").has_class("refused"))
 
     played(run, scenario)
@@ -191,16 +191,22 @@ def test_the_knobs_turn_all_gains_or_those_of_an_order(run: LiveRun) -> None:
 
     async def scenario(screen: Screen) -> None:
         await screen.pilot.press("g")
-        await screen.fill("2-4", "0.5 0.5 0.05")
-        await screen.until(lambda: "gain, all" in screen.text("gains") and "1.00 0.05-0.5" in screen.text("gains"))
+        await screen.fill("2-4", "0.5 0.5 0.05", "")
+        await screen.until(lambda: "0.5 from 0.05" in screen.text("gains"))
         await screen.pilot.press("right", "right")
-        await screen.until(lambda: gain() == pytest.approx([0.55, 0.55, 0.055]))
-        await screen.until(lambda: "1.10 0.055-0.55" in screen.text("gains"))
+        await screen.until(lambda: gain() == pytest.approx([0.6, 0.6, 0.06]))
+        await screen.until(lambda: "0.6 from 0.06" in screen.text("gains"))
         await screen.pilot.press("down", "left")
-        await screen.until(lambda: gain() == pytest.approx([0.525, 0.525]))
+        await screen.until(lambda: gain() == pytest.approx([0.55, 0.55]))
         assert list(run.asked[-1].modes) == [2, 3]
+        await screen.pilot.press("down", "left")
+        await screen.until(lambda: gain() == pytest.approx([0.05]))
+        await screen.until(lambda: "0.55 from 0.05" in screen.text("gains"))
         await screen.pilot.click("#gains", offset=(11 + 10, 0))
-        await screen.until(lambda: gain() == pytest.approx([0.7483, 0.7483, 0.07839], rel=1e-3))
+        await screen.until(lambda: gain() == pytest.approx([1.5, 1.5, 0.1364]))
+        await screen.pilot.press("u")
+        await screen.until(lambda: any(one.text == "auto" and one.accepted for one in run.asked))
+        await screen.until(lambda: "auto" in screen.text("gains"))
 
     played(run, scenario)
 
@@ -307,9 +313,7 @@ def test_the_words_are_those_of_the_tiles() -> None:
     stage.flux = 0.01
     found = stage.run(2.0)
     none = np.zeros(0, np.float32)
-    reading = Reading(
-        stage.host_ns, 0.1, stage.watcher.state(), found, None, None, none, {}, [], [], [], [], NOLL, none
-    )
+    reading = Reading(stage.host_ns, 0.1, stage.watcher.state(), found, None, None, none, {}, [], [], [], [], NOLL)
     assert panels.verdict(reading, RUN) == (found.level, f"CHECK  {found.headline}")
     lines = panels.tiles(reading).plain.splitlines()
     for line, tile in zip(lines, found.tiles, strict=True):

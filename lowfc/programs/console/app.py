@@ -19,6 +19,7 @@ from lowfc.adapters.process.clock import Clock
 from lowfc.client import Client
 from lowfc.contract.errors import LowfcError
 from lowfc.contract.events import Level as Severity
+from lowfc.control.loop.wording import AUTO
 from lowfc.programs.console import panels
 from lowfc.programs.console.actions import ACTIONS, EVERY, SAFE, Action, Values
 from lowfc.programs.console.feed import Feed, Reading
@@ -36,7 +37,8 @@ _LEFT = 62
 _LINES = 200
 _MOVED_EVERY = 10
 _OTHERS = (
-    ("↑↓ ←→", "knobs", "Choose a gain knob and turn it, from 0 to 1.5 times the configured gain"),
+    ("↑↓ ←→", "knobs", "Choose a gain knob and turn it, from 0 to 1.5 for the largest gain of its modes"),
+    ("u", "auto", "Let the gains of the chosen knob be automatic"),
     ("m", "mute", "Ring the terminal's bell at errors, or do not"),
     ("? q", "help, quit", "This help, and leave the console: nothing else ends"),
 )
@@ -93,6 +95,7 @@ class Console(App[str]):
         Binding("f12", f"press({SAFE.name!r})", priority=True),
         *(Binding(key, f"choose({by})") for key, by in (("up", -1), ("down", 1))),
         *(Binding(key, f"turn({by})") for key, by in (("left", -1), ("right", 1), ("minus", -1), ("plus", 1))),
+        Binding("u,U", "automatic"),
         Binding("m", "mute"),
         Binding("question_mark", "help"),
         Binding("q", "quit"),
@@ -152,6 +155,10 @@ class Console(App[str]):
         """Turn the chosen knob."""
         self.query_one(Gains).turn(steps)
 
+    def action_automatic(self) -> None:
+        """Let the gains of the chosen knob be automatic."""
+        self.query_one(Gains).automatic()
+
     def action_mute(self) -> None:
         """Ring no bell, or ring it again."""
         self._mute = not self._mute
@@ -179,7 +186,8 @@ class Console(App[str]):
 
     @on(Gains.Turned)
     def _turned(self, event: Gains.Turned) -> None:
-        self._do(EVERY["gain"], {"modes": ",".join(map(str, event.modes)), "values": " ".join(map(str, event.values))})
+        modes, values = ",".join(map(str, event.modes)), " ".join(map(str, event.values))
+        self._do(EVERY["gain"], {"modes": modes, "values": values, "text": "" if values else AUTO})
 
     def _do(self, action: Action, values: Values) -> None:
         """Start a task, or ask in a thread of its own: nobody waits for an answer, least of all a later SAFE."""
@@ -203,6 +211,8 @@ class Console(App[str]):
 
     @on(Answered)
     def _answered(self, event: Answered) -> None:
+        if self._torn_down:
+            return
         self._answer(event.sentence, good=event.good)
         self.query_one(f"#{_id(event.action)}").set_class(not event.good, "refused")
         if event.action.name == "gain" and not event.good:
@@ -219,7 +229,14 @@ class Console(App[str]):
         answer.set_class(not good, "refused")
         answer.update(sentence, layout=False)
 
+    @property
+    def _torn_down(self) -> bool:
+        """Whether the screen is no longer whole: what is under way then has nowhere to go."""
+        return not (self.screen_stack and self.screen_stack[0].query("#peers"))
+
     def _read(self) -> None:
+        if self._torn_down:
+            return
         reading = self._feed.read()
         self._readings += 1
         self._show(reading)

@@ -43,7 +43,7 @@ class Reading(NamedTuple):
         command_nm: (modes,) of the last step.
         events, requests: new ones.
         residual_nm, light: a value for each second, NaN where there is none.
-        noll, base_gain: modes of the calibration, and the configured gain of each; empty before they are known.
+        noll: modes of the calibration; empty before it is known.
     """
 
     host_ns: int
@@ -59,7 +59,6 @@ class Reading(NamedTuple):
     residual_nm: list[float]
     light: list[float]
     noll: tuple[int, ...]
-    base_gain: Single
 
     @property
     def connected(self) -> bool:
@@ -128,7 +127,6 @@ class Feed:
             [residual for residual, _ in self._trend],
             [light for _, light in self._trend],
             state.noll,
-            self._base_gain(state.noll),
         )
 
     def close(self) -> None:
@@ -142,12 +140,6 @@ class Feed:
             found = state.wavefront
             light = float("nan") if state.flux is None or state.frame_silent_s is not None else state.flux
             self._trend.append((float("nan") if found is None else found.residual_nm, light))
-
-    def _base_gain(self, noll: tuple[int, ...]) -> Single:
-        if self._config is None:
-            return np.zeros(0, np.float32)
-        control = self._config.control
-        return np.array([control.tilt_gain if mode in (2, 3) else control.gain for mode in noll], np.float32)
 
     def _catch_up(self) -> None:
         """Ask for what was sent before, in a thread: a process that is frozen answers late."""

@@ -1,4 +1,4 @@
-"""The gain knobs: one for all modes, one for each radial order. A knob at 1 is the configured gain."""
+"""The gain knobs: one for all modes, one for each radial order. A knob is at the largest gain of its modes."""
 
 import math
 import time
@@ -10,23 +10,25 @@ from textual import events
 from textual.message import Message
 from textual.widgets import Static
 
-from lowfc.arrays import Single
+from lowfc.arrays import Mask
 from lowfc.programs.console.feed import Reading
 from lowfc.programs.console.panels import BOLD, DIM, style
 from lowfc.programs.view.draw.colours import BLUE, GREY
 
 HIGHEST = 1.5
-STEP = 0.05
+STEP, FINE_STEP = 0.05, 0.01
+FINE_BELOW = 0.1
+"""Knobs below it are turned in fine steps."""
 _BAR = 10
 _BEFORE = 11  # columns before the bar
 _PENDING_S = 1.0  # after which the controller's state has what was asked
 
 
 class Gains(Static):
-    """The knobs; one is chosen, and turned by keys or by a click on its bar."""
+    """The knobs; one is chosen, and turned by keys or by a click on its bar: its modes keep their ratios."""
 
     class Turned(Message):
-        """Somebody turned a knob: these gains are wanted for these modes."""
+        """Somebody turned a knob: these gains are wanted for these modes, automatic ones where there are none."""
 
         def __init__(self, modes: tuple[int, ...], values: list[float]) -> None:
             super().__init__()
@@ -36,18 +38,19 @@ class Gains(Static):
         super().__init__(id="gains")
         self._chosen = 0
         self._noll: tuple[int, ...] = ()
-        self._base = self._gain = np.zeros(0, np.float32)
+        self._gain = np.zeros(0, np.float32)
+        self._automatic: Mask = np.zeros(0, bool)
         self._shown: Text | None = None
         self._pending: dict[int, tuple[float, float]] = {}
 
     def show(self, reading: Reading) -> None:
         """Take in the gains of the run."""
         state = reading.state.controller_state
-        gain = np.array(state.gain if state is not None else (), np.float32)
-        known = 0 < len(gain) == len(reading.noll) == len(reading.base_gain)
-        self._noll, self._base, self._gain = (
-            (reading.noll, reading.base_gain, gain) if known else ((), np.zeros(0, np.float32), np.zeros(0, np.float32))
-        )
+        if state is None or len(state.gain) != len(reading.noll):
+            self._noll = ()
+        else:
+            self._noll, self._gain = reading.noll, np.array(state.gain, np.float32)
+            self._automatic = np.array(state.automatic or [False] * len(state.gain), bool)
         self._draw()
 
     def choose(self, by: int) -> None:
@@ -58,7 +61,14 @@ class Gains(Static):
     def turn(self, steps: int) -> None:
         """Turn the chosen knob."""
         if self._noll:
-            self._want(self._chosen, self._knob(self._chosen) + steps * STEP)
+            knob = self._knob(self._chosen)
+            fine = knob < FINE_BELOW or (steps < 0 and knob <= FINE_BELOW)
+            self._want(self._chosen, knob + steps * (FINE_STEP if fine else STEP))
+
+    def automatic(self) -> None:
+        """Let the controller choose the gains of the chosen knob."""
+        if self._noll:
+            self.post_message(self.Turned(groups(self._noll)[self._chosen][1], []))
 
     def forget(self) -> None:
         """What was asked has been refused: the knobs are where the controller's gains are."""
@@ -73,28 +83,27 @@ class Gains(Static):
             self._draw()
 
     def _want(self, number: int, knob: float) -> None:
-        knob = min(max(round(knob / STEP) * STEP, 0.0), HIGHEST)
-        _, modes = groups(self._noll)[number]
-        places = [self._noll.index(mode) for mode in modes]
-        before = ratio(self._gain[places], self._base[places])
-        gains = self._base[places] * knob if before <= 0 else self._gain[places] / before * knob
+        knob = round(min(max(knob, 0.0), HIGHEST), 3)
+        places, before = self._places(number), self._gain[self._places(number)]
+        gains = np.full(len(places), knob) if not before.any() else before / before.max() * knob
         self._pending[number] = knob, time.monotonic() + _PENDING_S
-        self.post_message(self.Turned(modes, [float(f"{value:.4g}") for value in gains.tolist()]))
+        values = [float(f"{value:.4g}") for value in gains.tolist()]
+        self.post_message(self.Turned(groups(self._noll)[number][1], values))
+
+    def _places(self, number: int) -> list[int]:
+        return [self._noll.index(mode) for mode in groups(self._noll)[number][1]]
 
     def _knob(self, number: int) -> float:
         knob, until_s = self._pending.get(number, (0.0, 0.0))
-        if time.monotonic() < until_s:
-            return knob
-        places = [self._noll.index(mode) for mode in groups(self._noll)[number][1]]
-        return ratio(self._gain[places], self._base[places])
+        return knob if time.monotonic() < until_s else float(self._gain[self._places(number)].max())
 
     def _draw(self) -> None:
         lines = []
-        for number, (name, modes) in enumerate(groups(self._noll)):
-            knob = self._knob(number)
+        for number, (name, _) in enumerate(groups(self._noll)):
+            knob, places = self._knob(number), self._places(number)
             at = min(round(knob / HIGHEST * _BAR), _BAR)
-            gain = sorted({float(self._gain[self._noll.index(mode)]) for mode in modes})
-            ends = dict.fromkeys(f"{value:.3g}" for value in (gain[0], gain[-1]))
+            lowest = float(self._gain[places].min())
+            spread = "" if lowest > 0.99 * knob else f" from {lowest:.3g}"
             chosen = number == self._chosen
             lines.append(
                 Text.assemble(
@@ -102,18 +111,14 @@ class Gains(Static):
                     ("━" * at, style(BLUE)),
                     ("●", BOLD),
                     ("━" * (_BAR - at), style(GREY)),
-                    f" {knob:.2f} {'-'.join(ends)}",
+                    f" {knob:.3g}{spread}",
+                    (" auto" if self._automatic[places].all() else "", DIM),
                 )
             )
         text = Text("\n").join(lines) if lines else Text("gains are not known yet", DIM)
         if text != self._shown:
             self._shown = text
             self.update(text, layout=False)
-
-
-def ratio(gain: Single, base: Single) -> float:
-    """Gains by the configured ones: of the means, so that modes may differ."""
-    return float(gain.mean() / base.mean()) if base.any() else 0.0
 
 
 def groups(noll: Sequence[int]) -> list[tuple[str, tuple[int, ...]]]:

@@ -198,6 +198,6 @@ def request_line(asked: wire.Request) -> Text:
     return Text.assemble(
         (f"{clock(from_timestamp(asked.timestamp))} ", DIM),
         (" ".join(filter(None, [printable(asked.name), *fields])), BOLD),
-        (f" ({printable(asked.requester) or 'somebody'}): ", DIM),
+        (f" ({printable(asked.requester) or 'who is not said'}): ", DIM),
         (answer, style()) if asked.accepted else (f"refused: {printable(asked.reply)}", WRONG),
     )
