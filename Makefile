@@ -36,6 +36,7 @@ test-all: $(VENV)/.tests node lint types  ## everything, the slow tests and thos
 		echo "no Vulkan driver: the viewer tests will skip. Debian: apt install mesa-vulkan-drivers libvulkan1" >&2
 	@command -v chromium >/dev/null || { test "$$(id -u)" = 0 && apt-get install --yes chromium; } || \
 		echo "no chromium: the browser tests will skip. Debian: apt install chromium" >&2
+	$(INSTALL) --editable '.[test,epics-test]'
 	$(BIN)/python -m pytest
 
 bench: $(VENV)/.installed  ## time the loop beside the last release's figures; STORE=1 keeps them as this release's

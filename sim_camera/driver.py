@@ -18,8 +18,8 @@ from lowfc.contract.configuration import Configuration
 from lowfc.contract.envelope import Envelope
 from lowfc.contract.errors import BusError, ConfigurationError
 from lowfc.contract.messages import MIRROR_STATE, TRUTH, fields_of, timestamp, wire
+from lowfc.control.durations import Durations
 from lowfc.control.laws.stability import delay_weights
-from lowfc.control.loop.durations import Durations
 from lowfc.device import CameraSettings, DriverOptions, Exposure, Puts
 from lowfc.optics.detector.detector import saturation_dn
 from lowfc.optics.detector.photometry import tilt_nm_per_mas

@@ -19,7 +19,8 @@ from lowfc.adapters.bus.zenoh_bus import ZenohBus
 from lowfc.adapters.process.clock import HostClock
 from lowfc.adapters.process.host import by_this_process, program_name
 from lowfc.client.answer import Answer
-from lowfc.client.lease import Lease
+from lowfc.client.bench import BenchPublisher
+from lowfc.client.lease import Lease, held, new_identity
 from lowfc.client.mirror_watch import MirrorWatch
 from lowfc.client.requests import BY_NAME
 from lowfc.client.runs import starting, the_run
@@ -47,6 +48,7 @@ from lowfc.control.laws.linear_law import LinearLaw
 from lowfc.control.loop.camera import CameraSettings
 from lowfc.control.loop.command_channels import MIRROR, OFFSET
 from lowfc.control.loop.inputs import Step
+from lowfc.control.loop.interlocks import Value
 from lowfc.control.loop.wording import AUTO
 
 Single = npt.NDArray[np.float32]
@@ -101,6 +103,7 @@ class Client:
         self._bus = bus
         self._grid: tuple[int, int] | None = None
         self._lease: Lease | None = None
+        self._bench = BenchPublisher(bus)
 
     def __enter__(self) -> "Client":
         return self
@@ -217,6 +220,19 @@ class Client:
         """
         if self._lease is not None:
             self._lease.check()
+
+    def permit(self, purpose: str, hold_s: float | None = None, lease_id: int = 0) -> Answer:
+        """Ask whether something on the bench may be moved; with `hold_s`, the loop is held for so long: see `held`."""
+        values = () if hold_s is None else hold_s
+        return self.ask("permit", values=values, text=by_this_process(purpose), lease_id=lease_id or new_identity())
+
+    def held(self, purpose: str, hold_s: float) -> contextlib.AbstractContextManager[None]:
+        """Hold the loop while something on the bench is moved, for at most `hold_s`; a closed loop then goes on."""
+        return held(lambda own: self.permit(purpose, hold_s, own), lambda own: self.ask("release", lease_id=own))
+
+    def bench(self, name: str, value: Value) -> None:
+        """Publish a value of something else on the bench, for interlocks: again and again, or it becomes too old."""
+        self._bench.put(name, value)
 
     def note(self, text: str) -> Answer:
         """Leave a note in the log."""

@@ -4,7 +4,7 @@ import contextlib
 import secrets
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from typing import TYPE_CHECKING
 
 from lowfc.adapters.process.host import by_this_process
@@ -20,6 +20,23 @@ RENEWAL_S = 0.5
 
 Ask = Callable[[str, int, float, str], object]
 """Ask for `lease`, `renew` or `release`: the request, the lease's identity, seconds, its holder."""
+
+
+def new_identity() -> int:
+    """Identity of a reservation: a random number above 0."""
+    return secrets.randbits(63) | 1
+
+
+@contextlib.contextmanager
+def held(permit: Callable[[int], object], release: Callable[[int], object]) -> Iterator[None]:
+    """Ask for a permit, and release it at the end of the block."""
+    identity = new_identity()
+    permit(identity)
+    try:
+        yield
+    finally:
+        with contextlib.suppress(LowfcError):  # it ends by itself
+            release(identity)
 
 
 class Lease:
@@ -41,7 +58,7 @@ class Lease:
             RequestRefusedError: somebody else has reserved it.
             BusError: no controller is there.
         """
-        self.id = secrets.randbits(63) | 1
+        self.id = new_identity()
         self._ask = ask
         self._purpose = by_this_process(purpose)
         self._end_s = None if duration_s is None else time.monotonic() + duration_s

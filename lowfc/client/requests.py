@@ -118,6 +118,15 @@ DECLARED: tuple[Declaration, ...] = (
         ("text", "as in `lease`"),
     ),
     _declared("release", "End a reservation.", "", ("lease_id", "as in `lease`")),
+    _declared(
+        "permit",
+        "Ask whether something on the bench may be moved; with a time, a closed loop holds its command and the loop is "
+        "reserved for so long, or until it is released.",
+        'permit "moving the mask" --hold 5',
+        ("text", "what is moved, for people"),
+        ("values", "seconds for which the loop is held, at most 60; none to ask alone"),
+        ("lease_id", "of a hold: as in `lease`"),
+    ),
     _declared("configuration", "Answer with the configuration that the controller was started with.", "configuration"),
     Declaration(RECORD_KEY.format(name="start"), (), "Start the next log and print its path.", "record start"),
     Declaration(

@@ -19,7 +19,18 @@ from lowfc.contract.errors import ConfigurationError, brief
 from lowfc.contract.former_names import renamed_keys
 from lowfc.contract.network import Network as Network
 from lowfc.contract.printable import printable
-from lowfc.contract.sections import Camera, Disturbance, Mirror, NotNegative, Positive, Section, SensorSection, Star
+from lowfc.contract.sections import (
+    Camera,
+    Disturbance,
+    Gateway,
+    InterlockSection,
+    Mirror,
+    NotNegative,
+    Positive,
+    Section,
+    SensorSection,
+    Star,
+)
 
 LATE_NS, HOLD_NS = 20_000_000, 50_000_000
 """Least age of a late frame and least silence of a camera, where the configuration leaves them open."""
@@ -174,6 +185,9 @@ class Configuration(Section):
     """Seed of every random number in the simulation."""
     lockstep: bool = False
     """Expose the next frame only when the mirror has applied the last command; time is simulated."""
+    interlocks: list[InterlockSection] = Field(default_factory=list, max_length=32)
+    """Conditions on values of the bench, each a table [[interlocks]] with name, test (equal, different, above, below),
+    value, action (hold, open, safe, refuse_close, warn), max_age_s and when_old (acts, passes)."""
     star: Star = Star()
     sensor: SensorSection = SensorSection()
     camera: Camera = Camera()
@@ -185,6 +199,7 @@ class Configuration(Section):
     recorder: Recorder = Recorder()
     realtime: Realtime = Realtime()
     network: Network = Network()
+    gateway: Gateway = Gateway()
     drivers: dict[str, dict[str, Any]] = Field(default_factory=dict)
     """Options of drivers of cameras and mirrors by the driver's name, as each driver declares them: [drivers.NAME]."""
 
@@ -312,8 +327,9 @@ def explain(detail: Any) -> str:
     """One of pydantic's errors as a line for a user."""
     key = ".".join(str(part) for part in detail["loc"])
     if detail["type"] == "extra_forbidden":
-        known = [*keys(), *Configuration.model_fields]
-        near = difflib.get_close_matches(key[:_LONGEST_KEY], known, n=1, cutoff=0.0)
+        known = [*keys(), *Configuration.model_fields, *keys(InterlockSection, "interlocks.")]
+        plain = ".".join(part for part in detail["loc"] if isinstance(part, str))
+        near = difflib.get_close_matches(plain[:_LONGEST_KEY], known, n=1, cutoff=0.0)
         return f"unknown key {brief(key)}; the nearest known one is {near[0]!r}"
     message = detail["msg"].removeprefix("Value error, ")
     return printable(f"{key[:_LONGEST_KEY]} = {brief(detail['input'])}: {message[:300]}" if key else message)

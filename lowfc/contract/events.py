@@ -96,6 +96,8 @@ EVENTS: dict[str, Event] = {
         Event("LEASE_TAKEN", Level.INFO, "the loop is reserved for {holder}"),
         Event("LEASE_RELEASED", Level.INFO, "the loop is no longer reserved for {holder}"),
         Event("LEASE_ENDED", Level.WARNING, "the loop is no longer reserved for {holder}: {why}"),
+        Event("INTERLOCK_ACTS", Level.WARNING, "interlock: {why}; {action}"),
+        Event("INTERLOCK_CLEARED", Level.INFO, "interlock no longer acts: {why}"),
         Event("LOOP_STEPPED", Level.INFO, "the loop opened after its last step"),
         Event("MIRROR_LOST", Level.ERROR, "the mirror {fault}: a closed loop holds its command until it follows"),
         Event("MIRROR_BACK", Level.INFO, "the mirror follows again"),

@@ -34,6 +34,7 @@ class Role(StrEnum):
     VIEWER = "viewer"
     OPERATOR = "operator"
     REPLAY = "replay"
+    BENCH = "bench"
 
 
 EVERYBODY = frozenset(Role)
@@ -216,6 +217,16 @@ CALIBRATION = Topic(
     "What turns a frame into a command.",
     queryable=True,
 )
+BENCH = Topic(
+    "lowfc/bench/{name}",
+    wire.BenchValue,
+    Rate.EVENT,
+    frozenset({Role.BENCH, Role.OPERATOR}),
+    "A value of something else on the bench, for interlocks; the controller subscribes to the configured names.",
+    subscribers=_CONTROLLER | _MONITORS,
+    deterministic=False,
+    queryable=True,
+)
 EVENT = Topic(
     "lowfc/event",
     Log,
@@ -252,6 +263,7 @@ TOPICS: tuple[Topic, ...] = (
     SURFACE,
     TRUTH,
     CALIBRATION,
+    BENCH,
     EVENT,
     HEALTH,
 )

@@ -8,6 +8,7 @@ from lowfc.contract import toml_text
 from lowfc.contract.configuration import MOST_FAULTS, Configuration, explain
 from lowfc.contract.errors import ConfigurationError
 from lowfc.contract.former_names import renamed_keys
+from lowfc.contract.sections import InterlockSection
 
 _SECTIONS: dict[str, type[BaseModel]] = {
     name: info.annotation
@@ -63,15 +64,20 @@ def _is_of_key(data: dict[str, Any], detail: Any) -> bool:
 def _mend(data: dict[str, Any], detail: Any) -> str:
     """Remove the key at fault; return what that means, in words."""
     section, *path = detail["loc"]
-    (data.get(section, {}) if path else data).pop(path[0] if path else section, None)
+    table = data.get(section)
+    if path and isinstance(table, dict):
+        table.pop(path[0], None)
+    else:
+        data.pop(section, None)
     return "it is ignored" if detail["type"] == "extra_forbidden" else "the default is used"
 
 
 def _constructed(data: dict[str, Any], contradictory: set[str]) -> Configuration:
     """A configuration whose keys are sound each for itself."""
-    sections = {
+    sections: dict[str, Any] = {
         name: kind.model_construct(**data[name]) if name in contradictory else kind.model_validate(data[name])
         for name, kind in _SECTIONS.items()
         if name in data
     }
+    sections["interlocks"] = [InterlockSection.model_validate(one) for one in data.get("interlocks", ())]
     return Configuration.model_construct(**(data | sections))

@@ -9,8 +9,49 @@ from lowfc.contract.network import Section as Section
 Preset = Literal["quiet", "bench", "thermal", "reaction-wheel", "reaction-wheel-ideal", "step", "kolmogorov"]
 PRESETS: tuple[str, ...] = get_args(Preset)
 
+BENCH_NAME = r"^[A-Za-z][A-Za-z0-9_-]{0,63}$"
+"""Of a bench value, a regular expression."""
 Positive = Annotated[float, Field(gt=0)]
 NotNegative = Annotated[float, Field(ge=0)]
+
+
+class InterlockSection(Section):
+    """A condition on a value that something else on the bench publishes, and what follows while it holds."""
+
+    name: str = Field(pattern=BENCH_NAME)
+    """Name of the value: the last part of its topic, lowfc/bench/NAME."""
+    test: Literal["equal", "different", "above", "below"] = "equal"
+    """How the value compares with `value` where the interlock acts; above and below are for numbers."""
+    value: bool | float | Annotated[str, Field(max_length=200)]
+    """What it is compared with: true or false, a number, or a text."""
+    action: Literal["hold", "open", "safe", "refuse_close", "warn"]
+    """What follows: a closed loop holds its command, the loop opens, it goes into safe mode, it is not closed, or a
+    warning alone. All but the last refuse to close the loop meanwhile."""
+    max_age_s: float = Field(5.0, ge=0.01, le=3600)
+    """Time without a new value after which the last one is too old; publish at least twice as often."""
+    when_old: Literal["acts", "passes"] = "acts"
+    """What counts for a value that is too old, of another kind, or was never received."""
+
+    @model_validator(mode="after")
+    def _comparable(self) -> "InterlockSection":
+        if self.test in ("above", "below") and not isinstance(self.value, float):
+            raise ValueError(f"{self.test} compares numbers, and value is {self.value!r}")
+        return self
+
+
+class Gateway(Section):
+    """The gateways to control systems: `lowfc gateway`."""
+
+    prefix: str = Field("lowfc:", pattern=r"^[A-Za-z0-9_:.-]{1,40}$")
+    """Beginning of the name of every variable that it offers."""
+    listen: str = "127.0.0.1"
+    """Address on which it serves; loopback alone unless another is named."""
+    port: int = Field(5075, ge=1, le=65534)
+    """TCP port; searches are answered at the next UDP port."""
+    search: str = "127.0.0.1"
+    """Addresses at which variables of others are searched, with a space between two."""
+    bench: dict[Annotated[str, Field(pattern=BENCH_NAME)], str] = Field(default_factory=dict)
+    """Variables of others that become bench values: name of the value = name of the variable."""
 
 
 class Star(Section):

@@ -188,7 +188,7 @@ def test_the_command_makes_all_roles(tmp_path: Path) -> None:
     words = ["certs", str(tmp_path / "certs"), "--router", "localhost", "--mirror", "dm", "--mirror", "tip"]
     done = lowfc(*words)
     assert done.exit_code == 0, done.output
-    roles = {"router", "camera", "controller", "mirror-dm", "mirror-tip", "operator", "recorder", "viewer"}
+    roles = {"router", "bench", "camera", "controller", "mirror-dm", "mirror-tip", "operator", "recorder", "viewer"}
     folder = tmp_path / "certs"
     assert (
         {file.stem for file in folder.glob("*.pem")} == {file.stem for file in folder.glob("*.key")} == roles | {"ca"}

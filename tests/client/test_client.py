@@ -25,12 +25,14 @@ from lowfc.client.requests import DECLARED
 from lowfc.client.runs import nobody_yet, starting
 from lowfc.client.stream import WAITING, frame_of, step_of
 from lowfc.contract.codecs import codec
+from lowfc.contract.codecs.bench_codec import decode_bench_value
 from lowfc.contract.codecs.calibration_codec import encode_calibration, identified
 from lowfc.contract.configuration import Configuration
 from lowfc.contract.envelope import sequence_of
 from lowfc.contract.errors import BusError, CalibrationError, ConfigurationError, DataFileError, RequestRefusedError
 from lowfc.contract.events import EVENTS
 from lowfc.contract.messages import (
+    BENCH,
     CALIBRATION,
     CAMERA_STATE,
     EVENT,
@@ -46,6 +48,7 @@ from lowfc.contract.messages import (
 )
 from lowfc.control.laws.linear_law import integrator_block, of_blocks
 from lowfc.control.loop.inputs import Reply, Request, Step
+from lowfc.control.loop.interlocks import Value
 from lowfc.control.loop.requests import REQUESTS
 from lowfc.control.loop.safety import Limit, LoopMode
 from lowfc.programs.cli.ctl.command import ctl_app
@@ -119,7 +122,7 @@ ASKS: tuple[tuple[Callable[[Client], object], Request], ...] = (
     (lambda loop: loop.note("höher"), Request(0, "note", text="höher")),
     *(
         (partial(Client.ask, name=name, values=10, text="a test", lease_id=7), Request(0, name, (), (10.0,), **LEASE))
-        for name in ("lease", "renew")
+        for name in ("lease", "renew", "permit")
     ),
     (lambda loop: loop.ask("release", lease_id=7), Request(0, "release", lease_id=7)),
     (lambda loop: loop.configuration(), Request(0, "configuration")),
@@ -475,6 +478,30 @@ def test_a_step_comes_as_it_was_sent() -> None:
     assert step_of(Sample(STEP.key, b"\xff", 0, 0, 0)) is None
 
 
+def test_the_loop_is_held_for_a_move_and_given_back(controller: FakeController, loop: Client) -> None:
+    assert loop.permit("moving the mask").accepted
+    with pytest.raises(KeyError), loop.held("moving the mask", 5.0):
+        raise KeyError
+    asks, hold, back = controller.asked
+    assert [one.name for one in controller.asked] == ["permit", "permit", "release"]
+    assert (asks.values, hold.values) == ((), (5.0,))
+    assert hold.text.startswith("moving the mask by ")
+    assert hold.lease_id == back.lease_id != asks.lease_id
+
+
+@pytest.mark.parametrize("value", [True, 3, 2.5, "parked"])
+def test_a_bench_value_arrives_as_it_was_published(controller: FakeController, loop: Client, value: Value) -> None:
+    came: list[Sample] = []
+    controller.bus.subscribe(BENCH, came.append, "mask")
+    for _ in range(2):
+        loop.bench("mask", value)
+    loop.bench("another", value)
+    assert [decode_bench_value(one.payload) for one in came] == [value, value]
+    for name, wrong in (("a b", True), ("mask", float("nan")), ("mask", "x" * 201)):
+        with pytest.raises(ConfigurationError, match=name):
+            loop.bench(name, wrong)
+
+
 # The declaration, the document and the command line.
 
 
@@ -498,7 +525,7 @@ def test_every_command_has_help_with_an_example() -> None:
         for name, each in group.commands["record"].commands.items()  # type: ignore[attr-defined]
     }
     names = {asked.example.split()[0] for asked in DECLARED if asked.example}
-    assert names | {"dark", "reference"} == {name.split()[0] for name in commands}
+    assert names | {"bench", "dark", "reference"} == {name.split()[0] for name in commands}
     for name, command in commands.items():
         assert f"Example: lowfc {'calibrate' if name in ('dark', 'reference') else 'ctl'}" in command.help, name
 

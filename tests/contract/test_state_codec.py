@@ -11,6 +11,7 @@ from lowfc.contract.codecs.state_codec import controller_state, decode_state
 from lowfc.contract.messages import wire
 from lowfc.control.loop.advance import advance
 from lowfc.control.loop.inputs import CameraSettings, Load, MirrorReport, MirrorShape, Report, Tick
+from lowfc.control.loop.interlocks import BenchReport
 from lowfc.control.loop.state import State
 from tests.support.happenings import CALIBRATION
 from tests.support.toy import frame, loaded, settings
@@ -43,6 +44,7 @@ def test_a_state_of_another_calibration_is_refused() -> None:
         MirrorShape(5, np.arange(6, dtype=np.float32).reshape(2, 3), np.ones(2, np.float32)),
         MirrorReport(5, "does not answer"),
         Load(5, CALIBRATION, "a file"),
+        *(BenchReport(5, "mask", value, 3) for value in (True, False, 2.5, "parked", None)),
     ],
     ids=lambda one: type(one).__name__,
 )

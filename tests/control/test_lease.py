@@ -49,7 +49,7 @@ def left(state: State) -> int:
     return 0 if added is None or added.play is None else added.play.left(state.frame_sequence + 1)
 
 
-GRANTED = {"safe", "open", "pause", "stop", "status", "note", "lease", "renew", "release", "configuration"}
+GRANTED = {"safe", "open", "pause", "stop", "status", "note", "lease", "renew", "release", "permit", "configuration"}
 
 
 @pytest.mark.parametrize("name", sorted({*REQUESTS} - GRANTED))

@@ -24,6 +24,7 @@ ELSEWHERE = {
     "make test": ".ci/run",
     "lowfc console": "tests/console/test_terminal.py",
     "lowfc doctor": "tests/commissioning/test_doctor.py",
+    "lowfc gateway epics": "tests/interlocks/test_gateway.py",
     "rerun $(ls -t logs/*.mcap | head -1)": "tests/e2e/test_rerun_viewer.py",
     ROUTE: "tests/design/test_layout_files.py",
 }

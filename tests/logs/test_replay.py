@@ -9,6 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import settings as effort
 from hypothesis import strategies as st
+from mcap.reader import make_reader
 
 from lowfc.adapters.logs.reader import Logged, LogReader
 from lowfc.adapters.process.provenance import provenance
@@ -398,7 +399,11 @@ def test_several_processes_find_what_one_finds(log: Path, monkeypatch: pytest.Mo
 
 def test_a_log_with_a_hole_is_replayed_but_for_the_hole(log: Path, tmp_path: Path) -> None:
     hole = bytearray(log.read_bytes())
-    hole[len(hole) // 2] ^= 0x40
+    with log.open("rb") as stream:
+        summary = make_reader(stream).get_summary()
+    assert summary is not None
+    chunk = summary.chunk_indexes[len(summary.chunk_indexes) // 2]
+    hole[chunk.chunk_start_offset + chunk.chunk_length // 2] ^= 0x40
     (tmp_path / "hole.mcap").write_bytes(hole)
     found = workers.replay_files([tmp_path / "hole.mcap"], 0.0, 1, lambda done: None)
     there = len(list(LogReader(tmp_path / "hole.mcap", topics=[STEP], skip_damaged=True)))

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from lowfc.control.loop.durations import RATIO, Durations
+from lowfc.control.durations import RATIO, Durations
 
 
 def test_percentiles_are_numpys_to_a_bin() -> None:

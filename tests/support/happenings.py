@@ -5,11 +5,23 @@ from hypothesis import strategies as st
 
 from lowfc.contract.codecs.calibration_codec import identified
 from lowfc.control.loop.inputs import CameraSettings, Input, MirrorShape, Request, Tick
+from lowfc.control.loop.interlocks import Action, BenchReport, Interlock
 from tests.support.toy import NOLL, calibration, frame
 
 CALIBRATION = identified(calibration())
-TIGHT = {"limit_nm": (15.0, 8.0), "max_saturated_pixels": 0, "max_identical_frames": 2}
-"""Settings under which limits act."""
+INTERLOCKS = (
+    Interlock("mask", "equal", True, Action.HOLD, 1000),
+    Interlock("mask", "different", "parked", Action.OPEN, 2000, acts_when_old=False),
+    Interlock("pressure", "above", 3.0, Action.SAFE, 1000, acts_when_old=False),
+)
+TIGHT = {
+    "limit_nm": (15.0, 8.0),
+    "max_saturated_pixels": 0,
+    "max_identical_frames": 2,
+    "rate_hz": 1000.0,
+    "interlocks": INTERLOCKS,
+}
+"""Settings under which limits and interlocks act."""
 
 
 @st.composite
@@ -17,7 +29,7 @@ def inputs(draw: st.DrawFn) -> list[Input]:
     """Good and bad frames, gaps, silence, operators, devices."""
     taken: list[Input] = []
     count = 0
-    for kind in draw(st.lists(st.sampled_from("fffffbltrmcs"), min_size=1, max_size=40)):
+    for kind in draw(st.lists(st.sampled_from("fffffbltrmcsvp"), min_size=1, max_size=40)):
         seed = draw(st.integers(0, 1 << 16))
         rng = np.random.default_rng(seed)
         match kind:
@@ -41,6 +53,14 @@ def inputs(draw: st.DrawFn) -> list[Input]:
                 taken.append(MirrorShape(seed, shape, rng.normal(0, 5, 3).astype(np.float32)))
             case "c":
                 taken.append(CameraSettings(seed, CALIBRATION.shape, 7.0, CALIBRATION.saturation_dn))
+            case "v":
+                value = (True, False, "parked", "away", None)[seed % 5]
+                taken.append(BenchReport(seed, "mask", value, 0 if value is None else seed % 3000))
+                if seed % 11 == 0:
+                    taken.append(BenchReport(seed, "pressure", seed / 10_000))
+            case "p":
+                text, values = "moving the mask", (2**-8,) if seed % 2 else ()
+                taken.append(Request(seed, "permit", (), values, text, lease_id=1 + seed % 3))
             case "s":
                 taken += [Request(seed, "clear"), Request(seed, "close")]
     return taken

@@ -20,6 +20,7 @@ from lowfc.adapters.process.latch import Latch
 from lowfc.adapters.process.service import Service
 from lowfc.contract import configuration
 from lowfc.contract.codecs import codec
+from lowfc.contract.codecs.bench_codec import decode_bench_value, encode_bench_value
 from lowfc.contract.codecs.calibration_codec import decode_calibration, encode_calibration, identified
 from lowfc.contract.codecs.law_codec import wire_law
 from lowfc.contract.codecs.state_codec import controller_state, decode_state
@@ -33,6 +34,7 @@ from lowfc.control.loop.advance import advance
 from lowfc.control.loop.camera import CameraSettings
 from lowfc.control.loop.command_channels import PlayTable
 from lowfc.control.loop.inputs import Input, Load, MirrorShape, Tick
+from lowfc.control.loop.interlocks import BenchReport
 from lowfc.control.loop.requests import prepared
 from lowfc.control.loop.state import State
 from lowfc.device import DriverOptions
@@ -43,12 +45,13 @@ from lowfc.testing.clock import FakeClock
 from lowfc.testing.memory_bus import MemoryBus, MemoryHub
 from sim_dm.device import Device, apply_command, initial, tick
 from sim_dm.driver import SimulatedMirror
+from tests.support.happenings import INTERLOCKS
 from tests.support.mutated_logs import damaged, mutated, rewritten, small_log
 from tests.support.report_log import Night
 from tests.support.safety_checks import violations
 from tests.support.toy import GRID, NOLL, calibration, frame, loaded, settings
 
-USUAL = settings()
+USUAL = settings(interlocks=INTERLOCKS)
 CALIBRATION = identified(calibration())
 
 
@@ -174,7 +177,7 @@ def _messages() -> list[Target]:
     shape = np.ones(GRID, np.float32)
     modes = np.ones(len(NOLL), np.float32)
     loading, mirror = Load(0, CALIBRATION, "x"), MirrorShape(0, shape, modes)
-    inputs = (loading, mirror, CameraSettings(0, (6, 7), 100.0, 6e4), Tick(0, 5))
+    inputs = (loading, mirror, CameraSettings(0, (6, 7), 100.0, 6e4), Tick(0, 5), BenchReport(0, "mask", 2.5))
     told = wire.MirrorCommand(frame_sequence=5, channel="lowfc", valid_for_ns=10**8, rows=4, columns=5)
     told.actuators, told.command_nm[:] = shape.tobytes(), modes.tolist()
     mirror_state = wire.MirrorState(rows=4, columns=5, actuators=shape.tobytes(), command_nm=modes.tolist())
@@ -199,6 +202,13 @@ def _messages() -> list[Target]:
             "mirror state", (mirror_state.SerializeToString(),), partial(_mirror, loop), (LowfcError,), wire.MirrorState
         ),
         Target("camera state", (camera.SerializeToString(),), partial(_camera, loop), (LowfcError,), wire.CameraState),
+        Target(
+            "bench value",
+            tuple(encode_bench_value(value, 5) for value in (True, 2.5, "parked")),
+            decode_bench_value,
+            (LowfcError,),
+            wire.BenchValue,
+        ),
         Target(
             "controller input",
             tuple(codec.encode_input(each, 3) for each in inputs),
@@ -248,6 +258,7 @@ def _arrays() -> tuple[dict[str, LinearLaw], dict[str, PlayTable]]:
 
 def _busy(state: State) -> wire.ControllerState:
     """A state with everything in it."""
+    state, _ = advance(USUAL, state, BenchReport(0, "mask", None))
     for asked in _asked():
         if asked.name in ("channel", "offset", "law", "play"):
             state, _ = advance(USUAL, state, codec.request(asked, asked.name, 0))

@@ -16,8 +16,10 @@ from lowfc.contract.codecs.calibration_codec import camera_settings, identified
 from lowfc.contract.configuration import Configuration
 from lowfc.contract.errors import CalibrationError, ConfigurationError
 from lowfc.contract.messages import timestamp, wire
+from lowfc.contract.sections import InterlockSection
 from lowfc.control.calibration.actuator_response import actuators_to_modes
 from lowfc.control.calibration.calibration import Calibration, noise_nm2, normalise_flux, reconstructor
+from lowfc.control.loop.interlocks import Action, Interlock
 from lowfc.control.loop.safety import Limits, LoopMode
 from lowfc.control.loop.state import Settings
 from lowfc.optics.chain.added_contrast import ModalContrast
@@ -173,7 +175,13 @@ def settings(config: Configuration) -> Settings:
         else 0,  # without noise images are alike
         rate_hz=config.camera.rate_hz,
         guard=control.guard,
+        interlocks=tuple(map(_interlock, config.interlocks)),
     )
+
+
+def _interlock(one: InterlockSection) -> Interlock:
+    max_age_ns, acts_when_old = round(one.max_age_s * 1e9), one.when_old == "acts"
+    return Interlock(one.name, one.test, one.value, Action(one.action), max_age_ns, acts_when_old)
 
 
 def analytic_calibration(

@@ -7,6 +7,7 @@ import numpy as np
 from google.protobuf.message import DecodeError
 
 from lowfc.arrays import Single
+from lowfc.contract.codecs.bench_codec import report_of, wire_report
 from lowfc.contract.codecs.calibration_codec import camera_settings, decode_calibration, wire_camera
 from lowfc.contract.codecs.law_codec import law_header, law_of, wire_law
 from lowfc.contract.errors import BadMessageError
@@ -22,10 +23,10 @@ from lowfc.contract.messages import (
 )
 from lowfc.contract.printable import printable
 from lowfc.control.calibration.calibration import Calibration
+from lowfc.control.durations import Durations
 from lowfc.control.laws.linear_law import LinearLaw
 from lowfc.control.loop.camera import CameraSettings
 from lowfc.control.loop.command_channels import PlayTable
-from lowfc.control.loop.durations import Durations
 from lowfc.control.loop.inputs import (
     Command,
     Frame,
@@ -39,6 +40,7 @@ from lowfc.control.loop.inputs import (
     Step,
     Tick,
 )
+from lowfc.control.loop.interlocks import BenchReport
 from lowfc.control.loop.safety import LoopMode, Reason
 from lowfc.control.loop.wording import MOST_TEXT
 
@@ -149,6 +151,8 @@ def encode_input(taken: Report, number: int) -> bytes:
             message.mirror_report.CopyFrom(wire.MirrorReport(timestamp=time, fault=taken.fault))
             if taken.shape is not None:
                 message.mirror_report.mirror.CopyFrom(_wire_shape(taken.shape))
+        case BenchReport():
+            message.bench_report.CopyFrom(wire_report(taken))
         case CameraSettings():
             message.camera.CopyFrom(wire_camera(taken))
         case Load():
@@ -175,6 +179,8 @@ def decode_input(message: wire.ControlInput, calibrations: Mapping[str, Calibrat
             return MirrorReport(from_timestamp(report.timestamp), report.fault, shape)
         case "camera":
             return camera_settings(message.camera)
+        case "bench_report":
+            return report_of(message.bench_report)
         case "tick":
             return Tick(from_timestamp(message.timestamp), message.tick.silent_ns)
         case "load" if message.load.calibration_id in calibrations:

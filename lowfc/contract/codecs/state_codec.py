@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 
+from lowfc.contract.codecs.bench_codec import acting_of, interlock_of, wire_acting, wire_interlock
 from lowfc.contract.codecs.calibration_codec import camera_settings, wire_camera
 from lowfc.contract.codecs.codec import wire_mode, wire_reasons
 from lowfc.contract.codecs.law_codec import command_channels_of, gains_of, law_header, law_of, put_command_channels
@@ -32,7 +33,7 @@ _STATE = (
     *("input_number", "steps_left", "returning_to_zero", "identical_frames"),
 )
 _CONDITIONS = ("camera_awaited", "clear_id", "mode_cause", "mirror_fault")
-_LEASE = ("id", "holder", "last_sequence", "ended")
+_LEASE = ("id", "holder", "last_sequence", "ended", "holds")
 
 
 def controller_state(state: State, settings: Settings, time_ns: int) -> wire.ControllerState:
@@ -52,6 +53,7 @@ def controller_state(state: State, settings: Settings, time_ns: int) -> wire.Con
         lease=None if lease is None else wire.Lease(until=timestamp(lease.until_ns), **fields_of(lease, _LEASE)),
         measured_nm=() if estimate is None else estimate.error_nm.tolist(),
         flux_dn=0.0 if estimate is None else estimate.flux_dn,
+        interlocks_acting=map(wire_acting, conditions.acting),
         **fields_of(state, _STATE),
         **fields_of(conditions, _CONDITIONS),
     )
@@ -142,6 +144,7 @@ def decode_state(
             lease=Lease(until_ns=from_timestamp(message.lease.until), **fields_of(message.lease, _LEASE))
             if message.HasField("lease")
             else None,
+            acting=tuple(map(acting_of, message.interlocks_acting)),
             **fields_of(message, _CONDITIONS),
         ),
         **fields_of(message, _STATE),
@@ -186,6 +189,7 @@ def _encode_settings(settings: Settings) -> wire.ControllerSettings:
     return wire.ControllerSettings(
         start_mode=wire_mode(settings.start_mode),
         auto_gain=settings.auto_gain if any(settings.auto_gain) else (),
+        interlocks=map(wire_interlock, settings.interlocks),
         **fields_of(settings.limits, _LIMITS),
         **fields_of(settings, (*_SETTINGS, *_PAIRS)),
     )
@@ -199,6 +203,7 @@ def _decode_settings(message: wire.ControllerSettings) -> Settings:
         limits=Limits(*(getattr(message, name) for name in _LIMITS)),
         start_mode=LoopMode(message.start_mode),
         auto_gain=tuple(message.auto_gain) or (False, False),  # type: ignore[arg-type]  # a pair
+        interlocks=tuple(map(interlock_of, message.interlocks)),
         **fields_of(message, _SETTINGS),
         **pairs,
     )

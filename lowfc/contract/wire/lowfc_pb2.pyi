@@ -33,6 +33,7 @@ class Reason(int, metaclass=_enum_type_wrapper.EnumTypeWrapper):
     REASON_AHEAD: _ClassVar[Reason]
     REASON_CAMERA_UNKNOWN: _ClassVar[Reason]
     REASON_NO_MIRROR: _ClassVar[Reason]
+    REASON_HELD: _ClassVar[Reason]
     REASON_MODAL_LIMIT: _ClassVar[Reason]
     REASON_STROKE: _ClassVar[Reason]
     REASON_SLEW: _ClassVar[Reason]
@@ -66,6 +67,7 @@ REASON_STUCK: Reason
 REASON_AHEAD: Reason
 REASON_CAMERA_UNKNOWN: Reason
 REASON_NO_MIRROR: Reason
+REASON_HELD: Reason
 REASON_MODAL_LIMIT: Reason
 REASON_STROKE: Reason
 REASON_SLEW: Reason
@@ -163,8 +165,58 @@ class MirrorReport(_message.Message):
     mirror: MirrorState
     def __init__(self, timestamp: _Optional[_Union[datetime.datetime, _timestamp_pb2.Timestamp, _Mapping]] = ..., fault: _Optional[str] = ..., mirror: _Optional[_Union[MirrorState, _Mapping]] = ...) -> None: ...
 
+class BenchValue(_message.Message):
+    __slots__ = ("timestamp", "number", "text", "truth")
+    TIMESTAMP_FIELD_NUMBER: _ClassVar[int]
+    NUMBER_FIELD_NUMBER: _ClassVar[int]
+    TEXT_FIELD_NUMBER: _ClassVar[int]
+    TRUTH_FIELD_NUMBER: _ClassVar[int]
+    timestamp: _timestamp_pb2.Timestamp
+    number: float
+    text: str
+    truth: bool
+    def __init__(self, timestamp: _Optional[_Union[datetime.datetime, _timestamp_pb2.Timestamp, _Mapping]] = ..., number: _Optional[float] = ..., text: _Optional[str] = ..., truth: _Optional[bool] = ...) -> None: ...
+
+class BenchReport(_message.Message):
+    __slots__ = ("timestamp", "name", "value", "age_ns")
+    TIMESTAMP_FIELD_NUMBER: _ClassVar[int]
+    NAME_FIELD_NUMBER: _ClassVar[int]
+    VALUE_FIELD_NUMBER: _ClassVar[int]
+    AGE_NS_FIELD_NUMBER: _ClassVar[int]
+    timestamp: _timestamp_pb2.Timestamp
+    name: str
+    value: BenchValue
+    age_ns: int
+    def __init__(self, timestamp: _Optional[_Union[datetime.datetime, _timestamp_pb2.Timestamp, _Mapping]] = ..., name: _Optional[str] = ..., value: _Optional[_Union[BenchValue, _Mapping]] = ..., age_ns: _Optional[int] = ...) -> None: ...
+
+class Interlock(_message.Message):
+    __slots__ = ("name", "test", "value", "action", "max_age_ns", "acts_when_old")
+    NAME_FIELD_NUMBER: _ClassVar[int]
+    TEST_FIELD_NUMBER: _ClassVar[int]
+    VALUE_FIELD_NUMBER: _ClassVar[int]
+    ACTION_FIELD_NUMBER: _ClassVar[int]
+    MAX_AGE_NS_FIELD_NUMBER: _ClassVar[int]
+    ACTS_WHEN_OLD_FIELD_NUMBER: _ClassVar[int]
+    name: str
+    test: str
+    value: BenchValue
+    action: str
+    max_age_ns: int
+    acts_when_old: bool
+    def __init__(self, name: _Optional[str] = ..., test: _Optional[str] = ..., value: _Optional[_Union[BenchValue, _Mapping]] = ..., action: _Optional[str] = ..., max_age_ns: _Optional[int] = ..., acts_when_old: _Optional[bool] = ...) -> None: ...
+
+class ActingInterlock(_message.Message):
+    __slots__ = ("number", "action", "why")
+    NUMBER_FIELD_NUMBER: _ClassVar[int]
+    ACTION_FIELD_NUMBER: _ClassVar[int]
+    WHY_FIELD_NUMBER: _ClassVar[int]
+    number: int
+    action: str
+    why: str
+    def __init__(self, number: _Optional[int] = ..., action: _Optional[str] = ..., why: _Optional[str] = ...) -> None: ...
+
 class ControlInput(_message.Message):
-    __slots__ = ("timestamp", "input_number", "load", "mirror", "camera", "tick", "mirror_report")
+    __slots__ = ("timestamp", "input_number", "load", "mirror", "camera", "tick", "mirror_report", "bench_report")
     TIMESTAMP_FIELD_NUMBER: _ClassVar[int]
     INPUT_NUMBER_FIELD_NUMBER: _ClassVar[int]
     LOAD_FIELD_NUMBER: _ClassVar[int]
@@ -172,6 +224,7 @@ class ControlInput(_message.Message):
     CAMERA_FIELD_NUMBER: _ClassVar[int]
     TICK_FIELD_NUMBER: _ClassVar[int]
     MIRROR_REPORT_FIELD_NUMBER: _ClassVar[int]
+    BENCH_REPORT_FIELD_NUMBER: _ClassVar[int]
     timestamp: _timestamp_pb2.Timestamp
     input_number: int
     load: Load
@@ -179,7 +232,8 @@ class ControlInput(_message.Message):
     camera: CameraState
     tick: Tick
     mirror_report: MirrorReport
-    def __init__(self, timestamp: _Optional[_Union[datetime.datetime, _timestamp_pb2.Timestamp, _Mapping]] = ..., input_number: _Optional[int] = ..., load: _Optional[_Union[Load, _Mapping]] = ..., mirror: _Optional[_Union[MirrorState, _Mapping]] = ..., camera: _Optional[_Union[CameraState, _Mapping]] = ..., tick: _Optional[_Union[Tick, _Mapping]] = ..., mirror_report: _Optional[_Union[MirrorReport, _Mapping]] = ...) -> None: ...
+    bench_report: BenchReport
+    def __init__(self, timestamp: _Optional[_Union[datetime.datetime, _timestamp_pb2.Timestamp, _Mapping]] = ..., input_number: _Optional[int] = ..., load: _Optional[_Union[Load, _Mapping]] = ..., mirror: _Optional[_Union[MirrorState, _Mapping]] = ..., camera: _Optional[_Union[CameraState, _Mapping]] = ..., tick: _Optional[_Union[Tick, _Mapping]] = ..., mirror_report: _Optional[_Union[MirrorReport, _Mapping]] = ..., bench_report: _Optional[_Union[BenchReport, _Mapping]] = ...) -> None: ...
 
 class ControlTiming(_message.Message):
     __slots__ = ("timestamp", "frame_sequence", "transport_ns", "wakeup_ns", "compute_ns", "publish_ns", "frame_to_command_ns")
@@ -208,7 +262,7 @@ class ReasonCount(_message.Message):
     def __init__(self, reason: _Optional[_Union[Reason, str]] = ..., count: _Optional[int] = ...) -> None: ...
 
 class ControllerSettings(_message.Message):
-    __slots__ = ("stroke_nm", "slew_nm", "neighbour_nm", "delay_frames", "start_mode", "max_frame_age_ns", "frame_timeout_ns", "on_frame_timeout", "min_flux_fraction", "max_saturated_pixels", "gain", "leak", "limit_nm", "max_identical_frames", "rate_hz", "auto_gain", "guard")
+    __slots__ = ("stroke_nm", "slew_nm", "neighbour_nm", "delay_frames", "start_mode", "max_frame_age_ns", "frame_timeout_ns", "on_frame_timeout", "min_flux_fraction", "max_saturated_pixels", "gain", "leak", "limit_nm", "max_identical_frames", "rate_hz", "auto_gain", "guard", "interlocks")
     STROKE_NM_FIELD_NUMBER: _ClassVar[int]
     SLEW_NM_FIELD_NUMBER: _ClassVar[int]
     NEIGHBOUR_NM_FIELD_NUMBER: _ClassVar[int]
@@ -226,6 +280,7 @@ class ControllerSettings(_message.Message):
     RATE_HZ_FIELD_NUMBER: _ClassVar[int]
     AUTO_GAIN_FIELD_NUMBER: _ClassVar[int]
     GUARD_FIELD_NUMBER: _ClassVar[int]
+    INTERLOCKS_FIELD_NUMBER: _ClassVar[int]
     stroke_nm: float
     slew_nm: float
     neighbour_nm: float
@@ -243,7 +298,8 @@ class ControllerSettings(_message.Message):
     rate_hz: float
     auto_gain: _containers.RepeatedScalarFieldContainer[bool]
     guard: bool
-    def __init__(self, stroke_nm: _Optional[float] = ..., slew_nm: _Optional[float] = ..., neighbour_nm: _Optional[float] = ..., delay_frames: _Optional[float] = ..., start_mode: _Optional[_Union[LoopMode, str]] = ..., max_frame_age_ns: _Optional[int] = ..., frame_timeout_ns: _Optional[int] = ..., on_frame_timeout: _Optional[str] = ..., min_flux_fraction: _Optional[float] = ..., max_saturated_pixels: _Optional[int] = ..., gain: _Optional[_Iterable[float]] = ..., leak: _Optional[_Iterable[float]] = ..., limit_nm: _Optional[_Iterable[float]] = ..., max_identical_frames: _Optional[int] = ..., rate_hz: _Optional[float] = ..., auto_gain: _Optional[_Iterable[bool]] = ..., guard: _Optional[bool] = ...) -> None: ...
+    interlocks: _containers.RepeatedCompositeFieldContainer[Interlock]
+    def __init__(self, stroke_nm: _Optional[float] = ..., slew_nm: _Optional[float] = ..., neighbour_nm: _Optional[float] = ..., delay_frames: _Optional[float] = ..., start_mode: _Optional[_Union[LoopMode, str]] = ..., max_frame_age_ns: _Optional[int] = ..., frame_timeout_ns: _Optional[int] = ..., on_frame_timeout: _Optional[str] = ..., min_flux_fraction: _Optional[float] = ..., max_saturated_pixels: _Optional[int] = ..., gain: _Optional[_Iterable[float]] = ..., leak: _Optional[_Iterable[float]] = ..., limit_nm: _Optional[_Iterable[float]] = ..., max_identical_frames: _Optional[int] = ..., rate_hz: _Optional[float] = ..., auto_gain: _Optional[_Iterable[bool]] = ..., guard: _Optional[bool] = ..., interlocks: _Optional[_Iterable[_Union[Interlock, _Mapping]]] = ...) -> None: ...
 
 class Channel(_message.Message):
     __slots__ = ("name", "actuators", "shifts", "reached")
@@ -308,7 +364,7 @@ class LinearLaw(_message.Message):
     def __init__(self, name: _Optional[str] = ..., signal: _Optional[str] = ..., noll: _Optional[_Iterable[int]] = ..., delay_frames: _Optional[float] = ..., rate_hz: _Optional[float] = ..., states: _Optional[int] = ..., transition: _Optional[bytes] = ..., measurement_gain: _Optional[bytes] = ..., command_gain: _Optional[bytes] = ..., predict_only: _Optional[bytes] = ..., output: _Optional[bytes] = ..., id: _Optional[str] = ..., timestamp: _Optional[_Union[datetime.datetime, _timestamp_pb2.Timestamp, _Mapping]] = ...) -> None: ...
 
 class ControllerState(_message.Message):
-    __slots__ = ("timestamp", "frame_sequence", "mode", "calibration_id", "gain", "leak", "limit_nm", "delay_frames", "command_history_nm", "actuators", "offset", "counts", "frames_used", "frame_timestamp", "refused", "refused_count", "limits_hit", "frame_timeout", "commanded", "input_number", "settings", "offset_nm", "channels", "shift_history_nm", "law", "law_state", "law_frames", "play", "steps_left", "returning_to_zero", "measured_nm", "flux_dn", "identical_frames", "camera", "camera_expected", "camera_awaited", "clear_id", "mode_timestamp", "mode_cause", "lease", "mirror_rows", "mirror_columns", "mirror_fault", "calibration_provisional", "automatic", "prior_nm2", "weighting_flux_dn", "guard")
+    __slots__ = ("timestamp", "frame_sequence", "mode", "calibration_id", "gain", "leak", "limit_nm", "delay_frames", "command_history_nm", "actuators", "offset", "counts", "frames_used", "frame_timestamp", "refused", "refused_count", "limits_hit", "frame_timeout", "commanded", "input_number", "settings", "offset_nm", "channels", "shift_history_nm", "law", "law_state", "law_frames", "play", "steps_left", "returning_to_zero", "measured_nm", "flux_dn", "identical_frames", "camera", "camera_expected", "camera_awaited", "clear_id", "mode_timestamp", "mode_cause", "lease", "mirror_rows", "mirror_columns", "mirror_fault", "calibration_provisional", "automatic", "prior_nm2", "weighting_flux_dn", "guard", "interlocks_acting")
     TIMESTAMP_FIELD_NUMBER: _ClassVar[int]
     FRAME_SEQUENCE_FIELD_NUMBER: _ClassVar[int]
     MODE_FIELD_NUMBER: _ClassVar[int]
@@ -357,6 +413,7 @@ class ControllerState(_message.Message):
     PRIOR_NM2_FIELD_NUMBER: _ClassVar[int]
     WEIGHTING_FLUX_DN_FIELD_NUMBER: _ClassVar[int]
     GUARD_FIELD_NUMBER: _ClassVar[int]
+    INTERLOCKS_ACTING_FIELD_NUMBER: _ClassVar[int]
     timestamp: _timestamp_pb2.Timestamp
     frame_sequence: int
     mode: LoopMode
@@ -405,7 +462,8 @@ class ControllerState(_message.Message):
     prior_nm2: _containers.RepeatedScalarFieldContainer[float]
     weighting_flux_dn: float
     guard: Guard
-    def __init__(self, timestamp: _Optional[_Union[datetime.datetime, _timestamp_pb2.Timestamp, _Mapping]] = ..., frame_sequence: _Optional[int] = ..., mode: _Optional[_Union[LoopMode, str]] = ..., calibration_id: _Optional[str] = ..., gain: _Optional[_Iterable[float]] = ..., leak: _Optional[_Iterable[float]] = ..., limit_nm: _Optional[_Iterable[float]] = ..., delay_frames: _Optional[float] = ..., command_history_nm: _Optional[_Iterable[float]] = ..., actuators: _Optional[bytes] = ..., offset: _Optional[bytes] = ..., counts: _Optional[_Iterable[_Union[ReasonCount, _Mapping]]] = ..., frames_used: _Optional[int] = ..., frame_timestamp: _Optional[_Union[datetime.datetime, _timestamp_pb2.Timestamp, _Mapping]] = ..., refused: _Optional[_Union[Reason, str]] = ..., refused_count: _Optional[int] = ..., limits_hit: _Optional[_Iterable[_Union[Reason, str]]] = ..., frame_timeout: _Optional[bool] = ..., commanded: _Optional[bool] = ..., input_number: _Optional[int] = ..., settings: _Optional[_Union[ControllerSettings, _Mapping]] = ..., offset_nm: _Optional[_Iterable[float]] = ..., channels: _Optional[_Iterable[_Union[Channel, _Mapping]]] = ..., shift_history_nm: _Optional[_Iterable[float]] = ..., law: _Optional[_Union[LinearLaw, _Mapping]] = ..., law_state: _Optional[_Iterable[float]] = ..., law_frames: _Optional[int] = ..., play: _Optional[_Union[Play, _Mapping]] = ..., steps_left: _Optional[int] = ..., returning_to_zero: _Optional[bool] = ..., measured_nm: _Optional[_Iterable[float]] = ..., flux_dn: _Optional[float] = ..., identical_frames: _Optional[int] = ..., camera: _Optional[_Union[CameraState, _Mapping]] = ..., camera_expected: _Optional[_Union[CameraState, _Mapping]] = ..., camera_awaited: _Optional[bool] = ..., clear_id: _Optional[int] = ..., mode_timestamp: _Optional[_Union[datetime.datetime, _timestamp_pb2.Timestamp, _Mapping]] = ..., mode_cause: _Optional[str] = ..., lease: _Optional[_Union[Lease, _Mapping]] = ..., mirror_rows: _Optional[int] = ..., mirror_columns: _Optional[int] = ..., mirror_fault: _Optional[str] = ..., calibration_provisional: _Optional[bool] = ..., automatic: _Optional[_Iterable[bool]] = ..., prior_nm2: _Optional[_Iterable[float]] = ..., weighting_flux_dn: _Optional[float] = ..., guard: _Optional[_Union[Guard, _Mapping]] = ...) -> None: ...
+    interlocks_acting: _containers.RepeatedCompositeFieldContainer[ActingInterlock]
+    def __init__(self, timestamp: _Optional[_Union[datetime.datetime, _timestamp_pb2.Timestamp, _Mapping]] = ..., frame_sequence: _Optional[int] = ..., mode: _Optional[_Union[LoopMode, str]] = ..., calibration_id: _Optional[str] = ..., gain: _Optional[_Iterable[float]] = ..., leak: _Optional[_Iterable[float]] = ..., limit_nm: _Optional[_Iterable[float]] = ..., delay_frames: _Optional[float] = ..., command_history_nm: _Optional[_Iterable[float]] = ..., actuators: _Optional[bytes] = ..., offset: _Optional[bytes] = ..., counts: _Optional[_Iterable[_Union[ReasonCount, _Mapping]]] = ..., frames_used: _Optional[int] = ..., frame_timestamp: _Optional[_Union[datetime.datetime, _timestamp_pb2.Timestamp, _Mapping]] = ..., refused: _Optional[_Union[Reason, str]] = ..., refused_count: _Optional[int] = ..., limits_hit: _Optional[_Iterable[_Union[Reason, str]]] = ..., frame_timeout: _Optional[bool] = ..., commanded: _Optional[bool] = ..., input_number: _Optional[int] = ..., settings: _Optional[_Union[ControllerSettings, _Mapping]] = ..., offset_nm: _Optional[_Iterable[float]] = ..., channels: _Optional[_Iterable[_Union[Channel, _Mapping]]] = ..., shift_history_nm: _Optional[_Iterable[float]] = ..., law: _Optional[_Union[LinearLaw, _Mapping]] = ..., law_state: _Optional[_Iterable[float]] = ..., law_frames: _Optional[int] = ..., play: _Optional[_Union[Play, _Mapping]] = ..., steps_left: _Optional[int] = ..., returning_to_zero: _Optional[bool] = ..., measured_nm: _Optional[_Iterable[float]] = ..., flux_dn: _Optional[float] = ..., identical_frames: _Optional[int] = ..., camera: _Optional[_Union[CameraState, _Mapping]] = ..., camera_expected: _Optional[_Union[CameraState, _Mapping]] = ..., camera_awaited: _Optional[bool] = ..., clear_id: _Optional[int] = ..., mode_timestamp: _Optional[_Union[datetime.datetime, _timestamp_pb2.Timestamp, _Mapping]] = ..., mode_cause: _Optional[str] = ..., lease: _Optional[_Union[Lease, _Mapping]] = ..., mirror_rows: _Optional[int] = ..., mirror_columns: _Optional[int] = ..., mirror_fault: _Optional[str] = ..., calibration_provisional: _Optional[bool] = ..., automatic: _Optional[_Iterable[bool]] = ..., prior_nm2: _Optional[_Iterable[float]] = ..., weighting_flux_dn: _Optional[float] = ..., guard: _Optional[_Union[Guard, _Mapping]] = ..., interlocks_acting: _Optional[_Iterable[_Union[ActingInterlock, _Mapping]]] = ...) -> None: ...
 
 class Guard(_message.Message):
     __slots__ = ("groups", "frames", "sums_nm2", "void", "virtual_nm", "law_state")
@@ -438,18 +496,20 @@ class GuardedGroup(_message.Message):
     def __init__(self, overruled: _Optional[bool] = ..., faded: _Optional[int] = ..., takeovers: _Optional[int] = ..., blocks: _Optional[int] = ..., usual_nm2: _Optional[float] = ...) -> None: ...
 
 class Lease(_message.Message):
-    __slots__ = ("id", "holder", "until", "last_sequence", "ended")
+    __slots__ = ("id", "holder", "until", "last_sequence", "ended", "holds")
     ID_FIELD_NUMBER: _ClassVar[int]
     HOLDER_FIELD_NUMBER: _ClassVar[int]
     UNTIL_FIELD_NUMBER: _ClassVar[int]
     LAST_SEQUENCE_FIELD_NUMBER: _ClassVar[int]
     ENDED_FIELD_NUMBER: _ClassVar[int]
+    HOLDS_FIELD_NUMBER: _ClassVar[int]
     id: int
     holder: str
     until: _timestamp_pb2.Timestamp
     last_sequence: int
     ended: str
-    def __init__(self, id: _Optional[int] = ..., holder: _Optional[str] = ..., until: _Optional[_Union[datetime.datetime, _timestamp_pb2.Timestamp, _Mapping]] = ..., last_sequence: _Optional[int] = ..., ended: _Optional[str] = ...) -> None: ...
+    holds: bool
+    def __init__(self, id: _Optional[int] = ..., holder: _Optional[str] = ..., until: _Optional[_Union[datetime.datetime, _timestamp_pb2.Timestamp, _Mapping]] = ..., last_sequence: _Optional[int] = ..., ended: _Optional[str] = ..., holds: _Optional[bool] = ...) -> None: ...
 
 class Request(_message.Message):
     __slots__ = ("timestamp", "name", "modes", "values", "text", "accepted", "reply", "frame_sequence", "state", "input_number", "actuators", "table", "columns", "law", "calibration", "play_id", "lease_id", "requester", "prior_nm2", "flux_dn")

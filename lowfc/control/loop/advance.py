@@ -29,9 +29,12 @@ from lowfc.control.loop.inputs import (
     Step,
     Tick,
 )
+from lowfc.control.loop.interlocks import BenchReport
 from lowfc.control.loop.loading import (
+    bench_reported,
     camera_reported,
     end_probe,
+    held,
     in_mode,
     loaded,
     mirror_judged,
@@ -177,6 +180,8 @@ def _measure(settings: Settings, state: State, drive: ActiveLoop, frame: Frame) 
         return Rejection.CAMERA_UNKNOWN
     if state.conditions.mirror_fault and state.mode is LoopMode.CLOSED:
         return Rejection.NO_MIRROR
+    if state.mode is LoopMode.CLOSED and held(state):
+        return Rejection.HELD
     if frame.pixels is None or frame.pixels.shape != calibration.shape:
         return Rejection.WRONG_SIZE
     if frame.age_ns > settings.max_frame_age_ns:
@@ -386,6 +391,7 @@ _HANDLERS: dict[type, Callable[..., tuple[State, Outputs]]] = {
     MirrorShape: mirror_reported,
     MirrorReport: mirror_judged,
     CameraSettings: camera_reported,
+    BenchReport: bench_reported,
     Load: _load,
     Tick: _tick,
 }

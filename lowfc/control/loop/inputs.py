@@ -11,6 +11,7 @@ from lowfc.control.calibration.calibration import Calibration
 from lowfc.control.laws.linear_law import LinearLaw
 from lowfc.control.loop.camera import CameraSettings
 from lowfc.control.loop.command_channels import PlayTable
+from lowfc.control.loop.interlocks import BenchReport
 from lowfc.control.loop.safety import LoopMode, Reason
 
 COUNT_BITS = 32
@@ -115,7 +116,7 @@ class Tick:
     silent_ns: int
 
 
-Report = MirrorShape | MirrorReport | CameraSettings | Load | Tick
+Report = MirrorShape | MirrorReport | CameraSettings | BenchReport | Load | Tick
 """What is neither a frame nor a request."""
 Input = Frame | Request | Report
 

@@ -18,7 +18,7 @@ MAX_HOLDER = 200
 
 ENDED_BY = frozenset({"safe", "open", "pause", "stop"})
 """Requests that are granted to anybody, and that end the lease of somebody else."""
-UNRELATED = frozenset({"status", "note", "lease", "renew", "release"})
+UNRELATED = frozenset({"status", "note", "lease", "renew", "release", "permit"})
 """Requests that do not change the loop, and those of leases themselves."""
 
 
@@ -31,6 +31,7 @@ class Lease(NamedTuple):
         until_ns: end by the controller's clock, unless it is renewed.
         last_sequence: of the last frame for which it is in force; 0 where the frame rate is not known.
         ended: cause of its end; empty while it is in force.
+        holds: it is a permit: a closed loop holds its command while it is in force.
     """
 
     id: int
@@ -38,6 +39,7 @@ class Lease(NamedTuple):
     until_ns: int
     last_sequence: int = 0
     ended: str = ""
+    holds: bool = False
 
     def over(self, time_ns: int, frame_sequence: int) -> bool:
         """Whether it has not been renewed in time, by the clock or by the frames."""

@@ -9,6 +9,7 @@ from lowfc.control.calibration.calibration import Calibration
 from lowfc.control.loop.camera import CameraSettings, changes
 from lowfc.control.loop.command_channels import ADOPTED, Channel
 from lowfc.control.loop.inputs import MirrorReport, MirrorShape, Outputs, PendingEvent
+from lowfc.control.loop.interlocks import IN_WORDS, Action, BenchReport, judged, refusal
 from lowfc.control.loop.safety import LoopMode, limit
 from lowfc.control.loop.state import ActiveLoop, Conditions, Settings, State
 from lowfc.control.loop.wording import MEASURED_FIRST
@@ -68,6 +69,8 @@ def loaded(
         mode, cause = LoopMode.IDLE, wrong
     elif mode is LoopMode.CLOSED and (wrong := misfit(state)):
         mode, cause = LoopMode.OPEN, f"the camera does not fit the calibration: {wrong}"
+    elif mode is LoopMode.CLOSED and (wrong := refusal(state.conditions.acting, "close")):
+        mode, cause = LoopMode.OPEN, wrong
     if mode is not before_mode:
         events.append(mode_event(before_mode, mode, cause))
         state = state._replace(mode=mode, conditions=_since(state, time_ns, cause))
@@ -101,9 +104,47 @@ def holding(state: State) -> str:
         return f"the mirror {state.conditions.mirror_fault}"
     if state.frame_timeout:
         return "no frame comes"
+    if why := held(state):
+        return why
     if state.refused is not None and state.refused_count >= REFUSED_IN_A_ROW:
         return f"frames are refused as {state.refused.name}"
     return ""
+
+
+def held(state: State) -> str:
+    """What holds the command of a closed loop, an interlock or a permit; empty where nothing does."""
+    acting, lease = state.conditions.acting, state.conditions.lease
+    if lease is not None and lease.holds and not lease.ended:
+        return f"it is held for {lease.holder}"
+    return next((f"an interlock acts: {one.why}" for one in acting if one.action is Action.HOLD), "")
+
+
+def bench_reported(settings: Settings, state: State, report: BenchReport) -> tuple[State, Outputs]:
+    """Judge the interlocks on a bench value; one that begins to act makes the loop safer, and none closes it again.
+
+    A loop that started closed is opened by what would have refused to close it.
+    """
+    before = state.conditions.acting
+    after = judged(settings.interlocks, before, report)
+    if after is before:
+        return state, Outputs()
+    begun = [one for one in after if one not in before]
+    events = [PendingEvent("INTERLOCK_ACTS", {"why": one.why, "action": IN_WORDS[one.action]}) for one in begun]
+    still = {one.number for one in after}
+    events += [PendingEvent("INTERLOCK_CLEARED", {"why": one.why}) for one in before if one.number not in still]
+    state = state._replace(conditions=state.conditions._replace(acting=after))
+    opening = (Action.OPEN, Action.SAFE) if state.frames_used else (Action.OPEN, Action.SAFE, Action.REFUSE_CLOSE)
+    for one in begun:
+        mode, cause = state.mode, f"an interlock acts: {one.why}"
+        if one.action is Action.SAFE:
+            mode = LoopMode.SAFE
+        elif one.action in opening and mode is LoopMode.CLOSED:
+            mode = LoopMode.OPEN
+        if mode is not state.mode:
+            events.append(mode_event(state.mode, mode, cause))
+            events += [PendingEvent("SAFED", {"why": cause})] if mode is LoopMode.SAFE else []
+            state = in_mode(state, mode, report.time_ns, cause)
+    return state, Outputs(events=events, changed=True)
 
 
 def mirror_reported(settings: Settings, state: State, shape: MirrorShape) -> tuple[State, Outputs]:

@@ -11,13 +11,14 @@ import numpy as np
 from lowfc.arrays import Single
 from lowfc.control.laws.margins import check_law
 from lowfc.control.laws.stability import highest_gain
+from lowfc.control.loop import interlocks
 from lowfc.control.loop.command_channels import EXTERNAL, FLAT, MIRROR, CommandChannels, Play, play_table
 from lowfc.control.loop.gains import changed_law, per_mode
 from lowfc.control.loop.inputs import Outputs, PendingEvent, Reply, Request
 from lowfc.control.loop.lease import ENDED_BY, Lease, asked_by, refusal
 from lowfc.control.loop.loading import holding, in_mode, loaded, misfit, mode_event, uncalibrated
 from lowfc.control.loop.remarks import check_offset
-from lowfc.control.loop.reservation import lease, lease_checked, lease_ended, release, renew
+from lowfc.control.loop.reservation import lease, lease_checked, lease_ended, permit, release, renew
 from lowfc.control.loop.safety import Limits, LoopMode, Rejection, neighbour_difference_nm, request_mode
 from lowfc.control.loop.state import ActiveLoop, LawRunner, Settings, State
 from lowfc.control.loop.wording import MOST_TEXT, PAUSED, counted
@@ -118,7 +119,7 @@ def _granted(state: State, asked: str) -> LoopMode:
     """The mode that a request leads to; ValueError says why it is refused."""
     missing = uncalibrated(state)
     after, why = request_mode(state.mode, asked, calibrated=not missing)
-    if why:
+    if why := why or interlocks.refusal(state.conditions.acting, asked):
         raise ValueError(missing if asked == "close" and missing else why)
     if after is LoopMode.CLOSED:
         _check_closable(state)
@@ -183,8 +184,7 @@ def _law_of_modes(settings: Settings, state: State, request: Request) -> Handled
 
 
 def _offset(settings: Settings, state: State, request: Request) -> Handled:
-    drive = _drive(state)
-    added = drive.added()
+    added = (drive := _drive(state)).added()
     asked = request if request.values else replace(request, values=(0.0,))
     values = per_mode(drive.calibration.noll, asked, added.offset_nm)
     check_offset(drive, np.abs(values))
@@ -342,6 +342,7 @@ _HANDLERS: dict[str, Handler] = {
     "lease": lease,
     "renew": renew,
     "release": release,
+    "permit": permit,
 }
 
 CONFIGURATION = "configuration"

@@ -34,7 +34,7 @@ def renew(settings: Settings, state: State, request: Request) -> tuple[State, st
         raise ValueError("this lease is not in force: the controller restarted, or another lease was granted")
     if before.ended:
         raise ValueError(f"the lease ended: {before.ended}")
-    made = _extended(settings, state, request)
+    made = _extended(settings, state, request)._replace(holds=before.holds)
     return _with(state, made), made.reserved(request.time_ns)
 
 
@@ -52,7 +52,7 @@ def lease_checked(state: State, time_ns: int, frame_sequence: int) -> tuple[Stat
     held = state.conditions.lease
     if held is None or held.ended or not held.over(time_ns, frame_sequence):
         return state, []
-    return lease_ended(state, "it was not renewed in time")
+    return lease_ended(state, "its time is over" if held.holds else "it was not renewed in time")
 
 
 def lease_ended(state: State, why: str) -> tuple[State, list[PendingEvent]]:
@@ -64,6 +64,28 @@ def lease_ended(state: State, why: str) -> tuple[State, list[PendingEvent]]:
         drive = drive._replace(command_channels=drive.command_channels.stopped(state.frame_sequence))
     after = _with(state, held._replace(ended=why))._replace(drive=drive)
     return after, [PendingEvent("LEASE_ENDED", {"holder": held.holder, "why": why})]
+
+
+def permit(settings: Settings, state: State, request: Request) -> tuple[State, str, *tuple[PendingEvent, ...]]:
+    """Whether something on the bench may be moved; for some seconds, the loop is reserved and a closed one holds.
+
+    Raises:
+        ValueError: it may not, and why; or the request is not whole.
+    """
+    before, drive, closed = state.conditions.lease, state.drive, state.mode is LoopMode.CLOSED
+    if before is not None and not before.ended and before.id != request.lease_id:
+        raise ValueError(before.reserved(request.time_ns))
+    play = drive.command_channels.play if drive is not None and drive.command_channels is not None else None
+    if play is not None and not play.over(state.frame_sequence + 1):
+        raise ValueError("a probe sequence is being played, and would measure what moves")
+    if not request.values:
+        if closed:
+            raise ValueError("the loop is closed, and would follow what moves: ask for it to be held for some seconds")
+        return state, f"granted: the loop is {state.mode.in_words}"
+    made = _extended(settings, state, request)._replace(holds=True)
+    what = "holds its command" if closed else f"is {state.mode.in_words} and stays so"
+    text = f"granted for {request.values[0]:g} s: the loop {what}"
+    return _with(state, made), text, PendingEvent("LEASE_TAKEN", {"holder": made.holder})
 
 
 def _extended(settings: Settings, state: State, request: Request) -> Lease:

@@ -48,6 +48,7 @@ class Rejection(IntEnum):
     AHEAD = 10
     CAMERA_UNKNOWN = 11
     NO_MIRROR = 12
+    HELD = 13
 
 
 class Limit(IntEnum):

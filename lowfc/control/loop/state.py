@@ -18,6 +18,7 @@ from lowfc.control.loop.camera import CameraSettings
 from lowfc.control.loop.command_channels import CommandChannels
 from lowfc.control.loop.estimator import Estimate, Estimator
 from lowfc.control.loop.guard import Guard
+from lowfc.control.loop.interlocks import Acting, Interlock
 from lowfc.control.loop.lease import Lease
 from lowfc.control.loop.safety import Limits, LoopMode, Reason, Rejection
 
@@ -47,6 +48,7 @@ class Settings:
         rate_hz: of the frames; 0 where it is not known.
         guard: laws are guarded.
         auto_gain: whether the gains of tip and tilt, and of the other modes, follow what is measured.
+        interlocks: conditions on values of the bench.
     """
 
     limits: Limits
@@ -64,6 +66,7 @@ class Settings:
     rate_hz: float = 0.0
     guard: bool = False
     auto_gain: tuple[bool, bool] = (False, False)
+    interlocks: tuple[Interlock, ...] = ()
 
     def law(self, noll: tuple[int, ...]) -> Law:
         """The law for these modes: the first figure of each pair for tip and tilt, the second for the rest."""
@@ -256,6 +259,7 @@ class Conditions(NamedTuple):
         mode_since_ns: time of the change to this loop mode, and `mode_cause` its cause.
         lease: the reservation of the loop, or the last one that ended; None before the first.
         mirror_fault: why the mirror does not follow commands; empty where it does.
+        acting: interlocks that act.
     """
 
     camera: CameraSettings | None = None
@@ -265,6 +269,7 @@ class Conditions(NamedTuple):
     mode_cause: str = ""
     lease: Lease | None = None
     mirror_fault: str = ""
+    acting: tuple[Acting, ...] = ()
 
 
 class State(NamedTuple):

@@ -35,15 +35,22 @@ def commented(config: Configuration) -> str:
 def _lines(section: BaseModel, prefix: str = "") -> Iterator[str]:
     """Keys of a section, then the sections in it."""
     names = type(section).model_fields
-    inner = [name for name in names if isinstance(getattr(section, name), BaseModel)]
+    inner = {name: _tables(getattr(section, name)) for name in names}
     for name in names:
-        if name in inner:
+        if inner[name]:
             continue
         yield f"# {' '.join((names[name].description or '').split())}"
         mark = "" if name in section.model_fields_set else "#"
         yield from (f"{mark}{line}" for line in _assignment(name, getattr(section, name)))
-    for name in inner:
-        yield from ("", f"[{prefix}{name}]", *_lines(getattr(section, name), f"{prefix}{name}."))
+    for name, tables in inner.items():
+        header = f"[{prefix}{name}]" if isinstance(getattr(section, name), BaseModel) else f"[[{prefix}{name}]]"
+        for table in tables:
+            yield from ("", header, *_lines(table, f"{prefix}{name}."))
+
+
+def _tables(value: object) -> list[BaseModel]:
+    """The section that a value is, or the sections in it; none of a plain value."""
+    return [one for one in (value if isinstance(value, list) else [value]) if isinstance(one, BaseModel)]
 
 
 def _assignment(name: str, value: object) -> list[str]:
@@ -86,7 +93,7 @@ def config_zenoh(
         joined = open_run(run or DEFAULT_RUN if make else the_known_run(run))
     except BusError as fault:
         raise fault if make else BusError(f"{fault}; --make makes a run that is not there") from None
-    known = sorted({*joined.links.ports, "operator", "launcher"})
+    known = sorted({*joined.links.ports, "bench", "operator", "launcher"})
     if role not in known:
         raise BusError(f"run {run!r} has no role {role!r}; there are {', '.join(known)}")
     HostClock()  # its file says what time the messages of this host go by

@@ -19,6 +19,7 @@ COMMANDS = {
         Row("mirror", "cli.devices:mirror_app", "Run a mirror: its driver follows the commands of a run."),
         Row("record", "cli.processes:record", "Record the messages of a run in logs."),
         Row("bridge", "", "Run a bridge to another control system."),
+        Row("gateway", "", "Offer a run to a control system, and hear its variables."),
         Row("config", "", "Show and check the configuration."),
         Row("certs", "cli.hosts:certs", "Make the certificates of a run on several hosts."),
         Row("router", "cli.hosts:router", "Run the router of a run on several hosts."),
@@ -62,6 +63,7 @@ PARTS = (
     Row("config show", "cli.config:config_show", "Print every key with its value and its sentence, as TOML."),
     Row("config check", "cli.config:config_check", "Check a configuration file and the files it names."),
     Row("config zenoh", "cli.config:config_zenoh", "Print the zenoh configuration for a program of your own."),
+    Row("gateway epics", "gateway.command:epics", "Offer a run by EPICS PV Access."),
     Row("bench twin", "measure.bench.twin:twin", "Time the real-time optical model against the full one."),
     Row("bench record", "measure.bench.record:bench_record", "Measure what recording costs."),
 )

@@ -4,12 +4,10 @@ import contextlib
 import threading
 from collections import deque
 from contextlib import AbstractContextManager
-from dataclasses import replace
 from functools import partial
 
 from lowfc.adapters.bus.bus import ALL, Query, Sample
 from lowfc.adapters.bus.start_check import StartCheck
-from lowfc.adapters.files.factory import settings
 from lowfc.adapters.process.clock import SimulatedClock
 from lowfc.adapters.process.latch import Latch
 from lowfc.adapters.process.realtime import let_send
@@ -35,19 +33,20 @@ from lowfc.contract.messages import (
     wire,
 )
 from lowfc.control.calibration.calibration import Calibration
+from lowfc.control.durations import Durations
 from lowfc.control.loop.advance import advance
-from lowfc.control.loop.durations import Durations
 from lowfc.control.loop.inputs import Input, Load, MirrorReport, Outputs, Reply, Report, Request, Tick
 from lowfc.control.loop.loading import holding, misfit
 from lowfc.control.loop.requests import CONFIGURATION, MOST_REPLY, prepared
 from lowfc.control.loop.safety import LoopMode
 from lowfc.control.loop.state import State
+from lowfc.programs.core.bench_values import BenchValues
 from lowfc.programs.core.cache_warmup import CacheWarmup
 from lowfc.programs.core.camera_signs import CameraSigns
 from lowfc.programs.core.controller_report import Arrays, LastSecond, NotClosed, Offload, StageTiming
 from lowfc.programs.core.gain_watch import GainWatch
 from lowfc.programs.core.mirror_signs import MirrorSigns
-from lowfc.programs.core.start_up import StartUp
+from lowfc.programs.core.start_up import StartUp, settings_under
 
 TICK_NS = 10_000_000
 """Without frames the held command is repeated this often."""
@@ -67,13 +66,9 @@ class Controller:
         name = config.mirror.name
         self._service = service
         self._latch = latch
-        self._settings = settings(config)
+        self._settings = settings_under(latch, config)
         self._configuration = config.to_toml()
         self._start_up = StartUp(config)
-        if latch.safe:  # what was made safe stays so when the controller dies
-            self._settings = replace(self._settings, start_mode=LoopMode.SAFE)
-        elif not latch.kept:  # safe could not be remembered: nothing is driven until somebody is there
-            self._settings = replace(self._settings, start_mode=LoopMode.OPEN)
         self._gain_watch = GainWatch(self._settings, config.control.on_harm)
         self._measured: deque[Request] = deque()
         self._kept_safe = latch.safe
@@ -96,6 +91,7 @@ class Controller:
         )
         self._mirror = MirrorSigns(service, name)
         self._camera = CameraSigns(service, self._take)
+        self._bench = BenchValues(service, self._settings.interlocks, self._take)
         self._commands = service.publisher(COMMAND, name)
         self._steps = service.publisher(STEP)
         self._inputs = service.publisher(CONTROL_INPUT)
@@ -122,6 +118,7 @@ class Controller:
         """Do all but the frames: those are dealt with where they arrive, one turn each."""
         self._camera.await_first()
         self._adopt_mirror()
+        self._bench.ask()
         self._service.state = "running"
         with self._turn:
             self._begin()
@@ -191,6 +188,7 @@ class Controller:
         except BadMessageError as fault:
             self._service.unreadable(sample.key, fault)
             return
+        self._bench.look()
         if isinstance(clock, SimulatedClock):
             clock.set_ns(frame.time_ns)
         outputs = self._advance(frame)
@@ -230,8 +228,10 @@ class Controller:
         """Apply what the camera says of itself; without frames, hold."""
         if camera is not None:
             self._camera.take(camera)
-        if not self._service.clock.lockstep and self._mirror.due:
-            self._judge_mirror()
+        if not self._service.clock.lockstep:
+            self._bench.look()
+            if self._mirror.due:
+                self._judge_mirror()
         silent_ns = self._service.clock.host_ns() - self._last_frame_ns
         if silent_ns >= TICK_NS and not self._service.clock.lockstep:
             self._take(Tick(self._service.clock.now_ns(), silent_ns))

@@ -1,12 +1,14 @@
 """What the configuration has in files: read, checked, and asked of the controller when it starts."""
 
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
 from lowfc.adapters.files import factory, law_file
 from lowfc.adapters.files.mirror_maps import active_actuators, flat_nm
+from lowfc.adapters.process.latch import Latch
 from lowfc.arrays import Single
 from lowfc.contract.configuration import Configuration
 from lowfc.contract.errors import ConfigurationError, DataFileError, LowfcError
@@ -15,8 +17,8 @@ from lowfc.control.laws.margins import check_law
 from lowfc.control.loop.command_channels import ADOPTED, FLAT
 from lowfc.control.loop.inputs import Request
 from lowfc.control.loop.loading import ADOPTED_NM
-from lowfc.control.loop.safety import Limit, limit
-from lowfc.control.loop.state import State
+from lowfc.control.loop.safety import Limit, LoopMode, limit
+from lowfc.control.loop.state import Settings, State
 
 LIKENESS = 0.5
 """Of a mirror's shape to the flat map, from which on it is taken to be there already."""
@@ -62,6 +64,17 @@ def law(config: Configuration) -> LinearLaw | None:
     except ValueError as fault:
         raise ConfigurationError(f"control.law = {file!r}: {fault}") from None
     return found
+
+
+def settings_under(latch: Latch, config: Configuration) -> Settings:
+    """The settings of a configuration: what was made safe stays so when the controller dies.
+
+    Where that could not be remembered, nothing is driven until somebody is there.
+    """
+    found = factory.settings(config)
+    if latch.safe:
+        return replace(found, start_mode=LoopMode.SAFE)
+    return found if latch.kept else replace(found, start_mode=LoopMode.OPEN)
 
 
 class StartUp:

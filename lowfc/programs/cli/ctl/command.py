@@ -58,6 +58,12 @@ ValuesIfAny = Annotated[list[float] | None, typer.Argument(help=f"{_EACH} nm rms
 Zero = Annotated[bool, typer.Option(ZERO, help="Remove it.")]
 Frames = Annotated[int, typer.Argument(help="Frames for which the loop is closed.", parser=whole)]
 Text = Annotated[str, typer.Argument(help="What to remember.")]
+Purpose = Annotated[str, typer.Argument(help="What is moved.")]
+Hold = Annotated[
+    float | None, typer.Option(help="Seconds for which the loop is held; `open` ends that.", parser=number)
+]
+BenchName = Annotated[str, typer.Argument(help="Of the value, as in the interlocks of the configuration.")]
+BenchValue = Annotated[str, typer.Argument(help="true, false, a number or a text.")]
 Channel = Annotated[str, typer.Argument(help="Of the channel; `flat` does not shift the sensor's zero point.")]
 Shape = Annotated[Path | None, typer.Argument(help="FITS or .npy array (rows, columns), nm of surface.")]
 CalibrationFile = Annotated[Path, typer.Argument(help="Calibration file (FITS).")]
@@ -146,6 +152,34 @@ def _channel(name: Channel, file: Shape = None, zero: Zero = False, run: AnyRun 
     _ask(run, as_json, lambda loop: loop.channel(name, shape))
 
 
+def _permit(text: Purpose, hold: Hold = None, run: AnyRun = None, as_json: Json = False) -> None:
+    _ask(run, as_json, lambda loop: loop.permit(text, hold))
+
+
+def bench(name: BenchName, value: BenchValue, run: AnyRun = None, as_json: Json = False) -> None:
+    """Publish a value of something else on the bench, once, and print which interlocks act.
+
+    Example: lowfc ctl bench mask-moving true
+    """
+    from lowfc.programs.cli.ctl.status import figures, interlocks
+
+    truths: dict[str, bool | float | str] = {"true": True, "false": False}
+    try:
+        read = truths[value] if value in truths else float(value)
+    except ValueError:
+        read = value
+    with _joined(run) as loop:
+        loop.status()  # once it answers, it receives
+        loop.bench(name, read)
+        state = loop.status().state
+        assert state is not None  # noqa: S101  # that is what it answers with
+    known = figures(state, run=loop.run_id)
+    names = sorted({one.name for one in state.settings.interlocks})
+    unused = "" if name in names else f"; no interlock looks at it, they look at: {', '.join(names) or 'nothing'}"
+    said = {"run": loop.run_id, "name": name, "value": read, "interlocks": known["interlocks"]}
+    put(said, f"{name} is {value}{unused}; interlocks: {interlocks(known)} (run {loop.run_id})", as_json=as_json)
+
+
 def _load(file: CalibrationFile, run: AnyRun = None, as_json: Json = False) -> None:
     from lowfc.adapters.files import calibration_file
 
@@ -177,6 +211,7 @@ _OWN: dict[str, _Command] = {
     "gain": _gain,
     "step": _step,
     "note": _note,
+    "permit": _permit,
     "offset": _offset,
     "channel": _channel,
     "load": _load,
@@ -195,6 +230,7 @@ for _name, _asked in BY_NAME.items():
             help=f"{_asked.sentence}\n\nExample: lowfc ctl {_asked.example}",
             context_settings={"ignore_unknown_options": "values" in _fields},  # -5 is a value and no option
         )(_made)
+ctl_app.command()(bench)
 ctl_app.command()(dark)
 ctl_app.command()(reference)
 

@@ -101,6 +101,11 @@ def figures(
         ],
         "playing": playing,
         "reserved_for": state.lease.holder if state.lease.id and not state.lease.ended else None,
+        "interlocks": [
+            {"name": settings.interlocks[one.number].name, "action": one.action, "why": one.why}
+            for one in state.interlocks_acting
+        ],
+        "interlocks_configured": len(settings.interlocks),
         "limits_hit": [reason_of(reason).name for reason in state.limits_hit],
         "refused": reason_of(state.refused).name if state.refused else None,
         "counts": {reason_of(line.reason).name: line.count for line in state.counts},
@@ -145,6 +150,7 @@ def text(known: dict[str, Any]) -> str:
         if playing
         else "nothing",
         "reserved": f"for {known['reserved_for']}" if known["reserved_for"] else "for nobody",
+        "interlocks": interlocks(known),
         "mirror limits": f"stroke {known['stroke_nm']:g} nm, slew {known['slew_nm']:g} nm a frame, "
         f"neighbours {known['neighbour_nm']:g} nm; {_acting(known['limits_hit'])}",
         "counted": ", ".join(_counted(name, count) for name, count in known["counts"].items()) or "nothing refused",
@@ -153,6 +159,14 @@ def text(known: dict[str, Any]) -> str:
         + (", the first of a commissioning: without a verdict" if known["calibration_provisional"] else ""),
     }
     return "\n".join([_in_short(known), *(f"{name:14} {value}" for name, value in rows.items())])
+
+
+def interlocks(known: dict[str, Any]) -> str:
+    """Which interlocks act, for a person."""
+    if known["interlocks"]:
+        return "; ".join(f"{one['why']} ({one['action'].replace('_', ' ')})" for one in known["interlocks"])
+    count = known["interlocks_configured"]
+    return f"none of {count} acts" if count else "none"
 
 
 def recording_state(recorder: wire.Health) -> str:

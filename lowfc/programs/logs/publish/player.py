@@ -25,7 +25,7 @@ from lowfc.adapters.process.realtime import Granted, set_up
 from lowfc.adapters.process.service import Service
 from lowfc.contract.errors import ConfigurationError, DataFileError, nearest
 from lowfc.contract.messages import COMMAND, HEALTH, MIRROR_STATE, Role, topic_of
-from lowfc.control.loop.durations import Durations
+from lowfc.control.durations import Durations
 from lowfc.programs.logs.publish.selection import Selection, role_of
 
 BEHIND_NS = 1_000_000

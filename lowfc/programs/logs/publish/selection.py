@@ -10,7 +10,7 @@ from fnmatch import fnmatchcase
 from lowfc.adapters.bus.bus import name_in
 from lowfc.adapters.bus.run import Links, mirror_role
 from lowfc.contract.errors import BusError, ConfigurationError, nearest
-from lowfc.contract.messages import COMMAND, FRAME, HEALTH, TOPICS, Role, topic_of
+from lowfc.contract.messages import BENCH, COMMAND, FRAME, HEALTH, TOPICS, Role, topic_of
 
 
 class Selection:
@@ -90,6 +90,8 @@ def role_of(key: str) -> str:
     name = name_in(topic, key)
     if topic is HEALTH:
         return name
+    if topic is BENCH:  # of a log, it would speak for what is on the bench now
+        return Role.BENCH
     if len(topic.publisher) > 1:
         return ""
     (role,) = topic.publisher

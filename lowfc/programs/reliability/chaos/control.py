@@ -1,6 +1,7 @@
 """Chaos cases: gains, calibrations, safe mode and clocks."""
 
 import contextlib
+import time
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from functools import partial
@@ -134,6 +135,37 @@ def _restart_in_safe_mode(bench: ChaosBench) -> None:
     bench.client().safe()
     bench.frames(WHILE_FRAMES)
     killed(Role.CONTROLLER)(bench)
+
+
+MASK = {"name": "mask", "value": True, "action": "hold", "max_age_s": 1.0, "when_old": "passes"}
+FLIPS, FLOOD, FLOOD_HZ = 40, 4000, 2000
+
+
+@case(
+    "interlock",
+    "an interlock is flipped at random and gets 2,000 values a second; then its publisher dies while it acts",
+    config={"interlocks": [MASK]},
+    expected=("INTERLOCK_ACTS", "INTERLOCK_CLEARED"),
+)
+def _interlock(bench: ChaosBench) -> None:
+    client = bench.client()
+    for flip in range(FLIPS):
+        client.bench("mask", flip % 2 == 0)
+        bench.pause(0, 0.02)
+    begun_s = time.monotonic()
+    for number in range(FLOOD):
+        client.bench("mask", False)
+        if number > (time.monotonic() - begun_s) * FLOOD_HZ:
+            time.sleep(0.01)
+    client.bench("mask", True)
+    bench.wait(lambda: bool(_acting(client)), "the interlock to act")
+    bench.wait(lambda: not _acting(client), "a value that is too old")
+
+
+def _acting(client: Client) -> list[str]:
+    """Why interlocks act."""
+    state = client.status().state
+    return [] if state is None else [one.why for one in state.interlocks_acting]
 
 
 @contextlib.contextmanager

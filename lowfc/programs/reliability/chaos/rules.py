@@ -26,7 +26,7 @@ SPAN_NS = 1_000_000_000
 SHORT_FRAMES = 50
 ROUNDING_NM = 0.03
 """The driver rounds to 0.023 nm: a mirror's state may be that far from its command."""
-REFUSALS = frozenset(range(wire.REASON_NO_CALIBRATION, wire.REASON_STUCK + 1))
+REFUSALS = frozenset({*range(wire.REASON_NO_CALIBRATION, wire.REASON_STUCK + 1), wire.REASON_HELD})
 HOST_EVENTS = frozenset({"COMMANDS_LATE", "FRAMES_REFUSED", "FRAMES_MISSING", "REALTIME_REFUSED", "DISK_SLOW"})
 """Warnings for which a busy host is enough."""
 

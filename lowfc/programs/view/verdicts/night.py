@@ -8,7 +8,7 @@ import numpy as np
 from lowfc.adapters.logs.columns import Steps
 from lowfc.contract.codecs.codec import actuators
 from lowfc.contract.messages import Role
-from lowfc.control.loop.durations import Durations
+from lowfc.control.durations import Durations
 from lowfc.control.loop.safety import LoopMode
 from lowfc.control.loop.wording import counted
 from lowfc.programs.view.snapshot import LogEnd, Snapshot

@@ -87,6 +87,8 @@ def _loop(state: RunState) -> Tile:
     fault = state.controller_state.mirror_fault if state.controller_state is not None else ""
     if fault:
         return tile("HOLDING", f"closed, but the mirror {fault}: command held", Level.WARNING)
+    if held := _held(state.controller_state):
+        return tile("HOLDING", f"closed, but {held}: command held", Level.WARNING)
     if mirror.life is Liveness.SILENT:  # in logs of version 0.1 it is not missed
         return tile("CLOSED", "but the mirror is silent", Level.WARNING)
     if camera.life is Liveness.STOPPED:
@@ -103,6 +105,15 @@ def _loop(state: RunState) -> Tile:
         advice = "The law leaves more than the integrator, which has taken over. Tune again: `lowfc tune --live`."
         return tile("CLOSED", "the integrator in place of the law", Level.WARNING, advice)
     return tile("CLOSED", f"correcting{_since(state.controller_state)}", Level.GOOD, "Loop closed, nothing is wrong.")
+
+
+def _held(state: wire.ControllerState | None) -> str:
+    """What holds a closed loop: an interlock, or a permit; empty where nothing does."""
+    if state is None:
+        return ""
+    if state.lease.holds and not state.lease.ended:
+        return f"reserved for {short(printable(state.lease.holder))}"
+    return next((short(printable(one.why)) for one in state.interlocks_acting if one.action == "hold"), "")
 
 
 def _since(state: wire.ControllerState | None) -> str:

@@ -1,0 +1,118 @@
+"""Bench values and interlocks as messages, both ways."""
+
+from math import isfinite
+
+from google.protobuf.message import DecodeError
+
+from lowfc.contract.errors import BadMessageError
+from lowfc.contract.messages import checked_time_ns, from_timestamp, timestamp, wire
+from lowfc.control.loop.interlocks import MAX_TEXT, Acting, Action, BenchReport, Interlock, Value
+
+LARGEST_BYTES = 4 * MAX_TEXT + 200
+
+
+def encode_bench_value(value: Value, time_ns: int) -> bytes:
+    """BenchValue of a value measured at that time.
+
+    Raises:
+        BadMessageError: it is no finite number, no truth and no text of at most 200 characters.
+    """
+    message = wire_value(value)
+    _checked(message)
+    message.timestamp.CopyFrom(timestamp(time_ns))
+    return message.SerializeToString()
+
+
+def decode_bench_value(payload: bytes) -> Value:
+    """Value of a received BenchValue.
+
+    Raises:
+        BadMessageError: it cannot be read, or is none.
+    """
+    if len(payload) > LARGEST_BYTES:
+        raise BadMessageError(f"a bench value has at most {LARGEST_BYTES} bytes, got {len(payload)}")
+    try:
+        message = wire.BenchValue.FromString(payload)
+    except DecodeError as error:
+        raise BadMessageError(str(error)) from None
+    checked_time_ns(message.timestamp)
+    return _checked(message)
+
+
+def wire_value(value: Value) -> wire.BenchValue:
+    """Message of a value, without a time."""
+    if isinstance(value, bool):
+        return wire.BenchValue(truth=value)
+    return wire.BenchValue(text=value) if isinstance(value, str) else wire.BenchValue(number=value)
+
+
+def value_of(message: wire.BenchValue) -> Value:
+    """Value of a message.
+
+    Raises:
+        ValueError: it holds none, a number that is not finite, or a long text.
+    """
+    match message.WhichOneof("value"):
+        case "number" if isfinite(message.number):
+            return message.number
+        case "truth":
+            return message.truth
+        case "text" if len(message.text) <= MAX_TEXT:
+            return message.text
+    raise ValueError(f"a bench value is a finite number, a truth, or a text of at most {MAX_TEXT} characters")
+
+
+def _checked(message: wire.BenchValue) -> Value:
+    try:
+        return value_of(message)
+    except ValueError as error:
+        raise BadMessageError(str(error)) from None
+
+
+def wire_report(report: BenchReport) -> wire.BenchReport:
+    """Message of a value as it was taken in."""
+    value = None if report.value is None else wire_value(report.value)
+    time = timestamp(report.time_ns)
+    return wire.BenchReport(timestamp=time, name=report.name, value=value, age_ns=report.age_ns)
+
+
+def report_of(message: wire.BenchReport) -> BenchReport:
+    """Report of a message.
+
+    Raises:
+        ValueError: its value is none.
+    """
+    value = value_of(message.value) if message.HasField("value") else None
+    return BenchReport(from_timestamp(message.timestamp), message.name, value, message.age_ns)
+
+
+def wire_interlock(one: Interlock) -> wire.Interlock:
+    """Message of an interlock."""
+    return wire.Interlock(
+        name=one.name,
+        test=one.test,
+        value=wire_value(one.value),
+        action=one.action,
+        max_age_ns=one.max_age_ns,
+        acts_when_old=one.acts_when_old,
+    )
+
+
+def interlock_of(message: wire.Interlock) -> Interlock:
+    """Interlock of a message.
+
+    Raises:
+        ValueError: it has no value, or an action that this version does not know.
+    """
+    value, action = value_of(message.value), Action(message.action)
+    return Interlock(message.name, message.test, value, action, message.max_age_ns, message.acts_when_old)
+
+
+def wire_acting(one: Acting) -> wire.ActingInterlock:
+    """Message of an interlock that acts."""
+    return wire.ActingInterlock(number=one.number, action=one.action, why=one.why)
+
+
+def acting_of(message: wire.ActingInterlock) -> Acting:
+    """Interlock that acts, of a message; ValueError where its action is unknown."""
+    return Acting(message.number, Action(message.action), message.why)

@@ -1,0 +1,132 @@
+"""Interlocks: conditions on values that others on the bench publish, and what follows while they hold.
+
+An interlock only ever makes the loop safer: it holds, opens, relaxes to safe mode, refuses to close, or warns. It never
+closes the loop, and what it opened stays open.
+"""
+
+from dataclasses import dataclass
+from enum import StrEnum
+from typing import NamedTuple
+
+Value = bool | float | str
+MAX_TEXT = 200
+"""Characters of a value that is a text."""
+
+
+class Action(StrEnum):
+    """What follows while an interlock acts, the mildest first."""
+
+    WARN = "warn"
+    REFUSE_CLOSE = "refuse_close"
+    HOLD = "hold"
+    OPEN = "open"
+    SAFE = "safe"
+
+
+IN_WORDS = {
+    Action.WARN: "only a warning",
+    Action.REFUSE_CLOSE: "the loop is not closed",
+    Action.HOLD: "a closed loop holds its command",
+    Action.OPEN: "the loop opens",
+    Action.SAFE: "the loop goes into safe mode",
+}
+
+
+class Interlock(NamedTuple):
+    """A condition on a bench value.
+
+    Attributes:
+        name: of the bench value.
+        test: equal, different, above or below.
+        value: what it is compared with.
+        action: what follows while the condition holds.
+        max_age_ns: age above which the bench value is too old.
+        acts_when_old: what a value counts as that is too old, of another kind, or was never received.
+    """
+
+    name: str
+    test: str
+    value: Value
+    action: Action
+    max_age_ns: int
+    acts_when_old: bool = True
+
+    def acts(self, value: Value | None, age_ns: int) -> str:
+        """Why it acts on a value of this age, None where there is none; empty where it does not act."""
+        age_s = self.max_age_ns * 1e-9
+        if value is None:
+            return f"no value of {self.name} has been received" if self.acts_when_old else ""
+        if age_ns > self.max_age_ns:
+            return f"no value of {self.name} for more than {age_s:g} s" if self.acts_when_old else ""
+        if type(value) is not type(self.value):
+            return f"{self.name} is {shown(value)}, no {_KINDS[type(self.value)]}" if self.acts_when_old else ""
+        return f"{self.name} is {shown(value)}{self._compared()}" if self._holds(value) else ""
+
+    def _holds(self, value: Value) -> bool:
+        if isinstance(value, float) and isinstance(self.value, float) and self.test in _BOUNDS:
+            return value > self.value if self.test == "above" else value < self.value
+        return (value == self.value) is (self.test == "equal")
+
+    def _compared(self) -> str:
+        return "" if self.test == "equal" else f", {_BOUNDS.get(self.test, 'not')} {shown(self.value)}"
+
+
+class Acting(NamedTuple):
+    """An interlock that acts.
+
+    Attributes:
+        number: its place among the interlocks of the settings.
+        action: what follows.
+        why: what it acts on, as it began: a number goes on to change.
+    """
+
+    number: int
+    action: Action
+    why: str
+
+
+@dataclass(frozen=True, slots=True)
+class BenchReport:
+    """The newest value under a name; None where none was received. Its age is a clock's verdict."""
+
+    time_ns: int
+    name: str
+    value: Value | None
+    age_ns: int = 0
+
+
+def judged(interlocks: tuple[Interlock, ...], acting: tuple[Acting, ...], report: BenchReport) -> tuple[Acting, ...]:
+    """The interlocks that act after a report; the very same ones where that changes nothing."""
+    before = {one.number: one for one in acting}
+    after = dict(before)
+    for number, interlock in enumerate(interlocks):
+        if interlock.name == report.name:
+            why = interlock.acts(report.value, report.age_ns)
+            if not why:
+                after.pop(number, None)
+            elif number not in after or _by_value(after[number].why, report) is not _by_value(why, report):
+                after[number] = Acting(number, interlock.action, why)
+    return acting if after == before else tuple(after[number] for number in sorted(after))
+
+
+def refusal(acting: tuple[Acting, ...], asked: str) -> str:
+    """Why the interlocks that act refuse to `close` the loop or to `clear` safe mode; empty where they do not."""
+    refusing = (Action.SAFE,) if asked == "clear" else _AGAINST_CLOSING if asked == "close" else ()
+    return "; ".join(f"an interlock acts: {one.why}" for one in acting if one.action in refusing)
+
+
+def shown(value: Value) -> str:
+    """A value for people."""
+    if isinstance(value, bool):
+        return "true" if value else "false"
+    return f"{value:g}" if isinstance(value, float) else repr(value)
+
+
+def _by_value(why: str, report: BenchReport) -> bool:
+    """Whether an interlock acts by a value, and not for want of one."""
+    return why.startswith(f"{report.name} is ")
+
+
+_AGAINST_CLOSING = (Action.REFUSE_CLOSE, Action.HOLD, Action.OPEN, Action.SAFE)
+_BOUNDS = {"above": "above", "below": "below"}
+_KINDS = {bool: "truth", float: "number", str: "text"}

@@ -1,0 +1,1 @@
+"""`lowfc gateway`: a loop offered to a control system, whose variables become bench values."""

@@ -1,0 +1,156 @@
+"""PV Access: variables as PVs of a server, and PVs of others as bench values; loopback unless configured otherwise."""
+
+import time
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import numpy as np
+
+from lowfc.adapters.process.extras import install_advice
+from lowfc.contract.errors import BusError, ConfigurationError, LowfcError
+from lowfc.contract.sections import Gateway
+from lowfc.control.loop.interlocks import Value
+from lowfc.programs.gateway.offer import Kind, Put, Variable
+
+_CODES = {Kind.TRUTH: "?", Kind.NUMBER: "d", Kind.TEXT: "s", Kind.NUMBERS: "ad"}
+_EMPTY: dict[Kind, Any] = {Kind.TRUTH: False, Kind.NUMBER: 0.0, Kind.TEXT: "", Kind.NUMBERS: []}
+_INVALID = 3
+"""Severity of an alarm: the value is none."""
+Ask = Callable[[Put, Any], object]
+"""Carries a put out; LowfcError has the refusal."""
+
+
+def protocol() -> Any:
+    """The package p4p, with what is used of it.
+
+    Raises:
+        ConfigurationError: it is not installed.
+    """
+    try:
+        import p4p
+        import p4p.client.thread
+        import p4p.nt
+        import p4p.server.thread
+    except ImportError as error:
+        advice = install_advice("epics")
+        raise ConfigurationError(
+            f"lowfc gateway epics needs p4p, which is not there ({error}); install it with: {advice}"
+        ) from None
+    return p4p
+
+
+class EpicsGateway:
+    """The server of the variables, and monitors of the PVs that become bench values.
+
+    Attributes:
+        bench: value of each bench variable that is connected and valid, by the name of the bench value.
+    """
+
+    def __init__(self, config: Gateway, variables: Sequence[Variable], ask: Ask, changed: Callable[[], None]) -> None:
+        """Serve; `changed` is called after a change of `bench`, on another thread.
+
+        Raises:
+            ConfigurationError: p4p is not installed.
+            BusError: it cannot listen.
+        """
+        p4p = protocol()
+        self._variables, self.bench, self._changed = variables, dict[str, Value](), changed
+        self._last: dict[str, Any] = {}
+        self._pvs: dict[str, Any] = {}
+        for one in variables:
+            if one.kind is Kind.IMAGE:
+                initial: Any = np.zeros((1, 1), np.uint16)
+                self._pvs[one.name] = p4p.server.thread.SharedPV(nt=p4p.nt.NTNDArray(), initial=initial)
+                continue
+            nt = p4p.nt.NTScalar(_CODES[one.kind], display=True)
+            described = {"value": _EMPTY[one.kind], "display.description": one.sentence, "display.units": one.unit}
+            handler = {} if one.put is None else {"handler": _Puts(one.kind, one.put, ask)}
+            self._pvs[one.name] = p4p.server.thread.SharedPV(nt=nt, initial=described, **handler)
+        address, port = config.listen, config.port
+        served = {
+            "EPICS_PVAS_INTF_ADDR_LIST": address,
+            "EPICS_PVAS_SERVER_PORT": str(port),
+            "EPICS_PVAS_BROADCAST_PORT": str(port + 1),
+            "EPICS_PVAS_AUTO_BEACON_ADDR_LIST": "NO",
+            "EPICS_PVAS_BEACON_ADDR_LIST": address,
+        }
+        provided = {f"{config.prefix}{name}": pv for name, pv in self._pvs.items()}
+        try:
+            self._server = p4p.server.Server(providers=[provided], conf=served, useenv=False)
+        except RuntimeError as fault:
+            raise BusError(f"cannot serve PV Access on {address}:{port}: {fault}") from None
+        searched = {"EPICS_PVA_ADDR_LIST": config.search, "EPICS_PVA_AUTO_ADDR_LIST": "NO"}
+        self._context = p4p.client.thread.Context("pva", conf=searched, useenv=False)
+        self._monitors = [
+            self._context.monitor(pv, self._receiver(name), notify_disconnect=True) for name, pv in config.bench.items()
+        ]
+
+    @property
+    def port(self) -> int:
+        """At which it serves."""
+        return int(self._server.conf()["EPICS_PVAS_SERVER_PORT"])
+
+    def update(self, values: dict[str, Any], fault: str) -> None:
+        """Post what has changed; with a fault, all are marked as invalid."""
+        for one in self._variables:
+            value = values.get(one.name, _EMPTY.get(one.kind))
+            if value is None:
+                continue
+            pv = self._pvs[one.name]
+            if one.kind is Kind.IMAGE:
+                pv.post(value, timestamp=time.time())
+                continue
+            news = (np.asarray(value).tolist(), fault)
+            if self._last.get(one.name) != news:
+                self._last[one.name] = news
+                pv.post(value, severity=_INVALID if fault else 0, message=fault, timestamp=time.time())
+
+    def close(self) -> None:
+        """Serve and listen no more."""
+        for monitor in self._monitors:
+            monitor.close()
+        self._context.close()
+        self._server.stop()
+
+    def _receiver(self, name: str) -> Callable[[Any], None]:
+        def received(value: Any) -> None:
+            found = _value_of(value)
+            if found is None:
+                self.bench.pop(name, None)
+            else:
+                self.bench[name] = found
+            self._changed()
+
+        return received
+
+
+class _Puts:
+    """Carries out what is put to a variable; a put that is refused fails with the controller's sentence."""
+
+    def __init__(self, kind: Kind, put: Put, ask: Ask) -> None:
+        self._kind, self._put, self._ask = kind, put, ask
+
+    def put(self, pv: Any, operation: Any) -> None:
+        """One put, on a thread of the server's."""
+        try:
+            value = operation.value()
+            if self._kind is not Kind.TRUTH or value:  # a screen sets it back
+                self._ask(self._put, value.tolist() if isinstance(value, np.ndarray) else value)
+        except LowfcError as fault:
+            operation.done(error=str(fault))
+        else:
+            operation.done()
+
+
+def _value_of(value: Any) -> Value | None:
+    """The bench value of what a monitor brought; None where it is disconnected, invalid, or no scalar."""
+    if isinstance(value, Exception) or getattr(value, "severity", 0) >= _INVALID:
+        return None
+    raw = value.raw
+    if raw.getID().startswith("epics:nt/NTEnum"):
+        choices, index = raw["value.choices"], raw["value.index"]
+        return str(choices[index]) if 0 <= index < len(choices) else None
+    plain = raw["value"]
+    if isinstance(plain, bool | str):
+        return plain
+    return float(plain) if isinstance(plain, int | float) and np.isfinite(plain) else None

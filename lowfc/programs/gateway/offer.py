@@ -1,0 +1,123 @@
+"""What a gateway offers, whatever its protocol: variables with the loop's figures, and puts that are its requests.
+
+Requests derive from the declared ones: those whose fields are numbers, a text, or nothing.
+"""
+
+from collections.abc import Callable, Iterator
+from enum import Enum
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from lowfc.client import Answer, Client
+from lowfc.client.requests import DECLARED, Declaration
+from lowfc.contract.messages import Role, wire
+from lowfc.programs.cli.ctl.status import figures, interlocks
+from lowfc.programs.gateway.watch import Seen
+
+
+class Kind(Enum):
+    """What a variable holds."""
+
+    TRUTH = "truth"
+    NUMBER = "number"
+    TEXT = "text"
+    NUMBERS = "numbers"
+    IMAGE = "image"
+
+
+Put = Callable[[Client, Any], Answer]
+
+
+class Variable(NamedTuple):
+    """A variable.
+
+    Attributes:
+        name: lower case, after the gateway's prefix.
+        unit: of its value; empty where it has none.
+        sentence: what it is, or what a put does.
+        read: its value of what was seen; None of a request that has nothing to show.
+        put: asks the controller for the value that was put; RequestRefusedError has the refusal. None: read only.
+    """
+
+    name: str
+    kind: Kind
+    unit: str
+    sentence: str
+    read: Callable[[Seen, dict[str, Any]], Any] | None
+    put: Put | None = None
+
+
+def _status(key: str, empty: Any) -> Callable[[Seen, dict[str, Any]], Any]:
+    return lambda seen, status: empty if status[key] is None else status[key]
+
+
+def _latency(percentile: str) -> Callable[[Seen, dict[str, Any]], Any]:
+    def read(seen: Seen, status: dict[str, Any]) -> float:
+        controller = seen.processes.get(Role.CONTROLLER, wire.Health())
+        return float(getattr(controller.frame_to_command, f"{percentile}_ns") * 1e-3)
+
+    return read
+
+
+def _step(field: str) -> Callable[[Seen, dict[str, Any]], Any]:
+    return lambda seen, status: np.zeros(0) if seen.step is None else np.array(getattr(seen.step, field), float)
+
+
+READINGS = (
+    Variable("mode", Kind.TEXT, "", "Loop mode: idle, open, closed, safe.", _status("mode", "")),
+    Variable("verdict", Kind.TEXT, "", "How the loop is, in a sentence.", lambda seen, _: seen.verdict.headline),
+    Variable("verdict_level", Kind.TEXT, "", "The same in a word.", lambda seen, _: seen.verdict.level.name.lower()),
+    Variable("holding", Kind.TEXT, "", "Why a closed loop holds its command.", _status("holding", "")),
+    Variable("interlocks", Kind.TEXT, "", "Interlocks that act.", lambda _, status: interlocks(status)),
+    Variable("reserved_for", Kind.TEXT, "", "Who has reserved the loop.", _status("reserved_for", "")),
+    Variable("residual", Kind.NUMBER, "nm", "Modal error, rms of the last second.", _status("residual_rms_nm", 0.0)),
+    Variable("flux", Kind.NUMBER, "", "Light, part of the calibration's.", _status("flux_fraction", 0.0)),
+    Variable("rate", Kind.NUMBER, "Hz", "Frames in a second.", _status("rate_hz", 0.0)),
+    Variable("frames_missing", Kind.NUMBER, "", "Frames that never arrived.", _status("frames_missing", 0)),
+    Variable("latency_p50", Kind.NUMBER, "us", "From frame to command, median.", _latency("p50")),
+    Variable("latency_p99", Kind.NUMBER, "us", "From frame to command, 99th percentile.", _latency("p99")),
+    Variable("latency_max", Kind.NUMBER, "us", "From frame to command, longest.", _latency("max")),
+    Variable("law", Kind.TEXT, "", "Control law in use.", lambda _, status: status["law"]["name"]),
+    Variable("recording", Kind.TEXT, "", "Recording, stopped, failed or none.", _status("recording", "")),
+    Variable("error", Kind.NUMBERS, "nm", "Modal error of the newest frame.", _step("error_nm")),
+    Variable("pol", Kind.NUMBERS, "nm", "Pseudo-open-loop modes of the newest frame.", _step("pol_nm")),
+    Variable("command", Kind.NUMBERS, "nm", "Modal command.", _step("command_nm")),
+    Variable("gain", Kind.NUMBERS, "", "Integrator gain of each mode.", _status("gain", [])),
+    Variable("leak", Kind.NUMBERS, "", "Integrator leak of each mode.", _status("leak", [])),
+    Variable("limit", Kind.NUMBERS, "nm", "Largest modal command of each mode.", _status("limit_nm", [])),
+    Variable("offset", Kind.NUMBERS, "nm", "Target of each mode.", _status("offset_nm", [])),
+    Variable("frame", Kind.IMAGE, "DN", "The newest frame.", lambda seen, _: seen.frame),
+)
+
+
+def _request(one: Declaration) -> Variable | None:
+    """The variable of a request; None of one with arrays, or that only answers."""
+    fields, name = {field for field, _ in one.fields}, one.name
+    if not one.example or not fields <= {"modes", "values", "text", "lease_id"} or name in ("status", "configuration"):
+        return None
+    put: Put
+    if one.key.startswith("lowfc/record/"):
+        starts = name == "start"
+        name, kind, put = f"record_{name}", Kind.TRUTH, lambda loop, value: loop.record(starts)
+    elif "text" in fields:
+        kind, put = Kind.TEXT, lambda loop, value: loop.ask(one.name, text=str(value))
+    elif "values" in fields:
+        kind, put = Kind.NUMBERS, lambda loop, value: loop.ask(one.name, values=value)
+    else:
+        kind, put = Kind.TRUTH, lambda loop, value: loop.ask(one.name)
+    return Variable(name, kind, "", one.sentence, None, put)
+
+
+def variables() -> Iterator[Variable]:
+    """All variables: readings, of which those with the name of a request can be put, then the other requests."""
+    puts = {made.name: made for one in DECLARED if (made := _request(one)) is not None}
+    for reading in READINGS:
+        declared = puts.pop(reading.name, None)
+        yield reading if declared is None else reading._replace(put=declared.put)
+    yield from puts.values()
+
+
+def status_of(seen: Seen, run: str) -> dict[str, Any]:
+    """Figures of `lowfc ctl status` of what was seen, from which variables are read."""
+    return figures(seen.state, seen.processes, run)

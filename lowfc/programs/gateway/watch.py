@@ -1,0 +1,72 @@
+"""What a gateway sees of a run: the newest of everything, several times a second."""
+
+from typing import NamedTuple
+
+from lowfc.adapters.bus.bus import Bus, states
+from lowfc.adapters.process.clock import Clock
+from lowfc.arrays import Pixels
+from lowfc.contract.messages import STEP, Role, wire
+from lowfc.programs.view.snapshot import SHOWN, Accumulator
+from lowfc.programs.view.verdicts.tile import Verdict
+from lowfc.programs.view.verdicts.verdict import judge
+from lowfc.programs.view.verdicts.watcher import Watcher
+
+SILENT_NS = 2_000_000_000
+"""Without a Health of the controller, of which there are two a second."""
+_WAITING = 2000
+_PATIENCE_S = 0.2
+
+
+class Seen(NamedTuple):
+    """The run, now.
+
+    Attributes:
+        connected: the controller has been received lately; what is shown is not old.
+        frame: the newest one; None without a new one.
+        step: of the newest frame; None before the first.
+    """
+
+    connected: bool
+    state: wire.ControllerState
+    processes: dict[str, wire.Health]
+    verdict: Verdict
+    step: wire.ControlStep | None
+    frame: Pixels | None
+
+
+class Watch:
+    """Receives as a monitor does, in rings that cost the loop nothing."""
+
+    def __init__(self, bus: Bus, clock: Clock) -> None:
+        self._bus, self._clock = bus, clock
+        self._rings = {topic: bus.ring(topic, 1 if topic.latest_only else _WAITING) for topic in SHOWN}
+        self._accumulator, self._watcher = Accumulator(clock.now_ns() if clock.lockstep else None), Watcher()
+        self._known: set[tuple[str, int]] = set()
+        self._step: wire.ControlStep | None = None
+
+    def look(self) -> Seen:
+        """Take in what has come since the last call."""
+        add, now_ns = self._accumulator.add, self._clock.host_ns()
+        for topic, ring in self._rings.items():
+            samples = ring.drain()
+            for sample in samples:
+                add(topic, sample.key, sample.payload, sample.publish_time_ns, sample.sequence)
+            if topic is STEP and samples:
+                self._step = wire.ControlStep.FromString(samples[-1].payload)
+        snapshot = self._accumulator.snapshot(now_ns)
+        there = {(name, one.health.pid) for name, one in snapshot.health.items()}
+        if not there <= self._known:
+            self._known = there
+            for topic, sample in states(self._bus, SHOWN, _PATIENCE_S):
+                add(topic, sample.key, sample.payload, sample.publish_time_ns, sample.sequence)
+        self._watcher.feed(snapshot)
+        controller = snapshot.health.get(Role.CONTROLLER)
+        connected = controller is not None and now_ns - controller.time_ns < SILENT_NS
+        return Seen(
+            connected,
+            snapshot.controller or wire.ControllerState(),
+            {name: one.health for name, one in snapshot.health.items()},
+            judge(self._watcher.state()),
+            self._step,
+            snapshot.frame,
+        )

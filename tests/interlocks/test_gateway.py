@@ -1,0 +1,165 @@
+"""`lowfc gateway epics`: a real IOC drives an interlock, and a scan moves a gain and reads the residual."""
+
+import json
+import os
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from lowfc.adapters.bus.run import free_ports
+from lowfc.client import running
+from lowfc.client.requests import DECLARED
+from lowfc.contract.errors import ConfigurationError
+from lowfc.programs.gateway.offer import Kind, variables
+from tests.support.loops import interrupt, lowfc, start, until
+
+Process = subprocess.Popen[str]
+IOC = """
+from softioc import asyncio_dispatcher, builder, softioc
+
+builder.SetDeviceName("BENCH:MASK")
+builder.boolOut("MOVING", ZNAM="parked", ONAM="moving", initial_value=0)
+builder.LoadDatabase()
+softioc.iocInit(asyncio_dispatcher.AsyncioDispatcher())
+softioc.non_interactive_ioc()
+"""
+SCAN = """
+import json
+
+import bluesky.plan_stubs as bps
+import numpy as np
+from bluesky import RunEngine
+from ophyd_async.core import Array1D, init_devices
+from ophyd_async.epics.core import epics_signal_r, epics_signal_rw
+
+engine, rows = RunEngine(), []
+with init_devices():
+    gain = epics_signal_rw(Array1D[np.float64], "pva://lowfc:gain", name="gain")
+    residual = epics_signal_r(float, "pva://lowfc:residual", name="residual")
+
+
+def scan():
+    yield from bps.open_run()
+    for value in (0.05, 0.1, 0.2):
+        yield from bps.abs_set(gain, np.array([value]), wait=True)
+        yield from bps.sleep(1.5)
+        yield from bps.create()
+        yield from bps.read(residual)
+        yield from bps.read(gain)
+        yield from bps.save()
+    yield from bps.close_run()
+
+
+def keep(kind, document):
+    if kind == "event":
+        rows.append([document["data"]["residual"], np.asarray(document["data"]["gain"]).tolist()])
+
+
+engine(scan(), keep)
+print(json.dumps(rows))
+"""
+CONFIG = """
+[camera]
+rate_hz = 200
+[gateway]
+port = {port}
+search = "127.0.0.1:{search}"
+bench = {{ mask = "BENCH:MASK:MOVING" }}
+[[interlocks]]
+name = "mask"
+value = "moving"
+action = "hold"
+max_age_s = 2.0
+"""
+
+
+def test_every_request_of_numbers_or_a_text_is_offered_under_a_name_of_its_own() -> None:
+    offered = {one.name: one for one in variables()}
+    assert len(offered) == len(list(variables()))
+    for one in DECLARED:
+        fields = {field for field, _ in one.fields}
+        name = one.name if "record" not in one.key else f"record_{one.name}"
+        plain = fields <= {"modes", "values", "text", "lease_id"} and one.example
+        puts = bool(plain) and name not in ("status", "configuration")
+        assert (name in offered and offered[name].put is not None) is puts, name
+    assert offered["gain"].kind is Kind.NUMBERS
+    assert all(one.read is not None or one.put is not None for one in offered.values())
+
+
+def test_without_p4p_one_sentence_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "p4p", None)
+    fault = lowfc("gateway", "epics").exception
+    assert isinstance(fault, ConfigurationError)
+    assert "needs p4p" in str(fault)
+    assert "pip install" in str(fault)
+
+
+@pytest.fixture
+def ioc() -> Iterator[tuple[Process, int]]:
+    pytest.importorskip("softioc", reason="needs softioc")
+    tcp, udp, channel_access = free_ports(3)
+    ports = {"EPICS_PVAS_SERVER_PORT": tcp, "EPICS_PVAS_BROADCAST_PORT": udp, "EPICS_CA_SERVER_PORT": channel_access}
+    local = dict.fromkeys(("EPICS_PVAS_INTF_ADDR_LIST", "EPICS_CAS_INTF_ADDR_LIST"), "127.0.0.1")
+    known = os.environ | {name: str(port) for name, port in ports.items()} | local
+    process = subprocess.Popen([sys.executable, "-c", IOC], env=known, stdout=subprocess.DEVNULL, text=True)
+    yield process, udp
+    process.kill()
+    process.wait()
+
+
+@pytest.mark.epics
+@pytest.mark.slow
+@pytest.mark.exclusive
+def test_an_ioc_drives_an_interlock_and_a_scan_moves_a_gain(tmp_path: Path, ioc: tuple[Process, int]) -> None:
+    pytest.importorskip("ophyd_async", reason="needs ophyd-async")
+    process, search = ioc
+    (port,) = free_ports(1)
+    (tmp_path / "bench.toml").write_text(CONFIG.format(port=port, search=search))
+    loop = start(tmp_path, "sim-loop", "--config", "bench.toml", "--run", "epics", "--duration", "600", "--no-record")
+    until(lambda: "epics" in running(), 60)
+    gateway = start(tmp_path, "gateway", "epics", "--run", "epics", "--config", "bench.toml")
+    try:
+        scanned(loop, gateway, process, f"127.0.0.1:{port + 1} 127.0.0.1:{search}")
+    finally:
+        for one in (loop, gateway):
+            one.kill()
+            one.communicate()
+
+
+def scanned(loop: Process, gateway: Process, ioc: Process, addresses: str) -> None:
+    """The whole story, with the processes that take part."""
+    thread = pytest.importorskip("p4p.client.thread", reason="needs p4p")
+    with thread.Context("pva", conf={"EPICS_PVA_ADDR_LIST": addresses, "EPICS_PVA_AUTO_ADDR_LIST": "NO"}) as pvs:
+
+        def read(name: str) -> Any:
+            return pvs.get(f"lowfc:{name}", timeout=30.0)
+
+        until(lambda: read("mode") == "closed" and read("interlocks") == "none of 1 acts")
+        assert read("frame").shape == (80, 80)
+        assert len(read("error")) == len(read("gain")) == 14
+        pvs.put("BENCH:MASK:MOVING", 1)
+        until(lambda: read("interlocks") == "mask is 'moving' (hold)")
+        until(lambda: "mask is 'moving'" in read("holding"))
+        with pytest.raises(thread.RemoteError, match="an interlock acts: mask is 'moving'"):
+            pvs.put("lowfc:close", True)
+        pvs.put("BENCH:MASK:MOVING", 0)
+        until(lambda: read("interlocks") == "none of 1 acts")
+        with pytest.raises(thread.RemoteError, match=r"gain refused: .* becomes unstable"):
+            pvs.put("lowfc:gain", [9.0])
+        known = os.environ | {"EPICS_PVA_ADDR_LIST": addresses, "EPICS_PVA_AUTO_ADDR_LIST": "NO"}
+        scan = subprocess.run([sys.executable, "-c", SCAN], env=known, capture_output=True, text=True, check=False)
+        assert scan.returncode == 0, scan.stderr
+        rows = json.loads(scan.stdout)
+        assert [gains for _, gains in rows] == [pytest.approx([value] * 14) for value in (0.05, 0.1, 0.2)]
+        assert all(residual > 0 for residual, _ in rows)
+        ioc.kill()
+        until(lambda: read("interlocks") == "no value of mask for more than 2 s (hold)")
+        interrupt(loop)
+        until(lambda: read("mode").severity == 3)
+    _, complaints = interrupt(gateway)
+    assert gateway.returncode == 0, complaints
+    assert "Traceback" not in complaints
