@@ -23,7 +23,7 @@ from tests.support.image_streams.cacao import CAMERA, TOTAL, file_of
 from tests.support.image_streams.plain import PlainStream
 from tests.support.loops import going_on, loop, run, until
 
-pytestmark = pytest.mark.exclusive
+pytestmark = [pytest.mark.exclusive, pytest.mark.slow]
 
 ROOT = Path(__file__).parents[2]
 GRID = (34, 34)
@@ -38,6 +38,8 @@ static_nm = {{ "2" = {tilt_nm} }}
 
 [control]
 start_mode = "closed"
+tilt_gain = 0.5
+gain = 0.2
 
 [drivers.isio.camera]
 stream = "camnsv"
@@ -133,7 +135,6 @@ def test_a_loop_runs_by_streams_beside_others(folder: Path) -> None:
         assert theirs.pixels.any()
 
 
-@pytest.mark.slow
 def test_each_fault_of_a_stream_is_named_and_recovered_from(folder: Path) -> None:
     (folder / "bench.toml").write_text(BENCH.format(rate_hz=200, preset="quiet", tilt_nm=15))
     with closing(Bench(folder)) as bench, going_on(folder, MIRROR, CAMERA_DRIVER, CONTROLLER), bench.listening():
@@ -195,7 +196,6 @@ def _what_others_put_on_the_mirror_is_not_undone(bench: Bench) -> None:
         assert np.allclose(np.frombuffer(external.actuators, "f4"), dark_hole.reshape(-1) * 1000, atol=0.01)
 
 
-@pytest.mark.slow
 def test_a_minute_at_500_hz_loses_nothing_and_is_as_good_as_the_direct_loop(folder: Path) -> None:
     (folder / "bench.toml").write_text(BENCH.format(rate_hz=500, preset="bench", tilt_nm=0))
     with going_on(folder, CONTROLLER), closing(Bench(folder)) as bench, going_on(folder, MIRROR, CAMERA_DRIVER):
