@@ -104,8 +104,7 @@ class SimulatedCamera:
         """Build the optics, or take those that are given."""
         self._config = config
         self._scene = scene(config) if optics is None else optics
-        modal = factory.contrast_of(config)
-        self._contrast = None if modal is None else Contrast(modal)
+        self._contrast: Contrast | None = None
         self._fault = read_fault(Path(options.fault)) if options.fault else None
         state = factory.camera_state(config, self._scene.shape, 0)
         self._settings = fields_of(state, _SETTINGS)
@@ -133,6 +132,8 @@ class SimulatedCamera:
     def join(self, service: Service) -> None:
         """Declare the truth, and listen to the mirror."""
         self._service = service
+        modal = factory.contrast_of(self._config)  # in the one BLAS thread that a process of the loop has
+        self._contrast = None if modal is None else Contrast(modal)
         self._truths = service.publisher(TRUTH)
         service.bus.subscribe(MIRROR_STATE, self._hear, self._config.mirror.name)
         service.on_stop(self._arrived.set)

@@ -1,15 +1,26 @@
 """A camera's process: frames and settings of its driver to the bus."""
 
+import numpy as np
+
 from lowfc.adapters.process.realtime import let_send
 from lowfc.adapters.process.service import Service
+from lowfc.arrays import Pixels
 from lowfc.contract.configuration import Configuration
 from lowfc.contract.errors import BusError
 from lowfc.contract.messages import CAMERA_STATE, FRAME, image, timestamp, wire
-from lowfc.device.driver import Camera, CameraExtras, CameraSettings
+from lowfc.device.driver import Camera, CameraExtras, CameraSettings, Exposure
+from lowfc.device.watch import DriverWatch
 
 WAIT_S = 30.0
 """How long the first frame waits for those who must not miss it."""
 SETTINGS_NS = round(1e9 / float(CAMERA_STATE.rate))
+PATIENCE_S = 1.0
+"""How long an exposure may take to come, or three periods where they are longer."""
+REST_NS = 100_000_000
+AHEAD_NS = 5_000_000
+"""By which the end of an exposure may be ahead of its clock."""
+MOST_LOST, MOST_FASTER = 100, 4
+"""Frame numbers go on by at most so many, and so many times the periods since the last frame; else they began again."""
 FRAME_ID = "lowfc_camera"
 
 _IDLE = CameraExtras()
@@ -30,6 +41,9 @@ class CameraLoop:
         self._sent = getattr(driver, "sent", _IDLE.sent)
         self._fill_extra = getattr(driver, "fill", _IDLE.fill)
         self._first_put_ns = self._last_put_ns = 0
+        self._number: int | None = None
+        self._number_ns = self._lost = self._lost_due_ns = 0
+        self.watch = DriverWatch(service, PATIENCE_S)
         self._settings: CameraSettings | None = None
         self._due_ns = 0
         self._tell_settings()
@@ -42,6 +56,7 @@ class CameraLoop:
 
         Raises:
             BusError: somebody did not come, or in lockstep did not answer.
+            LowfcError: the driver says what a user has to put right.
         """
         service = self._service
         missing = service.wait_for(wait_for, WAIT_S)
@@ -50,48 +65,134 @@ class CameraLoop:
         service.state = "running"
         getattr(self._driver, "start", _IDLE.start)()
         step = getattr(self._driver, "step", _IDLE.step) if service.clock.lockstep else _IDLE.step
-        while service.running and service.work != self._limit:
-            self._tell_settings()
-            if self._publish_frame():
-                step()
-            service.beat()
-        self._driver.close()
+        with self.watch.over(self._driver.close):
+            while service.running and service.work != self._limit:
+                frame = self._next_frame()
+                if frame is not None:
+                    self._publish(*frame)
+                    step()
+                elif service.clock.host_ns() < self.watch.retry_ns:
+                    service.clock.sleep_until_ns(min(self.watch.retry_ns, service.clock.now_ns() + REST_NS))
+                self._tell_lost()
+                service.beat()
         service.finish()
 
-    def _publish_frame(self) -> bool:
-        exposure = self._driver.expose()
-        if exposure is None:
-            return False
-        assert self._settings is not None  # noqa: S101  # told before
-        clock, end_ns = self._service.clock, exposure.end_ns
-        if end_ns is None:
-            end_ns = clock.now_ns()
-        elif self._settings.clock == "monotonic":
-            end_ns += clock.offset_ns
-        payload = image(exposure.pixels, end_ns, FRAME_ID).SerializeToString()
-        if self._settings.clock == "run":
-            clock.sleep_until_ns(end_ns)
+    def _next_frame(self) -> tuple[Pixels, int] | None:
+        """Pixels of the next exposure and the run's time of its end; None where there is none."""
+        clock, watch = self._service.clock, self.watch
+        if clock.host_ns() < watch.retry_ns:
+            return None
+        watch.begin()
+        try:
+            settings = self._tell_settings()
+            exposure = self._driver.expose()
+            watch.returned()
+            if exposure is None:
+                return None
+            if exposure.pixels.shape != (settings.rows, settings.columns):
+                settings = self._tell_settings()  # the region has changed since
+            pixels = _checked(exposure.pixels, settings)
+            end_ns = self._end_ns(exposure, settings)
+            self._follow_numbers(exposure, settings)
+        except Exception as fault:
+            watch.failed(fault)
+            return None
+        watch.worked()
+        return pixels, end_ns
+
+    def _publish(self, pixels: Pixels, end_ns: int) -> None:
+        payload = image(pixels, end_ns, FRAME_ID).SerializeToString()
+        if self._simulated:
+            self._service.clock.sleep_until_ns(end_ns)
         envelope = self._puts.put(payload)
         let_send()
         self._sent(envelope)
         self._last_put_ns = envelope.publish_time_ns
         self._first_put_ns = self._first_put_ns or envelope.publish_time_ns
         self._service.work += 1
-        return True
 
-    def _tell_settings(self) -> None:
+    def _end_ns(self, exposure: Exposure, settings: CameraSettings) -> int:
+        """End of an exposure by the run's clock.
+
+        Raises:
+            ValueError: it is in the future.
+        """
+        clock = self._service.clock
+        if exposure.end_ns is None:
+            return clock.now_ns()
+        end_ns = int(exposure.end_ns)
+        if self._simulated:
+            return end_ns
+        end_ns += clock.offset_ns if settings.clock == "monotonic" else clock.ahead_ns()
+        if (ahead_ns := end_ns - clock.host_ns()) > AHEAD_NS:
+            raise ValueError(f"end_ns is {ahead_ns * 1e-9:.3f} s in the future of the {settings.clock} clock")
+        return end_ns
+
+    def _follow_numbers(self, exposure: Exposure, settings: CameraSettings) -> None:
+        """Count frames that the camera lost; where its numbers begin again, so do ours.
+
+        Raises:
+            ValueError: the number is that of the last frame.
+        """
+        lost, now_ns = exposure.lost, self._service.clock.host_ns()
+        if exposure.number is not None and self._number is not None:
+            step = (exposure.number - self._number) % settings.number_wrap
+            if step == 0:
+                raise ValueError(f"it returned frame number {exposure.number} twice")
+            most = MOST_LOST + MOST_FASTER * (now_ns - self._number_ns) // settings.period_ns
+            if step > most:
+                self._restart()
+            else:
+                lost += step - 1
+        self._number, self._number_ns = exposure.number, now_ns
+        if lost:
+            self._frames.published += lost
+            self._frames.skipped += lost
+            self._lost += lost
+
+    def _restart(self) -> None:
+        """A new start of the publisher: frames, and the settings that the controller then waits for."""
+        self._service.bus.restart()
+        self._settings = None
+        self._tell_settings()
+
+    def _tell_lost(self) -> None:
+        """Name lost frames, those of half a second in one event."""
+        now_ns = self._service.clock.host_ns()
+        if self._lost and now_ns >= self._lost_due_ns:
+            self._service.event("FRAMES_LOST", count=self._lost)
+            self._lost, self._lost_due_ns = 0, now_ns + SETTINGS_NS
+
+    def _tell_settings(self) -> CameraSettings:
         """Publish the settings when they have changed, and twice a second."""
         settings = self._driver.settings()
         time_ns = self._service.clock.now_ns() if settings.time_ns is None else settings.time_ns
-        if settings == self._settings and time_ns + settings.period_ns // 2 < self._due_ns:
-            return
-        self._settings, self._due_ns = settings, time_ns + SETTINGS_NS
-        self._states.put(state_of(settings, time_ns).SerializeToString())
+        if settings != self._settings or time_ns + settings.period_ns // 2 >= self._due_ns:
+            self._states.put(state_of(settings, time_ns).SerializeToString())
+            self._settings, self._due_ns = settings, time_ns + SETTINGS_NS
+            self._simulated = settings.clock == "run"
+            self.watch.patience_s = max(PATIENCE_S, 3e-9 * settings.period_ns)
+        return settings
 
     def _fill(self, health: wire.Health) -> None:
         if (elapsed_ns := self._last_put_ns - self._first_put_ns) > 0:
-            health.mean_rate_hz = (self._frames.published - 1) * 1e9 / elapsed_ns
+            health.mean_rate_hz = (self._service.work - 1) * 1e9 / elapsed_ns
+        health.driver_failures = self.watch.failures
         self._fill_extra(health)
+
+
+def _checked(pixels: Pixels, settings: CameraSettings) -> Pixels:
+    """Pixels as they may be published.
+
+    Raises:
+        ValueError: they are of another type or shape.
+    """
+    if pixels.dtype != np.uint16 or pixels.shape != (settings.rows, settings.columns):
+        raise ValueError(
+            f"pixels are {pixels.dtype} of shape {pixels.shape}, expected uint16 of shape "
+            f"{(settings.rows, settings.columns)}, as the settings say"
+        )
+    return pixels
 
 
 def state_of(settings: CameraSettings, time_ns: int) -> wire.CameraState:

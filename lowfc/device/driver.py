@@ -47,7 +47,7 @@ class CameraSettings:
         region_column: first column of the region read.
         clock: of `Exposure.end_ns`: CLOCK_MONOTONIC, CLOCK_REALTIME, or the run's (`service.clock`), by which only a
             simulated camera goes: its frame is published once that clock has reached the end of the exposure.
-        number_bits: after so many bits `Exposure.number` wraps.
+        number_wrap: at which `Exposure.number` begins again at 0, such as 1 << 16.
         time_ns: since when they are so, by the run's clock; now where it is None.
     """
 
@@ -64,7 +64,7 @@ class CameraSettings:
     region_row: int = 0
     region_column: int = 0
     clock: Literal["monotonic", "realtime", "run"] = "monotonic"
-    number_bits: int = 64
+    number_wrap: int = 1 << 64
     time_ns: int | None = field(default=None, compare=False)
 
 

@@ -1,6 +1,8 @@
 """A mirror's process: commands from the bus to its driver, state and picture to the bus."""
 
+import contextlib
 import threading
+from collections.abc import Callable
 
 import numpy as np
 from google.protobuf.message import DecodeError
@@ -25,9 +27,10 @@ from lowfc.contract.messages import (
     timestamp,
     wire,
 )
-from lowfc.control.loop.safety import Limits, Reason
+from lowfc.control.loop.safety import Limits, Reason, Rejection
 from lowfc.device.driver import Mirror, MirrorExtras, geometry
 from lowfc.device.guard import Command, Guard, Status, apply_command, tick
+from lowfc.device.watch import DriverWatch
 from lowfc.optics.chain.grid import pupil_axis
 from lowfc.optics.chain.mirror import influence_factors
 
@@ -35,9 +38,16 @@ TICK_NS = 10_000_000
 IDLE_STATE_NS = 100_000_000
 """Without commands the state is published this often, so that a restarted controller learns it."""
 PICTURE_PIXELS = 64
+PATIENCE_S = 0.5
+"""How long a driver may take to move."""
+
+
+class _LostError(Exception):
+    """The driver failed or hung: nobody knows where the mirror is."""
 
 
 _IDLE = MirrorExtras()
+_NONE: Single = np.zeros(0, np.float32)
 
 
 def guard_of(driver: Mirror, config: Configuration) -> Guard:
@@ -72,7 +82,7 @@ class MirrorLoop:
         self._settle = getattr(driver, "settle", None)
         getattr(driver, "join", _IDLE.join)(service)
         self._fill_extra = getattr(driver, "fill", _IDLE.fill)
-        self._status = self._start()
+        self.watch = DriverWatch(service, PATIENCE_S, self._hang)
         self._turn = threading.Lock()
         self._pause = Mailbox()  # nothing comes there: a signal can end its wait, wherever it strikes
         service.on_stop(self._pause.wake)
@@ -90,32 +100,45 @@ class MirrorLoop:
             config.control.max_start_ahead_h,
             lambda start, here: service.event("START_AHEAD", what="commands", start=start, here=here),
         )
+        flat_nm = np.zeros(self._guard.grid, np.float32)
+        self._status = Status(flat_nm, flat_nm)
+        self._known = self._returning = False
+        self._driven_nm: Single | None = None
+        with contextlib.suppress(_LostError):
+            self._start(flat_nm)
         service.fill = self._fill
         self._leave = service.handover(COMMAND, self._arrived, name, period_ns=config.period_ns)
         service.awaited = lambda: "" if self._status.received_ns else "a controller"
         service.state = "ready"
 
-    def _start(self) -> Status:
-        """Where the mirror is as the process starts: as the driver says, or driven to flat."""
-        position = getattr(self._driver, "position", None)
-        self._driven_nm: Single | None = None if position is None else position()
-        if self._driven_nm is not None:
-            return Status(self._driven_nm, self._driven_nm)
-        flat_nm = np.zeros(self._guard.grid, np.float32)
-        return Status(flat_nm, self._drive(flat_nm, np.inf))
+    def _start(self, flat_nm: Single) -> None:
+        """Begin from where the mirror is, as its driver says, or drive it to flat."""
+        held_nm = self._held()
+        if held_nm is None:
+            self._status = Status(flat_nm, self._drive(flat_nm, np.inf))
+        else:
+            self._status, self._driven_nm = Status(held_nm, held_nm), held_nm
+        self._known = True
 
     def run(self) -> None:
         """Do all but the commands, which are obeyed where they arrive: without one, the dead-man."""
         service = self._service
-        while service.running:
-            self._pause.take(TICK_NS * 1e-9)
-            with self._turn:
-                if not service.clock.lockstep and service.clock.host_ns() - self._obeyed_ns >= TICK_NS:
-                    self._wait()
-            service.beat()
+        with self.watch.over(self._close):
+            while service.running:
+                self._pause.take(TICK_NS * 1e-9)
+                free = self._turn.acquire(timeout=TICK_NS * 1e-9)
+                if free:
+                    try:
+                        if not service.clock.lockstep and service.clock.host_ns() - self._obeyed_ns >= TICK_NS:
+                            self._wait()
+                    finally:
+                        self._turn.release()
+                service.beat(alive=free)
+        service.finish()
+
+    def _close(self) -> None:
         self._leave()
         self._driver.close()
-        service.finish()
 
     def _arrived(self, sample: Sample) -> None:
         """On the thread that receives: a command. Those that waited while this process stood still are skipped."""
@@ -133,8 +156,11 @@ class MirrorLoop:
         if isinstance(clock, SimulatedClock):
             clock.set_ns(told.time_ns)
         before, refused_before = self._status, self._refused
-        self._status, self._refused = apply_command(self._guard, before, told, clock.now_ns(), self._drive)
-        refused = self._refused
+        refused: Reason | None = Rejection.NO_MIRROR
+        if not self._returning:
+            with contextlib.suppress(_LostError):
+                self._status, refused = apply_command(self._guard, before, told, clock.now_ns(), self._drive)
+        self._refused = refused
         self._publish(self._status.time_ns or clock.now_ns())
         self._service.work += 1
         if refused is not None and refused is not refused_before:
@@ -150,19 +176,67 @@ class MirrorLoop:
     def _drive(self, actuators_nm: Single, elapsed_ns: float) -> Single:
         """Have the driver move; without a new command a real mirror is left alone."""
         if self._settle is not None:
-            surface_nm: Single = self._settle(actuators_nm, elapsed_ns)
-            return surface_nm
-        if actuators_nm is self._driven_nm:
+            reached_nm = self._call(self._settle, actuators_nm, elapsed_ns)
+        elif actuators_nm is self._driven_nm:
             return self._status.surface_nm
-        reached_nm = self._driver.apply(actuators_nm)
+        else:
+            reached_nm = self._call(self._driver.apply, actuators_nm)
         self._driven_nm = actuators_nm
         return actuators_nm if reached_nm is None else reached_nm
+
+    def _held(self) -> Single | None:
+        """What the mirror holds, as its driver says; None where it cannot say."""
+        position = getattr(self._driver, "position", None)
+        return None if position is None else self._call(position)
+
+    def _call(self, method: Callable[..., Single | None], *arguments: object) -> Single | None:
+        """Where the mirror is, as a method of its driver returns.
+
+        Raises:
+            _LostError: it failed or hung: the mirror may be anywhere, and goes to its idle state before all else.
+        """
+        self.watch.begin()
+        try:
+            found_nm = method(*arguments)
+            if found_nm is not None:
+                flat = found_nm.reshape(-1)
+                if found_nm.shape != self._guard.grid or not np.isfinite(np.vdot(flat, flat)):
+                    raise ValueError(f"it is at {found_nm.shape} actuators, expected {self._guard.grid} of finite nm")
+            if self.watch.returned():
+                self.watch.worked()
+                return found_nm
+        except Exception as fault:
+            self.watch.failed(fault)
+        self._known, self._returning, self._driven_nm = False, True, None
+        self._status = self._status._replace(following=False, channels={}, command_nm=_NONE)
+        raise _LostError
+
+    def _hang(self) -> None:
+        """On the watch's thread: the state no longer says where the mirror is."""
+        self._known, self._refused = False, Rejection.NO_MIRROR
+        self._publish(self._service.clock.now_ns())
+
+    def _return(self) -> None:
+        """After a fault, a step to the idle state: flat, or the shape that it holds, or was driven to last."""
+        if self._service.clock.host_ns() < self.watch.retry_ns:
+            return
+        if self._driven_nm is None and (held_nm := self._held()) is not None:
+            self._status = self._status._replace(driven_nm=held_nm)
+        self._status = tick(self._guard, self._status, self._service.clock.now_ns(), self._drive)
+        self._known = True
+        self._returning = self._guard.flatten and bool(self._status.driven_nm.any())
+        if not self._returning:
+            self._refused = None
 
     def _wait(self) -> None:
         now_ns = self._service.clock.now_ns()
         before = self._status
-        self._status = tick(self._guard, before, now_ns, self._drive)
-        if before.following and not self._status.following:
+        with contextlib.suppress(_LostError):
+            if self._returning:
+                self._return()
+            else:
+                self._status = tick(self._guard, before, now_ns, self._drive)
+        if before.following and not self._status.following and not self._returning:
             action = "relaxing to flat" if self._guard.flatten else "holding the shape"
             self._service.event("COMMAND_EXPIRED", command_timeout_ms=before.valid_for_ns / 1e6, action=action)
         moved = (
@@ -174,13 +248,16 @@ class MirrorLoop:
     def _publish(self, time_ns: int) -> None:
         """Publish the state, then, when it is due, a picture of the surface."""
         status, state = self._status, state_of(self._status, time_ns)
+        if not self._known:
+            state.ClearField("actuators")
+            state.status = wire.MIRROR_STATUS_EXPIRED
         state.channels.extend(sorted(status.channels))
         state.safe = bool(status.safe)
         state.refused = self._refused.value if self._refused is not None else 0  # type: ignore[assignment]  # numbered alike
         self._states.put(state.SerializeToString())
         self._state_due_ns = self._service.clock.now_ns() + IDLE_STATE_NS
         now_ns = self._service.clock.now_ns()  # not by a command's time: that may be anything
-        if now_ns >= self._picture_due_ns:
+        if now_ns >= self._picture_due_ns and self._known:
             picture = np.asarray(self._y_factors @ status.surface_nm @ self._x_factors.T, np.float32)
             self._surfaces.put(image(picture, time_ns, "mirror").SerializeToString())
             self._picture_due_ns = now_ns + int(1e9 / float(SURFACE.rate))
@@ -191,6 +268,7 @@ class MirrorLoop:
         health.command_refused = self._refused.value if self._refused is not None else 0  # type: ignore[assignment]
         health.command_expired = bool(status.received_ns) and not status.following
         health.limits_hit.extend(reason.value for reason in status.limits_hit)  # type: ignore[misc]
+        health.driver_failures = self.watch.failures
         self._fill_extra(health)
 
 

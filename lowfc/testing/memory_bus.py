@@ -37,7 +37,7 @@ class MemoryPublisher:
     def __init__(self, bus: "MemoryBus", topic: Topic, key: str) -> None:
         self.topic = topic
         self.key = key
-        self.published = 0
+        self.published = self.skipped = 0
         self.handed_ns = 0
         self.last: tuple[bytes, Envelope] | None = None
         self._bus = bus
@@ -138,6 +138,12 @@ class MemoryBus:
     def peers(self) -> int:
         """See `Bus.peers`."""
         return sum(bus is not self for bus in self.hub.buses)
+
+    def restart(self) -> None:
+        """See `Bus.restart`."""
+        self.start_s = self.hub.starts[self.role] = max(self.clock.host_ns() // 10**9, self.start_s + 1)
+        for publisher in self.publishers:
+            publisher.published = publisher.skipped = 0
 
     def close(self) -> None:
         """Leave the hub."""

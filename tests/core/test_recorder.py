@@ -174,6 +174,25 @@ def test_the_ledger_takes_a_loss_back_when_the_message_comes_late() -> None:
     assert (ledger.lost(), ledger.news()) == ({FRAME.key: 3}, {FRAME.key: 1}), "two were said already"
 
 
+def test_the_ledger_does_not_count_what_the_camera_lost_before_it_could_send_it() -> None:
+    ledger = LossAccount()
+
+    def health(published: int, missing: int) -> None:
+        said = wire.Health(process="camera")
+        said.topics.add(topic=FRAME.key, published=published, missing=missing)
+        ledger.believe(entry(HEALTH, 0, key=HEALTH.at("camera"))[1], said)
+
+    ledger.enter(*entry(FRAME, 50), recorded=True)
+    health(51, 7)  # before the first frame that came
+    ledger.enter(*entry(FRAME, 53), recorded=True)
+    health(54, 9)
+    assert (ledger.lost(), ledger.news()) == ({}, {})
+    ledger.enter(*entry(FRAME, 56), recorded=True)
+    assert ledger.news() == {}, "the camera may still say that it lost them"
+    health(57, 10)
+    assert (ledger.news(), ledger.news()) == ({FRAME.key: 1}, {}), "one was lost on the way"
+
+
 def test_the_ledger_counts_nothing_as_lost_that_was_sent_twice() -> None:
     ledger = LossAccount()
     for count in (0, 1, 1, 2, 2, 4, 4):

@@ -65,7 +65,8 @@ class Publisher(Protocol):
     """Publishes one topic under one key.
 
     Attributes:
-        published: messages so far.
+        published: messages so far, with those skipped.
+        skipped: messages that never were: frames that a camera lost.
         handed_ns: time at which the last one had been handed to its direct link, or else to the bus, host clock.
         last: message and envelope, of a topic that can be queried.
     """
@@ -73,6 +74,7 @@ class Publisher(Protocol):
     topic: Topic
     key: str
     published: int
+    skipped: int
     handed_ns: int
     last: tuple[bytes, Envelope] | None
 
@@ -129,6 +131,10 @@ class Bus(Protocol):
 
     def peers(self) -> int:
         """Number of other processes that this one is connected to."""
+        ...
+
+    def restart(self) -> None:
+        """Begin a new start of this process, as where a camera's numbers begin again: publishers count from 0."""
         ...
 
     def close(self) -> None:

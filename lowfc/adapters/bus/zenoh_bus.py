@@ -56,12 +56,12 @@ class ZenohPublisher:
     ) -> None:
         self.topic = topic
         self.key = key
-        self.published = 0
+        self.published = self.skipped = 0
         self.handed_ns = 0
         self.last: tuple[bytes, Envelope] | None = None
         self._keeps = topic.queryable
         self._host_ns = bus.clock.host_ns
-        self._start_s = bus.start_s
+        self._bus = bus
         self._sent = bus.sent
         self._replying = bus.replying
         self._publisher = declare_publisher(session, topic, key, lockstep=bus.clock.lockstep)
@@ -72,7 +72,7 @@ class ZenohPublisher:
     def put(self, payload: bytes, publish_time_ns: int | None = None, sequence: int | None = None) -> Envelope:
         """Send `payload`; a slow reader delays it by at most 1 ms and loses it, or in lockstep is waited for."""
         envelope = Envelope(
-            sequence_of(self._start_s, self.published) if sequence is None else sequence,
+            sequence_of(self._bus.start_s, self.published) if sequence is None else sequence,
             self._host_ns() if publish_time_ns is None else publish_time_ns,
         )
         self.published += 1
@@ -161,6 +161,7 @@ class ZenohBus:
         self.role = role
         self._links = links
         self._closers: list[Callable[[], None]] = []
+        self._publishers: list[ZenohPublisher] = []
         self.clock = clock
         self.faults = Faults()
         self.offset: ClockOffset | None = None
@@ -210,6 +211,7 @@ class ZenohBus:
         path = self._direct_link(topic, name) if by_table else None
         publisher = ZenohPublisher(self, self._session, topic, topic.at(name), path)
         self._closers.append(publisher.close)
+        self._publishers.append(publisher)
         return publisher
 
     def subscribe(self, topic: Topic, handler: Callable[[Sample], None], name: str = ALL) -> Callable[[], None]:
@@ -304,6 +306,12 @@ class ZenohBus:
     def peers(self) -> int:
         """See `Bus.peers`; across hosts, the router alone."""
         return len(self._session.info.peers_zid()) + len(self._session.info.routers_zid())
+
+    def restart(self) -> None:
+        """See `Bus.restart`."""
+        self.start_s = self._links.claim_start(self.role, max(self.clock.host_ns() // 10**9, self.start_s + 1))
+        for publisher in self._publishers:
+            publisher.published = publisher.skipped = 0
 
     def close(self) -> None:
         """Leave the run, when what was put has been received or the peers have not answered in time.

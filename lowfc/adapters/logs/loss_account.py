@@ -25,6 +25,8 @@ class _Tally:
     Attributes:
         published: by its own last count, in which one that it sent twice is two.
         twice: of those recorded, messages that had come before.
+        never: lost before they could be sent, by its own account: frames of a camera; `before` the first message.
+        unconfirmed: lost when news were asked last.
         safe: recorded, and twice, flushed since.
     """
 
@@ -32,12 +34,20 @@ class _Tally:
     published: int = 0
     recorded: int = 0
     twice: int = 0
+    never: int = 0
+    before: int | None = None
+    unconfirmed: int = 0
     safe: tuple[int, int] = (0, 0)
     reported: int = 0
 
     @property
     def lost(self) -> int:
-        return self.sent - self.recorded
+        return max(0, self.sent - self.recorded - self.never)
+
+    @property
+    def confirmed(self) -> int:
+        """Of a camera that loses frames: lost at the last call, too, since its own account comes later than a frame."""
+        return min(self.lost, self.unconfirmed) if self.never else self.lost
 
     @property
     def sent(self) -> int:
@@ -56,6 +66,7 @@ class _Tally:
         self.recorded += other.recorded
         self.safe = self.safe[0] + other.safe[0], 0
         self.reported += other.reported
+        self.never += other.never
 
 
 class LossAccount:
@@ -97,6 +108,9 @@ class LossAccount:
                 self.names.admit(topic, count.topic)
                 author = self._known(health.process) if topic is EVENT else ""
                 tally = self._tally(count.topic, author, start_of(sample.sequence), count.published)
+                if tally.before is None:
+                    tally.before = count.missing if tally.gaps.first else 0
+                tally.never = count.missing - tally.before
                 if health.state == "stopped":
                     tally.published = count.published
 
@@ -123,9 +137,10 @@ class LossAccount:
 
     def news(self) -> dict[str, int]:
         """Messages lost since this was asked last, by key; one that comes late after all is not taken back."""
-        found = self._sum(lambda tally: max(0, tally.lost - tally.reported))
+        found = self._sum(lambda tally: max(0, tally.confirmed - tally.reported))
         for _, tally in self._all():
-            tally.reported = max(tally.reported, tally.lost)
+            tally.reported = max(tally.reported, tally.confirmed)
+            tally.unconfirmed = tally.lost
         return found
 
     def _tally(self, key: str, author: str, start_s: int, first: int) -> _Tally:

@@ -188,13 +188,14 @@ class Service:
         elif state in ("stopping", "stopped"):
             self._supervisor.stopping()
 
-    def beat(self) -> None:
-        """Send Health when it is due, twice a second, and a sign of life to the service manager.
+    def beat(self, *, alive: bool = True) -> None:
+        """Send Health when it is due, twice a second, and a sign of life to the service manager where it is `alive`.
 
         Call it in every turn of the loop that does the work, and nowhere else.
         """
         now_ns = self.clock.host_ns()
-        self._supervisor.alive(now_ns)
+        if alive:
+            self._supervisor.alive(now_ns)
         if self._check_waiting_ns is not None and 0 < self._check_waiting_ns <= now_ns:
             self._check_waiting_ns = 0
             if whom := self.awaited():
@@ -288,7 +289,8 @@ class Service:
 
     def _sent(self, publisher: Publisher) -> wire.TopicCount:
         own = publisher is self._health  # the message that carries the count is one of them
-        return wire.TopicCount(topic=publisher.key, published=publisher.published + own)
+        published = publisher.published + own
+        return wire.TopicCount(topic=publisher.key, published=published, missing=publisher.skipped)
 
     def _tell_unreadable(self) -> None:
         for key, (count, why) in self.bus.faults.take_unreadable().items():

@@ -1,0 +1,108 @@
+"""What becomes of a driver that fails or does not return: counted, named in an event, tried again after a while."""
+
+import re
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+
+from lowfc.adapters.process.service import Service
+from lowfc.contract.errors import LowfcError
+
+LOOK_S = 0.1
+PAUSES_NS = (0, 100_000_000, 200_000_000, 500_000_000, 1_000_000_000, 2_000_000_000, 4_000_000_000)
+"""How long a driver is left alone after so many failures in a row."""
+STEADY_NS = 1_000_000_000
+"""A driver that has not failed for so long works again."""
+
+
+class DriverWatch:
+    """Watches the calls of one driver.
+
+    Attributes:
+        failures: since the start; a call that does not return is one.
+        hangs: the call under way has not returned for too long.
+        failed_ns: host's time of the last one.
+        retry_ns: host's time before which the driver is left alone.
+    """
+
+    def __init__(self, service: Service, patience_s: float, hanging: Callable[[], None] = lambda: None) -> None:
+        """Give a call so many seconds, then call `hanging`, on another thread."""
+        self.failures = self.failed_ns = self.retry_ns = 0
+        self.hangs = False
+        self.patience_s = patience_s
+        self._service = service
+        self._hanging = hanging
+        self._calls = self._looked_at = self._looks = self._row = self._series = 0
+        self._under_way = False
+        self._kind = ""
+        self._ended = threading.Event()
+
+    @contextmanager
+    def over(self, close: Callable[[], None]) -> Iterator[None]:
+        """Look from now on, on a thread of its own; close the driver at the end, however that comes."""
+        threading.Thread(target=self._look_on, name="driver's watch", daemon=True).start()
+        try:
+            yield
+        finally:
+            self._ended.set()
+            try:
+                close()
+            except Exception as fault:
+                self.failed(fault)
+
+    def begin(self) -> None:
+        """A call begins."""
+        self._calls += 1
+        self._under_way = True
+
+    def returned(self) -> bool:
+        """The call has returned; whether it did so in time."""
+        self._under_way = False
+        in_time, self.hangs = not self.hangs, False
+        return in_time
+
+    def worked(self) -> None:
+        """What a call returned was good."""
+        self._row = 0
+        if self._series and self._service.clock.host_ns() - self.failed_ns >= STEADY_NS:
+            self._service.event("DRIVER_BACK", count=self._series)
+            self._series, self._kind = 0, ""
+
+    def failed(self, fault: Exception) -> None:
+        """A call raised, or returned nonsense.
+
+        Raises:
+            LowfcError: the fault itself, where it is one: a user has to put it right.
+        """
+        self._under_way = self.hangs = False
+        if isinstance(fault, LowfcError):
+            raise fault
+        self.retry_ns = self._service.clock.host_ns() + PAUSES_NS[min(self._row, len(PAUSES_NS) - 1)]
+        self._row += 1
+        self._count()
+        why = f"{type(fault).__name__}: {fault}"[:300]
+        kind = re.sub(r"\d+", "", why)  # the same fault with other numbers is said once
+        if kind != self._kind:
+            self._kind = kind
+            self._service.event("DRIVER_FAILED", why=why)
+
+    def look(self) -> None:
+        """Whether a call is the same at every look for too long: by looks, since the host may have stood still."""
+        if not self._under_way or self._calls != self._looked_at:
+            self._looked_at, self._looks = self._calls, 0
+            return
+        self._looks += 1
+        if self._looks * LOOK_S >= self.patience_s and not self.hangs:
+            self.hangs = True
+            self._count()
+            self._service.event("DRIVER_HANGS", hangs_s=self._looks * LOOK_S)
+            self._hanging()
+
+    def _count(self) -> None:
+        self.failures += 1
+        self._series += 1
+        self.failed_ns = self._service.clock.host_ns()
+
+    def _look_on(self) -> None:
+        while not self._ended.wait(LOOK_S):
+            self.look()
