@@ -1,5 +1,6 @@
 """Drivers of cameras and mirrors: what one is, and the two loops that run it."""
 
+from lowfc.adapters.process.service import Service
 from lowfc.arrays import Pixels, Single
 from lowfc.contract.configuration import Configuration
 from lowfc.contract.errors import ConfigurationError
@@ -12,10 +13,12 @@ from lowfc.device.driver import (
     Geometry,
     Mirror,
     MirrorExtras,
+    Need,
     Puts,
     geometry,
 )
 from lowfc.device.run import run_camera, run_mirror
+from lowfc.device.volts import VoltMap, VoltOptions
 
 __all__ = [
     "Camera",
@@ -28,9 +31,13 @@ __all__ = [
     "Geometry",
     "Mirror",
     "MirrorExtras",
+    "Need",
     "Pixels",
     "Puts",
+    "Service",
     "Single",
+    "VoltMap",
+    "VoltOptions",
     "geometry",
     "run_camera",
     "run_mirror",

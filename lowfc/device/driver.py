@@ -27,6 +27,22 @@ class DriverOptions(Section):
     """
 
 
+class Need(NamedTuple):
+    """What a driver needs of its host, for `lowfc doctor --device`.
+
+    A driver's class may have a class method `needs(options)` that returns some.
+
+    Attributes:
+        what: a package, a file, a device.
+        found: what was found of it; empty where it is not there.
+        advice: how to get it.
+    """
+
+    what: str
+    found: str
+    advice: str
+
+
 @dataclass(frozen=True, slots=True)
 class CameraSettings:
     """What a camera is set to.

@@ -1,5 +1,6 @@
-"""Drivers by their names: entry points of installed packages, or "module:Class"."""
+"""Drivers by their names: entry points of installed packages, or "module:Class", or "folder/file.py:Class"."""
 
+import importlib.util
 import sys
 import tomllib
 from collections.abc import Sequence
@@ -28,20 +29,28 @@ def load(kind: Kind, name: str) -> Any:
     Raises:
         ConfigurationError: there is none of that name, or it cannot be imported.
     """
-    if ":" in name:
-        sys.path.insert(0, str(Path.cwd()))  # `python -P` leaves out the folder in which the user stands
-        point = EntryPoint(name, name, f"lowfc.{kind}s")
+    module, colon, attribute = name.rpartition(":")
+    if colon:
+        # `python -P` leaves out the folder in which the user stands
+        sys.path.insert(0, str(Path(module).resolve().parent if module.endswith(".py") else Path.cwd()))
+        point = EntryPoint(name, f"{section(name)}:{attribute}", f"lowfc.{kind}s")
     elif name in (known := installed(kind)):
         point = known[name]
     else:
         raise ConfigurationError(
             f"no driver of a {kind} is called {name!r}{nearest(name, known)}; there are {', '.join(sorted(known))}, or "
-            "write module:Class"
+            "write module:Class or file.py:Class"
         )
     try:
         return point.load()
     except (ImportError, AttributeError) as fault:
         raise ConfigurationError(f"the driver {name!r} cannot be loaded: {fault}") from None
+
+
+def section(name: str) -> str:
+    """NAME of a driver's section [drivers.NAME]: its own, or its module's."""
+    module = name.partition(":")[0]
+    return Path(module).stem if module.endswith(".py") else module
 
 
 def opened(kind: Kind, name: str, config: Configuration, words: Sequence[str] = (), driver: Any = None) -> Any:
@@ -55,12 +64,32 @@ def opened(kind: Kind, name: str, config: Configuration, words: Sequence[str] = 
         driver: its class, where that is known.
     """
     driver = load(kind, name) if driver is None else driver
-    return driver(options(driver, table(config, kind, name), words), config)
+    given = options(driver, table(config, kind, name), words)
+    try:
+        return driver(given, config)
+    except OSError as fault:
+        raise ConfigurationError(f"the {kind} {name!r} cannot be opened: {fault}") from fault
+
+
+def faults(config: Configuration) -> list[str]:
+    """What is wrong with the sections [drivers.NAME] of a configuration, a sentence each."""
+    found = []
+    for name in config.drivers:
+        kinds = [kind for kind in KINDS if name in installed(kind)]
+        if not kinds and importlib.util.find_spec(name.partition(".")[0]) is None:
+            known = {*installed("camera"), *installed("mirror")}
+            found.append(f"drivers.{name}: no installed driver has that name{nearest(name, known)}, nor a module")
+        for kind in kinds:
+            try:
+                options(load(kind, name), table(config, kind, name))
+            except ConfigurationError as fault:
+                found.append(f"drivers.{name}: {fault}")
+    return found
 
 
 def table(config: Configuration, kind: Kind, name: str) -> dict[str, Any]:
     """Options of a driver in a configuration: [drivers.NAME], or its part for this kind."""
-    found = config.drivers.get(name.partition(":")[0], {})
+    found = config.drivers.get(section(name), {})
     if found and set(found) <= set(KINDS):
         return dict(found.get(kind, {}))
     return found

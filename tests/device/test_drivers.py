@@ -10,9 +10,10 @@ from lowfc.contract.configuration import load
 from lowfc.contract.errors import ConfigurationError
 from lowfc.contract.messages import CAMERA_STATE, COMMAND, FRAME, MIRROR_STATE, wire
 from lowfc.control.loop.safety import Limit
-from lowfc.device import CameraSettings, Configuration, DriverOptions, Exposure, Single, geometry, plugins
+from lowfc.device import CameraSettings, Configuration, DriverOptions, Exposure, Need, Single, geometry, plugins
 from lowfc.device.camera_loop import CameraLoop
 from lowfc.device.mirror_loop import MirrorLoop, guard_of
+from lowfc.programs.commissioning.doctor.devices import device_checks
 from lowfc.testing.clock import FakeClock
 from lowfc.testing.listener import Listener
 from lowfc.testing.memory_bus import MemoryBus, MemoryHub
@@ -133,6 +134,27 @@ def test_a_driver_is_found_by_entry_point_or_by_module_and_class(
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(sys, "path", list(sys.path))
     assert plugins.load("camera", "beside_me:Mine").__name__ == "Mine"
+    (tmp_path / "folder").mkdir()
+    (tmp_path / "folder/in_a_folder.py").write_text("class Mine: ...\n")
+    assert plugins.load("camera", "folder/in_a_folder.py:Mine").__name__ == "Mine"
+    assert plugins.section("folder/in_a_folder.py:Mine") == "in_a_folder"
     for name, why in [("sin", "did you mean 'sim'"), ("beside_me:Other", "cannot be loaded"), ("nowhere:X", "nowhere")]:
         with pytest.raises(ConfigurationError, match=why):
             plugins.load("camera", name)
+
+
+def test_a_configuration_is_checked_by_the_drivers_themselves() -> None:
+    assert plugins.faults(load(None, {"drivers.sim": {"camera": {"fault": ""}}, "drivers.json": {"any": 1}})) == []
+    wrong = plugins.faults(load(None, {"drivers.sim": {"camera": {"falt": ""}}, "drivers.sin.x": 1}))
+    assert ["'falt'" in wrong[0], "did you mean 'sim'" in wrong[1], len(wrong)] == [True, True, 2]
+
+
+def test_a_driver_says_what_it_needs(monkeypatch: pytest.MonkeyPatch) -> None:
+    needs = [Need("a cable", "cable 7", ""), Need("a camera", "", "switch it on")]
+    monkeypatch.setattr(Ramp, "needs", lambda options: needs, raising=False)
+    monkeypatch.setattr(plugins, "load", lambda kind, name: Ramp)
+    checks = list(device_checks("sim", load(None, {"drivers.sim.mirror": {"levle": 1}})))
+    assert [f"{check.name} {check.status}" for check in checks] == [
+        *("camera sim ok", "camera sim: a cable ok", "camera sim: a camera wrong", "mirror sim wrong")
+    ]
+    assert [check.advice for check in checks[1:3]] == ["", "switch it on"]

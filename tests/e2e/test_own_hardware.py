@@ -36,8 +36,8 @@ static_nm = { "2" = 15, "4" = 8 }
 gain = 0.2
 """
 DEVICES = (
-    "python examples/mirror.py --run bench --config bench.toml",
-    "python examples/camera.py --run bench --config bench.toml",
+    "lowfc mirror examples/mirror.py:MyMirror --run bench --config bench.toml",
+    "lowfc camera examples/camera.py:MyCamera --run bench --config bench.toml",
 )
 CONFORMANCE = (
     "lowfc conformance camera --run bench --config bench.toml",
@@ -49,7 +49,12 @@ PLAIN = (
     "python examples/plain_camera.py camera.json5 frames.npy",
 )
 
-DOCUMENTED = (*DEVICES, *CONFORMANCE, *LOOP, *PLAIN)
+COUNTING = (
+    "lowfc camera counting.py:Counting --run counting --peak-dn 9000",
+    "lowfc conformance camera --run counting",
+)
+DOCTOR = "lowfc doctor --device sim"
+DOCUMENTED = (*DEVICES, *CONFORMANCE, *LOOP, *PLAIN, *COUNTING, DOCTOR)
 """Commands of docs/hardware.md; all are run here."""
 
 SIMULATED = ("sim-camera --run bench --config bench.toml", "sim-dm --run bench --config bench.toml")
@@ -148,14 +153,23 @@ def test_the_simulated_devices_and_a_camera_in_plain_zenoh_keep_the_contract(ben
         conformance(bench, *CONFORMANCE, CONFORMANCE[0].partition(" --config")[0].replace("bench", "plain"))
 
 
+@pytest.mark.slow
+def test_a_camera_written_from_the_page_is_right_at_its_first_run(bench: Path) -> None:
+    (bench / "counting.py").write_text(block("python", (ROOT / "docs/hardware.md").read_text()))
+    with going_on(bench, COUNTING[0]):
+        until(lambda: (bench / "run/lowfc/counting").exists())
+        conformance(bench, COUNTING[1])
+    assert "2 ok" in command(bench, DOCTOR)
+
+
 TEXT = (ROOT / "docs/commissioning.md").read_text()
 COMMISSIONING = re.findall(r"^    ((?:python|lowfc) .*)$", TEXT, flags=re.MULTILINE)
 *PAGE_DEVICES, CONTROLLER, COMMISSION, LATER = COMMISSIONING
 
 
-def block(language: str) -> str:
+def block(language: str, page: str = TEXT) -> str:
     """The page's listing in this language."""
-    (found,) = re.findall(rf"^```{language}\n(.*?)^```$", TEXT, flags=re.MULTILINE | re.DOTALL)
+    (found,) = re.findall(rf"^```{language}\n(.*?)^```$", page, flags=re.MULTILINE | re.DOTALL)
     return str(found)
 
 
@@ -185,7 +199,7 @@ def test_a_camera_of_another_size_comes_to_a_closed_loop(bench: Path) -> None:
         assert figures["measured_error_nm"] == pytest.approx(figures["predicted_error_nm"], rel=0.15)
         with Client("bench") as client:
             state = client.status().state
-            assert state.mode_cause == "operator asked to close"
+            assert state.mode_cause == "asked to close for lowfc commission"
         assert calibration_file.load(bench / "calibration.fits").shape == (64, 64)
     with going_on(bench, *PAGE_DEVICES, LATER):
         until(lambda: closed(bench), 60)

@@ -15,7 +15,6 @@ from lowfc.contract.messages import wire
 from lowfc.control.calibration.calibration import Calibration
 from lowfc.control.loop.estimator import Estimator
 from lowfc.optics.twin.twin import Evaluator
-from lowfc.testing.clock import FakeClock
 from sim_camera.disturbance import BLOCK, _sum_of_waves
 from sim_camera.driver import disturbance_of
 from sim_camera.driver import scene as scene_of
@@ -177,8 +176,8 @@ def test_the_stand_in_of_the_examples_refuses_a_mirror_of_another_grid() -> None
     assert spec.loader is not None
     spec.loader.exec_module(stand_in := importlib.util.module_from_spec(spec))
     heard: list[Any] = []
-    service = SimpleNamespace(clock=FakeClock(), bus=SimpleNamespace(subscribe=lambda _, hear, __: heard.append(hear)))
-    optics = stand_in.Optics(Configuration(), service)
+    optics = stand_in.Optics(Configuration())
+    optics.join(SimpleNamespace(bus=SimpleNamespace(subscribe=lambda _, hear, __: heard.append(hear))))
     surface = np.zeros((24, 24), np.float32)
     state = wire.MirrorState(rows=24, columns=24, actuators=surface.tobytes())
     heard[0](SimpleNamespace(payload=state.SerializeToString()))

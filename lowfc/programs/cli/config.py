@@ -14,7 +14,7 @@ from lowfc.adapters.bus.zenoh_session import session_config
 from lowfc.adapters.process.clock import HostClock
 from lowfc.adapters.process.terminal import AnyRun, ConfigFile, configuration
 from lowfc.contract.configuration import Configuration
-from lowfc.contract.errors import BusError
+from lowfc.contract.errors import BusError, ConfigurationError
 from lowfc.programs.cli.ctl.which_run import the_known_run
 
 _HEADER = (
@@ -74,9 +74,13 @@ def config_check(config: Annotated[Path, typer.Argument(help="Configuration file
 
     Example: lowfc config check lowfc.toml
     """
+    from lowfc.device.plugins import faults
     from lowfc.programs.core.start_up import check_files
 
-    check_files(configuration(config))
+    settings = configuration(config)
+    check_files(settings)
+    if wrong := faults(settings):
+        raise ConfigurationError("\n".join(f"{config}: {one}" for one in wrong))
     typer.echo(f"{config}: fine")
 
 

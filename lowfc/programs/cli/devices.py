@@ -9,7 +9,8 @@ from lowfc.device import run_camera, run_mirror
 from lowfc.device.plugins import opened
 from lowfc.device.run import PASSED_ON, Frames, WaitFor
 
-Driver = Annotated[str, typer.Argument(help="Name of an installed driver, or module:Class.", show_default=False)]
+_DRIVER = "Name of an installed driver, module:Class or file.py:Class."
+Driver = Annotated[str, typer.Argument(help=_DRIVER, show_default=False)]
 
 camera_app = new_app("")
 mirror_app = new_app("")

@@ -21,6 +21,9 @@ FIELDS = {"name": "name", "status": "status", "detail": "got", "advice": "advice
 def doctor(
     config: ConfigFile = None,
     strict: Annotated[bool, typer.Option("--strict", help="Exit status 1 where there is a warning.")] = False,
+    device: Annotated[
+        str | None, typer.Option(help="Driver, by its name: look at what it needs, and at nothing else.")
+    ] = None,
     as_json: Json = False,
 ) -> None:
     """Say whether this host is fit for a real-time loop, what to do where it is not, and what it costs otherwise.
@@ -30,9 +33,16 @@ def doctor(
     Example: lowfc doctor --config lowfc.toml --strict
     """
     from lowfc.adapters.process.host import Host
+    from lowfc.programs.commissioning.doctor.devices import device_checks
     from lowfc.programs.commissioning.doctor.facts import gather
 
     settings = configuration(config)
+    if device is not None:
+        checks = list(device_checks(device, settings))
+        put(checks, (Status.WRONG, Status.OK), FIELDS, {"device": device} if as_json else None)
+        if any(check.status is Status.WRONG for check in checks):
+            raise typer.Exit(1)
+        return
     sys.stderr.write(
         f"sleeping 1000 times a second for {TRIAL_S:g} s in each scheduling class, to see how late this host wakes\n"
     )

@@ -1,0 +1,42 @@
+"""A mirror that is driven by volts, by the documented calls of Boston Micromachines' DM-SDK (module `bmc`).
+
+It was tested with a stand-in for that module, and has not met the hardware. Another vendor's calls take its place.
+
+Example: lowfc mirror examples/boston_mirror.py:BostonMirror --run bench --config bench.toml --serial 17CW000#001
+"""
+
+import bmc
+
+from lowfc.device import Configuration, Single, VoltMap, VoltOptions, geometry
+
+
+class BostonMirror:
+    """Values are fractions of the voltage range, 0 to 1."""
+
+    class Options(VoltOptions):
+        """Beside the maps."""
+
+        serial: str
+        """Serial number of the mirror."""
+
+    def __init__(self, options: Options, config: Configuration) -> None:
+        """Open the mirror."""
+        self.geometry = geometry(config)
+        self.dm = bmc.BmcDm()
+        self.check(self.dm.open_dm(options.serial))
+        self.map = VoltMap(options, config, self.dm.num_actuators())
+
+    def apply(self, actuators_nm: Single) -> Single:
+        """Send the values; the surface is what they make."""
+        values = self.map.values(actuators_nm)
+        self.check(self.dm.send_data(values))
+        return self.map.surface_nm(values)
+
+    def close(self) -> None:
+        """Let go of the mirror."""
+        self.dm.close_dm()
+
+    def check(self, status: int) -> None:
+        """Raise what the vendor says of a call that failed."""
+        if status != bmc.NO_ERR:
+            raise OSError(self.dm.error_string(status))

@@ -1,0 +1,76 @@
+"""From nm of surface to what a mirror's electronics take: a value for each channel, clipped, in the vendor's order."""
+
+import numpy as np
+
+from lowfc.adapters.files.mirror_maps import shape_of
+from lowfc.arrays import Array, Single, single
+from lowfc.contract.configuration import Configuration
+from lowfc.contract.errors import ConfigurationError
+from lowfc.device.driver import DriverOptions
+
+
+class VoltOptions(DriverOptions):
+    """Options of a mirror that is driven by a value for each channel: volts, or a fraction of their range.
+
+    Files are FITS or .npy, (rows, columns). A value makes `mirror.nm_per_unit` x gain nm of surface for each unit.
+    """
+
+    zero: float = 0.5
+    """Value at which an actuator is flat."""
+    zero_map: str = ""
+    """File of that value for each actuator; empty for `zero` for all."""
+    gain_map: str = ""
+    """File of each actuator's gain, relative to mirror.nm_per_unit; empty for 1 for all."""
+    lowest: float = 0.0
+    """Least value that is ever sent."""
+    highest: float = 1.0
+    """Largest value that is ever sent."""
+    order: str = ""
+    """File of each actuator's channel, from 0, and -1 for an actuator without one; empty for row after row."""
+
+
+class VoltMap:
+    """The values of a mirror's channels.
+
+    Attributes:
+        channels: how many there are, with those that no actuator has.
+    """
+
+    def __init__(self, options: VoltOptions, config: Configuration, channels: int | None = None) -> None:
+        """Read the maps; `channels` is how many the electronics have, where that is known.
+
+        Raises:
+            ConfigurationError: a map cannot be read or does not fit the mirror, or leaves no room for a surface.
+        """
+        grid = (config.mirror.rows, config.mirror.columns)
+
+        def read(key: str, file: str, otherwise: Array) -> Array:
+            return shape_of(config, f"option {key}", file).astype(float) if file else otherwise
+
+        zero = read("zero_map", options.zero_map, np.full(grid, options.zero))
+        gain = read("gain_map", options.gain_map, np.ones(grid))
+        order = read("order", options.order, np.arange(zero.size, dtype=float).reshape(grid)).ravel().astype(int)
+        self._used = np.flatnonzero(order >= 0)
+        self._channel = order[self._used]
+        self.channels = int(self._channel.max(initial=-1)) + 1 if channels is None else channels
+        if len(set(self._channel)) < len(self._channel) or self._channel.max(initial=-1) >= self.channels:
+            raise ConfigurationError(f"option order: each actuator has a channel of its own below {self.channels}")
+        if not (gain > 0).all():
+            raise ConfigurationError("option gain_map: every gain must be above 0")
+        self._zero, self._nm = zero.ravel()[self._used], (gain * config.mirror.nm_per_unit).ravel()[self._used]
+        self._range = low, high = options.lowest, options.highest
+        if not (low <= self._zero.min(initial=np.inf) <= self._zero.max(initial=-np.inf) <= high):
+            raise ConfigurationError(f"options zero, zero_map: a flat mirror has values within {low:g} to {high:g}")
+        self._grid = grid
+
+    def values(self, actuators_nm: Single) -> Array:
+        """Values (channels,) for actuators (rows, columns), nm of surface, within lowest to highest; 0 where unused."""
+        found = np.zeros(self.channels)
+        found[self._channel] = np.clip(self._zero + actuators_nm.ravel()[self._used] / self._nm, *self._range)
+        return found
+
+    def surface_nm(self, values: Array) -> Single:
+        """Actuators (rows, columns), nm of surface, under values (channels,); 0 where an actuator has no channel."""
+        surface = np.zeros(self._grid)
+        surface.flat[self._used] = (values[self._channel] - self._zero) * self._nm
+        return single(surface)

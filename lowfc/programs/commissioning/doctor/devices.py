@@ -1,0 +1,25 @@
+"""What a driver needs of this host, and whether it is there: `lowfc doctor --device`."""
+
+from collections.abc import Iterator
+
+from lowfc.contract.configuration import Configuration
+from lowfc.contract.errors import ConfigurationError
+from lowfc.device import plugins
+from lowfc.programs.commissioning.checks import Check, ok, wrong
+
+
+def device_checks(name: str, config: Configuration) -> Iterator[Check]:
+    """A check for each of a driver's needs, of each kind of which there is one; the driver is not opened."""
+    kinds = [kind for kind in plugins.KINDS if name in plugins.installed(kind)]
+    for kind in kinds or plugins.KINDS[:1]:
+        what = f"{kind} {name}"
+        try:
+            driver = plugins.load(kind, name)
+            options = plugins.options(driver, plugins.table(config, kind, name))
+        except ConfigurationError as fault:
+            yield wrong(str(fault), f"install it, or mend drivers.{name}")._replace(name=what)
+            continue
+        yield ok(f"{driver.__module__}:{driver.__qualname__}")._replace(name=what)
+        for need in getattr(driver, "needs", lambda _: ())(options):
+            check = ok(need.found) if need.found else wrong("it is not there", need.advice)
+            yield check._replace(name=f"{what}: {need.what}")

@@ -1,0 +1,95 @@
+"""Mirrors that are driven by volts: the map from surface to values, and a vendor's calls under it."""
+
+import sys
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from lowfc.contract.configuration import load
+from lowfc.contract.errors import ConfigurationError
+from lowfc.device import VoltMap, VoltOptions, plugins
+
+ROOT = Path(__file__).parents[2]
+CONFIG = load(None, {"mirror.rows": 2, "mirror.columns": 3, "mirror.nm_per_unit": 1000.0})
+SURFACE = np.array([[100, -200, 300], [0, 5000, -5000]], np.float32)
+
+
+def stored(path: Path, values: Any) -> str:
+    np.save(path, np.array(values, float))
+    return str(path)
+
+
+def test_a_surface_becomes_values_in_the_vendors_order_within_their_range(tmp_path: Path) -> None:
+    options = VoltOptions(
+        zero_map=stored(tmp_path / "zero.npy", [[0.5, 0.4, 0.5], [0.3, 0.5, 0.5]]),
+        gain_map=stored(tmp_path / "gain.npy", [[1, 2, 1], [1, 1, 1]]),
+        order=stored(tmp_path / "order.npy", [[5, 0, -1], [2, 3, 4]]),
+        highest=0.9,
+    )
+    mirror = VoltMap(options, CONFIG, channels=8)
+    values = mirror.values(SURFACE)
+    np.testing.assert_allclose(values, [0.3, 0, 0.3, 0.9, 0, 0.6, 0, 0], atol=1e-7)
+    reached = mirror.surface_nm(values)
+    np.testing.assert_allclose(reached, [[100, -200, 0], [0, 400, -500]], atol=1e-3)
+    assert reached.dtype == np.float32
+    assert VoltMap(options, CONFIG).channels == 6
+
+
+@pytest.mark.parametrize(
+    ("name", "values", "why"),
+    [
+        ("order", [[0, 0, 1], [2, 3, 4]], "channel of its own"),
+        ("order", [[0, 9, 1], [2, 3, 4]], "below 8"),
+        ("gain_map", [[0, 1, 1], [1, 1, 1]], "above 0"),
+        ("zero_map", [[2, 0, 0], [0, 0, 0]], "flat mirror"),
+        ("zero_map", [[0, 0, 0]], "1 x 3 values"),
+    ],
+)
+def test_a_map_that_cannot_be_is_refused(tmp_path: Path, name: str, values: Any, why: str) -> None:
+    options = VoltOptions(**{name: stored(tmp_path / "map.npy", values)})
+    with pytest.raises(ConfigurationError, match=why):
+        VoltMap(options, CONFIG, channels=8)
+
+
+class BmcDm:
+    """Stands in for the vendor's: it keeps what is sent, and refuses once it is broken."""
+
+    def open_dm(self, serial: str) -> int:
+        return 0 if serial == "17CW000#001" else 5
+
+    def num_actuators(self) -> int:
+        return 8
+
+    def send_data(self, values: Any) -> int:
+        self.sent = values
+        return 7 if getattr(self, "broken", False) else 0
+
+    def error_string(self, status: int) -> str:
+        return f"error {status}"
+
+    def close_dm(self) -> int:
+        self.closed = True
+        return 0
+
+
+def test_the_example_of_a_vendors_mirror(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "bmc", SimpleNamespace(BmcDm=BmcDm, NO_ERR=0))
+    monkeypatch.setattr(sys, "path", list(sys.path))
+    name = f"{ROOT}/examples/boston_mirror.py:BostonMirror"
+
+    def opened(serial: str) -> Any:
+        return plugins.opened("mirror", name, CONFIG, ("--serial", serial))
+
+    mirror = opened("17CW000#001")
+    np.testing.assert_allclose(mirror.apply(SURFACE)[0], [100, -200, 300], atol=1e-3)
+    np.testing.assert_allclose(mirror.dm.sent, [0.6, 0.3, 0.8, 0.5, 1, 0, 0, 0], atol=1e-7)
+    mirror.dm.broken = True
+    with pytest.raises(OSError, match="error 7"):
+        mirror.apply(SURFACE)
+    mirror.close()
+    assert mirror.dm.closed
+    with pytest.raises(ConfigurationError, match="cannot be opened: error 5"):
+        opened("another")
