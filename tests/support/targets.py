@@ -155,7 +155,7 @@ class Processes:
     def _live(self) -> None:
         self.clock.advance(1_000_000)
         self.mirror._wait()
-        self.controller._between_frames(self.controller._camera.take(0))
+        self.controller._between_frames(self.controller._camera.wait(0))
         self.controller._publish_state(self.clock.now_ns())
         for service in self.services:
             assert service.running, service.why
