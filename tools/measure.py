@@ -22,7 +22,7 @@ from benchmarks import curves, step, throughput
 from benchmarks.peers import contest
 from benchmarks.runner import Benchmark, in_markdown
 from lowfc.programs.measure.latency import text as latency_text
-from tools import console, dark_hole, laws, layouts, loop, pictures, reliability, sensors, slow_modes
+from tools import console, dark_hole, laws, layouts, loop, no_harm, pictures, reliability, sensors, slow_modes
 from tools.declared import DECLARED
 from tools.shared import ROOT, Figures, host, json_of, where
 
@@ -66,6 +66,7 @@ MEASUREMENTS = {
     "logs": Measurement(loop.LOG_COMMANDS, loop.measure_logs, loop.render_logs),
     "sensors": Measurement((sensors.COMMAND,), sensors.measure, sensors.render),
     "laws": Measurement((), laws.measure, laws.render),
+    "no_harm": Measurement((), no_harm.measure, no_harm.render),
     "slow_modes": Measurement((), slow_modes.measure, slow_modes.render),
     "zero_point": Measurement((dark_hole.COMMAND,), dark_hole.measure, dark_hole.render),
     "chaos": Measurement((reliability.CHAOS,), reliability.chaos, reliability.render_chaos),

@@ -8,6 +8,7 @@ from functools import partial
 
 from lowfc.adapters.bus.bus import ALL, Query, Sample
 from lowfc.adapters.bus.start_check import StartCheck
+from lowfc.adapters.files.factory import contrast_of
 from lowfc.adapters.process.clock import SimulatedClock
 from lowfc.adapters.process.latch import Latch
 from lowfc.adapters.process.realtime import let_send
@@ -69,7 +70,9 @@ class Controller:
         self._settings = settings_under(latch, config)
         self._configuration = config.to_toml()
         self._start_up = StartUp(config)
-        self._gain_watch = GainWatch(self._settings, config.control.on_harm)
+        contrast = contrast_of(config)
+        form = None if contrast is None else contrast.form
+        self._gain_watch = GainWatch(self._settings, config.control.on_harm, form)
         self._measured: deque[Request] = deque()
         self._kept_safe = latch.safe
         self._safe_signalled = False

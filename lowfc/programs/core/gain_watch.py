@@ -65,8 +65,15 @@ class GainWatch:
         closing_harm: what closing at the present gains would add, as a sentence; empty where nothing, or once closed.
     """
 
-    def __init__(self, settings: Settings, on_harm: str) -> None:
-        self._settings, self._on_harm = settings, on_harm
+    def __init__(self, settings: Settings, on_harm: str, contrast: Array | None = None) -> None:
+        """Watch a loop of these settings.
+
+        Args:
+            settings: The controller's.
+            on_harm: As `control.on_harm`.
+            contrast: (modes, modes) form of what the modes add to the dark zone, per nm^2, where it is known.
+        """
+        self._settings, self._on_harm, self._contrast = settings, on_harm, contrast
         self._groups: list[_Group] = []
         self._of: tuple[object, ...] = ()
         self._newest = 0
@@ -183,20 +190,23 @@ class GainWatch:
 
     def _closing_harm(self, gain: Single, drive: ActiveLoop) -> str:
         """What closing would add to the wavefront at gains that were judged as they are."""
-        noll, added_nm2, noise = np.array(drive.calibration.noll), 0.0, []
+        noll, added, harm_nm2 = np.array(drive.calibration.noll), "", np.zeros(len(drive.calibration.noll))
         for group in self._groups:
             one = group.verdict
             if one is None or not np.array_equal(gain[group.mask], drive.law.gain[group.mask]):
                 continue
             harmful = one.change_nm2 > CONFIDENCE * one.change_error_nm2
-            added_nm2 += float(one.change_nm2[harmful].sum())
-            noise += noll[group.mask][harmful].tolist()
+            harm_nm2[group.mask] = np.where(harmful, one.change_nm2, 0)
+        noise = noll[harm_nm2 > 0].tolist()
         if not noise:
             return ""
+        if self._contrast is not None and len(self._contrast) == noll.size:
+            added = f"{np.diag(self._contrast) @ harm_nm2:.1e} of contrast, "
         names, indices = ", ".join(f"Z{index}" for index in noise), ",".join(map(str, noise))
         return (
-            f"closing adds {added_nm2**0.5:.3g} nm rms at this star, for {names} measure more noise than there is to "
-            f"correct: `lowfc ctl gain auto --modes {indices}` chooses their gains, and 0 in place of auto leaves them"
+            f"closing adds {added}{harm_nm2.sum() ** 0.5:.3g} nm rms at this star, for {names} measure more noise than "
+            f"there is to correct: `lowfc ctl gain auto --modes {indices}` chooses their gains, and 0 in place of auto "
+            "leaves them"
         )
 
     def _noise_nm2(self, drive: ActiveLoop) -> Array | None:

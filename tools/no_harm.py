@@ -1,0 +1,167 @@
+"""Automatic gains on every star: what closing the loop changes, and what the best fixed gains would leave."""
+
+from collections.abc import Sequence
+from concurrent.futures import ProcessPoolExecutor
+from functools import lru_cache
+from typing import Any
+
+import numpy as np
+from rich.progress import track
+from threadpoolctl import threadpool_limits
+
+from lowfc.adapters.files import factory
+from lowfc.arrays import Array
+from lowfc.contract.configuration import FIXED_GAINS, Configuration
+from tools.law_bench import Bench, calibrated, configured
+from tools.modal_bench import ModalBench, noise_covariance_nm2
+from tools.shared import Figures, columns
+
+PRESETS = ("bench", "thermal", "reaction-wheel", "quiet")
+MAGNITUDES = tuple(range(-1, 9))
+BRIGHT = (-1, 0, 2)
+SEEDS = tuple(range(1, 9))
+IMAGED = ("sam", "zwfs")
+"""Sensors whose images are simulated, too, for some stars."""
+MODAL = ("sam", "sam27d10_bal14", "clowfs", "zwfs", "bar")
+IMAGED_MAGNITUDES = (2, 5, 8)
+OF_DARK_ZONE = 0.01
+"""Part of the dark zone's own contrast that may be added, besides three standard errors."""
+RATE_HZ, SECONDS = 250.0, 20.0
+GAINS = (0.005, 0.01, 0.02, 0.05, 0.1, 0.2, 0.4, 0.7, 1.1)
+_HALF = int(RATE_HZ * SECONDS / 2)
+_AUTO = {"control.tilt_gain": "auto", "control.gain": "auto"}
+
+
+def _configured(sensor: str, preset: str, magnitude: float, seed: int, gains: dict[str, Any]) -> Configuration:
+    keys: dict[str, Any] = {"disturbance.preset": preset, "star.magnitude": magnitude, "camera.rate_hz": RATE_HZ}
+    return configured(sensor, seed, **keys | gains | {"control.start_mode": "closed"})
+
+
+@lru_cache(maxsize=64)
+def _noise(sensor: str, magnitude: float) -> Array:
+    config = _configured(sensor, "bench", magnitude, 1, {})
+    return noise_covariance_nm2(config, calibrated(config))
+
+
+@lru_cache(maxsize=8)
+def _contrast(sensor: str) -> tuple[Array, float]:
+    """The form of what modes add to the contrast, (modes, modes), per nm^2, and the dark zone's own."""
+    made = factory.contrast_of(_configured(sensor, "bench", 0.0, 1, {}))
+    assert made is not None  # noqa: S101  # each of these has a science image
+    return made.form, made.by_image(np.zeros(len(made.noll)))
+
+
+@lru_cache(maxsize=64)
+def _open_nm2(preset: str, seed: int) -> Array:
+    """Mean squares (modes,) of the disturbance over the second half; of any sensor and star."""
+    config = _configured("sam", preset, 0.0, seed, FIXED_GAINS)
+    bench = ModalBench(config, np.eye(len(config.noll)))
+    bench.ask("open")
+    return _left_nm2(bench)
+
+
+def _left_nm2(bench: ModalBench) -> Array:
+    bench.run(_HALF, record=False)
+    bench.run(_HALF)
+    return np.asarray(np.square(bench.residual_nm()).mean(axis=0))
+
+
+def _modal(sensor: str, preset: str, magnitude: float, seed: int, gains: dict[str, Any]) -> Array:
+    """Mean squares (modes,) that are left over the second half."""
+    return _left_nm2(ModalBench(_configured(sensor, preset, magnitude, seed, gains), _noise(sensor, magnitude)))
+
+
+def of_modes(case: tuple[str, str, float]) -> Figures:
+    """Closed minus open of one sensor, preset and star, in contrast, by modes; on bright stars fixed gains, too."""
+    sensor, preset, magnitude = case
+    form, own = _contrast(sensor)
+    left = np.array([_modal(*case, seed, _AUTO) for seed in SEEDS])
+    before = np.array([_open_nm2(preset, seed) for seed in SEEDS])
+    found = _row(case, (left - before) @ np.diag(form), own, np.sqrt(before.sum(axis=1).mean()), left)
+    if magnitude in BRIGHT and preset != "quiet":
+        seeds = SEEDS[:2]
+        fixed = np.array(
+            [np.mean([_modal(*case, seed, dict.fromkeys(_AUTO, gain)) for seed in seeds], axis=0) for gain in GAINS]
+        )
+        tilt = fixed[:, :2].sum(axis=1).min()
+        best = tilt + fixed[:, 2:].sum(axis=1).min()
+        found["of_best"] = float(np.sqrt(left[: len(seeds)].sum(axis=1).mean() / best))
+        found["of_best_tilt"] = float(np.sqrt(left[: len(seeds), :2].sum(axis=1).mean() / tilt))
+    return found
+
+
+def of_images(case: tuple[str, str, float]) -> Figures:
+    """The same with every image simulated."""
+    sensor, preset, magnitude = case
+    form, own = _contrast(sensor)
+    calibration = calibrated(_configured(sensor, preset, magnitude, 1, _AUTO))
+    changes, left, before = [], [], []
+    for seed in SEEDS:
+        bench = Bench(_configured(sensor, preset, magnitude, seed, _AUTO), calibration)
+        bench.run(2 * _HALF)
+        truths = [truth.continuous for truth in bench.truths[-_HALF:]]
+        residual, disturbance = (
+            np.array([getattr(truth, name) for truth in truths], float) for name in ("residual_nm", "disturbance_nm")
+        )
+        left.append(np.square(residual).mean(axis=0))
+        before.append(np.square(disturbance).mean(axis=0))
+        changes.append((left[-1] - before[-1]) @ np.diag(form))
+    open_nm = np.sqrt(np.sum(before, axis=1).mean())
+    return _row(case, np.array(changes), own, open_nm, np.array(left)) | {"images": True}
+
+
+def _row(case: tuple[str, str, float], change: Array, own: float, open_nm: float, left_nm2: Array) -> Figures:
+    sensor, preset, magnitude = case
+    error = float(change.std(ddof=1) / np.sqrt(len(change)))
+    return {
+        "sensor": sensor,
+        "preset": preset,
+        "magnitude": magnitude,
+        "change": float(change.mean()),
+        "error": error,
+        "own": own,
+        "harms": bool(change.mean() > 3 * error + OF_DARK_ZONE * own),
+        "open_nm": float(open_nm),
+        "closed_nm": float(np.sqrt(left_nm2.sum(axis=1).mean())),
+    }
+
+
+def measure(
+    sensors: Sequence[str] = MODAL, magnitudes: Sequence[float] = MAGNITUDES, imaged: Sequence[str] = IMAGED
+) -> Figures:
+    """All cases."""
+    modes = [(one, preset, star) for one in sensors for preset in PRESETS for star in magnitudes]
+    images = [(one, preset, star) for one in imaged for preset in PRESETS for star in IMAGED_MAGNITUDES]
+    with threadpool_limits(1), ProcessPoolExecutor(initializer=threadpool_limits, initargs=(1,)) as pool:
+        rows = list(track(pool.map(of_modes, modes), "modes", total=len(modes)))
+        rows += list(track(pool.map(of_images, images), "images", total=len(images)))
+    return {"rows": rows, "seeds": len(SEEDS), "rate_hz": RATE_HZ, "seconds": SECONDS}
+
+
+def render(figures: Figures) -> str:
+    """A line for each sensor and star: wavefront open and closed by preset, and where closing harms."""
+    rows = figures["rows"]
+    modal = [row for row in rows if "images" not in row]
+    table = []
+    for sensor, magnitude in dict.fromkeys((row["sensor"], row["magnitude"]) for row in modal):
+        mine = {row["preset"]: row for row in modal if (row["sensor"], row["magnitude"]) == (sensor, magnitude)}
+        if magnitude in (-1, 2, 5, 8):
+            table.append(
+                {"sensor": sensor, "magnitude": magnitude}
+                | {preset: "{open_nm:.2f} to {closed_nm:.2f}".format(**row) for preset, row in mine.items()}
+            )
+    harmful = [row for row in rows if row["harms"]]
+    compared = [row["of_best"] for row in rows if "of_best" in row]
+    names = "; ".join("{sensor}, {preset}, V = {magnitude}".format(**row) for row in harmful) or "none"
+    heads = {"sensor": "`{sensor}`", "V": "{magnitude}"} | {
+        f"`{name}`": f"{{{name}}}" for name in PRESETS if name != "quiet"
+    }
+    return (
+        f"{columns(heads, table)}\nTrue wavefront open and closed with automatic gains, nm rms over the second half "
+        f"of {figures['seconds']:g} s at {figures['rate_hz']:g} Hz, mean of {figures['seeds']} seeds. Of {len(rows)} "
+        f"cases (V = {min(MAGNITUDES)} to {max(MAGNITUDES)}, these and `quiet`; {len(rows) - len(modal)} of them "
+        "with every image simulated) those in which "
+        f"closing adds more contrast than three standard errors and {100 * OF_DARK_ZONE:g} % of the dark zone's own: "
+        f"{names}. On bright stars (V = -1, 0, 2) automatic gains leave {min(compared):.2f} to {max(compared):.2f} "
+        "times what the best fixed gains leave, which were looked for afterwards."
+    )
