@@ -29,6 +29,8 @@ AT_ONCE = 5
 EACH_NM = (1.0, 2.0, 5.0)
 SHIFTED, PLAIN = "dark-hole", FLAT
 """Channels with the sensor's zero point taken along, and without."""
+GAINS = "[control]\ntilt_gain = 0.5\ngain = 0.05\n"
+"""What the loop would undo depends on its gains."""
 COMMAND = "lowfc sim-loop --lockstep --rate 1000 --disturbance bench --star-magnitude -2"
 PATIENCE_S = 60.0
 
@@ -79,7 +81,7 @@ def dark_hole(folder: Path, each_nm: float, toml: str = "", base_nm: npt.ArrayLi
         toml: configuration.
         base_nm: (rows, columns) what is on the channel without a zero-point shift all the time.
     """
-    (folder / "night.toml").write_text(toml)
+    (folder / "night.toml").write_text(f"{GAINS}{toml}")
     before = set(running())
     words = [sys.executable, "-m", *COMMAND.split(), "--config", "night.toml", "--json"]
     with subprocess.Popen(words, cwd=folder, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:

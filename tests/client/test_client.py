@@ -583,7 +583,7 @@ def test_the_status_says_everything() -> None:
         "steps_left": 12,
         "command_rms_nm": 10.0,
         "offset_rms_nm": 5.0,
-        "law": {"name": "lqg", "weight": 0.5},
+        "law": {"name": "lqg", "weight": 0.5, "overruled": []},
         "playing": {"target": "mirror", "frames": 20, "frames_left": 12},
         "channels": [{"name": "dark-hole", "rms_nm": 12.5**0.5, "shifts_zero_point": True, "reached": False}],
         "limits_hit": ["SLEW"],

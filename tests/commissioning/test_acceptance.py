@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from lowfc.adapters.files.drawing import figure_class, png
-from lowfc.contract.configuration import Acceptance, Configuration, load
+from lowfc.contract.configuration import FIXED_GAINS, Acceptance, Configuration, load
 from lowfc.contract.errors import ConfigurationError
 from lowfc.contract.messages import wire
 from lowfc.control.laws.linear_law import integrator_block, of_blocks
@@ -30,7 +30,7 @@ MULTISINE = rejection.Excitation(duration_s=3.0, rms_nm=3.0, lines_per_mode=8, m
 
 def configured(**changes: object) -> Configuration:
     usual = {"disturbance.preset": "quiet", "sensor.modes": 3, "star.magnitude": -1.0, "control.gain": 0.3}
-    return load(None, usual | {key.replace("__", "."): value for key, value in changes.items()})
+    return load(None, FIXED_GAINS | usual | {key.replace("__", "."): value for key, value in changes.items()})
 
 
 def played(loop: FoldedLoop, test: Any, *how: Any) -> list[Played]:

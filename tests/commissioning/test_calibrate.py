@@ -13,7 +13,7 @@ import pytest
 
 from lowfc.adapters.files import factory
 from lowfc.client import Answer, mirror_watch
-from lowfc.contract.configuration import Configuration, load
+from lowfc.contract.configuration import FIXED_GAINS, Configuration, load
 from lowfc.contract.errors import BusError, CalibrationError, DataFileError
 from lowfc.contract.events import EVENTS
 from lowfc.contract.messages import EVENT, wire
@@ -28,7 +28,7 @@ from lowfc.programs.commissioning.calibrate.run import CalibrationData, Calibrat
 from tests.support.folded_loop import FoldedLoop
 
 OUT = Path("night.fits")
-BRIGHT = {
+BRIGHT = FIXED_GAINS | {
     "sensor.sam": "sam27d10_bal14",
     "star.magnitude": 0.0,
     "disturbance.preset": "quiet",

@@ -14,7 +14,7 @@ from typer.testing import CliRunner
 from lowfc.adapters.files import calibration_file, factory
 from lowfc.adapters.process.progress import spoken
 from lowfc.contract.codecs.calibration_codec import identified
-from lowfc.contract.configuration import Configuration, load
+from lowfc.contract.configuration import FIXED_GAINS, Configuration, load
 from lowfc.contract.errors import CalibrationError, ConfigurationError, DataFileError
 from lowfc.control.calibration.alignment import Geometry, align, onto
 from lowfc.control.calibration.calibration import Calibration
@@ -30,7 +30,7 @@ from lowfc.programs.commissioning.calibrate.run import Calibrator
 from lowfc.programs.commissioning.calibrate.tasks import zero_point
 from tests.support.folded_loop import FoldedLoop
 
-CONFIG = {
+CONFIG = FIXED_GAINS | {
     "sensor.sam": "sam27d10_bal14",
     "sensor.modes": 6,
     "star.magnitude": 0.0,

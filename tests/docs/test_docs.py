@@ -76,6 +76,7 @@ DESIGN = (
 REQUESTS = (
     "lowfc ctl status",
     "lowfc ctl gain 0.3 --mode 2 --mode 3",
+    "lowfc ctl gain auto",
     "lowfc ctl open",
     "lowfc ctl close",
     "lowfc ctl safe",
