@@ -22,7 +22,7 @@ ROUTE = "rerun rrd route --application-id $(basename $log .mcap) deploy/layouts/
 ELSEWHERE = {
     "make sim-loop": ".ci/run",
     "make test": ".ci/run",
-    "lowfc console": "tests/console/test_terminal.py",
+    "lowfc console": "tests/console/test_console.py",
     "lowfc doctor": "tests/commissioning/test_doctor.py",
     "lowfc gateway epics": "tests/interlocks/test_gateway.py",
     "rerun $(ls -t logs/*.mcap | head -1)": "tests/e2e/test_rerun_viewer.py",

@@ -60,14 +60,15 @@ class Console(App[str]):
     #top {{ height: 2; }}
     #verdict {{ width: 1fr; height: 2; padding: 0 1; text-style: bold; }}
     #clock {{ width: 11; height: 2; padding: 0 1; text-style: bold; }}
-    #figures {{ height: 16; }}
+    #figures {{ height: 17; }}
     #left {{ width: {_LEFT}; }}
     #right {{ width: 1fr; padding: 0 0 0 1; }}
-    #tiles, #modes, #pictures {{ height: 7; }}
+    #tiles {{ height: 8; }}
+    #modes, #pictures {{ height: 7; }}
     #tiles, #sparks, #modes, #gains, #log, #peers, #table {{ text-wrap: nowrap; text-overflow: ellipsis; }}
     #sparks {{ height: 2; }}
     #gains {{ height: 5; }}
-    #facts {{ height: 4; }}
+    #facts {{ height: 5; }}
     .cut {{ visibility: hidden; }}
     #log {{ height: 1fr; }}
     #answer {{ height: 2; padding: 0 1; }}

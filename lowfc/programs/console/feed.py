@@ -15,7 +15,7 @@ from lowfc.client import Client, configuration_of
 from lowfc.contract.codecs.codec import actuators
 from lowfc.contract.configuration import Configuration
 from lowfc.contract.errors import LowfcError
-from lowfc.contract.messages import EVENT, REQUEST, STEP, SURFACE, TRUTH, Log, Topic, wire
+from lowfc.contract.messages import EVENT, REQUEST, STEP, SURFACE, TRUTH, Log, Role, Topic, wire
 from lowfc.optics.detector.photometry import tilt_nm_per_mas
 from lowfc.programs.view.snapshot import SHOWN, Accumulator, LastHealth
 from lowfc.programs.view.verdicts.run_state import RunState
@@ -29,6 +29,7 @@ TREND = 60
 """Seconds that the sparklines show, one value each."""
 _WAITING = {EVENT: 200, REQUEST: 200, STEP: 4000, TRUTH: 4000}
 _TOPICS = (*(topic for topic in SHOWN if topic is not SURFACE), REQUEST)
+_AGAIN_S = 5.0  # after which a busy controller is asked again for what it has not answered
 _POINT_NS = 1_000_000_000
 _UNSEEN = frozenset(("status", "configuration", "renew"))
 """Requests that change nothing, and come by themselves."""
@@ -84,7 +85,7 @@ class Feed:
         self._command_nm = np.zeros(0, np.float32)
         self._trend: deque[tuple[float, float]] = deque(maxlen=TREND)
         self._point_ns = 0
-        self._read_s = time.monotonic()
+        self._read_s = self._asked_s = time.monotonic()
         self._catch_up()
 
     def read(self) -> Reading:
@@ -100,7 +101,8 @@ class Feed:
             self._accumulator.add(topic, sample.key, sample.payload, sample.publish_time_ns, sample.sequence)
         snapshot = self._accumulator.snapshot(host_ns, behind_s=behind_s)
         there = {(name, one.health.pid) for name, one in snapshot.health.items()}
-        if not there <= self._known:
+        lacking = Role.CONTROLLER in snapshot.health and (snapshot.calibration is None or self._config is None)
+        if not there <= self._known or (lacking and now_s - self._asked_s > _AGAIN_S):
             self._known = there
             self._catch_up()
         self._watcher.feed(snapshot)
@@ -143,6 +145,7 @@ class Feed:
 
     def _catch_up(self) -> None:
         """Ask for what was sent before, in a thread: a process that is frozen answers late."""
+        self._asked_s = time.monotonic()
 
         def ask() -> None:
             self._earlier.extend(states(self._bus, SHOWN))
