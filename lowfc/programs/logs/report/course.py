@@ -127,8 +127,13 @@ def actuator_extremes_nm(history: History) -> Single:
 
 
 def _limits(reasons: Long) -> dict[str, int]:
+    """Those of the mirror: that a law was overruled is an event."""
     counts = count_reasons(reasons).items()
-    return {reason.name.lower(): count for reason, count in counts if reason >= _FIRST_LIMIT}
+    return {
+        reason.name.lower(): count
+        for reason, count in counts
+        if reason >= _FIRST_LIMIT and reason is not Limit.LAW_OVERRULED
+    }
 
 
 def _when(run: Run, request: wire.Request) -> float:
