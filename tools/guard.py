@@ -19,6 +19,7 @@ from lowfc.control.laws.stability import LOWEST_GAIN, highest_gain
 from lowfc.control.laws.tuning import best_gains
 from lowfc.control.laws.vibration import Line, Model
 from lowfc.control.loop.guard import Group, Guard
+from lowfc.control.loop.wording import counted
 from lowfc.optics.detector.photometry import tilt_nm_per_mas
 from sim_camera.disturbance import LINE_WIDTH, LINES_HZ, LINES_MAS
 from sim_camera.driver import disturbance_of
@@ -138,7 +139,7 @@ def cost_us(law: LinearLaw) -> dict[str, float]:
     for name, guard in (("driving", driving), ("virtual", virtual)):
         begun, _ = guard.judged(law, x, *loop, value_nm, value_nm, limited=False)
         step = partial(begun.judged, law, x, *loop, value_nm, value_nm, limited=False)
-        found[name] = 1e6 * min(timeit.repeat(step, repeat=60, number=400)) / 400
+        found[name] = 1e6 * min(timeit.repeat(step, repeat=1000, number=20)) / 20
     return found
 
 
@@ -176,7 +177,8 @@ def render(figures: Figures) -> str:
         [row | {"after": "" if row["latest_s"] is None else f"{row['latest_s']:.2f} s"} for row in figures["moved"]],
     )
     good = "; ".join(
-        f"V = {magnitude}: {sum(found)} times in {len(found)} runs" for magnitude, found in figures["good"].items()
+        f"V = {magnitude}: {sum(found)} times in {counted(len(found), 'run')}"
+        for magnitude, found in figures["good"].items()
     )
     cost = figures["cost_us"]
     return (

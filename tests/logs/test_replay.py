@@ -164,20 +164,20 @@ def test_whatever_happens_is_replayed_to_the_bit(
 def test_a_law_that_is_overruled_is_replayed_to_the_bit_also_from_the_middle_of_it() -> None:
     made = night([], guard=True, rate_hz=1000.0, limit_nm=(150.0, 150.0))
     made.take(Request(made.now_ns, "law", law=integrator((0.05,) * len(NOLL), (0.0,) * len(NOLL), NOLL, 1.0, 1000.0)))
-    for count in range(760):
+    for count in range(860):
         wave_nm = 20 * np.sin(0.04 * count + np.arange(len(NOLL)))
         made.take(frame(count, wave_nm + made.state.drive.history_nm[0]))
     told = [message for message in made.messages if message.key == STEP.key]
     overruled = [Limit.LAW_OVERRULED in wire.ControlStep.FromString(message.payload).reasons for message in told]
-    assert overruled == [False] * 498 + [True] * 262
+    assert overruled == [False] * 598 + [True] * 262
     account = replay(made.messages)
     assert account.identical
-    for first in (300, 540, 700):
+    for first in (300, 640, 800):
         cut = [message for message in made.messages if message.key in (CALIBRATION.key, LAW.key)]
         cut += [message for message in made.messages if message.log_time_ns >= told[first].log_time_ns]
         account = replay(cut)
         assert account.identical
-        assert account.frames >= 760 - first - 2 * STATE_EVERY
+        assert account.frames >= 860 - first - 2 * STATE_EVERY
 
 
 @effort(deadline=None)

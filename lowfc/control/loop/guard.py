@@ -20,7 +20,7 @@ from lowfc.control.loop.inputs import PendingEvent
 
 BLOCK_S, FEWEST = 0.1, 100
 """Duration of a block, and its frames at least."""
-WORSE_BLOCKS = 3
+WORSE_BLOCKS = 4
 """In a row after which the integrator takes over."""
 FADED_S = 0.1
 """In which one takes over from the other."""
