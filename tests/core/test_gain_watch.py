@@ -120,6 +120,16 @@ def test_a_loop_that_harms_opens_where_that_is_configured() -> None:
     assert named(loop, "MODE_CHANGED")[-1]["why"] == "auto: the loop made it worse"
 
 
+@pytest.mark.parametrize("request_name", ["open", "pause"])
+def test_what_an_operator_opens_while_gains_are_measured_stays_open(request_name: str) -> None:
+    loop = bench(3.5)
+    loop.run(100)
+    loop.ask(request_name)
+    loop.run(500)
+    assert {step.mode for step in loop.steps} == {LoopMode.OPEN}
+    assert gains(loop).any()  # measured all the same
+
+
 def test_a_mode_can_be_given_a_gain_and_be_made_automatic_again() -> None:
     loop = bench(2.0)
     loop.run(510)

@@ -16,6 +16,8 @@ CONFIDENCE = 2.0
 """Standard errors by which one gain must beat another; or it does so in `MOST_OF` of the blocks, for where the open
 loop wanders, one of them may outweigh all others."""
 MOST_OF = 9
+EARLY = 5
+"""Blocks in a row that must speak for it, for a mode that is hardly corrected to get a gain before the window ends."""
 LONGEST = 16
 """Times its first length, to which a window grows while it decides nothing."""
 LEAST_CORRECTED = 0.1
@@ -90,7 +92,7 @@ class GainBank:
         self._clear(self._windows[0])
 
     def followed(self, open_nm: Single, error_nm: Single, *, closed: bool) -> bool:
-        """Take the modes of one frame: of the open loop, and of the loop itself; whether a window is complete."""
+        """Take the modes of one frame: of the open loop, and of the loop itself; whether a block is complete."""
         self._loops, errors_nm = self._loops.followed(open_nm)
         squares = np.square(errors_nm)
         self._power += squares[0]
@@ -107,7 +109,23 @@ class GainBank:
         self._blocks.append(self._sums / self._frames)
         self._powers.append(self._power / self._frames)
         self._begin_block()
+        return True
+
+    @property
+    def complete(self) -> bool:
+        """Whether the window is, so that there can be a verdict."""
         return len(self._blocks) == BLOCKS
+
+    def early(self, gain: Single) -> Single:
+        """Gains (modes,) before the window is complete: of modes at 0 or the least gain that have begun to wander."""
+        now = self._row_of(gain)
+        if self.first or len(self._blocks) < EARLY or not (now <= 1).any():
+            return gain
+        blocks = np.array(self._blocks[-EARLY:], float)[:, :-1]
+        beyond = blocks - blocks[:, now, np.arange(now.size)][:, None]
+        sure = np.where((beyond < 0).all(axis=0), beyond.mean(axis=0), np.inf)
+        grown = (now <= 1) & np.isfinite(sure).any(axis=0)
+        return np.where(grown, self.rows[np.argmin(sure, axis=0)], gain).astype(np.float32)
 
     def held(self, frames: int) -> None:
         """Frames of which nothing was measured."""

@@ -21,7 +21,7 @@ from lowfc.control.loop.remarks import check_offset
 from lowfc.control.loop.reservation import lease, lease_checked, lease_ended, permit, release, renew
 from lowfc.control.loop.safety import Limits, LoopMode, Rejection, neighbour_difference_nm, request_mode
 from lowfc.control.loop.state import ActiveLoop, LawRunner, Settings, State
-from lowfc.control.loop.wording import MOST_TEXT, PAUSED, counted
+from lowfc.control.loop.wording import MEASURED_FIRST, MOST_TEXT, PAUSED, counted
 
 MOST_STEPS = 1 << 32
 MOST_REPLY = 1000
@@ -103,7 +103,8 @@ def _mode(settings: Settings, state: State, request: Request) -> Handled:
     cause = asked_by(state.conditions.lease, request)
     if request.name == "pause" and state.mode is LoopMode.OPEN and not paused:
         reply = "the loop is open already, and holds the command"
-    if request.name == "open" and paused:
+    waits = state.mode is LoopMode.OPEN and state.conditions.mode_cause == MEASURED_FIRST
+    if (request.name == "open" and paused) or (after is LoopMode.OPEN and waits):  # it stays open from now on
         state = state._replace(conditions=state.conditions._replace(mode_cause=cause))
     if after is LoopMode.CLOSED and state.drive is not None and state.drive.calibration.provisional:
         reply += (

@@ -169,6 +169,10 @@ class GainWatch:
         noise_nm2 = self._noise_nm2(drive)
         gain, initial, events = drive.law.gain.copy(), False, []
         for group in judged:
+            if not group.bank.complete:
+                early = group.bank.early(drive.law.gain[group.mask])
+                gain[group.mask] = np.where(drive.automatic[group.mask], early, gain[group.mask])
+                continue
             initial |= group.bank.first
             noise = None if noise_nm2 is None else noise_nm2[group.mask]
             group.verdict = verdict = group.bank.verdict(drive.law.gain[group.mask], noise)
@@ -183,7 +187,7 @@ class GainWatch:
             requests.append(self._gains(step, drive, gain))
         self.closing_harm = "" if state.mode is LoopMode.CLOSED else self._closing_harm(gain, drive)
         waits = state.mode is LoopMode.OPEN and state.conditions.mode_cause == MEASURED_FIRST
-        if waits:
+        if waits and all(group.verdict is not None for group in self._groups):
             requests.append(Request(step.time_ns, "close", text=f"{AUTO}: the gains were measured"))
         requests += [request for event in events for request in self._reaction(event, step, state)]
         return Remarks(tuple(requests), tuple(events))

@@ -26,7 +26,7 @@ def verdicts(made: GainBank, open_nm: Array, gain: Array, noise_nm2: float) -> l
     """Of a loop that is open, whose gains follow the verdicts."""
     found = []
     for one in open_nm.astype(np.float32):
-        if made.followed(one, one, closed=False):
+        if made.followed(one, one, closed=False) and made.complete:
             found.append(made.verdict(gain, noise_nm2 * ONES.astype(float)))
             gain = found[-1].gain
     return found
@@ -79,10 +79,22 @@ def test_a_window_that_decides_nothing_grows() -> None:
     lengths = []
     for _ in range(2000):
         one = rng.normal(0, 1, MODES).astype(np.float32)
-        if made.followed(one, one, closed=True):
+        if made.followed(one, one, closed=True) and made.complete:
             lengths.append(made.verdict(gain, None).frames)  # its wishes are not followed
     assert lengths[0] == 100
     assert max(lengths) >= 200
+
+
+def test_a_mode_that_begins_to_wander_need_not_wait_for_the_end_of_the_window() -> None:
+    made, none = bank(windows=(500, 5000)), np.zeros(MODES, np.float32)
+    verdicts(made, drift(500, 0.0, 1.0, 8), none, 1.0)
+    early = none
+    for count, one in enumerate(drift(3000, 0.5, 1.0, 9).astype(np.float32)):
+        if made.followed(one, one, closed=False):
+            assert not made.complete
+            early = made.early(early)
+            assert count >= 2499 or not early.any()
+    assert (early > 0.01).mean() > 0.9
 
 
 def _calibration(measured: bool) -> tuple[Calibration, CameraSettings]:
