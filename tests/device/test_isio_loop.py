@@ -205,9 +205,8 @@ def test_a_minute_at_500_hz_loses_nothing_and_is_as_good_as_the_direct_loop(fold
             with Client("bench") as client:
                 state = client.status().state
         assert not bench.said("FRAMES_MISSING")
-        assert not [one for one in state.counts if one.count > 5]
+        assert sum(one.count for one in state.counts) < 0.01 * state.frames_used  # late, where the host stood still
         figures = bench.stopped()
-    direct = loop(
-        folder, "--no-record", "--rate", "500", "--duration", "60", config='[disturbance]\npreset = "bench"\n'
-    )
+    config = '[disturbance]\npreset = "bench"\n[control]\ntilt_gain = 0.5\ngain = 0.2\n'
+    direct = loop(folder, "--no-record", "--rate", "500", "--duration", "60", config=config)
     assert figures["residual_rms_nm"] == pytest.approx(direct["residual_rms_nm"], rel=0.05)
