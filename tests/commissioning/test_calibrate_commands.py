@@ -275,7 +275,7 @@ def test_calibrations_of_different_sensors_are_not_compared(loop: FoldedLoop) ->
         told("--method", "hadamard", "--out", "nowhere/night.fits")
 
 
-BRIGHT = {"sensor.sam": "sam27d10_bal14", "star.magnitude": 0.0, "disturbance.preset": "quiet"}
+BRIGHT = FIXED_GAINS | {"sensor.sam": "sam27d10_bal14", "star.magnitude": 0.0, "disturbance.preset": "quiet"}
 THERE = "4=20,7=-20"
 SILENT = Console(quiet=True)
 

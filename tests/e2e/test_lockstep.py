@@ -84,7 +84,6 @@ def test_automatic_gains_are_inputs_that_two_runs_and_a_replay_have_alike(tmp_pa
     for name in ("one", "two"):
         (tmp_path / name).mkdir()
         figures = loop(tmp_path / name, "--lockstep", "--duration", "3", "--disturbance", "bench")
-        assert 0 < figures["closed_fraction"] < 1  # measured over two seconds first
         logs.append(payloads(figures["log"]))
     one, two = ({t: p for t, p in log.items() if topic_of(t[1:]).deterministic} for log in logs)
     assert one == two

@@ -27,6 +27,7 @@ from lowfc.adapters.bus.zenoh_bus import ZenohBus
 from lowfc.adapters.process.clock import HostClock
 from lowfc.contract.errors import BusError, ConfigurationError
 from lowfc.contract.messages import (
+    BENCH,
     CALIBRATION,
     CAMERA_STATE,
     COMMAND,
@@ -133,7 +134,7 @@ def bridge(bus: MemoryBus) -> Iterator[FoxgloveBridge]:
 
 
 def test_the_channels_are_those_of_the_table_and_explain_themselves(bridge: FoxgloveBridge, bus: MemoryBus) -> None:
-    shown = {"/" + topic.at("dm"): topic for topic in SHOWN if topic not in (HEALTH, SURFACE)}
+    shown = {"/" + topic.at("dm"): topic for topic in SHOWN if topic not in (BENCH, HEALTH, SURFACE)}
     with connected(bridge.port) as client:
         bus.publisher(COMMAND, "dm").put(b"")  # which is nothing for a viewer, and must not appear
         bus.publisher(MIRROR_STATE, "dm").put(b"")
