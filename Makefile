@@ -28,7 +28,7 @@ sim-loop: $(VENV)/.installed  ## install, then run the simulated loop for 20 s
 	$(BIN)/lowfc sim-loop --duration 20
 
 test: $(VENV)/.tests lint types  ## install, then lint, types and tests
-	OPENBLAS_NUM_THREADS=1 $(BIN)/python -m pytest -m 'not slow and not exclusive' -n auto --dist loadfile
+	OPENBLAS_NUM_THREADS=1 $(BIN)/python -m pytest -m 'not slow and not exclusive and not basler and not aravis' -n auto --dist loadfile
 	$(BIN)/python -m pytest -m 'exclusive and not slow'
 
 test-all: $(VENV)/.tests node lint types  ## everything, the slow tests and those that need node, chromium and a graphics driver too
@@ -36,7 +36,9 @@ test-all: $(VENV)/.tests node lint types  ## everything, the slow tests and thos
 		echo "no Vulkan driver: the viewer tests will skip. Debian: apt install mesa-vulkan-drivers libvulkan1" >&2
 	@command -v chromium >/dev/null || { test "$$(id -u)" = 0 && apt-get install --yes chromium; } || \
 		echo "no chromium: the browser tests will skip. Debian: apt install chromium" >&2
-	$(INSTALL) --editable '.[test,epics-test]'
+	@command -v arv-fake-gv-camera-0.8 >/dev/null || { test "$$(id -u)" = 0 && apt-get install --yes aravis-tools gir1.2-aravis-0.8 python3-gi; } || \
+		echo "no aravis: its tests will skip. Debian: apt install aravis-tools gir1.2-aravis-0.8 python3-gi" >&2
+	$(INSTALL) --editable '.[test,epics-test,basler]'
 	$(BIN)/python -m pytest
 
 bench: $(VENV)/.installed  ## time the loop beside the last release's figures; STORE=1 keeps them as this release's

@@ -1,0 +1,101 @@
+"""A GigE Vision or USB3 Vision camera, by the system's library aravis."""
+
+import importlib
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from lowfc.device import CameraSettings, Configuration, ConfigurationError, Exposure, Need
+from lowfc.device.drivers.genicam import WAIT_MS, GenicamOptions
+
+ADVICE = (
+    "Debian: apt install gir1.2-aravis-0.8 python3-gi; then let this Python see the package gi, by an environment made "
+    "with `python3 -m venv --system-site-packages`, or, where the system's Python is of the same version, by a link to "
+    "/usr/lib/python3/dist-packages/gi in its site-packages"
+)
+_BUFFERS = 32
+
+
+def _aravis() -> Any:
+    try:
+        importlib.import_module("gi").require_version("Aravis", "0.8")
+        return importlib.import_module("gi.repository.Aravis")
+    except (ImportError, ValueError) as fault:
+        raise ConfigurationError(f"the driver aravis needs aravis 0.8 and PyGObject ({fault}). {ADVICE}") from None
+
+
+class AravisCamera:
+    """Frames as aravis receives them; those that lack packets are gaps in the camera's own numbers."""
+
+    Options = GenicamOptions
+
+    def __init__(self, options: GenicamOptions, config: Configuration) -> None:
+        """Open the camera and set it."""
+        self._aravis = aravis = _aravis()
+        self._settings = options.settings(config)
+        try:
+            self._camera = aravis.Camera.new(options.camera or None)
+            self._set(options)
+            self._stream = self._camera.create_stream(None, None)
+            if self._camera.is_gv_device():  # a packet that is sent again comes too late
+                self._stream.set_property("packet-resend", aravis.GvStreamPacketResend.NEVER)
+            for _ in range(_BUFFERS):
+                self._stream.push_buffer(aravis.Buffer.new_allocate(self._camera.get_payload()))
+        except importlib.import_module("gi.repository.GLib").Error as fault:
+            raise ConfigurationError(f"camera {options.camera or '(the first found)'}: {fault.message}") from None
+
+    @classmethod
+    def needs(cls, options: GenicamOptions) -> list[Need]:
+        """The library, and a camera that it sees."""
+        try:
+            aravis = _aravis()
+        except ConfigurationError as fault:
+            return [Need("aravis", "", str(fault))]
+        aravis.update_device_list()
+        seen = [aravis.get_device_id(index) for index in range(aravis.get_n_devices())]
+        return [Need("aravis", "0.8", ""), Need("a camera", ", ".join(seen), "connect one; `arv-tool-0.8` lists them")]
+
+    def start(self) -> None:
+        """Begin to receive."""
+        self._camera.start_acquisition()
+
+    def settings(self) -> CameraSettings:
+        """As the camera took them."""
+        return self._settings
+
+    def expose(self) -> Exposure | None:
+        """The next whole frame; its time is that at which its first packet came, just after the exposure."""
+        buffer = self._stream.timeout_pop_buffer(WAIT_MS * 1000)
+        if buffer is None:
+            return None
+        try:
+            if buffer.get_status() != self._aravis.BufferStatus.SUCCESS:
+                return None
+            dtype = np.uint8 if self._settings.bit_depth == 8 else np.dtype("<u2")
+            shape = buffer.get_image_height(), buffer.get_image_width()
+            pixels = np.frombuffer(buffer.get_image_data(), dtype).reshape(shape).astype(np.uint16)
+            return Exposure(pixels, buffer.get_system_timestamp(), buffer.get_frame_id())
+        finally:
+            self._stream.push_buffer(buffer)
+
+    def close(self) -> None:
+        """Let go of the camera."""
+        self._camera.stop_acquisition()
+
+    def _set(self, options: GenicamOptions) -> None:
+        camera, settings = self._camera, self._settings
+        camera.set_range_check_policy(self._aravis.RangeCheckPolicy.ENABLE)
+        camera.set_pixel_format_from_string(options.pixel_format)
+        camera.set_region(options.region_column, options.region_row, options.columns, options.rows)
+        camera.set_exposure_time(settings.exposure_ns * 1e-3)
+        if options.gain is not None:
+            camera.set_gain(options.gain)
+        period_ns = settings.period_ns
+        if options.trigger:
+            camera.set_trigger(options.trigger)
+        else:
+            camera.clear_triggers()
+            camera.set_frame_rate(1e9 / period_ns)
+            period_ns = round(1e9 / camera.get_frame_rate())
+        self._settings = replace(settings, exposure_ns=round(camera.get_exposure_time() * 1e3), period_ns=period_ns)

@@ -1,0 +1,112 @@
+"""A Basler camera, by the vendor's package pypylon."""
+
+import importlib
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from lowfc.adapters.process.extras import install_advice
+from lowfc.device import CameraSettings, Configuration, ConfigurationError, Exposure, Need
+from lowfc.device.drivers.genicam import WAIT_MS, GenicamOptions
+
+_EXPOSURES = "ExposureTime", "ExposureTimeAbs"
+"""Names of newer and older cameras; the emulation has both, and goes by the older."""
+_RATES = "AcquisitionFrameRate", "AcquisitionFrameRateAbs"
+_RESULTS = "ResultingFrameRate", "ResultingFrameRateAbs", "BslResultingAcquisitionFrameRate"
+_BUFFERS = 16
+_QUEUED = 2
+"""Frames that wait while the host stands still; older ones are dropped and counted, for their times would be wrong."""
+
+
+def _pylon() -> Any:
+    try:
+        return importlib.import_module("pypylon.pylon")
+    except ImportError as fault:
+        raise ConfigurationError(
+            f"the driver basler needs the package pypylon ({fault}): {install_advice('basler')}"
+        ) from None
+
+
+class BaslerCamera:
+    """Frames as pylon grabs them; those that were lost or failed are gaps in the camera's own numbers."""
+
+    Options = GenicamOptions
+
+    def __init__(self, options: GenicamOptions, config: Configuration) -> None:
+        """Open the camera and set it."""
+        self._pylon = pylon = _pylon()
+        self._settings = options.settings(config)
+        try:
+            info = pylon.DeviceInfo()
+            if options.camera:
+                info.SetSerialNumber(options.camera)
+            self._camera = pylon.InstantCamera(pylon.TlFactory.GetInstance().CreateFirstDevice(info))
+            self._camera.Open()
+            self._set(options)
+        except importlib.import_module("pypylon.genicam").GenericException as fault:
+            which = options.camera or "the first found"
+            raise ConfigurationError(f"Basler camera {which}: {str(fault).rpartition(' : ')[0]}") from None
+
+    @classmethod
+    def needs(cls, options: GenicamOptions) -> list[Need]:
+        """The package, and a camera that it sees."""
+        try:
+            pylon = _pylon()
+        except ConfigurationError:
+            return [Need("pypylon", "", install_advice("basler"))]
+        seen = [one.GetFriendlyName() for one in pylon.TlFactory.GetInstance().EnumerateDevices()]
+        advice = "connect one and switch it on; PYLON_CAMEMU=1 in the environment emulates one"
+        return [Need("pypylon", pylon.GetPylonVersionString(), ""), Need("a camera", ", ".join(seen), advice)]
+
+    def start(self) -> None:
+        """Begin to grab."""
+        self._camera.StartGrabbing(self._pylon.GrabStrategy_LatestImages)
+
+    def settings(self) -> CameraSettings:
+        """As the camera took them."""
+        return self._settings
+
+    def expose(self) -> Exposure | None:
+        """The next whole frame."""
+        result = self._camera.RetrieveResult(WAIT_MS, self._pylon.TimeoutHandling_Return)
+        if not result.IsValid():
+            return None
+        with result:
+            if not result.GrabSucceeded():
+                return None
+            return Exposure(result.GetArray().astype(np.uint16), None, result.GetBlockID())
+
+    def close(self) -> None:
+        """Let go of the camera."""
+        self._camera.Close()
+
+    def _set(self, options: GenicamOptions) -> None:
+        camera, settings = self._camera, self._settings
+        camera.PixelFormat.Value = options.pixel_format
+        camera.OffsetX.Value = camera.OffsetY.Value = 0  # else the size may not fit
+        camera.Width.Value, camera.Height.Value = options.columns, options.rows
+        camera.OffsetX.Value, camera.OffsetY.Value = options.region_column, options.region_row
+        self._put(_EXPOSURES, settings.exposure_ns * 1e-3)
+        if options.gain is not None:
+            camera.Gain.Value = options.gain
+        camera.TriggerSelector.Value = "FrameStart"
+        camera.TriggerMode.Value = "On" if options.trigger else "Off"
+        period_ns = settings.period_ns
+        if options.trigger:
+            camera.TriggerSource.Value = options.trigger
+        else:
+            camera.AcquisitionFrameRateEnable.Value = True
+            self._put(_RATES, 1e9 / period_ns)
+            period_ns = round(1e9 / min(self._read(_RESULTS + _RATES)))
+        camera.MaxNumBuffer.Value, camera.OutputQueueSize.Value = _BUFFERS, _QUEUED
+        exposure_ns = round(self._read(_EXPOSURES)[0] * 1e3)
+        self._settings = replace(settings, exposure_ns=exposure_ns, period_ns=period_ns)
+
+    def _put(self, names: tuple[str, ...], value: float) -> None:
+        for node in (getattr(self._camera, name) for name in names):
+            if node.IsWritable():
+                node.Value = value
+
+    def _read(self, names: tuple[str, ...]) -> list[float]:
+        return [node.Value for name in names if (node := getattr(self._camera, name)).IsReadable()]

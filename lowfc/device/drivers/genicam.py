@@ -1,0 +1,60 @@
+"""What the drivers of GenICam cameras have in common: their options, and settings made of them."""
+
+from typing import Literal
+
+from pydantic import Field
+
+from lowfc.adapters.files.factory import camera_state
+from lowfc.contract.configuration import Configuration
+from lowfc.contract.messages import fields_of
+from lowfc.device import CameraSettings, DriverOptions
+
+_CONFIGURED = ("exposure_ns", "period_ns", "gain_e_per_dn", "bias_dn", "read_noise_e", "saturation_dn", "em_gain")
+FRAME_ID_WRAP = 65535
+"""GigE Vision counts frames from 1 to 65535 and goes on with 1; 64-bit numbers are as good modulo 65535."""
+WAIT_MS = 500
+
+
+class GenicamOptions(DriverOptions):
+    """Region and format of the frames; exposure and rate are those of [camera] where they are left out."""
+
+    camera: str = ""
+    """Serial number (basler), or identifier or address (aravis); empty for the first camera found."""
+    rows: int = Field(ge=1)
+    """Rows of the region read."""
+    columns: int = Field(ge=1)
+    """Columns of the region read."""
+    region_row: int = Field(default=0, ge=0)
+    """First row of the region read."""
+    region_column: int = Field(default=0, ge=0)
+    """First column of the region read."""
+    pixel_format: Literal["Mono8", "Mono10", "Mono12", "Mono14", "Mono16"] = "Mono12"
+    """Format of a pixel, each in bytes of its own."""
+    exposure_us: float | None = Field(default=None, gt=0)
+    """Exposure time."""
+    rate_hz: float | None = Field(default=None, gt=0)
+    """Frames per second: of the camera, or of its trigger."""
+    gain: float | None = None
+    """Gain, in the camera's unit, mostly dB; left as it is where it is left out."""
+    trigger: str = ""
+    """Line that triggers each frame, as the camera calls it (`Line1`); empty for a camera that runs freely."""
+
+    def settings(self, config: Configuration) -> CameraSettings:
+        """Settings as asked for; the converter's bits are the format's."""
+        configured = fields_of(camera_state(config, (self.rows, self.columns), 0), _CONFIGURED)
+        bits = int(self.pixel_format.removeprefix("Mono"))
+        configured["saturation_dn"] = min(configured["saturation_dn"], 2**bits - 1)
+        if self.exposure_us is not None:
+            configured["exposure_ns"] = round(self.exposure_us * 1e3)
+        if self.rate_hz is not None:
+            configured["period_ns"] = round(1e9 / self.rate_hz)
+        return CameraSettings(
+            self.rows,
+            self.columns,
+            **configured,
+            bit_depth=bits,
+            region_row=self.region_row,
+            region_column=self.region_column,
+            clock="realtime",
+            number_wrap=FRAME_ID_WRAP,
+        )

@@ -1,0 +1,188 @@
+"""Cameras of vendors against the vendors' own emulators: whole, with losses, and where something is missing."""
+
+import shutil
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from lowfc.adapters.process.clock import HostClock
+from lowfc.contract.configuration import load
+from lowfc.contract.errors import ConfigurationError
+from lowfc.contract.messages import CAMERA_STATE, FRAME
+from lowfc.device import plugins
+from lowfc.device.camera_loop import CameraLoop
+from lowfc.device.drivers import aravis
+from lowfc.device.drivers.aravis import AravisCamera
+from lowfc.device.drivers.basler import BaslerCamera
+from lowfc.device.drivers.genicam import GenicamOptions
+from lowfc.testing.listener import Listener
+from lowfc.testing.memory_bus import MemoryHub
+
+CONFIG = load(None, {"camera.rate_hz": 200.0})
+OPTIONS = {"rows": 60, "columns": 80, "region_row": 16, "region_column": 32, "rate_hz": 200.0, "exposure_us": 500.0}
+
+
+def run(driver: Any, frames: int) -> tuple[Listener, list[int]]:
+    """So many frames of a driver by its loop: what was heard, and the sequences of the frames."""
+    hub = MemoryHub()
+    heard = Listener(hub, HostClock(), FRAME, CAMERA_STATE)
+    CameraLoop(driver, heard.service("camera"), CONFIG, frames).run()
+    samples = [sample.sequence & 0xFFFFFFFF for sample in heard.samples[FRAME]]
+    return heard, samples
+
+
+@pytest.mark.parametrize(("name", "package"), [("basler", "pypylon"), ("aravis", "gi")])
+def test_without_the_package_one_sentence_says_what_to_install(
+    monkeypatch: pytest.MonkeyPatch, name: str, package: str
+) -> None:
+    for module in (package, f"{package}.pylon"):
+        monkeypatch.setitem(sys.modules, module, None)
+    driver = plugins.load("camera", name)
+    options = GenicamOptions(rows=8, columns=8)
+    with pytest.raises(ConfigurationError, match=rf"the driver {name} needs .*{package}.* install "):
+        driver(options, CONFIG)
+    (need,) = driver.needs(options)
+    assert not need.found
+    assert "install " in need.advice
+
+
+def test_settings_are_the_options_or_else_the_configuration() -> None:
+    settings = GenicamOptions(rows=8, columns=9, region_row=3, pixel_format="Mono10", rate_hz=500.0).settings(CONFIG)
+    assert (settings.rows, settings.columns, settings.region_row, settings.region_column) == (8, 9, 3, 0)
+    assert (settings.bit_depth, settings.saturation_dn, settings.period_ns) == (10, 1023, 2_000_000)
+    assert settings.exposure_ns == CONFIG.exposure_ns
+
+
+class Buffers:
+    """Stands in for a stream of aravis: buffers of 2 x 3 pixels with the frame numbers given, 0 for one that failed."""
+
+    def __init__(self, *numbers: int) -> None:
+        self.numbers, self.pushed = list(numbers), 0
+
+    def timeout_pop_buffer(self, wait_us: int) -> Any:
+        if not self.numbers:
+            return None
+        number = self.numbers.pop(0)
+        data = np.arange(6, dtype="<u2").tobytes()
+        methods = {
+            "get_status": "whole" if number else "missing-packets",
+            "get_image_height": 2,
+            "get_image_width": 3,
+            "get_image_data": data,
+            "get_system_timestamp": 1000 + number,
+            "get_frame_id": number,
+        }
+        return SimpleNamespace(**{name: lambda value=value: value for name, value in methods.items()})
+
+    def push_buffer(self, buffer: Any) -> None:
+        self.pushed += 1
+
+
+def test_numbers_of_gige_vision_wrap_without_a_zero_and_buffers_go_back() -> None:
+    driver, stream = object.__new__(AravisCamera), Buffers(65534, 65535, 0, 2)
+    driver._aravis = SimpleNamespace(BufferStatus=SimpleNamespace(SUCCESS="whole"))
+    driver._settings, driver._stream = GenicamOptions(rows=2, columns=3).settings(CONFIG), stream
+    driver._camera = SimpleNamespace(start_acquisition=lambda: None, stop_acquisition=lambda: None)
+    heard, sequences = run(driver, 3)
+    assert sequences == [0, 1, 3], "one was lost at the wrap: number 1"
+    assert heard.messages(FRAME)[0].data == np.arange(6, dtype="<u2").tobytes()
+    assert stream.pushed == 4
+
+
+@pytest.fixture
+def emulated(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Pylon's emulation of a camera."""
+    monkeypatch.setenv("PYLON_CAMEMU", "2")
+    pytest.importorskip("pypylon.pylon", reason="needs pypylon")
+
+
+@pytest.mark.basler
+def test_a_basler_camera_that_waits_for_its_trigger_is_silent_and_wrong_settings_are_refused(emulated: None) -> None:
+    driver = BaslerCamera(GenicamOptions(**OPTIONS, camera="0815-0001", trigger="Line1"), CONFIG)
+    driver.start()
+    assert driver.expose() is None
+    assert (driver._camera.TriggerSource.Value, driver._camera.TriggerMode.Value) == ("Line1", "On")
+    driver.close()
+    for options, why in [
+        ({"columns": 9999}, "9999 must be"),
+        ({"trigger": "Line9"}, "Line9"),
+        ({"camera": "7"}, "7: No"),
+    ]:
+        with pytest.raises(ConfigurationError, match=f"Basler camera .*{why}"):
+            BaslerCamera(GenicamOptions(**{**OPTIONS, **options}), CONFIG)
+    assert all(need.found for need in BaslerCamera.needs(GenicamOptions(**OPTIONS)))
+
+
+@pytest.mark.basler
+def test_a_basler_camera_is_set_and_its_failed_buffers_are_lost_frames(emulated: None) -> None:
+    driver = BaslerCamera(GenicamOptions(**OPTIONS, gain=6.0, pixel_format="Mono12"), CONFIG)
+    camera = driver._camera
+    assert (camera.Width.Value, camera.Height.Value, camera.OffsetX.Value, camera.OffsetY.Value) == (80, 60, 32, 16)
+    assert (camera.Gain.Value, camera.TriggerMode.Value) == (pytest.approx(6.0, abs=0.1), "Off")
+    assert (driver.settings().exposure_ns, driver.settings().period_ns) == (500_000, 5_000_000)
+    camera.ForceFailedBufferCount.Value = 7
+    camera.ForceFailedBuffer.Execute()
+    whole = driver.expose
+
+    def fail_later() -> Any:
+        exposure = whole()
+        if exposure is not None and exposure.number == 20:
+            camera.ForceFailedBuffer.Execute()
+        return exposure
+
+    driver.expose = fail_later  # type: ignore[method-assign]
+    heard, sequences = run(driver, 60)
+    assert sequences[-1] - 59 >= 7, "those that failed at the start are before the first number"
+    assert "FRAMES_LOST" in heard.events()
+    pixels = np.frombuffer(heard.messages(FRAME)[0].data, "<u2")
+    assert pixels.size == 60 * 80
+    assert 255 < pixels.max() < 4096
+
+
+@pytest.fixture
+def fake_camera() -> Iterator[None]:
+    """The fake camera of aravis on loopback; it loses 5 of 1000 packets."""
+    program = shutil.which("arv-fake-gv-camera-0.8")
+    if program is None:
+        pytest.skip("needs arv-fake-gv-camera-0.8 (Debian: apt install aravis-tools)")
+    try:
+        found = aravis._aravis()
+    except ConfigurationError as fault:
+        pytest.skip(str(fault))
+    with subprocess.Popen([program, "-i", "127.0.0.1", "-s", "LOWFC", "-r", "5"]) as process:
+        try:
+            for _ in range(50):
+                found.update_device_list()
+                if found.get_n_devices():
+                    break
+                time.sleep(0.1)
+            yield
+        finally:
+            process.kill()
+
+
+@pytest.mark.aravis
+@pytest.mark.filterwarnings("ignore:DynamicImporter:ImportWarning")
+def test_a_camera_by_aravis_is_set_and_frames_without_all_packets_are_lost_frames(fake_camera: None) -> None:
+    settings = {**OPTIONS, "rate_hz": 100.0, "camera": "Aravis-Fake-LOWFC", "pixel_format": "Mono16"}
+    driver = AravisCamera(GenicamOptions(**settings, gain=2.0), CONFIG)
+    region = driver._camera.get_region()
+    assert (region.x, region.y, region.width, region.height) == (32, 16, 80, 60)
+    assert (driver.settings().exposure_ns, driver.settings().period_ns) == (500_000, 10_000_000)
+    assert driver._camera.get_gain() == 2.0
+    heard, sequences = run(driver, 250)
+    assert sequences[-1] > 249, "packets are lost"
+    assert sequences == sorted(set(sequences))
+    assert heard.events()[:1] == ["STARTED"]
+    assert "FRAMES_LOST" in heard.events()
+    assert not any(name.startswith("DRIVER") for name in heard.events())
+    assert all(need.found for need in AravisCamera.needs(GenicamOptions(**settings)))
+    for wrong in ({"columns": 9999}, {"pixel_format": "Mono14"}, {"camera": "Nobody-7"}):
+        with pytest.raises(ConfigurationError, match=r"^camera "):
+            AravisCamera(GenicamOptions(**{**settings, **wrong}), CONFIG)
