@@ -170,7 +170,7 @@ def fake_camera() -> Iterator[None]:
 @pytest.mark.aravis
 @pytest.mark.filterwarnings("ignore:DynamicImporter:ImportWarning")
 def test_a_camera_by_aravis_is_set_and_frames_without_all_packets_are_lost_frames(fake_camera: None) -> None:
-    settings = {**OPTIONS, "rate_hz": 100.0, "camera": "Aravis-Fake-LOWFC", "pixel_format": "Mono16"}
+    settings = {**OPTIONS, "rate_hz": 100.0, "camera": "127.0.0.1", "pixel_format": "Mono16"}
     driver = AravisCamera(GenicamOptions(**settings, gain=2.0), CONFIG)
     region = driver._camera.get_region()
     assert (region.x, region.y, region.width, region.height) == (32, 16, 80, 60)
