@@ -12,6 +12,7 @@ from threadpoolctl import threadpool_limits
 from lowfc.adapters.files import factory
 from lowfc.arrays import Array
 from lowfc.contract.configuration import FIXED_GAINS, Configuration
+from lowfc.contract.errors import CalibrationError
 from tools.law_bench import Bench, calibrated, configured
 from tools.modal_bench import ModalBench, noise_covariance_nm2
 from tools.shared import Figures, columns
@@ -75,6 +76,10 @@ def of_modes(case: tuple[str, str, float]) -> Figures:
     """Closed minus open of one sensor, preset and star, in contrast, by modes; on bright stars fixed gains, too."""
     sensor, preset, magnitude = case
     form, own = _contrast(sensor)
+    try:
+        _noise(sensor, magnitude)
+    except CalibrationError as saturated:
+        return {"sensor": sensor, "preset": preset, "magnitude": magnitude, "saturates": str(saturated)}
     left = np.array([_modal(*case, seed, _AUTO) for seed in SEEDS])
     before = np.array([_open_nm2(preset, seed) for seed in SEEDS])
     found = _row(case, (left - before) @ np.diag(form), own, np.sqrt(before.sum(axis=1).mean()), left)
@@ -140,7 +145,7 @@ def measure(
 
 def render(figures: Figures) -> str:
     """A line for each sensor and star: wavefront open and closed by preset, and where closing harms."""
-    rows = figures["rows"]
+    rows = [row for row in figures["rows"] if "saturates" not in row]
     modal = [row for row in rows if "images" not in row]
     table = []
     for sensor, magnitude in dict.fromkeys((row["sensor"], row["magnitude"]) for row in modal):
@@ -151,6 +156,7 @@ def render(figures: Figures) -> str:
                 | {preset: "{open_nm:.2f} to {closed_nm:.2f}".format(**row) for preset, row in mine.items()}
             )
     harmful = [row for row in rows if row["harms"]]
+    stars = ", ".join(f"{one:g}" for one in sorted({row["magnitude"] for row in modal}))
     compared = [row["of_best"] for row in rows if "of_best" in row]
     names = "; ".join("{sensor}, {preset}, V = {magnitude}".format(**row) for row in harmful) or "none"
     heads = {"sensor": "`{sensor}`", "V": "{magnitude}"} | {
@@ -159,7 +165,7 @@ def render(figures: Figures) -> str:
     return (
         f"{columns(heads, table)}\nTrue wavefront open and closed with automatic gains, nm rms over the second half "
         f"of {figures['seconds']:g} s at {figures['rate_hz']:g} Hz, mean of {figures['seeds']} seeds. Of {len(rows)} "
-        f"cases (V = {min(MAGNITUDES)} to {max(MAGNITUDES)}, these and `quiet`; {len(rows) - len(modal)} of them "
+        f"cases (V = {stars}; these and `quiet`; {len(rows) - len(modal)} of them "
         "with every image simulated) those in which "
         f"closing adds more contrast than three standard errors and {100 * OF_DARK_ZONE:g} % of the dark zone's own: "
         f"{names}. On bright stars (V = -1, 0, 2) automatic gains leave {min(compared):.2f} to {max(compared):.2f} "

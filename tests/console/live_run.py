@@ -4,7 +4,7 @@ import threading
 import time
 from pathlib import Path
 
-from lowfc.adapters.bus.bus import Query
+from lowfc.adapters.bus.bus import Query, Sample
 from lowfc.adapters.files import factory
 from lowfc.adapters.process.clock import HostClock
 from lowfc.adapters.process.latch import Latch
@@ -43,7 +43,7 @@ class LiveRun:
     """The run.
 
     Attributes:
-        asked: requests as the controller published them.
+        asked: requests as the controller published them, but for those of consoles that begin.
         recorded: what was asked of the recorder.
         flux: of the star, as the calibration expects it at 1.
     """
@@ -54,7 +54,7 @@ class LiveRun:
         self.recorded: list[str] = []
         self.flux = 1.0
         observer = self.bus("observer")
-        observer.subscribe(REQUEST, lambda sample: self.asked.append(wire.Request.FromString(sample.payload)))
+        observer.subscribe(REQUEST, self._note)
         mirror_states: list[object] = []
         observer.subscribe(MIRROR_STATE, mirror_states.append)
         self.bus("recorder").queryable(RECORD_KEY.format(name="*"), self._record)
@@ -73,6 +73,11 @@ class LiveRun:
         for thread in self._threads:
             thread.start()
         until(lambda: mirror_states)
+
+    def _note(self, sample: Sample) -> None:
+        asked = wire.Request.FromString(sample.payload)
+        if asked.name != "configuration":
+            self.asked.append(asked)
 
     def bus(self, role: str) -> MemoryBus:
         return MemoryBus(self.hub, role, self.clock)

@@ -3,6 +3,7 @@
 import asyncio
 import contextlib
 import os
+import threading
 from collections.abc import AsyncIterator, Awaitable, Callable, Iterator
 from pathlib import Path
 
@@ -10,15 +11,18 @@ import numpy as np
 import pytest
 
 from lowfc.adapters.files import calibration_file, law_file
+from lowfc.adapters.process.clock import HostClock
 from lowfc.contract.codecs.calibration_codec import identified
 from lowfc.contract.events import EVENTS
 from lowfc.contract.messages import EVENT
 from lowfc.control.laws.linear_law import integrator_block, of_blocks
+from lowfc.testing.memory_bus import MemoryBus, MemoryHub
 from tests.console.live_run import RUN, LiveRun
 from tests.support.loops import until
 from tests.support.stage import Stage
 from tests.support.toy import GRID, NOLL, calibration
 
+pytestmark = pytest.mark.exclusive
 LAW = of_blocks([integrator_block(0.2, 0.01, "pol", 1.0)] * 3, "pol", "leaky", NOLL, 1.0, 50.0)
 PATIENCE_S = 15.0
 
@@ -302,6 +306,23 @@ def test_a_console_that_is_cut_off_says_so_and_shows_no_old_figures(tmp_path: Pa
 
     played(run, scenario)
     run.stop()
+
+
+def test_a_console_whose_terminal_is_gone_ends() -> None:
+    from lowfc.programs.console.app import FIGURES_S, Console
+
+    gone, clock = threading.Event(), HostClock()
+    app = Console(MemoryBus(MemoryHub(), "operator", clock), RUN, clock, terminal_gone=gone.is_set)
+
+    async def scenario() -> None:
+        async with app.run_test(size=(100, 30)) as pilot:
+            await pilot.pause(2 * FIGURES_S)
+            assert app.is_running
+            gone.set()
+            await pilot.pause(3 * FIGURES_S)
+            assert app.return_code == 0
+
+    asyncio.run(scenario())
 
 
 def test_the_words_are_those_of_the_tiles() -> None:

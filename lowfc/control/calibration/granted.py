@@ -9,9 +9,9 @@ from lowfc.control.loop.camera import CameraSettings
 
 
 def noise_covariance_nm2(calibration: Calibration, flux_dn: float, camera: CameraSettings | None) -> Array | None:
-    """Covariance (modes, modes) of one frame's noise, nm^2 of wavefront rms: photons of I0 and read-out.
+    """Covariance (modes, modes) of one frame's noise, nm^2 of wavefront rms, flux normalisation included.
 
-    None where the camera's gain is not known.
+    Photons of I0 and read-out; None where the camera's gain is not known.
     """
     if camera is None or not camera.gain_e_per_dn > 0 or not flux_dn > 0:
         return None
@@ -21,8 +21,9 @@ def noise_covariance_nm2(calibration: Calibration, flux_dn: float, camera: Camer
     variance = excess * pixel_variance(
         calibration.reference.astype(np.float64), flux_e, camera.read_noise_e / em_gain / excess**0.5
     )
-    R = calibration.reconstructor.astype(np.float64)
-    return np.asarray((R * (variance * calibration.good)) @ R.T)
+    R, good = calibration.reconstructor.astype(np.float64), calibration.good.astype(np.float64)
+    effective = R - np.outer(R @ calibration.reference, good)
+    return np.asarray((effective * (variance * good)) @ effective.T)
 
 
 def granted_rows(

@@ -30,6 +30,8 @@ class Verdict(NamedTuple):
     Attributes:
         gain: the gain that each mode should have from now on.
         power_nm2: mean square of the open loop, with the noise of a frame.
+        noise_nm2: of that, noise: as computed, or half the mean square of the change between frames where that
+            is more; None where it was not computed.
         change_nm2: mean square with the gain of now less that of the open loop: above 0, closing harms.
         change_error_nm2: its standard error.
         loop_nm2: the same of the loop itself, with whatever law drives it; None where it was not closed throughout.
@@ -39,6 +41,7 @@ class Verdict(NamedTuple):
 
     gain: Single
     power_nm2: Array
+    noise_nm2: Array | None
     change_nm2: Array
     change_error_nm2: Array
     loop_nm2: Array | None
@@ -84,6 +87,7 @@ class GainBank:
     def restart(self) -> None:
         """Begin anew, as for another star."""
         self._loops = self._at_rest
+        self._before_nm = np.zeros_like(self._at_rest.kept)
         self.begin_again()
 
     def begin_again(self) -> None:
@@ -96,6 +100,8 @@ class GainBank:
         self._loops, errors_nm = self._loops.followed(open_nm)
         squares = np.square(errors_nm)
         self._power += squares[0]
+        self._changes += np.square(errors_nm[0] - self._before_nm) / 2
+        self._before_nm = errors_nm[0]
         squares -= squares[0].copy()
         self._sums[:-1] += squares
         self._sums[-1] += np.square(error_nm) - np.square(open_nm)
@@ -108,6 +114,7 @@ class GainBank:
             return False
         self._blocks.append(self._sums / self._frames)
         self._powers.append(self._power / self._frames)
+        self._changed.append(self._changes / self._frames)
         self._begin_block()
         return True
 
@@ -139,6 +146,8 @@ class GainBank:
         frames = self._block * BLOCKS
         mean, error = _mean(blocks)
         chosen = self._chosen(blocks, now)
+        if noise_nm2 is not None:
+            noise_nm2 = np.maximum(noise_nm2, np.mean(self._changed, axis=0))
         if self.first and noise_nm2 is not None:
             injected = self.rows[1] / (2 - self.rows[1]) * noise_nm2
             there = power - noise_nm2 * (1 + CONFIDENCE * np.sqrt(2 / frames))
@@ -146,6 +155,7 @@ class GainBank:
         found = Verdict(
             np.where(chosen == now, gain, self.rows[chosen]).astype(np.float32),
             power,
+            noise_nm2,
             mean[now, modes],
             error[now, modes],
             mean[-1] if self._throughout else None,
@@ -181,22 +191,24 @@ class GainBank:
         self._longest = self._block * LONGEST
         self._blocks: list[Array] = []
         self._powers: list[Array] = []
+        self._changed: list[Array] = []
         self._throughout = True
         self._begin_block()
 
     def _begin_block(self) -> None:
         self._frames = 0
         self._sums = np.zeros((self.rows.size + 1, self._at_rest.kept.size))
-        self._power = np.zeros(self._at_rest.kept.size)
+        self._power, self._changes = np.zeros((2, self._at_rest.kept.size))
 
     def _lengthen(self) -> None:
         """Go on with blocks of twice the length; the longest window forgets its older half."""
         if 2 * self._block > self._longest:
-            self._blocks, self._powers = self._blocks[BLOCKS // 2 :], self._powers[BLOCKS // 2 :]
+            for values in (self._blocks, self._powers, self._changed):
+                del values[: BLOCKS // 2]
             return
         self._block *= 2
-        pairs = (np.array(values).reshape(BLOCKS // 2, 2, *values[0].shape) for values in (self._blocks, self._powers))
-        self._blocks, self._powers = (list(pair.mean(axis=1)) for pair in pairs)
+        for values in (self._blocks, self._powers, self._changed):
+            values[:] = list(np.array(values).reshape(BLOCKS // 2, 2, *values[0].shape).mean(axis=1))
 
 
 def _mean(blocks: Array) -> tuple[Array, Array]:
@@ -215,6 +227,8 @@ def left_alone_nm2(verdict: Verdict, left: Mask, noise_nm2: Array) -> Single:
 
     What is measured less the noise, and two standard errors of that noise.
     """
+    if verdict.noise_nm2 is not None:
+        noise_nm2 = np.maximum(noise_nm2, verdict.noise_nm2)
     uncertain = CONFIDENCE * noise_nm2 * np.sqrt(2 / verdict.frames)
     prior = np.maximum(verdict.power_nm2 - noise_nm2, 0) + uncertain
     return np.where(left, prior, 0).astype(np.float32)

@@ -102,10 +102,18 @@ class Console(App[str]):
         Binding("q", "quit"),
     ]
 
-    def __init__(self, bus: Bus, run_id: str, clock: Clock, moved: Callable[[], bool] = lambda: False) -> None:
+    def __init__(
+        self,
+        bus: Bus,
+        run_id: str,
+        clock: Clock,
+        moved: Callable[[], bool] = lambda: False,
+        terminal_gone: Callable[[], bool] = lambda: False,
+    ) -> None:
         """Look at a run; `moved` says whether it was begun anew, with other links."""
         super().__init__()
         self._bus, self._run_id, self._run_clock, self._moved = bus, run_id, clock, moved
+        self._terminal_gone = terminal_gone
         self._feed = Feed(bus, run_id, clock)
         self._lines: deque[Text] = deque(maxlen=_LINES)
         self._shown: dict[str, Text] = {}
@@ -236,6 +244,9 @@ class Console(App[str]):
         return not (self.screen_stack and self.screen_stack[0].query("#peers"))
 
     def _read(self) -> None:
+        if self._terminal_gone():  # nobody looks, and what reads the keys would never rest
+            self.exit()
+            return
         if self._torn_down:
             return
         reading = self._feed.read()

@@ -40,7 +40,13 @@ def _operated(run_id: str) -> bool:
     clock = clock_of(load(own if own.exists() else None))
     bus = ZenohBus(joined.links, Role.OPERATOR, clock, monitor=True)
     try:
-        app = Console(bus, run_id, clock, lambda: links.exists() and links.stat().st_ctime_ns != made_ns)
+        app = Console(
+            bus,
+            run_id,
+            clock,
+            moved=lambda: links.exists() and links.stat().st_ctime_ns != made_ns,
+            terminal_gone=lambda: not sys.stdin.isatty(),
+        )
         return app.run() == MOVED
     finally:
         bus.close()

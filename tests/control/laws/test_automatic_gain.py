@@ -141,6 +141,6 @@ def test_without_modes_to_leave_or_a_known_camera_the_reconstructor_stays() -> N
 def test_what_is_known_of_modes_that_are_left_is_what_is_measured_less_the_noise() -> None:
     power, none = np.array([2.0, 1.0, 5.0]), np.zeros(3)
     found = left_alone_nm2(
-        Verdict(none, power, none, none, None, none, 5000), np.array([True, True, False]), np.ones(3)
+        Verdict(none, power, np.ones(3), none, none, None, none, 5000), np.array([True, True, False]), np.ones(3)
     )
     np.testing.assert_allclose(found, [1.04, 0.04, 0], rtol=1e-5)
