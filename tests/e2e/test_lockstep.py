@@ -79,6 +79,7 @@ def test_two_runs_with_one_seed_write_the_same_bytes_and_have_one_digest(tmp_pat
     assert one["/lowfc/camera/frame"] != other["/lowfc/camera/frame"]
 
 
+@pytest.mark.exclusive
 def test_automatic_gains_are_inputs_that_two_runs_and_a_replay_have_alike(tmp_path: Path) -> None:
     logs = []
     for name in ("one", "two"):
