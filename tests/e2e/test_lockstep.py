@@ -17,14 +17,9 @@ from lowfc.contract.sections import SENSORS
 from lowfc.optics.chain.sensor import light_budget
 from lowfc.programs.core.recording.volume import bytes_per_s
 from sim_camera.prediction import tilt_residual_mas
-from tests.support.loops import children, loop, payloads, recorded_bytes, run, start, until
+from tests.support.loops import FIXED, children, loop, payloads, recorded_bytes, run, start, until
 from tools.measure import measured
 
-FIXED = """
-[control]
-tilt_gain = 0.5
-gain = 0.05
-"""
 GENTLE = """
 [camera]
 rate_hz = 1000

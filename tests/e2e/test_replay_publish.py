@@ -32,14 +32,14 @@ from lowfc.contract.messages import (
 )
 from lowfc.programs.logs.publish.player import publish, render
 from lowfc.programs.logs.publish.selection import Selection
-from tests.support.loops import LOWFC, loop, until
+from tests.support.loops import FIXED, LOWFC, loop, until
 
 pytestmark = pytest.mark.exclusive
 
 
 @pytest.fixture(scope="module")
 def log(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    path: Path = loop(tmp_path_factory.mktemp("night"), "--rate", "100", "--duration", "1")["log"]
+    path: Path = loop(tmp_path_factory.mktemp("night"), "--rate", "100", "--duration", "1", config=FIXED)["log"]
     return path
 
 

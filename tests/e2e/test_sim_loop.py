@@ -14,7 +14,7 @@ import pytest
 
 from lowfc.contract.messages import RawImage, from_timestamp, topic_of, wire
 from lowfc.programs.cli.ctl.command import SIGNAL
-from tests.support.loops import LOWFC, children, interrupt, loop, payloads, recorded_bytes, run, start, until
+from tests.support.loops import FIXED, LOWFC, children, interrupt, loop, payloads, recorded_bytes, run, start, until
 from tests.support.other_readers import foxglove
 
 pytestmark = pytest.mark.exclusive
@@ -25,7 +25,7 @@ FRAMES = 1500
 @pytest.fixture(scope="module")
 def live(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
     folder = tmp_path_factory.mktemp("live")
-    return loop(folder, "--duration", "3", "--rate", "500", "--star-magnitude", "0", "--seed", "3")
+    return loop(folder, "--duration", "3", "--rate", "500", "--star-magnitude", "0", "--seed", "3", config=FIXED)
 
 
 @pytest.fixture(scope="module")

@@ -23,6 +23,10 @@ LOWFC = [sys.executable, "-m", "lowfc"]
 PROGRAMS = Path(sys.executable).parent
 
 
+FIXED = "[control]\ntilt_gain = 0.5\ngain = 0.05\n"
+"""Gains of a loop that is closed from its first frame on."""
+
+
 def run(folder: Path, *arguments: str, config: str = "", timeout_s: float = 120) -> "subprocess.CompletedProcess[str]":
     """`lowfc` with these arguments, in a folder of its own."""
     words = [*LOWFC, *arguments]
