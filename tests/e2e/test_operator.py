@@ -187,7 +187,7 @@ def test_the_commands_say_what_they_did(night: Night) -> None:
     assert "offset is now 0 0 5 0" in said["lowfc ctl offset 5 -3 --modes 4,11"]
     assert "channel dark-hole: 1.47 nm rms of surface" in said["lowfc ctl channel dark-hole shape.npy"]
     assert "'leaky' takes over" in said["lowfc ctl law law.fits"]
-    assert [said[f"lowfc ctl {name}"].split(",")[0] for name in ("safe", "clear", "pause", "close")] == [
+    assert [re.split("[,;]", said[f"lowfc ctl {name}"])[0] for name in ("safe", "clear", "pause", "close")] == [
         "loop in safe mode",
         "loop open",
         "loop paused: the command is held until `lowfc ctl close`",
