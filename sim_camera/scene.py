@@ -16,7 +16,7 @@ from lowfc.optics.twin.twin import Evaluator, Twin, node_radii, wavefront_rms_nm
 from lowfc.optics.twin.twin_mirror import TwinMirror, wavefront_nm
 from sim_camera.disturbance import Disturbance, Sampler, screen
 
-_GAUSS_LEGENDRE = (1 + np.array([-1, 1]) / np.sqrt(3)) / 2
+GAUSS_LEGENDRE = (1 + np.array([-1, 1]) / np.sqrt(3)) / 2
 """Instants of an exposure whose mean is that over it, to third order in time."""
 
 
@@ -97,7 +97,7 @@ class Scene:
         self.instants = (np.arange(instants) + 0.5) / instants if instants > 1 else np.zeros(0)
         self._images = 2 if instants > 1 else 1
         self._wavefronts: list[tuple[Single, Single]] = []
-        seen = exposure * _GAUSS_LEGENDRE if instants > 1 else np.zeros(0)
+        seen = exposure * GAUSS_LEGENDRE if instants > 1 else np.zeros(0)
         self._sampler = Sampler(shaken, np.concatenate([[0.0], seen, self.instants]), rate_hz)
         laws_of(detector)  # the first frame has no time for it
 

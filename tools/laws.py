@@ -11,10 +11,11 @@ from lowfc.adapters.files.factory import frame_noise_nm
 from lowfc.contract.configuration import Configuration
 from lowfc.control.calibration.calibration import Calibration
 from lowfc.control.laws.continuous import left_power
-from lowfc.control.laws.kalman import lqg
-from lowfc.control.laws.linear_law import LinearLaw
+from lowfc.control.laws.kalman import lqg_block
+from lowfc.control.laws.linear_law import LinearLaw, of_blocks
 from lowfc.control.laws.margins import noise_gain
 from lowfc.control.laws.spectra import Pieces
+from lowfc.control.laws.tuning import within_margins
 from lowfc.control.laws.vibration import Line, Model
 from lowfc.optics.detector.photometry import tilt_nm_per_mas
 from sim_camera.disturbance import variances_nm2
@@ -109,8 +110,10 @@ def theory_mas(config: Configuration, calibration: Calibration, law: LinearLaw) 
     return float(np.sqrt(waves) / nm_per_mas), float(np.sqrt(noise) / nm_per_mas)
 
 
-def optimum_mas(config: Configuration, calibration: Calibration) -> float:
+def optimum_mas(config: Configuration, calibration: Calibration, *, robust: bool = False) -> float:
     """The least that an LQG law leaves in theory which knows the wheel's lines and the noise, and takes the best drift.
+
+    Where it is to be robust, it keeps the margins that `lowfc tune` asks for.
 
     Raises:
         RuntimeError: the search ended at its edge: what it found is no least.
@@ -128,7 +131,11 @@ def optimum_mas(config: Configuration, calibration: Calibration) -> float:
             drift: Any, axis: int = axis, power: Any = power, known: Any = known, variance: float = variance
         ) -> float:
             step, cutoff_hz = 10.0 ** np.asarray(drift)
-            law = lqg([Model(step, cutoff_hz, known, variance, RATE_HZ)], (2 + axis,), timing)
+            model = Model(step, cutoff_hz, known, variance, RATE_HZ)
+            block = within_margins(model, timing) if robust else lqg_block(model, timing)
+            if block is None:
+                return np.inf
+            law = of_blocks([block], "pol", "lqg", (2 + axis,), timing.delay, RATE_HZ)
             left = left_power(law, 2 * np.pi * frequency_hz / RATE_HZ, timing)[:, 0]
             return float(power @ left + variance * noise_gain(law, timing.delay)[0])
 

@@ -1,6 +1,7 @@
 """The mirrors of a running loop, for a program whose frames are worth nothing unless the mirror follows commands."""
 
 import time
+from collections import deque
 
 from google.protobuf.message import DecodeError
 
@@ -18,6 +19,7 @@ class MirrorWatch:
 
     Attributes:
         frame_sequence: of the newest command that every known mirror follows.
+        applied: the last ones of them, each with the time at which the mirror reported it, ns of the host's clock.
         interruption: what kept a mirror from following commands meanwhile, a sentence's subject and verb; else empty.
     """
 
@@ -28,6 +30,7 @@ class MirrorWatch:
             BusError: no mirror reported.
         """
         self.interruption = ""
+        self.applied: deque[tuple[int, int]] = deque(maxlen=WAITING)
         self._events: Ring = bus.ring(EVENT, WAITING)
         self._states: Ring = bus.ring(MIRROR_STATE, WAITING)
         self._mirrors: dict[str, tuple[int, int]] = {}  # by name: start of its process, frame of its command
@@ -54,6 +57,8 @@ class MirrorWatch:
                 continue
             if self._mirrors.get(name, (start_s, 0))[0] != start_s:
                 self.interruption = f"the mirror {name!r} restarted"
+            if state.frame_sequence > self._mirrors.get(name, (start_s, 0))[1]:
+                self.applied.append((state.frame_sequence, sample.publish_time_ns))
             self._mirrors[name] = start_s, state.frame_sequence
         for sample in self._events.drain():
             try:

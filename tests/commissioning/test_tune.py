@@ -4,6 +4,7 @@ import json
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -156,6 +157,19 @@ def test_a_running_loop_is_listened_to() -> None:
     assert 0 < added["predicted"] < added["open"]
     assert set(added["by_group"]["predicted"]) == {"tilt", "focus"}
     assert f"closed {added['closed']:+.1e}, predicted {added['predicted']:+.1e}; focus costs most (" in render(found)
+
+
+class Applying(Watched):
+    """Its mirror reports each command a fifth of a frame after the exposure's end."""
+
+    def mirror_watch(self) -> Any:
+        applied = [(frame_sequence(index), index * PERIOD_NS + PERIOD_NS // 5) for index in range(4000, 5000)]
+        return SimpleNamespace(applied=applied, read=lambda: None)
+
+
+def test_a_running_loop_tells_when_its_commands_are_applied() -> None:
+    run = of_run(Applying(CONFIG), 60.0)
+    assert (run.timing.delay, run.timing.applied) == (1.0, pytest.approx(0.7, abs=1e-3))
 
 
 def test_too_short_a_time_to_listen_is_refused_before_it_has_passed() -> None:

@@ -8,12 +8,14 @@ from typing import Any
 import numpy as np
 import pytest
 
-from lowfc.adapters.files.factory import analytic_calibration, mirror_on_twin, twin
+from lowfc.adapters.files.factory import analytic_calibration, mirror_on_twin, sensor, twin
 from lowfc.contract.configuration import Configuration, load
 from lowfc.contract.errors import ConfigurationError
 from lowfc.contract.messages import wire
 from lowfc.control.calibration.calibration import Calibration
 from lowfc.control.loop.estimator import Estimator
+from lowfc.optics.chain.sensor import image, pupil_radii
+from lowfc.optics.chain.zernike import zernikes
 from lowfc.optics.twin.twin import Evaluator
 from sim_camera.disturbance import BLOCK, _sum_of_waves
 from sim_camera.driver import disturbance_of
@@ -133,6 +135,25 @@ def test_an_image_is_the_mean_over_its_exposure(exposure: float) -> None:
         found = (blurred.expose(index, FLAT).astype(float) - 100) * 0.01
         worst = max(worst, float(np.abs(found - mean).max() / mean.max()))
     assert worst < 1e-5 + 0.005 / mean.max(), "and half a digital number"
+
+
+@pytest.mark.slow
+def test_a_blurred_image_is_as_near_the_full_model_as_one_at_rest() -> None:
+    """Two instants of the twin against 64 of the full optics, and one of each: at most a tenth worse."""
+    keys = {"disturbance__preset": "reaction-wheel-ideal", "camera__rate_hz": 1000.0}
+    config = configured(**FINE, **keys)
+    blurred, shaken, optics = scene_of(config), disturbance_of(config), sensor(config, print)
+    instant, shapes = Evaluator(blurred._optics), zernikes(config.noll, *pupil_radii(optics))
+    at_rest = moving = 0.0
+    for index in (0, 91):
+        instants = index + config.camera.exposure_fraction * (np.arange(64) + 0.5) / 64
+        each = [image(optics, np.tensordot(one, shapes, 1)) for one in _sum_of_waves(shaken, instants / 1000)]
+        middle = _sum_of_waves(shaken, instants[32:33] / 1000)[0].astype(np.float32)
+        electrons = float(blurred._electrons)
+        at_rest = max(at_rest, float(np.abs(instant.image(middle @ blurred._basis) - each[32]).max()))
+        found = (blurred.expose(index, FLAT).astype(float) - 100) * 0.01 / electrons
+        moving = max(moving, float(np.abs(found - np.mean(each, axis=0)).max()))
+    assert moving < 1.1 * at_rest + 0.005 / electrons, "and half a digital number"
 
 
 def test_the_continuous_truth_is_the_rms_over_the_period_and_the_mirrors_path(calibration: Calibration) -> None:

@@ -285,6 +285,11 @@ def joined(values: npt.NDArray[Any], rows: Long) -> npt.NDArray[Any]:
     return found
 
 
+def exposure_fraction(camera: wire.CameraState | None) -> float | None:
+    """Exposure over period; None where they are not known."""
+    return camera.exposure_ns / camera.period_ns if camera is not None and camera.period_ns else None
+
+
 def frame_rate_hz(camera: wire.CameraState | None, steps: Steps) -> float:
     """Frame rate: the camera's period where it is known, the median interval of the steps otherwise; 0 for none."""
     if camera is not None and camera.period_ns:

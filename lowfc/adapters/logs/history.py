@@ -21,6 +21,7 @@ from lowfc.adapters.logs.columns import (
     TruthRows,
     Truths,
     bits_of,
+    exposure_fraction,
     frame_rate_hz,
     joined,
     rows_of,
@@ -141,9 +142,8 @@ class History:
 
     @property
     def exposure_fraction(self) -> float | None:
-        """Exposure over period, of the camera; None where they are not known."""
-        camera = self.camera
-        return camera.exposure_ns / camera.period_ns if camera is not None and camera.period_ns else None
+        """See `columns.exposure_fraction`."""
+        return exposure_fraction(self.camera)
 
     @cached_property
     def true(self) -> Truths | None:

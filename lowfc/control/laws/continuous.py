@@ -22,6 +22,7 @@ _FILTER_REACH = 48
 """Frames before and after by which a mean between measurements is told."""
 
 _MOMENTS = 8
+_LONGEST = 5  # periods until a command is applied
 
 
 class Timing(NamedTuple):
@@ -43,6 +44,14 @@ class Timing(NamedTuple):
     def of(cls, delay: float, exposure: float) -> "Timing":
         """A command is in force when the first exposure wholly under it begins."""
         return cls(delay, delay, exposure)
+
+    @classmethod
+    def measured(cls, delay: float, exposure: float, waited: float) -> "Timing":
+        """A command is in force so long after its exposure's end; impossible or simulated times do not count."""
+        after = exposure + waited
+        if delay != round(delay) or not exposure < after <= _LONGEST:
+            return cls.of(delay, exposure)
+        return cls(delay, delay + after - np.ceil(after), exposure)
 
     @classmethod
     def sampled(cls, delay: float) -> "Timing":

@@ -32,7 +32,9 @@ from lowfc.control.laws.what_if import counterfactual, driven_by
 _NARROWER = (0.1, 0.01, 1e-3)  # what a line's width is tried at, of that fitted, where a log cannot resolve it
 _FASTER = (10.0,)  # and where lines move
 _SETTLING_FRAMES = 5000
-_QUIETER = 2.0 ** np.arange(8)  # by which noise is overestimated, until the margins hold
+_OCTAVES = (0.0, 1.0, 2.0, 4.0, 8.0, 16.0, 32.0)  # by which noise is overestimated, until the margins hold
+_NEAR_ENOUGH = 0.25
+"""Octaves between a filter whose margins hold and one whose do not: they leave the same within half a percent."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -156,12 +158,13 @@ def tune_lqg(
 
     scaled = ([_scaled(model, factor, finest_hz) for model in models] for factor in (*_NARROWER, *_FASTER))
     tried = [models, *scaled]
-    robust = [[_within_margins(model, timing) for model in candidates] for candidates in tried]
     steady = [integrator_block(g, lost, "pol", timing.delay) for g, lost in zip(gains.gain, leak, strict=True)]
+    held = [[within_margins(model, timing) for model in candidates] for candidates in tried]
+    robust = [[block or rest for block, rest in zip(blocks, steady, strict=True)] for blocks in held]
     left_nm2 = np.nan_to_num([left(blocks) for blocks in robust], nan=np.inf)
     best = left_nm2.argmin(axis=0)
-    wins = left_nm2.min(axis=0) < left(steady)
     modes = range(len(noll))
+    wins = left_nm2.min(axis=0) < left(steady)  # of themselves integrators do not
     chosen = [tried[best[mode]][mode] for mode in modes]
     law = law_of([robust[best[mode]][mode] if wins[mode] else steady[mode] for mode in modes])
     return _tuned(law, timing, ["lqg" if better else "integrator" for better in wins], chosen)
@@ -276,14 +279,33 @@ def _scaled(model: Model, factor: float, finest_hz: float) -> Model:
     return replace(model, lines=tuple(lines))
 
 
-def _within_margins(model: Model, timing: Timing) -> Block:
-    """The filter of a model, its noise taken for higher until the margins hold."""
-    for factor in _QUIETER.tolist():
-        block = lqg_block(replace(model, noise_nm2=factor * model.noise_nm2), timing)
+def within_margins(model: Model, timing: Timing) -> Block | None:
+    """The filter of a model, its noise taken for as much higher as the margins need; None where no such one has them.
+
+    A filter that trusts its measurements less foresees more smoothly; of one that knows a line, little is lost.
+    """
+
+    def held(octaves: float) -> Block | None:
+        block = lqg_block(replace(model, noise_nm2=2.0**octaves * model.noise_nm2), timing)
         law = of_blocks([block], "pol", "lqg", (2,), timing.delay, model.rate_hz)  # or any other mode
-        if _holds(margins.margins(law, timing.delay)):
+        return block if _holds(margins.margins(law, timing.delay)) else None
+
+    low = 0.0
+    for high in _OCTAVES:
+        found = held(high)
+        if found is not None:
             break
-    return block
+        low = high
+    else:
+        return None
+    while high - low > _NEAR_ENOUGH:
+        middle = (low + high) / 2
+        nearer = held(middle)
+        if nearer is None:
+            low = middle
+        else:
+            high, found = middle, nearer
+    return found
 
 
 def _holds(found: margins.Margins) -> bool:

@@ -11,10 +11,10 @@ from lowfc.adapters.logs.columns import Steps, of_steps
 from lowfc.adapters.logs.history import read_history
 from lowfc.adapters.logs.reader import LogReader
 from lowfc.arrays import Array, Mask, Single
-from lowfc.client import Client, configuration_of
+from lowfc.client import Client, MirrorWatch, configuration_of
 from lowfc.contract.codecs.law_codec import driving, gains_of
 from lowfc.contract.configuration import Configuration
-from lowfc.contract.errors import DataFileError
+from lowfc.contract.errors import BusError, DataFileError
 from lowfc.control.calibration.calibration import Calibration
 from lowfc.control.laws.continuous import Timing
 from lowfc.control.laws.law import Law
@@ -120,14 +120,17 @@ def of_run(loop: Client, seconds: float, progress: Callable[[float], None] | Non
             f"run {loop.run_id!r}: a law is tuned from at least {FEWEST} frames in a row, {needed_s:.3g} s at "
             f"{config.camera.rate_hz:g} Hz; asked to listen for {seconds:g} s: --live {np.ceil(1.2 * needed_s):.0f}"
         )
+    watch = _watched(loop)
     begun_s = time.monotonic()
     steps: list[Step] = []
     stream = loop.steps()
     for step in stream:
         steps.append(step)
         passed_s = time.monotonic() - begun_s
-        if progress is not None and len(steps) % 100 == 0:
+        if len(steps) % 100 == 0 and progress is not None:
             progress(passed_s)
+        if len(steps) % 100 == 0 and watch is not None:
+            watch.read()
         if passed_s >= seconds:
             break
     stream.close()
@@ -135,10 +138,11 @@ def of_run(loop: Client, seconds: float, progress: Callable[[float], None] | Non
         raise DataFileError(f"run {loop.run_id!r} has no calibration yet: `lowfc ctl load` gives it one")
     made = of_steps(steps, len(calibration.noll))
     period_s = float(np.median(np.diff(made.time_ns))) * 1e-9 if len(steps) > 1 else 0.0
+    rate_hz = 1 / period_s if period_s > 0 else config.camera.rate_hz
     return _telemetry(
         loop.run_id,
-        1 / period_s if period_s > 0 else config.camera.rate_hz,
-        Timing.of(float(state.delay_frames), config.camera.exposure_fraction),
+        rate_hz,
+        _timing(float(state.delay_frames), config.camera.exposure_fraction, made, watch, rate_hz),
         (gains_of(state), driving(state, loop.laws())),
         made,
         np.isfinite(made.pol_nm).all(axis=1) & (made.saturated_pixels == 0),
@@ -147,6 +151,23 @@ def of_run(loop: Client, seconds: float, progress: Callable[[float], None] | Non
         calibration,
         [f"{stream.lost} steps did not get here in time"] if stream.lost else [],
     )
+
+
+def _watched(loop: Client) -> MirrorWatch | None:
+    try:
+        return loop.mirror_watch()
+    except BusError:  # a mirror of somebody's own need not report
+        return None
+
+
+def _timing(delay: float, exposure: float, steps: Steps, watch: MirrorWatch | None, rate_hz: float) -> Timing:
+    """When commands are applied, by the times at which the mirror reported the last ones."""
+    ended_ns = dict(zip(steps.sequence.tolist(), steps.time_ns.tolist(), strict=True))
+    applied = () if watch is None else watch.applied
+    waited_ns = [time_ns - ended_ns[sequence] for sequence, time_ns in applied if sequence in ended_ns]
+    if not waited_ns:
+        return Timing.of(delay, exposure)
+    return Timing.measured(delay, exposure, float(np.median(waited_ns)) * 1e-9 * rate_hz)
 
 
 def _telemetry(

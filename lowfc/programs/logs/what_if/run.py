@@ -100,13 +100,10 @@ class LoggedRun:
             exposure = (history.configuration or Configuration()).camera.exposure_fraction
         rows = rows_of(history.mirror.sequence, self.steps.sequence)
         known = rows >= 0
-        if not known.any() or delay != round(delay):
+        if not known.any():
             return Timing.of(delay, exposure)
         waited_ns = history.mirror.publish_time_ns[known] - self.steps.time_ns[rows[known]]
-        after = exposure + float(np.median(waited_ns)) * 1e-9 * history.rate_hz
-        if not exposure < after <= LONGEST_DELAY:  # simulated time
-            return Timing.of(delay, exposure)
-        return Timing(delay, delay + after - np.ceil(after), exposure)
+        return Timing.measured(delay, exposure, float(np.median(waited_ns)) * 1e-9 * history.rate_hz)
 
     def rows_to_compare(self, laws: list[Law], usable: Mask) -> tuple[Mask, int, str]:
         """Which of the usable steps to compare runs at, the frames in which these laws settle, and in words.

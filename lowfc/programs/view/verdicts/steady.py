@@ -5,6 +5,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from lowfc.adapters.logs.columns import exposure_fraction
 from lowfc.arrays import Sequences, Single
 from lowfc.contract.codecs.law_codec import overruled
 from lowfc.contract.messages import wire
@@ -94,10 +95,9 @@ def attained(steady: Steady, rate_hz: float, camera: wire.CameraState | None) ->
     if law is None or steady.mode != LoopMode.CLOSED or not rate_hz:
         return None
     sequence, signals = steady.rows()
-    exposure = camera.exposure_ns / camera.period_ns if camera is not None and camera.period_ns else 0.0
     try:
-        pol, timing = pieces(sequence, signals[:, modes:]), Timing.of(law.delay_frames, exposure)
-        best = best_gains(pol, rate_hz, timing, np.array(law.leak))
+        timing = Timing.of(law.delay_frames, exposure_fraction(camera) or 0.0)
+        best = best_gains(pieces(sequence, signals[:, modes:]), rate_hz, timing, np.array(law.leak))
     except ValueError:
         return None  # too few frames in a row
     error_nm = signals[np.isfinite(signals).all(axis=1), :modes].astype(np.float64)

@@ -1,0 +1,76 @@
+"""LQG for damped lines: how near the best law that keeps the margins, and the margins themselves."""
+
+import numpy as np
+import pytest
+
+from lowfc.adapters.files.factory import frame_noise_nm
+from lowfc.control.laws.continuous import Timing
+from lowfc.control.laws.kalman import lqg_block
+from lowfc.control.laws.linear_law import of_blocks
+from lowfc.control.laws.margins import margins
+from lowfc.control.laws.spectra import Pieces
+from lowfc.control.laws.stability import LEAST_GAIN_MARGIN, LEAST_PHASE_MARGIN_DEG
+from lowfc.control.laws.tuning import within_margins
+from lowfc.control.laws.vibration import Line, Model
+from sim_camera.disturbance import LINES_HZ, LINES_MAS
+from tools import laws, lines
+from tools.law_bench import RATE_HZ, Bench, calibrated, configured, tuned
+
+
+def test_an_identified_law_is_near_the_best() -> None:
+    """At a noise at which the margins cost nothing."""
+    config = configured()
+    calibration = calibrated(config)
+    law = tuned(lines.tilts_of(config, frame_noise_nm(config, calibration)[:2], 8000), config)["lqg"].law
+    assert np.hypot(*laws.theory_mas(config, calibration, law)) < 1.05 * laws.optimum_mas(config, calibration)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("delay", lines.DELAYS)
+@pytest.mark.parametrize("magnitude", lines.MAGNITUDES)
+@pytest.mark.parametrize("width", lines.WIDTHS)
+def test_laws_are_near_the_best_that_keeps_the_margins(width: float, magnitude: float, delay: float) -> None:
+    found = lines.case(width, magnitude, delay)
+    assert max(found["identified_mas"]) < 1.05 * found["best_within_margins_mas"]
+    assert found["optimum_mas"] <= 1.001 * found["best_within_margins_mas"]
+
+
+@pytest.mark.parametrize("noise_nm", [0.05, 0.3, 2.0])
+@pytest.mark.parametrize("width", lines.WIDTHS)
+@pytest.mark.parametrize("delay", lines.DELAYS)
+def test_however_little_noise_there_is_a_filter_keeps_the_margins(noise_nm: float, width: float, delay: float) -> None:
+    """The less noise, the more a filter trusts and the smaller its margins: noise is taken for as high as needed."""
+    timing = Timing.of(delay, 0.5)
+    known = tuple(Line(hz, width * hz, (2.4 * mas) ** 2) for hz, mas in zip(LINES_HZ, LINES_MAS, strict=True))
+    model = Model(0.02, 2.0, known, noise_nm**2, RATE_HZ)
+    block = within_margins(model, timing)
+    assert block is not None
+    law, free = (of_blocks([one], "pol", "lqg", (2,), delay, RATE_HZ) for one in (block, lqg_block(model, timing)))
+
+    def over(one: object) -> float:
+        """The margin that is nearest to its limit, of that limit."""
+        found = margins(one, delay)
+        gain = min(found.gain_margin[0], 1 / max(found.gain_reduction[0], 1e-9)) / LEAST_GAIN_MARGIN
+        return float(min(gain, found.phase_margin_deg[0] / (0.7 * LEAST_PHASE_MARGIN_DEG)))
+
+    assert over(law) >= 1
+    assert over(law) < 1.1 or over(law) == over(free)
+
+
+@pytest.mark.slow
+def test_frames_without_images_are_as_those_with_them() -> None:
+    """Noise of the twin's images through the live loop, and the law that is identified from it."""
+    config = configured()
+    calibration = calibrated(config)
+    bench = Bench(config, calibration)
+    bench.ask("close")
+    bench.run(1000)
+    bench.forget()
+    bench.run(lines.FRAMES)
+    noise_nm = frame_noise_nm(config, calibration)[:2]
+    left = []
+    for pol in (Pieces((bench.pol().values[0][:, :2],), 0), lines.tilts_of(config, noise_nm, lines.FRAMES)):
+        found = tuned(pol, config)["lqg"]
+        np.testing.assert_allclose(np.sqrt([model.noise_nm2 for model in found.models]), noise_nm, rtol=0.1)
+        left.append(float(np.hypot(*laws.theory_mas(config, calibration, found.law))))
+    assert left[0] == pytest.approx(left[1], rel=0.03)
