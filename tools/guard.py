@@ -10,6 +10,7 @@ import numpy as np
 from rich.progress import track
 from threadpoolctl import threadpool_limits
 
+from lowfc.adapters.files.factory import frame_noise_nm2
 from lowfc.arrays import Array
 from lowfc.contract.configuration import Configuration
 from lowfc.control.laws.kalman import lqg
@@ -24,7 +25,7 @@ from lowfc.optics.detector.photometry import tilt_nm_per_mas
 from sim_camera.disturbance import LINE_WIDTH, LINES_HZ, LINES_MAS
 from sim_camera.driver import disturbance_of
 from tools.law_bench import RATE_HZ, calibrated, configured, timing_of, tuned
-from tools.modal_bench import ModalBench, noise_covariance_nm2
+from tools.modal_bench import ModalBench
 from tools.shared import Figures, columns
 
 SEEDS = tuple(range(1, 21))
@@ -42,7 +43,7 @@ class Case:
     def __init__(self, preset: str, magnitude: float, law_of: "LawOf | None" = None) -> None:
         self.keys: dict[str, Any] = {"disturbance.preset": preset, "star.magnitude": magnitude}
         config = configured(**self.keys)
-        self.covariance_nm2: Array = noise_covariance_nm2(config, calibrated(config))
+        self.covariance_nm2: Array = frame_noise_nm2(config, calibrated(config))
         bench = ModalBench(config, self.covariance_nm2)
         bench.ask("close")
         bench.run(1_000)

@@ -29,15 +29,6 @@ _INSTANTS = (np.arange(8) + 0.5) / 8
 _DRAWN = 1024
 
 
-def noise_covariance_nm2(config: Configuration, calibration: Calibration) -> Array:
-    """Covariance (modes, modes) of one frame's noise; its diagonal is that of `factory.frame_noise_nm`."""
-    camera, R = factory.detector(config), calibration.reconstructor.astype(float)
-    flux_e, I0 = calibration.flux_dn * camera.gain_e_per_dn / camera.em_gain, calibration.reference.astype(float)
-    variance = (np.maximum(I0, 0) * flux_e + factory.equivalent_read_noise_e(camera) ** 2) / flux_e**2
-    effective = (R - np.outer(R @ I0, calibration.good)) * calibration.good
-    return np.asarray((effective * variance) @ effective.T)
-
-
 def _two_pixels_a_mode(noll: tuple[int, ...]) -> Calibration:
     """A sensor with two pixels for each mode, one brighter and one darker, and a mirror with one actuator for each."""
     modes = len(noll)

@@ -14,7 +14,7 @@ from lowfc.arrays import Array
 from lowfc.contract.configuration import FIXED_GAINS, Configuration
 from lowfc.contract.errors import CalibrationError
 from tools.law_bench import Bench, calibrated, configured
-from tools.modal_bench import ModalBench, noise_covariance_nm2
+from tools.modal_bench import ModalBench
 from tools.shared import Figures, columns
 
 PRESETS = ("bench", "thermal", "reaction-wheel", "quiet")
@@ -41,7 +41,7 @@ def _configured(sensor: str, preset: str, magnitude: float, seed: int, gains: di
 @lru_cache(maxsize=64)
 def _noise(sensor: str, magnitude: float) -> Array:
     config = _configured(sensor, "bench", magnitude, 1, {})
-    return noise_covariance_nm2(config, calibrated(config))
+    return factory.frame_noise_nm2(config, calibrated(config))
 
 
 @lru_cache(maxsize=8)

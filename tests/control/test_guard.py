@@ -6,6 +6,7 @@ from functools import lru_cache
 import numpy as np
 import pytest
 
+from lowfc.adapters.files.factory import frame_noise_nm2
 from lowfc.arrays import Array
 from lowfc.contract.codecs.state_codec import controller_state, decode_state
 from lowfc.control.laws.linear_law import LinearLaw, integrator
@@ -18,7 +19,7 @@ from lowfc.programs.cli.ctl import status
 from tests.support.toy import NOLL, calibration, feed, frame, live, loaded, names, settings
 from tools.guard import MOVED, SEEDS, Case, identified_law, known_law, moved, undisturbed
 from tools.law_bench import Bench, calibrated, configured
-from tools.modal_bench import ModalBench, noise_covariance_nm2
+from tools.modal_bench import ModalBench
 
 RATE_HZ = 1000.0
 WHAT = settings(guard=True, gain=(0.5, 0.3), rate_hz=RATE_HZ)
@@ -215,7 +216,7 @@ def test_noise_without_images_is_that_of_the_images() -> None:
     found = calibrated(config)
     bench = Bench(config, found)
     bench.run(1000)
-    expected = noise_covariance_nm2(config, found)
+    expected = frame_noise_nm2(config, found)
     got = np.cov(np.array([step.error_nm for step in bench.steps]).T)
     assert np.linalg.norm(got - expected) < 0.15 * np.linalg.norm(expected)
     wheel = configured()

@@ -3,8 +3,7 @@
 import numpy as np
 
 from lowfc.arrays import Array, Single, single
-from lowfc.control.calibration.calibration import Calibration
-from lowfc.control.calibration.regularised import pixel_variance
+from lowfc.control.calibration.calibration import Calibration, noise_nm2
 from lowfc.control.loop.camera import CameraSettings
 
 
@@ -18,12 +17,9 @@ def noise_covariance_nm2(calibration: Calibration, flux_dn: float, camera: Camer
     em_gain = max(camera.em_gain, 1.0)
     excess = 2.0 if em_gain > 1 else 1.0
     flux_e = flux_dn * camera.gain_e_per_dn / em_gain
-    variance = excess * pixel_variance(
-        calibration.reference.astype(np.float64), flux_e, camera.read_noise_e / em_gain / excess**0.5
-    )
-    R, good = calibration.reconstructor.astype(np.float64), calibration.good.astype(np.float64)
-    effective = R - np.outer(R @ calibration.reference, good)
-    return np.asarray((effective * (variance * good)) @ effective.T)
+    read_noise_e = camera.read_noise_e / em_gain / excess**0.5
+    R, I0 = calibration.reconstructor.astype(np.float64), calibration.reference.astype(np.float64)
+    return excess * noise_nm2(R, I0, flux_e, read_noise_e)
 
 
 def granted_rows(

@@ -58,17 +58,15 @@ class GainBank:
 
     def __init__(
         self,
-        modes: int,
         kept: Single,
         limit_nm: Single,
         weights: Weights,
         delay_frames: float,
         windows: tuple[int, int],
     ) -> None:
-        """A bank of `modes` modes.
+        """A bank of as many modes as there are leaks.
 
         Args:
-            modes: Number of modes.
             kept: (modes,) 1 - leak.
             limit_nm: (modes,) largest command.
             weights: Which commands an exposure sees.
@@ -78,7 +76,7 @@ class GainBank:
         halvings = int(np.log2(highest_gain(delay_frames) / LEAST_GAIN))
         rows = highest_gain(delay_frames) * 0.5 ** np.arange(halvings, -1.0, -1)
         self.rows = np.concatenate([[0], rows]).astype(np.float32)
-        gain = np.repeat(self.rows[:, None], modes, axis=1)
+        gain = np.repeat(self.rows[:, None], kept.size, axis=1)
         self._at_rest = VirtualIntegrators.at_rest(gain, kept, limit_nm, weights)
         self._windows = windows
         self._closed = self._throughout = False

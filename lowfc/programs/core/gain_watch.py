@@ -26,6 +26,7 @@ CAUTIOUS = 0.05
 """Highest gain of the other modes before tip and tilt are corrected, whose square looks like other modes."""
 LEAST_FRAMES = 50
 """Of a window, however slow the loop."""
+_JUDGED = (LoopMode.OPEN, LoopMode.CLOSED)
 
 
 class Remarks(NamedTuple):
@@ -46,7 +47,6 @@ class _Group:
         frames = [max(round(seconds * rate_hz), LEAST_FRAMES) for seconds in (FIRST_S, window_s)]
         self.mask = mask
         self.bank = GainBank(
-            int(mask.sum()),
             drive.law.kept[mask],
             drive.law.limit_nm[mask],
             drive.weights,
@@ -96,14 +96,18 @@ class GainWatch:
         self._newest = step.frame_sequence
         held = missing if same_camera else 0
         added = drive.command_channels
-        if step.error_nm is None or step.pol_nm is None or (added is not None and added.play is not None):
+        playing = added is not None and added.play is not None
+        if step.error_nm is None or playing:
             held += 1
         if held:
             for group in self._groups:
                 group.bank.held(held)
-        if step.error_nm is None or step.pol_nm is None or state.mode not in (LoopMode.OPEN, LoopMode.CLOSED):
-            return NOTHING
-        if added is not None and added.play is not None:
+        if (
+            step.error_nm is None
+            or step.pol_nm is None
+            or playing
+            or state.mode not in (LoopMode.OPEN, LoopMode.CLOSED)
+        ):
             return NOTHING
         open_nm = step.pol_nm if added is None else step.pol_nm - added.offset_nm
         closed = step.mode is LoopMode.CLOSED and not state.returning_to_zero

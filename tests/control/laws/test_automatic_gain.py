@@ -19,7 +19,7 @@ def bank(delay_frames: float = 1.0, windows: tuple[int, int] = (1000, 500)) -> G
     weights = tuple(
         (lag, weight) for lag, weight in enumerate(delay_weights(delay_frames).astype(np.float32)) if weight
     )
-    return GainBank(MODES, ONES, 1e6 * ONES, weights, delay_frames, windows)
+    return GainBank(ONES, 1e6 * ONES, weights, delay_frames, windows)
 
 
 def verdicts(made: GainBank, open_nm: Array, gain: Array, noise_nm2: float) -> list[Verdict]:
