@@ -17,6 +17,7 @@ from lowfc.adapters.logs.history import read_history
 from lowfc.adapters.logs.reader import LogReader
 from lowfc.arrays import Array, Mask
 from lowfc.client import Client, running
+from lowfc.contract.errors import BusError
 from lowfc.control.loop.command_channels import FLAT
 from tools.shared import Figures, markdown
 
@@ -32,6 +33,7 @@ SHIFTED, PLAIN = "dark-hole", FLAT
 GAINS = "[control]\ntilt_gain = 0.5\ngain = 0.05\n"
 """What the loop would undo depends on its gains."""
 COMMAND = "lowfc sim-loop --lockstep --rate 1000 --disturbance bench --star-magnitude -2"
+RUN = "dark-hole"
 PATIENCE_S = 60.0
 
 
@@ -82,30 +84,34 @@ def dark_hole(folder: Path, each_nm: float, toml: str = "", base_nm: npt.ArrayLi
         base_nm: (rows, columns) what is on the channel without a zero-point shift all the time.
     """
     (folder / "night.toml").write_text(f"{GAINS}{toml}")
-    before = set(running())
-    words = [sys.executable, "-m", *COMMAND.split(), "--config", "night.toml", "--json"]
+    words = [sys.executable, "-m", *COMMAND.split(), "--run", RUN, "--config", "night.toml", "--json"]
     with subprocess.Popen(words, cwd=folder, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
         try:
             deadline_s = time.monotonic() + PATIENCE_S
-            while not set(running()) - before and time.monotonic() < deadline_s and process.poll() is None:
+            while RUN not in running() and time.monotonic() < deadline_s and process.poll() is None:
                 time.sleep(0.05)
-            (name,) = set(running()) - before
-            marks, seen = _asked(name, each_nm, np.asarray(base_nm))
-        finally:
+            marks, seen = _asked(each_nm, np.asarray(base_nm))
+        except BusError as error:
             process.send_signal(signal.SIGINT)
-            out, complaints = process.communicate(timeout=PATIENCE_S)
+            raise RuntimeError(f"{error}; the loop said: {process.communicate(timeout=PATIENCE_S)}") from error
+        process.send_signal(signal.SIGINT)
+        out, complaints = process.communicate(timeout=PATIENCE_S)
     if process.returncode:
         raise RuntimeError(complaints)
     log = folder / json.loads(out)["log"]
     return Night(_channels(log, marks, seen), log)
 
 
-def _asked(run: str, each_nm: float, base_nm: Array) -> tuple[dict[str, list[int]], Array]:
+def _asked(each_nm: float, base_nm: Array) -> tuple[dict[str, list[int]], Array]:
     """First frames of each step of each channel and of its end, and what the sensor sees of the steps."""
     marks: dict[str, list[int]] = {}
-    with Client(run) as loop:
-        for _ in loop.steps(2 * WINDOW, patience_s=PATIENCE_S):
-            pass
+    with Client(RUN) as loop:
+
+        def pass_by(frames: int) -> None:
+            for _ in loop.steps(frames, patience_s=PATIENCE_S):
+                pass
+
+        pass_by(2 * WINDOW)
         calibration = loop.calibration()
         used = np.asarray(calibration.actuators_to_modes.any(axis=0)).reshape(calibration.grid)
         shapes = shapes_nm(calibration.grid, each_nm, used)
@@ -113,13 +119,10 @@ def _asked(run: str, each_nm: float, base_nm: Array) -> tuple[dict[str, list[int
             marks[channel] = []
             for shape in shapes[every - 1 :: every]:
                 marks[channel].append(loop.channel(channel, shape + under_nm).frame_sequence)
-                for _ in loop.steps(SETTLE):
-                    pass
-            for _ in loop.steps(WINDOW):
-                pass
+                pass_by(SETTLE)
+            pass_by(WINDOW)
             marks[channel].append(loop.channel(channel, np.zeros(calibration.grid) + under_nm).frame_sequence)
-            for _ in loop.steps(WINDOW):
-                pass
+            pass_by(WINDOW)
     seen = shapes.reshape(STEPS, -1) @ calibration.actuators_to_modes.T.astype(np.float64)
     return marks, np.vstack([np.zeros(seen.shape[1]), seen])
 
