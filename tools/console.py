@@ -1,4 +1,4 @@
-"""Make the pictures of docs/console.md: `python -m tools.measure console`, about two minutes.
+"""Make the pictures of docs/howto/console.md: `python -m tools.measure console`, about two minutes.
 
 Real processes are brought into each state by hand, and a console without a terminal looks at them.
 """

@@ -1,4 +1,4 @@
-"""What laws leave of the wheel's five lines at every moment, in theory: a table of docs/tuning.md."""
+"""What laws leave of the wheel's five lines at every moment, in theory: a table of docs/howto/tuning.md."""
 
 from dataclasses import replace
 

@@ -1,4 +1,4 @@
-"""How much of a dark hole's steps the loop undoes: the table of docs/zero_point.md."""
+"""How much of a dark hole's steps the loop undoes: the table of docs/howto/zero_point.md."""
 
 import json
 import signal

@@ -1,4 +1,4 @@
-"""The guard of a law in the simulated loop, where lines move and where laws are good: a table of docs/tuning.md."""
+"""The guard of a law in the simulated loop, where lines move and where laws are good: for docs/howto/tuning.md."""
 
 import timeit
 from collections.abc import Callable

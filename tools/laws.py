@@ -1,4 +1,4 @@
-"""Every control law in the simulated loop, beside its theory: the table of docs/tuning.md."""
+"""Every control law in the simulated loop, beside its theory: the table of docs/howto/tuning.md."""
 
 from typing import Any
 

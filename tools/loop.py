@@ -68,7 +68,7 @@ SHORT_COLUMNS = {
 def short(figures: Figures) -> str:
     """Rate, latency and residual of the runs with real-time scheduling."""
     rows = (run for name, run in figures["runs"].items() if "SCHED_FIFO" in name)
-    pointer = "[Performance](docs/performance.md) has all runs, and how they were measured."
+    pointer = "[Performance](docs/measured/performance.md) has all runs, and how they were measured."
     return f"{columns(SHORT_COLUMNS, rows)}\n{pointer}\n"
 
 

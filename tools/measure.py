@@ -27,7 +27,7 @@ from tools.declared import DECLARED
 from tools.shared import ROOT, Figures, host, json_of, where
 
 MEASURED = ROOT / "tools" / "measured"
-PAGES = (ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md")))
+PAGES = (ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md")))
 SHORT = "loop in short"
 COST_CURVES = ROOT / "docs" / "pictures" / "cost_curves.png"
 

@@ -1,4 +1,4 @@
-"""Make the pictures of docs/viewing.md and the README: `python -m tools.measure pictures`, about three minutes.
+"""Make the pictures of docs/howto/viewing.md and the README: `python -m tools.measure pictures`, about three minutes.
 
 Real processes are brought into each state by hand, as an operator's bad night would, and `lowfc view
 --headless-screenshot` looks at them. Needs a Vulkan driver: `apt install mesa-vulkan-drivers libvulkan1`.

@@ -1,4 +1,4 @@
-"""Tables of docs/reliability.md: faults injected into the loop, hours of it, and damaged inputs for its readers."""
+"""Tables of docs/measured/reliability.md: faults injected into the loop, hours of it, damaged inputs."""
 
 from tempfile import TemporaryDirectory
 

@@ -1,4 +1,4 @@
-"""Every sensor, alone and in the simulated loop: the table of docs/sensors.md."""
+"""Every sensor, alone and in the simulated loop: the table of docs/explanation/sensors.md."""
 
 import statistics
 import sys

@@ -1,4 +1,4 @@
-"""How well the simulated loop holds slow drifts, mode by mode: the second table of docs/tuning.md."""
+"""How well the simulated loop holds slow drifts, mode by mode: the second table of docs/howto/tuning.md."""
 
 from typing import Any
 

@@ -1,4 +1,4 @@
-"""`lowfc hosts` and `lowfc router` leave nothing of having asked; docs/hosts.md has the code's figures."""
+"""`lowfc hosts` and `lowfc router` leave nothing of having asked; docs/howto/hosts.md has the code's figures."""
 
 import inspect
 import json
@@ -16,7 +16,7 @@ from lowfc.programs.cli.hosts import certs
 from tests.e2e.test_hosts import SHIFTS_NS
 from tests.support.loops import lowfc
 
-DOCUMENT = Path(__file__).parents[2] / "docs" / "hosts.md"
+DOCUMENT = Path(__file__).parents[2] / "docs" / "howto" / "hosts.md"
 WAY = Network(router="tls/127.0.0.1:7447", certificates="/etc/lowfc/certs")
 
 

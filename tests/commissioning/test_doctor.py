@@ -27,7 +27,7 @@ from lowfc.programs.commissioning.doctor.facts import Facts, gather, ranges
 from lowfc.programs.core.recording.volume import bytes_per_s
 from tests.support.loops import lowfc, until
 
-DOCUMENT = Path(__file__).parents[2] / "docs" / "doctor.md"
+DOCUMENT = Path(__file__).parents[2] / "docs" / "howto" / "doctor.md"
 LOOKS = {**timing.CHECKS.looks, **room.CHECKS.looks}
 NO_RIGHTS = [
     *(["setpriv", "--inh-caps=-all", "--bounding-set=-sys_nice,-ipc_lock,-sys_resource"] if os.geteuid() == 0 else []),

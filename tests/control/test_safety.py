@@ -230,7 +230,7 @@ def test_an_unknown_request_is_an_error_of_the_program() -> None:
 
 def test_the_document_on_safety_names_tests_that_exist() -> None:
     root = Path(__file__).parents[2]
-    named = set(re.findall(r"`(test_\w+)`", (root / "docs" / "safety.md").read_text(encoding="utf-8")))
+    named = set(re.findall(r"`(test_\w+)`", (root / "docs" / "explanation" / "safety.md").read_text(encoding="utf-8")))
     every = "\n".join(path.read_text(encoding="utf-8") for path in (root / "tests").rglob("test_*.py"))
     assert len(named) > 30
     assert {name for name in named if f"def {name}(" not in every} == set()

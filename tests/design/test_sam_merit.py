@@ -31,7 +31,7 @@ from lowfc.optics.chain.sam import Layout, check, transmission
 from lowfc.optics.chain.zernike import NOLLS_20, zernikes
 from lowfc.optics.detector.photometry import Photometry, electrons, tilt_nm_per_mas
 
-RECORDED_TABLES = Path(__file__).parents[2] / "docs" / "paper.json"
+RECORDED_TABLES = Path(__file__).parents[2] / "docs" / "measured" / "paper.json"
 
 
 @pytest.fixture(scope="module")

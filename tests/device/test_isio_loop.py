@@ -52,7 +52,7 @@ CAMERA_DRIVER = "lowfc camera isio --run bench --config bench.toml"
 CONTROLLER = "lowfc controller --run bench --config bench.toml"
 BRIDGE = "lowfc bridge isio --run bench --beside dm00disp03"
 DOCUMENTED = (MIRROR, CAMERA_DRIVER, CONTROLLER, BRIDGE)
-"""Commands of docs/cacao.md; all are run here."""
+"""Commands of docs/howto/cacao.md; all are run here."""
 
 
 class Bench:

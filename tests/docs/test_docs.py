@@ -53,7 +53,9 @@ def run(folder: Path, line: str) -> str:
 
 def test_every_command_of_the_documents_is_known() -> None:
     found = [
-        line for document in (README, *ROOT.glob("docs/*.md"), *ROOT.glob("deploy/*.md")) for line in commands(document)
+        line
+        for document in (README, *ROOT.glob("docs/**/*.md"), *ROOT.glob("deploy/*.md"))
+        for line in commands(document)
     ]
     assert len(found) > 15
     tested = {*ELSEWHERE, *LOOPS, *LOGS, *REQUESTS, *FILES, *BY_HAND, *SESSION, *BENCH, *VALIDATE, *DESIGN, *LOOKING}
@@ -61,6 +63,12 @@ def test_every_command_of_the_documents_is_known() -> None:
     assert set(found) == tested
     for line, where in ELSEWHERE.items():
         assert line.split()[0] in (ROOT / where).read_text()
+
+
+def test_every_link_leads_to_a_file() -> None:
+    for document in (*ROOT.glob("*.md"), *ROOT.glob("docs/**/*.md"), *ROOT.glob("deploy/*.md")):
+        for target in re.findall(r"\]\((?![a-z]+:|#)([^)#\s]+)", document.read_text()):
+            assert (document.parent / target).exists(), f"{document}: {target}"
 
 
 LOOPS = (

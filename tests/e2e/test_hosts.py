@@ -1,6 +1,6 @@
 """The loop across hosts: camera, controller, mirror and desk in network namespaces of their own, and a router.
 
-What happens when a link is cut, and what somebody gets who should get nothing. See docs/hosts.md.
+What happens when a link is cut, and what somebody gets who should get nothing. See docs/howto/hosts.md.
 """
 
 import contextlib

@@ -116,7 +116,7 @@ def test_a_process_that_stands_still_is_named(tmp_path: Path) -> None:
     assert "Traceback" not in complaints
 
 
-DOCS = Path(__file__).parents[2] / "docs"
+DOCS = Path(__file__).parents[2] / "docs" / "explanation"
 
 STATIC_NM = dict(zip(range(2, 16), (12, -9, 8, -7, 6, 5, -5, 4, -4, 3, -3, 3, -3, 3), strict=True))
 STILL = f"""

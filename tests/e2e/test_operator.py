@@ -1,4 +1,4 @@
-"""A night with the loop: every command of docs/operating.md, and its programs, against real processes."""
+"""A night with the loop: every command of docs/howto/operating.md, and its programs, against real processes."""
 
 import contextlib
 import io
@@ -31,7 +31,7 @@ from tests.support.safety_checks import violations
 
 pytestmark = pytest.mark.exclusive
 
-DOCUMENT = Path(__file__).parents[2] / "docs" / "operating.md"
+DOCUMENT = Path(__file__).parents[2] / "docs" / "howto" / "operating.md"
 COMMANDS = re.findall(r"^    (lowfc ctl .*)$", DOCUMENT.read_text(), flags=re.MULTILINE)
 PROGRAMS = re.findall(r"^```python\n(.*?)^```$", DOCUMENT.read_text(), flags=re.MULTILINE | re.DOTALL)
 

@@ -1,4 +1,4 @@
-"""The examples of docs/hardware.md and docs/commissioning.md as real processes: devices that are not of ours."""
+"""The examples of hardware.md and commissioning.md in docs/howto as real processes: devices that are not of ours."""
 
 import json
 import re
@@ -55,7 +55,7 @@ COUNTING = (
 )
 DOCTOR = "lowfc doctor --device sim"
 DOCUMENTED = (*DEVICES, *CONFORMANCE, *LOOP, *PLAIN, *COUNTING, DOCTOR)
-"""Commands of docs/hardware.md; all are run here."""
+"""Commands of docs/howto/hardware.md; all are run here."""
 
 SIMULATED = ("sim-camera --run bench --config bench.toml", "sim-dm --run bench --config bench.toml")
 
@@ -155,14 +155,14 @@ def test_the_simulated_devices_and_a_camera_in_plain_zenoh_keep_the_contract(ben
 
 @pytest.mark.slow
 def test_a_camera_written_from_the_page_is_right_at_its_first_run(bench: Path) -> None:
-    (bench / "counting.py").write_text(block("python", (ROOT / "docs/hardware.md").read_text()))
+    (bench / "counting.py").write_text(block("python", (ROOT / "docs/howto/hardware.md").read_text()))
     with going_on(bench, COUNTING[0]):
         until(lambda: (bench / "run/lowfc/counting").exists())
         conformance(bench, COUNTING[1])
     assert "2 ok" in command(bench, DOCTOR)
 
 
-TEXT = (ROOT / "docs/commissioning.md").read_text()
+TEXT = (ROOT / "docs/howto/commissioning.md").read_text()
 COMMISSIONING = re.findall(r"^    ((?:python|lowfc) .*)$", TEXT, flags=re.MULTILINE)
 *PAGE_DEVICES, CONTROLLER, COMMISSION, LATER = COMMISSIONING
 
@@ -181,7 +181,7 @@ def closed(folder: Path) -> bool:
 
 @pytest.mark.slow
 def test_a_camera_of_another_size_comes_to_a_closed_loop(bench: Path) -> None:
-    """docs/commissioning.md, as it stands: a camera of 64 x 64 pixels at 100 Hz with 14 bits."""
+    """docs/howto/commissioning.md, as it stands: a camera of 64 x 64 pixels at 100 Hz with 14 bits."""
     assert len(COMMISSIONING) == 5
     (bench / "examples/small_camera.py").write_text(block("python"))
     (bench / "bench.toml").write_text(block("toml"))

@@ -29,7 +29,7 @@ from lowfc.programs.paper.tables.reconstruction import ESTIMATORS, WITH_NUISANCE
 from lowfc.programs.paper.tables.tables import TABLES
 from tests.support.loops import lowfc
 
-DOCS = Path(__file__).parents[2] / "docs"
+DOCS = Path(__file__).parents[2] / "docs" / "measured"
 SAM = "sam27d07_bal14"
 FEW = 4
 RMS = "RMS residual, matched input"

@@ -1,6 +1,7 @@
 """Limits of the mirror, the loop-mode machine and the dead-man: no control law, no estimate, no trust.
 
-Used by the controller on what it sends and again by the mirror on what it gets. `docs/safety.md` lists the hazards.
+Used by the controller on what it sends and again by the mirror on what it gets; `docs/explanation/safety.md` lists
+the hazards.
 """
 
 from dataclasses import dataclass, field

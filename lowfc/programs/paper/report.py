@@ -1,4 +1,4 @@
-"""Run tables and figures; say what they found as text, as JSON, and as the document docs/paper.md."""
+"""Run tables and figures; say what they found as text, as JSON, and as the document docs/measured/paper.md."""
 
 import json
 from collections.abc import Sequence
@@ -25,7 +25,7 @@ FIGURES: dict[str, Case] = {f"fig{number}": _ALL[f"fig{number}"] for number in r
 CASES: dict[str, Case] = {**TABLES, **FIGURES}
 
 DOCUMENT, RESULTS, PICTURES = "paper.md", "paper.json", "pictures/paper"
-COMMAND = "lowfc validate all --docs docs"
+COMMAND = "lowfc validate all --docs docs/measured"
 
 Table = dict[str, Any]
 

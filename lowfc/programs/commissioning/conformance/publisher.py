@@ -32,7 +32,7 @@ def _envelope(seen: Collected) -> Check | None:
         return ok(f"on all of {len(messages)} messages") if messages else None
     sizes = sorted({"none" if one is None else f"{len(one)} bytes" for one in bare})
     got = f"{len(bare)} of {len(messages)} messages with {', '.join(sizes)}"
-    return wrong(got, "attach it to every put; docs/hardware.md has its bytes")
+    return wrong(got, "attach it to every put; docs/howto/hardware.md has its bytes")
 
 
 @PUBLISHER.check("sequence", "start of the publisher in unix seconds << 32 | count from 0, one more with each put")

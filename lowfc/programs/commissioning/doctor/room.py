@@ -13,7 +13,7 @@ from lowfc.programs.commissioning.doctor.facts import Facts
 from lowfc.programs.core.recording.volume import bytes_per_s, selected
 
 CHECKS: Table[Facts] = Table()
-"""The docstring of each says what it looks at; docs/doctor.md also says when it warns."""
+"""The docstring of each says what it looks at; docs/howto/doctor.md also says when it warns."""
 
 _STALL_S = 0.1
 _OPEN_FILES = 256

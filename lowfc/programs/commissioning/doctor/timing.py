@@ -13,7 +13,7 @@ from lowfc.programs.commissioning.checks import Check, Table, note, ok, warning
 from lowfc.programs.commissioning.doctor.facts import Facts, ranges
 
 CHECKS: Table[Facts] = Table()
-"""The docstring of each says what it looks at; docs/doctor.md also says when it warns."""
+"""The docstring of each says what it looks at; docs/howto/doctor.md also says when it warns."""
 
 PROCESSES = ("camera", "controller", "mirror", "recorder")
 
