@@ -5,7 +5,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 INSTALL := $(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt
 export PYTHONDONTWRITEBYTECODE :=  # rewriting and compiling every test anew takes 5 s of each interpreter that collects them
-.PHONY: help sim-loop test test-all bench lint types format proto node clean
+.PHONY: help sim-loop test test-all bench lint types format proto node docs clean
 
 help:  ## list the targets
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:[^#]*## /\t/' | expand -t 12
@@ -68,5 +68,9 @@ tests/node/node_modules: tests/node/package.json
 	npm install --prefix tests/node --no-audit --no-fund --no-package-lock
 	@touch $@
 
+docs: $(VENV)/.installed  ## build the site: build/docs/index.html
+	$(INSTALL) --editable '.[docs]'
+	$(BIN)/sphinx-build --fail-on-warning --keep-going --quiet docs build/docs
+
 clean:  ## remove what was installed and built
-	rm -rf $(VENV) tests/node/node_modules *.egg-info .pytest_cache .mypy_cache .ruff_cache .hypothesis
+	rm -rf $(VENV) tests/node/node_modules build *.egg-info .pytest_cache .mypy_cache .ruff_cache .hypothesis
