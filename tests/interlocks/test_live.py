@@ -1,0 +1,149 @@
+"""Interlocks on the real processes: at the next frame after the value, the same in a replay; a flood costs nothing."""
+
+import json
+import random
+import time
+from itertools import pairwise
+from pathlib import Path
+
+import pytest
+
+from lowfc.adapters.logs.reader import LogReader
+from lowfc.client import Client, running
+from lowfc.contract.errors import BusError, RequestRefusedError
+from lowfc.contract.messages import BENCH, CONTROL_INPUT, FRAME, STEP, wire
+from tests.support.loops import FIXED, interrupt, run, start, until
+
+FLIPS = 100
+MAX_AGE_S = 1
+FLOOD_HZ = 2000
+FLOOD_S = 2
+S = 1_000_000_000
+CONFIG = f"""
+[camera]
+rate_hz = 500
+{FIXED}
+[[interlocks]]
+name = "mask"
+value = true
+action = "hold"
+max_age_s = {MAX_AGE_S}
+[[interlocks]]
+name = "shutter"
+test = "different"
+value = "open"
+action = "open"
+when_old = "passes"
+"""
+
+
+OPTIONS = ("--config", "night.toml", "--run", "flipped", "--duration", "600")
+
+
+@pytest.mark.exclusive
+def test_flipped_flooded_and_silent_interlocks(tmp_path: Path) -> None:
+    """At 500 Hz: the first frame after a value obeys it; a flood loses no frame; silence counts from the age on."""
+    (tmp_path / "night.toml").write_text(CONFIG)
+    process = start(tmp_path, "sim-loop", "--json", *OPTIONS)
+    try:
+        _publish("flipped")
+    except BaseException:
+        process.kill()
+        process.communicate()
+        raise
+    out, complaints = interrupt(process)
+    assert process.returncode == 0, complaints
+    figures = json.loads(out)
+    assert figures["frames_missing"] == figures["messages_lost"] == 0
+    assert figures["frames_skipped"] <= 3, "the host stands still now and then, a flood would cost hundreds"
+    log = tmp_path / figures["log"]
+    replayed = json.loads(run(tmp_path, "replay", "--json", str(log)).stdout)
+    assert replayed["identical"]
+    assert replayed["unchecked"] == 0
+    _steps_follow_what_was_taken(log)
+    _values_act_at_the_next_frame(log)
+
+
+def _publish(name: str) -> None:
+    """Values at random moments, then a flood of them, then none any more."""
+    until(lambda: name in running(), 60)
+    rng = random.Random(3)  # noqa: S311
+    with Client(name) as loop:
+        until(lambda: _took_frames(loop), 60)
+        loop.bench("shutter", "open")
+        for number in range(FLIPS):  # some fall between the same two frames
+            for acts in (True, False):
+                time.sleep(rng.uniform(0, 0.015))
+                if number % 5:
+                    loop.bench("mask", acts)
+                    continue
+                loop.bench("mask", False)
+                loop.bench("shutter", "shut" if acts else "open")
+                if not acts:
+                    until(lambda: _closed(loop))
+        begun_s = time.monotonic()
+        for number in range(FLOOD_HZ * FLOOD_S):
+            loop.bench("mask", False)
+            if number > FLOOD_HZ * (time.monotonic() - begun_s):
+                time.sleep(0.005)
+        until(lambda: [one.why[:8] for one in loop.status().state.interlocks_acting] == ["no value"])
+
+
+def _took_frames(loop: Client) -> bool:
+    """Whether the loop has begun; before, its controller may not answer yet."""
+    try:
+        return bool(loop.status().state.frame_sequence)
+    except BusError:
+        return False
+
+
+def _closed(loop: Client) -> bool:
+    """Whether the loop was closed; it is refused until the values have been received."""
+    loop.bench("mask", False)
+    try:
+        return loop.close_loop().accepted
+    except RequestRefusedError:
+        return False
+
+
+def _steps_follow_what_was_taken(log: Path) -> None:
+    """Every step is as the interlocks were judged before it; a value that came no more counts from its age on."""
+    types = {STEP.key: wire.ControlStep, CONTROL_INPUT.key: wire.ControlInput}
+    taken = [types[one.key].FromString(one.payload) for one in LogReader(log, topics=[STEP, CONTROL_INPUT])]
+    changes = held = opened = age_ns = 0
+    mask = shut = False
+    for message in sorted(taken, key=lambda message: message.input_number):
+        if isinstance(message, wire.ControlStep):
+            assert (wire.REASON_HELD in message.reasons) is (mask and message.mode == wire.LOOP_MODE_CLOSED)
+            assert not (shut and message.mode == wire.LOOP_MODE_CLOSED)
+            held, opened = held + mask, opened + shut
+        elif message.WhichOneof("input") == "bench_report":
+            changes += 1
+            report = message.bench_report
+            if report.name == "shutter":
+                shut = report.value.text != "open"
+            else:
+                mask = report.value.truth or not report.HasField("value") or report.age_ns > MAX_AGE_S * S
+                age_ns = report.age_ns
+    assert changes >= FLIPS
+    assert held
+    assert opened
+    assert 0 < age_ns - MAX_AGE_S * S < S // 10
+
+
+def _values_act_at_the_next_frame(log: Path) -> None:
+    """The first frame that is published a period after a value obeys it; a few values may be longer on their way."""
+    messages = list(LogReader(log, topics=[BENCH, STEP, FRAME]))
+    values = [one for one in messages if one.key == BENCH.at("mask")]
+    frames_ns = {one.sequence: one.publish_time_ns for one in messages if one.key == FRAME.key}
+    steps = [wire.ControlStep.FromString(one.payload) for one in messages if one.key == STEP.key]
+    obeyed = []
+    for value, after in pairwise(values):
+        acts = wire.BenchValue.FromString(value.payload).truth
+        begun_ns = value.publish_time_ns + S // 500
+        made = [step for step in steps if begun_ns < frames_ns[step.frame_sequence] < after.publish_time_ns]
+        obeyed += [
+            (wire.REASON_HELD in step.reasons) is (acts and step.mode == wire.LOOP_MODE_CLOSED) for step in made[:1]
+        ]
+    assert len(obeyed) > FLIPS // 2
+    assert obeyed.count(False) <= len(obeyed) // 10, f"{obeyed.count(False)} of {len(obeyed)} values came later"
