@@ -173,6 +173,7 @@ def begun(config: Configuration, calibration: Calibration, shape: MirrorShape | 
         state, _ = advance(settings, state, shape)
     requests = StartUp(config).requests(state, 0)
     for request in requests:
+        assert request.requester == "the configuration"
         state, outputs = advance(settings, state, request)
         assert outputs.reply.accepted, outputs.reply.text
     return state, requests

@@ -292,7 +292,8 @@ def test_a_signal_makes_the_loop_safe(rig: Rig) -> None:
     rig.controller.safe_by_signal()
     rig.until("SAFED", lambda: "SAFED" in rig.events())
     rig.until("the request in the log", lambda: rig.said[REQUEST.key][-1].text == "SIGUSR1")
-    assert (rig.said[REQUEST.key][-1].name, rig.said[REQUEST.key][-1].accepted) == ("safe", True)
+    logged = rig.said[REQUEST.key][-1]
+    assert (logged.name, logged.accepted, logged.requester) == ("safe", True, "a signal")
     rig.expose(3)
     assert not actuators(rig.said[MIRROR_STATE.key][-1]).any()
     assert rig.said[COMMAND.key][-1].safe

@@ -85,6 +85,7 @@ def test_automatic_gains_are_inputs_that_two_runs_and_a_replay_have_alike(tmp_pa
     assert one == two
     asked = [wire.Request.FromString(payload) for payload in one["/lowfc/control/request"]]
     assert [(request.name, request.accepted) for request in asked[:2]] == [("gain", True), ("close", True)]
+    assert {request.requester for request in asked[:2]} == {"automatic gains"}
     replayed = run(tmp_path / "one", "replay", "last", "--json")
     assert json.loads(replayed.stdout)["identical"] is True
 

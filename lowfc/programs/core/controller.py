@@ -299,7 +299,7 @@ class Controller:
 
     def _make_safe(self) -> None:
         self._safe_signalled = False
-        self._enter(Request(self._service.clock.now_ns(), "safe", text="SIGUSR1"))
+        self._enter(Request(self._service.clock.now_ns(), "safe", text="SIGUSR1", requester="a signal"))
 
     def _keep_safe(self) -> None:
         """Let the latch follow the loop mode: after the answer, and by a thread of its own."""

@@ -26,6 +26,7 @@ CAUTIOUS = 0.05
 """Highest gain of the other modes before tip and tilt are corrected, whose square looks like other modes."""
 LEAST_FRAMES = 50
 """Of a window, however slow the loop."""
+REQUESTER = "automatic gains"
 _JUDGED = (LoopMode.OPEN, LoopMode.CLOSED)
 
 
@@ -192,7 +193,9 @@ class GainWatch:
         self.closing_harm = "" if state.mode is LoopMode.CLOSED else self._closing_harm(gain, drive)
         waits = state.mode is LoopMode.OPEN and state.conditions.mode_cause == MEASURED_FIRST
         if waits and all(group.verdict is not None for group in self._groups):
-            requests.append(Request(step.time_ns, "close", text=f"{AUTO}: the gains were measured"))
+            requests.append(
+                Request(step.time_ns, "close", text=f"{AUTO}: the gains were measured", requester=REQUESTER)
+            )
         requests += [request for event in events for request in self._reaction(event, step, state)]
         return Remarks(tuple(requests), tuple(events))
 
@@ -234,7 +237,9 @@ class GainWatch:
             prior_nm2 = tuple(prior.tolist())
         flux_dn = float(np.float32(self._light_was))
         values = tuple(gain.astype(np.float32).tolist())
-        return Request(step.time_ns, "gain", (), values, AUTO, prior_nm2=prior_nm2, flux_dn=flux_dn)
+        return Request(
+            step.time_ns, "gain", (), values, AUTO, requester=REQUESTER, prior_nm2=prior_nm2, flux_dn=flux_dn
+        )
 
     def _harm(self, group: _Group, verdict: Verdict, drive: ActiveLoop) -> list[PendingEvent]:
         """The event where an open loop would have left less for `HARMFUL` windows in a row."""
@@ -265,5 +270,5 @@ class GainWatch:
         if event.name != "LOOP_HARMS" or self._on_harm == "warn":
             return []
         law = state.drive is not None and state.drive.following is not None
-        asked = Request(step.time_ns, "open", text=f"{AUTO}: the loop made it worse")
+        asked = Request(step.time_ns, "open", text=f"{AUTO}: the loop made it worse", requester=REQUESTER)
         return [replace(asked, name="law")] if law and self._on_harm == "integrator" else [asked]

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -95,17 +96,18 @@ class StartUp:
         A mirror that has the flat map already, since another controller put it there, goes on with it: it is taken out
         of the shape that was adopted as it comes in under its own name, so that nothing moves.
         """
-        asked = []
+        asks = partial(Request, time_ns, requester="the configuration")
+        asked: list[Request] = []
         if self._law is not None:
-            asked.append(Request(time_ns, "law", law=self._law))
+            asked.append(asks("law", law=self._law))
         if self._flat_nm is not None:
             there_nm = _adopted_nm(state, self._flat_nm)
             if there_nm is not None:
                 rest_nm = (there_nm - self._flat_nm).reshape(-1)
                 if np.abs(rest_nm).max() <= ADOPTED_NM:
                     rest_nm[:] = 0
-                asked.append(Request(time_ns, "channel", text=ADOPTED, actuators_nm=rest_nm))
-            asked.append(Request(time_ns, "channel", text=FLAT, actuators_nm=self._flat_nm.reshape(-1)))
+                asked.append(asks("channel", text=ADOPTED, actuators_nm=rest_nm))
+            asked.append(asks("channel", text=FLAT, actuators_nm=self._flat_nm.reshape(-1)))
         return asked
 
     def refused(self, request: Request, why: str) -> None:
