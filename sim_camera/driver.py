@@ -29,6 +29,7 @@ from sim_camera.faulty import FaultyFrames, read_fault
 from sim_camera.figures import Figures
 from sim_camera.lateness import Lateness
 from sim_camera.path import MirrorPath
+from sim_camera.pixels import pixel_errors
 from sim_camera.scene import Scene
 
 PATIENCE_S = 5.0
@@ -62,18 +63,27 @@ def disturbance_of(config: Configuration) -> Disturbance:
 
 def scene(config: Configuration, shaken: Disturbance | None = None) -> Scene:
     """The optics of a configuration, its twin from the cache; `shaken` in place of the configured disturbance."""
-    optics = factory.twin(config, None, ignore)
+    optics, detector, camera = factory.twin(config, None, ignore), factory.detector(config), config.camera
     return Scene(
         optics,
         factory.true_mirror_on_twin(config, optics, ignore),
-        factory.detector(config),
+        detector,
         factory.electrons_per_exposure(config),
         disturbance_of(config) if shaken is None else shaken,
-        config.camera.rate_hz,
+        camera.rate_hz,
         config.seed,
-        config.camera.noise,
-        config.camera.exposure_fraction,
-        config.camera.instants,
+        camera.noise,
+        camera.exposure_fraction,
+        camera.instants,
+        pixel_errors(
+            detector,
+            optics.to_pixels.shape[:1] * 2,
+            config.seed,
+            camera.nonuniformity,
+            camera.nonlinearity,
+            camera.hot_pixels,
+            camera.hot_pixel_e_s * config.exposure_ns * 1e-9,
+        ),
     )
 
 

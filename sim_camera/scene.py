@@ -15,6 +15,7 @@ from lowfc.optics.detector.detector import Detector, expose, laws_of, saturation
 from lowfc.optics.twin.twin import Evaluator, Twin, node_radii, wavefront_rms_nm
 from lowfc.optics.twin.twin_mirror import TwinMirror, wavefront_nm
 from sim_camera.disturbance import Disturbance, Sampler, screen
+from sim_camera.pixels import PixelErrors
 
 GAUSS_LEGENDRE = (1 + np.array([-1, 1]) / np.sqrt(3)) / 2
 """Instants of an exposure whose mean is that over it, to third order in time."""
@@ -66,6 +67,7 @@ class Scene:
         noise: bool = True,
         exposure: float = 0.0,
         instants: int = 1,
+        pixels: PixelErrors | None = None,
     ) -> None:
         """Prepare everything that does not change from frame to frame.
 
@@ -81,6 +83,7 @@ class Scene:
             exposure: its length, in periods.
             instants: of each period at which the truth is computed; 1 for the start of the exposure alone, of which
                 the image is then one, too.
+            pixels: their errors; None for none.
         """
         self._optics = optics
         self._mirror = mirror
@@ -89,6 +92,7 @@ class Scene:
         self._electrons = np.float32(electrons)
         self._rng = np.random.Generator(np.random.SFC64(np.random.SeedSequence([seed, 3])))
         self._noise = noise
+        self._pixels = pixels
         self._area = optics.area_weights.astype(np.float32)
         self._basis = zernikes(shaken.noll, *node_radii(optics)).astype(np.float32)
         self._screen = self._static_screen(shaken.screen_nm, seed)
@@ -118,7 +122,10 @@ class Scene:
         electrons = self._evaluator.image(opds_nm[0]) * share
         for opd_nm in opds_nm[1:]:
             electrons += self._evaluator.image(opd_nm) * share
-        return expose(self._detector, electrons, self._rng) if self._noise else self._noiseless(electrons)
+        if self._pixels is not None:
+            electrons = electrons * self._pixels.gain + self._pixels.hot_e
+        frame = expose(self._detector, electrons, self._rng) if self._noise else self._noiseless(electrons)
+        return frame if self._pixels is None else self._pixels.response_dn[frame]
 
     def truth(self, index: int, actuators_nm: Single, path: tuple[list[Single], Single] | None = None) -> Truth:
         """The truth of a frame and of its period.

@@ -52,12 +52,23 @@ def tick(device: Device, status: Status, now_ns: int) -> Status:
 
 def settled(device: Device, driven_nm: Single, surface_nm: Single, elapsed_ns: float) -> Single:
     """Round to the driver's steps; first-order response of the actuators from a surface of `elapsed_ns` ago."""
+    return responded(device, rounded(device, driven_nm), surface_nm, elapsed_ns)
+
+
+def rounded(device: Device, driven_nm: Single) -> Single:
+    """To the driver's steps."""
     step = np.float32(device.step_nm)
     found = driven_nm / step
     np.rint(found, out=found)
     found *= step
+    return found
+
+
+def responded(device: Device, reached_nm: Single, surface_nm: Single, elapsed_ns: float) -> Single:
+    """First-order response of the actuators, on their way to `reached_nm` from a surface of `elapsed_ns` ago."""
+    found = reached_nm
     if device.settling_ns > 0 and elapsed_ns <= 20 * device.settling_ns:
-        found -= surface_nm
+        found = found - surface_nm
         found *= np.float32(-expm1(-max(elapsed_ns, 0) / device.settling_ns))
         found += surface_nm
     return _at_rest(device, found)

@@ -6,7 +6,8 @@ from lowfc.adapters.files.factory import mirror_limits
 from lowfc.arrays import Single
 from lowfc.contract.configuration import Configuration
 from lowfc.device import DriverOptions, geometry
-from sim_dm.device import Device, initial, settled
+from sim_dm.actuators import Actuators
+from sim_dm.device import Device, initial, responded, rounded
 
 
 def device(config: Configuration) -> Device:
@@ -34,6 +35,8 @@ class SimulatedMirror:
         self.geometry = geometry(config)
         self._device = device(config)
         self._surface_nm = initial(self._device).surface_nm
+        errors = config.mirror.gain_error, config.mirror.hysteresis, config.mirror.creep
+        self._actuators = Actuators(self._surface_nm.shape, *errors, config.seed) if any(errors) else None
 
     def apply(self, actuators_nm: Single) -> Single:
         """Move, and wait until it has settled."""
@@ -41,7 +44,10 @@ class SimulatedMirror:
 
     def settle(self, actuators_nm: Single, elapsed_ns: float) -> Single:
         """Where the actuators are, `elapsed_ns` after the last call."""
-        self._surface_nm = settled(self._device, actuators_nm, self._surface_nm, elapsed_ns)
+        reached_nm = rounded(self._device, actuators_nm)
+        if self._actuators is not None:
+            reached_nm = self._actuators.reach(reached_nm, elapsed_ns)
+        self._surface_nm = responded(self._device, reached_nm, self._surface_nm, elapsed_ns)
         return self._surface_nm
 
     def close(self) -> None:

@@ -19,15 +19,16 @@ from lowfc.control.laws.tuning import Tuned, best_gains, identified, tune_integr
 from lowfc.control.loop.advance import advance
 from lowfc.control.loop.inputs import Frame, Load, Outputs, PendingEvent, Request, Step
 from lowfc.control.loop.state import Settings, State
-from lowfc.device.guard import Command
+from lowfc.device import DriverOptions
+from lowfc.device.guard import Command, apply_command
 from lowfc.optics.detector.photometry import tilt_nm_per_mas
 from lowfc.programs.core.gain_watch import GainWatch
 from sim_camera.disturbance import LINES_HZ, Disturbance
 from sim_camera.driver import ignore, scene
 from sim_camera.path import MirrorPath
 from sim_camera.scene import Truth
-from sim_dm.device import apply_command, initial
-from sim_dm.driver import device
+from sim_dm.device import initial
+from sim_dm.driver import SimulatedMirror, device
 
 RATE_HZ = 1000.0
 
@@ -83,8 +84,8 @@ class Bench:
         self._watch = GainWatch(self._settings, config.control.on_harm)
         self.events: list[tuple[int, PendingEvent]] = []
         self._state = advance(self._settings, State(), Load(0, calibration, "bench"))[0]
-        self._mirror = device(config)
-        self._status = initial(self._mirror)
+        self._guard, self._mirror = device(config), SimulatedMirror(DriverOptions(), config)
+        self._status = initial(self._guard)
         self._weights = delay_weights(config.camera.delay_frames).astype(np.float32)
         self._shapes = [self._status.surface_nm] * len(self._weights)
         self._path = MirrorPath(self._status.surface_nm, config.camera.delay_frames - 1)
@@ -147,7 +148,7 @@ class Bench:
             if outputs.command is not None:
                 command = outputs.command
                 followed = Command("lowfc", frame.sequence, time_ns, 10**9, command.actuators_nm, command.command_nm)
-                self._status, refused = apply_command(self._mirror, self._status, followed, time_ns)
+                self._status, refused = apply_command(self._guard, self._status, followed, time_ns, self._mirror.settle)
                 if refused is not None:
                     raise ValueError(f"the mirror refused a command: {refused.name}")
             self._shapes = [self._status.surface_nm, *self._shapes[:-1]]

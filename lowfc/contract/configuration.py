@@ -243,6 +243,11 @@ class Configuration(Section):
         return round(self.period_ns * self.camera.exposure_fraction)
 
     @property
+    def dark_e(self) -> float:
+        """Electrons of a pixel in an exposure without light: clock-induced charge and dark current."""
+        return self.camera.clock_induced_charge_e + self.camera.dark_current_e_s * self.exposure_ns * 1e-9
+
+    @property
     def max_frame_age_ns(self) -> int:
         """Age above which a frame is refused."""
         return round(self.control.max_frame_age_ms * 1e6) or max(LATE_NS, 2 * self.period_ns)

@@ -147,6 +147,16 @@ class Camera(Section):
     """Electron-multiplying gain; 1 is a plain detector."""
     clock_induced_charge_e: NotNegative = 0.0
     """Spurious electrons per pixel and frame before multiplication."""
+    dark_current_e_s: NotNegative = 0.0
+    """Dark current of every pixel, electrons per second; known to an analytic calibration, as from a dark frame."""
+    hot_pixels: float = Field(0.0, ge=0, le=0.5)
+    """Of the simulated camera: fraction of pixels that are hot; an analytic calibration does not know of them."""
+    hot_pixel_e_s: Positive = 20_000.0
+    """Of the simulated camera: mean dark current of a hot pixel, electrons per second, exponentially distributed."""
+    nonlinearity: float = Field(0.0, ge=0, le=0.5)
+    """Of the simulated camera: by which fraction the gain of a faint pixel exceeds that of one at full well."""
+    nonuniformity: float = Field(0.0, ge=0, le=0.3)
+    """Of the simulated camera: rms of the pixels' response, a fraction; an analytic calibration does not know of it."""
     delay_frames: float = Field(1.0, ge=1, le=3)
     """Frames from the one a command is made from to the first exposed wholly under it; 1 is the least."""
     instants: int = Field(8, ge=1, le=64)
@@ -217,3 +227,9 @@ class Mirror(Section):
     """Of the simulated mirror: how far its actuators lie from where they are believed, along x and along y."""
     magnification: float = Field(1.0, ge=0.9, le=1.1)
     """Of the simulated mirror: its size in the pupil, of the one that is believed."""
+    gain_error: float = Field(0.0, ge=0, le=0.5)
+    """Of the simulated mirror: rms error of the actuators' gains, a fraction; from the seed."""
+    hysteresis: float = Field(0.0, ge=0, le=0.5)
+    """Of the simulated mirror: part of a move that turns back only after a play of 1 to 256 nm; 0.1 for a piezo."""
+    creep: float = Field(0.0, ge=0, le=0.1)
+    """Of the simulated mirror: part of a move that follows in each decade of time, 0.1 to 100 s; 0.01 for a piezo."""

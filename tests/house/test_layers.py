@@ -41,7 +41,9 @@ PURE_LAYERS = ("lowfc.arrays", "lowfc.optics", "lowfc.control", "lowfc.design")
 PURE_MODULES = (
     "lowfc.device.guard",
     "sim_dm.device",
+    "sim_dm.actuators",
     "sim_camera.path",
+    "sim_camera.pixels",
     "sim_camera.scene",
     "sim_camera.disturbance",
     "sim_camera.faults",

@@ -98,7 +98,7 @@ def detector(config: Configuration) -> Detector:
             camera.full_well_e,
             camera.bit_depth,
             camera.em_gain,
-            camera.clock_induced_charge_e,
+            config.dark_e,
             camera.photon_noise == "exact",
         )
     except ValueError as error:

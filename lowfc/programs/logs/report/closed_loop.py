@@ -224,7 +224,7 @@ def noise_of(history: History, rows: slice) -> SensorNoise | None:
         if not history.configuration.camera.noise:
             nothing = np.zeros(len(calibration.noll))
             return SensorNoise(nothing, nothing)
-        charge_e = history.configuration.camera.clock_induced_charge_e
+        charge_e = history.configuration.dark_e
     em_gain = max(camera.em_gain, 1.0)
     excess = 2.0 if em_gain > 1 else 1.0
     behind_e2 = camera.read_noise_e**2 + camera.gain_e_per_dn**2 / 12  # rounding to whole DN

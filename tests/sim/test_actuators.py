@@ -1,0 +1,74 @@
+"""Errors of the simulated mirror's actuators, against models of a few lines."""
+
+import numpy as np
+import pytest
+
+from lowfc.contract.configuration import load
+from lowfc.device import DriverOptions
+from sim_dm.actuators import PLAY_NM, Actuators
+from sim_dm.driver import SimulatedMirror
+
+GRID = (2, 3)
+NEVER, AT_ONCE = np.inf, 0.0
+
+
+def even(height_nm: float) -> np.ndarray:
+    return np.full(GRID, height_nm, np.float32)
+
+
+def test_gains_differ_from_actuator_to_actuator_and_come_from_the_seed() -> None:
+    one, same, other = (Actuators((40, 50), 0.05, 0, 0, seed) for seed in (1, 1, 2))
+    gains = [each.reach(np.full((40, 50), 100, np.float32), NEVER) / 100 for each in (one, same, other)]
+    assert gains[0].std() == pytest.approx(0.05, rel=0.05)
+    np.testing.assert_array_equal(gains[0], gains[1])
+    assert np.abs(gains[0] - gains[2]).max() > 0.05
+
+
+def play(width_nm: float, heights_nm: list[float]) -> list[float]:
+    """A block in a slot: it moves only where an end of the slot pushes it."""
+    found, at_nm = [], 0.0
+    for height_nm in heights_nm:
+        if height_nm - at_nm > width_nm:
+            at_nm = height_nm - width_nm
+        elif at_nm - height_nm > width_nm:
+            at_nm = height_nm + width_nm
+        found.append(at_nm)
+    return found
+
+
+def test_a_hysteresis_loop_is_that_of_blocks_in_slots_and_encloses_their_area() -> None:
+    """The loop of a play of half width r under a swing of +-A has the area 4 r (A - r)."""
+    swing_nm, share = 80.0, 0.1
+    cycle = swing_nm * np.sin(np.linspace(0, 2 * np.pi, 4001))
+    heights = [*cycle, *cycle[1:]]
+    actuators = Actuators(GRID, 0, share, 0, 1)
+    reached = [float(actuators.reach(even(height), AT_ONCE)[0, 0]) for height in heights]
+    plays = np.mean([play(width, heights) for width in PLAY_NM], axis=0)
+    np.testing.assert_allclose(reached, (1 - share) * np.array(heights) + share * plays, atol=1e-3)
+    driven, settled = np.array(heights[4000:]), np.array(reached[4000:])
+    area = abs(np.sum((settled[1:] + settled[:-1]) / 2 * np.diff(driven)))
+    expected = share * np.mean([4 * width * max(swing_nm - width, 0) for width in PLAY_NM])
+    assert area == pytest.approx(expected, rel=0.01)
+
+
+def test_creep_grows_with_the_logarithm_of_time() -> None:
+    actuators = Actuators(GRID, 0, 0, 0.01, 1)
+    actuators.reach(even(0), NEVER)
+    times_s = np.geomspace(1e-3, 1000, 600)
+    reached = [float(actuators.reach(even(100), 1e9 * step_s)[1, 2]) for step_s in np.diff(times_s, prepend=0.0)]
+    for decade_s in (0.3, 1.0, 3.0):
+        grown = np.interp([decade_s, 10 * decade_s], times_s, reached)
+        assert np.diff(grown)[0] == pytest.approx(1.0, abs=0.06)
+    assert reached[0] == pytest.approx(100, abs=0.05)
+    assert reached[-1] == pytest.approx(104, abs=0.05)
+
+
+def test_a_configuration_has_none_of_them_unless_it_says_so() -> None:
+    ideal, real = ({f"mirror.{key}": value for key in ("gain_error", "hysteresis", "creep")} for value in (0.0, 0.05))
+    shapes = np.random.default_rng(1).normal(0, 20, (20, 34, 34)).astype(np.float32)
+    plain, zero, one, same = (SimulatedMirror(DriverOptions(), load(None, keys)) for keys in ({}, ideal, real, real))
+    for shape in shapes:
+        ways = [mirror.settle(shape, 1e6) for mirror in (plain, zero, one, same)]
+        np.testing.assert_array_equal(ways[0], ways[1])
+        np.testing.assert_array_equal(ways[2], ways[3])
+    assert np.abs(ways[0] - ways[2]).max() > 1

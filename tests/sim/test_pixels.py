@@ -1,0 +1,73 @@
+"""Errors of the simulated detector's pixels, against models of a few lines."""
+
+from typing import Any
+
+import numpy as np
+import pytest
+from scipy import stats
+
+from lowfc.adapters.files.factory import detector
+from lowfc.contract.configuration import Configuration, load
+from lowfc.optics.detector.detector import Detector, expose, saturation_dn
+from sim_camera.driver import scene
+from sim_camera.pixels import pixel_errors, response
+
+FLAT = np.zeros((34, 34), np.float32)
+FULL = Detector(full_well_e=40_000.0, bias_dn=100.0)
+
+
+def quiet(**changed: Any) -> Configuration:
+    return load(None, {"disturbance.preset": "quiet", "star.magnitude": 20.0} | changed)
+
+
+def test_dark_current_is_poisson_of_the_exposure_time() -> None:
+    """400 electrons per second in 2 ms: the histogram of digital numbers is that of electrons drawn at 0.8 each."""
+    config = quiet(**{"camera.dark_current_e_s": 400.0, "camera.read_noise_e": 0.0})
+    assert config.dark_e == pytest.approx(0.8)
+    frame = expose(detector(config), np.zeros((400, 500)), np.random.default_rng(1))
+    counted = np.bincount((frame - 100).ravel(), minlength=8)
+    expected = stats.poisson.pmf(np.arange(8), 0.8) * frame.size
+    kept = expected > 5
+    assert (
+        stats.chisquare([*counted[kept], counted[~kept].sum()], [*expected[kept], frame.size - expected[kept].sum()])[1]
+        > 1e-3
+    )
+
+
+def test_dark_current_is_in_the_frames_and_in_the_calibrations_dark() -> None:
+    frames = [scene(quiet(**{"camera.dark_current_e_s": rate})).expose(0, FLAT) for rate in (0.0, 5000.0)]
+    assert frames[1].mean() - frames[0].mean() == pytest.approx(10, abs=0.2)
+
+
+def test_hot_pixels_and_gains_are_as_many_and_as_wide_as_said() -> None:
+    found = pixel_errors(FULL, (300, 400), 1, 0.02, 0.0, 0.01, 50.0)
+    assert found is not None
+    assert found.gain.std() == pytest.approx(0.02, rel=0.02)
+    hot = found.hot_e[found.hot_e > 0]
+    assert hot.size == pytest.approx(1200, abs=4 * np.sqrt(1200))
+    assert hot.mean() == pytest.approx(50, rel=0.15)
+    again = pixel_errors(FULL, (300, 400), 1, 0.02, 0.0, 0.01, 50.0)
+    np.testing.assert_array_equal(found.hot_e, again.hot_e)
+    np.testing.assert_array_equal(found.gain, again.gain)
+    assert pixel_errors(FULL, (300, 400), 1, 0, 0, 0, 50.0) is None
+
+
+def test_a_response_that_is_bent_has_its_gain_at_zero_and_its_end_at_full_well() -> None:
+    bent, full = response(FULL, 0.05), saturation_dn(FULL)
+    assert bent[[0, 50, 100, full]].tolist() == [0, 50, 100, full]
+    for signal in (200, 20_000, 35_000):
+        assert bent[100 + signal] - 100 == pytest.approx(signal * 1.05 - 0.05 * signal**2 / 40_000, abs=0.5)
+    assert (np.diff(bent[: full + 1].astype(int)) >= 0).all()
+    np.testing.assert_array_equal(response(FULL, 0.0), np.arange(1 << 16))
+
+
+def test_the_scene_applies_them_to_a_frame_and_a_seed_gives_it_again() -> None:
+    keys = {"camera.hot_pixels": 0.01, "camera.nonlinearity": 0.05, "camera.nonuniformity": 0.02, "camera.noise": False}
+    bright = {"star.magnitude": 0.0, "disturbance.preset": "quiet"}
+    plain, one, same = (scene(load(None, bright | more)) for more in ({"camera.noise": False}, keys, keys))
+    ideal, real = plain.expose(0, FLAT), one.expose(0, FLAT)
+    np.testing.assert_array_equal(real, same.expose(0, FLAT))
+    errors = pixel_errors(FULL, real.shape, 1, 0.02, 0.05, 0.01, 40.0)
+    signal = (ideal.astype(float) - 100) * errors.gain + errors.hot_e
+    expected = 100 + signal * (1 + 0.05 * (1 - signal / 40_000))
+    np.testing.assert_allclose(real, expected, atol=2)
