@@ -20,6 +20,8 @@ EARLY = 5
 """Blocks in a row that must speak for it, for a mode that is hardly corrected to get a gain before the window ends."""
 LONGEST = 16
 """Times its first length, to which a window grows while it decides nothing."""
+FEW = 3
+"""Modes below which they are judged each by itself alone: what most of them show says something of each."""
 LEAST_CORRECTED = 0.1
 """Where no gain is shown to be better: injected noise over what is there to correct, below which the least is taken."""
 
@@ -151,7 +153,7 @@ class GainBank:
             there = power - noise_nm2 * (1 + CONFIDENCE * np.sqrt(2 / frames))
             chosen = np.where((chosen == 0) & (injected < LEAST_CORRECTED * there), 1, chosen)
         found = Verdict(
-            np.where(chosen == now, gain, self.rows[chosen]).astype(np.float32),
+            self.rows[chosen],
             power,
             noise_nm2,
             mean[now, modes],
@@ -169,15 +171,26 @@ class GainBank:
 
     def _chosen(self, blocks: Array, now: Whole) -> Whole:
         """The row (modes,) for each mode whose row is `now`."""
-        rows, modes = blocks[:, :-1], np.arange(now.size)
-        beyond_now, better = _better(rows - rows[:, now, modes][:, None])
-        best = np.argmin(np.where(better, beyond_now, np.inf), axis=0)
-        best = np.where(better.any(axis=0), best, now)
+        own, modes = blocks[:, :-1], np.arange(now.size)
+        rows, helps = own + self._alike(own), own.mean(axis=0) < 0
         if self.first:
             beyond_open, better = _better(rows)
+            better &= helps
             return np.where(better.any(axis=0), np.argmin(np.where(better, beyond_open, np.inf), axis=0), 0)
+        beyond_now, better = _better(rows - rows[:, now, modes][:, None])
+        better &= helps
+        better[0] = _better(-own)[1][now, modes]
+        best = np.argmin(np.where(better, beyond_now, np.inf), axis=0)
+        best = np.where(better.any(axis=0), best, now)
         near = np.clip(best, np.maximum(now - 1, 0), now + 1)
         return np.where((now <= 1) | better[0], best, near)
+
+    def _alike(self, blocks: Array) -> Array:
+        """What modes whose disturbance is to their noise as it is with most of them would show."""
+        if blocks.shape[-1] < FEW:
+            return np.zeros_like(blocks)
+        noise_nm2 = np.maximum(np.mean(self._changed, axis=0), 1e-12)
+        return np.asarray(np.median(blocks / noise_nm2, axis=-1, keepdims=True) * noise_nm2)
 
     def _row_of(self, gain: Single) -> Whole:
         """The row (modes,) that is nearest to each gain."""

@@ -15,11 +15,11 @@ MODES = 30
 ONES = np.ones(MODES, np.float32)
 
 
-def bank(delay_frames: float = 1.0, windows: tuple[int, int] = (1000, 500)) -> GainBank:
+def bank(delay_frames: float = 1.0, windows: tuple[int, int] = (1000, 500), modes: int = MODES) -> GainBank:
     weights = tuple(
         (lag, weight) for lag, weight in enumerate(delay_weights(delay_frames).astype(np.float32)) if weight
     )
-    return GainBank(ONES, 1e6 * ONES, weights, delay_frames, windows)
+    return GainBank(ONES[:modes], 1e6 * ONES[:modes], weights, delay_frames, windows)
 
 
 def verdicts(made: GainBank, open_nm: Array, gain: Array, noise_nm2: float) -> list[Verdict]:
@@ -27,7 +27,7 @@ def verdicts(made: GainBank, open_nm: Array, gain: Array, noise_nm2: float) -> l
     found = []
     for one in open_nm.astype(np.float32):
         if made.followed(one, one, closed=False) and made.complete:
-            found.append(made.verdict(gain, noise_nm2 * ONES.astype(float)))
+            found.append(made.verdict(gain, noise_nm2 * np.ones(one.size)))
             gain = found[-1].gain
     return found
 
@@ -50,7 +50,7 @@ def test_a_drift_gets_the_gain_that_leaves_least(step_nm: float, delay_frames: f
     """Within 12 % rms of the best gain, in closed form for d = 1: drift s^2 / (g (2 - g)) and noise n^2 g / (2 - g)."""
     made = bank(delay_frames, (1000, 2500))
     found = verdicts(made, drift(8500, step_nm, 10.0, 2), np.zeros(MODES, np.float32), 100.0)
-    assert len(found) >= 4
+    assert len(found) >= 3
     gains = np.linspace(0.001, highest_gain(delay_frames), 2000)
     if delay_frames == 1.0:
         left = (step_nm**2 / gains + 100.0 * gains) / (2 - gains)
@@ -59,6 +59,21 @@ def test_a_drift_gets_the_gain_that_leaves_least(step_nm: float, delay_frames: f
     else:
         assert (found[-1].gain > 0).all()
         assert (found[-1].gain <= highest_gain(2.0) * 1.001).all()
+
+
+def test_a_mode_that_happens_to_stay_calm_is_taken_to_be_as_most_are() -> None:
+    """Gains of 30 modes that wander alike differ less than each by itself would have them, and none stays at 0."""
+    wander = drift(1000, 0.2, 10.0, 11)
+    together = verdicts(bank(), wander, np.zeros(MODES, np.float32), 100.0)[0].gain
+    alone = np.concatenate(
+        [
+            verdicts(bank(modes=2), wander[:, [one, one + 1]], np.zeros(2, np.float32), 100.0)[0].gain
+            for one in range(0, MODES, 2)
+        ]
+    )
+    assert not alone.all()
+    assert together.all()
+    assert np.ptp(np.log2(together)) < np.ptp(np.log2(alone[alone > 0]))
 
 
 def test_a_gain_moves_by_a_factor_of_two_and_falls_at_once_where_open_is_better() -> None:
