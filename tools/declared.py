@@ -11,7 +11,6 @@ from lowfc.client import requests, stream
 from lowfc.contract.codecs.codec import MOST_BYTES
 from lowfc.contract.configuration import Acceptance, keys
 from lowfc.contract.messages import CAMERA_STATE, COMMAND, EVENT, FRAME, HEALTH, MIRROR_STATE, SURFACE, Role, Topic
-from lowfc.contract.sections import Mirror
 from lowfc.control.calibration import linearity
 from lowfc.control.laws import transfer_function
 from lowfc.control.laws.stability import LEAST_GAIN_MARGIN, LEAST_PHASE_MARGIN_DEG, LOWEST_GAIN
@@ -92,15 +91,6 @@ def requirements() -> str:
     return markdown(("key", "default", "what must be"), rows)
 
 
-def mirror_keys() -> str:
-    """The keys of a mirror."""
-    rows = []
-    for name, info in keys(Mirror, "mirror.").items():
-        default = info.get_default(call_default_factory=True)
-        rows.append((f"`{name}`", f"`{default!r}`", sentence(info.description)))
-    return markdown(("key", "default", ""), rows)
-
-
 def agreement() -> str:
     """What a camera's settings and the configuration must say alike."""
     head = ("the camera's", "the configuration's", "may differ by", "needed", "used for")
@@ -164,7 +154,6 @@ DECLARED: dict[str, Callable[[], str]] = {
     "camera topics": partial(topics, Role.CAMERA, FRAME, CAMERA_STATE),
     "mirror topics": partial(topics, Role.MIRROR, COMMAND, MIRROR_STATE, SURFACE),
     **{name: partial(fields, name) for name in ("CameraState", "MirrorCommand", "MirrorState")},
-    "mirror keys": mirror_keys,
     "agreement": agreement,
 }
 """The tables by the names that the pages call them."""

@@ -1,7 +1,7 @@
 """Every request, once: its key, the fields of `lowfc.v1.Request` that it takes, what it does, its `lowfc ctl`.
 
-The client's methods, the commands of `lowfc ctl` and the table in docs/howto/operating.md are made of it; a test holds
-it against what the controller and the recorder know.
+The client's methods, the commands of `lowfc ctl` and the table in docs/reference/requests.md are made of it; a test
+holds it against what the controller and the recorder know.
 """
 
 from typing import NamedTuple

@@ -1,7 +1,7 @@
 """The shaped pupil by linear programming: the most open mask whose image has a dark zone.
 
 The transmissions of the cells of one quadrant are the variables. A mask that is symmetric about both axes has a real
-field, so that |E| <= sqrt(contrast) E(0) is two linear inequalities at every point. Less symmetry would gain nothing:
+field, so that `|E| <= sqrt(contrast) E(0)` is two linear inequalities at every point. Less symmetry would gain nothing:
 the mean of any mask and its mirror images is as open, and as dark in a zone that has both mirror symmetries itself.
 
 Between the points of a grid the light is tens of times brighter. Exchange: the maxima of the solution on a fine

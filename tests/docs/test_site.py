@@ -1,10 +1,19 @@
-"""The site: `make docs` builds it without a warning, and every page is in it."""
+"""The site: `make docs` builds it without a warning; every page, and all that is declared, is in it."""
 
 import subprocess
 import sys
+from html import unescape
 from pathlib import Path
 
 import pytest
+
+from lowfc.client.requests import DECLARED
+from lowfc.contract.configuration import keys
+from lowfc.contract.events import EVENTS
+from lowfc.contract.messages import TOPICS
+from lowfc.contract.wire import lowfc_pb2
+from lowfc.programs.cli.main import COMMANDS, PARTS
+from tools.advice import ADVICE, REASONS
 
 DOCS = Path(__file__).parents[2] / "docs"
 
@@ -22,3 +31,23 @@ def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_every_page_is_in_the_site(site: Path) -> None:
     for page in DOCS.rglob("*.md"):
         assert (site / page.relative_to(DOCS).with_suffix(".html")).is_file()
+
+
+def test_all_that_is_declared_is_in_the_reference(site: Path) -> None:
+    declared = {
+        "reference/commands": [f"lowfc {row.name}" for row in (*sum(COMMANDS.values(), ()), *PARTS)],
+        "reference/configuration": [*keys()],
+        "reference/topics": [topic.key for topic in TOPICS],
+        "reference/messages": [*lowfc_pb2.DESCRIPTOR.message_types_by_name],
+        "reference/requests": [request.key for request in DECLARED],
+        "howto/troubleshooting": [*EVENTS, *REASONS],
+    }
+    for page, words in declared.items():
+        text = unescape((site / f"{page}.html").read_text())
+        assert [word for word in words if word not in text] == []
+
+
+def test_every_event_and_every_reason_has_advice() -> None:
+    assert [*ADVICE] == [*EVENTS]
+    reasons = [value.name.removeprefix("REASON_") for value in lowfc_pb2.Reason.DESCRIPTOR.values]
+    assert [*REASONS] == reasons[1:]

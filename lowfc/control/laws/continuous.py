@@ -2,7 +2,7 @@
 
 The star moves while the mirror holds. A wave e^(i w t) is measured as m e^(i w t_k), its mean over the exposure; the
 command made of it is in force from a to a + 1 periods after t_k, where the wave has the mean h e^(i w (t_k + a)). The
-sampled loop says what the command is; what is left has a floor, 1 - |h|^2, that no command takes out.
+sampled loop says what the command is; what is left has a floor, `1 - |h|^2`, that no command takes out.
 
 Frequencies are in rad per frame, and may lie above pi: the sampled loop takes such a wave for its alias.
 """

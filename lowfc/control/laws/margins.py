@@ -33,7 +33,7 @@ class Margins:
         gain_margin: factor by which the loop's gain may grow, infinite where it may by any.
         gain_reduction: factor above which it must stay; 0 where it may fall to nothing.
         phase_margin_deg: lag at which it oscillates; 180 where the loop never has a gain of 1.
-        peak: largest |S|: 1 over the modulus margin, the least distance of L from -1.
+        peak: largest `|S|`: 1 over the modulus margin, the least distance of L from -1.
     """
 
     radius: Array
@@ -131,12 +131,12 @@ def sentence(found: Margins) -> str:
 
 
 def rejection(law: LinearLaw, frequency_hz: Array, delay_frames: float | None = None) -> Array:
-    """|S| (frequencies, modes): true residual over disturbance; with the delay of the law where none is given."""
+    """`|S|` (frequencies, modes): true residual over disturbance; with the delay of the law where none is given."""
     return np.abs(sensitivity(law, 2 * np.pi * np.asarray(frequency_hz, float) / law.rate_hz, delay_frames))
 
 
 def noise_transfer(law: LinearLaw, frequency_hz: Array, delay_frames: float | None = None) -> Array:
-    """|T| (frequencies, modes): true residual over measurement noise of the same mode."""
+    """`|T|` (frequencies, modes): true residual over measurement noise of the same mode."""
     return np.abs(sensitivity(law, 2 * np.pi * np.asarray(frequency_hz, float) / law.rate_hz, delay_frames) - 1)
 
 
@@ -269,7 +269,7 @@ def _gain_margins(loop: Complex) -> tuple[float, float]:
 
 
 def _phase_margin_deg(loop: Complex) -> float:
-    """Least angle between L and -1 where |L| = 1."""
+    """Least angle between L and -1 where `|L|` = 1."""
     size = np.log(np.abs(loop))
     crosses = np.flatnonzero(np.signbit(size[:-1]) != np.signbit(size[1:]))
     share = size[crosses] / (size[crosses] - size[crosses + 1])

@@ -1,5 +1,7 @@
 """Where the samples are, and the conventions that every other optics module keeps to.
 
+The conventions::
+
     arrays      [row = y, column = x]; y grows with the row index
     pupils      coordinates u in pupil diameters, u_i = (i + 1/2) / n - 1/2
     images      coordinates x in lambda0 / D, x_i = (i - (n - 1) / 2) / samples_per; lambda0 is the central wavelength

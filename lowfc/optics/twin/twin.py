@@ -5,7 +5,7 @@ At each wavelength the field at the sensor is linear in exp(i phi) at the pupil 
     exp(i phi) --to_modes--> modes --to_coefficients--> coefficients of prolate functions --basis--> field at points
 
 The intensity is band-limited to twice the field's band, so it is evaluated at few points of each axis, and the pixels
-are two small products: image = to_pixels |E|^2 to_pixels'. `twin_build` makes the matrices from a `Sensor`.
+are two small products: `image = to_pixels |E|^2 to_pixels'`. `twin_build` makes the matrices from a `Sensor`.
 """
 
 from dataclasses import dataclass
@@ -221,7 +221,7 @@ class _Stage:
         self._field = np.empty((2, points, points), np.float32)
 
     def add_intensity(self, phasor: Single, intensity: Single) -> None:
-        """Add |E|^2 at the points, for real and imaginary parts (used, 2) of exp(i phi) - 1."""
+        """Add `|E|^2` at the points, for real and imaginary parts (used, 2) of exp(i phi) - 1."""
         np.matmul(self._to_modes, phasor, out=self._modes)
         self._modes[:, 0] += self._flat_modes
         np.matmul(self._to_coefficients, self._modes.view(self._unit), out=self._pairs.view(self._unit))

@@ -1,0 +1,209 @@
+"""Parts of the site that the code makes while it is built: a line `<!-- built: NAME -->` of a page stands for one.
+
+They are reference tables, longer than a page in the sources should be. Shorter tables stand in the pages themselves
+(`tools.measure`).
+"""
+
+import re
+from collections.abc import Callable, Iterator
+from functools import partial
+from importlib import import_module
+from pkgutil import walk_packages
+from types import ModuleType
+from typing import Any, get_args
+
+import typer
+from pydantic import BaseModel
+from typer.main import get_command
+
+import lowfc.programs
+from lowfc.contract.configuration import Configuration, keys
+from lowfc.contract.events import EVENTS, Event, Level
+from lowfc.contract.former_names import FIELDS, KEYS, LAW_EXTENSIONS, VALUES
+from lowfc.contract.messages import TOPICS
+from lowfc.contract.sections import InterlockSection
+from lowfc.contract.wire import lowfc_pb2
+from lowfc.programs.cli.main import app
+from lowfc.programs.cli.result import Result
+from tools.advice import ADVICE, REASONS
+from tools.declared import fields, sentence
+from tools.shared import markdown
+
+_BUILT = re.compile(r"^<!-- built: (.+?) -->$", re.MULTILINE)
+_WIDTH = 100
+
+
+def with_built(page: str) -> str:
+    """A page with its built parts."""
+    return _BUILT.sub(lambda found: BUILT[found[1]](), page)
+
+
+def commands() -> str:
+    """Every command with its help."""
+    return "\n".join(
+        f"## {context.command_path}\n\n```text\n{context.get_help()}\n```\n"
+        for context in _contexts(typer.Context(get_command(app), info_name="lowfc", terminal_width=_WIDTH))
+    )
+
+
+def _contexts(context: typer.Context) -> Iterator[typer.Context]:
+    """A command, then those below it."""
+    yield context
+    for name in getattr(context.command, "commands", ()):
+        command = context.command.get_command(context, name)  # type: ignore[attr-defined]  # a group
+        yield from _contexts(typer.Context(command, parent=context, info_name=name, terminal_width=_WIDTH))
+
+
+def configuration() -> str:
+    """Every key of the configuration, by section."""
+    sections: dict[str, type[BaseModel]] = {
+        name: info.annotation
+        for name, info in Configuration.model_fields.items()
+        if isinstance(info.annotation, type) and issubclass(info.annotation, BaseModel)
+    }
+    found = [_keys("The top of the file", "", {name: 0 for name in Configuration.model_fields if name not in sections})]
+    found += [_keys(f"[{name}]", f"{sentence(one.__doc__)}.", keys(one, f"{name}.")) for name, one in sections.items()]
+    about = f"{sentence(InterlockSection.__doc__)}. A table each."
+    found.append(_keys("[[interlocks]]", about, keys(InterlockSection, "interlocks.")))
+    return "\n".join(found)
+
+
+def _keys(heading: str, about: str, names: Any) -> str:
+    known = {**keys(), **keys(InterlockSection, "interlocks.")}
+    rows = []
+    for name in names:
+        info = known[name]
+        default = "required" if info.is_required() else f"`{info.get_default(call_default_factory=True)!r}`"
+        bounds = [str(one) for one in info.metadata if hasattr(one, "__dataclass_fields__")]
+        words = [f"`{one}`" for one in get_args(info.annotation) if isinstance(one, str)]
+        rows.append((f"`{name}`", default, ", ".join((*words, *map(_bound, bounds))), sentence(info.description)))
+    return f"## {heading}\n\n{about}\n\n{markdown(('key', 'default', 'values', ''), rows)}"
+
+
+def _bound(text: str) -> str:
+    """In a reader's form, of a bound as in "Ge(ge=1)"."""
+    kind, _, value = text.rstrip(")").partition("=")
+    sign = {"Ge(ge": "at least", "Gt(gt": "above", "Le(le": "at most", "Lt(lt": "below"}.get(kind)
+    return f"{sign} {value}" if sign else ""
+
+
+def topics() -> str:
+    """Every topic."""
+    rows = []
+    for one in TOPICS:
+        when = f"{one.rate:g} Hz" if isinstance(one.rate, float) else str(one.rate)
+        full = one.message.DESCRIPTOR.full_name
+        own = full.startswith("lowfc.")
+        message = f"[`{full}`](messages.md#{full.rpartition('.')[2].lower()})" if own else f"`{full}`"
+        publisher = "any" if len(one.publisher) > 2 else ", ".join(sorted(map(str, one.publisher)))
+        rows.append((f"`{one.key}`", message, when, publisher, one.sentence))
+    return markdown(("topic", "message", "when", "published by", ""), rows)
+
+
+def messages() -> str:
+    """Every message with its fields, every enumeration with its values."""
+    file = lowfc_pb2.DESCRIPTOR
+    found = [f"## {name}\n\n{fields(name)}" for name in file.message_types_by_name]
+    for name, one in file.enum_types_by_name.items():
+        found.append(f"## {name}\n\n{markdown(('value', 'number'), ((f'`{v.name}`', v.number) for v in one.values))}")
+    return "\n".join(found)
+
+
+def json_objects() -> str:
+    """Every typed `--json` object."""
+    rows = []
+    for one in sorted(_subclasses(Result), key=lambda each: f"{each.__module__}.{each.__name__}"):
+        command = " ".join(one.__module__.removeprefix("lowfc.programs.").split(".")[-2:])
+        rows.append(f"### {one.__name__}\n\n{sentence(one.__doc__)}. Made by `{command}`.\n\n{_figures(one)}")
+    return "\n".join(rows)
+
+
+def _figures(result: type[Result]) -> str:
+    rows = []
+    for name, info in result.model_fields.items():
+        extra = info.json_schema_extra if isinstance(info.json_schema_extra, dict) else {}
+        rows.append(
+            (f"`{info.alias or name}`", f"`{_type(info.annotation)}`", extra.get("unit", ""), info.description or "")
+        )
+    return markdown(("key", "type", "unit", ""), rows)
+
+
+def _type(annotation: Any) -> str:
+    text = annotation.__name__ if isinstance(annotation, type) and not get_args(annotation) else str(annotation)
+    return re.sub(r"\b[\w.]+\.(?=\w)", "", text).replace("|", "or")
+
+
+def _subclasses(kind: type[Result]) -> set[type[Result]]:
+    for module in walk_packages(lowfc.programs.__path__, "lowfc.programs."):
+        import_module(module.name)
+    below: set[type[Result]] = set()
+    new = {kind}
+    while new:
+        new = {child for one in new for child in one.__subclasses__()} - below
+        below |= new
+    return {one for one in below if one.model_fields}
+
+
+def events(*levels: Level) -> str:
+    """Every event of these levels: what one sees, why, what to do."""
+    return "\n".join(_event(one) for one in EVENTS.values() if one.level in levels)
+
+
+def _event(event: Event) -> str:
+    why, what = ADVICE[event.name]
+    shown = re.sub(r"\{(\w+)[^}]*\}", r"\1", event.sentence)
+    return (
+        f"### {event.name}\n\n`{event.level.name} {event.name} {shown.replace('`', '')}`\n\n"
+        f"Why: {why}\n\nWhat to do: {what}\n"
+    )
+
+
+def reasons() -> str:
+    """Every reason of a refusal or a limit."""
+    names = [one.name.removeprefix("REASON_") for one in lowfc_pb2.Reason.DESCRIPTOR.values[1:]]
+    return markdown(("reason", "why", "what to do"), ((f"`{name}`", *REASONS[name]) for name in names))
+
+
+def upgrade() -> str:
+    """The former names."""
+    tables = {
+        "configuration key": KEYS,
+        "field of a message": FIELDS,
+        "value": VALUES,
+        "extension of a law file": {old: new for new, old in LAW_EXTENSIONS.items() if old != new},
+    }
+    rows = [(kind, f"`{old}`", f"`{new}`") for kind, table in tables.items() for old, new in table.items()]
+    return markdown(("what", "0.1", "0.2"), rows)
+
+
+def api(package: str) -> str:
+    """A package of the Python API: what it offers itself, or each of its modules."""
+    top = import_module(package)
+    own = [top] if hasattr(top, "__all__") else [*_modules(top)]
+    return "\n".join(_module(module) for module in own)
+
+
+def _modules(package: ModuleType) -> Iterator[ModuleType]:
+    for found in walk_packages(package.__path__, f"{package.__name__}."):
+        if not found.ispkg:
+            yield import_module(found.name)
+
+
+def _module(module: ModuleType) -> str:
+    name, imported = module.__name__, "   :imported-members:\n" if hasattr(module, "__all__") else ""
+    return f"## {name}\n\n```{{eval-rst}}\n.. automodule:: {name}\n   :members:\n{imported}```\n"
+
+
+BUILT: dict[str, Callable[[], str]] = {
+    "commands": commands,
+    "configuration": configuration,
+    "topics": topics,
+    "messages": messages,
+    "json": json_objects,
+    "events that want something": partial(events, Level.ERROR, Level.WARNING),
+    "events that tell": partial(events, Level.INFO),
+    "reasons": reasons,
+    "former names": upgrade,
+    **{f"api {one}": partial(api, f"lowfc.{one}") for one in ("client", "device", "optics", "design", "control")},
+}
+"""The parts by the names that the pages call them."""
