@@ -33,12 +33,12 @@ def the_run(name: str | None) -> str:
 
 
 def nobody_yet(name: str) -> str:
-    """Sentence for who waits for a run of which no process is on this host; empty where one is."""
+    """Sentence while a process waits for a run of which no other is on this host; empty where one is."""
     runs = living()
     if name in runs:
         return ""
     there = f"running: {_listed(runs)}{nearest(name, runs)}" if runs else "no other loop of yours is running"
-    return f"no process of run {name!r} is on this host, and one is waited for; {there}"
+    return f"waiting for run {name!r}, of which no process is on this host yet; {there}"
 
 
 def starting(name: str, role: Role) -> bool:

@@ -5,7 +5,7 @@ the nearest known one. `lowfc config show` prints all keys with their sentences.
 """
 
 import difflib
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -328,13 +328,21 @@ def keys(section: type[BaseModel] = Configuration, prefix: str = "") -> dict[str
     return found
 
 
+def _nearest(wanted: str, known: Sequence[str]) -> str:
+    """The known key that is most like a wrong one; where none is, the one whose name in its section is."""
+    names = {one.rpartition(".")[2]: one for one in reversed(known)}
+    whole = difflib.get_close_matches(wanted, known, 1, 0.0)
+    in_another = difflib.get_close_matches(wanted.rpartition(".")[2], names, 1, 0.75)
+    alike = difflib.get_close_matches(wanted, known, 1, 0.8)
+    return next(iter(alike or [names[one] for one in in_another] or whole))
+
+
 def explain(detail: Any) -> str:
     """One of pydantic's errors as a line for a user."""
     key = ".".join(str(part) for part in detail["loc"])
     if detail["type"] == "extra_forbidden":
         known = [*keys(), *Configuration.model_fields, *keys(InterlockSection, "interlocks.")]
         plain = ".".join(part for part in detail["loc"] if isinstance(part, str))
-        near = difflib.get_close_matches(plain[:_LONGEST_KEY], known, n=1, cutoff=0.0)
-        return f"unknown key {brief(key)}; the nearest known one is {near[0]!r}"
+        return f"unknown key {brief(key)}; the nearest known one is {_nearest(plain[:_LONGEST_KEY], known)!r}"
     message = detail["msg"].removeprefix("Value error, ")
     return printable(f"{key[:_LONGEST_KEY]} = {brief(detail['input'])}: {message[:300]}" if key else message)

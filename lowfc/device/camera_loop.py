@@ -27,7 +27,7 @@ _IDLE = CameraExtras()
 
 
 class CameraLoop:
-    """Publishes a driver's frames until told to stop, or a number of them."""
+    """Publishes a driver's frames until it is stopped, or a number of them."""
 
     def __init__(self, driver: Camera, service: Service, config: Configuration, frames: int | None = None) -> None:
         """Declare everything on the bus; publish the first settings."""

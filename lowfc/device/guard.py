@@ -88,7 +88,7 @@ class Status(NamedTuple):
         valid_for_ns: how long it may be held.
         following: whether there is a command in force.
         safe: channels whose last command was sent in safe mode.
-        clear_id: of the newest clear that a command told of.
+        clear_id: of the newest clear that a command carried.
     """
 
     driven_nm: Single

@@ -71,7 +71,7 @@ def guard_of(driver: Mirror, config: Configuration) -> Guard:
 
 
 class MirrorLoop:
-    """Follows commands until told to stop."""
+    """Follows commands until it is stopped."""
 
     def __init__(self, driver: Mirror, service: Service, config: Configuration) -> None:
         """Declare everything on the bus, and see where the mirror is."""

@@ -15,7 +15,7 @@ from lowfc.device.mirror_loop import MirrorLoop
 
 PASSED_ON = {"allow_extra_args": True, "ignore_unknown_options": True}
 """Settings of a command that leaves words to the driver: its options."""
-Frames = Annotated[int | None, typer.Option(min=1, help="Stop after so many frames; default: when told to.")]
+Frames = Annotated[int | None, typer.Option(min=1, help="Stop after so many frames; default: until Ctrl-C or SIGTERM.")]
 WaitFor = Annotated[list[str] | None, typer.Option(help="Process that the first frame waits for; repeat.")]
 
 

@@ -1,8 +1,10 @@
 """`lowfc --help`, and how a typed result becomes text and JSON."""
 
+import re
 import subprocess
 import sys
 
+import click
 import pytest
 import typer
 from typer.testing import CliRunner
@@ -26,6 +28,23 @@ def test_every_command_has_help_with_an_example(name: str) -> None:
     done = lowfc(*name.split(), "--help")
     assert done.exit_code == 0, done.output
     assert "Example: lowfc " in done.stdout
+
+
+def test_help_is_in_the_fields_words() -> None:
+    """Not those that say who told whom what; `latency` without a log runs a loop of its own."""
+    pages, context = [], click.Context(typer.main.get_command(app))
+    waiting = [(context.command, context)]
+    for command, above in waiting:
+        here = click.Context(command, parent=above, info_name=command.name)
+        pages.append(" ".join(command.get_help(here).split()))
+        if hasattr(command, "list_commands"):
+            commands = (command.get_command(here, name) for name in command.list_commands(here))
+            waiting.extend((each, here) for each in commands if each is not None)
+    assert len(pages) > 70
+    found = [re.search(r"\b(told|tells?|hears?|listen to|lies to|nobody can|last words)\b.*", page) for page in pages]
+    assert [one[0] for one in found if one] == []
+    (of_latency,) = (page for page in pages if "lowfc latency" in page)
+    assert "None: a loop that is run for it." in of_latency
 
 
 def test_a_command_is_imported_when_it_is_used() -> None:

@@ -16,7 +16,7 @@ import pytest
 import typer
 
 from lowfc.adapters.bus.bus import Query, Sample
-from lowfc.adapters.bus.other_loops import other_loops
+from lowfc.adapters.bus.other_loops import none_here, other_loops
 from lowfc.adapters.bus.run import open_run
 from lowfc.adapters.logs.reader import LogReader
 from lowfc.adapters.process.clock import HostClock
@@ -292,11 +292,11 @@ def test_a_run_is_found_by_who_is_there(own_runtime: Path, listen: Callable[...,
 
 
 def test_who_waits_for_a_run_that_nobody_is_in_is_told_the_others(listen: Callable[..., None]) -> None:
-    assert nobody_yet("bnch").endswith("and one is waited for; no other loop of yours is running")
+    assert nobody_yet("bnch").endswith("on this host yet; no other loop of yours is running")
     listen("bench", "camera", "controller")
     assert nobody_yet("bench") == ""
     open_run("bnch")  # as the recorder itself does
-    assert nobody_yet("bnch").endswith("one is waited for; running: bench (did you mean 'bench'?)")
+    assert nobody_yet("bnch").endswith("on this host yet; running: bench (did you mean 'bench'?)")
 
 
 def test_a_run_that_sim_loop_has_begun_is_starting(listen: Callable[..., None]) -> None:
@@ -320,23 +320,27 @@ def test_the_beginning_of_a_runs_name_is_enough(listen: Callable[..., None]) -> 
 
 
 def test_a_loop_that_is_not_seen_from_here_is_told_of(own_runtime: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Its owner, its process and its runtime directory, where the system tells."""
+    """Its owner, its process and its runtime directory, where the system tells; one that starts here is waited for."""
     words = [sys.executable, "-c", "print(flush=True); input()", "lowfc", "controller", "--run", "night"]
-    for there, told in (
-        ("/run/elsewhere", ", with XDG_RUNTIME_DIR=/run/elsewhere"),
-        (str(own_runtime), ", still starting"),
+    wrapped = ["/bin/sh", "-c", 'echo; read end; "$@"', *words[3:]]
+    for there, words_there, found in (
+        ("/run/elsewhere", words, ", with XDG_RUNTIME_DIR=/run/elsewhere"),
+        (str(own_runtime), words, ", starting or ending"),
+        (str(own_runtime), wrapped, ""),
     ):
         environment = os.environ | {"XDG_RUNTIME_DIR": there}
-        with subprocess.Popen(words, stdin=subprocess.PIPE, stdout=subprocess.PIPE, env=environment) as process:
+        with subprocess.Popen(words_there, stdin=subprocess.PIPE, stdout=subprocess.PIPE, env=environment) as process:
             process.stdout.readline()
-            ours = list(other_loops())
+            ours = [one for one in other_loops() if f"(process {process.pid})" in one]
+            sentence = none_here()
             with monkeypatch.context() as patch:
                 patch.setattr(os, "geteuid", lambda: 4_000_000_000)
                 theirs = list(other_loops())
             process.communicate(b"\n")
-        where = f"`lowfc controller --run night` (process {process.pid}{told})"
-        assert f"you run {where}" in ours
-        assert f"user {own_runtime.owner()} runs {where}" in theirs
+        where = f"`lowfc controller --run night` (process {process.pid}){found}"
+        assert ours == [f"you run {where}"] * bool(found)
+        assert (f"user {own_runtime.owner()} runs {where}" in theirs) == bool(found)
+        assert sentence.endswith("starting or ending: ask again in a few seconds") == ("starting" in found)
 
 
 # The mirror.

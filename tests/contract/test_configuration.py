@@ -62,6 +62,9 @@ def test_toml_round_trip(tmp_path: Path) -> None:
         ("[control]\ntiltgain = 0.5", "control.tiltgain", "control.tilt_gain"),
         ("[contol]\ngain = 0.5", "contol", "control"),
         ("lock_step = true", "lock_step", "lockstep"),
+        ("gian = 0.5", "gian", "control.gain"),
+        ("[loop]\ngain = 0.5", "loop", "lockstep"),
+        ("[control]\nrate_hz = 500", "control.rate_hz", "camera.rate_hz"),
         ("[mirror]\nzzz = 1", "mirror.zzz", "mirror"),
     ],
 )

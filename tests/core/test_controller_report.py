@@ -134,6 +134,17 @@ def test_the_first_line_of_the_status_says_whether_all_is_well() -> None:
         assert status.figures(controller_state(state, USUAL, 0))["paused"] == (word == "paused")
 
 
+def test_contrast_is_of_a_flat_mirror_and_of_this_one_whether_the_loop_is_closed_or_not() -> None:
+    recent = wire.WavefrontFigures(added_contrast_flat=7e-10, added_contrast=-4e-11)
+    camera = wire.Health(recent_wavefront=recent, wavefront=recent)
+    message = controller_state(loaded(USUAL), USUAL, (START + 12) * SECOND)
+    watch = Watch({"camera": camera}, [])
+    expected = "added to the dark zone's contrast: flat mirror +7.0e-10, left -4.0e-11"
+    assert expected in status.text(status.figures(message, {"camera": camera}))
+    assert expected in summary_text(summary(watch, record=False, rate_hz=250.0))
+    assert "  contrast -4.0e-11 of +7.0e-10  " in status_line(watch, 5.0)
+
+
 def test_the_last_second_forgets_what_was_before_and_what_was_refused() -> None:
     state, last = loaded(USUAL), LastSecond(SECOND // 4)
     assert last.figures(state, SECOND) == wire.LoopFigures()

@@ -154,6 +154,7 @@ def test_ctrl_c_while_it_loads_is_quiet(tmp_path: Path) -> None:
         (("config", "check", "/dev/zero"), "/dev/zero: not a readable TOML file: not a regular file"),
         (("config", "check", "brackets.toml"), "nested too deeply"),
         (("recover", "night.mcap", "header.mcap", "--json"), "name one"),
+        (("view", "nowhere.mcap", "--web"), "nowhere.mcap cannot be read"),
         (("bench", "record", "--folder", "nowhere"), "nowhere cannot be written"),
     ],
 )

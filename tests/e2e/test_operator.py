@@ -186,6 +186,7 @@ def test_the_commands_say_what_they_did(night: Night) -> None:
     assert "leak is now 0 0 0.001 0.001" in said["lowfc ctl leak 0.001 --modes 4-11"]
     assert "offset is now 0 0 5 0" in said["lowfc ctl offset 5 -3 --modes 4,11"]
     assert "channel dark-hole: 1.47 nm rms of surface" in said["lowfc ctl channel dark-hole shape.npy"]
+    assert "mask-moving is true; no interlock is configured (run" in said["lowfc ctl bench mask-moving true"]
     assert "'leaky' takes over" in said["lowfc ctl law law.fits"]
     assert [re.split("[,;]", said[f"lowfc ctl {name}"])[0] for name in ("safe", "clear", "pause", "close")] == [
         "loop in safe mode",

@@ -175,7 +175,7 @@ def test_a_pupil_of_ones_own_comes_from_its_file(tmp_path):
 def test_a_slip_in_the_name_of_a_sensor_is_named():
     with pytest.raises(ConfigurationError, match=r"layout is called 'clofws'.* nor is it a sensor.* mean 'clowfs'"):
         sensor_named("clofws")
-    with pytest.raises(ConfigurationError, match=r"'mask'; .*sam27d07.* nor is it a sensor; sam, bow.*"):
+    with pytest.raises(ConfigurationError, match=r"'mask': there are .*sam27d07.* nor is it a sensor: sam, bow.*"):
         sensor_named("mask")
 
 

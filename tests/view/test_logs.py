@@ -131,6 +131,8 @@ def test_every_view_of_the_layout_has_something_and_the_plots_show_all_of_a_log(
     flat, residual = values_of(tape.last(f"{trend.TREND}/curves").strips)  # the residual on top
     assert np.mean([y for _, y in flat]) < np.mean([y for _, y in residual])  # upwards is less
     assert len(residual) == len(flat) > 1
+    names = tape.last(f"{trend.TREND}/names").labels.as_arrow_array().to_pylist()
+    assert names == ["flat mirror", "residual", "true, 1 s mean"]
     begin_ns, end_ns = done.span_ns
     assert (end_ns - begin_ns) * 1e-9 == pytest.approx(done.log_s, abs=0.1)
     blueprint = layout(window_s=None, span_ns=done.span_ns, still=True)

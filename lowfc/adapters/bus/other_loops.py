@@ -14,16 +14,20 @@ _PROGRAMS = ("controller", "sim-loop")
 _MOST = 3
 _LONGEST = 48  # characters of a run's name
 _FOLDER = "XDG_RUNTIME_DIR"
+_STARTING = ", starting or ending"
 
 
 def none_here() -> str:
     """Sentence for a user without a loop here: the folder that was searched, and other loops on this host."""
+    found = list(other_loops())
+    soon = [each.removesuffix(_STARTING) for each in found if each.endswith(_STARTING)]
+    if soon:
+        return f"{soon[0]}, which is starting or ending: ask again in a few seconds"
     given = f"from {_FOLDER}" if os.environ.get(_FOLDER) else f"{_FOLDER} is not set"
     sentence = (
         f"no loop of user {_name(os.geteuid())} is running here: {runtime_path()} was searched ({given}); loops of "
         f"other users, or started with another {_FOLDER}, are not seen"
     )
-    found = list(other_loops())
     more = [f"and {len(found) - _MOST} more"] if len(found) > _MOST else []
     return "; ".join([sentence, *found[:_MOST], *more])
 
@@ -36,11 +40,13 @@ def other_loops() -> Iterator[str]:
             if program and process.pid != os.getpid():
                 owner = process.uids().effective
                 who = "you run" if owner == os.geteuid() else f"user {_name(owner)} runs"
-                yield f"{who} `{program}` (process {process.pid}{_where(process)})"
+                yield f"{who} `{program}` (process {process.pid}){_where(process)}"
 
 
 def _program(words: Sequence[str]) -> str:
-    """`lowfc controller --run NAME` of a command line that is one; empty for any other."""
+    """`lowfc controller --run NAME` of a command line that is one; empty for any other, also for that of sudo."""
+    if not words or not words[0].rpartition("/")[2].startswith("python"):
+        return ""
     for before, word in itertools.pairwise(words):
         if before.rpartition("/")[2] == "lowfc" and word in _PROGRAMS:
             name = words[words.index("--run") + 1 :][:1] if "--run" in words else []
@@ -55,7 +61,7 @@ def _where(process: psutil.Process) -> str:
     except psutil.Error:
         return ""
     if there == os.environ.get(_FOLDER, ""):
-        return ", still starting"
+        return _STARTING
     return f", with {_FOLDER}={there}" if there else f", without {_FOLDER}"
 
 

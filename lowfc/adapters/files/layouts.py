@@ -43,7 +43,9 @@ def load_layout(name: str) -> sams.Layout:
         known = ", ".join(sorted(layouts))
         if not wanted:
             raise ConfigurationError(f"{file} holds several layouts; say which as {file}:name, of {known}")
-        raise ConfigurationError(f"no sparse-aperture layout is called {wanted!r}{nearest(wanted, layouts)}; {known}")
+        raise ConfigurationError(
+            f"no sparse-aperture layout is called {wanted!r}{nearest(wanted, layouts)}: there are {known}"
+        )
     return parse_layout(file, wanted, layouts[wanted])
 
 

@@ -5,6 +5,7 @@ import os
 import signal
 import sys
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, NoReturn
 
@@ -25,10 +26,9 @@ AnyRun = Annotated[str | None, typer.Option("--run", help="Name of the run; defa
 Json = Annotated[bool, typer.Option("--json", help="Print one JSON object on standard output.")]
 _LOGS = "Logs (MCAP), finished or not; all files of a recording are one log. `last`: the newest in the log folder."
 Logs = Annotated[list[Path], typer.Argument(help=_LOGS, metavar="LOG...", readable=False, show_default=False)]
-LogsIfAny = Annotated[
-    list[Path] | None,
-    typer.Argument(help=f"{_LOGS} None: a running loop.", metavar="[LOG...]", readable=False, show_default=False),
-]
+_IfAny = partial(typer.Argument, metavar="[LOG...]", readable=False, show_default=False)
+LogsIfAny = Annotated[list[Path] | None, _IfAny(help=f"{_LOGS} None: a running loop.")]
+LogsOrMeasure = Annotated[list[Path] | None, _IfAny(help=f"{_LOGS} None: a loop that is run for it.")]
 ConfigFile = Annotated[Path | None, typer.Option("--config", help="Configuration file (TOML).", show_default=False)]
 
 

@@ -343,6 +343,6 @@ def _environment(show: Show) -> dict[str, str]:
     environment.pop("FORCE_RERUN_ANALYTICS", None)
     environment["CI"] = "1"  # rerun sends no usage statistics then, and the user's own settings stay as they are
     environment["ALL_PROXY"] = f"http://{HOST}:9"  # nobody there: it asks api.github.com for a newer version otherwise
-    environment["NO_COLOR"] = "1"  # its last words go into ours
+    environment["NO_COLOR"] = "1"  # the end of its output goes into ours
     environment["RUST_LOG"] = "warn,egui_wgpu=error,re_renderer=error,re_viewer::native=error"
     return environment

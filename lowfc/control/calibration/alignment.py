@@ -1,4 +1,4 @@
-"""How a real sensor's image lies to the computed one: scale, centre, rotation, parity.
+"""How a real sensor's image is placed relative to the computed one: scale, centre, rotation, parity.
 
 The image of a flat wavefront through a pupil without phase is the same turned by half a turn, so that the reference
 image alone cannot tell a rotation from one by 180 degrees more; there every mode answers with the opposite sign. One

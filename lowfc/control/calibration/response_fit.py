@@ -280,8 +280,11 @@ class Check(NamedTuple):
         """Whether the cross-talk is below this, as far as the noise of these frames lets them tell."""
         modes = len(self.error)
         unsure = _SURE * float(np.sqrt(2 * (self.error**4).sum() / modes**3))  # of the square of the rms
-        far = _FAR * float(self.error.max())
-        return bool(self.rms**2 <= rms**2 + unsure and self.largest <= largest + far)
+        return bool(self.rms**2 <= rms**2 + unsure and self.largest <= self.bound(largest))
+
+    def bound(self, largest: float) -> float:
+        """Largest element that these frames may show where none is above `largest`: their noise comes on top."""
+        return largest + _FAR * float(self.error.max())
 
 
 def check(answers: Array, wanted: Array, error: Array) -> Check:

@@ -42,7 +42,7 @@ def bridge_isio(
 ) -> None:
     """Publish modal error, command, residual and flux as ImageStreamIO streams, until Ctrl-C.
 
-    With --beside or --external it also tells the loop what other programs have on the mirror, so that it is not undone.
+    With --beside or --external the loop also gets what other programs have on the mirror, so that it does not undo it.
 
     Example: lowfc bridge isio --run bench --beside dm00disp03
     """

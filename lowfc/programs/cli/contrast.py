@@ -40,6 +40,11 @@ def most_of(figures: Mapping[str, Any]) -> tuple[str, float] | None:
     return None if most is None else (most["modes"], most["share"])
 
 
+def with_this_mirror(added: Mapping[str, float]) -> dict[str, float | None]:
+    """What a flat mirror would add, and what the present one does, whether the loop is closed or not."""
+    return {"flat mirror": added["open"], "left": added["closed"]}
+
+
 def sentence(added: Mapping[str, float | None], most: tuple[str, float] | None, beyond: Sequence[str] = ()) -> str:
     """What is added in each case, and which modes cost most in the last one."""
     cases = ", ".join(f"{name} {one:+.1e}" for name, one in added.items() if one is not None)

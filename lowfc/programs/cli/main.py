@@ -19,7 +19,7 @@ COMMANDS = {
         Row("mirror", "cli.devices:mirror_app", "Run a mirror: its driver follows the commands of a run."),
         Row("record", "cli.processes:record", "Record the messages of a run in logs."),
         Row("bridge", "", "Run a bridge to another control system."),
-        Row("gateway", "", "Offer a run to a control system, and hear its variables."),
+        Row("gateway", "", "Offer a run to a control system, and read its variables."),
         Row("config", "", "Show and check the configuration."),
         Row("certs", "cli.hosts:certs", "Make the certificates of a run on several hosts."),
         Row("router", "cli.hosts:router", "Run the router of a run on several hosts."),

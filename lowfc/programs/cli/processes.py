@@ -78,7 +78,7 @@ def record(
     words: Annotated[list[str] | None, typer.Argument(hidden=True)] = None,
     as_json: Json = False,
 ) -> None:
-    """Record a run's messages into MCAP logs until told to stop.
+    """Record a run's messages into MCAP logs until Ctrl-C or SIGTERM.
 
     Example: lowfc record --run bench --folder logs --longest-s 600 --min-free-mb 2000
     """
@@ -110,7 +110,7 @@ def record(
     complete = joined.path / "config.toml"  # a file may name only what was chosen; the log names every value
     write_whole(complete, settings.to_toml().encode())
     if not joined.links.network.router and (nobody := nobody_yet(run)):
-        typer.echo(nobody, err=True)
+        typer.echo(f"recorder: {nobody}", err=True)
     done = run_recorder(
         joined,
         Path(log.folder),

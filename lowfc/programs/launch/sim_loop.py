@@ -56,7 +56,7 @@ def sim_loop(
     Raises:
         BusError: a run of that name is there already.
         ViewerError: there is no screen for the window.
-        ProcessDiedError: a process ended by itself; the text names it and has its last words.
+        ProcessDiedError: a process ended by itself; the text names it, the end of its output and the log.
     """
     console = Console(stderr=True)
     require_screen(show)
@@ -76,6 +76,9 @@ def sim_loop(
             children.insert(len(children) - record, _view(run, show, console))  # the recorder ends last
         start_all(children)
         _supervise(config, children, watch, console, duration_s)
+    except ProcessDiedError as fault:
+        log = watch.of(Role.RECORDER).recording.file
+        raise ProcessDiedError(f"{fault}\nrecorded until then: {log}" if log else str(fault)) from fault
     finally:
         bus.close()
         stop_all(children)
@@ -177,7 +180,7 @@ def check(children: list[Child]) -> None:
     for child in children:
         done = child.name == Role.VIEWER or (child.name == Role.CAMERA and child.status == 0)
         if child.status is not None and not done:
-            raise ProcessDiedError(f"{child.how_it_ended()}; its last words:\n{child.stderr_tail()}")
+            raise ProcessDiedError(f"{child.how_it_ended()}; the end of its output:\n{child.stderr_tail()}")
 
 
 def _say_view_ended(view: Child, console: Console) -> None:

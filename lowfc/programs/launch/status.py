@@ -13,7 +13,7 @@ from lowfc.contract.events import Level
 from lowfc.contract.messages import COMMAND, FRAME, Role, wire
 from lowfc.contract.printable import printable
 from lowfc.control.loop.wording import counted, mode_word
-from lowfc.programs.cli.contrast import most_of, sentence
+from lowfc.programs.cli.contrast import most_of, sentence, with_this_mirror
 from lowfc.programs.launch.watch import Watch, mode_name, topic_count, wavefront
 
 SILENT_S = 2.0
@@ -71,7 +71,7 @@ def _silent(watch: Watch) -> str:
 
 def _added(recent: dict[str, Any]) -> str:
     added = recent["added_contrast"]
-    return "" if added is None else f"contrast +{added['closed']:.1e} of +{added['open']:.1e}  "
+    return "" if added is None else f"contrast {added['closed']:+.1e} of {added['open']:+.1e}  "
 
 
 def _wavefront(camera: wire.Health) -> str:
@@ -133,8 +133,8 @@ def _contrast(figures: dict[str, Any]) -> list[str]:
     if added is None:
         return []
     own = "" if figures["dark_zone_contrast"] is None else f"own {figures['dark_zone_contrast']:.1e}; "
-    beyond = ("closed",) if figures["beyond_quadratic"] else ()
-    return [f"contrast           {own}{sentence(added, most_of(figures), beyond)}"]
+    beyond = ("left",) if figures["beyond_quadratic"] else ()
+    return [f"contrast           {own}{sentence(with_this_mirror(added), most_of(figures), beyond)}"]
 
 
 def summary_text(figures: dict[str, Any]) -> str:

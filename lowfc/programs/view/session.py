@@ -12,6 +12,7 @@ from rich.console import Console
 from lowfc.adapters.bus.run import open_run
 from lowfc.adapters.bus.zenoh_bus import ZenohBus
 from lowfc.adapters.files.whole_file import being_written, require_folder
+from lowfc.adapters.logs.records import LogFile
 from lowfc.adapters.process.join import clock_of
 from lowfc.adapters.process.progress import passing_bar
 from lowfc.adapters.viewer.rerun_viewer import RerunViewer
@@ -78,6 +79,9 @@ def show_logs(logs: list[Path], config: Configuration | None, target: Target) ->
         DataFileError: a file cannot be read or written.
     """
     require_folder(target.written)
+    for log in logs:
+        with LogFile(log):  # one that cannot be read is named before a viewer starts
+            pass
     drawn = Drawn()
     with contextlib.ExitStack() as stack:
         if target.save is not None:

@@ -237,6 +237,8 @@ def test_frames_of_their_own_show_a_wrong_reconstructor() -> None:
     right = [check(each, np.eye(8), error) for each in answers]
     assert np.mean([each.within(0.012, 0.04) for each in right]) > 0.99
     assert np.sqrt(np.mean([each.rms**2 for each in right])) < 0.01
+    largest = max(right, key=lambda each: each.largest)
+    assert largest.bound(0.04) > largest.largest > 0.04, "with the noise of these frames it is good"
     wrong = np.eye(8)
     wrong[2, 5] = 0.3
     assert not any(check(each, wrong, error).within(0.012, 0.04) for each in answers)

@@ -175,9 +175,10 @@ def bench(name: BenchName, value: BenchValue, run: AnyRun = None, as_json: Json 
         assert state is not None  # noqa: S101  # that is what it answers with
     known = figures(state, run=loop.run_id)
     names = sorted({one.name for one in state.settings.interlocks})
-    unused = "" if name in names else f"; no interlock looks at it, they look at: {', '.join(names) or 'nothing'}"
+    unused = "" if name in names else f"; no interlock reads it, they read: {', '.join(names)}" if names else ""
+    acting = f"interlocks: {interlocks(known)}" if names else "no interlock is configured"
     said = {"run": loop.run_id, "name": name, "value": read, "interlocks": known["interlocks"]}
-    put(said, f"{name} is {value}{unused}; interlocks: {interlocks(known)} (run {loop.run_id})", as_json=as_json)
+    put(said, f"{name} is {value}{unused}; {acting} (run {loop.run_id})", as_json=as_json)
 
 
 def _load(file: CalibrationFile, run: AnyRun = None, as_json: Json = False) -> None:

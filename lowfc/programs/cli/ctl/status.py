@@ -13,7 +13,7 @@ from lowfc.contract.messages import FRAME, Role, from_timestamp, wire
 from lowfc.control.loop.safety import REASONS, Rejection, reason_of
 from lowfc.control.loop.state import FADING_FRAMES, SETTLING_FRAMES
 from lowfc.control.loop.wording import PAUSED, counted, mode_word
-from lowfc.programs.cli.contrast import most_of, sentence
+from lowfc.programs.cli.contrast import most_of, sentence, with_this_mirror
 from lowfc.programs.launch.watch import mode_name, topic_count, wavefront
 
 NOBODY = wire.Health()
@@ -140,7 +140,11 @@ def text(known: dict[str, Any]) -> str:
         + (f"; the last was refused as {_spoken(known['refused'])}" if known["refused"] else ""),
         "command": f"{known['command_rms_nm']:.3f} nm rms" + (", on its way to zero" if known["homing"] else ""),
         "offset": f"{known['offset_rms_nm']:.3f} nm rms",
-        **({} if known["added_contrast"] is None else {"contrast": sentence(known["added_contrast"], most_of(known))}),
+        **(
+            {"contrast": sentence(with_this_mirror(known["added_contrast"]), most_of(known))}
+            if known["added_contrast"]
+            else {}
+        ),
         "law": law,
         "gain": _values(known["gain"]) + _automatic(known["gain_automatic"]),
         "leak": _values(known["leak"]),
@@ -263,7 +267,7 @@ def _values(values: list[float], unit: str = "") -> str:
     if not values:
         return "none"
     same = len(set(values)) == 1
-    return f"{values[0]:g}{unit} for all" if same else " ".join(f"{value:g}" for value in values) + unit
+    return f"{values[0]:g}{unit} for all" if same else " ".join(f"{value:.4g}" for value in values) + unit
 
 
 def _rss(values: npt.ArrayLike) -> float:

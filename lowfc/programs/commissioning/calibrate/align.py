@@ -128,11 +128,11 @@ def computed_scale(config: Configuration) -> float:
 
 
 def in_words(found: Alignment, scale: float) -> str:
-    """Where the image is, and what is left of it; `scale` in pixels per lambda/D."""
+    """Where the image is, and how much of it differs from the computed one; `scale` in pixels per lambda/D."""
     geometry = found.geometry
     return (
         f"{scale:.4f} pixels per lambda/D, centre at row {geometry.row:.2f}, column "
         f"{geometry.column:.2f}, rotation {geometry.rotation_deg:.2f} degrees, "
-        f"{'reflected' if geometry.parity < 0 else 'not reflected'}; {found.residual:.1%} of the image is left "
-        f"({found.other_parity:.1%} with the other parity)"
+        f"{'reflected' if geometry.parity < 0 else 'not reflected'}; {found.residual:.1%} of the image differs from "
+        f"the computed one ({found.other_parity:.1%} with the other parity)"
     )

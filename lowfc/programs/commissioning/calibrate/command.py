@@ -121,7 +121,7 @@ def dark(
 ) -> None:
     """Take a dark and find bad pixels; write the calibration in use with both.
 
-    The star must be blocked meanwhile, which nobody can do from here.
+    Block the star first, by hand.
 
     Example: lowfc calibrate dark --frames 1000 --out night.fits
     """
@@ -160,7 +160,7 @@ def align(
     load: Load = False,
     as_json: Json = False,
 ) -> None:
-    """Fit how the sensor lies to the computed image; write the computed calibration for its pixels.
+    """Fit how the sensor is placed relative to the computed image; write the computed calibration for its pixels.
 
     A half turn more or less leaves the image as it is and reverses every mode: a poke shows which it is.
 

@@ -36,8 +36,9 @@ class Verdict(Result):
     snr_reached: float = figure("signal-to-noise ratio reached", form=".3g")
     check_cycles: int = figure("cycles that check it")
     check_cross_talk_rms: float = figure("their cross-talk, rms", form=".3g")
-    check_cross_talk_max: float = figure("their cross-talk, largest", form=".3g")
-    check_error: float = figure("noise of this cross-talk", form=".2g")
+    check_cross_talk_max: float = figure("their cross-talk, largest, with its noise", form=".3g")
+    check_cross_talk_bound: float = figure("good up to, with this noise", form=".3g")
+    check_error: float = figure("noise of an element of it", form=".2g")
     promised_cross_talk_rms: float = figure("promised cross-talk, rms", form=".3g")
     promised_cross_talk_max: float = figure("promised cross-talk, largest", form=".3g")
     recommended: bool = figure()
@@ -261,9 +262,9 @@ def judge(
         )
     if not check.within(rms, largest):
         faults.append(
-            f"cross-talk on frames that were not used for it: rms {check.rms:.3g} and at most {check.largest:.3g}, "
-            f"where {rms:.3g} and {largest:.3g} is expected; did the wavefront, the light or the sensor change "
-            "meanwhile?"
+            f"cross-talk on frames that were not used for it: rms {check.rms:.3g} and at most {check.largest:.3g}; "
+            f"expected {rms:.3g} and, with the noise of these frames, {check.bound(largest):.3g}: did the wavefront, "
+            "the light or the sensor change meanwhile?"
         )
     if noise_ratio is not None and noise_ratio.max() > MOST_NOISE:
         faults.append(
@@ -277,6 +278,7 @@ def judge(
         check_cycles=check.cycles,
         check_cross_talk_rms=check.rms,
         check_cross_talk_max=check.largest,
+        check_cross_talk_bound=check.bound(largest),
         check_error=float(check.error.max()),
         promised_cross_talk_rms=rms,
         promised_cross_talk_max=largest,

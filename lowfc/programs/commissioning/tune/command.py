@@ -20,7 +20,7 @@ Kind = Literal["integrator", "pi-notch", "lqg"]
 def tune(
     logs: LogsIfAny = None,
     controller: Annotated[Kind, typer.Option(help="Kind of law.")] = "integrator",
-    live: Annotated[float | None, typer.Option(min=1.0, help="Listen to a running loop, for seconds.")] = None,
+    live: Annotated[float | None, typer.Option(min=1.0, help="Seconds for which a running loop is observed.")] = None,
     out: Annotated[Path | None, typer.Option(help="Write the law to this file (FITS).")] = None,
     apply: Annotated[bool, typer.Option("--apply", help="Give the gains, or the law, to the running loop.")] = False,
     plot: Annotated[Path | None, typer.Option(help="Draw spectra into this file (PNG).")] = None,

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from lowfc.adapters.files.whole_file import require_folder, write_whole
-from lowfc.adapters.process.terminal import ConfigFile, Json, LogsIfAny, configuration
+from lowfc.adapters.process.terminal import ConfigFile, Json, LogsOrMeasure, configuration
 from lowfc.contract.errors import DataFileError
 from lowfc.programs.cli.output import put
 
@@ -34,7 +34,7 @@ class Camera(StrEnum):
 
 
 def latency(
-    logs: LogsIfAny = None,
+    logs: LogsOrMeasure = None,
     duration: Annotated[float, typer.Option(min=0.5, max=1e5, help="Seconds of each repeat.")] = 10.0,
     rate: Annotated[float | None, typer.Option(help="Frames per second; default: the file's, or 1000.")] = None,
     camera: Annotated[Camera, typer.Option(help="Frames made beforehand, or the simulated camera.")] = Camera.PREPARED,

@@ -219,4 +219,4 @@ def _check_ends(children: list[Child]) -> None:
 
 def _died(child: Child) -> ProcessDiedError:
     words = child.stderr_tail()
-    return ProcessDiedError(child.how_it_ended() + (f"; its last words:\n{words}" if words else ""))
+    return ProcessDiedError(child.how_it_ended() + (f"; the end of its output:\n{words}" if words else ""))

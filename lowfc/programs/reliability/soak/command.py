@@ -9,7 +9,7 @@ from lowfc.programs.cli.output import put
 
 
 def soak(
-    hours: Annotated[float, typer.Option(min=0.001, max=1000, help="For so long.")],
+    hours: Annotated[float, typer.Option(min=0.001, max=1000, help="Duration.")],
     config: ConfigFile = None,
     as_json: Json = False,
 ) -> None:

@@ -54,7 +54,7 @@ class Trend(Panel):
             y_ticks = [tick for tick in y_ticks if tick[0] == round(tick[0])]
         self._axes.fit(stream, (0.0, span_s), y, _clock_ticks(course.begin_ns, span_s), y_ticks)
         kind = "true" if course.true else "measured"
-        names = (f"flat mirror, {kind}", f"residual, {kind}", f"mean of {course.span_ns / 1e9:g} s")
+        names = ("flat mirror", "residual", f"{kind}, {course.span_ns / 1e9:g} s mean")
         self._axes.name(stream, names, (GREY, GREEN, GREY))
         self._axes.draw(stream, after_s, [*logarithms.T[::-1]], (GREY, GREEN), (1.2, 1.8))  # the residual on top
 
