@@ -134,11 +134,11 @@ class Client:
         return self.ask("gain", modes, text=AUTO)
 
     def leak(self, values: npt.ArrayLike, modes: Modes = ()) -> Answer:
-        """Set integrator leaks, as `gain`."""
+        """Set integrator leaks, as `gain`: one for all modes or one for each, (modes,)."""
         return self.ask("leak", modes, values)
 
     def limit(self, values: npt.ArrayLike, modes: Modes = ()) -> Answer:
-        """Set the largest modal commands, nm rms of wavefront, as `gain`."""
+        """Set the largest modal commands (modes,), nm rms of wavefront, as `gain`."""
         return self.ask("limit", modes, values)
 
     def step(self, frames: int) -> Answer:
@@ -146,7 +146,7 @@ class Client:
         return self.ask("step", values=frames)
 
     def offset(self, values: npt.ArrayLike = (), modes: Modes = ()) -> Answer:
-        """Set the loop's target, nm rms of wavefront, as `gain`; zero without values."""
+        """Set the loop's target (modes,), nm rms of wavefront, as `gain`; zero without values."""
         return self.ask("offset", modes, values)
 
     def channel(self, name: str, actuators_nm: npt.ArrayLike | None = None) -> Answer:
@@ -319,7 +319,7 @@ class Client:
         calibration: Calibration | None = None,
         lease_id: int | None = None,
     ) -> Answer:
-        """Ask the controller anything; the fields are those of `lowfc.v1.Request`.
+        """Ask the controller anything; the fields are those of `lowfc.v1.Request`: values (modes,), actuators nm.
 
         Raises:
             BusError: no controller is there, or it is too slow.

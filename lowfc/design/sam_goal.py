@@ -57,7 +57,10 @@ class Goal:
 
 
 def merit(optics: Optics, goal: Goal, fields: Single) -> float:
-    """The figure to be made small, above 0, of a mask's fields at the sensor; infinite where a mode has no signal."""
+    """The figure to be made small, above 0, of a mask's fields, shapes as in `hole_fields`.
+
+    Inf where a mode has no signal.
+    """
     try:
         value = _merit(optics, goal, fields)
     except np.linalg.LinAlgError:
@@ -66,7 +69,7 @@ def merit(optics: Optics, goal: Goal, fields: Single) -> float:
 
 
 def paper_ratios(optics: Optics, fields: Single, estimator: str = "pinv") -> dict[str, float]:
-    """Predicted over paper's figure, of each row of Tables 3 and 4: below 1 is better than the paper."""
+    """Predicted over paper's figure, of each row of Tables 3 and 4, of fields with shapes as in `hole_fields`."""
     ratios = {}
     for name in optics.focal_masks:
         seen = signal(optics, fields, name)
@@ -104,7 +107,7 @@ def _tilt_mas(optics: Optics, fields: Single, estimator: str) -> float:
 
 
 def figures(optics: Optics, fields: Single) -> dict[str, Any]:
-    """What the first focal-plane mask's rows would show, as plain values for people and for JSON.
+    """What the first focal-plane mask's rows would show, as plain values; fields have shapes as in `hole_fields`.
 
     "bound" is the Cramer-Rao bound of Table 3, which knows no second order; in Table 4 "weighted" attains it.
     """

@@ -184,7 +184,7 @@ def signal(optics: Optics, fields: Single, focal_mask: str) -> Signal:
 
     Args:
         optics: Everything before the mask.
-        fields: The sum of `hole_fields` over the mask.
+        fields: The sum of `hole_fields` over the mask, shapes as there; amplitude.
         focal_mask: One of `optics.focal_masks`.
     """
     count = 1 + len(NOLLS_20)
@@ -196,7 +196,7 @@ def signal(optics: Optics, fields: Single, focal_mask: str) -> Signal:
 
 
 def band_signal(optics: Optics, fields: Single) -> Signal:
-    """What the sensor sees of the whole band behind the first focal-plane mask, for Table 4."""
+    """What the sensor sees of the whole band behind the first focal-plane mask: amplitude, shapes as in `signal`."""
     count, first = 1 + optics.band_modes, (1 + len(NOLLS_20)) * len(optics.focal_masks)
     I0: Array = np.zeros(fields[0].size)
     H: Array = np.zeros((fields[0].size, optics.band_modes))

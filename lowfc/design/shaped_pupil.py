@@ -181,7 +181,7 @@ def relative_field(quarter: Array, axis: Array) -> Array:
 
 
 def largest_contrast(quarter: Array, request: Request) -> float:
-    """Largest contrast of a mask, on the fine grid of the dark zone and on its edges."""
+    """Largest contrast of a mask (cells, cells), on the fine grid of the dark zone and on its edges."""
     axis, zone = fine_grid(request.zone)
     on_grid = relative_field(quarter, axis)[zone]
     on_edge = _field_at(quarter, edge_points(request.zone, FINE_STEP))
@@ -189,7 +189,7 @@ def largest_contrast(quarter: Array, request: Request) -> float:
 
 
 def figures(quarter: Array, request: Request) -> Figures:
-    """What a mask does in the dark zone of a request."""
+    """What a mask does in the dark zone of a request: transmissions (cells, cells) of one quadrant."""
     axis, zone = fine_grid(request.zone)
     contrast = relative_field(quarter, axis)[zone] ** 2
     pupil = from_quarter(quarter, SAMPLES)
@@ -208,7 +208,7 @@ def figures(quarter: Array, request: Request) -> Figures:
 
 
 def stored(quarter: Array, request: Request) -> NDArray[np.floating]:
-    """The mask in the shortest floating-point type in which it keeps the promise."""
+    """The mask, transmissions (cells, cells), in the shortest floating-point type in which it keeps the promise."""
     for kind in (np.float16, np.float32):
         short: NDArray[np.floating] = quarter.astype(kind)
         if largest_contrast(short.astype(np.float64), request) <= request.contrast:

@@ -31,24 +31,27 @@ def random_wavefronts(rng: np.random.Generator, count: int, nolls: Sequence[int]
 
 
 def noisy_e(rng: np.random.Generator, mean_e: ArrayLike, read_noise_e: float) -> Array:
-    """An exposure in electrons: photon noise, read noise, and whole numbers at one electron per digital number."""
+    """An exposure (any shape) in electrons.
+
+    Photon noise, read noise, and whole numbers at one electron per digital number.
+    """
     mean_e = np.maximum(mean_e, 0.0)  # a twin's rounding leaves values below zero where there is no light
     return np.asarray(np.rint(rng.poisson(mean_e) + read_noise_e * rng.standard_normal(mean_e.shape)))
 
 
 def gram(basis: Array) -> Array:
-    """Mean products (modes, modes) of modes (modes, samples) over the open pupil, piston removed."""
+    """Mean products (modes, modes) of modes (modes, samples), in any unit, over the open pupil, piston removed."""
     centred = basis - basis.mean(axis=1, keepdims=True)
     return np.asarray(centred @ centred.T / basis.shape[1])
 
 
 def input_rms(gram: Array, bounds: Array) -> float:
-    """Root mean square over the open pupil of coefficients uniform between minus and plus bounds (modes,)."""
+    """Rms over the open pupil of coefficients uniform within plus or minus bounds (modes,), in their unit."""
     return float(np.sqrt(np.sum(np.diag(gram) * bounds**2) / 3.0))
 
 
 def expected_rms(gram: Array, covariance: Array) -> float:
-    """Root mean square over the open pupil of residuals with this covariance (modes, modes)."""
+    """Root mean square over the open pupil of residuals with this covariance (modes, modes), in their unit."""
     return float(np.sqrt(np.sum(gram * covariance)))
 
 
@@ -69,7 +72,7 @@ def residual_pv(basis: Array, residuals: Array) -> Array:
 
 
 def expected_r_squared(variances: Array, bounds: Array) -> Array:
-    """What `r_squared` tends to (modes,) with many estimates, if their errors do not depend on the truth.
+    """What `r_squared` tends to (modes,), without unit, with many estimates, if errors do not depend on the truth.
 
     Args:
         variances: (modes,) of the errors.
@@ -79,7 +82,7 @@ def expected_r_squared(variances: Array, bounds: Array) -> Array:
 
 
 def r_squared(estimates: Array, truth: Array) -> Array:
-    """Coefficient of determination (modes,) of estimates (n, modes), eq. (15) as the text below it reads."""
+    """Coefficient of determination (modes,), without unit, of estimates (n, modes), as the text below eq. (15)."""
     residual = np.sum((estimates - truth) ** 2, axis=0)
     total = np.sum((estimates - estimates.mean(axis=0)) ** 2, axis=0)
     return np.asarray(1.0 - residual / total)

@@ -216,7 +216,10 @@ class MirrorExtras:
         raise NotImplementedError
 
     def settle(self, actuators_nm: Single, elapsed_ns: float) -> Single:
-        """Simulated mirrors: in place of `apply`, with the run's time since the last call; without a command, too."""
+        """Simulated mirrors: `apply` (rows, columns) with the run's time since the last call.
+
+        Without a command, too.
+        """
         raise NotImplementedError
 
     def fill(self, health: wire.Health) -> None:

@@ -183,7 +183,7 @@ def reconstructor(
 
 
 def condition_number(response: Array) -> float:
-    """Largest over smallest singular value of H (pixels, modes); infinite where a mode has no signal."""
+    """Largest over smallest singular value, without unit, of H (pixels, modes); infinite where a mode has no signal."""
     singular = np.linalg.svd(response, compute_uv=False)
     return float(singular[0] / singular[-1]) if singular[-1] > 0 else float("inf")
 

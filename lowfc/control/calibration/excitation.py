@@ -59,7 +59,7 @@ def multisine(period_frames: int, bins: list[Whole], rms_nm: float, seed: int) -
 
     Args:
         period_frames: Frames in the period.
-        bins: Lines of each mode, as `lines` gives them.
+        bins: Lines of each mode, indices as `lines` gives them.
         rms_nm: Of each mode.
         seed: Of the phases.
     """

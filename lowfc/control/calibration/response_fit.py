@@ -201,7 +201,10 @@ def measured(sums: Sums) -> Measured:
 
 
 def without_outliers(answers: Array) -> Array:
-    """Answers (cycles, modes, modes) kept near their median: a jolt of the wavefront spoils one cycle, not the mean."""
+    """Answers (cycles, modes, modes), without unit, kept near their median.
+
+    A jolt of the wavefront spoils one cycle, not the mean.
+    """
     median = np.median(answers, axis=0)
     # 1.48: from the median deviation to the standard deviation; of a row, for all its elements have the same noise
     scale = 1.48 * np.median(np.abs(answers - median), axis=(0, 2))[:, None]
@@ -214,7 +217,7 @@ def row_error(answers: Array) -> Array:
     It comes from the scatter of the cycles, so that whatever disturbed them is in it: photons, read-out, vibration.
 
     Args:
-        answers: (cycles, modes, modes) what a reconstructor makes of the response of each cycle.
+        answers: (cycles, modes, modes) what a reconstructor makes of the response of each cycle, without unit.
 
     Returns:
         Infinite from a single cycle, or where the pokes do not tell the modes apart.
@@ -291,7 +294,7 @@ def check(answers: Array, wanted: Array, error: Array) -> Check:
     """Cross-talk of a reconstructor, from cycles that were not used for it.
 
     Args:
-        answers: (cycles, modes, modes) what it makes of the response of each.
+        answers: (cycles, modes, modes) what it makes of the response of each, without unit.
         wanted: (modes, modes) what it shall make of a response: one, unless combinations of modes are suppressed.
         error: (modes,) standard error of the elements of each row in one cycle.
     """

@@ -96,7 +96,7 @@ class GainBank:
         self._clear(self._windows[0])
 
     def followed(self, open_nm: Single, error_nm: Single, *, closed: bool) -> bool:
-        """Take the modes of one frame: of the open loop, and of the loop itself; whether a block is complete."""
+        """Take the modes (modes,) of one frame, of the open loop and of the loop; whether a block is complete."""
         self._loops, errors_nm = self._loops.followed(open_nm)
         squares = np.square(errors_nm)
         self._power += squares[0]

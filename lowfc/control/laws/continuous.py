@@ -60,19 +60,19 @@ class Timing(NamedTuple):
 
 
 def mean_over(omega: Array, length: float) -> Complex:
-    """Mean (frequencies,) of e^(i w u) over u in [0, length]."""
+    """Mean (frequencies,) of e^(i w u) over u in [0, length]; w in rad per frame."""
     turned = 1j * np.asarray(omega, float) * length
     small = np.abs(turned) < 1e-9
     return np.where(small, 1 + turned / 2, np.expm1(turned) / np.where(small, 1, turned))
 
 
 def hold_floor(omega: Array, held: float = 1.0) -> Array:
-    """Power (frequencies,) that is left of a wave of power 1 by the best command that is held."""
+    """Power (frequencies,) that is left of a wave of power 1 by the best command that is held; rad per frame."""
     return np.asarray(1 - np.abs(mean_over(omega, held)) ** 2)
 
 
 def left_power(law: LinearLaw, omega: Array, timing: Timing) -> Array:
-    """Mean over time (frequencies, modes) of what the loop leaves of a wave of power 1."""
+    """Mean over time (frequencies, modes) of what the loop leaves of a wave of power 1; rad per frame."""
     if not timing.held:  # at an instant, of a command what an exposure sees of it
         return np.asarray(np.abs(sensitivity(law, omega, timing.delay)) ** 2)
     command = commanded(law, omega, timing.delay) * mean_over(omega, timing.exposure)[:, None]
@@ -100,7 +100,7 @@ def spectrum_left(law: LinearLaw, omega: Array, measured: Array, noise_nm2: Arra
 
 
 def commanded(law: LinearLaw, omega: Array, delay: float) -> Complex:
-    """Command (frequencies, modes) made of a frame that measures e^(i w t_k), beside that wave at t_k."""
+    """Command (frequencies, modes) made of a frame that measures e^(i w t_k), over that wave; rad per frame."""
     S = sensitivity(law, omega, delay)
     seen = np.polynomial.polynomial.polyval(np.exp(-1j * omega), delay_weights(delay)) * np.exp(-1j * omega)
     return np.asarray((S - 1) / seen[:, None])

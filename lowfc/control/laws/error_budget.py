@@ -76,7 +76,7 @@ def white_noise(law: LinearLaw, noise_nm: Array) -> Term:
 
 
 def lag(law: LinearLaw, disturbance: Spectrum, mean_nm: Array, timing: Timing) -> Term:
-    """What the loop leaves of a disturbance that is known at the start of each exposure, by its spectrum and mean.
+    """What the loop leaves of a disturbance known at the start of each exposure, by spectrum and mean (modes,).
 
     With a `timing` that counts whole periods this is what is left at every moment.
     """
@@ -84,7 +84,7 @@ def lag(law: LinearLaw, disturbance: Spectrum, mean_nm: Array, timing: Timing) -
 
 
 def lag_under_noise(law: LinearLaw, measured: Spectrum, mean_nm: Array, timing: Timing) -> Term:
-    """The same of a disturbance that was measured with noise: the floor of its spectrum is taken off."""
+    """The same (modes,) of a disturbance that was measured with noise: the floor of its spectrum is taken off."""
     exposed = np.abs(mean_over(_omega(law, measured), timing.exposure)) ** 2
     passed = _passed(law, measured, timing) / exposed[:, None]
     floor = floor_nm2_hz(measured)

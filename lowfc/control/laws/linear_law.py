@@ -98,7 +98,7 @@ def at_rest(law: LinearLaw) -> Single:
 
 
 def follow(law: LinearLaw, x: Single, y: Single, kept: Single) -> Single:
-    """The state (states,) after a frame: y (modes,) of it, and the command (modes,) kept before it."""
+    """The state (states,) after a frame: y (modes,) nm of it, and the command (modes,) nm kept before it."""
     after: Single = law.transition @ x
     after += law.measurement_gain @ y
     after += law.command_gain @ kept
@@ -106,7 +106,7 @@ def follow(law: LinearLaw, x: Single, y: Single, kept: Single) -> Single:
 
 
 def coast(law: LinearLaw, x: Single, kept: Single) -> Single:
-    """The state (states,) one frame later, where that frame is missing or refused."""
+    """The state (states,) one frame later, where that frame is missing or refused; the command (modes,) in nm."""
     after: Single = law.predict_only @ x
     after += law.command_gain @ kept
     return after

@@ -131,12 +131,15 @@ def sentence(found: Margins) -> str:
 
 
 def rejection(law: LinearLaw, frequency_hz: Array, delay_frames: float | None = None) -> Array:
-    """`|S|` (frequencies, modes): true residual over disturbance; with the delay of the law where none is given."""
+    """`|S|` (frequencies, modes) at Hz: true residual over disturbance.
+
+    With the delay of the law where none is given.
+    """
     return np.abs(sensitivity(law, 2 * np.pi * np.asarray(frequency_hz, float) / law.rate_hz, delay_frames))
 
 
 def noise_transfer(law: LinearLaw, frequency_hz: Array, delay_frames: float | None = None) -> Array:
-    """`|T|` (frequencies, modes): true residual over measurement noise of the same mode."""
+    """`|T|` (frequencies, modes) at Hz: true residual over measurement noise of the same mode."""
     return np.abs(sensitivity(law, 2 * np.pi * np.asarray(frequency_hz, float) / law.rate_hz, delay_frames) - 1)
 
 

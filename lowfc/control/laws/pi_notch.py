@@ -40,7 +40,7 @@ def pi_notch(
     Args:
         noll: Noll index of each mode.
         gain: (modes,) integral gain, per frame.
-        proportional: (modes,) proportional gain.
+        proportional: (modes,) proportional gain, without unit.
         leak: (modes,) of the integral, per frame.
         notches: Of each mode.
         delay_frames: See `lowfc.control.laws.stability.delay_weights`.

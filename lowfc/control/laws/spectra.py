@@ -129,7 +129,10 @@ def floor_nm2_hz(found: Spectrum) -> Array:
 
 
 def in_bins(frequency_hz: Array, columns: Sequence[Array], per_decade: int = 20) -> tuple[Array, list[Array]]:
-    """Means over bins of even width in the logarithm of frequency, without 0 Hz: the frequencies, and each column."""
+    """Means over bins of even width in the logarithm of frequency, without 0 Hz.
+
+    The frequencies (bins,), and each column.
+    """
     places = np.floor(per_decade * np.log10(frequency_hz[1:])).astype(int)
     starts = np.flatnonzero(np.diff(places, prepend=places[0] - 1))
     counts = np.diff(starts, append=places.size)

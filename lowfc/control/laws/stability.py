@@ -22,7 +22,7 @@ _BISECTIONS = 50
 
 
 def settling_frames(gain: Array | Single, leak: Array | Single, least: float = 0.0) -> int:
-    """Frames until the slowest mode, of gain and leak (modes,), has settled after the loop was closed, or the least."""
+    """Frames until the slowest mode has settled after closing, or the least; gain and leak (modes,) without unit."""
     slowest = float((gain + leak)[gain + leak > 0].min(initial=1.0))
     return int(np.ceil(max(SETTLING / slowest, least)))
 
@@ -48,7 +48,7 @@ def delay_weights(delay_frames: float) -> Array:
 
 
 def open_loop(omega: Array | float, gain: float, leak: float, delay_frames: float) -> Complex:
-    """Loop transfer function L at angular frequencies omega (rad per frame)."""
+    """Loop transfer function L at angular frequencies omega (frequencies,), rad per frame."""
     z = np.exp(1j * np.asarray(omega, dtype=float))
     weights = delay_weights(delay_frames)
     seen = np.polynomial.polynomial.polyval(1 / z, weights)

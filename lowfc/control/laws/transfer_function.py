@@ -115,7 +115,7 @@ def seen_of_mirror(played_nm: Array, weights: Array) -> Array:
 
 
 def departure(value: Complex, theory: Array, error: Array, tolerance_db: float) -> Departure:
-    """Compare the sizes of lines (lines,) with theory (lines,), given their standard error (lines,)."""
+    """Compare the sizes of lines (lines,), in any unit, with theory (lines,), given their standard error (lines,)."""
     size = np.maximum(np.abs(value), 1e-30)
     db = _DB * np.log(size / np.maximum(theory, 1e-30))
     error_db = _DB * error / size

@@ -132,7 +132,7 @@ def identified(run: Pieces, rate_hz: float) -> list[Model]:
 
 
 def tune_integrator(models: Sequence[Model], gains: Gains, noll: tuple[int, ...], leak: Array, timing: Timing) -> Tuned:
-    """The loop's own integrator with these gains."""
+    """The loop's own integrator with these gains and leaks (modes,), without unit."""
     law = integrator(gains.gain, leak, noll, timing.delay, models[0].rate_hz)
     return _tuned(law, timing, ("integrator",) * len(noll), models)
 
@@ -140,7 +140,7 @@ def tune_integrator(models: Sequence[Model], gains: Gains, noll: tuple[int, ...]
 def tune_lqg(
     run: Pieces, models: Sequence[Model], gains: Gains, noll: tuple[int, ...], leak: Array, timing: Timing
 ) -> Tuned:
-    """LQG for the modes for which it beats the best integrator on this very run, that integrator for the others.
+    """LQG where it beats the best integrator on this very run, that integrator elsewhere; leaks (modes,) without unit.
 
     The run decides, too, how narrow lines are that are narrower than a spectrum tells, and how fast they move.
 
@@ -171,7 +171,10 @@ def tune_lqg(
 
 
 def tune_pi_notch(models: Sequence[Model], gains: Gains, noll: tuple[int, ...], leak: Array, timing: Timing) -> Tuned:
-    """An integrator with a notch for each line that one makes smaller within the margins, the strongest line first."""
+    """An integrator with a notch for each line that it makes smaller within the margins.
+
+    Leaks (modes,) without unit.
+    """
     rate_hz = models[0].rate_hz
     found = [_notched(*mode, timing) for mode in zip(models, gains.gain.tolist(), leak.tolist(), strict=True)]
     gain, notches = np.array([g for g, _ in found]), [of_mode for _, of_mode in found]

@@ -60,7 +60,10 @@ class Model:
     lowest_hz: float = 0.0
 
     def spectrum_nm2(self, omega: Array) -> Array:
-        """Spectrum of the disturbance at rad per frame, without noise: its mean over a turn is the variance."""
+        """Spectrum (frequencies,) of the disturbance at rad per frame, without noise.
+
+        Its mean over a turn is the variance.
+        """
         shown = np.maximum(omega, 2 * np.pi * self.lowest_hz / self.rate_hz)
         found = _drift(shown, self.drift_nm2, self.cutoff_hz / self.rate_hz)
         for line in self.lines:

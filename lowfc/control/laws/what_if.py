@@ -168,5 +168,5 @@ def frames_since(begins: Mask, running: Mask, missing: Whole) -> Whole:
 
 
 def rms(values: npt.NDArray[np.floating], rows: Mask) -> Array:
-    """Root mean square (modes,) of these rows of (steps, modes), about zero."""
+    """Root mean square (modes,) of these rows of (steps, modes), about zero, in their unit."""
     return np.asarray(np.sqrt(np.mean(values[rows].astype(np.float64) ** 2, axis=0)))

@@ -225,7 +225,7 @@ class CommandChannels(NamedTuple):
 
 
 def play_table(target: str, rows: Single, basis: Single) -> PlayTable:
-    """A table to be played, checked for all that needs no loop; shapes as in `PlayTable`.
+    """A table to be played, checked for all that needs no loop; shapes as in `PlayTable`, nm.
 
     Raises:
         ValueError: its parts do not fit together, it is too long, or a number in it is not finite.

@@ -72,7 +72,7 @@ def difference(calibration: Calibration, pixels: Pixels, min_flux_dn: float, out
 
 
 def filled(calibration: Calibration, pixels: Pixels) -> Pixels:
-    """A frame (pixels,) whose pixels at full well are what the reference has there, for the light of all the others.
+    """A frame (pixels,) DN whose pixels at full well are what the reference has there, for the light of all the others.
 
     A pixel that was hit says nothing of the wavefront, but would weigh as much as its charge.
     """
@@ -85,7 +85,7 @@ def filled(calibration: Calibration, pixels: Pixels) -> Pixels:
 
 
 def saturated_pixels(calibration: Calibration, pixels: Pixels) -> int:
-    """How many good pixels of a frame (pixels,) are at full well."""
+    """How many good pixels of a frame (pixels,) DN are at full well."""
     if pixels.item(pixels.argmax()) < calibration.saturation_dn:
         return 0
     return int(np.count_nonzero((pixels >= calibration.saturation_dn) & (calibration.good > 0)))

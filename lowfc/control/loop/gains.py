@@ -69,7 +69,7 @@ def _chosen(drive: ActiveLoop, request: Request) -> Mask:
 
 
 def per_mode(noll: tuple[int, ...], request: Request, before: Single) -> Single:
-    """The values of all modes (modes,) with those of the request in their places.
+    """The values of all modes (modes,), in their unit, with those of the request in their places.
 
     Raises:
         ValueError: what is wrong with the request.

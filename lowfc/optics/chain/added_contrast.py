@@ -56,7 +56,10 @@ class ModalContrast:
 
 
 def by_group(noll: Sequence[int], each: Array) -> dict[str, float]:
-    """Sums of what each mode adds (modes,) over modes of one kind, such as both comas; the largest first."""
+    """Sums of the contrast that each mode adds (modes,) over modes of one kind, such as both comas.
+
+    The largest first.
+    """
     found: dict[str, float] = {}
     for index, one in zip(noll, each.tolist(), strict=True):
         found[mode_group(index)] = found.get(mode_group(index), 0.0) + one
@@ -99,6 +102,6 @@ def contrast_form(pupil: Array, noll: tuple[int, ...], wavelength_nm: float, wed
 
 
 def without_negative(form: Array) -> Array:
-    """The form without its negative eigenvalues: for use as a loss, which must not reward a wavefront."""
+    """The form (modes, modes), contrast per nm^2, without negative eigenvalues: a loss must not reward a wavefront."""
     values, vectors = np.linalg.eigh(form)
     return np.asarray((vectors * np.maximum(values, 0)) @ vectors.T)

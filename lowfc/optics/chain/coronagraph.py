@@ -69,7 +69,7 @@ def wedge_samples(wedge: Wedge, columns: int, rows: int, samples_per: int = 4) -
 
 
 def mean_contrast(pupil: Array, opd_nm: Array, wavelength_nm: float, wedge: Wedge, samples_per: int = 4) -> float:
-    """Mean contrast in a wedge, from the samples around it alone; arguments as for `contrast`."""
+    """Mean contrast in a wedge, from the samples around it alone; arguments and shapes as for `contrast`."""
     columns, rows = _extent(wedge, samples_per)
     image = contrast(pupil, opd_nm, wavelength_nm, columns, rows, samples_per)
     return float(image[wedge_samples(wedge, columns, rows, samples_per)].mean())

@@ -61,7 +61,7 @@ def check(layout: Layout) -> None:
 
 
 def separations(centres: Array) -> Array:
-    """Distances (holes, holes) between centres (holes, 2); infinite from a hole to itself."""
+    """Distances (holes, holes) between centres (holes, 2), in their unit; infinite from a hole to itself."""
     distances = np.hypot(*(centres[:, None] - centres).transpose(2, 0, 1))
     np.fill_diagonal(distances, np.inf)
     return np.asarray(distances)

@@ -84,7 +84,7 @@ class ScienceCamera:
         return np.asarray(field.real**2 + field.imag**2)
 
     def mean_contrast(self, image: Single, wedge: Wedge) -> float:
-        """Mean of an image's samples in a wedge, those of `coronagraph.mean_contrast`.
+        """Mean of an image's samples (rows, columns) in a wedge, those of `coronagraph.mean_contrast`.
 
         Raises:
             ValueError: The wedge reaches beyond the image.

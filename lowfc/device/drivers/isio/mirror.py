@@ -70,7 +70,7 @@ class IsioMirror:
         return self._others.sum() * np.float32(self._options.nm_per_unit)
 
     def apply(self, actuators_nm: Single) -> Single | None:
-        """Write the channel; where the sum of all channels has followed, return what of it is this one's."""
+        """Write the channel (rows, columns); where the sum of all has followed, return what of it is this one's."""
         self._check_channel()
         total = self._current_total()
         before = 0 if total is None else total.count

@@ -1,0 +1,58 @@
+"""The Python API: every public name has a docstring, and one that takes arrays says their shapes and their unit."""
+
+import ast
+import re
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[2]
+PACKAGES = ("client", "device", "optics", "design", "control")
+ARRAYS = re.compile(r"\b(Array|Single|Complex|Whole|Long|Mask|Pixels|ArrayLike)\b")
+SHAPE = re.compile(r"\([\w+*/ .-]+,\)|\([\w+*/ .-]+(, ?[\w+*/ .-]+)+\)|shapes? as|any shape")
+UNIT = re.compile(
+    r"\b(nm2?|um|mas|DN|electrons?|e-|ns|s|Hz|rad|deg|waves|frames|diameters|lambda0?|"
+    r"radii|(their|any) unit|without unit|"
+    r"fractions?|factors?|relative|transmissions?|weights|amplitudes?|indices|contrast|0 or 1|1 where|whether)\b"
+)
+
+Definition = ast.FunctionDef | ast.ClassDef
+
+
+def public(body: list[ast.stmt], before: str, above: str = "") -> Iterator[tuple[str, Definition, str, str]]:
+    """Public definitions by dotted name, with their own docstring and that of their class."""
+    for one in body:
+        if isinstance(one, Definition) and not one.name.startswith("_"):
+            text = ast.get_docstring(one) or ""
+            yield f"{before}.{one.name}", one, text, above
+            if isinstance(one, ast.ClassDef):
+                yield from public(one.body, f"{before}.{one.name}", text)
+
+
+def names(package: str) -> list[tuple[str, Definition, str, str]]:
+    found = []
+    for path in sorted((ROOT / "lowfc" / package).rglob("*.py")):
+        module = ".".join(path.relative_to(ROOT).with_suffix("").parts)
+        found += public(ast.parse(path.read_text()).body, module)
+    return found
+
+
+@pytest.mark.parametrize("package", PACKAGES)
+def test_every_public_name_has_a_docstring(package: str) -> None:
+    found = names(package)
+    assert len(found) > 20
+    assert [name for name, _, text, _ in found if not text] == []
+
+
+@pytest.mark.parametrize("package", PACKAGES)
+def test_who_takes_arrays_says_their_shapes_and_units(package: str) -> None:
+    lacking = []
+    for name, one, text, above in names(package):
+        if isinstance(one, ast.FunctionDef):
+            taken = [argument for argument in one.args.args if argument.annotation is not None]
+            arrays = [each for each in taken if ARRAYS.search(ast.unparse(each.annotation))]
+            words = f"{text} {above} {' '.join(each.arg.rpartition('_')[2] for each in arrays)}"
+            if arrays and not (SHAPE.search(words) and UNIT.search(words)):
+                lacking.append((name, "shape" if not SHAPE.search(words) else "unit", [each.arg for each in arrays]))
+    assert lacking == []
