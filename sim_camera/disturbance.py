@@ -5,11 +5,12 @@ wave and a static screen, and its spectrum is known exactly. A damped line is a 
 wander (an Ornstein-Uhlenbeck process): it is drawn frame by frame, so that a late frame costs all before it.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from lowfc.arrays import Array, Complex, Single
+from sim_camera.wheel import Wheel, walk
 
 BLOCK = 8
 """Frames computed at once: cheap, and short enough not to delay a frame."""
@@ -55,6 +56,8 @@ class Disturbance:
         screen_nm: rms of a static Kolmogorov screen, 0 for none.
         lines: damped ones.
         seed: of the lines' course.
+        wheels: whose speeds may change.
+        shear: of the beam on the sensor's masks, sine waves: Hz (waves,) and pupil diameters (waves, 2).
     """
 
     noll: tuple[int, ...]
@@ -65,6 +68,8 @@ class Disturbance:
     screen_nm: float
     lines: tuple[DampedLine, ...] = ()
     seed: int = 0
+    wheels: tuple[Wheel, ...] = ()
+    shear: tuple[Array, Complex] | None = None
 
 
 def disturbance(
@@ -137,6 +142,58 @@ def disturbance(
     return Disturbance(noll, frequencies, amplitudes, step, static, screen, lines, seed)
 
 
+def with_more(
+    shaken: Disturbance,
+    rate_hz: float,
+    drift_nm: dict[int, float],
+    drift_slope: float,
+    jitter_nm: float,
+    shear: float,
+) -> Disturbance:
+    """The disturbance with more sources, each from a seed of its own.
+
+    Args:
+        shaken: without them.
+        rate_hz: frame rate.
+        drift_nm: nm per root second by Noll index, of a random walk.
+        drift_slope: of its spectrum, where it is another than a walk's 2.
+        jitter_nm: rms of tip and of tilt, white from half the frame rate to one and a half.
+        shear: rms of the beam's slow wander on the sensor's masks along each axis, pupil diameters.
+
+    Raises:
+        ValueError: a mode of the drift is not among the modes.
+    """
+    if unknown := set(drift_nm) - set(shaken.noll):
+        raise ValueError(f"the drifting mode Z{min(unknown)} is not one of Z{shaken.noll[0]} to Z{shaken.noll[-1]}")
+    waves = [(shaken.frequency_hz, shaken.amplitude_nm)]
+    if drift_nm:
+        per_root_s = np.array([drift_nm.get(index, 0.0) for index in shaken.noll])
+        waves.append(walk(np.random.default_rng([shaken.seed, 8]), per_root_s, drift_slope))
+    if jitter_nm:
+        rng = np.random.default_rng([shaken.seed, 9])
+        frequency_hz = rate_hz * (0.5 + (np.arange(_WAVES_PER_BAND) + rng.random(_WAVES_PER_BAND)) / _WAVES_PER_BAND)
+        tilt_nm = jitter_nm * np.isin(shaken.noll, (2, 3)) * np.sqrt(2 / _WAVES_PER_BAND)
+        waves.append((frequency_hz, tilt_nm * _phases(rng, (_WAVES_PER_BAND, len(shaken.noll)))))
+    wander = _drift(np.random.default_rng([shaken.seed, 10]), np.full(2, shear), _DRIFT_HZ) if shear else None
+    frequencies, amplitudes = zip(*waves, strict=True)
+    return replace(
+        shaken, frequency_hz=np.concatenate(frequencies), amplitude_nm=np.concatenate(amplitudes), shear=wander
+    )
+
+
+def shear_at(shaken: Disturbance, time_s: float) -> Array:
+    """Shear of the beam (2,) along x and y, pupil diameters; empty where there is none."""
+    if shaken.shear is None:
+        return np.zeros(0)
+    frequency_hz, amplitude = shaken.shear
+    return np.asarray((np.exp(2j * np.pi * frequency_hz * time_s) @ amplitude).real)
+
+
+def speeds_hz(shaken: Disturbance, time_s: float) -> Array:
+    """Speed of each wheel, turns per second."""
+    return np.array([wheel.speed_hz(np.array([time_s]))[0] for wheel in shaken.wheels])
+
+
 def modes_nm(shaken: Disturbance, first: int, count: int, rate_hz: float) -> Array:
     """Modes (count, modes) at the starts of the exposures of the frames from `first` on, nm of wavefront rms."""
     found = _sum_of_waves(shaken, (first + np.arange(count)) / rate_hz)
@@ -149,16 +206,25 @@ def modes_nm(shaken: Disturbance, first: int, count: int, rate_hz: float) -> Arr
 def _sum_of_waves(shaken: Disturbance, time_s: Array) -> Array:
     """Modes (instants, modes) at these times without the damped lines."""
     waves = np.exp(2j * np.pi * np.outer(time_s - time_s[0], shaken.frequency_hz)) @ _turned(shaken, time_s[0])
-    return np.asarray(waves.real + _square(time_s)[:, None] * shaken.step_nm + shaken.static_nm)
+    found = waves.real + _square(time_s)[:, None] * shaken.step_nm + shaken.static_nm
+    for wheel in shaken.wheels:
+        found += wheel.modes_nm(time_s)
+    return np.asarray(found)
 
 
 def variances_nm2(shaken: Disturbance, per_line: int = 401) -> tuple[Array, Array]:
-    """Frequencies (n,) in Hz and the variance at each (n, modes), nm^2; a damped line at the quantiles of its power."""
+    """Frequencies (n,) in Hz and the variance at each (n, modes), nm^2.
+
+    A damped line is at the quantiles of its power, a wheel's harmonics are where they are at time 0.
+    """
     frequency_hz, variance_nm2 = [shaken.frequency_hz], [np.abs(shaken.amplitude_nm) ** 2 / 2]
     quantiles = (np.arange(per_line) + 0.5) / per_line
     for line in shaken.lines:
         frequency_hz.append(np.abs(line.frequency_hz + line.width_hz / 2 * np.tan(np.pi * (quantiles - 0.5))))
         variance_nm2.append(np.tile(line.rms_nm**2 / per_line, (per_line, 1)))
+    for wheel in shaken.wheels:
+        for found, of_wheel in zip((frequency_hz, variance_nm2), wheel.lines(), strict=True):
+            found.append(of_wheel)
     return np.concatenate(frequency_hz), np.concatenate(variance_nm2)
 
 
@@ -240,6 +306,8 @@ class Sampler:
         found = self._waves @ np.vstack([turned.real, turned.imag]).astype(np.float32)
         square = _square(start_s + self._time_s)[:, None] * self._shaken.step_nm
         found += (square + self._shaken.static_nm).astype(np.float32)
+        for wheel in self._shaken.wheels:
+            found += wheel.modes_nm(start_s + self._time_s).astype(np.float32)
         block = found.reshape(self._shape)
         if self._lines is not None:
             vectors, (before, after) = self._lines.at(first, BLOCK), self._between

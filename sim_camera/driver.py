@@ -2,7 +2,7 @@
 
 import threading
 from collections import deque
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import NamedTuple
 
@@ -24,13 +24,14 @@ from lowfc.device import CameraSettings, DriverOptions, Exposure, Puts
 from lowfc.optics.detector.detector import saturation_dn
 from lowfc.optics.detector.photometry import tilt_nm_per_mas
 from sim_camera.contrast import AddedContrast, Contrast
-from sim_camera.disturbance import Disturbance, disturbance
+from sim_camera.disturbance import Disturbance, disturbance, with_more
 from sim_camera.faulty import FaultyFrames, read_fault
 from sim_camera.figures import Figures
 from sim_camera.lateness import Lateness
 from sim_camera.path import MirrorPath
 from sim_camera.pixels import pixel_errors
 from sim_camera.scene import Scene
+from sim_camera.wheel import wheels
 
 PATIENCE_S = 5.0
 """In lockstep, real time without progress after which the run is ended."""
@@ -45,31 +46,46 @@ _SETTINGS = (
 
 def disturbance_of(config: Configuration) -> Disturbance:
     """The disturbance of a configuration."""
-    section = config.disturbance
+    section, nm_per_mas = config.disturbance, tilt_nm_per_mas(config.star.diameter_m)
     try:
-        return disturbance(
+        shaken = disturbance(
             section.preset,
             config.noll,
             config.seed,
-            tilt_nm_per_mas(config.star.diameter_m),
+            nm_per_mas,
             config.star.wavelength_nm,
             section.scale,
             {int(index): amplitude for index, amplitude in section.static_nm.items()},
             section.line_width,
         )
+        shaken = with_more(
+            shaken,
+            config.camera.rate_hz,
+            {int(index): per_root_s for index, per_root_s in section.drift_nm.items()},
+            section.drift_slope,
+            section.jitter_mas * nm_per_mas,
+            section.shear,
+        )
     except ValueError as error:
         raise ConfigurationError(f"disturbance: {error}") from None
+    if not section.wheel_hz:
+        return shaken
+    speeds_hz = (section.wheel_hz, section.wheel_hz + section.second_wheel_hz)[: 2 if section.second_wheel_hz else 1]
+    rms_nm = np.where(np.isin(config.noll, (2, 3)), section.wheel_mas * nm_per_mas, 0.0)
+    spinning = wheels(config.seed, speeds_hz, rms_nm, section.wheel_course, section.wheel_change)
+    return replace(shaken, wheels=spinning)
 
 
 def scene(config: Configuration, shaken: Disturbance | None = None) -> Scene:
     """The optics of a configuration, its twin from the cache; `shaken` in place of the configured disturbance."""
     optics, detector, camera = factory.twin(config, None, ignore), factory.detector(config), config.camera
+    shaken = disturbance_of(config) if shaken is None else shaken
     return Scene(
         optics,
         factory.true_mirror_on_twin(config, optics, ignore),
         detector,
         factory.electrons_per_exposure(config),
-        disturbance_of(config) if shaken is None else shaken,
+        shaken,
         camera.rate_hz,
         config.seed,
         camera.noise,
@@ -84,6 +100,7 @@ def scene(config: Configuration, shaken: Disturbance | None = None) -> Scene:
             camera.hot_pixels,
             camera.hot_pixel_e_s * config.exposure_ns * 1e-9,
         ),
+        factory.shear_slopes(config) if shaken.shear is not None else None,
     )
 
 
@@ -252,6 +269,8 @@ class SimulatedCamera:
             residual_rms_nm=sampled.residual_rms_nm,
             added_contrast_flat=added_flat,
             added_contrast=0.0 if added is None else float(added.sum()),
+            wheel_speed_hz=truth.wheel_speed_hz.tolist(),
+            shear_diameters=truth.shear.tolist(),
         )
         if continuous is not None:
             message.instants = len(self._scene.instants)

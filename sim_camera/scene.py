@@ -9,16 +9,17 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from lowfc.arrays import Single
+from lowfc.arrays import Array, Single
 from lowfc.optics.chain.zernike import zernikes
 from lowfc.optics.detector.detector import Detector, expose, laws_of, saturation_dn
 from lowfc.optics.twin.twin import Evaluator, Twin, node_radii, wavefront_rms_nm
 from lowfc.optics.twin.twin_mirror import TwinMirror, wavefront_nm
-from sim_camera.disturbance import Disturbance, Sampler, screen
+from sim_camera.disturbance import Disturbance, Sampler, screen, shear_at, speeds_hz
 from sim_camera.pixels import PixelErrors
 
 GAUSS_LEGENDRE = (1 + np.array([-1, 1]) / np.sqrt(3)) / 2
 """Instants of an exposure whose mean is that over it, to third order in time."""
+_FOUR, _WEIGHTS_OF_FOUR = np.polynomial.legendre.leggauss(4)
 
 
 @dataclass(frozen=True, slots=True)
@@ -40,12 +41,16 @@ class Truth:
         continuous: root mean squares over the period, modes included; None where they are not computed.
         sensed_nm: (modes,) of the residual's mean over the exposure, which is what the sensor sees.
         instants_nm: (2, instants, modes) disturbance and residual at each instant.
+        wheel_speed_hz: of each wheel as the exposure starts.
+        shear: of the beam along x and y in the middle of the exposure, pupil diameters; empty where it has none.
     """
 
     sampled: Wavefront
     continuous: Wavefront | None
     sensed_nm: Single
     instants_nm: Single
+    wheel_speed_hz: Array
+    shear: Array
 
 
 class Scene:
@@ -68,6 +73,7 @@ class Scene:
         exposure: float = 0.0,
         instants: int = 1,
         pixels: PixelErrors | None = None,
+        shear_slopes: Array | None = None,
     ) -> None:
         """Prepare everything that does not change from frame to frame.
 
@@ -84,6 +90,7 @@ class Scene:
             instants: of each period at which the truth is computed; 1 for the start of the exposure alone, of which
                 the image is then one, too.
             pixels: their errors; None for none.
+            shear_slopes: (pixels, 2) change of the image per pupil diameter of shear; where the disturbance has shear.
         """
         self._optics = optics
         self._mirror = mirror
@@ -99,10 +106,16 @@ class Scene:
         self._screen_modes = np.asarray(self._project(self._screen), dtype=np.float32)
         self._mirror_to_modes = self._mirror_projection()
         self.instants = (np.arange(instants) + 0.5) / instants if instants > 1 else np.zeros(0)
-        self._images = 2 if instants > 1 else 1
+        seen, weights = GAUSS_LEGENDRE, np.full(2, 0.5)
+        if instants == 1:
+            seen, weights = np.zeros(0), np.ones(1)
+        elif shaken.frequency_hz.max(initial=0) > rate_hz / 2:
+            seen, weights = (1 + _FOUR) / 2, _WEIGHTS_OF_FOUR / 2
+        self._image_weights = weights.astype(np.float32)
         self._wavefronts: list[tuple[Single, Single]] = []
-        seen = exposure * GAUSS_LEGENDRE if instants > 1 else np.zeros(0)
-        self._sampler = Sampler(shaken, np.concatenate([[0.0], seen, self.instants]), rate_hz)
+        self._sampler = Sampler(shaken, np.concatenate([[0.0], exposure * seen, self.instants]), rate_hz)
+        self._shaken, self._rate_hz, self._exposure = shaken, rate_hz, exposure
+        self._shear_slopes = None if shear_slopes is None else shear_slopes.astype(np.float32)
         laws_of(detector)  # the first frame has no time for it
 
     @property
@@ -116,12 +129,15 @@ class Scene:
         modes = self._sampler.at(index)
         static_nm = self._screen + self._mirror_nm(actuators_nm)
         last = len(modes) - len(self.instants)
-        opds_nm = modes[last - self._images : last] @ self._basis
+        opds_nm = modes[last - self._image_weights.size : last] @ self._basis
         opds_nm += static_nm
-        share = self._electrons / np.float32(self._images)
-        electrons = self._evaluator.image(opds_nm[0]) * share
-        for opd_nm in opds_nm[1:]:
+        shares = self._electrons * self._image_weights
+        electrons = self._evaluator.image(opds_nm[0]) * shares[0]
+        for opd_nm, share in zip(opds_nm[1:], shares[1:], strict=True):
             electrons += self._evaluator.image(opd_nm) * share
+        if self._shear_slopes is not None:
+            sheared = self._shear_slopes @ self._shear(index).astype(np.float32)
+            electrons += (self._electrons * sheared).reshape(electrons.shape)
         if self._pixels is not None:
             electrons = electrons * self._pixels.gain + self._pixels.hot_e
         frame = expose(self._detector, electrons, self._rng) if self._noise else self._noiseless(electrons)
@@ -149,12 +165,16 @@ class Scene:
         residual = rows + of_shapes @ (np.array(shapes_nm).reshape(len(shapes_nm), -1) @ self._mirror_to_modes.T)
         flat, left = self._mean_squares_nm2(opd_nm), self._mean_squares_nm2(opd_nm + moved_nm)
         sampled = Wavefront(rows[0], residual[0], float(np.sqrt(flat[0])), float(np.sqrt(left[0])))
+        others = speeds_hz(self._shaken, index / self._rate_hz), self._shear(index)
         if not len(self.instants):
-            return Truth(sampled, None, sampled.residual_nm, np.array([rows, residual]))
-        sensed_nm = modes[1 : 1 + self._images].mean(axis=0) - modes[0] + residual[0]
+            return Truth(sampled, None, sampled.residual_nm, np.array([rows, residual]), *others)
+        sensed_nm = self._image_weights @ modes[1 : 1 + self._image_weights.size] - modes[0] + residual[0]
         over = (np.sqrt(np.square(of[1:]).mean(axis=0)) for of in (rows, residual))
         pupil = (float(np.sqrt(of[1:].mean())) for of in (flat, left))
-        return Truth(sampled, Wavefront(*over, *pupil), sensed_nm, np.array([rows[1:], residual[1:]]))
+        return Truth(sampled, Wavefront(*over, *pupil), sensed_nm, np.array([rows[1:], residual[1:]]), *others)
+
+    def _shear(self, index: int) -> Array:
+        return shear_at(self._shaken, (index + self._exposure / 2) / self._rate_hz)
 
     def _mirror_nm(self, actuators_nm: Single) -> Single:
         """Wavefront (used,) of a shape, remembered for the last few."""

@@ -179,12 +179,31 @@ class Disturbance(Section):
     """Of the reaction wheel's lines, between half-power points, as a fraction of their frequency."""
     static_nm: dict[str, float] = Field(default_factory=dict)
     """Constant wavefront added to it: Noll index = nm rms."""
+    drift_nm: dict[str, float] = Field(default_factory=dict)
+    """Random walk added to it, from 1e-4 to 10 Hz: Noll index = nm per root second."""
+    drift_slope: float = Field(2.0, ge=0, le=4)
+    """Power of frequency with which the drift's spectrum falls: drift_nm^2 / (2 pi^2 f^slope) per Hz; 2 for a walk."""
+    jitter_mas: NotNegative = 0.0
+    """Jitter too fast for the loop, mas rms per axis: white from half the frame rate to one and a half."""
+    shear: float = Field(0.0, ge=0, le=0.05)
+    """Slow wander of the beam on the sensor's masks, pupil diameters rms per axis; its effect to first order."""
+    wheel_hz: NotNegative = 0.0
+    """Speed of a reaction wheel at the start, turns per second; 0 for none. It shakes tip and tilt at its harmonics."""
+    wheel_mas: NotNegative = 3.0
+    """Of its first harmonic at high speed, mas rms per axis; the others are a half to a seventh."""
+    wheel_course: Literal["ramp", "walk", "run-down"] = "ramp"
+    """How its speed changes: evenly, at random, or as friction slows it."""
+    wheel_change: float = 0.0
+    """Of a ramp and, at its start, of a run-down Hz per second; of a walk Hz per root second; 0 for a steady wheel."""
+    second_wheel_hz: float = 0.0
+    """By which a second wheel of the same kind is faster at the start, so that the two beat; 0 for none."""
 
     @model_validator(mode="after")
     def _noll_indices(self) -> "Disturbance":
-        for key in self.static_nm:
-            if not key.isdecimal() or int(key) < 2:
-                raise ValueError(f"static_nm: {key!r} is not a Noll index of 2 or more")
+        for name in ("static_nm", "drift_nm"):
+            for key in getattr(self, name):
+                if not key.isdecimal() or int(key) < 2:
+                    raise ValueError(f"{name}: {key!r} is not a Noll index of 2 or more")
         return self
 
 

@@ -45,6 +45,7 @@ PURE_MODULES = (
     "sim_camera.path",
     "sim_camera.pixels",
     "sim_camera.scene",
+    "sim_camera.wheel",
     "sim_camera.disturbance",
     "sim_camera.faults",
     "sim_camera.figures",

@@ -296,8 +296,13 @@ def _nuisance(config: Configuration, light: Array, good: Array) -> Array | None:
         if name == "background":
             columns.append(np.ones((light.size, 1)))
         else:
-            columns.append(shear_response(sensor(config, lambda _: None), band(config)))
+            columns.append(shear_slopes(config))
     return normalise_flux(light, np.hstack(columns), good)[1] if columns else None
+
+
+def shear_slopes(config: Configuration) -> Array:
+    """Change of the image (pixels, 2) per pupil diameter of shear of the beam along x and y."""
+    return shear_response(sensor(config, lambda _: None), band(config))
 
 
 def _dark_dn(camera: Detector) -> float:

@@ -608,7 +608,7 @@ class MirrorState(_message.Message):
     def __init__(self, timestamp: _Optional[_Union[datetime.datetime, _timestamp_pb2.Timestamp, _Mapping]] = ..., frame_sequence: _Optional[int] = ..., status: _Optional[_Union[MirrorStatus, str]] = ..., rows: _Optional[int] = ..., columns: _Optional[int] = ..., actuators: _Optional[bytes] = ..., command_nm: _Optional[_Iterable[float]] = ..., limits_hit: _Optional[_Iterable[_Union[Reason, str]]] = ..., channels: _Optional[_Iterable[str]] = ..., safe: _Optional[bool] = ..., refused: _Optional[_Union[Reason, str]] = ...) -> None: ...
 
 class Truth(_message.Message):
-    __slots__ = ("timestamp", "frame_sequence", "disturbance_nm", "residual_nm", "disturbance_rms_nm", "residual_rms_nm", "instants", "continuous_disturbance_nm", "continuous_residual_nm", "continuous_disturbance_rms_nm", "continuous_residual_rms_nm", "sensed_residual_nm", "added_contrast_flat", "added_contrast")
+    __slots__ = ("timestamp", "frame_sequence", "disturbance_nm", "residual_nm", "disturbance_rms_nm", "residual_rms_nm", "instants", "continuous_disturbance_nm", "continuous_residual_nm", "continuous_disturbance_rms_nm", "continuous_residual_rms_nm", "sensed_residual_nm", "added_contrast_flat", "added_contrast", "wheel_speed_hz", "shear_diameters")
     TIMESTAMP_FIELD_NUMBER: _ClassVar[int]
     FRAME_SEQUENCE_FIELD_NUMBER: _ClassVar[int]
     DISTURBANCE_NM_FIELD_NUMBER: _ClassVar[int]
@@ -623,6 +623,8 @@ class Truth(_message.Message):
     SENSED_RESIDUAL_NM_FIELD_NUMBER: _ClassVar[int]
     ADDED_CONTRAST_FLAT_FIELD_NUMBER: _ClassVar[int]
     ADDED_CONTRAST_FIELD_NUMBER: _ClassVar[int]
+    WHEEL_SPEED_HZ_FIELD_NUMBER: _ClassVar[int]
+    SHEAR_DIAMETERS_FIELD_NUMBER: _ClassVar[int]
     timestamp: _timestamp_pb2.Timestamp
     frame_sequence: int
     disturbance_nm: _containers.RepeatedScalarFieldContainer[float]
@@ -637,7 +639,9 @@ class Truth(_message.Message):
     sensed_residual_nm: _containers.RepeatedScalarFieldContainer[float]
     added_contrast_flat: float
     added_contrast: float
-    def __init__(self, timestamp: _Optional[_Union[datetime.datetime, _timestamp_pb2.Timestamp, _Mapping]] = ..., frame_sequence: _Optional[int] = ..., disturbance_nm: _Optional[_Iterable[float]] = ..., residual_nm: _Optional[_Iterable[float]] = ..., disturbance_rms_nm: _Optional[float] = ..., residual_rms_nm: _Optional[float] = ..., instants: _Optional[int] = ..., continuous_disturbance_nm: _Optional[_Iterable[float]] = ..., continuous_residual_nm: _Optional[_Iterable[float]] = ..., continuous_disturbance_rms_nm: _Optional[float] = ..., continuous_residual_rms_nm: _Optional[float] = ..., sensed_residual_nm: _Optional[_Iterable[float]] = ..., added_contrast_flat: _Optional[float] = ..., added_contrast: _Optional[float] = ...) -> None: ...
+    wheel_speed_hz: _containers.RepeatedScalarFieldContainer[float]
+    shear_diameters: _containers.RepeatedScalarFieldContainer[float]
+    def __init__(self, timestamp: _Optional[_Union[datetime.datetime, _timestamp_pb2.Timestamp, _Mapping]] = ..., frame_sequence: _Optional[int] = ..., disturbance_nm: _Optional[_Iterable[float]] = ..., residual_nm: _Optional[_Iterable[float]] = ..., disturbance_rms_nm: _Optional[float] = ..., residual_rms_nm: _Optional[float] = ..., instants: _Optional[int] = ..., continuous_disturbance_nm: _Optional[_Iterable[float]] = ..., continuous_residual_nm: _Optional[_Iterable[float]] = ..., continuous_disturbance_rms_nm: _Optional[float] = ..., continuous_residual_rms_nm: _Optional[float] = ..., sensed_residual_nm: _Optional[_Iterable[float]] = ..., added_contrast_flat: _Optional[float] = ..., added_contrast: _Optional[float] = ..., wheel_speed_hz: _Optional[_Iterable[float]] = ..., shear_diameters: _Optional[_Iterable[float]] = ...) -> None: ...
 
 class Calibration(_message.Message):
     __slots__ = ("timestamp", "id", "operator_hash", "estimator", "noll", "mode_names", "wavelength_nm", "rows", "columns", "reference", "response", "reconstructor", "mask", "dark", "flux_dn", "saturation_dn", "mirror_rows", "mirror_columns", "modes_to_actuators", "actuators_to_modes", "camera")

@@ -1,0 +1,152 @@
+"""Wheels, drift, jitter and shear of the simulated world, against models of a few lines."""
+
+from dataclasses import replace
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+import pytest
+from scipy.integrate import cumulative_trapezoid
+
+from lowfc.adapters.files.factory import shear_slopes, twin
+from lowfc.contract.configuration import Configuration, load
+from lowfc.contract.errors import ConfigurationError
+from lowfc.optics.twin.twin import reference
+from sim_camera.disturbance import modes_nm, shear_at, variances_nm2
+from sim_camera.driver import disturbance_of, scene
+from sim_camera.wheel import HEIGHTS, ORDERS, SOFT_HZ, Wheel, walk, wheels
+
+FLAT = np.zeros((34, 34), np.float32)
+TIME_S = np.arange(0, 20, 2e-5)
+
+
+def quiet(**changed: Any) -> Configuration:
+    keys = {"disturbance.preset": "quiet", "camera.rate_hz": 1000.0}
+    return load(None, keys | {key.replace("__", "."): value for key, value in changed.items()})
+
+
+def wheel(course: str, change: float, start_hz: float = 30.0) -> Wheel:
+    return wheels(3, (start_hz,), np.array([2.0, 3.0]), course, change)[0]
+
+
+@pytest.mark.parametrize(
+    ("course", "change", "speed_hz"),
+    [
+        ("ramp", 0.0, lambda t: 30.0 + 0 * t),
+        ("ramp", -2.0, lambda t: 30.0 - 2 * t),
+        ("run-down", 3.0, lambda t: 30 * np.exp(-t / 10)),
+        ("run-down", 0.0, lambda t: 30.0 + 0 * t),
+    ],
+)
+def test_a_wheels_harmonics_turn_with_the_integral_of_its_speed(course: str, change: float, speed_hz: Any) -> None:
+    """The phase is summed up step by step; ramps go through standstill, where nothing is left."""
+    made, speed = wheel(course, change), speed_hz(TIME_S)
+    phase = 2 * np.pi * cumulative_trapezoid(speed, TIME_S, initial=0)
+    expected = np.zeros((TIME_S.size, 2))
+    for order, at_rest in zip(ORDERS, made.amplitude_nm, strict=True):
+        height = (order * speed) ** 2 / ((order * speed) ** 2 + SOFT_HZ**2)
+        expected += (height * np.exp(1j * order * phase))[:, None].real * at_rest.real
+        expected -= (height * np.exp(1j * order * phase))[:, None].imag * at_rest.imag
+    np.testing.assert_allclose(made.speed_hz(TIME_S), speed, atol=1e-9)
+    np.testing.assert_allclose(made.modes_nm(TIME_S), expected, atol=2e-3)
+    first, rms_nm = np.abs(made.amplitude_nm[0]) / np.sqrt(2), [2.0, 3.0]
+    np.testing.assert_allclose(first, rms_nm)
+    assert np.abs(made.amplitude_nm[:, 0] / made.amplitude_nm[0, 0]) == pytest.approx(HEIGHTS)
+
+
+def test_a_walking_speed_has_the_phase_that_is_its_integral() -> None:
+    made, time_s = wheel("walk", 0.5), TIME_S[::50]
+    speed = made.speed_hz(time_s)
+    assert speed[0] == pytest.approx(30)
+    assert np.ptp(speed) > 0.3
+    np.testing.assert_allclose(made.turns(time_s), cumulative_trapezoid(speed, time_s, initial=0), atol=1e-3)
+
+
+def test_a_walk_moves_by_the_root_of_time() -> None:
+    times_s, moved = np.array([0.3, 3.0, 30.0, 300.0]), []
+    for seed in range(300):
+        frequency_hz, amplitude = walk(np.random.default_rng(seed), np.array([0.2, 0.4]))
+        at = np.exp(2j * np.pi * np.outer([0.0, *times_s], frequency_hz)) @ amplitude
+        moved.append((at[1:] - at[0]).real)
+    expected = np.outer(np.sqrt(times_s), [0.2, 0.4])
+    np.testing.assert_allclose(np.std(moved, axis=0), expected, rtol=0.15)
+
+
+@pytest.mark.parametrize("slope", [1.0, 2.0, 3.0])
+def test_a_drift_has_the_spectrum_that_is_asked_for(slope: float) -> None:
+    shaken = disturbance_of(quiet(disturbance__drift_nm={"4": 0.3}, disturbance__drift_slope=slope))
+    frequency_hz, variance_nm2 = variances_nm2(shaken)
+    assert not np.delete(variance_nm2, 2, axis=1).any()
+    edges = np.geomspace(1e-3, 1, 4)
+    for low, high in pairwise(edges):
+        grid = np.geomspace(low, high, 1000)
+        expected = np.trapezoid(0.3**2 / (2 * np.pi**2 * grid**slope), grid)
+        inside = (frequency_hz >= low) & (frequency_hz < high)
+        assert variance_nm2[inside, 2].sum() == pytest.approx(expected, rel=0.3)
+    with pytest.raises(ConfigurationError, match="Z40"):
+        disturbance_of(quiet(disturbance__drift_nm={"40": 0.3}))
+
+
+def test_two_wheels_beat() -> None:
+    """Where both are as high, their sum goes from twice the one to nothing and back with the difference of speeds."""
+    one, other = wheels(1, (30.0, 30.5), np.array([2.0]))
+    time_s = np.arange(0, 4, 1e-3)
+    both = [replace(each, amplitude_nm=np.array([[2.0], *[[0]] * 4]) + 0j) for each in (one, other)]
+    total = sum(each.modes_nm(time_s)[:, 0] for each in both)
+    envelope = np.abs(total).reshape(-1, 100).max(axis=1)
+    expected = 4 * np.abs(np.cos(np.pi * 0.5 * (0.05 + 0.1 * np.arange(40)))) * 900 / 925
+    np.testing.assert_allclose(envelope, expected, atol=0.4)
+    config = quiet(disturbance__wheel_hz=30.0, disturbance__second_wheel_hz=0.5)
+    assert [each.start_hz for each in disturbance_of(config).wheels] == [30.0, 30.5]
+
+
+@pytest.mark.parametrize("exposure", [0.5, 1.0])
+def test_jitter_is_faster_than_the_frames_and_the_sensor_sees_its_mean_over_the_exposure(exposure: float) -> None:
+    config = quiet(disturbance__jitter_mas=2.0, camera__exposure_fraction=exposure)
+    shaken = disturbance_of(config)
+    assert 500 < shaken.frequency_hz.min() < shaken.frequency_hz.max() < 1500
+    np.testing.assert_allclose(np.sqrt(variances_nm2(shaken)[1].sum(axis=0))[:3] / 2.424, [2, 2, 0], rtol=1e-3)
+    made, fine = scene(config), 2000
+    for index in (0, 7, 8, 30):
+        within = modes_nm(shaken, index * fine, round(exposure * fine) + 1, 1000.0 * fine)
+        mean = (within[1:] + within[:-1]).mean(axis=0) / 2
+        assert np.abs(made.truth(index, FLAT).sensed_nm - mean)[:2].max() < 0.1
+
+
+def test_shear_of_the_beam_changes_the_image_and_not_the_wavefront() -> None:
+    keys = {"camera__noise": False, "camera__gain_e_per_dn": 0.01, "camera__full_well_e": 600.0}
+    config = quiet(disturbance__shear=0.002, **keys)
+    made, shaken = scene(config), disturbance_of(config)
+    course = np.array([shear_at(shaken, time_s) for time_s in np.arange(0, 100, 0.01)])
+    assert course.std(axis=0) == pytest.approx([0.002, 0.002], rel=0.2)
+    index = 1000 * int(np.abs(course[::100]).max(axis=1).argmax())
+    truth = made.truth(index, FLAT)
+    np.testing.assert_allclose(truth.shear, shear_at(shaken, (index + 0.25) / 1000))
+    assert truth.sampled.residual_rms_nm == pytest.approx(0, abs=1e-4)
+    changed = made.expose(index, FLAT).astype(float) - scene(quiet(**keys)).expose(index, FLAT)
+    slopes = shear_slopes(config) @ truth.shear
+    electrons = (made.expose(index, FLAT).sum() - 100 * 6400) / reference(twin(config, None, print)).sum()
+    np.testing.assert_allclose(changed.ravel(), electrons * slopes, atol=1.5)
+    assert np.abs(changed).max() > 25
+
+
+def test_one_seed_gives_the_same_frames_and_truths_in_any_order() -> None:
+    keys = {
+        "disturbance__wheel_hz": 40.0,
+        "disturbance__second_wheel_hz": 0.7,
+        "disturbance__wheel_course": "walk",
+        "disturbance__wheel_change": 0.3,
+        "disturbance__drift_nm": {"2": 0.1, "5": 0.1},
+        "disturbance__jitter_mas": 1.0,
+        "disturbance__shear": 0.001,
+    }
+    runs = []
+    for seed, order in ((1, (0, 9, 70)), (1, (70, 0, 9)), (2, (0, 9, 70))):
+        made = scene(quiet(**keys, seed=seed, camera__noise=False))
+        found = {index: (made.expose(index, FLAT).tobytes(), made.truth(index, FLAT)) for index in order}
+        runs.append([(found[index][0], found[index][1].instants_nm.tobytes()) for index in (0, 9, 70)])
+    assert runs[0] == runs[1]
+    assert runs[0] != runs[2]
+    speeds = made.truth(70, FLAT).wheel_speed_hz
+    assert speeds == pytest.approx([40, 40.7], abs=0.5)
+    assert speeds[0] not in (40.0, speeds[1])
