@@ -29,7 +29,9 @@ def the_run(name: str | None) -> str:
         raise BusError(f"choose a run with --run, the beginning of its name is enough: there are {_listed(runs)}")
     if found:
         raise BusError(f"{name!r} is the beginning of several runs: {', '.join(found)}")
-    raise BusError(f"there is no run {name!r}: there {'is' if len(runs) == 1 else 'are'} {_listed(runs)}")
+    raise BusError(
+        f"there is no run {name!r}: there {'is' if len(runs) == 1 else 'are'} {_listed(runs)}{nearest(name, runs)}"
+    )
 
 
 def nobody_yet(name: str) -> str:

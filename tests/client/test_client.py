@@ -317,27 +317,33 @@ def test_the_beginning_of_a_runs_name_is_enough(listen: Callable[..., None]) -> 
         the_run("n")
     with pytest.raises(BusError, match=r"there is no run 'day': there are night, night-2, noon$"):
         the_run("day")
+    with pytest.raises(BusError, match=r"noon \(did you mean 'night'\?\)$"):
+        the_run("ngiht")
 
 
-def test_a_loop_that_is_not_seen_from_here_is_told_of(own_runtime: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_loop_that_is_not_seen_from_here_is_named(own_runtime: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Its owner, its process and its runtime directory, where the system tells; one that starts here is waited for."""
-    words = [sys.executable, "-c", "print(flush=True); input()", "lowfc", "controller", "--run", "night"]
+    name = f"night-{os.getpid()}"
+    words = [sys.executable, "-c", "print(flush=True); input()", "lowfc", "controller", "--run", name]
     wrapped = ["/bin/sh", "-c", 'echo; read end; "$@"', *words[3:]]
+    parent = [*words[:1], "-c", "import subprocess, sys; subprocess.run(sys.argv[3:])", "lowfc", "sim-loop", *words]
     for there, words_there, found in (
         ("/run/elsewhere", words, ", with XDG_RUNTIME_DIR=/run/elsewhere"),
         (str(own_runtime), words, ", starting or ending"),
         (str(own_runtime), wrapped, ""),
+        ("/run/elsewhere", parent, ", with XDG_RUNTIME_DIR=/run/elsewhere"),
     ):
         environment = os.environ | {"XDG_RUNTIME_DIR": there}
         with subprocess.Popen(words_there, stdin=subprocess.PIPE, stdout=subprocess.PIPE, env=environment) as process:
             process.stdout.readline()
-            ours = [one for one in other_loops() if f"(process {process.pid})" in one]
+            ours = [one for one in other_loops() if f"(process {process.pid})" in one or name in one]
             sentence = none_here()
             with monkeypatch.context() as patch:
                 patch.setattr(os, "geteuid", lambda: 4_000_000_000)
                 theirs = list(other_loops())
             process.communicate(b"\n")
-        where = f"`lowfc controller --run night` (process {process.pid}){found}"
+        program = "sim-loop" if words_there is parent else "controller"
+        where = f"`lowfc {program} --run {name}` (process {process.pid}){found}"
         assert ours == [f"you run {where}"] * bool(found)
         assert (f"user {own_runtime.owner()} runs {where}" in theirs) == bool(found)
         assert sentence.endswith("starting or ending: ask again in a few seconds") == ("starting" in found)

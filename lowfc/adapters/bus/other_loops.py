@@ -33,11 +33,12 @@ def none_here() -> str:
 
 
 def other_loops() -> Iterator[str]:
-    """A sentence for each controller or simulated loop on this host, whoever runs it."""
+    """A sentence for each simulated loop, and each controller without one, on this host, whoever runs it."""
     for process in psutil.process_iter():
         with contextlib.suppress(psutil.Error):  # it has ended, or may not be read
             program = _program(process.cmdline())
-            if program and process.pid != os.getpid():
+            above = process.parent() if program else None
+            if program and process.pid != os.getpid() and not (above and _program(above.cmdline())):
                 owner = process.uids().effective
                 who = "you run" if owner == os.geteuid() else f"user {_name(owner)} runs"
                 yield f"{who} `{program}` (process {process.pid}){_where(process)}"
