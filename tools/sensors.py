@@ -14,6 +14,7 @@ from lowfc.adapters.files import factory
 from lowfc.contract.configuration import Configuration, load
 from lowfc.contract.sections import SENSORS, sensor_keys
 from lowfc.control.calibration.calibration import Calibration, normalise_flux
+from lowfc.design.fisher import cramer_rao, quantum_information, variance_e
 from lowfc.optics.chain.sensor import light_budget, pupil_radii, reference, response, shear_response
 from lowfc.optics.chain.zernike import zernikes
 from lowfc.optics.detector.photometry import tilt_nm_per_mas
@@ -49,6 +50,7 @@ def alone(name: str) -> Figures:
     """Light, condition and noise of a sensor, and the speed of its twin."""
     config = configured(name)
     optics = factory.sensor(config, sys.exit)
+    modes = zernikes(config.noll, *pupil_radii(optics))
     budget = light_budget(optics)
     twin = factory.twin(config, None, sys.exit)
     evaluator, flat = Evaluator(twin), np.zeros(twin.used.size, np.float32)
@@ -60,7 +62,7 @@ def alone(name: str) -> Figures:
     figures: Figures = {
         "light": budget.total,
         "peak": budget.peak,
-        "cond14": float(np.linalg.cond(response(optics, zernikes(config.noll, *pupil_radii(optics))))),
+        "cond14": float(np.linalg.cond(response(optics, modes))),
         "twin_us": 1e6 * statistics.median(times_s),
     }
     if name != "open":
@@ -71,7 +73,14 @@ def alone(name: str) -> Figures:
         figures["noise_with_shear_mas"] = tilt_noise_mas(
             beside_shear, factory.analytic_calibration(beside_shear, twin, on_nodes)
         )
+        in_band = configured(name, **{"sensor.wavelengths": 4})
+        band_twin = factory.twin(in_band, None, sys.exit)
+        of_band = factory.analytic_calibration(in_band, band_twin, factory.mirror_on_twin(in_band, band_twin, sys.exit))
+        figures["noise_in_band_mas"] = tilt_noise_mas(in_band, of_band)
         light = reference(optics).ravel()
+        bound = cramer_rao(response(optics, modes), variance_e(light, 0.0))
+        limit = np.linalg.inv(quantum_information(optics.pupil, modes, optics.wavelength_nm))
+        figures["quantum_share"] = float(np.median(np.diag(limit) / np.diag(bound)))
         slopes = normalise_flux(light, shear_response(optics), np.ones(light.size))[1]
         taken_nm = SHEAR * np.linalg.norm(plain.reconstructor @ slopes, axis=0)
         figures["shear_taken_for_nm"] = float(np.sqrt(np.mean(taken_nm**2)))
@@ -95,14 +104,16 @@ def in_the_loop(name: str, preset: str) -> dict[str, float]:
 def render(figures: Figures) -> str:
     """A line for each sensor."""
     head = [
-        *("`--sensor`", "light, %", "peak, %", "cond14", "tilt noise, mas", "with shear", "shear, nm", "twin, us"),
+        *("`--sensor`", "light, %", "peak, %", "cond14", "quantum, %", "tilt noise, mas"),
+        *("in the band", "with shear", "shear, nm", "twin, us"),
         *(column for preset in PRESETS for column in (f"`{preset}`: nm rms", "mas per axis")),
     ]
     rows = []
     for name, sensor in figures["sensors"].items():
-        keys = ("noise_mas", "noise_with_shear_mas", "shear_taken_for_nm")
+        keys = ("noise_mas", "noise_in_band_mas", "noise_with_shear_mas", "shear_taken_for_nm")
         cells = [name, f"{100 * sensor['light']:.2f}", f"{100 * sensor['peak']:.2f}"]
         cells.append(f"{sensor['cond14']:.0f}" if sensor["cond14"] < 1e6 else f"{sensor['cond14']:.0e}")
+        cells.append(f"{100 * sensor['quantum_share']:.1f}" if "quantum_share" in sensor else "-")
         cells += [f"{sensor[key]:.2f}" if key in sensor else "-" for key in keys]
         cells.append(f"{sensor['twin_us']:.0f}")
         for preset in PRESETS:
@@ -113,9 +124,12 @@ def render(figures: Figures) -> str:
     star = configured("sam")
     return (
         f"{markdown(head, rows)}\nLight is what falls on the detector, of all that enters the open circle; peak is the "
-        "brightest pixel's share of it; cond14 is the condition number of H for Z2 to Z15. The noise is that of tip "
-        f"and tilt, rms of both axes, in one frame of {star.exposure_ns / 1e6:g} ms of a star of V = "
-        f"{star.star.magnitude:g}, all {len(star.noll)} modes fitted; then with the shear of the beam fitted along; "
+        "brightest pixel's share of it; cond14 is the condition number of H for Z2 to Z15. Quantum is the share "
+        "that is used of what the light behind the pupil could tell: the median of the modes, without read noise. "
+        "The noise is that of tip and tilt, rms of both axes, in one frame of "
+        f"{star.exposure_ns / 1e6:g} ms of a star of V = {star.star.magnitude:g}, all {len(star.noll)} modes fitted, "
+        "all photons at the central wavelength; then with "
+        "the same photons over the band of 20 %, in four wavelengths; then with the shear of the beam fitted along; "
         f"then the wavefront, nm rms over the circle, for which a shear of {100 * SHEAR:g} % of the diameter is taken "
         "otherwise. The twin's time is one frame's, on one thread. The loop's columns are open -> closed: the true "
         f"wavefront over the open pupil and the true tilt, in the second half of {DURATION_S} simulated seconds at "

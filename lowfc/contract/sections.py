@@ -82,6 +82,9 @@ class SensorSection(Section):
     """Radius of its disk, lambda/D."""
     sam: str = "sam27d07"
     """Of a sam: a shipped layout, or FILE.json, or FILE.json:NAME."""
+    hole_samples: int = Field(1, ge=1, le=16)
+    """Of a sam: points across a pupil sample that say how much of it a hole covers. 1, as the paper: all or nothing, by
+    its centre; 4 for a mask that is made."""
     defocus_mm: float = Field(6.0, ge=1, le=50)
     """Of a clowfs: the detector's distance from focus."""
     focal_ratio: float = Field(20.0, ge=1, le=200)
@@ -110,7 +113,9 @@ SENSORS: dict[str, dict[str, Any]] = {
     "sam": {"kind": "sam"},
     "bowtie": {"kind": "sam", "focal_mask": "bowtie", "sam": "sam27d07_bowtie"},
     "clowfs": {"kind": "clowfs"},
+    "clowfs_tuned": {"kind": "clowfs", "defocus_mm": 3.0},
     "zwfs": {"kind": "zwfs"},
+    "zwfs_tuned": {"kind": "zwfs", "spot_diameter": 2.0},
     "bar": {"kind": "bar"},
     "open": {"kind": "open"},
     "lyot": {"kind": "sam", "pupil": "circle"},

@@ -1,9 +1,13 @@
-"""What noise leaves of an estimate: the covariance of a linear one, and the least that any unbiased one can have."""
+"""What noise leaves of an estimate: the covariance of a linear one, and the least that any unbiased one can have.
+
+The Cramer-Rao bound is that of a sensor. The quantum limit is that of the light, whatever the sensor.
+"""
 
 import numpy as np
 
 from lowfc.arrays import Array
 from lowfc.control.calibration.calibration import SINGULAR, condition_number
+from lowfc.optics.chain.grid import OPEN_AREA
 
 
 def variance_e(reference_e: Array, read_noise_e: float) -> Array:
@@ -46,3 +50,23 @@ def cramer_rao(H: Array, variance: Array) -> Array:
         raise ValueError("the sensor cannot tell the modes apart: its Fisher information is singular; use fewer modes")
     inverse = np.linalg.pinv(weighted)
     return np.asarray(inverse @ inverse.T)
+
+
+def quantum_information(pupil: Array, modes: Array, wavelength_nm: float, light_e: float = 1.0) -> Array:
+    """Quantum Fisher information (modes, modes), per nm^2: no measurement of the light tells more of its wavefront.
+
+    It is 4 N Cov: N photons behind the pupil's mask, and the covariance of the modes' phases over them.
+
+    Args:
+        pupil: (n, n) amplitude transmission.
+        modes: (modes, n, n) of unit rms over the circle.
+        wavelength_nm: The wavelength.
+        light_e: Electrons of the open circle's light.
+    """
+    energy = pupil**2
+    weights = (energy / energy.sum()).ravel()
+    shapes = modes.reshape(len(modes), -1)
+    mean = shapes @ weights
+    covariance = (shapes * weights) @ shapes.T - np.outer(mean, mean)
+    photons = light_e * float(energy.mean()) / OPEN_AREA
+    return np.asarray(4.0 * photons * (2.0 * np.pi / wavelength_nm) ** 2 * covariance)

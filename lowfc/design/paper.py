@@ -8,6 +8,8 @@ MODES = (14, 20)
 PEAK_E = 40_000.0
 """Electrons in the brightest pixel of the flat wavefront's image (Sect. 3.1)."""
 TABLE3_READ_NOISE_E = 3.0
+TABLE3_INPUT_WAVES = {14: 0.015, 20: 0.018}
+"""Root mean square of its random wavefronts over the open pupil, by number of modes."""
 
 STAR = Photometry()
 TABLE4_EXPOSURE_S = 0.05

@@ -3,8 +3,7 @@
 The fields in the relay pupil, behind the focal-plane mask, do not depend on the holes: that of the flat wavefront and
 the first-order one of each mode are propagated once (`build_optics`). Each hole adds a small product of matrices to
 every field at the sensor (`hole_fields`), so that a search which moves one hole recomputes that hole alone. I0 and H,
-eqs. (6) and (12), follow from the fields (`signal`, `band_signal`), and from these what Tables 3 and 4 would show
-(`table3_waves`, `table4_mas`).
+eqs. (6) and (12), follow from the fields (`signal`, `band_signal`); how good they are says `lowfc.design.merit`.
 """
 
 from collections.abc import Callable
@@ -14,28 +13,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lowfc.arrays import Array, Complex
-from lowfc.control.calibration.calibration import ESTIMATORS, condition_number
-from lowfc.design.paper import (
-    PEAK_E,
-    STAR,
-    TABLE3_READ_NOISE_E,
-    TABLE4_EXPOSURE_S,
-    TABLE4_READ_NOISE_E,
-)
-from lowfc.design.trials import expected_rms, gram
+from lowfc.design.merit import WAVELENGTH_NM, PupilForms, Signal
 from lowfc.optics.chain.band import Band, uniform
 from lowfc.optics.chain.focal_mask import bowtie, disk
 from lowfc.optics.chain.fourier import kernel, to_image, to_pupil
 from lowfc.optics.chain.grid import OPEN_AREA, pupil_axis
 from lowfc.optics.chain.zernike import NOLLS_20, zernikes
-from lowfc.optics.detector.photometry import electrons, tilt_nm_per_mas
 
 Single = NDArray[np.complex64]
 Hole = tuple[float, float, float]
 
 FOCAL_MASKS: dict[str, Callable[[int], Array]] = {"disk": disk, "bowtie": bowtie}
 
-WAVELENGTH_NM = 550.0
 IMAGE_WIDTH = 20
 """Width of the sensor's image, in lambda0 / D (Table 1)."""
 PIXELS_PER = 4
@@ -81,7 +70,7 @@ class Optics:
         groups: The central wavelength (flat wavefront and 20 modes, for each focal-plane mask), then the others of the
             band (flat wavefront and `band_modes` modes, for the first focal-plane mask).
         band_modes: Modes, tilts first, that can be fitted in Table 4.
-        gram: (20, 20) mean products of the modes, less their mean, over the open part of the shaped pupil.
+        forms: Of the shaped pupil.
         samples_per: Samples at the sensor per lambda0 / D; each stands for the mean over its surroundings.
         at_pixels: (pixels, samples) from a field's samples to its values at the pixels' centres, along one axis.
     """
@@ -90,7 +79,7 @@ class Optics:
     band: Band
     groups: tuple[Group, ...]
     band_modes: int
-    gram: Array
+    forms: PupilForms
     samples_per: int
     at_pixels: Single
 
@@ -138,7 +127,7 @@ def build_optics(
         band,
         tuple(groups),
         band_modes,
-        gram(modes[:, pupil > 0.5]),
+        PupilForms.of(pupil, modes),
         samples_per,
         (wanted @ np.linalg.pinv(at_samples, rcond=1e-3)).astype(np.complex64),
     )
@@ -160,23 +149,6 @@ def hole_fields(optics: Optics, hole: Hole) -> Single:
         patch = group.relay[:, rows, columns] * open_part
         parts.append(group.kernel[:, rows] @ (patch @ group.kernel[:, columns].T))
     return np.concatenate(parts)
-
-
-@dataclass(frozen=True)
-class Signal:
-    """An image and what the modes change of it, in one band.
-
-    Attributes:
-        I0: (samples,) flat wavefront's image, fraction of the open circle's light per pixel.
-        H: (samples, modes) its derivative per nm rms of each mode.
-        pixels_per_sample: How many pixels each value stands for.
-        peak: The largest value of a pixel.
-    """
-
-    I0: Array
-    H: Array
-    pixels_per_sample: float
-    peak: float
 
 
 def signal(optics: Optics, fields: Single, focal_mask: str) -> Signal:
@@ -208,56 +180,40 @@ def band_signal(optics: Optics, fields: Single) -> Signal:
     return Signal(I0, H, _pixels_per_sample(optics), float(I0.max()))
 
 
-def covariance_nm2(seen: Signal, electrons_e: float, read_noise_e: float, modes: int, estimator: str) -> Array:
-    """Covariance (modes, modes) of the first modes when these alone are fitted to one frame, photon and read noise.
+@dataclass(frozen=True, eq=False)
+class Mask:
+    """A sparse aperture mask that is judged: a `Candidate`.
 
-    Args:
-        seen: What the sensor sees.
-        electrons_e: Light that enters the open circle during the exposure.
-        read_noise_e: Of each pixel.
-        modes: How many are fitted.
-        estimator: "pinv", or "weighted", which attains the Cramer-Rao bound.
-
-    Raises:
-        ValueError: The estimator is not known.
+    Attributes:
+        optics: Everything before it.
+        fields: The sum of `hole_fields` over its holes.
     """
-    H = seen.H[:, :modes] * electrons_e
-    variance_e2 = (seen.I0 * electrons_e + read_noise_e**2)[:, None]
-    if estimator == "weighted":
-        return np.asarray(np.linalg.inv(H.T @ (H / variance_e2)) / seen.pixels_per_sample)
-    if estimator != "pinv":
-        raise ValueError(f"estimator must be one of {', '.join(ESTIMATORS)}, got {estimator!r}")
-    inverse = np.linalg.inv(H.T @ H)
-    return np.asarray(inverse @ (H.T @ (variance_e2 * H)) @ inverse / seen.pixels_per_sample)
 
+    optics: Optics
+    fields: Single
+    paper_tilt = "sam"
 
-def table3_noise_waves(optics: Optics, seen: Signal, modes: int, estimator: str) -> float:
-    """Residual rms over the open pupil that noise alone leaves in Table 3, in waves."""
-    covariance = covariance_nm2(seen, PEAK_E / seen.peak, TABLE3_READ_NOISE_E, modes, estimator)
-    return expected_rms(optics.gram[:modes, :modes], covariance) / WAVELENGTH_NM
+    @property
+    def forms(self) -> PupilForms:
+        """Of the shaped pupil."""
+        return self.optics.forms
 
+    @property
+    def paper_rows(self) -> tuple[str, ...]:
+        """The focal-plane masks."""
+        return self.optics.focal_masks
 
-def table3_waves(optics: Optics, seen: Signal, modes: int, estimator: str) -> float:
-    """Residual rms over the open pupil that Table 3 would show, noise and second order, in waves."""
-    return float(np.hypot(table3_noise_waves(optics, seen, modes, estimator), TABLE3_NONLINEARITY_WAVES[modes]))
+    def central(self, row: str) -> Signal:
+        """Behind one focal-plane mask."""
+        return signal(self.optics, self.fields, row)
 
+    def in_band(self) -> Signal:
+        """Behind the first focal-plane mask."""
+        return band_signal(self.optics, self.fields)
 
-def table4_mas(seen: Signal, modes: int, estimator: str) -> tuple[float, float]:
-    """Standard deviations of the tilts in x and y that Table 4 would show with our own photometry, in mas."""
-    light_e = electrons(STAR, TABLE4_EXPOSURE_S)
-    covariance = covariance_nm2(seen, light_e, TABLE4_READ_NOISE_E, modes, estimator)
-    x, y = np.sqrt(np.diag(covariance)[:2]) / tilt_nm_per_mas(STAR.diameter_m)
-    return float(x), float(y)
-
-
-def condition(seen: Signal, modes: int) -> float:
-    """Largest over smallest singular value of H."""
-    return condition_number(seen.H[:, :modes])
-
-
-def throughput(seen: Signal) -> float:
-    """Fraction of the open circle's light that falls on the pixels."""
-    return float(seen.I0.sum()) * seen.pixels_per_sample
+    def nonlinearity_waves(self, modes: int) -> float:
+        """The same for all masks."""
+        return TABLE3_NONLINEARITY_WAVES[modes]
 
 
 def _relay(amplitude: Complex, focal_mask: str, samples: int, scale: float) -> Complex:

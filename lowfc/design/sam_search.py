@@ -9,8 +9,8 @@ from math import exp, hypot, inf, log
 
 import numpy as np
 
-from lowfc.design.sam_goal import Goal, merit
-from lowfc.design.sam_merit import Optics, Single, hole_fields
+from lowfc.design.goal import Goal, merit
+from lowfc.design.sam_merit import Mask, Optics, Single, hole_fields
 
 Orbit = tuple[int, int, int]
 """Centre x, y and diameter of a hole, in thousandths of the pupil's diameter."""
@@ -106,7 +106,7 @@ def advance(optics: Optics, goal: Goal, bounds: Bounds, chain: Chain) -> Chain:
     orbits, best, best_merit = list(chain.orbits), chain.best, chain.best_merit
     fields = [orbit_fields(optics, orbit, bounds.symmetry) for orbit in orbits]
     total = np.sum(fields, axis=0)
-    current = merit(optics, goal, total)
+    current = merit(Mask(optics, total), goal)
     if current < best_merit:
         best, best_merit = tuple(orbits), current
     end = min(chain.step + BLOCK, chain.steps)
@@ -120,7 +120,7 @@ def advance(optics: Optics, goal: Goal, bounds: Bounds, chain: Chain) -> Chain:
         field = None if orbit is None else orbit_fields(optics, orbit, bounds.symmetry)
         changed = total if at is None else total - fields[at]
         changed = changed if field is None else changed + field
-        value = merit(optics, goal, changed)
+        value = merit(Mask(optics, changed), goal)
         # a layout that is 1 % worse is as likely at any level of the merit
         accepted = value < current or (value < inf and rng.random() < exp(-log(value / current) / temperature))
         if not accepted:

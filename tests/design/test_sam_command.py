@@ -16,8 +16,8 @@ from typer.testing import CliRunner
 from lowfc.adapters.files.layouts import SHIPPED, load_layout
 from lowfc.adapters.process.terminal import new_app
 from lowfc.contract.errors import ConfigurationError, DataFileError, LowfcError
-from lowfc.design.sam_goal import merit
-from lowfc.design.sam_merit import hole_fields
+from lowfc.design.goal import merit
+from lowfc.design.sam_merit import Mask, hole_fields
 from lowfc.design.sam_search import BLOCK
 from lowfc.programs.design import sam as program
 from lowfc.programs.design import sam_executors as executors
@@ -294,6 +294,6 @@ def test_the_recorded_command_finds_a_layout_as_good_as_the_shipped_one(tmp_path
 
     def merit_of(layout: str) -> float:
         fields = [hole_fields(optics, hole) for hole in load_layout(layout).holes]
-        return merit(optics, search.goal, np.sum(fields, axis=0))
+        return merit(Mask(optics, np.sum(fields, axis=0)), search.goal)
 
     assert merit_of(f"{tmp_path / 'mask.json'}:{name}") == pytest.approx(merit_of(name), rel=0.01)

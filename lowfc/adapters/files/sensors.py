@@ -87,7 +87,7 @@ def sensor_from(
                 layout = _layout(section.sam)
                 for text in layout_warnings(layout):
                     warn(text)
-                relay = ApertureMask(sams.transmission(layout, len(pupil)))
+                relay = ApertureMask(sams.transmission(layout, len(pupil), section.hole_samples))
         return Sensor(pupil, focal_mask, relay, wavelength_nm)
     except ValueError as error:
         raise ConfigurationError(f"sensor: {error}") from error

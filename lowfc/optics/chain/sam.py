@@ -75,11 +75,17 @@ def is_even_symmetric(layout: Layout) -> bool:
     return bool((distances.min(axis=1) < 1e-6).all())
 
 
-def transmission(layout: Layout, samples: int) -> Array:
-    """The mask (samples, samples): 1 where the sample's centre is in a hole, else 0, eqs. (1) and (2)."""
-    u = pupil_axis(samples)
-    mask = np.zeros((samples, samples), np.bool_)
+def transmission(layout: Layout, samples: int, points: int = 1) -> Array:
+    """The mask (samples, samples), eqs. (1) and (2): how much of each sample the holes leave open.
+
+    Args:
+        layout: Where the holes are.
+        samples: Across the pupil.
+        points: Across a sample, in either direction, that are looked at; 1 is its centre alone.
+    """
+    u = pupil_axis(samples * points)
+    mask = np.zeros((samples * points, samples * points), np.bool_)
     for x, y, diameter in layout.holes:
         box = np.ix_(*(np.flatnonzero(np.abs(u - centre) <= diameter / 2.0) for centre in (y, x)))
         mask[box] += np.hypot(u[box[0]] - y, u[box[1]] - x) <= diameter / 2.0
-    return mask.astype(np.float64)
+    return np.asarray(mask.reshape(samples, points, samples, points).mean(axis=(1, 3)))

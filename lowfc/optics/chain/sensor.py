@@ -108,10 +108,15 @@ def propagate(
         wavelength_nm: Its wavelength.
         focal_mask: Instead of the sensor's own.
     """
-    scale = sensor.wavelength_nm / wavelength_nm
     mask = sensor.focal_mask if focal_mask is None else focal_mask
-    size, relay = mask.shape[0], sensor.relay
-    focal = to_image(np.asarray(pupil_field, np.complex128), size, sensor.samples_per, scale) * mask
+    scale = sensor.wavelength_nm / wavelength_nm
+    focal = to_image(np.asarray(pupil_field, np.complex128), mask.shape[0], sensor.samples_per, scale)
+    return from_focus(sensor, focal * mask, wavelength_nm)
+
+
+def from_focus(sensor: Sensor, focal: Complex, wavelength_nm: float) -> Complex:
+    """Field at the sensor's samples of a field (k, k) that has passed the focal-plane mask."""
+    size, relay, scale = focal.shape[0], sensor.relay, sensor.wavelength_nm / wavelength_nm
     if isinstance(relay, ApertureMask):
         in_relay = to_pupil(focal, sensor.pupil.shape[0], sensor.samples_per, scale)
         return to_image(in_relay * relay.transmission, sensor.samples, sensor.samples_per, scale)
@@ -148,7 +153,7 @@ def image(sensor: Sensor, opd_nm: NDArray[np.floating], band: Band | None = None
     total = np.zeros((sensor.pixels, sensor.pixels))
     for wavelength_nm, weight in zip(band.wavelengths_nm, band.weights, strict=True):
         at_sensor = field(sensor, opd_nm, wavelength_nm)
-        total += weight * _pixel_sums(sensor, at_sensor.real**2 + at_sensor.imag**2)
+        total += weight * pixel_sums(sensor, at_sensor.real**2 + at_sensor.imag**2)
     return total
 
 
@@ -174,7 +179,7 @@ def response(sensor: Sensor, basis: NDArray[np.floating], band: Band | None = No
         for k, mode in enumerate(basis):
             Ek = propagate(sensor, sensor.pupil * mode, wavelength_nm)
             slope = (4.0 * np.pi / wavelength_nm) * (E0 * np.conj(1j * Ek)).real
-            H[:, k] += weight * _pixel_sums(sensor, slope).ravel()
+            H[:, k] += weight * pixel_sums(sensor, slope).ravel()
     return H
 
 
@@ -196,7 +201,7 @@ def shear_response(sensor: Sensor, band: Band | None = None) -> Array:
         E0 = propagate(sensor, sensor.pupil, wavelength_nm)
         for k, along in enumerate((ramp[None, :], ramp[:, None])):
             E1 = propagate(sensor, sensor.pupil, wavelength_nm, sensor.focal_mask * along)
-            slopes[:, k] += weight * _pixel_sums(sensor, 2.0 * (E0 * np.conj(E1)).real).ravel()
+            slopes[:, k] += weight * pixel_sums(sensor, 2.0 * (E0 * np.conj(E1)).real).ravel()
     return slopes
 
 
@@ -222,7 +227,7 @@ def light_budget(sensor: Sensor) -> LightBudget:
     )
 
 
-def _pixel_sums(sensor: Sensor, intensity: Array) -> Array:
+def pixel_sums(sensor: Sensor, intensity: Array) -> Array:
     """Bin samples to pixels and normalise to the light that enters the open circle."""
     shape = (sensor.pixels, sensor.binning, sensor.pixels, sensor.binning)
     return np.asarray(intensity.reshape(shape).sum(axis=(1, 3))) * (sensor.pitch**2 / OPEN_AREA)

@@ -6,6 +6,7 @@ import re
 import shlex
 from collections.abc import Callable
 from dataclasses import asdict, fields
+from math import isfinite
 from typing import Annotated, Any, get_type_hints
 
 import typer
@@ -22,6 +23,22 @@ def command_line(command: str, request: Any) -> str:
     """The command that asks for the same again; what is None is left out."""
     given = {flag(name): value for name, value in asdict(request).items() if value is not None}
     return shlex.join([*command.split(), *(str(word) for option in given.items() for word in option)])
+
+
+def span(option: str, text: str) -> tuple[float, float]:
+    """Ends of LOW:HIGH, or one value for both.
+
+    Raises:
+        ValueError: It is neither, or not finite.
+    """
+    low, _, high = text.partition(":")
+    try:
+        found = float(low), float(high or low)
+    except ValueError:
+        raise ValueError(f"{option} must be a number or LOW:HIGH, got {text!r}") from None
+    if not (isfinite(found[0]) and isfinite(found[1])):
+        raise ValueError(f"{option} must be a number or LOW:HIGH, got {text!r}")
+    return found
 
 
 def with_options_of(kind: type[Any]) -> Callable[[Callable[..., None]], Callable[..., None]]:

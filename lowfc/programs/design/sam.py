@@ -3,7 +3,7 @@
 import hashlib
 import shlex
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import FIRST_COMPLETED, Executor, Future, wait
 from contextlib import contextmanager
 from functools import cache, lru_cache
@@ -19,9 +19,9 @@ from lowfc.adapters.files.drawing import figure_class
 from lowfc.adapters.files.sensors import load_pupil
 from lowfc.adapters.process.progress import passing_bar
 from lowfc.contract.errors import ConfigurationError, LowfcError
+from lowfc.design.goal import figures
 from lowfc.design.paper import TABLE4_MODES
-from lowfc.design.sam_goal import figures
-from lowfc.design.sam_merit import FOCAL_MASKS, Hole, Optics, Single, build_optics, hole_fields
+from lowfc.design.sam_merit import FOCAL_MASKS, Hole, Mask, Optics, Single, build_optics, hole_fields
 from lowfc.design.sam_search import BLOCK, Chain, advance, holes, start
 from lowfc.optics.chain.sam import Layout
 from lowfc.programs.design.options import command_line
@@ -215,6 +215,7 @@ def render(result: dict[str, Any]) -> str:
             for estimator, tilts in shown["table4_mas"].items():
                 fits = "  ".join(f"{modes} modes x {x:.3f} y {y:.3f}" for modes, (x, y) in tilts.items())
                 lines.append(f"    Table 4  {estimator:<9} {fits} mas")
+            lines.append(f"    {noise_line(shown)}")
     lines.append(
         "predicted; the weighted estimator attains the Cramer-Rao bound of Table 4, 'bound' is that of Table 3"
     )
@@ -250,7 +251,15 @@ def _optics(focal_masks: tuple[str, ...], band_modes: int = 2) -> Optics:
 def _figures(focal_mask: str, holes_: tuple[Hole, ...]) -> dict[str, Any]:
     optics = _optics((focal_mask,), band_modes=14)
     fields: Single = np.sum([hole_fields(optics, hole) for hole in holes_], axis=0)
-    return figures(optics, fields)
+    return figures(Mask(optics, fields))
+
+
+def noise_line(shown: Mapping[str, Any]) -> str:
+    """What one exposure of Table 4's star leaves, of the figures of a sensor."""
+    return (
+        f"noise of 14 modes {shown['noise_nm']:.3g} nm, which adds {shown['contrast_noise']:.2e} to the contrast; "
+        f"{shown['quantum_share']:.1%} of the quantum limit"
+    )
 
 
 def _described(found: Sequence[Hole]) -> str:

@@ -3,9 +3,10 @@
 from dataclasses import dataclass, replace
 from functools import cached_property
 
-from lowfc.design.sam_goal import Goal
+from lowfc.design.goal import Goal
 from lowfc.design.sam_merit import FOCAL_MASKS
 from lowfc.design.sam_search import UNIT, Bounds
+from lowfc.programs.design.options import span
 
 
 @dataclass(frozen=True)
@@ -13,7 +14,7 @@ class Search:
     """All that the result depends on, besides the shaped pupil: the options of `lowfc design sam`.
 
     Attributes:
-        merit: What to minimise: paper, table3, table4, condition, throughput or pareto.
+        merit: What to minimise: paper, table3, table4, condition, throughput, pareto or contrast.
         estimator: pinv, or weighted for the Cramer-Rao bound. Default: weighted; pinv for the merit paper.
         modes: Modes in Table 3: 14 or 20.
         weight: Of Table 4 in paper and pareto, 0 to 1. Default: 0.5; in pareto, a front.
@@ -92,12 +93,8 @@ class Search:
 
 def _span(option: str, text: str, scale: int) -> tuple[int, int]:
     """LOW:HIGH, or one value for both, in units of 1 / scale."""
-    low, _, high = text.partition(":")
-    try:
-        first, last = (float(value) * scale for value in (low, high or low))
-        span = round(first), round(last)
-    except (ValueError, OverflowError):
-        raise ValueError(f"{option} must be a number or LOW:HIGH, got {text!r}") from None
-    if abs(span[0] - first) > 1e-6 or abs(span[1] - last) > 1e-6:
+    first, last = (value * scale for value in span(option, text))
+    found = round(first), round(last)
+    if abs(found[0] - first) > 1e-6 or abs(found[1] - last) > 1e-6:
         raise ValueError(f"{option} must be in steps of {1 / scale:g}, got {text!r}")
-    return span
+    return found

@@ -31,8 +31,8 @@ def validate(
         list[str] | None,
         typer.Option(
             help=f"Only this sensor, in all tables and figures but {' and '.join(OF_THE_PAPER)}: sam, bowtie, "
-            "bowtie:LAYOUT, clowfs, clowfs:MM (its defocus), zwfs, bar, open, lyot, aplc; or a layout, FILE.json or "
-            "FILE.json:NAME. Repeat.",
+            "bowtie:LAYOUT, clowfs, clowfs:MM (its defocus), clowfs_tuned, zwfs, zwfs_tuned, bar, open, lyot, aplc; or "
+            "a layout, FILE.json or FILE.json:NAME. Repeat.",
             show_default=False,
         ),
     ] = None,

@@ -35,13 +35,13 @@ _LIGHT = ("paper's electrons", "own photometry")
 GLANCE = (
     *(
         ("table3", name, modes, estimator, _RESIDUAL)
-        for name in ("sam", "sam18_sized", "bowtie", "clowfs", "zwfs")
+        for name in ("sam", "sam18_sized", "bowtie", "clowfs", "clowfs_tuned", "zwfs", "zwfs_tuned")
         for modes in (14, 20)
         for estimator in ("pinv", "weighted + 2 iterations")
     ),
     *(
         ("table4", name, modes, estimator, _SCATTER.format(light))
-        for name in ("sam", "sam18_sized", "clowfs", "zwfs")
+        for name in ("sam", "sam18_sized", "clowfs", "clowfs_tuned", "zwfs", "zwfs_tuned")
         for light in _LIGHT
         for modes in (2, 14)
         for estimator in ("pinv", "weighted")
@@ -59,6 +59,11 @@ GLANCE = (
         for estimator in ("pinv", "best possible fit")
     ),
     *(("conditioning", name, 14, None, "condition number") for name in ("open", "sam")),
+    *(
+        ("conditioning", name, 14, "Cramer-Rao bound", quantity)
+        for name in ("sam", "sam18_sized", "clowfs", "clowfs_tuned", "zwfs", "zwfs_tuned")
+        for quantity in ("noise", "noise, 20 % band", "share of the quantum limit")
+    ),
 )
 """Table and key of the rows that the document begins with."""
 

@@ -1,6 +1,7 @@
 """Sect. 4: how well the modes can be told apart behind an open circle, bars, and holes of several sizes."""
 
 from collections.abc import Iterator
+from functools import partial
 
 import numpy as np
 
@@ -8,16 +9,17 @@ from lowfc.adapters.files.layouts import load_layout
 from lowfc.adapters.files.sensors import sensor_from
 from lowfc.contract.sections import SensorSection
 from lowfc.control.calibration.calibration import condition_number
-from lowfc.design.fisher import cramer_rao, variance_e
+from lowfc.design.fisher import cramer_rao, quantum_information, variance_e
 from lowfc.design.paper import STAR, TABLE4_EXPOSURE_S, TABLE4_READ_NOISE_E
 from lowfc.optics.chain import sam as sams
+from lowfc.optics.chain.band import gauss_legendre
 from lowfc.optics.chain.relay import ApertureMask
-from lowfc.optics.chain.sensor import Sensor
+from lowfc.optics.chain.sensor import Sensor, reference, response
 from lowfc.optics.detector.photometry import electrons
 from lowfc.programs.paper.cases import Context, Prepared, Row, prepared, sparse_apertures
 from lowfc.programs.paper.tables.pointing import NM_PER_MAS
 
-OTHERS = ("clowfs", "zwfs")
+OTHERS = ("clowfs", "clowfs_tuned", "zwfs", "zwfs_tuned")
 """Sensors besides the shipped sparse apertures."""
 BARS = ((0.05, 20.0), (0.1, 20.0), (0.2, 20.0), (0.1, 0.0), (0.1, 45.0), (0.1, 90.0))
 """Width in pupil diameters and angle in degrees."""
@@ -28,6 +30,16 @@ FIXED_STAR = (
     f"Cramer-Rao bound at the central wavelength: V = {STAR.magnitude}, {STAR.diameter_m:g} m, {TABLE4_EXPOSURE_S} s, "
     "our own masks. Smaller holes are better conditioned and yet worse: the condition number does not know the light."
 )
+NOISE = (
+    f"Cramer-Rao bound, all 14 modes fitted, root of the sum of their variances, no read noise: V = {STAR.magnitude}, "
+    f"{TABLE4_EXPOSURE_S} s, our own masks. The same photons, at the central wavelength or over the band, in four "
+    "Gauss-Legendre wavelengths."
+)
+QUANTUM = (
+    "limit: quantum Fisher information of the light behind the pupil's mask, 4 N Cov of the modes' phases: no sensor "
+    "of this light does better."
+)
+SHARE = "Median over the modes of the quantum limit's variance over the Cramer-Rao bound's."
 CLAIMS = {
     "open": "Sect. 4: extremely high. limit: above 1e12 is singular in double precision.",
     "bar": "Sect. 4: below 1000 (the limit here), an order of magnitude above the sparse aperture mask's.",
@@ -85,6 +97,7 @@ def _rows(kind: str, mask: Prepared) -> Iterator[Row]:
         )
     yield Row(mask.name, "open circle's light that falls on the sensor", "", float(mask.I0.sum()))
     scale_e = electrons(STAR, TABLE4_EXPOSURE_S)
+    yield from _noise_rows(mask, scale_e)
     variance = variance_e(mask.I0 * scale_e, TABLE4_READ_NOISE_E)
     for modes in (2, 14):
         try:
@@ -93,3 +106,29 @@ def _rows(kind: str, mask: Prepared) -> Iterator[Row]:
             tilt = None
         quantity = "least std of x tilt"
         yield Row(mask.name, quantity, "mas", tilt, modes=modes, estimator="Cramer-Rao bound", assumption=FIXED_STAR)
+
+
+def _noise_rows(mask: Prepared, light_e: float) -> Iterator[Row]:
+    """The noise of 14 modes beside the least that the light allows."""
+    limit = np.diag(
+        np.linalg.inv(quantum_information(mask.sensor.pupil, mask.modes[:14], mask.sensor.wavelength_nm, light_e))
+    )
+    bounded = partial(Row, mask.name, modes=14, estimator="Cramer-Rao bound")
+    modes, band = mask.modes[:14], gauss_legendre(mask.sensor.wavelength_nm, count=4)
+    in_band = reference(mask.sensor, band).ravel(), response(mask.sensor, modes, band)
+    for quantity, (I0, H) in {"noise": (mask.I0, mask.H[:, :14]), "noise, 20 % band": in_band}.items():
+        try:
+            bound = np.diag(cramer_rao(H * light_e, variance_e(I0 * light_e, 0.0)))
+        except ValueError:
+            return
+        of_light = float(np.sqrt(limit.sum())) if quantity == "noise" else None
+        yield bounded(
+            quantity=quantity,
+            unit="nm",
+            measured=float(np.sqrt(bound.sum())),
+            limit=of_light,
+            assumption=f"{NOISE}\n{QUANTUM}" if of_light else NOISE,
+        )
+        if of_light:
+            share = float(np.median(limit / bound))
+            yield bounded(quantity="share of the quantum limit", unit="", measured=share, limit=1.0, assumption=SHARE)

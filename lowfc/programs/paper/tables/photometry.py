@@ -10,7 +10,14 @@ from scipy.optimize import brentq
 from lowfc.arrays import Array
 from lowfc.contract.sections import SensorSection
 from lowfc.design.fisher import covariance, variance_e
-from lowfc.design.paper import STAR, TABLE3_READ_NOISE_E, TABLE3_WAVES, TABLE4_EXPOSURE_S, TABLE4_MAS
+from lowfc.design.paper import (
+    STAR,
+    TABLE3_INPUT_WAVES,
+    TABLE3_READ_NOISE_E,
+    TABLE3_WAVES,
+    TABLE4_EXPOSURE_S,
+    TABLE4_MAS,
+)
 from lowfc.design.trials import bounds_waves, expected_r_squared, expected_rms
 from lowfc.optics.chain.relay import Defocus, fresnel_distance
 from lowfc.optics.chain.sensor import reference
@@ -185,7 +192,7 @@ def _defocus_contradiction(clowfs: Prepared) -> Iterator[Row]:
 def _r2_contradiction(sam: Prepared) -> Iterator[Row]:
     """A mean R2 of 0.97 and a residual 30 times below the input do not go together."""
     name = "inconsistency 3: R2 of 0.97 against a residual 30 times below the input"
-    paper_in, paper_out = reconstruction.INPUT_RMS_WAVES[14], TABLE3_WAVES["disk"][14][0]
+    paper_in, paper_out = TABLE3_INPUT_WAVES[14], TABLE3_WAVES["disk"][14][0]
     yield Row(
         name,
         "R2 if every mode's error were as far below its input as the wavefront's",

@@ -16,7 +16,7 @@ from lowfc.optics.chain.relay import ApertureMask
 from lowfc.optics.detector.photometry import electrons, tilt_nm_per_mas
 from lowfc.programs.paper.cases import Context, Prepared, Row, prepared, sparse_apertures
 
-OTHERS = ("clowfs", "clowfs:1", "zwfs")
+OTHERS = ("clowfs", "clowfs:1", "clowfs_tuned", "zwfs", "zwfs_tuned")
 """Sensors besides the shipped sparse apertures."""
 FITTED = {1: (2, 14, 20), 10: (2, 14)}
 """Numbers of modes, tip and tilt first, by the tilt in mas."""

@@ -10,11 +10,11 @@ from lowfc.arrays import Array
 from lowfc.design import trials as random
 from lowfc.design.estimators import KINDS, Fit, estimate, iterated
 from lowfc.design.fisher import cramer_rao, variance_e
-from lowfc.design.paper import MODES, PEAK_E, TABLE3_READ_NOISE_E, TABLE3_WAVES
+from lowfc.design.paper import MODES, PEAK_E, TABLE3_INPUT_WAVES, TABLE3_READ_NOISE_E, TABLE3_WAVES
 from lowfc.optics.chain.zernike import NOLLS_20
 from lowfc.programs.paper.cases import DEFAULT_SAM, Context, Prepared, Row, prepared, sparse_apertures
 
-OTHERS = ("bowtie", f"bowtie:{DEFAULT_SAM}", "clowfs", "zwfs", "bar", "lyot", "aplc")
+OTHERS = ("bowtie", f"bowtie:{DEFAULT_SAM}", "clowfs", "clowfs_tuned", "zwfs", "zwfs_tuned", "bar", "lyot", "aplc")
 """Sensors besides the shipped sparse apertures."""
 ITERATIONS = (0, 1, 2)
 WITH_NUISANCES = "weighted, flux and shear fitted along"
@@ -24,7 +24,6 @@ EVEN = (
     "a tilt."
 )
 
-INPUT_RMS_WAVES = {14: 0.015, 20: 0.018}
 INPUT_PV_WAVES = {14: 0.097, 20: 0.11}
 PAPER_WAVES = {
     "sam": TABLE3_WAVES["disk"],
@@ -63,14 +62,14 @@ def inputs(sensor: Prepared, modes: int, literal: bool) -> Iterator[Input]:
     low, high = random.LITERAL_WAVES
     bounds = random.bounds_waves(NOLLS_20[:modes], low, high)
     literal_rms = random.input_rms(sensor.gram[:modes, :modes], bounds)
-    scale = INPUT_RMS_WAVES[modes] / literal_rms
+    scale = TABLE3_INPUT_WAVES[modes] / literal_rms
     yield Input(
         "matched",
         low * scale,
         high * scale,
         f"Coefficients uniform within {low * scale:.4f} (n <= 2) and {high * scale:.4f} waves rms, for which the root "
-        f"mean square of the input is Table 3's {INPUT_RMS_WAVES[modes]}; with the text's {low} and {high} it would be "
-        f"{literal_rms:.3f}.",
+        f"mean square of the input is Table 3's {TABLE3_INPUT_WAVES[modes]}; with the text's {low} and {high} it would "
+        f"be {literal_rms:.3f}.",
     )
     if literal:
         yield Input("literal", low, high, f"Coefficients uniform within {low} and {high} waves rms, as in the text.")
@@ -159,7 +158,7 @@ def table3(context: Context) -> list[Row]:
 def _input_rows(sensor: Prepared, modes: int, wavefronts: Input, found: Ensemble) -> Iterator[Row]:
     drawn = partial(Row, f"input, pupil of {sensor.name}", modes=modes, assumption=wavefronts.assumption)
     for figure, paper, (mean, error) in (
-        ("RMS", INPUT_RMS_WAVES, _rms(sensor, found.truth_nm)),
+        ("RMS", TABLE3_INPUT_WAVES, _rms(sensor, found.truth_nm)),
         ("P-V", INPUT_PV_WAVES, _pv(sensor, found.truth_nm)),
     ):
         yield drawn(f"{figure}, {wavefronts.name} input", "waves", mean, paper[modes], error)

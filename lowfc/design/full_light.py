@@ -1,0 +1,147 @@
+"""Sensors that use all of the light behind the focal-plane mask, Zernike's and CLOWFS, predicted for a search.
+
+The fields on the focal-plane mask depend on neither the spot nor the defocus: they are propagated once, and each
+candidate from there.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from scipy.optimize import minimize_scalar
+
+from lowfc.arrays import Array, Complex
+from lowfc.control.calibration.calibration import reconstructor
+from lowfc.design.merit import WAVELENGTH_NM, PupilForms, Signal
+from lowfc.design.paper import MODES, TABLE3_INPUT_WAVES
+from lowfc.design.trials import LITERAL_WAVES, bounds_waves, input_rms, random_wavefronts, residual_rms
+from lowfc.optics.chain.band import Band, uniform
+from lowfc.optics.chain.fourier import to_image
+from lowfc.optics.chain.sensor import Sensor, from_focus, pixel_sums, pupil_radii
+from lowfc.optics.chain.zernike import NOLLS_20, zernikes
+
+_WAVEFRONTS = 20
+_SEED = 1
+
+
+@dataclass(frozen=True, eq=False)
+class Focus:
+    """What falls on a focal-plane mask.
+
+    Attributes:
+        band: Of Table 4.
+        forms: Of the pupil.
+        fields: By wavelength, (1 + modes, k, k): the flat wavefront's, and the first-order ones of the 20 modes.
+        wavefronts_nm: By the number of modes, (wavefronts, modes) random ones matched to Table 3's input.
+        aberrated: By the number of modes, (wavefronts, k, k) their fields at the central wavelength.
+    """
+
+    band: Band
+    forms: PupilForms
+    fields: dict[float, Complex]
+    wavefronts_nm: dict[int, Array]
+    aberrated: dict[int, Complex]
+
+    @classmethod
+    def of(cls, sensor: Sensor) -> "Focus":
+        """Behind the pupil of a sensor, as large as its focal-plane mask."""
+        modes = zernikes(NOLLS_20, *pupil_radii(sensor))
+        forms, band = PupilForms.of(sensor.pupil, modes), uniform(WAVELENGTH_NM)
+
+        def focal(pupil_field: Array | Complex, wavelength_nm: float = WAVELENGTH_NM) -> Complex:
+            size = len(sensor.focal_mask)
+            field = np.asarray(pupil_field, np.complex128)
+            return to_image(field, size, sensor.samples_per, WAVELENGTH_NM / wavelength_nm)
+
+        wanted = {WAVELENGTH_NM, *band.wavelengths_nm}
+        fields = {nm: np.array([focal(sensor.pupil * shape, nm) for shape in (1.0, *modes)]) for nm in wanted}
+        drawn, aberrated = {}, {}
+        for count in MODES:
+            nolls, (low, high) = NOLLS_20[:count], LITERAL_WAVES
+            scale = TABLE3_INPUT_WAVES[count] / input_rms(forms.gram[:count, :count], bounds_waves(nolls, low, high))
+            waves = random_wavefronts(np.random.default_rng(_SEED), _WAVEFRONTS, nolls, low * scale, high * scale)
+            phases = (np.tensordot(one, modes[:count], 1) for one in waves)
+            drawn[count] = waves * WAVELENGTH_NM
+            aberrated[count] = np.array([focal(sensor.pupil * np.exp(2j * np.pi * phase)) for phase in phases])
+        return cls(band, forms, fields, drawn, aberrated)
+
+
+@dataclass(frozen=True, eq=False)
+class FullLight:
+    """A sensor without a relay mask that is judged: a `lowfc.design.merit.Candidate`.
+
+    Its paper's rows are those of CLOWFS, the only sensor of this kind that the paper has figures of.
+
+    Attributes:
+        sensor: The optics.
+        focus: What falls on its focal-plane mask.
+    """
+
+    sensor: Sensor
+    focus: Focus
+    paper_rows = ("clowfs",)
+    paper_tilt = "clowfs"
+
+    @property
+    def forms(self) -> PupilForms:
+        """Of the pupil."""
+        return self.focus.forms
+
+    def central(self, row: str = "clowfs") -> Signal:
+        """What it sees at the central wavelength."""
+        return self._central
+
+    def in_band(self) -> Signal:
+        """What it sees of the band of Table 4."""
+        return self._in_band
+
+    @cached_property
+    def _central(self) -> Signal:
+        return self._signal(Band((WAVELENGTH_NM,), (1.0,)))
+
+    @cached_property
+    def _in_band(self) -> Signal:
+        return self._signal(self.focus.band)
+
+    def nonlinearity_waves(self, modes: int) -> float:
+        """Mean residual rms over the open pupil of random wavefronts without noise, by the plain pseudo-inverse."""
+        seen, truth = self.central(), self.focus.wavefronts_nm[modes]
+        R = reconstructor(seen.I0, seen.H[:, :modes], np.ones_like(seen.I0), 1.0, 0.0, "pinv")
+        images = [self._intensity(self._on_sensor(field, WAVELENGTH_NM)) for field in self.focus.aberrated[modes]]
+        residuals = truth - (np.array(images) - seen.I0) @ R.T
+        return float(residual_rms(self.forms.gram[:modes, :modes], residuals).mean()) / WAVELENGTH_NM
+
+    def _signal(self, band: Band) -> Signal:
+        pixels = self.sensor.pixels**2
+        I0, H = np.zeros(pixels), np.zeros((pixels, len(NOLLS_20)))
+        for nm, weight in zip(band.wavelengths_nm, band.weights, strict=True):
+            flat, *modes = (self._on_sensor(field, nm) for field in self.focus.fields[nm])
+            slopes = [(4.0 * np.pi / nm) * (flat * np.conj(1j * one)).real for one in modes]
+            I0 += weight * self._intensity(flat)
+            H += weight * np.array([pixel_sums(self.sensor, slope).ravel() for slope in slopes]).T
+        return Signal(I0, H, 1.0, float(I0.max()))
+
+    def _on_sensor(self, focal: Complex, wavelength_nm: float) -> Complex:
+        return from_focus(self.sensor, focal * self.sensor.focal_mask, wavelength_nm)
+
+    def _intensity(self, field: Complex) -> Array:
+        return pixel_sums(self.sensor, field.real**2 + field.imag**2).ravel()
+
+
+def sweep(merit_of: Callable[[float], float], low: float, high: float, count: int) -> tuple[Array, float]:
+    """Values (count,) evenly over a range, and the one between their neighbours of the least merit where it is least.
+
+    Args:
+        merit_of: Of a value.
+        low: End of the range.
+        high: Other end; the same for one value.
+        count: How many, at least 3.
+    """
+    if low == high:
+        return np.array([low]), low
+    values = np.linspace(low, high, count)
+    at = int(np.argmin([merit_of(value) for value in values.tolist()]))
+    bounds = values[max(at - 1, 0)], values[min(at + 1, count - 1)]
+    found = minimize_scalar(merit_of, bounds=bounds, method="bounded", options={"xatol": 1e-3 * (high - low)})
+    return values, float(min((found.x, values[at]), key=merit_of))

@@ -1,0 +1,127 @@
+"""What a search for a better sensor minimises."""
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from lowfc.control.calibration.calibration import ESTIMATORS
+from lowfc.design.merit import (
+    HELD,
+    Candidate,
+    condition,
+    contrast_noise,
+    exposure_nm2,
+    quantum_share,
+    table3_noise_waves,
+    table3_waves,
+    table4_mas,
+    throughput,
+)
+from lowfc.design.paper import MODES, TABLE3_WAVES, TABLE4_MAS, TABLE4_MODES
+
+MERITS = ("paper", "table3", "table4", "condition", "throughput", "pareto", "contrast")
+WEIGHTED = ("paper", "pareto")
+
+
+@dataclass(frozen=True)
+class Goal:
+    """What is minimised.
+
+    Attributes:
+        merit: Of `MERITS`; "paper" is the largest ratio of a predicted figure to the paper's, over its rows of Table 3
+            and Table 4, those of Table 3 to the power of 2 weight, that of Table 4 to 2 (1 - weight); "pareto" is
+            table3^(1 - weight) table4^weight; "contrast" is what the noise of one exposure of Table 4's star, 14 modes,
+            adds to the contrast of the dark zone.
+        estimator: "pinv", or "weighted" for the Cramer-Rao bound.
+        modes: Number of modes in Table 3 and in the condition number.
+        weight: Of Table 4 in "pareto" and "paper", 0 to 1; None for 1/2 in "paper", and for a weight of its own for
+            each chain in a "pareto" search.
+    """
+
+    merit: str = "paper"
+    estimator: str = "pinv"
+    modes: int = 14
+    weight: float | None = None
+
+    def __post_init__(self) -> None:
+        if self.merit not in MERITS:
+            raise ValueError(f"merit must be one of {', '.join(MERITS)}, got {self.merit!r}")
+        if self.modes not in MODES:
+            raise ValueError(f"modes must be 14 or 20 (radial degrees up to 4 or 5), got {self.modes}")
+        if self.estimator not in ESTIMATORS:
+            raise ValueError(f"estimator must be one of {', '.join(ESTIMATORS)}, got {self.estimator!r}")
+        if self.weight is not None and not (self.merit in WEIGHTED and 0.0 <= self.weight <= 1.0):
+            raise ValueError(
+                f"a weight, 0 to 1, belongs to the merits {' and '.join(WEIGHTED)}; got {self.weight} with "
+                f"{self.merit!r}"
+            )
+
+
+def merit(candidate: Candidate, goal: Goal) -> float:
+    """The figure to be made small, above 0; infinite where a mode has no signal."""
+    try:
+        value = _merit(candidate, goal)
+    except np.linalg.LinAlgError:
+        return float("inf")
+    return value if np.isfinite(value) and value > 0 else float("inf")
+
+
+def paper_ratios(candidate: Candidate, estimator: str = "pinv") -> dict[str, float]:
+    """Predicted over paper's figure, of each row of Tables 3 and 4: below 1 is better than the paper."""
+    ratios = {}
+    for name in candidate.paper_rows:
+        for modes in MODES:
+            residual = table3_waves(candidate, name, modes, estimator)
+            ratios[f"table3 {name} {modes} modes"] = residual / TABLE3_WAVES[name][modes][0]
+    ratios["table4"] = _tilt_mas(candidate, estimator) / TABLE4_MAS[candidate.paper_tilt][1]
+    return ratios
+
+
+def _merit(candidate: Candidate, goal: Goal) -> float:
+    first = candidate.paper_rows[0]
+    match goal.merit:
+        case "paper":
+            weight = 0.5 if goal.weight is None else goal.weight
+            ratios = paper_ratios(candidate, goal.estimator)
+            tilt = ratios.pop("table4")
+            return float(max(max(ratios.values()) ** (2.0 * weight), tilt ** (2.0 * (1.0 - weight))))
+        case "table4":
+            return _tilt_mas(candidate, goal.estimator)
+        case "condition":
+            return condition(candidate.central(first), goal.modes)
+        case "throughput":
+            return 1.0 / throughput(candidate.central(first))
+        case "contrast":
+            return contrast_noise(candidate.forms, candidate.central(first), goal.estimator)
+        case "table3":
+            return table3_waves(candidate, first, goal.modes, goal.estimator)
+    if goal.weight is None:
+        raise ValueError("a point of the front needs a weight")
+    residual = table3_waves(candidate, first, goal.modes, goal.estimator)
+    return float(residual ** (1.0 - goal.weight) * _tilt_mas(candidate, goal.estimator) ** goal.weight)
+
+
+def _tilt_mas(candidate: Candidate, estimator: str) -> float:
+    return max(table4_mas(candidate.in_band(), TABLE4_MODES, estimator))
+
+
+def figures(candidate: Candidate) -> dict[str, Any]:
+    """What the first row of Table 3, and Table 4, would show, as plain values for people and for JSON.
+
+    "bound" is the Cramer-Rao bound of Table 3, which knows no second order; in Table 4 "weighted" attains it.
+    """
+    first, in_band = candidate.paper_rows[0], candidate.in_band()
+    seen, forms = candidate.central(first), candidate.forms
+    table3 = {name: {str(m): table3_waves(candidate, first, m, name) for m in MODES} for name in ESTIMATORS}
+    table3["bound"] = {str(m): table3_noise_waves(forms, seen, m, "weighted") for m in MODES}
+    fitted = (TABLE4_MODES, in_band.H.shape[1])
+    return {
+        "throughput": throughput(seen),
+        "condition": {str(m): condition(seen, m) for m in MODES},
+        "table3_waves": table3,
+        "table4_mas": {name: {str(m): table4_mas(in_band, m, name) for m in fitted} for name in ESTIMATORS},
+        "noise_nm": float(np.sqrt(np.trace(exposure_nm2(seen, HELD, "weighted")))),
+        "contrast_noise": contrast_noise(forms, seen, "weighted"),
+        "quantum_share": quantum_share(forms, seen),
+    }

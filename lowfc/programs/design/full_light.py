@@ -1,0 +1,140 @@
+"""`lowfc design zwfs` and `lowfc design clowfs`: a sensor without a relay mask, over one of its dimensions."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+from typing import Any, Literal
+
+from threadpoolctl import threadpool_limits
+
+from lowfc.adapters.files.drawing import figure_class, png
+from lowfc.adapters.files.sensors import sensor_from
+from lowfc.adapters.files.whole_file import require_folder, write_whole
+from lowfc.contract.errors import ConfigurationError
+from lowfc.contract.sections import SensorSection
+from lowfc.design.full_light import Focus, FullLight, sweep
+from lowfc.design.goal import Goal, figures, merit
+from lowfc.design.merit import WAVELENGTH_NM
+from lowfc.programs.cli.result import Result, figure
+
+Kind = Literal["zwfs", "clowfs"]
+
+KEYS = {"zwfs": "spot_diameter", "clowfs": "defocus_mm"}
+_POINTS = 21
+
+
+class Point(Result):
+    """A sensor of one size."""
+
+    value: float = figure("size", form=".3f")
+    merit: float = figure("merit", form=".4g")
+    throughput: float = figure("light", form=".1%")
+    table3_waves: float = figure("Table 3, n<=4", "waves", ".2e")
+    table4_mas: float = figure("Table 4, 2 modes", "mas", ".3f")
+    condition: float = figure("cond14", form=".0f")
+    noise_nm: float = figure("noise of 14 modes", "nm", ".3g")
+    contrast_noise: float = figure("contrast it adds", form=".2e")
+    quantum_share: float = figure("of the quantum limit", form=".1%")
+
+
+class Swept(Result):
+    """Every size that was looked at, and the best."""
+
+    key: str = figure("key of [sensor]")
+    merit: str = figure("merit")
+    estimator: str = figure("estimator")
+    best: float = figure("best", form=".3f")
+    file: str = figure("written to")
+    points: list[Point] = figure()
+    figures_of_best: dict[str, Any] = figure()
+
+
+@dataclass(frozen=True)
+class Sizes:
+    """What is looked at: a kind, one end and the other, and keys of [sensor] that stay."""
+
+    kind: Kind
+    low: float
+    high: float
+    others: dict[str, float]
+
+
+def design(sizes: Sizes, goal: Goal, out: Path, plot: Path | None) -> Swept:
+    """Look at sizes of a sensor, find the best between them, and write its keys as a configuration.
+
+    Raises:
+        ConfigurationError: The sizes are not those of a sensor, or there is no matplotlib for the plot.
+        DataFileError: A file cannot be written.
+    """
+    if plot is not None:
+        figure_class()
+    require_folder(out, plot)
+    key = KEYS[sizes.kind]
+
+    @cache
+    def candidate(value: float) -> FullLight:
+        return FullLight(sensor_from(_section(sizes, value), WAVELENGTH_NM), focus)
+
+    def merit_of(value: float) -> float:
+        return merit(candidate(value), goal)
+
+    with threadpool_limits(1):
+        focus = Focus.of(sensor_from(_section(sizes, sizes.low), WAVELENGTH_NM))
+        values, best = sweep(merit_of, sizes.low, sizes.high, _POINTS)
+        points = [_point(candidate(value), value, merit_of, goal) for value in sorted({*values.tolist(), best})]
+        of_best = figures(candidate(best))
+    keys = {"kind": f'"{sizes.kind}"', **sizes.others, key: f"{best:.4g}"}
+    write_whole(out, "".join(["[sensor]\n", *(f"{name} = {value}\n" for name, value in keys.items())]).encode())
+    if plot is not None:
+        write_whole(plot, _picture(points, key, goal))
+    return Swept(
+        key=key,
+        merit=goal.merit,
+        estimator=goal.estimator,
+        best=best,
+        file=str(out),
+        points=points,
+        figures_of_best=of_best,
+    )
+
+
+def _section(sizes: Sizes, value: float) -> SensorSection:
+    try:
+        return SensorSection.model_validate({"kind": sizes.kind, **sizes.others, KEYS[sizes.kind]: value})
+    except ValueError as error:
+        raise ConfigurationError(f"{KEYS[sizes.kind]} = {value:g}: {error}") from None
+
+
+def _point(one: FullLight, value: float, merit_of: Callable[[float], float], goal: Goal) -> Point:
+    found = figures(one)
+    return Point(
+        value=value,
+        merit=merit_of(value),
+        throughput=found["throughput"],
+        table3_waves=found["table3_waves"][goal.estimator]["14"],
+        table4_mas=max(found["table4_mas"][goal.estimator]["2"]),
+        condition=found["condition"]["14"],
+        noise_nm=found["noise_nm"],
+        contrast_noise=found["contrast_noise"],
+        quantum_share=found["quantum_share"],
+    )
+
+
+def _picture(points: list[Point], key: str, goal: Goal) -> bytes:
+    """Every figure over the size, beside its least."""
+    drawing = figure_class()(figsize=(7.5, 5.0), layout="constrained")
+    axes = drawing.subplots()
+    values = [point.value for point in points]
+    labels = {
+        "merit": f"merit {goal.merit}",
+        "table3_waves": "Table 3",
+        "table4_mas": "Table 4",
+        "contrast_noise": "contrast of the noise",
+    }
+    for name, label in labels.items():
+        found = [getattr(point, name) for point in points]
+        axes.semilogy(values, [one / min(found) for one in found], label=label)
+    axes.set(xlabel=key, ylabel="of the least")
+    axes.legend()
+    return png(drawing)

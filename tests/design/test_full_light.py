@@ -1,0 +1,145 @@
+"""Sensors that use all of the light, tuned alike; and what any sensor could get of the light."""
+
+import json
+import tomllib
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from lowfc.adapters.files.layouts import load_layout
+from lowfc.adapters.files.sensors import sensor_from, sensor_named
+from lowfc.adapters.process.terminal import new_app
+from lowfc.contract.configuration import load
+from lowfc.contract.sections import SensorSection
+from lowfc.design.estimators import estimate, fit
+from lowfc.design.fisher import cramer_rao, quantum_information, variance_e
+from lowfc.design.full_light import Focus, FullLight, sweep
+from lowfc.design.goal import Goal, figures, merit
+from lowfc.design.merit import contrast_noise
+from lowfc.design.paper import STAR, TABLE4_EXPOSURE_S
+from lowfc.design.trials import noisy_e
+from lowfc.optics.chain.added_contrast import contrast_form
+from lowfc.optics.chain.sam import transmission
+from lowfc.optics.chain.sensor import image, pupil_radii, reference, response
+from lowfc.optics.chain.zernike import NOLLS_14, NOLLS_20, zernikes
+from lowfc.optics.detector.photometry import electrons
+from lowfc.programs.design.command import design_app
+
+LIGHT_E = electrons(STAR, TABLE4_EXPOSURE_S)
+# Noise of 14 modes in nm, and the share of the quantum limit, as an independent calculation found them.
+EXPECTED = {
+    "sam": (None, 0.006),
+    "sam18_sized": (None, 0.013),
+    "sam27d10_bal14": (None, 0.011),
+    "bar": (None, 0.035),
+    "zwfs": (1.57, 0.051),
+    "clowfs": (1.63, 0.062),
+    "zwfs_tuned": (1.30, None),
+    "clowfs_tuned": (1.22, None),
+}
+
+
+@pytest.fixture(scope="module")
+def focus():
+    return Focus.of(sensor_named("zwfs"))
+
+
+@pytest.fixture(scope="module")
+def modes():
+    return zernikes(NOLLS_20, *pupil_radii(sensor_named("zwfs")))
+
+
+@pytest.mark.parametrize("name", EXPECTED)
+def test_no_sensor_uses_all_of_the_light(name, modes):
+    sensor = sensor_named(name)
+    I0, H = reference(sensor).ravel() * LIGHT_E, response(sensor, modes[:14]) * LIGHT_E
+    bound = cramer_rao(H, variance_e(I0, 0.0))
+    limit = np.linalg.inv(quantum_information(sensor.pupil, modes[:14], 550.0, LIGHT_E))
+    assert np.linalg.eigvalsh(bound - limit).min() > 0
+    noise_nm, share = EXPECTED[name]
+    if noise_nm is not None:
+        assert np.sqrt(np.trace(bound)) == pytest.approx(noise_nm, rel=0.05)
+    if share is not None:
+        assert np.median(np.diag(limit) / np.diag(bound)) == pytest.approx(share, rel=0.1)
+
+
+def test_an_interferometer_of_two_holes_reaches_the_quantum_limit():
+    """Two small holes whose phases differ by a: their fringe at quadrature tells as much as the light holds."""
+    n, pupil = 64, np.zeros((64, 64))
+    pupil[32, 8], pupil[32, 56] = 1.0, 1.0
+    mode = np.zeros((1, n, n))
+    mode[0, 32, 8], mode[0, 32, 56] = 1.0, -1.0
+    found = quantum_information(pupil, mode, 2 * np.pi, light_e=n * n * np.pi / 4.0)  # 1 photon in each hole
+    assert found.item() == pytest.approx(4 * 2 * 1.0)  # N = 2, variance of the phase over them 1
+
+
+@pytest.mark.parametrize("name", ["zwfs_tuned", "clowfs_tuned"])
+def test_estimates_of_small_wavefronts_reach_the_bound_and_none_beats_it(name, modes):
+    sensor, count = sensor_named(name), 600
+    I0, H = reference(sensor).ravel(), response(sensor, modes[:14])
+    weighted = fit(NOLLS_14, I0, H, LIGHT_E, 1.0, "weighted")
+    bound = cramer_rao(weighted.response_e, variance_e(weighted.reference_e, 1.0))
+    rng = np.random.default_rng(5)
+    truth_nm = 0.5 * rng.standard_normal(14)
+    mean_e = image(sensor, np.tensordot(truth_nm, modes[:14], 1)).ravel() * LIGHT_E
+    found = np.array([estimate(weighted, noisy_e(rng, mean_e, 1.0)) for _ in range(count)])
+    whitened = np.diag(np.linalg.solve(bound, np.cov(found.T)))
+    error = np.sqrt(2.0 / (14 * count))
+    assert 1.0 - 3 * error < whitened.mean() < 1.05 + 3 * error
+
+
+@pytest.mark.parametrize("name", ["zwfs_tuned", "clowfs_tuned"])
+def test_a_candidate_is_predicted_as_the_full_chain_has_it(name, focus, modes):
+    sensor = sensor_named(name)
+    one = FullLight(sensor, focus)
+    seen = one.central()
+    assert np.allclose(seen.I0, reference(sensor).ravel(), rtol=1e-9, atol=1e-15)
+    assert np.allclose(seen.H[:, 7], response(sensor, modes[7:8])[:, 0], rtol=1e-9, atol=1e-15)
+    bound = cramer_rao(seen.H[:, :14] * LIGHT_E, variance_e(seen.I0 * LIGHT_E, 1.0))
+    expected = np.sum(contrast_form(sensor.pupil, NOLLS_14, 550.0) * bound)
+    assert contrast_noise(one.forms, seen, "weighted") == pytest.approx(expected, rel=0.01)
+    assert merit(one, Goal("contrast", "weighted")) == contrast_noise(one.forms, seen, "weighted")
+    shown = figures(one)
+    measured = {"zwfs_tuned": 9.0e-4, "clowfs_tuned": 1.4e-3}[name]  # second order alone, with the plain inverse
+    assert one.nonlinearity_waves(14) == pytest.approx(measured, rel=0.2)
+    assert shown["table3_waves"]["pinv"]["14"] > one.nonlinearity_waves(14)
+
+
+def test_a_sweep_finds_the_least_between_its_values():
+    values, best = sweep(lambda x: (x - 1.234) ** 2, 0.0, 4.0, 5)
+    assert values.tolist() == [0, 1, 2, 3, 4]
+    assert best == pytest.approx(1.234, abs=0.01)
+    assert sweep(abs, 2.0, 2.0, 5)[1] == 2.0
+
+
+def test_the_command_writes_the_keys_of_the_best(tmp_path):
+    app = new_app("Test.")
+    app.add_typer(design_app, name="design")
+    out = tmp_path / "clowfs.toml"
+    ran = CliRunner().invoke(app, ["design", "clowfs", "--defocus", "2.5:4.5", "--out", str(out), "--json"])
+    assert ran.exit_code == 0, ran.output
+    found = json.loads(ran.stdout)
+    assert found["best"] == pytest.approx(3.7, abs=0.1)
+    assert min(point["merit"] for point in found["points"]) == found["figures_of_best"]["contrast_noise"]
+    assert load(out).sensor.defocus_mm == pytest.approx(found["best"], rel=1e-3)
+    assert tomllib.loads(out.read_text())["sensor"]["kind"] == "clowfs"
+    wrong = CliRunner().invoke(app, ["design", "zwfs", "--spot", "0:1"])
+    assert wrong.exit_code
+    assert "spot_diameter" in str(wrong.exception)
+
+
+def test_holes_of_a_mask_that_is_made_move_the_image_little():
+    layout = load_layout(SensorSection().sam)
+    fine, centres = transmission(layout, 512, 4), transmission(layout, 512)
+    area = sum(np.pi / 4 * diameter**2 for _, _, diameter in layout.holes)
+    assert fine.mean() == pytest.approx(area, rel=1e-3)
+    assert set(np.unique(centres)) == {0.0, 1.0}
+    sensors = [sensor_from(SensorSection(hole_samples=points)) for points in (1, 4)]
+    tilt = zernikes(NOLLS_14, *pupil_radii(sensors[0]))
+    for of, expected in (
+        (lambda sensor: reference(sensor), 0.0035),
+        (lambda sensor: response(sensor, tilt), 0.0049),
+    ):
+        one, other = map(of, sensors)
+        assert np.linalg.norm(one - other) / np.linalg.norm(other) == pytest.approx(expected, rel=0.2)
