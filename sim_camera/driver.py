@@ -160,7 +160,7 @@ class SimulatedCamera:
         """Declare the truth, and listen to the mirror."""
         self._service = service
         modal = factory.contrast_of(self._config)  # in the one BLAS thread that a process of the loop has
-        self._contrast = None if modal is None else Contrast(modal)
+        self._contrast = Contrast(modal)
         self._truths = service.publisher(TRUTH)
         service.bus.subscribe(MIRROR_STATE, self._hear, self._config.mirror.name)
         service.on_stop(self._arrived.set)

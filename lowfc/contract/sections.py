@@ -80,6 +80,8 @@ class SensorSection(Section):
     """Reflective focal-plane mask: a disk, or the bowtie of Fig. 3."""
     focal_radius: float = Field(4.0, ge=1, le=10)
     """Radius of its disk, lambda/D."""
+    lyot_stop: float = Field(0.9, gt=0, le=1)
+    """Of circle and prolate: diameter of the stop in front of the science camera, pupil diameters."""
     sam: str = "sam27d07"
     """Of a sam: a shipped layout, or FILE.json, or FILE.json:NAME."""
     hole_samples: int = Field(1, ge=1, le=16)

@@ -7,7 +7,7 @@ from lowfc.adapters.files import factory
 from lowfc.arrays import Array
 from lowfc.contract.configuration import Configuration
 from lowfc.optics.chain.added_contrast import ModalContrast, by_group, contrast_form, costliest, without_negative
-from lowfc.optics.chain.coronagraph import DARK_ZONE, mean_contrast
+from lowfc.optics.chain.coronagraph import DARK_ZONE, Coronagraph, mean_contrast
 from lowfc.optics.chain.grid import pupil_axis
 from lowfc.optics.chain.zernike import zernikes
 from sim_camera.contrast import IMAGES, Contrast
@@ -62,7 +62,7 @@ def test_as_a_loss_it_rewards_nothing_and_keeps_what_costs(form: Array) -> None:
 
 def test_modes_of_a_kind_add_up_and_large_tilt_is_beyond_the_form(pupil: Array) -> None:
     """What two modes have in common is in the sum: half of it with each."""
-    modal, coma, tilt = ModalContrast(pupil, NOLL, WAVELENGTH_NM), NOLL.index(8), NOLL.index(2)
+    modal, coma, tilt = ModalContrast(Coronagraph(pupil), NOLL, WAVELENGTH_NM), NOLL.index(8), NOLL.index(2)
     shape = np.zeros(len(NOLL))
     shape[[coma, coma - 1, tilt]] = 0.3
     each = modal.by_mode(np.outer(shape, shape))
@@ -75,7 +75,7 @@ def test_modes_of_a_kind_add_up_and_large_tilt_is_beyond_the_form(pupil: Array) 
 
 
 def test_a_run_is_measured_by_images_of_its_second_half(pupil: Array) -> None:
-    contrast = Contrast(ModalContrast(pupil, NOLL, WAVELENGTH_NM))
+    contrast = Contrast(ModalContrast(Coronagraph(pupil), NOLL, WAVELENGTH_NM))
     assert contrast.measure() is None
     modes_nm = 0.3 * np.eye(len(NOLL), dtype=np.float32)[NOLL.index(11)]
     for frame in range(5000):

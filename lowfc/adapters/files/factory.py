@@ -9,7 +9,7 @@ from dataclasses import replace
 import numpy as np
 
 from lowfc.adapters.files.mirror_maps import active_actuators
-from lowfc.adapters.files.sensors import sensor_from
+from lowfc.adapters.files.sensors import coronagraph_from, sensor_from
 from lowfc.adapters.files.twin_cache import load_or_build, load_or_fit_mirror
 from lowfc.arrays import Array, single
 from lowfc.contract.codecs.calibration_codec import camera_settings, identified
@@ -63,15 +63,9 @@ def twin(config: Configuration, progress: Progress | None, warn: Callable[[str],
         raise ConfigurationError(f"sensor: {error}") from None
 
 
-def science_pupil(config: Configuration, warn: Callable[[str], None]) -> Array | None:
-    """The shaped pupil (n, n) of the science image; None for a coronagraph of which there is no science image yet."""
-    return None if config.sensor.pupil in ("circle", "prolate") else sensor(config, warn).pupil
-
-
-def contrast_of(config: Configuration) -> ModalContrast | None:
-    """What the modes add to the dark zone's contrast; None without a science image. It takes a tenth of a second."""
-    pupil = science_pupil(config, lambda _: None)
-    return None if pupil is None else ModalContrast(pupil, config.noll, config.star.wavelength_nm)
+def contrast_of(config: Configuration) -> ModalContrast:
+    """What the modes add to the dark zone's contrast. It takes a tenth of a second, behind a Lyot stop half of one."""
+    return ModalContrast(coronagraph_from(config.sensor), config.noll, config.star.wavelength_nm)
 
 
 def electrons_per_exposure(config: Configuration) -> float:

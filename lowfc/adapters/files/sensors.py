@@ -15,8 +15,9 @@ from lowfc.contract.codecs import input_file
 from lowfc.contract.errors import ConfigurationError, DataFileError, nearest
 from lowfc.contract.sections import SENSORS, SensorSection, sensor_keys
 from lowfc.optics.chain import sam as sams
+from lowfc.optics.chain.coronagraph import Coronagraph, LyotStop, Wedge
 from lowfc.optics.chain.focal_mask import bowtie, disk, phase_spot
-from lowfc.optics.chain.grid import SAMPLES
+from lowfc.optics.chain.grid import SAMPLES, pupil_axis
 from lowfc.optics.chain.pupil import circle, from_quarter, prolate, with_bar
 from lowfc.optics.chain.relay import ApertureMask, Defocus, PupilImage, Relay, fresnel_distance
 from lowfc.optics.chain.sensor import Sensor
@@ -24,6 +25,8 @@ from lowfc.optics.chain.sensor import Sensor
 _DATA = resources.files("lowfc") / "data"
 _LARGEST_BYTES = 1 << 30
 _WITH_LYOT_STOP = ("circle", "prolate")
+_LYOT_OUTER = 12.0
+"""Outer radius of their dark zone, lambda / D, which begins at the mask's edge and goes all round."""
 _log = logging.getLogger(__name__)
 
 
@@ -98,14 +101,20 @@ def sensor_named(name: str) -> Sensor:
     return sensor_from(SensorSection.model_validate(sensor_keys(name)))
 
 
-def science_pupil(section: SensorSection) -> Array | None:
-    """The shaped pupil (samples, samples) in front of the science camera; None where a Lyot stop makes its image.
+def coronagraph_from(section: SensorSection) -> Coronagraph:
+    """What makes the science image: of a shaped pupil, or behind a Lyot stop.
 
     Raises:
         ConfigurationError: There is no such pupil.
         DataFileError: Its file is missing or damaged.
     """
-    return None if section.pupil in _WITH_LYOT_STOP else _pupil(section)
+    pupil = _pupil(section)
+    if section.pupil not in _WITH_LYOT_STOP:
+        return Coronagraph(pupil)
+    u = pupil_axis(len(pupil))
+    stop = (np.hypot(u[:, None], u) <= section.lyot_stop / 2.0).astype(np.float64)
+    zone = Wedge(section.focal_radius, _LYOT_OUTER, 90.0)
+    return Coronagraph(pupil, zone, LyotStop(disk(radius=section.focal_radius), stop))
 
 
 def _layout(name: str) -> sams.Layout:

@@ -10,8 +10,8 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from lowfc.arrays import Array, Single
-from lowfc.optics.chain.coronagraph import DARK_ZONE, Wedge, wedge_samples
+from lowfc.arrays import Array, Complex, Single
+from lowfc.optics.chain.coronagraph import DARK_ZONE, Coronagraph, LyotStop, Wedge, wedge_samples
 from lowfc.optics.chain.fourier import kernel
 from lowfc.optics.chain.grid import pupil_axis
 from lowfc.optics.chain.science_camera import ScienceCamera
@@ -31,14 +31,16 @@ class ModalContrast:
         form: (modes, modes), see `contrast_form`.
     """
 
-    def __init__(self, pupil: Array, noll: tuple[int, ...], wavelength_nm: float) -> None:
-        """Prepare form and images of a shaped pupil (n, n)."""
-        self.noll, self.form = noll, contrast_form(pupil, noll, wavelength_nm)
-        self._camera = ScienceCamera(pupil, noll, wavelength_nm, int(np.ceil(DARK_ZONE.outer)), _SAMPLES_PER)
+    def __init__(self, coronagraph: Coronagraph, noll: tuple[int, ...], wavelength_nm: float) -> None:
+        """Prepare form and images."""
+        pupil, self._zone, lyot = coronagraph.pupil, coronagraph.dark_zone, coronagraph.lyot
+        self.noll, self.form = noll, contrast_form(pupil, noll, wavelength_nm, self._zone, lyot)
+        half_width = int(np.ceil(self._zone.outer))
+        self._camera = ScienceCamera(pupil, noll, wavelength_nm, half_width, _SAMPLES_PER, lyot)
 
     def by_image(self, modes_nm: Array | Single) -> float:
         """Contrast of the dark zone, the coronagraph's own with it, behind a wavefront (modes,)."""
-        return self._camera.mean_contrast(self._camera.image(modes_nm), DARK_ZONE)
+        return self._camera.mean_contrast(self._camera.image(modes_nm), self._zone)
 
     def by_mode(self, covariance_nm2: Array) -> Array:
         """What each mode adds (modes,), of wavefronts with a covariance (modes, modes); their sum is added in all."""
@@ -72,14 +74,21 @@ def costliest(groups: Mapping[str, float]) -> tuple[str, float]:
     return name, most / (sum(groups.values()) or 1.0)
 
 
-def contrast_form(pupil: Array, noll: tuple[int, ...], wavelength_nm: float, wedge: Wedge = DARK_ZONE) -> Array:
+def contrast_form(
+    pupil: Array,
+    noll: tuple[int, ...],
+    wavelength_nm: float,
+    wedge: Wedge = DARK_ZONE,
+    lyot: LyotStop | None = None,
+) -> Array:
     """Q (modes, modes) of the contrast a' Q a that a wavefront a (modes,) adds on average in a wedge, per nm^2.
 
     Args:
-        pupil: (n, n) amplitude transmission of the shaped pupil.
+        pupil: (n, n) amplitude transmission.
         noll: Noll index of each mode; a is nm rms over the circle.
         wavelength_nm: The wavelength.
         wedge: Part of the focal plane.
+        lyot: Mask and stop of a Lyot coronagraph; None for a shaped pupil alone.
     """
     side = 2 * int(np.ceil(wedge.outer * _SAMPLES_PER))
     inside = wedge_samples(wedge, side, side, _SAMPLES_PER)
@@ -87,17 +96,21 @@ def contrast_form(pupil: Array, noll: tuple[int, ...], wavelength_nm: float, wed
     radius = 2 * pupil_axis(len(pupil))
     rows, columns = np.nonzero(pupil)
     shapes = zernikes(noll, radius[columns], radius[rows])
-    still = to_focus @ pupil @ to_focus.T
 
-    def field(shape: Array) -> Array:
-        moved = np.zeros_like(pupil)
-        moved[rows, columns] = pupil[rows, columns] * shape
-        return np.asarray((to_focus @ moved @ to_focus.T)[inside])
+    def image(field: Array) -> Complex:
+        return np.asarray(to_focus @ (field if lyot is None else lyot.behind(field.astype(np.complex128))) @ to_focus.T)
 
-    fields = np.array([field(shape) for shape in shapes])
-    back = to_focus.T @ (still.conj() * inside) @ to_focus  # the sum over the wedge, brought back to the pupil
+    def moved(shape: Array) -> Complex:
+        field = np.zeros_like(pupil)
+        field[rows, columns] = pupil[rows, columns] * shape
+        return image(field)[inside]
+
+    fields = np.array([moved(shape) for shape in shapes])
+    back = to_focus.T @ (image(pupil).conj() * inside) @ to_focus  # the sum over the wedge, brought back to the pupil
+    back = back if lyot is None else lyot.transposed(back)
     second = (shapes * (pupil * back.real)[rows, columns]) @ shapes.T
-    scale = (2 * np.pi / wavelength_nm / pupil.sum()) ** 2 / np.count_nonzero(inside)
+    peak = pupil if lyot is None else pupil * lyot.stop
+    scale = (2 * np.pi / wavelength_nm / peak.sum()) ** 2 / np.count_nonzero(inside)
     return np.asarray(scale * ((fields @ fields.conj().T).real - second))
 
 

@@ -1,14 +1,15 @@
-"""The science image of a shaped-pupil coronagraph: what a wavefront does to the contrast (Fig. 1).
+"""The science image of a coronagraph: what a wavefront does to the contrast (Fig. 1).
 
-Contrast is intensity over the peak of the star with a flat wavefront; angles are in lambda / D (conventions: `grid`).
+Behind a shaped pupil it is the pupil's image; a Lyot coronagraph has an opaque mask and a stop in between. Contrast is
+intensity over the peak of the star beside the mask with a flat wavefront; angles are in lambda / D (see `grid`).
 """
 
 from dataclasses import dataclass
 
 import numpy as np
 
-from lowfc.arrays import Array, Mask
-from lowfc.optics.chain.fourier import kernel
+from lowfc.arrays import Array, Complex, Mask
+from lowfc.optics.chain.fourier import kernel, to_image, to_pupil
 from lowfc.optics.chain.grid import image_axis
 
 
@@ -36,18 +37,68 @@ class Wedge:
 DARK_ZONE = Wedge()
 
 
+@dataclass(frozen=True, eq=False)
+class LyotStop:
+    """What of a Lyot coronagraph follows its pupil: the light that the opaque mask takes out, and the stop.
+
+    Attributes:
+        opaque: (k, k) part of the focal plane that the mask takes out, 0 to 1; it goes to the sensor.
+        stop: (n, n) transmission in the pupil behind it.
+        samples_per: Samples of the opaque part per lambda / D.
+    """
+
+    opaque: Array
+    stop: Array
+    samples_per: int = 8
+
+    def behind(self, field: Complex) -> Complex:
+        """The field (n, n) behind the stop of one in front of the mask: that less what the mask takes out (Babinet)."""
+        return np.asarray(self.stop * (field - self._taken_out(field)))
+
+    def transposed(self, field: Complex) -> Complex:
+        """The transpose of `behind`: from behind the stop to in front of the mask."""
+        stopped = self.stop * field
+        return np.asarray(stopped - self._taken_out(stopped.conj()).conj())
+
+    def _taken_out(self, field: Complex) -> Complex:
+        focal = to_image(np.asarray(field, np.complex128), len(self.opaque), self.samples_per, 1.0)
+        return to_pupil(focal * self.opaque, len(field), self.samples_per, 1.0)
+
+
+@dataclass(frozen=True, eq=False)
+class Coronagraph:
+    """What makes the science image.
+
+    Attributes:
+        pupil: (n, n) amplitude transmission in front.
+        dark_zone: Where contrast is looked at.
+        lyot: Mask and stop of a Lyot coronagraph; None for a shaped pupil alone.
+    """
+
+    pupil: Array
+    dark_zone: Wedge = DARK_ZONE
+    lyot: LyotStop | None = None
+
+
 def contrast(
-    pupil: Array, opd_nm: Array, wavelength_nm: float, columns: int, rows: int | None = None, samples_per: int = 4
+    pupil: Array,
+    opd_nm: Array,
+    wavelength_nm: float,
+    columns: int,
+    rows: int | None = None,
+    samples_per: int = 4,
+    lyot: LyotStop | None = None,
 ) -> Array:
     """Contrast (rows, columns) in the middle of the science focal plane, on `image_axis` in either direction.
 
     Args:
-        pupil: (n, n) amplitude transmission of the shaped pupil.
+        pupil: (n, n) amplitude transmission.
         opd_nm: Wavefront (n, n).
         wavelength_nm: The wavelength.
         columns: Samples along x.
         rows: Samples along y; as many as columns when None.
         samples_per: Samples per lambda / D; two are enough for means, for the intensity's band is 1 D to either side.
+        lyot: Mask and stop of a Lyot coronagraph; None for a shaped pupil alone.
 
     Raises:
         ValueError: The wavefront is not sampled like the pupil.
@@ -56,8 +107,10 @@ def contrast(
         raise ValueError(f"a wavefront must be sampled like the pupil, {pupil.shape}, got {opd_nm.shape}")
     in_x = kernel(columns, samples_per, len(pupil), 1.0)
     in_y = kernel(columns if rows is None else rows, samples_per, len(pupil), 1.0)
-    field = in_y @ (pupil * np.exp((2j * np.pi / wavelength_nm) * opd_nm)) @ in_x.T
-    return np.asarray((field.real**2 + field.imag**2) / np.sum(pupil) ** 2)
+    field = pupil * np.exp((2j * np.pi / wavelength_nm) * opd_nm)
+    peak = pupil if lyot is None else pupil * lyot.stop
+    image = in_y @ (field if lyot is None else lyot.behind(field)) @ in_x.T
+    return np.asarray((image.real**2 + image.imag**2) / np.sum(peak) ** 2)
 
 
 def wedge_samples(wedge: Wedge, columns: int, rows: int, samples_per: int = 4) -> Mask:
@@ -68,10 +121,17 @@ def wedge_samples(wedge: Wedge, columns: int, rows: int, samples_per: int = 4) -
     return np.asarray((r >= wedge.inner) & (r <= wedge.outer) & opening)
 
 
-def mean_contrast(pupil: Array, opd_nm: Array, wavelength_nm: float, wedge: Wedge, samples_per: int = 4) -> float:
+def mean_contrast(
+    pupil: Array,
+    opd_nm: Array,
+    wavelength_nm: float,
+    wedge: Wedge,
+    samples_per: int = 4,
+    lyot: LyotStop | None = None,
+) -> float:
     """Mean contrast in a wedge, from the samples around it alone; arguments and shapes as for `contrast`."""
     columns, rows = _extent(wedge, samples_per)
-    image = contrast(pupil, opd_nm, wavelength_nm, columns, rows, samples_per)
+    image = contrast(pupil, opd_nm, wavelength_nm, columns, rows, samples_per, lyot)
     return float(image[wedge_samples(wedge, columns, rows, samples_per)].mean())
 
 

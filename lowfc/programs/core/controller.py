@@ -70,9 +70,7 @@ class Controller:
         self._settings = settings_under(latch, config)
         self._configuration = config.to_toml()
         self._start_up = StartUp(config)
-        contrast = contrast_of(config)
-        form = None if contrast is None else contrast.form
-        self._gain_watch = GainWatch(self._settings, config.control.on_harm, form)
+        self._gain_watch = GainWatch(self._settings, config.control.on_harm, contrast_of(config).form)
         self._measured: deque[Request] = deque()
         self._kept_safe = latch.safe
         self._safe_signalled = False

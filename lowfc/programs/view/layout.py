@@ -33,7 +33,7 @@ _PICTURES: dict[str, tuple[str, rrb.VisualBounds2D | None]] = {
     mirror.COMMAND: ("Mirror, nm (ring: at limit)", None),
     mirror.SURFACE: ("Mirror over the pupil, nm", None),
     pointing.TRAIL: ("Residual pointing, mas", pointing.BOUNDS),
-    science.IMAGE: ("Science camera: contrast, mean in the wedge from 4 to 6 λ/D", science.BOUNDS),
+    science.IMAGE: ("Science camera: contrast, mean over 2 λ/D from the mask's edge", science.BOUNDS),
     trend.TREND: ("Trend of the residual wavefront, nm rms", bounds(trend.WIDTH)),
     spectra.TILTS: ("Power spectrum of tip and tilt, nm²/Hz", bounds(spectra.WIDTH)),
     spectra.OTHERS: ("Power spectrum of the other modes, nm²/Hz", bounds(spectra.WIDTH)),

@@ -9,7 +9,7 @@ from functools import partial
 import rerun as rr
 
 from lowfc.adapters.bus.bus import Ring, Sample
-from lowfc.adapters.files.sensors import science_pupil
+from lowfc.adapters.files.sensors import coronagraph_from
 from lowfc.adapters.process.clock import Clock
 from lowfc.contract.configuration import Configuration
 from lowfc.contract.errors import LowfcError
@@ -56,11 +56,7 @@ class Renderer:
             Spectra,
         ]
         try:
-            pupil = science_pupil(config.sensor)
-            if pupil is None:
-                self._remarks.append("no science camera: behind a Lyot stop its image is not modelled")
-            else:
-                made.append(partial(Science, pupil, config.star.wavelength_nm))
+            made.append(partial(Science, coronagraph_from(config.sensor), config.star.wavelength_nm))
         except LowfcError as error:
             self._remarks.append(f"no science camera: {error}")
         self._makers = made

@@ -8,7 +8,7 @@ import rerun as rr
 import rerun.blueprint as rrb
 
 from lowfc.arrays import Array, Single
-from lowfc.optics.chain.coronagraph import DARK_ZONE, Wedge
+from lowfc.optics.chain.coronagraph import Coronagraph, Wedge
 from lowfc.optics.chain.science_camera import ScienceCamera
 from lowfc.programs.view.draw.colours import BLUE, GREEN, GREY, Rgb, sequential
 from lowfc.programs.view.draw.pictures import Picture
@@ -17,9 +17,9 @@ from lowfc.programs.view.panels.panel import Panel
 from lowfc.programs.view.snapshot import Snapshot
 
 IMAGE = "science/image"
-CONTRAST = Plot("science/contrast", "Mean contrast from 4 to 6 λ/D, log10", width=1.6)
-WEDGE = Wedge(4.0, 6.0)
-"""Where contrast is averaged."""
+CONTRAST = Plot("science/contrast", "Mean contrast over 2 λ/D from the mask's edge, log10", width=1.6)
+_WIDE = 2.0
+"""Contrast is averaged over so many lambda / D from the inner edge of the dark zone on."""
 
 _MEAN_OF = 5
 """Wavefronts, each the newest of a snapshot, that one image is the mean of."""
@@ -46,8 +46,10 @@ class Science(Panel):
 
     period_ns = 1_000_000_000
 
-    def __init__(self, pupil: Array, wavelength_nm: float) -> None:
-        self._pupil = pupil
+    def __init__(self, coronagraph: Coronagraph, wavelength_nm: float) -> None:
+        self._coronagraph = coronagraph
+        zone = coronagraph.dark_zone
+        self._wedge = Wedge(zone.inner, zone.inner + _WIDE, zone.half_opening_deg)
         self._wavelength_nm = wavelength_nm
         self._noll: tuple[int, ...] = ()
         self._camera: ScienceCamera | None = None
@@ -58,7 +60,7 @@ class Science(Panel):
 
     def begin(self, stream: rr.RecordingStream) -> None:
         """Draw what stays: where the mask ends and contrast is averaged, and the scale of the colours."""
-        lines = [line + np.array([start, 0]) for start in (0, _SECOND) for line in _outlines()]
+        lines = [line + np.array([start, 0]) for start in (0, _SECOND) for line in _outlines(self._wedge)]
         outlines = rr.LineStrips2D(lines, colors=[GREY], radii=rr.Radius.ui_points(0.7))
         stream.log(f"{IMAGE}/outlines", outlines, static=True)
         decades = range(_DARKEST, _BRIGHTEST + 1)
@@ -72,8 +74,9 @@ class Science(Panel):
         noll = snapshot.calibration.noll
         if self._camera is None or noll != self._noll:  # wavefronts of other modes are forgotten
             self._noll = noll
-            self._camera = ScienceCamera(self._pupil, noll, self._wavelength_nm, _HALF_WIDTH, _SAMPLES_PER)
-            self._flat = self._camera.mean_contrast(self._camera.image(np.zeros(len(noll))), WEDGE)
+            pupil, lyot = self._coronagraph.pupil, self._coronagraph.lyot
+            self._camera = ScienceCamera(pupil, noll, self._wavelength_nm, _HALF_WIDTH, _SAMPLES_PER, lyot)
+            self._flat = self._camera.mean_contrast(self._camera.image(np.zeros(len(noll))), self._wedge)
             self._clear()
         for source, waves in self._waves.items():
             new = snapshot.waves(true=source == "true")
@@ -91,7 +94,7 @@ class Science(Panel):
     def _show(self, stream: rr.RecordingStream, time_ns: int, camera: ScienceCamera, source: str) -> None:
         waves = self._waves[source]
         images = [np.mean([camera.image(wave[which]) for wave in waves], axis=0) for which in (0, 1)]
-        means = [camera.mean_contrast(image, WEDGE) for image in images]
+        means = [camera.mean_contrast(image, self._wedge) for image in images]
         if source != self._named:
             self._named = source
             CONTRAST.name(stream, dict(zip((*_NAMES[source], "flat wavefront"), (GREY, GREEN, BLUE), strict=True)))
@@ -117,13 +120,13 @@ def _side_by_side(now: Single, as_open: Single) -> Rgb:
     return sequential(shares)
 
 
-def _outlines() -> list[Array]:
+def _outlines(wedge: Wedge) -> list[Array]:
     """Lines (points, 2) in pixels of one image: the mask's edge, and the wedge on either side of the star."""
     turn = np.linspace(0, 2 * np.pi, 97)
-    opening = np.deg2rad(WEDGE.half_opening_deg) * np.linspace(-1, 1, 33)
-    arcs = [radius * _directions(opening) for radius in (WEDGE.inner, WEDGE.outer)]
+    opening = np.deg2rad(wedge.half_opening_deg) * np.linspace(-1, 1, 33)
+    arcs = [radius * _directions(opening) for radius in (wedge.inner, wedge.outer)]
     right = np.concatenate([arcs[0], arcs[1][::-1], arcs[0][:1]])
-    return [_SAMPLES / 2 + _SAMPLES_PER * line for line in (DARK_ZONE.inner * _directions(turn), right, -right)]
+    return [_SAMPLES / 2 + _SAMPLES_PER * line for line in (wedge.inner * _directions(turn), right, -right)]
 
 
 def _directions(angle: Array) -> Array:

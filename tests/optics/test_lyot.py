@@ -1,0 +1,71 @@
+"""The science image of Lyot coronagraphs, classical and apodised, against hcipy and in its fast forms."""
+
+import numpy as np
+import pytest
+
+from lowfc.adapters.files.sensors import coronagraph_from
+from lowfc.contract.sections import SENSORS, SensorSection
+from lowfc.optics.chain.added_contrast import ModalContrast, contrast_form
+from lowfc.optics.chain.coronagraph import Coronagraph, contrast, mean_contrast
+from lowfc.optics.chain.grid import pupil_axis
+from lowfc.optics.chain.zernike import NOLLS_14, zernikes
+
+NM = 550.0
+
+
+@pytest.fixture(scope="module", params=["lyot", "aplc"])
+def coronagraph(request) -> Coronagraph:
+    return coronagraph_from(SensorSection.model_validate(SENSORS[request.param]))
+
+
+@pytest.fixture(scope="module")
+def modes():
+    u = 2.0 * pupil_axis(512)
+    return zernikes(NOLLS_14, u, u[:, None])
+
+
+@pytest.fixture(scope="module")
+def waves_nm():
+    return np.random.default_rng(4).normal(0, 3.0, (2, 14))
+
+
+def test_its_image_is_that_of_hcipy(hcipy, coronagraph, modes, waves_nm):
+    opd_nm, lyot, samples = np.tensordot(waves_nm[0], modes, 1), coronagraph.lyot, 96
+    found = contrast(coronagraph.pupil, opd_nm, NM, samples, samples_per=4, lyot=lyot)
+
+    def focal_grid(count, samples_per):
+        step = 1 / samples_per
+        return hcipy.CartesianGrid(hcipy.RegularCoords([step] * 2, [count] * 2, [-(count - 1) * step / 2] * 2))
+
+    pupil_grid, mask_grid = hcipy.make_pupil_grid(512, 1.0), focal_grid(len(lyot.opaque), lyot.samples_per)
+    passed = hcipy.Field(1.0 - lyot.opaque.ravel(), mask_grid)
+    theirs = hcipy.LyotCoronagraph(pupil_grid, passed, hcipy.Field(lyot.stop.ravel(), pupil_grid))
+    camera = hcipy.FraunhoferPropagator(pupil_grid, focal_grid(samples, 4))
+    field = (coronagraph.pupil * np.exp(2j * np.pi / NM * opd_nm)).ravel()
+    behind = theirs.forward(hcipy.Wavefront(hcipy.Field(field, pupil_grid)))
+    star = hcipy.Wavefront(hcipy.Field((coronagraph.pupil * lyot.stop).ravel() + 0j, pupil_grid))
+    peak = np.abs(star.electric_field.sum() / 512**2) ** 2
+    expected = np.asarray(camera.forward(behind).intensity).reshape(samples, samples) / peak
+    assert np.linalg.norm(found - expected) < 1e-6 * np.linalg.norm(expected)
+
+
+def test_the_fast_image_and_the_form_are_those_of_the_exact_one(coronagraph, modes, waves_nm):
+    modal = ModalContrast(coronagraph, NOLLS_14, NM)
+    exact = [
+        mean_contrast(coronagraph.pupil, np.tensordot(one, modes, 1), NM, coronagraph.dark_zone, 2, coronagraph.lyot)
+        for one in (0 * waves_nm[0], *waves_nm, *-waves_nm, *-0.1 * waves_nm, *0.1 * waves_nm)
+    ]
+    own, *aberrated = exact
+    assert modal.by_image(waves_nm[0]) - modal.by_image(0 * waves_nm[0]) == pytest.approx(aberrated[0] - own, rel=0.02)
+    for k, one in enumerate(0.1 * waves_nm):  # in pairs: without the odd orders
+        pair = (aberrated[4 + k] + aberrated[6 + k]) / 2 - own
+        assert one @ modal.form @ one == pytest.approx(pair, rel=0.02)
+
+
+def test_tilt_matters_at_small_angles(coronagraph):
+    """Of APLC it costs 1800 times what it costs a shaped pupil; a classical mask's own light is 1e-5, and changes."""
+    shaped = coronagraph_from(SensorSection())
+    each, of_shaped = (
+        contrast_form(one.pupil, (2,), NM, one.dark_zone, one.lyot).item() for one in (coronagraph, shaped)
+    )
+    assert abs(each) > 1000 * of_shaped > 0
