@@ -228,6 +228,6 @@ def light_budget(sensor: Sensor) -> LightBudget:
 
 
 def pixel_sums(sensor: Sensor, intensity: Array) -> Array:
-    """Bin samples to pixels and normalise to the light that enters the open circle."""
+    """Pixels (pixels, pixels) of an intensity (samples, samples), as a fraction of the light in the open circle."""
     shape = (sensor.pixels, sensor.binning, sensor.pixels, sensor.binning)
     return np.asarray(intensity.reshape(shape).sum(axis=(1, 3))) * (sensor.pitch**2 / OPEN_AREA)
