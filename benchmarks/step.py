@@ -23,6 +23,7 @@ from lowfc.adapters.process.clock import HostClock
 from lowfc.adapters.process.realtime import set_up
 from lowfc.arrays import Long
 from lowfc.contract.codecs import codec
+from lowfc.control.kernel import stepping
 from lowfc.control.loop import advance
 from lowfc.control.loop.estimator import Estimator
 from lowfc.control.loop.safety import LoopMode
@@ -37,8 +38,8 @@ STAGES: dict[str, tuple[Any, str]] = {
     "full well": (advance, "saturated_pixels"),
     "estimate": (Estimator, "estimate"),
     "seen": (ActiveLoop, "seen_nm"),
-    "law": (advance, "integrate"),
-    "limits": (advance, "limit"),
+    "law": (stepping, "integrate"),
+    "limits": (stepping, "limit"),
     "encode": (codec, "encode_command"),
 }
 REST, STEP, PRODUCT = "modes to actuators, state, step", "the whole step", "one product R x"

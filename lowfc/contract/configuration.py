@@ -168,6 +168,8 @@ class Realtime(Section):
     """Keep idle processors awake while the loop runs: waking one takes longer than a hand-off; it costs power."""
     cache_warmup: bool = True
     """Do each control step a second time for nothing, so that the next frame finds the caches warm; not above 2 kHz."""
+    kernel: Literal["numpy", "fused"] = "numpy"
+    """Arithmetic of the controller's usual frame: numpy, or the fused step, compiled by numba (extra `fast`)."""
     camera_cpus: list[int] = Field(default_factory=list)
     """Processors of the camera; empty for all. Where the file says nothing, sim-loop gives the controller its own."""
     controller_cpus: list[int] = Field(default_factory=list)

@@ -59,6 +59,8 @@ EVENTS: dict[str, Event] = {
             "this boot's clock is {ahead_ms:+.0f} ms from the wall clock, and so are all times; see `lowfc doctor`",
         ),
         Event("REALTIME_REFUSED", Level.WARNING, "the host refused {measure}: {cost}"),
+        Event("KERNEL", Level.INFO, "the {kernel} step computes"),
+        Event("KERNEL_MISSING", Level.WARNING, "numpy computes: {advice}"),
         Event("CALIBRATION_LOADED", Level.INFO, "calibration {id}: {modes:mode}, {estimator}, from {source}"),
         Event("NOT_CALIBRATED", Level.WARNING, "the loop is idle: {why}"),
         Event("CAMERA_CHANGED", Level.WARNING, "the camera does not fit the calibration: {what}"),

@@ -175,6 +175,8 @@ def test_a_fit_host_has_no_warning(tmp_path: Path) -> None:
         ),
         ("clock source", "warning", "hpet", {CLOCKSOURCE: "hpet\n"}),
         ("load", "warning", "9.50 in the last minute", {"load": 9.5}),
+        ("control step", "note", 'realtime.kernel = "fused"', {}),
+        ("control step", "ok", "the fused step", {"config": load(None, {"realtime.kernel": "fused"})}),
         ("swap", "ok", "1 MB in use of 2097 MB; the loop's memory is locked", {"swap": (2_097_152_000, 1_048_576)}),
         ("huge pages", "warning", "always", {HUGE_PAGES: "[always] madvise never\n"}),
         ("socket buffers", "warning", "550 kB", {"proc/sys/net/ipv4/tcp_rmem": "4096 131072 550000\n"}),

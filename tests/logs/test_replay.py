@@ -12,6 +12,7 @@ from hypothesis import strategies as st
 from mcap.reader import make_reader
 
 from lowfc.adapters.logs.reader import Logged, LogReader
+from lowfc.adapters.process import compiled
 from lowfc.adapters.process.provenance import provenance
 from lowfc.contract.codecs import codec
 from lowfc.contract.codecs.calibration_codec import encode_calibration
@@ -41,10 +42,12 @@ from lowfc.control.loop.inputs import Frame, Input, Load, Request
 from lowfc.control.loop.requests import prepared
 from lowfc.control.loop.safety import Limit
 from lowfc.control.loop.state import Settings, State
-from lowfc.programs.logs.replay import controller_replay, workers
+from lowfc.programs.logs.replay import frames as frames_of_log
+from lowfc.programs.logs.replay import workers
 from lowfc.programs.logs.replay.account import Account
-from lowfc.programs.logs.replay.controller_replay import PATIENCE_NS, Frames, Share
+from lowfc.programs.logs.replay.controller_replay import PATIENCE_NS, Share
 from lowfc.programs.logs.replay.fold import replay
+from lowfc.programs.logs.replay.frames import Frames
 from tests.support import happenings, report_log
 from tests.support.happenings import TIGHT, inputs
 from tests.support.loops import lowfc
@@ -129,6 +132,22 @@ def night(taken: list[Input], **changes: object) -> Night:
     for one in taken:
         made.take(one)
     return made
+
+
+@pytest.mark.skipif(not compiled.available(), reason="needs the extra `fast`")
+def test_a_log_of_the_fused_step_is_replayed_by_it_to_the_bit_and_by_numpy_with_a_difference() -> None:
+    channel = Request(0, "channel", text="dark-hole", actuators_nm=np.full(20, 3, np.float32))
+    law = Request(0, "law", law=integrator([0.3] * 3, [0.0] * 3, NOLL, 2.5, 1000.0))
+    taken = [*frames(60, 1), channel, *frames(100, 61), law, *frames(400, 161)]
+    made = night(taken, kernel=compiled.kernel("fused"), delay_frames=2.5, interlocks=())
+    logged = [one.payload for one in made.messages if one.key == CONTROLLER_STATE.key][-1]
+    assert wire.ControllerState.FromString(logged).settings.kernel == "fused"
+    assert replay(made.messages).identical
+    other = replay(made.messages, kernel="numpy")
+    assert (other.other_kernel, other.identical) == ("numpy", False)
+    assert 0 < other.largest_difference_nm < 1e-3
+    tolerant = replay(made.messages, 1e-3, kernel="numpy")
+    assert (tolerant.frames, tolerant.different, tolerant.identical) == (560, 0, False)
 
 
 def of_another_camera(taken: list[Input]) -> list[Input]:
@@ -370,7 +389,7 @@ def test_nothing_to_check_is_not_identical() -> None:
 
 
 def test_frames_are_kept_within_a_budget(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(controller_replay, "FRAMES_BYTES", 1000)
+    monkeypatch.setattr(frames_of_log, "FRAMES_BYTES", 1000)
     kept = Frames()
     pixels = np.arange(100, dtype=np.uint16).reshape(10, 10)
     for sequence in range(50):

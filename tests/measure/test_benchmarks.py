@@ -17,7 +17,7 @@ from benchmarks.peers.contest import BARE, CONTESTANTS
 from benchmarks.peers.shared import ACTUATORS, MARKS, NumpyStep, Plan, Problem
 from benchmarks.sizes import Size, configuration, made_up
 from lowfc.contract.sections import Camera
-from lowfc.control.loop import advance
+from lowfc.control.kernel import stepping
 from lowfc.programs.measure.control_step import ControlStep
 from lowfc.programs.measure.frame_source import Payloads
 
@@ -44,17 +44,17 @@ def test_a_step_keeps_nothing_and_takes_no_more_than_the_frame_and_the_shapes(mo
     found = step.allocated(ControlStep(config, calibration, 0), Payloads(frames))
     assert abs(found["kept_bytes"]) < 1
     assert 2 * SMALL.pixels < found["peak_bytes"] < 2 * SMALL.pixels + 5 * 4 * SMALL.actuators + 4096
-    kept, original = [], advance.integrate
-    monkeypatch.setattr(advance, "integrate", lambda *given: (kept.append(bytes(100)), original(*given))[1])
+    kept, original = [], stepping.integrate
+    monkeypatch.setattr(stepping, "integrate", lambda *given: (kept.append(bytes(100)), original(*given))[1])
     assert step.allocated(ControlStep(config, calibration, 0), Payloads(frames))["kept_bytes"] > 100
 
 
 def test_the_stages_are_those_of_a_step_and_add_up(monkeypatch: pytest.MonkeyPatch) -> None:
     nothing = step.set_up(None, None, lock_memory=False, disable_cpu_idle=False)
     monkeypatch.setattr(step, "set_up", lambda *_, **__: nothing)  # this process stays what it is
-    original = advance.limit
+    original = stepping.limit
     found = step.measure(Namespace(seconds=0.2), lambda _: None)
-    assert advance.limit is original
+    assert stepping.limit is original
     (lines,) = step.tables(found)
     assert [line[0] for line in lines[1:]] == [*step.STAGES, step.REST, step.STEP, step.PRODUCT]
     assert all(float(cell) >= 0 for line in lines[1:] for cell in line[1:])

@@ -1,5 +1,6 @@
 """Origin of figures: versions, host, processor and linear algebra, by which two runs can be told apart."""
 
+import contextlib
 import importlib.metadata
 import os
 import platform
@@ -27,8 +28,8 @@ def provenance(run_id: str = "", seed: int | None = None) -> dict[str, str]:
 
     Returns:
         Versions by library, and lowfc, python, host, kernel, processor, processors, cpu_features (the processor's
-        vector instructions) and blas (library, version and the kernel chosen for this processor); run, seed and git
-        (commit of a checkout) where there is one.
+        vector instructions) and blas (library, version and the kernel chosen for this processor); numba, run, seed and
+        git (commit of a checkout) where there is one.
     """
     found = {
         "lowfc": __version__,
@@ -43,6 +44,8 @@ def provenance(run_id: str = "", seed: int | None = None) -> dict[str, str]:
         "blas": _blas(),
         **{library: importlib.metadata.version(library) for library in LIBRARIES},
     }
+    with contextlib.suppress(importlib.metadata.PackageNotFoundError):
+        found["numba"] = importlib.metadata.version("numba")
     if run_id:
         found["run"] = run_id
     if seed is not None:

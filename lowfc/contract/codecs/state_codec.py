@@ -1,6 +1,6 @@
 """The controller's state and settings as a message, both ways: whoever reads it goes on with the same next command."""
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from types import MappingProxyType
 from typing import Any
 
@@ -12,6 +12,7 @@ from lowfc.contract.codecs.codec import wire_mode, wire_reasons
 from lowfc.contract.codecs.law_codec import command_channels_of, gains_of, law_header, law_of, put_command_channels
 from lowfc.contract.messages import fields_of, floats, from_timestamp, timestamp, wire
 from lowfc.control.calibration.calibration import Calibration
+from lowfc.control.kernel.tables import NUMPY, Kernel
 from lowfc.control.laws import linear_law
 from lowfc.control.laws.linear_law import LinearLaw
 from lowfc.control.loop.command_channels import PlayTable
@@ -91,13 +92,16 @@ def decode_state(
     calibration: Calibration | None,
     laws: Mapping[str, LinearLaw] = MappingProxyType({}),
     plays: Mapping[str, PlayTable] = MappingProxyType({}),
+    kernel: Callable[[str], Kernel] = Kernel,
 ) -> tuple[Settings, State]:
     """Settings and state of a message; `calibration` is the one that it names, as are one of `laws` and of `plays`.
+
+    `kernel` finds the kernel of a name; without it, everything goes the reference's way.
 
     Raises:
         ValueError: the message is not whole, the calibration is another one, or its law or table is not there.
     """
-    settings = _decode_settings(message.settings)
+    settings = _decode_settings(message.settings, kernel)
     drive = None
     if message.mirror_rows:
         calibration = Calibration.none((message.mirror_rows, message.mirror_columns))
@@ -190,12 +194,13 @@ def _encode_settings(settings: Settings) -> wire.ControllerSettings:
         start_mode=wire_mode(settings.start_mode),
         auto_gain=settings.auto_gain if any(settings.auto_gain) else (),
         interlocks=map(wire_interlock, settings.interlocks),
+        kernel="" if settings.kernel.name == NUMPY.name else settings.kernel.name,
         **fields_of(settings.limits, _LIMITS),
         **fields_of(settings, (*_SETTINGS, *_PAIRS)),
     )
 
 
-def _decode_settings(message: wire.ControllerSettings) -> Settings:
+def _decode_settings(message: wire.ControllerSettings, kernel: Callable[[str], Kernel]) -> Settings:
     pairs: dict[str, Any] = {name: tuple(getattr(message, name)) for name in _PAIRS}
     if any(len(pair) != 2 for pair in pairs.values()):
         raise ValueError("the settings of a controller have two gains, leaks and limits")
@@ -204,6 +209,7 @@ def _decode_settings(message: wire.ControllerSettings) -> Settings:
         start_mode=LoopMode(message.start_mode),
         auto_gain=tuple(message.auto_gain) or (False, False),  # type: ignore[arg-type]  # a pair
         interlocks=tuple(map(interlock_of, message.interlocks)),
+        kernel=kernel(message.kernel or NUMPY.name),
         **fields_of(message, _SETTINGS),
         **pairs,
     )

@@ -262,7 +262,7 @@ class ReasonCount(_message.Message):
     def __init__(self, reason: _Optional[_Union[Reason, str]] = ..., count: _Optional[int] = ...) -> None: ...
 
 class ControllerSettings(_message.Message):
-    __slots__ = ("stroke_nm", "slew_nm", "neighbour_nm", "delay_frames", "start_mode", "max_frame_age_ns", "frame_timeout_ns", "on_frame_timeout", "min_flux_fraction", "max_saturated_pixels", "gain", "leak", "limit_nm", "max_identical_frames", "rate_hz", "auto_gain", "guard", "interlocks")
+    __slots__ = ("stroke_nm", "slew_nm", "neighbour_nm", "delay_frames", "start_mode", "max_frame_age_ns", "frame_timeout_ns", "on_frame_timeout", "min_flux_fraction", "max_saturated_pixels", "gain", "leak", "limit_nm", "max_identical_frames", "rate_hz", "auto_gain", "guard", "interlocks", "kernel")
     STROKE_NM_FIELD_NUMBER: _ClassVar[int]
     SLEW_NM_FIELD_NUMBER: _ClassVar[int]
     NEIGHBOUR_NM_FIELD_NUMBER: _ClassVar[int]
@@ -281,6 +281,7 @@ class ControllerSettings(_message.Message):
     AUTO_GAIN_FIELD_NUMBER: _ClassVar[int]
     GUARD_FIELD_NUMBER: _ClassVar[int]
     INTERLOCKS_FIELD_NUMBER: _ClassVar[int]
+    KERNEL_FIELD_NUMBER: _ClassVar[int]
     stroke_nm: float
     slew_nm: float
     neighbour_nm: float
@@ -299,7 +300,8 @@ class ControllerSettings(_message.Message):
     auto_gain: _containers.RepeatedScalarFieldContainer[bool]
     guard: bool
     interlocks: _containers.RepeatedCompositeFieldContainer[Interlock]
-    def __init__(self, stroke_nm: _Optional[float] = ..., slew_nm: _Optional[float] = ..., neighbour_nm: _Optional[float] = ..., delay_frames: _Optional[float] = ..., start_mode: _Optional[_Union[LoopMode, str]] = ..., max_frame_age_ns: _Optional[int] = ..., frame_timeout_ns: _Optional[int] = ..., on_frame_timeout: _Optional[str] = ..., min_flux_fraction: _Optional[float] = ..., max_saturated_pixels: _Optional[int] = ..., gain: _Optional[_Iterable[float]] = ..., leak: _Optional[_Iterable[float]] = ..., limit_nm: _Optional[_Iterable[float]] = ..., max_identical_frames: _Optional[int] = ..., rate_hz: _Optional[float] = ..., auto_gain: _Optional[_Iterable[bool]] = ..., guard: _Optional[bool] = ..., interlocks: _Optional[_Iterable[_Union[Interlock, _Mapping]]] = ...) -> None: ...
+    kernel: str
+    def __init__(self, stroke_nm: _Optional[float] = ..., slew_nm: _Optional[float] = ..., neighbour_nm: _Optional[float] = ..., delay_frames: _Optional[float] = ..., start_mode: _Optional[_Union[LoopMode, str]] = ..., max_frame_age_ns: _Optional[int] = ..., frame_timeout_ns: _Optional[int] = ..., on_frame_timeout: _Optional[str] = ..., min_flux_fraction: _Optional[float] = ..., max_saturated_pixels: _Optional[int] = ..., gain: _Optional[_Iterable[float]] = ..., leak: _Optional[_Iterable[float]] = ..., limit_nm: _Optional[_Iterable[float]] = ..., max_identical_frames: _Optional[int] = ..., rate_hz: _Optional[float] = ..., auto_gain: _Optional[_Iterable[bool]] = ..., guard: _Optional[bool] = ..., interlocks: _Optional[_Iterable[_Union[Interlock, _Mapping]]] = ..., kernel: _Optional[str] = ...) -> None: ...
 
 class Channel(_message.Message):
     __slots__ = ("name", "actuators", "shifts", "reached")

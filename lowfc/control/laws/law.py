@@ -4,7 +4,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from lowfc.arrays import Single
+from lowfc.arrays import Single, single
 
 
 @dataclass(frozen=True, slots=True)
@@ -13,12 +13,14 @@ class Law:
 
     Attributes:
         kept: (modes,) 1 - leak.
+        rows: (3, modes) gain, kept and limit.
     """
 
     gain: Single
     leak: Single
     limit_nm: Single
     kept: Single = field(init=False)
+    rows: Single = field(init=False)
 
     def __post_init__(self) -> None:
         if not self.gain.shape == self.leak.shape == self.limit_nm.shape:
@@ -34,6 +36,7 @@ class Law:
             if not (np.isfinite(array).all() and (array >= low).all() and (array <= high).all()):
                 raise ValueError(f"every {name} must be between {low} and {high}, got {array.tolist()}")
         object.__setattr__(self, "kept", 1 - self.leak)
+        object.__setattr__(self, "rows", single([self.gain, self.kept, self.limit_nm]))
 
 
 def integrate(law: Law, command_nm: Single, error_nm: Single) -> tuple[Single, bool]:

@@ -36,6 +36,7 @@ class LinearLaw:
         delay_frames: the delay it was made for, as `lowfc.control.laws.stability.delay_weights`.
         rate_hz: the frame rate it was made for.
         id: identity of the whole.
+        joined: (states, states + 2 modes) F, G and H side by side.
     """
 
     signal: Signal
@@ -49,6 +50,7 @@ class LinearLaw:
     delay_frames: float
     rate_hz: float
     id: str = field(init=False)
+    joined: Single = field(init=False)
 
     def __post_init__(self) -> None:
         if self.signal not in SIGNALS:
@@ -66,6 +68,7 @@ class LinearLaw:
         delay_weights(self.delay_frames)  # says what is wrong with a delay
         if not (np.isfinite(self.rate_hz) and self.rate_hz > 0):
             raise ValueError(f"rate_hz must be above 0, got {self.rate_hz}")
+        object.__setattr__(self, "joined", np.hstack([self.transition, self.measurement_gain, self.command_gain]))
         object.__setattr__(self, "id", identity((hashed, getattr(self, name)) for hashed, name in _IDENTITY))
 
 

@@ -10,11 +10,9 @@ from collections.abc import Callable, Mapping
 import numpy as np
 
 from lowfc.arrays import Single
-from lowfc.control.laws import linear_law
-from lowfc.control.laws.law import integrate
+from lowfc.control.kernel.stepping import next_command, respond, step_to_flat
 from lowfc.control.loop.camera import CameraSettings
 from lowfc.control.loop.estimator import Estimate, filled, saturated_pixels
-from lowfc.control.loop.guard import Guard
 from lowfc.control.loop.inputs import (
     COUNT_BITS,
     Command,
@@ -43,8 +41,8 @@ from lowfc.control.loop.loading import (
 )
 from lowfc.control.loop.requests import answer
 from lowfc.control.loop.reservation import lease_checked
-from lowfc.control.loop.safety import Limit, LoopMode, Reason, Rejection, limit
-from lowfc.control.loop.state import FADING_FRAMES, SETTLING_FRAMES, ActiveLoop, LawRunner, Settings, State
+from lowfc.control.loop.safety import Limit, LoopMode, Reason, Rejection
+from lowfc.control.loop.state import ActiveLoop, Settings, State
 
 UNMEASURED = frozenset({Rejection.NO_CALIBRATION, Rejection.WRONG_SIZE})
 """Without a calibration of its size, a frame is an exposure all the same: probe sequences go on where no law acts."""
@@ -81,13 +79,14 @@ def _frame(settings: Settings, state: State, frame: Frame) -> tuple[State, Outpu
     measured = _measure(settings, state, drive, frame)
     if isinstance(measured, Rejection):
         return _refuse(settings, _newest(state, drive, frame), frame, measured, events)
-    estimate, saturated = measured
+    estimate, saturated, usual = measured
     alike = state.identical_frames + 1 if estimate.same(state.estimate) else 0
     if 0 < settings.max_identical_frames < alike:
         stuck = _newest(state, drive, frame)._replace(identical_frames=alike)
         return _refuse(settings, stuck, frame, Rejection.STUCK, events)
-    error_nm, pol_nm, drive = _pseudo_open_loop(state, drive, estimate.error_nm, frame.sequence, events)
-    drive, reasons, homing = _next_command(settings, state, drive, error_nm, frame.sequence)
+    error_nm, pol_nm, drive, reasons, homing = respond(
+        settings, state, drive, estimate.error_nm, frame.sequence, events, usual=usual
+    )
     if reasons:
         drive = end_probe(drive, frame.sequence, _acted(reasons), events)
     if state.refused is not None:
@@ -171,8 +170,10 @@ def _newest(state: State, drive: ActiveLoop | None, frame: Frame) -> State:
     return state._replace(drive=drive, frame_timeout=False, frame_sequence=frame.sequence, frame_time_ns=frame.time_ns)
 
 
-def _measure(settings: Settings, state: State, drive: ActiveLoop, frame: Frame) -> tuple[Estimate, int] | Rejection:
-    """Modal errors of a frame and its saturated pixels, or why it cannot be used."""
+def _measure(
+    settings: Settings, state: State, drive: ActiveLoop, frame: Frame
+) -> tuple[Estimate, int, bool] | Rejection:
+    """Modal errors of a frame, its saturated pixels, and whether they are the fused step's; or why it is of no use."""
     calibration = drive.calibration
     if not calibration.noll:
         return Rejection.NO_CALIBRATION
@@ -186,107 +187,17 @@ def _measure(settings: Settings, state: State, drive: ActiveLoop, frame: Frame) 
         return Rejection.WRONG_SIZE
     if frame.age_ns > settings.max_frame_age_ns:
         return Rejection.LATE
-    pixels = frame.pixels.ravel()
+    pixels, min_flux_dn = frame.pixels.ravel(), settings.min_flux_fraction * calibration.flux_dn
+    usual = drive.estimator.usual(pixels, min_flux_dn)
+    if usual is not None:
+        return usual, 0, True
     saturated = saturated_pixels(calibration, pixels)
     if saturated > settings.max_saturated_pixels:
         return Rejection.SATURATED
     if saturated:
         pixels = filled(calibration, pixels)
-    estimate = drive.estimator.estimate(pixels, settings.min_flux_fraction * calibration.flux_dn)
-    return Rejection.DARK if estimate is None else (estimate, saturated)
-
-
-def _pseudo_open_loop(
-    state: State, drive: ActiveLoop, measured_nm: Single, sequence: int, events: list[PendingEvent]
-) -> tuple[Single, Single, ActiveLoop]:
-    """Error and pseudo-open-loop modes (modes,) of what the sensor measured, and the drive whose law has seen them.
-
-    Channels are taken out of both, as far as the exposure saw them; what the loop is to aim at is taken out of the
-    error.
-    """
-    added, error_nm = drive.command_channels, measured_nm
-    if added is not None:
-        error_nm = measured_nm - added.seen_nm(drive.weights)
-    pol_nm = to_undo_nm = error_nm - drive.seen_nm()
-    if added is not None:
-        target_nm = added.target_nm(sequence)
-        error_nm, to_undo_nm = error_nm - target_nm, pol_nm - target_nm
-    if drive.following is not None:
-        followed = drive.following.followed(error_nm, to_undo_nm, drive.history_nm[0])
-        if followed.guard is not None:
-            guard, more = _guarded(state, drive, followed, followed.guard, error_nm, to_undo_nm)
-            followed = followed._replace(guard=guard)
-            events += more
-        drive = drive._replace(following=followed)
-    return error_nm, pol_nm, drive
-
-
-def _guarded(
-    state: State, drive: ActiveLoop, law: LawRunner, guard: Guard, error_nm: Single, to_undo_nm: Single
-) -> tuple[Guard, list[PendingEvent]]:
-    """The guard of a law after a frame, and its events; both (modes,) without the loop's target."""
-    closed, added = state.mode is LoopMode.CLOSED, drive.command_channels
-    probed = state.returning_to_zero or (added is not None and added.play is not None)
-    if probed or not (closed or state.mode is LoopMode.OPEN):
-        return guard.at_rest(), []
-    if law.frames <= SETTLING_FRAMES or not closed:
-        return guard.observed(to_undo_nm, law.frames), []
-    if law.frames < SETTLING_FRAMES + FADING_FRAMES:
-        return guard.at_rest(), []
-    limited = any(reason is not Limit.MODAL_LIMIT for reason in state.limits_hit)  # virtual commands have that one, too
-    loop = drive.law, drive.weights, drive.history_nm
-    return guard.judged(law.law, law.x, *loop, error_nm, to_undo_nm, limited=limited)
-
-
-def _next_command(
-    settings: Settings, state: State, drive: ActiveLoop, error_nm: Single, sequence: int
-) -> tuple[ActiveLoop, tuple[Reason, ...], bool]:
-    """The command after an error (modes,), the limits that acted, and whether it is still on its way to zero."""
-    if state.mode is LoopMode.SAFE:
-        return _step_to_flat(settings, drive), (), False
-    added, homing = drive.command_channels, state.returning_to_zero
-    closed = state.mode is LoopMode.CLOSED
-    # A limit that acted on the last command has kept the mirror from where it was to go.
-    if not closed and not homing and (added is None or not (added.moving or state.limits_hit)):
-        return drive.stayed(1), (), False
-    command_nm, cut = drive.history_nm[0], False
-    if homing:
-        command_nm = np.zeros_like(command_nm)
-    elif closed:
-        command_nm, cut = _law_output(drive, error_nm)
-    wanted_nm = drive.to_actuators.dot(command_nm).reshape(drive.calibration.grid)
-    extra_nm: Single | None = None
-    if added is not None:
-        added = added.moved(sequence, settings.limits.kept_slew_nm / 2, drive.to_modes)
-        drive = drive._replace(command_channels=added)
-        played_nm = added.played_nm(sequence)
-        extra_nm = added.sum_nm if played_nm is None else added.sum_nm + played_nm
-        wanted_nm += extra_nm
-    limited = limit(settings.limits, drive.actuators_nm, wanted_nm)
-    if limited.reasons and (closed or homing):  # the modal command becomes what was kept, against wind-up
-        kept_nm = limited.actuators_nm
-        if extra_nm is not None:
-            kept_nm = np.subtract(kept_nm, extra_nm)
-        command_nm = drive.inverse @ kept_nm.reshape(-1)
-    reasons = (Limit.MODAL_LIMIT, *limited.reasons) if cut else limited.reasons
-    homing = homing and bool(limited.reasons) and not np.array_equal(limited.actuators_nm, drive.actuators_nm)
-    return drive.pushed(command_nm, limited.actuators_nm), reasons, homing
-
-
-def _law_output(drive: ActiveLoop, error_nm: Single) -> tuple[Single, bool]:
-    """The law's modal command (modes,) in its limits, and whether one was cut."""
-    following, held_nm = drive.following, drive.history_nm[0]
-    alone = following is not None and following.alone
-    if following is None or not alone:
-        integrated_nm, cut = integrate(drive.law, held_nm, error_nm)
-        if following is None or following.frames <= SETTLING_FRAMES:
-            return integrated_nm, cut
-    wanted_nm = linear_law.respond(following.law, following.x)
-    if not alone:
-        weight = following.weight
-        wanted_nm = wanted_nm * weight + integrated_nm * (1 - weight)
-    kept_nm = np.clip(wanted_nm, -drive.law.limit_nm, drive.law.limit_nm)
-    return kept_nm, not np.array_equal(kept_nm, wanted_nm)
+    estimate = drive.estimator.estimate(pixels, min_flux_dn)
+    return Rejection.DARK if estimate is None else (estimate, saturated, False)
 
 
 def _overruled(state: State, drive: ActiveLoop) -> bool:
@@ -300,14 +211,6 @@ def _acted(limits: tuple[Reason, ...]) -> str:
     return f"a limit acted: {', '.join(reason.name for reason in limits)}"
 
 
-def _step_to_flat(settings: Settings, drive: ActiveLoop) -> ActiveLoop:
-    """One frame towards flat, within the slew limit."""
-    flat = limit(settings.limits, drive.actuators_nm, np.zeros_like(drive.actuators_nm)).actuators_nm
-    if drive.command_channels is not None:
-        drive = drive._replace(command_channels=drive.command_channels.lowered(drive.to_modes))
-    return drive.pushed(drive.inverse @ flat.reshape(-1), flat)
-
-
 def _refuse(
     settings: Settings, state: State, frame: Frame, reason: Rejection, events: list[PendingEvent]
 ) -> tuple[State, Outputs]:
@@ -319,9 +222,9 @@ def _refuse(
     reasons: tuple[Reason, ...] = (reason,)
     if drive is not None:
         if state.mode is LoopMode.SAFE:
-            drive = _step_to_flat(settings, drive)
+            drive = step_to_flat(settings, drive)
         elif reason in UNMEASURED and state.mode is not LoopMode.CLOSED:
-            drive, hit, homing = _next_command(settings, state, drive.coasted(1), drive.history_nm[0], frame.sequence)
+            drive, hit, homing = next_command(settings, state, drive.coasted(1), drive.history_nm[0], frame.sequence)
             if hit:
                 drive = end_probe(drive, frame.sequence, _acted(hit), events)
             _limit_events(state.limits_hit, hit, events)
@@ -365,7 +268,7 @@ def _tick(settings: Settings, state: State, tick: Tick) -> tuple[State, Outputs]
         counts = _counted(counts, (Rejection.NO_FRAME,))
         drive = end_probe(drive, state.frame_sequence, f"no frame for {tick.silent_ns / 1e6:.0f} ms", events)
     if flatten or safe:
-        drive = _step_to_flat(settings, drive)
+        drive = step_to_flat(settings, drive)
     state = state._replace(drive=drive, frame_timeout=silent, commanded=True, counts=counts)
     return state, Outputs(command=_command(state, drive, drive.history_nm[0]), events=events, changed=freed)
 

@@ -133,10 +133,7 @@ class CommandChannels(NamedTuple):
 
     def seen_nm(self, weights: tuple[tuple[int, np.float32], ...]) -> Single:
         """The shift (modes,) in the last exposure."""
-        seen = np.zeros_like(self.shift_nm)
-        for lag, weight in weights:
-            seen += weight * self.shifts_nm[lag]
-        return seen
+        return seen_nm(weights, self.shifts_nm)
 
     def target_nm(self, sequence: int) -> Single:
         """The loop's target (modes,) for a frame."""
@@ -222,6 +219,15 @@ class CommandChannels(NamedTuple):
             if one.name in (FLAT, EXTERNAL) or not only_flat
         )
         return self._replace(play=None).at(tuple(kept), to_modes)
+
+
+def seen_nm(weights: tuple[tuple[int, np.float32], ...], newest_first: tuple[Single, ...]) -> Single:
+    """What the last exposure saw of commands or shifts (modes,)."""
+    (lag, weight), *others = weights
+    seen: Single = newest_first[lag] if weight == 1 else weight * newest_first[lag]
+    for lag, weight in others:
+        seen = seen + weight * newest_first[lag]
+    return seen
 
 
 def play_table(target: str, rows: Single, basis: Single) -> PlayTable:

@@ -6,6 +6,7 @@ import numpy as np
 
 from lowfc.arrays import Pixels, Single
 from lowfc.control.calibration.calibration import Calibration
+from lowfc.control.kernel.tables import NUMPY, Kernel, Tables
 
 
 class Estimate(NamedTuple):
@@ -30,19 +31,29 @@ class Estimator(NamedTuple):
         dark: (pixels,) DN.
         scratch: (pixels,) overwritten by every frame, so that nothing the size of a frame is allocated; it carries
             nothing from one call to the next.
+        kernel: by which the usual frame is measured, and its `tables`; None for the reference alone.
     """
 
     rows: Single
     reference_nm: Single
     dark: Single
     scratch: Single
+    kernel: Kernel
+    tables: Tables | None
 
     @classmethod
-    def of(cls, calibration: Calibration) -> "Estimator":
+    def of(cls, calibration: Calibration, kernel: Kernel = NUMPY) -> "Estimator":
         """The estimator of a calibration."""
         R, I0 = calibration.reconstructor, calibration.reference
         reference_nm = (R.astype(np.float64) @ I0).astype(np.float32)
-        return cls(np.vstack([R, calibration.good]), reference_nm, calibration.dark, np.empty_like(calibration.dark))
+        tables = Tables.of(kernel, calibration, reference_nm)
+        rows, scratch = np.vstack([R, calibration.good]), np.empty_like(calibration.dark)
+        return cls(rows, reference_nm, calibration.dark, scratch, kernel, tables)
+
+    def usual(self, pixels: Pixels, min_flux_dn: float) -> Estimate | None:
+        """Modal error of a usual frame (pixels,) by the fused step; None where the reference has to look at it."""
+        found = None if self.tables is None else self.tables.estimate(pixels, min_flux_dn)
+        return None if found is None else Estimate(*found)
 
     def estimate(self, pixels: Pixels, min_flux_dn: float) -> Estimate | None:
         """Modal error of a frame (pixels,); None where its flux is at most `min_flux_dn`."""

@@ -10,12 +10,13 @@ import numpy as np
 from lowfc.arrays import Mask, Single
 from lowfc.control.calibration.calibration import Calibration
 from lowfc.control.calibration.granted import granted_rows
+from lowfc.control.kernel.tables import NUMPY, Kernel
 from lowfc.control.laws import linear_law
 from lowfc.control.laws.law import Law
 from lowfc.control.laws.linear_law import LinearLaw
 from lowfc.control.laws.stability import delay_weights
 from lowfc.control.loop.camera import CameraSettings
-from lowfc.control.loop.command_channels import CommandChannels
+from lowfc.control.loop.command_channels import CommandChannels, seen_nm
 from lowfc.control.loop.estimator import Estimate, Estimator
 from lowfc.control.loop.guard import Guard
 from lowfc.control.loop.interlocks import Acting, Interlock
@@ -49,6 +50,7 @@ class Settings:
         guard: laws are guarded.
         auto_gain: whether the gains of tip and tilt, and of the other modes, follow what is measured.
         interlocks: conditions on values of the bench.
+        kernel: arithmetic of the usual frame.
     """
 
     limits: Limits
@@ -67,6 +69,7 @@ class Settings:
     guard: bool = False
     auto_gain: tuple[bool, bool] = (False, False)
     interlocks: tuple[Interlock, ...] = ()
+    kernel: Kernel = NUMPY
 
     def law(self, noll: tuple[int, ...]) -> Law:
         """The law for these modes: the first figure of each pair for tip and tilt, the second for the rest."""
@@ -126,7 +129,15 @@ class LawRunner(NamedTuple):
     @property
     def alone(self) -> bool:
         """Whether all of the command is the law's."""
-        return self.frames >= SETTLING_FRAMES + FADING_FRAMES and (self.guard is None or not self.guard.overruled)
+        return self._alone(self.frames)
+
+    @property
+    def about_to_be_alone(self) -> bool:
+        """Whether all of the command will be the law's once it has followed another frame."""
+        return self._alone(self.frames + 1)
+
+    def _alone(self, frames: int) -> bool:
+        return frames >= SETTLING_FRAMES + FADING_FRAMES and (self.guard is None or not self.guard.overruled)
 
     def taking_over(self) -> "LawRunner":
         """The same where the loop was just closed: it fades in."""
@@ -187,7 +198,7 @@ class ActiveLoop(NamedTuple):
         inverse = np.linalg.pinv(calibration.modes_to_actuators.astype(np.float64)).astype(np.float32)
         return cls(
             calibration,
-            Estimator.of(calibration),
+            Estimator.of(calibration, settings.kernel),
             settings.law(calibration.noll),
             np.asfortranarray(calibration.modes_to_actuators),
             inverse,
@@ -204,11 +215,7 @@ class ActiveLoop(NamedTuple):
 
     def seen_nm(self) -> Single:
         """The modal command (modes,) that the last exposure saw."""
-        (lag, weight), *others = self.weights
-        seen: Single = self.history_nm[lag] if weight == 1 else weight * self.history_nm[lag]
-        for lag, weight in others:
-            seen = seen + weight * self.history_nm[lag]
-        return seen
+        return seen_nm(self.weights, self.history_nm)
 
     def weighted(self, weighting: Weighting | None) -> "ActiveLoop":
         """With R made for other modes, or another star."""
@@ -216,7 +223,7 @@ class ActiveLoop(NamedTuple):
         if weighting is not None:
             rows = granted_rows(calibration, weighting.prior_nm2, weighting.flux_dn, self.camera)
             calibration = replace(calibration, reconstructor=rows)
-        return self._replace(weighting=weighting, estimator=Estimator.of(calibration))
+        return self._replace(weighting=weighting, estimator=Estimator.of(calibration, self.estimator.kernel))
 
     def added(self) -> CommandChannels:
         """What is added, though it be nothing."""

@@ -29,9 +29,11 @@ def controller(
 
     from lowfc.adapters.bus.run import open_run
     from lowfc.adapters.files.calibration_file import load
+    from lowfc.adapters.process import compiled
     from lowfc.adapters.process.join import join
     from lowfc.adapters.process.latch import Latch, latch_files
     from lowfc.contract.messages import Role
+    from lowfc.control.kernel.tables import FUSED
     from lowfc.programs.commissioning.analytic import analytic
     from lowfc.programs.core.controller import Controller
 
@@ -43,6 +45,9 @@ def controller(
         found = analytic(settings, Console(stderr=True))
     elif str(calibration) != "none":
         found = load(calibration)
+    if settings.realtime.kernel == FUSED and compiled.available():
+        with Console(stderr=True).status("compiling the fused step"):
+            compiled.kernel(FUSED)
     service = join(settings, run, Role.CONTROLLER, settings.realtime.controller_cpus)
     source = calibration.name if calibration is not None else "the configuration"
     latch = Latch(

@@ -67,7 +67,7 @@ class Controller:
         name = config.mirror.name
         self._service = service
         self._latch = latch
-        self._settings = settings_under(latch, config)
+        self._settings = settings_under(latch, config, service.event)
         self._configuration = config.to_toml()
         self._start_up = StartUp(config)
         self._gain_watch = GainWatch(self._settings, config.control.on_harm, contrast_of(config).form)

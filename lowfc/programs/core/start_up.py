@@ -9,10 +9,12 @@ import numpy as np
 
 from lowfc.adapters.files import factory, law_file
 from lowfc.adapters.files.mirror_maps import active_actuators, flat_nm
+from lowfc.adapters.process import compiled
 from lowfc.adapters.process.latch import Latch
 from lowfc.arrays import Single
 from lowfc.contract.configuration import Configuration
 from lowfc.contract.errors import ConfigurationError, DataFileError, LowfcError
+from lowfc.control.kernel.tables import NUMPY
 from lowfc.control.laws.linear_law import LinearLaw
 from lowfc.control.laws.margins import check_law
 from lowfc.control.loop.command_channels import ADOPTED, FLAT
@@ -67,12 +69,18 @@ def law(config: Configuration) -> LinearLaw | None:
     return found
 
 
-def settings_under(latch: Latch, config: Configuration) -> Settings:
-    """The settings of a configuration: what was made safe stays so when the controller dies.
+def settings_under(latch: Latch, config: Configuration, event: Callable[..., None]) -> Settings:
+    """The settings of a configuration, its kernel ready; what was made safe stays so when the controller dies.
 
-    Where that could not be remembered, nothing is driven until somebody is there.
+    Where that could not be remembered, nothing is driven until somebody is there. An `event` says which kernel computes
+    where it is not numpy's, or ought not to be.
     """
-    found = factory.settings(config)
+    wanted = config.realtime.kernel
+    found = replace(factory.settings(config), kernel=compiled.kernel(wanted))
+    if found.kernel.name != wanted:
+        event("KERNEL_MISSING", advice=compiled.missing())
+    elif found.kernel is not NUMPY:
+        event("KERNEL", kernel=wanted)
     if latch.safe:
         return replace(found, start_mode=LoopMode.SAFE)
     return found if latch.kept else replace(found, start_mode=LoopMode.OPEN)

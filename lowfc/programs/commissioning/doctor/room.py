@@ -8,6 +8,8 @@ from threadpoolctl import threadpool_info, threadpool_limits
 
 from lowfc.adapters.bus.own_certificate import WARN_DAYS
 from lowfc.adapters.bus.routed import ending_certificates
+from lowfc.adapters.process import compiled
+from lowfc.control.kernel.tables import FUSED
 from lowfc.programs.commissioning.checks import Check, Table, note, ok, warning
 from lowfc.programs.commissioning.doctor.facts import Facts
 from lowfc.programs.core.recording.volume import bytes_per_s, selected
@@ -72,6 +74,16 @@ def _blas(facts: Facts) -> Check:
     if held and max(held.values()) == 1:
         return ok(f"{names}; the loop holds it to one")
     return warning(names or f"none that threadpoolctl knows, in numpy {np.__version__}")
+
+
+@CHECKS.check("control step")
+def _control_step(facts: Facts) -> Check:
+    """Arithmetic of the usual frame, `realtime.kernel`: numpy, or the fused step, which needs the extra `fast`."""
+    there = compiled.available()
+    if facts.config.realtime.kernel == FUSED:
+        return ok("the fused step") if there else warning("numpy, not the fused step", compiled.missing())
+    advice = 'realtime.kernel = "fused"' if there else compiled.missing()
+    return note("numpy", advice, "a frame takes longer to become a command; `lowfc latency` measures how long")
 
 
 @CHECKS.check("socket buffers")

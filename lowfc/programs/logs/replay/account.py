@@ -19,6 +19,7 @@ class Account:
         steps: in the log.
         different: messages that differ by more than the tolerance, of them the first, and the largest difference of any
             number in nm.
+        other_kernel: arithmetic of the replay where the log's was another; empty where it was the same.
         rules_changed: inputs of another version's log that this version answers otherwise on purpose, by the rule.
     """
 
@@ -33,6 +34,7 @@ class Account:
     different: int = 0
     first_difference: Difference | None = None
     largest_difference_nm: float = 0.0
+    other_kernel: str = ""
     rules_changed: Counter[str] = field(default_factory=Counter)
 
     @property
@@ -42,8 +44,9 @@ class Account:
 
     @property
     def identical(self) -> bool:
-        """Whether steps and commands were checked, and nothing differed."""
-        return self.frames > 0 and not self.different and (self.commands > 0 or not self.commands_missing)
+        """Whether steps and commands were checked by the log's own arithmetic, and nothing differed."""
+        same = not self.different and not self.other_kernel
+        return self.frames > 0 and same and (self.commands > 0 or not self.commands_missing)
 
     def add(self, other: "Account") -> None:
         """Add what was found in the next share."""
@@ -52,7 +55,8 @@ class Account:
             if one.name == "largest_difference_nm":
                 setattr(self, one.name, max(mine, more))
             else:
-                setattr(self, one.name, mine or more if one.name == "first_difference" else mine + more)
+                either = one.name in ("first_difference", "other_kernel")
+                setattr(self, one.name, mine or more if either else mine + more)
 
     def figures(self) -> dict[str, Any]:
         """For a program."""

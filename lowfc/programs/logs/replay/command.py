@@ -11,16 +11,16 @@ from lowfc.adapters.logs.parts import in_order
 from lowfc.adapters.logs.recovery import faults, no_end
 from lowfc.adapters.process.progress import reading_bar
 from lowfc.adapters.process.provenance import provenance
-from lowfc.adapters.process.terminal import Json, Logs
+from lowfc.adapters.process.terminal import Json, KernelName, Logs
 from lowfc.contract.envelope import count_of
 from lowfc.control.loop.wording import counted
 from lowfc.programs.cli.output import put
 
-_HOST = ("lowfc", "git", "python", "numpy", "scipy", "blas", "processor", "cpu_features")
+_HOST = ("lowfc", "git", "python", "numpy", "numba", "scipy", "blas", "processor", "cpu_features")
 """What the same bytes may depend on; of the processor's features, those that only one of the two has."""
 
 
-def verify(logs: list[Path], tolerance_nm: float, jobs: int, console: Console) -> dict[str, Any]:
+def verify(logs: list[Path], tolerance_nm: float, jobs: int, console: Console, kernel: str = "") -> dict[str, Any]:
     """Replay logs that follow each other; return the figures that `--json` prints.
 
     Raises:
@@ -31,7 +31,7 @@ def verify(logs: list[Path], tolerance_nm: float, jobs: int, console: Console) -
     total = sum(path.stat().st_size for path in logs if path.exists())
     begun_s = time.monotonic()
     with reading_bar(console) as count:
-        outcome = replay_files(logs, tolerance_nm, jobs, lambda done: count("replaying", done, total))
+        outcome = replay_files(logs, tolerance_nm, jobs, lambda done: count("replaying", done, total), kernel)
     elapsed_s = time.monotonic() - begun_s
     return {
         **outcome.account.figures(),
@@ -53,6 +53,8 @@ def render(figures: dict[str, Any]) -> str:
     frames, largest_nm = figures["frames"], figures["largest_difference_nm"]
     if not frames:
         verdict = "nothing could be replayed"
+    elif figures["other_kernel"]:
+        verdict = f"{frames} frames, computed by {figures['other_kernel']}: not the same kernel as the log's"
     elif figures["identical"] and figures["tolerance_nm"]:
         verdict = f"{frames} frames, commands identical within {figures['tolerance_nm']:g} nm"
     elif figures["identical"]:
@@ -107,15 +109,19 @@ def replay_log(
     jobs: Annotated[
         int | None, typer.Option(min=1, help="Processes, at most; default: one on every processor.")
     ] = None,
+    kernel: Annotated[
+        KernelName | None, typer.Option(help="Arithmetic of the usual frame; default: the log's own.")
+    ] = None,
     as_json: Json = False,
 ) -> None:
     """Run the loop again on what it took in, and compare every step and command with the log, to the bit.
 
-    Exit status 0 only if they are identical. Logs may be complete, rotated, truncated or damaged.
+    Exit status 0 only if they are identical; under another kernel they never count as that. Logs may be complete,
+    rotated, truncated or damaged.
 
     Example: lowfc replay last
     """
-    figures = verify(in_order(logs), tolerance, jobs or 0, Console(stderr=True))
+    figures = verify(in_order(logs), tolerance, jobs or 0, Console(stderr=True), kernel or "")
     put(figures, render(figures), as_json=as_json)
     if not figures["identical"]:
         raise typer.Exit(1)

@@ -8,24 +8,25 @@ from dataclasses import dataclass, field
 from google.protobuf.message import Message
 
 from lowfc.adapters.logs.reader import Logged
+from lowfc.adapters.process import compiled
 from lowfc.contract.codecs import codec
 from lowfc.contract.codecs.state_codec import controller_state, decode_state
-from lowfc.contract.errors import BadMessageError, DataFileError
+from lowfc.contract.errors import DataFileError
 from lowfc.contract.messages import from_timestamp, wire
 from lowfc.contract.published import Published
+from lowfc.control.kernel.tables import Kernel
 from lowfc.control.loop.advance import advance
-from lowfc.control.loop.inputs import Frame, Input, Outputs, Request
+from lowfc.control.loop.inputs import Input, Outputs, Request
 from lowfc.control.loop.requests import prepared
 from lowfc.control.loop.state import Settings, State
 from lowfc.programs.logs.replay.account import Account
 from lowfc.programs.logs.replay.difference import Difference, difference
 from lowfc.programs.logs.replay.former import Former, changed_rule
+from lowfc.programs.logs.replay.frames import Frames
 
 PATIENCE_NS = 2_000_000_000
 """Messages of several publishers are recorded in the order they arrive; what is later than this is missing."""
-FRAMES_BYTES = 64 << 20
 _STATES_KEPT = 256
-_STEPS_KEPT = 10_000  # of which it is known from which frame they were made
 _BEFORE = "recorded before the first complete state of the controller"
 
 
@@ -44,42 +45,6 @@ class _Entry:
         """Whether a controller with a calibration sends a command."""
         taken = self.taken
         return isinstance(taken, wire.ControlStep) or (isinstance(taken, wire.ControlInput) and taken.HasField("tick"))
-
-
-class Frames:
-    """The newest frames of a log, by sequence, within a budget of memory."""
-
-    def __init__(self) -> None:
-        self._payloads: dict[int, list[bytes]] = {}
-        self._order: deque[int] = deque()
-        self._bytes = 0
-        self._steps: deque[tuple[int, int]] = deque(maxlen=_STEPS_KEPT)
-
-    def add(self, sequence: int, payload: bytes) -> None:
-        """Keep a frame; the oldest ones go."""
-        self._payloads.setdefault(sequence, []).append(payload)
-        self._order.append(sequence)
-        self._bytes += len(payload)
-        while self._bytes > FRAMES_BYTES and len(self._order) > 1:
-            oldest = self._order.popleft()
-            kept = self._payloads[oldest]
-            self._bytes -= len(kept.pop(0))
-            if not kept:
-                del self._payloads[oldest]
-
-    def note_step(self, step: wire.ControlStep) -> None:
-        """Remember which frame a step of the log was made from."""
-        self._steps.append((step.frame_sequence, from_timestamp(step.timestamp)))
-
-    def frame(self, sequence: int, time_ns: int, age_ns: int, *, last: bool = False) -> Frame | None:
-        """The frame of this sequence and time, for a sequence may come twice; or the `last` one that no step has."""
-        found = []
-        for payload in self._payloads.get(sequence, ()):
-            with contextlib.suppress(BadMessageError):  # the controller left it out, too
-                found.append(codec.decode_frame(payload, sequence, age_ns))
-        alike = next((frame for frame in found if frame.time_ns == time_ns), None)
-        others = (frame for frame in reversed(found) if (sequence, frame.time_ns) not in self._steps)
-        return next(others, None) if alike is None and last else alike
 
 
 @dataclass(frozen=True, slots=True)
@@ -102,6 +67,7 @@ class Context:
 
     Attributes:
         tolerance_nm: differences up to this are none.
+        kernel: that computes; empty for the log's own.
         former: what is compared of the log of another version; to be set before the first message.
     """
 
@@ -110,6 +76,7 @@ class Context:
     frames: Frames = field(default_factory=Frames)
     published: Published = field(default_factory=Published)
     account: Account = field(default_factory=Account)
+    kernel: str = ""
     former: Former | None = None
 
 
@@ -256,7 +223,15 @@ class ControllerReplay:
 
     def _decoded(self, message: wire.ControllerState) -> tuple[Settings, State]:
         known = self._context.published
-        return decode_state(message, known.calibrations.get(message.calibration_id), known.laws, known.plays)
+        calibration = known.calibrations.get(message.calibration_id)
+        return decode_state(message, calibration, known.laws, known.plays, self._kernel)
+
+    def _kernel(self, name: str) -> Kernel:
+        """The kernel to replay with, under the log's name for it."""
+        found = compiled.kernel(self._context.kernel or name)
+        if found.name != name:
+            self._account.other_kernel = found.name
+        return found._replace(name=name)
 
     def _leave_out(self, upto: int) -> None:
         for number in [number for number in self._entries if number <= upto]:

@@ -24,9 +24,9 @@ TOPICS = (FRAME, STEP, COMMAND, CONTROL_INPUT, CONTROLLER_STATE, REQUEST, *publi
 class Replay:
     """Takes the messages of a log, or of several that follow each other, and keeps the account."""
 
-    def __init__(self, tolerance_nm: float = 0.0, share: Share = WHOLE) -> None:
-        """Differences up to `tolerance_nm` are none: for a log of another kind of processor."""
-        self.context = Context(tolerance_nm, share)
+    def __init__(self, tolerance_nm: float = 0.0, share: Share = WHOLE, kernel: str = "") -> None:
+        """Differences up to `tolerance_nm` are none: for a log of another kind of processor, or another `kernel`."""
+        self.context = Context(tolerance_nm, share, kernel=kernel)
         self._controllers: dict[int, ControllerReplay] = {}
         self._last_ns = self._begun_ns = self._ended_ns = 0
 
@@ -80,13 +80,13 @@ class Replay:
         return self._controllers[start_s]
 
 
-def replay(messages: Iterable[Logged], tolerance_nm: float = 0.0, share: Share = WHOLE) -> Account:
+def replay(messages: Iterable[Logged], tolerance_nm: float = 0.0, share: Share = WHOLE, kernel: str = "") -> Account:
     """Replay a log's messages from beginning to end, or a share of them.
 
     Raises:
         DataFileError: see `Replay.take`.
     """
-    run = Replay(tolerance_nm, share)
+    run = Replay(tolerance_nm, share, kernel)
     for message in messages:
         run.take(message)
         if run.done:

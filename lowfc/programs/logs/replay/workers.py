@@ -54,7 +54,9 @@ class Outcome:
     stopped: list[str] = field(default_factory=list)
 
 
-def replay_files(paths: Sequence[Path], tolerance_nm: float, jobs: int, progress: Progress) -> Outcome:
+def replay_files(
+    paths: Sequence[Path], tolerance_nm: float, jobs: int, progress: Progress, kernel: str = ""
+) -> Outcome:
     """Replay logs that follow each other.
 
     Args:
@@ -62,6 +64,7 @@ def replay_files(paths: Sequence[Path], tolerance_nm: float, jobs: int, progress
         tolerance_nm: differences up to this are none.
         jobs: processes, at most; 0 for as many as there are processors.
         progress: called with the bytes replayed so far.
+        kernel: that computes; empty for the log's own.
 
     Raises:
         ConfigurationError: a log is named twice.
@@ -74,7 +77,7 @@ def replay_files(paths: Sequence[Path], tolerance_nm: float, jobs: int, progress
     jobs = jobs or len(os.sched_getaffinity(0))
     count = min(_SHARES_PER_JOB * jobs, size // _WORTH_BYTES) if ends_ns and jobs > 1 else 1
     if count < 2:
-        outcomes = [_replay_share(paths, tolerance_nm, WHOLE, progress)]
+        outcomes = [_replay_share(paths, tolerance_nm, kernel, WHOLE, progress)]
     else:
         edges = [0, *(ends_ns[len(ends_ns) * share // count] for share in range(1, count)), WHOLE.until_ns]
         shares = [Share(from_ns, until_ns) for from_ns, until_ns in pairwise(edges)]
@@ -82,7 +85,7 @@ def replay_files(paths: Sequence[Path], tolerance_nm: float, jobs: int, progress
         # Ctrl-C is for the parent, which ends its workers.
         context = multiprocessing.get_context("spawn")
         with context.Pool(min(jobs, count), signal.signal, (signal.SIGINT, signal.SIG_IGN)) as pool:
-            for outcome in pool.imap(partial(_replay_share, paths, tolerance_nm), shares):
+            for outcome in pool.imap(partial(_replay_share, paths, tolerance_nm, kernel), shares):
                 outcomes.append(outcome)
                 progress(size * len(outcomes) // count)
     whole = outcomes[0]
@@ -104,10 +107,10 @@ def _chunk_ends_ns(path: Path) -> list[int]:
 
 
 def _replay_share(
-    paths: Sequence[Path], tolerance_nm: float, share: Share, progress: Progress = lambda done: None
+    paths: Sequence[Path], tolerance_nm: float, kernel: str, share: Share, progress: Progress = lambda done: None
 ) -> Outcome:
     """Replay a share, on one thread as the live loop: more threads sum in another order."""
-    run = Replay(tolerance_nm, share)
+    run = Replay(tolerance_nm, share, kernel)
     log = WholeLog(
         paths,
         skip_damaged=True,

@@ -1,0 +1,170 @@
+"""The fused step: the arithmetic of the usual frame in two plain functions, to be compiled.
+
+They are written for a compiler: loops over arrays that were made before, nothing allocated, nothing called but numpy's
+types. Rows are taken four at a time, so that each vector is read once for four of them. `lowfc.adapters` compiles them.
+"""
+
+import numpy as np
+
+from lowfc.arrays import Pixels, Single
+
+
+def measure(
+    pixels: Pixels,
+    good: Pixels,
+    dark: Single,
+    tiles: Single,
+    scratch: Single,
+    reference_nm: Single,
+    full_well: int,
+    dark_sum_dn: float,
+    least_dn: float,
+    error_nm: Single,
+) -> float:
+    """Modal errors of a frame in one pass over its counts.
+
+    Args:
+        pixels: (pixels,) counts, DN.
+        good: (pixels,) all bits set where a pixel is used, else 0.
+        dark: (pixels,) DN.
+        tiles: (blocks x modes rounded up to four, block) R, block of pixels after block; zero where it was filled up.
+        scratch: (block,) overwritten.
+        reference_nm: (modes,) R I0.
+        full_well: counts from which on a pixel is saturated.
+        dark_sum_dn: sum of the dark over the good pixels.
+        least_dn: flux up to which the frame is not usual.
+        error_nm: (modes,) the result, nm of wavefront rms.
+
+    Returns:
+        The flux, DN, rounded as float32: the exact sum of the good pixels less `dark_sum_dn`. 0 where the frame is not
+        usual: a good pixel is saturated, or there is little light.
+    """
+    modes, block, row = error_nm.size, scratch.size, 0
+    total, highest = np.uint64(0), np.uint16(0)
+    for mode in range(modes):
+        error_nm[mode] = 0
+    for begin in range(0, pixels.size, block):
+        counts, used, offset = pixels[begin : begin + block], good[begin : begin + block], dark[begin : begin + block]
+        for i in range(counts.size):
+            count = counts[i]
+            scratch[i] = np.float32(count) - offset[i]
+            kept = count & used[i]
+            total += np.uint64(kept)
+            highest = max(highest, kept)
+        for mode in range(0, modes, 4):
+            first, second, third, fourth = tiles[row], tiles[row + 1], tiles[row + 2], tiles[row + 3]
+            row += 4
+            a, b, c, d = np.float32(0), np.float32(0), np.float32(0), np.float32(0)
+            for i in range(counts.size):
+                value = scratch[i]
+                a += first[i] * value
+                b += second[i] * value
+                c += third[i] * value
+                d += fourth[i] * value
+            error_nm[mode] += a
+            if mode + 1 < modes:
+                error_nm[mode + 1] += b
+            if mode + 2 < modes:
+                error_nm[mode + 2] += c
+            if mode + 3 < modes:
+                error_nm[mode + 3] += d
+    flux_dn = np.float32(np.float64(total) - dark_sum_dn)
+    if highest >= full_well or not flux_dn > least_dn:
+        return 0.0
+    scale = np.float32(1) / flux_dn
+    for mode in range(modes):
+        error_nm[mode] = error_nm[mode] * scale - reference_nm[mode]
+    return float(flux_dn)
+
+
+def respond(
+    measured_nm: Single,
+    seen_nm: Single,
+    shift_nm: Single,
+    target_nm: Single,
+    held_nm: Single,
+    integrator: Single,
+    x: Single,
+    transition: Single,
+    output: Single,
+    of_error: bool,
+    shapes: Single,
+    added_nm: Single,
+    previous_nm: Single,
+    stroke_nm: float,
+    slew_nm: float,
+    apart_nm: float,
+    made: Single,
+    actuators_nm: Single,
+) -> bool:
+    """From modal errors to the command of a closed loop, as long as no limit acts.
+
+    Args:
+        measured_nm: (modes,) of `measure`.
+        seen_nm: (modes,) the command in the exposure.
+        shift_nm: (modes,) the shift by channels in it.
+        target_nm: (modes,) the loop's target.
+        held_nm: (modes,) the last command.
+        integrator: (3, modes) gain, what is kept of the last command, limit, as in `lowfc.control.laws.law`.
+        x: (states,) of a linear law; empty for the integrator, as are the next two.
+        transition: (states, states + 2 modes) F, G and H side by side.
+        output: (modes, states) K.
+        of_error: the law's signal is the error, not the pseudo-open-loop modes.
+        shapes: (modes, actuators) nm of surface per nm of wavefront.
+        added_nm: (rows, columns) channels, nm of surface.
+        previous_nm: (rows, columns) the last command.
+        stroke_nm: largest deviation of an actuator from flat.
+        slew_nm: largest move of an actuator.
+        apart_nm: largest difference of neighbours.
+        made: (3 modes + states,) the results: error, without shift and target; pseudo-open-loop modes, without the
+            shift; command; x.
+        actuators_nm: (rows, columns) the result, nm of surface.
+
+    Returns:
+        Whether the results count: every number is finite, and no limit would change the command.
+    """
+    modes, states = measured_nm.size, x.size
+    stroke, slew, apart = np.float32(stroke_nm), np.float32(slew_nm), np.float32(apart_nm)
+    error_nm, pol_nm = made[:modes], made[modes : 2 * modes]
+    command_nm, after = made[2 * modes : 3 * modes], made[3 * modes :]
+    over = 0
+    for mode in range(modes):
+        free_nm = measured_nm[mode] - shift_nm[mode]
+        pol_nm[mode] = free_nm - seen_nm[mode]
+        error_nm[mode] = free_nm - target_nm[mode]
+        command_nm[mode] = integrator[1, mode] * held_nm[mode] - integrator[0, mode] * error_nm[mode]
+    for state in range(states):
+        row, total = transition[state], np.float32(0)
+        for i in range(states):
+            total += row[i] * x[i]
+        for mode in range(modes):
+            signal = error_nm[mode] if of_error else pol_nm[mode] - target_nm[mode]
+            total += row[states + mode] * signal + row[states + modes + mode] * held_nm[mode]
+        after[state] = total
+    for mode in range(modes):
+        if states:
+            row, total = output[mode], np.float32(0)
+            for i in range(states):
+                total += row[i] * after[i]
+            command_nm[mode] = total
+        over += not abs(command_nm[mode]) <= integrator[2, mode]
+    if over:
+        return False
+    rows, columns = previous_nm.shape
+    flat, before, added = actuators_nm.ravel(), previous_nm.ravel(), added_nm.ravel()
+    for i in range(flat.size):
+        flat[i] = added[i]
+    for mode in range(modes):
+        shape, value = shapes[mode], command_nm[mode]
+        for i in range(flat.size):
+            flat[i] += shape[i] * value
+    for i in range(flat.size):
+        over += not abs(flat[i]) <= stroke
+        over += not abs(flat[i] - before[i]) <= slew
+    for i in range(columns, flat.size):
+        over += not abs(flat[i] - flat[i - columns]) <= apart
+    for r in range(rows):
+        line = actuators_nm[r]
+        for i in range(1, columns):
+            over += not abs(line[i] - line[i - 1]) <= apart
+    return not over

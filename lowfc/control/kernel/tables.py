@@ -1,0 +1,93 @@
+"""Which arithmetic the step uses, and the arrays of a calibration as its compiled functions read them."""
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import numpy as np
+
+from lowfc.arrays import Pixels, Single, single
+from lowfc.control.calibration.calibration import Calibration
+
+FUSED = "fused"
+KERNELS = ("numpy", FUSED)
+BLOCK = 6400
+"""Pixels at a time, at most: as float32 they fill half of a processor's first cache."""
+DARK_MARGIN = 1e-3
+"""Part of the expected flux by which a usual frame has more than a dark one, so that rounding decides nothing."""
+
+
+class Kernel(NamedTuple):
+    """The arithmetic of the usual frame: `measure` and `respond` of `lowfc.control.kernel.functions`, compiled.
+
+    Without them, everything goes the reference's way, whatever the name.
+    """
+
+    name: str
+    measure: Callable[..., float] | None = None
+    respond: Callable[..., bool] | None = None
+
+
+NUMPY = Kernel("numpy")
+
+
+class Tables(NamedTuple):
+    """What the compiled functions need of a calibration; most as in `lowfc.control.kernel.functions`.
+
+    Attributes:
+        full_well: counts from which on a pixel is saturated; above all counts where none is.
+        margin_dn: flux that a usual frame has beyond that of a dark one.
+        shapes: (modes, actuators) nm of surface per nm of wavefront.
+        no_modes: (modes,) zeros, and `no_states` (0,), `no_law` (0, 0), `no_channels` (rows, columns).
+    """
+
+    measure: Callable[..., float]
+    respond: Callable[..., bool]
+    good: Pixels
+    dark: Single
+    tiles: Single
+    scratch: Single
+    reference_nm: Single
+    full_well: int
+    dark_sum_dn: float
+    margin_dn: float
+    shapes: Single
+    no_modes: Single
+    no_states: Single
+    no_law: Single
+    no_channels: Single
+
+    @classmethod
+    def of(cls, kernel: Kernel, calibration: Calibration, reference_nm: Single) -> "Tables | None":
+        """The tables of a calibration; None where the kernel has no functions, or the calibration no pixels."""
+        modes, pixels = calibration.reconstructor.shape
+        if kernel.measure is None or kernel.respond is None or not modes * pixels:
+            return None
+        blocks = -(-pixels // BLOCK)
+        block = -(-pixels // blocks)
+        filled = np.zeros((-(-modes // 4) * 4, blocks * block), np.float32)
+        filled[:modes, :pixels] = calibration.reconstructor
+        return cls(
+            kernel.measure,
+            kernel.respond,
+            np.where(calibration.good > 0, 0xFFFF, 0).astype(np.uint16),
+            single(calibration.dark),
+            single(filled.reshape(-1, blocks, block).swapaxes(0, 1)).reshape(-1, block),
+            np.empty(block, np.float32),
+            reference_nm,
+            int(np.ceil(min(calibration.saturation_dn, 0x1_0000))),
+            float(calibration.dark.astype(np.float64) @ calibration.good),
+            DARK_MARGIN * calibration.flux_dn,
+            single(calibration.modes_to_actuators.T),
+            np.zeros(modes, np.float32),
+            np.zeros(0, np.float32),
+            np.zeros((0, 0), np.float32),
+            np.zeros(calibration.grid, np.float32),
+        )
+
+    def estimate(self, pixels: Pixels, min_flux_dn: float) -> tuple[Single, float] | None:
+        """Modal errors (modes,) and flux of a usual frame (pixels,); None where it is not usual."""
+        error_nm = np.empty_like(self.reference_nm)
+        least_dn = min_flux_dn + self.margin_dn
+        measured = pixels, self.good, self.dark, self.tiles, self.scratch, self.reference_nm
+        flux_dn = self.measure(*measured, self.full_well, self.dark_sum_dn, least_dn, error_nm)
+        return (error_nm, flux_dn) if flux_dn else None

@@ -1,0 +1,48 @@
+"""The newest frames of a log, from which its steps are made again."""
+
+import contextlib
+from collections import deque
+
+from lowfc.contract.codecs import codec
+from lowfc.contract.errors import BadMessageError
+from lowfc.contract.messages import from_timestamp, wire
+from lowfc.control.loop.inputs import Frame
+
+FRAMES_BYTES = 64 << 20
+_STEPS_KEPT = 10_000  # of which it is known from which frame they were made
+
+
+class Frames:
+    """The newest frames of a log, by sequence, within a budget of memory."""
+
+    def __init__(self) -> None:
+        self._payloads: dict[int, list[bytes]] = {}
+        self._order: deque[int] = deque()
+        self._bytes = 0
+        self._steps: deque[tuple[int, int]] = deque(maxlen=_STEPS_KEPT)
+
+    def add(self, sequence: int, payload: bytes) -> None:
+        """Keep a frame; the oldest ones go."""
+        self._payloads.setdefault(sequence, []).append(payload)
+        self._order.append(sequence)
+        self._bytes += len(payload)
+        while self._bytes > FRAMES_BYTES and len(self._order) > 1:
+            oldest = self._order.popleft()
+            kept = self._payloads[oldest]
+            self._bytes -= len(kept.pop(0))
+            if not kept:
+                del self._payloads[oldest]
+
+    def note_step(self, step: wire.ControlStep) -> None:
+        """Remember which frame a step of the log was made from."""
+        self._steps.append((step.frame_sequence, from_timestamp(step.timestamp)))
+
+    def frame(self, sequence: int, time_ns: int, age_ns: int, *, last: bool = False) -> Frame | None:
+        """The frame of this sequence and time, for a sequence may come twice; or the `last` one that no step has."""
+        found = []
+        for payload in self._payloads.get(sequence, ()):
+            with contextlib.suppress(BadMessageError):  # the controller left it out, too
+                found.append(codec.decode_frame(payload, sequence, age_ns))
+        alike = next((frame for frame in found if frame.time_ns == time_ns), None)
+        others = (frame for frame in reversed(found) if (sequence, frame.time_ns) not in self._steps)
+        return next(others, None) if alike is None and last else alike

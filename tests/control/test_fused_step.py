@@ -1,0 +1,217 @@
+"""The fused step against the reference: random frames and states, step by step from the same state."""
+
+from collections import Counter
+from dataclasses import dataclass, field
+
+import numpy as np
+import pytest
+
+from lowfc.adapters.process import compiled
+from lowfc.arrays import Pixels, Single
+from lowfc.control.calibration.calibration import Calibration, normalise_flux, reconstructor
+from lowfc.control.kernel import stepping
+from lowfc.control.kernel.tables import FUSED
+from lowfc.control.laws.linear_law import LinearLaw, integrator
+from lowfc.control.laws.pi_notch import pi_notch
+from lowfc.control.loop.advance import advance
+from lowfc.control.loop.inputs import Frame, Load, Outputs, Request
+from lowfc.control.loop.requests import prepared
+from lowfc.control.loop.safety import Limit, Limits, Rejection
+from lowfc.control.loop.state import State
+from tests.support import toy
+
+RATE_HZ = 1000.0
+SAME_NM = 1e-4
+ROUNDINGS = 5
+"""Of float32: numbers of hundreds of nm are not known better."""
+FUSED_KERNEL = compiled.kernel(FUSED)
+pytestmark = pytest.mark.skipif(not compiled.available(), reason="needs the extra `fast`")
+
+
+@dataclass
+class Bench:
+    """A random sensor, mirror and controller, and what may happen to them."""
+
+    rng: np.random.Generator
+    found: Counter[str] = field(default_factory=Counter)
+    largest_nm: float = 0.0
+    repeats: int = 0
+
+    def __post_init__(self) -> None:
+        rng = self.rng
+        rows, columns, modes = rng.integers(8, 20), rng.integers(8, 20), int(rng.integers(1, 12))
+        self.shape, grid, pixels = (
+            (int(rows), int(columns)),
+            tuple(map(int, rng.integers(2, 9, 2))),
+            int(rows * columns),
+        )
+        self.noll = tuple(range(2, 2 + modes))
+        good = (rng.random(pixels) > rng.choice([0.0, 0.1])).astype(float)
+        I0, self.H = normalise_flux(rng.uniform(0.5, 1.5, pixels), rng.normal(0, 2e-3, (pixels, modes)), good)
+        self.I0, self.flux_dn = I0, 2000.0 * pixels
+        R = reconstructor(I0, self.H, good, self.flux_dn, 3.0)
+        self.dark = rng.uniform(90, 110, pixels)
+        shapes = rng.normal(0, 1, (grid[0] * grid[1], modes)) / modes**0.5
+        single = {"reference": I0, "response": self.H, "reconstructor": R, "good": good, "dark": self.dark}
+        self.calibration = Calibration(
+            noll=self.noll,
+            **{name: array.astype(np.float32) for name, array in single.items()},
+            modes_to_actuators=shapes.astype(np.float32),
+            shape=self.shape,
+            grid=grid,
+            flux_dn=self.flux_dn,
+            saturation_dn=float(rng.choice([60_000, np.inf])),
+            estimator="weighted",
+            wavelength_nm=550.0,
+            operator_hash="",
+            id="random",
+        )
+        tight = rng.random() < 0.5
+        self.settings = toy.settings(
+            limits=Limits(60.0, 20.0, 50.0) if tight else Limits(700.0, 300.0, 600.0),
+            limit_nm=(40.0, 15.0) if tight else (500.0, 300.0),
+            delay_frames=float(rng.choice([1.0, 1.5, 2.0, 2.75])),
+            max_saturated_pixels=int(rng.choice([0, 4])),
+            max_identical_frames=2,
+            min_flux_fraction=float(rng.choice([0.0, 0.2])),
+            gain=(0.4, 0.2),
+            leak=(0.01, 0.02),
+            guard=bool(rng.random() < 0.5),
+            rate_hz=RATE_HZ,
+            kernel=FUSED_KERNEL,
+        )
+        self.state, _ = advance(self.settings, State(), Load(0, self.calibration, "random"))
+        self.last, self.count, self.again = self.state, 0, np.zeros(self.shape, np.uint16)
+
+    def law(self) -> LinearLaw:
+        """A law that is stable in the loop, or none."""
+        modes, delay = len(self.noll), self.settings.delay_frames
+        if self.rng.random() < 0.5:
+            return integrator([0.2] * modes, [0.02] * modes, self.noll, delay, RATE_HZ)
+        none = np.zeros(modes)
+        return pi_notch(self.noll, none + 0.1, none + 0.05, none + 0.02, [()] * modes, delay, RATE_HZ)
+
+    def request(self) -> Request:
+        """What an operator may ask."""
+        rng, modes, actuators = self.rng, len(self.noll), int(np.prod(self.calibration.grid))
+        values = tuple(map(float, rng.uniform(0.05, 0.4, modes).astype(np.float32)))
+        shape = rng.normal(0, 5, actuators).astype(np.float32)
+        return [
+            Request(0, "gain", self.noll, values),
+            Request(0, "offset", self.noll, values),
+            Request(0, "channel", text="dark-hole", actuators_nm=shape * (rng.random() < 0.7)),
+            Request(0, "channel", text="flat", actuators_nm=shape),
+            Request(0, "play", text="mirror", actuators_nm=shape, table=rng.normal(0, 1, (5, 1)).astype(np.float32)),
+            Request(0, "play", text="offset", table=rng.normal(0, 1, (5, modes)).astype(np.float32)),
+            Request(0, "law", law=self.law()),
+            Request(0, "law"),
+            Request(0, str(rng.choice(["open", "safe", "zero", "stop"]))),
+        ][rng.integers(9)]
+
+    def pixels(self) -> Pixels:
+        """An image, seldom a bad one."""
+        rng = self.rng
+        kind = str(rng.choice(list("dDsSar"))) if rng.random() < 0.04 else "usual"
+        self.repeats = max(self.repeats - 1, 4 * (kind == "a"))
+        if self.repeats:
+            return self.again
+        wave_nm = rng.normal(0, 40 if kind == "r" else 4, len(self.noll))
+        light = self.flux_dn * rng.uniform(0.8, 1.2) * (self.I0 + self.H @ wave_nm)
+        light *= {"d": 0.0, "D": rng.uniform(0.15, 0.25)}.get(kind, 1.0)
+        image = np.clip(np.rint(self.dark + light + rng.normal(0, 3, light.size)), 0, 65535).astype(np.uint16)
+        if kind in "sS":
+            image[rng.integers(0, image.size, 1 if kind == "s" else 6)] = 65535
+        self.again = image.reshape(self.shape)
+        return self.again
+
+    def run(self, frames: int) -> None:
+        """Take so many frames; each by both arithmetics from the same state."""
+        for _ in range(frames):
+            if self.rng.random() < 0.01:
+                for request in (self.request(), Request(0, "clear"), Request(0, "close"))[:: self.rng.choice([1, 2])]:
+                    self.state, _ = advance(self.settings, self.state, prepared(self.settings, request))
+            self.count += 1 + int(self.rng.random() < 0.01)
+            age_ns = 10**9 if self.rng.random() < 0.002 else 0
+            self.frame(Frame(toy.frame_sequence(self.count), self.count * 1_000_000, age_ns, self.pixels()))
+
+    def frame(self, frame: Frame) -> None:
+        """Take a frame by both, and compare."""
+        drive = self.state.drive
+        assert drive is not None
+        alone = drive._replace(estimator=drive.estimator._replace(tables=None))
+        known = {"estimate": self.last.estimate, "identical_frames": self.last.identical_frames}
+        self.last, expected = advance(self.settings, self.state._replace(drive=alone, **known), frame)
+        self.state, outputs = advance(self.settings, self.state, frame)
+        self.compare(outputs, expected)
+        assert self.state.identical_frames == self.last.identical_frames
+        assert (self.state.mode, self.state.returning_to_zero) == (self.last.mode, self.last.returning_to_zero)
+
+    def compare(self, outputs: Outputs, expected: Outputs) -> None:
+        """The same verdicts and events, the same numbers but for rounding."""
+        step, other = outputs.step, expected.step
+        assert step is not None
+        assert other is not None
+        assert (step.mode, step.saturated_pixels) == (other.mode, other.saturated_pixels)
+        assert step.flux_dn == pytest.approx(other.flux_dn, rel=1e-6)
+        if step.reasons == other.reasons:
+            assert outputs.events == expected.events
+        else:
+            assert {*step.reasons} ^ {*other.reasons} <= {*Limit}
+            self.found["limits that only one saw"] += 1
+        self.found.update(reason.name for reason in step.reasons)
+        self.found["frames"] += 1
+        assert (outputs.command is None) is (expected.command is None)
+        for one, two in zip(_commands(outputs), _commands(expected), strict=True):
+            self.largest_nm = max(self.largest_nm, same(one, two, ROUNDINGS))
+        for one, two in ((step.error_nm, other.error_nm), (step.pol_nm, other.pol_nm)):
+            assert (one is None) is (two is None)
+            if one is not None and two is not None:
+                same(one, two, 4 * ROUNDINGS)
+
+
+def same(one: Single, two: Single, roundings: int) -> float:
+    """The largest difference, which is at most `SAME_NM` or so many roundings of the largest number."""
+    assert np.isfinite(one).all()
+    apart_nm = float(np.abs(one - two).max(initial=0))
+    assert apart_nm < max(SAME_NM, roundings * np.spacing(np.abs(two).max(initial=0)))
+    return apart_nm
+
+
+def _commands(outputs: Outputs) -> list[Single]:
+    assert outputs.step is not None
+    return [outputs.step.command_nm, *([] if outputs.command is None else [outputs.command.actuators_nm])]
+
+
+def compared(frames: int, each: int, monkeypatch: pytest.MonkeyPatch) -> tuple[Counter[str], float]:
+    """What came of so many random frames, and the largest difference."""
+    found: Counter[str] = Counter()
+    largest_nm, original = 0.0, stepping._fused
+
+    def counting(*given: object) -> object:
+        made = original(*given)  # type: ignore[arg-type]
+        found["fused"] += made is not None
+        return made
+
+    monkeypatch.setattr(stepping, "_fused", counting)
+    for seed in range(frames // each):
+        bench = Bench(np.random.default_rng(seed))
+        bench.run(each)
+        found.update(bench.found)
+        largest_nm = max(largest_nm, bench.largest_nm)
+    return found, largest_nm
+
+
+def test_random_frames_and_states(monkeypatch: pytest.MonkeyPatch) -> None:
+    found, _ = compared(10_000, 1000, monkeypatch)
+    assert found["fused"] > 2000
+    assert found["limits that only one saw"] <= 2
+    for reason in (Rejection.SATURATED, Rejection.DARK, Rejection.STUCK, Limit.SLEW, Limit.MODAL_LIMIT, Limit.STROKE):
+        assert found[reason.name], reason.name
+
+
+@pytest.mark.slow
+def test_a_million_random_frames_and_states(monkeypatch: pytest.MonkeyPatch) -> None:
+    found, largest_nm = compared(1_000_000, 1000, monkeypatch)
+    print(dict(found), f"largest difference {largest_nm:.3g} nm")
+    assert found["fused"] > 200_000
+    assert found["limits that only one saw"] < 200
