@@ -28,6 +28,11 @@ ADVICE: dict[str, Advice] = {
         "the host does not grant a real-time measure (SCHED_FIFO, locked memory, awake processors).",
         "run `lowfc doctor`, which names the right that is missing; until then latencies have a longer tail.",
     ),
+    "KERNEL": Advice("`realtime.kernel` asks for this arithmetic of the control step.", _NOTHING),
+    "KERNEL_MISSING": Advice(
+        "`realtime.kernel` asks for the fused step, and numba is not installed.",
+        "install the extra `fast`; the loop is the same without it, and takes longer for a frame.",
+    ),
     "CALIBRATION_LOADED": Advice("a calibration is in use, at the start or after `load`.", _NOTHING),
     "NOT_CALIBRATED": Advice(
         "there is no calibration, or the camera's frames have another size than it.",

@@ -5,11 +5,8 @@ import os
 import signal
 import sys
 from collections.abc import Callable
-<<<<<<< HEAD
-from functools import partial
-=======
 from enum import StrEnum
->>>>>>> 96dbf9f (The usual frame is computed in two compiled calls where realtime.kernel is fused; logs and replay name their kernel)
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, NoReturn
 

@@ -222,7 +222,7 @@ class CommandChannels(NamedTuple):
 
 
 def seen_nm(weights: tuple[tuple[int, np.float32], ...], newest_first: tuple[Single, ...]) -> Single:
-    """What the last exposure saw of commands or shifts (modes,)."""
+    """What the last exposure saw of commands or shifts (modes,), nm of wavefront rms."""
     (lag, weight), *others = weights
     seen: Single = newest_first[lag] if weight == 1 else weight * newest_first[lag]
     for lag, weight in others:
