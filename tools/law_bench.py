@@ -81,7 +81,7 @@ class Bench:
         self._other = shaken
         self._scene = scene(config, shaken)
         self._settings = factory.settings(config)
-        self._watch = GainWatch(self._settings, config.control.on_harm)
+        self._watch = GainWatch(self._settings, config.control.on_harm, factory.contrast_of(config).form)
         self.events: list[tuple[int, PendingEvent]] = []
         self._state = advance(self._settings, State(), Load(0, calibration, "bench"))[0]
         self._guard, self._mirror = device(config), SimulatedMirror(DriverOptions(), config)
@@ -111,6 +111,10 @@ class Bench:
     def closing_harm(self) -> str:
         """What closing would add, in words; empty for nothing."""
         return self._watch.closing_harm
+
+    def added_contrast(self) -> tuple[float, Array] | None:
+        """What the open loop adds to the dark zone, and each mode (modes,) now, as measured."""
+        return self._watch.added_contrast()
 
     def star(self, magnitude: float) -> None:
         """Point at another star."""

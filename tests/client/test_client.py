@@ -673,3 +673,14 @@ def test_a_log_that_cannot_be_begun_is_refused_and_may_be_asked_for_again(bench:
     summary = bench.stop()
     assert len(summary.files) == 2
     assert summary.failure == ""
+
+
+def test_contrast_is_said_of_a_real_camera_as_measured_and_of_a_simulated_one_as_it_is() -> None:
+    measured = wire.Health(recent_wavefront={"added_contrast_flat": 2e-9, "added_contrast": 3e-11})
+    true = wire.Health(recent_wavefront={"added_contrast_flat": 4e-9, "added_contrast": 5e-11})
+    processes = {Role.CAMERA: wire.Health(), Role.CONTROLLER: measured}
+    real, simulated = (figures(wire.ControllerState(), processes | more) for more in ({}, {Role.CAMERA: true}))
+    assert real["added_contrast"] == {"open": 2e-9, "closed": 3e-11}
+    assert "+3.0e-11, as measured by the sensor" in text(real)
+    assert simulated["added_contrast"] == {"open": 4e-9, "closed": 5e-11}
+    assert "as measured" not in text(simulated)

@@ -6,6 +6,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from lowfc.adapters.files import factory
 from lowfc.arrays import Single
 from lowfc.contract.codecs.state_codec import controller_state, decode_state
 from lowfc.contract.configuration import FIXED_GAINS
@@ -95,6 +96,28 @@ def test_whoever_reads_the_state_goes_on_with_the_same_reconstructor(faint: Benc
     np.testing.assert_array_equal(again.drive.estimator.rows, drive.estimator.rows)
     np.testing.assert_array_equal(again.drive.automatic, drive.automatic)
     assert controller_state(again, settings, 1) == message
+
+
+def test_what_the_wavefront_adds_to_the_contrast_is_measured_open_and_closed() -> None:
+    loop = bench(2.0)
+    form = np.diag(factory.contrast_of(loop.config).form)
+
+    def true(name: str, frames: int) -> float:
+        truths = [getattr(truth.continuous, name) for truth in loop.truths[-frames:]]
+        return float(form @ np.mean(np.square(truths), axis=0))
+
+    assert loop.added_contrast() is None
+    loop.run(4500)
+    found = loop.added_contrast()
+    assert found is not None
+    flat, each = found
+    assert flat == pytest.approx(true("disturbance_nm", 2500), rel=0.3)
+    assert 0.5 < each.sum() / true("residual_nm", 2500) < 2  # a frame's noise is some ten times what is left
+    loop.ask("open")
+    loop.run(1)
+    opened = loop.added_contrast()
+    assert opened is not None
+    assert opened[1].sum() == pytest.approx(flat)
 
 
 def test_gains_of_a_person_are_not_touched_and_harm_is_said_before_and_after() -> None:

@@ -149,9 +149,8 @@ class GainBank:
         if noise_nm2 is not None:
             noise_nm2 = np.maximum(noise_nm2, np.mean(self._changed, axis=0))
         if self.first and noise_nm2 is not None:
-            injected = self.rows[1] / (2 - self.rows[1]) * noise_nm2
             there = power - noise_nm2 * (1 + CONFIDENCE * np.sqrt(2 / frames))
-            chosen = np.where((chosen == 0) & (injected < LEAST_CORRECTED * there), 1, chosen)
+            chosen = np.where((chosen == 0) & (injected(self.rows[1]) * noise_nm2 < LEAST_CORRECTED * there), 1, chosen)
         found = Verdict(
             self.rows[chosen],
             power,
@@ -231,6 +230,11 @@ def _better(blocks: Array) -> tuple[Array, Mask]:
     """Mean over the blocks, and whether it is below 0 beyond doubt."""
     mean, error = _mean(blocks)
     return mean, (mean < -CONFIDENCE * error) | ((mean < 0) & (np.sum(blocks < 0, axis=0) >= MOST_OF))
+
+
+def injected(gain: Single) -> Single:
+    """Of the noise of a frame, what an integrator without delay puts on the mirror."""
+    return gain / (2 - gain)
 
 
 def left_alone_nm2(verdict: Verdict, left: Mask, noise_nm2: Array) -> Single:

@@ -44,7 +44,14 @@ from lowfc.control.loop.state import State
 from lowfc.programs.core.bench_values import BenchValues
 from lowfc.programs.core.cache_warmup import CacheWarmup
 from lowfc.programs.core.camera_signs import CameraSigns
-from lowfc.programs.core.controller_report import Arrays, LastSecond, NotClosed, Offload, StageTiming
+from lowfc.programs.core.controller_report import (
+    Arrays,
+    LastSecond,
+    NotClosed,
+    Offload,
+    StageTiming,
+    fill_worth,
+)
 from lowfc.programs.core.gain_watch import GainWatch
 from lowfc.programs.core.mirror_signs import MirrorSigns
 from lowfc.programs.core.start_up import StartUp, settings_under
@@ -159,7 +166,7 @@ class Controller:
         health.not_closed_ns, health.not_closed_cause = self._not_closed.note(self._state, now_ns)
         if self._state.mode is LoopMode.CLOSED:
             health.holding = holding(self._state)
-        health.closing_harm = self._gain_watch.closing_harm
+        fill_worth(health, self._gain_watch, self._state)
         health.last_second.CopyFrom(self._last_second.figures(self._state, self._service.clock.host_ns()))
         if self._frame_to_command.count:
             health.frame_to_command.CopyFrom(codec.latency(self._frame_to_command))

@@ -13,6 +13,8 @@ from lowfc.control.loop.inputs import Request, Step
 from lowfc.control.loop.safety import LoopMode
 from lowfc.control.loop.state import State
 from lowfc.control.loop.wording import counted
+from lowfc.optics.chain.added_contrast import by_group, costliest
+from lowfc.programs.core.gain_watch import GainWatch
 
 TIMING_PERIOD_NS = 100_000_000
 SECOND_NS = 1_000_000_000
@@ -101,6 +103,19 @@ class LastSecond:
         _, square_nm2, flux_dn = rows.mean(axis=0).tolist()
         fraction = flux_dn / state.drive.calibration.flux_dn
         return wire.LoopFigures(frames=len(rows), residual_rms_nm=square_nm2**0.5, flux_fraction=fraction)
+
+
+def fill_worth(health: wire.Health, watch: GainWatch, state: State) -> None:
+    """What closing would add, and what the wavefront adds to the dark zone, as measured."""
+    health.closing_harm = watch.closing_harm
+    measured = watch.added_contrast()
+    if measured is None or state.drive is None or not measured[0]:
+        return
+    flat, each = measured
+    name, share = costliest(by_group(state.drive.calibration.noll, each))
+    found = health.recent_wavefront
+    found.added_contrast_flat, found.added_contrast = flat, float(each.sum())
+    found.costliest_modes, found.costliest_share = name, share
 
 
 class Arrays:

@@ -7,7 +7,7 @@ import numpy as np
 
 from lowfc.arrays import Array, Mask, Single
 from lowfc.control.calibration.granted import noise_covariance_nm2
-from lowfc.control.laws.automatic_gain import CONFIDENCE, GainBank, Verdict, left_alone_nm2
+from lowfc.control.laws.automatic_gain import CONFIDENCE, GainBank, Verdict, injected, left_alone_nm2
 from lowfc.control.loop.inputs import COUNT_BITS, PendingEvent, Request, Step
 from lowfc.control.loop.safety import LoopMode
 from lowfc.control.loop.state import ActiveLoop, Settings, State
@@ -55,6 +55,7 @@ class _Group:
             (frames[0], frames[1]),
         )
         self.verdict: Verdict | None = None
+        self.gain = drive.law.gain[mask]
         self.harmful = 0
         self.calm = window_s == TILT_S
 
@@ -130,6 +131,21 @@ class GainWatch:
         found = self._judge(judged, step, state, drive)
         return found._replace(events=(*events, *found.events))
 
+    def added_contrast(self) -> tuple[float, Array] | None:
+        """What the open loop adds to the dark zone, and each mode (modes,) now; None while that was not measured."""
+        if self._contrast is None or not self._groups:
+            return None
+        before, left = np.zeros((2, len(self._contrast)))
+        for group in self._groups:
+            one, mine, closed = group.verdict, group.mask, self._mode is LoopMode.CLOSED
+            if one is None or one.noise_nm2 is None or mine.size != left.size or (closed and one.loop_nm2 is None):
+                return None
+            before[mine] = left[mine] = np.maximum(one.power_nm2 - one.noise_nm2, 0)
+            if one.loop_nm2 is not None and closed:
+                left[mine] = np.maximum(before[mine] + one.loop_nm2, injected(group.gain) * one.noise_nm2)
+        each = np.diag(self._contrast)
+        return float(each @ before), each * left
+
     def _begin(self, drive: ActiveLoop) -> None:
         """Begin anew under another calibration, leak or limit."""
         of = drive.calibration.id, drive.law.kept.tobytes(), drive.law.limit_nm.tobytes()
@@ -180,6 +196,7 @@ class GainWatch:
                 continue
             initial |= group.bank.first
             noise = None if noise_nm2 is None else noise_nm2[group.mask]
+            group.gain = drive.law.gain[group.mask]
             group.verdict = verdict = group.bank.verdict(drive.law.gain[group.mask], noise)
             wanted = verdict.gain if group.calm else np.minimum(verdict.gain, CAUTIOUS)
             gain[group.mask] = np.where(drive.automatic[group.mask], wanted, gain[group.mask])

@@ -45,6 +45,9 @@ def figures(
     lately, arrived = controller.last_second, topic_count(controller, FRAME.key)
     camera = processes.get(Role.CAMERA, NOBODY)
     true = wavefront(camera.recent_wavefront) if camera.HasField("recent_wavefront") else None
+    contrast = true
+    if (true is None or true["added_contrast"] is None) and controller.HasField("recent_wavefront"):
+        contrast = wavefront(controller.recent_wavefront)
     return {
         "run": run,
         "mode": mode_name(state.mode) or "starting",
@@ -53,8 +56,9 @@ def figures(
         "frames_used_last_second": lately.frames,
         "residual_rms_nm": lately.residual_rms_nm if lately.frames else None,
         "true_residual_rms_nm": None if true is None else true["residual_rms_nm"],
-        "added_contrast": true and true["added_contrast"],
-        "costliest_modes": true and true["costliest_modes"],
+        "added_contrast": contrast and contrast["added_contrast"],
+        "added_contrast_estimated": contrast is not true,
+        "costliest_modes": contrast and contrast["costliest_modes"],
         "flux_fraction": lately.flux_fraction if lately.frames else None,
         "frames_skipped": arrived.skipped,
         "frames_missing": arrived.missing,
@@ -140,11 +144,7 @@ def text(known: dict[str, Any]) -> str:
         + (f"; the last was refused as {_spoken(known['refused'])}" if known["refused"] else ""),
         "command": f"{known['command_rms_nm']:.3f} nm rms" + (", on its way to zero" if known["homing"] else ""),
         "offset": f"{known['offset_rms_nm']:.3f} nm rms",
-        **(
-            {"contrast": sentence(with_this_mirror(known["added_contrast"]), most_of(known))}
-            if known["added_contrast"]
-            else {}
-        ),
+        **_contrast(known),
         "law": law,
         "gain": _values(known["gain"]) + _automatic(known["gain_automatic"]),
         "leak": _values(known["leak"]),
@@ -163,6 +163,13 @@ def text(known: dict[str, Any]) -> str:
         + (", the first of a commissioning: without a verdict" if known["calibration_provisional"] else ""),
     }
     return "\n".join([_in_short(known), *(f"{name:14} {value}" for name, value in rows.items())])
+
+
+def _contrast(known: dict[str, Any]) -> dict[str, str]:
+    if known["added_contrast"] is None:
+        return {}
+    of = ", as measured by the sensor" if known["added_contrast_estimated"] else ""
+    return {"contrast": sentence(with_this_mirror(known["added_contrast"]), most_of(known)) + of}
 
 
 def interlocks(known: dict[str, Any]) -> str:

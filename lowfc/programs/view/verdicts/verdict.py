@@ -46,8 +46,8 @@ def judge(state: RunState, nm_per_mas: float | None = None) -> Verdict:
     loop = _loop(state)
     left = wavefront(state, nm_per_mas, loop)
     tiles = [loop, left, frames(state), star(state), _mirror(state), _latency(state), _recorder(state)]
-    if state.truth is not None and state.truth.costliest_modes:
-        tiles.insert(2, contrast(state.truth))
+    if state.contrast is not None:
+        tiles.insert(2, contrast(state.contrast))
     if state.behind_s > BEHIND_S:
         tiles.append(_view(state.behind_s))
     worst = worst_of(tiles)

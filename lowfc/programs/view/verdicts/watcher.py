@@ -26,7 +26,7 @@ from lowfc.contract.printable import printable
 from lowfc.control.loop.estimator import saturated_pixels
 from lowfc.control.loop.safety import LoopMode
 from lowfc.programs.launch.watch import topic_count
-from lowfc.programs.view.snapshot import Accumulator, Snapshot, Waves
+from lowfc.programs.view.snapshot import Accumulator, LastHealth, Snapshot, Waves
 from lowfc.programs.view.verdicts.run_state import NOW_S, RECENT_S, Counts, Liveness, Process, Rms, RunState
 from lowfc.programs.view.verdicts.steady import Attained, Steady, attained
 
@@ -135,9 +135,7 @@ class Watcher:
             wavefront=wavefront,
             latest=_rms(self._last(LATEST_S))[0],
             true=true,
-            truth=camera.health.recent_wavefront
-            if camera is not None and camera.health.HasField("recent_wavefront")
-            else None,
+            contrast=_contrast(camera, snapshot.health.get(Role.CONTROLLER)),
             attained=self._attained,
             latency_us=tuple(np.percentile(durations_us, [50, 99]).tolist()) if durations_us.size else None,
             stroke_nm=float(np.abs(surface_nm).max(initial=0.0)) if surface_nm is not None else 0.0,
@@ -262,6 +260,12 @@ class Watcher:
                 grown[name] = count - before
             self._counted[name] = (last.health.pid, count)
         return grown
+
+
+def _contrast(*processes: LastHealth | None) -> wire.WavefrontFigures | None:
+    """Of the first of these processes that knows what the wavefront adds to the contrast."""
+    known = (one.health.recent_wavefront for one in processes if one is not None)
+    return next((one for one in known if one.costliest_modes), None)
 
 
 def _rms(samples: list[_Sample]) -> tuple[Rms | None, bool]:
